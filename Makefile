@@ -65,10 +65,11 @@ bench: compile ## two commits side by side: make bench BASE=main [HEAD=branch] [
 # the inner loop first, which all others need; then two processes, so that none compiles what another compiles
 compile: install ## compile the kernels, on two cores
 	@$(RUN) -c "import twoloop.kernels.evaluation.own_inner"
-	@$(RUN) -c "import twoloop.kernels.steps.newton_step" & \
-	$(RUN) -c "from twoloop.kernels import advance, agreement, interpolation, lanes; \
+	@$(RUN) -c "from twoloop.kernels.lanes import lane_implicit" & \
+	$(RUN) -c "from twoloop.kernels import advance, agreement, interpolation; \
 	from twoloop.kernels.steps import adams_step, bdf_step, bridge, canonical_step, diagonal_step, explicit_step, \
-	fixed_point_step, newmark_step" && wait $$! && \
+	fixed_point_step, newmark_step; \
+	from twoloop.kernels.lanes import lane_dop853, lane_runs, lane_taylor" && wait $$! && \
 	$(RUN) -c "import twoloop.kernels.control.switching"
 
 test: compile ## the tests, on two cores; ARGS="-m ''" takes the slow ones too

@@ -8,7 +8,8 @@ import matplotlib.pyplot as plt
 FOLDER = Path(__file__).resolve().parents[1] / "twoloop"
 ROOMS = (  # from the lowest: each imports from itself and from those before it
     *("kernels.compile", "kernels.data", "kernels.algebra", "kernels.evaluation", "kernels.control", "kernels.steps"),
-    *("kernels", "checks", "problem", "generate", "methods", "run", "mechanisms", "symbolic"),
+    *("kernels.lanes", "kernels", "checks", "problem", "generate", "methods", "run"),
+    *("mechanisms", "bodies", "symbolic"),
     *("result", "solve", "ensembles", "sweeps", "testing"),
 )
 CALLS = {"__init__", "__main__", "exported", "solve"}  # flat

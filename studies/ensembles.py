@@ -12,7 +12,6 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from references.equations.many_at_once import by_diffrax, by_heyoka
-from references.heyoka.taylor import LARGEST_UNROLLED
 from references.paper.four_bar_minimal import MinimalFourBar
 from studies.bench import figures, tables
 from studies.bench.cli import StudyError
@@ -199,16 +198,10 @@ def make(output: Output) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def sizes() -> dict[str, int]:
-    """Coordinates of the mechanisms of STARTS, by the names of these."""
-    return {problem.name: problem.system.n_q for problem in (getattr(mechanisms, name)() for name in STARTS)}
-
-
 def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     """The ways that ran, and at equal error ours beside the others.
 
-    The error of a way is the largest of its runs, at a tolerance at which none failed. Ratios of the mechanisms on
-    which heyoka runs in compact mode are apart.
+    The error of a way is the largest of its runs, at a tolerance at which none failed.
     """
     made = rows[(rows["group"] == GROUP) & rows["tol"].notna()]  # of packages that are there
     made = made.assign(error_q=made["error_worst"].where(made["n_failed"] == 0), call_s=made["run_s"], floor=AGREE / 10)
@@ -224,16 +217,7 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
         n_runs, t_end = (own_rows[name].iloc[0] for name in ("n_runs", "t_end"))
         found["cases"].append({"case": case, "n_runs": int(n_runs), "t_end": float(t_end), "at": at})
         found["repeats"] = int(medians["repeats"].max())
-    compact = {name: n for name, n in sizes().items() if n > LARGEST_UNROLLED}
-    found |= {"unrolled_to": LARGEST_UNROLLED, "compact": []}
-    every: list[float] = []
-    for each in found["cases"]:
-        ratios = [line["ratio"] for line in each["at"] if line["ratio"] is not None]
-        if each["case"] in compact:
-            most = max(ratios, default=None)
-            found["compact"].append({"case": each["case"], "n_q": compact[each["case"]], "ratio": most})
-        else:
-            every += ratios
+    every = [line["ratio"] for each in found["cases"] for line in each["at"] if line["ratio"] is not None]
     found["ratios"] = [min(every), max(every)] if every else None
     found["verdicts"] = {
         verdict: sum(line["verdict"] == verdict for each in found["cases"] for line in each["at"])
@@ -247,19 +231,16 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
 
 
 def figures_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Figure]:
-    """CPU time of a run over the largest error, a panel a mechanism; dotted: heyoka in compact mode."""
+    """CPU time of a run over the largest error, a panel a mechanism."""
     made = rows[(rows["group"] == GROUP) & rows["tol"].notna() & (rows["n_failed"] == 0)]
     cases = list(dict.fromkeys(made["case"]))
     width = 3.4 * len(cases) + 1.2
     of_panels: dict[str, Any] = {"figsize": (width, 4.2), "layout": "constrained", "squeeze": False, "sharey": True}
     figure, panels = plt.subplots(1, len(cases), **of_panels)
-    compact = [each["case"] for each in found["compact"]]
     for axes, case in zip(panels[0], cases, strict=True):
         for way, own in made[made["case"] == case].groupby("way", sort=False):
             line = own.groupby("tol")[["error_worst", "run_s"]].median()
             look = figures.style(*LOOKS[way]) | {"label": way}
-            if way == HEYOKA and case in compact:
-                look |= {"label": f"{way}, compact mode", "linestyle": ":"}
             axes.plot(line["error_worst"], 1e6 * line["run_s"], **look)
         axes.set(xscale="log", yscale="log", xlabel="largest error of q at the end (m, rad)", title=case)
         axes.grid(alpha=0.3)

@@ -154,7 +154,9 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     listed = line_up[line_up["violation_q"].notna()].set_index("solver", drop=False)
     of_alpha = along[along["solver"].str.contains("Baumgarte") & along["error_q"].notna()]["violation_q"]
     failed = rows["status"] != "REACHED_END"
-    ranked = [ranking for target in TARGETS if len(ranking := tables.ranking(along, target))]
+    at_each = [costs for target in TARGETS if (costs := tables.costs_at(along, target, doubt=True))]
+    first = [min((cost, solver) for solver, (cost, _) in costs.items())[1] for costs in at_each]
+    kept = along.groupby("solver")["keeps_constraints"].first()
     return {
         "t_end": float(rows["t_end"].iloc[0]),
         "problem": rows["problem"].iloc[0],
@@ -179,8 +181,8 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
         "baumgarte": [of_alpha.min(), of_alpha.max()],
         "baumgarte_n": len(of_alpha),
         "baumgarte_kept": int((of_alpha <= KEPT).sum()),
-        "n_ranked": len(ranked),
-        "n_kept_first": sum(bool(ranking["keeps_constraints"].iloc[0]) for ranking in ranked),
+        "n_ranked": len(first),
+        "n_kept_first": sum(bool(kept[solver]) for solver in first),
         "listed": [_told(listed.loc[name]) for name in LISTED if name in listed.index],
         "targets": TARGETS,
         "cost": tables.work_precision(along, TARGETS, (*DRAWN, OWN_EXPLICIT, *STABILISED[1::3])),

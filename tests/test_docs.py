@@ -89,6 +89,21 @@ def test_a_fit_with_the_step_that_the_page_names_finds_the_masses(names):
     assert page["fit"].success and page["fit"].x == pytest.approx([page["m2"], page["m3"]], rel=1e-4)
 
 
+def test_the_models_of_the_page_of_bodies(names):
+    page = names("bodies")
+    six, result = page["problem"], page["result"]
+    assert result.success and six.freedom.degrees == 1 and not six.conserved
+    bars = [np.linalg.norm(b - a, axis=0) for a, b in six.drawing.at(result.q)[np.array(six.drawing.bars[:-1])]]
+    assert max(np.ptp(length) for length in bars) < 1e-9
+    other = solve_dae(six.system, six.t_span, six.q0, six.v0, "RadauIIA9", rtol=1e-11, atol=1e-11)
+    assert np.abs(other.q[:, -1] - result.q[:, -1]).max() < 1e-6
+    assert "does not close" in str(page.get("error", "does not close")) and page["runs"].success.all()
+    t, run = page["run"].t, page["run"]
+    torque = 2.0 / 3.0 * -7.2 * np.sin(3.0 * t) + 9.81 * np.sin(0.8 * np.sin(3.0 * t))  # J a + m g l / 2 sin
+    assert run.reactions("servo").torque == pytest.approx(torque, abs=1e-5)
+    assert page["linkage"].freedom.degrees == 1 and page["turning"].success
+
+
 @pytest.mark.parametrize(("tol", "step"), [(1e-8, 1e-4), (1e-12, 1.5e-8)])
 def test_so_are_the_derivatives_right_with_each_of_its_two_remedies(names, tol, step):
     slider, masses = names("your_mechanism")["slider"], np.array([2.0, 1.5])
@@ -232,7 +247,7 @@ ENTRIES = set(
 )
 
 
-@pytest.mark.parametrize("package", ["twoloop", "twoloop.symbolic", "twoloop.testing"])
+@pytest.mark.parametrize("package", ["twoloop", "twoloop.bodies", "twoloop.symbolic", "twoloop.testing"])
 def test_every_name_of_a_package_has_an_entry(package):
     module = pytest.importorskip(package, exc_type=ImportError)
     assert {f"{package}.{name}" for name in module.__all__} <= ENTRIES

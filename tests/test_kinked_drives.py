@@ -324,3 +324,29 @@ def test_a_smooth_drive_is_left_alone():
     assert looked.stats.n_rejected_error == without.stats.n_rejected_error
     assert (looked.t == without.t).all()
     assert (looked.q == without.q).all()
+
+
+@pytest.mark.parametrize("method", ["auto", "RadauIIA9", "TRBDF2", "Gauss12"])
+def test_a_rate_that_has_no_value_where_it_jumps_is_an_impulse(method):
+    """C_t of 0.5 |t - 0.4|, written as a quotient, is 0 / 0 at the kink."""
+
+    def half(t):
+        with np.errstate(invalid="ignore"):
+            return 0.5 * np.divide(t - 0.4, np.abs(t - 0.4))
+
+    def ends(rate):
+        system = ConstrainedSystem.from_python(
+            n_q=3,
+            n_c=2,
+            mass=np.eye(3),
+            force=lambda t, q, v: np.array([0.0, 0.0, -9.81]),
+            constraint=lambda t, q: np.array([q[0] - 0.5 * abs(t - 0.4), 0.5 * ((q[1] - q[0]) ** 2 + q[2] ** 2 - 1.0)]),
+            jacobian=lambda t, q: np.array([[1.0, 0.0, 0.0], [q[0] - q[1], q[1] - q[0], q[2]]]),
+            constraint_rate=lambda t, q: np.array([-rate(t), 0.0]),
+            gamma=lambda t, q, v: np.array([0.0, -((v[1] - v[0]) ** 2) - v[2] ** 2]),
+        )
+        result = solve_dae(system, (0.0, 0.6), [0.2, 0.8, -0.8], [-0.5, -0.5, 0.0], method, 1e-8, 1e-8)
+        assert result.success and "At t = 0.4 C_t or b jumps" in result.message
+        return result.q[:, -1]
+
+    assert np.abs(ends(half) - ends(lambda t: 0.5 * np.sign(t - 0.4))).max() < 1e-6

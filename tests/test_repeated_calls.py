@@ -10,10 +10,11 @@ import pytest
 
 from tests.problems import pendulum
 from twoloop import ConstraintWarning, mechanisms, solve_dae
+from twoloop.generate.choices import Choice
 from twoloop.generate.exact_derivatives import Territory, exact_derivatives, generic_states
 from twoloop.generate.families import family_of
 from twoloop.generate.straight_code import SharedCode
-from twoloop.generate.straight_line import Choice, StraightLine
+from twoloop.generate.straight_line import StraightLine
 from twoloop.generate.traced_values import unchecked
 from twoloop.kernels.layout import _free
 from twoloop.methods.plans_for import MOST, plans_for
@@ -21,6 +22,14 @@ from twoloop.methods.presets import PRESETS
 from twoloop.run import comparison
 
 MANY, FEW = 700, 320  # calls of functions in a second run, which compares callbacks again, and in a third
+ANOTHER = {  # the same in a run from another start, and in one with other parameters
+    "four_bar": (580, 2500),
+    "andrews": (590, 2500),
+    "redundant_slider_crank": (700, 3600),
+    "heavy_top": (760, 2700),
+    "spatial_four_bar": (560, 3900),
+    "closed_chain": (590, 5600),
+}
 
 
 def run(problem, rtol=1e-6, **options):
@@ -37,6 +46,27 @@ def test_a_repeated_call_takes_few_calls_of_functions(options):
         profile.disable()
         calls.append(pstats.Stats(profile).total_calls)
     assert calls[1] < MANY and calls[2] < FEW  # the first compiles callbacks, or checks derivatives
+
+
+def calls_of(function):
+    profile = cProfile.Profile()
+    profile.runcall(function)
+    return pstats.Stats(profile).total_calls
+
+
+@pytest.mark.parametrize("name", ANOTHER)
+@pytest.mark.filterwarnings("ignore::twoloop.ConstraintWarning")
+def test_a_call_from_another_start_or_with_other_parameters_takes_few_calls_of_functions(name):
+    """The median of calls: some compare callbacks once more."""
+    problem = mechanisms.closed_chain(4) if name == "closed_chain" else getattr(mechanisms, name)()
+    system, span = problem.system, 0.004 if name == "andrews" else 0.2
+    motion = solve_dae(system, (0.0, span), problem.q0, problem.v0, t_eval=np.linspace(0.0, span, 12))
+    states = list(zip(motion.t.tolist(), motion.q.T.copy(), motion.v.T.copy(), strict=True))
+    for _ in range(2):
+        starts = [calls_of(lambda s=s: solve_dae(system, (s[0], s[0] + 0.5 * span), *s[1:])) for s in states]
+    others = [system.with_parameters(system.parameters) for _ in range(5)]
+    p = [calls_of(lambda s=s: solve_dae(s, (0.0, 0.5 * span), problem.q0, problem.v0)) for s in others]
+    assert (np.median(starts) < ANOTHER[name][0]) and (np.median(p) < ANOTHER[name][1]), (starts, p)
 
 
 def test_a_workspace_that_was_used_is_as_a_new_one():

@@ -14,12 +14,13 @@ from tests.problems import pendulum, unconstrained, worst
 from tests.processes import run_python
 from twoloop import ConstrainedSystem, ConstraintWarning, callback
 from twoloop.generate import stage_code, straight_code
+from twoloop.generate.choices import Choice
 from twoloop.generate.coefficients import Coefficients
 from twoloop.generate.derivative import Derivative
 from twoloop.generate.llvm_text import Module
 from twoloop.generate.llvm_trigonometry import LARGEST_ANGLE
 from twoloop.generate.straight_code import own_code, write_function
-from twoloop.generate.straight_line import Choice, Factors, Outputs, Solution, StraightLine
+from twoloop.generate.straight_line import Factors, Outputs, Solution, StraightLine
 from twoloop.generate.tracing import Form, Graph
 from twoloop.kernels.compile import caches
 from twoloop.kernels.compile.own_functions import OwnFunctions, object_code

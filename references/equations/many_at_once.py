@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from references.diffrax.dopri8 import derivative_of, packages, solved
 from references.driver import imported
 from references.equations.expressions import Expressions
-from references.heyoka.taylor import LARGEST_UNROLLED, rates_of
+from references.heyoka.taylor import rates_of
 from twoloop.problem.problem import Problem
 
 Array = NDArray[np.float64]
@@ -48,9 +48,7 @@ def by_heyoka(problems: Sequence[Problem], t_end: float) -> Solve:
     def solve(tol: float) -> Array:
         if tol not in made:
             start = states[groups[0]].T.copy()
-            made[tol] = package.taylor_adaptive_batch(
-                motion, start, tol=tol, fast_math=True, compact_mode=n > LARGEST_UNROLLED
-            )
+            made[tol] = package.taylor_adaptive_batch(motion, start, tol=tol, fast_math=True)
         integrator, ends = made[tol], np.full((len(states), n), np.nan)
         for group in groups:
             integrator.set_time(0.0)

@@ -21,7 +21,7 @@ STUDIES = (
     "compare_page",
 )
 CLASSES = {  # tags of a case and the class of problem that they stand for, in the order of the first screen
-    ("smooth",): "smooth, rigid",
+    ("smooth",): "four-bar linkages, over long times",
     ("stiff", "vibrations irrelevant"): "stiff, vibrations irrelevant",
     ("stiff", "vibrations wanted"): "stiff, vibrations wanted",
 }
@@ -66,7 +66,8 @@ def classes(found: dict[str, dict[str, Any]]) -> list[dict[str, Any]]:
         made.append(_entry(label, case, [_at_error(at) for at in case["at"]]))
     if "energy" in found:
         long = found["energy"]["long"]
-        case = {"name": f"four-bar, {long['case']}", "t_end": long["t_end"]}
+        name = f"four-bar, {long['case']}, largest kinetic energy {number(long['kinetic'])} J"
+        case = {"name": name, "t_end": long["t_end"]}
         made.append(_entry(LONG, case, [_at_energy(at, long["equal"], "no_drift", "drift") for at in long["at"]]))
         made[-1]["without_drift"] = picks([_at_energy(at, long["equal"], "no_drift") for at in long["at"]])
     return made

@@ -222,7 +222,7 @@ def tightest(rows: pd.DataFrame) -> float:
 
 
 def why_not(rows: pd.DataFrame, target: float) -> str:
-    """What a table shows for a solver without a time at an error: why there is none."""
+    """What a table shows for a solver without a time at an error: that of a better run, or why there is none."""
     reached = rows[rows["error_q"].notna()]
     if reached.empty:
         first = rows["status"].iloc[0]
@@ -230,7 +230,8 @@ def why_not(rows: pd.DataFrame, target: float) -> str:
     finer = setting_of(rows) < setting_of(reached).min()
     stopped = bool((stopped_by_us(rows) & finer).any()) and bool((reached["error_q"] > target).all())
     if not stopped and not missed(rows, target):
-        return "not asked"
+        better = as_good(rows, target)
+        return "not asked" if np.isnan(better) else f"≤ {number(better)}"
     return f"least error {number(float(reached['error_q'].min()))}" + (", then our limit" if stopped else "")
 
 

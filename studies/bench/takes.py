@@ -33,7 +33,11 @@ def takes(found: Mapping[str, Any], groups: Sequence[Sequence[dict[str, Any]]]) 
         picks = [f"{solver} for errors of {errors}" for solver, errors in named]
         open_at = dict.fromkeys(at for entry in group for pick in entry["picks"] for at in pick["undecided"])
         doubt = f" (undecided: {listed(open_at)})" if open_at else ""
-        rows.append({"what": what, "take": ("; ".join(picks) or "no solver compared reaches these errors") + doubt})
+        picks = picks or ["no solver compared reaches these errors"]
+        free = group[0].get("without_drift", [])
+        calm = [f"{call(pick['solver'])} for {listed(pick['accuracies'])}" for pick in free]
+        without = f"; its energy drifts or wanders, without drift: {'; '.join(calm)}" if calm else ""
+        rows.append({"what": what, "take": "; ".join(picks) + doubt + without})
     often = [*_often(made.get("first_calls", [])), *_at_once(found.get("ensembles", {}).get("cases", []))]
     mechanisms = made.get("rivals", {}).get("mechanisms", [])
     short = [each for each in mechanisms if each.get("tags") and not OTHER_KINDS & {*each["tags"]}]
@@ -49,8 +53,16 @@ def _of_short_calls(mechanisms: Sequence[Mapping[str, Any]], with_code: set[str]
         return []
     coded = with_code.issuperset(each["case"] for each in mechanisms)
     parts = [f"{call(solver, coded)} on {n}" for solver, n in cheapest.most_common()]
-    n, what = len(mechanisms), "smooth, rigid, in calls of a few milliseconds"
+    times = [run["call_s"] for each in mechanisms for line in each["at"] if (run := _first(line))]
+    least, most = number(1e3 * min(times)), number(1e3 * max(times))
+    n, what = len(mechanisms), f"other smooth, rigid mechanisms, in calls of {least} to {most} ms"
     return [{"what": what, "take": f"of {n} mechanisms, the cheapest at most errors: {', '.join(parts)}"}]
+
+
+def _first(line: Mapping[str, Any]) -> Mapping[str, Any] | None:
+    """The cheapest of ours and of others at an error."""
+    runs = [run for run in (line["ours"], line["others"]) if run]
+    return min(runs, key=lambda run: run["call_s"], default=None)
 
 
 def _of_kinds(mechanisms: Sequence[Mapping[str, Any]], with_code: set[str]) -> list[dict[str, str]]:
@@ -96,9 +108,8 @@ def _won(at: Sequence[Mapping[str, Any]]) -> Counter[str]:
     """
     won: Counter[str] = Counter()
     for line in at:
-        runs = [(run["call_s"], run["solver"]) for run in (line["ours"], line["others"]) if run]
-        decided = line["verdict"] in ("ahead", "behind", "alone", "missed")
-        won.update([min(runs)[1] if decided else ""] if runs else [])
+        best, decided = _first(line), line["verdict"] in ("ahead", "behind", "alone", "missed")
+        won.update([best["solver"] if decided else ""] if best else [])
     return won
 
 

@@ -175,7 +175,10 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     missed = rows[rows["caught_by"] == NONE]
     who = rows[rows["caught_by"] != NONE]["caught_by"].map(catcher)
     by = {each: int((who == each).sum()) for each in (ITSELF, KNOWN, BOUNDS, TESTS)}
-    return {"n": len(rows), "missed": missed["fault"].tolist(), "by": by, "tolerance": TOLERANCE}
+    models = rows["place"] == "mechanism"
+    of_models = {"n": int(models.sum()), "stopped": int((who[models.reindex(who.index)] == ITSELF).sum())}
+    missed_ones = missed["fault"].tolist()
+    return {"n": len(rows), "missed": missed_ones, "by": by, "models": of_models, "tolerance": TOLERANCE}
 
 
 def report(output: Output, rows: pd.DataFrame, line: str) -> None:

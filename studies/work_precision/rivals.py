@@ -194,13 +194,18 @@ def _within(made: Sequence[dict[str, Any]], name: str, errors: Sequence[float]) 
     return {"name": name, "n_mechanisms": len(own), "standings": headline.counted(pairs)}
 
 
-def residual(rows: pd.DataFrame) -> float | None:
-    """Of rivals that do not enforce the constraints, what is left of these at the end over the error: the median."""
+def residual(rows: pd.DataFrame) -> dict[str, Any] | None:
+    """Of rivals that do not enforce the constraints, what is left of these at the end over the error: medians.
+
+    here: on the mechanism whose price is told; least, most: of all mechanisms.
+    """
     free = rows[(rows["family"] != "two-loop") & ~rows["keeps_constraints"].astype(bool)]
-    if free.empty:
+    shares = (free["violation_q"].astype(float) / free["error_q"].astype(float)).replace(np.inf, np.nan)
+    medians = shares.groupby(free["case"]).median()
+    medians = medians[medians > 0.0]  # the knife edge has no constraint of positions
+    if HEADLINE not in medians:
         return None
-    shares = (free["violation_q"].astype(float) / free["error_q"].astype(float)).replace(np.inf, np.nan).dropna()
-    return float(shares.median()) if len(shares) else None
+    return {"here": float(medians[HEADLINE]), "least": float(medians.min()), "most": float(medians.max())}
 
 
 def put(rows: pd.DataFrame) -> dict[str, Any]:
@@ -231,7 +236,7 @@ def aims(geometries: Iterable[pd.DataFrame]) -> list[dict[str, Any]]:
 def cell(found: dict[str, Any]) -> str:
     """A ratio, in brackets where it is undecided; or who gets there."""
     if found["ratio"] is None:
-        return {"alone": "ours", "unasked": "ours", "missed": "others", "none": ""}[found["verdict"]]
+        return {"alone": "ours", "unasked": "ours?", "missed": "others", "none": ""}[found["verdict"]]
     text = number(found["ratio"])
     return f"({text})" if found["verdict"] == "undecided" else text
 
@@ -269,7 +274,7 @@ def heat_map(found: dict[str, Any]) -> Figure:
         axes.set_yticks(range(len(names)), names)
         axes.grid(False)
         axes.set(title=name, xlabel="error at the end, over max(1, max |q|)")
-    told = "blue: ours ahead; in brackets: undecided; a word: only these get there; grey: not reached, or not run"
+    told = "blue: ours ahead; in brackets: undecided; “ours?”: not all rivals were run to their end; grey: not reached"
     figure.suptitle(f"Time of the fastest rival over ours ({told})", fontsize=10)
     figure.colorbar(image, ax=panels, label="ratio")
     return figure

@@ -1,6 +1,7 @@
 """What users get wrong, all of it: the tests run it, and docs/errors.md is written from it."""
 
 from tests.bad_input.between_steps import BETWEEN_STEPS
+from tests.bad_input.bodies import BODIES
 from tests.bad_input.ensembles import ENSEMBLES
 from tests.bad_input.joints import JOINTS
 from tests.bad_input.mechanisms import MECHANISMS
@@ -16,6 +17,7 @@ from tests.general.wrong_rows import ROWS
 
 CASES = [
     *(*SOLVE, *BETWEEN_STEPS, *START, *PROJECTION, *SYSTEMS, *METHODS, *MECHANISMS, *ROWS, *JOINTS, *RESULTS),
+    *BODIES,
     *ENSEMBLES,
     *SIMULATORS,
     *SYMBOLIC,

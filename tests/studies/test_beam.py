@@ -83,12 +83,9 @@ def test_the_advice_turns_with_the_rows(tmp_path):
 
 
 def test_of_a_solver_with_runs_it_is_not_said_that_it_was_not_asked():
-    runs = pd.DataFrame({"error_tip": [1e-5, 1e-6, np.nan], "call_s": [1.1, 3.0, 0.1]}).assign(
-        error_q=lambda x: x["error_tip"]
-    )
-    assert study._cell(runs, 1e-2, "not asked") == "1.1°"
-    assert study._cell(runs, 1e-5, "1.2") == "1.2"
-    assert study._cell(runs, 1e-9, "not asked") == "least error 1e-6"
+    runs = pd.DataFrame({"error_tip": [1e-5, 1e-6, np.nan]})
+    assert study._cell(runs, "not asked") == "least error 1e-6"
+    assert study._cell(runs, "≤ 1.1") == "≤ 1.1" and study._cell(runs[2:], "not asked") == "not asked"
 
 
 @pytest.mark.usefixtures("unsaved")

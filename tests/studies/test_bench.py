@@ -78,6 +78,23 @@ def test_a_short_run_is_called_several_times_more(kept, timed, calls):
     assert row(kept, ours, case(timed=timed))["calls"] == calls
 
 
+def test_runs_of_ours_are_timed_at_starts_that_no_call_has_had(kept):
+    begun = []
+
+    def run(case, value, repeat):
+        _, (t0, t1), q0, v0 = case.start
+        begun.append((t1 - t0 == pytest.approx(T_END), t0, *q0, *v0))
+        return ours(case, value, repeat)
+
+    with kept:
+        collect([Run(case(timed=1e9), solver(run), 1e-6, repeats=2)], kept)
+    timed = [start for whole, *start in begun if whole and start[0] > 0.0]
+    assert len(timed) == 6 and len({tuple(start) for start in timed}) == 6
+    for t0, *state in timed:
+        q, v, _ = pendulum_state(t0)
+        assert 0.0 < t0 < 1e-6 and worst(state, [*q, *v]) < 1e-12
+
+
 def test_the_first_call_of_a_setting_is_made_again_where_it_may_hold_a_build(kept):
     counted = []
 

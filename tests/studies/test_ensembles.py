@@ -1,6 +1,5 @@
 """Many runs in one call: every way ends where the equation in one coordinate does; sentences follow the rows."""
 
-import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 import pytest
@@ -77,24 +76,6 @@ def test_sentences_follow_the_rows():
     text = said({ENSEMBLE: 0.1, SINGLE: 0.01, HEYOKA: 0.05})
     assert f"ahead of heyoka's batches and diffrax in 0 and behind in {len(ERRORS)} of {len(ERRORS)} pairs" in text
     assert "10,000 four-bar linkages" in text and "none failed" in text
-
-
-def test_ratios_beside_compact_mode_are_told_apart():
-    times = {ENSEMBLE: 0.01, HEYOKA: 0.05}
-    spatial = rows(**times | {HEYOKA: 0.08}).assign(case="spatial slider-crank")
-    made = pd.concat([rows(**times), spatial[spatial["group"] == ensembles.GROUP]], ignore_index=True)
-    found = ensembles.findings_of(made)
-    assert found["ratios"] == pytest.approx([5.0, 5.0])
-    assert [(line["case"], line["n_q"]) for line in found["compact"]] == [("spatial slider-crank", 21)]
-    text = render("ensembles", found, {}, stamp="stamp", quick=False, rows=made)
-    assert "5.0 to 5.0 times as long; up to 8.0 on the spatial slider-crank, where heyoka runs in compact mode." in text
-    assert "with more (spatial slider-crank: 21) it is built in compact mode" in text
-    assert "compact" not in said(times)
-    (figure,) = ensembles.figures_of(made, found).values()
-    lines = [{line.get_label(): line.get_linestyle() for line in axes.lines} for axes in figure.axes]
-    assert lines == [{ENSEMBLE: "-", HEYOKA: "--"}, {ENSEMBLE: "-", f"{HEYOKA}, compact mode": ":"}]
-    assert len({axes.get_ylim() for axes in figure.axes}) == 1
-    plt.close(figure)
 
 
 def test_ways_are_compared_at_equal_error_and_not_at_equal_tolerance():

@@ -248,7 +248,8 @@ def test_what_is_not_told_apart_is_nobodys_win(tmp_path):
 def test_classes_come_in_their_order_and_the_long_one_from_the_energy():
     stiff = case(name="beam", tags=["stiff", "vibrations wanted"], at=[at_error(ours=BEST | {"energy": None})])
     made = entries([case(name="robot", tags=["odd"]), stiff, case()], energy=energy())
-    assert [entry["class"] for entry in made] == ["smooth, rigid", "stiff, vibrations wanted", "odd", index.LONG]
+    named = ["four-bar linkages, over long times", "stiff, vibrations wanted", "odd", index.LONG]
+    assert [entry["class"] for entry in made] == named
     (line,), (pick,), (free,) = made[-1]["at"], made[-1]["picks"], made[-1]["without_drift"]
     assert line["ours"]["solver"] == "Gauss(3)" and line["others"]["solver"] == "LSODA" and line["others"]["drifts"]
     assert pick["solver"] == "LSODA" and pick["over"] == [2.0] and free["solver"] == "Gauss(3)"
@@ -282,11 +283,10 @@ def test_what_can_be_trusted_is_counted(tmp_path):
         "n": 73,
         "missed": ["x"],
         "by": by,
+        "models": {"n": 20, "stopped": 12},
     }
     text = screen(tmp_path, planted_errors=planted)
-    said = (
-        "- Of 73 faults that we planted in models, solvers and reports `solve_dae` itself refuses or stops 20; no check"
-    )
+    said = "- Of 73 faults that we planted, 20 are in models; `solve_dae` refuses or stops 12 of these; no check"
     assert f"{said} of those run catches 1: x ([planted errors](planted_errors.md))." in text
 
 

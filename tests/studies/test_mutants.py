@@ -90,6 +90,7 @@ def text_of(seen_by, why=""):
         survivor["why"] = why
     whole = {"n": 1, "missed": [], "tolerance": 1e-10, "mutants": found | {"made": "stamp"}}
     whole["by"] = {"solve_dae": 1, "known motion": 0, "bounds": 0, "tests": 0}
+    whole["models"] = {"n": 1, "stopped": 1}
     return render("planted_errors", whole, {"faults": ""}, stamp="stamp", quick=False)
 
 

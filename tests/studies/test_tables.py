@@ -44,7 +44,7 @@ def test_cost_at_an_error_lies_on_the_line_between_two_runs():
 def test_nothing_is_interpolated_over_more_than_a_decade_or_between_methods():
     made = rows(("a", 1.1e-2, 1.0), ("a", 1.8e-7, 4.0))
     assert np.isnan(tables.time_for(made, 1e-4))  # no run within a decade: not asked
-    assert tables.time_for(made, 1e-6) == 4.0 and tables.why_not(made, 1e-4) == "not asked"
+    assert tables.time_for(made, 1e-6) == 4.0 and tables.why_not(made, 1e-4) == "≤ 4.0"
     near = made.assign(tol=[1e-4, 6e-5])  # asked on both sides: the solver leaps, and its price is that of the leap
     assert tables.time_for(near, 1e-4) == 4.0
     # errors need not fall with the setting: next to the target by error stands a run of quite another setting

@@ -35,6 +35,8 @@ def check_bounds(system: "ConstrainedSystem", t: float, q: Array, v: Array) -> N
     ValueError
         Naming the callback, the index and the sizes of its arrays.
     """
+    if len(system.within_bounds) == len(KINDS):
+        return
     state = {"q": q, "v": v, "lam": np.ones(system.n_c)}
     for kind, entry in KINDS.items():
         check_callback(system, kind, t, [state[name] for name in entry.state])
@@ -43,6 +45,9 @@ def check_bounds(system: "ConstrainedSystem", t: float, q: Array, v: Array) -> N
 def check_callback(system: "ConstrainedSystem", kind: str, t: float, state: list[Array]) -> None:
     """Run one callback as `check_bounds` does all."""
     if system.called_in_python or kind in system.within_bounds:
+        return
+    if kind not in system.given:  # what stands in its place is our own
+        system.within_bounds.add(kind)
         return
     function, p, out = getattr(system.functions, kind), system.parameters, system.arrays_of(kind)
     changed: list[int] = []

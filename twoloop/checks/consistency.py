@@ -4,28 +4,31 @@ from __future__ import annotations  # ArrayLike stays a word in help()
 
 from collections.abc import Callable
 from functools import cache
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import null_space, qr
+from scipy.linalg import lapack, null_space
 
 from twoloop.checks.bounds import check_bounds
-from twoloop.checks.derivatives import check_derivatives, unsymmetric_mass
-from twoloop.checks.scales import EPS, Scales, scales_of
+from twoloop.checks.derivatives import UNSYMMETRIC, check_derivatives, unsymmetric_mass
+from twoloop.checks.rank import eigenvalues, in_words, largest_solution, redundant_rows
+from twoloop.checks.scales import EPS, Scales, rows_at, scales_of
 from twoloop.kernels.compile.callbacks import KINDS
+from twoloop.kernels.compile.linking import direct
 
 if TYPE_CHECKING:
     from twoloop.problem.system import ConstrainedSystem
 
 Array = NDArray[np.float64]
 
-RANK_TOLERANCE = 1e-11  # of the largest diagonal entry of R
 CONSISTENT = 1e-8  # correction that an initial state may need, relative to the size of the mechanism
+SURELY = 0.1  # of that: where no more is needed, there is no doubt
 NEARBY = (0.0, 1e-3, 1e-2, 3e-2)  # of the coordinates: where the pattern of C_q is looked at
 TIED = 1e-6  # relative: corrections that exceed what is allowed by as much, of which the first is named
 ROUNDING = 64.0  # times the spacing of floating-point numbers: what rounding of the state may add to it
-MOST_TERMS, MOST_NAMED = 3, 8  # rows on which another depends: named with their coefficients, and named at all
+SINGULAR_MASS = 1e-12  # smallest eigenvalue over largest entry, below which M may have no inverse
+LEAST = np.array([ROUNDING * EPS, UNSYMMETRIC, SINGULAR_MASS])  # as the kernel takes them
 
 
 class ConstraintWarning(UserWarning):
@@ -52,6 +55,10 @@ def check_start(
     """
     check_bounds(system, t0, q0, v0)
     system.check_returned(t0, q0, v0)
+    if _in_order(system, t0, q0, v0):
+        if derivatives:
+            check_derivatives(system, t0, q0, exact)
+        return
     jacobian = system.jacobian(t0, q0)
     rows = jacobian if system.n_a == 0 else system.rows(t0, q0)
     reason = not_finite(system, t0, q0, v0)
@@ -75,6 +82,68 @@ def check_start(
     if not _at_rounding(rows @ v0 + rate, rows, v0, rate):
         scales = scales_of(system, t0, q0, rows)
         Violation.of_velocity(system, t0, q0, v0, rows, scales).refuse("v0")
+
+
+def _in_order(system: ConstrainedSystem, t: float, q: Array, v: Array) -> bool:
+    """Whether compiled callbacks give nothing at a start that would have to be looked at more closely."""
+    from twoloop.kernels.evaluation import first_look
+
+    if system.called_in_python:
+        return False
+    q, v = np.ascontiguousarray(q, dtype=np.float64), np.ascontiguousarray(v, dtype=np.float64)
+    n, n_c, n_rows = system.n_q, system.n_c, system.n_c + system.n_a
+    room, lam = np.zeros(first_look.room_size(n, n_c, system.n_a)), np.ones(n_c)
+    mass, (rows, pattern) = np.zeros((n, n)), np.zeros((2, n_rows, n))
+    try:
+        found = direct(first_look.look)(system.kit, t, q, v, lam, room, mass, rows, _ways(n), pattern, LEAST)
+    except Exception:  # of a callback, which is called by itself then
+        return False
+    if not found & first_look.IN_ORDER:
+        return False
+    place = (t, q.tobytes())
+    system.remember_at("pattern", place, pattern)
+    system.remember_at("mass and rows", place, (mass, rows))
+    if found & first_look.DEFINITE:
+        system.remember_at("definite mass", _place(system, t, q), True)
+    if found & first_look.CONSISTENT:
+        return True
+    force, C, rates = np.split(room[: n + n_c + n_rows], (n, n + n_c))
+    return _surely_consistent(system, t, q, v, mass, force, rows, C, rates)
+
+
+def _surely_consistent(
+    system: ConstrainedSystem,
+    t: float,
+    q: Array,
+    v: Array,
+    mass: Array,
+    force: Array,
+    rows: Array,
+    C: Array,
+    rates: Array,
+) -> bool:
+    """Whether `Violation` would accept a state beyond doubt, by what is cheaper than singular values.
+
+    The largest that corrections can be stands for each of them, the row that allows least for all, at a share of what
+    it allows, and the least that accelerations M^-1 Q can be for these; what rounding explains is left out.
+    """
+    scales = scales_of(system, t, q, rows)
+    times = largest_solution(scales.scaled(rows))
+    fastest = np.where(rows != 0.0, np.abs(v) / scales.columns, 0.0).max(axis=1)
+    speeds = np.maximum(fastest, np.abs(rates) / scales.rows)
+    if lapack.dpotrf(mass)[1] == 0:
+        pull = float((np.abs(force) / (np.abs(mass) @ scales.columns)).max())
+        speeds = np.maximum(speeds, np.sqrt(scales.reach * pull))
+    off = float(np.linalg.norm((rows @ v + rates) / scales.rows))
+    if not times * off <= SURELY * CONSISTENT * speeds.min():
+        return False
+    if system.n_a > 0:
+        if system.n_c == 0:
+            return True
+        rows = rows[: system.n_c]
+        scales = scales_of(system, t, q, rows)
+        times = largest_solution(scales.scaled(rows))
+    return bool(times * float(np.linalg.norm(C / scales.rows)) <= SURELY * CONSISTENT * scales.reach.min())
 
 
 def _at_rounding(values: Array, rows: Array, state: Array, rate: Array | float = 0.0) -> bool:
@@ -176,35 +245,6 @@ class Violation:
         )
 
 
-def redundant_rows(scaled: Array) -> list[int]:
-    """Rows of a Jacobian, scaled to like size, that depend on the others, by QR with pivoting."""
-    if scaled.size == 0:
-        return []
-    R, order = qr(scaled.T, mode="r", pivoting=True)
-    diagonal = np.abs(np.diagonal(R))
-    rank = int((diagonal > RANK_TOLERANCE * diagonal.max()).sum())
-    return sorted(order[rank:].tolist())
-
-
-def in_words(jacobian: Array, redundant: list[int]) -> str:
-    """Which rows depend on which others, with the coefficients where these are few: many differ from start to start."""
-    others = [i for i in range(len(jacobian)) if i not in redundant]
-    first, lengths = redundant[:5], np.linalg.norm(jacobian, axis=1)
-    equations = []
-    for i, factors in zip(first, np.linalg.lstsq(jacobian[others].T, jacobian[first].T, rcond=None)[0].T, strict=True):
-        parts = np.abs(factors) * lengths[others]
-        of = np.flatnonzero(parts > 1e-9 * lengths[i])
-        if len(of) > MOST_TERMS:
-            named = ", ".join(str(others[k]) for k in of[:MOST_NAMED])
-            also = f" and {len(of) - MOST_NAMED} more" if len(of) > MOST_NAMED else ""
-            equations.append(f"row {i} on rows {named}{also}")
-            continue
-        terms = [f"{factors[k]:.4g} row {others[k]}" for k in of]
-        equations.append(f"row {i} = {' + '.join(terms).replace('+ -', '- ') or '0'}")
-    more = ", ..." if len(redundant) > 5 else ""
-    return f"row(s) {redundant} depend on the others ({', '.join(equations)}{more})"
-
-
 def dependent_rows(system: ConstrainedSystem, t: float, q: Array) -> str:
     """Which rows of C_q(t, q) depend on the others, in words."""
     jacobian = system.rows(t, q)
@@ -234,21 +274,39 @@ def least_inertia(system: ConstrainedSystem, t: float, q: Array) -> tuple[float,
 
 
 def pattern_of(system: ConstrainedSystem, t: float, q: Array) -> Array:
-    """1 where C_q or A has an entry at a position or near it, (n_c + n_a, n_q)."""
-    found = np.zeros((system.n_c + system.n_a, system.n_q))
+    """1 where C_q or A has an entry at a position or near it, (n_c + n_a, n_q); not to be written to."""
+    return system.remembered_at("pattern", (t, q.tobytes()), lambda: _pattern_of(system, t, q))
+
+
+def _pattern_of(system: ConstrainedSystem, t: float, q: Array) -> Array:
     size = np.maximum(np.abs(q), np.abs(q).max())
-    for share, direction in zip(NEARBY, _directions(system.n_q), strict=True):
-        try:
-            found[system.rows(t, q + share * size * direction) != 0.0] = 1.0
-        except Exception:  # outside what the callbacks are made for; what is missed is found on the way
-            continue
-    return found
+    rows, defined = rows_at(system, t, q + size * _ways(system.n_q))  # what is missed is found on the way
+    return (rows[defined] != 0.0).any(axis=0).astype(float)
 
 
 @cache
-def _directions(n_q: int) -> Array:
-    """Ways in which positions near one lie, (len(NEARBY), n_q): always the same."""
-    return np.random.default_rng(4).uniform(-1.0, 1.0, (len(NEARBY), n_q))
+def _ways(n_q: int) -> Array:
+    """How far positions near one are from it, (len(NEARBY), n_q), over its size: always the same."""
+    return np.array(NEARBY)[:, None] * np.random.default_rng(4).uniform(-1.0, 1.0, (len(NEARBY), n_q))
+
+
+def mass_and_rows(system: ConstrainedSystem, t: float, q: Array) -> tuple[Array, Array]:
+    """M, and C_q with A, at a position; not to be written to."""
+    return system.remembered_at("mass and rows", (t, q.tobytes()), lambda: (system.mass(t, q), system.rows(t, q)))
+
+
+def has_definite_mass(system: ConstrainedSystem, t: float, q: Array) -> bool:
+    """Whether M has an inverse at a position, and not only on velocities that the constraints allow."""
+    return system.remembered_at("definite mass", _place(system, t, q), lambda: _is_definite(system.mass(t, q)))
+
+
+def _is_definite(mass: Array) -> bool:
+    return bool(eigenvalues(mass)[0] > SINGULAR_MASS * np.abs(mass).max())
+
+
+def _place(system: ConstrainedSystem, t: float, q: Array) -> Any:
+    """What a mass matrix depends on."""
+    return None if system.constant_mass else (t, q.tobytes())
 
 
 def _parts(value: Array | tuple[Array, ...]) -> tuple[Array, ...]:

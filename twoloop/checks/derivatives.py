@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.checks.differences import EPS, Estimate, Function, confirms, differentiate
-from twoloop.checks.scales import column_scales, sizes
+from twoloop.checks.scales import column_scales, generic_factors, median, sizes
+from twoloop.kernels.compile.linking import direct
 from twoloop.kernels.data.common import FORCE_BY_Q_GIVEN, FORCE_BY_V_GIVEN, REACTION_BY_Q_GIVEN
 
 if TYPE_CHECKING:
@@ -30,7 +31,8 @@ NEAR_START = 1e-3  # of the coordinates: tangents are looked at a little off the
 FASTEST = 1e9  # times the motion by one's own size in a second: beyond, C_q is nearly zero and the drive is not so fast
 ALONG_A_RUN = 9  # half-widths tried at most at a state of a run
 UNSYMMETRIC = 1e-10  # of the largest entry of M
-SAME = 1e-11  # relative: values that two callbacks must share
+SAME = 1e-11  # relative: values that two callbacks must share ...
+ROUNDED = 100.0  # ... and times rounding of the terms of a constraint
 ROUNDING = 1e-12  # of a difference, relative to the largest entry over the displacement
 
 WHAT = {
@@ -206,8 +208,10 @@ def unsymmetric_mass(system: ConstrainedSystem, t: float, q: Array) -> str | Non
 
 def _unsymmetric_near(system: ConstrainedSystem, t: float, q: Array) -> str | None:
     """The same a little off the start, where what is zero there shows."""
-    near = q + NEAR_START * sizes(q) * np.random.default_rng(1).uniform(0.5, 1.5, system.n_q)
-    if system.constant_mass or _defined(lambda: system.mass(t, near)) is None:
+    if system.constant_mass:
+        return None
+    near = q + NEAR_START * sizes(q) * np.abs(generic_factors(system.n_q))
+    if _defined(lambda: system.mass(t, near)) is None:
         return None
     wrong = unsymmetric_mass(system, t, near)
     return None if wrong is None else f"{wrong} (near the start: at q = {near})"
@@ -237,8 +241,7 @@ def _wrong_tangent(system: ConstrainedSystem, t: float, q: Array) -> str | None:
     """Which entry of the tangents that are given is wrong."""
     if system.functions.flags[FORCE_BY_Q_GIVEN] == 0:
         return None
-    generic = np.random.default_rng(1)
-    v = sizes(q) * generic.uniform(0.5, 1.5, system.n_q) * generic.choice((-1.0, 1.0), system.n_q)
+    v = sizes(q) * generic_factors(system.n_q)
     if _defined(lambda: system.force(t, q + NEAR_START * v, v)) is not None:
         q = q + NEAR_START * v
 
@@ -321,9 +324,9 @@ def _rounding(derivative: Callable[[Array], Array], given: Array, x: Array) -> A
 
 def _generic_velocities(jacobian: Array, rate: Array, q: Array) -> list[Array]:
     """Velocities in which each coordinate matters; where C_t is not zero, the last are as fast as the drive."""
-    generic = np.random.default_rng(1)
-    v = column_scales(jacobian, sizes(q)) * generic.uniform(0.5, 1.5, len(q)) * generic.choice((-1.0, 1.0), len(q))
-    v = v / float(np.median(np.abs(v) / sizes(q)))
+    size = sizes(q)
+    v = column_scales(jacobian, size) * generic_factors(len(q))
+    v = v / median(np.abs(v) / size)
     driven, moved = rate != 0.0, np.abs(jacobian) @ np.abs(v)
     if not (driven & (moved > 0.0)).any():
         return [v]
@@ -359,8 +362,13 @@ def _check_kinematics(system: ConstrainedSystem, t: float, q: Array) -> None:
     """Compare the fused callback with the separate ones, which were compared with differences before."""
     if "kinematics" not in system.given:
         return
+    from twoloop.kernels.evaluation.first_look import kinematics_agree
+
     v = _generic_velocities(system.jacobian(t, q), system.constraint_rate(t, q), q)[-1]
     for place in (q, q + NEAR_START * v):
+        room = *np.zeros((2, 3 + system.n_q, system.n_c)), np.zeros(system.n_c)
+        if direct(kinematics_agree)(system.kit, t, np.ascontiguousarray(place), v, *room, SAME, ROUNDED * EPS):
+            continue
         separate = {
             "constraint": system.constraint(t, place),
             "jacobian": system.jacobian(t, place),
@@ -370,7 +378,7 @@ def _check_kinematics(system: ConstrainedSystem, t: float, q: Array) -> None:
         size = EPS * np.abs(separate["jacobian"]) @ np.abs(place)  # of the terms in a constraint
         for fused, (kind, given) in zip(system.kinematics(t, place, v), separate.items(), strict=True):
             off = np.abs(fused - given)
-            level = SAME * np.abs(given).max(initial=0.0) + (100.0 * size if kind == "constraint" else 0.0)
+            level = SAME * np.abs(given).max(initial=0.0) + (ROUNDED * size if kind == "constraint" else 0.0)
             if (off > level).any():
                 entry = np.unravel_index(int((off - level).argmax()), off.shape)
                 where = int(entry[0]) if len(entry) == 1 else tuple(int(i) for i in entry)
@@ -384,7 +392,7 @@ def _check_kinematics(system: ConstrainedSystem, t: float, q: Array) -> None:
 def _check_constant_mass(system: ConstrainedSystem, t: float, q: Array) -> None:
     if not system.constant_mass:
         return
-    shift = 0.1 * sizes(q) * np.random.default_rng(1).choice((-1.0, 1.0), system.n_q)
+    shift = 0.1 * sizes(q) * np.sign(generic_factors(system.n_q))
     there = _defined(lambda: system.mass(t + 1.0, q + shift))
     if there is not None and np.abs(there - system.mass(t, q)).max() > 1e-10 * np.abs(there).max():
         raise ValueError(f"mass of {system.name!r} is said to be constant (constant_mass=True) and is not")
@@ -395,8 +403,7 @@ def _check_bandwidth(system: ConstrainedSystem, bandwidth: int, t: float, q: Arr
     places = np.arange(system.n_q)
     farthest, where = bandwidth, ""
     size = float(np.abs(q).max()) or 1.0
-    generic = np.random.default_rng(1)
-    v = size * generic.uniform(0.5, 1.5, system.n_q) * generic.choice((-1.0, 1.0), system.n_q)
+    v = size * generic_factors(system.n_q)
     q, shift = q + 1e-3 * v, 1e-3 * size
 
     def look(what: str, j: int, column: Array, level: float) -> None:

@@ -14,6 +14,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from twoloop.kernels.compile.linking import direct
+
 if TYPE_CHECKING:
     from twoloop.problem.system import ConstrainedSystem
 
@@ -22,7 +24,6 @@ Array = NDArray[np.float64]
 EPS = float(np.finfo(np.float64).eps)
 DISPLACEMENTS = (1e-2, 1e-4, 1e-6)  # of a coordinate, for the curvature of the constraints
 TURNS = 0.1  # units: a row that is short beside what it becomes over this way is short by its position
-NEGLIGIBLE = 1e-6  # of the largest coordinate: smaller ones are zero by chance and are no size
 
 
 @dataclass(frozen=True)
@@ -46,57 +47,76 @@ class Scales:
 def sizes(q: Array) -> Array:
     """A first guess at how far each coordinate must move to matter."""
     size = np.abs(q)
-    typical = _median(size[size > 0.0]) if size.any() else 1.0
-    return np.maximum(size, 1e-3 * typical)
+    ordered = size.copy()
+    ordered.sort()
+    n_zeros = len(q) - np.count_nonzero(size)
+    return np.maximum(size, 1e-3 * _middle(ordered[n_zeros:]) if n_zeros < len(q) else 1e-3)
 
 
-def _median(values: Array) -> float:
+@cache
+def generic_factors(n_q: int) -> Array:
+    """Between 0.5 and 1.5, of either sign, (n_q,): always the same."""
+    generic = np.random.default_rng(1)
+    return generic.uniform(0.5, 1.5, n_q) * generic.choice((-1.0, 1.0), n_q)
+
+
+def median(values: Array) -> float:
     """Of numbers that are finite, without what NumPy does about others."""
-    ordered = np.sort(values)
+    return _middle(np.sort(values))
+
+
+def _middle(ordered: Array) -> float:
+    """The same of numbers in order."""
     return 0.5 * float(ordered[(len(ordered) - 1) // 2] + ordered[len(ordered) // 2])
 
 
 def column_scales(jacobian: Array, typical: Array) -> Array:
     """Units of the coordinates in which the entries of C_q are of like size; of zero columns, the typical ones."""
-    size = np.abs(jacobian)
-    counts = size > 1e-12 * size.max(axis=1, keepdims=True, initial=0.0)  # others are what rounding has left
-    used = counts.any(axis=0)
-    if not used.any():
-        return typical
-    logs = np.where(counts, np.log(np.where(counts, size, 1.0)), 0.0)
-    in_row, in_column = np.maximum(counts.sum(axis=1), 1), np.maximum(counts.sum(axis=0), 1)
-    of_row, of_column = logs.sum(axis=1), logs.sum(axis=0)
-    counts_of = counts.astype(np.float64)
-    columns = np.zeros(len(typical))
-    for _ in range(20):  # least squares of log|C_q| + columns - rows, by turns
-        rows = (of_row + counts_of.dot(columns)) / in_row
-        before, columns = columns, (rows.dot(counts_of) - of_column) / in_column
-        if (columns == before).all():
-            break
-    # the unit of the whole is free: that of the coordinates
-    columns = np.exp(columns + _median(np.log(typical[used]) - columns[used]))
-    return np.where(used, columns, typical)
+    from twoloop.kernels.algebra.scaling import like_sizes
+
+    n_rows, n = jacobian.shape
+    columns, room = np.zeros((2, n))
+    direct(like_sizes)(
+        np.ascontiguousarray(jacobian), typical, columns, *np.zeros((2, n_rows, n)), np.zeros(n_rows), room
+    )
+    return columns
 
 
 def scales_of(system: ConstrainedSystem, t: float, q: Array, jacobian: Array) -> Scales:
     """Scales at a position, from C_q there and nearby; or from C_q and A, if `jacobian` has the rows of both."""
+    from twoloop.kernels.algebra.scaling import NEGLIGIBLE, reaches
+
     size = np.abs(q)
-    typical = _median(size[size > NEGLIGIBLE * size.max()]) if size.any() else 1.0
+    typical = median(size[size > NEGLIGIBLE * size.max()]) if size.any() else 1.0
     columns = column_scales(jacobian, np.maximum(size, typical))
-    norms, curvature = np.linalg.norm(jacobian * columns, axis=1), _curvature(system, t, q, columns, len(jacobian))
+    in_units = np.abs(jacobian) * columns
+    norms, curvature = np.sqrt((in_units * in_units).sum(axis=1)), _curvature(system, t, q, columns, len(jacobian))
     rows = np.maximum(norms, TURNS * curvature)
-    rows = np.where(rows > 0.0, rows, 1.0)
+    rows[rows == 0.0] = 1.0
     radius = np.where(norms > 0.0, norms, 1.0) / np.maximum(curvature, 1e-300)
-    in_units = np.where(jacobian != 0.0, size / columns, 0.0)
+    in_units = np.ascontiguousarray((jacobian != 0.0) * (size / columns))
     reach, negligible = np.ones(len(rows)), NEGLIGIBLE * float(in_units.max(initial=0.0))
-    for i, row in enumerate(in_units):
-        largest = float(row.max())
-        if radius[i] <= max(largest, 1.0):
-            reach[i] = radius[i]
-        elif largest > negligible:  # straight: the smaller half of the coordinates, so that an offset does not count
-            smaller = np.sort(row[row > NEGLIGIBLE * largest])
-            reach[i] = float(smaller[(len(smaller) - 1) // 2])
+    direct(reaches)(in_units, radius, negligible, np.zeros(len(q)), reach)
     return Scales(columns, rows, reach)
+
+
+def rows_at(system: ConstrainedSystem, t: float, places: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """C_q and A at positions, (n, n_c + n_a, n_q), and at which of these no callback raised an exception, (n,)."""
+    from twoloop.kernels.evaluation import first_look
+
+    n, kit, defined = len(places), system.kit, np.ones(len(places), dtype=bool)
+    rows = np.zeros((n, system.n_c + system.n_a, system.n_q))
+    evaluate = direct(first_look.rows_at)
+    try:
+        evaluate(kit, t, places, system.n_c, rows.reshape(-1, system.n_q))
+    except Exception:  # then one by one
+        rows[:] = 0.0
+        for k in range(n):
+            try:
+                evaluate(kit, t, places[k : k + 1], system.n_c, rows[k])
+            except Exception:  # outside what the callbacks are made for
+                defined[k] = False
+    return rows, defined
 
 
 @cache
@@ -108,15 +128,14 @@ def _signs(n_q: int) -> Array:
 def _curvature(system: ConstrainedSystem, t: float, q: Array, columns: Array, n_rows: int) -> Array:
     """How fast each row of C_q turns, per unit of the coordinates: one digit is enough."""
     way = columns * _signs(len(q))
-    rows = system.jacobian if n_rows == system.n_c else system.rows
     largest = np.zeros(n_rows)
-    for part in DISPLACEMENTS:
-        try:
-            ends = [rows(t, q + side * part * way) for side in (1.0, -1.0)]
-        except Exception:  # outside what the constraints are made for
-            continue
-        change = np.linalg.norm((ends[0] - ends[1]) * columns, axis=1) / (2.0 * part)
-        noise = EPS * (np.abs(ends[0]) @ columns + np.abs(ends[0] * columns) @ (np.abs(q) / columns)) / part
-        if np.isfinite(change).all():
+    shifts = np.array([side * part for part in DISPLACEMENTS for side in (1.0, -1.0)])
+    rows, defined = rows_at(system, t, q + shifts[:, None] * way)
+    rows = rows[:, :n_rows]
+    for k, part in enumerate(DISPLACEMENTS):
+        one, other = rows[2 * k : 2 * k + 2]
+        change = np.sqrt((((one - other) * columns) ** 2).sum(axis=1)) / (2.0 * part)
+        noise = EPS * (np.abs(one) @ (columns + np.abs(q))) / part
+        if defined[2 * k : 2 * k + 2].all() and np.isfinite(change).all():
             largest = np.maximum(largest, np.where(change > noise, change, 0.0))
     return largest

@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from twoloop.checks.arguments import check_positive, check_size, check_span, check_times, check_tolerance
 from twoloop.ensembles.in_lanes import LaneRuns, threads_of
+from twoloop.ensembles.lane_methods import IN_LANES, LaneMethod, lane_methods
 from twoloop.ensembles.runs import Runs
 from twoloop.ensembles.starts import NEAR, Starts, all_starts, system_of
 from twoloop.generate.tracing import Untraceable
@@ -17,8 +18,8 @@ from twoloop.result.result import Result
 from twoloop.solve import check_method, solve_dae
 
 Array = NDArray[np.float64]
+Integers = NDArray[np.int64]
 
-IN_LANES = ("auto", "Taylor")  # methods that go in lanes
 FAR = 1e5  # tolerances, by which a motion that is not chaotic does not end elsewhere
 CALL = 1e-3  # s of a call of solve_dae beside its steps
 WORTH = 20.0  # times what the runs of a call take singly: what their code may take to compile, as it is kept
@@ -40,12 +41,12 @@ def ensemble(
 ) -> Runs:
     """Integrate many runs of one system, each with parameters and a start of its own.
 
-    Runs go through machine code made for the system, one in each lane of the processor's vectors, by Taylor series with
-    steps of their own, which are checked as those of a single run; a lane whose run has ended takes the next one. All
-    parameters go through the same code, which is kept on disk. What lanes cannot do is made by `solve_dae`, run by run:
-    a run that comes near a singular position, a system whose callbacks branch or has nonholonomic rows, events, other
-    methods. The first run is made by `solve_dae` as well, with all of its checks, and what callbacks say of the end of
-    each other run is compared with what was found there.
+    Runs go through machine code made for the system, one in each lane of the processor's vectors, with steps of their
+    own, which are checked as those of a single run; a lane whose run has ended takes the next one. All parameters go
+    through the same code, which is kept on disk. What lanes cannot do is made by `solve_dae`, run by run: a run that
+    comes near a singular position, a system whose callbacks branch or has nonholonomic rows, events, other methods. The
+    first run is made by `solve_dae` as well, with all of its checks, and what callbacks say of the end of each other
+    run is compared with what was found there.
 
     Parameters
     ----------
@@ -59,7 +60,10 @@ def ensemble(
     rtol, atol, t_eval, events
         As for `solve_dae`; t_eval None: states are stored at the start and the end.
     method : str or method object
-        "auto" and "Taylor" go in lanes.
+        "auto", "Taylor", "DOP853", "RadauIIA5", "RadauIIA9" and "RadauIIA13" go in lanes. "auto" takes Taylor series
+        there, and DOP853 for runs that these cannot do and for systems that have none. If the first run came to
+        Newton's method, it takes the Radau method for the tolerance, for all runs: of order 5 from 3e-5 on, 13 below
+        1e-9, else 9, with errors of velocities tested as `Auto` does.
     threads : int, optional
         None: one for each core that this process may use. Results do not depend on it.
 
@@ -72,6 +76,13 @@ def ensemble(
     ------
     TypeError, ValueError
         If an argument is wrong, naming it, or a start is not consistent, naming the run.
+
+    Notes
+    -----
+    In lanes as singly, no step of DOP853 or of a Radau method is longer than a hundredth of the run. Stages are off the
+    constraints by the error of the formula, those of Radau methods, too, whose unknowns are here the accelerations of
+    all coordinates; the end of each step is put on the constraints. States at `t_eval` within a step are the ends of
+    shorter steps from its beginning. A run that would take more than 100,000 of these steps is made singly.
     """
     check_system(system)
     t0, t1 = check_span(t_span)
@@ -98,36 +109,45 @@ def ensemble(
 
     first = single(0)  # which checks the system, derivatives and all
     in_lanes, why = np.zeros(n_runs, dtype=bool), ""
-    if n_runs > 1:
+    made_by: dict[str, int] = {}
+    methods: list[LaneMethod] = []
+    if events is not None:
+        why = "events are looked for in single runs only"
+    elif method not in IN_LANES:
+        why = f"{chosen.name} does not go in lanes"
+    elif n_runs > 1:
+        stiff = (first.stats.n_jacobians or 0) > 0
+        methods = lane_methods(str(method), stiff, system.n_q, float(rtol), float(tolerance.min()))
+    for each in methods:
+        left = np.flatnonzero(~in_lanes)
+        if len(left) == 1:
+            break
         try:
-            if events is not None:
-                raise Untraceable("events are looked for in single runs only")
-            if method not in IN_LANES:
-                raise Untraceable(f"{chosen.name} does not go in lanes")
-            if (first.stats.n_jacobians or 0) > 0:
-                raise Untraceable("the motion is stiff, and the first run was made by Newton's method")
-            lanes = LaneRuns(system, starts)
-            singly = n_runs * (first.stats.cpu_time + CALL)
+            lanes = LaneRuns(system, starts, each)
+            singly = len(left) * (first.stats.cpu_time + CALL)
             if lanes.own.seconds_to_build > WORTH * singly:
                 raise Untraceable(f"to compile them does not pay for these runs, which take about {singly:.2g} s")
-            in_lanes = _in_lanes(lanes, t1, times, options, n_threads, (q, v, n_steps))
+            made = left[_in_lanes(lanes, left, t1, times, options, n_threads, (q, v, n_steps))]
         except Untraceable as reason:
-            why = str(reason)
+            why = why or str(reason)
+        else:
+            in_lanes[made], made_by[each.name] = True, len(made)
     for run in np.flatnonzero(~in_lanes).tolist():
         if run > 0:
             single(run)
-    return Runs(times, q, v, status, n_steps, ~in_lanes, _message(status, in_lanes, why), messages)
+    return Runs(times, q, v, status, n_steps, ~in_lanes, _message(status, made_by, why), messages)
 
 
 def _in_lanes(
     lanes: LaneRuns,
+    which: Integers,
     t1: float,
     times: Array,
     options: dict[str, Any],
     threads: int,
-    out: tuple[Array, Array, Any],
+    out: tuple[Array, Array, Integers],
 ) -> NDArray[np.bool_]:
-    """Which runs were made in lanes; the first is there already, made singly, and has to end where lanes have it.
+    """Which of these runs were made; the first is there already, made singly, and has to end where lanes have it.
 
     Raises
     ------
@@ -136,26 +156,27 @@ def _in_lanes(
     """
     q, v, n_steps = out
     system, starts = lanes.system, lanes.starts
-    for name, off in zip(("q0", "v0"), lanes.off(), strict=True):
-        for run in np.flatnonzero(~(off <= NEAR)).tolist():
+    for name, off in zip(("q0", "v0"), lanes.off(which), strict=True):
+        for run in which[~(off <= NEAR)].tolist():
             _check_start(system, starts, run, name)
     within = times[times > starts.t0]
     ends = within if within.size and within[-1] == t1 else np.append(within, t1)
-    new_q, new_v = np.full((2, len(starts.q), system.n_q, len(ends)), np.nan)
+    new_q, new_v = np.full((2, len(which), system.n_q, len(ends)), np.nan)
     rtol, atol = options["rtol"], options["atol"]
-    made, steps, at_end = lanes.make(t1, ends, rtol, atol, threads, new_q, new_v)
-    fine = (made == 1) & np.isfinite(new_q).all(axis=(1, 2))
-    last = np.ascontiguousarray(new_q[:, :, -1]), np.ascontiguousarray(new_v[:, :, -1])
-    fine[lanes.disagree(t1, float(atol.min()), fine, *last, at_end)] = False
+    status, steps, at_end = lanes.make(which, t1, ends, rtol, atol, threads, new_q, new_v)
+    fine = (status == 1) & np.isfinite(new_q).all(axis=(1, 2))
+    found = np.flatnonzero(fine)
+    last = new_q[:, :, -1], new_v[:, :, -1], at_end
+    fine[found[lanes.disagree(which[found], t1, float(atol.min()), *(each[found] for each in last))]] = False
     allowed = FAR * (atol + rtol * np.abs(q[0, :, -1]))
-    if fine[0] and times[-1] == t1 and (np.abs(last[0][0] - q[0, :, -1]) > allowed).any():
+    if fine[0] and times[-1] == t1 and (np.abs(new_q[0, :, -1] - q[0, :, -1]) > allowed).any():
         raise Untraceable(f"the first run ends elsewhere by itself, {FAR:g} tolerances and more away")
     fine[0] = False
-    n = len(within)
-    q[fine, :, len(times) - n :], v[fine, :, len(times) - n :] = new_q[fine, :, :n], new_v[fine, :, :n]
+    n, runs = len(within), which[fine]
+    q[runs, :, len(times) - n :], v[runs, :, len(times) - n :] = new_q[fine, :, :n], new_v[fine, :, :n]
     if n < len(times):
-        q[fine, :, 0], v[fine, :, 0] = starts.q[fine], starts.v[fine]
-    n_steps[fine] = steps[fine]
+        q[runs, :, 0], v[runs, :, 0] = starts.q[runs], starts.v[runs]
+    n_steps[runs] = steps[fine]
     return fine
 
 
@@ -184,9 +205,13 @@ def _of_run(run: int, error: ValueError) -> ValueError:
     return ValueError(f"run {run}: {error}".replace("twoloop.consistent_state(", "twoloop.consistent_states("))
 
 
-def _message(status: Any, in_lanes: Any, why: str) -> str:
-    failed, singly = int((status < 0).sum()), int((~in_lanes).sum())
-    said = f"{len(status) - failed} of {len(status)} runs reached the end or an event"
-    if why:
+def _message(status: Integers, made_by: dict[str, int], why: str) -> str:
+    failed, n_runs = int((status < 0).sum()), len(status)
+    said = f"{n_runs - failed} of {n_runs} runs reached the end or an event"
+    if not made_by and why:
         return f"{said}; none went in lanes: {why}."
-    return f"{said}; {singly} made singly: the first, which checks the system, and those that lanes cannot do."
+    in_lanes = "".join(f"{count} in lanes by {name}, " for name, count in made_by.items() if count > 0)
+    singly = n_runs - sum(made_by.values())
+    return (
+        f"{said}; {in_lanes}{singly} made singly: the first, which checks the system, and those that lanes cannot do."
+    )

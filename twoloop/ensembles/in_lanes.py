@@ -7,10 +7,10 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from twoloop.ensembles.lane_methods import LaneMethod
 from twoloop.ensembles.starts import Starts, generic_parameters, kit_to_write, over_rounding, system_of
+from twoloop.generate.choices import Choice
 from twoloop.generate.on_arrays import OnArrays
-from twoloop.generate.straight_line import Choice
-from twoloop.methods.taylor import order_in_lanes
 from twoloop.problem.system import ConstrainedSystem
 
 Array = NDArray[np.float64]
@@ -29,6 +29,7 @@ class LaneRuns:
     ----------
     system : ConstrainedSystem
     starts : Starts
+    method : LaneMethod
 
     Raises
     ------
@@ -36,35 +37,44 @@ class LaneRuns:
         Saying why lanes cannot do it.
     """
 
-    def __init__(self, system: ConstrainedSystem, starts: Starts):
+    def __init__(self, system: ConstrainedSystem, starts: Starts, method: LaneMethod):
         from twoloop.generate.own_lanes import OwnLanes  # compiled, or read from the cache, at the first ensemble
 
-        self.system, self.starts = system, starts
+        self.system, self.starts, self.method = system, starts, method
         generic, varying = generic_parameters(starts.parameters)
         choice = Choice.at(system_of(system, starts, 0), starts.t0, starts.q[0])
-        kind = ("lanes", choice, tuple(varying))  # of which the latest is kept
-        make = partial(OwnLanes, system, choice, generic, varying)
+        kind = ("lanes", method.series, choice, tuple(varying))  # of which the latest is kept
+        make = partial(OwnLanes, system, choice, generic, varying, method.series)
         self.own: OwnLanes = system.remembered_at(kind, generic.tobytes(), make)
 
-    def off(self) -> tuple[Array, Array]:
-        """max|C| and max|C_q v + C_t| of the starts, over what rounding may leave of their terms."""
+    def off(self, which: Integers) -> tuple[Array, Array]:
+        """max|C| and max|C_q v + C_t| of these starts, over what rounding may leave of their terms."""
         starts, equations = self.starts, self.own.code.equations.equations
         kinds = [equations.of(kind) for kind in ("constraint", "jacobian", "constraint_rate")]
-        off = np.empty((2, len(starts.q)))
-        for begin in range(0, len(starts.q), LARGEST):
-            rows = slice(begin, begin + LARGEST)
+        off = np.empty((2, len(which)))
+        for begin in range(0, len(which), LARGEST):
+            rows = which[begin : begin + LARGEST]
             q, v = starts.q[rows], starts.v[rows]
             arrays = OnArrays(equations.graph, self.own.record, starts.parameters[rows])
             C, G, rate = arrays.evaluate(kinds, starts.t0, q, v)
             faster = np.einsum("rij,rj->ri", G, v) + rate
-            off[:, rows] = over_rounding(C, G, q), over_rounding(faster, G, v, rate)
+            off[0, begin : begin + LARGEST] = over_rounding(C, G, q)
+            off[1, begin : begin + LARGEST] = over_rounding(faster, G, v, rate)
         return off[0], off[1]
 
     def make(
-        self, t1: float, times: Array, rtol: float, atol: Array, threads: int, out_q: Array, out_v: Array
+        self,
+        which: Integers,
+        t1: float,
+        times: Array,
+        rtol: float,
+        atol: Array,
+        threads: int,
+        out_q: Array,
+        out_v: Array,
     ) -> tuple[Integers, Integers, Array]:
-        """Make all runs: 1 for each that was made and 0 for each that is left, steps, and a and lam at the end."""
-        n_runs = len(self.starts.q)
+        """Make these runs: 1 for each that was made and 0 for each that is left, steps, and a and lam at the end."""
+        n_runs = len(which)
         status, n_steps = np.zeros((2, n_runs), dtype=np.int64)
         ends = np.full((n_runs, self.system.n_q + self.system.n_c), np.nan)
         n_blocks = 1 if threads == 1 else FOR_EACH * threads
@@ -72,7 +82,8 @@ class LaneRuns:
         blocks = [slice(begin, min(begin + size, n_runs)) for begin in range(0, n_runs, size)]
 
         def block(rows: slice) -> None:
-            self._make(rows, t1, times, rtol, atol, (out_q[rows], out_v[rows], ends[rows]), status[rows], n_steps[rows])
+            out = out_q[rows], out_v[rows], ends[rows]
+            self._make(which[rows], t1, times, rtol, atol, out, status[rows], n_steps[rows])
 
         if threads == 1 or len(blocks) == 1:
             for rows in blocks:
@@ -84,7 +95,7 @@ class LaneRuns:
 
     def _make(
         self,
-        rows: slice,
+        which: Integers,
         t1: float,
         times: Array,
         rtol: float,
@@ -93,31 +104,31 @@ class LaneRuns:
         status: Integers,
         n_steps: Integers,
     ) -> None:
-        from twoloop.kernels import lanes
+        from twoloop.kernels.lanes import lane_room, lane_runs
 
-        starts, code = self.starts, self.own.code
-        n, n_rows, order = code.n, code.n_rows, order_in_lanes(rtol, float(atol.min())) + 1
-        numbers = self.own.numbers(starts.parameters[rows])
-        room = _aligned(lanes.places(n, n_rows, code.n_numbers, order)[-1] + code.scratch_size(order), lanes.LANES)
+        starts, code, method = self.starts, self.own.code, self.method
+        n, n_rows = code.n, code.n_rows
+        numbers = self.own.numbers(starts.parameters[which])
+        begin = lane_room.places(n, n_rows, code.n_numbers)[-1]
+        room = _aligned(begin + method.memory(code), lane_room.LANES)
+        kit = lane_room.LaneKit(self.own.functions, method.step())
         redundant = bool(code.equations.redundant.conditions)
-        settings = np.array([n, n_rows, order, redundant], dtype=np.int64)
+        settings = np.array([n, n_rows, method.order, redundant, code.n_numbers], dtype=np.int64)
         control = np.concatenate([[starts.t0, t1, (t1 - starts.t0) / PLACES, rtol], atol, code.numbers.values])
-        given = np.ascontiguousarray(starts.q[rows]), np.ascontiguousarray(starts.v[rows])
-        lanes.advance_lanes(self.own.kit, settings, control, times, numbers, *given, *out, status, n_steps, room)
+        given = np.ascontiguousarray(starts.q[which]), np.ascontiguousarray(starts.v[which])
+        arrays = times, numbers, *given, *out, status, n_steps, room
+        lane_runs.advance_lanes(kit, settings, control, method.options, *arrays)
 
-    def disagree(self, t1: float, atol: float, made: NDArray[np.bool_], q: Array, v: Array, ends: Array) -> list[int]:
-        """Runs that were made, and whose callbacks say that the equations of motion do not hold at their end."""
+    def disagree(self, which: Integers, t1: float, atol: float, q: Array, v: Array, ends: Array) -> NDArray[np.bool_]:
+        """Of which of these runs callbacks say that the equations of motion do not hold at their end."""
         from twoloop.kernels.agreement import disagreement
 
         system, n = self.system, self.system.n_q
-        which = np.flatnonzero(made)
-        if which.size == 0:
-            return []
         room, worst = np.zeros(n * (n + 1) + system.n_c * (n + 3)), np.zeros(len(which))
-        arrays = self.starts.parameters, q, v, ends[:, :n], ends[:, n:]
-        chosen = (np.ascontiguousarray(each[which]) for each in arrays)
+        arrays = self.starts.parameters[which], q, v, ends[:, :n], ends[:, n:]
+        chosen = (np.ascontiguousarray(each) for each in arrays)
         disagreement(*kit_to_write(system), t1, AGREES, atol, *chosen, room, worst)
-        return which[~(worst <= 1.0)].tolist()
+        return ~(worst <= 1.0)
 
 
 def _aligned(vectors: int, lanes: int) -> Array:

@@ -27,7 +27,7 @@ class Runs:
     singly : ndarray (n_runs,) of bool
         Runs that were not made in lanes, but one by one, as by `solve_dae`.
     message : str
-        How many runs reached the end, how many were made singly, and why.
+        How many runs reached the end, how many were made in lanes, by which method, how many singly, and why.
     messages : dict of int to str
         What `solve_dae` said of those runs that failed.
     """

@@ -51,6 +51,7 @@ class Coefficients:
     def __init__(self, apart: bool = False) -> None:
         self._apart = apart
         self._values: list[float] = []
+        self._formulas: Any = np.zeros(0)
         self._varying: dict[tuple[float, Powers], Known] = {}
         self._known: dict[tuple[Terms, float], tuple[Terms, float]] = {}
 
@@ -61,8 +62,10 @@ class Coefficients:
 
     @property
     def formulas(self) -> Any:
-        """The same, as formulas where they know their parameters."""
-        return array_of(self._values)
+        """The same, as formulas where they know their parameters: one array, until there are more."""
+        if len(self._formulas) != len(self._values):
+            self._formulas = array_of(self._values)
+        return self._formulas
 
     def of(self, terms: Terms, constant: float = 0.0) -> tuple[Terms, float]:
         """Terms and constant with numbers in their places."""

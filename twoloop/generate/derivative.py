@@ -20,12 +20,14 @@ class Derivative:
     def __init__(self, graph: Graph, direction: dict[int, Form]):
         self.graph = graph
         self._known = dict(direction)
+        self._changing = sum(1 << i for i in direction)
 
     def of(self, form: Form) -> Form:
         """The derivative of a form."""
         total = Form(self.graph, 0.0, {})
         for i, c in form.terms.items():
-            total = total + self._of_quantity(i).times(c)
+            if self.graph.inputs_of[i] & self._changing:
+                total = total + self._of_quantity(i).times(c)
         return total
 
     def _of_quantity(self, i: int) -> Form:
@@ -33,7 +35,12 @@ class Derivative:
         while i not in self._known:
             operation = self.graph.operations[ahead[-1]]
             forms = () if operation is None else [form for form in operation[1:] if isinstance(form, Form)]
-            unknown = [k for form in forms for k in form.terms if k not in self._known]
+            unknown = [
+                k
+                for form in forms
+                for k in form.terms
+                if k not in self._known and self.graph.inputs_of[k] & self._changing
+            ]
             if unknown:
                 ahead += unknown
                 continue

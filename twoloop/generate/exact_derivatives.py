@@ -6,7 +6,7 @@ from functools import cache, partial
 import numpy as np
 from numpy.typing import NDArray
 
-from twoloop.checks.scales import sizes
+from twoloop.checks.scales import generic_factors, sizes
 from twoloop.generate.families import Family, of_family
 from twoloop.generate.traced_equations import OF_ROWS, Equations
 from twoloop.generate.traced_values import Check, Traced, unchecked
@@ -45,7 +45,7 @@ def _traced(system: ConstrainedSystem, family: Family) -> Traced:
 
 def exact_near(system: ConstrainedSystem, t: float, q: Array, v: Array) -> bool:
     """Whether C_q, C_t and Gamma are, near a start, the derivatives of what callbacks were traced to."""
-    places = [(t + share * TIME, q + share * _factors(1, len(q))[0] * sizes(q)) for share in NEAR]
+    places = [(t + share * TIME, q + share * generic_factors(len(q)) * sizes(q)) for share in NEAR]
 
     def check(made: Traced) -> None:
         try:

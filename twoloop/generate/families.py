@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from twoloop.generate.known_numbers import Record
+from twoloop.generate.known_numbers import Known, Powers, Record
 from twoloop.generate.tracing import Untraceable
 from twoloop.kernels.compile.caches import Newest
 from twoloop.problem.system import ConstrainedSystem
@@ -41,6 +41,8 @@ class Family:
     ----------
     parameters : ndarray of float and Known (n_p,)
         With which callbacks are traced.
+    traced : set of str
+        Kinds of callbacks that were: they do the same in all systems, at the same places of their arrays.
     """
 
     def __init__(self, parameters: Array, classes: Sequence[int]):
@@ -52,7 +54,13 @@ class Family:
             which = int(self._classes[place])
             known = self._record.parameters[abs(which) - 1]
             self.parameters[place] = known if which > 0 else -known
+        self.traced: set[str] = set()
+        self.within_bounds: set[str] = set()  # of these, what `check_bounds` has looked at in one of the systems
         self._made: dict[Any, Any] = {}
+        self._powers: dict[Powers, int] = {(): 0}  # products that stand in arrays of formulas, in the order they came
+        self._arrays: dict[
+            int, tuple[Any, tuple[Array, NDArray[np.int64], int]]
+        ] = {}  # such arrays by their ids, gathered
         self._tracing = RLock()  # what is traced is put down in one record
 
     def numbers(self, parameters: Array) -> Array:
@@ -61,16 +69,36 @@ class Family:
         return np.abs(parameters[first[self._classes[first] != 0]])
 
     def evaluator(self, parameters: Array) -> Evaluator:
-        """What evaluates formulas for a system's parameters."""
-        value = self._record.on(self.numbers(parameters))
+        """What evaluates formulas for a system's parameters; their arrays are those that are kept with the family."""
+        product, values = self._record.products(self.numbers(parameters)), [np.ones(1)]
 
         def evaluate(array: Any) -> Array:
             if array.dtype != object:
                 return array
+            scales, places, n_products = self._gathered(array)
             with np.errstate(all="ignore"):
-                return np.array([value(each) for each in array.ravel()], dtype=np.float64).reshape(array.shape)
+                known = values[0]
+                if len(known) < n_products:  # another thread may find the same
+                    more = [product(powers) for powers in list(self._powers)[len(known) :]]
+                    values[0] = known = np.append(known, more)
+                made: Array = scales * known[places]
+            return made
 
         return evaluate
+
+    def _gathered(self, array: Any) -> tuple[Array, NDArray[np.int64], int]:
+        """Numbers of an array as multiples of products of atoms, the places of these, and how many must be known."""
+        known = self._arrays.get(id(array))
+        if known is None:
+            powers = [each.powers if type(each) is Known else () for each in array.ravel()]
+            with self._tracing:
+                for each in powers:
+                    self._powers.setdefault(each, len(self._powers))
+            scales = np.array([each.scale if type(each) is Known else each for each in array.ravel()], dtype=np.float64)
+            places = np.array([self._powers[each] for each in powers], dtype=np.int64)
+            gathered = scales.reshape(array.shape), places.reshape(array.shape), int(places.max(initial=-1)) + 1
+            known = self._arrays[id(array)] = array, gathered  # what is named by its id is held
+        return known[1]
 
     def remembered(self, what: Any, make: Callable[[], Any]) -> Any:
         """What `make` makes of the callbacks, once."""
@@ -99,6 +127,7 @@ def of_family(system: ConstrainedSystem, what: Any, make: Callable[[Family], Any
             if isinstance(made, Untraceable):
                 raise made
             check(made)
+            family.traced |= made.kinds
             return made
         except Untraceable as error:
             reason = error
@@ -114,6 +143,20 @@ def _made_for(system: ConstrainedSystem, family: Family, what: Any, make: Callab
         return error.with_traceback(None)
     except (ArithmeticError, RecursionError) as error:
         return Untraceable(f"what it makes of its parameters cannot be written down: {error}")
+
+
+def take_bounds(system: ConstrainedSystem) -> None:
+    """Let a system have what `check_bounds` has found in others of its family, whose callbacks do the same."""
+    if not system.called_in_python:
+        family: Family = system.remembered(("family", family_of), partial(family_of, system))
+        system.within_bounds |= family.within_bounds
+
+
+def give_bounds(system: ConstrainedSystem) -> None:
+    """Let others of its family have what `check_bounds` has found in a system."""
+    if not system.called_in_python:
+        family: Family = system.remembered(("family", family_of), partial(family_of, system))
+        family.within_bounds |= family.traced & system.within_bounds
 
 
 def family_of(system: ConstrainedSystem) -> Family:

@@ -100,7 +100,12 @@ class Record:
         return {powers: number.scale * c for powers, c in definition[1]}
 
     def on(self, parameters: Array) -> Callable[[float], Any]:
-        """A function that gives what a number is for other parameters.
+        """A function that gives what a number is for other parameters, as `products` does for one of its factors."""
+        product = self.products(parameters)
+        return lambda number: number.scale * product(number.powers) if type(number) is Known else number
+
+    def products(self, parameters: Array) -> Callable[[Powers], Any]:
+        """A function that gives what a product of atoms is for other parameters.
 
         These are (n_p,), or (n_runs, n_p): then it gives (n_runs,), or one number for all.
         """
@@ -127,10 +132,7 @@ class Record:
                     atoms[place] = FUNCTIONS[definition[0]](*(c * product(powers) for powers, c in definition[1]))
             return atoms[place]
 
-        def value(number: float) -> Any:
-            return number.scale * product(number.powers) if type(number) is Known else number
-
-        return value
+        return product
 
     def evaluate(self, numbers: Sequence[float], parameters: Array) -> Array:
         """What numbers are for other parameters (n_runs, n_p): (n_runs, len(numbers))."""

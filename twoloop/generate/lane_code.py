@@ -10,17 +10,18 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from twoloop.generate.choices import Choice
 from twoloop.generate.coefficients import Coefficients
 from twoloop.generate.lane_emitter import LaneEmitter
 from twoloop.generate.lane_series import AT_ONCE, LaneSeries
 from twoloop.generate.llvm_text import Value, integer
 from twoloop.generate.series import series_program
 from twoloop.generate.straight_code import conditions_hold, results_of
-from twoloop.generate.straight_line import Choice, Outputs, Solution, StraightLine
+from twoloop.generate.straight_line import Outputs, Solution, StraightLine
 from twoloop.generate.tracing import Untraceable
-from twoloop.kernels import lanes
 from twoloop.kernels.control.defect import ROUNDING
 from twoloop.kernels.control.predictor import FLOOR, LEAST, SHARE_OF_MOTION
+from twoloop.kernels.lanes import lane_room as lanes
 from twoloop.problem.system import ConstrainedSystem
 
 Array = NDArray[np.float64]
@@ -29,35 +30,64 @@ LARGEST = 1500  # operations of a series, which take some seconds to compile
 
 
 class LaneCode:
-    """Writes the code of a mechanism, whose numbers depend on parameters as `record` has it."""
+    """Writes the code of a mechanism, whose numbers depend on parameters as `record` has it.
 
-    def __init__(self, system: ConstrainedSystem, choice: Choice, parameters: Any):
+    Parameters
+    ----------
+    system : ConstrainedSystem
+    choice : Choice
+    parameters : array of Known
+    series : bool
+        Whether there is to be code for its Taylor series, too.
+
+    Raises
+    ------
+    Untraceable
+        Saying why the equations, or their series, cannot be had.
+    """
+
+    def __init__(self, system: ConstrainedSystem, choice: Choice, parameters: Any, series: bool):
         self.numbers = Coefficients(apart=True)
         self.equations = equations = StraightLine(system, choice, parameters)
         self.solution = Solution(self.equations)
         self.n, self.n_rows = system.n_q, system.n_c + system.n_a
-        program = series_program(system, parameters)
-        if program.n_operations > LARGEST:
-            raise Untraceable(f"its series takes more than {LARGEST} operations")
-        self.recurrences = LaneSeries(program, self.solution, self.numbers, self.n, self.n_rows)
+        self.recurrences: LaneSeries | None = None
+        if series:
+            program = series_program(system, parameters)
+            if program.n_operations > LARGEST:
+                raise Untraceable(f"its series takes more than {LARGEST} operations")
+            self.recurrences = LaneSeries(program, self.solution, self.numbers, self.n, self.n_rows)
         self.structure = self._structure()
         self.n_numbers = self.numbers.n_varying
-        parts = [equations.there, equations.closer, equations.nearer, equations.redundant, self.solution.kept]
+        parts = [equations.there, equations.closer, equations.nearer, equations.redundant]
+        parts += [self.solution.kept] if series else []
         counts = [len(each.quantities(equations.graph)) for each in parts if each is not None]
-        self.n_quantities = sum(counts) + len(self.solution.solved.quantities(self.solution.graph))
+        counts += [len(self.solution.solved.quantities(self.solution.graph))] if series else []
+        self.n_quantities = sum(counts)
 
-    def scratch_size(self, order: int) -> int:
-        """Length of the memory that the series works in, in vectors."""
-        return self.recurrences.scratch_size(order)
+    @property
+    def tasks(self) -> tuple[str, ...]:
+        """What there is code for."""
+        return lanes.TASKS if self.recurrences is None else (*lanes.TASKS, *lanes.TASKS_OF_SERIES)
+
+    def series_size(self, order: int) -> int:
+        """Length of the memory that a series of an order takes and works in, in vectors."""
+        assert self.recurrences is not None
+        return (order + 1) * self.n + self.recurrences.scratch_size(order)
 
     def _structure(self) -> str:
         equations, numbers = self.equations, self.numbers
-        told: list[Any] = list(self.recurrences.structure)
-        for outputs in (equations.there, equations.closer, equations.nearer, equations.redundant, self.solution.kept):
+        told: list[Any] = []
+        parts = [equations.there, equations.closer, equations.nearer, equations.redundant]
+        if self.recurrences is not None:
+            told += list(self.recurrences.structure)
+            parts.append(self.solution.kept)
+        for outputs in parts:
             if outputs is not None:
                 told += [{name: len(forms) for name, forms in outputs.arrays.items()}, len(outputs.conditions)]
                 told += list(numbers.structure(equations.graph, outputs.forms))
-        told += list(numbers.structure(self.solution.graph, self.solution.solved.forms))
+        if self.recurrences is not None:
+            told += list(numbers.structure(self.solution.graph, self.solution.solved.forms))
         return hashlib.sha256(repr(told).encode()).hexdigest()
 
     # what is emitted
@@ -74,6 +104,7 @@ class LaneCode:
         for j in range(n):
             emit.store(inputs[1 + j], out, j)
             emit.store(emit.multiply(unit, inputs[1 + n + j]), out, n + j)
+        assert self.recurrences is not None
         self.recurrences.begin(emit, inputs, scratch)
         with emit.loop(integer(1), order, []) as (k, _, _):
             self.recurrences.order(emit, k, unit, out, scratch)
@@ -181,7 +212,7 @@ class LaneCode:
         return at(lanes.RTOL), [at(lanes.ATOL + j) for j in range(self.n)]
 
     def _at(self, emit: LaneEmitter, order: Value, control: Value, room: Value) -> "_Places":
-        *fixed, series, _ = lanes.places(self.n, self.n_rows, self.n_numbers, 0)
+        *fixed, series = lanes.places(self.n, self.n_rows, self.n_numbers)
         emit.numbers = emit.pointer(room, fixed.pop())
         emit.constants = emit.builder.gep(control, integer(lanes.ATOL + self.n))
         begin = emit.pointer(room, series)
@@ -235,7 +266,7 @@ class LaneCode:
 
 
 class _Places(NamedTuple):
-    """Pointers to what stands in `room`, see kernels/lanes.py."""
+    """Pointers to what stands in `room`, see kernels/lanes/lane_room.py."""
 
     state: Value
     new: Value

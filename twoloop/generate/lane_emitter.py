@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from twoloop.generate.coefficients import Coefficient
 from twoloop.generate.llvm_code import INTRINSICS, Emitter
 from twoloop.generate.llvm_text import BIT, DOUBLE, INTEGER, Value, integer, undefined, vector_of
-from twoloop.kernels.lanes import LANES
+from twoloop.kernels.lanes.lane_room import LANES
 
 # log2 on [1, 2] and 2^x on [-1/2, 1/2], fitted by least squares at Chebyshev points, highest power first: good to 2e-06
 # and 1e-07, for the lengths of steps

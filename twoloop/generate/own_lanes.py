@@ -18,15 +18,15 @@ from twoloop.generate import (
     straight_code,
     straight_line,
 )
+from twoloop.generate.choices import Choice
 from twoloop.generate.known_numbers import Record
 from twoloop.generate.lane_code import LaneCode
 from twoloop.generate.lane_emitter import LaneEmitter
 from twoloop.generate.llvm_text import Module
-from twoloop.generate.straight_line import Choice
 from twoloop.generate.tracing import Untraceable
 from twoloop.kernels.compile.caches import Newest, digest_of
-from twoloop.kernels.compile.own_functions import are_kept, own_functions
-from twoloop.kernels.lanes import CODE, TASKS, LaneKit
+from twoloop.kernels.compile.own_functions import OwnFunctions, are_kept, own_functions
+from twoloop.kernels.lanes.lane_room import CODE
 from twoloop.problem.system import ConstrainedSystem
 
 Array = NDArray[np.float64]
@@ -49,6 +49,8 @@ class OwnLanes:
     choice : Choice
     values, varying
         Of a `Record`: generic parameters, and which of them differ from run to run.
+    series : bool
+        Whether there is to be code for its Taylor series, too.
 
     Raises
     ------
@@ -56,31 +58,31 @@ class OwnLanes:
         Saying why the equations cannot be had.
     """
 
-    def __init__(self, system: ConstrainedSystem, choice: Choice, values: Array, varying: Sequence[int]):
+    def __init__(self, system: ConstrainedSystem, choice: Choice, values: Array, varying: Sequence[int], series: bool):
         if system.n_a > 0:
             raise Untraceable("it has nonholonomic rows")
         self.record = Record(values.tolist(), varying)
-        self.code = LaneCode(system, choice, self.record.parameters)
-        self._kit: LaneKit | None = _MADE.get(self.code.structure)
+        self.code = LaneCode(system, choice, self.record.parameters, series)
+        self._functions: OwnFunctions | None = _MADE.get(self.code.structure)
 
     @property
-    def kit(self) -> LaneKit:
+    def functions(self) -> OwnFunctions:
         """The code, compiled when it is first asked for."""
-        if self._kit is None:
-            made = own_functions(KIND, _stamp(), self.code.structure, self._write)
-            self._kit = _MADE[self.code.structure] = LaneKit(made)
-        return self._kit
+        if self._functions is None:
+            self._functions = own_functions(KIND, _stamp(), self.code.structure, self._write)
+            _MADE[self.code.structure] = self._functions
+        return self._functions
 
     def _write(self) -> tuple[list[str], str]:
         module = Module()
-        for name in TASKS:
+        for name in self.code.tasks:
             llvm_code.write(module, name, CODE.own_type(name), getattr(self.code, name), LaneEmitter)
-        return list(TASKS), str(module)
+        return list(self.code.tasks), str(module)
 
     @property
     def seconds_to_build(self) -> float:
         """About what the code takes to compile, s; 0 where it is there or on the disk."""
-        if self._kit is not None or are_kept(KIND, _stamp(), self.code.structure):
+        if self._functions is not None or are_kept(KIND, _stamp(), self.code.structure):
             return 0.0
         return BUILD_SECONDS * self.code.n_quantities
 
@@ -94,5 +96,5 @@ def _stamp() -> str:
     """A digest of what writes the code, and of the kernels that it goes with."""
     from twoloop.kernels.data import common
 
-    kernels = ("lanes", "control.defect", "control.predictor")
+    kernels = ("lanes.lane_room", "control.defect", "control.predictor")
     return digest_of("".join(map(common.stamp, kernels)), __file__, *WRITERS)

@@ -106,6 +106,11 @@ class SeriesProgram:
         return replace(self, early=early, late=late, rows=rows, balance=balance, traced=traced)
 
     @property
+    def kinds(self) -> frozenset[str]:
+        """Of callbacks that ran on symbols."""
+        return frozenset() if self.traced is None else self.traced.kinds
+
+    @property
     def n_nodes(self) -> int:
         """Number of quantities."""
         return 1 + 3 * self.n_q + self.n_rows + self.n_operations

@@ -13,12 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.generate import coefficients, llvm_code, llvm_text, llvm_trigonometry, straight_line
+from twoloop.generate.choices import Choice
 from twoloop.generate.coefficients import Coefficients
 from twoloop.generate.families import Evaluator, Family, of_family
 from twoloop.generate.llvm_code import Emitter, Quantities
 from twoloop.generate.llvm_text import DOUBLE, Module, Value
 from twoloop.generate.llvm_trigonometry import LARGEST_ANGLE, sine_and_cosine
-from twoloop.generate.straight_line import Choice, Outputs, StraightLine
+from twoloop.generate.straight_line import Outputs, StraightLine
 from twoloop.generate.traced_values import Check, Traced, unchecked
 from twoloop.generate.tracing import Form, Graph, Untraceable
 from twoloop.kernels.compile.caches import Newest, digest_of
@@ -201,6 +202,11 @@ class OwnCode(NamedTuple):
     numbers: Array  # that it reads
     traced: Traced
     evaluate: Evaluator  # of other formulas of the family
+
+    @property
+    def kinds(self) -> frozenset[str]:
+        """Of callbacks that ran on symbols."""
+        return self.traced.kinds
 
 
 def write_own(module: Module, name: str, graph: Graph, outputs: Outputs, numbers: Coefficients) -> None:

@@ -12,26 +12,19 @@ is not to be used. The same factors give the nearest position and velocity on th
 M is singular, rows g of G are added, M + g^T g, which changes neither. Of redundant rows those that count are kept.
 """
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from twoloop.generate.choices import Choice
 from twoloop.generate.traced_equations import Equations, only
 from twoloop.generate.traced_values import Traced
 from twoloop.generate.tracing import Form, Graph, Untraceable
 from twoloop.kernels.evaluation.inner import CONTRADICTS
 from twoloop.problem.system import ConstrainedSystem
 
-Array = NDArray[np.float64]
-
-SINGULAR_MASS = 1e-10  # smallest over largest eigenvalue, below which rows of G are added to M
-RANK = 1e-9  # of a row of G, of which no more is left without its part in the rows before: it depends on them
-NEAR = 0.01  # of the smallest pivot that a row of G may have at the start: where the constraints are near losing rank
-ROUNDING = 1e-8  # smallest pivot that is not nearly lost to rounding
 MOST = 20_000  # operations
 
 
@@ -209,7 +202,7 @@ class StraightLine:
         Saying why the equations cannot be had.
     """
 
-    def __init__(self, system: ConstrainedSystem, choice: "Choice", parameters: Any = None):
+    def __init__(self, system: ConstrainedSystem, choice: Choice, parameters: Any = None):
         self.equations = Equations(system, parameters)
         self.system, self.choice, self.graph = system, choice, self.equations.graph
         self.nothing = Form(self.graph, 0.0, {})
@@ -367,94 +360,5 @@ class Solution:
         self.solved = Outputs({"a": solution[:n], "lam": lam}, [])
 
 
-@dataclass(frozen=True)
-class Choice:
-    """What is decided by numbers at a position.
-
-    Attributes
-    ----------
-    rows : tuple of int
-        Rows of G of full rank.
-    added, scale : tuple of int, float
-        Rows of G that make M definite when added, and by what factor: a power of two that brings them to its size.
-    least : float
-        What the pivot of a row must be, of what it is without the others, a power of ten.
-    """
-
-    rows: tuple[int, ...]
-    added: tuple[int, ...]
-    scale: float
-    least: float
-
-    @classmethod
-    def at(cls, system: ConstrainedSystem, t: float, q: Array) -> "Choice":
-        """The choice at a position.
-
-        Raises
-        ------
-        Untraceable
-            If M is singular on velocities that the constraints allow.
-        """
-        mass, G = system.mass(t, q), system.rows(t, q)
-        rows = _independent(G)
-        if not rows:
-            return cls((), (), 1.0, 0.0)
-        scale = float(2.0 ** np.round(np.log2(np.abs(mass).max() / np.abs(G).max() ** 2)))
-        place = None if system.constant_mass else (t, q.tobytes())
-        if system.remembered_at("definite mass", place, lambda: not _weak(np.linalg.eigvalsh(mass)).any()):
-            added: tuple[int, ...] = ()
-        else:
-            added = _rows_for_mass(mass, G, scale, system.name)
-            mass = mass + scale * G[list(added)].T @ G[list(added)]
-        S = G[rows] @ np.linalg.solve(mass, G[rows].T)
-        size = np.sqrt(np.diag(S))
-        smallest = float(np.linalg.eigvalsh(S / np.outer(size, size))[0])  # no pivot is smaller, in any order
-        return cls(
-            tuple(rows), added, scale if added else 1.0, 10.0 ** np.floor(np.log10(max(NEAR * smallest, ROUNDING)))
-        )
-
-
 def _is_zero(form: Form) -> bool:
     return not form.terms and form.constant == 0.0
-
-
-def _independent(G: Array) -> list[int]:
-    """The first rows that no rows before add up to."""
-    if 0 < len(G) <= G.shape[1]:
-        rest_of = np.abs(np.diagonal(np.linalg.qr(G.T, mode="r")))  # a row without its part in those before
-        if (rest_of > 2.0 * RANK * np.linalg.norm(G, axis=1)).all():
-            return list(range(len(G)))
-    kept: list[int] = []
-    basis, squares = np.zeros((min(G.shape), G.shape[1])), (G * G).sum(axis=1).tolist()
-    for k, row in enumerate(G):
-        if len(kept) == len(basis):
-            break
-        before = basis[: len(kept)]
-        rest = row - (before @ row) @ before
-        rest -= (before @ rest) @ before
-        square = float(rest @ rest)
-        if square > RANK**2 * squares[k]:
-            basis[len(kept)] = rest / math.sqrt(square)
-            kept.append(k)
-    return kept
-
-
-def _weak(values: NDArray[Any]) -> NDArray[Any]:
-    """Which of the eigenvalues of M, in order, are none."""
-    return values < SINGULAR_MASS * values[-1]
-
-
-def _rows_for_mass(mass: Array, G: Array, scale: float, name: str) -> tuple[int, ...]:
-    """Rows of G with which M is definite, those of few entries first."""
-    added: list[int] = []
-    while True:
-        values, vectors = np.linalg.eigh(mass)
-        weak = _weak(values)
-        if not weak.any():
-            return tuple(added)
-        helps = np.linalg.norm(G @ vectors[:, weak], axis=1) > SINGULAR_MASS**0.5 * np.linalg.norm(G, axis=1)
-        free = [k for k in np.argsort(np.count_nonzero(G, axis=1), kind="stable") if helps[k] and k not in added]
-        if not free:
-            raise Untraceable(f"the mass of {name!r} stays singular with constraints added")
-        added.append(int(free[0]))
-        mass = mass + scale * np.outer(G[free[0]], G[free[0]])

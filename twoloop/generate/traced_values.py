@@ -8,6 +8,7 @@ at states spread over the time of the run and about its start, later at states o
 import copy
 import warnings
 from collections.abc import Callable, Mapping
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -28,6 +29,7 @@ KINDS = (
     *("nonholonomic", "nonholonomic_rate", "nonholonomic_gamma"),
 )
 AROUND = 8  # states about the start, beside it
+TIMES = np.linspace(0.0, 1.0, AROUND)  # of a run, over its length, at which these are
 AWAY = 0.3  # of the size of coordinates: how far these are from it
 EACH, MOST = 32, 64  # states of a part of a run, and of a run ...
 FEW = 9  # ... if callbacks are called in Python
@@ -59,8 +61,8 @@ class Traced:
         self.which = np.array([kind in known for kind in KINDS], dtype=np.int64)
         self.sizes = np.array([system.n_q, system.n_c, system.n_a], dtype=np.int64)
         self.name = system.name
+        self.kinds = frozenset(graph.traced)  # that ran on symbols
         self.trusted = False
-        self._kit: Any = None
         entries = (forms[kind][place] for kind, place in self.places)
         made = {k: form for k, form in enumerate(entries) if form.terms or form.constant}  # others stay zero
         self.program = program_of(graph, 1 + 2 * system.n_q, made)
@@ -70,7 +72,7 @@ class Traced:
         other = copy.copy(self)
         constants, coefficients = evaluate(self.program.constants), evaluate(self.program.coefficients)
         other.program = self.program._replace(constants=constants, coefficients=coefficients)
-        other.name, other.trusted, other._kit = system.name, False, None
+        other.name, other.trusted = system.name, False
         return other
 
     def refuse(self, system: ConstrainedSystem, t0: float, t1: float, q: Array, v: Array) -> None:
@@ -127,14 +129,11 @@ class Traced:
         return None
 
     def _both(self, system: ConstrainedSystem, states: Array) -> tuple[int, Array, Array, Array]:
-        from twoloop.kernels.data.common import Kit
         from twoloop.kernels.evaluation import traced as kernels
 
         called, traced, bounds = np.zeros((3, len(states), len(self.places)))
-        if self._kit is None or self._kit.functions is not system.functions:
-            self._kit = Kit(system.functions)
         n_different = direct(kernels.compare)(
-            self._kit,
+            system.kit,
             self.sizes,
             self.which,
             np.ascontiguousarray(states),
@@ -194,10 +193,18 @@ def unchecked(traced: Traced) -> None:
 
 def _around(t0: float, t1: float, q: Array, v: Array) -> Array:
     """States [t, q, v], a start first, others about it at times of a run, at the speed of its size a second or more."""
-    generic = np.random.default_rng(6)
     size = sizes(q)
     speed = np.maximum(size, np.abs(v))
-    times = t0 + (t1 - t0) * np.linspace(0.0, 1.0, AROUND)[:, None]
-    parts = generic.uniform(-1.0, 1.0, (2, AROUND, len(q)))
-    around = np.hstack([times, q + AWAY * size * parts[0], speed * parts[1]])
-    return np.vstack([np.concatenate([[t0], q, v]), around])
+    n, parts = len(q), _parts(len(q))
+    states = np.empty((1 + AROUND, 1 + 2 * n))
+    states[0, 0], states[0, 1 : 1 + n], states[0, 1 + n :] = t0, q, v
+    states[1:, 0] = t0 + (t1 - t0) * TIMES
+    states[1:, 1 : 1 + n] = q + AWAY * size * parts[0]
+    states[1:, 1 + n :] = speed * parts[1]
+    return states
+
+
+@cache
+def _parts(n_q: int) -> Array:
+    """Between -1 and 1, (2, AROUND, n_q): always the same."""
+    return np.random.default_rng(6).uniform(-1.0, 1.0, (2, AROUND, n_q))

@@ -31,6 +31,8 @@ BRANCHES = "it branches on, or converts to a number, what depends on t, q or v"
 # of numbers
 SIN, COS, EXP, LOG, ATAN, ROOT = map(function_of_number, ("sin", "cos", "exp", "log", "atan", "sqrt"))
 
+_size = float.__abs__  # a plain number, also of one that knows its parameters
+
 CONVERTS = "it converts what depends on t, q or v to a number, as functions of math do within methods (numpy's do not)"
 
 
@@ -44,6 +46,7 @@ class Graph:
         self.sizes: list[int] = []
         self.operations: list[tuple[int, Form, Form | None] | None] = []
         self.late: list[bool] = []  # whether a quantity depends on more than time and coordinates
+        self.inputs_of: list[int] = []  # the inputs that a quantity depends on, a bit each
         self.traced: dict[str, Any] = {}
         self.running = False  # whether a callback runs on its quantities now ...
         self.refused = ""  # ... and why it cannot, which it may have caught
@@ -63,6 +66,7 @@ class Graph:
         self.sizes.append(n)
         self.operations += [None] * n
         self.late += [late] * n
+        self.inputs_of += [1 << first + i for i in range(n)]
         return [Form(self, 0.0, {first + i: 1.0}) for i in range(n)]
 
     def operation(self, kind: int, first: "Form", second: "Form | None" = None) -> "Form":
@@ -72,6 +76,10 @@ class Graph:
             self._known[key] = len(self.operations)
             self.operations.append((kind, first, second))
             self.late.append(first.late or (second is not None and second.late))
+            bits = 0
+            for i in (*first.terms, *(() if second is None else second.terms)):
+                bits |= self.inputs_of[i]
+            self.inputs_of.append(bits)
         return Form(self, 0.0, {self._known[key]: 1.0})
 
     def needed_by(self, forms: Iterable["Form"]) -> list[int]:
@@ -130,7 +138,7 @@ class Form:
 
     def times(self, factor: float) -> "Form":
         """A multiple."""
-        if factor == 0.0:
+        if float.__eq__(factor, 0.0):
             return Form(self.graph, 0.0, {})
         return Form(self.graph, self.constant * factor, {i: c * factor for i, c in self.terms.items()})
 
@@ -154,12 +162,12 @@ class Form:
         terms = dict(self.terms)
         for i, c in other.terms.items():
             total = terms.get(i, 0.0) + c
-            if abs(total) <= CANCELLED * abs(c):
+            if _size(total) <= CANCELLED * _size(c):
                 del terms[i]
             else:
                 terms[i] = total
         constant = self.constant + other.constant
-        return Form(self.graph, 0.0 if abs(constant) <= CANCELLED * abs(other.constant) else constant, terms)
+        return Form(self.graph, 0.0 if _size(constant) <= CANCELLED * _size(other.constant) else constant, terms)
 
     __radd__ = __add__
 

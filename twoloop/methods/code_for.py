@@ -65,8 +65,10 @@ def _refuse(method: Method, fixed: bool) -> None:
 
 def is_small(system: ConstrainedSystem) -> bool:
     """Whether its callbacks are compiled, can be traced, and make few operations."""
-    if system.called_in_python:
-        return False
+    return not system.called_in_python and bool(system.remembered("small", lambda: _is_small(system)))
+
+
+def _is_small(system: ConstrainedSystem) -> bool:
     try:
         return series_for(system).n_operations <= SMALL
     except Untraceable:

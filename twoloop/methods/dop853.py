@@ -108,8 +108,7 @@ class DOP853:
         if self.code is None or not free:
             return plan
         made = compiled_stages(self.code, s)
-        return replace(
-            plan,
+        return plan.changed(
             step=kernels.COMPILED_EXPLICIT,
             memory=np.zeros(max(plan.memory.size, made.memory_size)),
             own=(made.functions,),

@@ -64,8 +64,12 @@ class Plan:
 
     def fresh(self) -> "Plan":
         """The same for another run, with memory of its own; not so the plans that it holds."""
+        return self.changed(memory=self.memory.copy())
+
+    def changed(self, **changes: Any) -> "Plan":
+        """The same with other values of some fields."""
         other = object.__new__(Plan)  # `replace` takes ten times as long
-        vars(other).update(vars(self), memory=self.memory.copy())
+        vars(other).update(vars(self), **changes)
         return other
 
 

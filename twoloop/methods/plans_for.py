@@ -1,7 +1,5 @@
 """The plans by which a method runs a system; those of presets are made once for a system and a tolerance."""
 
-from dataclasses import replace
-
 from twoloop.generate.straight_code import OwnCode
 from twoloop.generate.traced_values import Check
 from twoloop.kernels.data.intervals import ACCELERATIONS, VELOCITIES
@@ -59,11 +57,11 @@ def _made(
         interiors[ACCELERATIONS] = method.plan(system.n_q, rtol, atol, True) if plan.interior is None else plan.interior
     if code is None:
         return plan, interiors
-    plan = replace(_with_code(plan, code), traced=(*plan.traced, code.traced))
+    plan = _with_code(plan, code).changed(traced=(*plan.traced, code.traced))
     if plan.substitute is not None:
-        plan = replace(plan, substitute=_with_code(plan.substitute, code))
+        plan = plan.changed(substitute=_with_code(plan.substitute, code))
     return plan, interiors
 
 
 def _with_code(plan: Plan, code: OwnCode) -> Plan:
-    return replace(plan, inner=code.shared.inner, own=(code.shared.functions, *plan.own), numbers=code.numbers)
+    return plan.changed(inner=code.shared.inner, own=(code.shared.functions, *plan.own), numbers=code.numbers)

@@ -1,6 +1,6 @@
 """RungeKutta(...): implicit Runge-Kutta methods, their outer loop by fixed point or by Newton's method."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -149,8 +149,7 @@ class RungeKutta:
         memory = np.zeros(kernels.memory_size(tableau.stages, n_q))
         plan = Plan(kernels.RUNGE_KUTTA, options, memory, 1.0 / (tableau.order + 1), rough=ROUGH)
         if self.outer == "paper":
-            return replace(
-                plan,
+            return plan.changed(
                 step=kernels.PAPER,
                 factor_min=0.5,
                 limit_start=1.0,
@@ -159,11 +158,11 @@ class RungeKutta:
                 lands=True,
                 rough=1.0,
             )
-        plan = replace(plan, least_error=LEAST_ERROR, symmetric=self.partition == "symmetric", parts=self._parts())
+        plan = plan.changed(least_error=LEAST_ERROR, symmetric=self.partition == "symmetric", parts=self._parts())
         if self.variables == "momenta":
             from twoloop.kernels.steps import canonical_step as momenta
 
-            return replace(plan, step=momenta.MOMENTA, memory=np.zeros(momenta.memory_size(tableau.stages, n_q)))
+            return plan.changed(step=momenta.MOMENTA, memory=np.zeros(momenta.memory_size(tableau.stages, n_q)))
         if self.outer == "fixed-point":
             return plan
         newton = self._newton_plan(plan, n_q)
@@ -177,8 +176,7 @@ class RungeKutta:
         tableau = self.tableau
         extra = newton.newton_options(tableau.A, tableau.b, tableau.c, self.tested == "all")
         n_eigen = int(extra[newton_memory.N_REAL] + extra[newton_memory.N_PAIRS])
-        made = replace(
-            plan,
+        made = plan.changed(
             step=newton.NEWTON,
             options=np.concatenate([plan.options, extra]),
             memory=np.zeros(newton_memory.memory_size(n_eigen, tableau.stages, n_q)),
@@ -186,7 +184,7 @@ class RungeKutta:
         )
         if tableau.order <= UNDIVIDED:
             return made
-        return replace(made, within_newton=replace(made, memory=made.memory.copy(), parts=tableau.stages - 1))
+        return made.changed(within_newton=made.changed(memory=made.memory.copy(), parts=tableau.stages - 1))
 
     def _parts(self) -> int:
         """Parts of a step whose states carry the solution between its ends to the accuracy of the method."""

@@ -137,14 +137,13 @@ class Taylor:
         )
         kept = plan.options.copy()
         kept[series.KEEP] = 1.0
-        interior = replace(plan, options=kept, memory=plan.memory.copy())
+        interior = plan.changed(options=kept, memory=plan.memory.copy())
         if self.code is None:
-            return replace(plan, interior=interior)
+            return plan.changed(interior=interior)
         code = compiled_series(self.code)
         options = plan.options.copy()
         options[series.N_FACTORS] = code.n_factors
-        return replace(
-            plan,
+        return plan.changed(
             step=taylor.COMPILED_TAYLOR,
             options=options,
             memory=np.zeros(code.memory_size(highest)),

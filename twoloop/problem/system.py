@@ -14,7 +14,7 @@ from twoloop.checks.arguments import check_flag, check_number, check_real, check
 from twoloop.checks.bounds import check_callback
 from twoloop.kernels.compile.callbacks import KINDS, STATE, stand_in
 from twoloop.kernels.compile.private import Dispatcher
-from twoloop.kernels.data.common import BANDWIDTH, CONSTANT_MASS, GIVEN, N_FLAGS, PROGRAMS, Functions
+from twoloop.kernels.data.common import BANDWIDTH, CONSTANT_MASS, GIVEN, N_FLAGS, PROGRAMS, Functions, Kit
 from twoloop.problem.adapters import (
     ConstantMatrix,
     PythonFunctions,
@@ -300,6 +300,11 @@ class ConstrainedSystem:
         """Whether the callbacks are plain Python functions."""
         return self._python is not None
 
+    @property
+    def kit(self) -> Kit:
+        """The callbacks as kernels take them."""
+        return self.remembered(("kit", id(self.functions)), lambda: Kit(self.functions))
+
     def remembered(self, what: Any, make: Callable[[], Any]) -> Any:
         """What `make` makes of the equations with these parameters, once; functions may do otherwise."""
         if self.called_in_python:  # what such functions find in their surroundings may change
@@ -316,6 +321,11 @@ class ConstrainedSystem:
         if known is None or known[0] != state:
             known = self.made[what] = state, make()
         return known[1]
+
+    def remember_at(self, what: Any, state: Any, made: Any) -> None:
+        """Let `remembered_at` have what was made beside something else."""
+        if not self.called_in_python:
+            self.made[what] = state, made
 
     def arrays_of(self, kind: str) -> list[Array]:
         """Zeros for a kind of callback to fill."""

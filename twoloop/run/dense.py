@@ -4,7 +4,6 @@ from __future__ import annotations  # ArrayLike stays a word in help()
 
 import warnings
 from collections.abc import Mapping
-from dataclasses import replace
 from functools import cached_property
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -207,7 +206,7 @@ class Interpolator:
 
             method = RungeKutta(radau_iia(3), outer="newton") if stiff else DOP853()
             atol = float(self.tolerances[common.ATOL :].min())
-            plan = replace(method.plan(self.system.n_q, self.rtol, atol, True), parts=REPAIRED)
+            plan = method.plan(self.system.n_q, self.rtol, atol, True).changed(parts=REPAIRED)
             self.repairs[stiff] = plan, kit_of(self.system, self.made_of[1], self.made_of[2][: self.system.n_q], plan)
         return self.repairs[stiff]
 

@@ -3,7 +3,8 @@
 import warnings
 from typing import TYPE_CHECKING
 
-from twoloop.checks.consistency import ConstraintWarning, dependent_rows, in_words, least_inertia, not_finite
+from twoloop.checks.consistency import ConstraintWarning, dependent_rows, least_inertia, not_finite
+from twoloop.checks.rank import in_words
 from twoloop.kernels.data import common
 from twoloop.run.crossings import said_of_crossings, singular_ratio
 from twoloop.run.pace import INTERRUPTED, OUT_OF_TIME, STAGNATED, STAGNATION_STEPS, Pace

@@ -1,7 +1,5 @@
 """What goes on where a run's own steps cannot: another plan, steps across a singular position or over a jump."""
 
-from dataclasses import replace
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -43,7 +41,7 @@ def bridge(run: Run) -> tuple[Plan, Array]:
     run.crossings.append([(float(clock[a.T]), run.state.copy())])
     plan = DOP853().plan(run.system.n_q, run.rtol, float(run.tolerances[common.ATOL :].min()), False)
     control = run.control.copy()
-    control[: a.N_RULE] = replace(plan, least_error=0.0).rule
+    control[: a.N_RULE] = plan.changed(least_error=0.0).rule
     control[a.SYMMETRIC], control[a.BRIDGE], control[a.MAX_ATTEMPTS] = 0.0, 0.0, 1.0
     control[a.GIVES_WAY] = 0.0
     if control[a.FIXED_STEP] == 0.0:
@@ -51,7 +49,7 @@ def bridge(run: Run) -> tuple[Plan, Array]:
     clock[a.H_LIMIT], clock[a.LIMIT_AGE] = np.inf, 0.0
     run.lengths = [float(clock[a.H_LONG]) * part for part in BRIDGES]
     clock[a.H_NEXT] = run.lengths.pop(0)
-    return replace(plan, step=bridge.BRIDGING), control
+    return plan.changed(step=bridge.BRIDGING), control
 
 
 def beyond(run: Run, plan: Plan, control: Array, code: int, accepted: int) -> tuple[Plan, Array, int]:

@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 
 from twoloop.checks.consistency import (
     dependent_rows,
-    in_words,
     least_inertia,
     pattern_of,
 )
+from twoloop.checks.rank import in_words
 from twoloop.kernels.compile.linking import direct
 from twoloop.kernels.data import common
 from twoloop.kernels.layout import copy_of
@@ -65,8 +65,9 @@ class Run:
         self.functions = self.kit.functions
         n_rows = system.n_c + system.n_a
         self.state = np.concatenate([q0, v0, np.zeros(system.n_q + n_rows)])
-        self.pattern = system.remembered_at("pattern", (t0, q0.tobytes()), lambda: pattern_of(system, t0, q0))
-        self.work = self._workspace()
+        self.pattern = pattern_of(system, t0, q0)
+        # ranks are found anew at every start: those of the last one are a guess, which spares a second workspace
+        self.work = self._workspace(*system.made.get("ranks", (None, None)))
         self.new_state = np.zeros_like(self.state)
         self.tolerances = np.zeros(common.ATOL + system.n_q)
         self.tolerances[common.RTOL] = rtol
@@ -130,7 +131,7 @@ class Run:
         start = direct(self.a.start)
         code = start(self.kit, self.work, self.t0, self.state)
         if code == common.RANK_DIFFERS:
-            ranks = [int(self.work.notes[place]) for place in (common.RANK, common.RANK_V)]
+            self.system.made["ranks"] = ranks = int(self.work.notes[common.RANK]), int(self.work.notes[common.RANK_V])
             self.work = self._workspace(*ranks)
             code = start(self.kit, self.work, self.t0, self.state)
         if code == common.GAMMA_INACCURATE:  # the first step says so, too, and that run has a result
@@ -161,7 +162,9 @@ class Run:
         n_rows, n = self.system.n_c + self.system.n_a, self.system.n_q
         if self.rank == n_rows:
             return np.zeros(0, dtype=np.int64), ""
-        redundant = np.setdiff1d(np.arange(n_rows), self.work.rows_v)
+        left_out = np.ones(n_rows, dtype=bool)
+        left_out[self.work.rows_v] = False
+        redundant = np.flatnonzero(left_out)
         rows, a = self.system.rows(self.t0, self.state[:n]), self.state[2 * n : 3 * n]
         off = np.abs(rows @ a - self.work.Gamma)
         allowed = CONTRADICTS * np.maximum(np.abs(rows) @ np.abs(a) + np.abs(self.work.Gamma), 1.0)

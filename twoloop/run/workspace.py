@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from twoloop.checks.consistency import least_inertia
+from twoloop.checks.consistency import has_definite_mass, least_inertia
 from twoloop.kernels.algebra.banded import banded_pays
 from twoloop.kernels.algebra.lapack import addresses
 from twoloop.kernels.algebra.sparse import sparse_pays
@@ -18,7 +18,6 @@ from twoloop.problem.system import ConstrainedSystem
 Array = NDArray[np.float64]
 
 GAMMA_ACCURACY = 1e-11  # relative; differences of C_q and C_t cannot be asked for more
-SINGULAR_MASS = 1e-12  # smallest eigenvalue over largest entry, below which M may have no inverse
 MOST_KITS = 16  # that are kept with a system
 ROUNDING = 1e-15  # of the largest coordinate: corrections of this size are rounding
 
@@ -27,35 +26,50 @@ def kit_of(system: ConstrainedSystem, t0: float, q0: Array, plan: Plan | None = 
     """The callbacks of a system, with flags that say which linear algebra suits it, and what a plan calls."""
     from twoloop.kernels.evaluation.calls import inner_loop
 
-    given = ("flags", system.functions.flags.tobytes())
-    flags = system.remembered_at(given, (t0, q0.tobytes()), lambda: _flags(system, t0, q0))
-    if plan is None:
-        return common.Kit(system.functions._replace(flags=flags.copy()), inner_loop)
-    return kit_with(system, flags, plan)
+    flags = _flags_at(system, t0, q0)
+    if plan is not None:
+        return kit_with(system, flags, plan)
+
+    def make() -> tuple[common.Kit, Any]:
+        functions = system.functions
+        return common.Kit(functions._replace(flags=flags.copy()), inner_loop), functions
+
+    if flags[common.FORM] == common.AUGMENTED:  # which a run may change
+        return make()[0]
+    made: tuple[common.Kit, Any] = system.remembered(("general kit", id(system.functions), flags.tobytes()), make)
+    return made[0]
 
 
-def _flags(system: ConstrainedSystem, t0: float, q0: Array) -> Array:
+def _flags_at(system: ConstrainedSystem, t0: float, q0: Array) -> Array:
+    """Flags at a position, not to be written to."""
+    definite = has_definite_mass(system, t0, q0)
+    key = ("flags", system.functions.flags.tobytes(), definite)
+    flags, sparse = system.remembered(key, lambda: _flags(system, t0, q0, definite))
+    if not sparse:
+        return flags  # type: ignore[no-any-return]
+    place = (t0, q0.tobytes())
+    if definite or system.remembered_at("inertia", place, lambda: least_inertia(system, t0, q0)[0]) > 0.0:
+        flags = flags.copy()
+        flags[common.FORM] = common.AUGMENTED
+    return flags  # type: ignore[no-any-return]
+
+
+def _flags(system: ConstrainedSystem, t0: float, q0: Array, definite: bool) -> tuple[Array, bool]:
+    """Flags with dense or banded algebra, and whether sparse factors would pay."""
     flags: Array = system.functions.flags.copy()
-    place = None if system.constant_mass else (t0, q0.tobytes())
-    diagonal, definite = system.remembered_at("mass", place, lambda: _kind_of(system.mass(t0, q0)))
     if system.constant_mass:
-        flags[common.DIAGONAL_MASS] = diagonal
+        flags[common.DIAGONAL_MASS] = _is_diagonal(system.mass(t0, q0))
     reduced = not definite or system.n_q <= 2 * (system.n_c + system.n_a)
     flags[common.FORM] = common.NULL_SPACE if reduced else common.MULTIPLIERS
     bandwidth = system.bandwidth if definite and system.n_a == 0 else None
     if bandwidth is not None and banded_pays(system.n_q, system.n_c, bandwidth):
         flags[common.BANDWIDTH], flags[common.FORM] = bandwidth, common.MULTIPLIERS
     flags[common.DENSE_FORM] = flags[common.FORM]
-    sparse = sparse_pays(system.n_q, system.n_c + system.n_a, bool(flags[common.DIAGONAL_MASS]))
-    if sparse and (definite or least_inertia(system, t0, q0)[0] > 0.0):
-        flags[common.FORM] = common.AUGMENTED
-    return flags
+    return flags, sparse_pays(system.n_q, system.n_c + system.n_a, bool(flags[common.DIAGONAL_MASS]))
 
 
-def _kind_of(mass: Array) -> tuple[bool, bool]:
-    """Whether a mass matrix is diagonal, and definite."""
-    diagonal = np.count_nonzero(mass - np.diag(np.diagonal(mass))) == 0
-    return diagonal, bool(np.linalg.eigvalsh(mass).min() > SINGULAR_MASS * np.abs(mass).max())
+def _is_diagonal(mass: Array) -> bool:
+    return np.count_nonzero(mass) == np.count_nonzero(mass.diagonal())
 
 
 def kit_with(system: ConstrainedSystem, flags: Array, plan: Plan) -> common.Kit:

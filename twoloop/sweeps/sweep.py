@@ -119,6 +119,12 @@ def sweep(
         If pandas, pyarrow, dask or rich is missing where it is needed.
     TypeError, ValueError
         If an argument is wrong, functions cannot be sent to other processes, or `out` holds another sweep.
+
+    Notes
+    -----
+    Every run is one of `solve_dae`, none goes in lanes: `measure` may ask for all that a `Result` has, a run that takes
+    its process down takes no other with it, and a row is the same however the runs are divided, or interrupted. Where
+    runs differ in parameters and starts alone, and states at given times are enough, `ensemble` makes many more.
     """
     check_choice("parallel", parallel, PARALLEL)
     check_flag("progress", progress)

@@ -17,6 +17,7 @@ from numba.extending import NativeValue, lower_builtin, models, register_model, 
 from numba.np.arrayobj import make_array, populate_array
 from numba.np.numpy_support import as_dtype
 
+from twoloop.kernels.compile.caches import Newest
 from twoloop.kernels.compile.linking import machine_code
 
 _KNOWN: dict[str, Any] = {}
@@ -49,6 +50,7 @@ class Reference(types.Type):
         self.own_functions: set[str] = set()  # of these, those of LLVM
         self.places: dict[str, int] = {}
         self.n_words = 0
+        self._addresses: Any = Newest()  # of functions of a value, which take long to look up
         for field, kind in self.arrays.items():
             self.places[field] = self.n_words
             self.n_words += 1 + kind.ndim
@@ -102,13 +104,17 @@ class Reference(types.Type):
                 raise TypeError(f"{field} must be a {kind}; given {array.dtype} of shape {array.shape}")
             words.append(array.ctypes.data)
             words.extend(array.shape)
-        for field, signature in self.functions.items():
-            function = getattr(values, field)
-            if field in self.own_functions:
-                words.append(function)
-            else:
-                words.append(0 if function is None else machine_code(function, signature))
+        functions = tuple([getattr(values, field) for field in self.functions])
+        addresses = self._addresses.get(functions)
+        if addresses is None:
+            self._addresses[functions] = addresses = list(map(self._address, self.functions, functions))
+        words.extend(addresses)
         return np.array(words, dtype=np.int64)
+
+    def _address(self, field: str, function: Any) -> int:
+        if field in self.own_functions:
+            return int(function)
+        return 0 if function is None else machine_code(function, self.functions[field])
 
 
 register_model(Reference)(models.OpaqueModel)

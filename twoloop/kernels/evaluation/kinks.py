@@ -10,6 +10,7 @@ is the jump, in one of the halves, however short they are.
 import numpy as np
 
 from twoloop.kernels.data.common import ATOL, RTOL, compiled
+from twoloop.kernels.data.finite import finite_vector
 from twoloop.kernels.data.tolerances import allowed
 from twoloop.kernels.evaluation.constraints import constraint_rates
 
@@ -33,6 +34,8 @@ def _sample(f, w, t, q, way, begin, end):
         for m in range(q.size):
             w.x[m] = q[m] + (time - t) * way[m]
         constraint_rates(f, w, time, w.x, w.rates[k])
+        if not finite_vector(w.rates[k]):  # as the derivative of |t| at 0: the value next to it
+            constraint_rates(f, w, time + np.spacing(abs(time)), w.x, w.rates[k])
 
 
 @compiled

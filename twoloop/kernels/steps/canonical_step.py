@@ -15,7 +15,10 @@ import numpy as np
 
 from twoloop.kernels.algebra.factors import columns_of, rows_of, solve
 from twoloop.kernels.algebra.linalg import copy, ldl_factor, ldl_solve
+from twoloop.kernels.control.compensated_sums import N_RESTS, compensated, forget, keep_rest, rests
+from twoloop.kernels.control.convergence import CONVERGED, MAX_ITERATIONS, UNDECIDED, judged
 from twoloop.kernels.control.predictor import departure, keep_predicted
+from twoloop.kernels.control.richardson import conclude
 from twoloop.kernels.data.common import (
     ATTEMPT,
     CONSTANT_MASS,
@@ -39,21 +42,9 @@ from twoloop.kernels.evaluation.calls import (
     dependent_positions,
     find_gamma,
     find_tangents,
-    rounding_floor,
 )
 from twoloop.kernels.evaluation.gamma import longest_difference
-from twoloop.kernels.steps.fixed_point_step import (
-    GROWTH,
-    MAX_ITERATIONS,
-    N_RESTS,
-    PATIENCE,
-    compensated,
-    conclude,
-    forget,
-    keep_rest,
-    rests,
-)
-from twoloop.kernels.steps.stages import FARTHEST, INNER_TOL, OUTER_TOL, STAGES, interpolate, tableau_of
+from twoloop.kernels.steps.stages import EXTRAPOLATION, FARTHEST, INNER_TOL, OUTER_TOL, STAGES, interpolate, tableau_of
 
 # places in `memory`: scalars, then stage blocks (s, n), vectors (n), matrices; GOES_ON: the last attempt was accepted
 GOES_ON, HAS_TRIAL, H_TRIAL, HAS_PREVIOUS, H_PREVIOUS, PARTITION_NUMBER, N_MEMORY_SCALARS = range(7)
@@ -231,9 +222,8 @@ def _iterate(f, w, options, memory, tolerances, t, h, q, v0, p, V_stage, R_stage
                 total += A[j, k] * V_stage[k, m]
             Q_stage[j, m] = q[m] + h * total
     first = 0.0
-    before = 0.0
-    earlier = np.inf
-    converged = False
+    before = earlier = np.inf
+    verdict = UNDECIDED
     for iteration in range(MAX_ITERATIONS):
         w.counters[N_OUTER] += 1
         for j in range(s):
@@ -261,22 +251,14 @@ def _iterate(f, w, options, memory, tolerances, t, h, q, v0, p, V_stage, R_stage
                 change = max(change, difference / max(abs(v[m]), 1.0))
                 change = max(change, h * difference / max(abs(Q_stage[j, m]), 1.0))
             copy(v, V_stage[j])
-        if change <= options[OUTER_TOL]:
-            converged = True
-            break
         if iteration < 2:
             first = max(first, change)
-        elif not change <= GROWTH * first:
-            return OUTER_DIVERGED, 0.0
-        elif change >= earlier:  # two iterations back: errors go from q to p in one iteration and back in the next
-            if change <= rounding_floor(q):
-                converged = True
-                break
-            if iteration >= PATIENCE:
-                return OUTER_DIVERGED, 0.0
-        earlier = before if iteration > 0 else np.inf
-        before = change
-    if not converged:
+        verdict = judged(change, earlier, first, iteration, options[OUTER_TOL], q)
+        if verdict != UNDECIDED:
+            break
+        # of two iterations back: errors go from q to p in one iteration and back in the next
+        earlier, before = before, change
+    if verdict != CONVERGED:
         return OUTER_DIVERGED, 0.0
     for m in range(n):
         in_q = 0.0
@@ -376,11 +358,12 @@ def momenta_step(f, w, options, memory, t, h, tolerances, state, new_state):
     if tolerances[ESTIMATE] == 1.0:
         copy(q1, q_full)
         copy(v1, v_full)
+        g = 0.5 * h
         for j in range(s):
             interpolate(c, 0.5 * c[j], v_trial, weights, v_half[j])
             interpolate(c, 0.5 * c[j], r_trial, weights, r_half[j])
         code, off_mid = _iterate(
-            f, w, options, memory, tolerances, t, 0.5 * h, q, v, p, v_half, r_half, q_mid, p_mid, v_mid, rest
+            f, w, options, memory, tolerances, t, g, q, v, p, v_half, r_half, q_mid, p_mid, v_mid, rest
         )
         if code != DONE:
             return Attempt(code, np.inf, 0.0)
@@ -388,27 +371,14 @@ def momenta_step(f, w, options, memory, t, h, tolerances, state, new_state):
             interpolate(c, 0.5 + 0.5 * c[j], v_trial, weights, v_half[j])
             interpolate(c, 0.5 + 0.5 * c[j], r_trial, weights, r_half[j])
         code, off = _iterate(
-            f,
-            w,
-            options,
-            memory,
-            tolerances,
-            t + 0.5 * h,
-            0.5 * h,
-            q_mid,
-            v_mid,
-            p_mid,
-            v_half,
-            r_half,
-            q1,
-            p1,
-            v1,
-            rest,
+            f, w, options, memory, tolerances, t + g, g, q_mid, v_mid, p_mid, v_half, r_half, q1, p1, v1, rest
         )
         if code != DONE:
             return Attempt(code, np.inf, 0.0)
         off = max(off, off_mid)  # of the two half steps, from which the run goes on
-        code, error = conclude(f, w, options, t + h, tolerances, q, v, q_full, v_full, q1, v1)
+        code, error = conclude(
+            f, w, options[EXTRAPOLATION], options[INNER_TOL], t + h, tolerances, q, v, q_full, v_full, q1, v1
+        )
         if code != DONE:
             return Attempt(code, np.inf, 0.0)
     code = accelerations(f, w, t + h, q1, v1, a1, lam1)

@@ -7,26 +7,26 @@ twice to q'' = a), `iterate_first_order` is the paper's loop on y_i = [v_i, q_i]
 import numpy as np
 
 from twoloop.kernels.algebra.linalg import copy
+from twoloop.kernels.control.compensated_sums import N_RESTS, compensated, forget, keep_rest, rests
 from twoloop.kernels.control.controller import nothing_to_settle
+from twoloop.kernels.control.convergence import CONVERGED, MAX_ITERATIONS, UNDECIDED, judged
 from twoloop.kernels.control.predictor import restore_predicted
+from twoloop.kernels.control.richardson import conclude
 from twoloop.kernels.data.common import (
-    ATOL,
     ATTEMPT,
     DONE,
     ESTIMATE,
     N_OUTER,
     OUTER_DIVERGED,
-    RTOL,
     SETTLE,
     Attempt,
     Step,
     compiled,
-    exact,
     inlined,
     kernel,
     merged,
 )
-from twoloop.kernels.evaluation.calls import accelerations, evaluate, restore, rounding_floor
+from twoloop.kernels.evaluation.calls import accelerations, evaluate, restore
 from twoloop.kernels.steps.stages import (
     EXTRAPOLATION,
     FARTHEST,
@@ -39,16 +39,12 @@ from twoloop.kernels.steps.stages import (
     tableau_of,
 )
 
-MAX_ITERATIONS = 60
 MAX_ITERATIONS_PAPER = 200  # the paper names no limit; (33) ends a divergent loop long before
-GROWTH = 1e3  # the differences may first grow (the iteration is not normal), but not by more than this
 SHARE_BESIDE = 0.01  # of end_error, beside Richardson's estimate: it is there for jumps between ends and stages
 SUDDEN = 10.0  # what that has to be in the paper's procedure, which has no such estimate, before it counts
-PATIENCE = 8  # iterations after which a difference that grows again means divergence
 
 # places in `memory`: scalars, then stage blocks (s, n_q) and vectors (n_q)
 HAS_TRIAL, H_TRIAL, HAS_PREVIOUS, H_PREVIOUS, N_MEMORY_SCALARS = range(5)
-N_RESTS = 4  # rows of REST: what rounding took from q and from v, at the last accepted step and in this attempt
 PREVIOUS, TRIAL, HALF, Q_STAGE, V_STAGE, N_BLOCKS = range(6)
 Q_FULL, V_FULL, Q_MID, V_MID, A_MID, Q_OLD, V_OLD, REST, N_VECTORS = (*range(8), 7 + N_RESTS)
 
@@ -68,36 +64,6 @@ def _block(memory, s, n, which):
 def _vector(memory, s, n, which):
     start = N_MEMORY_SCALARS + N_BLOCKS * s * n + which * n
     return memory[start : start + n]
-
-
-@inlined
-def rests(memory, n, tolerances):
-    """The rows of REST, with which `memory` begins; none with step-size control, whose errors exceed rounding."""
-    count = N_RESTS if tolerances[ESTIMATE] == 0.0 else 0
-    return memory[: count * n].reshape((count, n))
-
-
-@exact
-def compensated(x, rest, increment):
-    """The sum of the three, and what rounding takes from it (W. Kahan, Commun. ACM 8 (1965), 40)."""
-    increment += rest
-    total = x + increment
-    return total, increment - (total - x)
-
-
-@merged
-def forget(coordinates, rest):
-    """Coordinates that the constraints give have no rest."""
-    for i in range(N_RESTS // 2, rest.shape[0]):
-        for m in coordinates:
-            rest[i, m] = 0.0
-
-
-@merged
-def keep_rest(rest):
-    """That of the last attempt, which was accepted, is what the next step begins with."""
-    for i in range(rest.shape[0] // 2):
-        copy(rest[rest.shape[0] // 2 + i], rest[i])
 
 
 @compiled
@@ -120,8 +86,8 @@ def iterate_accelerations(f, w, options, tolerances, t, h, q, v, A_stage, Q_stag
                 total += A2[j, k] * A_stage[k, m]
             Q_stage[j, m] = q[m] + c[j] * h * v[m] + h * h * total
     first = 0.0
-    before = 0.0
-    converged = False
+    before = np.inf
+    verdict = UNDECIDED
     for iteration in range(MAX_ITERATIONS):
         w.counters[N_OUTER] += 1
         # all stages are set before any is evaluated: Gauss-Seidel would converge for smaller h only
@@ -144,21 +110,13 @@ def iterate_accelerations(f, w, options, tolerances, t, h, q, v, A_stage, Q_stag
                 change = max(change, difference / max(abs(V_stage[j, m]), 1.0))
                 change = max(change, h * difference / max(abs(Q_stage[j, m]), 1.0))
             copy(q1, A_stage[j])
-        if change <= options[OUTER_TOL]:
-            converged = True
-            break
         if iteration == 0:
             first = change
-        elif not change <= GROWTH * first:
-            return OUTER_DIVERGED, 0.0
-        elif change >= before:
-            if change <= rounding_floor(q):
-                converged = True
-                break
-            if iteration >= PATIENCE:
-                return OUTER_DIVERGED, 0.0
+        verdict = judged(change, before, first, iteration, options[OUTER_TOL], q)
+        if verdict != UNDECIDED:
+            break
         before = change
-    if not converged:
+    if verdict != CONVERGED:
         return OUTER_DIVERGED, 0.0
     for m in range(n):
         in_q = 0.0
@@ -249,37 +207,6 @@ def iterate_first_order(f, w, options, t, h, q, v, a, A_stage, Q_stage, V_stage,
     return OUTER_DIVERGED
 
 
-@compiled
-def _richardson_error(tolerances, largest, q, v, q_full, v_full, q1, v1):
-    """Difference of one step and two half steps over (26), for positions and velocities, dependents too.
-
-    Its largest component, or the root mean square (27).
-    """
-    rtol = tolerances[RTOL]
-    total = 0.0
-    top = 0.0
-    for m in range(q.size):
-        atol = tolerances[ATOL + m]
-        in_q = (q_full[m] - q1[m]) / (atol + rtol * max(abs(q[m]), abs(q_full[m])))
-        in_v = (v_full[m] - v1[m]) / (atol + rtol * max(abs(v[m]), abs(v_full[m])))
-        total += in_q * in_q + in_v * in_v
-        top = max(top, abs(in_q), abs(in_v))
-    return top if largest else np.sqrt(total / (2 * q.size))
-
-
-@compiled
-def conclude(f, w, options, t, tolerances, q, v, q_full, v_full, q1, v1):
-    """The error of the two half steps and, with EXTRAPOLATION, their extrapolation with the whole step."""
-    share = options[EXTRAPOLATION]
-    error = _richardson_error(tolerances, share > 0.0, q, v, q_full, v_full, q1, v1)
-    if not (share > 0.0 and error <= 1.0):
-        return DONE, error
-    for m in range(q.size):
-        q1[m] += share * (q1[m] - q_full[m])
-        v1[m] += share * (v1[m] - v_full[m])
-    return restore(f, w, t, q1, v1, options[INNER_TOL]), error
-
-
 @inlined
 def _rests_of(memory, s, n, tolerances):
     return rests(memory[N_MEMORY_SCALARS + (N_BLOCKS * s + REST) * n :], n, tolerances)
@@ -349,7 +276,9 @@ def runge_kutta_step(f, w, options, memory, t, h, tolerances, state, new_state):
         if code != DONE:
             return Attempt(code, np.inf, 0.0)
         off = max(off, off_mid)  # of the two half steps, from which the run goes on
-        code, error = conclude(f, w, options, t + h, tolerances, q, v, q_full, v_full, q1, v1)
+        code, error = conclude(
+            f, w, options[EXTRAPOLATION], options[INNER_TOL], t + h, tolerances, q, v, q_full, v_full, q1, v1
+        )
         if code != DONE:
             return Attempt(code, np.inf, 0.0)
     code = accelerations(f, w, t + h, q1, v1, a1, lam1)
@@ -394,7 +323,9 @@ def paper_step(f, w, options, memory, t, h, tolerances, state, new_state):
         )
         if code != DONE:
             return Attempt(code, np.inf, 0.0)
-        code, error = conclude(f, w, options, t + h, tolerances, q, v, q_full, v_full, q1, v1)
+        code, error = conclude(
+            f, w, options[EXTRAPOLATION], options[INNER_TOL], t + h, tolerances, q, v, q_full, v_full, q1, v1
+        )
         if code != DONE:
             return Attempt(code, np.inf, 0.0)
     code = accelerations(f, w, t + h, q1, v1, a1, lam1)

@@ -272,7 +272,7 @@ def _estimate(f, w, options, memory, h, tolerances, state, new_state, A_stage):
 
 
 @merged
-def _middle(c):
+def middle_node(c):
     """The node next to the middle."""
     found = 0
     for j in range(c.size):
@@ -314,7 +314,7 @@ def newton_step(f, w, options, memory, t, h, tolerances, state, new_state):
         if memory[HAS_JACOBIAN] == 0.0:
             # stiff directions turn as the body moves: halfway they are at most half a step's turn from any stage's; at
             # the time of a stage, so that this sees nothing of a force that the stages do not see
-            x = _middle(c) * h
+            x = middle_node(c) * h
             for m in range(n):
                 q_mid[m] = q[m] + x * (v[m] + 0.5 * x * a[m])
                 v_mid[m] = v[m] + x * a[m]

@@ -1,0 +1,278 @@
+"""Mistakes with models of bodies and joints."""
+
+import numpy as np
+
+from tests.bad_input.case import Case, cases_of
+from twoloop.bodies import PlanarModel, SpatialModel
+
+GROUP = "bodies.PlanarModel"
+of_planar = cases_of(GROUP)
+of_spatial = cases_of("bodies.SpatialModel")
+of_problem = cases_of("bodies: problem")
+NAMES = "give the body that body(...) returned, or its name"
+
+
+def planar():
+    """A bar on a pin, and a block."""
+    model = PlanarModel(name="press")
+    model.body("bar", mass=1.0, inertia=0.1, position=(0.5, 0.0))
+    model.body("block", mass=1.0, inertia=0.1, position=(1.0, 0.0))
+    model.revolute("ground", "bar", at=(0.0, 0.0), name="pin")
+    return model
+
+
+def spatial():
+    model = SpatialModel()
+    model.body("bar", mass=1.0, inertia=(0.1, 0.1, 0.1), position=(0.0, 0.0, 0.0))
+    return model
+
+
+def body(**changed):
+    given = {"name": "arm", "mass": 1.0, "inertia": 0.1, "position": (0.0, 0.0), **changed}
+    return lambda: planar().body(**given)
+
+
+def solid(**changed):
+    given = {"mass": 1.0, "inertia": (0.1, 0.1, 0.1), "position": (0.0, 0.0, 0.0), **changed}
+    return lambda: spatial().body("arm", **given)
+
+
+def drive(motion, **more):
+    return lambda: planar().drive("pin", motion, **more)
+
+
+def rough(distance):
+    """Two bars of 1 m that are to reach a point of the ground."""
+    model = PlanarModel(name="arms")
+    one = model.body("one", mass=1.0, inertia=0.1, position=(0.45, 0.2), angle=0.3)
+    two = model.body("two", mass=1.0, inertia=0.1, position=(1.4, 0.2), angle=-0.3)
+    ground = model.ground
+    model.revolute(ground, one, at=(ground.point(0.0, 0.0), one.point(-0.5, 0.0)))
+    model.revolute(one, two, at=(one.point(0.5, 0.0), two.point(-0.5, 0.0)))
+    model.revolute(two, ground, at=(two.point(0.5, 0.0), ground.point(distance, 0.0)), name="end")
+    return model.problem()
+
+
+def locked():
+    """A bar on two pins that is to turn."""
+    model = PlanarModel(name="truss")
+    model.body("bar", mass=1.0, inertia=0.1, position=(0.5, 0.0), angular_velocity=2.0)
+    for x in (0.0, 1.0):
+        model.revolute("ground", "bar", at=(x, 0.0))
+    return model.problem()
+
+
+def two_drives():
+    model = planar()
+    model.drive("pin", lambda t: t)
+    model.drive("pin", lambda t: 2.0 * t)
+    return model.problem()
+
+
+def half_a_turn():
+    model = spatial()
+    model.revolute("ground", "bar", at=(0.0, 0.0, 0.0), axis=(0.0, 0.0, 1.0), name="hinge")
+    model.drive("hinge", lambda t: 2.5 + t)
+    return model.problem()
+
+
+def point_of_another():
+    model = planar()
+    return model.revolute("bar", "block", at=(model.bodies[1].point(0.0, 0.0), model.bodies[1].point(0.0, 0.0)))
+
+
+BODIES: list[Case] = [
+    of_planar("a name twice", body(name="bar"), "something is called 'bar' already", "give each part its own name"),
+    of_planar("`name=''`", body(name=""), "name must not be empty", "give a name"),
+    of_planar("`name=3`", body(name=3), "name must be a string; given 3", "give text", TypeError),
+    of_planar("`mass=-1`", body(mass=-1), "mass of 'arm' must be positive", "give a positive mass"),
+    of_planar(
+        "`mass=0`", body(mass=0), "mass of 'arm' must be positive", "give a positive mass; for a rod without, distance"
+    ),
+    of_planar("`mass='1'`", body(mass="1"), "mass of 'arm' must be a number", "give a number", TypeError),
+    of_planar("`mass=nan`", body(mass=np.nan), "mass of 'arm' must be positive", "find out where the NaN comes from"),
+    of_planar(
+        "`inertia=0`", body(inertia=0.0), "inertia of 'arm' must be positive", "give the moment about the centre"
+    ),
+    of_planar(
+        "a position in space", body(position=(0, 0, 0)), r"position of 'arm' must have shape \(2,\)", "give x and y"
+    ),
+    of_planar("`angle=inf`", body(angle=np.inf), "angle of 'arm' must be finite", "give radians"),
+    of_planar("`gravity=9.81`", lambda: PlanarModel(9.81), r"gravity must have shape \(2,\)", "give a vector"),
+    of_planar(
+        "an unknown body",
+        lambda: planar().revolute("bar", "blok", at=(0, 0)),
+        "b must be a body of this model, 'ground', 'bar', 'block'; given 'blok'",
+        NAMES,
+    ),
+    of_planar(
+        "a body of another model",
+        lambda: planar().revolute("bar", planar().bodies[1], at=(0, 0)),
+        "'block' belongs to another",
+        NAMES,
+    ),
+    of_planar(
+        "a number for a body", lambda: planar().revolute(0, "bar", at=(0, 0)), "a must be a body", NAMES, TypeError
+    ),
+    of_planar(
+        "a joint of a body with itself",
+        lambda: planar().revolute("bar", "bar", at=(0, 0)),
+        "a and b of a revolute joint must be two bodies; given 'bar' twice",
+        "give two bodies",
+    ),
+    of_planar(
+        "an axis of length zero",
+        lambda: planar().prismatic("bar", "block", at=(0, 0), axis=(0, 0)),
+        "axis must have a direction",
+        "give a vector other than zero",
+    ),
+    of_planar(
+        "a point on another body",
+        point_of_another,
+        "must be a point on 'bar'; given one on 'block'",
+        "the first point is one of a, the second one of b",
+    ),
+    of_planar(
+        "a single point of a body",
+        lambda: (model := planar()).revolute("bar", "block", at=model.bodies[0].point(0.0, 0.0)),
+        "at must be a point in space, or a pair of points",
+        "give a point of each body",
+        TypeError,
+    ),
+    of_planar(
+        "a distance of points that coincide",
+        lambda: planar().distance("bar", (1, 0), "block", (1, 0)),
+        "coincide in the position given",
+        "give a length, or take a revolute joint",
+    ),
+    of_planar(
+        "a negative stiffness",
+        lambda: planar().spring("bar", (0, 0), "block", (1, 0), stiffness=-1.0),
+        "stiffness must not be negative; given -1.0",
+        "give N/m; for a force that pushes away, force(...)",
+    ),
+    of_planar(
+        "a damper without a length",
+        lambda: planar().spring("bar", (0, 0), "block", (1, 0), stiffness=1.0, damping=1.0, length=0.0),
+        "has no direction where its points meet",
+        "give a length, or the damper as a force",
+    ),
+    of_planar(
+        "a force on the ground",
+        lambda: planar().force("ground", (0, 0), (1.0, 0.0)),
+        "body must be a body that moves; given the ground",
+        "leave it out, or let it act on a body",
+    ),
+    of_planar(
+        "a force of three components",
+        lambda: planar().force("bar", (0, 0), (1, 0, 0)),
+        "f of 'force on bar' must be 2 finite numbers",
+        "give x and y",
+    ),
+    of_planar(
+        "a force of t and q",
+        lambda: planar().force("bar", (0, 0), lambda t, q: (1.0, 0.0)),
+        r"is called as \(t\) or \(t, q, v\); the function given takes 2 arguments",
+        "take t, q and v",
+        TypeError,
+    ),
+    of_planar(
+        "a function that returns another shape",
+        lambda: (m := planar(), m.force("bar", (0, 0), lambda t: 1.0), m.problem()),
+        "must return shape",
+        "return one number for each component",
+    ),
+    of_planar(
+        "an unknown joint",
+        lambda: planar().motor("pins", 1.0),
+        "joint must be one of this model, 'pin'",
+        "give its name",
+    ),
+    of_planar(
+        "a joint of another model",
+        lambda: planar().motor(planar().joints[0], 1.0),
+        "'pin' belongs to another",
+        "give a joint of the same model",
+    ),
+    of_planar(
+        "a motor in a distance",
+        lambda: (m := planar()).motor(m.distance("bar", (0, 0), "block", (1, 0)), 1.0),
+        "motor needs a revolute or prismatic joint; given 'distance bar-block', which is distance",
+        "let a force or a spring act between the points",
+    ),
+    of_planar("a number for a motion", drive(1.0), "must be a function of t", "give lambda t: ...", TypeError),
+    of_planar(
+        "a motion that branches",
+        drive(lambda t: 0.0 if t < 1.0 else t),
+        "derivatives do not follow from it.*give rate= and acceleration=",
+        "give its derivatives, or write it without branches",
+    ),
+    of_planar(
+        "`rate` without `acceleration`",
+        drive(lambda t: t, rate=lambda t: 1.0),
+        "rate and acceleration .* go together",
+        "give both, or none",
+        TypeError,
+    ),
+    of_spatial(
+        "an inertia that is not positive",
+        solid(inertia=(1.0, 1.0, 0.0)),
+        "inertia of 'arm' must be symmetric and positive definite",
+        "give a thin rod a small moment about its axis",
+    ),
+    of_spatial(
+        "an inertia of two numbers", solid(inertia=(1.0, 1.0)), "must be three finite moments", "give J or its diagonal"
+    ),
+    of_spatial(
+        "a rotation that is none",
+        solid(rotation=np.ones((3, 3))),
+        r"rotation of 'arm' must be a rotation matrix \(3, 3\)",
+        "columns are the axes of the body, right-handed",
+    ),
+    of_spatial(
+        "axes of a universal joint that are not perpendicular",
+        lambda: spatial().universal("ground", "bar", at=(0, 0, 0), axes=((1, 0, 0), (1, 1, 0))),
+        "axes of 'universal bar-ground' must be perpendicular",
+        "give the two axes of the cross",
+    ),
+    of_problem("a model without bodies", lambda: PlanarModel().problem(), "has no bodies", "add bodies first"),
+    of_problem(
+        "a loop that cannot close",
+        lambda: rough(2.3),
+        r"cannot be put together: the joint '.*' does not close",
+        "look at the lengths around the loop",
+    ),
+    of_problem(
+        "a velocity that joints do not allow",
+        locked,
+        "do not allow the velocities given: the rate of angle of bar was to be 2",
+        "give velocities of fewer bodies",
+    ),
+    of_problem(
+        "two drives that contradict", two_drives, "too many constraints for the motion asked", "leave one of them out"
+    ),
+    of_problem(
+        "a drive that begins far away",
+        half_a_turn,
+        "the bodies end half a turn from it",
+        "give the bodies near to where the motion begins",
+    ),
+    of_problem(
+        "an unknown parameter",
+        lambda: rough(1.9).with_parameters({"mass of three": 1.0}),
+        "'arms' has no parameter 'mass of three'",
+        "names are in problem.parameters",
+    ),
+    of_problem(
+        "a mass that becomes negative",
+        lambda: rough(1.9).with_parameters({"mass of two": -1.0}),
+        "mass of two must be positive",
+        "give a positive mass",
+    ),
+    of_problem(
+        "a length that no longer fits",
+        lambda: rough(1.9).with_parameters({"x of end on ground": 2.5}),
+        "cannot be put together",
+        "change other lengths with it",
+    ),
+]

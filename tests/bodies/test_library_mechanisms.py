@@ -1,0 +1,319 @@
+"""Ready mechanisms of the library, written with bodies and joints, move as the library has them."""
+
+import math
+
+import numpy as np
+import pytest
+
+from twoloop import solve_dae
+from twoloop.bodies import PlanarModel, SpatialModel
+from twoloop.mechanisms import (
+    andrews,
+    bricard,
+    driven_slider_crank,
+    four_bar,
+    governor,
+    heavy_top,
+    redundant_slider_crank,
+    spatial_four_bar,
+    spatial_slider_crank,
+    sundials_slider_crank,
+)
+from twoloop.mechanisms.andrews import (
+    DA,
+    EE,
+    FF,
+    LENGTH,
+    RA,
+    RR,
+    SA,
+    SB,
+    SC,
+    SD,
+    SPRING,
+    TA,
+    TB,
+    TORQUE,
+    UA,
+    UB,
+    XA,
+    XB,
+    XC,
+    YA,
+    YB,
+    YC,
+    ZT,
+    D,
+    U,
+)
+from twoloop.mechanisms.rotation import rotation_matrix
+from twoloop.mechanisms.spatial_four_bar import inertia as round_bar
+
+pytestmark = pytest.mark.filterwarnings("ignore::twoloop.ConstraintWarning")
+
+TIMES = np.linspace(0.0, 1.0, 6)
+
+
+def run(problem, end, tolerance):
+    result = solve_dae(
+        problem.system,
+        (0.0, end),
+        problem.q0,
+        problem.v0,
+        "DOP853",
+        t_eval=end * TIMES,
+        rtol=tolerance,
+        atol=tolerance,
+        compiled=False,
+    )
+    assert result.success, result.message
+    return result
+
+
+def both(model, known, end, tolerance=1e-11, conserved=True, energy=True):
+    """Runs of a model and of a ready problem; their energies move alike."""
+    made = model.problem((0.0, end))
+    assert made.conserved == conserved
+    one, other = run(made, end, tolerance), run(known, end, tolerance)
+    energies = [problem.energy(each.t, each.q, each.v) for problem, each in ((made, one), (known, other))]
+    if energy:
+        scale = 1.0 + np.abs(energies[1] - energies[1][0]).max()
+        np.testing.assert_allclose(energies[0] - energies[0][0], energies[1] - energies[1][0], atol=1e-8 * scale)
+    return made, one.q, other.q
+
+
+def test_four_bar():
+    known = four_bar()
+    lengths, q, v = (1.0, 2.0, 1.5), known.q0.reshape(3, 3), known.v0.reshape(3, 3)
+    model = PlanarModel()
+    for name, long, state, rate in zip(("bar 1", "bar 2", "bar 3"), lengths, q, v, strict=True):
+        model.body(name, mass=long, inertia=long**3 / 12.0, position=state[:2], angle=state[2], velocity=rate[:2])
+    along = [
+        0.5 * long * np.array([math.cos(state[2]), math.sin(state[2])]) for long, state in zip(lengths, q, strict=True)
+    ]
+    model.revolute("ground", "bar 1", at=(0.0, 0.0))
+    model.revolute("bar 1", "bar 2", at=q[0, :2] + along[0])
+    model.revolute("bar 2", "bar 3", at=q[1, :2] + along[1])
+    model.revolute("bar 3", "ground", at=(3.0, 0.0))
+    made, one, other = both(model, known, 5.0)
+    np.testing.assert_allclose(one, other, atol=1e-8)
+    assert made.freedom.degrees == 1 and made.freedom.redundant == () and made.tags[0] == "closed chain"
+
+
+def slider_crank(angular_velocity=None):
+    crank, rod, masses = 0.5, 1.2, (1.0, 1.5, 0.8)
+    angle = 0.5
+    pin = crank * np.array([math.cos(angle), math.sin(angle)])
+    tilt = -math.asin(pin[1] / rod)
+    end = pin + rod * np.array([math.cos(tilt), math.sin(tilt)])
+    model = PlanarModel()
+    one = model.body(
+        "crank",
+        mass=masses[0],
+        inertia=masses[0] * crank**2 / 12.0,
+        position=0.5 * pin,
+        angle=angle,
+        angular_velocity=angular_velocity,
+    )
+    two = model.body("rod", mass=masses[1], inertia=masses[1] * rod**2 / 12.0, position=0.5 * (pin + end), angle=tilt)
+    three = model.body("slider", mass=masses[2], inertia=0.02, position=end)
+    hinge = model.revolute("ground", one, at=(0.0, 0.0))
+    model.revolute(one, two, at=pin)
+    model.revolute(two, three, at=end)
+    model.prismatic("ground", three, at=end, axis=(1.0, 0.0))
+    return model, hinge, pin, end
+
+
+def test_redundant_slider_crank():
+    model, _, pin, end = slider_crank(angular_velocity=8.0)
+    model.distance("slider", end, "crank", pin)
+    made, one, other = both(model, redundant_slider_crank(), 2.0)
+    np.testing.assert_allclose(one, other, atol=1e-8)
+    assert "redundant" in made.tags and made.freedom.degrees == 1
+    assert [set(group) for group in made.freedom.redundant] == [
+        {"revolute crank-rod", "revolute rod-slider", "distance slider-crank"}
+    ]
+
+
+@pytest.mark.parametrize("motion", ["derived", "given"])
+def test_driven_slider_crank(motion):
+    model, hinge, _, _ = slider_crank()
+    derivatives = (
+        {}
+        if motion == "derived"
+        else {
+            "rate": lambda t: 4.0 + 0.9 * math.cos(3.0 * t),
+            "acceleration": lambda t: -2.7 * math.sin(3.0 * t),
+        }
+    )
+    model.drive(hinge, lambda t: 4.0 * t + 0.3 * np.sin(3.0 * t), **derivatives)
+    made, one, other = both(model, driven_slider_crank(), 2.0, conserved=False)
+    np.testing.assert_allclose(one, other, atol=1e-8)
+    assert made.freedom.degrees == 0 and "driven" in made.tags
+
+
+def test_andrews():
+    known = andrews()
+    beta, theta, gamma, phi, delta, omega, epsilon = known.q0
+    A, B, C = np.array([XA, YA]), np.array([XB, YB]), np.array([XC, YC])
+
+    def turned(angle, x, y):
+        return np.array([math.cos(angle) * x - math.sin(angle) * y, math.sin(angle) * x + math.cos(angle) * y])
+
+    pin = turned(beta, RR, 0.0)
+    shared = pin + turned(beta + theta, -D, 0.0)
+    fourth, sixth = A + turned(delta, ZT, 0.0), A + turned(epsilon, 0.0, -U)
+    model = PlanarModel(gravity=(0.0, 0.0), name="squeezer")
+    centres = (
+        (turned(beta, RA, 0.0), beta),
+        (pin + turned(beta + theta, -DA, 0.0), beta + theta),
+        (B + turned(gamma, SB, -SA), gamma),
+        (fourth + turned(phi + delta, 0.0, -EE), phi + delta),
+        (A + turned(delta, TA, TB), delta),
+        (sixth + turned(omega + epsilon, FF, 0.0), omega + epsilon),
+        (A + turned(epsilon, -UB, -UA), epsilon),
+    )
+    masses, inertias = known.parameters["masses"], known.parameters["inertias"]
+    k = [
+        model.body(f"K{i + 1}", mass=masses[i], inertia=inertias[i], position=place, angle=angle)
+        for i, (place, angle) in enumerate(centres)
+    ]
+    ground = model.ground
+    for one, other, at in (
+        (ground, k[0], (0.0, 0.0)),
+        (k[0], k[1], pin),
+        (k[1], k[2], shared),
+        (k[1], k[3], shared),
+        (k[1], k[5], shared),
+        (k[2], ground, B),
+        (k[3], k[4], fourth),
+        (k[4], ground, A),
+        (k[5], k[6], sixth),
+        (k[6], ground, A),
+    ):
+        model.revolute(one, other, at=at)
+    model.spring(ground, C, k[2], B + turned(gamma, SD, -SC), stiffness=SPRING, length=LENGTH)
+    model.torque(k[0], TORQUE)
+    made, one, other = both(model, known, 0.03, conserved=False, energy=False)
+    np.testing.assert_allclose(one[2], other[0], atol=1e-7)
+    np.testing.assert_allclose(one[8], other[2], atol=1e-8)
+    np.testing.assert_allclose(one[14], other[4], atol=1e-8)
+    assert made.freedom.degrees == 1
+
+
+def test_sundials_slider_crank():
+    known = sundials_slider_crank()
+    model = PlanarModel(gravity=(0.0, 0.0))
+    tilt = math.asin(-0.5)
+    pin, end = np.array([0.0, 0.5]), np.array([math.cos(tilt), 0.0])
+    centre = 0.5 * (pin + end)
+    light = 1e-10  # crank and rod of the example have moments about their ends alone
+    crank = model.body("crank", mass=light, inertia=1.0, position=(0.0, 0.0), angle=0.5 * math.pi)
+    rod = model.body("rod", mass=light, inertia=2.0, position=end, angle=tilt)
+    slider = model.body("slider", mass=1.0, inertia=1.0, position=end)
+    model.revolute("ground", crank, at=(0.0, 0.0))
+    model.revolute(crank, rod, at=pin)
+    model.revolute(rod, slider, at=end)
+    model.prismatic("ground", slider, at=end, axis=(2.0, 0.0))
+    model.spring(crank, 0.5 * pin, rod, centre, stiffness=1.0, damping=1.0, length=1.0)
+    model.force(rod, 2.0 * end - pin, (1.0, 0.0))
+    _, one, other = both(model, known, 5.0, conserved=False, energy=False)
+    np.testing.assert_allclose(one[[2, 6, 5]], other, atol=1e-8)
+
+
+def box(mass, x, y, z):
+    return mass * (y * y + z * z) / 12.0, mass * (x * x + z * z) / 12.0, mass * (x * x + y * y) / 12.0
+
+
+def test_bricard():
+    C = np.array([[0, 0, 0], [1, 0, 0], [1, -1, 0], [1, -1, 1], [0, -1, 1], [0, 0, 1]], dtype=float)
+    axes = np.eye(3)[[1, 2, 0, 1, 2, 0]]
+    model = SpatialModel(gravity=(0.0, -9.81, 0.0))
+    bars = [model.ground]
+    for k in range(5):
+        R = np.column_stack([C[k + 1] - C[k], axes[k], np.cross(C[k + 1] - C[k], axes[k])])
+        moments = box(1.0, 1.0, 0.1, 0.1)
+        bars.append(model.body(f"bar {k + 1}", mass=1.0, inertia=moments, position=0.5 * (C[k] + C[k + 1]), rotation=R))
+    bars.append(model.ground)
+    for k in range(6):
+        model.revolute(bars[k], bars[k + 1], at=C[k], axis=axes[k])
+    made, one, other = both(model, bricard(), 1.0)
+    np.testing.assert_allclose(one.reshape(5, 7, -1)[:, :3], other.reshape(5, 12, -1)[:, :3], atol=1e-8)
+    assert made.freedom.degrees == 1 and len(made.freedom.redundant[0]) == 6
+
+
+def spatial_as_given(known, masses, inertias, gravity=(0.0, 0.0, -9.81)):
+    """A model with bodies as a problem of spatial bodies starts."""
+    model = SpatialModel(gravity)
+    names = [each.split(" of ")[1] for each in known.coordinates[::7]]
+    q, v = known.q0.reshape(-1, 7), known.v0.reshape(-1, 7)
+    for name, mass, moments, state, rate in zip(names, masses, inertias, q, v, strict=True):
+        e, u = state[3:], rate[3:]
+        R = rotation_matrix(e)
+        spin = 2.0 * (e[0] * u[1:] - u[0] * e[1:] + np.cross(e[1:], u[1:]))
+        model.body(
+            name, mass=mass, inertia=moments, position=state[:3], rotation=R, velocity=rate[:3], angular_velocity=spin
+        )
+    return model
+
+
+def test_spatial_four_bar():
+    known = spatial_four_bar()
+    masses = known.parameters["masses"].values()
+    lengths = (0.3, known.parameters["coupler"], 0.7)
+    inertias = [round_bar(mass, long) for mass, long in zip(masses, lengths, strict=True)]
+    model = spatial_as_given(known, masses, inertias)
+    D = np.array([0.9, 0.0, 0.3])
+    model.revolute("ground", "crank", at=(0.0, 0.0, 0.0), axis=(0.0, 0.0, 3.0))
+    model.spherical("crank", "coupler", at=(0.3, 0.0, 0.0))
+    model.spherical("coupler", "rocker", at=np.add(D, (0.0, 0.0, 0.7)))
+    model.revolute("rocker", "ground", at=D, axis=(0.0, 1.0, 0.0))
+    made, one, other = both(model, known, 2.0)
+    np.testing.assert_allclose(one, other, atol=1e-8)
+    assert made.freedom.degrees == 2
+
+
+def test_spatial_slider_crank():
+    known = spatial_slider_crank()
+    model = spatial_as_given(known, known.parameters["masses"].values(), known.parameters["inertias"].values())
+    x, R = np.array([1.0, 0.0, 0.0]), rotation_matrix(known.q0[10:14])
+    A = np.array([0.0, 0.1, 0.12])
+    end = known.q0[14:17]
+    model.revolute("crank", "ground", at=A, axis=x)
+    model.spherical("crank", "rod", at=np.add(A, (0.0, 0.0, 0.08)))
+    model.universal("rod", "slider", at=end, axes=(R[:, 1], x))
+    model.prismatic("ground", "slider", at=(0.0, 0.0, 0.0), axis=x)
+    made, one, other = both(model, known, 5.0)
+    np.testing.assert_allclose(one, other, atol=1e-8)
+    assert made.freedom.degrees == 1
+
+
+def test_governor():
+    known = governor()
+    bar, cube = 0.3, 3.0
+    centre = (0.5 * bar + 5.0) / (bar + 5.0)
+    axial, across, _ = box(bar, 1.0, 0.01, 0.01)
+    across += bar * (centre - 0.5) ** 2 + 5.0 * (1.0 - centre) ** 2
+    rod = (axial, across, across)
+    masses = (bar, cube, bar + 5.0, bar + 5.0)
+    inertias = (box(bar, 0.01, 0.01, 1.0), box(cube, 0.1, 0.1, 0.1), rod, rod)
+    model = spatial_as_given(known, masses, inertias)
+    z, y = np.array([0.0, 0.0, 1.0]), np.array([0.0, 1.0, 0.0])
+    model.revolute("ground", "shaft", at=(0.0, 0.0, 0.0), axis=z)
+    model.prismatic("shaft", "slider", at=0.5 * z, axis=z)
+    for name, side in (("rod A", 1.0), ("rod B", -1.0)):
+        hinge, end = np.array([side * 0.05, 0.0, 1.0]), np.array([side * 0.05, 0.0, 0.5])
+        along = np.array([side * math.cos(math.radians(30.0)), 0.0, -math.sin(math.radians(30.0))])
+        model.revolute("shaft", name, at=hinge, axis=y)
+        model.spring(name, hinge + 0.5 * along, "slider", end, stiffness=8e5, damping=4e4, length=0.5)
+    made, one, other = both(model, known, 0.02, tolerance=1e-10, conserved=False)
+    np.testing.assert_allclose(one, other, atol=1e-8)
+    assert made.freedom.degrees == 4
+
+
+def test_heavy_top():
+    known = heavy_top()
+    model = spatial_as_given(known, [15.0], [(0.234375, 0.46875, 0.234375)])
+    model.spherical("ground", "top", at=(0.0, 0.0, 0.0))
+    _, one, other = both(model, known, 0.2)
+    np.testing.assert_allclose(one, other, atol=1e-8)

@@ -1,0 +1,232 @@
+"""Models from MJCF and back: the same motion as those written by hand."""
+
+import numpy as np
+import pytest
+
+from tests.bodies.random_models import Both
+from twoloop import solve_dae
+from twoloop.bodies import IgnoredWarning, SpatialModel, from_mjcf
+from twoloop.bodies.mjcf_geometry import geom_lump
+from twoloop.mechanisms.rotation import rotation_matrix
+
+pytestmark = pytest.mark.filterwarnings("ignore::twoloop.ConstraintWarning")
+
+LEG = """
+<mujoco model="leg">
+  <compiler angle="degree" eulerseq="XYZ"/>
+  <option gravity="0 0 -9.81" timestep="0.002"/>
+  <default>
+    <joint damping="0.05"/>
+    <geom contype="0" conaffinity="0" density="500"/>
+    <default class="stiff"><joint stiffness="3" springref="20"/></default>
+  </default>
+  <worldbody>
+    <light pos="0 0 3"/>
+    <body name="hip" pos="0 0 1" euler="0 30 0">
+      <joint name="hip" axis="0 1 0"/>
+      <geom type="capsule" fromto="0 0 0 0 0 -0.4" size="0.04"/>
+      <body name="plate" pos="0 0 -0.2" quat="0.5 0.5 0.5 0.5">
+        <geom type="box" size="0.05 0.02 0.03" mass="0.2"/>
+      </body>
+      <body name="shin" pos="0 0 -0.4" axisangle="0 1 0 -60">
+        <joint name="knee" axis="0 2 0" class="stiff" damping="0.1"/>
+        <inertial pos="0 0 -0.2" mass="0.8" diaginertia="0.02 0.021 0.004" zaxis="1 0 1"/>
+        <geom type="sphere" size="0.1"/>
+      </body>
+    </body>
+    <body name="bob" pos="1 0 0.5"><freejoint/><geom type="ellipsoid" size="0.1 0.2 0.3"/></body>
+  </worldbody>
+</mujoco>
+"""
+
+
+def read(text, folder):
+    path = folder / "model.xml"
+    path.write_text(text)
+    return from_mjcf(path)
+
+
+def end(model, end=0.5, **options):
+    problem = model.problem((0.0, end))
+    result = solve_dae(problem.system, problem.t_span, problem.q0, problem.v0, "DOP853", rtol=1e-11, atol=1e-11)
+    assert result.success
+    return problem, result.q[:, -1].reshape(-1, 7)
+
+
+def about_y(degrees):
+    half = np.radians(degrees) / 2.0
+    return rotation_matrix([np.cos(half), 0.0, np.sin(half), 0.0])
+
+
+def test_a_leg_by_hand_and_from_a_file(tmp_path):
+    read_model = read(LEG, tmp_path)
+    hand = SpatialModel()
+    r, h, density = 0.04, 0.2, 500.0
+    pipe, ball = density * np.pi * r**2 * 2.0 * h, density * 4.0 / 3.0 * np.pi * r**3
+    across = pipe * (h**2 / 3.0 + r**2 / 4.0) + ball * (0.4 * r**2 + h**2 + 0.75 * h * r)
+    thigh = np.diag([across, across, 0.5 * pipe * r**2 + 0.4 * ball * r**2])
+    edges = np.array([0.03, 0.05, 0.02]) ** 2  # turned by 120 degrees, that is x to y to z
+    thigh += 0.2 * np.diag(edges.sum() - edges) / 3.0  # both have their centres at -0.2
+    R, S = about_y(30.0), about_y(-30.0)
+    top, knee = np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.0, 1.0]) + R @ [0.0, 0.0, -0.4]
+    one = hand.body("hip", mass=pipe + ball + 0.2, inertia=thigh, position=top + R @ [0.0, 0.0, -0.2], rotation=R)
+    J = about_y(45.0) @ np.diag([0.02, 0.021, 0.004]) @ about_y(45.0).T
+    two = hand.body("shin", mass=0.8, inertia=J, position=knee + S @ [0.0, 0.0, -0.2], rotation=S)
+    hip = hand.revolute("ground", one, at=top, axis=(0.0, 1.0, 0.0))
+    bend = hand.revolute(one, two, at=knee, axis=(0.0, 1.0, 0.0))
+    hand.torsion_spring(hip, stiffness=0.0, damping=0.05)
+    hand.torsion_spring(bend, stiffness=3.0, damping=0.1, angle=np.radians(20.0))
+    squares = np.array([0.1, 0.2, 0.3]) ** 2
+    mass = density * 4.0 / 3.0 * np.pi * 0.006
+    hand.body("bob", mass=mass, inertia=mass * (squares.sum() - squares) / 5.0, position=(1.0, 0.0, 0.5))
+    (made, one), (_, other) = end(read_model), end(hand)
+    np.testing.assert_allclose(one, other, atol=1e-9)
+    assert read_model.name == "leg" and made.freedom.degrees == 8 and read_model.ignored == ()
+    assert [joint.name for joint in read_model.joints] == ["joint hip", "knee"]  # as a body is called hip
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_random_models_written_and_read_again_move_alike(seed, tmp_path):
+    both = Both(seed, False, n=6)
+    kinds = ("revolute", "universal", "cylindrical", "table", "prismatic", "spherical", "fixed")
+    joints = {}
+    for k in range(6):
+        kind = kinds[(k + 2 * seed) % 7]
+        i, j = (None if k == 0 else k - 1, k) if (k + seed) % 3 else (k, None if k == 0 else k - 1)
+        joints[kind] = (i, j, getattr(both, kind)(i, j))
+    both.spring(0, 3)
+    both.spring(None, 5)
+    for kind in ("revolute", "prismatic"):
+        if kind in joints:
+            joint = joints[kind][2][0]
+            spring = both.model.torsion_spring if kind == "revolute" else both.model.axial_spring
+            spring(joint, stiffness=2.0, damping=0.1, **{"angle" if kind == "revolute" else "length": 0.4})
+    both.model.to_mjcf(tmp_path / "written.xml")
+    again = from_mjcf(tmp_path / "written.xml")
+    (made, one), (other_made, other) = end(both.model, 0.3), end(again, 0.3)
+    assert made.freedom.degrees == other_made.freedom.degrees
+    welded = joints["fixed"][:2] if "fixed" in joints else ()  # are one body when they are read
+    for k, body in enumerate(again.bodies):
+        number = next(each.number for each in both.handles if each.name == body.name)
+        if number not in welded:
+            np.testing.assert_allclose(other[k, :3], one[number, :3], atol=1e-8)
+
+
+def four_bar():
+    model = SpatialModel(name="loop")
+    points = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 1.0], [2.0, 0.3, 1.5], [2.5, 0.3, 0.0]])
+    for k in range(3):
+        model.rod(f"bar {k}", points[k], points[k + 1], radius=0.03, mass=1.0 + k)
+    y = (0.0, 1.0, 0.0)
+    model.revolute("ground", "bar 0", at=points[0], axis=y)
+    model.spherical("bar 0", "bar 1", at=points[1])
+    model.spherical("bar 1", "bar 2", at=points[2])
+    model.revolute("bar 2", "ground", at=points[3], axis=y)
+    return model
+
+
+def test_loops_are_closed_again(tmp_path):
+    model = four_bar()
+    model.to_mjcf(tmp_path / "loop.xml")
+    text = (tmp_path / "loop.xml").read_text()
+    assert text.count("<connect") == 1 and text.count('type="hinge"') == 2 and text.count('type="ball"') == 1
+    (_, one), (made, other) = end(model), end(from_mjcf(tmp_path / "loop.xml"))
+    order = [int(name[-1]) for name in made.names[::7]]
+    np.testing.assert_allclose(other[:, :3], one[order, :3], atol=1e-8)
+    door = SpatialModel()
+    door.body("door", mass=2.0, inertia=(1.0, 1.0, 1.0), position=(1.0, 0.0, 0.0))
+    for z in (0.0, 0.3):
+        door.revolute("ground", "door", at=(0.0, 0.0, z), axis=(0.0, 0.2, 1.0), name=f"hinge {z}")
+    door.to_mjcf(tmp_path / "door.xml")
+    again = from_mjcf(tmp_path / "door.xml").problem()
+    assert again.freedom.degrees == 0 and door.problem().freedom.degrees == 0  # hinges not in line
+    door.fixed("door", "ground")
+    door.to_mjcf(tmp_path / "door.xml")
+    assert "<weld" in (tmp_path / "door.xml").read_text()
+    assert len(from_mjcf(tmp_path / "door.xml").joints) == 4
+
+
+def test_what_is_not_read_is_listed(tmp_path):
+    text = """
+    <mujoco>
+      <worldbody>
+        <geom type="plane" size="1 1 1"/>
+        <body name="arm"><joint name="j" range="0 90" armature="0.1" frictionloss="1"/><geom size="0.1"/></body>
+      </worldbody>
+      <actuator><motor name="m" joint="j"/></actuator>
+      <sensor><jointpos joint="j"/></sensor>
+      <equality><joint name="e" joint1="j"/></equality>
+    </mujoco>"""
+    with pytest.warns(IgnoredWarning, match="armature of joint 'j'"):
+        model = read(text, tmp_path)
+    assert model.ignored == (
+        "actuator: motor 'm'",
+        "sensor: jointpos",
+        "limits of joint 'j'",
+        "armature of joint 'j'",
+        "frictionloss of joint 'j'",
+        "equality: joint 'e'",
+        "contacts between geoms",
+    )
+    model = four_bar()
+    model.motor(model.joints[0], 1.0)
+    model.drive(model.joints[3], lambda t: t)
+    with pytest.warns(IgnoredWarning, match="without drive of .*; motor of "):
+        model.to_mjcf(tmp_path / "out.xml")
+
+
+@pytest.mark.parametrize(
+    ("body", "message"),
+    [
+        ('<joint/><joint axis="1 0 0"/><joint axis="0 1 0"/><geom size="1"/>', "are none that a model has"),
+        ("<joint/>", "has joints but no mass"),
+        ('<joint axis="0 0 0"/><geom size="1"/>', "must have a direction"),
+        ('<joint/><geom type="capsule" size="1"/>', "must be 2 positive numbers"),
+        ('<joint/><inertial mass="1"/>', "diaginertia of .* must be 3 finite numbers"),
+        ('<joint class="none"/><geom size="1"/>', "of the class 'none', which no default has"),
+        ('<frame/><geom size="1"/>', "<frame> is not read"),
+        ('<joint pos="1 x 2"/><geom size="1"/>', "pos of joint 'joint of b' must be 3 finite numbers"),
+    ],
+)
+def test_what_cannot_be_read_is_said(body, message, tmp_path):
+    with pytest.raises(ValueError, match=message):
+        read(f'<mujoco><worldbody><body name="b">{body}</body></worldbody></mujoco>', tmp_path)
+
+
+def test_files_that_are_none(tmp_path):
+    for text, message in (("<robot/>", "must begin with <mujoco>"), ("<mujoco>", "is not XML")):
+        with pytest.raises(ValueError, match=message):
+            read(text, tmp_path)
+    with pytest.raises(ValueError, match=r"includes 'other.xml'"):
+        read('<mujoco><include file="other.xml"/></mujoco>', tmp_path)
+    with pytest.raises(FileNotFoundError):
+        from_mjcf(tmp_path / "missing.xml")
+    model = four_bar()
+    model.distance("bar 0", (0.0, 0.0, 0.5), "ground", (1.0, 0.0, 0.0))
+    with pytest.raises(ValueError, match="no counterpart of 'distance bar 0-ground'"):
+        model.to_mjcf(tmp_path / "out.xml")
+    model = four_bar()
+    model.universal("bar 0", "bar 2", at=(0.0, 0.0, 0.0), axes=((1.0, 0.0, 0.0), (0.0, 1.0, 0.0)))
+    for k in range(3):
+        model.universal("ground", f"bar {k}", at=(0.0, 0.0, 0.0), axes=((1.0, 0.0, 0.0), (0.0, 1.0, 0.0)))
+    with pytest.raises(ValueError, match="closes a loop"):
+        model.to_mjcf(tmp_path / "out.xml")
+
+
+def test_solids_against_sums_over_points():
+    points = np.random.default_rng(1).uniform(-1.0, 1.0, (400_000, 3))
+    for kind, size, inside in (
+        ("ellipsoid", "0.5 1 0.7", lambda x, y, z: (x / 0.5) ** 2 + y**2 + (z / 0.7) ** 2 < 1.0),
+        ("cylinder", "0.6 0.8", lambda x, y, z: (x**2 + y**2 < 0.36) & (abs(z) < 0.8)),
+        (
+            "capsule",
+            "0.4 0.5",
+            lambda x, y, z: x**2 + y**2 + np.maximum(abs(z) - 0.5, 0.0) ** 2 < 0.16,
+        ),
+        ("box", "0.3 0.5 0.9", lambda x, y, z: (abs(x) < 0.3) & (abs(y) < 0.5) & (abs(z) < 0.9)),
+    ):
+        held = points[inside(*points.T)]
+        lump = geom_lump({"type": kind, "size": size, "density": "2"}, kind, True, "xyz")
+        assert lump.mass == pytest.approx(2.0 * 8.0 * len(held) / len(points), rel=0.01)
+        J = lump.mass * (np.mean((held**2).sum(axis=1)) * np.eye(3) - held.T @ held / len(held))
+        np.testing.assert_allclose(lump.J, J, atol=0.02 * lump.J.max())

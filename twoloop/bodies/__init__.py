@@ -1,0 +1,8 @@
+"""Mechanisms from bodies and joints: masses, joints and forces in, a `Problem` with its equations out."""
+
+from twoloop.bodies.mjcf_geometry import IgnoredWarning
+from twoloop.bodies.mjcf_reader import from_mjcf
+from twoloop.bodies.planar_model import PlanarModel
+from twoloop.bodies.spatial_model import SpatialModel
+
+__all__ = ["IgnoredWarning", "PlanarModel", "SpatialModel", "from_mjcf"]

@@ -1,0 +1,202 @@
+"""What a model collects: bodies, joints and forces under names of their own, and how arguments name them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from twoloop.bodies.functions import Function, force_function
+from twoloop.bodies.parameter_layout import NONE
+from twoloop.bodies.parts import Body, BodyDirection, BodyPoint, Force, JointRow, ModelJoint, Numbers
+from twoloop.checks.arguments import check_positive, check_text, check_vector, shown
+
+Array = NDArray[np.float64]
+Points = tuple[Numbers, Numbers]
+
+AXES = ("x", "y", "z")
+
+
+class Collection:
+    """Bodies, joints and forces, in two or three dimensions."""
+
+    dimension: int
+
+    def __init__(self, gravity: ArrayLike, name: str):
+        self.gravity = check_vector("gravity", gravity, self.dimension)
+        self.name = check_text("name", name)
+        zero = np.zeros(self.dimension)
+        self.ground = Body("ground", NONE, zero, self._no_rotation(), np.zeros(0))
+        self.bodies: list[Body] = []
+        self.joints: list[ModelJoint] = []
+        self.forces: list[Force] = []
+
+    def __repr__(self) -> str:
+        return (
+            f"{type(self).__name__}({self.name!r}: {len(self.bodies)} bodies, {len(self.joints)} joints and drives, "
+            f"{len(self.forces)} forces)"
+        )
+
+    def _no_rotation(self) -> Any:
+        """The angle, or the matrix, of the ground."""
+        raise NotImplementedError
+
+    def _add_body(self, body: Body) -> Body:
+        self.bodies.append(body)
+        return body
+
+    def _add_joint(self, joint: ModelJoint) -> ModelJoint:
+        self.joints.append(joint)
+        return joint
+
+    def _add_force(self, force: Force) -> Force:
+        self.forces.append(force)
+        return force
+
+    def _new_name(self, what: str, name: str | None, *bodies: Body) -> str:
+        """A name that nothing else has: the one given, or one of the kind and the bodies."""
+        known = {each.name for part in (self.bodies, self.joints, self.forces) for each in part} | {"ground"}
+        if name is not None:
+            if not check_text("name", name).strip():
+                raise ValueError(f"name must not be empty; given {name!r}")
+            if name in known:
+                raise ValueError(f"name must be new in the model: something is called {name!r} already")
+            return name
+        ordered = bodies[::-1] if bodies and bodies[0].number == NONE else bodies
+        made = f"{what} {'-'.join(body.name for body in ordered)}" if bodies else what
+        number = 2
+        while (new := made if number == 2 and made not in known else f"{made} {number}") in known:
+            number += 1
+        return new
+
+    def _body(self, argument: str, given: Any) -> Body:
+        """A body of this model, by itself or by its name."""
+        if isinstance(given, Body):
+            if given is self.ground or any(given is body for body in self.bodies):
+                return given
+            raise ValueError(f"{argument} must be a body of this model; {given.name!r} belongs to another")
+        if not isinstance(given, str):
+            raise TypeError(f"{argument} must be a body, what body(...) returned, or its name; given {shown(given)}")
+        for body in (self.ground, *self.bodies):
+            if body.name == given:
+                return body
+        known = ", ".join(repr(body.name) for body in (self.ground, *self.bodies))
+        raise ValueError(f"{argument} must be a body of this model, {known}; given {given!r}")
+
+    def _moving_body(self, argument: str, given: Any) -> Body:
+        body = self._body(argument, given)
+        if body is self.ground:
+            raise ValueError(f"{argument} must be a body that moves; given the ground")
+        return body
+
+    def _different(self, kind: str, a: Body, b: Body) -> None:
+        if a is b:
+            raise ValueError(f"a and b of a {kind} must be two bodies; given {a.name!r} twice")
+
+    def _joint(self, given: Any, kinds: tuple[str, ...], what: str) -> ModelJoint:
+        """A joint of this model of one of some kinds, by itself or by its name."""
+        found = next((joint for joint in self.joints if given is joint or joint.name == given), None)
+        if found is None:
+            if not isinstance(given, (ModelJoint, str)):
+                raise TypeError(
+                    f"joint must be what revolute(...) and its kin returned, or its name; given {shown(given)}"
+                )
+            if isinstance(given, ModelJoint):
+                raise ValueError(f"joint must be one of this model; {given.name!r} belongs to another")
+            known = ", ".join(repr(joint.name) for joint in self.joints) or "none so far"
+            raise ValueError(f"joint must be one of this model, {known}; given {given!r}")
+        if found.kind not in kinds:
+            raise ValueError(f"{what} needs a {' or '.join(kinds)} joint; given {found.name!r}, which is {found.kind}")
+        return found
+
+    def _point(self, argument: str, given: Any, body: Body) -> Array:
+        """A point in the axes of a body, given there or in space."""
+        if isinstance(given, BodyPoint):
+            if given.body is not body:
+                raise ValueError(f"{argument} must be a point on {body.name!r}; given one on {given.body.name!r}")
+            return given.place
+        return body.local_point(check_vector(argument, given, self.dimension))
+
+    def _points(self, at: Any, a: Body, b: Body) -> tuple[Array, Array]:
+        """The point of a joint in the axes of both bodies: one in space, or a pair of theirs."""
+        if isinstance(at, (tuple, list)) and any(isinstance(each, BodyPoint) for each in at):
+            if len(at) != 2:
+                raise ValueError(f"at must be a point in space, or a pair of points of a and b; given {shown(at)}")
+            return self._point("at[0]", at[0], a), self._point("at[1]", at[1], b)
+        if isinstance(at, BodyPoint):
+            raise TypeError(
+                "at must be a point in space, or a pair of points, one of each body: at=(a.point(...), b.point(...)); "
+                f"given a point on {at.body.name!r} alone"
+            )
+        place = check_vector("at", at, self.dimension)
+        return a.local_point(place), b.local_point(place)
+
+    def _direction(self, argument: str, given: Any, body: Body) -> Array:
+        """A unit direction in the axes of a body, given there or in space."""
+        if isinstance(given, BodyDirection):
+            if given.body is not body:
+                raise ValueError(f"{argument} must be a direction on {body.name!r}; given one on {given.body.name!r}")
+            direction = given.components
+        else:
+            direction = body.local_direction(check_vector(argument, given, self.dimension))
+        length = float(np.linalg.norm(direction))
+        if not length > 0.0:
+            raise ValueError(f"{argument} must have a direction; given {shown(given)}, of length zero")
+        return direction / length
+
+    def _directions(self, axis: Any, a: Body, b: Body) -> tuple[Array, Array]:
+        """The axis of a joint in the axes of both bodies."""
+        if isinstance(axis, (tuple, list)) and any(isinstance(each, BodyDirection) for each in axis):
+            if len(axis) != 2:
+                raise ValueError(f"axis must be a direction, or a pair of directions of a and b; given {shown(axis)}")
+            return self._direction("axis[0]", axis[0], a), self._direction("axis[1]", axis[1], b)
+        return self._direction("axis", axis, a), self._direction("axis", axis, b)
+
+    def _numbers(self, name: str, body: Body, place: Array) -> Numbers:
+        """The place of a point on a body, named by what is there."""
+        names = (f"{axis} of {name} on {body.name} (m)" for axis in AXES[: self.dimension])
+        return Numbers(tuple(place.tolist()), tuple(names))
+
+    def _function(self, name: str, given: Any, size: int, unit: str) -> tuple[Function | None, Numbers | None]:
+        """The f of a force, a torque or a motor: a function, or constant numbers with names."""
+        found = force_function(f"f of {name!r}", given, size)
+        if isinstance(found, Function):
+            return found, None
+        parts = ("value",) if size == 1 else AXES[:size]
+        return None, Numbers(tuple(found.tolist()), tuple(f"{part} of {name} ({unit})" for part in parts))
+
+    def _pair(self, kind: str, a: Any, b: Any, name: str | None, at: Any) -> tuple[Body, Body, str, Points]:
+        """Bodies and name of a joint, and its point on both; None: the centre of mass of b, or of a on the ground."""
+        first, second = self._body("a", a), self._body("b", b)
+        self._different(f"{kind} joint", first, second)
+        name = self._new_name(kind, name, first, second)
+        if at is None:
+            at = first.position if second is self.ground else second.position
+        here, there = self._points(at, first, second)
+        return first, second, name, (self._numbers(name, first, here), self._numbers(name, second, there))
+
+    def _distance(
+        self, kind: int, a: Any, at_a: Any, b: Any, at_b: Any, length: float | None, name: str | None
+    ) -> ModelJoint:
+        first, second = self._body("a", a), self._body("b", b)
+        self._different("distance joint", first, second)
+        name = self._new_name("distance", name, first, second)
+        here, there = self._point("at_a", at_a, first), self._point("at_b", at_b, second)
+        if length is None:
+            length = float(np.linalg.norm(first.in_space(here) - second.in_space(there)))
+            if length == 0.0:
+                raise ValueError(f"the points of {name!r} coincide in the position given; give a length, or take a pin")
+        check_positive(f"length of {name!r}", length)
+        points = self._numbers(name, first, here), self._numbers(name, second, there)
+        long = Numbers((float(length),), (f"length of {name} (m)",))
+        row = JointRow(kind, 1, first, second, *points, long)
+        return self._add_joint(ModelJoint(name, "distance", first, second, (row,), *points))
+
+    def _new_body(self, name: str, mass: float, position: ArrayLike, velocity: ArrayLike | None) -> tuple[Any, ...]:
+        """What bodies have in two and three dimensions, checked: name, position, mass, velocity."""
+        name = self._new_name("body", check_text("name", name))
+        check_positive(f"mass of {name!r}", mass)
+        place = check_vector(f"position of {name!r}", position, self.dimension)
+        speed = None if velocity is None else check_vector(f"velocity of {name!r}", velocity, self.dimension)
+        return name, place, float(mass), speed

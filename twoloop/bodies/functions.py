@@ -1,0 +1,186 @@
+"""Functions that a user gives: forces of t, q and v, motions of t. They are traced once to programs, if they can be."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twoloop.checks.arguments import check_finite, check_real, shown
+from twoloop.generate.calls_on_symbols import as_forms, trace
+from twoloop.generate.derivative import Derivative
+from twoloop.generate.programs import Program, program_of
+from twoloop.generate.tracing import Form, Graph, Untraceable, symbols
+from twoloop.kernels.evaluation.operations import RESULT
+
+Array = NDArray[np.float64]
+
+ARGUMENTS = {1: "(t)", 3: "(t, q, v)"}
+
+
+@dataclass(frozen=True, eq=False)
+class Function:
+    """A function of a force, a torque, a motor, or a motion with its derivatives.
+
+    Attributes
+    ----------
+    name : str
+        Of the argument, and of what has it, for messages.
+    function : callable
+    n_arguments : int
+        1: of t; 3: of t, q and v.
+    size : int
+        How many numbers it gives.
+    derivatives : tuple of callable
+        Of a motion: its first and second derivative, if they are given.
+    traced : ndarray or None
+        Of a motion without: a program of t that gives all three.
+    """
+
+    name: str
+    function: Callable[..., Any]
+    n_arguments: int
+    size: int
+    derivatives: tuple[Callable[..., Any], ...] = ()
+    traced: Array | None = None
+
+    def at(self, t: float, q: Array, v: Array) -> Array:
+        """What it gives, of the right shape; of a motion its derivatives, too."""
+        arguments = (t, q.copy(), v.copy())[: self.n_arguments]
+        made = [self._checked(each(*arguments)) for each in (self.function, *self.derivatives)]
+        if self.traced is not None:
+            from twoloop.bodies.program_results import results  # whose import compiles
+
+            made.append(results(0, t, np.zeros(0), np.zeros(0), self.traced)[1:3])
+        return np.concatenate(made)
+
+    def _checked(self, value: Any) -> Array:
+        array = check_real(f"what {self.name} returns", value)
+        if array.shape != (self.size,) and not (self.size == 1 and array.shape == ()):
+            expected = "a number" if self.size == 1 else f"shape ({self.size},)"
+            raise ValueError(f"{self.name} must return {expected}; it returned {shown(value)}")
+        return array.reshape(self.size)
+
+    def forms(self, graph: Graph, t: Form, q: Sequence[Form], v: Sequence[Form]) -> list[Form]:
+        """What it makes of symbols; raises Untraceable."""
+        arguments = (t, symbols(q), symbols(v))[: self.n_arguments]
+        made: list[Form] = []
+        for each in (self.function, *self.derivatives):
+            array = np.array(trace(each, *arguments), dtype=object)
+            if array.shape != (self.size,) and not (self.size == 1 and array.shape == ()):
+                raise Untraceable(f"on symbols it returns shape {array.shape}")
+            made += as_forms(graph, array.reshape(self.size)).tolist()
+        return made
+
+
+def force_function(name: str, given: Any, size: int) -> Function | Array:
+    """A function of t or of t, q and v as it is given, or constant numbers.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If it is neither.
+    """
+    if callable(given):
+        return Function(name, given, _n_arguments(name, given, (1, 3)), size)
+    if size == 1:
+        return np.array([check_finite(name, given)])
+    array = check_real(name, given)
+    if array.shape != (size,) or not np.isfinite(array).all():
+        raise ValueError(
+            f"{name} must be {size} finite numbers, or a function of t or of t, q, v that returns them; given "
+            f"{shown(given)}"
+        )
+    return array
+
+
+def motion_function(name: str, motion: Any, rate: Any, acceleration: Any) -> Function:
+    """A motion of t with its derivatives, which are traced where they are not given.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If they are no functions of t, or the derivatives neither given nor found.
+    """
+    if not callable(motion):
+        raise TypeError(f"{name} must be a function of t, such as lambda t: 0.5 * np.sin(2.0 * t); given {motion!r}")
+    if (rate is None) != (acceleration is None):
+        raise TypeError(f"rate and acceleration of {name} go together: give both, or none to have them derived")
+    for each in (motion, rate, acceleration):
+        if each is not None and not callable(each):
+            raise TypeError(f"rate and acceleration of {name} must be functions of t; given {each!r}")
+        if each is not None:
+            _n_arguments(name, each, (1,))
+    function = Function(name, motion, 1, 1, () if rate is None else (rate, acceleration))
+    if rate is None:
+        try:
+            return replace(function, traced=np.array(numbers_of(program_for([function], 0, True))))
+        except Untraceable as error:
+            raise ValueError(
+                f"{error}; so its derivatives do not follow from it. Write it with numpy's functions and without "
+                "branches, or give rate= and acceleration=, its first and second derivative as functions of t"
+            ) from None
+    return function
+
+
+def motion_forms(function: Function, graph: Graph, t: Form) -> list[Form]:
+    """A motion and two derivatives."""
+    made = function.forms(graph, t, [], [])
+    if not function.derivatives:
+        (place,) = t.terms
+        for _ in range(2):
+            made.append(Derivative(graph, {place: Form(graph, 1.0, {})}).of(made[-1]))
+    return made
+
+
+def program_for(functions: Sequence[Function], n_q: int, motions: bool) -> Program:
+    """One program for all functions, in their order; raises Untraceable."""
+    graph = Graph()
+    (t,) = graph.inputs(1, False)
+    q, v = graph.inputs(n_q, False), graph.inputs(n_q, True)
+    made: list[Form] = []
+    for each in functions:
+        try:
+            made += motion_forms(each, graph, t) if motions else each.forms(graph, t, q, v)
+        except Untraceable as error:
+            raise Untraceable(f"{each.name}: {error}") from None
+    return program_of(graph, 1 + 2 * n_q, dict(enumerate(made)))
+
+
+def numbers_of(program: Program) -> list[float]:
+    """A program as it stands in the parameters, see `program_results`."""
+    n_results = int((program.rows[:, 0] == RESULT).sum())
+    sizes = [n_results, program.n_nodes, len(program.rows), len(program.columns)]
+    parts: list[Any] = [sizes, program.rows.ravel(), program.columns, program.coefficients, program.constants.ravel()]
+    return [float(x) for part in parts for x in part]
+
+
+def is_constant(function: Function) -> bool:
+    """Whether a motion is known to hold its joint still."""
+    graph = Graph()
+    try:
+        return not function.forms(graph, graph.inputs(1, False)[0], [], [])[0].terms
+    except Untraceable:
+        return False
+
+
+def _n_arguments(name: str, function: Any, allowed: tuple[int, ...]) -> int:
+    expected = " or ".join(ARGUMENTS[n] for n in allowed)
+    try:
+        parameters = inspect.signature(function).parameters.values()
+    except (TypeError, ValueError):  # built-in functions have none to look at
+        return allowed[0]
+    places = [each for each in parameters if each.kind in (each.POSITIONAL_ONLY, each.POSITIONAL_OR_KEYWORD)]
+    needed = sum(each.default is each.empty for each in places)
+    if any(each.kind == each.KEYWORD_ONLY and each.default is each.empty for each in parameters):
+        raise TypeError(f"{name} is called as {expected}; the function given needs arguments by name")
+    if any(each.kind == each.VAR_POSITIONAL for each in parameters):
+        return allowed[-1]
+    for n in allowed:
+        if needed <= n <= len(places) and needed > 0:
+            return n
+    raise TypeError(f"{name} is called as {expected}; the function given takes {len(places)} arguments")

@@ -1,0 +1,313 @@
+"""The forces of a model, and the motions that are given."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from twoloop.bodies.collection import Collection
+from twoloop.bodies.functions import Function, motion_function
+from twoloop.bodies.parameter_layout import BRAKE, FORCE, PULL, RAIL, RUB, SPRING, TORQUE
+from twoloop.bodies.parts import Body, Force, JointRow, ModelJoint, Numbers
+from twoloop.checks.arguments import check_finite, check_positive
+
+
+class Loads(Collection):
+    """Adds springs, forces, motors and drives to a model."""
+
+    def _drive_row(self, joint: ModelJoint, motion: Function) -> JointRow:
+        raise NotImplementedError
+
+    def _torsion(self, name: str, joint: ModelJoint, numbers: Numbers) -> Force:
+        raise NotImplementedError
+
+    def _motor(self, name: str, joint: ModelJoint, unit: str, f: Any) -> Force:
+        raise NotImplementedError
+
+    def _along(self, name: str, kind: int, joint: ModelJoint, numbers: Numbers) -> Force:
+        """A force along the axis of a prismatic joint; about that of a revolute one for friction."""
+        raise NotImplementedError
+
+    def spring(
+        self,
+        a: Body | str,
+        at_a: Any,
+        b: Body | str,
+        at_b: Any,
+        *,
+        stiffness: float,
+        damping: float = 0.0,
+        length: float | None = None,
+        name: str | None = None,
+    ) -> Force:
+        """A spring with a damper between a point of one body and a point of another.
+
+        Parameters
+        ----------
+        a, b : Body or str
+            The bodies, or their names.
+        at_a, at_b : array_like (2 or 3,) or BodyPoint
+            The points, in space in the position given, m; or `body.point(...)`.
+        stiffness, damping : float
+            N/m and N s/m.
+        length : float, optional
+            At which the spring is without force, m. None: the distance of the points in the position given.
+        name : str, optional
+
+        Returns
+        -------
+        Force
+
+        Raises
+        ------
+        TypeError, ValueError
+            If an argument is wrong.
+        """
+        first, second = self._body("a", a), self._body("b", b)
+        self._different("spring", first, second)
+        name = self._new_name("spring", name, first, second)
+        here, there = self._point("at_a", at_a, first), self._point("at_b", at_b, second)
+        distance = float(np.linalg.norm(first.in_space(here) - second.in_space(there)))
+        stiffness, damping = _not_negative("stiffness", stiffness), _not_negative("damping", damping)
+        length = distance if length is None else _not_negative("length", length)
+        points = self._numbers(name, first, here), self._numbers(name, second, there)
+        if length == 0.0:
+            if damping:
+                raise ValueError(
+                    f"the spring {name!r} without a length has no direction where its points meet, so that it takes no "
+                    "damping; give it a length, or take a force of t, q, v for the damper"
+                )
+            more, kind = Numbers((stiffness,), (f"stiffness of {name} (N/m)",)), PULL
+        else:
+            names = f"stiffness of {name} (N/m)", f"damping of {name} (N s/m)", f"length of {name} (m)"
+            more, kind = Numbers((stiffness, damping, length), names), SPRING
+        return self._add_force(Force(name, kind, first, second, *points, more))
+
+    def torsion_spring(
+        self,
+        joint: ModelJoint | str,
+        *,
+        stiffness: float,
+        damping: float = 0.0,
+        angle: float = 0.0,
+        name: str | None = None,
+    ) -> Force:
+        """A torsional spring with a damper in a revolute joint.
+
+        Parameters
+        ----------
+        joint : ModelJoint or str
+            A revolute joint, or its name.
+        stiffness, damping : float
+            N m/rad and N m s/rad.
+        angle : float
+            By how much b must have turned against a, from the position given, for the spring to be without torque, rad.
+        name : str, optional
+
+        Returns
+        -------
+        Force
+
+        Raises
+        ------
+        TypeError, ValueError
+            If an argument is wrong.
+        """
+        hinge = self._joint(joint, ("revolute",), "torsion_spring")
+        name = self._new_name(f"torsion spring of {hinge.name}", name)
+        values = _not_negative("stiffness", stiffness), _not_negative("damping", damping), check_finite("angle", angle)
+        names = f"stiffness of {name} (N m/rad)", f"damping of {name} (N m s/rad)", f"angle of {name} (rad)"
+        return self._add_force(self._torsion(name, hinge, Numbers(values, names)))
+
+    def axial_spring(
+        self,
+        joint: ModelJoint | str,
+        *,
+        stiffness: float,
+        damping: float = 0.0,
+        length: float = 0.0,
+        name: str | None = None,
+    ) -> Force:
+        """A spring with a damper along a prismatic joint.
+
+        Parameters
+        ----------
+        joint : ModelJoint or str
+            A prismatic joint, or its name.
+        stiffness, damping : float
+            N/m and N s/m.
+        length : float
+            By how much b must have slid along the axis of a, from its point there, for the spring to be without force,
+            m; negative: against the axis.
+        name : str, optional
+
+        Returns
+        -------
+        Force
+
+        Raises
+        ------
+        TypeError, ValueError
+            If an argument is wrong.
+        """
+        slide = self._joint(joint, ("prismatic",), "axial_spring")
+        name = self._new_name(f"spring of {slide.name}", name)
+        values = (
+            _not_negative("stiffness", stiffness),
+            _not_negative("damping", damping),
+            check_finite("length", length),
+        )
+        names = f"stiffness of {name} (N/m)", f"damping of {name} (N s/m)", f"length of {name} (m)"
+        return self._add_force(self._along(name, RAIL, slide, Numbers(values, names)))
+
+    def friction(self, joint: ModelJoint | str, f: float, *, speed: float, name: str | None = None) -> Force:
+        """Friction in a revolute or prismatic joint, by a smooth law: -f tanh(rate / speed).
+
+        Dry friction jumps where the motion turns round, and holds at rest; this does neither, and creeps below `speed`.
+        It does not depend on the load of the joint. A small `speed` makes the equations stiff.
+
+        Parameters
+        ----------
+        joint : ModelJoint or str
+        f : float
+            The torque or force at high speed, N m or N.
+        speed : float
+            The rate at which three quarters of it are reached, rad/s or m/s.
+        name : str, optional
+
+        Returns
+        -------
+        Force
+
+        Raises
+        ------
+        TypeError, ValueError
+            If an argument is wrong.
+        """
+        rubbed = self._joint(joint, ("revolute", "prismatic"), "friction")
+        name = self._new_name(f"friction of {rubbed.name}", name)
+        check_positive("speed", speed)
+        turns = rubbed.kind == "revolute"
+        units = ("N m", "rad/s") if turns else ("N", "m/s")
+        names = f"value of {name} ({units[0]})", f"speed of {name} ({units[1]})"
+        numbers = Numbers((_not_negative("f", f), float(speed)), names)
+        return self._add_force(self._along(name, BRAKE if turns else RUB, rubbed, numbers))
+
+    def force(self, body: Body | str, at: Any, f: Any, *, name: str | None = None) -> Force:
+        """A force on a body, along the axes of space, at a point that the body carries along.
+
+        Parameters
+        ----------
+        body : Body or str
+        at : array_like (2 or 3,) or BodyPoint
+            The point, in space in the position given, m; or `body.point(...)`.
+        f : array_like (2 or 3,) or callable
+            N: a constant force, or f(t) or f(t, q, v) that returns one. The coordinates of a body in `q` and `v` are
+            `body.coordinates`.
+        name : str, optional
+
+        Returns
+        -------
+        Force
+
+        Raises
+        ------
+        TypeError, ValueError
+            If an argument is wrong.
+        """
+        on = self._moving_body("body", body)
+        name = self._new_name(f"force on {on.name}", name)
+        there = self._numbers(name, on, self._point("at", at, on))
+        function, more = self._function(name, f, self.dimension, "N")
+        return self._add_force(Force(name, FORCE, self.ground, on, None, there, more, function))
+
+    def torque(self, body: Body | str, f: Any, *, name: str | None = None) -> Force:
+        """A torque on a body: in a plane a number, positive from x to y; in space (3,) along the axes of space.
+
+        Parameters
+        ----------
+        body : Body or str
+        f : float, array_like (3,) or callable
+            N m: a constant torque, or f(t) or f(t, q, v) that returns one.
+        name : str, optional
+
+        Returns
+        -------
+        Force
+
+        Raises
+        ------
+        TypeError, ValueError
+            If an argument is wrong.
+        """
+        on = self._moving_body("body", body)
+        name = self._new_name(f"torque on {on.name}", name)
+        function, more = self._function(name, f, 1 if self.dimension == 2 else 3, "N m")
+        return self._add_force(Force(name, TORQUE, self.ground, on, None, None, more, function))
+
+    def motor(self, joint: ModelJoint | str, f: Any, *, name: str | None = None) -> Force:
+        """A torque in a revolute joint, or a force along a prismatic one: on b, and the opposite on a.
+
+        Parameters
+        ----------
+        joint : ModelJoint or str
+        f : float or callable
+            N m or N: a number, or f(t) or f(t, q, v) that returns one.
+        name : str, optional
+
+        Returns
+        -------
+        Force
+
+        Raises
+        ------
+        TypeError, ValueError
+            If an argument is wrong.
+        """
+        moved = self._joint(joint, ("revolute", "prismatic"), "motor")
+        name = self._new_name(f"motor of {moved.name}", name)
+        return self._add_force(self._motor(name, moved, "N m" if moved.kind == "revolute" else "N", f))
+
+    def drive(
+        self,
+        joint: ModelJoint | str,
+        motion: Any,
+        *,
+        rate: Any = None,
+        acceleration: Any = None,
+        name: str | None = None,
+    ) -> ModelJoint:
+        """A given motion of a revolute or prismatic joint: how far b has turned or slid on a from the position given.
+
+        Parameters
+        ----------
+        joint : ModelJoint or str
+        motion : callable
+            motion(t), rad or m. At the start of the run the bodies are put where it says.
+        rate, acceleration : callable, optional
+            Its first and second derivative, of t. None: they are derived from the motion, exactly, which must then be
+            made of numpy's functions, without branches.
+        name : str, optional
+
+        Returns
+        -------
+        ModelJoint
+            Whose reaction is the torque or force of the drive.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If an argument is wrong, or the derivatives are neither given nor found.
+        """
+        moved = self._joint(joint, ("revolute", "prismatic"), "drive")
+        name = self._new_name(f"drive of {moved.name}", name)
+        row = self._drive_row(moved, motion_function(f"motion of {name!r}", motion, rate, acceleration))
+        return self._add_joint(ModelJoint(name, "drive", moved.a, moved.b, (row,), moved.point_a, moved.point_b))
+
+
+def _not_negative(argument: str, value: Any) -> float:
+    number = check_finite(argument, value)
+    if number < 0.0:
+        raise ValueError(f"{argument} must not be negative; given {value!r}")
+    return number

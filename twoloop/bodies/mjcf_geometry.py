@@ -1,0 +1,177 @@
+"""What reading and writing of MJCF share: poses, inertias, and the warning of what is left out.
+
+See MuJoCo's XML reference, mujoco.readthedocs.io/en/stable/XMLreference.html.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twoloop.mechanisms.rotation import rotation_matrix
+
+Array = NDArray[np.float64]
+
+DENSITY = 1000.0  # kg/m^3, of geoms that give neither mass nor density
+
+
+class IgnoredWarning(UserWarning):
+    """What of a file has no counterpart in a model, or of a model in a file."""
+
+
+@dataclass(frozen=True)
+class Pose:
+    """Where a frame is in another: origin (3,) and rotation (3, 3)."""
+
+    x: Array
+    R: Array
+
+    def then(self, inner: Pose) -> Pose:
+        """Where a frame is that is given within this one."""
+        return Pose(self.x + self.R @ inner.x, self.R @ inner.R)
+
+    def point(self, place: Array) -> Array:
+        """A point of this frame, in the other."""
+        return np.asarray(self.x + self.R @ place)
+
+
+@dataclass(frozen=True)
+class Lump:
+    """A mass with its centre (3,) and its inertia about this (3, 3), in one frame."""
+
+    mass: float
+    centre: Array
+    J: Array
+
+    def seen(self, pose: Pose) -> Lump:
+        """The same from the frame in which its own is given."""
+        return Lump(self.mass, pose.point(self.centre), pose.R @ self.J @ pose.R.T)
+
+
+def together(lumps: list[Lump]) -> Lump:
+    """Several lumps as one; without mass at the origin."""
+    mass = sum(lump.mass for lump in lumps)
+    if not mass > 0.0:
+        return Lump(0.0, np.zeros(3), np.zeros((3, 3)))
+    centre = sum((lump.mass * lump.centre for lump in lumps), np.zeros(3)) / mass
+    J = np.zeros((3, 3))
+    for lump in lumps:
+        d = lump.centre - centre
+        J += lump.J + lump.mass * (d @ d * np.eye(3) - np.outer(d, d))
+    return Lump(mass, centre, J)
+
+
+def numbers(text: str, n: int, what: str) -> Array:
+    """Numbers of an attribute, of which there must be n."""
+    try:
+        found = np.array([float(each) for each in text.split()])
+    except ValueError:
+        found = np.zeros(0)
+    if len(found) != n or not np.isfinite(found).all():
+        raise ValueError(f"{what} must be {n} finite numbers; given {text!r}")
+    return found
+
+
+def pose_of(attributes: Mapping[str, str], what: str, degrees: bool, sequence: str) -> Pose:
+    """The pose that pos and one of quat, axisangle, xyaxes, zaxis and euler give."""
+    x = numbers(attributes.get("pos", "0 0 0"), 3, f"pos of {what}")
+    return Pose(x, _rotation(attributes, what, np.pi / 180.0 if degrees else 1.0, sequence))
+
+
+def _rotation(given: Mapping[str, str], what: str, unit: float, sequence: str) -> Array:
+    if "quat" in given:
+        return _of_quaternion(numbers(given["quat"], 4, f"quat of {what}"))
+    if "axisangle" in given:
+        *axis, angle = numbers(given["axisangle"], 4, f"axisangle of {what}")
+        return _about(np.array(axis), unit * angle)
+    if "xyaxes" in given:
+        first, second = numbers(given["xyaxes"], 6, f"xyaxes of {what}").reshape(2, 3)
+        x = first / np.linalg.norm(first)
+        y = second - (second @ x) * x
+        y /= np.linalg.norm(y)
+        return np.column_stack([x, y, np.cross(x, y)])
+    if "zaxis" in given:
+        z = numbers(given["zaxis"], 3, f"zaxis of {what}")
+        across, cosine = np.cross((0.0, 0.0, 1.0), z), z[2] / np.linalg.norm(z)
+        if np.linalg.norm(across) < 1e-12 * np.linalg.norm(z):
+            return np.eye(3) if cosine > 0.0 else np.diag([1.0, -1.0, -1.0])
+        return _about(across, float(np.arccos(np.clip(cosine, -1.0, 1.0))))
+    if "euler" in given:
+        R = np.eye(3)
+        for letter, turn in zip(sequence, numbers(given["euler"], 3, f"euler of {what}"), strict=True):
+            part = _about(np.eye(3)["xyz".index(letter.lower())], unit * turn)
+            R = R @ part if letter.islower() else part @ R  # lower case turns with the frame
+        return R
+    return np.eye(3)
+
+
+def _of_quaternion(quaternion: Array) -> Array:
+    return rotation_matrix(quaternion / np.linalg.norm(quaternion))
+
+
+def _about(axis: Array, angle: float) -> Array:
+    direction = axis / np.linalg.norm(axis)
+    return _of_quaternion(np.append(np.cos(0.5 * angle), np.sin(0.5 * angle) * direction))
+
+
+def geom_lump(given: Mapping[str, str], what: str, degrees: bool, sequence: str) -> Lump | None:
+    """The mass of a geom, seen from its body; None: it has no volume that is known here."""
+    kind = given.get("type", "sphere")
+    if kind not in _VOLUMES:
+        return None
+    pose = pose_of(given, what, degrees, sequence)
+    size = np.array([float(each) for each in given.get("size", "").split()])
+    if "fromto" in given:
+        ends = numbers(given["fromto"], 6, f"fromto of {what}").reshape(2, 3)
+        along = ends[0] - ends[1]
+        pose = Pose(0.5 * ends.sum(axis=0), _rotation({"zaxis": " ".join(map(repr, along.tolist()))}, what, 1.0, "xyz"))
+        half = 0.5 * float(np.linalg.norm(along))
+        size = np.append(size[:1], half) if kind in ("capsule", "cylinder") else np.array([size[0], size[0], half])
+    needed = {"sphere": 1, "capsule": 2, "cylinder": 2, "box": 3, "ellipsoid": 3}[kind]
+    if len(size) < needed or not (size[:needed] > 0.0).all():
+        raise ValueError(
+            f"size of {what} must be {needed} positive numbers for a {kind}; given {given.get('size', '')!r}"
+        )
+    volume, moments = _VOLUMES[kind](size)
+    mass = float(given["mass"]) if "mass" in given else float(given.get("density", DENSITY)) * volume
+    return Lump(mass, np.zeros(3), mass * np.diag(moments)).seen(pose)
+
+
+# volume, and moments about the axes over the mass
+
+
+def _ellipsoid(size: Array) -> tuple[float, Array]:
+    squares = (size[:3] if len(size) > 2 else np.full(3, size[0])) ** 2
+    return 4.0 / 3.0 * np.pi * float(np.sqrt(squares.prod())), (squares.sum() - squares) / 5.0
+
+
+def _sphere(size: Array) -> tuple[float, Array]:
+    return _ellipsoid(np.full(3, size[0]))
+
+
+def _box(size: Array) -> tuple[float, Array]:
+    squares = size[:3] ** 2
+    return 8.0 * float(size[:3].prod()), (squares.sum() - squares) / 3.0
+
+
+def _cylinder(size: Array) -> tuple[float, Array]:
+    r, h = size[:2]
+    across = r * r / 4.0 + h * h / 3.0
+    return 2.0 * np.pi * r * r * h, np.array([across, across, 0.5 * r * r])
+
+
+def _capsule(size: Array) -> tuple[float, Array]:
+    """A cylinder and the halves of a ball, whose centres of mass are 3/8 of the radius from its ends."""
+    r, h = size[:2]
+    whole, (across, _, along) = _cylinder(size)
+    ball = 4.0 / 3.0 * np.pi * r**3
+    caps = 0.4 * r * r + h * h + 0.75 * h * r
+    total = whole + ball
+    moments = np.array([whole * across + ball * caps] * 2 + [whole * along + ball * 0.4 * r * r]) / total
+    return total, moments
+
+
+_VOLUMES = {"sphere": _sphere, "capsule": _capsule, "cylinder": _cylinder, "box": _box, "ellipsoid": _ellipsoid}

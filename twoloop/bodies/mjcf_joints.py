@@ -1,0 +1,66 @@
+"""Joints of MJCF, of which a body may have several, as one joint of a model."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twoloop.bodies.parts import Body, ModelJoint
+from twoloop.bodies.spatial_model import SpatialModel
+
+Array = NDArray[np.float64]
+
+SAME = 1e-9  # of directions, and of places over 1 m
+
+
+@dataclass(frozen=True)
+class Freed:
+    """A joint as MJCF has it: its kind (hinge, slide, ball), a place and an axis in space, and its other attributes."""
+
+    name: str
+    kind: str
+    at: Array
+    axis: Array
+    attributes: dict[str, str]
+
+
+def add_joints(model: SpatialModel, parent: Body, child: Body, freed: list[Freed]) -> ModelJoint | None:
+    """The joint that leaves what several free; None: all is free.
+
+    Raises
+    ------
+    ValueError
+        If no joint of a model leaves that.
+    """
+    kinds = sorted(each.kind for each in freed)
+    if kinds in (["free"], ["ball", "slide", "slide", "slide"]):
+        return None
+    hinges, slides = ([each for each in freed if each.kind == kind] for kind in ("hinge", "slide"))
+    name, first = freed[0].name, freed[0]
+    if kinds == ["ball"]:
+        return model.spherical(parent, child, at=first.at, name=name)
+    if kinds == ["hinge"]:
+        return model.revolute(parent, child, at=first.at, axis=first.axis, name=name)
+    if kinds == ["slide"]:
+        return model.prismatic(parent, child, at=first.at, axis=first.axis, name=name)
+    if kinds == ["hinge", "slide"] and _parallel(hinges[0], slides[0]):
+        return model.cylindrical(parent, child, at=hinges[0].at, axis=hinges[0].axis, name=name)
+    if kinds == ["hinge", "hinge"] and _across(*hinges) and np.abs(hinges[0].at - hinges[1].at).max() < SAME:
+        return model.universal(parent, child, at=first.at, axes=[each.axis for each in hinges], name=name)
+    if kinds == ["hinge", "slide", "slide"] and all(_across(hinges[0], slide) for slide in slides):
+        return model.planar(parent, child, at=hinges[0].at, axis=hinges[0].axis, name=name)
+    raise ValueError(
+        f"the joints of the body {child.name!r} ({', '.join(each.kind for each in freed)}) are none that a model has: "
+        "one hinge, slide or ball; a slide and a hinge along one axis; two hinges that cross at right angles; two "
+        "slides and a hinge across both; all six. Put a body with mass between them"
+    )
+
+
+def _parallel(one: Freed, other: Freed) -> bool:
+    return float(np.abs(np.cross(one.axis, other.axis)).max()) < SAME
+
+
+def _across(one: Freed, other: Freed) -> bool:
+    return abs(float(one.axis @ other.axis)) < SAME

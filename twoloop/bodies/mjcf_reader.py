@@ -1,0 +1,357 @@
+"""Models from MJCF, the format of MuJoCo: bodies, hinges, slides, balls; loops closed by connect and weld."""
+
+from __future__ import annotations
+
+import os
+import warnings
+import xml.etree.ElementTree as ElementTree
+from dataclasses import dataclass, field
+from typing import Any
+from xml.etree.ElementTree import Element
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twoloop.bodies.mjcf_geometry import IgnoredWarning, Lump, Pose, geom_lump, numbers, pose_of, together
+from twoloop.bodies.mjcf_joints import Freed, add_joints
+from twoloop.bodies.parts import Body, ModelJoint
+from twoloop.bodies.spatial_model import SpatialModel
+
+Array = NDArray[np.float64]
+
+SEEN_ONLY = {"asset", "visual", "statistic", "size", "custom", "camera", "light"}  # without effect on the motion
+KNOWN = {"compiler", "option", "default", "worldbody", "equality", "tendon"}
+SOFT = ("armature", "frictionloss")
+AGREES = 1e-6  # of the pose that a weld asks for
+
+
+@dataclass
+class Part:
+    """A body that moves, with what is fixed to it: its parent, its frame in space, joints and masses in space."""
+
+    name: str
+    parent: Part | None
+    pose: Pose
+    freed: list[Freed] = field(default_factory=list)
+    lumps: list[Lump] = field(default_factory=list)
+    body: Body | None = None
+
+
+def from_mjcf(path: str | os.PathLike[str]) -> SpatialModel:
+    """Read a model from an MJCF file, in the pose that the file has (qpos0).
+
+    Read are bodies with their masses, or those of their geoms; hinge, slide, ball and free joints, and those of their
+    combinations that a `SpatialModel` has; stiffness, damping, ref and springref of hinges and slides; equalities
+    connect and weld, which are exact here and soft in MuJoCo; tendons between two sites as springs; gravity. Bodies
+    without joints are one with their parents.
+
+    Parameters
+    ----------
+    path : path-like
+
+    Returns
+    -------
+    SpatialModel
+        `model.ignored` lists what was not read: contacts, limits, actuators, armatures, ...
+
+    Warns
+    -----
+    IgnoredWarning
+        If that is not empty.
+
+    Raises
+    ------
+    ValueError
+        If the file is no MJCF, needs other files, or has joints or welds that a model has not.
+
+    Notes
+    -----
+    The format is described in MuJoCo's XML reference.
+    """
+    try:
+        root = ElementTree.parse(path).getroot()
+    except ElementTree.ParseError as error:
+        raise ValueError(f"{os.fspath(path)!r} is not XML: {error}") from None
+    if root.tag != "mujoco":
+        raise ValueError(f"{os.fspath(path)!r} must begin with <mujoco>; it begins with <{root.tag}>")
+    reader = _Reader(root)
+    reader.read()
+    reader.model.ignored = tuple(reader.ignored)
+    if reader.ignored:
+        warnings.warn(f"{os.fspath(path)!r}: ignored are {'; '.join(reader.ignored)}", IgnoredWarning, stacklevel=2)
+    return reader.model
+
+
+class _Reader:
+    def __init__(self, root: Element):
+        self.root, self.ignored = root, list[str]()
+        compiler = {key: value for each in root.findall("compiler") for key, value in each.attrib.items()}
+        self.degrees, self.sequence = compiler.get("angle", "degree") == "degree", compiler.get("eulerseq", "xyz")
+        self.from_geoms = compiler.get("inertiafromgeom", "auto")
+        for key in ("settotalmass", "balanceinertia", "boundmass", "boundinertia", "alignfree"):
+            if compiler.get(key, "0") not in ("0", "-1", "false"):
+                self.ignored.append(f"{key} of the compiler")
+        if compiler.get("coordinate", "local") != "local":
+            raise ValueError("coordinates of an MJCF file must be local; global ones were dropped by MuJoCo in 2.3.4")
+        self.defaults: dict[str, dict[str, dict[str, str]]] = {"main": {}}
+        for each in root.findall("default"):
+            self._default(each, "main", {})
+        gravity = np.array([0.0, 0.0, -9.81])
+        for each in root.findall("option"):
+            gravity = numbers(each.get("gravity", "0 0 -9.81"), 3, "gravity") if each.get("gravity") else gravity
+            for key in ("density", "viscosity", "wind"):
+                if any(float(x) for x in each.get(key, "0").split()):
+                    self.ignored.append(f"{key} of the surrounding medium")
+            if any(flag.get("gravity") == "disable" for flag in each.findall("flag")):
+                gravity = np.zeros(3)
+        self.model = SpatialModel(gravity, name=root.get("model", "MuJoCo Model"))
+        self.frames: dict[str, tuple[Part | None, Pose]] = {"world": (None, Pose(np.zeros(3), np.eye(3)))}
+        self.sites: dict[str, tuple[Part | None, Array]] = {}
+        self.parts: list[Part] = []
+        self.n_geoms = 0
+        self.taken = {"ground", *(each.get("name", "") for each in root.iter("body"))}
+
+    def read(self) -> None:
+        """The whole file."""
+        for each in self.root:
+            if each.tag == "include":
+                raise ValueError(
+                    f"the file includes {each.get('file')!r}; write all into one file (MuJoCo saves such a one)"
+                )
+            if each.tag not in SEEN_ONLY | KNOWN:
+                self.ignored += [f"{each.tag}: {_called(part)}" for part in each] or [each.tag]
+        for each in self.root.findall("worldbody"):
+            self._within(each, None, Pose(np.zeros(3), np.eye(3)), "main")
+        for part in self.parts:
+            self._add(part)
+        for each in self.root.findall("equality"):
+            for equality in each:
+                self._equality(equality)
+        for each in self.root.findall("tendon"):
+            for tendon in each:
+                self._tendon(tendon)
+        if self.n_geoms > 1:
+            self.ignored.append("contacts between geoms")
+
+    def _default(self, element: Element, name: str, inherited: dict[str, dict[str, str]]) -> None:
+        name = element.get("class", name)
+        known = {tag: dict(values) for tag, values in inherited.items()}
+        for each in element:
+            if each.tag != "default":
+                known[each.tag] = {**known.get(each.tag, {}), **each.attrib}
+        self.defaults[name] = known
+        for each in element.findall("default"):
+            self._default(each, name, known)
+
+    def _attributes(self, element: Element, childclass: str) -> dict[str, str]:
+        name = element.get("class", childclass)
+        if name not in self.defaults:
+            raise ValueError(f"{_called(element)} is of the class {name!r}, which no default has")
+        return {**self.defaults[name].get(element.tag, {}), **element.attrib}
+
+    def _pose(self, attributes: dict[str, str], what: str) -> Pose:
+        return pose_of(attributes, what, self.degrees, self.sequence)
+
+    def _within(self, element: Element, part: Part | None, pose: Pose, childclass: str) -> None:
+        """What stands in a body, or in the world."""
+        lumps: list[Lump] = []
+        for each in element:
+            given = self._attributes(each, childclass)
+            if each.tag == "body":
+                self._body(each, part, pose, each.get("childclass", childclass))
+            elif each.tag == "geom":
+                lump = self._geom(given, _called(each))
+                lumps += [] if lump is None else [lump]
+            elif each.tag == "site":
+                place = pose.point(self._pose(given, _called(each)).x)
+                self.sites[each.get("name", f"site {len(self.sites)}")] = part, place
+            elif each.tag in ("frame", "replicate", "attach", "composite", "flexcomp"):
+                raise ValueError(f"<{each.tag}> is not read; MuJoCo saves a file in which it is written out")
+            elif each.tag not in SEEN_ONLY | {"inertial", "joint", "freejoint"}:
+                self.ignored.append(_called(each))
+        inertial = element.find("inertial")
+        if inertial is not None and self.from_geoms != "true":
+            lumps = [self._inertial(inertial, element.get("name", "?"))]
+        elif self.from_geoms == "false":
+            lumps = []
+        if part is not None:
+            part.lumps += [lump.seen(pose) for lump in lumps]
+
+    def _body(self, element: Element, parent: Part | None, outer: Pose, childclass: str) -> None:
+        name = element.get("name", f"body {len(self.frames)}")
+        name = "ground of the file" if name == "ground" else name  # the world is the ground here
+        pose, part = outer.then(self._pose(dict(element.attrib), f"body {name!r}")), parent
+        for key in ("mocap", "gravcomp"):
+            if element.get(key, "0") not in ("0", "false"):
+                self.ignored.append(f"{key} of body {name!r}")
+        joints = [each for each in element if each.tag in ("joint", "freejoint")]
+        if joints:
+            part = Part(name, parent, pose)
+            self.parts.append(part)
+            for each in joints:
+                part.freed.append(self._joint(each, pose, childclass, name, len(part.freed)))
+        self.frames[element.get("name", name)] = part, pose
+        self._within(element, part, pose, childclass)
+
+    def _joint(self, element: Element, pose: Pose, childclass: str, body: str, number: int) -> Freed:
+        given = self._attributes(element, childclass)
+        name = self._free(element.get("name"), f"joint of {body}" if number == 0 else f"joint {number + 1} of {body}")
+        kind = "free" if element.tag == "freejoint" else given.get("type", "hinge")
+        limited = given.get("limited", "auto")
+        if kind != "free" and (limited == "true" or (limited == "auto" and "range" in given)):
+            self.ignored.append(f"limits of joint {name!r}")
+        for key in SOFT:
+            if any(float(x) for x in given.get(key, "0").split()):
+                self.ignored.append(f"{key} of joint {name!r}")
+        if "springdamper" in given and any(float(x) for x in given["springdamper"].split()):
+            self.ignored.append(f"springdamper of joint {name!r}")
+        axis = numbers(given.get("axis", "0 0 1"), 3, f"axis of joint {name!r}")
+        if not axis.any():
+            raise ValueError(f"axis of joint {name!r} must have a direction; given {given['axis']!r}")
+        place = numbers(given.get("pos", "0 0 0"), 3, f"pos of joint {name!r}")
+        return Freed(name, kind, pose.point(place), pose.R @ axis / np.linalg.norm(axis), given)
+
+    def _free(self, name: str | None, default: str) -> str:
+        """A name that no other part has: in MJCF bodies, joints and tendons may share one."""
+        name = default if name is None else name
+        while name in self.taken:
+            name = f"{default.split()[0]} {name}"
+        self.taken.add(name)
+        return name
+
+    def _geom(self, given: dict[str, str], what: str) -> Lump | None:
+        if float(given.get("contype", 1)) or float(given.get("conaffinity", 1)):
+            self.n_geoms += 1
+        if given.get("shellinertia", "false") == "true":
+            self.ignored.append(f"shellinertia of {what}")
+        lump = geom_lump(given, what, self.degrees, self.sequence)
+        if lump is None and given.get("type") not in ("plane", "hfield"):
+            self.ignored.append(f"the mass of {what}, which is a {given.get('type')}")
+        return lump
+
+    def _inertial(self, element: Element, body: str) -> Lump:
+        what = f"inertial of body {body!r}"
+        given = dict(element.attrib)
+        if "mass" not in given:
+            raise ValueError(f"{what} needs a mass")
+        if "fullinertia" in given:
+            xx, yy, zz, xy, xz, yz = numbers(given["fullinertia"], 6, f"fullinertia of {what}")
+            J = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+        else:
+            J = np.diag(numbers(given.get("diaginertia", ""), 3, f"diaginertia of {what}"))
+        return Lump(float(given["mass"]), np.zeros(3), J).seen(self._pose(given, what))
+
+    def _add(self, part: Part) -> None:
+        """The body and the joint of a part."""
+        lump = together(part.lumps)
+        if not lump.mass > 0.0:
+            raise ValueError(
+                f"the body {part.name!r} has joints but no mass: give it an <inertial>, or a geom with volume"
+            )
+        R = part.pose.R
+        part.body = self.model.body(
+            part.name, mass=lump.mass, inertia=R.T @ lump.J @ R, position=lump.centre, rotation=R
+        )
+        joint = add_joints(self.model, self._of(part.parent), part.body, part.freed)
+        for freed in part.freed:
+            self._springs(freed, joint)
+
+    def _of(self, part: Part | None) -> Body:
+        body = self.model.ground if part is None else part.body
+        assert body is not None
+        return body
+
+    def _springs(self, freed: Freed, joint: ModelJoint | None) -> None:
+        """Spring and damper of a joint, about the value springref, where the file's pose has the value ref."""
+        stiffness, damping = (freed.attributes.get(key, "0").split() for key in ("stiffness", "damping"))
+        if not any(float(x) for x in (*stiffness, *damping)):
+            return
+        if joint is None or joint.kind not in ("revolute", "prismatic") or len(stiffness) > 1 or len(damping) > 1:
+            self.ignored.append(f"stiffness and damping of joint {freed.name!r}")
+            return
+        unit = np.pi / 180.0 if self.degrees and freed.kind == "hinge" else 1.0
+        rest = unit * (float(freed.attributes.get("springref", 0.0)) - float(freed.attributes.get("ref", 0.0)))
+        k, c = float(stiffness[0]), float(damping[0])
+        if joint.kind == "revolute":
+            self.model.torsion_spring(joint, stiffness=k, damping=c, angle=rest)
+        else:
+            self.model.axial_spring(joint, stiffness=k, damping=c, length=rest)
+
+    def _equality(self, element: Element) -> None:
+        given = self._attributes(element, "main")
+        if given.get("active", "true") == "false":
+            return
+        if element.tag not in ("connect", "weld"):
+            self.ignored.append(f"equality: {_called(element)}")
+            return
+        ends: list[tuple[Part | None, Any]] = []
+        if "site1" in given:
+            if element.tag == "weld":
+                raise ValueError(f"{_called(element)} between sites is not read; give bodies")
+            ends = [self._site(given[key]) for key in ("site1", "site2")]
+            one, other = (self._of(part) for part, _ in ends)
+            points = tuple(
+                body.point(*body.local_point(place)) for body, (_, place) in zip((one, other), ends, strict=True)
+            )
+            self.model.spherical(
+                one,
+                other,
+                at=points,
+                name=self._free(given.get("name"), f"{element.tag} of {one.name} and {other.name}"),
+            )
+            return
+        frames = [self._frame(given[key]) if key in given else self.frames["world"] for key in ("body1", "body2")]
+        one, other = (self._of(part) for part, _ in frames)
+        if element.tag == "connect":
+            place = frames[0][1].point(numbers(given.get("anchor", ""), 3, f"anchor of {_called(element)}"))
+            self.model.spherical(
+                one,
+                other,
+                at=place,
+                name=self._free(given.get("name"), f"{element.tag} of {one.name} and {other.name}"),
+            )
+            return
+        wanted = numbers(given.get("relpose", "0 1 0 0 0 0 0"), 7, f"relpose of {_called(element)}")
+        if wanted[3:].any():
+            pose = pose_of({"pos": _text(wanted[:3]), "quat": _text(wanted[3:])}, _called(element), True, "xyz")
+            asked = frames[0][1].then(pose)
+            off = max(np.abs(asked.x - frames[1][1].x).max(), np.abs(asked.R - frames[1][1].R).max())
+            if off > AGREES:
+                raise ValueError(
+                    f"relpose of {_called(element)} must be the one that the bodies have; it is off by {off:.3g}"
+                )
+        self.model.fixed(
+            one, other, name=self._free(given.get("name"), f"{element.tag} of {one.name} and {other.name}")
+        )
+
+    def _tendon(self, element: Element) -> None:
+        given = self._attributes(element, "main")
+        rest = given.get("springlength", "-1").split()
+        stiffness, damping = float(given.get("stiffness", 0.0)), float(given.get("damping", 0.0))
+        plain = element.tag == "spatial" and [each.tag for each in element] == ["site", "site"]
+        if not plain or len(rest) != 1 or given.get("limited", "false") == "true" or "range" in given:
+            self.ignored.append(f"tendon: {_called(element)}")
+            return
+        (one, here), (other, there) = (self._site(each.get("site", "")) for each in element)
+        length = None if float(rest[0]) < 0.0 else float(rest[0])
+        first, second = self._of(one), self._of(other)
+        name = self._free(given.get("name"), f"spring of {first.name} and {second.name}")
+        self.model.spring(first, here, second, there, stiffness=stiffness, damping=damping, length=length, name=name)
+
+    def _site(self, name: str) -> tuple[Part | None, Array]:
+        if name not in self.sites:
+            raise ValueError(f"the site {name!r} is not in the file")
+        return self.sites[name]
+
+    def _frame(self, name: str) -> tuple[Part | None, Pose]:
+        if name not in self.frames:
+            raise ValueError(f"the body {name!r} is not in the file")
+        return self.frames[name]
+
+
+def _called(element: Element) -> str:
+    return f"{element.tag} {element.get('name')!r}" if element.get("name") else element.tag
+
+
+def _text(values: Array) -> str:
+    return " ".join(map(repr, values.tolist()))

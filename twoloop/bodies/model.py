@@ -1,0 +1,187 @@
+"""How models in a plane and in space are put together."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twoloop.bodies import assembly
+from twoloop.bodies.loads import Loads
+from twoloop.bodies.model_energy import ModelEnergy
+from twoloop.bodies.model_problem import ModelProblem
+from twoloop.bodies.model_system import joints_of, system_of
+from twoloop.bodies.parts import Body, ModelJoint
+from twoloop.bodies.sketches import drawing_of
+from twoloop.bodies.tables import Tables
+from twoloop.checks.arguments import check_positive, check_span, check_text, shown
+
+Array = NDArray[np.float64]
+
+
+class Model(Loads):
+    """What `PlanarModel` and `SpatialModel` share beside their bodies and joints."""
+
+    coordinate_names: tuple[str, ...]
+
+    def problem(
+        self, t_span: tuple[float, float] = (0.0, 10.0), *, name: str | None = None, keep: Sequence[Body | str] = ()
+    ) -> ModelProblem:
+        """The model put together, ready to run.
+
+        Bodies whose poses do not quite fit are moved by the least change until all joints close. Velocities that were
+        given with bodies are kept, the others are those of least kinetic energy that the joints and drives allow.
+
+        Parameters
+        ----------
+        t_span : (float, float)
+            Start and end, s.
+        name : str, optional
+            None: that of the model.
+        keep : sequence of Body or str
+            Bodies that must stay where they are while the others are put together.
+
+        Returns
+        -------
+        ModelProblem
+            With the system, a consistent start, energy, joints, drawing, names, and `freedom`.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If the model has no bodies, a joint cannot close (says which), or the joints do not allow the velocities.
+        """
+        span = check_span(t_span)
+        name = self.name if name is None else check_text("name", name)
+        if isinstance(keep, (str, Body)):
+            keep = (keep,)
+        if not isinstance(keep, (tuple, list)):
+            raise TypeError(f"keep must be a list of bodies, or of their names; given {shown(keep)}")
+        kept = tuple(j for each in keep for j in self._moving_body("keep", each).coordinates)
+        return self.put_together(span, name, kept, None, None)
+
+    def put_together(
+        self,
+        t_span: tuple[float, float],
+        name: str,
+        keep: tuple[int, ...],
+        values: Mapping[str, float] | None,
+        guess: Array | None,
+    ) -> ModelProblem:
+        """What `problem` makes, with parameters and a guess of the positions."""
+        if not self.bodies:
+            raise ValueError(f"{self.name!r} has no bodies: add some with body(...) before problem()")
+        tables = self._tables(self.joints, values)
+        self._check_inertias(tables)
+        start = self._start() if guess is None else guess
+        about = t_span[0], start, np.zeros_like(start)
+        system = system_of(self.dimension, tables, joints_of(tables), name, about)
+        coordinates = tuple(f"{each} of {body.name}" for body in self.bodies for each in self.coordinate_names)
+        bare, joints = tables, [joint for joint in self.joints if joint.kind != "drive"]
+        if len(joints) < len(self.joints):
+            bare = self._tables(joints, values)
+        q = assembly.positions(
+            system if bare is tables else system_of(self.dimension, bare, joints_of(bare), name, about),
+            t_span[0],
+            start,
+            self._turning(),
+            keep,
+            bare.rows,
+            coordinates,
+        )
+        if bare is not tables:
+            q = assembly.driven_there(system, t_span[0], q, keep)
+        self._check_branches(t_span[0], q)
+        given, known = self._velocities(q)
+        v = assembly.velocities(system, t_span[0], q, given, known, coordinates)
+        freedom = assembly.freedom(system, t_span[0], q, tables.rows)
+        return ModelProblem(
+            name=name,
+            system=system,
+            q0=q,
+            v0=v,
+            t_span=t_span,
+            energy=ModelEnergy(tables.p.copy(), self.dimension),
+            parameters=tables.values,
+            note=_note(freedom, tables.untraced),
+            conserved=tables.conserve,
+            tags=self._tags(freedom),
+            coordinates=coordinates,
+            drawing=drawing_of(tables),
+            model=self._as_it_is(),
+            keep=keep,
+            freedom=freedom,
+        )
+
+    def _tables(self, joints: Sequence[ModelJoint], values: Mapping[str, float] | None) -> Tables:
+        """The tables of the model with some of its joints, and with other values of its parameters."""
+        tables = Tables(self.gravity, self.bodies, joints, self.forces, self._first_row())
+        tables.replaced(values or {})
+        return tables
+
+    def _as_it_is(self) -> Model:
+        """A copy to which nothing is added."""
+        other = copy.copy(self)
+        other.bodies, other.joints, other.forces = list(self.bodies), list(self.joints), list(self.forces)
+        return other
+
+    def _turning(self) -> NDArray[np.bool_]:
+        """Which coordinates are rotations."""
+        return np.tile(np.arange(len(self.coordinate_names)) >= self.dimension, len(self.bodies))
+
+    def _first_row(self) -> int:
+        """How many rows stand before those of the joints."""
+        return 0
+
+    def _check_inertias(self, tables: Tables) -> None:
+        for body in self.bodies:
+            place = tables.places[f"mass of {body.name} (kg)"]
+            check_positive(f"mass of {body.name}", float(tables.p[place]))
+            self._check_moments(body.name, tables.p[place + 1 : place + len(body.inertia)])
+
+    def _check_moments(self, name: str, moments: Array) -> None:
+        raise NotImplementedError
+
+    def _check_branches(self, t: float, q: Array) -> None:
+        """Whether every drive is where it should be, and not half a turn away."""
+
+    def _start(self) -> Array:
+        """The coordinates in the position given, (n_q,)."""
+        raise NotImplementedError
+
+    def _velocities(self, q: Array) -> tuple[Array, NDArray[np.bool_]]:
+        """The velocities given, (n_q,), and which of them are."""
+        raise NotImplementedError
+
+    def _tags(self, freedom: assembly.Freedom) -> tuple[str, ...]:
+        closed = False
+        linked = {body.number: {body.number} for body in (self.ground, *self.bodies)}
+        for joint in self.joints:
+            if joint.kind != "drive":
+                one, other = linked[joint.a.number], linked[joint.b.number]
+                closed |= one is other
+                one |= other
+                linked |= dict.fromkeys(other, one)
+        known = {
+            "closed chain" if closed else "open chain": True,
+            "rigid": True,
+            "planar" if self.dimension == 2 else "spatial": True,
+            "driven": any(joint.kind == "drive" for joint in self.joints),
+            "redundant": bool(freedom.redundant),
+            "singular": freedom.singular > 0,
+        }
+        return tuple(tag for tag, holds in known.items() if holds)
+
+
+def _note(freedom: assembly.Freedom, untraced: str) -> str:
+    """What there is to know of a model that was put together."""
+    noun = "degree" if freedom.degrees == 1 else "degrees"
+    parts = [f"{freedom.degrees} {noun} of freedom."]
+    if freedom.singular:
+        parts.append(f"The start is singular: {freedom.singular} more there.")
+    parts += [f"Rows follow from others among {', '.join(map(repr, group))}." for group in freedom.redundant]
+    if untraced:
+        parts.append(f"Its functions are called in Python, which is slower: {untraced}.")
+    return " ".join(parts)

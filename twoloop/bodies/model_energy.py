@@ -1,0 +1,129 @@
+"""Energy of a model: kinetic, of the weight, and of its springs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twoloop.bodies.parameter_layout import (
+    BODIES,
+    F_FIRST,
+    F_FIRST_AT,
+    F_KIND,
+    F_MORE,
+    F_ON_FIRST,
+    F_SECOND,
+    F_SECOND_AT,
+    FORCE_WIDTH,
+    FORCES,
+    HEAD,
+    N_FORCES,
+    PLANAR_BODY,
+    PULL,
+    RAIL,
+    SPATIAL_BODY,
+    SPRING,
+    TORSION,
+)
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class ModelEnergy:
+    """Kinetic energy, potential of the weight and of the springs, J, of one state or of many.
+
+    Attributes
+    ----------
+    p : ndarray (n_p,)
+        Parameters of the model.
+    dimension : int
+        2 or 3.
+    """
+
+    p: Array
+    dimension: int
+
+    def __call__(self, t: Any, q: Array, v: Array) -> Any:
+        """Of one state, or of the columns of many."""
+        q, v = (np.asarray(x).reshape(self._n, -1, *np.shape(x)[1:]) for x in (q, v))
+        size = PLANAR_BODY if self.dimension == 2 else SPATIAL_BODY
+        bodies = self.p[self.dimension : self.dimension + size * self._n].reshape(-1, size)
+        masses, gravity = bodies[:, 0], self.p[: self.dimension]
+        total = 0.5 * np.einsum("i,ij...->...", masses, v[:, : self.dimension] ** 2)
+        total -= np.einsum("i,j,ij...->...", masses, gravity, q[:, : self.dimension])
+        if self.dimension == 2:
+            total += 0.5 * np.einsum("i,i...->...", bodies[:, 1], v[:, 2] ** 2)
+        else:
+            J = bodies[:, [1, 4, 5, 4, 2, 6, 5, 6, 3]].reshape(-1, 3, 3)
+            spins = _spins(q[:, 3:], v[:, 3:])
+            total += 0.5 * np.einsum("ijk,ij...,ik...->...", J, spins, spins)
+        for kind, i, at, j, there, more, on_first in self._forces:
+            if kind in (SPRING, PULL):
+                gap = self._place(q, j, there) - self._place(q, i, at)
+                length = np.sqrt((gap**2).sum(axis=0))
+                total += 0.5 * self.p[more] * (length - (self.p[more + 2] if kind == SPRING else 0.0)) ** 2
+            elif kind == TORSION:
+                total += 0.5 * self.p[more] * (self._turned(q, i, j, at, there) - self.p[more + 2]) ** 2
+            elif kind == RAIL:
+                gap = self._place(q, j, there) - self._place(q, i, on_first)
+                slid = (self._axis(q, i, at) * gap).sum(axis=0)
+                total += 0.5 * self.p[more] * (slid - self.p[more + 2]) ** 2
+        return total
+
+    @property
+    def _n(self) -> int:
+        return int(self.p[self.p.size - HEAD + BODIES])
+
+    @property
+    def _forces(self) -> Any:
+        head = self.p[self.p.size - HEAD :].astype(int)
+        first, n = head[FORCES], head[N_FORCES]
+        table = self.p[first : first + FORCE_WIDTH * n].reshape(-1, FORCE_WIDTH).astype(int)
+        return table[:, [F_KIND, F_FIRST, F_FIRST_AT, F_SECOND, F_SECOND_AT, F_MORE, F_ON_FIRST]].tolist()
+
+    def _place(self, q: Array, body: int, at: int) -> Array:
+        """The point of a body in space, (2 or 3,) or (2 or 3, n_t)."""
+        point = self.p[at : at + self.dimension]
+        if body < 0:
+            return point.reshape(-1, *(1,) * (q.ndim - 2))
+        if self.dimension == 2:
+            s, c = np.sin(q[body, 2]), np.cos(q[body, 2])
+            return q[body, :2] + np.array([c * point[0] - s * point[1], s * point[0] + c * point[1]])
+        from twoloop.mechanisms.rotation import rotated  # whose import compiles
+
+        return q[body, :3] + np.array(rotated.py_func(*q[body, 3:], *point))
+
+    def _axis(self, q: Array, body: int, at: int) -> Array:
+        """An axis of a body in space, (2 or 3,) or (2 or 3, n_t)."""
+        if self.dimension == 2:
+            angle = self.p[at] + (q[body, 2] if body >= 0 else np.zeros(q.shape[2:]))
+            return np.array([np.cos(angle), np.sin(angle)])
+        axis = self.p[at : at + 3]
+        if body < 0:
+            return axis.reshape(-1, *(1,) * (q.ndim - 2))
+        from twoloop.mechanisms.rotation import rotated  # whose import compiles
+
+        return np.array(rotated.py_func(*q[body, 3:], *axis))
+
+    def _turned(self, q: Array, i: int, j: int, axis: int, zero: int) -> Any:
+        if self.dimension == 2:
+            return (q[j, 2] if j >= 0 else 0.0) - (q[i, 2] if i >= 0 else 0.0)
+        from twoloop.bodies.spatial_places import product  # whose import compiles
+
+        one, other = (q[body, 3:] if body >= 0 else (1.0, 0.0, 0.0, 0.0) for body in (i, j))
+        relative = product.py_func(one[0], -one[1], -one[2], -one[3], *other)
+        start = self.p[zero : zero + 4]
+        c, *parts = product.py_func(*relative, start[0], *-start[1:])
+        s = sum(x * part for x, part in zip(self.p[axis : axis + 3], parts, strict=True))
+        return 4.0 * np.arctan(s / (c + np.sqrt(c * c + s * s)))
+
+
+def _spins(e: Array, u: Array) -> Array:
+    """Angular velocities along the bodies' axes, (n, 3) or (n, 3, n_t)."""
+    from twoloop.mechanisms.rotation import half_spin  # whose import compiles
+
+    return 2.0 * np.stack(half_spin.py_func(*np.moveaxis(e, 1, 0), *np.moveaxis(u, 1, 0)), axis=1)

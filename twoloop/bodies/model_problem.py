@@ -1,0 +1,94 @@
+"""A model put together: the problem, which knows its parameters by name and can be put together with others."""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+from twoloop.bodies.assembly import Freedom
+from twoloop.checks.arguments import check_finite
+from twoloop.problem.problem import Problem
+
+if TYPE_CHECKING:
+    from twoloop.bodies.model import Model
+
+
+@dataclass(frozen=True)
+class ModelProblem(Problem):
+    """A `Problem` made of bodies and joints.
+
+    `parameters` are all masses, places, lengths, stiffnesses, ... by name, in the order in which they stand first in
+    `system.parameters`; what follows there says which joint ties which bodies, and must stay as it is.
+
+    Attributes
+    ----------
+    freedom : Freedom
+        Degrees of freedom, and which joints have rows that follow from others.
+    """
+
+    model: Model | None = field(default=None, repr=False)
+    keep: tuple[int, ...] = field(default=(), repr=False)
+    freedom: Freedom = field(default_factory=lambda: Freedom(0, 0, ()))
+
+    def place(self, name: str) -> int:
+        """Where a parameter stands in `system.parameters`, by its name with or without the unit.
+
+        Raises
+        ------
+        ValueError
+            If there is none of that name.
+        """
+        return self._known(name)[1]
+
+    def with_parameters(self, parameters: Mapping[str, float]) -> ModelProblem:
+        """The same model with other values of some parameters, put together again from this start.
+
+        Parameters
+        ----------
+        parameters : mapping
+            From names, with or without the unit, to numbers.
+
+        Returns
+        -------
+        ModelProblem
+            Nothing is compiled. Its start is near this one, and has the velocities that were given with the bodies.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If a name is unknown, a number is not finite, or the bodies cannot be put together.
+        """
+        if not isinstance(parameters, Mapping):
+            raise TypeError(f"parameters must be a mapping from names to numbers; given {parameters!r}")
+        values = dict(self.parameters)
+        for name, value in parameters.items():
+            values[self._known(name)[0]] = check_finite(f"parameters[{name!r}]", value)
+        if self.model is None:
+            raise ValueError(
+                f"{self.name!r} came from another process without its model, whose functions cannot travel: make it "
+                "again, or give them names at the top level of a module"
+            )
+        return self.model.put_together(self.t_span, self.name, self.keep, values, self.q0)
+
+    def __getstate__(self) -> dict[str, Any]:
+        state = dict(vars(self))
+        try:
+            pickle.dumps(self.model)
+        except Exception:  # a function without a name of its own
+            state["model"] = None
+        return state
+
+    def _known(self, name: Any) -> tuple[str, int]:
+        for place, known in enumerate(self.parameters):
+            if name in (known, known.rpartition(" (")[0]):
+                return known, place
+        words = str(name).split()
+        near = [known for known in self.parameters if words and words[-1] in known.split()]
+        raise ValueError(f"{self.name!r} has no parameter {name!r}; it has {_listed(near or list(self.parameters))}")
+
+
+def _listed(names: Sequence[str]) -> str:
+    shown = ", ".join(map(repr, names[:6]))
+    return shown if len(names) <= 6 else f"{shown} and {len(names) - 6} more: see problem.parameters"

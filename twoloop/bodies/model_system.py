@@ -1,0 +1,142 @@
+"""The system of a model: compiled callbacks that read its tables; in Python where its functions cannot be traced."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twoloop.bodies.functions import Function
+from twoloop.bodies.parameter_layout import FORCE_PROGRAM, HEAD, MOTION_PROGRAM
+from twoloop.bodies.tables import Tables
+from twoloop.problem.joints import Joint
+from twoloop.problem.system import ConstrainedSystem
+
+Array = NDArray[np.float64]
+
+KINDS = ("mass", "force", "constraint", "jacobian", "constraint_rate", "gamma")
+OF_JOINTS = ("constraint", "jacobian", "gamma")
+STATES = 5  # at which programs are compared with the functions that they were traced from
+AGREES = 1e-10  # relative
+
+
+def joints_of(tables: Tables) -> list[Joint]:
+    """The joints of the system, for `Result.reactions`."""
+    made = []
+    for joint in tables.joints:
+        point = tables.of(joint.point_a if joint.body is joint.a else joint.point_b).tolist()
+        translation, rotation = joint.body.coordinates[: len(point)], joint.body.coordinates[len(point) :]
+        made.append(Joint(joint.name, tables.rows[joint.name], translation, rotation, tuple(point)))
+    return made
+
+
+def system_of(
+    dimension: int,
+    tables: Tables,
+    joints: list[Joint],
+    name: str,
+    start: tuple[float, Array, Array],
+) -> ConstrainedSystem:
+    """The system, whose programs of functions agree with these about the start."""
+    callbacks: Any = import_module(f"twoloop.bodies.{'planar' if dimension == 2 else 'spatial'}_callbacks")
+    n_q = (3 if dimension == 2 else 7) * len(tables.bodies)
+    kinds = [kind for kind in KINDS if kind in ("mass", "force") or (kind in OF_JOINTS and tables.n_rows)]
+    if tables.motions:
+        kinds.append("constraint_rate")
+    options: Any = {"n_q": n_q, "n_c": tables.n_rows, "joints": joints, "name": name, "parameters": tables.p}
+    for each in (*tables.motions, *tables.functions):
+        each.at(*start)  # says what is wrong with what it returns
+    if not tables.untraced:
+        tables.untraced = _disagreement(tables, *start)
+    if tables.untraced:
+        made = InPython(callbacks, tables, n_q)
+        return ConstrainedSystem.from_python(**options, **{kind: getattr(made, kind) for kind in kinds})
+    given = {kind: getattr(callbacks, kind) for kind in kinds}
+    return ConstrainedSystem(**options, constant_mass=dimension == 2, **given)
+
+
+def _disagreement(tables: Tables, t: float, q: Array, v: Array) -> str:
+    """Which function does not give what its program gives; "": none is known."""
+    from twoloop.bodies.program_results import results  # whose import compiles
+
+    head, p = tables.p[tables.p.size - HEAD :], tables.p
+    generic = np.random.default_rng(8)
+    for functions, place in ((tables.motions, head[MOTION_PROGRAM]), (tables.functions, head[FORCE_PROGRAM])):
+        for number in range(STATES if functions else 0):
+            away = generic.uniform(-1.0, 1.0, (2, len(q))) * (number > 0)
+            then = t + 0.37 * number
+            one, other = q + 0.3 * away[0], v + away[1]
+            made, first = results(int(place), then, one, other, p), 0
+            for each in functions:
+                try:
+                    known = each.at(then, one, other)
+                except (ArithmeticError, TypeError):  # outside what it is made for
+                    known = np.full(each.size, np.nan)
+                size = 3 if functions is tables.motions else each.size
+                found, first = made[first : first + len(known)], first + size
+                off = np.abs(known - found) > AGREES * (1.0 + np.abs(known))
+                if (off & np.isfinite(known)).any():
+                    return f"{each.name} does not give at t = {then:g} what it gave when it was traced"
+    return ""
+
+
+class InPython:
+    """The callbacks of a model whose functions are called in Python; the tables are read by the compiled ones.
+
+    Parameters
+    ----------
+    callbacks : module
+    tables : Tables
+    n_q : int
+    """
+
+    def __init__(self, callbacks: Any, tables: Tables, n_q: int):
+        self._callbacks = callbacks
+        self._motions, self._functions = tuple(tables.motions), tuple(tables.functions)
+        self._n_q, self._n_rows = n_q, tables.n_rows
+
+    def mass(self, t: float, q: Array, p: Array) -> Array:
+        """M."""
+        made = np.zeros((self._n_q, self._n_q))
+        self._callbacks.mass(t, q, p, made)
+        return made
+
+    def force(self, t: float, q: Array, v: Array, p: Array) -> Array:
+        """Q."""
+        made = np.zeros(self._n_q)
+        self._callbacks.fill_force(q, v, p, _called(self._functions, t, q, v), made)
+        return made
+
+    def constraint(self, t: float, q: Array, p: Array) -> Array:
+        """C."""
+        made = np.zeros(self._n_rows)
+        self._callbacks.fill_constraint(q, p, self._moved(t), made)
+        return made
+
+    def jacobian(self, t: float, q: Array, p: Array) -> Array:
+        """C_q."""
+        made = np.zeros((self._n_rows, self._n_q))
+        self._callbacks.fill_jacobian(q, p, self._moved(t), made)
+        return made
+
+    def constraint_rate(self, t: float, q: Array, p: Array) -> Array:
+        """C_t."""
+        made = np.zeros(self._n_rows)
+        self._callbacks.fill_rate(q, p, self._moved(t), made)
+        return made
+
+    def gamma(self, t: float, q: Array, v: Array, p: Array) -> Array:
+        """The right-hand side of C_q a = gamma."""
+        made = np.zeros(self._n_rows)
+        self._callbacks.fill_gamma(q, v, p, self._moved(t), made)
+        return made
+
+    def _moved(self, t: float) -> Array:
+        nothing = np.zeros(0)
+        return _called(self._motions, t, nothing, nothing)
+
+
+def _called(functions: tuple[Function, ...], t: float, q: Array, v: Array) -> Array:
+    return np.concatenate([np.zeros(0), *(each.at(t, q, v) for each in functions)])

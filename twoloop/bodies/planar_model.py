@@ -1,0 +1,340 @@
+"""Models in a plane."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from twoloop.bodies.functions import Function
+from twoloop.bodies.model import Model
+from twoloop.bodies.parameter_layout import ACROSS, ALONG, ANGLE, DISTANCE, PIN, SLIDE, TORQUE, TORSION
+from twoloop.bodies.parts import Body, Force, JointRow, ModelJoint, Numbers
+from twoloop.checks.arguments import check_finite, check_positive, check_vector
+
+Array = NDArray[np.float64]
+
+
+class PlanarModel(Model):
+    """A mechanism in a plane, from bodies, joints and forces.
+
+    Coordinates are x, y of each body's centre of mass and its angle, positive from x to y. Points and axes are given in
+    space, in the position in which the bodies are given, or on a body by `body.point(...)` and `body.direction(...)`.
+
+    Parameters
+    ----------
+    gravity : array_like (2,)
+        m/s^2.
+    name : str
+
+    Attributes
+    ----------
+    ground : Body
+    bodies, joints, forces : list
+        What was added so far.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If an argument is wrong.
+    """
+
+    dimension = 2
+    coordinate_names = ("x (m)", "y (m)", "angle (rad)")
+
+    def __init__(self, gravity: ArrayLike = (0.0, -9.81), *, name: str = "planar model"):
+        super().__init__(gravity, name)
+
+    def body(
+        self,
+        name: str,
+        *,
+        mass: float,
+        inertia: float,
+        position: ArrayLike,
+        angle: float = 0.0,
+        velocity: ArrayLike | None = None,
+        angular_velocity: float | None = None,
+    ) -> Body:
+        """Add a body.
+
+        Parameters
+        ----------
+        name : str
+        mass, inertia : float
+            kg, and kg m^2 about the centre of mass.
+        position : array_like (2,)
+            Of the centre of mass, m.
+        angle : float
+            rad.
+        velocity : array_like (2,), optional
+            Of the centre of mass at the start, m/s. None: it follows from the other velocities.
+        angular_velocity : float, optional
+            rad/s, likewise.
+
+        Returns
+        -------
+        Body
+
+        Raises
+        ------
+        TypeError, ValueError
+            If an argument is wrong, or something of the model has this name.
+        """
+        name, place, weight, speed = self._new_body(name, mass, position, velocity)
+        check_positive(f"inertia of {name!r}", inertia)
+        rate = None if angular_velocity is None else check_finite(f"angular_velocity of {name!r}", angular_velocity)
+        turned = check_finite(f"angle of {name!r}", angle)
+        spin = None if rate is None else np.array([rate])
+        return self._add_body(Body(name, len(self.bodies), place, turned, np.array([weight, inertia]), speed, spin))
+
+    def rod(self, name: str, start: ArrayLike, end: ArrayLike, *, mass: float, **motion: Any) -> Body:
+        """Add a uniform thin rod between two points of space; its angle is that from `start` to `end`.
+
+        Parameters
+        ----------
+        name : str
+        start, end : array_like (2,)
+            m.
+        mass : float
+            kg.
+        **motion
+            `velocity` and `angular_velocity`, as for `body`.
+
+        Returns
+        -------
+        Body
+
+        Raises
+        ------
+        TypeError, ValueError
+            If an argument is wrong.
+        """
+        one, other = check_vector(f"start of {name!r}", start, 2), check_vector(f"end of {name!r}", end, 2)
+        length = float(np.hypot(*(other - one)))
+        check_positive(f"mass of {name!r}", mass)
+        check_positive(f"the length of {name!r}, from start to end,", length)
+        position, angle = 0.5 * (one + other), float(np.arctan2(*(other - one)[::-1]))
+        return self.body(name, mass=mass, inertia=mass * length**2 / 12.0, position=position, angle=angle, **motion)
+
+    def box(self, name: str, size: ArrayLike, *, mass: float, position: ArrayLike, **pose: Any) -> Body:
+        """Add a uniform rectangle.
+
+        Parameters
+        ----------
+        name : str
+        size : array_like (2,)
+            Its edges along the axes of the body, m.
+        mass : float
+            kg.
+        position : array_like (2,)
+            Of the centre, m.
+        **pose
+            `angle`, `velocity` and `angular_velocity`, as for `body`.
+
+        Returns
+        -------
+        Body
+
+        Raises
+        ------
+        TypeError, ValueError
+            If an argument is wrong.
+        """
+        edges = check_vector(f"size of {name!r}", size, 2)
+        check_positive(f"mass of {name!r}", mass)
+        for edge in edges:
+            check_positive(f"each edge of {name!r}", float(edge))
+        return self.body(name, mass=mass, inertia=mass * float(edges @ edges) / 12.0, position=position, **pose)
+
+    def disc(self, name: str, radius: float, *, mass: float, position: ArrayLike, **pose: Any) -> Body:
+        """Add a uniform disc.
+
+        Parameters
+        ----------
+        name : str
+        radius : float
+            m.
+        mass : float
+            kg.
+        position : array_like (2,)
+            Of the centre, m.
+        **pose
+            `angle`, `velocity` and `angular_velocity`, as for `body`.
+
+        Returns
+        -------
+        Body
+
+        Raises
+        ------
+        TypeError, ValueError
+            If an argument is wrong.
+        """
+        check_positive(f"radius of {name!r}", radius)
+        check_positive(f"mass of {name!r}", mass)
+        return self.body(name, mass=mass, inertia=0.5 * mass * radius**2, position=position, **pose)
+
+    def revolute(self, a: Body | str, b: Body | str, *, at: Any, name: str | None = None) -> ModelJoint:
+        """A pin: b turns on a.
+
+        Parameters
+        ----------
+        a, b : Body or str
+            The bodies, or their names.
+        at : array_like (2,) or (BodyPoint, BodyPoint)
+            Where the pin is, in space in the position given, m; or a point of a and one of b, which are put together.
+        name : str, optional
+
+        Returns
+        -------
+        ModelJoint
+
+        Raises
+        ------
+        TypeError, ValueError
+            If an argument is wrong.
+        """
+        first, second, name, points = self._pair("revolute", a, b, name, at)
+        return self._add_joint(ModelJoint(name, "revolute", first, second, (_pin(first, second, *points),), *points))
+
+    def prismatic(self, a: Body | str, b: Body | str, *, at: Any, axis: Any, name: str | None = None) -> ModelJoint:
+        """A slide: b moves along an axis of a, and does not turn on it.
+
+        Parameters
+        ----------
+        a, b : Body or str
+        at : array_like (2,) or (BodyPoint, BodyPoint)
+            A point on the axis, m.
+        axis : array_like (2,) or BodyDirection
+            Its direction, of any length; a pair of directions of a and b says how b is turned against a.
+        name : str, optional
+
+        Returns
+        -------
+        ModelJoint
+
+        Raises
+        ------
+        TypeError, ValueError
+            If an argument is wrong.
+        """
+        first, second, name, points = self._pair("prismatic", a, b, name, at)
+        one, other = self._directions(axis, first, second)
+        turned = float(np.arctan2(one[1], one[0]))
+        pair = isinstance(axis, (tuple, list)) and not isinstance(axis[0], (int, float, np.number))
+        offset = turned - float(np.arctan2(other[1], other[0])) if pair else second.rotation - first.rotation
+        along = Numbers((turned,), (f"angle of {name} on {first.name} (rad)",))
+        rows = (
+            JointRow(ACROSS, 1, first, second, *points, along),
+            JointRow(ANGLE, 1, first, second, more=_turn(name, first, second, offset)),
+        )
+        return self._add_joint(ModelJoint(name, "prismatic", first, second, rows, *points))
+
+    def fixed(self, a: Body | str, b: Body | str, *, at: Any = None, name: str | None = None) -> ModelJoint:
+        """Both bodies move as one.
+
+        Parameters
+        ----------
+        a, b : Body or str
+        at : array_like (2,) or (BodyPoint, BodyPoint), optional
+            To which the reaction refers, m. None: the centre of mass of b, or of a if b is the ground.
+        name : str, optional
+
+        Returns
+        -------
+        ModelJoint
+
+        Raises
+        ------
+        TypeError, ValueError
+            If an argument is wrong.
+        """
+        first, second, name, points = self._pair("fixed", a, b, name, at)
+        turned = _turn(name, first, second, second.rotation - first.rotation)
+        rows = _pin(first, second, *points), JointRow(ANGLE, 1, first, second, more=turned)
+        return self._add_joint(ModelJoint(name, "fixed", first, second, rows, *points))
+
+    def distance(
+        self,
+        a: Body | str,
+        at_a: Any,
+        b: Body | str,
+        at_b: Any,
+        *,
+        length: float | None = None,
+        name: str | None = None,
+    ) -> ModelJoint:
+        """A massless rod between a point of a and a point of b.
+
+        Parameters
+        ----------
+        a, b : Body or str
+        at_a, at_b : array_like (2,) or BodyPoint
+            The points, in space in the position given, m.
+        length : float, optional
+            m. None: their distance in the position given.
+        name : str, optional
+
+        Returns
+        -------
+        ModelJoint
+
+        Raises
+        ------
+        TypeError, ValueError
+            If an argument is wrong.
+        """
+        return self._distance(DISTANCE, a, at_a, b, at_b, length, name)
+
+    def _no_rotation(self) -> float:
+        return 0.0
+
+    def _drive_row(self, joint: ModelJoint, motion: Function) -> JointRow:
+        if joint.kind == "revolute":
+            zero = Numbers((joint.b.rotation - joint.a.rotation,))
+            return JointRow(ANGLE, 1, joint.a, joint.b, more=zero, motion=motion)
+        across = joint.rows[0]
+        return JointRow(ALONG, 1, joint.a, joint.b, across.on_first, across.on_second, across.more, motion)
+
+    def _torsion(self, name: str, joint: ModelJoint, numbers: Numbers) -> Force:
+        stiffness, damping, angle = numbers.values
+        total = angle + joint.b.rotation - joint.a.rotation
+        names = (*numbers.names[:2], f"angle of {joint.b.name} against {joint.a.name} without torque of {name} (rad)")
+        values = Numbers((stiffness, damping, total), names)
+        return Force(name, TORSION, joint.a, joint.b, None, None, values)
+
+    def _motor(self, name: str, joint: ModelJoint, unit: str, f: Any) -> Force:
+        function, more = self._function(name, f, 1, unit)
+        if joint.kind == "revolute":
+            return Force(name, TORQUE, joint.a, joint.b, None, None, more, function)
+        return Force(name, SLIDE, joint.a, joint.b, joint.rows[0].more, joint.point_b, more, function)
+
+    def _along(self, name: str, kind: int, joint: ModelJoint, numbers: Numbers) -> Force:
+        axis = joint.rows[0].more  # None of a revolute one
+        return Force(name, kind, joint.a, joint.b, axis, joint.point_b, numbers, point_on_first=joint.point_a)
+
+    def _check_moments(self, name: str, moments: Array) -> None:
+        check_positive(f"moment of inertia of {name}", float(moments[0]))
+
+    def _start(self) -> Array:
+        return np.concatenate([np.append(body.position, body.rotation) for body in self.bodies])
+
+    def _velocities(self, q: Array) -> tuple[Array, NDArray[np.bool_]]:
+        given = np.full((len(self.bodies), 3), np.nan)
+        for row, body in zip(given, self.bodies, strict=True):
+            if body.velocity is not None:
+                row[:2] = body.velocity
+            if body.angular_velocity is not None:
+                row[2:] = body.angular_velocity
+        known = np.isfinite(given.ravel())
+        return np.where(known, given.ravel(), 0.0), known
+
+
+def _pin(a: Body, b: Body, on_a: Numbers, on_b: Numbers) -> JointRow:
+    return JointRow(PIN, 2, a, b, on_a, on_b)
+
+
+def _turn(name: str, a: Body, b: Body, angle: float) -> Numbers:
+    return Numbers((angle,), (f"angle of {b.name} against {a.name} in {name} (rad)",))

@@ -1,0 +1,54 @@
+"""What the functions of a model give: programs that were traced of them and stand in the parameters."""
+
+import numpy as np
+
+from twoloop.kernels.compile.caches import helper
+from twoloop.kernels.evaluation.operations import END, FIRST, KIND, MADE, N_COLUMNS, RESULT, SECOND
+from twoloop.kernels.evaluation.program import operation
+
+N_RESULTS, N_NODES, N_ROWS, N_TERMS, PROGRAM = range(5)
+
+
+@helper
+def total(nodes, first, p, columns, coefficients, constant, begin, end):
+    """A form: a constant and multiples of nodes."""
+    made = p[constant]
+    for k in range(begin, end):
+        made = made + p[coefficients + k] * nodes[first + int(p[columns + k])]
+    return made
+
+
+@helper
+def results(place, t, q, v, p):
+    """The results of the program at a place of p, then all of its nodes; p itself where there is none."""
+    if place < 0:
+        return p
+    first, n_rows, n_terms = int(p[place + N_RESULTS]), int(p[place + N_ROWS]), int(p[place + N_TERMS])
+    rows = place + PROGRAM
+    columns = rows + N_COLUMNS * n_rows
+    coefficients = columns + n_terms
+    constants = coefficients + n_terms
+    nodes = np.zeros(first + int(p[place + N_NODES]))
+    nodes[first] = t
+    for j in range(q.size):
+        nodes[first + 1 + j] = q[j]
+        nodes[first + 1 + q.size + j] = v[j]
+    for i in range(n_rows):
+        row = rows + N_COLUMNS * i
+        kind, made = int(p[row + KIND]), int(p[row + MADE])
+        begin, middle, end = int(p[row + FIRST]), int(p[row + SECOND]), int(p[row + END])
+        x = total(nodes, first, p, columns, coefficients, constants + 2 * i, begin, middle)
+        y = total(nodes, first, p, columns, coefficients, constants + 2 * i + 1, middle, end)
+        if kind == RESULT:
+            nodes[made] = x
+        else:
+            nodes[first + made] = operation(kind, x, y)
+    return nodes
+
+
+@helper
+def result(made, place, order):
+    """A derivative of a motion, zero where there is none."""
+    if place < 0:
+        return 0.0
+    return made[place + order]

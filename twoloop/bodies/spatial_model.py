@@ -1,0 +1,372 @@
+"""Models in space."""
+
+from __future__ import annotations
+
+import os
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from twoloop.bodies.functions import Function
+from twoloop.bodies.parameter_layout import AXIAL, LENGTH, PLANE, POINT, SLIDE, TORSION, TURN
+from twoloop.bodies.parts import Body, Force, JointRow, ModelJoint, Numbers
+from twoloop.bodies.spatial_rows import across, on_line, parallel, perpendiculars, relative
+from twoloop.bodies.spatial_shapes import SpatialShapes
+from twoloop.checks.arguments import shown
+from twoloop.mechanisms.rotation import euler_parameters, euler_rates, rotation_matrix
+
+Array = NDArray[np.float64]
+
+PERPENDICULAR_TO = 1e-6  # cosine of the angle between the axes of a universal joint, at most
+
+
+class SpatialModel(SpatialShapes):
+    """A mechanism in space, from bodies, joints and forces.
+
+    Coordinates are x, y, z of each body's centre of mass and the four Euler parameters of its axes. Points and axes are
+    given in space, in the position in which the bodies are given, or on a body by `body.point(...)` and
+    `body.direction(...)`.
+
+    Parameters
+    ----------
+    gravity : array_like (3,)
+        m/s^2.
+    name : str
+
+    Attributes
+    ----------
+    ground : Body
+    bodies, joints, forces : list
+        What was added so far.
+    ignored : tuple of str
+        What was not read of a file, see `from_mjcf`.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If an argument is wrong.
+    """
+
+    ignored: tuple[str, ...] = ()  # what of a file has no counterpart, see `from_mjcf`
+    coordinate_names = ("x (m)", "y (m)", "z (m)", "e0 (-)", "e1 (-)", "e2 (-)", "e3 (-)")
+
+    def __init__(self, gravity: ArrayLike = (0.0, 0.0, -9.81), *, name: str = "spatial model"):
+        super().__init__(gravity, name)
+
+    def spherical(self, a: Body | str, b: Body | str, *, at: Any, name: str | None = None) -> ModelJoint:
+        """A ball joint: both bodies share a point.
+
+        Parameters
+        ----------
+        a, b : Body or str
+            The bodies, or their names.
+        at : array_like (3,) or (BodyPoint, BodyPoint)
+            Where, in space in the position given, m; or a point of a and one of b, which are put together.
+        name : str, optional
+
+        Returns
+        -------
+        ModelJoint
+
+        Raises
+        ------
+        TypeError, ValueError
+            If an argument is wrong.
+        """
+        first, second, name, points = self._pair("spherical", a, b, name, at)
+        rows = (JointRow(POINT, 3, first, second, *points),)
+        return self._add_joint(ModelJoint(name, "spherical", first, second, rows, *points))
+
+    def revolute(self, a: Body | str, b: Body | str, *, at: Any, axis: Any, name: str | None = None) -> ModelJoint:
+        """A hinge: b turns on a about an axis.
+
+        Parameters
+        ----------
+        a, b : Body or str
+        at : array_like (3,) or (BodyPoint, BodyPoint)
+            A point on the axis, m.
+        axis : array_like (3,) or (BodyDirection, BodyDirection)
+            Its direction, of any length.
+        name : str, optional
+
+        Returns
+        -------
+        ModelJoint
+
+        Raises
+        ------
+        TypeError, ValueError
+            If an argument is wrong.
+        """
+        first, second, name, points = self._pair("revolute", a, b, name, at)
+        one, other = self._directions(axis, first, second)
+        rows = JointRow(POINT, 3, first, second, *points), *parallel(first, one, second, other)
+        return self._add_joint(ModelJoint(name, "revolute", first, second, rows, *points, (one, other)))
+
+    def universal(self, a: Body | str, b: Body | str, *, at: Any, axes: Any, name: str | None = None) -> ModelJoint:
+        """A cross: one of its axes is fixed in a, the other, perpendicular, in b.
+
+        Parameters
+        ----------
+        a, b : Body or str
+        at : array_like (3,) or (BodyPoint, BodyPoint)
+            Its centre, m.
+        axes : (array_like (3,), array_like (3,)) or (BodyDirection, BodyDirection)
+            The axis in a and the axis in b.
+        name : str, optional
+
+        Returns
+        -------
+        ModelJoint
+
+        Raises
+        ------
+        TypeError, ValueError
+            If an argument is wrong, or the axes are not perpendicular.
+        """
+        if not isinstance(axes, (tuple, list, np.ndarray)) or len(axes) != 2:
+            raise ValueError(f"axes must be two directions, the axis in a and the axis in b; given {shown(axes)}")
+        first, second, name, points = self._pair("universal", a, b, name, at)
+        one, other = self._direction("axes[0]", axes[0], first), self._direction("axes[1]", axes[1], second)
+        cosine = float((first.rotation @ one) @ (second.rotation @ other))
+        if not any(hasattr(each, "body") for each in axes) and abs(cosine) > PERPENDICULAR_TO:
+            raise ValueError(
+                f"axes of {name!r} must be perpendicular; given {shown(axes)}, whose cosine is {cosine:.6g}"
+            )
+        rows = JointRow(POINT, 3, first, second, *points), across(first, one, second, other)
+        return self._add_joint(ModelJoint(name, "universal", first, second, rows, *points, (one, other)))
+
+    def cylindrical(self, a: Body | str, b: Body | str, *, at: Any, axis: Any, name: str | None = None) -> ModelJoint:
+        """A sleeve: b slides along an axis of a, and turns about it.
+
+        Parameters
+        ----------
+        a, b : Body or str
+        at : array_like (3,) or (BodyPoint, BodyPoint)
+            A point on the axis, m.
+        axis : array_like (3,) or (BodyDirection, BodyDirection)
+            Its direction, of any length.
+        name : str, optional
+
+        Returns
+        -------
+        ModelJoint
+
+        Raises
+        ------
+        TypeError, ValueError
+            If an argument is wrong.
+        """
+        first, second, name, points = self._pair("cylindrical", a, b, name, at)
+        one, other = self._directions(axis, first, second)
+        rows = *on_line(first, one, second, *points), *parallel(first, one, second, other)
+        return self._add_joint(ModelJoint(name, "cylindrical", first, second, rows, *points, (one, other)))
+
+    def prismatic(self, a: Body | str, b: Body | str, *, at: Any, axis: Any, name: str | None = None) -> ModelJoint:
+        """A slide: b moves along an axis of a, and does not turn on it.
+
+        Parameters
+        ----------
+        a, b : Body or str
+        at : array_like (3,) or (BodyPoint, BodyPoint)
+            A point on the axis, m.
+        axis : array_like (3,) or (BodyDirection, BodyDirection)
+            Its direction, of any length.
+        name : str, optional
+
+        Returns
+        -------
+        ModelJoint
+
+        Raises
+        ------
+        TypeError, ValueError
+            If an argument is wrong.
+        """
+        first, second, name, points = self._pair("prismatic", a, b, name, at)
+        one, other = self._directions(axis, first, second)
+        first_across, third = perpendiculars(one)
+        held = across(first, first_across, second, relative(first, one, second, other).T @ third)
+        rows = *on_line(first, one, second, *points), *parallel(first, one, second, other), held
+        return self._add_joint(ModelJoint(name, "prismatic", first, second, rows, *points, (one, other)))
+
+    def planar(self, a: Body | str, b: Body | str, *, at: Any, axis: Any, name: str | None = None) -> ModelJoint:
+        """A table: b slides in a plane of a, and turns about the axis across it.
+
+        Parameters
+        ----------
+        a, b : Body or str
+        at : array_like (3,) or (BodyPoint, BodyPoint)
+            A point in the plane, m.
+        axis : array_like (3,) or (BodyDirection, BodyDirection)
+            The direction across the plane, of any length.
+        name : str, optional
+
+        Returns
+        -------
+        ModelJoint
+
+        Raises
+        ------
+        TypeError, ValueError
+            If an argument is wrong.
+        """
+        first, second, name, points = self._pair("planar", a, b, name, at)
+        one, other = self._directions(axis, first, second)
+        plane = JointRow(PLANE, 1, first, second, Numbers(tuple(one)), points[1], points[0])
+        rows = plane, *parallel(first, one, second, other)
+        return self._add_joint(ModelJoint(name, "planar", first, second, rows, *points, (one, other)))
+
+    def fixed(self, a: Body | str, b: Body | str, *, at: Any = None, name: str | None = None) -> ModelJoint:
+        """Both bodies move as one.
+
+        Parameters
+        ----------
+        a, b : Body or str
+        at : array_like (3,) or (BodyPoint, BodyPoint), optional
+            To which the reaction refers, m. None: the centre of mass of b, or of a if b is the ground.
+        name : str, optional
+
+        Returns
+        -------
+        ModelJoint
+
+        Raises
+        ------
+        TypeError, ValueError
+            If an argument is wrong.
+        """
+        first, second, name, points = self._pair("fixed", a, b, name, at)
+        there = second.rotation.T @ first.rotation
+        pairs = ((0, 1), (0, 2), (1, 2))
+        rows = (
+            JointRow(POINT, 3, first, second, *points),
+            *(across(first, np.eye(3)[i], second, there[:, j]) for i, j in pairs),
+        )
+        return self._add_joint(ModelJoint(name, "fixed", first, second, rows, *points))
+
+    def distance(
+        self,
+        a: Body | str,
+        at_a: Any,
+        b: Body | str,
+        at_b: Any,
+        *,
+        length: float | None = None,
+        name: str | None = None,
+    ) -> ModelJoint:
+        """A massless rod between a point of a and a point of b.
+
+        Parameters
+        ----------
+        a, b : Body or str
+        at_a, at_b : array_like (3,) or BodyPoint
+            The points, in space in the position given, m.
+        length : float, optional
+            m. None: their distance in the position given.
+        name : str, optional
+
+        Returns
+        -------
+        ModelJoint
+
+        Raises
+        ------
+        TypeError, ValueError
+            If an argument is wrong.
+        """
+        return self._distance(LENGTH, a, at_a, b, at_b, length, name)
+
+    def to_mjcf(self, path: str | os.PathLike[str]) -> None:
+        """Write the model to a file that MuJoCo reads, see `twoloop.bodies.from_mjcf`.
+
+        Joints become hinges, slides and balls of a tree of bodies; those that close loops, connect and weld. Springs
+        become stiffness and damping of joints, and tendons.
+
+        Parameters
+        ----------
+        path : path-like
+
+        Warns
+        -----
+        IgnoredWarning
+            If there are velocities, forces, motors, drives or friction: these have no place in such a file.
+
+        Raises
+        ------
+        ValueError
+            If MJCF has no counterpart of a joint, or none that closes a loop.
+        """
+        from twoloop.bodies.mjcf_writer import write
+
+        write(self, path)
+
+    def _no_rotation(self) -> Array:
+        return np.eye(3)
+
+    def _drive_row(self, joint: ModelJoint, motion: Function) -> JointRow:
+        one, other = joint.axes
+        if joint.kind == "prismatic":
+            along = Numbers(tuple(one))
+            return JointRow(PLANE, 1, joint.a, joint.b, along, joint.point_b, joint.point_a, motion)
+        first, second = perpendiculars(one)
+        zero = relative(joint.a, one, joint.b, other).T @ first
+        return JointRow(TURN, 1, joint.a, joint.b, Numbers((*first, *second)), Numbers(tuple(zero)), None, motion)
+
+    def _torsion(self, name: str, joint: ModelJoint, numbers: Numbers) -> Force:
+        one, other = joint.axes
+        zero = euler_parameters(relative(joint.a, one, joint.b, other))
+        here, there = (euler_parameters(body.rotation) for body in (joint.a, joint.b))
+        w = here[0] * there[0] + here[1:] @ there[1:]
+        x = here[0] * there[1:] - there[0] * here[1:] - np.cross(here[1:], there[1:])
+        zero = zero if zero @ np.append(w, x) > 0.0 else -zero  # of both signs the one that the bodies start with
+        axis, start = Numbers(tuple(one)), Numbers(tuple(zero))
+        return Force(name, TORSION, joint.a, joint.b, axis, start, numbers, joint=joint)
+
+    def _motor(self, name: str, joint: ModelJoint, unit: str, f: Any) -> Force:
+        function, more = self._function(name, f, 1, unit)
+        axis = Numbers(tuple(joint.axes[0]))
+        if joint.kind == "revolute":
+            return Force(name, AXIAL, joint.a, joint.b, axis, None, more, function)
+        return Force(name, SLIDE, joint.a, joint.b, axis, joint.point_b, more, function)
+
+    def _along(self, name: str, kind: int, joint: ModelJoint, numbers: Numbers) -> Force:
+        axis = Numbers(tuple(joint.axes[0]))
+        places = axis, joint.point_b, numbers
+        return Force(name, kind, joint.a, joint.b, *places, point_on_first=joint.point_a, joint=joint)
+
+    def _first_row(self) -> int:
+        return len(self.bodies)
+
+    def _start(self) -> Array:
+        return np.concatenate([[*body.position, *euler_parameters(body.rotation)] for body in self.bodies])
+
+    def _velocities(self, q: Array) -> tuple[Array, NDArray[np.bool_]]:
+        given = np.full((len(self.bodies), 7), np.nan)
+        for row, body, state in zip(given, self.bodies, q.reshape(-1, 7), strict=True):
+            if body.velocity is not None:
+                row[:3] = body.velocity
+            if body.angular_velocity is not None:
+                row[3:] = euler_rates(state[3:], body.angular_velocity)
+        known = np.isfinite(given.ravel())
+        return np.where(known, given.ravel(), 0.0), known
+
+    def _check_branches(self, t: float, q: Array) -> None:
+        for joint in self.joints:
+            row = joint.rows[0]
+            if row.kind != TURN or row.motion is None:
+                continue
+            assert row.on_first is not None and row.on_second is not None
+            one, other = (
+                np.eye(3) if body is self.ground else rotation_matrix(q[7 * body.number + 3 : 7 * body.number + 7])
+                for body in (joint.a, joint.b)
+            )
+            there = one.T @ (other @ np.array(row.on_second.values))
+            angle = float(row.motion.at(t, q, q)[0])
+            first, second = np.array(row.on_first.values).reshape(2, 3)
+            if np.cos(angle) * (first @ there) + np.sin(angle) * (second @ there) < 0.0:
+                raise ValueError(
+                    f"{joint.name!r} is to begin at {angle:.6g} rad from the position given, which is so far away that "
+                    "the bodies end half a turn from it: give their poses nearer to where the motion begins"
+                )

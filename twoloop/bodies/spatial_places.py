@@ -1,0 +1,139 @@
+"""Vectors and points of spatial bodies, their rates, and the generalised forces at them: helpers of the callbacks.
+
+Coordinates of a body: x, y, z of the centre of mass and the Euler parameters of its axes; see `mechanisms.rotation`.
+"""
+
+import math
+
+from twoloop.kernels.compile.caches import helper
+from twoloop.mechanisms.rotation import half_spin, pulled, rotated, rotated_rate
+
+
+@helper
+def vector(q, body, x, y, z):
+    """A vector that turns with a body, in space."""
+    if body < 0:
+        return x, y, z
+    k = 7 * body + 3
+    return rotated(q[k], q[k + 1], q[k + 2], q[k + 3], x, y, z)
+
+
+@helper
+def vector_rate(q, v, body, x, y, z):
+    """Its derivative, and twice R(e') a, which is its second one where e'' = 0."""
+    if body < 0:
+        return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    k = 7 * body + 3
+    ux, uy, uz = rotated_rate(q[k], q[k + 1], q[k + 2], q[k + 3], v[k], v[k + 1], v[k + 2], v[k + 3], x, y, z)
+    ax, ay, az = rotated(v[k], v[k + 1], v[k + 2], v[k + 3], x, y, z)
+    return ux, uy, uz, 2.0 * ax, 2.0 * ay, 2.0 * az
+
+
+@helper
+def centre(q, body):
+    """The centre of mass; also the velocity, of v."""
+    if body < 0:
+        return 0.0, 0.0, 0.0
+    return q[7 * body], q[7 * body + 1], q[7 * body + 2]
+
+
+@helper
+def place(q, body, p, at):
+    """The point of a body whose three numbers stand in p."""
+    x, y, z = vector(q, body, p[at], p[at + 1], p[at + 2])
+    cx, cy, cz = centre(q, body)
+    return cx + x, cy + y, cz + z
+
+
+@helper
+def motion(q, v, body, p, at):
+    """Velocity of that point, and what its acceleration has without v'."""
+    ux, uy, uz, ax, ay, az = vector_rate(q, v, body, p[at], p[at + 1], p[at + 2])
+    cx, cy, cz = centre(v, body)
+    return cx + ux, cy + uy, cz + uz, ax, ay, az
+
+
+@helper
+def turn_row(q, row, body, x, y, z, fx, fy, fz):
+    """Add to a row (n_q,) the derivative of f . (vector of a body) by its Euler parameters."""
+    if body >= 0:
+        k = 7 * body + 3
+        d0, d1, d2, d3 = pulled(q[k], q[k + 1], q[k + 2], q[k + 3], x, y, z, fx, fy, fz)
+        row[k] += d0
+        row[k + 1] += d1
+        row[k + 2] += d2
+        row[k + 3] += d3
+
+
+@helper
+def move_row(row, body, fx, fy, fz):
+    """Add to a row the derivative of f . (centre of a body)."""
+    if body >= 0:
+        row[7 * body] += fx
+        row[7 * body + 1] += fy
+        row[7 * body + 2] += fz
+
+
+@helper
+def push_row(q, row, body, p, at, fx, fy, fz):
+    """Add to a row the derivative of f . (point of a body): the generalised force of f there."""
+    move_row(row, body, fx, fy, fz)
+    turn_row(q, row, body, p[at], p[at + 1], p[at + 2], fx, fy, fz)
+
+
+@helper
+def twist_row(q, row, body, x, y, z):
+    """Add to a row the generalised force of a torque in space, 2 G^T R^T torque."""
+    if body >= 0:
+        k = 7 * body + 3
+        e0, e1, e2, e3 = q[k], q[k + 1], q[k + 2], q[k + 3]
+        x, y, z = rotated(e0, -e1, -e2, -e3, 2.0 * x, 2.0 * y, 2.0 * z)
+        row[k] += -e1 * x - e2 * y - e3 * z
+        row[k + 1] += e0 * x - e3 * y + e2 * z
+        row[k + 2] += e3 * x + e0 * y - e1 * z
+        row[k + 3] += -e2 * x + e1 * y + e0 * z
+
+
+@helper
+def spin(q, v, body):
+    """Angular velocity in space."""
+    if body < 0:
+        return 0.0, 0.0, 0.0
+    k = 7 * body + 3
+    x, y, z = half_spin(q[k], q[k + 1], q[k + 2], q[k + 3], v[k], v[k + 1], v[k + 2], v[k + 3])
+    return rotated(q[k], q[k + 1], q[k + 2], q[k + 3], 2.0 * x, 2.0 * y, 2.0 * z)
+
+
+@helper
+def parameters_of(q, body):
+    """Euler parameters."""
+    if body < 0:
+        return 1.0, 0.0, 0.0, 0.0
+    k = 7 * body + 3
+    return q[k], q[k + 1], q[k + 2], q[k + 3]
+
+
+@helper
+def product(a0, a1, a2, a3, b0, b1, b2, b3):
+    """Euler parameters of two rotations, the second first."""
+    return (
+        a0 * b0 - a1 * b1 - a2 * b2 - a3 * b3,
+        a0 * b1 + a1 * b0 + a2 * b3 - a3 * b2,
+        a0 * b2 - a1 * b3 + a2 * b0 + a3 * b1,
+        a0 * b3 + a1 * b2 - a2 * b1 + a3 * b0,
+    )
+
+
+@helper
+def turned(q, i, j, p, axis, zero):
+    """By how much body j has turned about an axis (3 numbers in p) of body i since their Euler parameters at `zero`.
+
+    Continuous within two turns to either side, as Euler parameters change their sign after one. `zero`: place in p of
+    the Euler parameters of j relative to i at the angle zero.
+    """
+    e0, e1, e2, e3 = parameters_of(q, i)
+    b0, b1, b2, b3 = parameters_of(q, j)
+    r0, r1, r2, r3 = product(e0, -e1, -e2, -e3, b0, b1, b2, b3)
+    c, x, y, z = product(r0, r1, r2, r3, p[zero], -p[zero + 1], -p[zero + 2], -p[zero + 3])
+    s = x * p[axis] + y * p[axis + 1] + z * p[axis + 2]
+    return 4.0 * math.atan(s / (c + math.sqrt(c * c + s * s)))

@@ -1,0 +1,45 @@
+"""Rows of the constraints of which joints in space are made, from unit directions in the axes of bodies."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twoloop.bodies.parameter_layout import PERPENDICULAR, PLANE
+from twoloop.bodies.parts import Body, JointRow, Numbers
+
+Array = NDArray[np.float64]
+
+
+def perpendiculars(axis: Array) -> tuple[Array, Array]:
+    """Two unit directions, perpendicular to an axis and to each other: right-handed with it."""
+    first = np.cross(axis, np.eye(3)[int(np.argmin(np.abs(axis)))])
+    first /= np.linalg.norm(first)
+    return first, np.cross(axis, first)
+
+
+def across(a: Body, one: Array, b: Body, other: Array) -> JointRow:
+    """A direction of a and one of b stay perpendicular."""
+    return JointRow(PERPENDICULAR, 1, a, b, Numbers(tuple(one)), Numbers(tuple(other)))
+
+
+def parallel(a: Body, one: Array, b: Body, other: Array) -> tuple[JointRow, ...]:
+    """A direction of a and one of b stay parallel."""
+    return tuple(across(a, each, b, other) for each in perpendiculars(one))
+
+
+def on_line(a: Body, one: Array, b: Body, on_a: Numbers, on_b: Numbers) -> tuple[JointRow, ...]:
+    """A point of b stays on a line of a."""
+    return tuple(JointRow(PLANE, 1, a, b, Numbers(tuple(each)), on_b, on_a) for each in perpendiculars(one))
+
+
+def relative(a: Body, one: Array, b: Body, other: Array) -> Array:
+    """The rotation of b against a nearest to the one given in which the axis of b is that of a."""
+    given: Array = a.rotation.T @ b.rotation
+    there = given @ other
+    turn, c = np.cross(there, one), float(there @ one)
+    if c < 0.0 and np.linalg.norm(turn) < 1e-6:  # opposite: half a turn about any direction across
+        half = perpendiculars(one)[0]
+        return np.asarray((2.0 * np.outer(half, half) - np.eye(3)) @ given)
+    cross = np.array([[0.0, -turn[2], turn[1]], [turn[2], 0.0, -turn[0]], [-turn[1], turn[0], 0.0]])
+    return np.asarray((np.eye(3) + cross + cross @ cross / (1.0 + c)) @ given)

@@ -1,0 +1,175 @@
+"""The parameters of a model: numbers with names, tables of joints and forces, programs; see `parameter_layout`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twoloop.bodies.functions import is_constant, numbers_of, program_for
+from twoloop.bodies.parameter_layout import BRAKE, NONE, PULL, RAIL, RUB, SPRING, TORSION
+from twoloop.bodies.parts import Body, Force, JointRow, ModelJoint, Numbers
+from twoloop.generate.tracing import Untraceable
+
+Array = NDArray[np.float64]
+
+GRAVITY = ("x", "y", "z")
+MOMENTS = {
+    2: ("moment of inertia",),
+    3: tuple(f"J_{which}" for which in ("xx", "yy", "zz", "xy", "xz", "yz")),
+}
+
+
+class Tables:
+    """All numbers of a model in one vector.
+
+    Parameters
+    ----------
+    gravity : ndarray (2 or 3,)
+    bodies, joints, forces : sequence
+    first_row : int
+        Of the joints: how many rows stand before them.
+
+    Attributes
+    ----------
+    p : ndarray
+    places : dict
+        Where the numbers with names stand in p, from 0 on.
+    rows : dict
+        Rows of C of each joint, by its name.
+    motions, functions : list of Function
+        Drives and forces that are functions, in the order of their results.
+    untraced : str
+        Why these do not stand in p as programs; "": they do, or there are none.
+    """
+
+    def __init__(
+        self,
+        gravity: Array,
+        bodies: Sequence[Body],
+        joints: Sequence[ModelJoint],
+        forces: Sequence[Force],
+        first_row: int,
+    ):
+        self.bodies, self.joints, self.forces = bodies, joints, forces
+        self.places: dict[str, int] = {}
+        self._values: list[float] = []
+        self._constants: list[float] = []
+        self._known: dict[int, int] = {}
+        self._keep: list[Numbers] = []  # so that no other gets the identity of one
+        dimension = len(gravity)
+        self._place(Numbers(tuple(gravity), tuple(f"gravity along {axis} (m/s^2)" for axis in GRAVITY[:dimension])))
+        for body in bodies:
+            names = ("mass (kg)", *(f"{moment} (kg m^2)" for moment in MOMENTS[dimension]))
+            self._place(Numbers(tuple(body.inertia), tuple(_of(name, body.name) for name in names)))
+        rows = [row for joint in joints for row in joint.rows]
+        for row in rows:
+            self._place_all(row.on_first, row.on_second, row.more)
+        for force in forces:
+            self._place_all(force.on_first, force.on_second, force.more)
+        self._n_named = len(self._values)
+        self.motions = [row.motion for row in rows if row.motion is not None]
+        self.functions = [force.function for force in forces if force.function is not None]
+        self.rows: dict[str, tuple[int, ...]] = {}
+        self._write(dimension, first_row)
+
+    @property
+    def values(self) -> dict[str, float]:
+        """The numbers with names."""
+        return {name: float(self.p[place]) for name, place in self.places.items()}
+
+    def of(self, numbers: Numbers) -> Array:
+        """Some numbers as they stand in p."""
+        place = self._at(numbers)
+        return self.p[place : place + len(numbers.values)]
+
+    @property
+    def conserve(self) -> bool:
+        """Whether nothing in the model changes its energy: no damper, force, torque or motor, no drive that moves."""
+        for force in self.forces:
+            numbers = np.zeros(0) if force.more is None else self.of(force.more)
+            if force.kind in (SPRING, TORSION, RAIL):
+                numbers = numbers[1:2]  # the damping
+            elif force.kind in (BRAKE, RUB):
+                numbers = numbers[:1]
+            if force.function is not None or (force.kind != PULL and numbers.any()):
+                return False
+        return all(is_constant(motion) for motion in self.motions)
+
+    def replaced(self, values: Mapping[str, float]) -> None:
+        """Put other values in the place of those that are here."""
+        for name, value in values.items():
+            if name in self.places:
+                self.p[self.places[name]] = value
+
+    def _place_all(self, *parts: Numbers | None) -> None:
+        for numbers in parts:
+            if numbers is not None and id(numbers) not in self._known:
+                self._place(numbers)
+
+    def _place(self, numbers: Numbers) -> None:
+        self._keep.append(numbers)
+        if not numbers.names:
+            self._known[id(numbers)] = NONE - 1 - len(self._constants)  # counted back from NONE until all are known
+            self._constants += numbers.values
+            return
+        self._known[id(numbers)] = len(self._values)
+        for name, value in zip(numbers.names, numbers.values, strict=True):
+            while name in self.places:  # names of bodies and joints can add up to the same
+                name = f"other {name}"
+            self.places[name] = len(self._values)
+            self._values.append(value)
+
+    def _at(self, numbers: Numbers | None) -> int:
+        if numbers is None:
+            return NONE
+        place = self._known[id(numbers)]
+        return place if place >= 0 else self._n_named + NONE - 1 - place
+
+    def _write(self, dimension: int, first_row: int) -> None:
+        n_q = (3 if dimension == 2 else 7) * len(self.bodies)
+        table: list[float] = []
+        row, motion, result = first_row, 0, 0
+        for joint in self.joints:
+            numbered: list[int] = []
+            for part in joint.rows:
+                table += self._joint_row(part, row, NONE if part.motion is None else 3 * motion)
+                motion += part.motion is not None
+                numbered += range(row, row + part.n_rows)
+                row += part.n_rows
+            self.rows[joint.name] = tuple(numbered)
+        n_before = len(self._values) + len(self._constants)
+        forces = n_before + len(table)
+        for force in self.forces:
+            first, second, function = force.first.number, force.second.number, force.function
+            table += (force.kind, first, self._at(force.on_first), second, self._at(force.on_second))
+            table += (self._at(force.more), NONE if function is None else result, self._at(force.point_on_first))
+            result += 0 if function is None else function.size
+        self.n_rows, self.untraced = row, ""
+        programs: list[list[float]] = []
+        for functions, motions in ((self.motions, True), (self.functions, False)):
+            try:
+                programs.append(numbers_of(program_for(functions, n_q, motions)) if functions else [])
+            except Untraceable as error:
+                self.untraced = str(error)
+                programs.append([])
+        begin = n_before + len(table)
+        places = [begin if programs[0] else NONE, begin + len(programs[0]) if programs[1] else NONE]
+        n_joint_rows = sum(len(joint.rows) for joint in self.joints)
+        head = [len(self.bodies), n_before, n_joint_rows, forces, len(self.forces), *places]
+        parts = (self._values, self._constants, table, *programs, head)
+        self.p = np.concatenate([np.asarray(part, dtype=float) for part in parts])
+
+    def _joint_row(self, row: JointRow, number: int, motion: int) -> tuple[float, ...]:
+        first, second = row.first.number, row.second.number
+        return (
+            *(row.kind, number, first, self._at(row.on_first), second, self._at(row.on_second)),
+            *(self._at(row.more), motion),
+        )
+
+
+def _of(quantity: str, name: str) -> str:
+    """Of "mass (kg)" and "crank" make "mass of crank (kg)"."""
+    head, unit = quantity.split(" (")
+    return f"{head} of {name} ({unit}"

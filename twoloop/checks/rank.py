@@ -1,0 +1,80 @@
+"""Rows that depend on others: which they are, how they are made of these, and how large solutions can be."""
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import lapack, qr
+
+from twoloop.kernels.compile.linking import direct
+
+Array = NDArray[np.float64]
+
+RANK_TOLERANCE = 1e-11  # of the largest diagonal entry of R
+MOST_TERMS, MOST_NAMED = 3, 8  # rows on which another depends: named with their coefficients, and named at all
+NO_DIRECTION = 1e-12  # of a row: what rounding leaves of it without its part in others that it depends on
+
+
+def eigenvalues(matrix: Array) -> Array:
+    """Of a symmetric matrix, in order: LAPACK called at once takes a fifth of the time where it is small."""
+    values: Array = lapack.dsyevd(matrix, compute_v=0)[0]
+    return values
+
+
+def orthogonalised(rows: Array, least: float) -> tuple[Array, Array, list[int]]:
+    """Rows of length 1, the lower triangle that makes those rows of them that count, and which these are.
+
+    A row counts if more of it than the share `least` is no combination of those before.
+    """
+    from twoloop.kernels.algebra.independent import independent_rows
+
+    most, kept = min(rows.shape), np.zeros(len(rows), dtype=np.int64)
+    basis, factors = np.zeros((most + 1, rows.shape[1])), np.zeros((most + 1, most + 1))
+    n = direct(independent_rows)(np.ascontiguousarray(rows), least, basis, factors, kept)
+    return basis[:n], factors[:n, :n], kept[:n].tolist()
+
+
+def largest_solution(rows: Array) -> float:
+    """How many times as large as values the solution of least norm, or by least squares, is at most; 1 if it is less.
+
+    What is below NO_DIRECTION of a row counts as dependent on others.
+    """
+    from twoloop.kernels.algebra.independent import size_of_inverse
+
+    _, factors, kept = orthogonalised(rows, NO_DIRECTION)
+    return max(1.0, direct(size_of_inverse)(np.ascontiguousarray(factors), len(kept), np.zeros(len(kept))))
+
+
+def redundant_rows(scaled: Array) -> list[int]:
+    """Rows of a Jacobian, scaled to like size, that depend on the others, by QR with pivoting."""
+    if scaled.size == 0:
+        return []
+    R, order = qr(scaled.T, mode="r", pivoting=True)
+    diagonal = np.abs(np.diagonal(R))
+    rank = int((diagonal > RANK_TOLERANCE * diagonal.max()).sum())
+    return sorted(order[rank:].tolist())
+
+
+def in_words(jacobian: Array, redundant: list[int]) -> str:
+    """Which rows depend on which others, with the coefficients where these are few: many differ from start to start."""
+    others = [i for i in range(len(jacobian)) if i not in redundant]
+    first, lengths = redundant[:5], np.linalg.norm(jacobian, axis=1)
+    equations = []
+    for i, factors in zip(first, _combinations(jacobian[others], jacobian[first]), strict=True):
+        parts = np.abs(factors) * lengths[others]
+        of = np.flatnonzero(parts > 1e-9 * lengths[i])
+        if len(of) > MOST_TERMS:
+            named = ", ".join(str(others[k]) for k in of[:MOST_NAMED])
+            also = f" and {len(of) - MOST_NAMED} more" if len(of) > MOST_NAMED else ""
+            equations.append(f"row {i} on rows {named}{also}")
+            continue
+        terms = [f"{factors[k]:.4g} row {others[k]}" for k in of]
+        equations.append(f"row {i} = {' + '.join(terms).replace('+ -', '- ') or '0'}")
+    more = ", ..." if len(redundant) > 5 else ""
+    return f"row(s) {redundant} depend on the others ({', '.join(equations)}{more})"
+
+
+def _combinations(others: Array, rows: Array) -> Array:
+    """Which combination of others each row is, by least squares where it is none."""
+    basis, factors, kept = orthogonalised(others, RANK_TOLERANCE)
+    if len(kept) < len(others):
+        return np.linalg.lstsq(others.T, rows.T, rcond=None)[0].T  # type: ignore[return-value]
+    return lapack.dtrtrs(factors, basis @ rows.T, lower=1, trans=1)[0].T  # type: ignore[no-any-return]

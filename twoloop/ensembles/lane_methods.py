@@ -1,0 +1,115 @@
+"""Methods that go in lanes: the step of each, its parameters and its memory."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twoloop.methods.auto import LOOSE, TIGHTEST
+from twoloop.methods.dop853_tableau import B
+from twoloop.methods.plan import Method, least_tolerance
+from twoloop.methods.presets import PRESETS
+from twoloop.methods.runge_kutta import RungeKutta
+from twoloop.methods.tableaux import radau_iia
+from twoloop.methods.taylor import order_in_lanes
+from twoloop.run.run import FIRST_STEP
+
+if TYPE_CHECKING:  # it loads kernels
+    from twoloop.generate.lane_code import LaneCode
+
+Array = NDArray[np.float64]
+
+STAGES = {"RadauIIA5": 3, "RadauIIA9": 5, "RadauIIA13": 7}  # of the implicit methods
+IN_LANES = ("auto", "Taylor", "DOP853", *STAGES)  # presets that go in lanes
+
+
+@dataclass(frozen=True)
+class LaneMethod:
+    """A method made ready for runs in lanes.
+
+    Attributes
+    ----------
+    name : str
+    series : bool
+        Whether it needs code for Taylor series.
+    order : int
+        What code made for a mechanism gets as the order.
+    options : ndarray
+        What its step reads.
+    step, memory : callable
+        Its kernel, compiled when it is first asked for, and the length of its memory, in vectors, for such code.
+    """
+
+    name: str
+    series: bool
+    order: int
+    options: Array
+    step: Callable[[], Any]
+    memory: Callable[["LaneCode"], int]
+
+
+def lane_methods(name: str, stiff: bool, n: int, rtol: float, atol: float) -> list[LaneMethod]:
+    """Methods for runs of n coordinates by a preset; the next one where no code can be had for one.
+
+    "auto" takes Taylor series, or DOP853 where there are none; for stiff motion the Radau method that it takes singly,
+    at loose tolerances that of order 5.
+    """
+    if name == "DOP853":
+        return [_dop853(n, rtol, atol)]
+    if name == "Taylor":
+        return [_taylor(rtol, atol)]
+    if name != "auto":
+        return [_newton(name, "all", n, rtol, atol)]
+    if not stiff:
+        return [_taylor(rtol, atol), _dop853(n, rtol, atol)]
+    tolerance = least_tolerance(rtol, atol)
+    radau = "RadauIIA5" if tolerance >= LOOSE else "RadauIIA9" if tolerance >= TIGHTEST else "RadauIIA13"
+    return [_newton(radau, "positions", n, rtol, atol)]
+
+
+def _taylor(rtol: float, atol: float) -> LaneMethod:
+    def step() -> Any:
+        from twoloop.kernels.lanes.lane_taylor import step_by_series
+
+        return step_by_series
+
+    order = order_in_lanes(rtol, atol) + 1
+    return LaneMethod("Taylor", True, order, np.zeros(0), step, lambda code: code.series_size(order))
+
+
+def _dop853(n: int, rtol: float, atol: float) -> LaneMethod:
+    def step() -> Any:
+        from twoloop.kernels.lanes.lane_dop853 import step_by_dop853
+
+        return step_by_dop853
+
+    def memory(code: "LaneCode") -> int:
+        from twoloop.kernels.lanes.lane_dop853 import memory_size
+
+        return memory_size(len(B), n)
+
+    return LaneMethod("DOP853", False, 8, _options(PRESETS["DOP853"], n, rtol, atol), step, memory)
+
+
+def _newton(name: str, tested: Literal["all", "positions"], n: int, rtol: float, atol: float) -> LaneMethod:
+    def step() -> Any:
+        from twoloop.kernels.lanes.lane_implicit import step_by_newton
+
+        return step_by_newton
+
+    def memory(code: "LaneCode") -> int:
+        from twoloop.kernels.lanes.lane_newton import memory_size
+
+        return memory_size(tableau.stages, n)
+
+    tableau = radau_iia(STAGES[name])
+    method = RungeKutta(tableau, outer="newton", tested=tested)
+    return LaneMethod(name, False, tableau.order, _options(method, n, rtol, atol), step, memory)
+
+
+def _options(method: Method, n: int, rtol: float, atol: float) -> Array:
+    """What a step reads, behind what lane_control.py reads."""
+    plan = method.plan(n, rtol, atol, False)
+    return np.concatenate([plan.rule, [plan.rough, FIRST_STEP, least_tolerance(rtol, atol)], plan.options])

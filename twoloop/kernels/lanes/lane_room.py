@@ -1,0 +1,123 @@
+"""What lanes have in memory, and what kernels call: functions made for a mechanism, and the step of a method."""
+
+from typing import Any
+
+from numba import types
+from numba.extending import typeof_impl
+
+from twoloop.kernels.compile.callbacks import VECTOR
+from twoloop.kernels.compile.own_functions import OwnFunctions
+from twoloop.kernels.compile.reference import Reference
+from twoloop.kernels.data.common import INTEGERS, merged
+
+LANES = 8  # doubles of a vector: those of AVX-512, or of two narrower ones
+
+# vectors in `room`, one number for each lane; behind them STATE, NEW, PREDICTED, ... as `places` has it
+(
+    T,
+    AHEAD,
+    UNIT,
+    H,
+    X,
+    FINE,  # 1: of the lanes that a task is for; what it leaves 1 could be done
+    MOVED,
+    DEFECT,
+    OFF,
+    LENGTH,
+    LONGEST,  # that the step may be, s
+    ASKED,  # 1: the lanes that begin a run, or in which a state is wanted
+    WORST,  # defect within the step
+    REFUSED,  # steps, one after another
+    RUNNING,
+    WHICH,  # run
+    REACHED,  # of the times at which states are wanted
+    LEFT_TO_MOVE,
+    MOVED_BEFORE,
+    ON_CONSTRAINTS,
+    ACCEPTED,
+    FRESH,  # 1: lanes whose run has not taken a step yet
+    ERROR,  # of a step, over the tolerances
+    WANTED,  # step, before it is cut short by the end of the run
+    H_NEXT,
+    H_LIMIT,  # of steps, after one that failed ...
+    LIMIT_AGE,  # ... so many steps ago
+    ROUGH_TO,  # where the last step ended that was refused for a sudden error
+    PAST,  # of controller.py, of one lane after the other
+    _MORE_PAST,
+    N_FIELDS,
+) = range(31)
+# functions made for a mechanism, (order, control, room), on what lies in `room`
+TASKS = (
+    "closer",  # positions of NEW, at AHEAD, moved towards the constraints, by MOVED
+    "nearer",  # the same and velocities, and A and LAM there
+    "there",  # A at NEW as it stands
+    "redundant",  # whether rows that do not count hold at NEW
+    "judge",  # DEFECT and OFF: of a step H from STATE by PREDICTED to NEW
+    "take",  # NEW becomes STATE where ACCEPTED
+)
+TASKS_OF_SERIES = (
+    "series",  # coefficients about STATE at T, in units of time UNIT
+    "lengths",  # LENGTH of the step at which the last two terms are within the tolerances, in units
+    "evaluate",  # NEW and FOUND: the state and its accelerations by the series, X units of time on
+)
+CODE = Reference("LaneKit", {})
+CODE.add_own_functions(dict.fromkeys((*TASKS, *TASKS_OF_SERIES), types.none(types.int64, VECTOR, VECTOR)))
+# of a method, (code, settings, control, options, room, status, n_steps, within): a step H of each lane that runs, and
+# whether it is ACCEPTED, with its end in NEW, A and LAM; or, `within` the step that was just accepted, NEW, X seconds
+# after its beginning, of the lanes that FINE names, off the constraints as yet
+STEP = types.void(CODE, INTEGERS, *[VECTOR] * 3, *[INTEGERS] * 2, types.boolean)
+CODE.add_function("step", STEP)
+
+LEFT, ENDED = 0, 1  # what becomes of a run: left to a run of its own, or made
+N, N_ROWS, ORDER, CHECKS_REDUNDANT, N_NUMBERS = range(5)  # in `settings`
+T0, T1, GAP, RTOL, ATOL = range(5)  # in `control`; from ATOL on a tolerance for each coordinate
+
+SHORTEST = 1e-13  # step, of the time
+
+
+class LaneKit:
+    """The functions made for a mechanism and the step of a method, as kernels get them."""
+
+    def __init__(self, own: OwnFunctions, step: Any):
+        self.__dict__.update(dict.fromkeys((*TASKS, *TASKS_OF_SERIES), 0))
+        self.__dict__.update(own.addresses)
+        self.own, self.step = own, step
+        self.table = CODE.table(self)
+        self.address = self.table.ctypes.data
+
+
+@typeof_impl.register(LaneKit)
+def _type_of_kit(value: Any, context: Any) -> Any:
+    return CODE
+
+
+def places(n, n_rows, n_numbers):
+    """Where in `room` stand STATE, NEW, PREDICTED, FOUND, A, LAM, the numbers of the code, the memory of the method.
+
+    Counted in vectors.
+    """
+    state = N_FIELDS
+    new = state + 2 * n
+    predicted = new + 2 * n
+    found = predicted + n
+    a = found + n
+    lam = a + n
+    numbers = lam + n_rows
+    return state, new, predicted, found, a, lam, numbers, numbers + n_numbers
+
+
+places_of = merged(places)
+
+
+@merged
+def fill_field(room, field, value):
+    """The same number in all lanes."""
+    for k in range(LANES):
+        room[field * LANES + k] = value
+
+
+@merged
+def leave(room, status, k):
+    """Leave the run of a lane to a run of its own."""
+    room[RUNNING * LANES + k] = 0.0
+    status[int(room[WHICH * LANES + k])] = LEFT
