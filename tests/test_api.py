@@ -7,7 +7,7 @@ import pytest
 
 import twoloop
 from tests.problems import START, pendulum_state, worst
-from twoloop import ConstrainedSystem, mechanisms, solve_dae
+from twoloop import ConstrainedSystem, exported, mechanisms, solve_dae
 
 
 @pytest.mark.parametrize("make", [mechanisms.four_bar, mechanisms.pendulum])
@@ -44,6 +44,13 @@ def test_arguments_that_are_left_out_are_as_documented():
     result = solve_dae(system, (0.0, 2.0), *START, **options)
     assert (result.q == solve_dae(few, (0.0, 2.0), *START).q).all()
     assert worst(result.q[:, -1], pendulum_state(2.0)[0]) < 1e-6
+
+
+def test_names_that_come_when_they_are_asked_for():
+    assert twoloop.__all__ == exported.__all__ and set(twoloop.__all__) <= set(dir(twoloop))
+    assert twoloop.mechanisms is mechanisms  # and so do folders
+    with pytest.raises(AttributeError, match="module 'twoloop' has no attribute 'solve_ode'"):
+        twoloop.solve_ode  # noqa: B018
 
 
 def test_all_that_is_promised_can_be_imported():

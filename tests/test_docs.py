@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from tests.test_rooms import documentation
+from tests.testing.planted import FAULTS
 from twoloop import Result, Status, mechanisms, solve_dae
 from twoloop.methods.presets import PRESETS
 from twoloop.run.record import explained
@@ -140,6 +141,14 @@ def test_many_runs(names):
     assert min(sizes["tolerances.png"], sizes["workspace.png"]) > 5000
 
 
+def test_the_red_example_is_as_printed(names):
+    page, text = names("check_simulator"), (DOCS / "check_simulator.md").read_text(encoding="utf-8")
+    assert not page["report"].passed and page["repaired"].passed
+    assert all(failure.hint in text for failure in page["report"].failures)
+    assert f"Of {len(FAULTS)} faults planted" in text
+    assert all(f"    {failure.property}: " in text for failure in page["report"].failures)
+
+
 def test_dense_output(names):
     page = names("between_steps")
     assert page["state"].q.shape == (9, 10_001)
@@ -238,7 +247,7 @@ ENTRIES = set(
 )
 
 
-@pytest.mark.parametrize("package", ["twoloop", "twoloop.bodies", "twoloop.symbolic"])
+@pytest.mark.parametrize("package", ["twoloop", "twoloop.bodies", "twoloop.symbolic", "twoloop.testing"])
 def test_every_name_of_a_package_has_an_entry(package):
     module = pytest.importorskip(package, exc_type=ImportError)
     assert {f"{package}.{name}" for name in module.__all__} <= ENTRIES

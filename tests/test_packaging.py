@@ -30,6 +30,9 @@ def test_the_wheel_says_that_it_is_typed(tmp_path, monkeypatch):
     monkeypatch.chdir(ROOT)
     with zipfile.ZipFile(tmp_path / build_wheel(str(tmp_path))) as wheel:
         names = set(wheel.namelist())
+        entry_points = wheel.read(f"twoloop-{_version()}.dist-info/entry_points.txt").decode()
+    assert "[pytest11]\ntwoloop.testing.plugin = twoloop.testing.plugin" in entry_points
+    assert "twoloop/testing/known_motions.npz" in names
     assert {"twoloop/py.typed", "twoloop/__init__.py", "twoloop/kernels/data/common.py"} <= names
     assert {name.split("/")[0] for name in names} == {"twoloop", f"twoloop-{_version()}.dist-info"}
     assert not [name for name in names if name.endswith((".nbi", ".nbc", ".pyc"))]

@@ -1,29 +1,15 @@
-"""Two-loop state-space integration of constrained mechanical systems, M q'' + C_q^T lam = Q, C(q, t) = 0."""
+"""Two-loop state-space integration of constrained mechanical systems, M q'' + C_q^T lam = Q, C(q, t) = 0.
 
-from twoloop.checks.consistency import ConstraintWarning
-from twoloop.ensembles.consistent_states import consistent_states
-from twoloop.ensembles.ensemble import ensemble
-from twoloop.ensembles.integrator import Integrator
-from twoloop.ensembles.runs import Runs
-from twoloop.kernels.compile.callbacks import callback
-from twoloop.methods.bdf import BDF
-from twoloop.methods.dop853 import DOP853
-from twoloop.methods.esdirk import ESDIRK
-from twoloop.methods.newmark import Newmark
-from twoloop.methods.presets import paper_irk, paper_newmark
-from twoloop.methods.runge_kutta import RungeKutta
-from twoloop.methods.taylor import Taylor
-from twoloop.problem.drawing import Drawing
-from twoloop.problem.joints import Joint
-from twoloop.problem.system import ConstrainedSystem
-from twoloop.result.certificate import Certificate, CertificateWarning
-from twoloop.result.citations import citation
-from twoloop.result.loading import load
-from twoloop.result.result import Result
-from twoloop.run.projection import ConsistentState, consistent_state
-from twoloop.run.record import Statistics, Status
-from twoloop.solve import solve_dae
-from twoloop.sweeps.sweep import sweep
+The names are imported when the first of them is asked for, so that `twoloop.testing` does without numba and SciPy.
+"""
+
+from importlib import import_module
+from importlib.util import find_spec
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from twoloop.exported import *  # noqa: F403
+# ruff: noqa: F405, a test compares the names below with those of `exported`
 
 __version__ = "0.1.0"
 
@@ -57,3 +43,17 @@ __all__ = [
     "solve_dae",
     "sweep",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    if name in __all__:
+        exported = import_module("twoloop.exported")
+        globals().update({each: getattr(exported, each) for each in __all__})
+        return globals()[name]
+    if not name.startswith("_") and find_spec(f"twoloop.{name}") is not None:
+        return import_module(f"twoloop.{name}")
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

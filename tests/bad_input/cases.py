@@ -8,6 +8,7 @@ from tests.bad_input.mechanisms import MECHANISMS
 from tests.bad_input.methods import METHODS
 from tests.bad_input.projection import PROJECTION
 from tests.bad_input.results import RESULTS
+from tests.bad_input.simulators import SIMULATORS
 from tests.bad_input.solving import SOLVE
 from tests.bad_input.start import START
 from tests.bad_input.symbolic import SYMBOLIC
@@ -18,5 +19,6 @@ CASES = [
     *(*SOLVE, *BETWEEN_STEPS, *START, *PROJECTION, *SYSTEMS, *METHODS, *MECHANISMS, *ROWS, *JOINTS, *RESULTS),
     *BODIES,
     *ENSEMBLES,
+    *SIMULATORS,
     *SYMBOLIC,
 ]

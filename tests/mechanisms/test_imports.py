@@ -22,7 +22,7 @@ def mechanisms_among(modules):
 
 def test_a_mechanism_imports_no_other_and_its_name_is_a_function_also_after_an_import_of_the_module():
     first, *after = imported(
-        "import twoloop",
+        "import twoloop; twoloop.solve_dae",
         "import twoloop.mechanisms",
         "from twoloop.mechanisms import four_bar",
         "import twoloop.mechanisms.heavy_top; from twoloop.mechanisms import heavy_top; assert callable(heavy_top)",

@@ -1,0 +1,248 @@
+"""`check_simulator`: what it measures, what it finds, what it says of it, and what it refuses."""
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from tests.testing.planted import ALPHA, FAULTS, ORDERS, RATTLE, RK, module_of
+from tests.testing.systems import system_of
+from twoloop import solve_dae
+from twoloop.testing import check_simulator
+from twoloop.testing.changes import in_a_frame, in_millimetres_and_grams
+from twoloop.testing.known_problems import MAKERS
+
+STEPS = (100, 200)
+LONG = ("andrews", "heavy_top")  # where an evaluation takes longest
+NAMED = [fault.words for fault in FAULTS]
+QUICK = [fault for k, fault in enumerate(FAULTS) if fault.problem not in LONG and fault.words not in NAMED[:k]]
+
+
+def known(edit=lambda problem, q, v, lam: (q, v, lam)):
+    """A simulator that knows the answer, and returns it after an edit."""
+
+    def simulate(problem, times, setting):
+        motion = MAKERS[problem.name]().reference
+        if problem.reference is None:  # the same problem seen otherwise, or begun later
+            raise NotImplementedError("begun elsewhere")
+        return edit(problem, motion.q.copy(), motion.v.copy(), motion.lam.copy())
+
+    return simulate
+
+
+def properties_that_fail(report):
+    return {failure.property for failure in report.failures}
+
+
+# --- what is right passes
+
+
+@pytest.mark.parametrize(
+    "fault",
+    [pytest.param(fault, id=fault.name, marks=[] if fault in QUICK else [pytest.mark.slow]) for fault in FAULTS],
+)
+def test_a_planted_fault_is_found_and_named(fault):
+    module = module_of(fault.example, fault.old, fault.new)
+    report = check_simulator(module.simulate, fault.problem, steps=STEPS, order=ORDERS[fault.example])
+    assert not report.passed
+    assert any(fault.words in failure.hint for failure in report.failures), str(report)
+
+
+@pytest.mark.parametrize("name", MAKERS)
+@pytest.mark.slow
+def test_sound_integrators_pass_on_every_problem(name):
+    beyond = {
+        RK: {"redundant_slider_crank"},
+        RATTLE: {"redundant_slider_crank", "heavy_top", "andrews", "spatial_four_bar"},
+    }
+    steps = (800, 1600) if "stiff" in name else (200, 400, 800)  # longer ones do not converge, and say so
+    for example in (RK, ALPHA, RATTLE):
+        if name not in beyond.get(example, ()):
+            report = check_simulator(module_of(example).simulate, name, steps=steps, order=ORDERS[example])
+            assert report.passed, str(report)
+
+
+def by_twoloop(problem, times, tolerance):
+    span = (times[0], times[-1])
+    run = solve_dae(system_of(problem), span, problem.q0, problem.v0, rtol=tolerance, atol=tolerance, t_eval=times)
+    if not run.success:
+        raise RuntimeError(run.message)
+    return run.q.T, run.v.T, run.lam.T
+
+
+def test_twoloop_passes_its_own_check():
+    report = check_simulator(by_twoloop, ["driven_crank", "force_ends"], tolerances=[1e-5, 1e-8])
+    assert report.passed, str(report)
+
+
+@pytest.mark.filterwarnings("ignore::twoloop.ConstraintWarning")
+@pytest.mark.parametrize("name", MAKERS)
+@pytest.mark.slow
+def test_twoloop_passes_on_every_problem(name):
+    report = check_simulator(by_twoloop, name)
+    assert report.passed, str(report)
+
+
+def by_scipy(problem, times, tolerance):
+    """The equations at index 1, which nothing puts back on the constraints."""
+    n = problem.n_q
+
+    def rate(t, y):
+        return np.concatenate([y[n:], problem.acceleration(t, y[:n], y[n:])[0]])
+
+    start = np.concatenate([problem.q0, problem.v0])
+    y = solve_ivp(rate, (times[0], times[-1]), start, t_eval=times, rtol=tolerance, atol=tolerance).y
+    return y[:n].T, y[n:].T
+
+
+def test_a_tolerance_that_is_not_passed_on():
+    report = check_simulator(lambda problem, times, tolerance: by_scipy(problem, times, 1e-4)[0], "driven_crank")
+    assert any("it is not used" in failure.hint for failure in report.failures)
+
+
+def test_index_1_without_projection_leaves_the_constraints():
+    report = check_simulator(by_scipy, "pendulum")
+    assert properties_that_fail(report) == {"constraints"}
+    assert "Project" in report.failures[0].hint
+
+
+# --- what is returned wrongly, of the known motion itself
+
+
+def singular_branch(problem, q, v, lam):
+    """After the first singular position the second crank goes back where the first one goes on."""
+    beyond = problem.reference.t > problem.singular_times[0]
+    q[beyond, 3] *= -1.0
+    return q, v, lam
+
+
+WRONG = [
+    ("pendulum", lambda problem, q, v, lam: (q, -v, lam), "velocities have the other sign"),
+    ("pendulum", lambda problem, q, v, lam: (q, np.vstack([v[:1], v[:-1]]), lam), "the output time before"),
+    ("pendulum", lambda problem, q, v, lam: (q, v, -lam), "multipliers have the other sign"),
+    ("pendulum", lambda problem, q, v, lam: (q, v, 0.5 * lam), "0.5 times"),
+    ("pendulum", lambda problem, q, v, lam: (np.roll(q, 1, axis=0), None, None), "late"),
+    ("pendulum", lambda problem, q, v, lam: (np.roll(q, -1, axis=0), None, None), "early"),
+    ("heavy_top", lambda problem, q, v, lam: (q * np.where(np.arange(7) < 3, 1, np.sign(q)), None, None), "e and -e"),
+    ("crank_rocker", lambda problem, q, v, lam: (np.arctan2(np.sin(q), np.cos(q)), None, None), "whole turns"),
+    ("parallelogram", singular_branch, "Right until the first singular position"),
+]
+
+
+@pytest.mark.parametrize(("name", "edit", "words"), WRONG, ids=[f"{name}: {words}" for name, _, words in WRONG])
+def test_what_is_returned_wrongly_is_named(name, edit, words):
+    report = check_simulator(known(edit), name)
+    hints = [failure.hint for failure in report.failures if failure.property not in ("frame", "units")]
+    assert any(words in hint for hint in hints), str(report)
+
+
+@pytest.mark.parametrize("name", [name for name, maker in MAKERS.items() if maker().reference is not None])
+def test_the_known_motion_itself_passes(name):
+    report = check_simulator(known(), name, tolerances=[1e-8])
+    assert properties_that_fail(report) == {"frame", "units"}  # for these it does not know
+
+
+# --- frames and units are the same problem
+
+
+@pytest.mark.parametrize("change", [in_a_frame, in_millimetres_and_grams])
+@pytest.mark.parametrize("name", MAKERS)
+def test_a_problem_seen_otherwise_has_the_same_accelerations(name, change):
+    problem = MAKERS[name]()
+    seen = change(problem)
+    q, v, t = problem.q0 + 0.01, problem.v0 + 0.1, 0.2
+    there_q, there_v = seen.T @ q + seen.d, seen.T @ v
+    back_q, back_v, _ = seen.back(there_q, there_v, None)
+    assert back_q == pytest.approx(q, abs=1e-12) and back_v == pytest.approx(v, abs=1e-12)
+    for kind in ("constraint", "constraint_rate"):
+        here, there = getattr(problem, kind)(t, q), getattr(seen.problem, kind)(t, there_q)
+        assert there == pytest.approx(seen.rows * here, abs=1e-9 * max(1.0, np.abs(there).max()))
+    state = problem.t_span[0], problem.q0, problem.v0
+    other = problem.t_span[0], seen.problem.q0, seen.problem.v0
+    (a, lam), (there_a, there_lam) = problem.acceleration(*state), seen.problem.acceleration(*other)
+    _, back_a, back_lam = seen.back(there_q, there_a, there_lam)
+    assert back_a == pytest.approx(a, abs=1e-8 * max(1.0, np.abs(a).max()))
+    J = problem.jacobian(*state[:2])
+    assert J.T @ back_lam == pytest.approx(J.T @ lam, abs=1e-7 * max(1.0, np.abs(lam).max()))
+    if problem.energy is not None:
+        assert seen.problem.energy(t, there_q, there_v) == pytest.approx(seen.work * problem.energy(t, q, v), rel=1e-9)
+
+
+def test_a_frame_turns_distances_into_themselves():
+    """Euler parameters, too: the pin of the heavy top stays where the frame has moved it."""
+    seen = in_a_frame(MAKERS["heavy_top"]())
+    assert np.abs(seen.T @ seen.T.T - np.eye(7)).max() < 1e-14
+    assert np.abs(seen.T - np.eye(7)).max() > 0.1 and np.abs(seen.d).max() > 0.5
+    flat = in_a_frame(MAKERS["four_bar"]())
+    assert flat.d[2::3] == pytest.approx(0.7) and flat.T[0, 1] == pytest.approx(-np.sin(0.7))
+
+
+# --- failures that are told
+
+
+def test_silence_is_found_and_a_word_is_not():
+    def silent(problem, times, tolerance):
+        return np.tile(problem.q0, (times.size, 1))
+
+    def partly(problem, times, tolerance):
+        return np.where(times[:, None] > 0.5, np.nan, silent(problem, times, tolerance))
+
+    def raises(problem, times, tolerance):
+        raise ArithmeticError("stuck at t = 1")
+
+    assert "Success with a wrong answer" in check_simulator(silent, "out_of_reach").failures[0].hint
+    assert check_simulator(partly, ["out_of_reach", "force_ends"]).passed
+    assert check_simulator(raises, ["out_of_reach", "force_ends"]).passed
+    report = check_simulator(raises, "pendulum")
+    assert report.failures[0].property == "runs" and "ArithmeticError: stuck at t = 1" in str(report)
+    assert report.skipped == (("pendulum", "everything else", "the run did not come to the end"),)
+    assert "q is not finite from t = 0.52 s on" in str(check_simulator(partly, "pendulum"))
+
+
+def test_a_coarse_step_may_say_no_and_the_finest_may_not():
+    example = module_of(RK).simulate
+
+    def from_step(least):
+        def simulate(problem, times, step):
+            if step > least * (problem.t_span[1] - problem.t_span[0]):
+                raise ValueError("too long a step")
+            return example(problem, times, step)
+
+        return simulate
+
+    assert check_simulator(from_step(0.008), "pendulum", steps=(100, 200, 400), order=4).passed
+    assert properties_that_fail(check_simulator(from_step(1e-3), "pendulum", steps=(100, 200, 400))) == {"runs"}
+
+
+# --- the report
+
+
+def test_the_report():
+    report = check_simulator(known(lambda problem, q, v, lam: (q + 0.1, None, None)), ["pendulum", "driven_crank"])
+    failure = report.failures[0]
+    assert (failure.problem, failure.property) == ("pendulum", "error of q")
+    assert failure.measured == pytest.approx(0.1) and 0.0 < failure.allowed < 0.1 and failure.hint
+    assert "pendulum: error of q: 0.1, allowed" in str(failure) and "error of q: 0.1" in str(report)
+    table = report.to_markdown()
+    rows = [line for line in table.splitlines() if line.startswith("|")]
+    assert {row.count("|") for row in rows} == {6}
+    assert "| pendulum | frame | not measured |  | the motion itself is wrong |" in rows
+    assert sum("**failed**" in row for row in rows) == len(report.failures)
+
+
+def test_errors_are_over_the_largest_coordinate():
+    problem = MAKERS["driven_crank"]()
+    largest = np.abs(problem.reference.q).max()
+    report = check_simulator(known(lambda problem, q, v, lam: (q + 0.1, None, None)), "driven_crank")
+    assert largest > 2.0 and report.failures[0].measured == pytest.approx(0.1 / largest)
+
+
+# --- wrong answers; wrong arguments are in tests/bad_input/simulators.py
+
+
+def test_answers_that_differ_from_run_to_run():
+    def simulate(problem, times, tolerance):
+        q = np.tile(problem.q0, (times.size, 1))
+        return (q, 0.0 * q) if tolerance > 1e-5 else q
+
+    with pytest.raises(TypeError, match="the same of q, v and lam in every run; on 'pendulum'"):
+        check_simulator(simulate, "pendulum")

@@ -1,0 +1,32 @@
+"""Known motions of mechanisms, and a check of any simulator against them; imports numpy only."""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from twoloop.testing.conformance import check_simulator
+    from twoloop.testing.findings import Failure, Finding, Report
+    from twoloop.testing.known_problem import KnownProblem, Motion
+    from twoloop.testing.known_problems import problems
+
+_MODULES = {
+    "Failure": "findings",
+    "Finding": "findings",
+    "KnownProblem": "known_problem",
+    "Motion": "known_problem",
+    "Report": "findings",
+    "check_simulator": "conformance",
+    "problems": "known_problems",
+}
+
+__all__ = ["Failure", "Finding", "KnownProblem", "Motion", "Report", "check_simulator", "problems"]
+
+
+def __getattr__(name: str) -> Any:  # pytest imports `plugin` in every run, which is not to cost an import of numpy
+    if name not in _MODULES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return __all__

@@ -1,0 +1,121 @@
+"""Andrews' squeezing mechanism: seven bodies, three loops that share a joint, driven by a constant torque.
+
+Angles beta, Theta, gamma, Phi, delta, Omega, epsilon and constants as in Hairer & Wanner, Solving Ordinary Differential
+Equations II, Sect. VII.7, and the Test Set for IVP Solvers, "andrews". The mass matrix, the terms of the velocities and
+gamma are made of the positions of the centres, which are sums of vectors that turn with sums of angles.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+MASSES = np.array([0.04325, 0.00365, 0.02373, 0.00706, 0.07050, 0.00706, 0.05498])  # kg
+INERTIAS = np.array([2.194e-6, 4.410e-7, 5.255e-6, 5.667e-7, 1.169e-5, 5.667e-7, 1.912e-5])  # kg m^2
+A, B, C = np.array([-0.06934, -0.00227]), np.array([-0.03635, 0.03273]), np.array([0.014, 0.072])  # m
+STIFFNESS, UNSTRESSED, TORQUE = 4530.0, 0.07785, 0.033  # N/m, m, N m
+START = np.array(
+    [
+        -0.0617138900142764496358948458001,
+        0.0,
+        0.455279819163070380255912382449,
+        0.222668390165885884674473185609,
+        0.487364979543842550225598953530,
+        -0.222668390165885884674473185609,
+        1.23054744454982119249735015568,
+    ]
+)
+# which angles add up to that of each body
+TURNS = np.zeros((7, 7))
+TURNS[0, 0] = TURNS[1, 0] = TURNS[1, 1] = TURNS[2, 2] = TURNS[3, 3] = TURNS[3, 4] = TURNS[4, 4] = 1.0
+TURNS[5, 5] = TURNS[5, 6] = TURNS[6, 6] = 1.0
+
+# each point: the sum of vectors (body, x, y) that turn with bodies, from the ground points (0, 0), B, A, A
+SHARED = [(0, 0.007, 0.0), (1, -0.028, 0.0)]  # the joint that the loops share
+LOOPS = [
+    (B, [(2, 0.0, -0.035)]),
+    (A, [(3, 0.0, -0.02), (4, 0.04, 0.0)]),
+    (A, [(5, 0.02, 0.0), (6, 0.0, -0.04)]),
+]
+CENTRES = [  # of mass, by vectors of which the position on the body alone counts where the other end is on the ground
+    [(0, 0.00092, 0.0)],
+    [(0, 0.007, 0.0), (1, -0.0115, 0.0)],
+    [(2, 0.01874, 0.01043)],
+    [(4, 0.04, 0.0), (3, 0.0, -(0.02 - 0.01421))],
+    [(4, 0.02308, 0.00916)],
+    [(6, 0.0, -0.04), (5, 0.02 - 0.01421, 0.0)],
+    [(6, 0.01228, -0.00449)],
+]
+SPRING = [(2, 0.02, -0.018)]  # its end on body 3
+
+
+def vector(turns: Array, parts: list[tuple[int, float, float]]) -> Array:
+    """Parts (n_parts, 2) of a point, each turned with its body."""
+    s, c = np.sin(turns), np.cos(turns)
+    return np.array([[c[i] * x - s[i] * y, s[i] * x + c[i] * y] for i, x, y in parts])
+
+
+def vector_by_q(turns: Array, parts: list[tuple[int, float, float]]) -> Array:
+    """Derivative (2, 7) of the sum of the parts by the seven angles."""
+    around = vector(turns, parts) @ np.array([[0.0, 1.0], [-1.0, 0.0]])
+    return around.T @ TURNS[[part[0] for part in parts]]
+
+
+def bend(turns: Array, rates: Array, parts: list[tuple[int, float, float]]) -> Array:
+    """Second derivative (2,) of the sum of the parts at constant angular velocities."""
+    return -(rates[[part[0] for part in parts]] ** 2) @ vector(turns, parts)
+
+
+class AndrewsEquations:
+    """The mechanism as published."""
+
+    n_q, n_c = 7, 6
+
+    def mass(self, t: float, q: Array) -> Array:
+        """M (7, 7)."""
+        turns = TURNS @ q
+        M = TURNS.T @ (INERTIAS[:, None] * TURNS)
+        for m, parts in zip(MASSES, CENTRES, strict=True):
+            J = vector_by_q(turns, parts)
+            M += m * J.T @ J
+        return M
+
+    def force(self, t: float, q: Array, v: Array) -> Array:
+        """Q (7,): torque, spring, and the terms of the velocities."""
+        turns, rates = TURNS @ q, TURNS @ v
+        Q = TORQUE * np.eye(7)[0]
+        for m, parts in zip(MASSES, CENTRES, strict=True):
+            Q -= m * vector_by_q(turns, parts).T @ bend(turns, rates, parts)
+        arm = self._spring(turns)
+        length = np.linalg.norm(arm)
+        return Q - STIFFNESS * (length - UNSTRESSED) / length * vector_by_q(turns, SPRING).T @ arm
+
+    def _spring(self, turns: Array) -> Array:
+        return B + vector(turns, SPRING).sum(axis=0) - C
+
+    def constraint(self, t: float, q: Array) -> Array:
+        """C (6,)."""
+        turns = TURNS @ q
+        shared = vector(turns, SHARED).sum(axis=0)
+        return np.concatenate([shared - ground - vector(turns, parts).sum(axis=0) for ground, parts in LOOPS])
+
+    def jacobian(self, t: float, q: Array) -> Array:
+        """C_q (6, 7)."""
+        turns = TURNS @ q
+        shared = vector_by_q(turns, SHARED)
+        return np.vstack([shared - vector_by_q(turns, parts) for _, parts in LOOPS])
+
+    def constraint_rate(self, t: float, q: Array) -> Array:
+        """C_t (6,), zero."""
+        return np.zeros(6)
+
+    def gamma(self, t: float, q: Array, v: Array) -> Array:
+        """Right-hand side of C_q a = gamma (6,)."""
+        turns, rates = TURNS @ q, TURNS @ v
+        shared = bend(turns, rates, SHARED)
+        return np.concatenate([bend(turns, rates, parts) - shared for _, parts in LOOPS])
+
+    def energy(self, t: float, q: Array, v: Array) -> float:
+        """Of motion and spring, and the potential of the constant torque, J."""
+        stretch = np.linalg.norm(self._spring(TURNS @ q)) - UNSTRESSED
+        return float(0.5 * v @ self.mass(t, q) @ v + 0.5 * STIFFNESS * stretch**2 - TORQUE * q[0])

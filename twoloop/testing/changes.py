@@ -1,0 +1,107 @@
+"""The same problem seen otherwise: from a turned and moved frame, in other units, or begun later."""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from twoloop.testing.known_problem import Array, KnownProblem
+from twoloop.testing.spatial_equations import parameters_of, skew
+
+TURN, AXIS = 0.7, np.array([1.0, 2.0, -1.5]) / np.sqrt(7.25)  # rad, and the axis in space
+MOVE = np.array([1.7, -2.3, 0.9])  # of the largest length among the coordinates
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """A problem in coordinates T q + d, and the way back.
+
+    Attributes
+    ----------
+    problem : KnownProblem
+        What a simulator gets; without `reference`.
+    T : ndarray (n_q, n_q)
+    d : ndarray (n_q,)
+    rows : ndarray (n_c,)
+        Factors of the rows of C.
+    work : float
+        Factor of energies.
+    """
+
+    problem: KnownProblem
+    T: Array
+    d: Array
+    rows: Array
+    work: float
+
+    def back(self, q: Array, v: Array | None, lam: Array | None) -> tuple[Array, Array | None, Array | None]:
+        """Rows of states in the coordinates of the original problem."""
+        inverse = np.linalg.inv(self.T)
+        return (
+            (q - self.d) @ inverse.T,
+            None if v is None else v @ inverse.T,
+            None if lam is None else lam * self.rows / self.work,
+        )
+
+
+def in_a_frame(problem: KnownProblem, turn: float = TURN, move: float = 1.0) -> Seen:
+    """The problem in a frame that is turned, rad, and moved, in multiples of some times its size."""
+    T, d = np.eye(problem.n_q), np.zeros(problem.n_q)
+    kinds = problem.coordinates
+    lengths = [abs(value) for kind, value in zip(kinds, problem.q0, strict=True) if kind in "xyz"]
+    shift = move * MOVE * max(lengths, default=0.0)
+    R, p = _rotation(turn, "z" in kinds)
+    for k, kind in enumerate(kinds):
+        if kind == "x":
+            n = 3 if "z" in kinds else 2
+            T[k : k + n, k : k + n], d[k : k + n] = R[:n, :n], shift[:n]
+        elif kind == "angle":
+            d[k] = turn
+        elif kind == "e0":  # the product of two quaternions, which is linear in each
+            product = p[0] * np.eye(4)
+            product[0, 1:], product[1:, 0] = -p[1:], p[1:]
+            product[1:, 1:] += skew(p[1:])
+            T[k : k + 4, k : k + 4] = product
+    return _seen(problem, T, d, np.ones(problem.n_c), 1.0)
+
+
+def _rotation(turn: float, spatial: bool) -> tuple[Array, Array]:
+    """A rotation matrix (3, 3) and its Euler parameters (4,); in a plane about z."""
+    axis = AXIS if spatial else np.array([0.0, 0.0, 1.0])
+    R = np.eye(3) + np.sin(turn) * skew(axis) + (1.0 - np.cos(turn)) * skew(axis) @ skew(axis)
+    return R, parameters_of(R)
+
+
+def in_millimetres_and_grams(problem: KnownProblem) -> Seen:
+    """The problem with lengths in mm and masses in g; the second stays."""
+    T = np.diag([1e3 if kind in "xyz" else 1.0 for kind in problem.coordinates])
+    return _seen(problem, T, np.zeros(problem.n_q), 1e3**problem.row_powers, 1e3 * 1e3**2)
+
+
+def _seen(problem: KnownProblem, T: Array, d: Array, rows: Array, work: float) -> Seen:
+    back = np.linalg.inv(T)
+
+    def at(q: Array) -> Array:
+        return back @ (np.asarray(q, dtype=float) - d)
+
+    changed: dict[str, Any] = {
+        "mass": lambda t, q: work * back.T @ problem.mass(t, at(q)) @ back,
+        "force": lambda t, q, v: work * back.T @ problem.force(t, at(q), back @ v),
+        "constraint": lambda t, q: rows * problem.constraint(t, at(q)),
+        "jacobian": lambda t, q: rows[:, None] * problem.jacobian(t, at(q)) @ back,
+        "constraint_rate": lambda t, q: rows * problem.constraint_rate(t, at(q)),
+        "gamma": lambda t, q, v: rows * problem.gamma(t, at(q), back @ v),
+    }
+    energy = problem.energy
+    if energy is not None:
+        changed["energy"] = lambda t, q, v: work * energy(t, at(q), back @ v)
+    changed |= {"q0": T @ problem.q0 + d, "v0": T @ problem.v0, "reference": None, "invariants": {}}
+    return Seen(replace(problem, **changed), T, d, rows, work)
+
+
+def begun_later(problem: KnownProblem, k: int, n_intervals: int) -> KnownProblem:
+    """The problem from the k-th state of its known motion on, for some intervals between its times."""
+    motion = problem.reference
+    assert motion is not None
+    span = float(motion.t[k]), float(motion.t[k] + n_intervals * (motion.t[1] - motion.t[0]))
+    return replace(problem, q0=motion.q[k], v0=motion.v[k], t_span=span, reference=None)

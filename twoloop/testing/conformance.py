@@ -1,0 +1,196 @@
+"""Checks any simulator of mechanisms against known motions."""
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import numpy as np
+
+from twoloop.testing.changes import in_a_frame, in_millimetres_and_grams
+from twoloop.testing.findings import Finding, Report
+from twoloop.testing.hints import Evidence, with_hints
+from twoloop.testing.known_motions import N_TIMES
+from twoloop.testing.known_problem import KnownProblem
+from twoloop.testing.known_problems import listed, named
+from twoloop.testing.measuring import Observed, Settings
+from twoloop.testing.properties import measured, seen_otherwise
+from twoloop.testing.simulated import Simulate, Simulated, simulated
+
+Skipped = tuple[str, str, str]
+SAYS_SO = "says that it ends"
+WRONG = (
+    "Success with a wrong answer: there is no motion any more. Look whether iterations converge, whether C = 0 holds "
+    "at the end of a step, and whether numbers are finite, and raise."
+)
+SEEN = {"frame": in_a_frame, "units": in_millimetres_and_grams}
+
+
+def check_simulator(
+    simulate: Simulate,
+    problems: str | KnownProblem | Iterable[str | KnownProblem] = "smoke",
+    *,
+    tolerances: Sequence[float] = (1e-4, 1e-6, 1e-8),
+    steps: Sequence[int] | None = None,
+    order: float | None = None,
+) -> Report:
+    """Run a simulator of mechanisms on problems whose motions are known, and say what does not hold.
+
+    Parameters
+    ----------
+    simulate : callable
+        simulate(problem, times, tolerance) -> q (n_t, n_q), or (q, v), or (q, v, lam) with lam (n_t, n_c) of
+        M a + C_q^T lam = Q: the states at `times` (n_t,), s, the first of which is the start, a row for each. Where it
+        cannot go on it raises an exception, of any class, or returns NaN from there on. `problem` is a `KnownProblem`.
+    problems : {"smoke", "all"}, str, or sequence of str and KnownProblem
+        A few that together take little time, all, or those named (`twoloop.testing.problems`).
+    tolerances : sequence of float
+        From the largest to the smallest.
+    steps : sequence of int, optional
+        For simulators of fixed steps, instead of `tolerances`: numbers of steps over the span of each problem, each a
+        multiple of 100, so that steps end at the times. `simulate` then gets the length of the step, s.
+    order : float, optional
+        With `steps`: the order that the method has. None: anything from 0.7 up passes.
+
+    Returns
+    -------
+    Report
+        `report.passed`, `report.failures` (problem, property, measured, allowed, hint); `print(report)`.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If an argument is out of range, or `simulate` returns no arrays, or arrays of another shape.
+
+    Notes
+    -----
+    What is measured on each problem, and what passes. Errors are over the largest coordinate (velocity) of the motion,
+    or 1; G is the growth of perturbations up to an instant (`Motion.growth`), so that errors on a chaotic motion may
+    grow with it.
+
+    - *error of q, v*: with tolerances at most 1000 G times the tolerance, and 0.3; with steps 0.3 at the finest.
+    - *limit of q, v* (steps): what is left when steps go to zero. The finest run's error is at most three times what
+      the last refinement changed; if not, it is one of the model.
+    - *order of q, v* (steps): the fall of the errors at the last refinement, at least `order` - 0.6.
+    - *constraints*, *velocity constraints*: the distances from C = 0 and C_q v + C_t = 0, at most 10 and 100 tolerances
+      at all times; with steps 1e-8, or velocities' distances that fall with the steps.
+    - *energy* and other invariants: drift over the largest kinetic energy, as three errors of q; with steps as limits.
+    - *multipliers*: errors of the forces C_q^T lam, unique also with redundant rows, over the largest.
+    - *frame*, *units*: the errors of the same problem in a frame that is turned and moved, and in mm and g.
+    - *runs*: all tolerances, or the two finest steps, reach the end; a coarse one may say that it does not.
+    - *says that it ends*: on problems that have no motion beyond some time, an exception, or NaN.
+
+    Examples
+    --------
+    >>> from twoloop.testing import check_simulator
+    >>> from my_package.solver import simulate  # doctest: +SKIP
+    >>> report = check_simulator(simulate)  # doctest: +SKIP
+    >>> assert report.passed, str(report)  # doctest: +SKIP
+    """
+    if not callable(simulate):
+        raise TypeError(f"simulate must be a function of (problem, times, tolerance); given {type(simulate).__name__}")
+    settings = settings_of(tolerances, steps, order)
+    findings: list[Finding] = []
+    skipped: list[Skipped] = []
+    for problem in named(problems):
+        found, not_found = check_problem(simulate, problem, settings)
+        findings += found
+        skipped += not_found
+    return Report(tuple(findings), tuple(skipped))
+
+
+def settings_of(tolerances: Sequence[float], steps: Sequence[int] | None, order: float | None) -> Settings:
+    """The settings of a check, their values looked at."""
+    if order is not None and not (_number(order) and order > 0.0):
+        raise ValueError(f"order must be a positive number; given {order!r}")
+    if steps is not None:
+        given = listed("steps", steps)
+        whole = all(isinstance(n, int | np.integer) and n > 0 and n % (N_TIMES - 1) == 0 for n in given)
+        if not whole or len(given) < 2 or given != sorted(set(given)):
+            raise ValueError(
+                f"steps must be two or more growing numbers of steps, each a multiple of {N_TIMES - 1}; given {steps!r}"
+            )
+        return Settings(None, tuple(given), order)
+    if order is not None:
+        raise ValueError(f"order is for simulators of fixed steps, with steps=; given {order!r} without")
+    values = listed("tolerances", tolerances)
+    if not values or not all(_number(value) and 0.0 < value < 1.0 for value in values):
+        raise ValueError(f"tolerances must be numbers between 0 and 1; given {tolerances!r}")
+    if values != sorted(set(values), reverse=True):
+        raise ValueError(f"tolerances must fall from the first to the last; given {tolerances!r}")
+    return Settings(tuple(float(value) for value in values), None, None)
+
+
+def _number(value: Any) -> bool:
+    return isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
+
+
+def check_problem(simulate: Simulate, problem: KnownProblem, settings: Settings) -> tuple[list[Finding], list[Skipped]]:
+    """All properties on one problem, and those that could not be measured."""
+    values, motion = settings.of(problem), problem.reference
+    if problem.ends is not None:
+        return [_says_so(simulate, problem, values[-1])], []
+    if motion is None:
+        raise ValueError(f"problems must have a known motion; {problem.name!r} has no reference")
+    runs = [simulated(simulate, problem, motion.t, value) for value in values]
+    findings = [_runs(problem, settings, values, runs)]
+    complete = [(value, run) for value, run in zip(values, runs, strict=True) if run.complete]
+    if not findings[0].passed:
+        return findings, [(problem.name, "everything else", "the run did not come to the end")]
+    if len({(run.v is None, run.lam is None) for _, run in complete}) > 1:
+        raise TypeError(f"simulate must return the same of q, v and lam in every run; on {problem.name!r} it did not")
+    observed = Observed(problem, motion, *(list(each) for each in zip(*complete, strict=True)))
+    findings += measured(observed, settings)
+    skipped: list[Skipped] = []
+    middle = observed.settings[len(observed.settings) // 2]
+    for name, change in SEEN.items():
+        if any(not each.passed and each.property in ("error of q", "limit of q") for each in findings):
+            skipped.append((problem.name, name, "the motion itself is wrong"))
+            continue
+        seen = change(problem)
+        run = simulated(simulate, seen.problem, motion.t, middle)
+        findings.append(seen_otherwise(observed, settings, name, seen, run, middle))
+    failed = {each.property: each for each in findings if not each.passed}
+    return with_hints(findings, Evidence(observed, settings, failed, simulate)), skipped
+
+
+def properties_of(problem: KnownProblem, settings: Settings) -> list[str]:
+    """Names of the properties that can be found on a problem, of a simulator that returns q, v and lam."""
+    if problem.ends is not None:
+        return [SAYS_SO]
+    kinds = ("error of",) if settings.tolerances else ("error of", "limit of", "order of")
+    names = ["runs", *(f"{kind} {which}" for which in "qv" for kind in kinds), "constraints", "velocity constraints"]
+    kept = [*problem.invariants, *([] if problem.energy is None else ["energy"])]
+    return [*names, *kept, "multipliers", *SEEN]
+
+
+def _runs(problem: KnownProblem, settings: Settings, values: list[float], runs: list[Simulated]) -> Finding:
+    """Whether the runs that have to come to the end do: with fixed steps the two finest; a coarse one may say no."""
+    needed = list(zip(values, runs, strict=True))[0 if settings.tolerances else -2 :]
+    for value, run in needed:
+        if not run.complete:
+            what = run.error or _first_not_finite(run)
+            return Finding(problem.name, "runs", f"{what} (at {value:.3g})", "the end of the motion", False)
+    return Finding(problem.name, "runs", "the end", "the end of the motion", True)
+
+
+def _first_not_finite(run: Simulated) -> str:
+    for name, array in (("q", run.q), ("v", run.v), ("lam", run.lam)):
+        if array is not None and not np.isfinite(array).all():
+            return f"{name} is not finite from t = {run.t[np.argmin(np.isfinite(array).all(axis=1))]:.3g} s on"
+    return "no numbers"
+
+
+def _says_so(simulate: Simulate, problem: KnownProblem, setting: float) -> Finding:
+    """A problem that has no motion beyond some time: the only right answer is to say so."""
+    assert problem.ends is not None
+    run = simulated(simulate, problem, np.linspace(*problem.t_span, N_TIMES), setting)
+    beyond = run.q[run.t > problem.ends + 1e-9]
+    said = bool(run.error) or not np.isfinite(beyond).all(axis=1).any()
+    what = run.error or ("NaN" if said else f"finite numbers to t = {problem.t_span[1]:.3g} s")
+    return Finding(
+        problem.name,
+        SAYS_SO,
+        what,
+        f"an exception, or NaN from t = {problem.ends:.3g} s on",
+        said,
+        "" if said else WRONG,
+    )

@@ -1,0 +1,343 @@
+"""What the pattern of errors of a simulator points to."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from twoloop.testing.changes import in_a_frame
+from twoloop.testing.findings import Finding
+from twoloop.testing.known_problem import Array
+from twoloop.testing.measuring import Observed, Settings, allowed, forces_of_constraints, still_there, violations
+from twoloop.testing.mistakes import mistaken_acceleration
+from twoloop.testing.properties import changes_of, observed_order
+from twoloop.testing.simulated import Simulate, seen_back, simulated
+
+CLEAR = 0.1  # of an error, to which the right explanation reduces it
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """The runs of a problem, which properties failed on them, and the simulator to ask again."""
+
+    observed: Observed
+    settings: Settings
+    failed: dict[str, Finding]
+    simulate: Simulate
+
+    @cached_property
+    def position(self) -> Array:
+        """Errors (n_t,) of the coordinates of the finest run."""
+        return self.observed.errors("q")[-1]
+
+    def wrong(self, kind: str) -> bool:
+        """Whether the limit of q or v is wrong, or the error of tolerances."""
+        return bool({f"error of {kind}", f"limit of {kind}"} & set(self.failed))
+
+    def clears(self, q: Array) -> bool:
+        """Whether other coordinates (n_t, n_q) instead of those of the finest run take most of the error away."""
+        motion = self.observed.motion
+        left = np.abs(q - motion.q).max(axis=1) / motion.scales[0]
+        return bool(left.max() < CLEAR * self.position.max())
+
+
+def _output(e: Evidence) -> str:
+    """States that are right, and returned wrongly."""
+    if not e.wrong("q"):
+        return ""
+    q, motion, kinds = e.observed.runs[-1].q, e.observed.motion, e.observed.problem.coordinates
+    if np.ptp(q, axis=0).max() == 0.0:
+        return "Nothing moves: every row is the same."
+    for shift, word in ((1, "late"), (-1, "early")):
+        moved = np.roll(q, -shift, axis=0)
+        moved[[0, -1]] = motion.q[[0, -1]]
+        if e.clears(moved):
+            return (
+                f"The rows are one output time {word}: row k has to be the state at times[k], the first one the start."
+            )
+    angles = np.array([kind in ("angle", "relative") for kind in kinds])
+    turns = np.where(angles, 2.0 * np.pi * np.round((q - motion.q) / (2.0 * np.pi)), 0.0)
+    if turns.any() and e.clears(q - turns):
+        return "Angles differ by whole turns: they have to go on beyond pi, not jump back."
+    euler = np.array([kind[0] == "e" for kind in kinds])
+    nearer = np.where(euler & (np.abs(q + motion.q) < np.abs(q - motion.q)), -q, q)
+    if euler.any() and e.clears(nearer):
+        return "Euler parameters have the other sign: e and -e are one rotation, but q has to be continuous."
+    return ""
+
+
+def _singular(e: Evidence) -> str:
+    problem, motion = e.observed.problem, e.observed.motion
+    if not problem.singular_times or not e.wrong("q"):
+        return ""
+    first = problem.singular_times[0]
+    before = e.position[motion.t < first - 0.02 * (motion.t[-1] - motion.t[0])].max()
+    if before < CLEAR * min(e.position.max(), 1.0):
+        return (
+            f"Right until the first singular position (t = {first:.3g} s), where C_q loses rank: the run takes another "
+            "branch there, or solves a singular matrix. Follow positions and velocities through, or stop."
+        )
+    return ""
+
+
+def _acceleration(e: Evidence) -> str:
+    if not e.wrong("q") and not e.wrong("v"):
+        return ""
+    by_steps = e.settings.steps is not None
+    mistake = mistaken_acceleration(e.simulate, e.observed.problem, e.observed.settings[-1], by_steps)
+    return f"The accelerations are wrong: {mistake}." if mistake else ""
+
+
+def _rates_of_time(e: Evidence) -> str:
+    """Velocities with C_q v = 0 where C_t is not zero."""
+    problem, run = e.observed.problem, e.observed.runs[-1]
+    if "velocity constraints" not in e.failed or run.v is None:
+        return ""
+    states = list(zip(run.t, run.q, run.v, strict=True))[1:]
+    rates = np.array([problem.constraint_rate(t, q) for t, q, _ in states])
+    left = np.array([problem.jacobian(t, q) @ v for t, q, v in states])
+    if rates.any() and np.abs(left).max() < CLEAR * np.abs(left + rates).max():
+        return "The velocities obey C_q v = 0 where the constraints move: C_t is left out of C_q v + C_t = 0."
+    return ""
+
+
+def _one_order_less(e: Evidence) -> bool:
+    """Whether velocities converge an order more slowly than positions."""
+    orders = [observed_order(e.observed, kind) for kind in "qv"] if "order of v" in e.failed else []
+    return len(orders) == 2 and None not in orders and float(orders[1] or 0.0) < float(orders[0] or 0.0) - 0.5
+
+
+def _velocities(e: Evidence) -> str:
+    run, motion, problem = e.observed.runs[-1], e.observed.motion, e.observed.problem
+    if run.v is None or e.wrong("q") or "order of q" in e.failed or not (e.wrong("v") or _one_order_less(e)):
+        return ""
+    a = np.array([problem.acceleration(*state)[0] for state in zip(motion.t, motion.q, motion.v, strict=True)])
+    others = {
+        "The velocities have the other sign.": -motion.v,
+        "The velocities are those of the output time before.": np.vstack([motion.v[:1], motion.v[:-1]]),
+    }
+    if e.settings.steps is not None:
+        h = e.observed.settings[-1]
+        middle = "The velocities are those of the middle of the step {}: bring them to its end with half a step of a."
+        others |= {
+            middle.format("before"): motion.v - 0.5 * h * a,
+            middle.format("after"): motion.v + 0.5 * h * a,
+            "The velocities are those of one step before.": motion.v - h * a,
+            "The velocities are those of one step later.": motion.v + h * a,
+        }
+    start = max(1, motion.t.size // 20)
+    error = np.linalg.norm((run.v - motion.v)[start:])
+    for text, other in others.items():
+        if np.linalg.norm((run.v - other)[start:]) < 2.0 * CLEAR * error:
+            return f"Positions are right and velocities are not. {text}"
+    held = "" if "velocity constraints" not in e.failed else " They do not obey C_q v + C_t = 0 either: project them."
+    return (
+        "Positions are right and velocities are not: they come from another instant, or not from the final "
+        f"iteration, or were not corrected with the positions.{held}"
+    )
+
+
+def _drift(e: Evidence) -> str:
+    if "constraints" not in e.failed:
+        return ""
+    found = [violations(e.observed.problem, run, e.observed.motion.scales)[0] for run in e.observed.runs]
+    off = found[-1]
+    if any(each[-30:].max() > 4.0 * each[1:11].max() for each in found):
+        return (
+            "The violation of C grows along the run: only accelerations (or velocities) obey the constraints. Project "
+            "positions and velocities after each step, or stabilise (GGL; Baumgarte leaves a rest)."
+        )
+    if e.settings.steps is not None and found[-2].max() > 1.5 * off.max():
+        return (
+            "The violation of C falls with the steps and does not grow along the run: C = 0 is asked for at another "
+            "instant than that of the state (t instead of t + h?), of a state that is changed afterwards, or only for "
+            "its derivatives (Baumgarte)."
+        )
+    return (
+        "The violation of C is there from the first steps and does not grow: an iteration for the positions stops too "
+        "early, with a tolerance of its own or in single precision, or a penalty or regularisation stands in for C = 0."
+    )
+
+
+def _unused(e: Evidence) -> str:
+    runs = e.observed.runs
+    same = len(runs) > 1 and np.array_equal(runs[0].q, runs[-1].q)
+    return "The same numbers whatever the tolerance, or the step: it is not used." if same else ""
+
+
+def _falls(e: Evidence) -> bool:
+    """Whether the error of q goes on falling."""
+    errors = e.observed.errors("q")
+    if e.settings.tolerances is not None:
+        return len(errors) < 2 or errors[-1].max() <= 0.3 * errors[0].max()
+    value, rest = still_there(errors, changes_of(e.observed, "q"), e.observed.floor("q"))
+    return value <= rest and errors[-1].max() < 0.8 * errors[-2].max()
+
+
+def _floor(e: Evidence) -> str:
+    if not {"limit of q", "limit of v"} & set(e.failed) and (not e.wrong("q") or _falls(e)):
+        return ""
+    return (
+        f"The error stays at {e.position.max():.1g}, however fine: not the method but the model is wrong "
+        "(a mass, a force, a sign), or an iteration, a difference quotient or a penalty ends it."
+    )
+
+
+def _coarse(e: Evidence) -> str:
+    if e.settings.steps is None or not {"error of q", "error of v"} & set(e.failed):
+        return ""
+    errors = e.observed.errors("q")
+    return (
+        f"The error falls, from {errors[-2].max():.1g} to {errors[-1].max():.1g} by the last refinement, and is "
+        "still too large: take more steps."
+    )
+
+
+def _clock(e: Evidence) -> str:
+    """Constraints that hold at the time since the start."""
+    problem, run = e.observed.problem, e.observed.runs[-1]
+    begin = problem.t_span[0]
+    if begin == 0.0 or "constraints" not in e.failed:
+        return ""
+    since, there = (
+        max(np.abs(problem.constraint(t - shift, q)).max() for t, q in zip(run.t[1:], run.q[1:], strict=True))
+        for shift in (begin, 0.0)
+    )
+    return (
+        f"The constraints hold at t - {begin:g} s: time does not begin at 0 here, but at t_span[0] = times[0]."
+        if since < CLEAR * there
+        else ""
+    )
+
+
+def _orders(e: Evidence) -> str:
+    lost = [e.failed[name] for name in ("order of q", "order of v") if name in e.failed]
+    if not lost:
+        return ""
+    seen, said = float(lost[0].measured), e.settings.order
+    where = lost[0].property.removeprefix("order of ")
+    if said is not None and seen > 0.6 and abs(said - 1.0 - seen) < 0.4:
+        start = (
+            f"One order of {where} is lost, {seen:.1f} instead of {said:g}: a coefficient, or a term at another time"
+        )
+    elif said is not None:
+        start = f"The order of {where} is {seen:.1f} instead of {said:g}"
+    else:
+        start = f"The error of {where} falls with the order {seen:.1f} only"
+    if 0.6 < seen < 1.4:
+        start += ". First order: something is that of the start of the step (time, velocity, matrix, force)"
+    return f"{start}."
+
+
+def _slack(e: Evidence) -> str:
+    if e.settings.tolerances is None or not (e.wrong("q") or e.wrong("v")):
+        return ""
+    errors = e.observed.errors("q")
+    limits = [allowed(e.observed.motion, setting).max() for setting in e.observed.settings]
+    over = errors[-1].max() / limits[-1]
+    return (
+        f"The error falls with the tolerance, and is {over:.1g} times what is allowed at the last: the estimate of the "
+        "error is too small, or leaves out some coordinates, or the tolerance is not passed on."
+    )
+
+
+def _multipliers(e: Evidence) -> str:
+    run, problem, motion = e.observed.runs[-1], e.observed.problem, e.observed.motion
+    if run.lam is None:
+        return ""
+    known = forces_of_constraints(problem, motion, motion.lam)[1:]
+    found = forces_of_constraints(problem, motion, run.lam)[1:]
+    factor = float((found * known).sum() / (known**2).sum())
+    rest = np.abs(found - factor * known).max() / max(np.abs(found).max(), 1e-300)
+    if rest > 2.0 * CLEAR:
+        return (
+            "The multipliers belong to another instant (the middle of the step?) or to other positions and velocities "
+            "than those returned, or some rows of C are numbered otherwise."
+        )
+    if abs(factor + 1.0) < CLEAR:
+        return "The multipliers have the other sign: M a + C_q^T lam = Q."
+    if e.settings.steps is not None:
+        h = e.observed.settings[-1]
+        for power, name in ((1, "h"), (2, "h^2")):
+            for part, word in ((1.0, ""), (0.5, " / 2")):
+                for sign, minus in ((1.0, ""), (-1.0, "-")):
+                    if abs(factor / (sign * part * h**power) - 1.0) < CLEAR:
+                        return f"The multipliers are impulses: {minus}{name}{word} times the forces. Divide by it."
+    return f"The multipliers are {factor:.3g} times those of M a + C_q^T lam = Q."
+
+
+def _frame(e: Evidence) -> str:
+    n, motion = len(e.observed.settings) // 2, e.observed.motion
+    middle, least = e.observed.settings[n], 30.0 * e.observed.errors("q")[n].max() + 1e-6
+    if e.settings.tolerances:
+        least = max(least, float(allowed(motion, middle).max()))
+    wrong = []
+    for name, turn, move in (("turned", 0.7, 0.0), ("moved", 0.0, 1.0)):
+        seen = in_a_frame(e.observed.problem, turn, move)
+        run = seen_back(simulated(e.simulate, seen.problem, motion.t, middle), seen)
+        error = np.abs(run.q - motion.q).max() / motion.scales[0] if run.complete else np.inf
+        if error > least:
+            wrong.append(name)
+    if wrong == ["turned"]:
+        return (
+            "Wrong in a turned frame, right in a moved one: a direction is fixed in the code (gravity, an axis of a "
+            "joint or of inertia, an angle from the x axis)."
+        )
+    if wrong == ["moved"]:
+        return (
+            "Wrong in a moved frame, right in a turned one: something depends on the distance from the origin (a "
+            "tolerance relative to q, a moment about the origin, a place that is fixed in the code)."
+        )
+    return "Wrong in another frame: a direction, a place or a tolerance is fixed in the code."
+
+
+def _units(e: Evidence) -> str:
+    return (
+        "Right in m and kg, wrong in mm and g: a constant in the code has a unit (an absolute tolerance, a penalty, a "
+        "regularisation, the acceleration of gravity, a step of differences)."
+    )
+
+
+def _where(e: Evidence) -> str:
+    """Nothing else fits: from when on the motion is another one."""
+    motion = e.observed.motion
+    off = np.flatnonzero(e.position > 0.01)
+    if not off.size:
+        return ""
+    return (
+        f"Off by 1 % from t = {motion.t[off[0]]:.3g} s on, of {motion.t[-1]:.3g} s. Compare accelerations there with "
+        "problem.acceleration(t, q, v)."
+    )
+
+
+MOTION: tuple[Callable[[Evidence], str], ...] = (
+    _output,
+    _singular,
+    _acceleration,
+    _rates_of_time,
+    _velocities,
+    _clock,
+    _unused,
+    _drift,
+    _floor,
+    _orders,
+    _coarse,
+    _slack,
+    _where,
+)
+OWN: dict[str, Callable[[Evidence], str]] = {"multipliers": _multipliers, "frame": _frame, "units": _units}
+
+
+def with_hints(findings: list[Finding], evidence: Evidence) -> list[Finding]:
+    """The findings, those that failed with what their pattern points to."""
+    general = ""
+    if any(name not in OWN for name in evidence.failed):
+        general = next((text for rule in MOTION if (text := rule(evidence))), "")
+    hinted = []
+    for finding in findings:
+        if not finding.passed and not isinstance(finding.measured, str):
+            own = OWN.get(finding.property)
+            finding = replace(finding, hint=own(evidence) if own else general)
+        hinted.append(finding)
+    return hinted

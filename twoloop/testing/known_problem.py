@@ -1,0 +1,143 @@
+"""A problem whose motion is known: its equations as functions of numpy arrays, its start, and what is known."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Quantity = Callable[[float, Array, Array], float]
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """A motion that is known from two unlike routes.
+
+    Attributes
+    ----------
+    t : ndarray (n_t,)
+        Times, s, at equal distances from the start to the end of the problem.
+    q, v : ndarray (n_t, n_q)
+        Coordinates and velocities, a row for each time.
+    lam : ndarray (n_t, n_c)
+        Multipliers of M a + C_q^T lam = Q, those of least norm where rows are redundant.
+    digits : dict of str to ndarray (n_t,)
+        "q", "v", "lam": decimals on which the routes agree, over max(1, largest value of the motion).
+    growth : ndarray (n_t,)
+        By which factor, at most, a perturbation of the state at an earlier time has grown, q and v each relative
+        to its largest value. At least 1.
+    """
+
+    t: Array
+    q: Array
+    v: Array
+    lam: Array
+    digits: Mapping[str, Array]
+    growth: Array
+
+    @property
+    def scales(self) -> tuple[float, float]:
+        """Largest coordinate and velocity of the motion, at least 1: what errors are relative to."""
+        return max(1.0, float(np.abs(self.q).max())), max(1.0, float(np.abs(self.v).max()))
+
+
+@dataclass(frozen=True, eq=False)
+class KnownProblem:
+    """Equations M(t, q) a + C_q^T lam = Q(t, q, v), C(t, q) = 0, a start, and what is known of the motion.
+
+    Attributes
+    ----------
+    name : str
+        As `problems` and `check_simulator` take it.
+    mass : callable
+        mass(t, q) -> M (n_q, n_q), of full rank on the directions that C_q allows.
+    force : callable
+        force(t, q, v) -> Q (n_q,).
+    constraint, jacobian, constraint_rate : callable
+        constraint(t, q) -> C (n_c,), and its derivatives C_q (n_c, n_q) and C_t (n_c,).
+    gamma : callable
+        gamma(t, q, v) -> right-hand side (n_c,) of C_q a = gamma.
+    energy : callable or None
+        energy(t, q, v) -> J, where the motion keeps it.
+    q0, v0 : ndarray (n_q,)
+        Consistent start, read-only.
+    t_span : (float, float)
+        Start and end of the motion, s.
+    tags : tuple of str
+        Of `TAGS`.
+    coordinates : tuple of str
+        What each is: "x", "y", "z" of a point, m; "angle" in the plane from the x axis, "relative" to another body,
+        rad; "e0" ... "e3", Euler parameters.
+    row_powers : ndarray (n_c,)
+        Power of the unit of length in each row of C: 1 for m, 2 for m^2, 0 for an angle.
+    reference : Motion or None
+        The known motion; None where there is none to the end.
+    invariants : mapping of str to callable
+        Further functions of (t, q, v) that the motion keeps.
+    singular_times : tuple of float
+        When C_q loses rank.
+    ends : float or None
+        When the motion ends: beyond this there is none, and a simulator has to say so.
+    note : str
+        What the problem shows.
+    """
+
+    name: str
+    mass: Callable[[float, Array], Array]
+    force: Callable[[float, Array, Array], Array]
+    constraint: Callable[[float, Array], Array]
+    jacobian: Callable[[float, Array], Array]
+    constraint_rate: Callable[[float, Array], Array]
+    gamma: Callable[[float, Array, Array], Array]
+    energy: Quantity | None
+    q0: Array
+    v0: Array
+    t_span: tuple[float, float]
+    tags: tuple[str, ...]
+    coordinates: tuple[str, ...]
+    row_powers: Array
+    reference: Motion | None = None
+    invariants: Mapping[str, Quantity] = field(default_factory=dict)
+    singular_times: tuple[float, ...] = ()
+    ends: float | None = None
+    note: str = ""
+
+    def __post_init__(self) -> None:
+        for name in ("q0", "v0"):  # a simulator that steps in place is not to change the start of its next run
+            start = np.array(getattr(self, name), dtype=float)
+            start.flags.writeable = False
+            object.__setattr__(self, name, start)
+
+    @property
+    def n_q(self) -> int:
+        """Number of coordinates."""
+        return self.q0.size
+
+    @property
+    def n_c(self) -> int:
+        """Number of rows of C."""
+        return self.row_powers.size
+
+    def acceleration(self, t: float, q: Array, v: Array) -> tuple[Array, Array]:
+        """Acceleration (n_q,) and multipliers (n_c,) at a consistent state, those of least norm."""
+        return solved(self.mass(t, q), self.force(t, q, v), self.jacobian(t, q), self.gamma(t, q, v))
+
+    def __repr__(self) -> str:
+        return f"KnownProblem({self.name!r}: {', '.join(self.tags)}; n_q = {self.n_q}, n_c = {self.n_c})"
+
+
+def solved(M: Array, Q: Array, J: Array, right: Array) -> tuple[Array, Array]:
+    """Solution a, lam of M a + J^T lam = Q, J a = right, of least norm in lam."""
+    n, m = J.shape[1], J.shape[0]
+    matrix = np.block([[M, J.T], [J, np.zeros((m, m))]])
+    scale = np.ones(n + m)
+    for _ in range(5):  # in any units all rows get a largest entry of 1 (Ruiz 2001), before ranks are told
+        size = np.abs(scale[:, None] * matrix * scale).max(axis=1)
+        scale /= np.sqrt(np.where(size > 0.0, size, 1.0))
+    right = scale * np.concatenate([Q, right])
+    whole, _, rank, _ = np.linalg.lstsq(scale[:, None] * matrix * scale, right, rcond=1e-12)
+    a, lam = np.split(scale * whole, [n])
+    if rank < n + m:  # of least norm in units of the rows, not in those just chosen
+        lam = np.linalg.lstsq(J.T, J.T @ lam, rcond=1e-11)[0]
+    return a, lam

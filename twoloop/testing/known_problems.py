@@ -1,0 +1,107 @@
+"""The problems whose motions are known, by name and by tag."""
+
+from collections.abc import Iterable
+from typing import Any
+
+from twoloop.testing import linkages, pendulums, spatial_mechanisms
+from twoloop.testing.known_problem import KnownProblem
+
+TAGS = {
+    "smoke": "a few that together take little time",
+    "open chain": "no loop of bodies",
+    "closed chain": "loops of bodies",
+    "planar": "in a plane",
+    "spatial": "in space",
+    "driven": "constraints that depend on time",
+    "redundant": "a row of C follows from the others",
+    "singular": "C_q loses rank on the way",
+    "stiff": "a vibration far faster than the motion",
+    "mass ratio": "masses that differ by a factor of 1000",
+    "no motion to the end": "the motion ends before the end of the span, which has to be said",
+}
+
+MAKERS = {
+    maker.__name__: maker
+    for maker in (
+        pendulums.pendulum,
+        linkages.driven_crank,
+        linkages.four_bar,
+        linkages.redundant_slider_crank,
+        spatial_mechanisms.heavy_top,
+        pendulums.out_of_reach,
+        pendulums.double_pendulum,
+        pendulums.heavy_end,
+        pendulums.spherical_pendulum,
+        pendulums.stiff_spring_pendulum,
+        pendulums.closed_chain,
+        pendulums.parallelogram,
+        linkages.crank_rocker,
+        linkages.slider_crank,
+        linkages.driven_slider_crank,
+        linkages.andrews,
+        spatial_mechanisms.spatial_four_bar,
+        pendulums.force_ends,
+    )
+}
+
+
+def problems(tags: str | Iterable[str] | None = None) -> list[KnownProblem]:
+    """Problems whose motions are known, in plain numpy: to test a simulator with.
+
+    Parameters
+    ----------
+    tags : str or sequence of str, optional
+        Of `KnownProblem.tags`: those that have all of them. None: every problem.
+
+    Returns
+    -------
+    list of KnownProblem
+        Equations, start, and the known motion, `reference`.
+
+    Raises
+    ------
+    ValueError
+        If no problem has such a tag.
+
+    Notes
+    -----
+    The motions in the wheel were made by two unlike routes, and hold the decimals on which these agree
+    (`Motion.digits`): twoloop's Gauss method, and SciPy's DOP853 on equations in few coordinates, or on those of
+    index 1 with projections.
+
+    Examples
+    --------
+    >>> from twoloop.testing import problems
+    >>> [problem.name for problem in problems("driven")]
+    ['driven_crank', 'out_of_reach', 'driven_slider_crank']
+    """
+    wanted = listed("tags", () if tags is None else tags)
+    for tag in wanted:
+        if tag not in TAGS:
+            raise ValueError(f"tags must be of {', '.join(TAGS)}; given {tag!r}")
+    everything = (maker() for maker in MAKERS.values())
+    return [problem for problem in everything if set(wanted) <= set(problem.tags)]
+
+
+def named(choice: str | KnownProblem | Iterable[str | KnownProblem]) -> list[KnownProblem]:
+    """The problems of a choice: "smoke", "all", a name, or names and problems."""
+    if isinstance(choice, str) and choice in ("smoke", "all"):
+        return problems("smoke" if choice == "smoke" else None)
+    chosen: list[KnownProblem] = []
+    for each in [choice] if isinstance(choice, KnownProblem) else listed("problems", choice):
+        if isinstance(each, KnownProblem):
+            chosen.append(each)
+        elif isinstance(each, str) and each in MAKERS:
+            chosen.append(MAKERS[each]())
+        else:
+            raise ValueError(f"problems must be 'smoke', 'all' or of {', '.join(MAKERS)}; given {each!r}")
+    if not chosen:
+        raise ValueError("problems must name at least one; given an empty list, on which everything would pass")
+    return chosen
+
+
+def listed(name: str, given: Any) -> list[Any]:
+    """The members of a list that was given, or the one text."""
+    if not isinstance(given, Iterable):
+        raise TypeError(f"{name} must be a list; given {given!r}")
+    return [given] if isinstance(given, str) else list(given)

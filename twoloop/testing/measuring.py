@@ -1,0 +1,128 @@
+"""Errors of runs against the known motion, and what a tolerance or a step allows."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from twoloop.testing.known_problem import Array, KnownProblem, Motion, Quantity
+from twoloop.testing.simulated import Simulated
+
+SAFETY = 1000.0  # tolerances that an error may have, times the growth of perturbations: a tolerance is one of steps
+MOST = 0.3  # an error that no tolerance allows
+HELD = 10.0  # tolerances by which positions may be off the constraints, at any time
+HELD_RATES = 100.0  # and velocities
+HELD_BY_STEPS = 1e-8  # what positions may be off the constraints in runs of fixed steps, whatever their length
+ROUNDING = 1e-9  # of such runs, times the growth: errors below are not compared
+UNRESOLVED = 1e-2  # what steps longer than a stiff vibration may leave, however long they are
+LAM_DIGITS = 6.0  # of the known multipliers, below which these are not compared
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Tolerances, or numbers of equal steps over the span, from the coarsest to the finest."""
+
+    tolerances: tuple[float, ...] | None
+    steps: tuple[int, ...] | None
+    order: float | None
+
+    def of(self, problem: KnownProblem) -> list[float]:
+        """What the simulator gets: tolerances, or the length of the steps, s."""
+        if self.tolerances is not None:
+            return list(self.tolerances)
+        assert self.steps is not None
+        return [(problem.t_span[1] - problem.t_span[0]) / n for n in self.steps]
+
+
+@dataclass(frozen=True, eq=False)
+class Observed:
+    """The runs of a problem that came to the end, from the coarsest to the finest, with their settings."""
+
+    problem: KnownProblem
+    motion: Motion
+    settings: list[float]
+    runs: list[Simulated]
+
+    def errors(self, kind: str) -> list[Array]:
+        """Errors (n_t,) of "q" or "v" of each run, over the largest value of the motion."""
+        scale = dict(zip("qv", self.motion.scales, strict=True))[kind]
+        known = getattr(self.motion, kind)
+        return [np.abs(getattr(run, kind) - known).max(axis=1) / scale for run in self.runs]
+
+    @property
+    def rounding(self) -> Array:
+        """What is not compared in runs of fixed steps (n_t,)."""
+        stiff = UNRESOLVED if "stiff" in self.problem.tags else 0.0
+        return ROUNDING * self.motion.growth + stiff
+
+    def floor(self, kind: str) -> Array:
+        """What is not told from rounding (n_t,): the digits of the reference, and rounding that has grown."""
+        return 10.0 * 10.0 ** -self.motion.digits[kind] + 0.1 * ROUNDING * self.motion.growth
+
+
+def allowed(motion: Motion, tolerance: float) -> Array:
+    """The largest error (n_t,) at a tolerance, without the floor."""
+    return np.minimum(MOST, SAFETY * tolerance * motion.growth)
+
+
+def violations(problem: KnownProblem, run: Simulated, scales: tuple[float, float]) -> tuple[Array, Array | None]:
+    """Least distances (n_t,) of q and v from the constraints, over the largest values of the motion."""
+    off, rates = np.zeros(run.t.size), np.zeros(run.t.size)
+    for k, (t, q) in enumerate(zip(run.t, run.q, strict=True)):
+        J = problem.jacobian(t, q)
+        values = [problem.constraint(t, q)]
+        if run.v is not None:
+            values.append(J @ run.v[k] + problem.constraint_rate(t, q))
+        # rows of the same size, or a rank would depend on the units; near a singular position only what can be mended
+        size = np.linalg.norm(J, axis=1)
+        size = np.where(size > 0.0, size, 1.0)[:, None]
+        moved = np.linalg.lstsq(J / size, np.column_stack(values) / size, rcond=1e-6)[0]
+        off[k] = np.abs(moved[:, 0]).max() / scales[0]
+        if run.v is not None:
+            rates[k] = np.abs(moved[:, 1]).max() / scales[1]
+    return off, None if run.v is None else rates
+
+
+def drifts(problem: KnownProblem, quantity: Quantity, run: Simulated, motion: Motion) -> Array:
+    """Change (n_t,) of an invariant, over the range of the kinetic energy, or over the invariant itself."""
+    assert run.v is not None
+    values = np.array([quantity(*state) for state in zip(run.t, run.q, run.v, strict=True)])
+    known = quantity(problem.t_span[0], problem.q0, problem.v0)
+    if quantity is not problem.energy:
+        return np.abs(values - known) / max(abs(known), 1e-12)
+    states = zip(motion.t, motion.q, motion.v, strict=True)
+    return np.abs(values - known) / max(0.5 * v @ problem.mass(t, q) @ v for t, q, v in states)
+
+
+def forces_of_constraints(problem: KnownProblem, motion: Motion, lam: Array) -> Array:
+    """C_q^T lam (n_t, n_q) on the known motion: unique also where multipliers are not."""
+    states = zip(motion.t, motion.q, lam, strict=True)
+    return np.array([problem.jacobian(t, q).T @ own for t, q, own in states])
+
+
+def lam_errors(observed: Observed) -> list[Array]:
+    """Errors (n_t,) of the forces of the constraints of each run, over the largest; 0 where they are not known."""
+    problem, motion = observed.problem, observed.motion
+    known = forces_of_constraints(problem, motion, motion.lam)
+    scale = max(1e-12, np.abs(known).max())
+    told = motion.digits["lam"] > LAM_DIGITS
+    told[0] = False  # at the start many have none yet
+    found = [forces_of_constraints(problem, motion, run.lam) for run in observed.runs if run.lam is not None]
+    return [np.where(told, np.abs(forces - known).max(axis=1) / scale, 0.0) for forces in found]
+
+
+def order(coarse: Array, fine: Array, ratio: float, floor: Array) -> float | None:
+    """Observed order of errors (n_t,) of two runs, over the times where both are far from rounding and from 1."""
+    usable = np.logical_and.accumulate(coarse < 0.1) & (np.maximum.accumulate(fine) > 10.0 * floor)
+    if not usable.any() or fine[usable].max() == 0.0:
+        return None
+    return float(np.log(coarse[usable].max() / fine[usable].max()) / np.log(ratio))
+
+
+def still_there(errors: list[Array], changes: list[Array], floor: Array) -> tuple[float, float]:
+    """An error of the finest run, and what may be left there: three times its change by the last refinement.
+
+    Of the errors that are not small beside the largest; small ones may be zeros on the way.
+    """
+    rest = np.maximum(3.0 * np.maximum.accumulate(changes[-1]), floor)
+    worst = int(np.argmax(np.where(errors[-1] > 0.1 * errors[-1].max(), errors[-1] / rest, 0.0)))
+    return float(errors[-1][worst]), float(rest[worst])

@@ -1,0 +1,159 @@
+"""What a simulator takes for the acceleration, told from its velocities, and which mistake would make it so."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from twoloop.testing.changes import begun_later
+from twoloop.testing.known_problem import Array, KnownProblem, solved
+from twoloop.testing.simulated import Simulate, simulated
+
+PLACES = range(0, 86, 5)  # of the known motion, from which the simulator is started
+LATER = 10  # output times after which it is looked at
+SURE = 3.0  # times the change by a finer difference quotient, from which on a difference of accelerations is one
+EXPLAINS = 0.15  # of the difference from the true acceleration, which may remain
+Mistake = Callable[[KnownProblem, float, Array, Array], Array]
+
+
+def _with(**edits: Callable[..., Array]) -> Mistake:
+    """The acceleration with some of M, Q, J and gamma replaced."""
+
+    def mistaken(problem: KnownProblem, t: float, q: Array, v: Array) -> Array:
+        parts = {
+            "M": problem.mass(t, q),
+            "Q": problem.force(t, q, v),
+            "J": problem.jacobian(t, q),
+            "right": problem.gamma(t, q, v),
+        }
+        return solved(**{name: edits[name](problem, t, q, v) if name in edits else parts[name] for name in parts})[0]
+
+    return mistaken
+
+
+def _unconstrained(sign: float) -> Mistake:
+    def mistaken(problem: KnownProblem, t: float, q: Array, v: Array) -> Array:
+        lam = problem.acceleration(t, q, v)[1]
+        right = problem.force(t, q, v) - sign * problem.jacobian(t, q).T @ lam
+        return np.asarray(np.linalg.lstsq(problem.mass(t, q), right, rcond=1e-12)[0], dtype=float)
+
+    return mistaken
+
+
+def _start(p: KnownProblem) -> float:
+    return p.t_span[0]
+
+
+MISTAKES: dict[str, Mistake] = {
+    "gamma has the other sign: the accelerations obey C_q a = +gamma, here C_q a = -gamma": _with(
+        right=lambda p, t, q, v: -p.gamma(t, q, v)
+    ),
+    "gamma is left out: the accelerations obey C_q a = gamma, here C_q a = 0": _with(
+        right=lambda p, t, q, v: 0.0 * p.gamma(t, q, v)
+    ),
+    "the part of gamma that depends on time (C_tt) is left out, or taken at a fixed time": _with(
+        right=lambda p, t, q, v: p.gamma(t, q, v) - p.gamma(t, q, 0.0 * v)
+    ),
+    "the velocities are left out of gamma": _with(right=lambda p, t, q, v: p.gamma(t, q, 0.0 * v)),
+    "the forces have the other sign": _with(Q=lambda p, t, q, v: -p.force(t, q, v)),
+    "the forces are left out": _with(Q=lambda p, t, q, v: 0.0 * q),
+    "the forces that depend on the velocities (gyroscopic, centrifugal) are left out": _with(
+        Q=lambda p, t, q, v: p.force(t, q, 0.0 * v)
+    ),
+    "the forces are those of the start: they are to be taken at (t, q, v)": _with(
+        Q=lambda p, t, q, v: p.force(_start(p), p.q0, p.v0)
+    ),
+    "only the diagonal of the mass matrix is used": _with(M=lambda p, t, q, v: np.diag(np.diag(p.mass(t, q)))),
+    "the mass matrix is that of the start: it is to be taken at (t, q)": _with(
+        M=lambda p, t, q, v: p.mass(_start(p), p.q0)
+    ),
+    "the mass matrix is left out": _with(M=lambda p, t, q, v: np.eye(q.size)),
+    "C_q is that of the start: it is to be taken at (t, q)": _with(J=lambda p, t, q, v: p.jacobian(_start(p), p.q0)),
+    "the forces of the constraints are left out": _unconstrained(0.0),
+    "the forces of the constraints have the other sign: M a + C_q^T lam = Q": _unconstrained(-1.0),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """An acceleration as a simulator has it at a state of its own, how far it is known, and the true one."""
+
+    problem: KnownProblem
+    t: float
+    q: Array
+    v: Array
+    a: Array
+    doubt: float
+    true: Array
+    free: Array  # directions (n_free, n_q) that the constraints allow
+
+
+def mistaken_acceleration(simulate: Simulate, problem: KnownProblem, setting: float, by_steps: bool) -> str:
+    """Which mistake explains the accelerations of a simulator, or ""; each is started on the known motion."""
+    tries = (_seen(simulate, begun_later(problem, k, LATER + 1), setting, by_steps) for k in _telling(problem))
+    places = [seen for seen in tries if seen is not None]
+    if len(places) < 2:  # once may be chance
+        return ""
+    best, least = "", EXPLAINS
+    for name, mistake in MISTAKES.items():
+        others = [_tried(mistake, each.problem, each.t, each.q, each.v) for each in places]
+        for free_only in (False, True):
+            rest, gap = 0.0, 0.0
+            for each, other in zip(places, others, strict=True):
+                project = each.free if free_only else np.eye(each.a.size)
+                off = np.linalg.norm(project @ (each.a - each.true))
+                if off > SURE * each.doubt and np.linalg.norm(project @ (other - each.true)) > SURE * each.doubt:
+                    gap += float(off**2)
+                rest += float(np.linalg.norm(project @ (each.a - other)) ** 2)
+            if gap > 0.0 and np.sqrt(rest / gap) < least:
+                best, least = name, float(np.sqrt(rest / gap))
+    return best
+
+
+def _tried(mistake: Mistake, problem: KnownProblem, t: float, q: Array, v: Array) -> Array:
+    try:
+        return mistake(problem, t, q, v)
+    except np.linalg.LinAlgError:
+        return np.full(q.size, np.nan)
+
+
+def _telling(problem: KnownProblem) -> list[int]:
+    """Three places of the motion after which most mistakes show, away from singular positions."""
+    motion = problem.reference
+    assert motion is not None
+    shows = {}
+    for k in PLACES:
+        t, q, v = motion.t[k + LATER], motion.q[k + LATER], motion.v[k + LATER]
+        if any(motion.t[k] - 0.03 * t < singular < 1.03 * t for singular in problem.singular_times):
+            continue
+        later = begun_later(problem, k, LATER + 1)
+        true = later.acceleration(t, q, v)[0]
+        changes = [np.abs(_tried(mistake, later, t, q, v) - true).max() for mistake in MISTAKES.values()]
+        shows[k] = sum(change > 0.1 * np.abs(true).max() for change in changes)
+    return sorted(shows, key=lambda k: -shows[k])[:3]
+
+
+def _seen(simulate: Simulate, problem: KnownProblem, setting: float, by_steps: bool) -> Seen | None:
+    """A state of a run near its end, and the acceleration there by differences; None where it does not run."""
+    first, last = problem.t_span
+    interval = (last - first) / (LATER + 1)
+    step = 0.125 * interval
+    times = first + interval * LATER + step * np.arange(-2.0, 3.0)
+    try:
+        run = simulated(simulate, problem, np.concatenate([[first], times]), step if by_steps else setting)
+    except (TypeError, ValueError):  # of another shape: it takes no times but those of the motion
+        return None
+    if not run.complete:
+        return None
+    t, q, x = float(times[2]), run.q[3], run.q[1:]
+    by_q = (8.0 * (x[3] - x[1]) - (x[4] - x[0])) / (12.0 * step)
+    if run.v is not None:
+        v, u = run.v[3], run.v[1:]
+        rough, a = (u[3] - u[1]) / (2.0 * step), (8.0 * (u[3] - u[1]) - (u[4] - u[0])) / (12.0 * step)
+    else:
+        v, rough = by_q, (x[3] - 2.0 * x[2] + x[1]) / step**2
+        a = (16.0 * (x[3] + x[1]) - 30.0 * x[2] - (x[4] + x[0])) / (12.0 * step**2)
+    true, J = problem.acceleration(t, q, v)[0], problem.jacobian(t, q)
+    values, directions = np.linalg.svd(J)[1:]
+    free = directions[int((values > 1e-9 * values[0]).sum()) :]
+    return Seen(problem, t, q, v, a, float(np.linalg.norm(a - rough)), true, free)

@@ -1,0 +1,140 @@
+"""Equations of rigid bodies in a plane: coordinates x, y, angle of each, about the centre of mass."""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+Point = tuple[float, float]
+Drive = tuple[Callable[[float], float], Callable[[float], float], Callable[[float], float]]
+GROUND = -1
+
+
+class PlanarEquations:
+    """Bodies under their weight; add joints with `pin`, `distance` and `drive`, in the order of their rows.
+
+    Parameters
+    ----------
+    masses, inertias : array_like (n_bodies,)
+        kg, and kg m^2 about the centres of mass.
+    gravity : float
+        m/s^2, along -y.
+    """
+
+    def __init__(self, masses: ArrayLike, inertias: ArrayLike, gravity: float):
+        m, J = np.asarray(masses, dtype=float), np.asarray(inertias, dtype=float)
+        self.n_q, self.n_c = 3 * m.size, 0
+        self._diagonal = np.column_stack([m, m, J]).ravel()
+        self._force = np.column_stack([0.0 * m, -gravity * m, 0.0 * J]).ravel()
+        self._pins: list[tuple[tuple[int, Point, int, Point], float | None]] = []
+        self._rows: list[list[int]] = []
+        self._drives: list[tuple[int, int, Drive]] = []
+
+    def pin(self, i: int, a: Point, j: int, b: Point) -> None:
+        """Two rows: point a of body i is point b of body j, or of the ground."""
+        self._pins.append(((i, a, j, b), None))
+        self._rows.append([self.n_c, self.n_c + 1])
+        self.n_c += 2
+
+    def distance(self, i: int, a: Point, j: int, b: Point, length: float) -> None:
+        """A row: half the squared distance of the points is half the squared length."""
+        self._pins.append(((i, a, j, b), length))
+        self._rows.append([self.n_c])
+        self.n_c += 1
+
+    def drive(self, coordinate: int, drive: Drive) -> None:
+        """A row: a coordinate is a function of time, which is given with its two derivatives."""
+        self._drives.append((self.n_c, coordinate, drive))
+        self.n_c += 1
+
+    def _arm(self, q: Array, body: int, point: Point) -> Array:
+        """From the centre of a body to a point of it, in space; of the ground, the point."""
+        if body == GROUND:
+            return np.array(point)
+        s, c = np.sin(q[3 * body + 2]), np.cos(q[3 * body + 2])
+        return np.array([c * point[0] - s * point[1], s * point[0] + c * point[1]])
+
+    def _between(self, q: Array, i: int, a: Point, j: int, b: Point) -> Array:
+        """From point b of body j to point a of body i."""
+        total = self._arm(q, i, a) - self._arm(q, j, b)
+        for body, sign in ((i, 1.0), (j, -1.0)):
+            if body != GROUND:
+                total = total + sign * q[3 * body : 3 * body + 2]
+        return total
+
+    def _between_by_q(self, q: Array, i: int, a: Point, j: int, b: Point) -> Array:
+        """Its derivative (2, n_q)."""
+        J = np.zeros((2, self.n_q))
+        for body, point, sign in ((i, a, 1.0), (j, b, -1.0)):
+            if body != GROUND:
+                x, y = self._arm(q, body, point)
+                J[:, 3 * body : 3 * body + 2] += sign * np.eye(2)
+                J[:, 3 * body + 2] += sign * np.array([-y, x])
+        return J
+
+    def mass(self, t: float, q: Array) -> Array:
+        """M (n_q, n_q)."""
+        return np.diag(self._diagonal)
+
+    def force(self, t: float, q: Array, v: Array) -> Array:
+        """Q (n_q,): the weights."""
+        return self._force.copy()
+
+    def constraint(self, t: float, q: Array) -> Array:
+        """C (n_c,)."""
+        C = np.zeros(self.n_c)
+        for rows, (ends, length) in zip(self._rows, self._pins, strict=True):
+            arm = self._between(q, *ends)
+            C[rows] = arm if length is None else 0.5 * (arm @ arm - length**2)
+        for row, k, (motion, _, _) in self._drives:
+            C[row] = q[k] - motion(t)
+        return C
+
+    def jacobian(self, t: float, q: Array) -> Array:
+        """C_q (n_c, n_q)."""
+        J = np.zeros((self.n_c, self.n_q))
+        for rows, (ends, length) in zip(self._rows, self._pins, strict=True):
+            by_q = self._between_by_q(q, *ends)
+            J[rows] = by_q if length is None else self._between(q, *ends) @ by_q
+        for row, k, _ in self._drives:
+            J[row, k] = 1.0
+        return J
+
+    def constraint_rate(self, t: float, q: Array) -> Array:
+        """C_t (n_c,)."""
+        rates = np.zeros(self.n_c)
+        for row, _, (_, rate, _) in self._drives:
+            rates[row] = -rate(t)
+        return rates
+
+    def gamma(self, t: float, q: Array, v: Array) -> Array:
+        """Right-hand side of C_q a = gamma (n_c,)."""
+        right = np.zeros(self.n_c)
+        for rows, ((i, a, j, b), length) in zip(self._rows, self._pins, strict=True):
+            towards = np.zeros(2)  # minus the accelerations of the points at constant angular velocities
+            for body, point, sign in ((i, a, 1.0), (j, b, -1.0)):
+                if body != GROUND:
+                    towards += sign * v[3 * body + 2] ** 2 * self._arm(q, body, point)
+            if length is None:
+                right[rows] = towards
+            else:
+                rate = self._between_by_q(q, i, a, j, b) @ v
+                right[rows] = self._between(q, i, a, j, b) @ towards - rate @ rate
+        for row, _, (_, _, acceleration) in self._drives:
+            right[row] = acceleration(t)
+        return right
+
+    def energy(self, t: float, q: Array, v: Array) -> float:
+        """Of motion and weight, J."""
+        return float(0.5 * self._diagonal @ v**2 - self._force @ q)
+
+
+def bodies(*states: tuple[complex, float]) -> Array:
+    """Coordinates (3 n,) of bodies, or their velocities, each given as x + i y and an angle."""
+    return np.array([[place.real, place.imag, angle] for place, angle in states]).ravel()
+
+
+def rods(lengths: Sequence[float], masses: Sequence[float]) -> Array:
+    """Moments of inertia (n,) of uniform rods about their centres, kg m^2."""
+    return np.asarray(masses) * np.asarray(lengths) ** 2 / 12.0

@@ -1,0 +1,132 @@
+"""Equations of points on massless links: coordinates are theirs, a row is half the squared length of a link."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+Place = int | tuple[float, ...]  # the number of a point, or a place of the ground
+
+
+class PointEquations:
+    """Points in a plane or in space with links of fixed length and springs.
+
+    Parameters
+    ----------
+    mass : array_like (n_points,) or (n_points, n_points)
+        Of the points, kg; a matrix where bars between them are lumped consistently.
+    weight : array_like (n_points, n_axes)
+        Constant force on each point, N.
+    links : sequence of (place, place, float)
+        Ends, each the number of a point or a place of the ground, and the length, m.
+    springs : sequence of (place, place, float, float)
+        Ends, stiffness in N/m and unstressed length in m.
+    """
+
+    def __init__(
+        self,
+        mass: ArrayLike,
+        weight: ArrayLike,
+        links: Sequence[tuple[Place, Place, float]],
+        springs: Sequence[tuple[Place, Place, float, float]] = (),
+    ):
+        self.weight = np.asarray(weight, dtype=float)
+        n_points, n_axes = self.weight.shape
+        masses = np.asarray(mass, dtype=float)
+        self._mass = np.kron(np.diag(masses) if masses.ndim == 1 else masses, np.eye(n_axes))
+        self.n_q, self.n_c = n_points * n_axes, len(links)
+        self._across, self._from = self._differences([link[:2] for link in links])
+        self._lengths = np.array([link[2] for link in links])
+        self._spring_across, self._spring_from = self._differences([spring[:2] for spring in springs])
+        self._stiffness = np.array([spring[2] for spring in springs])
+        self._unstressed = np.array([spring[3] for spring in springs])
+
+    def _differences(self, pairs: Sequence[tuple[Place, Place]]) -> tuple[Array, Array]:
+        """D (n, n_axes, n_q) and d (n, n_axes), such that D q + d are the vectors between the ends."""
+        n_points, n_axes = self.weight.shape
+        across, start = np.zeros((len(pairs), n_axes, n_points, n_axes)), np.zeros((len(pairs), n_axes))
+        for k, ends in enumerate(pairs):
+            for end, sign in zip(ends, (1.0, -1.0), strict=True):
+                if isinstance(end, tuple):
+                    start[k] += sign * np.array(end)
+                else:
+                    across[k, :, end, :] += sign * np.eye(n_axes)
+        return across.reshape(len(pairs), n_axes, n_points * n_axes), start
+
+    def mass(self, t: float, q: Array) -> Array:
+        """M (n_q, n_q)."""
+        return self._mass.copy()
+
+    def force(self, t: float, q: Array, v: Array) -> Array:
+        """Q (n_q,): weights and springs."""
+        total = self.weight.ravel().copy()
+        if self._stiffness.size:
+            arms = self._spring_across @ q + self._spring_from
+            lengths = np.linalg.norm(arms, axis=1)
+            pulls = -self._stiffness * (lengths - self._unstressed) / lengths
+            total += np.einsum("k,ka,kaq->q", pulls, arms, self._spring_across)
+        return total
+
+    def constraint(self, t: float, q: Array) -> Array:
+        """C (n_c,)."""
+        arms = self._across @ q + self._from
+        return 0.5 * ((arms**2).sum(axis=1) - self._lengths**2)
+
+    def jacobian(self, t: float, q: Array) -> Array:
+        """C_q (n_c, n_q)."""
+        arms = self._across @ q + self._from
+        return (arms[:, None, :] @ self._across)[:, 0, :]
+
+    def constraint_rate(self, t: float, q: Array) -> Array:
+        """C_t (n_c,), zero."""
+        return np.zeros(self.n_c)
+
+    def gamma(self, t: float, q: Array, v: Array) -> Array:
+        """Right-hand side of C_q a = gamma (n_c,)."""
+        return -((self._across @ v) ** 2).sum(axis=1)
+
+    def energy(self, t: float, q: Array, v: Array) -> float:
+        """Of motion, weight and springs, J."""
+        total = 0.5 * v @ self._mass @ v - self.weight.ravel() @ q
+        if self._stiffness.size:
+            lengths = np.linalg.norm(self._spring_across @ q + self._spring_from, axis=1)
+            total += 0.5 * self._stiffness @ (lengths - self._unstressed) ** 2
+        return float(total)
+
+
+class DrivenPoint(PointEquations):
+    """A point on a link whose height is prescribed, y = y0 + rate t; beyond the length of the link it is nowhere."""
+
+    def __init__(self, length: float, height: float, rate: float, gravity: float):
+        super().__init__([1.0], [[0.0, -gravity]], [(0, (0.0, 0.0), length)])
+        self.n_c, self._height, self._rate = 2, height, rate
+
+    def constraint(self, t: float, q: Array) -> Array:
+        """C (2,)."""
+        return np.append(super().constraint(t, q), q[1] - self._height - self._rate * t)
+
+    def jacobian(self, t: float, q: Array) -> Array:
+        """C_q (2, 2)."""
+        return np.vstack([super().jacobian(t, q), [0.0, 1.0]])
+
+    def constraint_rate(self, t: float, q: Array) -> Array:
+        """C_t (2,)."""
+        return np.array([0.0, -self._rate])
+
+    def gamma(self, t: float, q: Array, v: Array) -> Array:
+        """Right-hand side of C_q a = gamma (2,)."""
+        return np.append(super().gamma(t, q, v), 0.0)
+
+
+class EndingForce(PointEquations):
+    """Points with a drag that is known up to a time only: a square root of what is left of it, NaN beyond."""
+
+    def __init__(self, ends: float, *arguments: ArrayLike):
+        super().__init__(*arguments)  # type: ignore[arg-type]
+        self._ends = ends
+
+    def force(self, t: float, q: Array, v: Array) -> Array:
+        """Q (n_q,)."""
+        with np.errstate(invalid="ignore"):
+            return super().force(t, q, v) - np.sqrt(self._ends - t) * v

@@ -1,0 +1,218 @@
+"""Equations of rigid bodies in space: x, y, z of the centre of mass and four Euler parameters of each.
+
+The first rows keep the Euler parameters normalised, half of e.e is 1/2, the next are those of the joints.
+"""
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+GROUND = -1
+
+
+def skew(a: Array) -> Array:
+    """The matrix of the cross product with a vector (3,)."""
+    return np.array([[0.0, -a[2], a[1]], [a[2], 0.0, -a[0]], [-a[1], a[0], 0.0]])
+
+
+def turned(e: Array, a: Array) -> Array:
+    """R(e) a, a quadratic form of the Euler parameters (4,)."""
+    u = e[1:]
+    return (e[0] ** 2 - u @ u) * a + 2.0 * u * (u @ a) + 2.0 * e[0] * np.cross(u, a)
+
+
+def turned_by_e(e: Array, a: Array) -> Array:
+    """Derivative (3, 4) of R(e) a by the Euler parameters, which is linear in these."""
+    u = e[1:]
+    by_u = (u @ a) * np.eye(3) + np.outer(u, a) - np.outer(a, u) - e[0] * skew(a)
+    return 2.0 * np.column_stack([e[0] * a + np.cross(u, a), by_u])
+
+
+def half_spin(e: Array) -> Array:
+    """G (3, 4): the angular velocity along the axes of the body is 2 G e'."""
+    return np.column_stack([-e[1:], e[0] * np.eye(3) - skew(e[1:])])
+
+
+def parameters_of(R: Array) -> Array:
+    """Euler parameters (4,) of a rotation matrix, by the largest of the four, the sign such that e0 is not negative."""
+    products = np.empty((4, 4))
+    products[0, 0], products[1:, 1:] = 1.0 + np.trace(R), R + R.T + (1.0 - np.trace(R)) * np.eye(3)
+    products[0, 1:] = products[1:, 0] = R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]
+    best = products[int(np.argmax(np.diag(products)))]
+    return best / np.linalg.norm(best) * (1.0 if best[0] >= 0.0 else -1.0)
+
+
+class SpatialEquations:
+    """Bodies under their weight; add them with `body`, then joints in the order of their rows.
+
+    Parameters
+    ----------
+    gravity : array_like (3,)
+        m/s^2.
+    """
+
+    def __init__(self, gravity: ArrayLike):
+        self._gravity = np.asarray(gravity, dtype=float)
+        self._masses: list[float] = []
+        self._inertias: list[Array] = []
+        self._start: list[Array] = []
+        self._rates: list[Array] = []
+        self._points: list[tuple[int, int, Array, int, Array]] = []
+        self._directions: list[tuple[int, int, Array, int, Array]] = []
+        self._n_joint_rows = 0
+
+    @property
+    def n_q(self) -> int:
+        """Number of coordinates."""
+        return 7 * len(self._masses)
+
+    @property
+    def n_c(self) -> int:
+        """Number of rows."""
+        return len(self._masses) + self._n_joint_rows
+
+    @property
+    def start(self) -> tuple[Array, Array]:
+        """States q, v (n_q,) as the bodies were added."""
+        return np.concatenate(self._start), np.concatenate(self._rates)
+
+    def body(
+        self, mass: float, inertia: ArrayLike, place: ArrayLike, R: ArrayLike, velocity: ArrayLike, spin: ArrayLike
+    ) -> int:
+        """Add a body by its principal moments, its start, and the angular velocity along the axes of space."""
+        e = parameters_of(np.asarray(R, dtype=float))
+        along = np.asarray(R, dtype=float).T @ np.asarray(spin, dtype=float)
+        self._masses.append(mass)
+        self._inertias.append(np.diag(np.asarray(inertia, dtype=float)))
+        self._start.append(np.concatenate([np.asarray(place, dtype=float), e]))
+        self._rates.append(np.concatenate([np.asarray(velocity, dtype=float), 0.5 * half_spin(e).T @ along]))
+        return len(self._masses) - 1
+
+    def _fixed_to(self, body: int, vector: ArrayLike, from_centre: bool) -> Array:
+        """A vector, or a point from the centre, of space at the start along the axes of a body."""
+        given = np.asarray(vector, dtype=float)
+        if body == GROUND:
+            return given
+        r, e = self._start[body][:3], self._start[body][3:]
+        return turned(e * np.array([1.0, -1.0, -1.0, -1.0]), given - r if from_centre else given)
+
+    def spherical(self, i: int, j: int, point: ArrayLike) -> None:
+        """Three rows: both bodies share a point."""
+        ends = (self._fixed_to(body, point, True) for body in (i, j))
+        a, b = ends
+        self._points.append((self._n_joint_rows, i, a, j, b))
+        self._n_joint_rows += 3
+
+    def revolute(self, i: int, j: int, point: ArrayLike, axis: ArrayLike) -> None:
+        """Five rows: both bodies share a point and an axis."""
+        self.spherical(i, j, point)
+        axis = np.asarray(axis, dtype=float)
+        first = np.cross(axis, np.eye(3)[int(np.argmin(np.abs(axis)))])
+        for across in (first, np.cross(axis, first)):
+            unit = self._fixed_to(i, across / np.linalg.norm(across), False)
+            self._directions.append((self._n_joint_rows, i, unit, j, self._fixed_to(j, axis, False)))
+            self._n_joint_rows += 1
+
+    def _vector(self, q: Array, body: int, a: Array) -> Array:
+        return a if body == GROUND else turned(q[7 * body + 3 : 7 * body + 7], a)
+
+    def _vector_by_e(self, q: Array, body: int, a: Array) -> Array:
+        return np.zeros((3, 4)) if body == GROUND else turned_by_e(q[7 * body + 3 : 7 * body + 7], a)
+
+    def _rate(self, q: Array, v: Array, body: int, a: Array) -> Array:
+        return self._vector_by_e(q, body, a) @ (np.zeros(4) if body == GROUND else v[7 * body + 3 : 7 * body + 7])
+
+    def mass(self, t: float, q: Array) -> Array:
+        """M (n_q, n_q), of rank 6 for each body."""
+        M = np.zeros((self.n_q, self.n_q))
+        for body, (m, J) in enumerate(zip(self._masses, self._inertias, strict=True)):
+            k = 7 * body
+            G = half_spin(q[k + 3 : k + 7])
+            M[k : k + 3, k : k + 3] = m * np.eye(3)
+            M[k + 3 : k + 7, k + 3 : k + 7] = 4.0 * G.T @ J @ G
+        return M
+
+    def force(self, t: float, q: Array, v: Array) -> Array:
+        """Q (n_q,): weights, and the terms of the velocities."""
+        Q = np.zeros(self.n_q)
+        for body, (m, J) in enumerate(zip(self._masses, self._inertias, strict=True)):
+            k = 7 * body
+            Q[k : k + 3] = m * self._gravity
+            e, rate = q[k + 3 : k + 7], v[k + 3 : k + 7]
+            Q[k + 3 : k + 7] = -8.0 * half_spin(rate).T @ (J @ (half_spin(e) @ rate))
+        return Q
+
+    def constraint(self, t: float, q: Array) -> Array:
+        """C (n_c,)."""
+        n = len(self._masses)
+        C = np.zeros(self.n_c)
+        C[:n] = 0.5 * ((q.reshape(n, 7)[:, 3:] ** 2).sum(axis=1) - 1.0)
+        for row, i, a, j, b in self._points:
+            gap = self._vector(q, i, a) - self._vector(q, j, b)
+            for body, sign in ((i, 1.0), (j, -1.0)):
+                if body != GROUND:
+                    gap = gap + sign * q[7 * body : 7 * body + 3]
+            C[n + row : n + row + 3] = gap
+        for row, i, a, j, b in self._directions:
+            C[n + row] = self._vector(q, i, a) @ self._vector(q, j, b)
+        return C
+
+    def jacobian(self, t: float, q: Array) -> Array:
+        """C_q (n_c, n_q)."""
+        n = len(self._masses)
+        J = np.zeros((self.n_c, self.n_q))
+        for body in range(n):
+            J[body, 7 * body + 3 : 7 * body + 7] = q[7 * body + 3 : 7 * body + 7]
+        for row, i, a, j, b in self._points:
+            for body, point, sign in ((i, a, 1.0), (j, b, -1.0)):
+                if body != GROUND:
+                    rows = slice(n + row, n + row + 3)
+                    J[rows, 7 * body : 7 * body + 3] += sign * np.eye(3)
+                    J[rows, 7 * body + 3 : 7 * body + 7] += sign * self._vector_by_e(q, body, point)
+        for row, i, a, j, b in self._directions:
+            for body, own, other in ((i, a, self._vector(q, j, b)), (j, b, self._vector(q, i, a))):
+                if body != GROUND:
+                    J[n + row, 7 * body + 3 : 7 * body + 7] += other @ self._vector_by_e(q, body, own)
+        return J
+
+    def constraint_rate(self, t: float, q: Array) -> Array:
+        """C_t (n_c,), zero."""
+        return np.zeros(self.n_c)
+
+    def gamma(self, t: float, q: Array, v: Array) -> Array:
+        """Right-hand side of C_q a = gamma (n_c,)."""
+        n = len(self._masses)
+        right = np.zeros(self.n_c)
+        right[:n] = -(v.reshape(n, 7)[:, 3:] ** 2).sum(axis=1)
+        still = np.zeros(3)
+
+        def bend(body: int, a: Array) -> Array:
+            """The second derivative of a vector that turns with a body, where e'' = 0."""
+            return still if body == GROUND else 2.0 * turned(v[7 * body + 3 : 7 * body + 7], a)
+
+        for row, i, a, j, b in self._points:
+            right[n + row : n + row + 3] = bend(j, b) - bend(i, a)
+        for row, i, a, j, b in self._directions:
+            total = bend(i, a) @ self._vector(q, j, b) + self._vector(q, i, a) @ bend(j, b)
+            right[n + row] = -total - 2.0 * self._rate(q, v, i, a) @ self._rate(q, v, j, b)
+        return right
+
+    def energy(self, t: float, q: Array, v: Array) -> float:
+        """Of motion and weight, J."""
+        total = 0.0
+        for body, (m, J) in enumerate(zip(self._masses, self._inertias, strict=True)):
+            k = 7 * body
+            spin = 2.0 * half_spin(q[k + 3 : k + 7]) @ v[k + 3 : k + 7]
+            total += float(0.5 * m * v[k : k + 3] @ v[k : k + 3] + 0.5 * spin @ J @ spin)
+            total -= float(m * self._gravity @ q[k : k + 3])
+        return total
+
+    def vertical_momentum(self, t: float, q: Array, v: Array) -> float:
+        """Angular momentum about the z axis of space, kg m^2/s."""
+        total = 0.0
+        for body, (m, J) in enumerate(zip(self._masses, self._inertias, strict=True)):
+            k = 7 * body
+            e = q[k + 3 : k + 7]
+            own = turned(e, J @ (2.0 * half_spin(e) @ v[k + 3 : k + 7]))
+            total += float(own[2] + m * (q[k] * v[k + 1] - q[k + 1] * v[k]))
+        return total
