@@ -286,9 +286,7 @@ def test_what_can_be_trusted_is_counted(tmp_path):
         "models": {"n": 20, "stopped": 12},
     }
     text = screen(tmp_path, planted_errors=planted)
-    said = (
-        "- Of 73 faults that we planted, 20 are in models; `solve_dae` refuses or stops 12 of these; no check"
-    )
+    said = "- Of 73 faults that we planted, 20 are in models; `solve_dae` refuses or stops 12 of these; no check"
     assert f"{said} of those run catches 1: x ([planted errors](planted_errors.md))." in text
 
 
