@@ -24,6 +24,7 @@ Array = NDArray[np.float64]
 Ours = Callable[[Array, Array, Array], tuple[Array, Array, Array]]
 
 SPECTRAL_RADIUS = 0.9  # Exudyn's default
+SPARSE = 90  # coordinates from which on its sparse solver is the faster one
 ALPHA = -0.3  # of HHT; the default of MSC Adams, whose HHT integrator is the usual one on index 3
 SOLVERS = {
     "GeneralizedAlpha": "Exudyn generalized-alpha, spectral radius 0.9, index 3, fixed step",
@@ -98,6 +99,8 @@ def run(
     if dependent_rows:
         settings.linearSolver.solverType = exu.LinearSolverType.EigenDense
         settings.linearSolver.ignoreSingularJacobian = True
+    elif reference.size > SPARSE:
+        settings.linearSolver.solverType = exu.LinearSolverType.EigenSparse
     settings.timeIntegration.generalizedAlpha.spectralRadius = radius
     limit = TimeLimit(task.time_limit)
     with _silence(), user_call:

@@ -16,7 +16,7 @@ from studies.bench.takes import takes
 # claims and compare_page read the others' rows
 STUDIES = (
     *("linkage", "work_precision", "table3", "motion", "step_size", "violation", "energy", "beam", "validation"),
-    *("ablation", "honesty", "robustness", "planted_errors", "symbolic_size", "sweep_linkages", "ensembles"),
+    *("ablation", "honesty", "robustness", "planted_errors", "symbolic_size", "sweep_linkages", "ensembles", "scale"),
     "claims",
     "compare_page",
 )

@@ -1,6 +1,7 @@
 """Planar assemblies of n bodies with pins, of any size: open and closed chains, ladders, trees, stars."""
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,10 +10,17 @@ from twoloop.mechanisms.planar import GROUND, PlanarBodies
 from twoloop.problem.system import ConstrainedSystem
 
 Array = NDArray[np.float64]
-Assembly = tuple[ConstrainedSystem, Array]
 
 BEND = 0.4  # rad: how far bars lean, so that no two are in line
 LEVEL = 2.4  # rad: of the bars across a ladder, none of whose others come near this direction
+
+
+class Assembly(NamedTuple):
+    """A system, its position, and the bodies that it is made of."""
+
+    system: ConstrainedSystem
+    q: Array
+    bodies: PlanarBodies
 
 
 class Bars:
@@ -43,7 +51,8 @@ class Bars:
 
     def assembly(self, name: str) -> Assembly:
         """The system, and its position."""
-        return self.bodies.system(name), np.column_stack([self.centres, self.angles]).ravel()
+        q = np.column_stack([self.centres, self.angles]).ravel()
+        return Assembly(self.bodies.system(name), q, self.bodies)
 
 
 def _leaning(n: int) -> Array:

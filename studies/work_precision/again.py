@@ -16,7 +16,7 @@ from studies.bench import cli
 from studies.bench.cli import StudyError
 from studies.bench.store import KeptRows, Output
 from studies.compare import GROUP as LENGTH
-from studies.work_precision import first_calls, minimal, rivals, scaling, study
+from studies.work_precision import first_calls, minimal, rivals, study
 
 AT_LENGTH = ", at length"  # after the name of a case: the runs over its whole motion
 
@@ -35,7 +35,6 @@ def parts() -> dict[str, Part]:
     found = {name: Part(rivals.GROUP, name, partial(_of_rivals, name)) for name in rivals.problems(False)}
     for case in study.known_cases(False):
         found[case.name + AT_LENGTH] = Part(LENGTH, case.name, partial(study.at_length, [case], False))
-    found["size"] = Part(scaling.GROUP, None, partial(scaling.collect, False))
     found["first calls"] = Part(first_calls.GROUP, None, partial(first_calls.collect, quick=False))
     found[minimal.GROUP] = Part(minimal.GROUP, None, partial(minimal.collect, quick=False))
     return found

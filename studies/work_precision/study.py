@@ -1,7 +1,7 @@
 """Every mechanism with every solver, ours and others': what each accuracy costs, and which solver to take.
 
 Four cases are run at length, over their whole motion; all others, with more rivals, by `rivals`. What was aimed
-at is judged in `goals`; how cost grows with size is in `scaling`.
+at is judged in `goals`.
 """
 
 from collections.abc import Sequence
@@ -31,7 +31,7 @@ from studies.bench.solvers import (
 )
 from studies.bench.store import KeptRows, Output, Row
 from studies.compare import GROUP, runs_of
-from studies.work_precision import first_calls, goals, minimal, processors, rivals, scaling
+from studies.work_precision import first_calls, goals, minimal, processors, rivals
 
 ERRORS = (1e-2, 1e-4, 1e-6)  # the accuracies of the first screen
 FURTHER = ("Gauss6", IRK_LINE, QUARTER, f"IDA, {IDA_FORMS[0]}")
@@ -99,7 +99,7 @@ def make(output: Output) -> pd.DataFrame:
     quick = output.call.quick
     with output.kept() as kept:
         made = [at_length(known_cases(quick), quick, kept)]
-        made += [rivals.collect(rivals.runs(quick), kept), scaling.collect(quick, kept)]
+        made += [rivals.collect(rivals.runs(quick), kept)]
         made += [first_calls.collect(kept, quick), minimal.collect(kept, quick)]
     return pd.concat(made, ignore_index=True)
 
@@ -149,8 +149,7 @@ def report(output: Output, rows: pd.DataFrame, line: str) -> dict[str, Any]:
     found = rivals.findings_of(everywhere)
     findings = findings_of(medians, known) | {"rivals": found}
     findings |= {"goals": goals.findings_of(known, medians, everywhere), "asked": asked(part(rows, rivals.GROUP))}
-    findings |= {"scaling": scaling.findings_of(part(rows, scaling.GROUP)), "versions": versions()}
-    findings["fitted"] = scaling.FITTED
+    findings["versions"] = versions()
     findings["first_calls"] = first_calls.findings_of(first_calls.at_error(part(rows, first_calls.GROUP), everywhere))
     findings["unrolled"] = LARGEST_UNROLLED
     in_angles = on_the_same_processor(part(rows, minimal.GROUP), part(rows, rivals.GROUP))

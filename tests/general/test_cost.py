@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from studies.work_precision.scaling import chain
+from tests.chains import chain
 from twoloop import solve_dae
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import twoloop.run.workspace as workspace_module
-from studies.work_precision.scaling import chain
+from tests.chains import chain
 from tests.general.mechanisms import mechanism
 from tests.general.runs import error
 from tests.problems import force_residual, functions_of, pendulum, violations, worst

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from studies.work_precision.scaling import chain
+from tests.chains import chain
 from tests.problems import entry
 from twoloop.kernels.algebra import factors
 from twoloop.kernels.algebra.elimination import (

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from studies.work_precision.scaling import chain
+from tests.chains import chain
 from tests.kernels.test_augmented import form, started
 from tests.problems import kept
 from twoloop.kernels.algebra.saddle_point import solve_both

@@ -143,7 +143,7 @@ def test_runs_are_those_of_the_other_forms(large, method):
     found = []
     for least in (10**9, 0):
         large(least)
-        system, q = closed_chain(18)
+        system, q, _ = closed_chain(18)
         options = {"method": method, "rtol": 1e-10, "atol": 1e-10, "compiled": False, "dense_output": True}
         found.append(solve_dae(system, (0.0, 0.05), q, np.zeros_like(q), **options))
     one, other = found
@@ -180,7 +180,7 @@ def test_programs_grow_with_the_bodies_and_no_faster(large):
     for make in ASSEMBLIES:
         updates = {}
         for n in (99, 999):
-            system, q = make(n)
+            system, q, _ = make(n)
             form = static_form(system, 0.0, q)
             updates[n] = int(form.program[N_UPDATES])
             run = started_run(system, q)
@@ -327,7 +327,7 @@ def test_a_position_that_is_nearly_singular_is_left_to_the_dense_forms(any_size,
 
 def test_starts_of_large_systems(large):
     for make in (open_chain, closed_chain, ladder):
-        system, q = make(36)
+        system, q, _ = make(36)
         rng = np.random.default_rng(2)
         guess, speeds = q + 1e-5 * rng.normal(size=len(q)), rng.normal(size=len(q))
         large(10**9)

@@ -11,8 +11,7 @@ from studies.bench.render import render
 from studies.bench.runs_by_error import LOOSEST
 from studies.bench.solvers import CATALOGUE, OWN, RIVALS
 from studies.bench.store import KeptRows
-from studies.work_precision import goals, rivals, scaling
-from twoloop import solve_dae
+from studies.work_precision import goals, rivals
 
 
 def rows(*lines, case="four-bar"):
@@ -131,54 +130,13 @@ def test_repetitions_are_interleaved_and_what_is_refused_is_asked_once():
     assert len(kept) == n_rows
 
 
-def test_exponents_are_fitted_to_large_sizes():
-    assert scaling.exponent([1, 10, 20, 40], [99.0, 1.0, 4.0, 16.0]) == pytest.approx(2.0)
-    assert scaling.exponent([1, 2, 5], [1.0, 2.0, 5.0]) is None
-
-
-@pytest.mark.parametrize("closed", [False, True])
-def test_chains_start_on_their_constraints(closed):
-    problem = scaling.chain(7, closed)
-    assert problem.system.n_c == 7 + closed
-    assert np.abs(problem.system.constraint(0.0, problem.q0)).max() < 1e-15
-    result = solve_dae(problem.system, (0.0, 0.2), problem.q0, problem.v0, method="Adams")
-    assert (
-        result.success
-        and np.abs(problem.energy(0.0, result.q, result.v) - problem.energy(0.0, problem.q0, problem.v0)).max() < 1e-6
-    )
-
-
-def test_a_step_that_counts_no_evaluations_has_its_cost_all_the_same():
-    row = {"case": "open chain", "solver": "Taylor", "message": "", "evaluation_us": float("nan")}
-    made = pd.DataFrame([row | {"n": n, "step_us": float(n)} for n in (10, 100)])
-    (line,) = scaling.findings_of(made)
-    assert line["step_exponent"] == pytest.approx(1.0)
-
-
-def test_a_failed_size_is_a_row_and_no_cost():
-    row = scaling._row("open chain", scaling.chain(2, False), 2, "Unknown", 0)
-    assert row["status"] == "FAILED" and row["step_us"] is None
-    (line,) = scaling.findings_of(pd.DataFrame([row]))
-    assert line["failed"] and "| open chain | failed |" in render("scaling", {"scaling": [line]}, {})
-
-
-def test_bars_of_a_chain_hang_together():
-    problem = scaling.rigid_chain(4)
-    assert np.abs(problem.system.constraint(0.0, problem.q0)).max() < 1e-15
-    lines = [scaling._row(scaling.RIGID, scaling.rigid_chain(n), n, "Adams", 0) for n in (2, 3)]
-    found = scaling.findings_of(pd.DataFrame(lines))
-    assert found[0]["sizes"] == [2, 3]
-
-
 def stated(own, heyoka=2.0, python=9.0, **changed):
     """The text of the report, of rows of the four-bar."""
     table = compared(own, heyoka, python=python)
     found = {
         "cases": [],
-        "scaling": [],
         "first_calls": [],
         "minimal": {"mechanisms": []},
-        "fitted": 10,
         "measured": {"commits": 1, "processors": ["this"]},
         "default": "auto",
         "rivals": rivals.findings_of(table),

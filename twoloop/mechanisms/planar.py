@@ -249,7 +249,7 @@ class PlanarBodies:
         self.gravity, self.n_c = gravity, 0
         self._joints: list[list[float]] = []
         self._named: list[Joint] = []
-        self._pins: list[tuple[int, tuple[float, float], int, tuple[float, float]]] = []
+        self.pins: list[tuple[int, tuple[float, float], int, tuple[float, float]]] = []
 
     def _add(
         self, kind: float, rows: int, numbers: list[float], name: str, body: int, point: tuple[float, float]
@@ -270,7 +270,7 @@ class PlanarBodies:
 
     def pin(self, i: int, a: tuple[float, float], j: int, b: tuple[float, float]) -> int:
         """Two rows: point a of body i is point b of body j (or of the ground); returns the first one's number."""
-        self._pins.append((i, a, j, b))
+        self.pins.append((i, a, j, b))
         return self._add(PIN, 2, [i, *a, j, *b, 0.0], *self._between("pin", i, a, j, b))
 
     def distance(self, i: int, a: tuple[float, float], j: int, b: tuple[float, float], length: float) -> int:
@@ -327,7 +327,7 @@ class PlanarBodies:
         """Bodies as lines between their pins; with one pin a uniform rod, or a square where that is the centre."""
         sketch = Sketch()
         ends: list[list[tuple[float, float]]] = [[] for _ in self.names]
-        for i, a, j, b in self._pins:
+        for i, a, j, b in self.pins:
             for body, point in ((i, a), (j, b)):
                 if body == GROUND:
                     sketch.point(body, point)
@@ -342,7 +342,7 @@ class PlanarBodies:
                 sketch.add_box(body, (side, side))
             for first, second in pairwise(points):
                 sketch.line((body, first), (body, second))
-        for i, a, j, _ in self._pins:
+        for i, a, j, _ in self.pins:
             if GROUND not in (i, j):
                 sketch.trace(i, a)
         return sketch.drawing

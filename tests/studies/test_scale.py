@@ -1,0 +1,79 @@
+"""The study of size: slopes and ratios turn with the rows; assemblies and Exudyn's models of them agree."""
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from studies import scale
+from studies.bench.large import ASSEMBLIES, open_chain
+from studies.bench.render import render
+
+EXUDYN = "Exudyn, GeneralizedAlpha"
+
+
+def evaluations(power=1.0, **changed):
+    made = [
+        {
+            "group": scale.EVALUATION,
+            "case": "open chain",
+            "n": n,
+            "repeat": k,
+            "evaluation_us": 0.1 * n**power * (1 + k),
+        }
+        for n in (10, 30, 100, 1000)
+        for k in range(3)
+    ]
+    return pd.DataFrame(made).assign(step_us=1.0, start_s=0.5, status="REACHED_END", message="", **changed)
+
+
+def chains(ours=0.1, exudyn=5.0):
+    made = []
+    for name, family, cost, setting in ((scale.DEFAULT, "two-loop", ours, "tol"), (EXUDYN, "Exudyn", exudyn, "h")):
+        for error in (1e-2, 1e-3, 1e-4, 1e-5, 1e-6):
+            for k in range(3):
+                made.append({"solver": name, "family": family, setting: error, "error_q": error, "repeat": k})
+                made[-1]["call_s"] = cost * (1.0 + 0.001 * k)
+    about = {"group": scale.CHAIN, "case": "open chain of 20", "n": 20, "status": "REACHED_END", "floor": 1e-9}
+    return pd.DataFrame(made).assign(called_from="compiled", keeps_constraints=True, **about)
+
+
+def said(rows):
+    found = scale.findings_of(rows)
+    return found, render("scale", found, {}, stamp="stamp", quick=False, rows=rows)
+
+
+def test_slopes_and_ratios_follow_the_rows():
+    found, text = said(pd.concat([evaluations(), chains()], ignore_index=True))
+    assert found["kinds"][0]["slope"] == pytest.approx([1.0] * 3)
+    assert "of their number on the open chain." in text and "with the power 1.0 (1.0 to 1.0)" in text
+    assert "at equal error Exudyn takes 50 times as long as the default" in text
+    found, text = said(pd.concat([evaluations(2.0), chains(ours=1.0, exudyn=0.5)], ignore_index=True))
+    assert found["kinds"][0]["slope"][0] == pytest.approx(2.0)
+    assert "at equal error Exudyn takes 0.50 times as long" in text
+
+
+def test_a_failed_size_is_named_and_in_no_fit():
+    failed = evaluations().assign(status="FAILED", message="lost rank", evaluation_us=None)
+    rows = pd.concat([evaluations(), failed[failed["n"] == 1000].assign(case="star"), chains()], ignore_index=True)
+    found, text = said(rows)
+    assert [line["case"] for line in found["kinds"]] == ["open chain"] and "star of 1000" in text
+
+
+@pytest.mark.parametrize("build", ASSEMBLIES)
+def test_assemblies_start_on_their_constraints(build):
+    made = build(12)
+    assert np.abs(made.system.constraint(0.0, made.q)).max() < 1e-14
+    assert made.system.n_q == 36 and made.bodies.masses.size == 12
+
+
+def test_exudyns_bodies_move_as_ours():
+    pytest.importorskip("exudyn")
+    from references.exudyn.pinned import solve_pinned
+    from twoloop import solve_dae
+
+    made = open_chain(5)
+    problem = scale.problem_of(made, 0.2)
+    ends = [solve_pinned(problem, made.bodies, steps).q[:, -1] for steps in (100, 200)]
+    ours = solve_dae(problem.system, problem.t_span, problem.q0, problem.v0, rtol=1e-9, atol=1e-9).q[:, -1]
+    errors = [np.abs(end - ours).max() for end in ends]
+    assert errors[1] < 1e-3 and errors[0] / errors[1] == pytest.approx(4.0, rel=0.2)
