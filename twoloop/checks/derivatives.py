@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from twoloop.checks.differences import EPS, Estimate, Function, confirms, differentiate
 from twoloop.checks.scales import column_scales, generic_factors, median, sizes
 from twoloop.checks.sparse_rows import Rows, SparseRows, apart, is_finite
-from twoloop.checks.values import check_values, unsymmetric_mass
+from twoloop.checks.values import SAME, check_values, unsymmetric_mass
 from twoloop.kernels.compile.linking import direct
 from twoloop.kernels.data.common import FORCE_BY_Q_GIVEN, FORCE_BY_V_GIVEN, REACTION_BY_Q_GIVEN
 
@@ -32,8 +32,7 @@ TIME = 0.1  # s: first guess at how fast constraints move
 NEAR_START = 1e-3  # of the coordinates: tangents are looked at a little off the start, where symmetry hides terms
 FASTEST = 1e9  # times the motion by one's own size in a second: beyond, C_q is nearly zero and the drive is not so fast
 ALONG_A_RUN = 9  # half-widths tried at most at a state of a run
-SAME = 1e-11  # relative: values that two callbacks must share ...
-ROUNDED = 100.0  # ... and times rounding of the terms of a constraint
+ROUNDED = 100.0  # times rounding of the terms of a constraint, by which values that callbacks share may differ, too
 ROUNDING = 1e-12  # of a difference, relative to the largest entry over the displacement
 
 WHAT = {
