@@ -180,8 +180,8 @@ def test_every_number_of_the_screen_is_made_again_from_the_rows(tmp_path):
         "| `compiled=True`" + count(("auto, compiled",) * 2, 1),
         "| `compiled=False`" + count(("auto",) * 2, 0),
         "| the best of our methods in hindsight" + count(None, 1),
-        f"the cheapest rival takes {0.5 * (1.4 / 0.52 + 5.9 / 40.0):.1f} times the default's time at 1e-4, 1.4 at 1e-6, "
-        "1.4 at 1e-8 and 1.4 at 1e-10. ",
+        f"the cheapest rival takes {0.5 * (1.4 / 0.52 + 5.9 / 40.0):.1f} times the default's time at 1e-4, 1.4 at "
+        "1e-6, 1.4 at 1e-8 and 1.4 at 1e-10. ",
         "At errors of 1e-3 to 1e-6 on the 2 mechanisms without singular positions, the default is "
         + count(("auto, compiled", "auto"), None),
         "for mechanisms with compiled callbacks whose equations take few operations, 1 of 2 here;",
