@@ -4,15 +4,13 @@ A study lists `Run`s, `collect` makes the rows, `tables` summarises them. Mechan
 `solvers.py`, what a row says of the quality of a run in `metrics.py`.
 """
 
-import signal
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from itertools import count
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -20,6 +18,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from references.driver import user_call
 from studies.bench import metrics
+from studies.bench.alarm import Alarm
 from studies.bench.reference_motion import ReferenceMotion, make_reference
 from studies.bench.store import Array, KeptRows, Row
 from twoloop import ConstrainedSystem, Result, Statistics, solve_dae
@@ -40,10 +39,6 @@ _COUNT = count(1)  # of new starts
 
 class NotApplicable(Exception):
     """Raised by a solver of the catalogue for a case that it cannot run; the text says why."""
-
-
-class TimeLimit(Exception):
-    """Raised in a run that has used up its CPU time."""
 
 
 @dataclass(frozen=True)
@@ -378,7 +373,7 @@ def attempt(run: Run, repeat: int, around: float | None = None) -> tuple[Result 
     user_call.forget()
     limit = run.case.time_limit
     try:
-        with _Alarm(limit, AROUND * limit if around is None else around) as alarm:
+        with Alarm(limit, AROUND * limit if around is None else around) as alarm:
             began = time.process_time()
             result = run.solver.run(run.case, run.value, repeat)
             spent = time.process_time() - began
@@ -402,37 +397,3 @@ def attempt(run: Run, repeat: int, around: float | None = None) -> tuple[Result 
     if not result.success and "time_limit =" in result.message:  # as the adapters in references/ say it
         return result, "TIME_LIMIT", result.message, spent
     return result, result.status.name, result.message, spent
-
-
-class _Alarm:
-    """Raise TimeLimit in this process when a user's call, or all around it, has used up its CPU time, where it can.
-
-    Compiled code is not interrupted but at its return to Python. `rang` says why the exception was raised.
-    """
-
-    def __init__(self, seconds: float, around: float):
-        self.seconds, self.around, self.rang = seconds, around, ""
-        self._can = hasattr(signal, "setitimer") and threading.current_thread() is threading.main_thread()
-        self._began, self._before = 0.0, None
-
-    def __enter__(self) -> Self:
-        if self._can:
-            self._began = time.process_time()
-            # a timer of wall-clock time: one of CPU time makes the clocks of CPU time advance in ticks of 4 ms on Linux
-            self._before = signal.signal(signal.SIGALRM, self._look)  # type: ignore[assignment]
-            # again and again: an exception raised in a callback of a foreign solver may be swallowed by it
-            signal.setitimer(signal.ITIMER_REAL, 1.1 * self.seconds, min(1.0, 0.5 * self.seconds))
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self._can:
-            signal.setitimer(signal.ITIMER_REAL, 0.0)
-            signal.signal(signal.SIGALRM, self._before)
-
-    def _look(self, *_: object) -> None:
-        if user_call.so_far() >= 1.1 * self.seconds:  # a solver's own limit comes first
-            self.rang = f"Stopped after {self.seconds:g} s of CPU time, the limit of a run."
-        elif time.process_time() - self._began >= self.around:
-            self.rang = f"Stopped after {self.around:g} s of CPU time, the limit of all that an adapter does."
-        if self.rang:
-            raise TimeLimit

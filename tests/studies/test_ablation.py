@@ -1,7 +1,5 @@
 """The ablation study: sentences turn with the rows, costs are not interpolated over gaps, and a run of each variant."""
 
-import json
-
 import numpy as np
 import pandas as pd
 import pytest
@@ -25,10 +23,10 @@ from studies.ablation import (
     findings_of,
     verdict,
 )
-from studies.bench.cli import Call, StudyError
+from studies.bench.cli import StudyError
 from studies.bench.collector import attempt
 from studies.bench.render import render
-from studies.bench.store import Output
+from tests.studies.of_study import GOOD, found_of
 
 FACTORS = {PAPER: (1.0, 3.0, 1.8), FROZEN: (9.0, 9.0, 9.0), PROJECTED: (1.1, 1.2, 1.0)}
 FACTORS |= {STABILISED: (2.0, 2.1, 2.2), UNPROJECTED: (1.05, 1.1, 0.9)}
@@ -36,7 +34,7 @@ FACTORS |= {STABILISED: (2.0, 2.1, 2.2), UNPROJECTED: (1.05, 1.1, 0.9)}
 
 def rows():
     """Medians of a full run, made up but like them."""
-    good = {"status": "REACHED_END", "message": "", "floor": 1e-11, "repeat": 0, "astray": False, "energy": 1e-6}
+    good = GOOD | {"floor": 1e-11, "astray": False, "energy": 1e-6}
     good |= {"h": np.nan, "tol": np.nan, "h_median": 0.05, "violation_early": 1e-15, "violation_late": 1e-15}
     lines = []
     for case, tableau in ((LINKAGE, SUN), (LINKAGE, GAUSS), (FLEXIBLE, SUN)):
@@ -102,12 +100,11 @@ def test_the_answer_turns_with_the_rows(made):
 
 
 def test_a_report_is_short_and_a_quick_one_says_so(made, tmp_path, unsaved):
-    with Output(Call("ablation", True, tmp_path, False, "")) as output:
-        ablation.STUDY.report(output, made, "stamp")
+    found = found_of(ablation, tmp_path, made, quick=True)
     text = (tmp_path / "ablation.md").read_text()
     assert "**Quick run**" in text and "**Quick run**" not in text_of(made)
     assert len(text.split()) < 1000
-    assert json.loads((tmp_path / "ablation.json").read_text())["against"][PROJECTED]["verdicts"]["time"] == "dearer"
+    assert found["against"][PROJECTED]["verdicts"]["time"] == "dearer"
 
 
 def test_findings(made):

@@ -11,6 +11,7 @@ import pytest
 
 from references.driver import user_call
 from studies.bench import collector as bench
+from studies.bench.alarm import TimeLimit
 from studies.bench.collector import Case, NotApplicable, Run, Solver, collect
 from studies.bench.reference_motion import Quintic, ReferenceMotion, check_published, make_reference
 from studies.bench.solvers import CATALOGUE
@@ -173,7 +174,7 @@ def test_a_limit_is_one_whatever_a_foreign_library_makes_of_it(kept, made):
         try:
             with user_call:
                 spend(10.0)
-        except bench.TimeLimit:
+        except TimeLimit:
             if made == "raised":
                 raise RuntimeError("KeyboardInterrupt") from None
         failed = {"status": Status.SOLVER_FAILED, "message": "failed: KeyboardInterrupt"}
