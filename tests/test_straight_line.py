@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numba import njit
 
+from tests.compiled import unit_mass
 from tests.problems import pendulum, unconstrained, worst
 from tests.processes import run_python
 from twoloop import ConstrainedSystem, ConstraintWarning, callback
@@ -314,11 +315,6 @@ def test_redundant_rows_that_stop_holding_end_the_run():
         broken = solve_dae(system(0.1), (0.0, 1.0), [0.0, 0.0], [1.0, 0.0], "DOP853", compiled=True)
     assert held.success
     assert not broken.success and broken.status.name == "ROWS_CONTRADICT"
-
-
-@callback("mass")
-def unit_mass(t, q, p, M):
-    M[0, 0] = 1.0
 
 
 @callback("force")

@@ -116,14 +116,6 @@ def test_fewer_steps_are_refused_than_taken(tol):
     assert stats.n_rejected_error + stats.n_rejected_convergence < 0.4 * stats.n_accepted
 
 
-def test_at_equal_error_it_costs_less_than_the_others():
-    own, error = shared_run("DOP853", 1e-8)
-    for method, tol in (("Gauss12", 1e-5), ("BDF", 1e-8)):
-        other, other_error = shared_run(method, tol)
-        assert error < other_error
-        assert own.stats.n_evaluations < 0.8 * other.stats.n_evaluations
-
-
 # --- constraints
 
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicSpline
 from scipy.linalg import eigh
 
+from references.scipy.beam_reduced import reduced_motion
 from tests.problems import row_errors, slope, violations, worst
 from twoloop import solve_dae
 from twoloop.mechanisms import ancf_beam, moderately_stiff_beam, very_flexible_beam
@@ -46,28 +46,6 @@ def tangent(problem):
     K = np.zeros((problem.q0.size, problem.q0.size))
     elastic_tangent(0.0, problem.q0, problem.v0, problem.system.functions.p, K)
     return K
-
-
-def reduced_motion(problem, t_eval, rtol=1e-8):
-    """q and v at t_eval by DOP853 on the equations without the base's two coordinates, whose motion is known."""
-    system, n = problem.system, problem.q0.size
-    amplitude, frequency = problem.parameters["amplitude"], problem.parameters["angular_frequency"]
-    M = system.mass(0.0, problem.q0)
-    inverse = np.linalg.inv(M[2:, 2:])
-    q, v, Q = np.zeros(n), np.zeros(n), np.zeros(n)
-
-    def rate(t, y):
-        q[0], q[2:] = amplitude * math.sin(frequency * t), y[: n - 2]
-        a0 = -amplitude * frequency**2 * math.sin(frequency * t)
-        Q[:] = 0.0
-        system.functions.force(t, q, v, system.functions.p, Q)
-        return np.concatenate([y[n - 2 :], inverse @ (Q[2:] - M[2:, 0] * a0)])
-
-    y0 = np.concatenate([problem.q0[2:], problem.v0[2:]])
-    y = solve_ivp(rate, (0.0, t_eval[-1]), y0, "DOP853", rtol=rtol, atol=rtol, t_eval=t_eval).y
-    phase, zero = frequency * np.asarray(t_eval), np.zeros(len(t_eval))
-    q = np.vstack([amplitude * np.sin(phase), zero, y[: n - 2]])
-    return q, np.vstack([amplitude * frequency * np.cos(phase), zero, y[n - 2 :]])
 
 
 @given(times, states, states)
@@ -179,7 +157,7 @@ def test_static_tip_deflection_is_that_of_the_locked_beam(modulus, n):
 
 def check_tip_heights(name, problem, end=2.0):
     n = np.count_nonzero(end + 1e-9 > TIMES)
-    q, _ = reduced_motion(problem, TIMES[:n])
+    q, _ = reduced_motion(problem, TIMES[:n], 1e-8)
     assert worst(tip_height(q), TIP_HEIGHTS[name][:n]) < PRINTED
     return q
 
@@ -208,7 +186,7 @@ def test_tip_of_the_very_flexible_beam_that_starts_as_a_whole():
 @pytest.mark.slow
 @pytest.mark.parametrize(("n", "height"), [(8, 0.001), (16, -0.091)])
 def test_four_elements_are_too_few_for_the_very_flexible_beam(n, height):
-    q, _ = reduced_motion(very_flexible_beam(n), [1.0])
+    q, _ = reduced_motion(very_flexible_beam(n), [1.0], 1e-8)
     assert abs(tip_height(q)[0] - height) < 1e-3
     assert abs(tip_height(q)[0] - TIP_HEIGHTS["flexible, node"][4]) > 0.29
 

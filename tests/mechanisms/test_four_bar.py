@@ -8,7 +8,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from references.paper.four_bar_minimal import MinimalFourBar
-from tests.problems import one_angle, row_errors, run, slope, violations, worst
+from tests.problems import row_errors, run, slope, violations, worst
 from twoloop import solve_dae
 from twoloop.mechanisms import four_bar
 
@@ -90,15 +90,6 @@ def test_default_is_marked_as_assumed_and_others_carry_no_reference(default_four
     assert collinear_four_bar.reference is None
     p = default_four_bar.parameters
     assert (p["L1"], p["L2"], p["L3"], p["L"], p["gravity"]) == (1.0, 2.0, 1.5, 3.0, 9.81)
-
-
-def test_reference_is_the_motion_of_an_equation_in_one_angle(default_four_bar):
-    q, v = one_angle((1.0, 2.0, 1.5), 3.0, 0.0, -1)([0.0, 10.0])
-    reference = default_four_bar.reference
-    assert reference.t == 10.0
-    assert worst(q[:, 0], default_four_bar.q0) < 1e-14
-    assert worst(q[:, 1], reference.q) < 2e-12
-    assert worst(v[:, 1], reference.v) < 1e-11
 
 
 # the embedded estimate of RadauIIA5 is of order 3, and its steps continue unextrapolated

@@ -240,14 +240,6 @@ def test_further_columns_come_from_the_study_and_its_case(kept):
     assert abs(got["length"]) < 1e-13
 
 
-@pytest.fixture
-def interruptible():
-    """Ctrl-C raises, also where the tests are a job in the background."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, before)
-
-
 @pytest.mark.usefixtures("interruptible")
 def test_ctrl_c_keeps_finished_rows_and_the_next_start_goes_on(kept):
     calls = []

@@ -19,8 +19,8 @@ from studies.honesty.traps import FORCE
 from studies.table3 import study as table3
 from studies.work_precision import first_calls, rivals
 from studies.work_precision import study as work_precision
+from tests.studies.of_study import found_of
 from tests.studies.test_index import energy
-from tests.studies.test_table3 import found_of
 from tests.studies.test_table3 import rows as rows_of_table3
 from twoloop.mechanisms import bricard, four_bar
 
@@ -342,7 +342,7 @@ def test_no_other_gets_there_is_said_where_one_was_asked(verdict, said):
 
 def test_the_report_on_table_3_has_the_same_sentence(tmp_path):
     made = rows_of_table3().replace({"solver": {"Gauss12": "Taylor"}})
-    ratios = found_of(tmp_path, made)["explicit"]["over"]
+    ratios = found_of(table3, tmp_path, made)["explicit"]["over"]
     text = (tmp_path / "table3.md").read_text()
     assert "\n- `DOP853`, `Taylor` and `Adams` are explicit or PECE: " in text
     assert min(ratios) > 1.0 and "faster at every error" in text and f"is {number(min(ratios))}" in text
