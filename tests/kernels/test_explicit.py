@@ -131,17 +131,6 @@ def test_a_loose_inner_loop_costs_one_iteration_an_evaluation_and_few_digits():
 # --- other methods, other problems
 
 
-def test_it_agrees_with_gauss_to_many_digits():
-    problem, times = FOUR_BAR, np.linspace(0.0, 5.0, 51)
-    own, other = (
-        run(problem, 5.0, method=method, rtol=1e-13, atol=1e-13, t_eval=times) for method in ("DOP853", "Gauss12")
-    )
-    assert worst(own.q, other.q) < 1e-11
-    assert worst(own.v, other.v) < 1e-10
-    assert worst(own.a, other.a) < 1e-9
-    assert worst(own.lam, other.lam) < 1e-9
-
-
 def test_the_very_flexible_beam():
     problem, span = very_flexible_beam(), (0.0, 0.1)
     own = solve_dae(problem.system, span, problem.q0, problem.v0, "DOP853", 1e-8, 1e-8)
