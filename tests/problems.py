@@ -58,21 +58,25 @@ def unconstrained(force, n_q=1, **more):
 # --- pendulum: unit mass on a unit rod, Cartesian coordinates, closed form by elliptic functions
 
 
+PLAIN = {
+    "n_q": 2,
+    "n_c": 1,
+    "mass": lambda t, q: np.eye(2),
+    "force": lambda t, q, v: np.array([0.0, -9.81]),
+    "constraint": lambda t, q: np.array([0.5 * (q[0] * q[0] + q[1] * q[1] - 1.0)]),
+    "jacobian": lambda t, q: q.reshape((1, 2)),
+}
+
+
 def pendulum(*, compile=False, gamma=True, constant_mass=False, **changed):
     """The pendulum, with other functions in place of its own; gamma=False: by differences."""
 
     def right_side(t, q, v):
         return np.array([-(v[0] * v[0] + v[1] * v[1])])
 
-    functions = {
-        "mass": np.eye(2) if constant_mass else lambda t, q: np.eye(2),
-        "force": lambda t, q, v: np.array([0.0, -9.81]),
-        "constraint": lambda t, q: np.array([0.5 * (q[0] * q[0] + q[1] * q[1] - 1.0)]),
-        "jacobian": lambda t, q: q.reshape((1, 2)),
-        "gamma": gamma if callable(gamma) else right_side if gamma else None,
-        "name": "pendulum",
-    }
-    return ConstrainedSystem.from_python(compile=compile, **{"n_q": 2, "n_c": 1, **functions, **changed})
+    functions = PLAIN | ({"mass": np.eye(2)} if constant_mass else {})
+    functions |= {"gamma": gamma if callable(gamma) else right_side if gamma else None, "name": "pendulum"}
+    return ConstrainedSystem.from_python(compile=compile, **functions | changed)
 
 
 def held_twice(factor=1.0, **more):

@@ -5,6 +5,7 @@ import json
 import pytest
 
 from studies.bench.cli import Call
+from studies.bench.render import render
 from studies.bench.solvers import CATALOGUE
 from studies.bench.store import Output
 
@@ -31,6 +32,12 @@ def found_of(study, folder, rows, quick=False):
     with Output(Call(name, quick, folder, True, "")) as output:
         study.STUDY.report(output, rows, "stamp")
     return json.loads((folder / f"{name}.json").read_text())
+
+
+def said(study, rows, quick=False):
+    """The findings of a module's study from rows, and the text of its report."""
+    found = study.findings_of(rows)
+    return found, render(study.STUDY.name, found, {}, stamp="stamp", quick=quick, rows=rows)
 
 
 class QuickRun:
