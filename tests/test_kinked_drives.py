@@ -335,10 +335,17 @@ def test_a_rate_that_has_no_value_where_it_jumps_is_an_impulse(method):
             return 0.5 * np.divide(t - 0.4, np.abs(t - 0.4))
 
     def ends(rate):
-        system = driven(lambda t: 0.5 * abs(t - 0.4), rate, lambda t: 0.0)
-        q0 = START + np.array([0.2, 0.2, 0.0, 0.2, 0.0])
-        v0 = impulse(system, 0.0, q0, np.zeros(5))
-        result = solve_dae(system, (0.0, 0.6), q0, v0, method, 1e-8, 1e-8)
+        system = ConstrainedSystem.from_python(
+            n_q=3,
+            n_c=2,
+            mass=np.eye(3),
+            force=lambda t, q, v: np.array([0.0, 0.0, -9.81]),
+            constraint=lambda t, q: np.array([q[0] - 0.5 * abs(t - 0.4), 0.5 * ((q[1] - q[0]) ** 2 + q[2] ** 2 - 1.0)]),
+            jacobian=lambda t, q: np.array([[1.0, 0.0, 0.0], [q[0] - q[1], q[1] - q[0], q[2]]]),
+            constraint_rate=lambda t, q: np.array([-rate(t), 0.0]),
+            gamma=lambda t, q, v: np.array([0.0, -((v[1] - v[0]) ** 2) - v[2] ** 2]),
+        )
+        result = solve_dae(system, (0.0, 0.6), [0.2, 0.8, -0.8], [-0.5, -0.5, 0.0], method, 1e-8, 1e-8)
         assert result.success and "At t = 0.4 C_t or b jumps" in result.message
         return result.q[:, -1]
 
