@@ -18,7 +18,7 @@ import numpy as np
 import pandas as pd
 
 from studies.bench import headline
-from studies.bench.collector import NOTHING_RUN, Run
+from studies.bench.collector import NOTHING_RUN, Run, Warm
 from studies.bench.runs_by_error import DECADE, LOOSEST, NEAR
 from studies.bench.store import KeptRows, Row
 from studies.bench.tables import TIGHTEST
@@ -35,7 +35,6 @@ COARSER = 10.0**0.5  # of steps where a tolerance changes by a decade
 
 ALWAYS = (headline.DEFAULT, headline.OWN_CODE)  # what a user gets is asked for all accuracies
 
-Built = set[tuple[int, str, float]]  # what has been compiled, as `bench.build` keeps it
 Side = tuple[str, bool]  # a mechanism, and whether the solver is ours
 
 
@@ -59,7 +58,7 @@ class _Progress:
 def collect(
     todo: Sequence[Run],
     kept: KeptRows,
-    make: Callable[[Run, int, Built], Row],
+    make: Callable[[Run, int, Warm], Row],
     all_asked: Callable[[Run], bool] = lambda run: False,
     errors: Sequence[float] = (),
     always_repeated: Callable[[Run], bool] = lambda run: False,
@@ -76,8 +75,8 @@ def collect(
     all_asked : callable, optional
         all_asked(run): the solver is asked for all accuracies on this mechanism, however far behind it is.
     errors : sequence of float, optional
-        The accuracies that are compared, for which solvers that are not far behind the fastest of their side, and
-        those of ALWAYS, are asked between their settings.
+        The accuracies that are compared, for which solvers that are not far behind the fastest of their side, those of
+        ALWAYS, and those that are asked for all are asked between their settings.
     always_repeated : callable, optional
         always_repeated(run): repeated, however far behind, as its time is compared with that of another such run.
 
@@ -86,7 +85,7 @@ def collect(
     DataFrame
         In the order of the runs, the repetitions of a run one below the other.
     """
-    built: Built = set()
+    built: Warm = set()
     progress: dict[tuple[str, str], _Progress] = defaultdict(_Progress)
     reached: dict[Side, list[tuple[float, float]]] = defaultdict(list)  # error and time of the runs on a mechanism
     todo = list(todo)
@@ -106,7 +105,7 @@ def collect(
         by_solver: dict[tuple[str, str], list[Run]] = defaultdict(list)
         for run in todo:
             by_solver[run.case.name, run.solver.name].append(run)
-        more = [run for own in by_solver.values() for run in between(own, kept, reached, errors)]
+        more = [run for own in by_solver.values() for run in between(own, kept, reached, errors, all_asked(own[0]))]
         for run in more:
             first(run)
         todo += more
@@ -124,7 +123,11 @@ def _side(run: Run) -> Side:
 
 
 def between(
-    own: Sequence[Run], kept: KeptRows, reached: Mapping[Side, Sequence[tuple[float, float]]], errors: Sequence[float]
+    own: Sequence[Run],
+    kept: KeptRows,
+    reached: Mapping[Side, Sequence[tuple[float, float]]],
+    errors: Sequence[float],
+    all_asked: bool = False,
 ) -> list[Run]:
     """Runs of one solver on one mechanism where its errors leave more than a decade out, and beyond its ends."""
     rows = {run.value: kept[run.key(0)] for run in own if run.key(0) in kept}
@@ -135,7 +138,7 @@ def between(
     fastest = [
         min((cpu for each, cpu in reached[_side(own[0])] if each <= error[value]), default=np.inf) for value in made
     ]
-    limit = np.inf if own[0].solver.name in ALWAYS else CLOSE
+    limit = np.inf if all_asked or own[0].solver.name in ALWAYS else CLOSE
     close = {value: rows[value]["call_s"] <= limit * least for value, least in zip(made, fastest, strict=True)}
     asked = []
     for loose, tight in itertools.pairwise(made):
