@@ -7,7 +7,7 @@ A study lists `Run`s, `collect` makes the rows, `tables` summarises them. Mechan
 import sys
 import time
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import count
 from typing import Any
@@ -51,7 +51,7 @@ class Case:
         In tables and rows.
     problem : Problem
     t_end : float
-        s; runs start at 0.
+        s, that runs last.
     known : callable or None
         known() -> ReferenceMotion where the motion is known; None: two unlike methods make one.
     n_instants : int
@@ -75,6 +75,8 @@ class Case:
         Class of the problem, "smooth", "stiff", "long", for tables over several cases.
     note : str
         What is assumed.
+    t0 : float
+        s, at which runs start; other than 0 for solvers of ours alone, which take their span from `start`.
     """
 
     name: str
@@ -91,6 +93,7 @@ class Case:
     timed: float = 0.1
     tags: tuple[str, ...] = ()
     note: str = ""
+    t0: float = 0.0
 
     @cached_property
     def instants(self) -> Array:
@@ -122,23 +125,11 @@ class Case:
     @property
     def start(self) -> tuple[ConstrainedSystem, tuple[float, float], Array, Array]:
         """System, time span, q0 and v0, as all solvers take them."""
-        return self.problem.system, (0.0, self.t_end), self.problem.q0, self.problem.v0
+        return self.problem.system, (self.t0, self.t0 + self.t_end), self.problem.q0, self.problem.v0
 
     def steps(self) -> tuple[float, ...]:
         """Fixed steps, s."""
         return self.step_sizes or tuple(self.t_end / n for n in (1e3, 3e3, 1e4, 3e4, 1e5))
-
-
-@dataclass(frozen=True)
-class CaseLater(Case):
-    """A case whose runs start at t0 (s), as ours can."""
-
-    t0: float = 0.0
-
-    @property
-    def start(self) -> tuple[ConstrainedSystem, tuple[float, float], Array, Array]:
-        """As of a case, from t0 on."""
-        return self.problem.system, (self.t0, self.t0 + self.t_end), self.problem.q0, self.problem.v0
 
 
 @dataclass(frozen=True)
@@ -340,8 +331,7 @@ def from_new_start(run: Run) -> Run:
     t0 = next(_COUNT) * LATER * case.t_end
     state = case.motion_at_start(t0)
     problem = replace(case.problem, q0=state.q, v0=state.v)
-    given = {each.name: getattr(case, each.name) for each in fields(Case)} | {"problem": problem}
-    return replace(run, case=CaseLater(**given, t0=t0))
+    return replace(run, case=replace(case, problem=problem, t0=t0))
 
 
 def _may_hold_a_build(run: Run, status: str, spent: float) -> bool:

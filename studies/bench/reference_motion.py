@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,9 @@ from twoloop.mechanisms import Problem
 TIGHT = 1e-13  # tolerance of both runs of the smooth pair
 STIFF = 1e-11  # of the pair for stiff problems, which IDA does not follow below
 REFINED = 4  # parts of a step of the second run, at whose ends the first one is stored
+
+_explicit = partial(solve_index1, method="DOP853", stabilisation="projection")
+_own_explicit = partial(solve_dae, method="DOP853")
 
 
 @dataclass(frozen=True)
@@ -87,14 +91,6 @@ def make_reference(problem: Problem, t_end: float, time_limit: float | None = No
         floor = max(float(differ), motion.uncertainty(), 1e-15)
         return ReferenceMotion(motion, floor, f"{name}, tolerances {tolerance:.0e}, which differ by {differ:.1e}")
     raise StudyError(f"no reference for {problem.name!r}: {' / '.join(said)}")
-
-
-def _explicit(*run: Any, **options: Any) -> Result:
-    return solve_index1(*run, "DOP853", stabilisation="projection", **options)
-
-
-def _own_explicit(*run: Any, **options: Any) -> Result:
-    return solve_dae(*run, "DOP853", **options)
 
 
 def _ida(*run: Any, **options: Any) -> Result:
