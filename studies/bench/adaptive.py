@@ -62,6 +62,7 @@ def collect(
     all_asked: Callable[[Run], bool] = lambda run: False,
     errors: Sequence[float] = (),
     always_repeated: Callable[[Run], bool] = lambda run: False,
+    fine: Callable[[Run], bool] = lambda run: False,
 ) -> pd.DataFrame:
     """Rows of all runs that are of use, the repetitions interleaved.
 
@@ -75,10 +76,12 @@ def collect(
     all_asked : callable, optional
         all_asked(run): the solver is asked for all accuracies on this mechanism, however far behind it is.
     errors : sequence of float, optional
-        The accuracies that are compared, for which solvers that are not far behind the fastest of their side, those of
-        ALWAYS, and those that are asked for all are asked between their settings.
+        The accuracies that are compared, for which solvers that are not far behind the fastest of their side, and
+        those of ALWAYS, are asked between their settings.
     always_repeated : callable, optional
         always_repeated(run): repeated, however far behind, as its time is compared with that of another such run.
+    fine : callable, optional
+        fine(run): asked between its settings, however far behind.
 
     Returns
     -------
@@ -105,7 +108,7 @@ def collect(
         by_solver: dict[tuple[str, str], list[Run]] = defaultdict(list)
         for run in todo:
             by_solver[run.case.name, run.solver.name].append(run)
-        more = [run for own in by_solver.values() for run in between(own, kept, reached, errors, all_asked(own[0]))]
+        more = [run for own in by_solver.values() for run in between(own, kept, reached, errors, fine(own[0]))]
         for run in more:
             first(run)
         todo += more
@@ -127,7 +130,7 @@ def between(
     kept: KeptRows,
     reached: Mapping[Side, Sequence[tuple[float, float]]],
     errors: Sequence[float],
-    all_asked: bool = False,
+    fine: bool = False,
 ) -> list[Run]:
     """Runs of one solver on one mechanism where its errors leave more than a decade out, and beyond its ends."""
     rows = {run.value: kept[run.key(0)] for run in own if run.key(0) in kept}
@@ -138,7 +141,7 @@ def between(
     fastest = [
         min((cpu for each, cpu in reached[_side(own[0])] if each <= error[value]), default=np.inf) for value in made
     ]
-    limit = np.inf if all_asked or own[0].solver.name in ALWAYS else CLOSE
+    limit = np.inf if fine or own[0].solver.name in ALWAYS else CLOSE
     close = {value: rows[value]["call_s"] <= limit * least for value, least in zip(made, fastest, strict=True)}
     asked = []
     for loose, tight in itertools.pairwise(made):

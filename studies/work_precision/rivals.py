@@ -117,7 +117,8 @@ def runs(quick: bool) -> list[Run]:
 def collect(todo: Sequence[Run], kept: KeptRows) -> pd.DataFrame:
     """Rows of all runs that are of use; on the four-bars however far behind a solver is."""
     quick = all(run.repeats == 1 for run in todo)
-    return adaptive.collect(todo, kept, row_at_end, lambda run: run.case.name in GEOMETRIES, () if quick else DECADES)
+    errors, priced = () if quick else DECADES, lambda run: run.case.name == HEADLINE
+    return adaptive.collect(todo, kept, row_at_end, lambda run: run.case.name in GEOMETRIES, errors, fine=priced)
 
 
 def row_at_end(run: Run, repeat: int, built: Warm) -> Row:
