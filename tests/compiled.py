@@ -13,6 +13,11 @@ def unit_mass(t, q, p, M):
         M[k, k] = 1.0
 
 
+@callback("mass")
+def heavy(t, q, p, M):
+    M[0, 0] = M[1, 1] = p[0]
+
+
 @callback("force")
 def weight(t, q, v, p, Q):
     Q[1] = -9.81

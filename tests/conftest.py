@@ -1,5 +1,6 @@
 """Hypothesis without deadlines (the first call may compile) and always with the same examples; shared problems."""
 
+import signal
 from importlib.util import find_spec
 
 import pytest
@@ -27,3 +28,11 @@ def default_four_bar():
 @pytest.fixture(scope="session")
 def collinear_four_bar():
     return LINKAGES["collinear"]
+
+
+@pytest.fixture
+def interruptible():
+    """Python's own handler of Ctrl-C, without which shells start jobs in the background."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)

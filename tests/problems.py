@@ -58,21 +58,36 @@ def unconstrained(force, n_q=1, **more):
 # --- pendulum: unit mass on a unit rod, Cartesian coordinates, closed form by elliptic functions
 
 
+PLAIN = {
+    "n_q": 2,
+    "n_c": 1,
+    "mass": lambda t, q: np.eye(2),
+    "force": lambda t, q, v: np.array([0.0, -9.81]),
+    "constraint": lambda t, q: np.array([0.5 * (q[0] * q[0] + q[1] * q[1] - 1.0)]),
+    "jacobian": lambda t, q: q.reshape((1, 2)),
+}
+
+
 def pendulum(*, compile=False, gamma=True, constant_mass=False, **changed):
     """The pendulum, with other functions in place of its own; gamma=False: by differences."""
 
     def right_side(t, q, v):
         return np.array([-(v[0] * v[0] + v[1] * v[1])])
 
+    functions = PLAIN | ({"mass": np.eye(2)} if constant_mass else {})
+    functions |= {"gamma": gamma if callable(gamma) else right_side if gamma else None, "name": "pendulum"}
+    return ConstrainedSystem.from_python(compile=compile, **functions | changed)
+
+
+def held_twice(factor=1.0, **more):
+    """The pendulum with its row once more, multiplied by a factor."""
+    scale = np.array([1.0, factor])
     functions = {
-        "mass": np.eye(2) if constant_mass else lambda t, q: np.eye(2),
-        "force": lambda t, q, v: np.array([0.0, -9.81]),
-        "constraint": lambda t, q: np.array([0.5 * (q[0] * q[0] + q[1] * q[1] - 1.0)]),
-        "jacobian": lambda t, q: q.reshape((1, 2)),
-        "gamma": gamma if callable(gamma) else right_side if gamma else None,
-        "name": "pendulum",
+        "constraint": lambda t, q: scale * 0.5 * (q @ q - 1.0),
+        "jacobian": lambda t, q: np.outer(scale, q),
+        "gamma": lambda t, q, v: -scale * (v @ v),
     }
-    return ConstrainedSystem.from_python(compile=compile, **{"n_q": 2, "n_c": 1, **functions, **changed})
+    return pendulum(**{"n_c": 2, "constant_mass": True, **functions, **more})
 
 
 def kit_of(system):
@@ -324,65 +339,9 @@ def oblique_to_point(result):
 
 
 # --- the four-bar linkage: the default one, and one whose bars 1 and 2 come into line, where theta_3 alone does not
-# determine the rest; by one angle
+# determine the rest
 
 LINKAGES = {"default": four_bar(), "collinear": four_bar(lengths=(0.8, 1.2, 1.0), ground=2.0)}
-
-
-def one_angle(lengths, ground, theta3, branch):
-    """The linkage released from rest, by Lagrange's equation for theta_2 alone: a function of the times.
-
-    Valid where theta_2 determines the others, as it does in the default linkage. Nothing is shared with twoloop.
-    """
-    L1, L2, L3 = lengths
-    masses = np.array(lengths)
-
-    def angles(th2, side):
-        rest = ground - L2 * np.exp(1j * th2)  # bars 1 and 3 together
-        corner = np.arccos((L1**2 + abs(rest) ** 2 - L3**2) / (2.0 * L1 * abs(rest)))
-        th1 = np.angle(rest) + side * corner
-        return np.array([th1, th2, np.angle(rest - L1 * np.exp(1j * th1))])
-
-    joint = ground - L3 * np.exp(1j * theta3)
-    d = abs(joint)
-    th1 = np.angle(joint) + branch * np.arccos((L1**2 + d**2 - L2**2) / (2.0 * L1 * d))
-    th2 = np.angle(joint - L1 * np.exp(1j * th1))
-    side = min((1, -1), key=lambda s: abs(np.exp(1j * angles(th2, s)[0]) - np.exp(1j * th1)))
-
-    def kinematics(th2):
-        """Angles, d angles / d th2 and the second derivative, by differentiating the closure twice."""
-        e = np.array(lengths) * np.exp(1j * angles(th2, side))
-        closure = np.array([[-e[0].imag, -e[2].imag], [e[0].real, e[2].real]])
-        w1, w3 = np.linalg.solve(closure, [e[1].imag, -e[1].real])
-        w = np.array([w1, 1.0, w3])
-        left = (e * w**2).sum()
-        b1, b3 = np.linalg.solve(closure, [left.real, left.imag])
-        return e, w, np.array([b1, 0.0, b3])
-
-    def centres(ends):
-        return np.cumsum(ends) - 0.5 * ends
-
-    def rate(t, y):
-        e, w, b = kinematics(y[0])
-        u = centres(1j * e * w)
-        bias = centres(1j * e * b - e * w**2)
-        inertias = masses * np.array(lengths) ** 2 / 12.0
-        inertia = masses @ (abs(u) ** 2) + inertias @ w**2
-        coupling = masses @ (u.conj() * bias).real + inertias @ (w * b)
-        return [y[1], -(coupling * y[1] ** 2 + G * (masses @ u.imag)) / inertia]
-
-    def state(t):
-        end = float(np.max(t))
-        y = solve_ivp(rate, (0.0, end), [th2, 0.0], "DOP853", **TIGHT).sol(np.atleast_1d(t))
-        q, v = np.empty((9, y.shape[1])), np.empty((9, y.shape[1]))
-        for k, (angle, speed) in enumerate(y.T):
-            e, w, _ = kinematics(angle)
-            x, u = centres(e), centres(1j * e * w) * speed
-            q[0::3, k], q[1::3, k], q[2::3, k] = x.real, x.imag, angles(angle, side)
-            v[0::3, k], v[1::3, k], v[2::3, k] = u.real, u.imag, w * speed
-        return q, v
-
-    return state
 
 
 # --- what every test of a run wants to know

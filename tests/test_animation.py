@@ -2,15 +2,14 @@
 
 import json
 import re
-import shutil
 import stat
-import subprocess
 import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from tests.processes import run_node
 from twoloop import solve_dae
 from twoloop.mechanisms import pendulum, spatial_slider_crank
 from twoloop.result.animation import projected
@@ -71,13 +70,8 @@ def scene_of(path):
 
 
 def played(path):
-    node = shutil.which("node")
-    if node is None:
-        pytest.skip("node is not installed")
     script = re.search(r"<script>(.*)</script>", path.read_text(encoding="utf-8"), re.DOTALL)[1]
-    done = subprocess.run([node, "-"], input=f"{DOCUMENT}{script}{PLAYED}", capture_output=True, text=True, timeout=60)
-    assert done.returncode == 0, done.stderr
-    return json.loads(done.stdout)
+    return run_node(f"{DOCUMENT}{script}{PLAYED}")
 
 
 def test_the_page_of_a_planar_mechanism(swung, tmp_path):

@@ -5,6 +5,7 @@ from contextlib import nullcontext
 import numpy as np
 import pytest
 
+from tests.compiled import heavy
 from tests.problems import pendulum
 from tests.test_bounds import FAR
 from twoloop import ConstrainedSystem, callback, consistent_state, mechanisms, solve_dae
@@ -72,14 +73,9 @@ def as_far_as_it_is_told(t, q, v, p, Q):
     Q[int(p[1] * FAR)] = -9.81 * p[0]
 
 
-@callback("mass")
-def of_parameter(t, q, p, M):
-    M[0, 0] = M[1, 1] = p[0]
-
-
 @pytest.mark.parametrize("wrong", [2.0, 0.7])
 def test_bounds_are_looked_at_where_parameters_are_places(wrong):
-    given = pendulum(compile=True).given | {"force": as_far_as_it_is_told, "mass": of_parameter}
+    given = pendulum(compile=True).given | {"force": as_far_as_it_is_told, "mass": heavy}
     system = ConstrainedSystem(n_q=2, n_c=1, parameters=[1.3, 0.1 / FAR], **given)
     q0, v0 = [0.6, -0.8], [0.0, 0.0]
     for _ in range(2):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import twoloop
-from tests.problems import START, pendulum_state, worst
+from tests.problems import PLAIN, START, pendulum_state, worst
 from twoloop import ConstrainedSystem, exported, mechanisms, solve_dae
 
 
@@ -30,15 +30,9 @@ def test_what_a_problem_and_a_result_have(make):
 
 def test_arguments_that_are_left_out_are_as_documented():
     """With all of them given, a run is that of the few that are needed."""
-    functions = {
-        "mass": lambda t, q: np.eye(2),
-        "force": lambda t, q, v: np.array([0.0, -9.81]),
-        "constraint": lambda t, q: np.array([0.5 * (q @ q - 1.0)]),
-        "jacobian": lambda t, q: q[None, :],
-    }
-    few = ConstrainedSystem.from_python(n_q=2, n_c=1, **functions)
+    few = ConstrainedSystem.from_python(**PLAIN)
     more = {"constraint_rate": None, "gamma": None, "compile": False, "name": "system"}
-    system = ConstrainedSystem.from_python(n_q=2, n_c=1, **functions, **more)
+    system = ConstrainedSystem.from_python(**PLAIN, **more)
     options = {"t_eval": None, "first_step": None, "max_step": np.inf, "max_steps": None, "dense_output": False}
     options |= {"method": "auto", "rtol": 1e-8, "atol": 1e-8, "events": None, "progress": None}
     result = solve_dae(system, (0.0, 2.0), *START, **options)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.compiled import circle, radius
+from tests.compiled import circle, heavy, radius
 from tests.problems import pendulum
 from twoloop import ConstrainedSystem, callback, solve_dae
 from twoloop.kernels.compile.callbacks import KINDS, OPTIONAL
@@ -47,11 +47,6 @@ def test_callbacks_may_be_typed_at_a_prompt(how):
     done = subprocess.run(command, input=given, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
     assert done.stdout.strip() == "True"
-
-
-@callback("mass")
-def heavy(t, q, p, M):
-    M[0, 0] = M[1, 1] = p[0]
 
 
 @callback("force")

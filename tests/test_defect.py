@@ -116,8 +116,10 @@ def test_auto_goes_on_where_a_series_is_not_finite(name, compiled):
         assert np.abs(np.sum(middle.q**2, axis=0) - 1.0).max() < 1e-12
 
 
-def test_a_series_that_is_not_finite_says_so():
-    result = solve_dae(pendulum(drag), (0.0, 1.0), *start_of((0.7, 0.0)), method="Taylor", rtol=1e-8, atol=1e-8)
+@pytest.mark.parametrize("compiled", [False, True])
+def test_a_series_that_is_not_finite_says_so(compiled):
+    start = pendulum(drag), (0.0, 1.0), *start_of((0.7, 0.0))
+    result = solve_dae(*start, "Taylor", rtol=1e-8, atol=1e-8, compiled=compiled)
     assert result.status.name == "NOT_FINITE"
     assert "no derivatives" in result.message
     assert "DOP853" in result.message

@@ -138,31 +138,28 @@ def swung():
     return swing(1.5, dense_output=True).sol
 
 
-@pytest.mark.parametrize("method", ["SunRadau5", "Gauss12", "RadauIIA5"])
+OTHERS = ("redundant slider-crank", "massless coordinate", "knife edge", "driven crank", "planet")
+ACROSS = "A02, N = 1"  # a singular position
+
+
 @pytest.mark.parametrize(
-    "name", ["redundant slider-crank", "massless coordinate", "knife edge", "driven crank", "planet"]
+    ("name", "method"),
+    [
+        *((name, method) for name in OTHERS for method in ("SunRadau5", "Gauss12", "RadauIIA5")),
+        *((ACROSS, method) for method in ("DOP853", "Gauss12")),
+    ],
 )
 def test_other_mechanisms(name, method):
-    """Redundant rows, a singular mass, non-holonomic rows, a drive, and no constraints at all."""
-    m = mechanism(name)
+    """Redundant rows, a singular mass, non-holonomic rows, a drive, no constraints at all; rank lost on the way."""
+    m, end = mechanism(name), 2.0 if name == ACROSS else 1.0
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of redundant rows
-        result = solve_dae(m.system(), (0.0, 1.0), *m.start, method, dense_output=True, check_derivatives=False)
-    at_steps = max(worst(result.q[:, k], m.state(result.t[k])[0]) for k in range(1, result.t.size))
-    t = np.linspace(0.0, 1.0, 41)
+        result = solve_dae(m.system(), (0.0, end), *m.start, method, dense_output=True, check_derivatives=False)
+    t = np.linspace(0.0, end, 41)
     state = result.sol(t)
-    assert max(worst(state.q[:, k], m.state(t[k])[0]) for k in range(t.size)) < 2.0 * at_steps + 1e-12
-    assert force_residual(m.system(), state) < 4.0 * force_residual(m.system(), result) + 1e-11
-
-
-@pytest.mark.parametrize("method", ["DOP853", "Gauss12"])
-def test_across_a_singular_position(method):
-    m = mechanism("A02, N = 1")
-    result = solve_dae(m.system(), (0.0, 2.0), *m.start, method, check_derivatives=False, dense_output=True)
-    at_steps = max(worst(result.q[:, k], m.state(result.t[k])[0]) for k in range(1, result.t.size))
-    t = np.linspace(0.0, 2.0, 60)
-    state = result.sol(t)
-    assert max(worst(state.q[:, k], m.state(t[k])[0]) for k in range(t.size)) < 2.0 * at_steps
+    assert worst(state.q, m.states(t)[0]) < 2.0 * worst(result.q, m.states(result.t)[0]) + 1e-12
+    if name != ACROSS:
+        assert force_residual(m.system(), state) < 4.0 * force_residual(m.system(), result) + 1e-11
 
 
 def test_vibrations_that_are_stepped_over_leave_no_noise():

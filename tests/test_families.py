@@ -6,6 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 
+from tests.compiled import centripetal, heavy, radius
 from twoloop import ConstrainedSystem, callback, solve_dae
 from twoloop.generate.families import _alone, family_of
 from twoloop.generate.series_code import compiled_series
@@ -29,11 +30,6 @@ MECHANISMS = [four_bar, andrews, driven_crank, redundant_slider_crank, spatial_f
 SPAN = (0.0, 1.0)
 
 
-@callback("mass")
-def unit_mass(t, q, p, M):
-    M[0, 0] = M[1, 1] = p[0]
-
-
 @callback("force")
 def spring(t, q, v, p, Q):
     Q[0] = -p[1] * q[0] - p[2] * v[0]
@@ -43,16 +39,6 @@ def spring(t, q, v, p, Q):
 @callback("constraint")
 def circle(t, q, p, C):
     C[0] = 0.5 * (q[0] ** 2 + q[1] ** 2 - p[3] ** 2)
-
-
-@callback("jacobian")
-def circle_by_q(t, q, p, Cq):
-    Cq[0, 0], Cq[0, 1] = q[0], q[1]
-
-
-@callback("gamma")
-def circle_gamma(t, q, v, p, Qd):
-    Qd[0] = -(v[0] ** 2) - v[1] ** 2
 
 
 @callback("force")
@@ -72,7 +58,7 @@ def by_threshold(t, q, v, p, Q):
 
 def pendulum(parameters, force=spring):
     return ConstrainedSystem(
-        n_q=2, n_c=1, mass=unit_mass, force=force, constraint=circle, jacobian=circle_by_q, gamma=circle_gamma,
+        n_q=2, n_c=1, mass=heavy, force=force, constraint=circle, jacobian=radius, gamma=centripetal,
         parameters=parameters,
     )  # fmt: skip
 

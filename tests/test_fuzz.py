@@ -16,7 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import twoloop
-from tests.problems import pendulum
+from tests.problems import PLAIN, pendulum
 from twoloop import ConstrainedSystem, Joint, consistent_state, mechanisms, solve_dae
 from twoloop.kernels.compile.callbacks import KINDS
 from twoloop.methods import tableaux
@@ -50,14 +50,6 @@ SORTS = {
     "class": st.sampled_from([int, ConstrainedSystem, twoloop.BDF]),
     "function of the wrong signature": st.just(lambda: 0.0),
     "object": st.builds(object),
-}
-PLAIN = {
-    "n_q": 2,
-    "n_c": 1,
-    "mass": lambda t, q: np.eye(2),
-    "force": lambda t, q, v: np.array([0.0, -9.81]),
-    "constraint": lambda t, q: np.array([0.5 * (q @ q - 1.0)]),
-    "jacobian": lambda t, q: q[None, :],
 }
 BEAM = {"youngs_modulus": 2e11, "amplitude": 0.1, "angular_frequency": 1.0}
 BOUNDS = {"max_steps": 5, "time_limit": 0.05}  # of the runs

@@ -1,7 +1,5 @@
 """t_eval: interpolated where steps adapt, landed on where they are fixed or the paper's."""
 
-import tracemalloc
-
 import numpy as np
 import pytest
 
@@ -102,21 +100,3 @@ def test_a_failed_run_has_the_times_that_it_reached(default_four_bar, method):
     assert result.status == Status.MAX_STEPS
     assert 1 < result.t.size < TIMES.size
     assert (result.t == TIMES[: np.searchsorted(TIMES, result.h.sum(), side="right")]).all()
-
-
-def test_the_states_of_all_steps_are_not_kept(default_four_bar):
-    """Memory goes with the output times and a chunk of steps, not with the steps of the run."""
-
-    def peak(**options):
-        tracemalloc.start()
-        result = run(default_four_bar, 40.0, method="Gauss4", rtol=1e-9, atol=1e-9, **options)
-        try:
-            return result.h.size, tracemalloc.get_traced_memory()[1]
-        finally:
-            tracemalloc.stop()
-
-    run(default_four_bar, 0.1, method="Gauss4", dense_output=True)  # compiled by now
-    n_steps, few = peak(t_eval=[0.0, 40.0])
-    _, all_of_them = peak(dense_output=True)
-    assert n_steps > 5000
-    assert few < 0.4 * all_of_them

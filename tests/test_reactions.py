@@ -9,7 +9,7 @@ import pytest
 
 import twoloop
 from tests.compiled import PENDULUM
-from tests.problems import pendulum as bare_pendulum
+from tests.problems import held_twice
 from twoloop import ConstrainedSystem, ConstraintWarning, Joint, solve_dae
 from twoloop.mechanisms import (
     andrews,
@@ -285,16 +285,6 @@ def test_a_redundant_row_is_said_to_leave_single_joints_open():
     assert not changed["pin crank-ground"]
 
 
-def test_rows_that_depend_on_one_another_within_a_joint_leave_it_unique():
-    with pytest.warns(ConstraintWarning):
-        result = solve_dae(hanging_twice((0, 1)), (0.0, 0.1), *BOB)
-    link = result.reactions("link")
-    assert result.rank == 1 and link.unique
-    assert np.abs(link.force - [[0.0], [9.81]]).max() < 1e-12
-    with pytest.warns(ConstraintWarning):
-        assert not solve_dae(hanging_twice((0,)), (0.0, 0.1), *BOB).reactions("link").unique
-
-
 # --- signs, points, names
 
 
@@ -306,24 +296,15 @@ def hanging():
     return ConstrainedSystem(**PENDULUM, joints=[Joint("link", (0,), (0, 1))])
 
 
-def hanging_twice(rows, **more):
-    """The same, the length of the link said twice, and the link of some of these rows."""
-    return bare_pendulum(
-        n_c=2,
-        constant_mass=True,
-        constraint=lambda t, q: np.repeat(0.5 * (q @ q - 1.0), 2),
-        jacobian=lambda t, q: np.stack([q, q]),
-        gamma=False,
-        joints=[Joint("link", rows, (0, 1), **more)],
-    )
-
-
+@pytest.mark.parametrize("equations", [None, np.array([[1.0, 0.0], [1.0, 2.0]])], ids=["rows", "sums of rows"])
 @pytest.mark.parametrize(("rows", "unique"), [((0,), False), ((1,), False), ((0, 1), True)])
-def test_what_is_unique_among_sums_of_rows(rows, unique):
-    sums_of_rows = np.array([[1.0, 0.0], [1.0, 2.0]])
+def test_rows_that_depend_on_one_another_leave_what_has_all_of_them_unique(rows, unique, equations):
+    """The length of the link is said twice."""
+    system = held_twice(joints=[Joint("link", rows, (0, 1), equations=equations)])
     with pytest.warns(ConstraintWarning):
-        link = solve_dae(hanging_twice(rows, equations=sums_of_rows), (0.0, 0.1), *BOB).reactions("link")
-    assert link.unique == unique
+        result = solve_dae(system, (0.0, 0.1), *BOB)
+    link = result.reactions("link")
+    assert result.rank == 1 and link.unique == unique
     if unique:
         assert np.abs(link.force - [[0.0], [9.81]]).max() < 1e-12
 

@@ -13,6 +13,7 @@ from twoloop import ConstrainedSystem, Status, callback, consistent_state, solve
 from twoloop.mechanisms import four_bar
 from twoloop.run.interrupts import CALLS_A_USER
 
+pytestmark = pytest.mark.usefixtures("interruptible")
 START = ([0.0, -1.0], [3.0, 0.0])
 OTHER = [1.0, 2.0, 1.5, 2.9]  # lengths of the default four-bar, its ground a little shorter
 
@@ -126,14 +127,6 @@ def test_an_event_before_the_first_output_ends_the_run(options):
 
 
 # --- Ctrl-C
-
-
-@pytest.fixture(autouse=True)
-def ctrl_c_raises():
-    """Python's own handler of Ctrl-C, without which shells start jobs in the background."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, before)
 
 
 class Counted:

@@ -107,12 +107,6 @@ def test_more_output_than_a_buffer_holds(default_four_bar):
 # --- step sizes
 
 
-def test_step_sizes_sum_to_the_span(default_four_bar):
-    result = run(default_four_bar)
-    assert result.h.sum() == pytest.approx(10.0, abs=1e-12)
-    assert (result.h > 0.0).all()
-
-
 def test_first_step_is_tried_first():
     assert swing(first_step=1e-3).h[0] == 1e-3
     # of a run of which it is less than a hundredth, as no longer step is tried
@@ -253,16 +247,17 @@ def test_evaluations_are_calls_of_the_force():
 # --- functions in plain Python
 
 
-def test_a_closure_that_changes_is_followed():
+@pytest.mark.parametrize("method", ["auto", "DOP853", "Taylor"])
+def test_a_closure_that_changes_is_followed(method):
     gravity = [9.81]
     system = pendulum(force=lambda t, q, v: np.array([0.0, -gravity[0]]))
-    heavy = swing(system=system)
+    heavy = swing(system=system, method=method)
     gravity[0] = 1.0
-    light = swing(system=system)
+    light = swing(system=system, method=method)
     assert worst(heavy.q[:, -1], pendulum_state(2.0)[0]) < 1e-6
     assert worst(light.q[:, -1], heavy.q[:, -1]) > 0.1
     gravity[0] = 9.81
-    assert (swing(system=system).q == heavy.q).all()
+    assert (swing(system=system, method=method).q == heavy.q).all()
 
 
 def test_functions_get_copies_that_they_may_spoil():

@@ -1,29 +1,19 @@
 """Code made for the equations of one mechanism: against the general inner loop, dense linear algebra and references."""
 
-import ctypes
 import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from numba import njit
 
+from tests.compiled import unit_mass
 from tests.problems import pendulum, unconstrained, worst
 from tests.processes import run_python
 from twoloop import ConstrainedSystem, ConstraintWarning, callback
 from twoloop.generate import stage_code, straight_code
-from twoloop.generate.choices import Choice
-from twoloop.generate.coefficients import Coefficients
-from twoloop.generate.derivative import Derivative
-from twoloop.generate.llvm_text import Module
-from twoloop.generate.llvm_trigonometry import LARGEST_ANGLE
-from twoloop.generate.straight_code import own_code, write_function
-from twoloop.generate.straight_line import Factors, Outputs, Solution, StraightLine
-from twoloop.generate.tracing import Form, Graph
+from twoloop.generate.straight_code import own_code
 from twoloop.kernels.compile import caches
-from twoloop.kernels.compile.own_functions import OwnFunctions, object_code
 from twoloop.kernels.data.common import BY_GENERAL, DONE
 from twoloop.kernels.evaluation import calls
 from twoloop.mechanisms import (
@@ -78,34 +68,6 @@ def run_from(system, q0, v0, compiled):
         own = own_code(system, 0.0, q0)
         plan = replace(plan, inner=own.shared.inner, own=(own.shared.functions,), numbers=own.numbers)
     return Run(system, plan, 0.0, q0, v0, 1e-8, np.full(system.n_q, 1e-8), None)
-
-
-def read_by(graph, outputs):
-    """The numbers that code for some outputs reads."""
-    numbers = Coefficients()
-    list(numbers.structure(graph, outputs.forms))
-    return numbers
-
-
-def compute(graph, outputs, inputs):
-    """What code for some outputs gives: whether its conditions hold, and the arrays."""
-    numbers = read_by(graph, outputs)
-    filled = tuple(np.full(len(forms), np.nan) for forms in outputs.arrays.values())
-    return machine_code_of(graph, outputs, numbers)(*inputs, numbers.values, *filled), filled
-
-
-def machine_code_of(graph, outputs, numbers):
-    """What Python calls, on arrays, for a function of LLVM."""
-    module, n = Module(), len(graph.sizes) + 1 + len(outputs.arrays)
-    write_function(module, "function", ("i1", ["double*"] * n), graph, outputs, numbers)
-    made = OwnFunctions(["function"], object_code(str(module)))
-    function = ctypes.CFUNCTYPE(ctypes.c_bool, *[ctypes.c_void_p] * n)(made.addresses["function"])
-
-    def call(*given, made=made):
-        arrays = [np.atleast_1d(each) for each in given]
-        return function(*(each.ctypes.data for each in arrays))
-
-    return call
 
 
 @ending_at_a_reference
@@ -166,49 +128,6 @@ def test_a_run_ends_at_its_reference_by_as_many_evaluations(make):
         assert np.abs(problem.system.constraint(t, q)).max(initial=0.0) < 1e-12
 
 
-@pytest.mark.parametrize("make", [four_bar, andrews, heavy_top, spatial_four_bar, rolling_disc])
-def test_factors_that_are_kept_solve_for_any_right_hand_side(make):
-    problem, rng = make(), np.random.default_rng(5)
-    system = problem.system
-    equations = StraightLine(system, Choice.at(system, 0.0, problem.q0))
-    solution = Solution(equations)
-    holds, (kept,) = compute(equations.graph, solution.kept, (0.0, problem.q0, problem.v0))
-    M, G = system.mass(0.0, problem.q0), system.rows(0.0, problem.q0)
-    r, c = rng.standard_normal(len(M)), rng.standard_normal(len(G))
-    _, (a, lam) = compute(solution.graph, solution.solved, (r, c, kept))
-    assert holds
-    assert np.abs(M @ a + G.T @ lam - r).max() < 1e-10 * np.abs(G.T @ lam).max()
-    assert np.abs(G @ a - c).max() < 1e-10
-
-
-@settings(max_examples=30, deadline=None)
-@given(st.integers(1, 7), st.integers(0, 4), st.integers(0, 10**6))
-def test_elimination_solves_what_dense_linear_algebra_solves(n, m, seed):
-    rng = np.random.default_rng(seed)
-    root = rng.standard_normal((n, n)) * (rng.random((n, n)) < 0.4)
-    matrix = np.zeros((n + m, n + m))
-    matrix[:n, :n] = root @ root.T + np.diag(1.0 + rng.random(n))
-    G = np.eye(m, n)[:, rng.permutation(n)] * 2.0 + 0.3 * rng.standard_normal((m, n)) * (rng.random((m, n)) < 0.5)
-    m = min(m, n)
-    matrix, G = matrix[: n + m, : n + m], G[:m]
-    matrix[n:, :n], matrix[:n, n:] = G, G.T
-    graph = Graph()
-    given = graph.inputs(matrix.size, False)
-    right = graph.inputs(n + m, False)
-    forms = {
-        (i, j): given[i * (n + m) + j] for i in range(n + m) for j in range(n + m) if matrix[i, j] != 0.0 or i == j < n
-    }
-    factors = Factors(forms, n + m, n)
-    b = rng.standard_normal(n + m)
-    known = dict(enumerate(np.concatenate([matrix.ravel(), b]).tolist()))
-    x = [evaluated(form, known) for form in factors.solve(right)]
-    assert np.allclose(x, np.linalg.solve(matrix, b), rtol=1e-6, atol=1e-9)
-    assert len(factors.conditions) == m
-    shares = [evaluated(one, known) / evaluated(other, known) for one, other in factors.conditions]
-    assert all(0.0 < share < 1.0 + 1e-9 for share in shares)
-    assert all(evaluated(form, known) > 0.0 for form in factors.positive)
-
-
 @pytest.mark.parametrize("method", ["DOP853", "Adams", "Taylor"])
 def test_a_mass_that_is_not_definite_any_more_is_said_as_without(method):
     """A mass that falls to nothing at t = 1, without a force."""
@@ -220,45 +139,6 @@ def test_a_mass_that_is_not_definite_any_more_is_said_as_without(method):
     general, own = run(False), run(True)
     assert not own.success and own.status is general.status
     assert own.t[-1] == pytest.approx(general.t[-1], abs=1e-3)
-
-
-def evaluated(form, known):
-    """The number that a form of sums, products and quotients is."""
-    for i in Outputs({"": [form]}, []).quantities(form.graph):
-        kind, first, second = form.graph.operations[i]
-        x = first.constant + sum(c * known[j] for j, c in first.terms.items())
-        y = 1.0 if second is None else second.constant + sum(c * known[j] for j, c in second.terms.items())
-        known[i] = 1.0 / x if kind == 1 else x * y
-    return form.constant + sum(c * known[j] for j, c in form.terms.items())
-
-
-@pytest.mark.parametrize("size", [1.0, 1e3, 0.9 * LARGEST_ANGLE])
-def test_sine_and_cosine_are_right_to_rounding(size):
-    graph = Graph()
-    (angle,) = graph.inputs(1, False)
-    outputs = Outputs({"of": [angle.sine(), angle.cosine()]}, [])
-    numbers = read_by(graph, outputs)
-    function, values = machine_code_of(graph, outputs, numbers), numbers.values
-    rng = np.random.default_rng(6)
-    angles = np.concatenate([size * rng.uniform(-1.0, 1.0, 20_000), np.arange(-50, 51) * np.pi / 4.0])
-    found = np.zeros((angles.size, 2))
-    for angle, pair in zip(angles, found, strict=True):
-        function(np.array([angle]), values, pair)
-    sines, cosines = found.T
-    # of the C library: those of older NumPy are off by a rounding more
-    assert worst(sines, np.array([math.sin(x) for x in angles])) < 2.3e-16
-    assert worst(cosines, np.array([math.cos(x) for x in angles])) < 2.3e-16
-
-
-def test_beyond_the_angles_that_it_takes_and_where_nothing_is_finite_it_says_so():
-    graph = Graph()
-    x, y = graph.inputs(2, False)
-    outputs = Outputs({"of": [x.sine() * y]}, [])
-    assert compute(graph, outputs, (np.array([1.0, 2.0]),))[0]
-    for each in ([2.0 * LARGEST_ANGLE, 1.0], [math.nan, 1.0], [1.0, math.inf], [1.0, math.nan]):
-        holds, (filled,) = compute(graph, outputs, (np.array(each),))
-        assert not holds
-        assert np.isnan(filled).all()  # nothing was written
 
 
 def test_near_a_singular_position_the_general_inner_loop_takes_over():
@@ -316,11 +196,6 @@ def test_redundant_rows_that_stop_holding_end_the_run():
     assert not broken.success and broken.status.name == "ROWS_CONTRADICT"
 
 
-@callback("mass")
-def unit_mass(t, q, p, M):
-    M[0, 0] = 1.0
-
-
 @callback("force")
 def spring(t, q, v, p, Q):
     Q[0] = -p[0] * q[0]
@@ -361,13 +236,6 @@ def test_one_code_serves_all_numbers(method, monkeypatch):
     assert len(made) == 1
 
 
-def test_numbers_that_cancel_leave_no_rounding():
-    graph = Graph()
-    x, y = graph.inputs(2, False)
-    assert not ((0.1 * x + 0.2 * y) * 3.0 - 0.3 * x - 0.6 * y).terms
-    assert (1e-12 * x + (0.1 + 0.2) * y - 0.3 * y).terms == {0: 1e-12}
-
-
 def test_a_second_process_compiles_nothing():
     program = """
         from twoloop import solve_dae
@@ -398,23 +266,3 @@ def test_of_code_on_the_disk_the_newest_is_kept(monkeypatch, tmp_path):
         assert solve_dae(system, (0.0, 0.1), [1.0], [0.0], "DOP853", compiled=True).success
     for kind in ("equations", "stages"):
         assert len(list(tmp_path.glob(f"{kind}.*.nbc"))) == 2
-
-
-def test_the_derivative_of_every_operation():
-    graph = Graph()
-    (x,) = graph.inputs(1, False)
-    laws = {
-        "square root": (lambda x: (x + 2.0).square_root(), lambda x: math.sqrt(x + 2.0)),
-        "exponential": (lambda x: (x * 0.5).exponential(), lambda x: math.exp(0.5 * x)),
-        "sine": (lambda x: x.sine(), math.sin),
-        "cosine": (lambda x: x.cosine(), math.cos),
-        "logarithm": (lambda x: (x + 3.0).logarithm(), lambda x: math.log(x + 3.0)),
-        "arctangent": (lambda x: x.arctangent(), math.atan),
-        "quotient": (lambda x: x / (x * x + 1.0), lambda x: x / (x * x + 1.0)),
-    }
-    one = Form(graph, 1.0, {})
-    for law, known in laws.values():
-        slope = Derivative(graph, {0: one}).of(law(x))
-        _, (value,) = compute(graph, Outputs({"slope": [slope]}, []), (np.array([0.7]),))
-        e = 1e-5
-        assert abs(value[0] - (known(0.7 + e) - known(0.7 - e)) / (2.0 * e)) < 1e-9

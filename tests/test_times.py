@@ -20,13 +20,9 @@ def test_a_start_at_the_time_of_a_clock_costs_no_digits(method):
     error_far = worst(far.q, pendulum_state(far.t - 1.7e9)[0])
     error_near = worst(near.q, pendulum_state(near.t)[0])
     assert far.t[-1] == 1.7e9 + 2.0
-    assert (np.diff(far.t) == far.h).all()  # a step is the difference of two times
+    for result in (far, near):  # a step is the difference of two times
+        assert (np.diff(result.t) == result.h).all()
     assert error_far < 2.0 * error_near + 1e-9
-
-
-def test_the_steps_are_differences_of_times_near_zero_too():
-    result = swing(3.0, method="DOP853")
-    assert (np.diff(result.t) == result.h).all()
 
 
 @pytest.mark.parametrize("end", [1e12, 1e15])

@@ -4,15 +4,13 @@ A study lists `Run`s, `collect` makes the rows, `tables` summarises them. Mechan
 `solvers.py`, what a row says of the quality of a run in `metrics.py`.
 """
 
-import signal
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import count
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -20,6 +18,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from references.driver import user_call
 from studies.bench import metrics
+from studies.bench.alarm import Alarm
 from studies.bench.reference_motion import ReferenceMotion, make_reference
 from studies.bench.store import Array, KeptRows, Row
 from twoloop import ConstrainedSystem, Result, Statistics, solve_dae
@@ -42,10 +41,6 @@ class NotApplicable(Exception):
     """Raised by a solver of the catalogue for a case that it cannot run; the text says why."""
 
 
-class TimeLimit(Exception):
-    """Raised in a run that has used up its CPU time."""
-
-
 @dataclass(frozen=True)
 class Case:
     """A mechanism, a time span, and what runs are measured by.
@@ -56,7 +51,7 @@ class Case:
         In tables and rows.
     problem : Problem
     t_end : float
-        s; runs start at 0.
+        s, that runs last.
     known : callable or None
         known() -> ReferenceMotion where the motion is known; None: two unlike methods make one.
     n_instants : int
@@ -80,6 +75,8 @@ class Case:
         Class of the problem, "smooth", "stiff", "long", for tables over several cases.
     note : str
         What is assumed.
+    t0 : float
+        s, at which runs start; other than 0 for solvers of ours alone, which take their span from `start`.
     """
 
     name: str
@@ -96,6 +93,7 @@ class Case:
     timed: float = 0.1
     tags: tuple[str, ...] = ()
     note: str = ""
+    t0: float = 0.0
 
     @cached_property
     def instants(self) -> Array:
@@ -127,23 +125,11 @@ class Case:
     @property
     def start(self) -> tuple[ConstrainedSystem, tuple[float, float], Array, Array]:
         """System, time span, q0 and v0, as all solvers take them."""
-        return self.problem.system, (0.0, self.t_end), self.problem.q0, self.problem.v0
+        return self.problem.system, (self.t0, self.t0 + self.t_end), self.problem.q0, self.problem.v0
 
     def steps(self) -> tuple[float, ...]:
         """Fixed steps, s."""
         return self.step_sizes or tuple(self.t_end / n for n in (1e3, 3e3, 1e4, 3e4, 1e5))
-
-
-@dataclass(frozen=True)
-class CaseLater(Case):
-    """A case whose runs start at t0 (s), as ours can."""
-
-    t0: float = 0.0
-
-    @property
-    def start(self) -> tuple[ConstrainedSystem, tuple[float, float], Array, Array]:
-        """As of a case, from t0 on."""
-        return self.problem.system, (self.t0, self.t0 + self.t_end), self.problem.q0, self.problem.v0
 
 
 @dataclass(frozen=True)
@@ -345,8 +331,7 @@ def from_new_start(run: Run) -> Run:
     t0 = next(_COUNT) * LATER * case.t_end
     state = case.motion_at_start(t0)
     problem = replace(case.problem, q0=state.q, v0=state.v)
-    given = {each.name: getattr(case, each.name) for each in fields(Case)} | {"problem": problem}
-    return replace(run, case=CaseLater(**given, t0=t0))
+    return replace(run, case=replace(case, problem=problem, t0=t0))
 
 
 def _may_hold_a_build(run: Run, status: str, spent: float) -> bool:
@@ -383,7 +368,7 @@ def attempt(run: Run, repeat: int, around: float | None = None) -> tuple[Result 
     user_call.forget()
     limit = run.case.time_limit
     try:
-        with _Alarm(limit, AROUND * limit if around is None else around) as alarm:
+        with Alarm(limit, AROUND * limit if around is None else around) as alarm:
             began = time.process_time()
             result = run.solver.run(run.case, run.value, repeat)
             spent = time.process_time() - began
@@ -407,37 +392,3 @@ def attempt(run: Run, repeat: int, around: float | None = None) -> tuple[Result 
     if not result.success and "time_limit =" in result.message:  # as the adapters in references/ say it
         return result, "TIME_LIMIT", result.message, spent
     return result, result.status.name, result.message, spent
-
-
-class _Alarm:
-    """Raise TimeLimit in this process when a user's call, or all around it, has used up its CPU time, where it can.
-
-    Compiled code is not interrupted but at its return to Python. `rang` says why the exception was raised.
-    """
-
-    def __init__(self, seconds: float, around: float):
-        self.seconds, self.around, self.rang = seconds, around, ""
-        self._can = hasattr(signal, "setitimer") and threading.current_thread() is threading.main_thread()
-        self._began, self._before = 0.0, None
-
-    def __enter__(self) -> Self:
-        if self._can:
-            self._began = time.process_time()
-            # a timer of wall-clock time: one of CPU time makes the clocks of CPU time advance in ticks of 4 ms on Linux
-            self._before = signal.signal(signal.SIGALRM, self._look)  # type: ignore[assignment]
-            # again and again: an exception raised in a callback of a foreign solver may be swallowed by it
-            signal.setitimer(signal.ITIMER_REAL, 1.1 * self.seconds, min(1.0, 0.5 * self.seconds))
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self._can:
-            signal.setitimer(signal.ITIMER_REAL, 0.0)
-            signal.signal(signal.SIGALRM, self._before)
-
-    def _look(self, *_: object) -> None:
-        if user_call.so_far() >= 1.1 * self.seconds:  # a solver's own limit comes first
-            self.rang = f"Stopped after {self.seconds:g} s of CPU time, the limit of a run."
-        elif time.process_time() - self._began >= self.around:
-            self.rang = f"Stopped after {self.around:g} s of CPU time, the limit of all that an adapter does."
-        if self.rang:
-            raise TimeLimit

@@ -2,6 +2,8 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -14,6 +16,9 @@ from twoloop.mechanisms import Problem
 TIGHT = 1e-13  # tolerance of both runs of the smooth pair
 STIFF = 1e-11  # of the pair for stiff problems, which IDA does not follow below
 REFINED = 4  # parts of a step of the second run, at whose ends the first one is stored
+
+_explicit = partial(solve_index1, method="DOP853", stabilisation="projection")
+_own_explicit = partial(solve_dae, method="DOP853")
 
 
 @dataclass(frozen=True)
@@ -56,7 +61,7 @@ def make_reference(problem: Problem, t_end: float, time_limit: float | None = No
     StudyError
         If no pair reaches t_end.
     """
-    span, start = (0.0, t_end), (problem.q0, problem.v0)
+    run = problem.system, (0.0, t_end), problem.q0, problem.v0
     said, smooth = [], False
     for name, second, method, tolerance in (
         ("Gauss16 (twoloop) and SciPy's DOP853, projected", _explicit, "Gauss16", TIGHT),
@@ -65,8 +70,9 @@ def make_reference(problem: Problem, t_end: float, time_limit: float | None = No
     ):
         if second is _own_explicit and smooth:
             continue
+        options: dict[str, Any] = {"rtol": tolerance, "atol": tolerance, "time_limit": time_limit}
         try:
-            other = second(problem, t_end, tolerance, time_limit)
+            other = second(*run, **options)
         except (ValueError, RuntimeError) as error:  # it does not take this mechanism, or is not installed
             said.append(str(error))
             continue
@@ -76,8 +82,7 @@ def make_reference(problem: Problem, t_end: float, time_limit: float | None = No
             continue
         parts = [other.t[:-1] + k / REFINED * np.diff(other.t) for k in range(REFINED)]
         fine = np.append(np.sort(np.concatenate(parts)), t_end)
-        given = (*start, method, tolerance, tolerance)
-        first = solve_dae(problem.system, span, *given, t_eval=fine, time_limit=time_limit)
+        first = solve_dae(*run, method, t_eval=fine, **options)
         if not first.success:
             said.append(first.message)
             continue
@@ -88,21 +93,10 @@ def make_reference(problem: Problem, t_end: float, time_limit: float | None = No
     raise StudyError(f"no reference for {problem.name!r}: {' / '.join(said)}")
 
 
-def _explicit(problem: Problem, t_end: float, tolerance: float, time_limit: float | None) -> Result:
-    run, tolerances = (problem.system, (0.0, t_end), problem.q0, problem.v0), (tolerance, tolerance)
-    return solve_index1(*run, "DOP853", *tolerances, stabilisation="projection", time_limit=time_limit)
-
-
-def _own_explicit(problem: Problem, t_end: float, tolerance: float, time_limit: float | None) -> Result:
-    run, tolerances = (problem.system, (0.0, t_end), problem.q0, problem.v0), (tolerance, tolerance)
-    return solve_dae(*run, "DOP853", *tolerances, time_limit=time_limit)
-
-
-def _ida(problem: Problem, t_end: float, tolerance: float, time_limit: float | None) -> Result:
+def _ida(*run: Any, **options: Any) -> Result:
     from references.sundials.ida import solve_ida
 
-    run, tolerances = (problem.system, (0.0, t_end), problem.q0, problem.v0), (tolerance, tolerance)
-    return solve_ida(*run, "stabilised", *tolerances, time_limit=time_limit)
+    return solve_ida(*run, "stabilised", **options)
 
 
 def check_published(problem: Problem, motion: ReferenceMotion, t_end: float) -> float | None:

@@ -6,11 +6,12 @@ import numpy as np
 import pandas as pd
 
 from studies import ablation
+from studies.bench import tables
 from studies.bench.metrics import ASTRAY, LOST
 from studies.bench.solvers import GEAR_ORDERS, IDA_C, IRK, IRK_LINE, NEWMARK, OWN_BDF, QUARTER, gear
 from studies.claims.beam_judges import FOLLOWS, TIPS
 from studies.claims.experiments import PASSES
-from studies.claims.rows import BEAMS, DEFAULT, LONG, NotRun, Rows, as_good_costs, cheapest, common_costs
+from studies.claims.rows import BEAMS, DEFAULT, LONG, NotRun, Rows, cheapest, common_costs
 from studies.claims.verdicts import Judgement, decide, span, span_known
 from studies.energy.drift import NO_DRIFT, verdict
 from studies.energy.runs import ONE
@@ -211,7 +212,7 @@ def gstiff(rows: Rows, part: str) -> Judgement:
 def stand_in_as_foil(rows: Rows) -> Judgement:
     ours = rows.long("table3", solver=IRK_LINE, problem=DEFAULT)
     theirs = rows.long("motion", group=GSTIFF_GROUP, solver=gear(5))
-    ratios = common_costs(theirs, ours, TIPS, "call_s")
+    ratios = common_costs(theirs, ours, TIPS)
     return decide((ratio > 1.0 for ratio in ratios), ratio=span(ratios))
 
 
@@ -303,11 +304,9 @@ def _newmark_over_irk(rows: Rows) -> dict[str, list[float]]:
     for name in BOTH_BETAS:
         for problem in dict.fromkeys(rows.long("table3")["problem"]):
             one, other = (_along(rows, solver, problem) for solver in (name, IRK_LINE))
-            ratios["linkage"] += common_costs(
-                one, other, tuple(e for e in ERRORS if e < one["error_q"].max()), "call_s"
-            )
+            ratios["linkage"] += common_costs(one, other, tuple(e for e in ERRORS if e < one["error_q"].max()))
         for key, case in zip(("soft", "stiff"), BEAMS, strict=True):
-            ratios[key] += as_good_costs(rows.beam(case, name), rows.beam(case, IRK), FINER, "call_s")
+            ratios[key] += common_costs(rows.beam(case, name), rows.beam(case, IRK), FINER, tables.as_good)
     return ratios
 
 

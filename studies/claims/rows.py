@@ -1,6 +1,6 @@
 """The rows of the other studies, as the judges read them; all that depends on how a study writes them stands here."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -94,21 +94,17 @@ class Rows:
         return self.pick("beam", BEAM_END, named, case=case, group="run", **equal)
 
 
-def common_costs(one: pd.DataFrame, other: pd.DataFrame, targets: tuple[float, ...], what: str) -> list[float]:
-    """Costs of `one` over those of `other` at the errors that both reach."""
-    costs = [(tables.time_for(one, e, what), tables.time_for(other, e, what)) for e in targets]
+def common_costs(
+    one: pd.DataFrame,
+    other: pd.DataFrame,
+    targets: tuple[float, ...],
+    cost: Callable[[pd.DataFrame, float], float] = tables.time_for,
+) -> list[float]:
+    """Times of `one` over those of `other` at the errors that both reach; `cost`: that of the runs of a solver."""
+    costs = [(cost(one, e), cost(other, e)) for e in targets]
     ratios = [a / b for a, b in costs if np.isfinite(a) and np.isfinite(b)]
     if not ratios:
         raise NotRun(f"{one['solver'].iloc[0]} and {other['solver'].iloc[0]} have no error in common")
-    return ratios
-
-
-def as_good_costs(one: pd.DataFrame, other: pd.DataFrame, targets: tuple[float, ...], what: str) -> list[float]:
-    """Costs of `one` over those of `other`, of each the cheapest run that is at least as good as an error."""
-    costs = [[tables.as_good(runs, e, what) for runs in (one, other)] for e in targets]
-    ratios = [a / b for a, b in costs if np.isfinite(a) and np.isfinite(b)]
-    if not ratios:
-        raise NotRun(f"{one['solver'].iloc[0]} and {other['solver'].iloc[0]} have no error that both reach")
     return ratios
 
 

@@ -1,56 +1,29 @@
-"""A knife edge on an inclined plane: one non-holonomic row, closed form (Bloch, Nonholonomic Mechanics, Sect. 1.6).
+"""The knife edge of the library, and two variations of it, in closed form.
 
-x points down the slope, phi is the angle of the blade. The blade turns with a constant angular velocity; it starts at
-rest at the origin, pointing down. Two variations of our own: the plane as a holonomic row of a point in space, and a
-blade that is pushed sideways at a known speed, so that the non-holonomic row has a rate b(t, q).
+The plane as a holonomic row of a point in space; and a blade that is pushed sideways at a known speed, so that the
+non-holonomic row has a rate b(t, q).
 """
 
 import numpy as np
 
-from tests.general.mechanism import G, Mechanism, of_functions
+from tests.general.mechanism import G, Mechanism, known, of_functions, of_problem
+from tests.mechanisms.motions import spatial
+from tests.problems import functions_of
+from twoloop import mechanisms
+from twoloop.mechanisms.knife_edge import INERTIA, SLOPE, SPIN
+from twoloop.mechanisms.knife_edge import MASS as M
 
-M, INERTIA, SLOPE, SPIN = 1.3, 0.2, 0.4, 1.7
-PULL = G * np.sin(SLOPE)
 PUSH = 0.6  # amplitude of the sideways speed, m/s
 END = 2.0
-
-
-def nonholonomic(t, q):
-    return np.array([[np.sin(q[2]), -np.cos(q[2]), 0.0]])
-
-
-def nonholonomic_gamma(t, q, v):
-    return np.array([-v[2] * (v[0] * np.cos(q[2]) + v[1] * np.sin(q[2]))])
-
-
-def state(t):
-    s, c = np.sin(SPIN * t), np.cos(SPIN * t)
-    scale = PULL / (2.0 * SPIN**2)
-    q = np.array([scale * s * s, scale * (SPIN * t - s * c), SPIN * t])
-    return q, np.array([PULL / SPIN * s * c, PULL / SPIN * s * s, SPIN])
-
-
-FUNCTIONS = {
-    "n_q": 3,
-    "n_c": 0,
-    "n_a": 1,
-    "mass": np.diag([M, M, INERTIA]),
-    "force": lambda t, q, v: np.array([M * PULL, 0.0, 0.0]),
-    "nonholonomic": nonholonomic,
-    "nonholonomic_gamma": nonholonomic_gamma,
-}
+PROBLEM = mechanisms.knife_edge()
+EDGE = PROBLEM.system
+FUNCTIONS = {"n_q": 3, "n_c": 0, "n_a": 1, "name": "knife edge", **functions_of(EDGE)}
+state = PROBLEM.motion
 
 
 def knife_edge():
-    """No holonomic row at all; the ready mechanism is this one in compiled functions."""
-    return Mechanism(
-        name="knife edge",
-        system=of_functions(**FUNCTIONS, name="knife edge"),
-        end=END,
-        state=state,
-        rank=1,
-        energy=lambda q, v: 0.5 * v @ (np.array([M, M, INERTIA]) * v) - M * PULL * q[0],
-    )
+    """No holonomic row at all."""
+    return of_problem(PROBLEM, known(spatial.knife_edge(), END), END)
 
 
 def knife_edge_in_space():
@@ -109,7 +82,7 @@ def pushed_knife_edge():
             | {
                 "nonholonomic_rate": lambda t, q: np.array([-PUSH * np.sin(2.0 * SPIN * t)]),
                 "nonholonomic_gamma": lambda t, q, v: (
-                    nonholonomic_gamma(t, q, v) + 2.0 * PUSH * SPIN * np.cos(2.0 * SPIN * t)
+                    EDGE.nonholonomic_gamma(t, q, v) + 2.0 * PUSH * SPIN * np.cos(2.0 * SPIN * t)
                 ),
             }
         ),

@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from tests.compiled import PENDULUM
-from tests.test_callbacks import heavy
+from tests.compiled import PENDULUM, heavy
 from twoloop import ConstrainedSystem, callback, solve_dae
 
 

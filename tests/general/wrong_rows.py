@@ -8,13 +8,13 @@ import numpy as np
 from tests.bad_input.case import HUGE, WRONG, argument, cases_of
 from tests.general import knife_edge
 from tests.general.faulty import parted_drives, parted_velocities, without_inertia
-from twoloop import RungeKutta, consistent_state, solve_dae
+from twoloop import ConstrainedSystem, RungeKutta, consistent_state, solve_dae
 from twoloop.methods.tableaux import gauss
 
 
 def edge(**changed):
     """The knife edge, with other arguments in place of its own."""
-    return knife_edge.knife_edge().system(**changed)
+    return ConstrainedSystem.from_python(**knife_edge.FUNCTIONS | changed) if changed else knife_edge.EDGE
 
 
 def slide(system=None, v0=None, **options):
@@ -138,7 +138,7 @@ ROWS = [
     case(
         "`nonholonomic_gamma` with the wrong sign",
         lambda: slide(
-            edge(nonholonomic_gamma=lambda t, q, v: -knife_edge.nonholonomic_gamma(t, q, v)),
+            edge(nonholonomic_gamma=lambda t, q, v: -knife_edge.EDGE.nonholonomic_gamma(t, q, v)),
             v0=[1.0, 0.0, knife_edge.SPIN],
         ),
         "nonholonomic_gamma of 'knife edge' is not .*entry 0 is",

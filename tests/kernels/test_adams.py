@@ -34,13 +34,6 @@ def test_a_step_is_two_evaluations_and_few_are_refused(tol):
     assert stats.n_rejected_convergence == 0
 
 
-def test_it_takes_fewer_evaluations_than_others_at_equal_error():
-    own, error = shared_run("Adams", 1e-12)
-    other, other_error = shared_run("Gauss12", 1e-10)
-    assert max(error, other_error) < 3e-11  # rounding has its share in both
-    assert own.stats.n_evaluations < 0.5 * other.stats.n_evaluations
-
-
 def test_it_says_that_it_cannot_keep_a_constant_step():
     with pytest.raises(ValueError, match=r"method='Adams' .* leave step_size out"):
         swing(method="Adams", step_size=0.01)

@@ -4,13 +4,6 @@ import numpy as np
 import pytest
 
 from tests.problems import (
-    force_residual,
-    moving_pivot,
-    moving_pivot_state,
-    oblique_pendulum,
-    oblique_point,
-    oblique_start,
-    oblique_to_point,
     violations,
     worst,
 )
@@ -42,29 +35,6 @@ def test_constraints_hold_at_every_accepted_step_of_a_long_run(request, name, ge
         np.abs(problem.system.constraint(t, q)).max() for t, q in zip(result.t[half:], result.q.T[half:], strict=True)
     )
     assert late < 1e-9
-
-
-def test_multipliers_and_accelerations_with_a_mass_that_varies_in_time_and_place():
-    system = oblique_pendulum()
-    times = np.linspace(0.0, 5.0, 21)
-    result = solve_dae(system, (0.0, 5.0), *oblique_start(), rtol=1e-10, atol=1e-10, t_eval=times)
-    x, u, lam = oblique_point(times)
-    points, speeds = oblique_to_point(result)
-    assert worst(points, x) < 1e-9
-    assert worst(speeds, u) < 1e-9
-    assert worst(result.lam[0], lam) < 1e-8
-    assert force_residual(system, result) < 1e-10
-
-
-@pytest.mark.parametrize("gamma", [True, False])
-def test_rheonomic_constraints(gamma):
-    times = np.linspace(0.0, 3.0, 13)
-    system = moving_pivot(gamma=gamma)
-    result = solve_dae(system, (0.0, 3.0), *moving_pivot_state(0.0), rtol=1e-10, atol=1e-10, t_eval=times)
-    q, v = moving_pivot_state(times)
-    assert worst(result.q, q) < 1e-9
-    assert worst(result.v, v) < 5e-9
-    assert max(violations(system, result)) < 1e-11
 
 
 def test_update_first_then_test(default_four_bar):

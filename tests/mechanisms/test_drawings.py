@@ -5,11 +5,10 @@ import pickle
 import numpy as np
 import pytest
 
-from tests.mechanisms.test_ready_mechanisms import PROBLEMS
+from tests.mechanisms.test_ready_mechanisms import EVERY, every
 from twoloop import Drawing, mechanisms
 
 SPRINGS = {"Andrews' squeezing mechanism": 1, "SUNDIALS slider-crank": 1, "A05 governor": 2}
-MADE = {**PROBLEMS, "four-bar": mechanisms.four_bar(), "beam": mechanisms.very_flexible_beam(2)}
 
 
 def lengths(problem, q):
@@ -24,17 +23,16 @@ def test_every_mechanism_has_a_drawing():
     assert all(function().drawing.bars for function in functions)
 
 
-@pytest.mark.parametrize("name", [name for name in MADE if name not in ("beam", "projection pendulum")])
+@pytest.mark.parametrize("name", [name for name in EVERY if name not in ("beam", "projection pendulum")])
 def test_bars_are_rigid_but_for_springs(name):
-    problem = MADE[name]
+    problem = EVERY[name]
     change = np.abs(lengths(problem, problem.reference.q) - lengths(problem, problem.q0))
     assert (change > 1e-9).sum() == SPRINGS.get(name, 0)
     assert np.abs(problem.reference.q - problem.q0).max() > 1e-3  # it did move
 
 
-@pytest.mark.parametrize("name", MADE)
-def test_many_states_at_once_are_those_one_by_one(name):
-    problem = MADE[name]
+@every
+def test_many_states_at_once_are_those_one_by_one(problem):
     q = np.column_stack([problem.q0, problem.q0 + 0.1])
     both = problem.drawing.at(q)
     assert both.shape[1] == (2 if "planar" in problem.tags else 3)
@@ -42,9 +40,8 @@ def test_many_states_at_once_are_those_one_by_one(name):
         np.testing.assert_allclose(both[..., k], problem.drawing.at(q[:, k]), rtol=0.0, atol=1e-14)
 
 
-@pytest.mark.parametrize("name", MADE)
-def test_problems_can_be_sent_to_other_processes(name):
-    problem = MADE[name]
+@every
+def test_problems_can_be_sent_to_other_processes(problem):
     other = pickle.loads(pickle.dumps(problem))
     np.testing.assert_array_equal(other.drawing.at(problem.q0), problem.drawing.at(problem.q0))
     assert other.energy(0.0, other.q0, other.v0) == problem.energy(0.0, problem.q0, problem.v0)
@@ -52,7 +49,7 @@ def test_problems_can_be_sent_to_other_processes(name):
 
 
 def test_four_bar_from_pin_to_pin():
-    problem = MADE["four-bar"]
+    problem = EVERY["four-bar"]
     points = problem.drawing.at(problem.reference.q)
     assert lengths(problem, problem.reference.q) == pytest.approx([1.0, 2.0, 1.5], abs=1e-13)
     assert points[[0, 3]].tolist() == [[0.0, 0.0], [3.0, 0.0]]
@@ -78,9 +75,9 @@ def test_the_point_of_the_rim_that_touches_the_plane_is_at_rest():
 
 
 def test_the_beam_is_drawn_as_long_as_it_is():
-    problem = MADE["beam"]
+    problem = EVERY["beam"]
     points = problem.drawing.at(problem.q0)
-    assert points[:, 0] == pytest.approx(np.linspace(0.0, 1.0, 17), abs=1e-15)
+    assert points[:, 0] == pytest.approx(np.linspace(0.0, 1.0, 33), abs=1e-15)
     assert not points[:, 1].any()
 
 
@@ -97,7 +94,7 @@ def test_wrong_drawings(arguments, error, words):
 
 
 def test_names_and_units():
-    problem = MADE["beam"]
+    problem = EVERY["beam"]
     assert problem.names[:3] == ("x of node 0", "y of node 0", "x slope of node 0")
     assert problem.units[:3] == ("m", "m", "")
     assert mechanisms.bricard().units[3] == ""  # "-"

@@ -1,4 +1,4 @@
-"""The four-bar linkage: derivatives, power balance, assembly, and its motion by routes with one degree of freedom."""
+"""The four-bar linkage: derivatives, assembly, and its motion by routes with one degree of freedom."""
 
 import math
 
@@ -8,7 +8,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from references.paper.four_bar_minimal import MinimalFourBar
-from tests.problems import one_angle, row_errors, run, slope, violations, worst
+from tests.problems import row_errors, run, violations, worst
 from twoloop import solve_dae
 from twoloop.mechanisms import four_bar
 
@@ -34,23 +34,6 @@ def system_of(L1, L2, L3, ground):
 def test_derivatives_of_the_constraint(L1, L2, L3, ground, q, v):
     by_q, by_t, gamma = row_errors(system_of(L1, L2, L3, ground), 0.0, q, v)
     assert by_q < 1e-8 and by_t == 0.0 and gamma < 1e-7
-
-
-@given(states, states)
-def test_energy_changes_with_the_power_of_the_forces(q, v):
-    # along q'' = a without constraints: dE/dt = v . (M a - Q) for any a
-    problem = four_bar()
-    system = problem.system
-    a = np.sin(np.arange(9.0))
-    rate = slope(lambda s: problem.energy(s, q + s * v + 0.5 * s * s * a, v + s * a))
-    assert abs(rate - v @ (system.mass(0.0, q) @ a - system.force(0.0, q, v))) < 1e-7
-
-
-def test_energy_takes_one_state_or_many(default_four_bar):
-    problem = default_four_bar
-    many = problem.energy(np.zeros(3), np.tile(problem.q0[:, None], 3), np.ones((9, 3)))
-    assert many.shape == (3,)
-    assert worst(many, problem.energy(0.0, problem.q0, np.ones(9))) < 1e-14
 
 
 def test_masses_are_those_of_uniform_rods(default_four_bar):
@@ -90,15 +73,6 @@ def test_default_is_marked_as_assumed_and_others_carry_no_reference(default_four
     assert collinear_four_bar.reference is None
     p = default_four_bar.parameters
     assert (p["L1"], p["L2"], p["L3"], p["L"], p["gravity"]) == (1.0, 2.0, 1.5, 3.0, 9.81)
-
-
-def test_reference_is_the_motion_of_an_equation_in_one_angle(default_four_bar):
-    q, v = one_angle((1.0, 2.0, 1.5), 3.0, 0.0, -1)([0.0, 10.0])
-    reference = default_four_bar.reference
-    assert reference.t == 10.0
-    assert worst(q[:, 0], default_four_bar.q0) < 1e-14
-    assert worst(q[:, 1], reference.q) < 2e-12
-    assert worst(v[:, 1], reference.v) < 1e-11
 
 
 # the embedded estimate of RadauIIA5 is of order 3, and its steps continue unextrapolated

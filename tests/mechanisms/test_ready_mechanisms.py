@@ -1,4 +1,4 @@
-"""All ready mechanisms: what they say of themselves, references by a second route, and nine digits at 1e-10."""
+"""All ready mechanisms: what they say of themselves, derivatives, references by a second route, nine digits."""
 
 import warnings
 from functools import cache
@@ -10,14 +10,26 @@ from tests.general.mechanisms import ELSEWHERE
 from tests.mechanisms.make_references import converged, digits
 from tests.mechanisms.motions import closed_forms, known_motions
 from tests.mechanisms.motions.integrate import by_scipy
-from tests.problems import slope
+from tests.problems import row_errors, slope
 from twoloop import ConstraintWarning, mechanisms, solve_dae
-from twoloop.mechanisms import andrews, driven_slider_crank, governor, heavy_top, n_four_bar, sundials_slider_crank
+from twoloop.mechanisms import (
+    andrews,
+    driven_slider_crank,
+    four_bar,
+    governor,
+    heavy_top,
+    n_four_bar,
+    sundials_slider_crank,
+    very_flexible_beam,
+)
 from twoloop.mechanisms.sundials_slider_crank import PRINTED
 
 COMPUTED, CLOSED = known_motions(), closed_forms()
 PROBLEMS = {name: problem for name, (problem, *_) in {**COMPUTED, **CLOSED}.items()}
 PROBLEMS["driven slider-crank"] = driven_slider_crank()
+EVERY = {**PROBLEMS, "four-bar": four_bar(), "beam": very_flexible_beam()}
+DAMPED = ("SUNDIALS slider-crank", "A05 governor")
+every = pytest.mark.parametrize("problem", EVERY.values(), ids=EVERY)
 SINGULAR = [name for name, problem in PROBLEMS.items() if "singular" in problem.tags]
 REGULAR = [name for name in PROBLEMS if name not in SINGULAR]
 # the others run in tests/general/test_accuracy.py, against the motions from which their references are
@@ -184,6 +196,28 @@ def test_invariants(name):
         assert values.shape == result.t.shape
         assert values[0] == pytest.approx(quantity(0.0, problem.q0, problem.v0), rel=1e-14)
         assert np.ptp(values) < 1e-9 * max(1.0, np.abs(values).max())
+
+
+@every
+def test_energy_takes_one_state_or_many(problem):
+    times = np.array([0.0, 0.1, 0.2])
+    q, v = (x[:, None] + 0.1 * np.sin(np.arange(3.0 * x.size)).reshape(-1, 3) for x in (problem.q0, problem.v0))
+    many, each = problem.energy(times, q, v), [problem.energy(*state) for state in zip(times, q.T, v.T, strict=True)]
+    assert many.shape == (3,) and many == pytest.approx(each, rel=1e-12, abs=1e-12)
+
+
+@every
+@pytest.mark.parametrize("seed", range(5))
+def test_rows_and_powers_are_derivatives(problem, seed):
+    """Of the constraints, and of the energy along q'' = a without constraints: dE/dt = v . (M a - Q) for any a."""
+    system, random = problem.system, np.random.default_rng(seed)
+    t, q = random.uniform(0.0, 3.0), problem.q0 + 0.1 * random.normal(size=problem.q0.size)
+    v, a = random.normal(size=(2, problem.q0.size))
+    assert max(row_errors(system, t, q, v)) < 1e-9
+    if problem.name not in DAMPED:
+        rate = slope(lambda s: problem.energy(t + s, q + s * v + 0.5 * s * s * a, v + s * a))
+        power = v @ (system.mass(t, q) @ a - system.force(t, q, v))
+        assert rate == pytest.approx(power, rel=1e-10, abs=1e-10)
 
 
 def test_the_governor_only_loses_energy():

@@ -187,14 +187,7 @@ LATE = 0.7  # s
 def late(kind, becomes):
     """The pendulum, of whose functions one returns NaN, or raises, after `LATE`."""
     exact = pendulum()
-    functions = {
-        "mass": lambda t, q: exact.mass(t, q),
-        "force": lambda t, q, v: exact.force(t, q, v),
-        "constraint": lambda t, q: exact.constraint(t, q),
-        "jacobian": lambda t, q: exact.jacobian(t, q),
-        "gamma": lambda t, q, v: exact.gamma(t, q, v),
-    }
-    return pendulum(**{kind: lambda t, *state: functions[kind](t, *state) * (1.0 if t <= LATE else becomes())})
+    return pendulum(**{kind: lambda t, *state: getattr(exact, kind)(t, *state) * (1.0 if t <= LATE else becomes())})
 
 
 def raising():

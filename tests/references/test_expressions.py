@@ -13,6 +13,7 @@ from references.equations.straight_line import Program, Value, program_of, strai
 from references.sundials.cvode_c import solve_cvode_c
 from studies.validation.study import MAKE
 from tests.compiled import PENDULUM
+from tests.problems import pendulum as plain_pendulum
 from twoloop import ConstrainedSystem, Status
 from twoloop.kernels.compile.callbacks import callback
 from twoloop.mechanisms import double_pendulum, four_bar, heavy_top, n_four_bar, very_flexible_beam
@@ -98,17 +99,8 @@ def test_forces_of_exponentials_and_their_like_are_written_as_code():
 
 def test_systems_without_expressions_are_refused():
     pytest.importorskip("sksundae")
-    plain = ConstrainedSystem.from_python(
-        n_q=2,
-        n_c=1,
-        mass=np.eye(2),
-        force=lambda t, q, v: np.array([0.0, -9.81]),
-        constraint=lambda t, q: np.array([0.5 * (q @ q - 1.0)]),
-        jacobian=lambda t, q: q[None, :],
-        gamma=lambda t, q, v: np.array([-(v @ v)]),
-    )
     with pytest.raises(ValueError, match="are Python functions, not compiled ones"):
-        solve_cvode_c(plain, (0.0, 1.0), [1.0, 0.0], [0.0, 0.0])
+        solve_cvode_c(plain_pendulum(), (0.0, 1.0), [1.0, 0.0], [0.0, 0.0])
 
 
 @callback("force")

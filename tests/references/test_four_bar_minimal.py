@@ -8,7 +8,6 @@ import pytest
 
 from references.paper import four_bar_minimal
 from references.paper.four_bar_minimal import MinimalFourBar, trajectory
-from tests.problems import one_angle
 from twoloop.mechanisms import four_bar
 
 PROBLEMS = [four_bar(), four_bar(lengths=(0.8, 1.2, 1.0), ground=2.0), four_bar((1.0, 1.2, 0.5), 1.0, math.pi, 1)]
@@ -67,19 +66,6 @@ def test_folds_times_of_any_sign_and_order():
     assert np.allclose(q[:, 1], q[:, 2], atol=1e-15) and np.allclose(v[:, 1], -v[:, 2], atol=1e-15)
     again = trajectory(PROBLEMS[1].parameters, times + 3 * minimal.period)
     assert np.abs(q - again[0]).max() < 1e-12 and np.abs(v - again[1]).max() < 1e-11
-
-
-@pytest.mark.parametrize("k", [0, 1])
-def test_the_motion_and_its_period_are_those_of_an_equation_in_one_angle(k):
-    """Which th2 is in the first two cases."""
-    p, form = PROBLEMS[k].parameters, minimal_form(k)
-    times = form.period * np.array([0.1, 0.3, 0.5, 0.8, 1.0])
-    q, v = one_angle((p["L1"], p["L2"], p["L3"]), p["L"], p["theta3"], p["branch"])(times)
-    known = form.states(times)
-    turns = (q[2::3] - known[0][2::3]) / (2.0 * np.pi)
-    q[2::3] -= 2.0 * np.pi * np.round(turns)
-    assert np.abs(q - known[0]).max() < 1e-10 and np.abs(v - known[1]).max() < 1e-10
-    assert np.abs(v[:, [2, 4]]).max() < 1e-10  # at rest
 
 
 def test_second_geometry_passes_positions_where_bars_are_in_line():

@@ -16,6 +16,7 @@ from references.sundials import loop
 from references.sundials.ida import solve_ida
 from references.sundials.ida_c import solve_ida_c
 from references.sundials.residual import FORMS, Implicit, iteration_matrix_at, residual_at
+from tests.problems import PLAIN
 from twoloop import ConstrainedSystem, callback, consistent_state, solve_dae
 from twoloop.mechanisms import four_bar
 from twoloop.run.record import Status
@@ -190,23 +191,15 @@ def test_too_many_steps_end_the_run(monkeypatch):
     assert result.t.tolist() == [1e-6]
 
 
-FUNCTIONS = {
-    "mass": np.eye(2),
-    "force": lambda t, q, v: np.array([0.0, -9.81]),
-    "constraint": lambda t, q: np.array([0.5 * (q[0] * q[0] + q[1] * q[1] - 1.0)]),
-    "jacobian": lambda t, q: q.reshape((1, 2)),
-}
-
-
 def test_python_functions_are_refused():
-    system = ConstrainedSystem.from_python(n_q=2, n_c=1, **FUNCTIONS)
+    system = ConstrainedSystem.from_python(**PLAIN)
     with pytest.raises(ValueError, match=r"system must have compiled callbacks.*compile=True.*solve_ida"):
         solve_ida_c(system, (0.0, 1.0), [1.0, 0.0], [0.0, 0.0])
 
 
 @pytest.mark.slow  # what is compiled is as in the tests above, but by from_python
 def test_functions_that_from_python_compiles_are_taken():
-    system = ConstrainedSystem.from_python(n_q=2, n_c=1, compile=True, **FUNCTIONS)
+    system = ConstrainedSystem.from_python(compile=True, **PLAIN)
     result = solve_ida_c(system, (0.0, 1.0), [1.0, 0.0], [0.0, 0.0])
     assert result.success
     assert np.abs(0.5 * (result.v**2).sum(axis=0) + 9.81 * result.q[1]).max() < 1e-4

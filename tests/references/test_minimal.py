@@ -34,7 +34,7 @@ SOLVERS = {
 def motion(problem, t_end):
     own = minimal(problem)
     rates = own.equations(math)
-    made = solve_ivp(lambda t, y: rates(y), (0.0, t_end), own.start, "DOP853", rtol=1e-12, atol=1e-12)
+    made = solve_ivp(lambda t, y: rates(y), (0.0, t_end), own.start, "DOP853", rtol=1e-13, atol=1e-14)
     return made.t, *own.states(made.y)
 
 
@@ -43,7 +43,7 @@ def test_the_motion_is_the_problems(name):
     problem = MAKE[name]()
     t, q, v = motion(problem, problem.reference.t)
     assert np.abs(q[:, 0] - problem.q0).max() < 1e-14 and np.abs(v[:, 0] - problem.v0).max() < 1e-14
-    assert np.abs(q[:, -1] - problem.reference.q).max() < 1e-9
+    assert np.abs(q[:, -1] - problem.reference.q).max() < 1e-10
     assert np.abs(v[:, -1] - problem.reference.v).max() < 1e-9
     for k in range(0, t.size, 20):  # on the constraints, by positions and by velocities
         q_k, v_k = np.ascontiguousarray(q[:, k]), np.ascontiguousarray(v[:, k])
@@ -55,20 +55,22 @@ def test_the_motion_is_the_problems(name):
 
 
 @pytest.mark.parametrize(
-    "given",
+    ("given", "far"),
     [
-        SECOND,
-        {"lengths": (0.5, 2.0, 1.5), "ground": 2.2, "theta3": -0.9},
-        {"lengths": (1.61, 1.476, 1.41), "ground": 0.585, "theta3": -0.423},  # bars that turn by more than half
-        {"lengths": (1.534, 1.25, 0.616), "ground": 1.72, "theta3": -1.72, "branch": 1},
-        {"lengths": (0.64, 1.4, 0.89), "ground": 1.16, "theta3": -1.27, "branch": 1},
+        ({}, 1e-10),
+        (SECOND, 1e-10),
+        ({"lengths": (0.5, 2.0, 1.5), "ground": 2.2, "theta3": -0.9}, 1e-9),
+        # bars that turn by more than half
+        ({"lengths": (1.61, 1.476, 1.41), "ground": 0.585, "theta3": -0.423}, 1e-9),
+        ({"lengths": (1.534, 1.25, 0.616), "ground": 1.72, "theta3": -1.72, "branch": 1}, 1e-9),
+        ({"lengths": (0.64, 1.4, 0.89), "ground": 1.16, "theta3": -1.27, "branch": 1}, 1e-9),
     ],
 )
-def test_any_four_bar_with_an_angle_clear_of_its_dead_centres(given):
+def test_any_four_bar_with_an_angle_clear_of_its_dead_centres(given, far):
     problem = mechanisms.four_bar(**given)
-    t, q, v = motion(problem, 5.0)
+    t, q, v = motion(problem, 5.0)  # more than two periods
     known = MinimalFourBar.from_parameters(problem.parameters).states(t)
-    assert np.abs(q - known[0]).max() < 1e-9 and np.abs(v - known[1]).max() < 1e-8
+    assert np.abs(q - known[0]).max() < far and np.abs(v - known[1]).max() < 10.0 * far
 
 
 @pytest.mark.parametrize("name", ["pendulum, right", "double pendulum", "slider-crank", "four-bar"])

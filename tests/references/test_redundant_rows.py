@@ -5,7 +5,7 @@ import pytest
 
 from references.equations.rows import independent_rows
 from references.scipy.index1 import solve_index1
-from tests.problems import pendulum
+from tests.problems import held_twice, pendulum
 from tests.references.adapters import ADAPTERS
 from twoloop.mechanisms import bricard, redundant_slider_crank
 
@@ -39,27 +39,16 @@ def test_the_rows_that_are_kept_span_all():
     assert independent_rows(rows) == (0, 2, 5)
 
 
-def held_twice(constraint, rate=None):
-    """A point on a circle, held by two rows of C with the same gradient."""
-    return pendulum(
-        n_c=2,
-        constraint=constraint,
-        jacobian=lambda t, q: np.array([q, q]),
-        constraint_rate=rate,
-        gamma=False,
-        name="held twice",
-    )
-
-
 @pytest.mark.parametrize("name", [pytest.param("DOP853, projected", marks=pytest.mark.slow), "IDA, stabilised"])
 def test_rows_that_contradict_one_another_now_or_later_are_no_success(name):
     start = (0.0, 1.0), [1.0, 0.0], [0.0, 0.0]
-    now = held_twice(lambda t, q: np.array([0.5 * (q @ q - 1.0), 0.5 * (q @ q - 1.1)]))
+    now = held_twice(constraint=lambda t, q: 0.5 * (q @ q - np.array([1.0, 1.1])), name="held twice")
     with pytest.raises(ValueError, match=r"q0 must satisfy all constraints of 'held twice': row\(s\) \[1\]"):
         ADAPTERS[name](now, *start)
     later = held_twice(
-        lambda t, q: np.array([0.5 * (q @ q - 1.0), 0.5 * (q @ q - 1.0 - 0.1 * t * t)]),
-        lambda t, q: np.array([0.0, -0.1 * t]),
+        constraint=lambda t, q: 0.5 * (q @ q - np.array([1.0, 1.0 + 0.1 * t * t])),
+        constraint_rate=lambda t, q: np.array([0.0, -0.1 * t]),
+        gamma=False,
     )
     result = ADAPTERS[name](later, *start)
     assert not result.success and "Row(s) [1] of C_q follow from others at t = 0, were left out" in result.message

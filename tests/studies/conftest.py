@@ -3,6 +3,7 @@
 from dataclasses import replace
 from types import SimpleNamespace
 
+import pandas as pd
 import pytest
 
 from studies import ablation, motion, step_size, violation
@@ -14,6 +15,21 @@ from studies.energy import study as energy
 def own_lock(monkeypatch, tmp_path_factory):
     """A lock of timed studies for each test: neither a study on this machine nor another test makes it fail."""
     monkeypatch.setattr(store, "LOCK", str(tmp_path_factory.mktemp("lock") / "timed.lock"))
+
+
+@pytest.fixture(scope="module")
+def out(request, tmp_path_factory):
+    """The folder of a quick run of the study of a module of tests, its `STUDIED`."""
+    study = request.module.STUDIED.STUDY
+    folder = tmp_path_factory.mktemp(study.name)
+    study.main(["--quick", "--out", str(folder)])
+    return folder
+
+
+@pytest.fixture(scope="module")
+def made(request, out):
+    """The rows of this run."""
+    return pd.read_csv(out / f"{request.module.STUDIED.STUDY.name}.csv", comment="#")
 
 
 @pytest.fixture

@@ -1,7 +1,5 @@
 """The ablation study: sentences turn with the rows, costs are not interpolated over gaps, and a run of each variant."""
 
-import json
-
 import numpy as np
 import pandas as pd
 import pytest
@@ -25,10 +23,9 @@ from studies.ablation import (
     findings_of,
     verdict,
 )
-from studies.bench.cli import Call, StudyError
+from studies.bench.cli import StudyError
 from studies.bench.collector import attempt
-from studies.bench.render import render
-from studies.bench.store import Output
+from tests.studies.of_study import GOOD, found_of, said
 
 FACTORS = {PAPER: (1.0, 3.0, 1.8), FROZEN: (9.0, 9.0, 9.0), PROJECTED: (1.1, 1.2, 1.0)}
 FACTORS |= {STABILISED: (2.0, 2.1, 2.2), UNPROJECTED: (1.05, 1.1, 0.9)}
@@ -36,7 +33,7 @@ FACTORS |= {STABILISED: (2.0, 2.1, 2.2), UNPROJECTED: (1.05, 1.1, 0.9)}
 
 def rows():
     """Medians of a full run, made up but like them."""
-    good = {"status": "REACHED_END", "message": "", "floor": 1e-11, "repeat": 0, "astray": False, "energy": 1e-6}
+    good = GOOD | {"floor": 1e-11, "astray": False, "energy": 1e-6}
     good |= {"h": np.nan, "tol": np.nan, "h_median": 0.05, "violation_early": 1e-15, "violation_late": 1e-15}
     lines = []
     for case, tableau in ((LINKAGE, SUN), (LINKAGE, GAUSS), (FLEXIBLE, SUN)):
@@ -58,10 +55,6 @@ def rows():
     return pd.DataFrame(lines)
 
 
-def text_of(made, quick=False):
-    return render("ablation", findings_of(made), {}, stamp="stamp", quick=quick)
-
-
 @pytest.fixture
 def made():
     return rows()
@@ -74,20 +67,20 @@ def scaled(made, variant, factor, columns=("n_evaluations", "n_factorizations", 
 
 
 def test_the_answer_turns_with_the_rows(made):
-    text = text_of(made)
+    text = said(ablation, made)[1]
     assert "keeps the constraints as well, and takes " in text
     assert "under this fixed-point iteration its extra multipliers do not pay; what they cost with Newton" in text
     assert f"added with {SUN.name} and {GAUSS.name}, does this." in text and "without it" not in text
     radau = made[made["tableau"] == SUN.name].assign(tableau=RADAU.name)
     radau.loc[radau["solver"] == STABILISED, "violation_q"] = 5e-7
-    assert f"With {RADAU.name}, without it, the violation reaches 5e-7 m" in text_of(pd.concat([made, radau]))
+    assert f"With {RADAU.name}, without it, the violation reaches 5e-7 m" in said(ablation, pd.concat([made, radau]))[1]
     assert "the order falls to 1 with every tableau" in text and "solving them in the loop is right" in text
     assert "violation grows: 1e-7 m" in text and "1e-5 m in the last" in text and "nothing is cheaper" in text
-    text = text_of(scaled(scaled(made, PROJECTED, 4.0), STABILISED, 0.2))
+    text = said(ablation, scaled(scaled(made, PROJECTED, 4.0), STABILISED, 0.2))[1]
     assert "**Answer.** Yes: projecting once a step" in text and "takes no less time at any error compared" in text
     assert "the extra multipliers that the paper calls inefficient save time at every error" in text
     changed = scaled(scaled(made, PROJECTED, 1.8, (TIME,)), PROJECTED, 0.9, ("n_evaluations",))
-    text = text_of(scaled(changed, UNPROJECTED, 9.0))
+    text = said(ablation, scaled(changed, UNPROJECTED, 9.0))[1]
     assert "**Answer.** No: projecting once a step keeps the constraints as well in the same time" in text
     assert "more evaluations" not in text and "nothing is cheaper" not in text
     mixed = made.copy()
@@ -95,19 +88,18 @@ def test_the_answer_turns_with_the_rows(made):
     mixed.loc[mixed["solver"] == PROJECTED, "violation_q"] = 1e-6
     mixed["violation_late"] = mixed["violation_early"]
     mixed.loc[(mixed["solver"] == FROZEN) & (mixed["group"] == "order"), "error_q"] **= 5
-    text = text_of(mixed)
+    text = said(ablation, mixed)[1]
     assert "**Answer.** Not in general: projecting once a step keeps the constraints less well" in text
     assert "violation does not grow" in text
     assert "does not fall to 1 with every tableau" in text and "is right" not in text
 
 
 def test_a_report_is_short_and_a_quick_one_says_so(made, tmp_path, unsaved):
-    with Output(Call("ablation", True, tmp_path, False, "")) as output:
-        ablation.STUDY.report(output, made, "stamp")
+    found = found_of(ablation, tmp_path, made, quick=True)
     text = (tmp_path / "ablation.md").read_text()
-    assert "**Quick run**" in text and "**Quick run**" not in text_of(made)
+    assert "**Quick run**" in text and "**Quick run**" not in said(ablation, made)[1]
     assert len(text.split()) < 1000
-    assert json.loads((tmp_path / "ablation.json").read_text())["against"][PROJECTED]["verdicts"]["time"] == "dearer"
+    assert found["against"][PROJECTED]["verdicts"]["time"] == "dearer"
 
 
 def test_findings(made):

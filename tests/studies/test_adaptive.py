@@ -9,24 +9,23 @@ from tests.studies.test_rivals import Kept
 VALUES = (1e-2, 1e-4, 1e-6, 1e-8, 1e-10)
 
 
-def made(*solvers, repeats=2, all_asked=False, kept=None):
-    """Tolerances of the rows of each solver, given (name, make(value) -> status, error, seconds)."""
-    case = Case("crane", None, 1.0)
-    makers = dict(solvers)
-    todo = [
-        Run(case, Solver(name, "any", "compiled", True, "tol", None, VALUES), value, "", repeats)
-        for name in makers
-        for value in VALUES
-    ]
+def collected(makers, start=VALUES, families=None, setting="tol", repeats=5, all_asked=False, kept=None, **errors):
+    """Rows of solvers, given name: make(value) -> status, error, seconds."""
+    case, values = Case("crane", None, 10.0), VALUES if setting == "tol" else ()
+    families = families or dict.fromkeys(makers, "any")
+    solvers = [Solver(name, families[name], "compiled", True, setting, None, values) for name in makers]
+    todo = [Run(case, solver, value, "", repeats) for solver in solvers for value in start]
 
-    def make(run, repeat, built):
+    def row(run, repeat, built):
         status, error, seconds = makers[run.solver.name](run.value)
-        return {"solver": run.solver.name, "tol": run.value, "repeat": repeat, "status": status, "error_q": error} | {
-            "case": run.case.name,
-            "call_s": seconds,
-        }
+        line = {"solver": run.solver.name, "case": "crane", setting: run.value, "repeat": repeat, "status": status}
+        return line | {"error_q": error, "call_s": seconds}
 
-    return adaptive.collect(todo, Kept() if kept is None else kept, make, lambda run: all_asked)
+    return adaptive.collect(todo, Kept() if kept is None else kept, row, lambda run: all_asked, **errors)
+
+
+def made(*solvers, repeats=2, **options):
+    return collected(dict(solvers), repeats=repeats, **options)
 
 
 def good(seconds):
@@ -88,22 +87,9 @@ def test_a_run_goes_on_from_what_is_kept():
 
 def asked(make, errors=(1e-2, 1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9), start=VALUES[:3], **others):
     """Tolerances of which a solver was asked, given make(value) -> status, error, seconds; others beside it."""
-    case = Case("crane", None, 1.0)
-    makers = {"a": make, **others}
-    solvers = [Solver(name, "any", "compiled", True, "tol", None, VALUES) for name in sorted(makers, reverse=True)]
-    todo = [Run(case, solver, value) for solver in solvers for value in start]
-
-    def row(run, repeat, built):
-        status, error, seconds = makers[run.solver.name](run.value)
-        return {"solver": run.solver.name, "tol": run.value, "repeat": repeat, "status": status, "error_q": error} | {
-            "case": run.case.name,
-            "call_s": seconds,
-        }
-
-    made = adaptive.collect(todo, Kept(), row, errors=errors)
-    first = made[(made["repeat"] == 0) & (made["solver"] == "a")].sort_values("tol", ascending=False)
-    assert made.groupby(["solver", "tol"]).size().isin([1, 5]).all()
-    return first
+    rows = collected({**others, "a": make}, start, errors=errors)
+    assert rows.groupby(["solver", "tol"]).size().isin([1, 5]).all()
+    return rows[(rows["repeat"] == 0) & (rows["solver"] == "a")].sort_values("tol", ascending=False)
 
 
 def test_a_solver_is_asked_between_settings_until_no_error_is_a_decade_from_the_next():
@@ -134,19 +120,8 @@ def test_ours_are_far_behind_by_the_fastest_of_ours_and_the_default_is_asked_in_
     fast, slow = (lambda value, time=time: ("REACHED_END", 1e-3 * value, time) for time in (1e-3, 0.1))
     slower = lambda value: ("REACHED_END", value, 1.0)  # noqa: E731
     families = {"fast": "theirs", "slow": "two-loop", "slower": "two-loop", "auto": "two-loop"}
-    case, made = Case("crane", None, 1.0), {"fast": fast, "slow": slow, "slower": slower, "auto": slower}
-    todo = [
-        Run(case, Solver(name, family, "compiled", True, "tol", None, VALUES), value)
-        for name, family in families.items()
-        for value in VALUES[:3]
-    ]
-
-    def row(run, repeat, built):
-        status, error, seconds = made[run.solver.name](run.value)
-        line = {"solver": run.solver.name, "case": "crane", "tol": run.value, "repeat": repeat, "status": status}
-        return line | {"error_q": error, "call_s": seconds}
-
-    rows = adaptive.collect(todo, Kept(), row, errors=(1e-2, 1e-4, 1e-6, 1e-8))
+    makers = {"fast": fast, "slow": slow, "slower": slower, "auto": slower}
+    rows = collected(makers, VALUES[:3], families, errors=(1e-2, 1e-4, 1e-6, 1e-8))
     asked = rows[rows["repeat"] == 0].groupby("solver").size()
     assert asked["slow"] > 3 and asked["slower"] == 3 and asked["auto"] > 3
 
@@ -162,17 +137,8 @@ def test_a_limit_at_a_loose_setting_moves_to_the_next_and_two_running_end_it():
 
 def asked_steps(make, errors=(1e-3, 1e-5, 1e-7), start=(300, 1000), **others):
     """Numbers of steps that a solver of fixed steps was asked for, given make(n) -> status, error, seconds."""
-    case, makers = Case("crane", None, 10.0), {"a": make, **others}
-    solvers = [Solver(name, "any", "compiled", True, "h", None) for name in sorted(makers, reverse=True)]
-    todo = [Run(case, solver, case.t_end / n) for solver in solvers for n in start]
-
-    def row(run, repeat, built):
-        status, error, seconds = makers[run.solver.name](run.case.t_end / run.value)
-        return {"solver": run.solver.name, "case": "crane", "h": run.value, "status": status, "error_q": error} | {
-            "call_s": seconds
-        }
-
-    rows = adaptive.collect(todo, Kept(), row, errors=errors)
+    makers = {name: lambda h, make=make: make(10.0 / h) for name, make in {**others, "a": make}.items()}
+    rows = collected(makers, [10.0 / n for n in start], setting="h", errors=errors)
     numbers = sorted({10.0 / h for h in rows[rows["solver"] == "a"]["h"]})
     assert [round(n) for n in numbers] == pytest.approx(numbers)  # the motion takes a whole number of each
     return [round(n) for n in numbers]

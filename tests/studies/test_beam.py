@@ -1,6 +1,5 @@
 """The beam study: its measures, its sentences on changed rows, the quick run."""
 
-import json
 from dataclasses import replace
 
 import numpy as np
@@ -17,19 +16,20 @@ from studies.beam.study import TARGETS, findings_of
 from studies.bench import index
 from studies.bench.cases import load
 from studies.bench.cases.beam import MAKE, SOFT, STIFF
-from studies.bench.cli import Call, StudyError
+from studies.bench.cli import StudyError
 from studies.bench.collector import Run, attempt
 from studies.bench.solvers import IDA_C, IDA_C_ORDER_2, NEWMARK, OWN_EXPLICIT, PAPER_TOL, QUARTER, RIVALS
-from studies.bench.store import Output
+from tests.studies.of_study import GOOD, QuickRun, found_of
 from twoloop import solve_dae
 from twoloop.methods.tableaux import gauss, sun_radau_iib
 
+STUDIED = study
 W_MAX = {SOFT: 3358.5, STIFF: 33585.0}
 
 
 def rows(t_end=2.0):
     """Rows like those of a full run, made up: medians of three solvers' runs and of all else."""
-    common = {"group": "run", "status": "REACHED_END", "message": "", "t_end": t_end, "floor": 1e-9, "repeat": 0}
+    common = GOOD | {"group": "run", "t_end": t_end, "floor": 1e-9}
     common |= {"called_from": "compiled", "keeps_constraints": True, "violation_q": 1e-17, "violation_v": 1e-17}
     common |= {"energy": np.nan, "n_rejected": 100.0, "n_rejected_convergence": 80.0, "tol": np.nan, "h": np.nan}
     times = {PAPER: 5.0, NEWMARK: 2.0, QUARTER: 1.0, "BDF": 0.3, NEWTON: 0.05, OWN_EXPLICIT: 0.2, IDA_C: 0.4}
@@ -56,16 +56,9 @@ def rows(t_end=2.0):
     return pd.DataFrame(made)
 
 
-def found_of(tmp_path, made, quick=False):
-    """The findings, with which the report was written."""
-    with Output(Call("beam", quick, tmp_path, False, "")) as output:
-        study.STUDY.report(output, made, "stamp")
-    return json.loads((tmp_path / "beam.json").read_text())
-
-
 @pytest.mark.usefixtures("unsaved")
 def test_the_advice_turns_with_the_rows(tmp_path):
-    found = found_of(tmp_path, rows())["cases"][1]
+    found = found_of(study, tmp_path, rows())["cases"][1]
     assert [at["error"] for at in found["at"]] == [1e-2, 1e-3, 1e-4] == list(TARGETS)
     assert found["at"][0]["best"]["solver"] == NEWTON
     assert found["at"][0]["ours"]["call_s"] == pytest.approx(0.79, abs=0.01)
@@ -73,12 +66,12 @@ def test_the_advice_turns_with_the_rows(tmp_path):
     made = rows()
     made.loc[made["solver"] == IDA_C_ORDER_2, "call_s"] /= 100.0
     made.loc[made["solver"] == PAPER, "call_s"] /= 100.0
-    found = found_of(tmp_path, made)["cases"][1]
+    found = found_of(study, tmp_path, made)["cases"][1]
     assert found["at"][0]["best"]["solver"] == IDA_C_ORDER_2
     assert not found["at"][0]["best"]["ours"]
     made = rows()
     made.loc[(made["solver"] == IDA_C_ORDER_2) & (made["error_tip"] == 5e-3), "call_s"] = 1e-3
-    found = found_of(tmp_path, made)["cases"][1]
+    found = found_of(study, tmp_path, made)["cases"][1]
     assert [at["best"]["solver"] for at in found["at"]] == [IDA_C_ORDER_2, IDA_C_ORDER_2, NEWTON]
 
 
@@ -91,7 +84,7 @@ def test_of_a_solver_with_runs_it_is_not_said_that_it_was_not_asked():
 @pytest.mark.usefixtures("unsaved")
 def test_what_the_mesh_changes_is_found_for_each_beam(tmp_path):
     def below(made):
-        return [case["below_mesh"] for case in found_of(tmp_path, made)["cases"]]
+        return [case["below_mesh"] for case in found_of(study, tmp_path, made)["cases"]]
 
     assert below(rows()) == [list(TARGETS)] * 2
     made = rows()
@@ -105,26 +98,26 @@ def test_what_the_mesh_changes_is_found_for_each_beam(tmp_path):
 
 @pytest.mark.usefixtures("unsaved")
 def test_the_step_limit_is_reconciled_by_numbers_or_not(tmp_path):
-    found = found_of(tmp_path, rows())
+    found = found_of(study, tmp_path, rows())
     assert found["reconciled"] and found["gauss_seidel_shorter"] and found["test_no_limit"]
     assert found["test_limits"] == [0.9, 0.45, 0.11] and found["test_tols"] == [1e-1, 1e-2, 1e-8]
     made = rows()
     made.loc[(made["group"] == "along"), "measured"] = 0.2  # shorter than the accepted steps
     made.loc[made["solver"] == JACOBI, "theory"] = 3.0
-    found = found_of(tmp_path, made)
+    found = found_of(study, tmp_path, made)
     assert not found["reconciled"] and not found["gauss_seidel_shorter"]
     made = rows()
     made.loc[made["group"] == "growth test", "measured"] = 0.457
-    found = found_of(tmp_path, made)
+    found = found_of(study, tmp_path, made)
     assert not found["reconciled"] and not found["test_no_limit"]
 
 
 @pytest.mark.usefixtures("unsaved")
 def test_growth_turns_with_the_rows(tmp_path):
-    assert found_of(tmp_path, rows())["growth_as_frequency"]
+    assert found_of(study, tmp_path, rows())["growth_as_frequency"]
     made = rows()
     made.loc[(made["case"] == STIFF) & (made["solver"] == PAPER), "n_evaluations"] *= 10.0
-    assert not found_of(tmp_path, made)["growth_as_frequency"]
+    assert not found_of(study, tmp_path, made)["growth_as_frequency"]
 
 
 @pytest.mark.usefixtures("unsaved")
@@ -134,8 +127,8 @@ def test_failures_and_what_is_not_there_are_told(tmp_path):
     without = made[made["solver"] != IDA_C]
     numbers = ["error_q", "error_tip", "call_s", "n_evaluations", "n_steps", "h_median"]
     peer = peer.assign(**dict.fromkeys(numbers, np.nan))
-    assert found_of(tmp_path, pd.concat([peer, without], ignore_index=True))["cases"][0]["failed"] == 1
-    assert found_of(tmp_path, made)["cases"][0]["failed"] == 0
+    assert found_of(study, tmp_path, pd.concat([peer, without], ignore_index=True))["cases"][0]["failed"] == 1
+    assert found_of(study, tmp_path, made)["cases"][0]["failed"] == 0
     with pytest.raises(StudyError, match="lack those of group 'along'"):
         findings_of(made[made["group"] != "along"])
 
@@ -144,17 +137,17 @@ def test_failures_and_what_is_not_there_are_told(tmp_path):
 def test_exudyn_is_judged_by_its_own_motion_and_not_ranked(tmp_path):
     made = rows()
     made.loc[made["solver"] == EXUDYN, "call_s"] = 1e-6
-    found = found_of(tmp_path, made)
+    found = found_of(study, tmp_path, made)
     assert found["cases"][0]["at"][0]["best"]["solver"] != EXUDYN and found["exudyn"]
-    assert not found_of(tmp_path, made[made["solver"] != EXUDYN])["exudyn"]
+    assert not found_of(study, tmp_path, made[made["solver"] != EXUDYN])["exudyn"]
 
 
 @pytest.mark.usefixtures("unsaved")
 def test_whether_vibrations_are_stepped_over_is_read_from_the_steps(tmp_path):
-    assert [case["steps_over"] for case in found_of(tmp_path, rows())["cases"]] == [False, False]
+    assert [case["steps_over"] for case in found_of(study, tmp_path, rows())["cases"]] == [False, False]
     made = rows()
     made.loc[(made["case"] == STIFF) & (made["solver"] == NEWTON), "h_median"] = 200.0 / W_MAX[STIFF]
-    cases_ = found_of(tmp_path, made)["cases"]
+    cases_ = found_of(study, tmp_path, made)["cases"]
     assert [case["steps_over"] for case in cases_] == [False, True] and cases_[1]["longest"]["solver"] == NEWTON
 
 
@@ -235,31 +228,18 @@ def test_frequencies_are_those_of_the_published_case():
     assert abs(frequencies(MAKE[SOFT]())[-1] - 3358.5) < 0.05
 
 
-@pytest.fixture(scope="module")
-def out(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("beam")
-    beam.main(["--quick", "--out", str(folder)])
-    return folder
+class TestQuickRun(QuickRun):
+    pictures = ("beam_very_flexible", "beam_moderately_stiff")
 
 
-@pytest.fixture(scope="module")
-def quick_rows(out):
-    return pd.read_csv(out / "beam.csv", comment="#")
-
-
-@pytest.mark.usefixtures("unsaved")
-def test_the_quick_study_runs_and_is_drawn_again(out):
+def test_a_quick_report_does_not_compare_with_the_paper(out):
     text = (out / "beam.md").read_text()
     assert "6278" not in text and "56.2" not in text  # the paper's seconds are not for so short a motion
-    beam.main(["--quick", "--out", str(out), "--redraw"])
-    assert (out / "beam.md").read_text() == text
-    for name in ("beam_very_flexible", "beam_moderately_stiff"):
-        assert (out / f"{name}.png").exists() and (out / f"{name}.svg").exists()
     assert beam.__doc__.split(":")[0] in index.first_screen(out, True)
 
 
-def test_quick_runs_follow_the_reference_and_newton_needs_far_fewer_evaluations(quick_rows):
-    made = quick_rows[quick_rows["group"] == "run"]
+def test_quick_runs_follow_the_reference_and_newton_needs_far_fewer_evaluations(made):
+    made = made[made["group"] == "run"]
     assert (made["status"] == "REACHED_END").all() and made["error_tip"].max() < 0.02
     counts = made[made["case"] == STIFF].groupby("solver")["n_evaluations"].min()
     assert counts[PAPER] > 100.0 * counts[NEWTON]
@@ -267,9 +247,9 @@ def test_quick_runs_follow_the_reference_and_newton_needs_far_fewer_evaluations(
     assert 1e-4 < steps[SOFT] < 3e-3 and 1e-5 < steps[STIFF] < 1e-4
 
 
-def test_the_papers_growth_test_is_no_limit_of_the_iteration(quick_rows):
-    limits = quick_rows[quick_rows["group"] == "limit"].set_index("solver")["theory"]
-    tests = quick_rows[quick_rows["group"] == "growth test"].set_index("tol")["measured"]
+def test_the_papers_growth_test_is_no_limit_of_the_iteration(made):
+    limits = made[made["group"] == "limit"].set_index("solver")["theory"]
+    tests = made[made["group"] == "growth test"].set_index("tol")["measured"]
     assert limits[GAUSS_SEIDEL] > tests[1e-1] > tests[1e-2] > 2.0 * tests[1e-8] > 0.0
 
 

@@ -11,6 +11,7 @@ import pytest
 
 from references.driver import user_call
 from studies.bench import collector as bench
+from studies.bench.alarm import TimeLimit
 from studies.bench.collector import Case, NotApplicable, Run, Solver, collect
 from studies.bench.reference_motion import Quintic, ReferenceMotion, check_published, make_reference
 from studies.bench.solvers import CATALOGUE
@@ -173,7 +174,7 @@ def test_a_limit_is_one_whatever_a_foreign_library_makes_of_it(kept, made):
         try:
             with user_call:
                 spend(10.0)
-        except bench.TimeLimit:
+        except TimeLimit:
             if made == "raised":
                 raise RuntimeError("KeyboardInterrupt") from None
         failed = {"status": Status.SOLVER_FAILED, "message": "failed: KeyboardInterrupt"}
@@ -237,14 +238,6 @@ def test_further_columns_come_from_the_study_and_its_case(kept):
     got = row(kept, ours, more, measure=measure)
     assert got["largest_x"] == pytest.approx(1.0, abs=0.6) and len(got["curve"]) == 3
     assert abs(got["length"]) < 1e-13
-
-
-@pytest.fixture
-def interruptible():
-    """Ctrl-C raises, also where the tests are a job in the background."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, before)
 
 
 @pytest.mark.usefixtures("interruptible")

@@ -10,6 +10,7 @@ from studies.bench.cli import ROOT, StudyError
 from studies.bench.collector import Case
 from studies.bench.render import render
 from tests.problems import pendulum, pendulum_state
+from tests.studies.of_study import median
 from twoloop.mechanisms import Problem
 
 CODE = (ROOT / "docs" / "compare.md").read_text().split("```python\n")[1].split("```")[0]
@@ -71,11 +72,8 @@ def test_errors_are_one_line(file, capsys):
 def findings(**rows):
     q, v, _ = pendulum_state(0.0)
     case = Case("swing", Problem("swing", pendulum(), q, v, (0.0, 1.0), lambda t, q, v: 0.0), 1.0)
-    common = {"keeps_constraints": True, "called_from": "compiled", "floor": 1e-10, "status": "REACHED_END"}
-    common |= {"violation_q": 0.0, "violation_v": 0.0, "energy": 0.0, "n_evaluations": 1.0, "tol": 1e-6}
     lines = [
-        {"solver": name, "family": family, "error_q": error, "call_s": cpu, "call_q1": cpu, "call_q3": cpu, **common}
-        for name, (family, error, cpu) in rows.items()
+        median(name, error, cpu, family=family, tol=1e-6, floor=1e-10) for name, (family, error, cpu) in rows.items()
     ]
     return compare.findings_of(pd.DataFrame(lines), case, (1e-4,)) | {"source": "", "published": None}
 

@@ -78,12 +78,11 @@ def test_called_from_python_is_said_of_what_is():
 
 
 def test_without_a_reference_the_report_says_why(mechanisms, monkeypatch):
-    def too_slow(problem, t_end, tolerance, time_limit):
+    def too_slow(*run, time_limit, **options):
         raise RuntimeError(f"stopped after {time_limit:g} s")
 
-    for name in ("_explicit", "_own_explicit"):
+    for name in ("_explicit", "_own_explicit", "_ida"):
         monkeypatch.setattr(reference_motion, name, too_slow)
-    monkeypatch.setattr(reference_motion, "_ida", too_slow)
     says = r"^error: no reference for 'heavy top': .*stopped after 7 s\. Choose a shorter --t-end, or more than"
     with pytest.raises(SystemExit, match=says):
         compared(mechanisms, "top", "--reference-limit", "7")

@@ -18,6 +18,7 @@ import pytest
 from studies import compare_page
 from studies.bench import figures
 from studies.bench.cli import REPORTS, StudyError
+from tests.processes import run_node
 
 STAMP = "# full work_precision; `made up`"
 RUNS = [  # case, end, solver, family, called from, tolerance, repetition, CPU, status, message, evaluations, errors
@@ -111,15 +112,9 @@ def folder(tmp_path):
 
 def in_node(path, acts, address=""):
     """What the page shows at first and after each act."""
-    node = shutil.which("node")
-    if node is None:
-        pytest.skip("node is not installed")
     script = re.findall(r"<script>(.*?)</script>", path.read_text(encoding="utf-8"), re.DOTALL)[-1]
     source = f"{IN_NODE.replace('HASH', json.dumps(address))}{script}{LOOK.replace('ADDRESS', 'replaced')}"
-    source += f"look();\n{acts}\nconsole.log(JSON.stringify(said));"
-    done = subprocess.run([node, "-"], input=source, capture_output=True, text=True, timeout=60)
-    assert done.returncode == 0, done.stderr
-    return json.loads(done.stdout)
+    return run_node(f"{source}look();\n{acts}\nconsole.log(JSON.stringify(said));")
 
 
 def in_chromium(path, acts, address=""):

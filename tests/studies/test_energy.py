@@ -2,6 +2,7 @@
 
 import json
 import math
+from functools import partial
 
 import numpy as np
 import pandas as pd
@@ -36,21 +37,16 @@ from studies.energy.runs import (
     runs,
 )
 from studies.energy.study import pick
+from tests.studies import of_study
 
+STUDIED = energy
 RIVALS = (HEYOKA, CVODE_C, CVODES, DIFFRAX)
 PERIOD = 2.2489859198
 
 
 @pytest.fixture(scope="module")
-def quick(tmp_path_factory):
-    out = tmp_path_factory.mktemp("energy")
-    energy.main(["--quick", "--out", str(out)])
-    return out
-
-
-@pytest.fixture(scope="module")
-def loaded(quick):
-    output = Output(Call("energy", True, quick, False, ""))
+def loaded(out):
+    output = Output(Call("energy", True, out, False, ""))
     return output.load_rows(curves=True)[0]
 
 
@@ -60,14 +56,8 @@ def rows(loaded):
 
 
 @pytest.fixture
-def found_of(tmp_path, loaded, unsaved):
-    def made(changed):
-        """The findings, with which the report was written."""
-        with Output(Call("energy", True, tmp_path, False, "")) as output:
-            energy.STUDY.report(output, changed, "stamp")
-        return json.loads((tmp_path / "energy.json").read_text())
-
-    return made
+def found_of(tmp_path, unsaved):
+    return partial(of_study.found_of, energy, tmp_path, quick=True)
 
 
 def changed(rows, where, **values):
@@ -78,22 +68,18 @@ def changed(rows, where, **values):
     return rows
 
 
-def test_the_report_is_short_and_only_it_is_left(quick):
+def test_only_the_report_is_left(out):
     names = {"README.md", "energy.md", "energy.csv", "energy.json", "energy_series.npz", ".lock"}
     names |= {f"energy_{what}.{suffix}" for what in ("long", "cost") for suffix in ("png", "svg")}
-    assert {path.name for path in quick.iterdir()} == names
-    assert (quick / "energy_long.png").stat().st_size > 10_000
+    assert {path.name for path in out.iterdir()} == names
 
 
-@pytest.mark.usefixtures("unsaved")
-def test_redraw_writes_the_same_report(quick):
-    text = (quick / "energy.md").read_text()
-    energy.STUDY.main(["--quick", "--out", str(quick), "--redraw"])
-    assert (quick / "energy.md").read_text() == text
+class TestQuickRun(of_study.QuickRun):
+    pictures = ("energy_long", "energy_cost")
 
 
-def test_findings_answer_the_first_screen(quick):
-    found = json.loads((quick / "energy.json").read_text())["long"]
+def test_findings_answer_the_first_screen(out):
+    found = json.loads((out / "energy.json").read_text())["long"]
     ours = found["no_drift"]["ours"]
     assert ours["calm"] and ours["keeps"] and ours["call_s"] > 0.0
     assert [at["share"] for at in found["at"]] == [1e-3, 1e-5, 1e-7]
@@ -173,8 +159,8 @@ TURNING = {  # finding: rows, what is changed in them; the finding is there befo
 
 
 @pytest.mark.parametrize(("finding", "where", "slope"), TURNING.values(), ids=TURNING)
-def test_findings_turn_with_the_rows(finding, where, slope, rows, found_of, quick):
-    assert finding(json.loads((quick / "energy.json").read_text()))
+def test_findings_turn_with_the_rows(finding, where, slope, rows, found_of, out):
+    assert finding(json.loads((out / "energy.json").read_text()))
     assert not finding(found_of(changed(rows, where, slope_error=0.0, slope=slope)))
 
 

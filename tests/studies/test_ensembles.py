@@ -8,8 +8,8 @@ from references.equations.many_at_once import by_diffrax, by_heyoka
 from studies import ensembles
 from studies.bench import takes
 from studies.bench.cli import StudyError
-from studies.bench.render import render
 from studies.ensembles import DIFFRAX, ENSEMBLE, ERRORS, HEYOKA, SINGLE, TOLERANCES
+from tests.studies.of_study import said
 from twoloop.mechanisms import double_pendulum
 
 T_END = 1.0
@@ -64,16 +64,11 @@ def rows(error=lambda way, tol: tol, **seconds):
     return pd.DataFrame([*made, whole])
 
 
-def said(times, **more):
-    made = rows(**times, **more)
-    return render("ensembles", ensembles.findings_of(made), {}, stamp="stamp", quick=False, rows=made)
-
-
 def test_sentences_follow_the_rows():
-    text = said({ENSEMBLE: 0.01, SINGLE: 0.1, HEYOKA: 0.05})
+    _, text = said(ensembles, rows(**{ENSEMBLE: 0.01, SINGLE: 0.1, HEYOKA: 0.05}))
     assert "`twoloop.ensemble` takes the least time, beside heyoka's batches and diffrax: the cheaper of them" in text
     assert "takes 5.0 to 5.0 times as long." in text
-    text = said({ENSEMBLE: 0.1, SINGLE: 0.01, HEYOKA: 0.05})
+    _, text = said(ensembles, rows(**{ENSEMBLE: 0.1, SINGLE: 0.01, HEYOKA: 0.05}))
     assert f"ahead of heyoka's batches and diffrax in 0 and behind in {len(ERRORS)} of {len(ERRORS)} pairs" in text
     assert "10,000 four-bar linkages" in text and "none failed" in text
 

@@ -32,6 +32,7 @@ from studies.honesty import study as honesty
 from studies.motion import GRIDS
 from studies.table3 import study as table3
 from studies.work_precision import rivals
+from tests.studies.of_study import median
 
 NEW = (  # of rivals that no table of styles knows, as a study may bring them
     *("IDA from C, q and v tested", "CVODE from C, BDF, projected", "CVODES, CasADi", "heyoka, minimal coordinates"),
@@ -56,16 +57,14 @@ def pair(solver):
 
 def rows(**seconds):
     """Medians on the four-bar: of each solver three runs a decade of error apart, the time that of the loosest."""
-    common = {"case": "four-bar", "called_from": "compiled", "keeps_constraints": True, "status": "REACHED_END"}
-    common |= {"floor": 1e-14, "violation_q": 0.0, "violation_v": 0.0, "energy": 0.0, "astray": False}
-    made = []
-    for solver, time in seconds.items():
-        for k, error in enumerate(ERRORS):
-            line = {"solver": solver, "family": FAMILY.get(solver, "two-loop"), "tol": error, "error_q": error}
-            cost = time * 2.0**k
-            line |= {"call_s": cost, "call_q1": cost, "call_q3": cost, "times": (cost,) * 5, "n_evaluations": 9.0}
-            made.append(common | line)
-    return pd.DataFrame(made)
+    return pd.DataFrame(
+        [
+            median(solver, error, cost := time * 2.0**k, family=FAMILY.get(solver, "two-loop"), times=(cost,) * 5)
+            | {"case": "four-bar", "tol": error, "astray": False}
+            for solver, time in seconds.items()
+            for k, error in enumerate(ERRORS)
+        ]
+    )
 
 
 def drawn(axes):

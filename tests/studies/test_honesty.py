@@ -8,7 +8,6 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from studies.bench.render import render
 from studies.honesty import solvers as honesty_solvers
 from studies.honesty import study as honesty
 from studies.honesty.solvers import DEFAULT, IDA_C, KINDS, LIMITED, kind_of, own, solvers, why_not
@@ -25,6 +24,7 @@ from studies.honesty.traps import (
     traps,
     under_forces,
 )
+from tests.studies.of_study import said
 from twoloop import solve_dae
 from twoloop.methods.presets import PRESETS
 
@@ -115,70 +115,44 @@ def test_ours_say_so(name, method):
     assert row_of(TRAPS[name], partial(own, method))["outcome"] == honesty.SAID
 
 
-def test_sentences_turn_with_the_rows():
-    lines = [
-        {
-            "group": MISTAKE,
-            "trap": trap,
-            "mechanism": "chain of 2",
-            "solver": solver,
-            "outcome": honesty.RIGHT,
-            "status": "REACHED_END",
-            "asked": True,
-            "error": 1e-9,
-        }
-        for trap in ("a", "b")
-        for solver in ("BDF (twoloop)", "LSODA, index 1")
-    ]
-    rows = pd.DataFrame(lines)
-
-    def text(rows):
-        return render("honesty", honesty.findings_of(rows), {}, stamp="stamp", quick=False)
-
-    assert "None of ours is silently wrong" in text(rows) and "All runs are correct: a; b." in text(rows)
-    rows.loc[3, "outcome"] = honesty.SAID
-    assert "All runs are correct: a." in text(rows)
-    rows.loc[rows["trap"] == "b", "outcome"] = honesty.SILENT
-    told = text(rows)
-    assert "- Of ours 1 run is silently wrong or hangs: b." in told
-    assert "All runs are correct: a." in told and "All runs report failure" not in told
-    assert "No solver notices: b" in told
-
-
 OURS, COMPILED, OTHER, THEIRS = DEFAULT, "auto, compiled (twoloop)", "BDF (twoloop)", "LSODA, index 1"
 BOUND = THEIRS + LIMITED
+
+
+def row(group, trap, solver, outcome=honesty.RIGHT):
+    about = {"group": group, "trap": trap, "mechanism": "pendulum", "solver": solver, "outcome": outcome}
+    return about | {"status": "REACHED_END", "asked": True, "error": 1e-9}
 
 
 def rows_of_forces(wrong=()):
     """Two runs of each solver, one on a mistake and one under a force; those of `wrong` are wrong and silent."""
     return pd.DataFrame(
         [
-            {
-                "group": group,
-                "trap": "gust" if group == FORCE else "a",
-                "mechanism": "pendulum",
-                "solver": solver,
-                "outcome": honesty.SILENT if (solver, group) in wrong else honesty.RIGHT,
-                "status": "REACHED_END",
-                "asked": True,
-                "error": 1e-9,
-            }
+            row(group, trap, solver, honesty.SILENT if (solver, group) in wrong else honesty.RIGHT)
             for solver in (OURS, COMPILED, OTHER, THEIRS, BOUND)
-            for group in (MISTAKE, FORCE)
+            for group, trap in ((MISTAKE, "a"), (FORCE, "gust"))
         ]
     )
 
 
-def told_of_forces(rows):
-    found = honesty.findings_of(rows)
-    return found, render("honesty", found, {}, stamp="stamp", quick=False)
+def test_sentences_turn_with_the_rows():
+    rows = pd.DataFrame([row(MISTAKE, trap, solver) for trap in ("a", "b") for solver in (OTHER, THEIRS)])
+    _, text = said(honesty, rows)
+    assert "None of ours is silently wrong" in text and "All runs are correct: a; b." in text
+    rows.loc[3, "outcome"] = honesty.SAID
+    assert "All runs are correct: a." in said(honesty, rows)[1]
+    rows.loc[rows["trap"] == "b", "outcome"] = honesty.SILENT
+    _, text = said(honesty, rows)
+    assert "- Of ours 1 run is silently wrong or hangs: b." in text
+    assert "All runs are correct: a." in text and "All runs report failure" not in text
+    assert "No solver notices: b" in text
 
 
 def test_trust_is_counted_over_mistakes_and_forces():
-    found, text = told_of_forces(rows_of_forces())
+    found, text = said(honesty, rows_of_forces())
     none = dict.fromkeys(("wrong", "unasked", "gross", "slight", "refused"), 0)
     assert found["trust"]["default"] == none | {"n": 2}
-    found, text = told_of_forces(rows_of_forces([(COMPILED, FORCE), (OTHER, FORCE), (THEIRS, MISTAKE)]))
+    found, text = said(honesty, rows_of_forces([(COMPILED, FORCE), (OTHER, FORCE), (THEIRS, MISTAKE)]))
     wrong = dict.fromkeys(KINDS, 0) | {"ours": 2, "scipy": 1, "others": 1}
     assert {name: each["wrong"] for name, each in found["trust"].items()} == wrong
     assert "| our other methods | 0 | 0 | 0 | 4 | 0 | 2 |" in text
@@ -193,7 +167,7 @@ def test_an_error_is_large_or_small_and_a_run_without_an_end_is_large():
     rows = rows_of_forces([(OURS, MISTAKE), (OURS, FORCE), (THEIRS, FORCE)])
     rows.loc[rows["solver"] == OURS, "error"] = [2.0 * honesty.EXACT, 0.5 * honesty.EXACT]
     rows.loc[(rows["solver"] == THEIRS) & (rows["group"] == FORCE), ["outcome", "error"]] = honesty.HANG, np.nan
-    found, text = told_of_forces(rows)
+    found, text = said(honesty, rows)
     got = {who: (found["trust"][who]["gross"], found["trust"][who]["slight"]) for who in ("default", "scipy")}
     assert got == {"default": (1, 1), "scipy": (1, 0)}
     assert "| the default | 0 | 0 | 0 | 2 | 1 | 1 |" in text and "off by 1e-5 to 1e-3 |" in text
@@ -210,7 +184,7 @@ def test_every_solver_is_of_one_kind():
 def test_a_force_that_was_never_evaluated_stays_among_the_wrong_ones():
     rows = rows_of_forces([(OURS, MISTAKE), (THEIRS, MISTAKE), (THEIRS, FORCE)])
     rows.loc[rows["group"] == MISTAKE, "asked"] = False
-    found, text = told_of_forces(rows)
+    found, text = said(honesty, rows)
     assert (found["trust"]["default"]["wrong"], found["trust"]["default"]["unasked"]) == (1, 1)
     assert (found["trust"]["others"]["wrong"], found["trust"]["others"]["unasked"]) == (2, 1)
     assert found["traps"][0]["silent"] == [OURS, THEIRS]
@@ -237,7 +211,7 @@ def test_a_refusal_is_no_run(message):
     rows = rows_of_forces()
     changed = (rows["solver"] == COMPILED) & (rows["group"] == MISTAKE)
     rows.loc[changed, ["outcome", "status"]] = honesty.NOT_RUN, "RAISED"
-    found, text = told_of_forces(rows)
+    found, text = said(honesty, rows)
     assert found["trust"]["ours"]["n"] == 3 and found["trust"]["ours"]["refused"] == 1
     assert "| our other methods | 0 | 0 | 0 | 3 | 0 | 0 |" in text and "1 of our other methods." in text
 
@@ -284,14 +258,14 @@ def test_forces_held_out_are_others_and_counted_apart():
     assert row_of(held[0])["outcome"] == honesty.RIGHT and GROWN < honesty.LOOSENESS
     again = rows_of_forces([(OURS, FORCE)])
     apart = again[again["group"] == FORCE].assign(group=HELD_OUT)
-    found, text = told_of_forces(pd.concat([rows_of_forces(), apart], ignore_index=True))
+    found, text = said(honesty, pd.concat([rows_of_forces(), apart], ignore_index=True))
     assert found["trust"]["default"]["wrong"] == 0 and found["held_out"]["trust"]["default"]["wrong"] == 1
     assert "| the default | gust | pendulum | 1e-9 |" in text and "with a seed of their own" in text
 
 
 def test_checks_of_the_input_are_counted_apart():
     line = rows_of_forces().assign(group=INPUT, trap="inconsistent positions", outcome=honesty.SILENT)
-    found, text = told_of_forces(pd.concat([rows_of_forces(), line], ignore_index=True))
+    found, text = said(honesty, pd.concat([rows_of_forces(), line], ignore_index=True))
     assert {name: each["wrong"] for name, each in found["trust"].items()} == dict.fromkeys(found["trust"], 0)
     assert found["n_traps"] == 1 and found["input"]["n_traps"] == 1
     assert "6 of 6 runs of ours" in text and "2 of 2 of others (inconsistent positions)" in text

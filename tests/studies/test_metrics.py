@@ -7,7 +7,7 @@ import pytest
 
 from studies.bench import metrics
 from studies.bench.reference_motion import ReferenceMotion
-from tests.problems import pendulum, pendulum_energy, pendulum_state
+from tests.problems import held_twice, pendulum, pendulum_energy, pendulum_state
 from twoloop import solve_dae
 from twoloop.mechanisms import Problem
 
@@ -93,12 +93,6 @@ def test_correct_digits():
 
 
 def test_multipliers_that_are_not_unique_are_not_compared():
-    twice = pendulum(
-        n_c=2,
-        constraint=lambda t, q: np.array([0.5 * (q @ q - 1.0)] * 2),
-        jacobian=lambda t, q: np.array([q, q]),
-        gamma=None,
-    )
-    assert metrics.multipliers(twice, 0.0, np.array([1.0, 0.0]), np.zeros(2)) is None
+    assert metrics.multipliers(held_twice(), 0.0, np.array([1.0, 0.0]), np.zeros(2)) is None
     one = metrics.multipliers(pendulum(), 0.0, *pendulum_state(0.0)[:2])
     assert one == pytest.approx(pendulum_state(0.0)[2])

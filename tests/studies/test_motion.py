@@ -1,39 +1,27 @@
 """The motion study: its sentences turn with the rows, and what must hold in the rows of a quick run."""
 
-import json
-
 import numpy as np
 import pandas as pd
 import pytest
 
 from studies import motion
-from studies.bench.cli import Call
 from studies.bench.solvers import CANONICAL, CATALOGUE, GEAR_ORDERS, IRK, LINE_UP, NEWMARK, gear
-from studies.bench.store import Output
 from studies.motion import VISIBLE, find
+from tests.studies.of_study import GOOD, QuickRun, found_of, told
+
+STUDIED = motion
 
 
 def rows():
     """Medians of a full run, made up but like them."""
-    good = {"status": "REACHED_END", "message": "", "problem": "four-bar", "t_end": 100.0, "floor": 1e-11, "repeat": 0}
-    good |= {
-        "error_q": 1e-6,
-        "call_s": 1.0,
-        "n_evaluations": 1e4,
-        "kinetic": 22.5,
-        "range_y3": 0.726,
-        "err_out": np.nan,
-        "case": "four-bar",
-    }
+    good = GOOD | {"problem": "four-bar", "case": "four-bar", "t_end": 100.0, "floor": 1e-11, "error_q": 1e-6}
+    good |= {"call_s": 1.0, "n_evaluations": 1e4, "kinetic": 22.5, "range_y3": 0.726, "err_out": np.nan}
     good |= {"error_y3": 5e-3, "error_y3_short": 1e-6, "top": 0.0, "top_late": -1e-4, "energy": -1e-3, "growth": 2.0}
-    good |= {"good_until": 100.0, "lost": False, "astray": False, "h": np.nan, "tol": np.nan, "case": "four-bar"}
+    good |= {"good_until": 100.0, "lost": False, "astray": False, "h": np.nan, "tol": np.nan}
     lines = []
 
     def add(group, name, value, **more):
-        solver = CATALOGUE[name]
-        told = {"family": solver.family, "called_from": solver.called_from, "solver": name, "group": group}
-        told |= {"keeps_constraints": solver.keeps_constraints, solver.setting: value}
-        lines.append({**good, **told, **more})
+        lines.append({**good, **told(name), "group": group, CATALOGUE[name].setting: value, **more})
 
     for name, value in LINE_UP.items():
         add("line-up", name, value, growth=1.0 if name == CANONICAL else 2.0)
@@ -44,16 +32,9 @@ def rows():
     return pd.DataFrame(lines)
 
 
-def found_of(folder, made, quick=False):
-    """The findings, with which the report was written."""
-    with Output(Call("motion", quick, folder, False, "")) as output:
-        motion.STUDY.report(output, made, "stamp")
-    return json.loads((folder / "motion.json").read_text())
-
-
 @pytest.mark.usefixtures("unsaved")
 def test_findings_turn_with_the_rows(tmp_path):
-    found = found_of(tmp_path, rows())
+    found = found_of(motion, tmp_path, rows())
     gear_found = found["gear"]
     assert found["procedures_hold"] and found["agree"] and found["agree_long"]
     assert (gear_found["n"], gear_found["off_coarse"], gear_found["off_fine"]) == (6, [1, 2, 3], [1, 2])
@@ -68,15 +49,15 @@ def test_findings_turn_with_the_rows(tmp_path):
     made.loc[stand_in & long, "error_y3_short"] = 0.5
     made.loc[made["solver"] == CANONICAL, "growth"] = 2.5
     made.loc[made.index[-1], ["status", "message", "error_y3"]] = ["SOLVER_FAILED", "why", np.nan]
-    found = found_of(tmp_path, made)
+    found = found_of(motion, tmp_path, made)
     assert {one["solver"]: one["holds"] for one in found["procedures"]} == {IRK: True, NEWMARK: False}
     assert not found["procedures_hold"] and not found["agree"] and found["canonical_growth"] == 2.5
     assert len(found["gear"]["off_coarse"]) == 6 and found["gear"]["off_fine"] == []
 
     made.loc[stand_in, ["error_y3", "error_y3_short"]] = 1e-3
-    found = found_of(tmp_path, made)["gear"]
+    found = found_of(motion, tmp_path, made)["gear"]
     assert found["off_coarse"] == found["off_long"] == found["both"] == []
-    found_of(tmp_path, made, quick=True)
+    found_of(motion, tmp_path, made, quick=True)
 
 
 def test_the_full_study_lists_its_runs_once():
@@ -86,30 +67,12 @@ def test_the_full_study_lists_its_runs_once():
     assert len(motion.runs(True)) < 40
 
 
-@pytest.fixture(scope="module")
-def out(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("motion")
-    motion.main(["--quick", "--out", str(folder)])
-    return folder
-
-
-@pytest.fixture(scope="module")
-def made(out):
-    return pd.read_csv(out / "motion.csv", comment="#")
-
-
 def at(made, order, step):
     return find(made, gear(order), step)
 
 
-@pytest.mark.usefixtures("unsaved")
-def test_the_report_can_be_drawn_again(out):
-    text = (out / "motion.md").read_text()
-    motion.main(["--quick", "--out", str(out), "--redraw"])
-    assert (out / "motion.md").read_text() == text
-    for name in ("short", "long", "error"):
-        assert all((out / f"motion_{name}.{suffix}").stat().st_size > 10_000 for suffix in ("png", "svg"))
-    assert (out / "motion_series.npz").stat().st_size < 300_000
+class TestQuickRun(QuickRun):
+    pictures = ("motion_short", "motion_long", "motion_error")
 
 
 def test_the_stand_in_of_order_2_is_visibly_wrong_at_a_long_step_only(made):

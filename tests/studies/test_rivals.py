@@ -12,18 +12,18 @@ from studies.bench.runs_by_error import LOOSEST
 from studies.bench.solvers import CATALOGUE, OWN, RIVALS
 from studies.bench.store import KeptRows
 from studies.work_precision import goals, rivals
+from tests.studies.of_study import median
 
 
 def rows(*lines, case="four-bar"):
     """Medians of (solver, family, called from, error, seconds), of five equal repetitions, at the loosest setting."""
-    made = []
-    for solver, family, called_from, error, cpu in lines:
-        row = {"group": rivals.GROUP, "case": case, "solver": solver, "family": family, "called_from": called_from}
-        row |= {"error_q": error, "floor": 1e-14, "tol": LOOSEST, "n_evaluations": 1e6 * cpu}
-        row |= {"call_s": cpu, "call_q1": cpu, "call_q3": cpu, "times": (cpu,) * 5}
-        row |= {"violation_q": 1e-15, "violation_v": 1e-15, "energy": 0.0, "keeps_constraints": True}
-        made.append(row | {"status": "REACHED_END", "repeat": 0})
-    return pd.DataFrame(made)
+    told = {"group": rivals.GROUP, "case": case, "tol": LOOSEST}
+    return pd.DataFrame(
+        [
+            median(solver, error, cpu, family=family, called_from=called_from, times=(cpu,) * 5, **told)
+            for solver, family, called_from, error, cpu in lines
+        ]
+    )
 
 
 def compared(own, heyoka, python=9.0, error=1e-14):

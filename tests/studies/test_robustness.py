@@ -10,8 +10,8 @@ import pytest
 from references.paper.four_bar_minimal import MinimalFourBar
 from studies.bench.apart import apart
 from studies.bench.random_linkages import GRASHOF, KINDS, NEAR, draw, end_of, end_of_scaled, four_lengths, scaled
-from studies.bench.render import render
 from studies.robustness import study as robustness
+from tests.studies.of_study import said
 from twoloop.mechanisms import four_bar
 
 
@@ -118,13 +118,8 @@ def rows_of(outcome, last=1e-16):
     return pd.DataFrame([*lines, long | {"value": 1.0}, long | {"value": 10.0}, sharp])
 
 
-def text_of(rows):
-    found = robustness.findings_of(rows)
-    return render("robustness", found, {}, stamp="stamp", quick=False)
-
-
 def test_sentences_turn_with_the_rows():
-    good = text_of(rows_of("right"))
+    _, good = said(robustness, rows_of("right"))
     assert "No run of the linkages, of any size and mass" in good
     assert "With all methods none of 1 runs is silently wrong, of 1 random mechanisms under sharp forces (half" in good
     assert "- None of 1 random mechanisms under sharp forces, each run at one tolerance from 1e-4 to 1e-4, mis" in good
@@ -136,14 +131,14 @@ def test_sentences_turn_with_the_rows():
     assert "1 runs that count as right there are off by more than 1e-2." in good
     assert "All methods are right from 1e-6 to 1e3 m" in good
     assert "The violation does not grow" in good
-    bad = text_of(rows_of(robustness.SILENT, last=1e-12))
+    _, bad = said(robustness, rows_of(robustness.SILENT, last=1e-12))
     assert "Of linkages, sizes and masses: 2 runs" in bad
     assert "With all methods 1 of 1 runs are silently wrong, of 1 random mechanisms under sharp forces" in bad
     assert "(half of them drags and frictions): drag in 1 run." in bad
     assert "- 1 of 1 random mechanisms under sharp" in bad
     assert " 1e-4, misleads the default (drag: off by 0.020 at 1e-4);" in bad
     more = pd.concat([rows_of(robustness.SILENT), rows_of(robustness.SILENT).tail(1).assign(error=0.3, value=1.0)])
-    text = text_of(more.reset_index(drop=True))
+    _, text = said(robustness, more.reset_index(drop=True))
     assert "- 2 of 2 random" in text and " mislead the default (at worst drag: off by 0.30 at 1e-4);" in text
     assert "All methods are right from" in bad and "from 1e0 to 1e3 m" in bad
     assert "The violation grows in runs of 10 steps and more with BDF" in bad

@@ -200,15 +200,6 @@ def test_every_row_has_its_processor(tmp_path):
         assert kept["a"] == {"x": 1, "processor": processor()}
 
 
-def test_a_study_pins_its_threads_whoever_starts_it():
-    names = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "XLA_FLAGS")
-    environment = {name: value for name, value in os.environ.items() if name not in names} | {"OMP_NUM_THREADS": "4"}
-    code = f"import sys, os, studies; assert 'numpy' not in sys.modules; print([os.environ[n] for n in {names!r}])"
-    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, env=environment, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.startswith("['1', '1', '1', '--xla_cpu_multi_thread_eigen=false intra_op")
-
-
 def test_no_text_tells_where_the_project_lies(tmp_path):
     with Output(call(tmp_path)) as output:
         output.save_rows(pd.DataFrame({"message": [f"refused ({ROOT / 'studies' / 'traps.py'}, line 56)"]}), STAMP)

@@ -2,8 +2,8 @@
 
 import pandas as pd
 
-from studies.bench.render import render
 from studies.symbolic_size import study as symbolic_size
+from tests.studies.of_study import said
 
 
 def rows():
@@ -16,13 +16,8 @@ def rows():
     return pd.DataFrame([*sizes, twin | {"hand_evaluations": 100, "twin_evaluations": 100}])
 
 
-def text(rows):
-    found = symbolic_size.findings_of(rows)
-    return render("symbolic_size", found, {}, stamp="stamp", quick=False, rows=rows)
-
-
 def test_sentences_turn_with_the_rows():
-    given = text(rows())
+    _, given = said(symbolic_size, rows())
     assert "All chains up to n = 5 were derived and compiled" in given
     assert "compiling takes 30 s with them (`tangents=True`) and 3.0 s without" in given
     assert "takes 1.5 s of CPU time in the median, 1.5 s at most" in given
@@ -30,7 +25,7 @@ def test_sentences_turn_with_the_rows():
     worse = rows()
     worse.loc[0, "second_s"], worse.loc[1, "status"] = 2.5, "TIME_LIMIT"
     worse.loc[2, ["twin_us", "twin_evaluations"]] = 2.0, 101.0
-    given = text(worse)
+    _, given = said(symbolic_size, worse)
     assert "Not all chains were derived and compiled: angles, n = 5: TIME_LIMIT" in given
     assert "takes 2.5 s of CPU time in the median, 2.5 s at most" in given
     assert "costs 2.0 to 2.0 times as much" in given

@@ -1,16 +1,13 @@
 """Table 3: its sentences turn with the rows, and the causes are computed."""
 
 import itertools
-import json
 
 import numpy as np
 import pandas as pd
 import pytest
 
-from studies.bench.cli import Call
 from studies.bench.collector import REPEATS
 from studies.bench.solvers import IDA_C, IRK, IRK_LINE, NEWMARK, QUARTER
-from studies.bench.store import Output
 from studies.table3 import study as table3
 from studies.table3.causes import (
     FAMILIES,
@@ -25,16 +22,18 @@ from studies.table3.causes import (
     in_two_groups,
     printed,
 )
+from tests.studies.of_study import GOOD, QuickRun, found_of
 
+STUDIED = table3
 PROBLEMS = ("four-bar 1, 2, 1.5 m on 3 m", "four-bar 0.8, 1.2, 1 m on 2 m")
 
 
 def rows(machine=10.0, step=0.0, t_end=100.0):
     """Rows in which the paper's code is `machine` times slower, and costs `step` more evaluations an attempted step."""
-    common = {"family": "two-loop", "called_from": "compiled", "keeps_constraints": True, "status": "REACHED_END"}
-    common |= {"message": "", "floor": 1e-11, "error_v": 0.1, "error_end": 0.01, "energy": 0.0, "t_end": t_end}
+    common = GOOD | {"family": "two-loop", "called_from": "compiled", "keeps_constraints": True}
+    common |= {"floor": 1e-11, "error_v": 0.1, "error_end": 0.01, "energy": 0.0, "t_end": t_end}
     common |= {"violation_q": 1e-15, "violation_v": 1e-15, "violation_early": 1e-16, "violation_late": 1e-16}
-    common |= {"lost": False, "astray": False, "repeat": 0, "start_up_s": 1.0, "kinetic": 20.0, "n_rejected": 0.0}
+    common |= {"lost": False, "astray": False, "start_up_s": 1.0, "kinetic": 20.0, "n_rejected": 0.0}
     common |= {"err_in": np.nan, "err_out": np.nan, "tol": np.nan, "h": np.nan, "n_inner": 1.0}
     lines = []
     for problem in PROBLEMS:
@@ -74,24 +73,17 @@ def rows(machine=10.0, step=0.0, t_end=100.0):
     return pd.DataFrame(lines)
 
 
-def found_of(tmp_path, made, quick=False):
-    """The findings, with which the report was written."""
-    with Output(Call("table3", quick, tmp_path, True, "")) as output:
-        table3.STUDY.report(output, made, "stamp")
-    return json.loads((tmp_path / "table3.json").read_text())
-
-
 @pytest.mark.usefixtures("unsaved")
 def test_the_cells_are_the_papers_time_over_ours(tmp_path):
-    assert found_of(tmp_path, rows())["one_constant"] is True
+    assert found_of(table3, tmp_path, rows())["one_constant"] is True
     assert "0.36 / 3.60 ×10" in (tmp_path / "table3.md").read_text()  # paper time over ours in every cell
 
 
 @pytest.mark.usefixtures("unsaved")
 def test_one_machine_constant_is_told_from_more(tmp_path):
-    found = found_of(tmp_path, rows())
+    found = found_of(table3, tmp_path, rows())
     assert found["one_constant"] and found["span_time"] == pytest.approx(1.0)
-    assert not found_of(tmp_path, rows(step=2.0))["one_constant"]
+    assert not found_of(table3, tmp_path, rows(step=2.0))["one_constant"]
     found = causes(rows(step=2.0).query("problem == @PROBLEMS[0]"))
     assert found["span_time"] > 1.5 and not found["one_constant"]
     assert found["partition_us"] == pytest.approx(2.0)
@@ -103,7 +95,7 @@ def test_one_machine_constant_is_told_from_more(tmp_path):
 def test_a_partition_too_cheap_to_be_measured_explains_nothing(tmp_path):
     made = rows(step=2.0)
     made.loc[made["solver"] == "fixed step, symmetric", "call_s"] = 0.09
-    found = found_of(tmp_path, made)
+    found = found_of(table3, tmp_path, made)
     assert found["partition_us"] <= 0.0 and not found["partition_explains"]
 
 
@@ -117,7 +109,7 @@ def test_ratios_of_times_show_their_scatter():
 
 @pytest.mark.usefixtures("unsaved")
 def test_findings_turn_with_the_rows(tmp_path):
-    found = found_of(tmp_path, rows())
+    found = found_of(table3, tmp_path, rows())
     assert (found["newmark_lost"], found["irk_lost"], found["failed"]) == (["1e-3"], [], 0)
     assert found["newmark_dearer_everywhere"] and found["newmark_over_irk"] == pytest.approx([3.0, 4.0])
     assert {at["solver"] for at in found["cheapest"]} == {"Gauss12"}
@@ -127,7 +119,7 @@ def test_findings_turn_with_the_rows(tmp_path):
     made.loc[made["solver"] == IDA_C, "call_s"] = 0.01
     failing = made.index[made["solver"] == IDA_C][-1]
     made.loc[failing, ["status", "error_q"]] = ["STEP_TOO_SMALL", np.nan]
-    found = found_of(tmp_path, made)
+    found = found_of(table3, tmp_path, made)
     assert found["newmark_lost"] == [] and found["irk_lost"][0] == "1e-3" and not found["newmark_dearer_everywhere"]
     assert (found["failed"], found["failed_two_loop"]) == (1, 0)
     assert (found["cheapest"][0]["solver"], found["cheapest"][0]["ours"]) == (IDA_C, False)
@@ -135,7 +127,7 @@ def test_findings_turn_with_the_rows(tmp_path):
 
 @pytest.mark.usefixtures("unsaved")
 def test_both_readings_of_the_stopping_test_are_compared_with_the_printed_row(tmp_path):
-    found = found_of(tmp_path, rows())["readings"]
+    found = found_of(table3, tmp_path, rows())["readings"]
     assert {line["over"]: line["astray"] for line in found} == {"all of z": False, "y_i only": True}
     every, independent = found
     assert independent["rms"] == pytest.approx(0.0, abs=1e-12) and every["rms"] > 0.1
@@ -143,24 +135,24 @@ def test_both_readings_of_the_stopping_test_are_compared_with_the_printed_row(tm
     assert "the run on all of z stays in phase, the run on y_i only leaves the phase." in text
     made = rows()
     made.loc[made["solver"].str.contains("y_i only"), "status"] = "RAISED"
-    assert len(found_of(tmp_path, made)["readings"]) == 1
+    assert len(found_of(table3, tmp_path, made)["readings"]) == 1
     assert "deviate (rms)" not in (tmp_path / "table3.md").read_text()
 
 
 @pytest.mark.usefixtures("unsaved")
 def test_the_exchanged_labels_fit_only_where_they_do(tmp_path):
-    assert not found_of(tmp_path, rows(step=2.0))["exchanged_fits_better"]
+    assert not found_of(table3, tmp_path, rows(step=2.0))["exchanged_fits_better"]
     made = rows()
     cells_ = made["group"] == "Table 3: IRK"
     paper = [PAPER_IRK[TOLERANCES.index(o)][TOLERANCES.index(i)] for i, o in made[cells_][["err_in", "err_out"]].values]
     made.loc[cells_, "n_evaluations"] = 1e5 * np.array(paper)
-    found = found_of(tmp_path, made)
+    found = found_of(table3, tmp_path, made)
     assert found["exchanged_fits_better"] and found["fits"]["exchanged"]["span"] <= found["flat"]
 
 
 @pytest.mark.usefixtures("unsaved")
 def test_a_quick_report_compares_nothing_with_the_paper(tmp_path):
-    found_of(tmp_path, rows(t_end=10.0), quick=True)
+    found_of(table3, tmp_path, rows(t_end=10.0), quick=True)
     assert "3.60" not in (tmp_path / "table3.md").read_text()
 
 
@@ -180,18 +172,11 @@ def test_the_study_lists_all_cells_once():
     assert sum(run.repeats for run in table3.runs(*four_bar.cases(True), True)) < 100
 
 
-@pytest.fixture(scope="module")
-def out(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("table3")
-    table3.main(["--quick", "--out", str(folder)])
-    return folder
+class TestQuickRun(QuickRun):
+    pictures = ("table3",)
 
 
-@pytest.mark.usefixtures("unsaved")
-def test_the_quick_study_runs_and_is_drawn_again(out):
-    text = (out / "table3.md").read_text()
-    assert (out / "table3.png").exists() and (out / "table3.svg").exists()
-    made = pd.read_csv(out / "table3.csv", comment="#")
+def test_the_quick_study_has_all_cells(made):
     found = made[made["group"].isin(FAMILIES) & (made["case"] == "four-bar")]
     assert len(found) == 32 and (found["status"] == "REACHED_END").all()
     newmark = found[(found["solver"] == NEWMARK) & (found["err_in"] == 1e-9)].set_index("err_out")
@@ -199,9 +184,6 @@ def test_the_quick_study_runs_and_is_drawn_again(out):
         assert 3.5 < newmark["n_evaluations"][finer] / newmark["n_evaluations"][coarser] < 5.0
     irk = found[(found["solver"] == IRK) & (found["err_in"] == 1e-9)].set_index("err_out")
     assert newmark["n_evaluations"][1e-9] > 5.0 * irk["n_evaluations"][1e-9]
-    table3.main(["--quick", "--out", str(out), "--redraw"])
-    assert (out / "table3.md").read_text() == text
-    assert not list(out.glob("*.partial.jsonl"))
 
 
 def test_the_default_is_called_a_series_where_it_takes_the_steps_of_one():

@@ -7,17 +7,12 @@ import pytest
 from studies.bench import figures, tables
 from studies.bench.cli import Call
 from studies.bench.store import Output
+from tests.studies.of_study import median
 
 
 def rows(*lines, floor=1e-12):
     """Rows of (solver, error, seconds), one repetition each."""
-    common = {"family": "two-loop", "called_from": "compiled", "keeps_constraints": True, "status": "REACHED_END"}
-    common |= {"floor": floor, "violation_q": 1e-16, "violation_v": 1e-16, "energy": 0.0, "repeat": 0, "message": ""}
-    made = [
-        {"solver": solver, "error_q": error, "call_s": cpu, "call_q1": cpu, "call_q3": cpu, "n_evaluations": 1e3 * cpu}
-        for solver, error, cpu in lines
-    ]
-    return pd.DataFrame([{**common, **line} for line in made])
+    return pd.DataFrame([median(*line, floor=floor, n_evaluations=1e3 * line[2]) for line in lines])
 
 
 def test_medians_keep_the_repetition_of_median_error_and_the_quartiles_of_time():

@@ -9,10 +9,10 @@ import pytest
 
 from studies.bench import end_states
 from studies.bench.collector import Run
-from studies.bench.render import render
 from studies.bench.solvers import CATALOGUE
 from studies.validation import deceived
 from studies.validation import study as validation
+from tests.studies.of_study import said
 from twoloop import mechanisms, solve_dae
 
 
@@ -92,13 +92,6 @@ def made_up(**changed):
     return pd.DataFrame(lines)
 
 
-def found_of(rows):
-    """The findings, of which a report can be written."""
-    found = validation.findings_of(rows)
-    render("validation", found, {}, stamp="stamp", quick=False)
-    return found
-
-
 def alone_of(found):
     """Where ours alone are right: what became of the others, as far as anything did."""
     return {
@@ -108,36 +101,35 @@ def alone_of(found):
 
 
 def test_findings_turn_with_the_rows():
-    found = found_of(made_up())
+    found = said(validation, made_up())[0]
     assert found["ours_always"] == ["Gauss12", "BDF"] and found["only_others"] == found["ours_short"] == []
     assert found["solvers"][0]["slope"] == pytest.approx([1.0, 1.0, 1.0])
     stopped = {"status": "STEP_TOO_SMALL", "outcome": "said so", "error_q": np.nan, "digits_q": np.nan}
-    found = found_of(made_up(where=[("A02, N = 1", "Gauss12"), ("A02, N = 1", "BDF")], what=stopped))
+    found = said(validation, made_up(where=[("A02, N = 1", "Gauss12"), ("A02, N = 1", "BDF")], what=stopped))[0]
     assert found["ours_always"] == [] and found["only_others"] == ["A02, N = 1"]
     assert [(line["case"], line["stopped"]) for line in found["ours_short"]] == [("A02, N = 1", ["Gauss12"])]
     wrong = {"outcome": "wrong", "error_q": 1e-3, "digits_q": 3.0}
-    found = found_of(made_up(where=[("double pendulum", "BDF")], what=wrong))
+    found = said(validation, made_up(where=[("double pendulum", "BDF")], what=wrong))[0]
     (tight,) = found["ours_wrong_tight"]
     assert (tight["solver"], tight["case"], tight["error_q"]) == ("BDF", "double pendulum", 1e-3)
     assert found["n_wrong"] == {"ours": 4, "others": 0}
     refused = {"outcome": "not run", "status": "RAISED", "error_q": np.nan, "digits_q": np.nan}
-    found = found_of(made_up(where=[("double pendulum", "LSODA, index 1")], what=refused))
+    found = said(validation, made_up(where=[("double pendulum", "LSODA, index 1")], what=refused))[0]
     assert alone_of(found) == {"double pendulum": {"not run": ["LSODA, index 1"]}}
-    found = found_of(made_up(where=[("double pendulum", "LSODA, index 1")], what=wrong))
+    found = said(validation, made_up(where=[("double pendulum", "LSODA, index 1")], what=wrong))[0]
     assert alone_of(found) == {"double pendulum": {"wrong": ["LSODA, index 1"]}}
     assert found["n_ended"] == {"ours": 16, "others": 8}
     stopped = stopped | {"status": "TIME_LIMIT"}
-    found = found_of(made_up(where=[("double pendulum", "LSODA, index 1")], what=stopped))
+    found = said(validation, made_up(where=[("double pendulum", "LSODA, index 1")], what=stopped))[0]
     assert alone_of(found) == {"double pendulum": {"limit": ["LSODA, index 1"]}}  # our limit is no miss of theirs
     assert found["n_ended"] == {"ours": 16, "others": 4}
 
 
 def test_a_solver_that_was_run_and_was_inexact_is_not_called_one_that_was_not_run():
     inexact = {"outcome": "inexact", "error_q": 2e-5, "digits_q": 4.7}
-    found = validation.findings_of(made_up(where=[("double pendulum", "LSODA, index 1")], what=inexact))
-    text = render("validation", found, {}, stamp="stamp", quick=False)
-    said = "- On double pendulum only ours are right: `Gauss12` and `BDF`. Of the others, run and inexact: "
-    assert said + "`LSODA, index 1` (2e-5).\n" in text and "not run" not in text
+    _, text = said(validation, made_up(where=[("double pendulum", "LSODA, index 1")], what=inexact))
+    ours = "- On double pendulum only ours are right: `Gauss12` and `BDF`. Of the others, run and inexact: "
+    assert ours + "`LSODA, index 1` (2e-5).\n" in text and "not run" not in text
 
 
 def test_cells_that_are_no_failures_are_hatched():
@@ -192,15 +184,14 @@ def test_findings_of_steps_and_of_models_follow_their_rows():
     first |= {"n_deceived": 0, "worst_step": 0.3, "first_step": 8.0}
     exudyn = {"group": validation.MODELLED, "case": "heavy top", "solver": "Exudyn, HHT", "t_end": 1.0, "status": "x"}
     runs = [exudyn | {"h": 1.0 / n, "error_q": 100.0 / n**2} for n in (100, 400)]
-    found = found_of(pd.concat([made_up(), pd.DataFrame([first, *runs])]))
+    found, text = said(validation, pd.concat([made_up(), pd.DataFrame([first, *runs])]))
     assert found["models"]["n_steps"] == 400 and found["models"]["errors"] == pytest.approx([6.25e-4] * 2)
-    text = render("validation", found, {}, stamp="stamp", quick=False)
     cells = [
         line.strip("| ").split(" | ") for line in text.split("| deceived |\n")[1].split("\n\n")[0].splitlines()[1:]
     ]
     assert {line[0]: line[-1] for line in cells} == {"Gauss12": "–", "BDF": "0 %", "LSODA, index 1": "–"}
     assert found["models"]["orders"] == pytest.approx([2.0, 2.0]) and "converging at orders of 2.0 (theirs" in text
-    found = found_of(pd.concat([made_up(), pd.DataFrame([first | {"first_step": 0.5}])]))
+    found = said(validation, pd.concat([made_up(), pd.DataFrame([first | {"first_step": 0.5}])]))[0]
     assert found["models"] is None
 
 

@@ -1,16 +1,15 @@
 """The violation study: its sentences turn with the rows, and what must hold in the rows of a quick run."""
 
-import json
-
 import numpy as np
 import pandas as pd
 import pytest
 
 from studies import violation
-from studies.bench.cli import Call
 from studies.bench.solvers import CATALOGUE, CVODE_C_PROJECTED, IDA_C, IRK, baumgarte, gear
-from studies.bench.store import Output
 from studies.violation import ALONG, LOOSE, PAIRS, TIGHT, grows, kind
+from tests.studies.of_study import GOOD, QuickRun, found_of, told
+
+STUDIED = violation
 
 DRIFTS = {"violation_q": 1e-7, "violation_v": 1e-8, "growth_q": 2.0, "growth_v": 1.0, "early_q": 1e-9, "late_q": 1e-7}
 BAUMGARTE = baumgarte("DOP853", 10.0)
@@ -18,19 +17,17 @@ BAUMGARTE = baumgarte("DOP853", 10.0)
 
 def rows():
     """Medians of a full run, made up but like them."""
-    good = {"status": "REACHED_END", "message": "", "problem": "four-bar", "t_end": 100.0, "floor": 1e-11, "repeat": 0}
+    good = GOOD | {"problem": "four-bar", "case": "four-bar", "t_end": 100.0, "floor": 1e-11, "tol": 1e-8}
     good |= {"error_q": 1e-6, "call_s": 1.0, "n_evaluations": 1e4, "energy": 0.0, "err_in": np.nan, "err_out": np.nan}
     good |= {"violation_q": 9e-16, "violation_v": 2e-15, "violation_a": 3e-13, "violation_35": 4e-16, "h": np.nan}
-    good |= {"violation_36": 9e-16, "tol": 1e-8, "case": "four-bar"}
+    good |= {"violation_36": 9e-16}
     good |= {
         f"{what}_{level}": x for level in "qva" for what, x in (("growth", 0.0), ("early", 9e-16), ("late", 9e-16))
     }
     lines = []
 
     def add(group, name, **more):
-        solver = CATALOGUE[name]
-        told = {"family": solver.family, "called_from": solver.called_from, "solver": name, "group": group}
-        lines.append({**good, **told, "keeps_constraints": solver.keeps_constraints, **more})
+        lines.append({**good, **told(name), "group": group, **more})
 
     for name in (IRK, "Gauss12", "DOP853, projected"):
         add("line-up", name)
@@ -49,16 +46,9 @@ def rows():
     return pd.DataFrame(lines)
 
 
-def found_of(folder, made, quick=False):
-    """The findings, with which the report was written."""
-    with Output(Call("violation", quick, folder, False, "")) as output:
-        violation.STUDY.report(output, made, "stamp")
-    return json.loads((folder / "violation.json").read_text())
-
-
 @pytest.mark.usefixtures("unsaved")
 def test_findings_turn_with_the_rows(tmp_path):
-    found = found_of(tmp_path, rows())
+    found = found_of(violation, tmp_path, rows())
     assert not found["irk_grows"] and found["n_ours"] == 2 and found["ours_keep"] and not found["ours_growing"]
     assert found["others_growing"] == ["LSODA, index 1", "DOP853, index 1"] and found["growing_to"] == [1e-7, 1e-7]
     assert found["growing_unprojected"] and len(set(violation.LISTED)) == len(violation.LISTED)
@@ -79,7 +69,7 @@ def test_findings_turn_with_the_rows(tmp_path):
     made.loc[along & ~made["keeps_constraints"], "call_s"] /= 100.0
     made.loc[along & made["solver"].isin([drifting for _, drifting in PAIRS]), "call_s"] *= 200.0
     made.loc[made.index[-1], ["status", "message"]] = ["SOLVER_FAILED", "why"]
-    found = found_of(tmp_path, made)
+    found = found_of(violation, tmp_path, made)
     assert found["irk_grows"] and not found["ours_keep"] and found["ours_growing"] == [IRK]
     assert found["others_growing"] == [] and found["baumgarte_kept"] == 4
     assert (found["n_ranked"], found["n_kept_first"]) == (3, 0)
@@ -111,30 +101,12 @@ def test_the_full_study_lists_its_runs_once():
 
 
 @pytest.fixture(scope="module")
-def out(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("violation")
-    violation.main(["--quick", "--out", str(folder)])
-    return folder
-
-
-@pytest.fixture(scope="module")
-def made(out):
-    return pd.read_csv(out / "violation.csv", comment="#")
-
-
-@pytest.fixture(scope="module")
 def line_up(made):
     return made[made["group"] == "line-up"].set_index("solver")
 
 
-@pytest.mark.usefixtures("unsaved")
-def test_the_report_can_be_drawn_again(out):
-    text = (out / "violation.md").read_text()
-    violation.main(["--quick", "--out", str(out), "--redraw"])
-    assert (out / "violation.md").read_text() == text
-    for name in ("violation.png", "violation.svg", "violation_cost.png", "violation_cost.svg"):
-        assert (out / name).stat().st_size > 10_000
-    assert (out / "violation_series.npz").stat().st_size < 300_000
+class TestQuickRun(QuickRun):
+    pictures = ("violation", "violation_cost")
 
 
 def test_two_loop_procedures_keep_the_constraints_and_do_not_drift(line_up):
