@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from twoloop.checks.differences import EPS, Estimate, Function, confirms, differentiate
 from twoloop.checks.scales import column_scales, generic_factors, median, sizes
 from twoloop.checks.sparse_rows import Rows, SparseRows, apart, is_finite
-from twoloop.checks.values import SAME, check_values, unsymmetric_mass
+from twoloop.checks.values import SAME, UNSYMMETRIC, unsymmetric_mass, wrong_values
 from twoloop.kernels.compile.linking import direct
 from twoloop.kernels.data.common import FORCE_BY_Q_GIVEN, FORCE_BY_V_GIVEN, REACTION_BY_Q_GIVEN
 
@@ -69,29 +69,34 @@ def check_derivatives(system: ConstrainedSystem, t: float, q: Array, exact: Call
     if system.checked:
         return
     wrong = None if exact is not None and exact() else _wrong_constraint(system, t, q, FORWARD)
-    wrong = wrong or _wrong_tangent(system, t, q) or _unsymmetric_near(system, t, q)
+    wrong = wrong or _wrong_tangent(system, t, q) or _unsymmetric_near(system, t, q) or _wrong_kinematics(system, t, q)
+    if wrong is None and system.constant_mass:
+        wrong = _changed_mass(system, t, q, t + 1.0, q + 0.1 * sizes(q) * np.sign(generic_factors(system.n_q)))
     if wrong is not None:
         raise ValueError(wrong)
-    _check_kinematics(system, t, q)
-    _check_constant_mass(system, t, q)
     if system.bandwidth is not None:
         _check_bandwidth(system, system.bandwidth, t, q)
     near = q + NEAR_START * sizes(q) * np.random.default_rng(1).uniform(0.5, 1.5, system.n_q)
-    check_values(system, t, q if _defined(lambda: system.constraint(t, near)) is None else near)
+    wrong = wrong_values(system, t, q if _defined(lambda: system.constraint(t, near)) is None else near)
+    if wrong is not None:
+        raise ValueError(wrong)
     system.checked = True
 
 
+def unlike_itself(system: ConstrainedSystem, t: float, q: Array, t0: float, q0: Array) -> str | None:
+    """Say what of M, `kinematics` and values is not as it should be at a position of a run from (t0, q0), or None."""
+    wrong = _changed_mass(system, t0, q0, t, q) if system.constant_mass else unsymmetric_mass(system, t, q)
+    return wrong or _wrong_kinematics(system, t, q) or wrong_values(system, t, q)
+
+
 def wrong_derivative(system: ConstrainedSystem, t: float, q: Array, v: Array) -> str | None:
-    """Say which of C_q, C_t, gamma and M is wrong at a state of a run, or None: formulas may hold near the start only.
+    """Say which of C_q, C_t and gamma is wrong at a state of a run, or None: formulas may hold near the start only.
 
     One direction through all coordinates and time stands for all entries, so that this costs as a rule nine calls of
     `constraint`, ten of `jacobian` and of `constraint_rate` and one of `gamma`, whatever n_q. Only where the direction
     shows a difference are the entries compared one by one, as at the start. Tangents are not looked at: they decide
     whether Newton's method converges, not what it converges to.
     """
-    unsymmetric = None if system.constant_mass else unsymmetric_mass(system, t, q)
-    if unsymmetric is not None:
-        return unsymmetric
     jacobian, rate = system.sparse_rows(t, q), system.rates(t, q)
     if jacobian.size == 0 or not (is_finite(jacobian) and np.isfinite(rate).all()):
         return None
@@ -384,10 +389,10 @@ def _minus(function: Function) -> Function:
     return lambda s: -function(s)
 
 
-def _check_kinematics(system: ConstrainedSystem, t: float, q: Array) -> None:
-    """Compare the fused callback with the separate ones, which were compared with differences before."""
+def _wrong_kinematics(system: ConstrainedSystem, t: float, q: Array) -> str | None:
+    """Compare the fused callback with the separate ones, which are compared with differences."""
     if "kinematics" not in system.given:
-        return
+        return None
     from twoloop.kernels.evaluation.first_look import kinematics_agree
 
     rows = system.sparse_rows(t, q)[: system.n_c]
@@ -410,20 +415,20 @@ def _check_kinematics(system: ConstrainedSystem, t: float, q: Array) -> None:
                 entry = np.unravel_index(int((off - level).argmax()), off.shape)
                 where = int(entry[0]) if len(entry) == 1 else tuple(int(i) for i in entry)
                 here, there = _as_far_as_they_differ(float(fused[entry]), float(given[entry]))
-                raise ValueError(
+                return (
                     f"kinematics of {system.name!r} does not give what {kind} gives: entry {where} is "
                     f"{here} and {there} (near t = {t:.10g}). Correct it, or leave it out"
                 )
+    return None
 
 
-def _check_constant_mass(system: ConstrainedSystem, t: float, q: Array) -> None:
-    if not system.constant_mass:
-        return
-    shift = 0.1 * sizes(q) * np.sign(generic_factors(system.n_q))
+def _changed_mass(system: ConstrainedSystem, t0: float, q0: Array, t: float, q: Array) -> str | None:
+    """Say that a mass is not the same in two places, where it is said to be constant, or None."""
     mass = system.mass_values if "mass" in system.entries else system.mass
-    there = _defined(lambda: mass(t + 1.0, q + shift))
-    if there is not None and np.abs(there - mass(t, q)).max() > 1e-10 * np.abs(there).max():
-        raise ValueError(f"mass of {system.name!r} is said to be constant (constant_mass=True) and is not")
+    there = _defined(lambda: mass(t, q))
+    if there is None or not np.abs(there - mass(t0, q0)).max() > UNSYMMETRIC * np.abs(there).max():
+        return None
+    return f"mass of {system.name!r} is said to be constant (constant_mass=True) and is not"
 
 
 def _check_bandwidth(system: ConstrainedSystem, bandwidth: int, t: float, q: Array) -> None:
