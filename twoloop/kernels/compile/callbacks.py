@@ -217,7 +217,7 @@ def callback(kind: str) -> Callable[[Callable[..., None]], Dispatcher]:
 
     The function gets the time, the coordinates `q` (n_q,), where the kind has them the velocities `v` (n_q,) or the
     multipliers `lam` (n_c,), the parameters `p`, and the array to fill, which arrives full of zeros (a tangent's of a
-    system with a bandwidth only within the band: add to it)::
+    system with a bandwidth only within the band: add to it). It must not write to the others::
 
         @callback("jacobian")
         def jacobian(t, q, p, Cq):
@@ -236,7 +236,7 @@ def callback(kind: str) -> Callable[[Callable[..., None]], Dispatcher]:
     ValueError
         If `kind` is unknown.
     TypeError
-        If the function has other arguments, or numba cannot compile it.
+        If the function has other arguments, writes to one that it is given, or numba cannot compile it.
     """
     if callable(kind):
         raise TypeError('the decorator needs the kind of callback: write @callback("force"), not @callback')
@@ -282,7 +282,11 @@ def compile_callback(
 
 
 def _compiled_to_write(
-    kind: str, function: Callable[..., Any], watched: tuple[str, str] | None, named: Callable[..., Any], error: Exception
+    kind: str,
+    function: Callable[..., Any],
+    watched: tuple[str, str] | None,
+    named: Callable[..., Any],
+    error: Exception,
 ) -> Dispatcher:
     """The same of a function whose helpers are compiled for arrays that may be written; one that does so is refused."""
     try:
@@ -321,8 +325,8 @@ def stand_in(kind: str) -> Dispatcher:
 def _why_not(kind: str, function: Callable[..., Any], error: Exception) -> str:
     """Which function numba cannot compile, and the line of numba's message that says most."""
     return (
-        f"{kind}: numba cannot compile the function {_named(function)}; it must use numbers, numpy arrays of one type and "
-        f"of the shape that {kind} asks for, and functions that numba knows (helpers need numba.njit)\n"
+        f"{kind}: numba cannot compile the function {_named(function)}; it must use numbers, numpy arrays of one type "
+        f"and of the shape that {kind} asks for, and functions that numba knows (helpers need numba.njit)\n"
         f"Numba says: {_telling_line(error)}"
     )
 
