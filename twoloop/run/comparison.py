@@ -5,7 +5,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from twoloop.checks.derivatives import unlike_itself, wrong_derivative
+from twoloop.checks.derivatives import wrong_derivative
+from twoloop.checks.structure import unlike_itself
 from twoloop.generate.exact_derivatives import Territory, exact_derivatives, generic_states
 from twoloop.generate.traced_values import Sample
 from twoloop.run.record import Status
