@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.checks.differences import EPS, as_far_as_they_differ, defined
-from twoloop.checks.scales import generic_factors, generic_velocities, sizes
+from twoloop.checks.scales import generic_factors, generic_velocities
 from twoloop.checks.values import SAME, UNSYMMETRIC, unsymmetric_mass, wrong_values
 from twoloop.kernels.compile.linking import direct
 

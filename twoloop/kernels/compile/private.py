@@ -10,6 +10,7 @@ __all__ = ["Dispatcher", "also_for", "cgutils"]
 
 def also_for(function: Dispatcher, signature: Any) -> None:
     """Let a function of one signature be called with another, whose arguments are the same in memory."""
-    (compiled,) = function.overloads.values()
-    function._insert([each._code for each in signature.args], compiled.entry_point, False)
-    function.overloads[signature.args] = compiled._replace(signature=signature)
+    own: Any = function
+    (compiled,) = own.overloads.values()
+    own._insert([each._code for each in signature.args], compiled.entry_point, False)
+    own.overloads[signature.args] = compiled._replace(signature=signature)
