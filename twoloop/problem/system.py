@@ -245,7 +245,7 @@ class ConstrainedSystem:
             `with_parameters` makes a system of others, of which nothing is compiled again.
         compile : bool
             False: the functions are called as they are, with copies of q and v. True: numba compiles them, with
-            the values of closures and globals as they are now.
+            the values of closures and globals as they are now; they must not write to their arguments.
         mass_entries, jacobian_entries : (rows, columns), optional
             As for the class.
         bandwidth : int, optional
