@@ -5,12 +5,13 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numba
 import numpy as np
 import pytest
 
-from tests.compiled import circle, heavy, radius
+from tests.compiled import centripetal, circle, heavy, radius, unit_mass, weight
 from tests.problems import pendulum
-from twoloop import ConstrainedSystem, callback, solve_dae
+from twoloop import ConstrainedSystem, Status, callback, solve_dae
 from twoloop.kernels.compile.callbacks import KINDS, OPTIONAL
 from twoloop.kernels.data.common import GIVEN, KIT, Functions
 
@@ -172,3 +173,104 @@ def test_what_is_left_out_leaves_zeros(kind):
 def test_gamma_left_out_cannot_be_called():
     with pytest.raises(ValueError, match="'pendulum' was given no gamma"):
         pendulum(gamma=False).gamma(0.0, np.ones(2), np.ones(2))
+
+
+@numba.njit
+def wrapped(q):
+    if q[0] > np.pi:
+        q[0] -= 2.0 * np.pi
+
+
+def wraps_an_angle(t, q, v, p, Q):
+    if q[0] > np.pi:  # never at the start of a run
+        q[0] -= 2.0 * np.pi
+
+
+def limits_a_speed(t, q, v, p, Q):
+    rates = v[:1]
+    rates[0] = min(rates[0], 2.0)
+
+
+def keeps_a_state(t, q, v, p, Q):
+    if v[0] > 2.0:
+        p[0] = 1.0
+
+
+def scales(t, q, v, p, Q):
+    v *= 0.5
+
+
+def asks_a_helper(t, q, v, p, Q):
+    wrapped(q)
+
+
+@pytest.mark.parametrize("function", [wraps_an_angle, limits_a_speed, keeps_a_state, scales, asks_a_helper])
+def test_a_callback_that_writes_to_its_arguments_is_refused(function):
+    """The run went on with what it wrote: another angle, another speed, other parameters, without a word."""
+    with pytest.raises(TypeError, match=rf"'{function.__name__}' \(.*\(q, v, p\), which are those of the run. Copy"):
+        callback("force")(function)
+
+
+def test_functions_that_return_arrays_must_not_write_either():
+    def force(t, q, v):
+        if q[0] > 2.0:
+            v[1] = 0.0
+        return -v
+
+    with pytest.raises(TypeError, match=r"force: the function 'force' \(.*test_callbacks\.py.* must not change"):
+        pendulum(compile=True, force=force)
+    assert pendulum(force=force).force(0.0, [3.0, 0.0], [1.0, 1.0]).tolist() == [-1.0, 0.0]  # on copies it may
+
+
+def test_helpers_compiled_for_arrays_that_may_be_written_are_taken():
+    @numba.njit("f8(f8[::1])")
+    def first(x):
+        return x[0]
+
+    @callback("force")
+    def force(t, q, v, p, Q):
+        x = q.copy()
+        x[0] += 1.0
+        Q[0] = first(q) + x[0]
+
+    Q, q = np.zeros(1), np.ones(1)
+    force(0.0, q, q, q, Q)
+    assert Q[0] == 3.0 and q[0] == 1.0
+
+
+@callback("mass")
+def heavier_beyond(t, q, p, M):
+    M[0, 0] = 1.0 if q[0] < p[0] else 1.0 + q[0]
+
+
+@callback("force")
+def pushed(t, q, v, p, Q):
+    Q[0] = 1.0
+
+
+@pytest.mark.parametrize("method", ["auto", "Adams", "RadauIIA9", "TRBDF2", "Gauss8", "Newmark"])
+def test_a_mass_that_is_constant_at_the_start_only_ends_the_run(method):
+    """It was factored once, and the motion that of a lighter body, by every method."""
+    system = ConstrainedSystem(
+        n_q=1, n_c=0, mass=heavier_beyond, force=pushed, parameters=[1.0], constant_mass=True, name="growing"
+    )
+    for _ in range(3):  # what is kept of the runs before is of ones that failed
+        result = solve_dae(system, (0.0, 3.0), [0.0], [0.0], method, rtol=1e-6, atol=1e-6)
+        assert result.status is Status.WRONG_DERIVATIVE and "mass of 'growing' is said to be constant" in result.message
+    assert solve_dae(system, (0.0, 1.0), [0.0], [0.0], method, rtol=1e-6, atol=1e-6).success
+
+
+@callback("kinematics")
+def agrees_at_first(t, q, v, p, C, Cq, Ct, Qd):
+    C[0] = 0.5 * (q[0] * q[0] + q[1] * q[1] - 1.0)
+    Cq[0, 0], Cq[0, 1] = q[0], q[1] if q[0] > 0.0 else 1.01 * q[1]
+    Qd[0] = -(v[0] * v[0] + v[1] * v[1])
+
+
+@pytest.mark.parametrize("method", ["auto", "Adams", "TRBDF2"])
+def test_kinematics_that_agree_at_the_start_only_end_the_run(method):
+    given = dict(mass=unit_mass, force=weight, constraint=circle, jacobian=radius, gamma=centripetal)
+    system = ConstrainedSystem(n_q=2, n_c=1, **given, kinematics=agrees_at_first, name="fused")
+    result = solve_dae(system, (0.0, 1.0), [1.0, 0.0], [0.0, 0.0], method, rtol=1e-6, atol=1e-6)
+    assert result.status is Status.WRONG_DERIVATIVE
+    assert "kinematics of 'fused' does not give what jacobian gives: entry (0, 1)" in result.message

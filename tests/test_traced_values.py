@@ -317,17 +317,6 @@ def test_what_is_cancelled_exactly_may_be_rounded_in_the_callback():
     assert result.success
 
 
-@callback("force")
-def changes_q(t, q, v, p, Q):
-    q[0] = 0.5
-    Q[0] = -q[0]
-
-
-def test_a_compiled_callback_must_leave_what_it_is_given():
-    with pytest.raises(ValueError, match="force of 'free' must not change the arrays that it is given: it changes q"):
-        run(free(changes_q), "DOP853")
-
-
 @pytest.mark.parametrize("force", [Damper().force, Damper(), functools.partial(Damper.force, Damper())])
 def test_numba_takes_functions_only(force):
     with pytest.raises(TypeError, match=r"force: compile=True takes functions .* given"):

@@ -230,3 +230,21 @@ def test_solids_against_sums_over_points():
         assert lump.mass == pytest.approx(2.0 * 8.0 * len(held) / len(points), rel=0.01)
         J = lump.mass * (np.mean((held**2).sum(axis=1)) * np.eye(3) - held.T @ held / len(held))
         np.testing.assert_allclose(lump.J, J, atol=0.02 * lump.J.max())
+
+
+def test_defaults_of_tendons_and_what_else_was_passed_over(tmp_path):
+    text = """<mujoco>
+      <compiler inertiagrouprange="0 1"/>
+      <default><tendon stiffness="7" damping="2"/><equality active="false"/></default>
+      <worldbody>
+        <site name="a"/>
+        <body name="bob" pos="0 0 1"><freejoint/><geom size="0.1"/><site name="b"/></body>
+      </worldbody>
+      <tendon><spatial frictionloss="1"><site site="a"/><site site="b"/></spatial></tendon>
+      <equality><connect body1="bob" anchor="0 0 0"/></equality>
+    </mujoco>"""
+    with pytest.warns(IgnoredWarning, match="inertiagrouprange of the compiler; frictionloss of spatial"):
+        model = read(text, tmp_path)
+    problem = model.problem()
+    assert [value for name, value in problem.parameters.items() if "spring" in name][-3:] == [7.0, 2.0, 1.0]
+    assert len(problem.joints) == 0

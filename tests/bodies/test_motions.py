@@ -260,3 +260,20 @@ def test_a_torsion_spring_in_space_counts_more_than_half_a_turn():
     angle = 3.0 / frequency * np.sin(frequency * result.t)  # to 256 degrees
     np.testing.assert_allclose(result.q[6], np.sin(0.5 * angle), atol=1e-8)
     assert problem.conserved and np.ptp(problem.energy(result.t, result.q, result.v)) < 1e-8
+
+
+@pytest.mark.parametrize("method", ["auto", "DOP853", "RadauIIA9", "TRBDF2"])
+def test_a_torsion_spring_in_space_does_not_jump_after_a_turn(method):
+    """Its torque changed from one end to the other: a run went on, and said nothing."""
+    model = SpatialModel(gravity=(0.0, 0.0, 0.0))
+    wheel = model.body("wheel", mass=1.0, inertia=(1.0, 1.0, 1.0), position=(0.0, 0.0, 0.0), angular_velocity=(0, 0, 4))
+    hinge = model.revolute("ground", wheel, at=(0.0, 0.0, 0.0), axis=(0.0, 0.0, 1.0))
+    spring = model.torsion_spring(hinge, stiffness=0.05, damping=0.01)
+    problem = model.problem((0.0, 10.0))
+    result = solve_dae(problem.system, problem.t_span, problem.q0, problem.v0, method, rtol=1e-4, atol=1e-4)
+    assert not result.success
+    assert 0.85 < np.arctan2(result.q[6, -1], result.q[3, -1]) / np.pi <= 0.95
+    damped = problem.with_parameters({f"stiffness of {spring.name}": 0.0})  # a damper may turn on
+    result = solve_dae(damped.system, damped.t_span, damped.q0, damped.v0, method, rtol=1e-6, atol=1e-6)
+    rate = 2.0 * (result.q[3, -1] * result.v[6, -1] - result.q[6, -1] * result.v[3, -1])
+    assert result.success and rate == pytest.approx(4.0 * np.exp(-0.1), rel=1e-3)

@@ -38,6 +38,15 @@ def test_parameters_of_a_run(problem, monkeypatch):
     assert len(integrator._systems) <= 2
 
 
+def test_its_tolerances_stay(problem):
+    tolerances = np.full(9, 1e-9)
+    integrator = Integrator(problem.system, atol=tolerances)
+    runs = [integrator.run((0.0, 0.5), problem.q0, problem.v0)]
+    tolerances[:] = 1e-3
+    runs.append(integrator.run((0.0, 0.5), problem.q0, problem.v0))
+    assert (runs[0].q == runs[1].q).all()
+
+
 def test_wrong_tolerances_and_systems_are_named_when_it_is_made(problem):
     with pytest.raises(ValueError, match="rtol must be positive"):
         Integrator(problem.system, rtol=0.0)

@@ -103,6 +103,7 @@ class Loads(Collection):
             N m/rad and N m s/rad.
         angle : float
             By how much b must have turned against a, from the position given, for the spring to be without torque, rad.
+            In space b may turn by 0.95 of a turn to either side of that position; there the spring has no value beyond.
         name : str, optional
 
         Returns

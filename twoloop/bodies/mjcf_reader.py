@@ -22,6 +22,7 @@ Array = NDArray[np.float64]
 SEEN_ONLY = {"asset", "visual", "statistic", "size", "custom", "camera", "light"}  # without effect on the motion
 KNOWN = {"compiler", "option", "default", "worldbody", "equality", "tendon"}
 SOFT = ("armature", "frictionloss")
+DEFAULT_OF = {"spatial": "tendon", "fixed": "tendon", "connect": "equality", "weld": "equality"}  # elements of defaults
 AGREES = 1e-6  # of the pose that a weld asks for
 
 
@@ -91,6 +92,8 @@ class _Reader:
         for key in ("settotalmass", "balanceinertia", "boundmass", "boundinertia", "alignfree"):
             if compiler.get(key, "0") not in ("0", "-1", "false"):
                 self.ignored.append(f"{key} of the compiler")
+        if compiler.get("inertiagrouprange", "0 5").split() != ["0", "5"]:
+            self.ignored.append("inertiagrouprange of the compiler")
         if compiler.get("coordinate", "local") != "local":
             raise ValueError("coordinates of an MJCF file must be local; global ones were dropped by MuJoCo in 2.3.4")
         self.defaults: dict[str, dict[str, dict[str, str]]] = {"main": {}}
@@ -147,7 +150,7 @@ class _Reader:
         name = element.get("class", childclass)
         if name not in self.defaults:
             raise ValueError(f"{_called(element)} is of the class {name!r}, which no default has")
-        return {**self.defaults[name].get(element.tag, {}), **element.attrib}
+        return {**self.defaults[name].get(DEFAULT_OF.get(element.tag, element.tag), {}), **element.attrib}
 
     def _pose(self, attributes: dict[str, str], what: str) -> Pose:
         return pose_of(attributes, what, self.degrees, self.sequence)
@@ -200,9 +203,7 @@ class _Reader:
         limited = given.get("limited", "auto")
         if kind != "free" and (limited == "true" or (limited == "auto" and "range" in given)):
             self.ignored.append(f"limits of joint {name!r}")
-        for key in SOFT:
-            if any(float(x) for x in given.get(key, "0").split()):
-                self.ignored.append(f"{key} of joint {name!r}")
+        self._soft(given, f"joint {name!r}")
         if "springdamper" in given and any(float(x) for x in given["springdamper"].split()):
             self.ignored.append(f"springdamper of joint {name!r}")
         axis = numbers(given.get("axis", "0 0 1"), 3, f"axis of joint {name!r}")
@@ -210,6 +211,11 @@ class _Reader:
             raise ValueError(f"axis of joint {name!r} must have a direction; given {given['axis']!r}")
         place = numbers(given.get("pos", "0 0 0"), 3, f"pos of joint {name!r}")
         return Freed(name, kind, pose.point(place), pose.R @ axis / np.linalg.norm(axis), given)
+
+    def _soft(self, given: dict[str, str], what: str) -> None:
+        for key in SOFT:
+            if any(float(x) for x in given.get(key, "0").split()):
+                self.ignored.append(f"{key} of {what}")
 
     def _free(self, name: str | None, default: str) -> str:
         """A name that no other part has: in MJCF bodies, joints and tendons may share one."""
@@ -332,6 +338,7 @@ class _Reader:
         if not plain or len(rest) != 1 or given.get("limited", "false") == "true" or "range" in given:
             self.ignored.append(f"tendon: {_called(element)}")
             return
+        self._soft(given, _called(element))
         (one, here), (other, there) = (self._site(each.get("site", "")) for each in element)
         length = None if float(rest[0]) < 0.0 else float(rest[0])
         first, second = self._of(one), self._of(other)

@@ -57,8 +57,8 @@ from twoloop.bodies.spatial_places import (
     place,
     push_row,
     spin,
+    torsion,
     turn_row,
-    turned,
     twist_row,
     vector,
     vector_rate,
@@ -271,7 +271,7 @@ def fill_force(q, v, p, made, Q):
             wx, wy, wz = spin(q, v, j)
             rate = x * (wx - ux) + y * (wy - uy) + z * (wz - uz)
             if kind == TORSION:
-                push = -p[more] * (turned(q, i, j, p, at, there) - p[more + 2]) - p[more + 1] * rate
+                push = -torsion(q, i, j, p, at, there, p[more], p[more + 2]) - p[more + 1] * rate
             elif kind == BRAKE:
                 push = -p[more] * math.tanh(rate / p[more + 1])
             elif given >= 0:

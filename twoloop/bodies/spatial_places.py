@@ -9,6 +9,8 @@ from twoloop.kernels.compile.caches import helper
 from twoloop.mechanisms.rotation import half_spin, rotated
 from twoloop.mechanisms.spatial import centre, move_row, turn_row, vector, vector_rate
 
+FARTHEST = -math.cos(0.95 * math.pi)  # 0.95 of a turn
+
 
 @helper
 def place(q, body, p, at):
@@ -77,15 +79,18 @@ def product(a0, a1, a2, a3, b0, b1, b2, b3):
 
 
 @helper
-def turned(q, i, j, p, axis, zero):
-    """By how much body j has turned about an axis (3 numbers in p) of body i since their Euler parameters at `zero`.
+def torsion(q, i, j, p, axis, zero, stiffness, angle):
+    """The torque of a spring by how much body j has turned about an axis (3 numbers in p) of body i, less an angle.
 
-    Continuous within two turns to either side, as Euler parameters change their sign after one. `zero`: place in p of
-    the Euler parameters of j relative to i at the angle zero.
+    The turn is counted from the Euler parameters of j relative to i at `zero` in p. These tell turns apart only within
+    one to either side, where it would jump: a spring has no value, NaN, a bit before.
     """
     e0, e1, e2, e3 = parameters_of(q, i)
     b0, b1, b2, b3 = parameters_of(q, j)
     r0, r1, r2, r3 = product(e0, -e1, -e2, -e3, b0, b1, b2, b3)
     c, x, y, z = product(r0, r1, r2, r3, p[zero], -p[zero + 1], -p[zero + 2], -p[zero + 3])
     s = x * p[axis] + y * p[axis + 1] + z * p[axis + 2]
-    return 4.0 * math.atan(s / (c + math.sqrt(c * c + s * s)))
+    r = math.sqrt(c * c + s * s)
+    left = c + FARTHEST * r
+    root = math.sqrt(stiffness * left)  # a damper alone, of no stiffness, turns on
+    return root * root / left * (4.0 * math.atan(s / (c + r)) - angle)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations  # ArrayLike stays a word in help()
 
+import copy
 import inspect
 from typing import Any
 
@@ -53,7 +54,7 @@ class Integrator:
         check_positive("rtol", rtol)
         check_tolerance("atol", atol, system.n_q)
         self.system = system
-        self._options = {"method": check_method(method), "rtol": rtol, "atol": atol, **options}
+        self._options = {"method": check_method(method), "rtol": rtol, "atol": copy.copy(atol), **options}
         self._systems: dict[bytes, ConstrainedSystem] = {}
 
     def run(

@@ -88,6 +88,8 @@ class Territory:
 
     def covers(self, states: Array) -> bool:
         """Whether there is nothing new in a run through these states, rows."""
+        if not self._least.size:
+            return False
         return bool((states >= self._least).all() and (states <= self._largest).all())
 
     def add(self, states: Array) -> None:

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.checks.derivatives import wrong_derivative
-from twoloop.checks.values import unsymmetric_mass
+from twoloop.checks.structure import unlike_itself
 from twoloop.generate.exact_derivatives import Territory, exact_derivatives, generic_states
 from twoloop.generate.traced_values import Sample
 from twoloop.run.record import Status
@@ -44,7 +44,7 @@ def compared(
         return status, message
     before = status
     if check_derivatives:
-        status, message = _derivatives_again(run, t, table, last, status, message)
+        status, message = _derivatives_again(run, t, table, last, states[-1], status, message)
     status, message = _traces(run, states, status, message)
     if status == before:
         territory.add(states)
@@ -53,9 +53,9 @@ def compared(
 
 
 def _derivatives_again(
-    run: "Run", t: Array, table: Array, last: tuple[float, Array], status: Status, message: str
+    run: "Run", t: Array, table: Array, last: tuple[float, Array], first: Array, status: Status, message: str
 ) -> tuple[Status, str]:
-    """Status and message, unless a derivative is wrong where the run went."""
+    """Status and message, unless a derivative, or a constant mass, is wrong where the run went from its first state."""
     n = run.system.n_q
     inner = np.arange(1, LATER_CHECKS + 1) * len(t) // (LATER_CHECKS + 1)
     states = [(float(t[k]), table[k, :n], table[k, n : 2 * n]) for k in np.unique(inner) if 0 < k < len(t)]
@@ -63,9 +63,9 @@ def _derivatives_again(
     exact = exact_derivatives(run.system)
     fine = exact is not None and exact.wrong(run.system, generic_states(states)) is None
     for instant, q, v in states:
-        wrong = None if fine else wrong_derivative(run.system, instant, q, v)
-        if fine and not run.system.constant_mass:
-            wrong = unsymmetric_mass(run.system, instant, q)
+        wrong = unlike_itself(run.system, instant, q, float(first[0]), first[1 : 1 + n])
+        if wrong is None and not fine:
+            wrong = wrong_derivative(run.system, instant, q, v)
         if wrong is not None:
             return Status.WRONG_DERIVATIVE, f"At t = {instant:.10g} of the run {wrong} {message}"
     return status, message

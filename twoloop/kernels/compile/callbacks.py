@@ -16,9 +16,11 @@ import numba
 from numba.core.dispatcher import Dispatcher
 
 from twoloop.kernels.compile.caches import compile_kept, watch
+from twoloop.kernels.compile.private import also_for
 
 f8 = numba.types.float64
 VECTOR = numba.types.float64[::1]
+READ = numba.types.Array(f8, 1, "C", readonly=True)  # in memory the same
 MATRIX = numba.types.float64[:, ::1]
 
 # what callbacks depend on beside t and p, and the size of each
@@ -77,9 +79,17 @@ class Kind:
 
     @property
     def signature(self) -> Any:
-        """What numba compiles a callback for."""
+        """With what kernels call a callback."""
+        return self._signature(VECTOR)
+
+    @property
+    def reading(self) -> Any:
+        """What numba compiles a callback for: it cannot write to what is not its own."""
+        return self._signature(READ)
+
+    def _signature(self, given: Any) -> Any:
         filled = [VECTOR if len(shape) == 1 else MATRIX for _, shape in self.outputs]
-        return numba.types.void(f8, *[VECTOR] * len(self.state), VECTOR, *filled)
+        return numba.types.void(f8, *[given] * len(self.state), given, *filled)
 
     @property
     def size(self) -> str:
@@ -207,7 +217,7 @@ def callback(kind: str) -> Callable[[Callable[..., None]], Dispatcher]:
 
     The function gets the time, the coordinates `q` (n_q,), where the kind has them the velocities `v` (n_q,) or the
     multipliers `lam` (n_c,), the parameters `p`, and the array to fill, which arrives full of zeros (a tangent's of a
-    system with a bandwidth only within the band: add to it)::
+    system with a bandwidth only within the band: add to it). It must not write to the others::
 
         @callback("jacobian")
         def jacobian(t, q, p, Cq):
@@ -226,7 +236,7 @@ def callback(kind: str) -> Callable[[Callable[..., None]], Dispatcher]:
     ValueError
         If `kind` is unknown.
     TypeError
-        If the function has other arguments, or numba cannot compile it.
+        If the function has other arguments, writes to one that it is given, or numba cannot compile it.
     """
     if callable(kind):
         raise TypeError('the decorator needs the kind of callback: write @callback("force"), not @callback')
@@ -264,9 +274,35 @@ def compile_callback(
     if watched is not None:
         watched = f"{watched[0]} {_OPTIONS}", watched[1]
     try:
-        return compile_kept(function, KINDS[kind].signature, watched, **_OPTIONS)
+        made = compile_kept(function, KINDS[kind].reading, watched, **_OPTIONS)
     except Exception as error:  # numba lets some of its own assertions through
-        raise TypeError(_why_not(kind, named or function, error)) from None
+        return _compiled_to_write(kind, function, watched, named or function, error)
+    also_for(made, KINDS[kind].signature)
+    return made
+
+
+def _compiled_to_write(
+    kind: str,
+    function: Callable[..., Any],
+    watched: tuple[str, str] | None,
+    named: Callable[..., Any],
+    error: Exception,
+) -> Dispatcher:
+    """The same of a function whose helpers are compiled for arrays that may be written; one that does so is refused."""
+    try:
+        made = compile_kept(function, KINDS[kind].signature, watched, **_OPTIONS)
+    except Exception as its_own:
+        raise TypeError(_why_not(kind, named, its_own)) from None
+    if _ONLY_A_HELPER.search(plain := _plain(error)) and "setitem" not in plain:
+        return made
+    raise TypeError(
+        f"{kind}: the function {_named(named)} must not change the arrays that it is given "
+        f"({', '.join([*KINDS[kind].state, 'p'])}), which are those of the run. Copy first\n"
+        f"Numba says: {_telling_line(error)}"
+    ) from None
+
+
+_ONLY_A_HELPER = re.compile(r"Invalid use of type\(CPUDispatcher\(")
 
 
 @cache
@@ -288,13 +324,16 @@ def stand_in(kind: str) -> Dispatcher:
 
 def _why_not(kind: str, function: Callable[..., Any], error: Exception) -> str:
     """Which function numba cannot compile, and the line of numba's message that says most."""
-    name, code = getattr(function, "__name__", "?"), getattr(function, "__code__", None)
-    where = f" ({code.co_filename}, line {code.co_firstlineno})" if code else ""
     return (
-        f"{kind}: numba cannot compile the function {name!r}{where}; it must use numbers, numpy arrays of one type and "
-        f"of the shape that {kind} asks for, and functions that numba knows (helpers need numba.njit)\n"
+        f"{kind}: numba cannot compile the function {_named(function)}; it must use numbers, numpy arrays of one type "
+        f"and of the shape that {kind} asks for, and functions that numba knows (helpers need numba.njit)\n"
         f"Numba says: {_telling_line(error)}"
     )
+
+
+def _named(function: Callable[..., Any]) -> str:
+    name, code = getattr(function, "__name__", "?"), getattr(function, "__code__", None)
+    return f"{name!r} ({code.co_filename}, line {code.co_firstlineno})" if code else repr(name)
 
 
 # lines of numba's messages that only lead to another, or show source
@@ -304,8 +343,12 @@ _LEADING = re.compile(
 )
 
 
+def _plain(error: Exception) -> str:
+    return re.sub(r"\x1b\[[0-9;]*m", "", str(error))
+
+
 def _telling_line(error: Exception) -> str:
-    plain = re.sub(r"\x1b\[[0-9;]*m", "", str(error))
+    plain = _plain(error)
     plain = re.sub(r":\s*>>> ", ": ", plain)  # a signature that was not found
     lines = [line.strip() for line in plain.splitlines() if line and not line.startswith("    ")]
     telling = [line for line in lines if line and not _LEADING.match(line) and not line.startswith("def ")]
