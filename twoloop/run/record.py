@@ -129,6 +129,9 @@ class Record:
     rtol: float | None = None
     atol: Array | None = None
     untested: NDArray[np.bool_] | None = None
+    changes: str = ""
+    arcs: tuple[Any, ...] = ()
+    impacts: tuple[Any, ...] = ()
 
     @property
     def success(self) -> bool:
