@@ -5,6 +5,7 @@ from twoloop.ensembles.consistent_states import consistent_states
 from twoloop.ensembles.ensemble import ensemble
 from twoloop.ensembles.integrator import Integrator
 from twoloop.ensembles.runs import Runs
+from twoloop.impacts.motion import solve_with_stops
 from twoloop.kernels.compile.callbacks import callback
 from twoloop.methods.bdf import BDF
 from twoloop.methods.dop853 import DOP853
@@ -15,6 +16,7 @@ from twoloop.methods.runge_kutta import RungeKutta
 from twoloop.methods.taylor import Taylor
 from twoloop.problem.drawing import Drawing
 from twoloop.problem.joints import Joint
+from twoloop.problem.stops import Stop
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.result.certificate import Certificate, CertificateWarning
 from twoloop.result.citations import citation
@@ -43,6 +45,7 @@ __all__ = [
     "Runs",
     "Statistics",
     "Status",
+    "Stop",
     "Taylor",
     "callback",
     "citation",
@@ -53,5 +56,6 @@ __all__ = [
     "paper_irk",
     "paper_newmark",
     "solve_dae",
+    "solve_with_stops",
     "sweep",
 ]

@@ -291,6 +291,11 @@ class PlanarModel(Model):
     def _no_rotation(self) -> float:
         return 0.0
 
+    def _axis(self, joint: ModelJoint) -> Array:
+        assert joint.rows[0].more is not None
+        (angle,) = joint.rows[0].more.values
+        return np.array([np.cos(angle), np.sin(angle)])
+
     def _drive_row(self, joint: ModelJoint, motion: Function) -> JointRow:
         if joint.kind == "revolute":
             zero = Numbers((joint.b.rotation - joint.a.rotation,))

@@ -305,6 +305,9 @@ class SpatialModel(SpatialShapes):
     def _no_rotation(self) -> Array:
         return np.eye(3)
 
+    def _axis(self, joint: ModelJoint) -> Array:
+        return joint.axes[0]
+
     def _drive_row(self, joint: ModelJoint, motion: Function) -> JointRow:
         one, other = joint.axes
         if joint.kind == "prismatic":

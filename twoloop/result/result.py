@@ -83,7 +83,8 @@ class Result(Record):
         What changed on the way, where this is more than one run of one system: inputs at samples (`Integrator.step`),
         velocities in impacts (`solve_with_stops`). "": nothing.
     arcs : tuple of Result
-        Of `solve_with_stops`: the runs from impact to impact that this is joined of. Files do not keep them.
+        Of `solve_with_stops`: the runs from impact to impact that this is joined of. Files and other processes do
+        not get them, nor their `sol`.
     impacts : tuple of Impact
         Likewise: when, at which stops, the velocities before and after, and the impulses.
     """

@@ -177,6 +177,8 @@ class Record:
             pickle.dumps(self.system)
         except TypeError:  # of functions without a name of their own
             state["system"] = None
+        if self.arcs:
+            state |= {"arcs": (), "sol": None}
         return state
 
     def __repr__(self) -> str:

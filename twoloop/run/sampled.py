@@ -246,7 +246,7 @@ class SampledRun:
             if any((each != made[0]).any() for each in made[1:]):
                 raise ValueError(
                     f"inputs must enter forces alone; that at place {place} enters {kind} of {self.system.name!r}, "
-                    "which cannot change between samples: positions or momenta would jump. Start anew with other parameters"
+                    "which cannot change between samples: positions or momenta would jump; start anew with others"
                 )
         self._free.add(place)
 
