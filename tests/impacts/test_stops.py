@@ -49,9 +49,9 @@ def test_a_ball_bounces_to_rest(tmp_path):
     result.save(tmp_path / "run.npz")
     again = load(tmp_path / "run.npz", problem.system)
     assert (again.q == result.q).all() and again.changes == result.changes
+    again.animate(tmp_path / "run.html")
+    result.plot(tmp_path / "run.png")
     for each in (result, again, pickle.loads(pickle.dumps(result))):
-        each.animate(tmp_path / "run.html")
-        each.plot(tmp_path / "run.png")
         with pytest.raises(ValueError, match="impacts"):
             each.certify()
     assert result.arcs[0].certify().passed
@@ -151,6 +151,17 @@ def test_a_box_rocks_to_rest_on_two_corners(restitution):
     assert (np.diff(result.energy) < 1e-9).all()
     assert min(stop.gap(0.0, q) for q in result.q.T for stop in problem.stops) > -1e-10
     np.testing.assert_allclose(-result.arcs[-1].lam[:, -1], [0.5 * GRAVITY] * 2)
+
+
+def test_a_ball_comes_to_rest_in_a_wedge_at_the_origin():
+    model = ball()
+    for side in (-1.0, 1.0):
+        normal = (side * np.sin(0.7), np.cos(0.7))
+        model.stop("ball", (0.0, 1.0), "ground", (0.0, 0.0), normal=normal, restitution=0.5)
+    model.force("ball", (0.0, 1.0), (0.1, 0.0))
+    _, result = moved(model, 4.0)
+    np.testing.assert_allclose(result.q[:, -1], 0.0, atol=1e-9)
+    assert len(result.impacts) > 20 and {len(impact.stops) for impact in result.impacts} == {1, 2}
 
 
 def test_balls_and_walls_without_loss():

@@ -13,12 +13,11 @@ from twoloop.checks.arguments import check_positive, check_span, check_times, ch
 from twoloop.impacts.contact import Accelerations, Closed
 from twoloop.impacts.gaps import Gap, Gaps
 from twoloop.impacts.joined import Impact, joined
-from twoloop.impacts.laws import complementary, impulses, responses
+from twoloop.impacts.laws import NEGLIGIBLE, complementary, impulses, responses
 from twoloop.methods.plan import Method
 from twoloop.problem.stops import Stop
 from twoloop.problem.system import ConstrainedSystem, check_system
 from twoloop.result.result import Result
-from twoloop.run.projection import consistent_state
 from twoloop.run.record import Status
 from twoloop.solve import solve_dae
 
@@ -26,7 +25,10 @@ Array = NDArray[np.float64]
 
 LOW = 0.01  # of the absolute tolerance: a rebound to less than this height ends in contact
 ROUNDING = 1e-13  # of the largest coordinate, at least
+LEAST_STEP = 1e-9  # s, or relative: the first of an arc
+NOTHING = 1e-20  # m or rad: coordinates that rounding alone keeps from zero
 STANDS = 1e-13  # relative: arcs that are shorter do not move on in time ...
+CORRECTIONS = 3  # of positions, by Newton's method
 MOST_STANDING = 30  # ... and so many of them in a row end the motion
 OF_A_RUN = {"system", "t_span", "q0", "v0", "method", "rtol", "atol", "t_eval", "events", "dense_output", "step_size"}
 
@@ -186,15 +188,31 @@ class _Motion:
         """A run until a gap closes, or a stop that is closed lets go."""
         system = self._system(resting)
         if resting:
-            self.q, self.v = consistent_state(system, self.t, self.q, self.v)[:2]
+            self._close(system, resting)
         start = self.gaps.at(self.t, self.q, self.v)
         events = [self._lets_go(resting, k) if k in resting else self._closes(k, start) for k in range(len(self.stops))]
         options = {**self.options, "check_derivatives": self.options.get("check_derivatives", True) and not self.arcs}
+        if self.arcs and self.options.get("first_step") is None and self.arcs[-1].h.size:
+            least = LEAST_STEP * max(1.0, abs(self.t))  # coordinates next to zero have no size to choose a step by
+            options["first_step"] = min(max(0.1 * float(self.arcs[-1].h.max()), least), t1 - self.t)
         arc = solve_dae(system, (self.t, t1), self.q, self.v, events=events, dense_output=True, **options)
         self.arcs.append(arc)
         self.let_go = [k for k in resting if arc.t_events is not None and arc.t_events[k].size]
         if arc.t.size:
             self.t, self.q, self.v = float(arc.t[-1]), arc.q[:, -1].copy(), arc.v[:, -1].copy()
+
+    def _close(self, system: ConstrainedSystem, resting: tuple[int, ...]) -> None:
+        """Put the state on the constraints and the closed stops, from which it is off by less than the tolerances."""
+        for _ in range(CORRECTIONS):
+            rows, off = system.jacobian(self.t, self.q), system.constraint(self.t, self.q)
+            self.q = self.q - np.linalg.lstsq(rows, off, rcond=NEGLIGIBLE)[0]
+        self.q[np.abs(self.q) < NOTHING] = 0.0
+        gap = self.gaps.at(self.t, self.q, self.v)
+        W, u = gap.W[list(resting)], gap.u[list(resting)]
+        X = responses(self.system, self.t, self.q, W)
+        self.v = self.v - X @ np.linalg.lstsq(W @ X, u, rcond=NEGLIGIBLE)[0]
+        rows, off = system.rows(self.t, self.q), system.velocity_constraint(self.t, self.q, self.v)
+        self.v = self.v - np.linalg.lstsq(rows, off, rcond=NEGLIGIBLE)[0]
 
     def _closes(self, k: int, start: Gap) -> Any:
         """The event of a gap that is open, or about to open: zero where it is as closed as it was at the start."""
