@@ -210,7 +210,11 @@ def velocities(
             f"{f' ({unit}/s)' if unit else ''}. Give velocities of fewer bodies (the others follow), or fewer joints"
         )
     v = v - np.linalg.lstsq(scaled, scaled @ v + system.rates(t, q) / scales.rows, rcond=SINGULAR)[0]
-    v[~known & (np.abs(v) < ROUNDING * np.abs(v).max())] = 0.0  # what rounding leaves of bodies at rest
+    at_rest = np.where(~known & (np.abs(v) < ROUNDING * np.abs(v).max()), 0.0, v)  # without what rounding leaves
+    rates = system.rates(t, q) / scales.rows
+    terms = ROUNDING * (np.abs(scaled) @ np.abs(at_rest) + np.abs(rates))
+    if (np.abs(scaled @ at_rest + rates) <= np.maximum(np.abs(scaled @ v + rates), terms)).all():
+        v = at_rest
     return np.asarray(v * scales.columns)
 
 

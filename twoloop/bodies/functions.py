@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from twoloop.bodies.row_function import RowFunction
 from twoloop.checks.arguments import check_finite, check_real, shown
 from twoloop.generate.calls_on_symbols import as_forms, trace
 from twoloop.generate.derivative import Derivative
@@ -47,6 +48,11 @@ class Function:
     size: int
     derivatives: tuple[Callable[..., Any], ...] = ()
     traced: Array | None = None
+
+    @property
+    def n_results(self) -> int:
+        """How many numbers its program gives: of a motion three."""
+        return 3 if self.derivatives or self.traced is not None else self.size
 
     def at(self, t: float, q: Array, v: Array) -> Array:
         """What it gives, of the right shape; of a motion its derivatives, too."""
@@ -137,7 +143,7 @@ def motion_forms(function: Function, graph: Graph, t: Form) -> list[Form]:
     return made
 
 
-def program_for(functions: Sequence[Function], n_q: int, motions: bool) -> Program:
+def program_for(functions: Sequence[Function | RowFunction], n_q: int, motions: bool) -> Program:
     """One program for all functions, in their order; raises Untraceable."""
     graph = Graph()
     (t,) = graph.inputs(1, False)
@@ -145,7 +151,10 @@ def program_for(functions: Sequence[Function], n_q: int, motions: bool) -> Progr
     made: list[Form] = []
     for each in functions:
         try:
-            made += motion_forms(each, graph, t) if motions else each.forms(graph, t, q, v)
+            if motions and isinstance(each, Function):
+                made += motion_forms(each, graph, t)
+            else:
+                made += each.forms(graph, t, q, v)
         except Untraceable as error:
             raise Untraceable(f"{each.name}: {error}") from None
     return program_of(graph, 1 + 2 * n_q, dict(enumerate(made)))
@@ -159,8 +168,10 @@ def numbers_of(program: Program) -> list[float]:
     return [float(x) for part in parts for x in part]
 
 
-def is_constant(function: Function) -> bool:
+def is_constant(function: Function | RowFunction) -> bool:
     """Whether a motion is known to hold its joint still."""
+    if isinstance(function, RowFunction):
+        return True
     graph = Graph()
     try:
         return not function.forms(graph, graph.inputs(1, False)[0], [], [])[0].terms

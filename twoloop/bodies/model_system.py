@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from twoloop.bodies.functions import Function
 from twoloop.bodies.parameter_layout import FORCE_PROGRAM, HEAD, MOTION_PROGRAM
+from twoloop.bodies.row_function import RowFunction
 from twoloop.bodies.tables import Tables
 from twoloop.problem.joints import Joint
 from twoloop.problem.system import ConstrainedSystem
@@ -43,7 +44,7 @@ def system_of(
     callbacks: Any = import_module(f"twoloop.bodies.{'planar' if dimension == 2 else 'spatial'}_callbacks")
     n_q = (3 if dimension == 2 else 7) * len(tables.bodies)
     kinds = [kind for kind in KINDS if kind in ("mass", "force") or (kind in OF_JOINTS and tables.n_rows)]
-    if tables.motions:
+    if any(isinstance(motion, Function) for motion in tables.motions):
         kinds.append("constraint_rate")
     options: Any = {"n_q": n_q, "n_c": tables.n_rows, "joints": joints, "name": name, "parameters": tables.p}
     for each in (*tables.motions, *tables.functions):
@@ -73,8 +74,8 @@ def _disagreement(tables: Tables, t: float, q: Array, v: Array) -> str:
                 try:
                     known = each.at(then, one, other)
                 except (ArithmeticError, TypeError):  # outside what it is made for
-                    known = np.full(each.size, np.nan)
-                size = 3 if functions is tables.motions else each.size
+                    known = np.full(each.n_results, np.nan)
+                size = each.n_results
                 found, first = made[first : first + len(known)], first + size
                 off = np.abs(known - found) > AGREES * (1.0 + np.abs(known))
                 if (off & np.isfinite(known)).any():
@@ -112,31 +113,30 @@ class InPython:
     def constraint(self, t: float, q: Array, p: Array) -> Array:
         """C."""
         made = np.zeros(self._n_rows)
-        self._callbacks.fill_constraint(q, p, self._moved(t), made)
+        self._callbacks.fill_constraint(q, p, self._moved(t, q, q), made)
         return made
 
     def jacobian(self, t: float, q: Array, p: Array) -> Array:
         """C_q."""
         made = np.zeros((self._n_rows, self._n_q))
-        self._callbacks.fill_jacobian(q, p, self._moved(t), made)
+        self._callbacks.fill_jacobian(q, p, self._moved(t, q, q), made)
         return made
 
     def constraint_rate(self, t: float, q: Array, p: Array) -> Array:
         """C_t."""
         made = np.zeros(self._n_rows)
-        self._callbacks.fill_rate(q, p, self._moved(t), made)
+        self._callbacks.fill_rate(q, p, self._moved(t, q, q), made)
         return made
 
     def gamma(self, t: float, q: Array, v: Array, p: Array) -> Array:
         """The right-hand side of C_q a = gamma."""
         made = np.zeros(self._n_rows)
-        self._callbacks.fill_gamma(q, v, p, self._moved(t), made)
+        self._callbacks.fill_gamma(q, v, p, self._moved(t, q, v), made)
         return made
 
-    def _moved(self, t: float) -> Array:
-        nothing = np.zeros(0)
-        return _called(self._motions, t, nothing, nothing)
+    def _moved(self, t: float, q: Array, v: Array) -> Array:
+        return _called(self._motions, t, q, v)
 
 
-def _called(functions: tuple[Function, ...], t: float, q: Array, v: Array) -> Array:
+def _called(functions: tuple[Function | RowFunction, ...], t: float, q: Array, v: Array) -> Array:
     return np.concatenate([np.zeros(0), *(each.at(t, q, v) for each in functions)])

@@ -42,6 +42,7 @@ from twoloop.bodies.parameter_layout import (
     SLIDE,
     TORQUE,
     TORSION,
+    WRITTEN,
 )
 from twoloop.bodies.program_results import result, results
 from twoloop.kernels.compile.caches import helper
@@ -111,6 +112,9 @@ def fill_constraint(q, p, made, C):
     for k in range(first, first + JOINT_WIDTH * n, JOINT_WIDTH):
         kind, row, i, j = int(p[k + KIND]), int(p[k + ROW]), int(p[k + FIRST]), int(p[k + SECOND])
         more, moved = int(p[k + MORE]), result(made, int(p[k + MOTION]), 0)
+        if kind == WRITTEN:
+            C[row] = made[int(p[k + MOTION])]
+            continue
         if kind == ANGLE:
             C[row] = angle_of(q, j) - angle_of(q, i) - p[more] - moved
             continue
@@ -132,6 +136,11 @@ def fill_jacobian(q, p, made, Cq):
     first, n = int(p[p.size - HEAD + JOINTS]), int(p[p.size - HEAD + N_JOINTS])
     for k in range(first, first + JOINT_WIDTH * n, JOINT_WIDTH):
         kind, row, i, j = int(p[k + KIND]), int(p[k + ROW]), int(p[k + FIRST]), int(p[k + SECOND])
+        if kind == WRITTEN:
+            first_result, columns = int(p[k + MOTION]) + 3, int(p[k + MORE])
+            for m in range(int(p[columns])):
+                Cq[row, int(p[columns + 1 + m])] = made[first_result + m]
+            continue
         if kind == ANGLE:
             turn(Cq[row], j, 1.0)
             turn(Cq[row], i, -1.0)
@@ -159,7 +168,7 @@ def fill_rate(q, p, made, Ct):
     first, n = int(p[p.size - HEAD + JOINTS]), int(p[p.size - HEAD + N_JOINTS])
     for k in range(first, first + JOINT_WIDTH * n, JOINT_WIDTH):
         if int(p[k + MOTION]) >= 0:
-            Ct[int(p[k + ROW])] = -result(made, int(p[k + MOTION]), 1)
+            Ct[int(p[k + ROW])] = -result(made, int(p[k + MOTION]), 1)  # zero of WRITTEN rows
 
 
 @helper
@@ -169,6 +178,9 @@ def fill_gamma(q, v, p, made, Qd):
     for k in range(first, first + JOINT_WIDTH * n, JOINT_WIDTH):
         kind, row, i, j = int(p[k + KIND]), int(p[k + ROW]), int(p[k + FIRST]), int(p[k + SECOND])
         more, moved = int(p[k + MORE]), result(made, int(p[k + MOTION]), 2)
+        if kind == WRITTEN:
+            Qd[row] = made[int(p[k + MOTION]) + 2]
+            continue
         if kind == ANGLE:
             Qd[row] = moved
             continue
@@ -273,7 +285,7 @@ def constraint(t, q, p, C):
 
 @callback("jacobian")
 def jacobian(t, q, p, Cq):
-    fill_jacobian(q, p, p, Cq)  # motions have no part in it
+    fill_jacobian(q, p, results(int(p[p.size - HEAD + MOTION_PROGRAM]), t, q, q, p), Cq)
 
 
 @callback("constraint_rate")

@@ -48,6 +48,7 @@ from twoloop.bodies.parameter_layout import (
     TORQUE,
     TORSION,
     TURN,
+    WRITTEN,
 )
 from twoloop.bodies.program_results import result, results
 from twoloop.bodies.spatial_places import (
@@ -105,6 +106,9 @@ def fill_constraint(q, p, made, C):
     for k in range(first, first + JOINT_WIDTH * n, JOINT_WIDTH):
         kind, row, i, j = int(p[k + KIND]), int(p[k + ROW]), int(p[k + FIRST]), int(p[k + SECOND])
         at, there, more, moved = int(p[k + FIRST_AT]), int(p[k + SECOND_AT]), int(p[k + MORE]), int(p[k + MOTION])
+        if kind == WRITTEN:
+            C[row] = made[int(p[k + MOTION])]
+            continue
         if kind in (PERPENDICULAR, TURN):
             if kind == TURN:
                 (x, y, z), _, _ = followed(p, at, made, moved)
@@ -139,6 +143,11 @@ def fill_jacobian(q, p, made, Cq):
     for k in range(first, first + JOINT_WIDTH * n, JOINT_WIDTH):
         kind, row, i, j = int(p[k + KIND]), int(p[k + ROW]), int(p[k + FIRST]), int(p[k + SECOND])
         at, there, more = int(p[k + FIRST_AT]), int(p[k + SECOND_AT]), int(p[k + MORE])
+        if kind == WRITTEN:
+            first_result, columns = int(p[k + MOTION]) + 3, int(p[k + MORE])
+            for m in range(int(p[columns])):
+                Cq[row, int(p[columns + 1 + m])] = made[first_result + m]
+            continue
         if kind == POINT:
             for axis in range(3):
                 fx, fy, fz = 1.0 * (axis == 0), 1.0 * (axis == 1), 1.0 * (axis == 2)
@@ -194,6 +203,9 @@ def fill_gamma(q, v, p, made, Qd):
     for k in range(first, first + JOINT_WIDTH * n, JOINT_WIDTH):
         kind, row, i, j = int(p[k + KIND]), int(p[k + ROW]), int(p[k + FIRST]), int(p[k + SECOND])
         at, there, more, moved = int(p[k + FIRST_AT]), int(p[k + SECOND_AT]), int(p[k + MORE]), int(p[k + MOTION])
+        if kind == WRITTEN:
+            Qd[row] = made[int(p[k + MOTION]) + 2]
+            continue
         if kind in (PERPENDICULAR, TURN):
             bx, by, bz = vector(q, j, p[there], p[there + 1], p[there + 2])
             bux, buy, buz, bax, bay, baz = vector_rate(q, v, j, p[there], p[there + 1], p[there + 2])

@@ -134,8 +134,8 @@ class Tables:
         for joint in self.joints:
             numbered: list[int] = []
             for part in joint.rows:
-                table += self._joint_row(part, row, NONE if part.motion is None else 3 * motion)
-                motion += part.motion is not None
+                table += self._joint_row(part, row, NONE if part.motion is None else motion)
+                motion += 0 if part.motion is None else part.motion.n_results
                 numbered += range(row, row + part.n_rows)
                 row += part.n_rows
             self.rows[joint.name] = tuple(numbered)
