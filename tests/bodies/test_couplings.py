@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from twoloop import solve_dae
-from twoloop.bodies import PlanarModel
+from twoloop import mechanisms, solve_dae
+from twoloop.bodies import PlanarModel, SpatialModel
 
 GRAVITY = 9.81
 TIMES = np.linspace(0.0, 1.0, 6)
@@ -162,3 +162,49 @@ def test_couplings_with_a_function_that_is_called_in_python():
     assert problem.system.called_in_python
     result = solve_dae(problem.system, (0.0, 0.4), problem.q0, problem.v0)
     np.testing.assert_allclose(result.q[[2, 5], -1], [0.5 / 0.01 * 0.4**2, -0.5 / 0.01 * 0.4**2], rtol=1e-7)
+
+
+def test_a_rolling_disc_in_space():
+    """That of the library, in angles: the same path of the centre."""
+    known = mechanisms.rolling_disc()
+    p = known.parameters
+    yaw, lean, _ = p["angles"]
+    m, r = p["mass"], p["radius"]
+    c, s = np.cos(lean), np.sin(lean)
+    ahead, axle = np.array([np.cos(yaw), np.sin(yaw), 0.0]), np.array([np.sin(yaw) * c, -np.cos(yaw) * c, -s])
+    turn, fall, spin = known.v0[3:]
+    w = turn * np.array([0.0, 0.0, 1.0]) + fall * ahead + spin * axle
+    model = SpatialModel(gravity=(0.0, 0.0, -p["gravity"]))
+    R = np.column_stack([ahead, axle, np.cross(ahead, axle)])
+    wheel = model.body(
+        "wheel",
+        mass=m,
+        inertia=m * r * r * np.array([0.25, 0.5, 0.25]),
+        position=known.q0[:3],
+        rotation=R,
+        velocity=known.v0[:3],
+        angular_velocity=w,
+    )
+    joint = model.rolling(wheel, radius=r, axis=axle)
+    problem = model.problem((0.0, 2.0))
+    found = solve_dae(problem.system, (0.0, 2.0), problem.q0, problem.v0, rtol=1e-10, atol=1e-10)
+    theirs = solve_dae(known.system, (0.0, 2.0), known.q0, known.v0, rtol=1e-10, atol=1e-10)
+    np.testing.assert_allclose(found.q[:3, -1], theirs.q[:3, -1], atol=1e-7)
+    assert problem.conserved and np.ptp(found.energy) < 1e-7
+    force = found.reactions(joint.name).force
+    np.testing.assert_allclose(force - [[0.0], [0.0], [m * p["gravity"]]], m * found.a[:3], atol=1e-6)
+
+
+def test_a_skate_on_a_slope():
+    """The blade turns evenly, and its speed is what the slope makes of its direction."""
+    model, spin = PlanarModel(gravity=(0.0, -3.0)), 1.7
+    blade = model.body("blade", mass=2.0, inertia=0.3, position=(0.0, 0.0), angular_velocity=spin)
+    joint = model.skate(blade, at=(0.0, 0.0), axis=(1.0, 0.0))
+    problem, result = moved(model)
+    phase, scale = spin * TIMES, 3.0 / spin**2
+    x, y = 0.5 * phase + 0.25 * np.sin(2.0 * phase) - np.sin(phase), 0.5 * np.sin(phase) ** 2 + np.cos(phase) - 1.0
+    np.testing.assert_allclose(result.q[:2], scale * np.array([x, y]), atol=1e-9)
+    np.testing.assert_allclose(result.q[2], phase, atol=1e-9)
+    assert problem.system.n_a == 1 and problem.conserved and np.ptp(result.energy) < 1e-9
+    force = result.reactions(joint.name).force
+    np.testing.assert_allclose(force - [[0.0], [6.0]], 2.0 * result.a[:2], atol=1e-8)

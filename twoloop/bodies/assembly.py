@@ -123,7 +123,7 @@ def driven_there(system: ConstrainedSystem, t: float, start: Array, keep: Sequen
 
 def _open(system: ConstrainedSystem, left: Array, rows: Mapping[str, tuple[int, ...]]) -> str:
     """Which joints stay open, by what is left of their rows."""
-    misfit = {name: float(left[list(of)].max()) for name, of in rows.items()}
+    misfit = {name: max((float(left[k]) for k in of if k < len(left)), default=0.0) for name, of in rows.items()}
     worst = max(misfit, key=lambda name: misfit[name])
     others = [name for name in misfit if name != worst and misfit[name] > 0.1 * misfit[worst]]
     also = f" (nor do {', '.join(map(repr, others))})" if others else ""

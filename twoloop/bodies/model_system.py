@@ -44,9 +44,17 @@ def system_of(
     callbacks: Any = import_module(f"twoloop.bodies.{'planar' if dimension == 2 else 'spatial'}_callbacks")
     n_q = (3 if dimension == 2 else 7) * len(tables.bodies)
     kinds = [kind for kind in KINDS if kind in ("mass", "force") or (kind in OF_JOINTS and tables.n_rows)]
+    kinds += ["nonholonomic", "nonholonomic_gamma"] if tables.n_rates else []
     if any(isinstance(motion, Function) for motion in tables.motions):
         kinds.append("constraint_rate")
-    options: Any = {"n_q": n_q, "n_c": tables.n_rows, "joints": joints, "name": name, "parameters": tables.p}
+    options: Any = {
+        "n_q": n_q,
+        "n_c": tables.n_rows,
+        "n_a": tables.n_rates,
+        "joints": joints,
+        "name": name,
+        "parameters": tables.p,
+    }
     for each in (*tables.motions, *tables.functions):
         each.at(*start)  # says what is wrong with what it returns
     if not tables.untraced:
@@ -96,7 +104,7 @@ class InPython:
     def __init__(self, callbacks: Any, tables: Tables, n_q: int):
         self._callbacks = callbacks
         self._motions, self._functions = tuple(tables.motions), tuple(tables.functions)
-        self._n_q, self._n_rows = n_q, tables.n_rows
+        self._n_q, self._n_rows, self._n_rates = n_q, tables.n_rows, tables.n_rates
 
     def mass(self, t: float, q: Array, p: Array) -> Array:
         """M."""
@@ -132,6 +140,18 @@ class InPython:
         """The right-hand side of C_q a = gamma."""
         made = np.zeros(self._n_rows)
         self._callbacks.fill_gamma(q, v, p, self._moved(t, q, v), made)
+        return made
+
+    def nonholonomic(self, t: float, q: Array, p: Array) -> Array:
+        """A."""
+        made = np.zeros((self._n_rates, self._n_q))
+        self._callbacks.fill_nonholonomic(p, self._moved(t, q, q), made)
+        return made
+
+    def nonholonomic_gamma(self, t: float, q: Array, v: Array, p: Array) -> Array:
+        """The right-hand side of A a = Q_a."""
+        made = np.zeros(self._n_rates)
+        self._callbacks.fill_nonholonomic_gamma(p, self._moved(t, q, v), made)
         return made
 
     def _moved(self, t: float, q: Array, v: Array) -> Array:

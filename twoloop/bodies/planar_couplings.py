@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 
 from twoloop.bodies.model import Model
-from twoloop.bodies.model_stops import placed
-from twoloop.bodies.parameter_layout import WRITTEN
+from twoloop.bodies.model_stops import placed, turned
+from twoloop.bodies.parameter_layout import RATE, WRITTEN
 from twoloop.bodies.parts import Body, JointRow, ModelJoint, Numbers
-from twoloop.bodies.row_function import RowFunction
+from twoloop.bodies.row_function import RateFunction, RowFunction
 from twoloop.checks.arguments import check_finite, check_positive
 
 
@@ -122,6 +122,44 @@ class Couplings(Model):
             lambda q: _along(q, first, angle, foot, second, zero) + radius * _turned(q, joint),
         ]
         return self._coupled(name, "rolling", joint, rows, joint)
+
+    def skate(self, body: Body | str, *, at: Any, axis: Any, name: str | None = None) -> ModelJoint:
+        """A blade, or a thin wheel seen from above: its point moves along an axis of the body only. Non-holonomic.
+
+        Parameters
+        ----------
+        body : Body or str
+        at : array_like (2,) or BodyPoint
+            The point, in space in the position given, m.
+        axis : array_like (2,) or BodyDirection
+            Along the blade, in space in the position given.
+        name : str, optional
+
+        Returns
+        -------
+        ModelJoint
+            Whose reaction is the force across the blade, on the body.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If an argument is wrong.
+        """
+        on = self._moving_body("body", body)
+        name = self._new_name("skate", name, on)
+        place, (x, y) = self._point("at", at, on), self._direction("axis", axis, on)
+
+        def across(q: Any, v: Any) -> Any:
+            (rx, ry), (nx, ny) = turned(q, on, place), turned(q, on, np.array([-y, x]))
+            u, w, spin = (v[j] for j in on.coordinates)
+            return nx * (u - spin * ry) + ny * (w + spin * rx)
+
+        columns = on.coordinates
+        places = Numbers((float(len(columns)), *map(float, columns)))
+        points = Numbers(tuple(on.in_space(place))), Numbers(tuple(place))
+        function = RateFunction(f"skate {name!r}", across, columns)
+        row = JointRow(RATE, 1, self.ground, on, *points, places, function)
+        return self._add_joint(ModelJoint(name, "skate", self.ground, on, (row,), *points))
 
     def point_on_curve(
         self, a: Body | str, b: Body | str, *, at: Any, curve: Callable[[Any, Any], Any], name: str | None = None

@@ -32,7 +32,7 @@ class RowFunction:
     """
 
     name: str
-    function: Callable[[Any], Any]
+    function: Callable[..., Any]
     columns: tuple[int, ...]
     traced: Array = field(init=False, repr=False)
 
@@ -71,3 +71,22 @@ class RowFunction:
 
         n = 1 + max(self.columns)
         return np.asarray(results(0, t, q[:n].copy(), v[:n].copy(), self.traced)[: self.n_results])
+
+
+@dataclass(frozen=True, eq=False)
+class RateFunction(RowFunction):
+    """A row A(q) v = 0 of the non-holonomic constraints: function(q, v) -> number, linear in v."""
+
+    @property
+    def n_results(self) -> int:
+        """The right-hand side of A a = Q_a, and A at each of its coordinates."""
+        return 1 + len(self.columns)
+
+    def forms(self, graph: Graph, t: Form, q: Sequence[Form], v: Sequence[Form]) -> list[Form]:
+        """These, of symbols."""
+        function: Callable[..., Any] = self.function
+        value = trace(lambda _, one, other: function(one, other), t, symbols(q), symbols(v))
+        row, one = as_forms(graph, np.array(value, dtype=object).reshape(1))[0], Form(graph, 1.0, {})
+        along = {next(iter(each.terms)): rate for each, rate in zip(q, v, strict=True)}
+        gradient = [Derivative(graph, {next(iter(v[j].terms)): one}).of(row) for j in self.columns]
+        return [Derivative(graph, along).of(row).times(-1.0), *gradient]
