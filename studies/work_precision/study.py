@@ -15,7 +15,7 @@ import pandas as pd
 from references.heyoka.taylor import LARGEST_UNROLLED
 from studies.bench import adaptive, cases, figures, headline, study, tables
 from studies.bench.cli import StudyError
-from studies.bench.collector import Case, Run, row_of
+from studies.bench.collector import Case, Run, Warm, row_of
 from studies.bench.render import number, render
 from studies.bench.solvers import (
     COMPARED,
@@ -110,7 +110,7 @@ def at_length(known: Sequence[Case], quick: bool, kept: KeptRows) -> pd.DataFram
     return adaptive.collect(made, kept, _row, lambda run: True, () if quick else ERRORS)
 
 
-def _row(run: Run, repeat: int, built: adaptive.Built) -> Row:
+def _row(run: Run, repeat: int, built: Warm) -> Row:
     return row_of(run, repeat, None, built)
 
 

@@ -12,6 +12,7 @@ from twoloop.bodies.functions import Function
 from twoloop.bodies.parameter_layout import FORCE_PROGRAM, HEAD, MOTION_PROGRAM
 from twoloop.bodies.row_function import RowFunction
 from twoloop.bodies.tables import Tables
+from twoloop.generate.tracing import Untraceable
 from twoloop.problem.joints import Joint
 from twoloop.problem.system import ConstrainedSystem
 
@@ -105,54 +106,60 @@ class InPython:
         self._callbacks = callbacks
         self._motions, self._functions = tuple(tables.motions), tuple(tables.functions)
         self._n_q, self._n_rows, self._n_rates = n_q, tables.n_rows, tables.n_rates
+        self._untraced = tables.untraced
 
     def mass(self, t: float, q: Array, p: Array) -> Array:
         """M."""
-        made = np.zeros((self._n_q, self._n_q))
+        made = self._zeros(q, self._n_q, self._n_q)
         self._callbacks.mass(t, q, p, made)
         return made
 
     def force(self, t: float, q: Array, v: Array, p: Array) -> Array:
         """Q."""
-        made = np.zeros(self._n_q)
+        made = self._zeros(q, self._n_q)
         self._callbacks.fill_force(q, v, p, _called(self._functions, t, q, v), made)
         return made
 
     def constraint(self, t: float, q: Array, p: Array) -> Array:
         """C."""
-        made = np.zeros(self._n_rows)
+        made = self._zeros(q, self._n_rows)
         self._callbacks.fill_constraint(q, p, self._moved(t, q, q), made)
         return made
 
     def jacobian(self, t: float, q: Array, p: Array) -> Array:
         """C_q."""
-        made = np.zeros((self._n_rows, self._n_q))
+        made = self._zeros(q, self._n_rows, self._n_q)
         self._callbacks.fill_jacobian(q, p, self._moved(t, q, q), made)
         return made
 
     def constraint_rate(self, t: float, q: Array, p: Array) -> Array:
         """C_t."""
-        made = np.zeros(self._n_rows)
+        made = self._zeros(q, self._n_rows)
         self._callbacks.fill_rate(q, p, self._moved(t, q, q), made)
         return made
 
     def gamma(self, t: float, q: Array, v: Array, p: Array) -> Array:
         """The right-hand side of C_q a = gamma."""
-        made = np.zeros(self._n_rows)
+        made = self._zeros(q, self._n_rows)
         self._callbacks.fill_gamma(q, v, p, self._moved(t, q, v), made)
         return made
 
     def nonholonomic(self, t: float, q: Array, p: Array) -> Array:
         """A."""
-        made = np.zeros((self._n_rates, self._n_q))
+        made = self._zeros(q, self._n_rates, self._n_q)
         self._callbacks.fill_nonholonomic(p, self._moved(t, q, q), made)
         return made
 
     def nonholonomic_gamma(self, t: float, q: Array, v: Array, p: Array) -> Array:
         """The right-hand side of A a = Q_a."""
-        made = np.zeros(self._n_rates)
+        made = self._zeros(q, self._n_rates)
         self._callbacks.fill_nonholonomic_gamma(p, self._moved(t, q, v), made)
         return made
+
+    def _zeros(self, q: Array, *shape: int) -> Array:
+        if q.dtype == object:  # symbols, on which the compiled callbacks would say less
+            raise Untraceable(self._untraced)
+        return np.zeros(shape)
 
     def _moved(self, t: float, q: Array, v: Array) -> Array:
         return _called(self._motions, t, q, v)
