@@ -145,6 +145,7 @@ def test_a_five_bar():
     agreed(problem, 0.4)
 
 
+@pytest.mark.slow
 def test_lazy_tongs_open_all_alike():
     n, half = 4, np.array([0.2, 0.15])
     places, bars = {}, {}
@@ -248,6 +249,7 @@ def test_bennetts_linkage():
     agreed(problem, 1.0)
 
 
+@pytest.mark.slow  # as is Bennett's, which is not
 def test_a_sarrus_linkage_moves_on_a_line():
     """P.-F. Sarrus (1853): two pairs of plates on hinges in two directions; a table rises without turning."""
     model = SpatialModel(name="Sarrus")

@@ -153,6 +153,7 @@ def test_a_box_rocks_to_rest_on_two_corners(restitution):
     np.testing.assert_allclose(-result.arcs[-1].lam[:, -1], [0.5 * GRAVITY] * 2)
 
 
+@pytest.mark.slow
 def test_a_ball_comes_to_rest_in_a_wedge_at_the_origin():
     model = ball()
     for side in (-1.0, 1.0):

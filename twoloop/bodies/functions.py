@@ -14,9 +14,8 @@ from twoloop.bodies.row_function import RowFunction
 from twoloop.checks.arguments import check_finite, check_real, shown
 from twoloop.generate.calls_on_symbols import as_forms, trace
 from twoloop.generate.derivative import Derivative
-from twoloop.generate.programs import Program, program_of
+from twoloop.generate.programs import Program, numbers_of, program_of
 from twoloop.generate.tracing import Form, Graph, Untraceable, symbols
-from twoloop.kernels.evaluation.operations import RESULT
 
 Array = NDArray[np.float64]
 
@@ -158,14 +157,6 @@ def program_for(functions: Sequence[Function | RowFunction], n_q: int, motions: 
         except Untraceable as error:
             raise Untraceable(f"{each.name}: {error}") from None
     return program_of(graph, 1 + 2 * n_q, dict(enumerate(made)))
-
-
-def numbers_of(program: Program) -> list[float]:
-    """A program as it stands in the parameters, see `program_results`."""
-    n_results = int((program.rows[:, 0] == RESULT).sum())
-    sizes = [n_results, program.n_nodes, len(program.rows), len(program.columns)]
-    parts: list[Any] = [sizes, program.rows.ravel(), program.columns, program.coefficients, program.constants.ravel()]
-    return [float(x) for part in parts for x in part]
 
 
 def is_constant(function: Function | RowFunction) -> bool:

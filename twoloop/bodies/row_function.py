@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from twoloop.generate.calls_on_symbols import as_forms, trace
 from twoloop.generate.derivative import Derivative
-from twoloop.generate.programs import program_of
+from twoloop.generate.programs import numbers_of, program_of
 from twoloop.generate.tracing import Form, Graph, Untraceable, symbols
 
 Array = NDArray[np.float64]
@@ -37,8 +37,6 @@ class RowFunction:
     traced: Array = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        from twoloop.bodies.functions import numbers_of
-
         n, graph = 1 + max(self.columns), Graph()
         (t,) = graph.inputs(1, False)
         q, v = graph.inputs(n, False), graph.inputs(n, True)

@@ -7,9 +7,10 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from twoloop.bodies.functions import is_constant, numbers_of, program_for
+from twoloop.bodies.functions import is_constant, program_for
 from twoloop.bodies.parameter_layout import BRAKE, NONE, PULL, RAIL, RATE, RUB, SPRING, TORSION
 from twoloop.bodies.parts import Body, Force, JointRow, ModelJoint, Numbers
+from twoloop.generate.programs import numbers_of
 from twoloop.generate.tracing import Untraceable
 
 Array = NDArray[np.float64]

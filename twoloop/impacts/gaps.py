@@ -8,11 +8,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from twoloop.bodies.functions import numbers_of
 from twoloop.checks.arguments import shown
 from twoloop.generate.calls_on_symbols import as_forms, trace
 from twoloop.generate.derivative import Derivative
-from twoloop.generate.programs import program_of
+from twoloop.generate.programs import numbers_of, program_of
 from twoloop.generate.tracing import Form, Graph, Untraceable, symbols
 from twoloop.problem.stops import Stop
 
