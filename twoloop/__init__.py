@@ -31,6 +31,7 @@ __all__ = [
     "Runs",
     "Statistics",
     "Status",
+    "Stop",
     "Taylor",
     "callback",
     "citation",
@@ -41,6 +42,7 @@ __all__ = [
     "paper_irk",
     "paper_newmark",
     "solve_dae",
+    "solve_with_stops",
     "sweep",
 ]
 

@@ -5,6 +5,7 @@ from twoloop.ensembles.consistent_states import consistent_states as consistent_
 from twoloop.ensembles.ensemble import ensemble as ensemble
 from twoloop.ensembles.integrator import Integrator as Integrator
 from twoloop.ensembles.runs import Runs as Runs
+from twoloop.impacts.motion import solve_with_stops as solve_with_stops
 from twoloop.kernels.compile.callbacks import callback as callback
 from twoloop.methods.bdf import BDF as BDF
 from twoloop.methods.dop853 import DOP853 as DOP853
@@ -16,6 +17,7 @@ from twoloop.methods.runge_kutta import RungeKutta as RungeKutta
 from twoloop.methods.taylor import Taylor as Taylor
 from twoloop.problem.drawing import Drawing as Drawing
 from twoloop.problem.joints import Joint as Joint
+from twoloop.problem.stops import Stop as Stop
 from twoloop.problem.system import ConstrainedSystem as ConstrainedSystem
 from twoloop.result.certificate import Certificate as Certificate
 from twoloop.result.certificate import CertificateWarning as CertificateWarning

@@ -3,6 +3,7 @@
 from tests.bad_input.between_steps import BETWEEN_STEPS
 from tests.bad_input.bodies import BODIES
 from tests.bad_input.ensembles import ENSEMBLES
+from tests.bad_input.impacts import IMPACTS
 from tests.bad_input.joints import JOINTS
 from tests.bad_input.mechanisms import MECHANISMS
 from tests.bad_input.methods import METHODS
@@ -18,6 +19,7 @@ from tests.general.wrong_rows import ROWS
 CASES = [
     *(*SOLVE, *BETWEEN_STEPS, *START, *PROJECTION, *SYSTEMS, *METHODS, *MECHANISMS, *ROWS, *JOINTS, *RESULTS),
     *BODIES,
+    *IMPACTS,
     *ENSEMBLES,
     *SIMULATORS,
     *SYMBOLIC,

@@ -248,3 +248,35 @@ def test_defaults_of_tendons_and_what_else_was_passed_over(tmp_path):
     problem = model.problem()
     assert [value for name, value in problem.parameters.items() if "spring" in name][-3:] == [7.0, 2.0, 1.0]
     assert len(problem.joints) == 0
+
+
+def test_accelerations_of_a_tree_are_those_of_mujoco(tmp_path):
+    mujoco = pytest.importorskip("mujoco")
+    random = np.random.default_rng(6)
+    model = SpatialModel(gravity=(0.5, -1.0, -9.0))
+    parents = ["ground", "b0", "b1", "b1", "b3", "b4"]
+    for k in range(6):
+        turn = np.linalg.qr(random.normal(size=(3, 3)))[0]
+        J = np.diag((0.1, 0.2, 0.25)) + 0.01 * np.ones((3, 3))
+        turn *= np.linalg.det(turn)
+        model.body(f"b{k}", mass=1.0 + k, inertia=J, position=random.normal(size=3), rotation=turn)
+    at, axes = random.normal(size=(6, 3)), random.normal(size=(6, 3))
+    hinge = model.revolute(parents[0], "b0", at=at[0], axis=axes[0])
+    slide = model.prismatic(parents[1], "b1", at=at[1], axis=axes[1])
+    model.spherical(parents[2], "b2", at=at[2])
+    model.universal(parents[3], "b3", at=at[3], axes=(axes[3], np.cross(axes[3], axes[2])))
+    model.cylindrical(parents[4], "b4", at=at[4], axis=axes[4])
+    model.fixed(parents[5], "b5")
+    model.torsion_spring(hinge, stiffness=3.0, angle=0.4)
+    model.axial_spring(slide, stiffness=5.0, length=0.2)
+    model.spring("b0", at[0], "b3", at[5], stiffness=2.0, length=0.1)
+    model.to_mjcf(tmp_path / "tree.xml")
+    theirs = mujoco.MjModel.from_xml_path(str(tmp_path / "tree.xml"))
+    data = mujoco.MjData(theirs)
+    mujoco.mj_forward(theirs, data)
+    problem = model.problem()
+    ours = solve_dae(problem.system, (0.0, 1e-3), problem.q0, problem.v0).a[:, 0].reshape(6, 7)[:, :3]
+    moved = np.zeros((3, theirs.nv))
+    for k in range(6):
+        mujoco.mj_jacBodyCom(theirs, data, moved, None, theirs.body(f"b{k}").id)
+        np.testing.assert_allclose(moved @ data.qacc, ours[k], rtol=1e-9, atol=1e-9)

@@ -123,7 +123,7 @@ def driven_there(system: ConstrainedSystem, t: float, start: Array, keep: Sequen
 
 def _open(system: ConstrainedSystem, left: Array, rows: Mapping[str, tuple[int, ...]]) -> str:
     """Which joints stay open, by what is left of their rows."""
-    misfit = {name: float(left[list(of)].max()) for name, of in rows.items()}
+    misfit = {name: max((float(left[k]) for k in of if k < len(left)), default=0.0) for name, of in rows.items()}
     worst = max(misfit, key=lambda name: misfit[name])
     others = [name for name in misfit if name != worst and misfit[name] > 0.1 * misfit[worst]]
     also = f" (nor do {', '.join(map(repr, others))})" if others else ""
@@ -210,7 +210,11 @@ def velocities(
             f"{f' ({unit}/s)' if unit else ''}. Give velocities of fewer bodies (the others follow), or fewer joints"
         )
     v = v - np.linalg.lstsq(scaled, scaled @ v + system.rates(t, q) / scales.rows, rcond=SINGULAR)[0]
-    v[~known & (np.abs(v) < ROUNDING * np.abs(v).max())] = 0.0  # what rounding leaves of bodies at rest
+    at_rest = np.where(~known & (np.abs(v) < ROUNDING * np.abs(v).max()), 0.0, v)  # without what rounding leaves
+    rates = system.rates(t, q) / scales.rows
+    terms = ROUNDING * (np.abs(scaled) @ np.abs(at_rest) + np.abs(rates))
+    if (np.abs(scaled @ at_rest + rates) <= np.maximum(np.abs(scaled @ v + rates), terms)).all():
+        v = at_rest
     return np.asarray(v * scales.columns)
 
 

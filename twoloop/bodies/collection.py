@@ -11,6 +11,7 @@ from twoloop.bodies.functions import Function, force_function
 from twoloop.bodies.parameter_layout import NONE
 from twoloop.bodies.parts import Body, BodyDirection, BodyPoint, Force, JointRow, ModelJoint, Numbers
 from twoloop.checks.arguments import check_positive, check_text, check_vector, shown
+from twoloop.problem.stops import Stop
 
 Array = NDArray[np.float64]
 Points = tuple[Numbers, Numbers]
@@ -32,6 +33,7 @@ class Collection:
         self.bodies: list[Body] = []
         self.joints: list[ModelJoint] = []
         self.forces: list[Force] = []
+        self.stops: list[Stop] = []
 
     def __repr__(self) -> str:
         return (
@@ -57,7 +59,9 @@ class Collection:
 
     def _new_name(self, what: str, name: str | None, *bodies: Body) -> str:
         """A name that nothing else has: the one given, or one of the kind and the bodies."""
-        known = {each.name for part in (self.bodies, self.joints, self.forces) for each in part} | {"ground"}
+        known = {each.name for part in (self.bodies, self.joints, self.forces, self.stops) for each in part} | {
+            "ground"
+        }
         if name is not None:
             if not check_text("name", name).strip():
                 raise ValueError(f"name must not be empty; given {name!r}")

@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from twoloop.bodies.row_function import RowFunction
 from twoloop.checks.arguments import check_finite, check_real, shown
 from twoloop.generate.calls_on_symbols import as_forms, trace
 from twoloop.generate.derivative import Derivative
-from twoloop.generate.programs import Program, program_of
+from twoloop.generate.programs import Program, numbers_of, program_of
 from twoloop.generate.tracing import Form, Graph, Untraceable, symbols
-from twoloop.kernels.evaluation.operations import RESULT
 
 Array = NDArray[np.float64]
 
@@ -47,6 +47,11 @@ class Function:
     size: int
     derivatives: tuple[Callable[..., Any], ...] = ()
     traced: Array | None = None
+
+    @property
+    def n_results(self) -> int:
+        """How many numbers its program gives: of a motion three."""
+        return 3 if self.derivatives or self.traced is not None else self.size
 
     def at(self, t: float, q: Array, v: Array) -> Array:
         """What it gives, of the right shape; of a motion its derivatives, too."""
@@ -137,7 +142,7 @@ def motion_forms(function: Function, graph: Graph, t: Form) -> list[Form]:
     return made
 
 
-def program_for(functions: Sequence[Function], n_q: int, motions: bool) -> Program:
+def program_for(functions: Sequence[Function | RowFunction], n_q: int, motions: bool) -> Program:
     """One program for all functions, in their order; raises Untraceable."""
     graph = Graph()
     (t,) = graph.inputs(1, False)
@@ -145,22 +150,19 @@ def program_for(functions: Sequence[Function], n_q: int, motions: bool) -> Progr
     made: list[Form] = []
     for each in functions:
         try:
-            made += motion_forms(each, graph, t) if motions else each.forms(graph, t, q, v)
+            if motions and isinstance(each, Function):
+                made += motion_forms(each, graph, t)
+            else:
+                made += each.forms(graph, t, q, v)
         except Untraceable as error:
             raise Untraceable(f"{each.name}: {error}") from None
     return program_of(graph, 1 + 2 * n_q, dict(enumerate(made)))
 
 
-def numbers_of(program: Program) -> list[float]:
-    """A program as it stands in the parameters, see `program_results`."""
-    n_results = int((program.rows[:, 0] == RESULT).sum())
-    sizes = [n_results, program.n_nodes, len(program.rows), len(program.columns)]
-    parts: list[Any] = [sizes, program.rows.ravel(), program.columns, program.coefficients, program.constants.ravel()]
-    return [float(x) for part in parts for x in part]
-
-
-def is_constant(function: Function) -> bool:
+def is_constant(function: Function | RowFunction) -> bool:
     """Whether a motion is known to hold its joint still."""
+    if isinstance(function, RowFunction):
+        return True
     graph = Graph()
     try:
         return not function.forms(graph, graph.inputs(1, False)[0], [], [])[0].terms

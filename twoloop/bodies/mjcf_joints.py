@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
+from twoloop.bodies.mjcf_geometry import Lump, Pose, together
 from twoloop.bodies.parts import Body, ModelJoint
 from twoloop.bodies.spatial_model import SpatialModel
 
@@ -24,6 +25,35 @@ class Freed:
     at: Array
     axis: Array
     attributes: dict[str, str]
+
+
+@dataclass
+class Part:
+    """A body that moves, with what is fixed to it: its parent, its frame in space, joints and masses in space."""
+
+    name: str
+    parent: Part | None
+    pose: Pose
+    freed: list[Freed] = field(default_factory=list)
+    lumps: list[Lump] = field(default_factory=list)
+    body: Body | None = None
+
+
+def body_of(model: SpatialModel, part: Part | None) -> Body:
+    """The body of a part; None: the ground."""
+    body = model.ground if part is None else part.body
+    assert body is not None
+    return body
+
+
+def add_part(model: SpatialModel, part: Part) -> ModelJoint | None:
+    """Add the body of a part to a model, and its joint; None: all is free."""
+    lump = together(part.lumps)
+    if not lump.mass > 0.0:
+        raise ValueError(f"the body {part.name!r} has joints but no mass: give it an <inertial>, or a geom with volume")
+    R = part.pose.R
+    part.body = model.body(part.name, mass=lump.mass, inertia=R.T @ lump.J @ R, position=lump.centre, rotation=R)
+    return add_joints(model, body_of(model, part.parent), part.body, part.freed)
 
 
 def add_joints(model: SpatialModel, parent: Body, child: Body, freed: list[Freed]) -> ModelJoint | None:

@@ -5,15 +5,14 @@ from __future__ import annotations
 import os
 import warnings
 import xml.etree.ElementTree as ElementTree
-from dataclasses import dataclass, field
 from typing import Any
 from xml.etree.ElementTree import Element
 
 import numpy as np
 from numpy.typing import NDArray
 
-from twoloop.bodies.mjcf_geometry import IgnoredWarning, Lump, Pose, geom_lump, numbers, pose_of, together
-from twoloop.bodies.mjcf_joints import Freed, add_joints
+from twoloop.bodies.mjcf_geometry import IgnoredWarning, Lump, Pose, geom_lump, numbers, pose_of
+from twoloop.bodies.mjcf_joints import Freed, Part, add_part, body_of
 from twoloop.bodies.parts import Body, ModelJoint
 from twoloop.bodies.spatial_model import SpatialModel
 
@@ -24,18 +23,6 @@ KNOWN = {"compiler", "option", "default", "worldbody", "equality", "tendon"}
 SOFT = ("armature", "frictionloss")
 DEFAULT_OF = {"spatial": "tendon", "fixed": "tendon", "connect": "equality", "weld": "equality"}  # elements of defaults
 AGREES = 1e-6  # of the pose that a weld asks for
-
-
-@dataclass
-class Part:
-    """A body that moves, with what is fixed to it: its parent, its frame in space, joints and masses in space."""
-
-    name: str
-    parent: Part | None
-    pose: Pose
-    freed: list[Freed] = field(default_factory=list)
-    lumps: list[Lump] = field(default_factory=list)
-    body: Body | None = None
 
 
 def from_mjcf(path: str | os.PathLike[str]) -> SpatialModel:
@@ -249,23 +236,12 @@ class _Reader:
 
     def _add(self, part: Part) -> None:
         """The body and the joint of a part."""
-        lump = together(part.lumps)
-        if not lump.mass > 0.0:
-            raise ValueError(
-                f"the body {part.name!r} has joints but no mass: give it an <inertial>, or a geom with volume"
-            )
-        R = part.pose.R
-        part.body = self.model.body(
-            part.name, mass=lump.mass, inertia=R.T @ lump.J @ R, position=lump.centre, rotation=R
-        )
-        joint = add_joints(self.model, self._of(part.parent), part.body, part.freed)
+        joint = add_part(self.model, part)
         for freed in part.freed:
             self._springs(freed, joint)
 
     def _of(self, part: Part | None) -> Body:
-        body = self.model.ground if part is None else part.body
-        assert body is not None
-        return body
+        return body_of(self.model, part)
 
     def _springs(self, freed: Freed, joint: ModelJoint | None) -> None:
         """Spring and damper of a joint, about the value springref, where the file's pose has the value ref."""

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.bodies import assembly
-from twoloop.bodies.loads import Loads
 from twoloop.bodies.model_energy import ModelEnergy
 from twoloop.bodies.model_problem import ModelProblem
+from twoloop.bodies.model_stops import Stops
 from twoloop.bodies.model_system import joints_of, system_of
 from twoloop.bodies.parts import Body, ModelJoint
 from twoloop.bodies.sketches import drawing_of
@@ -21,7 +21,7 @@ from twoloop.checks.arguments import check_positive, check_span, check_text, sho
 Array = NDArray[np.float64]
 
 
-class Model(Loads):
+class Model(Stops):
     """What `PlanarModel` and `SpatialModel` share beside their bodies and joints."""
 
     coordinate_names: tuple[str, ...]
@@ -113,6 +113,7 @@ class Model(Loads):
             model=self._as_it_is(),
             keep=keep,
             freedom=freedom,
+            stops=tuple(self.stops),
         )
 
     def _tables(self, joints: Sequence[ModelJoint], values: Mapping[str, float] | None) -> Tables:
@@ -125,6 +126,7 @@ class Model(Loads):
         """A copy to which nothing is added."""
         other = copy.copy(self)
         other.bodies, other.joints, other.forces = list(self.bodies), list(self.joints), list(self.forces)
+        other.stops = list(self.stops)
         return other
 
     def _turning(self) -> NDArray[np.bool_]:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from twoloop.bodies.assembly import Freedom
 from twoloop.checks.arguments import check_finite
 from twoloop.problem.problem import Problem
+from twoloop.problem.stops import Stop
 
 if TYPE_CHECKING:
     from twoloop.bodies.model import Model
@@ -26,11 +27,14 @@ class ModelProblem(Problem):
     ----------
     freedom : Freedom
         Degrees of freedom, and which joints have rows that follow from others.
+    stops : tuple of Stop
+        For `solve_with_stops`.
     """
 
     model: Model | None = field(default=None, repr=False)
     keep: tuple[int, ...] = field(default=(), repr=False)
     freedom: Freedom = field(default_factory=lambda: Freedom(0, 0, ()))
+    stops: tuple[Stop, ...] = ()
 
     def place(self, name: str) -> int:
         """Where a parameter stands in `system.parameters`, by its name with or without the unit.

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from twoloop.bodies.functions import Function
 from twoloop.bodies.parameter_layout import FORCE_PROGRAM, HEAD, MOTION_PROGRAM
+from twoloop.bodies.row_function import RowFunction
 from twoloop.bodies.tables import Tables
 from twoloop.generate.tracing import Untraceable
 from twoloop.problem.joints import Joint
@@ -44,9 +45,17 @@ def system_of(
     callbacks: Any = import_module(f"twoloop.bodies.{'planar' if dimension == 2 else 'spatial'}_callbacks")
     n_q = (3 if dimension == 2 else 7) * len(tables.bodies)
     kinds = [kind for kind in KINDS if kind in ("mass", "force") or (kind in OF_JOINTS and tables.n_rows)]
-    if tables.motions:
+    kinds += ["nonholonomic", "nonholonomic_gamma"] if tables.n_rates else []
+    if any(isinstance(motion, Function) for motion in tables.motions):
         kinds.append("constraint_rate")
-    options: Any = {"n_q": n_q, "n_c": tables.n_rows, "joints": joints, "name": name, "parameters": tables.p}
+    options: Any = {
+        "n_q": n_q,
+        "n_c": tables.n_rows,
+        "n_a": tables.n_rates,
+        "joints": joints,
+        "name": name,
+        "parameters": tables.p,
+    }
     for each in (*tables.motions, *tables.functions):
         each.at(*start)  # says what is wrong with what it returns
     if not tables.untraced:
@@ -74,8 +83,8 @@ def _disagreement(tables: Tables, t: float, q: Array, v: Array) -> str:
                 try:
                     known = each.at(then, one, other)
                 except (ArithmeticError, TypeError):  # outside what it is made for
-                    known = np.full(each.size, np.nan)
-                size = 3 if functions is tables.motions else each.size
+                    known = np.full(each.n_results, np.nan)
+                size = each.n_results
                 found, first = made[first : first + len(known)], first + size
                 off = np.abs(known - found) > AGREES * (1.0 + np.abs(known))
                 if (off & np.isfinite(known)).any():
@@ -96,7 +105,8 @@ class InPython:
     def __init__(self, callbacks: Any, tables: Tables, n_q: int):
         self._callbacks = callbacks
         self._motions, self._functions = tuple(tables.motions), tuple(tables.functions)
-        self._n_q, self._n_rows, self._untraced = n_q, tables.n_rows, tables.untraced
+        self._n_q, self._n_rows, self._n_rates = n_q, tables.n_rows, tables.n_rates
+        self._untraced = tables.untraced
 
     def mass(self, t: float, q: Array, p: Array) -> Array:
         """M."""
@@ -113,25 +123,37 @@ class InPython:
     def constraint(self, t: float, q: Array, p: Array) -> Array:
         """C."""
         made = self._zeros(q, self._n_rows)
-        self._callbacks.fill_constraint(q, p, self._moved(t), made)
+        self._callbacks.fill_constraint(q, p, self._moved(t, q, q), made)
         return made
 
     def jacobian(self, t: float, q: Array, p: Array) -> Array:
         """C_q."""
         made = self._zeros(q, self._n_rows, self._n_q)
-        self._callbacks.fill_jacobian(q, p, self._moved(t), made)
+        self._callbacks.fill_jacobian(q, p, self._moved(t, q, q), made)
         return made
 
     def constraint_rate(self, t: float, q: Array, p: Array) -> Array:
         """C_t."""
         made = self._zeros(q, self._n_rows)
-        self._callbacks.fill_rate(q, p, self._moved(t), made)
+        self._callbacks.fill_rate(q, p, self._moved(t, q, q), made)
         return made
 
     def gamma(self, t: float, q: Array, v: Array, p: Array) -> Array:
         """The right-hand side of C_q a = gamma."""
         made = self._zeros(q, self._n_rows)
-        self._callbacks.fill_gamma(q, v, p, self._moved(t), made)
+        self._callbacks.fill_gamma(q, v, p, self._moved(t, q, v), made)
+        return made
+
+    def nonholonomic(self, t: float, q: Array, p: Array) -> Array:
+        """A."""
+        made = self._zeros(q, self._n_rates, self._n_q)
+        self._callbacks.fill_nonholonomic(p, self._moved(t, q, q), made)
+        return made
+
+    def nonholonomic_gamma(self, t: float, q: Array, v: Array, p: Array) -> Array:
+        """The right-hand side of A a = Q_a."""
+        made = self._zeros(q, self._n_rates)
+        self._callbacks.fill_nonholonomic_gamma(p, self._moved(t, q, v), made)
         return made
 
     def _zeros(self, q: Array, *shape: int) -> Array:
@@ -139,10 +161,9 @@ class InPython:
             raise Untraceable(self._untraced)
         return np.zeros(shape)
 
-    def _moved(self, t: float) -> Array:
-        nothing = np.zeros(0)
-        return _called(self._motions, t, nothing, nothing)
+    def _moved(self, t: float, q: Array, v: Array) -> Array:
+        return _called(self._motions, t, q, v)
 
 
-def _called(functions: tuple[Function, ...], t: float, q: Array, v: Array) -> Array:
+def _called(functions: tuple[Function | RowFunction, ...], t: float, q: Array, v: Array) -> Array:
     return np.concatenate([np.zeros(0), *(each.at(t, q, v) for each in functions)])

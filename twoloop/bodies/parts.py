@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from twoloop.bodies.functions import Function
 from twoloop.bodies.parameter_layout import NONE
+from twoloop.bodies.row_function import RowFunction
 from twoloop.checks.arguments import check_vector
 
 Array = NDArray[np.float64]
@@ -104,7 +105,7 @@ class JointRow:
     on_first: Numbers | None = None
     on_second: Numbers | None = None
     more: Numbers | None = None
-    motion: Function | None = None
+    motion: Function | RowFunction | None = None
 
 
 @dataclass(frozen=True, eq=False)

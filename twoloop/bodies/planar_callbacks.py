@@ -35,6 +35,7 @@ from twoloop.bodies.parameter_layout import (
     PLANAR_BODY,
     PULL,
     RAIL,
+    RATE,
     ROW,
     RUB,
     SECOND,
@@ -42,6 +43,7 @@ from twoloop.bodies.parameter_layout import (
     SLIDE,
     TORQUE,
     TORSION,
+    WRITTEN,
 )
 from twoloop.bodies.program_results import result, results
 from twoloop.kernels.compile.caches import helper
@@ -99,6 +101,11 @@ def fill_constraint(q, p, made, C):
     for k in range(first, first + JOINT_WIDTH * n, JOINT_WIDTH):
         kind, row, i, j = int(p[k + KIND]), int(p[k + ROW]), int(p[k + FIRST]), int(p[k + SECOND])
         more, moved = int(p[k + MORE]), result(made, int(p[k + MOTION]), 0)
+        if kind == RATE:
+            continue
+        if kind == WRITTEN:
+            C[row] = made[int(p[k + MOTION])]
+            continue
         if kind == ANGLE:
             C[row] = angle_of(q, j) - angle_of(q, i) - p[more] - moved
             continue
@@ -120,6 +127,13 @@ def fill_jacobian(q, p, made, Cq):
     first, n = int(p[p.size - HEAD + JOINTS]), int(p[p.size - HEAD + N_JOINTS])
     for k in range(first, first + JOINT_WIDTH * n, JOINT_WIDTH):
         kind, row, i, j = int(p[k + KIND]), int(p[k + ROW]), int(p[k + FIRST]), int(p[k + SECOND])
+        if kind == RATE:
+            continue
+        if kind == WRITTEN:
+            first_result, columns = int(p[k + MOTION]) + 3, int(p[k + MORE])
+            for m in range(int(p[columns])):
+                Cq[row, int(p[columns + 1 + m])] = made[first_result + m]
+            continue
         if kind == ANGLE:
             turn(Cq[row], j, 1.0)
             turn(Cq[row], i, -1.0)
@@ -146,8 +160,8 @@ def fill_rate(q, p, made, Ct):
     """C_t, of drives alone."""
     first, n = int(p[p.size - HEAD + JOINTS]), int(p[p.size - HEAD + N_JOINTS])
     for k in range(first, first + JOINT_WIDTH * n, JOINT_WIDTH):
-        if int(p[k + MOTION]) >= 0:
-            Ct[int(p[k + ROW])] = -result(made, int(p[k + MOTION]), 1)
+        if int(p[k + MOTION]) >= 0 and int(p[k + KIND]) != RATE:
+            Ct[int(p[k + ROW])] = -result(made, int(p[k + MOTION]), 1)  # zero of WRITTEN rows
 
 
 @helper
@@ -157,6 +171,11 @@ def fill_gamma(q, v, p, made, Qd):
     for k in range(first, first + JOINT_WIDTH * n, JOINT_WIDTH):
         kind, row, i, j = int(p[k + KIND]), int(p[k + ROW]), int(p[k + FIRST]), int(p[k + SECOND])
         more, moved = int(p[k + MORE]), result(made, int(p[k + MOTION]), 2)
+        if kind == RATE:
+            continue
+        if kind == WRITTEN:
+            Qd[row] = made[int(p[k + MOTION]) + 2]
+            continue
         if kind == ANGLE:
             Qd[row] = moved
             continue
@@ -241,6 +260,26 @@ def fill_force(q, v, p, made, Q):
         add(Q, j, -x, -y, bdx, bdy)
 
 
+@helper
+def fill_nonholonomic(p, made, A):
+    """A."""
+    first, n = int(p[p.size - HEAD + JOINTS]), int(p[p.size - HEAD + N_JOINTS])
+    for k in range(first, first + JOINT_WIDTH * n, JOINT_WIDTH):
+        if int(p[k + KIND]) == RATE:
+            row, entries, columns = int(p[k + ROW]), int(p[k + MOTION]) + 1, int(p[k + MORE])
+            for m in range(int(p[columns])):
+                A[row, int(p[columns + 1 + m])] = made[entries + m]
+
+
+@helper
+def fill_nonholonomic_gamma(p, made, Qa):
+    """The right-hand side of A a = Q_a."""
+    first, n = int(p[p.size - HEAD + JOINTS]), int(p[p.size - HEAD + N_JOINTS])
+    for k in range(first, first + JOINT_WIDTH * n, JOINT_WIDTH):
+        if int(p[k + KIND]) == RATE:
+            Qa[int(p[k + ROW])] = made[int(p[k + MOTION])]
+
+
 @callback("mass")
 def mass(t, q, p, M):
     for body in range(int(p[p.size - HEAD + BODIES])):
@@ -261,7 +300,7 @@ def constraint(t, q, p, C):
 
 @callback("jacobian")
 def jacobian(t, q, p, Cq):
-    fill_jacobian(q, p, p, Cq)  # motions have no part in it
+    fill_jacobian(q, p, results(int(p[p.size - HEAD + MOTION_PROGRAM]), t, q, q, p), Cq)
 
 
 @callback("constraint_rate")
@@ -272,3 +311,13 @@ def constraint_rate(t, q, p, Ct):
 @callback("gamma")
 def gamma(t, q, v, p, Qd):
     fill_gamma(q, v, p, results(int(p[p.size - HEAD + MOTION_PROGRAM]), t, q, v, p), Qd)
+
+
+@callback("nonholonomic")
+def nonholonomic(t, q, p, A):
+    fill_nonholonomic(p, results(int(p[p.size - HEAD + MOTION_PROGRAM]), t, q, q, p), A)
+
+
+@callback("nonholonomic_gamma")
+def nonholonomic_gamma(t, q, v, p, Qa):
+    fill_nonholonomic_gamma(p, results(int(p[p.size - HEAD + MOTION_PROGRAM]), t, q, v, p), Qa)

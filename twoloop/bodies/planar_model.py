@@ -8,15 +8,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from twoloop.bodies.functions import Function
-from twoloop.bodies.model import Model
 from twoloop.bodies.parameter_layout import ACROSS, ALONG, ANGLE, DISTANCE, PIN, SLIDE, TORQUE, TORSION
 from twoloop.bodies.parts import Body, Force, JointRow, ModelJoint, Numbers
+from twoloop.bodies.planar_couplings import Couplings
 from twoloop.checks.arguments import check_finite, check_positive, check_vector
 
 Array = NDArray[np.float64]
 
 
-class PlanarModel(Model):
+class PlanarModel(Couplings):
     """A mechanism in a plane, from bodies, joints and forces.
 
     Coordinates are x, y of each body's centre of mass and its angle, positive from x to y. Points and axes are given in
@@ -259,6 +259,11 @@ class PlanarModel(Model):
 
     def _no_rotation(self) -> float:
         return 0.0
+
+    def _axis(self, joint: ModelJoint) -> Array:
+        assert joint.rows[0].more is not None
+        (angle,) = joint.rows[0].more.values
+        return np.array([np.cos(angle), np.sin(angle)])
 
     def _drive_row(self, joint: ModelJoint, motion: Function) -> JointRow:
         if joint.kind == "revolute":

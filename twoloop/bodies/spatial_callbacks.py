@@ -39,6 +39,7 @@ from twoloop.bodies.parameter_layout import (
     POINT,
     PULL,
     RAIL,
+    RATE,
     ROW,
     RUB,
     SECOND,
@@ -48,6 +49,7 @@ from twoloop.bodies.parameter_layout import (
     TORQUE,
     TORSION,
     TURN,
+    WRITTEN,
 )
 from twoloop.bodies.program_results import result, results
 from twoloop.bodies.spatial_places import (
@@ -105,6 +107,11 @@ def fill_constraint(q, p, made, C):
     for k in range(first, first + JOINT_WIDTH * n, JOINT_WIDTH):
         kind, row, i, j = int(p[k + KIND]), int(p[k + ROW]), int(p[k + FIRST]), int(p[k + SECOND])
         at, there, more, moved = int(p[k + FIRST_AT]), int(p[k + SECOND_AT]), int(p[k + MORE]), int(p[k + MOTION])
+        if kind == RATE:
+            continue
+        if kind == WRITTEN:
+            C[row] = made[int(p[k + MOTION])]
+            continue
         if kind in (PERPENDICULAR, TURN):
             if kind == TURN:
                 (x, y, z), _, _ = followed(p, at, made, moved)
@@ -139,6 +146,13 @@ def fill_jacobian(q, p, made, Cq):
     for k in range(first, first + JOINT_WIDTH * n, JOINT_WIDTH):
         kind, row, i, j = int(p[k + KIND]), int(p[k + ROW]), int(p[k + FIRST]), int(p[k + SECOND])
         at, there, more = int(p[k + FIRST_AT]), int(p[k + SECOND_AT]), int(p[k + MORE])
+        if kind == RATE:
+            continue
+        if kind == WRITTEN:
+            first_result, columns = int(p[k + MOTION]) + 3, int(p[k + MORE])
+            for m in range(int(p[columns])):
+                Cq[row, int(p[columns + 1 + m])] = made[first_result + m]
+            continue
         if kind == POINT:
             for axis in range(3):
                 fx, fy, fz = 1.0 * (axis == 0), 1.0 * (axis == 1), 1.0 * (axis == 2)
@@ -173,7 +187,7 @@ def fill_rate(q, p, made, Ct):
     first, n = int(p[p.size - HEAD + JOINTS]), int(p[p.size - HEAD + N_JOINTS])
     for k in range(first, first + JOINT_WIDTH * n, JOINT_WIDTH):
         moved = int(p[k + MOTION])
-        if moved >= 0:
+        if moved >= 0 and int(p[k + KIND]) != RATE:
             if int(p[k + KIND]) == TURN:
                 there = int(p[k + SECOND_AT])
                 _, (x, y, z), _ = followed(p, int(p[k + FIRST_AT]), made, moved)
@@ -194,6 +208,11 @@ def fill_gamma(q, v, p, made, Qd):
     for k in range(first, first + JOINT_WIDTH * n, JOINT_WIDTH):
         kind, row, i, j = int(p[k + KIND]), int(p[k + ROW]), int(p[k + FIRST]), int(p[k + SECOND])
         at, there, more, moved = int(p[k + FIRST_AT]), int(p[k + SECOND_AT]), int(p[k + MORE]), int(p[k + MOTION])
+        if kind == RATE:
+            continue
+        if kind == WRITTEN:
+            Qd[row] = made[int(p[k + MOTION]) + 2]
+            continue
         if kind in (PERPENDICULAR, TURN):
             bx, by, bz = vector(q, j, p[there], p[there + 1], p[there + 2])
             bux, buy, buz, bax, bay, baz = vector_rate(q, v, j, p[there], p[there + 1], p[there + 2])
@@ -323,6 +342,26 @@ def fill_force(q, v, p, made, Q):
         push_row(q, Q, j, p, there, -x, -y, -z)
 
 
+@helper
+def fill_nonholonomic(p, made, A):
+    """A."""
+    first, n = int(p[p.size - HEAD + JOINTS]), int(p[p.size - HEAD + N_JOINTS])
+    for k in range(first, first + JOINT_WIDTH * n, JOINT_WIDTH):
+        if int(p[k + KIND]) == RATE:
+            row, entries, columns = int(p[k + ROW]), int(p[k + MOTION]) + 1, int(p[k + MORE])
+            for m in range(int(p[columns])):
+                A[row, int(p[columns + 1 + m])] = made[entries + m]
+
+
+@helper
+def fill_nonholonomic_gamma(p, made, Qa):
+    """The right-hand side of A a = Q_a."""
+    first, n = int(p[p.size - HEAD + JOINTS]), int(p[p.size - HEAD + N_JOINTS])
+    for k in range(first, first + JOINT_WIDTH * n, JOINT_WIDTH):
+        if int(p[k + KIND]) == RATE:
+            Qa[int(p[k + ROW])] = made[int(p[k + MOTION])]
+
+
 @callback("mass")
 def mass(t, q, p, M):
     for body in range(int(p[p.size - HEAD + BODIES])):
@@ -361,3 +400,13 @@ def constraint_rate(t, q, p, Ct):
 @callback("gamma")
 def gamma(t, q, v, p, Qd):
     fill_gamma(q, v, p, results(int(p[p.size - HEAD + MOTION_PROGRAM]), t, q, v, p), Qd)
+
+
+@callback("nonholonomic")
+def nonholonomic(t, q, p, A):
+    fill_nonholonomic(p, results(int(p[p.size - HEAD + MOTION_PROGRAM]), t, q, q, p), A)
+
+
+@callback("nonholonomic_gamma")
+def nonholonomic_gamma(t, q, v, p, Qa):
+    fill_nonholonomic_gamma(p, results(int(p[p.size - HEAD + MOTION_PROGRAM]), t, q, v, p), Qa)

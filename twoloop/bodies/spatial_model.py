@@ -12,7 +12,7 @@ from twoloop.bodies.functions import Function
 from twoloop.bodies.parameter_layout import AXIAL, LENGTH, PLANE, POINT, SLIDE, TORSION, TURN
 from twoloop.bodies.parts import Body, Force, JointRow, ModelJoint, Numbers
 from twoloop.bodies.spatial_rows import across, on_line, parallel, perpendiculars, relative
-from twoloop.bodies.spatial_shapes import SpatialShapes
+from twoloop.bodies.wheels import Wheels
 from twoloop.checks.arguments import shown
 from twoloop.mechanisms.rotation import euler_parameters, euler_rates, rotation_matrix
 
@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 PERPENDICULAR_TO = 1e-6  # cosine of the angle between the axes of a universal joint, at most
 
 
-class SpatialModel(SpatialShapes):
+class SpatialModel(Wheels):
     """A mechanism in space, from bodies, joints and forces.
 
     Coordinates are x, y, z of each body's centre of mass and the four Euler parameters of its axes. Points and axes are
@@ -273,6 +273,9 @@ class SpatialModel(SpatialShapes):
 
     def _no_rotation(self) -> Array:
         return np.eye(3)
+
+    def _axis(self, joint: ModelJoint) -> Array:
+        return joint.axes[0]
 
     def _drive_row(self, joint: ModelJoint, motion: Function) -> JointRow:
         one, other = joint.axes

@@ -7,9 +7,10 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from twoloop.bodies.functions import is_constant, numbers_of, program_for
-from twoloop.bodies.parameter_layout import BRAKE, NONE, PULL, RAIL, RUB, SPRING, TORSION
+from twoloop.bodies.functions import is_constant, program_for
+from twoloop.bodies.parameter_layout import BRAKE, NONE, PULL, RAIL, RATE, RUB, SPRING, TORSION
 from twoloop.bodies.parts import Body, Force, JointRow, ModelJoint, Numbers
+from twoloop.generate.programs import numbers_of
 from twoloop.generate.tracing import Untraceable
 
 Array = NDArray[np.float64]
@@ -130,15 +131,20 @@ class Tables:
     def _write(self, dimension: int, first_row: int) -> None:
         n_q = (3 if dimension == 2 else 7) * len(self.bodies)
         table: list[float] = []
-        row, motion, result = first_row, 0, 0
+        row, motion, result, self.n_rates = first_row, 0, 0, 0
         for joint in self.joints:
             numbered: list[int] = []
             for part in joint.rows:
-                table += self._joint_row(part, row, NONE if part.motion is None else 3 * motion)
-                motion += part.motion is not None
-                numbered += range(row, row + part.n_rows)
-                row += part.n_rows
+                of_rates = part.kind == RATE
+                number = self.n_rates if of_rates else row
+                table += self._joint_row(part, number, NONE if part.motion is None else motion)
+                motion += 0 if part.motion is None else part.motion.n_results
+                numbered += [NONE - number] if of_rates else range(row, row + part.n_rows)
+                self.n_rates += of_rates
+                row += 0 if of_rates else part.n_rows
             self.rows[joint.name] = tuple(numbered)
+        for name, rows in self.rows.items():  # those of A come after those of C
+            self.rows[name] = tuple(row + NONE - each if each < 0 else each for each in rows)
         n_before = len(self._values) + len(self._constants)
         forces = n_before + len(table)
         for force in self.forces:

@@ -4,22 +4,29 @@ from __future__ import annotations  # ArrayLike stays a word in help()
 
 import copy
 import inspect
+import warnings
+from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
+import numpy as np
 from numpy.typing import ArrayLike
 
-from twoloop.checks.arguments import check_positive, check_tolerance
+from twoloop.checks.arguments import check_finite, check_positive, check_tolerance, check_vector
+from twoloop.checks.consistency import ConstraintWarning
 from twoloop.methods.plan import Method
 from twoloop.problem.system import ConstrainedSystem, check_system
 from twoloop.result.result import Result
+from twoloop.run.sampled import SampledRun, SampledState
 from twoloop.solve import check_method, solve_dae
 
 MOST = 64  # systems of other parameters that are kept
+FOR_SAMPLES = {"method", "rtol", "atol", "max_step", "check_derivatives"}
 OF_A_RUN = {"system", "t_span", "q0", "v0", "method", "rtol", "atol", "t_eval"}
 
 
 class Integrator:
-    """A system with a method and tolerances, for many runs one after another.
+    """A system with a method and tolerances, for many runs one after another, or for one from sample to sample.
 
     What does not change from run to run is made once and kept: plans, machine code, checks of the same start, and for
     the latest parameters the systems that they make. For thousands of runs at once see `ensemble`.
@@ -56,6 +63,7 @@ class Integrator:
         self.system = system
         self._options = {"method": check_method(method), "rtol": rtol, "atol": copy.copy(atol), **options}
         self._systems: dict[bytes, ConstrainedSystem] = {}
+        self._sampled: SampledRun | None = None
 
     def run(
         self,
@@ -85,6 +93,105 @@ class Integrator:
         """
         system = self.system if parameters is None else self._system_of(parameters)
         return solve_dae(system, t_span, q0, v0, t_eval=t_eval, **self._options)
+
+    def start(self, t0: float, q0: ArrayLike, v0: ArrayLike, parameters: ArrayLike | None = None) -> SampledState:
+        """Begin a motion that `step` goes on with, sample by sample.
+
+        Parameters
+        ----------
+        t0 : float
+            s.
+        q0, v0 : array_like (n_q,)
+            Consistent coordinates and velocities.
+        parameters : array_like, optional
+            Those of the first sample. None: those of the system.
+
+        Returns
+        -------
+        SampledState
+            `.t`, `.q`, `.v`, `.a` and `.lam` at the start.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If the start is refused, or the integrator has the method "Taylor" or an option that is for runs alone.
+        """
+        for name in self._options.keys() - FOR_SAMPLES:
+            if self._options[name] not in (None, False, "auto"):
+                raise ValueError(f"start takes no {name}, which is for run alone; the integrator was made with it")
+        t0 = check_finite("t0", t0)
+        n, rtol, max_step = self.system.n_q, self._options["rtol"], self._options.get("max_step", np.inf)
+        check_positive("max_step", max_step, infinite=True)
+        self._sampled = SampledRun(
+            self.system.with_parameters(self.system.parameters if parameters is None else parameters)
+            if self.system.parameters.size
+            else copy.copy(self.system),
+            self._options["method"],
+            float(rtol),
+            check_tolerance("atol", self._options["atol"], n),
+            float(max_step),
+            self._options.get("check_derivatives", True),
+            t0,
+            check_vector("q0", q0, n),
+            check_vector("v0", v0, n),
+        )
+        if self._sampled.run.said_of_rows:
+            warnings.warn(self._sampled.run.said_of_rows, ConstraintWarning, stacklevel=2)
+        return self._sampled.state
+
+    def step(self, dt: float, inputs: Mapping[int, float] | ArrayLike | None = None) -> SampledState:
+        """Go on by a sample, with inputs that stay as they are until its end.
+
+        What a step does beside integrating takes some microseconds: nothing is checked anew. Accelerations jump with
+        the inputs, and the method begins anew there; error control is that of `run`. As in a run, no step is longer
+        than a hundredth of the time since the start, so that the first samples are divided into many.
+
+        Parameters
+        ----------
+        dt : float
+            s.
+        inputs : mapping from int to float, or array_like (n_p,), optional
+            Parameters of the system that change, by their places, or all parameters. They may enter forces alone. None:
+            all stay. The place of a parameter of a model is `problem.place("value of motor of shoulder")`.
+
+        Returns
+        -------
+        SampledState
+            `.t`, `.q`, `.v`, `.a` and `.lam` at the end of the sample, under its inputs; read-only.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If an argument is wrong, an input enters more than forces, or there was no `start`.
+        RuntimeError
+            If the step fails; the message says why, as that of a run. `result()` has what was computed before.
+        """
+        if self._sampled is None:
+            raise ValueError("step goes on from a start: call integrator.start(t0, q0, v0) first")
+        if not (type(dt) is float and 0.0 < dt < np.inf):
+            check_positive("dt", dt)
+        if inputs is not None:
+            self._sampled.set(inputs)
+        return self._sampled.step(float(dt))
+
+    def result(self) -> Result:
+        """The motion since `start`, at the ends of the samples: a `Result` to plot, animate and save.
+
+        Returns
+        -------
+        Result
+            Without a dense solution. `result.changes` says that inputs changed.
+
+        Raises
+        ------
+        ValueError
+            If there was no `start`.
+        """
+        if self._sampled is None:
+            raise ValueError("result has the samples since a start: call integrator.start(t0, q0, v0) first")
+        record = replace(self._sampled.record(), system=self.system, method=self._options["method"].name)
+        atol = check_tolerance("atol", self._options["atol"], self.system.n_q)
+        return Result(**vars(record) | {"compiled": False, "rtol": float(self._options["rtol"]), "atol": atol})
 
     def _system_of(self, parameters: ArrayLike) -> ConstrainedSystem:
         made = self.system.with_parameters(parameters)

@@ -43,3 +43,11 @@ def program_of(graph: Graph, n_inputs: int, results: Mapping[int, Form]) -> Prog
         array_of(c for pair in constants for c in pair).reshape(-1, 2),
         len(node),
     )
+
+
+def numbers_of(program: Program) -> list[float]:
+    """A program as it stands in the parameters, see `bodies/program_results.py`."""
+    n_results = int((program.rows[:, 0] == RESULT).sum())
+    sizes = [n_results, program.n_nodes, len(program.rows), len(program.columns)]
+    parts: list[Any] = [sizes, program.rows.ravel(), program.columns, program.coefficients, program.constants.ravel()]
+    return [float(x) for part in parts for x in part]

@@ -163,7 +163,7 @@ class Form:
         for i, c in other.terms.items():
             total = terms.get(i, 0.0) + c
             if _size(total) <= CANCELLED * _size(c):
-                del terms[i]
+                terms.pop(i, None)  # a coefficient that underflowed is not there
             else:
                 terms[i] = total
         constant = self.constant + other.constant

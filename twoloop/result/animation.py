@@ -105,7 +105,13 @@ def _positions(result: Record, times: Array) -> Array:
     from scipy.interpolate import BPoly  # takes a tenth of a second to import, and few results need it
 
     states = np.stack([result.q.T, result.v.T, result.a.T], axis=1)
-    return np.asarray(BPoly.from_derivatives(result.t, states)(times)).T
+    made = np.empty((len(result.q), len(times)))
+    first = np.append(0, np.flatnonzero(np.diff(result.t) == 0.0) + 1)  # of the pieces between impacts
+    for begin, end in zip(first, np.append(first[1:], len(result.t)), strict=True):
+        if end - begin > 1:
+            own = (times >= result.t[begin]) & (times <= result.t[end - 1])
+            made[:, own] = BPoly.from_derivatives(result.t[begin:end], states[begin:end])(times[own]).T
+    return made
 
 
 def page(scene: Scene) -> str:

@@ -80,6 +80,11 @@ def certify(result: Record, rtol: float | None, atol: ArrayLike | None) -> Certi
             "certify needs the system: read a file by twoloop.load(path, system), give a result of another solver "
             "dataclasses.replace(result, system=system)"
         )
+    if result.changes:
+        raise ValueError(
+            f"certify looks at one run of one system; in this result {result.changes}"
+            f"{': certify its parts, result.arcs' if result.arcs else ''}"
+        )
     look = _Look(result, result.system, *_tolerances(result, result.system.n_q, rtol, atol))
     defect, where = 0.0, float(look.t[0])
     unseen: list[tuple[float, float]] = []

@@ -66,6 +66,7 @@ def load(path: str | os.PathLike[str], system: ConstrainedSystem | None = None) 
         system=system,
         method=known.method,
         compiled=known.compiled,
+        changes=known.changes,
         sol=None if system is None or "sol_t" not in arrays else _solution(system, arrays, words),
     )
 

@@ -79,6 +79,14 @@ class Result(Record):
         Steps in which the errors of velocities were not tested: those by Newton's method of "auto" and of methods with
         tested="positions", as "TRBDF2", and all of `Newmark(error_tol=...)`. None: they were tested in all, or a
         foreign solver ran.
+    changes : str
+        What changed on the way, where this is more than one run of one system: inputs at samples (`Integrator.step`),
+        velocities in impacts (`solve_with_stops`). "": nothing.
+    arcs : tuple of Result
+        Of `solve_with_stops`: the runs from impact to impact that this is joined of. Files and other processes do
+        not get them, nor their `sol`.
+    impacts : tuple of Impact
+        Likewise: when, at which stops, the velocities before and after, and the impulses.
     """
 
     def to_dataframe(self) -> Any:

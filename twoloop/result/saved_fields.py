@@ -71,6 +71,7 @@ class Fields:
             fits = len(set(rows.tolist())) == len(rows) == n_rows - (self.rank or 0)
             self._check("redundant", fits and bool(((rows >= 0) & (rows < n_rows)).all()), "rows beside `rank` others")
         self.message, self.method = self._word("message", str), self._word("method", str, "")  # older files: no method
+        self.changes = self._word("changes", str, "")
         self.compiled: bool | None = None if words.get("compiled") is None else self._word("compiled", bool)
         self.status = Status(self._choice("status", [int(each) for each in Status]))
         self.statistics = self._statistics()

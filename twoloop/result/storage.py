@@ -36,9 +36,9 @@ def save(result: Record, path: str | os.PathLike[str]) -> None:
         arrays |= {f"{name}_{k}": array for k, array in enumerate(getattr(result, name) or [])}
     words: dict[str, Any] = {"format": FORMAT, "status": int(result.status), "message": result.message}
     words |= {"stats": asdict(result.stats), "rank": result.rank, "n_events": n_events, "method": result.method}
-    words |= {"compiled": result.compiled}
+    words |= {"compiled": result.compiled, "changes": result.changes}
     words |= {name: getattr(result, name) for name in NUMBERS}
-    if result.sol is not None:
+    if result.sol is not None and not result.arcs:  # whose solution is theirs
         interpolator, table = result.sol.interpolator, result.sol.table
         arrays |= {"sol_t": table.t, "sol_states": table.states, "sol_kinds": table.kinds}
         words |= {"sol_end": result.sol.t_max, "sol_ranks": interpolator.ranks, "sol_rtol": interpolator.rtol}

@@ -129,6 +129,9 @@ class Record:
     rtol: float | None = None
     atol: Array | None = None
     untested: NDArray[np.bool_] | None = None
+    changes: str = ""
+    arcs: tuple[Any, ...] = ()
+    impacts: tuple[Any, ...] = ()
 
     @property
     def success(self) -> bool:
@@ -174,6 +177,8 @@ class Record:
             pickle.dumps(self.system)
         except TypeError:  # of functions without a name of their own
             state["system"] = None
+        if self.arcs:
+            state |= {"arcs": (), "sol": None}
         return state
 
     def __repr__(self) -> str:

@@ -1,0 +1,127 @@
+"""Stops, samples and couplings that cannot be."""
+
+import numpy as np
+
+from tests.bad_input.case import cases_of
+from twoloop import Integrator, Stop, solve_with_stops
+from twoloop.bodies import PlanarModel
+from twoloop.mechanisms import four_bar
+
+LINKAGE = four_bar()
+of_stops, of_step, of_model = cases_of("solve_with_stops"), cases_of("Integrator.step"), cases_of("bodies.PlanarModel")
+
+
+def against(*stops, **options):
+    return lambda: solve_with_stops(LINKAGE.system, (0.0, 1.0), LINKAGE.q0, LINKAGE.v0, list(stops), **options)
+
+
+def step(dt=1e-3, **options):
+    def call():
+        integrator = Integrator(LINKAGE.system)
+        integrator.start(0.0, LINKAGE.q0, LINKAGE.v0)
+        integrator.step(dt, **options)
+
+    return call
+
+
+def wheels(call):
+    """Of a model of two wheels on pins."""
+    model = PlanarModel()
+    for k in range(2):
+        model.disc(f"wheel {k}", 0.1, mass=1.0, position=(0.2 * k, 0.0))
+        model.revolute("ground", f"wheel {k}", at=(0.2 * k, 0.0), name=f"pin {k}")
+    return lambda: call(model)
+
+
+def branching(x, y):
+    return x if x > 0.0 else y
+
+
+IMPACTS = [
+    of_stops("no stops", against(), "stops must be a Stop or a list of them", "give some, or `solve_dae`", TypeError),
+    of_stops(
+        "a function in place of a stop", against(lambda t, q: q[0]), "stops must be a Stop", "Stop(gap)", TypeError
+    ),
+    of_stops(
+        "a start beyond a stop",
+        against(Stop(lambda t, q: q[8] - 9.0, name="wall")),
+        "on this side of all stops; the gap of 'wall' is",
+        "turn its sign, or start elsewhere",
+    ),
+    of_stops(
+        "a gap that branches",
+        against(Stop(lambda t, q: q[8] if q[0] > 0.0 else 1.0)),
+        "gap of 'stop' must be a number made of t and q by numpy's functions",
+        "make two stops of it",
+    ),
+    of_stops(
+        "`restitution=1.1`", lambda: Stop(lambda t, q: q[0], 1.1), "restitution of 'stop' must be from 0 to 1", "0 to 1"
+    ),
+    of_stops(
+        "`events=`", against(Stop(lambda t, q: 9.0 - q[8]), events=[]), "no option 'events'", "stops are", TypeError
+    ),
+    of_step(
+        "a step before a start",
+        lambda: Integrator(LINKAGE.system).step(1e-3),
+        "step goes on from a start",
+        "call `start(t0, q0, v0)` first",
+    ),
+    of_step("`dt=0`", step(0.0), "dt must be positive", "give the length of a sample"),
+    of_step("a place that is none", step(inputs={9: 1.0}), "inputs must map places in the parameters", "count from 0"),
+    of_step("`inputs=[1.0]` of four", step(inputs=[1.0]), "inputs must be all 4 parameters", "give all, or a mapping"),
+    of_step("an input that is not finite", step(inputs={0: np.nan}), "inputs must be finite", "look at the controller"),
+    of_step(
+        "a length that changes on the way",
+        step(inputs={0: 1.5}),
+        "inputs must enter forces alone; that at place 0 enters",
+        "`start` anew with other parameters",
+    ),
+    of_step(
+        "`method='Taylor'`",
+        lambda: Integrator(LINKAGE.system, "Taylor").start(0.0, LINKAGE.q0, LINKAGE.v0),
+        "must not be 'Taylor'",
+        "take the default",
+    ),
+    of_step(
+        "`compiled=True`",
+        lambda: Integrator(LINKAGE.system, compiled=True).start(0.0, LINKAGE.q0, LINKAGE.v0),
+        "start takes no compiled",
+        "leave it out",
+    ),
+    of_model(
+        "a gear of one hinge",
+        wheels(lambda model: model.gear("pin 0", "pin 0", ratio=1.0)),
+        "a gear needs two joints",
+        "name both",
+    ),
+    of_model(
+        "`ratio=0`",
+        wheels(lambda model: model.gear("pin 0", "pin 1", ratio=0.0)),
+        "ratio must not be zero",
+        "fix it instead",
+    ),
+    of_model(
+        "a rack of two hinges",
+        wheels(lambda model: model.rack("pin 0", "pin 1", radius=0.1)),
+        "needs a prismatic joint",
+        "give a hinge and a slide",
+    ),
+    of_model(
+        "a wheel of negative radius",
+        wheels(lambda model: model.rolling("ground", "wheel 0", radius=-1.0, axis=(1, 0))),
+        "radius must be positive",
+        "turn the axis instead",
+    ),
+    of_model(
+        "a curve that branches",
+        wheels(lambda model: model.point_on_curve("ground", "wheel 0", at=(0, 0), curve=branching)),
+        "must be made of numpy's functions, without branches",
+        "make one formula of it",
+    ),
+    of_model(
+        "a limit without a number",
+        wheels(lambda model: model.limit("pin 0")),
+        "needs lower, upper, or both",
+        "give one of them",
+    ),
+]

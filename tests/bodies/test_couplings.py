@@ -1,0 +1,210 @@
+"""Gears, racks, wheels that roll and points on curves, against equations in least coordinates."""
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from twoloop import mechanisms, solve_dae
+from twoloop.bodies import PlanarModel, SpatialModel
+
+GRAVITY = 9.81
+TIMES = np.linspace(0.0, 1.0, 6)
+
+
+def moved(model, method="DOP853"):
+    problem = model.problem((0.0, TIMES[-1]))
+    run = problem.system, problem.t_span, problem.q0, problem.v0, method
+    result = solve_dae(*run, rtol=1e-11, atol=1e-11, t_eval=TIMES)
+    assert result.success, result.message
+    return problem, result
+
+
+def by_hand(acceleration, start):
+    found = solve_ivp(
+        lambda t, y: [y[1], acceleration(t, *y)], (0.0, TIMES[-1]), start, "DOP853", TIMES, rtol=1e-12, atol=1e-13
+    )
+    return found.y
+
+
+@pytest.mark.parametrize("method", ["DOP853", "auto", "RadauIIA9"])
+def test_a_train_of_gears(method):
+    """Two wheels on the ground, the second with a weight beside its centre."""
+    model = PlanarModel()
+    model.disc("small", 0.1, mass=2.0, position=(0.0, 0.0), angle=0.3, angular_velocity=4.0)
+    model.body("large", mass=3.0, inertia=0.05, position=(0.35, 0.05))
+    one, other = model.revolute("ground", "small", at=(0.0, 0.0)), model.revolute("ground", "large", at=(0.3, 0.0))
+    gear = model.gear(one, other, ratio=-0.5)
+    model.motor(one, lambda t: np.cos(t))
+    problem, result = moved(model, method)
+    at, away = np.arctan2(0.05, 0.05), np.hypot(0.05, 0.05)
+    inertia = 0.01 + 0.25 * (0.05 + 3.0 * away**2)
+
+    def acceleration(t, turned, rate):
+        return (np.cos(t) + 0.5 * 3.0 * GRAVITY * away * np.cos(at - 0.5 * turned)) / inertia
+
+    known = by_hand(acceleration, [0.0, 4.0])
+    np.testing.assert_allclose(result.q[2] - 0.3, known[0], atol=1e-9)
+    np.testing.assert_allclose(result.q[5], -0.5 * known[0], atol=1e-9)
+    assert problem.freedom.degrees == 1
+    torque = result.reactions(gear.name).torque  # on the large wheel
+    weight = 3.0 * GRAVITY * away * np.cos(at - 0.5 * known[0])
+    alpha = np.array([acceleration(t, *state) for t, state in zip(TIMES, known.T, strict=True)])
+    np.testing.assert_allclose(torque, -0.5 * alpha * (0.05 + 3.0 * away**2) + weight, atol=1e-7)
+
+
+def test_planets_on_a_carrier():
+    """With the sun held, n of the carrier, the planet turns on the carrier by the ratio of the teeth."""
+    model = PlanarModel(gravity=(0.0, 0.0))
+    carrier = model.rod("carrier", (0.0, 0.0), (0.3, 0.0), mass=1.0, angular_velocity=2.0)
+    sun = model.disc("sun", 0.2, mass=1.0, position=(0.0, 0.0))
+    planet = model.disc("planet", 0.1, mass=0.5, position=(0.3, 0.0))
+    model.revolute("ground", carrier, at=(0.0, 0.0))
+    model.fixed("ground", sun)
+    on_carrier = model.revolute(carrier, sun, at=(0.0, 0.0))
+    axle = model.revolute(carrier, planet, at=(0.3, 0.0))
+    model.gear(on_carrier, axle, ratio=-2.0)
+    with pytest.warns(match="have rank"):  # the sun is held, and turns about its centre
+        problem, result = moved(model)
+    np.testing.assert_allclose(result.q[2], 2.0 * TIMES, atol=1e-9)
+    np.testing.assert_allclose(result.q[8], 3.0 * result.q[2], atol=1e-9)
+    assert problem.conserved and np.ptp(result.energy) < 1e-9
+
+
+@pytest.mark.parametrize("tilt", [0.0, 0.4])
+def test_a_rack(tilt):
+    model, along = PlanarModel(), np.array([np.cos(tilt), np.sin(tilt)])
+    model.disc("pinion", 0.2, mass=2.0, position=(0.0, 0.0))
+    model.body("rack", mass=1.5, inertia=0.1, position=(0.0, -0.2))
+    pinion = model.revolute("ground", "pinion", at=(0.0, 0.0))
+    slide = model.prismatic("ground", "rack", at=(0.0, -0.2), axis=along)
+    model.rack(pinion, slide, radius=0.2)
+    model.axial_spring(slide, stiffness=30.0, length=0.1)
+    _, result = moved(model)
+
+    def acceleration(t, s, rate):
+        return (-30.0 * (s - 0.1) - 1.5 * GRAVITY * np.sin(tilt)) / (1.5 + 0.5 * 2.0)
+
+    known = by_hand(acceleration, [0.0, 0.0])
+    np.testing.assert_allclose(result.q[3:5], np.outer(along, known[0]) + np.array([[0.0], [-0.2]]), atol=1e-9)
+    np.testing.assert_allclose(result.q[2], known[0] / 0.2, atol=1e-8)
+
+
+def test_a_wheel_that_rolls_down_a_slope_that_slides():
+    """A disc on a wedge on a level floor: the classical pair of equations."""
+    m, M, r, tilt = 1.0, 2.0, 0.1, 0.5
+    along, up = np.array([np.cos(tilt), np.sin(tilt)]), np.array([-np.sin(tilt), np.cos(tilt)])
+    model = PlanarModel()
+    model.body("wedge", mass=M, inertia=1.0, position=(0.0, 0.0))
+    model.disc("wheel", r, mass=m, position=0.5 * along + r * up)
+    model.prismatic("ground", "wedge", at=(0.0, 0.0), axis=(1.0, 0.0))
+    joint = model.rolling("wedge", "wheel", radius=r, axis=along)
+    problem, result = moved(model)
+    c = np.cos(tilt)
+    A = np.array([[1.5 * m, m * c], [m * c, m + M]])
+    s, x = np.linalg.solve(A, [-m * GRAVITY * np.sin(tilt), 0.0])
+    np.testing.assert_allclose(result.q[0], 0.5 * x * TIMES**2, atol=1e-9)
+    np.testing.assert_allclose(result.q[5], -0.5 * s / r * TIMES**2, atol=1e-8)
+    assert problem.freedom.degrees == 2 and problem.conserved and np.ptp(result.energy) < 1e-9
+    force = result.reactions(joint.name).force  # on the wedge; the opposite and its weight move the wheel
+    np.testing.assert_allclose(-force[1] - m * GRAVITY, m * result.a[4], atol=1e-7)
+
+
+def test_a_bead_on_a_cycloid_is_isochronous():
+    """C. Huygens: the period is that of small oscillations, 4 pi sqrt(r / g), whatever the amplitude."""
+    r = 0.2
+    model = PlanarModel()
+
+    def cycloid(x, y):  # the branch about the bottom at the origin
+        turn = np.arctan(np.sqrt(y / (2.0 * r - y)))
+        return x * x - (2.0 * r * (turn + np.sin(turn) * np.cos(turn))) ** 2
+
+    half = 0.9  # of the parameter: the height is 2 r sin(half)^2
+    place = (2.0 * r * (half + np.sin(half) * np.cos(half)), 2.0 * r * np.sin(half) ** 2)
+    bead = model.body("bead", mass=1.0, inertia=1.0, position=place)
+    model.point_on_curve("ground", bead, at=place, curve=cycloid)
+    problem = model.problem()
+    quarter = np.pi * np.sqrt(r / GRAVITY)
+    result = solve_dae(problem.system, (0.0, 0.9 * quarter), problem.q0, problem.v0, rtol=1e-10, atol=1e-10)
+    arc = 4.0 * r * np.sin(half) * np.cos(0.5 * np.sqrt(GRAVITY / r) * 0.9 * quarter)  # from the bottom, of its end
+    turn = np.arcsin(arc / (4.0 * r))
+    np.testing.assert_allclose(result.q[0, -1], 2.0 * r * (turn + np.sin(turn) * np.cos(turn)), atol=1e-8)
+    assert problem.freedom.degrees == 2  # along the curve, and turning
+
+
+def test_a_cam_with_a_follower():
+    """A pin of a slide in a slot of a turning disc, r = 0.3 + 0.05 cos(2 phi) squared, by hand."""
+    model = PlanarModel(gravity=(0.0, 0.0))
+    high = 0.3 - 0.05 * np.cos(0.4)
+    cam = model.disc("cam", 0.4, mass=1.0, position=(0.0, 0.0), angle=0.2)
+    follower = model.body("follower", mass=0.5, inertia=0.1, position=(0.0, high))
+    hinge = model.revolute("ground", cam, at=(0.0, 0.0))
+    model.prismatic("ground", follower, at=(0.0, high), axis=(0.0, 1.0))
+
+    def groove(x, y):
+        square = x * x + y * y
+        return np.sqrt(square) - 0.3 - 0.05 * (x * x - y * y) / square
+
+    model.point_on_curve(cam, follower, at=(0.0, high), curve=groove)
+    model.drive(hinge, lambda t: 3.0 * t)
+    _, result = moved(model)
+    phi = 0.5 * np.pi - 0.2 - 3.0 * TIMES
+    np.testing.assert_allclose(result.q[4], 0.3 + 0.05 * np.cos(2.0 * phi), atol=1e-9)
+
+
+def test_couplings_with_a_function_that_is_called_in_python():
+    model = PlanarModel()
+    for k in range(2):
+        model.disc(f"wheel {k}", 0.1, mass=1.0, position=(0.2 * k, 0.0))
+        model.revolute("ground", f"wheel {k}", at=(0.2 * k, 0.0), name=f"pin {k}")
+    model.gear("pin 0", "pin 1", ratio=-1.0)
+    model.motor("pin 0", lambda t: 1.0 if t < 0.5 else 0.0)  # is called in Python, and the gear with it
+    problem = model.problem()
+    assert problem.system.called_in_python
+    result = solve_dae(problem.system, (0.0, 0.4), problem.q0, problem.v0)
+    np.testing.assert_allclose(result.q[[2, 5], -1], [0.5 / 0.01 * 0.4**2, -0.5 / 0.01 * 0.4**2], rtol=1e-7)
+
+
+def test_a_rolling_disc_in_space():
+    """That of the library, in angles: the same path of the centre."""
+    known = mechanisms.rolling_disc()
+    p = known.parameters
+    yaw, lean, _ = p["angles"]
+    m, r = p["mass"], p["radius"]
+    c, s = np.cos(lean), np.sin(lean)
+    ahead, axle = np.array([np.cos(yaw), np.sin(yaw), 0.0]), np.array([np.sin(yaw) * c, -np.cos(yaw) * c, -s])
+    turn, fall, spin = known.v0[3:]
+    w = turn * np.array([0.0, 0.0, 1.0]) + fall * ahead + spin * axle
+    model = SpatialModel(gravity=(0.0, 0.0, -p["gravity"]))
+    R = np.column_stack([ahead, axle, np.cross(ahead, axle)])
+    wheel = model.body(
+        "wheel",
+        mass=m,
+        inertia=m * r * r * np.array([0.25, 0.5, 0.25]),
+        position=known.q0[:3],
+        rotation=R,
+        velocity=known.v0[:3],
+        angular_velocity=w,
+    )
+    joint = model.rolling(wheel, radius=r, axis=axle)
+    problem = model.problem((0.0, 2.0))
+    found = solve_dae(problem.system, (0.0, 2.0), problem.q0, problem.v0, rtol=1e-10, atol=1e-10)
+    theirs = solve_dae(known.system, (0.0, 2.0), known.q0, known.v0, rtol=1e-10, atol=1e-10)
+    np.testing.assert_allclose(found.q[:3, -1], theirs.q[:3, -1], atol=1e-7)
+    assert problem.conserved and np.ptp(found.energy) < 1e-7
+    force = found.reactions(joint.name).force
+    np.testing.assert_allclose(force - [[0.0], [0.0], [m * p["gravity"]]], m * found.a[:3], atol=1e-6)
+
+
+def test_a_skate_on_a_slope():
+    """The blade turns evenly, and its speed is what the slope makes of its direction."""
+    model, spin = PlanarModel(gravity=(0.0, -3.0)), 1.7
+    blade = model.body("blade", mass=2.0, inertia=0.3, position=(0.0, 0.0), angular_velocity=spin)
+    joint = model.skate(blade, at=(0.0, 0.0), axis=(1.0, 0.0))
+    problem, result = moved(model)
+    phase, scale = spin * TIMES, 3.0 / spin**2
+    x, y = 0.5 * phase + 0.25 * np.sin(2.0 * phase) - np.sin(phase), 0.5 * np.sin(phase) ** 2 + np.cos(phase) - 1.0
+    np.testing.assert_allclose(result.q[:2], scale * np.array([x, y]), atol=1e-9)
+    np.testing.assert_allclose(result.q[2], phase, atol=1e-9)
+    assert problem.system.n_a == 1 and problem.conserved and np.ptp(result.energy) < 1e-9
+    force = result.reactions(joint.name).force
+    np.testing.assert_allclose(force - [[0.0], [6.0]], 2.0 * result.a[:2], atol=1e-8)

@@ -1,0 +1,229 @@
+"""Models from URDF files: what is read, what is not, the same by hand, and by Pinocchio where it is installed."""
+
+import warnings
+
+import numpy as np
+import pytest
+
+from twoloop import solve_dae
+from twoloop.bodies import IgnoredWarning, Loop, PlanarModel, SpatialModel, from_urdf
+from twoloop.mechanisms.rotation import euler_rates, rotation_matrix
+
+ARM = """<?xml version="1.0"?>
+<robot name="arm">
+  <material name="grey"><color rgba="0.5 0.5 0.5 1"/></material>
+  <link name="base"/>
+  <link name="shoulder"><inertial><origin xyz="0.1 0 0.02" rpy="0.3 0 0"/><mass value="2"/>
+    <inertia ixx="0.02" ixy="0.001" ixz="0" iyy="0.03" iyz="-0.002" izz="0.025"/></inertial>
+    <collision><geometry><sphere radius="0.1"/></geometry></collision></link>
+  <link name="upper"><inertial><origin xyz="0.25 0 0" rpy="0 0 0.4"/><mass value="1.5"/>
+    <inertia ixx="0.01" ixy="0" ixz="0" iyy="0.04" iyz="0" izz="0.04"/></inertial>
+    <collision><geometry><sphere radius="0.1"/></geometry></collision></link>
+  <link name="weight"><inertial><origin xyz="0 0.05 0"/><mass value="0.7"/>
+    <inertia ixx="0.001" ixy="0" ixz="0" iyy="0.001" iyz="0" izz="0.001"/></inertial></link>
+  <link name="slide"><inertial><mass value="0.4"/>
+    <inertia ixx="0.002" ixy="0" ixz="0" iyy="0.002" iyz="0" izz="0.003"/></inertial></link>
+  <joint name="mount" type="fixed"><parent link="base"/><child link="pedestal"/>
+    <origin xyz="0 0 0.5" rpy="0.2 -0.1 0.3"/></joint>
+  <link name="pedestal"/>
+  <joint name="turn" type="continuous"><parent link="pedestal"/><child link="shoulder"/><origin xyz="0 0 0.1"/>
+    <axis xyz="0 0 2"/><dynamics damping="0.3" friction="0.1"/></joint>
+  <joint name="lift" type="revolute"><parent link="shoulder"/><child link="upper"/>
+    <origin xyz="0.2 0 0.1" rpy="1.2 0 0.5"/><axis xyz="0 1 1"/>
+    <limit lower="-1" upper="1" effort="10" velocity="3"/></joint>
+  <joint name="hold" type="fixed"><parent link="upper"/><child link="weight"/>
+    <origin xyz="0.4 0 0" rpy="0 0.7 0"/></joint>
+  <joint name="push" type="prismatic"><parent link="weight"/><child link="slide"/><origin xyz="0 0 0.1" rpy="0 0 1"/>
+    <axis xyz="1 0 0"/><limit lower="-1" upper="1" effort="10" velocity="3"/></joint>
+  <transmission name="gears"/>
+</robot>"""
+POSITIONS = {"turn": 0.4, "lift": -0.3, "push": 0.05}
+
+
+@pytest.fixture
+def arm(tmp_path):
+    path = tmp_path / "arm.urdf"
+    path.write_text(ARM)
+    return path
+
+
+def read(path, **options):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", IgnoredWarning)
+        return from_urdf(path, **options)
+
+
+def turned(x, y, z):
+    """About fixed axes: x, then y, then z."""
+    (a, b), (c, d), (e, f) = ((np.cos(angle), np.sin(angle)) for angle in (x, y, z))
+    one, two, three = np.eye(3), np.eye(3), np.eye(3)
+    one[1:, 1:], three[:2, :2] = ((a, -b), (b, a)), ((e, -f), (f, e))
+    two[np.ix_([0, 2], [0, 2])] = ((c, d), (-d, c))
+    return three @ two @ one
+
+
+def about(axis, angle):
+    axis = np.array(axis) / np.linalg.norm(axis)
+    return rotation_matrix(np.append(np.cos(0.5 * angle), np.sin(0.5 * angle) * axis))
+
+
+def by_hand():
+    """The arm, its frames multiplied out."""
+    model = SpatialModel(name="arm")
+    pedestal, place = turned(0.2, -0.1, 0.3), np.array([0.0, 0.0, 0.5])
+    first, at = pedestal @ about((0, 0, 1), 0.4), place + pedestal @ (0, 0, 0.1)
+    J = turned(0.3, 0, 0) @ [[0.02, 0.001, 0], [0.001, 0.03, -0.002], [0, -0.002, 0.025]] @ turned(0.3, 0, 0).T
+    model.body("shoulder", mass=2.0, inertia=J, position=at + first @ (0.1, 0, 0.02), rotation=first)
+    model.revolute("ground", "shoulder", at=at, axis=pedestal[:, 2], name="turn")
+    model.torsion_spring("turn", stiffness=0.0, damping=0.3)
+    frame, knee = first @ turned(1.2, 0, 0.5), at + first @ (0.2, 0, 0.1)
+    second = frame @ about((0, 1, 1), -0.3)
+    masses, centres = np.array([1.5, 0.7]), np.array([(0.25, 0, 0), (0.4, 0, 0) + turned(0, 0.7, 0) @ (0, 0.05, 0)])
+    centre = masses @ centres / masses.sum()
+    J = turned(0, 0, 0.4) @ np.diag([0.01, 0.04, 0.04]) @ turned(0, 0, 0.4).T + 0.001 * np.eye(3)
+    for m, d in zip(masses, centres - centre, strict=True):
+        J = J + m * (d @ d * np.eye(3) - np.outer(d, d))
+    model.body("upper", mass=2.2, inertia=J, position=knee + second @ centre, rotation=second)
+    model.revolute("shoulder", "upper", at=knee, axis=frame @ (0, 1, 1), name="lift")
+    weight, there = second @ turned(0, 0.7, 0), knee + second @ (0.4, 0, 0)
+    third, rail = weight @ turned(0, 0, 1), there + weight @ (0, 0, 0.1)
+    moments = (0.002, 0.002, 0.003)
+    model.body("slide", mass=0.4, inertia=moments, position=rail + third @ (0.05, 0, 0), rotation=third)
+    model.prismatic("upper", "slide", at=rail, axis=third[:, 0], name="push")
+    return model
+
+
+def test_the_same_by_hand(arm):
+    problems = read(arm, positions=POSITIONS).problem(), by_hand().problem()
+    ends = []
+    for problem in problems:
+        result = solve_dae(problem.system, (0.0, 1.0), problem.q0, problem.v0, "DOP853", rtol=1e-11, atol=1e-11)
+        assert result.success
+        ends.append(result.q[:, -1])
+    assert problems[0].freedom == problems[1].freedom and problems[0].freedom.degrees == 3
+    np.testing.assert_allclose(problems[0].q0, problems[1].q0, atol=1e-14)
+    np.testing.assert_allclose(ends[0], ends[1], atol=1e-11)
+
+
+def test_what_is_ignored_is_told(arm):
+    with pytest.warns(IgnoredWarning, match="friction of joint 'turn'"):
+        model = from_urdf(arm)
+    assert model.ignored == (
+        *("transmission gears", "friction of joint 'turn'", "limits of joint 'lift'", "limits of joint 'push'"),
+        "contacts between links",
+    )
+    assert [body.name for body in model.bodies] == ["shoulder", "upper", "slide"]
+    assert read(arm, free_base=False).problem().freedom.degrees == 3
+
+
+@pytest.mark.parametrize("free_base", [False, True])
+def test_accelerations_are_those_of_pinocchio(arm, free_base, tmp_path):
+    pin = pytest.importorskip("pinocchio")
+    if free_base:
+        heavy = (
+            '<link name="base"><inertial><mass value="3"/><inertia ixx="1" ixy="0" ixz="0" iyy="2" iyz="0" izz="2"/>'
+        )
+        arm = tmp_path / "free.urdf"
+        arm.write_text(ARM.replace('<link name="base"/>', heavy + "</inertial></link>"))
+    root = (pin.JointModelFreeFlyer(),) if free_base else ()
+    theirs = pin.buildModelFromUrdf(str(arm), *root)
+    data = theirs.createData()
+    model = read(arm, positions=POSITIONS, free_base=free_base)
+    problem, system = model.problem(), model.problem().system
+    q = pin.neutral(theirs)
+    for name, value in POSITIONS.items():
+        joint = theirs.joints[theirs.getJointId(name)]
+        place = q[joint.idx_q : joint.idx_q + joint.nq]
+        place[:] = (np.cos(value), np.sin(value)) if joint.nq == 2 else value
+    rates = np.random.default_rng(1).uniform(-1.0, 1.0, theirs.nv)
+    torque = np.zeros(theirs.nv)
+    damped = theirs.joints[theirs.getJointId("turn")].idx_v
+    torque[damped] = -0.3 * rates[damped]
+    a = pin.aba(theirs, data, q, rates, torque)
+    pin.forwardKinematics(theirs, data, q, rates, a)
+    known, v = [], []
+    for k in range(1, 1 + len(model.bodies)):
+        pose, lever, speed, change = data.oMi[k], theirs.inertias[k].lever, data.v[k], data.a[k]
+        np.testing.assert_allclose(problem.q0[7 * (k - 1) :][:3], pose.act(lever), atol=1e-14)
+        w = speed.angular
+        v += [*(pose.rotation @ (speed.linear + np.cross(w, lever)))]
+        v += [*euler_rates(problem.q0[7 * (k - 1) + 3 :][:4], pose.rotation @ w)]
+        moved = change.linear + np.cross(w, speed.linear) + np.cross(change.angular, lever)
+        known.append(pose.rotation @ (moved + np.cross(w, np.cross(w, lever))))
+    found = solve_dae(system, (0.0, 1e-3), problem.q0, np.array(v)).a[:, 0]
+    np.testing.assert_allclose(found.reshape(-1, 7)[:, :3], known, atol=1e-10)
+    energy = pin.computeKineticEnergy(theirs, data, q, rates)
+    at_rest = problem.energy(0.0, problem.q0, 0.0 * problem.v0)
+    assert problem.energy(0.0, problem.q0, v) - at_rest == pytest.approx(energy)
+
+
+LINKAGE = """<robot name="four-bar">{links}
+  <joint name="pivot" type="revolute"><parent link="base"/><child link="crank"/><axis xyz="0 -1 0"/>
+    <limit effort="1" velocity="1"/></joint>
+  <joint name="elbow" type="continuous"><parent link="crank"/><child link="rod"/><origin xyz="1 0 0"/>
+    <axis xyz="0 -1 0"/></joint>
+  <joint name="foot" type="continuous"><parent link="base"/><child link="rocker"/><origin xyz="3 0 0"/>
+    <axis xyz="0 -1 0"/></joint>
+</robot>"""
+LINK = """<link name="{}"><inertial><origin xyz="{} 0 0"/><mass value="{}"/>
+    <inertia ixx="0.01" ixy="0" ixz="0" iyy="{}" iyz="0" izz="0.5"/></inertial></link>"""
+BARS = {"crank": 1.0, "rod": 2.0, "rocker": 1.5}
+
+
+def test_a_loop_that_is_given_beside_the_file(tmp_path):
+    links = "".join(LINK.format(name, 0.5 * L, L, L**3 / 12.0) for name, L in BARS.items())
+    path = tmp_path / "four_bar.urdf"
+    path.write_text(LINKAGE.format(links='<link name="base"/>' + links))
+    loop = Loop(
+        "revolute", "rod", "rocker", at=(2.0, 0.0, 0.0), at_b=(1.5, 0.0, 0.0), axis=(0.0, 1.0, 0.0), name="knee"
+    )
+    model = read(path, loops=[loop], positions={"pivot": 1.4, "elbow": -1.2, "foot": 1.9})
+    plane = PlanarModel()
+    with pytest.warns(match="have rank"):
+        space = model.problem()
+        result = solve_dae(space.system, (0.0, 2.0), space.q0, space.v0, "DOP853", rtol=1e-10, atol=1e-10)
+    for k, body in enumerate(model.bodies):
+        name, L, q = body.name, BARS[body.name], space.q0[7 * k :]
+        axis = rotation_matrix(q[3:7])[:, 0]
+        plane.body(name, mass=L, inertia=L**3 / 12.0, position=q[[0, 2]], angle=float(np.arctan2(axis[2], axis[0])))
+    points = {body.name: [body.point(x * BARS[body.name], 0.0) for x in (-0.5, 0.5)] for body in plane.bodies}
+    base = plane.ground
+    plane.revolute(base, "crank", at=(base.point(0.0, 0.0), points["crank"][0]))
+    plane.revolute("crank", "rod", at=(points["crank"][1], points["rod"][0]))
+    plane.revolute("rod", "rocker", at=(points["rod"][1], points["rocker"][1]))
+    plane.revolute(base, "rocker", at=(base.point(3.0, 0.0), points["rocker"][0]))
+    flat = plane.problem()
+    known = solve_dae(flat.system, (0.0, 2.0), flat.q0, flat.v0, "DOP853", rtol=1e-10, atol=1e-10)
+    assert space.freedom.degrees == flat.freedom.degrees == 1
+    ours, theirs = result.q.reshape(3, 7, -1)[:, [0, 2], -1], known.q.reshape(3, 3, -1)[:, :2, -1]
+    np.testing.assert_allclose(ours, theirs, atol=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("<robot", "<robots", "is not XML"),
+        ('type="prismatic"', 'type="planar"', "type of joint 'push' must be one of"),
+        ('<child link="slide"/>', '<child link="upper"/>', "has two parents"),
+        ('<mass value="0.4"/>', "", "needs <mass> and <inertia>"),
+        ('<child link="slide"/>', '<child link="other"/>', "child of joint 'push' must be a link of the file"),
+        ('<axis xyz="1 0 0"/>', '<axis xyz="0 0 0"/>', "must have a direction"),
+        ('<mass value="0.4"/>', '<mass value="0"/>', "has joints but no mass"),
+    ],
+)
+def test_what_is_wrong_is_named(arm, old, new, message):
+    arm.write_text(arm.read_text().replace(old, new, 1))
+    with pytest.raises(ValueError, match=message):
+        read(arm)
+
+
+def test_wrong_loops_and_positions(arm):
+    for options, message in (
+        ({"positions": {"knee": 1.0}}, "no joint of that name"),
+        ({"positions": {"hold": 1.0}}, "has no angle"),
+        ({"loops": [Loop("revolute", "slide", "ground")]}, "needs an axis"),
+        ({"loops": [Loop("spherical", "slide", "wall")]}, "must be between links"),
+        ({"loops": [Loop("gear", "slide", "ground")]}, "kind of a loop must be"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            read(arm, **options)

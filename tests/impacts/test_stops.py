@@ -1,0 +1,224 @@
+"""Impacts with restitution, rest in contact and release, against closed forms and equations in least coordinates."""
+
+import pickle
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.optimize import brentq
+
+from twoloop import ConstrainedSystem, Status, Stop, load, solve_with_stops
+from twoloop.bodies import PlanarModel, SpatialModel
+
+GRAVITY = 9.81
+TIGHT = {"rtol": 1e-10, "atol": 1e-10}
+
+
+def ball(y=1.0, **motion):
+    model = PlanarModel(name="ball")
+    model.body("ball", mass=2.0, inertia=0.1, position=(0.0, y), **motion)
+    return model
+
+
+def moved(model, t1, stops=None, **options):
+    problem = model.problem((0.0, t1))
+    result = solve_with_stops(
+        problem.system, problem.t_span, problem.q0, problem.v0, stops or list(problem.stops), **TIGHT | options
+    )
+    assert result.success, result.message
+    return problem, result
+
+
+def test_a_ball_bounces_to_rest(tmp_path):
+    e, drop = 0.7, np.sqrt(2.0 / GRAVITY)
+    model = ball(velocity=(0.3, 0.0), angular_velocity=1.0)
+    model.stop("ball", (0.0, 1.0), "ground", (5.0, 0.0), normal=(0.0, 3.0), restitution=e, name="floor")
+    problem, result = moved(model, 4.0)
+    times = np.array([impact.t for impact in result.impacts])
+    flights = 2.0 * e ** np.arange(1, len(times)) * GRAVITY * drop / GRAVITY
+    np.testing.assert_allclose(times, drop + np.append(0.0, np.cumsum(flights)), atol=1e-10)
+    assert 20 < len(times) < 60 and abs(times[-1] - drop * (1.0 + e) / (1.0 - e)) < 1e-5
+    assert result.impacts[0].stops == ("floor",)
+    assert result.impacts[0].impulses == pytest.approx(2.0 * (1.0 + e) * GRAVITY * drop)
+    np.testing.assert_allclose(result.q[:, -1], [1.2, 0.0, 4.0], atol=1e-9)
+    np.testing.assert_allclose(-result.arcs[-1].lam[0], 2.0 * GRAVITY)
+    assert result.lam.shape == (0, len(result.t)) and result.t.shape == result.energy.shape
+    first = times[0]
+    np.testing.assert_allclose(result.sol(0.5 * first).q[1], 1.0 - 0.5 * GRAVITY * (0.5 * first) ** 2, atol=1e-9)
+    assert result.sol(first).v[1] == pytest.approx(e * GRAVITY * drop) and (result.sol([3.9, 0.0]).q[1] == [0, 1]).all()
+    result.save(tmp_path / "run.npz")
+    again = load(tmp_path / "run.npz", problem.system)
+    assert (again.q == result.q).all() and again.changes == result.changes
+    again.animate(tmp_path / "run.html")
+    result.plot(tmp_path / "run.png")
+    for each in (result, again, pickle.loads(pickle.dumps(result))):
+        with pytest.raises(ValueError, match="impacts"):
+            each.certify()
+    assert result.arcs[0].certify().passed
+
+
+def test_output_times():
+    model = ball()
+    model.stop("ball", (0.0, 1.0), "ground", (0.0, 0.0), normal=(0.0, 1.0), restitution=0.5)
+    times = np.linspace(0.0, 2.0, 21)
+    _, all_steps = moved(model, 2.0)
+    _, result = moved(model, 2.0, t_eval=times)
+    np.testing.assert_array_equal(result.t, times)
+    np.testing.assert_array_equal(result.q, all_steps.sol(times).q)
+    assert np.isfinite(result.a).all()
+
+
+def test_a_rod_falls_on_a_stop_and_bounces():
+    """The pin takes its share of the impulses."""
+    model, e, m = PlanarModel(), 0.6, 2.0
+    rod = model.rod("rod", (0.0, 0.0), (1.0, 0.0), mass=m)
+    model.revolute("ground", rod, at=(0.0, 0.0))
+    model.stop(rod, (1.0, 0.0), "ground", (0.0, -0.3), normal=(0.0, 1.0), restitution=e)
+    problem, result = moved(model, 2.0)
+    limit, t, y, known = -np.arcsin(0.3), 0.0, np.zeros(2), []
+
+    def lands(t, y):
+        return y[0] - limit
+
+    lands.terminal, lands.direction = True, -1
+    for _ in range(8):
+        fall = solve_ivp(
+            lambda t, y: [y[1], -1.5 * GRAVITY * np.cos(y[0])],
+            *((t, t + 2.0), y, "DOP853"),
+            **{"rtol": 1e-12, "atol": 1e-14, "events": lands, "first_step": 1e-3},
+        )
+        t, y = fall.t_events[0][0], np.array([limit, -e * fall.y_events[0][0][1]])
+        known.append(t)
+    np.testing.assert_allclose([impact.t for impact in result.impacts][:8], known, atol=1e-9)
+    at_rest = result.arcs[-1]
+    assert result.q[2, -1] == pytest.approx(limit) and at_rest.t[0] < 1.0
+    np.testing.assert_allclose(-at_rest.lam[2], 0.5 * m * GRAVITY, rtol=1e-9)  # half its weight
+    for impact in result.impacts:
+        q = result.sol(impact.t).q
+        assert np.abs(problem.system.velocity_constraint(impact.t, q, impact.v_after)).max() < 1e-12
+
+
+def test_a_stop_lets_go_when_its_force_would_pull():
+    model = PlanarModel()
+    rod = model.rod("rod", (0.0, 0.0), (1.0, 0.0), mass=2.0)
+    pin = model.revolute("ground", rod, at=(0.0, 0.0))
+    model.motor(pin, lambda t: 12.0 * np.sin(t))
+    (stop,) = model.limit(pin, lower=0.0, restitution=0.5)
+    _, result = moved(model, 1.2)
+    assert stop.name == "lower limit of revolute rod-ground" and result.impacts == () and len(result.arcs) == 2
+    assert result.arcs[0].t[-1] == pytest.approx(np.arcsin(GRAVITY / 12.0), abs=1e-10)
+    assert result.q[2].min() >= 0.0 and result.q[2, -1] > 1e-4
+
+
+def test_a_plastic_ball_on_a_table_that_shakes():
+    """It takes off where the table falls faster than it, lands where their paths meet, and stays again."""
+    A, w = 0.01, 40.0
+
+    def table(t):
+        return A * np.sin(w * t), A * w * np.cos(w * t), A * w * w * np.sin(w * t)
+
+    known, t = [], 0.0
+    while t < 0.6:
+        if table(t)[2] < GRAVITY:
+            grid = t + np.arange(0.0, 0.3, 1e-4)
+            s = grid[np.argmax(table(grid)[2] >= GRAVITY)]
+            t = brentq(lambda s: table(s)[2] - GRAVITY, s - 1e-4, s, xtol=1e-14)
+        known.append(t)
+        y, rate, _ = table(t)
+        grid = t + np.arange(1e-3, 0.3, 1e-4)
+
+        def above(s, y=y, rate=rate, t=t):
+            return y + rate * (s - t) - 0.5 * GRAVITY * (s - t) ** 2 - table(s)[0]
+
+        s = grid[np.argmax(above(grid) <= 0.0)]
+        t = brentq(above, s - 1e-4, s, xtol=1e-14)
+        known.append(t)
+    stop = Stop(lambda t, q: q[1] - A * np.sin(w * t), 0.0)
+    _, result = moved(ball(0.0, velocity=(0.0, A * w)), 0.6, stop)
+    ends = [arc.t[-1] for arc in result.arcs[:-1]]
+    np.testing.assert_allclose(ends, known[: len(ends)], atol=1e-9)
+    assert len(ends) >= 6
+
+
+@pytest.mark.parametrize("restitution", [0.0, 0.5])
+def test_a_box_rocks_to_rest_on_two_corners(restitution):
+    model = PlanarModel()
+    box = model.box("box", (1.0, 0.4), mass=1.0, position=(0.0, 0.6), angle=0.3)
+    for corner in ((0.5, 0.2), (0.5, -0.2), (-0.5, 0.2), (-0.5, -0.2)):
+        model.stop(box, box.point(*corner), "ground", (0.0, 0.0), normal=(0.0, 1.0), restitution=restitution)
+    problem, result = moved(model, 5.0)
+    np.testing.assert_allclose(result.q[1:, -1], [0.2, 0.0], atol=1e-9)
+    assert (np.diff(result.energy) < 1e-9).all()
+    assert min(stop.gap(0.0, q) for q in result.q.T for stop in problem.stops) > -1e-10
+    np.testing.assert_allclose(-result.arcs[-1].lam[:, -1], [0.5 * GRAVITY] * 2)
+
+
+@pytest.mark.slow
+def test_a_ball_comes_to_rest_in_a_wedge_at_the_origin():
+    model = ball()
+    for side in (-1.0, 1.0):
+        normal = (side * np.sin(0.7), np.cos(0.7))
+        model.stop("ball", (0.0, 1.0), "ground", (0.0, 0.0), normal=normal, restitution=0.2)
+    model.force("ball", (0.0, 1.0), (0.1, 0.0))
+    _, result = moved(model, 2.5)
+    np.testing.assert_allclose(result.q[:, -1], 0.0, atol=1e-9)
+    assert len(result.impacts) > 20
+
+
+def test_balls_and_walls_without_loss():
+    model = PlanarModel(gravity=(0.0, 0.0))
+    for k, x in enumerate((0.0, 1.0, 2.0)):
+        model.disc(f"disc {k}", 0.2, mass=1.0, position=(x, 0.0), velocity=(1.0 - min(k, 1), 0.0))
+    for k in range(2):
+        ends = model.bodies[k].point(0.2, 0.0), model.bodies[k + 1].point(-0.2, 0.0)
+        model.stop(model.bodies[k + 1], ends[1], model.bodies[k], ends[0], normal=(1.0, 0.0), restitution=1.0)
+    model.stop("disc 2", (2.2, 0.0), "ground", (3.2, 0.0), normal=(-1.0, 0.0), restitution=1.0)
+    _, result = moved(model, 4.0)
+    np.testing.assert_allclose([impact.t for impact in result.impacts], [0.6, 1.2, 2.2, 3.2, 3.8], atol=1e-12)
+    assert np.ptp(result.energy) < 1e-12
+
+
+def test_a_plane_and_space_agree():
+    """A pendulum on a slide that runs against its limits, and a bob against a wall that the slide carries."""
+
+    def model(spatial):
+        def at(x, y):
+            return (x, 0.0, y) if spatial else (x, y)
+
+        made = SpatialModel() if spatial else PlanarModel()
+        across = {"axis": (0.0, -1.0, 0.0)} if spatial else {}
+        inertia = (0.1, 0.1, 0.1) if spatial else 0.1
+        sledge = made.body("sledge", mass=1.0, inertia=inertia, position=at(0.0, 0.0), velocity=at(1.0, 0.0))
+        bob = made.body("bob", mass=0.5, inertia=inertia, position=at(0.3, -0.6))
+        made.limit(
+            made.prismatic("ground", sledge, at=at(0.0, 0.0), axis=at(2.0, 0.0)), lower=-0.2, upper=0.5, restitution=0.8
+        )
+        made.revolute(sledge, bob, at=at(0.0, 0.0), **across)
+        made.stop(bob, at(0.3, -0.6), sledge, at(-0.1, 0.0), normal=at(1.0, 0.0), restitution=0.4)
+        return made
+
+    plane, space = (moved(model(spatial), 6.0, compiled=False)[1] for spatial in (False, True))
+    assert len(plane.impacts) > 5 and {len(set(i.stops)) for i in plane.impacts} == {1}
+    np.testing.assert_allclose([i.t for i in space.impacts], [i.t for i in plane.impacts], atol=1e-8)
+    np.testing.assert_allclose(space.q[[7, 9], -1], plane.q[[3, 4], -1], atol=1e-7)
+
+
+def test_plain_functions_and_redundant_rows():
+    def constraint(t, q):
+        return np.array([0.5 * (q @ q - 1.0), q @ q - 1.0])
+
+    system = ConstrainedSystem.from_python(
+        n_q=2, n_c=2, mass=np.eye(2), force=lambda t, q, v: np.array([0.0, -GRAVITY]), constraint=constraint
+    )
+    with pytest.warns(match="have rank 1 of 2"):
+        result = solve_with_stops(system, (0.0, 1.5), [1.0, 0.0], [0.0, 0.0], Stop(lambda t, q: q[0], 0.0), **TIGHT)
+    # at the bottom, where gravity does not hold it: one impact takes all of its speed
+    assert len(result.impacts) == 1 and np.abs(result.q[:, -1] - [0.0, -1.0]).max() < 1e-9
+    assert result.impacts[0].impulses == pytest.approx(np.sqrt(2.0 * GRAVITY))
+
+
+def test_between_two_stops_that_leave_no_room():
+    cramped = [Stop(lambda t, q: q[1], 0.5), Stop(lambda t, q: 1e-13 - q[1] + 0.0 * t, 0.5)]
+    held = ball(0.0).problem()
+    result = solve_with_stops(held.system, (0.0, 1.0), held.q0, held.v0, cramped)
+    assert result.status in (Status.REACHED_END, Status.STAGNATED) and np.abs(result.q[1]).max() < 1e-9

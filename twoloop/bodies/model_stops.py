@@ -1,0 +1,173 @@
+"""Stops of a model: planes that points of bodies do not cross, and limits of joints."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twoloop.bodies.loads import Loads
+from twoloop.bodies.parts import Body, ModelJoint
+from twoloop.checks.arguments import check_finite
+from twoloop.problem.stops import Stop
+
+Array = NDArray[np.float64]
+
+
+def turned(q: Any, body: Body, vector: Any) -> list[Any]:
+    """A vector in the axes of a body, in space; of numbers or symbols."""
+    if body.number < 0:
+        return list(vector)
+    if len(vector) == 2:
+        s, c = np.sin(q[body.coordinates[2]]), np.cos(q[body.coordinates[2]])
+        return [c * vector[0] - s * vector[1], s * vector[0] + c * vector[1]]
+    w, *e = (q[j] for j in body.coordinates[3:])
+    across = [e[i - 2] * vector[i - 1] - e[i - 1] * vector[i - 2] + w * vector[i] for i in range(3)]  # e x a + w a
+    return [vector[i] + 2.0 * (e[i - 2] * across[i - 1] - e[i - 1] * across[i - 2]) for i in range(3)]
+
+
+def placed(q: Any, body: Body, place: Array) -> list[Any]:
+    """A point in the axes of a body, in space."""
+    moved = turned(q, body, place)
+    return moved if body.number < 0 else [q[j] + x for j, x in zip(body.coordinates, moved, strict=False)]
+
+
+@dataclass(frozen=True, eq=False)
+class PlaneGap:
+    """How far a point of one body is above a plane of another, m."""
+
+    body: Body
+    place: Array
+    other: Body
+    foot: Array
+    normal: Array
+
+    def __call__(self, t: Any, q: Any) -> Any:
+        """The distance; of numbers or symbols."""
+        one, two = placed(q, self.body, self.place), placed(q, self.other, self.foot)
+        return sum(n * (x - y) for n, x, y in zip(turned(q, self.other, self.normal), one, two, strict=True))
+
+
+@dataclass(frozen=True, eq=False)
+class TurnGap:
+    """How far a planar hinge is from a limit, rad."""
+
+    joint: ModelJoint
+    limit: float
+    sign: float
+
+    def __call__(self, t: Any, q: Any) -> Any:
+        """The angle that is left; of numbers or symbols."""
+        ends = (self.joint.b, self.joint.a)
+        one, two = (0.0 if body.number < 0 else q[body.coordinates[2]] - body.rotation for body in ends)
+        return self.sign * (one - two - self.limit)
+
+
+class Stops(Loads):
+    """Adds stops to a model, for `twoloop.solve_with_stops`."""
+
+    def stop(
+        self,
+        body: Body | str,
+        at: Any,
+        other: Body | str,
+        foot: Any,
+        *,
+        normal: Any,
+        restitution: float = 0.0,
+        name: str | None = None,
+    ) -> Stop:
+        """A plane of one body that a point of another does not cross; without friction.
+
+        Parameters
+        ----------
+        body : Body or str
+        at : array_like (2 or 3,) or BodyPoint
+            Its point, in space in the position given, m.
+        other : Body or str
+            With the plane; the ground for a floor or a wall.
+        foot : array_like (2 or 3,) or BodyPoint
+            A point of the plane, m.
+        normal : array_like (2 or 3,) or BodyDirection
+            Across the plane, to the side on which the point is.
+        restitution : float
+            From 0 to 1.
+        name : str, optional
+
+        Returns
+        -------
+        Stop
+
+        Raises
+        ------
+        TypeError, ValueError
+            If an argument is wrong.
+        """
+        one, two = self._body("body", body), self._body("other", other)
+        self._different("stop", one, two)
+        name = self._new_name("stop", name, one, two)
+        places = self._point("at", at, one), two, self._point("foot", foot, two), self._direction("normal", normal, two)
+        return self._add_stop(Stop(PlaneGap(one, *places), restitution, name))
+
+    def limit(
+        self,
+        joint: ModelJoint | str,
+        *,
+        lower: float | None = None,
+        upper: float | None = None,
+        restitution: float = 0.0,
+        name: str | None = None,
+    ) -> tuple[Stop, ...]:
+        """Limits of a joint: a revolute one in a plane, or a prismatic one.
+
+        Parameters
+        ----------
+        joint : ModelJoint or str
+        lower, upper : float, optional
+            How far b may turn on a, or slide along the axis, from the position given, rad or m. None: without end.
+        restitution : float
+            From 0 to 1.
+        name : str, optional
+            Before "lower limit" and "upper limit". None: that of the joint.
+
+        Returns
+        -------
+        tuple of Stop
+
+        Raises
+        ------
+        TypeError, ValueError
+            If an argument is wrong, or no limit is given.
+        """
+        kinds = ("revolute", "prismatic") if self.dimension == 2 else ("prismatic",)
+        limited = self._joint(joint, kinds, "limit")
+        given = {"lower": (lower, 1.0), "upper": (upper, -1.0)}
+        if lower is None and upper is None:
+            raise ValueError(f"limit of {limited.name!r} needs lower, upper, or both")
+        made = []
+        for which, (value, sign) in given.items():
+            if value is not None:
+                new = self._new_name(f"{which} limit of {limited.name if name is None else name}", None)
+                gap = self._gap(limited, check_finite(which, value), sign)
+                made.append(self._add_stop(Stop(gap, restitution, new)))
+        return tuple(made)
+
+    def _gap(self, joint: ModelJoint, limit: float, sign: float) -> Any:
+        if joint.kind == "revolute":
+            return TurnGap(joint, limit, sign)
+        axis = self._axis(joint)
+        there = (
+            joint.b.in_space(np.array(joint.point_b.values)) if joint.b.number >= 0 else np.array(joint.point_b.values)
+        )
+        foot = joint.a.local_point(there) + limit * axis
+        return PlaneGap(joint.b, np.array(joint.point_b.values), joint.a, foot, sign * axis)
+
+    def _axis(self, joint: ModelJoint) -> Array:
+        """The axis of a prismatic joint, in the axes of a."""
+        raise NotImplementedError
+
+    def _add_stop(self, stop: Stop) -> Stop:
+        self.stops.append(stop)
+        return stop

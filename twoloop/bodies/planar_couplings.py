@@ -1,0 +1,244 @@
+"""Joints in a plane that couple motions: gears, racks, wheels that roll, points on curves."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from twoloop.bodies.model import Model
+from twoloop.bodies.model_stops import placed, turned
+from twoloop.bodies.parameter_layout import RATE, WRITTEN
+from twoloop.bodies.parts import Body, JointRow, ModelJoint, Numbers
+from twoloop.bodies.row_function import RateFunction, RowFunction
+from twoloop.checks.arguments import check_finite, check_positive
+
+
+class Couplings(Model):
+    """Adds such joints to a planar model. Their numbers are no parameters of it."""
+
+    def gear(
+        self, one: ModelJoint | str, other: ModelJoint | str, *, ratio: float, name: str | None = None
+    ) -> ModelJoint:
+        """Two hinges that turn together: `other` turns by `ratio` times what `one` turns, from the position given.
+
+        Parameters
+        ----------
+        one, other : ModelJoint or str
+            Revolute joints; each turns its b on its a. Two wheels on one carrier have it as their a.
+        ratio : float
+            Negative for wheels that touch from outside: minus the radius of one over that of the other.
+        name : str, optional
+
+        Returns
+        -------
+        ModelJoint
+            Whose reaction is a torque on the bodies of `other`.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If an argument is wrong.
+        """
+        first, second = self._two(one, "revolute", other, "revolute", "gear")
+        factor = check_finite("ratio", ratio)
+        if factor == 0.0:
+            raise ValueError("ratio must not be zero: the other hinge would be held; use fixed(...) for that")
+        name = self._new_name(f"gear of {first.name} and {second.name}", name)
+        return self._coupled(name, "gear", second, [lambda q: _turned(q, second) - factor * _turned(q, first)], first)
+
+    def rack(
+        self, pinion: ModelJoint | str, slide: ModelJoint | str, *, radius: float, name: str | None = None
+    ) -> ModelJoint:
+        """A pinion on a rack: the slide moves by `radius` times what the pinion turns, from the position given.
+
+        Parameters
+        ----------
+        pinion, slide : ModelJoint or str
+            A revolute and a prismatic joint.
+        radius : float
+            m; negative where a turn from x to y moves the slide against its axis.
+        name : str, optional
+
+        Returns
+        -------
+        ModelJoint
+
+        Raises
+        ------
+        TypeError, ValueError
+            If an argument is wrong.
+        """
+        first, second = self._two(pinion, "revolute", slide, "prismatic", "rack")
+        factor = check_finite("radius", radius)
+        if factor == 0.0:
+            raise ValueError("radius must not be zero: the slide would be held; use fixed(...) for that")
+        name = self._new_name(f"rack of {first.name} and {second.name}", name)
+        angle = float(np.arctan2(*self._axis(second)[::-1]))
+        ends = [np.array(point.values) for point in (second.point_a, second.point_b)]
+
+        def slid(q: Any) -> Any:
+            return _along(q, second.a, angle, ends[0], second.b, ends[1])
+
+        start = slid(self._start())
+        return self._coupled(name, "rack", second, [lambda q: slid(q) - start - factor * _turned(q, first)], first)
+
+    def rolling(
+        self, a: Body | str, wheel: Body | str, *, radius: float, axis: Any, name: str | None = None
+    ) -> ModelJoint:
+        """A wheel, whose centre of mass is its centre, that rolls on a line of a without slipping.
+
+        Parameters
+        ----------
+        a, wheel : Body or str
+            The line is below the wheel in the position given: `radius` to the right of its centre, seen along the axis.
+        radius : float
+            m.
+        axis : array_like (2,) or BodyDirection
+            Along the line.
+        name : str, optional
+
+        Returns
+        -------
+        ModelJoint
+            Whose reaction is what the wheel does to a; where a is the ground, what this does to the wheel.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If an argument is wrong.
+        """
+        first, second, name, named = self._pair("rolling", a, wheel, name, None)
+        points = Numbers(named[0].values), Numbers(named[1].values)
+        if second is self.ground:
+            raise ValueError("wheel must be a body that moves; given the ground")
+        check_positive("radius", radius)
+        direction = self._direction("axis", axis, first)
+        angle, foot = float(np.arctan2(*direction[::-1])), np.array(points[0].values)
+        zero, joint = np.zeros(2), ModelJoint(name, "rolling", first, second, (), *points)
+        rows = [
+            lambda q: _along(q, first, angle + 0.5 * np.pi, foot, second, zero),
+            lambda q: _along(q, first, angle, foot, second, zero) + radius * _turned(q, joint),
+        ]
+        return self._coupled(name, "rolling", joint, rows, joint)
+
+    def skate(self, body: Body | str, *, at: Any, axis: Any, name: str | None = None) -> ModelJoint:
+        """A blade, or a thin wheel seen from above: its point moves along an axis of the body only. Non-holonomic.
+
+        Parameters
+        ----------
+        body : Body or str
+        at : array_like (2,) or BodyPoint
+            The point, in space in the position given, m.
+        axis : array_like (2,) or BodyDirection
+            Along the blade, in space in the position given.
+        name : str, optional
+
+        Returns
+        -------
+        ModelJoint
+            Whose reaction is the force across the blade, on the body.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If an argument is wrong.
+        """
+        on = self._moving_body("body", body)
+        name = self._new_name("skate", name, on)
+        place, (x, y) = self._point("at", at, on), self._direction("axis", axis, on)
+
+        def across(q: Any, v: Any) -> Any:
+            (rx, ry), (nx, ny) = turned(q, on, place), turned(q, on, np.array([-y, x]))
+            u, w, spin = (v[j] for j in on.coordinates)
+            return nx * (u - spin * ry) + ny * (w + spin * rx)
+
+        columns = on.coordinates
+        places = Numbers((float(len(columns)), *map(float, columns)))
+        points = Numbers(tuple(on.in_space(place))), Numbers(tuple(place))
+        function = RateFunction(f"skate {name!r}", across, columns)
+        row = JointRow(RATE, 1, self.ground, on, *points, places, function)
+        return self._add_joint(ModelJoint(name, "skate", self.ground, on, (row,), *points))
+
+    def point_on_curve(
+        self, a: Body | str, b: Body | str, *, at: Any, curve: Callable[[Any, Any], Any], name: str | None = None
+    ) -> ModelJoint:
+        """A point of b that stays on a curve of a, as a pin in a slot or the tip of a follower on its cam.
+
+        Parameters
+        ----------
+        a, b : Body or str
+        at : array_like (2,) or BodyPoint
+            The point of b, in space in the position given, m.
+        curve : callable
+            curve(x, y), zero on the curve; x and y from the centre of mass of a in its axes, of the ground in space, m.
+            Such as `lambda x, y: y - 0.1 * np.cos(5.0 * x)`, of numpy's functions without branches. Its gradient must
+            not be zero on the curve.
+        name : str, optional
+
+        Returns
+        -------
+        ModelJoint
+
+        Raises
+        ------
+        TypeError, ValueError
+            If an argument is wrong, or the curve cannot be run on symbols.
+        """
+        first, second = self._body("a", a), self._body("b", b)
+        self._different("point_on_curve", first, second)
+        name = self._new_name("point on curve", name, first, second)
+        if not callable(curve):
+            raise TypeError(f"curve of {name!r} must be a function of x and y; given {curve!r}")
+        there = self._point("at", at, second)
+        here = first.local_point(second.in_space(there))
+        points = Numbers(tuple(here)), Numbers(tuple(there))
+
+        def off(q: Any) -> Any:
+            return curve(*_seen(q, first, placed(q, second, there)))
+
+        joint = ModelJoint(name, "point on curve", first, second, (), *points)
+        return self._coupled(name, "point on curve", joint, [off], joint)
+
+    def _two(self, one: Any, kind: str, other: Any, other_kind: str, what: str) -> tuple[ModelJoint, ModelJoint]:
+        first, second = self._joint(one, (kind,), what), self._joint(other, (other_kind,), what)
+        if first is second:
+            raise ValueError(f"a {what} needs two joints; given {first.name!r} twice")
+        return first, second
+
+    def _coupled(
+        self, name: str, kind: str, acts: ModelJoint, rows: list[Callable[[Any], Any]], also: ModelJoint
+    ) -> ModelJoint:
+        """The joint of rows that are functions of the coordinates of the bodies of two joints."""
+        columns = tuple(sorted({j for joint in (acts, also) for body in (joint.a, joint.b) for j in body.coordinates}))
+        places = Numbers((float(len(columns)), *map(float, columns)))
+        ends = acts.a, acts.b, acts.point_a, acts.point_b
+        functions = (RowFunction(f"{kind} {name!r}", row, columns) for row in rows)
+        made = tuple(JointRow(WRITTEN, 1, *ends, places, each) for each in functions)
+        return self._add_joint(ModelJoint(name, kind, acts.a, acts.b, made, acts.point_a, acts.point_b))
+
+
+def _angle(q: Any, body: Body) -> Any:
+    return 0.0 if body.number < 0 else q[body.coordinates[2]]
+
+
+def _turned(q: Any, joint: ModelJoint) -> Any:
+    """By how much b has turned on a since the position given."""
+    return _angle(q, joint.b) - _angle(q, joint.a) - (joint.b.rotation - joint.a.rotation)
+
+
+def _along(q: Any, a: Body, angle: float, here: Any, b: Body, there: Any) -> Any:
+    """How far a point of b is from one of a, along a direction of a."""
+    (x, y), (u, w) = placed(q, a, here), placed(q, b, there)
+    total = _angle(q, a) + angle
+    return np.cos(total) * (u - x) + np.sin(total) * (w - y)
+
+
+def _seen(q: Any, body: Body, point: list[Any]) -> list[Any]:
+    """A point of space in the axes of a body."""
+    if body.number < 0:
+        return point
+    x, y = (each - q[j] for each, j in zip(point, body.coordinates, strict=False))
+    s, c = np.sin(_angle(q, body)), np.cos(_angle(q, body))
+    return [c * x + s * y, c * y - s * x]

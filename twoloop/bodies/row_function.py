@@ -1,0 +1,90 @@
+"""Rows of the constraints that are functions of the coordinates: recorded once, with their derivatives."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twoloop.generate.calls_on_symbols import as_forms, trace
+from twoloop.generate.derivative import Derivative
+from twoloop.generate.programs import numbers_of, program_of
+from twoloop.generate.tracing import Form, Graph, Untraceable, symbols
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class RowFunction:
+    """A row C(q) = 0, of coordinates of some bodies.
+
+    Attributes
+    ----------
+    name : str
+        For messages.
+    function : callable
+        function(q) -> number, made of operations that can be recorded.
+    columns : tuple of int
+        The coordinates that it depends on.
+    """
+
+    name: str
+    function: Callable[..., Any]
+    columns: tuple[int, ...]
+    traced: Array = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        n, graph = 1 + max(self.columns), Graph()
+        (t,) = graph.inputs(1, False)
+        q, v = graph.inputs(n, False), graph.inputs(n, True)
+        try:
+            made = self.forms(graph, t, q, v)
+        except Untraceable as error:
+            raise ValueError(f"{self.name} must be made of numpy's functions, without branches: {error}") from None
+        object.__setattr__(self, "traced", np.array(numbers_of(program_of(graph, 1 + 2 * n, dict(enumerate(made))))))
+
+    @property
+    def n_results(self) -> int:
+        """C, C_t, gamma, and the derivative by each of its coordinates."""
+        return 3 + len(self.columns)
+
+    def forms(self, graph: Graph, t: Form, q: Sequence[Form], v: Sequence[Form]) -> list[Form]:
+        """These, of symbols."""
+        value = np.array(trace(lambda _, coordinates: self.function(coordinates), t, symbols(q)), dtype=object)
+        if value.shape not in ((), (1,)):
+            raise Untraceable(f"on symbols it returns shape {value.shape}")
+        row = as_forms(graph, value.reshape(1))[0]
+        one, places = Form(graph, 1.0, {}), [next(iter(each.terms)) for each in q]
+        along = dict(zip(places, v, strict=True))
+        bend = Derivative(graph, along).of(Derivative(graph, along).of(row))
+        gradient = [Derivative(graph, {places[j]: one}).of(row) for j in self.columns]
+        return [row, Form(graph, 0.0, {}), bend.times(-1.0), *gradient]
+
+    def at(self, t: float, q: Array, v: Array) -> Array:
+        """These, in numbers."""
+        from twoloop.bodies.program_results import results  # whose import compiles
+
+        n = 1 + max(self.columns)
+        return np.asarray(results(0, t, q[:n].copy(), v[:n].copy(), self.traced)[: self.n_results])
+
+
+@dataclass(frozen=True, eq=False)
+class RateFunction(RowFunction):
+    """A row A(q) v = 0 of the non-holonomic constraints: function(q, v) -> number, linear in v."""
+
+    @property
+    def n_results(self) -> int:
+        """The right-hand side of A a = Q_a, and A at each of its coordinates."""
+        return 1 + len(self.columns)
+
+    def forms(self, graph: Graph, t: Form, q: Sequence[Form], v: Sequence[Form]) -> list[Form]:
+        """These, of symbols."""
+        function: Callable[..., Any] = self.function
+        value = trace(lambda _, one, other: function(one, other), t, symbols(q), symbols(v))
+        row, one = as_forms(graph, np.array(value, dtype=object).reshape(1))[0], Form(graph, 1.0, {})
+        along = {next(iter(each.terms)): rate for each, rate in zip(q, v, strict=True)}
+        gradient = [Derivative(graph, {next(iter(v[j].terms)): one}).of(row) for j in self.columns]
+        return [Derivative(graph, along).of(row).times(-1.0), *gradient]

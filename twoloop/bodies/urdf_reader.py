@@ -1,0 +1,277 @@
+"""Models from URDF, the format of robots: a tree of links and joints; loops are given beside it."""
+
+from __future__ import annotations
+
+import os
+import warnings
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+from xml.etree.ElementTree import Element
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from twoloop.bodies.mjcf_geometry import IgnoredWarning, Lump, Pose, numbers, pose_of
+from twoloop.bodies.mjcf_joints import Freed, Part, add_part, body_of
+from twoloop.bodies.parts import Body
+from twoloop.bodies.spatial_model import SpatialModel
+from twoloop.checks.arguments import check_choice, check_finite, check_flag, check_vector
+
+Array = NDArray[np.float64]
+
+KINDS = {"revolute": "hinge", "continuous": "hinge", "prismatic": "slide", "floating": "free", "fixed": ""}
+CLOSING = ("spherical", "revolute", "universal", "cylindrical", "prismatic", "planar", "fixed")
+WITHOUT_EFFECT = {"link", "joint", "material"}  # what is read, and colours
+
+
+@dataclass(frozen=True)
+class Loop:
+    """A joint that closes a loop of a file that has only trees.
+
+    Attributes
+    ----------
+    kind : str
+        "spherical", "revolute", "universal", "cylindrical", "prismatic", "planar" or "fixed".
+    a, b : str
+        Names of links; "ground".
+    at : array_like (3,)
+        In the frame of link a, m.
+    at_b : array_like (3,), optional
+        The point of b in the frame of link b, which is put there. None: they meet in the position read.
+    axis, axis_b : array_like (3,), optional
+        Directions in the frames of a and of b. None for b: that of a, in the position read.
+    name : str, optional
+    """
+
+    kind: str
+    a: str
+    b: str
+    at: ArrayLike = (0.0, 0.0, 0.0)
+    at_b: ArrayLike | None = None
+    axis: ArrayLike | None = None
+    axis_b: ArrayLike | None = None
+    name: str | None = None
+
+
+def from_urdf(
+    path: str | os.PathLike[str],
+    *,
+    loops: Sequence[Loop] = (),
+    positions: Mapping[str, float] | None = None,
+    free_base: bool = False,
+    gravity: ArrayLike = (0.0, 0.0, -9.81),
+) -> SpatialModel:
+    """Read a model from a URDF file.
+
+    Read are links with their inertials, joints of the kinds revolute, continuous, prismatic, floating and fixed, and
+    their damping. Links that are fixed to others are one with them.
+
+    Parameters
+    ----------
+    path : path-like
+    loops : sequence of Loop
+        Joints that close loops, which such a file cannot have.
+    positions : mapping, optional
+        From names of joints to angles or displacements, rad or m: the position of the bodies. Others are zero.
+    free_base : bool
+        Whether the root link moves freely; otherwise it is fixed to the ground.
+    gravity : array_like (3,)
+        m/s^2, which such a file does not have.
+
+    Returns
+    -------
+    SpatialModel
+        Its bodies have the names of links, and the axes of their frames. `model.ignored` lists what was not read:
+        limits, friction, mimicry, collisions, transmissions, ...
+
+    Warns
+    -----
+    IgnoredWarning
+        If that is not empty.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If the file is no URDF or no tree, a link that moves has no mass, or an argument is wrong.
+
+    Notes
+    -----
+    The format is described at wiki.ros.org/urdf/XML.
+    """
+    try:
+        root = ElementTree.parse(path).getroot()
+    except ElementTree.ParseError as error:
+        raise ValueError(f"{os.fspath(path)!r} is not XML: {error}") from None
+    if root.tag != "robot":
+        raise ValueError(f"{os.fspath(path)!r} must begin with <robot>; it begins with <{root.tag}>")
+    check_flag("free_base", free_base)
+    reader = _Reader(root, dict(positions or {}), SpatialModel(gravity, name=root.get("name", "robot")))
+    reader.read(free_base)
+    for loop in loops:
+        reader.close(loop)
+    reader.model.ignored = tuple(reader.ignored)
+    if reader.ignored:
+        warnings.warn(f"{os.fspath(path)!r}: ignored are {'; '.join(reader.ignored)}", IgnoredWarning, stacklevel=2)
+    return reader.model
+
+
+class _Reader:
+    def __init__(self, root: Element, positions: dict[str, Any], model: SpatialModel):
+        self.model, self.ignored = model, list[str]()
+        self.links = {_name(each): each for each in root.findall("link")}
+        self.joints = root.findall("joint")
+        self.ignored += [
+            f"{each.tag} {each.get('name') or each.get('reference') or ''!s}".rstrip()
+            for each in root
+            if each.tag not in WITHOUT_EFFECT
+        ]
+        self.positions = {name: check_finite(f"positions[{name!r}]", value) for name, value in positions.items()}
+        unknown = self.positions.keys() - {_name(each) for each in self.joints}
+        if unknown:
+            raise ValueError(f"positions has {min(unknown)!r}, and the file no joint of that name")
+        self.frames: dict[str, tuple[Part | None, Pose]] = {}
+        self.collisions = 0
+
+    def read(self, free_base: bool) -> None:
+        """All links, from the root on."""
+        children: dict[str, list[Element]] = {name: [] for name in self.links}
+        parents: dict[str, str] = {}
+        for joint in self.joints:
+            parent, child = (self._end(joint, which) for which in ("parent", "child"))
+            if child in parents:
+                raise ValueError(f"the link {child!r} has two parents, {parents[child]!r} and {parent!r}: give loops=")
+            children[parent].append(joint)
+            parents[child] = parent
+        roots = [name for name in self.links if name not in parents]
+        if len(roots) != 1:
+            raise ValueError(f"a URDF file must be one tree of links; roots of this one are {roots}")
+        here = Pose(np.zeros(3), np.eye(3))
+        base = None
+        if free_base:
+            base = Part(roots[0], None, here, [Freed("base", "free", np.zeros(3), np.array([0.0, 0.0, 1.0]), {})])
+        parts = [] if base is None else [base]
+        self._link(roots[0], base, here)
+        ahead = [roots[0]]
+        while ahead:
+            name = ahead.pop(0)
+            for joint in children[name]:
+                parts += self._joint(joint, *self.frames[name])
+                ahead.append(self._end(joint, "child"))
+        for part in parts:
+            made = add_part(self.model, part)
+            damping = float(part.freed[0].attributes.get("damping", 0.0))
+            if damping and made is not None and made.kind == "revolute":
+                self.model.torsion_spring(made, stiffness=0.0, damping=damping)
+            elif damping and made is not None:
+                self.model.axial_spring(made, stiffness=0.0, damping=damping)
+        if self.collisions > 1:
+            self.ignored.append("contacts between links")
+
+    def close(self, loop: Loop) -> None:
+        """A joint that closes a loop."""
+        kind = check_choice("kind of a loop", loop.kind, CLOSING) or loop.kind
+        (part, here), (other, there) = (self._frame(name) for name in (loop.a, loop.b))
+        one, two = body_of(self.model, part), body_of(self.model, other)
+        at: Any = here.point(check_vector("at of a loop", loop.at, 3))
+        if loop.at_b is not None:
+            at_b = there.point(check_vector("at_b of a loop", loop.at_b, 3))
+            at = one.point(*one.local_point(at)), two.point(*two.local_point(at_b))
+        more: dict[str, Any] = {}
+        if kind not in ("spherical", "fixed"):
+            if loop.axis is None:
+                raise ValueError(f"a {kind} loop needs an axis; that of {loop.a!r} and {loop.b!r} has none")
+            axis = here.R @ check_vector("axis of a loop", loop.axis, 3)
+            axis_b = axis if loop.axis_b is None else there.R @ check_vector("axis_b of a loop", loop.axis_b, 3)
+            pair = _direction(one, axis), _direction(two, axis_b)
+            more = {"axes" if kind == "universal" else "axis": pair}
+        getattr(self.model, kind)(one, two, at=at, name=loop.name, **more)
+
+    def _frame(self, name: str) -> tuple[Part | None, Pose]:
+        if name == "ground":
+            return None, Pose(np.zeros(3), np.eye(3))
+        if name not in self.frames:
+            raise ValueError(f"a loop must be between links of the file or the ground; given {name!r}")
+        return self.frames[name]
+
+    def _end(self, joint: Element, which: str) -> str:
+        end = joint.find(which)
+        name = "" if end is None else end.get("link", "")
+        if name not in self.links:
+            raise ValueError(f"{which} of joint {_name(joint)!r} must be a link of the file; given {name!r}")
+        return name
+
+    def _joint(self, joint: Element, parent: Part | None, outer: Pose) -> list[Part]:
+        """The link behind a joint, and the part that it begins, if it moves."""
+        name, kind = _name(joint), joint.get("type", "")
+        if kind not in KINDS:
+            raise ValueError(f"type of joint {name!r} must be one of {', '.join(KINDS)}; given {kind!r}")
+        child = self._end(joint, "child")
+        pose = outer.then(_origin(joint, f"origin of joint {name!r}"))
+        given = joint.find("axis")
+        axis = numbers("1 0 0" if given is None else given.get("xyz", "1 0 0"), 3, f"axis of joint {name!r}")
+        if not axis.any():
+            raise ValueError(f"axis of joint {name!r} must have a direction; given {axis.tolist()}")
+        axis = axis / np.linalg.norm(axis)
+        dynamics = joint.find("dynamics")
+        attributes = {} if dynamics is None else dict(dynamics.attrib)
+        if float(attributes.get("friction", 0.0)):
+            self.ignored.append(f"friction of joint {name!r}")
+        if kind in ("revolute", "prismatic") and joint.find("limit") is not None:
+            self.ignored.append(f"limits of joint {name!r}")
+        for tag in ("mimic", "safety_controller"):
+            if joint.find(tag) is not None:
+                self.ignored.append(f"{tag} of joint {name!r}")
+        value = self.positions.get(name, 0.0)
+        if value and kind not in ("revolute", "continuous", "prismatic"):
+            raise ValueError(f"positions has {name!r}, a {kind} joint, which has no angle or displacement")
+        if kind == "fixed":
+            self._link(child, parent, pose)
+            return []
+        own = f"joint {name}" if name in self.links else name  # in URDF both may have one name
+        moved = Freed(own, KINDS[kind], pose.x, pose.R @ axis, attributes)
+        if kind == "prismatic":
+            pose = pose.then(Pose(value * axis, np.eye(3)))
+        elif kind != "floating":
+            turn = {"axisangle": " ".join(map(repr, [*axis.tolist(), value]))}
+            pose = pose.then(pose_of(turn, f"joint {name!r}", False, "XYZ"))
+        part = Part(child, parent, pose, [moved])
+        self._link(child, part, pose)
+        return [part]
+
+    def _link(self, name: str, part: Part | None, pose: Pose) -> None:
+        """The frame and the mass of a link."""
+        self.frames[name] = part, pose
+        element = self.links[name]
+        self.collisions += element.find("collision") is not None
+        inertial = element.find("inertial")
+        if inertial is None or part is None:
+            return
+        what = f"inertial of link {name!r}"
+        mass, inertia = inertial.find("mass"), inertial.find("inertia")
+        if mass is None or inertia is None:
+            raise ValueError(f"{what} needs <mass> and <inertia>")
+        xx, xy, xz, yy, yz, zz = (float(inertia.get(key, 0.0)) for key in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz"))
+        J = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+        (value,) = numbers(mass.get("value", ""), 1, f"mass of link {name!r}")
+        part.lumps.append(Lump(float(value), np.zeros(3), J).seen(pose.then(_origin(inertial, what))))
+
+
+def _name(element: Element) -> str:
+    name = element.get("name")
+    if not name:
+        raise ValueError(f"each <{element.tag}> of a URDF file must have a name")
+    return name
+
+
+def _origin(element: Element, what: str) -> Pose:
+    """Where a frame is in that of its parent: xyz, then turned about fixed axes by roll, pitch and yaw."""
+    origin = element.find("origin")
+    given = {} if origin is None else origin.attrib
+    turns = numbers(given.get("rpy", "0 0 0"), 3, f"rpy of {what}").tolist()
+    return pose_of({"pos": given.get("xyz", "0 0 0"), "euler": " ".join(map(repr, turns))}, what, False, "XYZ")
+
+
+def _direction(body: Body, direction: Array) -> Any:
+    return body.direction(*body.local_direction(direction))

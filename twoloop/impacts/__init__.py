@@ -1,0 +1,1 @@
+"""Motion against stops: impacts with restitution, and rest in contact."""

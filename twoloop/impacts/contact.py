@@ -1,0 +1,99 @@
+"""A system with some of its stops closed: constraints that hold as long as their forces push."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twoloop.generate.derived import standing_for
+from twoloop.generate.traced_values import unchecked
+from twoloop.impacts.gaps import Gaps
+from twoloop.kernels.compile.linking import direct
+from twoloop.kernels.data import common
+from twoloop.methods.dop853 import DOP853
+from twoloop.problem.system import ConstrainedSystem
+from twoloop.run.run import Run
+
+Array = NDArray[np.float64]
+
+
+class Closed:
+    """The functions of a system whose constraints are joined by the gaps of some stops.
+
+    Parameters
+    ----------
+    system : ConstrainedSystem
+    gaps : Gaps
+    which : list of int
+        The stops that are closed.
+    """
+
+    def __init__(self, system: ConstrainedSystem, gaps: Gaps, which: list[int]):
+        self._system, self._gaps, self._which = system, gaps, which
+        self._still = np.zeros(system.n_q)
+
+    def _of(self, kind: str, t: float, *state: Array) -> Array:
+        (out,) = self._system.arrays_of(kind)
+        getattr(self._system.functions, kind)(t, *state, self._system.functions.p, out)
+        return np.asarray(out)
+
+    def mass(self, t: float, q: Array) -> Array:
+        """M."""
+        return self._of("mass", t, q)
+
+    def force(self, t: float, q: Array, v: Array) -> Array:
+        """Q."""
+        return self._of("force", t, q, v)
+
+    def constraint(self, t: float, q: Array) -> Array:
+        """C, then the gaps."""
+        return np.append(self._of("constraint", t, q), self._gaps.at(t, q, self._still).g[self._which])
+
+    def jacobian(self, t: float, q: Array) -> Array:
+        """C_q, then their gradients."""
+        rows = self._system.jacobian(t, q) if self._system.n_c else np.zeros((0, self._system.n_q))
+        return np.vstack([rows, self._gaps.at(t, q, self._still).W[self._which]])
+
+    def constraint_rate(self, t: float, q: Array) -> Array:
+        """C_t, then theirs."""
+        return np.append(self._system.constraint_rate(t, q), self._gaps.at(t, q, self._still).u[self._which])
+
+    def gamma(self, t: float, q: Array, v: Array) -> Array:
+        """The right-hand side of C_q a = gamma, and theirs."""
+        own = self._of("gamma", t, q, v) if self._system.n_c else np.zeros(0)
+        return np.append(own, -self._gaps.at(t, q, v).bend[self._which])
+
+    def made(self, names: str) -> ConstrainedSystem:
+        """The system of these."""
+        system = self._system
+        functions: dict[str, Any] = {
+            kind: getattr(self, kind) for kind in ("mass", "force", "constraint", "jacobian", "constraint_rate")
+        }
+        if "gamma" in system.given or system.n_c == 0:
+            functions["gamma"] = self.gamma
+        for kind in system.given:
+            if kind.startswith("nonholonomic"):
+                functions[kind] = getattr(system, kind)
+        sizes: dict[str, Any] = {"n_q": system.n_q, "n_c": system.n_c + len(self._which), "n_a": system.n_a}
+        return ConstrainedSystem.from_python(**sizes, **functions, name=f"{system.name} on {names}")
+
+
+class Accelerations:
+    """Accelerations and multipliers of a system at any state, as its runs find them."""
+
+    def __init__(self, system: ConstrainedSystem, t: float, q: Array, v: Array, atol: Array):
+        derived, _ = standing_for(system, unchecked)
+        plan = DOP853().plan(system.n_q, 1e-8, 1e-8, False)
+        self._run = Run(derived, plan, t, q, v, 1e-8, atol, None)
+        self._run.work.notes[common.GENERATION] = 1.0  # the ranks are known
+        self._n = system.n_q
+
+    def at(self, t: float, q: Array, v: Array) -> tuple[Array, Array]:
+        """a (n_q,) and [lam; mu]; NaN where there are none."""
+        run, n = self._run, self._n
+        state = np.concatenate([q, v, np.zeros(len(run.state) - 2 * n)])
+        if direct(run.a.start)(run.kit, run.work, t, state) != common.DONE:
+            state[2 * n :] = np.nan
+        return state[2 * n : 3 * n], state[3 * n :]

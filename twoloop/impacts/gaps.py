@@ -1,0 +1,98 @@
+"""The gaps of stops with their derivatives, from operations that are recorded once."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twoloop.checks.arguments import shown
+from twoloop.generate.calls_on_symbols import as_forms, trace
+from twoloop.generate.derivative import Derivative
+from twoloop.generate.programs import numbers_of, program_of
+from twoloop.generate.tracing import Form, Graph, Untraceable, symbols
+from twoloop.problem.stops import Stop
+
+Array = NDArray[np.float64]
+
+STATES = 5  # at which what was recorded is compared with the function
+AGREES = 1e-10  # relative
+
+
+class Gap(NamedTuple):
+    """Of k stops: gaps, their rates, what their second derivatives have without v', and their gradients (k, n_q)."""
+
+    g: Array
+    u: Array
+    bend: Array
+    W: Array
+
+
+class Gaps:
+    """The gaps of all stops.
+
+    Parameters
+    ----------
+    stops : sequence of Stop
+    t0, q0 : float, ndarray (n_q,)
+        A state about which what was recorded is compared with the functions.
+
+    Raises
+    ------
+    ValueError
+        If a gap cannot be run on symbols, or does not give what it gave then.
+    """
+
+    def __init__(self, stops: Sequence[Stop], t0: float, q0: Array):
+        self.n, self._n_q = len(stops), len(q0)
+        graph = Graph()
+        (t,) = graph.inputs(1, False)
+        q, v = graph.inputs(self._n_q, False), graph.inputs(self._n_q, True)
+        made: list[Form] = []
+        for stop in stops:
+            try:
+                gap = as_forms(graph, np.array(trace(stop.gap, t, symbols(q)), dtype=object).reshape(1))[0]
+            except (Untraceable, ValueError) as error:
+                raise ValueError(
+                    f"gap of {stop.name!r} must be a number made of t and q by numpy's functions, without branches: "
+                    f"{error}"
+                ) from None
+            made += _with_derivatives(graph, gap, t, q, v)
+        program = program_of(graph, 1 + 2 * self._n_q, dict(enumerate(made)))
+        self._p = np.array(numbers_of(program))
+        self._compare(stops, t0, q0)
+
+    def at(self, t: float, q: Array, v: Array) -> Gap:
+        """All of them at a state."""
+        from twoloop.bodies.program_results import results  # whose import compiles
+
+        made = results(0, t, q, v, self._p)[: self.n * (3 + self._n_q)].reshape(self.n, -1)
+        return Gap(made[:, 0], made[:, 1], made[:, 2], made[:, 3:])
+
+    def _compare(self, stops: Sequence[Stop], t0: float, q0: Array) -> None:
+        away = np.random.default_rng(4).uniform(-0.3, 0.3, (STATES, len(q0)))
+        away[0] = 0.0
+        for k, each in enumerate(away):
+            t, q = t0 + 0.37 * k, q0 + each
+            found = self.at(t, q, np.zeros_like(q)).g
+            for stop, own in zip(stops, found, strict=True):
+                value: Any = stop.gap(t, q.copy())
+                if k == 0 and not (np.ndim(value) == 0 and np.isfinite(value)):
+                    raise ValueError(f"gap of {stop.name!r} must return a finite number; it returned {shown(value)}")
+                if np.isfinite(value) and abs(value - own) > AGREES * (1.0 + abs(own)):
+                    raise ValueError(
+                        f"gap of {stop.name!r} does not give at t = {t:g} what it gave when it was recorded: it must "
+                        "depend on t and q alone, without branches"
+                    )
+
+
+def _with_derivatives(graph: Graph, gap: Form, t: Form, q: Sequence[Form], v: Sequence[Form]) -> list[Form]:
+    """A gap, its rate, what its second derivative has without v', and its gradient."""
+    one = Form(graph, 1.0, {})
+    (time,), places = t.terms, [next(iter(each.terms)) for each in q]
+    along = {time: one, **dict(zip(places, v, strict=True))}
+    rate = Derivative(graph, along).of(gap)
+    bend = Derivative(graph, along).of(rate)
+    return [gap, rate, bend, *(Derivative(graph, {place: one}).of(gap) for place in places)]

@@ -1,0 +1,147 @@
+"""Runs from impact to impact as one result."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import fields
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from twoloop.checks.arguments import check_real
+from twoloop.problem.system import ConstrainedSystem
+from twoloop.result.result import Result
+from twoloop.run.record import Statistics, Status, explained
+
+Array = NDArray[np.float64]
+
+CHANGES = "velocities jumped in impacts, or stops were closed for a while"
+
+
+class Impact(NamedTuple):
+    """An impact: when, s; at which stops; velocities before and after (n_q,); impulses, N s (N m s of an angle)."""
+
+    t: float
+    stops: tuple[str, ...]
+    v_before: Array
+    v_after: Array
+    impulses: Array
+
+
+class ArcState(NamedTuple):
+    """The state at a time, or at times (n,): q, v, a (n_q,) or (n_q, n), lam (n_c + n_a,) or (n_c + n_a, n)."""
+
+    t: Any
+    q: Array
+    v: Array
+    a: Array
+    lam: Array
+
+
+class ArcSolution:
+    """`result.sol` of a motion of several arcs: at an impact the state is that after it.
+
+    Attributes
+    ----------
+    arcs : tuple of Result
+    t_min, t_max : float
+        The times that it covers, s.
+    """
+
+    def __init__(self, arcs: Sequence[Result], n_c: int):
+        self.arcs, self._n_c = tuple(arcs), n_c
+        self.t_min, self.t_max = float(arcs[0].t[0]), float(arcs[-1].t[-1])
+
+    def __call__(self, t: ArrayLike) -> ArcState:
+        """The state at a time or at times (n,) in any order.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If t is no number or vector, or not within the run.
+        """
+        times = check_real("t", t)
+        if times.ndim > 1 or not ((times >= self.t_min) & (times <= self.t_max)).all():
+            raise ValueError(f"t must be a number or (n,), from {self.t_min!r} to {self.t_max!r}; given {times!r:.100}")
+        flat = np.atleast_1d(times)
+        first = self.arcs[0]
+        made = [np.empty((len(each), len(flat))) for each in (first.q, first.v, first.a, first.lam)]
+        which = np.searchsorted([arc.t[0] for arc in self.arcs], flat, side="right") - 1
+        for k in np.unique(which):
+            own = np.flatnonzero(which == k)
+            assert self.arcs[k].sol is not None
+            state = self.arcs[k].sol(flat[own])
+            for out, found in zip(made, (state.q, state.v, state.a, self._own_rows(state.lam)), strict=True):
+                out[:, own] = found
+        if times.ndim == 0:
+            return ArcState(float(times), *(each[:, 0] for each in made))
+        return ArcState(times, *made)
+
+    def _own_rows(self, lam: Array) -> Array:
+        return own_rows(lam, self._n_c, len(self.arcs[0].lam))
+
+    def __repr__(self) -> str:
+        return f"ArcSolution(from t = {self.t_min:g} to {self.t_max:g} s, {len(self.arcs)} arcs)"
+
+
+def own_rows(lam: Array, n_c: int, n_rows: int) -> Array:
+    """The multipliers of a system itself, without those of closed stops, which stand behind those of C."""
+    return np.vstack([lam[:n_c], lam[len(lam) - (n_rows - n_c) :]])
+
+
+def joined(
+    system: ConstrainedSystem,
+    arcs: Sequence[Result],
+    impacts: Sequence[Impact],
+    times: Array | None,
+    stagnated: str,
+) -> Result:
+    """One result of all arcs, at the ends of their steps or at output times."""
+    last, n_rows = arcs[-1], system.n_c + system.n_a
+    table: list[Array]
+    if times is None:
+        parts = [(arc.t, arc.q, arc.v, arc.a, own_rows(arc.lam, system.n_c, n_rows)) for arc in arcs]
+        table = [np.concatenate(each, axis=-1) for each in zip(*parts, strict=True)]
+    else:
+        table = list(ArcSolution(arcs, system.n_c)(times[times <= last.t[-1]]))
+    status, message = (Status.STAGNATED, stagnated) if stagnated else (last.status, last.message)
+    if not stagnated and len(arcs) > 1:
+        message += f" {len(impacts)} impacts."
+    known: dict[str, Any] = {
+        name: _all(arcs, name) for name in ("rejected_error", "rejected_convergence", "partitioned")
+    }
+    changes = CHANGES if impacts or any(arc.system is not system for arc in arcs) else ""
+    t, q, v, a, lam = table
+    return Result(
+        *(t, q, v, a, lam),
+        h=np.concatenate([arc.h for arc in arcs]),
+        status=status,
+        message=message + (explained(status) if stagnated else ""),
+        stats=_total([arc.stats for arc in arcs]),
+        rank=arcs[0].rank,
+        redundant=arcs[0].redundant,
+        **known,
+        sol=ArcSolution(arcs, system.n_c),  # type: ignore[arg-type]  # called alike
+        widest_gap=max(arc.widest_gap or 0.0 for arc in arcs),
+        system=system,
+        method=arcs[0].method,
+        compiled=arcs[0].compiled,
+        rtol=arcs[0].rtol,
+        atol=arcs[0].atol,
+        untested=_all(arcs, "untested"),
+        changes=changes,
+        arcs=tuple(arcs),
+        impacts=tuple(impacts),
+    )
+
+
+def _all(arcs: Sequence[Result], name: str) -> Any:
+    parts = [getattr(arc, name) for arc in arcs]
+    return None if any(part is None for part in parts) else np.concatenate(parts)
+
+
+def _total(parts: Sequence[Statistics]) -> Statistics:
+    return Statistics(
+        **{each.name: sum(getattr(part, each.name) or 0 for part in parts) for each in fields(Statistics)}
+    )

@@ -1,0 +1,50 @@
+"""The laws of stops without friction: of impacts, and of the forces that keep a gap closed."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import nnls
+
+from twoloop.problem.system import ConstrainedSystem
+
+Array = NDArray[np.float64]
+
+NEGLIGIBLE = 1e-12  # relative: singular values, and eigenvalues, that count as zero
+
+
+def responses(system: ConstrainedSystem, t: float, q: Array, W: Array) -> Array:
+    """How impulses at stops change the velocities, (n_q, k): M X + G^T Y = W^T with G X = 0, all constraints held."""
+    mass, rows = system.mass(t, q), system.rows(t, q)
+    size = float(np.abs(mass).max())
+    lengths = np.linalg.norm(rows, axis=1)
+    lengths[lengths == 0.0] = 1.0
+    scaled = rows / lengths[:, None] * size
+    matrix = np.block([[mass, scaled.T], [scaled, np.zeros((len(rows), len(rows)))]])
+    right = np.vstack([W.T, np.zeros((len(rows), len(W)))])
+    return np.linalg.lstsq(matrix, right, rcond=NEGLIGIBLE)[0][: system.n_q]
+
+
+def complementary(D: Array, b: Array) -> Array:
+    """Numbers x >= 0 with D x + b >= 0, and x 0 where this is positive; D symmetric and positive semidefinite.
+
+    They minimise x^T D x / 2 + b^T x: a problem of least squares, |B x - y| with B^T B = D and B^T y = -b.
+    """
+    if not len(b):
+        return np.zeros(0)
+    values, vectors = np.linalg.eigh(0.5 * (D + D.T))
+    kept = values > NEGLIGIBLE * values.max(initial=0.0)
+    roots = np.sqrt(values[kept])
+    x = nnls(roots[:, None] * vectors[:, kept].T, -(vectors[:, kept].T @ b) / roots)[0]
+    held = x > 0.0
+    x[held] = np.linalg.lstsq(D[np.ix_(held, held)], -b[held], rcond=NEGLIGIBLE)[0]
+    return np.maximum(x, 0.0)
+
+
+def impulses(D: Array, u: Array, restitution: Array) -> Array:
+    """Impulses at k stops of rates u, by Moreau's law: those that open with less than e times the old speed have one.
+
+    J. J. Moreau, Unilateral contact and dry friction in finite freedom dynamics, CISM 302 (1988): u+ + e u- >= 0, the
+    impulse is not negative, and one of both is zero. The energy does not grow where all e are the same.
+    """
+    return complementary(D, (1.0 + restitution) * u)

@@ -1,0 +1,41 @@
+"""Stops that a motion may run against."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from twoloop.checks.arguments import check_finite, check_text
+
+
+@dataclass(frozen=True)
+class Stop:
+    """A one-sided constraint without friction: its gap stays at zero or above, by impacts or by a force.
+
+    Attributes
+    ----------
+    gap : callable
+        gap(t, q), m or rad: positive where the stop is not touched. It is run once on symbols, so that its derivatives
+        are exact: numpy's functions, without branches.
+    restitution : float
+        From 0 to 1: the speed at which the gap opens after an impact over that at which it closed before.
+    name : str
+
+    Raises
+    ------
+    TypeError, ValueError
+        If an attribute is wrong.
+    """
+
+    gap: Callable[[Any, Any], Any]
+    restitution: float = 0.0
+    name: str = "stop"
+
+    def __post_init__(self) -> None:
+        check_text("name", self.name)
+        if not callable(self.gap):
+            raise TypeError(f"gap of {self.name!r} must be a function of t and q; given {self.gap!r}")
+        value = check_finite(f"restitution of {self.name!r}", self.restitution)
+        if not 0.0 <= value <= 1.0:
+            raise ValueError(f"restitution of {self.name!r} must be from 0 to 1; given {value!r}")

@@ -1,0 +1,258 @@
+"""A run that stops at every sample of a controller, where parameters may change, without checks on the way."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twoloop.checks.arguments import check_finite, check_real, shown
+from twoloop.checks.consistency import check_start
+from twoloop.generate.derived import standing_for
+from twoloop.generate.exact_derivatives import exact_near
+from twoloop.generate.traced_values import Traced
+from twoloop.kernels.compile.callbacks import KINDS
+from twoloop.kernels.compile.linking import direct
+from twoloop.kernels.data import common
+from twoloop.methods.auto import Auto
+from twoloop.methods.plan import Method
+from twoloop.methods.taylor import Taylor
+from twoloop.problem.system import ConstrainedSystem
+from twoloop.run.course import Course
+from twoloop.run.interrupts import Interrupts
+from twoloop.run.record import Record, Status
+from twoloop.run.recorder import Wanted
+from twoloop.run.run import LONGEST_UNSEEN, Run
+
+Array = NDArray[np.float64]
+
+STEPS = 1024  # in one call of the compiled loop
+FORCES = {"force", "force_by_q", "force_by_v"}
+CHANGED = "the parameters changed at samples"
+
+
+class SampledState(NamedTuple):
+    """The state at the end of a sample: t, s, and q, v, a (n_q,), lam (n_c + n_a,); read-only."""
+
+    t: float
+    q: Array
+    v: Array
+    a: Array
+    lam: Array
+
+
+class SampledRun:
+    """A run from sample to sample.
+
+    Parameters
+    ----------
+    system : ConstrainedSystem
+        Of its own: its parameters are written to.
+    method : Method
+    rtol, atol : float, ndarray (n_q,)
+    max_step : float
+    derivatives : bool
+        Whether derivatives are checked at the start.
+    t0, q0, v0 : float, ndarray (n_q,)
+
+    Raises
+    ------
+    TypeError, ValueError
+        If the start is refused, or the method is a Taylor series, which is made for given parameters.
+    """
+
+    def __init__(
+        self,
+        system: ConstrainedSystem,
+        method: Method,
+        rtol: float,
+        atol: Array,
+        max_step: float,
+        derivatives: bool,
+        t0: float,
+        q0: Array,
+        v0: Array,
+    ):
+        if isinstance(method, Taylor):
+            raise ValueError(
+                "method of start and step must not be 'Taylor', whose series are made for given parameters"
+            )
+        if isinstance(method, Auto):
+            method = replace(method, series=None, n_rows=system.n_c + system.n_a)
+        check_start(system, t0, q0, v0, derivatives=derivatives, exact=lambda: exact_near(system, t0, q0, v0))
+
+        def check(traced: Traced) -> None:
+            traced.refuse(system, t0, t0 + 1.0, q0, v0)
+
+        derived, _ = standing_for(system, check)  # by what inputs must not enter
+        plan = method.plan(system.n_q, rtol, float(atol.min()), False)
+        self.run = Run(derived, plan, t0, q0, v0, rtol, atol, None)
+        self.system, self.method, self.max_step, self.t0 = system, method, max_step, t0
+        self.p = system.functions.p[system.called_in_python :]
+        self._free: set[int] = set()  # places of parameters that are known to enter forces alone
+        self._changed = False
+        self.run.work.notes[common.GENERATION] = 1.0  # the ranks are known
+        self.run.set_sizes(None, max_step, t0 + 1.0)
+        self.run.control[self.run.a.STORE_ALL] = 0.0
+        self._outputs, self._filled = np.zeros(1), np.zeros(2, dtype=np.int64)
+        self._buffers = np.empty(1), np.empty((1, len(self.run.state))), np.empty((STEPS, self.run.a.N_STEP_COLUMNS))
+        self.rows, self.times, self.steps = list[Array](), list[float](), list[Array]()
+        self.cpu = 0.0
+        self._note(t0)
+
+    @property
+    def t(self) -> float:
+        """Where it is, s."""
+        return self.times[-1]
+
+    def set(self, inputs: Any) -> None:
+        """Take other parameters: a mapping from places to numbers, or all of them."""
+        if not self.p.size:
+            raise ValueError(f"inputs are parameters, of which {self.system.name!r} has none: make it with parameters=")
+        if isinstance(inputs, Mapping):
+            for place, value in inputs.items():
+                if type(place) is not int or not 0 <= place < len(self.p):
+                    raise ValueError(
+                        f"inputs must map places in the parameters, whole numbers from 0 to {len(self.p) - 1}, to "
+                        f"numbers; given the place {shown(place)} (a name has its place by problem.place(name))"
+                    )
+                number = value if type(value) is float and abs(value) < np.inf else check_finite("inputs", value)
+                if number != self.p[place]:
+                    self._write(place, number)
+            return
+        values = check_real("inputs", inputs)
+        if values.shape != self.p.shape or not np.isfinite(values).all():
+            raise ValueError(
+                f"inputs must be all {len(self.p)} parameters, finite, or a mapping from places to numbers; given "
+                f"{shown(inputs)}"
+            )
+        for place in np.flatnonzero(values != self.p).tolist():
+            self._write(place, float(values[place]))
+
+    def step(self, dt: float) -> SampledState:
+        """Go on by dt, and note the state there."""
+        run, a, clock = self.run, self.run.a, self.run.clock
+        t = self.times[-1]
+        end = t + dt
+        began = time.process_time()
+        code = a.PAUSED
+        if self._changed or self.system.called_in_python:  # what such functions find in their surroundings may change
+            code = self._begin_anew(t)
+        run.gap = run.tolerances[common.GAP] = LONGEST_UNSEEN * (end - self.t0)
+        run.limit_steps()
+        self._outputs[0], clock[a.NEXT_OUTPUT], clock[a.T_START], clock[a.N_FIXED] = end, 0.0, t, 0.0
+        run.control[a.MAX_ATTEMPTS] = STEPS
+        steps = self._buffers[2]
+        while code == a.PAUSED:
+            code = direct(a.advance)(
+                *(run.kit, run.work, run.plan.options, run.plan.memory, run.tolerances, run.control, clock),
+                *(run.state, run.new_state, self._outputs, *self._buffers, self._filled),
+            )
+            if self._filled[1]:
+                self.steps.append(steps[: self._filled[1]].copy())
+        if code != a.ALL_OUTPUT_DONE:
+            self._by_course(end)
+        self.cpu += time.process_time() - began
+        self._note(end)
+        return self.state
+
+    @property
+    def state(self) -> SampledState:
+        """The state at the end of the last sample."""
+        row, n = self.rows[-1], self.run.system.n_q
+        return SampledState(self.times[-1], row[:n], row[n : 2 * n], row[2 * n : 3 * n], row[3 * n :])
+
+    def _note(self, t: float) -> None:
+        row = self.run.state.copy()
+        row.setflags(write=False)
+        self.rows.append(row)
+        self.times.append(t)
+
+    def record(self) -> Record:
+        """All states at samples so far."""
+        run, a, n = self.run, self.run.a, self.run.system.n_q
+        table = np.array(self.rows)
+        steps = np.concatenate([np.empty((0, a.N_STEP_COLUMNS)), *self.steps])
+        return Record(
+            *(np.array(self.times), table[:, :n].T, table[:, n : 2 * n].T, table[:, 2 * n : 3 * n].T),
+            lam=table[:, 3 * n :].T,
+            h=steps[:, a.H],
+            status=Status.REACHED_END,
+            message=f"Stepped to t = {self.t:g} in {len(self.times) - 1} samples.",
+            stats=run.statistics(self.cpu),
+            rank=run.rank,
+            redundant=run.redundant.copy(),
+            untested=steps[:, a.JACOBIANS] > 0.0,
+            widest_gap=float(run.work.notes[common.WIDEST_GAP]),
+            system=self.system,
+            changes=CHANGED,
+        )
+
+    def _begin_anew(self, t: float) -> int:
+        """Accelerations with other parameters, and a method that forgets those before."""
+        run, a = self.run, self.run.a
+        code = direct(a.start)(run.kit, run.work, t, run.state)
+        first = 0
+        if run.plan.first is not None:  # of a pair it is kept which of the two is at work
+            from twoloop.kernels.control.switching import N_SCALARS
+
+            first = N_SCALARS + 2 * run.system.n_q
+        run.plan.memory[first:] = run.memory[first:]
+        run.clock[: a.N_PAST] = 0.0
+        self._changed = False
+        if code != common.DONE:
+            raise RuntimeError(
+                f"the accelerations of {self.system.name!r} cannot be found at t = {t:.10g} with the inputs given: the "
+                "forces are not finite, or the constraints have lost rank"
+            )
+        return int(a.PAUSED)
+
+    def _by_course(self, end: float) -> None:
+        """What the compiled loop cannot do by itself: a singular position, a jump, another algebra; or a failure."""
+        run = self.run
+        run.t0 = float(run.clock[run.a.T])
+        wanted = Wanted(np.array([end]), True, False, None)
+        with Interrupts() as interrupts:
+            course = Course(run, end, wanted, lambda t: None, None, interrupts)
+            record = course.to_end(False)
+        run.control[run.a.STORE_ALL] = 0.0
+        self.steps.append(np.concatenate(course.step_parts)[1:])
+        if record.status != Status.REACHED_END:
+            raise RuntimeError(f"step of {self.system.name!r}: {record.message}")
+
+    def _write(self, place: int, value: float) -> None:
+        if place not in self._free:
+            self._check_free(place, value)
+        self.p[place] = value
+        self._changed = True
+
+    def _check_free(self, place: int, value: float) -> None:
+        """Refuse an input that is more than a force: with it the state would jump."""
+        before, n = float(self.p[place]), self.system.n_q
+        t, row = self.times[-1], self.rows[-1]
+        known = {"q": row[:n], "v": row[n : 2 * n]}
+        for kind in sorted(self.system.given.keys() - self.system.scattered - FORCES):
+            if not set(KINDS[kind].state) <= set(known):
+                continue
+            made = []
+            for each in (before, value, 0.5 * before + 1.37):
+                self.p[place] = each
+                made.append(np.concatenate([np.ravel(x) for x in _listed(self._of(kind, t, known))]))
+            self.p[place] = before
+            if any((each != made[0]).any() for each in made[1:]):
+                raise ValueError(
+                    f"inputs must enter forces alone; that at place {place} enters {kind} of {self.system.name!r}, "
+                    "which cannot change between samples: positions or momenta would jump; start anew with others"
+                )
+        self._free.add(place)
+
+    def _of(self, kind: str, t: float, known: dict[str, Array]) -> Any:
+        return self.system.evaluate(kind, t, *(known[name] for name in KINDS[kind].state))
+
+
+def _listed(made: Any) -> tuple[Any, ...]:
+    return made if isinstance(made, tuple) else (made,)
