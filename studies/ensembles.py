@@ -219,6 +219,12 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
         found["repeats"] = int(medians["repeats"].max())
     every = [line["ratio"] for each in found["cases"] for line in each["at"] if line["ratio"] is not None]
     found["ratios"] = [min(every), max(every)] if every else None
+    pairs = [line for each in found["cases"] for line in each["at"] if line["error"] == max(ERRORS)]
+    known = [line["ratio"] for line in pairs if line["ratio"] is not None]
+    behind = [line["ratio"] for line in pairs if line["verdict"] == "behind"]
+    found["loose"] = {"error": max(ERRORS), "cases": len(known), "behind": len(behind)}
+    found["loose"]["ratios"] = [min(behind), max(behind)] if behind else []
+    found["n_single"] = N_SINGLE
     found["verdicts"] = {
         verdict: sum(line["verdict"] == verdict for each in found["cases"] for line in each["at"])
         for verdict in ("ahead", "behind", "undecided", "alone", "missed", "none")

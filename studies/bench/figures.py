@@ -265,6 +265,7 @@ def work_precision(rows: pd.DataFrame, solvers: Sequence[str], title: str, error
             right.plot(errors, runs["n_evaluations"].astype(float), **one)
     for axes, what in ((left, "CPU time of the call (s)"), (right, "evaluations")):
         axes.set(xscale="log", yscale="log", xlabel=error, ylabel=what)
-    legend(figure, [left], f"{LEGEND}\nleft out: motion lost\n[P]: called from Python")
+    from_python = any(label.endswith(" [P]") for label in left.get_legend_handles_labels()[1])
+    legend(figure, [left], f"{LEGEND}\nleft out: motion lost" + from_python * "\n[P]: called from Python")
     figure.suptitle(title, fontsize=10)
     return figure

@@ -274,7 +274,8 @@ def heat_map(found: dict[str, Any]) -> Figure:
         axes.set_yticks(range(len(names)), names)
         axes.grid(False)
         axes.set(title=name, xlabel="error at the end, over max(1, max |q|)")
-    told = "blue: ours ahead; in brackets: undecided; “ours?”: not all rivals were run to their end; grey: not reached"
-    figure.suptitle(f"Time of the fastest rival over ours ({told})", fontsize=10)
-    figure.colorbar(image, ax=panels, label="ratio")
+    told = "blue: ours ahead; in brackets: undecided; grey: reached by “ours” or “others” alone, or by none; "
+    told += "“ours?”: not all rivals were run to their end"
+    figure.suptitle(f"Time of the fastest rival over ours\n{told}", fontsize=9)
+    figure.colorbar(image, ax=panels, label="ratio", extend="both")
     return figure

@@ -321,6 +321,7 @@ def test_one_factor_of_the_machine_would_be_seen(tables):
         for (i, e_in), (j, e_out) in itertools.product(enumerate(TOLERANCES), repeat=2):
             place = (table["group"] == group) & (table["err_in"] == e_in) & (table["err_out"] == e_out)
             table.loc[place, "call_s"] = (paper[i][j] or 1.0) / 10.0
+    table = tables["table3"] = table.drop(columns="times")
     assert verdict("table_3_seconds", tables) is CONSISTENT
 
 

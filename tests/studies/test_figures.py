@@ -263,4 +263,4 @@ def test_the_cells_of_table_3_are_drawn_as_ratios():
     assert told[0] == ["10"] * 5 + ["1.0", "★"] + ["10"] * 9
     assert told[1] == ["★", "10", "10", "10"] * 4
     assert first.get_xlabel() == "err_out" and first.get_ylabel() == "err_in"
-    assert scale.get_ylabel() == "paper's time / ours"
+    assert scale.get_ylabel() == "paper's time / our least"
