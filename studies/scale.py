@@ -198,7 +198,10 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
             "lines": tables.work_precision(medians, ERRORS),
         }
         of_chain["over_exudyn"] = [ratio for error in ERRORS if (ratio := over_exudyn(medians, error))]
-        of_chain |= {"step": steps_of(medians), "fastest": [each for error in ERRORS if (each := fastest(medians, error))]}
+        of_chain |= {
+            "step": steps_of(medians),
+            "fastest": [each for error in ERRORS if (each := fastest(medians, error))],
+        }
         found["chains"].append(of_chain)
     return found
 
@@ -224,7 +227,9 @@ def steps_of(medians: pd.DataFrame) -> dict[str, Any] | None:
 def fastest(medians: pd.DataFrame, error: float) -> dict[str, Any] | None:
     """The rival with the cheapest run within an error, and the default's time over its; None: one has no such run."""
     costs = {str(name): tables.as_good(own, error) for name, own in medians.groupby("solver", sort=False)}
-    rivals = [name for name in medians[medians["family"] != "two-loop"]["solver"].unique() if costs[name] == costs[name]]
+    rivals = [
+        name for name in medians[medians["family"] != "two-loop"]["solver"].unique() if costs[name] == costs[name]
+    ]
     ours = costs.get(DEFAULT, np.nan)
     if not rivals or not np.isfinite(ours):
         return None

@@ -75,9 +75,19 @@ OURS: dict[str, dict[str, str]] = {
 }
 THEIRS: dict[str, dict[str, str]] = {
     GREEN: {"heyoka": "*", "GSTIFF stand-in, order 3": "3"},
-    SKY: {"CVODE from C, Adams": ">", "CVODE from C, BDF": "v", "CVODE from C, BDF, projected": "^", "CVODE, Adams": "h"}
+    SKY: {
+        "CVODE from C, Adams": ">",
+        "CVODE from C, BDF": "v",
+        "CVODE from C, BDF, projected": "^",
+        "CVODE, Adams": "h",
+    }
     | {"GSTIFF stand-in, order 1": "1"},
-    ORANGE: {"IDA from C, stabilised": "<", "IDA from C, q and v tested": "v", "IDA, index1": "h", "IDA, stabilised": "s"}
+    ORANGE: {
+        "IDA from C, stabilised": "<",
+        "IDA from C, q and v tested": "v",
+        "IDA, index1": "h",
+        "IDA, stabilised": "s",
+    }
     | {"IDA from C, order 2, positions tested": "X", "GSTIFF stand-in, order 2": "2"},
     LIME: {"LSODA, index 1": "p", "DOP853, index 1": "8", "DOP853, projected": "X", "DOP853, Baumgarte 10": "^"}
     | {"Radau, index 1": "d", "BDF, index 1": "D", "GSTIFF stand-in, order 4": "4"},

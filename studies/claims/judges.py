@@ -98,7 +98,8 @@ def projection_inefficient(rows: Rows) -> Judgement:
 
 
 def extra_multipliers(rows: Rows) -> Judgement:
-    table, values = rows.pick("ablation", ablation.T_END), {}
+    table = rows.pick("ablation", ablation.T_END)
+    values: dict[str, Any] = {}
     for name, what in (("evaluations", "n_evaluations"), ("time", ablation.TIME)):
         found = ablation.ratios(table, ablation.STABILISED, what)
         if not found:
