@@ -68,7 +68,7 @@ def in_two_groups(times: Sequence[float]) -> bool:
 
 
 def cells(rows: pd.DataFrame, exchanged: bool = False) -> pd.DataFrame:
-    """Cells that both have: printed time, our least time and counts; exchanged: err_in and err_out of the IRK swapped."""
+    """Cells of both: printed time, our least time and counts; exchanged: err_in and err_out of the IRK swapped."""
     lines = []
     for group, (i, e_in), (j, e_out) in product(FAMILIES, enumerate(TOLERANCES), enumerate(TOLERANCES)):
         swapped = exchanged and group == "Table 3: IRK"
