@@ -189,6 +189,7 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
         "cases": [{"name": name, "t_end": float(where(rows, case=name)["t_end"].iloc[0])} for name in cases],
         "tableaux": tableaux,
         "against": against,
+        "margin": MARGIN,
         "n_compared": len(ratios(rows, PROJECTED, "n_evaluations")),
         "frozen": {"at_least": _span(frozen_ratios(rows)), "best": frozen.to_dict()},
         "orders": orders,

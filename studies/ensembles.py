@@ -219,6 +219,13 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
         found["repeats"] = int(medians["repeats"].max())
     every = [line["ratio"] for each in found["cases"] for line in each["at"] if line["ratio"] is not None]
     found["ratios"] = [min(every), max(every)] if every else None
+    found["rivals_ahead"] = [
+        {"case": each["case"], "error": line["error"], "ratio": line["ratio"], "way": _best_rival(line["run_s"])}
+        for each in found["cases"]
+        for line in each["at"]
+        if line["verdict"] == "behind"
+    ]
+    found["n_single"] = N_SINGLE
     found["verdicts"] = {
         verdict: sum(line["verdict"] == verdict for each in found["cases"] for line in each["at"])
         for verdict in ("ahead", "behind", "undecided", "alone", "missed", "none")
@@ -228,6 +235,10 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     found["refused"] = refused.to_dict("records")
     found["geometry"] = geometry[["n_runs", "wall", "cpu", "n_failed", "n_singly"]].to_dict("records")
     return found
+
+
+def _best_rival(run_s: dict[str, float]) -> str:
+    return min((name for name in run_s if name not in OWN), key=run_s.__getitem__)
 
 
 def figures_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Figure]:

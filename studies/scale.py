@@ -4,7 +4,6 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import cache, partial
-from itertools import pairwise
 from typing import Any
 
 import matplotlib.pyplot as plt
@@ -36,6 +35,7 @@ TOLERANCES = (1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8)
 EXUDYN = {f"Exudyn, {name}": name for name in ("GeneralizedAlpha", "TrapezoidalIndex2")}
 N_STEPS = (100, 300, 1000, 3000, 10_000)  # of Exudyn; the last once
 OTHERS = ("CVODE from C, Adams",)  # on the smallest chain: its expressions grow faster than the chain
+STAGES = 12  # evaluations of a step of DOP853
 LIMIT, TIGHT = 60.0, 1e-10  # s of CPU of a run; tolerance of the reference
 AGREE = 1e-7  # how far two unlike methods may end apart with it
 
@@ -105,7 +105,7 @@ def solvers(n: int) -> dict[str, tuple[float, ...]]:
     """What runs a chain of n bodies, and tolerances, or steps in s."""
     steps = tuple(CHAINS[n] / n_steps for n_steps in N_STEPS)
     ours = dict.fromkeys((DEFAULT, "DOP853 (twoloop)"), TOLERANCES)
-    others = dict.fromkeys(OTHERS, TOLERANCES[1::2]) if n == min(CHAINS) else {}
+    others = dict.fromkeys(OTHERS, TOLERANCES) if n == min(CHAINS) else {}
     return {**ours, **dict.fromkeys(EXUDYN, steps), **others}
 
 
@@ -182,7 +182,7 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
         by_size = own.groupby("n")
         times = {int(n): tuple(each["evaluation_us"].astype(float)) for n, each in by_size}
         us = {n: float(np.median(each)) for n, each in times.items()}
-        dear = [n for n, later in pairwise(us) if us[n] > us[later]]
+        dear = [n for n in us if any(us[n] > us[m] for m in us if m > n)]
         line = {"case": str(case), "us": us, "dear": dear}
         line["start_s"] = {int(n): float(each["start_s"].median()) for n, each in by_size}
         found["kinds"].append(line | {"slope": None if dear else slope(list(times), list(times.values()))})
@@ -198,6 +198,10 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
             "lines": tables.work_precision(medians, ERRORS),
         }
         of_chain["over_exudyn"] = [ratio for error in ERRORS if (ratio := over_exudyn(medians, error))]
+        of_chain |= {
+            "step": steps_of(medians),
+            "fastest": [each for error in ERRORS if (each := fastest(medians, error))],
+        }
         found["chains"].append(of_chain)
     return found
 
@@ -209,11 +213,35 @@ def over_exudyn(medians: pd.DataFrame, error: float) -> float | None:
     return min(cost for cost, _ in costs.values()) / ours if costs and ours == ours else None
 
 
+def steps_of(medians: pd.DataFrame) -> dict[str, Any] | None:
+    """Time of a step of Exudyn (s), of its finest run that ended, and of `DOP853`; None: one of them has no run."""
+    ended = medians[medians["error_q"].notna()]
+    theirs, ours = ended[ended["family"] == "Exudyn"], ended[ended["solver"] == f"{METHOD} (twoloop)"]
+    if theirs.empty or ours["n_evaluations"].isna().all():
+        return None
+    finest = theirs[theirs["h"] == theirs["h"].min()].sort_values("call_s").iloc[0]
+    exudyn = float(finest["call_s"] * finest["h"] / CHAINS[int(finest["n"])])
+    return {"exudyn": exudyn, "ours": STAGES * float((ours["call_s"] / ours["n_evaluations"]).min())}
+
+
+def fastest(medians: pd.DataFrame, error: float) -> dict[str, Any] | None:
+    """The rival with the cheapest run within an error, and the default's time over its; None: one has no such run."""
+    costs = {str(name): tables.as_good(own, error) for name, own in medians.groupby("solver", sort=False)}
+    rivals = [
+        name for name in medians[medians["family"] != "two-loop"]["solver"].unique() if costs[name] == costs[name]
+    ]
+    ours = costs.get(DEFAULT, np.nan)
+    if not rivals or not np.isfinite(ours):
+        return None
+    best = min(rivals, key=costs.__getitem__)
+    return {"error": error, "solver": best, "run_s": costs[best], "ours_s": ours}
+
+
 def figures_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Figure]:
     """An evaluation over the number of bodies, and what an accuracy costs on chains."""
     figure, axes = plt.subplots(figsize=(6.4, 4.4), layout="constrained")
-    for line, marker in zip(found["kinds"], "osD^vP", strict=False):
-        axes.plot(list(line["us"]), list(line["us"].values()), marker=marker, markersize=4, label=line["case"])
+    for line, color, marker in zip(found["kinds"], figures.COLORS, "osD^vP", strict=False):
+        axes.plot(list(line["us"]), list(line["us"].values()), marker=marker, color=color, label=line["case"])
     axes.set(xscale="log", yscale="log", xlabel="bodies", ylabel="time of an evaluation, projections included (µs)")
     axes.legend(fontsize=8)
     axes.grid(alpha=0.3)

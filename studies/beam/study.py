@@ -153,7 +153,7 @@ def tables_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, str]:
 def _cell(runs: pd.DataFrame, cell: str) -> str:
     """A cell of the table; of a solver of which no run is so good, its least error."""
     least = runs["error_tip"].dropna().min()
-    return f"least error {number(float(least))}" if cell == "not asked" and least == least else cell
+    return f"least error {number(float(least))}" if cell == tables.UNASKED and least == least else cell
 
 
 def figures_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Figure]:

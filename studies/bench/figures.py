@@ -1,7 +1,7 @@
 """One style for all figures: a colour and a marker for each solver, and the work-precision figure."""
 
 import zlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
 from io import BytesIO
 from itertools import product
@@ -55,68 +55,50 @@ mpl.rcParams.update(
 # Okabe and Ito's colours, told apart by colour-blind readers; a marker besides, and dashes for other families
 BLACK, ORANGE, SKY, GREEN = "#000000", "#E69F00", "#56B4E9", "#009E73"
 YELLOW, BLUE, RED, PINK, GREY, BROWN = "#B39B00", "#0072B2", "#D55E00", "#CC79A7", "#7F7F7F", "#7A4A12"
-VIOLET, MAGENTA = "#6A3D9A", "#D4006A"  # two more, of the default, and of Taylor and others
+VIOLET, MAGENTA = "#6A3D9A", "#D4006A"  # more, as ours and others' share none
+OLIVE, CRIMSON, LIME, TAN, ROSE, LAVENDER = "#556B2F", "#8B0000", "#8CC63E", "#C49C6B", "#FF9D9A", "#A99BD8"
 
-# solver: colour, marker; those that a work-precision figure mostly draws together have markers of their own
-STYLES: dict[str, tuple[str, str]] = {
-    "DOP853 (twoloop)": (RED, "o"),
-    "Adams": (BLACK, "d"),
-    "auto": (VIOLET, "s"),
-    "Taylor": (MAGENTA, "D"),
-    "auto, compiled": (VIOLET, "P"),
-    "Taylor, compiled": (MAGENTA, "X"),
-    "Adams, compiled": (BLACK, "^"),
-    "DOP853, compiled": (RED, "v"),
-    "TRBDF2": (SKY, "v"),
-    "ESDIRK4": (GREY, "v"),
-    "Gauss12": (BLUE, "D"),
-    "Gauss6": (BROWN, "D"),
-    "SunRadau5": (PINK, "v"),
-    "RadauIIA5": (ORANGE, "^"),
-    "RadauIIA9": (BROWN, "o"),
-    "RadauIIA13": (MAGENTA, "^"),
-    "RadauIIA5, by differences": (GREY, "^"),
-    "Gauss6, Newton": (BROWN, "X"),
-    "BDF": (GREEN, "P"),
-    "Newmark": (GREY, "h"),
-    "PaperIRK": (YELLOW, "H"),
-    "PaperIRK, Atol = Rtol varied": (YELLOW, "H"),
-    "PaperNewmark (beta = 1/2)": (GREY, "X"),
-    "PaperNewmark, beta = 1/4": (BLACK, "X"),
-    "Gauss6, momenta, symmetric": (BLACK, "D"),
-    "Gauss16": (BLUE, "h"),
-    "heyoka": (GREEN, "*"),
-    "CVODE from C, Adams": (SKY, ">"),
-    "CVODE from C, BDF": (ORANGE, "v"),
-    "CVODE from C, BDF, projected": (PINK, "^"),
-    "CVODE, Adams": (ORANGE, "<"),
-    "Dopri8, diffrax": (PINK, "8"),
-    "Pr9, index 1": (ORANGE, "p"),
-    "IDAS, CasADi": (RED, "d"),
-    "CVODES, CasADi": (BLUE, "d"),
-    "CVODES, CasADi, Adams": (GREEN, "d"),
-    "collocation, CasADi": (GREY, "d"),
-    "IDA from C, stabilised": (BLACK, "<"),
-    "IDA from C, q and v tested": (BLACK, "v"),
-    "IDA from C, order 2, positions tested": (BLUE, "X"),
-    "IDA, stabilised": (GREY, "<"),
-    "IDA, index1": (BROWN, "v"),
-    "LSODA, index 1": (BROWN, "p"),
-    "DOP853, index 1": (PINK, "p"),
-    "DOP853, projected": (ORANGE, "P"),
-    "DOP853, Baumgarte 10": (GREEN, "s"),
-    "GSTIFF stand-in, order 1": (VIOLET, "1"),
-    "GSTIFF stand-in, order 2": (MAGENTA, "2"),
-    "GSTIFF stand-in, order 3": (GREEN, "3"),
-    "GSTIFF stand-in, order 4": (ORANGE, "4"),
-    "GSTIFF stand-in, order 5": (BLUE, "+"),
-    "GSTIFF stand-in, order 6": (BROWN, "x"),
-    "Radau, index 1": (PINK, "d"),
-    "BDF, index 1": (YELLOW, "d"),
-    "Exudyn, GeneralizedAlpha": (RED, "8"),
-    "Exudyn, GeneralizedAlpha 0.6": (ORANGE, "8"),
-    "Exudyn, GeneralizedAlpha 1": (BLACK, "8"),
-    "Exudyn, TrapezoidalIndex2": (BLUE, "^"),
+# a colour is of one family of solvers alone; in it each has a marker, and those that a work-precision figure mostly
+# draws together have markers of their own
+OURS: dict[str, dict[str, str]] = {
+    RED: {"DOP853 (twoloop)": "o", "DOP853, compiled": "v"},
+    BLACK: {"Adams": "d", "Adams, compiled": "^"},
+    VIOLET: {"auto": "s", "auto, compiled": "P"},
+    MAGENTA: {"Taylor": "D", "Taylor, compiled": "X"},
+    BLUE: {"Gauss12": "D", "Gauss6": "d", "Gauss6, Newton": "X", "Gauss6, momenta, symmetric": "o", "Gauss16": "h"},
+    PINK: {"SunRadau5": "v"},
+    BROWN: {"RadauIIA5": "^", "RadauIIA9": "o", "RadauIIA13": "s", "RadauIIA5, by differences": "<"},
+    OLIVE: {"TRBDF2": "v", "ESDIRK4": "^"},
+    CRIMSON: {"BDF": "P"},
+    GREY: {"Newmark": "h", "PaperNewmark (beta = 1/2)": "X", "PaperNewmark, beta = 1/4": "s"},
+    YELLOW: {"PaperIRK": "H", "PaperIRK, Atol = Rtol varied": "H"},
+}
+THEIRS: dict[str, dict[str, str]] = {
+    GREEN: {"heyoka": "*", "GSTIFF stand-in, order 3": "3"},
+    SKY: {
+        "CVODE from C, Adams": ">",
+        "CVODE from C, BDF": "v",
+        "CVODE from C, BDF, projected": "^",
+        "CVODE, Adams": "h",
+    }
+    | {"GSTIFF stand-in, order 1": "1"},
+    ORANGE: {
+        "IDA from C, stabilised": "<",
+        "IDA from C, q and v tested": "v",
+        "IDA, index1": "h",
+        "IDA, stabilised": "s",
+    }
+    | {"IDA from C, order 2, positions tested": "X", "GSTIFF stand-in, order 2": "2"},
+    LIME: {"LSODA, index 1": "p", "DOP853, index 1": "8", "DOP853, projected": "X", "DOP853, Baumgarte 10": "^"}
+    | {"Radau, index 1": "d", "BDF, index 1": "D", "GSTIFF stand-in, order 4": "4"},
+    TAN: {"Exudyn, GeneralizedAlpha": "D", "Exudyn, TrapezoidalIndex2": "^", "GSTIFF stand-in, order 5": "+"}
+    | {"Exudyn, GeneralizedAlpha 0.6": "h", "Exudyn, GeneralizedAlpha 1": "d"},
+    LAVENDER: {"IDAS, CasADi": "d", "CVODES, CasADi": "D", "CVODES, CasADi, Adams": ">", "collocation, CasADi": "v"}
+    | {"GSTIFF stand-in, order 6": "x"},
+    ROSE: {"Dopri8, diffrax": "8", "Pr9, index 1": "p"},
+}
+STYLES = {  # solver: colour, marker
+    name: (color, marker) for color, own in (OURS | THEIRS).items() for name, marker in own.items()
 }
 SAME = {  # the default looks like the method that it is, a tableau like the preset that is made of it
     GIVEN: DEFAULT,
@@ -126,19 +108,23 @@ SAME = {  # the default looks like the method that it is, a tableau like the pre
     "Radau IIA(3)": "RadauIIA5",
     "Newmark, β = 1/2": "PaperNewmark (beta = 1/2)",
 }
-COLORS = (RED, GREEN, BLUE, ORANGE, PINK, SKY, GREY, BROWN, VIOLET, MAGENTA, BLACK, YELLOW)
+COLORS = (*OURS,)
 MARKERS = "o^sDvP>d<pX*Hh8"  # those that can be open
 
 
 @cache
 def looks() -> dict[str, tuple[str, str]]:
     """Colour and marker of all solvers that are known: of those without an entry above, the next that are free."""
-    free = [pair for pair in _pairs() if pair not in STYLES.values()]
-    return STYLES | dict(zip((name for name in CATALOGUE if name not in STYLES | SAME), free, strict=False))
+    found = dict(STYLES)
+    for colors, ours in ((OURS, True), (THEIRS, False)):
+        unlisted = (name for name in CATALOGUE if name not in STYLES | SAME)
+        names = (name for name in unlisted if (CATALOGUE[name].family == "two-loop") == ours)
+        found |= dict(zip(names, _free(colors, STYLES), strict=False))
+    return found
 
 
-def _pairs() -> list[tuple[str, str]]:
-    return [(color, marker) for marker, color in product(MARKERS, COLORS)]
+def _free(colors: Iterable[str], known: Mapping[str, tuple[str, str]]) -> list[tuple[str, str]]:
+    return [(color, marker) for marker, color in product(MARKERS, colors) if (color, marker) not in known.values()]
 
 
 def _look_of(solver: str) -> tuple[str, str]:
@@ -146,7 +132,7 @@ def _look_of(solver: str) -> tuple[str, str]:
     known = looks()
     if (name := SAME.get(solver, solver)) in known:
         return known[name]
-    free = [pair for pair in _pairs() if pair not in known.values()]
+    free = _free(THEIRS, known)
     return free[zlib.crc32(name.encode()) % len(free)]
 
 
@@ -289,6 +275,7 @@ def work_precision(rows: pd.DataFrame, solvers: Sequence[str], title: str, error
             right.plot(errors, runs["n_evaluations"].astype(float), **one)
     for axes, what in ((left, "CPU time of the call (s)"), (right, "evaluations")):
         axes.set(xscale="log", yscale="log", xlabel=error, ylabel=what)
-    legend(figure, [left], f"{LEGEND}\nleft out: motion lost\n[P]: called from Python")
+    from_python = any(label.endswith(" [P]") for label in left.get_legend_handles_labels()[1])
+    legend(figure, [left], f"{LEGEND}\nleft out: motion lost" + from_python * "\n[P]: called from Python")
     figure.suptitle(title, fontsize=10)
     return figure

@@ -33,6 +33,7 @@ RANKED = (
     *("violation_q", "violation_v", "energy"),
 )
 NEARLY = 1.25  # runs whose error is above one by a smaller factor nearly get there
+UNASKED = "not run at such an error"
 SPREAD = 0.05  # of the median: times whose quartiles are closer are shown without them
 
 
@@ -231,7 +232,7 @@ def why_not(rows: pd.DataFrame, target: float) -> str:
     stopped = bool((stopped_by_us(rows) & finer).any()) and bool((reached["error_q"] > target).all())
     if not stopped and not missed(rows, target):
         better = as_good(rows, target)
-        return "not asked" if np.isnan(better) else f"≤ {number(better)}"
+        return UNASKED if np.isnan(better) else f"≤ {number(better)}"
     return f"least error {number(float(reached['error_q'].min()))}" + (", then our limit" if stopped else "")
 
 

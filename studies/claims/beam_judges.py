@@ -50,10 +50,13 @@ def jacobian_difficult(rows: Rows) -> Judgement:
 
 def stiff_applicable(rows: Rows) -> Judgement:
     limit = rows.pick("beam", named="latest stages", group="limit").iloc[0]
-    steps = [float(_paper_on(rows, case)["h_median"]) for case in BEAMS]
+    runs = [_paper_on(rows, case) for case in BEAMS]
+    steps, reached = [float(run["h_median"]) for run in runs], sum(map(_follows, runs))
     h_omega = [steps[0] * limit["w_max"], steps[1] * limit["w_max"] * STIFFER]
     limited = max(h_omega) < limit["theory"] and max(h_omega) < FACTOR * min(h_omega)  # h goes as 1 / w_max
-    return decide([not limited], h_omega=span(h_omega), limit=float(limit["theory"]))
+    values = {"reached": reached, "limited": limited, "limit": float(limit["theory"])}
+    all_reached = reached == len(BEAMS)
+    return decide([all_reached and not limited], all_reached, h_omega=span(h_omega), **values)
 
 
 def limit_reset_34(rows: Rows) -> Judgement:
@@ -86,8 +89,11 @@ def step_order(rows: Rows, case: str, order: float) -> Judgement:
 
 def beams_work(rows: Rows) -> Judgement:
     runs = [_paper_on(rows, case) for case in BEAMS]
-    good = (run["status"] == "REACHED_END" and run["error_q"] < FOLLOWS for run in runs)
-    return decide(good, soft=_at_most(runs[0]), stiff=_at_most(runs[1]))
+    return decide(map(_follows, runs), soft=_at_most(runs[0]), stiff=_at_most(runs[1]))
+
+
+def _follows(run: pd.Series) -> bool:
+    return bool(run["status"] == "REACHED_END" and run["error_q"] < FOLLOWS)
 
 
 def _at_most(run: pd.Series) -> float:

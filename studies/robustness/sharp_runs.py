@@ -26,6 +26,7 @@ TOLERANCES = (1e-4, 1e-6, 1e-8, 1e-10, 1e-12)
 LARGE = 1e-2  # m or rad: an error that a user would not expect at the loosest tolerance, though it counts as right
 SEED, N_MECHANISMS = 25, 144  # every other one with friction: about 3,000 runs
 TIME_LIMIT = 10.0  # s
+THOUSAND = 1e3  # tolerances, whatever the sensitivity of the motion
 SHARP = "sharp"  # group of these rows
 
 Part = tuple[str, Callable[[], list[Row]]]
@@ -86,7 +87,8 @@ def counts(rows: pd.DataFrame) -> dict[str, Any]:
     loose = rows[(rows["tol"] == max(TOLERANCES)) & (rows["outcome"] == RIGHT)]
     n_loose = int((loose["error"].astype(float) > LARGE).sum())
     found["loose"] = {"tolerance": max(TOLERANCES), "error": LARGE, "n": n_loose}
-    found["families"] = {str(family): len(own) for family, own in silent.groupby("what")}
+    groups = silent.groupby(["method", "what"], sort=False)
+    found["silent"] = [{"method": str(name), "what": str(what), "n": len(own)} for (name, what), own in groups]
     by_tolerance = rows.groupby("tol")["allowed"].agg(["median", "max"]).sort_index(ascending=False)
     found["allowed"] = [
         {"tol": float(tol), "median": float(line["median"]), "most": float(line["max"])}
@@ -98,7 +100,16 @@ def counts(rows: pd.DataFrame) -> dict[str, Any]:
         "n": int(((rows["method"] == DEFAULT) & ~refused).sum()),
         "wrong": misled[["what", "name", "tol", "error"]].to_dict("records"),
     }
+    found["within_thousand"] = within_thousand(rows[(rows["method"] == DEFAULT) & ~refused])
     return found | {"jumps": JUMPS}
+
+
+def within_thousand(runs: pd.DataFrame) -> dict[str, Any]:
+    """How many runs end within 1000 tolerances, whatever the sensitivity; how many report failure, or do neither."""
+    failed = runs["outcome"] == SAID
+    near = ~failed & (runs["error"].astype(float) <= THOUSAND * runs["tol"].astype(float))
+    counted = {"within": int(near.sum()), "failed": int(failed.sum()), "beyond": int((~failed & ~near).sum())}
+    return {"tolerances": THOUSAND, "n": len(runs)} | counted
 
 
 def main(quick: bool) -> None:

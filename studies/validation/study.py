@@ -324,7 +324,8 @@ def figures_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Figure]:
     axes.axvline(n_own - 0.5, color="white", linewidth=3.0)
     axes.set_title(
         f"Correct decimals of q at the end, rtol = atol = {power(TIGHT)}; left: ours, right: others\n"
-        f"grey: stopped by the solver; hatched: no failure, L: stopped by us after {number(TIME_LIMIT)} s, –: not run",
+        f"grey: stopped by the solver; hatched: no failure, L: stopped by us after {number(TIME_LIMIT)} s, –: not run\n"
+        "rank: the constraints lose rank, step: no step is small enough, failed: stopped otherwise",
         fontsize=9,
     )
     figure.colorbar(image, ax=axes, label="decimals")

@@ -19,6 +19,7 @@ from studies.bench.cases.beam import MAKE, SOFT, STIFF
 from studies.bench.cli import StudyError
 from studies.bench.collector import Run, attempt
 from studies.bench.solvers import IDA_C, IDA_C_ORDER_2, NEWMARK, OWN_EXPLICIT, PAPER_TOL, QUARTER, RIVALS
+from studies.bench.tables import UNASKED
 from tests.studies.of_study import GOOD, QuickRun, found_of
 from twoloop import solve_dae
 from twoloop.methods.tableaux import gauss, sun_radau_iib
@@ -77,8 +78,8 @@ def test_the_advice_turns_with_the_rows(tmp_path):
 
 def test_of_a_solver_with_runs_it_is_not_said_that_it_was_not_asked():
     runs = pd.DataFrame({"error_tip": [1e-5, 1e-6, np.nan]})
-    assert study._cell(runs, "not asked") == "least error 1e-6"
-    assert study._cell(runs, "≤ 1.1") == "≤ 1.1" and study._cell(runs[2:], "not asked") == "not asked"
+    assert study._cell(runs, UNASKED) == "least error 1e-6"
+    assert study._cell(runs, "≤ 1.1") == "≤ 1.1" and study._cell(runs[2:], UNASKED) == UNASKED
 
 
 @pytest.mark.usefixtures("unsaved")

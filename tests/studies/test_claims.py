@@ -43,8 +43,8 @@ def tables(whole):
 
 
 EXPECTED = {
-    **dict.fromkeys(("more_efficient", "because_of_order", "baumgarte_inexact", "projection_exact"), PART),
-    **dict.fromkeys(("tolerances_and_steps", "values_alone", "general", "every_stage"), PART),
+    **dict.fromkeys(("more_efficient", "because_of_order", "energy_bounds_y3", "projection_exact"), PART),
+    **dict.fromkeys(("tolerances_and_steps", "values_alone", "general"), PART),
     **dict.fromkeys(("implicit_needed", "symplectic_stable", "euler_predictor", "partition_kept"), PART),
     **dict.fromkeys(("gstiff_short", "gstiff_long", "parting"), CONSISTENT),
     **dict.fromkeys(("fourteen_times", "table_3_seconds", "soft_step", "beam_seconds"), ASSUMED),
@@ -53,7 +53,9 @@ EXPECTED = {
     "low_index_fails": PART,
     **dict.fromkeys(("newmark_tolerances", "newmark_star"), CIRCULAR),
     **dict.fromkeys(("index_1_drifts", "constraints_kept", "agree_and_reach", "large_steps", "works_long"), HOLDS),
-    **dict.fromkeys(("beams_work", "dependents_in_the_loop", "newmark_symplectic"), HOLDS),
+    **dict.fromkeys(("beams_work", "dependents_in_the_loop", "newmark_symplectic", "baumgarte_inexact"), HOLDS),
+    "extra_multipliers": HOLDS,
+    "stiff_applicable": PART,
     **dict.fromkeys(("grows_a_lot", "any_method", "nonholonomic"), HOLDS),
 }
 
@@ -68,7 +70,8 @@ FLIPS = [  # claim, study, rows, changes, verdict then
     ("low_index_fails", "motion", "group == 'GSTIFF stand-in'", {"astray": False}, FAILS),
     ("index_1_drifts", "table3", "solver.str.startswith('DOP')", {"violation_late": 1e-15}, PART),
     ("index_1_drifts", "table3", "solver == solver", {"violation_late": 1e-15}, FAILS),
-    ("baumgarte_inexact", "violation", "group == 'tolerances'", {"violation_q": 1e-5}, HOLDS),
+    ("baumgarte_inexact", "violation", "group == 'tolerances' and tol == 1e-8", {"violation_q": 1e-14}, PART),
+    ("baumgarte_inexact", "violation", "group == 'tolerances'", {"violation_q": 1e-14}, FAILS),
     ("projection_exact", "table3", "solver == 'IDA, stabilised'", {"violation_q": 0.0}, HOLDS),
     ("projection_exact", "table3", "solver == 'IDA, stabilised' and tol > 1e-13", {"astray": True}, NOT_RUN),
     ("projection_inefficient", "table3", "solver.str.contains('sta|pro')", {"call_s": 9, "n_evaluations": 1e9}, HOLDS),
@@ -77,6 +80,7 @@ FLIPS = [  # claim, study, rows, changes, verdict then
     ("constraints_kept", "violation", "solver == 'PaperIRK'", {"growth_q": 1.0, "late_q": 1e-13}, FAILS),
     ("constraints_kept", "violation", "solver == 'PaperIRK'", {"violation_a": 1e-9}, FAILS),
     ("stiff_applicable", "beam", "case == 'moderately stiff'", {"h_median": 1e-2}, HOLDS),
+    ("stiff_applicable", "beam", "case == 'moderately stiff'", {"error_q": 0.1}, FAILS),
     ("symplectic_stable", "energy", "solver == solver", {"slope": 0.0}, HOLDS),
     ("symplectic_stable", "energy", "solver == 'PaperIRK'", {"slope": -1.0}, FAILS),
     ("symplectic_stable", "energy", "solver == 'PaperIRK'", {"lost": True}, FAILS),
@@ -108,8 +112,8 @@ FLIPS = [  # claim, study, rows, changes, verdict then
     ("grows_a_lot", "beam", "solver == 'PaperIRK'", {"call_s": 1.0}, FAILS),
     ("beam_seconds", "beam", "case == 'moderately stiff'", {"call_s": 111.6}, CONSISTENT),
     ("beams_work", "beam", "case == 'very flexible'", {"error_q": np.nan}, NOT_RUN),
-    ("every_stage", "ablation", "solver == 'projected once a step'", {"n_evaluations": 1e6, "call_s": 9.0}, HOLDS),
-    ("every_stage", "ablation", "solver == 'stabilised index 2'", {"call_s": 0.01}, FAILS),
+    ("extra_multipliers", "ablation", "solver == 'stabilised index 2' and tol == 1e-2", {"n_evaluations": 99.0}, PART),
+    ("extra_multipliers", "ablation", "solver == 'stabilised index 2'", {"call_s": 0.01}, FAILS),
     ("dependents_in_the_loop", "ablation", "solver == 'dependents frozen'", {"n_evaluations": 1.0}, PART),
     ("dependents_in_the_loop", "ablation", "solver != 'dependents frozen'", {"error_q": 1.0}, NOT_RUN),
 ]  # fmt: skip
@@ -120,6 +124,7 @@ OTHER_NUMBERS = [
     ("partition_kept", "partitions mostly kept", 18.0, HOLDS),
     ("partition_kept", "partitions mostly kept", 3.0, FAILS),
     ("energy_bounds_y3", "linkages passing", 0.0, HOLDS),
+    ("energy_bounds_y3", "highest y3, assumed", 0.01, FAILS),
     ("any_method", "methods of their order", 9.0, PART),
     ("values_alone", "calls differenced", 4.0, HOLDS),
     ("values_alone", "difference", 1e-3, FAILS),
@@ -159,6 +164,7 @@ def test_one_factor_of_the_machine_would_be_seen(tables):
         for (i, e_in), (j, e_out) in itertools.product(enumerate(TOLERANCES), repeat=2):
             place = (table["group"] == group) & (table["err_in"] == e_in) & (table["err_out"] == e_out)
             table.loc[place, "call_s"] = (paper[i][j] or 1.0) / 10.0
+    table = tables["table3"] = table.drop(columns="times")
     assert verdict("table_3_seconds", tables) is CONSISTENT
 
 

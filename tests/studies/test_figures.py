@@ -40,6 +40,15 @@ NEW = (  # of rivals that no table of styles knows, as a study may bring them
 )
 FAMILY = {"heyoka": "heyoka", "CVODE from C, Adams": "SUNDIALS", "CVODE, Adams": "SUNDIALS", "LSODA, index 1": "SciPy"}
 FAMILY |= {"IDA from C, stabilised": "SUNDIALS", "DOP853, index 1": "SciPy", "Dopri8, diffrax": "diffrax"}
+FAMILIES = {  # of rivals that one figure shows, with what it mostly shows of them
+    "heyoka": (HEYOKA,),
+    "CVO": (CVODE_C, "CVODE, Adams", "CVODE from C, BDF"),
+    "IDA": (IDA_C, IDA_C_STATES, IDA_C_ORDER_2, "IDA, stabilised", "IDA, index1"),
+    "SciPy": ("LSODA, index 1", "DOP853, index 1", "DOP853, projected", "Radau, index 1"),
+    "Exudyn": ("Exudyn, GeneralizedAlpha", "Exudyn, TrapezoidalIndex2"),
+    "CasADi": ("IDAS, CasADi", "CVODES, CasADi", "collocation, CasADi"),
+    "diffrax": ("Dopri8, diffrax",),
+}
 ERRORS = (1e-2, 1e-3, 1e-4)
 OFTEN = (*FIRST[:2], HEYOKA, CVODE_C)  # of the lines of a work-precision figure
 
@@ -82,6 +91,17 @@ def test_no_two_solvers_look_alike():
     names.pop(GIVEN)  # in its runs the default is auto
     alike = [pairs for pairs in itertools.combinations(names, 2) if pair(pairs[0]) == pair(pairs[1])]
     assert alike == [] and pair(IRK) == pair(IRK_LINE) and pair(GIVEN) == pair(DEFAULT)
+
+
+def test_no_colour_is_of_ours_and_of_others_nor_of_two_families_drawn_together():
+    ours, theirs = (
+        {pair(name)[0] for name, solver in CATALOGUE.items() if (solver.family == "two-loop") == own}
+        for own in (True, False)
+    )
+    assert not ours & theirs and not figures.OURS.keys() & figures.THEIRS.keys()
+    listed = {family: {pair(name)[0] for name in names} for family, names in FAMILIES.items()}
+    assert all(len(each) == 1 for each in listed.values())
+    assert len(set.union(*listed.values())) == len(listed)
 
 
 @pytest.mark.parametrize(
@@ -242,4 +262,4 @@ def test_the_cells_of_table_3_are_drawn_as_ratios():
     assert told[0] == ["10"] * 5 + ["1.0", "★"] + ["10"] * 9
     assert told[1] == ["★", "10", "10", "10"] * 4
     assert first.get_xlabel() == "err_out" and first.get_ylabel() == "err_in"
-    assert scale.get_ylabel() == "paper's time / ours"
+    assert scale.get_ylabel() == "paper's time / our least"

@@ -11,6 +11,7 @@ from references.paper.four_bar_minimal import MinimalFourBar
 from studies.bench.apart import apart
 from studies.bench.random_linkages import GRASHOF, KINDS, NEAR, draw, end_of, end_of_scaled, four_lengths, scaled
 from studies.robustness import study as robustness
+from studies.robustness.sharp_runs import within_thousand
 from tests.studies.of_study import said
 from twoloop.mechanisms import four_bar
 
@@ -120,25 +121,30 @@ def rows_of(outcome, last=1e-16):
 
 def test_sentences_turn_with_the_rows():
     _, good = said(robustness, rows_of("right"))
-    assert "No run of the linkages, of any size and mass" in good
-    assert "With all methods none of 1 runs is silently wrong, of 1 random mechanisms under sharp forces (half" in good
-    assert "- None of 1 random mechanisms under sharp forces, each run at one tolerance from 1e-4 to 1e-4, mis" in good
-    assert (
-        "misleads the default; errors are allowed there in proportion to the sensitivity of the motion, and no" in good
-    )
+    assert "None on the linkages, at any size or mass, is silently wrong." in good
+    assert "With all methods together none of 1 runs is silently wrong. Half of these mechanisms have drags" in good
+    text = "The default ends within 1000 tolerances on 1 of 1 random mechanisms under sharp forces (0 report failure)"
+    assert text + ", each run at one tolerance from 1e-4 to 1e-4; no other project's solver was run." in good
     assert "so errors of up to 1e-5 m or rad are allowed." in good
     assert "| error allowed, largest | 0.50 |" in good and "| BDF | 1e-6 … 1e3 | 1e-6 … 1e3 | 1e-6 … 1e3 |" in good
     assert "1 runs that count as right there are off by more than 1e-2." in good
     assert "All methods are right from 1e-6 to 1e3 m" in good
     assert "The violation does not grow" in good
     _, bad = said(robustness, rows_of(robustness.SILENT, last=1e-12))
-    assert "Of linkages, sizes and masses: 2 runs" in bad
-    assert "With all methods 1 of 1 runs are silently wrong, of 1 random mechanisms under sharp forces" in bad
-    assert "(half of them drags and frictions): drag in 1 run." in bad
-    assert "- 1 of 1 random mechanisms under sharp" in bad
-    assert " 1e-4, misleads the default (drag: off by 0.020 at 1e-4);" in bad
+    assert "On the linkages, of all sizes and masses, 2 runs are silently wrong:" in bad
+    assert "With all methods together 1 of 1 runs is silently wrong (`auto`, drag)." in bad
+    assert " 1 is silently wrong, at worst with drag: off by 0.020 at 1e-4." in bad
     more = pd.concat([rows_of(robustness.SILENT), rows_of(robustness.SILENT).tail(1).assign(error=0.3, value=1.0)])
     _, text = said(robustness, more.reset_index(drop=True))
-    assert "- 2 of 2 random" in text and " mislead the default (at worst drag: off by 0.30 at 1e-4);" in text
+    assert "on 1 of 2 random mechanisms under sharp forces (0 report failure, 1 ends farther off without" in text
+    assert (
+        " 2 are silently wrong, at worst with drag: off by 0.30 at 1e-4." in text and "(`auto`, drag in 2 runs)" in text
+    )
     assert "All methods are right from" in bad and "from 1e0 to 1e3 m" in bad
     assert "The violation grows in runs of 10 steps and more with BDF" in bad
+
+
+def test_the_thousand_tolerances_do_not_grow_with_the_sensitivity():
+    made = pd.DataFrame([[1e-6, 9e-4, "right"], [1e-6, 2e-3, "right"], [1e-8, np.nan, robustness.SAID]])
+    found = within_thousand(made.set_axis(["tol", "error", "outcome"], axis=1))
+    assert found == {"tolerances": 1000.0, "n": 3, "within": 1, "failed": 1, "beyond": 1}

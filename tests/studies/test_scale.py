@@ -34,7 +34,7 @@ def chains(ours=0.1, exudyn=5.0):
                 made.append({"solver": name, "family": family, setting: error, "error_q": error, "repeat": k})
                 made[-1]["call_s"] = cost * (1.0 + 0.001 * k)
     about = {"group": scale.CHAIN, "case": "open chain of 20", "n": 20, "status": "REACHED_END", "floor": 1e-9}
-    return pd.DataFrame(made).assign(called_from="compiled", keeps_constraints=True, **about)
+    return pd.DataFrame(made).assign(called_from="compiled", keeps_constraints=True, n_evaluations=1000.0, **about)
 
 
 def said(rows):
@@ -45,11 +45,39 @@ def said(rows):
 def test_slopes_and_ratios_follow_the_rows():
     found, text = said(pd.concat([evaluations(), chains()], ignore_index=True))
     assert found["kinds"][0]["slope"] == pytest.approx([1.0] * 3)
+    assert found["chains"][0]["fastest"][0] == pytest.approx(
+        {"error": 1e-3, "solver": EXUDYN, "run_s": 5.005, "ours_s": 0.1001}, abs=1e-9
+    )
+    assert f"The fastest rival is `{EXUDYN}`: 5.0 s for 1e-3 (the default 0.10 s, faster), 5.0 s for 1e-4" in text
     assert "of their number on the open chain." in text and "with the power 1.0 (1.0 to 1.0)" in text
     assert "at equal error Exudyn takes 50 times as long as the default" in text
     found, text = said(pd.concat([evaluations(2.0), chains(ours=1.0, exudyn=0.5)], ignore_index=True))
     assert found["kinds"][0]["slope"][0] == pytest.approx(2.0)
-    assert "at equal error Exudyn takes 0.50 times as long" in text
+    assert "at equal error Exudyn takes 0.50 times as long" in text and "(the default 1.0 s, slower)" in text
+
+
+def test_a_chain_is_said_to_be_dearer_than_any_larger_one():
+    made = evaluations()
+    made.loc[made["n"] == 30, "evaluation_us"], made.loc[made["n"] == 100, "evaluation_us"] = 200.0, 500.0
+    made.loc[made["n"] == 1000, "evaluation_us"] = 100.0
+    found, text = said(pd.concat([made, chains()], ignore_index=True))
+    assert found["kinds"][0]["dear"] == [30, 100] and "with 30 and 100 bodies than with a larger number" in text
+    assert found["kinds"][0]["slope"] is None and "sparse form" not in text
+
+
+def test_the_order_is_named_where_steps_cost_about_the_same():
+    made = chains()
+    ours = made[made["solver"] == scale.DEFAULT].assign(solver="DOP853 (twoloop)")
+    found, text = said(pd.concat([evaluations(), made, ours], ignore_index=True))
+    # 5 s of steps of 1e-6 s over 1 s; 12 evaluations of 0.1 s / 1000
+    assert found["chains"][0]["step"] == pytest.approx({"exudyn": 5.005e-6, "ours": 1.2e-3}, rel=1e-2)
+    assert "a step of its takes 5e-6 s" in text and "most of this is the order" in text
+    cheap = pd.concat([evaluations(), made, ours.assign(call_s=1e-5)], ignore_index=True)
+    assert "most of this is the order" not in said(cheap)[1]
+
+
+def test_cvode_is_asked_for_all_that_the_default_is_asked_for():
+    assert scale.solvers(20)[scale.OTHERS[0]] == scale.solvers(20)[scale.DEFAULT]
 
 
 def test_a_failed_size_is_named_and_in_no_fit():

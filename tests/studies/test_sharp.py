@@ -95,7 +95,11 @@ def test_counts_of_runs():
     about |= {"tol": 1e-4, "error": 0.02, "allowed": 0.01}
     found = sharp_runs.counts(pd.DataFrame([about | {"outcome": each} for each in (RIGHT, SILENT, SAID, RIGHT)]))
     assert (found["n"], found[RIGHT], found[SAID], found[SILENT], found["n_mechanisms"]) == (4, 2, 1, 1, 1)
-    assert found["families"] == {"drag": 1} and found["loose"] == {"tolerance": 1e-4, "error": 1e-2, "n": 2}
+    assert found["silent"] == [{"method": "auto", "what": "drag", "n": 1}] and found["loose"] == {
+        "tolerance": 1e-4,
+        "error": 1e-2,
+        "n": 2,
+    }
     assert found["allowed"] == [{"tol": 1e-4, "median": 0.01, "most": 0.01}]
     assert found["default"]["n"] == 4 and [line["error"] for line in found["default"]["wrong"]] == [0.02]
 

@@ -76,7 +76,7 @@ def test_a_ranking_turns_with_the_rows():
 
 def test_a_cell_that_is_not_reached_says_why():
     made = rows(("a", 1e-4, 1.0)).assign(tol=1e-5)
-    assert tables.work_precision(made, [1e-3, 1e-5]) == [["a", "compiled", "1.0", "not asked"]]
+    assert tables.work_precision(made, [1e-3, 1e-5]) == [["a", "compiled", "1.0", "not run at such an error"]]
     tightest = made.assign(tol=tables.TIGHTEST)
     assert tables.work_precision(tightest, [1e-5])[0][2] == "least error 1e-4" and tables.missed(tightest, 1e-5)
     limited = pd.concat([made, rows(("a", np.nan, 60.0)).assign(status="TIME_LIMIT", tol=1e-7)])
