@@ -1,8 +1,8 @@
 """What the models of all engines are read off: poses and twists of bodies in space, joints of a tree, cuts of loops.
 
-Every engine is given the same: each body's mass and inertia about its centre of mass, a tree of joints whose coordinates
-are zero at the start, and the joints that close loops. A planar mechanism is put into the plane z = 0; its hinges that
-close loops become ball joints there, for the hinges of the tree keep it in the plane.
+Every engine is given the same: each body's mass and inertia about its centre of mass, a tree of joints whose
+coordinates are zero at the start, and the joints that close loops. A planar mechanism is put into the plane z = 0; its
+hinges that close loops become ball joints there, for the hinges of the tree keep it in the plane.
 """
 
 import time
@@ -58,7 +58,7 @@ class Motion:
 
 @dataclass(frozen=True)
 class Prepared:
-    """A model in an engine: its total mass (kg), and run(t_end, n_steps, n_stored) -> Motion, from the start each time."""
+    """A model in an engine: its total mass, kg, and run(t_end, n_steps, n_stored) -> Motion, which begins anew."""
 
     mass: float
     run: Callable[[float, int, int], Motion]
@@ -95,6 +95,7 @@ class Rigid:
 
     Attributes
     ----------
+    given : ModelProblem
     model : SpatialModel
     planar : bool
         Whether it was made of a planar one.
@@ -106,6 +107,7 @@ class Rigid:
         Constant ones, N m.
     """
 
+    given: ModelProblem
     model: SpatialModel
     planar: bool
     x: Array
@@ -198,8 +200,8 @@ def rigid_of(problem: ModelProblem) -> Rigid:
     wrong += [f.name for f in given.forces if f.kind not in (SPRING, TORQUE) or f.function is not None]
     if wrong:
         raise ValueError(f"engines are given bodies, joints, springs and constant torques alone; not {wrong[0]!r}")
-    x, R, v, w = (each[0] for each in states(problem, problem.q0[:, None], problem.v0[:, None]))
     planar = given.dimension == 2
+    x, R, v, w = (each[0] for each in states(planar, problem.q0[:, None], problem.v0[:, None]))
     model = _in_space(given, x, R, v, w) if planar else given
     if max(np.abs(np.array([body.position for body in model.bodies]) - x).max(), 0.0) > 1e-9:
         raise ValueError(f"the bodies of {problem.name!r} are not given where they start; give them closed")
@@ -207,7 +209,7 @@ def rigid_of(problem: ModelProblem) -> Rigid:
     for force in given.forces:
         if force.kind == TORQUE:
             torques[force.second.number] += [0.0, 0.0, *force.more.values] if planar else force.more.values
-    return Rigid(model, planar, x, R, v, w, *spanning_tree(model), torques)
+    return Rigid(problem, model, planar, x, R, v, w, *spanning_tree(model), torques)
 
 
 def _in_space(given: Any, x: Array, R: Array, v: Array, w: Array) -> SpatialModel:
@@ -235,9 +237,9 @@ def _in_space(given: Any, x: Array, R: Array, v: Array, w: Array) -> SpatialMode
     return model
 
 
-def states(problem: ModelProblem, q: Array, v: Array) -> tuple[Array, Array, Array, Array]:
+def states(planar: bool, q: Array, v: Array) -> tuple[Array, Array, Array, Array]:
     """x, R, v, w of `Motion` from the coordinates (n_q, n_t) of a model in a plane or in space."""
-    planar, n_t = problem.model.dimension == 2, q.shape[1]  # type: ignore[union-attr]
+    n_t = q.shape[1]
     shaped, rates = (each.T.reshape(n_t, -1, 3 if planar else 7) for each in (q, v))
     n = shaped.shape[1]
     x, speed, R, w = (np.zeros((n_t, n, 3)), np.zeros((n_t, n, 3)), np.zeros((n_t, n, 3, 3)), np.zeros((n_t, n, 3)))
