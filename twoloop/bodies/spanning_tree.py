@@ -26,7 +26,8 @@ def spanning_tree(model: Any) -> tuple[dict[int, tuple[Body, ModelJoint]], list[
     linked = {each.number: {each.number} for each in (model.ground, *model.bodies)}
     edges: list[ModelJoint] = []
     loops: list[ModelJoint] = []
-    for joint in sorted(joints, key=lambda each: TREE.index(each.kind)):
+    # those to the ground before others of their kind: a loop is then cut between bodies that move, in shorter branches
+    for joint in sorted(joints, key=lambda each: (TREE.index(each.kind), model.ground not in (each.a, each.b))):
         one, other = linked[joint.a.number], linked[joint.b.number]
         if one is other:
             loops.append(joint)

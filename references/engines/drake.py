@@ -1,0 +1,152 @@
+"""Drake: a discrete plant with the SAP solver, loops closed by ball constraints between bodies."""
+
+import time
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from references.driver import imported
+from references.engines.rigid import (
+    BALL,
+    HINGE,
+    SLIDE,
+    Motion,
+    Prepared,
+    Rigid,
+    Seen,
+    cut_points,
+    freedoms,
+    march,
+    point_of,
+    springs,
+)
+
+
+class Settings(NamedTuple):
+    """The approximation of a discrete plant; "continuous": a plant without steps of its own."""
+
+    approximation: str = "kSap"
+
+
+def prepare(rigid: Rigid, settings: Settings = Settings()) -> Prepared:  # noqa: B008
+    """The mechanism in Drake; a step is a plant's own, so the call makes the plant.
+
+    Raises
+    ------
+    RuntimeError
+        If Drake is not installed.
+    ValueError
+        If it has no counterpart of a joint.
+    """
+    imported("pydrake", "drake", extra="engines")
+    from pydrake.systems.analysis import Simulator
+
+    def run(t_end: float, n_steps: int, n_stored: int) -> Motion:
+        began = time.process_time()
+        h = t_end / n_steps
+        plant, bodies = _plant(rigid, settings, h)
+        simulator = Simulator(plant)
+        context = simulator.get_mutable_context()
+        _start(rigid, plant, context, bodies)
+        simulator.Initialize()
+        done = 0
+
+        def step(n: int) -> str:
+            nonlocal done
+            done += n
+            try:
+                simulator.AdvanceTo(done * h)
+            except RuntimeError as error:
+                return str(error).strip().splitlines()[0]
+            return ""
+
+        def see() -> Seen:
+            poses = [plant.EvalBodyPoseInWorld(context, body) for body in bodies]
+            twists = [plant.EvalBodySpatialVelocityInWorld(context, body) for body in bodies]
+            x, R = (
+                np.array([each.translation() for each in poses]),
+                np.array([each.rotation().matrix() for each in poses]),
+            )
+            v, w = (np.array([getattr(each, part)() for each in twists]) for part in ("translational", "rotational"))
+            return done * h, x, R, v, w
+
+        return march(began, n_steps, n_stored, see, step)
+
+    _, bodies = _plant(rigid, settings, 1e-3)
+    return Prepared(float(sum(body.default_mass() for body in bodies)), run)
+
+
+def _plant(rigid: Rigid, settings: Settings, h: float) -> tuple[Any, list[Any]]:
+    from pydrake.math import RigidTransform, RotationMatrix
+    from pydrake.multibody.plant import DiscreteContactApproximation, MultibodyPlant
+    from pydrake.multibody.tree import (
+        FixedOffsetFrame,
+        LinearSpringDamper,
+        RotationalInertia,
+        SpatialInertia,
+        UnitInertia,
+    )
+
+    plant = MultibodyPlant(0.0 if settings.approximation == "continuous" else h)
+    if settings.approximation != "continuous":
+        plant.set_discrete_contact_approximation(getattr(DiscreteContactApproximation, settings.approximation))
+    plant.mutable_gravity_field().set_gravity_vector(rigid.model.gravity)
+    made = {rigid.model.ground.number: plant.world_body()}
+    for body in rigid.model.bodies:
+        mass, *moments = body.inertia.tolist()
+        unit = UnitInertia().SetFromRotationalInertia(RotationalInertia(*moments), mass)
+        made[body.number] = plant.AddRigidBody(body.name, SpatialInertia(mass, np.zeros(3), unit))
+    for body in rigid.model.bodies:
+        parent, joint = rigid.parents[body.number]
+        point, found = point_of(body, joint), freedoms(body, joint)
+        turned = np.eye(3)
+        if len(found) == 2:  # the axes of a universal joint
+            turned = np.column_stack([found[0][1], found[1][1], np.cross(found[0][1], found[1][1])])
+        frames = []
+        for end, R, at in (
+            (parent, parent.rotation.T @ body.rotation @ turned, parent.local_point(body.in_space(point))),
+            (body, turned, point),
+        ):
+            pose = RigidTransform(RotationMatrix.ProjectToRotationMatrix(R), at)
+            name = f"{joint.name} on {end.name}"
+            frames.append(plant.AddFrame(FixedOffsetFrame(name, made[end.number].body_frame(), pose)))
+        plant.AddJoint(_joint(joint.name, found, frames))
+    for a, on_a, b, on_b in cut_points(rigid):
+        plant.AddBallConstraint(made[a.number], on_a, made[b.number], on_b)
+    for a, on_a, b, on_b, (stiffness, damping, length) in springs(rigid.model):
+        ends = made[a.number], on_a, made[b.number], on_b
+        plant.AddForceElement(LinearSpringDamper(*ends, length, stiffness, damping))
+    plant.Finalize()
+    return plant, [made[body.number] for body in rigid.model.bodies]
+
+
+def _joint(name: str, found: list[tuple[str, Any]], frames: list[Any]) -> Any:
+    from pydrake.multibody.tree import BallRpyJoint, PrismaticJoint, RevoluteJoint, UniversalJoint
+
+    kinds = tuple(kind for kind, _ in found)
+    if kinds == (BALL,):
+        return BallRpyJoint(name, *frames)
+    if kinds == (HINGE, HINGE):
+        return UniversalJoint(name, *frames)
+    if kinds in ((HINGE,), (SLIDE,)):
+        return (RevoluteJoint if kinds == (HINGE,) else PrismaticJoint)(name, *frames, found[0][1])
+    raise ValueError(f"Drake is given hinges, slides, balls and universal joints; {name!r} is of {' and '.join(kinds)}")
+
+
+def _start(rigid: Rigid, plant: Any, context: Any, bodies: list[Any]) -> None:
+    from pydrake.multibody.math import SpatialForce
+    from pydrake.multibody.plant import ExternallyAppliedSpatialForce
+
+    v = plant.GetVelocities(context).copy()
+    for body in rigid.model.bodies:
+        joint, rates = plant.GetJointByName(rigid.parents[body.number][1].name), rigid.rates(body)
+        v[joint.velocity_start() : joint.velocity_start() + len(rates)] = rates
+    plant.SetVelocities(context, v)
+    forces = []
+    for k in np.flatnonzero(rigid.torques.any(axis=1)):
+        force = ExternallyAppliedSpatialForce()
+        force.body_index, force.p_BoBq_B = bodies[k].index(), np.zeros(3)
+        force.F_Bq_W = SpatialForce(tau=rigid.torques[k], f=np.zeros(3))
+        forces.append(force)
+    if forces:
+        plant.get_applied_spatial_force_input_port().FixValue(context, forces)
