@@ -52,8 +52,8 @@ def prepare(rigid: Rigid, settings: Settings = Settings()) -> Prepared:  # noqa:
 
         def step(n: int) -> str:
             mujoco.mj_step(model, data, nstep=n)
-            lost = [k for k, each in enumerate(data.warning) if each.number]
-            return f"MuJoCo warns of {mujoco.mjtWarning(lost[0]).name}" if lost else ""
+            numbers = data.warning.number
+            return f"MuJoCo warns of {mujoco.mjtWarning(int(numbers.argmax())).name}" if numbers.any() else ""
 
         def see() -> Seen:
             mujoco.mj_kinematics(model, data)
