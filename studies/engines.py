@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, partial
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
@@ -30,7 +30,7 @@ FLAT = 1.5  # factor by which errors of two steps differ at most where they no l
 MODULES = {"mujoco": mujoco, "drake": drake, "pinocchio": pinocchio, "exudyn_bodies": exudyn_bodies}
 NAMES = {"mujoco": "MuJoCo", "drake": "Drake", "pinocchio": "Pinocchio", "exudyn_bodies": "Exudyn", OURS: "twoloop"}
 PACKAGES = {"mujoco": "mujoco", "drake": "drake", "pinocchio": "pin", "exudyn_bodies": "exudyn"}
-RIGID = {"solref": "1e-9 1", "solimp": "0.9999 0.9999 0.001"}
+RIGID = mujoco.Settings("RK4", "1e-9 1", "0.9999 0.9999 0.001")
 SHOWN = ("four-bar", "Watt's six-bar", "Andrews' squeezer", "RSSR", "Bricard", "Stewart platform")  # in the figure
 
 
@@ -62,7 +62,7 @@ CONFIGURATIONS = (
     Configuration(
         "mujoco",
         "RK4, solref 2h",
-        mujoco.Settings("RK4", **RIGID),
+        RIGID,
         '`integrator="RK4"`; on connects `solref="1e-9 1" solimp="0.9999 0.9999 0.001"`',
     ),
     Configuration("drake", "SAP", drake.Settings(), "`kSap`"),
@@ -86,7 +86,7 @@ CONFIGURATIONS = (
     Configuration(OURS, "default"),
 )
 BEST: dict[str, Any] = {  # of the gates: the most rigid of an engine
-    "mujoco": mujoco.Settings("RK4", **RIGID),
+    "mujoco": RIGID,
     "drake": drake.Settings(),
     "pinocchio": pinocchio.Settings("RK4", 1e-8),
     "exudyn_bodies": exudyn_bodies.Settings(),
@@ -182,7 +182,7 @@ def _ours(loop: Loop, tolerance: float) -> tuple[Callable[[], Motion], Callable[
     def run() -> Motion:
         made = loop.ours(tolerance, times=loop.times)
         motion = loop.motion(made.q, made.v)
-        return motion if made.success else _with(motion, made.message)
+        return motion if made.success else replace(motion, message=made.message)
 
     def again(k: int) -> Motion:
         began = time.process_time()
@@ -191,10 +191,6 @@ def _ours(loop: Loop, tolerance: float) -> tuple[Callable[[], Motion], Callable[
         return loop.motion(made.q[:, :1], made.v[:, :1], call, made.stats.cpu_time)
 
     return run, again
-
-
-def _with(motion: Motion, message: str) -> Motion:
-    return Motion(*(getattr(motion, name) for name in ("t", "x", "R", "v", "w", "call_s", "stepping_s")), message)
 
 
 def order_and_floor(h: Any, error: Any, least: float) -> tuple[float | None, float | None]:
@@ -222,7 +218,6 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
         "errors": list(ERRORS),
         "lost": LOST,
         "limit": LIMIT,
-        "gate_step": GATE_STEP,
     }
     found["absent"] = sorted(set(gates[gates["status"] == "NOT_AVAILABLE"]["family"]))
     found["versions"] = {NAMES[engine]: _version(package) for engine, package in PACKAGES.items()}
@@ -294,23 +289,24 @@ def _engine(name: str, runs: pd.DataFrame, cases: list[str]) -> dict[str, Any]:
     """At each error the configuration of an engine that gets there most often, then at the least sum of logarithms."""
     lines: list[dict[str, Any] | None] = []
     for error in ERRORS:
-        ranked = []
+        ranked: list[tuple[int, float, str, list[float], list[float]]] = []
         for solver, own in runs.groupby("solver", sort=False):
             by_case = {case: each for case, each in own.groupby("case")}
             costs = {case: cost for case in cases if case in by_case and (cost := _priced(by_case[case], error))}
             if costs:
-                steps = [_step_for(by_case[case], error) for case in costs]
-                stepping = [_priced(by_case[case], error, "stepping_s") for case in costs]
+                found = (_step_for(by_case[case], error) for case in costs)
+                steps = [step for step in found if step is not None]
+                stepping = [_priced(by_case[case], error, "stepping_s") or np.nan for case in costs]
                 middle = float(np.median(list(costs.values())))
                 ranked.append((-len(costs), middle, str(solver), steps, stepping))
         best = min(ranked, key=lambda each: each[:2], default=None)
         if best is None:
             lines.append(None)
             continue
-        steps = [each for each in best[3] if each is not None]
+        steps = best[3]
         line = {"solver": best[2], "reached": -best[0], "call_s": best[1]}
         line |= {"steps": [min(steps), max(steps)] if steps else None}
-        lines.append(line | {"stepping_s": float(np.median([each for each in best[4] if each is not None]))})
+        lines.append(line | {"stepping_s": float(np.nanmedian(best[4]))})
     return {"name": name, "at": lines}
 
 

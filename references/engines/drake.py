@@ -38,14 +38,13 @@ def prepare(rigid: Rigid, settings: Settings = Settings()) -> Prepared:  # noqa:
     ValueError
         If it has no counterpart of a joint.
     """
-    imported("pydrake", "drake", extra="engines")
-    from pydrake.systems.analysis import Simulator
+    simulation = _module("systems.analysis")
 
     def run(t_end: float, n_steps: int, n_stored: int) -> Motion:
         began = time.process_time()
         h = t_end / n_steps
         plant, bodies = _plant(rigid, settings, h)
-        simulator = Simulator(plant)
+        simulator = simulation.Simulator(plant)
         context = simulator.get_mutable_context()
         _start(rigid, plant, context, bodies)
         simulator.Initialize()
@@ -76,26 +75,23 @@ def prepare(rigid: Rigid, settings: Settings = Settings()) -> Prepared:  # noqa:
     return Prepared(float(sum(body.default_mass() for body in bodies)), run)
 
 
-def _plant(rigid: Rigid, settings: Settings, h: float) -> tuple[Any, list[Any]]:
-    from pydrake.math import RigidTransform, RotationMatrix
-    from pydrake.multibody.plant import DiscreteContactApproximation, MultibodyPlant
-    from pydrake.multibody.tree import (
-        FixedOffsetFrame,
-        LinearSpringDamper,
-        RotationalInertia,
-        SpatialInertia,
-        UnitInertia,
-    )
+def _module(name: str) -> Any:
+    return imported(f"pydrake.{name}", "drake", extra="engines")
 
-    plant = MultibodyPlant(0.0 if settings.approximation == "continuous" else h)
+
+def _plant(rigid: Rigid, settings: Settings, h: float) -> tuple[Any, list[Any]]:
+    mathematics, multibody, tree = (_module(name) for name in ("math", "multibody.plant", "multibody.tree"))
+    plant = multibody.MultibodyPlant(0.0 if settings.approximation == "continuous" else h)
     if settings.approximation != "continuous":
-        plant.set_discrete_contact_approximation(getattr(DiscreteContactApproximation, settings.approximation))
+        plant.set_discrete_contact_approximation(
+            getattr(multibody.DiscreteContactApproximation, settings.approximation)
+        )
     plant.mutable_gravity_field().set_gravity_vector(rigid.model.gravity)
     made = {rigid.model.ground.number: plant.world_body()}
     for body in rigid.model.bodies:
         mass, *moments = body.inertia.tolist()
-        unit = UnitInertia().SetFromRotationalInertia(RotationalInertia(*moments), mass)
-        made[body.number] = plant.AddRigidBody(body.name, SpatialInertia(mass, np.zeros(3), unit))
+        unit = tree.UnitInertia().SetFromRotationalInertia(tree.RotationalInertia(*moments), mass)
+        made[body.number] = plant.AddRigidBody(body.name, tree.SpatialInertia(mass, np.zeros(3), unit))
     for body in rigid.model.bodies:
         parent, joint = rigid.parents[body.number]
         point, found = point_of(body, joint), freedoms(body, joint)
@@ -107,36 +103,32 @@ def _plant(rigid: Rigid, settings: Settings, h: float) -> tuple[Any, list[Any]]:
             (parent, parent.rotation.T @ body.rotation @ turned, parent.local_point(body.in_space(point))),
             (body, turned, point),
         ):
-            pose = RigidTransform(RotationMatrix.ProjectToRotationMatrix(R), at)
+            pose = mathematics.RigidTransform(mathematics.RotationMatrix.ProjectToRotationMatrix(R), at)
             name = f"{joint.name} on {end.name}"
-            frames.append(plant.AddFrame(FixedOffsetFrame(name, made[end.number].body_frame(), pose)))
+            frames.append(plant.AddFrame(tree.FixedOffsetFrame(name, made[end.number].body_frame(), pose)))
         plant.AddJoint(_joint(joint.name, found, frames))
     for a, on_a, b, on_b in cut_points(rigid):
         plant.AddBallConstraint(made[a.number], on_a, made[b.number], on_b)
     for a, on_a, b, on_b, (stiffness, damping, length) in springs(rigid.model):
         ends = made[a.number], on_a, made[b.number], on_b
-        plant.AddForceElement(LinearSpringDamper(*ends, length, stiffness, damping))
+        plant.AddForceElement(tree.LinearSpringDamper(*ends, length, stiffness, damping))
     plant.Finalize()
     return plant, [made[body.number] for body in rigid.model.bodies]
 
 
 def _joint(name: str, found: list[tuple[str, Any]], frames: list[Any]) -> Any:
-    from pydrake.multibody.tree import BallRpyJoint, PrismaticJoint, RevoluteJoint, UniversalJoint
-
+    tree = _module("multibody.tree")
     kinds = tuple(kind for kind, _ in found)
     if kinds == (BALL,):
-        return BallRpyJoint(name, *frames)
+        return tree.BallRpyJoint(name, *frames)
     if kinds == (HINGE, HINGE):
-        return UniversalJoint(name, *frames)
+        return tree.UniversalJoint(name, *frames)
     if kinds in ((HINGE,), (SLIDE,)):
-        return (RevoluteJoint if kinds == (HINGE,) else PrismaticJoint)(name, *frames, found[0][1])
+        return (tree.RevoluteJoint if kinds == (HINGE,) else tree.PrismaticJoint)(name, *frames, found[0][1])
     raise ValueError(f"Drake is given hinges, slides, balls and universal joints; {name!r} is of {' and '.join(kinds)}")
 
 
 def _start(rigid: Rigid, plant: Any, context: Any, bodies: list[Any]) -> None:
-    from pydrake.multibody.math import SpatialForce
-    from pydrake.multibody.plant import ExternallyAppliedSpatialForce
-
     v = plant.GetVelocities(context).copy()
     for body in rigid.model.bodies:
         joint, rates = plant.GetJointByName(rigid.parents[body.number][1].name), rigid.rates(body)
@@ -144,9 +136,9 @@ def _start(rigid: Rigid, plant: Any, context: Any, bodies: list[Any]) -> None:
     plant.SetVelocities(context, v)
     forces = []
     for k in np.flatnonzero(rigid.torques.any(axis=1)):
-        force = ExternallyAppliedSpatialForce()
+        force = _module("multibody.plant").ExternallyAppliedSpatialForce()
         force.body_index, force.p_BoBq_B = bodies[k].index(), np.zeros(3)
-        force.F_Bq_W = SpatialForce(tau=rigid.torques[k], f=np.zeros(3))
+        force.F_Bq_W = _module("multibody.math").SpatialForce(tau=rigid.torques[k], f=np.zeros(3))
         forces.append(force)
     if forces:
         plant.get_applied_spatial_force_input_port().FixValue(context, forces)

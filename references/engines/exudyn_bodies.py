@@ -35,9 +35,8 @@ def prepare(rigid: Rigid, settings: Settings = Settings()) -> Prepared:  # noqa:
     planar = rigid.planar and all(joint.kind != "prismatic" for joint in rigid.model.joints)
     problem = rigid.given if planar else rigid.model.problem((0.0, 1.0))
     dependent = bool(rigid.given.freedom.redundant)
-    start = coordinates(
-        Motion(np.zeros(1), *(each[None] for each in (rigid.x, rigid.R, rigid.v, rigid.w)), 0.0, 0.0), planar
-    )
+    x, R, v, w = (each[None] for each in (rigid.x, rigid.R, rigid.v, rigid.w))
+    start = coordinates(Motion(np.zeros(1), x, R, v, w, 0.0, 0.0), planar)
 
     def build() -> Any:
         return _model(rigid, planar, *(each[:, 0].reshape(len(rigid.x), -1) for each in start))

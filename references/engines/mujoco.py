@@ -34,6 +34,7 @@ def prepare(rigid: Rigid, settings: Settings = Settings()) -> Prepared:  # noqa:
         If MJCF has no counterpart of a joint.
     """
     mujoco = imported("mujoco", extra="engines")
+    mujoco.set_mju_user_warning(lambda text: None)  # which it would put into a file in the folder of the caller
     model = mujoco.MjModel.from_xml_string(file_of(rigid, settings))
     bodies = [model.body(body.name).id for body in rigid.model.bodies]
 

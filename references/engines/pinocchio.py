@@ -174,7 +174,7 @@ def _force(
 
         zero = np.zeros(3)
         for k in turning:
-            pull(k, zero, zero, rigid.torques[k])
+            pull(int(k), zero, zero, rigid.torques[k])
         for a, on_a, b, on_b, (stiffness, damping, length) in known:
             if damping:
                 raise ValueError("a spring between points is given to Pinocchio without damping")

@@ -85,8 +85,8 @@ def march(began: float, n_steps: int, n_stored: int, see: Callable[[], Seen], st
             message = f"at {state[0]:.3g} s or before: {message}"
             break
         stored.append(state)
-    columns = (np.array(each) for each in zip(*stored, strict=True))
-    return Motion(*columns, time.process_time() - began, spent, message)
+    t, x, R, v, w = (np.array(each) for each in zip(*stored, strict=True))
+    return Motion(t, x, R, v, w, time.process_time() - began, spent, message)
 
 
 @dataclass(frozen=True)
@@ -232,8 +232,7 @@ def _in_space(given: Any, x: Array, R: Array, v: Array, w: Array) -> SpatialMode
             model.revolute(a, b, at=at, axis=Z, name=name)
     for one, at, other, there, (stiffness, damping, length) in springs(given):
         ends = [np.append(body.in_space(place), 0.0) for body, place in ((one, at), (other, there))]
-        values = {"stiffness": stiffness, "damping": damping, "length": length}
-        model.spring(one.name, ends[0], other.name, ends[1], **values)
+        model.spring(one.name, ends[0], other.name, ends[1], stiffness=stiffness, damping=damping, length=length)
     return model
 
 

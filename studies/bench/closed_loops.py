@@ -105,7 +105,7 @@ def parallelogram() -> ModelProblem:
 def parallelogram_motion(times: Array) -> tuple[Array, Array, float]:
     """Coordinates and velocities (9, n_t) of the parallelogram that does not fold, and how far two routes differ.
 
-    Its bars turn alike, with the moment of inertia 2/3 + 2 kg m^2 against the weight of 3 kg at the end of a bar of 1 m.
+    Its bars turn alike, with a moment of inertia of 2/3 + 2 kg m^2 and the weight of 3 kg at the end of a bar of 1 m.
     """
 
     def rates(t: float, y: Array) -> list[float]:

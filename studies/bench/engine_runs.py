@@ -19,7 +19,8 @@ from twoloop.bodies.model_problem import ModelProblem
 INSTANTS = 50  # beside the start, at which motions are compared
 TIGHT = 1e-12  # tolerance of both routes to a reference
 LIMIT = 1.0  # s of CPU that the next finer run may be expected to take
-GATE_STEP, GATE_STEPS = 1e-5, 200  # of the time span, in which the gates look at accelerations; SAP takes some steps to hold
+GATE_STEP = 1e-5  # of the time span, over which the gates look at accelerations ...
+GATE_STEPS = 200  # ... in so many steps: Drake's loops take some to hold
 SAME_POSE, SAME_MASS, SAME_ACCELERATION, SAME_PLACE = 1e-9, 1e-12, 1e-2, 1e-6
 TIMED, ENOUGH = 3, 0.3  # calls of which the shortest counts, and s of CPU after which no further one is made
 
