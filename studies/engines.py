@@ -1,7 +1,7 @@
 """Engines and closed loops: what MuJoCo, Drake, Pinocchio and Exudyn are off by, and what an accuracy costs there."""
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from importlib.metadata import PackageNotFoundError, version
@@ -227,11 +227,15 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     found["configurations"] = [_configuration(each, runs[runs["solver"] == each.name]) for each in CONFIGURATIONS]
     found["cheapest"] = [_cheapest(case, runs[runs["case"] == case]) for case in cases]
     found["engines"] = [_engine(name, runs[runs["family"] == name], cases) for name in NAMES.values()]
-    first = ERRORS[0]
-    winners = [line["at"][0]["solver"].split(", ")[0] for line in found["cheapest"] if line["at"][0]]
-    found["wins"] = {name: winners.count(name) for name in NAMES.values() if name in winners}
-    found["first_error"] = first
+    for key in ("at", "engines"):  # with ours and without
+        found[f"wins_{key}"] = [_counted(line[key][k] for line in found["cheapest"]) for k in range(len(ERRORS))]
     return found
+
+
+def _counted(cheapest: Iterable[dict[str, Any] | None]) -> dict[str, int]:
+    """On how many mechanisms each engine is the cheapest."""
+    names = [line["solver"].split(", ")[0] for line in cheapest if line]
+    return {name: names.count(name) for name in sorted(set(names), key=lambda each: (-names.count(each), each))}
 
 
 def _version(package: str) -> str:
@@ -274,15 +278,16 @@ def _priced(runs: pd.DataFrame, error: float, what: str = "call_s") -> float | N
 
 
 def _cheapest(case: str, runs: pd.DataFrame) -> dict[str, Any]:
-    """At each error the cheapest configuration on a mechanism, and ours."""
-    at: list[dict[str, Any] | None] = []
-    ours: list[float | None] = []
+    """At each error the cheapest configuration on a mechanism, the cheapest of an engine, and what ours takes."""
+    line: dict[str, Any] = {"case": case, "at": [], "engines": [], "ours": []}
+    own = f"{NAMES[OURS]}, default"
     for error in ERRORS:
-        costs = {str(solver): cost for solver, own in runs.groupby("solver") if (cost := _priced(own, error))}
-        best = min(costs, key=costs.__getitem__) if costs else None
-        at.append({"solver": best, "call_s": costs[best]} if best else None)
-        ours.append(costs.get(f"{NAMES[OURS]}, default"))
-    return {"case": case, "at": at, "ours": ours}
+        costs = {str(solver): cost for solver, rows in runs.groupby("solver") if (cost := _priced(rows, error))}
+        for key, priced in (("at", costs), ("engines", {name: cost for name, cost in costs.items() if name != own})):
+            best = min(priced, key=priced.__getitem__) if priced else None
+            line[key].append({"solver": best, "call_s": priced[best]} if best else None)
+        line["ours"].append(costs.get(own))
+    return line
 
 
 def _engine(name: str, runs: pd.DataFrame, cases: list[str]) -> dict[str, Any]:

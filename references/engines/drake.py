@@ -34,7 +34,7 @@ def prepare(rigid: Rigid, settings: Settings = Settings()) -> Prepared:  # noqa:
     Raises
     ------
     RuntimeError
-        If Drake is not installed.
+        If Drake is not installed, or refuses to take a step.
     ValueError
         If it has no counterpart of a joint.
     """
@@ -72,6 +72,8 @@ def prepare(rigid: Rigid, settings: Settings = Settings()) -> Prepared:  # noqa:
         return march(began, n_steps, n_stored, see, step)
 
     _, bodies = _plant(rigid, settings, 1e-3)
+    if refused := run(1e-6, 1, 1).message:
+        raise RuntimeError(refused.split(": ", 1)[1])
     return Prepared(float(sum(body.default_mass() for body in bodies)), run)
 
 
