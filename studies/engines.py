@@ -201,7 +201,7 @@ def order_and_floor(h: Any, error: Any, least: float) -> tuple[float | None, flo
     order = np.argsort(-np.asarray(h, dtype=float))
     h, error = np.asarray(h, dtype=float)[order], np.asarray(error, dtype=float)[order]
     floor = None
-    if error.size >= 3 and FLAT * error[-1] > error[-2] and error[-1] > 10.0 * least:
+    if error.size >= 3 and FLAT * error[-1] > error[-3:].max() and 1.0 > error[-1] > 10.0 * least:
         floor = float(error[-1])
     kept = (error < LOST) & (error > max(4.0 * (floor or 0.0), 10.0 * least))
     pairs = kept[:-1] & kept[1:]
@@ -247,23 +247,25 @@ def _version(package: str) -> str:
 
 def _configuration(each: Configuration, runs: pd.DataFrame) -> dict[str, Any]:
     ended = runs[runs["error_q"].notna()]
-    orders, floors = [], []
+    orders, floors, lost = [], [], 0
     for _, own in ended.groupby("case", sort=False):
+        lost += bool((own["error_q"].astype(float) > LOST).all())
         if own["h"].notna().all():
             order, floor = order_and_floor(own["h"], own["error_q"], float(own["floor"].max()))
             orders += [order] if order is not None else []
             floors += [floor] if floor is not None else []
-    failed = runs[runs["status"].isin(("FAILED", "NOT_APPLICABLE", "NOT_AVAILABLE", "GATE_FAILED"))]
+    refused = runs.loc[runs["status"] == "NOT_APPLICABLE", "message"]
     return {
         "name": each.name,
         "how": each.how,
         "runs": len(ended),
         "silent": int((ended["error_q"].astype(float) > LOST).sum()),
         "failed": int((runs["status"] == "FAILED").sum()),
-        "refused": sorted(set(failed[failed["status"] != "FAILED"]["message"])),
+        "refused": sorted({message.split(". ")[1] for message in refused}),
         "order": [min(orders), float(np.median(orders)), max(orders)] if orders else None,
         "floor": [min(floors), max(floors)] if floors else None,
         "n_floors": len(floors),
+        "lost": lost,
         "gap": float(ended["gap"].astype(float).median()) if len(ended) else None,
     }
 
@@ -312,7 +314,7 @@ def _engine(name: str, runs: pd.DataFrame, cases: list[str]) -> dict[str, Any]:
         line = {"solver": best[2], "reached": -best[0], "call_s": best[1]}
         line |= {"steps": [min(steps), max(steps)] if steps else None}
         lines.append(line | {"stepping_s": float(np.nanmedian(best[4]))})
-    return {"name": name, "at": lines}
+    return {"name": name, "runs": int(runs["error_q"].notna().sum()), "at": lines}
 
 
 def _step_for(runs: pd.DataFrame, error: float) -> float | None:
