@@ -74,7 +74,9 @@ def prepare(rigid: Rigid, settings: Settings = Settings()) -> Prepared:  # noqa:
     _, bodies = _plant(rigid, settings, 1e-3)
     if refused := run(1e-6, 1, 1).message:
         raise RuntimeError(refused.split(": ", 1)[1])
-    return Prepared(float(sum(body.default_mass() for body in bodies)), run)
+    own = [body.default_spatial_inertia() for body in bodies]
+    moments = [float(each.CalcRotationalInertia().CalcPrincipalMomentsOfInertia().max()) for each in own]
+    return Prepared(np.array([each.get_mass() for each in own]), np.array(moments), run)
 
 
 def _module(name: str) -> Any:

@@ -6,7 +6,17 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from references.driver import imported
-from references.engines.rigid import Motion, Prepared, Rigid, axis_of, coordinates, point_of, springs, states
+from references.engines.rigid import (
+    Motion,
+    Prepared,
+    Rigid,
+    axis_of,
+    coordinates,
+    largest_moment,
+    point_of,
+    springs,
+    states,
+)
 
 PLANAR_CUT = [1, 1, 0, 0, 0, 0]
 
@@ -53,7 +63,9 @@ def prepare(rigid: Rigid, settings: Settings = Settings()) -> Prepared:  # noqa:
         return Motion(made.t, *parts, call, made.stats.cpu_time, "" if made.success else made.message)
 
     made = build()
-    return Prepared(float(sum(made.mbs.GetObjectParameter(body, "physicsMass") for body in made.bodies)), run)
+    masses, inertias = ([made.mbs.GetObject(body)[name] for body in made.bodies] for name in ("mass", "inertia"))
+    moments = [J if planar else largest_moment(np.array([0.0, *np.array(J)[[0, 1, 2, 5, 4, 3]]])) for J in inertias]
+    return Prepared(np.array(masses), np.array(moments), run)
 
 
 def _model(rigid: Rigid, planar: bool, q: Any, v: Any) -> Any:

@@ -68,7 +68,7 @@ def prepare(rigid: Rigid, settings: Settings = Settings()) -> Prepared:  # noqa:
 
         return march(began, n_steps, n_stored, see, step)
 
-    return Prepared(float(model.body_mass.sum()), run)
+    return Prepared(model.body_mass[bodies], model.body_inertia[bodies].max(axis=1), run)
 
 
 def file_of(rigid: Rigid, settings: Settings) -> str:

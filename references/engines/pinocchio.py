@@ -20,6 +20,7 @@ from references.engines.rigid import (
     march,
     point_of,
     springs,
+    tensor,
 )
 from twoloop.bodies.parts import Body
 
@@ -110,7 +111,9 @@ def prepare(rigid: Rigid, settings: Settings = Settings()) -> Prepared:  # noqa:
 
         return march(began, n_steps, n_stored, see, step)
 
-    return Prepared(float(sum(each.mass for each in model.inertias)), run)
+    own = [model.inertias[frames[k][0]] for k in range(len(rigid.x))]
+    moments = [float(np.linalg.eigvalsh(each.inertia)[-1]) for each in own]
+    return Prepared(np.array([each.mass for each in own]), np.array(moments), run)
 
 
 def _tree(pin: Any, rigid: Rigid) -> tuple[Any, dict[int, tuple[int, Any]]]:
@@ -132,10 +135,8 @@ def _tree(pin: Any, rigid: Rigid) -> tuple[Any, dict[int, tuple[int, Any]]]:
             kinds = {BALL: pin.JointModelSpherical, SLIDE: pin.JointModelPrismaticUnaligned}
             made = kinds[kind]() if kind == BALL else kinds.get(kind, pin.JointModelRevoluteUnaligned)(axis)
             number = model.addJoint(number, made, place if k == 0 else pin.SE3.Identity(), f"{joint.name} {k + 1}")
-        mass, xx, yy, zz, xy, xz, yz = body.inertia.tolist()
-        J = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
         origin = pin.SE3(np.eye(3), -point)
-        model.appendBodyToJoint(number, pin.Inertia(mass, np.zeros(3), J), origin)
+        model.appendBodyToJoint(number, pin.Inertia(float(body.inertia[0]), np.zeros(3), tensor(body.inertia)), origin)
         frames[body.number] = number, origin
     return model, frames
 

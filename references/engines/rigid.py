@@ -58,9 +58,18 @@ class Motion:
 
 @dataclass(frozen=True)
 class Prepared:
-    """A model in an engine: its total mass, kg, and run(t_end, n_steps, n_stored) -> Motion, which begins anew."""
+    """A model in an engine.
 
-    mass: float
+    Attributes
+    ----------
+    masses, moments : ndarray (n_bodies,)
+        As the engine has them: kg, and the largest principal moment of inertia, kg m^2.
+    run : callable
+        run(t_end, n_steps, n_stored) -> Motion, which begins anew.
+    """
+
+    masses: Array
+    moments: Array
     run: Callable[[float, int, int], Motion]
 
 
@@ -137,6 +146,17 @@ class Rigid:
             return np.zeros((2, 3))
         w = self.w[body.number]
         return np.array([self.v[body.number] + np.cross(w, at - self.x[body.number]), w])
+
+
+def largest_moment(inertia: Array) -> float:
+    """The largest principal moment of a body's numbers: mass, xx, yy, zz, xy, xz, yz."""
+    return float(np.linalg.eigvalsh(tensor(inertia))[-1])
+
+
+def tensor(inertia: Array) -> Array:
+    """The tensor (3, 3) of such numbers."""
+    _, xx, yy, zz, xy, xz, yz = inertia
+    return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
 
 
 def point_of(body: Body, joint: ModelJoint) -> Array:
