@@ -51,7 +51,6 @@ class Configuration:
 
 CONFIGURATIONS = (
     Configuration("mujoco", "default", mujoco.Settings()),
-    Configuration("mujoco", "implicitfast", mujoco.Settings("implicitfast"), '`integrator="implicitfast"`'),
     Configuration("mujoco", "RK4", mujoco.Settings("RK4"), '`integrator="RK4"`'),
     Configuration(
         "mujoco",
@@ -72,14 +71,20 @@ CONFIGURATIONS = (
     Configuration(
         "pinocchio",
         "Euler, Baumgarte",
-        pinocchio.Settings("Euler", 1e-8, baumgarte=10.0),
-        "semi-implicit Euler; `ProximalSettings(1e-14, 1e-8, 20)`, `Kp` 100, `Kd` 20",
+        pinocchio.Settings("Euler", 1e-3, baumgarte=10.0),
+        "semi-implicit Euler; `ProximalSettings(1e-14, 1e-3, 20)`, `Kp` 100, `Kd` 20",
     ),
     Configuration(
         "pinocchio",
         "RK4, Baumgarte",
+        pinocchio.Settings("RK4", 1e-3, baumgarte=10.0),
+        "RK4 of q and v; `ProximalSettings(1e-14, 1e-3, 20)`, `Kp` 100, `Kd` 20",
+    ),
+    Configuration(
+        "pinocchio",
+        "RK4, mu 1e-8",
         pinocchio.Settings("RK4", 1e-8, baumgarte=10.0),
-        "RK4 of q and v; `ProximalSettings(1e-14, 1e-8, 20)`, `Kp` 100, `Kd` 20",
+        "as before, with `ProximalSettings(1e-14, 1e-8, 20)`",
     ),
     Configuration("exudyn_bodies", "generalized-alpha", exudyn_bodies.Settings()),
     Configuration("exudyn_bodies", "trapezoidal", exudyn_bodies.Settings("TrapezoidalIndex2"), "`TrapezoidalIndex2`"),
@@ -88,7 +93,7 @@ CONFIGURATIONS = (
 BEST: dict[str, Any] = {  # of the gates: the most rigid of an engine
     "mujoco": RIGID,
     "drake": drake.Settings(),
-    "pinocchio": pinocchio.Settings("RK4", 1e-8),
+    "pinocchio": pinocchio.Settings("RK4", 1e-3),
     "exudyn_bodies": exudyn_bodies.Settings(),
 }
 
