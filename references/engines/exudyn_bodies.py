@@ -90,6 +90,8 @@ def _model(rigid: Rigid, planar: bool, q: Any, v: Any) -> Any:
             turned = turned[:, [2, 0, 1]]  # along x
         elif joint.kind == "universal":
             turned = np.column_stack([*axes, np.cross(*axes)])
+        elif joint.kind not in locked:
+            raise ValueError(f"Exudyn is given {', '.join(locked)} joints; {joint.name!r} is {joint.kind}")
         cut = rigid.planar and joint.kind == "spherical"
         point = joint.a.in_space(point_of(joint.a, joint))
         model.joint(a, b, point, np.eye(3) if cut else turned, PLANAR_CUT if cut else locked[joint.kind])

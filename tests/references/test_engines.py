@@ -4,12 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from references.engines import drake, exudyn_bodies, mujoco, pinocchio
 from references.engines.rigid import coordinates, cut_points, gaps, rigid_of
 from studies.bench.closed_loops import MECHANISMS, bricard, closed_chain, parallelogram, rssr, squeezer, stewart
 from studies.bench.engine_runs import Loop, errors, gate
-from twoloop.bodies import PlanarModel
+from twoloop.bodies import PlanarModel, SpatialModel
 
 RIGID = {
     "mujoco": (mujoco, mujoco.Settings("RK4", "1e-9 1", "0.9999 0.9999 0.001"), "mujoco"),
@@ -28,14 +29,33 @@ def prepared(engine, rigid):
 
 @pytest.fixture(scope="module")
 def loops():
-    """A planar mechanism with a spring and a torque, and one in space with all kinds of joints but hinges."""
-    return Loop(squeezer()), Loop(stewart())
+    """A planar mechanism with a spring and a torque, and one in space with tensors, turned axes and swapped bodies."""
+    return Loop(squeezer()), Loop(crooked())
+
+
+def crooked():
+    """Hinge, cross, ball and hinge; bodies with axes and tensors in any direction, the whole turned in space."""
+    Q, *turns = Rotation.random(7, random_state=5).as_matrix()
+    O, P, S, D = np.array([(0.0, 0.0, 0.0), (0.3, 0.0, 0.0), (0.9, 0.0, 1.0), (0.9, 0.0, 0.3)]) @ Q.T
+    x, y, z = Q.T
+    model = SpatialModel(gravity=-9.81 * z, name="crooked")
+    for k, (name, start, end) in enumerate((("crank", O, P), ("coupler", P, S), ("rocker", D, S))):
+        motion = {"angular_velocity": 6.0 * z} if k == 0 else {}
+        J = turns[k] @ np.diag([0.02, 0.05, 0.06]) @ turns[k].T
+        model.body(name, mass=0.8, inertia=J, position=0.4 * start + 0.6 * end, rotation=turns[3 + k], **motion)
+    model.revolute("crank", "ground", at=O, axis=z)
+    model.universal("coupler", "crank", at=P, axes=(x - 0.6 * z, y))
+    model.spherical("coupler", "rocker", at=S)
+    model.revolute("rocker", "ground", at=D, axis=y)
+    return model.problem((0.0, 1.0))
 
 
 @engines
 @pytest.mark.parametrize("k", [0, 1])
-def test_models_pass_the_gates(loops, engine, k):
-    assert gate(loops[k], prepared(engine, loops[k].rigid)) == ""
+def test_models_pass_the_gates_and_move_as_they_should(loops, engine, k):
+    ready = prepared(engine, loops[k].rigid)
+    assert gate(loops[k], ready) == ""
+    assert errors(loops[k], ready.run(loops[k].t_end, 2000, 50))["error_q"] < 0.1
 
 
 @engines
@@ -76,9 +96,9 @@ def test_errors_fall_with_the_step(engine, order):
     assert off[1]["error_v"] < 0.05 and off[1]["gap"] < 1e-3
 
 
-def test_mujoco_has_the_masses_and_moments_that_it_is_given(loops):
+def test_mujoco_has_the_masses_and_moments_that_it_is_given():
     package = pytest.importorskip("mujoco")
-    rigid = loops[1].rigid
+    rigid = rigid_of(stewart())
     model = package.MjModel.from_xml_string(mujoco.file_of(rigid, mujoco.Settings()))
     for body in rigid.model.bodies:
         own = model.body(body.name)
@@ -86,9 +106,9 @@ def test_mujoco_has_the_masses_and_moments_that_it_is_given(loops):
         np.testing.assert_allclose(sorted(own.inertia), sorted(body.inertia[1:4]), rtol=1e-9)
 
 
-def test_pinocchio_adds_joints_branch_by_branch(loops):
+def test_pinocchio_adds_joints_branch_by_branch():
     pin = pytest.importorskip("pinocchio")
-    model, frames = pinocchio._tree(pin, loops[1].rigid)
+    model, frames = pinocchio._tree(pin, rigid_of(stewart()))
     for number in range(1, model.njoints):  # the joints of a branch follow one another
         branch = list(model.subtrees[number])
         assert branch == list(range(number, number + len(branch)))
@@ -114,6 +134,15 @@ def test_coordinates_come_back_from_motions(loops):
         again = loop.motion(q, v)
         for name in ("x", "R", "v", "w"):
             np.testing.assert_allclose(getattr(one, name), getattr(again, name), atol=1e-9)
+
+
+def test_a_joint_without_a_counterpart_is_named():
+    pytest.importorskip("exudyn")
+    model = SpatialModel(name="sleeve")
+    model.rod("bar", (0.0, 0.0, 0.0), (1.0, 0.0, 0.0), radius=0.02, mass=1.0)
+    model.cylindrical("ground", "bar", at=(0.0, 0.0, 0.0), axis=(1.0, 0.0, 0.0))
+    with pytest.raises(ValueError, match="is cylindrical"):
+        exudyn_bodies.prepare(rigid_of(model.problem()))
 
 
 def test_what_no_engine_is_given_is_refused():
