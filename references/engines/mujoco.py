@@ -15,12 +15,11 @@ from twoloop.bodies.mjcf_geometry import IgnoredWarning
 
 
 class Settings(NamedTuple):
-    """Integrator of MuJoCo; solref and solimp of what closes loops, None: its defaults; flags to switch off."""
+    """Integrator of MuJoCo; solref and solimp of what closes loops, None: its defaults."""
 
     integrator: str = "Euler"
     solref: str | None = None
     solimp: str | None = None
-    off: tuple[str, ...] = ()
 
 
 def prepare(rigid: Rigid, settings: Settings = Settings()) -> Prepared:  # noqa: B008
@@ -47,9 +46,8 @@ def prepare(rigid: Rigid, settings: Settings = Settings()) -> Prepared:  # noqa:
             rates = rigid.rates(body)
             for number, (kind, _) in enumerate(freedoms(body, joint := rigid.parents[body.number][1])):
                 first = model.joint(joint.name if number == 0 else f"{joint.name} {number + 1}").dofadr[0]
-                data.qvel[first : first + (3 if kind == BALL else 1)] = rates[
-                    number : number + (3 if kind == BALL else 1)
-                ]
+                width = 3 if kind == BALL else 1
+                data.qvel[first : first + width] = rates[number : number + width]
 
         def step(n: int) -> str:
             mujoco.mj_step(model, data, nstep=n)
@@ -80,8 +78,6 @@ def file_of(rigid: Rigid, settings: Settings) -> str:
         root = ElementTree.parse(path).getroot()
     option: Any = root.find("option")
     option.set("integrator", settings.integrator)
-    if settings.off:
-        ElementTree.SubElement(option, "flag", dict.fromkeys(settings.off, "disable"))
     for element in root.findall("equality/*"):
         for name, value in (("solref", settings.solref), ("solimp", settings.solimp)):
             if value is not None:

@@ -103,11 +103,11 @@ def prepare(rigid: Rigid, settings: Settings = Settings()) -> Prepared:  # noqa:
                 poses.append(data.oMi[joint] * origin)
                 twists.append(origin.actInv(data.v[joint]))
             x, R = np.array([each.translation for each in poses]), np.array([each.rotation for each in poses])
-            v_w = [
+            speeds, spins = (
                 np.array([pose.rotation @ getattr(twist, part) for pose, twist in zip(poses, twists, strict=True)])
                 for part in ("linear", "angular")
-            ]
-            return taken * h, x, R, v_w[0], v_w[1]
+            )
+            return taken * h, x, R, speeds, spins
 
         return march(began, n_steps, n_stored, see, step)
 
