@@ -298,7 +298,7 @@ def _cheapest(case: str, runs: pd.DataFrame) -> dict[str, Any]:
 
 
 def _engine(name: str, runs: pd.DataFrame, cases: list[str]) -> dict[str, Any]:
-    """At each error the configuration of an engine that gets there on most mechanisms, then in the least median time."""
+    """At each error the configuration of an engine that gets there on most mechanisms, then the fastest by median."""
     lines: list[dict[str, Any] | None] = []
     for error in ERRORS:
         ranked: list[tuple[int, float, str, list[float], list[float]]] = []
