@@ -2,7 +2,7 @@
 # PYTHON=/path/to/python chooses the interpreter, ARGS="--quick" passes options on.
 
 .DEFAULT_GOAL := help
-.PHONY: help install peers compile table3 reports bench test test-portable test-oldest lint docs lock clean
+.PHONY: help install peers engines compile table3 reports bench test test-portable test-oldest lint docs lock clean
 
 # one thread: CPU times can be compared, and no BLAS changes a count
 export OPENBLAS_NUM_THREADS := 1
@@ -51,6 +51,12 @@ peers: .venv/peers ## the rivals that work_precision compares with where they ar
 
 .venv/peers: requirements-peers.lock $(STAMP)
 	@$(RUN) $(PIP) install -c requirements.lock -r requirements-peers.lock
+	@touch $@
+
+engines: .venv/engines ## the physics engines of the study engines, where they are installed: MuJoCo, Pinocchio, Drake
+
+.venv/engines: requirements-engines.lock $(STAMP)
+	@$(RUN) $(PIP) install -c requirements.lock -r requirements-engines.lock
 	@touch $@
 
 table3: install ## the paper's Table 3 into reports/; ARGS="--quick" takes seconds
@@ -102,7 +108,7 @@ docs: install ## the documentation, into docs/_build/html; a warning is an error
 	$(RUN) -m sphinx -W --keep-going -q -b html docs docs/_build/html
 	@echo "docs/_build/html/index.html"
 
-lock: ## renew both lock files from pyproject.toml; PYTHON=python3.11, the oldest supported
+lock: ## renew the lock files from pyproject.toml; PYTHON=python3.11, the oldest supported
 	@$(FIND_PYTHON); "$$python" -m venv --clear .venv
 	@$(RUN) $(PIP) install ".[references,symbolic,sweeps,docs,studies,dev]" hatchling
 	@{ grep '^#' requirements.lock; $(RUN) -m pip freeze --exclude twoloop; } > requirements.new
@@ -110,6 +116,10 @@ lock: ## renew both lock files from pyproject.toml; PYTHON=python3.11, the oldes
 	@$(RUN) $(PIP) install -c requirements.lock ".[peers]"
 	@{ grep '^#' requirements-peers.lock; $(RUN) -m pip freeze --exclude twoloop | grep -vxFf requirements.lock; } > requirements.new
 	@mv requirements.new requirements-peers.lock
+	@$(RUN) $(PIP) install -c requirements.lock -c requirements-peers.lock ".[engines]"
+	@{ grep '^#' requirements-engines.lock; $(RUN) -m pip freeze --exclude twoloop | grep -vxFf requirements.lock \
+		| grep -vxFf requirements-peers.lock; } > requirements.new
+	@mv requirements.new requirements-engines.lock
 
 clean: ## remove caches (numba's too) and builds; .venv and .venv-oldest stay
 	find . -name '.venv*' -prune -o -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -22,6 +22,7 @@ def write(folder: Path) -> None:
     for file in (ROOT / "reports").iterdir():
         if file.suffix in SHOWN:
             shutil.copy(file, reports)
+    shutil.copytree(ROOT / "reports" / "engines", reports / "engines")  # scripts that a report links
     index = reports / "README.md"  # from docs/generated/reports the pages are two folders up
     index.write_text(index.read_text(encoding="utf-8").replace("](../docs/", "](../../"), encoding="utf-8")
     (folder / "which_method.md").write_text(page(ROOT / "reports"), encoding="utf-8")

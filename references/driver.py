@@ -147,7 +147,7 @@ def imported(module: str, name: str = "", extra: str = "peers") -> Any:
         return import_module(module)
     except ImportError as error:
         name = name or module.partition(".")[0]
-        how = "make peers, or pip" if extra == "peers" else "pip"
+        how = f"make {extra}, or pip" if extra in ("peers", "engines") else "pip"
         raise RuntimeError(f"{name} is not installed: {how} install 'twoloop[{extra}]'") from error
 
 

@@ -7,6 +7,7 @@ import numpy as np
 from exudyn.itemInterface import (
     GenericJoint,
     LoadMassProportional,
+    LoadTorqueVector,
     MarkerBodyMass,
     MarkerBodyPosition,
     MarkerBodyRigid,
@@ -59,9 +60,9 @@ class Model:
         return len(self.bodies) - 1
 
     def body(self, mass: float, inertia: ArrayLike, q: Array, v: Array) -> int:
-        """A body in space: principal moments, centre and Euler parameters (7,), and their rates."""
+        """A body in space: moments xx, yy, zz, yz, xz, xy or the first three, centre and Euler parameters, rates."""
         node = self.mbs.AddNode(NodeRigidBodyEP(referenceCoordinates=q.tolist(), initialVelocities=v.tolist()))
-        moments = [*np.asarray(inertia, dtype=float).tolist(), 0.0, 0.0, 0.0]
+        moments = [*np.asarray(inertia, dtype=float).tolist(), 0.0, 0.0, 0.0][:6]
         body = self.mbs.AddObject(ObjectRigidBody(mass=mass, inertia=moments, nodeNumber=node))
         return self._added(body, node, q, (q[:3], rotation_matrix(q[3:])))
 
@@ -103,6 +104,11 @@ class Model:
 
     def _marker(self, number: int, local: list[float]) -> int:
         return int(self.mbs.AddMarker(MarkerBodyPosition(bodyNumber=number, localPosition=local)))
+
+    def torque(self, body: int, torque: ArrayLike) -> None:
+        """A constant torque on a body, along the axes of space."""
+        marker = self.mbs.AddMarker(MarkerBodyRigid(bodyNumber=self.bodies[body]))
+        self.mbs.AddLoad(LoadTorqueVector(markerNumber=marker, loadVector=np.asarray(torque, dtype=float).tolist()))
 
     def hold(self, body: int, coordinate: int) -> None:
         """Keep a coordinate of a body."""

@@ -14,13 +14,11 @@ from numpy.typing import NDArray
 from twoloop.bodies.mjcf_geometry import IgnoredWarning
 from twoloop.bodies.parameter_layout import PULL, RAIL, SPRING, TORSION
 from twoloop.bodies.parts import Body, Force, ModelJoint
+from twoloop.bodies.spanning_tree import spanning_tree
 from twoloop.mechanisms.rotation import euler_parameters
 
 Array = NDArray[np.float64]
 
-# kinds of joints in the order in which they go into the tree: those that close no loop first
-TREE = ("prismatic", "cylindrical", "universal", "planar", "revolute", "fixed", "spherical")
-LOOP = ("spherical", "revolute", "fixed")
 HALF = 0.5  # m, from each other: the two points of a hinge that closes a loop
 
 
@@ -53,44 +51,7 @@ class _Writer:
                 self.tendons.append(force)
             else:
                 self.left_out.append(force.name)
-        self.parents, self.loops = self._tree()
-
-    def _tree(self) -> tuple[dict[int, tuple[Body, ModelJoint]], list[ModelJoint]]:
-        """By number of a body its parent and the joint to it; and the joints that close loops."""
-        joints = [each for each in self.model.joints if each.kind != "drive"]
-        wrong = [each for each in joints if each.kind not in TREE]
-        if wrong:
-            raise ValueError(f"MJCF has no counterpart of {wrong[0].name!r}, which is {wrong[0].kind}")
-        linked = {each.number: {each.number} for each in (self.model.ground, *self.model.bodies)}
-        edges: list[ModelJoint] = []
-        loops: list[ModelJoint] = []
-        for joint in sorted(joints, key=lambda each: TREE.index(each.kind)):
-            one, other = linked[joint.a.number], linked[joint.b.number]
-            if one is other:
-                loops.append(joint)
-                continue
-            edges.append(joint)
-            one |= other
-            linked |= dict.fromkeys(other, one)
-        wrong = [each for each in loops if each.kind not in LOOP]
-        if wrong:
-            raise ValueError(
-                f"{wrong[0].name!r} closes a loop, which in MJCF {' and '.join(LOOP)} joints can; it is {wrong[0].kind}"
-            )
-        parents: dict[int, tuple[Body, ModelJoint]] = {}
-        ahead: list[Body] = [self.model.ground, *self.model.bodies]
-        reached: set[int] = set()
-        for root in ahead:
-            stack = [] if root.number in reached else [root]
-            while stack:
-                body = stack.pop()
-                reached.add(body.number)
-                for joint in edges:
-                    child = joint.b if joint.a is body else joint.a if joint.b is body else None
-                    if child is not None and child.number not in reached:
-                        parents[child.number] = body, joint
-                        stack.append(child)
-        return parents, loops
+        self.parents, self.loops = spanning_tree(model)
 
     def root(self) -> Element:
         """The whole file."""

@@ -1,0 +1,148 @@
+"""Drake: a discrete plant with the SAP solver, loops closed by ball constraints between bodies."""
+
+import time
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from references.driver import imported
+from references.engines.rigid import (
+    BALL,
+    HINGE,
+    SLIDE,
+    Motion,
+    Prepared,
+    Rigid,
+    Seen,
+    cut_points,
+    freedoms,
+    march,
+    point_of,
+    springs,
+)
+
+
+class Settings(NamedTuple):
+    """The approximation of a discrete plant; "continuous": a plant without steps of its own."""
+
+    approximation: str = "kSap"
+
+
+def prepare(rigid: Rigid, settings: Settings = Settings()) -> Prepared:  # noqa: B008
+    """The mechanism in Drake; a step is a plant's own, so the call makes the plant.
+
+    Raises
+    ------
+    RuntimeError
+        If Drake is not installed, or refuses to take a step.
+    ValueError
+        If it has no counterpart of a joint.
+    """
+    simulation = _module("systems.analysis")
+
+    def run(t_end: float, n_steps: int, n_stored: int) -> Motion:
+        began = time.process_time()
+        h = t_end / n_steps
+        plant, bodies = _plant(rigid, settings, h)
+        simulator = simulation.Simulator(plant)
+        context = simulator.get_mutable_context()
+        _start(rigid, plant, context, bodies)
+        simulator.Initialize()
+        done = 0
+
+        def step(n: int) -> str:
+            nonlocal done
+            done += n
+            try:
+                simulator.AdvanceTo(done * h)
+            except RuntimeError as error:
+                return str(error).strip().splitlines()[0]
+            return ""
+
+        def see() -> Seen:
+            poses = [plant.EvalBodyPoseInWorld(context, body) for body in bodies]
+            twists = [plant.EvalBodySpatialVelocityInWorld(context, body) for body in bodies]
+            x, R = (
+                np.array([each.translation() for each in poses]),
+                np.array([each.rotation().matrix() for each in poses]),
+            )
+            v, w = (np.array([getattr(each, part)() for each in twists]) for part in ("translational", "rotational"))
+            return done * h, x, R, v, w
+
+        return march(began, n_steps, n_stored, see, step)
+
+    _, bodies = _plant(rigid, settings, 1e-3)
+    if refused := run(1e-6, 1, 1).message:
+        raise RuntimeError(refused.split(": ", 1)[1])
+    own = [body.default_spatial_inertia() for body in bodies]
+    moments = [float(each.CalcRotationalInertia().CalcPrincipalMomentsOfInertia().max()) for each in own]
+    return Prepared(np.array([each.get_mass() for each in own]), np.array(moments), run)
+
+
+def _module(name: str) -> Any:
+    return imported(f"pydrake.{name}", "drake", extra="engines")
+
+
+def _plant(rigid: Rigid, settings: Settings, h: float) -> tuple[Any, list[Any]]:
+    mathematics, multibody, tree = (_module(name) for name in ("math", "multibody.plant", "multibody.tree"))
+    plant = multibody.MultibodyPlant(0.0 if settings.approximation == "continuous" else h)
+    if settings.approximation != "continuous":
+        plant.set_discrete_contact_approximation(
+            getattr(multibody.DiscreteContactApproximation, settings.approximation)
+        )
+    plant.mutable_gravity_field().set_gravity_vector(rigid.model.gravity)
+    made = {rigid.model.ground.number: plant.world_body()}
+    for body in rigid.model.bodies:
+        mass, *moments = body.inertia.tolist()
+        unit = tree.UnitInertia().SetFromRotationalInertia(tree.RotationalInertia(*moments), mass)
+        made[body.number] = plant.AddRigidBody(body.name, tree.SpatialInertia(mass, np.zeros(3), unit))
+    for body in rigid.model.bodies:
+        parent, joint = rigid.parents[body.number]
+        point, found = point_of(body, joint), freedoms(body, joint)
+        turned = np.eye(3)
+        if len(found) == 2:  # the axes of a universal joint
+            turned = np.column_stack([found[0][1], found[1][1], np.cross(found[0][1], found[1][1])])
+        frames = []
+        for end, R, at in (
+            (parent, parent.rotation.T @ body.rotation @ turned, parent.local_point(body.in_space(point))),
+            (body, turned, point),
+        ):
+            pose = mathematics.RigidTransform(mathematics.RotationMatrix.ProjectToRotationMatrix(R), at)
+            name = f"{joint.name} on {end.name}"
+            frames.append(plant.AddFrame(tree.FixedOffsetFrame(name, made[end.number].body_frame(), pose)))
+        plant.AddJoint(_joint(joint.name, found, frames))
+    for a, on_a, b, on_b in cut_points(rigid):
+        plant.AddBallConstraint(made[a.number], on_a, made[b.number], on_b)
+    for a, on_a, b, on_b, (stiffness, damping, length) in springs(rigid.model):
+        ends = made[a.number], on_a, made[b.number], on_b
+        plant.AddForceElement(tree.LinearSpringDamper(*ends, length, stiffness, damping))
+    plant.Finalize()
+    return plant, [made[body.number] for body in rigid.model.bodies]
+
+
+def _joint(name: str, found: list[tuple[str, Any]], frames: list[Any]) -> Any:
+    tree = _module("multibody.tree")
+    kinds = tuple(kind for kind, _ in found)
+    if kinds == (BALL,):
+        return tree.BallRpyJoint(name, *frames)
+    if kinds == (HINGE, HINGE):
+        return tree.UniversalJoint(name, *frames)
+    if kinds in ((HINGE,), (SLIDE,)):
+        return (tree.RevoluteJoint if kinds == (HINGE,) else tree.PrismaticJoint)(name, *frames, found[0][1])
+    raise ValueError(f"Drake is given hinges, slides, balls and universal joints; {name!r} is of {' and '.join(kinds)}")
+
+
+def _start(rigid: Rigid, plant: Any, context: Any, bodies: list[Any]) -> None:
+    v = plant.GetVelocities(context).copy()
+    for body in rigid.model.bodies:
+        joint, rates = plant.GetJointByName(rigid.parents[body.number][1].name), rigid.rates(body)
+        v[joint.velocity_start() : joint.velocity_start() + len(rates)] = rates
+    plant.SetVelocities(context, v)
+    forces = []
+    for k in np.flatnonzero(rigid.torques.any(axis=1)):
+        force = _module("multibody.plant").ExternallyAppliedSpatialForce()
+        force.body_index, force.p_BoBq_B = bodies[k].index(), np.zeros(3)
+        force.F_Bq_W = _module("multibody.math").SpatialForce(tau=rigid.torques[k], f=np.zeros(3))
+        forces.append(force)
+    if forces:
+        plant.get_applied_spatial_force_input_port().FixValue(context, forces)

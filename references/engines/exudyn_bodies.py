@@ -1,0 +1,105 @@
+"""Exudyn: rigid bodies with Euler parameters, or planar ones with pins, and joints between these, all of its own."""
+
+import time
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from references.driver import imported
+from references.engines.rigid import (
+    Motion,
+    Prepared,
+    Rigid,
+    axis_of,
+    coordinates,
+    largest_moment,
+    point_of,
+    springs,
+    states,
+)
+
+PLANAR_CUT = [1, 1, 0, 0, 0, 0]
+
+
+class Settings(NamedTuple):
+    """A solver of `references.exudyn.run`; the spectral radius of generalized-alpha, None: Exudyn's 0.9."""
+
+    solver: str = "GeneralizedAlpha"
+    radius: float | None = None
+
+
+def prepare(rigid: Rigid, settings: Settings = Settings()) -> Prepared:  # noqa: B008
+    """The mechanism in Exudyn; the call holds the making of its model, which a run changes.
+
+    Raises
+    ------
+    RuntimeError
+        If Exudyn is not installed.
+    ValueError
+        If it has no counterpart of a joint.
+    """
+    imported("exudyn", extra="references")
+    from references.exudyn.run import check_steps
+    from references.exudyn.run import run as run_exudyn
+
+    planar = rigid.planar and all(joint.kind != "prismatic" for joint in rigid.model.joints)
+    problem = rigid.given if planar else rigid.model.problem((0.0, 1.0))
+    dependent = bool(rigid.given.freedom.redundant)
+    x, R, v, w = (each[None] for each in (rigid.x, rigid.R, rigid.v, rigid.w))
+    start = coordinates(Motion(np.zeros(1), x, R, v, w, 0.0, 0.0), planar)
+
+    def build() -> Any:
+        return _model(rigid, planar, *(each[:, 0].reshape(len(rigid.x), -1) for each in start))
+
+    def run(t_end: float, n_steps: int, n_stored: int) -> Motion:
+        began = time.process_time()
+        every = n_steps // n_stored
+        steps = check_steps(problem, t_end, n_steps, settings.solver, every, None, settings.radius)
+        model = build()
+        reference = np.concatenate(model.reference)
+        made = run_exudyn(model.mbs, model.sensors, reference, steps, None, dependent)
+        call = time.process_time() - began
+        parts = states(planar, made.q, made.v)
+        return Motion(made.t, *parts, call, made.stats.cpu_time, "" if made.success else made.message)
+
+    made = build()
+    masses, inertias = ([made.mbs.GetObject(body)[name] for body in made.bodies] for name in ("mass", "inertia"))
+    moments = [J if planar else largest_moment(np.array([0.0, *np.array(J)[[0, 1, 2, 5, 4, 3]]])) for J in inertias]
+    return Prepared(np.array(masses), np.array(moments), run)
+
+
+def _model(rigid: Rigid, planar: bool, q: Any, v: Any) -> Any:
+    from references.exudyn.model import PRISMATIC, REVOLUTE, SPHERICAL, UNIVERSAL, Model, frame
+
+    locked = {"revolute": REVOLUTE, "prismatic": PRISMATIC, "spherical": SPHERICAL, "universal": UNIVERSAL}
+    model = Model(rigid.model.gravity)
+    for body, state, rate in zip(rigid.model.bodies, q, v, strict=True):
+        mass, xx, yy, zz, xy, xz, yz = body.inertia.tolist()
+        if planar:
+            model.planar_body(mass, zz, state, rate)
+        else:
+            model.body(mass, (xx, yy, zz, yz, xz, xy), state, rate)
+    for joint in rigid.model.joints:
+        a, b = joint.a.number, joint.b.number
+        if planar:
+            model.pin(a, tuple(point_of(joint.a, joint)[:2]), b, tuple(point_of(joint.b, joint)[:2]))
+            continue
+        axes = [end.rotation @ axis_of(end, joint) for end in (joint.a, joint.b)]
+        turned = frame(axes[0])
+        if joint.kind == "prismatic":
+            turned = turned[:, [2, 0, 1]]  # along x
+        elif joint.kind == "universal":
+            turned = np.column_stack([*axes, np.cross(*axes)])
+        elif joint.kind not in locked:
+            raise ValueError(f"Exudyn is given {', '.join(locked)} joints; {joint.name!r} is {joint.kind}")
+        cut = rigid.planar and joint.kind == "spherical"
+        point = joint.a.in_space(point_of(joint.a, joint))
+        model.joint(a, b, point, np.eye(3) if cut else turned, PLANAR_CUT if cut else locked[joint.kind])
+    for one, at, other, there, values in springs(rigid.model):
+        # Exudyn's planar bodies take points in their own axes, see Model.planar_body
+        ends = (at, there) if planar else (one.in_space(at), other.in_space(there))
+        model.spring(one.number, ends[0], other.number, ends[1], *values)
+    for k in np.flatnonzero(rigid.torques.any(axis=1)):
+        model.torque(int(k), rigid.torques[k])
+    model.mbs.Assemble()
+    return model

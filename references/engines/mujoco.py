@@ -1,0 +1,85 @@
+"""MuJoCo: the file that `to_mjcf` writes, with an integrator and the softness of the constraints that close loops."""
+
+import tempfile
+import time
+import warnings
+from pathlib import Path
+from typing import Any, NamedTuple
+from xml.etree import ElementTree
+
+import numpy as np
+
+from references.driver import imported
+from references.engines.rigid import BALL, Motion, Prepared, Rigid, Seen, freedoms, march
+from twoloop.bodies.mjcf_geometry import IgnoredWarning
+
+
+class Settings(NamedTuple):
+    """Integrator of MuJoCo; solref and solimp of what closes loops, None: its defaults."""
+
+    integrator: str = "Euler"
+    solref: str | None = None
+    solimp: str | None = None
+
+
+def prepare(rigid: Rigid, settings: Settings = Settings()) -> Prepared:  # noqa: B008
+    """The mechanism in MuJoCo.
+
+    Raises
+    ------
+    RuntimeError
+        If MuJoCo is not installed.
+    ValueError
+        If MJCF has no counterpart of a joint.
+    """
+    mujoco = imported("mujoco", extra="engines")
+    mujoco.set_mju_user_warning(lambda text: None)  # which it would put into a file in the folder of the caller
+    model = mujoco.MjModel.from_xml_string(file_of(rigid, settings))
+    bodies = [model.body(body.name).id for body in rigid.model.bodies]
+
+    def run(t_end: float, n_steps: int, n_stored: int) -> Motion:
+        began = time.process_time()
+        model.opt.timestep = t_end / n_steps
+        data = mujoco.MjData(model)
+        data.xfrc_applied[bodies, 3:] = rigid.torques
+        for body in rigid.model.bodies:
+            rates = rigid.rates(body)
+            for number, (kind, _) in enumerate(freedoms(body, joint := rigid.parents[body.number][1])):
+                first = model.joint(joint.name if number == 0 else f"{joint.name} {number + 1}").dofadr[0]
+                width = 3 if kind == BALL else 1
+                data.qvel[first : first + width] = rates[number : number + width]
+
+        def step(n: int) -> str:
+            mujoco.mj_step(model, data, nstep=n)
+            numbers = data.warning.number
+            return f"MuJoCo warns of {mujoco.mjtWarning(int(numbers.argmax())).name}" if numbers.any() else ""
+
+        def see() -> Seen:
+            mujoco.mj_kinematics(model, data)
+            mujoco.mj_comPos(model, data)
+            mujoco.mj_comVel(model, data)
+            twists = np.empty((len(bodies), 6))
+            for row, body in zip(twists, bodies, strict=True):
+                mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_BODY, body, row, 0)
+            poses = data.xpos[bodies].copy(), data.xmat[bodies].reshape(-1, 3, 3).copy()
+            return data.time, *poses, twists[:, 3:], twists[:, :3]
+
+        return march(began, n_steps, n_stored, see, step)
+
+    return Prepared(model.body_mass[bodies], model.body_inertia[bodies].max(axis=1), run)
+
+
+def file_of(rigid: Rigid, settings: Settings) -> str:
+    """The text of `to_mjcf` with these settings."""
+    with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
+        warnings.simplefilter("ignore", IgnoredWarning)  # start velocities and torques are put into the data
+        path = Path(folder, "model.xml")
+        rigid.model.to_mjcf(path)
+        root = ElementTree.parse(path).getroot()
+    option: Any = root.find("option")
+    option.set("integrator", settings.integrator)
+    for element in root.findall("equality/*"):
+        for name, value in (("solref", settings.solref), ("solimp", settings.solimp)):
+            if value is not None:
+                element.set(name, value)
+    return ElementTree.tostring(root, encoding="unicode")

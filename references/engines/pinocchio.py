@@ -1,0 +1,220 @@
+"""Pinocchio: a tree in joint coordinates, loops by its constrained dynamics, and a loop of steps around it."""
+
+import time
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from references.driver import imported
+from references.engines.rigid import (
+    BALL,
+    SLIDE,
+    Motion,
+    Prepared,
+    Rigid,
+    Seen,
+    cut_points,
+    freedoms,
+    march,
+    point_of,
+    springs,
+    tensor,
+)
+from twoloop.bodies.parts import Body
+
+Array = NDArray[np.float64]
+Acceleration = Callable[[Array, Array], Array]
+
+
+class Settings(NamedTuple):
+    """How a step is taken, semi-implicit ("Euler") or by "RK4"; mu and iterations, None: the defaults; Baumgarte's."""
+
+    integrator: str = "Euler"
+    mu: float | None = None
+    iterations: int = 20
+    baumgarte: float | None = None  # 1/s: both of its roots
+
+
+def prepare(rigid: Rigid, settings: Settings = Settings()) -> Prepared:  # noqa: B008
+    """The mechanism in Pinocchio, its steps taken in Python as its examples do.
+
+    Raises
+    ------
+    RuntimeError
+        If Pinocchio is not installed.
+    ValueError
+        If it has no counterpart of a joint.
+    """
+    pin = imported("pinocchio", "pin", extra="engines")
+    model, frames = _tree(pin, rigid)
+    constraints = pin.StdVec_RigidConstraintModel()
+    for a, on_a, b, on_b in cut_points(rigid):
+        ends = [
+            (joint, origin * pin.SE3(np.eye(3), at))
+            for (joint, origin), at in ((frames[a.number], on_a), (frames[b.number], on_b))
+        ]
+        made = pin.RigidConstraintModel(pin.ContactType.CONTACT_3D, model, *ends[0], *ends[1], pin.ReferenceFrame.LOCAL)
+        if settings.baumgarte is not None:
+            gains = made.m_baumgarte_parameters
+            gains.Kp, gains.Kd = settings.baumgarte**2, 2.0 * settings.baumgarte
+            made.setBaumgarteCorrectorParameters(gains)
+        constraints.append(made)
+    proximal = pin.ProximalSettings()
+    if settings.mu is not None:
+        proximal = pin.ProximalSettings(1e-14, settings.mu, settings.iterations)
+
+    def run(t_end: float, n_steps: int, n_stored: int) -> Motion:
+        began = time.process_time()
+        h, data = t_end / n_steps, model.createData()
+        datas = pin.StdVec_RigidConstraintData()
+        for each in constraints:
+            datas.append(each.createData())
+        pin.initConstraintDynamics(model, data, constraints, datas)
+        force = _force(pin, rigid, model, data, frames)
+
+        def acceleration(q: Array, v: Array) -> Array:
+            return np.asarray(pin.constraintDynamics(model, data, q, v, force(q, v), constraints, datas, proximal))
+
+        q, v = pin.neutral(model), _start(rigid, frames, model)
+        taken = 0
+        rate = _rates(model)
+
+        def step(n: int) -> str:
+            nonlocal q, v, taken
+            for _ in range(n):
+                if settings.integrator == "Euler":
+                    v = v + h * acceleration(q, v)
+                    q = pin.integrate(model, q, h * v)
+                else:
+                    q, v = _runge_kutta(acceleration, rate, q, v, h)
+                    q = pin.normalize(model, q)
+                if not np.isfinite(v).all():
+                    return "the accelerations are not finite"
+            taken += n
+            return ""
+
+        def see() -> Seen:
+            pin.forwardKinematics(model, data, q, v)
+            poses, twists = [], []
+            for k in range(len(rigid.x)):
+                joint, origin = frames[k]
+                poses.append(data.oMi[joint] * origin)
+                twists.append(origin.actInv(data.v[joint]))
+            x, R = np.array([each.translation for each in poses]), np.array([each.rotation for each in poses])
+            speeds, spins = (
+                np.array([pose.rotation @ getattr(twist, part) for pose, twist in zip(poses, twists, strict=True)])
+                for part in ("linear", "angular")
+            )
+            return taken * h, x, R, speeds, spins
+
+        return march(began, n_steps, n_stored, see, step)
+
+    own = [model.inertias[frames[k][0]] for k in range(len(rigid.x))]
+    moments = [float(np.linalg.eigvalsh(each.inertia)[-1]) for each in own]
+    return Prepared(np.array([each.mass for each in own]), np.array(moments), run)
+
+
+def _tree(pin: Any, rigid: Rigid) -> tuple[Any, dict[int, tuple[int, Any]]]:
+    """The model, and by number of a body its joint and where its centre of mass is in this."""
+    model = pin.Model()
+    model.gravity = pin.Motion(np.array(rigid.model.gravity), np.zeros(3))
+    frames = {rigid.model.ground.number: (0, pin.SE3.Identity())}
+    # each body right after its parent's others: joints in another order silently give wrong accelerations
+    ahead = _children(rigid, rigid.model.ground)
+    while ahead:
+        body = ahead.pop()
+        parent, joint = rigid.parents[body.number]
+        ahead += _children(rigid, body)
+        point = point_of(body, joint)
+        number, origin = frames[parent.number]
+        there = pin.SE3(parent.rotation.T @ body.rotation, parent.local_point(body.in_space(point)))
+        place = origin * there
+        for k, (kind, axis) in enumerate(freedoms(body, joint)):
+            kinds = {BALL: pin.JointModelSpherical, SLIDE: pin.JointModelPrismaticUnaligned}
+            made = kinds[kind]() if kind == BALL else kinds.get(kind, pin.JointModelRevoluteUnaligned)(axis)
+            number = model.addJoint(number, made, place if k == 0 else pin.SE3.Identity(), f"{joint.name} {k + 1}")
+        origin = pin.SE3(np.eye(3), -point)
+        model.appendBodyToJoint(number, pin.Inertia(float(body.inertia[0]), np.zeros(3), tensor(body.inertia)), origin)
+        frames[body.number] = number, origin
+    return model, frames
+
+
+def _children(rigid: Rigid, parent: Body) -> list[Body]:
+    return [body for body in rigid.model.bodies if rigid.parents[body.number][0] is parent]
+
+
+def _start(rigid: Rigid, frames: dict[int, tuple[int, Any]], model: Any) -> Array:
+    v = np.zeros(model.nv)
+    for body in rigid.model.bodies:
+        rates = rigid.rates(body)
+        last = model.joints[frames[body.number][0]]
+        v[last.idx_v + last.nv - len(rates) : last.idx_v + last.nv] = rates
+    return v
+
+
+def _force(
+    pin: Any, rigid: Rigid, model: Any, data: Any, frames: dict[int, tuple[int, Any]]
+) -> Callable[[Array, Array], Array]:
+    """Generalised forces of springs and constant torques, as a function of q and v."""
+    known, turning = springs(rigid.model), np.flatnonzero(rigid.torques.any(axis=1))
+    if not known and not turning.size:
+        zero = np.zeros(model.nv)
+        return lambda q, v: zero
+
+    def force(q: Array, v: Array) -> Array:
+        pin.computeJointJacobians(model, data, q)
+        tau = np.zeros(model.nv)
+
+        def pull(body: int, point: Array, f: Array, torque: Array) -> None:
+            joint, _ = frames[body]
+            if joint:
+                J = pin.getJointJacobian(model, data, joint, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED)
+                tau[:] += J[:3].T @ f + J[3:].T @ (np.cross(point - data.oMi[joint].translation, f) + torque)
+
+        zero = np.zeros(3)
+        for k in turning:
+            pull(int(k), zero, zero, rigid.torques[k])
+        for a, on_a, b, on_b, (stiffness, damping, length) in known:
+            if damping:
+                raise ValueError("a spring between points is given to Pinocchio without damping")
+            ends = [
+                (data.oMi[joint] * origin).act(at)
+                for (joint, origin), at in ((frames[a.number], on_a), (frames[b.number], on_b))
+            ]
+            along = ends[1] - ends[0]
+            long = float(np.linalg.norm(along))
+            f = stiffness * (long - length) / long * along
+            pull(a.number, ends[0], f, zero)
+            pull(b.number, ends[1], -f, zero)
+        return tau
+
+    return force
+
+
+def _rates(model: Any) -> Callable[[Array, Array], Array]:
+    """dq/dt as a function of q and v: quaternions (x, y, z, w) of ball joints turn in the axes of the body."""
+    balls = [(each.idx_q, each.idx_v) for each in model.joints if each.nq == 4]
+    if not balls:
+        return lambda q, v: v
+    places = np.array([(each.idx_q, each.idx_v) for each in model.joints if each.nq == 1 and each.nv == 1], dtype=int)
+
+    def rate(q: Array, v: Array) -> Array:
+        made = np.zeros_like(q)
+        made[places[:, 0]] = v[places[:, 1]]
+        for i, j in balls:
+            f, e, w = q[i : i + 3], q[i + 3], v[j : j + 3]
+            made[i : i + 3], made[i + 3] = 0.5 * (e * w + np.cross(f, w)), -0.5 * f @ w
+        return made
+
+    return rate
+
+
+def _runge_kutta(a: Acceleration, rate: Acceleration, q: Array, v: Array, h: float) -> tuple[Array, Array]:
+    """A step of the classical method of order 4, quaternions as four numbers."""
+    a1, u1 = a(q, v), rate(q, v)
+    a2, u2 = a(q + 0.5 * h * u1, v2 := v + 0.5 * h * a1), rate(q + 0.5 * h * u1, v2)
+    a3, u3 = a(q + 0.5 * h * u2, v3 := v + 0.5 * h * a2), rate(q + 0.5 * h * u2, v3)
+    a4, u4 = a(q + h * u3, v4 := v + h * a3), rate(q + h * u3, v4)
+    return q + h / 6.0 * (u1 + 2.0 * (u2 + u3) + u4), v + h / 6.0 * (a1 + 2.0 * (a2 + a3) + a4)

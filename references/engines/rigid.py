@@ -1,0 +1,314 @@
+"""What the models of all engines are read off: poses and twists of bodies in space, joints of a tree, cuts of loops.
+
+Every engine is given the same: each body's mass and inertia about its centre of mass, a tree of joints whose
+coordinates are zero at the start, and the joints that close loops. A planar mechanism is put into the plane z = 0; its
+hinges that close loops become ball joints there, for the hinges of the tree keep it in the plane.
+"""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twoloop.bodies import SpatialModel
+from twoloop.bodies.model_problem import ModelProblem
+from twoloop.bodies.parameter_layout import SPRING, TORQUE
+from twoloop.bodies.parts import Body, ModelJoint
+from twoloop.bodies.spanning_tree import spanning_tree
+from twoloop.mechanisms.rotation import G, euler_parameters, euler_rates, rotation_matrix
+
+Array = NDArray[np.float64]
+
+SLIDE, HINGE, BALL = "slide", "hinge", "ball"
+FREEDOMS = ("revolute", "prismatic", "cylindrical", "universal", "spherical")  # kinds of joints of a tree
+HALF = 0.5  # m, from each other: the two points of a hinge that closes a loop
+Z = (0.0, 0.0, 1.0)
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Where the bodies are at some instants, and what it took.
+
+    Attributes
+    ----------
+    t : ndarray (n_t,)
+        s; the first is 0.
+    x, v, w : ndarray (n_t, n_bodies, 3)
+        Centres of mass (m), their velocities (m/s), angular velocities along the axes of space (rad/s).
+    R : ndarray (n_t, n_bodies, 3, 3)
+        Their columns are the axes of the bodies.
+    call_s, stepping_s : float
+        CPU time of the call on a model that has been built, and of its steps alone, s.
+    message : str
+        Why it ended before its time; nothing if it did not.
+    """
+
+    t: Array
+    x: Array
+    R: Array
+    v: Array
+    w: Array
+    call_s: float
+    stepping_s: float
+    message: str = ""
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A model in an engine.
+
+    Attributes
+    ----------
+    masses, moments : ndarray (n_bodies,)
+        As the engine has them: kg, and the largest principal moment of inertia, kg m^2.
+    run : callable
+        run(t_end, n_steps, n_stored) -> Motion, which begins anew.
+    """
+
+    masses: Array
+    moments: Array
+    run: Callable[[float, int, int], Motion]
+
+
+Seen = tuple[float, Array, Array, Array, Array]  # t, x, R, v, w of `Motion` at one instant
+
+
+def march(began: float, n_steps: int, n_stored: int, see: Callable[[], Seen], step: Callable[[int], str]) -> Motion:
+    """The motion of an engine that has been set up since `began`: step(n) takes n steps, and says why if it cannot.
+
+    States are stored at n_stored instants about evenly spaced beside the start, after whole steps.
+    """
+    stored, spent, message = [see()], 0.0, ""
+    ends = np.unique(np.round(np.linspace(0, n_steps, n_stored + 1)).astype(int))
+    for n in np.diff(ends):
+        start = time.process_time()
+        message = step(int(n))
+        spent += time.process_time() - start
+        state = see()
+        if not message and not all(np.isfinite(each).all() for each in state):
+            message = "the state is not finite"
+        if message:
+            message = f"at {state[0]:.3g} s or before: {message}"
+            break
+        stored.append(state)
+    t, x, R, v, w = (np.array(each) for each in zip(*stored, strict=True))
+    return Motion(t, x, R, v, w, time.process_time() - began, spent, message)
+
+
+@dataclass(frozen=True)
+class Rigid:
+    """A mechanism in space, and how it starts.
+
+    Attributes
+    ----------
+    given : ModelProblem
+    model : SpatialModel
+    planar : bool
+        Whether it was made of a planar one.
+    x, R, v, w : ndarray
+        Of the bodies at the start, as in `Motion` at one instant.
+    parents, loops
+        Of `spanning_tree`.
+    torques : ndarray (n_bodies, 3)
+        Constant ones, N m.
+    """
+
+    given: ModelProblem
+    model: SpatialModel
+    planar: bool
+    x: Array
+    R: Array
+    v: Array
+    w: Array
+    parents: dict[int, tuple[Body, ModelJoint]]
+    loops: list[ModelJoint]
+    torques: Array
+
+    def rates(self, body: Body) -> Array:
+        """Start velocities of the joint above a body, in the order of `freedoms`; a ball's in the axes of the body."""
+        parent, joint = self.parents[body.number]
+        point = point_of(body, joint)
+        here = body.position + body.rotation @ point
+        speed, spin = self._twist(body, here) - self._twist(parent, here)
+        columns = []
+        for kind, axis in freedoms(body, joint):
+            turned, zero = body.rotation @ axis, np.zeros((3, 3))
+            columns.append(np.vstack([turned, zero[0]] if kind == SLIDE else [zero[0], turned]).reshape(6, 1))
+            if kind == BALL:
+                columns[-1] = np.vstack([zero, body.rotation])
+        return np.linalg.lstsq(np.hstack(columns), np.concatenate([speed, spin]))[0]
+
+    def _twist(self, body: Body, at: Array) -> Array:
+        if body is self.model.ground:
+            return np.zeros((2, 3))
+        w = self.w[body.number]
+        return np.array([self.v[body.number] + np.cross(w, at - self.x[body.number]), w])
+
+
+def largest_moment(inertia: Array) -> float:
+    """The largest principal moment of a body's numbers: mass, xx, yy, zz, xy, xz, yz."""
+    return float(np.linalg.eigvalsh(tensor(inertia))[-1])
+
+
+def tensor(inertia: Array) -> Array:
+    """The tensor (3, 3) of such numbers."""
+    _, xx, yy, zz, xy, xz, yz = inertia
+    return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+
+
+def point_of(body: Body, joint: ModelJoint) -> Array:
+    """The point of a joint in the axes of one of its bodies."""
+    return np.array((joint.point_a if body is joint.a else joint.point_b).values)
+
+
+def axis_of(body: Body, joint: ModelJoint) -> Array:
+    """The axis of a joint in the axes of one of its bodies; z of a ball's, which has none."""
+    return joint.axes[0 if body is joint.a else 1] if joint.axes else body.rotation.T @ np.array(Z)
+
+
+def freedoms(body: Body, joint: ModelJoint) -> list[tuple[str, Array]]:
+    """What the joint above a body allows, in the order of MuJoCo's file: kind and axis in the axes of the body."""
+    if joint.kind not in FREEDOMS:
+        raise ValueError(f"a joint of a tree must be {', '.join(FREEDOMS)}; {joint.name!r} is {joint.kind}")
+    if joint.kind == "spherical":
+        return [(BALL, np.array(Z))]
+    if joint.kind == "universal":
+        axes = [
+            body.local_direction(end.rotation @ own) for end, own in zip((joint.a, joint.b), joint.axes, strict=True)
+        ]
+        return [(HINGE, axis) for axis in (axes if joint.b is body else axes[::-1])]
+    axis = joint.axes[1] if joint.b is body else -joint.axes[0]
+    kinds = {"revolute": (HINGE,), "prismatic": (SLIDE,), "cylindrical": (SLIDE, HINGE)}[joint.kind]
+    return [(kind, axis) for kind in kinds]
+
+
+def cut_points(rigid: Rigid) -> list[tuple[Body, Array, Body, Array]]:
+    """Pairs of points that coincide where loops are cut: one pair of a ball, two on the axis of a hinge."""
+    pairs = []
+    for joint in rigid.loops:
+        if joint.kind not in ("spherical", "revolute"):
+            raise ValueError(f"a loop is closed by a ball or a hinge; {joint.name!r} is {joint.kind}")
+        sides = (0.0,) if joint.kind == "spherical" else (-HALF, HALF)
+        for side in sides:
+            places = [point_of(body, joint) + side * axis_of(body, joint) for body in (joint.a, joint.b)]
+            pairs.append((joint.a, places[0], joint.b, places[1]))
+    return pairs
+
+
+def springs(model: Any) -> list[tuple[Body, Array, Body, Array, tuple[float, ...]]]:
+    """Both ends of each spring in the axes of the bodies; stiffness, damping, length."""
+    return [
+        (f.first, np.array(f.on_first.values), f.second, np.array(f.on_second.values), f.more.values)
+        for f in model.forces
+        if f.kind == SPRING
+    ]
+
+
+def rigid_of(problem: ModelProblem) -> Rigid:
+    """What engines are given of a model in a plane or in space.
+
+    Raises
+    ------
+    ValueError
+        If it holds a drive, or a force that is neither a spring between points nor a constant torque.
+    """
+    given: Any = problem.model
+    wrong = [each.name for each in given.joints if each.kind == "drive"]
+    wrong += [f.name for f in given.forces if f.kind not in (SPRING, TORQUE) or f.function is not None]
+    if wrong:
+        raise ValueError(f"engines are given bodies, joints, springs and constant torques alone; not {wrong[0]!r}")
+    planar = given.dimension == 2
+    x, R, v, w = (each[0] for each in states(planar, problem.q0[:, None], problem.v0[:, None]))
+    model = _in_space(given, x, R, v, w) if planar else given
+    if max(np.abs(np.array([body.position for body in model.bodies]) - x).max(), 0.0) > 1e-9:
+        raise ValueError(f"the bodies of {problem.name!r} are not given where they start; give them closed")
+    torques = np.zeros_like(x)
+    for force in given.forces:
+        if force.kind == TORQUE:
+            torques[force.second.number] += [0.0, 0.0, *force.more.values] if planar else force.more.values
+    return Rigid(problem, model, planar, x, R, v, w, *spanning_tree(model), torques)
+
+
+def _in_space(given: Any, x: Array, R: Array, v: Array, w: Array) -> SpatialModel:
+    """A planar model in the plane z = 0, its loops cut at balls."""
+    model = SpatialModel((*given.gravity, 0.0), name=given.name)
+    for k, body in enumerate(given.bodies):
+        mass, J = body.inertia
+        motion = {"velocity": v[k], "angular_velocity": w[k]}
+        model.body(body.name, mass=mass, inertia=(0.6 * J, 0.6 * J, J), position=x[k], rotation=R[k], **motion)
+    cuts = {joint.name for joint in spanning_tree(given)[1]}
+    for joint in given.joints:
+        a, b, name = joint.a.name, joint.b.name, joint.name
+        at = np.append(joint.a.in_space(np.array(joint.point_a.values)), 0.0)
+        if joint.kind == "prismatic":
+            turned = joint.rows[0].more.values[0] + joint.a.rotation
+            model.prismatic(a, b, at=at, axis=(np.cos(turned), np.sin(turned), 0.0), name=name)
+        elif name in cuts:
+            model.spherical(a, b, at=at, name=name)
+        else:
+            model.revolute(a, b, at=at, axis=Z, name=name)
+    for one, at, other, there, (stiffness, damping, length) in springs(given):
+        ends = [np.append(body.in_space(place), 0.0) for body, place in ((one, at), (other, there))]
+        model.spring(one.name, ends[0], other.name, ends[1], stiffness=stiffness, damping=damping, length=length)
+    return model
+
+
+def states(planar: bool, q: Array, v: Array) -> tuple[Array, Array, Array, Array]:
+    """x, R, v, w of `Motion` from the coordinates (n_q, n_t) of a model in a plane or in space."""
+    n_t = q.shape[1]
+    shaped, rates = (each.T.reshape(n_t, -1, 3 if planar else 7) for each in (q, v))
+    n = shaped.shape[1]
+    x, speed, R, w = (np.zeros((n_t, n, 3)), np.zeros((n_t, n, 3)), np.zeros((n_t, n, 3, 3)), np.zeros((n_t, n, 3)))
+    if planar:
+        x[..., :2], speed[..., :2], w[..., 2] = shaped[..., :2], rates[..., :2], rates[..., 2]
+        s, c = np.sin(shaped[..., 2]), np.cos(shaped[..., 2])
+        R[..., 0, 0], R[..., 0, 1], R[..., 1, 0], R[..., 1, 1], R[..., 2, 2] = c, -s, s, c, 1.0
+        return x, R, speed, w
+    x[:], speed[:] = shaped[..., :3], rates[..., :3]
+    for i, k in np.ndindex(n_t, n):
+        e = shaped[i, k, 3:] / np.linalg.norm(shaped[i, k, 3:])
+        R[i, k] = rotation_matrix(e)
+        w[i, k] = R[i, k] @ (2.0 * G(e) @ rates[i, k, 3:])
+    return x, R, speed, w
+
+
+def coordinates(motion: Motion, planar: bool) -> tuple[Array, Array]:
+    """Coordinates and velocities (n_q, n_t) of a model, of a motion in space; Euler parameters of either sign."""
+    n_t, n = motion.x.shape[:2]
+    if planar:
+        angles = np.unwrap(np.arctan2(motion.R[..., 1, 0], motion.R[..., 0, 0]), axis=0)
+        q, v = (
+            np.concatenate(each, axis=2)
+            for each in (
+                (motion.x[..., :2], angles[..., None]),
+                (motion.v[..., :2], motion.w[..., 2:]),
+            )
+        )
+    else:
+        q, v = np.empty((n_t, n, 7)), np.empty((n_t, n, 7))
+        q[..., :3], v[..., :3] = motion.x, motion.v
+        for i, k in np.ndindex(n_t, n):
+            q[i, k, 3:] = euler_parameters(motion.R[i, k])
+            v[i, k, 3:] = euler_rates(q[i, k, 3:], motion.w[i, k])
+    return q.reshape(n_t, -1).T, v.reshape(n_t, -1).T
+
+
+def gaps(rigid: Rigid, x: Array, R: Array) -> Array:
+    """Largest distance between points of bodies that joints put together, m, at each instant (n_t,)."""
+    found = np.zeros(len(x))
+    for joint in rigid.model.joints:
+        places = []
+        for body in (joint.a, joint.b):
+            point = point_of(body, joint)
+            ground = body is rigid.model.ground
+            places.append(point[None] if ground else x[:, body.number] + R[:, body.number] @ point)
+        apart = places[1] - places[0]
+        if joint.kind in ("prismatic", "cylindrical"):
+            body, axis = joint.a, joint.axes[0]
+            along = axis[None] if body is rigid.model.ground else R[:, body.number] @ axis
+            apart = apart - np.sum(apart * along, axis=1)[:, None] * along
+        found = np.maximum(found, np.linalg.norm(apart, axis=1))
+    return found

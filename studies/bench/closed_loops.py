@@ -1,0 +1,282 @@
+"""Mechanisms with closed loops made of bodies and joints, for programs that take such: a model each, and its time."""
+
+import math
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.integrate import solve_ivp
+from scipy.optimize import brentq
+
+from twoloop.bodies import PlanarModel, SpatialModel
+from twoloop.bodies.model_problem import ModelProblem
+from twoloop.mechanisms import andrews as ready_andrews
+from twoloop.mechanisms import four_bar as ready_four_bar
+from twoloop.mechanisms.andrews import (
+    DA,
+    EE,
+    FF,
+    LENGTH,
+    RA,
+    RR,
+    SA,
+    SB,
+    SC,
+    SD,
+    SPRING,
+    TA,
+    TB,
+    TORQUE,
+    UA,
+    UB,
+    XA,
+    XB,
+    XC,
+    YA,
+    YB,
+    YC,
+    ZT,
+    D,
+    U,
+)
+
+Array = NDArray[np.float64]
+
+
+def _closing(one: Array, r: float, other: Array, s: float, side: float = 1.0) -> Array:
+    """The point at distances r and s from two points, to the left of the way from one to the other."""
+    along = other - one
+    d = float(np.linalg.norm(along))
+    x = (r * r - s * s + d * d) / (2.0 * d)
+    y = side * math.sqrt(r * r - x * x)
+    return one + (x * along + y * np.array([-along[1], along[0]])) / d
+
+
+def _linkage(
+    name: str, crank: float, coupler: float, rocker: float, base: float, angle: float, rate: float
+) -> PlanarModel:
+    """A four-bar linkage of uniform rods of 1 kg/m, its crank at an angle and turning."""
+    O, C = np.zeros(2), np.array([base, 0.0])
+    A = crank * np.array([math.cos(angle), math.sin(angle)])
+    B = _closing(A, coupler, C, rocker)
+    model = PlanarModel(name=name)
+    model.rod("crank", O, A, mass=crank, angular_velocity=rate)
+    model.rod("coupler", A, B, mass=coupler)
+    model.rod("rocker", B, C, mass=rocker)
+    for pair, at in (
+        (("ground", "crank"), O),
+        (("crank", "coupler"), A),
+        (("coupler", "rocker"), B),
+        (("rocker", "ground"), C),
+    ):
+        model.revolute(*pair, at=at)
+    return model
+
+
+def four_bar() -> ModelProblem:
+    """The four-bar of the paper, 1, 2 and 1.5 m on 3 m, as the library starts it."""
+    known = ready_four_bar()
+    q, v = known.q0.reshape(3, 3), known.v0.reshape(3, 3)
+    model = PlanarModel(name="four-bar")
+    lengths = (1.0, 2.0, 1.5)
+    for k, long in enumerate(lengths):
+        motion = {"velocity": v[k, :2], "angular_velocity": v[k, 2]}
+        model.body(f"bar {k + 1}", mass=long, inertia=long**3 / 12.0, position=q[k, :2], angle=q[k, 2], **motion)
+    ends = [
+        state[:2] + 0.5 * long * np.array([math.cos(state[2]), math.sin(state[2])])
+        for long, state in zip(lengths, q, strict=True)
+    ]
+    for pair, at in ((("ground", "bar 1"), (0.0, 0.0)), (("bar 1", "bar 2"), ends[0]), (("bar 2", "bar 3"), ends[1])):
+        model.revolute(*pair, at=at)
+    model.revolute("bar 3", "ground", at=(3.0, 0.0))
+    return model.problem((0.0, 10.0))
+
+
+def crank_rocker() -> ModelProblem:
+    """A four-bar whose crank turns round: 0.5, 2 and 1.5 m on 1.8 m."""
+    return _linkage("crank-rocker", 0.5, 2.0, 1.5, 1.8, 0.5, 8.0).problem((0.0, 10.0))
+
+
+def parallelogram() -> ModelProblem:
+    """1, 2 and 1 m on 2 m: the bars line up twice a turn, where it could fold."""
+    return _linkage("parallelogram", 1.0, 2.0, 1.0, 2.0, 0.5 * math.pi, 8.0).problem((0.0, 2.0))
+
+
+def parallelogram_motion(times: Array) -> tuple[Array, Array, float]:
+    """Coordinates and velocities (9, n_t) of the parallelogram that does not fold, and how far two routes differ.
+
+    Its bars turn alike, with a moment of inertia of 2/3 + 2 kg m^2 and the weight of 3 kg at the end of a bar of 1 m.
+    """
+
+    def rates(t: float, y: Array) -> list[float]:
+        return [y[1], -3.0 * 9.81 * math.cos(y[0]) / (2.0 / 3.0 + 2.0)]
+
+    span, start = (0.0, float(times[-1])), [0.5 * math.pi, 8.0]
+    runs = [solve_ivp(rates, span, start, each, t_eval=times, rtol=1e-12, atol=1e-12).y for each in ("DOP853", "LSODA")]
+    (angle, rate), zero = runs[0], np.zeros_like(times)
+    c, s = np.cos(angle), np.sin(angle)
+    q = np.array([0.5 * c, 0.5 * s, angle, 1.0 + c, s, zero, 2.0 + 0.5 * c, 0.5 * s, angle - math.pi])
+    v = np.array([-0.5 * s, 0.5 * c, 1.0 + zero, -s, c, zero, -0.5 * s, 0.5 * c, 1.0 + zero]) * rate
+    return q, v, float(np.abs(runs[0] - runs[1]).max())
+
+
+def six_bar() -> ModelProblem:
+    """Watt's linkage: a four-bar whose coupler, a triangle, moves a second loop."""
+    O, A, B, C, D_, E, F = (0.0, 0.0), (0.0, 0.5), (1.6, 1.1), (2.0, 0.0), (0.7, 1.6), (2.6, 1.9), (3.2, 0.0)
+    model = PlanarModel(name="Watt's six-bar")
+    model.rod("crank", O, A, mass=0.5, angular_velocity=-6.0)
+    model.body("coupler", mass=2.0, inertia=0.4, position=(0.77, 1.07))
+    for name, start, end in (("rocker", B, C), ("arm", D_, E), ("post", E, F)):
+        model.rod(name, start, end, mass=1.0)
+    pins = [("ground", "crank", O), ("crank", "coupler", A), ("coupler", "rocker", B), ("rocker", "ground", C)]
+    pins += [("coupler", "arm", D_), ("arm", "post", E), ("post", "ground", F)]
+    for a, b, point in pins:
+        model.revolute(a, b, at=point)
+    return model.problem((0.0, 5.0))
+
+
+def slider_crank() -> ModelProblem:
+    """A slider-crank with two coupler rods between the same pins: the second adds a row that follows from others."""
+    crank, rod, angle = 0.5, 1.2, 0.5
+    pin = crank * np.array([math.cos(angle), math.sin(angle)])
+    end = np.array([pin[0] + math.sqrt(rod**2 - pin[1] ** 2), 0.0])
+    model = PlanarModel(name="slider-crank, two rods")
+    model.rod("crank", (0.0, 0.0), pin, mass=1.0, angular_velocity=8.0)
+    model.rod("rod", pin, end, mass=1.5)
+    model.rod("second rod", pin, end, mass=0.5)
+    model.body("slider", mass=0.8, inertia=0.02, position=end)
+    model.revolute("ground", "crank", at=(0.0, 0.0))
+    for each in ("rod", "second rod"):
+        model.revolute("crank", each, at=pin)
+        model.revolute(each, "slider", at=end)
+    model.prismatic("ground", "slider", at=end, axis=(1.0, 0.0))
+    return model.problem((0.0, 5.0))
+
+
+def closed_chain(n: int = 50) -> ModelProblem:
+    """Uniform bars, 1 kg and 2 m / n long, hung between two points 1.6 m apart, released from an arc above these."""
+    # half the angle of the arc, whose chord and length have the ratio 0.8 of n equal chords
+    half = brentq(lambda each: math.sin(each) - 0.8 * n * math.sin(each / n), 0.1, 3.0)
+    radius = 0.8 / math.sin(half)
+    angles = np.linspace(-half, half, n + 1)
+    points = np.column_stack([radius * np.sin(angles), radius * (np.cos(angles) - math.cos(half))])
+    model = PlanarModel(name=f"closed chain of {n}")
+    for k, (one, other) in enumerate(pairwise(points)):
+        model.rod(f"bar {k}", one, other, mass=1.0 / n)
+    names = ["ground", *(f"bar {k}" for k in range(n)), "ground"]
+    for (a, b), at in zip(pairwise(names), points, strict=True):
+        model.revolute(a, b, at=at)
+    return model.problem((0.0, 0.5))
+
+
+def squeezer() -> ModelProblem:
+    """Andrews' squeezing mechanism, of seven bodies, three loops, a spring and a constant torque."""
+    known = ready_andrews()
+    beta, theta, gamma, phi, delta, omega, epsilon = known.q0
+    A, B, C = np.array([XA, YA]), np.array([XB, YB]), np.array([XC, YC])
+    pin = _turned(beta, RR, 0.0)
+    shared = pin + _turned(beta + theta, -D, 0.0)
+    fourth, sixth = A + _turned(delta, ZT, 0.0), A + _turned(epsilon, 0.0, -U)
+    model = PlanarModel(gravity=(0.0, 0.0), name="Andrews' squeezer")
+    centres = (
+        (_turned(beta, RA, 0.0), beta),
+        (pin + _turned(beta + theta, -DA, 0.0), beta + theta),
+        (B + _turned(gamma, SB, -SA), gamma),
+        (fourth + _turned(phi + delta, 0.0, -EE), phi + delta),
+        (A + _turned(delta, TA, TB), delta),
+        (sixth + _turned(omega + epsilon, FF, 0.0), omega + epsilon),
+        (A + _turned(epsilon, -UB, -UA), epsilon),
+    )
+    for k, (mass, inertia, (place, angle)) in enumerate(
+        zip(known.parameters["masses"], known.parameters["inertias"], centres, strict=True), 1
+    ):
+        model.body(f"K{k}", mass=mass, inertia=inertia, position=place, angle=angle)
+    pins = [("ground", "K1", (0.0, 0.0)), ("K1", "K2", pin), ("K2", "K3", shared), ("K2", "K4", shared)]
+    pins += [("K2", "K6", shared), ("K3", "ground", B), ("K4", "K5", fourth), ("K5", "ground", A)]
+    pins += [("K6", "K7", sixth), ("K7", "ground", A)]
+    for a, b, at in pins:
+        model.revolute(a, b, at=at)
+    model.spring("ground", C, "K3", B + _turned(gamma, SD, -SC), stiffness=SPRING, length=LENGTH)
+    model.torque("K1", TORQUE)
+    return model.problem((0.0, 0.03))
+
+
+def _turned(angle: float, x: float, y: float) -> Array:
+    return np.array([math.cos(angle) * x - math.sin(angle) * y, math.sin(angle) * x + math.cos(angle) * y])
+
+
+def rssr() -> ModelProblem:
+    """A spatial four-bar with two hinges and two ball joints."""
+    model = SpatialModel(name="RSSR")
+    O, P, S, T = (0.0, 0.0, 0.0), (0.3, 0.0, 0.0), (0.9, 0.0, 1.0), (0.9, 0.0, 0.3)
+    model.rod("crank", O, P, radius=0.02, mass=0.8, angular_velocity=(0.0, 0.0, 6.0))
+    for name, start, end in (("coupler", P, S), ("rocker", T, S)):
+        model.rod(name, start, end, radius=0.02, mass=0.8)
+    model.revolute("ground", "crank", at=O, axis=(0.0, 0.0, 1.0))
+    model.spherical("crank", "coupler", at=P)
+    model.spherical("coupler", "rocker", at=S)
+    model.revolute("rocker", "ground", at=T, axis=(0.0, 1.0, 0.0))
+    return model.problem((0.0, 5.0))
+
+
+def bricard() -> ModelProblem:
+    """Bricard's six hinges, five bars of 1 kg and 1 m and the ground: it moves though its rows seem one too many."""
+    C = np.array([[0, 0, 0], [1, 0, 0], [1, -1, 0], [1, -1, 1], [0, -1, 1], [0, 0, 1]], dtype=float)
+    axes = np.eye(3)[[1, 2, 0, 1, 2, 0]]
+    model = SpatialModel(gravity=(0.0, -9.81, 0.0), name="Bricard")
+    for k in range(5):
+        R = np.column_stack([C[k + 1] - C[k], axes[k], np.cross(C[k + 1] - C[k], axes[k])])
+        moments = np.array([0.02, 1.01, 1.01]) / 12.0
+        model.body(f"bar {k + 1}", mass=1.0, inertia=moments, position=0.5 * (C[k] + C[k + 1]), rotation=R)
+    for k in range(6):
+        a, b = (f"bar {j}" if 1 <= j <= 5 else "ground" for j in (k, k + 1))
+        model.revolute(a, b, at=C[k], axis=axes[k])
+    return model.problem((0.0, 10.0))
+
+
+def governor() -> ModelProblem:
+    """Watt's flyball governor: arms hinged to a turning shaft, links from these to a sleeve that slides on it."""
+    model = SpatialModel(name="flyball governor")
+    y, z = (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
+    spin = (0.0, 0.0, 9.0)
+    model.rod("shaft", (0.0, 0.0, 0.0), z, radius=0.02, mass=1.0, angular_velocity=spin)
+    angle, long = math.radians(35.0), 0.4
+    drop, out = long * math.cos(angle), long * math.sin(angle)
+    model.box("sleeve", (0.1, 0.1, 0.1), mass=2.0, position=(0.0, 0.0, 1.0 - 2.0 * drop))
+    model.revolute("ground", "shaft", at=(0.0, 0.0, 0.0), axis=z)
+    model.prismatic("shaft", "sleeve", at=(0.0, 0.0, 1.0 - 2.0 * drop), axis=z)
+    for name, side in (("right", 1.0), ("left", -1.0)):
+        top, elbow = np.array([side * 0.05, 0.0, 1.0]), np.array([side * (0.05 + out), 0.0, 1.0 - drop])
+        low = np.array([side * 0.05, 0.0, 1.0 - 2.0 * drop])
+        model.rod(f"{name} arm", top, elbow, radius=0.02, mass=1.5)
+        model.rod(f"{name} link", elbow, low, radius=0.01, mass=0.3)
+        model.revolute("shaft", f"{name} arm", at=top, axis=y)
+        model.revolute(f"{name} arm", f"{name} link", at=elbow, axis=y)
+        model.revolute(f"{name} link", "sleeve", at=low, axis=y)
+    return model.problem((0.0, 5.0))
+
+
+def stewart() -> ModelProblem:
+    """A platform on six legs, each two bodies that slide on one another, with a spring from base to platform."""
+    model = SpatialModel(name="Stewart platform")
+    model.body("platform", mass=4.0, inertia=(0.4, 0.4, 0.8), position=(0.0, 0.0, 1.0), velocity=(0.3, 0.1, 0.0))
+    for k in range(6):
+        low, high = (math.radians(60.0 * (k // 2 * 2) + side * (1 if k % 2 else -1)) for side in (10.0, 50.0))
+        foot = np.array([math.cos(low), math.sin(low), 0.0])
+        top = np.array([0.5 * math.cos(high), 0.5 * math.sin(high), 1.0])
+        along = (top - foot) / np.linalg.norm(top - foot)
+        model.rod(f"cylinder {k}", foot, foot + 0.55 * (top - foot), radius=0.03, mass=0.6)
+        model.rod(f"piston {k}", foot + 0.45 * (top - foot), top, radius=0.02, mass=0.4)
+        across = np.cross(along, (0.0, 0.0, 1.0))
+        across /= np.linalg.norm(across)
+        model.universal("ground", f"cylinder {k}", at=foot, axes=(across, np.cross(along, across)))
+        model.prismatic(f"cylinder {k}", f"piston {k}", at=0.5 * (foot + top), axis=along)
+        model.spherical(f"piston {k}", "platform", at=top)
+        model.spring("ground", foot, "platform", top, stiffness=600.0, length=1.05 * float(np.linalg.norm(top - foot)))
+    return model.problem((0.0, 3.0))
+
+
+MECHANISMS = (
+    *(four_bar, crank_rocker, parallelogram, six_bar, slider_crank, squeezer, closed_chain),
+    *(rssr, bricard, governor, stewart),
+)

@@ -1,0 +1,170 @@
+"""Runs of physics engines on closed loops: reference motions, gates before anything is timed, and rows."""
+
+import time
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from references.engines.rigid import (
+    Motion,
+    Prepared,
+    Rigid,
+    coordinates,
+    gaps,
+    largest_moment,
+    rigid_of,
+    states,
+    tensor,
+)
+from studies.bench.closed_loops import parallelogram, parallelogram_motion
+from studies.bench.store import Array, Row
+from twoloop import ConstraintWarning, solve_dae
+from twoloop.bodies.model_problem import ModelProblem
+
+INSTANTS = 50  # beside the start, at which motions are compared
+TIGHT = 1e-12  # tolerance of both routes to a reference
+LIMIT = 1.0  # s of CPU that the next finer run may be expected to take
+# time of the gates, as a share of the span, and steps within it, of which one pair must do: Drake's loops take some
+# steps to hold, and Exudyn's accelerations carry rounding over the square of the step
+GATES = (1e-5, 1), (1e-5, 10), (1e-5, 200), (1e-3, 20)
+SAME_POSE, SAME_INERTIA, SAME_ACCELERATION, SAME_PLACE = 1e-9, 1e-9, 5e-3, 1e-6
+TIMED, ENOUGH = 3, 0.3  # calls of which the shortest counts, and s of CPU after which no further one is made
+
+
+@dataclass(frozen=True)
+class Loop:
+    """A mechanism with its reference; `floor`: how far its two routes differ, over all instants."""
+
+    problem: ModelProblem
+
+    @cached_property
+    def rigid(self) -> Rigid:
+        """As engines are given it."""
+        return rigid_of(self.problem)
+
+    @property
+    def t_end(self) -> float:
+        """Its time, s."""
+        return self.problem.t_span[1]
+
+    @cached_property
+    def times(self) -> Array:
+        """The instants, with the start."""
+        return np.linspace(0.0, self.t_end, INSTANTS + 1)
+
+    def ours(self, tolerance: float, method: str = "auto", times: Array | None = None, t0: float = 0.0) -> Any:
+        """A run of ours."""
+        options: dict[str, Any] = {"method": method, "rtol": tolerance, "atol": tolerance, "t_eval": times}
+        options |= {} if method == "auto" else {"compiled": False}  # references are no reason to compile
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", ConstraintWarning)
+            problem = self.problem
+            return solve_dae(problem.system, (t0, t0 + self.t_end), problem.q0, problem.v0, **options)
+
+    @cached_property
+    def reference(self) -> tuple[Motion, float]:
+        """The motion by a route, and how far another, unlike, ends up from it at any instant.
+
+        Raises
+        ------
+        RuntimeError
+            If one of them fails.
+        """
+        if self.problem.name == parallelogram().name:  # ours do not cross its singular positions so tightly
+            q, v, apart = parallelogram_motion(self.times)
+            return self.motion(q, v), apart
+        runs = [self.ours(TIGHT, method, self.times) for method in ("DOP853", "RadauIIA9")]
+        if not all(run.success for run in runs):
+            raise RuntimeError(next(run.message for run in runs if not run.success))
+        one, other = (self.motion(run.q, run.v) for run in runs)
+        return one, float(max(np.abs(one.x - other.x).max(), np.abs(one.R - other.R).max()))
+
+    def motion(self, q: Array, v: Array, call_s: float = 0.0, stepping_s: float = 0.0) -> Motion:
+        """Of coordinates of the model, at the instants."""
+        return Motion(self.times[: q.shape[1]], *states(self.rigid.planar, q, v), call_s, stepping_s)
+
+    @cached_property
+    def start_rates(self) -> dict[float, tuple[Array, Array]]:
+        """Changes of v and w within the times of the gates, by these."""
+        spans = [0.0, *sorted({share * self.t_end for share, _ in GATES})]
+        run = self.ours(TIGHT, "DOP853", np.array(spans))
+        _, _, v, w = states(self.rigid.planar, run.q, run.v)
+        return {span: (v[k] - v[0], w[k] - w[0]) for k, span in enumerate(spans)}
+
+
+def gate(loop: Loop, prepared: Prepared) -> str:
+    """What is wrong with a model before anything is timed; nothing if it is the mechanism that was asked for."""
+    rigid = loop.rigid
+    bodies = rigid.model.bodies
+    for what, own, given in (
+        ("mass", prepared.masses, [body.inertia[0] for body in bodies]),
+        ("largest moment of inertia", prepared.moments, [largest_moment(body.inertia) for body in bodies]),
+    ):
+        for body, one, other in zip(bodies, own, given, strict=True):
+            if abs(one - other) > SAME_INERTIA * other:
+                return f"the {what} of {body.name!r} is {one:.6g} instead of {other:.6g}"
+    wrong = ""
+    for share, n_steps in GATES:
+        span = share * loop.t_end
+        motion = prepared.run(span, n_steps, 1)
+        if motion.message:
+            wrong = f"the first steps fail: {motion.message}"
+            continue
+        pose = max(np.abs(motion.x[0] - rigid.x).max(), np.abs(motion.R[0] - rigid.R).max())
+        if pose > SAME_POSE:
+            return f"the pose at the start is off by {pose:.2g}"
+        gap = gaps(rigid, motion.x, motion.R)[-1]
+        wrong = _accelerated(loop, motion, span) or (
+            f"joints gape by {gap:.2g} m at the start" if gap > SAME_PLACE else ""
+        )
+        if not wrong:
+            return ""
+    return wrong
+
+
+def _accelerated(loop: Loop, motion: Motion, span: float) -> str:
+    """Whether velocities change as they should, those of turning at the bodies' radii of gyration."""
+    dv, dw = loop.start_rates[span]
+    bodies = loop.rigid.model.bodies
+    size = np.array([np.sqrt(np.trace(tensor(each.inertia)) / 2.0 / each.inertia[0]) for each in bodies])[:, None]
+    changes = (motion.v[1] - motion.v[0], dv), (size * (motion.w[1] - motion.w[0]), size * dw)
+    largest = max(float(np.abs(expected).max()) for _, expected in changes)
+    for name, (change, expected) in zip(("", "angular "), changes, strict=True):
+        off = np.abs(change - expected).max() / largest
+        if off > SAME_ACCELERATION:
+            return f"{name}accelerations at the start are off by {off:.2g} of the largest: a loop, an inertia, a motor?"
+    return ""
+
+
+def errors(loop: Loop, motion: Motion) -> Row:
+    """What a motion that reached its end is off by, at the instants."""
+    (known, _), rigid = loop.reference, loop.rigid
+    off = max(np.abs(motion.x - known.x).max(), np.abs(motion.R - known.R).max())
+    fastest = max(np.linalg.norm(known.v, axis=2).max(), 1e-12)
+    energies, kinetic = [], 0.0
+    for each in (motion, known):
+        energies.append(loop.problem.energy(each.t, *coordinates(each, rigid.planar)))
+    J = np.array([tensor(body.inertia) for body in rigid.model.bodies])
+    local = np.einsum("tkji,tkj->tki", known.R, known.w)
+    m = np.array([body.inertia[0] for body in rigid.model.bodies])
+    kinetic = 0.5 * (m * (known.v**2).sum(axis=2) + np.einsum("tki,kij,tkj->tk", local, J, local)).sum(axis=1).max()
+    return {
+        "error_q": float(off),
+        "error_v": float(np.abs(motion.v - known.v).max() / fastest),
+        "gap": float(gaps(rigid, motion.x, motion.R).max()),
+        "energy": float(np.abs(energies[0] - energies[1]).max() / kinetic),
+    }
+
+
+def timed(run: Callable[[int], Motion]) -> tuple[float, float]:
+    """CPU time of the shortest of some calls, whole and stepping; run(k) makes the k-th."""
+    calls: list[tuple[float, float]] = []
+    began = time.process_time()
+    while len(calls) < TIMED and (not calls or time.process_time() - began < ENOUGH):
+        motion = run(len(calls))
+        calls.append((motion.call_s, motion.stepping_s))
+    return min(calls)

@@ -1,0 +1,154 @@
+"""Models of closed loops in physics engines: inertia, kinematics, accelerations; and what the gates catch."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from references.engines import drake, exudyn_bodies, mujoco, pinocchio
+from references.engines.rigid import coordinates, cut_points, gaps, rigid_of
+from studies.bench.closed_loops import MECHANISMS, bricard, closed_chain, parallelogram, rssr, squeezer, stewart
+from studies.bench.engine_runs import Loop, errors, gate
+from twoloop.bodies import PlanarModel, SpatialModel
+
+RIGID = {
+    "mujoco": (mujoco, mujoco.Settings("RK4", "1e-9 1", "0.9999 0.9999 0.001"), "mujoco"),
+    "drake": (drake, drake.Settings(), "pydrake"),
+    "pinocchio": (pinocchio, pinocchio.Settings("RK4", 1e-8), "pinocchio"),
+    "exudyn": (exudyn_bodies, exudyn_bodies.Settings(), "exudyn"),
+}
+engines = pytest.mark.parametrize("engine", RIGID)
+
+
+def prepared(engine, rigid):
+    module, settings, package = RIGID[engine]
+    pytest.importorskip(package)
+    return module.prepare(rigid, settings)
+
+
+@pytest.fixture(scope="module")
+def loops():
+    """A planar mechanism with a spring and a torque, and one in space with tensors, turned axes and swapped bodies."""
+    return Loop(squeezer()), Loop(crooked())
+
+
+def crooked():
+    """Hinge, cross, ball and hinge; bodies with axes and tensors in any direction, the whole turned in space."""
+    Q, *turns = Rotation.random(7, random_state=5).as_matrix()
+    O, P, S, D = np.array([(0.0, 0.0, 0.0), (0.3, 0.0, 0.0), (0.9, 0.0, 1.0), (0.9, 0.0, 0.3)]) @ Q.T
+    x, y, z = Q.T
+    model = SpatialModel(gravity=-9.81 * z, name="crooked")
+    for k, (name, start, end) in enumerate((("crank", O, P), ("coupler", P, S), ("rocker", D, S))):
+        motion = {"angular_velocity": 6.0 * z} if k == 0 else {}
+        J = turns[k] @ np.diag([0.02, 0.05, 0.06]) @ turns[k].T
+        model.body(name, mass=0.8, inertia=J, position=0.4 * start + 0.6 * end, rotation=turns[3 + k], **motion)
+    model.revolute("crank", "ground", at=O, axis=z)
+    model.universal("coupler", "crank", at=P, axes=(x - 0.6 * z, y))
+    model.spherical("coupler", "rocker", at=S)
+    model.revolute("rocker", "ground", at=D, axis=y)
+    return model.problem((0.0, 1.0))
+
+
+@engines
+@pytest.mark.parametrize("k", [0, 1])
+def test_models_pass_the_gates_and_move_as_they_should(loops, engine, k):
+    ready = prepared(engine, loops[k].rigid)
+    assert gate(loops[k], ready) == ""
+    assert errors(loops[k], ready.run(loops[k].t_end, 2000, 50))["error_q"] < 0.1
+
+
+@engines
+def test_gates_catch_a_loop_an_inertia_a_mass_and_a_torque(loops, engine):
+    loop = loops[0]
+    rigid = loop.rigid
+
+    def model(change):
+        problem = squeezer()
+        body = problem.model.bodies[2]
+        change(problem.model, body.inertia)
+        return rigid_of(problem)
+
+    def lose_inertia(model, inertia):
+        inertia[1] *= 0.5
+
+    def lose_mass(model, inertia):
+        inertia[0] *= 0.5
+
+    def lose_joint(model, inertia):
+        model.joints.remove(next(joint for joint in model.joints if joint.name == cut))
+
+    cut = rigid.loops[0].name
+    assert "the largest moment of inertia of 'K3' is 2." in gate(loop, prepared(engine, model(lose_inertia)))
+    assert "the mass of 'K3' is 0." in gate(loop, prepared(engine, model(lose_mass)))
+    assert "accelerations" in gate(loop, prepared(engine, model(lose_joint)))
+    turned = replace(rigid, torques=1.1 * rigid.torques)
+    assert "accelerations" in gate(loop, prepared(engine, turned))
+
+
+@pytest.mark.parametrize(("engine", "order"), [("mujoco", 1.7), ("drake", 0.8), ("pinocchio", 3.5), ("exudyn", 1.8)])
+def test_errors_fall_with_the_step(engine, order):
+    problem = rssr()
+    loop = Loop(replace(problem, t_span=(0.0, 0.2)))
+    run = prepared(engine, loop.rigid).run
+    off = [errors(loop, run(0.2, n, 50)) for n in (50, 200)]
+    assert np.log(off[0]["error_q"] / off[1]["error_q"]) / np.log(4.0) > order
+    assert off[1]["error_v"] < 0.05 and off[1]["gap"] < 1e-3
+
+
+def test_mujoco_has_the_masses_and_moments_that_it_is_given():
+    package = pytest.importorskip("mujoco")
+    rigid = rigid_of(stewart())
+    model = package.MjModel.from_xml_string(mujoco.file_of(rigid, mujoco.Settings()))
+    for body in rigid.model.bodies:
+        own = model.body(body.name)
+        np.testing.assert_allclose(own.mass, body.inertia[0])
+        np.testing.assert_allclose(sorted(own.inertia), sorted(body.inertia[1:4]), rtol=1e-9)
+
+
+def test_pinocchio_adds_joints_branch_by_branch():
+    pin = pytest.importorskip("pinocchio")
+    model, frames = pinocchio._tree(pin, rigid_of(stewart()))
+    for number in range(1, model.njoints):  # the joints of a branch follow one another
+        branch = list(model.subtrees[number])
+        assert branch == list(range(number, number + len(branch)))
+    assert len(frames) == 14
+
+
+@pytest.mark.parametrize("make", MECHANISMS)
+def test_loops_are_cut_between_bodies_that_move_and_close(make):
+    problem = closed_chain(6) if make is closed_chain else make()
+    rigid = rigid_of(problem)
+    for a, on_a, b, on_b in cut_points(rigid):
+        assert rigid.model.ground not in (a, b)
+        np.testing.assert_allclose(a.in_space(on_a), b.in_space(on_b), atol=1e-12)
+    assert gaps(rigid, rigid.x[None], rigid.R[None])[0] < 1e-12
+    assert problem.freedom.degrees >= 1
+
+
+def test_coordinates_come_back_from_motions(loops):
+    for loop in (*loops, Loop(parallelogram()), Loop(bricard())):
+        rigid = loop.rigid
+        one = loop.motion(loop.problem.q0[:, None], loop.problem.v0[:, None])
+        q, v = coordinates(one, rigid.planar)
+        again = loop.motion(q, v)
+        for name in ("x", "R", "v", "w"):
+            np.testing.assert_allclose(getattr(one, name), getattr(again, name), atol=1e-9)
+
+
+def test_a_joint_without_a_counterpart_is_named():
+    pytest.importorskip("exudyn")
+    model = SpatialModel(name="sleeve")
+    model.rod("bar", (0.0, 0.0, 0.0), (1.0, 0.0, 0.0), radius=0.02, mass=1.0)
+    model.cylindrical("ground", "bar", at=(0.0, 0.0, 0.0), axis=(1.0, 0.0, 0.0))
+    with pytest.raises(ValueError, match="is cylindrical"):
+        exudyn_bodies.prepare(rigid_of(model.problem()))
+
+
+def test_what_no_engine_is_given_is_refused():
+    model = PlanarModel(name="arm")
+    model.rod("bar", (0.0, 0.0), (1.0, 0.0), mass=1.0)
+    hinge = model.revolute("ground", "bar", at=(0.0, 0.0))
+    model.motor(hinge, lambda t: 1.0 + t, name="servo")
+    with pytest.raises(ValueError, match="not 'servo'"):
+        rigid_of(model.problem())

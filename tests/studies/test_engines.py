@@ -1,0 +1,83 @@
+"""The study of engines: orders and floors, prices and settings turn with the rows; without engines it says so."""
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from studies import engines
+from studies.bench.closed_loops import four_bar
+from studies.bench.render import render
+
+STEPS = np.array([1e-2, 3e-3, 1e-3, 3e-4])
+RUNS = {"family": "MuJoCo", "status": "REACHED_END", "message": "", "floor": 1e-11, "gap": 1e-6}
+
+
+def made(solver, errors, cost=1.0, case="four-bar", **more):
+    family = solver.split(", ")[0]
+    rows = []
+    for k, (h, error) in enumerate(zip(STEPS, errors, strict=True)):
+        own = {"tol": h**2, "h": None} if family == "twoloop" else {"tol": None, "h": h, "n_steps": int(1.0 / h)}
+        rows.append({"group": "run", "case": case, "solver": solver, "error_q": error, "call_s": cost * 2.0**k, **own})
+    return pd.DataFrame(rows).assign(**RUNS | {"family": family} | more, stepping_s=lambda each: each["call_s"])
+
+
+def said(*parts):
+    gates = [{"group": "gate", "case": "four-bar", "solver": name, "family": name} for name in ("MuJoCo", "Drake")]
+    head = pd.DataFrame(gates).assign(status=["PASSED", "NOT_AVAILABLE"], message=["", "drake is not installed"])
+    rows = pd.concat([head, *parts], ignore_index=True)
+    found = engines.findings_of(rows)
+    tables = engines.tables_of(rows, found)
+    return found, render("engines", found, tables, stamp="stamp", quick=False, rows=rows)
+
+
+def test_order_and_floor():
+    order, floor = engines.order_and_floor(STEPS, 50.0 * STEPS**2, 1e-12)
+    assert order == pytest.approx(2.0) and floor is None
+    order, floor = engines.order_and_floor(STEPS, [1e-2, 1.2e-3, 1.1e-3, 1.1e-3], 1e-12)
+    assert order is None and floor == 1.1e-3
+    assert engines.order_and_floor(STEPS, [1.9, 1.8, 1.9, 1.8], 1e-12) == (None, None)  # the motion is lost
+
+
+def test_what_to_set_and_what_is_wrong_follow_the_rows():
+    flat = made("MuJoCo, default", [0.5, 0.3, 0.29, 0.28])
+    good = made("MuJoCo, RK4, solref 2h", 10.0 * STEPS**2)
+    ours = made("twoloop, default", 1e-1 * STEPS**2, cost=0.1)
+    found, text = said(flat, good, ours)
+    by_name = {each["name"]: each for each in found["configurations"]}
+    assert by_name["MuJoCo, default"]["silent"] == 4 and by_name["MuJoCo, default"]["lost"] == 1
+    assert by_name["MuJoCo, default"]["floor"] == [0.28, 0.28]
+    assert found["wins_engines"][1] == {"MuJoCo": 1} and found["wins_at"][1] == {"twoloop": 1}
+    assert "RK4, solref 2h: 1 of 1, h = 10 ms" in text and "Not installed, and so without rows: Drake." in text
+    found, text = said(flat, good.assign(call_s=0.01), ours)
+    assert found["wins_at"][1] == {"MuJoCo": 1}
+
+
+def test_an_engine_that_is_not_there_is_a_row(monkeypatch):
+    def absent(rigid, settings):
+        raise RuntimeError("mujoco is not installed: make engines")
+
+    monkeypatch.setattr(engines.mujoco, "prepare", absent)
+    engines.gated.cache_clear()
+    row = engines.run_row(four_bar, engines.CONFIGURATIONS[0], 100, [])
+    engines.gated.cache_clear()
+    assert row["status"] == "NOT_AVAILABLE" and "not installed" in row["message"] and row["error_q"] is None
+
+
+def test_a_model_that_fails_its_gates_is_not_timed(monkeypatch):
+    monkeypatch.setattr(engines, "gated", lambda build, engine: ("GATE_FAILED", "a loop is missing"))
+    row = engines.run_row(four_bar, engines.CONFIGURATIONS[0], 100, [])
+    assert row["status"] == "GATE_FAILED" and row["call_s"] is None
+
+
+def test_ours_runs_without_any_engine():
+    ours = next(each for each in engines.CONFIGURATIONS if each.engine == engines.OURS)
+    row = engines.run_row(four_bar, ours, 1e-8, [])
+    assert row["error_q"] < 1e-5 and row["gap"] < 1e-12 and row["energy"] < 1e-6
+    assert 0.0 < row["stepping_s"] <= row["call_s"]
+
+
+@pytest.mark.slow
+def test_the_quick_run(tmp_path):
+    engines.main(["--quick", "--out", str(tmp_path)])
+    text = (tmp_path / "engines.md").read_text()
+    assert "Quick run" in text and (tmp_path / "engines.png").is_file()
