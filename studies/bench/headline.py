@@ -103,12 +103,13 @@ def price(rows: pd.DataFrame, firsts: pd.DataFrame, case: str) -> dict[str, Any]
     Returns
     -------
     dict
-        case, t_end, errors, first_at (tolerance of the first calls, None without them), elsewhere_s (what a call of the
-        default from another start takes longer, None where that was not measured), and lines: name, first_s or None,
+        case, processor ("": not kept), t_end, errors, first_at (tolerance of the first calls, None without them),
+        elsewhere_s (what a call of the default from another start takes longer, None where that was not measured), and
+        lines: name, first_s or None,
         and at each error solver, call_s, inside_s (of it inside the integrator, of the cheapest run that is good
-        enough; None of rivals), keeps (the constraints), from_python and near (error and call_s of a run that nearly
-        gets there and takes much less, or None), or in their place why there is none: "not run", "not reached", "not
-        asked".
+        enough; None of rivals), keeps (the constraints), from_python and near (asked, error and call_s of a run that
+        nearly gets there and takes much less, or None), or in their place why there is none: "not run", "not reached",
+        "not asked".
     """
     rows = rows[rows["case"] == case]
     if rows.empty:
@@ -123,6 +124,7 @@ def price(rows: pd.DataFrame, firsts: pd.DataFrame, case: str) -> dict[str, Any]
         first_s = float(built["first_call_s"].min()) if len(built) else None
         lines.append({"name": name, "first_s": first_s, "at": [_priced(runs, error, rival) for error in PRICED]})
     found = {"case": case, "t_end": float(rows["t_end"].iloc[0]), "errors": list(PRICED), "lines": lines}
+    found["processor"] = str(rows["processor"].iloc[0]) if "processor" in rows else ""
     return found | {"first_at": float(first["tol"].iloc[0]) if len(first) else None, "elsewhere_s": _elsewhere(first)}
 
 
@@ -161,4 +163,4 @@ def _near(runs: pd.DataFrame, error: float, call_s: float) -> dict[str, float] |
     if near.empty:
         return None
     run = near.loc[near["call_s"].astype(float).idxmin()]
-    return {"error": float(run["error_q"]), "call_s": float(run["call_s"])}
+    return {"asked": error, "error": float(run["error_q"]), "call_s": float(run["call_s"])}

@@ -38,6 +38,7 @@ RANGES = {  # of errors; none: all of them on the mechanisms that cross singular
     "1e-10 to 1e-13": DECADES[7:],
     "singular positions": (),
 }
+TYPICAL = (1e-4, 1e-6, 1e-8, 1e-10)  # errors at which the default is compared with the cheapest rival in the median
 SHOWN = DECADES[::2]  # at which the four-bars are judged
 DOWN_TO = 1e-12  # the error down to which no rival was to be ahead
 AHEAD = {"heyoka": 2, "rivals called from Python": 8, "other compiled rivals": 4}  # aimed at on the four-bars
@@ -180,6 +181,7 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     found["put"] = put(rows)
     found["with_code"] = [each["case"] for each in made if given_on(each["case"]) == headline.OWN_CODE]
     found["ranges"] = [_within(made, name, errors) for name, errors in RANGES.items()]
+    found["typical"] = [each for error in TYPICAL if (each := _typical(made, error)) is not None]
     python = rows[rows["called_from"] == "Python"]["solver"].unique()
     ahead = [at["standing"][headline.BEST] for at in every if at["standing"][headline.BEST]["verdict"] == "ahead"]
     found["ahead_of_python"] = sum(best["rival"]["solver"] in python for best in ahead)
@@ -193,6 +195,18 @@ def _within(made: Sequence[dict[str, Any]], name: str, errors: Sequence[float]) 
     own = [each for each in made if ("singular" in each["tags"]) is singular]
     pairs = [[at["standing"] for at in each["at"] if singular or at["error"] in errors] for each in own]
     return {"name": name, "n_mechanisms": len(own), "standings": headline.counted(pairs)}
+
+
+def _typical(made: Sequence[dict[str, Any]], error: float) -> dict[str, Any] | None:
+    """Time of the cheapest rival over that of the default at an error: quartiles over mechanisms.
+
+    Those with singular positions, at which accelerations are not defined, do not count. None: it is not known on any.
+    """
+    smooth = [each for each in made if "singular" not in each["tags"]]
+    ratios = [at["standing"][headline.GIVEN]["ratio"] for each in smooth for at in each["at"] if at["error"] == error]
+    known = [ratio for ratio in ratios if ratio is not None]
+    quartiles = np.percentile(known, (25, 50, 75)).tolist() if known else []
+    return {"error": error, "n": len(known), "quartiles": quartiles} if known else None
 
 
 def residual(rows: pd.DataFrame) -> dict[str, Any] | None:
