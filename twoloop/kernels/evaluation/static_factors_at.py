@@ -22,6 +22,7 @@ from twoloop.kernels.data.common import (
     RANK,
     RANK_DIFFERS,
     RANK_V,
+    SINGULAR,
     SMALLEST,
     compiled,
 )
@@ -80,10 +81,12 @@ def _factor(f, w, least):
 
 @compiled
 def _fault(w, t, q):
-    """Which values are not finite; NEEDS_DENSE where all are."""
+    """Which values are not finite; where all are, whether M is to blame, which dense forms may do with, or the rows."""
     if not finite_vector(w.mass_values):
         return not_finite(w.notes, MASS, t, q)
-    return NEEDS_DENSE if finite_vector(w.jacobian_values) else not_finite(w.notes, JACOBIAN, t, q)
+    if not finite_vector(w.jacobian_values):
+        return not_finite(w.notes, JACOBIAN, t, q)
+    return NEEDS_DENSE if w.notes[SMALLEST] < 0.0 else SINGULAR
 
 
 @compiled
@@ -202,7 +205,7 @@ def _choose(f, w, t, q):
 def _take(w):
     """Make the rows that count those of the workspace, which has room for so many."""
     if _number(w.counts) != w.rows_v.size:
-        return NEEDS_DENSE
+        return SINGULAR
     place = 0
     for i in range(w.counts.size):
         if w.counts[i] != 0.0:
