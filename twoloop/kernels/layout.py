@@ -131,7 +131,7 @@ def _of_static_form(n_q: int, n_c: int, rank: int, static: Static) -> tuple[dict
         "pattern": (n_rows, n_q),
         "mass_pattern": (side, side),
         "z": (n_c,),
-        "minimum": (n_redundant * (n_c + n_redundant + 1),),
+        "minimum": ((static.n_factors + n + n_q) * (n_redundant > 0),),
         "predicted": (n_q,),
         "mass_values": (static.n_mass_values,),
         "jacobian_values": (static.n_jacobian_values,),

@@ -13,9 +13,10 @@ from twoloop.checks.consistency import (
     pattern_of,
 )
 from twoloop.checks.rank import SHOWN, equations_in_words, in_words
-from twoloop.checks.sparse_rows import norms
+from twoloop.checks.sparse_rows import SparseRows, norms
 from twoloop.kernels.compile.linking import direct
 from twoloop.kernels.data import common
+from twoloop.kernels.evaluation.tasks import SOLVE
 from twoloop.kernels.layout import copy_of
 from twoloop.methods.plan import Plan, least_tolerance
 from twoloop.problem.system import ConstrainedSystem
@@ -240,16 +241,17 @@ class Run:
         )
 
     def _in_words(self, rows: list[int]) -> str:
-        """Which rows depend on which others; the static form has found the shares when it found the multipliers."""
+        """Which rows depend on which others; the factors of the static form tell the shares of the first."""
         q = self.state[: self.system.n_q]
         counted = self.work.rows_v.tolist()
         if self.static is None or set(rows) & set(counted):
             return in_words(self.system.rows(self.t0, q), rows)
-        n_rows = self.system.n_c
-        shares = -self.work.minimum[: (n_rows - len(counted)) * n_rows].reshape(-1, n_rows)
         all_rows = self.system.sparse_rows(self.t0, q)
-        lengths = norms(all_rows)
-        return equations_in_words(rows, counted, shares[:SHOWN, counted], lengths)
+        assert isinstance(all_rows, SparseRows)
+        shares, zero, x = np.zeros((min(SHOWN, len(rows)), len(all_rows))), np.zeros(len(all_rows)), np.zeros_like(q)
+        for row, share in zip(rows, shares, strict=False):
+            direct(self.kit.inner)(self.kit, self.work, SOLVE, self.t0, all_rows.row(row), zero, 0.0, x, share)
+        return equations_in_words(rows, counted, shares[:, counted], norms(all_rows))
 
     def set_sizes(self, first_step: float | None, max_step: float, t1: float) -> None:
         """Set the first and the largest step, s."""

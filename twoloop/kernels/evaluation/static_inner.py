@@ -31,11 +31,11 @@ from twoloop.kernels.evaluation.program import gamma_by_program
 from twoloop.kernels.evaluation.static_factors_at import (
     choose_rows,
     factors_there,
-    least_norm,
     mass_values_there,
     refinements,
     solve_values,
 )
+from twoloop.kernels.evaluation.static_least_norm import least_norm
 from twoloop.kernels.evaluation.tasks import (
     ACCELERATIONS,
     EVALUATE,
@@ -108,8 +108,7 @@ def _accelerate(f, w, t, q, v, a):
 def _equilibrate(f, w, lam):
     """Multipliers of all rows, of least norm where rows are redundant."""
     copy(w.z, lam)
-    if w.rows_v.size < lam.size:
-        least_norm(f, w, lam)
+    return least_norm(f, w, lam) if w.rows_v.size < lam.size else DONE
 
 
 @compiled
@@ -234,8 +233,7 @@ def static_inner_loop(f, w, task, t, q, v, tolerance, a, lam):
         code = factors_there(f, w, t, q)
         return _accelerate(f, w, t, q, v, a) if code == DONE else code
     if task == MULTIPLIERS:
-        _equilibrate(f, w, lam)
-        return DONE
+        return _equilibrate(f, w, lam)
     if task >= TANGENTS:
         return _other_task(f, w, task, t, q, v, a, lam)
     code = DONE
@@ -246,5 +244,5 @@ def static_inner_loop(f, w, task, t, q, v, tolerance, a, lam):
     code = _accelerate(f, w, t, q, v, a)
     if code != DONE or task == EVALUATE:
         return code
-    _equilibrate(f, w, lam)
-    return DONE if _is_as_planned(w) else NEEDS_DENSE
+    code = _equilibrate(f, w, lam)
+    return code if _is_as_planned(w) else NEEDS_DENSE
