@@ -16,7 +16,7 @@ from twoloop.kernels.algebra.static_factors import factor, solve
 from twoloop.kernels.algebra.static_program import N_OFF, N_PIVOTS, jacobian_of, order_of
 from twoloop.kernels.data.common import DONE, NEEDS_DENSE, compiled
 
-SHARE = 1e-9  # of the squares of a column of G: W
+SHARE = 1e-11  # of the squares of a column of G: W
 ENOUGH = 1e-14  # of the largest force: what may be left of b
 ALLOWED = 1e-9  # ... and what may be left where it no longer shrinks
 MOST = 30  # solutions
