@@ -46,6 +46,7 @@ class _Holds:
         self.parts = _Sets(n_bodies)
         self.grounded = [False] * n_bodies
         self.hangs: list[set[int]] = [set() for _ in range(n_bodies)]
+        self.hanging: dict[int, list[int]] = {hub: [] for hub in hubs}  # bodies whose parts hang, or hung, on a hub
 
     def lets(self, joint: int) -> bool:
         """Whether a joint may be eliminated."""
@@ -63,7 +64,7 @@ class _Holds:
     def eliminate_hub(self, hub: int) -> None:
         """Join the parts that hang on a hub, and the hub."""
         self.hubs.discard(hub)
-        hanging = [body for body in range(len(self.hangs)) if hub in self.hangs[body]]
+        hanging = self.hanging.pop(hub)
         for body in hanging:
             self.hangs[body].discard(hub)
         self._join([hub, *hanging], False, frozenset())
@@ -78,7 +79,9 @@ class _Holds:
                 hubs = {*hubs, *self.hangs[other], *self.hangs[part]}
                 part = self.parts.join(part, other)
         self.grounded[part] = self.grounded[part] or grounded
-        self.hangs[part].update(hubs)
+        for hub in hubs - self.hangs[part]:
+            self.hangs[part].add(hub)
+            self.hanging[hub].append(part)
 
 
 def elimination_order(
@@ -88,6 +91,7 @@ def elimination_order(
     jacobian_entries: tuple[Integers, Integers],
     together: Iterable[Sequence[int]] = (),
     first: Sequence[int] = (),
+    couplings: tuple[Integers, Integers] | None = None,
 ) -> Integers:
     """Coordinates j, and rows i as n_q + i, in the order of elimination.
 
@@ -100,6 +104,9 @@ def elimination_order(
         Coordinates of one body each, beyond those that M couples.
     first : sequence of int
         Rows of single bodies that come before all joints, but for those of hubs, so that they always count.
+    couplings : (rows, columns), optional
+        Entries by which bodies are coupled beside their joints, as by springs. All bodies then are hubs, each with the
+        first of its rows.
     """
     body_of = bodies_of(n_q, mass_entries, together)
     touched: list[set[int]] = [set() for _ in range(n_rows)]
@@ -116,14 +123,21 @@ def elimination_order(
         for body in joint:
             joints_of[body].append(k)
     hubs = {body for body in range(n_q) if len(joints_of[body]) > MOST_JOINTS}
+    if couplings is not None:
+        hubs = set(body_of)
     coordinates: dict[int, list[int]] = {}
     for j, body in enumerate(body_of):
         coordinates.setdefault(body, []).append(j)
     order = [j for j in range(n_q) if body_of[j] not in hubs]
     order += [n_q + i for i in first if not touched[i] & hubs]
     late = [n_q + i for i in first if touched[i] & hubs]
+    if couplings is not None:
+        for i in first:
+            coordinates[next(iter(touched[i]))].append(n_q + i)
+        late = []
     nodes = [[n_q + i for i in rows_of[joint]] for joint in joints] + [coordinates[hub] for hub in sorted(hubs)]
-    for node in _minimum_degree(joints, joints_of, sorted(hubs), [len(node) for node in nodes], n_q):
+    pairs = () if couplings is None else {(body_of[i], body_of[j]) for i, j in zip(*couplings, strict=True)}
+    for node in _minimum_degree(joints, joints_of, sorted(hubs), [len(node) for node in nodes], n_q, pairs):
         order += nodes[node]
     order += late
     return np.array(order, dtype=np.int64)
@@ -146,8 +160,12 @@ def _minimum_degree(
     hubs: Sequence[int],
     sizes: Sequence[int],
     n_bodies: int,
+    pairs: Iterable[tuple[int, int]],
 ) -> list[int]:
-    """Joints, and hubs as len(joints) + their place: each time, of those that may come, one with fewest neighbours."""
+    """Joints, and hubs as len(joints) + their place: each time, of those that may come, one with fewest neighbours.
+
+    `pairs`: of hubs that are coupled beside their joints.
+    """
     n_joints = len(joints)
     place = {hub: n_joints + k for k, hub in enumerate(hubs)}
     near: list[set[int]] = [set() for _ in sizes]
@@ -159,6 +177,9 @@ def _minimum_degree(
         else:
             for k in numbers:
                 near[k].update(numbers)
+    for one, other in pairs:
+        near[place[one]].add(place[other])
+        near[place[other]].add(place[one])
     for k, others in enumerate(near):
         others.discard(k)
     holds = _Holds(joints, n_bodies, set(hubs))
@@ -168,14 +189,13 @@ def _minimum_degree(
 
     heap = [(degree(node), node) for node in range(len(sizes))]
     heapq.heapify(heap)
-    done, order, waiting = [False] * len(sizes), [], []
+    done, order = [False] * len(sizes), []
     while heap:
         known, node = heapq.heappop(heap)
         if done[node] or known != degree(node):
             continue  # there is a newer entry
         if node < n_joints and not holds.lets(node):
-            waiting.append(node)  # until another hub is gone
-            continue
+            continue  # it comes up again when a hub is gone that others before it hang on: the two are neighbours
         done[node] = True
         order.append(node)
         changed = near[node]
@@ -186,8 +206,6 @@ def _minimum_degree(
             holds.eliminate(node)
         else:
             holds.eliminate_hub(hubs[node - n_joints])
-            changed = changed | {each for each in waiting if not done[each]}
-            waiting = []
         for other in changed:
             heapq.heappush(heap, (degree(other), other))
     return order
