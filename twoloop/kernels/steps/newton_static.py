@@ -16,7 +16,7 @@ from twoloop.kernels.algebra.linalg import copy
 from twoloop.kernels.algebra.static_lu import factor as factor_lu
 from twoloop.kernels.algebra.static_lu import load, tangents_of
 from twoloop.kernels.algebra.static_lu import solve as solve_lu
-from twoloop.kernels.algebra.static_program import N_OFF, N_PIVOTS, jacobian_of, mass_of
+from twoloop.kernels.algebra.static_program import N_OF_MASS, N_OFF, N_PIVOTS, jacobian_of, mass_of
 from twoloop.kernels.data.common import (
     DONE,
     N_EVALUATIONS,
@@ -48,7 +48,7 @@ N_VECTORS = 3  # of all coordinates: the force, the same displaced, and what is 
 def matrices_size(program: np.ndarray, n_mass: int, n_jacobian: int, n_eigenvalues: int) -> int:
     """Numbers in w.matrices: see _state, _vectors and _factors."""
     n = int(program[N_PIVOTS])
-    n_tangents = len(mass_of(program)[0]) - n_mass
+    n_tangents = int(program[N_OF_MASS]) - n_mass
     one = n + 2 * int(program[N_OFF])
     return n_mass + n_jacobian + 2 * n_tangents + (N_VECTORS + 7) * n + (1 + 2 * n_eigenvalues) * one
 
