@@ -37,7 +37,7 @@ def form(monkeypatch):
     return choose
 
 
-def sprung(bodies, q, pairs, extra=None):
+def sprung(bodies, q, pairs, extra=None, named=True):
     """The same planar bodies with torsion springs, dampers and dry friction between pairs of them, and drag."""
     one, other = 3 * np.array(pairs).T + 2
     rest = q[one] - q[other]
@@ -60,6 +60,7 @@ def sprung(bodies, q, pairs, extra=None):
         jacobian_values=system.jacobian_values,
         jacobian_entries=system.entries["jacobian"],
         gamma=system.gamma,
+        joints=system.joints if named else (),
     )
 
 
@@ -74,7 +75,8 @@ def laddered(n):
 
 def branched(n):
     made = tree(n)
-    return sprung(made.bodies, made.q, [(k, (k - 1) // 2) for k in range(1, n)]), made.q
+    pairs = [(k, (k - 1) // 2) for k in range(1, n)]
+    return sprung(made.bodies, made.q, pairs, named=False), made.q  # without joints bodies are not known
 
 
 def redundant(n):

@@ -41,8 +41,9 @@ class _Sets:
 class _Holds:
     """What holds the parts that eliminated bodies and joints make up: the ground, and hubs that are to come."""
 
-    def __init__(self, joints: Sequence[frozenset[int]], n_bodies: int, hubs: set[int]):
+    def __init__(self, joints: Sequence[frozenset[int]], n_bodies: int, hubs: set[int], lone: AbstractSet[int]):
         self.joints, self.hubs = joints, set(hubs)  # those that are left
+        self.lone = lone  # single coordinates, of whose body nothing else is known: no part of these is surely free
         self.parts = _Sets(n_bodies)
         self.grounded = [False] * n_bodies
         self.hangs: list[set[int]] = [set() for _ in range(n_bodies)]
@@ -52,14 +53,15 @@ class _Holds:
         """Whether a joint may be eliminated."""
         bodies = self.joints[joint]
         parts = {self.parts.find(body) for body in bodies if body not in self.hubs}
-        if any(not self.grounded[part] and not self.hangs[part] for part in parts):
+        if not bodies & self.lone and any(not self.grounded[part] and not self.hangs[part] for part in parts):
             return True
         return not bodies & self.hubs and not any(self.hangs[part] for part in parts)
 
     def eliminate(self, joint: int) -> None:
         """Join the parts that a joint connects."""
         bodies = self.joints[joint]
-        self._join((body for body in bodies if body not in self.hubs), len(bodies) == 1, bodies & self.hubs)
+        grounded = len(bodies) == 1 or bool(bodies & self.lone)
+        self._join((body for body in bodies if body not in self.hubs), grounded, bodies & self.hubs)
 
     def eliminate_hub(self, hub: int) -> None:
         """Join the parts that hang on a hub, and the hub."""
@@ -136,8 +138,13 @@ def elimination_order(
             coordinates[next(iter(touched[i]))].append(n_q + i)
         late = []
     nodes = [[n_q + i for i in rows_of[joint]] for joint in joints] + [coordinates[hub] for hub in sorted(hubs)]
-    pairs = () if couplings is None else {(body_of[i], body_of[j]) for i, j in zip(*couplings, strict=True)}
-    for node in _minimum_degree(joints, joints_of, sorted(hubs), [len(node) for node in nodes], n_q, pairs):
+    pairs: set[tuple[int, int]] = set()
+    lone: set[int] = set()
+    if couplings is not None:
+        pairs = {(body_of[i], body_of[j]) for i, j in zip(*couplings, strict=True)}
+        lone = {hub for hub in hubs if len(coordinates[hub]) == 1}
+    sizes = [len(node) for node in nodes]
+    for node in _minimum_degree(joints, joints_of, sorted(hubs), sizes, n_q, pairs, lone):
         order += nodes[node]
     order += late
     return np.array(order, dtype=np.int64)
@@ -161,10 +168,11 @@ def _minimum_degree(
     sizes: Sequence[int],
     n_bodies: int,
     pairs: Iterable[tuple[int, int]],
+    lone: AbstractSet[int],
 ) -> list[int]:
     """Joints, and hubs as len(joints) + their place: each time, of those that may come, one with fewest neighbours.
 
-    `pairs`: of hubs that are coupled beside their joints.
+    `pairs`: of hubs that are coupled beside their joints. `lone`: see _Holds.
     """
     n_joints = len(joints)
     place = {hub: n_joints + k for k, hub in enumerate(hubs)}
@@ -182,7 +190,7 @@ def _minimum_degree(
         near[place[other]].add(place[one])
     for k, others in enumerate(near):
         others.discard(k)
-    holds = _Holds(joints, n_bodies, set(hubs))
+    holds = _Holds(joints, n_bodies, set(hubs), lone)
 
     def degree(node: int) -> int:
         return sum(sizes[other] for other in near[node])
