@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 
 from references.exudyn.pinned import solve_pinned
 from studies.bench import figures, tables
-from studies.bench.collector import Case, NotApplicable, Run, Solver, called_from, timed
+from studies.bench.collector import Case, Run, Solver, called_from, timed
 from studies.bench.large import ASSEMBLIES, Assembly, open_chain
 from studies.bench.runs_by_error import resampled
 from studies.bench.solvers import CATALOGUE, DEFAULT
@@ -141,8 +141,6 @@ def solver_of(name: str) -> Solver:
         return CATALOGUE[name]
 
     def run(case: Case, step: float, repeat: int) -> Result:
-        if "chain" not in case.name:
-            raise NotApplicable(f"no model of {case.name!r}")
         bodies = case_of(case.problem.q0.size // 3)[1].bodies
         return solve_pinned(case.problem, bodies, round(case.t_end / step), EXUDYN[name], case.time_limit)
 
@@ -173,8 +171,7 @@ def slope(n: Any, times: Any) -> list[float] | None:
     drawn = np.log(resampled([times[k] for k in kept]))
     middle = np.log([np.median(times[k]) for k in kept])
     x = np.log(n[kept])
-    fits = [float(np.polyfit(x, middle, 1)[0]), *np.percentile(np.polyfit(x, drawn, 1)[0], tables.INTERVAL).tolist()]
-    return [float(value) for value in fits]
+    return [float(np.polyfit(x, middle, 1)[0]), *np.percentile(np.polyfit(x, drawn, 1)[0], tables.INTERVAL).tolist()]
 
 
 def findings_of(rows: pd.DataFrame) -> dict[str, Any]:

@@ -1,57 +1,30 @@
-"""What `twoloop` exports."""
+"""What `twoloop` exports: the names of its `__all__`."""
 
-from twoloop.checks.consistency import ConstraintWarning
-from twoloop.ensembles.consistent_states import consistent_states
-from twoloop.ensembles.ensemble import ensemble
-from twoloop.ensembles.integrator import Integrator
-from twoloop.ensembles.runs import Runs
-from twoloop.kernels.compile.callbacks import callback
-from twoloop.methods.bdf import BDF
-from twoloop.methods.dop853 import DOP853
-from twoloop.methods.esdirk import ESDIRK
-from twoloop.methods.newmark import Newmark
-from twoloop.methods.presets import paper_irk, paper_newmark
-from twoloop.methods.runge_kutta import RungeKutta
-from twoloop.methods.taylor import Taylor
-from twoloop.problem.drawing import Drawing
-from twoloop.problem.joints import Joint
-from twoloop.problem.system import ConstrainedSystem
-from twoloop.result.certificate import Certificate, CertificateWarning
-from twoloop.result.citations import citation
-from twoloop.result.loading import load
-from twoloop.result.result import Result
-from twoloop.run.projection import ConsistentState, consistent_state
-from twoloop.run.record import Statistics, Status
-from twoloop.solve import solve_dae
-from twoloop.sweeps.sweep import sweep
-
-__all__ = [
-    "BDF",
-    "DOP853",
-    "ESDIRK",
-    "Certificate",
-    "CertificateWarning",
-    "ConsistentState",
-    "ConstrainedSystem",
-    "ConstraintWarning",
-    "Drawing",
-    "Integrator",
-    "Joint",
-    "Newmark",
-    "Result",
-    "RungeKutta",
-    "Runs",
-    "Statistics",
-    "Status",
-    "Taylor",
-    "callback",
-    "citation",
-    "consistent_state",
-    "consistent_states",
-    "ensemble",
-    "load",
-    "paper_irk",
-    "paper_newmark",
-    "solve_dae",
-    "sweep",
-]
+from twoloop.checks.consistency import ConstraintWarning as ConstraintWarning
+from twoloop.ensembles.consistent_states import consistent_states as consistent_states
+from twoloop.ensembles.ensemble import ensemble as ensemble
+from twoloop.ensembles.integrator import Integrator as Integrator
+from twoloop.ensembles.runs import Runs as Runs
+from twoloop.kernels.compile.callbacks import callback as callback
+from twoloop.methods.bdf import BDF as BDF
+from twoloop.methods.dop853 import DOP853 as DOP853
+from twoloop.methods.esdirk import ESDIRK as ESDIRK
+from twoloop.methods.newmark import Newmark as Newmark
+from twoloop.methods.presets import paper_irk as paper_irk
+from twoloop.methods.presets import paper_newmark as paper_newmark
+from twoloop.methods.runge_kutta import RungeKutta as RungeKutta
+from twoloop.methods.taylor import Taylor as Taylor
+from twoloop.problem.drawing import Drawing as Drawing
+from twoloop.problem.joints import Joint as Joint
+from twoloop.problem.system import ConstrainedSystem as ConstrainedSystem
+from twoloop.result.certificate import Certificate as Certificate
+from twoloop.result.certificate import CertificateWarning as CertificateWarning
+from twoloop.result.citations import citation as citation
+from twoloop.result.loading import load as load
+from twoloop.result.result import Result as Result
+from twoloop.run.projection import ConsistentState as ConsistentState
+from twoloop.run.projection import consistent_state as consistent_state
+from twoloop.run.record import Statistics as Statistics
+from twoloop.run.record import Status as Status
+from twoloop.solve import solve_dae as solve_dae
+from twoloop.sweeps.sweep import sweep as sweep

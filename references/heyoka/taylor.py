@@ -18,7 +18,7 @@ from twoloop.result.result import Result
 
 Array = NDArray[np.float64]
 
-LARGEST_UNROLLED = 21  # coordinates; with more, an unrolled integrator takes over a minute to build for a tolerance
+LARGEST_UNROLLED = 21  # coordinates; with more, an unrolled integrator may take minutes to build for a tolerance
 STEPS_A_CALL = 100  # between two looks at the clock
 
 
@@ -27,7 +27,7 @@ def solve_heyoka(task: Task, tol: float = 1e-8, *, max_step: float | None = None
     """Integrate a constrained mechanical system, as the ODE q' = v, v' = a(t, q, v), with heyoka's Taylor integrator.
 
     What it was given: the accelerations eliminated symbolically, without structural zeros, in an order of least fill;
-    `fast_math`; its default, the unrolled form (`compact_mode=False`, up to 3.5 times as fast as the compact one) up to
+    `fast_math`; its default, the unrolled form (`compact_mode=False`, faster than the compact one) up to
     `LARGEST_UNROLLED` coordinates; timed is a second use of the integrator, as its tutorials have it: time and state
     are set, and `propagate_until` is called, without output. The clock is looked at every `STEPS_A_CALL` steps.
 

@@ -11,7 +11,7 @@ import pandas as pd
 from studies.bench import adaptive
 from studies.bench.cases import beam
 from studies.bench.cases.beam import SOFT, STIFF
-from studies.bench.collector import REPEATS, Array, Case, Run, Solver, row_of
+from studies.bench.collector import REPEATS, Array, Case, Run, Solver, Warm, row_of
 from studies.bench.metrics import ASTRAY, deviation
 from studies.bench.solvers import (
     CATALOGUE,
@@ -104,7 +104,7 @@ def runs(known: dict[str, Case], quick: bool) -> Iterator[Run]:
 def collected(todo: Iterator[Run], kept: KeptRows, quick: bool) -> pd.DataFrame:
     """Rows of these runs and of those that leave no decade of the tip's error out; ours are asked however slow."""
 
-    def make(run: Run, repeat: int, built: adaptive.Built) -> Row:
+    def make(run: Run, repeat: int, built: Warm) -> Row:
         row = row_of(run, repeat, measure, built)
         return row | {"error_all": row.get("error_q"), "error_q": row.get("error_tip")}
 

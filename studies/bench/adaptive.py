@@ -18,7 +18,7 @@ import numpy as np
 import pandas as pd
 
 from studies.bench import headline
-from studies.bench.collector import NOTHING_RUN, Run
+from studies.bench.collector import NOTHING_RUN, Run, Warm
 from studies.bench.runs_by_error import DECADE, LOOSEST, NEAR
 from studies.bench.store import KeptRows, Row
 from studies.bench.tables import TIGHTEST
@@ -35,7 +35,6 @@ COARSER = 10.0**0.5  # of steps where a tolerance changes by a decade
 
 ALWAYS = (headline.DEFAULT, headline.OWN_CODE)  # what a user gets is asked for all accuracies
 
-Built = set[tuple[int, str, float]]  # what has been compiled, as `bench.build` keeps it
 Side = tuple[str, bool]  # a mechanism, and whether the solver is ours
 
 
@@ -59,10 +58,11 @@ class _Progress:
 def collect(
     todo: Sequence[Run],
     kept: KeptRows,
-    make: Callable[[Run, int, Built], Row],
+    make: Callable[[Run, int, Warm], Row],
     all_asked: Callable[[Run], bool] = lambda run: False,
     errors: Sequence[float] = (),
     always_repeated: Callable[[Run], bool] = lambda run: False,
+    fine: Callable[[Run], bool] = lambda run: False,
 ) -> pd.DataFrame:
     """Rows of all runs that are of use, the repetitions interleaved.
 
@@ -80,13 +80,15 @@ def collect(
         those of ALWAYS, are asked between their settings.
     always_repeated : callable, optional
         always_repeated(run): repeated, however far behind, as its time is compared with that of another such run.
+    fine : callable, optional
+        fine(run): asked between its settings, however far behind.
 
     Returns
     -------
     DataFrame
         In the order of the runs, the repetitions of a run one below the other.
     """
-    built: Built = set()
+    built: Warm = set()
     progress: dict[tuple[str, str], _Progress] = defaultdict(_Progress)
     reached: dict[Side, list[tuple[float, float]]] = defaultdict(list)  # error and time of the runs on a mechanism
     todo = list(todo)
@@ -106,7 +108,7 @@ def collect(
         by_solver: dict[tuple[str, str], list[Run]] = defaultdict(list)
         for run in todo:
             by_solver[run.case.name, run.solver.name].append(run)
-        more = [run for own in by_solver.values() for run in between(own, kept, reached, errors)]
+        more = [run for own in by_solver.values() for run in between(own, kept, reached, errors, fine(own[0]))]
         for run in more:
             first(run)
         todo += more
@@ -124,7 +126,11 @@ def _side(run: Run) -> Side:
 
 
 def between(
-    own: Sequence[Run], kept: KeptRows, reached: Mapping[Side, Sequence[tuple[float, float]]], errors: Sequence[float]
+    own: Sequence[Run],
+    kept: KeptRows,
+    reached: Mapping[Side, Sequence[tuple[float, float]]],
+    errors: Sequence[float],
+    fine: bool = False,
 ) -> list[Run]:
     """Runs of one solver on one mechanism where its errors leave more than a decade out, and beyond its ends."""
     rows = {run.value: kept[run.key(0)] for run in own if run.key(0) in kept}
@@ -135,7 +141,7 @@ def between(
     fastest = [
         min((cpu for each, cpu in reached[_side(own[0])] if each <= error[value]), default=np.inf) for value in made
     ]
-    limit = np.inf if own[0].solver.name in ALWAYS else CLOSE
+    limit = np.inf if fine or own[0].solver.name in ALWAYS else CLOSE
     close = {value: rows[value]["call_s"] <= limit * least for value, least in zip(made, fastest, strict=True)}
     asked = []
     for loose, tight in itertools.pairwise(made):

@@ -236,6 +236,7 @@ class Run:
 
 Timed = tuple[Result | None, str, str, dict[str, Any]]  # result, status, message, columns of times
 Measure = Callable[[Run, Result], dict[str, Any]]
+Warm = set[tuple[int, str, float] | str]  # what has been compiled, see `warm_up`, and the settings called so far
 
 
 def collect(runs: Iterable[Run], kept: KeptRows, measure: Measure | None = None) -> pd.DataFrame:
@@ -274,7 +275,7 @@ def collect(runs: Iterable[Run], kept: KeptRows, measure: Measure | None = None)
         _ = case.scale  # makes the reference, which is not to be timed with anything
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     bar = Progress(*columns, disable=not sys.stdout.isatty())
-    warm: set[tuple[int, str, float]] = set()
+    warm: Warm = set()
     with bar as progress:
         task = progress.add_task("".ljust(50), total=len(order), completed=len(order) - len(left))
         for run, k in left:
@@ -285,14 +286,14 @@ def collect(runs: Iterable[Run], kept: KeptRows, measure: Measure | None = None)
     return pd.DataFrame([kept[key] for key in order if key in kept])
 
 
-def row_of(run: Run, k: int, measure: Measure | None, warm: set[tuple[int, str, float]]) -> Row:
-    """Make a repetition of a run and measure it over the motion; `warm` is what `build` has compiled."""
+def row_of(run: Run, k: int, measure: Measure | None, warm: Warm) -> Row:
+    """Make a repetition of a run and measure it over the motion."""
     case, solver = run.case, run.solver
     row: Row = {"group": run.group, "case": case.name, "problem": case.problem.name, "solver": solver.name}
     row |= {"family": solver.family, "called_from": called_from(run), "keeps_constraints": solver.keeps_constraints}
     row |= {**run.settings, "t_end": case.t_end, "repeat": k}
     warm_up(run, k, warm)
-    result, status, message, times = timed(run, k)
+    result, status, message, times = timed(run, k, warm)
     stats = Statistics() if result is None else result.stats
     row |= {**times, "status": status, "message": message, "used": solver.took(run.value, result)}
     rejected = [n for n in (stats.n_rejected_error, stats.n_rejected_convergence) if n is not None]
@@ -311,17 +312,21 @@ def row_of(run: Run, k: int, measure: Measure | None, warm: set[tuple[int, str, 
         return row | metrics.COLUMNS | {"status": "NOT_MEASURED", "message": why}
 
 
-def timed(run: Run, repeat: int) -> Timed:
+def timed(run: Run, repeat: int, warm: Warm | None = None) -> Timed:
     """A run, its status and message, and what it takes, each call the same: all studies time in this place.
 
     call_s is the CPU time of the call that a user writes: of solve_dae all of it, of another project's solver what its
     adapter marks (`references.driver`). Where it is shorter than `case.timed`, it is the mean of CALLS more, as the
     first in a row of others' runs takes up to 1.6 times as long; those of ours begin a little later in the motion, each
-    at a start that no call has had, as `solve_dae` remembers starts. The first call of a setting does not count where
-    it may hold a build. inside_s is what the solver says of the time in its own loop.
+    at a start that no call has had, as `solve_dae` remembers starts. The first call of a setting in a process, by
+    `warm` or as the first repetition, does not count where it may hold a build. inside_s is what the solver says of the
+    time in its own loop.
     """
     result, status, message, spent = attempt(run, repeat)
-    if repeat == 0 and _may_hold_a_build(run, status, spent):
+    first = repeat == 0 if warm is None else run.key(0) not in warm
+    if warm is not None:
+        warm.add(run.key(0))
+    if first and _may_hold_a_build(run, status, spent):
         result, status, message, spent = attempt(run, repeat)
     if result is None:
         return None, status, message, {"call_s": None, "inside_s": None, "calls": 0}
@@ -351,7 +356,7 @@ def _may_hold_a_build(run: Run, status: str, spent: float) -> bool:
     return status == "REACHED_END" and 0.0 < run.case.timed <= spent < BUILDING
 
 
-def warm_up(run: Run, repeat: int, warm: set[tuple[int, str, float]], limit: float = COMPILING) -> None:
+def warm_up(run: Run, repeat: int, warm: Warm, limit: float = COMPILING) -> None:
     """Let a run compile what it calls, by the beginning of it, unless `warm` has it; a failure comes in the run."""
     what = (id(run.case), run.solver.name, run.value if run.solver.builds_each else 0.0)
     if what in warm:

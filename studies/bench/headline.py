@@ -106,9 +106,9 @@ def price(rows: pd.DataFrame, firsts: pd.DataFrame, case: str) -> dict[str, Any]
         case, t_end, errors, first_at (tolerance of the first calls, None without them), elsewhere_s (what a call of the
         default from another start takes longer, None where that was not measured), and lines: name, first_s or None,
         and at each error solver, call_s, inside_s (of it inside the integrator, of the cheapest run that is good
-        enough; None of rivals), keeps (the constraints), from_python and near (error and call_s of a run that nearly
-        gets there and takes much less, or None), or in their place why there is none: "not run", "not reached", "not
-        asked".
+        enough; None of rivals), keeps (the constraints), from_python and near (asked, error and call_s of a run that
+        nearly gets there and takes much less, or None), or in their place why there is none: "not run", "not reached",
+        "not asked".
     """
     rows = rows[rows["case"] == case]
     if rows.empty:
@@ -161,4 +161,4 @@ def _near(runs: pd.DataFrame, error: float, call_s: float) -> dict[str, float] |
     if near.empty:
         return None
     run = near.loc[near["call_s"].astype(float).idxmin()]
-    return {"error": float(run["error_q"]), "call_s": float(run["call_s"])}
+    return {"asked": error, "error": float(run["error_q"]), "call_s": float(run["call_s"])}

@@ -15,6 +15,7 @@ DECADE = 10.0 * (1.0 + 1e-9)  # between two runs that lie farther apart nothing 
 NEAR = 2.0  # settings that differ by less are nearly the same
 FEWEST = 3  # repetitions that an interval asks for
 LOOSEST = 1e-1  # tolerance of which looser ones are of no use
+BY_TOLERANCE = ("heyoka", "Taylor", "auto", "the default")  # how solvers begin whose order the tolerance sets
 RESAMPLES, SEED = 1000, 25  # draws of the repetitions
 
 
@@ -53,14 +54,14 @@ class Runs:
     A table of 70 columns takes minutes where it is sorted and cut for every solver and every error.
     """
 
-    def __init__(self, columns: Mapping[str, NDArray[Any]], rows: NDArray[np.int64], what: str):
+    def __init__(self, columns: Mapping[str, NDArray[Any]], rows: NDArray[np.int64], what: str, solver: str):
         errors, settings = columns["error_q"][rows], columns["setting"][rows]
         order = np.argsort(errors, kind="stable")  # NaN last
         known = order[~np.isnan(errors[order]) & ~np.isnan(columns[what][rows][order])]
         self.columns, self.rows = columns, rows[known]
         self.floor = float(np.fmax.reduce(columns["floor"][self.rows], initial=-np.inf))
         self.errors = np.maximum(errors[known], columns["floor"][self.rows])
-        self.settings = settings[known]
+        self.settings, self.of_one_order = settings[known], not solver.startswith(BY_TOLERANCE)
         best = float(settings[~np.isnan(errors)].max(initial=0.0))
         # than which none is looser that the solver can run: tried, or of no use
         self.loosest = best if (settings[np.isnan(errors)] > best).any() else LOOSEST
@@ -89,14 +90,15 @@ def _columns(rows: pd.DataFrame, *more: str) -> dict[str, NDArray[Any]]:
 
 def runs_with(rows: pd.DataFrame, what: str) -> Runs:
     """Those of rows of one solver."""
-    return Runs(_columns(rows, what), np.arange(len(rows)), what)
+    solver = str(rows["solver"].iloc[0]) if len(rows) and "solver" in rows else ""
+    return Runs(_columns(rows, what), np.arange(len(rows)), what, solver)
 
 
 def by_solver(rows: pd.DataFrame, *costs: str) -> dict[str, Runs]:
     """Those of each solver, in order of appearance; runs without the first of the costs are left out."""
     columns = _columns(rows, *costs)
     codes, names = pd.factorize(rows["solver"])
-    return {str(name): Runs(columns, np.flatnonzero(codes == k), costs[0]) for k, name in enumerate(names)}
+    return {str(name): Runs(columns, np.flatnonzero(codes == k), costs[0], str(name)) for k, name in enumerate(names)}
 
 
 def place_of(runs: Runs, target: float) -> Place | None:
@@ -107,7 +109,7 @@ def place_of(runs: Runs, target: float) -> Place | None:
     None: no run is so good, or none was asked for about this: within a decade below the target, at the loosest setting
     that the solver can run, or at nearly the same setting as a looser one that is not good enough (the solver leaps
     over the target). The place between two runs, on the log-log line through them, is None where they are more than a
-    decade apart or of different methods.
+    decade apart, or of different methods or orders.
     """
     errors, settings = runs.errors, runs.settings
     n_good = int((errors <= target).sum())
@@ -120,7 +122,7 @@ def place_of(runs: Runs, target: float) -> Place | None:
     if not (below >= target / DECADE or joined or near or (settings[:n_good] >= runs.loosest).any()):
         return None
     first = int((errors < below / DECADE).sum())
-    if not joined or runs.used(n_good - 1) != runs.used(n_good):
+    if not joined or not runs.of_one_order or runs.used(n_good - 1) != runs.used(n_good):
         return first, n_good, None
     x = np.log(errors[n_good - 1 : n_good + 1])
     return first, n_good, float((np.log(target) - x[0]) / (x[1] - x[0]))

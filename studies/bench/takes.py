@@ -36,7 +36,7 @@ def takes(found: Mapping[str, Any], groups: Sequence[Sequence[dict[str, Any]]]) 
         picks = picks or ["no solver compared reaches these errors"]
         free = group[0].get("without_drift", [])
         calm = [f"{call(pick['solver'])} for {listed(pick['accuracies'])}" for pick in free]
-        without = f"; its energy drifts or wanders, without drift: {'; '.join(calm)}" if calm else ""
+        without = f"; its energy drifts or wanders; without drift: {'; '.join(calm)}" if calm else ""
         rows.append({"what": what, "take": "; ".join(picks) + doubt + without})
     often = [*_often(made.get("first_calls", [])), *_at_once(found.get("ensembles", {}).get("cases", []))]
     mechanisms = made.get("rivals", {}).get("mechanisms", [])
@@ -121,25 +121,18 @@ def _cheapest(at: Sequence[Mapping[str, Any]]) -> str:
 
 
 def _often(first_calls: Sequence[Mapping[str, Any]]) -> list[str]:
-    """By which run code for the mechanism has paid, by the first calls: the default's, on every mechanism, sooner."""
+    """By which run what is built has paid, by the first calls: the default's code, and the cheapest later call."""
     paying = [line for line in first_calls if line["pays"] and line["solver"] != DEFAULT]
-    if not paying:
-        return []
-    always = min((line for line in paying if not line["never"]), key=_latest, default=None)
-    sooner = [line for line in paying if always is None or (line["never"] and _latest(line) < _latest(always))]
-    own = [line for line in paying if line["solver"] == f"{DEFAULT}, compiled"]
-    told = [*own, *([always] if always else []), *sorted(sooner, key=_latest)]
-    parts = [_by_run(line) for k, line in enumerate(told) if line not in told[:k]]
-    return [f"breaks even with `compiled=False`, at an error of 1e-8: {'; '.join(parts)}"]
+    cheapest = min(paying, key=lambda line: float(line["call_s"]), default=None)
+    told = [line for line in paying if line["solver"] == f"{DEFAULT}, compiled" or line is cheapest]
+    parts = [f"{_paid(line)}{', the cheapest later call' if line is cheapest else ''}" for line in told]
+    return [f"in single calls with an error of 1e-8: {'; '.join(parts)}"] if parts else []
 
 
-def _by_run(line: Mapping[str, Any]) -> str:
-    where = f"on all {line['n']} mechanisms" if not line["never"] else f"on {line['n'] - line['never']} of {line['n']}"
-    return f"{call(line['solver'])} {where} by run {_latest(line):.0f}"
-
-
-def _latest(line: Mapping[str, Any]) -> float:
-    return float(max(line["pays"]))
+def _paid(line: Mapping[str, Any]) -> str:
+    first, last = min(line["pays"]), max(line["pays"])
+    by = f"run {first:.0f}" if first == last else f"run {first:.0f} to {last:.0f}"
+    return f"code of {call(line['solver'])} pays from {by} on {line['n'] - line['never']} of {line['n']} mechanisms"
 
 
 def _at_once(cases: Sequence[Mapping[str, Any]]) -> list[str]:

@@ -2,7 +2,7 @@
 
 import time
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import chain, pairwise
@@ -13,6 +13,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
+from scipy.stats import fisher_exact
 
 from references.heyoka.taylor import LARGEST_UNROLLED
 from references.sundials.loop import SMALLEST_STEP
@@ -44,6 +45,7 @@ from twoloop.kernels.compile import callbacks
 LOOSENESS = 1e3  # an answer is right within so many times the tolerance ...
 LEAST = 1e-10  # ... of which no more is asked than this
 USUAL = 1e-8  # tolerance of the traps that are not about tolerances
+CONFIDENCE = 0.95  # of what is said of shares of wrong runs
 GRACE = 6.0  # s beyond the time limit of a run after which it hangs
 TRUTHS = (1e-12, 1e-10, 1e-9)  # tolerances of the two runs that make the right answer: the first that succeed
 TRUTH_LIMIT = 10.0  # s that one of them may take
@@ -217,9 +219,26 @@ def findings_of(all_rows: pd.DataFrame) -> dict[str, Any]:
     theirs = [line for line in found["held_out"]["solvers"] if not line["solver"].endswith((OURS, LIMITED))]
     counted = [{key: line[key] for key in ("solver", "n", "wrong", "gross")} for line in theirs]
     found["held_out"]["by_solver"] = sorted(counted, key=lambda line: -line["wrong"])
+    found["held_out"] |= against_default(found["held_out"]["trust"])
     found |= {"unrolled_to": LARGEST_UNROLLED, "smallest_step": SMALLEST_STEP}
     found |= {"exact": EXACT, "off": LOOSENESS * USUAL, "usual": USUAL, "scipy": list(SCIPY)}
     return found | {"forces_end": T_END, "forces_agree": TRUE_TO, "grown": GROWN}
+
+
+def against_default(trust: Mapping[str, Mapping[str, int]]) -> dict[str, Any]:
+    """Who was run, below what the default's share of wrong runs is if it has none, and whose share differs from it."""
+    ran = [kind for kind in KINDS[:-1] if trust[kind]["n"]]  # the default, ours, others
+    bad = {kind: (trust[kind]["wrong"], trust[kind]["n"] - trust[kind]["wrong"]) for kind in ran}
+    found: dict[str, Any] = {"ran": ran, "below": None, "apart": []}
+    if "default" in ran:
+        n = trust["default"]["n"]
+        found["below"] = 1.0 - (0.5 * (1.0 - CONFIDENCE)) ** (1.0 / n)
+        found["apart"] = [
+            kind
+            for kind in ran
+            if kind not in ("default", "ours") and fisher_exact([bad["default"], bad[kind]]).pvalue < 1.0 - CONFIDENCE
+        ]
+    return found
 
 
 def graded(ran: pd.DataFrame) -> dict[str, int]:

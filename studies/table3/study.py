@@ -13,7 +13,7 @@ from matplotlib.ticker import LogLocator
 from studies.bench import adaptive, figures, tables
 from studies.bench.cases import four_bar
 from studies.bench.cli import StudyError
-from studies.bench.collector import REPEATS, Case, Run, Solver, collect, row_of
+from studies.bench.collector import REPEATS, Case, Run, Solver, Warm, collect, row_of
 from studies.bench.headline import OWN_CODE
 from studies.bench.metrics import ASTRAY, LOST
 from studies.bench.render import number, power, table
@@ -103,7 +103,7 @@ def make(output: Output) -> pd.DataFrame:
     def highest(run: Run, result: Result) -> dict[str, float]:
         return {"y3_max": float(result.q[four_bar.Y3].max()) if result.t.size else float("nan")}
 
-    def row(run: Run, repeat: int, built: adaptive.Built) -> Row:
+    def row(run: Run, repeat: int, built: Warm) -> Row:
         return row_of(run, repeat, highest, built)
 
     def ours(run: Run) -> bool:

@@ -20,7 +20,7 @@ from references.paper.four_bar_minimal import MinimalFourBar
 from studies.bench import adaptive, figures, headline, tables
 from studies.bench.cases.four_bar import SECOND
 from studies.bench.cli import StudyError
-from studies.bench.collector import REPEATS, Run, warm_up
+from studies.bench.collector import REPEATS, Run, Warm, warm_up
 from studies.bench.end_states import case_of, row_of
 from studies.bench.render import number, power
 from studies.bench.solvers import CATALOGUE, HEYOKA, OWN, RIVALS, TAYLOR
@@ -38,6 +38,7 @@ RANGES = {  # of errors; none: all of them on the mechanisms that cross singular
     "1e-10 to 1e-13": DECADES[7:],
     "singular positions": (),
 }
+TYPICAL = (1e-4, 1e-6, 1e-8, 1e-10)  # errors at which the default is compared with the cheapest rival in the median
 SHOWN = DECADES[::2]  # at which the four-bars are judged
 DOWN_TO = 1e-12  # the error down to which no rival was to be ahead
 AHEAD = {"heyoka": 2, "rivals called from Python": 8, "other compiled rivals": 4}  # aimed at on the four-bars
@@ -117,10 +118,11 @@ def runs(quick: bool) -> list[Run]:
 def collect(todo: Sequence[Run], kept: KeptRows) -> pd.DataFrame:
     """Rows of all runs that are of use; on the four-bars however far behind a solver is."""
     quick = all(run.repeats == 1 for run in todo)
-    return adaptive.collect(todo, kept, row_at_end, lambda run: run.case.name in GEOMETRIES, () if quick else DECADES)
+    errors, priced = () if quick else DECADES, lambda run: run.case.name == HEADLINE
+    return adaptive.collect(todo, kept, row_at_end, lambda run: run.case.name in GEOMETRIES, errors, fine=priced)
 
 
-def row_at_end(run: Run, repeat: int, built: adaptive.Built) -> Row:
+def row_at_end(run: Run, repeat: int, built: Warm) -> Row:
     """A repetition of a run, measured by the end of the reference."""
     warm_up(run, repeat, built, COMPILING)
     row = row_of(run) | {"repeat": repeat, "keeps_constraints": run.solver.keeps_constraints}
@@ -179,6 +181,7 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     found["put"] = put(rows)
     found["with_code"] = [each["case"] for each in made if given_on(each["case"]) == headline.OWN_CODE]
     found["ranges"] = [_within(made, name, errors) for name, errors in RANGES.items()]
+    found["typical"] = [each for error in TYPICAL if (each := _typical(made, error)) is not None]
     python = rows[rows["called_from"] == "Python"]["solver"].unique()
     ahead = [at["standing"][headline.BEST] for at in every if at["standing"][headline.BEST]["verdict"] == "ahead"]
     found["ahead_of_python"] = sum(best["rival"]["solver"] in python for best in ahead)
@@ -192,6 +195,18 @@ def _within(made: Sequence[dict[str, Any]], name: str, errors: Sequence[float]) 
     own = [each for each in made if ("singular" in each["tags"]) is singular]
     pairs = [[at["standing"] for at in each["at"] if singular or at["error"] in errors] for each in own]
     return {"name": name, "n_mechanisms": len(own), "standings": headline.counted(pairs)}
+
+
+def _typical(made: Sequence[dict[str, Any]], error: float) -> dict[str, Any] | None:
+    """Time of the cheapest rival over that of the default at an error: quartiles over mechanisms.
+
+    Those with singular positions, at which accelerations are not defined, do not count. None: it is not known on any.
+    """
+    smooth = [each for each in made if "singular" not in each["tags"]]
+    ratios = [at["standing"][headline.GIVEN]["ratio"] for each in smooth for at in each["at"] if at["error"] == error]
+    known = [ratio for ratio in ratios if ratio is not None]
+    quartiles = np.percentile(known, (25, 50, 75)).tolist() if known else []
+    return {"error": error, "n": len(known), "quartiles": quartiles} if known else None
 
 
 def residual(rows: pd.DataFrame) -> dict[str, Any] | None:
@@ -266,15 +281,18 @@ def heat_map(found: dict[str, Any]) -> Figure:
     for axes, name in zip(panels, whose, strict=True):
         standings = [[at["standing"][name] for at in each["at"]] for each in found["mechanisms"]]
         shown = np.array([[each["ratio"] or np.nan for each in line] for line in standings], dtype=float)
-        image = axes.imshow(shown, norm=LogNorm(0.1, 10.0), cmap=colours, aspect="auto")
+        image = axes.imshow(shown, norm=LogNorm(0.04, 25.0), cmap=colours, aspect="auto")
         for (i, j), value in np.ndenumerate(shown):
-            color = "white" if abs(np.log10(value)) > 0.6 else "black"  # black on the grey of those without a ratio
+            color = "white" if abs(np.log10(value)) > 0.8 else "black"  # black on the grey of those without a ratio
             axes.text(j, i, cell(standings[i][j]), ha="center", va="center", fontsize=6, color=color)
         axes.set_xticks(range(len(DECADES)), [power(error) for error in DECADES], fontsize=7)
         axes.set_yticks(range(len(names)), names)
         axes.grid(False)
         axes.set(title=name, xlabel="error at the end, over max(1, max |q|)")
-    told = "blue: ours ahead; in brackets: undecided; “ours?”: not all rivals were run to their end; grey: not reached"
+    told = (
+        "blue: ours ahead; in brackets: undecided; ours, others: no other reaches the error; ours?: not all rivals "
+        "were run to their end; grey: no ratio"
+    )
     figure.suptitle(f"Time of the fastest rival over ours ({told})", fontsize=10)
-    figure.colorbar(image, ax=panels, label="ratio")
+    figure.colorbar(image, ax=panels, label="ratio", extend="both")
     return figure

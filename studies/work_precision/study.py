@@ -15,7 +15,7 @@ import pandas as pd
 from references.heyoka.taylor import LARGEST_UNROLLED
 from studies.bench import adaptive, cases, figures, headline, study, tables
 from studies.bench.cli import StudyError
-from studies.bench.collector import Case, Run, row_of
+from studies.bench.collector import Case, Run, Warm, row_of
 from studies.bench.render import number, render
 from studies.bench.solvers import (
     COMPARED,
@@ -110,7 +110,7 @@ def at_length(known: Sequence[Case], quick: bool, kept: KeptRows) -> pd.DataFram
     return adaptive.collect(made, kept, _row, lambda run: True, () if quick else ERRORS)
 
 
-def _row(run: Run, repeat: int, built: adaptive.Built) -> Row:
+def _row(run: Run, repeat: int, built: Warm) -> Row:
     return row_of(run, repeat, None, built)
 
 
@@ -155,6 +155,7 @@ def report(output: Output, rows: pd.DataFrame, line: str) -> dict[str, Any]:
     in_angles = on_the_same_processor(part(rows, minimal.GROUP), part(rows, rivals.GROUP))
     findings["measured"] = measured_on(rows)
     findings["repetition"] = {"calls": int(part(rows, rivals.GROUP)["calls"].max()), "below": rivals.TIMED}
+    findings["repetition"] |= {"once": made_once(everywhere), "outclassed": adaptive.OUTCLASSED}
     findings["price"] = headline.price(everywhere, part(rows, first_calls.GROUP), rivals.HEADLINE)
     findings["minimal"] = minimal.findings_of(in_angles if in_angles.empty else tables.medians(in_angles), everywhere)
     findings |= {} if output.call.quick else processors.kept(output, rows, line, found)
@@ -163,6 +164,13 @@ def report(output: Output, rows: pd.DataFrame, line: str) -> dict[str, Any]:
     text = render("work_precision", findings, {}, stamp=line, quick=output.call.quick)
     output.write("work_precision.md", text)
     return findings
+
+
+def made_once(medians: pd.DataFrame) -> dict[str, float]:
+    """Shares of the settings that ended and were timed once, of ours and of others."""
+    ended = medians[medians["error_q"].notna()]
+    ours = ended["family"] == "two-loop"
+    return {who: float((own["repeats"] == 1).mean()) for who, own in (("ours", ended[ours]), ("others", ended[~ours]))}
 
 
 def asked(rows: pd.DataFrame) -> dict[str, Any]:

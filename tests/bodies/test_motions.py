@@ -150,6 +150,11 @@ def test_functions_that_branch_are_called_in_python_and_do_the_same():
     assert called[0].system.called_in_python and not traced[0].system.called_in_python
     assert "called in Python" in called[0].note and "converts to a number" in called[0].note
     np.testing.assert_allclose(called[1].q, traced[1].q, atol=1e-9)
+    with pytest.raises(
+        ValueError,
+        match=r"'Taylor' needs .*: f of 'motor of prismatic cart-ground': .* converts to a number.*if t < 1e9",
+    ):
+        moved(cart(PlanarModel(), branching, 0.4), "Taylor")
     model = cart(PlanarModel(), branching, 0.4)
     model.drive("revolute cart-rod", lambda t: 2.0 * t + 0.1 * t**2)  # is traced all the same
     problem, result = moved(model, "DOP853")

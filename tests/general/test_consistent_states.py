@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from twoloop import ConstrainedSystem, consistent_state, consistent_states, mechanisms
+from tests.compiled import unit_mass, weight
+from twoloop import ConstrainedSystem, callback, consistent_state, consistent_states, mechanisms
 
 
 def guesses(problem, n, far=0.02):
@@ -84,3 +85,21 @@ def test_a_guess_that_does_not_say_on_which_assembly_it_is_is_refused():
         consistent_states(system, 0.0, q, np.zeros(2), keep=[0])
     found, _ = consistent_states(system, 0.0, q[:1], np.zeros(2), keep=[0])
     assert np.abs(found - [[0.6, 0.8]]).max() < 1e-15
+
+
+@callback("constraint")
+def at_a_place_that_is_a_parameter(t, q, p, C):
+    C[0] = q[0] - q[int(p[0])]
+
+
+@callback("jacobian")
+def derivative_at_a_place(t, q, p, Cq):
+    Cq[0, 0] = 1.0
+    Cq[0, int(p[0])] -= 1.0
+
+
+def test_places_among_parameters_do_not_lead_out_of_bounds():
+    functions = {"constraint": at_a_place_that_is_a_parameter, "jacobian": derivative_at_a_place}
+    system = ConstrainedSystem(n_q=2, n_c=1, mass=unit_mass, force=weight, parameters=[1.0], name="far", **functions)
+    with pytest.raises(ValueError, match=r"guess 1: .* of 'far' goes out of bounds: index 10000000"):
+        consistent_states(system, 0.0, [1.0, 1.0], np.zeros(2), parameters=[[1.0], [1e7]])

@@ -54,6 +54,7 @@ def test_nothing_is_interpolated_over_more_than_a_decade_or_between_methods():
     changed = rows(("a", 1e-2, 1.0), ("a", 2e-3, 4.0)).assign(used=["Newton", "explicit"])
     assert tables.time_for(changed, 5e-3) == 4.0 > tables.time_for(changed.assign(used=""), 5e-3)
     assert tables.time_for(changed.assign(used=np.nan), 5e-3) < 4.0  # as a file has it where nothing is chosen
+    assert tables.time_for(changed.assign(used="", solver="heyoka"), 5e-3) == 4.0  # whose order the tolerance sets
 
 
 def test_what_no_looser_setting_makes_cheaper_counts_at_every_error():

@@ -95,19 +95,19 @@ def test_the_table_has_a_row_for_each_class_with_the_cheapest():
 @pytest.mark.parametrize(
     ("pays", "never", "said"),
     [
-        ([3.0, 40.0], 1, "`compiled=True` on 4 of 5 by run 40; "),
-        ([3.0, 60.0], 1, "`compiled=True` on 4 of 5 by run 60; "),
+        ([3.0, 40.0], 1, "; code of `compiled=True` pays from run 3 to 40 on 4 of 5 mechanisms"),
+        ([60.0], 4, "; code of `compiled=True` pays from run 60 on 1 of 5 mechanisms"),
         ([], 5, ""),
     ],
 )
 def test_code_for_the_mechanism_is_advised_where_the_first_calls_say_that_it_pays(pays, never, said):
-    line = {"solver": "auto, compiled", "n": 5, "pays": pays, "never": never}
-    theirs = {**line, "solver": "heyoka", "pays": [50.0], "never": 0}
+    line = {"solver": "auto, compiled", "n": 5, "pays": pays, "never": never, "call_s": 2e-3}
+    theirs = {**line, "solver": "heyoka", "pays": [50.0], "never": 0, "call_s": 1e-3}
     (row,) = takes({"work_precision": {"first_calls": [theirs, line]}}, [])
-    begin = "breaks even with `compiled=False`, at an error of 1e-8: "
-    assert row["take"] == f"{begin}{said}`heyoka` on all 5 mechanisms by run 50"
+    begin = "in single calls with an error of 1e-8: code of `heyoka` pays from run 50 on 5 of 5 mechanisms"
+    assert row["take"] == f"{begin}, the cheapest later call{said}"
     (row,) = takes({"work_precision": {"first_calls": [line | {"pays": [3.0, 40.0], "never": 2}]}}, [])
-    assert row["take"].endswith(": `compiled=True` on 3 of 5 by run 40")
+    assert row["take"].endswith("run 3 to 40 on 3 of 5 mechanisms, the cheapest later call")
     assert takes({"work_precision": {"first_calls": []}}, []) == []
 
 

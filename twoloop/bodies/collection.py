@@ -22,6 +22,7 @@ class Collection:
     """Bodies, joints and forces, in two or three dimensions."""
 
     dimension: int
+    distance_kind: int  # of the row of a distance, in the callbacks
 
     def __init__(self, gravity: ArrayLike, name: str):
         self.gravity = check_vector("gravity", gravity, self.dimension)
@@ -176,9 +177,36 @@ class Collection:
         here, there = self._points(at, first, second)
         return first, second, name, (self._numbers(name, first, here), self._numbers(name, second, there))
 
-    def _distance(
-        self, kind: int, a: Any, at_a: Any, b: Any, at_b: Any, length: float | None, name: str | None
+    def distance(
+        self,
+        a: Body | str,
+        at_a: Any,
+        b: Body | str,
+        at_b: Any,
+        *,
+        length: float | None = None,
+        name: str | None = None,
     ) -> ModelJoint:
+        """A massless rod between a point of a and a point of b.
+
+        Parameters
+        ----------
+        a, b : Body or str
+        at_a, at_b : array_like (2,) or (3,), or BodyPoint
+            The points, in space in the position given, m.
+        length : float, optional
+            m. None: their distance in the position given.
+        name : str, optional
+
+        Returns
+        -------
+        ModelJoint
+
+        Raises
+        ------
+        TypeError, ValueError
+            If an argument is wrong.
+        """
         first, second = self._body("a", a), self._body("b", b)
         self._different("distance joint", first, second)
         name = self._new_name("distance", name, first, second)
@@ -190,7 +218,7 @@ class Collection:
         check_positive(f"length of {name!r}", length)
         points = self._numbers(name, first, here), self._numbers(name, second, there)
         long = Numbers((float(length),), (f"length of {name} (m)",))
-        row = JointRow(kind, 1, first, second, *points, long)
+        row = JointRow(self.distance_kind, 1, first, second, *points, long)
         return self._add_joint(ModelJoint(name, "distance", first, second, (row,), *points))
 
     def _new_body(self, name: str, mass: float, position: ArrayLike, velocity: ArrayLike | None) -> tuple[Any, ...]:

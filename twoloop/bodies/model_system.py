@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from twoloop.bodies.functions import Function
 from twoloop.bodies.parameter_layout import FORCE_PROGRAM, HEAD, MOTION_PROGRAM
 from twoloop.bodies.tables import Tables
+from twoloop.generate.tracing import Untraceable
 from twoloop.problem.joints import Joint
 from twoloop.problem.system import ConstrainedSystem
 
@@ -95,43 +96,48 @@ class InPython:
     def __init__(self, callbacks: Any, tables: Tables, n_q: int):
         self._callbacks = callbacks
         self._motions, self._functions = tuple(tables.motions), tuple(tables.functions)
-        self._n_q, self._n_rows = n_q, tables.n_rows
+        self._n_q, self._n_rows, self._untraced = n_q, tables.n_rows, tables.untraced
 
     def mass(self, t: float, q: Array, p: Array) -> Array:
         """M."""
-        made = np.zeros((self._n_q, self._n_q))
+        made = self._zeros(q, self._n_q, self._n_q)
         self._callbacks.mass(t, q, p, made)
         return made
 
     def force(self, t: float, q: Array, v: Array, p: Array) -> Array:
         """Q."""
-        made = np.zeros(self._n_q)
+        made = self._zeros(q, self._n_q)
         self._callbacks.fill_force(q, v, p, _called(self._functions, t, q, v), made)
         return made
 
     def constraint(self, t: float, q: Array, p: Array) -> Array:
         """C."""
-        made = np.zeros(self._n_rows)
+        made = self._zeros(q, self._n_rows)
         self._callbacks.fill_constraint(q, p, self._moved(t), made)
         return made
 
     def jacobian(self, t: float, q: Array, p: Array) -> Array:
         """C_q."""
-        made = np.zeros((self._n_rows, self._n_q))
+        made = self._zeros(q, self._n_rows, self._n_q)
         self._callbacks.fill_jacobian(q, p, self._moved(t), made)
         return made
 
     def constraint_rate(self, t: float, q: Array, p: Array) -> Array:
         """C_t."""
-        made = np.zeros(self._n_rows)
+        made = self._zeros(q, self._n_rows)
         self._callbacks.fill_rate(q, p, self._moved(t), made)
         return made
 
     def gamma(self, t: float, q: Array, v: Array, p: Array) -> Array:
         """The right-hand side of C_q a = gamma."""
-        made = np.zeros(self._n_rows)
+        made = self._zeros(q, self._n_rows)
         self._callbacks.fill_gamma(q, v, p, self._moved(t), made)
         return made
+
+    def _zeros(self, q: Array, *shape: int) -> Array:
+        if q.dtype == object:  # symbols, on which the compiled callbacks would say less
+            raise Untraceable(self._untraced)
+        return np.zeros(shape)
 
     def _moved(self, t: float) -> Array:
         nothing = np.zeros(0)

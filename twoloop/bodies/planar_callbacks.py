@@ -46,6 +46,8 @@ from twoloop.bodies.parameter_layout import (
 from twoloop.bodies.program_results import result, results
 from twoloop.kernels.compile.caches import helper
 from twoloop.kernels.compile.callbacks import callback
+from twoloop.mechanisms.planar import motion
+from twoloop.mechanisms.planar import place as place_on
 
 WEIGHT = 2  # numbers of gravity, before those of the bodies
 
@@ -61,21 +63,7 @@ def angle_of(q, body):
 @helper
 def place(q, body, p, at):
     """The point of a body whose two numbers stand in p, and its derivative by the angle: x, y, dx, dy."""
-    a, b = p[at], p[at + 1]
-    if body < 0:
-        return a, b, 0.0, 0.0
-    s, c = math.sin(q[3 * body + 2]), math.cos(q[3 * body + 2])
-    x, y = c * a - s * b, s * a + c * b
-    return q[3 * body] + x, q[3 * body + 1] + y, -y, x
-
-
-@helper
-def motion(v, body, dx, dy):
-    """Velocity of a point whose derivative by the angle is (dx, dy), and what its acceleration has without v'."""
-    if body < 0:
-        return 0.0, 0.0, 0.0, 0.0
-    w = v[3 * body + 2]
-    return v[3 * body] + w * dx, v[3 * body + 1] + w * dy, -w * w * dy, w * w * dx
+    return place_on(q, body, p[at], p[at + 1])
 
 
 @helper

@@ -41,6 +41,7 @@ class PlanarModel(Model):
     """
 
     dimension = 2
+    distance_kind = DISTANCE
     coordinate_names = ("x (m)", "y (m)", "angle (rad)")
 
     def __init__(self, gravity: ArrayLike = (0.0, -9.81), *, name: str = "planar model"):
@@ -255,38 +256,6 @@ class PlanarModel(Model):
         turned = _turn(name, first, second, second.rotation - first.rotation)
         rows = _pin(first, second, *points), JointRow(ANGLE, 1, first, second, more=turned)
         return self._add_joint(ModelJoint(name, "fixed", first, second, rows, *points))
-
-    def distance(
-        self,
-        a: Body | str,
-        at_a: Any,
-        b: Body | str,
-        at_b: Any,
-        *,
-        length: float | None = None,
-        name: str | None = None,
-    ) -> ModelJoint:
-        """A massless rod between a point of a and a point of b.
-
-        Parameters
-        ----------
-        a, b : Body or str
-        at_a, at_b : array_like (2,) or BodyPoint
-            The points, in space in the position given, m.
-        length : float, optional
-            m. None: their distance in the position given.
-        name : str, optional
-
-        Returns
-        -------
-        ModelJoint
-
-        Raises
-        ------
-        TypeError, ValueError
-            If an argument is wrong.
-        """
-        return self._distance(DISTANCE, a, at_a, b, at_b, length, name)
 
     def _no_rotation(self) -> float:
         return 0.0

@@ -50,6 +50,7 @@ class SpatialModel(SpatialShapes):
 
     ignored: tuple[str, ...] = ()  # what of a file has no counterpart, see `from_mjcf`
     coordinate_names = ("x (m)", "y (m)", "z (m)", "e0 (-)", "e1 (-)", "e2 (-)", "e3 (-)")
+    distance_kind = LENGTH
 
     def __init__(self, gravity: ArrayLike = (0.0, 0.0, -9.81), *, name: str = "spatial model"):
         super().__init__(gravity, name)
@@ -245,38 +246,6 @@ class SpatialModel(SpatialShapes):
             *(across(first, np.eye(3)[i], second, there[:, j]) for i, j in pairs),
         )
         return self._add_joint(ModelJoint(name, "fixed", first, second, rows, *points))
-
-    def distance(
-        self,
-        a: Body | str,
-        at_a: Any,
-        b: Body | str,
-        at_b: Any,
-        *,
-        length: float | None = None,
-        name: str | None = None,
-    ) -> ModelJoint:
-        """A massless rod between a point of a and a point of b.
-
-        Parameters
-        ----------
-        a, b : Body or str
-        at_a, at_b : array_like (3,) or BodyPoint
-            The points, in space in the position given, m.
-        length : float, optional
-            m. None: their distance in the position given.
-        name : str, optional
-
-        Returns
-        -------
-        ModelJoint
-
-        Raises
-        ------
-        TypeError, ValueError
-            If an argument is wrong.
-        """
-        return self._distance(LENGTH, a, at_a, b, at_b, length, name)
 
     def to_mjcf(self, path: str | os.PathLike[str]) -> None:
         """Write the model to a file that MuJoCo reads, see `twoloop.bodies.from_mjcf`.

@@ -23,7 +23,10 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-OWN = {"twoloop.checks.bounds", "twoloop.generate.tracing", "twoloop.generate.calls_on_symbols"}
+OWN = {
+    *("twoloop.checks.bounds", "twoloop.generate.tracing", "twoloop.generate.calls_on_symbols"),
+    "twoloop.bodies.model_system",
+}
 MANY = 4096  # parameters that a callback may ask for beyond those that it has, for telling which array is too short
 
 

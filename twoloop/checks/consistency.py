@@ -30,7 +30,6 @@ NEARBY = (0.0, 1e-3, 1e-2, 3e-2)  # of the coordinates: where the pattern of C_q
 TIED = 1e-6  # relative: corrections that exceed what is allowed by as much, of which the first is named
 ROUNDING = 64.0  # times the spacing of floating-point numbers: what rounding of the state may add to it
 SINGULAR_MASS = 1e-12  # smallest eigenvalue over largest entry, below which M may have no inverse
-LARGE = 100  # coordinates from which on rows are looked at by their entries, where these are given
 LEAST = np.array([ROUNDING * EPS, UNSYMMETRIC, SINGULAR_MASS])  # as the kernel takes them
 
 
@@ -93,7 +92,7 @@ def _in_order(system: ConstrainedSystem, t: float, q: Array, v: Array) -> bool:
     """Whether compiled callbacks give nothing at a start that would have to be looked at more closely."""
     from twoloop.kernels.evaluation import first_look
 
-    if system.called_in_python or (system.n_q >= LARGE and system.entries):
+    if system.called_in_python or system.entries:
         return False
     q, v = np.ascontiguousarray(q, dtype=np.float64), np.ascontiguousarray(v, dtype=np.float64)
     n, n_c, n_rows = system.n_q, system.n_c, system.n_c + system.n_a

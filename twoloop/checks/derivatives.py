@@ -1,4 +1,4 @@
-"""Is what a system says about itself true? C_q, C_t, Q_d and tangents against differences, M symmetric, bandwidth.
+"""C_q, C_t, Q_d and the tangents of a system against differences, and the symmetry of M.
 
 A wrong sign in one of them often runs to the end and looks like a motion. Every entry is compared at the start, and
 along a run one direction through all of them.
@@ -6,7 +6,6 @@ along a run one direction through all of them.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -14,11 +13,19 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from twoloop.checks.differences import EPS, Estimate, Function, confirms, differentiate
-from twoloop.checks.scales import column_scales, generic_factors, median, sizes
-from twoloop.checks.sparse_rows import Rows, SparseRows, apart, is_finite
+from twoloop.checks.differences import (
+    EPS,
+    Estimate,
+    Function,
+    as_far_as_they_differ,
+    confirms,
+    defined,
+    differentiate,
+)
+from twoloop.checks.scales import generic_factors, generic_velocities, sizes
+from twoloop.checks.sparse_rows import SparseRows, apart, is_finite
+from twoloop.checks.structure import check_bandwidth, check_constant_mass, check_kinematics
 from twoloop.checks.values import check_values, unsymmetric_mass
-from twoloop.kernels.compile.linking import direct
 from twoloop.kernels.data.common import FORCE_BY_Q_GIVEN, FORCE_BY_V_GIVEN, REACTION_BY_Q_GIVEN
 
 if TYPE_CHECKING:
@@ -30,11 +37,7 @@ ANYWHERE = (0, 1, -1)  # around the place; where the callbacks are not defined t
 FORWARD = (1, -1)  # for times at the start: callbacks need not work before it
 TIME = 0.1  # s: first guess at how fast constraints move
 NEAR_START = 1e-3  # of the coordinates: tangents are looked at a little off the start, where symmetry hides terms
-FASTEST = 1e9  # times the motion by one's own size in a second: beyond, C_q is nearly zero and the drive is not so fast
 ALONG_A_RUN = 9  # half-widths tried at most at a state of a run
-SAME = 1e-11  # relative: values that two callbacks must share ...
-ROUNDED = 100.0  # ... and times rounding of the terms of a constraint
-ROUNDING = 1e-12  # of a difference, relative to the largest entry over the displacement
 
 WHAT = {
     "jacobian": "the derivative of constraint with respect to q",
@@ -73,12 +76,12 @@ def check_derivatives(system: ConstrainedSystem, t: float, q: Array, exact: Call
     wrong = wrong or _wrong_tangent(system, t, q) or _unsymmetric_near(system, t, q)
     if wrong is not None:
         raise ValueError(wrong)
-    _check_kinematics(system, t, q)
-    _check_constant_mass(system, t, q)
+    check_kinematics(system, t, q)
+    check_constant_mass(system, t, q)
     if system.bandwidth is not None:
-        _check_bandwidth(system, system.bandwidth, t, q)
+        check_bandwidth(system, system.bandwidth, t, q)
     near = q + NEAR_START * sizes(q) * np.random.default_rng(1).uniform(0.5, 1.5, system.n_q)
-    check_values(system, t, q if _defined(lambda: system.constraint(t, near)) is None else near)
+    check_values(system, t, q if defined(lambda: system.constraint(t, near)) is None else near)
     system.checked = True
 
 
@@ -97,7 +100,7 @@ def wrong_derivative(system: ConstrainedSystem, t: float, q: Array, v: Array) ->
     if jacobian.size == 0 or not (is_finite(jacobian) and np.isfinite(rate).all()):
         return None
     n_c = system.n_c
-    generic = _generic_velocities(jacobian, rate, q)[-1]
+    generic = generic_velocities(jacobian, rate, q)[-1]
     generic = generic * max(1.0, float(np.abs(v).max()) / float(np.abs(generic).max()))
     scale = min(TIME, _time_scale(q, generic))
     noise = EPS * (abs(jacobian) @ np.abs(q))[:n_c]
@@ -110,7 +113,7 @@ def wrong_derivative(system: ConstrainedSystem, t: float, q: Array, v: Array) ->
     for kind, rows in _gammas(system):
         if suspicious:
             break
-        right = _defined(lambda kind=kind: system.evaluate(kind, t, q, generic))  # type: ignore[misc]
+        right = defined(lambda kind=kind: system.evaluate(kind, t, q, generic))  # type: ignore[misc]
         if right is None:
             return None
         given = -right
@@ -158,20 +161,12 @@ class _Comparison:
         hint = HINTS.get(self.kind, "")
         if self.kind == "force_by_v" and self.system.functions.flags[FORCE_BY_V_GIVEN] == 0:
             hint = ", that is, give force_by_v: beside force_by_q the force may depend on v only with it"
-        given, found = _as_far_as_they_differ(float(self.given[row]), float(best.slope[row]))
+        given, found = as_far_as_they_differ(float(self.given[row]), float(best.slope[row]))
         return (
             f"{self.kind} of {self.system.name!r} is not {WHAT[self.kind]}: entry {entry} is {given}, by "
             f"differences it is {found} with an error of about {best.error[row]:.1g} (near t = "
             f"{self.t:.10g}; velocities are chosen at random). Correct its formula{hint}"
         )
-
-
-def _as_far_as_they_differ(one: float, other: float) -> tuple[str, str]:
-    """Two numbers, to the third digit of their difference: those behind it are rounding, or of no interest."""
-    if not 0.0 < abs(one - other) < np.inf:
-        return f"{one:.3g}", f"{other:.3g}"
-    places = 2 - math.floor(math.log10(abs(one - other)))
-    return f"{round(one, places) + 0.0:.16g}", f"{round(other, places) + 0.0:.16g}"
 
 
 def _wrong_constraint(system: ConstrainedSystem, t: float, q: Array, sides: tuple[int, ...]) -> str | None:
@@ -183,8 +178,8 @@ def _wrong_constraint(system: ConstrainedSystem, t: float, q: Array, sides: tupl
     if not (is_finite(jacobian) and np.isfinite(rate).all()):
         return None
     for kind, rows in _gammas(system):
-        for v in _generic_velocities(jacobian, rate, q):
-            given = _defined(lambda kind=kind, v=v: system.evaluate(kind, t, q, v))  # type: ignore[misc]
+        for v in generic_velocities(jacobian, rate, q):
+            given = defined(lambda kind=kind, v=v: system.evaluate(kind, t, q, v))  # type: ignore[misc]
             if given is None:
                 continue
             noise = EPS * (abs(jacobian) @ np.abs(v) + np.abs(rate))[rows]
@@ -202,7 +197,7 @@ def _unsymmetric_near(system: ConstrainedSystem, t: float, q: Array) -> str | No
     if system.constant_mass:
         return None
     near = q + NEAR_START * sizes(q) * np.abs(generic_factors(system.n_q))
-    if _defined(lambda: system.mass(t, near)) is None:
+    if defined(lambda: system.mass(t, near)) is None:
         return None
     wrong = unsymmetric_mass(system, t, near)
     return None if wrong is None else f"{wrong} (near the start: at q = {near})"
@@ -237,7 +232,7 @@ def _wrong_tangent(system: ConstrainedSystem, t: float, q: Array) -> str | None:
     if system.functions.flags[FORCE_BY_Q_GIVEN] == 0:
         return None
     v = sizes(q) * generic_factors(system.n_q)
-    if _defined(lambda: system.force(t, q + NEAR_START * v, v)) is not None:
+    if defined(lambda: system.force(t, q + NEAR_START * v, v)) is not None:
         q = q + NEAR_START * v
 
     def force_in_q(x: Array) -> Array:
@@ -259,18 +254,9 @@ def _wrong_tangent(system: ConstrainedSystem, t: float, q: Array) -> str | None:
     return _wrong_column(system, "reaction_by_q", t, q, reaction_in_q, lambda x: system.reaction_by_q(t, x, lam))
 
 
-def _defined(function: Callable[[], Array]) -> Array | None:
-    """What a callback gives away from the state, or None: there it may be outside what it is made for."""
-    try:
-        value = function()
-    except Exception:
-        return None
-    return value if np.isfinite(value).all() else None
-
-
 def _varies(function: Callable[[Array], Array], x: Array) -> bool:
     """Whether a function changes along one direction, which is cheaper to see than by all columns."""
-    values = [_defined(lambda part=part: function(part * x)) for part in (1.0, 1.001, 2.0, 0.0, 1e3)]  # type: ignore[misc]
+    values = [defined(lambda part=part: function(part * x)) for part in (1.0, 1.001, 2.0, 0.0, 1e3)]  # type: ignore[misc]
     known = [value for value in values if value is not None]
     return any(bool((value != known[0]).any()) for value in known)
 
@@ -284,7 +270,7 @@ def _wrong_column(
     derivative: Callable[[Array], Array],
 ) -> str | None:
     """Displace one coordinate (or velocity) after another and compare the columns of a matrix."""
-    given = _defined(lambda: derivative(x))
+    given = defined(lambda: derivative(x))
     if given is None:
         return None
     noise = EPS * (np.abs(given) @ np.abs(x))
@@ -349,18 +335,6 @@ def _rounding(derivative: Callable[[Array], Array], given: Array, x: Array) -> A
     return largest
 
 
-def _generic_velocities(jacobian: Rows, rate: Array, q: Array) -> list[Array]:
-    """Velocities in which each coordinate matters; where C_t is not zero, the last are as fast as the drive."""
-    size = sizes(q)
-    v = column_scales(jacobian, size) * generic_factors(len(q))
-    v = v / median(np.abs(v) / size)
-    driven, moved = rate != 0.0, abs(jacobian) @ np.abs(v)
-    if not (driven & (moved > 0.0)).any():
-        return [v]
-    faster = float(np.median(np.abs(rate[driven & (moved > 0.0)]) / moved[driven & (moved > 0.0)]))
-    return [v, min(faster, FASTEST) * v]
-
-
 def _time_scale(q: Array, v: Array) -> float:
     """Time in which no coordinate moves by more than its size, s."""
     return float((sizes(q) / np.maximum(np.abs(v), 1e-300)).min())
@@ -383,83 +357,3 @@ def _along_a_line(system: ConstrainedSystem, t: float, q: Array, v: Array, rows:
 
 def _minus(function: Function) -> Function:
     return lambda s: -function(s)
-
-
-def _check_kinematics(system: ConstrainedSystem, t: float, q: Array) -> None:
-    """Compare the fused callback with the separate ones, which were compared with differences before."""
-    if "kinematics" not in system.given:
-        return
-    from twoloop.kernels.evaluation.first_look import kinematics_agree
-
-    rows = system.sparse_rows(t, q)[: system.n_c]
-    v = _generic_velocities(rows, system.constraint_rate(t, q), q)[-1]
-    for place in (q, q + NEAR_START * v):
-        room = *np.zeros((2, 3 + system.n_q, system.n_c)), np.zeros(system.n_c)
-        if direct(kinematics_agree)(system.kit, t, np.ascontiguousarray(place), v, *room, SAME, ROUNDED * EPS):
-            continue
-        separate = {
-            "constraint": system.constraint(t, place),
-            "jacobian": system.jacobian(t, place),
-            "constraint_rate": system.constraint_rate(t, place),
-            "gamma": system.gamma(t, place, v),
-        }
-        size = EPS * np.abs(separate["jacobian"]) @ np.abs(place)  # of the terms in a constraint
-        for fused, (kind, given) in zip(system.kinematics(t, place, v), separate.items(), strict=True):
-            off = np.abs(fused - given)
-            level = SAME * np.abs(given).max(initial=0.0) + (ROUNDED * size if kind == "constraint" else 0.0)
-            if (off > level).any():
-                entry = np.unravel_index(int((off - level).argmax()), off.shape)
-                where = int(entry[0]) if len(entry) == 1 else tuple(int(i) for i in entry)
-                here, there = _as_far_as_they_differ(float(fused[entry]), float(given[entry]))
-                raise ValueError(
-                    f"kinematics of {system.name!r} does not give what {kind} gives: entry {where} is "
-                    f"{here} and {there} (near t = {t:.10g}). Correct it, or leave it out"
-                )
-
-
-def _check_constant_mass(system: ConstrainedSystem, t: float, q: Array) -> None:
-    if not system.constant_mass:
-        return
-    shift = 0.1 * sizes(q) * np.sign(generic_factors(system.n_q))
-    mass = system.mass_values if "mass" in system.entries else system.mass
-    there = _defined(lambda: mass(t + 1.0, q + shift))
-    if there is not None and np.abs(there - mass(t, q)).max() > 1e-10 * np.abs(there).max():
-        raise ValueError(f"mass of {system.name!r} is said to be constant (constant_mass=True) and is not")
-
-
-def _check_bandwidth(system: ConstrainedSystem, bandwidth: int, t: float, q: Array) -> None:
-    """Displace one coordinate or velocity after another: what lies farther away than the bandwidth may not answer."""
-    places = np.arange(system.n_q)
-    farthest, where = bandwidth, ""
-    size = float(np.abs(q).max()) or 1.0
-    v = size * generic_factors(system.n_q)
-    q, shift = q + 1e-3 * v, 1e-3 * size
-
-    def look(what: str, j: int, column: Array, level: float) -> None:
-        nonlocal farthest, where
-        distances = np.where(np.isfinite(column) & (np.abs(column) > level), np.abs(places - j), 0)
-        if distances.max() > farthest:
-            i = int(distances.argmax())
-            farthest, where = int(distances[i]), f"{what} has the entry ({i}, {j}) = {column[i]:.6g}"
-
-    for j, column in enumerate(system.mass(t, q).T):
-        look("M", j, column, 0.0)
-    for j in range(system.n_q):
-        step = np.where(places == j, shift, 0.0)
-        try:
-            force, jacobian = system.force(t, q, v), system.jacobian(t, q)
-            by_q, by_v = system.force(t, q + step, v) - force, system.force(t, q, v + step) - force
-            change = system.jacobian(t, q + step) - jacobian
-        except (ArithmeticError, ValueError):  # math.sqrt and its like, outside what the callbacks are made for
-            continue
-        level = ROUNDING * float(np.abs(force).max()) / shift
-        look("the derivative of force by q", j, by_q / shift, level)
-        look("the derivative of force by v", j, by_v / shift, level)
-        level = ROUNDING * float(np.abs(jacobian).max(initial=0.0)) / shift
-        for k in range(system.n_c):
-            look(f"the second derivative of constraint {k} by q", j, change[k] / shift, level)
-    if where:
-        raise ValueError(
-            f"bandwidth of {system.name!r} must be at least {farthest}: {where}; given {bandwidth}. Or number the "
-            "coordinates otherwise, or leave bandwidth out"
-        )

@@ -6,6 +6,7 @@ a kink, a step and an oscillation that the points do not resolve all leave them 
 and Approximation Practice, 2013). The width of the interval is looked for, because scales are not known beforehand.
 """
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
@@ -220,3 +221,20 @@ def confirms(
         if k > RIPPLES and found.ripple[entry] > 0.0:  # not from the ends of the interval: it may hide a steep slope
             return False
     return True
+
+
+def defined(function: Callable[[], Array]) -> Array | None:
+    """What a callback gives away from the state, or None: there it may be outside what it is made for."""
+    try:
+        value = function()
+    except Exception:
+        return None
+    return value if np.isfinite(value).all() else None
+
+
+def as_far_as_they_differ(one: float, other: float) -> tuple[str, str]:
+    """Two numbers, to the third digit of their difference: those behind it are rounding, or of no interest."""
+    if not 0.0 < abs(one - other) < np.inf:
+        return f"{one:.3g}", f"{other:.3g}"
+    places = 2 - math.floor(math.log10(abs(one - other)))
+    return f"{round(one, places) + 0.0:.16g}", f"{round(other, places) + 0.0:.16g}"

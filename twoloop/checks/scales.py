@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
+FASTEST = 1e9  # times the motion by one's own size in a second: beyond, C_q is nearly zero and the drive is not so fast
 EPS = float(np.finfo(np.float64).eps)
 DISPLACEMENTS = (1e-2, 1e-4, 1e-6)  # of a coordinate, for the curvature of the constraints
 TURNS = 0.1  # units: a row that is short beside what it becomes over this way is short by its position
@@ -159,3 +160,15 @@ def _curvature(system: ConstrainedSystem, t: float, q: Array, columns: Array, n_
         if defined[2 * k : 2 * k + 2].all() and np.isfinite(change).all():
             largest = np.maximum(largest, np.where(change > noise, change, 0.0))
     return largest
+
+
+def generic_velocities(jacobian: Rows, rate: Array, q: Array) -> list[Array]:
+    """Velocities in which each coordinate matters; where C_t is not zero, the last are as fast as the drive."""
+    size = sizes(q)
+    v = column_scales(jacobian, size) * generic_factors(len(q))
+    v = v / median(np.abs(v) / size)
+    driven, moved = rate != 0.0, abs(jacobian) @ np.abs(v)
+    if not (driven & (moved > 0.0)).any():
+        return [v]
+    faster = float(np.median(np.abs(rate[driven & (moved > 0.0)]) / moved[driven & (moved > 0.0)]))
+    return [v, min(faster, FASTEST) * v]

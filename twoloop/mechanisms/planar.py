@@ -20,6 +20,7 @@ from twoloop.kernels.compile.caches import helper
 from twoloop.kernels.compile.callbacks import callback
 from twoloop.mechanisms.points import Sketch
 from twoloop.problem.drawing import Drawing
+from twoloop.problem.entries import LARGE
 from twoloop.problem.joints import Joint, unused
 from twoloop.problem.problem import Array
 from twoloop.problem.system import ConstrainedSystem
@@ -29,7 +30,6 @@ DISTANCE = 1.0  # half the squared distance of the points is `value`: one row
 COORDINATE = 2.0  # q[i] = ax + ay t + bx sin(by t): one row
 WIDTH = 9  # numbers of a joint
 GROUND = -1
-LARGE = 100  # coordinates from which on the values of entries serve
 
 
 @helper

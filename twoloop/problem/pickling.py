@@ -1,13 +1,25 @@
 """Systems in other processes: their functions travel by name, and never as a number that means another's there."""
 
+from __future__ import annotations
+
 import importlib
 import pickle
 from dataclasses import dataclass
 from operator import attrgetter
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from twoloop.kernels.compile.private import Dispatcher
+from twoloop.problem.adapters import ConstantMatrix
+from twoloop.problem.description import Description
 from twoloop.problem.generated import GeneratedCode, code_of
+
+if TYPE_CHECKING:
+    from twoloop.problem.system import ConstrainedSystem
+
+Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -72,3 +84,43 @@ def packed(system_name: str, kind: str, function: Any) -> Any:
 def unpacked(function: Any) -> Any:
     """The function that `packed` replaced."""
     return function.found() if isinstance(function, (ByName, FromEquations)) else function
+
+
+def reduced(system: ConstrainedSystem) -> tuple[Any, ...]:
+    """What `made_again` needs to make a system in another process, beside its class."""
+    plain = system._returning or system.python_functions
+    options: dict[str, Any] = {"n_q": system.n_q, "n_c": system.n_c, "n_a": system.n_a}
+    options |= {"bandwidth": system.bandwidth, "joints": system.joints, "name": system.name}
+    options |= {f"{kind}_entries": entries for kind, entries in system.entries.items()}
+    if plain:
+        options["compile"] = not system.called_in_python
+        options["parameters"] = system.parameters if system._taking else None
+    else:
+        options |= {"constant_mass": system.constant_mass, "parameters": system.parameters}
+    own = {kind: function for kind, function in (plain or system.given).items() if kind not in system.scattered}
+    functions = {kind: packed(system.name, kind, function) for kind, function in own.items()}
+    known = system.description
+    if known.energy is not None:
+        packed(system.name, "energy", known.energy)
+    if known.drawing is not None:
+        packed(system.name, "points of the drawing", known.drawing.points)
+    return bool(plain), options, functions, system.functions.flags, known
+
+
+def made_again(
+    cls: type[ConstrainedSystem],
+    plain: bool,
+    options: dict[str, Any],
+    packed: dict[str, Any],
+    flags: Array,
+    known: Description,
+) -> ConstrainedSystem:
+    """The system that was pickled, of the functions that this process finds by the same names."""
+    functions = {kind: unpacked(function) for kind, function in packed.items()}
+    for kind in ("mass", "mass_values") if plain else ():
+        if isinstance(functions.get(kind), ConstantMatrix):
+            functions[kind] = functions[kind].matrix
+    system = (cls.from_python if plain else cls)(**options, **functions)
+    system.functions.flags[:] = flags
+    system.description = known
+    return system

@@ -28,7 +28,7 @@ from twoloop.problem.description import Description
 from twoloop.problem.entries import VALUES_OF, DenseFunction, dense_callback
 from twoloop.problem.given import checked_entries, checked_parameters, given_callbacks, in_place_of
 from twoloop.problem.joints import Joint, check_joints
-from twoloop.problem.pickling import packed, unpacked
+from twoloop.problem.pickling import made_again, reduced
 from twoloop.problem.system_methods import add_callbacks
 
 Array = NDArray[np.float64]
@@ -451,42 +451,7 @@ class ConstrainedSystem:
         return other
 
     def __reduce__(self) -> tuple[Any, ...]:
-        plain = self._returning or (self._python.functions if self._python is not None else {})
-        options: dict[str, Any] = {"n_q": self.n_q, "n_c": self.n_c, "n_a": self.n_a}
-        options |= {"bandwidth": self.bandwidth, "joints": self.joints, "name": self.name}
-        options |= {f"{kind}_entries": entries for kind, entries in self.entries.items()}
-        if plain:
-            options["compile"] = not self.called_in_python
-            options["parameters"] = self.parameters if self._taking else None
-        else:
-            options |= {"constant_mass": self.constant_mass, "parameters": self.parameters}
-        own = {kind: function for kind, function in (plain or self.given).items() if kind not in self.scattered}
-        functions = {kind: packed(self.name, kind, function) for kind, function in own.items()}
-        known = self.description
-        if known.energy is not None:
-            packed(self.name, "energy", known.energy)
-        if known.drawing is not None:
-            packed(self.name, "points of the drawing", known.drawing.points)
-        return _made_again, (type(self), bool(plain), options, functions, self.functions.flags, known)
-
-
-def _made_again(
-    cls: type[ConstrainedSystem],
-    plain: bool,
-    options: dict[str, Any],
-    packed: dict[str, Any],
-    flags: Array,
-    known: Description,
-) -> ConstrainedSystem:
-    """The system that was pickled, of the functions that this process finds by the same names."""
-    functions = {kind: unpacked(function) for kind, function in packed.items()}
-    for kind in ("mass", "mass_values") if plain else ():
-        if isinstance(functions.get(kind), ConstantMatrix):
-            functions[kind] = functions[kind].matrix
-    system = (cls.from_python if plain else cls)(**options, **functions)
-    system.functions.flags[:] = flags
-    system.description = known
-    return system
+        return made_again, (type(self), *reduced(self))
 
 
 def check_system(system: object) -> None:

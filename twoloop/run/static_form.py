@@ -16,12 +16,12 @@ from twoloop.kernels.algebra.static_program import (
 )
 from twoloop.kernels.layout import Static
 from twoloop.methods.plan import Plan
+from twoloop.problem.entries import LARGE
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.newton_form import newton_form
 
 Array = NDArray[np.float64]
 
-LARGE = 100  # coordinates from which on it is faster than the forms of saddle_point.py: measured on chains
 SINGULAR = 1e-10  # smallest over largest eigenvalue of a body's M, below which it counts as singular
 SPARSE = 0.05  # of the multiplications of dense factors: a program with more of them is not worth its indices
 

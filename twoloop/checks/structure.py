@@ -1,0 +1,103 @@
+"""What a system says of its callbacks as a whole: M constant, a bandwidth, `kinematics` in the place of others."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twoloop.checks.differences import EPS, as_far_as_they_differ, defined
+from twoloop.checks.scales import generic_factors, generic_velocities, sizes
+from twoloop.checks.values import SAME
+from twoloop.kernels.compile.linking import direct
+
+if TYPE_CHECKING:
+    from twoloop.problem.system import ConstrainedSystem
+
+Array = NDArray[np.float64]
+
+NEAR = 1e-3  # of the coordinates: also looked at a little off the start, where symmetry hides terms
+ROUNDED = 100.0  # times rounding of the terms of a constraint, by which values that callbacks share may differ, too
+ROUNDING = 1e-12  # of a difference, relative to the largest entry over the displacement
+
+
+def check_kinematics(system: ConstrainedSystem, t: float, q: Array) -> None:
+    """Compare the fused callback with the separate ones, which were compared with differences before."""
+    if "kinematics" not in system.given:
+        return
+    from twoloop.kernels.evaluation.first_look import kinematics_agree
+
+    rows = system.sparse_rows(t, q)[: system.n_c]
+    v = generic_velocities(rows, system.constraint_rate(t, q), q)[-1]
+    for place in (q, q + NEAR * v):
+        room = *np.zeros((2, 3 + system.n_q, system.n_c)), np.zeros(system.n_c)
+        if direct(kinematics_agree)(system.kit, t, np.ascontiguousarray(place), v, *room, SAME, ROUNDED * EPS):
+            continue
+        separate = {
+            "constraint": system.constraint(t, place),
+            "jacobian": system.jacobian(t, place),
+            "constraint_rate": system.constraint_rate(t, place),
+            "gamma": system.gamma(t, place, v),
+        }
+        size = EPS * np.abs(separate["jacobian"]) @ np.abs(place)  # of the terms in a constraint
+        for fused, (kind, given) in zip(system.kinematics(t, place, v), separate.items(), strict=True):
+            off = np.abs(fused - given)
+            level = SAME * np.abs(given).max(initial=0.0) + (ROUNDED * size if kind == "constraint" else 0.0)
+            if (off > level).any():
+                entry = np.unravel_index(int((off - level).argmax()), off.shape)
+                where = int(entry[0]) if len(entry) == 1 else tuple(int(i) for i in entry)
+                here, there = as_far_as_they_differ(float(fused[entry]), float(given[entry]))
+                raise ValueError(
+                    f"kinematics of {system.name!r} does not give what {kind} gives: entry {where} is "
+                    f"{here} and {there} (near t = {t:.10g}). Correct it, or leave it out"
+                )
+
+
+def check_constant_mass(system: ConstrainedSystem, t: float, q: Array) -> None:
+    """Compare M with that of another time and position, if it is said to be constant."""
+    if not system.constant_mass:
+        return
+    shift = 0.1 * sizes(q) * np.sign(generic_factors(system.n_q))
+    mass = system.mass_values if "mass" in system.entries else system.mass
+    there = defined(lambda: mass(t + 1.0, q + shift))
+    if there is not None and np.abs(there - mass(t, q)).max() > 1e-10 * np.abs(there).max():
+        raise ValueError(f"mass of {system.name!r} is said to be constant (constant_mass=True) and is not")
+
+
+def check_bandwidth(system: ConstrainedSystem, bandwidth: int, t: float, q: Array) -> None:
+    """Displace one coordinate or velocity after another: what lies farther away than the bandwidth may not answer."""
+    places = np.arange(system.n_q)
+    farthest, where = bandwidth, ""
+    size = float(np.abs(q).max()) or 1.0
+    v = size * generic_factors(system.n_q)
+    q, shift = q + 1e-3 * v, 1e-3 * size
+
+    def look(what: str, j: int, column: Array, level: float) -> None:
+        nonlocal farthest, where
+        distances = np.where(np.isfinite(column) & (np.abs(column) > level), np.abs(places - j), 0)
+        if distances.max() > farthest:
+            i = int(distances.argmax())
+            farthest, where = int(distances[i]), f"{what} has the entry ({i}, {j}) = {column[i]:.6g}"
+
+    for j, column in enumerate(system.mass(t, q).T):
+        look("M", j, column, 0.0)
+    for j in range(system.n_q):
+        step = np.where(places == j, shift, 0.0)
+        try:
+            force, jacobian = system.force(t, q, v), system.jacobian(t, q)
+            by_q, by_v = system.force(t, q + step, v) - force, system.force(t, q, v + step) - force
+            change = system.jacobian(t, q + step) - jacobian
+        except (ArithmeticError, ValueError):  # math.sqrt and its like, outside what the callbacks are made for
+            continue
+        level = ROUNDING * float(np.abs(force).max()) / shift
+        look("the derivative of force by q", j, by_q / shift, level)
+        look("the derivative of force by v", j, by_v / shift, level)
+        level = ROUNDING * float(np.abs(jacobian).max(initial=0.0)) / shift
+        for k in range(system.n_c):
+            look(f"the second derivative of constraint {k} by q", j, change[k] / shift, level)
+    if where:
+        raise ValueError(
+            f"bandwidth of {system.name!r} must be at least {farthest}: {where}; given {bandwidth}. Or number the "
+            "coordinates otherwise, or leave bandwidth out"
+        )
