@@ -40,7 +40,7 @@ from twoloop.kernels.steps.newton_memory import (
 )
 from twoloop.kernels.steps.newton_tangents import DIFFERENCE, displaced_with_all
 
-MISSED = 0.5  # of what the entries of a row say of a displacement: more is said by entries that are missing
+MISSED = 0.2  # of what the entries of a row say of a displacement: more is said by entries that are missing
 ROUNDING = 1e-13  # of the largest force: what a difference may be off at all
 N_VECTORS = 3  # of all coordinates: the force, the same displaced, and what is displaced
 
