@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import twoloop.run.static_form as static_module
-from studies.bench.large import ASSEMBLIES, closed_chain, ladder, open_chain
+from studies.bench.large import ASSEMBLIES, LEVEL, closed_chain, ladder, open_chain
 from tests.large_systems import Assembly, dense_solution
 from tests.problems import worst
 from twoloop import ConstrainedSystem, ConstraintWarning, Status, consistent_state, mechanisms, solve_dae
@@ -176,6 +176,36 @@ def test_redundant_rows_are_named_and_held(large):
     assert worst(system.constraint(0.02, result.q[:, -1]), 0.0) < 1e-12
 
 
+def test_many_redundant_rows(any_size):
+    """More than eighty, with multipliers of least norm."""
+    assembly = Assembly(3, 60, 0, 90)
+    system = assembly.bodies.system("many pins twice")
+    v = assembly.v(system)
+    a, lam, rank, _ = dense_solution(system, assembly.q, v)
+    started = Started(system, assembly.q, v)
+    assert started.rank == rank <= system.n_c - 80
+    assert worst(started.a, a) < 1e-9 * np.abs(a).max()
+    assert worst(started.lam, lam) < 1e-9 * np.abs(lam).max()
+
+
+def test_a_ladder_whose_parallelograms_pass_their_flat_position():
+    """Which is a singular one: steps cross it. Rungs stay parallel, and the rails each other's images."""
+    made, left = ladder(99), 66
+    result = solve_dae(made.system, (0.0, 0.09), made.q, 0.0 * made.q, "DOP853", 1e-6, 1e-6, compiled=False)
+    assert result.success
+    assert result.stats.n_partitions < 10  # the static form all along
+    angles = result.q[2::3]
+    assert worst(angles[left:], LEVEL) < 1e-8
+    assert worst(angles[:left:2], angles[1:left:2]) < 1e-8
+    least = min(
+        np.linalg.svd(made.system.jacobian(0.0, q), compute_uv=False)[-1]
+        for q in result.q.T[(result.t > 0.07) & (result.t < 0.08)]
+    )
+    assert least < 1e-3
+    energy = made.bodies.energy(result.t, result.q, result.v)
+    assert np.ptp(energy) < 1e-6 * np.abs(energy).max()
+
+
 def test_programs_grow_with_the_bodies_and_no_faster(large):
     for make in ASSEMBLIES:
         updates = {}
@@ -288,7 +318,7 @@ def test_an_entry_that_comes_up_on_the_way_ends_the_static_form(large):
 
 
 def test_stiff_motion_goes_on_by_newton(large):
-    """The default leaves the static form when Newton's method is due: both ways lead to the same end."""
+    """By sparse or dense matrices: both ways lead to the same end."""
     n = 12
     ends = []
     for least in (10**9, 0):

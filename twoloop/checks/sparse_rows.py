@@ -62,6 +62,13 @@ class SparseRows:
                     made[k, columns.index(column)] = value
         return made
 
+    def row(self, i: int) -> Array:
+        """One row as a full one."""
+        made = np.zeros(self.shape[1])
+        first, last = np.searchsorted(self.rows, [i, i + 1])
+        made[self.columns[first:last]] = self.values[first:last]
+        return made
+
     def matrix(self) -> Array:
         """The full matrix."""
         made = np.zeros(self.shape)

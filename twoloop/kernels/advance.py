@@ -86,13 +86,15 @@ GO_ON = -1  # nothing of these yet
 
 SHORT = 0.5  # of the longest of the last steps: a step below it may be near a singular position ...
 COLLAPSED = 0.2  # of it: steps for which the pivots of C_q are looked at anew
-STATIC_SINGULAR = 0.01  # of the largest: the smallest sine of a row, below which the static form is not relied on
 SINGULAR_PIVOT = 0.2  # ... and is where the smallest pivot of C_q is below this share of the largest it had
+STATIC_SINGULAR = 0.01  # the same of the static form, whose pivots are sines of single rows ...
+LOST = 0.001  # ... and which is given up there for steps below this share of the longest
 FADING = 0.98  # of the longest step, with each accepted one
 RARELY = 16  # accepted steps from one look at the partition to the next where steps do without it
 FEW = 32  # degrees of freedom; where they are k times as many, a partition is looked at every k + 1 steps: T is full
 SUDDEN = 10.0  # an error that is so large was not foreseen: the force jumps, or bends, within the step
 REFUSED = 0.95  # of a refused step is what the next one is at most
+NEARER = 0.25  # of the smallest sine at the start of a step: one that ends nearer to a singular position ends half-way
 NEAR = 4.0  # times that differ by less than so many spacings of floating-point numbers are one
 
 # places in `control`, constant during a run, after the rule of controller.py
@@ -136,8 +138,9 @@ H, ERRORS, FAILURES, PARTITIONS, JACOBIANS, N_STEP_COLUMNS = range(6)
     JUMP_TO,
     LEAPS,  # 1: the next step is that over it, and new_state its end
     ROUGH_TO,  # where the last step ended that was refused for a sudden error
+    PIVOT_HERE,  # the smallest pivot at the end of the last step, of the static form
     N_CLOCK,
-) = range(N_PAST, N_PAST + 16)
+) = range(N_PAST, N_PAST + 17)
 
 
 @kernel(i8(KIT, WORK, f8, VECTOR))
@@ -249,6 +252,24 @@ def _before_kink(f, w, tolerances, control, clock, t, size, accepted, state, new
 
 
 @merged
+def _ends_at_singular(f, w, control, clock):
+    """Whether a step of the static form ends so near a singular position that the next would have to begin there.
+
+    Steps cross such a position unharmed where it lies well between their ends.
+    """
+    if f.flags[FORM] != STATIC or control[FIXED_STEP] > 0.0:
+        return False
+    return w.notes[PIVOT] < min(STATIC_SINGULAR * clock[LARGEST_PIVOT], NEARER * clock[PIVOT_HERE])
+
+
+@merged
+def _lost_at_singular(f, clock, size):
+    """Whether a step of the static form that came to nothing is so short that others have to try, see bridge.py."""
+    near = clock[PIVOT_HERE] < STATIC_SINGULAR * clock[LARGEST_PIVOT]
+    return f.flags[FORM] == STATIC and near and size < LOST * clock[H_LONG]
+
+
+@merged
 def _failed(f, w, control, clock, t, size, code, retried, state):
     """What becomes of a step that failed for such a reason: a shorter one, another partition, or the end.
 
@@ -257,7 +278,7 @@ def _failed(f, w, control, clock, t, size, code, retried, state):
     """
     n = w.Q.size
     poor = code in (SINGULAR, INNER_DIVERGED)
-    if code == NEEDS_DENSE:
+    if code == NEEDS_DENSE or _lost_at_singular(f, clock, size):
         return HAS_TO_BE_DENSE
     w.counters[N_REJECTED_CONVERGENCE] += 1
     clock[FAILURE_CODE] = code
@@ -279,11 +300,13 @@ def _failed(f, w, control, clock, t, size, code, retried, state):
 
 
 @merged
-def _refused(w, control, clock, t, size, proposal):
+def _refused(f, w, control, clock, t, size, proposal):
     """What becomes of a step whose error is too large: a shorter one, a tiny one by a spacing, or steps across."""
     w.counters[N_REJECTED_ERROR] += 1
     clock[FAILURE_CODE] = DONE
     clock[H_NEXT] = min(proposal, REFUSED * size, size - np.spacing(abs(t + size)))
+    if _lost_at_singular(f, clock, size):
+        return HAS_TO_BE_DENSE
     if size < SHORT * clock[H_LONG] and _near_singular(w, control, clock):
         return NEAR_SINGULAR
     return GO_ON
@@ -313,9 +336,11 @@ def _look_at_partition(f, w, control, clock, size, lands, state):
 
     The state is full (q, v, a, lam): a new choice of independent coordinates needs no conversion.
     """
+    short = size < SHORT * clock[H_LONG] and control[FIXED_STEP] == 0.0 and not lands
     if f.flags[FORM] == STATIC:
+        clock[PIVOT_HERE] = w.notes[PIVOT]
         clock[LARGEST_PIVOT] = max(clock[LARGEST_PIVOT], w.notes[PIVOT])
-        return HAS_TO_BE_DENSE if w.notes[PIVOT] < STATIC_SINGULAR * clock[LARGEST_PIVOT] else GO_ON
+        return GO_ON
     n = w.Q.size
     straight = f.flags[STRAIGHT] == 1 and w.notes[BY_GENERAL] == 0.0
     every = 1
@@ -338,7 +363,6 @@ def _look_at_partition(f, w, control, clock, size, lands, state):
         w.notes[SENSITIVITY] = 1.0  # as of a partition far from there: this one is not to last
         if w.notes[PIVOT] < SINGULAR_PIVOT * clock[LARGEST_PIVOT]:
             w.notes[NEARLY_SINGULAR] = 1.0
-    short = size < SHORT * clock[H_LONG] and control[FIXED_STEP] == 0.0 and not lands
     return NEAR_SINGULAR if short and _near_singular(w, control, clock) else GO_ON
 
 
@@ -412,6 +436,11 @@ def advance(
         # at a jump the embedded formula may agree by chance: until the place is passed, the estimate has to be smaller
         strict = control[ROUGH] if t < clock[ROUGH_TO] else 1.0
         accepted = code == DONE and error * strict <= 1.0
+        if accepted and not reaches and _ends_at_singular(f, w, control, clock):
+            f.settle(f, w, options, memory, tolerances, False)
+            w.counters[N_REJECTED_ERROR] += 1
+            clock[H_NEXT], clock[PIVOT_HERE] = 0.5 * size, w.notes[PIVOT]
+            continue
         driven = control[DRIVEN] == 1.0 and not leaps
         if driven and _before_kink(f, w, tolerances, control, clock, t, size, accepted, state, new_state):
             f.settle(f, w, options, memory, tolerances, False)
@@ -436,7 +465,7 @@ def advance(
             factor = min(factor, max(control[FACTOR_MIN], control[SAFETY] * error ** -control[EXPONENT]))
         proposal = min(size * factor, clock[H_LIMIT])
         if not accepted:
-            end = _refused(w, control, clock, t, size, proposal)
+            end = _refused(f, w, control, clock, t, size, proposal)
             if end != GO_ON:
                 return end
             continue

@@ -28,7 +28,7 @@ class Static(NamedTuple):
     dense_jacobian: bool
 
 
-Sizes = tuple[int, int, int, int, int, bool, bool, int, Static | None]
+Sizes = tuple[int, int, int, int, int, bool, bool, int, Static | None, int]
 Places = list[tuple[str, int, int, tuple[int, ...]]]  # of arrays in a piece of memory: name, begin, end, shape
 
 
@@ -58,14 +58,17 @@ def make_work(
     augmented: bool = False,
     n_nodes: int = 0,
     static: Static | None = None,
+    n_matrices: int = 0,
 ) -> Work:
     """The workspace of one run; ranks are those of C_q, and of C_q and A, at most n_c and n_c + n_a.
+
+    There is room for n_matrices numbers of those of Newton's method.
 
     It may be one that a run of these sizes gave back: to make the arrays takes longer than to clear them.
     """
     r = min(n_c, n_q) if rank is None else rank
     r_v = min(n_c + n_a, n_q) if rank_v is None else rank_v
-    sizes = (n_q, n_c, n_a, r, r_v, reduced and n_q > r_v, augmented, n_nodes, static)
+    sizes = (n_q, n_c, n_a, r, r_v, reduced and n_q > r_v, augmented, n_nodes, static, n_matrices)
     given_back = _given_back(sizes)
     return _new(sizes) if given_back is None else _cleared(given_back)
 
@@ -131,7 +134,7 @@ def _of_static_form(n_q: int, n_c: int, rank: int, static: Static) -> tuple[dict
         "pattern": (n_rows, n_q),
         "mass_pattern": (side, side),
         "z": (n_c,),
-        "minimum": (n_redundant * (n_c + n_redundant + 1),),
+        "minimum": ((static.n_factors + n + n_q) * (n_redundant > 0),),
         "predicted": (n_q,),
         "mass_values": (static.n_mass_values,),
         "jacobian_values": (static.n_jacobian_values,),
@@ -152,7 +155,16 @@ def _of_static_form(n_q: int, n_c: int, rank: int, static: Static) -> tuple[dict
 
 @cache
 def _layout(
-    n_q: int, n_c: int, n_a: int, r: int, r_v: int, reduced: bool, augmented: bool, n_nodes: int, static: Static | None
+    n_q: int,
+    n_c: int,
+    n_a: int,
+    r: int,
+    r_v: int,
+    reduced: bool,
+    augmented: bool,
+    n_nodes: int,
+    static: Static | None,
+    n_matrices: int,
 ) -> Layout:
     n_rows = n_c + n_a
     n_redundant = n_rows - r_v
@@ -185,6 +197,7 @@ def _layout(
         "predicted": (r,),
         "notes": (N_NOTES,),
         "nodes": (n_nodes,),
+        "matrices": (n_matrices,),
         **dict.fromkeys(("mass_values", "jacobian_values", "counts", "factors", "pivot_sizes"), (0,)),
         **dict.fromkeys(("unknowns", "solutions"), (0,)),
     }

@@ -55,6 +55,7 @@ def switching(first: Plan, second: Plan, limit: float, n_q: int, looks: int = 1,
         first=first.step,
         second=second.step,
         stable_to=None,
+        matrices=max(first.matrices, second.matrices),
         within_newton=second.within_newton,
     )
 

@@ -105,6 +105,7 @@ class ESDIRK:
     def plan(self, n_q: int, rtol: float, atol: float, fixed: bool) -> Plan:
         """Make the method ready for a run of n_q coordinates."""
         from twoloop.kernels.steps import diagonal_step as kernels
+        from twoloop.kernels.steps.newton_memory import n_matrices
 
         make, order = FORMULAS[self.formula]
         A, embedded = make()
@@ -120,6 +121,8 @@ class ESDIRK:
                 A, A.sum(axis=1), A[-1] - embedded, inner_tol, outer_tol, self.tested == "all", order == 2
             ),
             kernels.diagonal_memory(len(embedded), n_q),
+            matrices=n_matrices(1),
+            projects=True,
             exponent=exponent,
             safety=SAFETY,
             least_error=LEAST_ERROR,

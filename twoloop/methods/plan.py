@@ -50,6 +50,7 @@ class Plan:
     numbers: Any = None  # what those of the inner loop and of stages read ...
     own_numbers: Any = None  # ... and those of series
     instead: Any = None  # what is called where those of the step cannot serve
+    matrices: int = 0  # of Newton's method: how many of (n_q, n_q) the workspace is to have room for
     parts: int = 1  # equal steps that a step is divided into for the solution between its ends ...
     interior: "Plan | None" = None  # ... and how they are made; None: by the method itself
     looks_within: bool = False  # whether its steps look at the equations between their ends; if not, they are limited

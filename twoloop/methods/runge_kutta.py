@@ -180,6 +180,8 @@ class RungeKutta:
             step=newton.NEWTON,
             options=np.concatenate([plan.options, extra]),
             memory=np.zeros(newton_memory.memory_size(n_eigen, tableau.stages, n_q)),
+            matrices=newton_memory.n_matrices(n_eigen),
+            projects=True,
             exponent=1.0 / (tableau.stages + 1),
         )
         if tableau.order <= UNDIVIDED:

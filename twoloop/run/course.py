@@ -174,7 +174,7 @@ class Course:
         """Choose what makes the next steps, where it is not what made the last ones."""
         run, a = self.run, self.run.a
         if self.code == a.HAS_TO_BE_DENSE or run.is_lost_without_dense(self.code):
-            run.become_dense()
+            run.change_form()
             self.kit, self.code = run.kit, a.PAUSED
         elif self.code == a.HAS_TO_GIVE_WAY:
             give_way(run)

@@ -90,6 +90,7 @@ class Interpolator:
         self.parts = max((plan.parts for plan in self.plans.values()), default=REPAIRED)
         self.parts = max(self.parts, REPAIRED)
         self.static = static_form(system, t0, row[: system.n_q], *self.plans.values())
+        self.matrices = max((plan.matrices for plan in self.plans.values()), default=0)
         self._prepare()
         self.filled: dict[float, tuple[Array, Array]] = {}
         self.sound: set[float] = set()  # where intervals begin whose neighbours serve
@@ -105,7 +106,7 @@ class Interpolator:
         self.kits = {kind: kit_of(system, t0, q0, plan, static) for kind, plan in self.plans.items()}
         self.kit = kit_of(system, t0, q0, None, static)
         pattern = pattern_of(system, t0, q0) if static is None else np.zeros((0, 0))
-        self.work = workspace(system, self.kit, pattern, q0, self.rtol, 0.0, self.ranks, static)
+        self.work = workspace(system, self.kit, pattern, q0, self.rtol, 0.0, self.ranks, static, self.matrices)
         self.work.notes[common.GENERATION] = 1.0  # the ranks are known
         advance.start(self.kit, self.work, t0, np.concatenate([row, np.zeros(system.n_c + system.n_a)]))
         self.repairs: dict[bool, tuple[Plan, Any]] = {}
@@ -224,9 +225,12 @@ class Interpolator:
             method = RungeKutta(radau_iia(3), outer="newton") if stiff else DOP853()
             atol = float(self.tolerances[common.ATOL :].min())
             plan = method.plan(self.system.n_q, self.rtol, atol, True).changed(parts=REPAIRED)
-            if not plan.projects and self.static is not None:
-                self._become_dense()
             q0 = self.made_of[2][: self.system.n_q]
+            if plan.matrices > self.matrices:
+                self.matrices = plan.matrices
+                if self.static is not None:
+                    self.static = static_form(self.system, self.made_of[1], q0, *self.plans.values(), plan)
+                self._prepare()
             self.repairs[stiff] = plan, kit_of(self.system, self.made_of[1], q0, plan, self.static)
         return self.repairs[stiff]
 

@@ -13,15 +13,16 @@ from twoloop.checks.consistency import (
     pattern_of,
 )
 from twoloop.checks.rank import SHOWN, equations_in_words, in_words
-from twoloop.checks.sparse_rows import norms
+from twoloop.checks.sparse_rows import SparseRows, norms
 from twoloop.kernels.compile.linking import direct
 from twoloop.kernels.data import common
+from twoloop.kernels.evaluation.tasks import SOLVE
 from twoloop.kernels.layout import copy_of
 from twoloop.methods.plan import Plan, least_tolerance
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.messages import said_of_not_finite
 from twoloop.run.record import Statistics
-from twoloop.run.static_form import static_form
+from twoloop.run.static_form import static_form, with_newton
 from twoloop.run.workspace import kit_of, kit_with, workspace
 
 Array = NDArray[np.float64]
@@ -66,6 +67,7 @@ class Run:
         self.rtol, self.reuse, self.interiors, self.traced = rtol, plan.reuse, interiors, plan.traced
         others = () if plan.substitute is None else (plan.substitute,)
         self.static = static_form(system, t0, q0, plan, *others)
+        self.matrices = max(each.matrices for each in (plan, *others))
         self.kit = kit_of(system, t0, q0, plan, self.static)
         self.functions = self.kit.functions
         n_rows = system.n_c + system.n_a
@@ -128,7 +130,8 @@ class Run:
         """Arrays for ranks of C_q and of all rows; without them for full ones."""
         q0 = self.state[: self.system.n_q]
         pattern = self._pattern(q0) if self.static is None else NONE
-        work = workspace(self.system, self.kit, pattern, q0, self.rtol, self.reuse, (rank, rank_v), self.static)
+        ranks = rank, rank_v
+        work = workspace(self.system, self.kit, pattern, q0, self.rtol, self.reuse, ranks, self.static, self.matrices)
         work.notes[common.NEARLY_SINGULAR] = 0.0 if self.plan.watchful else 1.0
         return work
 
@@ -146,20 +149,25 @@ class Run:
             and int(self.clock[self.a.FAILURE_CODE]) in reasons
         )
 
-    def become_dense(self) -> None:
-        """Go on with the forms of saddle_point.py where the static one cannot decide: at the state there is."""
+    def change_form(self) -> None:
+        """Go on with Newton's matrices in the static form where they are due, else with the forms of saddle_point.py.
+
+        At the state there is.
+        """
         n = self.system.n_q
         before, largest = self.work, float(self.clock[self.a.LARGEST_PIVOT])
         rank = len(before.rows_v)
-        self.static = None
         t, q = float(self.clock[self.a.T]), self.state[:n].copy()
-        self.kit = kit_of(self.system, t, q, self.plan)
+        static, self.static = self.static, None
+        if static is not None and static.newton is None and self.matrices > 0:
+            self.static = with_newton(self.system, t, q, static)
+        self.kit = kit_of(self.system, t, q, self.plan, self.static)
         self.functions = self.kit.functions
         self.work = self._workspace(rank, rank)
         self.work.counters[:] = before.counters
         kept = [common.LARGEST_DEFECT, common.UNCHECKED, common.WIDEST_GAP, common.KINK_BEFORE, common.KINK_AFTER]
         self.work.notes[kept] = before.notes[kept]
-        self.control[self.a.BRIDGE] = 1.0
+        self.control[self.a.BRIDGE] = self.static is None
         clock, a = self.clock, self.a
         if clock[a.FAILURE_CODE] != common.DONE:
             clock[a.H_NEXT], clock[a.H_LIMIT] = clock[a.H_LONG] or clock[a.H_NEXT], self.plan.limit_start
@@ -240,16 +248,17 @@ class Run:
         )
 
     def _in_words(self, rows: list[int]) -> str:
-        """Which rows depend on which others; the static form has found the shares when it found the multipliers."""
+        """Which rows depend on which others; the factors of the static form tell the shares of the first."""
         q = self.state[: self.system.n_q]
         counted = self.work.rows_v.tolist()
         if self.static is None or set(rows) & set(counted):
             return in_words(self.system.rows(self.t0, q), rows)
-        n_rows = self.system.n_c
-        shares = -self.work.minimum[: (n_rows - len(counted)) * n_rows].reshape(-1, n_rows)
         all_rows = self.system.sparse_rows(self.t0, q)
-        lengths = norms(all_rows)
-        return equations_in_words(rows, counted, shares[:SHOWN, counted], lengths)
+        assert isinstance(all_rows, SparseRows)
+        shares, zero, x = np.zeros((min(SHOWN, len(rows)), len(all_rows))), np.zeros(len(all_rows)), np.zeros_like(q)
+        for row, share in zip(rows, shares, strict=False):
+            direct(self.kit.inner)(self.kit, self.work, SOLVE, self.t0, all_rows.row(row), zero, 0.0, x, share)
+        return equations_in_words(rows, counted, shares[:, counted], norms(all_rows))
 
     def set_sizes(self, first_step: float | None, max_step: float, t1: float) -> None:
         """Set the first and the largest step, s."""

@@ -1,6 +1,6 @@
 """Whether a run may use the static form, for large systems: where the entries of M and C_q are, and the program."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,7 @@ from twoloop.kernels.layout import Static
 from twoloop.methods.plan import Plan
 from twoloop.problem.entries import LARGE
 from twoloop.problem.system import ConstrainedSystem
+from twoloop.run.newton_form import newton_form
 
 Array = NDArray[np.float64]
 
@@ -33,6 +34,18 @@ class StaticForm(NamedTuple):
     mass: Entries
     pattern: Array  # of a dense Jacobian, (n_c, n_q), 1 where it has entries; of no size beside jacobian_values
     mass_pattern: Array  # of a dense M that is not constant, likewise
+    known: tuple[Any, ...]  # of what a program of Newton's matrix is made besides
+    newton: NDArray[np.int32] | None = None  # that program, once it is asked for
+
+    def n_matrices(self, matrices: int) -> int:
+        """Numbers of Newton's matrices, of a plan with so many dense ones."""
+        from twoloop.kernels.steps.newton_memory import SYSTEMS
+        from twoloop.kernels.steps.newton_static import matrices_size
+
+        if self.newton is None or matrices == 0:
+            return 0
+        n_values = self.static.n_mass_values, self.static.n_jacobian_values
+        return matrices_size(self.newton, *n_values, (matrices - SYSTEMS) // 2)
 
 
 def static_form(system: ConstrainedSystem, t0: float, q0: Array, *plans: Plan) -> StaticForm | None:
@@ -42,7 +55,16 @@ def static_form(system: ConstrainedSystem, t0: float, q0: Array, *plans: Plan) -
     known = "gamma" in system.given or system.functions.gamma_program.size > 0
     if not known or not all(plan.projects and plan.inner is None and not plan.own for plan in plans):
         return None
-    return system.remembered("static form", lambda: _made(system, t0, q0))  # type: ignore[no-any-return]
+    form: StaticForm | None = system.remembered("static form", lambda: _made(system, t0, q0))
+    if form is not None and any(plan.matrices and plan.first is None for plan in plans):
+        return with_newton(system, t0, q0, form)
+    return form
+
+
+def with_newton(system: ConstrainedSystem, t0: float, q0: Array, form: StaticForm) -> StaticForm | None:
+    """The same with the program of Newton's matrix; None where there is none."""
+    program = system.remembered("newton form", lambda: newton_form(system, t0, q0, *form.known))
+    return None if program is None else form._replace(newton=program)
 
 
 def _made(system: ConstrainedSystem, t0: float, q0: Array) -> StaticForm | None:
@@ -68,7 +90,7 @@ def _made(system: ConstrainedSystem, t0: float, q0: Array) -> StaticForm | None:
         return None
     n_factors = int(program[N_PIVOTS] + program[N_OFF] + 1)
     static = Static(n_factors, len(mass[0]), len(jacobian[0]), dense_mass, "jacobian" not in system.entries)
-    return StaticForm(program, static, mass, pattern, mass_pattern)
+    return StaticForm(program, static, mass, pattern, mass_pattern, (mass, jacobian, together, stiff))
 
 
 def _stiff_rows(

@@ -52,6 +52,8 @@ def _static_kit(system: ConstrainedSystem, plan: Plan | None, form: StaticForm) 
     flags = system.functions.flags.copy()
     flags[common.FORM] = common.STATIC
     functions = system.functions._replace(flags=flags, static_program=form.program)
+    if form.newton is not None:
+        functions = functions._replace(newton_program=form.newton)
     if plan is None:
         return common.Kit(functions, static_inner_loop)
     called = (plan.step, plan.first, plan.second)
@@ -121,14 +123,19 @@ def workspace(
     reuse: float,
     ranks: tuple[int | None, int | None] = (None, None),
     static: StaticForm | None = None,
+    matrices: int = 0,
 ) -> common.Work:
-    """Arrays for ranks of C_q and of all rows; without them for full ones. `pattern` is that of all rows."""
+    """Arrays for ranks of C_q and of all rows; without them for full ones. `pattern` is that of all rows.
+
+    `matrices`: as of a plan.
+    """
     flags = kit.flags
     reduced, augmented = flags[common.DENSE_FORM] == common.NULL_SPACE, flags[common.FORM] == common.AUGMENTED
     programs = [each for each in (kit.jacobian_program, kit.gamma_program) if each.size]
     n_nodes = max((int(each[N_NODES]) for each in programs), default=0)
     sizes = (system.n_q, system.n_c, system.n_a, *ranks, bool(reduced), bool(augmented), n_nodes)
-    work = make_work(*sizes, None if static is None else static.static)
+    n_matrices = matrices * system.n_q**2 if static is None else static.n_matrices(matrices)
+    work = make_work(*sizes, None if static is None else static.static, n_matrices)
     work.notes[common.GAMMA_REQUIRED] = max(rtol, GAMMA_ACCURACY)
     work.notes[common.GAMMA_SHARE] = 1.0
     work.notes[common.KINK_BEFORE], work.notes[common.KINK_AFTER] = -np.inf, np.inf

@@ -41,29 +41,32 @@ class _Sets:
 class _Holds:
     """What holds the parts that eliminated bodies and joints make up: the ground, and hubs that are to come."""
 
-    def __init__(self, joints: Sequence[frozenset[int]], n_bodies: int, hubs: set[int]):
+    def __init__(self, joints: Sequence[frozenset[int]], n_bodies: int, hubs: set[int], lone: AbstractSet[int]):
         self.joints, self.hubs = joints, set(hubs)  # those that are left
+        self.lone = lone  # single coordinates, of whose body nothing else is known: no part of these is surely free
         self.parts = _Sets(n_bodies)
         self.grounded = [False] * n_bodies
         self.hangs: list[set[int]] = [set() for _ in range(n_bodies)]
+        self.hanging: dict[int, list[int]] = {hub: [] for hub in hubs}  # bodies whose parts hang, or hung, on a hub
 
     def lets(self, joint: int) -> bool:
         """Whether a joint may be eliminated."""
         bodies = self.joints[joint]
         parts = {self.parts.find(body) for body in bodies if body not in self.hubs}
-        if any(not self.grounded[part] and not self.hangs[part] for part in parts):
+        if not bodies & self.lone and any(not self.grounded[part] and not self.hangs[part] for part in parts):
             return True
         return not bodies & self.hubs and not any(self.hangs[part] for part in parts)
 
     def eliminate(self, joint: int) -> None:
         """Join the parts that a joint connects."""
         bodies = self.joints[joint]
-        self._join((body for body in bodies if body not in self.hubs), len(bodies) == 1, bodies & self.hubs)
+        grounded = len(bodies) == 1 or bool(bodies & self.lone)
+        self._join((body for body in bodies if body not in self.hubs), grounded, bodies & self.hubs)
 
     def eliminate_hub(self, hub: int) -> None:
         """Join the parts that hang on a hub, and the hub."""
         self.hubs.discard(hub)
-        hanging = [body for body in range(len(self.hangs)) if hub in self.hangs[body]]
+        hanging = self.hanging.pop(hub)
         for body in hanging:
             self.hangs[body].discard(hub)
         self._join([hub, *hanging], False, frozenset())
@@ -78,7 +81,9 @@ class _Holds:
                 hubs = {*hubs, *self.hangs[other], *self.hangs[part]}
                 part = self.parts.join(part, other)
         self.grounded[part] = self.grounded[part] or grounded
-        self.hangs[part].update(hubs)
+        for hub in hubs - self.hangs[part]:
+            self.hangs[part].add(hub)
+            self.hanging[hub].append(part)
 
 
 def elimination_order(
@@ -88,6 +93,7 @@ def elimination_order(
     jacobian_entries: tuple[Integers, Integers],
     together: Iterable[Sequence[int]] = (),
     first: Sequence[int] = (),
+    couplings: tuple[Integers, Integers] | None = None,
 ) -> Integers:
     """Coordinates j, and rows i as n_q + i, in the order of elimination.
 
@@ -100,6 +106,9 @@ def elimination_order(
         Coordinates of one body each, beyond those that M couples.
     first : sequence of int
         Rows of single bodies that come before all joints, but for those of hubs, so that they always count.
+    couplings : (rows, columns), optional
+        Entries by which bodies are coupled beside their joints, as by springs. All bodies then are hubs, each with the
+        first of its rows.
     """
     body_of = bodies_of(n_q, mass_entries, together)
     touched: list[set[int]] = [set() for _ in range(n_rows)]
@@ -116,14 +125,26 @@ def elimination_order(
         for body in joint:
             joints_of[body].append(k)
     hubs = {body for body in range(n_q) if len(joints_of[body]) > MOST_JOINTS}
+    if couplings is not None:
+        hubs = set(body_of)
     coordinates: dict[int, list[int]] = {}
     for j, body in enumerate(body_of):
         coordinates.setdefault(body, []).append(j)
     order = [j for j in range(n_q) if body_of[j] not in hubs]
     order += [n_q + i for i in first if not touched[i] & hubs]
     late = [n_q + i for i in first if touched[i] & hubs]
+    if couplings is not None:
+        for i in first:
+            coordinates[next(iter(touched[i]))].append(n_q + i)
+        late = []
     nodes = [[n_q + i for i in rows_of[joint]] for joint in joints] + [coordinates[hub] for hub in sorted(hubs)]
-    for node in _minimum_degree(joints, joints_of, sorted(hubs), [len(node) for node in nodes], n_q):
+    pairs: set[tuple[int, int]] = set()
+    lone: set[int] = set()
+    if couplings is not None:
+        pairs = {(body_of[i], body_of[j]) for i, j in zip(*couplings, strict=True)}
+        lone = {hub for hub in hubs if len(coordinates[hub]) == 1}
+    sizes = [len(node) for node in nodes]
+    for node in _minimum_degree(joints, joints_of, sorted(hubs), sizes, n_q, pairs, lone):
         order += nodes[node]
     order += late
     return np.array(order, dtype=np.int64)
@@ -146,8 +167,13 @@ def _minimum_degree(
     hubs: Sequence[int],
     sizes: Sequence[int],
     n_bodies: int,
+    pairs: Iterable[tuple[int, int]],
+    lone: AbstractSet[int],
 ) -> list[int]:
-    """Joints, and hubs as len(joints) + their place: each time, of those that may come, one with fewest neighbours."""
+    """Joints, and hubs as len(joints) + their place: each time, of those that may come, one with fewest neighbours.
+
+    `pairs`: of hubs that are coupled beside their joints. `lone`: see _Holds.
+    """
     n_joints = len(joints)
     place = {hub: n_joints + k for k, hub in enumerate(hubs)}
     near: list[set[int]] = [set() for _ in sizes]
@@ -159,23 +185,25 @@ def _minimum_degree(
         else:
             for k in numbers:
                 near[k].update(numbers)
+    for one, other in pairs:
+        near[place[one]].add(place[other])
+        near[place[other]].add(place[one])
     for k, others in enumerate(near):
         others.discard(k)
-    holds = _Holds(joints, n_bodies, set(hubs))
+    holds = _Holds(joints, n_bodies, set(hubs), lone)
 
     def degree(node: int) -> int:
         return sum(sizes[other] for other in near[node])
 
     heap = [(degree(node), node) for node in range(len(sizes))]
     heapq.heapify(heap)
-    done, order, waiting = [False] * len(sizes), [], []
+    done, order = [False] * len(sizes), []
     while heap:
         known, node = heapq.heappop(heap)
         if done[node] or known != degree(node):
             continue  # there is a newer entry
         if node < n_joints and not holds.lets(node):
-            waiting.append(node)  # until another hub is gone
-            continue
+            continue  # it comes up again when a hub is gone that others before it hang on: the two are neighbours
         done[node] = True
         order.append(node)
         changed = near[node]
@@ -186,8 +214,6 @@ def _minimum_degree(
             holds.eliminate(node)
         else:
             holds.eliminate_hub(hubs[node - n_joints])
-            changed = changed | {each for each in waiting if not done[each]}
-            waiting = []
         for other in changed:
             heapq.heappush(heap, (degree(other), other))
     return order

@@ -43,8 +43,15 @@ def static_program(
     stiff_rows : sequence of int
         Rows g along which M is to be stiffened, by a multiple of g g^T, whose entries M has.
     """
-    n = n_q + n_rows
     order = elimination_order(n_q, n_rows, mass, jacobian, together, stiff_rows)
+    return program_in_order(order, n_q, mass, jacobian, stiff_rows)
+
+
+def program_in_order(
+    order: Integers, n_q: int, mass: Entries, jacobian: Entries, stiff_rows: Sequence[int], both: bool = False
+) -> NDArray[np.int32] | None:
+    """The same for an order. `both`: of unsymmetric factors, whose rows of U stand N_OFF behind the columns of L."""
+    n = len(order)
     position = np.empty(n, dtype=np.int64)
     position[order] = np.arange(n)
     rows = np.concatenate([position[mass[0]], position[n_q + jacobian[0]]])
@@ -71,7 +78,8 @@ def static_program(
     targets = slots(np.concatenate(firsts), np.concatenate(seconds))
     source = slots(low, high)
     n_mass = len(mass[0])
-    source[:n_mass][rows[:n_mass] < columns[:n_mass]] = n + len(keys)  # the other triangle: a slot that nobody reads
+    above = rows[:n_mass] < columns[:n_mass]  # the other triangle: without U, of a slot that nobody reads
+    source[:n_mass][above] = source[:n_mass][above] + len(keys) if both else n + len(keys)
     which, first, second = _products(jacobian[0], stiff_rows)
     one, other = (position[jacobian[1][each]] for each in (first, second))
     stiffened = [which, first, second, slots(np.minimum(one, other), np.maximum(one, other))]
@@ -120,6 +128,13 @@ def _columns_of_factors(n: int, low: Integers, high: Integers) -> list[Integers]
 
 
 @inlined
+def behind(program):
+    """Where what stands behind these sections begins."""
+    first = N_HEAD + 2 * program[N_PIVOTS] + 1 + program[N_OFF] + program[N_UPDATES]
+    return first + 3 * (program[N_OF_MASS] + program[N_OF_JACOBIAN]) + 4 * program[N_STIFFENED]
+
+
+@inlined
 def order_of(program):
     """Which coordinate, or n_q + which row, each pivot is of."""
     return program[N_HEAD : N_HEAD + program[N_PIVOTS]]
@@ -163,4 +178,5 @@ def stiffened_of(program):
     first = N_HEAD + 2 * program[N_PIVOTS] + 1 + program[N_OFF] + program[N_UPDATES]
     first += 3 * (program[N_OF_MASS] + program[N_OF_JACOBIAN])
     middle = first + 2 * n
-    return program[first : first + n], program[first + n : middle], program[middle : middle + n], program[middle + n :]
+    slots = program[middle + n : middle + 2 * n]
+    return program[first : first + n], program[first + n : middle], program[middle : middle + n], slots

@@ -28,7 +28,6 @@ from twoloop.kernels.data.common import (
     GAP,
     N_EVALUATIONS,
     N_JACOBIANS,
-    NEEDS_DENSE,
     OUTER_DIVERGED,
     REUSE,
     ROUNDED,
@@ -145,7 +144,8 @@ def _memories(memory, n):
 @compiled
 def _evaluate(f, w, t, Q, V, A):
     """Accelerations A at a state (Q, V) near the constraints, which is moved there."""
-    if f.flags[STRAIGHT] == 1 and w.Rate.size == w.C.size:  # cheaper, to the nearest state on the constraints
+    # cheaper, to the nearest state on the constraints; and where evaluations do not move it
+    if (f.flags[STRAIGHT] == 1 and w.Rate.size == w.C.size) or f.flags[FORM] == STATIC:
         return f.inner(f, w, PROJECT, t, Q, V, INNER_TOL, A, w.lam)
     return evaluate(f, w, t, Q, V, INNER_TOL, A)
 
@@ -341,8 +341,6 @@ def switching_step(f, w, options, memory, t, h, tolerances, state, new_state):
                 _restart(second if was_explicit else first)
     explicit = _is_explicit(memory)
     w.notes[EXPLICIT_STEP] = 1.0 if explicit else 0.0
-    if not explicit and f.flags[FORM] == STATIC:  # Newton's method needs a partition
-        return Attempt(NEEDS_DENSE, np.inf, 0.0)
     begin = N_OPTIONS + int(options[SIZE_1])
     each = options[N_PAIR : N_PAIR + N_OF_EACH] if explicit else options[N_PAIR + N_OF_EACH : N_OPTIONS]
     w.notes[REUSE] = max(each[REUSE_OF], w.notes[ROUNDED])

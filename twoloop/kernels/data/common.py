@@ -29,8 +29,15 @@ INTEGERS = types.int64[::1]
 PLACES = types.int32[::1]  # of long programs, which are to stay in the cache
 
 # programs in the place of callbacks that are not given, see evaluation/program.py, and that of the elimination of large
-# systems, see algebra/static_program.py; of size 0 where there is none
-PROGRAMS = ("jacobian_program", "jacobian_numbers", "gamma_program", "gamma_numbers", "static_program")
+# systems and of their Newton matrices, see algebra/static_program.py and static_lu.py; of size 0 where there is none
+PROGRAMS = (
+    "jacobian_program",
+    "jacobian_numbers",
+    "gamma_program",
+    "gamma_numbers",
+    "static_program",
+    "newton_program",
+)
 # the callbacks of a mechanism, its parameters, its flags and its programs
 Functions: Any = namedtuple("Functions", [*KINDS, "p", "flags", *PROGRAMS])  # type: ignore[misc]
 
@@ -105,6 +112,7 @@ class Work(NamedTuple):
     predicted: Any  # (r) dependent positions that the integration formula gives, before the constraints restore them
     notes: Any  # (N_NOTES) see below
     nodes: Any  # what the operations of a program make
+    matrices: Any  # of Newton's method, see steps/newton_memory.py and steps/newton_static.py
     # of the static form alone; there N is n_q + n_c, and what is of no use to it is empty
     mass_values: Any  # entries of M, see algebra/static_program.py
     jacobian_values: Any  # entries of G
@@ -269,7 +277,7 @@ KIT = Reference(
     "Kit",
     {
         **{"p": VECTOR, "flags": INTEGERS, "numbers": VECTOR, "own_numbers": VECTOR},
-        **dict(zip(PROGRAMS, (INTEGERS, VECTOR, INTEGERS, VECTOR, PLACES), strict=True)),
+        **dict(zip(PROGRAMS, (INTEGERS, VECTOR, INTEGERS, VECTOR, PLACES, PLACES), strict=True)),
     },
 )
 for _name, _kind in KINDS.items():

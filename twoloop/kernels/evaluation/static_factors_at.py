@@ -1,4 +1,4 @@
-"""M, G and the factors of a large system at a state, by its static program; which rows count, and multipliers.
+"""M, G and the factors of a large system at a state, by its static program; and which rows count.
 
 Nothing here has the size of n_c times n_q where callbacks give values of entries. Dense callbacks fill dense arrays,
 from which the entries are taken.
@@ -6,7 +6,7 @@ from which the entries are taken.
 
 import numpy as np
 
-from twoloop.kernels.algebra.linalg import copy, ldl_factor, ldl_solve
+from twoloop.kernels.algebra.linalg import copy
 from twoloop.kernels.algebra.static_factors import factor, load, refined
 from twoloop.kernels.algebra.static_program import N_PIVOTS, jacobian_of, mass_of, order_of
 from twoloop.kernels.data.common import (
@@ -22,6 +22,7 @@ from twoloop.kernels.data.common import (
     RANK,
     RANK_DIFFERS,
     RANK_V,
+    SINGULAR,
     SMALLEST,
     compiled,
 )
@@ -31,7 +32,6 @@ from twoloop.kernels.evaluation.program import jacobian_by_program
 SUSPECT = 1e-6  # a pivot below this share of its size is looked at: that of a redundant row is rounding
 LEAST = 1e-10  # ... and one below this share no factors with pivots of one row can do with
 DEPENDENT = 1e-11  # sine of the angle to the other rows, found without cancellation, up to which a row is redundant
-MOST_REDUNDANT = 64  # rows: each takes a solution at every state, for multipliers of least norm
 ONCE, TWICE = 1e-3, 1e-7  # the smallest share, below which solutions are refined, and refined again
 
 
@@ -80,10 +80,12 @@ def _factor(f, w, least):
 
 @compiled
 def _fault(w, t, q):
-    """Which values are not finite; NEEDS_DENSE where all are."""
+    """Which values are not finite; where all are, whether M is to blame, which dense forms may do with, or the rows."""
     if not finite_vector(w.mass_values):
         return not_finite(w.notes, MASS, t, q)
-    return NEEDS_DENSE if finite_vector(w.jacobian_values) else not_finite(w.notes, JACOBIAN, t, q)
+    if not finite_vector(w.jacobian_values):
+        return not_finite(w.notes, JACOBIAN, t, q)
+    return NEEDS_DENSE if w.notes[SMALLEST] < 0.0 else SINGULAR
 
 
 @compiled
@@ -180,7 +182,7 @@ def _choose(f, w, t, q):
     w.counts[:] = 1.0
     if not _factor(f, w, SUSPECT) > 0.0:
         return _fault(w, t, q)
-    order, n_q, n_redundant = order_of(f.static_program), w.Q.size, 0
+    order, n_q = order_of(f.static_program), w.Q.size
     copy(w.counts, w.z)  # 0 for rows to look at
     for k in range(order.size):
         row = order[k] - n_q
@@ -188,21 +190,20 @@ def _choose(f, w, t, q):
             continue
         sine = _sine(f, w, row, w.pivot_sizes[k])
         if sine <= DEPENDENT:
-            n_redundant += 1
             continue
         number = _number(w.counts)
         w.counts[row] = 1.0
         smallest = _factor(f, w, LEAST) if sine * sine > LEAST else 0.0
         if not smallest > 0.0 or _number(w.counts) != number + 1:
             return _fault(w, t, q)
-    return DONE if n_redundant <= MOST_REDUNDANT else NEEDS_DENSE
+    return DONE
 
 
 @compiled
 def _take(w):
     """Make the rows that count those of the workspace, which has room for so many."""
     if _number(w.counts) != w.rows_v.size:
-        return NEEDS_DENSE
+        return SINGULAR
     place = 0
     for i in range(w.counts.size):
         if w.counts[i] != 0.0:
@@ -226,36 +227,3 @@ def choose_rows(f, w, t, q):
         return RANK_DIFFERS
     w.notes[GENERATION] += 1.0
     return _take(w)
-
-
-@compiled
-def least_norm(f, w, lam):
-    """Take away from lam what the null space of G^T has of it, as saddle_point.least_norm does."""
-    n_q, n_rows = w.Q.size, lam.size
-    n_red = n_rows - w.rows_v.size
-    Z = w.minimum[: n_red * n_rows].reshape((n_red, n_rows))
-    gram = w.minimum[n_red * n_rows : n_red * (n_rows + n_red)].reshape((n_red, n_red))
-    part = w.minimum[n_red * (n_rows + n_red) :]
-    i = 0
-    for row in range(n_rows):
-        if w.counts[row] != 0.0:
-            continue
-        _row_as_force(f, w, row)
-        solve_values(f, w, 1)
-        for k in range(n_rows):
-            Z[i, k] = -w.unknowns[n_q + k]
-        Z[i, row] = 1.0
-        part[i] = 0.0
-        for k in range(n_rows):
-            part[i] += Z[i, k] * lam[k]
-        i += 1
-    for i in range(n_red):
-        for j in range(i, n_red):
-            gram[i, j] = 0.0
-            for k in range(n_rows):
-                gram[i, j] += Z[i, k] * Z[j, k]
-    ldl_factor(gram)
-    ldl_solve(gram, part)
-    for i in range(n_red):
-        for k in range(n_rows):
-            lam[k] -= part[i] * Z[i, k]

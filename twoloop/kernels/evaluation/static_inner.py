@@ -1,8 +1,9 @@
 """The inner loop of large systems: what the steps ask for, by factors with a static program.
 
-There is no partition: wherever others restore dependent coordinates, all are moved to the nearest state on the
-constraints, nearest in the metric of M. What these factors cannot decide is NEEDS_DENSE: a run then goes on with the
-forms of saddle_point.py, as it does for methods that need a partition.
+There is no partition: all coordinates are integrated, and evaluated as they stand. Wherever others restore dependent
+coordinates, all are moved to the nearest state on the constraints, nearest in the metric of M. What these factors
+cannot decide is NEEDS_DENSE: a run then goes on with the forms of saddle_point.py, as it does for methods that need a
+partition.
 """
 
 import numpy as np
@@ -31,11 +32,11 @@ from twoloop.kernels.evaluation.program import gamma_by_program
 from twoloop.kernels.evaluation.static_factors_at import (
     choose_rows,
     factors_there,
-    least_norm,
     mass_values_there,
     refinements,
     solve_values,
 )
+from twoloop.kernels.evaluation.static_least_norm import least_norm
 from twoloop.kernels.evaluation.tasks import (
     ACCELERATIONS,
     EVALUATE,
@@ -44,6 +45,7 @@ from twoloop.kernels.evaluation.tasks import (
     MASS_TASK,
     MULTIPLIERS,
     POSITIONS,
+    PROJECT,
     REDUNDANT,
     RENEW,
     RESTORE,
@@ -108,8 +110,7 @@ def _accelerate(f, w, t, q, v, a):
 def _equilibrate(f, w, lam):
     """Multipliers of all rows, of least norm where rows are redundant."""
     copy(w.z, lam)
-    if w.rows_v.size < lam.size:
-        least_norm(f, w, lam)
+    return least_norm(f, w, lam) if w.rows_v.size < lam.size else DONE
 
 
 @compiled
@@ -230,21 +231,20 @@ def _other_task(f, w, task, t, q, v, a, lam):
 @kernel(INNER)
 def static_inner_loop(f, w, task, t, q, v, tolerance, a, lam):
     """What the names of the tasks say, at (t, q, v), see calls.py; of SOLVE, q and v are the right-hand side."""
-    if task == EVALUATE_THERE:
+    if task in (EVALUATE, EVALUATE_THERE):
         code = factors_there(f, w, t, q)
         return _accelerate(f, w, t, q, v, a) if code == DONE else code
     if task == MULTIPLIERS:
-        _equilibrate(f, w, lam)
-        return DONE
+        return _equilibrate(f, w, lam)
     if task >= TANGENTS:
         return _other_task(f, w, task, t, q, v, a, lam)
     code = DONE
     if task != ACCELERATIONS:
-        code = _to_constraints(f, w, t, q, v, tolerance)
+        code = _to_constraints(f, w, t, q, v, tolerance if task == PROJECT else 0.0)
         if code != DONE or task in (RESTORE, POSITIONS):
             return code
     code = _accelerate(f, w, t, q, v, a)
-    if code != DONE or task == EVALUATE:
+    if code != DONE:
         return code
-    _equilibrate(f, w, lam)
-    return DONE if _is_as_planned(w) else NEEDS_DENSE
+    code = _equilibrate(f, w, lam)
+    return code if _is_as_planned(w) else NEEDS_DENSE

@@ -26,10 +26,12 @@ from twoloop.kernels.data.common import (
     DONE,
     ESTIMATE,
     FORCE_BY_Q_GIVEN,
+    FORM,
     GENERATION,
     N_OUTER,
     OUTER_DIVERGED,
     SETTLE,
+    STATIC,
     Attempt,
     Step,
     compiled,
@@ -131,7 +133,12 @@ def _place(w, z, q_bar, v_bar, a, Q, V):
 @merged
 def _dense_tangents(f, w):
     """Whether each iteration has a matrix of its own that is factored as it stands."""
-    return f.flags[FORCE_BY_Q_GIVEN] == 1 and f.flags[BANDWIDTH] < 0 and w.Rate.size == w.C.size
+    return (
+        f.flags[FORCE_BY_Q_GIVEN] == 1
+        and f.flags[BANDWIDTH] < 0
+        and w.Rate.size == w.C.size
+        and f.flags[FORM] != STATIC
+    )
 
 
 @merged
@@ -181,8 +188,9 @@ def _solve_stage(f, w, options, memory, t, h, tolerances, A_stage):
         for m in w.independent:
             scale_q = max(scale_q, abs(Q[m]))
             scale_v = max(scale_v, abs(V[m]))
-        for m in w.dependent:
-            a[m] = F[m]
+        if f.flags[FORM] != STATIC:  # where none is dependent
+            for m in w.dependent:
+                a[m] = F[m]
         code = _prepare(f, w, options, memory, t, h, Q, V, F)
         if code != DONE:
             memory[HAS_JACOBIAN] = 0.0

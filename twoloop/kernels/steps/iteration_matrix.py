@@ -55,9 +55,9 @@ def _symmetric(A):
 
 
 @compiled
-def _fill(memory, n, m, z, H):
+def _fill(w, memory, n, m, z, H):
     """T^T M T - z^2 T^T K T - z T^T D T into H."""
-    N, Kr, Dr = space(memory, 1, n, SYSTEMS), space(memory, 1, n, BY_Q), space(memory, 1, n, BY_V)
+    N, Kr, Dr = space(w, n, SYSTEMS), space(w, n, BY_Q), space(w, n, BY_V)
     square = z * z
     if memory[DAMPED] == 1.0:
         for i in range(m * m):
@@ -73,42 +73,42 @@ def factor_iteration(f, w, memory, t, q, v, z):
     n = q.size
     m = w.independent.size
     w.counters[N_JACOBIANS] += 1
-    numbers = space(memory, 1, n, FILTER)
-    K, R = numbers.reshape((n, n)), space(memory, 1, n, SYSTEMS).reshape((n, n))
-    AT = space(memory, 1, n, SYSTEMS + 1)[: n * m].reshape((n, m))
+    numbers = space(w, n, FILTER)
+    K, R = numbers.reshape((n, n)), space(w, n, SYSTEMS).reshape((n, n))
+    AT = space(w, n, SYSTEMS + 1)[: n * m].reshape((n, m))
     code = tangent_by_q(f, w, t, q, v, n - 1, vector(memory, 1, n, Q_MOVED), K, R)
     if code == DONE:
         code = find_tangents(f, w, t, q)
     if code != DONE:
         return code
-    reduce(w, K, AT, _square(space(memory, 1, n, BY_Q), m))
+    reduce(w, K, AT, _square(space(w, n, BY_Q), m))
     memory[DAMPED] = f.flags[FORCE_BY_V_GIVEN]
     code = tangent_by_v(f, t, q, v, n - 1, K)
     if code != DONE:
         return code
     if memory[DAMPED] == 1.0:
-        reduce(w, K, AT, _square(space(memory, 1, n, BY_V), m))
-    reduce(w, w.M, AT, _square(space(memory, 1, n, SYSTEMS), m))
+        reduce(w, K, AT, _square(space(w, n, BY_V), m))
+    reduce(w, w.M, AT, _square(space(w, n, SYSTEMS), m))
     w.counters[N_FACTORIZATIONS] += 1
-    _fill(memory, n, m, z, numbers)
+    _fill(w, memory, n, m, z, numbers)
     H = _square(numbers, m)
     memory[SYMMETRIC] = 0.0
     if _symmetric(H):
         if ldl_factor(H):
             memory[SYMMETRIC] = 1.0
             return DONE
-        _fill(memory, n, m, z, numbers)  # not definite, as of a compressed beam
-    return DONE if lu_factor(H, pivots_of(memory, 1, n, 1, 0)) > 0.0 else SINGULAR
+        _fill(w, memory, n, m, z, numbers)  # not definite, as of a compressed beam
+    return DONE if lu_factor(H, pivots_of(memory, 1, n, 0)) > 0.0 else SINGULAR
 
 
 @compiled
 def _solve(w, memory, x):
     m = x.size
-    H = _square(space(memory, 1, w.Q.size, FILTER), m)
+    H = _square(space(w, w.Q.size, FILTER), m)
     if memory[SYMMETRIC] == 1.0:
         ldl_solve(H, x)
     else:
-        lu_solve(H, pivots_of(memory, 1, w.Q.size, 1, 0), x)
+        lu_solve(H, pivots_of(memory, 1, w.Q.size, 0), x)
 
 
 @compiled
@@ -116,7 +116,7 @@ def solve_iteration(w, memory, residual, a):
     """The correction of the independents of a, added; it replaces the residual (n_q)."""
     n = w.Q.size
     m = w.independent.size
-    N, x = _square(space(memory, 1, n, SYSTEMS), m), vector(memory, 1, n, V_MOVED)[:m]
+    N, x = _square(space(w, n, SYSTEMS), m), vector(memory, 1, n, V_MOVED)[:m]
     for i in range(m):
         total = 0.0
         for j in range(m):
@@ -133,7 +133,7 @@ def filter_by_iteration(w, memory, z, e_q, e_v):
     """e_v (n_dof) becomes (I - z^2 J_q - z J_v)^-1 (e_v + z J_q e_q)."""
     n = w.Q.size
     m = e_q.size
-    N, Kr = _square(space(memory, 1, n, SYSTEMS), m), _square(space(memory, 1, n, BY_Q), m)
+    N, Kr = _square(space(w, n, SYSTEMS), m), _square(space(w, n, BY_Q), m)
     x = vector(memory, 1, n, V_MOVED)[:m]
     for i in range(m):
         total = 0.0

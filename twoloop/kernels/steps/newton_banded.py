@@ -66,9 +66,9 @@ def _band(numbers, n, b):
 
 
 @inlined
-def _constraints(memory, s, n, r, b):
+def _constraints(w, n, r, b):
     """What stands behind K: the rows of C_q that count, w.D and the columns of its entries, where K was taken."""
-    numbers = space(memory, s, n, BY_Q)
+    numbers = space(w, n, BY_Q)
     start = n * (2 * b + 1)
     Cq = numbers[start : start + r * n].reshape((r, n))
     start += r * n
@@ -123,15 +123,15 @@ def _copy_band(A, b, band):
 @compiled
 def _from_tangents(f, w, memory, s, t, q, v, b):
     n = q.size
-    K, R = space(memory, s, n, FILTER).reshape((n, n)), space(memory, s, n, SYSTEMS).reshape((n, n))
+    K, R = space(w, n, FILTER).reshape((n, n)), space(w, n, SYSTEMS).reshape((n, n))
     code = tangent_by_q(f, w, t, q, v, b, vector(memory, s, n, Q_MOVED), K, R)
     if code != DONE:
         return code
-    _copy_band(K, b, _band(space(memory, s, n, BY_Q), n, b))
+    _copy_band(K, b, _band(space(w, n, BY_Q), n, b))
     memory[DAMPED] = f.flags[FORCE_BY_V_GIVEN]
     code = tangent_by_v(f, t, q, v, b, K)
     if memory[DAMPED] == 1.0:
-        _copy_band(K, b, _band(space(memory, s, n, BY_V), n, b))
+        _copy_band(K, b, _band(space(w, n, BY_V), n, b))
     return code
 
 
@@ -141,7 +141,7 @@ def derivatives(f, w, memory, s, t, q, v):
     n = q.size
     b = f.flags[BANDWIDTH]
     w.counters[N_JACOBIANS] += 1
-    Cq, D, columns = _constraints(memory, s, n, w.rows.size, b)
+    Cq, D, columns = _constraints(w, n, w.rows.size, b)
     for i in range(w.rows.size):
         copy(w.G[w.rows[i]], Cq[i])
     code = find_tangents(f, w, t, q)
@@ -154,7 +154,7 @@ def derivatives(f, w, memory, s, t, q, v):
     base, moved = vector(memory, s, n, A_NEW), vector(memory, s, n, Q_MOVED)
     _unbalanced(f, w, t, q, v)
     copy(w.Q, base)
-    code = _difference_groups(f, w, t, q, v, False, base, moved, b, _band(space(memory, s, n, BY_Q), n, b))
+    code = _difference_groups(f, w, t, q, v, False, base, moved, b, _band(space(w, n, BY_Q), n, b))
     if code != DONE:
         return code
     # one displacement of all velocities tells whether there is anything to difference
@@ -167,14 +167,14 @@ def derivatives(f, w, memory, s, t, q, v):
             memory[DAMPED] = 1.0
     if memory[DAMPED] == 0.0:
         return DONE
-    return _difference_groups(f, w, t, q, v, True, base, moved, b, _band(space(memory, s, n, BY_V), n, b))
+    return _difference_groups(f, w, t, q, v, True, base, moved, b, _band(space(w, n, BY_V), n, b))
 
 
 @compiled
 def _fill(w, memory, s, b, z, numbers):
     """M - z^2 K - z D to where it is factored."""
     n = w.Q.size
-    K, D = _band(space(memory, s, n, BY_Q), n, b), _band(space(memory, s, n, BY_V), n, b)
+    K, D = _band(space(w, n, BY_Q), n, b), _band(space(w, n, BY_V), n, b)
     damped = memory[DAMPED] == 1.0
     target = lu_band(numbers, n, b)
     for i in range(n):
@@ -193,20 +193,20 @@ def factor(f, w, options, memory, s, h):
     place = eigen_place(options, s)
     n_eigen = count_eigenvalues(options, s)
     n_real = int(options[place + N_REAL])
-    Cq, _, _ = _constraints(memory, s, n, w.rows.size, b)
-    numbers = space(memory, s, n, FILTER)
+    Cq, _, _ = _constraints(w, n, w.rows.size, b)
+    numbers = space(w, n, FILTER)
     _fill(w, memory, s, b, h * options[place + GAMMA0], numbers)
     w.counters[N_FACTORIZATIONS] += 1
-    code = factor_bordered(w, b, Cq, numbers, pivots_of(memory, s, n, n_eigen, 0), DGBTRF, DGBTRS)
+    code = factor_bordered(w, b, Cq, numbers, pivots_of(memory, s, n, 0), DGBTRF, DGBTRS)
     place += N_EIGEN_SCALARS + s
     for k in range(n_eigen):
         if code != DONE:
             return code
         if k > 0 or n_real == 0:  # else the eigenvalue is gamma0
-            system = system_space(memory, s, n, k)
+            system = system_space(w, n, k)
             _fill(w, memory, s, b, h * complex(options[place], options[place + 1]), system)
             w.counters[N_FACTORIZATIONS] += 1
-            code = factor_bordered(w, b, Cq, system, pivots_of(memory, s, n, n_eigen, 1 + k), ZGBTRF, ZGBTRS)
+            code = factor_bordered(w, b, Cq, system, pivots_of(memory, s, n, 1 + k), ZGBTRF, ZGBTRS)
         place += 2 + 4 * s
     return code
 
@@ -215,7 +215,7 @@ def factor(f, w, options, memory, s, h):
 def _all_coordinates(w, memory, s, b, x, X):
     """X = T x; of x (n_q) the first n_dof numbers count, the others are scratch."""
     n_dof = w.independent.size
-    _, D, columns = _constraints(memory, s, w.Q.size, w.rows.size, b)
+    _, D, columns = _constraints(w, w.Q.size, w.rows.size, b)
     for i in columns:
         X[i] = 0.0
     for k in range(n_dof):
@@ -227,7 +227,7 @@ def _all_coordinates(w, memory, s, b, x, X):
 @compiled
 def _solve_for_independents(w, memory, s, b, numbers, pivots, substitute, x):
     """Solve with the full right-hand side x (n_q); its first n_dof numbers become the independents of the solution."""
-    Cq, _, _ = _constraints(memory, s, x.size, w.rows.size, b)
+    Cq, _, _ = _constraints(w, x.size, w.rows.size, b)
     solve_bordered(w, b, Cq, numbers, pivots, substitute, x)
     for k in range(w.independent.size):  # ascending, so that none is overwritten before its turn
         x[k] = x[w.independent[k]]
@@ -239,7 +239,7 @@ def solve(f, w, options, memory, s, k, x):
     n = w.Q.size
     b = f.flags[BANDWIDTH]
     n_eigen = count_eigenvalues(options, s)
-    pivots = pivots_of(memory, s, n, n_eigen, 1 + k)
+    pivots = pivots_of(memory, s, n, 1 + k)
     if k == 0 and options[eigen_place(options, s) + N_REAL] > 0.0:  # the eigenvalue is gamma0
         real, X = vector(memory, s, n, V_MOVED), vector(memory, s, n, Q_MOVED)
         for i in range(n):
@@ -247,8 +247,8 @@ def solve(f, w, options, memory, s, k, x):
         _all_coordinates(w, memory, s, b, real, X)
         real[:] = 0.0
         add_banded_mass_times(f, w, X, real)
-        pivots = pivots_of(memory, s, n, n_eigen, 0)
-        _solve_for_independents(w, memory, s, b, space(memory, s, n, FILTER), pivots, DGBTRS, real)
+        pivots = pivots_of(memory, s, n, 0)
+        _solve_for_independents(w, memory, s, b, space(w, n, FILTER), pivots, DGBTRS, real)
         for i in range(n):
             x[i] = real[i]
     else:
@@ -256,7 +256,7 @@ def solve(f, w, options, memory, s, k, x):
         _all_coordinates(w, memory, s, b, x, X)
         x[:] = 0.0
         add_banded_mass_times(f, w, X, x)
-        _solve_for_independents(w, memory, s, b, system_space(memory, s, n, k), pivots, ZGBTRS, x)
+        _solve_for_independents(w, memory, s, b, system_space(w, n, k), pivots, ZGBTRS, x)
 
 
 @compiled
@@ -265,7 +265,7 @@ def filter_error(f, w, options, memory, s, h, e_q, e_v):
     n = w.Q.size
     b = f.flags[BANDWIDTH]
     z = h * options[eigen_place(options, s) + GAMMA0]
-    K, X = _band(space(memory, s, n, BY_Q), n, b), vector(memory, s, n, Q_MOVED)
+    K, X = _band(space(w, n, BY_Q), n, b), vector(memory, s, n, Q_MOVED)
     _all_coordinates(w, memory, s, b, e_v, X)
     e_v[:] = 0.0
     add_banded_mass_times(f, w, X, e_v)
@@ -273,5 +273,5 @@ def filter_error(f, w, options, memory, s, h, e_q, e_v):
     for i in range(n):
         for j in range(max(0, i - b), min(n, i + b + 1)):
             e_v[i] += z * K[i, b + j - i] * X[j]
-    pivots = pivots_of(memory, s, n, count_eigenvalues(options, s), 0)
-    _solve_for_independents(w, memory, s, b, space(memory, s, n, FILTER), pivots, DGBTRS, e_v)
+    pivots = pivots_of(memory, s, n, 0)
+    _solve_for_independents(w, memory, s, b, space(w, n, FILTER), pivots, DGBTRS, e_v)

@@ -78,16 +78,16 @@ def _from_tangents(f, w, memory, s, t, q, v):
     m = w.independent.size
     w.counters[N_JACOBIANS] += 1
     # factors are not needed any more: their spaces hold K or D, then T^T M T and T^T A
-    K, R = _square(space(memory, s, n, FILTER), n), _square(space(memory, s, n, SYSTEMS), n)
+    K, R = _square(space(w, n, FILTER), n), _square(space(w, n, SYSTEMS), n)
     code = tangent_by_q(f, w, t, q, v, n - 1, vector(memory, s, n, Q_MOVED), K, R)
     if code != DONE:
         return code
-    AT = space(memory, s, n, SYSTEMS + 1)[: n * m].reshape((n, m))
+    AT = space(w, n, SYSTEMS + 1)[: n * m].reshape((n, m))
     code = find_tangents(f, w, t, q)
     if code != DONE:
         return code
-    Jq, Jv = _square(space(memory, s, n, BY_Q), m), _square(space(memory, s, n, BY_V), m)
-    N = _square(space(memory, s, n, SYSTEMS), m)
+    Jq, Jv = _square(space(w, n, BY_Q), m), _square(space(w, n, BY_V), m)
+    N = _square(space(w, n, SYSTEMS), m)
     reduce(w, w.M, AT, N)
     if not ldl_factor(N):
         return SINGULAR
@@ -108,7 +108,7 @@ def derivatives(f, w, options, memory, s, t, q, v, a):
         return _from_tangents(f, w, memory, s, t, q, v)
     n = q.size
     m = w.independent.size
-    Jq, Jv = _square(space(memory, s, n, BY_Q), m), _square(space(memory, s, n, BY_V), m)
+    Jq, Jv = _square(space(w, n, BY_Q), m), _square(space(w, n, BY_V), m)
     q_moved, v_moved = vector(memory, s, n, Q_MOVED), vector(memory, s, n, V_MOVED)
     a_new = vector(memory, s, n, A_NEW)
     w.counters[N_JACOBIANS] += 1
@@ -158,12 +158,12 @@ def factor(w, options, memory, s, h):
     """Factors of I - (h l)^2 J_q - h l J_v for gamma0, real, and for the other eigenvalues l, complex."""
     n = w.Q.size
     m = w.independent.size
-    Jq, Jv = _square(space(memory, s, n, BY_Q), m), _square(space(memory, s, n, BY_V), m)
+    Jq, Jv = _square(space(w, n, BY_Q), m), _square(space(w, n, BY_V), m)
     place = eigen_place(options, s)
     n_eigen = count_eigenvalues(options, s)
     n_real = int(options[place + N_REAL])
     damped = memory[DAMPED] == 1.0
-    filter_matrix = _square(space(memory, s, n, FILTER), m)
+    filter_matrix = _square(space(w, n, FILTER), m)
     hl = h * options[place + GAMMA0]
     for i in range(m):
         for j in range(m):
@@ -172,7 +172,7 @@ def factor(w, options, memory, s, h):
                 filter_matrix[i, j] -= hl * Jv[i, j]
         filter_matrix[i, i] += 1.0
     w.counters[N_FACTORIZATIONS] += 1
-    if not lu_factor(filter_matrix, pivots_of(memory, s, n, n_eigen, 0)) > 0.0:
+    if not lu_factor(filter_matrix, pivots_of(memory, s, n, 0)) > 0.0:
         return SINGULAR
     place += N_EIGEN_SCALARS + s
     for k in range(n_eigen):
@@ -180,7 +180,7 @@ def factor(w, options, memory, s, h):
         place += 2 + 4 * s
         if k == 0 and n_real > 0:  # the eigenvalue is gamma0
             continue
-        matrix = _square(system_space(memory, s, n, k), m)
+        matrix = _square(system_space(w, n, k), m)
         for i in range(m):
             for j in range(m):
                 matrix[i, j] = -z * z * Jq[i, j]
@@ -188,7 +188,7 @@ def factor(w, options, memory, s, h):
                     matrix[i, j] -= z * Jv[i, j]
             matrix[i, i] += 1.0
         w.counters[N_FACTORIZATIONS] += 1
-        if not lu_factor(matrix, pivots_of(memory, s, n, n_eigen, 1 + k)) > 0.0:
+        if not lu_factor(matrix, pivots_of(memory, s, n, 1 + k)) > 0.0:
             return SINGULAR
     return DONE
 
@@ -198,16 +198,15 @@ def solve(w, options, memory, s, k, x):
     """Solve the k-th eigenvalue's system; x (n_dof) is overwritten."""
     n = w.Q.size
     m = x.size
-    n_eigen = count_eigenvalues(options, s)
     if k == 0 and options[eigen_place(options, s) + N_REAL] > 0.0:  # the eigenvalue is gamma0
         real = vector(memory, s, n, V_MOVED)[:m]
         for i in range(m):
             real[i] = x[i].real
-        lu_solve(_square(space(memory, s, n, FILTER), m), pivots_of(memory, s, n, n_eigen, 0), real)
+        lu_solve(_square(space(w, n, FILTER), m), pivots_of(memory, s, n, 0), real)
         for i in range(m):
             x[i] = real[i]
     else:
-        lu_solve(_square(system_space(memory, s, n, k), m), pivots_of(memory, s, n, n_eigen, 1 + k), x)
+        lu_solve(_square(system_space(w, n, k), m), pivots_of(memory, s, n, 1 + k), x)
 
 
 @compiled
@@ -215,12 +214,11 @@ def filter_error(w, options, memory, s, h, e_q, e_v):
     """e_v becomes (I - (h gamma0)^2 J_q - h gamma0 J_v)^-1 (e_v + h gamma0 J_q e_q), all (n_dof)."""
     n = w.Q.size
     m = e_q.size
-    n_eigen = count_eigenvalues(options, s)
     gamma0 = options[eigen_place(options, s) + GAMMA0]
-    Jq = _square(space(memory, s, n, BY_Q), m)
+    Jq = _square(space(w, n, BY_Q), m)
     for i in range(m):
         total = 0.0
         for j in range(m):
             total += Jq[i, j] * e_q[j]
         e_v[i] += h * gamma0 * total
-    lu_solve(_square(space(memory, s, n, FILTER), m), pivots_of(memory, s, n, n_eigen, 0), e_v)
+    lu_solve(_square(space(w, n, FILTER), m), pivots_of(memory, s, n, 0), e_v)

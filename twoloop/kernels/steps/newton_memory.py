@@ -28,15 +28,18 @@ N_REAL, N_PAIRS, GAMMA0, VELOCITIES, N_EIGEN_SCALARS = range(5)
 ) = range(13)
 PREVIOUS, TRIAL, RESIDUAL, Q_STAGE, V_STAGE, N_BLOCKS = range(6)
 A_NEW, Q_MOVED, V_MOVED, E_Q, E_V, Q_MID, V_MID, A_MID, N_VECTORS = range(9)
-# spaces of n_q^2 numbers each; those from SYSTEMS on go in pairs, complex, one for each eigenvalue
+# spaces in w.matrices, of n_q^2 numbers each; those from SYSTEMS on go in pairs, complex, one for each eigenvalue
 BY_Q, BY_V, FILTER, SYSTEMS = range(4)
 
 
 def memory_size(n_eigenvalues: int, s: int, n_q: int) -> int:
-    """Length of `memory`: scalars, stage blocks, vectors, spaces for matrices, pivots, two complex vectors, weights."""
-    matrices = SYSTEMS + 2 * n_eigenvalues
-    vectors = N_BLOCKS * s + N_VECTORS + 5 + n_eigenvalues
-    return N_MEMORY_SCALARS + vectors * n_q + matrices * n_q * n_q + s
+    """Length of `memory`: scalars, stage blocks, vectors, pivots, two complex vectors, weights."""
+    return N_MEMORY_SCALARS + (N_BLOCKS * s + N_VECTORS + 5 + n_eigenvalues) * n_q + s
+
+
+def n_matrices(n_eigenvalues: int) -> int:
+    """How many spaces of n_q^2 numbers there are to be in w.matrices."""
+    return SYSTEMS + 2 * n_eigenvalues
 
 
 @merged
@@ -67,32 +70,31 @@ def vector(memory, s, n, which):
 
 
 @inlined
-def space(memory, s, n, which):
+def space(w, n, which):
     """The space of one matrix, (n^2)."""
-    start = N_MEMORY_SCALARS + (N_BLOCKS * s + N_VECTORS + which * n) * n
-    return memory[start : start + n * n]
+    return w.matrices[which * n * n : (which + 1) * n * n]
 
 
 @inlined
-def system_space(memory, s, n, k):
+def system_space(w, n, k):
     """The space of the k-th eigenvalue's system, complex (n^2)."""
-    start = N_MEMORY_SCALARS + (N_BLOCKS * s + N_VECTORS + (SYSTEMS + 2 * k) * n) * n
-    return memory[start : start + 2 * n * n].view(np.complex128)
+    start = (SYSTEMS + 2 * k) * n * n
+    return w.matrices[start : start + 2 * n * n].view(np.complex128)
 
 
 @inlined
-def _tail(memory, s, n, n_eigen, k):
-    start = N_MEMORY_SCALARS + (N_BLOCKS * s + N_VECTORS + (SYSTEMS + 2 * n_eigen) * n) * n + k * n
+def _tail(memory, s, n, k):
+    start = N_MEMORY_SCALARS + (N_BLOCKS * s + N_VECTORS + k) * n
     return memory[start : start + 2 * n]
 
 
 @inlined
-def pivots_of(memory, s, n, n_eigen, k):
+def pivots_of(memory, s, n, k):
     """Integers (n) for the row exchanges of the filter (k = 0) or of the (k - 1)-th eigenvalue's system."""
-    return _tail(memory, s, n, n_eigen, k)[:n].view(np.int64)
+    return _tail(memory, s, n, k)[:n].view(np.int64)
 
 
 @inlined
 def complex_vector(memory, s, n, n_eigen, which):
     """Complex scratch (n), `which` being 0 or 1."""
-    return _tail(memory, s, n, n_eigen, 1 + n_eigen + 2 * which).view(np.complex128)
+    return _tail(memory, s, n, 1 + n_eigen + 2 * which).view(np.complex128)

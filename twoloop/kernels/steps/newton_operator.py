@@ -1,17 +1,20 @@
 """The matrices of Newton's method behind one interface: I - z^2 J_q - z J_v for each eigenvalue, z = h l.
 
-J_q and J_v are the derivatives of the two-loop right-hand side by the independent positions and velocities. Two
-structures serve: newton_dense.py and, where the system has a bandwidth, newton_banded.py.
+J_q and J_v are the derivatives of the two-loop right-hand side by the independent positions and velocities. Three
+structures serve: newton_dense.py, newton_banded.py where the system has a bandwidth, and newton_static.py for large
+systems, of which all coordinates count as independent.
 """
 
-from twoloop.kernels.data.common import BANDWIDTH, compiled
-from twoloop.kernels.steps import newton_banded, newton_dense
+from twoloop.kernels.data.common import BANDWIDTH, FORM, STATIC, compiled
+from twoloop.kernels.steps import newton_banded, newton_dense, newton_static
 from twoloop.kernels.steps.newton_memory import H_FACTORED
 
 
 @compiled
 def derivatives_at(f, w, options, memory, s, t, q, v, a):
     """Derivatives at a state (q, v) that was evaluated just before, with a as its accelerations."""
+    if f.flags[FORM] == STATIC:
+        return newton_static.derivatives(f, w, memory, t, q, v)
     if f.flags[BANDWIDTH] >= 0:
         return newton_banded.derivatives(f, w, memory, s, t, q, v)
     return newton_dense.derivatives(f, w, options, memory, s, t, q, v, a)
@@ -20,7 +23,9 @@ def derivatives_at(f, w, options, memory, s, t, q, v, a):
 @compiled
 def factor_systems(f, w, options, memory, s, h):
     """Factors for steps of h, for every eigenvalue and for gamma0."""
-    if f.flags[BANDWIDTH] >= 0:
+    if f.flags[FORM] == STATIC:
+        code = newton_static.factor(f, w, options, s, h)
+    elif f.flags[BANDWIDTH] >= 0:
         code = newton_banded.factor(f, w, options, memory, s, h)
     else:
         code = newton_dense.factor(w, options, memory, s, h)
@@ -31,7 +36,9 @@ def factor_systems(f, w, options, memory, s, h):
 @compiled
 def solve_system(f, w, options, memory, s, k, x):
     """Solve the k-th eigenvalue's system; the first n_dof numbers of x (n_q) are overwritten."""
-    if f.flags[BANDWIDTH] >= 0:
+    if f.flags[FORM] == STATIC:
+        newton_static.solve(f, w, options, s, k, x)
+    elif f.flags[BANDWIDTH] >= 0:
         newton_banded.solve(f, w, options, memory, s, k, x)
     else:
         newton_dense.solve(w, options, memory, s, k, x[: w.independent.size])
@@ -41,7 +48,9 @@ def solve_system(f, w, options, memory, s, k, x):
 def filter_error(f, w, options, memory, s, h, e_q, e_v):
     """e_v becomes (I - z^2 J_q - z J_v)^-1 (e_v + z J_q e_q), z = h gamma0: the first n_dof numbers of each (n_q)."""
     m = w.independent.size
-    if f.flags[BANDWIDTH] >= 0:
+    if f.flags[FORM] == STATIC:
+        newton_static.filter_error(f, w, options, s, h, e_q, e_v)
+    elif f.flags[BANDWIDTH] >= 0:
         newton_banded.filter_error(f, w, options, memory, s, h, e_q, e_v)
     else:
         newton_dense.filter_error(w, options, memory, s, h, e_q[:m], e_v[:m])

@@ -22,11 +22,13 @@ from twoloop.kernels.data.common import (
     ATTEMPT,
     DONE,
     ESTIMATE,
+    FORM,
     GENERATION,
     LEAST,
     N_OUTER,
     OUTER_DIVERGED,
     SETTLE,
+    STATIC,
     Attempt,
     Step,
     compiled,
@@ -182,8 +184,9 @@ def _iterate(f, w, options, memory, t, h, tolerances, q, v, A_stage):
                 return code
             for m in range(n):
                 residual[j, m] = a_new[m] - A_stage[j, m]
-            for m in w.dependent:
-                A_stage[j, m] = a_new[m]
+            if f.flags[FORM] != STATIC:  # where none is dependent
+                for m in w.dependent:
+                    A_stage[j, m] = a_new[m]
         scale_q, scale_v = 1.0, 1.0
         for j in range(s):
             for m in w.independent:

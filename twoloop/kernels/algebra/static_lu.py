@@ -1,0 +1,170 @@
+"""Factors of Newton's matrix of a large system, which is not symmetric, by a static program; and how it is differenced.
+
+    [M - z^2 K - z D  G^T]
+    [G                 0 ]  = L U
+
+in the order of static_order.py with couplings, with pivots of one row and no look at the numbers. The numbers of M come
+first among the entries, then those of K and D. Behind the program stand groups of these, each of columns of which no
+two have an entry in the same row, so that one displacement serves all (Curtis, Powell & Reid 1974, doi
+10.1093/imamat/13.1.117).
+"""
+
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twoloop.kernels.algebra.static_order import elimination_order
+from twoloop.kernels.algebra.static_program import (
+    N_COORDINATES,
+    N_OFF,
+    N_PIVOTS,
+    Entries,
+    Integers,
+    behind,
+    columns_of,
+    jacobian_of,
+    mass_of,
+    order_of,
+    program_in_order,
+    stiffened_of,
+    targets_of,
+)
+from twoloop.kernels.data.common import compiled, inlined
+
+LEAST = 1e-11  # of what it is the difference of: a smaller pivot is rounding
+
+
+def newton_program(
+    n_q: int,
+    n_rows: int,
+    mass: Entries,
+    jacobian: Entries,
+    tangents: Entries,
+    together: Iterable[Sequence[int]],
+    stiff_rows: Sequence[int],
+) -> NDArray[np.int32] | None:
+    """The program, `tangents` being the entries of K and D, both triangles; None where there would be too many updates.
+
+    The tangents must be in the order of `in_groups`.
+    """
+    groups = groups_of(tangents, n_q)[tangents[1]]
+    begins = np.searchsorted(groups, np.arange(groups.max(initial=-1) + 2))
+    order = elimination_order(n_q, n_rows, mass, jacobian, together, stiff_rows, tangents)
+    entries = np.concatenate([mass[0], tangents[0]]), np.concatenate([mass[1], tangents[1]])
+    program = program_in_order(order, n_q, entries, jacobian, stiff_rows, both=True)
+    return None if program is None else np.concatenate([program, begins]).astype(np.int32)
+
+
+def in_groups(tangents: Entries, n_q: int) -> Entries:
+    """The entries, those of a group together."""
+    sequence = np.argsort(groups_of(tangents, n_q)[tangents[1]], kind="stable")
+    return tangents[0][sequence], tangents[1][sequence]
+
+
+def groups_of(entries: Entries, n_q: int) -> Integers:
+    """The group of each column."""
+    rows_of: list[list[int]] = [[] for _ in range(n_q)]
+    for i, j in zip(*(each.tolist() for each in entries), strict=True):
+        rows_of[j].append(i)
+    found = np.zeros(n_q, dtype=np.int64)
+    by_row: list[set[int]] = [set() for _ in range(n_q)]  # groups that have an entry in a row
+    for j, own in enumerate(rows_of):
+        used = set().union(*(by_row[i] for i in own))
+        found[j] = group = next(k for k in range(n_q) if k not in used)
+        for i in own:
+            by_row[i].add(group)
+    return found
+
+
+@inlined
+def tangents_of(program):
+    """Rows and columns of the entries of K and D, and where each group of them begins, and the last one ends."""
+    begins = program[behind(program) :]
+    rows, columns, _ = mass_of(program)
+    n_mass = rows.size - begins[begins.size - 1]
+    return rows[n_mass:], columns[n_mass:], begins
+
+
+@compiled
+def load(program, mass, jacobian, K, D, z, stiffness, values):
+    """The numbers of the matrix for z into their slots."""
+    for s in range(values.size):
+        values[s] = 0.0
+    off = program[N_OFF]
+    _, _, slots = mass_of(program)
+    for k in range(mass.size):
+        values[slots[k]] += mass[k]
+    for k in range(K.size):
+        values[slots[mass.size + k]] -= z * (z * K[k] + D[k])
+    _, _, slots = jacobian_of(program)
+    for k in range(slots.size):
+        values[slots[k]] += jacobian[k]
+        values[slots[k] + off] += jacobian[k]
+    which, first, second, slots = stiffened_of(program)
+    for u in range(which.size):
+        share = stiffness[which[u]] * jacobian[first[u]] * jacobian[second[u]]
+        values[slots[u]] += share
+        if slots[u] >= program[N_PIVOTS]:
+            values[slots[u] + off] += share
+
+
+@compiled
+def factor(program, counts, values, sizes):
+    """The factors in the place of the numbers, 1 / pivot on the diagonal; whether all pivots were large enough.
+
+    Rows that do not count, 0 in `counts`, have 0 there and no part in it. `sizes` is scratch, real numbers.
+    """
+    n_q, n, off = program[N_COORDINATES], program[N_PIVOTS], program[N_OFF]
+    order, targets = order_of(program), targets_of(program)
+    begin, _ = columns_of(program)
+    for k in range(n):
+        sizes[k] = abs(values[k])
+    u = 0
+    for k in range(n):
+        first, last = n + begin[k], n + begin[k + 1]
+        if order[k] >= n_q and counts[order[k] - n_q] == 0.0:
+            values[k] = 0.0
+            for s in range(first, last):
+                values[s] = 0.0
+                values[s + off] = 0.0
+            u += (last - first) * (last - first + 1) // 2
+            continue
+        if not abs(values[k]) > LEAST * sizes[k]:  # also true for NaN
+            return False
+        inverse = 1.0 / values[k]
+        values[k] = inverse
+        for s in range(first, last):
+            one, other = values[s] * inverse, values[s + off] * inverse
+            target = targets[u]  # of the diagonal
+            change = one * values[s + off]
+            values[target] -= change
+            sizes[target] += abs(change)
+            u += 1
+            for r in range(s + 1, last):
+                target = targets[u]
+                values[target] -= values[r] * other
+                values[target + off] -= one * values[r + off]
+                u += 1
+            values[s] = one
+    return True
+
+
+@compiled
+def solve(program, values, x, y):
+    """The solution for x = [r, c] in its place, by the factors; y is scratch."""
+    n, off, order = program[N_PIVOTS], program[N_OFF], order_of(program)
+    begin, row_of = columns_of(program)
+    for k in range(n):
+        y[k] = x[order[k]]
+    for k in range(n):
+        share = y[k]
+        for s in range(begin[k], begin[k + 1]):
+            y[row_of[s]] -= values[n + s] * share
+    for k in range(n - 1, -1, -1):
+        total = y[k]
+        for s in range(begin[k], begin[k + 1]):
+            total -= values[n + off + s] * y[row_of[s]]
+        y[k] = total * values[k]
+    for k in range(n):
+        x[order[k]] = y[k]
