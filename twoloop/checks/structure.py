@@ -22,23 +22,20 @@ ROUNDED = 100.0  # times rounding of the terms of a constraint, by which values 
 ROUNDING = 1e-12  # of a difference, relative to the largest entry over the displacement
 
 
-def unlike_itself(system: ConstrainedSystem, t: float, q: Array, t0: float, q0: Array) -> str | None:
+def unlike_itself(system: ConstrainedSystem, t: float, q: Array, v: Array, t0: float, q0: Array) -> str | None:
     """Say what of M, `kinematics` and values is not as it should be at a position of a run from (t0, q0), or None."""
     wrong = changed_mass(system, t0, q0, t, q) if system.constant_mass else unsymmetric_mass(system, t, q)
-    return wrong or wrong_kinematics(system, t, q) or wrong_values(system, t, q)
+    return wrong or (None if _agree(system, t, q, v) else wrong_kinematics(system, t, q)) or wrong_values(system, t, q)
 
 
 def wrong_kinematics(system: ConstrainedSystem, t: float, q: Array) -> str | None:
     """Compare the fused callback with the separate ones, which are compared with differences."""
     if "kinematics" not in system.given:
         return None
-    from twoloop.kernels.evaluation.first_look import kinematics_agree
-
     rows = system.sparse_rows(t, q)[: system.n_c]
     v = generic_velocities(rows, system.constraint_rate(t, q), q)[-1]
     for place in (q, q + NEAR * v):
-        room = *np.zeros((2, 3 + system.n_q, system.n_c)), np.zeros(system.n_c)
-        if direct(kinematics_agree)(system.kit, t, np.ascontiguousarray(place), v, *room, SAME, ROUNDED * EPS):
+        if _agree(system, t, place, v):
             continue
         separate = {
             "constraint": system.constraint(t, place),
@@ -61,9 +58,26 @@ def wrong_kinematics(system: ConstrainedSystem, t: float, q: Array) -> str | Non
     return None
 
 
+def _agree(system: ConstrainedSystem, t: float, q: Array, v: Array) -> bool:
+    """Whether kinematics are not given, or give what the separate callbacks give."""
+    if "kinematics" not in system.given:
+        return True
+    from twoloop.kernels.evaluation.first_look import kinematics_agree
+
+    room = *np.zeros((2, 3 + system.n_q, system.n_c)), np.zeros(system.n_c)
+    state = np.ascontiguousarray(q), np.ascontiguousarray(v)
+    return bool(direct(kinematics_agree)(system.kit, t, *state, *room, SAME, ROUNDED * EPS))
+
+
 def changed_mass(system: ConstrainedSystem, t0: float, q0: Array, t: float, q: Array) -> str | None:
     """Say that a mass is not the same in two places, where it is said to be constant, or None."""
-    mass = system.mass_values if "mass" in system.entries else system.mass
+    kind = "mass_values" if "mass" in system.entries else "mass"
+
+    def mass(t: float, q: Array) -> Array:
+        (made,) = system.arrays_of(kind)
+        getattr(system.functions, kind)(t, np.ascontiguousarray(q), system.functions.p, made)
+        return made
+
     there = defined(lambda: mass(t, q))
     if there is None or not np.abs(there - mass(t0, q0)).max() > UNSYMMETRIC * np.abs(there).max():
         return None

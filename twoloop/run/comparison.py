@@ -63,7 +63,7 @@ def _derivatives_again(
     exact = exact_derivatives(run.system)
     fine = exact is not None and exact.wrong(run.system, generic_states(states)) is None
     for instant, q, v in states:
-        wrong = unlike_itself(run.system, instant, q, float(first[0]), first[1 : 1 + n])
+        wrong = unlike_itself(run.system, instant, q, v, float(first[0]), first[1 : 1 + n])
         if wrong is None and not fine:
             wrong = wrong_derivative(run.system, instant, q, v)
         if wrong is not None:
