@@ -191,9 +191,10 @@ def test_the_sentence_on_trust_is_computed(tmp_path):
     assert "A pulse of 1 ms between two looks was missed by the default, too" in text
     assert "andom mechanisms under sharp forces" not in text
     trust["default"] |= {"wrong": 3, "unasked": 2}
-    misled = {"default": {"n": 150, "wrong": []}, "allowed": [{"tol": 1e-4}, {"tol": 1e-12}]}
+    within = {"tolerances": 1000.0, "n": 150, "within": 149, "failed": 1, "beyond": 0}
+    misled = {"default": {"n": 150, "wrong": []}, "within_thousand": within, "allowed": [{"tol": 1e-4}, {"tol": 1e-12}]}
     told = {"honesty": honesty, "robustness": {"sharp": misled}}
-    said = "None of 150 random mechanisms under sharp forces, each run at one tolerance from 1e-4 to 1e-12, misleads "
+    said = "on 149 of 150 random mechanisms under sharp forces (1 reports failure), each run at one tolerance from 1e-4 to "
     assert said in front(tmp_path, [case()], **told)
     text = screen(tmp_path, [case()], **told)
     assert said in text
