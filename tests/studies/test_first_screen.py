@@ -191,8 +191,8 @@ def test_every_number_of_the_screen_is_made_again_from_the_rows(tmp_path):
         "methods 0, heyoka 0, IDA and CVODE 1. ",
         "with one of a hundredth of the run 1 of their 65 runs are off by over 1e-3, 1 of 130 without. "
         "A pulse of 1 ms ",
-        "within 1000 tolerances on 141 of 144 random mechanisms under sharp forces (2 report failure, 1 ends farther off "
-        "without saying so), each run at one tolerance from 1e-4 to 1e-12; no other project's solver was run; 1 is "
+        "within 1000 tolerances on 141 of 144 random mechanisms under sharp forces (2 report failure, 1 ends farther "
+        "off without saying so), each run at one tolerance from 1e-4 to 1e-12; no other project's solver was run; 1 is "
         "silently wrong by the sensitivity of the motion, at worst with gust of 3 ms: off by 0.060 at 1e-6",
     ]
     for said in expected:

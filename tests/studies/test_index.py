@@ -194,7 +194,7 @@ def test_the_sentence_on_trust_is_computed(tmp_path):
     within = {"tolerances": 1000.0, "n": 150, "within": 149, "failed": 1, "beyond": 0}
     misled = {"default": {"n": 150, "wrong": []}, "within_thousand": within, "allowed": [{"tol": 1e-4}, {"tol": 1e-12}]}
     told = {"honesty": honesty, "robustness": {"sharp": misled}}
-    said = "on 149 of 150 random mechanisms under sharp forces (1 reports failure), each run at one tolerance from 1e-4 to "
+    said = "on 149 of 150 random mechanisms under sharp forces (1 reports failure), each run at one tolerance from "
     assert said in front(tmp_path, [case()], **told)
     text = screen(tmp_path, [case()], **told)
     assert said in text
