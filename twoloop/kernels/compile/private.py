@@ -1,5 +1,6 @@
 """What of numba's private parts is used where code is generated; other modules take it from here."""
 
+from copy import copy
 from typing import Any
 
 from numba.core import cgutils
@@ -14,3 +15,6 @@ def also_for(function: Dispatcher, signature: Any) -> None:
     (compiled,) = own.overloads.values()
     own._insert([each._code for each in signature.args], compiled.entry_point, False)
     own.overloads[signature.args] = compiled._replace(signature=signature)
+    described = copy(compiled.fndesc)  # for compiled functions that call it
+    described.argtypes = signature.args
+    own.targetctx.insert_user_function(compiled.entry_point, described, [compiled.library])
