@@ -15,7 +15,14 @@ DECADE = 10.0 * (1.0 + 1e-9)  # between two runs that lie farther apart nothing 
 NEAR = 2.0  # settings that differ by less are nearly the same
 FEWEST = 3  # repetitions that an interval asks for
 LOOSEST = 1e-1  # tolerance of which looser ones are of no use
-BY_TOLERANCE = ("heyoka", "Taylor", "auto", "the default")  # how solvers begin whose order the tolerance sets
+BY_TOLERANCE = (
+    "heyoka",
+    "Taylor",
+    "auto",
+    "the default",
+    "ensemble",
+    "solve_dae",
+)  # how solvers begin whose order the tolerance sets
 RESAMPLES, SEED = 1000, 25  # draws of the repetitions
 
 

@@ -203,12 +203,12 @@ def test_the_default_is_called_a_series_where_it_takes_the_steps_of_one():
 
 @pytest.mark.usefixtures("unsaved")
 def test_times_that_scatter_with_the_same_counts_give_no_ratio(tmp_path):
-    found = found_of(tmp_path, rows())
+    found = found_of(table3, tmp_path, rows())
     assert not found["times_unequal"] and "times as long, by repetition: " in (tmp_path / "table3.md").read_text()
     made = pd.concat([rows().assign(repeat=k) for k in range(5)]).sort_index(kind="stable").reset_index(drop=True)
     slow = (made["group"] == "Table 3: Newmark") & (made["err_out"] == 1e-9)
     made.loc[slow & made["repeat"].isin((1, 2, 4)), "call_s"] *= 1.3
-    found = found_of(tmp_path, made)
+    found = found_of(table3, tmp_path, made)
     text = (tmp_path / "table3.md").read_text()
     assert found["times_unequal"] and "fall into two groups with the same counts (5.1 to 6.6 s; Runge" in text
     assert "by repetition" not in text and "no ratio of times is a result" in text
