@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 
+from studies.bench.closed_loops import squeezer
 from twoloop import solve_dae
 from twoloop.bodies import PlanarModel, SpatialModel
 from twoloop.mechanisms import (
@@ -18,33 +19,6 @@ from twoloop.mechanisms import (
     spatial_four_bar,
     spatial_slider_crank,
     sundials_slider_crank,
-)
-from twoloop.mechanisms.andrews import (
-    DA,
-    EE,
-    FF,
-    LENGTH,
-    RA,
-    RR,
-    SA,
-    SB,
-    SC,
-    SD,
-    SPRING,
-    TA,
-    TB,
-    TORQUE,
-    UA,
-    UB,
-    XA,
-    XB,
-    XC,
-    YA,
-    YB,
-    YC,
-    ZT,
-    D,
-    U,
 )
 from twoloop.mechanisms.rotation import rotation_matrix
 from twoloop.mechanisms.spatial_four_bar import inertia as round_bar
@@ -70,9 +44,8 @@ def run(problem, end, tolerance):
     return result
 
 
-def both(model, known, end, tolerance=1e-11, conserved=True, energy=True):
-    """Runs of a model and of a ready problem; their energies move alike."""
-    made = model.problem((0.0, end))
+def both(made, known, end, tolerance=1e-11, conserved=True, energy=True):
+    """Runs of a model's problem and of a ready one; their energies move alike."""
     assert made.conserved == conserved
     one, other = run(made, end, tolerance), run(known, end, tolerance)
     energies = [problem.energy(each.t, each.q, each.v) for problem, each in ((made, one), (known, other))]
@@ -95,7 +68,7 @@ def test_four_bar():
     model.revolute("bar 1", "bar 2", at=q[0, :2] + along[0])
     model.revolute("bar 2", "bar 3", at=q[1, :2] + along[1])
     model.revolute("bar 3", "ground", at=(3.0, 0.0))
-    made, one, other = both(model, known, 5.0)
+    made, one, other = both(model.problem((0.0, 5.0)), known, 5.0)
     np.testing.assert_allclose(one, other, atol=1e-8)
     assert made.freedom.degrees == 1 and made.freedom.redundant == () and made.tags[0] == "closed chain"
 
@@ -127,7 +100,7 @@ def slider_crank(angular_velocity=None):
 def test_redundant_slider_crank():
     model, _, pin, end = slider_crank(angular_velocity=8.0)
     model.distance("slider", end, "crank", pin)
-    made, one, other = both(model, redundant_slider_crank(), 2.0)
+    made, one, other = both(model.problem((0.0, 2.0)), redundant_slider_crank(), 2.0)
     np.testing.assert_allclose(one, other, atol=1e-8)
     assert "redundant" in made.tags and made.freedom.degrees == 1
     assert [set(group) for group in made.freedom.redundant] == [
@@ -147,54 +120,13 @@ def test_driven_slider_crank(motion):
         }
     )
     model.drive(hinge, lambda t: 4.0 * t + 0.3 * np.sin(3.0 * t), **derivatives)
-    made, one, other = both(model, driven_slider_crank(), 2.0, conserved=False)
+    made, one, other = both(model.problem((0.0, 2.0)), driven_slider_crank(), 2.0, conserved=False)
     np.testing.assert_allclose(one, other, atol=1e-8)
     assert made.freedom.degrees == 0 and "driven" in made.tags
 
 
 def test_andrews():
-    known = andrews()
-    beta, theta, gamma, phi, delta, omega, epsilon = known.q0
-    A, B, C = np.array([XA, YA]), np.array([XB, YB]), np.array([XC, YC])
-
-    def turned(angle, x, y):
-        return np.array([math.cos(angle) * x - math.sin(angle) * y, math.sin(angle) * x + math.cos(angle) * y])
-
-    pin = turned(beta, RR, 0.0)
-    shared = pin + turned(beta + theta, -D, 0.0)
-    fourth, sixth = A + turned(delta, ZT, 0.0), A + turned(epsilon, 0.0, -U)
-    model = PlanarModel(gravity=(0.0, 0.0), name="squeezer")
-    centres = (
-        (turned(beta, RA, 0.0), beta),
-        (pin + turned(beta + theta, -DA, 0.0), beta + theta),
-        (B + turned(gamma, SB, -SA), gamma),
-        (fourth + turned(phi + delta, 0.0, -EE), phi + delta),
-        (A + turned(delta, TA, TB), delta),
-        (sixth + turned(omega + epsilon, FF, 0.0), omega + epsilon),
-        (A + turned(epsilon, -UB, -UA), epsilon),
-    )
-    masses, inertias = known.parameters["masses"], known.parameters["inertias"]
-    k = [
-        model.body(f"K{i + 1}", mass=masses[i], inertia=inertias[i], position=place, angle=angle)
-        for i, (place, angle) in enumerate(centres)
-    ]
-    ground = model.ground
-    for one, other, at in (
-        (ground, k[0], (0.0, 0.0)),
-        (k[0], k[1], pin),
-        (k[1], k[2], shared),
-        (k[1], k[3], shared),
-        (k[1], k[5], shared),
-        (k[2], ground, B),
-        (k[3], k[4], fourth),
-        (k[4], ground, A),
-        (k[5], k[6], sixth),
-        (k[6], ground, A),
-    ):
-        model.revolute(one, other, at=at)
-    model.spring(ground, C, k[2], B + turned(gamma, SD, -SC), stiffness=SPRING, length=LENGTH)
-    model.torque(k[0], TORQUE)
-    made, one, other = both(model, known, 0.03, conserved=False, energy=False)
+    made, one, other = both(squeezer(), andrews(), 0.03, conserved=False, energy=False)
     np.testing.assert_allclose(one[2], other[0], atol=1e-7)
     np.testing.assert_allclose(one[8], other[2], atol=1e-8)
     np.testing.assert_allclose(one[14], other[4], atol=1e-8)
@@ -217,7 +149,7 @@ def test_sundials_slider_crank():
     model.prismatic("ground", slider, at=end, axis=(2.0, 0.0))
     model.spring(crank, 0.5 * pin, rod, centre, stiffness=1.0, damping=1.0, length=1.0)
     model.force(rod, 2.0 * end - pin, (1.0, 0.0))
-    _, one, other = both(model, known, 5.0, conserved=False, energy=False)
+    _, one, other = both(model.problem((0.0, 5.0)), known, 5.0, conserved=False, energy=False)
     np.testing.assert_allclose(one[[2, 6, 5]], other, atol=1e-8)
 
 
@@ -237,7 +169,7 @@ def test_bricard():
     bars.append(model.ground)
     for k in range(6):
         model.revolute(bars[k], bars[k + 1], at=C[k], axis=axes[k])
-    made, one, other = both(model, bricard(), 1.0)
+    made, one, other = both(model.problem((0.0, 1.0)), bricard(), 1.0)
     np.testing.assert_allclose(one.reshape(5, 7, -1)[:, :3], other.reshape(5, 12, -1)[:, :3], atol=1e-8)
     assert made.freedom.degrees == 1 and len(made.freedom.redundant[0]) == 6
 
@@ -268,7 +200,7 @@ def test_spatial_four_bar():
     model.spherical("crank", "coupler", at=(0.3, 0.0, 0.0))
     model.spherical("coupler", "rocker", at=np.add(D, (0.0, 0.0, 0.7)))
     model.revolute("rocker", "ground", at=D, axis=(0.0, 1.0, 0.0))
-    made, one, other = both(model, known, 2.0)
+    made, one, other = both(model.problem((0.0, 2.0)), known, 2.0)
     np.testing.assert_allclose(one, other, atol=1e-8)
     assert made.freedom.degrees == 2
 
@@ -283,7 +215,7 @@ def test_spatial_slider_crank():
     model.spherical("crank", "rod", at=np.add(A, (0.0, 0.0, 0.08)))
     model.universal("rod", "slider", at=end, axes=(R[:, 1], x))
     model.prismatic("ground", "slider", at=(0.0, 0.0, 0.0), axis=x)
-    made, one, other = both(model, known, 5.0)
+    made, one, other = both(model.problem((0.0, 5.0)), known, 5.0)
     np.testing.assert_allclose(one, other, atol=1e-8)
     assert made.freedom.degrees == 1
 
@@ -306,7 +238,7 @@ def test_governor():
         along = np.array([side * math.cos(math.radians(30.0)), 0.0, -math.sin(math.radians(30.0))])
         model.revolute("shaft", name, at=hinge, axis=y)
         model.spring(name, hinge + 0.5 * along, "slider", end, stiffness=8e5, damping=4e4, length=0.5)
-    made, one, other = both(model, known, 0.02, tolerance=1e-10, conserved=False)
+    made, one, other = both(model.problem((0.0, 0.02)), known, 0.02, tolerance=1e-10, conserved=False)
     np.testing.assert_allclose(one, other, atol=1e-8)
     assert made.freedom.degrees == 4
 
@@ -315,5 +247,5 @@ def test_heavy_top():
     known = heavy_top()
     model = spatial_as_given(known, [15.0], [(0.234375, 0.46875, 0.234375)])
     model.spherical("ground", "top", at=(0.0, 0.0, 0.0))
-    _, one, other = both(model, known, 0.2)
+    _, one, other = both(model.problem((0.0, 0.2)), known, 0.2)
     np.testing.assert_allclose(one, other, atol=1e-8)

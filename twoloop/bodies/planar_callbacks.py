@@ -2,6 +2,7 @@
 
 import math
 
+from twoloop.bodies.function_rows import fill_entries, fill_nonholonomic, fill_nonholonomic_gamma
 from twoloop.bodies.parameter_layout import (
     ACROSS,
     ANGLE,
@@ -130,9 +131,7 @@ def fill_jacobian(q, p, made, Cq):
         if kind == RATE:
             continue
         if kind == WRITTEN:
-            first_result, columns = int(p[k + MOTION]) + 3, int(p[k + MORE])
-            for m in range(int(p[columns])):
-                Cq[row, int(p[columns + 1 + m])] = made[first_result + m]
+            fill_entries(p, k, made, int(p[k + MOTION]) + 3, Cq[row])
             continue
         if kind == ANGLE:
             turn(Cq[row], j, 1.0)
@@ -258,26 +257,6 @@ def fill_force(q, v, p, made, Q):
             x, y = pull * x, pull * y
         add(Q, i, x, y, adx, ady)
         add(Q, j, -x, -y, bdx, bdy)
-
-
-@helper
-def fill_nonholonomic(p, made, A):
-    """A."""
-    first, n = int(p[p.size - HEAD + JOINTS]), int(p[p.size - HEAD + N_JOINTS])
-    for k in range(first, first + JOINT_WIDTH * n, JOINT_WIDTH):
-        if int(p[k + KIND]) == RATE:
-            row, entries, columns = int(p[k + ROW]), int(p[k + MOTION]) + 1, int(p[k + MORE])
-            for m in range(int(p[columns])):
-                A[row, int(p[columns + 1 + m])] = made[entries + m]
-
-
-@helper
-def fill_nonholonomic_gamma(p, made, Qa):
-    """The right-hand side of A a = Q_a."""
-    first, n = int(p[p.size - HEAD + JOINTS]), int(p[p.size - HEAD + N_JOINTS])
-    for k in range(first, first + JOINT_WIDTH * n, JOINT_WIDTH):
-        if int(p[k + KIND]) == RATE:
-            Qa[int(p[k + ROW])] = made[int(p[k + MOTION])]
 
 
 @callback("mass")

@@ -1,0 +1,30 @@
+"""Rows that are functions of coordinates, in a plane and in space: read from the results of their program."""
+
+from twoloop.bodies.parameter_layout import HEAD, JOINT_WIDTH, JOINTS, KIND, MORE, MOTION, N_JOINTS, RATE, ROW
+from twoloop.kernels.compile.caches import helper
+
+
+@helper
+def fill_entries(p, k, made, first_result, entries):
+    """Derivatives by the coordinates that the row of a joint at place k depends on, into entries (n_q,)."""
+    columns = int(p[k + MORE])
+    for m in range(int(p[columns])):
+        entries[int(p[columns + 1 + m])] = made[first_result + m]
+
+
+@helper
+def fill_nonholonomic(p, made, A):
+    """A."""
+    first, n = int(p[p.size - HEAD + JOINTS]), int(p[p.size - HEAD + N_JOINTS])
+    for k in range(first, first + JOINT_WIDTH * n, JOINT_WIDTH):
+        if int(p[k + KIND]) == RATE:
+            fill_entries(p, k, made, int(p[k + MOTION]) + 1, A[int(p[k + ROW])])
+
+
+@helper
+def fill_nonholonomic_gamma(p, made, Qa):
+    """The right-hand side of A a = Q_a."""
+    first, n = int(p[p.size - HEAD + JOINTS]), int(p[p.size - HEAD + N_JOINTS])
+    for k in range(first, first + JOINT_WIDTH * n, JOINT_WIDTH):
+        if int(p[k + KIND]) == RATE:
+            Qa[int(p[k + ROW])] = made[int(p[k + MOTION])]
