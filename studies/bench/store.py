@@ -157,7 +157,7 @@ class Output:
 
     def save_findings(self, findings: Mapping[str, Any]) -> None:
         """Write NAME.json; what is not finite becomes null."""
-        told = {"timed": WHOLE_CALL, "processor": processor()} if self.call.study in TIMED else {}
+        told = {"timed": WHOLE_CALL} if self.call.study in TIMED else {}
         text = json.dumps(plain({**findings, **told}), indent=1, allow_nan=False, ensure_ascii=False)
         self.write(f"{self.call.study}.json", text + "\n")
 

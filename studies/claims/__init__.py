@@ -14,7 +14,7 @@ from studies.bench.index import write_index
 from studies.bench.render import render
 from studies.bench.store import Output
 from studies.claims import beam_judges, experiments, judges
-from studies.claims.rows import STUDIES, Rows, read
+from studies.claims.rows import STUDIES, Rows, processors, read
 from studies.claims.verdicts import Claim, Judgement, Verdict, load
 
 ERRATA = tomllib.loads(Path(__file__).with_name("errata.toml").read_text())
@@ -79,6 +79,7 @@ def report(output: Output, rows: Rows, line: str) -> dict[str, Any]:
     """Write findings, rows and both reports; the findings."""
     pairs = judged(rows)
     findings, table = findings_of(pairs) | {"experiments": dict(rows.experiments)}, csv_rows(pairs)
+    findings["processors"] = processors(output.path)
     output.save_findings(findings)
     output.save_rows(table, line)
     more = {"stamp": line, "quick": output.call.quick}

@@ -40,6 +40,17 @@ def read(folder: Path) -> dict[str, pd.DataFrame]:
     return found
 
 
+def processors(folder: Path) -> dict[str, list[str]]:
+    """Processors by which the rows in the folder were measured, and of which studies, by the first lines of these."""
+    found: dict[str, list[str]] = {}
+    for name in STUDIES:
+        path = folder / f"{name}.csv"
+        # behind kind, command, date and commit: processor, cores
+        for machine in read_rows(path)[1].split("; ")[4:5] if path.is_file() else ():
+            found.setdefault(machine.rpartition(", ")[0], []).append(name)
+    return found
+
+
 def _one_a_run(name: str, table: pd.DataFrame) -> pd.DataFrame:
     if name == "beam" and "error_tip" in table:  # the error by which the beams are judged
         table["error_q"] = table["error_tip"]

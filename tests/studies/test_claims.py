@@ -9,7 +9,7 @@ import pytest
 from studies import claims
 from studies.bench.solvers import IRK, NEWMARK, QUARTER
 from studies.claims import beam_judges, experiments, judge_of, judged, judges
-from studies.claims.rows import STUDIES, Rows, read
+from studies.claims.rows import STUDIES, Rows, processors, read
 from studies.claims.verdicts import Claim, Judgement, Verdict, load
 from studies.table3.causes import PAPER_IRK, PAPER_NEWMARK, TOLERANCES
 from tests.studies.claim_rows import EXPERIMENTS, MADE
@@ -288,3 +288,10 @@ def test_report_is_written_again_from_rows(folder):
 def test_experiments_are_what_the_judges_read(monkeypatch):
     """Their names, from a quick run."""
     assert set(experiments.make(True)) == set(EXPERIMENTS)
+
+
+def test_the_processors_are_those_of_the_rows_and_not_of_who_draws_them(tmp_path):
+    for name, machine in (("table3", "Z80"), ("beam", "6502"), ("energy", "Z80")):
+        first = f"# full {name}; `python -m studies.{name}`; 2026-01-01; commit abc; {machine}, 2 cores; Linux"
+        (tmp_path / f"{name}.csv").write_text(f"{first}\nsolver\na\n")
+    assert processors(tmp_path) == {"Z80": ["table3", "energy"], "6502": ["beam"]}

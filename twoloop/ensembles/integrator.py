@@ -142,9 +142,9 @@ class Integrator:
     def step(self, dt: float, inputs: Mapping[int, float] | ArrayLike | None = None) -> SampledState:
         """Go on by a sample, with inputs that stay as they are until its end.
 
-        What a step does beside integrating takes some microseconds: nothing is checked anew. Accelerations jump with
-        the inputs, and the method begins anew there; error control is that of `run`. As in a run, no step is longer
-        than a hundredth of the time since the start, so that the first samples are divided into many.
+        Nothing is checked anew. Accelerations jump with the inputs, and the method begins anew there; error control is
+        that of `run`. As in a run, no step is longer than a hundredth of the time since the start, so that the first
+        samples are divided into many.
 
         Parameters
         ----------
