@@ -15,6 +15,7 @@ from twoloop.kernels.control.controller import (
     factor_of,
     remember,
 )
+from twoloop.kernels.control.sudden import sudden_time
 from twoloop.kernels.data.common import (
     AUGMENTED,
     BY_GENERAL,
@@ -51,6 +52,7 @@ from twoloop.kernels.data.common import (
     VECTOR,
     WIDEST_GAP,
     WORK,
+    compiled,
     f8,
     i8,
     kernel,
@@ -92,9 +94,10 @@ LOST = 0.001  # ... and which is given up there for steps below this share of th
 FADING = 0.98  # of the longest step, with each accepted one
 RARELY = 16  # accepted steps from one look at the partition to the next where steps do without it
 FEW = 32  # degrees of freedom; where they are k times as many, a partition is looked at every k + 1 steps: T is full
-SUDDEN = 10.0  # an error that is so large was not foreseen: the force jumps, or bends, within the step
+UNFORESEEN = 10.0  # an error that is so large was not foreseen: the force jumps, or bends, within the step
 REFUSED = 0.95  # of a refused step is what the next one is at most
 NEARER = 0.25  # of the smallest sine at the start of a step: one that ends nearer to a singular position ends half-way
+NEARLY = 0.01  # of the spacing of times ahead: before a sudden change by that is at it
 NEAR = 4.0  # times that differ by less than so many spacings of floating-point numbers are one
 
 # places in `control`, constant during a run, after the rule of controller.py
@@ -113,9 +116,10 @@ NEAR = 4.0  # times that differ by less than so many spacings of floating-point 
     GIVES_WAY,  # 1: stop with HAS_TO_GIVE_WAY at a value that is not finite, as another method goes on ...
     PROVISIONAL,  # ... and after this number of steps, if the next is no longer than steps of others may be
     DRIVEN,  # 1: C_t or b may jump
-    ROUGH,  # by how much an error may be larger than its estimate where a force jumps, see SUDDEN
+    ROUGH,  # by how much an error may be larger than its estimate where a force jumps, see UNFORESEEN
+    SPACING,  # s, of times at which to look ahead for sudden changes; 0: there are none
     N_CONTROL,
-) = range(N_RULE, N_RULE + 16)
+) = range(N_RULE, N_RULE + 17)
 
 # places in a row of `out_steps`: the size of an accepted step, and the counters so far; JACOBIANS is 0 after an
 # explicit step of a method that switches
@@ -139,8 +143,10 @@ H, ERRORS, FAILURES, PARTITIONS, JACOBIANS, N_STEP_COLUMNS = range(6)
     LEAPS,  # 1: the next step is that over it, and new_state its end
     ROUGH_TO,  # where the last step ended that was refused for a sudden error
     PIVOT_HERE,  # the smallest pivot at the end of the last step, of the static form
+    LOOKED_TO,  # up to where changes with time were looked for
+    SUDDEN,  # where the next one is that is sudden
     N_CLOCK,
-) = range(N_PAST, N_PAST + 17)
+) = range(N_PAST, N_PAST + 19)
 
 
 @kernel(i8(KIT, WORK, f8, VECTOR))
@@ -212,6 +218,17 @@ def _off_grid(control, t, h, left, leaps):
     if size > control[MAX_STEP]:
         size = representable(t, size - np.spacing(abs(t + size)))
     return size, reaches
+
+
+@compiled
+def _up_to_sudden(f, w, tolerances, clock, spacing, t, size, last, q, v):
+    """The size of a step that does not pass over a sudden change with time."""
+    while clock[SUDDEN] <= t + NEARLY * spacing or clock[SUDDEN] == np.inf:
+        begin = max(t, clock[LOOKED_TO])
+        if begin >= min(t + size, last):
+            return size
+        clock[SUDDEN], clock[LOOKED_TO] = sudden_time(f, w, tolerances, begin, spacing, last, q, v)
+    return min(size, representable(t, clock[SUDDEN] - t))
 
 
 @merged
@@ -428,7 +445,12 @@ def advance(
         lands = reaches and goal == target
         if reaches:
             size = goal - t
-        elif size <= max(NEAR * np.spacing(abs(t)), control[SHORTEST]):
+        if size > control[SPACING] > 0.0 or t < clock[SUDDEN] < t + size:
+            whole, last = size, outputs[outputs.size - 1]
+            size = _up_to_sudden(f, w, tolerances, clock, control[SPACING], t, whole, last, state[:n], state[n : 2 * n])
+            if size < whole:
+                reaches, lands, shortened = False, False, True
+        if not reaches and size <= max(NEAR * np.spacing(abs(t)), control[SHORTEST]):
             return STEP_TOO_SMALL
         code, error, factor = _attempt(
             f, w, options, memory, tolerances, control, clock, t, size, leaps, state, new_state
@@ -456,7 +478,7 @@ def advance(
             if fixed:
                 retried = t
             continue
-        if error > SUDDEN and not accepted:
+        if error > UNFORESEEN and not accepted:
             clock[ROUGH_TO] = t + size
         error *= strict
         if factor == 0.0:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from twoloop.kernels.algebra.elimination import index_size, values_size
 from twoloop.kernels.algebra.lapack import N_ROUTINES
+from twoloop.kernels.control.sudden import N_CHANGES
 from twoloop.kernels.data.common import N_COUNTERS, N_NOTES, WORK, Work
 from twoloop.kernels.evaluation.kinks import PARTS
 
@@ -185,6 +186,7 @@ def _layout(
         "mass_pattern": (n_q, n_q) if augmented else (0, 0),
         "Gamma_tried": (2, n_rows),
         "rates": (PARTS + 1, n_rows),
+        "changes": (N_CHANGES, n_q + n_rows),
         **dict.fromkeys(("Q", "x", "y"), (n_q,)),
         "C": (n_c,),
         **dict.fromkeys(("Rate", "Gamma", "g", "lam"), (n_rows,)),

@@ -14,7 +14,9 @@ from twoloop.checks.consistency import (
 )
 from twoloop.checks.rank import SHOWN, equations_in_words, in_words
 from twoloop.checks.sparse_rows import SparseRows, norms
+from twoloop.generate.time_dependence import may_be_sudden
 from twoloop.kernels.compile.linking import direct
+from twoloop.kernels.control.sudden import PLACES
 from twoloop.kernels.data import common
 from twoloop.kernels.evaluation.tasks import SOLVE
 from twoloop.kernels.layout import copy_of
@@ -94,7 +96,8 @@ class Run:
         self.control_by(plan)
         self.substituted = False  # whether another plan has taken over, for good
         self.clock[advance.JUMP_FROM] = self.clock[advance.JUMP_TO] = np.inf
-        self.clock[advance.ROUGH_TO] = -np.inf
+        self.clock[advance.ROUGH_TO] = self.clock[advance.LOOKED_TO] = self.clock[advance.SUDDEN] = -np.inf
+        self.looks_ahead = step_size is None and may_be_sudden(system)
         self.crossings: list[list[tuple[float, Array]]] = []  # states before and behind steps across singular positions
         self.lengths: list[float] = []  # of steps across such a position that are still to be tried
         self.jumps: list[float] = []  # times at which velocities changed as by an impulse
@@ -273,6 +276,7 @@ class Run:
     def limit_steps(self) -> None:
         """Let no step that does not look at the equations between its ends pass over a hundredth of the run."""
         self.control[self.a.MAX_STEP] = self.max_step if self.plan.looks_within else min(self.max_step, self.gap)
+        self.control[self.a.SPACING] = self.gap / PLACES if self.looks_ahead else 0.0
 
     def first_step(self, span: float, state: Array) -> float:
         """A share of the time in which velocities and accelerations of a state change the coordinates as a whole."""

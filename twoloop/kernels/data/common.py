@@ -82,6 +82,7 @@ class Work(NamedTuple):
     places: Any  # where the entries of each row of G begin (n_c + n_a + 1), counted in what follows: their columns
     Gamma_tried: Any  # (2, n_c + n_a) Gamma by differences over a double length, and with the length tried before
     rates: Any  # (13, n_c + n_a) C_t and b at times within a step, see kinks.py
+    changes: Any  # (8, n_q + n_c + n_a) of forces, C_t and b with time, see sudden.py
     Q: Any  # (n_q) force
     x: Any  # (n_q) scratch
     y: Any  # (n_q) scratch
@@ -132,7 +133,8 @@ _INTEGER_FIELDS = {
     *("index_a", "places", "order", "row_order", "counters", "lapack"),
 }
 _MATRIX_FIELDS = {
-    *("M", "L", "G", "S", "W", "A", "MT", "D", "Gx", "G_of_S", "pattern", "mass_pattern", "Gamma_tried", "rates")
+    *("M", "L", "G", "S", "W", "A", "MT", "D", "Gx", "G_of_S", "pattern", "mass_pattern", "Gamma_tried", "rates"),
+    "changes",
 }
 WORK = Reference(
     "Work",

@@ -1,0 +1,54 @@
+"""Whether forces, C_t or b may change suddenly with time, by what their callbacks are traced to."""
+
+from typing import Any, NamedTuple
+
+from twoloop.generate.families import Evaluator, Family, of_family
+from twoloop.generate.traced_equations import Equations
+from twoloop.generate.traced_values import unchecked
+from twoloop.generate.tracing import Form, Graph, Untraceable
+from twoloop.kernels.evaluation.operations import COSINE, PRODUCT, SINE, SUM
+from twoloop.problem.system import ConstrainedSystem
+
+SMOOTH = (PRODUCT, SUM, SINE, COSINE)  # polynomials and vibrations: nothing happens in a short time alone
+LARGEST = 300  # coordinates: of more, to trace them takes longer than to look at them
+BY_TIME = 1  # the bit of t, the first input of a graph
+
+
+class TimeDependence(NamedTuple):
+    """What is known of a family of systems."""
+
+    is_sudden: bool
+    kinds: frozenset[str]  # of callbacks that ran on symbols
+
+    def of(self, system: ConstrainedSystem, evaluate: Evaluator) -> "TimeDependence":
+        """That of one of the systems: the same."""
+        return self
+
+
+def may_be_sudden(system: ConstrainedSystem) -> bool:
+    """Whether a force, C_t or b may act for a short time; so may what cannot be traced."""
+    if system.n_q > LARGEST:
+        return True
+    try:
+        known: TimeDependence = of_family(system, "time dependence", _traced(system), unchecked)
+    except Untraceable:
+        return True
+    return known.is_sudden
+
+
+def _traced(system: ConstrainedSystem) -> Any:
+    def make(family: Family) -> TimeDependence:
+        equations = Equations(system, family.parameters)
+        kinds = ("force", "constraint_rate", "nonholonomic_rate")
+        forms = [form for kind in kinds if kind in system.given for form in equations.of(kind).ravel()]
+        return TimeDependence(_is_sudden(equations.graph, forms), frozenset(equations.graph.traced))
+
+    return make
+
+
+def _is_sudden(graph: Graph, forms: list[Form]) -> bool:
+    for i in graph.needed_by(forms):
+        operation = graph.operations[i]
+        if operation is not None and operation[0] not in SMOOTH and graph.inputs_of[i] & BY_TIME:
+            return True
+    return False
