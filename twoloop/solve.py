@@ -95,8 +95,9 @@ def solve_dae(
         First step to try, s. None: chosen from the velocities and accelerations at the start.
     max_step : float
         Largest step, s. Methods that do not look at the equations between the ends and stages of their steps, all but
-        "Taylor", take none that is longer than a hundredth of the run in any case. A force that acts for a shorter time
-        than `result.widest_gap` may be passed over unseen: give its duration.
+        "Taylor", take none that is longer than a hundredth of the run in any case. Forces and drives are looked at with
+        time every two-thousandth of the run, and steps end where they change suddenly; what acts for a shorter time, or
+        on a shorter way, may be passed over unseen: give its duration.
     max_steps : int, optional
         Largest number of accepted steps. None: no limit, but a run whose steps have become a thousand times shorter
         than before, so that the rest would take more than ten million of them, ends with the status STAGNATED.

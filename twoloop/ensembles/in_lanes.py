@@ -11,12 +11,14 @@ from twoloop.ensembles.lane_methods import LaneMethod
 from twoloop.ensembles.starts import Starts, generic_parameters, kit_to_write, over_rounding, system_of
 from twoloop.generate.choices import Choice
 from twoloop.generate.on_arrays import OnArrays
+from twoloop.generate.time_dependence import may_be_sudden
 from twoloop.problem.system import ConstrainedSystem
 
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
-PLACES = 100  # of a run, at least as many at which the equations are looked at
+PLACES = 100  # of a run, at least as many at which the equations are looked at ...
+OF_SUDDEN = 20  # ... times as many where a force may act for a short time: lanes do not look ahead
 SMALLEST, LARGEST = 128, 4096  # runs of a block; numbers of all of a block's runs are made at once
 FOR_EACH = 3  # blocks for each of several threads, so that all end at about the same time
 AGREES = 1e-7  # of the terms of an equation: what rounding may leave of it at the end of a run
@@ -42,6 +44,7 @@ class LaneRuns:
 
         self.system, self.starts, self.method = system, starts, method
         generic, varying = generic_parameters(starts.parameters)
+        self.places = PLACES * (OF_SUDDEN if may_be_sudden(system) else 1)
         choice = Choice.at(system_of(system, starts, 0), starts.t0, starts.q[0])
         kind = ("lanes", method.series, choice, tuple(varying))  # of which the latest is kept
         make = partial(OwnLanes, system, choice, generic, varying, method.series)
@@ -114,7 +117,7 @@ class LaneRuns:
         kit = lane_room.LaneKit(self.own.functions, method.step())
         redundant = bool(code.equations.redundant.conditions)
         settings = np.array([n, n_rows, method.order, redundant, code.n_numbers], dtype=np.int64)
-        control = np.concatenate([[starts.t0, t1, (t1 - starts.t0) / PLACES, rtol], atol, code.numbers.values])
+        control = np.concatenate([[starts.t0, t1, (t1 - starts.t0) / self.places, rtol], atol, code.numbers.values])
         given = np.ascontiguousarray(starts.q[which]), np.ascontiguousarray(starts.v[which])
         arrays = times, numbers, *given, *out, status, n_steps, room
         lane_runs.advance_lanes(kit, settings, control, method.options, *arrays)

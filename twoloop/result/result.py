@@ -63,7 +63,8 @@ class Result(Record):
     widest_gap : float or None
         The longest time of the run within which the equations were perhaps not looked at, s: what lasts no longer may
         have been missed. It is the longest distance of the places where "Taylor" looks, or the longest step of other
-        methods; at most a hundredth of the run unless the steps are constant. None where a foreign solver ran.
+        methods; at most a hundredth of the run unless the steps are constant. Forces and drives were besides looked at
+        with time alone, every two-thousandth of the run. None where a foreign solver ran.
     system : ConstrainedSystem or None
         The system: `reactions` and `plot` evaluate its rows, and its `Problem` told it names, energy and drawing. None
         where a foreign solver ran, a file was read without the system, or the result comes from another process, and

@@ -97,7 +97,7 @@ class Run:
         self.substituted = False  # whether another plan has taken over, for good
         self.clock[advance.JUMP_FROM] = self.clock[advance.JUMP_TO] = np.inf
         self.clock[advance.ROUGH_TO] = self.clock[advance.LOOKED_TO] = self.clock[advance.SUDDEN] = -np.inf
-        self.looks_ahead = step_size is None and may_be_sudden(system)
+        self.looks_ahead = step_size is None and may_be_sudden(system, plan.traced)
         self.crossings: list[list[tuple[float, Array]]] = []  # states before and behind steps across singular positions
         self.lengths: list[float] = []  # of steps across such a position that are still to be tried
         self.jumps: list[float] = []  # times at which velocities changed as by an impulse

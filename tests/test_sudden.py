@@ -1,0 +1,113 @@
+"""Forces that act for a thousandth of the run: steps end where something changes suddenly with time."""
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from twoloop import ConstrainedSystem, ensemble, solve_dae
+from twoloop.generate.time_dependence import may_be_sudden
+from twoloop.mechanisms import driven_slider_crank, four_bar
+
+T_END, SIZE, WIDTH = 3.0, 200.0, 1e-3
+PLACES = np.random.default_rng(12).uniform(0.4, 2.4, 12)
+START = np.array([0.0, -1.0]), np.array([0.5, 0.0])
+
+
+def gust(t, q, v, p):
+    return np.array([SIZE * np.exp(-(((t - p[0]) / p[1]) ** 2)), -9.81])
+
+
+def switched(t, q, v, p):
+    return np.array([SIZE if abs(t - p[0]) < p[1] else 0.0, -9.81])
+
+
+def vibrating(t, q, v, p):
+    return np.array([SIZE * np.sin(30.0 * t + p[0]) + p[1] * t * t, -9.81])
+
+
+def steady(t, q, v, p):
+    return np.array([-p[1] * v[0], -9.81])
+
+
+def pendulum(force, at=1.5, width=WIDTH):
+    return ConstrainedSystem.from_python(
+        n_q=2,
+        n_c=1,
+        mass=lambda t, q, p: np.eye(2),
+        force=force,
+        constraint=lambda t, q, p: np.array([0.5 * (q[0] * q[0] + q[1] * q[1] - 1.0)]),
+        jacobian=lambda t, q, p: np.array([[q[0], q[1]]]),
+        gamma=lambda t, q, v, p: np.array([-(v[0] * v[0] + v[1] * v[1])]),
+        parameters=[at, width],
+        compile=True,
+    )
+
+
+SYSTEMS = {"gust": pendulum(gust), "switched": pendulum(switched)}
+
+
+def end(force, at):
+    """(x, y) at T_END by the angle, in steps that cannot pass over the gust."""
+
+    def rate(t, state):
+        return state[1], np.cos(state[0]) * force(t, None, None, (at, WIDTH))[0] - 9.81 * np.sin(state[0])
+
+    state = np.array([0.0, 0.5])
+    for t0, t1 in ((0.0, at - 8 * WIDTH), (at - 8 * WIDTH, at + 8 * WIDTH), (at + 8 * WIDTH, T_END)):
+        longest = WIDTH / 20.0 if force is switched and t1 - t0 < 0.1 else max(WIDTH / 2.0, (t1 - t0) / 40.0)
+        made = solve_ivp(rate, (t0, t1), state, method="DOP853", rtol=1e-11, atol=1e-11, max_step=longest)
+        state = made.y[:, -1]
+    return np.array([np.sin(state[0]), -np.cos(state[0])])
+
+
+@pytest.mark.parametrize("options", [{}, {"compiled": False}, {"method": "Adams"}, {"method": "RadauIIA5"}], ids=str)
+def test_no_gust_of_a_thousandth_of_the_run_is_passed_over(options):
+    for at in PLACES:
+        system = SYSTEMS["gust"].with_parameters([at, WIDTH])
+        result = solve_dae(system, (0.0, T_END), *START, rtol=1e-8, atol=1e-8, **options)
+        assert result.success
+        assert np.abs(result.q[:, -1] - end(gust, at)).max() < 1e-5
+
+
+@pytest.mark.parametrize("method", ["auto", "TRBDF2"])
+def test_nor_is_a_force_that_is_switched_on_for_that_time(method):
+    for at in PLACES[:4]:
+        system = SYSTEMS["switched"].with_parameters([at, WIDTH])
+        result = solve_dae(system, (0.0, T_END), *START, method=method, rtol=1e-6, atol=1e-6)
+        assert result.success
+        assert np.abs(result.q[:, -1] - end(switched, at)).max() < 1e-3
+
+
+def test_nor_in_lanes():
+    runs = ensemble(
+        SYSTEMS["gust"], (0.0, T_END), *START, parameters=[[at, WIDTH] for at in PLACES], rtol=1e-8, atol=1e-8
+    )
+    assert runs.success.all()
+    for q, at in zip(runs.q[:, :, -1], PLACES, strict=True):
+        assert np.abs(q - end(gust, at)).max() < 1e-5
+
+
+def test_what_may_act_for_a_short_time():
+    assert may_be_sudden(SYSTEMS["gust"]) and may_be_sudden(SYSTEMS["switched"])
+    assert not may_be_sudden(pendulum(vibrating)) and not may_be_sudden(pendulum(steady))
+    assert not may_be_sudden(four_bar().system) and not may_be_sudden(driven_slider_crank().system)
+
+
+def test_forces_are_not_called_beyond_the_end_of_a_run():
+    latest = []
+
+    def force(t, q, v):
+        latest.append(t)
+        return np.array([1.0 if t > 0.5 else 0.0, -9.81])
+
+    system = ConstrainedSystem.from_python(
+        n_q=2,
+        n_c=1,
+        mass=lambda t, q: np.eye(2),
+        force=force,
+        constraint=lambda t, q: np.array([0.5 * (q @ q - 1.0)]),
+        jacobian=lambda t, q: q[None, :],
+        gamma=lambda t, q, v: np.array([-(v @ v)]),
+    )
+    result = solve_dae(system, (0.0, 1.0), *START, t_eval=[0.3, 1.0], method="DOP853")
+    assert result.success and max(latest) <= 1.0
