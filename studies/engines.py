@@ -20,13 +20,12 @@ from studies.bench.engine_runs import INSTANTS, LIMIT, Loop, errors, gate, timed
 from studies.bench.render import number
 from studies.bench.store import Output, Row
 from studies.bench.study import Study
+from twoloop.audit.step_audit import LOST, order_and_floor
 
 GATE, RUN, OURS = "gate", "run", "twoloop"  # groups of rows; the engine that is none
 N_STEPS = (100, 200, 500, 1500, 5000, 15_000, 50_000, 150_000)  # multiples of INSTANTS
 TOLERANCES = (1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10, 1e-11)
 ERRORS = (1e-2, 1e-3, 1e-4, 1e-6)
-LOST = 0.1  # an error of positions from which on a motion is another one
-FLAT = 1.5  # factor by which errors of two steps differ at most where they no longer fall
 MODULES = {"mujoco": mujoco, "drake": drake, "pinocchio": pinocchio, "exudyn_bodies": exudyn_bodies}
 NAMES = {"mujoco": "MuJoCo", "drake": "Drake", "pinocchio": "Pinocchio", "exudyn_bodies": "Exudyn", OURS: "twoloop"}
 PACKAGES = {"mujoco": "mujoco", "drake": "drake", "pinocchio": "pin", "exudyn_bodies": "exudyn"}
@@ -196,22 +195,6 @@ def _ours(loop: Loop, tolerance: float) -> tuple[Callable[[], Motion], Callable[
         return loop.motion(made.q[:, :1], made.v[:, :1], call, made.stats.cpu_time)
 
     return run, again
-
-
-def order_and_floor(h: Any, error: Any, least: float) -> tuple[float | None, float | None]:
-    """Observed order, the median between steps where the error falls, and the error that shorter steps do not lower.
-
-    `least` is what the reference resolves. None: not enough runs to tell, or no floor in sight.
-    """
-    order = np.argsort(-np.asarray(h, dtype=float))
-    h, error = np.asarray(h, dtype=float)[order], np.asarray(error, dtype=float)[order]
-    floor = None
-    if error.size >= 3 and FLAT * error[-1] > error[-3:].max() and 1.0 > error[-1] > 10.0 * least:
-        floor = float(error[-1])
-    kept = (error < LOST) & (error > max(4.0 * (floor or 0.0), 10.0 * least))
-    pairs = kept[:-1] & kept[1:]
-    slopes = (np.diff(np.log(error)) / np.diff(np.log(h)))[pairs] if error.size > 1 else np.zeros(0)
-    return (float(np.median(slopes)) if slopes.size else None), floor
 
 
 def findings_of(rows: pd.DataFrame) -> dict[str, Any]:

@@ -294,21 +294,3 @@ def coordinates(motion: Motion, planar: bool) -> tuple[Array, Array]:
             q[i, k, 3:] = euler_parameters(motion.R[i, k])
             v[i, k, 3:] = euler_rates(q[i, k, 3:], motion.w[i, k])
     return q.reshape(n_t, -1).T, v.reshape(n_t, -1).T
-
-
-def gaps(rigid: Rigid, x: Array, R: Array) -> Array:
-    """Largest distance between points of bodies that joints put together, m, at each instant (n_t,)."""
-    found = np.zeros(len(x))
-    for joint in rigid.model.joints:
-        places = []
-        for body in (joint.a, joint.b):
-            point = point_of(body, joint)
-            ground = body is rigid.model.ground
-            places.append(point[None] if ground else x[:, body.number] + R[:, body.number] @ point)
-        apart = places[1] - places[0]
-        if joint.kind in ("prismatic", "cylindrical"):
-            body, axis = joint.a, joint.axes[0]
-            along = axis[None] if body is rigid.model.ground else R[:, body.number] @ axis
-            apart = apart - np.sum(apart * along, axis=1)[:, None] * along
-        found = np.maximum(found, np.linalg.norm(apart, axis=1))
-    return found

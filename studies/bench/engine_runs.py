@@ -14,7 +14,6 @@ from references.engines.rigid import (
     Prepared,
     Rigid,
     coordinates,
-    gaps,
     largest_moment,
     rigid_of,
     states,
@@ -23,6 +22,7 @@ from references.engines.rigid import (
 from studies.bench.closed_loops import parallelogram, parallelogram_motion
 from studies.bench.store import Array, Row
 from twoloop import ConstraintWarning, solve_dae
+from twoloop.audit.poses import gaps
 from twoloop.bodies.model_problem import ModelProblem
 
 INSTANTS = 50  # beside the start, at which motions are compared
@@ -117,7 +117,7 @@ def gate(loop: Loop, prepared: Prepared) -> str:
         pose = max(np.abs(motion.x[0] - rigid.x).max(), np.abs(motion.R[0] - rigid.R).max())
         if pose > SAME_POSE:
             return f"the pose at the start is off by {pose:.2g}"
-        gap = gaps(rigid, motion.x, motion.R)[-1]
+        gap = gaps(rigid.model, motion.x, motion.R)[-1]
         wrong = _accelerated(loop, motion, span) or (
             f"joints gape by {gap:.2g} m at the start" if gap > SAME_PLACE else ""
         )
@@ -155,7 +155,7 @@ def errors(loop: Loop, motion: Motion) -> Row:
     return {
         "error_q": float(off),
         "error_v": float(np.abs(motion.v - known.v).max() / fastest),
-        "gap": float(gaps(rigid, motion.x, motion.R).max()),
+        "gap": float(gaps(rigid.model, motion.x, motion.R).max()),
         "energy": float(np.abs(energies[0] - energies[1]).max() / kinetic),
     }
 

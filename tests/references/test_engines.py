@@ -7,9 +7,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from references.engines import drake, exudyn_bodies, mujoco, pinocchio
-from references.engines.rigid import coordinates, cut_points, gaps, rigid_of
+from references.engines.rigid import coordinates, cut_points, rigid_of
 from studies.bench.closed_loops import MECHANISMS, bricard, closed_chain, parallelogram, rssr, squeezer, stewart
 from studies.bench.engine_runs import Loop, errors, gate
+from twoloop.audit.poses import gaps
 from twoloop.bodies import PlanarModel, SpatialModel
 
 RIGID = {
@@ -122,7 +123,7 @@ def test_loops_are_cut_between_bodies_that_move_and_close(make):
     for a, on_a, b, on_b in cut_points(rigid):
         assert rigid.model.ground not in (a, b)
         np.testing.assert_allclose(a.in_space(on_a), b.in_space(on_b), atol=1e-12)
-    assert gaps(rigid, rigid.x[None], rigid.R[None])[0] < 1e-12
+    assert gaps(rigid.model, rigid.x[None], rigid.R[None])[0] < 1e-12
     assert problem.freedom.degrees >= 1
 
 

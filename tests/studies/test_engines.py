@@ -7,6 +7,7 @@ import pytest
 from studies import engines
 from studies.bench.closed_loops import four_bar
 from studies.bench.render import render
+from twoloop.audit.step_audit import order_and_floor
 
 STEPS = np.array([1e-2, 3e-3, 1e-3, 3e-4])
 RUNS = {"family": "MuJoCo", "status": "REACHED_END", "message": "", "floor": 1e-11, "gap": 1e-6}
@@ -31,11 +32,11 @@ def said(*parts):
 
 
 def test_order_and_floor():
-    order, floor = engines.order_and_floor(STEPS, 50.0 * STEPS**2, 1e-12)
+    order, floor = order_and_floor(STEPS, 50.0 * STEPS**2, 1e-12)
     assert order == pytest.approx(2.0) and floor is None
-    order, floor = engines.order_and_floor(STEPS, [1e-2, 1.2e-3, 1.1e-3, 1.1e-3], 1e-12)
+    order, floor = order_and_floor(STEPS, [1e-2, 1.2e-3, 1.1e-3, 1.1e-3], 1e-12)
     assert order is None and floor == 1.1e-3
-    assert engines.order_and_floor(STEPS, [1.9, 1.8, 1.9, 1.8], 1e-12) == (None, None)  # the motion is lost
+    assert order_and_floor(STEPS, [1.9, 1.8, 1.9, 1.8], 1e-12) == (None, None)  # the motion is lost
 
 
 def test_what_to_set_and_what_is_wrong_follow_the_rows():

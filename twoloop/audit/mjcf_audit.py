@@ -163,7 +163,7 @@ def audit_mjcf(
         mujoco.set_mju_user_warning(None)
     notes = [problem.note]
     notes += [f"Loops gaped by {gap:.2g} m there: they are closed first."] if gap > MOVED else []
-    others = [name for name in inside.keys() if name != key]
+    others = [name for name in inside.keyframes if name != key]
     notes += [f"Other starts, by --key: {', '.join(others)}."] if others else []
     left_out = tuple(each for each in model.ignored if not each.startswith(("sensor", "keyframe")))
     start = "the pose of the file" if key is None else f"the keyframe {key!r}"

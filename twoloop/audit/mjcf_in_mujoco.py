@@ -99,11 +99,13 @@ class InMuJoCo:
             engine.eq_active0[:] = 0
         kept = np.isin(engine.eq_type, (mujoco.mjtEq.mjEQ_CONNECT, mujoco.mjtEq.mjEQ_WELD))
         engine.eq_active0[~kept] = 0
-        single = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
+        single = int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)
         for k in range(engine.njnt):
-            if engine.body_jntnum[engine.jnt_bodyid[k]] > 1 or engine.jnt_type[k] not in single:
-                engine.jnt_stiffness[k] = 0.0
-                engine.dof_damping[engine.dof_jntid == k] = 0.0
+            own = engine.dof_jntid == k
+            higher = engine.jnt_stiffnesspoly[k].any() or engine.dof_dampingpoly[own].any()
+            if higher or engine.body_jntnum[engine.jnt_bodyid[k]] > 1 or int(engine.jnt_type[k]) not in single:
+                engine.jnt_stiffness[k] = engine.jnt_stiffnesspoly[k] = 0.0
+                engine.dof_damping[own] = engine.dof_dampingpoly[own] = 0.0
         for k in range(engine.ntendon):
             first, n = engine.tendon_adr[k], engine.tendon_num[k]
             sites = n == 2 and (engine.wrap_type[first : first + n] == mujoco.mjtWrap.mjWRAP_SITE).all()
@@ -115,7 +117,8 @@ class InMuJoCo:
             engine.tendon_armature[:] = 0.0
             mujoco.mj_setConst(engine, mujoco.MjData(engine))
 
-    def keys(self) -> list[str]:
+    @property
+    def keyframes(self) -> list[str]:
         """Names of the keyframes; numbers of those without."""
         kind = self.mujoco.mjtObj.mjOBJ_KEY
         return [self.mujoco.mj_id2name(self.engine, kind, k) or str(k) for k in range(self.engine.nkey)]
@@ -131,9 +134,9 @@ class InMuJoCo:
         mujoco, engine = self.mujoco, self.engine
         data = mujoco.MjData(engine)
         if key is not None:
-            if key not in self.keys():
-                raise ValueError(f"the file has no keyframe {key!r}; it has {', '.join(self.keys()) or 'none'}")
-            mujoco.mj_resetDataKeyframe(engine, data, self.keys().index(key))
+            if key not in self.keyframes:
+                raise ValueError(f"the file has no keyframe {key!r}; it has {', '.join(self.keyframes) or 'none'}")
+            mujoco.mj_resetDataKeyframe(engine, data, self.keyframes.index(key))
         gap = None
         for _ in range(100):
             rows, off = self._rows(data)
@@ -204,9 +207,9 @@ class InMuJoCo:
             mujoco.mj_mulM(engine, data, inertia[k], unit[k])
         self._same("masses and inertias", inertia, by_v.T @ system.mass(0.0, q) @ by_v, 0.0)
         least = float(np.abs(inertia).max() + np.abs(still[0]).max())
-        self._same("forces at rest (gravity, springs)", *still, SAME * least)
-        dampers = [np.array(each) for each in zip(*map(damping, range(engine.nv)), strict=True)]
-        self._same("forces of dampers", *dampers, SAME * least)
+        self._same("forces at rest (gravity, springs)", still[0], still[1], SAME * least)
+        dampers = np.array([damping(k) for k in range(engine.nv)])  # (nv, 2, nv)
+        self._same("forces of dampers", dampers[:, 0], dampers[:, 1], SAME * least)
         data.qpos[:], data.qvel[:] = start, 0.0
         rows, _ = self._rows(data)
         q, by_v = self.coordinates(data)
@@ -225,7 +228,7 @@ class InMuJoCo:
             body = self.model.bodies[int(np.flatnonzero(self.bodies == self.engine.dof_bodyid[dof])[0])].name
             raise ValueError(
                 f"MuJoCo's model is not the one that was read: {what} differ by {off.max() / largest:.2g} of the "
-                f"largest, most at a joint of {body!r}. MuJoCo has something there that `from_mjcf` has not, or otherwise"
+                f"largest, most at a joint of {body!r}. MuJoCo has something there that `from_mjcf` has not"
             )
 
     def simulator(self, qpos: Array, qvel: Array, settings: Settings) -> Any:

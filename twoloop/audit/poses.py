@@ -3,9 +3,9 @@
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from twoloop.mechanisms.rotation import rotation_matrix
+from twoloop.mechanisms.rotation import euler_parameters, rotation_matrix
 
 Array = NDArray[np.float64]
 
@@ -25,6 +25,32 @@ def poses(model: Any, q: Array) -> tuple[Array, Array]:
             e = parts[place][3:]
             R[place] = rotation_matrix(e / np.linalg.norm(e))
     return parts[..., :d], R
+
+
+def coordinates(x: ArrayLike, R: ArrayLike) -> Array:
+    """Coordinates of the problem of a `SpatialModel`, of poses that another program has computed.
+
+    Parameters
+    ----------
+    x : array_like (n_t, n_bodies, 3)
+        Centres of mass in the order of `model.bodies`, m.
+    R : array_like (n_t, n_bodies, 3, 3)
+        Their columns are the axes of the bodies.
+
+    Returns
+    -------
+    ndarray (n_t, 7 n_bodies)
+
+    Raises
+    ------
+    ValueError
+        If shapes do not fit, or one of R is no rotation matrix.
+    """
+    x, R = np.asarray(x, dtype=float), np.asarray(R, dtype=float)
+    if x.ndim != 3 or x.shape[2] != 3 or R.shape != (*x.shape, 3):
+        raise ValueError(f"x must be (n_t, n_bodies, 3) and R (n_t, n_bodies, 3, 3); given {x.shape} and {R.shape}")
+    e = [[euler_parameters(each) for each in row] for row in R]
+    return np.concatenate([x, np.array(e)], axis=2).reshape(len(x), -1)
 
 
 def gaps(model: Any, x: Array, R: Array) -> Array:

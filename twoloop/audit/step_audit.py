@@ -23,6 +23,8 @@ TIGHT = 1e-12  # tolerance of both routes to the reference
 LOST = 0.1  # an error from which on a motion is another one
 FLAT = 1.5  # factor by which errors of two steps differ at most where they no longer fall
 COARSEST, SETTLED, FINEST = 8.0, 0.25, 2.0**-12  # steps, over the one given; from the second on a floor is one
+WELL_BELOW = 0.1  # of the error asked for
+SAME_START = 1e-6  # m, and of axes
 LIMIT = 4.0  # s of CPU that the next run may be expected to take
 RESOLVED = 0.1  # how far the routes to the reference may differ, over the error that is asked for
 
@@ -80,11 +82,11 @@ class Audit:
     @property
     def reaching(self) -> AuditedRun | None:
         """The run with the longest step that has the error asked for, as all with shorter ones have, one at least."""
-        found = None
-        for k, run in enumerate(reversed(self.runs)):
-            if not run.error <= self.error:
+        found: AuditedRun | None = None
+        for k, each in enumerate(reversed(self.runs)):
+            if not each.error <= self.error:
                 break
-            found = run if k else found
+            found = each if k else found
         return found
 
     def __str__(self) -> str:
@@ -95,9 +97,9 @@ class Audit:
             lines.append(f"  {1e3 * run.step:10.4g}  {what}")
         order = "not seen" if self.order is None else f"{self.order:.1f}"
         floor = "none in sight" if self.floor is None else f"{self.floor:.2g}: shorter steps do not lower the error"
-        run = self.reaching
-        reached = f"error {self.error:g}: " + (f"from a step of {1e3 * run.step:.4g} ms" if run else "not reached")
-        return "\n".join([*lines, f"  order {order}; floor {floor}; {reached}"])
+        longest = self.reaching
+        steps = f"from a step of {1e3 * longest.step:.4g} ms" if longest else "not reached"
+        return "\n".join([*lines, f"  order {order}; floor {floor}; error {self.error:g}: {steps}"])
 
 
 def audit_simulator(
@@ -116,8 +118,8 @@ def audit_simulator(
     problem : ModelProblem
         Of `model.problem(t_span)`: the mechanism, its start, and how long it is followed.
     step : float
-        The one in use, s, rounded to a part of a 50th of the span. Tried are up to 8 times this, and half the one before
-        until the error falls no more, is well below the one asked for, or the next run would take more than some seconds.
+        The one in use, s, rounded to a part of a 50th of the span. Tried are up to 8 times this, and each half the one
+        before, until the error falls no more, is well below the one asked for, or a run would take more than seconds.
     error : float, optional
         Asked for: the largest of any body's centre (m) or axes over the motion.
     label : str, optional
@@ -129,7 +131,7 @@ def audit_simulator(
     Raises
     ------
     TypeError, ValueError
-        If an argument is wrong, nothing moves, or `simulate` returns no array of the shape asked for.
+        If an argument is wrong, nothing moves, or `simulate` starts elsewhere, or returns an array of another shape.
     RuntimeError
         If the two routes to the reference fail, or differ by more than a tenth of `error`.
     """
@@ -143,12 +145,13 @@ def audit_simulator(
     n = INSTANTS * max(1, round((t1 - t0) / (step * INSTANTS)))  # so that instants are whole steps apart
     while n % (2 * INSTANTS) == 0 and (t1 - t0) / n < 0.7 * COARSEST * step:
         n //= 2
-    while (t1 - t0) / n >= FINEST * step and not (runs and 2.0 * runs[-1].cpu_s > LIMIT):
+    # the first run may hold imports and compiling
+    while (t1 - t0) / n >= FINEST * step and not (len(runs) > 1 and 2.0 * runs[-1].cpu_s > LIMIT):
         runs.append(_run(simulate, problem, known, n))
         own = [run for run in runs if not run.message]
         order, floor = order_and_floor([run.step for run in own], [run.error for run in own], apart)
         at_rest = floor is not None and (t1 - t0) / n <= SETTLED * step  # long steps may lose the motion alike
-        if at_rest or (len(own) > 3 and own[-1].error < max(0.02 * error, 10.0 * apart)):
+        if at_rest or (len(own) > 3 and own[-1].error < max(WELL_BELOW * error, 10.0 * apart)):
             break
         n *= 2
     return Audit(label, t1 - t0, error, apart, tuple(runs), order, floor)
@@ -193,6 +196,8 @@ def _run(simulate: Simulate, problem: ModelProblem, known: tuple[Array, Array], 
     if not np.isfinite(q).all():
         return AuditedRun(h, n, np.nan, np.nan, spent, "failed: the state is not finite")
     x, R = poses(problem.model, q)
+    if (off := max(np.abs(x[0] - known[0][0]).max(), np.abs(R[0] - known[1][0]).max())) > SAME_START:
+        raise ValueError(f"simulate must start where the problem does; its first row is off by {off:.2g} (m, axes)")
     return AuditedRun(h, n, _off((x, R), known), float(gaps(problem.model, x, R).max()), spent)
 
 

@@ -92,8 +92,13 @@ class _Reader:
             for key in ("density", "viscosity", "wind"):
                 if any(float(x) for x in each.get(key, "0").split()):
                     self.ignored.append(f"{key} of the surrounding medium")
-            if any(flag.get("gravity") == "disable" for flag in each.findall("flag")):
-                gravity = np.zeros(3)
+        flags = (flag.attrib for each in root.findall("option") for flag in each.findall("flag"))
+        disabled = {key for flag in flags for key, value in flag.items() if value == "disable"}
+        gravity = np.zeros(3) if "gravity" in disabled else gravity
+        self.without_loops = bool(disabled & {"constraint", "equality"})
+        self.without = {"stiffness"} if "spring" in disabled else set()
+        self.without |= {"damping"} if "damper" in disabled else set()
+        self.without |= {"stiffness", "damping"} if "passive" in disabled else set()  # one flag, before MuJoCo 3.4
         self.model = SpatialModel(gravity, name=root.get("model", "MuJoCo Model"))
         self.frames: dict[str, tuple[Part | None, Pose]] = {"world": (None, Pose(np.zeros(3), np.eye(3)))}
         self.sites: dict[str, tuple[Part | None, Array]] = {}
@@ -137,7 +142,8 @@ class _Reader:
         name = element.get("class", childclass)
         if name not in self.defaults:
             raise ValueError(f"{_called(element)} is of the class {name!r}, which no default has")
-        return {**self.defaults[name].get(DEFAULT_OF.get(element.tag, element.tag), {}), **element.attrib}
+        given = {**self.defaults[name].get(DEFAULT_OF.get(element.tag, element.tag), {}), **element.attrib}
+        return {key: value for key, value in given.items() if key not in self.without}
 
     def _pose(self, attributes: dict[str, str], what: str) -> Pose:
         return pose_of(attributes, what, self.degrees, self.sequence)
@@ -261,7 +267,7 @@ class _Reader:
 
     def _equality(self, element: Element) -> None:
         given = self._attributes(element, "main")
-        if given.get("active", "true") == "false":
+        if self.without_loops or given.get("active", "true") == "false":
             return
         if element.tag not in ("connect", "weld"):
             self.ignored.append(f"equality: {_called(element)}")
