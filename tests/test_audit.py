@@ -2,13 +2,14 @@
 
 import json
 import sys
+from importlib.util import find_spec
 
 import numpy as np
 import pytest
 
 from twoloop import solve_dae
 from twoloop.__main__ import main
-from twoloop.audit import audit_mjcf, audit_simulator, coordinates
+from twoloop.audit import audit_mjcf, audit_simulator, coordinates, mjcf_audit, step_audit
 from twoloop.audit.poses import gaps, poses
 from twoloop.bodies import PlanarModel, SpatialModel
 
@@ -136,14 +137,9 @@ def test_without_mujoco_it_says_so(tmp_path, monkeypatch):
         audit_mjcf(file_with(tmp_path))
 
 
+@pytest.mark.skipif(find_spec("mujoco") is None, reason="MuJoCo is not installed")
 class TestInMuJoCo:
-    """With MuJoCo."""
-
-    @pytest.fixture(scope="class", autouse=True)
-    def installed(self):
-        return pytest.importorskip("mujoco")
-
-    def test_the_default_has_a_floor_and_the_advice_holds(self, tmp_path, capsys, installed):
+    def test_the_default_has_a_floor_and_the_advice_holds(self, tmp_path, capsys):
         path = file_with(tmp_path, end('<actuator><position joint="pivot" kp="100"/></actuator>'))
         out = [str(tmp_path / name) for name in ("audit.json", "audit.csv")]
         main(["audit", str(path), "--t-end", "0.5", "--error", "1e-3", "--out", *out])
@@ -169,21 +165,15 @@ class TestInMuJoCo:
                 ('name="crank">', 'name="crank" childclass="soft">'),
             ],
             [
-                (
-                    '<geom fromto="0 0 0 0.7 0 0.1"/>',
-                    '<geom fromto="0 0 0 0.7 0 0.1"/><body pos="0.7 0 0" euler="0 30 0">',
-                ),
-                ("      </body>\n    </body>", '<geom size="0.1 0.05"/></body></body></body>'),
+                ('0.7 0 0.1"/>\n      </body>', '0.7 0 0.1"/><body pos="0.7 0 0" euler="0 30 0">\n</body></body>'),
+                ("\n</body>", '<geom size="0.1 0.05"/></body>'),
             ],
             [
                 ('timestep="0.002"/>', 'timestep="0.002"><flag spring="disable"/></option>'),
                 ('name="elbow"', 'name="elbow" stiffness="3" damping="0.1"'),
             ],
             [
-                (
-                    "<worldbody>",
-                    '<worldbody><body pos="0 0 3"><freejoint/><geom type="box" size="0.3 0.2 0.1" mass="3"/>',
-                ),
+                ("<worldbody>", '<worldbody><body pos="0 0 3"><freejoint/><geom type="box" size=".3 .2 .1" mass="3"/>'),
                 ("</worldbody>", "</body></worldbody>"),
             ],
             [('name="elbow"', 'name="elbow" stiffness="3 1 2" damping="0.1"')],
@@ -227,14 +217,13 @@ class TestInMuJoCo:
             model.bodies[1].inertia[0] *= 1.01
             return model
 
-        from twoloop.audit import mjcf_audit
-
         from_mjcf = mjcf_audit.from_mjcf
         monkeypatch.setattr(mjcf_audit, "from_mjcf", other)
         with pytest.raises(ValueError, match=r"masses and inertias differ by .* of 'crank'"):
             audit_mjcf(file_with(tmp_path))
 
-    def test_the_command_ends_with_one_line_and_a_status(self, tmp_path, capsys):
+    def test_the_command_ends_with_one_line_and_a_status(self, tmp_path, capsys, monkeypatch):
+        monkeypatch.setattr(step_audit, "FINEST", 0.5)
         path = file_with(tmp_path)
         with pytest.raises(SystemExit, match=r"--out takes a file that ends in .json or .csv; given"):
             main(["audit", str(path), "--out", str(tmp_path / "audit.txt")])
