@@ -141,7 +141,7 @@ def _values(each: Configuration, quick: bool) -> Iterator[float]:
 
 
 def _row(group: str, build: Callable[[], Any], **more: Any) -> Row:
-    nothing = dict.fromkeys(("h", "tol", "n_steps", "call_s", "stepping_s", "error_q", "error_v", "gap", "energy"))
+    nothing = dict.fromkeys(("h", "tol", "n_steps", "call_s", "stepping_s", "error_q", "error_v", "error_f", "gap", "energy"))
     return {"group": group, "case": loop_of(build).problem.name, **nothing, "floor": None, "message": "", **more}
 
 
@@ -185,14 +185,14 @@ def _again(prepared: Prepared, t_end: float, n_steps: int, k: int) -> Motion:
 def _ours(loop: Loop, tolerance: float) -> tuple[Callable[[], Motion], Callable[[int], Motion]]:
     def run() -> Motion:
         made = loop.ours(tolerance, times=loop.times)
-        motion = loop.motion(made.q, made.v)
+        motion = loop.motion(made.q, made.v, loop.force(made))
         return motion if made.success else replace(motion, message=made.message)
 
     def again(k: int) -> Motion:
         began = time.process_time()
         made = loop.ours(tolerance, t0=1e-9 * (k + 1) * loop.t_end)  # a start that no call has had
         call = time.process_time() - began
-        return loop.motion(made.q[:, :1], made.v[:, :1], call, made.stats.cpu_time)
+        return loop.motion(made.q[:, :1], made.v[:, :1], None, call, made.stats.cpu_time)
 
     return run, again
 

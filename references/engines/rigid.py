@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from twoloop.bodies import SpatialModel
 from twoloop.bodies.model_problem import ModelProblem
-from twoloop.bodies.parameter_layout import SPRING, TORQUE
+from twoloop.bodies.parameter_layout import SPRING, TORQUE, TORSION
 from twoloop.bodies.parts import Body, ModelJoint
 from twoloop.bodies.spanning_tree import spanning_tree
 from twoloop.mechanisms.rotation import G, euler_parameters, euler_rates, rotation_matrix
@@ -40,6 +40,8 @@ class Motion:
         Centres of mass (m), their velocities (m/s), angular velocities along the axes of space (rad/s).
     R : ndarray (n_t, n_bodies, 3, 3)
         Their columns are the axes of the bodies.
+    f : ndarray (n_t, 3)
+        Force of the first joint that closes a loop on its `body`, along the axes of space, N; NaN: not told.
     call_s, stepping_s : float
         CPU time of the call on a model that has been built, and of its steps alone, s.
     message : str
@@ -51,6 +53,7 @@ class Motion:
     R: Array
     v: Array
     w: Array
+    f: Array
     call_s: float
     stepping_s: float
     message: str = ""
@@ -73,7 +76,8 @@ class Prepared:
     run: Callable[[float, int, int], Motion]
 
 
-Seen = tuple[float, Array, Array, Array, Array]  # t, x, R, v, w of `Motion` at one instant
+Seen = tuple[float, Array, Array, Array, Array, Array]  # t, x, R, v, w, f of `Motion` at one instant
+UNTOLD = np.full(3, np.nan)
 
 
 def march(began: float, n_steps: int, n_stored: int, see: Callable[[], Seen], step: Callable[[int], str]) -> Motion:
@@ -88,14 +92,14 @@ def march(began: float, n_steps: int, n_stored: int, see: Callable[[], Seen], st
         message = step(int(n))
         spent += time.process_time() - start
         state = see()
-        if not message and not all(np.isfinite(each).all() for each in state):
+        if not message and not all(np.isfinite(each).all() for each in state[:-1]):
             message = "the state is not finite"
         if message:
             message = f"at {state[0]:.3g} s or before: {message}"
             break
         stored.append(state)
-    t, x, R, v, w = (np.array(each) for each in zip(*stored, strict=True))
-    return Motion(t, x, R, v, w, time.process_time() - began, spent, message)
+    parts = (np.array(each) for each in zip(*stored, strict=True))
+    return Motion(*parts, time.process_time() - began, spent, message)
 
 
 @dataclass(frozen=True)
@@ -207,17 +211,25 @@ def springs(model: Any) -> list[tuple[Body, Array, Body, Array, tuple[float, ...
     ]
 
 
+def hinge_springs(model: Any) -> dict[str, tuple[float, float, float]]:
+    """By name of a hinge the stiffness and damping of the spring in it, and the angle from the start at which it rests."""
+    return {f.joint.name: f.more.values for f in model.forces if f.kind == TORSION}
+
+
 def rigid_of(problem: ModelProblem) -> Rigid:
     """What engines are given of a model in a plane or in space.
 
     Raises
     ------
     ValueError
-        If it holds a drive, or a force that is neither a spring between points nor a constant torque.
+        If it holds a drive, a force that is neither a spring nor a constant torque, or a spring in a joint that closes
+        a loop.
     """
     given: Any = problem.model
     wrong = [each.name for each in given.joints if each.kind == "drive"]
-    wrong += [f.name for f in given.forces if f.kind not in (SPRING, TORQUE) or f.function is not None]
+    wrong += [f.name for f in given.forces if f.kind not in (SPRING, TORQUE, TORSION) or f.function]
+    cuts = {joint.name for joint in spanning_tree(given)[1]}
+    wrong += [name for name in hinge_springs(given) if name in cuts]
     if wrong:
         raise ValueError(f"engines are given bodies, joints, springs and constant torques alone; not {wrong[0]!r}")
     planar = given.dimension == 2
@@ -253,6 +265,8 @@ def _in_space(given: Any, x: Array, R: Array, v: Array, w: Array) -> SpatialMode
     for one, at, other, there, (stiffness, damping, length) in springs(given):
         ends = [np.append(body.in_space(place), 0.0) for body, place in ((one, at), (other, there))]
         model.spring(one.name, ends[0], other.name, ends[1], stiffness=stiffness, damping=damping, length=length)
+    for name, (stiffness, damping, angle) in hinge_springs(given).items():
+        model.torsion_spring(name, stiffness=stiffness, damping=damping, angle=angle)
     return model
 
 

@@ -80,12 +80,24 @@ class Loop:
         runs = [self.ours(TIGHT, method, self.times) for method in ("DOP853", "RadauIIA9")]
         if not all(run.success for run in runs):
             raise RuntimeError(next(run.message for run in runs if not run.success))
-        one, other = (self.motion(run.q, run.v) for run in runs)
+        one, other = (self.motion(run.q, run.v, self.force(run)) for run in runs)
         return one, float(max(np.abs(one.x - other.x).max(), np.abs(one.R - other.R).max()))
 
-    def motion(self, q: Array, v: Array, call_s: float = 0.0, stepping_s: float = 0.0) -> Motion:
+    def force(self, run: Any) -> Array:
+        """Of the first joint that closes a loop in a run of ours, as in `Motion`; NaN if it is not unique."""
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", ConstraintWarning)
+            made = run.reactions(self.rigid.loops[0].name)
+        if not made.unique:
+            return np.full((run.t.size, 3), np.nan)
+        return np.pad(made.force.T, ((0, 0), (0, 3 - len(made.force))))
+
+    def motion(
+        self, q: Array, v: Array, f: Array | None = None, call_s: float = 0.0, stepping_s: float = 0.0
+    ) -> Motion:
         """Of coordinates of the model, at the instants."""
-        return Motion(self.times[: q.shape[1]], *states(self.rigid.planar, q, v), call_s, stepping_s)
+        f = np.full((q.shape[1], 3), np.nan) if f is None else f
+        return Motion(self.times[: q.shape[1]], *states(self.rigid.planar, q, v), f, call_s, stepping_s)
 
     @cached_property
     def start_rates(self) -> dict[float, tuple[Array, Array]]:
@@ -152,7 +164,10 @@ def errors(loop: Loop, motion: Motion) -> Row:
     local = np.einsum("tkji,tkj->tki", known.R, known.w)
     m = np.array([body.inertia[0] for body in rigid.model.bodies])
     kinetic = 0.5 * (m * (known.v**2).sum(axis=2) + np.einsum("tki,kij,tkj->tk", local, J, local)).sum(axis=1).max()
+    d = 2 if rigid.planar else 3  # what holds a mechanism in its plane is not unique
+    f = np.abs(motion.f - known.f)[:, :d].max() / np.abs(known.f[:, :d]).max()
     return {
+        "error_f": float(f),
         "error_q": float(off),
         "error_v": float(np.abs(motion.v - known.v).max() / fastest),
         "gap": float(gaps(rigid.model, motion.x, motion.R).max()),
