@@ -141,7 +141,9 @@ def _values(each: Configuration, quick: bool) -> Iterator[float]:
 
 
 def _row(group: str, build: Callable[[], Any], **more: Any) -> Row:
-    nothing = dict.fromkeys(("h", "tol", "n_steps", "call_s", "stepping_s", "error_q", "error_v", "error_f", "gap", "energy"))
+    nothing = dict.fromkeys(
+        ("h", "tol", "n_steps", "call_s", "stepping_s", "error_q", "error_v", "error_f", "gap", "energy")
+    )
     return {"group": group, "case": loop_of(build).problem.name, **nothing, "floor": None, "message": "", **more}
 
 

@@ -213,7 +213,14 @@ def springs(model: Any) -> list[tuple[Body, Array, Body, Array, tuple[float, ...
 
 def hinge_springs(model: Any) -> dict[str, tuple[float, float, float]]:
     """By name of a hinge the stiffness and damping of the spring in it, and the angle from the start at which it rests."""
-    return {f.joint.name: f.more.values for f in model.forces if f.kind == TORSION}
+    found = {}
+    for each in model.forces:
+        if each.kind == TORSION:
+            stiffness, damping, angle = each.more.values
+            if model.dimension == 2:  # whose springs rest at an angle between the axes of the bodies
+                angle -= each.second.rotation - each.first.rotation
+            found[each.joint.name] = stiffness, damping, angle
+    return found
 
 
 def rigid_of(problem: ModelProblem) -> Rigid:
