@@ -74,7 +74,7 @@ def prepare(rigid: Rigid, settings: Settings = Settings()) -> Prepared:  # noqa:
 
 
 def _model(rigid: Rigid, planar: bool, q: Any, v: Any) -> tuple[Any, int, Any]:
-    """The model, a sensor of the force of the first joint that closes a loop, and the axes of this in its first body."""
+    """The model, a sensor of the force of the first joint that closes a loop, and its axes in its first body."""
     from references.exudyn.model import PRISMATIC, REVOLUTE, SPHERICAL, UNIVERSAL, Model, frame
 
     locked = {"revolute": REVOLUTE, "prismatic": PRISMATIC, "spherical": SPHERICAL, "universal": UNIVERSAL}

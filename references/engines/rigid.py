@@ -98,8 +98,8 @@ def march(began: float, n_steps: int, n_stored: int, see: Callable[[], Seen], st
             message = f"at {state[0]:.3g} s or before: {message}"
             break
         stored.append(state)
-    parts = (np.array(each) for each in zip(*stored, strict=True))
-    return Motion(*parts, time.process_time() - began, spent, message)
+    t, x, R, v, w, f = (np.array(each) for each in zip(*stored, strict=True))
+    return Motion(t, x, R, v, w, f, time.process_time() - began, spent, message)
 
 
 @dataclass(frozen=True)
@@ -212,7 +212,7 @@ def springs(model: Any) -> list[tuple[Body, Array, Body, Array, tuple[float, ...
 
 
 def hinge_springs(model: Any) -> dict[str, tuple[float, float, float]]:
-    """By name of a hinge the stiffness and damping of the spring in it, and the angle from the start at which it rests."""
+    """By name of a hinge stiffness and damping of the spring in it, and the angle from the start at which it rests."""
     found = {}
     for each in model.forces:
         if each.kind == TORSION:

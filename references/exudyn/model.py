@@ -113,7 +113,7 @@ class Model:
         self.mbs.AddLoad(LoadTorqueVector(markerNumber=marker, loadVector=np.asarray(torque, dtype=float).tolist()))
 
     def turn(self, body: int, stiffness: float, damping: float, angle: float) -> None:
-        """A torsional spring between a planar body and the ground, which rests where the body has turned by an angle."""
+        """A torsional spring between the ground and a planar body, at rest where this has turned by an angle."""
         properties: dict[str, Any] = {"stiffness": stiffness, "damping": damping, "offset": angle}
         self.mbs.AddObject(ObjectConnectorCoordinateSpringDamper(markerNumbers=self._coordinate(body, 2), **properties))
 

@@ -83,6 +83,16 @@ class Loop:
         one, other = (self.motion(run.q, run.v, self.force(run)) for run in runs)
         return one, float(max(np.abs(one.x - other.x).max(), np.abs(one.R - other.R).max()))
 
+    @cached_property
+    def kinetic(self) -> float:
+        """The largest kinetic energy of the reference, J."""
+        known, bodies = self.reference[0], self.rigid.model.bodies
+        J = np.array([tensor(body.inertia) for body in bodies])
+        local = np.einsum("tkji,tkj->tki", known.R, known.w)
+        m = np.array([body.inertia[0] for body in bodies])
+        each = m * (known.v**2).sum(axis=2) + np.einsum("tki,kij,tkj->tk", local, J, local)
+        return float(0.5 * each.sum(axis=1).max())
+
     def force(self, run: Any) -> Array:
         """Of the first joint that closes a loop in a run of ours, as in `Motion`; NaN if it is not unique."""
         with warnings.catch_warnings():
@@ -157,13 +167,7 @@ def errors(loop: Loop, motion: Motion) -> Row:
     (known, _), rigid = loop.reference, loop.rigid
     off = max(np.abs(motion.x - known.x).max(), np.abs(motion.R - known.R).max())
     fastest = max(np.linalg.norm(known.v, axis=2).max(), 1e-12)
-    energies, kinetic = [], 0.0
-    for each in (motion, known):
-        energies.append(loop.problem.energy(each.t, *coordinates(each, rigid.planar)))
-    J = np.array([tensor(body.inertia) for body in rigid.model.bodies])
-    local = np.einsum("tkji,tkj->tki", known.R, known.w)
-    m = np.array([body.inertia[0] for body in rigid.model.bodies])
-    kinetic = 0.5 * (m * (known.v**2).sum(axis=2) + np.einsum("tki,kij,tkj->tk", local, J, local)).sum(axis=1).max()
+    energies = [loop.problem.energy(each.t, *coordinates(each, rigid.planar)) for each in (motion, known)]
     d = 2 if rigid.planar else 3  # what holds a mechanism in its plane is not unique
     f = np.abs(motion.f - known.f)[:, :d].max() / np.abs(known.f[:, :d]).max()
     return {
@@ -171,7 +175,7 @@ def errors(loop: Loop, motion: Motion) -> Row:
         "error_q": float(off),
         "error_v": float(np.abs(motion.v - known.v).max() / fastest),
         "gap": float(gaps(rigid.model, motion.x, motion.R).max()),
-        "energy": float(np.abs(energies[0] - energies[1]).max() / kinetic),
+        "energy": float(np.abs(energies[0] - energies[1]).max() / loop.kinetic),
     }
 
 
