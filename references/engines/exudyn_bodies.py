@@ -62,8 +62,8 @@ def prepare(rigid: Rigid, settings: Settings = Settings()) -> Prepared:  # noqa:
         made = run_exudyn(model.mbs, model.sensors, reference, steps, None, dependent)
         call = time.process_time() - began
         parts = states(planar, made.q, made.v)
-        f = model.mbs.GetSensorStoredData(sensor)[:, 1:4]
-        if not planar:
+        f = np.full((made.t.size, 3), np.nan) if sensor < 0 else model.mbs.GetSensorStoredData(sensor)[:, 1:4]
+        if not planar and sensor >= 0:
             f = np.einsum("tij,tj->ti", parts[1][:, rigid.loops[0].a.number] @ axes, f)
         return Motion(made.t, *parts, f, call, made.stats.cpu_time, "" if made.success else made.message)
 
@@ -79,7 +79,7 @@ def _model(rigid: Rigid, planar: bool, q: Any, v: Any) -> tuple[Any, int, Any]:
 
     locked = {"revolute": REVOLUTE, "prismatic": PRISMATIC, "spherical": SPHERICAL, "universal": UNIVERSAL}
     model = Model(rigid.model.gravity)
-    cut, sensor, own = rigid.loops[0].name, 0, np.eye(3)
+    sensor, own = -1, np.eye(3)
     for body, state, rate in zip(rigid.model.bodies, q, v, strict=True):
         mass, xx, yy, zz, xy, xz, yz = body.inertia.tolist()
         if planar:
@@ -90,7 +90,7 @@ def _model(rigid: Rigid, planar: bool, q: Any, v: Any) -> tuple[Any, int, Any]:
         a, b = joint.a.number, joint.b.number
         if planar:
             made = model.pin(a, tuple(point_of(joint.a, joint)[:2]), b, tuple(point_of(joint.b, joint)[:2]))
-            sensor = model.told(made, False) if joint.name == cut else sensor
+            sensor = model.told(made, False) if joint.name == rigid.cut else sensor
             continue
         axes = [end.rotation @ axis_of(end, joint) for end in (joint.a, joint.b)]
         turned = frame(axes[0])
@@ -104,7 +104,7 @@ def _model(rigid: Rigid, planar: bool, q: Any, v: Any) -> tuple[Any, int, Any]:
         turned = np.eye(3) if flat else turned
         point = joint.a.in_space(point_of(joint.a, joint))
         made = model.joint(a, b, point, turned, PLANAR_CUT if flat else locked[joint.kind])
-        if joint.name == cut:
+        if joint.name == rigid.cut:
             sensor, own = model.told(made, True), joint.a.rotation.T @ turned
     for one, at, other, there, values in springs(rigid.model):
         # Exudyn's planar bodies take points in their own axes, see Model.planar_body

@@ -36,8 +36,8 @@ def prepare(rigid: Rigid, settings: Settings = Settings()) -> Prepared:  # noqa:
     mujoco.set_mju_user_warning(lambda text: None)  # which it would put into a file in the folder of the caller
     model = mujoco.MjModel.from_xml_string(file_of(rigid, settings))
     bodies = [model.body(body.name).id for body in rigid.model.bodies]
-    cut = rigid.loops[0].name  # of a hinge, two connects
-    connects = [k for k in range(model.neq) if model.equality(k).name in (cut, f"{cut} 2")]
+    of_cut = rigid.cut, f"{rigid.cut} 2"  # of a hinge, two connects
+    connects = [k for k in range(model.neq) if model.equality(k).name in of_cut]
 
     def run(t_end: float, n_steps: int, n_stored: int) -> Motion:
         began = time.process_time()

@@ -11,6 +11,7 @@ from references.driver import imported
 from references.engines.rigid import (
     BALL,
     SLIDE,
+    UNTOLD,
     Motion,
     Prepared,
     Rigid,
@@ -62,7 +63,7 @@ def prepare(rigid: Rigid, settings: Settings = Settings()) -> Prepared:  # noqa:
             gains.Kp, gains.Kd = settings.baumgarte**2, 2.0 * settings.baumgarte
             made.setBaumgarteCorrectorParameters(gains)
         constraints.append(made)
-    n_points = 1 if rigid.loops[0].kind == "spherical" else 2
+    n_points = {"spherical": 1, "revolute": 2}[rigid.loops[0].kind] if rigid.loops else 0
     proximal = pin.ProximalSettings()
     if settings.mu is not None:
         proximal = pin.ProximalSettings(1e-14, settings.mu, settings.iterations)
@@ -109,10 +110,12 @@ def prepare(rigid: Rigid, settings: Settings = Settings()) -> Prepared:  # noqa:
                 np.array([pose.rotation @ getattr(twist, part) for pose, twist in zip(poses, twists, strict=True)])
                 for part in ("linear", "angular")
             )
-            acceleration(q, v)
-            turned = data.oMi[constraints[0].joint1_id].rotation @ constraints[0].joint1_placement.rotation
-            f = sum(turned @ each.contact_force.linear for each in list(datas)[:n_points])
-            return taken * h, x, R, speeds, spins, np.asarray(f)
+            f = UNTOLD
+            if n_points:
+                acceleration(q, v)
+                turned = data.oMi[constraints[0].joint1_id].rotation @ constraints[0].joint1_placement.rotation
+                f = turned @ np.sum([each.contact_force.linear for each in list(datas)[:n_points]], axis=0)
+            return taken * h, x, R, speeds, spins, f
 
         return march(began, n_steps, n_stored, see, step)
 

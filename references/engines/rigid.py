@@ -131,6 +131,11 @@ class Rigid:
     loops: list[ModelJoint]
     torques: Array
 
+    @property
+    def cut(self) -> str:
+        """The name of the first joint that closes a loop; nothing of a tree."""
+        return self.loops[0].name if self.loops else ""
+
     def rates(self, body: Body) -> Array:
         """Start velocities of the joint above a body, in the order of `freedoms`; a ball's in the axes of the body."""
         parent, joint = self.parents[body.number]

@@ -97,7 +97,7 @@ class Loop:
         """Of the first joint that closes a loop in a run of ours, as in `Motion`; NaN if it is not unique."""
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", ConstraintWarning)
-            made = run.reactions(self.rigid.loops[0].name)
+            made = run.reactions(self.rigid.cut)
         if not made.unique:
             return np.full((run.t.size, 3), np.nan)
         return np.pad(made.force.T, ((0, 0), (0, 3 - len(made.force))))
