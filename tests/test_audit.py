@@ -131,6 +131,11 @@ def test_gaps_are_of_points_that_joints_keep_together():
         coordinates(x[0], R)
 
 
+def test_what_is_left_out_of_many_joints_is_counted():
+    given = ("limits of joint 'a'", "actuator: motor 'm'", "limits of joint 'b'", "armature of joint 'a'")
+    assert mjcf_audit._counted(given) == ["limits of 2 joints", "actuator: motor 'm'", "armature of joint 'a'"]
+
+
 def test_without_mujoco_it_says_so(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "mujoco", None)
     with pytest.raises(RuntimeError, match="mujoco is not installed: pip install mujoco"):

@@ -151,12 +151,14 @@ class _Reader:
     def _within(self, element: Element, part: Part | None, pose: Pose, childclass: str) -> None:
         """What stands in a body, or in the world."""
         lumps: list[Lump] = []
+        inertial = element.find("inertial") if self.from_geoms != "true" else None
+        weigh = part is not None and inertial is None and self.from_geoms != "false"  # the geoms
         for each in element:
             given = self._attributes(each, childclass)
             if each.tag == "body":
                 self._body(each, part, pose, each.get("childclass", childclass))
             elif each.tag == "geom":
-                lump = self._geom(given, _called(each))
+                lump = self._geom(given, _called(each), weigh)
                 lumps += [] if lump is None else [lump]
             elif each.tag == "site":
                 place = pose.point(self._pose(given, _called(each)).x)
@@ -165,11 +167,8 @@ class _Reader:
                 raise ValueError(f"<{each.tag}> is not read; MuJoCo saves a file in which it is written out")
             elif each.tag not in SEEN_ONLY | {"inertial", "joint", "freejoint"}:
                 self.ignored.append(_called(each))
-        inertial = element.find("inertial")
-        if inertial is not None and self.from_geoms != "true":
-            lumps = [self._inertial(inertial, element.get("name", "?"))]
-        elif self.from_geoms == "false":
-            lumps = []
+        if not weigh:
+            lumps = [] if inertial is None else [self._inertial(inertial, element.get("name", "?"))]
         if part is not None:
             part.lumps += [lump.seen(pose) for lump in lumps]
 
@@ -218,13 +217,14 @@ class _Reader:
         self.taken.add(name)
         return name
 
-    def _geom(self, given: dict[str, str], what: str) -> Lump | None:
+    def _geom(self, given: dict[str, str], what: str, weighs: bool) -> Lump | None:
         if float(given.get("contype", 1)) or float(given.get("conaffinity", 1)):
             self.n_geoms += 1
-        if given.get("shellinertia", "false") == "true":
+        if given.get("shellinertia", "false") == "true" and weighs:
             self.ignored.append(f"shellinertia of {what}")
         lump = geom_lump(given, what, self.degrees, self.sequence)
-        if lump is None and given.get("type") not in ("plane", "hfield"):
+        weighs = weighs and float(given.get("mass", given.get("density", 1.0))) > 0.0
+        if lump is None and weighs and given.get("type") not in ("plane", "hfield"):
             self.ignored.append(f"the mass of {what}, which is a {given.get('type')}")
         return lump
 
