@@ -254,8 +254,14 @@ def test_defaults_of_tendons_and_what_else_was_passed_over(tmp_path):
 
 @pytest.mark.parametrize(
     ("flag", "loops", "springs", "dampers"),
-    [("", 1, 1, 1), ("equality", 0, 1, 1), ("constraint", 0, 1, 1), ("spring", 1, 0, 1), ("damper", 1, 1, 0)]
-    + [("passive", 1, 0, 0)],
+    [
+        ("", 1, 1, 1),
+        ("equality", 0, 1, 1),
+        ("constraint", 0, 1, 1),
+        ("spring", 1, 0, 1),
+        ("damper", 1, 1, 0),
+        ("passive", 1, 0, 0),
+    ],
 )
 def test_what_flags_disable_is_not_there(flag, loops, springs, dampers, tmp_path):
     geom = "<geom fromto='0 0 0 1 0 0' size='0.1' type='capsule'/>"
