@@ -133,7 +133,9 @@ def _joint(name: str, found: list[tuple[str, Any]], frames: list[Any], damping: 
     if kinds == (HINGE, HINGE):
         return tree.UniversalJoint(name, *frames)
     if kinds in ((HINGE,), (SLIDE,)):
-        return (tree.RevoluteJoint if kinds == (HINGE,) else tree.PrismaticJoint)(name, *frames, found[0][1], damping)
+        return (tree.RevoluteJoint if kinds == (HINGE,) else tree.PrismaticJoint)(
+            name, *frames, found[0][1], damping=damping
+        )
     raise ValueError(f"Drake is given hinges, slides, balls and universal joints; {name!r} is of {' and '.join(kinds)}")
 
 

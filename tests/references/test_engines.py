@@ -17,6 +17,7 @@ from studies.bench.closed_loops import (
     parallelogram,
     rssr,
     servo,
+    slider_crank,
     squeezer,
     stewart,
     turned_rssr,
@@ -44,8 +45,8 @@ def prepared(engine, rigid):
 
 @pytest.fixture(scope="module")
 def loops():
-    """A planar mechanism with a spring and a torque, and one in space with tensors, turned axes and swapped bodies."""
-    return Loop(squeezer()), Loop(crooked())
+    """In a plane with a spring and a torque; in space with tensors, turned axes and swapped bodies; with a slide."""
+    return Loop(squeezer()), Loop(crooked()), Loop(replace(slider_crank(), t_span=(0.0, 0.5)))
 
 
 def crooked():
@@ -66,7 +67,7 @@ def crooked():
 
 
 @engines
-@pytest.mark.parametrize("k", [0, 1])
+@pytest.mark.parametrize("k", [0, 1, 2])
 def test_models_pass_the_gates_and_move_as_they_should(loops, engine, k):
     ready = prepared(engine, loops[k].rigid)
     assert gate(loops[k], ready) == ""

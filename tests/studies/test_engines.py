@@ -71,9 +71,10 @@ def test_motors_and_energies_stand_beside_what_they_change():
     )
     energy = good[:1].assign(group="energy", n_steps=50_000, error_q=None, energy=0.03)
     found, text = said(good, motor, energy)
-    cells = {line["label"]: line["cells"] for line in found["probes"][:7]}
-    assert cells["with a speed motor"] == [None, 0.02] and cells["energy over 100 s"] == [None, 0.03]
-    assert found["cases"] == ["four-bar"] and "| with a speed motor | – | 0.020 |" in text
+    cells = {line["label"]: line["cells"] for line in found["probes"]}
+    assert cells["speed motor; PD motor"] == [[None, None], [0.02, None]]
+    assert cells["energy, 100 s: four-bar; RSSR"] == [[None, None], [0.03, None]]
+    assert found["cases"] == ["four-bar"] and "| speed motor; PD motor | –/– | 0.020/– |" in text
 
 
 def test_an_engine_that_is_not_there_is_a_row(monkeypatch):
