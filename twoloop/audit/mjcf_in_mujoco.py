@@ -64,7 +64,7 @@ class InMuJoCo:
         try:
             self.engine = self.mujoco.MjModel.from_xml_path(os.fspath(path))
         except ValueError as error:
-            raise ValueError(f"MuJoCo refuses the file: {error}") from None
+            raise ValueError(f"MuJoCo refuses the file: {' '.join(str(error).split())}") from None
         self.model = model
         self._switch_off()
         engine = self.engine
