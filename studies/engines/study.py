@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 
 from references.engines.rigid import Motion, Prepared, coordinates
 from studies.bench import figures
-from studies.bench.closed_loops import MECHANISMS, VARIANTS, four_bar, rssr, servo
+from studies.bench.closed_loops import MECHANISMS, VARIANTS, four_bar, rssr
 from studies.bench.engine_runs import INSTANTS, LIMIT, Loop, errors, gate, timed
 from studies.bench.store import Output, Row
 from studies.bench.study import Study
@@ -51,7 +51,7 @@ def make(output: Output) -> pd.DataFrame:
     """Rows of the gates, of runs, of motors, masses and turned frames, and of the energy over a long time."""
     quick = output.call.quick
     mechanisms = (four_bar, rssr) if quick else MECHANISMS
-    variants = (servo,) if quick else VARIANTS
+    variants = () if quick else VARIANTS
     with output.kept() as kept:
         rows: list[Row] = []
         for build in (*mechanisms, *variants):
