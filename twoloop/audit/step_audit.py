@@ -168,8 +168,8 @@ def reference(problem: ModelProblem, error: float) -> tuple[tuple[Array, Array],
             run = solve_dae(problem.system, problem.t_span, problem.q0, problem.v0, compiled=False, **options)
             if not run.success:
                 raise RuntimeError(
-                    f"the motion of rigid joints is not known beyond {run.t[-1]:.3g} s: follow it for a shorter time, or "
-                    f"from another start. {method}: {run.message}"
+                    f"the motion of rigid joints is not known beyond {run.t[-1]:.3g} s: follow it for a shorter time, "
+                    f"or from another start. {method}: {run.message}"
                 )
             found.append(poses(problem.model, run.q.T))
     apart = _off(*found)
