@@ -262,7 +262,7 @@ ENTRIES = set(
 )
 
 
-@pytest.mark.parametrize("package", ["twoloop", "twoloop.bodies", "twoloop.symbolic", "twoloop.testing"])
+@pytest.mark.parametrize("package", [f"twoloop{each}" for each in ("", ".audit", ".bodies", ".symbolic", ".testing")])
 def test_every_name_of_a_package_has_an_entry(package):
     module = pytest.importorskip(package, exc_type=ImportError)
     assert {f"{package}.{name}" for name in module.__all__} <= ENTRIES

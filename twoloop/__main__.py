@@ -1,4 +1,4 @@
-"""python -m twoloop: what is installed, compile everything, solve a ready mechanism or one from a file."""
+"""python -m twoloop: what is installed, compile everything, solve a mechanism, audit MuJoCo on closed loops."""
 
 import argparse
 import os
@@ -12,6 +12,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 from twoloop import Result, __version__, kernels, solve_dae
+from twoloop.audit.mjcf_audit import audit_mjcf, check_ending
 from twoloop.kernels.compile.caches import folder_of
 from twoloop.mechanisms.user_file import problem_from
 from twoloop.methods.presets import PRESETS
@@ -115,6 +116,27 @@ def write(result: Result, file: Path) -> None:
         result.animate(file)
 
 
+def audit(given: argparse.Namespace) -> None:
+    """Compare MuJoCo's motion of a file with that of rigid loops, and write what was asked for.
+
+    Raises
+    ------
+    RuntimeError, ValueError
+        Of `audit_mjcf`, or if a file cannot be written as asked.
+    """
+    for file in given.out:
+        check_ending(file)
+        if not file.parent.is_dir():
+            raise ValueError(f"--out: there is no folder {file.parent.resolve()}")
+    made = audit_mjcf(given.file, error=given.error, t_end=given.t_end, key=given.key)
+    print(made)
+    for file in given.out:
+        made.write(file)
+        print(f"wrote {file}")
+    if not made.advice:
+        raise SystemExit(1)
+
+
 def parser() -> argparse.ArgumentParser:
     """The command line."""
     made = argparse.ArgumentParser(prog="python -m twoloop", description=__doc__)
@@ -136,6 +158,12 @@ def parser() -> argparse.ArgumentParser:
     )
     one.add_argument("--t-end", type=float, help="s; default: the end of the problem's t_span")
     one.add_argument("--out", nargs="+", default=[], metavar="FILE", help=f"files, by ending: {', '.join(ENDINGS)}")
+    loops = commands.add_parser("audit", help="what MuJoCo is off by on the closed loops of an MJCF file; what to set")
+    loops.add_argument("file", metavar="MODEL.xml", help="a file with loops closed by connect or weld")
+    loops.add_argument("--error", type=float, default=1e-3, help="wanted, m and of axes; default: 1e-3")
+    loops.add_argument("--t-end", type=float, default=2.0, help="s; default: 2")
+    loops.add_argument("--key", help="keyframe to start from; default: the pose of the file, at rest")
+    loops.add_argument("--out", nargs="+", default=[], type=Path, metavar="FILE", help="files, .json or .csv")
     return made
 
 
@@ -147,6 +175,8 @@ def main(words: Sequence[str] | None = None) -> None:
             info()
         elif given.command == "compile":
             compile_all()
+        elif given.command == "audit":
+            audit(given)
         else:
             solve(given)
     except (ImportError, OSError, RuntimeError, ValueError) as error:

@@ -10,12 +10,14 @@ from references.engines.rigid import (
     BALL,
     HINGE,
     SLIDE,
+    UNTOLD,
     Motion,
     Prepared,
     Rigid,
     Seen,
     cut_points,
     freedoms,
+    hinge_springs,
     march,
     point_of,
     springs,
@@ -67,7 +69,7 @@ def prepare(rigid: Rigid, settings: Settings = Settings()) -> Prepared:  # noqa:
                 np.array([each.rotation().matrix() for each in poses]),
             )
             v, w = (np.array([getattr(each, part)() for each in twists]) for part in ("translational", "rotational"))
-            return done * h, x, R, v, w
+            return done * h, x, R, v, w, UNTOLD  # it has no output of the forces of ball constraints
 
         return march(began, n_steps, n_stored, see, step)
 
@@ -110,7 +112,10 @@ def _plant(rigid: Rigid, settings: Settings, h: float) -> tuple[Any, list[Any]]:
             pose = mathematics.RigidTransform(mathematics.RotationMatrix.ProjectToRotationMatrix(R), at)
             name = f"{joint.name} on {end.name}"
             frames.append(plant.AddFrame(tree.FixedOffsetFrame(name, made[end.number].body_frame(), pose)))
-        plant.AddJoint(_joint(joint.name, found, frames))
+        stiffness, damping, angle = hinge_springs(rigid.model).get(joint.name, (0.0, 0.0, 0.0))
+        made_joint = plant.AddJoint(_joint(joint.name, found, frames, damping))
+        if stiffness:
+            plant.AddForceElement(tree.RevoluteSpring(made_joint, angle, stiffness))
     for a, on_a, b, on_b in cut_points(rigid):
         plant.AddBallConstraint(made[a.number], on_a, made[b.number], on_b)
     for a, on_a, b, on_b, (stiffness, damping, length) in springs(rigid.model):
@@ -120,7 +125,7 @@ def _plant(rigid: Rigid, settings: Settings, h: float) -> tuple[Any, list[Any]]:
     return plant, [made[body.number] for body in rigid.model.bodies]
 
 
-def _joint(name: str, found: list[tuple[str, Any]], frames: list[Any]) -> Any:
+def _joint(name: str, found: list[tuple[str, Any]], frames: list[Any], damping: float) -> Any:
     tree = _module("multibody.tree")
     kinds = tuple(kind for kind, _ in found)
     if kinds == (BALL,):
@@ -128,7 +133,9 @@ def _joint(name: str, found: list[tuple[str, Any]], frames: list[Any]) -> Any:
     if kinds == (HINGE, HINGE):
         return tree.UniversalJoint(name, *frames)
     if kinds in ((HINGE,), (SLIDE,)):
-        return (tree.RevoluteJoint if kinds == (HINGE,) else tree.PrismaticJoint)(name, *frames, found[0][1])
+        return (tree.RevoluteJoint if kinds == (HINGE,) else tree.PrismaticJoint)(
+            name, *frames, found[0][1], damping=damping
+        )
     raise ValueError(f"Drake is given hinges, slides, balls and universal joints; {name!r} is of {' and '.join(kinds)}")
 
 

@@ -7,11 +7,13 @@ import numpy as np
 
 from references.driver import imported
 from references.engines.rigid import (
+    UNTOLD,
     Motion,
     Prepared,
     Rigid,
     axis_of,
     coordinates,
+    hinge_springs,
     largest_moment,
     point_of,
     springs,
@@ -46,7 +48,7 @@ def prepare(rigid: Rigid, settings: Settings = Settings()) -> Prepared:  # noqa:
     problem = rigid.given if planar else rigid.model.problem((0.0, 1.0))
     dependent = bool(rigid.given.freedom.redundant)
     x, R, v, w = (each[None] for each in (rigid.x, rigid.R, rigid.v, rigid.w))
-    start = coordinates(Motion(np.zeros(1), x, R, v, w, 0.0, 0.0), planar)
+    start = coordinates(Motion(np.zeros(1), x, R, v, w, UNTOLD[None], 0.0, 0.0), planar)
 
     def build() -> Any:
         return _model(rigid, planar, *(each[:, 0].reshape(len(rigid.x), -1) for each in start))
@@ -55,24 +57,29 @@ def prepare(rigid: Rigid, settings: Settings = Settings()) -> Prepared:  # noqa:
         began = time.process_time()
         every = n_steps // n_stored
         steps = check_steps(problem, t_end, n_steps, settings.solver, every, None, settings.radius)
-        model = build()
+        model, sensor, axes = build()
         reference = np.concatenate(model.reference)
         made = run_exudyn(model.mbs, model.sensors, reference, steps, None, dependent)
         call = time.process_time() - began
         parts = states(planar, made.q, made.v)
-        return Motion(made.t, *parts, call, made.stats.cpu_time, "" if made.success else made.message)
+        f = np.full((made.t.size, 3), np.nan) if sensor < 0 else model.mbs.GetSensorStoredData(sensor)[:, 1:4]
+        if not planar and sensor >= 0:
+            f = np.einsum("tij,tj->ti", parts[1][:, rigid.loops[0].a.number] @ axes, f)
+        return Motion(made.t, *parts, f, call, made.stats.cpu_time, "" if made.success else made.message)
 
-    made = build()
+    made, *_ = build()
     masses, inertias = ([made.mbs.GetObject(body)[name] for body in made.bodies] for name in ("mass", "inertia"))
     moments = [J if planar else largest_moment(np.array([0.0, *np.array(J)[[0, 1, 2, 5, 4, 3]]])) for J in inertias]
     return Prepared(np.array(masses), np.array(moments), run)
 
 
-def _model(rigid: Rigid, planar: bool, q: Any, v: Any) -> Any:
+def _model(rigid: Rigid, planar: bool, q: Any, v: Any) -> tuple[Any, int, Any]:
+    """The model, a sensor of the force of the first joint that closes a loop, and its axes in its first body."""
     from references.exudyn.model import PRISMATIC, REVOLUTE, SPHERICAL, UNIVERSAL, Model, frame
 
     locked = {"revolute": REVOLUTE, "prismatic": PRISMATIC, "spherical": SPHERICAL, "universal": UNIVERSAL}
     model = Model(rigid.model.gravity)
+    sensor, own = -1, np.eye(3)
     for body, state, rate in zip(rigid.model.bodies, q, v, strict=True):
         mass, xx, yy, zz, xy, xz, yz = body.inertia.tolist()
         if planar:
@@ -82,7 +89,8 @@ def _model(rigid: Rigid, planar: bool, q: Any, v: Any) -> Any:
     for joint in rigid.model.joints:
         a, b = joint.a.number, joint.b.number
         if planar:
-            model.pin(a, tuple(point_of(joint.a, joint)[:2]), b, tuple(point_of(joint.b, joint)[:2]))
+            made = model.pin(a, tuple(point_of(joint.a, joint)[:2]), b, tuple(point_of(joint.b, joint)[:2]))
+            sensor = model.told(made, False) if joint.name == rigid.cut else sensor
             continue
         axes = [end.rotation @ axis_of(end, joint) for end in (joint.a, joint.b)]
         turned = frame(axes[0])
@@ -92,14 +100,23 @@ def _model(rigid: Rigid, planar: bool, q: Any, v: Any) -> Any:
             turned = np.column_stack([*axes, np.cross(*axes)])
         elif joint.kind not in locked:
             raise ValueError(f"Exudyn is given {', '.join(locked)} joints; {joint.name!r} is {joint.kind}")
-        cut = rigid.planar and joint.kind == "spherical"
+        flat = rigid.planar and joint.kind == "spherical"
+        turned = np.eye(3) if flat else turned
         point = joint.a.in_space(point_of(joint.a, joint))
-        model.joint(a, b, point, np.eye(3) if cut else turned, PLANAR_CUT if cut else locked[joint.kind])
+        made = model.joint(a, b, point, turned, PLANAR_CUT if flat else locked[joint.kind])
+        if joint.name == rigid.cut:
+            sensor, own = model.told(made, True), joint.a.rotation.T @ turned
     for one, at, other, there, values in springs(rigid.model):
         # Exudyn's planar bodies take points in their own axes, see Model.planar_body
         ends = (at, there) if planar else (one.in_space(at), other.in_space(there))
         model.spring(one.number, ends[0], other.number, ends[1], *values)
+    for name, values in hinge_springs(rigid.model).items():
+        joint = next(each for each in rigid.model.joints if each.name == name)
+        if not planar or rigid.model.ground not in (joint.a, joint.b):
+            raise ValueError(f"Exudyn is given springs in planar hinges on the ground; {name!r} is another joint")
+        sign = 1.0 if joint.a is rigid.model.ground else -1.0
+        model.turn(joint.body.number, *values[:2], sign * values[2])
     for k in np.flatnonzero(rigid.torques.any(axis=1)):
         model.torque(int(k), rigid.torques[k])
     model.mbs.Assemble()
-    return model
+    return model, sensor, own

@@ -36,6 +36,8 @@ def prepare(rigid: Rigid, settings: Settings = Settings()) -> Prepared:  # noqa:
     mujoco.set_mju_user_warning(lambda text: None)  # which it would put into a file in the folder of the caller
     model = mujoco.MjModel.from_xml_string(file_of(rigid, settings))
     bodies = [model.body(body.name).id for body in rigid.model.bodies]
+    of_cut = rigid.cut, f"{rigid.cut} 2"  # of a hinge, two connects
+    connects = [k for k in range(model.neq) if model.equality(k).name in of_cut]
 
     def run(t_end: float, n_steps: int, n_stored: int) -> Motion:
         began = time.process_time()
@@ -62,7 +64,10 @@ def prepare(rigid: Rigid, settings: Settings = Settings()) -> Prepared:  # noqa:
             for row, body in zip(twists, bodies, strict=True):
                 mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_BODY, body, row, 0)
             poses = data.xpos[bodies].copy(), data.xmat[bodies].reshape(-1, 3, 3).copy()
-            return data.time, *poses, twists[:, 3:], twists[:, :3]
+            state = data.time, *poses, twists[:, 3:], twists[:, :3]
+            mujoco.mj_forward(model, data)  # forces belong to the step before
+            own = (data.efc_type == mujoco.mjtConstraint.mjCNSTR_EQUALITY) & np.isin(data.efc_id, connects)
+            return *state, data.efc_force[own].reshape(-1, 3).sum(axis=0)
 
         return march(began, n_steps, n_stored, see, step)
 

@@ -11,12 +11,14 @@ from references.driver import imported
 from references.engines.rigid import (
     BALL,
     SLIDE,
+    UNTOLD,
     Motion,
     Prepared,
     Rigid,
     Seen,
     cut_points,
     freedoms,
+    hinge_springs,
     march,
     point_of,
     springs,
@@ -61,6 +63,7 @@ def prepare(rigid: Rigid, settings: Settings = Settings()) -> Prepared:  # noqa:
             gains.Kp, gains.Kd = settings.baumgarte**2, 2.0 * settings.baumgarte
             made.setBaumgarteCorrectorParameters(gains)
         constraints.append(made)
+    n_points = {"spherical": 1, "revolute": 2}[rigid.loops[0].kind] if rigid.loops else 0
     proximal = pin.ProximalSettings()
     if settings.mu is not None:
         proximal = pin.ProximalSettings(1e-14, settings.mu, settings.iterations)
@@ -107,7 +110,12 @@ def prepare(rigid: Rigid, settings: Settings = Settings()) -> Prepared:  # noqa:
                 np.array([pose.rotation @ getattr(twist, part) for pose, twist in zip(poses, twists, strict=True)])
                 for part in ("linear", "angular")
             )
-            return taken * h, x, R, speeds, spins
+            f = UNTOLD
+            if n_points:
+                acceleration(q, v)
+                turned = data.oMi[constraints[0].joint1_id].rotation @ constraints[0].joint1_placement.rotation
+                f = turned @ np.sum([each.contact_force.linear for each in list(datas)[:n_points]], axis=0)
+            return taken * h, x, R, speeds, spins, f
 
         return march(began, n_steps, n_stored, see, step)
 
@@ -159,7 +167,12 @@ def _force(
 ) -> Callable[[Array, Array], Array]:
     """Generalised forces of springs and constant torques, as a function of q and v."""
     known, turning = springs(rigid.model), np.flatnonzero(rigid.torques.any(axis=1))
-    if not known and not turning.size:
+    hinges = [
+        (model.joints[frames[body][0]], values)
+        for body, (_, joint) in rigid.parents.items()
+        if (values := hinge_springs(rigid.model).get(joint.name))
+    ]
+    if not known and not hinges and not turning.size:
         zero = np.zeros(model.nv)
         return lambda q, v: zero
 
@@ -174,6 +187,8 @@ def _force(
                 tau[:] += J[:3].T @ f + J[3:].T @ (np.cross(point - data.oMi[joint].translation, f) + torque)
 
         zero = np.zeros(3)
+        for joint, (stiffness, damping, angle) in hinges:
+            tau[joint.idx_v] -= stiffness * (q[joint.idx_q] - angle) + damping * v[joint.idx_v]
         for k in turning:
             pull(int(k), zero, zero, rigid.torques[k])
         for a, on_a, b, on_b, (stiffness, damping, length) in known:

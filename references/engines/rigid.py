@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from twoloop.bodies import SpatialModel
 from twoloop.bodies.model_problem import ModelProblem
-from twoloop.bodies.parameter_layout import SPRING, TORQUE
+from twoloop.bodies.parameter_layout import SPRING, TORQUE, TORSION
 from twoloop.bodies.parts import Body, ModelJoint
 from twoloop.bodies.spanning_tree import spanning_tree
 from twoloop.mechanisms.rotation import G, euler_parameters, euler_rates, rotation_matrix
@@ -40,6 +40,8 @@ class Motion:
         Centres of mass (m), their velocities (m/s), angular velocities along the axes of space (rad/s).
     R : ndarray (n_t, n_bodies, 3, 3)
         Their columns are the axes of the bodies.
+    f : ndarray (n_t, 3)
+        Force of the first joint that closes a loop on its `body`, along the axes of space, N; NaN: not told.
     call_s, stepping_s : float
         CPU time of the call on a model that has been built, and of its steps alone, s.
     message : str
@@ -51,6 +53,7 @@ class Motion:
     R: Array
     v: Array
     w: Array
+    f: Array
     call_s: float
     stepping_s: float
     message: str = ""
@@ -73,7 +76,8 @@ class Prepared:
     run: Callable[[float, int, int], Motion]
 
 
-Seen = tuple[float, Array, Array, Array, Array]  # t, x, R, v, w of `Motion` at one instant
+Seen = tuple[float, Array, Array, Array, Array, Array]  # t, x, R, v, w, f of `Motion` at one instant
+UNTOLD = np.full(3, np.nan)
 
 
 def march(began: float, n_steps: int, n_stored: int, see: Callable[[], Seen], step: Callable[[int], str]) -> Motion:
@@ -88,14 +92,14 @@ def march(began: float, n_steps: int, n_stored: int, see: Callable[[], Seen], st
         message = step(int(n))
         spent += time.process_time() - start
         state = see()
-        if not message and not all(np.isfinite(each).all() for each in state):
+        if not message and not all(np.isfinite(each).all() for each in state[:-1]):
             message = "the state is not finite"
         if message:
             message = f"at {state[0]:.3g} s or before: {message}"
             break
         stored.append(state)
-    t, x, R, v, w = (np.array(each) for each in zip(*stored, strict=True))
-    return Motion(t, x, R, v, w, time.process_time() - began, spent, message)
+    t, x, R, v, w, f = (np.array(each) for each in zip(*stored, strict=True))
+    return Motion(t, x, R, v, w, f, time.process_time() - began, spent, message)
 
 
 @dataclass(frozen=True)
@@ -126,6 +130,11 @@ class Rigid:
     parents: dict[int, tuple[Body, ModelJoint]]
     loops: list[ModelJoint]
     torques: Array
+
+    @property
+    def cut(self) -> str:
+        """The name of the first joint that closes a loop; nothing of a tree."""
+        return self.loops[0].name if self.loops else ""
 
     def rates(self, body: Body) -> Array:
         """Start velocities of the joint above a body, in the order of `freedoms`; a ball's in the axes of the body."""
@@ -207,17 +216,32 @@ def springs(model: Any) -> list[tuple[Body, Array, Body, Array, tuple[float, ...
     ]
 
 
+def hinge_springs(model: Any) -> dict[str, tuple[float, float, float]]:
+    """By name of a hinge stiffness and damping of the spring in it, and the angle from the start at which it rests."""
+    found = {}
+    for each in model.forces:
+        if each.kind == TORSION:
+            stiffness, damping, angle = each.more.values
+            if model.dimension == 2:  # whose springs rest at an angle between the axes of the bodies
+                angle -= each.second.rotation - each.first.rotation
+            found[each.joint.name] = stiffness, damping, angle
+    return found
+
+
 def rigid_of(problem: ModelProblem) -> Rigid:
     """What engines are given of a model in a plane or in space.
 
     Raises
     ------
     ValueError
-        If it holds a drive, or a force that is neither a spring between points nor a constant torque.
+        If it holds a drive, a force that is neither a spring nor a constant torque, or a spring in a joint that closes
+        a loop.
     """
     given: Any = problem.model
     wrong = [each.name for each in given.joints if each.kind == "drive"]
-    wrong += [f.name for f in given.forces if f.kind not in (SPRING, TORQUE) or f.function is not None]
+    wrong += [f.name for f in given.forces if f.kind not in (SPRING, TORQUE, TORSION) or f.function]
+    cuts = {joint.name for joint in spanning_tree(given)[1]}
+    wrong += [name for name in hinge_springs(given) if name in cuts]
     if wrong:
         raise ValueError(f"engines are given bodies, joints, springs and constant torques alone; not {wrong[0]!r}")
     planar = given.dimension == 2
@@ -253,6 +277,8 @@ def _in_space(given: Any, x: Array, R: Array, v: Array, w: Array) -> SpatialMode
     for one, at, other, there, (stiffness, damping, length) in springs(given):
         ends = [np.append(body.in_space(place), 0.0) for body, place in ((one, at), (other, there))]
         model.spring(one.name, ends[0], other.name, ends[1], stiffness=stiffness, damping=damping, length=length)
+    for name, (stiffness, damping, angle) in hinge_springs(given).items():
+        model.torsion_spring(name, stiffness=stiffness, damping=damping, angle=angle)
     return model
 
 
@@ -294,21 +320,3 @@ def coordinates(motion: Motion, planar: bool) -> tuple[Array, Array]:
             q[i, k, 3:] = euler_parameters(motion.R[i, k])
             v[i, k, 3:] = euler_rates(q[i, k, 3:], motion.w[i, k])
     return q.reshape(n_t, -1).T, v.reshape(n_t, -1).T
-
-
-def gaps(rigid: Rigid, x: Array, R: Array) -> Array:
-    """Largest distance between points of bodies that joints put together, m, at each instant (n_t,)."""
-    found = np.zeros(len(x))
-    for joint in rigid.model.joints:
-        places = []
-        for body in (joint.a, joint.b):
-            point = point_of(body, joint)
-            ground = body is rigid.model.ground
-            places.append(point[None] if ground else x[:, body.number] + R[:, body.number] @ point)
-        apart = places[1] - places[0]
-        if joint.kind in ("prismatic", "cylindrical"):
-            body, axis = joint.a, joint.axes[0]
-            along = axis[None] if body is rigid.model.ground else R[:, body.number] @ axis
-            apart = apart - np.sum(apart * along, axis=1)[:, None] * along
-        found = np.maximum(found, np.linalg.norm(apart, axis=1))
-    return found

@@ -16,11 +16,13 @@ from exudyn.itemInterface import (
     NodeRigidBody2D,
     NodeRigidBodyEP,
     ObjectConnectorCoordinate,
+    ObjectConnectorCoordinateSpringDamper,
     ObjectConnectorSpringDamper,
     ObjectGround,
     ObjectJointRevolute2D,
     ObjectRigidBody,
     ObjectRigidBody2D,
+    SensorObject,
 )
 from numpy.typing import ArrayLike, NDArray
 
@@ -80,14 +82,14 @@ class Model:
         centre, R = self.places[body]
         return self.bodies[body], (R.T @ (point - centre)).tolist(), R
 
-    def joint(self, i: int, j: int, point: ArrayLike, frame: Array, locked: list[int]) -> None:
+    def joint(self, i: int, j: int, point: ArrayLike, frame: Array, locked: list[int]) -> int:
         """Lock motions of body j relative to i in the axes of a frame at a point, both as at the start in space."""
         markers = []
         for body in (i, j):
             number, local, R = self._local(body, point)
             place = exu.HT(rotation=R.T @ frame, translation=local)  # type: ignore[call-arg]  # its stub lags behind
             markers.append(self.mbs.AddMarker(MarkerBodyRigid(bodyNumber=number, localHT=place)))
-        self.mbs.AddObject(GenericJoint(markerNumbers=markers, constrainedAxes=locked))
+        return int(self.mbs.AddObject(GenericJoint(markerNumbers=markers, constrainedAxes=locked)))
 
     def spring(self, i: int, a: ArrayLike, j: int, b: ArrayLike, *data: float) -> None:
         """A spring-damper between points of space at the start: stiffness, damping, length."""
@@ -96,11 +98,11 @@ class Model:
         properties: dict[str, Any] = {"stiffness": stiffness, "damping": damping, "referenceLength": length}
         self.mbs.AddObject(ObjectConnectorSpringDamper(markerNumbers=markers, **properties))
 
-    def pin(self, i: int, a: tuple[float, float], j: int, b: tuple[float, float]) -> None:
+    def pin(self, i: int, a: tuple[float, float], j: int, b: tuple[float, float]) -> int:
         """A pin between points of two planar bodies, each in the axes of its body."""
         numbers = (self.ground if body == GROUND else self.bodies[body] for body in (i, j))
         markers = [self._marker(number, [*point, 0.0]) for number, point in zip(numbers, (a, b), strict=True)]
-        self.mbs.AddObject(ObjectJointRevolute2D(markerNumbers=markers))
+        return int(self.mbs.AddObject(ObjectJointRevolute2D(markerNumbers=markers)))
 
     def _marker(self, number: int, local: list[float]) -> int:
         return int(self.mbs.AddMarker(MarkerBodyPosition(bodyNumber=number, localPosition=local)))
@@ -110,14 +112,27 @@ class Model:
         marker = self.mbs.AddMarker(MarkerBodyRigid(bodyNumber=self.bodies[body]))
         self.mbs.AddLoad(LoadTorqueVector(markerNumber=marker, loadVector=np.asarray(torque, dtype=float).tolist()))
 
-    def hold(self, body: int, coordinate: int) -> None:
-        """Keep a coordinate of a body."""
+    def turn(self, body: int, stiffness: float, damping: float, angle: float) -> None:
+        """A torsional spring between the ground and a planar body, at rest where this has turned by an angle."""
+        properties: dict[str, Any] = {"stiffness": stiffness, "damping": damping, "offset": angle}
+        self.mbs.AddObject(ObjectConnectorCoordinateSpringDamper(markerNumbers=self._coordinate(body, 2), **properties))
+
+    def _coordinate(self, body: int, coordinate: int) -> list[int]:
         fixed = self.mbs.AddNode(NodePointGround())
-        markers = [
+        return [
             self.mbs.AddMarker(MarkerNodeCoordinate(nodeNumber=node, coordinate=k))
             for node, k in ((fixed, 0), (self.nodes[body], coordinate))
         ]
-        self.mbs.AddObject(ObjectConnectorCoordinate(markerNumbers=markers))
+
+    def told(self, joint: int, local: bool) -> int:
+        """A sensor of the force of a joint; `local`: in the axes of its first marker."""
+        kind = exu.OutputVariableType.ForceLocal if local else exu.OutputVariableType.Force
+        options: dict[str, Any] = {"storeInternal": True, "writeToFile": False, "outputVariableType": kind}
+        return int(self.mbs.AddSensor(SensorObject(objectNumber=joint, **options)))
+
+    def hold(self, body: int, coordinate: int) -> None:
+        """Keep a coordinate of a body."""
+        self.mbs.AddObject(ObjectConnectorCoordinate(markerNumbers=self._coordinate(body, coordinate)))
 
 
 def frame(z: ArrayLike) -> Array:

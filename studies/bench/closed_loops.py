@@ -39,6 +39,7 @@ from twoloop.mechanisms.andrews import (
     D,
     U,
 )
+from twoloop.mechanisms.rotation import rotation_matrix
 
 Array = NDArray[np.float64]
 
@@ -53,15 +54,15 @@ def _closing(one: Array, r: float, other: Array, s: float, side: float = 1.0) ->
 
 
 def _linkage(
-    name: str, crank: float, coupler: float, rocker: float, base: float, angle: float, rate: float
+    name: str, crank: float, coupler: float, rocker: float, base: float, angle: float, rate: float, ratio: float = 1.0
 ) -> PlanarModel:
-    """A four-bar linkage of uniform rods of 1 kg/m, its crank at an angle and turning."""
+    """A four-bar linkage of uniform rods of 1 kg/m, the coupler `ratio` times lighter, its crank turning."""
     O, C = np.zeros(2), np.array([base, 0.0])
     A = crank * np.array([math.cos(angle), math.sin(angle)])
     B = _closing(A, coupler, C, rocker)
     model = PlanarModel(name=name)
     model.rod("crank", O, A, mass=crank, angular_velocity=rate)
-    model.rod("coupler", A, B, mass=coupler)
+    model.rod("coupler", A, B, mass=coupler / ratio)
     model.rod("rocker", B, C, mass=rocker)
     for pair, at in (
         (("ground", "crank"), O),
@@ -75,9 +76,13 @@ def _linkage(
 
 def four_bar() -> ModelProblem:
     """The four-bar of the paper, 1, 2 and 1.5 m on 3 m, as the library starts it."""
+    return _published("four-bar").problem((0.0, 10.0))
+
+
+def _published(name: str) -> PlanarModel:
     known = ready_four_bar()
     q, v = known.q0.reshape(3, 3), known.v0.reshape(3, 3)
-    model = PlanarModel(name="four-bar")
+    model = PlanarModel(name=name)
     lengths = (1.0, 2.0, 1.5)
     for k, long in enumerate(lengths):
         motion = {"velocity": v[k, :2], "angular_velocity": v[k, 2]}
@@ -89,12 +94,40 @@ def four_bar() -> ModelProblem:
     for pair, at in ((("ground", "bar 1"), (0.0, 0.0)), (("bar 1", "bar 2"), ends[0]), (("bar 2", "bar 3"), ends[1])):
         model.revolute(*pair, at=at)
     model.revolute("bar 3", "ground", at=(3.0, 0.0))
-    return model.problem((0.0, 10.0))
+    return model
+
+
+CRANK_ROCKER = (0.5, 2.0, 1.5, 1.8, 0.5, 8.0)
 
 
 def crank_rocker() -> ModelProblem:
     """A four-bar whose crank turns round: 0.5, 2 and 1.5 m on 1.8 m."""
-    return _linkage("crank-rocker", 0.5, 2.0, 1.5, 1.8, 0.5, 8.0).problem((0.0, 10.0))
+    return _linkage("crank-rocker", *CRANK_ROCKER).problem((0.0, 10.0))
+
+
+def light_coupler() -> ModelProblem:
+    """The crank-rocker with a coupler a hundred times lighter."""
+    return _linkage("coupler of 1:100", *CRANK_ROCKER, 100.0).problem((0.0, 10.0))
+
+
+def lighter_coupler() -> ModelProblem:
+    """The crank-rocker with a coupler ten thousand times lighter."""
+    return _linkage("coupler of 1:10000", *CRANK_ROCKER, 1e4).problem((0.0, 10.0))
+
+
+def driven() -> ModelProblem:
+    """The crank-rocker, a motor at its crank: 5 N m s/rad times what is missing to 8 rad/s."""
+    model = _linkage("speed motor", *CRANK_ROCKER)
+    model.torque("crank", 5.0 * 8.0)
+    model.torsion_spring(model.joints[0], stiffness=0.0, damping=5.0)
+    return model.problem((0.0, 10.0))
+
+
+def servo() -> ModelProblem:
+    """The four-bar, a PD motor at its first bar that turns it by 0.5 rad: 200 N m/rad and 5 N m s/rad."""
+    model = _published("PD motor")
+    model.torsion_spring(model.joints[0], stiffness=200.0, damping=5.0, angle=0.5)
+    return model.problem((0.0, 10.0))
 
 
 def parallelogram() -> ModelProblem:
@@ -207,15 +240,24 @@ def _turned(angle: float, x: float, y: float) -> Array:
 
 def rssr() -> ModelProblem:
     """A spatial four-bar with two hinges and two ball joints."""
-    model = SpatialModel(name="RSSR")
-    O, P, S, T = (0.0, 0.0, 0.0), (0.3, 0.0, 0.0), (0.9, 0.0, 1.0), (0.9, 0.0, 0.3)
-    model.rod("crank", O, P, radius=0.02, mass=0.8, angular_velocity=(0.0, 0.0, 6.0))
-    for name, start, end in (("coupler", P, S), ("rocker", T, S)):
-        model.rod(name, start, end, radius=0.02, mass=0.8)
-    model.revolute("ground", "crank", at=O, axis=(0.0, 0.0, 1.0))
+    return _rssr("RSSR", np.eye(3))
+
+
+def turned_rssr() -> ModelProblem:
+    """The same, turned in space with its gravity, about no axis of the frame."""
+    return _rssr("RSSR, turned", rotation_matrix(np.array([0.5, 0.7, -0.1, 0.5])))
+
+
+def _rssr(name: str, Q: Array) -> ModelProblem:
+    model = SpatialModel(gravity=Q @ [0.0, 0.0, -9.81], name=name)
+    O, P, S, T = np.array([(0.0, 0.0, 0.0), (0.3, 0.0, 0.0), (0.9, 0.0, 1.0), (0.9, 0.0, 0.3)]) @ Q.T
+    model.rod("crank", O, P, radius=0.02, mass=0.8, angular_velocity=6.0 * Q[:, 2])
+    for part, start, end in (("coupler", P, S), ("rocker", T, S)):
+        model.rod(part, start, end, radius=0.02, mass=0.8)
+    model.revolute("ground", "crank", at=O, axis=Q[:, 2])
     model.spherical("crank", "coupler", at=P)
     model.spherical("coupler", "rocker", at=S)
-    model.revolute("rocker", "ground", at=T, axis=(0.0, 1.0, 0.0))
+    model.revolute("rocker", "ground", at=T, axis=Q[:, 1])
     return model.problem((0.0, 5.0))
 
 
@@ -280,3 +322,4 @@ MECHANISMS = (
     *(four_bar, crank_rocker, parallelogram, six_bar, slider_crank, squeezer, closed_chain),
     *(rssr, bricard, governor, stewart),
 )
+VARIANTS = (driven, servo, light_coupler, lighter_coupler, turned_rssr)

@@ -14,7 +14,6 @@ from references.engines.rigid import (
     Prepared,
     Rigid,
     coordinates,
-    gaps,
     largest_moment,
     rigid_of,
     states,
@@ -23,6 +22,7 @@ from references.engines.rigid import (
 from studies.bench.closed_loops import parallelogram, parallelogram_motion
 from studies.bench.store import Array, Row
 from twoloop import ConstraintWarning, solve_dae
+from twoloop.audit.poses import gaps
 from twoloop.bodies.model_problem import ModelProblem
 
 INSTANTS = 50  # beside the start, at which motions are compared
@@ -80,12 +80,34 @@ class Loop:
         runs = [self.ours(TIGHT, method, self.times) for method in ("DOP853", "RadauIIA9")]
         if not all(run.success for run in runs):
             raise RuntimeError(next(run.message for run in runs if not run.success))
-        one, other = (self.motion(run.q, run.v) for run in runs)
+        one, other = (self.motion(run.q, run.v, self.force(run)) for run in runs)
         return one, float(max(np.abs(one.x - other.x).max(), np.abs(one.R - other.R).max()))
 
-    def motion(self, q: Array, v: Array, call_s: float = 0.0, stepping_s: float = 0.0) -> Motion:
+    @cached_property
+    def kinetic(self) -> float:
+        """The largest kinetic energy of the reference, J."""
+        known, bodies = self.reference[0], self.rigid.model.bodies
+        J = np.array([tensor(body.inertia) for body in bodies])
+        local = np.einsum("tkji,tkj->tki", known.R, known.w)
+        m = np.array([body.inertia[0] for body in bodies])
+        each = m * (known.v**2).sum(axis=2) + np.einsum("tki,kij,tkj->tk", local, J, local)
+        return float(0.5 * each.sum(axis=1).max())
+
+    def force(self, run: Any) -> Array:
+        """Of the first joint that closes a loop in a run of ours, as in `Motion`; NaN if it is not unique."""
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", ConstraintWarning)
+            made = run.reactions(self.rigid.cut)
+        if not made.unique:
+            return np.full((run.t.size, 3), np.nan)
+        return np.pad(made.force.T, ((0, 0), (0, 3 - len(made.force))))
+
+    def motion(
+        self, q: Array, v: Array, f: Array | None = None, call_s: float = 0.0, stepping_s: float = 0.0
+    ) -> Motion:
         """Of coordinates of the model, at the instants."""
-        return Motion(self.times[: q.shape[1]], *states(self.rigid.planar, q, v), call_s, stepping_s)
+        f = np.full((q.shape[1], 3), np.nan) if f is None else f
+        return Motion(self.times[: q.shape[1]], *states(self.rigid.planar, q, v), f, call_s, stepping_s)
 
     @cached_property
     def start_rates(self) -> dict[float, tuple[Array, Array]]:
@@ -117,7 +139,7 @@ def gate(loop: Loop, prepared: Prepared) -> str:
         pose = max(np.abs(motion.x[0] - rigid.x).max(), np.abs(motion.R[0] - rigid.R).max())
         if pose > SAME_POSE:
             return f"the pose at the start is off by {pose:.2g}"
-        gap = gaps(rigid, motion.x, motion.R)[-1]
+        gap = gaps(rigid.model, motion.x, motion.R)[-1]
         wrong = _accelerated(loop, motion, span) or (
             f"joints gape by {gap:.2g} m at the start" if gap > SAME_PLACE else ""
         )
@@ -145,18 +167,15 @@ def errors(loop: Loop, motion: Motion) -> Row:
     (known, _), rigid = loop.reference, loop.rigid
     off = max(np.abs(motion.x - known.x).max(), np.abs(motion.R - known.R).max())
     fastest = max(np.linalg.norm(known.v, axis=2).max(), 1e-12)
-    energies, kinetic = [], 0.0
-    for each in (motion, known):
-        energies.append(loop.problem.energy(each.t, *coordinates(each, rigid.planar)))
-    J = np.array([tensor(body.inertia) for body in rigid.model.bodies])
-    local = np.einsum("tkji,tkj->tki", known.R, known.w)
-    m = np.array([body.inertia[0] for body in rigid.model.bodies])
-    kinetic = 0.5 * (m * (known.v**2).sum(axis=2) + np.einsum("tki,kij,tkj->tk", local, J, local)).sum(axis=1).max()
+    energies = [loop.problem.energy(each.t, *coordinates(each, rigid.planar)) for each in (motion, known)]
+    d = 2 if rigid.planar else 3  # what holds a mechanism in its plane is not unique
+    f = np.abs(motion.f - known.f)[:, :d].max() / np.abs(known.f[:, :d]).max()
     return {
+        "error_f": float(f),
         "error_q": float(off),
         "error_v": float(np.abs(motion.v - known.v).max() / fastest),
-        "gap": float(gaps(rigid, motion.x, motion.R).max()),
-        "energy": float(np.abs(energies[0] - energies[1]).max() / kinetic),
+        "gap": float(gaps(rigid.model, motion.x, motion.R).max()),
+        "energy": float(np.abs(energies[0] - energies[1]).max() / loop.kinetic),
     }
 
 

@@ -1,5 +1,7 @@
 """Models from MJCF and back: the same motion as those written by hand."""
 
+import warnings
+
 import numpy as np
 import pytest
 
@@ -248,6 +250,51 @@ def test_defaults_of_tendons_and_what_else_was_passed_over(tmp_path):
     problem = model.problem()
     assert [value for name, value in problem.parameters.items() if "spring" in name][-3:] == [7.0, 2.0, 1.0]
     assert len(problem.joints) == 0
+
+
+@pytest.mark.parametrize(
+    ("flag", "loops", "springs", "dampers"),
+    [
+        ("", 1, 1, 1),
+        ("equality", 0, 1, 1),
+        ("constraint", 0, 1, 1),
+        ("spring", 1, 0, 1),
+        ("damper", 1, 1, 0),
+        ("passive", 1, 0, 0),
+    ],
+)
+def test_what_flags_disable_is_not_there(flag, loops, springs, dampers, tmp_path):
+    geom = "<geom fromto='0 0 0 1 0 0' size='0.1' type='capsule'/>"
+    body = f"<body name='{{}}'><joint stiffness='3' damping='2'/>{geom}</body>"
+    option = f"<option><flag {flag}='disable'/></option>" if flag else ""
+    equality = "<equality><connect body1='a' body2='b' anchor='1 0 0'/></equality>"
+    path = tmp_path / "flags.xml"
+    path.write_text(f"<mujoco>{option}<worldbody>{body.format('a')}{body.format('b')}</worldbody>{equality}</mujoco>")
+    with pytest.warns(IgnoredWarning, match="contacts between geoms"):
+        model = from_mjcf(path)
+    assert sum(joint.kind == "spherical" for joint in model.joints) == loops
+    values = [force.more.values[:2] for force in model.forces] or [(0.0, 0.0)]
+    assert values[0] == (3.0 * springs, 2.0 * dampers)
+
+
+def test_the_mass_of_a_mesh_is_missed_where_it_counts_only(tmp_path):
+    path = tmp_path / "mesh.xml"
+    geom = "<geom type='mesh' contype='0' conaffinity='0'{}/>"
+    inertial = "<inertial pos='0 0 1' mass='2' diaginertia='1 1 1'/>"
+    for more, weighed in (("", True), (" mass='0'", False), (" density='0'", False)):
+        own = f"<body><joint/>{geom.format(more)}<geom size='0.1'/></body>"
+        path.write_text(f"<mujoco><worldbody>{own}</worldbody></mujoco>")
+        model = _read(path)
+        assert any("the mass of" in each for each in model.ignored) == weighed
+    path.write_text(f"<mujoco><worldbody><body><joint/>{geom.format('')}{inertial}</body></worldbody></mujoco>")
+    model = from_mjcf(path)
+    assert model.ignored == () and model.bodies[0].inertia[0] == 2.0
+
+
+def _read(path):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", IgnoredWarning)
+        return from_mjcf(path)
 
 
 def test_accelerations_of_a_tree_are_those_of_mujoco(tmp_path):

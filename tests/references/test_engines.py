@@ -7,10 +7,26 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from references.engines import drake, exudyn_bodies, mujoco, pinocchio
-from references.engines.rigid import coordinates, cut_points, gaps, rigid_of
-from studies.bench.closed_loops import MECHANISMS, bricard, closed_chain, parallelogram, rssr, squeezer, stewart
+from references.engines.rigid import coordinates, cut_points, rigid_of
+from studies.bench.closed_loops import (
+    MECHANISMS,
+    VARIANTS,
+    bricard,
+    closed_chain,
+    driven,
+    parallelogram,
+    rssr,
+    servo,
+    slider_crank,
+    squeezer,
+    stewart,
+    turned_rssr,
+)
 from studies.bench.engine_runs import Loop, errors, gate
+from twoloop import audit
+from twoloop.audit.poses import gaps
 from twoloop.bodies import PlanarModel, SpatialModel
+from twoloop.bodies.parameter_layout import TORSION
 
 RIGID = {
     "mujoco": (mujoco, mujoco.Settings("RK4", "1e-9 1", "0.9999 0.9999 0.001"), "mujoco"),
@@ -29,8 +45,8 @@ def prepared(engine, rigid):
 
 @pytest.fixture(scope="module")
 def loops():
-    """A planar mechanism with a spring and a torque, and one in space with tensors, turned axes and swapped bodies."""
-    return Loop(squeezer()), Loop(crooked())
+    """In a plane with a spring and a torque; in space with tensors, turned axes and swapped bodies; with a slide."""
+    return Loop(squeezer()), Loop(crooked()), Loop(replace(slider_crank(), t_span=(0.0, 0.5)))
 
 
 def crooked():
@@ -51,7 +67,7 @@ def crooked():
 
 
 @engines
-@pytest.mark.parametrize("k", [0, 1])
+@pytest.mark.parametrize("k", [0, 1, 2])
 def test_models_pass_the_gates_and_move_as_they_should(loops, engine, k):
     ready = prepared(engine, loops[k].rigid)
     assert gate(loops[k], ready) == ""
@@ -86,6 +102,42 @@ def test_gates_catch_a_loop_an_inertia_a_mass_and_a_torque(loops, engine):
     assert "accelerations" in gate(loop, prepared(engine, turned))
 
 
+@engines
+@pytest.mark.parametrize("make", [driven, servo])
+def test_motors_do_what_they_should(engine, make):
+    loop = Loop(replace(make(), t_span=(0.0, 1.0)))
+    off = errors(loop, prepared(engine, loop.rigid).run(1.0, 2000, 50))
+    assert off["error_q"] < 0.02 and off["error_v"] < 0.02
+    idle = [force for force in loop.problem.model.forces if force.kind != TORSION]
+    loop.problem.model.forces[:] = idle
+    without = rigid_of(loop.problem)
+    assert errors(loop, prepared(engine, without).run(1.0, 2000, 50))["error_q"] > 0.1
+
+
+def leaning():
+    """Two bars that lean on one another, at rest, and a pendulum that moves: forces by hand, without any solver."""
+    model = PlanarModel(name="leaning")
+    model.rod("left", (0.0, 0.0), (1.0, 1.5), mass=1.0)
+    model.rod("right", (1.0, 1.5), (2.4, 0.2), mass=2.0)
+    model.rod("pendulum", (3.0, 0.0), (3.5, 0.0), mass=1.0)
+    for a, b, at in (("ground", "left", (0.0, 0.0)), ("left", "right", (1.0, 1.5)), ("right", "ground", (2.4, 0.2))):
+        model.revolute(a, b, at=at)
+    model.revolute("ground", "pendulum", at=(3.0, 0.0))
+    return model.problem((0.0, 0.1))
+
+
+@pytest.mark.parametrize("engine", [name for name in RIGID if name != "drake"])
+def test_the_force_of_a_joint_has_the_sign_of_ours_at_rest_and_its_size_in_motion(engine):
+    loop = Loop(leaning())
+    # moments about the feet: of the left bar x 1.5 - y 1 = -g 0.5, of the right one with the opposite force
+    f = np.linalg.solve([[1.5, -1.0], [1.3, 1.4]], [-9.81 * 0.5, -2.0 * 9.81 * 0.7])
+    for told in (loop.reference[0].f, prepared(engine, loop.rigid).run(0.1, 1000, 50).f):
+        np.testing.assert_allclose(told[:, :2], np.tile(f, (51, 1)), rtol=2e-3)
+    turned = Loop(replace(turned_rssr(), t_span=(0.0, 0.2)))
+    assert errors(turned, prepared(engine, turned.rigid).run(0.2, 2000, 50))["error_f"] < 0.02
+    assert np.isnan(Loop(replace(bricard(), t_span=(0.0, 0.05))).reference[0].f).all()  # not unique
+
+
 @pytest.mark.parametrize(("engine", "order"), [("mujoco", 1.7), ("drake", 0.8), ("pinocchio", 3.5), ("exudyn", 1.8)])
 def test_errors_fall_with_the_step(engine, order):
     problem = rssr()
@@ -94,6 +146,19 @@ def test_errors_fall_with_the_step(engine, order):
     off = [errors(loop, run(0.2, n, 50)) for n in (50, 200)]
     assert np.log(off[0]["error_q"] / off[1]["error_q"]) / np.log(4.0) > order
     assert off[1]["error_v"] < 0.05 and off[1]["gap"] < 1e-3
+
+
+@pytest.mark.parametrize("engine", ["pinocchio", "exudyn"])
+def test_an_engine_is_audited_by_a_small_adapter(engine):
+    problem = replace(rssr(), t_span=(0.0, 0.2))
+    run = prepared(engine, rigid_of(problem)).run
+
+    def simulate(problem, times, step):
+        motion = run(times[-1], round(times[-1] / step), len(times) - 1)
+        return audit.coordinates(motion.x, motion.R)
+
+    made = audit.audit_simulator(simulate, problem, step=2e-3, error=1e-4)
+    assert made.order > 1.7 and made.reaching.error <= 1e-4
 
 
 def test_mujoco_has_the_masses_and_moments_that_it_is_given():
@@ -115,14 +180,14 @@ def test_pinocchio_adds_joints_branch_by_branch():
     assert len(frames) == 14
 
 
-@pytest.mark.parametrize("make", MECHANISMS)
+@pytest.mark.parametrize("make", (*MECHANISMS, *VARIANTS))
 def test_loops_are_cut_between_bodies_that_move_and_close(make):
     problem = closed_chain(6) if make is closed_chain else make()
     rigid = rigid_of(problem)
     for a, on_a, b, on_b in cut_points(rigid):
         assert rigid.model.ground not in (a, b)
         np.testing.assert_allclose(a.in_space(on_a), b.in_space(on_b), atol=1e-12)
-    assert gaps(rigid, rigid.x[None], rigid.R[None])[0] < 1e-12
+    assert gaps(rigid.model, rigid.x[None], rigid.R[None])[0] < 1e-12
     assert problem.freedom.degrees >= 1
 
 

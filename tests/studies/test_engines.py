@@ -4,12 +4,13 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from studies import engines
 from studies.bench.closed_loops import four_bar
 from studies.bench.render import render
+from studies.engines import study as engines
+from twoloop.audit.step_audit import order_and_floor
 
 STEPS = np.array([1e-2, 3e-3, 1e-3, 3e-4])
-RUNS = {"family": "MuJoCo", "status": "REACHED_END", "message": "", "floor": 1e-11, "gap": 1e-6}
+RUNS = {"family": "MuJoCo", "status": "REACHED_END", "message": "", "floor": 1e-11, "gap": 1e-6, "span": 1.0}
 
 
 def made(solver, errors, cost=1.0, case="four-bar", **more):
@@ -26,16 +27,15 @@ def said(*parts):
     head = pd.DataFrame(gates).assign(status=["PASSED", "NOT_AVAILABLE"], message=["", "drake is not installed"])
     rows = pd.concat([head, *parts], ignore_index=True)
     found = engines.findings_of(rows)
-    tables = engines.tables_of(rows, found)
-    return found, render("engines", found, tables, stamp="stamp", quick=False, rows=rows)
+    return found, render("engines", found, {}, stamp="stamp", quick=False, rows=rows)
 
 
 def test_order_and_floor():
-    order, floor = engines.order_and_floor(STEPS, 50.0 * STEPS**2, 1e-12)
+    order, floor = order_and_floor(STEPS, 50.0 * STEPS**2, 1e-12)
     assert order == pytest.approx(2.0) and floor is None
-    order, floor = engines.order_and_floor(STEPS, [1e-2, 1.2e-3, 1.1e-3, 1.1e-3], 1e-12)
+    order, floor = order_and_floor(STEPS, [1e-2, 1.2e-3, 1.1e-3, 1.1e-3], 1e-12)
     assert order is None and floor == 1.1e-3
-    assert engines.order_and_floor(STEPS, [1.9, 1.8, 1.9, 1.8], 1e-12) == (None, None)  # the motion is lost
+    assert order_and_floor(STEPS, [1.9, 1.8, 1.9, 1.8], 1e-12) == (None, None)  # the motion is lost
 
 
 def test_what_to_set_and_what_is_wrong_follow_the_rows():
@@ -46,17 +46,42 @@ def test_what_to_set_and_what_is_wrong_follow_the_rows():
     by_name = {each["name"]: each for each in found["configurations"]}
     assert by_name["MuJoCo, default"]["silent"] == 4 and by_name["MuJoCo, default"]["lost"] == 1
     assert by_name["MuJoCo, default"]["floor"] == [0.28, 0.28]
-    assert found["wins_engines"][1] == {"MuJoCo": 1} and found["wins_at"][1] == {"twoloop": 1}
-    assert "RK4, solref 2h: 1 of 1, h = 10 ms" in text and "Not installed, and so without rows: Drake." in text
+    best = by_name["MuJoCo, RK4, solref 2h"]
+    assert best["gross"] == 0 and best["silent"] == 0 and best["order"][1] == pytest.approx(2.0)
+    assert found["wins_engines"][1] == {"MuJoCo": 1} and found["wins_all"][1] == {"twoloop": 1}
+    first = found["engines"][0]
+    assert first["solver"] == "MuJoCo, RK4, solref 2h" and first["steps"] == {"four-bar": [1e-2, 1e-2, 3e-3]}
+    assert "| four-bar | 10/10/3.0 |" in text and "Not installed, and so without rows: Drake." in text
     found, text = said(flat, good.assign(call_s=0.01), ours)
-    assert found["wins_at"][1] == {"MuJoCo": 1}
+    assert found["wins_all"][1] == {"MuJoCo": 1}
+
+
+def test_the_error_at_a_speed_is_that_of_calls_as_fast():
+    slow = made("MuJoCo, RK4, solref 2h", [1e-2, 1e-3, 1e-4, 1e-5], cost=0.005)
+    found, _ = said(slow.assign(span=1.0))
+    assert found["engines"][0]["speeds"] == [1e-5, 1e-3]  # calls of 5, 10, 20 and 40 ms; 1 s and 10 ms are allowed
+    found, text = said(slow.assign(span=0.1))
+    assert found["engines"][0]["speeds"] == [1e-5, None] and "| 1e-5 | – |" in text
+
+
+def test_motors_and_energies_stand_beside_what_they_change():
+    good = made("MuJoCo, RK4, solref 2h", 10.0 * STEPS**2)
+    motor = good.assign(
+        group="variant", case="speed motor", n_steps=[50, 500, 5000, 50_000], error_q=[1.0, 0.1, 0.02, 0.0]
+    )
+    energy = good[:1].assign(group="energy", n_steps=50_000, error_q=None, energy=0.03)
+    found, text = said(good, motor, energy)
+    cells = {line["label"]: line["cells"] for line in found["probes"]}
+    assert cells["speed motor; PD motor"] == [[None, None], [0.02, None]]
+    assert cells["energy, 100 s: four-bar; RSSR"] == [[None, None], [0.03, None]]
+    assert found["cases"] == ["four-bar"] and "| speed motor; PD motor | –/– | 0.020/– |" in text
 
 
 def test_an_engine_that_is_not_there_is_a_row(monkeypatch):
     def absent(rigid, settings):
         raise RuntimeError("mujoco is not installed: make engines")
 
-    monkeypatch.setattr(engines.mujoco, "prepare", absent)
+    monkeypatch.setattr(engines.MODULES["mujoco"], "prepare", absent)
     engines.gated.cache_clear()
     row = engines.run_row(four_bar, engines.CONFIGURATIONS[0], 100, [])
     engines.gated.cache_clear()
@@ -72,8 +97,15 @@ def test_a_model_that_fails_its_gates_is_not_timed(monkeypatch):
 def test_ours_runs_without_any_engine():
     ours = next(each for each in engines.CONFIGURATIONS if each.engine == engines.OURS)
     row = engines.run_row(four_bar, ours, 1e-8, [])
-    assert row["error_q"] < 1e-5 and row["gap"] < 1e-12 and row["energy"] < 1e-6
+    assert row["error_q"] < 1e-5 and row["gap"] < 1e-12 and row["energy"] < 1e-6 and row["error_f"] < 1e-5
     assert 0.0 < row["stepping_s"] <= row["call_s"]
+
+
+def test_the_energy_over_a_long_time_is_of_the_whole_motion(monkeypatch):
+    monkeypatch.setattr(engines, "LONG", 12.0)
+    ours = next(each for each in engines.CONFIGURATIONS if each.engine == engines.OURS)
+    row = engines.energy_row(four_bar, ours)
+    assert 0.0 < row["energy"] < 1e-6 and row["group"] == "energy" and row["status"] == "REACHED_END"
 
 
 @pytest.mark.slow

@@ -92,8 +92,13 @@ class _Reader:
             for key in ("density", "viscosity", "wind"):
                 if any(float(x) for x in each.get(key, "0").split()):
                     self.ignored.append(f"{key} of the surrounding medium")
-            if any(flag.get("gravity") == "disable" for flag in each.findall("flag")):
-                gravity = np.zeros(3)
+        flags = (flag.attrib for each in root.findall("option") for flag in each.findall("flag"))
+        disabled = {key for flag in flags for key, value in flag.items() if value == "disable"}
+        gravity = np.zeros(3) if "gravity" in disabled else gravity
+        self.without_loops = bool(disabled & {"constraint", "equality"})
+        self.without = {"stiffness"} if "spring" in disabled else set()
+        self.without |= {"damping"} if "damper" in disabled else set()
+        self.without |= {"stiffness", "damping"} if "passive" in disabled else set()  # one flag, before MuJoCo 3.4
         self.model = SpatialModel(gravity, name=root.get("model", "MuJoCo Model"))
         self.frames: dict[str, tuple[Part | None, Pose]] = {"world": (None, Pose(np.zeros(3), np.eye(3)))}
         self.sites: dict[str, tuple[Part | None, Array]] = {}
@@ -137,7 +142,8 @@ class _Reader:
         name = element.get("class", childclass)
         if name not in self.defaults:
             raise ValueError(f"{_called(element)} is of the class {name!r}, which no default has")
-        return {**self.defaults[name].get(DEFAULT_OF.get(element.tag, element.tag), {}), **element.attrib}
+        given = {**self.defaults[name].get(DEFAULT_OF.get(element.tag, element.tag), {}), **element.attrib}
+        return {key: value for key, value in given.items() if key not in self.without}
 
     def _pose(self, attributes: dict[str, str], what: str) -> Pose:
         return pose_of(attributes, what, self.degrees, self.sequence)
@@ -145,12 +151,14 @@ class _Reader:
     def _within(self, element: Element, part: Part | None, pose: Pose, childclass: str) -> None:
         """What stands in a body, or in the world."""
         lumps: list[Lump] = []
+        inertial = element.find("inertial") if self.from_geoms != "true" else None
+        weigh = part is not None and inertial is None and self.from_geoms != "false"  # the geoms
         for each in element:
             given = self._attributes(each, childclass)
             if each.tag == "body":
                 self._body(each, part, pose, each.get("childclass", childclass))
             elif each.tag == "geom":
-                lump = self._geom(given, _called(each))
+                lump = self._geom(given, _called(each), weigh)
                 lumps += [] if lump is None else [lump]
             elif each.tag == "site":
                 place = pose.point(self._pose(given, _called(each)).x)
@@ -159,11 +167,8 @@ class _Reader:
                 raise ValueError(f"<{each.tag}> is not read; MuJoCo saves a file in which it is written out")
             elif each.tag not in SEEN_ONLY | {"inertial", "joint", "freejoint"}:
                 self.ignored.append(_called(each))
-        inertial = element.find("inertial")
-        if inertial is not None and self.from_geoms != "true":
-            lumps = [self._inertial(inertial, element.get("name", "?"))]
-        elif self.from_geoms == "false":
-            lumps = []
+        if not weigh:
+            lumps = [] if inertial is None else [self._inertial(inertial, element.get("name", "?"))]
         if part is not None:
             part.lumps += [lump.seen(pose) for lump in lumps]
 
@@ -212,13 +217,14 @@ class _Reader:
         self.taken.add(name)
         return name
 
-    def _geom(self, given: dict[str, str], what: str) -> Lump | None:
+    def _geom(self, given: dict[str, str], what: str, weighs: bool) -> Lump | None:
         if float(given.get("contype", 1)) or float(given.get("conaffinity", 1)):
             self.n_geoms += 1
-        if given.get("shellinertia", "false") == "true":
+        if given.get("shellinertia", "false") == "true" and weighs:
             self.ignored.append(f"shellinertia of {what}")
         lump = geom_lump(given, what, self.degrees, self.sequence)
-        if lump is None and given.get("type") not in ("plane", "hfield"):
+        weighs = weighs and float(given.get("mass", given.get("density", 1.0))) > 0.0
+        if lump is None and weighs and given.get("type") not in ("plane", "hfield"):
             self.ignored.append(f"the mass of {what}, which is a {given.get('type')}")
         return lump
 
@@ -261,7 +267,7 @@ class _Reader:
 
     def _equality(self, element: Element) -> None:
         given = self._attributes(element, "main")
-        if given.get("active", "true") == "false":
+        if self.without_loops or given.get("active", "true") == "false":
             return
         if element.tag not in ("connect", "weld"):
             self.ignored.append(f"equality: {_called(element)}")

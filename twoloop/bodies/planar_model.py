@@ -277,7 +277,7 @@ class PlanarModel(Couplings):
         total = angle + joint.b.rotation - joint.a.rotation
         names = (*numbers.names[:2], f"angle of {joint.b.name} against {joint.a.name} without torque of {name} (rad)")
         values = Numbers((stiffness, damping, total), names)
-        return Force(name, TORSION, joint.a, joint.b, None, None, values)
+        return Force(name, TORSION, joint.a, joint.b, None, None, values, joint=joint)
 
     def _motor(self, name: str, joint: ModelJoint, unit: str, f: Any) -> Force:
         function, more = self._function(name, f, 1, unit)

@@ -1,0 +1,3 @@
+from studies.engines import main
+
+main()

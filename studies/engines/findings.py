@@ -1,0 +1,171 @@
+"""What the rows of the engines say: what to set, what it costs, where errors end, and who is wrong without a word."""
+
+from collections.abc import Iterable
+from importlib.metadata import PackageNotFoundError, version
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from studies.bench import tables
+from studies.bench.end_states import EXACT
+from studies.bench.engine_runs import LIMIT
+from studies.engines.configurations import CONFIGURATIONS, NAMES, OURS, PACKAGES, Configuration
+from twoloop.audit.step_audit import LOST, order_and_floor
+
+GATE, RUN, VARIANT, ENERGY = "gate", "run", "variant", "energy"  # groups of rows
+ERRORS = (1e-2, 1e-3, 1e-4, 1e-6)
+SET_FOR = ERRORS[:3]  # for which a step is named
+SPEEDS = (1, 100)  # times real time
+PROBED = 5000  # steps, over 10 s or 5 s, of the table of motors, masses, frames and forces
+PROBES = {  # what is asked, of which mechanisms, in which groups, by which measure
+    "crank-rocker; its coupler 100, 10000 times lighter": (
+        ("crank-rocker", RUN, "error_q"),
+        ("coupler of 1:100", VARIANT, "error_q"),
+        ("coupler of 1:10000", VARIANT, "error_q"),
+    ),
+    "speed motor; PD motor": (("speed motor", VARIANT, "error_q"), ("PD motor", VARIANT, "error_q")),
+    "RSSR; turned in space": (("RSSR", RUN, "error_q"), ("RSSR, turned", VARIANT, "error_q")),
+    "joint force: crank-rocker; RSSR": (("crank-rocker", RUN, "error_f"), ("RSSR", RUN, "error_f")),
+    "energy, 100 s: four-bar; RSSR": (("four-bar", ENERGY, "energy"), ("RSSR", ENERGY, "energy")),
+}
+
+
+def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
+    """Versions, gates, what each configuration is off by, and what an accuracy costs."""
+    runs, gates = rows[rows["group"] == RUN], rows[rows["group"] == GATE]
+    cases = list(dict.fromkeys(runs["case"]))
+    found: dict[str, Any] = {
+        "cases": cases,
+        "errors": list(ERRORS),
+        "lost": LOST,
+        "limit": LIMIT,
+    }
+    found["absent"] = sorted(set(gates[gates["status"] == "NOT_AVAILABLE"]["family"]))
+    found["versions"] = {NAMES[engine]: _version(package) for engine, package in PACKAGES.items()}
+    found["gates"] = gates[gates["status"] != "PASSED"][["case", "solver", "message"]].to_dict("records")
+    found["n_gates"] = int((gates["status"] == "PASSED").sum())
+    found["apart"] = float(runs["floor"].astype(float).max())
+    found["configurations"] = [_configuration(each, runs[runs["solver"] == each.name]) for each in CONFIGURATIONS]
+    cheapest = [_cheapest(runs[runs["case"] == case]) for case in cases]
+    for key in ("all", "engines"):  # with ours and without
+        found[f"wins_{key}"] = [_counted(line[key][k] for line in cheapest) for k in range(len(ERRORS))]
+    found["engines"] = [
+        line for name in NAMES.values() if (line := _engine(runs[runs["family"] == name], cases)) is not None
+    ]
+    found["set_for"], found["speeds"] = list(SET_FOR), list(SPEEDS)
+    found["probed"] = [CONFIGURATIONS[0].name, *(line["solver"] for line in found["engines"])]
+    found["probes"] = [
+        {"label": label, "cells": [[_probe(rows, solver, *each) for each in asked] for solver in found["probed"]]}
+        for label, asked in PROBES.items()
+    ]
+    found["exact"] = EXACT
+    return found
+
+
+def _counted(cheapest: Iterable[str | None]) -> dict[str, int]:
+    """On how many mechanisms each engine is the cheapest."""
+    names = [solver.split(", ")[0] for solver in cheapest if solver]
+    return {name: names.count(name) for name in sorted(set(names), key=lambda each: (-names.count(each), each))}
+
+
+def _version(package: str) -> str:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return "not installed"
+
+
+def _configuration(each: Configuration, runs: pd.DataFrame) -> dict[str, Any]:
+    ended = runs[runs["error_q"].notna()]
+    orders, floors, lost = [], [], 0
+    for _, own in ended.groupby("case", sort=False):
+        lost += bool((own["error_q"].astype(float) > LOST).all())
+        if own["h"].notna().all():
+            order, floor = order_and_floor(own["h"], own["error_q"], float(own["floor"].max()))
+            orders += [order] if order is not None else []
+            floors += [floor] if floor is not None else []
+    return {
+        "name": each.name,
+        "how": each.how,
+        "runs": len(ended),
+        "silent": int((ended["error_q"].astype(float) > EXACT).sum()),
+        "gross": int((ended["error_q"].astype(float) > LOST).sum()),
+        "failed": int((runs["status"] == "FAILED").sum()),
+        "order": [min(orders), float(np.median(orders)), max(orders)] if orders else None,
+        "floor": [min(floors), max(floors)] if floors else None,
+        "n_floors": len(floors),
+        "lost": lost,
+        "gap": float(ended["gap"].astype(float).median()) if len(ended) else None,
+    }
+
+
+def _priced(runs: pd.DataFrame, error: float, what: str = "call_s") -> float | None:
+    """What a configuration takes on a mechanism for an error: between its runs, or of the cheapest that is as good."""
+    if runs["error_q"].isna().all():
+        return None
+    cost = tables.time_for(runs, error, what)
+    good = runs[runs["error_q"].astype(float) <= error]
+    return float(cost) if cost == cost else float(good[what].min()) if len(good) else None
+
+
+def _cheapest(runs: pd.DataFrame) -> dict[str, list[str | None]]:
+    """At each error the cheapest configuration on a mechanism, of all and of the engines."""
+    line: dict[str, list[str | None]] = {"all": [], "engines": []}
+    for error in ERRORS:
+        costs = {str(solver): cost for solver, own in runs.groupby("solver") if (cost := _priced(own, error))}
+        line["all"].append(min(costs, key=costs.__getitem__, default=None))
+        costs.pop(f"{NAMES[OURS]}, default", None)
+        line["engines"].append(min(costs, key=costs.__getitem__, default=None))
+    return line
+
+
+def _engine(runs: pd.DataFrame, cases: list[str]) -> dict[str, Any] | None:
+    """The configuration of an engine that reaches most errors on most mechanisms, then the fastest; None: none ran."""
+    ranked: list[tuple[int, float, str]] = []
+    for solver, own in runs.groupby("solver", sort=False):
+        costs = [cost for _, each in own.groupby("case") for error in ERRORS if (cost := _priced(each, error))]
+        ranked += [(-len(costs), float(np.median(costs)), str(solver))] if costs else []
+    if not ranked:
+        return None
+    solver = min(ranked)[2]
+    by_case = {str(case): own for case, own in runs[runs["solver"] == solver].groupby("case")}
+    line: dict[str, Any] = {"name": solver.split(", ")[0], "solver": solver, "at": [], "speeds": []}
+    line["how"] = next(each.how for each in CONFIGURATIONS if each.name == solver)
+    line["steps"] = {
+        case: [_step_for(by_case[case], error) if case in by_case else None for error in SET_FOR] for case in cases
+    }
+    for error in ERRORS:
+        reached = [own for own in by_case.values() if _priced(own, error)]
+        medians = {
+            what: float(np.median([_priced(own, error, what) or np.nan for own in reached]))
+            for what in ("call_s", "stepping_s")
+            if reached
+        }
+        line["at"].append({"reached": len(reached), **medians})
+    for speed in SPEEDS:
+        least = [_within(own, speed) for own in by_case.values()]
+        line["speeds"].append(float(np.median(least)) if np.isfinite(np.median(least)) else None)
+    return line
+
+
+def _within(runs: pd.DataFrame, speed: float) -> float:
+    """The least error of the runs on a mechanism with calls so many times faster than real time; infinite: none."""
+    fast = runs[runs["error_q"].notna() & (runs["call_s"].astype(float) <= runs["span"].astype(float) / speed)]
+    return float(fast["error_q"].astype(float).min()) if len(fast) else np.inf
+
+
+def _probe(rows: pd.DataFrame, solver: str, case: str, group: str, measure: str) -> float | None:
+    """What a configuration is off by with `PROBED` steps, ours with a tolerance of 1e-8; None: not told, or not run."""
+    own = rows[(rows["group"] == group) & (rows["case"] == case) & (rows["solver"] == solver)]
+    own = own[(own["n_steps"] == PROBED) | (own["tol"] == 1e-8) | (group == ENERGY)]
+    value = own[measure].astype(float).min() if len(own) else np.nan
+    return float(value) if np.isfinite(value) else None
+
+
+def _step_for(runs: pd.DataFrame, error: float) -> float | None:
+    """The longest step, or loosest tolerance, of which neither it nor any shorter one is off by more."""
+    known = runs[runs["error_q"].notna()].assign(value=lambda each: each["h"].fillna(each["tol"]))
+    wrong = known[known["error_q"].astype(float) > error]["value"].min()
+    good = known[~(known["value"] >= wrong)]["value"] if wrong == wrong else known["value"]
+    return float(good.max()) if len(good) else None

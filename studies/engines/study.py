@@ -1,0 +1,218 @@
+"""Engines and closed loops: what MuJoCo, Drake, Pinocchio and Exudyn are off by, and what an accuracy costs there."""
+
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache, partial
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+
+from references.engines.rigid import Motion, Prepared, coordinates
+from studies.bench import figures
+from studies.bench.closed_loops import MECHANISMS, VARIANTS, four_bar, rssr
+from studies.bench.engine_runs import INSTANTS, LIMIT, Loop, errors, gate, timed
+from studies.bench.store import Output, Row
+from studies.bench.study import Study
+from studies.engines.configurations import BEST, CONFIGURATIONS, MODULES, NAMES, OURS, Configuration
+from studies.engines.findings import ENERGY, GATE, RUN, VARIANT, findings_of
+from twoloop.audit.step_audit import LOST
+
+N_STEPS = (100, 200, 500, 1500, 5000, 15_000, 50_000, 150_000)  # multiples of INSTANTS
+TOLERANCES = (1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10, 1e-11)
+FEWER = {RUN: (N_STEPS, TOLERANCES), VARIANT: ((500, 5000, 50_000), (1e-4, 1e-6, 1e-8))}  # steps, or tolerances
+LONG, LONG_STEPS, LONG_INSTANTS, LONG_LIMIT = 100.0, 50_000, 200, 6.0  # s; how it is run; s of CPU
+SHOWN = ("four-bar", "Watt's six-bar", "Andrews' squeezer", "RSSR", "Bricard", "Stewart platform")  # in the figure
+STOPPED = ("NOT_AVAILABLE", "NOT_APPLICABLE", "GATE_FAILED")
+
+
+@cache
+def loop_of(make: Callable[[], Any]) -> Loop:
+    """A mechanism, made once."""
+    return Loop(make())
+
+
+@cache
+def gated(make: Callable[[], Any], engine: str) -> tuple[str, str]:
+    """Status and message of the gates of an engine's model of a mechanism."""
+    try:
+        wrong = gate(loop_of(make), MODULES[engine].prepare(loop_of(make).rigid, BEST[engine]))
+    except RuntimeError as error:
+        return ("NOT_AVAILABLE" if "not installed" in str(error) else "FAILED"), str(error).strip().splitlines()[0]
+    except ValueError as error:
+        return "NOT_APPLICABLE", str(error)
+    return ("GATE_FAILED", wrong) if wrong else ("PASSED", "")
+
+
+def make(output: Output) -> pd.DataFrame:
+    """Rows of the gates, of runs, of motors, masses and turned frames, and of the energy over a long time."""
+    quick = output.call.quick
+    mechanisms = (four_bar, rssr) if quick else MECHANISMS
+    variants = () if quick else VARIANTS
+    with output.kept() as kept:
+        rows: list[Row] = []
+        for build in (*mechanisms, *variants):
+            group = RUN if build in mechanisms else VARIANT
+            for engine in MODULES:
+                rows.append(kept.made(f"{GATE} {build.__name__} {engine}", partial(_gate_row, build, engine)))
+            for each in CONFIGURATIONS:
+                cost: list[float] = []  # of the run before, and its steps
+                values: Any = FEWER[group][each.engine == OURS]
+                for value in values[1:4:2] if quick else values:
+                    key = f"{group} {build.__name__} {each.name} {value!r}"
+                    row = kept.made(key, partial(run_row, build, each, value, cost, group))
+                    cost = [row["call_s"], row["n_steps"]] if row["call_s"] else cost
+                    rows.append(row)
+                    if row["status"] in STOPPED:
+                        break
+        for build in () if quick else (four_bar, rssr):
+            rows += [
+                kept.made(f"{ENERGY} {build.__name__} {each.name}", partial(energy_row, build, each))
+                for each in CONFIGURATIONS
+            ]
+    return pd.DataFrame(rows)
+
+
+def _row(group: str, build: Callable[[], Any], **more: Any) -> Row:
+    names = ("h", "tol", "n_steps", "call_s", "stepping_s", "error_q", "error_v", "error_f", "gap", "energy", "floor")
+    loop = loop_of(build)
+    known = {"group": group, "case": loop.problem.name, "span": loop.t_end}
+    return {**known, **dict.fromkeys(names), "message": "", **more}
+
+
+def _gate_row(build: Callable[[], Any], engine: str) -> Row:
+    status, message = gated(build, engine)
+    return _row(GATE, build, solver=NAMES[engine], family=NAMES[engine], status=status, message=message)
+
+
+def _prepared(build: Callable[[], Any], each: Configuration) -> tuple[Prepared | None, Row]:
+    """The model in an engine, or why there is none."""
+    status, message = gated(build, each.engine)
+    if status != "PASSED":
+        return None, {"status": status, "message": message}
+    try:
+        return MODULES[each.engine].prepare(loop_of(build).rigid, each.settings), {}
+    except RuntimeError as error:
+        return None, {"status": "NOT_APPLICABLE", "message": str(error).strip().splitlines()[0]}
+
+
+def run_row(build: Callable[[], Any], each: Configuration, value: float, before: list[float], group: str = RUN) -> Row:
+    """A run, its error and its time; the shortest of several calls in the group of runs."""
+    loop = loop_of(build)
+    row = _row(group, build, solver=each.name, family=NAMES[each.engine], status="REACHED_END")
+    if each.engine == OURS:
+        row |= {"tol": value}
+        run, again = _ours(loop, value)
+    else:
+        row |= {"h": loop.t_end / value, "n_steps": int(value)}
+        prepared, why = _prepared(build, each)
+        if prepared is None:
+            return row | why
+        if before and before[0] * value / before[1] > LIMIT:
+            return row | {"status": "TIME_LIMIT", "message": f"not run: would take more than {LIMIT:g} s"}
+        run = partial(prepared.run, loop.t_end, int(value), INSTANTS)
+        again = partial(_again, prepared, loop.t_end, int(value))
+    motion = run()
+    if motion.message:
+        return row | {"status": "FAILED", "message": motion.message, "call_s": motion.call_s}
+    call, stepping = timed(again) if group == RUN else (motion.call_s, motion.stepping_s)
+    row |= {"call_s": call, "stepping_s": stepping, "floor": loop.reference[1]}
+    return row | errors(loop, motion)
+
+
+def _again(prepared: Prepared, t_end: float, n_steps: int, k: int) -> Motion:
+    return prepared.run(t_end, n_steps, 1)
+
+
+def _ours(loop: Loop, tolerance: float) -> tuple[Callable[[], Motion], Callable[[int], Motion]]:
+    def run() -> Motion:
+        began = time.process_time()
+        made = loop.ours(tolerance, times=loop.times)
+        motion = loop.motion(made.q, made.v, loop.force(made), time.process_time() - began, made.stats.cpu_time)
+        return motion if made.success else replace(motion, message=made.message)
+
+    def again(k: int) -> Motion:
+        began = time.process_time()
+        made = loop.ours(tolerance, t0=1e-9 * (k + 1) * loop.t_end)  # a start that no call has had
+        call = time.process_time() - began
+        return loop.motion(made.q[:, :1], made.v[:, :1], None, call, made.stats.cpu_time)
+
+    return run, again
+
+
+def energy_row(build: Callable[[], Any], each: Configuration) -> Row:
+    """The largest change of the energy over a long time, over the largest kinetic energy of the reference."""
+    loop = loop_of(build)
+    row = _row(ENERGY, build, solver=each.name, family=NAMES[each.engine], status="REACHED_END")
+    if each.engine == OURS:
+        longer = Loop(replace(loop.problem, t_span=(0.0, LONG)))
+        made = longer.ours(1e-8, times=np.linspace(0.0, LONG, LONG_INSTANTS + 1))
+        row |= {"tol": 1e-8, "call_s": made.stats.cpu_time}
+        t, q, v, message = made.t, made.q, made.v, "" if made.success else made.message
+    else:
+        row |= {"h": LONG / LONG_STEPS, "n_steps": LONG_STEPS}
+        prepared, why = _prepared(build, each)
+        if prepared is None:
+            return row | why
+        share = 100
+        if share * prepared.run(LONG / share, LONG_STEPS // share, 1).stepping_s > LONG_LIMIT:
+            return row | {"status": "TIME_LIMIT", "message": f"not run: would take more than {LONG_LIMIT:g} s"}
+        motion = prepared.run(LONG, LONG_STEPS, LONG_INSTANTS)
+        row |= {"call_s": motion.call_s}
+        t, message = motion.t, motion.message
+        q, v = coordinates(motion, loop.rigid.planar)
+    if message:
+        return row | {"status": "FAILED", "message": message}
+    energies = loop.problem.energy(t, q, v)
+    return row | {"energy": float(np.abs(energies - energies[0]).max() / loop.kinetic)}
+
+
+LOOKS = {  # engine: colour
+    "MuJoCo": figures.BLUE,
+    "Drake": figures.GREEN,
+    "Pinocchio": figures.ORANGE,
+    "Exudyn": figures.PINK,
+    "twoloop": figures.BLACK,
+}
+
+
+def figures_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Figure]:
+    """Time of the call over the error, a panel a mechanism."""
+    runs = rows[(rows["group"] == RUN) & rows["error_q"].notna()]
+    shown = [case for case in SHOWN if case in set(runs["case"])] or found["cases"]
+    columns = min(3, len(shown))
+    lines = -(-len(shown) // columns)
+    size: dict[str, Any] = {
+        "figsize": (3.3 * columns + 1.0, 2.9 * lines + 1.2),
+        "layout": "constrained",
+        "squeeze": False,
+    }
+    figure, panels = plt.subplots(lines, columns, sharey=True, **size)
+    for panel, case in zip(panels.flat, shown, strict=False):
+        own, markers = runs[runs["case"] == case], dict.fromkeys(LOOKS, 0)
+        for each in CONFIGURATIONS:
+            line = own[own["solver"] == each.name].assign(value=lambda row: row["h"].fillna(row["tol"]))
+            family = NAMES[each.engine]
+            look = {"color": LOOKS[family], "marker": "osD^v"[markers[family]], "markersize": 3.5}
+            markers[family] += 1
+            if len(line):
+                line = line.sort_values("value")
+                panel.plot(line["error_q"].astype(float), 1e3 * line["call_s"], label=each.name, **look)
+        panel.axvspan(LOST, 10.0, color=figures.GREY, alpha=0.15, lw=0)
+        panel.set(xscale="log", yscale="log", title=case, xlim=(1e-11, 10.0))
+    for panel in panels[-1]:
+        panel.set_xlabel("error of positions (m, or of the axes)")
+    for panel in panels[:, 0]:
+        panel.set_ylabel("CPU time of the call (ms)")
+    entries = {
+        label: handle for panel in panels.flat for handle, label in zip(*panel.get_legend_handles_labels(), strict=True)
+    }
+    figure.legend(entries.values(), entries, loc="outside lower center", ncols=3, fontsize=8)
+    return {"engines": figure}
+
+
+STUDY = Study("engines", __doc__, make, findings_of, figures_of)
+main = STUDY.main

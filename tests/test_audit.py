@@ -1,0 +1,239 @@
+"""The audit: a simulator's order, floor and step; an MJCF file in MuJoCo, compared before it moves; what is refused."""
+
+import json
+import sys
+from importlib.util import find_spec
+
+import numpy as np
+import pytest
+
+from twoloop import solve_dae
+from twoloop.__main__ import main
+from twoloop.audit import audit_mjcf, audit_simulator, coordinates, mjcf_audit, step_audit
+from twoloop.audit.poses import gaps, poses
+from twoloop.bodies import PlanarModel, SpatialModel
+
+FILE = """
+<mujoco model="linkage">
+  <option timestep="0.002"/>
+  <default>
+    <geom type="capsule" size="0.02" contype="0" conaffinity="0"/>
+    <joint axis="0 1 0"/>
+  </default>
+  <worldbody>
+    <body name="crank">
+      <joint name="pivot"/>
+      <geom fromto="0 0 0 0.1 0 0.3"/>
+      <body name="rod" pos="0.1 0 0.3">
+        <joint name="elbow"/>
+        <geom fromto="0 0 0 0.7 0 0.1"/>
+      </body>
+    </body>
+    <body name="rocker" pos="0.7 0 0">
+      <joint name="base"/>
+      <geom fromto="0 0 0 0.1 0 0.4"/>
+    </body>
+  </worldbody>
+  <equality><connect body1="rod" body2="rocker" anchor="0.7 0 0.1"/></equality>
+</mujoco>
+"""
+
+
+def file_with(folder, *changes):
+    """The file, with each first text replaced by the second."""
+    text = FILE
+    for old, new in changes:
+        assert old in text
+        text = text.replace(old, new)
+    path = folder / "linkage.xml"
+    path.write_text(text)
+    return path
+
+
+def end(*lines):
+    return "</mujoco>", "".join(lines) + "</mujoco>"
+
+
+@pytest.fixture(scope="module")
+def pendulum():
+    model = PlanarModel(name="pendulum")
+    model.rod("bar", (0.0, 0.0), (1.0, 0.0), mass=1.0)
+    model.revolute("ground", "bar", at=(0.0, 0.0))
+    return model.problem((0.0, 0.5))
+
+
+def falling(bias=0.0, order=1):
+    """A simulator with an error of an order and a bias, made of the motion itself."""
+
+    def simulate(problem, times, step):
+        run = solve_dae(problem.system, problem.t_span, problem.q0, problem.v0, rtol=1e-12, atol=1e-12, t_eval=times)
+        return run.q.T + (bias + 5.0 * step**order) * (times - times[0])[:, None]
+
+    return simulate
+
+
+def test_order_floor_and_step(pendulum):
+    audit = audit_simulator(falling(order=2), pendulum, step=5e-3, error=1e-4)
+    assert audit.order == pytest.approx(2.0, abs=0.1) and audit.floor is None
+    run = audit.reaching
+    assert run.error <= 1e-4 < audit.runs[audit.runs.index(run) - 1].error
+    assert run.gap == pytest.approx(run.error, rel=1.0)
+    floored = audit_simulator(falling(bias=1e-2), pendulum, step=5e-3, error=1e-3)
+    assert floored.floor == pytest.approx(5e-3, rel=0.5) and floored.reaching is None
+    assert "floor 0.00" in str(floored) and "not reached" in str(floored)
+
+
+def test_a_lucky_step_is_no_accuracy(pendulum):
+    def simulate(problem, times, step):
+        good = abs(step - 5e-3) < 1e-9
+        return falling(bias=0.0 if good else 0.1, order=9)(problem, times, step)
+
+    audit = audit_simulator(simulate, pendulum, step=5e-3, error=1e-3)
+    assert min(run.error for run in audit.runs) < 1e-6 and audit.reaching is None
+
+
+def test_a_failure_is_a_row_and_a_wrong_simulator_an_error(pendulum):
+    def failing(problem, times, step):
+        raise RuntimeError("the loop broke")
+
+    audit = audit_simulator(failing, pendulum, step=1e-2)
+    assert audit.reaching is None and "the loop broke" in str(audit) and np.isnan(audit.runs[0].error)
+    assert "not finite" in str(audit_simulator(lambda p, t, h: np.full((51, 3), np.nan), pendulum, step=1e-2))
+    with pytest.raises(ValueError, match=r"of shape \(51, 3\); it returned \(3, 51\)"):
+        audit_simulator(lambda p, t, h: np.zeros((3, 51)), pendulum, step=1e-2)
+    with pytest.raises(ValueError, match=r"start where the problem does; its first row is off by 0\.5"):
+        audit_simulator(lambda p, t, h: np.zeros((51, 3)), pendulum, step=1e-2)
+    with pytest.raises(TypeError, match=r"model.problem\(...\)"):
+        audit_simulator(failing, None, step=1e-2)
+
+
+def test_what_stands_still_or_is_not_known_is_refused(pendulum):
+    with pytest.raises(RuntimeError, match="not known to 1e-17: two references differ by"):
+        audit_simulator(falling(), pendulum, step=1e-2, error=1e-17)
+    model = PlanarModel(name="hanging")
+    model.rod("bar", (0.0, 0.0), (0.0, -1.0), mass=1.0)
+    model.revolute("ground", "bar", at=(0.0, 0.0))
+    with pytest.raises(ValueError, match="nothing moves"):
+        audit_simulator(falling(), model.problem((0.0, 0.5)), step=1e-2)
+
+
+def test_gaps_are_of_points_that_joints_keep_together():
+    model = SpatialModel(name="slide")
+    model.rod("bar", (0.0, 0.0, 0.0), (1.0, 0.0, 0.0), radius=0.02, mass=1.0)
+    model.box("block", (0.1, 0.1, 0.1), mass=1.0, position=(1.0, 0.0, 0.0))
+    model.revolute("ground", "bar", at=(0.0, 0.0, 0.0), axis=(0.0, 1.0, 0.0))
+    model.prismatic("bar", "block", at=(1.0, 0.0, 0.0), axis=(1.0, 0.0, 0.0))
+    q = model.problem().q0
+    x, R = poses(model, q[None])
+    np.testing.assert_allclose(coordinates(x, R)[0], q, atol=1e-12)
+    assert gaps(model, x, R)[0] < 1e-12
+    along, across = (x + np.array([[0.0, 0.0, 0.0], [0.3, 0.0, up]]) for up in (0.0, 0.2))
+    assert gaps(model, along, R)[0] < 1e-12 and gaps(model, across, R)[0] == pytest.approx(0.2)
+    with pytest.raises(ValueError, match="given"):
+        coordinates(x[0], R)
+
+
+def test_what_is_left_out_of_many_joints_is_counted():
+    given = ("limits of joint 'a'", "actuator: motor 'm'", "limits of joint 'b'", "armature of joint 'a'")
+    assert mjcf_audit._counted(given) == ["limits of 2 joints", "actuator: motor 'm'", "armature of joint 'a'"]
+
+
+def test_without_mujoco_it_says_so(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "mujoco", None)
+    with pytest.raises(RuntimeError, match="mujoco is not installed: pip install mujoco"):
+        audit_mjcf(file_with(tmp_path))
+
+
+@pytest.mark.skipif(find_spec("mujoco") is None, reason="MuJoCo is not installed")
+class TestInMuJoCo:
+    def test_the_default_has_a_floor_and_the_advice_holds(self, tmp_path, capsys):
+        path = file_with(tmp_path, end('<actuator><position joint="pivot" kp="100"/></actuator>'))
+        out = [str(tmp_path / name) for name in ("audit.json", "audit.csv")]
+        main(["audit", str(path), "--t-end", "0.5", "--error", "1e-3", "--out", *out])
+        said = capsys.readouterr().out
+        assert "Neither motion has: actuator: position." in said and 'integrator="RK4"' in said
+        known = json.loads((tmp_path / "audit.json").read_text())
+        first, *_, last = known["audits"]
+        assert first["floor"] > 1e-2 and first["reaching"] is None and last["reaching"]["error"] < 1e-3
+        assert (tmp_path / "audit.csv").read_text().count("RK4") == len(last["runs"])
+        option, loop = (line.strip() for line in known["advice"].splitlines()[1:3])
+        loop = loop.removeprefix("on every connect and weld: ")
+        again = file_with(tmp_path, ('<option timestep="0.002"/>', option), ("<connect", f"<connect {loop}"))
+        assert audit_mjcf(again, error=1e-3, t_end=0.5).audits[0].runs[0].error < 1e-3
+
+    @pytest.mark.parametrize(
+        "changes",
+        [
+            [('timestep="0.002"', 'timestep="0.002" gravity="3 1 -4"')],
+            [("<default>", '<compiler angle="radian" eulerseq="zyx"/><default>'), ('name="crank"', 'euler="0 0.2 0"')],
+            [('name="elbow"', 'name="elbow" ref="20" springref="35" stiffness="3" damping="0.1"')],
+            [
+                ("<joint axis", '<default class="soft"><joint stiffness="2" springref="30"/></default><joint axis'),
+                ('name="crank">', 'name="crank" childclass="soft">'),
+            ],
+            [
+                ('0.7 0 0.1"/>\n      </body>', '0.7 0 0.1"/><body pos="0.7 0 0" euler="0 30 0">\n</body></body>'),
+                ("\n</body>", '<geom size="0.1 0.05"/></body>'),
+            ],
+            [
+                ('timestep="0.002"/>', 'timestep="0.002"><flag spring="disable"/></option>'),
+                ('name="elbow"', 'name="elbow" stiffness="3" damping="0.1"'),
+            ],
+            [
+                ("<worldbody>", '<worldbody><body pos="0 0 3"><freejoint/><geom type="box" size=".3 .2 .1" mass="3"/>'),
+                ("</worldbody>", "</body></worldbody>"),
+            ],
+            [('name="elbow"', 'name="elbow" stiffness="3 1 2" damping="0.1"')],
+            [('name="pivot"', 'name="pivot" range="-20 20" armature="0.2" frictionloss="0.3" stiffness="1"')],
+        ],
+        ids=["gravity", "turned", "ref", "class", "fused", "flag", "free", "polynomial", "ignored"],
+    )
+    def test_both_models_are_one(self, tmp_path, changes):
+        """RK4 with stiff loops goes to the motion of the model that was read, or the two are not the same."""
+        made = audit_mjcf(file_with(tmp_path, *changes), error=1e-2, t_end=0.1)
+        assert made.audits[-1].runs[-1].error < 1e-4
+
+    def test_a_keyframe_is_where_it_starts_with_loops_closed(self, tmp_path):
+        key = '<keyframe><key name="swung" qpos="0.3 0 0" qvel="3 0 0"/><key qpos="0 0 0"/></keyframe>'
+        path = file_with(tmp_path, end(key))
+        made = audit_mjcf(path, error=1e-2, t_end=0.2, key="swung")
+        assert any("gaped by 0.25 m" in note for note in made.notes) and "'swung'" in made.start
+        assert made.audits[-1].runs[-1].error < 1e-3
+        with pytest.raises(ValueError, match="no keyframe 'no'; it has swung, 1"):
+            audit_mjcf(path, key="no")
+
+    @pytest.mark.parametrize(
+        ("changes", "words"),
+        [
+            ([("<connect", '<connect active="false"')], "no loop"),
+            ([('timestep="0.002"/>', 'timestep="0.002"><flag equality="disable"/></option>')], "no loop"),
+            ([('timestep="0.002"/>', 'timestep="0.002"><flag constraint="disable"/></option>')], "no loop"),
+            ([("<default>", '<compiler settotalmass="5"/><default>')], "settotalmass of the compiler, which"),
+            ([('name="elbow"', 'name="elbow" springdamper="0.1 1"')], "springdamper of joint 'elbow', which"),
+            ([('timestep="0.002"', 'timestep="0.002" gravity="0 0 0"')], "nothing moves"),
+            ([('name="pivot"/>', 'name="pivot" axis="0 1"/>')], "axis of joint 'pivot' must be 3"),
+        ],
+    )
+    def test_what_cannot_be_audited_is_refused(self, tmp_path, changes, words):
+        with pytest.raises(ValueError, match=words):
+            audit_mjcf(file_with(tmp_path, *changes))
+
+    def test_a_model_that_is_another_one_is_refused(self, tmp_path, monkeypatch):
+        def other(path):
+            model = from_mjcf(path)
+            model.bodies[1].inertia[0] *= 1.01
+            return model
+
+        from_mjcf = mjcf_audit.from_mjcf
+        monkeypatch.setattr(mjcf_audit, "from_mjcf", other)
+        with pytest.raises(ValueError, match=r"masses and inertias differ by .* of 'crank'"):
+            audit_mjcf(file_with(tmp_path))
+
+    def test_the_command_ends_with_one_line_and_a_status(self, tmp_path, capsys, monkeypatch):
+        monkeypatch.setattr(step_audit, "FINEST", 0.5)
+        path = file_with(tmp_path)
+        with pytest.raises(SystemExit, match=r"--out takes a file that ends in .json or .csv; given"):
+            main(["audit", str(path), "--out", str(tmp_path / "audit.txt")])
+        with pytest.raises(SystemExit) as ended:
+            main(["audit", str(path), "--t-end", "0.5", "--error", "1e-9"])
+        assert ended.value.code == 1 and "Nothing tried reaches an error of 1e-09" in capsys.readouterr().out
