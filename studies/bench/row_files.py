@@ -1,0 +1,55 @@
+"""Runs in the format of `twoloop.rows`, of the medians that tables are made of."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from studies.bench.cli import processor
+from studies.bench.mechanism_names import mechanism_of
+from studies.bench.runs_by_error import SETTINGS
+from twoloop import __version__
+from twoloop.rows.row_format import REACHED_END, SCHEMA, Row
+
+PACKAGES = {"SUNDIALS": "scikit-sundae", "solve_dae": "solve-dae"}  # of families that are called otherwise
+QUALITY = ("violation_q", "violation_v", "error_lam", "energy")
+DIGITS = 4  # significant, of numbers
+LONGEST = 120  # letters of a message
+
+
+def in_format(run: Mapping[str, Any], columns: Mapping[str, str], versions: Mapping[str, str]) -> Row:
+    """The row of a run.
+
+    Parameters
+    ----------
+    run : mapping
+        A line of `tables.medians`.
+    columns : mapping
+        Where it has the errors and floors of the format that are known.
+    versions : mapping
+        Of the rivals' packages, and of solvers from files.
+    """
+    family, done = run["family"], run["status"] == REACHED_END
+    setting = next(name for name in SETTINGS if run.get(name) == run.get(name, float("nan")))
+    row = {"schema": SCHEMA, "mechanism": mechanism_of(run["case"]), "t_end": run["t_end"], "solver": run["solver"]}
+    row |= {name: run[name] for name in ("family", "called_from", "keeps_constraints", "status")}
+    if family == "two-loop":
+        row["version"] = ", ".join([__version__, *([run["commit"]] if "commit" in run else [])])
+    else:
+        package = PACKAGES.get(family, family.lower())
+        row["version"] = versions.get(run["solver"]) or versions.get(package) or "unknown"
+    row |= {"processor": run.get("processor") or processor(), "setting": setting, "value": run[setting]}
+    row |= {"times_s": [_rounded(time) for time in run["times"]] if done else [], "evaluations": run["n_evaluations"]}
+    if not done:
+        row["message"] = " ".join(str(run["message"]).split())[:LONGEST]
+    else:
+        row |= {name: run[name] for name in ("used", "calibration", "calibration_s") if name in run}
+        row |= {name: run[column] for name, column in columns.items()}
+        row |= {name: abs(run[name]) for name in QUALITY if run[name] is not None}
+        row["astray"] = True if run["astray"] in (True, "True") else None
+    return {name: _rounded(value) for name, value in row.items() if value not in (None, "") and value == value}
+
+
+def _rounded(value: Any) -> Any:
+    if not isinstance(value, float):
+        return value
+    short = float(f"{value:.{DIGITS}g}")
+    return int(short) if short.is_integer() and short < 1e15 else short
