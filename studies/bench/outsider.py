@@ -18,12 +18,11 @@ import numpy as np
 
 from references.driver import user_call
 from studies.bench.cli import ROOT, StudyError
-from studies.bench.collector import Case, NotApplicable, Solver
+from studies.bench.collector import FILE, Case, NotApplicable, Solver
 from studies.bench.own_environment import dependencies, environment
 from studies.bench.solvers import TOLERANCES
 from twoloop import Result, Statistics, Status
 
-FAMILY = "file"
 N_TIMES = 101  # states that a solver is asked for, the first of which is the start
 START = 60.0  # s that the process may take to load twoloop, the mechanism and the solver
 CHILD = "import sys; sys.path[:0] = {!r}; from studies.bench.outsider_process import main; main({}, *{!r})"
@@ -45,8 +44,8 @@ class Outsider:
         In rows.
     digest : str
         Of the file.
-    beside : dict
-        What the last answer says beside the motion, for the row.
+    calibrated : float
+        s of the calibration beside the last call (`twoloop.rows.calibration`).
 
     Raises
     ------
@@ -61,7 +60,7 @@ class Outsider:
             raise StudyError(f"--solver takes FILE.py:FUNCTION, a file that there is; given {where}")
         data = self.path.read_bytes()
         self.name, self.digest = f"{self.path.name}:{self.function}", hashlib.sha256(data).hexdigest()[:10]
-        self.mechanism, self.beside = _absolute(mechanism), dict[str, Any]()
+        self.mechanism, self.calibrated = _absolute(mechanism), float("nan")
         self._python = environment(dependencies(data.decode("utf-8", "replace"), self.path))
         self._process: subprocess.Popen[bytes] | None = None
         self._pipe: Connection | None = None
@@ -69,7 +68,31 @@ class Outsider:
 
     def solver(self) -> Solver:
         """Its entry in a catalogue."""
-        return Solver(self.name, FAMILY, "Python", True, "tol", self._run, TOLERANCES, own_accelerations=True)
+        return Solver(self.name, FILE, "Python", True, "tol", self._run, TOLERANCES, own_accelerations=True)
+
+    def start(self) -> None:
+        """Start the process, which loads the file.
+
+        Raises
+        ------
+        StudyError
+            If it cannot.
+        """
+        self._pipe, there = Pipe()
+        given = (str(self.path), self.function, self.mechanism)
+        code = CHILD.format([str(ROOT)], there.fileno(), given)
+        # a group of its own, so that what it starts ends with it
+        options: dict[str, Any] = {"pass_fds": [there.fileno()], "start_new_session": True, "cwd": self.path.parent}
+        options |= dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.DEVNULL)
+        self._process = subprocess.Popen([self._python, "-c", code], **options)
+        there.close()
+        try:
+            said = self._asked({}, START) or {"failure": f"not loaded in {START:g} s"}
+        except RuntimeError as error:
+            said = {"failure": str(error)}
+        if said["failure"]:
+            self.end()
+            raise StudyError(f"{self.path} is no solver: {said['failure']}")
 
     def _run(self, case: Case, tolerance: float, repeat: int) -> Result:
         """A run, as solvers of the catalogue are run."""
@@ -86,14 +109,12 @@ class Outsider:
                 f"Not back by time_limit = {case.time_limit:g} s at the tolerance {tolerance:g}, and asked no more."
             )
             return _failed(case, self._spent)
-        if "unusable" in answer:
-            raise RuntimeError(answer["unusable"])
         if "failure" in answer:
             return _failed(case, answer["failure"])
         if answer["v"] is None:
             raise RuntimeError("it returns positions alone; return (q, v)")
         user_call.seconds = answer["seconds"]
-        self.beside = {"calibration_s": answer["calibration_s"]}
+        self.calibrated = answer["calibration_s"]
         q, v = np.array(answer["q"]).T, np.array(answer["v"]).T
         none = np.full_like(q, np.nan)
         lam = np.full((system.n_c, N_TIMES), np.nan) if answer["l"] is None else np.array(answer["l"]).T
@@ -109,13 +130,13 @@ class Outsider:
         RuntimeError
             If the process ends instead.
         """
-        starting = self._pipe is None
-        if starting:
-            self._start()
+        if self._pipe is None:
+            self.start()
         assert self._pipe is not None and self._process is not None
         try:
-            self._pipe.send_bytes(json.dumps(ask).encode())
-            if not self._pipe.poll(limit + START * starting):
+            if ask:
+                self._pipe.send_bytes(json.dumps(ask).encode())
+            if not self._pipe.poll(limit):
                 self.end()
                 return None
             return dict(json.loads(self._pipe.recv_bytes()))
@@ -125,16 +146,6 @@ class Outsider:
             code = process.returncode
             why = f"by {signal.Signals(-code).name}" if code < 0 else f"with status {code}"
             raise RuntimeError(f"the process of the solver ended {why}") from None
-
-    def _start(self) -> None:
-        self._pipe, there = Pipe()
-        given = (str(self.path), self.function, self.mechanism)
-        code = CHILD.format([str(ROOT)], there.fileno(), given)
-        # a group of its own, so that what it starts ends with it
-        options: dict[str, Any] = {"pass_fds": [there.fileno()], "start_new_session": True, "cwd": self.path.parent}
-        quiet = {"stdin": subprocess.DEVNULL, "stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-        self._process = subprocess.Popen([self._python, "-c", code], **options, **quiet)
-        there.close()
 
     def end(self) -> None:
         """End the process, if there is one, and what it has started."""

@@ -117,10 +117,10 @@ def main(descriptor: int, file: str, function: str, mechanism: str) -> None:
         failure = ""
     except BaseException as error:  # whatever a file does when it is imported
         failure = f"{type(error).__name__}: {error}"
-    while True:
+    connection.send_bytes(json.dumps({"failure": failure}).encode())
+    while not failure:
         try:
             ask = json.loads(connection.recv_bytes())
         except EOFError:
             return
-        answer = {"unusable": failure} if failure else run(simulate, problem, ask)
-        connection.send_bytes(json.dumps(answer).encode())
+        connection.send_bytes(json.dumps(run(simulate, problem, ask)).encode())

@@ -1,18 +1,31 @@
 """Runs in the format of `twoloop.rows`, of the medians that tables are made of."""
 
 from collections.abc import Mapping
+from contextlib import suppress
+from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
 from studies.bench.cli import processor
+from studies.bench.collector import FILE
 from studies.bench.mechanism_names import mechanism_of
 from studies.bench.runs_by_error import SETTINGS
 from twoloop import __version__
 from twoloop.rows.row_format import REACHED_END, SCHEMA, Row
 
+RIVALS = ("heyoka", "scikit-sundae", "scipy", "extensisq", "diffrax", "casadi", "solve-dae", "exudyn")
 PACKAGES = {"SUNDIALS": "scikit-sundae", "solve_dae": "solve-dae"}  # of families that are called otherwise
 QUALITY = ("violation_q", "violation_v", "error_lam", "energy")
 DIGITS = 4  # significant, of numbers
 LONGEST = 120  # letters of a message
+
+
+def versions() -> dict[str, str]:
+    """Of the packages compared, those that are installed."""
+    found = {}
+    for package in RIVALS:
+        with suppress(PackageNotFoundError):
+            found[package] = version(package)
+    return found
 
 
 def in_format(run: Mapping[str, Any], columns: Mapping[str, str], versions: Mapping[str, str]) -> Row:
@@ -30,7 +43,8 @@ def in_format(run: Mapping[str, Any], columns: Mapping[str, str], versions: Mapp
     family, done = run["family"], run["status"] == REACHED_END
     setting = next(name for name in SETTINGS if run.get(name) == run.get(name, float("nan")))
     row = {"schema": SCHEMA, "mechanism": mechanism_of(run["case"]), "t_end": run["t_end"], "solver": run["solver"]}
-    row |= {name: run[name] for name in ("family", "called_from", "keeps_constraints", "status")}
+    row |= {name: run[name] for name in ("family", "called_from", "status")}
+    row["keeps_constraints"] = None if family == FILE else run["keeps_constraints"]
     if family == "two-loop":
         row["version"] = ", ".join([__version__, *([run["commit"]] if "commit" in run else [])])
     else:

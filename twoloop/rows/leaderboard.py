@@ -147,7 +147,8 @@ def _ranked(rows: Sequence[Row], measure: str, target: float) -> tuple[list[Entr
     timed, others = [], []
     for solver in solvers:
         own = [k for k, row in enumerate(rows) if (row["solver"], row["version"], row["setting"]) == solver]
-        if not any(measure in rows[k] or rows[k]["status"] != REACHED_END for k in own):
+        reached = [rows[k] for k in own if rows[k]["status"] == REACHED_END]
+        if reached and not any(measure in row for row in reached):
             continue  # measured by the other error
         runs = Runs(columns, np.array(own), "call_s", solver[0])
         place = place_of(runs, target)
@@ -180,8 +181,7 @@ def _why_not(runs: Runs, rows: Sequence[Row], target: float) -> str:
     """Why a solver has no time at an error."""
     if not runs.errors.size:
         row = rows[0]
-        said = f"{row['status'].lower().replace('_', ' ')}: {row.get('message', '')}".removesuffix(": ")
-        return said if row["status"] != REACHED_END else "not measured"
+        return f"{row['status'].lower().replace('_', ' ')}: {row.get('message', '')}".removesuffix(": ")
     good = runs.errors <= target
     if target < runs.floor:
         return f"the reference resolves {runs.floor:.2g}"
