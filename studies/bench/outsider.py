@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from references.driver import user_call
-from studies.bench.cli import ROOT, StudyError
+from studies.bench.cli import CLONE, ROOT, StudyError
 from studies.bench.collector import FILE, Case, NotApplicable, Solver
 from studies.bench.own_environment import dependencies, environment
 from studies.bench.solvers import TOLERANCES
@@ -25,7 +25,7 @@ from twoloop import Result, Statistics, Status
 
 N_TIMES = 101  # states that a solver is asked for, the first of which is the start
 START = 60.0  # s that the process may take to load twoloop, the mechanism and the solver
-CHILD = "import sys; sys.path[:0] = {!r}; from studies.bench.outsider_process import main; main({}, *{!r})"
+CHILD = "import sys; sys.path.insert({}, {!r}); from studies.bench.outsider_process import main; main({}, *{!r})"
 
 
 class Outsider:
@@ -80,11 +80,11 @@ class Outsider:
         """
         self._pipe, there = Pipe()
         given = (str(self.path), self.function, self.mechanism)
-        code = CHILD.format([str(ROOT)], there.fileno(), given)
+        code = CHILD.format(0 if CLONE else len(sys.path), str(ROOT), there.fileno(), given)
         # a group of its own, so that what it starts ends with it
         options: dict[str, Any] = {"pass_fds": [there.fileno()], "start_new_session": True, "cwd": self.path.parent}
         options |= dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.DEVNULL)
-        self._process = subprocess.Popen([self._python, "-c", code], **options)
+        self._process = subprocess.Popen([self._python, "-P", "-c", code], **options)
         there.close()
         try:
             said = self._asked({}, START) or {"failure": f"not loaded in {START:g} s"}
