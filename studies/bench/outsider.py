@@ -8,6 +8,7 @@ import json
 import os
 import signal
 import subprocess
+import sys
 from contextlib import suppress
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection
