@@ -48,10 +48,9 @@ def in_format(run: Mapping[str, Any], columns: Mapping[str, str], versions: Mapp
     if family == "two-loop":
         row["version"] = ", ".join([__version__, *([run["commit"]] if "commit" in run else [])])
     else:
-        package = PACKAGES.get(family, family.lower())
-        row["version"] = versions.get(run["solver"]) or versions.get(package) or "unknown"
+        row["version"] = versions.get(run["solver"]) or versions.get(package_of(family)) or "unknown"
     row |= {"processor": run.get("processor") or processor(), "setting": setting, "value": run[setting]}
-    row |= {"times_s": [_rounded(time) for time in run["times"]] if done else [], "evaluations": run["n_evaluations"]}
+    row |= {"times_s": [rounded(time) for time in run["times"]] if done else [], "evaluations": run["n_evaluations"]}
     if not done:
         row["message"] = " ".join(str(run["message"]).split())[:LONGEST]
     else:
@@ -59,10 +58,16 @@ def in_format(run: Mapping[str, Any], columns: Mapping[str, str], versions: Mapp
         row |= {name: run[column] for name, column in columns.items()}
         row |= {name: abs(run[name]) for name in QUALITY if run[name] is not None}
         row["astray"] = True if run["astray"] in (True, "True") else None
-    return {name: _rounded(value) for name, value in row.items() if value not in (None, "") and value == value}
+    return {name: rounded(value) for name, value in row.items() if value not in (None, "") and value == value}
 
 
-def _rounded(value: Any) -> Any:
+def package_of(family: str) -> str:
+    """The package that the solvers of a family are of."""
+    return PACKAGES.get(family, family.lower())
+
+
+def rounded(value: Any) -> Any:
+    """A number of few digits, a whole one as an integer; all else as it is."""
     if not isinstance(value, float):
         return value
     short = float(f"{value:.{DIGITS}g}")

@@ -108,7 +108,9 @@ def sympy_lagrange(problem: KnownProblem, times: Array, tolerance: float) -> Sta
 
     def rate(t: float, y: Array) -> Array:
         matrix, forcing = full(*y)
-        return np.linalg.solve(matrix, np.ravel(forcing))[: 2 * n]  # rates of q and v, then multipliers
+        return np.asarray(np.linalg.solve(matrix, np.ravel(forcing)), np.float64)[
+            : 2 * n
+        ]  # rates of q and v, then multipliers
 
     options = {"method": "DOP853", "t_eval": times, "rtol": tolerance, "atol": tolerance}
     found = solve_ivp(rate, (times[0], times[-1]), _start(problem), **options)
