@@ -5,6 +5,8 @@ from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
+import pandas as pd
+
 from studies.bench.cli import processor
 from studies.bench.collector import FILE
 from studies.bench.mechanism_names import mechanism_of
@@ -15,7 +17,8 @@ from twoloop.rows.row_format import REACHED_END, SCHEMA, Row
 RIVALS = ("heyoka", "scikit-sundae", "scipy", "extensisq", "diffrax", "casadi", "solve-dae", "exudyn")
 PACKAGES = {"SUNDIALS": "scikit-sundae", "solve_dae": "solve-dae"}  # of families that are called otherwise
 QUALITY = ("violation_q", "violation_v", "error_lam", "energy")
-DIGITS = 4  # significant, of numbers
+DIGITS = 4  # significant, of numbers that are measured, not of ...
+EXACT = ("t_end", "value", "evaluations")  # ... these
 LONGEST = 120  # letters of a message
 
 
@@ -50,7 +53,10 @@ def in_format(run: Mapping[str, Any], columns: Mapping[str, str], versions: Mapp
     else:
         row["version"] = versions.get(run["solver"]) or versions.get(package_of(family)) or "unknown"
     row |= {"processor": run.get("processor") or processor(), "setting": setting, "value": run[setting]}
-    row |= {"times_s": [rounded(time) for time in run["times"]] if done else [], "evaluations": run["n_evaluations"]}
+    row |= {
+        "times_s": [rounded(time) for time in run["times"]] if done else [],
+    }
+    row["evaluations"] = None if pd.isna(run["n_evaluations"]) else int(run["n_evaluations"])
     if not done:
         row["message"] = " ".join(str(run["message"]).split())[:LONGEST]
     else:
@@ -58,7 +64,8 @@ def in_format(run: Mapping[str, Any], columns: Mapping[str, str], versions: Mapp
         row |= {name: run[column] for name, column in columns.items()}
         row |= {name: abs(run[name]) for name in QUALITY if run[name] is not None}
         row["astray"] = True if run["astray"] in (True, "True") else None
-    return {name: rounded(value) for name, value in row.items() if value not in (None, "") and value == value}
+    known = {name: value for name, value in row.items() if value not in (None, "") and value == value}
+    return {name: value if name in EXACT else rounded(value) for name, value in known.items()}
 
 
 def package_of(family: str) -> str:

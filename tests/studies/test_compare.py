@@ -29,7 +29,7 @@ def file(tmp_path):
 @pytest.mark.parametrize("code", [PLAIN, pytest.param(CODE, marks=pytest.mark.slow)], ids=["plain", "compiled"])
 def test_the_page_of_the_docs_runs_outside_the_repository(file, code, monkeypatch):
     file.write_text(code)
-    words = ["swing.py:swing", "--quick", "--t-end", "0.5", "--out", "report", "--errors", "1e-3", "1e-5"]
+    words = ["swing.py:swing", "--quick", "--t-end", "0.512345", "--out", "report", "--errors", "1e-3", "1e-5"]
     monkeypatch.chdir(file.parent)
     compare.main([*words, "--solvers", *SOLVERS, "--solver", "my_solver.py:solve"])
     out = file.parent / "report"
@@ -61,9 +61,9 @@ def test_the_page_of_the_docs_runs_outside_the_repository(file, code, monkeypatc
     elsewhere = file.parent / "elsewhere.jsonl"
     elsewhere.write_text(row_format.text_of(row | {"processor": "abacus"} for row in own))
     compare.main([*again, "--with", str(elsewhere)])
-    assert "swing to 0.5 s, error 0.001 over the motion, m or rad; abacus" in (out / "compare.md").read_text()
+    assert "swing to 0.512345 s, error 0.001 over the motion, m or rad; abacus" in (out / "compare.md").read_text()
     for words, says in (
-        (["--with", "archive"], "archive has no rows of swing to 0.5 s, but of"),
+        (["--with", "archive"], "archive has no rows of swing to 0.512345 s, but of"),
         (["--with", str(file)], "not in the format of rows"),
         (["--solver", again[-1]], "--solver must name different ones"),
     ):
