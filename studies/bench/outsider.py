@@ -25,7 +25,7 @@ from studies.bench.solvers import TOLERANCES
 from twoloop import Result, Statistics, Status
 
 N_TIMES = 101  # states that a solver is asked for, the first of which is the start
-START = 60.0  # s that the process may take to load twoloop, the mechanism and the solver
+START = 300.0  # s that the process may take to load twoloop, the mechanism and the solver
 CHILD = "import sys; sys.path.insert({}, {!r}); from studies.bench.outsider_process import main; main({}, *{!r})"
 
 
