@@ -10,7 +10,7 @@ ROOMS = (  # from the lowest: each imports from itself and from those before it
     *("kernels.compile", "kernels.data", "kernels.algebra", "kernels.evaluation", "kernels.control", "kernels.steps"),
     *("kernels.lanes", "kernels", "checks", "problem", "generate", "methods", "run"),
     *("mechanisms", "bodies", "symbolic"),
-    *("result", "solve", "impacts", "ensembles", "sweeps", "testing", "audit"),
+    *("result", "solve", "impacts", "ensembles", "sweeps", "testing", "rows", "audit"),
 )
 CALLS = {"__init__", "__main__", "exported", "solve"}  # flat
 

@@ -5,7 +5,7 @@ import sys
 import traceback
 
 from studies.bench import cli
-from studies.bench.cli import REPORTS, ROOT
+from studies.bench.cli import CLONE, REPORTS, ROOT
 from studies.bench.index import STUDIES, put_in_readme
 
 USAGE = "usage: python -m studies [NAME | all | readme | compare FILE.py:FUNCTION] [--quick] [--out DIR] [--redraw]"
@@ -45,7 +45,7 @@ def run_all(words: list[str]) -> None:
             traceback.print_exc()
             failed.append(name)
     options = {word.split("=")[0] for word in words}
-    if not options & {"--quick", "--out"} and "work_precision" not in failed:
+    if CLONE and not options & {"--quick", "--out"} and "work_precision" not in failed:
         put_in_readme(REPORTS, ROOT / "README.md")
     if failed:
         sys.exit(f"{len(failed)} of {len(STUDIES)} studies failed, see above: {', '.join(failed)}")

@@ -1,22 +1,32 @@
-"""Work-precision report of a mechanism of your own: our methods beside IDA and SciPy's solvers."""
+"""Work-precision report of a mechanism or a solver of your own: our methods beside IDA and SciPy's solvers."""
 
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 
 from studies.bench import cli, figures, tables
 from studies.bench.cli import StudyError
-from studies.bench.collector import REPEATS, Case, Run, collect
+from studies.bench.collector import FILE, REPEATS, Case, Run, Solver, collect
+from studies.bench.mechanism_names import mechanism_of
+from studies.bench.outsider import N_TIMES, Outsider
 from studies.bench.reference_motion import ReferenceMotion, check_published, make_reference
 from studies.bench.render import number, power, render, table
+from studies.bench.row_files import in_format, versions
 from studies.bench.solvers import CATALOGUE, COMPARED
-from studies.bench.store import Output
+from studies.bench.store import Output, Row
+from twoloop import Result
 from twoloop.mechanisms import Problem
 from twoloop.mechanisms.user_file import problem_from
+from twoloop.rows.calibration import CALIBRATION, calibration_s
+from twoloop.rows.leaderboard import ARCHIVE, boards
+from twoloop.rows.row_format import read_rows, text_of
 
 GROUP = "compare"
 ERRORS = (1e-2, 1e-4, 1e-6, 1e-8)
@@ -53,17 +63,50 @@ def known_of(problem: Problem, t_end: float, limit: float) -> ReferenceMotion:
     return made
 
 
-def runs_of(case: Case, solvers: Iterable[str], quick: bool) -> list[Run]:
-    """All runs of the comparison of a case."""
-    runs = []
-    for name in solvers:
-        solver = CATALOGUE[name]
+def runs_of(case: Case, solvers: Iterable[str | Solver], quick: bool) -> list[Run]:
+    """All runs of the comparison of a case; a `Solver` that is no name is from a file."""
+    runs, at_times = [], replace(case, n_instants=N_TIMES - 1, known=lambda: case.reference)
+    for each in solvers:
+        solver, of = (CATALOGUE[each], case) if isinstance(each, str) else (each, at_times)
         values = solver.grid(case)
         if quick:
             own = (case.tolerances or ())[:6:2]  # a case that has its own has loose ones
             values = own or QUICK if solver.setting == "tol" else values[:2]
-        runs += [Run(case, solver, value, GROUP, 1 if quick else REPEATS) for value in values]
+        runs += [Run(of, solver, value, GROUP, 1 if quick else REPEATS) for value in values]
     return runs
+
+
+def beside(outsiders: Mapping[str, Outsider], run: Run, result: Result) -> dict[str, Any]:
+    """The calibration, in the process in which the solver ran, and the error at the end over the largest coordinate."""
+    outsider = outsiders.get(run.solver.name)
+    q, _ = run.case.reference.states(run.case.instants[-1:])
+    size = max(1.0, float(np.abs(q).max()))
+    ended = float(np.abs(result.q[:, -1] - q[:, 0]).max()) / size if result.success else None
+    calibrated = calibration_s() if outsider is None else outsider.calibrated
+    found = {"calibration": CALIBRATION, "calibration_s": calibrated}
+    return found | {"error_over": ended, "floor_over": run.case.reference.floor / size}
+
+
+def rows_from(files: Iterable[str], mechanism: str, t_end: float) -> list[Row]:
+    """The rows of files that are of this comparison's mechanism; the word "archive" is the file that is shipped.
+
+    Raises
+    ------
+    StudyError
+        If a file has none, or cannot be read.
+    """
+    found = []
+    for file in files:
+        try:
+            rows = read_rows(ARCHIVE if file == "archive" else Path(file))
+        except ValueError as error:
+            raise StudyError(str(error)) from None
+        own = [row for row in rows if row["mechanism"] == mechanism and abs(row["t_end"] / t_end - 1.0) < 1e-9]
+        if not own:
+            known = sorted({f"{row['mechanism']} to {row['t_end']:g} s" for row in rows})
+            raise StudyError(f"{file} has no rows of {mechanism} to {t_end:g} s, but of {', '.join(known)}")
+        found += own
+    return found
 
 
 def findings_of(rows: pd.DataFrame, case: Case, errors: Sequence[float]) -> dict[str, Any]:
@@ -80,9 +123,14 @@ def findings_of(rows: pd.DataFrame, case: Case, errors: Sequence[float]) -> dict
     return found | {"failed": bool((rows["status"] != "REACHED_END").any())}
 
 
-def report(output: Output, case: Case, rows: pd.DataFrame, line: str, errors: Sequence[float]) -> None:
-    """Write findings, figure and report."""
+def report(
+    output: Output, case: Case, rows: pd.DataFrame, line: str, errors: Sequence[float], given: Mapping[str, Any]
+) -> None:
+    """Write findings, figure, rows in the format, and report; `given`: versions of solvers, rows from elsewhere."""
     rows = tables.medians(rows)
+    columns = {"error": "error_q", "floor": "floor", "error_end": "error_over", "floor_end": "floor_over"}
+    own = [in_format(run, columns, given["versions"]) for run in rows.to_dict("records")]
+    output.write("compare.jsonl", text_of(own))
     findings = findings_of(rows, case, errors)
     if output.call.redraw:  # without making the reference again
         findings |= {key: output.load_findings().get(key) for key in ("source", "published")}
@@ -101,7 +149,12 @@ def report(output: Output, case: Case, rows: pd.DataFrame, line: str, errors: Se
     quality = [[run[key] for key in kept] for _, run in tables.ranking(rows, middle).iterrows()]
     ready = {"work": table(header, tables.work_precision(rows, errors)), "kept": table([*kept.values()], quality)}
     ready["failed"] = _failed(rows)
+    all_rows = [*own, *given["rows"]]
+    found = [board for error in errors for board in boards(all_rows, error)] if given["rows"] else []
+    ready["beside"] = "\n\n".join(map(str, found)).replace("`", "'")
     more = {"stamp": line, "quick": output.call.quick, "middle": middle, "note": case.note, "drawn": bool(lines)}
+    files = dict.fromkeys(rows[rows["family"] == FILE]["solver"])
+    more |= {"files": [f"`{name}`" for name in files], "n_times": N_TIMES}
     output.write("compare.md", render("compare", findings, ready, **more))
 
 
@@ -113,6 +166,11 @@ def _work(words: Sequence[str] | None) -> None:
     parser = cli.parser("compare", __doc__)
     what = "FILE.py:FUNCTION, which returns a twoloop.mechanisms.Problem, or a ready mechanism"
     parser.add_argument("where", metavar="MECHANISM", help=what)
+    what = "FILE.py:FUNCTION, simulate(problem, times, tolerance) as check_simulator takes it; may be given again"
+    parser.add_argument("--solver", action="append", default=[], metavar="FILE.py:FUNCTION", help=what)
+    what = "rows to show beside (twoloop rows check); the word archive: those that are shipped"
+    parser.add_argument("--with", dest="files", nargs="+", default=[], metavar="FILE.jsonl", help=what)
+    parser.add_argument("--time-limit", type=float, default=Case.time_limit, metavar="S", help="s, for each run")
     parser.add_argument("--t-end", type=float, help="s; default: the end of the problem's t_span")
     parser.add_argument("--solvers", nargs="+", metavar="NAME", help=f"of {', '.join(CATALOGUE)}")
     limit: dict[str, Any] = {"default": REFERENCE_LIMIT, "metavar": "S", "help": "s, for each run of the reference"}
@@ -126,22 +184,36 @@ def _work(words: Sequence[str] | None) -> None:
         raise StudyError("--errors must be positive")
     if not given.reference_limit > 0.0:
         raise StudyError(f"--reference-limit must be positive; given {given.reference_limit:g}")
+    if not given.time_limit > 0.0:
+        raise StudyError(f"--time-limit must be positive; given {given.time_limit:g}")
     given.out = given.out or Path("compare")
     problem = load_problem(given.where)
     t_end = problem.t_span[1] if given.t_end is None else given.t_end
     if not t_end > 0.0:
         raise StudyError(f"--t-end must be positive; given {t_end:g}")
     known = partial(known_of, problem, t_end, given.reference_limit)
-    case = Case(problem.name, problem, t_end, known, note=problem.note, timed=0.004 if given.quick else 0.02)
+    limits: dict[str, Any] = {"time_limit": given.time_limit, "timed": 0.004 if given.quick else 0.02}
+    case = Case(problem.name, problem, t_end, known, note=problem.note, **limits)
+    elsewhere = rows_from(given.files, mechanism_of(problem.name), t_end)
+    outsiders = {each.name: each for each in (Outsider(where, given.where) for where in given.solver)}
+    if len(outsiders) < len(given.solver):
+        raise StudyError(f"--solver must name different ones; given {', '.join(given.solver)}")
+    told = {"versions": versions() | {each.name: each.digest for each in outsiders.values()}, "rows": elsewhere}
     call, errors = cli.call_of("compare", given, words), sorted(given.errors, reverse=True)
-    with Output(call) as output:
+    with Output(call) as output, ExitStack() as ending:
+        for outsider in outsiders.values():
+            ending.callback(outsider.end)
+            if not call.redraw:
+                outsider.start()
         if call.redraw:
             rows, line = output.load_rows()
         else:
-            runs, line, failed = runs_of(case, given.solvers or COMPARED, call.quick), cli.stamp(call.command), ""
+            solvers = [*(given.solvers or COMPARED), *(each.solver() for each in outsiders.values())]
+            runs, line, failed = runs_of(case, solvers, call.quick), cli.stamp(call.command), ""
+            files = {each.name: [each.digest, given.time_limit] for each in outsiders.values()}
             try:
-                with output.kept({"where": given.where, "t_end": t_end}) as kept:
-                    rows = collect(runs, kept)  # raises without a reference
+                with output.kept({"where": given.where, "t_end": t_end, "files": files}) as kept:
+                    rows = collect(runs, kept, partial(beside, outsiders))  # raises without a reference
                 output.save_rows(rows, line)
                 if not (rows["status"] == "REACHED_END").any():
                     failed = _failed(rows)
@@ -150,8 +222,8 @@ def _work(words: Sequence[str] | None) -> None:
                 found = {"name": case.name, "why": str(error)}
                 output.write("compare.md", render("compare_failed", found, {"failed": failed}, stamp=line))
                 raise
-        report(output, case, rows, line, errors)
-    print(f"wrote compare.md, .csv, .json, .png and .svg to {output.path}")
+        report(output, case, rows, line, errors, told)
+    print(f"wrote compare.md, .csv, .jsonl, .json, .png and .svg to {output.path}")
 
 
 def main(words: Sequence[str] | None = None) -> None:

@@ -15,12 +15,12 @@ from references.exudyn.pinned import solve_pinned
 from studies.bench import figures, tables
 from studies.bench.collector import Case, Run, Solver, called_from, timed
 from studies.bench.large import ASSEMBLIES, Assembly, open_chain
-from studies.bench.runs_by_error import resampled
 from studies.bench.solvers import CATALOGUE, DEFAULT
 from studies.bench.store import Output, Row
 from studies.bench.study import Study
 from twoloop import Result, solve_dae
 from twoloop.mechanisms import Problem
+from twoloop.rows.equal_error import resampled
 
 EVALUATION, CHAIN = "evaluation", "chain"  # groups of rows
 SIZES, QUICK_SIZES = (3, 10, 30, 100, 300, 1000, 3000), (3, 10)

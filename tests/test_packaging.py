@@ -34,7 +34,9 @@ def test_the_wheel_says_that_it_is_typed(tmp_path, monkeypatch):
     assert "[pytest11]\ntwoloop.testing.plugin = twoloop.testing.plugin" in entry_points
     assert "twoloop/testing/known_motions.npz" in names
     assert {"twoloop/py.typed", "twoloop/__init__.py", "twoloop/kernels/data/common.py"} <= names
-    assert {name.split("/")[0] for name in names} == {"twoloop", f"twoloop-{_version()}.dist-info"}
+    shipped = {"twoloop", "references", "studies"}
+    assert {name.split("/")[0] for name in names} == {*shipped, f"twoloop-{_version()}.dist-info"}
+    assert {"twoloop/rows/archive.jsonl.gz", "studies/templates/compare.md.j2"} <= names
     assert not [name for name in names if name.endswith((".nbi", ".nbc", ".pyc"))]
 
 

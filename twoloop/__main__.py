@@ -1,4 +1,4 @@
-"""python -m twoloop: what is installed, compile everything, solve a mechanism, audit MuJoCo on closed loops."""
+"""python -m twoloop: what is installed, compile everything, solve a mechanism, audit MuJoCo; rows of solvers."""
 
 import argparse
 import os
@@ -16,6 +16,8 @@ from twoloop.audit.mjcf_audit import audit_mjcf, check_ending
 from twoloop.kernels.compile.caches import folder_of
 from twoloop.mechanisms.user_file import problem_from
 from twoloop.methods.presets import PRESETS
+from twoloop.rows.leaderboard import leaderboard
+from twoloop.rows.row_format import SHOWN, mistakes, read_lines
 
 NEEDED = ("numpy", "scipy", "numba")
 OPTIONAL = ("pandas", "pyarrow", "matplotlib", "pillow", "rich", "sympy", "dask")
@@ -137,6 +139,27 @@ def audit(given: argparse.Namespace) -> None:
         raise SystemExit(1)
 
 
+def check_rows(files: Sequence[Path]) -> None:
+    """Say what files of rows hold, or what is wrong with them.
+
+    Raises
+    ------
+    SystemExit
+        If a row has a mistake, or there is none.
+    """
+    failed = False
+    for file in files:
+        rows, wrong = mistakes(read_lines(file))
+        failed |= bool(wrong) or not rows
+        for each in wrong[:SHOWN]:
+            print(f"{file}: {each}")
+        more = f", {len(wrong)} mistakes" if wrong else ""
+        n_solvers, n_mechanisms = (len({row[name] for row in rows}) for name in ("solver", "mechanism"))
+        print(f"{file}: {len(rows)} good rows, of {n_solvers} solvers on {n_mechanisms} mechanisms{more}")
+    if failed:
+        raise SystemExit(1)
+
+
 def parser() -> argparse.ArgumentParser:
     """The command line."""
     made = argparse.ArgumentParser(prog="python -m twoloop", description=__doc__)
@@ -164,6 +187,15 @@ def parser() -> argparse.ArgumentParser:
     loops.add_argument("--t-end", type=float, default=2.0, help="s; default: 2")
     loops.add_argument("--key", help="keyframe to start from; default: the pose of the file, at rest")
     loops.add_argument("--out", nargs="+", default=[], type=Path, metavar="FILE", help="files, .json or .csv")
+    rows = commands.add_parser("rows", help="rows of runs of solvers, as docs/compare.md has their format")
+    checked = rows.add_subparsers(dest="what", required=True).add_parser("check", help="say what is wrong with files")
+    checked.add_argument("files", nargs="+", type=Path, metavar="FILE", help=".jsonl, or .jsonl.gz")
+    board = commands.add_parser("leaderboard", help="which solver takes how long for an error on a mechanism")
+    board.add_argument("--mechanism", required=True, metavar="NAME", help="such as four_bar; a wrong name lists all")
+    board.add_argument("--error", type=float, default=1e-6, help="default: 1e-6")
+    board.add_argument("--t-end", type=float, help="s; default: all ends that there are rows of")
+    board.add_argument("--with", dest="files", nargs="+", default=[], type=Path, metavar="FILE", help="further rows")
+    board.add_argument("--out", type=Path, metavar="FILE", help=f"a picture, by ending: {', '.join(PICTURES)}")
     return made
 
 
@@ -177,6 +209,10 @@ def main(words: Sequence[str] | None = None) -> None:
             compile_all()
         elif given.command == "audit":
             audit(given)
+        elif given.command == "rows":
+            check_rows(given.files)
+        elif given.command == "leaderboard":
+            print(leaderboard(given.mechanism, given.error, given.files, given.t_end, given.out))
         else:
             solve(given)
     except (ImportError, OSError, RuntimeError, ValueError) as error:

@@ -19,9 +19,9 @@ import pandas as pd
 
 from studies.bench import headline
 from studies.bench.collector import NOTHING_RUN, Run, Warm
-from studies.bench.runs_by_error import DECADE, LOOSEST, NEAR
 from studies.bench.store import KeptRows, Row
 from studies.bench.tables import TIGHTEST
+from twoloop.rows.equal_error import DECADE, LOOSEST, NEAR
 
 FAR = 20.0
 RUNNING = 2

@@ -16,7 +16,8 @@ from pathlib import Path
 from twoloop import ConstraintWarning
 
 ROOT = Path(__file__).parents[2]
-REPORTS = ROOT / "reports"
+CLONE = (ROOT / "pyproject.toml").is_file()  # otherwise this is an installed package
+REPORTS = (ROOT if CLONE else Path.cwd()) / "reports"
 PACKAGES = ("twoloop", "numpy", "scipy", "numba", "scikit-sundae", "exudyn")
 
 
@@ -105,6 +106,8 @@ def commit() -> str:
         return subprocess.run(["git", *words], cwd=ROOT, capture_output=True, text=True, check=True).stdout.strip()
 
     try:
+        if not CLONE:  # whatever repository the environment may stand in
+            raise OSError
         changed = git("status", "--porcelain", "--", "twoloop", "references", "studies")
         return git("rev-parse", "--short=10", "HEAD") + (" with uncommitted changes" if changed else "")
     except (OSError, subprocess.CalledProcessError):

@@ -32,6 +32,8 @@ CALLS = 3
 LATER = 1e-9  # of the time span, by which starts lie apart at which runs of ours are timed
 BUILDING = 10.0  # s that building or compiling takes at most: the first call of a setting, where shorter, may hold it
 REPEATS = 5
+FILE = "file"  # family of solvers from files
+REMEMBERING = ("two-loop", FILE)  # families that know a start when they see it again, or may
 NOTHING_RUN = ("NOT_APPLICABLE", "NOT_AVAILABLE")  # statuses of rows for which no solver was started
 ONCE = (*NOTHING_RUN, "TIME_LIMIT")  # which is not asked again
 _COUNT = count(1)  # of new starts
@@ -318,7 +320,7 @@ def timed(run: Run, repeat: int, warm: Warm | None = None) -> Timed:
         return None, status, message, {"call_s": None, "inside_s": None, "calls": 0}
     calls = [(spent, result.stats.cpu_time)]
     if result.success and spent < run.case.timed:
-        runs = [from_new_start(run) if run.solver.family == "two-loop" else run for _ in range(CALLS)]
+        runs = [from_new_start(run) if run.solver.family in REMEMBERING else run for _ in range(CALLS)]
         again = [attempt(each, repeat) for each in runs]
         calls = [(spent, each.stats.cpu_time) for each, _, _, spent in again if each is not None] or calls
     call, inside = (float(np.mean(times)) for times in zip(*calls, strict=True))

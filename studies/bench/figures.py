@@ -18,10 +18,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
-from studies.bench.runs_by_error import DECADE, astray, setting_of, used
+from studies.bench.runs_by_error import astray, setting_of, used
 from studies.bench.solvers import CATALOGUE, COMPILED, DEFAULT, GIVEN, HEYOKA, IRK, IRK_LINE
 from studies.bench.store import Output
 from studies.bench.tables import time_for
+from twoloop.rows.equal_error import DECADE
 
 MOST_LINES = 9
 FIRST = (DEFAULT, *(name for name, method in COMPILED.items() if method == DEFAULT), IRK_LINE, IRK)  # always drawn

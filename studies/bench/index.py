@@ -17,7 +17,7 @@ from studies.bench.takes import takes
 STUDIES = (
     *("linkage", "work_precision", "table3", "motion", "step_size", "violation", "energy", "beam", "validation"),
     *("ablation", "honesty", "robustness", "planted_errors", "symbolic_size", "sweep_linkages", "ensembles", "scale"),
-    "engines",
+    *("engines", "conformance"),
     "claims",
     "compare_page",
 )

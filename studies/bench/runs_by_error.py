@@ -1,7 +1,5 @@
-"""The runs of one solver on one case, by error: which of them are good enough, and what an error between them costs."""
+"""The columns of tables of runs that comparisons at equal error look at."""
 
-from collections.abc import Iterable, Mapping, Sequence
-from functools import cache, lru_cache
 from typing import Any
 
 import numpy as np
@@ -9,38 +7,9 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from studies.bench.store import Array
+from twoloop.rows.equal_error import Runs
 
 SETTINGS = ("err_out", "h", "tol")  # a procedure along err_out has a tol, too, which does not vary
-DECADE = 10.0 * (1.0 + 1e-9)  # between two runs that lie farther apart nothing is interpolated
-NEAR = 2.0  # settings that differ by less are nearly the same
-FEWEST = 3  # repetitions that an interval asks for
-LOOSEST = 1e-1  # tolerance of which looser ones are of no use
-BY_TOLERANCE = (
-    "heyoka",
-    "Taylor",
-    "auto",
-    "the default",
-    "ensemble",
-    "solve_dae",
-)  # how solvers begin whose order the tolerance sets
-RESAMPLES, SEED = 1000, 25  # draws of the repetitions
-
-
-@cache
-def _rounds(n: int) -> NDArray[np.int64]:
-    """Rounds of n repetitions, drawn again (RESAMPLES, n): the same for all runs, as rounds are interleaved."""
-    return np.random.default_rng(SEED).integers(0, n, (RESAMPLES, n))
-
-
-def resampled(times: Iterable[Sequence[float]]) -> Array:
-    """Medians of the times of each run over rounds drawn again (n_runs, RESAMPLES); NaN of fewer than three."""
-    drawn = [_medians_drawn(tuple(own)) if len(own) >= FEWEST else np.full(RESAMPLES, np.nan) for own in times]
-    return np.array(drawn).reshape(-1, RESAMPLES)
-
-
-@lru_cache(maxsize=20_000)
-def _medians_drawn(times: tuple[float, ...]) -> Array:
-    return np.asarray(np.median(np.array(times)[_rounds(len(times))], axis=1))
 
 
 def setting_of(rows: pd.DataFrame) -> Array:
@@ -50,42 +19,6 @@ def setting_of(rows: pd.DataFrame) -> Array:
         if name in rows:
             found = np.where(np.isnan(found), rows[name].to_numpy(float), found)
     return found
-
-
-Place = tuple[int, int, float | None]
-
-
-class Runs:
-    """The runs of one solver on one case that have an error and this cost, by error, in arrays.
-
-    A table of 70 columns takes minutes where it is sorted and cut for every solver and every error.
-    """
-
-    def __init__(self, columns: Mapping[str, NDArray[Any]], rows: NDArray[np.int64], what: str, solver: str):
-        errors, settings = columns["error_q"][rows], columns["setting"][rows]
-        order = np.argsort(errors, kind="stable")  # NaN last
-        known = order[~np.isnan(errors[order]) & ~np.isnan(columns[what][rows][order])]
-        self.columns, self.rows = columns, rows[known]
-        self.floor = float(np.fmax.reduce(columns["floor"][self.rows], initial=-np.inf))
-        self.errors = np.maximum(errors[known], columns["floor"][self.rows])
-        self.settings, self.of_one_order = settings[known], not solver.startswith(BY_TOLERANCE)
-        best = float(settings[~np.isnan(errors)].max(initial=0.0))
-        # than which none is looser that the solver can run: tried, or of no use
-        self.loosest = best if (settings[np.isnan(errors)] > best).any() else LOOSEST
-
-    def of(self, column: str) -> NDArray[Any]:
-        """What stands in a column."""
-        return self.columns[column][self.rows]
-
-    def drawn(self) -> Array:
-        """`resampled` of the times; NaN where these are not known."""
-        known = "times" in self.columns
-        return resampled(self.of("times")) if known else np.full((len(self.rows), RESAMPLES), np.nan)
-
-    def used(self, k: int) -> str:
-        """The method that the solver took in a run, if it chooses."""
-        taken = self.of("used")[k] if "used" in self.columns else ""
-        return taken if isinstance(taken, str) else ""
 
 
 def _columns(rows: pd.DataFrame, *more: str) -> dict[str, NDArray[Any]]:
@@ -108,33 +41,6 @@ def by_solver(rows: pd.DataFrame, *costs: str) -> dict[str, Runs]:
     return {str(name): Runs(columns, np.flatnonzero(codes == k), costs[0], str(name)) for k, name in enumerate(names)}
 
 
-def place_of(runs: Runs, target: float) -> Place | None:
-    """Which runs of one solver, by error, are good enough, and where between them and the next the target is.
-
-    Of those good enough the ones within a decade of the worst of them count: a run that is better by far, and cheaper
-    by the scatter of its time, is not what a user asks for. The first of these, and the number of all up to the last.
-    None: no run is so good, or none was asked for about this: within a decade below the target, at the loosest setting
-    that the solver can run, or at nearly the same setting as a looser one that is not good enough (the solver leaps
-    over the target). The place between two runs, on the log-log line through them, is None where they are more than a
-    decade apart, or of different methods or orders.
-    """
-    errors, settings = runs.errors, runs.settings
-    n_good = int((errors <= target).sum())
-    if n_good == 0 or target < runs.floor:
-        return None
-    below, end = errors[n_good - 1], n_good == len(errors)
-    joined = not end and 0.0 < errors[n_good] <= DECADE * below
-    looser = settings[n_good:, None] / settings[:n_good]
-    near = ((looser >= 1.0) & (looser <= NEAR)).any()
-    if not (below >= target / DECADE or joined or near or (settings[:n_good] >= runs.loosest).any()):
-        return None
-    first = int((errors < below / DECADE).sum())
-    if not joined or not runs.of_one_order or runs.used(n_good - 1) != runs.used(n_good):
-        return first, n_good, None
-    x = np.log(errors[n_good - 1 : n_good + 1])
-    return first, n_good, float((np.log(target) - x[0]) / (x[1] - x[0]))
-
-
 def used(run: pd.Series) -> str:
     """The method that a solver took which chooses; a file has nothing where there is none."""
     return run["used"] if isinstance(run.get("used"), str) else ""
@@ -147,20 +53,3 @@ def astray(runs: pd.DataFrame) -> pd.Series:
 
 def errors_of(runs: pd.DataFrame) -> Array:
     return np.maximum(runs["error_q"].to_numpy(float), runs["floor"].to_numpy(float))
-
-
-def cost_at(costs: Array, place: Place) -> Array:
-    """The least cost (of each draw, if there are many) at a place; `costs`: a row a run, by error."""
-    first, n_good, share = place
-    best = np.fmin.reduce(costs[first:n_good])  # NaN: draws of runs made once, as others are cheaper
-    if share is None:
-        return np.asarray(best)
-    with np.errstate(invalid="ignore"):
-        between = np.exp((1.0 - share) * np.log(costs[n_good - 1]) + share * np.log(costs[n_good]))
-    return np.fmin(best, between)
-
-
-def cheapest(runs: Runs, place: Place) -> int:
-    """The row of the cheapest run at a place."""
-    first, n_good, _ = place
-    return int(runs.rows[first + np.argmin(runs.of("call_s")[first:n_good])])

@@ -9,22 +9,11 @@ from numpy.typing import NDArray
 
 from studies.bench.collector import NOTHING_RUN
 from studies.bench.render import number, power
-from studies.bench.runs_by_error import (
-    astray,
-    by_solver,
-    cheapest,
-    cost_at,
-    errors_of,
-    place_of,
-    resampled,
-    runs_with,
-    setting_of,
-)
+from studies.bench.runs_by_error import astray, by_solver, errors_of, runs_with, setting_of
 from studies.bench.store import Array
+from twoloop.rows.equal_error import INTERVAL, LEAST, cheapest, cost_at, place_of, resampled
 
 TIGHTEST = 1e-13  # tolerance of which tighter ones are of no use
-INTERVAL = (2.5, 97.5)  # percentiles that count of times drawn again
-LEAST = 1.05  # ratio of times that counts: less is within what machine and order of the calls do
 LIMITED = ("TIME_LIMIT", "MAX_STEPS")  # statuses of runs that we ended
 CAPPED = "steps were not enough|TOO_MUCH_WORK"  # in the messages of adapters whose most steps were used up
 COSTS = ("call_s", "call_q1", "call_q3", "n_evaluations")

@@ -5,9 +5,7 @@ at is judged in `goals`.
 """
 
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import replace
-from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
 import pandas as pd
@@ -17,6 +15,7 @@ from studies.bench import adaptive, cases, figures, headline, study, tables
 from studies.bench.cli import StudyError
 from studies.bench.collector import Case, Run, Warm, row_of
 from studies.bench.render import number, render
+from studies.bench.row_files import versions
 from studies.bench.solvers import (
     COMPARED,
     COMPARED_OWN,
@@ -40,7 +39,6 @@ IDA = ("IDA from C", "IDA, ")  # how its lines begin; CVODE is of the same famil
 QUICK = (*COMPARED[:4], "RadauIIA5", "IDA, stabilised")  # others take seconds to compile or to run
 QUICK_CASES = ("four-bar",)  # the beams' references take seconds
 TIME_LIMIT = 3.0  # s of CPU of a run: slower ones are of no use beside others
-PACKAGES = ("heyoka", "scikit-sundae", "scipy", "extensisq", "diffrax", "casadi", "solve-dae", "exudyn")
 
 
 def runs(case: Case, quick: bool) -> list[Run]:
@@ -117,15 +115,6 @@ def _row(run: Run, repeat: int, built: Warm) -> Row:
 def part(rows: pd.DataFrame, group: str = GROUP) -> pd.DataFrame:
     """The rows of one group, by default of the four cases, without columns that it has not."""
     return rows[rows["group"] == group].dropna(axis="columns", how="all").reset_index(drop=True)
-
-
-def versions() -> dict[str, str]:
-    """Of the packages compared, those that are installed."""
-    found = {}
-    for package in PACKAGES:
-        with suppress(PackageNotFoundError):
-            found[package] = version(package)
-    return found
 
 
 def measured_on(rows: pd.DataFrame) -> dict[str, Any]:

@@ -5,11 +5,11 @@ import pytest
 
 from studies.bench import headline, index, tables
 from studies.bench.render import render
-from studies.bench.runs_by_error import LOOSEST
 from studies.work_precision import rivals
 from studies.work_precision import study as work_precision
 from tests.studies.test_index import case, energy
 from tests.studies.test_tables import rows
+from twoloop.rows.equal_error import LOOSEST
 
 ERROR = 1e-6
 

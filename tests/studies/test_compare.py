@@ -12,8 +12,9 @@ from studies.bench.render import render
 from tests.problems import pendulum, pendulum_state
 from tests.studies.of_study import median
 from twoloop.mechanisms import Problem
+from twoloop.rows import row_format
 
-CODE = (ROOT / "docs" / "compare.md").read_text().split("```python\n")[1].split("```")[0]
+CODE, SOLVER = (part.split("```")[0] for part in (ROOT / "docs" / "compare.md").read_text().split("```python\n")[1:])
 PLAIN = CODE.replace("compile=True", "compile=False")  # machine code takes longer to make than all else here
 SOLVERS = ("DOP853 (twoloop)", "DOP853, projected", "Exudyn, GeneralizedAlpha")
 
@@ -21,26 +22,53 @@ SOLVERS = ("DOP853 (twoloop)", "DOP853, projected", "Exudyn, GeneralizedAlpha")
 @pytest.fixture
 def file(tmp_path):
     (tmp_path / "swing.py").write_text(PLAIN)
+    (tmp_path / "my_solver.py").write_text(SOLVER.partition("# ///\n")[2])  # without an environment of its own
     return tmp_path / "swing.py"
 
 
 @pytest.mark.parametrize("code", [PLAIN, pytest.param(CODE, marks=pytest.mark.slow)], ids=["plain", "compiled"])
 def test_the_page_of_the_docs_runs_outside_the_repository(file, code, monkeypatch):
     file.write_text(code)
-    words = ["swing.py:swing", "--quick", "--t-end", "0.5", "--out", "report", "--errors", "1e-3", "1e-5"]
+    words = ["swing.py:swing", "--quick", "--t-end", "0.512345", "--out", "report", "--errors", "1e-3", "1e-5"]
     monkeypatch.chdir(file.parent)
-    compare.main([*words, "--solvers", *SOLVERS])
+    compare.main([*words, "--solvers", *SOLVERS, "--solver", "my_solver.py:solve"])
     out = file.parent / "report"
     text, rows = (out / "compare.md").read_text(), pd.read_csv(out / "compare.csv", comment="#")
-    assert set(rows["solver"]) == set(SOLVERS) and "NOT_APPLICABLE" in set(rows["status"])
+    assert set(rows["solver"]) == {*SOLVERS, "my_solver.py:solve"} and "NOT_APPLICABLE" in set(rows["status"])
     assert "model of its own" in text and "Quick run" in text and "1e-5" in text
     findings = json.loads((out / "compare.json").read_text())
     assert findings["floor"] < 1e-9 and [at["error"] for at in findings["cheapest"]] == [1e-3, 1e-5]
     assert {"compare.png", "compare.svg"} <= {path.name for path in out.iterdir()}
+    monkeypatch.setattr(compare.figures, "save", lambda *arguments: None)  # longer than all else of a report
+    monkeypatch.setattr(compare.figures, "work_precision", lambda *arguments: None)
     (out / "compare.md").unlink()
     monkeypatch.chdir(file.parent.parent)
-    compare.main([f"{file}:swing", *words[1:-4], str(out), *words[-3:], "--redraw"])
+    again = [
+        f"{file}:swing",
+        *words[1:-4],
+        str(out),
+        *words[-3:],
+        "--redraw",
+        "--solver",
+        f"{file.parent}/my_solver.py:solve",
+    ]
+    compare.main(again)
     assert (out / "compare.md").read_text() == text
+    own = row_format.read_rows(out / "compare.jsonl")
+    mine = [row for row in own if row["solver"] == "my_solver.py:solve" and row["status"] == "REACHED_END"]
+    assert len(mine) == 3 and all(row["calibration_s"] > 0.0 and row["evaluations"] > 0 for row in mine)
+    assert mine[-1]["error"] < 1e-5 and "keeps_constraints" not in mine[0] and mine[0]["mechanism"] == "swing"
+    elsewhere = file.parent / "elsewhere.jsonl"
+    elsewhere.write_text(row_format.text_of(row | {"processor": "abacus"} for row in own))
+    compare.main([*again, "--with", str(elsewhere)])
+    assert "swing to 0.512345 s, error 0.001 over the motion, m or rad; abacus" in (out / "compare.md").read_text()
+    for words, says in (
+        (["--with", "archive"], "archive has no rows of swing to 0.512345 s, but of"),
+        (["--with", str(file)], "not in the format of rows"),
+        (["--solver", again[-1]], "--solver must name different ones"),
+    ):
+        with pytest.raises(SystemExit, match=says):
+            compare.main([*again, *words])
 
 
 @pytest.mark.parametrize(
@@ -79,8 +107,9 @@ def findings(**rows):
 
 
 def text_of(found):
-    tables = {"work": "", "kept": "", "failed": ""}
-    return render("compare", found, tables, stamp="", quick=False, middle=1e-4, note="", drawn=True)
+    tables = {"work": "", "kept": "", "failed": "", "beside": ""}
+    more = {"middle": 1e-4, "note": "", "drawn": True, "files": [], "n_times": 101}
+    return render("compare", found, tables, stamp="", quick=False, **more)
 
 
 def test_the_sentences_turn_with_the_rows():

@@ -12,7 +12,6 @@ import pytest
 from studies.bench import headline, index, tables
 from studies.bench.collector import Case
 from studies.bench.render import number, render
-from studies.bench.runs_by_error import LOOSEST
 from studies.bench.takes import takes
 from studies.honesty import study as honesty
 from studies.honesty.traps import FORCE
@@ -23,6 +22,7 @@ from tests.studies.of_study import found_of, median
 from tests.studies.test_index import energy
 from tests.studies.test_table3 import rows as rows_of_table3
 from twoloop.mechanisms import bricard, four_bar
+from twoloop.rows.equal_error import LOOSEST
 
 ROOT = Path(__file__).parents[2]
 BEGIN, END = "<!-- generated: begin -->\n", "<!-- generated: end -->"

@@ -5,9 +5,9 @@ import pytest
 
 from studies.bench import tables
 from studies.bench.collector import Case
-from studies.bench.runs_by_error import LOOSEST
 from studies.work_precision import goals
 from tests.studies.test_rivals import compared, rows
+from twoloop.rows.equal_error import LOOSEST
 
 
 def test_the_default_is_compared_with_the_best_of_ours_wherever_one_gets():

@@ -8,11 +8,11 @@ import pytest
 
 from studies.bench import headline, tables
 from studies.bench.render import render
-from studies.bench.runs_by_error import LOOSEST
 from studies.bench.solvers import CATALOGUE, OWN, RIVALS
 from studies.bench.store import KeptRows
 from studies.work_precision import goals, rivals
 from tests.studies.of_study import median
+from twoloop.rows.equal_error import LOOSEST
 
 
 def rows(*lines, case="four-bar"):

@@ -1,0 +1,174 @@
+"""Solvers from files: `simulate(problem, times, tolerance)` of `twoloop.testing`, each in a process of its own.
+
+The process has an environment of its own where the file asks for one (`own_environment`).
+"""
+
+import hashlib
+import json
+import os
+import signal
+import subprocess
+import sys
+from contextlib import suppress
+from multiprocessing import Pipe
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from references.driver import user_call
+from studies.bench.cli import CLONE, ROOT, StudyError
+from studies.bench.collector import FILE, Case, NotApplicable, Solver
+from studies.bench.own_environment import dependencies, environment
+from studies.bench.solvers import TOLERANCES
+from twoloop import Result, Statistics, Status
+
+N_TIMES = 101  # states that a solver is asked for, the first of which is the start
+START = 300.0  # s that the process may take to load twoloop, the mechanism and the solver
+CHILD = "import sys; sys.path.insert({}, {!r}); from studies.bench.outsider_process import main; main({}, *{!r})"
+
+
+class Outsider:
+    """A solver of a file on one mechanism, in a process that is started when it is asked, and again when it has died.
+
+    Parameters
+    ----------
+    where : str
+        FILE.py:FUNCTION.
+    mechanism : str
+        As `problem_from` takes it.
+
+    Attributes
+    ----------
+    name : str
+        In rows.
+    digest : str
+        Of the file.
+    calibrated : float
+        s of the calibration beside the last call (`twoloop.rows.calibration`).
+
+    Raises
+    ------
+    StudyError
+        If there is no such file, its header cannot be read or obeyed.
+    """
+
+    def __init__(self, where: str, mechanism: str):
+        file, _, self.function = where.rpartition(":")
+        self.path = Path(file).resolve()
+        if not self.function.isidentifier() or not self.path.is_file():
+            raise StudyError(f"--solver takes FILE.py:FUNCTION, a file that there is; given {where}")
+        data = self.path.read_bytes()
+        self.name, self.digest = f"{self.path.name}:{self.function}", hashlib.sha256(data).hexdigest()[:10]
+        self.mechanism, self.calibrated = _absolute(mechanism), float("nan")
+        self._python = environment(dependencies(data.decode("utf-8", "replace"), self.path))
+        self._process: subprocess.Popen[bytes] | None = None
+        self._pipe: Connection | None = None
+        self._spent = ""
+
+    def solver(self) -> Solver:
+        """Its entry in a catalogue."""
+        return Solver(self.name, FILE, "Python", True, "tol", self._run, TOLERANCES, own_accelerations=True)
+
+    def start(self) -> None:
+        """Start the process, which loads the file.
+
+        Raises
+        ------
+        StudyError
+            If it cannot.
+        """
+        self._pipe, there = Pipe()
+        given = (str(self.path), self.function, self.mechanism)
+        code = CHILD.format(0 if CLONE else len(sys.path), str(ROOT), there.fileno(), given)
+        # a group of its own, so that what it starts ends with it
+        options: dict[str, Any] = {"pass_fds": [there.fileno()], "start_new_session": True, "cwd": self.path.parent}
+        options |= dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.DEVNULL)
+        self._process = subprocess.Popen([self._python, "-P", "-c", code], **options)
+        there.close()
+        try:
+            said = self._asked({}, START) or {"failure": f"not loaded in {START:g} s"}
+        except RuntimeError as error:
+            said = {"failure": str(error)}
+        if said["failure"]:
+            self.end()
+            raise StudyError(f"{self.path} is no solver: {said['failure']}")
+
+    def _run(self, case: Case, tolerance: float, repeat: int) -> Result:
+        """A run, as solvers of the catalogue are run."""
+        system, (t0, _), q0, v0 = case.start
+        if system.n_a:
+            raise NotApplicable("a solver from a file gets no constraints of velocities alone")
+        ask = {"t0": t0, "t_end": case.t_end, "q0": q0.tolist(), "v0": v0.tolist()}
+        ask |= {"value": tolerance, "n_times": N_TIMES}
+        if self._spent:
+            return _failed(case, self._spent)
+        answer = self._asked(ask, case.time_limit)
+        if answer is None:
+            self._spent = (
+                f"Not back by time_limit = {case.time_limit:g} s at the tolerance {tolerance:g}, and asked no more."
+            )
+            return _failed(case, self._spent)
+        if "failure" in answer:
+            return _failed(case, answer["failure"])
+        if answer["v"] is None:
+            raise RuntimeError("it returns positions alone; return (q, v)")
+        user_call.seconds = answer["seconds"]
+        self.calibrated = answer["calibration_s"]
+        q, v = np.array(answer["q"]).T, np.array(answer["v"]).T
+        none = np.full_like(q, np.nan)
+        lam = np.full((system.n_c, N_TIMES), np.nan) if answer["l"] is None else np.array(answer["l"]).T
+        times, counts = np.linspace(t0, t0 + case.t_end, N_TIMES), {"n_evaluations": answer["n_forces"] or None}
+        stats = Statistics(**counts, cpu_time=answer["seconds"])
+        return Result(times, q, v, none, lam, np.empty(0), Status.REACHED_END, f"{self.name} returned.", stats)
+
+    def _asked(self, ask: dict[str, Any], limit: float) -> dict[str, Any] | None:
+        """The answer of the process; None where it does not come in time.
+
+        Raises
+        ------
+        RuntimeError
+            If the process ends instead.
+        """
+        if self._pipe is None:
+            self.start()
+        assert self._pipe is not None and self._process is not None
+        try:
+            if ask:
+                self._pipe.send_bytes(json.dumps(ask).encode())
+            if not self._pipe.poll(limit):
+                self.end()
+                return None
+            return dict(json.loads(self._pipe.recv_bytes()))
+        except (EOFError, OSError, ValueError):  # it has died, or writes into the pipe
+            process = self._process
+            self.end()
+            code = process.returncode
+            why = f"by {signal.Signals(-code).name}" if code < 0 else f"with status {code}"
+            raise RuntimeError(f"the process of the solver ended {why}") from None
+
+    def end(self) -> None:
+        """End the process, if there is one, and what it has started."""
+        if self._process is None or self._pipe is None:
+            return
+        self._pipe.close()
+        with suppress(subprocess.TimeoutExpired):
+            self._process.wait(0.2)  # it ends by itself where it has died, or listens
+        with suppress(ProcessLookupError, PermissionError):
+            os.killpg(self._process.pid, signal.SIGKILL)
+        self._process.wait()
+        self._process = self._pipe = None
+
+
+def _failed(case: Case, message: str) -> Result:
+    """A result of the start alone."""
+    _, (t0, _), q0, v0 = case.start
+    start = (np.array([t0]), q0[:, None], v0[:, None], 0.0 * q0[:, None], np.zeros((case.problem.system.n_c, 1)))
+    return Result(*start, np.empty(0), Status.SOLVER_FAILED, message, Statistics(cpu_time=0.0))
+
+
+def _absolute(mechanism: str) -> str:
+    """The mechanism, as it is found from another folder."""
+    file, colon, function = mechanism.rpartition(":")
+    return f"{Path(file).resolve()}{colon}{function}" if file else mechanism

@@ -1,0 +1,126 @@
+"""The process in which a solver from a file runs: it calls the solver whenever it is asked, and times each call.
+
+Asked and answered in JSON, over a pipe: what the solver prints, imports or breaks stays here.
+"""
+
+import importlib.util
+import json
+import os
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from references.equations.accelerations import compiled_gamma
+from twoloop.mechanisms import Problem
+from twoloop.mechanisms.user_file import problem_from
+from twoloop.rows.calibration import calibration_s
+from twoloop.testing.known_problem import Array, KnownProblem
+from twoloop.testing.simulated import simulated
+
+
+def known_problem(problem: Problem, t0: float, q0: Array, v0: Array, t_end: float) -> KnownProblem:
+    """A mechanism as `simulate` of `twoloop.testing` takes it, without what is known of its motion."""
+    system = problem.system
+    gamma_into, p = compiled_gamma(system), system.functions.p
+
+    def gamma(t: float, q: Array, v: Array) -> Array:
+        right = np.zeros(system.n_c)
+        gamma_into(t, np.array(q, dtype=float), np.array(v, dtype=float), p, right)
+        return right
+
+    return KnownProblem(
+        problem.name,
+        system.mass,
+        system.force,
+        system.constraint,
+        system.jacobian,
+        system.constraint_rate,
+        gamma,
+        problem.energy if problem.conserved else None,
+        q0,
+        v0,
+        (t0, t0 + t_end),
+        problem.tags,
+        tuple(str(each) for each in problem.coordinates),
+        np.ones(system.n_c),
+        note=problem.note,
+    )
+
+
+def loaded(path: Path, function: str) -> Callable[..., Any]:
+    """The function of a file.
+
+    Raises
+    ------
+    AttributeError
+        If there is none; an exception of the file itself comes through.
+    """
+    spec = importlib.util.spec_from_file_location(path.stem, path)
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules.setdefault(path.stem, module)
+    sys.path.insert(0, str(path.parent))
+    spec.loader.exec_module(module)
+    found = getattr(module, function, None)
+    if not callable(found):
+        raise AttributeError(f"{path.name} has no function {function}")
+    return found  # type: ignore[no-any-return]
+
+
+def run(simulate: Callable[..., Any], problem: Problem, ask: dict[str, Any]) -> dict[str, Any]:
+    """What a call returned, and what it took."""
+    posed = known_problem(problem, ask["t0"], np.array(ask["q0"]), np.array(ask["v0"]), ask["t_end"])
+    n_forces, force, seconds = 0, posed.force, 0.0
+
+    def counted(t: float, q: Array, v: Array) -> Array:
+        nonlocal n_forces
+        n_forces += 1
+        return force(t, q, v)
+
+    def clocked(*given: Any) -> Any:
+        nonlocal seconds
+        began = _cpu_time()
+        try:
+            return simulate(*given)
+        finally:
+            seconds = _cpu_time() - began
+
+    times = np.linspace(*posed.t_span, ask["n_times"])
+    calibration = calibration_s()
+    try:
+        found = simulated(clocked, replace(posed, force=counted), times, ask["value"])
+    except (TypeError, ValueError) as error:  # of another shape
+        return {"failure": str(error)}
+    if found.error or not found.complete:
+        return {"failure": found.error or "numbers that are not finite"}
+    arrays = {"q": found.q.tolist()}
+    arrays |= {name: None if part is None else part.tolist() for name, part in (("v", found.v), ("l", found.lam))}
+    return arrays | {"seconds": seconds, "calibration_s": min(calibration, calibration_s()), "n_forces": n_forces}
+
+
+def _cpu_time() -> float:
+    """Of this process, of its threads, and of the processes that it has waited for, s."""
+    return time.process_time() + sum(os.times()[2:4])
+
+
+def main(descriptor: int, file: str, function: str, mechanism: str) -> None:
+    """Answer until the pipe is closed."""
+    connection = Connection(descriptor)
+    try:
+        problem, simulate = problem_from(mechanism), loaded(Path(file), function)
+        failure = ""
+    except BaseException as error:  # whatever a file does when it is imported
+        failure = f"{type(error).__name__}: {error}"
+    connection.send_bytes(json.dumps({"failure": failure}).encode())
+    while not failure:
+        try:
+            ask = json.loads(connection.recv_bytes())
+        except EOFError:
+            return
+        connection.send_bytes(json.dumps(run(simulate, problem, ask)).encode())

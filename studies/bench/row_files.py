@@ -1,0 +1,81 @@
+"""Runs in the format of `twoloop.rows`, of the medians that tables are made of."""
+
+from collections.abc import Mapping
+from contextlib import suppress
+from importlib.metadata import PackageNotFoundError, version
+from typing import Any
+
+import pandas as pd
+
+from studies.bench.cli import processor
+from studies.bench.collector import FILE
+from studies.bench.mechanism_names import mechanism_of
+from studies.bench.runs_by_error import SETTINGS
+from twoloop import __version__
+from twoloop.rows.row_format import REACHED_END, SCHEMA, Row
+
+RIVALS = ("heyoka", "scikit-sundae", "scipy", "extensisq", "diffrax", "casadi", "solve-dae", "exudyn")
+PACKAGES = {"SUNDIALS": "scikit-sundae", "solve_dae": "solve-dae"}  # of families that are called otherwise
+QUALITY = ("violation_q", "violation_v", "error_lam", "energy")
+DIGITS = 4  # significant, of numbers that are measured, not of ...
+EXACT = ("t_end", "value", "evaluations")  # ... these
+LONGEST = 120  # letters of a message
+
+
+def versions() -> dict[str, str]:
+    """Of the packages compared, those that are installed."""
+    found = {}
+    for package in RIVALS:
+        with suppress(PackageNotFoundError):
+            found[package] = version(package)
+    return found
+
+
+def in_format(run: Mapping[str, Any], columns: Mapping[str, str], versions: Mapping[str, str]) -> Row:
+    """The row of a run.
+
+    Parameters
+    ----------
+    run : mapping
+        A line of `tables.medians`.
+    columns : mapping
+        Where it has the errors and floors of the format that are known.
+    versions : mapping
+        Of the rivals' packages, and of solvers from files.
+    """
+    family, done = run["family"], run["status"] == REACHED_END
+    setting = next(name for name in SETTINGS if run.get(name) == run.get(name, float("nan")))
+    row = {"schema": SCHEMA, "mechanism": mechanism_of(run["case"]), "t_end": run["t_end"], "solver": run["solver"]}
+    row |= {name: run[name] for name in ("family", "called_from", "status")}
+    row["keeps_constraints"] = None if family == FILE else run["keeps_constraints"]
+    if family == "two-loop":
+        row["version"] = ", ".join([__version__, *([run["commit"]] if "commit" in run else [])])
+    else:
+        row["version"] = versions.get(run["solver"]) or versions.get(package_of(family)) or "unknown"
+    row |= {"processor": run.get("processor") or processor(), "setting": setting, "value": run[setting]}
+    row |= {
+        "times_s": [rounded(time) for time in run["times"]] if done else [],
+    }
+    row["evaluations"] = None if pd.isna(run["n_evaluations"]) else int(run["n_evaluations"])
+    if not done:
+        row["message"] = " ".join(str(run["message"]).split())[:LONGEST]
+    else:
+        row |= {name: run[name] for name in ("used", "calibration", "calibration_s") if name in run}
+        row |= {name: run[column] for name, column in columns.items()}
+        row |= {name: abs(run[name]) for name in QUALITY if run[name] is not None}
+        row["astray"] = True if run["astray"] in (True, "True") else None
+    known = {name: value for name, value in row.items() if value not in (None, "") and value == value}
+    return {name: value if name in EXACT else rounded(value) for name, value in known.items()}
+
+
+def package_of(family: str) -> str:
+    """The package that the solvers of a family are of."""
+    return PACKAGES.get(family, family.lower())
+
+
+def rounded(value: Any) -> Any:
+    """A number of few digits, a whole one as an integer; all else as it is."""
+    if not isinstance(value, float):
+        return value
+    short = float(f"{value:.{DIGITS}g}")
+    return int(short) if short.is_integer() and short < 1e15 else short

@@ -1,0 +1,5 @@
+"""python -m studies.conformance."""
+
+from studies.conformance.study import main
+
+main()

@@ -1,0 +1,51 @@
+"""The rows of work_precision.csv in the wheel: one a run, in the format of `twoloop.rows`.
+
+`python -m studies.work_precision.archive` makes `twoloop/rows/archive.jsonl.gz` of reports/work_precision.csv.
+"""
+
+import gzip
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+import pandas as pd
+
+from studies.bench import cli, tables
+from studies.bench.cli import REPORTS
+from studies.bench.row_files import in_format
+from studies.bench.store import read_rows
+from studies.compare import GROUP as LENGTH
+from studies.work_precision.rivals import GROUP
+from twoloop.rows.leaderboard import ARCHIVE
+from twoloop.rows.row_format import Row, text_of
+
+MEASURED = {  # what the errors of a group are
+    GROUP: {"error_end": "error_q", "floor_end": "floor"},
+    LENGTH: {"error": "error_q", "floor": "floor"},
+}
+
+
+def archived(rows: pd.DataFrame, versions: dict[str, str]) -> list[Row]:
+    """Rows of the format, of the repetitions of all runs of the comparisons; `versions`: of the rivals' packages."""
+    found = []
+    for group, columns in MEASURED.items():
+        medians = tables.medians(rows[rows["group"] == group])
+        found += [in_format(run, columns, versions) for run in medians.to_dict("records")]
+    return found
+
+
+def made_of(folder: Path) -> str:
+    """The archive of the rows in a folder of reports."""
+    rows, _ = read_rows(folder / "work_precision.csv", "group", "case", "solver", "t_end")
+    return text_of(archived(rows, json.loads((folder / "work_precision.json").read_text())["versions"]))
+
+
+def main(words: Sequence[str] | None = None) -> None:
+    """Write the archive."""
+    text = made_of(REPORTS)
+    ARCHIVE.write_bytes(gzip.compress(text.encode(), 9, mtime=0))
+    print(f"wrote {text.count(chr(10))} rows, {ARCHIVE.stat().st_size / 1e3:.0f} kB, to {ARCHIVE}")
+
+
+if __name__ == "__main__":
+    cli.main(main)

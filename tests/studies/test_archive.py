@@ -1,0 +1,43 @@
+"""The rows in the wheel are those of work_precision.csv, and mechanisms have one name in all rows."""
+
+import inspect
+
+import pandas as pd
+
+from studies.bench.cli import REPORTS
+from studies.bench.mechanism_names import READY, mechanism_of
+from studies.bench.row_files import package_of, rounded
+from studies.bench.store import read_rows
+from studies.work_precision import archive
+from twoloop import mechanisms
+from twoloop.rows.leaderboard import ARCHIVE
+from twoloop.rows.row_format import mistakes, read_lines, text_of
+
+AGAIN = "make it again by python -m studies.work_precision.archive"
+
+
+def test_the_archive_is_of_the_rows_of_the_report():
+    rows, _ = read_rows(REPORTS / "work_precision.csv")
+    kept = [line for line in read_lines(ARCHIVE) if '"mechanism":"four_bar_second"' in line]
+    versions = {row["family"]: row["version"] for row in mistakes(kept)[0] if row["family"] != "two-loop"}
+    versions |= {package_of(family): version for family, version in versions.items()}
+    made = archive.archived(rows[rows["case"] == "four-bar, second"], versions)
+    assert text_of(made).splitlines() == kept, AGAIN
+    runs = rows[rows["group"].isin(archive.MEASURED)]
+    settings = ["case", "group", "solver", "tol", "h", "err_out", "t_end"]
+    assert len(runs.drop_duplicates(settings)) == len([line for line in read_lines(ARCHIVE) if line]), AGAIN
+
+
+def test_ready_mechanisms_are_called_by_their_functions():
+    for name in mechanisms.__all__:
+        maker = getattr(mechanisms, name)
+        if inspect.isfunction(maker) and name != "ancf_beam":  # which has arguments
+            assert mechanism_of(maker().name) == name
+    assert all(hasattr(mechanisms, name) for title, name in READY.items() if "second" not in name)
+    assert mechanism_of("My crane, 3 m (wet)") == "my_crane_3_m_wet"
+
+
+def test_numbers_are_short_and_whole_ones_whole():
+    rows = pd.DataFrame({"a": [1.23456e-7, 10.0, float("nan")]})
+    assert [rounded(value) for value in rows["a"][:2]] == [1.235e-7, 10]
+    assert isinstance(rounded(10.0), int) and rounded("x") == "x" and rounded(True) is True
