@@ -12,7 +12,8 @@ from twoloop.bodies import assembly
 from twoloop.bodies.model_energy import ModelEnergy
 from twoloop.bodies.model_problem import ModelProblem
 from twoloop.bodies.model_stops import Stops
-from twoloop.bodies.model_system import joints_of, system_of
+from twoloop.bodies.model_system import check_forces, joints_of, system_of
+from twoloop.bodies.notes import note_of
 from twoloop.bodies.parts import Body, ModelJoint
 from twoloop.bodies.sketches import drawing_of
 from twoloop.bodies.tables import Tables
@@ -74,6 +75,7 @@ class Model(Stops):
         if not self.bodies:
             raise ValueError(f"{self.name!r} has no bodies: add some with body(...) before problem()")
         tables = self._tables(self.joints, values)
+        tables.check()
         self._check_inertias(tables)
         start = self._start() if guess is None else guess
         about = t_span[0], start, np.zeros_like(start)
@@ -91,11 +93,13 @@ class Model(Stops):
             bare.rows,
             coordinates,
         )
+        closed = q
         if bare is not tables:
             q = assembly.driven_there(system, t_span[0], q, keep)
         self._check_branches(t_span[0], q)
         given, known = self._velocities(q)
         v = assembly.velocities(system, t_span[0], q, given, known, coordinates)
+        check_forces(tables, t_span[0], q, v)
         freedom = assembly.freedom(system, t_span[0], q, tables.rows)
         return ModelProblem(
             name=name,
@@ -105,7 +109,7 @@ class Model(Stops):
             t_span=t_span,
             energy=ModelEnergy(tables.p.copy(), self.dimension),
             parameters=tables.values,
-            note=_note(freedom, tables.untraced),
+            note=note_of(self, tables, freedom, closed if guess is not None else start, closed, q, coordinates),
             conserved=tables.conserve,
             tags=self._tags(freedom),
             coordinates=coordinates,
@@ -175,15 +179,3 @@ class Model(Stops):
             "singular": freedom.singular > 0,
         }
         return tuple(tag for tag, holds in known.items() if holds)
-
-
-def _note(freedom: assembly.Freedom, untraced: str) -> str:
-    """What there is to know of a model that was put together."""
-    noun = "degree" if freedom.degrees == 1 else "degrees"
-    parts = [f"{freedom.degrees} {noun} of freedom."]
-    if freedom.singular:
-        parts.append(f"The start is singular: {freedom.singular} more there.")
-    parts += [f"Rows follow from others among {', '.join(map(repr, group))}." for group in freedom.redundant]
-    if untraced:
-        parts.append(f"Its functions are called in Python, which is slower: {untraced}.")
-    return " ".join(parts)
