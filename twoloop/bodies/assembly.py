@@ -35,7 +35,7 @@ class Freedom:
     Attributes
     ----------
     degrees : int
-        Degrees of freedom.
+        Degrees of freedom: how many velocities are independent.
     singular : int
         How many more there are at the start alone, where the joints lose rank.
     redundant : tuple of tuple of str
@@ -224,7 +224,7 @@ def freedom(system: ConstrainedSystem, t: float, q: Array, rows: Mapping[str, tu
         return Freedom(system.n_q, 0, ())
     scaled = _scaled(system, t, q)
     if _full_rank(scaled):
-        return Freedom(system.n_q - system.n_c, 0, ())
+        return Freedom(system.n_q - len(scaled), 0, ())
     at_start = _rank(system, t, q)
     beside = at_start
     free = null_space(scaled, rcond=SINGULAR)
