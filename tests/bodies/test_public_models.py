@@ -199,7 +199,7 @@ def test_a_stewart_platform():
 def test_a_delta_robot():
     """R. Clavel's robot as in M. Zavatsky's tutorial, Delta robot kinematics (Trossen Robotics' forum, 2009).
 
-    Sides of the triangles 457.3 and 115 mm, arms 112 and 232 mm; compared with the copies of its code in other programs.
+    Sides of the triangles 457.3 and 115 mm, arms 112 and 232 mm; compared with copies of its code in other programs.
     """
     f, e, arm, rod = 0.4573, 0.115, 0.112, 0.232
     out, near = f / (2.0 * np.sqrt(3.0)), e / (2.0 * np.sqrt(3.0))
