@@ -1,4 +1,4 @@
-"""What is made anew with every build, in docs/generated: reports, methods, gallery, joints, the run of the front page."""
+"""What is made anew with every build, in docs/generated: reports, methods, gallery, joints, the front page."""
 
 import contextlib
 import io

@@ -222,6 +222,7 @@ def test_all_three_are_one_mechanism(names):
     ends = [solve_dae(s, (0.0, 2.0), page["q0"], page["v0"], rtol=1e-8, atol=1e-8).q[:, -1] for s in systems]
     assert np.ptp(ends, axis=0).max() < 1e-5
     assert page["problem"].q0 == pytest.approx(page["q0"], abs=1e-14)
+    assert page["turned"].q[[0, 2], -1] == pytest.approx(ends[0][[0, 2]], abs=1e-5)  # SymPy's joints
     assert np.ptp(page["energy"]) < 1e-5
 
 
