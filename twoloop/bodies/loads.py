@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -9,7 +10,7 @@ import numpy as np
 from twoloop.bodies.collection import Collection
 from twoloop.bodies.functions import Function, motion_function
 from twoloop.bodies.parameter_layout import BRAKE, FORCE, PULL, RAIL, RUB, SPRING, TORQUE
-from twoloop.bodies.parts import Body, Force, JointRow, ModelJoint, Numbers
+from twoloop.bodies.parts import Body, DryFriction, Force, JointRow, ModelJoint, Numbers
 from twoloop.checks.arguments import check_finite, check_not_negative, check_positive
 
 
@@ -198,6 +199,41 @@ class Loads(Collection):
         names = f"value of {name} ({units[0]})", f"speed of {name} ({units[1]})"
         numbers = Numbers((check_not_negative("f", f), float(speed)), names)
         return self._add_force(self._along(name, BRAKE if turns else RUB, rubbed, numbers))
+
+    def dry_friction(
+        self, joint: ModelJoint | str, f: float, *, static: float | None = None, name: str | None = None
+    ) -> DryFriction:
+        """Coulomb's friction in a revolute or prismatic joint, which may stick; for `solve_with_friction`.
+
+        It does not depend on the load of the joint. `solve_dae` does not know it.
+
+        Parameters
+        ----------
+        joint : ModelJoint or str
+        f : float
+            The torque or force against sliding, N m or N.
+        static : float, optional
+            The most that holds the joint while it sticks, at least `f`. None: the same.
+        name : str, optional
+
+        Returns
+        -------
+        DryFriction
+
+        Raises
+        ------
+        TypeError, ValueError
+            If an argument is wrong.
+        """
+        rubbed = self._joint(joint, ("revolute", "prismatic"), "dry_friction")
+        name = self._new_name(f"dry friction of {rubbed.name}", name)
+        kinetic = check_not_negative("f", f)
+        most = kinetic if static is None else check_not_negative("static", static)
+        if most < kinetic:
+            raise ValueError(f"static must be at least f = {kinetic:g}; given {static!r}")
+        force = replace(self._motor(name, rubbed, "", 0.0), more=Numbers((0.0,)), joint=None)
+        self.dry.append(DryFriction(name, rubbed, kinetic, most, self._add_force(force)))
+        return self.dry[-1]
 
     def force(self, body: Body | str, at: Any, f: Any, *, name: str | None = None) -> Force:
         """A force on a body, along the axes of space, at a point that the body carries along.

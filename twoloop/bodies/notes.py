@@ -73,6 +73,8 @@ def _forgotten(model: Collection) -> Iterator[str]:
         if force.joint is not None and id(force.joint.point_b) in drives:
             name = drives[id(force.joint.point_b)]
             yield f"{force.name!r} acts where {name!r} prescribes the motion: it changes the reaction of that alone."
+    if model.dry:
+        yield "solve_with_friction keeps its dry friction; solve_dae does not know it."
     if model.stops:
         yield "solve_with_stops keeps its stops; solve_dae does not know them."
 
