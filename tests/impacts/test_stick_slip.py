@@ -93,8 +93,7 @@ def test_a_block_on_a_belt_sticks_and_slips():
     assert problem.v0[3] == 0.0  # at rest: it slides at first
     result = solve_with_friction(problem, **TIGHT)
     w, x0, x1 = np.sqrt(k / m), kinetic / k, static / k
-    caught = np.pi / 2 / w  # from rest: x = x0 (1 - cos wt), which is as fast as the belt at sin wt = speed / (w x0)
-    caught = np.arcsin(speed / (w * x0)) / w
+    caught = np.arcsin(speed / (w * x0)) / w  # from rest: x = x0 (1 - cos wt) is as fast as the belt then
     slip = 2.0 * (np.pi - np.arctan((x1 - x0) * w / speed)) / w
     hold = (x1 - (x0 - (x1 - x0))) / speed  # it is caught at 2 x0 - x1, the mirror image of where it was released
     first = caught + (x1 - x0 * (1.0 - np.cos(w * caught))) / speed
@@ -120,18 +119,70 @@ def test_two_blocks_of_which_one_holds_the_other():
     assert result.q[0, -1] == pytest.approx(most, abs=1e-9) and result.q[3, -1] == pytest.approx(1.0, abs=1e-12)
 
 
-def test_what_cannot_be():
-    model = PlanarModel(name="sled")
-    model.body("block", mass=1.0, inertia=0.1, position=(0.0, 0.0))
-    guide = model.prismatic("ground", "block", at=(0.0, 0.0), axis=(1.0, 0.0))
-    with pytest.raises(ValueError, match="'sled' has no dry friction"):
-        solve_with_friction(model.problem())
-    with pytest.raises(ValueError, match="static must be at least f = 2; given 1"):
-        model.dry_friction(guide, 2.0, static=1.0)
-    model.dry_friction(guide, 2.0)
-    problem = model.problem()
+def rotor(torque, **friction):
+    """A rotor without weight under a torque."""
+    model = PlanarModel((0.0, 0.0))
+    model.body("rotor", mass=1.0, inertia=0.5, position=(0.0, 0.0))
+    hinge = model.revolute("ground", "rotor", at=(0.0, 0.0))
+    model.dry_friction(hinge, 1.0, **friction)
+    model.motor(hinge, torque)
+    return model.problem((0.0, 4.0))
+
+
+def test_static_friction_is_overcome_and_one_in_balance_holds():
+    released = solve_with_friction(rotor(lambda t: t, static=1.5), **TIGHT)
+    np.testing.assert_allclose(changes(released), [1.5], atol=1e-9)
+    assert released.v[2, -1] == pytest.approx((16.0 - 2.25) - 2.0 * 2.5, abs=1e-9)
+    held = solve_with_friction(rotor(1.0), **TIGHT)
+    assert len(held.arcs) == 1 and not held.v.any()
+    at_once = solve_with_friction(rotor(lambda t: 1.0 + t), **TIGHT)  # friction is at its most from the start
+    assert at_once.v[2, -1] == pytest.approx(16.0, abs=1e-7)
+
+
+def test_a_block_on_a_cart_is_caught_and_both_stop():
+    model = PlanarModel()
+    model.body("cart", mass=2.0, inertia=1.0, position=(0.0, 0.0))
+    model.body("block", mass=1.0, inertia=1.0, position=(0.0, 0.2), velocity=(2.0, 0.0))
+    model.dry_friction(model.prismatic("ground", "cart", at=(0.0, 0.0), axis=(1.0, 0.0)), 2.0)
+    model.dry_friction(model.prismatic("cart", "block", at=(0.0, 0.2), axis=(1.0, 0.0)), 5.0)
+    problem = model.problem((0.0, 5.0))
+    problem.v0[:] = [0.0, 0.0, 0.0, 2.0, 0.0, 0.0]
+    result = solve_with_friction(problem, **TIGHT)
+    caught, speed = 2.0 / 6.5, 3.0 / 6.5  # decelerations -5 and (5 - 2) / 2, then 2 / 3 together
+    np.testing.assert_allclose(changes(result), [caught, caught + 1.5 * speed], atol=1e-9)
+    assert result.q[0, -1] == pytest.approx(0.75 * caught**2 + 0.75 * speed**2, abs=1e-9)
+    lighter = solve_with_friction(problem.with_parameters({"mass of block": 0.5}), **TIGHT)
+    assert lighter.success and lighter.q[0, -1] < result.q[0, -1]
+
+
+def double_pendulum(kind):
+    points = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0]])
+    flat = kind is PlanarModel
+    model = kind((0.0, -9.81) if flat else (0.0, -9.81, 0.0))
+    axis = {} if flat else {"axis": (0.0, 0.0, 1.0)}
+    for k, name in enumerate("ab"):
+        one, other = points[k], points[k + 1]
+        if flat:
+            model.body(name, mass=1.0, inertia=0.1, position=0.5 * (one + other))
+        else:
+            place = np.append(0.5 * (one + other), 0.0)
+            model.body(name, mass=1.0, inertia=(0.1, 0.1, 0.1), position=place)
+        joint = model.revolute("ab"[k - 1] if k else "ground", name, at=one if flat else np.append(one, 0.0), **axis)
+        model.dry_friction(joint, (1.0, 0.5)[k], static=(1.6, 0.5)[k])
+    return model.problem((0.0, 1.6))
+
+
+def test_a_double_pendulum_by_unlike_methods_in_a_plane_and_in_space():
+    problem = double_pendulum(PlanarModel)
+    known = solve_with_friction(problem, method="DOP853", **TIGHT)
+    assert len(changes(known)) >= 5
+    assert np.diff(problem.energy(known.t, known.q, known.v)).max() < 1e-12  # friction takes energy only
+    for other, method in ((problem, "RadauIIA9"), (double_pendulum(SpatialModel), "DOP853")):
+        result = solve_with_friction(other, method=method, **TIGHT)
+        np.testing.assert_allclose(changes(result), changes(known), atol=1e-9)
+
+
+def test_what_the_problem_says_of_dry_friction():
+    problem = rotor(1.0)
     assert "solve_with_friction keeps its dry friction" in problem.note and not problem.conserved
-    with pytest.raises(TypeError, match="no option 'events'"):
-        solve_with_friction(problem, events=[])
-    with pytest.raises(TypeError, match="problem must be that of a model"):
-        solve_with_friction(problem.system)
+    assert not any("friction" in name for name in problem.parameters)

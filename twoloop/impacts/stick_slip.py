@@ -23,8 +23,9 @@ from twoloop.solve import solve_dae
 
 Array = NDArray[np.float64]
 
-REST = 1e-12  # of the velocities of the bodies: rates of joints that count as zero at the start
-HOLDS = 1e-12  # relative: friction below its most by less does not hold
+REST = 1e-10  # of the largest velocities of the last arc: rates of joints that count as zero
+INDEPENDENT = 1e-9  # of how a joint yields alone, over the same of a free body
+AT_MOST = 1e-9  # relative: friction that holds with all that it has
 
 
 def solve_with_friction(
@@ -64,7 +65,7 @@ def solve_with_friction(
     Raises
     ------
     TypeError, ValueError
-        If an argument is wrong, or the model has no dry friction.
+        If an argument is wrong, the model has no dry friction, or a joint with it cannot slide by itself.
 
     Notes
     -----
@@ -73,7 +74,9 @@ def solve_with_friction(
     """
     if not isinstance(problem, ModelProblem):
         raise TypeError(f"problem must be that of a model, what model.problem() returned; given {shown(problem)}")
-    if problem.model is None or not problem.model.dry:
+    if problem.model is None:
+        raise ValueError(f"{problem.name!r} came from another process without its model: make it again there")
+    if not problem.model.dry:
         raise ValueError(
             f"{problem.name!r} has no dry friction: add some with model.dry_friction(...), or use solve_dae"
         )
@@ -97,6 +100,8 @@ class _Motion:
         self.t, self.q, self.v = t, problem.q0.copy(), problem.v0.copy()
         self.rubs = self.model.dry
         self._pulls = [self.model.pull(rub, problem.parameters) for rub in self.rubs]
+        self._check_independent(problem)
+        self.speeds = np.abs(self.v)  # the largest of the last arc
         self.still: set[int] = set()  # joints that have stopped, or stick
         self.released: dict[int, int] = {}  # the direction in which those begin to slide that were held
         self.arcs: list[Result] = []
@@ -116,6 +121,22 @@ class _Motion:
                 said = f"Stopped at t = {self.t:.10g}: {standing} changes in a row at this time. Loosen atol"
                 return joined(system, self.arcs, (), times, said, tale)
 
+    def _check_independent(self, problem: ModelProblem) -> None:
+        """Raise unless each joint can slide while the others stick: else their shares are not determined."""
+        W = np.array([self._along(k, self.q) for k in range(len(self.rubs))])
+        D = W @ responses(problem.system, self.t, self.q, W)
+        scale = (W**2).sum(axis=1) / float(np.abs(problem.system.mass(self.t, self.q)).max())
+        for k, rub in enumerate(self.rubs):
+            before = D[:k, :k]
+            left = D[k, k] - D[k, :k] @ np.linalg.lstsq(before, D[:k, k], rcond=NEGLIGIBLE)[0]
+            if not left > INDEPENDENT * scale[k]:
+                others = ", ".join(repr(each.name) for each in self.rubs[:k])
+                raise ValueError(
+                    f"the joint of {rub.name!r} cannot slide by itself: drives or other joints hold it"
+                    f"{f', or it moves as those of {others} do' if k else ''}, so that its friction is not determined "
+                    "while it sticks; leave it out, and give another joint all of the friction"
+                )
+
     def _along(self, k: int, q: Array) -> Array:
         """By how much a joint slides with the coordinates, (n_q,)."""
         return self._pulls[k].force(0.0, q, np.zeros_like(q))
@@ -124,7 +145,7 @@ class _Motion:
         """In which direction each joint slides; 0: it sticks."""
         W = np.array([self._along(k, self.q) for k in range(len(self.rubs))])
         u = W @ self.v
-        moves = np.abs(u) > REST * (np.abs(W) @ np.abs(self.v))
+        moves = np.abs(u) > REST * (np.abs(W) @ self.speeds)
         signs = [self.released.get(k, int(np.sign(u[k])) * bool(moves[k])) for k in range(len(u))]
         slow = [k for k in range(len(u)) if k not in self.released and (k in self.still or not moves[k])]
         if not slow:
@@ -138,10 +159,11 @@ class _Motion:
         R, W = held.jacobian(self.t, self.q)[of], W[slow]
         c = _turned(R, W) * (R @ a - held.gamma(self.t, self.q, self.v)[of])
         most = np.array([self.rubs[k].static for k in slow])
-        F = _held(W @ responses(free, self.t, self.q, W), c, most)
-        for k, force, limit, alone in zip(slow, F, most, c, strict=True):
-            if abs(force) >= (1.0 - HOLDS) * limit:
-                signs[k] = int(np.sign(-force or alone))
+        D = W @ responses(free, self.t, self.q, W)
+        left = D @ (F := _held(D, c, most)) + c  # how the joints accelerate
+        terms = np.abs(D) @ np.abs(F) + np.abs(c)
+        for k, sign, slides in zip(slow, np.sign(left), np.abs(left) > AT_MOST * terms, strict=True):
+            signs[k] = int(sign) * bool(slides)
         return signs
 
     def _forces(self, signs: list[int]) -> dict[str, float]:
@@ -174,14 +196,12 @@ class _Motion:
             W = self._along(k, q)
             return float(-holds.at(t, q, v)[1][row] * _turned(system.jacobian(t, q)[[row]], W[None])[0])
 
-        events = [
-            terminal(self._stops(k, sign) if sign else _released(force, k, self.rubs[k].static))
-            for k, sign in enumerate(signs)
-        ]
+        events = [terminal(self._stops(k, sign) if sign else self._lets_go(k, force)) for k, sign in enumerate(signs)]
         options = {**self.options, "check_derivatives": self.options.get("check_derivatives", True) and not self.arcs}
         arc = solve_dae(system, (self.t, t1), self.q, self.v, events=events, dense_output=True, **options)
         self.arcs.append(arc)
         if arc.t.size:
+            self.speeds = np.abs(arc.v).max(axis=1)
             self.t, self.q, self.v = float(arc.t[-1]), arc.q[:, -1].copy(), arc.v[:, -1].copy()
         over = {k for k in range(len(signs)) if arc.t_events is not None and arc.t_events[k].size}
         self.released = {k: -int(np.sign(force(k, self.t, self.q, self.v))) for k in over if signs[k] == 0}
@@ -200,6 +220,13 @@ class _Motion:
 
         return stops
 
+    def _lets_go(self, k: int, force: Any) -> Any:
+        """The event of a joint that needs more than its friction; one that needs all of it may do so at once."""
+        most = self.rubs[k].static
+        if abs(force(k, self.t, self.q, self.v)) > (1.0 - AT_MOST) * most:
+            most *= 1.0 + AT_MOST
+        return lambda t, q, v: most - abs(force(k, t, q, v))
+
     def _close(self, system: ConstrainedSystem) -> None:
         """Put the state on the constraints of a mode, from which it is off by less than the tolerances."""
         for _ in range(CORRECTIONS):
@@ -207,10 +234,6 @@ class _Motion:
             self.q = self.q - np.linalg.lstsq(system.jacobian(self.t, self.q), off, rcond=NEGLIGIBLE)[0]
         rows, off = system.rows(self.t, self.q), system.velocity_constraint(self.t, self.q, self.v)
         self.v = self.v - np.linalg.lstsq(rows, off, rcond=NEGLIGIBLE)[0]
-
-
-def _released(force: Any, k: int, most: float) -> Any:
-    return lambda t, q, v: most - abs(force(k, t, q, v))
 
 
 def _turned(R: Array, W: Array) -> Array:
