@@ -1,4 +1,4 @@
-"""What is made anew with every build, in docs/generated: reports, which method, gallery, the run of the front page."""
+"""What is made anew with every build, in docs/generated: reports, methods, gallery, joints, the front page."""
 
 import contextlib
 import io
@@ -6,6 +6,7 @@ import shutil
 from pathlib import Path
 
 import gallery
+import joints
 import rooms
 
 from studies.which_method import page, table
@@ -28,6 +29,7 @@ def write(folder: Path) -> None:
     (folder / "which_method.md").write_text(page(ROOT / "reports"), encoding="utf-8")
     (folder / "takes.md").write_text(table(ROOT / "reports"), encoding="utf-8")
     rooms.draw(folder / "rooms.svg")
+    joints.write(folder / "joints.md")
     run_the_front_page(folder / "extra" / "front")
     gallery.write(folder / "gallery.md", folder / "extra" / "animations")
 

@@ -1,5 +1,6 @@
 """The documentation and the README: their code as printed, links, what they say of every status, generated pages."""
 
+import inspect
 import re
 from itertools import pairwise
 from pathlib import Path
@@ -10,6 +11,7 @@ import pytest
 from tests.test_rooms import documentation
 from tests.testing.planted import FAULTS
 from twoloop import Result, Status, mechanisms, solve_dae
+from twoloop.bodies import PlanarModel, SpatialModel
 from twoloop.methods.presets import PRESETS
 from twoloop.run.record import explained
 
@@ -220,6 +222,7 @@ def test_all_three_are_one_mechanism(names):
     ends = [solve_dae(s, (0.0, 2.0), page["q0"], page["v0"], rtol=1e-8, atol=1e-8).q[:, -1] for s in systems]
     assert np.ptp(ends, axis=0).max() < 1e-5
     assert page["problem"].q0 == pytest.approx(page["q0"], abs=1e-14)
+    assert page["turned"].q[[0, 2], -1] == pytest.approx(ends[0][[0, 2]], abs=1e-5)  # SymPy's joints
     assert np.ptp(page["energy"]) < 1e-5
 
 
@@ -286,13 +289,34 @@ def test_links_lead_to_files_that_are_there():
 
 
 def test_the_front_page_shows_what_its_code_writes(tmp_path):
-    for name in ("gallery", "rooms"):
+    for name in ("gallery", "shapes", "joints", "rooms"):
         documentation(name)
     documentation("generate").run_the_front_page(tmp_path / "front")
     assert {file.name for file in (tmp_path / "front").iterdir()} == {"run.png", "run.html"}
     text = (DOCS / "index.md").read_text(encoding="utf-8")
     assert '<iframe src="front/run.html"' in text and "generated/extra/front/run.png" in text
     assert "{include} generated/takes.md" in text  # the table "your mechanism, take"
+
+
+def test_the_page_of_joints_shows_every_joint(tmp_path):
+    documentation("shapes")
+    documentation("joints").write(tmp_path / "joints.md")  # runs the code of each, and moves its bodies
+    plane, space = (tmp_path / "joints.md").read_text(encoding="utf-8").split("## In space")
+    for text, model in ((plane, PlanarModel), (space, SpatialModel)):
+        joints = {
+            name for name, each in inspect.getmembers(model, inspect.isfunction) if is_joint(each) and name[0] != "_"
+        }
+        assert joints - {"drive"} == set(re.findall(r"model\.(\w+)\(", text))
+    pictures = re.findall(r"\]\((joint-[\w-]+\.svg)\)", plane + space)
+    assert len(set(pictures)) == len(pictures) == 18
+    assert all((tmp_path / picture).stat().st_size > 1000 for picture in pictures)
+    assert (
+        "With it, the body has 1 degree of freedom" in plane and "With it, the body has 5 degrees of freedom" in space
+    )
+
+
+def is_joint(method):
+    return inspect.signature(method).return_annotation == "ModelJoint"
 
 
 def test_the_gallery_shows_every_ready_mechanism(tmp_path, monkeypatch):

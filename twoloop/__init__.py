@@ -42,6 +42,7 @@ __all__ = [
     "paper_irk",
     "paper_newmark",
     "solve_dae",
+    "solve_with_friction",
     "solve_with_stops",
     "sweep",
 ]

@@ -62,6 +62,14 @@ def locked():
     return model.problem()
 
 
+def sideways():
+    """A sledge that is to slip."""
+    model = PlanarModel(name="ice")
+    model.body("sledge", mass=1.0, inertia=0.1, position=(0.0, 0.0), velocity=(0.0, 1.0))
+    model.skate("sledge", at=(0.0, 0.0), axis=(1.0, 0.0))
+    return model.problem()
+
+
 def two_drives():
     model = planar()
     model.drive("pin", lambda t: t)
@@ -200,6 +208,55 @@ BODIES: list[Case] = [
         "motor needs a revolute or prismatic joint; given 'distance bar-block', which is distance",
         "let a force or a spring act between the points",
     ),
+    of_planar(
+        "limits the wrong way round",
+        lambda: planar().limit("pin", lower=1.0, upper=0.5),
+        "lower of the limit of 'pin' must be below upper; given 1.0, 0.5",
+        "exchange them",
+    ),
+    of_planar(
+        "a force that is NaN",
+        lambda: (m := planar(), m.force("bar", (0, 0), lambda t: (np.nan, 0.0)), m.problem()),
+        r"f of 'force on bar' must be finite at the start; at t = 0 it gives array\(\[nan",
+        "find out where the NaN comes from",
+    ),
+    of_planar(
+        "a force that has no value at rest",
+        lambda: (m := planar(), m.torque("bar", lambda t, q, v: -v[2] / abs(v[2])), m.problem()),
+        "f of 'torque on bar' must be finite at the start; .* divisions by zero",
+        "friction(...) is a smooth law; or give velocities",
+    ),
+    of_planar(
+        "a force of coordinates that the model does not have",
+        lambda: (m := planar(), m.force("bar", (0, 0), lambda t, q, v: (q[17], 0.0)), m.problem()),
+        "index 17 is out of bounds",
+        "`body.coordinates` are those of a body",
+        IndexError,
+    ),
+    of_planar(
+        "a spring whose points coincide",
+        lambda: (m := planar(), m.spring("bar", (0, 0), "ground", (0, 0), stiffness=1.0, length=0.1), m.problem()),
+        "the points of the spring 'spring bar-ground' coincide at the start",
+        "move a point, or give `length=0`",
+    ),
+    of_planar(
+        "a negative damping",
+        lambda: planar().torsion_spring("pin", stiffness=1.0, damping=-0.1),
+        "damping must not be negative; given -0.1",
+        "for a torque that drives, motor(...)",
+    ),
+    of_planar(
+        "a drive of a drive",
+        lambda: (m := planar()).drive(m.drive("pin", lambda t: t), lambda t: t),
+        "drive needs a revolute or prismatic joint; given 'drive of pin', which is drive",
+        "drive the joint once",
+    ),
+    of_planar(
+        "a drive that is not finite",
+        lambda: (m := planar(), m.drive("pin", lambda t: np.sqrt(t)), m.problem()),
+        "motion of 'drive of pin' must be finite at the start",
+        "its rate is infinite there: give a motion that begins smoothly",
+    ),
     of_planar("a number for a motion", drive(1.0), "must be a function of t", "give lambda t: ...", TypeError),
     of_planar(
         "a motion that branches",
@@ -230,6 +287,18 @@ BODIES: list[Case] = [
         "columns are the axes of the body, right-handed",
     ),
     of_spatial(
+        "a rotation of NaN",
+        solid(rotation=np.full((3, 3), np.nan)),
+        r"rotation of 'arm' must be a rotation matrix \(3, 3\)",
+        "find out where the NaN comes from",
+    ),
+    of_spatial(
+        "a wheel that lies flat",
+        lambda: spatial().rolling("bar", radius=0.5, axis=(0, 0, 1)),
+        "axis of 'rolling bar' must not be across the plane",
+        "the axis is that about which the wheel is round",
+    ),
+    of_spatial(
         "axes of a universal joint that are not perpendicular",
         lambda: spatial().universal("ground", "bar", at=(0, 0, 0), axes=((1, 0, 0), (1, 1, 0))),
         "axes of 'universal bar-ground' must be perpendicular",
@@ -247,6 +316,12 @@ BODIES: list[Case] = [
         locked,
         "do not allow the velocities given: the rate of angle of bar was to be 2",
         "give velocities of fewer bodies",
+    ),
+    of_problem(
+        "a velocity across a skate",
+        sideways,
+        "do not allow the velocities given: the rate of y of sledge was to be 1",
+        "give one along the blade",
     ),
     of_problem(
         "two drives that contradict", two_drives, "too many constraints for the motion asked", "leave one of them out"
@@ -268,6 +343,26 @@ BODIES: list[Case] = [
         lambda: rough(1.9).with_parameters({"mass of two": -1.0}),
         "mass of two must be positive",
         "give a positive mass",
+    ),
+    of_problem(
+        "a damping that becomes negative",
+        lambda: (
+            (m := planar(), m.torsion_spring("pin", stiffness=1.0, name="s"))[0]
+            .problem()
+            .with_parameters({"damping of s": -1.0})
+        ),
+        r"damping of s \(N m s/rad\) must not be negative; given -1.0",
+        "give zero or more",
+    ),
+    of_problem(
+        "a distance that becomes zero",
+        lambda: (
+            (m := planar(), m.distance("bar", (1, 0), "block", (2, 0), name="d"))[0]
+            .problem()
+            .with_parameters({"length of d": 0.0})
+        ),
+        r"length of d \(m\) must be positive",
+        "take a revolute joint for points that coincide",
     ),
     of_problem(
         "a length that no longer fits",

@@ -3,12 +3,13 @@
 import numpy as np
 
 from tests.bad_input.case import cases_of
-from twoloop import Integrator, Stop, solve_with_stops
+from twoloop import Integrator, Stop, solve_with_friction, solve_with_stops
 from twoloop.bodies import PlanarModel
 from twoloop.mechanisms import four_bar
 
 LINKAGE = four_bar()
 of_stops, of_step, of_model = cases_of("solve_with_stops"), cases_of("Integrator.step"), cases_of("bodies.PlanarModel")
+of_friction = cases_of("solve_with_friction")
 
 
 def against(*stops, **options):
@@ -31,6 +32,21 @@ def wheels(call):
         model.disc(f"wheel {k}", 0.1, mass=1.0, position=(0.2 * k, 0.0))
         model.revolute("ground", f"wheel {k}", at=(0.2 * k, 0.0), name=f"pin {k}")
     return lambda: call(model)
+
+
+def rubbed(*joints, drive=None, **friction):
+    """Of a four-bar with friction in some joints, A, B, C and D."""
+    model, points = PlanarModel(name="linkage"), [(0.0, 0.0), (0.0, 1.0), (2.0, 1.5), (2.5, 0.0)]
+    for k in range(3):
+        model.rod(f"bar {k}", points[k], points[k + 1], mass=1.0)
+    bodies = ("ground", "bar 0", "bar 1", "bar 2", "ground")
+    for k in range(4):
+        model.revolute(bodies[k], bodies[k + 1], at=points[k], name="ABCD"[k])
+    for joint in joints:
+        model.dry_friction(joint, 1.0, **friction)
+    if drive:
+        model.drive("A", drive)
+    return model.problem()
 
 
 def branching(x, y):
@@ -123,5 +139,43 @@ IMPACTS = [
         wheels(lambda model: model.limit("pin 0")),
         "needs lower, upper, or both",
         "give one of them",
+    ),
+    of_friction(
+        "a model without dry friction",
+        lambda: solve_with_friction(rubbed()),
+        "'linkage' has no dry friction: add some with model.dry_friction",
+        "or take `solve_dae`",
+    ),
+    of_friction(
+        "a system in place of a problem",
+        lambda: solve_with_friction(rubbed("A").system),
+        "problem must be that of a model, what model.problem",
+        "give what `model.problem()` returned",
+        TypeError,
+    ),
+    of_friction(
+        "`events=`",
+        lambda: solve_with_friction(rubbed("A"), events=[]),
+        "solve_with_friction has no option 'events'",
+        "changes are events of its own",
+        TypeError,
+    ),
+    of_friction(
+        "`static` below `f`",
+        lambda: rubbed("A", static=0.5),
+        "static must be at least f = 1; given 0.5",
+        "leave it out, or give more",
+    ),
+    of_friction(
+        "friction in two joints of a linkage with one degree of freedom",
+        lambda: solve_with_friction(rubbed("A", "B")),
+        "'dry friction of B' cannot slide by itself.* or it moves as those of 'dry friction of A' do",
+        "give one joint all of it",
+    ),
+    of_friction(
+        "friction in a joint that is driven",
+        lambda: solve_with_friction(rubbed("A", drive=lambda t: 0.3 * t)),
+        "'dry friction of A' cannot slide by itself: drives or other joints hold it",
+        "add it to the torque of the drive",
     ),
 ]

@@ -1,6 +1,6 @@
 """Published mechanisms with loops: each right to nine digits by two unlike methods, and what is known of its geometry.
 
-Dimensions are published ones, of the sources named; masses are not, and are chosen here.
+Dimensions are published ones where a source is named; masses are chosen here.
 """
 
 import numpy as np
@@ -56,7 +56,8 @@ def meet(one, radius, other, far, side):
     return one + x * along + side * np.sqrt(radius**2 - x * x) * np.array([-along[1], along[0]])
 
 
-# T. Jansen, The Great Pretender (2007): the "holy numbers", here in tenths of a metre
+# T. Jansen, The Great Pretender (2007): the "holy numbers", over 100; compared with those of other people's programs,
+# OpenSCAD User Manual/Example/Strandbeest (Wikibooks) among them
 LENGTHS = (38.0, 41.5, 39.3, 40.1, 55.8, 39.4, 36.7, 65.7, 49.0, 50.0, 61.9, 7.8, 15.0)
 JANSEN = {name: 0.01 * length for name, length in zip("abcdefghijklm", LENGTHS, strict=True)}
 LEG = {"crank": "ZX", "j": "XV", "k": "XW", "bde": "YVU", "c": "YW", "f": "UT", "ghi": "TWS"}
@@ -170,10 +171,13 @@ def test_lazy_tongs_open_all_alike():
 
 @pytest.mark.slow  # a delta robot is not
 def test_a_stewart_platform():
-    """The "left hand" of INRIA (J.-P. Merlet, Parallel Robots): joints of base and platform, here in units of 5 cm."""
+    """Six legs between two hexagons, in proportions like those of INRIA's "left hand" (J.-P. Merlet, Parallel Robots).
+
+    The numbers are ours: no public source was found to compare them with.
+    """
     base = [(-9.7, 9.1), (9.7, 9.1), (12.76, 3.9), (3.0, -13.0), (-3.0, -13.0), (-12.76, 3.9)]
     top = [(-3.0, 7.3), (3.0, 7.3), (7.822, -1.052), (4.822, -6.248), (-4.822, -6.248), (-7.822, -1.052)]
-    model = SpatialModel(name="left hand")
+    model = SpatialModel(name="hexapod")
     plate = model.body("plate", mass=2.0, inertia=(0.1, 0.1, 0.2), position=(0.0, 0.0, 0.8))
     for k, (one, other) in enumerate(zip(base, top, strict=True)):
         A, B = 0.05 * np.array([*one, 0.0]), np.array([0.05 * other[0], 0.05 * other[1], 0.8])
@@ -193,7 +197,10 @@ def test_a_stewart_platform():
 
 
 def test_a_delta_robot():
-    """R. Clavel's robot in the dimensions of M. Zavatsky's tutorial: triangles 457.3 and 115 mm, arms 112 and 232."""
+    """R. Clavel's robot as in M. Zavatsky's tutorial, Delta robot kinematics (Trossen Robotics' forum, 2009).
+
+    Sides of the triangles 457.3 and 115 mm, arms 112 and 232 mm; compared with copies of its code in other programs.
+    """
     f, e, arm, rod = 0.4573, 0.115, 0.112, 0.232
     out, near = f / (2.0 * np.sqrt(3.0)), e / (2.0 * np.sqrt(3.0))
     knee = out + arm * np.cos(0.4)

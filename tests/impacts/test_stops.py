@@ -222,3 +222,20 @@ def test_between_two_stops_that_leave_no_room():
     held = ball(0.0).problem()
     result = solve_with_stops(held.system, (0.0, 1.0), held.q0, held.v0, cramped)
     assert result.status in (Status.REACHED_END, Status.STAGNATED) and np.abs(result.q[1]).max() < 1e-9
+
+
+def test_a_motion_that_begins_at_rest_on_a_stop_has_the_multipliers_of_its_system():
+    model = PlanarModel()
+    model.body("block", mass=1.0, inertia=1.0, position=(0.0, 0.0))
+    model.prismatic("ground", "block", at=(0.0, 0.0), axis=(0.0, 1.0))
+    model.stop("block", (0.0, 0.0), "ground", (0.0, 0.0), normal=(0.0, 1.0))
+    model.force("block", (0.0, 0.0), lambda t: (3.0, 12.0 * t))  # lifts the block from t = 9.81 / 12 on
+    problem = model.problem((0.0, 2.0))
+    result = solve_with_stops(
+        problem.system, problem.t_span, problem.q0, problem.v0, problem.stops, t_eval=[0.0, 0.5, 2.0], **TIGHT
+    )
+    assert result.lam.shape == (2, 3) and len(result.arcs) == 2
+    t, t0 = 2.0, 9.81 / 12.0
+    known = 2.0 * (t**3 - t0**3) - 6.0 * t0**2 * (t - t0) - 0.5 * 9.81 * (t - t0) ** 2
+    assert result.q[1, -1] == pytest.approx(known, abs=1e-8)
+    np.testing.assert_allclose(np.abs(result.lam[0]), 3.0, atol=1e-8)

@@ -35,7 +35,7 @@ class Freedom:
     Attributes
     ----------
     degrees : int
-        Degrees of freedom.
+        Degrees of freedom: how many velocities are independent.
     singular : int
         How many more there are at the start alone, where the joints lose rank.
     redundant : tuple of tuple of str
@@ -174,7 +174,7 @@ def velocities(
     ValueError
         If the joints do not allow the velocities given, or a drive asks for what they do not allow.
     """
-    if system.n_c == 0 or not (known.any() or system.rates(t, q).any()):
+    if system.n_c + system.n_a == 0 or not (known.any() or system.rates(t, q).any()):
         return np.where(known, given, 0.0)
     rows = system.rows(t, q)
     scales = scales_of(system, t, q, rows)
@@ -220,11 +220,11 @@ def velocities(
 
 def freedom(system: ConstrainedSystem, t: float, q: Array, rows: Mapping[str, tuple[int, ...]]) -> Freedom:
     """Degrees of freedom at a start and beside it, and which joints have rows that follow from others."""
-    if system.n_c == 0:
+    if system.n_c + system.n_a == 0:
         return Freedom(system.n_q, 0, ())
     scaled = _scaled(system, t, q)
     if _full_rank(scaled):
-        return Freedom(system.n_q - system.n_c, 0, ())
+        return Freedom(system.n_q - len(scaled), 0, ())
     at_start = _rank(system, t, q)
     beside = at_start
     free = null_space(scaled, rcond=SINGULAR)

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from twoloop.bodies.functions import Function, force_function
 from twoloop.bodies.parameter_layout import NONE
-from twoloop.bodies.parts import Body, BodyDirection, BodyPoint, Force, JointRow, ModelJoint, Numbers
+from twoloop.bodies.parts import Body, BodyDirection, BodyPoint, DryFriction, Force, JointRow, ModelJoint, Numbers
 from twoloop.checks.arguments import check_positive, check_text, check_vector, shown
 from twoloop.problem.stops import Stop
 
@@ -34,6 +34,7 @@ class Collection:
         self.joints: list[ModelJoint] = []
         self.forces: list[Force] = []
         self.stops: list[Stop] = []
+        self.dry: list[DryFriction] = []
 
     def __repr__(self) -> str:
         return (

@@ -56,7 +56,11 @@ class Function:
     def at(self, t: float, q: Array, v: Array) -> Array:
         """What it gives, of the right shape; of a motion its derivatives, too."""
         arguments = (t, q.copy(), v.copy())[: self.n_arguments]
-        made = [self._checked(each(*arguments)) for each in (self.function, *self.derivatives)]
+        try:
+            made = [self._checked(each(*arguments)) for each in (self.function, *self.derivatives)]
+        except Exception as error:
+            error.add_note(f"raised by {self.name} at t = {t!r}")
+            raise
         if self.traced is not None:
             from twoloop.bodies.program_results import results  # whose import compiles
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -9,8 +10,8 @@ import numpy as np
 from twoloop.bodies.collection import Collection
 from twoloop.bodies.functions import Function, motion_function
 from twoloop.bodies.parameter_layout import BRAKE, FORCE, PULL, RAIL, RUB, SPRING, TORQUE
-from twoloop.bodies.parts import Body, Force, JointRow, ModelJoint, Numbers
-from twoloop.checks.arguments import check_finite, check_positive
+from twoloop.bodies.parts import Body, DryFriction, Force, JointRow, ModelJoint, Numbers
+from twoloop.checks.arguments import check_finite, check_not_negative, check_positive
 
 
 class Loads(Collection):
@@ -69,8 +70,8 @@ class Loads(Collection):
         name = self._new_name("spring", name, first, second)
         here, there = self._point("at_a", at_a, first), self._point("at_b", at_b, second)
         distance = float(np.linalg.norm(first.in_space(here) - second.in_space(there)))
-        stiffness, damping = _not_negative("stiffness", stiffness), _not_negative("damping", damping)
-        length = distance if length is None else _not_negative("length", length)
+        stiffness, damping = check_not_negative("stiffness", stiffness), check_not_negative("damping", damping)
+        length = distance if length is None else check_not_negative("length", length)
         points = self._numbers(name, first, here), self._numbers(name, second, there)
         if length == 0.0:
             if damping:
@@ -117,7 +118,11 @@ class Loads(Collection):
         """
         hinge = self._joint(joint, ("revolute",), "torsion_spring")
         name = self._new_name(f"torsion spring of {hinge.name}", name)
-        values = _not_negative("stiffness", stiffness), _not_negative("damping", damping), check_finite("angle", angle)
+        values = (
+            check_not_negative("stiffness", stiffness),
+            check_not_negative("damping", damping),
+            check_finite("angle", angle),
+        )
         names = f"stiffness of {name} (N m/rad)", f"damping of {name} (N m s/rad)", f"angle of {name} (rad)"
         return self._add_force(self._torsion(name, hinge, Numbers(values, names)))
 
@@ -155,8 +160,8 @@ class Loads(Collection):
         slide = self._joint(joint, ("prismatic",), "axial_spring")
         name = self._new_name(f"spring of {slide.name}", name)
         values = (
-            _not_negative("stiffness", stiffness),
-            _not_negative("damping", damping),
+            check_not_negative("stiffness", stiffness),
+            check_not_negative("damping", damping),
             check_finite("length", length),
         )
         names = f"stiffness of {name} (N/m)", f"damping of {name} (N s/m)", f"length of {name} (m)"
@@ -192,8 +197,43 @@ class Loads(Collection):
         turns = rubbed.kind == "revolute"
         units = ("N m", "rad/s") if turns else ("N", "m/s")
         names = f"value of {name} ({units[0]})", f"speed of {name} ({units[1]})"
-        numbers = Numbers((_not_negative("f", f), float(speed)), names)
+        numbers = Numbers((check_not_negative("f", f), float(speed)), names)
         return self._add_force(self._along(name, BRAKE if turns else RUB, rubbed, numbers))
+
+    def dry_friction(
+        self, joint: ModelJoint | str, f: float, *, static: float | None = None, name: str | None = None
+    ) -> DryFriction:
+        """Coulomb's friction in a revolute or prismatic joint, which may stick; for `solve_with_friction`.
+
+        It does not depend on the load of the joint. `solve_dae` does not know it.
+
+        Parameters
+        ----------
+        joint : ModelJoint or str
+        f : float
+            The torque or force against sliding, N m or N.
+        static : float, optional
+            The most that holds the joint while it sticks, at least `f`. None: the same.
+        name : str, optional
+
+        Returns
+        -------
+        DryFriction
+
+        Raises
+        ------
+        TypeError, ValueError
+            If an argument is wrong.
+        """
+        rubbed = self._joint(joint, ("revolute", "prismatic"), "dry_friction")
+        name = self._new_name(f"dry friction of {rubbed.name}", name)
+        kinetic = check_not_negative("f", f)
+        most = kinetic if static is None else check_not_negative("static", static)
+        if most < kinetic:
+            raise ValueError(f"static must be at least f = {kinetic:g}; given {static!r}")
+        force = replace(self._motor(name, rubbed, "", 0.0), more=Numbers((0.0,)), joint=None)
+        self.dry.append(DryFriction(name, rubbed, kinetic, most, self._add_force(force)))
+        return self.dry[-1]
 
     def force(self, body: Body | str, at: Any, f: Any, *, name: str | None = None) -> Force:
         """A force on a body, along the axes of space, at a point that the body carries along.
@@ -305,10 +345,3 @@ class Loads(Collection):
         name = self._new_name(f"drive of {moved.name}", name)
         row = self._drive_row(moved, motion_function(f"motion of {name!r}", motion, rate, acceleration))
         return self._add_joint(ModelJoint(name, "drive", moved.a, moved.b, (row,), moved.point_a, moved.point_b))
-
-
-def _not_negative(argument: str, value: Any) -> float:
-    number = check_finite(argument, value)
-    if number < 0.0:
-        raise ValueError(f"{argument} must not be negative; given {value!r}")
-    return number

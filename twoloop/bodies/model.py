@@ -4,19 +4,23 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.bodies import assembly
+from twoloop.bodies.functions import motion_function
 from twoloop.bodies.model_energy import ModelEnergy
 from twoloop.bodies.model_problem import ModelProblem
 from twoloop.bodies.model_stops import Stops
-from twoloop.bodies.model_system import joints_of, system_of
-from twoloop.bodies.parts import Body, ModelJoint
+from twoloop.bodies.model_system import check_forces, joints_of, system_of
+from twoloop.bodies.notes import note_of
+from twoloop.bodies.parts import Body, DryFriction, ModelJoint, Numbers
 from twoloop.bodies.sketches import drawing_of
 from twoloop.bodies.tables import Tables
 from twoloop.checks.arguments import check_positive, check_span, check_text, shown
+from twoloop.problem.system import ConstrainedSystem
 
 Array = NDArray[np.float64]
 
@@ -74,6 +78,7 @@ class Model(Stops):
         if not self.bodies:
             raise ValueError(f"{self.name!r} has no bodies: add some with body(...) before problem()")
         tables = self._tables(self.joints, values)
+        tables.check()
         self._check_inertias(tables)
         start = self._start() if guess is None else guess
         about = t_span[0], start, np.zeros_like(start)
@@ -91,11 +96,13 @@ class Model(Stops):
             bare.rows,
             coordinates,
         )
+        closed = q
         if bare is not tables:
             q = assembly.driven_there(system, t_span[0], q, keep)
         self._check_branches(t_span[0], q)
         given, known = self._velocities(q)
         v = assembly.velocities(system, t_span[0], q, given, known, coordinates)
+        check_forces(tables, t_span[0], q, v)
         freedom = assembly.freedom(system, t_span[0], q, tables.rows)
         return ModelProblem(
             name=name,
@@ -105,8 +112,8 @@ class Model(Stops):
             t_span=t_span,
             energy=ModelEnergy(tables.p.copy(), self.dimension),
             parameters=tables.values,
-            note=_note(freedom, tables.untraced),
-            conserved=tables.conserve,
+            note=note_of(self, tables, freedom, closed if guess is not None else start, closed, q, coordinates),
+            conserved=tables.conserve and not self.dry,
             tags=self._tags(freedom),
             coordinates=coordinates,
             drawing=drawing_of(tables),
@@ -115,6 +122,57 @@ class Model(Stops):
             freedom=freedom,
             stops=tuple(self.stops),
         )
+
+    def mode(
+        self,
+        name: str,
+        values: Mapping[str, float],
+        friction: Mapping[str, float],
+        held: Mapping[str, float],
+        t: float,
+        q: Array,
+    ) -> tuple[ConstrainedSystem, dict[str, tuple[int, ...]]]:
+        """The system while dry friction has given values, and some of its joints are held.
+
+        Parameters
+        ----------
+        name : str
+        values : mapping
+            Parameters by their names.
+        friction, held : mapping
+            By the names of what rubs: the forces, and how far b has turned or slid on a where it sticks. NaN: it has
+            slid by the time, as that of a gauge.
+        t, q : float, ndarray (n_q,)
+            A state of it.
+
+        Returns
+        -------
+        ConstrainedSystem
+        dict
+            Rows of the joints that are held, by the names of what rubs.
+        """
+        other = self._as_it_is()
+        for rub in self.dry:
+            if rub.name in friction:
+                number = Numbers((friction[rub.name],))
+                other.forces[self.forces.index(rub.force)] = replace(rub.force, more=number)
+            if rub.name in held:
+                at, joint = held[rub.name], rub.joint
+                motion = motion_function(rub.name, (lambda t: t) if np.isnan(at) else lambda t, at=at: at, None, None)
+                points = joint.point_a, joint.point_b
+                row = self._drive_row(joint, motion)
+                other.joints.append(ModelJoint(f"{rub.name} sticks", "drive", joint.a, joint.b, (row,), *points))
+        tables = other._tables(other.joints, values)
+        system = system_of(self.dimension, tables, joints_of(tables), name, (t, q, np.zeros_like(q)))
+        return system, {name: tables.rows[f"{name} sticks"] for name in held}
+
+    def pull(self, rub: DryFriction, values: Mapping[str, float]) -> ConstrainedSystem:
+        """A system whose force is that of unit friction alone: by how much a joint slides with the coordinates."""
+        other = self._as_it_is()
+        other.gravity, other.forces = np.zeros(self.dimension), [replace(rub.force, more=Numbers((1.0,)))]
+        places = {name: value for name, value in values.items() if not name.startswith("gravity")}
+        tables, still = other._tables([], places), np.zeros_like(self._start())
+        return system_of(self.dimension, tables, [], rub.name, (0.0, self._start(), still))
 
     def _tables(self, joints: Sequence[ModelJoint], values: Mapping[str, float] | None) -> Tables:
         """The tables of the model with some of its joints, and with other values of its parameters."""
@@ -126,7 +184,7 @@ class Model(Stops):
         """A copy to which nothing is added."""
         other = copy.copy(self)
         other.bodies, other.joints, other.forces = list(self.bodies), list(self.joints), list(self.forces)
-        other.stops = list(self.stops)
+        other.stops, other.dry = list(self.stops), list(self.dry)
         return other
 
     def _turning(self) -> NDArray[np.bool_]:
@@ -175,15 +233,3 @@ class Model(Stops):
             "singular": freedom.singular > 0,
         }
         return tuple(tag for tag, holds in known.items() if holds)
-
-
-def _note(freedom: assembly.Freedom, untraced: str) -> str:
-    """What there is to know of a model that was put together."""
-    noun = "degree" if freedom.degrees == 1 else "degrees"
-    parts = [f"{freedom.degrees} {noun} of freedom."]
-    if freedom.singular:
-        parts.append(f"The start is singular: {freedom.singular} more there.")
-    parts += [f"Rows follow from others among {', '.join(map(repr, group))}." for group in freedom.redundant]
-    if untraced:
-        parts.append(f"Its functions are called in Python, which is slower: {untraced}.")
-    return " ".join(parts)

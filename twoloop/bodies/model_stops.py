@@ -10,28 +10,11 @@ from numpy.typing import NDArray
 
 from twoloop.bodies.loads import Loads
 from twoloop.bodies.parts import Body, ModelJoint
+from twoloop.bodies.places import placed, turned
 from twoloop.checks.arguments import check_finite
 from twoloop.problem.stops import Stop
 
 Array = NDArray[np.float64]
-
-
-def turned(q: Any, body: Body, vector: Any) -> list[Any]:
-    """A vector in the axes of a body, in space; of numbers or symbols."""
-    if body.number < 0:
-        return list(vector)
-    if len(vector) == 2:
-        s, c = np.sin(q[body.coordinates[2]]), np.cos(q[body.coordinates[2]])
-        return [c * vector[0] - s * vector[1], s * vector[0] + c * vector[1]]
-    w, *e = (q[j] for j in body.coordinates[3:])
-    across = [e[i - 2] * vector[i - 1] - e[i - 1] * vector[i - 2] + w * vector[i] for i in range(3)]  # e x a + w a
-    return [vector[i] + 2.0 * (e[i - 2] * across[i - 1] - e[i - 1] * across[i - 2]) for i in range(3)]
-
-
-def placed(q: Any, body: Body, place: Array) -> list[Any]:
-    """A point in the axes of a body, in space."""
-    moved = turned(q, body, place)
-    return moved if body.number < 0 else [q[j] + x for j, x in zip(body.coordinates, moved, strict=False)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,6 +129,8 @@ class Stops(Loads):
         given = {"lower": (lower, 1.0), "upper": (upper, -1.0)}
         if lower is None and upper is None:
             raise ValueError(f"limit of {limited.name!r} needs lower, upper, or both")
+        if lower is not None and upper is not None and not lower < upper:
+            raise ValueError(f"lower of the limit of {limited.name!r} must be below upper; given {lower!r}, {upper!r}")
         made = []
         for which, (value, sign) in given.items():
             if value is not None:

@@ -9,9 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.bodies.functions import Function
-from twoloop.bodies.parameter_layout import FORCE_PROGRAM, HEAD, MOTION_PROGRAM
+from twoloop.bodies.parameter_layout import FORCE_PROGRAM, HEAD, MOTION_PROGRAM, SPRING
+from twoloop.bodies.places import placed
 from twoloop.bodies.row_function import RowFunction
 from twoloop.bodies.tables import Tables
+from twoloop.checks.arguments import shown
 from twoloop.generate.tracing import Untraceable
 from twoloop.problem.joints import Joint
 from twoloop.problem.system import ConstrainedSystem
@@ -22,6 +24,8 @@ KINDS = ("mass", "force", "constraint", "jacobian", "constraint_rate", "gamma")
 OF_JOINTS = ("constraint", "jacobian", "gamma")
 STATES = 5  # at which programs are compared with the functions that they were traced from
 AGREES = 1e-10  # relative
+COINCIDE = 1e-12  # relative: points of a spring
+QUIET = np.errstate(divide="ignore", invalid="ignore")  # what is not finite is said by name
 
 
 def joints_of(tables: Tables) -> list[Joint]:
@@ -56,8 +60,7 @@ def system_of(
         "name": name,
         "parameters": tables.p,
     }
-    for each in (*tables.motions, *tables.functions):
-        each.at(*start)  # says what is wrong with what it returns
+    _check_functions(tables, *start)
     if not tables.untraced:
         tables.untraced = _disagreement(tables, *start)
     if tables.untraced:
@@ -67,6 +70,41 @@ def system_of(
     return ConstrainedSystem(**options, constant_mass=dimension == 2, **given)
 
 
+@QUIET
+def _check_functions(tables: Tables, t: float, q: Array, v: Array) -> None:
+    for each in (*tables.motions, *tables.functions):
+        value = each.at(t, q, v)  # says what is wrong with what it returns
+        if each in tables.motions or not np.isfinite(tables.p).all():
+            _check_finite(each, value, t)
+
+
+@QUIET
+def check_forces(tables: Tables, t: float, q: Array, v: Array) -> None:
+    """Raise where a force has no value at the start."""
+    for each in tables.functions:
+        _check_finite(each, each.at(t, q, v), t)
+    for force in tables.forces:
+        if force.kind != SPRING:
+            continue
+        assert force.on_first is not None and force.on_second is not None and force.more is not None
+        one = placed(q, force.first, tables.of(force.on_first))
+        two = placed(q, force.second, tables.of(force.on_second))
+        if np.abs(np.subtract(one, two)).max() <= COINCIDE * np.abs((*one, *two, tables.of(force.more)[2])).max():
+            raise ValueError(
+                f"the points of the spring {force.name!r} coincide at the start, where it has no direction; give it "
+                "other points, or length=0 for a pull in proportion to their distance"
+            )
+
+
+def _check_finite(function: Function | RowFunction, value: Array, t: float) -> None:
+    if not np.isfinite(value).all():
+        raise ValueError(
+            f"{function.name} must be finite at the start; at t = {t:g} it gives {shown(value)}. Look for divisions by "
+            "zero, and for roots and logarithms of what is not positive; or begin elsewhere"
+        )
+
+
+@QUIET
 def _disagreement(tables: Tables, t: float, q: Array, v: Array) -> str:
     """Which function does not give what its program gives; "": none is known."""
     from twoloop.bodies.program_results import results  # whose import compiles

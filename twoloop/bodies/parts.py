@@ -154,3 +154,22 @@ class Force:
     function: Function | None = field(default=None, repr=False)
     point_on_first: Numbers | None = field(default=None, repr=False)
     joint: ModelJoint | None = field(default=None, repr=False)  # in which it is
+
+
+@dataclass(frozen=True, eq=False)
+class DryFriction:
+    """Coulomb's friction in a joint; `model.dry_friction(...)` makes it.
+
+    Attributes
+    ----------
+    name : str
+    joint : ModelJoint
+    kinetic, static : float
+        N m or N: while b slides on a, and the most that holds it.
+    """
+
+    name: str
+    joint: ModelJoint = field(repr=False)
+    kinetic: float
+    static: float
+    force: Force = field(repr=False)  # on b in the direction of the joint; zero but in a mode

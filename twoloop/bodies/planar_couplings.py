@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from twoloop.bodies.model import Model
-from twoloop.bodies.model_stops import placed, turned
 from twoloop.bodies.parameter_layout import RATE, WRITTEN
 from twoloop.bodies.parts import Body, JointRow, ModelJoint, Numbers
+from twoloop.bodies.places import placed, turned
 from twoloop.bodies.row_function import RateFunction, RowFunction
 from twoloop.checks.arguments import check_finite, check_positive
 

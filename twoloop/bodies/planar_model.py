@@ -282,8 +282,8 @@ class PlanarModel(Couplings):
     def _motor(self, name: str, joint: ModelJoint, unit: str, f: Any) -> Force:
         function, more = self._function(name, f, 1, unit)
         if joint.kind == "revolute":
-            return Force(name, TORQUE, joint.a, joint.b, None, None, more, function)
-        return Force(name, SLIDE, joint.a, joint.b, joint.rows[0].more, joint.point_b, more, function)
+            return Force(name, TORQUE, joint.a, joint.b, None, None, more, function, joint=joint)
+        return Force(name, SLIDE, joint.a, joint.b, joint.rows[0].more, joint.point_b, more, function, joint=joint)
 
     def _along(self, name: str, kind: int, joint: ModelJoint, numbers: Numbers) -> Force:
         axis = joint.rows[0].more  # None of a revolute one

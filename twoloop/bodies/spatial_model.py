@@ -300,8 +300,8 @@ class SpatialModel(Wheels):
         function, more = self._function(name, f, 1, unit)
         axis = Numbers(tuple(joint.axes[0]))
         if joint.kind == "revolute":
-            return Force(name, AXIAL, joint.a, joint.b, axis, None, more, function)
-        return Force(name, SLIDE, joint.a, joint.b, axis, joint.point_b, more, function)
+            return Force(name, AXIAL, joint.a, joint.b, axis, None, more, function, joint=joint)
+        return Force(name, SLIDE, joint.a, joint.b, axis, joint.point_b, more, function, joint=joint)
 
     def _along(self, name: str, kind: int, joint: ModelJoint, numbers: Numbers) -> Force:
         axis = Numbers(tuple(joint.axes[0]))

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from twoloop.bodies.model import Model
 from twoloop.bodies.parts import Body
 from twoloop.bodies.spatial_rows import perpendiculars
+from twoloop.bodies.tables import TENSOR
 from twoloop.checks.arguments import check_positive, check_real, check_vector, shown
 from twoloop.mechanisms.rotation import euler_parameters, rotation_matrix
 
@@ -162,7 +163,7 @@ class SpatialShapes(Model):
         return self.body(name, mass=mass, inertia=np.full(3, 0.4 * mass * radius**2), position=position, **pose)
 
     def _check_moments(self, name: str, moments: Array) -> None:
-        _moments(f"inertia of {name}", moments[[0, 3, 4, 3, 1, 5, 4, 5, 2]].reshape(3, 3))
+        _moments(f"inertia of {name}", moments[TENSOR].reshape(3, 3))
 
 
 def _rotation(name: str, given: ArrayLike) -> Array:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from twoloop.bodies.functions import is_constant, program_for
 from twoloop.bodies.parameter_layout import BRAKE, NONE, PULL, RAIL, RATE, RUB, SPRING, TORSION
 from twoloop.bodies.parts import Body, Force, JointRow, ModelJoint, Numbers
+from twoloop.checks.arguments import check_not_negative, check_positive
 from twoloop.generate.programs import numbers_of
 from twoloop.generate.tracing import Untraceable
 
@@ -20,6 +21,8 @@ MOMENTS = {
     2: ("moment of inertia",),
     3: tuple(f"J_{which}" for which in ("xx", "yy", "zz", "xy", "xz", "yz")),
 }
+
+TENSOR = [0, 3, 4, 3, 1, 5, 4, 5, 2]  # where the entries of a tensor of inertia stand among these
 
 
 class Tables:
@@ -97,6 +100,20 @@ class Tables:
             if force.function is not None or (force.kind != PULL and numbers.any()):
                 return False
         return all(is_constant(motion) for motion in self.motions)
+
+    def check(self) -> None:
+        """Raise where a number has a sign that it cannot have."""
+        parts: list[Force | JointRow] = [*self.forces, *(row for joint in self.joints for row in joint.rows)]
+        for part in parts:
+            rubs = isinstance(part, Force) and part.kind in (BRAKE, RUB)
+            rail = isinstance(part, Force) and part.kind == RAIL
+            numbers = part.more or Numbers(())
+            for name, value in zip(numbers.names, self.of(numbers).tolist() if numbers.names else (), strict=True):
+                what = name.split(" of ")[0]
+                if what == "speed" or (what == "length" and not rail):
+                    check_positive(name, value)
+                elif what in ("stiffness", "damping") or rubs:
+                    check_not_negative(name, value)
 
     def replaced(self, values: Mapping[str, float]) -> None:
         """Put other values in the place of those that are here."""

@@ -7,13 +7,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from twoloop.bodies.model_stops import turned
 from twoloop.bodies.parameter_layout import RATE, WRITTEN
 from twoloop.bodies.parts import Body, JointRow, ModelJoint, Numbers
+from twoloop.bodies.places import turned
 from twoloop.bodies.row_function import RateFunction, RowFunction
 from twoloop.bodies.spatial_rows import perpendiculars
 from twoloop.bodies.spatial_shapes import SpatialShapes
 from twoloop.checks.arguments import check_positive, check_vector
+
+FLAT = 1e-6  # sine of the angle between axle and normal
 
 
 class Wheels(SpatialShapes):
@@ -57,6 +59,8 @@ class Wheels(SpatialShapes):
         check_positive("radius", radius)
         axle = self._direction("axis", axis, on)
         n, place = self._direction("normal", normal, self.ground), check_vector("foot", foot, 3)
+        if not _upright(n, on.rotation @ axle)[1] > FLAT:
+            raise ValueError(f"axis of {name!r} must not be across the plane: a wheel that lies flat does not roll")
 
         def height(q: Any) -> Any:
             above = sum(n[i] * (q[on.coordinates[i]] - place[i]) for i in range(3))

@@ -143,6 +143,14 @@ def check_finite(name: str, value: Any) -> float:
     return number
 
 
+def check_not_negative(name: str, value: Any) -> float:
+    """Return `value` as a finite float from zero up, or say that it is none."""
+    number = check_finite(name, value)
+    if number < 0.0:
+        raise ValueError(f"{name} must not be negative; given {value!r}")
+    return number
+
+
 def check_positive(name: str, value: Any, infinite: bool = False) -> None:
     """Raise unless `value` is a positive number, finite unless `infinite`."""
     number = check_number(name, value)

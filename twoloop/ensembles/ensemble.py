@@ -80,10 +80,11 @@ def ensemble(
     Notes
     -----
     In lanes as singly, no step of DOP853 or of a Radau method is longer than a hundredth of the run; where a force may
-    act for a short time, lanes look at the equations every two-thousandth, which singly is done to forces alone. Stages are off the
-    constraints by the error of the formula, those of Radau methods, too, whose unknowns are here the accelerations of
-    all coordinates; the end of each step is put on the constraints. States at `t_eval` within a step are the ends of
-    shorter steps from its beginning. A run that would take more than 100,000 of these steps is made singly.
+    act for a short time, lanes look at the equations every two-thousandth, which singly is done to forces alone. Stages
+    are off the constraints by the error of the formula, those of Radau methods, too, whose unknowns are here the
+    accelerations of all coordinates; the end of each step is put on the constraints. States at `t_eval` within a step
+    are the ends of shorter steps from its beginning. A run that would take more than 100,000 of these steps is made
+    singly.
     """
     check_system(system)
     t0, t1 = check_span(t_span)

@@ -16,7 +16,7 @@ from twoloop.run.record import Statistics, Status, explained
 
 Array = NDArray[np.float64]
 
-CHANGES = "velocities jumped in impacts, or stops were closed for a while"
+CHANGES = "velocities jumped in impacts, or stops were closed or joints stuck for a while"
 
 
 class Impact(NamedTuple):
@@ -49,8 +49,8 @@ class ArcSolution:
         The times that it covers, s.
     """
 
-    def __init__(self, arcs: Sequence[Result], n_c: int):
-        self.arcs, self._n_c = tuple(arcs), n_c
+    def __init__(self, arcs: Sequence[Result], n_c: int, n_a: int):
+        self.arcs, self._n_c, self._n_rows = tuple(arcs), n_c, n_c + n_a
         self.t_min, self.t_max = float(arcs[0].t[0]), float(arcs[-1].t[-1])
 
     def __call__(self, t: ArrayLike) -> ArcState:
@@ -66,7 +66,7 @@ class ArcSolution:
             raise ValueError(f"t must be a number or (n,), from {self.t_min!r} to {self.t_max!r}; given {times!r:.100}")
         flat = np.atleast_1d(times)
         first = self.arcs[0]
-        made = [np.empty((len(each), len(flat))) for each in (first.q, first.v, first.a, first.lam)]
+        made = [np.empty((len(each), len(flat))) for each in (first.q, first.v, first.a, self._own_rows(first.lam))]
         which = np.searchsorted([arc.t[0] for arc in self.arcs], flat, side="right") - 1
         for k in np.unique(which):
             own = np.flatnonzero(which == k)
@@ -79,7 +79,7 @@ class ArcSolution:
         return ArcState(times, *made)
 
     def _own_rows(self, lam: Array) -> Array:
-        return own_rows(lam, self._n_c, len(self.arcs[0].lam))
+        return own_rows(lam, self._n_c, self._n_rows)
 
     def __repr__(self) -> str:
         return f"ArcSolution(from t = {self.t_min:g} to {self.t_max:g} s, {len(self.arcs)} arcs)"
@@ -96,18 +96,19 @@ def joined(
     impacts: Sequence[Impact],
     times: Array | None,
     stagnated: str,
+    tale: str,
 ) -> Result:
-    """One result of all arcs, at the ends of their steps or at output times."""
+    """One result of all arcs, at the ends of their steps or at output times; `tale` ends its message."""
     last, n_rows = arcs[-1], system.n_c + system.n_a
     table: list[Array]
     if times is None:
         parts = [(arc.t, arc.q, arc.v, arc.a, own_rows(arc.lam, system.n_c, n_rows)) for arc in arcs]
         table = [np.concatenate(each, axis=-1) for each in zip(*parts, strict=True)]
     else:
-        table = list(ArcSolution(arcs, system.n_c)(times[times <= last.t[-1]]))
+        table = list(ArcSolution(arcs, system.n_c, system.n_a)(times[times <= last.t[-1]]))
     status, message = (Status.STAGNATED, stagnated) if stagnated else (last.status, last.message)
     if not stagnated and len(arcs) > 1:
-        message += f" {len(impacts)} impacts."
+        message += f" {tale}"
     known: dict[str, Any] = {
         name: _all(arcs, name) for name in ("rejected_error", "rejected_convergence", "partitioned")
     }
@@ -122,7 +123,7 @@ def joined(
         rank=arcs[0].rank,
         redundant=arcs[0].redundant,
         **known,
-        sol=ArcSolution(arcs, system.n_c),  # type: ignore[arg-type]  # called alike
+        sol=ArcSolution(arcs, system.n_c, system.n_a),  # type: ignore[arg-type]  # called alike
         widest_gap=max(arc.widest_gap or 0.0 for arc in arcs),
         system=system,
         method=arcs[0].method,

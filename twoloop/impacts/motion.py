@@ -127,7 +127,7 @@ class _Motion:
             self._arc(resting, t1)
             last = self.arcs[-1]
             if last.status != Status.EVENT or self.t >= t1:
-                return joined(self.system, self.arcs, self.impacts, times, "")
+                return joined(self.system, self.arcs, self.impacts, times, "", self._tale)
             standing = standing + 1 if self.t - before <= STANDS * max(1.0, abs(self.t)) else 0
             if standing == MOST_STANDING:
                 names = ", ".join(repr(name) for name in dict.fromkeys(n for i in self.impacts[-9:] for n in i.stops))
@@ -135,7 +135,11 @@ class _Motion:
                     f"Stopped at t = {self.t:.10g}: {standing} impacts or releases in a row at this time ({names}). "
                     "Look for stops that push against each other, or loosen atol"
                 )
-                return joined(self.system, self.arcs, self.impacts, times, said)
+                return joined(self.system, self.arcs, self.impacts, times, said, self._tale)
+
+    @property
+    def _tale(self) -> str:
+        return f"{len(self.impacts)} impacts."
 
     def _meet(self) -> tuple[int, ...]:
         """Velocities after what happens at this instant, and the stops that stay closed."""
@@ -227,7 +231,7 @@ class _Motion:
                 return (g - g0) / (t - t0) if t > t0 else u0
             return g - min(g0, 0.0) + low
 
-        return _terminal(closes)
+        return terminal(closes)
 
     def _lets_go(self, resting: tuple[int, ...], k: int) -> Any:
         """The event of a force that would pull."""
@@ -236,9 +240,10 @@ class _Motion:
         def lets_go(t: float, q: Array, v: Array) -> float:
             return -float(accelerations.at(t, q, v)[1][row])
 
-        return _terminal(lets_go)
+        return terminal(lets_go)
 
 
-def _terminal(event: Any) -> Any:
+def terminal(event: Any) -> Any:
+    """An event that ends a run where it falls through zero."""
     event.terminal, event.direction = True, -1
     return event

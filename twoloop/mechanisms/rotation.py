@@ -85,7 +85,7 @@ def euler_parameters(R: ArrayLike) -> Array:
         If `R` is not a rotation matrix.
     """
     R = np.asarray(R, dtype=float)
-    if R.shape != (3, 3) or np.abs(R.T @ R - np.eye(3)).max() > 1e-9 or np.linalg.det(R) < 0.0:
+    if R.shape != (3, 3) or not np.abs(R.T @ R - np.eye(3)).max() <= 1e-9 or np.linalg.det(R) < 0.0:
         raise ValueError(f"R must be a rotation matrix (3, 3), orthonormal and right-handed; given {R!r}")
     # the symmetric matrix 4 e e^T, whose column with the largest diagonal is free of cancellation
     d = R[0, 0] + R[1, 1] + R[2, 2]
