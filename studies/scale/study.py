@@ -80,7 +80,8 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
             "fastest": [each for error in ERRORS if (each := fastest(medians, error))],
         }
         found["chains"].append(of_chain)
-    held = rows[rows["group"] == MEMORY]
+    held = rows[rows["group"].eq(MEMORY)]
+    held = held[held["memory_mb"].notna()] if len(held) else held
     found["memory"] = {int(row["n"]): float(row["memory_mb"]) for _, row in held.iterrows()}
     found["trees"] = [_beside_engines(line, rows[rows["group"] == TREE]) for line in found["kinds"]]
     found["trees"] = [line for line in found["trees"] if line["engines"]]
