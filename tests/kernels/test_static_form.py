@@ -96,6 +96,7 @@ def test_more_random_assemblies_agree_with_dense_algebra(any_size):
 
 @pytest.mark.parametrize("ratio", [1e6, 1e10])
 def test_mass_ratios(any_size, ratio):
+    decided = 0
     for seed in range(4):
         assembly = Assembly(seed, 30, 2, 0, heaviest=ratio)
         system = assembly.bodies.system("heavy and light")
@@ -103,8 +104,10 @@ def test_mass_ratios(any_size, ratio):
         started = Started(system, assembly.q, v)
         if started.code == common.NEEDS_DENSE:
             continue
+        decided += 1
         root, (a, *_) = np.sqrt(np.diag(system.mass(0.0, assembly.q))), dense_solution(system, assembly.q, v)
         assert worst(root * started.a, root * a) < 1e-8 * np.abs(root * a).max()
+    assert decided >= 3
 
 
 def test_projection_is_that_in_the_metric_of_the_masses(any_size):
@@ -434,3 +437,40 @@ def test_values_of_spatial_bodies_are_the_entries_of_their_matrices(monkeypatch)
         np.add.at(made, system.entries[kind], system.evaluate(f"{kind}_values", 0.0, q))
         assert worst(made, dense) < 1e-14
         assert len(system.entries[kind][0]) < 0.15 * dense.size
+
+
+def in_space(made):
+    """A planar assembly as bodies in space with hinges across the plane."""
+    bodies, places = SpatialBodies((0.0, -made.bodies.gravity, 0.0)), made.q.reshape(-1, 3)
+    for k, (x, y, angle) in enumerate(places):
+        c, s, J = np.cos(angle), np.sin(angle), made.bodies.inertias[k]
+        turned = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+        bodies.body(f"bar {k}", made.bodies.masses[k], (0.6 * J, 0.6 * J, J), (x, y, 0.0), turned)
+    for i, (a, b), j, _ in made.bodies.pins:
+        (x, y, angle), (c, s) = places[i], (np.cos(places[i, 2]), np.sin(places[i, 2]))
+        bodies.revolute(i, j, (x + c * a - s * b, y + s * a + c * b, 0.0), (0.0, 0.0, 1.0))
+    return bodies
+
+
+@pytest.mark.parametrize(
+    ("build", "n", "loops"),
+    [
+        (closed_chain, 60, 1),
+        (ladder, 30, 10),
+        pytest.param(closed_chain, 1000, 1, marks=pytest.mark.slow),
+        pytest.param(ladder, 300, 100, marks=pytest.mark.slow),
+    ],
+)
+def test_parallel_hinges_have_three_redundant_rows_a_loop(any_size, build, n, loops):
+    made = build(n)
+    bodies = in_space(made)
+    system, (q, v) = bodies.system("parallel hinges"), bodies.start
+    planar_one, one = Started(made.system, made.q, 0.0 * made.q), Started(system, q, v)
+    assert (planar_one.code, one.code) == (common.DONE, common.DONE)
+    assert (planar_one.rank, one.rank) == (made.system.n_c, system.n_c - 3 * loops)
+    expected = planar_one.a.reshape(-1, 3)[:, :2]
+    assert worst(one.a.reshape(-1, 7)[:, :2], expected) < 1e-8 * np.abs(expected).max()
+    (rows, columns), (i, j) = system.entries["jacobian"], system.entries["mass"]
+    reaction = np.bincount(columns, system.jacobian_values(0.0, q) * one.lam[rows], system.n_q)
+    inertia = np.bincount(i, system.mass_values(0.0, q) * one.a[j], system.n_q)
+    assert worst(inertia + reaction, system.force(0.0, q, v)) < 1e-8 * np.abs(reaction).max()
