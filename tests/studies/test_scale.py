@@ -4,9 +4,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from studies import scale
 from studies.bench.large import ASSEMBLIES, open_chain
 from studies.bench.render import render
+from studies.scale import rivals, runs
+from studies.scale import study as scale
 
 EXUDYN = "Exudyn, GeneralizedAlpha"
 
@@ -77,7 +78,7 @@ def test_the_order_is_named_where_steps_cost_about_the_same():
 
 
 def test_cvode_is_asked_for_all_that_the_default_is_asked_for():
-    assert scale.solvers(20)[scale.OTHERS[0]] == scale.solvers(20)[scale.DEFAULT]
+    assert runs.solvers(20)[runs.OTHERS[0]] == runs.solvers(20)[scale.DEFAULT]
 
 
 def test_a_failed_size_is_named_and_in_no_fit():
@@ -100,8 +101,28 @@ def test_exudyns_bodies_move_as_ours():
     from twoloop import solve_dae
 
     made = open_chain(5)
-    problem = scale.problem_of(made, 0.2)
+    problem = runs.problem_of(made, 0.2)
     ends = [solve_pinned(problem, made.bodies, steps).q[:, -1] for steps in (100, 200)]
     ours = solve_dae(problem.system, problem.t_span, problem.q0, problem.v0, rtol=1e-9, atol=1e-9).q[:, -1]
     errors = [np.abs(end - ours).max() for end in ends]
     assert errors[1] < 1e-3 and errors[0] / errors[1] == pytest.approx(4.0, rel=0.2)
+
+
+def test_engines_and_where_others_stop_follow_the_rows():
+    beside = [
+        {"group": rivals.TREE, "case": "open chain", "solver": name, "n": n, "evaluation_us": us * n, "start_s": 1.0}
+        for name, us in (("MuJoCo", 0.5), ("Pinocchio", 0.25))
+        for n in (10, 30, 600)
+    ]
+    grown = [
+        {"group": rivals.UNTIL, "solver": "heyoka", "n": n, "build_s": 1.0, "call_s": 0.002, "error_q": 1e-7}
+        for n in (5, 10)
+    ]
+    rows = pd.DataFrame([*beside, *grown]).assign(status="REACHED_END", repeat=0)
+    stopped = {"group": rivals.UNTIL, "solver": "heyoka", "n": 20, "status": "TIME_LIMIT", "message": "not run: 17 s"}
+    found, text = said(pd.concat([evaluations(), chains(), rows, pd.DataFrame([stopped])], ignore_index=True))
+    assert "On the open chain of 30 bodies MuJoCo takes 15 µs, Pinocchio takes 7.5 µs for the accelerations" in text
+    assert found["trees"][0]["engines"]["Pinocchio"] == {10: 2.5, 30: 7.5, 600: 150.0}
+    assert "| heyoka | 1.0 + 2.0, 1e-7 | 1.0 + 2.0, 1e-7 | at 20: not run: 17 s |" in text
+    before = [40, rivals.BUDGET]
+    assert rivals.until_row(80, "heyoka", before)["status"] == "TIME_LIMIT" and before[0] == 40

@@ -82,7 +82,7 @@ def _index_error(
         try:
             with warnings.catch_warnings(), np.errstate(all="ignore"):
                 warnings.simplefilter("ignore")
-                Rewritten(wrap).value(function)(t, *given, *(array.copy() for array in out))
+                Rewritten(wrap).value(function)(t, *given, *(np.zeros(array.shape) for array in out))
         except IndexError as error:
             return error
         except Exception:  # what does not run in Python may run compiled; its own errors come up when it is called

@@ -196,7 +196,8 @@ def _unsymmetric_near(system: ConstrainedSystem, t: float, q: Array) -> str | No
     if system.constant_mass:
         return None
     near = q + NEAR_START * sizes(q) * np.abs(generic_factors(system.n_q))
-    if defined(lambda: system.mass(t, near)) is None:
+    kind = "mass_values" if "mass" in system.entries else "mass"
+    if defined(lambda: system.evaluate(kind, t, near)) is None:
         return None
     wrong = unsymmetric_mass(system, t, near)
     return None if wrong is None else f"{wrong} (near the start: at q = {near})"

@@ -69,6 +69,7 @@ from twoloop.kernels.evaluation.calls import (
 from twoloop.kernels.evaluation.gamma import representable
 from twoloop.kernels.evaluation.kinks import JUMP, RAMP, SMOOTH, find_kink, unexplained
 from twoloop.kernels.evaluation.partition import CHANGED, partition_is_poor
+from twoloop.kernels.evaluation.static_factors_at import CAREFUL
 
 # what advance() returns; PAUSED: a buffer is full, or MAX_ATTEMPTS were made
 (
@@ -90,6 +91,8 @@ SHORT = 0.5  # of the longest of the last steps: a step below it may be near a s
 COLLAPSED = 0.2  # of it: steps for which the pivots of C_q are looked at anew
 SINGULAR_PIVOT = 0.2  # ... and is where the smallest pivot of C_q is below this share of the largest it had
 STATIC_SINGULAR = 0.01  # the same of the static form, whose pivots are sines of single rows ...
+CARE = 0.05  # ... and where a refused step that begins below this share is tried again with care ...
+LESS = 0.8  # ... and then by steps each of which is this times the one before
 LOST = 0.001  # ... and which is given up there for steps below this share of the longest
 FADING = 0.98  # of the longest step, with each accepted one
 RARELY = 16  # accepted steps from one look at the partition to the next where steps do without it
@@ -287,6 +290,24 @@ def _lost_at_singular(f, clock, size):
 
 
 @merged
+def _with_care(f, w, control, clock, size):
+    """Whether a step of the static form that begins near a singular position is tried again with more care.
+
+    Stages beside the constraints have accelerations there whose errors grow with the nearness. A step that ends well
+    beyond may be made where shorter ones, which end nearer, are not: lengths from the longest of the last ones down.
+    """
+    near = clock[PIVOT_HERE] < CARE * clock[LARGEST_PIVOT]
+    if f.flags[FORM] != STATIC or control[FIXED_STEP] > 0.0 or w.notes[NEARLY_SINGULAR] == 1.0 or not near:
+        return False
+    clock[H_NEXT] = LESS * size
+    if w.notes[NEARLY_SINGULAR] == 0.0:
+        w.notes[NEARLY_SINGULAR] = CAREFUL
+        clock[H_NEXT] = max(size, clock[H_LONG])
+    clock[H_LIMIT] = max(clock[H_LIMIT], clock[H_NEXT])
+    return True
+
+
+@merged
 def _failed(f, w, control, clock, t, size, code, retried, state):
     """What becomes of a step that failed for such a reason: a shorter one, another partition, or the end.
 
@@ -298,6 +319,8 @@ def _failed(f, w, control, clock, t, size, code, retried, state):
     if code == NEEDS_DENSE or _lost_at_singular(f, clock, size):
         return HAS_TO_BE_DENSE
     w.counters[N_REJECTED_CONVERGENCE] += 1
+    if _with_care(f, w, control, clock, size):
+        return GO_ON
     clock[FAILURE_CODE] = code
     clock[H_FAILED] = size
     if code == NOT_FINITE and control[GIVES_WAY] == 1.0:
@@ -321,6 +344,8 @@ def _refused(f, w, control, clock, t, size, proposal):
     """What becomes of a step whose error is too large: a shorter one, a tiny one by a spacing, or steps across."""
     w.counters[N_REJECTED_ERROR] += 1
     clock[FAILURE_CODE] = DONE
+    if _with_care(f, w, control, clock, size):
+        return GO_ON
     clock[H_NEXT] = min(proposal, REFUSED * size, size - np.spacing(abs(t + size)))
     if _lost_at_singular(f, clock, size):
         return HAS_TO_BE_DENSE
@@ -357,6 +382,8 @@ def _look_at_partition(f, w, control, clock, size, lands, state):
     if f.flags[FORM] == STATIC:
         clock[PIVOT_HERE] = w.notes[PIVOT]
         clock[LARGEST_PIVOT] = max(clock[LARGEST_PIVOT], w.notes[PIVOT])
+        if w.notes[NEARLY_SINGULAR] == CAREFUL and w.notes[PIVOT] >= CARE * clock[LARGEST_PIVOT]:
+            w.notes[NEARLY_SINGULAR] = 0.0
         return GO_ON
     n = w.Q.size
     straight = f.flags[STRAIGHT] == 1 and w.notes[BY_GENERAL] == 0.0
@@ -461,7 +488,8 @@ def advance(
         if accepted and not reaches and _ends_at_singular(f, w, control, clock):
             f.settle(f, w, options, memory, tolerances, False)
             w.counters[N_REJECTED_ERROR] += 1
-            clock[H_NEXT], clock[PIVOT_HERE] = 0.5 * size, w.notes[PIVOT]
+            if not _with_care(f, w, control, clock, size):
+                clock[H_NEXT], clock[PIVOT_HERE] = 0.5 * size, w.notes[PIVOT]
             continue
         driven = control[DRIVEN] == 1.0 and not leaps
         if driven and _before_kink(f, w, tolerances, control, clock, t, size, accepted, state, new_state):

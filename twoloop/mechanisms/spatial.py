@@ -11,6 +11,8 @@ The first rows are e.e = 1 of each body, then those of the joints. Vectors are i
 body -1. The mass matrix has the rank 6 of 7 for each body, 4 G^T J G being of rank 3.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from twoloop.kernels.compile.caches import helper
@@ -23,6 +25,7 @@ PLANE = 2.0  # the point b of j lies in the plane across the direction a of i, t
 JOINT, SPRING = 13, 11  # numbers of each
 HEAD = 6
 GROUND = -1
+MOVED, TURNED = (0, 1, 2), (3, 4, 5, 6)  # coordinates of a body
 
 
 @helper
@@ -212,3 +215,102 @@ def gamma(t, q, v, p, Qd):
         dx, dy, dz = centre(v, j)
         Qd[row] -= 2.0 * (aux * (dx + bux - cx - sux) + auy * (dy + buy - cy - suy) + auz * (dz + buz - cz - suz))
         Qd[row] -= ax * (bax - sax) + ay * (bay - say) + az * (baz - saz)
+
+
+@helper
+def put_turned(q, values, place, body, x, y, z, fx, fy, fz):
+    """The derivative of f . (vector of a body) by its Euler parameters into four values; where the next ones are."""
+    if body < 0:
+        return place
+    k = 7 * body + 3
+    d0, d1, d2, d3 = pulled(q[k], q[k + 1], q[k + 2], q[k + 3], x, y, z, fx, fy, fz)
+    values[place] += d0
+    values[place + 1] += d1
+    values[place + 2] += d2
+    values[place + 3] += d3
+    return place + 4
+
+
+@callback("mass_values")
+def mass_values(t, q, p, values):
+    for body in range(int(p[0])):
+        m, k, place = HEAD + 4 * body, 7 * body + 3, 19 * body
+        e0, e1, e2, e3 = q[k], q[k + 1], q[k + 2], q[k + 3]
+        G = ((-e1, e0, e3, -e2), (-e2, -e3, e0, e1), (-e3, e2, -e1, e0))
+        values[place] = values[place + 1] = values[place + 2] = p[m]
+        for i in range(4):
+            for j in range(4):
+                for axis in range(3):
+                    values[place + 3 + 4 * i + j] += 4.0 * p[m + 1 + axis] * G[axis][i] * G[axis][j]
+
+
+@callback("jacobian_values")
+def jacobian_values(t, q, p, values):
+    n = int(p[0])
+    for body in range(n):
+        for i in range(4):
+            values[4 * body + i] = q[7 * body + 3 + i]
+    first, at = HEAD + 4 * n, 4 * n
+    for k in range(first, first + JOINT * int(p[1]), JOINT):
+        i, j = int(p[k + 2]), int(p[k + 6])
+        a0, a1, a2, b0, b1, b2 = p[k + 3], p[k + 4], p[k + 5], p[k + 7], p[k + 8], p[k + 9]
+        if p[k] == POINT:
+            for axis in range(3):
+                fx, fy, fz = 1.0 * (axis == 0), 1.0 * (axis == 1), 1.0 * (axis == 2)
+                if i >= 0:
+                    values[at] = 1.0
+                    at = put_turned(q, values, at + 1, i, a0, a1, a2, fx, fy, fz)
+                if j >= 0:
+                    values[at] = -1.0
+                    at = put_turned(q, values, at + 1, j, b0, b1, b2, -fx, -fy, -fz)
+            continue
+        ax, ay, az = vector(q, i, a0, a1, a2)
+        bx, by, bz = vector(q, j, b0, b1, b2)
+        at = put_turned(q, values, at, j, b0, b1, b2, ax, ay, az)
+        if p[k] == DIRECTION:
+            at = put_turned(q, values, at, i, a0, a1, a2, bx, by, bz)
+            continue
+        cx, cy, cz = centre(q, i)
+        dx, dy, dz = centre(q, j)
+        sx, sy, sz = vector(q, i, p[k + 10], p[k + 11], p[k + 12])
+        put_turned(q, values, at, i, a0, a1, a2, dx + bx - cx - sx, dy + by - cy - sy, dz + bz - cz - sz)
+        at = put_turned(q, values, at, i, p[k + 10], p[k + 11], p[k + 12], -ax, -ay, -az)
+        for body, sign in ((i, -1.0), (j, 1.0)):
+            if body >= 0:
+                values[at], values[at + 1], values[at + 2] = sign * ax, sign * ay, sign * az
+                at += 3
+
+
+def mass_entries(n: int) -> tuple[list[int], list[int]]:
+    """Rows and columns of what `mass_values` gives of n bodies, in its order."""
+    rows, columns = [], []
+    for first in range(0, 7 * n, 7):
+        turned = range(first + 3, first + 7)
+        rows += [*range(first, first + 3), *(i for i in turned for _ in turned)]
+        columns += [*range(first, first + 3), *(j for _ in turned for j in turned)]
+    return rows, columns
+
+
+def jacobian_entries(n: int, joints: Sequence[Sequence[float]]) -> tuple[list[int], list[int]]:
+    """Rows and columns of what `jacobian_values` gives of n bodies, in its order."""
+    rows = [body for body in range(n) for _ in TURNED]
+    columns = [7 * body + k for body in range(n) for k in TURNED]
+
+    def add(row: int, body: int, of_body: Sequence[int]) -> None:
+        if body != GROUND:
+            rows.extend([row] * len(of_body))
+            columns.extend(7 * body + k for k in of_body)
+
+    for kind, first, *numbers in joints:
+        row, i, j = int(first), int(numbers[0]), int(numbers[4])
+        if kind == POINT:
+            for axis in range(3):
+                add(row + axis, i, (axis, *TURNED))
+                add(row + axis, j, (axis, *TURNED))
+            continue
+        add(row, j, TURNED)
+        add(row, i, TURNED)
+        if kind == PLANE:
+            add(row, i, MOVED)
+            add(row, j, MOVED)
+    return rows, columns

@@ -11,6 +11,7 @@ from twoloop.mechanisms.points import Sketch
 from twoloop.mechanisms.rotation import euler_parameters, euler_rates, rotation_matrix
 from twoloop.mechanisms.spatial import DIRECTION, GROUND, PLANE, POINT
 from twoloop.problem.drawing import Drawing
+from twoloop.problem.entries import LARGE
 from twoloop.problem.joints import Joint, unused
 from twoloop.problem.problem import Array
 from twoloop.problem.system import ConstrainedSystem
@@ -152,8 +153,18 @@ class SpatialBodies:
     def system(self, name: str) -> ConstrainedSystem:
         """The system of what was added so far."""
         n = len(self._bodies)
-        tables = [np.ravel(table) for table in (self._bodies, self._joints_after(n), self._springs)]
+        joints = self._joints_after(n)
+        tables = [np.ravel(table) for table in (self._bodies, joints, self._springs)]
+        values: dict[str, Any] = {}
+        if 7 * n >= LARGE:
+            values = {
+                "mass_values": spatial.mass_values,
+                "mass_entries": spatial.mass_entries(n),
+                "jacobian_values": spatial.jacobian_values,
+                "jacobian_entries": spatial.jacobian_entries(n, joints),
+            }
         return ConstrainedSystem(
+            **values,
             n_q=7 * n,
             n_c=n + self.n_joint_rows,
             mass=spatial.mass,

@@ -60,6 +60,15 @@ def switching(first: Plan, second: Plan, limit: float, n_q: int, looks: int = 1,
     )
 
 
+def with_matrix_cost(plan: Plan, cost: float) -> Plan:
+    """A plan of `switching` to which a Newton matrix costs so many evaluations."""
+    from twoloop.kernels.control import switching as kernels
+
+    options = plan.options.copy()
+    options[kernels.MATRIX_COST] = cost
+    return plan.changed(options=options)
+
+
 _PLANS = Newest()  # of implicit methods, which they depend on alone
 
 

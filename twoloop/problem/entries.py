@@ -16,7 +16,7 @@ Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Entries = tuple[Integers, Integers]  # rows and columns
 
-LARGE = 100  # coordinates from which on entries serve better than dense matrices: measured on chains of bars
+LARGE = 64  # coordinates from which on entries serve better than dense matrices; on chains of bars from 36 on
 VALUES_OF = {"mass": "mass_values", "jacobian": "jacobian_values"}  # of dense kinds, those that give values alone
 
 

@@ -175,7 +175,7 @@ class Course:
         run, a = self.run, self.run.a
         if self.code == a.HAS_TO_BE_DENSE or run.is_lost_without_dense(self.code):
             run.change_form()
-            self.kit, self.code = run.kit, a.PAUSED
+            self.plan, self.kit, self.code = run.plan, run.kit, a.PAUSED
         elif self.code == a.HAS_TO_GIVE_WAY:
             give_way(run)
             self.plan, self.control, self.kit, self.code = run.plan, run.control, run.kit, a.PAUSED

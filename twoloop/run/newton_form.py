@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.checks.consistency import NEARBY
-from twoloop.kernels.algebra.static_lu import in_groups, newton_program
+from twoloop.kernels.algebra.static_lu import groups_of, in_groups, newton_program
 from twoloop.kernels.algebra.static_program import N_UPDATES, Entries
 from twoloop.problem.system import ConstrainedSystem
 
@@ -22,8 +22,11 @@ def newton_form(
     jacobian: Entries,
     together: list[tuple[int, ...]],
     stiff: list[int],
-) -> NDArray[np.int32] | None:
-    """The program of Newton's matrix, see static_lu.py; None where it is not sparse, or cannot be found."""
+) -> tuple[NDArray[np.int32], int] | None:
+    """The program of Newton's matrix, see static_lu.py, and the number of groups of columns that are differenced.
+
+    None where it is not sparse, or cannot be found.
+    """
     found: set[tuple[int, int]] = set()
     rng = np.random.default_rng(9)
     size, lam = max(1.0, float(np.abs(q0).max())), rng.uniform(0.5, 1.5, system.n_c)
@@ -39,7 +42,9 @@ def newton_form(
     places = np.array(sorted(found), dtype=np.int64).reshape(-1, 2)
     tangents = in_groups((places[:, 0], places[:, 1]), system.n_q)
     program = newton_program(system.n_q, system.n_c, mass, jacobian, tangents, together, stiff)
-    return None if program is None or program[N_UPDATES] > SPARSE * system.n_q**3 / 3.0 else program
+    if program is None or program[N_UPDATES] > SPARSE * system.n_q**3 / 3.0:
+        return None
+    return program, int(groups_of(tangents, system.n_q).max(initial=-1)) + 1
 
 
 def _entries(system: ConstrainedSystem, t: float, q: Array, v: Array, lam: Array, most: float) -> set[tuple[int, int]]:

@@ -20,6 +20,7 @@ from twoloop.kernels.control.sudden import PLACES
 from twoloop.kernels.data import common
 from twoloop.kernels.evaluation.tasks import SOLVE
 from twoloop.kernels.layout import copy_of
+from twoloop.methods.auto import with_matrix_cost
 from twoloop.methods.plan import Plan, least_tolerance
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.messages import said_of_not_finite
@@ -164,6 +165,8 @@ class Run:
         static, self.static = self.static, None
         if static is not None and static.newton is None and self.matrices > 0:
             self.static = with_newton(self.system, t, q, static)
+        if self.static is not None and self.plan.first is not None:
+            self.plan = with_matrix_cost(self.plan, self.static.matrix_cost())
         self.kit = kit_of(self.system, t, q, self.plan, self.static)
         self.functions = self.kit.functions
         self.work = self._workspace(rank, rank)

@@ -36,6 +36,12 @@ class StaticForm(NamedTuple):
     mass_pattern: Array  # of a dense M that is not constant, likewise
     known: tuple[Any, ...]  # of what a program of Newton's matrix is made besides
     newton: NDArray[np.int32] | None = None  # that program, once it is asked for
+    n_groups: int = 0  # of columns, for each of which Newton's matrix takes displaced forces
+
+    def matrix_cost(self) -> float:
+        """What Newton's matrix and its factors cost, in evaluations of accelerations, about."""
+        assert self.newton is not None
+        return self.n_groups + float(self.newton[N_UPDATES]) / max(1.0, float(self.program[N_UPDATES]))
 
     def n_matrices(self, matrices: int) -> int:
         """Numbers of Newton's matrices, of a plan with so many dense ones."""
@@ -63,8 +69,8 @@ def static_form(system: ConstrainedSystem, t0: float, q0: Array, *plans: Plan) -
 
 def with_newton(system: ConstrainedSystem, t0: float, q0: Array, form: StaticForm) -> StaticForm | None:
     """The same with the program of Newton's matrix; None where there is none."""
-    program = system.remembered("newton form", lambda: newton_form(system, t0, q0, *form.known))
-    return None if program is None else form._replace(newton=program)
+    made = system.remembered("newton form", lambda: newton_form(system, t0, q0, *form.known))
+    return None if made is None else form._replace(newton=made[0], n_groups=made[1])
 
 
 def _made(system: ConstrainedSystem, t0: float, q0: Array) -> StaticForm | None:

@@ -32,6 +32,7 @@ from twoloop.kernels.evaluation.program import jacobian_by_program
 SUSPECT = 1e-6  # a pivot below this share of its size is looked at: that of a redundant row is rounding
 LEAST = 1e-10  # ... and one below this share no factors with pivots of one row can do with
 DEPENDENT = 1e-11  # sine of the angle to the other rows, found without cancellation, up to which a row is redundant
+CAREFUL = 2.0  # of NEARLY_SINGULAR: stages are put on the constraints, as it matters how well they keep to these
 ONCE, TWICE = 1e-3, 1e-7  # the smallest share, below which solutions are refined, and refined again
 
 

@@ -19,6 +19,7 @@ from twoloop.kernels.data.common import (
     INNER_DIVERGED,
     N_EVALUATIONS,
     N_INNER,
+    NEARLY_SINGULAR,
     NEEDS_DENSE,
     PIVOT,
     ROUNDED,
@@ -30,6 +31,7 @@ from twoloop.kernels.data.finite import CONSTRAINT, FORCE, GAMMA, MASS, RATE, fi
 from twoloop.kernels.evaluation.constraints import constraint_rates
 from twoloop.kernels.evaluation.program import gamma_by_program
 from twoloop.kernels.evaluation.static_factors_at import (
+    CAREFUL,
     choose_rows,
     factors_there,
     mass_values_there,
@@ -232,7 +234,11 @@ def _other_task(f, w, task, t, q, v, a, lam):
 def static_inner_loop(f, w, task, t, q, v, tolerance, a, lam):
     """What the names of the tasks say, at (t, q, v), see calls.py; of SOLVE, q and v are the right-hand side."""
     if task in (EVALUATE, EVALUATE_THERE):
-        code = factors_there(f, w, t, q)
+        code = DONE
+        if task == EVALUATE and w.notes[NEARLY_SINGULAR] == CAREFUL:
+            code = _to_constraints(f, w, t, q, v, tolerance)
+        if code == DONE:
+            code = factors_there(f, w, t, q)
         return _accelerate(f, w, t, q, v, a) if code == DONE else code
     if task == MULTIPLIERS:
         return _equilibrate(f, w, lam)

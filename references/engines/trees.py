@@ -1,0 +1,151 @@
+"""Trees of planar bodies with pins in MuJoCo and Pinocchio, for what an evaluation of their dynamics takes."""
+
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.integrate import solve_ivp
+
+from references.driver import imported
+from twoloop.mechanisms.planar import GROUND, PlanarBodies
+
+Array = NDArray[np.float64]
+
+Z = (0.0, 0.0, 1.0)
+
+
+class TreeDynamics(NamedTuple):
+    """A tree at a state: `evaluate` makes its accelerations, `angular` tells those of the bodies in space (n,)."""
+
+    evaluate: Callable[[], Any]
+    angular: Callable[[], Array]
+
+
+def _outwards(bodies: PlanarBodies) -> Iterator[tuple[int, Array, int, Array]]:
+    """Each body, its centre from its pin, on which body it hangs, and where from the pin of that one.
+
+    In the axes of the bodies; a branch at a time, as Pinocchio needs it.
+    """
+    hanging: dict[int, list[tuple[int, Array, Array]]] = {}
+    for i, here, j, there in bodies.pins:
+        hanging.setdefault(j, []).append((i, np.array([*here, 0.0]), np.array([*there, 0.0])))
+    ahead = [(GROUND, np.zeros(3), each) for each in hanging[GROUND]]
+    while ahead:
+        on, pin, (body, here, there) = ahead.pop()
+        yield body, -here, on, there - pin
+        ahead += [(body, here, each) for each in hanging.get(body, ())]
+
+
+def _moments(J: float) -> list[float]:
+    """Of a body in space that turns about z alone."""
+    return [0.6 * J, 0.6 * J, J]
+
+
+def _in_space(parents: list[tuple[int, int]], relative: Array) -> Array:
+    """Sums of what belongs to the joints, by body, from the ground outwards."""
+    made = np.zeros(len(relative))
+    for body, on in parents:
+        made[body] = relative[body] + (0.0 if on == GROUND else made[on])
+    return made
+
+
+def _relative(values: Array, body: int, on: int) -> float:
+    return float(values[body] - (0.0 if on == GROUND else values[on]))
+
+
+def mujoco_tree(bodies: PlanarBodies, angles: Array, rates: Array) -> TreeDynamics:
+    """The tree in MuJoCo at angles and angular velocities in space (n,); an evaluation is `mj_forward`.
+
+    Raises
+    ------
+    RuntimeError
+        If MuJoCo is not installed.
+    """
+    mujoco = imported("mujoco", extra="engines")
+    spec = mujoco.MjSpec()
+    spec.option.gravity = [0.0, -bodies.gravity, 0.0]
+    made, parents, speeds = {GROUND: spec.worldbody}, [], []
+    for body, centre, on, there in _outwards(bodies):
+        half = 0.5 * _relative(angles, body, on)
+        mass = {"mass": bodies.masses[body], "inertia": _moments(bodies.inertias[body]), "explicitinertial": True}
+        turned = [np.cos(half), 0.0, 0.0, np.sin(half)]
+        made[body] = made[on].add_body(name=str(body), pos=there, quat=turned, ipos=centre, **mass)
+        made[body].add_joint(type=mujoco.mjtJoint.mjJNT_HINGE, axis=Z)
+        parents.append((body, on))
+        speeds.append(_relative(rates, body, on))
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    first = [model.body(str(body)).dofadr[0] for body in range(len(angles))]
+    data.qvel[[first[body] for body, _ in parents]] = speeds
+    return TreeDynamics(lambda: mujoco.mj_forward(model, data), lambda: _in_space(parents, data.qacc[first]))
+
+
+class _Pinocchio(NamedTuple):
+    pin: Any
+    model: Any
+    first: list[int]  # of each body: the place of its joint among the coordinates
+    parents: list[tuple[int, int]]
+
+
+def _in_pinocchio(bodies: PlanarBodies) -> _Pinocchio:
+    pin = imported("pinocchio", "pin", extra="engines")
+    model = pin.Model()
+    model.gravity = pin.Motion(np.array([0.0, -bodies.gravity, 0.0]), np.zeros(3))
+    joints, parents = {GROUND: 0}, []
+    for body, centre, on, there in _outwards(bodies):
+        place = pin.SE3(np.eye(3), there)
+        joints[body] = model.addJoint(joints[on], pin.JointModelRZ(), place, str(body))
+        inertia = pin.Inertia(float(bodies.masses[body]), centre, np.diag(_moments(bodies.inertias[body])))
+        model.appendBodyToJoint(joints[body], inertia, pin.SE3.Identity())
+        parents.append((body, on))
+    return _Pinocchio(pin, model, [model.joints[joints[body]].idx_v for body in range(len(bodies.masses))], parents)
+
+
+def pinocchio_tree(bodies: PlanarBodies, angles: Array, rates: Array) -> TreeDynamics:
+    """The same in Pinocchio, with its joint about z; an evaluation is `aba`.
+
+    Raises
+    ------
+    RuntimeError
+        If Pinocchio is not installed.
+    """
+    pin, model, first, parents = _in_pinocchio(bodies)
+    data, q, v, tau = model.createData(), *np.zeros((3, model.nv))
+    for body, on in parents:
+        q[first[body]], v[first[body]] = _relative(angles, body, on), _relative(rates, body, on)
+    return TreeDynamics(lambda: pin.aba(model, data, q, v, tau), lambda: _in_space(parents, data.ddq[first]))
+
+
+def end_by_pinocchio(bodies: PlanarBodies, angles: Array, t_end: float, tolerance: float) -> Array:
+    """Coordinates (3 n,) of a tree some time after its release, by SciPy's DOP853 on the accelerations of Pinocchio.
+
+    Raises
+    ------
+    RuntimeError
+        If Pinocchio is not installed.
+    """
+    pin, model, first, parents = _in_pinocchio(bodies)
+    data, y0, tau = model.createData(), np.zeros(2 * model.nv), np.zeros(model.nv)
+    for body, on in parents:
+        y0[first[body]] = _relative(angles, body, on)
+
+    def rate(t: float, y: Array) -> Array:
+        q, v = np.split(y, 2)
+        return np.concatenate([v, pin.aba(model, data, q, v, tau)])
+
+    options = {"rtol": tolerance, "atol": tolerance, "method": "DOP853"}
+    ends = _in_space(parents, solve_ivp(rate, (0.0, t_end), y0, t_eval=(t_end,), **options).y[first, 0])
+    pins, made = {GROUND: np.zeros(2)}, np.zeros((len(angles), 3))
+    for body, centre, on, there in _outwards(bodies):
+        pins[body] = pins[on] + _turned(0.0 if on == GROUND else ends[on], there)
+        made[body] = *(pins[body] + _turned(ends[body], centre)), ends[body]
+    return made.ravel()
+
+
+def _turned(angle: float, place: Array) -> Array:
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([c * place[0] - s * place[1], s * place[0] + c * place[1]])
+
+
+ENGINES = {"MuJoCo": mujoco_tree, "Pinocchio": pinocchio_tree}

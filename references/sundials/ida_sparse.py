@@ -1,0 +1,161 @@
+"""SUNDIALS IDA with its sparse solver, by scikit-sundae, on a system that gives the values of its entries alone.
+
+The equations are the stabilised ones of residual.py, the linear equations are solved by SuperLU_MT, which the wheels of
+scikit-sundae hold, and the Jacobian is by differences of columns that have no row in common. Both functions are
+compiled; what calls them is Python.
+"""
+
+import warnings
+from collections.abc import Callable
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+import sksundae
+from numba import njit
+from numba.core.dispatcher import Dispatcher
+from numpy.typing import NDArray
+from scipy.sparse import bmat, coo_array, csc_array, eye_array
+
+from references.driver import CAUSES, Task, TimeLimit, adapter, user_call
+from references.equations.least_norm import accelerations
+from references.equations.linear import OPTIONS
+from references.sundials.loop import SMALLEST_STEP
+from references.sundials.residual import DIFFERENCE
+from twoloop.problem.system import ConstrainedSystem
+from twoloop.result.result import Result
+
+Array = NDArray[np.float64]
+
+
+@adapter(velocity_rows=False)
+def solve_ida_sparse(task: Task, rtol: float = 1e-8, atol: float = 1e-8) -> Result:
+    """Integrate a constrained mechanical system whose forces do not depend on the state, with IDA.
+
+    Parameters
+    ----------
+    rtol, atol : float
+        IDA's tolerances for q, v, Lam and Mu.
+    others : see `references.driver`
+        The result has the start and the end alone.
+
+    Raises
+    ------
+    ValueError
+        If the system has no `jacobian_values` and `mass_values`.
+    """
+    system, (t0, t1), limit = task.system, (task.t0, task.t1), TimeLimit(task.time_limit)
+    if not {"jacobian", "mass"} <= system.entries.keys():
+        raise ValueError(f"system must have jacobian_values and mass_values; {system.name!r} has not")
+    f, n, m = system.functions, system.n_q, system.n_c
+    residual = _residual_of(f.mass_values, f.force, f.constraint, f.constraint_rate, f.jacobian_values)
+    entries = tuple(np.asarray(each) for name in ("mass", "jacobian") for each in system.entries[name])
+    space = *entries, np.zeros(entries[0].size), np.zeros(entries[2].size)
+
+    pattern = pattern_of_residual(system)
+    groups, matrix = groups_of(pattern), _matrix_of(residual)
+
+    def resfn(t, y, yp, res):  # type: ignore[no-untyped-def]
+        residual(n, t, np.array(y), np.array(yp), f.p, *space, res)  # which are read-only arrays
+        if limit.passed():
+            res[:] = np.nan
+
+    def jacfn(t, y, yp, res, cj, JJ):  # type: ignore[no-untyped-def]
+        matrix(n, t, cj, np.array(y), np.array(yp), f.p, *space, groups, pattern.indptr, pattern.indices, JJ)
+
+    a, lam = (each[:, 0] for each in accelerations(system, np.array([t0]), task.y0[:, None]))
+    y, yp = np.concatenate([task.y0, np.zeros(2 * m)]), np.concatenate([task.v0, a, lam, np.zeros(m)])
+    steps = {"min_step": SMALLEST_STEP * (t1 - t0), "max_step": t1 - t0, "max_num_steps": 10**9}
+    sparse = {"linsolver": "sparse", "sparsity": pattern, "jacfn": jacfn}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # that the pattern is not used for differences of its own, which take longer
+        solver: Any = sksundae.ida.IDA(resfn, rtol=rtol, atol=atol, **sparse, **steps)
+    jacfn(t0, y, yp, y, 1.0, np.zeros(pattern.nnz))  # compiles
+    resfn(t0, y, yp, np.zeros_like(y))
+    with user_call:
+        solver.init_step(t0, y, yp)
+        outcome = solver.step(t1, tstop=t1)
+    failure = ""
+    if outcome.status < 0 and limit.exceeded:
+        failure = limit.message("IDA", float(outcome.t), "take looser tolerances")
+    elif outcome.status < 0:
+        failure = f"IDA failed after t = {outcome.t:.10g} with status {outcome.status}. {CAUSES} other tolerances."
+    ends = [np.concatenate([y[: 2 * n], yp[n : 2 * n + m]]) for y, yp in ((y, yp), (outcome.y, outcome.yp))]
+    counts = {"n_evaluations": int(outcome.nfev), "n_factorizations": int(outcome.njev)}
+    return task.result("IDA", np.array([t0, float(outcome.t)]), np.transpose(ends), failure, **counts)
+
+
+def pattern_of_residual(system: ConstrainedSystem) -> csc_array:
+    """Where the residual changes with the unknowns q, v, Lam, Mu and their rates, 1, (n, n)."""
+    n, m = system.n_q, system.n_c
+    M, G = (
+        coo_array((np.ones(len(rows)), (rows, columns)), shape=(size, n))
+        for size, (rows, columns) in ((n, system.entries["mass"]), (m, system.entries["jacobian"]))
+    )
+    both, one = G.T @ G, eye_array(n)  # C_q^T lam changes with all coordinates that share a row
+    blocks = [[one + both, one, None, G.T], [both, M, G.T, None], [G, None, None, None], [G, G, None, None]]
+    made = csc_array(bmat(blocks) != 0.0)
+    # with indices of 64 bits scikit-sundae fails, in the end by a damaged heap
+    return csc_array((made.data, made.indices.astype(np.int32), made.indptr.astype(np.int32)), shape=made.shape)
+
+
+def groups_of(pattern: csc_array) -> NDArray[np.int64]:
+    """The group of each column (n,): those of one have no row in common."""
+    near = csc_array(pattern.T @ pattern)
+    groups = np.full(near.shape[1], -1)
+    for j in range(groups.size):
+        taken = set(groups[near.indices[near.indptr[j] : near.indptr[j + 1]]].tolist())
+        groups[j] = next(g for g in range(len(taken) + 1) if g not in taken)
+    return groups
+
+
+@lru_cache(maxsize=8)
+def _residual_of(
+    mass: Dispatcher, force: Dispatcher, constraint: Dispatcher, rate: Dispatcher, jacobian: Dispatcher
+) -> Callable[..., None]:
+    """(n_q, t, y, y', p, rows and columns of M and of C_q, room for their values, res) -> None: the residual."""
+
+    @njit(**OPTIONS)
+    def residual(n, t, y, yp, p, rows, columns, row_of, column_of, M, G, res):  # type: ignore[no-untyped-def]
+        m = y.size // 2 - n
+        q, v, Lam, Mu = y[:n], y[n : 2 * n], yp[2 * n : 2 * n + m], yp[2 * n + m :]
+        res[:], M[:], G[:] = 0.0, 0.0, 0.0
+        force(t, q, v, p, res[n : 2 * n])
+        constraint(t, q, p, res[2 * n : 2 * n + m])
+        rate(t, q, p, res[2 * n + m :])
+        mass(t, q, p, M)
+        jacobian(t, q, p, G)
+        for j in range(n):
+            res[j], res[n + j] = yp[j] - v[j], -res[n + j]
+        for k in range(rows.size):
+            res[n + rows[k]] += M[k] * yp[n + columns[k]]
+        for k in range(row_of.size):
+            i, j = row_of[k], column_of[k]
+            res[j] += G[k] * Mu[i]
+            res[n + j] += G[k] * Lam[i]
+            res[2 * n + m + i] += G[k] * v[j]
+
+    return residual
+
+
+@lru_cache(maxsize=8)
+def _matrix_of(residual: Callable[..., None]) -> Callable[..., None]:
+    """The same with cj behind t, and groups, beginnings and rows of columns, values: dF/dy + cj dF/dy'."""
+
+    @njit(**OPTIONS)
+    def matrix(n, t, cj, y, yp, p, r, c, r_of, c_of, M, G, groups, begin, rows, values):  # type: ignore[no-untyped-def]
+        there, moved = np.zeros_like(y), np.zeros_like(y)
+        residual(n, t, y, yp, p, r, c, r_of, c_of, M, G, there)
+        for group in range(groups.max() + 1):
+            x, rate = y.copy(), yp.copy()
+            for j in range(y.size):
+                if groups[j] == group:
+                    x[j] += DIFFERENCE * max(1.0, abs(y[j]))
+                    rate[j] += cj * (x[j] - y[j])
+            residual(n, t, x, rate, p, r, c, r_of, c_of, M, G, moved)
+            for j in range(y.size):
+                if groups[j] == group:
+                    for k in range(begin[j], begin[j + 1]):
+                        values[k] = (moved[rows[k]] - there[rows[k]]) / (x[j] - y[j])
+
+    return matrix

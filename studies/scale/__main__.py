@@ -1,0 +1,3 @@
+from studies.scale import main
+
+main()

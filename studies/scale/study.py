@@ -1,0 +1,176 @@
+"""Cost against size: an evaluation of mechanisms of 3 to 3000 bodies, and chains beside others' solvers."""
+
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+
+from studies.bench import figures, tables
+from studies.bench.solvers import DEFAULT
+from studies.bench.store import Output
+from studies.bench.study import Study
+from studies.scale.rivals import BUDGET, TREE, UNTIL, UNTIL_END, trees, until
+from studies.scale.runs import (
+    CHAIN,
+    CHAINS,
+    ERRORS,
+    EVALUATION,
+    FROM,
+    LIMIT,
+    MEMORY,
+    METHOD,
+    SPARSE_IDA,
+    STAGES,
+    TO,
+    TOLERANCE,
+    chains,
+    evaluations,
+)
+from twoloop.rows.equal_error import resampled
+
+
+def make(output: Output) -> pd.DataFrame:
+    """Rows of evaluations and memory, of trees, of chains, and of those that grow until others stop."""
+    quick = output.call.quick
+    with output.kept() as kept:
+        groups = evaluations, trees, chains, until
+        return pd.DataFrame([kept.made(key, row) for group in groups for key, row in group(quick)])
+
+
+def slope(n: Any, times: Any) -> list[float] | None:
+    """p of cost ~ n^p over the sizes from FROM to TO, and its range over repetitions drawn again; None: too few."""
+    n = np.asarray(n, dtype=float)
+    kept = np.flatnonzero((n >= FROM) & (n <= TO))
+    if kept.size < 2:
+        return None
+    drawn = np.log(resampled([times[k] for k in kept]))
+    middle = np.log([np.median(times[k]) for k in kept])
+    x = np.log(n[kept])
+    return [float(np.polyfit(x, middle, 1)[0]), *np.percentile(np.polyfit(x, drawn, 1)[0], tables.INTERVAL).tolist()]
+
+
+def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
+    """Slopes and times by kind of mechanism; chains at equal error."""
+    found: dict[str, Any] = {"kinds": [], "chains": [], "from": FROM, "to": TO, "errors": list(ERRORS), "limit": LIMIT}
+    made = rows[(rows["group"] == EVALUATION) & rows["evaluation_us"].notna()]
+    for case, own in made.groupby("case", sort=False):
+        by_size = own.groupby("n")
+        times = {int(n): tuple(each["evaluation_us"].astype(float)) for n, each in by_size}
+        us = {n: float(np.median(each)) for n, each in times.items()}
+        dear = [n for n in us if any(us[n] > us[m] for m in us if m > n)]
+        line = {"case": str(case), "us": us, "dear": dear}
+        line["start_s"] = {int(n): float(each["start_s"].median()) for n, each in by_size}
+        found["kinds"].append(line | {"slope": None if dear else slope(list(times), list(times.values()))})
+    found["failed"] = rows[rows["group"].eq(EVALUATION) & rows["status"].eq("FAILED")][["case", "n"]].to_dict("records")
+    chains = rows[rows["group"] == CHAIN].sort_values(
+        ["n", "solver", "h", "tol", "repeat"], ascending=[True] * 2 + [False] * 2 + [True]
+    )
+    for n, own in chains.groupby("n"):
+        medians = tables.medians(own.reset_index(drop=True))
+        of_chain: dict[str, Any] = {
+            "n": int(n),
+            "t_end": CHAINS[int(n)],
+            "lines": tables.work_precision(medians, ERRORS),
+        }
+        of_chain["over_exudyn"] = [ratio for error in ERRORS if (ratio := over_exudyn(medians, error))]
+        of_chain |= {
+            "step": steps_of(medians),
+            "fastest": [each for error in ERRORS if (each := fastest(medians, error))],
+        }
+        found["chains"].append(of_chain)
+    held = rows[rows["group"].eq(MEMORY)]
+    held = held[held["memory_mb"].notna()] if len(held) else held
+    found["memory"] = {int(row["n"]): float(row["memory_mb"]) for _, row in held.iterrows()}
+    found["trees"] = [_beside_engines(line, rows[rows["group"] == TREE]) for line in found["kinds"]]
+    found["trees"] = [line for line in found["trees"] if line["engines"]]
+    grown = rows[rows["group"] == UNTIL]
+    found["until"] = [_until(str(solver), own) for solver, own in grown.groupby("solver", sort=False)]
+    found |= {"budget": BUDGET, "sparse_ida": SPARSE_IDA, "tolerance": TOLERANCE, "until_end": UNTIL_END}
+    of_reference = rows["reference"].dropna() if "reference" in rows else rows["group"][:0]
+    found["references"] = sorted(set(of_reference))
+    return found
+
+
+def _beside_engines(line: dict[str, Any], rows: pd.DataFrame) -> dict[str, Any]:
+    """Of a kind of tree: µs of an evaluation by the number of bodies, of ours and of the engines that were right."""
+    found: dict[str, Any] = {"case": line["case"], "ours": line["us"], "engines": {}, "start_s": {}}
+    right = rows[rows["case"].eq(line["case"]) & rows["status"].eq("REACHED_END")]
+    for engine, own in right.groupby("solver", sort=False):
+        by_size = own.groupby("n")
+        found["engines"][str(engine)] = {int(n): float(each["evaluation_us"].median()) for n, each in by_size}
+        found["start_s"][str(engine)] = {int(n): float(each["start_s"].median()) for n, each in by_size}
+    return found
+
+
+def _until(solver: str, rows: pd.DataFrame) -> dict[str, Any]:
+    """A solver's chains that were run, by n, and why it stopped."""
+    run = rows[rows["status"] == "REACHED_END"]
+    stopped = rows[rows["status"] != "REACHED_END"]
+    made = {int(row["n"]): {key: row[key] for key in ("build_s", "call_s", "error_q")} for _, row in run.iterrows()}
+    why = None if stopped.empty else {"n": int(stopped["n"].iloc[0]), "message": str(stopped["message"].iloc[0])}
+    return {"solver": solver, "made": made, "stopped": why}
+
+
+def over_exudyn(medians: pd.DataFrame, error: float) -> float | None:
+    """Time of Exudyn, by the cheaper of its runs about an error, over that of the default's cheapest run within it."""
+    ours = tables.as_good(medians[medians["solver"] == DEFAULT], error)
+    costs = tables.costs_at(medians[medians["family"] == "Exudyn"], error, doubt=True)
+    return min(cost for cost, _ in costs.values()) / ours if costs and ours == ours else None
+
+
+def steps_of(medians: pd.DataFrame) -> dict[str, Any] | None:
+    """Time of a step of Exudyn (s), of its finest run that ended, and of `DOP853`; None: one of them has no run."""
+    ended = medians[medians["error_q"].notna()]
+    theirs, ours = ended[ended["family"] == "Exudyn"], ended[ended["solver"] == f"{METHOD} (twoloop)"]
+    if theirs.empty or ours["n_evaluations"].isna().all():
+        return None
+    finest = theirs[theirs["h"] == theirs["h"].min()].sort_values("call_s").iloc[0]
+    exudyn = float(finest["call_s"] * finest["h"] / CHAINS[int(finest["n"])])
+    return {"exudyn": exudyn, "ours": STAGES * float((ours["call_s"] / ours["n_evaluations"]).min())}
+
+
+def fastest(medians: pd.DataFrame, error: float) -> dict[str, Any] | None:
+    """The rival with the cheapest run within an error, and the default's time over its; None: one has no such run."""
+    costs = {str(name): tables.as_good(own, error) for name, own in medians.groupby("solver", sort=False)}
+    rivals = [
+        name for name in medians[medians["family"] != "two-loop"]["solver"].unique() if costs[name] == costs[name]
+    ]
+    ours = costs.get(DEFAULT, np.nan)
+    if not rivals or not np.isfinite(ours):
+        return None
+    best = min(rivals, key=costs.__getitem__)
+    return {"error": error, "solver": best, "run_s": costs[best], "ours_s": ours}
+
+
+def figures_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Figure]:
+    """An evaluation over the number of bodies, and what an accuracy costs on chains."""
+    figure, axes = plt.subplots(figsize=(6.4, 4.4), layout="constrained")
+    for line, color, marker in zip(found["kinds"], figures.COLORS, "osD^vP", strict=False):
+        axes.plot(list(line["us"]), list(line["us"].values()), marker=marker, color=color, label=line["case"])
+    axes.set(xscale="log", yscale="log", xlabel="bodies", ylabel="time of an evaluation, projections included (µs)")
+    axes.legend(fontsize=8)
+    axes.grid(alpha=0.3)
+    chains = rows[(rows["group"] == CHAIN) & rows["error_q"].notna()]
+    sizes = sorted(set(chains["n"]))
+    width: dict[str, Any] = {"figsize": (3.4 * len(sizes) + 1.2, 4.2), "layout": "constrained", "squeeze": False}
+    second, panels = plt.subplots(1, len(sizes), sharey=True, **width)
+    for panel, n in zip(panels[0], sizes, strict=True):
+        for solver, own in chains[chains["n"] == n].groupby("solver", sort=False):
+            line = own.assign(setting=own["tol"].fillna(own["h"])).groupby("setting")[["error_q", "call_s"]].median()
+            look = figures.style(str(solver), str(own["family"].iloc[0]), bool(own["keeps_constraints"].iloc[0]))
+            panel.plot(line["error_q"], line["call_s"], **look | {"label": str(solver)})
+        panel.set(xscale="log", yscale="log", xlabel="error of q at the end, over max(1, max |q|)", title=f"{n} bars")
+        panel.grid(alpha=0.3)
+    panels[0][0].set_ylabel("CPU time of the call (s)")
+    shown = {label: line for axes in panels[0] for line, label in zip(*axes.get_legend_handles_labels(), strict=True)}
+    second.legend(shown.values(), shown, loc="outside lower center", ncols=3, fontsize=8)
+    return {"scale": figure, "scale_chains": second}
+
+
+STUDY = Study("scale", __doc__, make, findings_of, figures_of)
+main = STUDY.main
+
+if __name__ == "__main__":
+    main()
