@@ -77,7 +77,8 @@ class Course:
         self.plan, self.control, self.kit = run.plan, run.control, run.kit  # at the moment: not always the run's own
         self.step_parts = [FIRST_PARTITION]
         self.filled = np.zeros(2, dtype=np.int64)
-        self.pace, self.looks, self.sample = Pace(run.t0), Looks(run.plan), Sample(2 * run.system.n_q)
+        self.pace, self.looks = Pace(run.t0), Looks(run.plan)
+        self.sample = Sample(run.t0, run.state, 2 * run.system.n_q)
         self.cpu = 0.0
         self.raised: Exception | None = None
         self.code = INTERRUPTED if interrupts.asked else run.a.PAUSED
@@ -86,7 +87,6 @@ class Course:
         """Go on chunk by chunk, look at derivatives once more at the end, and put together what the run returns."""
         run, recorder = self.run, self.recorder
         a, clock = run.a, run.clock
-        self.sample.add(clock[a.T : a.T + 1], run.state[None, :])
         buffers, copied = self._buffers(), True
         while self.code == a.PAUSED:
             across, leaps = self.plan is not run.plan, clock[a.LEAPS] == 1.0
@@ -144,9 +144,8 @@ class Course:
 
     def _take(self, t: Array, rows: Array, steps: Array, kinds: NDArray[np.int64]) -> None:
         """Take over what a chunk has stored."""
-        run, a = self.run, self.run.a
-        self.sample.add(t, rows)
-        self.sample.add(run.clock[a.T : a.T + 1], run.state[None, :])
+        run = self.run
+        self.sample.add(t, rows, float(run.clock[run.a.T]), run.state)
         self.step_parts.append(steps)
         self.recorder.add(t, rows, kinds)
 
@@ -210,8 +209,11 @@ class Course:
             if recorder.ended is None:
                 status, message = outcome(run, code, self.t1, self.pace)
             if code != INTERRUPTED:
-                last = (float(run.clock[a.T]), run.state) if recorder.last is None else recorder.last
-                status, message = compared(run, t, table, last, self.sample, check_derivatives, status, message)
+                end = reached
+                if recorder.last is not None:
+                    self.sample.add(t[:0], table[:0], *recorder.last)
+                    end = recorder.last[0]
+                status, message = compared(run, self.sample, end, check_derivatives, status, message)
             if status in EXPLAINED_BY_STIFFNESS:
                 message += said_of_stiffness(self.looks, run.kit, run.work)
         except KeyboardInterrupt:
