@@ -69,6 +69,11 @@ def make_work(
     r = min(n_c, n_q) if rank is None else rank
     r_v = min(n_c + n_a, n_q) if rank_v is None else rank_v
     sizes = (n_q, n_c, n_a, r, r_v, reduced and n_q > r_v, augmented, n_nodes, static, n_matrices)
+    return empty(sizes)
+
+
+def empty(sizes: Sizes) -> Work:
+    """A workspace of such sizes as another has, full of zeros."""
     given_back = _given_back(sizes)
     return _new(sizes) if given_back is None else _cleared(given_back)
 

@@ -17,13 +17,13 @@ from twoloop.checks.sparse_rows import SparseRows, norms
 from twoloop.kernels.compile.linking import direct
 from twoloop.kernels.data import common
 from twoloop.kernels.evaluation.tasks import SOLVE
-from twoloop.kernels.layout import copy_of
+from twoloop.kernels.layout import copy_of, empty
 from twoloop.methods.plan import Plan, least_tolerance
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.messages import said_of_not_finite
 from twoloop.run.record import Statistics
 from twoloop.run.static_form import static_form, with_newton
-from twoloop.run.workspace import kit_of, kit_with, workspace
+from twoloop.run.workspace import kit_of, kit_with, made_ready, workspace
 
 Array = NDArray[np.float64]
 
@@ -105,6 +105,29 @@ class Run:
 
     def again(self) -> "Run":
         """A copy of this run at its start; this one must not have taken a step."""
+        other = self._copy()
+        other.work = copy_of(self.work)
+        return other
+
+    def at(self, t0: float, q0: Array, v0: Array) -> "Run | None":
+        """The same from another start, where C_q is of the same ranks; None where it is not, or nothing can begin.
+
+        Not of the static form, nor of one that a run may change.
+        """
+        other, n = self._copy(), self.system.n_q
+        other.t0, other.compared_to = t0, [-np.inf]
+        other.state[:n], other.state[n : 2 * n], other.state[2 * n :] = q0, v0, 0.0
+        other.clock[self.a.T] = other.clock[self.a.T_START] = t0
+        work = empty(self.work.sizes)
+        made_ready(work, self.system, self.kit.flags, other._pattern(q0), q0, self.rtol, self.reuse)
+        work.notes[common.NEARLY_SINGULAR] = 0.0 if self.plan.watchful else 1.0
+        other.work = work
+        if direct(self.a.start)(other.kit, work, t0, other.state) != common.DONE:
+            return None
+        other.redundant, other.said_of_rows = other._redundant_rows()
+        return other
+
+    def _copy(self) -> "Run":
         other = object.__new__(Run)
         vars(other).update(vars(self), plan=self.plan.fresh(), crossings=[], jumps=[])
         for name in ("state", "new_state", "tolerances", "control", "clock"):
@@ -112,7 +135,6 @@ class Run:
         if self.static is None and self.kit.flags[common.FORM] == common.AUGMENTED:  # which a run may change
             other.kit = kit_with(self.system, self.kit.flags, other.plan)
             other.functions = other.kit.functions
-        other.work = copy_of(self.work)
         return other
 
     def control_by(self, plan: Plan) -> None:

@@ -85,7 +85,12 @@ def _flags(system: ConstrainedSystem, t0: float, q0: Array, definite: bool) -> t
     if bandwidth is not None and banded_pays(system.n_q, system.n_c, bandwidth):
         flags[common.BANDWIDTH], flags[common.FORM] = bandwidth, common.MULTIPLIERS
     flags[common.DENSE_FORM] = flags[common.FORM]
-    return flags, sparse_pays(system.n_q, system.n_c + system.n_a, bool(flags[common.DIAGONAL_MASS]))
+    return flags, may_change(system, flags)
+
+
+def may_change(system: ConstrainedSystem, flags: Array) -> bool:
+    """Whether another position may ask for other flags, though M has an inverse there as well or as little."""
+    return sparse_pays(system.n_q, system.n_c + system.n_a, bool(flags[common.DIAGONAL_MASS]))
 
 
 def _is_diagonal(mass: Array) -> bool:
@@ -136,11 +141,25 @@ def workspace(
     sizes = (system.n_q, system.n_c, system.n_a, *ranks, bool(reduced), bool(augmented), n_nodes)
     n_matrices = matrices * system.n_q**2 if static is None else static.n_matrices(matrices)
     work = make_work(*sizes, None if static is None else static.static, n_matrices)
+    return made_ready(work, system, flags, pattern, q0, rtol, reuse, static)
+
+
+def made_ready(
+    work: common.Work,
+    system: ConstrainedSystem,
+    flags: Array,
+    pattern: Array,
+    q0: Array,
+    rtol: float,
+    reuse: float,
+    static: StaticForm | None = None,
+) -> common.Work:
+    """A workspace full of zeros with what a run finds in it."""
     work.notes[common.GAMMA_REQUIRED] = max(rtol, GAMMA_ACCURACY)
     work.notes[common.GAMMA_SHARE] = 1.0
     work.notes[common.KINK_BEFORE], work.notes[common.KINK_AFTER] = -np.inf, np.inf
-    work.notes[common.ROUNDED] = ROUNDING * float(np.abs(q0).max())
-    work.notes[common.REUSE] = max(reuse, work.notes[common.ROUNDED])
+    rounded = ROUNDING * float(np.abs(q0).max())
+    work.notes[common.ROUNDED], work.notes[common.REUSE] = rounded, max(reuse, rounded)
     if static is not None:
         _fill(work, system, static, q0)
         return work
