@@ -13,7 +13,7 @@ from twoloop.kernels.data import common, intervals
 from twoloop.run.comparison import compared
 from twoloop.run.dense import Interpolator
 from twoloop.run.interrupts import Interrupts, said_of_interrupt
-from twoloop.run.messages import outcome
+from twoloop.run.messages import message_of, outcome
 from twoloop.run.pace import INTERRUPTED, OUT_OF_TIME, STAGNATED, Pace
 from twoloop.run.passage import beyond, bridge, give_way, leap
 from twoloop.run.record import Record, Status, explained
@@ -231,7 +231,7 @@ class Course:
             lam=table[:, 3 * n :].T,
             h=steps[1:, a.H],
             status=status,
-            message=message + explained(status),
+            message=message_of(run, message + explained(status)),
             stats=statistics,
             rank=run.rank,
             redundant=run.redundant.copy(),  # runs of one start share it

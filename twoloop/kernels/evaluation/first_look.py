@@ -62,24 +62,27 @@ def _symmetric(mass, allowed):
 
 
 @exact
-def _rounding(value, row, state, rate, allowed):
-    """Whether a value is no more than this share of the terms that it is the sum of."""
+def _rounding(value, row, state, least, rate, allowed):
+    """Whether a value is no more than this share of the terms that it is the sum of, no state being below the least."""
     size = abs(rate)
     for j in range(state.size):
-        size += abs(row[j]) * abs(state[j])
+        size += abs(row[j]) * max(abs(state[j]), least)
     return abs(value) <= allowed * size
 
 
 @exact
 def _consistent(C, rate, rows, q, v, allowed):
-    """Whether positions and velocities are on the rows but for rounding."""
+    """Whether positions and velocities are on the rows but for rounding, of velocities of the fastest coordinate."""
+    fastest = 0.0
+    for j in range(q.size):
+        fastest = max(fastest, abs(v[j]))
     for i in range(len(rows)):
         speed = 0.0
         for j in range(q.size):
             speed += rows[i, j] * v[j]
-        if not _rounding(speed + rate[i], rows[i], v, rate[i], allowed):
+        if not _rounding(speed + rate[i], rows[i], v, fastest, rate[i], allowed):
             return False
-        if i < C.size and not _rounding(C[i], rows[i], q, 0.0, allowed):
+        if i < C.size and not _rounding(C[i], rows[i], q, 0.0, 0.0, allowed):
             return False
     return True
 
