@@ -172,25 +172,39 @@ def test_a_run_that_goes_where_none_was_is_compared_there():
 
 
 def test_the_box_of_a_session():
-    near, far = np.array([[0.0, 1.0], [1.0, 2.0]]), np.array([[0.5, 3.0]])
+    near, far = np.array([[0.0, 1.0], [1.0, 2.0]]), np.array([[0.5, 3.0], [0.5, 1.5]])
     territory = Territory()
     looked = []
     for _ in range(9):
-        looked.append(territory.is_due() or not territory.covers(near))
+        looked.append(territory.is_due() or len(territory.without_known(near)) > 0)
         territory.add(near)
     assert [k + 1 for k, anew in enumerate(looked) if anew] == [1, 2, 4, 8]
-    assert not territory.covers(far)
-    territory.add(far)
-    assert territory.covers(np.array([[0.7, 2.5]]))
+    assert np.array_equal(territory.without_known(far), far[:1])
+    assert np.array_equal(territory.without_known(far - [0.0, 0.98]), far[:1] - [0.0, 0.98])
+    assert not len(territory.without_known(far - [0.0, 0.995]))  # next to it
+    territory.add(far[:1])
+    assert not len(territory.without_known(np.array([[0.7, 2.5]])))
 
 
-def test_only_the_start_of_the_last_call_is_known(monkeypatch):
+def test_a_box_that_grows_by_little_is_compared_in_the_end():
+    territory, compared = Territory(), []
+    territory.add(np.array([[0.0, 0.0], [1.0, 1.0]]))
+    for t in np.linspace(1.0, 1.1, 101):
+        new = territory.without_known(np.array([[t, 0.5]]))
+        territory.add(new)
+        compared += new[:, 0].tolist()
+    assert np.allclose(np.diff([1.0, *compared]), 0.011, atol=0.002) and len(compared) > 8
+
+
+def test_every_start_that_is_not_the_last_is_checked(monkeypatch):
     looked = []
-    monkeypatch.setattr("twoloop.run.launch.check_start", lambda *given, **options: looked.append(1))
+    monkeypatch.setattr("twoloop.run.launch.check_start", lambda *given, **options: looked.append(given[2].copy()))
     problem = mechanisms.pendulum()
-    for q0 in (problem.q0, problem.q0, -problem.q0, problem.q0):
+    starts = [sign * problem.q0 for sign in (1, 1, -1, 1, -1, -1, 1)]
+    for q0 in starts:
         solve_dae(problem.system, (0.0, 0.1), q0, problem.v0)
-    assert len(looked) == 3
+    kept = starts[0]  # a run from there is kept, whose start was checked
+    assert [np.array_equal(q, kept) for q in looked] == [True, False, False]
 
 
 def test_a_wrong_start_is_refused_after_a_good_one_and_again():

@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Mapping
-from contextlib import suppress
 from functools import cache
 from typing import Any, NamedTuple
 
@@ -89,10 +88,10 @@ def copy_of(work: Work) -> Work:
 
 def _given_back(sizes: Sizes) -> Work | None:
     free = _free.get(sizes)
-    if free:
-        with suppress(IndexError):  # another thread took it
-            return free.pop()
-    return None
+    try:
+        return free.pop() if free else None
+    except IndexError:  # another thread took it
+        return None
 
 
 def _new(sizes: Sizes) -> Work:

@@ -10,8 +10,8 @@ from twoloop.generate.derived import standing_for
 from twoloop.generate.exact_derivatives import exact_near
 from twoloop.generate.families import give_bounds, take_bounds
 from twoloop.generate.straight_code import OwnCode
-from twoloop.generate.traced_values import Traced, unchecked
-from twoloop.methods.code_for import Compiled, code_for
+from twoloop.generate.traced_values import Traced
+from twoloop.methods.code_for import Compiled, code_for, may_have_code
 from twoloop.methods.plan import Method
 from twoloop.methods.plans_for import plans_for
 from twoloop.methods.presets import is_preset
@@ -32,7 +32,7 @@ class Kept(NamedTuple):
     t1: float
     code: OwnCode | None
     definite: bool  # whether M was
-    moves: bool
+    moves: bool  # whether what it takes depends on the start by that alone
 
 
 class Asked(NamedTuple):
@@ -80,7 +80,9 @@ def run_from(system: ConstrainedSystem, t0: float, q0: Array, v0: Array, asked: 
         trusted = is_preset(asked.method) and all(traced.trusted for traced in run.traced)
         if trusted and run.work.notes.base.size <= LARGEST:
             runs = {} if len(runs) == MOST else dict(runs)  # another thread may look at the old one
-            moves = run.static is None and not may_change(run.system, run.kit.flags)
+            fixed = asked.step_size is not None
+            settled = code is not None or not may_have_code(run.system, asked.method, fixed, asked.compiled)
+            moves = run.static is None and settled and not may_change(run.system, run.kit.flags)
             runs[call] = Kept(run.again(), start, asked.t1, code, has_definite_mass(system, t0, q0), moves)
     system.made["runs"] = start, runs
     return run
@@ -89,8 +91,7 @@ def run_from(system: ConstrainedSystem, t0: float, q0: Array, v0: Array, asked: 
 def _moved(kept: Kept, system: ConstrainedSystem, t0: float, q0: Array, v0: Array, asked: Asked) -> Run | None:
     """A run from another start; None where something else suits that."""
     _check_start(system, t0, q0, v0, asked.check_derivatives)
-    fixed = asked.step_size is not None
-    if code_for(kept.run.system, asked.method, fixed, asked.compiled, t0, q0, unchecked) is not kept.code:
+    if kept.code is not None and not kept.code.serves(system, t0, q0):
         return None
     run = kept.run.at(t0, q0, v0) if has_definite_mass(system, t0, q0) == kept.definite else None
     if run is not None:

@@ -42,7 +42,7 @@ def bridge(run: Run) -> tuple[Plan, Array]:
 
     a, clock = run.a, run.clock
     run.crossings.append([(float(clock[a.T]), run.state.copy())])
-    plan = DOP853().plan(run.system.n_q, run.rtol, float(run.tolerances[common.ATOL :].min()), False)
+    plan = DOP853().plan(run.system.n_q, run.rtol, run.least_atol, False)
     control = run.control.copy()
     control[: a.N_RULE] = plan.changed(least_error=0.0).rule
     control[a.SYMMETRIC], control[a.BRIDGE], control[a.MAX_ATTEMPTS] = 0.0, 0.0, 1.0

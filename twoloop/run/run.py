@@ -65,6 +65,7 @@ class Run:
         self.system, self.plan, self.t0 = system, plan, t0
         self.memory = plan.memory.copy()
         self.rtol, self.reuse, self.interiors, self.traced = rtol, plan.reuse, interiors, plan.traced
+        self.least_atol = float(atol.min())
         others = () if plan.substitute is None else (plan.substitute,)
         self.static = static_form(system, t0, q0, plan, *others)
         self.matrices = max(each.matrices for each in (plan, *others))
@@ -78,7 +79,7 @@ class Run:
         self.tolerances = np.zeros(common.ATOL + system.n_q)
         self.tolerances[common.RTOL] = rtol
         self.tolerances[common.ESTIMATE] = step_size is None
-        self.tolerances[common.LEAST] = least_tolerance(rtol, float(atol.min()))
+        self.tolerances[common.LEAST] = least_tolerance(rtol, self.least_atol)
         self.tolerances[common.ATOL :] = atol
         self.control = np.zeros(advance.N_CONTROL)
         self.control[advance.MAX_STEP] = np.inf
@@ -129,9 +130,17 @@ class Run:
 
     def _copy(self) -> "Run":
         other = object.__new__(Run)
-        vars(other).update(vars(self), plan=self.plan.fresh(), crossings=[], jumps=[])
-        for name in ("state", "new_state", "tolerances", "control", "clock"):
-            setattr(other, name, getattr(self, name).copy())
+        vars(other).update(
+            vars(self),
+            plan=self.plan.fresh(),
+            state=self.state.copy(),
+            new_state=self.new_state.copy(),
+            tolerances=self.tolerances.copy(),
+            control=self.control.copy(),
+            clock=self.clock.copy(),
+            crossings=[],
+            jumps=[],
+        )
         if self.static is None and self.kit.flags[common.FORM] == common.AUGMENTED:  # which a run may change
             other.kit = kit_with(self.system, self.kit.flags, other.plan)
             other.functions = other.kit.functions
@@ -300,7 +309,7 @@ class Run:
         """A share of the time in which velocities and accelerations of a state change the coordinates as a whole."""
         n = self.system.n_q
         q, v, a = np.abs(state[: 3 * n]).reshape(3, n).max(axis=1).tolist()
-        q = max(q, float(self.tolerances[common.ATOL :].min()))  # all coordinates zero: there is no other length
+        q = max(q, self.least_atol)  # all coordinates zero: there is no other length
         scales = [span]
         if v > 0.0:
             scales.append(q / v)

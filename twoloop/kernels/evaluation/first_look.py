@@ -22,8 +22,8 @@ from twoloop.kernels.data.common import (
 from twoloop.kernels.data.finite import finite, finite_vector
 
 # flags of what is found: all is finite, M symmetric, no row empty; the state on the rows but for rounding; an M that
-# varies definite
-IN_ORDER, CONSISTENT, DEFINITE = 1, 2, 4
+# varies definite, or not
+IN_ORDER, CONSISTENT, DEFINITE, INDEFINITE = 1, 2, 4, 8
 SURELY = 2.0  # times what counts as no eigenvalue: what rounding does not reach
 
 
@@ -112,14 +112,14 @@ def _note_entries_near(f, t, q, ways, place, rows, n_c, pattern):
 
 @exact
 def _definite(mass, least, factors):
-    """Whether no eigenvalue is below this share of the largest entry, beyond doubt."""
+    """Whether no eigenvalue is below this share of the largest entry."""
     n, largest = len(mass), 0.0
     for i in range(n):
         for j in range(n):
             factors[i, j] = mass[i, j]
             largest = max(largest, abs(mass[i, j]))
     for i in range(n):
-        factors[i, i] -= SURELY * least * largest
+        factors[i, i] -= least * largest
     return ldl_factor(factors)
 
 
@@ -171,8 +171,11 @@ def look(f, t, q, v, lam, room, mass, rows, ways, pattern, least):
         found = IN_ORDER
         if _consistent(room[force:C], room[C:rate], rows, q, v, least[0]):
             found |= CONSISTENT
-    if flags[CONSTANT_MASS] == 0 and _definite(mass, least[2], scratch):
-        found |= DEFINITE
+    if flags[CONSTANT_MASS] == 0:  # beyond doubt
+        if _definite(mass, SURELY * least[2], scratch):
+            found |= DEFINITE
+        elif not _definite(mass, least[2] / SURELY, scratch):
+            found |= INDEFINITE
     near = room[end : end + n_rows * n].reshape((n_rows, n))
     _note_entries_near(f, t, q, ways, room[end + n_rows * n : end + n_rows * n + n], near, n_c, pattern)
     return found
