@@ -4,7 +4,7 @@ from __future__ import annotations  # ArrayLike stays a word in help()
 
 import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from typing import Any
 
 import numpy as np
@@ -36,6 +36,7 @@ from twoloop.run.recorder import Wanted
 Array = NDArray[np.float64]
 
 ROUNDING = 1e-15
+NO_BAR = nullcontext(lambda t: None)  # in the place of what shows how far a run is
 SAME = 1e-9  # relative: a step and a span that differ by less are one, however they were rounded
 
 
@@ -154,7 +155,7 @@ def solve_dae(
     v0 = check_vector("v0", v0, system.n_q)
     check_positive("rtol", rtol)
     atol = check_tolerance("atol", atol, system.n_q)
-    if max(rtol, atol.min()) < ROUNDING:
+    if rtol < ROUNDING and atol.min() < ROUNDING:
         raise ValueError(
             f"rtol and atol must not both be below {ROUNDING:g}, where rounding hides the error; given {rtol!r} and "
             f"{float(atol.min())!r}"
@@ -195,7 +196,7 @@ def solve_dae(
         if run.said_of_rows:
             warnings.warn(run.said_of_rows, ConstraintWarning, stacklevel=2)
         with_code = bool(run.plan.own)
-        with _progress_bar(progress, chosen.name, t0, t1) as report:
+        with _progress_bar(chosen.name, t0, t1) if progress else NO_BAR as report:
             lands = run.plan.lands or step_size is not None or (times is not None and set(times.tolist()) <= {t0, t1})
             wanted = Wanted(times, lands, bool(dense_output), event_functions)
             record = Course(run, t1, wanted, report, time_limit, interrupts).to_end(check_derivatives)
@@ -205,9 +206,8 @@ def solve_dae(
         if own is not None:  # Newmark's own test, of positions, has its place
             rtol, atol[:], untested = own, own, np.ones(len(record.h), dtype=bool)
         given = {"method": chosen.name, "compiled": with_code, "rtol": float(rtol), "atol": atol}
-        own = {"system": system, "untested": untested, **given}
-        return Result(**vars(record) | own)
-    return Result(**vars(not_begun(system, t0, event_functions, chosen.name)))
+        return Result.of(record, system=system, untested=untested, **given)
+    return Result.of(not_begun(system, t0, event_functions, chosen.name))
 
 
 def check_method(method: str | Method) -> Method:
@@ -225,11 +225,8 @@ def check_method(method: str | Method) -> Method:
 
 
 @contextmanager
-def _progress_bar(progress: bool | None, name: str, t0: float, t1: float) -> Iterator[Any]:
-    """A function that takes the time reached; draws a bar when asked to."""
-    if not progress:
-        yield lambda t: None
-        return
+def _progress_bar(name: str, t0: float, t1: float) -> Iterator[Any]:
+    """A function that takes the time reached, and draws it."""
     try:
         from rich.progress import Progress
     except ImportError as error:

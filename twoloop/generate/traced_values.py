@@ -181,10 +181,15 @@ class Sample:
         if len(self._parts) > MOST:
             self._parts = self._parts[::2]
 
-    def up_to(self, end: float) -> Array:
+    def end(self, t: float, state: Array) -> None:
+        """Leave out what is beyond a time, and take the state there."""
+        states = self.states()
+        self._parts = [states[states[:, 0] <= t]]
+        self.add(states[:0, 0], states[:0], t, state)
+
+    def states(self) -> Array:
         """All of them, the last first."""
-        states = np.concatenate(self._parts)
-        return states[states[:, 0] <= end]
+        return np.concatenate(self._parts)
 
 
 Check = Callable[[Traced], None]

@@ -31,7 +31,7 @@ def compared(
     everywhere = territory.is_due() or run.system.called_in_python
     if not everywhere and end <= run.compared_to[0]:
         return status, message
-    states = sample.up_to(end)
+    states = sample.states()
     first = states[-1]
     if not everywhere:
         states = territory.without_known(states)

@@ -93,7 +93,7 @@ class Course:
             began = time.process_time()
             self._advance(buffers)
             n_rows, n_steps = self.filled.tolist()
-            t, rows, steps = (part[:n] for part, n in zip(buffers, (n_rows, n_rows, n_steps), strict=True))
+            t, rows, steps = buffers[0][:n_rows], buffers[1][:n_rows], buffers[2][:n_steps]
             copied = 2 * n_rows < len(buffers[0])  # then copies take less room
             if copied:
                 t, rows, steps = t.copy(), rows.copy(), steps.copy()
@@ -101,6 +101,11 @@ class Course:
             spent = time.process_time() - began
             self.cpu += spent
             if recorder.ended is not None:
+                break
+            if self.code == a.ALL_OUTPUT_DONE:
+                if self.looks.kept:
+                    self.looks.pass_by(steps[:, a.H])
+                self.report(self.t1)
                 break
             self._look(steps, across, spent)
             if not copied or len(buffers[0]) < min(run.chunk, BUFFER_ROWS):
@@ -211,7 +216,7 @@ class Course:
             if code != INTERRUPTED:
                 end = reached
                 if recorder.last is not None:
-                    self.sample.add(t[:0], table[:0], *recorder.last)
+                    self.sample.end(*recorder.last)
                     end = recorder.last[0]
                 status, message = compared(run, self.sample, end, check_derivatives, status, message)
             if status in EXPLAINED_BY_STIFFNESS:
