@@ -96,7 +96,7 @@ def check_vector(name: str, value: ArrayLike, n: int) -> Array:
     array = check_real(name, value)
     if array.shape != (n,):
         raise ValueError(f"{name} must have shape ({n},); given shape {array.shape}")
-    if not math.isfinite(array.dot(array)) and not np.isfinite(array).all():
+    if not math.isfinite(sum(array.tolist())) and not np.isfinite(array).all():  # sums may be too large
         raise ValueError(f"{name} must be finite; entries {np.flatnonzero(~np.isfinite(array)).tolist()} are not")
     return array
 

@@ -49,7 +49,7 @@ def compared(
 def _derivatives_again(run: "Run", states: Array, first: Array, status: Status, message: str) -> tuple[Status, str]:
     """Status and message, unless a derivative, or a constant mass, is wrong where the run went from its first state."""
     n = run.system.n_q
-    chosen = states[:: 1 + (len(states) - 1) // LATER]
+    chosen = states[:: 1 + (len(states) - 1) // LATER][::-1]
     some = [(float(each[0]), each[1 : 1 + n], each[1 + n :]) for each in chosen]
     exact = exact_derivatives(run.system)
     fine = exact is not None and exact.wrong(run.system, generic_states(some)) is None

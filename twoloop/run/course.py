@@ -15,7 +15,7 @@ from twoloop.run.dense import Interpolator
 from twoloop.run.interrupts import Interrupts, said_of_interrupt
 from twoloop.run.messages import message_of, outcome
 from twoloop.run.pace import INTERRUPTED, OUT_OF_TIME, STAGNATED, Pace
-from twoloop.run.passage import beyond, bridge, give_way, leap
+from twoloop.run.passage import beyond, bridge, bridging_kit, give_way, leap
 from twoloop.run.record import Record, Status, explained
 from twoloop.run.recorder import Recorder, Wanted
 from twoloop.run.run import Run
@@ -187,7 +187,7 @@ class Course:
             self.code = a.PAUSED
         elif self.code == a.NEAR_SINGULAR:
             self.plan, self.control = bridge(run)
-            self.kit = common.Kit(run.functions, run.kit.general, self.plan.step)
+            self.kit = bridging_kit(run.kit)
             self.code = a.PAUSED
         elif self.plan is not run.plan and self.code != a.ALL_OUTPUT_DONE:
             self.plan, self.control, self.code = beyond(run, self.plan, self.control, self.code, n_steps)

@@ -4,7 +4,7 @@ import warnings
 from typing import TYPE_CHECKING, Any
 
 from twoloop.checks.consistency import ConstraintWarning, dependent_rows, least_inertia, not_finite
-from twoloop.checks.rank import in_words
+from twoloop.checks.rank import in_words, surely_above
 from twoloop.kernels.data import common
 from twoloop.run.crossings import said_of_crossings, singular_ratio
 from twoloop.run.pace import INTERRUPTED, OUT_OF_TIME, STAGNATED, STAGNATION_STEPS, Pace
@@ -138,7 +138,10 @@ def _said_of_end(run: "Run") -> str:
     """A warning, and the sentence, where the run ends with constraints that have lost rank."""
     if not run.crossings and not (run.plan.watchful and run.work.notes[common.NEARLY_SINGULAR] == 1.0):
         return ""
-    ratio = singular_ratio(run.system, float(run.clock[run.a.T]), run.state[: run.system.n_q], run.rank)
+    t, q, rank = float(run.clock[run.a.T]), run.state[: run.system.n_q], run.rank
+    if surely_above(LOST_AT_END, run.system.rows(t, q), rank):
+        return ""
+    ratio = singular_ratio(run.system, t, q, rank)
     if ratio > LOST_AT_END:
         return ""
     said = (

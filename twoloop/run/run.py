@@ -10,10 +10,11 @@ from numpy.typing import NDArray
 from twoloop.checks.consistency import (
     dependent_rows,
     least_inertia,
+    mass_and_rows,
     pattern_of,
 )
 from twoloop.checks.rank import SHOWN, equations_in_words, in_words
-from twoloop.checks.sparse_rows import SparseRows, norms
+from twoloop.checks.sparse_rows import Rows, SparseRows, norms
 from twoloop.kernels.compile.linking import direct
 from twoloop.kernels.data import common
 from twoloop.kernels.evaluation.tasks import SOLVE
@@ -263,7 +264,7 @@ class Run:
         left_out = np.ones(n_rows, dtype=bool)
         left_out[self.work.rows_v] = False
         redundant = np.flatnonzero(left_out)
-        rows, a = self.system.sparse_rows(self.t0, self.state[:n]), self.state[2 * n : 3 * n]
+        rows, a = self._rows(), self.state[2 * n : 3 * n]
         off = np.abs(rows @ a - self.work.Gamma)
         allowed = CONTRADICTS * np.maximum(abs(rows) @ np.abs(a) + np.abs(self.work.Gamma), 1.0)
         wrong = np.flatnonzero(off > allowed).tolist()
@@ -278,14 +279,21 @@ class Run:
             "step; multipliers are those of least norm. See docs/constraints.md#redundant-rows"
         )
 
+    def _rows(self) -> Rows:
+        """C_q and A at the start."""
+        system, q = self.system, self.state[: self.system.n_q]
+        if system.called_in_python or system.entries:
+            return system.sparse_rows(self.t0, q)
+        return mass_and_rows(system, self.t0, q)[1]
+
     def _in_words(self, rows: list[int]) -> str:
         """Which rows depend on which others; the factors of the static form tell the shares of the first."""
         q = self.state[: self.system.n_q]
-        counted = self.work.rows_v.tolist()
+        counted, all_rows = self.work.rows_v.tolist(), self._rows()
+        if not isinstance(all_rows, SparseRows):
+            return in_words(all_rows, rows)
         if self.static is None or set(rows) & set(counted):
             return in_words(self.system.rows(self.t0, q), rows)
-        all_rows = self.system.sparse_rows(self.t0, q)
-        assert isinstance(all_rows, SparseRows)
         shares, zero, x = np.zeros((min(SHOWN, len(rows)), len(all_rows))), np.zeros(len(all_rows)), np.zeros_like(q)
         for row, share in zip(rows, shares, strict=False):
             direct(self.kit.inner)(self.kit, self.work, SOLVE, self.t0, all_rows.row(row), zero, 0.0, x, share)
@@ -308,7 +316,7 @@ class Run:
     def first_step(self, span: float, state: Array) -> float:
         """A share of the time in which velocities and accelerations of a state change the coordinates as a whole."""
         n = self.system.n_q
-        q, v, a = np.abs(state[: 3 * n]).reshape(3, n).max(axis=1).tolist()
+        q, v, a = np.maximum.reduce(np.abs(state[: 3 * n]).reshape(3, n), axis=1).tolist()
         q = max(q, self.least_atol)  # all coordinates zero: there is no other length
         scales = [span]
         if v > 0.0:

@@ -158,7 +158,7 @@ def made_ready(
     work.notes[common.GAMMA_REQUIRED] = max(rtol, GAMMA_ACCURACY)
     work.notes[common.GAMMA_SHARE] = 1.0
     work.notes[common.KINK_BEFORE], work.notes[common.KINK_AFTER] = -np.inf, np.inf
-    rounded = ROUNDING * float(np.abs(q0).max())
+    rounded = ROUNDING * float(np.maximum.reduce(np.abs(q0)))
     work.notes[common.ROUNDED], work.notes[common.REUSE] = rounded, max(reuse, rounded)
     if static is not None:
         _fill(work, system, static, q0)
