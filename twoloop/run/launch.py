@@ -17,7 +17,7 @@ from twoloop.methods.plans_for import plans_for
 from twoloop.methods.presets import is_preset
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.run import Run
-from twoloop.run.workspace import may_change
+from twoloop.run.workspace import sparse_factors_pay
 
 Array = NDArray[np.float64]
 
@@ -82,8 +82,9 @@ def run_from(system: ConstrainedSystem, t0: float, q0: Array, v0: Array, asked: 
             runs = {} if len(runs) == MOST else dict(runs)  # another thread may look at the old one
             fixed = asked.step_size is not None
             settled = code is not None or not may_have_code(run.system, asked.method, fixed, asked.compiled)
-            moves = run.static is None and settled and not may_change(run.system, run.kit.flags)
-            runs[call] = Kept(run.again(), start, asked.t1, code, has_definite_mass(system, t0, q0), moves)
+            definite = has_definite_mass(system, t0, q0)
+            moves = run.static is None and settled and (definite or not sparse_factors_pay(run.system, run.kit.flags))
+            runs[call] = Kept(run.again(), start, asked.t1, code, definite, moves)
     system.made["runs"] = start, runs
     return run
 

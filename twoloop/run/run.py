@@ -114,7 +114,7 @@ class Run:
     def at(self, t0: float, q0: Array, v0: Array) -> "Run | None":
         """The same from another start, where C_q is of the same ranks; None where it is not, or nothing can begin.
 
-        Not of the static form, nor of one that a run may change.
+        Not of the static form.
         """
         other, n = self._copy(), self.system.n_q
         other.t0, other.compared_to = t0, [-np.inf]
