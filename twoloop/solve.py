@@ -5,6 +5,7 @@ from __future__ import annotations  # ArrayLike stays a word in help()
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
+from operator import is_
 from typing import Any
 
 import numpy as np
@@ -143,51 +144,32 @@ def solve_dae(
         through unchanged, with a note that says which and at what time; so does what is wrong with an event's value.
     """
     check_system(system)
-    check_flag("dense_output", dense_output)
+    given = (
+        *(method, rtol, atol, first_step, max_step, max_steps, step_size),
+        *(dense_output, progress, time_limit, check_derivatives, compiled),
+    )
+    known = system.made.get("options")
+    if known is None or not all(map(is_, given, known[0])):
+        known = given, _checked(system, *given)
+        if type(atol) is float:  # an array may be changed by who gives it
+            system.made["options"] = known
+    chosen, rtol, atol, max_step, compiled = known[1]
     event_functions = None if events is None else check_events(events)
-    if progress is not None:
-        check_flag("progress", progress)
-    compiled = check_compiled(compiled)
-    check_flag("check_derivatives", check_derivatives)
-    chosen = check_method(method)
     t0, t1 = check_span(t_span)
     q0 = check_vector("q0", q0, system.n_q)
     v0 = check_vector("v0", v0, system.n_q)
-    check_positive("rtol", rtol)
-    atol = check_tolerance("atol", atol, system.n_q)
-    if rtol < ROUNDING and atol.min() < ROUNDING:
-        raise ValueError(
-            f"rtol and atol must not both be below {ROUNDING:g}, where rounding hides the error; given {rtol!r} and "
-            f"{float(atol.min())!r}"
-        )
-    if first_step is not None:
-        check_positive("first_step", first_step)
-    check_positive("max_step", max_step, infinite=True)
-    if step_size is not None:
-        check_positive("step_size", step_size)
-        if step_size > (t1 - t0) * (1.0 + SAME):
-            raise ValueError(f"step_size must not exceed the length of t_span, {t1 - t0:g}; given {step_size!r}")
-        if first_step is not None or max_step != np.inf:
-            raise ValueError("step_size is a constant step: give neither first_step nor max_step with it")
-    if max_steps is not None:
-        check_size("max_steps", max_steps, 1)
-    if time_limit is not None:
-        check_positive("time_limit", time_limit)
-    if system.n_a > 0 and getattr(chosen, "variables", "velocities") == "momenta":
-        raise ValueError(
-            f"method with variables='momenta' needs constraints on positions only: there are no canonical variables "
-            f"for the n_a = {system.n_a} nonholonomic rows of {system.name!r}. Take variables='velocities'"
-        )
+    if step_size is not None and step_size > (t1 - t0) * (1.0 + SAME):
+        raise ValueError(f"step_size must not exceed the length of t_span, {t1 - t0:g}; given {step_size!r}")
     times = None if t_eval is None else check_times(t_eval, t0, t1, step_size)
     with Interrupts() as interrupts:
         asked = Asked(
             method=chosen,
-            rtol=float(rtol),
+            rtol=rtol,
             atol=atol,
             t1=t1,
             step_size=step_size,
             first_step=first_step,
-            max_step=float(max_step),
+            max_step=max_step,
             max_steps=max_steps,
             compiled=compiled,
             check_derivatives=check_derivatives,
@@ -205,9 +187,57 @@ def solve_dae(
         atol, own = atol.copy(), getattr(chosen, "error_tol", None)
         if own is not None:  # Newmark's own test, of positions, has its place
             rtol, atol[:], untested = own, own, np.ones(len(record.h), dtype=bool)
-        given = {"method": chosen.name, "compiled": with_code, "rtol": float(rtol), "atol": atol}
-        return Result.of(record, system=system, untested=untested, **given)
+        told = {"method": chosen.name, "compiled": with_code, "rtol": float(rtol), "atol": atol}
+        return Result.of(record, system=system, untested=untested, **told)
     return Result.of(not_begun(system, t0, event_functions, chosen.name))
+
+
+def _checked(
+    system: ConstrainedSystem,
+    method: Any,
+    rtol: Any,
+    atol: Any,
+    first_step: Any,
+    max_step: Any,
+    max_steps: Any,
+    step_size: Any,
+    dense_output: Any,
+    progress: Any,
+    time_limit: Any,
+    check_derivatives: Any,
+    compiled: Any,
+) -> tuple[Method, float, Array, float, Compiled]:
+    """What a run takes of the options of a call, or what is wrong with them."""
+    check_flag("dense_output", dense_output)
+    if progress is not None:
+        check_flag("progress", progress)
+    compiled = check_compiled(compiled)
+    check_flag("check_derivatives", check_derivatives)
+    chosen = check_method(method)
+    check_positive("rtol", rtol)
+    atol = check_tolerance("atol", atol, system.n_q)
+    if max(rtol, atol.min()) < ROUNDING:
+        raise ValueError(
+            f"rtol and atol must not both be below {ROUNDING:g}, where rounding hides the error; given {rtol!r} and "
+            f"{float(atol.min())!r}"
+        )
+    if first_step is not None:
+        check_positive("first_step", first_step)
+    check_positive("max_step", max_step, infinite=True)
+    if step_size is not None:
+        check_positive("step_size", step_size)
+        if first_step is not None or max_step != np.inf:
+            raise ValueError("step_size is a constant step: give neither first_step nor max_step with it")
+    if max_steps is not None:
+        check_size("max_steps", max_steps, 1)
+    if time_limit is not None:
+        check_positive("time_limit", time_limit)
+    if system.n_a > 0 and getattr(chosen, "variables", "velocities") == "momenta":
+        raise ValueError(
+            f"method with variables='momenta' needs constraints on positions only: there are no canonical variables "
+            f"for the n_a = {system.n_a} nonholonomic rows of {system.name!r}. Take variables='velocities'"
+        )
+    return chosen, float(rtol), atol, float(max_step), compiled
 
 
 def check_method(method: str | Method) -> Method:
