@@ -28,7 +28,7 @@ from twoloop.methods.plan import Method
 from twoloop.methods.presets import PRESETS
 from twoloop.problem.events import check_events
 from twoloop.problem.system import ConstrainedSystem, check_system
-from twoloop.result.result import Result
+from twoloop.result.result import Result, result_of
 from twoloop.run.course import Course
 from twoloop.run.interrupts import Interrupts, not_begun
 from twoloop.run.launch import Asked, run_from
@@ -122,7 +122,8 @@ def solve_dae(
     check_derivatives : bool
         Whether C_q, C_t, gamma and tangents are compared with differences at the first start of a system, and all but
         the tangents again at a few states of runs: with exact derivatives where the callbacks run on symbols, else with
-        differences. Of compiled callbacks only runs that reach new states are compared, and the 2nd, 4th, 8th, ....
+        differences. Of compiled callbacks only states beyond those of earlier runs are compared, and the 2nd, 4th, 8th,
+        ... run as a whole.
     compiled : bool or "auto"
         Whether the equations of the mechanism become machine code of their own, for the methods "auto", "Taylor",
         "DOP853" and "Adams": as a rule two to four times as fast inside the integrator, less over a short call, and not
@@ -188,8 +189,8 @@ def solve_dae(
         if own is not None:  # Newmark's own test, of positions, has its place
             rtol, atol[:], untested = own, own, np.ones(len(record.h), dtype=bool)
         told = {"method": chosen.name, "compiled": with_code, "rtol": float(rtol), "atol": atol}
-        return Result.of(record, system=system, untested=untested, **told)
-    return Result.of(not_begun(system, t0, event_functions, chosen.name))
+        return result_of(record, system=system, untested=untested, **told)
+    return result_of(not_begun(system, t0, event_functions, chosen.name))
 
 
 def _checked(

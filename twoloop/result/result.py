@@ -89,13 +89,6 @@ class Result(Record):
         Likewise: when, at which stops, the velocities before and after, and the impulses.
     """
 
-    @classmethod
-    def of(cls, record: Record, **more: Any) -> Result:
-        """The result that a record is, with other values of some fields."""
-        made = object.__new__(cls)  # a frozen class of thirty fields takes microseconds to make
-        vars(made).update(vars(record), **more)
-        return made
-
     def to_dataframe(self) -> Any:
         """The run as a table of pandas: a row an instant.
 
@@ -244,3 +237,10 @@ class Result(Record):
             Where to; a file there is replaced.
         """
         save(self, path)
+
+
+def result_of(record: Record, **more: Any) -> Result:
+    """The result that a record is, with other values of some fields."""
+    made = object.__new__(Result)  # a frozen class of thirty fields takes microseconds to make
+    vars(made).update(vars(record), **more)
+    return made
