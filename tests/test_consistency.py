@@ -12,7 +12,7 @@ from tests.derivative_cases import UNITS, lever, linkage, slider_crank
 from tests.problems import pendulum, worst
 from twoloop import ConstrainedSystem, ConstraintWarning, consistent_state, solve_dae
 from twoloop.checks.consistency import check_start
-from twoloop.mechanisms import four_bar, redundant_slider_crank
+from twoloop.mechanisms import four_bar, n_four_bar, redundant_slider_crank
 
 REST = np.zeros(2)
 STRETCHED = math.acos(0.25)  # theta_3 at which bars 1 and 2 of this linkage are in line
@@ -210,3 +210,16 @@ def test_every_state_of_a_run_is_a_start(unit, method):
     assert result.success
     for t, q, v in zip(result.t, result.q.T, result.v.T, strict=True):
         check_start(problem.system, t, q, v)
+
+
+def test_velocities_off_by_rounding_of_the_fastest_are_no_violation_and_larger_ones_are():
+    """Beside a singular position, where a row moves by next to nothing and a correction is many times what is off."""
+    problem = n_four_bar(1)
+    solution = solve_dae(
+        problem.system, (0.0, 1e-3), problem.q0, problem.v0, rtol=1e-12, atol=1e-12, dense_output=True
+    ).sol
+    for t in (1e-9, 1e-7, 1e-4):
+        state = solution(t)
+        check_start(problem.system, t, state.q, state.v)
+        with pytest.raises(ValueError, match="v0 is not consistent"):
+            check_start(problem.system, t, state.q, state.v + 1e-9 * problem.system.jacobian(t, state.q)[0])

@@ -4,7 +4,8 @@ from __future__ import annotations  # ArrayLike stays a word in help()
 
 import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
+from operator import is_
 from typing import Any
 
 import numpy as np
@@ -27,7 +28,7 @@ from twoloop.methods.plan import Method
 from twoloop.methods.presets import PRESETS
 from twoloop.problem.events import check_events
 from twoloop.problem.system import ConstrainedSystem, check_system
-from twoloop.result.result import Result
+from twoloop.result.result import Result, result_of
 from twoloop.run.course import Course
 from twoloop.run.interrupts import Interrupts, not_begun
 from twoloop.run.launch import Asked, run_from
@@ -36,6 +37,7 @@ from twoloop.run.recorder import Wanted
 Array = NDArray[np.float64]
 
 ROUNDING = 1e-15
+NO_BAR = nullcontext(lambda t: None)  # in the place of what shows how far a run is
 SAME = 1e-9  # relative: a step and a span that differ by less are one, however they were rounded
 
 
@@ -121,7 +123,8 @@ def solve_dae(
     check_derivatives : bool
         Whether C_q, C_t, gamma and tangents are compared with differences at the first start of a system, and all but
         the tangents again at a few states of runs: with exact derivatives where the callbacks run on symbols, else with
-        differences. Of compiled callbacks only runs that reach new states are compared, and the 2nd, 4th, 8th, ....
+        differences. Of compiled callbacks only states beyond those of earlier runs are compared, and the 2nd, 4th, 8th,
+        ... run as a whole.
     compiled : bool or "auto"
         Whether the equations of the mechanism become machine code of their own, for the methods "auto", "Taylor",
         "DOP853" and "Adams": as a rule two to four times as fast inside the integrator, less over a short call, and not
@@ -143,16 +146,76 @@ def solve_dae(
         through unchanged, with a note that says which and at what time; so does what is wrong with an event's value.
     """
     check_system(system)
-    check_flag("dense_output", dense_output)
+    given = (
+        *(method, rtol, atol, first_step, max_step, max_steps, step_size),
+        *(dense_output, progress, time_limit, check_derivatives, compiled),
+    )
+    known = system.made.get("options")
+    if known is None or not all(map(is_, given, known[0])):
+        known = given, _checked(system, *given)
+        if type(atol) is float:  # an array may be changed by who gives it
+            system.made["options"] = known
+    chosen, rtol, atol, max_step, compiled = known[1]
     event_functions = None if events is None else check_events(events)
+    t0, t1 = check_span(t_span)
+    q0 = check_vector("q0", q0, system.n_q)
+    v0 = check_vector("v0", v0, system.n_q)
+    if step_size is not None and step_size > (t1 - t0) * (1.0 + SAME):
+        raise ValueError(f"step_size must not exceed the length of t_span, {t1 - t0:g}; given {step_size!r}")
+    times = None if t_eval is None else check_times(t_eval, t0, t1, step_size)
+    with Interrupts() as interrupts:
+        asked = Asked(
+            method=chosen,
+            rtol=rtol,
+            atol=atol,
+            t1=t1,
+            step_size=step_size,
+            first_step=first_step,
+            max_step=max_step,
+            max_steps=max_steps,
+            compiled=compiled,
+            check_derivatives=check_derivatives,
+        )
+        run = run_from(system, t0, q0, v0, asked)
+        if run.said_of_rows:
+            warnings.warn(run.said_of_rows, ConstraintWarning, stacklevel=2)
+        with_code = bool(run.plan.own)
+        with _progress_bar(chosen.name, t0, t1) if progress else NO_BAR as report:
+            lands = run.plan.lands or step_size is not None or (times is not None and set(times.tolist()) <= {t0, t1})
+            wanted = Wanted(times, lands, bool(dense_output), event_functions)
+            record = Course(run, t1, wanted, report, time_limit, interrupts).to_end(check_derivatives)
+        give_back(run.work)
+        untested = record.untested if getattr(chosen, "tested", "all") == "positions" else None
+        atol, own = atol.copy(), getattr(chosen, "error_tol", None)
+        if own is not None:  # Newmark's own test, of positions, has its place
+            rtol, atol[:], untested = own, own, np.ones(len(record.h), dtype=bool)
+        told = {"method": chosen.name, "compiled": with_code, "rtol": float(rtol), "atol": atol}
+        return result_of(record, system=system, untested=untested, **told)
+    return result_of(not_begun(system, t0, event_functions, chosen.name))
+
+
+def _checked(
+    system: ConstrainedSystem,
+    method: Any,
+    rtol: Any,
+    atol: Any,
+    first_step: Any,
+    max_step: Any,
+    max_steps: Any,
+    step_size: Any,
+    dense_output: Any,
+    progress: Any,
+    time_limit: Any,
+    check_derivatives: Any,
+    compiled: Any,
+) -> tuple[Method, float, Array, float, Compiled]:
+    """What a run takes of the options of a call, or what is wrong with them."""
+    check_flag("dense_output", dense_output)
     if progress is not None:
         check_flag("progress", progress)
     compiled = check_compiled(compiled)
     check_flag("check_derivatives", check_derivatives)
     chosen = check_method(method)
-    t0, t1 = check_span(t_span)
-    q0 = check_vector("q0", q0, system.n_q)
-    v0 = check_vector("v0", v0, system.n_q)
     check_positive("rtol", rtol)
     atol = check_tolerance("atol", atol, system.n_q)
     if max(rtol, atol.min()) < ROUNDING:
@@ -165,8 +228,6 @@ def solve_dae(
     check_positive("max_step", max_step, infinite=True)
     if step_size is not None:
         check_positive("step_size", step_size)
-        if step_size > (t1 - t0) * (1.0 + SAME):
-            raise ValueError(f"step_size must not exceed the length of t_span, {t1 - t0:g}; given {step_size!r}")
         if first_step is not None or max_step != np.inf:
             raise ValueError("step_size is a constant step: give neither first_step nor max_step with it")
     if max_steps is not None:
@@ -178,37 +239,7 @@ def solve_dae(
             f"method with variables='momenta' needs constraints on positions only: there are no canonical variables "
             f"for the n_a = {system.n_a} nonholonomic rows of {system.name!r}. Take variables='velocities'"
         )
-    times = None if t_eval is None else check_times(t_eval, t0, t1, step_size)
-    with Interrupts() as interrupts:
-        asked = Asked(
-            method=chosen,
-            rtol=float(rtol),
-            atol=atol,
-            t1=t1,
-            step_size=step_size,
-            first_step=first_step,
-            max_step=float(max_step),
-            max_steps=max_steps,
-            compiled=compiled,
-            check_derivatives=check_derivatives,
-        )
-        run = run_from(system, t0, q0, v0, asked)
-        if run.said_of_rows:
-            warnings.warn(run.said_of_rows, ConstraintWarning, stacklevel=2)
-        with_code = bool(run.plan.own)
-        with _progress_bar(progress, chosen.name, t0, t1) as report:
-            lands = run.plan.lands or step_size is not None or (times is not None and set(times.tolist()) <= {t0, t1})
-            wanted = Wanted(times, lands, bool(dense_output), event_functions)
-            record = Course(run, t1, wanted, report, time_limit, interrupts).to_end(check_derivatives)
-        give_back(run.work)
-        untested = record.untested if getattr(chosen, "tested", "all") == "positions" else None
-        atol, own = atol.copy(), getattr(chosen, "error_tol", None)
-        if own is not None:  # Newmark's own test, of positions, has its place
-            rtol, atol[:], untested = own, own, np.ones(len(record.h), dtype=bool)
-        given = {"method": chosen.name, "compiled": with_code, "rtol": float(rtol), "atol": atol}
-        own = {"system": system, "untested": untested, **given}
-        return Result(**vars(record) | own)
-    return Result(**vars(not_begun(system, t0, event_functions, chosen.name)))
+    return chosen, float(rtol), atol, float(max_step), compiled
 
 
 def check_method(method: str | Method) -> Method:
@@ -226,11 +257,8 @@ def check_method(method: str | Method) -> Method:
 
 
 @contextmanager
-def _progress_bar(progress: bool | None, name: str, t0: float, t1: float) -> Iterator[Any]:
-    """A function that takes the time reached; draws a bar when asked to."""
-    if not progress:
-        yield lambda t: None
-        return
+def _progress_bar(name: str, t0: float, t1: float) -> Iterator[Any]:
+    """A function that takes the time reached, and draws it."""
     try:
         from rich.progress import Progress
     except ImportError as error:

@@ -5,7 +5,8 @@ import pytest
 
 from twoloop.checks.rank import largest_solution, orthogonalised
 from twoloop.checks.scales import column_scales
-from twoloop.generate.choices import BOUNDS, LEAST, _least_pivot
+from twoloop.generate.choices import BOUNDS, LEAST, RANK, SINGULAR_MASS
+from twoloop.kernels.algebra.pivots import STAYS_SINGULAR, choose, room_size
 
 RANDOM = np.random.default_rng(12)
 ROWS = RANDOM.standard_normal((5, 8))
@@ -26,6 +27,18 @@ def test_no_solution_is_larger(rows):
     assert max(np.linalg.norm(inverse, 2), 1.0) <= bound <= max(np.linalg.norm(inverse), 1.0) * 10.0
 
 
+def chosen(mass, G):
+    """What the kernel says of M and G: the bound that pivots keep, rows that count and that help, and the factor."""
+    room, found = np.full(room_size(*G.shape), np.nan), np.zeros(2 + 3 * len(G), dtype=np.int64)
+    place = choose(np.ascontiguousarray(mass), np.ascontiguousarray(G), RANK, SINGULAR_MASS, BOUNDS, room, found)
+    n_kept, n_added, *places = found.tolist()
+    return place, places[:n_kept], places[len(G) : len(G) + n_added], room[0]
+
+
+def least_pivot(mass, G):
+    return LEAST[chosen(mass, G)[0]]
+
+
 @pytest.mark.parametrize("near", [1.0, 1e-1, 1e-3, 1e-6])
 def test_the_least_pivot_is_the_power_of_ten_below_the_least_eigenvalue(near):
     G = np.vstack([ROWS[:3], ROWS[0] + near * ROWS[3]])
@@ -34,12 +47,32 @@ def test_the_least_pivot_is_the_power_of_ten_below_the_least_eigenvalue(near):
     size = np.sqrt(np.diag(S))
     least = np.linalg.eigvalsh(S / np.outer(size, size))[0]
     expected = LEAST[int((least < BOUNDS).sum())]
-    assert _least_pivot(mass, G, "some") == expected
-    assert near == 1.0 or expected < _least_pivot(mass, ROWS[:4], "some")
+    assert least_pivot(mass, G) == expected
+    assert near == 1.0 or expected < least_pivot(mass, ROWS[:4])
 
 
 def test_one_row_has_the_largest_least_pivot():
-    assert _least_pivot(np.eye(8), 0.3 * ROWS[:1], "some") == LEAST[0] == 0.01
+    assert least_pivot(np.eye(8), 0.3 * ROWS[:1]) == LEAST[0] == 0.01
+
+
+@pytest.mark.parametrize("n_weak", [0, 1, 2, 3])
+def test_rows_that_help_a_mass_to_an_inverse_are_as_many_as_it_lacks(n_weak):
+    Q = np.linalg.qr(RANDOM.standard_normal((8, 8)))[0]
+    values = np.where(np.arange(8) < n_weak, 1e-14, 10.0 ** np.linspace(-3.0, 2.0, 8))
+    mass = Q * values @ Q.T
+    sparse = np.zeros((2, 8))
+    sparse[0, :2], sparse[1] = 1.0, Q[:, 7]  # few entries, and none that helps
+    place, kept, added, scale = chosen(0.5 * (mass + mass.T), np.vstack([ROWS, sparse]))
+    assert kept == list(range(7)) and place >= 0 and len(added) == n_weak and 6 not in added
+    assert added[:1] == [5][:n_weak]  # that of the fewest entries comes first
+    more = mass + scale * np.vstack([ROWS, sparse])[added].T @ np.vstack([ROWS, sparse])[added]
+    assert np.linalg.eigvalsh(more)[0] > 1e-10 * np.linalg.eigvalsh(more)[-1]
+
+
+def test_a_mass_that_no_row_helps_stays_singular():
+    mass = np.diag([1.0, 1.0, 0.0])
+    assert chosen(mass, np.array([[1.0, 0.0, 0.0]]))[0] == STAYS_SINGULAR
+    assert chosen(mass, np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 2.0]]))[2] == [1]
 
 
 def test_units_that_were_multiplied_into_a_matrix_are_found():

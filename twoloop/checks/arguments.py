@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
 
+NUMBERS = (float, int)  # but not bool
 FAR = 1e300  # s: times that need no closer look whether they are finite
 NEAR = 8.0  # times that differ by less than so many spacings of floating-point numbers cannot be told apart
 HOLDS = {"U": "text", "S": "text", "M": "dates", "m": "time differences", "c": "complex numbers"}  # by NumPy's kind
@@ -95,7 +96,7 @@ def check_vector(name: str, value: ArrayLike, n: int) -> Array:
     array = check_real(name, value)
     if array.shape != (n,):
         raise ValueError(f"{name} must have shape ({n},); given shape {array.shape}")
-    if not np.isfinite(array).all():
+    if not math.isfinite(sum(array.tolist())) and not np.isfinite(array).all():  # sums may be too large
         raise ValueError(f"{name} must be finite; entries {np.flatnonzero(~np.isfinite(array)).tolist()} are not")
     return array
 
@@ -118,8 +119,11 @@ def check_indices(name: str, value: Any, n: int) -> list[int]:
 
 def check_span(t_span: tuple[float, float]) -> tuple[float, float]:
     """Return start and end, or say what is wrong with them."""
-    usual = type(t_span) is tuple and len(t_span) == 2 and all(type(t) in (int, float) and abs(t) < FAR for t in t_span)
-    t0, t1 = map(float, t_span) if usual else check_vector("t_span", t_span, 2).tolist()
+    t0, t1 = t_span if type(t_span) is tuple and len(t_span) == 2 else (0.0, 0.0)
+    if type(t0) in NUMBERS and type(t1) in NUMBERS and -FAR < t0 < t1 < FAR:
+        t0, t1 = float(t0), float(t1)
+    else:
+        t0, t1 = check_vector("t_span", t_span, 2).tolist()
     if not t1 - t0 > NEAR * math.ulp(max(abs(t0), abs(t1))):
         raise ValueError(f"t_span must be (start, end) with end > start; given ({t0!r}, {t1!r})")
     return t0, t1
@@ -160,9 +164,11 @@ def check_positive(name: str, value: Any, infinite: bool = False) -> None:
 
 def check_tolerance(name: str, value: ArrayLike, n_q: int) -> Array:
     """Return a tolerance as an array (n_q,): a positive number for all coordinates, or one for each."""
-    if not isinstance(value, (list, tuple, np.ndarray)) and np.ndim(value) == 0:
+    if type(value) is float or (not isinstance(value, (list, tuple, np.ndarray)) and np.ndim(value) == 0):
         check_positive(name, value)
-        return np.full(n_q, value, dtype=np.float64)
+        array = np.empty(n_q)
+        array.fill(value)
+        return array
     array = check_real(name, value)
     if array.shape != (n_q,):
         raise ValueError(

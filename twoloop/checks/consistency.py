@@ -90,26 +90,25 @@ def check_start(
 
 def _in_order(system: ConstrainedSystem, t: float, q: Array, v: Array) -> bool:
     """Whether compiled callbacks give nothing at a start that would have to be looked at more closely."""
-    from twoloop.kernels.evaluation import first_look
+    from twoloop.kernels.evaluation.first_look import CONSISTENT, DEFINITE, IN_ORDER, INDEFINITE, look, room_size
 
     if system.called_in_python or system.entries:
         return False
     q, v = np.ascontiguousarray(q, dtype=np.float64), np.ascontiguousarray(v, dtype=np.float64)
     n, n_c, n_rows = system.n_q, system.n_c, system.n_c + system.n_a
-    room, lam = np.zeros(first_look.room_size(n, n_c, system.n_a)), np.ones(n_c)
-    mass, (rows, pattern) = np.zeros((n, n)), np.zeros((2, n_rows, n))
+    room, mass, (rows, pattern) = np.zeros(room_size(n, n_c, system.n_a)), np.zeros((n, n)), np.zeros((2, n_rows, n))
     try:
-        found = direct(first_look.look)(system.kit, t, q, v, lam, room, mass, rows, _ways(n), pattern, LEAST)
+        found = direct(look)(system.kit, t, q, v, _ones(n_c), room, mass, rows, _ways(n), pattern, LEAST)
     except Exception:  # of a callback, which is called by itself then
         return False
-    if not found & first_look.IN_ORDER:
+    if not found & IN_ORDER:
         return False
     place = (t, q.tobytes())
     system.remember_at("pattern", place, pattern)
     system.remember_at("mass and rows", place, (mass, rows))
-    if found & first_look.DEFINITE:
-        system.remember_at("definite mass", _place(system, t, q), True)
-    if found & first_look.CONSISTENT:
+    if found & (DEFINITE | INDEFINITE):
+        system.remember_at("definite mass", _place(system, t, q), bool(found & DEFINITE))
+    if found & CONSISTENT:
         return True
     force, C, rates = np.split(room[: n + n_c + n_rows], (n, n + n_c))
     return _surely_consistent(system, t, q, v, mass, force, rows, C, rates)
@@ -292,6 +291,11 @@ def _pattern_of(system: ConstrainedSystem, t: float, q: Array) -> Array:
     size = np.maximum(np.abs(q), np.abs(q).max())
     rows, defined = rows_at(system, t, q + size * _ways(system.n_q))  # what is missed is found on the way
     return (rows[defined] != 0.0).any(axis=0).astype(float)
+
+
+@cache
+def _ones(n: int) -> Array:
+    return np.ones(n)
 
 
 @cache

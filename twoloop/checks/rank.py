@@ -44,6 +44,17 @@ def largest_solution(rows: Array) -> float:
     return max(1.0, direct(size_of_inverse)(np.ascontiguousarray(factors), len(kept), np.zeros(len(kept))))
 
 
+def surely_above(ratio: float, rows: Array, rank: int) -> bool:
+    """Whether so many singular values are above this share of the largest, by bounds that cost less than these."""
+    from twoloop.kernels.algebra.independent import size_of_inverse
+
+    _, factors, kept = orthogonalised(rows, NO_DIRECTION)
+    if len(kept) != rank or rank == 0:
+        return False
+    inverse = direct(size_of_inverse)(np.ascontiguousarray(factors), rank, np.zeros(rank))
+    return bool(ratio * float(np.linalg.norm(rows)) * inverse < 1.0)
+
+
 def redundant_rows(scaled: Array) -> list[int]:
     """Rows of a Jacobian, scaled to like size, that depend on the others, by QR with pivoting."""
     if scaled.size == 0:

@@ -16,7 +16,7 @@ from twoloop.checks.arguments import check_finite, check_positive, check_toleran
 from twoloop.checks.consistency import ConstraintWarning
 from twoloop.methods.plan import Method
 from twoloop.problem.system import ConstrainedSystem, check_system
-from twoloop.result.result import Result
+from twoloop.result.result import Result, result_of
 from twoloop.run.sampled import SampledRun, SampledState
 from twoloop.solve import check_method, solve_dae
 
@@ -191,7 +191,7 @@ class Integrator:
             raise ValueError("result has the samples since a start: call integrator.start(t0, q0, v0) first")
         record = replace(self._sampled.record(), system=self.system, method=self._options["method"].name)
         atol = check_tolerance("atol", self._options["atol"], self.system.n_q)
-        return Result(**vars(record) | {"compiled": False, "rtol": float(self._options["rtol"]), "atol": atol})
+        return result_of(record, compiled=False, rtol=float(self._options["rtol"]), atol=atol)
 
     def _system_of(self, parameters: ArrayLike) -> ConstrainedSystem:
         made = self.system.with_parameters(parameters)

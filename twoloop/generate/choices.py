@@ -4,14 +4,11 @@ The choice depends on the position alone, so that the same call gets the same co
 """
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import lapack
 
 from twoloop.checks.consistency import mass_and_rows
-from twoloop.checks.rank import eigenvalues, orthogonalised
 from twoloop.generate.tracing import Untraceable
 from twoloop.kernels.compile.linking import direct
 from twoloop.problem.system import ConstrainedSystem
@@ -53,51 +50,20 @@ class Choice:
         Untraceable
             If M is singular on velocities that the constraints allow.
         """
+        from twoloop.kernels.algebra.pivots import STAYS_SINGULAR, choose, room_size
+
         mass, G = mass_and_rows(system, t, q)
-        rows = orthogonalised(G, RANK)[2]
-        if not rows:
+        n_rows = len(G)
+        room, chosen = np.empty(room_size(*G.shape)), np.empty(2 + 3 * n_rows, dtype=np.int64)
+        constant = system.constant_mass and system.made.get("no weak mass", False)
+        place = direct(choose)(mass, G, RANK, 0.0 if constant else SINGULAR_MASS, BOUNDS, room, chosen)
+        n_kept, n_added, *places = chosen.tolist()
+        if n_kept == 0:
             return cls((), (), 1.0, 0.0)
-        place = None if system.constant_mass else (t, q.tobytes())
-        added: tuple[int, ...] = ()
-        scale = 1.0
-        if not system.remembered_at("no weak mass", place, lambda: not _weak(eigenvalues(mass)).any()):
-            scale = float(2.0 ** np.round(np.log2(np.abs(mass).max() / np.abs(G).max() ** 2)))
-            added = _rows_for_mass(mass, G, scale, system.name)
-            mass = mass + scale * G[list(added)].T @ G[list(added)]
-        if len(rows) < len(G):
-            G = G[rows]
-        return cls(tuple(rows), added, scale, _least_pivot(mass, G, system.name))
-
-
-def _least_pivot(mass: Array, G: Array, name: str) -> float:
-    """The largest power of ten that is not above NEAR of any pivot that a row may have, from those of LEAST."""
-    from twoloop.kernels.algebra.pivots import first_bound_kept
-
-    n_rows, n = G.shape
-    room = np.empty((n, n)), np.empty((n, n_rows)), np.empty((2 * n_rows, n_rows)), np.empty(n_rows)
-    place = direct(first_bound_kept)(mass, G, BOUNDS, *room)
-    if place < 0:
-        raise Untraceable(f"the mass of {name!r} is too nearly singular")
-    return float(LEAST[place])
-
-
-def _weak(values: NDArray[Any]) -> NDArray[Any]:
-    """Which of the eigenvalues of M, in order, are none."""
-    return values < SINGULAR_MASS * values[-1]
-
-
-def _rows_for_mass(mass: Array, G: Array, scale: float, name: str) -> tuple[int, ...]:
-    """Rows of G with which M is definite, those of few entries first."""
-    added: list[int] = []
-    while True:
-        values, vectors, _ = lapack.dsyevd(mass)
-        weak = _weak(values)
-        if not weak.any():
-            return tuple(added)
-        helped = G @ vectors[:, weak]
-        helps = (helped * helped).sum(axis=1) > SINGULAR_MASS * (G * G).sum(axis=1)
-        free = [k for k in np.argsort(np.count_nonzero(G, axis=1), kind="stable") if helps[k] and k not in added]
-        if not free:
-            raise Untraceable(f"the mass of {name!r} stays singular with constraints added")
-        added.append(int(free[0]))
-        mass = mass + scale * np.outer(G[free[0]], G[free[0]])
+        if place < 0:
+            stays = "stays singular with constraints added" if place == STAYS_SINGULAR else "is too nearly singular"
+            raise Untraceable(f"the mass of {system.name!r} {stays}")
+        if n_added == 0:
+            system.made["no weak mass"] = True
+        added = tuple(places[n_rows : n_rows + n_added])
+        return cls(tuple(places[:n_kept]), added, float(room[0]), float(LEAST[place]))

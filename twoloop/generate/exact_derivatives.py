@@ -18,6 +18,8 @@ Array = NDArray[np.float64]
 MOST = 50_000  # entries of C_q
 NEAR = (0.0, 1e-3, 0.03)  # of the coordinates, and of TIME
 TIME = 0.1  # s
+BESIDE = 0.01  # of the box of a Territory, less than states of a run that are compared lie apart: no new place
+ROUNDED = 1e-9  # of its longest side but that of the time: the same for coordinates that move by rounding alone
 
 
 def exact_derivatives(system: ConstrainedSystem, check: Check = unchecked) -> Traced | None:
@@ -79,22 +81,27 @@ class Territory:
 
     def __init__(self) -> None:
         self._runs = 0
-        self._least, self._largest = np.zeros(0), np.zeros(0)
+        self._box = np.zeros((2, 0))  # the least and the largest of each number, and the same of what is no new place
+        self._known = self._box
 
     def is_due(self) -> bool:
         """Whether callbacks are to be compared wherever the next run goes: the 1st, 2nd, 4th, 8th, ..."""
         self._runs += 1
         return self._runs & (self._runs - 1) == 0
 
-    def covers(self, states: Array) -> bool:
-        """Whether there is nothing new in a run through these states, rows."""
-        if not self._least.size:
-            return False
-        return bool((states >= self._least).all() and (states <= self._largest).all())
+    def without_known(self, states: Array) -> Array:
+        """Those of the states, rows, of a run that lie in no place, or next to none, where one was compared."""
+        if not self._box.size:
+            return states
+        least, largest = self._known
+        new = (states < least) | (states > largest)
+        return states[new.any(axis=1)] if new.any() else states[:0]
 
     def add(self, states: Array) -> None:
-        """Take in the states of a run in which nothing was wrong."""
-        least, largest = states.min(axis=0), states.max(axis=0)
-        if self._least.size:
-            least, largest = np.minimum(least, self._least), np.maximum(largest, self._largest)
-        self._least, self._largest = least, largest
+        """Take in states of a run in which nothing was wrong."""
+        if len(states) == 0:
+            return
+        known = np.concatenate([states, self._box]) if self._box.size else states
+        least, largest = self._box = np.array([known.min(axis=0), known.max(axis=0)])
+        beside = BESIDE * (largest - least) + ROUNDED * float((largest - least)[1:].max())
+        self._known = np.array([least - beside, largest + beside])

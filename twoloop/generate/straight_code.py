@@ -208,6 +208,13 @@ class OwnCode(NamedTuple):
         """Of callbacks that ran on symbols."""
         return self.traced.kinds
 
+    def serves(self, system: ConstrainedSystem, t0: float, q0: Array) -> bool:
+        """Whether a run of the same system from this position gets the same code."""
+        try:
+            return Choice.at(system, t0, q0) == self.shared.equations.choice
+        except Untraceable:
+            return False
+
 
 def write_own(module: Module, name: str, graph: Graph, outputs: Outputs, numbers: Coefficients) -> None:
     """The same of one that kernels know by its name."""

@@ -164,24 +164,32 @@ class Traced:
 
 
 class Sample:
-    """Some states [t, q, v] of a run, from its start to where it has come to."""
+    """Some states [t, q, v] of a run, rows, from its start to where it has come to."""
 
-    def __init__(self, n: int) -> None:
-        self._n = n
-        self._parts: list[tuple[Array, Array]] = []
+    def __init__(self, t: float, state: Array, n: int) -> None:
+        self._n, self._parts = n, list[Array]()
+        self.add(state[:0], state[None, :][:0], t, state)
 
-    def add(self, t: Array, rows: Array) -> None:
-        """Take some of the states, rows that begin with [q, v] of n numbers, of a part of the run."""
+    def add(self, t: Array, rows: Array, end: float, state: Array) -> None:
+        """Take some states of a part of the run, rows that begin with [q, v] of n numbers, and that at its end."""
         stride = 1 + len(t) // EACH
-        self._parts.append((t[::stride].copy(), rows[::stride, : self._n].copy()))
+        some = t[::stride]
+        part = np.empty((len(some) + 1, 1 + self._n))
+        part[0, 0], part[0, 1:] = end, state[: self._n]
+        part[:0:-1, 0], part[:0:-1, 1:] = some, rows[::stride, : self._n]
+        self._parts.insert(0, part)
         if len(self._parts) > MOST:
             self._parts = self._parts[::2]
 
-    def up_to(self, end: float) -> Array:
+    def end(self, t: float, state: Array) -> None:
+        """Leave out what is beyond a time, and take the state there."""
+        states = self.states()
+        self._parts = [states[states[:, 0] <= t]]
+        self.add(states[:0, 0], states[:0], t, state)
+
+    def states(self) -> Array:
         """All of them, the last first."""
-        times, rows = (np.concatenate(each)[::-1] for each in zip(*self._parts, strict=True))
-        states = np.column_stack([times, rows])
-        return states if times[0] <= end else states[times <= end]
+        return np.concatenate(self._parts)
 
 
 Check = Callable[[Traced], None]

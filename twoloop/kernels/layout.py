@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Mapping
-from contextlib import suppress
 from functools import cache
 from typing import Any, NamedTuple
 
@@ -70,6 +69,11 @@ def make_work(
     r = min(n_c, n_q) if rank is None else rank
     r_v = min(n_c + n_a, n_q) if rank_v is None else rank_v
     sizes = (n_q, n_c, n_a, r, r_v, reduced and n_q > r_v, augmented, n_nodes, static, n_matrices)
+    return empty(sizes)
+
+
+def empty(sizes: Sizes) -> Work:
+    """A workspace of such sizes as another has, full of zeros."""
     given_back = _given_back(sizes)
     return _new(sizes) if given_back is None else _cleared(given_back)
 
@@ -85,10 +89,10 @@ def copy_of(work: Work) -> Work:
 
 def _given_back(sizes: Sizes) -> Work | None:
     free = _free.get(sizes)
-    if free:
-        with suppress(IndexError):  # another thread took it
-            return free.pop()
-    return None
+    try:
+        return free.pop() if free else None
+    except IndexError:  # another thread took it
+        return None
 
 
 def _new(sizes: Sizes) -> Work:
@@ -114,6 +118,7 @@ def _cleared(work: Work) -> Work:
     work.notes.base[:] = 0.0
     work.counters.base[:] = 0
     work.G_of_S[:] = np.nan
+    work.changes[:] = 0.0
     return work
 
 

@@ -5,9 +5,8 @@ from dataclasses import dataclass, replace
 from twoloop.generate.series import is_quick
 from twoloop.generate.straight_code import OwnCode
 from twoloop.generate.traced_values import Check, unchecked
-from twoloop.kernels.compile.caches import Newest
 from twoloop.methods.dop853 import DOP853
-from twoloop.methods.plan import Method, Plan, least_tolerance
+from twoloop.methods.plan import Method, Plan, kept_plan, least_tolerance
 from twoloop.methods.taylor import Taylor
 from twoloop.problem.system import ConstrainedSystem
 
@@ -67,18 +66,6 @@ def with_matrix_cost(plan: Plan, cost: float) -> Plan:
     options = plan.options.copy()
     options[kernels.MATRIX_COST] = cost
     return plan.changed(options=options)
-
-
-_PLANS = Newest()  # of implicit methods, which they depend on alone
-
-
-def _kept_plan(method: Method, n_q: int, rtol: float, atol: float) -> Plan:
-    """The plan of a method that does not look at the system: a part of others, which have memories of their own."""
-    key = (id(method), n_q, rtol, atol)
-    known: tuple[Method, Plan] | None = _PLANS.get(key)
-    if known is None:
-        _PLANS[key] = known = method, method.plan(n_q, rtol, atol, False)  # what is named by its id is held
-    return known[1]
 
 
 @dataclass(frozen=True)
@@ -183,7 +170,7 @@ class Auto:
             return self.fixed.plan(n_q, rtol, atol, True)
         tolerance = least_tolerance(rtol, atol)
         implicit = self.loose if tolerance >= LOOSE else self.tight if tolerance >= TIGHTEST else self.tightest
-        second = _kept_plan(implicit, n_q, rtol, atol)
+        second = kept_plan(implicit, n_q, rtol, atol)
         dearer = self._dearer(n_q) if self.compiled else 1.0
         if self.series is None or self.series.program is None:
             return self._explicit(self.few, n_q, rtol, atol, second, dearer)

@@ -46,12 +46,19 @@ def code_for(
     if compiled is True:
         _refuse(method, fixed)
         return own_code(system, t0, q0, check)
-    if compiled is False or fixed or not takes_code(method, False) or not is_small(system):
+    if not may_have_code(system, method, fixed, compiled):
         return None
     try:
         return own_code(system, t0, q0, check)
     except ValueError:
         return None
+
+
+def may_have_code(system: ConstrainedSystem, method: Method, fixed: bool, compiled: Compiled) -> bool:
+    """Whether a run gets code where it can be had."""
+    if compiled == "auto":
+        return not fixed and takes_code(method, False) and is_small(system)
+    return compiled
 
 
 def _refuse(method: Method, fixed: bool) -> None:

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.checks.arguments import check_positive
+from twoloop.kernels.compile.caches import Newest
 
 Array = NDArray[np.float64]
 
@@ -109,3 +110,15 @@ def check_tolerances(method: Method, *names: str) -> None:
     for name in names:
         if getattr(method, name) is not None:
             check_positive(name, getattr(method, name))
+
+
+_PLANS = Newest()  # of methods that do not look at the system
+
+
+def kept_plan(method: Method, n_q: int, rtol: float, atol: float) -> Plan:
+    """The plan of a method that does not look at the system: a part of others, which have memories of their own."""
+    key = (id(method), n_q, rtol, atol)
+    known: tuple[Method, Plan] | None = _PLANS.get(key)
+    if known is None:
+        _PLANS[key] = known = method, method.plan(n_q, rtol, atol, False)  # what is named by its id is held
+    return known[1]

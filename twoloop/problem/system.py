@@ -349,7 +349,7 @@ class ConstrainedSystem:
 
     def remembered(self, what: Any, make: Callable[[], Any]) -> Any:
         """What `make` makes of the equations with these parameters, once; functions may do otherwise."""
-        if self.called_in_python:  # what such functions find in their surroundings may change
+        if self._python is not None:  # what such functions find in their surroundings may change
             return make()
         if what not in self.made:
             self.made[what] = make()
@@ -357,7 +357,7 @@ class ConstrainedSystem:
 
     def remembered_at(self, what: Any, state: Any, make: Callable[[], Any]) -> Any:
         """The same of the equations at a state, as long as no other state is asked for."""
-        if self.called_in_python:
+        if self._python is not None:
             return make()
         known = self.made.get(what)
         if known is None or known[0] != state:
@@ -366,7 +366,7 @@ class ConstrainedSystem:
 
     def remember_at(self, what: Any, state: Any, made: Any) -> None:
         """Let `remembered_at` have what was made beside something else."""
-        if not self.called_in_python:
+        if self._python is None:
             self.made[what] = state, made
 
     def arrays_of(self, kind: str) -> list[Array]:

@@ -16,18 +16,11 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-LATER_CHECKS = 3  # states of the run, beside the last, at which derivatives are checked again
+LATER = 4  # states of the run at which derivatives are checked again, the last among them
 
 
 def compared(
-    run: "Run",
-    t: Array,
-    table: Array,
-    last: tuple[float, Array],
-    sample: Sample,
-    check_derivatives: bool,
-    status: Status,
-    message: str,
+    run: "Run", sample: Sample, end: float, check_derivatives: bool, status: Status, message: str
 ) -> tuple[Status, str]:
     """Status and message, unless callbacks are not what they should be where the run went.
 
@@ -35,39 +28,37 @@ def compared(
     """
     what = (check_derivatives, *map(id, run.traced))  # the system keeps these
     territory = run.system.remembered(("territory", what), Territory)
-    again = not territory.is_due() and not run.system.called_in_python
-    if again and last[0] <= run.compared_to[0]:
+    everywhere = territory.is_due() or run.system.called_in_python
+    if not everywhere and end <= run.compared_to[0]:
         return status, message
-    states = sample.up_to(last[0])
-    if again and territory.covers(states):
-        run.compared_to[0] = last[0]
-        return status, message
+    states = sample.states()
+    first = states[-1]
+    if not everywhere:
+        states = territory.without_known(states)
     before = status
-    if check_derivatives:
-        status, message = _derivatives_again(run, t, table, last, states[-1], status, message)
-    status, message = _traces(run, states, status, message)
+    if len(states) > 0:
+        if check_derivatives:
+            status, message = _derivatives_again(run, states, first, status, message)
+        status, message = _traces(run, states, status, message)
     if status == before:
         territory.add(states)
-        run.compared_to[0] = last[0]
+        run.compared_to[0] = end
     return status, message
 
 
-def _derivatives_again(
-    run: "Run", t: Array, table: Array, last: tuple[float, Array], first: Array, status: Status, message: str
-) -> tuple[Status, str]:
+def _derivatives_again(run: "Run", states: Array, first: Array, status: Status, message: str) -> tuple[Status, str]:
     """Status and message, unless a derivative, or a constant mass, is wrong where the run went from its first state."""
     n = run.system.n_q
-    inner = np.arange(1, LATER_CHECKS + 1) * len(t) // (LATER_CHECKS + 1)
-    states = [(float(t[k]), table[k, :n], table[k, n : 2 * n]) for k in np.unique(inner) if 0 < k < len(t)]
-    states.append((last[0], last[1][:n], last[1][n : 2 * n]))
+    chosen = states[:: 1 + (len(states) - 1) // LATER][::-1]
+    some = [(float(each[0]), each[1 : 1 + n], each[1 + n :]) for each in chosen]
     exact = exact_derivatives(run.system)
-    fine = exact is not None and exact.wrong(run.system, generic_states(states)) is None
-    for instant, q, v in states:
-        wrong = unlike_itself(run.system, instant, q, v, float(first[0]), first[1 : 1 + n])
+    fine = exact is not None and exact.wrong(run.system, generic_states(some)) is None
+    for t, q, v in some:
+        wrong = unlike_itself(run.system, t, q, v, float(first[0]), first[1 : 1 + n])
         if wrong is None and not fine:
-            wrong = wrong_derivative(run.system, instant, q, v)
+            wrong = wrong_derivative(run.system, t, q, v)
         if wrong is not None:
-            return Status.WRONG_DERIVATIVE, f"At t = {instant:.10g} of the run {wrong} {message}"
+            return Status.WRONG_DERIVATIVE, f"At t = {t:.10g} of the run {wrong} {message}"
     return status, message
 
 

@@ -13,9 +13,9 @@ from twoloop.kernels.data import common, intervals
 from twoloop.run.comparison import compared
 from twoloop.run.dense import Interpolator
 from twoloop.run.interrupts import Interrupts, said_of_interrupt
-from twoloop.run.messages import outcome
+from twoloop.run.messages import message_of, outcome
 from twoloop.run.pace import INTERRUPTED, OUT_OF_TIME, STAGNATED, Pace
-from twoloop.run.passage import beyond, bridge, give_way, leap
+from twoloop.run.passage import beyond, bridge, bridging_kit, give_way, leap
 from twoloop.run.record import Record, Status, explained
 from twoloop.run.recorder import Recorder, Wanted
 from twoloop.run.run import Run
@@ -77,7 +77,8 @@ class Course:
         self.plan, self.control, self.kit = run.plan, run.control, run.kit  # at the moment: not always the run's own
         self.step_parts = [FIRST_PARTITION]
         self.filled = np.zeros(2, dtype=np.int64)
-        self.pace, self.looks, self.sample = Pace(run.t0), Looks(run.plan), Sample(2 * run.system.n_q)
+        self.pace, self.looks = Pace(run.t0), Looks(run.plan)
+        self.sample = Sample(run.t0, run.state, 2 * run.system.n_q)
         self.cpu = 0.0
         self.raised: Exception | None = None
         self.code = INTERRUPTED if interrupts.asked else run.a.PAUSED
@@ -86,14 +87,13 @@ class Course:
         """Go on chunk by chunk, look at derivatives once more at the end, and put together what the run returns."""
         run, recorder = self.run, self.recorder
         a, clock = run.a, run.clock
-        self.sample.add(clock[a.T : a.T + 1], run.state[None, :])
         buffers, copied = self._buffers(), True
         while self.code == a.PAUSED:
             across, leaps = self.plan is not run.plan, clock[a.LEAPS] == 1.0
             began = time.process_time()
             self._advance(buffers)
             n_rows, n_steps = self.filled.tolist()
-            t, rows, steps = (part[:n] for part, n in zip(buffers, (n_rows, n_rows, n_steps), strict=True))
+            t, rows, steps = buffers[0][:n_rows], buffers[1][:n_rows], buffers[2][:n_steps]
             copied = 2 * n_rows < len(buffers[0])  # then copies take less room
             if copied:
                 t, rows, steps = t.copy(), rows.copy(), steps.copy()
@@ -101,6 +101,11 @@ class Course:
             spent = time.process_time() - began
             self.cpu += spent
             if recorder.ended is not None:
+                break
+            if self.code == a.ALL_OUTPUT_DONE:
+                if self.looks.kept:
+                    self.looks.pass_by(steps[:, a.H])
+                self.report(self.t1)
                 break
             self._look(steps, across, spent)
             if not copied or len(buffers[0]) < min(run.chunk, BUFFER_ROWS):
@@ -144,9 +149,8 @@ class Course:
 
     def _take(self, t: Array, rows: Array, steps: Array, kinds: NDArray[np.int64]) -> None:
         """Take over what a chunk has stored."""
-        run, a = self.run, self.run.a
-        self.sample.add(t, rows)
-        self.sample.add(run.clock[a.T : a.T + 1], run.state[None, :])
+        run = self.run
+        self.sample.add(t, rows, float(run.clock[run.a.T]), run.state)
         self.step_parts.append(steps)
         self.recorder.add(t, rows, kinds)
 
@@ -183,7 +187,7 @@ class Course:
             self.code = a.PAUSED
         elif self.code == a.NEAR_SINGULAR:
             self.plan, self.control = bridge(run)
-            self.kit = common.Kit(run.functions, run.kit.general, self.plan.step)
+            self.kit = bridging_kit(run.kit)
             self.code = a.PAUSED
         elif self.plan is not run.plan and self.code != a.ALL_OUTPUT_DONE:
             self.plan, self.control, self.code = beyond(run, self.plan, self.control, self.code, n_steps)
@@ -210,8 +214,11 @@ class Course:
             if recorder.ended is None:
                 status, message = outcome(run, code, self.t1, self.pace)
             if code != INTERRUPTED:
-                last = (float(run.clock[a.T]), run.state) if recorder.last is None else recorder.last
-                status, message = compared(run, t, table, last, self.sample, check_derivatives, status, message)
+                end = reached
+                if recorder.last is not None:
+                    self.sample.end(*recorder.last)
+                    end = recorder.last[0]
+                status, message = compared(run, self.sample, end, check_derivatives, status, message)
             if status in EXPLAINED_BY_STIFFNESS:
                 message += said_of_stiffness(self.looks, run.kit, run.work)
         except KeyboardInterrupt:
@@ -229,7 +236,7 @@ class Course:
             lam=table[:, 3 * n :].T,
             h=steps[1:, a.H],
             status=status,
-            message=message + explained(status),
+            message=message_of(run, message + explained(status)),
             stats=statistics,
             rank=run.rank,
             redundant=run.redundant.copy(),  # runs of one start share it

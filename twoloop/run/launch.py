@@ -5,30 +5,43 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from twoloop.checks.consistency import check_start
+from twoloop.checks.consistency import check_start, has_definite_mass
 from twoloop.generate.derived import standing_for
 from twoloop.generate.exact_derivatives import exact_near
 from twoloop.generate.families import give_bounds, take_bounds
+from twoloop.generate.straight_code import OwnCode
 from twoloop.generate.traced_values import Traced
-from twoloop.methods.code_for import Compiled, code_for
+from twoloop.methods.code_for import Compiled, code_for, may_have_code
 from twoloop.methods.plan import Method
 from twoloop.methods.plans_for import plans_for
 from twoloop.methods.presets import is_preset
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.run import Run
+from twoloop.run.workspace import sparse_factors_pay
 
 Array = NDArray[np.float64]
 
 MOST, LARGEST = 16, 100_000  # runs that are kept with a system, and numbers of each
 
 
+class Kept(NamedTuple):
+    """A run at its start, for calls that ask for the same, from there or from elsewhere."""
+
+    run: Run
+    start: tuple[float, bytes, bytes]
+    t1: float
+    code: OwnCode | None
+    definite: bool  # whether M was
+    moves: bool  # whether what it takes depends on the start by that alone
+
+
 class Asked(NamedTuple):
     """What a call asks of a run, beside what it is to keep; `solve_dae` says what the names mean."""
 
     method: Method
-    rtol: float
     atol: Array
     t1: float
+    rtol: float
     step_size: float | None
     first_step: float | None
     max_step: float
@@ -38,9 +51,9 @@ class Asked(NamedTuple):
 
 
 def run_from(system: ConstrainedSystem, t0: float, q0: Array, v0: Array, asked: Asked) -> Run:
-    """The run of a call: a copy of a kept one, if an equal call was made and none from another start came between.
+    """The run of a call: a copy of one that is kept, where the same was asked for, from there or from another start.
 
-    Kept are those of presets, compiled callbacks and trusted traces, if the call before was from the same start.
+    Kept are those of presets, compiled callbacks and trusted traces, from the second call of a system on.
 
     Raises
     ------
@@ -48,36 +61,50 @@ def run_from(system: ConstrainedSystem, t0: float, q0: Array, v0: Array, asked: 
         If the start is refused, the method cannot run the system, or asked-for code cannot be had.
     """
     if system.called_in_python:  # what such functions find in their surroundings may change
-        return _made(system, t0, q0, v0, asked)
-    method, rtol, atol, *others = asked
-    start, call = (t0, q0.tobytes(), v0.tobytes()), (id(method), rtol, atol.tobytes(), *others)
-    came_from, kept = system.made.get("runs", (None, {}))
-    if came_from == start and call in kept:
-        again: Run = kept[call].again()
-        return again
-    run = _made(system, t0, q0, v0, asked)
-    trusted = is_preset(method) and all(traced.trusted for traced in run.traced)
-    if came_from != start:  # it may be one of many starts, or of many systems, each of which is taken once
-        kept = {}
-    elif trusted and run.work.notes.base.size <= LARGEST:
-        kept = {} if len(kept) == MOST else dict(kept)  # another thread may look at the old one
-        kept[call] = run.again()
-    system.made["runs"] = start, kept
+        return _made(system, t0, q0, v0, asked)[0]
+    start, call = (t0, q0.tobytes(), v0.tobytes()), (id(asked.method), asked.atol.tobytes(), asked[3:])
+    came_from, runs = system.made.get("runs", (None, None))
+    kept: Kept | None = None if runs is None else runs.get(call)
+    run = None
+    if kept is not None and kept.start == start:
+        run, code = kept.run.again(), kept.code
+        if kept.t1 != asked.t1:
+            _set_sizes(run, asked)
+    elif kept is not None and kept.moves:
+        run, code = _moved(kept, system, t0, q0, v0, asked), kept.code
+    if run is None:
+        run, code = _made(system, t0, q0, v0, asked)
+    if runs is None:  # it may be one of many systems, each of which is taken once
+        runs = {}
+    elif kept is None or (came_from == start != kept.start):
+        trusted = is_preset(asked.method) and all(traced.trusted for traced in run.traced)
+        if trusted and run.work.notes.base.size <= LARGEST:
+            runs = {} if len(runs) == MOST else dict(runs)  # another thread may look at the old one
+            fixed = asked.step_size is not None
+            settled = code is not None or not may_have_code(run.system, asked.method, fixed, asked.compiled)
+            definite = has_definite_mass(system, t0, q0)
+            moves = run.static is None and settled and (definite or not sparse_factors_pay(run.system, run.kit.flags))
+            runs[call] = Kept(run.again(), start, asked.t1, code, definite, moves)
+    system.made["runs"] = start, runs
     return run
 
 
-def _made(system: ConstrainedSystem, t0: float, q0: Array, v0: Array, asked: Asked) -> Run:
-    start, fixed = (t0, q0.tobytes(), v0.tobytes()), asked.step_size is not None
-    given, new = system, not system.checked
+def _moved(kept: Kept, system: ConstrainedSystem, t0: float, q0: Array, v0: Array, asked: Asked) -> Run | None:
+    """A run from another start; None where something else suits that."""
+    _check_start(system, t0, q0, v0, asked.check_derivatives)
+    if kept.code is not None and not kept.code.serves(system, t0, q0):
+        return None
+    run = kept.run.at(t0, q0, v0) if has_definite_mass(system, t0, q0) == kept.definite else None
+    if run is not None:
+        _set_sizes(run, asked)
+    return run
+
+
+def _made(system: ConstrainedSystem, t0: float, q0: Array, v0: Array, asked: Asked) -> tuple[Run, OwnCode | None]:
+    fixed, given, new = asked.step_size is not None, system, not system.checked
     if new:
         take_bounds(system)
-    system.remembered_at(
-        ("start", asked.check_derivatives),
-        start,
-        lambda: check_start(
-            system, t0, q0, v0, derivatives=asked.check_derivatives, exact=lambda: exact_near(system, t0, q0, v0)
-        ),
-    )
+    _check_start(system, t0, q0, v0, asked.check_derivatives)
 
     def check(traced: Traced) -> None:
         traced.refuse(system, t0, asked.t1, q0, v0)
@@ -90,8 +117,21 @@ def _made(system: ConstrainedSystem, t0: float, q0: Array, v0: Array, asked: Ask
     if new:
         give_bounds(given)
     run = Run(system, plan, t0, q0, v0, asked.rtol, asked.atol, asked.step_size, interiors)
-    if not fixed:
-        run.set_sizes(asked.first_step, asked.max_step, asked.t1)
+    _set_sizes(run, asked)
     if asked.max_steps is not None:
         run.control[run.a.MAX_STEPS] = asked.max_steps
-    return run
+    return run, code
+
+
+def _check_start(system: ConstrainedSystem, t0: float, q0: Array, v0: Array, derivatives: bool) -> None:
+    """Check a start, once as long as no other is asked for."""
+
+    def check() -> None:
+        check_start(system, t0, q0, v0, derivatives=derivatives, exact=lambda: exact_near(system, t0, q0, v0))
+
+    system.remembered_at(("start", derivatives), (t0, q0.tobytes(), v0.tobytes()), check)
+
+
+def _set_sizes(run: Run, asked: Asked) -> None:
+    if asked.step_size is None:
+        run.set_sizes(asked.first_step, asked.max_step, asked.t1)

@@ -1,10 +1,10 @@
 """What is said of how a run ended: status and message, and what to try."""
 
 import warnings
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from twoloop.checks.consistency import ConstraintWarning, dependent_rows, least_inertia, not_finite
-from twoloop.checks.rank import in_words
+from twoloop.checks.rank import in_words, surely_above
 from twoloop.kernels.data import common
 from twoloop.run.crossings import said_of_crossings, singular_ratio
 from twoloop.run.pace import INTERRUPTED, OUT_OF_TIME, STAGNATED, STAGNATION_STEPS, Pace
@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
 NEARLY_SINGULAR = 1e-3  # smallest over largest singular value of C_q, below which a message says so
 LOST_AT_END = 1e-6  # the same, below which the state at the end of a run is said not to be determined
+CROSSINGS = "\0"  # stands for what is said of singular positions that were crossed
 NEXT_TO_END = 1e-3  # of the run: where it stops so close to its end, that is said
 
 _REASONS = {
@@ -34,8 +35,19 @@ def _said_of_passages(run: "Run") -> str:
     said = ""
     if run.jumps:
         said = f" At t = {_times(run.jumps)} C_t or b jumps: velocities changed there as by an impulse."
-    now = (float(run.clock[run.a.T]), run.state)
-    return said + said_of_crossings(run.system, run.crossings, now, run.rank)
+    return said + (CROSSINGS if run.crossings else "")
+
+
+def message_of(run: "Run", words: str) -> Any:
+    """The message of these words, or what makes it: to measure what was crossed takes longer than many a run."""
+    if CROSSINGS not in words:
+        return words
+    system, crossings, now, rank = run.system, run.crossings, (float(run.clock[run.a.T]), run.state), run.rank
+
+    def made() -> str:
+        return words.replace(CROSSINGS, said_of_crossings(system, crossings, now, rank))
+
+    return made() if system.called_in_python else made  # what such functions find in their surroundings may change
 
 
 def outcome(run: "Run", code: int, t1: float, pace: Pace) -> tuple[Status, str]:
@@ -126,7 +138,10 @@ def _said_of_end(run: "Run") -> str:
     """A warning, and the sentence, where the run ends with constraints that have lost rank."""
     if not run.crossings and not (run.plan.watchful and run.work.notes[common.NEARLY_SINGULAR] == 1.0):
         return ""
-    ratio = singular_ratio(run.system, float(run.clock[run.a.T]), run.state[: run.system.n_q], run.rank)
+    t, q, rank = float(run.clock[run.a.T]), run.state[: run.system.n_q], run.rank
+    if surely_above(LOST_AT_END, run.system.rows(t, q), rank):
+        return ""
+    ratio = singular_ratio(run.system, t, q, rank)
     if ratio > LOST_AT_END:
         return ""
     said = (

@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 
 from twoloop.kernels.compile.linking import direct
 from twoloop.kernels.data import common
-from twoloop.methods.plan import Plan
+from twoloop.methods.plan import Plan, kept_plan
 from twoloop.run.impulse import beyond_jump
 from twoloop.run.run import Run
 from twoloop.run.workspace import kit_of, kit_with
@@ -38,11 +38,11 @@ def give_way(run: Run) -> None:
 def bridge(run: Run) -> tuple[Plan, Array]:
     """The plan and the controls for steps across a singular position, see kernels/steps/bridge.py."""
     from twoloop.kernels.steps import bridge
-    from twoloop.methods.dop853 import DOP853
+    from twoloop.methods.presets import PRESETS
 
     a, clock = run.a, run.clock
     run.crossings.append([(float(clock[a.T]), run.state.copy())])
-    plan = DOP853().plan(run.system.n_q, run.rtol, float(run.tolerances[common.ATOL :].min()), False)
+    plan = kept_plan(PRESETS["DOP853"], run.system.n_q, run.rtol, run.least_atol).fresh()
     control = run.control.copy()
     control[: a.N_RULE] = plan.changed(least_error=0.0).rule
     control[a.SYMMETRIC], control[a.BRIDGE], control[a.MAX_ATTEMPTS] = 0.0, 0.0, 1.0
@@ -53,6 +53,16 @@ def bridge(run: Run) -> tuple[Plan, Array]:
     run.lengths = [float(clock[a.H_LONG]) * part for part in BRIDGES]
     clock[a.H_NEXT] = run.lengths.pop(0)
     return plan.changed(step=bridge.BRIDGING), control
+
+
+def bridging_kit(kit: common.Kit) -> common.Kit:
+    """What steps across call; it stays with what the run's own steps call."""
+    from twoloop.kernels.steps.bridge import BRIDGING
+
+    known = vars(kit)
+    if "bridging" not in known:
+        known["bridging"] = common.Kit(kit.functions, kit.general, BRIDGING)
+    return known["bridging"]  # type: ignore[no-any-return]
 
 
 def beyond(run: Run, plan: Plan, control: Array, code: int, accepted: int) -> tuple[Plan, Array, int]:

@@ -1,6 +1,7 @@
 """How a run ended, what it cost, and the trajectory: what a run returns, and `Result` makes more of."""
 
 import pickle
+from collections.abc import Callable
 from dataclasses import dataclass, fields
 from enum import IntEnum
 from typing import Any
@@ -172,7 +173,7 @@ class Record:
         return found
 
     def __getstate__(self) -> dict[str, Any]:
-        state = dict(vars(self))
+        state = vars(self) | {"message": self.message}
         try:
             pickle.dumps(self.system)
         except TypeError:  # of functions without a name of their own
@@ -186,3 +187,21 @@ class Record:
         counts = ", ".join(f"{name}={value}" for name, value in known.items() if value is not None)
         end = f"t[-1]={self.t[-1]:g}" if self.t.size else "no output"
         return f"Result({self.status.name}: {self.message} n_t={self.t.size}, {end}; {counts})"
+
+
+class _Message:
+    """A message that may be put together when it is first asked for."""
+
+    def __get__(self, record: Any, owner: Any = None) -> str:
+        if record is None:
+            raise AttributeError("message")  # there is no default
+        known = vars(record)
+        if not isinstance(known["message"], str):
+            known["message"] = known["message"]()
+        return known["message"]  # type: ignore[no-any-return]
+
+    def __set__(self, record: Any, message: str | Callable[[], str]) -> None:
+        vars(record)["message"] = message
+
+
+Record.message = _Message()  # type: ignore[assignment]  # behind the decorator, which would take it for a default

@@ -10,23 +10,24 @@ from numpy.typing import NDArray
 from twoloop.checks.consistency import (
     dependent_rows,
     least_inertia,
+    mass_and_rows,
     pattern_of,
 )
 from twoloop.checks.rank import SHOWN, equations_in_words, in_words
-from twoloop.checks.sparse_rows import SparseRows, norms
+from twoloop.checks.sparse_rows import Rows, SparseRows, norms
 from twoloop.generate.time_dependence import may_be_sudden
 from twoloop.kernels.compile.linking import direct
 from twoloop.kernels.control.sudden import PLACES
 from twoloop.kernels.data import common
 from twoloop.kernels.evaluation.tasks import SOLVE
-from twoloop.kernels.layout import copy_of
+from twoloop.kernels.layout import copy_of, empty
 from twoloop.methods.auto import with_matrix_cost
 from twoloop.methods.plan import Plan, least_tolerance
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.messages import said_of_not_finite
 from twoloop.run.record import Statistics
 from twoloop.run.static_form import static_form, with_newton
-from twoloop.run.workspace import kit_of, kit_with, workspace
+from twoloop.run.workspace import kit_of, kit_with, made_ready, workspace
 
 Array = NDArray[np.float64]
 
@@ -68,6 +69,7 @@ class Run:
         self.system, self.plan, self.t0 = system, plan, t0
         self.memory = plan.memory.copy()
         self.rtol, self.reuse, self.interiors, self.traced = rtol, plan.reuse, interiors, plan.traced
+        self.least_atol = float(atol.min())
         others = () if plan.substitute is None else (plan.substitute,)
         self.static = static_form(system, t0, q0, plan, *others)
         self.matrices = max(each.matrices for each in (plan, *others))
@@ -81,7 +83,7 @@ class Run:
         self.tolerances = np.zeros(common.ATOL + system.n_q)
         self.tolerances[common.RTOL] = rtol
         self.tolerances[common.ESTIMATE] = step_size is None
-        self.tolerances[common.LEAST] = least_tolerance(rtol, float(atol.min()))
+        self.tolerances[common.LEAST] = least_tolerance(rtol, self.least_atol)
         self.tolerances[common.ATOL :] = atol
         self.control = np.zeros(advance.N_CONTROL)
         self.control[advance.MAX_STEP] = np.inf
@@ -109,14 +111,44 @@ class Run:
 
     def again(self) -> "Run":
         """A copy of this run at its start; this one must not have taken a step."""
+        other = self._copy()
+        other.work = copy_of(self.work)
+        return other
+
+    def at(self, t0: float, q0: Array, v0: Array) -> "Run | None":
+        """The same from another start, where C_q is of the same ranks; None where it is not, or nothing can begin.
+
+        Not of the static form.
+        """
+        other, n = self._copy(), self.system.n_q
+        other.t0, other.compared_to = t0, [-np.inf]
+        other.state[:n], other.state[n : 2 * n], other.state[2 * n :] = q0, v0, 0.0
+        other.clock[self.a.T] = other.clock[self.a.T_START] = t0
+        work = empty(self.work.sizes)
+        made_ready(work, self.system, self.kit.flags, other._pattern(q0), q0, self.rtol, self.reuse)
+        work.notes[common.NEARLY_SINGULAR] = 0.0 if self.plan.watchful else 1.0
+        other.work = work
+        if direct(self.a.start)(other.kit, work, t0, other.state) != common.DONE:
+            return None
+        other.redundant, other.said_of_rows = other._redundant_rows()
+        return other
+
+    def _copy(self) -> "Run":
         other = object.__new__(Run)
-        vars(other).update(vars(self), plan=self.plan.fresh(), crossings=[], jumps=[])
-        for name in ("state", "new_state", "tolerances", "control", "clock"):
-            setattr(other, name, getattr(self, name).copy())
+        vars(other).update(
+            vars(self),
+            plan=self.plan.fresh(),
+            state=self.state.copy(),
+            new_state=self.new_state.copy(),
+            tolerances=self.tolerances.copy(),
+            control=self.control.copy(),
+            clock=self.clock.copy(),
+            crossings=[],
+            jumps=[],
+        )
         if self.static is None and self.kit.flags[common.FORM] == common.AUGMENTED:  # which a run may change
             other.kit = kit_with(self.system, self.kit.flags, other.plan)
             other.functions = other.kit.functions
-        other.work = copy_of(self.work)
         return other
 
     def control_by(self, plan: Plan) -> None:
@@ -238,7 +270,7 @@ class Run:
         left_out = np.ones(n_rows, dtype=bool)
         left_out[self.work.rows_v] = False
         redundant = np.flatnonzero(left_out)
-        rows, a = self.system.sparse_rows(self.t0, self.state[:n]), self.state[2 * n : 3 * n]
+        rows, a = self._rows(), self.state[2 * n : 3 * n]
         off = np.abs(rows @ a - self.work.Gamma)
         allowed = CONTRADICTS * np.maximum(abs(rows) @ np.abs(a) + np.abs(self.work.Gamma), 1.0)
         wrong = np.flatnonzero(off > allowed).tolist()
@@ -253,14 +285,21 @@ class Run:
             "step; multipliers are those of least norm. See docs/constraints.md#redundant-rows"
         )
 
+    def _rows(self) -> Rows:
+        """C_q and A at the start."""
+        system, q = self.system, self.state[: self.system.n_q]
+        if system.called_in_python or system.entries:
+            return system.sparse_rows(self.t0, q)
+        return mass_and_rows(system, self.t0, q)[1]
+
     def _in_words(self, rows: list[int]) -> str:
         """Which rows depend on which others; the factors of the static form tell the shares of the first."""
         q = self.state[: self.system.n_q]
-        counted = self.work.rows_v.tolist()
+        counted, all_rows = self.work.rows_v.tolist(), self._rows()
+        if not isinstance(all_rows, SparseRows):
+            return in_words(all_rows, rows)
         if self.static is None or set(rows) & set(counted):
             return in_words(self.system.rows(self.t0, q), rows)
-        all_rows = self.system.sparse_rows(self.t0, q)
-        assert isinstance(all_rows, SparseRows)
         shares, zero, x = np.zeros((min(SHOWN, len(rows)), len(all_rows))), np.zeros(len(all_rows)), np.zeros_like(q)
         for row, share in zip(rows, shares, strict=False):
             direct(self.kit.inner)(self.kit, self.work, SOLVE, self.t0, all_rows.row(row), zero, 0.0, x, share)
@@ -284,8 +323,8 @@ class Run:
     def first_step(self, span: float, state: Array) -> float:
         """A share of the time in which velocities and accelerations of a state change the coordinates as a whole."""
         n = self.system.n_q
-        q, v, a = np.abs(state[: 3 * n]).reshape(3, n).max(axis=1).tolist()
-        q = max(q, float(self.tolerances[common.ATOL :].min()))  # all coordinates zero: there is no other length
+        q, v, a = np.maximum.reduce(np.abs(state[: 3 * n]).reshape(3, n), axis=1).tolist()
+        q = max(q, self.least_atol)  # all coordinates zero: there is no other length
         scales = [span]
         if v > 0.0:
             scales.append(q / v)

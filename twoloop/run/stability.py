@@ -49,7 +49,7 @@ class Looks:
         """Note the lengths of accepted steps."""
         self.n_steps += steps.size
         last = steps[-LAST_STEPS:]
-        self.last = last if last.size == LAST_STEPS else np.append(self.last, last)[-LAST_STEPS:]
+        self.last = last if last.size == LAST_STEPS else np.concatenate([self.last, last])[-LAST_STEPS:]
 
     def take(self, t: float, state: Array, n_q: int) -> None:
         """Keep this state, that after the last steps; of many only every second, fourth, ..."""

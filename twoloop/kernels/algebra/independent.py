@@ -4,7 +4,7 @@ import math
 
 from numba import types
 
-from twoloop.kernels.data.common import INTEGERS, MATRIX, VECTOR, compiled, f8, i8, kernel
+from twoloop.kernels.data.common import INTEGERS, MATRIX, VECTOR, compiled, f8, i8, kernel, merged
 
 
 @compiled
@@ -15,8 +15,8 @@ def _dot(x, y):
     return total
 
 
-@kernel(i8(MATRIX, f8, MATRIX, MATRIX, INTEGERS), vectorized=True)
-def independent_rows(G, least, basis, factors, kept):
+@merged
+def first_rows(G, least, basis, factors, kept):
     """Put down the first rows that no rows before add up to, and return how many they are.
 
     Such a row keeps more than the share `least` of its length without its part in those before, by Gram and Schmidt's
@@ -47,6 +47,12 @@ def independent_rows(G, least, basis, factors, kept):
             kept[n_kept] = k
             n_kept += 1
     return n_kept
+
+
+@kernel(i8(MATRIX, f8, MATRIX, MATRIX, INTEGERS), vectorized=True)
+def independent_rows(G, least, basis, factors, kept):
+    """The same, for Python."""
+    return first_rows(G, least, basis, factors, kept)
 
 
 @kernel(types.float64(MATRIX, i8, VECTOR))

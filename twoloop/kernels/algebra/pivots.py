@@ -1,36 +1,136 @@
-"""How small the pivots of G M^-1 G^T can become, whatever the order of elimination."""
+"""Which rows of G count, which help M to an inverse, and how small the pivots of G M^-1 G^T can become in any order."""
 
 import math
 
-from twoloop.kernels.algebra.linalg import copy_matrix, ldl_factor, ldl_solve_rows
-from twoloop.kernels.data.common import MATRIX, VECTOR, i8, kernel
+from twoloop.kernels.algebra.independent import first_rows
+from twoloop.kernels.algebra.linalg import copy_matrix, ldl_factor, ldl_solve, ldl_solve_rows
+from twoloop.kernels.data.common import INTEGERS, MATRIX, VECTOR, compiled, f8, i8, kernel, merged
 
 ROUNDING = 1e-12  # relative: what a bound may be missed by
+NOT_DEFINITE, STAYS_SINGULAR = -1, -2
+TINY = 1e-300
 
 
-@kernel(i8(MATRIX, MATRIX, VECTOR, MATRIX, MATRIX, MATRIX, VECTOR), vectorized=True)
-def first_bound_kept(mass, G, bounds, factors, solved, S, sizes):
+def room_size(n_rows: int, n: int) -> int:
+    """How many numbers `choose` takes for scratch."""
+    most = min(n_rows, n) + 1
+    return most * (n + most) + 2 * n * n + n_rows * (2 * n + 2 * n_rows + 1) + n
+
+
+@merged
+def _n_weak(A):
+    """Factors of a symmetric A as of `ldl_factor`, and how many of its eigenvalues are negative."""
+    n, count = len(A), 0
+    for k in range(n):
+        if not A[k, k] > 0.0:
+            count += 1
+            if A[k, k] == 0.0:
+                A[k, k] = -TINY
+        A[k, k] = 1.0 / A[k, k]
+        for i in range(k + 1, n):
+            if A[k, i] != 0.0:
+                factor = A[k, i] * A[k, k]
+                for j in range(i, n):
+                    A[i, j] -= factor * A[k, j]
+    return count
+
+
+@compiled
+def _count_weak(mass, weak, A):
+    """How many eigenvalues of M are below this share of the largest, or of what bounds it; and factors without it."""
+    largest = 0.0
+    for i in range(len(mass)):
+        total = 0.0
+        for j in range(len(mass)):
+            total += abs(mass[i, j])
+        largest = max(largest, total)
+    copy_matrix(mass, A)
+    for i in range(len(mass)):
+        A[i, i] -= weak * largest
+    return _n_weak(A)
+
+
+@merged
+def _scale(mass, G):
+    """The power of two that brings G^T G to the size of M."""
+    largest, longest = 0.0, 0.0
+    for i in range(len(mass)):
+        for j in range(len(mass)):
+            largest = max(largest, abs(mass[i, j]))
+    for i in range(len(G)):
+        for j in range(len(mass)):
+            longest = max(longest, abs(G[i, j]))
+    return 2.0 ** math.floor(math.log2(largest / (longest * longest)) + 0.5)
+
+
+@merged
+def _sort_by_entries(G, order, counts):
+    """Places of the rows, those of few entries first."""
+    for k in range(len(G)):
+        count, i = 0.0, k
+        for j in range(G.shape[1]):
+            count += G[k, j] != 0.0
+        while i > 0 and counts[i - 1] > count:
+            counts[i], order[i] = counts[i - 1], order[i - 1]
+            i -= 1
+        counts[i], order[i] = count, k
+
+
+@merged
+def _helps(A, g, scale, x):
+    """Whether an eigenvalue less is negative with g g^T: by the sign of the determinant that this brings."""
+    for j in range(x.size):
+        x[j] = g[j]
+    ldl_solve(A, x)
+    total = 0.0
+    for j in range(x.size):
+        total += g[j] * x[j]
+    return 1.0 + scale * total < 0.0
+
+
+@merged
+def _add_rows(mass, G, weak, scale, A, x, order, added):
+    """Add rows to M until no eigenvalue is weak, and put them down; how many, or STAYS_SINGULAR."""
+    n_added = 0
+    while _count_weak(mass, weak, A) > 0:
+        found = -1
+        for k in range(len(G)):
+            if order[k] >= 0 and _helps(A, G[order[k]], scale, x):
+                found = k
+                break
+        if found < 0:
+            return STAYS_SINGULAR
+        row = order[found]
+        added[n_added], order[found] = row, -1
+        n_added += 1
+        for i in range(len(mass)):
+            if G[row, i] != 0.0:
+                for j in range(len(mass)):
+                    mass[i, j] += scale * G[row, i] * G[row, j]
+    return n_added
+
+
+@merged
+def _first_bound_kept(mass, G, kept, n_rows, bounds, factors, solved, S, sizes):
     """Place of the first bound that no pivot is below, each over what it is without the other rows; how many, if none.
 
     No pivot is below the least eigenvalue of S = G M^-1 G^T with a diagonal of 1, and that is above a bound where S
-    less the bound is definite. -1: M is not. `factors` is (n_q, n_q), `solved` (n_q, n_rows), `S` (2 n_rows, n_rows)
-    and `sizes` (n_rows,), for scratch.
+    less the bound is definite. NOT_DEFINITE: M is not.
     """
-    n_rows = len(G)
     copy_matrix(mass, factors)
     if not ldl_factor(factors):
-        return -1
-    for i in range(len(mass)):
-        for k in range(n_rows):
-            solved[i, k] = G[k, i]
+        return NOT_DEFINITE
+    for k in range(n_rows):
+        for i in range(len(mass)):
+            solved[i, k] = G[kept[k], i]
     ldl_solve_rows(factors, solved)
     for i in range(n_rows):
         for k in range(n_rows):
             S[i, k] = 0.0
         for j in range(len(mass)):
-            if G[i, j] != 0.0:
+            if G[kept[i], j] != 0.0:
                 for k in range(n_rows):
-                    S[i, k] += G[i, j] * solved[j, k]
+                    S[i, k] += G[kept[i], j] * solved[j, k]
         sizes[i] = math.sqrt(S[i, i])
     less = S[n_rows:]
     for place in range(bounds.size):
@@ -41,3 +141,36 @@ def first_bound_kept(mass, G, bounds, factors, solved, S, sizes):
         if ldl_factor(less):
             return place
     return bounds.size
+
+
+@kernel(i8(MATRIX, MATRIX, f8, f8, VECTOR, VECTOR, INTEGERS), vectorized=True)
+def choose(given, G, least, weak, bounds, room, chosen):
+    """What a Choice (generate/choices.py) says of M and G, and the place of the first of these bounds that is kept.
+
+    Rows of G count as `independent_rows` has it for `least`; others help M where eigenvalues of it are below the share
+    `weak` of the largest, 0 where that is known not to be. `chosen`, of 2 + 3 n_rows numbers, begins with how many
+    count and how many help, then has these, and those, each in n_rows places; `room` begins with their factor.
+    """
+    n_rows, n = G.shape
+    most = min(n_rows, n) + 1
+    kept, added, order = chosen[2 : 2 + n_rows], chosen[2 + n_rows : 2 + 2 * n_rows], chosen[2 + 2 * n_rows :]
+    end = most * n
+    basis = room[:end].reshape((most, n))
+    n_kept = first_rows(G, least, basis, room[end : end + most * most].reshape((most, most)), kept)
+    mass, end = room[end : end + n * n].reshape((n, n)), end + n * n
+    A, end = room[end : end + n * n].reshape((n, n)), end + n * n
+    x, end = room[end : end + n], end + n
+    sizes, end = room[end : end + n_rows], end + n_rows
+    copy_matrix(given, mass)
+    n_added, scale = 0, 1.0
+    if n_kept > 0 and weak > 0.0 and _count_weak(mass, weak, A) > 0:
+        scale = _scale(mass, G)
+        _sort_by_entries(G, order, sizes)
+        n_added = _add_rows(mass, G, weak, scale, A, x, order, added)
+    chosen[0], chosen[1], place = n_kept, max(n_added, 0), n_added
+    if n_added >= 0:
+        solved, end = room[end : end + n * n_kept].reshape((n, n_kept)), end + n * n_kept
+        S = room[end : end + 2 * n_kept * n_kept].reshape((2 * n_kept, n_kept))
+        place = _first_bound_kept(mass, G, kept, n_kept, bounds, A, solved, S, sizes)
+    room[0] = scale
+    return place

@@ -22,8 +22,8 @@ from twoloop.kernels.data.common import (
 from twoloop.kernels.data.finite import finite, finite_vector
 
 # flags of what is found: all is finite, M symmetric, no row empty; the state on the rows but for rounding; an M that
-# varies definite
-IN_ORDER, CONSISTENT, DEFINITE = 1, 2, 4
+# varies definite, or not
+IN_ORDER, CONSISTENT, DEFINITE, INDEFINITE = 1, 2, 4, 8
 SURELY = 2.0  # times what counts as no eigenvalue: what rounding does not reach
 
 
@@ -62,24 +62,27 @@ def _symmetric(mass, allowed):
 
 
 @exact
-def _rounding(value, row, state, rate, allowed):
-    """Whether a value is no more than this share of the terms that it is the sum of."""
+def _rounding(value, row, state, least, rate, allowed):
+    """Whether a value is no more than this share of the terms that it is the sum of, no state being below the least."""
     size = abs(rate)
     for j in range(state.size):
-        size += abs(row[j]) * abs(state[j])
+        size += abs(row[j]) * max(abs(state[j]), least)
     return abs(value) <= allowed * size
 
 
 @exact
 def _consistent(C, rate, rows, q, v, allowed):
-    """Whether positions and velocities are on the rows but for rounding."""
+    """Whether positions and velocities are on the rows but for rounding, of velocities of the fastest coordinate."""
+    fastest = 0.0
+    for j in range(q.size):
+        fastest = max(fastest, abs(v[j]))
     for i in range(len(rows)):
         speed = 0.0
         for j in range(q.size):
             speed += rows[i, j] * v[j]
-        if not _rounding(speed + rate[i], rows[i], v, rate[i], allowed):
+        if not _rounding(speed + rate[i], rows[i], v, fastest, rate[i], allowed):
             return False
-        if i < C.size and not _rounding(C[i], rows[i], q, 0.0, allowed):
+        if i < C.size and not _rounding(C[i], rows[i], q, 0.0, 0.0, allowed):
             return False
     return True
 
@@ -109,14 +112,14 @@ def _note_entries_near(f, t, q, ways, place, rows, n_c, pattern):
 
 @exact
 def _definite(mass, least, factors):
-    """Whether no eigenvalue is below this share of the largest entry, beyond doubt."""
+    """Whether no eigenvalue is below this share of the largest entry."""
     n, largest = len(mass), 0.0
     for i in range(n):
         for j in range(n):
             factors[i, j] = mass[i, j]
             largest = max(largest, abs(mass[i, j]))
     for i in range(n):
-        factors[i, i] -= SURELY * least * largest
+        factors[i, i] -= least * largest
     return ldl_factor(factors)
 
 
@@ -168,8 +171,11 @@ def look(f, t, q, v, lam, room, mass, rows, ways, pattern, least):
         found = IN_ORDER
         if _consistent(room[force:C], room[C:rate], rows, q, v, least[0]):
             found |= CONSISTENT
-    if flags[CONSTANT_MASS] == 0 and _definite(mass, least[2], scratch):
-        found |= DEFINITE
+    if flags[CONSTANT_MASS] == 0:  # beyond doubt
+        if _definite(mass, SURELY * least[2], scratch):
+            found |= DEFINITE
+        elif not _definite(mass, least[2] / SURELY, scratch):
+            found |= INDEFINITE
     near = room[end : end + n_rows * n].reshape((n_rows, n))
     _note_entries_near(f, t, q, ways, room[end + n_rows * n : end + n_rows * n + n], near, n_c, pattern)
     return found
