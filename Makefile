@@ -81,14 +81,17 @@ compile: install ## compile the kernels, on two cores
 	from twoloop.kernels.steps import adams_step, bdf_step, bridge, canonical_step, explicit_step, \
 	fixed_point_step, newmark_step, taylor_step" && wait $$!
 
+# files in the order of their names: sorted by how many tests they have, long ones with few tests would come last
+SHARED := -n 2 --dist loadfile --no-loadscope-reorder
+
 test: compile ## the tests, on two cores; ARGS="-m ''" takes the slow ones too
-	$(RUN) -m pytest -n 2 --dist loadfile $(ARGS)
+	$(RUN) -m pytest $(SHARED) $(ARGS)
 
 # other rounding: no fused operations, and kernels of OpenBLAS for an old processor; a numba cache of its own, as below
 test-portable: install ## the tests of twoloop and references as on another processor; ARGS=tests/kernels for some
 	@export NUMBA_CPU_NAME=generic OPENBLAS_CORETYPE=Nehalem NUMBA_CACHE_DIR=$(CURDIR)/.venv/portable; \
 	$(MAKE) --no-print-directory compile && \
-	$(RUN) -m pytest -n 2 --dist loadfile --ignore tests/studies $(ARGS)
+	$(RUN) -m pytest $(SHARED) --ignore tests/studies $(ARGS)
 
 # the numba cache is its own: the versions would take turns in compiling everything anew
 test-oldest: .venv-oldest/installed ## the tests of twoloop with the oldest versions it supports; about ten minutes

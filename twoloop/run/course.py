@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from twoloop.generate.traced_values import Sample
 from twoloop.kernels.compile.linking import direct
 from twoloop.kernels.data import common, intervals
+from twoloop.kernels.data.kit import Kit
 from twoloop.run.comparison import compared
 from twoloop.run.dense import Interpolator
 from twoloop.run.interrupts import Interrupts, said_of_interrupt
@@ -123,7 +124,7 @@ class Course:
         run.control[a.MAX_ATTEMPTS] = min(run.chunk, max(0, self.next_look - run.attempts()))
         self.filled[:] = 0  # for Ctrl-C before the chunk begins
         try:
-            self.code = direct(a.advance)(
+            self.code = direct(run.kernels.advance)(
                 self.kit,
                 run.work,
                 self.plan.options,
@@ -183,7 +184,7 @@ class Course:
             self.code = a.PAUSED
         elif self.code == a.NEAR_SINGULAR:
             self.plan, self.control = bridge(run)
-            self.kit = common.Kit(run.functions, run.kit.general, self.plan.step)
+            self.kit = Kit(run.functions, run.kit.general, self.plan.step)
             self.code = a.PAUSED
         elif self.plan is not run.plan and self.code != a.ALL_OUTPUT_DONE:
             self.plan, self.control, self.code = beyond(run, self.plan, self.control, self.code, n_steps)

@@ -83,7 +83,7 @@ def leap(run: Run, t1: float) -> bool:
         return False
     run.new_state[: 2 * n] = state
     run.work.notes[common.KINK_BEFORE], run.work.notes[common.KINK_AFTER] = end, np.inf
-    if direct(a.start)(run.kit, run.work, end, run.new_state) != common.DONE:
+    if direct(run.kernels.start)(run.kit, run.work, end, run.new_state) != common.DONE:
         return False
     run.jumps.append(end)
     run.plan.memory[:] = run.memory

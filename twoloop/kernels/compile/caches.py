@@ -34,7 +34,7 @@ from twoloop.kernels.compile.ownership import make_own, own_folder, read_own, wr
 
 UNWRITABLE = (
     "twoloop: machine code cannot be kept on disk, so every process compiles again. Set NUMBA_CACHE_DIR to a folder "
-    "that you can write, and nobody else can"
+    "that only you can write"
 )
 MOST_KEPT = 500  # sets of functions made for single mechanisms, of each kind, on disk ...
 MOST_HELD = 50  # ... and in memory
