@@ -68,24 +68,30 @@ reports: install ## all studies into reports/
 bench: compile ## two commits side by side: make bench BASE=main [HEAD=branch] [ARGS=--short]
 	@$(RUN) -m studies.bench_commits $(BASE) $(if $(HEAD),--head $(HEAD)) $(ARGS)
 
-# the inner loop first, which all others need; then two processes, so that none compiles what another compiles
+# the inner loop first, which all others need; then two processes of about equal work, neither of which imports, and so
+# compiles, what the other does: what Newton's matrices and large systems have in common is in one of them
 compile: install ## compile the kernels, on two cores
-	@$(RUN) -c "import twoloop.kernels.evaluation.own_inner"
-	@$(RUN) -c "from twoloop.kernels.lanes import lane_implicit" & \
+	@$(RUN) -c "from twoloop.kernels.evaluation import calls, own_inner; from twoloop.kernels.control import controller"
+	@$(RUN) -c "from twoloop.kernels.steps import diagonal_step, newton_step; \
+	from twoloop.kernels.evaluation import static_inner; from twoloop.kernels.lanes import lane_implicit" & \
 	$(RUN) -c "from twoloop.kernels import advance, agreement, interpolation; \
-	from twoloop.kernels.steps import adams_step, bdf_step, bridge, canonical_step, diagonal_step, explicit_step, \
-	fixed_point_step, newmark_step; from twoloop.kernels.evaluation import static_inner; \
-	from twoloop.kernels.lanes import lane_dop853, lane_runs, lane_taylor" && wait $$! && \
-	$(RUN) -c "import twoloop.kernels.control.switching"
+	from twoloop.kernels.algebra import independent, pivots, scaling; from twoloop.kernels.control import switching; \
+	from twoloop.kernels.evaluation import first_look, traced; \
+	from twoloop.kernels.lanes import lane_dop853, lane_runs, lane_taylor; \
+	from twoloop.kernels.steps import adams_step, bdf_step, bridge, canonical_step, explicit_step, \
+	fixed_point_step, newmark_step, taylor_step" && wait $$!
+
+# files in the order of their names: sorted by how many tests they have, long ones with few tests would come last
+SHARED := -n 2 --dist loadfile --no-loadscope-reorder
 
 test: compile ## the tests, on two cores; ARGS="-m ''" takes the slow ones too
-	$(RUN) -m pytest -n 2 --dist loadfile $(ARGS)
+	$(RUN) -m pytest $(SHARED) $(ARGS)
 
 # other rounding: no fused operations, and kernels of OpenBLAS for an old processor; a numba cache of its own, as below
 test-portable: install ## the tests of twoloop and references as on another processor; ARGS=tests/kernels for some
 	@export NUMBA_CPU_NAME=generic OPENBLAS_CORETYPE=Nehalem NUMBA_CACHE_DIR=$(CURDIR)/.venv/portable; \
 	$(MAKE) --no-print-directory compile && \
-	$(RUN) -m pytest -n 2 --dist loadfile --ignore tests/studies $(ARGS)
+	$(RUN) -m pytest $(SHARED) --ignore tests/studies $(ARGS)
 
 # the numba cache is its own: the versions would take turns in compiling everything anew
 test-oldest: .venv-oldest/installed ## the tests of twoloop with the oldest versions it supports; about ten minutes

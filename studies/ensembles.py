@@ -169,7 +169,7 @@ def _timed(solve: Solve, tol: float) -> tuple[float, Array]:
 
 
 def with_geometry(n: int) -> dict[str, Any]:
-    """Linkages with lengths a little off: put together and run, in blocks, on all cores; what all of it takes."""
+    """Linkages with slightly different lengths: assembled and run, in blocks, on all cores; the total time."""
     problem, random = mechanisms.four_bar(), np.random.default_rng(11)
     system, began, failed, singly, spent = problem.system, time.perf_counter(), 0, 0, time.process_time()
     for first in range(0, n, BLOCK):

@@ -1,5 +1,6 @@
 """Hypothesis without deadlines (the first call may compile) and always with the same examples; shared problems."""
 
+import gc
 import signal
 from importlib.util import find_spec
 
@@ -18,6 +19,13 @@ collect_ignore = [] if find_spec("pandas") and find_spec("matplotlib") else list
 
 settings.register_profile("twoloop", deadline=None, derandomize=True, max_examples=25)
 settings.load_profile("twoloop")
+
+
+def pytest_collection_finish():
+    """What the tests have imported stays: Python need not look through it for cycles again and again."""
+    gc.collect()
+    gc.freeze()
+    gc.set_threshold(20_000, 20, 20)
 
 
 @pytest.fixture(scope="session")

@@ -11,7 +11,8 @@ from tests.compiled import PENDULUM
 from twoloop import ConstrainedSystem, solve_dae
 from twoloop.kernels.compile.caches import compile_kept
 from twoloop.kernels.compile.linking import KernelCompiler
-from twoloop.kernels.data.common import FORCE_BY_Q_GIVEN, OPTIONS, Kit, stamp
+from twoloop.kernels.data.common import FORCE_BY_Q_GIVEN, OPTIONS, stamp
+from twoloop.kernels.data.kit import Kit
 from twoloop.kernels.evaluation.calls import inner_loop
 from twoloop.kernels.steps.explicit_step import EXPLICIT
 from twoloop.mechanisms import four_bar

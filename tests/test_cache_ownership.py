@@ -1,4 +1,4 @@
-"""Code is loaded from what nobody else can write, as ssh asks of keys; what others can write is compiled anew."""
+"""Code is loaded from what no other user can write, as ssh asks of keys; what others can write is compiled anew."""
 
 import hashlib
 import os
@@ -179,4 +179,4 @@ def test_where_the_users_caches_are_in_doubt_too_code_ends_with_the_process(tmp_
 
 
 def test_the_advice_names_the_folder_to_take():
-    assert "NUMBA_CACHE_DIR" in caches.UNWRITABLE and "nobody else can" in caches.UNWRITABLE
+    assert "NUMBA_CACHE_DIR" in caches.UNWRITABLE and "only you can write" in caches.UNWRITABLE

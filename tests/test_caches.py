@@ -7,6 +7,7 @@ from numba import njit
 from tests.own_cache import RUN, Folder, with_kernels
 from tests.processes import run_python
 from twoloop.kernels.compile.caches import UNWRITABLE, watch
+from twoloop.kernels.compile.closures import kept_when_called, stands_for
 
 
 @pytest.fixture
@@ -202,6 +203,27 @@ def test_digests_of_functions_that_name_themselves_end():
     assert watch(again.py_func) == watch(again.py_func) is not None
 
 
+def scaled(scale, helper):
+    @kept_when_called()
+    def function(x):
+        return scale * helper(x)
+
+    return function
+
+
+def test_closures_are_kept_by_what_they_enclose():
+    one, two = (njit(lambda x, by=by: by * x) for by in (1.0, 2.0))
+    for scale, helper, value in ((1.0, one, 1.0), (3.0, one, 3.0), (3.0, two, 6.0), (1.0, one, 1.0)):
+        made = scaled(scale, helper)
+        assert made(1.0) == value
+    assert sum(made.stats.cache_hits.values()) == 1  # the last is the first
+    named = njit(lambda x: OPEN_FILES[0] * x)
+    assert scaled(1.0, named)._cache.cache_path is None  # it cannot be watched
+    stands_for(named, "a name")
+    assert scaled(1.0, named)._cache.cache_path is not None
+
+
+OPEN_FILES = (object(),)
 SYMBOL = """
 import sys
 from twoloop.problem.adapters import through_python

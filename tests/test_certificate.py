@@ -22,7 +22,7 @@ from twoloop.mechanisms import (
     redundant_slider_crank,
     rolling_disc,
 )
-from twoloop.run.dense import DenseSolution
+from twoloop.run.dense_solution import DenseSolution
 
 END = 3.0
 

@@ -8,8 +8,8 @@ import pytest
 
 from tests.compiled import centripetal, heavy, radius
 from twoloop import ConstrainedSystem, callback, solve_dae
+from twoloop.generate.compiled_series import compiled_series
 from twoloop.generate.families import _alone, family_of
-from twoloop.generate.series_code import compiled_series
 from twoloop.generate.straight_code import own_code
 from twoloop.generate.straight_line import StraightLine
 from twoloop.generate.traced_values import Traced

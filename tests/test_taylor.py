@@ -7,7 +7,7 @@ import pytest
 
 from tests.problems import pendulum, unconstrained
 from twoloop import Taylor, solve_dae
-from twoloop.generate import series_code
+from twoloop.generate import compiled_series
 from twoloop.generate.series import series_program
 from twoloop.generate.straight_code import own_code
 from twoloop.kernels.steps.recurrences import N_MEMORY_SCALARS
@@ -133,11 +133,11 @@ def test_compiled_operations_give_the_same_run():
 def test_compiled_code_is_read_from_the_disk(monkeypatch):
     problem = four_bar()
     code = own_code(problem.system, 0.0, problem.q0)
-    series_code.compiled_series(code)  # now it is there
-    monkeypatch.setattr(series_code, "_MADE", {})
+    compiled_series.compiled_series(code)  # now it is there
+    monkeypatch.setattr(compiled_series, "_MADE", {})
     code.shared.family._made.clear()
     monkeypatch.setattr("twoloop.kernels.compile.own_functions.object_code", None)
-    assert "find_order" in series_code.compiled_series(code).functions.addresses
+    assert "find_order" in compiled_series.compiled_series(code).functions.addresses
 
 
 def test_compiled_code_uses_nothing_that_was_left_in_memory(monkeypatch):
@@ -157,7 +157,7 @@ def test_compiled_code_uses_nothing_that_was_left_in_memory(monkeypatch):
 
 def test_equations_too_long_to_compile_are_refused(monkeypatch):
     problem = spatial_four_bar()
-    monkeypatch.setattr(series_code, "LARGEST", 100)
+    monkeypatch.setattr(compiled_series, "LARGEST", 100)
     monkeypatch.setattr("twoloop.generate.families._FAMILIES", {})  # without what another test has made
     words = r"of at most 100 operations; these are [1-9]\d\d\. Leave it out"
     with pytest.raises(ValueError, match=words):

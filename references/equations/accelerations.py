@@ -15,7 +15,7 @@ from numba import njit
 from numba.core.dispatcher import Dispatcher
 from numpy.typing import NDArray
 
-from references.equations.linear import OPTIONS, SINGULAR, cholesky, cholesky_solve, lu_factor, lu_solve
+from references.equations.linear import OPTIONS, SINGULAR, cholesky, cholesky_solve, kept, lu_factor, lu_solve
 from twoloop.kernels.data.common import GAMMA_GIVEN
 from twoloop.problem.system import ConstrainedSystem
 
@@ -71,7 +71,7 @@ def compiled_gamma(system: ConstrainedSystem) -> Callable[..., None]:
 def _gamma_by_differences(jacobian: Dispatcher, constraint_rate: Dispatcher) -> Callable[..., None]:
     """Q_d = -d/de [C_q v + C_t](t + e, q + e v), by central differences of order 4."""
 
-    @njit(**OPTIONS)
+    @kept
     def gamma(t, q, v, p, Qd):  # type: ignore[no-untyped-def]
         speed = 1.0
         for i in range(v.size):
@@ -107,7 +107,7 @@ def _accelerations(
     """(t, q, v, alpha, p, factors, known, a, lam) -> success: eqs. (6)-(8), with Baumgarte's terms when alpha > 0."""
     mass_at = matrix_of(mass)
 
-    @njit(**OPTIONS)
+    @kept
     def accelerate(t, q, v, alpha, p, factors, known, a, lam):  # type: ignore[no-untyped-def]
         n, m = q.size, lam.size
         Cq = np.zeros((m, n))
@@ -134,7 +134,7 @@ def _accelerations(
 def matrix_of(mass: Dispatcher) -> Callable[..., Any]:
     """(t, q, p, factors, known) -> the factors of M and True, or, where it is not positive definite, M and False."""
 
-    @njit(**OPTIONS)
+    @kept
     def mass_at(t, q, p, factors, known):  # type: ignore[no-untyped-def]
         definite = not known & SADDLE
         if known & CONSTANT:

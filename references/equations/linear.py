@@ -7,6 +7,7 @@ import numpy as np
 from numba import njit
 
 from twoloop.kernels.compile.caches import compile_kept, watch
+from twoloop.kernels.compile.closures import kept_when_called
 
 SINGULAR = 1e-13  # a pivot smaller than this, against what stood there, or in its row, is zero
 
@@ -16,6 +17,11 @@ OPTIONS: dict[str, Any] = {"error_model": "numpy", "fastmath": {"contract", "rea
 def compiled_now(signature: Any) -> Callable[[Callable[..., Any]], Any]:
     """Compile for any mechanism, and keep the machine code on disk until it or something that it calls changes."""
     return lambda function: compile_kept(function, signature, watch(function), error_model="numpy")
+
+
+# a function of the callbacks that it encloses: compiled when it is called, for the types that it is called with, and
+# read from the disk in later processes where callbacks and code are the same
+kept = kept_when_called(**OPTIONS)
 
 
 @njit(**OPTIONS)

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from references.driver import Task, TimeLimit, adapter
 from references.paper import ablation_kernels as kernels
 from twoloop.checks.arguments import check_choice
-from twoloop.kernels.data.common import GAMMA_GIVEN, Kit
+from twoloop.kernels.data.common import GAMMA_GIVEN
+from twoloop.kernels.data.kit import Kit
 from twoloop.methods.tableaux import Tableau
 from twoloop.result.result import Result
 

@@ -19,7 +19,8 @@ from references.driver import Task, TimeLimit, adapter, user_call
 from references.equations.linear import compiled_now, lu_factor, lu_solve
 from references.scipy.index1 import solve_index1
 from twoloop.checks.arguments import check_choice, check_size, check_times
-from twoloop.kernels.data.common import INTEGERS, KIT, MATRIX, Kit
+from twoloop.kernels.data.common import INTEGERS, KIT, MATRIX
+from twoloop.kernels.data.kit import Kit
 from twoloop.result.result import Result
 
 Array = NDArray[np.float64]

@@ -18,7 +18,7 @@ from scipy.integrate import BDF, DOP853, LSODA, RK45, OdeSolver, Radau
 from references.driver import ADVICE, Task, TimeLimit, adapter, imported, user_call
 from references.equations.accelerations import Equations, matrix_of, solve_for
 from references.equations.expressions import NotSymbolic
-from references.equations.linear import OPTIONS
+from references.equations.linear import OPTIONS, kept
 from references.equations.straight_line import straight_line_jacobian
 from references.scipy.steps import Steps
 from twoloop.checks.arguments import check_choice, check_positive
@@ -192,7 +192,7 @@ class RightHandSide(Equations):
 def _derivative(accelerate: Callable[..., Any]) -> Callable[..., Any]:
     """(t, y, n_c, alpha, p, factors, known, counters) -> y'."""
 
-    @njit(**OPTIONS)
+    @kept
     def derivative(t, y, m, alpha, p, factors, known, counters):  # type: ignore[no-untyped-def]
         n = y.size // 2
         rate = np.empty(2 * n)
@@ -214,7 +214,7 @@ def _projection(
     """(t, y, n_c, p, factors, known) -> success; y is projected in place, positions by Newton, then velocities."""
     mass_at = matrix_of(mass)
 
-    @njit(**OPTIONS)
+    @kept
     def project(t, y, m, p, factors, known):  # type: ignore[no-untyped-def]
         n = y.size // 2
         q, v = y[:n].copy(), y[n:].copy()

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from references.driver import Task
 from references.equations.accelerations import compiled_gamma
 from references.equations.least_norm import accelerations
-from references.equations.linear import OPTIONS
+from references.equations.linear import kept
 from twoloop.kernels.compile.callbacks import stand_in
 from twoloop.kernels.data.common import FORCE_BY_Q_GIVEN, FORCE_BY_V_GIVEN
 
@@ -99,7 +99,7 @@ def residual_at(parts: Parts) -> Callable[..., None]:
     """(t, y, y', p, M, Cq, res) -> None: the residual; M and C_q are left as they are at q."""
     index1, mass, force, constraint, jacobian, constraint_rate, gamma, _, positions, constant_mass = parts
 
-    @njit(**OPTIONS)
+    @kept
     def residual(t, y, yp, p, M, Cq, res):  # type: ignore[no-untyped-def]
         m, n = Cq.shape
         q, v, a = y[:n], y[n : 2 * n], yp[n : 2 * n]
@@ -157,7 +157,7 @@ def iteration_matrix_at(parts: Parts) -> Callable[..., None]:
     differenced = residual_at(parts._replace(force=_no_force if exact else force, tangent=None))
     by_velocities = index1 or not exact
 
-    @njit(**OPTIONS)
+    @kept
     def of_velocities(t, q, v, p, m, out):  # type: ignore[no-untyped-def]
         n = q.size
         out[: n + m] = 0.0
@@ -166,7 +166,7 @@ def iteration_matrix_at(parts: Parts) -> Callable[..., None]:
         if index1:
             gamma(t, q, v, p, out[n : n + m])
 
-    @njit(**OPTIONS)
+    @kept
     def iteration_matrix(t, cj, y, yp, p, M, Cq, K, moved, here, there, J):  # type: ignore[no-untyped-def]
         m, n = Cq.shape
         moved[:] = y

@@ -3,6 +3,7 @@
 from dataclasses import replace
 from types import SimpleNamespace
 
+import matplotlib as mpl
 import pandas as pd
 import pytest
 
@@ -22,7 +23,8 @@ def out(request, tmp_path_factory):
     """The folder of a quick run of the study of a module of tests, its `STUDIED`."""
     study = request.module.STUDIED.STUDY
     folder = tmp_path_factory.mktemp(study.name)
-    study.main(["--quick", "--out", str(folder)])
+    with mpl.rc_context({"savefig.bbox": "standard"}):  # the tight one draws each figure twice
+        study.main(["--quick", "--out", str(folder)])
     return folder
 
 

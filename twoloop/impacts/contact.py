@@ -94,6 +94,6 @@ class Accelerations:
         """a (n_q,) and [lam; mu]; NaN where there are none."""
         run, n = self._run, self._n
         state = np.concatenate([q, v, np.zeros(len(run.state) - 2 * n)])
-        if direct(run.a.start)(run.kit, run.work, t, state) != common.DONE:
+        if direct(run.kernels.start)(run.kit, run.work, t, state) != common.DONE:
             state[2 * n :] = np.nan
         return state[2 * n : 3 * n], state[3 * n :]

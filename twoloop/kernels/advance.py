@@ -6,19 +6,74 @@
 import numpy as np
 
 from twoloop.kernels.algebra.linalg import copy
+from twoloop.kernels.control.clock import (
+    ALL_OUTPUT_DONE,
+    AT_JUMP,
+    DRIVEN,
+    ERRORS,
+    FAILURE_CODE,
+    FAILURES,
+    FIXED_STEP,
+    FIXED_STEP_FAILED,
+    GIVES_WAY,
+    GO_ON,
+    H_FAILED,
+    H_LIMIT,
+    H_LONG,
+    H_NEXT,
+    HAS_TO_BE_DENSE,
+    HAS_TO_GIVE_WAY,
+    JACOBIANS,
+    JUMP_FROM,
+    JUMP_TO,
+    LEAPS,
+    LIMIT_AGE,
+    LIMIT_FACTOR,
+    LIMIT_MEMORY,
+    LIMIT_START,
+    MAX_ATTEMPTS,
+    MAX_STEP,
+    MAX_STEPS,
+    MAX_STEPS_REACHED,
+    N_FIXED,
+    NEAR_SINGULAR,
+    NEXT_OUTPUT,
+    PARTITIONS,
+    PAUSED,
+    PIVOT_HERE,
+    PROVISIONAL,
+    RANK_LOST,
+    ROUGH,
+    ROUGH_TO,
+    ROWS_VIOLATED,
+    SHORTEST,
+    SPACING,
+    STEP_TOO_SMALL,
+    STORE_ALL,
+    SUDDEN,
+    SYMMETRIC,
+    T_START,
+    H,
+    T,
+)
 from twoloop.kernels.control.controller import (
     EXPONENT,
     FACTOR_MIN,
-    N_PAST,
-    N_RULE,
     SAFETY,
     factor_of,
     remember,
 )
-from twoloop.kernels.control.sudden import sudden_time
+from twoloop.kernels.control.landing import NEAR, off_grid, on_grid
+from twoloop.kernels.control.singular import (
+    SHORT,
+    ends_at_singular,
+    look_at_partition,
+    lost_at_singular,
+    near_singular,
+    with_care,
+)
+from twoloop.kernels.control.sudden import up_to_sudden
 from twoloop.kernels.data.common import (
-    AUGMENTED,
-    BY_GENERAL,
     DEFECT,
     DONE,
     EXPLICIT_STEP,
@@ -37,22 +92,17 @@ from twoloop.kernels.data.common import (
     N_PARTITIONS,
     N_REJECTED_CONVERGENCE,
     N_REJECTED_ERROR,
-    NEARLY_SINGULAR,
     NEEDS_DENSE,
     NOT_FINITE,
-    NULL_SPACE,
     ORIENTATION,
     ORIENTATION_NEW,
     PIVOT,
-    SENSITIVITY,
     SINGULAR,
     STATIC,
-    STRAIGHT,
     UNCHECKED,
     VECTOR,
     WIDEST_GAP,
     WORK,
-    compiled,
     f8,
     i8,
     kernel,
@@ -66,90 +116,12 @@ from twoloop.kernels.evaluation.calls import (
     renew_partition,
     take_midpoint,
 )
-from twoloop.kernels.evaluation.gamma import representable
 from twoloop.kernels.evaluation.kinks import JUMP, RAMP, SMOOTH, find_kink, unexplained
-from twoloop.kernels.evaluation.partition import CHANGED, partition_is_poor
-from twoloop.kernels.evaluation.static_factors_at import CAREFUL
+from twoloop.kernels.evaluation.partition import CHANGED
 
-# what advance() returns; PAUSED: a buffer is full, or MAX_ATTEMPTS were made
-(
-    ALL_OUTPUT_DONE,
-    PAUSED,
-    STEP_TOO_SMALL,
-    FIXED_STEP_FAILED,
-    RANK_LOST,
-    MAX_STEPS_REACHED,
-    ROWS_VIOLATED,
-    NEAR_SINGULAR,
-    HAS_TO_GIVE_WAY,
-    AT_JUMP,  # of C_t or b; the caller is to put the state beyond it into new_state
-    HAS_TO_BE_DENSE,  # the static form cannot decide what it was asked
-) = range(11)
-GO_ON = -1  # nothing of these yet
-
-SHORT = 0.5  # of the longest of the last steps: a step below it may be near a singular position ...
-COLLAPSED = 0.2  # of it: steps for which the pivots of C_q are looked at anew
-SINGULAR_PIVOT = 0.2  # ... and is where the smallest pivot of C_q is below this share of the largest it had
-STATIC_SINGULAR = 0.01  # the same of the static form, whose pivots are sines of single rows ...
-CARE = 0.05  # ... and where a refused step that begins below this share is tried again with care ...
-LESS = 0.8  # ... and then by steps each of which is this times the one before
-LOST = 0.001  # ... and which is given up there for steps below this share of the longest
 FADING = 0.98  # of the longest step, with each accepted one
-RARELY = 16  # accepted steps from one look at the partition to the next where steps do without it
-FEW = 32  # degrees of freedom; where they are k times as many, a partition is looked at every k + 1 steps: T is full
 UNFORESEEN = 10.0  # an error that is so large was not foreseen: the force jumps, or bends, within the step
 REFUSED = 0.95  # of a refused step is what the next one is at most
-NEARER = 0.25  # of the smallest sine at the start of a step: one that ends nearer to a singular position ends half-way
-NEARLY = 0.01  # of the spacing of times ahead: before a sudden change by that is at it
-NEAR = 4.0  # times that differ by less than so many spacings of floating-point numbers are one
-
-# places in `control`, constant during a run, after the rule of controller.py
-(
-    MAX_STEP,
-    FIXED_STEP,  # 0: step-size control
-    LIMIT_START,  # h_max at the beginning of a step
-    LIMIT_FACTOR,  # h_max becomes this times the step that did not converge ...
-    LIMIT_MEMORY,  # ... for this many accepted steps
-    MAX_STEPS,  # accepted steps
-    STORE_ALL,  # 1: every accepted step is stored; 0: output times only
-    SYMMETRIC,  # 1: each step has the partition of its midpoint; 0: a partition stays until it is renewed
-    MAX_ATTEMPTS,  # in one call, so that the caller can look at what goes on
-    BRIDGE,  # 1: stop with NEAR_SINGULAR where steps become short near a singular position
-    SHORTEST,  # s; a shorter step is too small, and so is one of a few spacings of t
-    GIVES_WAY,  # 1: stop with HAS_TO_GIVE_WAY at a value that is not finite, as another method goes on ...
-    PROVISIONAL,  # ... and after this number of steps, if the next is no longer than steps of others may be
-    DRIVEN,  # 1: C_t or b may jump
-    ROUGH,  # by how much an error may be larger than its estimate where a force jumps, see UNFORESEEN
-    SPACING,  # s, of times at which to look ahead for sudden changes; 0: there are none
-    N_CONTROL,
-) = range(N_RULE, N_RULE + 17)
-
-# places in a row of `out_steps`: the size of an accepted step, and the counters so far; JACOBIANS is 0 after an
-# explicit step of a method that switches
-H, ERRORS, FAILURES, PARTITIONS, JACOBIANS, N_STEP_COLUMNS = range(6)
-
-# places in `clock`, carried from call to call, after the past of controller.py
-(
-    T,
-    H_NEXT,
-    H_LIMIT,
-    LIMIT_AGE,
-    NEXT_OUTPUT,
-    T_START,
-    N_FIXED,
-    FAILURE_CODE,
-    H_FAILED,
-    H_LONG,  # the longest of the last steps, fading
-    LARGEST_PIVOT,  # of the smallest pivots of C_q so far
-    JUMP_FROM,  # the interval in which C_t or b jumps, where one lies ahead; else infinite
-    JUMP_TO,
-    LEAPS,  # 1: the next step is that over it, and new_state its end
-    ROUGH_TO,  # where the last step ended that was refused for a sudden error
-    PIVOT_HERE,  # the smallest pivot at the end of the last step, of the static form
-    LOOKED_TO,  # up to where changes with time were looked for
-    SUDDEN,  # where the next one is that is sudden
-    N_CLOCK,
-) = range(N_PAST, N_PAST + 19)
 
 
 @kernel(i8(KIT, WORK, f8, VECTOR))
@@ -170,12 +142,6 @@ def start(f, w, t, state):
 
 
 @merged
-def _near_singular(w, control, clock):
-    """Whether C_q was close to losing rank when the partition was chosen, and the caller wants to know."""
-    return control[BRIDGE] == 1.0 and w.notes[PIVOT] < SINGULAR_PIVOT * clock[LARGEST_PIVOT]
-
-
-@merged
 def _kink(f, w, t, size, tolerances, accepted, state, new_state):
     """What find_kink says of a step whose velocities change by more than its accelerations explain."""
     n = w.Q.size
@@ -187,51 +153,6 @@ def _kink(f, w, t, size, tolerances, accepted, state, new_state):
     for m in range(n):
         w.y[m] = (new_state[m] - state[m]) / size
     return find_kink(f, w, t, t + size, q, v, w.y, tolerances)
-
-
-@merged
-def _on_grid(clock, t, h, target, goal):
-    """Size of a step of a fixed grid, how many of the grid it is, and whether it reaches the goal.
-
-    Times are counted, not added up; an output time within a millionth of a step of the grid is on it.
-    """
-    rounding = NEAR * np.spacing(max(abs(t), abs(target)))
-    near = max(1e-6 * h, rounding)
-    in_grid = 1.0
-    if target <= clock[T_START] + clock[N_FIXED] * h + near:
-        in_grid = 0.0  # a second output time beside the same point of the grid
-    end = clock[T_START] + (clock[N_FIXED] + in_grid) * h
-    reaches = goal <= end + near
-    size = h
-    if abs(t + h - end) > rounding:
-        size = end - t  # back to the grid after such an output time
-    if reaches and goal < target and abs(goal - end) > rounding:
-        in_grid = 0.0
-    return size, in_grid, reaches
-
-
-@merged
-def _off_grid(control, t, h, left, leaps):
-    """Size of a step with step-size control, and whether it reaches the goal, which is so far away."""
-    reaches = leaps or h >= left * (1.0 - 1e-10)
-    size = h
-    if h > 0.5 * left and not reaches:
-        size = 0.5 * left  # two equal steps rather than a long and a tiny one
-    size = representable(t, size)
-    if size > control[MAX_STEP]:
-        size = representable(t, size - np.spacing(abs(t + size)))
-    return size, reaches
-
-
-@compiled
-def _up_to_sudden(f, w, tolerances, clock, spacing, t, size, last, q, v):
-    """The size of a step that does not pass over a sudden change with time."""
-    while clock[SUDDEN] <= t + NEARLY * spacing or clock[SUDDEN] == np.inf:
-        begin = max(t, clock[LOOKED_TO])
-        if begin >= min(t + size, last):
-            return size
-        clock[SUDDEN], clock[LOOKED_TO] = sudden_time(f, w, tolerances, begin, spacing, last, q, v)
-    return min(size, representable(t, clock[SUDDEN] - t))
 
 
 @merged
@@ -272,42 +193,6 @@ def _before_kink(f, w, tolerances, control, clock, t, size, accepted, state, new
 
 
 @merged
-def _ends_at_singular(f, w, control, clock):
-    """Whether a step of the static form ends so near a singular position that the next would have to begin there.
-
-    Steps cross such a position unharmed where it lies well between their ends.
-    """
-    if f.flags[FORM] != STATIC or control[FIXED_STEP] > 0.0:
-        return False
-    return w.notes[PIVOT] < min(STATIC_SINGULAR * clock[LARGEST_PIVOT], NEARER * clock[PIVOT_HERE])
-
-
-@merged
-def _lost_at_singular(f, clock, size):
-    """Whether a step of the static form that came to nothing is so short that others have to try, see bridge.py."""
-    near = clock[PIVOT_HERE] < STATIC_SINGULAR * clock[LARGEST_PIVOT]
-    return f.flags[FORM] == STATIC and near and size < LOST * clock[H_LONG]
-
-
-@merged
-def _with_care(f, w, control, clock, size):
-    """Whether a step of the static form that begins near a singular position is tried again with more care.
-
-    Stages beside the constraints have accelerations there whose errors grow with the nearness. A step that ends well
-    beyond may be made where shorter ones, which end nearer, are not: lengths from the longest of the last ones down.
-    """
-    near = clock[PIVOT_HERE] < CARE * clock[LARGEST_PIVOT]
-    if f.flags[FORM] != STATIC or control[FIXED_STEP] > 0.0 or w.notes[NEARLY_SINGULAR] == 1.0 or not near:
-        return False
-    clock[H_NEXT] = LESS * size
-    if w.notes[NEARLY_SINGULAR] == 0.0:
-        w.notes[NEARLY_SINGULAR] = CAREFUL
-        clock[H_NEXT] = max(size, clock[H_LONG])
-    clock[H_LIMIT] = max(clock[H_LIMIT], clock[H_NEXT])
-    return True
-
-
-@merged
 def _failed(f, w, control, clock, t, size, code, retried, state):
     """What becomes of a step that failed for such a reason: a shorter one, another partition, or the end.
 
@@ -316,10 +201,10 @@ def _failed(f, w, control, clock, t, size, code, retried, state):
     """
     n = w.Q.size
     poor = code in (SINGULAR, INNER_DIVERGED)
-    if code == NEEDS_DENSE or _lost_at_singular(f, clock, size):
+    if code == NEEDS_DENSE or lost_at_singular(f, clock, size):
         return HAS_TO_BE_DENSE
     w.counters[N_REJECTED_CONVERGENCE] += 1
-    if _with_care(f, w, control, clock, size):
+    if with_care(f, w, control, clock, size):
         return GO_ON
     clock[FAILURE_CODE] = code
     clock[H_FAILED] = size
@@ -327,9 +212,9 @@ def _failed(f, w, control, clock, t, size, code, retried, state):
         return HAS_TO_GIVE_WAY
     if control[FIXED_STEP] > 0.0:
         if not poor or t == retried:
-            return NEAR_SINGULAR if _near_singular(w, control, clock) else FIXED_STEP_FAILED
+            return NEAR_SINGULAR if near_singular(w, control, clock) else FIXED_STEP_FAILED
     else:
-        if size < SHORT * clock[H_LONG] and _near_singular(w, control, clock):
+        if size < SHORT * clock[H_LONG] and near_singular(w, control, clock):
             return NEAR_SINGULAR
         clock[H_LIMIT] = control[LIMIT_FACTOR] * size
         clock[LIMIT_AGE] = 0.0
@@ -344,12 +229,12 @@ def _refused(f, w, control, clock, t, size, proposal):
     """What becomes of a step whose error is too large: a shorter one, a tiny one by a spacing, or steps across."""
     w.counters[N_REJECTED_ERROR] += 1
     clock[FAILURE_CODE] = DONE
-    if _with_care(f, w, control, clock, size):
+    if with_care(f, w, control, clock, size):
         return GO_ON
     clock[H_NEXT] = min(proposal, REFUSED * size, size - np.spacing(abs(t + size)))
-    if _lost_at_singular(f, clock, size):
+    if lost_at_singular(f, clock, size):
         return HAS_TO_BE_DENSE
-    if size < SHORT * clock[H_LONG] and _near_singular(w, control, clock):
+    if size < SHORT * clock[H_LONG] and near_singular(w, control, clock):
         return NEAR_SINGULAR
     return GO_ON
 
@@ -370,44 +255,6 @@ def _count(w, tolerances, size, out_step):
     out_step[FAILURES] = w.counters[N_REJECTED_CONVERGENCE]
     out_step[PARTITIONS] = w.counters[N_PARTITIONS]
     out_step[JACOBIANS] = 0.0 if w.notes[EXPLICIT_STEP] == 1.0 else w.counters[N_JACOBIANS]
-
-
-@merged
-def _look_at_partition(f, w, control, clock, size, lands, state):
-    """Choose coordinates anew where they have become poor, and see how near a singular position is.
-
-    The state is full (q, v, a, lam): a new choice of independent coordinates needs no conversion.
-    """
-    short = size < SHORT * clock[H_LONG] and control[FIXED_STEP] == 0.0 and not lands
-    if f.flags[FORM] == STATIC:
-        clock[PIVOT_HERE] = w.notes[PIVOT]
-        clock[LARGEST_PIVOT] = max(clock[LARGEST_PIVOT], w.notes[PIVOT])
-        if w.notes[NEARLY_SINGULAR] == CAREFUL and w.notes[PIVOT] >= CARE * clock[LARGEST_PIVOT]:
-            w.notes[NEARLY_SINGULAR] = 0.0
-        return GO_ON
-    n = w.Q.size
-    straight = f.flags[STRAIGHT] == 1 and w.notes[BY_GENERAL] == 0.0
-    every = 1
-    if f.flags[FORM] == AUGMENTED:
-        every += w.independent_v.size // FEW
-    if straight:
-        every = RARELY
-    looked = w.counters[N_ACCEPTED] % every == 0
-    if looked and (straight or f.flags[FORM] != NULL_SPACE):
-        find_tangents(f, w, clock[T], state[:n])
-    if looked and partition_is_poor(w) and renew_partition(f, w, clock[T], state[:n]) != DONE:
-        return RANK_LOST
-    clock[LARGEST_PIVOT] = max(clock[LARGEST_PIVOT], w.notes[PIVOT])
-    if w.notes[PIVOT] < SINGULAR_PIVOT * clock[LARGEST_PIVOT]:
-        w.notes[NEARLY_SINGULAR] = 1.0
-    if size < COLLAPSED * clock[H_LONG] and w.notes[NEARLY_SINGULAR] == 0.0 and control[BRIDGE] == 1.0:
-        # a motion may go straight towards a singular position, and its partition show nothing of it
-        if renew_partition(f, w, clock[T], state[:n]) != DONE:
-            return RANK_LOST
-        w.notes[SENSITIVITY] = 1.0  # as of a partition far from there: this one is not to last
-        if w.notes[PIVOT] < SINGULAR_PIVOT * clock[LARGEST_PIVOT]:
-            w.notes[NEARLY_SINGULAR] = 1.0
-    return NEAR_SINGULAR if short and _near_singular(w, control, clock) else GO_ON
 
 
 _ADVANCE = i8(
@@ -465,16 +312,16 @@ def advance(
         h = control[FIXED_STEP] if fixed else min(clock[H_NEXT], clock[H_LIMIT], control[MAX_STEP])
         in_grid = 1.0  # steps of the grid that this one is
         if fixed:
-            size, in_grid, reaches = _on_grid(clock, t, h, target, goal)
+            size, in_grid, reaches = on_grid(clock, t, h, target, goal)
         else:
-            size, reaches = _off_grid(control, t, h, goal - t, leaps)
+            size, reaches = off_grid(control, t, h, goal - t, leaps)
         shortened = reaches or (h > 0.5 * (goal - t) and not fixed)
         lands = reaches and goal == target
         if reaches:
             size = goal - t
         if size > control[SPACING] > 0.0 or t < clock[SUDDEN] < t + size:
             whole, last = size, outputs[outputs.size - 1]
-            size = _up_to_sudden(f, w, tolerances, clock, control[SPACING], t, whole, last, state[:n], state[n : 2 * n])
+            size = up_to_sudden(f, w, tolerances, clock, control[SPACING], t, whole, last, state[:n], state[n : 2 * n])
             if size < whole:
                 reaches, lands, shortened = False, False, True
         if not reaches and size <= max(NEAR * np.spacing(abs(t)), control[SHORTEST]):
@@ -485,10 +332,10 @@ def advance(
         # at a jump the embedded formula may agree by chance: until the place is passed, the estimate has to be smaller
         strict = control[ROUGH] if t < clock[ROUGH_TO] else 1.0
         accepted = code == DONE and error * strict <= 1.0
-        if accepted and not reaches and _ends_at_singular(f, w, control, clock):
+        if accepted and not reaches and ends_at_singular(f, w, control, clock):
             f.settle(f, w, options, memory, tolerances, False)
             w.counters[N_REJECTED_ERROR] += 1
-            if not _with_care(f, w, control, clock, size):
+            if not with_care(f, w, control, clock, size):
                 clock[H_NEXT], clock[PIVOT_HERE] = 0.5 * size, w.notes[PIVOT]
             continue
         driven = control[DRIVEN] == 1.0 and not leaps
@@ -554,6 +401,6 @@ def advance(
         if leaps:
             return PAUSED
         if control[SYMMETRIC] == 0.0:
-            end = _look_at_partition(f, w, control, clock, size, lands, state)
+            end = look_at_partition(f, w, control, clock, size, lands, state)
             if end != GO_ON:
                 return end

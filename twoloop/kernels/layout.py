@@ -84,6 +84,7 @@ def copy_of(work: Work) -> Work:
     other = _given_back(sizes) or _new(sizes)
     other.notes.base[:] = work.notes.base
     other.counters.base[:] = work.counters.base
+    other.changes[:] = 0.0
     return other
 
 

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.checks.arguments import check_size
+from twoloop.generate.compiled_series import compiled_series
 from twoloop.generate.series import SeriesProgram, series_for
-from twoloop.generate.series_code import compiled_series
 from twoloop.generate.straight_code import OwnCode
 from twoloop.generate.traced_values import Check, unchecked
 from twoloop.generate.tracing import Untraceable

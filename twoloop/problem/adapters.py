@@ -13,8 +13,9 @@ import numpy as np
 from numba import njit, objmode
 from numpy.typing import NDArray
 
-from twoloop.kernels.compile.caches import named_apart, watch
+from twoloop.kernels.compile.caches import digest_of, named_apart, watch
 from twoloop.kernels.compile.callbacks import KINDS, compile_callback
+from twoloop.kernels.compile.closures import stands_for
 from twoloop.kernels.compile.private import Dispatcher
 
 Array = NDArray[np.float64]
@@ -96,7 +97,9 @@ def through_python(kind: str) -> Dispatcher:
             _call(number, (t, q.copy(), x.copy()), p, out)
 
     through = with_two if len(KINDS[kind].state) == 1 else with_three
-    return compile_callback(kind, through, ("through Python", str(place)))
+    made = compile_callback(kind, through, ("through Python", str(place)))
+    stands_for(made, digest_of(f"through Python, {place}", __file__))
+    return made
 
 
 def compile_returning(kind: str, function: Callable[..., Any], takes_p: bool) -> Dispatcher:

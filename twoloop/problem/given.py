@@ -1,6 +1,6 @@
 """What a system is given: which callbacks, entries and parameters, and what stands for those that are left out."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from twoloop.checks.arguments import check_real, shown
 from twoloop.kernels.compile.callbacks import KINDS, stand_in
 from twoloop.kernels.compile.private import Dispatcher
-from twoloop.problem.adapters import through_python
+from twoloop.problem.adapters import ConstantMatrix, check_arguments, through_python
 from twoloop.problem.entries import VALUES_OF, Entries, check_entries
 from twoloop.problem.jacobian import differenced_jacobian
 
@@ -72,8 +72,53 @@ def checked_entries(callbacks: dict[str, Any], n_q: int, n_c: int, mass: Any, ja
     return made
 
 
+class PlainFunctions(NamedTuple):
+    """Plain functions by kind, where the entries stand that they give, and which of them take the parameters p."""
+
+    functions: dict[str, Any]
+    entries: dict[str, Entries]
+    constant_mass: bool
+    taking: frozenset[str]
+    p: Array
+
+
+def plain_functions(
+    functions: dict[str, Any], sizes: tuple[int, int, int], entries: tuple[Any, Any], parameters: Any, name: str
+) -> PlainFunctions:
+    """What a system of plain functions is made of, checked; `entries` are those of M and C_q."""
+    n_q, n_c, n_a = sizes
+    if functions.get("kinematics") is not None:
+        raise TypeError(
+            "kinematics fills four arrays in place: compile it by @twoloop.callback('kinematics') and give it "
+            "with compiled callbacks to ConstrainedSystem(...)"
+        )
+    functions = given_callbacks(functions, n_c, n_a)
+    places = checked_entries(functions, n_q, n_c, *entries)
+    of_values = places["mass"][0].shape if "mass" in places else ()
+    shapes: dict[str, Any] = {"mass": (n_q, n_q), "mass_values": of_values}
+    masses = [kind for kind in shapes if kind in functions]
+    constant_mass = not any(callable(functions[kind]) for kind in masses)
+    for kind in masses if constant_mass else ():
+        matrix = check_real(kind, functions[kind])
+        if matrix.shape != shapes[kind]:
+            raise ValueError(f"{kind} must have shape {shapes[kind]}; given an array of shape {matrix.shape}")
+        functions[kind] = ConstantMatrix(matrix)
+    for kind, function in functions.items():
+        if not callable(function):
+            raise TypeError(f"{kind} must be a function; given {function!r} of type {type(function).__name__}")
+    known = parameters is not None
+    taking = frozenset(kind for kind, function in functions.items() if check_arguments(kind, function, known))
+    p = checked_parameters(() if parameters is None else parameters)
+    if known and not taking:
+        raise ValueError(
+            f"parameters are given, but none of the functions of {name!r} takes them: let those that need them "
+            "have p as their last argument, as in mass(t, q, p), or leave parameters out"
+        )
+    return PlainFunctions(functions, places, constant_mass, taking, p)
+
+
 def in_place_of(kind: str, given: dict[str, Dispatcher]) -> Dispatcher:
-    """The callback that stands in the place of one that is not given."""
+    """The callback that stands in for one that is not given."""
     if KINDS[kind].absent != "differences" or "constraint" not in given:
         return stand_in(kind)
     constraint = given["constraint"]

@@ -15,18 +15,17 @@ from twoloop.checks.bounds import check_callback
 from twoloop.checks.sparse_rows import Rows, SparseRows
 from twoloop.kernels.compile.callbacks import KINDS, STATE
 from twoloop.kernels.compile.private import Dispatcher
-from twoloop.kernels.data.common import BANDWIDTH, CONSTANT_MASS, GIVEN, N_FLAGS, PROGRAMS, Functions, Kit
+from twoloop.kernels.data.common import BANDWIDTH, CONSTANT_MASS, GIVEN, N_FLAGS, PROGRAMS, Functions
+from twoloop.kernels.data.kit import Kit
 from twoloop.problem.adapters import (
-    ConstantMatrix,
     PythonFunctions,
-    check_arguments,
     compile_returning,
     store,
     through_python,
 )
 from twoloop.problem.description import Description
 from twoloop.problem.entries import VALUES_OF, DenseFunction, dense_callback
-from twoloop.problem.given import checked_entries, checked_parameters, given_callbacks, in_place_of
+from twoloop.problem.given import checked_entries, checked_parameters, given_callbacks, in_place_of, plain_functions
 from twoloop.problem.joints import Joint, check_joints
 from twoloop.problem.pickling import made_again, reduced
 from twoloop.problem.system_methods import add_callbacks
@@ -168,7 +167,7 @@ class ConstrainedSystem:
         """The vector `p` that every callback gets, read-only: `with_parameters` makes a system of others."""
         p = self.functions.p[self.called_in_python :].copy()  # kernels want an array that may be written
         p.setflags(write=False)
-        return p.view()  # which nobody can make writable again
+        return p.view()  # which cannot be made writable again
 
     @parameters.setter
     def parameters(self, value: Any) -> None:
@@ -270,36 +269,11 @@ class ConstrainedSystem:
         unless coordinates of very different scale, or a driving motion of kilohertz, ask for the formula.
         """
         n_q, n_c, n_a = check_size("n_q", n_q, 1), check_size("n_c", n_c, 0), check_size("n_a", n_a, 0)
-        if functions.get("kinematics") is not None:
-            raise TypeError(
-                "kinematics fills four arrays in place: compile it by @twoloop.callback('kinematics') and give it "
-                "with compiled callbacks to ConstrainedSystem(...)"
-            )
-        functions = given_callbacks(functions, n_c, n_a)
-        entries = checked_entries(functions, n_q, n_c, mass_entries, jacobian_entries)
-        of_values = entries["mass"][0].shape if "mass" in entries else ()
-        shapes: dict[str, Any] = {"mass": (n_q, n_q), "mass_values": of_values}
-        masses = [kind for kind in shapes if kind in functions]
-        constant_mass = not any(callable(functions[kind]) for kind in masses)
-        for kind in masses if constant_mass else ():
-            matrix = check_real(kind, functions[kind])
-            if matrix.shape != shapes[kind]:
-                raise ValueError(f"{kind} must have shape {shapes[kind]}; given an array of shape {matrix.shape}")
-            functions[kind] = ConstantMatrix(matrix)
-        for kind, function in functions.items():
-            if not callable(function):
-                raise TypeError(f"{kind} must be a function; given {function!r} of type {type(function).__name__}")
-        known = parameters is not None
-        taking = frozenset(kind for kind, function in functions.items() if check_arguments(kind, function, known))
-        p = checked_parameters(() if parameters is None else parameters)
-        if known and not taking:
-            raise ValueError(
-                f"parameters are given, but none of the functions of {name!r} takes them: let those that need them "
-                "have p as their last argument, as in mass(t, q, p), or leave parameters out"
-            )
+        plain = plain_functions(functions, (n_q, n_c, n_a), (mass_entries, jacobian_entries), parameters, name)
+        functions, entries, taking = plain.functions, plain.entries, plain.taking
         sizes: dict[str, Any] = {"n_q": n_q, "n_c": n_c, "n_a": n_a}
         options: dict[str, Any] = {
-            "constant_mass": constant_mass,
+            "constant_mass": plain.constant_mass,
             "mass_entries": mass_entries,
             "jacobian_entries": jacobian_entries,
             "bandwidth": bandwidth,
@@ -310,7 +284,7 @@ class ConstrainedSystem:
             compiled: dict[str, Any] = {
                 kind: compile_returning(kind, each, kind in taking) for kind, each in functions.items()
             }
-            system = cls(**sizes, **options, **compiled, parameters=p)
+            system = cls(**sizes, **options, **compiled, parameters=plain.p)
             system._returning, system._taking = functions, taking
             return system
         made = {kind: VALUES_OF[kind] for kind in entries if kind not in functions}
@@ -319,7 +293,7 @@ class ConstrainedSystem:
         taking |= {kind for kind, of in made.items() if of in taking}
         python = PythonFunctions(name, functions, taking)
         wrappers: dict[str, Any] = {kind: through_python(kind) for kind in functions}
-        system = cls(**sizes, **options, **wrappers, parameters=np.append(python.handle, p))
+        system = cls(**sizes, **options, **wrappers, parameters=np.append(python.handle, plain.p))
         system._python, system._taking = python, taking  # the registry holds it weakly
         system.scattered = frozenset(made)
         return system

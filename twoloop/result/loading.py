@@ -13,7 +13,8 @@ from twoloop.problem.system import ConstrainedSystem, check_system
 from twoloop.result.result import Result
 from twoloop.result.saved_fields import OF_EVENTS, Fields
 from twoloop.result.storage import ALWAYS, FORMAT, SOMETIMES, check_path
-from twoloop.run.dense import DenseSolution, Interpolator, Table, ranks_at
+from twoloop.run.dense import Interpolator, Table, ranks_at
+from twoloop.run.dense_solution import DenseSolution
 
 
 def load(path: str | os.PathLike[str], system: ConstrainedSystem | None = None) -> Result:

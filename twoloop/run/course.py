@@ -128,7 +128,7 @@ class Course:
         run.control[a.MAX_ATTEMPTS] = min(run.chunk, max(0, self.next_look - run.attempts()))
         self.filled[:] = 0  # for Ctrl-C before the chunk begins
         try:
-            self.code = direct(a.advance)(
+            self.code = direct(run.kernels.advance)(
                 self.kit,
                 run.work,
                 self.plan.options,

@@ -5,6 +5,7 @@ from numpy.typing import NDArray
 
 from twoloop.kernels.compile.linking import direct
 from twoloop.kernels.data import common
+from twoloop.kernels.data.kit import Kit
 from twoloop.methods.plan import Plan, kept_plan
 from twoloop.run.impulse import beyond_jump
 from twoloop.run.run import Run
@@ -55,13 +56,13 @@ def bridge(run: Run) -> tuple[Plan, Array]:
     return plan.changed(step=bridge.BRIDGING), control
 
 
-def bridging_kit(kit: common.Kit) -> common.Kit:
+def bridging_kit(kit: Kit) -> Kit:
     """What steps across call; it stays with what the run's own steps call."""
     from twoloop.kernels.steps.bridge import BRIDGING
 
     known = vars(kit)
     if "bridging" not in known:
-        known["bridging"] = common.Kit(kit.functions, kit.general, BRIDGING)
+        known["bridging"] = Kit(kit.functions, kit.general, BRIDGING)
     return known["bridging"]  # type: ignore[no-any-return]
 
 
@@ -93,7 +94,7 @@ def leap(run: Run, t1: float) -> bool:
         return False
     run.new_state[: 2 * n] = state
     run.work.notes[common.KINK_BEFORE], run.work.notes[common.KINK_AFTER] = end, np.inf
-    if direct(a.start)(run.kit, run.work, end, run.new_state) != common.DONE:
+    if direct(run.kernels.start)(run.kit, run.work, end, run.new_state) != common.DONE:
         return False
     run.jumps.append(end)
     run.plan.memory[:] = run.memory

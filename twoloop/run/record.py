@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from twoloop.problem.description import Description
 from twoloop.problem.system import ConstrainedSystem
-from twoloop.run.dense import DenseSolution
+from twoloop.run.dense_solution import DenseSolution
 
 Array = NDArray[np.float64]
 

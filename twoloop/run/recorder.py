@@ -7,7 +7,8 @@ from numpy.typing import NDArray
 
 from twoloop.kernels.data.intervals import WINDOW
 from twoloop.problem.events import Event, EventSearch
-from twoloop.run.dense import DenseSolution, Interpolator, Table
+from twoloop.run.dense import Interpolator, Table
+from twoloop.run.dense_solution import DenseSolution
 
 Array = NDArray[np.float64]
 

@@ -103,12 +103,12 @@ class Remaker:
         clock[a.H_LIMIT] = run.plan.limit_start
         clock[a.H_NEXT] = self.next_step if self.next_step < np.inf else FIRST_TRY * (t1 - t0)
         self.next_step = np.inf
-        if a.start(run.kit, run.work, t0, run.state) != common.DONE:
+        if run.kernels.start(run.kit, run.work, t0, run.state) != common.DONE:
             return None
         times = np.array([between, t1] if t0 < between < t1 else [t1])
         arrays = (run.plan.options, run.plan.memory, run.tolerances, run.control, clock, run.state, run.new_state)
         found: list[Array] = []
-        longest, advance = 0.0, direct(a.advance)
+        longest, advance = 0.0, direct(run.kernels.advance)
         _, states, steps, filled = self.out
         for _ in range(0, most, CHUNK):
             code = advance(run.kit, run.work, *arrays, times, *self.out)

@@ -64,8 +64,9 @@ class Run:
         interiors: Mapping[int, Plan] = MappingProxyType({}),
     ):
         from twoloop.kernels import advance  # compiled, or read from the cache, at the first run of a process
+        from twoloop.kernels.control import clock
 
-        self.a = advance
+        self.kernels, self.a = advance, clock
         self.system, self.plan, self.t0 = system, plan, t0
         self.memory = plan.memory.copy()
         self.rtol, self.reuse, self.interiors, self.traced = rtol, plan.reuse, interiors, plan.traced
@@ -85,21 +86,21 @@ class Run:
         self.tolerances[common.ESTIMATE] = step_size is None
         self.tolerances[common.LEAST] = least_tolerance(rtol, self.least_atol)
         self.tolerances[common.ATOL :] = atol
-        self.control = np.zeros(advance.N_CONTROL)
-        self.control[advance.MAX_STEP] = np.inf
-        self.control[advance.FIXED_STEP] = 0.0 if step_size is None else step_size
-        self.control[advance.MAX_STEPS] = np.inf
-        self.control[advance.BRIDGE] = self.static is None
+        self.control = np.zeros(clock.N_CONTROL)
+        self.control[clock.MAX_STEP] = np.inf
+        self.control[clock.FIXED_STEP] = 0.0 if step_size is None else step_size
+        self.control[clock.MAX_STEPS] = np.inf
+        self.control[clock.BRIDGE] = self.static is None
         rates = system.given.keys() & {"constraint_rate", "nonholonomic_rate", "kinematics"}
-        self.control[advance.DRIVEN] = bool(rates)
+        self.control[clock.DRIVEN] = bool(rates)
         first_chunk = FIRST_CHUNK_IN_PYTHON if system.called_in_python else FIRST_CHUNK
         self.chunk = max(1, first_chunk // max(1, system.n_q // SMALL))  # attempts in one call of advance, at most
-        self.clock = np.zeros(advance.N_CLOCK)
-        self.clock[advance.T] = self.clock[advance.T_START] = t0
+        self.clock = np.zeros(clock.N_CLOCK)
+        self.clock[clock.T] = self.clock[clock.T_START] = t0
         self.control_by(plan)
         self.substituted = False  # whether another plan has taken over, for good
-        self.clock[advance.JUMP_FROM] = self.clock[advance.JUMP_TO] = np.inf
-        self.clock[advance.ROUGH_TO] = self.clock[advance.LOOKED_TO] = self.clock[advance.SUDDEN] = -np.inf
+        self.clock[clock.JUMP_FROM] = self.clock[clock.JUMP_TO] = np.inf
+        self.clock[clock.ROUGH_TO] = self.clock[clock.LOOKED_TO] = self.clock[clock.SUDDEN] = -np.inf
         self.looks_ahead = step_size is None and may_be_sudden(system, plan.traced)
         self.crossings: list[list[tuple[float, Array]]] = []  # states before and behind steps across singular positions
         self.lengths: list[float] = []  # of steps across such a position that are still to be tried
@@ -128,7 +129,7 @@ class Run:
         made_ready(work, self.system, self.kit.flags, other._pattern(q0), q0, self.rtol, self.reuse)
         work.notes[common.NEARLY_SINGULAR] = 0.0 if self.plan.watchful else 1.0
         other.work = work
-        if direct(self.a.start)(other.kit, work, t0, other.state) != common.DONE:
+        if direct(self.kernels.start)(other.kit, work, t0, other.state) != common.DONE:
             return None
         other.redundant, other.said_of_rows = other._redundant_rows()
         return other
@@ -211,16 +212,16 @@ class Run:
             clock[a.H_NEXT], clock[a.H_LIMIT] = clock[a.H_LONG] or clock[a.H_NEXT], self.plan.limit_start
             clock[a.FAILURE_CODE] = common.DONE
         state = self.state.copy()
-        code = direct(self.a.start)(self.kit, self.work, t, state)
+        code = direct(self.kernels.start)(self.kit, self.work, t, state)
         if code == common.RANK_DIFFERS:  # as it does where a start at which rows depend on one another was left
             self.work.notes[common.GENERATION] = 1.0
-            code = direct(self.a.start)(self.kit, self.work, t, state)
+            code = direct(self.kernels.start)(self.kit, self.work, t, state)
         if before.notes[common.PIVOT] > 0.0 and largest > 0.0:  # as if it had been looked at in this way all along
             pivot = self.work.notes[common.PIVOT]
             self.clock[self.a.LARGEST_PIVOT] = pivot * max(1.0, largest / before.notes[common.PIVOT])
 
     def _begin(self) -> None:
-        start = direct(self.a.start)
+        start = direct(self.kernels.start)
         code = start(self.kit, self.work, self.t0, self.state)
         if self.static is not None and code == common.RANK_DIFFERS:
             rank = int(self.work.notes[common.RANK])

@@ -148,7 +148,7 @@ class SampledRun:
         run.control[a.MAX_ATTEMPTS] = STEPS
         steps = self._buffers[2]
         while code == a.PAUSED:
-            code = direct(a.advance)(
+            code = direct(run.kernels.advance)(
                 *(run.kit, run.work, run.plan.options, run.plan.memory, run.tolerances, run.control, clock),
                 *(run.state, run.new_state, self._outputs, *self._buffers, self._filled),
             )
@@ -195,7 +195,7 @@ class SampledRun:
     def _begin_anew(self, t: float) -> int:
         """Accelerations with other parameters, and a method that forgets those before."""
         run, a = self.run, self.run.a
-        code = direct(a.start)(run.kit, run.work, t, run.state)
+        code = direct(run.kernels.start)(run.kit, run.work, t, run.state)
         first = 0
         if run.plan.first is not None:  # of a pair it is kept which of the two is at work
             from twoloop.kernels.control.switching import N_SCALARS

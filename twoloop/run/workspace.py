@@ -10,6 +10,7 @@ from twoloop.kernels.algebra.banded import banded_pays
 from twoloop.kernels.algebra.lapack import addresses
 from twoloop.kernels.algebra.sparse import sparse_pays
 from twoloop.kernels.data import common
+from twoloop.kernels.data.kit import Kit
 from twoloop.kernels.evaluation.operations import N_NODES
 from twoloop.kernels.layout import make_work
 from twoloop.methods.plan import Plan
@@ -25,7 +26,7 @@ ROUNDING = 1e-15  # of the largest coordinate: corrections of this size are roun
 
 def kit_of(
     system: ConstrainedSystem, t0: float, q0: Array, plan: Plan | None = None, static: StaticForm | None = None
-) -> common.Kit:
+) -> Kit:
     """The callbacks of a system, with flags that say which linear algebra suits it, and what a plan calls."""
     from twoloop.kernels.evaluation.calls import inner_loop
 
@@ -35,17 +36,17 @@ def kit_of(
     if plan is not None:
         return kit_with(system, flags, plan)
 
-    def make() -> tuple[common.Kit, Any]:
+    def make() -> tuple[Kit, Any]:
         functions = system.functions
-        return common.Kit(functions._replace(flags=flags.copy()), inner_loop), functions
+        return Kit(functions._replace(flags=flags.copy()), inner_loop), functions
 
     if flags[common.FORM] == common.AUGMENTED:  # which a run may change
         return make()[0]
-    made: tuple[common.Kit, Any] = system.remembered(("general kit", id(system.functions), flags.tobytes()), make)
+    made: tuple[Kit, Any] = system.remembered(("general kit", id(system.functions), flags.tobytes()), make)
     return made[0]
 
 
-def _static_kit(system: ConstrainedSystem, plan: Plan | None, form: StaticForm) -> common.Kit:
+def _static_kit(system: ConstrainedSystem, plan: Plan | None, form: StaticForm) -> Kit:
     """The same for the static form."""
     from twoloop.kernels.evaluation.static_inner import static_inner_loop
 
@@ -55,9 +56,9 @@ def _static_kit(system: ConstrainedSystem, plan: Plan | None, form: StaticForm) 
     if form.newton is not None:
         functions = functions._replace(newton_program=form.newton)
     if plan is None:
-        return common.Kit(functions, static_inner_loop)
+        return Kit(functions, static_inner_loop)
     called = (plan.step, plan.first, plan.second)
-    return common.Kit(functions, static_inner_loop, *called, static_inner_loop, plan.instead)
+    return Kit(functions, static_inner_loop, *called, static_inner_loop, plan.instead)
 
 
 def _flags_at(system: ConstrainedSystem, t0: float, q0: Array) -> Array:
@@ -97,13 +98,13 @@ def _is_diagonal(mass: Array) -> bool:
     return np.count_nonzero(mass) == np.count_nonzero(mass.diagonal())
 
 
-def kit_with(system: ConstrainedSystem, flags: Array, plan: Plan) -> common.Kit:
+def kit_with(system: ConstrainedSystem, flags: Array, plan: Plan) -> Kit:
     """The callbacks with these flags, and what a plan calls; kept with the system for the next run."""
     from twoloop.kernels.evaluation.calls import inner_loop
 
     called = (plan.inner or inner_loop, plan.step, plan.first, plan.second)
     read = (plan.numbers, plan.own_numbers)
-    kept: dict[Any, tuple[common.Kit, Any]] = system.remembered("kits", dict)
+    kept: dict[Any, tuple[Kit, Any]] = system.remembered("kits", dict)
     # what it names by numbers is held by what is kept
     key = (id(system.functions), flags.tobytes(), *called, plan.instead, *map(id, (*plan.own, *read)))
     changes = flags[common.FORM] == common.AUGMENTED  # which a run may
@@ -112,16 +113,16 @@ def kit_with(system: ConstrainedSystem, flags: Array, plan: Plan) -> common.Kit:
     flags = flags.copy()
     flags[common.STRAIGHT] = plan.inner is not None
     functions = system.functions._replace(flags=flags)
-    made = common.Kit(functions, *called, inner_loop, plan.instead, plan.own, *read)
+    made = Kit(functions, *called, inner_loop, plan.instead, plan.own, *read)
     if len(kept) == MOST_KITS:
         del kept[next(iter(kept))]
     kept[key] = made, system.functions
     return _with_own_flags(made) if changes else made
 
 
-def _with_own_flags(kit: common.Kit) -> common.Kit:
+def _with_own_flags(kit: Kit) -> Kit:
     """A copy for one run, which takes a tenth of the time that another kit does."""
-    other, flags, table = object.__new__(common.Kit), kit.flags.copy(), kit.table.copy()
+    other, flags, table = object.__new__(Kit), kit.flags.copy(), kit.table.copy()
     table[common.KIT.places["flags"]] = flags.ctypes.data
     functions = kit.functions._replace(flags=flags)
     vars(other).update(vars(kit), functions=functions, flags=flags, table=table, address=table.ctypes.data)
@@ -130,7 +131,7 @@ def _with_own_flags(kit: common.Kit) -> common.Kit:
 
 def workspace(
     system: ConstrainedSystem,
-    kit: common.Kit,
+    kit: Kit,
     pattern: Array,
     q0: Array,
     rtol: float,

@@ -45,8 +45,8 @@ def digest_of(what: str, value: Any) -> str:
         digest.add(value)
     except CannotBeWatched as why:
         raise ValueError(
-            f"{what} reaches {why}, whose state cannot be read, so that nobody can tell whether rows that are kept are "
-            "of the same functions. Make it inside of the function, or leave `out` away"
+            f"{what} reaches {why}, whose state cannot be read, so that it cannot be decided whether rows that are "
+            "kept are of the same functions. Make it inside of the function, or leave `out` away"
         ) from None
     return digest.hash.hexdigest()
 

@@ -127,7 +127,7 @@ class _Worker:
 
 
 def _serve(connection: Connection, task: Task) -> None:
-    """What a worker does: answer until nobody asks."""
+    """What a worker does: answer until no more is asked."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's business
     before = n_made()
     connection.send("ready")

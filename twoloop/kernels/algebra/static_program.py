@@ -78,7 +78,7 @@ def program_in_order(
     targets = slots(np.concatenate(firsts), np.concatenate(seconds))
     source = slots(low, high)
     n_mass = len(mass[0])
-    above = rows[:n_mass] < columns[:n_mass]  # the other triangle: without U, of a slot that nobody reads
+    above = rows[:n_mass] < columns[:n_mass]  # the other triangle: without U, of a slot that is never read
     source[:n_mass][above] = source[:n_mass][above] + len(keys) if both else n + len(keys)
     which, first, second = _products(jacobian[0], stiff_rows)
     one, other = (position[jacobian[1][each]] for each in (first, second))

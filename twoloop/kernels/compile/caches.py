@@ -6,6 +6,7 @@ can be written and when a file is damaged, and runs what others have put into on
 """
 
 import enum
+import gc
 import glob
 import hashlib
 import inspect
@@ -13,8 +14,8 @@ import pickle
 import sys
 import types
 import uuid
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -33,7 +34,7 @@ from twoloop.kernels.compile.ownership import make_own, own_folder, read_own, wr
 
 UNWRITABLE = (
     "twoloop: machine code cannot be kept on disk, so every process compiles again. Set NUMBA_CACHE_DIR to a folder "
-    "that you can write, and nobody else can"
+    "that only you can write"
 )
 MOST_KEPT = 500  # sets of functions made for single mechanisms, of each kind, on disk ...
 MOST_HELD = 50  # ... and in memory
@@ -77,10 +78,23 @@ def compile_kept(
         except RuntimeError:  # numba finds no folder; there is none for what is typed at a prompt
             if Path(inspect.getfile(function)).exists():
                 say_once(UNWRITABLE)
-    dispatcher.compile(signature)
+    with _uncollected():
+        dispatcher.compile(signature)
     dispatcher.disable_compile()
     _N_MADE[0] += 1
     return dispatcher
+
+
+@contextmanager
+def _uncollected() -> Iterator[None]:
+    """Without the collection of cycles: what numba makes lives until the end, and that takes a sixth of the time."""
+    collecting = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if collecting:
+            gc.enable()
 
 
 class Newest(dict[Any, Any]):

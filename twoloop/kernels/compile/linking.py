@@ -23,6 +23,7 @@ from numba.core.dispatcher import Dispatcher
 from numba.core.targetconfig import ConfigStack
 from numba.core.typed_passes import InlineOverloads, IRLegalization, NopythonRewrites
 from numba.core.types.functions import BaseFunction, Function
+from numba.core.untyped_passes import InlineClosureLikes
 from numba.np import arrayobj
 
 
@@ -92,7 +93,8 @@ def _call_type(self: Any, context: Any, args: Any, kws: Any) -> Any:
 
     Numba tries all implementations of an operator at each call, which is a tenth of a compilation.
     """
-    key = self, args, tuple(kws.items()), repr(ConfigStack.top_or_none())
+    options: Any = ConfigStack.top_or_none()
+    key = self, args, tuple(kws.items()), repr(options and options._values)
     if key not in _call_types:
         signature = _plain_call_type(self, context, args, kws)
         _call_types[key] = signature, self._impl_keys[signature.args]
@@ -118,9 +120,10 @@ def _own_rules() -> Iterator[None]:
             arrayobj.fix_integer_index = _index_from_either_end
 
 
-# passes over every function that find nothing to do in kernels: whole arrays in an expression, as none is allocated;
-# overloads that are put in the place of calls before lowering; what cannot stand in a compiled function
-_NEEDLESS = {NopythonRewrites, InlineOverloads, IRLegalization}
+# passes over every function that find nothing to do in kernels: functions within functions; whole arrays in an
+# expression, as none is allocated; overloads that are put in the place of calls before lowering; what cannot stand in
+# a compiled function
+_NEEDLESS = {InlineClosureLikes, NopythonRewrites, InlineOverloads, IRLegalization}
 
 
 class _Compiler(Compiler):

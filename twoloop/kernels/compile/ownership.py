@@ -1,4 +1,4 @@
-"""Code is loaded from files and folders that belong to the user, or to root, and that nobody else can write.
+"""Code is loaded from files and folders that belong to the user, or to root, and that no other user can write.
 
 It is what ssh asks of keys: whoever can write a file of machine code, or put another in its place, runs what he likes
 in the name of whoever loads it. A checksum within the file does not help, as he writes that, too.
@@ -15,8 +15,8 @@ from pathlib import Path
 from numba.misc.appdirs import AppDirs
 
 ADVICE = (
-    "Code is loaded only from what belongs to you or root and nobody else can write: take that right away (chmod go-w) "
-    "or set NUMBA_CACHE_DIR to a folder of your own in folders that others cannot write"
+    "Code is loaded only from what belongs to you or root and no other user can write: take that right away (chmod "
+    "go-w) or set NUMBA_CACHE_DIR to a folder of your own in folders that others cannot write"
 )
 
 

@@ -7,12 +7,15 @@ of the values; of what happens within one or two of them they are as large. A st
 
 import numpy as np
 
+from twoloop.kernels.control.clock import LOOKED_TO, SUDDEN
 from twoloop.kernels.data.common import RTOL, compiled
 from twoloop.kernels.evaluation.constraints import constraint_rates
+from twoloop.kernels.evaluation.gamma import representable
 
 PLACES = 20  # times ahead that are compared
 SHARE = 0.1  # of the range: a second difference that is sudden; that of a bell as wide as four of these times
 LEAST = 0.1  # of rtol, times the largest value so far: a range that may matter
+NEARLY = 0.01  # of the spacing of these times: before a sudden change by that is at it
 NOW, BEFORE, EARLIER, LOW, HIGH, BEND, PLACE, LARGEST, N_CHANGES = range(9)  # rows of w.changes
 
 
@@ -69,3 +72,14 @@ def sudden_time(f, w, tolerances, t, spacing, last, q, v):
         if span > least and changes[BEND, j] > SHARE * span:
             first = min(first, t + changes[PLACE, j] * spacing)
     return first, min(first, end)
+
+
+@compiled
+def up_to_sudden(f, w, tolerances, clock, spacing, t, size, last, q, v):
+    """The size of a step that does not pass over a sudden change with time."""
+    while clock[SUDDEN] <= t + NEARLY * spacing or clock[SUDDEN] == np.inf:
+        begin = max(t, clock[LOOKED_TO])
+        if begin >= min(t + size, last):
+            return size
+        clock[SUDDEN], clock[LOOKED_TO] = sudden_time(f, w, tolerances, begin, spacing, last, q, v)
+    return min(size, representable(t, clock[SUDDEN] - t))

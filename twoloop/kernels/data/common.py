@@ -13,14 +13,12 @@ from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
 from numba import njit, types
 from numba.extending import typeof_impl
 
 from twoloop.kernels.compile.caches import compile_kept
 from twoloop.kernels.compile.callbacks import KINDS, MATRIX, OPTIONAL, VECTOR, f8
 from twoloop.kernels.compile.linking import HelperCompiler, KernelCompiler, VectorizingCompiler
-from twoloop.kernels.compile.own_functions import OwnFunctions
 from twoloop.kernels.compile.private import Dispatcher
 from twoloop.kernels.compile.reference import Reference
 
@@ -232,49 +230,6 @@ class Step(NamedTuple):
     settle: Any = None
 
 
-NONE = np.zeros(0)
-
-
-class Kit:
-    """What kernels get of a system and a method, one reference: the callbacks, the inner loop and the step.
-
-    The latter two are compiled once, and not again in what calls them; None where they are not called. A step that
-    chooses between two others has these as `first` and `second`. An inner loop that calls functions made for the
-    mechanism leaves to `general` what these do not do; `instead` is what is called where those of a step do not serve.
-    `own` are sets of such functions; `numbers` is what those of the inner loop and of stages read, `own_numbers` what
-    those of series read.
-    """
-
-    def __init__(
-        self,
-        functions: Any,
-        inner: Any = None,
-        step: Step | None = None,
-        first: Step | None = None,
-        second: Step | None = None,
-        general: Any = None,
-        instead: Any = None,
-        own: tuple[OwnFunctions, ...] = (),
-        numbers: Any = None,
-        own_numbers: Any = None,
-    ):
-        self.__dict__.update(functions._asdict())
-        self.functions, self.inner, self.general, self.instead, self.own = functions, inner, general, instead, own
-        self.numbers = NONE if numbers is None else numbers
-        self.own_numbers = NONE if own_numbers is None else own_numbers
-        self.attempt, self.settle = step or Step()
-        self.attempt_first, self.settle_first = first or Step()
-        self.attempt_second, self.settle_second = second or Step()
-        self.__dict__.update(dict.fromkeys(OWN_FUNCTIONS, 0))
-        for each in own:
-            self.__dict__.update(each.addresses)
-        self.table = KIT.table(self)
-        self.address = self.table.ctypes.data
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self.functions, name)
-
-
 KIT = Reference(
     "Kit",
     {
@@ -322,11 +277,6 @@ OWN_FUNCTIONS = {
     "sum_stages": types.none(*[VECTOR] * 4, f8, VECTOR, VECTOR),
 }
 KIT.add_own_functions(OWN_FUNCTIONS)
-
-
-@typeof_impl.register(Kit)
-def _type_of_kit(value: Any, context: Any) -> Any:
-    return KIT
 
 
 # places in the array `tolerances` that a step gets; ESTIMATE is 0 for a fixed step, LEAST the smallest tolerance, GAP

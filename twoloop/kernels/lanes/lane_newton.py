@@ -35,9 +35,9 @@ from twoloop.kernels.lanes.lane_room import (
     places_of,
 )
 from twoloop.kernels.steps.newton_memory import N_EIGEN_SCALARS, N_REAL, count_eigenvalues, eigen_place
-from twoloop.kernels.steps.newton_step import MAX_ITERATIONS, STAGNATION, middle_node
+from twoloop.kernels.steps.newton_operator import MAX_ITERATIONS, STAGNATION
 from twoloop.kernels.steps.newton_tangents import DIFFERENCE
-from twoloop.kernels.steps.stages import FARTHEST, OUTER_TOL
+from twoloop.kernels.steps.stages import FARTHEST, OUTER_TOL, middle_node
 
 # of the method's memory, in vectors: one number for each lane, ...
 (

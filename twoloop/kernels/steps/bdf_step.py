@@ -28,7 +28,7 @@ from twoloop.kernels.data.common import (
     kernel,
 )
 from twoloop.kernels.evaluation.calls import accelerations, evaluate_state, rounding_floor
-from twoloop.kernels.steps.fixed_point_step import iterate_accelerations
+from twoloop.kernels.steps.fixed_point_loops import iterate_accelerations
 from twoloop.kernels.steps.stages import options_array as gauss_options
 
 MAX_ORDER = 5

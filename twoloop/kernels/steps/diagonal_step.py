@@ -66,8 +66,7 @@ from twoloop.kernels.steps.newton_memory import (
     memory_size,
     vector,
 )
-from twoloop.kernels.steps.newton_operator import derivatives_at, factor_systems, filter_error
-from twoloop.kernels.steps.newton_step import correct
+from twoloop.kernels.steps.newton_operator import correct, derivatives_at, factor_systems, filter_error
 from twoloop.kernels.steps.stages import INNER_TOL, N_SCALARS, OUTER_TOL, STAGES, options_array
 
 MAX_ITERATIONS = 8

@@ -7,7 +7,19 @@ systems, of which all coordinates count as independent.
 
 from twoloop.kernels.data.common import BANDWIDTH, FORM, STATIC, compiled
 from twoloop.kernels.steps import newton_banded, newton_dense, newton_static
-from twoloop.kernels.steps.newton_memory import H_FACTORED
+from twoloop.kernels.steps.newton_memory import (
+    H_FACTORED,
+    N_EIGEN_SCALARS,
+    N_REAL,
+    Q_STAGE,
+    block,
+    complex_vector,
+    count_eigenvalues,
+    eigen_place,
+)
+
+MAX_ITERATIONS = 15
+STAGNATION = 0.1  # of the step tolerance: corrections of this size that no longer shrink are rounding
 
 
 @compiled
@@ -54,3 +66,36 @@ def filter_error(f, w, options, memory, s, h, e_q, e_v):
         newton_banded.filter_error(f, w, options, memory, s, h, e_q, e_v)
     else:
         newton_dense.filter_error(w, options, memory, s, h, e_q[:m], e_v[:m])
+
+
+@compiled
+def correct(f, w, options, memory, s, residual, A_stage):
+    """Solve for the corrections of the stage accelerations and add them; `residual` becomes the corrections."""
+    n = w.Q.size
+    m = w.independent.size
+    place = eigen_place(options, s)
+    n_real = int(options[place + N_REAL])
+    n_eigen = count_eigenvalues(options, s)
+    x = complex_vector(memory, s, n, n_eigen, 0)
+    place += N_EIGEN_SCALARS + s
+    d = block(memory, s, n, Q_STAGE)  # free between two evaluations
+    d[:, :] = 0.0
+    for k in range(n_eigen):
+        row = place + 2
+        column = row + 2 * s
+        place += 2 + 4 * s
+        for i in range(m):
+            total = complex(0.0, 0.0)
+            for j in range(s):
+                total += complex(options[row + j], options[row + s + j]) * residual[j, w.independent[i]]
+            x[i] = total
+        solve_system(f, w, options, memory, s, k, x)
+        twice = 1.0 if k < n_real else 2.0
+        for j in range(s):
+            re, im = options[column + j], options[column + s + j]
+            for i in range(m):
+                d[j, w.independent[i]] += twice * (re * x[i].real - im * x[i].imag)
+    for j in range(s):
+        for i in w.independent:
+            residual[j, i] = d[j, i]
+            A_stage[j, i] += d[j, i]

@@ -33,7 +33,6 @@ from twoloop.kernels.data.common import (
     Step,
     compiled,
     kernel,
-    merged,
 )
 from twoloop.kernels.data.tolerances import allowed
 from twoloop.kernels.evaluation.calls import accelerations, evaluate, multipliers
@@ -53,7 +52,6 @@ from twoloop.kernels.steps.newton_memory import (
     HAS_PREVIOUS,
     HAS_TRIAL,
     N_EIGEN_SCALARS,
-    N_REAL,
     PARTITION_NUMBER,
     PREVIOUS,
     Q_MID,
@@ -64,19 +62,22 @@ from twoloop.kernels.steps.newton_memory import (
     V_STAGE,
     VELOCITIES,
     block,
-    complex_vector,
-    count_eigenvalues,
     eigen_place,
     vector,
 )
-from twoloop.kernels.steps.newton_operator import derivatives_at, factor_systems, filter_error, solve_system
-from twoloop.kernels.steps.stages import FARTHEST, INNER_TOL, OUTER_TOL, STAGES, interpolate, tableau_of
+from twoloop.kernels.steps.newton_operator import (
+    MAX_ITERATIONS,
+    STAGNATION,
+    correct,
+    derivatives_at,
+    factor_systems,
+    filter_error,
+)
+from twoloop.kernels.steps.stages import FARTHEST, INNER_TOL, OUTER_TOL, STAGES, interpolate, middle_node, tableau_of
 
-MAX_ITERATIONS = 15
 SAME_STEP = 1e-9  # relative: steps are differences of times, and the same step is rounded otherwise at another time
 SLOW = 0.05  # contraction above which the derivatives are renewed before the next step
-STAGNATION = 0.1  # of the step tolerance: corrections of this size that no longer shrink are rounding
-STAGNATION_FIXED = 1e-9  # the same for fixed steps, relative to max(1, |value|)
+STAGNATION_FIXED = 1e-9  # as STAGNATION, for fixed steps, relative to max(1, |value|)
 
 
 def newton_options(
@@ -120,39 +121,6 @@ def _estimate_weights(b: NDArray[np.float64], c: NDArray[np.float64], gamma0: fl
         embedded[:-1] = np.linalg.solve(np.vander(c[:-1], increasing=True).T, moments[:-1])
         embedded[0] -= gamma0
     return np.asarray(embedded - b)
-
-
-@compiled
-def correct(f, w, options, memory, s, residual, A_stage):
-    """Solve for the corrections of the stage accelerations and add them; `residual` becomes the corrections."""
-    n = w.Q.size
-    m = w.independent.size
-    place = eigen_place(options, s)
-    n_real = int(options[place + N_REAL])
-    n_eigen = count_eigenvalues(options, s)
-    x = complex_vector(memory, s, n, n_eigen, 0)
-    place += N_EIGEN_SCALARS + s
-    d = block(memory, s, n, Q_STAGE)  # free between two evaluations
-    d[:, :] = 0.0
-    for k in range(n_eigen):
-        row = place + 2
-        column = row + 2 * s
-        place += 2 + 4 * s
-        for i in range(m):
-            total = complex(0.0, 0.0)
-            for j in range(s):
-                total += complex(options[row + j], options[row + s + j]) * residual[j, w.independent[i]]
-            x[i] = total
-        solve_system(f, w, options, memory, s, k, x)
-        twice = 1.0 if k < n_real else 2.0
-        for j in range(s):
-            re, im = options[column + j], options[column + s + j]
-            for i in range(m):
-                d[j, w.independent[i]] += twice * (re * x[i].real - im * x[i].imag)
-    for j in range(s):
-        for i in w.independent:
-            residual[j, i] = d[j, i]
-            A_stage[j, i] += d[j, i]
 
 
 @compiled
@@ -272,16 +240,6 @@ def _estimate(f, w, options, memory, h, tolerances, state, new_state, A_stage):
     copy(e_v, once)
     _filter(f, w, options, memory, h, e_q, e_v)
     return max(error, lasting_error(w, memory, tolerances, h * gamma0, raw, once, e_v, state, new_state))
-
-
-@merged
-def middle_node(c):
-    """The node next to the middle."""
-    found = 0
-    for j in range(c.size):
-        if abs(c[j] - 0.5) < abs(c[found] - 0.5):
-            found = j
-    return c[found]
 
 
 @kernel(SETTLE)

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from twoloop.kernels.data.common import compiled, inlined
+from twoloop.kernels.data.common import compiled, inlined, merged
 from twoloop.kernels.data.tolerances import allowed
 
 FARTHEST = 3.0  # largest step ratio over which the old stage polynomial is extrapolated
@@ -46,6 +46,16 @@ def tableau_of(options):
     A2 = options[o + s * s : o + 2 * s * s].reshape((s, s))
     o += 2 * s * s
     return s, A, A2, options[o : o + s], options[o + s : o + 2 * s], options[o + 2 * s : o + 3 * s]
+
+
+@merged
+def middle_node(c):
+    """The node next to the middle."""
+    found = 0
+    for j in range(c.size):
+        if abs(c[j] - 0.5) < abs(c[found] - 0.5):
+            found = j
+    return c[found]
 
 
 @compiled

@@ -1,0 +1,92 @@
+"""The series of one mechanism compiled: its machine code is kept on disk as that of the kernels."""
+
+import hashlib
+from collections.abc import Callable
+from functools import cache
+from typing import Any, NamedTuple
+
+from twoloop.generate import llvm_code, series_code, series_groups
+from twoloop.generate.coefficients import Coefficients
+from twoloop.generate.llvm_text import Module
+from twoloop.generate.series import series_program
+from twoloop.generate.series_code import SeriesCode
+from twoloop.generate.straight_code import OwnCode, SharedCode, write_own
+from twoloop.generate.straight_line import Solution
+from twoloop.kernels.compile.caches import Newest, digest_of
+from twoloop.kernels.compile.own_functions import OwnFunctions, own_functions
+
+LARGEST = 3000  # operations: the time to compile them grows faster than their number
+
+
+class CompiledSeries(NamedTuple):
+    """Functions of a program and of the solution of an order."""
+
+    functions: OwnFunctions
+    code: SeriesCode
+    n_factors: int  # numbers that are kept
+    numbers: Any  # what they read, or formulas for it
+
+    def memory_size(self, order: int) -> int:
+        """Length of `memory` for series of this order."""
+        from twoloop.kernels.steps.recurrences import N_MEMORY_SCALARS
+
+        n, n_rows = self.code.n, self.code.n_rows
+        series = 2 * (order + 1) * n
+        return N_MEMORY_SCALARS + series + 2 * (n + n_rows) + self.n_factors + self.code.scratch_size(order) + n
+
+
+_MADE = Newest()
+
+
+def compiled_series(code: OwnCode) -> CompiledSeries:
+    """The code of a system's program, and of the solution of an order, compiled; its machine code is kept on disk.
+
+    Raises
+    ------
+    ValueError
+        If it would take too long to compile.
+    """
+    own = code.shared
+    made: CompiledSeries = own.family.remembered(("series", own.equations.choice), lambda: _compiled(own))
+    return made._replace(numbers=code.evaluate(made.numbers))
+
+
+def _compiled(own: SharedCode) -> CompiledSeries:
+    from twoloop.kernels.data.common import KIT
+
+    system, family = own.equations.system, own.family
+    program = family.remembered("series", lambda: series_program(system, family.parameters))
+    if program.n_operations > LARGEST:
+        raise ValueError(
+            f"compiled=True is for equations of at most {LARGEST} operations; these are {program.n_operations}. Leave "
+            f"it out"
+        )
+    numbers = Coefficients()
+    code, solution = SeriesCode(program, numbers), Solution(own.equations)
+    structure = [own.digest, program.n_q, program.n_rows, code.groups.structure, solution.n_kept]
+    structure += numbers.structure(solution.graph, solution.solved.forms)
+    key = hashlib.sha256(repr(structure).encode()).hexdigest()
+
+    def write() -> tuple[list[str], str]:
+        module = Module()
+        write_own(module, "own_factors", own.equations.graph, solution.kept, own.numbers)
+        write_own(module, "own_solution", solution.graph, solution.solved, numbers)
+        recurrences: dict[str, Callable[..., Any]] = {
+            "begin_series": code.begin,
+            "find_order": code.find_order,
+            "take_order": code.take_order,
+        }
+        for name, emit in recurrences.items():
+            llvm_code.write(module, name, KIT.own_type(name), emit)
+        return ["own_factors", "own_solution", *recurrences], str(module)
+
+    made = _MADE.get(key)
+    if made is None:
+        _MADE[key] = made = own_functions("series", _stamp(), key, write)
+    return CompiledSeries(made, code, solution.n_kept, numbers.formulas)
+
+
+@cache
+def _stamp() -> str:
+    """A digest of what writes the functions; what they share with those of the equations is in the key."""
+    return digest_of("", __file__, series_code, series_groups)

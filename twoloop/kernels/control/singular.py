@@ -1,0 +1,123 @@
+"""What a run looks at beside its steps: whether its partition has become poor, and a singular position is near."""
+
+from twoloop.kernels.control.clock import (
+    BRIDGE,
+    FIXED_STEP,
+    GO_ON,
+    H_LIMIT,
+    H_LONG,
+    H_NEXT,
+    LARGEST_PIVOT,
+    NEAR_SINGULAR,
+    PIVOT_HERE,
+    RANK_LOST,
+    T,
+)
+from twoloop.kernels.data.common import (
+    AUGMENTED,
+    BY_GENERAL,
+    DONE,
+    FORM,
+    N_ACCEPTED,
+    NEARLY_SINGULAR,
+    NULL_SPACE,
+    PIVOT,
+    SENSITIVITY,
+    STATIC,
+    STRAIGHT,
+    merged,
+)
+from twoloop.kernels.evaluation.calls import find_tangents, renew_partition
+from twoloop.kernels.evaluation.partition import partition_is_poor
+from twoloop.kernels.evaluation.static_factors_at import CAREFUL
+
+SHORT = 0.5  # of the longest of the last steps: a step below it may be near a singular position ...
+COLLAPSED = 0.2  # of it: steps for which the pivots of C_q are looked at anew
+SINGULAR_PIVOT = 0.2  # ... and is where the smallest pivot of C_q is below this share of the largest it had
+STATIC_SINGULAR = 0.01  # the same of the static form, whose pivots are sines of single rows ...
+CARE = 0.05  # ... and where a refused step that begins below this share is tried again with care ...
+LESS = 0.8  # ... and then by steps each of which is this times the one before
+LOST = 0.001  # ... and which is given up there for steps below this share of the longest
+RARELY = 16  # accepted steps from one look at the partition to the next where steps do without it
+FEW = 32  # degrees of freedom; where they are k times as many, a partition is looked at every k + 1 steps: T is full
+NEARER = 0.25  # of the smallest sine at the start of a step: one that ends nearer to a singular position ends half-way
+
+
+@merged
+def near_singular(w, control, clock):
+    """Whether C_q was close to losing rank when the partition was chosen, and the caller wants to know."""
+    return control[BRIDGE] == 1.0 and w.notes[PIVOT] < SINGULAR_PIVOT * clock[LARGEST_PIVOT]
+
+
+@merged
+def ends_at_singular(f, w, control, clock):
+    """Whether a step of the static form ends so near a singular position that the next would have to begin there.
+
+    Steps cross such a position unharmed where it lies well between their ends.
+    """
+    if f.flags[FORM] != STATIC or control[FIXED_STEP] > 0.0:
+        return False
+    return w.notes[PIVOT] < min(STATIC_SINGULAR * clock[LARGEST_PIVOT], NEARER * clock[PIVOT_HERE])
+
+
+@merged
+def lost_at_singular(f, clock, size):
+    """Whether a step of the static form that came to nothing is so short that others have to try, see bridge.py."""
+    near = clock[PIVOT_HERE] < STATIC_SINGULAR * clock[LARGEST_PIVOT]
+    return f.flags[FORM] == STATIC and near and size < LOST * clock[H_LONG]
+
+
+@merged
+def with_care(f, w, control, clock, size):
+    """Whether a step of the static form that begins near a singular position is tried again with more care.
+
+    Stages beside the constraints have accelerations there whose errors grow with the nearness. A step that ends well
+    beyond may be made where shorter ones, which end nearer, are not: lengths from the longest of the last ones down.
+    """
+    near = clock[PIVOT_HERE] < CARE * clock[LARGEST_PIVOT]
+    if f.flags[FORM] != STATIC or control[FIXED_STEP] > 0.0 or w.notes[NEARLY_SINGULAR] == 1.0 or not near:
+        return False
+    clock[H_NEXT] = LESS * size
+    if w.notes[NEARLY_SINGULAR] == 0.0:
+        w.notes[NEARLY_SINGULAR] = CAREFUL
+        clock[H_NEXT] = max(size, clock[H_LONG])
+    clock[H_LIMIT] = max(clock[H_LIMIT], clock[H_NEXT])
+    return True
+
+
+@merged
+def look_at_partition(f, w, control, clock, size, lands, state):
+    """Choose coordinates anew where they have become poor, and see how near a singular position is.
+
+    The state is full (q, v, a, lam): a new choice of independent coordinates needs no conversion.
+    """
+    short = size < SHORT * clock[H_LONG] and control[FIXED_STEP] == 0.0 and not lands
+    if f.flags[FORM] == STATIC:
+        clock[PIVOT_HERE] = w.notes[PIVOT]
+        clock[LARGEST_PIVOT] = max(clock[LARGEST_PIVOT], w.notes[PIVOT])
+        if w.notes[NEARLY_SINGULAR] == CAREFUL and w.notes[PIVOT] >= CARE * clock[LARGEST_PIVOT]:
+            w.notes[NEARLY_SINGULAR] = 0.0
+        return GO_ON
+    n = w.Q.size
+    straight = f.flags[STRAIGHT] == 1 and w.notes[BY_GENERAL] == 0.0
+    every = 1
+    if f.flags[FORM] == AUGMENTED:
+        every += w.independent_v.size // FEW
+    if straight:
+        every = RARELY
+    looked = w.counters[N_ACCEPTED] % every == 0
+    if looked and (straight or f.flags[FORM] != NULL_SPACE):
+        find_tangents(f, w, clock[T], state[:n])
+    if looked and partition_is_poor(w) and renew_partition(f, w, clock[T], state[:n]) != DONE:
+        return RANK_LOST
+    clock[LARGEST_PIVOT] = max(clock[LARGEST_PIVOT], w.notes[PIVOT])
+    if w.notes[PIVOT] < SINGULAR_PIVOT * clock[LARGEST_PIVOT]:
+        w.notes[NEARLY_SINGULAR] = 1.0
+    if size < COLLAPSED * clock[H_LONG] and w.notes[NEARLY_SINGULAR] == 0.0 and control[BRIDGE] == 1.0:
+        # a motion may go straight towards a singular position, and its partition show nothing of it
+        if renew_partition(f, w, clock[T], state[:n]) != DONE:
+            return RANK_LOST
+        w.notes[SENSITIVITY] = 1.0  # as of a partition far from there: this one is not to last
+        if w.notes[PIVOT] < SINGULAR_PIVOT * clock[LARGEST_PIVOT]:
+            w.notes[NEARLY_SINGULAR] = 1.0
+    return NEAR_SINGULAR if short and near_singular(w, control, clock) else GO_ON

@@ -1,0 +1,158 @@
+"""Two outer loops of implicit Runge-Kutta steps by fixed point, compiled in the steps that call them.
+
+`iterate_accelerations` iterates on the stage accelerations alone (the tableau applied twice to q'' = a),
+`iterate_first_order` is the paper's loop on y_i = [v_i, q_i]. Equation numbers are the paper's.
+"""
+
+import numpy as np
+
+from twoloop.kernels.algebra.linalg import copy
+from twoloop.kernels.control.compensated_sums import compensated, forget
+from twoloop.kernels.control.convergence import CONVERGED, MAX_ITERATIONS, UNDECIDED, judged
+from twoloop.kernels.control.predictor import restore_predicted
+from twoloop.kernels.data.common import DONE, N_OUTER, OUTER_DIVERGED, compiled, merged
+from twoloop.kernels.evaluation.calls import evaluate, restore
+from twoloop.kernels.steps.stages import INNER_TOL, OUTER_TEST, OUTER_TOL, tableau_of
+
+MAX_ITERATIONS_PAPER = 200  # the paper names no limit; (33) ends a divergent loop long before
+
+
+@compiled
+def iterate_accelerations(f, w, options, tolerances, t, h, q, v, A_stage, Q_stage, V_stage, q1, v1, rest):
+    """One step of size h from (q, v), a fixed-point iteration on the stage accelerations.
+
+    A_stage holds their prediction on entry.
+    Q_j = q + c_j h v + h^2 sum_k (A A)_jk a_k and V_j = v + h sum_k A_jk a_k have the same solution as (17); for
+    undamped systems the iteration's rate is the square of the first-order one. On return A_stage has converged and
+    (q1, v1) is the end of the step, on the constraints. The sums are compensated where `rest` has rows. Returns the
+    code, and how far the prediction of the dependents was off.
+    """
+    s, A, A2, b, bA, c = tableau_of(options)
+    n = q.size
+    tolerance = options[INNER_TOL]
+    for j in range(s):
+        for m in range(n):
+            total = 0.0
+            for k in range(s):
+                total += A2[j, k] * A_stage[k, m]
+            Q_stage[j, m] = q[m] + c[j] * h * v[m] + h * h * total
+    first = 0.0
+    before = np.inf
+    verdict = UNDECIDED
+    for iteration in range(MAX_ITERATIONS):
+        w.counters[N_OUTER] += 1
+        # all stages are set before any is evaluated: Gauss-Seidel would converge for smaller h only
+        for j in range(s):
+            for m in w.independent:
+                in_q = 0.0
+                in_v = 0.0
+                for k in range(s):
+                    in_q += A2[j, k] * A_stage[k, m]
+                    in_v += A[j, k] * A_stage[k, m]
+                Q_stage[j, m] = q[m] + c[j] * h * v[m] + h * h * in_q
+                V_stage[j, m] = v[m] + h * in_v
+        change = 0.0
+        for j in range(s):
+            code = evaluate(f, w, t + c[j] * h, Q_stage[j], V_stage[j], tolerance, q1)
+            if code != DONE:
+                return code, 0.0
+            for m in w.independent:
+                difference = h * abs(q1[m] - A_stage[j, m])
+                change = max(change, difference / max(abs(V_stage[j, m]), 1.0))
+                change = max(change, h * difference / max(abs(Q_stage[j, m]), 1.0))
+            copy(q1, A_stage[j])
+        if iteration == 0:
+            first = change
+        verdict = judged(change, before, first, iteration, options[OUTER_TOL], q)
+        if verdict != UNDECIDED:
+            break
+        before = change
+    if verdict != CONVERGED:
+        return OUTER_DIVERGED, 0.0
+    for m in range(n):
+        in_q = 0.0
+        in_v = 0.0
+        for k in range(s):
+            in_q += bA[k] * A_stage[k, m]
+            in_v += b[k] * A_stage[k, m]
+        if rest.shape[0] == 0:
+            q1[m] = q[m] + h * v[m] + h * h * in_q
+            v1[m] = v[m] + h * in_v
+        else:
+            q1[m], rest[2, m] = compensated(q[m], rest[0, m], h * v[m] + h * h * in_q)
+            v1[m], rest[3, m] = compensated(v[m], rest[1, m], h * in_v)
+    forget(w.dependent, rest)
+    return restore_predicted(f, w, tolerances, t + h, h, q, v, q1, v1, tolerance)
+
+
+@merged
+def _largest_change(coordinates, q, v, q_old, v_old):
+    change = 0.0
+    for m in coordinates:
+        change = max(change, abs(q[m] - q_old[m]) / max(abs(q[m]), 1.0))
+        change = max(change, abs(v[m] - v_old[m]) / max(abs(v[m]), 1.0))
+    return change
+
+
+@compiled
+def iterate_first_order(f, w, options, t, h, q, v, a, A_stage, Q_stage, V_stage, q_old, v_old, q1, v1):
+    """One step of size h by the paper's outer loop on y_i = [v_i, q_i]: explicit Euler start, tests (32) and (33).
+
+    `a` is the acceleration at (t, q, v); K_j = [a_j; v_j] are the rows of A_stage and V_stage. An iteration goes from
+    stage to stage with the latest K, in the manner of Gauss and Seidel. On return (q1, v1) is the end of the step, on
+    the constraints.
+    """
+    s, A, _, b, _, c = tableau_of(options)
+    n = q.size
+    tolerance = options[INNER_TOL]
+    for m in range(n):
+        q1[m] = q[m] + h * v[m]
+        v1[m] = v[m] + h * a[m]
+    code = evaluate(f, w, t + h, q1, v1, tolerance, A_stage[0])
+    if code != DONE:
+        return code
+    for j in range(s):
+        copy(A_stage[0], A_stage[j])
+        copy(v1, V_stage[j])
+        copy(q1, Q_stage[j])
+    norm_before = np.inf
+    for _ in range(MAX_ITERATIONS_PAPER):
+        w.counters[N_OUTER] += 1
+        for j in range(s):
+            for m in w.independent:
+                in_q = 0.0
+                in_v = 0.0
+                for k in range(s):
+                    in_q += A[j, k] * V_stage[k, m]
+                    in_v += A[j, k] * A_stage[k, m]
+                Q_stage[j, m] = q[m] + h * in_q
+                V_stage[j, m] = v[m] + h * in_v
+            code = evaluate(f, w, t + c[j] * h, Q_stage[j], V_stage[j], tolerance, A_stage[j])
+            if code != DONE:
+                return code
+        copy(q1, q_old)
+        copy(v1, v_old)
+        for m in w.independent:
+            in_q = 0.0
+            in_v = 0.0
+            for k in range(s):
+                in_q += b[k] * V_stage[k, m]
+                in_v += b[k] * A_stage[k, m]
+            q1[m] = q[m] + h * in_q
+            v1[m] = v[m] + h * in_v
+        code = restore(f, w, t + h, q1, v1, tolerance)
+        if code != DONE:
+            return code
+        change = _largest_change(w.independent, q1, v1, q_old, v_old)
+        if options[OUTER_TEST] == 1.0:
+            change = max(change, _largest_change(w.dependent, q1, v1, q_old, v_old))
+        if change <= options[OUTER_TOL]:  # (32)
+            return DONE
+        norm = 0.0
+        for m in range(n):
+            norm += (q1[m] - q_old[m]) ** 2 + (v1[m] - v_old[m]) ** 2
+        norm = np.sqrt(norm)
+        if not norm <= norm_before:  # (33)
+            return OUTER_DIVERGED
+        norm_before = norm
+    return OUTER_DIVERGED
