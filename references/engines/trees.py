@@ -28,8 +28,9 @@ def _outwards(bodies: PlanarBodies) -> Iterator[tuple[int, Array, int, Array]]:
     In the axes of the bodies; a branch at a time, as Pinocchio needs it.
     """
     hanging: dict[int, list[tuple[int, Array, Array]]] = {}
-    for i, here, j, there in bodies.pins:
-        hanging.setdefault(j, []).append((i, np.array([*here, 0.0]), np.array([*there, 0.0])))
+    for i, (x, y), j, (u, w) in bodies.pins:
+        hanging.setdefault(j, []).append((i, np.array([x, y, 0.0]), np.array([u, w, 0.0])))
+    ahead: list[tuple[int, Array, tuple[int, Array, Array]]]
     ahead = [(GROUND, np.zeros(3), each) for each in hanging[GROUND]]
     while ahead:
         on, pin, (body, here, there) = ahead.pop()

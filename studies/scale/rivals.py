@@ -41,7 +41,8 @@ def _moving(build: Callable[[int], Assembly], n: int) -> tuple[Assembly, np.ndar
     """A tree soon after its release: angles, angular velocities and accelerations."""
     made = build(n)
     result = solve_dae(made.system, (0.0, SOON), made.q, np.zeros_like(made.q))
-    return made, *(each[2::3, -1] for each in (result.q, result.v, result.a))
+    q, v, a = (each[2::3, -1] for each in (result.q, result.v, result.a))
+    return made, q, v, a
 
 
 @cache

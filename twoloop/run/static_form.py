@@ -23,6 +23,7 @@ from twoloop.run.newton_form import newton_form
 Array = NDArray[np.float64]
 
 SINGULAR = 1e-10  # smallest over largest eigenvalue of a body's M, below which it counts as singular
+NEWTON = 1.6  # times LARGE: coordinates from which on Newton's matrices are sparse
 SPARSE = 0.05  # of the multiplications of dense factors: a program with more of them is not worth its indices
 
 
@@ -68,7 +69,9 @@ def static_form(system: ConstrainedSystem, t0: float, q0: Array, *plans: Plan) -
 
 
 def with_newton(system: ConstrainedSystem, t0: float, q0: Array, form: StaticForm) -> StaticForm | None:
-    """The same with the program of Newton's matrix; None where there is none."""
+    """The same with the program of Newton's matrix; None where there is none, or would not pay."""
+    if system.n_q < NEWTON * LARGE:
+        return None
     made = system.remembered("newton form", lambda: newton_form(system, t0, q0, *form.known))
     return None if made is None else form._replace(newton=made[0], n_groups=made[1])
 
