@@ -78,7 +78,7 @@ def time_for(rows: pd.DataFrame, target: float, what: str = "call_s") -> float:
 def run_for(rows: pd.DataFrame, target: float) -> pd.Series:
     """The run of one solver that `time_for` prices, where there is one."""
     runs = runs_with(rows, "call_s")
-    place = place_of(runs, target)
+    place = place_of(runs, target, unasked=True)
     assert place is not None
     return rows.iloc[cheapest(runs, place)]
 
@@ -87,24 +87,23 @@ Costs = dict[str, tuple[float, Array]]  # by solver the time at an error, and dr
 
 
 def costs_at(rows: pd.DataFrame, target: float, doubt: bool = False) -> Costs:
-    """Of the solvers of one case that get to an error and were asked for about so much, what they take.
+    """Of the solvers of one case that get to an error, what the cheapest run takes that is good enough.
 
-    `doubt`: of those, too, that get there but were not asked for about so much, by the cheaper of the two runs on
-    either side, so that no solver is ahead of another for want of a run. A run out of phase is on neither side.
+    `doubt`: of those that were not asked for about so much, the next looser run counts as good enough, so that no
+    solver is ahead of another for want of a run. A run out of phase does not.
     """
     found = {}
     for solver, runs in by_solver(rows, "call_s").items():
-        place = place_of(runs, target)
-        if place is None and doubt and target >= runs.floor:
-            n_good = int((runs.errors <= target).sum())
-            looser = n_good < len(runs.errors) and not runs.of("astray")[n_good]
-            place = None if n_good == 0 else (n_good - 1, n_good + looser, None)
-        if place is not None:
-            costs, drawn = runs.of("call_s"), runs.drawn()
-            first, n_good, _ = place
-            if np.isnan(drawn[first + np.argmin(costs[first:n_good])]).any():  # of the cheapest it is not known
-                drawn[:] = np.nan
-            found[solver] = float(cost_at(costs, place)), cost_at(drawn, place)
+        place = place_of(runs, target, unasked=True)
+        if place is None:
+            continue
+        if doubt and place_of(runs, target) is None:
+            n_good = place[0]
+            place = n_good + (n_good < len(runs.errors) and not runs.of("astray")[n_good]), None
+        costs, drawn = runs.of("call_s"), runs.drawn()
+        if np.isnan(drawn[np.argmin(costs[: place[0]])]).any():  # of the cheapest it is not known
+            drawn[:] = np.nan
+        found[solver] = float(cost_at(costs, place)), cost_at(drawn, place)
     return found
 
 
@@ -152,7 +151,7 @@ def compared(own: Costs, others: Costs) -> dict[str, Any]:
 
 
 def ranking(rows: pd.DataFrame, target: float) -> pd.DataFrame:
-    """The solvers of one case that reach an error, cheapest first.
+    """The solvers of one case that reach an error, cheapest first; others' only where asked for about so much.
 
     Returns
     -------
@@ -162,7 +161,8 @@ def ranking(rows: pd.DataFrame, target: float) -> pd.DataFrame:
     """
     lines = []
     for solver, runs in by_solver(rows, *COSTS).items():
-        place = place_of(runs, target)
+        ours = rows.iloc[runs.rows[0]]["family"] == "two-loop" if len(runs.rows) else False
+        place = place_of(runs, target, unasked=ours)
         if place is None:
             continue
         run = rows.iloc[cheapest(runs, place)]
