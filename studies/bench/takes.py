@@ -10,7 +10,7 @@ from twoloop.methods.presets import PRESETS
 
 DECIDED = ("ahead", "behind", "alone", "missed")  # verdicts by which one solver is the cheapest
 SUFFIX = " (twoloop)"  # of our solvers, in the findings of honesty
-SMOOTH, STIFF, SINGULAR, LONG = "smooth motion over a short time", "stiff", "singular", "long and conservative"
+SMOOTH, STIFF, SINGULAR, LONG = "short smooth motion", "stiff", "singular", "long and conservative"
 KINDS = {  # tags of mechanisms, and what a user calls them; a mechanism of several counts for the first
     STIFF: "stiff springs and dampers",
     SINGULAR: "singular positions on the way",
@@ -20,8 +20,8 @@ KINDS = {  # tags of mechanisms, and what a user calls them; a mechanism of seve
     "spatial": "spatial",
 }
 BEAMS = {  # of the study of the beam, and their classes
-    "moderately stiff": "stiff beam whose vibrations do not matter",
-    "very flexible": "flexible beam whose vibrations matter",
+    "moderately stiff": "stiff beam, vibrations irrelevant",
+    "very flexible": "flexible beam, vibrations wanted",
 }
 BEAM_CLASSES = ("stiff, vibrations irrelevant", "stiff, vibrations wanted")  # which the beam's report judges by the tip
 
@@ -37,8 +37,8 @@ def takes(found: Mapping[str, Any], groups: Sequence[Sequence[dict[str, Any]]]) 
     rows = _of_kinds(rivals, with_code)
     rows += [_of_class(name, own, with_code) for name, own in classes.items() if name not in (*BEAM_CLASSES, LONG)]
     rows += [_by_the_tip(case) for case in found.get("beam", {}).get("cases", []) if case["name"] in BEAMS]
-    rows += [_of_energy(entry) for entry in classes[LONG]]
-    rows += _many_runs(made.get("first_calls", []), found.get("ensembles", {}).get("cases", []))
+    rows += [_of_energy(entry, "four-bar" in with_code) for entry in classes[LONG]]
+    rows += _at_once(found.get("ensembles", {}).get("cases", [])) + _singly(made.get("first_calls", []))
     return rows + _in_angles(made.get("minimal", {}))
 
 
@@ -55,9 +55,9 @@ def _of_class(name: str, entries: Sequence[dict[str, Any]], with_code: set[str])
 
 def _shares(won: Mapping[str, int], of: str, coded: bool) -> str:
     """Each solver with how often it is the cheapest ("": none is told from the others), the most often first."""
-    total, ranked = sum(won.values()), sorted(won.items(), key=lambda item: (not item[0], -item[1]))
-    parts = [f"{call(solver, coded) if solver else 'no clear choice'} at {n}" for solver, n in ranked if n]
-    return f"{', '.join(parts)} of {total} {of}" if parts else ""
+    total, ranked = sum(won.values()), sorted(won.items(), key=lambda item: -item[1])
+    parts = [f"{call(solver, coded)} ({n} of {total} {of})" for solver, n in ranked if solver and n]
+    return ", ".join(parts) or ("no clear choice" if total else "")
 
 
 def _by_the_tip(case: Mapping[str, Any]) -> dict[str, str]:
@@ -68,14 +68,14 @@ def _by_the_tip(case: Mapping[str, Any]) -> dict[str, str]:
             undecided = at.get("verdict") == "undecided"
             names = [at[which]["solver"] for which in (("ours", "others") if undecided else ("best",))]
             by[" or ".join(call(name) for name in names)].append(power(at["error"]))
-    take = "; ".join(f"{who} for errors of {listed(errors)} m" for who, errors in by.items())
+    take = ", ".join(f"{who} ({listed(errors)} m)" for who, errors in by.items())
     return {"what": f"{BEAMS[case['name']]}, by its tip", "take": take or "no solver compared reaches these errors"}
 
 
-def _of_energy(entry: Mapping[str, Any]) -> dict[str, str]:
+def _of_energy(entry: Mapping[str, Any], coded: bool) -> dict[str, str]:
     """The cheapest for an error of the energy over a long time, and the cheapest whose energy does not drift."""
     sides = (entry["picks"], entry.get("without_drift", []))
-    told = [listed(dict.fromkeys(call(pick["solver"]) for pick in picks)) for picks in sides]
+    told = [listed(dict.fromkeys(call(pick["solver"], coded) for pick in picks)) for picks in sides]
     without = f"; without drift {told[1]}" if told[1] else ""
     what = f"energy over {power(entry['t_end'])} s (four-bar, timed once each)"
     return {"what": what, "take": (told[0] or "no solver compared reaches these errors") + without}
@@ -103,7 +103,7 @@ def _of_kinds(rivals: Mapping[str, Any], with_code: set[str]) -> list[dict[str, 
         won = Counter(_cheapest(each["at"]) for each in these)
         coded = with_code.issuperset(each["case"] for each in these)
         words = "; ".join(KINDS.get(kind, SMOOTH) for kind in of)
-        first.append({"what": words, "take": _shares(won, "mechanisms (at most errors)", coded)})
+        first.append({"what": words, "take": _shares(won, "mechanisms", coded)})
     return first + rows
 
 
@@ -111,10 +111,10 @@ def _crossed(rivals: Mapping[str, Any], own: Sequence[Mapping[str, Any]]) -> str
     """Who is ahead where the motion crosses singular positions."""
     verdicts = [at["verdict"] for each in own for at in each["at"]]
     ahead, behind = verdicts.count("ahead"), verdicts.count("behind")
-    of = f"our best is ahead of all rivals in {ahead} and behind in {behind} of {ahead + behind} clear comparisons"
     standing = next((each["standings"][0] for each in rivals.get("ranges", []) if each["name"].startswith(SINGULAR)), 0)
-    default = f" (the default: {standing['ahead']} and {standing['behind']})" if standing else ""
-    return f"one of our methods: {of}{default}" if ahead > behind else f"a rival: {of}{default}"
+    default = f", the default in {standing['ahead']} and {standing['behind']}" if standing else ""
+    whose = "one of our methods" if ahead > behind else "another project's solver"
+    return f"{whose} (our best is ahead in {ahead} and behind in {behind} comparisons{default})"
 
 
 def _by_error(at: Sequence[Mapping[str, Any]]) -> str:
@@ -123,10 +123,11 @@ def _by_error(at: Sequence[Mapping[str, Any]]) -> str:
     for line in at:
         run = _first(line)
         if run:
-            by[call(run["solver"]) if line["verdict"] in DECIDED else "no clear choice"].append(line["error"])
+            by[call(run["solver"]) if line["verdict"] in DECIDED else ""].append(line["error"])
+    by.pop("", None)
     spans = {who: (power(max(errors)), power(min(errors))) for who, errors in by.items()}
-    said = [f"{who} at {high}{f' to {low}' if low != high else ''}" for who, (high, low) in spans.items()]
-    return "; ".join(said) or "no solver compared reaches these errors"
+    said = [f"{who} ({high}{f' to {low}' if low != high else ''})" for who, (high, low) in spans.items()]
+    return ", ".join(said) or "no solver compared reaches these errors"
 
 
 def _first(line: Mapping[str, Any]) -> Mapping[str, Any] | None:
@@ -148,17 +149,19 @@ def _cheapest(at: Sequence[Mapping[str, Any]]) -> str:
     return solver if 2 * n > won.total() else ""
 
 
-def _many_runs(first_calls: Sequence[Mapping[str, Any]], cases: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
-    """Who is the cheapest where many runs are one call, and after how many single calls what is built has paid."""
+def _at_once(cases: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
+    """Who is the cheapest where many runs are one call."""
     won: Counter[str] = Counter()
     for each in cases:
         best = Counter(min(at["run_s"], key=at["run_s"].get) if at["verdict"] in DECIDED else "" for at in each["at"])
         won.update([best.most_common(1)[0][0]] if best else [])
-    ways = f"in one call {_shares(won, 'mechanisms', False)}" if won.total() else ""
+    return [{"what": "many runs in one call", "take": _shares(won, "mechanisms", False)}] if won.total() else []
+
+
+def _singly(first_calls: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
+    """After how many single calls what is built has paid."""
     paid = [_paid(line) for line in first_calls if line["pays"] and line["solver"] in (f"{DEFAULT}, compiled", HEYOKA)]
-    single = f"in single calls {' and '.join(paid)}, against `compiled=False`" if paid else ""
-    take = "; ".join(part for part in (ways, single) if part)
-    return [{"what": "many runs of one mechanism", "take": take}] if take else []
+    return [{"what": "many single calls", "take": f"{' and '.join(paid)}, against `compiled=False`"}] if paid else []
 
 
 def _paid(line: Mapping[str, Any]) -> str:
@@ -166,7 +169,7 @@ def _paid(line: Mapping[str, Any]) -> str:
     first, last = (f"{float(f'{runs:.0e}'):.0f}" for runs in (min(line["pays"]), max(line["pays"])))
     after = first if first == last else f"{first} to {last}"
     on = f" on {line['n'] - line['never']} of {line['n']} mechanisms" if line["never"] else ""
-    return f"code of {call(line['solver'])} pays after some {after} runs{on}"
+    return f"{call(line['solver'])} after some {after} calls{on}"
 
 
 def _in_angles(minimal: Mapping[str, Any]) -> list[dict[str, str]]:
@@ -174,9 +177,8 @@ def _in_angles(minimal: Mapping[str, Any]) -> list[dict[str, str]]:
     if not minimal.get("n") or minimal["n_behind"] <= minimal["n_ahead"]:
         return []
     pairs = f"{minimal['n_behind']} of {minimal['n']} comparisons"
-    take = f"an ODE in these angles, by heyoka or CVODE: faster than our best in {pairs}"
-    take += f", in the median in {number(minimal['median'])} of the time"
-    return [{"what": "loops that close in closed form, if you derive the equations", "take": take}]
+    take = f"an ODE in angles (faster than our best in {pairs}, {number(minimal['median'])} of the time in the median)"
+    return [{"what": "loops that close in closed form", "take": take}]
 
 
 def call(solver: str, coded: bool = False) -> str:

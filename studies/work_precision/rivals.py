@@ -116,10 +116,10 @@ def runs(quick: bool) -> list[Run]:
 
 
 def collect(todo: Sequence[Run], kept: KeptRows) -> pd.DataFrame:
-    """Rows of all runs that are of use; on the four-bars however far behind a solver is."""
+    """Rows of all runs that are of use; on the four-bars however far behind a solver is, and repeated where priced."""
     quick = all(run.repeats == 1 for run in todo)
     errors, priced = () if quick else DECADES, lambda run: run.case.name == HEADLINE
-    return adaptive.collect(todo, kept, row_at_end, lambda run: run.case.name in GEOMETRIES, errors, fine=priced)
+    return adaptive.collect(todo, kept, row_at_end, lambda run: run.case.name in GEOMETRIES, errors, priced, priced)
 
 
 def row_at_end(run: Run, repeat: int, built: Warm) -> Row:
@@ -185,7 +185,8 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     python = rows[rows["called_from"] == "Python"]["solver"].unique()
     ahead = [at["standing"][headline.BEST] for at in every if at["standing"][headline.BEST]["verdict"] == "ahead"]
     found["ahead_of_python"] = sum(best["rival"]["solver"] in python for best in ahead)
-    found["residual"] = residual(rows)
+    found["residual"], found["shortest"] = residual(rows), shortest(rows)
+    found["processors"] = sorted(rows["processor"].dropna().unique()) if "processor" in rows else []
     return found | {"aims": aims(by_case[name] for name in GEOMETRIES if name in by_case)}
 
 
@@ -221,6 +222,16 @@ def residual(rows: pd.DataFrame) -> dict[str, Any] | None:
     if HEADLINE not in medians:
         return None
     return {"here": float(medians[HEADLINE]), "least": float(medians.min()), "most": float(medians.max())}
+
+
+def shortest(rows: pd.DataFrame) -> dict[str, Any]:
+    """The shortest call of ours; in how many pairs of mechanism and error a rival takes less, and heyoka is the one."""
+    least, below = float(rows[rows["family"] == "two-loop"]["call_s"].astype(float).min()), []
+    for (_, own), error in product(rows[rows["family"] != "two-loop"].groupby("case", sort=False), DECADES):
+        costs = tables.costs_at(own, error)
+        best = min(costs, key=lambda name: costs[name][0], default=None)
+        below += [best] if best is not None and costs[best][0] < least else []
+    return {"call_s": least, "n": len(below), "heyoka": below.count(HEYOKA)}
 
 
 def put(rows: pd.DataFrame) -> dict[str, Any]:
