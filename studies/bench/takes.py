@@ -4,7 +4,7 @@ from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from studies.bench.render import listed, number, power
+from studies.bench.render import listed, number, one_digit, power
 from studies.bench.solvers import COMPILED, DEFAULT, HEYOKA
 from twoloop.methods.presets import PRESETS
 
@@ -166,7 +166,7 @@ def _singly(first_calls: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
 
 def _paid(line: Mapping[str, Any]) -> str:
     """After about how many runs code has paid, to one digit: single first calls scatter."""
-    first, last = (f"{float(f'{runs:.0e}'):.0f}" for runs in (min(line["pays"]), max(line["pays"])))
+    first, last = one_digit(min(line["pays"])), one_digit(max(line["pays"]))
     after = first if first == last else f"{first} to {last}"
     on = f" on {line['n'] - line['never']} of {line['n']} mechanisms" if line["never"] else ""
     return f"{call(line['solver'])} after some {after} calls{on}"

@@ -178,7 +178,7 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     found["alone"] = [each["case"] for each in made if not any(at["others"] for at in each["at"])]
     asked = {each["case"] for each in made if any(at["verdict"] == "alone" for at in each["at"])}
     found["not_put"] = [name for name in found["alone"] if name not in asked]
-    found["put"] = put(rows)
+    found["put"], found["fewest"] = put(rows), fewest(rows)
     found["with_code"] = [each["case"] for each in made if given_on(each["case"]) == headline.OWN_CODE]
     found["ranges"] = [_within(made, name, errors) for name, errors in RANGES.items()]
     found["typical"] = [each for error in TYPICAL if (each := _typical(made, error)) is not None]
@@ -222,6 +222,15 @@ def residual(rows: pd.DataFrame) -> dict[str, Any] | None:
     if HEADLINE not in medians:
         return None
     return {"here": float(medians[HEADLINE]), "least": float(medians.min()), "most": float(medians.max())}
+
+
+def fewest(rows: pd.DataFrame) -> dict[str, Any]:
+    """The mechanism on which the fewest rivals end a run: how many, of those put to any."""
+    others = rows[rows["family"] != "two-loop"]
+    n = int(others["solver"].nunique())
+    ended = others[others["error_q"].notna()].groupby("case")["solver"].nunique()
+    ended = ended.reindex(rows["case"].unique(), fill_value=0)
+    return {"case": str(ended.idxmin()), "ended": int(ended.min()), "n": n}
 
 
 def shortest(rows: pd.DataFrame) -> dict[str, Any]:
