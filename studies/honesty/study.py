@@ -313,10 +313,10 @@ def picture(totals: Sequence[dict[str, Any]]) -> Figure:
 
     Where all runs of several solvers are right, these share a line.
     """
-    groups: dict[str, list[dict[str, Any]]] = {"ours": [], "others": [], "others, max_step": []}
+    groups: dict[str, list[dict[str, Any]]] = {"ours": [], "rivals": [], "rivals, max_step": []}
     for line in totals:
         limited = line["solver"].endswith(LIMITED)
-        groups["ours" if line["solver"].endswith(OURS) else "others, max_step" if limited else "others"].append(line)
+        groups["ours" if line["solver"].endswith(OURS) else "rivals, max_step" if limited else "rivals"].append(line)
     bars: list[tuple[str, list[float], list[int]]] = []
     ends: dict[str, int] = {}
     for whose, own in groups.items():

@@ -36,6 +36,7 @@ from studies.work_precision import first_calls, goals, minimal, processors, riva
 ERRORS = (1e-2, 1e-4, 1e-6)  # the accuracies of the first screen
 FURTHER = ("Gauss6", IRK_LINE, QUARTER, f"IDA, {IDA_FORMS[0]}")
 STIFF = ("TRBDF2", *RADAU[1:], IDA_C_ORDER_2)  # in their place on stiff cases; the paper's: `studies.beam`
+BETWEEN = (7e-4, 5e-4, 3e-4, 2e-4)  # tolerances of the first of these, whose loose runs lie on no line
 IDA = ("IDA from C", "IDA, ")  # how its lines begin; CVODE is of the same family, and IDAS is CasADi's
 QUICK = (*COMPARED[:4], "RadauIIA5", "IDA, stabilised")  # others take seconds to compile or to run
 QUICK_CASES = ("four-bar",)  # the beams' references take seconds
@@ -50,7 +51,9 @@ def runs(case: Case, quick: bool) -> list[Run]:
         return runs_of(case, QUICK, quick)
     made = runs_of(case, dict.fromkeys((*COMPARED_OWN, *RIVALS, *(STIFF if stiff else FURTHER))), quick)
     coarse = (case.tolerances or TOLERANCES)[::2]
-    return [run for run in made if run.solver.setting != "tol" or run.value in coarse]
+    made = [run for run in made if run.solver.setting != "tol" or run.value in coarse]
+    rough = {run.solver.name: run for run in made if stiff and run.solver.name == STIFF[0]}.values()
+    return made + [replace(run, value=value) for run in rough for value in BETWEEN]
 
 
 def class_of(rows: pd.DataFrame, error: float) -> dict[str, Any]:
