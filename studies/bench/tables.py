@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 from studies.bench.collector import NOTHING_RUN
 from studies.bench.render import number, power
 from studies.bench.runs_by_error import (
+    DECADE,
+    FEWEST,
     astray,
     by_solver,
     cheapest,
@@ -34,6 +36,7 @@ RANKED = (
 )
 NEARLY = 1.25  # runs whose error is above one by a smaller factor nearly get there
 UNASKED = "not run at such an error"
+UNLIKE = 3.0  # times the median time of the repetitions of a run: such a one was not the run alone
 SPREAD = 0.05  # of the median: times whose quartiles are closer are shown without them
 
 
@@ -41,19 +44,39 @@ def medians(rows: pd.DataFrame) -> pd.DataFrame:
     """One row a run: the repetition of median error, with median and quartiles of the time of all calls.
 
     The rows are those of `collect`, in its order: the repetitions of a run one below the other. A run of which any
-    repetition failed is represented by a failed one if half of them or more failed. `times` holds those of all.
+    repetition failed is represented by a failed one if half of them or more failed. `times` holds those of all that
+    are `alike`; `unlike` is how many are not.
     """
     firsts = np.flatnonzero(rows["repeat"].diff().fillna(-1) <= 0)
     errors, times = rows["error_q"].astype(float).fillna(np.inf).to_numpy(), rows["call_s"].to_numpy(float)
     chosen, quartiles, kept = [], [], []
     for run in np.split(np.arange(len(rows)), firsts[1:]):
         chosen.append(run[np.argsort(errors[run], kind="stable")[len(run) // 2]])
-        known = times[run][~np.isnan(times[run])]
+        known = times[run][alike(times[run], errors[run])]
         kept.append(tuple(known))
         quartiles.append(np.percentile(known, (25, 50, 75)) if known.size else np.full(3, np.nan))
     found = rows.iloc[chosen].drop(columns="repeat").reset_index(drop=True)
     found[["call_q1", "call_s", "call_q3"]] = np.array(quartiles)
-    return found.assign(repeats=np.diff(firsts, append=len(rows)), times=pd.Series(kept, dtype=object))
+    repeats = np.diff(firsts, append=len(rows))
+    timed = np.add.reduceat(~np.isnan(times), firsts) if len(rows) else repeats
+    found = found.assign(repeats=repeats, times=pd.Series(kept, dtype=object))
+    return found.assign(unlike=timed - np.array([len(each) for each in kept], int))
+
+
+def alike(times: Array, errors: Array) -> NDArray[np.bool_]:
+    """Which repetitions of a run took a time of the same thing; all that have a time, if fewer than three are left.
+
+    Not those that failed where most ended (a limit of ours), whose error is a decade from the median (another path of
+    steps), or that took UNLIKE times the median (code was built, or the machine was busy).
+    """
+    known = ~np.isnan(times)
+    if known.sum() < FEWEST:
+        return known
+    ended, middle = np.isfinite(errors), np.median(np.sort(errors)[: max(1, int(np.isfinite(errors).sum()))])
+    same = known & (times <= UNLIKE * np.median(times[known]))
+    if 2 * ended.sum() > len(errors):
+        same &= ended & (errors <= DECADE * middle) & (middle <= DECADE * errors)
+    return same if same.sum() >= FEWEST else known
 
 
 def where(rows: pd.DataFrame, **equal: Any) -> pd.DataFrame:

@@ -152,7 +152,7 @@ def report(output: Output, rows: pd.DataFrame, line: str) -> dict[str, Any]:
     found = rivals.findings_of(everywhere)
     findings = findings_of(medians, known) | {"rivals": found}
     findings |= {"goals": goals.findings_of(known, medians, everywhere), "asked": asked(part(rows, rivals.GROUP))}
-    findings["versions"] = versions()
+    findings["versions"], findings["unlike"] = versions(), unlike(pd.concat([medians, everywhere], ignore_index=True))
     findings["first_calls"] = first_calls.findings_of(first_calls.at_error(part(rows, first_calls.GROUP), everywhere))
     findings["unrolled"] = LARGEST_UNROLLED
     in_angles = on_the_same_processor(part(rows, minimal.GROUP), part(rows, rivals.GROUP))
@@ -167,6 +167,13 @@ def report(output: Output, rows: pd.DataFrame, line: str) -> dict[str, Any]:
     text = render("work_precision", findings, {}, stamp=line, quick=output.call.quick)
     output.write("work_precision.md", text)
     return findings
+
+
+def unlike(medians: pd.DataFrame) -> dict[str, Any]:
+    """How many repetitions were not of the run alone, and of which runs."""
+    own = medians[medians["unlike"] > 0]
+    named = [f"{run['solver']} on {run['case']} at {tables.setting(run)}" for _, run in own.iterrows()]
+    return {"n": int(own["unlike"].sum()), "runs": named, "times": tables.UNLIKE}
 
 
 def made_once(medians: pd.DataFrame) -> dict[str, float]:

@@ -178,6 +178,21 @@ def test_the_cheapest_lines_are_the_cheapest():
     assert figures.cheapest_lines(made, (1e-3,), 2) == ["s0", "s1"]
 
 
+def test_repetitions_that_timed_something_else_do_not_count():
+    times, errors = np.array([1.0, 1.1, 9.0, 1.2, 0.9]), np.full(5, 1e-6)
+    assert tables.alike(times, errors).tolist() == [True, True, False, True, True]
+    assert tables.alike(times, np.array([1e-6, 1e-6, 1e-6, 2e-5, np.inf])).tolist() == [True] * 5  # too few are left
+    stopped = np.array([1e-6, 1e-6, 1e-6, 1e-6, np.inf])
+    assert tables.alike(np.ones(5), stopped).tolist() == [True] * 4 + [False]
+    off = np.array([1e-6, 1e-6, 1e-6, 1e-6, 1e-3])
+    assert tables.alike(np.ones(5), off).tolist() == [True] * 4 + [False]
+    assert tables.alike(np.array([1.0, 9.0]), np.full(2, 1e-6)).all()  # of two it is not known which
+    made = pd.concat([rows(("a", 1e-6, time)).assign(repeat=k) for k, time in enumerate(times)], ignore_index=True)
+    found = tables.medians(made.drop(columns=["times", "call_q1", "call_q3"], errors="ignore"))
+    assert found["unlike"].tolist() == [1] and found["times"][0] == (1.0, 1.1, 1.2, 0.9)
+    assert found["call_s"].tolist() == [pytest.approx(1.05)] and found["repeats"].tolist() == [5]
+
+
 def test_the_price_is_the_cheapest_run_that_is_good_enough_however_good():
     """A looser error never costs more than a tighter one."""
     made = rows(("a", 8e-5, 8.7), ("a", 2e-5, 8.5), ("a", 1e-7, 9.0), ("a", 1e-13, 7.7))
