@@ -17,7 +17,8 @@ from twoloop.run.run import LONGEST_UNSEEN
 
 OWN = (GIVEN, "Taylor", "Adams", "DOP853", "Gauss12", "RadauIIA5", "BDF")
 IDA, IDA_C, CVODE_C, HEYOKA = "IDA, stabilised", "IDA from C", "CVODE from C, Adams", "heyoka, Taylor"
-COMPILED_ONLY = (IDA_C, CVODE_C, HEYOKA)
+PROJECTED = "CVODE from C, BDF, projected"
+COMPILED_ONLY = (IDA_C, CVODE_C, PROJECTED, HEYOKA)
 SCIPY = ("LSODA", "DOP853", "Radau", "BDF")
 OF_FORCES = (  # further ones of ours under sharp forces: all presets but the paper's, which follow it to the letter
     *("auto, compiled", "auto, not compiled", "Taylor, compiled", "Gauss4", "Gauss6", "Gauss8", "Gauss10", "Gauss14"),
@@ -44,7 +45,7 @@ def kind_of(name: str) -> str:
         return "default" if name == DEFAULT else "ours"
     if name.endswith(LIMITED):
         return "limited"
-    return "heyoka" if name == HEYOKA else "sundials" if name in (IDA, IDA_C, CVODE_C) else "scipy"
+    return "heyoka" if name == HEYOKA else "sundials" if name in (IDA, IDA_C, CVODE_C, PROJECTED) else "scipy"
 
 
 def own(method: str, trap: Trap) -> Result:
@@ -73,6 +74,7 @@ def solvers(quick: bool, group: str = MISTAKE) -> dict[str, Call]:
         others = {} if group == SHORT else {IDA: partial(solve_ida, form="stabilised")}
         others |= {IDA_C: solve_ida_c}
         others |= {CVODE_C: partial(solve_cvode_c, method="Adams"), HEYOKA: solve_heyoka}
+        others |= {} if group == SHORT else {PROJECTED: partial(solve_cvode_c, method="BDF", projected=True)}
     others |= {f"{name}, index 1": partial(solve_index1, method=name) for name in (QUICK_SCIPY if quick else theirs)}
     made |= {name: partial(other, solve, False) for name, solve in others.items()}
     if group not in (INPUT, SHORT):  # to whose checks steps do not matter; of which max_step is the remedy

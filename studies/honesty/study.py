@@ -33,6 +33,7 @@ from studies.honesty.solvers import (
     LIMITED,
     LOOK,
     OURS,
+    PROJECTED,
     SCIPY,
     Call,
     kind_of,
@@ -58,7 +59,7 @@ REFUSALS = (  # of an adapter or of ours to put the equations, or the setting, t
     *("NotSymbolic", "compiled=True needs equations", "needs callbacks whose operations it can see"),
     *("must be positive definite", "cannot keep a constant one", "LinAlgError"),
 )
-BUILT = (HEYOKA, CVODE_C)  # solvers that are built for each system, which takes longer than they run
+BUILT = (HEYOKA, CVODE_C, PROJECTED)  # solvers that are built for each system, which takes longer than they run
 
 PARTS = {  # of the bars of the figure, in counts of `totals`
     "gross": (f"silently wrong, off by over {power(EXACT)}", figures.RED),
