@@ -41,7 +41,7 @@ SPREAD = 0.05  # of the median: times whose quartiles are closer are shown witho
 
 
 def medians(rows: pd.DataFrame) -> pd.DataFrame:
-    """One row a run: the repetition of median error, with median and quartiles of the time of all calls.
+    """One row a run: the repetition of median error, with medians of the times and quartiles of those of the calls.
 
     The rows are those of `collect`, in its order: the repetitions of a run one below the other. A run of which any
     repetition failed is represented by a failed one if half of them or more failed. `times` holds those of all that
@@ -49,14 +49,18 @@ def medians(rows: pd.DataFrame) -> pd.DataFrame:
     """
     firsts = np.flatnonzero(rows["repeat"].diff().fillna(-1) <= 0)
     errors, times = rows["error_q"].astype(float).fillna(np.inf).to_numpy(), rows["call_s"].to_numpy(float)
-    chosen, quartiles, kept = [], [], []
+    inside = rows["inside_s"].to_numpy(float) if "inside_s" in rows else np.full(len(rows), np.nan)
+    chosen, quartiles, kept, insides = [], [], [], []
     for run in np.split(np.arange(len(rows)), firsts[1:]):
         chosen.append(run[np.argsort(errors[run], kind="stable")[len(run) // 2]])
-        known = times[run][alike(times[run], errors[run])]
+        same = run[alike(times[run], errors[run])]
+        known = times[same]
         kept.append(tuple(known))
+        insides.append(np.median(inside[same]) if same.size else np.nan)
         quartiles.append(np.percentile(known, (25, 50, 75)) if known.size else np.full(3, np.nan))
     found = rows.iloc[chosen].drop(columns="repeat").reset_index(drop=True)
     found[["call_q1", "call_s", "call_q3"]] = np.array(quartiles)
+    found = found.assign(inside_s=insides) if "inside_s" in rows else found
     repeats = np.diff(firsts, append=len(rows))
     timed = np.add.reduceat(~np.isnan(times), firsts) if len(rows) else repeats
     found = found.assign(repeats=repeats, times=pd.Series(kept, dtype=object))

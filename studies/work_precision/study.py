@@ -86,6 +86,7 @@ def findings_of(rows: pd.DataFrame, known: Sequence[Case]) -> dict[str, Any]:
         over = [line["default_over"] for line in at if line["default_over"] is not None]
         slug = "_".join("".join(letter if letter.isalnum() else " " for letter in case.name).split())
         found: dict[str, Any] = {"name": case.name, "tags": list(case.tags), "t_end": case.t_end, "at": at}
+        found["processor"] = str(runs["processor"].iloc[0]) if "processor" in runs else ""
         found |= {"default_dominated": bool(over) and min(over) > 1.0}
         found |= {"default_over": [min(over), max(over)] if over else []}
         listed.append(found | {"figure": f"work_precision_{slug}.png"})

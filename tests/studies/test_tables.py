@@ -187,10 +187,12 @@ def test_repetitions_that_timed_something_else_do_not_count():
     off = np.array([1e-6, 1e-6, 1e-6, 1e-6, 1e-3])
     assert tables.alike(np.ones(5), off).tolist() == [True] * 4 + [False]
     assert tables.alike(np.array([1.0, 9.0]), np.full(2, 1e-6)).all()  # of two it is not known which
-    made = pd.concat([rows(("a", 1e-6, time)).assign(repeat=k) for k, time in enumerate(times)], ignore_index=True)
+    made = [rows(("a", 1e-6, time)).assign(repeat=k, inside_s=0.5 * time) for k, time in enumerate(times)]
+    made = pd.concat(made, ignore_index=True)
     found = tables.medians(made.drop(columns=["times", "call_q1", "call_q3"], errors="ignore"))
     assert found["unlike"].tolist() == [1] and found["times"][0] == (1.0, 1.1, 1.2, 0.9)
     assert found["call_s"].tolist() == [pytest.approx(1.05)] and found["repeats"].tolist() == [5]
+    assert found["inside_s"].tolist() == [pytest.approx(0.525)]
 
 
 def test_the_price_is_the_cheapest_run_that_is_good_enough_however_good():
