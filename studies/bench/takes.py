@@ -111,7 +111,9 @@ def _crossed(rivals: Mapping[str, Any], own: Sequence[Mapping[str, Any]]) -> str
     """Who is ahead where the motion crosses singular positions."""
     verdicts = [at["verdict"] for each in own for at in each["at"]]
     ahead, behind = verdicts.count("ahead"), verdicts.count("behind")
-    standing = next((each["standings"][0] for each in rivals.get("ranges", []) if each["name"].startswith(SINGULAR)), None)
+    standing = next(
+        (each["standings"][0] for each in rivals.get("ranges", []) if each["name"].startswith(SINGULAR)), None
+    )
     default = f", the default in {standing['ahead']} and {standing['behind']}" if standing else ""
     whose = "one of our methods" if ahead > behind else "another project's solver"
     return f"{whose} (our best is ahead in {ahead} and behind in {behind} comparisons{default})"

@@ -280,16 +280,18 @@ def picture(rows: pd.DataFrame) -> Figure:
     rows = rows[rows["case"] == HEADLINE]
     figure, axes = plt.subplots(figsize=(7.6, 4.4), layout="constrained")
     priced = (headline.price(rows, rows[:0], HEADLINE) or {"lines": []})["lines"]
-    named = [at["solver"] for line in priced for at in line["at"] if at["solver"]]
+    named, once = [at["solver"] for line in priced for at in line["at"] if at["solver"]], []
     for solver in dict.fromkeys([*figures.lines_of(rows, SHOWN), *named]):
         line = figures.with_gaps(rows[rows["solver"] == solver])
         look = figures.look(line[line["error_q"].notna()].iloc[0])
         look["label"] = SAID.get(solver, solver)
         axes.plot(line["error_q"].astype(float), 1e3 * line["call_s"].astype(float), **look)
-        once = line[line["repeats"] == 1] if "repeats" in line else line[:0]
-        alone = {"linestyle": "", "marker": "+", "color": "black", "markersize": 9, "zorder": 4, "label": "timed once"}
-        if len(once):
-            axes.plot(once["error_q"].astype(float), 1e3 * once["call_s"].astype(float), **alone)
+        once += [line[line["repeats"] == 1]] if "repeats" in line else []
+    single = pd.concat(once) if once else rows[:0]
+    alone = {"linestyle": "", "marker": "+", "color": "black", "markersize": 6, "markeredgewidth": 0.6, "zorder": 4}
+    if len(single):
+        errors, times = single["error_q"].astype(float), 1e3 * single["call_s"].astype(float)
+        axes.plot(errors, times, **alone, label="timed once")
     error = "error after 10 s, over max(1, max |q|)"
     axes.set(xscale="log", yscale="log", xlabel=error, ylabel="CPU time of the call (ms)")
     figures.legend(figure, [axes], figures.LEGEND)
