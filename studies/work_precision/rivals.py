@@ -288,7 +288,14 @@ def picture(rows: pd.DataFrame) -> Figure:
         axes.plot(line["error_q"].astype(float), 1e3 * line["call_s"].astype(float), **look)
         once += [line[line["repeats"] == 1]] if "repeats" in line else []
     single = pd.concat(once) if once else rows[:0]
-    alone = {"linestyle": "", "marker": "+", "color": "black", "markersize": 6, "markeredgewidth": 0.6, "zorder": 4}
+    alone: dict[str, Any] = {
+        "linestyle": "",
+        "marker": "+",
+        "color": "black",
+        "markersize": 6,
+        "markeredgewidth": 0.6,
+        "zorder": 4,
+    }
     if len(single):
         errors, times = single["error_q"].astype(float), 1e3 * single["call_s"].astype(float)
         axes.plot(errors, times, **alone, label="timed once")
