@@ -85,6 +85,9 @@ def at(runs: pd.DataFrame, error: float) -> dict[str, Any]:
     seconds = dict(zip(ranked["solver"], ranked["call_s"], strict=True))
     found: dict[str, Any] = {"error": error, "best": tables.best(ranked)}
     found |= tables.of_both(ranked)
+    own = runs["family"] == "two-loop"
+    sides = tables.costs_at(runs[own], error), tables.costs_at(runs[~own], error, doubt=True)
+    found["verdict"] = tables.compared(*sides)["verdict"]
     found |= dict.fromkeys(("ida_over_ours", "paper_over_best"))
     ida = min((seconds[name] for name in (IDA_C, IDA_C_ORDER_2) if name in seconds), default=None)
     if ida is not None and found["ours"] is not None:

@@ -56,7 +56,7 @@ mpl.rcParams.update(
 # Okabe and Ito's colours, told apart by colour-blind readers; a marker besides, and dashes for other families
 BLACK, ORANGE, SKY, GREEN = "#000000", "#E69F00", "#56B4E9", "#009E73"
 YELLOW, BLUE, RED, PINK, GREY, BROWN = "#B39B00", "#0072B2", "#D55E00", "#CC79A7", "#7F7F7F", "#7A4A12"
-VIOLET, MAGENTA = "#6A3D9A", "#D4006A"  # more, as ours and others' share none
+VIOLET, MAGENTA, SLATE, STEEL = "#6A3D9A", "#D4006A", "#2F4F6F", "#4FA3A5"  # more, as ours and others' share none
 OLIVE, CRIMSON, LIME, TAN, ROSE, LAVENDER = "#556B2F", "#8B0000", "#8CC63E", "#C49C6B", "#FF9D9A", "#A99BD8"
 
 # a colour is of one family of solvers alone; in it each has a marker, and those that a work-precision figure mostly
@@ -71,7 +71,8 @@ OURS: dict[str, dict[str, str]] = {
     BROWN: {"RadauIIA5": "^", "RadauIIA9": "o", "RadauIIA13": "s", "RadauIIA5, by differences": "<"},
     OLIVE: {"TRBDF2": "v", "ESDIRK4": "^"},
     CRIMSON: {"BDF": "P"},
-    GREY: {"Newmark": "h", "PaperNewmark (beta = 1/2)": "X", "PaperNewmark, beta = 1/4": "s"},
+    GREY: {"Newmark": "h", "PaperNewmark (beta = 1/2)": "X"},
+    SLATE: {"PaperNewmark, beta = 1/4": "s"},
     YELLOW: {"PaperIRK": "H", "PaperIRK, Atol = Rtol varied": "H"},
 }
 THEIRS: dict[str, dict[str, str]] = {
@@ -89,7 +90,8 @@ THEIRS: dict[str, dict[str, str]] = {
         "IDA, index1": "h",
         "IDA, stabilised": "s",
     }
-    | {"IDA from C, order 2, positions tested": "X", "GSTIFF stand-in, order 2": "2"},
+    | {"IDA from C, order 2, positions tested": "X"},
+    STEEL: {"GSTIFF stand-in, order 2": "2"},
     LIME: {"LSODA, index 1": "p", "DOP853, index 1": "8", "DOP853, projected": "X", "DOP853, Baumgarte 10": "^"}
     | {"Radau, index 1": "d", "BDF, index 1": "D", "GSTIFF stand-in, order 4": "4"},
     TAN: {"Exudyn, GeneralizedAlpha": "D", "Exudyn, TrapezoidalIndex2": "^", "GSTIFF stand-in, order 5": "+"}

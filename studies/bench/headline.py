@@ -105,10 +105,10 @@ def price(rows: pd.DataFrame, firsts: pd.DataFrame, case: str) -> dict[str, Any]
     dict
         case, processor ("": not kept), t_end, errors, first_at (tolerance of the first calls, None without them),
         elsewhere_s (what a call of the default from another start takes longer, None where that was not measured), and
-        lines: name, first_s or None,
-        and at each error solver, call_s, inside_s (of it inside the integrator, of the cheapest run that is good
-        enough; None of rivals), keeps (the constraints), from_python and near (asked, error and call_s of a run that
-        nearly gets there and takes much less, or None), or in their place why there is none: "not run", "not reached",
+        lines: name, first_s or None, and at each error solver, call_s, inside_s (of it inside the integrator, of the
+        cheapest run that is good enough; None of rivals), repeats of that run (0: not kept), keeps (the constraints),
+        from_python and near (asked, error and call_s of a run that nearly gets there and takes much less, or None), or
+        in their place why there is none: "not run", "not reached",
         "not asked".
     """
     rows = rows[rows["case"] == case]
@@ -147,8 +147,9 @@ def _priced(runs: pd.DataFrame, error: float, rival: bool) -> dict[str, Any]:
             "keeps": bool(line["keeps_constraints"]),
             "from_python": bool(line["called_from"] == "Python"),
         }
-        inside_s = None if rival else float(tables.run_for(own, error)["inside_s"])
-        told |= {"inside_s": inside_s, "near": _near(runs, error, call_s)}
+        run = tables.run_for(own, error)
+        inside_s = None if rival else float(run["inside_s"])
+        told |= {"inside_s": inside_s, "near": _near(runs, error, call_s), "repeats": int(run.get("repeats", 0))}
         return {"solver": solver, "call_s": float(call_s), "why": None} | told
     put = tables.put(runs)
     missed = all(tables.missed(own, error) for _, own in put.groupby("solver"))

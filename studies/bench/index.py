@@ -80,6 +80,7 @@ def _entry(label: str, case: dict[str, Any], at: list[dict[str, Any]]) -> dict[s
     missed = [line for line in reached if line["ida_missed"]]
     made = {"class": label, "name": case["name"], "t_end": case["t_end"], "at": at, "picks": picks(at)}
     made |= {"ida_over": over, "ida_misses": [line["accuracy"] for line in missed], "without_drift": []}
+    made["processor"] = case.get("processor", "")
     return made | {"ida_tightest": max((line["ida_tightest"] for line in missed), default=None)}
 
 

@@ -45,6 +45,11 @@ def power(value: float) -> str:
     return f"{mantissa}e{int(exponent)}"
 
 
+def one_digit(value: float) -> str:
+    """A count to one digit: 30000 for 29817."""
+    return f"{float(f'{value:.0e}'):.0f}"
+
+
 def brief(stamp: str) -> str:
     """Command, date, commit and machine of a stamp; the first line of the CSV has the versions, too."""
     return "; ".join(stamp.split("; ")[:4])
@@ -89,6 +94,7 @@ def environment() -> jinja2.Environment:
     )
     made.filters |= {"code": code, "num": number, "power": power, "pct": percent, "listed": listed}
     made.filters["brief"] = brief
+    made.filters["digit"] = one_digit
     made.globals["table"] = table
     return made
 

@@ -200,12 +200,15 @@ def noise(name: str, g: np.random.Generator) -> Sharp:
     return force
 
 
+def gust(width: float) -> Callable[..., Sharp]:
+    """draw(name, generator) of a gust of about this width (s) at a random time."""
+    size = log(5.0, 50.0, (0.03 / width) ** 0.5)
+    return family(3, about(), c=between(0.3, 2.3), b=log(0.7, 1.4, width), a=size)
+
+
 def families() -> dict[str, Draw]:
     """Name to draw(generator), which returns a force of that family with random numbers."""
     when, size = between(0.3, 2.3), log(5.0, 50.0)
-
-    def gust(width: float) -> Callable[..., Sharp]:
-        return family(3, about(), c=when, b=log(0.7, 1.4, width), a=log(5.0, 50.0, (0.03 / width) ** 0.5))
 
     def jumps(b: float, c: float) -> dict[str, Any]:
         return {"breaks": (c,)}

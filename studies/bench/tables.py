@@ -11,7 +11,7 @@ from studies.bench.collector import NOTHING_RUN
 from studies.bench.render import number, power
 from studies.bench.runs_by_error import astray, by_solver, errors_of, runs_with, setting_of
 from studies.bench.store import Array
-from twoloop.rows.equal_error import INTERVAL, LEAST, cheapest, cost_at, place_of, resampled
+from twoloop.rows.equal_error import DECADE, FEWEST, INTERVAL, LEAST, cheapest, cost_at, place_of, resampled
 
 TIGHTEST = 1e-13  # tolerance of which tighter ones are of no use
 LIMITED = ("TIME_LIMIT", "MAX_STEPS")  # statuses of runs that we ended
@@ -23,26 +23,51 @@ RANKED = (
 )
 NEARLY = 1.25  # runs whose error is above one by a smaller factor nearly get there
 UNASKED = "not run at such an error"
+UNLIKE = 3.0  # times the median time of the repetitions of a run: such a one was not the run alone
 SPREAD = 0.05  # of the median: times whose quartiles are closer are shown without them
 
 
 def medians(rows: pd.DataFrame) -> pd.DataFrame:
-    """One row a run: the repetition of median error, with median and quartiles of the time of all calls.
+    """One row a run: the repetition of median error, with medians of the times and quartiles of those of the calls.
 
     The rows are those of `collect`, in its order: the repetitions of a run one below the other. A run of which any
-    repetition failed is represented by a failed one if half of them or more failed. `times` holds those of all.
+    repetition failed is represented by a failed one if half of them or more failed. `times` holds those of all that
+    are `alike`; `unlike` is how many are not.
     """
     firsts = np.flatnonzero(rows["repeat"].diff().fillna(-1) <= 0)
     errors, times = rows["error_q"].astype(float).fillna(np.inf).to_numpy(), rows["call_s"].to_numpy(float)
-    chosen, quartiles, kept = [], [], []
+    inside = rows["inside_s"].to_numpy(float) if "inside_s" in rows else np.full(len(rows), np.nan)
+    chosen, quartiles, kept, insides = [], [], [], []
     for run in np.split(np.arange(len(rows)), firsts[1:]):
         chosen.append(run[np.argsort(errors[run], kind="stable")[len(run) // 2]])
-        known = times[run][~np.isnan(times[run])]
+        same = run[alike(times[run], errors[run])]
+        known = times[same]
         kept.append(tuple(known))
+        insides.append(np.median(inside[same]) if same.size else np.nan)
         quartiles.append(np.percentile(known, (25, 50, 75)) if known.size else np.full(3, np.nan))
     found = rows.iloc[chosen].drop(columns="repeat").reset_index(drop=True)
     found[["call_q1", "call_s", "call_q3"]] = np.array(quartiles)
-    return found.assign(repeats=np.diff(firsts, append=len(rows)), times=pd.Series(kept, dtype=object))
+    found = found.assign(inside_s=insides) if "inside_s" in rows else found
+    repeats = np.diff(firsts, append=len(rows))
+    timed = np.add.reduceat(~np.isnan(times), firsts) if len(rows) else repeats
+    found = found.assign(repeats=repeats, times=pd.Series(kept, dtype=object))
+    return found.assign(unlike=timed - np.array([len(each) for each in kept], int))
+
+
+def alike(times: Array, errors: Array) -> NDArray[np.bool_]:
+    """Which repetitions of a run took a time of the same thing; all that have a time, if fewer than three are left.
+
+    Not those that failed where most ended (a limit of ours), whose error is a decade from the median (another path of
+    steps), or that took UNLIKE times the median (code was built, or the machine was busy).
+    """
+    known = ~np.isnan(times)
+    if known.sum() < FEWEST:
+        return known
+    ended, middle = np.isfinite(errors), np.median(np.sort(errors)[: max(1, int(np.isfinite(errors).sum()))])
+    same = known & (times <= UNLIKE * np.median(times[known]))
+    if 2 * ended.sum() > len(errors):
+        same &= ended & (errors <= DECADE * middle) & (middle <= DECADE * errors)
+    return same if same.sum() >= FEWEST else known
 
 
 def where(rows: pd.DataFrame, **equal: Any) -> pd.DataFrame:
@@ -67,7 +92,7 @@ def time_for(rows: pd.DataFrame, target: float, what: str = "call_s") -> float:
 def run_for(rows: pd.DataFrame, target: float) -> pd.Series:
     """The run of one solver that `time_for` prices, where there is one."""
     runs = runs_with(rows, "call_s")
-    place = place_of(runs, target)
+    place = place_of(runs, target, unasked=True)
     assert place is not None
     return rows.iloc[cheapest(runs, place)]
 
@@ -76,24 +101,23 @@ Costs = dict[str, tuple[float, Array]]  # by solver the time at an error, and dr
 
 
 def costs_at(rows: pd.DataFrame, target: float, doubt: bool = False) -> Costs:
-    """Of the solvers of one case that get to an error and were asked for about so much, what they take.
+    """Of the solvers of one case that get to an error, what the cheapest run takes that is good enough.
 
-    `doubt`: of those, too, that get there but were not asked for about so much, by the cheaper of the two runs on
-    either side, so that no solver is ahead of another for want of a run. A run out of phase is on neither side.
+    `doubt`: of those that were not asked for about so much, the next looser run counts as good enough, so that no
+    solver is ahead of another for want of a run. A run out of phase does not.
     """
     found = {}
     for solver, runs in by_solver(rows, "call_s").items():
-        place = place_of(runs, target)
-        if place is None and doubt and target >= runs.floor:
-            n_good = int((runs.errors <= target).sum())
-            looser = n_good < len(runs.errors) and not runs.of("astray")[n_good]
-            place = None if n_good == 0 else (n_good - 1, n_good + looser, None)
-        if place is not None:
-            costs, drawn = runs.of("call_s"), runs.drawn()
-            first, n_good, _ = place
-            if np.isnan(drawn[first + np.argmin(costs[first:n_good])]).any():  # of the cheapest it is not known
-                drawn[:] = np.nan
-            found[solver] = float(cost_at(costs, place)), cost_at(drawn, place)
+        place = place_of(runs, target, unasked=True)
+        if place is None:
+            continue
+        if doubt and place_of(runs, target) is None:
+            n_good = place[0]
+            place = n_good + (n_good < len(runs.errors) and not runs.of("astray")[n_good]), None
+        costs, drawn = runs.of("call_s"), runs.drawn()
+        if np.isnan(drawn[np.argmin(costs[: place[0]])]).any():  # of the cheapest it is not known
+            drawn[:] = np.nan
+        found[solver] = float(cost_at(costs, place)), cost_at(drawn, place)
     return found
 
 
@@ -141,7 +165,7 @@ def compared(own: Costs, others: Costs) -> dict[str, Any]:
 
 
 def ranking(rows: pd.DataFrame, target: float) -> pd.DataFrame:
-    """The solvers of one case that reach an error, cheapest first.
+    """The solvers of one case that reach an error, cheapest first; others' only where asked for about so much.
 
     Returns
     -------
@@ -151,7 +175,8 @@ def ranking(rows: pd.DataFrame, target: float) -> pd.DataFrame:
     """
     lines = []
     for solver, runs in by_solver(rows, *COSTS).items():
-        place = place_of(runs, target)
+        ours = rows.iloc[runs.rows[0]]["family"] == "two-loop" if len(runs.rows) else False
+        place = place_of(runs, target, unasked=ours)
         if place is None:
             continue
         run = rows.iloc[cheapest(runs, place)]

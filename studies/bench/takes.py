@@ -4,59 +4,132 @@ from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from studies.bench.render import listed, number
-from studies.bench.solvers import COMPILED, DEFAULT
+from studies.bench.render import listed, number, one_digit, power
+from studies.bench.solvers import COMPILED, DEFAULT, HEYOKA
 from twoloop.methods.presets import PRESETS
 
-_UNDECIDED = "the default: no solver is told apart from the others"
-DECIDED = ("ahead", "behind", "alone")  # verdicts by which one is the cheapest
+DECIDED = ("ahead", "behind", "alone", "missed")  # verdicts by which one solver is the cheapest
 SUFFIX = " (twoloop)"  # of our solvers, in the findings of honesty
-KINDS = {  # tags of mechanisms, and what a user calls them
+SMOOTH, STIFF, SINGULAR, LONG = "short smooth motion", "stiff", "singular", "long and conservative"
+KINDS = {  # tags of mechanisms, and what a user calls them; a mechanism of several counts for the first
+    STIFF: "stiff springs and dampers",
+    SINGULAR: "singular positions on the way",
+    "driven": "driven by a given motion",
+    "non-holonomic": "rolling, or sliding on an edge",
     "redundant": "redundant constraints",
     "spatial": "spatial",
-    "driven": "driven by a given motion",
-    "non-holonomic": "rolling, or sliding on an edge: non-holonomic",
 }
-
-OTHER_KINDS = {*KINDS, "singular", "stiff"}  # of which the table says more
+BEAMS = {  # of the study of the beam, and their classes
+    "moderately stiff": "stiff beam, vibrations irrelevant",
+    "very flexible": "flexible beam, vibrations wanted",
+}
+BEAM_CLASSES = ("stiff, vibrations irrelevant", "stiff, vibrations wanted")  # which the beam's report judges by the tip
 
 
 def takes(found: Mapping[str, Any], groups: Sequence[Sequence[dict[str, Any]]]) -> list[dict[str, str]]:
     """For each class of problem (`groups`, those of `index.advice`) and kind of mechanism, what is the cheapest."""
-    rows, made = [], found.get("work_precision", {})
-    with_code = set(made.get("rivals", {}).get("with_code", []))
-    for group in groups:
-        coded = with_code.issuperset(entry["name"].partition(",")[0] for entry in group)  # whatever its lengths
-        motions = "; ".join(f"{entry['name']}, {number(entry['t_end'])} s" for entry in group)
-        what = f"{group[0]['class']} ({motions})"
-        named = [(call(pick["solver"], coded), listed(pick["accuracies"])) for pick in group[0]["picks"]]
-        picks = [f"{solver} for errors of {errors}" for solver, errors in named]
-        open_at = dict.fromkeys(at for entry in group for pick in entry["picks"] for at in pick["undecided"])
-        doubt = f" (undecided: {listed(open_at)})" if open_at else ""
-        picks = picks or ["no solver compared reaches these errors"]
-        free = group[0].get("without_drift", [])
-        calm = [f"{call(pick['solver'])} for {listed(pick['accuracies'])}" for pick in free]
-        without = f"; its energy drifts or wanders; without drift: {'; '.join(calm)}" if calm else ""
-        rows.append({"what": what, "take": "; ".join(picks) + doubt + without})
-    often = [*_often(made.get("first_calls", [])), *_at_once(found.get("ensembles", {}).get("cases", []))]
-    mechanisms = made.get("rivals", {}).get("mechanisms", [])
-    short = [each for each in mechanisms if each.get("tags") and not OTHER_KINDS & {*each["tags"]}]
-    rows += [*_of_short_calls(short, with_code), *_of_kinds(mechanisms, with_code)]
-    return rows + ([{"what": "run many times", "take": "; ".join(often)}] if often else [])
+    made = found.get("work_precision", {})
+    rivals = made.get("rivals", {})
+    with_code = set(rivals.get("with_code", []))
+    classes: dict[str, list[dict[str, Any]]] = defaultdict(list)
+    for entry in (entry for group in groups for entry in group):
+        classes[entry["class"]].append(entry)
+    rows = _of_kinds(rivals, with_code)
+    rows += [_of_class(name, own, with_code) for name, own in classes.items() if name not in (*BEAM_CLASSES, LONG)]
+    rows += [_by_the_tip(case) for case in found.get("beam", {}).get("cases", []) if case["name"] in BEAMS]
+    rows += [_of_energy(entry, "four-bar" in with_code) for entry in classes[LONG]]
+    rows += _at_once(found.get("ensembles", {}).get("cases", [])) + _singly(made.get("first_calls", []))
+    return rows + _in_angles(made.get("minimal", {}))
 
 
-def _of_short_calls(mechanisms: Sequence[Mapping[str, Any]], with_code: set[str]) -> list[dict[str, str]]:
-    """Who is the cheapest on the other smooth mechanisms, whose calls take milliseconds."""
-    cheapest = Counter(_cheapest(each["at"]) for each in mechanisms)
-    cheapest.pop("", None)
-    if not cheapest:
-        return []
-    coded = with_code.issuperset(each["case"] for each in mechanisms)
-    parts = [f"{call(solver, coded)} on {n}" for solver, n in cheapest.most_common()]
-    times = [run["call_s"] for each in mechanisms for line in each["at"] if (run := _first(line))]
-    least, most = number(1e3 * min(times)), number(1e3 * max(times))
-    n, what = len(mechanisms), f"other smooth, rigid mechanisms, in calls of {least} to {most} ms"
-    return [{"what": what, "take": f"of {n} mechanisms, the cheapest at most errors: {', '.join(parts)}"}]
+def _of_class(name: str, entries: Sequence[dict[str, Any]], with_code: set[str]) -> dict[str, str]:
+    """At how many errors, on all mechanisms of a class, each solver is the cheapest."""
+    coded = with_code.issuperset(entry["name"].partition(",")[0] for entry in entries)  # whatever its lengths
+    won: Counter[str] = Counter()
+    for pick in (pick for entry in entries for pick in entry["picks"]):
+        won.update({pick["solver"]: len(pick["accuracies"]) - len(pick["undecided"]), "": len(pick["undecided"])})
+    times = listed(dict.fromkeys(number(entry["t_end"]) for entry in entries))
+    what = f"{name} ({listed(dict.fromkeys(entry['name'] for entry in entries))}, {times} s)"
+    return {"what": what, "take": _shares(won, "errors", coded) or "no solver compared reaches these errors"}
+
+
+def _shares(won: Mapping[str, int], of: str, coded: bool) -> str:
+    """Each solver with how often it is the cheapest ("": none is told from the others), the most often first."""
+    total, ranked = sum(won.values()), sorted(won.items(), key=lambda item: -item[1])
+    parts = [f"{call(solver, coded)} ({n} of {total} {of})" for solver, n in ranked if solver and n]
+    return ", ".join(parts) or ("no clear choice" if total else "")
+
+
+def _by_the_tip(case: Mapping[str, Any]) -> dict[str, str]:
+    """The cheapest on a beam by the error of its tip; two where neither is clearly cheaper."""
+    by: dict[str, list[str]] = defaultdict(list)
+    for at in case["at"]:
+        if at["best"] is not None:
+            undecided = at.get("verdict") == "undecided"
+            names = [at[which]["solver"] for which in (("ours", "others") if undecided else ("best",))]
+            by[" or ".join(call(name) for name in names)].append(power(at["error"]))
+    take = ", ".join(f"{who} ({listed(errors)} m)" for who, errors in by.items())
+    return {"what": f"{BEAMS[case['name']]}, by its tip", "take": take or "no solver compared reaches these errors"}
+
+
+def _of_energy(entry: Mapping[str, Any], coded: bool) -> dict[str, str]:
+    """The cheapest for an error of the energy over a long time, and the cheapest whose energy does not drift."""
+    sides = (entry["picks"], entry.get("without_drift", []))
+    told = [listed(dict.fromkeys(call(pick["solver"], coded) for pick in picks)) for picks in sides]
+    without = f"; without drift {told[1]}" if told[1] else ""
+    what = f"energy over {power(entry['t_end'])} s (four-bar, timed once each)"
+    return {"what": what, "take": (told[0] or "no solver compared reaches these errors") + without}
+
+
+def _of_kinds(rivals: Mapping[str, Any], with_code: set[str]) -> list[dict[str, str]]:
+    """Of each kind of mechanism who is the cheapest; kinds on most of whose mechanisms one solver is, in one row."""
+    kinds: dict[str, list[Mapping[str, Any]]] = {kind: [] for kind in ("", *KINDS)}
+    for each in rivals.get("mechanisms", []):
+        if each.get("tags"):  # the four-bars are a class of their own
+            kinds[next((kind for kind in KINDS if kind in each["tags"]), "")].append(each)
+    groups: dict[str, list[str]] = defaultdict(list)
+    rows = []
+    for kind, own in kinds.items():
+        if kind == SINGULAR and own:
+            rows.append({"what": KINDS[kind], "take": _crossed(rivals, own)})
+        elif kind == STIFF and own:
+            rows += [{"what": f"{KINDS[kind]} ({each['case']})", "take": _by_error(each["at"])} for each in own]
+        elif own:
+            most = Counter(_cheapest(each["at"]) for each in own).most_common(1)[0]
+            groups[most[0] if 2 * most[1] > len(own) else ""].append(kind)
+    first = []
+    for of in (kinds_of for _, kinds_of in sorted(groups.items(), key=lambda item: not item[0])):
+        these = [each for kind in of for each in kinds[kind]]
+        won = Counter(_cheapest(each["at"]) for each in these)
+        coded = with_code.issuperset(each["case"] for each in these)
+        words = "; ".join(KINDS.get(kind, SMOOTH) for kind in of)
+        first.append({"what": words, "take": _shares(won, "mechanisms", coded)})
+    return first + rows
+
+
+def _crossed(rivals: Mapping[str, Any], own: Sequence[Mapping[str, Any]]) -> str:
+    """Who is ahead where the motion crosses singular positions."""
+    verdicts = [at["verdict"] for each in own for at in each["at"]]
+    ahead, behind = verdicts.count("ahead"), verdicts.count("behind")
+    standing = next(
+        (each["standings"][0] for each in rivals.get("ranges", []) if each["name"].startswith(SINGULAR)), None
+    )
+    default = f", the default in {standing['ahead']} and {standing['behind']}" if standing else ""
+    whose = "one of our methods" if ahead > behind else "another project's solver"
+    return f"{whose} (our best is ahead in {ahead} and behind in {behind} comparisons{default})"
+
+
+def _by_error(at: Sequence[Mapping[str, Any]]) -> str:
+    """The cheapest from one error to another."""
+    by: dict[str, list[float]] = defaultdict(list)
+    for line in at:
+        run = _first(line)
+        if run:
+            by[call(run["solver"]) if line["verdict"] in DECIDED else ""].append(line["error"])
+    by.pop("", None)
+    spans = {who: (power(max(errors)), power(min(errors))) for who, errors in by.items()}
+    said = [f"{who} ({high}{f' to {low}' if low != high else ''})" for who, (high, low) in spans.items()]
+    return ", ".join(said) or "no solver compared reaches these errors"
 
 
 def _first(line: Mapping[str, Any]) -> Mapping[str, Any] | None:
@@ -65,86 +138,49 @@ def _first(line: Mapping[str, Any]) -> Mapping[str, Any] | None:
     return min(runs, key=lambda run: run["call_s"], default=None)
 
 
-def _of_kinds(mechanisms: Sequence[Mapping[str, Any]], with_code: set[str]) -> list[dict[str, str]]:
-    """Of each kind who is the cheapest on all mechanisms; of the other kinds who is it on which mechanism."""
-    open_kinds, told = [], set()
-    closed: dict[str, list[tuple[str, set[str]]]] = defaultdict(list)
-    others: dict[str, Sequence[Mapping[str, Any]]] = {}
-    for kind, words in KINDS.items():
-        own = [each for each in mechanisms if kind in each.get("tags", ())]
-        these = [each["at"] for each in own]
-        cheapest = Counter(_cheapest(at) for at in these)
-        solver, n = max(cheapest.items(), key=lambda item: (item[0] != "", item[1]), default=("", 0))
-        if solver and n == len(these):
-            cases = {each["case"] for each in own}
-            closed[solver].append((words, cases))
-            told |= cases
-        elif these:
-            open_kinds.append(words)
-            others |= {each["case"]: each["at"] for each in own}
-    rows = []
-    for solver, kinds in closed.items():
-        every = set().union(*(cases for _, cases in kinds))
-        n = len(every)
-        said = f"{call(solver, with_code >= every)}, the cheapest at most errors on {n} of {n} such mechanisms"
-        rows.append({"what": "; ".join(words for words, _ in kinds), "take": said})
-    left = {case: at for case, at in others.items() if case not in told}
-    by_solver: dict[str, list[str]] = defaultdict(list)
-    for case, at in left.items():
-        by_solver[_cheapest(at)].append(case)
-    open_ones = by_solver.pop("", [])
-    if open_kinds:
-        ranked = sorted(by_solver.items(), key=lambda item: -len(item[1]))
-        parts = [f"{call(solver, with_code.issuperset(cases))} on {listed(cases)}" for solver, cases in ranked]
-        parts += [f"none is the cheapest at most errors on {listed(open_ones)}"] if open_ones else []
-        rows.append({"what": "; ".join(open_kinds), "take": "; ".join(parts) if by_solver else _UNDECIDED})
-    return rows
+def _cheapest(at: Sequence[Mapping[str, Any]]) -> str:
+    """The cheapest solver at more than half of the errors that any solver reaches on a mechanism; "": there is none.
 
-
-def _won(at: Sequence[Mapping[str, Any]]) -> Counter[str]:
-    """At how many errors that any solver reaches on one mechanism each solver is the cheapest.
-
-    Errors at which ours and others are not told apart, or others were not asked, count for "".
+    Errors at which ours and others cannot be ranked, or others were not run, count for none.
     """
     won: Counter[str] = Counter()
     for line in at:
-        best, decided = _first(line), line["verdict"] in ("ahead", "behind", "alone", "missed")
-        won.update([best["solver"] if decided else ""] if best else [])
-    return won
-
-
-def _cheapest(at: Sequence[Mapping[str, Any]]) -> str:
-    """The cheapest solver at more than half of the errors on one mechanism; "" where there is none."""
-    won = _won(at)
+        best = _first(line)
+        won.update([best["solver"] if line["verdict"] in DECIDED else ""] if best else [])
     solver, n = won.most_common(1)[0] if won else ("", 0)
     return solver if 2 * n > won.total() else ""
 
 
-def _often(first_calls: Sequence[Mapping[str, Any]]) -> list[str]:
-    """By which run what is built has paid, by the first calls: the default's code, and the cheapest later call."""
-    paying = [line for line in first_calls if line["pays"] and line["solver"] != DEFAULT]
-    cheapest = min(paying, key=lambda line: float(line["call_s"]), default=None)
-    told = [line for line in paying if line["solver"] == f"{DEFAULT}, compiled" or line is cheapest]
-    parts = [f"{_paid(line)}{', the cheapest later call' if line is cheapest else ''}" for line in told]
-    return [f"in single calls with an error of 1e-8: {'; '.join(parts)}"] if parts else []
+def _at_once(cases: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
+    """Who is the cheapest where many runs are one call."""
+    won: Counter[str] = Counter()
+    for each in cases:
+        best = Counter(min(at["run_s"], key=at["run_s"].get) if at["verdict"] in DECIDED else "" for at in each["at"])
+        won.update([best.most_common(1)[0][0]] if best else [])
+    return [{"what": "many runs in one call", "take": _shares(won, "mechanisms", False)}] if won.total() else []
+
+
+def _singly(first_calls: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
+    """After how many single calls what is built has paid."""
+    paid = [_paid(line) for line in first_calls if line["pays"] and line["solver"] in (f"{DEFAULT}, compiled", HEYOKA)]
+    return [{"what": "many single calls", "take": f"{' and '.join(paid)}, against `compiled=False`"}] if paid else []
 
 
 def _paid(line: Mapping[str, Any]) -> str:
-    first, last = min(line["pays"]), max(line["pays"])
-    by = f"run {first:.0f}" if first == last else f"run {first:.0f} to {last:.0f}"
-    return f"code of {call(line['solver'])} pays from {by} on {line['n'] - line['never']} of {line['n']} mechanisms"
+    """After about how many runs code has paid, to one digit: single first calls scatter."""
+    first, last = one_digit(min(line["pays"])), one_digit(max(line["pays"]))
+    after = first if first == last else f"{first} to {last}"
+    on = f" on {line['n'] - line['never']} of {line['n']} mechanisms" if line["never"] else ""
+    return f"{call(line['solver'])} after some {after} calls{on}"
 
 
-def _at_once(cases: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Who is the cheapest at most errors where many runs are one call, by mechanism."""
-    by_way: dict[str, list[str]] = {}
-    for each in cases:
-        won = Counter(min(at["run_s"], key=at["run_s"].get) if at["verdict"] in DECIDED else "" for at in each["at"])
-        if won:
-            by_way.setdefault(won.most_common(1)[0][0], []).append(each["case"])
-    ways = sorted(by_way.items(), key=lambda item: (item[0] == "", -len(item[1])))
-    parts = [f"{f'`{way}`' if way else 'undecided'} on {listed(names)}" for way, names in ways]
-    return [f"in one call {', '.join(parts)}"] if any(by_way) else []
+def _in_angles(minimal: Mapping[str, Any]) -> list[dict[str, str]]:
+    """An ODE in minimal coordinates beside our best with constraints."""
+    if not minimal.get("n") or minimal["n_behind"] <= minimal["n_ahead"]:
+        return []
+    pairs = f"{minimal['n_behind']} of {minimal['n']} comparisons"
+    take = f"an ODE in angles (faster than our best in {pairs}, {number(minimal['median'])} of the time in the median)"
+    return [{"what": "loops that close in closed form", "take": take}]
 
 
 def call(solver: str, coded: bool = False) -> str:

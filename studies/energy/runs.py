@@ -18,6 +18,7 @@ from studies.bench.reference_motion import ReferenceMotion
 from studies.bench.solvers import (
     CATALOGUE,
     CVODE_C,
+    CVODE_C_PROJECTED,
     CVODES,
     DEFAULT,
     DIFFRAX,
@@ -139,17 +140,19 @@ def _exudyn(solver: str, case: Case, h: float, repeat: int) -> Result:
 
 
 FINE = (1e-6, 1e-8, 1e-10, 1e-12)
+FINER = (1e-6, 3e-7, 1e-7, 3e-8, 1e-8, 3e-9, 1e-9, 3e-10, 1e-10, 3e-11, 1e-11, 1e-12)  # of those that set the price
 # on SWITCHING: settings, loose to tight (quick: the first), and how each stores states at the case's instants
 OTHERS: dict[str, tuple[tuple[float, ...], Callable[[Case, float, int], Result]]] = {
-    DEFAULT: (FINE, partial(_controlled, "auto")),
-    OWN_CODE: (FINE, partial(_controlled, "auto", compiled=True)),
+    DEFAULT: (FINER, partial(_controlled, "auto")),
+    OWN_CODE: (FINER, partial(_controlled, "auto", compiled=True)),
     OWN_EXPLICIT: (FINE, partial(_controlled, "DOP853")),
     "Gauss12": ((1e-5, 1e-7), partial(_controlled, "Gauss12")),
     IDA_C: (FINE, CATALOGUE[IDA_C].run),
-    CVODE_C: (FINE, CATALOGUE[CVODE_C].run),
+    CVODE_C: (FINER, CATALOGUE[CVODE_C].run),
+    CVODE_C_PROJECTED: (FINE, CATALOGUE[CVODE_C_PROJECTED].run),
     DIFFRAX: (FINE, partial(_long, solve_diffrax)),
     CVODES: (FINE, partial(_long, solve_cvodes)),
-    HEYOKA: ((*FINE, 1e-14), CATALOGUE[HEYOKA].run),
+    HEYOKA: ((*FINER, 1e-14), CATALOGUE[HEYOKA].run),
     LSODA: ((1e-8, 1e-10, 1e-12), partial(_index1, "LSODA", "none")),
     PROJECTED: ((1e-7, 1e-9, 1e-11), partial(_index1, "DOP853", "projection")),
     ALPHA: ((0.01,), partial(_exudyn, "GeneralizedAlpha")),

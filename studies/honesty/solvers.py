@@ -11,13 +11,14 @@ from references.sundials.cvode_c import solve_cvode_c
 from references.sundials.ida import solve_ida
 from references.sundials.ida_c import solve_ida_c
 from studies.bench.solvers import GIVEN
-from studies.honesty.traps import FORCE, HELD_OUT, INPUT, MISTAKE, Trap
+from studies.honesty.traps import FORCE, HELD_OUT, INPUT, MISTAKE, SHORT, Trap
 from twoloop import Result, solve_dae
 from twoloop.run.run import LONGEST_UNSEEN
 
 OWN = (GIVEN, "Taylor", "Adams", "DOP853", "Gauss12", "RadauIIA5", "BDF")
 IDA, IDA_C, CVODE_C, HEYOKA = "IDA, stabilised", "IDA from C", "CVODE from C, Adams", "heyoka, Taylor"
-COMPILED_ONLY = (IDA_C, CVODE_C, HEYOKA)
+PROJECTED = "CVODE from C, BDF, projected"
+COMPILED_ONLY = (IDA_C, CVODE_C, PROJECTED, HEYOKA)
 SCIPY = ("LSODA", "DOP853", "Radau", "BDF")
 OF_FORCES = (  # further ones of ours under sharp forces: all presets but the paper's, which follow it to the letter
     *("auto, compiled", "auto, not compiled", "Taylor, compiled", "Gauss4", "Gauss6", "Gauss8", "Gauss10", "Gauss14"),
@@ -27,6 +28,9 @@ OURS = " (twoloop)"
 DEFAULT = f"{GIVEN}{OURS}"
 WITH_CODE: dict[str, dict[str, Any]] = {"": {}, "compiled": {"compiled": True}, "not compiled": {"compiled": False}}
 QUICK_OWN, QUICK_SCIPY = (GIVEN, "DOP853", "BDF"), ("DOP853",)
+OF_SHORT = (GIVEN, "DOP853", "RadauIIA5")  # under gusts that a solver may step over, with IDA_C, CVODE_C, HEYOKA ...
+SCIPY_OF_SHORT = ("DOP853",)
+LOOK = LONGEST_UNSEEN  # of a run: so often ours look at the forces at least
 LIMITED = ", max_step"  # of others that take no step longer than ours do by default
 
 # whose a solver is, in the words of the findings
@@ -41,7 +45,7 @@ def kind_of(name: str) -> str:
         return "default" if name == DEFAULT else "ours"
     if name.endswith(LIMITED):
         return "limited"
-    return "heyoka" if name == HEYOKA else "sundials" if name in (IDA, IDA_C, CVODE_C) else "scipy"
+    return "heyoka" if name == HEYOKA else "sundials" if name in (IDA, IDA_C, CVODE_C, PROJECTED) else "scipy"
 
 
 def own(method: str, trap: Trap) -> Result:
@@ -54,7 +58,7 @@ def own(method: str, trap: Trap) -> Result:
 
 def other(solve: Callable[..., Result], limited: bool, trap: Trap) -> Result:
     """Another project's, without a largest step, or with the longest that ours take by default."""
-    longest = LONGEST_UNSEEN * trap.t_end if limited else None
+    longest = LOOK * trap.t_end if limited else None
     options = {"time_limit": trap.time_limit, "max_step": trap.steps.get("max_step", longest)}
     tolerances = {"tol": trap.tolerance} if solve is solve_heyoka else {"rtol": trap.tolerance, "atol": trap.tolerance}
     return solve(trap.system, (0.0, trap.t_end), trap.q0, trap.v0, **tolerances, **options)
@@ -62,15 +66,18 @@ def other(solve: Callable[..., Result], limited: bool, trap: Trap) -> Result:
 
 def solvers(quick: bool, group: str = MISTAKE) -> dict[str, Call]:
     """Name to call, of those that are run on a group of traps; ours first, then others without `max_step` and with."""
-    ours = (*OWN, *(OF_FORCES if group in (FORCE, HELD_OUT) else ()))
+    ours = OF_SHORT if group == SHORT else (*OWN, *(OF_FORCES if group in (FORCE, HELD_OUT) else ()))
+    theirs = SCIPY_OF_SHORT if group == SHORT else SCIPY
     made: dict[str, Call] = {f"{name}{OURS}": partial(own, name) for name in (QUICK_OWN if quick else ours)}
     others: dict[str, Callable[..., Result]] = {}
     if not quick:
-        others = {IDA: partial(solve_ida, form="stabilised"), IDA_C: solve_ida_c}
+        others = {} if group == SHORT else {IDA: partial(solve_ida, form="stabilised")}
+        others |= {IDA_C: solve_ida_c}
         others |= {CVODE_C: partial(solve_cvode_c, method="Adams"), HEYOKA: solve_heyoka}
-    others |= {f"{name}, index 1": partial(solve_index1, method=name) for name in (QUICK_SCIPY if quick else SCIPY)}
+        others |= {} if group == SHORT else {PROJECTED: partial(solve_cvode_c, method="BDF", projected=True)}
+    others |= {f"{name}, index 1": partial(solve_index1, method=name) for name in (QUICK_SCIPY if quick else theirs)}
     made |= {name: partial(other, solve, False) for name, solve in others.items()}
-    if group != INPUT:  # to whose checks steps do not matter
+    if group not in (INPUT, SHORT):  # to whose checks steps do not matter; of which max_step is the remedy
         made |= {name + LIMITED: partial(other, solve, True) for name, solve in others.items()}
     return made
 

@@ -2,7 +2,7 @@
 
 import time
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import chain, pairwise
@@ -13,7 +13,6 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
-from scipy.stats import fisher_exact
 
 from references.heyoka.taylor import LARGEST_UNROLLED
 from references.sundials.loop import SMALLEST_STEP
@@ -25,12 +24,16 @@ from studies.bench.render import power
 from studies.bench.sharp_forces import T_END
 from studies.bench.store import Array, Output, Row
 from studies.bench.study import Study
+from studies.honesty import short_forces
 from studies.honesty.solvers import (
     CVODE_C,
+    DEFAULT,
     HEYOKA,
     KINDS,
     LIMITED,
+    LOOK,
     OURS,
+    PROJECTED,
     SCIPY,
     Call,
     kind_of,
@@ -38,14 +41,13 @@ from studies.honesty.solvers import (
     why_not,
 )
 from studies.honesty.traps import AGREE as TRUE_TO
-from studies.honesty.traps import FORCE, GROWN, HELD_OUT, HELD_OUT_SEED, INPUT, MISTAKE, Trap, held_out, traps
+from studies.honesty.traps import FORCE, GROWN, HELD_OUT, HELD_OUT_SEED, INPUT, MISTAKE, SHORT, Trap, held_out, traps
 from twoloop import ConstrainedSystem, solve_dae
 from twoloop.kernels.compile import callbacks
 
 LOOSENESS = 1e3  # an answer is right within so many times the tolerance ...
 LEAST = 1e-10  # ... of which no more is asked than this
 USUAL = 1e-8  # tolerance of the traps that are not about tolerances
-CONFIDENCE = 0.95  # of what is said of shares of wrong runs
 GRACE = 6.0  # s beyond the time limit of a run after which it hangs
 TRUTHS = (1e-12, 1e-10, 1e-9)  # tolerances of the two runs that make the right answer: the first that succeed
 TRUTH_LIMIT = 10.0  # s that one of them may take
@@ -57,7 +59,7 @@ REFUSALS = (  # of an adapter or of ours to put the equations, or the setting, t
     *("NotSymbolic", "compiled=True needs equations", "needs callbacks whose operations it can see"),
     *("must be positive definite", "cannot keep a constant one", "LinAlgError"),
 )
-BUILT = (HEYOKA, CVODE_C)  # solvers that are built for each system, which takes longer than they run
+BUILT = (HEYOKA, CVODE_C, PROJECTED)  # solvers that are built for each system, which takes longer than they run
 
 PARTS = {  # of the bars of the figure, in counts of `totals`
     "gross": (f"silently wrong, off by over {power(EXACT)}", figures.RED),
@@ -165,7 +167,7 @@ def make(output: Output) -> pd.DataFrame:
         return run(name, call, trap, truth)
 
     with output.kept() as kept, unchecked():
-        for trap in chain(traps(output.call.quick), held_out(output.call.quick)):
+        for trap in chain(*(each(output.call.quick) for each in (traps, held_out, short_forces.traps))):
             known = solvers(output.call.quick, trap.group)
             keys = {name: " | ".join(about(name, trap).values()) for name in known}
             truth = None if all(key in kept for key in keys.values()) else right_answer(trap)
@@ -212,33 +214,19 @@ def findings_of(all_rows: pd.DataFrame) -> dict[str, Any]:
     """What the report says: of mistakes and forces, how far ours can be trusted on both, and what was held out."""
     rows, forces, inputs, held = (all_rows[all_rows["group"] == group] for group in (MISTAKE, FORCE, INPUT, HELD_OUT))
     both = pd.concat([rows, forces])
-    found = of_mistakes(rows) | {"forces": of_forces(forces), "trust": trust_in(both)}
+    found = of_mistakes(rows) | {"forces": of_forces(forces) | {"trust": trust_in(forces)}, "trust": trust_in(both)}
     found["forces_only"] = [name for name in dict.fromkeys(forces["solver"]) if name not in set(rows["solver"])]
     found["input"] = of_mistakes(inputs) | {"trust": trust_in(inputs)}
     found["held_out"] = of_forces(held) | {"trust": trust_in(held), "bad": bad_in(held), "seed": HELD_OUT_SEED}
     theirs = [line for line in found["held_out"]["solvers"] if not line["solver"].endswith((OURS, LIMITED))]
     counted = [{key: line[key] for key in ("solver", "n", "wrong", "gross")} for line in theirs]
     found["held_out"]["by_solver"] = sorted(counted, key=lambda line: -line["wrong"])
-    found["held_out"] |= against_default(found["held_out"]["trust"])
+    found["held_out"]["ran"] = [kind for kind in KINDS[:-1] if found["held_out"]["trust"][kind]["n"]]
+    short = all_rows[(all_rows["group"] == SHORT) & (all_rows["outcome"] != NOT_RUN)]
+    found |= {"short": short_forces.findings_of(short, (SILENT, HANG)), "look": LOOK}
     found |= {"unrolled_to": LARGEST_UNROLLED, "smallest_step": SMALLEST_STEP}
     found |= {"exact": EXACT, "off": LOOSENESS * USUAL, "usual": USUAL, "scipy": list(SCIPY)}
     return found | {"forces_end": T_END, "forces_agree": TRUE_TO, "grown": GROWN}
-
-
-def against_default(trust: Mapping[str, Mapping[str, int]]) -> dict[str, Any]:
-    """Who was run, below what the default's share of wrong runs is if it has none, and whose share differs from it."""
-    ran = [kind for kind in KINDS[:-1] if trust[kind]["n"]]  # the default, ours, others
-    bad = {kind: (trust[kind]["wrong"], trust[kind]["n"] - trust[kind]["wrong"]) for kind in ran}
-    found: dict[str, Any] = {"ran": ran, "below": None, "apart": []}
-    if "default" in ran:
-        n = trust["default"]["n"]
-        found["below"] = 1.0 - (0.5 * (1.0 - CONFIDENCE)) ** (1.0 / n)
-        found["apart"] = [
-            kind
-            for kind in ran
-            if kind not in ("default", "ours") and fisher_exact([bad["default"], bad[kind]]).pvalue < 1.0 - CONFIDENCE
-        ]
-    return found
 
 
 def graded(ran: pd.DataFrame) -> dict[str, int]:
@@ -326,18 +314,19 @@ def picture(totals: Sequence[dict[str, Any]]) -> Figure:
 
     Where all runs of several solvers are right, these share a line.
     """
-    groups: dict[str, list[dict[str, Any]]] = {"ours": [], "others": [], "others, max_step": []}
+    groups: dict[str, list[dict[str, Any]]] = {"ours": [], "rivals": [], "rivals, max_step": []}
     for line in totals:
         limited = line["solver"].endswith(LIMITED)
-        groups["ours" if line["solver"].endswith(OURS) else "others, max_step" if limited else "others"].append(line)
+        groups["ours" if line["solver"].endswith(OURS) else "rivals, max_step" if limited else "rivals"].append(line)
     bars: list[tuple[str, list[float], list[int]]] = []
     ends: dict[str, int] = {}
     for whose, own in groups.items():
-        bad = [line for line in own if line[RIGHT] < line["n"]]
+        bad = [line for line in own if line[RIGHT] < line["n"] or line["solver"] == DEFAULT]  # which has its own bar
         bad = own if len(own) - len(bad) == 1 else bad
         for line in bad:
             name = line["solver"].removesuffix(OURS).removesuffix(LIMITED)
             counts = [line[part] for part in PARTS]
+            name = "the default" if line["solver"] == DEFAULT else name
             bars.append((f"{name} ({line['n']})", [100.0 * count / line["n"] for count in counts], counts))
         if len(own) > len(bad):
             n = sum(line["n"] for line in own) - sum(line["n"] for line in bad)

@@ -25,8 +25,8 @@ from twoloop.mechanisms import Problem, four_bar, n_four_bar
 
 NEVER = 1e30  # s
 # what a trap is made of: a start or derivative that checks of input find, a model or setting, a force that is sharp,
-# such a one with other numbers, on which no method was repaired
-INPUT, MISTAKE, FORCE, HELD_OUT = "input", "mistake", "force", "held out"
+# such a one with other numbers, on which no method was repaired, one that a solver may step over
+INPUT, MISTAKE, FORCE, HELD_OUT, SHORT = "input", "mistake", "force", "held out", "short"
 AGREE = 1e-8  # m or rad: how far two methods may differ in the motion under a force
 SEED = 13  # of the numbers of the forces
 HELD_OUT_SEED = 20261122  # of those held out: a date; on what they give no method was repaired
@@ -155,7 +155,7 @@ class Trap:
     positions : callable or None
         positions(t) -> q, where they are known.
     group : str
-        INPUT, MISTAKE, FORCE or HELD_OUT.
+        INPUT, MISTAKE, FORCE, HELD_OUT or SHORT.
     tolerance, time_limit : float
     steps : mapping
         `step_size`, `first_step` or `max_step`, for solvers whose adapter takes them.

@@ -25,6 +25,7 @@ from studies.bench.solvers import (
     GIVEN,
     HEYOKA,
     IDA_C,
+    IDA_C_STATES,
     OWN_BDF,
     OWN_EXPLICIT,
     TAYLOR,
@@ -61,7 +62,7 @@ MAKE: tuple[Callable[[], Problem], ...] = (
 QUICK = (0, 2, 4, 10, 14)  # places in MAKE
 OWN = (GIVEN, TAYLOR, ADAMS, OWN_EXPLICIT, "Gauss12", "RadauIIA5", OWN_BDF)
 OTHERS = (
-    *(IDA_C, HEYOKA, CVODE_C, CVODE_C_PROJECTED, CVODES),
+    *(IDA_C, IDA_C_STATES, HEYOKA, CVODE_C, CVODE_C_PROJECTED, CVODES, "Radau, solve_dae"),
     *("LSODA, index 1", "DOP853, index 1", "DOP853, projected", "Radau, index 1", "BDF, index 1"),
 )
 QUICK_OTHERS = ("DOP853, index 1",)

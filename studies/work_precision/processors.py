@@ -92,12 +92,10 @@ def findings_of(table: pd.DataFrame) -> list[dict[str, Any]]:
                 continue
             turned = both[both[["verdict_one", "verdict_other"]].apply(lambda x: set(x) == {"ahead", "behind"}, axis=1)]
             apart = np.exp(np.abs(np.log(both["ratio_one"] / both["ratio_other"])))
-            line = {
-                "processors": [one, other],
-                "time": time,
-                "n": len(both),
-                "turned": turned[PLACE].to_dict("records"),
-            }
+            ahead = np.where(turned["verdict_one"] == "ahead", one, other)
+            line: dict[str, Any] = {"processors": [one, other], "time": time, "n": len(both)}
+            line["turned"] = turned[PLACE].assign(ahead_on=ahead).to_dict("records")
+            line["over"] = float((both["ratio_other"] / both["ratio_one"]).median())
             line["same_code"] = bool((both["commit_one"] == both["commit_other"]).all())
             found.append(line | {"apart": float(apart.median()), "most": float(apart.max())})
             break

@@ -43,6 +43,7 @@ SHOWN = DECADES[::2]  # at which the four-bars are judged
 DOWN_TO = 1e-12  # the error down to which no rival was to be ahead
 AHEAD = {"heyoka": 2, "rivals called from Python": 8, "other compiled rivals": 4}  # aimed at on the four-bars
 HEADLINE = "four-bar"
+SAID = {headline.OWN_CODE: "the default", headline.DEFAULT: "compiled=False"}  # on it
 GEOMETRIES: dict[str, Callable[[], Problem]] = {
     HEADLINE: mechanisms.four_bar,
     "four-bar, second": lambda: mechanisms.four_bar(**SECOND),  # type: ignore[arg-type]
@@ -116,10 +117,10 @@ def runs(quick: bool) -> list[Run]:
 
 
 def collect(todo: Sequence[Run], kept: KeptRows) -> pd.DataFrame:
-    """Rows of all runs that are of use; on the four-bars however far behind a solver is."""
+    """Rows of all runs that are of use; on the four-bars however far behind a solver is, and repeated where priced."""
     quick = all(run.repeats == 1 for run in todo)
     errors, priced = () if quick else DECADES, lambda run: run.case.name == HEADLINE
-    return adaptive.collect(todo, kept, row_at_end, lambda run: run.case.name in GEOMETRIES, errors, fine=priced)
+    return adaptive.collect(todo, kept, row_at_end, lambda run: run.case.name in GEOMETRIES, errors, priced, priced)
 
 
 def row_at_end(run: Run, repeat: int, built: Warm) -> Row:
@@ -167,8 +168,6 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     found: dict[str, Any] = {"mechanisms": made, "n": len(every), "n_behind": len(behind)}
     found["standings"] = headline.counted([at["standing"] for at in each["at"]] for each in made)
     rivals = [at["standing"][headline.BEST]["rival"]["solver"] for at in behind]
-    best = [at["verdict"] for each in made if "singular" in each["tags"] for at in each["at"]]
-    found["singular_ahead"] = best.count("ahead")
     found["behind"] = dict(pd.Series(rivals, dtype=object).value_counts())
     found["behind"] = {str(name): int(count) for name, count in found["behind"].items()}
     found |= {"down_to": DOWN_TO, "n_behind_down_to": sum(at["error"] >= 0.5 * DOWN_TO for at in behind)}
@@ -178,14 +177,15 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     found["alone"] = [each["case"] for each in made if not any(at["others"] for at in each["at"])]
     asked = {each["case"] for each in made if any(at["verdict"] == "alone" for at in each["at"])}
     found["not_put"] = [name for name in found["alone"] if name not in asked]
-    found["put"] = put(rows)
+    found["put"], found["fewest"] = put(rows), fewest(rows)
     found["with_code"] = [each["case"] for each in made if given_on(each["case"]) == headline.OWN_CODE]
     found["ranges"] = [_within(made, name, errors) for name, errors in RANGES.items()]
     found["typical"] = [each for error in TYPICAL if (each := _typical(made, error)) is not None]
     python = rows[rows["called_from"] == "Python"]["solver"].unique()
     ahead = [at["standing"][headline.BEST] for at in every if at["standing"][headline.BEST]["verdict"] == "ahead"]
     found["ahead_of_python"] = sum(best["rival"]["solver"] in python for best in ahead)
-    found["residual"] = residual(rows)
+    found["residual"], found["shortest"] = residual(rows), shortest(rows)
+    found["processors"] = sorted(rows["processor"].dropna().unique()) if "processor" in rows else []
     return found | {"aims": aims(by_case[name] for name in GEOMETRIES if name in by_case)}
 
 
@@ -221,6 +221,25 @@ def residual(rows: pd.DataFrame) -> dict[str, Any] | None:
     if HEADLINE not in medians:
         return None
     return {"here": float(medians[HEADLINE]), "least": float(medians.min()), "most": float(medians.max())}
+
+
+def fewest(rows: pd.DataFrame) -> dict[str, Any]:
+    """The mechanism on which the fewest rivals end a run: how many, of those put to any."""
+    others = rows[rows["family"] != "two-loop"]
+    n = int(others["solver"].nunique())
+    ended = others[others["error_q"].notna()].groupby("case")["solver"].nunique()
+    ended = ended.reindex(rows["case"].unique(), fill_value=0)
+    return {"case": str(ended.idxmin()), "ended": int(ended.min()), "n": n}
+
+
+def shortest(rows: pd.DataFrame) -> dict[str, Any]:
+    """The shortest call of ours; in how many pairs of mechanism and error a rival takes less, and heyoka is the one."""
+    least, below = float(rows[rows["family"] == "two-loop"]["call_s"].astype(float).min()), []
+    for (_, own), error in product(rows[rows["family"] != "two-loop"].groupby("case", sort=False), DECADES):
+        costs = tables.costs_at(own, error)
+        best = min(costs, key=lambda name: costs[name][0], default=None)
+        below += [best] if best is not None and costs[best][0] < least else []
+    return {"call_s": least, "n": len(below), "heyoka": below.count(HEYOKA)}
 
 
 def put(rows: pd.DataFrame) -> dict[str, Any]:
@@ -260,10 +279,26 @@ def picture(rows: pd.DataFrame) -> Figure:
     """The README's picture: what a call takes over error on the four-bar: default, cheapest of ours, main rivals."""
     rows = rows[rows["case"] == HEADLINE]
     figure, axes = plt.subplots(figsize=(7.6, 4.4), layout="constrained")
-    for solver in figures.lines_of(rows, SHOWN):
+    priced = (headline.price(rows, rows[:0], HEADLINE) or {"lines": []})["lines"]
+    named, once = [at["solver"] for line in priced for at in line["at"] if at["solver"]], []
+    for solver in dict.fromkeys([*figures.lines_of(rows, SHOWN), *named]):
         line = figures.with_gaps(rows[rows["solver"] == solver])
         look = figures.look(line[line["error_q"].notna()].iloc[0])
+        look["label"] = SAID.get(solver, solver)
         axes.plot(line["error_q"].astype(float), 1e3 * line["call_s"].astype(float), **look)
+        once += [line[line["repeats"] == 1]] if "repeats" in line else []
+    single = pd.concat(once) if once else rows[:0]
+    alone: dict[str, Any] = {
+        "linestyle": "",
+        "marker": "+",
+        "color": "black",
+        "markersize": 6,
+        "markeredgewidth": 0.6,
+        "zorder": 4,
+    }
+    if len(single):
+        errors, times = single["error_q"].astype(float), 1e3 * single["call_s"].astype(float)
+        axes.plot(errors, times, **alone, label="timed once")
     error = "error after 10 s, over max(1, max |q|)"
     axes.set(xscale="log", yscale="log", xlabel=error, ylabel="CPU time of the call (ms)")
     figures.legend(figure, [axes], figures.LEGEND)
@@ -275,7 +310,7 @@ def heat_map(found: dict[str, Any]) -> Figure:
     """Mechanism x decade: the time of the fastest rival over that of the default and of the best of ours."""
     names = [each["case"] for each in found["mechanisms"]]
     whose = (headline.GIVEN, headline.BEST)
-    size = (4.6 * len(whose) + 2.0, 0.28 * len(names) + 1.6)
+    size = (5.2 * len(whose) + 1.6, 0.34 * len(names) + 1.6)
     figure, panels = plt.subplots(1, len(whose), figsize=size, sharey=True, layout="constrained")
     colours = plt.get_cmap("RdBu").with_extremes(bad="#e6e6e6")
     for axes, name in zip(panels, whose, strict=True):
@@ -284,15 +319,11 @@ def heat_map(found: dict[str, Any]) -> Figure:
         image = axes.imshow(shown, norm=LogNorm(0.04, 25.0), cmap=colours, aspect="auto")
         for (i, j), value in np.ndenumerate(shown):
             color = "white" if abs(np.log10(value)) > 0.8 else "black"  # black on the grey of those without a ratio
-            axes.text(j, i, cell(standings[i][j]), ha="center", va="center", fontsize=6, color=color)
-        axes.set_xticks(range(len(DECADES)), [power(error) for error in DECADES], fontsize=7)
+            axes.text(j, i, cell(standings[i][j]), ha="center", va="center", fontsize=8, color=color)
+        axes.set_xticks(range(len(DECADES)), [power(error) for error in DECADES], fontsize=8)
         axes.set_yticks(range(len(names)), names)
         axes.grid(False)
-        axes.set(title=name, xlabel="error at the end, over max(1, max |q|)")
-    told = (
-        "blue: ours ahead; in brackets: undecided; ours, others: no other reaches the error; ours?: not all rivals "
-        "were run to their end; grey: no ratio"
-    )
-    figure.suptitle(f"Time of the fastest rival over ours ({told})", fontsize=10)
+        axes.set(title=name, xlabel="error at the end")
+    figure.suptitle("Time of the fastest rival over ours (blue: ours faster)", fontsize=12)
     figure.colorbar(image, ax=panels, label="ratio", extend="both")
     return figure

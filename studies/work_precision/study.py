@@ -35,6 +35,7 @@ from studies.work_precision import first_calls, goals, minimal, processors, riva
 ERRORS = (1e-2, 1e-4, 1e-6)  # the accuracies of the first screen
 FURTHER = ("Gauss6", IRK_LINE, QUARTER, f"IDA, {IDA_FORMS[0]}")
 STIFF = ("TRBDF2", *RADAU[1:], IDA_C_ORDER_2)  # in their place on stiff cases; the paper's: `studies.beam`
+BETWEEN = (7e-4, 5e-4, 3e-4, 2e-4)  # tolerances of the first of these, whose loose runs lie on no line
 IDA = ("IDA from C", "IDA, ")  # how its lines begin; CVODE is of the same family, and IDAS is CasADi's
 QUICK = (*COMPARED[:4], "RadauIIA5", "IDA, stabilised")  # others take seconds to compile or to run
 QUICK_CASES = ("four-bar",)  # the beams' references take seconds
@@ -48,7 +49,9 @@ def runs(case: Case, quick: bool) -> list[Run]:
         return runs_of(case, QUICK, quick)
     made = runs_of(case, dict.fromkeys((*COMPARED_OWN, *RIVALS, *(STIFF if stiff else FURTHER))), quick)
     coarse = (case.tolerances or TOLERANCES)[::2]
-    return [run for run in made if run.solver.setting != "tol" or run.value in coarse]
+    made = [run for run in made if run.solver.setting != "tol" or run.value in coarse]
+    rough = {run.solver.name: run for run in made if stiff and run.solver.name == STIFF[0]}.values()
+    return made + [replace(run, value=value) for run in rough for value in BETWEEN]
 
 
 def class_of(rows: pd.DataFrame, error: float) -> dict[str, Any]:
@@ -81,6 +84,7 @@ def findings_of(rows: pd.DataFrame, known: Sequence[Case]) -> dict[str, Any]:
         over = [line["default_over"] for line in at if line["default_over"] is not None]
         slug = "_".join("".join(letter if letter.isalnum() else " " for letter in case.name).split())
         found: dict[str, Any] = {"name": case.name, "tags": list(case.tags), "t_end": case.t_end, "at": at}
+        found["processor"] = str(runs["processor"].iloc[0]) if "processor" in runs else ""
         found |= {"default_dominated": bool(over) and min(over) > 1.0}
         found |= {"default_over": [min(over), max(over)] if over else []}
         listed.append(found | {"figure": f"work_precision_{slug}.png"})
@@ -138,7 +142,7 @@ def report(output: Output, rows: pd.DataFrame, line: str) -> dict[str, Any]:
     found = rivals.findings_of(everywhere)
     findings = findings_of(medians, known) | {"rivals": found}
     findings |= {"goals": goals.findings_of(known, medians, everywhere), "asked": asked(part(rows, rivals.GROUP))}
-    findings["versions"] = versions()
+    findings["versions"], findings["unlike"] = versions(), unlike(pd.concat([medians, everywhere], ignore_index=True))
     findings["first_calls"] = first_calls.findings_of(first_calls.at_error(part(rows, first_calls.GROUP), everywhere))
     findings["unrolled"] = LARGEST_UNROLLED
     in_angles = on_the_same_processor(part(rows, minimal.GROUP), part(rows, rivals.GROUP))
@@ -153,6 +157,13 @@ def report(output: Output, rows: pd.DataFrame, line: str) -> dict[str, Any]:
     text = render("work_precision", findings, {}, stamp=line, quick=output.call.quick)
     output.write("work_precision.md", text)
     return findings
+
+
+def unlike(medians: pd.DataFrame) -> dict[str, Any]:
+    """How many repetitions were not of the run alone, and of which runs."""
+    own = medians[medians["unlike"] > 0]
+    named = [f"{run['solver']} on {run['case']} at {tables.setting(run)}" for _, run in own.iterrows()]
+    return {"n": int(own["unlike"].sum()), "runs": named, "times": tables.UNLIKE}
 
 
 def made_once(medians: pd.DataFrame) -> dict[str, float]:

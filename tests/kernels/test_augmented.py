@@ -161,7 +161,7 @@ def test_a_program_outlasts_partitions(choose):
     run = started(chain(12, False))
     program = run.work.index_a.copy()
     for _ in range(2):
-        assert run.a.start(run.kit, run.work, 0.0, run.state) == common.DONE
+        assert run.kernels.start(run.kit, run.work, 0.0, run.state) == common.DONE
     assert (run.work.index_a == program).all()
 
 

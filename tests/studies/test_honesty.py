@@ -8,6 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from studies.honesty import short_forces
 from studies.honesty import solvers as honesty_solvers
 from studies.honesty import study as honesty
 from studies.honesty.solvers import DEFAULT, IDA_C, KINDS, LIMITED, kind_of, own, solvers, why_not
@@ -18,6 +19,7 @@ from studies.honesty.traps import (
     INPUT,
     KINK,
     MISTAKE,
+    SHORT,
     forces,
     held_out,
     of_linkages,
@@ -285,3 +287,21 @@ def test_forces_are_on_three_mechanisms():
     assert len({name for name, _ in made}) >= 15
     for bodies in ("pendulum", "bars", "slider_in_space"):
         assert ("gust of 3 ms", bodies) in made
+
+
+def test_a_gust_shorter_than_a_look_is_a_rate_over_random_times():
+    made = list(short_forces.traps(quick=True))
+    assert {trap.group for trap in made} == {SHORT} and len({trap.mechanism for trap in made}) == len(made) == 2
+    assert len({tuple(trap.system.parameters) for trap in made}) == 2
+    assert {"CVODE from C, Adams", "heyoka, Taylor", "IDA from C", "DOP853, index 1"} < set(solvers(False, SHORT))
+    assert not any(name.endswith(LIMITED) for name in solvers(False, SHORT))
+    lines = [("gust of 1 ms", OURS, honesty.SILENT, 0.1), ("gust of 1 ms", OURS, honesty.SILENT, 1e-4)]
+    lines += [("gust of 10 ms", OURS, honesty.RIGHT, 1e-9), ("gust of 1 ms", THEIRS, honesty.HANG, np.nan)]
+    lines += [("gust of 1 ms", THEIRS, honesty.NOT_RUN, np.nan)]
+    rows = rows_of_forces()
+    short = rows.iloc[[0] * len(lines)].reset_index(drop=True).assign(group=SHORT, mechanism="pendulum, draw 0")
+    short[["trap", "solver", "outcome", "error"]] = lines
+    found, text = said(honesty, pd.concat([rows, short], ignore_index=True))
+    assert found["short"]["widths"] == [1e-3, 1e-2] and found["short"]["default"] == {"n": 3, "gross": 1}
+    assert "| the default | 1/2 | 0/1 |" in text and "| LSODA, index 1 | 1/1 | 0/0 |" in text
+    assert "## Forces shorter than a look" not in said(honesty, rows)[1]

@@ -139,9 +139,10 @@ def test_runs_made_once_as_they_are_far_behind_undo_no_verdict():
 
 def test_no_solver_is_ahead_of_another_for_want_of_a_run():
     made = rows(("heyoka", 1e-1, 1.0), ("heyoka", 1e-9, 50.0)).assign(tol=[1e-1, 1e-9])
-    assert tables.costs_at(made, 1e-5) == {}  # nothing is told of its cost there ...
+    assert np.isnan(tables.time_for(made, 1e-5))  # nothing is told of its cost there ...
+    assert tables.costs_at(made, 1e-5)["heyoka"][0] == 50.0  # ... but what the better run takes
     (time, _) = tables.costs_at(made, 1e-5, doubt=True)["heyoka"]
-    assert time == 1.0  # ... and none is ahead of it that takes more than its looser run
+    assert time == 1.0  # none is ahead of it that takes more than its looser run
     assert tables.costs_at(made, 1e-10, doubt=True) == {}
 
 
@@ -177,10 +178,27 @@ def test_the_cheapest_lines_are_the_cheapest():
     assert figures.cheapest_lines(made, (1e-3,), 2) == ["s0", "s1"]
 
 
-def test_a_run_that_is_better_by_far_and_cheaper_by_scatter_is_not_the_price():
-    """Of many runs that are good enough the least time is that of the luckiest."""
+def test_repetitions_that_timed_something_else_do_not_count():
+    times, errors = np.array([1.0, 1.1, 9.0, 1.2, 0.9]), np.full(5, 1e-6)
+    assert tables.alike(times, errors).tolist() == [True, True, False, True, True]
+    assert tables.alike(times, np.array([1e-6, 1e-6, 1e-6, 2e-5, np.inf])).tolist() == [True] * 5  # too few are left
+    stopped = np.array([1e-6, 1e-6, 1e-6, 1e-6, np.inf])
+    assert tables.alike(np.ones(5), stopped).tolist() == [True] * 4 + [False]
+    off = np.array([1e-6, 1e-6, 1e-6, 1e-6, 1e-3])
+    assert tables.alike(np.ones(5), off).tolist() == [True] * 4 + [False]
+    assert tables.alike(np.array([1.0, 9.0]), np.full(2, 1e-6)).all()  # of two it is not known which
+    made = [rows(("a", 1e-6, time)).assign(repeat=k, inside_s=0.5 * time) for k, time in enumerate(times)]
+    made = pd.concat(made, ignore_index=True)
+    found = tables.medians(made.drop(columns=["times", "call_q1", "call_q3"], errors="ignore"))
+    assert found["unlike"].tolist() == [1] and found["times"][0] == (1.0, 1.1, 1.2, 0.9)
+    assert found["call_s"].tolist() == [pytest.approx(1.05)] and found["repeats"].tolist() == [5]
+    assert found["inside_s"].tolist() == [pytest.approx(0.525)]
+
+
+def test_the_price_is_the_cheapest_run_that_is_good_enough_however_good():
+    """A looser error never costs more than a tighter one."""
     made = rows(("a", 8e-5, 8.7), ("a", 2e-5, 8.5), ("a", 1e-7, 9.0), ("a", 1e-13, 7.7))
     made = made.assign(tol=[1e-4, 1e-5, 1e-7, 1e-12])
-    assert tables.time_for(made, 1e-4) == 8.5 and tables.costs_at(made, 1e-4)["a"][0] == 8.5
-    assert tables.run_for(made, 1e-4)["error_q"] == 2e-5
-    assert tables.time_for(made, 1e-6) == 9.0
+    for error in (1e-4, 1e-6, 1e-12):
+        assert tables.time_for(made, error) == 7.7 and tables.costs_at(made, error)["a"][0] == 7.7
+    assert tables.run_for(made, 1e-4)["error_q"] == 1e-13

@@ -82,32 +82,29 @@ def test_a_solver_is_asked_for_as_a_user_does(solver, without, with_code):
 def test_the_table_has_a_row_for_each_class_with_the_cheapest():
     loose = {"solver": "TRBDF2", "accuracies": ["1e-2", "1e-4"], "undecided": []}
     tight = {"solver": "auto, compiled", "accuracies": ["1e-6"], "undecided": []}
-    picked = [loose, tight]
-    entries = [{"class": "stiff", "name": name, "t_end": 2.0, "picks": picked} for name in ("a beam", "another")]
+    entries = [{"class": "odd", "name": name, "t_end": 2.0, "picks": [loose, tight]} for name in ("a crane", "another")]
     (row,) = takes({}, advice(entries))
-    assert row["what"] == "stiff (a beam, 2.0 s; another, 2.0 s)"
-    assert row["take"] == '`method="TRBDF2"` for errors of 1e-2 and 1e-4; `compiled=True` for errors of 1e-6'
+    assert row["what"] == "odd (a crane and another, 2.0 s)"
+    assert row["take"] == '`method="TRBDF2"` (4 of 6 errors), `compiled=True` (2 of 6 errors)'
     entries[1]["picks"] = [loose | {"undecided": ["1e-4"]}, tight]
     (row,) = takes({}, advice(entries))
-    assert row["take"].endswith("for errors of 1e-6 (undecided: 1e-4)")
+    assert row["take"].startswith('`method="TRBDF2"` (3 of 6 errors)')
 
 
 @pytest.mark.parametrize(
     ("pays", "never", "said"),
     [
-        ([3.0, 40.0], 1, "; code of `compiled=True` pays from run 3 to 40 on 4 of 5 mechanisms"),
-        ([60.0], 4, "; code of `compiled=True` pays from run 60 on 1 of 5 mechanisms"),
+        ([3.0, 42.0], 1, "`compiled=True` after some 3 to 40 calls on 4 of 5 mechanisms"),
+        ([58.0], 4, "`compiled=True` after some 60 calls on 1 of 5 mechanisms"),
         ([], 5, ""),
     ],
 )
 def test_code_for_the_mechanism_is_advised_where_the_first_calls_say_that_it_pays(pays, never, said):
-    line = {"solver": "auto, compiled", "n": 5, "pays": pays, "never": never, "call_s": 2e-3}
-    theirs = {**line, "solver": "heyoka", "pays": [50.0], "never": 0, "call_s": 1e-3}
-    (row,) = takes({"work_precision": {"first_calls": [theirs, line]}}, [])
-    begin = "in single calls with an error of 1e-8: code of `heyoka` pays from run 50 on 5 of 5 mechanisms"
-    assert row["take"] == f"{begin}, the cheapest later call{said}"
-    (row,) = takes({"work_precision": {"first_calls": [line | {"pays": [3.0, 40.0], "never": 2}]}}, [])
-    assert row["take"].endswith("run 3 to 40 on 3 of 5 mechanisms, the cheapest later call")
+    line = {"solver": "auto, compiled", "n": 5, "pays": pays, "never": never}
+    theirs = {**line, "solver": "heyoka", "pays": [29817.0], "never": 0}
+    (row,) = takes({"work_precision": {"first_calls": [line, theirs]}}, [])
+    parts = " and ".join(part for part in (said, "`heyoka` after some 30000 calls") if part)
+    assert row == {"what": "many single calls", "take": f"{parts}, against `compiled=False`"}
     assert takes({"work_precision": {"first_calls": []}}, []) == []
 
 

@@ -20,7 +20,8 @@ BY_TOLERANCE = (
     "the default",
     "ensemble",
     "solve_dae",
-)  # how solvers begin whose order the tolerance sets
+    "TRBDF2",
+)  # how solvers begin whose order the tolerance sets, or whose loose runs are too rough for a line
 INTERVAL = (2.5, 97.5)  # percentiles that count of times drawn again
 LEAST = 1.05  # ratio of times that counts: less is within what machine and order of the calls do
 RESAMPLES, SEED = 1000, 25  # draws of the repetitions
@@ -43,7 +44,7 @@ def _medians_drawn(times: tuple[float, ...]) -> Array:
     return np.asarray(np.median(np.array(times)[_rounds(len(times))], axis=1))
 
 
-Place = tuple[int, int, float | None]
+Place = tuple[int, float | None]
 
 
 class Runs:
@@ -79,15 +80,14 @@ class Runs:
         return taken if isinstance(taken, str) else ""
 
 
-def place_of(runs: Runs, target: float) -> Place | None:
-    """Which runs of one solver, by error, are good enough, and where between them and the next the target is.
+def place_of(runs: Runs, target: float, unasked: bool = False) -> Place | None:
+    """How many runs of one solver, by error, are good enough, and where between them and the next the target is.
 
-    Of those good enough the ones within a decade of the worst of them count: a run that is better by far, and cheaper
-    by the scatter of its time, is not what a user asks for. The first of these, and the number of all up to the last.
-    None: no run is so good, or none was asked for about this: within a decade below the target, at the loosest setting
-    that the solver can run, or at nearly the same setting as a looser one that is not good enough (the solver leaps
-    over the target). The place between two runs, on the log-log line through them, is None where they are more than a
-    decade apart, or of different methods or orders.
+    All of these count, however much better they are: a user who wants an error takes the cheapest run that has it.
+    None: no run is so good, or, unless `unasked`, none was asked for about this: within a decade below the target, at
+    the loosest setting that the solver can run, or at nearly the same setting as a looser one that is not good enough
+    (the solver leaps over the target). The place between two runs, on the log-log line through them, is None where
+    they are more than a decade apart, or of different methods or orders.
     """
     errors, settings = runs.errors, runs.settings
     n_good = int((errors <= target).sum())
@@ -97,19 +97,19 @@ def place_of(runs: Runs, target: float) -> Place | None:
     joined = not end and 0.0 < errors[n_good] <= DECADE * below
     looser = settings[n_good:, None] / settings[:n_good]
     near = ((looser >= 1.0) & (looser <= NEAR)).any()
-    if not (below >= target / DECADE or joined or near or (settings[:n_good] >= runs.loosest).any()):
+    asked = below >= target / DECADE or joined or near or (settings[:n_good] >= runs.loosest).any()
+    if not (asked or unasked):
         return None
-    first = int((errors < below / DECADE).sum())
     if not joined or not runs.of_one_order or runs.used(n_good - 1) != runs.used(n_good):
-        return first, n_good, None
+        return n_good, None
     x = np.log(errors[n_good - 1 : n_good + 1])
-    return first, n_good, float((np.log(target) - x[0]) / (x[1] - x[0]))
+    return n_good, float((np.log(target) - x[0]) / (x[1] - x[0]))
 
 
 def cost_at(costs: Array, place: Place) -> Array:
     """The least cost (of each draw, if there are many) at a place; `costs`: a row a run, by error."""
-    first, n_good, share = place
-    best = np.fmin.reduce(costs[first:n_good])  # NaN: draws of runs made once, as others are cheaper
+    n_good, share = place
+    best = np.fmin.reduce(costs[:n_good])  # NaN: draws of runs made once, as others are cheaper
     if share is None:
         return np.asarray(best)
     with np.errstate(invalid="ignore"):
@@ -119,5 +119,4 @@ def cost_at(costs: Array, place: Place) -> Array:
 
 def cheapest(runs: Runs, place: Place) -> int:
     """The row of the cheapest run at a place."""
-    first, n_good, _ = place
-    return int(runs.rows[first + np.argmin(runs.of("call_s")[first:n_good])])
+    return int(runs.rows[np.argmin(runs.of("call_s")[: place[0]])])

@@ -1,0 +1,60 @@
+"""Gusts so short that a solver may step over them: how many runs end silently wrong, over random times of the gust."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from studies.bench.end_states import EXACT
+from studies.bench.sharp_forces import Sharp, gust
+from studies.bench.sharp_mechanisms import Mechanism, bars
+from studies.bench.sharp_mechanisms import chain as chain_of
+from studies.bench.sharp_motion import motion
+from studies.honesty.solvers import DEFAULT
+from studies.honesty.traps import AGREE, GROWN, SHORT, Trap, of_force, pendulum
+
+WIDTHS = (1e-4, 3e-4, 1e-3, 3e-3, 1e-2)  # s
+N_DRAWS, N_QUICK, QUICK_WIDTHS = 100, 2, (1e-3,)  # of each width on each mechanism
+SEED = 25
+
+
+def two_points(sharp: Sharp) -> Mechanism:
+    """A chain of two points of 1 kg on links of 1 m."""
+    two = np.ones(2)
+    return chain_of(sharp, two, two, np.array([1.0, 0.5]), 0.0 * two)
+
+
+def name_of(width: float) -> str:
+    return f"gust of {1e3 * width:g} ms"
+
+
+def traps(quick: bool) -> Iterator[Trap]:
+    """Each width on each mechanism, at random times, drawn until two methods agree and errors do not grow.
+
+    The motion (`sharp_motion.motion`) is by SciPy's DOP853 in steps of a fortieth of the gust's window, and by LSODA.
+    """
+    for place, width in enumerate(QUICK_WIDTHS if quick else WIDTHS):
+        for k, bodies in enumerate((pendulum,) if quick else (pendulum, bars, two_points)):
+            for draw in range(N_QUICK if quick else N_DRAWS):
+                g, known = np.random.default_rng([SEED, place, k, draw]), None
+                while known is None or not (known.apart <= AGREE and known.growth <= GROWN):
+                    mechanism = bodies(gust(width)(name_of(width), g))
+                    known = motion(mechanism)
+                trap = of_force(mechanism, SHORT, partial(known.q.__getitem__, -1))
+                yield replace(trap, mechanism=f"{mechanism.name}, draw {draw}")
+
+
+def findings_of(ran: pd.DataFrame, wrong: Sequence[str]) -> dict[str, Any]:
+    """Of each solver the runs with a `wrong` outcome, off by over EXACT, by width; of the default all of them, too."""
+    gross = ran["outcome"].isin(wrong) & ~(ran["error"].astype(float) <= EXACT)
+    widths = [width for width in WIDTHS if (ran["trap"] == name_of(width)).any()]
+    lines = []
+    for solver, own in ran.groupby("solver", sort=False):
+        by = [gross[own.index[own["trap"] == name_of(width)]] for width in widths]
+        lines.append({"solver": str(solver), "at": [{"n": len(each), "gross": int(each.sum())} for each in by]})
+    mine = gross[ran["solver"] == DEFAULT]
+    found = {"widths": widths, "solvers": lines, "n": len(ran)}
+    return found | {"default": {"n": len(mine), "gross": int(mine.sum())}}
