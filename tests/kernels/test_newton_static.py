@@ -176,3 +176,17 @@ def test_programs_grow_with_the_bodies_and_no_faster():
             updates.append(int(form.newton[N_UPDATES]))
             assert form.matrix_cost() < 3.0 + system.n_q / 8.0  # what a dense one is taken to cost
         assert updates[1] <= 3.6 * updates[0]
+
+
+def test_a_chain_of_hinges_in_space():
+    """Of 15 bodies with four Euler parameters each: with sparse Newton matrices no step was accepted."""
+    bodies, at, before = SpatialBodies((0.0, 0.0, -9.81)), np.zeros(3), GROUND
+    for k in range(15):
+        along = np.array([0.3, 0.1 * np.sin(k), -0.15])
+        body = bodies.body(f"body {k}", 1.0, (0.01, 0.02, 0.025), at + along / 2, np.eye(3))
+        bodies.revolute(before, body, at, (0.1 * np.cos(k), 1.0, 0.2 * np.sin(k)))
+        before, at = body, at + along
+    system, (q, v) = bodies.system("hinges"), bodies.start
+    ends = [solve_dae(system, (0.0, 0.02), q, v, method, 1e-8, 1e-8) for method in ("RadauIIA9", "DOP853")]
+    assert all(end.success for end in ends)
+    assert worst(ends[0].q[:, -1], ends[1].q[:, -1]) < 1e-8
