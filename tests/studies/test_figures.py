@@ -243,7 +243,7 @@ def test_the_bars_of_honesty_are_the_shares_of_the_outcomes():
     shares = [[bar.get_width() for bar in bars] for bars in axes.containers]
     third = 100.0 / 3.0  # one run hangs, one is off by a little, one failed
     assert np.allclose(shares, [[0.0, 0.0, third], [0.0, 0.0, third], [25.0, 0.0, third]])
-    assert {text.get_text() for text in axes.texts} == {"", "1", "ours", "others"} and axes.get_title()
+    assert {text.get_text() for text in axes.texts} == {"", "1", "ours", "rivals"} and axes.get_title()
     names = [label.get_text() for label in axes.get_yticklabels()]
     assert names == ["auto (4)", "2 solvers, all right (10)", "LSODA, index 1 (3)"]
 
