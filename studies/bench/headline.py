@@ -148,7 +148,7 @@ def _priced(runs: pd.DataFrame, error: float, rival: bool) -> dict[str, Any]:
             "from_python": bool(line["called_from"] == "Python"),
         }
         run = tables.run_for(own, error)
-        inside_s = None if rival else float(run["inside_s"])
+        inside_s = None if rival else float(run.get("inside_s", float("nan")))
         told |= {"inside_s": inside_s, "near": _near(runs, error, call_s), "repeats": int(run.get("repeats", 0))}
         return {"solver": solver, "call_s": float(call_s), "why": None} | told
     put = tables.put(runs)

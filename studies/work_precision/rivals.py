@@ -279,7 +279,7 @@ def picture(rows: pd.DataFrame) -> Figure:
     """The README's picture: what a call takes over error on the four-bar: default, cheapest of ours, main rivals."""
     rows = rows[rows["case"] == HEADLINE]
     figure, axes = plt.subplots(figsize=(7.6, 4.4), layout="constrained")
-    priced = (headline.price(rows, rows[:0], HEADLINE) or {"lines": []})["lines"]
+    priced = (headline.price(rows.assign(t_end=0.0), rows[:0], HEADLINE) or {"lines": []})["lines"]
     named, once = [at["solver"] for line in priced for at in line["at"] if at["solver"]], []
     for solver in dict.fromkeys([*figures.lines_of(rows, SHOWN), *named]):
         line = figures.with_gaps(rows[rows["solver"] == solver])
