@@ -9,15 +9,15 @@ import numpy as np
 import pandas as pd
 
 from studies.bench.end_states import EXACT
-from studies.bench.sharp_forces import Sharp, gust
+from studies.bench.sharp_forces import T_END, Sharp, gust
 from studies.bench.sharp_mechanisms import Mechanism, bars
 from studies.bench.sharp_mechanisms import chain as chain_of
 from studies.bench.sharp_motion import motion
-from studies.honesty.solvers import DEFAULT
+from studies.honesty.solvers import DEFAULT, LOOK
 from studies.honesty.traps import AGREE, GROWN, SHORT, Trap, of_force, pendulum
 
 WIDTHS = (1e-4, 3e-4, 1e-3, 3e-3, 1e-2)  # s
-N_DRAWS, N_QUICK, QUICK_WIDTHS = 100, 2, (1e-3,)  # of each width on each mechanism
+N_DRAWS, N_QUICK, QUICK_WIDTHS = 20, 2, (1e-3,)  # of each width on each mechanism
 SEED = 25
 
 
@@ -48,13 +48,18 @@ def traps(quick: bool) -> Iterator[Trap]:
 
 
 def findings_of(ran: pd.DataFrame, wrong: Sequence[str]) -> dict[str, Any]:
-    """Of each solver the runs with a `wrong` outcome, off by over EXACT, by width; of the default all of them, too."""
+    """Of each solver the runs with a `wrong` outcome, off by over EXACT, by width; of the default by length, too.
+
+    Of a gust longer than the time between two looks, twice its width is.
+    """
     gross = ran["outcome"].isin(wrong) & ~(ran["error"].astype(float) <= EXACT)
     widths = [width for width in WIDTHS if (ran["trap"] == name_of(width)).any()]
     lines = []
     for solver, own in ran.groupby("solver", sort=False):
         by = [gross[own.index[own["trap"] == name_of(width)]] for width in widths]
         lines.append({"solver": str(solver), "at": [{"n": len(each), "gross": int(each.sum())} for each in by]})
-    mine = gross[ran["solver"] == DEFAULT]
-    found = {"widths": widths, "solvers": lines, "n": len(ran)}
-    return found | {"default": {"n": len(mine), "gross": int(mine.sum())}}
+    mine = ran["solver"] == DEFAULT
+    seen = ran["trap"].isin([name_of(width) for width in widths if 2.0 * width >= LOOK * T_END])
+    by_length = {"longer": gross[mine & seen], "shorter": gross[mine & ~seen]}
+    found = {"widths": widths, "solvers": lines, "n": len(ran), "look": LOOK * T_END}
+    return found | {"default": {name: {"n": len(own), "gross": int(own.sum())} for name, own in by_length.items()}}

@@ -13,6 +13,7 @@ from references.sundials.ida_c import solve_ida_c
 from studies.bench.solvers import GIVEN
 from studies.honesty.traps import FORCE, HELD_OUT, INPUT, MISTAKE, SHORT, Trap
 from twoloop import Result, solve_dae
+from twoloop.kernels.control.sudden import PLACES
 from twoloop.run.run import LONGEST_UNSEEN
 
 OWN = (GIVEN, "Taylor", "Adams", "DOP853", "Gauss12", "RadauIIA5", "BDF")
@@ -30,7 +31,7 @@ WITH_CODE: dict[str, dict[str, Any]] = {"": {}, "compiled": {"compiled": True}, 
 QUICK_OWN, QUICK_SCIPY = (GIVEN, "DOP853", "BDF"), ("DOP853",)
 OF_SHORT = (GIVEN, "DOP853", "RadauIIA5")  # under gusts that a solver may step over, with IDA_C, CVODE_C, HEYOKA ...
 SCIPY_OF_SHORT = ("DOP853",)
-LOOK = LONGEST_UNSEEN  # of a run: so often ours look at the forces at least
+LOOK = LONGEST_UNSEEN / PLACES  # of a run: so often ours look at least at forces that change with time
 LIMITED = ", max_step"  # of others that take no step longer than ours do by default
 
 # whose a solver is, in the words of the findings
@@ -58,7 +59,7 @@ def own(method: str, trap: Trap) -> Result:
 
 def other(solve: Callable[..., Result], limited: bool, trap: Trap) -> Result:
     """Another project's, without a largest step, or with the longest that ours take by default."""
-    longest = LOOK * trap.t_end if limited else None
+    longest = LONGEST_UNSEEN * trap.t_end if limited else None
     options = {"time_limit": trap.time_limit, "max_step": trap.steps.get("max_step", longest)}
     tolerances = {"tol": trap.tolerance} if solve is solve_heyoka else {"rtol": trap.tolerance, "atol": trap.tolerance}
     return solve(trap.system, (0.0, trap.t_end), trap.q0, trap.v0, **tolerances, **options)

@@ -302,6 +302,7 @@ def test_a_gust_shorter_than_a_look_is_a_rate_over_random_times():
     short = rows.iloc[[0] * len(lines)].reset_index(drop=True).assign(group=SHORT, mechanism="pendulum, draw 0")
     short[["trap", "solver", "outcome", "error"]] = lines
     found, text = said(honesty, pd.concat([rows, short], ignore_index=True))
-    assert found["short"]["widths"] == [1e-3, 1e-2] and found["short"]["default"] == {"n": 3, "gross": 1}
+    assert found["short"]["widths"] == [1e-3, 1e-2]
+    assert found["short"]["default"] == {"longer": {"n": 3, "gross": 1}, "shorter": {"n": 0, "gross": 0}}
     assert "| the default | 1/2 | 0/1 |" in text and "| LSODA, index 1 | 1/1 | 0/0 |" in text
     assert "## Forces shorter than a look" not in said(honesty, rows)[1]

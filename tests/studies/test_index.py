@@ -183,14 +183,12 @@ def test_the_sentence_on_trust_is_computed(tmp_path):
     assert (
         "1e-8, under 15 kinds of sharp forces: the default 1 of 30, our other methods 1 of 30, heyoka 1 of 30. " in text
     )
-    assert "in development" not in text and "Steps look" not in text
+    assert "in development" not in text and "Ours look" not in text
     honesty["forces"]["trust"] = trust
     text = front(tmp_path, [case()], honesty=honesty | {"look": 5e-4})
     assert "in development: the default 0 of 50, our other methods 5 of 50. " in text
-    assert (
-        "Steps look at the forces at least every 5e-4 of a run; a shorter force can be missed, by the default too"
-        in text
-    )
+    said = "Ours look at forces that change with time at least every 5e-4 of a run; a shorter one can be missed, by"
+    assert said in text
     assert "andom mechanisms under sharp forces" not in text
     trust["default"] |= {"wrong": 3, "unasked": 2}
     within = {"tolerances": 1000.0, "n": 150, "within": 149, "failed": 1, "beyond": 0}
