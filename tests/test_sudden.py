@@ -88,9 +88,9 @@ def test_nor_in_lanes():
 
 
 def test_what_may_act_for_a_short_time():
-    assert may_be_sudden(SYSTEMS["gust"]) and may_be_sudden(SYSTEMS["switched"])
-    assert not may_be_sudden(pendulum(vibrating)) and not may_be_sudden(pendulum(steady))
-    assert not may_be_sudden(four_bar().system) and not may_be_sudden(driven_slider_crank().system)
+    assert all(may_be_sudden(system, False) for system in SYSTEMS.values())
+    smooth = pendulum(vibrating), pendulum(steady), four_bar().system, driven_slider_crank().system
+    assert not any(may_be_sudden(system, False) for system in smooth)
 
 
 def test_forces_are_not_called_beyond_the_end_of_a_run():

@@ -1,11 +1,10 @@
 """Whether forces, C_t or b may change suddenly with time, by what their callbacks are traced to."""
 
-from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 from twoloop.generate.families import Evaluator, Family, of_family
 from twoloop.generate.traced_equations import Equations
-from twoloop.generate.traced_values import Traced, unchecked
+from twoloop.generate.traced_values import unchecked
 from twoloop.generate.tracing import Form, Graph, Untraceable
 from twoloop.kernels.evaluation.operations import COSINE, PRODUCT, SINE, SUM
 from twoloop.problem.system import ConstrainedSystem
@@ -26,13 +25,12 @@ class TimeDependence(NamedTuple):
         return self
 
 
-def may_be_sudden(system: ConstrainedSystem, traced: Sequence[Traced] = ()) -> bool:
+def may_be_sudden(system: ConstrainedSystem, ran_on_symbols: bool) -> bool:
     """Whether a force, C_t or b may act for a short time; so may what cannot be traced.
 
-    Functions called in Python run on symbols only if they have done so for `traced`: they may keep what they are given.
+    Functions called in Python run on symbols only if the force has done so: they may keep what they are given.
     """
-    ran = any("force" in each.kinds for each in traced)
-    if system.n_q > LARGEST or (system.called_in_python and not ran):
+    if system.n_q > LARGEST or (system.called_in_python and not ran_on_symbols):
         return True
     try:
         known: TimeDependence = of_family(system, "time dependence", _traced(system), unchecked)

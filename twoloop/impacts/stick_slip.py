@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import inspect
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import lsq_linear
 
-from twoloop.bodies.model_problem import ModelProblem
 from twoloop.checks.arguments import check_positive, check_span, check_times, check_tolerance, shown
 from twoloop.impacts.contact import Accelerations
 from twoloop.impacts.joined import joined
@@ -20,6 +19,9 @@ from twoloop.problem.system import ConstrainedSystem
 from twoloop.result.result import Result
 from twoloop.run.record import Status
 from twoloop.solve import solve_dae
+
+if TYPE_CHECKING:
+    from twoloop.bodies.model_problem import ModelProblem
 
 Array = NDArray[np.float64]
 
@@ -72,6 +74,8 @@ def solve_with_friction(
     Changes are found as events are: a joint that stops and slides on the other way within a quarter of a step is
     missed; `max_step` helps.
     """
+    from twoloop.bodies.model_problem import ModelProblem  # which imports much that other motions do without
+
     if not isinstance(problem, ModelProblem):
         raise TypeError(f"problem must be that of a model, what model.problem() returned; given {shown(problem)}")
     if problem.model is None:

@@ -101,7 +101,9 @@ class Run:
         self.substituted = False  # whether another plan has taken over, for good
         self.clock[clock.JUMP_FROM] = self.clock[clock.JUMP_TO] = np.inf
         self.clock[clock.ROUGH_TO] = self.clock[clock.LOOKED_TO] = self.clock[clock.SUDDEN] = -np.inf
-        self.looks_ahead = step_size is None and may_be_sudden(system, plan.traced)
+        self.looks_ahead = step_size is None and may_be_sudden(
+            system, any("force" in each.kinds for each in plan.traced)
+        )
         self.crossings: list[list[tuple[float, Array]]] = []  # states before and behind steps across singular positions
         self.lengths: list[float] = []  # of steps across such a position that are still to be tried
         self.jumps: list[float] = []  # times at which velocities changed as by an impulse
