@@ -17,7 +17,7 @@ from studies.honesty.solvers import DEFAULT, LOOK
 from studies.honesty.traps import AGREE, GROWN, SHORT, Trap, of_force, pendulum
 
 WIDTHS = (1e-4, 3e-4, 1e-3, 3e-3, 1e-2)  # s
-N_DRAWS, N_QUICK, QUICK_WIDTHS = 20, 2, (1e-3,)  # of each width on each mechanism
+N_DRAWS, N_QUICK, QUICK_WIDTHS = 8, 2, (1e-3,)  # of each width on each mechanism
 SEED = 25
 
 
