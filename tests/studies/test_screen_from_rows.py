@@ -6,6 +6,7 @@ from dataclasses import replace
 import pytest
 
 from studies import ensembles
+from studies.beam import study as beam
 from studies.bench import index, study
 from studies.bench.cli import REPORTS, ROOT
 from studies.energy import study as energy
@@ -18,7 +19,7 @@ from tests.studies.test_first_screen import differing
 
 WITHOUT_FIGURES = {
     each.STUDY.name: replace(each.STUDY, figures=lambda rows, found: {})
-    for each in (table3, honesty, robustness, energy, ensembles)
+    for each in (table3, honesty, robustness, energy, ensembles, beam)
 }
 TOLD = {"work_precision": work_precision, **WITHOUT_FIGURES}  # which it quotes
 
