@@ -48,7 +48,7 @@ def rows_and_gamma(f, w, t, q, v):
 
 
 def in_kernels(system, t, q, v):
-    """C_q and Gamma as an evaluation takes them."""
+    """C_q and Gamma as used in an evaluation."""
     system, traced = standing_for(system, unchecked)
     kit = kit_of(system, t, q)
     work = workspace(system, kit, np.ones((system.n_c + system.n_a, system.n_q)), q, 1e-8, 0.0)

@@ -209,7 +209,7 @@ def _checked(
     check_derivatives: Any,
     compiled: Any,
 ) -> tuple[Method, float, Array, float, Compiled]:
-    """What a run takes of the options of a call, or what is wrong with them."""
+    """The options of a call as a run needs them; raises where one is wrong."""
     check_flag("dense_output", dense_output)
     if progress is not None:
         check_flag("progress", progress)

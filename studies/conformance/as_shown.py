@@ -1,4 +1,4 @@
-"""Solvers that nobody here wrote, called as their own documentation shows, on equations in plain numpy."""
+"""Solvers of other projects, called as their own documentation shows, on equations in plain numpy."""
 
 from collections.abc import Callable
 

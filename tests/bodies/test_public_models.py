@@ -56,7 +56,7 @@ def meet(one, radius, other, far, side):
     return one + x * along + side * np.sqrt(radius**2 - x * x) * np.array([-along[1], along[0]])
 
 
-# T. Jansen, The Great Pretender (2007): the "holy numbers", over 100; compared with those of other people's programs,
+# T. Jansen, The Great Pretender (2007): the "holy numbers", over 100; compared with those of public programs,
 # OpenSCAD User Manual/Example/Strandbeest (Wikibooks) among them
 LENGTHS = (38.0, 41.5, 39.3, 40.1, 55.8, 39.4, 36.7, 65.7, 49.0, 50.0, 61.9, 7.8, 15.0)
 JANSEN = {name: 0.01 * length for name, length in zip("abcdefghijklm", LENGTHS, strict=True)}

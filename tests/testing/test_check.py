@@ -12,7 +12,7 @@ from twoloop.testing.changes import in_a_frame, in_millimetres_and_grams
 from twoloop.testing.known_problems import MAKERS
 
 STEPS = (100, 200)
-LONG = ("andrews", "heavy_top")  # where an evaluation takes longest
+LONG = ("andrews", "heavy_top")  # the dearest to evaluate
 NAMED = [fault.words for fault in FAULTS]
 QUICK = [fault for k, fault in enumerate(FAULTS) if fault.problem not in LONG and fault.words not in NAMED[:k]]
 

@@ -170,7 +170,7 @@ class Loads(Collection):
     def friction(self, joint: ModelJoint | str, f: float, *, speed: float, name: str | None = None) -> Force:
         """Friction in a revolute or prismatic joint, by a smooth law: -f tanh(rate / speed).
 
-        Dry friction jumps where the motion turns round, and holds at rest; this does neither, and creeps below `speed`.
+        Dry friction jumps where the motion reverses, and holds at rest; this law does neither: it creeps below that.
         It does not depend on the load of the joint. A small `speed` makes the equations stiff.
 
         Parameters

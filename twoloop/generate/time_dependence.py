@@ -9,8 +9,9 @@ from twoloop.generate.tracing import Form, Graph, Untraceable
 from twoloop.kernels.evaluation.operations import COSINE, PRODUCT, SINE, SUM
 from twoloop.problem.system import ConstrainedSystem
 
-SMOOTH = (PRODUCT, SUM, SINE, COSINE)  # polynomials and vibrations: nothing happens in a short time alone
-LARGEST = 300  # coordinates: of more, to trace them takes longer than to look at them
+SMOOTH = (PRODUCT, SUM, SINE, COSINE)  # polynomials and vibrations: nothing happens in a short time alone ...
+HIGHEST = 8  # ... up to this degree: a high power of a cosine is a pulse
+LARGEST = 300  # coordinates: to trace the forces of more takes up to seconds, the looks of a run a tenth of it
 BY_TIME = 1  # the bit of t, the first input of a graph
 
 
@@ -50,8 +51,17 @@ def _traced(system: ConstrainedSystem) -> Any:
 
 
 def _is_sudden(graph: Graph, forms: list[Form]) -> bool:
+    degrees = {0: 1}  # in time, or in vibrations with it; 0 of what is not here
+
+    def degree(form: Form | None) -> int:
+        return 0 if form is None else max((degrees.get(i, 0) for i in form.terms), default=0)
+
     for i in graph.needed_by(forms):
         operation = graph.operations[i]
-        if operation is not None and operation[0] not in SMOOTH and graph.inputs_of[i] & BY_TIME:
+        if operation is None or not graph.inputs_of[i] & BY_TIME:
+            continue
+        kind, first, second = operation
+        degrees[i] = degree(first) + degree(second) if kind == PRODUCT else degree(first)
+        if kind not in SMOOTH or degrees[i] > HIGHEST:
             return True
     return False

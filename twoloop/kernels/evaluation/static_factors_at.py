@@ -81,7 +81,7 @@ def _factor(f, w, least):
 
 @compiled
 def _fault(w, t, q):
-    """Which values are not finite; where all are, whether M is to blame, which dense forms may do with, or the rows."""
+    """Which values are not finite; where all are, whether M is singular, as dense forms may accept, or the rows are."""
     if not finite_vector(w.mass_values):
         return not_finite(w.notes, MASS, t, q)
     if not finite_vector(w.jacobian_values):
