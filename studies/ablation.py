@@ -49,8 +49,8 @@ KEPT = 1e-12  # m; what is violated no more is kept
 GROWS = 2.0  # times the violation of the first tenth of a run in its last
 SAME_TOLERANCE = HALVES[8]  # 1e-5, the paper's, at which step lengths are compared
 
-COLORS = (figures.RED, figures.GREY, figures.BLUE, figures.GREEN, figures.ORANGE)
-LOOKS = dict(zip(VARIANTS, zip(COLORS, "ovsD^", strict=True), strict=True))
+TITLE = "how constraints are kept"
+LOOKS = dict(zip(VARIANTS, zip(figures.shades(len(VARIANTS)), "ovsD^", strict=True), strict=True))
 
 
 def _solve(variant: str, tableau: Tableau, setting: str, case: Case, value: float, repeat: int) -> Result:
@@ -259,7 +259,7 @@ def figures_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Figure]:
             label = "CPU time (s)" if what == TIME else text
             panel.set(xscale="log", yscale="log", ylabel=label, xlabel="largest position error (m, rad)")
         line[0].set_title(name, loc="left")
-    figures.legend(made, np.ravel(axes))
+    figures.legend(made, np.ravel(axes), TITLE)
     drift, (left, right) = plt.subplots(1, 2, figsize=(9.2, 3.2), layout="constrained")
     for variant in VARIANTS:
         row = _at_drawn(rows, variant)
@@ -270,7 +270,7 @@ def figures_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Figure]:
             drift.suptitle(f"{row['case']}, steps of {row['h']:g} s", fontsize=10)
     left.set(yscale="log", xlabel="t (s)", ylabel="largest |C| so far (m)", ylim=(1e-17, None))
     right.set(yscale="log", xlabel="t (s)", ylabel="largest |E − E(0)| so far (J)", ylim=(1e-10, None))
-    figures.legend(drift, [left])
+    figures.legend(drift, [left], TITLE)
     return {"ablation": made, "ablation_drift": drift}
 
 

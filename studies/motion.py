@@ -20,8 +20,10 @@ from studies.bench.render import number
 from studies.bench.solvers import (
     CANONICAL,
     CATALOGUE,
+    CVODE_C,
     GEAR_ORDERS,
     GIVEN,
+    HEYOKA,
     IDA_C,
     IRK,
     LINE_UP,
@@ -44,7 +46,7 @@ GRIDS = {"short": np.linspace(0.0, SHORT, 201), "last": np.linspace(-LAST, 0.0, 
 EXUDYN = "Exudyn, GeneralizedAlpha"
 SMALLEST = 1e-11  # m, of the reference
 LISTED = (
-    *(IRK, NEWMARK, GIVEN, "SunRadau5", OWN_EXPLICIT, CANONICAL, IDA_C, "DOP853, projected"),
+    *(IRK, NEWMARK, GIVEN, "SunRadau5", OWN_EXPLICIT, CANONICAL, IDA_C, HEYOKA, CVODE_C, "DOP853, projected"),
     *("LSODA, index 1", EXUDYN),
 )
 
@@ -134,10 +136,9 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
         procedures.append(found | {"holds": bool(run["top"] < PASSES and run["top_late"] > -PASSES)})
     told = ("solver", "called_from", "error_y3_short", "error_y3", "growth", "energy", "n_evaluations")
     listed = [find(rows, name) for name in LISTED]
-    grown, exudyn = (
-        rows[(rows["group"] == "line-up") & (rows["family"] == family)].set_index("solver")["growth"].dropna()
-        for family in ("two-loop", "Exudyn")
-    )
+    lined = rows[(rows["group"] == "line-up") & rows["growth"].notna()].set_index("solver")
+    grown, exudyn = (lined[lined["family"] == family]["growth"] for family in ("two-loop", "Exudyn"))
+    others = lined[lined["tol"].notna() & (lined["family"] != "two-loop")].groupby("keeps_constraints")["growth"]
     return {
         "t_end": float(rows["t_end"].iloc[0]),
         "problem": rows["problem"].iloc[0],
@@ -153,6 +154,7 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
         "listed": [{name: row[name] for name in told} | {"setting": setting(row)} for row in listed if row is not None],
         "canonical_growth": grown.get(CANONICAL),
         "exudyn_growth": [exudyn.min(), exudyn.max()] if len(exudyn) else None,
+        "others_growth": {str(bool(keeps)): [own.min(), own.max()] for keeps, own in others},
         "growth": [grown.drop(CANONICAL, errors="ignore").min(), grown.drop(CANONICAL, errors="ignore").max()],
     }
 
@@ -191,7 +193,7 @@ def error_figure(rows: pd.DataFrame) -> Figure:
     """Largest error of y3 so far over time."""
     figure, panels = plt.subplots(1, 2, figsize=(9.2, 4.4), sharex=True, sharey=True, layout="constrained")
     sides = {
-        "one setting each, see the table": [find(rows, name) for name in LISTED[:8]],
+        "one setting each, see the table": [find(rows, name) for name in LISTED[:10]],
         f"GSTIFF stand-in, h = {MIDDLE:g} s": [find(rows, gear(order), MIDDLE) for order in GEAR_ORDERS],
     }
     for panel, (title, entries) in zip(panels, sides.items(), strict=True):

@@ -49,7 +49,7 @@ PAIRS = (  # kept, not kept
 )
 OWN = (GIVEN, "SunRadau5", "Gauss12", OWN_EXPLICIT)
 ALONG = (*(name for pair in PAIRS for name in pair), "LSODA, index 1", IDA_C, HEYOKA, CVODE_C, *OWN)
-MORE = dict.fromkeys((HEYOKA, CVODE_C, CVODE_C_PROJECTED), 1e-8)  # tolerances, in the line-up of this study
+MORE = {CVODE_C_PROJECTED: 1e-8}  # tolerance, in the line-up of this study
 STABILISED = tuple(baumgarte(name, alpha) for name in ("DOP853", "LSODA") for alpha in ALPHAS)
 QUICK_ALONG = (*PAIRS[0], baumgarte("DOP853", 10.0), *OWN)
 DRAWN = (*PAIRS[0], *PAIRS[1], HEYOKA, CVODE_C, IDA_C, GIVEN)  # cost over error

@@ -19,7 +19,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
 from studies.bench.runs_by_error import astray, setting_of, used
-from studies.bench.solvers import CATALOGUE, COMPILED, DEFAULT, GIVEN, HEYOKA, IRK, IRK_LINE
+from studies.bench.solvers import CATALOGUE, COMPILED, DEFAULT, GEAR_ORDERS, GIVEN, HEYOKA, IRK, IRK_LINE, gear
 from studies.bench.store import Output
 from studies.bench.tables import time_for
 from twoloop.rows.equal_error import DECADE
@@ -56,7 +56,7 @@ mpl.rcParams.update(
 # Okabe and Ito's colours, told apart by colour-blind readers; a marker besides, and dashes for other families
 BLACK, ORANGE, SKY, GREEN = "#000000", "#E69F00", "#56B4E9", "#009E73"
 YELLOW, BLUE, RED, PINK, GREY, BROWN = "#B39B00", "#0072B2", "#D55E00", "#CC79A7", "#7F7F7F", "#7A4A12"
-VIOLET, MAGENTA, SLATE, STEEL = "#6A3D9A", "#D4006A", "#2F4F6F", "#4FA3A5"  # more, as ours and others' share none
+VIOLET, MAGENTA, SLATE = "#6A3D9A", "#D4006A", "#2F4F6F"  # more, as ours and others' share none
 OLIVE, CRIMSON, LIME, TAN, ROSE, LAVENDER = "#556B2F", "#8B0000", "#8CC63E", "#C49C6B", "#FF9D9A", "#A99BD8"
 
 # a colour is of one family of solvers alone; in it each has a marker, and those that a work-precision figure mostly
@@ -76,14 +76,13 @@ OURS: dict[str, dict[str, str]] = {
     YELLOW: {"PaperIRK": "H", "PaperIRK, Atol = Rtol varied": "H"},
 }
 THEIRS: dict[str, dict[str, str]] = {
-    GREEN: {"heyoka": "*", "GSTIFF stand-in, order 3": "3"},
+    GREEN: {"heyoka": "*"},
     SKY: {
         "CVODE from C, Adams": ">",
         "CVODE from C, BDF": "v",
         "CVODE from C, BDF, projected": "^",
         "CVODE, Adams": "h",
-    }
-    | {"GSTIFF stand-in, order 1": "1"},
+    },
     ORANGE: {
         "IDA from C, stabilised": "<",
         "IDA from C, q and v tested": "v",
@@ -91,18 +90,17 @@ THEIRS: dict[str, dict[str, str]] = {
         "IDA, stabilised": "s",
     }
     | {"IDA from C, order 2, positions tested": "X"},
-    STEEL: {"GSTIFF stand-in, order 2": "2"},
     LIME: {"LSODA, index 1": "p", "DOP853, index 1": "8", "DOP853, projected": "X", "DOP853, Baumgarte 10": "^"}
-    | {"Radau, index 1": "d", "BDF, index 1": "D", "GSTIFF stand-in, order 4": "4"},
-    TAN: {"Exudyn, GeneralizedAlpha": "D", "Exudyn, TrapezoidalIndex2": "^", "GSTIFF stand-in, order 5": "+"}
+    | {"Radau, index 1": "d", "BDF, index 1": "D"},
+    TAN: {"Exudyn, GeneralizedAlpha": "D", "Exudyn, TrapezoidalIndex2": "^"}
     | {"Exudyn, GeneralizedAlpha 0.6": "h", "Exudyn, GeneralizedAlpha 1": "d"},
-    LAVENDER: {"IDAS, CasADi": "d", "CVODES, CasADi": "D", "CVODES, CasADi, Adams": ">", "collocation, CasADi": "v"}
-    | {"GSTIFF stand-in, order 6": "x"},
+    LAVENDER: {"IDAS, CasADi": "d", "CVODES, CasADi": "D", "CVODES, CasADi, Adams": ">", "collocation, CasADi": "v"},
     ROSE: {"Dopri8, diffrax": "8", "Pr9, index 1": "p"},
 }
+STEELS = ("#9AD0D2", "#6FB7B9", "#4A9A9D", "#327D81", "#1E6064", "#0B4447")  # of the stand-in, by its order
 STYLES = {  # solver: colour, marker
     name: (color, marker) for color, own in (OURS | THEIRS).items() for name, marker in own.items()
-}
+} | {gear(order): look for order, look in zip(GEAR_ORDERS, zip(STEELS, "1234+x", strict=True), strict=True)}
 SAME = {  # the default looks like the method that it is, a tableau like the preset that is made of it
     GIVEN: DEFAULT,
     "Sun Radau IIB(3)": "SunRadau5",
@@ -111,7 +109,6 @@ SAME = {  # the default looks like the method that it is, a tableau like the pre
     "Radau IIA(3)": "RadauIIA5",
     "Newmark, β = 1/2": "PaperNewmark (beta = 1/2)",
 }
-COLORS = (*OURS,)
 MARKERS = "o^sDvP>d<pX*Hh8"  # those that can be open
 
 
@@ -150,6 +147,11 @@ def style(solver: str, family: str = "two-loop", keeps_constraints: bool = True)
 def look(row: pd.Series) -> dict[str, Any]:
     """Colour, marker and line of the row's solver, labelled with its name."""
     return style(row["solver"], row["family"], bool(row["keeps_constraints"])) | {"label": row["solver"]}
+
+
+def shades(n: int) -> list[Any]:
+    """Colours of what is no solver, from dark to light; a legend of them has a title that says what they are."""
+    return list(plt.get_cmap("viridis")(np.linspace(0.0, 0.85, n)))
 
 
 def legend(figure: Figure, axes: Iterable[Axes], title: str | None = None) -> None:
@@ -279,6 +281,10 @@ def work_precision(rows: pd.DataFrame, solvers: Sequence[str], title: str, error
     for axes, what in ((left, "CPU time of the call (s)"), (right, "evaluations")):
         axes.set(xscale="log", yscale="log", xlabel=error, ylabel=what)
     from_python = any(label.endswith(" [P]") for label in left.get_legend_handles_labels()[1])
-    legend(figure, [left], f"{LEGEND}\nleft out: motion lost" + from_python * "\n[P]: called from Python")
+    legend(
+        figure,
+        [left],
+        f"{LEGEND}\nleft out: motion lost\nvertical bars: quartiles" + from_python * "\n[P]: called from Python",
+    )
     figure.suptitle(title, fontsize=10)
     return figure

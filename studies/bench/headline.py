@@ -18,7 +18,7 @@ BEST = "best of ours"
 WHOSE = (GIVEN, OWN_CODE, DEFAULT, BEST)
 STANDINGS = ("ahead", "behind", "undecided", "alone", "unasked")
 PRICED = (1e-4, 1e-6)  # errors of the price on the first screen
-CHEAPER = 1.5  # by which a run that nearly gets there takes less time, where that is to be said
+CHEAPER = 1.2  # by which a run that nearly gets there takes less time, where that is to be said
 FROM_C = ("CVODE from C", "IDA from C")  # each in several settings, the best of which counts
 SCIPY = "SciPy's best"
 

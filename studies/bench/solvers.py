@@ -307,7 +307,7 @@ LINE_UP: dict[str, float] = {
     "Newmark": 1e-6,  # of order 2: ten times the steps at 1e-8
     CANONICAL: 0.01,
     **{f"IDA, {form}": 1e-8 for form in IDA_FORMS},
-    IDA_C: 1e-8,
+    **dict.fromkeys((IDA_C, HEYOKA, CVODE_C), 1e-8),
     "LSODA, index 1": 1e-8,
     "DOP853, index 1": 1e-8,
     "DOP853, projected": 1e-8,

@@ -179,7 +179,12 @@ def _in_angles(minimal: Mapping[str, Any]) -> list[dict[str, str]]:
     if not minimal.get("n") or minimal["n_behind"] <= minimal["n_ahead"]:
         return []
     pairs = f"{minimal['n_behind']} of {minimal['n']} comparisons"
-    take = f"an ODE in angles (faster than our best in {pairs}, {number(minimal['median'])} of the time in the median)"
+    faster = (at for each in minimal.get("mechanisms", []) for at in each["at"] if at["verdict"] == "behind")
+    by = Counter(at["rival"]["solver"].partition(",")[0] for at in faster)
+    who = f" by {' or '.join(f'`{name}`' for name, _ in by.most_common())}" if by else ""
+    share = f"{number(minimal['median'])} of its time in the median"
+    wrong = f"; {minimal['wrong']} of {minimal['asked']} runs are silently wrong" if minimal.get("wrong") else ""
+    take = f"an ODE in angles{who} (faster than our best in {pairs}, {share}{wrong})"
     return [{"what": "loops that close in closed form", "take": take}]
 
 

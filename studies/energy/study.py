@@ -186,7 +186,7 @@ def cost_figure(rows: pd.DataFrame) -> Figure:
     ended = (long["status"] == "REACHED_END") & ~long["lost"].fillna(True).astype(bool)
     long = long.assign(error_q=long["energy"].abs().where(ended), floor=0.0, solver=long["name"], astray=False)
     long = long[long["solver"].isin(DRAWN) & ((long["solver"] != KEEPING) | long["h"].notna())]
-    title = f"{number(long['t_end'].iloc[0])} s; ringed: no drift; {KEEPING}: fixed steps; each run timed once"
+    title = f"{number(long['t_end'].iloc[0])} s, each run timed once; ringed: no drift"
     figure = figures.work_precision(long, DRAWN, title, "largest energy error over the run (J)")
     calm = long[long["verdict"] == NO_DRIFT]
     for axes, what in zip(figure.axes, ("call_s", "n_evaluations"), strict=True):

@@ -147,10 +147,10 @@ def fastest(medians: pd.DataFrame, error: float) -> dict[str, Any] | None:
 def figures_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Figure]:
     """An evaluation over the number of bodies, and what an accuracy costs on chains."""
     figure, axes = plt.subplots(figsize=(6.4, 4.4), layout="constrained")
-    for line, color, marker in zip(found["kinds"], figures.COLORS, "osD^vP", strict=False):
+    for line, color, marker in zip(found["kinds"], figures.shades(len(found["kinds"])), "osD^vP", strict=False):
         axes.plot(list(line["us"]), list(line["us"].values()), marker=marker, color=color, label=line["case"])
     axes.set(xscale="log", yscale="log", xlabel="bodies", ylabel="time of an evaluation, projections included (µs)")
-    axes.legend(fontsize=8)
+    axes.legend(fontsize=8, title="mechanism")
     axes.grid(alpha=0.3)
     chains = rows[(rows["group"] == CHAIN) & rows["error_q"].notna()]
     sizes = sorted(set(chains["n"]))

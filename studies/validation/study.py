@@ -270,6 +270,16 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     }
     found["ours_always"] = [name for name in OWN if all(name in line["ours_right"] for line in problems)]
     found["judged"] = [of_condition(str(name), own) for name, own in judged.groupby("case", sort=False)]
+    found["judged_wrong"] = {
+        which: {
+            "n": int(own["outcome"].isin(("right", "wrong")).sum()),
+            "wrong": int((own["outcome"] == "wrong").sum()),
+        }
+        for which, own in (
+            ("ours", judged[judged["family"] == "two-loop"]),
+            ("others", judged[judged["family"] != "two-loop"]),
+        )
+    }
     found["judged_at"] = sorted(map(float, judged["tol"].unique()), reverse=True)
     found["ours_wrong_tight"] = [line for line in wrong if line["family"] == "two-loop" and line["tol"] == TIGHT]
     found["exact"] = EXACT
