@@ -19,9 +19,9 @@ from studies.bench.store import Output, plain, read_rows
 FILE = "compare.html"
 SOURCES = ("work_precision", "validation")
 MEASURES = {
-    "error_q": "largest position error (m, rad)",
-    "error_v": "largest velocity error",
-    "error_lam": "largest error of the multipliers",
+    "error_q": "error of positions (m, rad)",
+    "error_v": "error of velocities",
+    "error_lam": "error of multipliers",
     "energy": "energy error (J)",
     "violation_q": "largest violation of positions, |C|",
     "violation_v": "largest violation of velocities",

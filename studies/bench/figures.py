@@ -280,11 +280,14 @@ def work_precision(rows: pd.DataFrame, solvers: Sequence[str], title: str, error
             right.plot(errors, runs["n_evaluations"].astype(float), **one)
     for axes, what in ((left, "CPU time of the call (s)"), (right, "evaluations")):
         axes.set(xscale="log", yscale="log", xlabel=error, ylabel=what)
+    bars = bool((rows["call_q3"] > rows["call_q1"]).any())
     from_python = any(label.endswith(" [P]") for label in left.get_legend_handles_labels()[1])
     legend(
         figure,
         [left],
-        f"{LEGEND}\nleft out: motion lost\nvertical bars: quartiles" + from_python * "\n[P]: called from Python",
+        f"{LEGEND}\nleft out: motion lost"
+        + bars * "\nvertical bars: quartiles"
+        + from_python * "\n[P]: called from Python",
     )
     figure.suptitle(title, fontsize=10)
     return figure
