@@ -1,4 +1,4 @@
-"""Work-precision report of a mechanism or a solver of your own: our methods beside IDA and SciPy's solvers."""
+"""Work-precision report of a mechanism or a solver of your own: our methods beside those of other projects."""
 
 import time
 from collections.abc import Iterable, Mapping, Sequence
