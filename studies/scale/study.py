@@ -132,8 +132,11 @@ def steps_of(medians: pd.DataFrame) -> dict[str, Any] | None:
 
 
 def fastest(medians: pd.DataFrame, error: float) -> dict[str, Any] | None:
-    """The rival with the cheapest run within an error, and the default's time over its; None: one has no such run."""
+    """The rival that is the cheapest at an error, its price and the default's, as in the table; None: one has none."""
     costs = {str(name): tables.as_good(own, error) for name, own in medians.groupby("solver", sort=False)}
+    for name, own in medians.groupby("solver", sort=False):
+        if (price := tables.time_for(own, error)) == price:
+            costs[str(name)] = price
     rivals = [
         name for name in medians[medians["family"] != "two-loop"]["solver"].unique() if costs[name] == costs[name]
     ]
