@@ -184,12 +184,10 @@ def _in_angles(minimal: Mapping[str, Any]) -> list[dict[str, str]]:
     who = f" by {' or '.join(f'`{name}`' for name, _ in by.most_common())}" if by else ""
     share = f"{number(minimal['median'])} of its time in the median"
     whose = listed(f"`{each['solver'].partition(',')[0]}`" for each in minimal.get("wrong_by", []))
-    wrong = (
-        f"; {minimal['wrong']} of {minimal['asked']} runs, of {whose}, are silently wrong"
-        if minimal.get("wrong")
-        else ""
-    )
-    take = f"an ODE in angles{who} (faster than our best in {pairs}, {share}{wrong})"
+    told = f"faster than our best in {pairs}, {share}"
+    if minimal.get("wrong"):
+        told += f"; {minimal['wrong']} of {minimal['asked']} runs, of {whose}, silently wrong"
+    take = f"an ODE in angles{who} ({told})"
     return [{"what": "loops that close in closed form", "take": take}]
 
 
