@@ -1,6 +1,7 @@
 """Code that is traced once for systems that share callbacks: with any parameters it is what they would get alone."""
 
 import cProfile
+import gc
 import math
 import pstats
 from concurrent.futures import ThreadPoolExecutor
@@ -210,6 +211,23 @@ def test_what_else_was_made_of_a_family_costs_nothing():
     calls_for(few)
     alone = calls_for(few)
     assert calls_for(many) > 2 * alone and calls_for(few) == alone
+
+
+def test_garbage_is_collected_again_when_something_was_made():
+    family = family_of(four_bar().system)
+
+    def fail():
+        assert not gc.isenabled()
+        raise ValueError
+
+    for on in (True, False):
+        (gc.enable if on else gc.disable)()
+        try:
+            with pytest.raises(ValueError):
+                family.remembered(object(), fail)
+            assert gc.isenabled() is on
+        finally:
+            gc.enable()
 
 
 def test_threads_trace_one_family_one_after_another(monkeypatch):

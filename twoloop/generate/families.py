@@ -5,7 +5,9 @@ leave operations out; what is equal, but for its sign, stays equal. So systems o
 A callback that branches on its parameters, or rounds them, has no formulas: it is traced for each system alone.
 """
 
-from collections.abc import Callable
+import gc
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import partial
 from threading import RLock
 from typing import Any
@@ -97,8 +99,21 @@ class Family:
         if what not in self._made:
             with self._tracing:
                 if what not in self._made:
-                    self._made[what] = make()
+                    with _no_collection():
+                        self._made[what] = make()
         return self._made[what]
+
+
+@contextmanager
+def _no_collection() -> Iterator[None]:
+    """Let Python not look for garbage among what is traced, which all stays: that takes up to a tenth of a build."""
+    collects = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if collects:
+            gc.enable()
 
 
 def of_family(system: ConstrainedSystem, what: Any, make: Callable[[Family], Any], check: Callable[[Any], None]) -> Any:
