@@ -5,9 +5,7 @@ leave operations out; what is equal, but for its sign, stays equal. So systems o
 A callback that branches on its parameters, or rounds them, has no formulas: it is traced for each system alone.
 """
 
-import gc
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from functools import partial
 from threading import RLock
 from typing import Any
@@ -17,7 +15,7 @@ from numpy.typing import NDArray
 
 from twoloop.generate.known_numbers import Known, Powers, Record
 from twoloop.generate.tracing import Untraceable
-from twoloop.kernels.compile.caches import Newest
+from twoloop.kernels.compile.caches import Newest, _uncollected
 from twoloop.problem.system import ConstrainedSystem
 
 Array = NDArray[np.float64]
@@ -99,21 +97,9 @@ class Family:
         if what not in self._made:
             with self._tracing:
                 if what not in self._made:
-                    with _no_collection():
+                    with _uncollected():  # what is traced all stays, too
                         self._made[what] = make()
         return self._made[what]
-
-
-@contextmanager
-def _no_collection() -> Iterator[None]:
-    """Let Python not look for garbage among what is traced, which all stays: that takes up to a tenth of a build."""
-    collects = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if collects:
-            gc.enable()
 
 
 def of_family(system: ConstrainedSystem, what: Any, make: Callable[[Family], Any], check: Callable[[Any], None]) -> Any:
