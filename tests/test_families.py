@@ -1,6 +1,9 @@
 """Code that is traced once for systems that share callbacks: with any parameters it is what they would get alone."""
 
+import cProfile
+import gc
 import math
+import pstats
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -10,6 +13,7 @@ from tests.compiled import centripetal, heavy, radius
 from twoloop import ConstrainedSystem, callback, solve_dae
 from twoloop.generate.compiled_series import compiled_series
 from twoloop.generate.families import _alone, family_of
+from twoloop.generate.known_numbers import Known
 from twoloop.generate.straight_code import own_code
 from twoloop.generate.straight_line import StraightLine
 from twoloop.generate.traced_values import Traced
@@ -190,6 +194,40 @@ def test_nothing_is_traced_for_the_next_parameters(monkeypatch):
     monkeypatch.setattr("twoloop.generate.straight_code.StraightLine", None)
     code = own_code(pendulum(PARAMETERS[0]).with_parameters([1.4, 2.9, 0.5, 1.9]), 0.0, start)
     compiled_series(code)
+
+
+def test_what_else_was_made_of_a_family_costs_nothing():
+    system = bricard().system
+    family = family_of(system)
+    formulas = [each for each in family.parameters if type(each) is Known][:9]
+
+    def calls_for(array):
+        evaluate, profile = family.evaluator(system.parameters), cProfile.Profile()
+        profile.runcall(evaluate, array)
+        return pstats.Stats(profile).total_calls
+
+    few = np.array(formulas[:2], dtype=object)
+    many = np.array([one * other for one in formulas for other in formulas], dtype=object)
+    calls_for(few)
+    alone = calls_for(few)
+    assert calls_for(many) > 2 * alone and calls_for(few) == alone
+
+
+def test_garbage_is_collected_again_when_something_was_made():
+    family = family_of(four_bar().system)
+
+    def fail():
+        assert not gc.isenabled()
+        raise ValueError
+
+    for on in (True, False):
+        (gc.enable if on else gc.disable)()
+        try:
+            with pytest.raises(ValueError):
+                family.remembered(object(), fail)
+            assert gc.isenabled() is on
+        finally:
+            gc.enable()
 
 
 def test_threads_trace_one_family_one_after_another(monkeypatch):

@@ -98,7 +98,8 @@ def _in_order(system: ConstrainedSystem, t: float, q: Array, v: Array) -> bool:
     n, n_c, n_rows = system.n_q, system.n_c, system.n_c + system.n_a
     room, mass, (rows, pattern) = np.zeros(room_size(n, n_c, system.n_a)), np.zeros((n, n)), np.zeros((2, n_rows, n))
     try:
-        found = direct(look)(system.kit, t, q, v, _ones(n_c), room, mass, rows, _ways(n), pattern, LEAST)
+        sizes = system.made.get("sizes", _zeros(n))
+        found = direct(look)(system.kit, t, q, v, sizes, _ones(n_c), room, mass, rows, _ways(n), pattern, LEAST)
     except Exception:  # of a callback, which is called by itself then
         return False
     if not found & IN_ORDER:
@@ -146,7 +147,10 @@ def _surely_consistent(
         rows = rows[: system.n_c]
         scales = scales_of(system, t, q, rows)
         times = largest_solution(scales.scaled(rows))
-    return bool(times * float(np.linalg.norm(C / scales.rows)) <= SURELY * CONSISTENT * scales.reach.min())
+    consistent = times * float(np.linalg.norm(C / scales.rows)) <= SURELY * CONSISTENT * scales.reach.min()
+    if consistent:  # how far coordinates move until they matter, at the next start as well, beside what rounding is
+        system.made["sizes"] = scales.by_coordinate(scales.reach, rows)
+    return bool(consistent)
 
 
 def is_at_rounding(values: Array, rows: Rows, state: Array, rate: Array | float = 0.0) -> bool:
@@ -296,6 +300,11 @@ def _pattern_of(system: ConstrainedSystem, t: float, q: Array) -> Array:
 @cache
 def _ones(n: int) -> Array:
     return np.ones(n)
+
+
+@cache
+def _zeros(n: int) -> Array:
+    return np.zeros(n)
 
 
 @cache

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.checks.differences import EPS, as_far_as_they_differ, defined
-from twoloop.checks.scales import generic_factors, generic_velocities
+from twoloop.checks.scales import generic_factors, generic_velocities, rows_at
 from twoloop.checks.values import SAME, UNSYMMETRIC, unsymmetric_mass, wrong_values
 from twoloop.kernels.compile.linking import direct
 
@@ -19,6 +19,7 @@ Array = NDArray[np.float64]
 
 NEAR = 1e-3  # of the coordinates: also looked at a little off the start, where symmetry hides terms
 ROUNDED = 100.0  # times rounding of the terms of a constraint, by which values that callbacks share may differ, too
+MOST = 1_000_000  # numbers of Jacobians that are looked at together
 ROUNDING = 1e-12  # of a difference, relative to the largest entry over the displacement
 
 
@@ -86,35 +87,40 @@ def changed_mass(system: ConstrainedSystem, t0: float, q0: Array, t: float, q: A
 
 def check_bandwidth(system: ConstrainedSystem, bandwidth: int, t: float, q: Array) -> None:
     """Displace one coordinate or velocity after another: what lies farther away than the bandwidth may not answer."""
-    places = np.arange(system.n_q)
+    n, places = system.n_q, np.arange(system.n_q)
     farthest, where = bandwidth, ""
     size = float(np.abs(q).max()) or 1.0
-    v = size * generic_factors(system.n_q)
+    v = size * generic_factors(n)
     q, shift = q + 1e-3 * v, 1e-3 * size
+    steps, away = shift * np.eye(n), np.abs(places - places[:, None])
 
-    def look(what: str, j: int, column: Array, level: float) -> None:
+    def look(what: str, first: int, answers: Array, level: float) -> None:
+        """Rows of answers are what answers to coordinates from the first on."""
         nonlocal farthest, where
-        distances = np.where(np.isfinite(column) & (np.abs(column) > level), np.abs(places - j), 0)
+        far = away[first : first + len(answers)]
+        distances = np.where(np.isfinite(answers) & (np.abs(answers) > level), far, 0)
         if distances.max() > farthest:
-            i = int(distances.argmax())
-            farthest, where = int(distances[i]), f"{what} has the entry ({i}, {j}) = {column[i]:.6g}"
+            j, i = np.unravel_index(int(distances.argmax()), distances.shape)
+            farthest, where = int(distances[j, i]), f"{what} has the entry ({i}, {first + j}) = {answers[j, i]:.6g}"
 
-    for j, column in enumerate(system.mass(t, q).T):
-        look("M", j, column, 0.0)
-    for j in range(system.n_q):
-        step = np.where(places == j, shift, 0.0)
+    def force(q: Array, v: Array) -> Array:
         try:
-            force, jacobian = system.force(t, q, v), system.jacobian(t, q)
-            by_q, by_v = system.force(t, q + step, v) - force, system.force(t, q, v + step) - force
-            change = system.jacobian(t, q + step) - jacobian
+            return system.force(t, q, v)
         except (ArithmeticError, ValueError):  # math.sqrt and its like, outside what the callbacks are made for
-            continue
-        level = ROUNDING * float(np.abs(force).max()) / shift
-        look("the derivative of force by q", j, by_q / shift, level)
-        look("the derivative of force by v", j, by_v / shift, level)
-        level = ROUNDING * float(np.abs(jacobian).max(initial=0.0)) / shift
+            return np.full(n, np.nan)
+
+    look("M", 0, system.mass(t, q).T, 0.0)
+    at = force(q, v)
+    level = ROUNDING * float(np.abs(at).max()) / shift
+    look("the derivative of force by q", 0, (np.array([force(q + step, v) for step in steps]) - at) / shift, level)
+    look("the derivative of force by v", 0, (np.array([force(q, v + step) for step in steps]) - at) / shift, level)
+    for some in np.array_split(places, 1 + n * n * system.n_c // MOST):
+        rows, known = rows_at(system, t, np.vstack([q, q + steps[some]]))
+        rows = np.where(known[:, None, None], rows[:, : system.n_c], np.nan)
+        level = ROUNDING * float(np.abs(rows[0]).max(initial=0.0)) / shift
         for k in range(system.n_c):
-            look(f"the second derivative of constraint {k} by q", j, change[k] / shift, level)
+            name = f"the second derivative of constraint {k} by q"
+            look(name, int(some[0]), (rows[1:, k] - rows[0, k]) / shift, level)
     if where:
         raise ValueError(
             f"bandwidth of {system.name!r} must be at least {farthest}: {where}; given {bandwidth}. Or number the "

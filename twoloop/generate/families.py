@@ -5,7 +5,7 @@ leave operations out; what is equal, but for its sign, stays equal. So systems o
 A callback that branches on its parameters, or rounds them, has no formulas: it is traced for each system alone.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 from threading import RLock
 from typing import Any
@@ -15,10 +15,11 @@ from numpy.typing import NDArray
 
 from twoloop.generate.known_numbers import Known, Powers, Record
 from twoloop.generate.tracing import Untraceable
-from twoloop.kernels.compile.caches import Newest
+from twoloop.kernels.compile.caches import Newest, _uncollected
 from twoloop.problem.system import ConstrainedSystem
 
 Array = NDArray[np.float64]
+Gathered = tuple[Array, NDArray[np.int64], list[Powers]]
 Evaluator = Callable[[Any], Array]  # of an array of numbers, some of which may be formulas, for one system
 
 GENERIC = 0.5, 1.5  # range of the numbers with which callbacks are traced: of one size, so that none hides another
@@ -34,7 +35,7 @@ class Family:
     ----------
     parameters : ndarray (n_p,)
         Of one of the systems.
-    classes : sequence of int
+    classes : ndarray of int (n_p,)
         Which of its numbers each parameter is, from 1 on, negative for a negative one; 0: it stays what it is.
 
     Attributes
@@ -45,8 +46,8 @@ class Family:
         Kinds of callbacks that were: they do the same in all systems, at the same places of their arrays.
     """
 
-    def __init__(self, parameters: Array, classes: Sequence[int]):
-        self._classes = np.array(classes, dtype=np.int64)
+    def __init__(self, parameters: Array, classes: NDArray[np.int64]):
+        self._classes = classes
         n_numbers = int(np.abs(self._classes).max(initial=0))
         self._record = Record(np.random.default_rng(7).uniform(*GENERIC, n_numbers).tolist(), range(n_numbers))
         self.parameters = parameters.astype(object) if self._classes.any() else parameters.copy()
@@ -57,10 +58,7 @@ class Family:
         self.traced: set[str] = set()
         self.within_bounds: set[str] = set()  # of these, what `check_bounds` has looked at in one of the systems
         self._made: dict[Any, Any] = {}
-        self._powers: dict[Powers, int] = {(): 0}  # products that stand in arrays of formulas, in the order they came
-        self._arrays: dict[
-            int, tuple[Any, tuple[Array, NDArray[np.int64], int]]
-        ] = {}  # such arrays by their ids, gathered
+        self._arrays: dict[int, tuple[Any, Gathered]] = {}  # of formulas, by their ids
         self._tracing = RLock()  # what is traced is put down in one record
 
     def numbers(self, parameters: Array) -> Array:
@@ -70,33 +68,27 @@ class Family:
 
     def evaluator(self, parameters: Array) -> Evaluator:
         """What evaluates formulas for a system's parameters; their arrays are those that are kept with the family."""
-        product, values = self._record.products(self.numbers(parameters)), [np.ones(1)]
+        product = self._record.products(self.numbers(parameters))
 
         def evaluate(array: Any) -> Array:
             if array.dtype != object:
                 return array
-            scales, places, n_products = self._gathered(array)
+            scales, places, products = self._gathered(array)
             with np.errstate(all="ignore"):
-                known = values[0]
-                if len(known) < n_products:  # another thread may find the same
-                    more = [product(powers) for powers in list(self._powers)[len(known) :]]
-                    values[0] = known = np.append(known, more)
-                made: Array = scales * known[places]
+                made: Array = scales * np.array(list(map(product, products)))[places]
             return made
 
         return evaluate
 
-    def _gathered(self, array: Any) -> tuple[Array, NDArray[np.int64], int]:
-        """Numbers of an array as multiples of products of atoms, the places of these, and how many must be known."""
+    def _gathered(self, array: Any) -> Gathered:
+        """Numbers of an array as multiples of products of atoms, the places of these, and the products."""
         known = self._arrays.get(id(array))
         if known is None:
             powers = [each.powers if type(each) is Known else () for each in array.ravel()]
-            with self._tracing:
-                for each in powers:
-                    self._powers.setdefault(each, len(self._powers))
+            products = {each: place for place, each in enumerate(dict.fromkeys(powers))}
             scales = np.array([each.scale if type(each) is Known else each for each in array.ravel()], dtype=np.float64)
-            places = np.array([self._powers[each] for each in powers], dtype=np.int64)
-            gathered = scales.reshape(array.shape), places.reshape(array.shape), int(places.max(initial=-1)) + 1
+            places = np.array([products[each] for each in powers], dtype=np.int64)
+            gathered = scales.reshape(array.shape), places.reshape(array.shape), list(products)
             known = self._arrays[id(array)] = array, gathered  # what is named by its id is held
         return known[1]
 
@@ -105,7 +97,8 @@ class Family:
         if what not in self._made:
             with self._tracing:
                 if what not in self._made:
-                    self._made[what] = make()
+                    with _uncollected():  # what is traced all stays, too
+                        self._made[what] = make()
         return self._made[what]
 
 
@@ -162,9 +155,9 @@ def give_bounds(system: ConstrainedSystem) -> None:
 def family_of(system: ConstrainedSystem) -> Family:
     """The family of a system of compiled callbacks, which depend on their arguments alone."""
     parameters = system.parameters
-    classes = _classes(parameters.tolist())
-    fixed = [x for x, which in zip(parameters.tolist(), classes, strict=True) if which == 0]
-    key = (*system.given.items(), system.n_q, system.n_c, system.n_a, *classes, *fixed)
+    classes = _classes(parameters)
+    fixed = parameters[classes == 0] + 0.0  # without a sign of zero
+    key = (*system.given.items(), system.n_q, system.n_c, system.n_a, classes.tobytes(), fixed.tobytes())
     known: Family | None = _FAMILIES.get(key)
     if known is None:
         _FAMILIES[key] = known = Family(parameters, classes)
@@ -173,14 +166,16 @@ def family_of(system: ConstrainedSystem) -> Family:
 
 def _alone(system: ConstrainedSystem) -> Family:
     """A family of a system with these parameters only, all of which are plain numbers."""
-    return Family(system.parameters, [0] * system.parameters.size)
+    return Family(system.parameters, np.zeros(system.parameters.size, dtype=np.int64))
 
 
-def _classes(parameters: Sequence[float]) -> list[int]:
-    known: dict[float, int] = {}
-    classes = []
-    for x in parameters:
-        stays = x.is_integer() or not EXTREME < abs(x) < 1.0 / EXTREME
-        which = 0 if stays else known.setdefault(abs(x), len(known) + 1)
-        classes.append(which if x > 0.0 else -which)
+def _classes(parameters: Array) -> NDArray[np.int64]:
+    """Which number each parameter is, in the order in which they come, with its sign; 0 where it stays what it is."""
+    size = np.abs(parameters)
+    varies = (size > EXTREME) & (size < 1.0 / EXTREME) & (size != np.floor(size))
+    _, first, which = np.unique(size[varies], return_index=True, return_inverse=True)
+    rank = np.empty(len(first), dtype=np.int64)
+    rank[first.argsort()] = np.arange(1, len(first) + 1)
+    classes = np.zeros(len(size), dtype=np.int64)
+    classes[varies] = np.copysign(rank[which], parameters[varies])
     return classes

@@ -63,26 +63,31 @@ def _symmetric(mass, allowed):
 
 @exact
 def _rounding(value, row, state, least, rate, allowed):
-    """Whether a value is no more than this share of the terms that it is the sum of, no state being below the least."""
+    """Whether a value is no more than this share of the terms that it is the sum of, no state being below its least."""
     size = abs(rate)
     for j in range(state.size):
-        size += abs(row[j]) * max(abs(state[j]), least)
+        size += abs(row[j]) * max(abs(state[j]), least[j])
     return abs(value) <= allowed * size
 
 
 @exact
-def _consistent(C, rate, rows, q, v, allowed):
-    """Whether positions and velocities are on the rows but for rounding, of velocities of the fastest coordinate."""
-    fastest = 0.0
+def _consistent(C, rate, rows, q, v, sizes, fastest, allowed):
+    """Whether positions and velocities are on the rows but for rounding, of velocities of the fastest coordinate.
+
+    No coordinate counts as less than its size; `fastest` is scratch.
+    """
+    largest = 0.0
     for j in range(q.size):
-        fastest = max(fastest, abs(v[j]))
+        largest = max(largest, abs(v[j]))
+    for j in range(q.size):
+        fastest[j] = largest
     for i in range(len(rows)):
         speed = 0.0
         for j in range(q.size):
             speed += rows[i, j] * v[j]
         if not _rounding(speed + rate[i], rows[i], v, fastest, rate[i], allowed):
             return False
-        if i < C.size and not _rounding(C[i], rows[i], q, 0.0, 0.0, allowed):
+        if i < C.size and not _rounding(C[i], rows[i], q, sizes, 0.0, allowed):
             return False
     return True
 
@@ -123,13 +128,14 @@ def _definite(mass, least, factors):
     return ldl_factor(factors)
 
 
-@kernel(i8(KIT, f8, VECTOR, VECTOR, VECTOR, VECTOR, MATRIX, MATRIX, MATRIX, MATRIX, VECTOR))
-def look(f, t, q, v, lam, room, mass, rows, ways, pattern, least):
+@kernel(i8(KIT, f8, VECTOR, VECTOR, VECTOR, VECTOR, VECTOR, MATRIX, MATRIX, MATRIX, MATRIX, VECTOR))
+def look(f, t, q, v, sizes, lam, room, mass, rows, ways, pattern, least):
     """Flags of what is found at (t, q, v); arrays are full of zeros, but for `lam`, and these.
 
-    `least` are relative: what counts as rounding of a state, as the asymmetry of M, and as an eigenvalue of M. `ways`
-    say how far from q, over its size, rows are looked at, too. `mass` and `rows` become M, and C_q with A, `pattern` 1
-    where rows have entries; `room`, of `room_size` numbers, begins with the force, C, and C_t with b.
+    `least` are relative: what counts as rounding of a state, as the asymmetry of M, and as an eigenvalue of M. In what
+    counts as rounding, no coordinate is less than its size. `ways` say how far from q, over its size, rows are looked
+    at, too. `mass` and `rows` become M, and C_q with A, `pattern` 1 where rows have entries; `room`, of `room_size`
+    numbers, begins with the force, C, and C_t with b.
     """
     n, n_c, n_rows, flags = q.size, lam.size, rows.shape[0], f.flags
     force, C, rate, gamma = n, n + n_c, n + n_c + n_rows, n + n_c + 2 * n_rows  # where they end
@@ -169,7 +175,7 @@ def look(f, t, q, v, lam, room, mass, rows, ways, pattern, least):
     found = 0
     if _symmetric(mass, least[1]) and not _empty(rows):
         found = IN_ORDER
-        if _consistent(room[force:C], room[C:rate], rows, q, v, least[0]):
+        if _consistent(room[force:C], room[C:rate], rows, q, v, sizes, scratch[0], least[0]):
             found |= CONSISTENT
     if flags[CONSTANT_MASS] == 0:  # beyond doubt
         if _definite(mass, SURELY * least[2], scratch):
