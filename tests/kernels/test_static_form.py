@@ -5,7 +5,7 @@ import pytest
 
 import twoloop.run.static_form as static_module
 from studies.bench.large import ASSEMBLIES, LEVEL, closed_chain, ladder, open_chain
-from tests.large_systems import Assembly, dense_solution
+from tests.large_systems import Assembly, SpatialAssembly, dense_solution
 from tests.problems import worst
 from twoloop import ConstrainedSystem, ConstraintWarning, Status, consistent_state, mechanisms, solve_dae
 from twoloop.kernels import advance
@@ -57,11 +57,11 @@ class Started:
         return q, v
 
 
-def compare(seed, most):
+def compare(seed, most, kind=Assembly):
     """The larger error of accelerations and multipliers of a random assembly; None where dense has to decide."""
     rng = np.random.default_rng(seed)
     n = int(rng.integers(5, most))
-    assembly = Assembly(seed, n, int(rng.integers(0, max(1, n // 5))), int(rng.choice([0, 0, 1, 3])))
+    assembly = kind(seed, n, int(rng.integers(0, max(1, n // 5))), int(rng.choice([0, 0, 1, 3])))
     system = assembly.bodies.system("random")
     v = assembly.v(system)
     a, lam, rank, nearest = dense_solution(system, assembly.q, v)
@@ -81,17 +81,19 @@ def any_size(large, monkeypatch):
     monkeypatch.setattr(static_module, "SPARSE", 1e9)
 
 
-def test_random_assemblies_agree_with_dense_algebra(any_size):
-    found = [compare(seed, 100) for seed in range(24)]
+@pytest.mark.parametrize(("kind", "number", "most"), [(Assembly, 24, 100), (SpatialAssembly, 12, 30)])
+def test_random_assemblies_agree_with_dense_algebra(any_size, kind, number, most):
+    found = [compare(seed, most, kind) for seed in range(number)]
     assert max(error for error in found if error is not None) < 1e-9
-    assert found.count(None) <= 2
+    assert found.count(None) <= number // 12
 
 
 @pytest.mark.slow
-def test_more_random_assemblies_agree_with_dense_algebra(any_size):
-    found = [compare(seed, 300) for seed in range(1000, 1200)]
+@pytest.mark.parametrize(("kind", "number", "most"), [(Assembly, 150, 300), (SpatialAssembly, 50, 120)])
+def test_more_random_assemblies_agree_with_dense_algebra(any_size, kind, number, most):
+    found = [compare(seed, most, kind) for seed in range(1000, 1000 + number)]
     assert max(error for error in found if error is not None) < 1e-9
-    assert found.count(None) <= 10
+    assert found.count(None) <= number // 20
 
 
 @pytest.mark.parametrize("ratio", [1e6, 1e10])
