@@ -71,8 +71,7 @@ def static_form(system: ConstrainedSystem, t0: float, q0: Array, *plans: Plan) -
 
 def with_newton(system: ConstrainedSystem, t0: float, q0: Array, form: StaticForm) -> StaticForm | None:
     """The same with the program of Newton's matrix; None where there is none, or would not pay."""
-    *_, stiff = form.known
-    if system.n_q < NEWTON * LARGE or stiff:  # of chains of hinged bodies whose M is singular steps came to nothing
+    if system.n_q < NEWTON * LARGE:
         return None
     made = system.remembered("newton form", lambda: newton_form(system, t0, q0, *form.known))
     return None if made is None else form._replace(newton=made[0], n_groups=made[1])
