@@ -1,5 +1,7 @@
 """Large systems by sparse factors with a static program, against dense algebra in NumPy and the other forms."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -16,6 +18,7 @@ from twoloop.mechanisms import planar, spatial_bodies
 from twoloop.mechanisms.planar import GROUND
 from twoloop.mechanisms.spatial_bodies import SpatialBodies
 from twoloop.methods.dop853 import DOP853
+from twoloop.methods.presets import PRESETS
 from twoloop.run.run import Run
 from twoloop.run.static_form import static_form
 from twoloop.run.workspace import kit_of, workspace
@@ -164,6 +167,16 @@ def test_runs_are_those_of_the_other_forms(large, method):
     assert max(worst(system.constraint(0.0, q), 0.0) for q in ours.q.T) < 1e-13
     name = system.joints[5].name
     assert worst(one.reactions(name).force[:, -1], other.reactions(name).force[:, -1]) < 1e-7
+
+
+def test_the_default_of_large_systems_with_values_of_entries_is_explicit_by_dop853(large):
+    """A projection, one a step, costs as much as an evaluation: Adams' many short steps take twice the time."""
+    system, n = closed_chain(30).system, 90
+    large(10**9)
+    dense = closed_chain(30).system
+    for given, name, tolerance in ((system, "DOP853", 1e-6), (system, "Adams", 1e-11), (dense, "Adams", 1e-6)):
+        chosen = replace(PRESETS["auto"].for_system(given), series=None).plan(n, tolerance, tolerance, False)
+        assert chosen.first == PRESETS[name].plan(n, tolerance, tolerance, False).step
 
 
 def test_redundant_rows_are_named_and_held(large):
