@@ -1,12 +1,33 @@
-"""Random planar assemblies with loops and redundant rows, and their accelerations by NumPy's dense algebra alone."""
+"""Random assemblies with loops and redundant rows, and their accelerations by NumPy's dense algebra alone."""
 
 import numpy as np
 
 from twoloop.mechanisms.planar import GROUND, PlanarBodies
+from twoloop.mechanisms.spatial_bodies import SpatialBodies
 
 
-class Assembly:
-    """Bodies at random places, a tree of pins, pins that close loops, and pins that repeat others.
+class _Random:
+    """A tree of joints, joints that close loops, and joints between pairs of bodies that have one already."""
+
+    def connect(self, n, loops, doubles):
+        for k in range(n):
+            self.join(k, int(self.rng.integers(max(0, k - 6), k)) if k else GROUND)
+        tree = list(self.pairs)
+        for _ in range(loops):
+            i, j = int(self.rng.integers(n)), int(self.rng.integers(-1, n))
+            self.close(i, GROUND if i == j else j)
+        for _ in range(doubles):
+            self.close(*self.pairs[int(self.rng.integers(len(self.pairs)))])
+        return tree
+
+    def v(self, system):
+        """Random velocities that the constraints allow."""
+        G, v = system.jacobian(0.0, self.q), self.rng.normal(size=system.n_q)
+        return v - np.linalg.pinv(G, rcond=1e-10) @ (G @ v)
+
+
+class Assembly(_Random):
+    """Bodies at random places in a plane, with pins.
 
     What two pins on one pair of bodies hold, and a pin that is there twice, makes redundant rows.
     """
@@ -17,19 +38,15 @@ class Assembly:
         masses = heaviest ** rng.uniform(-0.5, 0.5, n)
         self.bodies = PlanarBodies([f"body {k}" for k in range(n)], masses, masses * rng.uniform(0.2, 1.0, n))
         self.pairs = []
-        for k in range(n):
-            self.pin(k, int(rng.integers(max(0, k - 6), k)) if k else GROUND)
-        for _ in range(loops):
-            i, j = int(rng.integers(n)), int(rng.integers(-1, n))
-            self.pin(i, GROUND if i == j else j)
-        for _ in range(doubles):
-            self.pin(*self.pairs[int(rng.integers(len(self.pairs)))])
+        self.connect(n, loops, doubles)
 
-    def pin(self, i, j):
+    def join(self, i, j):
         """Pin two bodies at a random place near the first."""
         at = self.places[i, :2] + self.rng.normal(size=2)
         self.pairs.append((i, j))
         self.bodies.pin(i, self.on(i, at), j, tuple(at) if j == GROUND else self.on(j, at))
+
+    close = join
 
     def on(self, k, at):
         """A place in the axes of a body."""
@@ -41,24 +58,70 @@ class Assembly:
     def q(self):
         return self.places.ravel()
 
-    def v(self, system):
-        """Random velocities that the constraints allow."""
-        G, v = system.jacobian(0.0, self.q), self.rng.normal(size=system.n_q)
-        return v - np.linalg.pinv(G, rcond=1e-10) @ (G @ v)
+
+class SpatialAssembly(_Random):
+    """Bodies at random places in space: hinges, balls, crosses and slides, and balls that close loops.
+
+    Two balls on one pair of bodies make one redundant row, three make three. `springs`: stiffness and damping of one
+    along each joint of the tree.
+    """
+
+    def __init__(self, seed, n, loops=0, doubles=0, springs=()):
+        rng = self.rng = np.random.default_rng(seed)
+        self.places, self.bodies, self.pairs = (
+            rng.normal(size=(n, 3)) * np.cbrt(n),
+            SpatialBodies((0.0, 0.0, -9.81)),
+            [],
+        )
+        for k, place in enumerate(self.places):
+            R, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+            mass = 2.0 ** rng.uniform(-0.5, 0.5)
+            moments = tuple(mass * rng.uniform(0.15, 0.27, 3))
+            self.bodies.body(f"body {k}", mass, moments, place, R * np.linalg.det(R))
+        tree = self.connect(n, loops, doubles)
+        for i, j in tree if springs else ():
+            one, other = self.near(i), rng.normal(size=3) if j == GROUND else self.near(j)
+            self.bodies.spring(i, one, j, other, *springs, 1.1 * float(np.linalg.norm(one - other)))
+
+    def near(self, k):
+        """A random place near a body."""
+        return self.places[k] + self.rng.normal(size=3)
+
+    def join(self, i, j):
+        """Connect two bodies, either of which may be named first, by some joint near the first."""
+        self.pairs.append((i, j))
+        at, a, b = self.near(i), *np.linalg.qr(self.rng.normal(size=(3, 2)))[0].T
+        first, second = (i, j) if self.rng.integers(2) else (j, i)
+        kind = self.rng.choice(["spherical", "revolute", "universal", "prismatic"])
+        axes = {"spherical": (), "universal": (a, b)}.get(kind, (a,))
+        getattr(self.bodies, kind)(first, second, at, *axes)
+
+    def close(self, i, j):
+        """A ball that closes a loop, or is one more on two bodies."""
+        self.pairs.append((i, j))
+        self.bodies.spherical(i, j, self.near(i))
+
+    @property
+    def q(self):
+        return self.bodies.start[0]
 
 
 def dense_solution(system, q, v):
     """Accelerations, multipliers of least norm, rank, and the smallest singular value that counts over the largest.
 
-    By singular values of G M^(-1/2), rows scaled to 1.
+    By singular values of G L^-T, rows scaled to 1, where M = L L^T; with four Euler parameters M + G^T G does for M.
     """
-    G, root = system.jacobian(0.0, q), np.sqrt(np.diag(system.mass(0.0, q)))
+    G, M = system.jacobian(0.0, q), system.mass(0.0, q)
+    singular = np.linalg.eigvalsh(M)[0] < 1e-10
+    root = np.linalg.cholesky(M + G.T @ G if singular else M)
     force, gamma = system.force(0.0, q, v), system.gamma(0.0, q, v)
-    lengths = np.linalg.norm(G / root, axis=1)
-    left, values, right = np.linalg.svd(G / root / lengths[:, None], full_matrices=False)
+    heavy = force + G.T @ gamma if singular else force
+    rows = np.linalg.solve(root, G.T).T
+    lengths = np.linalg.norm(rows, axis=1)
+    left, values, right = np.linalg.svd(rows / lengths[:, None], full_matrices=False)
     rank = int((values > 1e-9 * values[0]).sum())
     inverse = (right[:rank].T / values[:rank]) @ left[:, :rank].T
-    free = force / root - inverse @ ((G @ (force / root**2)) / lengths)
-    a = (free + inverse @ (gamma / lengths)) / root
-    lam = np.linalg.lstsq(G.T, force - root**2 * a, rcond=1e-9)[0]
+    free = np.linalg.solve(root, heavy)
+    a = np.linalg.solve(root.T, free + inverse @ ((gamma - rows @ free) / lengths))
+    lam = np.linalg.lstsq(G.T, force - M @ a, rcond=1e-9)[0]
     return a, lam, rank, float(values[rank - 1] / values[0])

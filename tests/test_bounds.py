@@ -9,6 +9,8 @@ from numba import njit
 from tests.problems import pendulum
 from tests.test_callbacks import PENDULUM
 from twoloop import ConstrainedSystem, callback, consistent_state, solve_dae
+from twoloop.checks import bounds, values
+from twoloop.generate import exact_derivatives
 from twoloop.kernels.compile.callbacks import KINDS
 
 FAR = 10**7  # a write so far out would end the process
@@ -59,6 +61,27 @@ def test_every_entry_point_watches_every_callback(entry, kind):
     tangents = NO_TANGENT if kind == "reaction_by_q" else {}
     with pytest.raises(ValueError, match=rf"{kind} of 'far' goes out of bounds: index {FAR}"):
         ENTRIES[entry](system(**tangents, **{kind: beyond(kind)}))
+
+
+@callback("mass_values")
+def heavy_values(t, q, p, values):
+    values[0] = values[1] = p[0]
+
+
+@callback("jacobian_values")
+def radius_values(t, q, p, values):
+    values[0], values[1] = q[0], q[1]
+
+
+@pytest.mark.parametrize("kind", ["mass", "jacobian"])
+@pytest.mark.parametrize("method", ["BDF", "DOP853"])
+def test_dense_matrices_of_large_systems_are_watched_where_they_are_asked_for(monkeypatch, kind, method):
+    for module in (bounds, values, exact_derivatives):
+        monkeypatch.setattr(module, "MOST", 0)
+    entries = {"mass_values": heavy_values, "mass_entries": ([0, 1], [0, 1])}
+    entries |= {"jacobian_values": radius_values, "jacobian_entries": ([0, 0], [0, 1])}
+    with pytest.raises(ValueError, match=rf"{kind} of 'far' goes out of bounds: index {FAR}"):
+        solve_dae(system(**entries, **{kind: beyond(kind)}), (0.0, 0.1), Q, V, method)
 
 
 @pytest.mark.parametrize("entry", ENTRIES)

@@ -3,13 +3,14 @@
 import numpy as np
 import pytest
 
+import twoloop.run.newton_form as newton_form
 import twoloop.run.static_form as static_module
 from studies.bench.large import ASSEMBLIES, closed_chain, ladder, open_chain, tree
-from tests.large_systems import Assembly
+from tests.large_systems import Assembly, SpatialAssembly
 from tests.problems import worst
 from twoloop import ConstrainedSystem, solve_dae
 from twoloop.kernels.algebra.static_program import N_UPDATES
-from twoloop.mechanisms import planar
+from twoloop.mechanisms import planar, spatial_bodies
 from twoloop.mechanisms.planar import GROUND
 from twoloop.mechanisms.spatial_bodies import SpatialBodies
 from twoloop.run.run import Run
@@ -27,6 +28,7 @@ def form(monkeypatch):
 
     monkeypatch.setattr(Run, "change_form", noted)
     monkeypatch.setattr(static_module, "SPARSE", 1e9)
+    monkeypatch.setattr(newton_form, "SPARSE", 1e9)
 
     def choose(static):
         monkeypatch.setattr(static_module, "LARGE", 0 if static else 10**9)
@@ -178,8 +180,39 @@ def test_programs_grow_with_the_bodies_and_no_faster():
         assert updates[1] <= 3.6 * updates[0]
 
 
+@pytest.mark.filterwarnings("ignore::twoloop.ConstraintWarning")
+@pytest.mark.parametrize(
+    ("seed", "n", "loops", "doubles", "method", "stiffness"),
+    [
+        (1, 10, 0, 0, "RadauIIA9", 1e3),
+        (2, 11, 2, 0, "RadauIIA5", 1e5),
+        (3, 10, 1, 2, "RadauIIA9", 1e3),
+        pytest.param(4, 60, 0, 0, "RadauIIA9", 1e4, marks=pytest.mark.slow),
+        pytest.param(5, 40, 4, 2, "RadauIIA9", 1e4, marks=pytest.mark.slow),
+        *[
+            pytest.param(seed, 5 + (7 * seed) % 30, seed % 4, seed % 3, "RadauIIA9", 1e4, marks=pytest.mark.slow)
+            for seed in range(10, 20)
+        ],
+    ],
+)
+def test_spatial_assemblies_with_springs(form, monkeypatch, seed, n, loops, doubles, method, stiffness):
+    monkeypatch.setattr(spatial_bodies, "LARGE", 0)
+    ends = []
+    for static in (False, True):
+        left = form(static)
+        made = SpatialAssembly(seed, n, loops, doubles, (stiffness, 1.0))
+        q, v = made.bodies.start
+        ends.append(solve_dae(made.bodies.system("sprung"), (0.0, 0.01), q, v, method, 1e-10, 1e-10, compiled=False))
+        assert ends[-1].success and left == []
+    one, other = ends
+    assert worst(one.q[:, -1], other.q[:, -1]) < 1e-9
+    assert worst(one.lam[:, -1], other.lam[:, -1]) < 1e-6 * max(1.0, np.abs(one.lam[:, -1]).max())
+    assert other.stats.n_outer <= 2.1 * one.stats.n_outer
+    assert other.stats.n_jacobians <= 1.5 * one.stats.n_jacobians + 2
+
+
 def test_a_chain_of_hinges_in_space():
-    """Of 15 bodies with four Euler parameters each: with sparse Newton matrices no step was accepted."""
+    """Rows of the hinge on the ground are not among those that stiffen M: else no step was accepted."""
     bodies, at, before = SpatialBodies((0.0, 0.0, -9.81)), np.zeros(3), GROUND
     for k in range(15):
         along = np.array([0.3, 0.1 * np.sin(k), -0.15])

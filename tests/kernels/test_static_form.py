@@ -1,11 +1,13 @@
 """Large systems by sparse factors with a static program, against dense algebra in NumPy and the other forms."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 import twoloop.run.static_form as static_module
 from studies.bench.large import ASSEMBLIES, LEVEL, closed_chain, ladder, open_chain
-from tests.large_systems import Assembly, dense_solution
+from tests.large_systems import Assembly, SpatialAssembly, dense_solution
 from tests.problems import worst
 from twoloop import ConstrainedSystem, ConstraintWarning, Status, consistent_state, mechanisms, solve_dae
 from twoloop.kernels import advance
@@ -16,6 +18,7 @@ from twoloop.mechanisms import planar, spatial_bodies
 from twoloop.mechanisms.planar import GROUND
 from twoloop.mechanisms.spatial_bodies import SpatialBodies
 from twoloop.methods.dop853 import DOP853
+from twoloop.methods.presets import PRESETS
 from twoloop.run.run import Run
 from twoloop.run.static_form import static_form
 from twoloop.run.workspace import kit_of, workspace
@@ -57,11 +60,11 @@ class Started:
         return q, v
 
 
-def compare(seed, most):
+def compare(seed, most, kind=Assembly):
     """The larger error of accelerations and multipliers of a random assembly; None where dense has to decide."""
     rng = np.random.default_rng(seed)
     n = int(rng.integers(5, most))
-    assembly = Assembly(seed, n, int(rng.integers(0, max(1, n // 5))), int(rng.choice([0, 0, 1, 3])))
+    assembly = kind(seed, n, int(rng.integers(0, max(1, n // 5))), int(rng.choice([0, 0, 1, 3])))
     system = assembly.bodies.system("random")
     v = assembly.v(system)
     a, lam, rank, nearest = dense_solution(system, assembly.q, v)
@@ -81,17 +84,19 @@ def any_size(large, monkeypatch):
     monkeypatch.setattr(static_module, "SPARSE", 1e9)
 
 
-def test_random_assemblies_agree_with_dense_algebra(any_size):
-    found = [compare(seed, 100) for seed in range(24)]
+@pytest.mark.parametrize(("kind", "number", "most"), [(Assembly, 24, 100), (SpatialAssembly, 12, 30)])
+def test_random_assemblies_agree_with_dense_algebra(any_size, kind, number, most):
+    found = [compare(seed, most, kind) for seed in range(number)]
     assert max(error for error in found if error is not None) < 1e-9
-    assert found.count(None) <= 2
+    assert found.count(None) <= number // 12
 
 
 @pytest.mark.slow
-def test_more_random_assemblies_agree_with_dense_algebra(any_size):
-    found = [compare(seed, 300) for seed in range(1000, 1200)]
+@pytest.mark.parametrize(("kind", "number", "most"), [(Assembly, 150, 300), (SpatialAssembly, 50, 120)])
+def test_more_random_assemblies_agree_with_dense_algebra(any_size, kind, number, most):
+    found = [compare(seed, most, kind) for seed in range(1000, 1000 + number)]
     assert max(error for error in found if error is not None) < 1e-9
-    assert found.count(None) <= 10
+    assert found.count(None) <= number // 20
 
 
 @pytest.mark.parametrize("ratio", [1e6, 1e10])
@@ -162,6 +167,16 @@ def test_runs_are_those_of_the_other_forms(large, method):
     assert max(worst(system.constraint(0.0, q), 0.0) for q in ours.q.T) < 1e-13
     name = system.joints[5].name
     assert worst(one.reactions(name).force[:, -1], other.reactions(name).force[:, -1]) < 1e-7
+
+
+def test_the_default_of_large_systems_with_values_of_entries_is_explicit_by_dop853(large):
+    """A projection, one a step, costs as much as an evaluation: Adams' many short steps take twice the time."""
+    system, n = closed_chain(30).system, 90
+    large(10**9)
+    dense = closed_chain(30).system
+    for given, name, tolerance in ((system, "DOP853", 1e-6), (system, "Adams", 1e-11), (dense, "Adams", 1e-6)):
+        chosen = replace(PRESETS["auto"].for_system(given), series=None).plan(n, tolerance, tolerance, False)
+        assert chosen.first == PRESETS[name].plan(n, tolerance, tolerance, False).step
 
 
 def test_redundant_rows_are_named_and_held(large):

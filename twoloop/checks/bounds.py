@@ -14,6 +14,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from twoloop.checks.values import MOST
 from twoloop.kernels.compile.caches import names_in, of_library
 from twoloop.kernels.compile.callbacks import KINDS
 from twoloop.kernels.compile.private import Dispatcher
@@ -33,6 +34,8 @@ MANY = 4096  # parameters that a callback may ask for beyond those that it has, 
 def check_bounds(system: "ConstrainedSystem", t: float, q: Array, v: Array) -> None:
     """Run every compiled callback of a system once at (t, q, v) where bounds are watched; later calls do nothing.
 
+    Dense matrices of large systems that give values of entries are left: what asks for them evaluates them first.
+
     Raises
     ------
     ValueError
@@ -42,6 +45,8 @@ def check_bounds(system: "ConstrainedSystem", t: float, q: Array, v: Array) -> N
         return
     state = {"q": q, "v": v, "lam": np.ones(system.n_c)}
     for kind, entry in KINDS.items():
+        if kind in system.entries and system.n_q * (system.n_q if kind == "mass" else system.n_c) > MOST:
+            continue
         check_callback(system, kind, t, [state[name] for name in entry.state])
 
 

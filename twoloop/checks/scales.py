@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from twoloop.checks.bounds import check_callback
 from twoloop.checks.sparse_rows import Rows, SparseRows
 from twoloop.kernels.compile.linking import direct
 
@@ -126,6 +127,7 @@ def rows_at(system: ConstrainedSystem, t: float, places: Array) -> tuple[Array, 
     """C_q and A at positions, (n, n_c + n_a, n_q), and at which of these no callback raised an exception, (n,)."""
     from twoloop.kernels.evaluation import first_look
 
+    check_callback(system, "jacobian", t, [places[0]])
     n, kit, defined = len(places), system.kit, np.ones(len(places), dtype=bool)
     rows = np.zeros((n, system.n_c + system.n_a, system.n_q))
     evaluate = direct(first_look.rows_at)

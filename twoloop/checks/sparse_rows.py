@@ -20,9 +20,13 @@ class SparseRows:
     """
 
     def __init__(self, rows: Integers, columns: Integers, values: Array, shape: tuple[int, int]):
-        places, which = np.unique(rows * shape[1] + columns, return_inverse=True)
+        places, self.place_of = np.unique(rows * shape[1] + columns, return_inverse=True)
         self.rows, self.columns, self.shape = places // shape[1], places % shape[1], shape
-        self.values = np.bincount(which, values, len(places)) if len(places) else np.zeros(0)
+        self.values = self.added(values)
+
+    def added(self, values: Array) -> Array:
+        """Values given in the order of the rows and columns that this was made of, in its own."""
+        return np.bincount(self.place_of, values, len(self.rows)).astype(np.float64)
 
     @property
     def size(self) -> int:
@@ -36,15 +40,16 @@ class SparseRows:
         return np.bincount(self.rows, self.values * x[self.columns], self.shape[0]).astype(np.float64)
 
     def __abs__(self) -> SparseRows:
-        return self._with(np.abs(self.values))
+        return self.with_values(np.abs(self.values))
 
     def pattern(self) -> SparseRows:
         """1 for each entry."""
-        return self._with(np.ones(len(self.values)))
+        return self.with_values(np.ones(len(self.values)))
 
-    def _with(self, values: Array) -> SparseRows:
+    def with_values(self, values: Array) -> SparseRows:
+        """Others at the same places."""
         other = object.__new__(SparseRows)
-        other.rows, other.columns, other.values, other.shape = self.rows, self.columns, values, self.shape
+        vars(other).update(vars(self), values=values)
         return other
 
     def __getitem__(self, part: slice) -> SparseRows:

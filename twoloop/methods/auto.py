@@ -79,6 +79,9 @@ class Auto:
     its default for small ones) a series pays below 1e-6, for 16 coordinates or more below 1e-8, with at most 8
     operations in all below 1e-3, and `many` from 64 coordinates on.
 
+    Systems that give the values of entries have `few` from 64 coordinates on, too, unless tolerances are below 1e-10 or
+    there are at most a quarter as many constraints: their projections, one a step, cost as much as evaluations.
+
     At looser tolerances than these a run begins with `series` as well, as others may take no steps longer than a
     hundredth of the run: after 10 steps it goes on without, if the next would be no longer than that. It also goes on
     without where the series is not finite and the functions are.
@@ -120,6 +123,7 @@ class Auto:
     fixed: Method
     n_rows: int = 0  # constraints of the system, and whether there is code made for it; solve_dae says so
     compiled: bool = False
+    sparse: bool = False  # whether it gives the values of entries: an evaluation then costs no more than a projection
 
     @property
     def name(self) -> str:
@@ -133,7 +137,8 @@ class Auto:
 
     def for_system(self, system: ConstrainedSystem, code: OwnCode | None = None, check: Check = unchecked) -> "Auto":
         """The same for the operations of a system, without `series` where they cannot be seen, or not be relied on."""
-        chosen = replace(self, n_rows=system.n_c + system.n_a, compiled=code is not None)
+        sparse = len(system.entries) == 2 and system.n_a == 0
+        chosen = replace(self, n_rows=system.n_c + system.n_a, compiled=code is not None, sparse=sparse)
         if code is not None and isinstance(self.few, DOP853):
             chosen = replace(chosen, few=self.few.for_system(system, code))
         plain = code is None and (system.called_in_python or not is_quick(system))
@@ -187,7 +192,7 @@ class Auto:
 
     def _explicit(self, few: Method, n_q: int, rtol: float, atol: float, second: Plan, dearer: float) -> Plan:
         """The plan without a series."""
-        many = n_q >= VERY_MANY
+        many = n_q >= VERY_MANY and not self.sparse
         if n_q >= MANY and not self.compiled:
             many = many or self.n_rows <= CONSTRAINED * n_q or least_tolerance(rtol, atol) < TIGHT_MANY
         explicit, limit, looks = (self.many, LIMIT_MANY, 1) if many else (few, LIMIT_FEW, LOOKS_FEW)

@@ -28,6 +28,9 @@ class BDF:
     at the rate of the truncation error; large ones may do either from order 3 on. The fixed point limits h to about
     the reciprocal of the largest frequency or rate of decay: stiff problems need small steps.
 
+    Its matrices are dense: of systems of more than some forty bodies take "DOP853", or where they are stiff "RadauIIA5"
+    or "TRBDF2", which have sparse ones.
+
     Parameters
     ----------
     max_order : int

@@ -397,7 +397,9 @@ class ConstrainedSystem:
         """The same by their entries, where `jacobian_values` gives these."""
         if self.n_a > 0 or "jacobian" not in self.entries:
             return self.rows(t, q)
-        return SparseRows(*self.entries["jacobian"], self.jacobian_values(t, q), (self.n_c, self.n_q))
+        values, shape = self.jacobian_values(t, q), (self.n_c, self.n_q)
+        made = self.remembered("sparse rows", lambda: SparseRows(*self.entries["jacobian"], values, shape))
+        return made.with_values(made.added(values))  # type: ignore[no-any-return]
 
     def rates(self, t: float, q: ArrayLike) -> Array:
         """C_t, then b, (n_c + n_a,)."""

@@ -51,10 +51,10 @@ def _entries(system: ConstrainedSystem, t: float, q: Array, v: Array, lam: Array
     """Where Q - C_q^T lam changes with a coordinate, and Q with a velocity, and the same mirrored."""
 
     def reaction(q: Array) -> Array:
-        rows = system.sparse_rows(t, q)
-        if isinstance(rows, np.ndarray):
-            return lam @ rows
-        return np.bincount(rows.columns, rows.values * lam[rows.rows], len(q)).astype(np.float64)
+        if "jacobian" not in system.entries:
+            return lam @ system.jacobian(t, q)
+        rows, columns = system.entries["jacobian"]
+        return np.bincount(columns, system.jacobian_values(t, q) * lam[rows], len(q)).astype(np.float64)
 
     force, of_rows = system.force(t, q, v), reaction(q)
     found: set[tuple[int, int]] = set()

@@ -23,6 +23,7 @@ from twoloop.run.newton_form import newton_form
 Array = NDArray[np.float64]
 
 SINGULAR = 1e-10  # smallest over largest eigenvalue of a body's M, below which it counts as singular
+ALONG = 1e-3  # of a row: more of it has to lie along directions without mass if it is to stiffen these
 NEWTON = 1.6  # times LARGE: coordinates from which on Newton's matrices are sparse
 SPARSE = 0.05  # of the multiplications of dense factors: a program with more of them is not worth its indices
 
@@ -70,8 +71,7 @@ def static_form(system: ConstrainedSystem, t0: float, q0: Array, *plans: Plan) -
 
 def with_newton(system: ConstrainedSystem, t0: float, q0: Array, form: StaticForm) -> StaticForm | None:
     """The same with the program of Newton's matrix; None where there is none, or would not pay."""
-    *_, stiff = form.known
-    if system.n_q < NEWTON * LARGE or stiff:  # of chains of hinged bodies whose M is singular steps came to nothing
+    if system.n_q < NEWTON * LARGE:
         return None
     made = system.remembered("newton form", lambda: newton_form(system, t0, q0, *form.known))
     return None if made is None else form._replace(newton=made[0], n_groups=made[1])
@@ -93,7 +93,7 @@ def _made(system: ConstrainedSystem, t0: float, q0: Array) -> StaticForm | None:
         mass_pattern = found if dense_mass else mass_pattern
     if not _is_sparse(system.n_q, len(jacobian[0])) or not _is_sparse(system.n_q, len(mass[0])):
         return None
-    together = [joint.translation + joint.rotation for joint in system.joints]
+    together = _together(system, mass)
     stiff = _stiff_rows(system, t0, q0, mass, jacobian, together)
     program = static_program(system.n_q, system.n_c, mass, jacobian, together, stiff)
     if program is None or program[N_UPDATES] > SPARSE * _dense_work(system.n_q, system.n_c):
@@ -103,10 +103,27 @@ def _made(system: ConstrainedSystem, t0: float, q0: Array) -> StaticForm | None:
     return StaticForm(program, static, mass, pattern, mass_pattern, (mass, jacobian, together, stiff))
 
 
+def _together(system: ConstrainedSystem, mass: Entries) -> list[tuple[int, ...]]:
+    """Coordinates of one body each: those that joints act on, and all others that are laid out as these, in space.
+
+    A joint names one of its bodies, so that the end of a chain may be in none.
+    """
+    named = [joint.translation + joint.rotation for joint in system.joints]
+    layouts = {tuple(j - own[0] for j in own) for own in named}
+    if layouts != {tuple(range(7))} or system.n_q % 7 > 0 or any(own[0] % 7 > 0 for own in named):
+        return named
+    body_of = bodies_of(system.n_q, mass, ())
+    expected = [7 * k + (j if j < 3 else 3) for k in range(system.n_q // 7) for j in range(7)]
+    return named if body_of != expected else [tuple(range(k, k + 7)) for k in range(0, system.n_q, 7)]
+
+
 def _stiff_rows(
     system: ConstrainedSystem, t0: float, q0: Array, mass: Entries, jacobian: Entries, together: list[tuple[int, ...]]
 ) -> list[int]:
-    """Rows of single bodies whose M is singular, with no entry but where M has some: see static_factors.py."""
+    """Rows of single bodies that M is singular along, with no entry but where M has some: see static_factors.py.
+
+    No more than make it definite: others, as of a hinge on the ground, hold the body as joints do.
+    """
     values = system.mass_values(t0, q0) if "mass" in system.entries else system.mass(t0, q0)[mass]
     body_of = np.array(bodies_of(system.n_q, mass, together))
     coordinates: dict[int, list[int]] = {}
@@ -118,20 +135,33 @@ def _stiff_rows(
     for i, j, value in zip(*(each.tolist() for each in (*mass, values)), strict=True):
         blocks[int(body_of[i])][place[i], place[j]] += value
         there.add((i, j))
-    singular = {body for body, block in blocks.items() if not _is_definite(block)}
-    columns: dict[int, list[int]] = {}
-    for i, j in zip(*(each.tolist() for each in jacobian), strict=True) if singular else ():
-        columns.setdefault(i, []).append(j)
-    return [
-        i
-        for i, own in columns.items()
-        if body_of[own[0]] in singular and all((j, k) in there for j in own for k in own)
-    ]
+    free = {body: ways for body, block in blocks.items() if (ways := _without_mass(block)).size > 0}
+    if not free:
+        return []
+    columns: dict[int, list[tuple[int, float]]] = {}
+    values = system.jacobian_values(t0, q0) if "jacobian" in system.entries else system.jacobian(t0, q0)[jacobian]
+    for i, j, value in zip(*(each.tolist() for each in (*jacobian, values)), strict=True):
+        columns.setdefault(i, []).append((j, value))
+    found = []
+    for i, own in columns.items():
+        body = int(body_of[own[0][0]])
+        if body in free and all((j, k) in there for j, _ in own for k, _ in own):
+            row = np.zeros(len(coordinates[body]))
+            for j, value in own:
+                row[place[j]] += value
+            along = free[body] @ row
+            if np.linalg.norm(along) > ALONG * np.linalg.norm(row):
+                found.append(i)
+                free[body] = np.linalg.svd(along[None, :])[2][1:] @ free[body]
+    return found
 
 
-def _is_definite(block: Array) -> bool:
-    values = np.linalg.eigvalsh(block) if np.isfinite(block).all() else np.zeros(1)
-    return bool(values[0] > SINGULAR * values[-1])
+def _without_mass(block: Array) -> Array:
+    """Directions along which a body's M is singular, one a row."""
+    if not np.isfinite(block).all():
+        return np.eye(len(block))
+    values, ways = np.linalg.eigh(block)
+    return np.asarray(ways.T[values <= SINGULAR * values[-1]])
 
 
 def _is_sparse(n_q: int, n_entries: int) -> bool:

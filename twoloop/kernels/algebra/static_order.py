@@ -152,13 +152,16 @@ def elimination_order(
 
 def bodies_of(n_q: int, mass_entries: tuple[Integers, Integers], together: Iterable[Sequence[int]]) -> list[int]:
     """Of each coordinate, the first of its body."""
-    sets = _Sets(n_q)
-    for i, j in zip(*(each.tolist() for each in mass_entries), strict=True):
-        sets.join(i, j)
-    for first, *others in together:
-        for other in others:
-            sets.join(first, other)
-    return [sets.find(j) for j in range(n_q)]
+    pairs = np.array([(first, other) for first, *others in together for other in others], dtype=np.int64).reshape(-1, 2)
+    ones, others = (np.concatenate([entries, column]) for entries, column in zip(mass_entries, pairs.T, strict=True))
+    first_of, before = np.arange(n_q), np.full(n_q, -1)
+    while (first_of != before).any():
+        before = first_of.copy()
+        least = np.minimum(first_of[ones], first_of[others])
+        np.minimum.at(first_of, ones, least)
+        np.minimum.at(first_of, others, least)
+        first_of = first_of[first_of]
+    return first_of.tolist()  # type: ignore[no-any-return]
 
 
 def _minimum_degree(
