@@ -9,12 +9,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.bodies.functions import Function
-from twoloop.bodies.parameter_layout import FORCE_PROGRAM, HEAD, MOTION_PROGRAM, SPRING
+from twoloop.bodies.parameter_layout import (
+    ANGLE,
+    FORCE_PROGRAM,
+    HEAD,
+    MOTION_PROGRAM,
+    PERPENDICULAR,
+    RATE,
+    SPRING,
+    TURN,
+)
 from twoloop.bodies.places import placed
 from twoloop.bodies.row_function import RowFunction
 from twoloop.bodies.tables import Tables
 from twoloop.checks.arguments import shown
 from twoloop.generate.tracing import Untraceable
+from twoloop.problem.entries import LARGE
 from twoloop.problem.joints import Joint
 from twoloop.problem.system import ConstrainedSystem
 
@@ -67,7 +77,28 @@ def system_of(
         made = InPython(callbacks, tables, n_q)
         return ConstrainedSystem.from_python(**options, **{kind: getattr(made, kind) for kind in kinds})
     given = {kind: getattr(callbacks, kind) for kind in kinds}
+    if n_q >= LARGE and tables.n_rows:
+        given |= {"mass_values": callbacks.mass_values, "jacobian_values": callbacks.jacobian_values}
+        options |= {f"{kind}_entries": found for kind, found in entries_of(dimension, tables).items()}
     return ConstrainedSystem(**options, constant_mass=dimension == 2, **given)
+
+
+def entries_of(dimension: int, tables: Tables) -> dict[str, NDArray[np.int64]]:
+    """Rows and columns of what the callbacks `mass_values` and `jacobian_values` of a model give, in their order."""
+    width, n = (3 if dimension == 2 else 7), len(tables.bodies)
+    blocks = [[k] for k in range(3)] + ([[3, 4, 5, 6]] if dimension == 3 else [])
+    places = [(width * k + i, width * k + j) for k in range(n) for block in blocks for i in block for j in block]
+    named = [(k, 7 * k + j) for k in range(n) for j in range(3, 7)] if dimension == 3 else []
+    turn_alone = (ANGLE,) if dimension == 2 else (PERPENDICULAR, TURN)
+    row = len(named) // 4
+    for part in (part for joint in tables.joints for part in joint.rows if part.kind != RATE):
+        skipped = dimension if part.kind in turn_alone else 0
+        columns: Any = (*part.first.coordinates[skipped:], *part.second.coordinates[skipped:])
+        if isinstance(part.motion, RowFunction):
+            columns = part.motion.columns
+        named += [(row + k, j) for k in range(part.n_rows) for j in columns]
+        row += part.n_rows
+    return {"mass": np.array(places).T, "jacobian": np.array(named).T}
 
 
 @QUIET
