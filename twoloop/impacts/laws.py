@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import nnls
+from scipy.optimize import lsq_linear, nnls
 
 from twoloop.problem.system import ConstrainedSystem
 
@@ -32,13 +32,24 @@ def complementary(D: Array, b: Array) -> Array:
     """
     if not len(b):
         return np.zeros(0)
-    values, vectors = np.linalg.eigh(0.5 * (D + D.T))
-    kept = values > NEGLIGIBLE * values.max(initial=0.0)
-    roots = np.sqrt(values[kept])
-    x = nnls(roots[:, None] * vectors[:, kept].T, -(vectors[:, kept].T @ b) / roots)[0]
+    x = nnls(*_squares(D, b))[0]
     held = x > 0.0
     x[held] = np.linalg.lstsq(D[np.ix_(held, held)], -b[held], rcond=NEGLIGIBLE)[0]
     return np.maximum(x, 0.0)
+
+
+def bounded(D: Array, c: Array, lower: Array, upper: Array) -> Array:
+    """Forces within bounds that minimise x^T D x / 2 + c^T x: what has room leaves no acceleration D x + c."""
+    lower = np.minimum(lower, upper - np.finfo(np.float64).tiny)
+    return np.asarray(lsq_linear(*_squares(D, c), (lower, upper), method="bvls", tol=1e-14).x)
+
+
+def _squares(D: Array, b: Array) -> tuple[Array, Array]:
+    """B and y of |B x - y|, with B^T B = D and B^T y = -b."""
+    values, vectors = np.linalg.eigh(0.5 * (D + D.T))
+    kept = values > NEGLIGIBLE * values.max(initial=0.0)
+    roots = np.sqrt(values[kept])
+    return roots[:, None] * vectors[:, kept].T, -(vectors[:, kept].T @ b) / roots
 
 
 def impulses(D: Array, u: Array, restitution: Array) -> Array:
