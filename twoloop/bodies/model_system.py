@@ -1,4 +1,4 @@
-"""The system of a model: compiled callbacks that read its tables; in Python where its functions cannot be traced."""
+"""The system of a model: compiled callbacks that read its tables; in Python where its forces cannot be traced."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.bodies.functions import Function
+from twoloop.bodies.loaded_friction import LoadedFriction
 from twoloop.bodies.parameter_layout import (
     ANGLE,
     FORCE_PROGRAM,
@@ -73,8 +74,12 @@ def system_of(
     _check_functions(tables, *start)
     if not tables.untraced:
         tables.untraced = _disagreement(tables, *start)
+    if tables.loaded and not tables.untraced:
+        tables.untraced = "friction in proportion to loads needs the forces in the joints"
     if tables.untraced:
         made = InPython(callbacks, tables, n_q)
+        if tables.loaded:
+            made.loaded = LoadedFriction(callbacks, tables, made.redundant(*start))
         return ConstrainedSystem.from_python(**options, **{kind: getattr(made, kind) for kind in kinds})
     given = {kind: getattr(callbacks, kind) for kind in kinds}
     if n_q >= LARGE and tables.n_rows:
@@ -127,6 +132,17 @@ def check_forces(tables: Tables, t: float, q: Array, v: Array) -> None:
             )
 
 
+def check_loads(tables: Tables, redundant: tuple[tuple[str, ...], ...]) -> None:
+    """Raise where friction grows with a load that joints share in any proportion."""
+    for force in tables.loaded:
+        group = next((each for each in redundant if force.joint is not None and force.joint.name in each), ())
+        if group:
+            raise ValueError(
+                f"{force.name!r} grows with the load of its joint, which is not determined: rows follow from others "
+                f"among {', '.join(map(repr, group))}. Take joints that leave more free, or no coefficient"
+            )
+
+
 def _check_finite(function: Function | RowFunction, value: Array, t: float) -> None:
     if not np.isfinite(value).all():
         raise ValueError(
@@ -172,10 +188,20 @@ class InPython:
     """
 
     def __init__(self, callbacks: Any, tables: Tables, n_q: int):
-        self._callbacks = callbacks
+        self._callbacks, self.p = callbacks, tables.p
         self._motions, self._functions = tuple(tables.motions), tuple(tables.functions)
         self._n_q, self._n_rows, self._n_rates = n_q, tables.n_rows, tables.n_rates
         self._untraced = tables.untraced
+        self.loaded: LoadedFriction | None = None
+
+    def redundant(self, t: float, q: Array, v: Array) -> bool:
+        """Whether rows of the constraints follow from others at a state."""
+        rows = self._rows(t, q, self.p)
+        return int(np.linalg.matrix_rank(rows)) < len(rows)
+
+    def _rows(self, t: float, q: Array, p: Array) -> Array:
+        rates = self.nonholonomic(t, q, p) if self._n_rates else np.zeros((0, self._n_q))
+        return np.vstack([self.jacobian(t, q, p), rates])
 
     def mass(self, t: float, q: Array, p: Array) -> Array:
         """M."""
@@ -187,6 +213,10 @@ class InPython:
         """Q."""
         made = self._zeros(q, self._n_q)
         self._callbacks.fill_force(q, v, p, _called(self._functions, t, q, v), made)
+        if self.loaded is not None:
+            rates = self.nonholonomic_gamma(t, q, v, p) if self._n_rates else np.zeros(0)
+            gamma = np.append(self.gamma(t, q, v, p), rates)
+            made += self.loaded.of(q, v, p, made, self.mass(t, q, p), self._rows(t, q, p), gamma)
         return made
 
     def constraint(self, t: float, q: Array, p: Array) -> Array:
