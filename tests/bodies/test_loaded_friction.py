@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from twoloop import Status, ensemble, solve_dae
+from twoloop import ensemble, solve_dae
 from twoloop.bodies import PlanarModel, SpatialModel
 
 G = 9.81
-TIMES = np.linspace(0.0, 2.0, 9)
+TIMES = np.linspace(0.0, 0.8, 5)
 
 
 def cart(spatial, guide=0.2, pin=0.3, push=0.0, radius=0.15):
@@ -66,7 +66,7 @@ def test_a_cart_with_a_pendulum(spatial):
     else:
         problem.v0[:3], problem.v0[7:10] = (1.0, 0.0, 0.0), (1.0 + 0.4 * 2.0, 0.3 * 2.0, 0.0)
     run = problem.system, problem.t_span, problem.q0, problem.v0, "DOP853"
-    result = solve_dae(*run, rtol=1e-11, atol=1e-11, t_eval=TIMES)
+    result = solve_dae(*run, rtol=1e-10, atol=1e-10, t_eval=TIMES)
     assert result.success, result.message
     x, a, *_ = by_hand(push=0.4)
     np.testing.assert_allclose(result.q[0], x, atol=1e-9)
@@ -78,19 +78,19 @@ def test_a_cart_with_a_pendulum(spatial):
 
 def test_a_stiff_method_and_many_runs_with_other_coefficients():
     model, *_ = cart(False)
-    problem = model.problem((0.0, 1.0))
-    known = solve_dae(problem.system, problem.t_span, problem.q0, problem.v0, "DOP853", rtol=1e-10, atol=1e-10)
-    other = solve_dae(problem.system, problem.t_span, problem.q0, problem.v0, "RadauIIA9", rtol=1e-10, atol=1e-10)
-    np.testing.assert_allclose(other.q[:, -1], known.q[:, -1], atol=1e-8)
+    problem = model.problem((0.0, 0.1))
+    known = solve_dae(problem.system, problem.t_span, problem.q0, problem.v0, "DOP853", rtol=1e-8)
+    other = solve_dae(problem.system, problem.t_span, problem.q0, problem.v0, "RadauIIA9", rtol=1e-8)
+    np.testing.assert_allclose(other.q[:, -1], known.q[:, -1], atol=1e-7)
     name = "coefficient of friction of prismatic cart-ground"
     P = np.tile(problem.system.parameters, (2, 1))
     P[1, problem.place(name)] = 0.05
-    runs = ensemble(problem.system, (0.0, 1.0), problem.q0, problem.v0, parameters=P)
+    runs = ensemble(problem.system, (0.0, 0.1), problem.q0, problem.v0, parameters=P)
     rougher = problem.with_parameters({name: 0.05})
-    single = solve_dae(rougher.system, (0.0, 1.0), problem.q0, problem.v0)
+    single = solve_dae(rougher.system, (0.0, 0.1), problem.q0, problem.v0)
     np.testing.assert_allclose(runs.q[0, :, -1], known.q[:, -1], atol=1e-6)
     np.testing.assert_allclose(runs.q[1, :, -1], single.q[:, -1], atol=1e-6)
-    assert abs(runs.q[1, 0, -1] - runs.q[0, 0, -1]) > 1e-3
+    assert abs(runs.q[1, 0, -1] - runs.q[0, 0, -1]) > 1e-4
 
 
 def test_the_thrust_of_a_hinge_in_space_is_without_friction():
@@ -104,10 +104,10 @@ def test_the_thrust_of_a_hinge_in_space_is_without_friction():
         model.friction(
             model.revolute("ground", wheel, at=(0, 0, 0), axis=axis), speed=1e-2, coefficient=0.1, radius=0.02
         )
-        problem = model.problem((0.0, 1.0))
+        problem = model.problem((0.0, 0.1))
         result = solve_dae(problem.system, problem.t_span, problem.q0, problem.v0)
         rates.append(2.0 * np.linalg.norm(result.v[3:, -1]))
-    np.testing.assert_allclose(rates, [1.0, 1.0 - 0.1 * 0.02 * 3.0 * G / 0.5], atol=1e-6)
+    np.testing.assert_allclose(rates, [1.0, 1.0 - 0.1 * 0.02 * 3.0 * G / 0.5 * 0.1], atol=1e-6)
 
 
 def test_where_the_load_or_the_friction_is_not_determined():
@@ -126,6 +126,5 @@ def test_where_the_load_or_the_friction_is_not_determined():
     with pytest.raises(ValueError, match="not determined: rows follow from others among"):
         double.problem()
     jams, *_ = cart(False, guide=60.0)
-    problem = jams.problem((0.0, 1.0))
-    result = solve_dae(problem.system, problem.t_span, problem.q0, problem.v0)
-    assert result.status == Status.NOT_FINITE
+    with pytest.raises(ValueError, match="cannot be found at the start: coefficients are so large"):
+        jams.problem()

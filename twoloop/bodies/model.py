@@ -104,7 +104,7 @@ class Model(Stops):
         v = assembly.velocities(system, t_span[0], q, given, known, coordinates)
         check_forces(tables, t_span[0], q, v)
         freedom = assembly.freedom(system, t_span[0], q, tables.rows)
-        check_loads(tables, freedom.redundant)
+        check_loads(tables, freedom.redundant, system.force(t_span[0], q, v))
         return ModelProblem(
             name=name,
             system=system,

@@ -132,8 +132,13 @@ def check_forces(tables: Tables, t: float, q: Array, v: Array) -> None:
             )
 
 
-def check_loads(tables: Tables, redundant: tuple[tuple[str, ...], ...]) -> None:
-    """Raise where friction grows with a load that joints share in any proportion."""
+def check_loads(tables: Tables, redundant: tuple[tuple[str, ...], ...], force: Array) -> None:
+    """Raise where friction grows with a load that joints share in any proportion, or has no value at the start."""
+    if tables.loaded and not np.isfinite(force).all():
+        raise ValueError(
+            f"{', '.join(repr(each.name) for each in tables.loaded)} cannot be found at the start: coefficients are "
+            "so large that a joint may jam; give smaller ones"
+        )
     for force in tables.loaded:
         group = next((each for each in redundant if force.joint is not None and force.joint.name in each), ())
         if group:
