@@ -132,9 +132,9 @@ def check_forces(tables: Tables, t: float, q: Array, v: Array) -> None:
             )
 
 
-def check_loads(tables: Tables, redundant: tuple[tuple[str, ...], ...], force: Array) -> None:
+def check_loads(tables: Tables, redundant: tuple[tuple[str, ...], ...], Q: Array) -> None:
     """Raise where friction grows with a load that joints share in any proportion, or has no value at the start."""
-    if tables.loaded and not np.isfinite(force).all():
+    if tables.loaded and not np.isfinite(Q).all():
         raise ValueError(
             f"{', '.join(repr(each.name) for each in tables.loaded)} cannot be found at the start: coefficients are "
             "so large that a joint may jam; give smaller ones"

@@ -114,7 +114,8 @@ def scales_of(system: ConstrainedSystem, t: float, q: Array, jacobian: Array) ->
     norms, curvature = np.sqrt((in_units * in_units).sum(axis=1)), _curvature(system, t, q, columns, len(jacobian))
     rows = np.maximum(norms, TURNS * curvature)
     rows[rows == 0.0] = 1.0
-    radius = np.where(norms > 0.0, norms, 1.0) / np.maximum(curvature, 1e-300)
+    with np.errstate(over="ignore"):  # of rows that are straight
+        radius = np.where(norms > 0.0, norms, 1.0) / np.maximum(curvature, 1e-300)
     in_units = np.ascontiguousarray((jacobian != 0.0) * (size / columns))
     reach, negligible = np.ones(len(rows)), NEGLIGIBLE * float(in_units.max(initial=0.0))
     direct(reaches)(in_units, radius, negligible, np.zeros(len(q)), reach)
