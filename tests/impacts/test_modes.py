@@ -110,3 +110,30 @@ def test_an_impact_releases_a_joint_that_sticks():
     assert speed > 0.0 and f / (M + m) * m < g
     np.testing.assert_allclose([arc.t[0] for arc in result.arcs], [0.0, first, t, t + speed * (M + m) / f], atol=1e-9)
     assert abs(result.v[:, -1]).max() < 1e-12
+
+
+def test_two_blocks_that_touch_hold_with_the_friction_of_both():
+    """A block pushes another ever harder: they slide when the frictions of both are overcome, however they share."""
+    model = PlanarModel(name="blocks")
+    for name, x, f in (("A", 0.0, 2.0), ("B", 0.3, 1.4)):
+        model.body(name, mass=1.0, inertia=1.0, position=(x, 0.0))
+        model.dry_friction(model.prismatic("ground", name, at=(x, 0.0), axis=(1.0, 0.0)), f)
+    model.stop("B", (0.3, 0.0), "A", (0.3, 0.0), normal=(1.0, 0.0))
+    model.force("A", (0.0, 0.0), lambda t: np.array([2.0 * t, 0.0]))
+    model.force("B", (0.3, 0.0), lambda t: np.array([-0.1 * t, 0.0]))  # so that they touch from the start
+    problem = model.problem((0.0, 3.0))
+    result = solve_with_friction(problem, **TIGHT)
+    assert result.success, result.message
+    begins = 3.4 / 1.9
+    moves = np.abs(result.v[0]) > 1e-9
+    assert result.t[moves].min() > begins - 1e-6 and len(result.arcs) < 100
+    u = 3.0 - begins  # 2 v' = 1.9 (t - begins)
+    np.testing.assert_allclose(result.v[[0, 3], -1], 0.475 * u**2, atol=1e-7)
+    np.testing.assert_allclose(result.q[[0, 3], -1], [0.475 * u**3 / 3.0, 0.3 + 0.475 * u**3 / 3.0], atol=1e-7)
+
+
+def test_a_joint_at_rest_without_load_stays_at_rest():
+    """The rounding of what acts on it counts for nothing."""
+    model, _ = block(0.0, 2.0, 0.0, upper=0.0)
+    result = solve_with_friction(model.problem((0.0, 1.0)), **TIGHT)
+    assert result.success and len(result.arcs) == 1 and np.abs(result.q[0]).max() < 1e-12

@@ -29,11 +29,12 @@ STANDS = 1e-13  # relative: arcs that are shorter do not move on in time ...
 CORRECTIONS = 3  # of positions, by Newton's method
 MOST_STANDING = 30  # ... and so many of them in a row end the motion
 REST = 1e-10  # of the largest velocities of the last arc: rates of joints that count as zero
+RELEASED = 1e-7  # relative: less than its friction holds a joint that it has just released
 AT_MOST = 1e-9  # relative: friction that holds with all that it has
 
 
 class Undetermined(ValueError):
-    """How joints that stick share their load is not determined."""
+    """No share of the load among joints that stick, and stops, was found that they can bear."""
 
 
 class Motion:
@@ -72,7 +73,7 @@ class Motion:
         self.let_go: list[int] = []  # stops whose force has just become zero
         self.speeds = np.abs(v)  # the largest of the last arc
         self.still: set[int] = set()  # joints that have stopped, or stick
-        self.released: dict[int, int] = {}  # the direction in which those begin to slide that were held
+        self.released: set[int] = set()  # those that stuck until now
         self._known: dict[tuple[int, tuple[int, ...]], tuple[ConstrainedSystem, ConstrainedSystem]] = {}
         self._forces: dict[int, tuple[ConstrainedSystem, Accelerations]] = {}
 
@@ -125,29 +126,33 @@ class Motion:
         D = W @ responses(self.system, self.t, self.q, W)
         if not of:
             return signs, tuple(closing[complementary(D, c) > 0.0].tolist())
-        n, most = len(closing), self.rubs.most[of]
-        force = bounded(D, c, np.append(np.zeros(n), -most), np.append(np.full(n, np.inf), most))
+        n = len(closing)
+        force = bounded(D, c, n, self._most(of))
         left = (D @ force + c)[n:]  # how the joints accelerate
-        terms = (np.abs(D) @ np.abs(force) + np.abs(c))[n:]
+        terms = (np.abs(D) @ np.abs(force) + np.abs(c))[n:] + D.diagonal()[n:] * self.rubs.most[of]
         pushes = force[:n] > 0.0
         base = np.flatnonzero(pushes).tolist()
         for k, sign, slides, at in zip(
             of, np.sign(left), np.abs(left) > AT_MOST * terms, range(n, n + len(of)), strict=True
         ):
-            signs[k] = int(sign) if slides else self._sticks(D, at, base, pushes.sum())
+            signs[k] = int(sign) if slides else self._sticks(k, force[at], D, at, base, pushes.sum())
         return signs, tuple(closing[pushes].tolist())
 
-    def _sticks(self, D: Array, at: int, base: list[int], n_pushing: int) -> int | None:
-        """STICKS, or IDLE where stops that push hold the joint already; then it has no friction until one lets go."""
+    def _most(self, of: list[int]) -> Array:
+        """What can hold joints that are at rest; less of one that was just released."""
+        low = np.minimum(self.rubs.kinetic, (1.0 - RELEASED) * self.rubs.most)
+        return np.array([(low if k in self.released else self.rubs.most)[k] for k in of])
+
+    def _sticks(self, k: int, force: float, D: Array, at: int, base: list[int], n_pushing: int) -> int | None:
+        """STICKS, or IDLE where stops that push, and joints that stick, hold the joint already.
+
+        Then its friction stays as it is until one of these lets go; where stops alone hold the joint, it has none.
+        """
         known = np.linalg.lstsq(D[np.ix_(base, base)], D[base, at], rcond=NEGLIGIBLE)[0]
         if D[at, at] - D[at, base] @ known > INDEPENDENT * D[at, at]:
             base.append(at)
             return STICKS
-        if np.abs(known[n_pushing:]).max(initial=0.0) > INDEPENDENT:
-            raise Undetermined(
-                f"at t = {self.t:.10g} several joints stick that stops hold as well, so that their friction is not "
-                "determined; leave some of it out, and give another joint all of it"
-            )
+        self.rubs.frozen[k] = force if np.abs(known[n_pushing:]).max(initial=0.0) > INDEPENDENT else 0.0
         return IDLE
 
     def _hit(self, gap: Gap, near: NDArray[np.int64]) -> NDArray[np.bool_]:
@@ -166,7 +171,7 @@ class Motion:
         if hit.any():
             names = tuple(self.stops[k].name for k in near[hit])
             self.impacts.append(Impact(self.t, names, before.copy(), v.copy(), P[hit]))
-            self.still, self.released = set(), {}
+            self.still, self.released = set(), set()
         self.v = v
         return slow
 
@@ -177,7 +182,7 @@ class Motion:
         if of:
             W = self.rubs.along(self.q)[of]
             X = responses(self.system, self.t, self.q, W)
-            a = a + X @ bounded(W @ X, c, -self.rubs.most[of], self.rubs.most[of])
+            a = a + X @ bounded(W @ X, c, 0, self._most(of))
         gap = self.gaps.at(self.t, self.q, v)
         c, u = (gap.W @ a + gap.bend)[near], gap.u[near]
         return np.asarray(
@@ -189,8 +194,8 @@ class Motion:
         W = self.rubs.along(self.q)
         u = W @ v
         moves = np.abs(u) > REST * (np.abs(W) @ self.speeds)
-        slow = [k for k in range(len(u)) if k not in self.released and (k in self.still or not moves[k])]
-        return [0 if k in slow else self.released.get(k, int(np.sign(u[k]))) for k in range(len(u))], slow
+        slow = [k for k in range(len(u)) if k in self.still or k in self.released or not moves[k]]
+        return [0 if k in slow else int(np.sign(u[k])) for k in range(len(u))], slow
 
     def _free(self, signs: Signs, of: list[int], v: Array) -> tuple[Array, Array]:
         """Accelerations while no stop pushes and joints at rest have no friction, and those of these joints."""
@@ -221,12 +226,12 @@ class Motion:
     def _arc(self, signs: Signs, resting: tuple[int, ...], t1: float) -> None:
         """A run until a gap closes or lets go, or a joint stops or is released."""
         mode, rows = self.rubs.mode(signs, self.t, self.q)
-        lasting = STICKS not in signs  # what sticks does so at places of its own
+        lasting = not {STICKS, IDLE} & set(signs)  # what sticks does so at places of its own
         system = self._closed(mode, resting, lasting)
         if system.n_c and (resting or self.rubs.n):
             self._close(system, resting)
         start = self.gaps.at(self.t, self.q, self.v)
-        holds = self._accelerations(system, lasting) if resting or not lasting else None
+        holds = self._accelerations(system, lasting) if resting or STICKS in signs else None
 
         def multiplier(row: int, t: float, q: Array, v: Array) -> float:
             assert holds is not None
@@ -253,8 +258,7 @@ class Motion:
         over = {k for k in range(len(events)) if arc.t_events is not None and arc.t_events[k].size}
         n = len(signs)
         self.let_go = [k for k in resting if n + k in over]
-        held = {k for k in over if k < n and signs[k] == STICKS}
-        self.released = {k: -int(np.sign(friction(k, self.t, self.q, self.v))) for k in held}
+        self.released = {k for k in over if k < n and signs[k] == STICKS}
         self.still = {k for k in range(n) if (not signs[k]) != (k in over)}
 
     def _close(self, system: ConstrainedSystem, resting: tuple[int, ...]) -> None:
@@ -294,22 +298,18 @@ class Motion:
 
     def _stops(self, k: int, sign: int) -> Any:
         """The event of a joint that comes to rest; one that begins to slide is at rest at first."""
-        t0, u0 = self.t, sign * float(self.rubs.along(self.q, k) @ self.v)
-        begins = k in self.still or k in self.released
-
-        def stops(t: float, q: Array, v: Array) -> float:
-            u = sign * float(self.rubs.along(q, k) @ v)
-            if begins:
-                return (u - u0) / (t - t0) if t > t0 else 1.0
-            return u
-
-        return stops
+        u0 = sign * float(self.rubs.along(self.q, k) @ self.v)
+        least = u0 - self.low if k in self.still or k in self.released else 0.0
+        return lambda t, q, v: sign * float(self.rubs.along(q, k) @ v) - least
 
     def _slips(self, k: int, friction: Any) -> Any:
         """The event of a joint that needs more than its friction; one that needs all of it may do so at once."""
         most = self.rubs.most[k]
-        if abs(friction(k, self.t, self.q, self.v)) > (1.0 - AT_MOST) * most:
-            most *= 1.0 + AT_MOST
+        needed = abs(friction(k, self.t, self.q, self.v))
+        if needed > (1.0 + RELEASED) * most:
+            raise Undetermined(f"at t = {self.t:.10g} a joint that sticks needs {needed:.10g}, and has {most:.10g}")
+        if needed > (1.0 - AT_MOST) * most:
+            most = max(most, needed) * (1.0 + AT_MOST)
         return lambda t, q, v: most - abs(friction(k, t, q, v))
 
 

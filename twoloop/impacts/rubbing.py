@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 Signs = list[int | None]  # of joints: in which direction they slide, or one of these
-STICKS, IDLE = 0, None  # held by friction, or by a stop that pushes
+STICKS, IDLE = 0, None  # held by friction, or by stops and other joints that hold it already
 INDEPENDENT = 1e-9  # of how a joint yields alone, over the same of a free body
 
 
@@ -24,7 +24,8 @@ class Frictionless:
     """A system in which nothing sticks: it has one mode."""
 
     n = 0
-    most = np.zeros(0)
+    most = kinetic = np.zeros(0)
+    frozen: ClassVar[dict[int, float]] = {}
 
     def __init__(self, system: ConstrainedSystem):
         self.system = system
@@ -67,7 +68,9 @@ class Rubbing:
         assert problem.model is not None
         self.system, self._problem, self._model, self._rubs = problem.system, problem, problem.model, problem.model.dry
         self.n, self.most = len(self._rubs), np.array([rub.static for rub in self._rubs])
+        self.kinetic = np.array([rub.kinetic for rub in self._rubs])
         self._pulls = [self._model.pull(rub, problem.parameters) for rub in self._rubs]
+        self.frozen: dict[int, float] = {}  # friction of joints that are IDLE
         self._lasting: dict[tuple[int | None, ...], ConstrainedSystem] = {}
         self._check_independent(problem.t_span[0], problem.q0)
 
@@ -110,17 +113,18 @@ class Rubbing:
 
     def mode(self, signs: Signs, t: float, q: Array) -> tuple[ConstrainedSystem, dict[int, int]]:
         """The system while some joints slide, and those that stick do so where they are; the rows of these."""
-        if STICKS not in signs:
+        if not {STICKS, IDLE} & set(signs):
             return self.free(signs, t, q), {}
         names = [rub.name for rub, sign in zip(self._rubs, signs, strict=True) if sign == STICKS]
         gauge, rows = self._made("gauge", signs, dict.fromkeys(names, np.nan), t, q)
-        first, other = (gauge.constraint(t, q) for t in (0.0, 0.5 * np.pi))
+        first, other = (gauge.constraint(t, q) for t in (0.0, 0.5 * np.pi)) if names else ((), ())
         held = {}
         for rub in (rub for rub in self._rubs if rub.name in names):
             (row,) = rows[rub.name]
             turns = self._model.dimension == 3 and rub.joint.kind == "revolute"  # whose row is A cos t + B sin t
             held[rub.name] = float(np.arctan2(-first[row], other[row]) if turns else first[row])
-        system, rows = self._made(f"{self._problem.name}, {', '.join(names)} sticks", signs, held, t, q)
+        said = f", {', '.join(names)} sticks" if names else ""
+        system, rows = self._made(self._problem.name + said, signs, held, t, q)
         return system, {k: rows[rub.name][0] for k, rub in enumerate(self._rubs) if rub.name in names}
 
     def turned(self, k: int, system: ConstrainedSystem, row: int, t: float, q: Array) -> float:
@@ -131,4 +135,5 @@ class Rubbing:
         self, name: str, signs: Signs, held: dict[str, float], t: float, q: Array
     ) -> tuple[ConstrainedSystem, dict[str, tuple[int, ...]]]:
         forces = {rub.name: -(sign or 0) * rub.kinetic for rub, sign in zip(self._rubs, signs, strict=True)}
+        forces |= {self._rubs[k].name: self.frozen[k] for k, sign in enumerate(signs) if sign is IDLE}
         return self._model.mode(name, self._problem.parameters, forces, held, t, q)
