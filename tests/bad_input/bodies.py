@@ -12,6 +12,19 @@ of_problem = cases_of("bodies: problem")
 NAMES = "give the body that body(...) returned, or its name"
 
 
+def loaded(coefficient=0.2, twice=False, **friction):
+    """A cart on a guide with friction in proportion to its load, and a rod that swings on it."""
+    model = PlanarModel(name="cart")
+    model.body("cart", mass=1.0, inertia=1.0, position=(0.0, 0.0), velocity=(1.0, 0.0))
+    model.body("rod", mass=1.0, inertia=0.1, position=(0.5, 0.5), velocity=(1.0, 0.0))
+    guide = model.prismatic("ground", "cart", at=(0.0, 0.0), axis=(1.0, 0.0))
+    model.revolute("cart", "rod", at=(0.0, 0.0))
+    if twice:
+        model.prismatic("ground", "cart", at=(1.0, 0.0), axis=(1.0, 0.0))
+    model.friction(guide, coefficient=coefficient, speed=0.1, **friction)
+    return model.problem()
+
+
 def planar():
     """A bar on a pin, and a block."""
     model = PlanarModel(name="press")
@@ -146,6 +159,24 @@ BODIES: list[Case] = [
         "at must be a point in space, or a pair of points",
         "give a point of each body",
         TypeError,
+    ),
+    of_planar(
+        "the radius of a pin for friction on a guide",
+        lambda: loaded(radius=0.1),
+        "radius is that of the pin of a revolute joint whose friction has a coefficient; given radius=0.1",
+        "leave it out; a pin needs one where its friction has a coefficient",
+    ),
+    of_planar(
+        "friction in proportion to a load that two joints share",
+        lambda: loaded(twice=True),
+        "grows with the load of its joint, which is not determined: rows follow from others among",
+        "make one of them a slot (a distance, or a point on a curve), or give the friction as a number",
+    ),
+    of_planar(
+        "friction so large that a joint may jam",
+        lambda: loaded(coefficient=50.0),
+        "cannot be found at the start: coefficients are so large that a joint may jam",
+        "give less; locks that hold themselves have no smooth law",
     ),
     of_planar(
         "a distance of points that coincide",

@@ -297,6 +297,43 @@ def _read(path):
         return from_mjcf(path)
 
 
+def test_what_defaults_leave_to_an_element(tmp_path):
+    """Several sections add up, one way to turn replaces another, and sizes that are not given stay."""
+    path = tmp_path / "defaults.xml"
+    path.write_text("""<mujoco>
+      <default><geom type="box" size="0.1 0.2 0.3" quat="0.5 0.1 0.8 0" density="300" contype="0"
+        conaffinity="0"/></default>
+      <default><joint damping="0.5"/><default class="long"><geom size="0.4" euler="0 0 90"/></default></default>
+      <worldbody><body name="a"><joint axis="0 1 0"/><geom size="0.5" euler="90 0 0"/></body>
+        <body name="b" pos="3 0 0"><joint axis="0 1 0"/><geom class="long"/></body></worldbody></mujoco>""")
+    model = from_mjcf(path)
+    (a, b), spring = model.bodies, model.forces[0]
+    mass = 300.0 * 8.0 * 0.5 * 0.2 * 0.3
+    moments = mass / 3.0 * np.array([0.2**2 + 0.3**2, 0.5**2 + 0.2**2, 0.5**2 + 0.3**2])  # y and z change places
+    np.testing.assert_allclose(a.inertia[:4], [mass, *moments])
+    assert spring.more.values[1] == 0.5
+    mass = 300.0 * 8.0 * 0.4 * 0.2 * 0.3
+    moments = mass / 3.0 * np.array([0.4**2 + 0.3**2, 0.2**2 + 0.3**2, 0.2**2 + 0.4**2])
+    np.testing.assert_allclose(b.inertia[:4], [mass, *moments])
+
+
+def test_sites_between_two_points_and_springs_whose_length_is_elsewhere(tmp_path):
+    text = """<mujoco><worldbody><site name="w" pos="1 1 1"/><body name="a"><joint axis="0 1 0" {0}/>
+      <geom size="0.1" pos="1 0 0"/>
+      <site name="s" type="capsule" fromto="0.1 0 0 0.5 0.2 0" size="0.01"/></body></worldbody>
+      <tendon><spatial stiffness="{1}" {2}><site site="s"/><site site="w"/></spatial></tendon></mujoco>"""
+    path = tmp_path / "site.xml"
+    path.write_text(text.format("", "30", 'springlength="0.3"'))
+    (spring,) = from_mjcf(path).forces
+    np.testing.assert_allclose(spring.on_first.values, [0.3 - 1.0, 0.1, 0.0])
+    path.write_text(text.format('ref="30"', "30", ""))
+    with pytest.raises(ValueError, match=r"needs a springlength.*springref"):
+        from_mjcf(path)
+    path.write_text(text.format("", "30 2", ""))
+    with pytest.warns(IgnoredWarning, match="tendon: spatial"):
+        assert not from_mjcf(path).forces
+
+
 def test_accelerations_of_a_tree_are_those_of_mujoco(tmp_path):
     mujoco = pytest.importorskip("mujoco")
     random = np.random.default_rng(6)

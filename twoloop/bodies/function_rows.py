@@ -1,6 +1,19 @@
 """Rows that are functions of coordinates, in a plane and in space: read from the results of their program."""
 
-from twoloop.bodies.parameter_layout import HEAD, JOINT_WIDTH, JOINTS, KIND, MORE, MOTION, N_JOINTS, RATE, ROW
+from twoloop.bodies.parameter_layout import (
+    FIRST,
+    HEAD,
+    JOINT_WIDTH,
+    JOINTS,
+    KIND,
+    MORE,
+    MOTION,
+    N_JOINTS,
+    RATE,
+    ROW,
+    SECOND,
+    WRITTEN,
+)
 from twoloop.kernels.compile.caches import helper
 
 
@@ -10,6 +23,26 @@ def fill_entries(p, k, made, first_result, entries):
     columns = int(p[k + MORE])
     for m in range(int(p[columns])):
         entries[int(p[columns + 1 + m])] = made[first_result + m]
+
+
+@helper
+def take_entries(p, k, width, skipped, row, values, at):
+    """Move the entries of a row of the joint at place k from where they stand in C_q to the values, and clear the row.
+
+    Those by the coordinates of both bodies, less the first few where a row turns alone; see `model_system.entries_of`.
+    """
+    if int(p[k + KIND]) == WRITTEN:
+        columns = int(p[k + MORE])
+        for m in range(int(p[columns])):
+            j = int(p[columns + 1 + m])
+            values[at + m], row[j] = row[j], 0.0
+        return at + int(p[columns])
+    for body in (int(p[k + FIRST]), int(p[k + SECOND])):
+        if body >= 0:
+            for j in range(width * body + skipped, width * (body + 1)):
+                values[at], row[j] = row[j], 0.0
+                at += 1
+    return at
 
 
 @helper

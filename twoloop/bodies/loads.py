@@ -167,19 +167,35 @@ class Loads(Collection):
         names = f"stiffness of {name} (N/m)", f"damping of {name} (N s/m)", f"length of {name} (m)"
         return self._add_force(self._along(name, RAIL, slide, Numbers(values, names)))
 
-    def friction(self, joint: ModelJoint | str, f: float, *, speed: float, name: str | None = None) -> Force:
-        """Friction in a revolute or prismatic joint, by a smooth law: -f tanh(rate / speed).
+    def friction(
+        self,
+        joint: ModelJoint | str,
+        f: float = 0.0,
+        *,
+        speed: float,
+        coefficient: float | None = None,
+        radius: float | None = None,
+        name: str | None = None,
+    ) -> Force:
+        """Friction in a revolute or prismatic joint, by a smooth law: -(f + coefficient load) tanh(rate / speed).
 
-        Dry friction jumps where the motion reverses, and holds at rest; this law does neither: it creeps below that.
-        It does not depend on the load of the joint. A small `speed` makes the equations stiff.
+        Dry friction jumps where the motion reverses, and holds at rest; this law does neither: it creeps below that. A
+        small `speed` makes the equations stiff. With a coefficient it grows with the load of the joint: with its force
+        across the axis, times the radius of a hinge; torques and thrust that the joint carries are not counted. The
+        forces in the joints are then found at every evaluation, in Python, and the friction has no value where a
+        coefficient is so large that the joint may jam.
 
         Parameters
         ----------
         joint : ModelJoint or str
         f : float
-            The torque or force at high speed, N m or N.
+            The torque or force at high speed that does not depend on the load, N m or N.
         speed : float
             The rate at which three quarters of it are reached, rad/s or m/s.
+        coefficient : float, optional
+            Of friction over load. None: it does not depend on the load.
+        radius : float, optional
+            Of the pin of a revolute joint with a coefficient, m.
         name : str, optional
 
         Returns
@@ -189,16 +205,28 @@ class Loads(Collection):
         Raises
         ------
         TypeError, ValueError
-            If an argument is wrong.
+            If an argument is wrong; by `problem()`, if a load is not determined.
         """
         rubbed = self._joint(joint, ("revolute", "prismatic"), "friction")
         name = self._new_name(f"friction of {rubbed.name}", name)
         check_positive("speed", speed)
         turns = rubbed.kind == "revolute"
+        if (radius is not None) != (turns and coefficient is not None):
+            raise ValueError(
+                "radius is that of the pin of a revolute joint whose friction has a coefficient; given "
+                f"radius={radius!r}, coefficient={coefficient!r} for {rubbed.name!r}, which is {rubbed.kind}"
+            )
         units = ("N m", "rad/s") if turns else ("N", "m/s")
-        names = f"value of {name} ({units[0]})", f"speed of {name} ({units[1]})"
-        numbers = Numbers((check_not_negative("f", f), float(speed)), names)
-        return self._add_force(self._along(name, BRAKE if turns else RUB, rubbed, numbers))
+        names = [f"value of {name} ({units[0]})", f"speed of {name} ({units[1]})"]
+        values = [check_not_negative("f", f), float(speed)]
+        if coefficient is not None:
+            names += [f"coefficient of {name} (-)"]
+            values += [check_not_negative("coefficient", coefficient)]
+        if radius is not None:
+            check_positive("radius", radius)
+            names, values = [*names, f"radius of {name} (m)"], [*values, float(radius)]
+        numbers = Numbers(tuple(values), tuple(names))
+        return self._add_force(replace(self._along(name, BRAKE if turns else RUB, rubbed, numbers), joint=rubbed))
 
     def dry_friction(
         self, joint: ModelJoint | str, f: float, *, static: float | None = None, name: str | None = None

@@ -22,6 +22,7 @@ SEEN_ONLY = {"asset", "visual", "statistic", "size", "custom", "camera", "light"
 KNOWN = {"compiler", "option", "default", "worldbody", "equality", "tendon"}
 SOFT = ("armature", "frictionloss")
 DEFAULT_OF = {"spatial": "tendon", "fixed": "tendon", "connect": "equality", "weld": "equality"}  # elements of defaults
+TURNS = {"quat", "axisangle", "xyaxes", "zaxis", "euler"}  # of which an element gives one
 AGREES = 1e-6  # of the pose that a weld asks for
 
 
@@ -84,8 +85,8 @@ class _Reader:
         if compiler.get("coordinate", "local") != "local":
             raise ValueError("coordinates of an MJCF file must be local; global ones were dropped by MuJoCo in 2.3.4")
         self.defaults: dict[str, dict[str, dict[str, str]]] = {"main": {}}
-        for each in root.findall("default"):
-            self._default(each, "main", {})
+        for each in root.findall("default"):  # of which there may be several
+            self._default(each, "main", self.defaults["main"])
         gravity = np.array([0.0, 0.0, -9.81])
         for each in root.findall("option"):
             gravity = numbers(each.get("gravity", "0 0 -9.81"), 3, "gravity") if each.get("gravity") else gravity
@@ -133,7 +134,7 @@ class _Reader:
         known = {tag: dict(values) for tag, values in inherited.items()}
         for each in element:
             if each.tag != "default":
-                known[each.tag] = {**known.get(each.tag, {}), **each.attrib}
+                known[each.tag] = _merged(known.get(each.tag, {}), each.attrib)
         self.defaults[name] = known
         for each in element.findall("default"):
             self._default(each, name, known)
@@ -142,7 +143,7 @@ class _Reader:
         name = element.get("class", childclass)
         if name not in self.defaults:
             raise ValueError(f"{_called(element)} is of the class {name!r}, which no default has")
-        given = {**self.defaults[name].get(DEFAULT_OF.get(element.tag, element.tag), {}), **element.attrib}
+        given = _merged(self.defaults[name].get(DEFAULT_OF.get(element.tag, element.tag), {}), element.attrib)
         return {key: value for key, value in given.items() if key not in self.without}
 
     def _pose(self, attributes: dict[str, str], what: str) -> Pose:
@@ -161,6 +162,9 @@ class _Reader:
                 lump = self._geom(given, _called(each), weigh)
                 lumps += [] if lump is None else [lump]
             elif each.tag == "site":
+                if "fromto" in given:
+                    ends = numbers(given["fromto"], 6, f"fromto of {_called(each)}")
+                    given["pos"] = _text(0.5 * (ends[:3] + ends[3:]))
                 place = pose.point(self._pose(given, _called(each)).x)
                 self.sites[each.get("name", f"site {len(self.sites)}")] = part, place
             elif each.tag in ("frame", "replicate", "attach", "composite", "flexcomp"):
@@ -299,6 +303,10 @@ class _Reader:
                 name=self._free(given.get("name"), f"{element.tag} of {one.name} and {other.name}"),
             )
             return
+        if float(given.get("torquescale", 1.0)) == 0.0:
+            raise ValueError(
+                f"torquescale of {_called(element)} must not be zero: give a connect where bodies may turn"
+            )
         wanted = numbers(given.get("relpose", "0 1 0 0 0 0 0"), 7, f"relpose of {_called(element)}")
         if wanted[3:].any():
             pose = pose_of({"pos": _text(wanted[:3]), "quat": _text(wanted[3:])}, _called(element), True, "xyz")
@@ -315,17 +323,35 @@ class _Reader:
     def _tendon(self, element: Element) -> None:
         given = self._attributes(element, "main")
         rest = given.get("springlength", "-1").split()
-        stiffness, damping = float(given.get("stiffness", 0.0)), float(given.get("damping", 0.0))
+        stiffness, damping = (given.get(key, "0") for key in ("stiffness", "damping"))
         plain = element.tag == "spatial" and [each.tag for each in element] == ["site", "site"]
+        plain &= len(stiffness.split()) == 1 == len(damping.split())
         if not plain or len(rest) != 1 or given.get("limited", "false") == "true" or "range" in given:
             self.ignored.append(f"tendon: {_called(element)}")
             return
         self._soft(given, _called(element))
         (one, here), (other, there) = (self._site(each.get("site", "")) for each in element)
         length = None if float(rest[0]) < 0.0 else float(rest[0])
+        if length is None and float(stiffness) and (away := self._away(one) or self._away(other)):
+            raise ValueError(
+                f"{_called(element)} needs a springlength: MuJoCo takes that which it has where joints are at their "
+                f"springref, and that of {away!r} is not its ref"
+            )
         first, second = self._of(one), self._of(other)
         name = self._free(given.get("name"), f"spring of {first.name} and {second.name}")
-        self.model.spring(first, here, second, there, stiffness=stiffness, damping=damping, length=length, name=name)
+        self.model.spring(
+            first, here, second, there, stiffness=float(stiffness), damping=float(damping), length=length, name=name
+        )
+
+    def _away(self, part: Part | None) -> str:
+        """The name of a joint, from a part to the ground, whose springref is not its ref; "": there is none."""
+        while part is not None:
+            for freed in part.freed:
+                spring, given = (float(freed.attributes.get(key, 0.0)) for key in ("springref", "ref"))
+                if freed.kind in ("hinge", "slide") and spring != given:
+                    return freed.name
+            part = part.parent
+        return ""
 
     def _site(self, name: str) -> tuple[Part | None, Array]:
         if name not in self.sites:
@@ -336,6 +362,14 @@ class _Reader:
         if name not in self.frames:
             raise ValueError(f"the body {name!r} is not in the file")
         return self.frames[name]
+
+
+def _merged(known: dict[str, str], own: dict[str, str]) -> dict[str, str]:
+    """Attributes of an element over those of its defaults: of the ways to turn there is one, of sizes the last stay."""
+    kept = {key: value for key, value in known.items() if key not in TURNS or not own.keys() & TURNS}
+    sizes = own.get("size", "").split()
+    sizes += known.get("size", "").split()[len(sizes) :]
+    return {**kept, **own, **({"size": " ".join(sizes)} if sizes else {})}
 
 
 def _called(element: Element) -> str:

@@ -14,7 +14,7 @@ from twoloop.bodies.functions import motion_function
 from twoloop.bodies.model_energy import ModelEnergy
 from twoloop.bodies.model_problem import ModelProblem
 from twoloop.bodies.model_stops import Stops
-from twoloop.bodies.model_system import check_forces, joints_of, system_of
+from twoloop.bodies.model_system import check_forces, check_loads, joints_of, system_of
 from twoloop.bodies.notes import note_of
 from twoloop.bodies.parts import Body, DryFriction, ModelJoint, Numbers
 from twoloop.bodies.sketches import drawing_of
@@ -104,6 +104,7 @@ class Model(Stops):
         v = assembly.velocities(system, t_span[0], q, given, known, coordinates)
         check_forces(tables, t_span[0], q, v)
         freedom = assembly.freedom(system, t_span[0], q, tables.rows)
+        check_loads(tables, freedom.redundant, system.force(t_span[0], q, v))
         return ModelProblem(
             name=name,
             system=system,

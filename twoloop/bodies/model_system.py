@@ -1,4 +1,4 @@
-"""The system of a model: compiled callbacks that read its tables; in Python where its functions cannot be traced."""
+"""The system of a model: compiled callbacks that read its tables; in Python where its forces cannot be traced."""
 
 from __future__ import annotations
 
@@ -9,12 +9,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.bodies.functions import Function
-from twoloop.bodies.parameter_layout import FORCE_PROGRAM, HEAD, MOTION_PROGRAM, SPRING
+from twoloop.bodies.loaded_friction import LoadedFriction
+from twoloop.bodies.parameter_layout import (
+    ANGLE,
+    FORCE_PROGRAM,
+    HEAD,
+    MOTION_PROGRAM,
+    PERPENDICULAR,
+    RATE,
+    SPRING,
+    TURN,
+)
 from twoloop.bodies.places import placed
 from twoloop.bodies.row_function import RowFunction
 from twoloop.bodies.tables import Tables
 from twoloop.checks.arguments import shown
 from twoloop.generate.tracing import Untraceable
+from twoloop.problem.entries import LARGE
 from twoloop.problem.joints import Joint
 from twoloop.problem.system import ConstrainedSystem
 
@@ -63,11 +74,36 @@ def system_of(
     _check_functions(tables, *start)
     if not tables.untraced:
         tables.untraced = _disagreement(tables, *start)
+    if tables.loaded and not tables.untraced:
+        tables.untraced = "friction in proportion to loads needs the forces in the joints"
     if tables.untraced:
         made = InPython(callbacks, tables, n_q)
+        if tables.loaded:
+            made.loaded = LoadedFriction(callbacks, tables, made.redundant(*start))
         return ConstrainedSystem.from_python(**options, **{kind: getattr(made, kind) for kind in kinds})
     given = {kind: getattr(callbacks, kind) for kind in kinds}
+    if n_q >= LARGE and tables.n_rows:
+        given |= {"mass_values": callbacks.mass_values, "jacobian_values": callbacks.jacobian_values}
+        options |= {f"{kind}_entries": found for kind, found in entries_of(dimension, tables).items()}
     return ConstrainedSystem(**options, constant_mass=dimension == 2, **given)
+
+
+def entries_of(dimension: int, tables: Tables) -> dict[str, NDArray[np.int64]]:
+    """Rows and columns of what the callbacks `mass_values` and `jacobian_values` of a model give, in their order."""
+    width, n = (3 if dimension == 2 else 7), len(tables.bodies)
+    blocks = [[k] for k in range(3)] + ([[3, 4, 5, 6]] if dimension == 3 else [])
+    places = [(width * k + i, width * k + j) for k in range(n) for block in blocks for i in block for j in block]
+    named = [(k, 7 * k + j) for k in range(n) for j in range(3, 7)] if dimension == 3 else []
+    turn_alone = (ANGLE,) if dimension == 2 else (PERPENDICULAR, TURN)
+    row = len(named) // 4
+    for part in (part for joint in tables.joints for part in joint.rows if part.kind != RATE):
+        skipped = dimension if part.kind in turn_alone else 0
+        columns: Any = (*part.first.coordinates[skipped:], *part.second.coordinates[skipped:])
+        if isinstance(part.motion, RowFunction):
+            columns = part.motion.columns
+        named += [(row + k, j) for k in range(part.n_rows) for j in columns]
+        row += part.n_rows
+    return {"mass": np.array(places).T, "jacobian": np.array(named).T}
 
 
 @QUIET
@@ -93,6 +129,22 @@ def check_forces(tables: Tables, t: float, q: Array, v: Array) -> None:
             raise ValueError(
                 f"the points of the spring {force.name!r} coincide at the start, where it has no direction; give it "
                 "other points, or length=0 for a pull in proportion to their distance"
+            )
+
+
+def check_loads(tables: Tables, redundant: tuple[tuple[str, ...], ...], Q: Array) -> None:
+    """Raise where friction grows with a load that joints share in any proportion, or has no value at the start."""
+    if tables.loaded and not np.isfinite(Q).all():
+        raise ValueError(
+            f"{', '.join(repr(each.name) for each in tables.loaded)} cannot be found at the start: coefficients are "
+            "so large that a joint may jam; give smaller ones"
+        )
+    for force in tables.loaded:
+        group = next((each for each in redundant if force.joint is not None and force.joint.name in each), ())
+        if group:
+            raise ValueError(
+                f"{force.name!r} grows with the load of its joint, which is not determined: rows follow from others "
+                f"among {', '.join(map(repr, group))}. Take joints that leave more free, or no coefficient"
             )
 
 
@@ -141,10 +193,20 @@ class InPython:
     """
 
     def __init__(self, callbacks: Any, tables: Tables, n_q: int):
-        self._callbacks = callbacks
+        self._callbacks, self.p = callbacks, tables.p
         self._motions, self._functions = tuple(tables.motions), tuple(tables.functions)
         self._n_q, self._n_rows, self._n_rates = n_q, tables.n_rows, tables.n_rates
         self._untraced = tables.untraced
+        self.loaded: LoadedFriction | None = None
+
+    def redundant(self, t: float, q: Array, v: Array) -> bool:
+        """Whether rows of the constraints follow from others at a state."""
+        rows = self._rows(t, q, self.p)
+        return int(np.linalg.matrix_rank(rows)) < len(rows)
+
+    def _rows(self, t: float, q: Array, p: Array) -> Array:
+        rates = self.nonholonomic(t, q, p) if self._n_rates else np.zeros((0, self._n_q))
+        return np.vstack([self.jacobian(t, q, p), rates])
 
     def mass(self, t: float, q: Array, p: Array) -> Array:
         """M."""
@@ -156,6 +218,10 @@ class InPython:
         """Q."""
         made = self._zeros(q, self._n_q)
         self._callbacks.fill_force(q, v, p, _called(self._functions, t, q, v), made)
+        if self.loaded is not None:
+            rates = self.nonholonomic_gamma(t, q, v, p) if self._n_rates else np.zeros(0)
+            gamma = np.append(self.gamma(t, q, v, p), rates)
+            made += self.loaded.of(q, v, p, made, self.mass(t, q, p), self._rows(t, q, p), gamma)
         return made
 
     def constraint(self, t: float, q: Array, p: Array) -> Array:

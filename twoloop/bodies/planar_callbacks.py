@@ -2,7 +2,9 @@
 
 import math
 
-from twoloop.bodies.function_rows import fill_entries, fill_nonholonomic, fill_nonholonomic_gamma
+import numpy as np
+
+from twoloop.bodies.function_rows import fill_entries, fill_nonholonomic, fill_nonholonomic_gamma, take_entries
 from twoloop.bodies.parameter_layout import (
     ACROSS,
     ANGLE,
@@ -123,35 +125,40 @@ def fill_constraint(q, p, made, C):
 
 
 @helper
+def fill_rows(q, p, made, k, Cq, row):
+    """The rows of C_q of the part of a joint that stands at place k, from a row on."""
+    kind, i, j = int(p[k + KIND]), int(p[k + FIRST]), int(p[k + SECOND])
+    if kind == WRITTEN:
+        fill_entries(p, k, made, int(p[k + MOTION]) + 3, Cq[row])
+        return
+    if kind == ANGLE:
+        turn(Cq[row], j, 1.0)
+        turn(Cq[row], i, -1.0)
+        return
+    ax, ay, adx, ady = place(q, i, p, int(p[k + FIRST_AT]))
+    bx, by, bdx, bdy = place(q, j, p, int(p[k + SECOND_AT]))
+    x, y = bx - ax, by - ay
+    if kind == PIN:
+        add(Cq[row], i, -1.0, 0.0, adx, ady)
+        add(Cq[row], j, 1.0, 0.0, bdx, bdy)
+        add(Cq[row + 1], i, 0.0, -1.0, adx, ady)
+        add(Cq[row + 1], j, 0.0, 1.0, bdx, bdy)
+    elif kind == DISTANCE:
+        add(Cq[row], i, -x, -y, adx, ady)
+        add(Cq[row], j, x, y, bdx, bdy)
+    else:
+        fx, fy = direction(q, i, p[int(p[k + MORE])], kind == ACROSS)
+        add(Cq[row], i, -fx, -fy, adx - y, ady + x)
+        add(Cq[row], j, fx, fy, bdx, bdy)
+
+
+@helper
 def fill_jacobian(q, p, made, Cq):
     """C_q; `made`: results of the program of motions."""
     first, n = int(p[p.size - HEAD + JOINTS]), int(p[p.size - HEAD + N_JOINTS])
     for k in range(first, first + JOINT_WIDTH * n, JOINT_WIDTH):
-        kind, row, i, j = int(p[k + KIND]), int(p[k + ROW]), int(p[k + FIRST]), int(p[k + SECOND])
-        if kind == RATE:
-            continue
-        if kind == WRITTEN:
-            fill_entries(p, k, made, int(p[k + MOTION]) + 3, Cq[row])
-            continue
-        if kind == ANGLE:
-            turn(Cq[row], j, 1.0)
-            turn(Cq[row], i, -1.0)
-            continue
-        ax, ay, adx, ady = place(q, i, p, int(p[k + FIRST_AT]))
-        bx, by, bdx, bdy = place(q, j, p, int(p[k + SECOND_AT]))
-        x, y = bx - ax, by - ay
-        if kind == PIN:
-            add(Cq[row], i, -1.0, 0.0, adx, ady)
-            add(Cq[row], j, 1.0, 0.0, bdx, bdy)
-            add(Cq[row + 1], i, 0.0, -1.0, adx, ady)
-            add(Cq[row + 1], j, 0.0, 1.0, bdx, bdy)
-        elif kind == DISTANCE:
-            add(Cq[row], i, -x, -y, adx, ady)
-            add(Cq[row], j, x, y, bdx, bdy)
-        else:
-            fx, fy = direction(q, i, p[int(p[k + MORE])], kind == ACROSS)
-            add(Cq[row], i, -fx, -fy, adx - y, ady + x)
-            add(Cq[row], j, fx, fy, bdx, bdy)
+        if int(p[k + KIND]) != RATE:
+            fill_rows(q, p, made, k, Cq, int(p[k + ROW]))
 
 
 @helper
@@ -280,6 +287,26 @@ def constraint(t, q, p, C):
 @callback("jacobian")
 def jacobian(t, q, p, Cq):
     fill_jacobian(q, p, results(int(p[p.size - HEAD + MOTION_PROGRAM]), t, q, q, p), Cq)
+
+
+@callback("mass_values")
+def mass_values(t, q, p, values):
+    for body in range(int(p[p.size - HEAD + BODIES])):
+        at = WEIGHT + PLANAR_BODY * body
+        values[3 * body] = values[3 * body + 1] = p[at]
+        values[3 * body + 2] = p[at + 1]
+
+
+@callback("jacobian_values")
+def jacobian_values(t, q, p, values):
+    made = results(int(p[p.size - HEAD + MOTION_PROGRAM]), t, q, q, p)
+    rows, at = np.zeros((2, q.size), dtype=q.dtype), 0
+    first, n = int(p[p.size - HEAD + JOINTS]), int(p[p.size - HEAD + N_JOINTS])
+    for k in range(first, first + JOINT_WIDTH * n, JOINT_WIDTH):
+        if int(p[k + KIND]) != RATE:
+            fill_rows(q, p, made, k, rows, 0)
+            for row in range(2 if int(p[k + KIND]) == PIN else 1):
+                at = take_entries(p, k, 3, 2 * (int(p[k + KIND]) == ANGLE), rows[row], values, at)
 
 
 @callback("constraint_rate")

@@ -6,25 +6,14 @@ The first rows are e.e = 1 of each body, then those of the joints. The mass matr
 
 import math
 
-from twoloop.bodies.function_rows import fill_entries, fill_nonholonomic, fill_nonholonomic_gamma
+import numpy as np
+
+from twoloop.bodies.function_rows import fill_entries, fill_nonholonomic, fill_nonholonomic_gamma, take_entries
 from twoloop.bodies.parameter_layout import (
-    AXIAL,
     BODIES,
-    BRAKE,
-    F_FIRST,
-    F_FIRST_AT,
-    F_KIND,
-    F_MORE,
-    F_ON_FIRST,
-    F_RESULT,
-    F_SECOND,
-    F_SECOND_AT,
     FIRST,
     FIRST_AT,
-    FORCE,
     FORCE_PROGRAM,
-    FORCE_WIDTH,
-    FORCES,
     HEAD,
     JOINT_WIDTH,
     JOINTS,
@@ -33,54 +22,30 @@ from twoloop.bodies.parameter_layout import (
     MORE,
     MOTION,
     MOTION_PROGRAM,
-    N_FORCES,
     N_JOINTS,
     PERPENDICULAR,
     PLANE,
     POINT,
-    PULL,
-    RAIL,
     RATE,
     ROW,
-    RUB,
     SECOND,
     SECOND_AT,
-    SLIDE,
     SPATIAL_BODY,
-    TORQUE,
-    TORSION,
     TURN,
     WRITTEN,
 )
 from twoloop.bodies.program_results import result, results
+from twoloop.bodies.spatial_forces import WEIGHT, fill_force, inertia
 from twoloop.bodies.spatial_places import (
-    centre,
     motion,
-    move_row,
     place,
     push_row,
-    spin,
-    torsion,
     turn_row,
-    twist_row,
     vector,
     vector_rate,
 )
 from twoloop.kernels.compile.caches import helper
 from twoloop.kernels.compile.callbacks import callback
-from twoloop.mechanisms.rotation import half_spin
-
-WEIGHT = 3  # numbers of gravity, before those of the bodies
-
-
-@helper
-def inertia(p, at, x, y, z):
-    """J times a vector, in the axes of a body."""
-    return (
-        p[at + 1] * x + p[at + 4] * y + p[at + 5] * z,
-        p[at + 4] * x + p[at + 2] * y + p[at + 6] * z,
-        p[at + 5] * x + p[at + 6] * y + p[at + 3] * z,
-    )
 
 
 @helper
@@ -137,47 +102,51 @@ def fill_constraint(q, p, made, C):
 
 
 @helper
+def fill_rows(q, p, made, k, Cq, row):
+    """The rows of C_q of the part of a joint that stands at place k, from a row on."""
+    kind, i, j = int(p[k + KIND]), int(p[k + FIRST]), int(p[k + SECOND])
+    at, there, more = int(p[k + FIRST_AT]), int(p[k + SECOND_AT]), int(p[k + MORE])
+    if kind == WRITTEN:
+        fill_entries(p, k, made, int(p[k + MOTION]) + 3, Cq[row])
+        return
+    if kind == POINT:
+        for axis in range(3):
+            fx, fy, fz = 1.0 * (axis == 0), 1.0 * (axis == 1), 1.0 * (axis == 2)
+            push_row(q, Cq[row + axis], i, p, at, -fx, -fy, -fz)
+            push_row(q, Cq[row + axis], j, p, there, fx, fy, fz)
+        return
+    if kind == LENGTH:
+        ax, ay, az = place(q, i, p, at)
+        bx, by, bz = place(q, j, p, there)
+        push_row(q, Cq[row], i, p, at, ax - bx, ay - by, az - bz)
+        push_row(q, Cq[row], j, p, there, bx - ax, by - ay, bz - az)
+        return
+    x, y, z = p[at], p[at + 1], p[at + 2]
+    if kind == TURN:
+        (x, y, z), _, _ = followed(p, at, made, int(p[k + MOTION]))
+    ax, ay, az = vector(q, i, x, y, z)
+    if kind == PLANE:
+        bx, by, bz = place(q, j, p, there)
+        sx, sy, sz = place(q, i, p, more)
+        push_row(q, Cq[row], j, p, there, ax, ay, az)
+        push_row(q, Cq[row], i, p, more, -ax, -ay, -az)
+        turn_row(q, Cq[row], i, x, y, z, bx - sx, by - sy, bz - sz)
+    else:
+        bx, by, bz = vector(q, j, p[there], p[there + 1], p[there + 2])
+        turn_row(q, Cq[row], j, p[there], p[there + 1], p[there + 2], ax, ay, az)
+        turn_row(q, Cq[row], i, x, y, z, bx, by, bz)
+
+
+@helper
 def fill_jacobian(q, p, made, Cq):
     """C_q; `made`: results of the program of motions."""
-    n = int(p[p.size - HEAD + BODIES])
-    for body in range(n):
+    for body in range(int(p[p.size - HEAD + BODIES])):
         for k in range(7 * body + 3, 7 * body + 7):
             Cq[body, k] = q[k]
     first, n = int(p[p.size - HEAD + JOINTS]), int(p[p.size - HEAD + N_JOINTS])
     for k in range(first, first + JOINT_WIDTH * n, JOINT_WIDTH):
-        kind, row, i, j = int(p[k + KIND]), int(p[k + ROW]), int(p[k + FIRST]), int(p[k + SECOND])
-        at, there, more = int(p[k + FIRST_AT]), int(p[k + SECOND_AT]), int(p[k + MORE])
-        if kind == RATE:
-            continue
-        if kind == WRITTEN:
-            fill_entries(p, k, made, int(p[k + MOTION]) + 3, Cq[row])
-            continue
-        if kind == POINT:
-            for axis in range(3):
-                fx, fy, fz = 1.0 * (axis == 0), 1.0 * (axis == 1), 1.0 * (axis == 2)
-                push_row(q, Cq[row + axis], i, p, at, -fx, -fy, -fz)
-                push_row(q, Cq[row + axis], j, p, there, fx, fy, fz)
-            continue
-        if kind == LENGTH:
-            ax, ay, az = place(q, i, p, at)
-            bx, by, bz = place(q, j, p, there)
-            push_row(q, Cq[row], i, p, at, ax - bx, ay - by, az - bz)
-            push_row(q, Cq[row], j, p, there, bx - ax, by - ay, bz - az)
-            continue
-        x, y, z = p[at], p[at + 1], p[at + 2]
-        if kind == TURN:
-            (x, y, z), _, _ = followed(p, at, made, int(p[k + MOTION]))
-        ax, ay, az = vector(q, i, x, y, z)
-        if kind == PLANE:
-            bx, by, bz = place(q, j, p, there)
-            sx, sy, sz = place(q, i, p, more)
-            push_row(q, Cq[row], j, p, there, ax, ay, az)
-            push_row(q, Cq[row], i, p, more, -ax, -ay, -az)
-            turn_row(q, Cq[row], i, x, y, z, bx - sx, by - sy, bz - sz)
-        else:
-            bx, by, bz = vector(q, j, p[there], p[there + 1], p[there + 2])
-            turn_row(q, Cq[row], j, p[there], p[there + 1], p[there + 2], ax, ay, az)
-            turn_row(q, Cq[row], i, x, y, z, bx, by, bz)
+        if int(p[k + KIND]) != RATE:
+            fill_rows(q, p, made, k, Cq, int(p[k + ROW]))
 
 
 @helper
@@ -254,106 +223,50 @@ def fill_gamma(q, v, p, made, Qd):
 
 
 @helper
-def fill_force(q, v, p, made, Q):
-    """Q; `made`: results of the program of forces."""
-    for body in range(int(p[p.size - HEAD + BODIES])):
-        m, k = WEIGHT + SPATIAL_BODY * body, 7 * body + 3
-        move_row(Q, body, p[m] * p[0], p[m] * p[1], p[m] * p[2])
-        # -8 G(e')^T J G(e) e': what the kinetic energy leaves when e'' = 0
-        u0, u1, u2, u3 = v[k], v[k + 1], v[k + 2], v[k + 3]
-        wx, wy, wz = half_spin(q[k], q[k + 1], q[k + 2], q[k + 3], u0, u1, u2, u3)
-        x, y, z = inertia(p, m, -8.0 * wx, -8.0 * wy, -8.0 * wz)
-        Q[k] += -u1 * x - u2 * y - u3 * z
-        Q[k + 1] += u0 * x - u3 * y + u2 * z
-        Q[k + 2] += u3 * x + u0 * y - u1 * z
-        Q[k + 3] += -u2 * x + u1 * y + u0 * z
-    first, n = int(p[p.size - HEAD + FORCES]), int(p[p.size - HEAD + N_FORCES])
-    for k in range(first, first + FORCE_WIDTH * n, FORCE_WIDTH):
-        kind, i, j, more = int(p[k + F_KIND]), int(p[k + F_FIRST]), int(p[k + F_SECOND]), int(p[k + F_MORE])
-        at, there, given = int(p[k + F_FIRST_AT]), int(p[k + F_SECOND_AT]), int(p[k + F_RESULT])
-        if kind == TORQUE:
-            if given >= 0:
-                twist_row(q, Q, j, made[given], made[given + 1], made[given + 2])
-            else:
-                twist_row(q, Q, j, p[more], p[more + 1], p[more + 2])
-            continue
-        if kind == FORCE:
-            if given >= 0:
-                push_row(q, Q, j, p, there, made[given], made[given + 1], made[given + 2])
-            else:
-                push_row(q, Q, j, p, there, p[more], p[more + 1], p[more + 2])
-            continue
-        if kind in (AXIAL, TORSION, BRAKE):  # about an axis of body i
-            x, y, z = vector(q, i, p[at], p[at + 1], p[at + 2])
-            ux, uy, uz = spin(q, v, i)
-            wx, wy, wz = spin(q, v, j)
-            rate = x * (wx - ux) + y * (wy - uy) + z * (wz - uz)
-            if kind == TORSION:
-                push = -torsion(q, i, j, p, at, there, p[more], p[more + 2]) - p[more + 1] * rate
-            elif kind == BRAKE:
-                push = -p[more] * math.tanh(rate / p[more + 1])
-            elif given >= 0:
-                push = made[given]
-            else:
-                push = p[more]
-            x, y, z = push * x, push * y, push * z
-            twist_row(q, Q, j, x, y, z)
-            twist_row(q, Q, i, -x, -y, -z)
-            continue
-        if kind in (SLIDE, RAIL, RUB):  # along an axis of body i, at the point of j, also on i
-            x, y, z = vector(q, i, p[at], p[at + 1], p[at + 2])
-            bx, by, bz = place(q, j, p, there)
-            cx, cy, cz = centre(q, i)
-            cx, cy, cz = bx - cx, by - cy, bz - cz
-            wx, wy, wz, _, _, _ = motion(q, v, j, p, there)
-            ux, uy, uz = centre(v, i)
-            ox, oy, oz = spin(q, v, i)
-            wx, wy, wz = wx - ux - oy * cz + oz * cy, wy - uy - oz * cx + ox * cz, wz - uz - ox * cy + oy * cx
-            rate = x * wx + y * wy + z * wz
-            if kind == RAIL:
-                ax, ay, az = place(q, i, p, int(p[k + F_ON_FIRST]))
-                push = -p[more] * (x * (bx - ax) + y * (by - ay) + z * (bz - az) - p[more + 2]) - p[more + 1] * rate
-            elif kind == RUB:
-                push = -p[more] * math.tanh(rate / p[more + 1])
-            elif given >= 0:
-                push = made[given]
-            else:
-                push = p[more]
-            x, y, z = push * x, push * y, push * z
-            push_row(q, Q, j, p, there, x, y, z)
-            move_row(Q, i, -x, -y, -z)
-            twist_row(q, Q, i, cz * y - cy * z, cx * z - cz * x, cy * x - cx * y)
-            continue
-        ax, ay, az = place(q, i, p, at)
-        bx, by, bz = place(q, j, p, there)
-        x, y, z = bx - ax, by - ay, bz - az
-        if kind == PULL:
-            x, y, z = p[more] * x, p[more] * y, p[more] * z
-        else:
-            length = math.sqrt(x * x + y * y + z * z)
-            x, y, z = x / length, y / length, z / length
-            ux, uy, uz, _, _, _ = motion(q, v, i, p, at)
-            wx, wy, wz, _, _, _ = motion(q, v, j, p, there)
-            pull = p[more] * (length - p[more + 2])
-            pull += p[more + 1] * (x * (wx - ux) + y * (wy - uy) + z * (wz - uz))
-            x, y, z = pull * x, pull * y, pull * z
-        push_row(q, Q, i, p, at, x, y, z)
-        push_row(q, Q, j, p, there, -x, -y, -z)
+def fill_mass(q, p, body, M, first):
+    """The block of M of a body, from a row and column on."""
+    m, k = WEIGHT + SPATIAL_BODY * body, 7 * body + 3
+    e0, e1, e2, e3 = q[k], q[k + 1], q[k + 2], q[k + 3]
+    columns = ((-e1, -e2, -e3), (e0, -e3, e2), (e3, e0, -e1), (-e2, e1, e0))  # of G
+    for i in range(3):
+        M[first + i, first + i] = p[m]
+    for j in range(4):
+        x, y, z = columns[j]
+        x, y, z = inertia(p, m, 4.0 * x, 4.0 * y, 4.0 * z)
+        for i in range(4):
+            M[first + 3 + i, first + 3 + j] = columns[i][0] * x + columns[i][1] * y + columns[i][2] * z
 
 
 @callback("mass")
 def mass(t, q, p, M):
     for body in range(int(p[p.size - HEAD + BODIES])):
-        m, first = WEIGHT + SPATIAL_BODY * body, 7 * body
-        e0, e1, e2, e3 = q[first + 3], q[first + 4], q[first + 5], q[first + 6]
-        columns = ((-e1, -e2, -e3), (e0, -e3, e2), (e3, e0, -e1), (-e2, e1, e0))  # of G
+        fill_mass(q, p, body, M, 7 * body)
+
+
+@callback("mass_values")
+def mass_values(t, q, p, values):
+    block = np.zeros((7, 7), dtype=q.dtype)
+    for body in range(int(p[p.size - HEAD + BODIES])):
+        fill_mass(q, p, body, block, 0)
         for i in range(3):
-            M[first + i, first + i] = p[m]
-        for j in range(4):
-            x, y, z = columns[j]
-            x, y, z = inertia(p, m, 4.0 * x, 4.0 * y, 4.0 * z)
-            for i in range(4):
-                M[first + 3 + i, first + 3 + j] = columns[i][0] * x + columns[i][1] * y + columns[i][2] * z
+            values[19 * body + i] = block[i, i]
+        for i in range(16):
+            values[19 * body + 3 + i] = block[3 + i // 4, 3 + i % 4]
+
+
+@callback("jacobian_values")
+def jacobian_values(t, q, p, values):
+    made, n = results(int(p[p.size - HEAD + MOTION_PROGRAM]), t, q, q, p), int(p[p.size - HEAD + BODIES])
+    for k in range(4 * n):
+        values[k] = q[7 * (k // 4) + 3 + k % 4]
+    rows, at = np.zeros((3, q.size), dtype=q.dtype), 4 * n
+    first, n = int(p[p.size - HEAD + JOINTS]), int(p[p.size - HEAD + N_JOINTS])
+    for k in range(first, first + JOINT_WIDTH * n, JOINT_WIDTH):
+        kind = int(p[k + KIND])
+        if kind != RATE:
+            fill_rows(q, p, made, k, rows, 0)
+            for row in range(3 if kind == POINT else 1):
+                at = take_entries(p, k, 7, 3 * (kind in (PERPENDICULAR, TURN)), rows[row], values, at)
 
 
 @callback("force")

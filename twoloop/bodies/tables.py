@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.bodies.functions import is_constant, program_for
-from twoloop.bodies.parameter_layout import BRAKE, NONE, PULL, RAIL, RATE, RUB, SPRING, TORSION
+from twoloop.bodies.parameter_layout import AXIAL, BRAKE, NONE, PULL, RAIL, RATE, RUB, SLIDE, SPRING, TORQUE, TORSION
 from twoloop.bodies.parts import Body, Force, JointRow, ModelJoint, Numbers
 from twoloop.checks.arguments import check_not_negative, check_positive
 from twoloop.generate.programs import numbers_of
@@ -44,6 +44,8 @@ class Tables:
         Rows of C of each joint, by its name.
     motions, functions : list of Function
         Drives and forces that are functions, in the order of their results.
+    loaded : list of Force
+        Friction in proportion to the load of its joint. Unit motors in these joints stand behind the forces.
     untraced : str
         Why these do not stand in p as programs; "": they do, or there are none.
     """
@@ -56,7 +58,8 @@ class Tables:
         forces: Sequence[Force],
         first_row: int,
     ):
-        self.bodies, self.joints, self.forces = bodies, joints, forces
+        self.gravity, self.bodies, self.joints, self.forces = gravity, bodies, joints, forces
+        self.loaded = [each for each in forces if each.kind in (BRAKE, RUB) and each.more and len(each.more.values) > 2]
         self.places: dict[str, int] = {}
         self._values: list[float] = []
         self._constants: list[float] = []
@@ -72,6 +75,8 @@ class Tables:
             self._place_all(row.on_first, row.on_second, row.more)
         for force in forces:
             self._place_all(force.on_first, force.on_second, force.more)
+        self._unit = Numbers((1.0,))
+        self._place_all(self._unit if self.loaded else None)
         self._n_named = len(self._values)
         self.motions = [row.motion for row in rows if row.motion is not None]
         self.functions = [force.function for force in forces if force.function is not None]
@@ -96,7 +101,7 @@ class Tables:
             if force.kind in (SPRING, TORSION, RAIL):
                 numbers = numbers[1:2]  # the damping
             elif force.kind in (BRAKE, RUB):
-                numbers = numbers[:1]
+                numbers = numbers[[0, *range(2, len(numbers))]]
             if force.function is not None or (force.kind != PULL and numbers.any()):
                 return False
         return all(is_constant(motion) for motion in self.motions)
@@ -120,6 +125,10 @@ class Tables:
         for name, value in values.items():
             if name in self.places:
                 self.p[self.places[name]] = value
+
+    def place(self, force: Force) -> int:
+        """Where the numbers of a force stand in p."""
+        return self._at(force.more)
 
     def _place_all(self, *parts: Numbers | None) -> None:
         for numbers in parts:
@@ -169,6 +178,10 @@ class Tables:
             table += (force.kind, first, self._at(force.on_first), second, self._at(force.on_second))
             table += (self._at(force.more), NONE if function is None else result, self._at(force.point_on_first))
             result += 0 if function is None else function.size
+        for force in self.loaded:
+            turns = TORQUE if len(self.gravity) == 2 else AXIAL
+            table += (turns if force.kind == BRAKE else SLIDE, force.first.number, self._at(force.on_first))
+            table += (force.second.number, self._at(force.on_second), self._at(self._unit), NONE, NONE)
         self.n_rows, self.untraced = row, ""
         programs: list[list[float]] = []
         for functions, motions in ((self.motions, True), (self.functions, False)):

@@ -68,7 +68,7 @@ class Gaps:
         """All of them at a state."""
         from twoloop.bodies.program_results import results  # whose import compiles
 
-        made = results(0, t, q, v, self._p)[: self.n * (3 + self._n_q)].reshape(self.n, -1)
+        made = results(0, t, q, v, self._p)[: self.n * (3 + self._n_q)].reshape(self.n, 3 + self._n_q)
         return Gap(made[:, 0], made[:, 1], made[:, 2], made[:, 3:])
 
     def _compare(self, stops: Sequence[Stop], t0: float, q0: Array) -> None:

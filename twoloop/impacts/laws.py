@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import nnls
+from scipy.optimize import lsq_linear, nnls
 
 from twoloop.problem.system import ConstrainedSystem
 
 Array = NDArray[np.float64]
 
+EVEN = 1e-6  # relative: by how much forces that share a load seek to be alike
+WEIGHT = 1e3  # of that problem, so that its gradients are large beside the tolerance of the solver
+MOST_STEPS = 1000  # of it
 NEGLIGIBLE = 1e-12  # relative: singular values, and eigenvalues, that count as zero
 
 
@@ -32,13 +35,40 @@ def complementary(D: Array, b: Array) -> Array:
     """
     if not len(b):
         return np.zeros(0)
-    values, vectors = np.linalg.eigh(0.5 * (D + D.T))
-    kept = values > NEGLIGIBLE * values.max(initial=0.0)
-    roots = np.sqrt(values[kept])
-    x = nnls(roots[:, None] * vectors[:, kept].T, -(vectors[:, kept].T @ b) / roots)[0]
+    x = nnls(*_squares(D, b))[0]
     held = x > 0.0
     x[held] = np.linalg.lstsq(D[np.ix_(held, held)], -b[held], rcond=NEGLIGIBLE)[0]
     return np.maximum(x, 0.0)
+
+
+def bounded(D: Array, c: Array, n: int, most: Array) -> Array:
+    """Forces that minimise x^T D x / 2 + c^T x: what has room leaves no acceleration D x + c.
+
+    The first n, of stops, are not negative, the others, of friction, are within `most`. Where they share a load in any
+    proportion, they do so evenly: the sum of x^2 / most is added with a small weight.
+    """
+    tiny = np.finfo(np.float64).tiny
+    B, y = _squares(D, c)
+    size = np.sqrt(D.diagonal().max())
+    unit = max(
+        float(np.linalg.norm(y)) / size, NEGLIGIBLE * float(most.max()), tiny
+    )  # of forces: the problem is solved in numbers of about 1
+    bound = np.maximum(most / unit, tiny)
+    even = np.zeros((len(most), len(c)))
+    even[:, n:] = np.diag(EVEN * np.sqrt(bound.min() / bound))
+    matrix, right = np.vstack([B / size, even]), np.append(y / (size * unit), 0.0 * most)
+    limits = np.append(np.zeros(n), -bound), np.append(np.full(n, np.inf), bound)
+    return np.asarray(
+        unit * lsq_linear(WEIGHT * matrix, WEIGHT * right, limits, "bvls", tol=1e-14, max_iter=MOST_STEPS).x
+    )
+
+
+def _squares(D: Array, b: Array) -> tuple[Array, Array]:
+    """B and y of |B x - y|, with B^T B = D and B^T y = -b."""
+    values, vectors = np.linalg.eigh(0.5 * (D + D.T))
+    kept = values > NEGLIGIBLE * values.max(initial=0.0)
+    roots = np.sqrt(values[kept])
+    return roots[:, None] * vectors[:, kept].T, -(vectors[:, kept].T @ b) / roots
 
 
 def impulses(D: Array, u: Array, restitution: Array) -> Array:

@@ -1,0 +1,130 @@
+"""Friction that grows with the load of a joint, against Newton's and Euler's laws solved apart."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from twoloop import ensemble, solve_dae
+from twoloop.bodies import PlanarModel, SpatialModel
+
+G = 9.81
+TIMES = np.linspace(0.0, 0.8, 5)
+
+
+def cart(spatial, guide=0.2, pin=0.3, push=0.0, radius=0.15):
+    """A cart on a guide, and a rod that hangs from it; friction in both joints."""
+    if spatial:
+        model, z = SpatialModel((0.0, -G, 0.0)), (0.0, 0.0, 1.0)
+        model.body("cart", mass=2.0, inertia=(0.1, 0.1, 0.1), position=(0, 0, 0), velocity=(1.0, 0, 0))
+        model.body("rod", mass=1.0, inertia=(0.3, 0.2, 0.08), position=(0.3, -0.4, 0), angular_velocity=(0, 0, 2.0))
+        rail = model.prismatic("ground", "cart", at=(0, 0, 0), axis=(1, 0, 0))
+        hinge = model.revolute("cart", "rod", at=(0, 0, 0), axis=z)
+    else:
+        model = PlanarModel()
+        model.body("cart", mass=2.0, inertia=0.1, position=(0.0, 0.0), velocity=(1.0, 0.0))
+        model.body("rod", mass=1.0, inertia=0.08, position=(0.3, -0.4), angular_velocity=2.0)
+        rail = model.prismatic("ground", "cart", at=(0.0, 0.0), axis=(1.0, 0.0))
+        hinge = model.revolute("cart", "rod", at=(0.0, 0.0))
+    model.friction(rail, push, speed=0.3, coefficient=guide)
+    model.friction(hinge, speed=0.5, coefficient=pin, radius=radius)
+    return model, rail, hinge
+
+
+@cache
+def by_hand(guide=0.2, pin=0.3, push=0.0, radius=0.15):
+    """x of the cart, the angle from below, and their rates; forces in the joints by iteration."""
+    M, m, J, l = 2.0, 1.0, 0.08, 0.5
+
+    def accelerations(x, a, u, w):
+        s, c, rub, turn, before = np.sin(a), np.cos(a), 0.0, 0.0, np.inf
+        while abs(abs(rub) + abs(turn) - before) > 1e-14:
+            before = abs(rub) + abs(turn)
+            # m (x'' + l (a'' c - w^2 s)) = X, m l (a'' s + w^2 c) = Y - m g, M x'' = -X + rub,
+            # J a'' = -l s Y - l c X + turn
+            A = np.array([[m, m * l * c, -1, 0], [0, m * l * s, 0, -1], [M, 0, 1, 0], [0, J, l * c, l * s]])
+            _, _, X, Y = found = np.linalg.solve(A, [m * l * w**2 * s, -m * l * w**2 * c - m * G, rub, turn])
+            rub = -(push + guide * abs(Y + M * G)) * np.tanh(u / 0.3)
+            turn = -pin * radius * np.hypot(X, Y) * np.tanh(w / 0.5)
+        return found[:2]
+
+    def slope(t, y):
+        return [*y[2:], *accelerations(*y)]
+
+    start = [0.0, np.arctan2(0.3, 0.4), 1.0, 2.0]
+    return solve_ivp(slope, (0.0, TIMES[-1]), start, "DOP853", TIMES, rtol=1e-11, atol=1e-12).y
+
+
+@pytest.mark.parametrize("spatial", [False, True])
+def test_a_cart_with_a_pendulum(spatial):
+    model, *_ = cart(spatial, push=0.4)
+    problem = model.problem((0.0, TIMES[-1]))
+    assert not problem.conserved and "forces in the joints" in problem.note
+    if not spatial:
+        problem.v0[:] = [1.0, 0.0, 0.0, 1.0 + 0.4 * 2.0, 0.3 * 2.0, 2.0]  # both as given, the hinge closed
+    else:
+        problem.v0[:3], problem.v0[7:10] = (1.0, 0.0, 0.0), (1.0 + 0.4 * 2.0, 0.3 * 2.0, 0.0)
+    run = problem.system, problem.t_span, problem.q0, problem.v0, "DOP853"
+    result = solve_dae(*run, rtol=1e-10, atol=1e-10, t_eval=TIMES)
+    assert result.success, result.message
+    x, a, *_ = by_hand(push=0.4)
+    np.testing.assert_allclose(result.q[0], x, atol=1e-9)
+    rod = result.q[7:9] if spatial else result.q[3:5]
+    np.testing.assert_allclose(rod, [x + 0.5 * np.sin(a), -0.5 * np.cos(a)], atol=1e-9)
+    weight = problem.energy(result.t, result.q, result.v)
+    assert (np.diff(weight) < 0.0).all()
+
+
+def test_a_stiff_method_and_many_runs_with_other_coefficients():
+    model, *_ = cart(False)
+    problem = model.problem((0.0, 0.1))
+    known = solve_dae(problem.system, problem.t_span, problem.q0, problem.v0, "DOP853", rtol=1e-8)
+    other = solve_dae(problem.system, problem.t_span, problem.q0, problem.v0, "RadauIIA9", rtol=1e-8)
+    np.testing.assert_allclose(other.q[:, -1], known.q[:, -1], atol=1e-7)
+    name = "coefficient of friction of prismatic cart-ground"
+    P = np.tile(problem.system.parameters, (2, 1))
+    P[1, problem.place(name)] = 0.05
+    runs = ensemble(problem.system, (0.0, 0.1), problem.q0, problem.v0, parameters=P)
+    rougher = problem.with_parameters({name: 0.05})
+    single = solve_dae(rougher.system, (0.0, 0.1), problem.q0, problem.v0)
+    np.testing.assert_allclose(runs.q[0, :, -1], known.q[:, -1], atol=1e-6)
+    np.testing.assert_allclose(runs.q[1, :, -1], single.q[:, -1], atol=1e-6)
+    assert abs(runs.q[1, 0, -1] - runs.q[0, 0, -1]) > 1e-4
+
+
+def test_the_thrust_of_a_hinge_in_space_is_without_friction():
+    """A wheel on a vertical axle with its weight along it, beside one of which the axle is level."""
+    rates = []
+    for axis in ((0.0, 0.0, 1.0), (1.0, 0.0, 0.0)):
+        model = SpatialModel()
+        wheel = model.body(
+            "wheel", mass=3.0, inertia=(0.5, 0.5, 0.5), position=(0, 0, 0), angular_velocity=np.array(axis)
+        )
+        model.friction(
+            model.revolute("ground", wheel, at=(0, 0, 0), axis=axis), speed=1e-2, coefficient=0.1, radius=0.02
+        )
+        problem = model.problem((0.0, 0.1))
+        result = solve_dae(problem.system, problem.t_span, problem.q0, problem.v0)
+        rates.append(2.0 * np.linalg.norm(result.v[3:, -1]))
+    np.testing.assert_allclose(rates, [1.0, 1.0 - 0.1 * 0.02 * 3.0 * G / 0.5 * 0.1], atol=1e-6)
+
+
+def test_where_the_load_or_the_friction_is_not_determined():
+    model, rail, hinge = cart(False)
+    with pytest.raises(ValueError, match="radius is that of the pin of a revolute joint"):
+        model.friction(rail, speed=0.1, coefficient=0.1, radius=0.1)
+    with pytest.raises(ValueError, match="radius is that of the pin of a revolute joint"):
+        model.friction(hinge, speed=0.1, coefficient=0.1)
+    with pytest.raises(ValueError, match="coefficient must not be negative"):
+        model.friction(rail, speed=0.1, coefficient=-0.1)
+    double = PlanarModel()
+    double.body("block", mass=1.0, inertia=1.0, position=(0.0, 0.0))
+    first = double.prismatic("ground", "block", at=(0.0, 0.0), axis=(1.0, 0.0))
+    double.prismatic("ground", "block", at=(1.0, 0.0), axis=(1.0, 0.0))
+    double.friction(first, speed=0.1, coefficient=0.1)
+    with pytest.raises(ValueError, match="not determined: rows follow from others among"):
+        double.problem()
+    jams, *_ = cart(False, guide=60.0)
+    with pytest.raises(ValueError, match="cannot be found at the start: coefficients are so large"):
+        jams.problem()

@@ -1,0 +1,319 @@
+"""A motion in modes: arcs between impacts, contact and release, sliding and sticking."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twoloop.impacts.contact import Accelerations, Closed
+from twoloop.impacts.gaps import Gap, Gaps
+from twoloop.impacts.joined import Impact, joined
+from twoloop.impacts.laws import NEGLIGIBLE, bounded, complementary, impulses, responses
+from twoloop.impacts.rubbing import IDLE, INDEPENDENT, STICKS, Frictionless, Rubbing, Signs
+from twoloop.problem.stops import Stop
+from twoloop.problem.system import ConstrainedSystem
+from twoloop.result.result import Result
+from twoloop.run.record import Status
+from twoloop.solve import solve_dae
+
+Array = NDArray[np.float64]
+
+LOW = 0.01  # of the absolute tolerance: a rebound to less than this height ends in contact
+ROUNDING = 1e-13  # of the largest coordinate, at least
+LEAST_STEP = 1e-9  # s, or relative: the first of an arc
+NOTHING = 1e-20  # m or rad: coordinates that rounding alone keeps from zero
+STANDS = 1e-13  # relative: arcs that are shorter do not move on in time ...
+CORRECTIONS = 3  # of positions, by Newton's method
+MOST_STANDING = 30  # ... and so many of them in a row end the motion
+REST = 1e-10  # of the largest velocities of the last arc: rates of joints that count as zero
+RELEASED = 1e-7  # relative: less than its friction holds a joint that it has just released
+AT_MOST = 1e-9  # relative: friction that holds with all that it has
+
+
+class Undetermined(ValueError):
+    """No share of the load among joints that stick, and stops, was found that they can bear."""
+
+
+class Motion:
+    """What is known of a motion: its state, which stops are closed, and which joints stick.
+
+    Parameters
+    ----------
+    stops : sequence of Stop
+    rubs : Rubbing or Frictionless
+        The system in its modes.
+    t, q, v : float, ndarray (n_q,), ndarray (n_q,)
+    options : dict
+        Of runs.
+    """
+
+    def __init__(
+        self,
+        stops: Sequence[Stop],
+        rubs: Rubbing | Frictionless,
+        t: float,
+        q: Array,
+        v: Array,
+        options: dict[str, Any],
+    ):
+        self.system, self.rubs, self.stops, self.options = rubs.system, rubs, list(stops), options
+        self.t, self.q, self.v = t, q, v
+        self.e = np.array([stop.restitution for stop in stops])
+        self.gaps = Gaps(stops, t, q)
+        self.low = max(LOW * float(options["atol"].min()), ROUNDING * max(1.0, float(np.abs(q).max())))
+        wrong = np.flatnonzero(self.gaps.at(t, q, v).g < -100.0 * self.low)
+        if wrong.size:
+            gap = float(self.gaps.at(t, q, v).g[wrong[0]])
+            raise ValueError(f"q0 must be on this side of all stops; the gap of {stops[wrong[0]].name!r} is {gap:.3g}")
+        self.arcs: list[Result] = []
+        self.impacts: list[Impact] = []
+        self.let_go: list[int] = []  # stops whose force has just become zero
+        self.speeds = np.abs(v)  # the largest of the last arc
+        self.still: set[int] = set()  # joints that have stopped, or stick
+        self.released: set[int] = set()  # those that stuck until now
+        self._known: dict[tuple[int, tuple[int, ...]], tuple[ConstrainedSystem, ConstrainedSystem]] = {}
+        self._forces: dict[int, tuple[ConstrainedSystem, Accelerations]] = {}
+
+    def to(self, t1: float, times: Array | None) -> Result:
+        """Go on to the end."""
+        standing = 0
+        while True:
+            before = self.t
+            try:
+                self._arc(*self._meet(), t1)
+            except Undetermined as error:
+                if not self.arcs:
+                    raise
+                return joined(self.system, self.arcs, self.impacts, times, f"Stopped: {error}", self._tale)
+            last = self.arcs[-1]
+            if last.status != Status.EVENT or self.t >= t1:
+                return joined(self.system, self.arcs, self.impacts, times, "", self._tale)
+            standing = standing + 1 if self.t - before <= STANDS * max(1.0, abs(self.t)) else 0
+            if standing == MOST_STANDING:
+                names = dict.fromkeys(name for impact in self.impacts[-9:] for name in impact.stops)
+                of = f" ({', '.join(map(repr, names))})" if names else ""
+                said = (
+                    f"Stopped at t = {self.t:.10g}: {standing} impacts or other changes in a row at this time{of}. "
+                    "Look for stops that push against each other, or loosen atol"
+                )
+                return joined(self.system, self.arcs, self.impacts, times, said, self._tale)
+
+    @property
+    def _tale(self) -> str:
+        changes = f"{len(self.arcs) - 1} changes between sliding and sticking."
+        if self.stops and self.rubs.n:
+            return f"{len(self.impacts)} impacts, {len(self.arcs) - 1} changes of what slides, sticks or rests."
+        return changes if self.rubs.n else f"{len(self.impacts)} impacts."
+
+    def _meet(self) -> tuple[Signs, tuple[int, ...]]:
+        """What happens at this instant: the velocities after it, who slides where (0: sticks), and who stays closed."""
+        gap = self.gaps.at(self.t, self.q, self.v)
+        near = np.flatnonzero(gap.g <= self.low)
+        slow = np.zeros(near.size, dtype=bool)
+        if near.size:
+            slow = self._hit(gap, near) & ~np.isin(near, self.let_go)  # the force of those is zero but for rounding
+        closing = near[slow]
+        signs, of = self._sliding(self.v)
+        if not closing.size and not of:
+            return signs, ()
+        a, c_rubs = self._free(signs, of, self.v)
+        gap = self.gaps.at(self.t, self.q, self.v)
+        c = np.append(gap.W[closing] @ a + gap.bend[closing], c_rubs)
+        W = np.vstack([gap.W[closing], self.rubs.along(self.q)[of]])
+        D = W @ responses(self.system, self.t, self.q, W)
+        if not of:
+            return signs, tuple(closing[complementary(D, c) > 0.0].tolist())
+        n = len(closing)
+        force = bounded(D, c, n, self._most(of))
+        left = (D @ force + c)[n:]  # how the joints accelerate
+        terms = (np.abs(D) @ np.abs(force) + np.abs(c))[n:] + D.diagonal()[n:] * self.rubs.most[of]
+        pushes = force[:n] > 0.0
+        base = np.flatnonzero(pushes).tolist()
+        for k, sign, slides, at in zip(
+            of, np.sign(left), np.abs(left) > AT_MOST * terms, range(n, n + len(of)), strict=True
+        ):
+            signs[k] = int(sign) if slides else self._sticks(k, force[at], D, at, base, pushes.sum())
+        return signs, tuple(closing[pushes].tolist())
+
+    def _most(self, of: list[int]) -> Array:
+        """What can hold joints that are at rest; less of one that was just released."""
+        low = np.minimum(self.rubs.kinetic, (1.0 - RELEASED) * self.rubs.most)
+        return np.array([(low if k in self.released else self.rubs.most)[k] for k in of])
+
+    def _sticks(self, k: int, force: float, D: Array, at: int, base: list[int], n_pushing: int) -> int | None:
+        """STICKS, or IDLE where stops that push, and joints that stick, hold the joint already.
+
+        Then its friction stays as it is until one of these lets go; where stops alone hold the joint, it has none.
+        """
+        known = np.linalg.lstsq(D[np.ix_(base, base)], D[base, at], rcond=NEGLIGIBLE)[0]
+        if D[at, at] - D[at, base] @ known > INDEPENDENT * D[at, at]:
+            base.append(at)
+            return STICKS
+        self.rubs.frozen[k] = force if np.abs(known[n_pushing:]).max(initial=0.0) > INDEPENDENT else 0.0
+        return IDLE
+
+    def _hit(self, gap: Gap, near: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Change the velocities by the impulses at stops that are closed, and say which of these would hardly open."""
+        X = responses(self.system, self.t, self.q, gap.W[near])  # dry friction has no impulse
+        D = gap.W[near] @ X
+        before, u = self.v, gap.u[near]
+        P = impulses(D, u, self.e[near])
+        v = before + X @ P
+        slow = self._slow(near, v)
+        if (slow & (P > 0.0) & (self.e[near] > 0.0)).any():
+            P = impulses(D, u, np.where(slow, 0.0, self.e[near]))
+            v = before + X @ P
+            slow = self._slow(near, v)
+        hit = P > 0.0
+        if hit.any():
+            names = tuple(self.stops[k].name for k in near[hit])
+            self.impacts.append(Impact(self.t, names, before.copy(), v.copy(), P[hit]))
+            self.still, self.released = set(), set()
+        self.v = v
+        return slow
+
+    def _slow(self, near: NDArray[np.int64], v: Array) -> NDArray[np.bool_]:
+        """Which of these stops would open by less than what counts."""
+        signs, of = self._sliding(v)
+        a, c = self._free(signs, of, v)
+        if of:
+            W = self.rubs.along(self.q)[of]
+            X = responses(self.system, self.t, self.q, W)
+            a = a + X @ bounded(W @ X, c, 0, self._most(of))
+        gap = self.gaps.at(self.t, self.q, v)
+        c, u = (gap.W @ a + gap.bend)[near], gap.u[near]
+        return np.asarray(
+            u * np.abs(u) <= 2.0 * self.low * np.maximum(-c, 0.0) + ROUNDING * np.abs(v).max() ** 2, dtype=bool
+        )
+
+    def _sliding(self, v: Array) -> tuple[Signs, list[int]]:
+        """In which direction each joint slides, and those that are at rest."""
+        W = self.rubs.along(self.q)
+        u = W @ v
+        moves = np.abs(u) > REST * (np.abs(W) @ self.speeds)
+        slow = [k for k in range(len(u)) if k in self.still or k in self.released or not moves[k]]
+        return [0 if k in slow else int(np.sign(u[k])) for k in range(len(u))], slow
+
+    def _free(self, signs: Signs, of: list[int], v: Array) -> tuple[Array, Array]:
+        """Accelerations while no stop pushes and joints at rest have no friction, and those of these joints."""
+        a = self._accelerations(self.rubs.free(signs, self.t, self.q)).at(self.t, self.q, v)[0]
+        return a, self.rubs.accelerations(signs, of, self.t, self.q, v, a)
+
+    def _accelerations(self, system: ConstrainedSystem, kept: bool = True) -> Accelerations:
+        if id(system) in self._forces:
+            return self._forces[id(system)][1]
+        made = Accelerations(system, self.t, self.q, self.v, self.options["atol"])
+        if kept:
+            self._forces[id(system)] = system, made
+        return made
+
+    def _closed(self, system: ConstrainedSystem, resting: tuple[int, ...], kept: bool) -> ConstrainedSystem:
+        """A system while some stops are closed."""
+        if not resting:
+            return system
+        key = id(system), resting
+        if key in self._known:
+            return self._known[key][1]
+        names = ", ".join(self.stops[k].name for k in resting)
+        made = Closed(system, self.gaps, list(resting)).made(names)
+        if kept:
+            self._known[key] = system, made
+        return made
+
+    def _arc(self, signs: Signs, resting: tuple[int, ...], t1: float) -> None:
+        """A run until a gap closes or lets go, or a joint stops or is released."""
+        mode, rows = self.rubs.mode(signs, self.t, self.q)
+        lasting = not {STICKS, IDLE} & set(signs)  # what sticks does so at places of its own
+        system = self._closed(mode, resting, lasting)
+        if system.n_c and (resting or self.rubs.n):
+            self._close(system, resting)
+        start = self.gaps.at(self.t, self.q, self.v)
+        holds = self._accelerations(system, lasting) if resting or STICKS in signs else None
+
+        def multiplier(row: int, t: float, q: Array, v: Array) -> float:
+            assert holds is not None
+            return float(holds.at(t, q, v)[1][row])
+
+        def friction(k: int, t: float, q: Array, v: Array) -> float:
+            return -multiplier(rows[k], t, q, v) * self.rubs.turned(k, system, rows[k], t, q)
+
+        def pulls(k: int) -> Any:
+            row = mode.n_c + resting.index(k)
+            return terminal(lambda t, q, v: -multiplier(row, t, q, v))
+
+        events = [self._changes(k, sign, friction) for k, sign in enumerate(signs)]
+        events += [pulls(k) if k in resting else self._closes(k, start) for k in range(len(self.stops))]
+        options = {**self.options, "check_derivatives": self.options.get("check_derivatives", True) and not self.arcs}
+        if self.arcs and self.options.get("first_step") is None and self.arcs[-1].h.size:
+            least = LEAST_STEP * max(1.0, abs(self.t))  # coordinates next to zero have no size to choose a step by
+            options["first_step"] = min(max(0.1 * float(self.arcs[-1].h.max()), least), t1 - self.t)
+        arc = solve_dae(system, (self.t, t1), self.q, self.v, events=events, dense_output=True, **options)
+        self.arcs.append(arc)
+        if arc.t.size:
+            self.speeds = np.abs(arc.v).max(axis=1)
+            self.t, self.q, self.v = float(arc.t[-1]), arc.q[:, -1].copy(), arc.v[:, -1].copy()
+        over = {k for k in range(len(events)) if arc.t_events is not None and arc.t_events[k].size}
+        n = len(signs)
+        self.let_go = [k for k in resting if n + k in over]
+        self.released = {k for k in over if k < n and signs[k] == STICKS}
+        self.still = {k for k in range(n) if (not signs[k]) != (k in over)}
+
+    def _close(self, system: ConstrainedSystem, resting: tuple[int, ...]) -> None:
+        """Put the state on the constraints of a mode, from which it is off by less than the tolerances."""
+        for _ in range(CORRECTIONS):
+            rows, off = system.jacobian(self.t, self.q), system.constraint(self.t, self.q)
+            self.q = self.q - np.linalg.lstsq(rows, off, rcond=NEGLIGIBLE)[0]
+        if resting:
+            self.q[np.abs(self.q) < NOTHING] = 0.0
+            gap = self.gaps.at(self.t, self.q, self.v)
+            W, u = gap.W[list(resting)], gap.u[list(resting)]
+            X = responses(self.system, self.t, self.q, W)
+            self.v = self.v - X @ np.linalg.lstsq(W @ X, u, rcond=NEGLIGIBLE)[0]
+        rows, off = system.rows(self.t, self.q), system.velocity_constraint(self.t, self.q, self.v)
+        self.v = self.v - np.linalg.lstsq(rows, off, rcond=NEGLIGIBLE)[0]
+
+    def _closes(self, k: int, start: Gap) -> Any:
+        """The event of a gap that is open, or about to open: zero where it is as closed as it was at the start."""
+        g0, u0, t0, low = float(start.g[k]), float(start.u[k]), self.t, self.low
+        opens = u0 > 0.0 and u0 * u0 > low * 1e-6
+
+        def closes(t: float, q: Array, v: Array) -> float:
+            g = float(self.gaps.at(t, q, v).g[k])
+            if g0 > low:
+                return g
+            if opens:
+                return (g - g0) / (t - t0) if t > t0 else u0
+            return g - min(g0, 0.0) + low
+
+        return terminal(closes)
+
+    def _changes(self, k: int, sign: int | None, friction: Any) -> Any:
+        """The event that ends the mode of a joint."""
+        if sign is IDLE:
+            return terminal(lambda t, q, v: 1.0)
+        return terminal(self._slips(k, friction) if sign == STICKS else self._stops(k, sign))
+
+    def _stops(self, k: int, sign: int) -> Any:
+        """The event of a joint that comes to rest; one that begins to slide is at rest at first."""
+        u0 = sign * float(self.rubs.along(self.q, k) @ self.v)
+        least = u0 - self.low if k in self.still or k in self.released else 0.0
+        return lambda t, q, v: sign * float(self.rubs.along(q, k) @ v) - least
+
+    def _slips(self, k: int, friction: Any) -> Any:
+        """The event of a joint that needs more than its friction; one that needs all of it may do so at once."""
+        most = self.rubs.most[k]
+        needed = abs(friction(k, self.t, self.q, self.v))
+        if needed > (1.0 + RELEASED) * most:
+            raise Undetermined(f"at t = {self.t:.10g} a joint that sticks needs {needed:.10g}, and has {most:.10g}")
+        if needed > (1.0 - AT_MOST) * most:
+            most = max(most, needed) * (1.0 + AT_MOST)
+        return lambda t, q, v: most - abs(friction(k, t, q, v))
+
+
+def terminal(event: Any) -> Any:
+    """An event that ends a run where it falls through zero."""
+    event.terminal, event.direction = True, -1
+    return event

@@ -1,0 +1,139 @@
+"""What sticks and slides: the systems of a model with dry friction in its modes, or of one without."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twoloop.impacts.laws import NEGLIGIBLE, responses
+from twoloop.problem.system import ConstrainedSystem
+
+if TYPE_CHECKING:
+    from twoloop.bodies.model_problem import ModelProblem
+
+Array = NDArray[np.float64]
+
+Signs = list[int | None]  # of joints: in which direction they slide, or one of these
+STICKS, IDLE = 0, None  # held by friction, or by stops and other joints that hold it already
+INDEPENDENT = 1e-9  # of how a joint yields alone, over the same of a free body
+
+
+class Frictionless:
+    """A system in which nothing sticks: it has one mode."""
+
+    n = 0
+    most = kinetic = np.zeros(0)
+    frozen: ClassVar[dict[int, float]] = {}
+
+    def __init__(self, system: ConstrainedSystem):
+        self.system = system
+
+    def along(self, q: Array, k: int | None = None) -> Array:
+        """No directions."""
+        return np.zeros((0, len(q)))
+
+    def free(self, signs: Signs, t: float, q: Array) -> ConstrainedSystem:
+        """The system."""
+        return self.system
+
+    def accelerations(self, signs: Signs, of: list[int], t: float, q: Array, v: Array, a: Array) -> Array:
+        """None."""
+        return np.zeros(0)
+
+    def mode(self, signs: Signs, t: float, q: Array) -> tuple[ConstrainedSystem, dict[int, int]]:
+        """The system, without rows of what sticks."""
+        return self.system, {}
+
+    def turned(self, k: int, system: ConstrainedSystem, row: int, t: float, q: Array) -> float:
+        """Nothing is."""
+        raise NotImplementedError
+
+
+class Rubbing:
+    """A model with dry friction in joints, each of which slides, with a sign, or sticks: 0.
+
+    Parameters
+    ----------
+    problem : ModelProblem
+
+    Raises
+    ------
+    ValueError
+        If a joint cannot slide by itself.
+    """
+
+    def __init__(self, problem: ModelProblem):
+        assert problem.model is not None
+        self.system, self._problem, self._model, self._rubs = problem.system, problem, problem.model, problem.model.dry
+        self.n, self.most = len(self._rubs), np.array([rub.static for rub in self._rubs])
+        self.kinetic = np.array([rub.kinetic for rub in self._rubs])
+        self._pulls = [self._model.pull(rub, problem.parameters) for rub in self._rubs]
+        self.frozen: dict[int, float] = {}  # friction of joints that are IDLE
+        self._lasting: dict[tuple[int | None, ...], ConstrainedSystem] = {}
+        self._check_independent(problem.t_span[0], problem.q0)
+
+    def along(self, q: Array, k: int | None = None) -> Array:
+        """By how much joints slide with the coordinates, (n, n_q); or one of them, (n_q,)."""
+        if k is None:
+            return np.array([self.along(q, each) for each in range(self.n)])
+        return self._pulls[k].force(0.0, q, np.zeros_like(q))
+
+    def _check_independent(self, t: float, q: Array) -> None:
+        """Raise unless each joint can slide while the others stick: else their shares are not determined."""
+        W = self.along(q)
+        D = W @ responses(self.system, t, q, W)
+        scale = (W**2).sum(axis=1) / float(np.abs(self.system.mass(t, q)).max())
+        for k, rub in enumerate(self._rubs):
+            before = D[:k, :k]
+            left = D[k, k] - D[k, :k] @ np.linalg.lstsq(before, D[:k, k], rcond=NEGLIGIBLE)[0]
+            if not left > INDEPENDENT * scale[k]:
+                others = ", ".join(repr(each.name) for each in self._rubs[:k])
+                raise ValueError(
+                    f"the joint of {rub.name!r} cannot slide by itself: drives or other joints hold it"
+                    f"{f', or it moves as those of {others} do' if k else ''}, so that its friction is not determined "
+                    "while it sticks; leave it out, and give another joint all of the friction"
+                )
+
+    def free(self, signs: Signs, t: float, q: Array) -> ConstrainedSystem:
+        """The system while some joints slide and the others are without friction."""
+        known = tuple(signs)
+        if known not in self._lasting:
+            self._lasting[known] = self._made(self._problem.name, signs, {}, t, q)[0]
+        return self._lasting[known]
+
+    def accelerations(self, signs: Signs, of: list[int], t: float, q: Array, v: Array, a: Array) -> Array:
+        """How joints that are at rest begin to slide, where the coordinates have the accelerations a."""
+        if not of:
+            return np.zeros(0)
+        held, rows = self.mode(signs, t, q)
+        R, gamma = held.jacobian(t, q), held.gamma(t, q, v)
+        return np.array([self.turned(k, held, rows[k], t, q) * (R[rows[k]] @ a - gamma[rows[k]]) for k in of])
+
+    def mode(self, signs: Signs, t: float, q: Array) -> tuple[ConstrainedSystem, dict[int, int]]:
+        """The system while some joints slide, and those that stick do so where they are; the rows of these."""
+        if not {STICKS, IDLE} & set(signs):
+            return self.free(signs, t, q), {}
+        names = [rub.name for rub, sign in zip(self._rubs, signs, strict=True) if sign == STICKS]
+        gauge, rows = self._made("gauge", signs, dict.fromkeys(names, np.nan), t, q)
+        first, other = (gauge.constraint(t, q) for t in (0.0, 0.5 * np.pi)) if names else ((), ())
+        held = {}
+        for rub in (rub for rub in self._rubs if rub.name in names):
+            (row,) = rows[rub.name]
+            turns = self._model.dimension == 3 and rub.joint.kind == "revolute"  # whose row is A cos t + B sin t
+            held[rub.name] = float(np.arctan2(-first[row], other[row]) if turns else first[row])
+        said = f", {', '.join(names)} sticks" if names else ""
+        system, rows = self._made(self._problem.name + said, signs, held, t, q)
+        return system, {k: rows[rub.name][0] for k, rub in enumerate(self._rubs) if rub.name in names}
+
+    def turned(self, k: int, system: ConstrainedSystem, row: int, t: float, q: Array) -> float:
+        """Sign of the row of a joint that sticks against the direction in which it slides."""
+        return float(np.sign(system.jacobian(t, q)[row] @ self.along(q, k)))
+
+    def _made(
+        self, name: str, signs: Signs, held: dict[str, float], t: float, q: Array
+    ) -> tuple[ConstrainedSystem, dict[str, tuple[int, ...]]]:
+        forces = {rub.name: -(sign or 0) * rub.kinetic for rub, sign in zip(self._rubs, signs, strict=True)}
+        forces |= {self._rubs[k].name: self.frozen[k] for k, sign in enumerate(signs) if sign is IDLE}
+        return self._model.mode(name, self._problem.parameters, forces, held, t, q)
