@@ -41,6 +41,7 @@ def test_findings_turn_with_the_rows(tmp_path):
     assert gear_found["off_long"] == [1, 2, 3] and [one["order"] for one in gear_found["both"]] == [3]
     assert gear_found["both"][0]["limits"] == pytest.approx([1.6e-3, 0.0125], rel=0.03)
     assert found["canonical_growth"] == 1.0 and found["growth"] == [2.0, 2.0]
+    assert found["others_growth"] == {"False": [2.0, 2.0], "True": [2.0, 2.0]}  # that let constraints drift, and others
 
     made = rows()
     stand_in, long = made["group"] == "GSTIFF stand-in", made["h"] == 0.02
