@@ -209,12 +209,24 @@ def test_a_loop_that_is_given_beside_the_file(tmp_path):
         ('<child link="slide"/>', '<child link="other"/>', "child of joint 'push' must be a link of the file"),
         ('<axis xyz="1 0 0"/>', '<axis xyz="0 0 0"/>', "must have a direction"),
         ('<mass value="0.4"/>', '<mass value="0"/>', "has joints but no mass"),
+        ('ixx="', 'ixx="x', "inertia of link 'shoulder' must be 6 finite numbers"),
+        ('damping="', 'damping="x', "damping of joint 'turn' must be 1 finite numbers"),
+        ("</robot>", '<link name="slide"/></robot>', "links must have different names; 'slide' is there twice"),
     ],
 )
 def test_what_is_wrong_is_named(arm, old, new, message):
     arm.write_text(arm.read_text().replace(old, new, 1))
     with pytest.raises(ValueError, match=message):
         read(arm)
+
+
+def test_the_damping_of_a_floating_joint_is_told(tmp_path):
+    path = tmp_path / "floats.urdf"
+    path.write_text("""<robot name="floats"><link name="base"/><link name="hull"><inertial><mass value="1"/>
+      <inertia ixx="1" iyy="1" izz="1"/></inertial></link><joint name="free" type="floating"><parent link="base"/>
+      <child link="hull"/><dynamics damping="3"/></joint></robot>""")
+    with pytest.warns(IgnoredWarning, match="damping of joint 'free'"):
+        assert not from_urdf(path).joints
 
 
 def test_wrong_loops_and_positions(arm):

@@ -182,6 +182,19 @@ def test_a_double_pendulum_by_unlike_methods_in_a_plane_and_in_space():
         np.testing.assert_allclose(changes(result), changes(known), atol=1e-9)
 
 
+def test_wheels_that_mesh_come_to_rest():
+    """What rounding leaves of their rates is no motion."""
+    model = PlanarModel((0.0, 0.0))
+    model.disc("small", 0.1, mass=1.0, position=(0.0, 0.0), angular_velocity=5.0)
+    model.disc("large", 0.2, mass=1.0, position=(0.3, 0.0))
+    pins = [model.revolute("ground", name, at=(x, 0.0)) for name, x in (("small", 0.0), ("large", 0.3))]
+    model.gear(*pins, ratio=-0.5)
+    model.dry_friction(pins[0], 0.1)
+    result = solve_with_friction(model.problem((0.0, 2.0)), **TIGHT)
+    np.testing.assert_allclose(changes(result), [5.0 * (0.005 + 0.25 * 0.02) / 0.1], atol=1e-9)
+    assert not result.v[:, -1].any()
+
+
 def test_what_the_problem_says_of_dry_friction():
     problem = rotor(1.0)
     assert "solve_with_friction keeps its dry friction" in problem.note and not problem.conserved

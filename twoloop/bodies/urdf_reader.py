@@ -121,6 +121,10 @@ class _Reader:
     def __init__(self, root: Element, positions: dict[str, Any], model: SpatialModel):
         self.model, self.ignored = model, list[str]()
         self.links = {_name(each): each for each in root.findall("link")}
+        if len(self.links) < len(root.findall("link")):
+            names = [_name(each) for each in root.findall("link")]
+            twice = next(name for name in names if names.count(name) > 1)
+            raise ValueError(f"links must have different names; {twice!r} is there twice")
         self.joints = root.findall("joint")
         self.ignored += [
             f"{each.tag} {each.get('name') or each.get('reference') or ''!s}".rstrip()
@@ -161,7 +165,10 @@ class _Reader:
                 ahead.append(self._end(joint, "child"))
         for part in parts:
             made = add_part(self.model, part)
-            damping = float(part.freed[0].attributes.get("damping", 0.0))
+            freed = part.freed[0]
+            (damping,) = numbers(freed.attributes.get("damping", "0"), 1, f"damping of joint {freed.name!r}")
+            if damping and made is None:
+                self.ignored.append(f"damping of joint {freed.name!r}")
             if damping and made is not None and made.kind == "revolute":
                 self.model.torsion_spring(made, stiffness=0.0, damping=damping)
             elif damping and made is not None:
@@ -252,7 +259,10 @@ class _Reader:
         mass, inertia = inertial.find("mass"), inertial.find("inertia")
         if mass is None or inertia is None:
             raise ValueError(f"{what} needs <mass> and <inertia>")
-        xx, xy, xz, yy, yz, zz = (float(inertia.get(key, 0.0)) for key in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz"))
+        keys = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+        xx, xy, xz, yy, yz, zz = numbers(
+            " ".join(inertia.get(key, "0") for key in keys), 6, f"inertia of link {name!r}"
+        )
         J = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
         (value,) = numbers(mass.get("value", ""), 1, f"mass of link {name!r}")
         part.lumps.append(Lump(float(value), np.zeros(3), J).seen(pose.then(_origin(inertial, what))))

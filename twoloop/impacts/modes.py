@@ -24,7 +24,7 @@ Array = NDArray[np.float64]
 LOW = 0.01  # of the absolute tolerance: a rebound to less than this height ends in contact
 ROUNDING = 1e-13  # of the largest coordinate, at least
 LEAST_STEP = 1e-9  # s, or relative: the first of an arc
-NOTHING = 1e-20  # m or rad: coordinates that rounding alone keeps from zero
+NOTHING = 1e-20  # m or rad, also over s: coordinates and rates that rounding alone keeps from zero
 STANDS = 1e-13  # relative: arcs that are shorter do not move on in time ...
 CORRECTIONS = 3  # of positions, by Newton's method
 MOST_STANDING = 30  # ... and so many of them in a row end the motion
@@ -274,6 +274,7 @@ class Motion:
             self.v = self.v - X @ np.linalg.lstsq(W @ X, u, rcond=NEGLIGIBLE)[0]
         rows, off = system.rows(self.t, self.q), system.velocity_constraint(self.t, self.q, self.v)
         self.v = self.v - np.linalg.lstsq(rows, off, rcond=NEGLIGIBLE)[0]
+        self.v[np.abs(self.v) < max(NOTHING, 1e-16 * float(self.speeds.max()))] = 0.0
 
     def _closes(self, k: int, start: Gap) -> Any:
         """The event of a gap that is open, or about to open: zero where it is as closed as it was at the start."""
