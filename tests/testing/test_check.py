@@ -11,7 +11,6 @@ from twoloop.testing import check_simulator
 from twoloop.testing.changes import in_a_frame, in_millimetres_and_grams
 from twoloop.testing.known_problems import MAKERS
 
-STEPS = (100, 200)
 LONG = ("andrews", "heavy_top")  # the dearest to evaluate
 NAMED = [fault.words for fault in FAULTS]
 QUICK = [fault for k, fault in enumerate(FAULTS) if fault.problem not in LONG and fault.words not in NAMED[:k]]
@@ -42,7 +41,7 @@ def properties_that_fail(report):
 )
 def test_a_planted_fault_is_found_and_named(fault):
     module = module_of(fault.example, fault.old, fault.new)
-    report = check_simulator(module.simulate, fault.problem, steps=STEPS, order=ORDERS[fault.example])
+    report = check_simulator(module.simulate, fault.problem, steps=fault.steps, order=ORDERS[fault.example])
     assert not report.passed
     assert any(fault.words in failure.hint for failure in report.failures), str(report)
 
