@@ -197,6 +197,16 @@ def test_silence_is_found_and_a_word_is_not():
     assert "q is not finite from t = 0.52 s on" in str(check_simulator(partly, "pendulum"))
 
 
+def test_redundant_rows_are_named_where_a_run_ends():
+    def simulate(problem, times, tolerance):
+        J = problem.jacobian(times[0], problem.q0)
+        np.linalg.inv(J @ J.T)
+        raise ArithmeticError("rank")
+
+    assert "A row of C follows" in check_simulator(simulate, "redundant_slider_crank").failures[0].hint
+    assert check_simulator(simulate, "four_bar").failures[0].hint == ""
+
+
 def test_a_coarse_step_may_say_no_and_the_finest_may_not():
     example = module_of(RK).simulate
 

@@ -23,6 +23,10 @@ WRONG = (
     "Success with a wrong answer: there is no motion any more. Look whether iterations converge, whether C = 0 holds "
     "at the end of a step, and whether numbers are finite, and raise."
 )
+REDUNDANT = (
+    "A row of C follows from the others here, and [M C_q^T; C_q 0] is singular: take least squares or leave such rows "
+    "out; a simulator that is not meant for them names its problems without this one."
+)
 SEEN = {"frame": in_a_frame, "units": in_millimetres_and_grams}
 
 
@@ -159,6 +163,8 @@ def _beginning(simulate: Simulate, problem: KnownProblem, settings: Settings, va
     """What the beginning of a motion points to, of a run that does not come to its end."""
     motion = problem.reference
     assert motion is not None
+    if "redundant" in problem.tags:
+        return REDUNDANT
     for n in (N_TIMES // 10, 3):
         arrays = {name: getattr(motion, name)[: n + 1] for name in ("t", "q", "v", "lam", "growth")}
         begun = Motion(**arrays, digits={name: each[: n + 1] for name, each in motion.digits.items()})
