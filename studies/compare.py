@@ -163,7 +163,8 @@ def _work(words: Sequence[str] | None) -> None:
     parser = cli.parser("compare", __doc__)
     what = "FILE.py:FUNCTION, which returns a twoloop.mechanisms.Problem, or a ready mechanism"
     parser.add_argument("where", metavar="MECHANISM", help=what)
-    what = "FILE.py:FUNCTION, simulate(problem, times, tolerance) as check_simulator takes it; may be given again"
+    what = "FILE.py:FUNCTION, simulate(problem, times, tolerance) as check_simulator takes it, or sundae_ida, "
+    what += "a file of references.as_shown; may be given again"
     parser.add_argument("--solver", action="append", default=[], metavar="FILE.py:FUNCTION", help=what)
     what = "rows to show beside (twoloop rows check); the word archive: those that are shipped"
     parser.add_argument("--with", dest="files", nargs="+", default=[], metavar="FILE.jsonl", help=what)

@@ -5,9 +5,10 @@ import os
 import pandas as pd
 import pytest
 
+from references import as_shown
+from references.plain_equations import NoModel
 from studies.bench.render import render
 from studies.conformance import study
-from studies.conformance.as_shown import NoModel
 from studies.conformance.simulators import ADAPTERS, OURS, SHOWN, Simulator, simulators, twin_of
 from twoloop.testing import problems
 from twoloop.testing.changes import in_a_frame
@@ -67,6 +68,14 @@ def test_every_simulator_is_named_once_and_has_a_version():
     names = [each.name for each in found]
     assert len(set(names)) == len(names) > 25 and {each.group for each in found} == {OURS, ADAPTERS, SHOWN}
     assert set(study.QUICK) < set(names)
+
+
+def test_a_solver_is_found_by_its_place(tmp_path, monkeypatch):
+    text = "NAME, PACKAGE, DRIFTS = 'mine', 'numpy', False\ndef simulate(problem, times, tolerance):\n    return None\n"
+    (tmp_path / "mine_alone.py").write_text(text)
+    monkeypatch.setattr(as_shown, "__path__", [*as_shown.__path__, str(tmp_path)])
+    found = {each.name: each for each in simulators() if each.group == SHOWN}
+    assert found["mine"].package == "numpy" and not found["mine"].drifts and len(found) > 5
 
 
 def test_the_report_says_who_passes_and_what_fails():
