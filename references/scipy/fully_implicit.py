@@ -19,8 +19,8 @@ from twoloop.result.result import Result
 
 Array = NDArray[np.float64]
 
-# of the span. The package's own first step from a start at rest is 1e-6 of it, so short that the rounding of C over it is
-# more than Newton's test asks of the multipliers' integrals; a step that does not converge is halved, and is then worse
+# of the span. From a start at rest the package's own first step is 1e-6 of it, so short that the rounding of C over it
+# is more than Newton's test asks of the multipliers' integrals; a step that does not converge is halved, and is then worse
 FIRST_STEP = 1e-3
 METHODS: dict[str, dict[str, int]] = {"Radau": {"stages": 3}, "Radau9": {"stages": 5}, "BDF": {}}
 
