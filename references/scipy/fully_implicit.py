@@ -20,7 +20,7 @@ from twoloop.result.result import Result
 Array = NDArray[np.float64]
 
 # of the span. From a start at rest the package's own first step is 1e-6 of it, so short that the rounding of C over it
-# is more than Newton's test asks of the multipliers' integrals; a step that does not converge is halved, and is then worse
+# is more than Newton's test asks of the multipliers' integrals; a step that does not converge is halved, and is worse
 FIRST_STEP = 1e-3
 METHODS: dict[str, dict[str, int]] = {"Radau": {"stages": 3}, "Radau9": {"stages": 5}, "BDF": {}}
 
