@@ -18,15 +18,15 @@ from studies.bench.mechanism_names import mechanism_of
 from studies.bench.outsider import N_TIMES, Outsider
 from studies.bench.reference_motion import ReferenceMotion, check_published, make_reference
 from studies.bench.render import number, power, render, table
-from studies.bench.row_files import in_format, versions
+from studies.bench.row_files import in_format, rows_of_file, versions
 from studies.bench.solvers import CATALOGUE, COMPARED
 from studies.bench.store import Output, Row
 from twoloop import Result
 from twoloop.mechanisms import Problem
 from twoloop.mechanisms.user_file import problem_from
 from twoloop.rows.calibration import CALIBRATION, calibration_s
-from twoloop.rows.leaderboard import ARCHIVE, boards
-from twoloop.rows.row_format import read_rows, text_of
+from twoloop.rows.leaderboard import boards
+from twoloop.rows.row_format import text_of
 
 GROUP = "compare"
 ERRORS = (1e-2, 1e-4, 1e-6, 1e-8)
@@ -97,10 +97,7 @@ def rows_from(files: Iterable[str], mechanism: str, t_end: float) -> list[Row]:
     """
     found = []
     for file in files:
-        try:
-            rows = read_rows(ARCHIVE if file == "archive" else Path(file))
-        except ValueError as error:
-            raise StudyError(str(error)) from None
+        rows = rows_of_file(file)
         own = [row for row in rows if row["mechanism"] == mechanism and abs(row["t_end"] / t_end - 1.0) < 1e-9]
         if not own:
             known = sorted({f"{row['mechanism']} to {row['t_end']:g} s" for row in rows})
@@ -166,7 +163,8 @@ def _work(words: Sequence[str] | None) -> None:
     parser = cli.parser("compare", __doc__)
     what = "FILE.py:FUNCTION, which returns a twoloop.mechanisms.Problem, or a ready mechanism"
     parser.add_argument("where", metavar="MECHANISM", help=what)
-    what = "FILE.py:FUNCTION, simulate(problem, times, tolerance) as check_simulator takes it; may be given again"
+    what = "FILE.py:FUNCTION, simulate(problem, times, tolerance) as check_simulator takes it, or sundae_ida, "
+    what += "a file of references.as_shown; may be given again"
     parser.add_argument("--solver", action="append", default=[], metavar="FILE.py:FUNCTION", help=what)
     what = "rows to show beside (twoloop rows check); the word archive: those that are shipped"
     parser.add_argument("--with", dest="files", nargs="+", default=[], metavar="FILE.jsonl", help=what)

@@ -10,9 +10,11 @@ from typing import Any
 
 import pandas as pd
 
-from studies.bench import figures, study, tables
+from studies.bench import cli, figures, tables
 from studies.bench.cli import StudyError
+from studies.bench.index import write_index
 from studies.bench.render import TEMPLATES
+from studies.bench.row_files import as_runs, rows_of_file
 from studies.bench.runs_by_error import SETTINGS
 from studies.bench.store import Output, plain, read_rows
 
@@ -39,8 +41,8 @@ VENDOR = Path(__file__).parent / "vendor"
 LIBRARIES = ("chart-4.6.1", "chartjs-plugin-zoom-2.2.0")  # the second extends the first
 
 
-def read(folder: Path) -> tuple[pd.DataFrame, dict[str, str]]:
-    """One row a run of all studies in a folder, and the stamps of these.
+def read(folder: Path, files: Sequence[str] = ()) -> tuple[pd.DataFrame, dict[str, str]]:
+    """One row a run of all studies in a folder and of files of rows, and where these are from.
 
     Raises
     ------
@@ -58,8 +60,15 @@ def read(folder: Path) -> tuple[pd.DataFrame, dict[str, str]]:
         # a study may run one mechanism for several lengths of time, whose costs cannot be compared
         parts.append(rows.assign(mechanism=rows["case"] + rows["t_end"].map(", {:g} s".format), study=name))
         stamps[name] = first.removeprefix("# ")
+    given = {file: rows_of_file(file) for file in files}
+    if given:  # together, so that rows of one's own are beside those that are shipped
+        parts.append(as_runs([row for rows in given.values() for row in rows]).assign(study="rows"))
+        stamps |= {file: f"{len(rows)} rows of files" for file, rows in given.items()}
     if not parts:
-        raise StudyError(f"there are no rows in {folder}: run python -m studies.work_precision first")
+        raise StudyError(
+            f"there are no rows in {folder}: run python -m studies.work_precision first, or give --with archive, "
+            "the rows that are shipped"
+        )
     rows = pd.concat(parts, ignore_index=True)
     # rows of cost against size have no setting, and no error to compare
     settings = [name for name in SETTINGS if name in rows]
@@ -129,13 +138,21 @@ def page(data: dict[str, Any]) -> str:
     return re.sub("|".join(parts), lambda found: parts[found[0]], template)
 
 
-def _work(output: Output) -> None:
-    output.write(FILE, page(page_data(*read(output.path))))
+def _work(words: Sequence[str] | None) -> None:
+    parser = cli.parser("compare_page", __doc__)
+    what = "rows to show, too (twoloop rows check); the word archive: those that are shipped"
+    parser.add_argument("--with", dest="files", nargs="+", default=[], metavar="FILE.jsonl", help=what)
+    given = parser.parse_args(words)
+    with Output(cli.call_of("compare_page", given, words)) as output:
+        output.write(FILE, page(page_data(*read(output.path, given.files))))
+        if not given.files:
+            write_index(output)
+    print(f"wrote {output.path / FILE}")
 
 
 def main(words: Sequence[str] | None = None) -> None:
     """Write compare.html from the rows in the folder."""
-    study.run("compare_page", __doc__, words, _work)
+    cli.main(_work, words)
 
 
 if __name__ == "__main__":

@@ -9,7 +9,7 @@ import pytest
 
 from twoloop import mechanisms
 from twoloop.__main__ import main
-from twoloop.rows import leaderboard
+from twoloop.rows import leaderboard, row_format
 from twoloop.rows.leaderboard import ARCHIVE, boards, chosen, seconds
 from twoloop.rows.row_format import FIELDS, mistakes, read_rows, text_of
 
@@ -49,6 +49,9 @@ def row(**more):
         ({"called_from": "C"}, 'called_from: given "C", expected compiled or Python'),
         ({"calibration_s": 0.1}, "calibration: expected beside calibration_s"),
         ({"setting": ["tol"]}, "setting: given"),
+        ({"status": "reached end"}, 'status: given "reached end", expected REACHED_END in these letters'),
+        ({"solver": "mine "}, 'solver: given "mine ", expected printable text, no blanks around it'),
+        ({"version": "1" * 501}, "at most 500 letters"),
     ],
 )
 def test_a_mistake_is_named_by_line_and_field(more, says):
@@ -71,13 +74,14 @@ def test_a_mistake_is_named_by_line_and_field(more, says):
 @pytest.mark.parametrize(
     ("line", "says"),
     [
-        ("{", "not JSON"),
-        ("[1]", "given [1], expected an object"),
-        (json.dumps(row(value=float("nan"))), "NaN is no number of JSON"),
-        (json.dumps(row(value=float("-inf"))), "-Infinity is no number of JSON"),
+        ("{", 'given "{", expected a JSON object on a line of its own: '),
+        ("[1]", "given [1], expected a JSON object"),
+        (json.dumps(row(value=float("nan"))), "value: given NaN, expected a number > 0; leave out what is not known"),
+        (json.dumps(row(times_s=[0.1, float("nan")])), "times_s: given [0.1, NaN], expected a list of numbers > 0"),
+        (json.dumps(row(value=float("-inf"))), "value: given -Infinity, expected a number > 0"),
         (text_of([row()])[:-2] + ',"t_end":3}', "t_end stands twice"),
         (text_of([row(times_s=[5.0])]), "the run of line 1 again"),
-        ("[" * 100_000, "not JSON"),
+        ("[" * 100_000, "expected a JSON object"),
     ],
 )
 def test_lines_that_are_no_rows(line, says):
@@ -85,7 +89,7 @@ def test_lines_that_are_no_rows(line, says):
     assert len(rows) == 1 and len(found) == 1 and found[0].startswith("line 2: ") and says in found[0]
 
 
-def test_files_are_checked_from_the_command_line(tmp_path, capsys):
+def test_files_are_checked_from_the_command_line(tmp_path, capsys, monkeypatch):
     good, bad, none = (tmp_path / name for name in ("good.jsonl.gz", "bad.jsonl", "none.jsonl"))
     good.write_bytes(gzip.compress(text_of([row(), row(status="RAISED", times_s=[], error_end=..., value=1)]).encode()))
     main(["rows", "check", str(good)])
@@ -99,6 +103,17 @@ def test_files_are_checked_from_the_command_line(tmp_path, capsys):
     for path, says in ((bad, "line 1: schema"), (none, "has no rows"), (tmp_path, "cannot be read")):
         with pytest.raises(ValueError, match=says):
             read_rows(path)
+    mark = tmp_path / "mark.jsonl"
+    mark.write_bytes(b"\xef\xbb\xbf" + text_of([row(mechanism="fuor_bar")]).encode())
+    main(["rows", "check", str(mark)])
+    assert "'fuor_bar' is taken for one of your own; the ready one is 'four_bar'" in capsys.readouterr().out
+    with pytest.raises(SystemExit):
+        main(["rows", "check", str(none)])
+    assert "there is no row" in capsys.readouterr().out
+    monkeypatch.setattr(row_format, "LARGEST", 50)
+    with pytest.raises(ValueError, match=r"good\.jsonl\.gz cannot be read: more than 5e"):
+        read_rows(good)
+    monkeypatch.undo()
     (tmp_path / "cut.jsonl.gz").write_bytes(good.read_bytes()[:-12])
     (tmp_path / "bent.jsonl.gz").write_bytes(good.read_bytes()[:15] + b"\xff" + good.read_bytes()[16:])
     for name in ("cut", "bent"):

@@ -7,11 +7,12 @@ import platform
 import sys
 import time
 from collections.abc import Sequence
+from difflib import get_close_matches
 from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-from twoloop import Result, __version__, kernels, solve_dae
+from twoloop import Result, __version__, kernels, mechanisms, solve_dae
 from twoloop.audit.mjcf_audit import audit_mjcf, check_ending
 from twoloop.kernels.compile.caches import folder_of
 from twoloop.mechanisms.user_file import problem_from
@@ -158,6 +159,11 @@ def check_rows(files: Sequence[Path]) -> None:
         more = f", {len(wrong)} mistakes" if wrong else ""
         n_solvers, n_mechanisms = (len({row[name] for row in rows}) for name in ("solver", "mechanism"))
         print(f"{file}: {len(rows)} good rows, of {n_solvers} solvers on {n_mechanisms} mechanisms{more}")
+        for name in sorted({row["mechanism"] for row in rows}.difference(mechanisms.__all__)):
+            for near in get_close_matches(name, mechanisms.__all__, 1, 0.8):
+                print(f"{file}: mechanism: {name!r} is taken for one of your own; the ready one is {near!r}")
+        if not rows and not wrong:
+            print(f"{file}: there is no row, a JSON object on a line of its own")
     if failed:
         raise SystemExit(1)
 

@@ -19,6 +19,9 @@ from twoloop.result.result import Result
 
 Array = NDArray[np.float64]
 
+# of the span. From a start at rest the package's own first step is 1e-6 of it, so short that the rounding of C over it
+# is more than Newton's test asks of the multipliers' integrals; a step that does not converge is halved, and is worse
+FIRST_STEP = 1e-3
 METHODS: dict[str, dict[str, int]] = {"Radau": {"stages": 3}, "Radau9": {"stages": 5}, "BDF": {}}
 
 
@@ -45,7 +48,8 @@ def solve_fully_implicit(task: Task, method: str = "Radau", rtol: float = 1e-8, 
     check_choice("method", method, tuple(METHODS))
     package, functions = imported("solve_dae.integrate"), Functions(task)
     solver_type = package.BDFDAE if method == "BDF" else package.RadauDAE
-    options = {"rtol": rtol, "atol": atol, "jac": functions.jacobians, **METHODS[method]}
+    first = FIRST_STEP * abs(task.t1 - task.t0)
+    options = {"rtol": rtol, "atol": atol, "jac": functions.jacobians, "first_step": first, **METHODS[method]}
 
     def made(limit: TimeLimit) -> Any:
         y0, yp0 = functions.form.start

@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from references import as_shown
 from references.driver import user_call
 from studies.bench.cli import CLONE, ROOT, StudyError
 from studies.bench.collector import FILE, Case, NotApplicable, Solver
@@ -24,6 +25,7 @@ from studies.bench.own_environment import dependencies, environment
 from studies.bench.solvers import TOLERANCES
 from twoloop import Result, Statistics, Status
 
+SHOWN = Path(as_shown.__file__).parent
 N_TIMES = 101  # states that a solver is asked for, the first of which is the start
 START = 300.0  # s that the process may take to load twoloop, the mechanism and the solver
 CHILD = "import sys; sys.path.insert({}, {!r}); from studies.bench.outsider_process import main; main({}, *{!r})"
@@ -35,7 +37,7 @@ class Outsider:
     Parameters
     ----------
     where : str
-        FILE.py:FUNCTION.
+        FILE.py:FUNCTION, or a file of `references.as_shown` by its name.
     mechanism : str
         As `problem_from` takes it.
 
@@ -55,10 +57,12 @@ class Outsider:
     """
 
     def __init__(self, where: str, mechanism: str):
-        file, _, self.function = where.rpartition(":")
+        shown = SHOWN / f"{where}.py"
+        file, _, self.function = (f"{shown}:simulate" if where.isidentifier() else where).rpartition(":")
         self.path = Path(file).resolve()
         if not self.function.isidentifier() or not self.path.is_file():
-            raise StudyError(f"--solver takes FILE.py:FUNCTION, a file that there is; given {where}")
+            known = ", ".join(sorted(each.stem for each in SHOWN.glob("[!_]*.py")))
+            raise StudyError(f"--solver takes FILE.py:FUNCTION, a file that there is, or one of {known}; given {where}")
         data = self.path.read_bytes()
         self.name, self.digest = f"{self.path.name}:{self.function}", hashlib.sha256(data).hexdigest()[:10]
         self.mechanism, self.calibrated = _absolute(mechanism), float("nan")

@@ -1,22 +1,26 @@
-"""Runs in the format of `twoloop.rows`, of the medians that tables are made of."""
+"""Runs in the format of `twoloop.rows`, of the medians that tables are made of, and back."""
 
 from collections.abc import Mapping
 from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from statistics import median
 from typing import Any
 
 import pandas as pd
 
-from studies.bench.cli import processor
+from studies.bench.cli import StudyError, processor
 from studies.bench.collector import FILE
 from studies.bench.mechanism_names import mechanism_of
 from studies.bench.runs_by_error import SETTINGS
 from twoloop import __version__
-from twoloop.rows.row_format import REACHED_END, SCHEMA, Row
+from twoloop.rows.leaderboard import ARCHIVE
+from twoloop.rows.row_format import REACHED_END, SCHEMA, Row, read_rows
 
 RIVALS = ("heyoka", "scikit-sundae", "scipy", "extensisq", "diffrax", "casadi", "solve-dae", "exudyn")
 PACKAGES = {"SUNDIALS": "scikit-sundae", "solve_dae": "solve-dae"}  # of families that are called otherwise
 QUALITY = ("violation_q", "violation_v", "error_lam", "energy")
+SAME = ("t_end", "solver", "family", "status", "astray", "error_v", *QUALITY)  # by these names in tables of runs, too
 DIGITS = 4  # significant, of numbers that are measured, not of ...
 EXACT = ("t_end", "value", "evaluations")  # ... these
 LONGEST = 120  # letters of a message
@@ -71,6 +75,42 @@ def in_format(run: Mapping[str, Any], columns: Mapping[str, str], versions: Mapp
 def package_of(family: str) -> str:
     """The package that the solvers of a family are of."""
     return PACKAGES.get(family, family.lower())
+
+
+def rows_of_file(file: str) -> list[Row]:
+    """The rows of a file; of the word "archive" those that are shipped.
+
+    Raises
+    ------
+    StudyError
+        If it cannot be read, has none, or a mistake.
+    """
+    try:
+        return read_rows(ARCHIVE if file == "archive" else Path(file))
+    except ValueError as error:
+        raise StudyError(str(error)) from None
+
+
+def as_runs(rows: list[Row]) -> pd.DataFrame:
+    """Rows of the format as a table of runs, medians of their times; a mechanism on each processor has a name."""
+    ends = {(row["mechanism"], row["t_end"]) for row in rows if "error_end" in row}
+    found = []
+    for row in rows:
+        done, where = row["status"] == REACHED_END, (row["mechanism"], row["t_end"])
+        for error, floor, words in (("error", "floor", ""), ("error_end", "floor_end", " at the end")):
+            if error not in row and (done or (error == "error_end") != (where in ends)):
+                continue  # a run that failed stands beside those that did not
+            run = {
+                name: row.get(name) for name in ("t_end", "solver", "family", "status", "astray", *QUALITY, "error_v")
+            }
+            run |= {"case": row["mechanism"], "message": row.get("message", ""), row["setting"]: row["value"]}
+            run |= {
+                "call_s": median(row["times_s"]) if row["times_s"] else None,
+                "n_evaluations": row.get("evaluations"),
+            }
+            run |= {"called_from": row.get("called_from", "?"), "error_q": row.get(error), "floor": row.get(floor, 0.0)}
+            found.append(run | {"mechanism": f"{where[0]}, {where[1]:g} s{words}, {row['processor']}"})
+    return pd.DataFrame(found)
 
 
 def rounded(value: Any) -> Any:

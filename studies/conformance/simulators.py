@@ -3,20 +3,23 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from importlib import import_module
+from pkgutil import iter_modules
 from typing import Any
 
 import numpy as np
 
+from references import as_shown
 from references.casadi.integrators import solve_cvodes, solve_idas
 from references.diffrax.dopri8 import solve_diffrax
 from references.heyoka.taylor import solve_heyoka
+from references.plain_equations import NoModel
 from references.scipy.fully_implicit import solve_fully_implicit
 from references.scipy.index1 import solve_index1
 from references.sundials.cvode import solve_cvode
 from references.sundials.cvode_c import solve_cvode_c
 from references.sundials.ida import solve_ida
 from references.sundials.ida_c import solve_ida_c
-from studies.conformance.as_shown import AS_SHOWN, NoModel
 from twoloop import ConstrainedSystem, Result, mechanisms, solve_dae
 from twoloop.mechanisms import Problem
 from twoloop.methods.presets import PRESETS
@@ -171,5 +174,10 @@ def simulators() -> list[Simulator]:
         for name, (package, solve, drifts) in rivals.items()
     ]
     found.append(Simulator("Exudyn, GeneralizedAlpha", ADAPTERS, "exudyn", exudyn, steps=STEPS))
-    shown = AS_SHOWN.items()
-    return found + [Simulator(name, SHOWN, of, solve, "stabilised" not in name) for name, (solve, of) in shown]
+    return found + [Simulator(each.NAME, SHOWN, each.PACKAGE, each.simulate, each.DRIFTS) for each in shown()]
+
+
+def shown() -> list[Any]:
+    """The modules in the folder of `references.as_shown`."""
+    names = sorted(each.name for each in iter_modules(as_shown.__path__))
+    return [import_module(f"{as_shown.__name__}.{name}") for name in names]

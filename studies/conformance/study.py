@@ -18,7 +18,7 @@ from studies.bench.study import Study
 from studies.conformance.simulators import ADAPTERS, OURS, SHOWN, Simulator, simulators
 from twoloop import ConstraintWarning
 from twoloop.testing import problems
-from twoloop.testing.conformance import check_problem, settings_of
+from twoloop.testing.conformance import SAYS_SO, check_problem, settings_of
 from twoloop.testing.findings import Finding, shown
 from twoloop.testing.known_problem import KnownProblem
 from twoloop.testing.known_problems import MAKERS
@@ -31,8 +31,11 @@ NOT_CHECKED = "NoModel: "  # how a message begins that says so
 HELD = ("constraints", "velocity constraints")
 DRIFTS = "its equations are of accelerations; nothing keeps it on the constraints"
 PASSED, FAILED, UNTOLD = "passed", "failed", "not checked"
-LONGEST = 100  # characters of a cell; the CSV has all
-COLUMNS = ("simulator", "problem", "property", "measured", "allowed", "reason")
+LONGEST = 90  # letters of a message in the report
+SIGNS = {  # of properties, in the report
+    **{"error of q": "q", "limit of q": "q", "error of v": "v", "limit of v": "v"},
+    **{"constraints": "C", "velocity constraints": "C'", "energy": "E", "multipliers": "λ", SAYS_SO: "ends"},
+}
 
 
 def checked(simulator: Simulator, problem: KnownProblem, quick: bool) -> list[Row]:
@@ -123,19 +126,32 @@ def _line(name: str, rows: pd.DataFrame) -> dict[str, Any]:
 
 
 def tables_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, str]:
-    """A table of each group without those that pass everything, and one of failures, known drift apart."""
-    header = ["simulator", "of", "problems passed", "properties", "what does not hold"]
-    ready = {}
+    """What fails where, a line for each simulator that does not pass everything; and runs that do not end."""
+    names = list(rows["problem"].unique())
+    lines = []
     for group, told in found["groups"].items():
-        lines = []
         for line in (each for each in told["lines"] if each["simulator"] not in told["passed"]):
-            what = "; ".join(f"{name}: {', '.join(where)}" for name, where in line["failures"].items())
-            cells = [line["simulator"], line["of"], f"{line['passed']} of {line['checked']}", str(line["properties"])]
-            lines.append([*cells, what if line["checked"] else "has no model of these problems"])
-        ready[group] = table(header, lines) if lines else ""
-    failed = rows[(rows["outcome"] == FAILED) & (rows["reason"] != DRIFTS)].fillna("")
-    lines = [[" ".join(str(row[name]).split())[:LONGEST] for name in COLUMNS] for _, row in failed.iterrows()]
-    return ready | {"failed": table(COLUMNS, lines) if lines else ""}
+            own = rows[(rows["group"] == group) & (rows["simulator"] == line["simulator"])]
+            cells = [_cell(own[own["problem"] == name]) for name in names]
+            lines.append([line["simulator"], line["of"], *cells])
+    ended = rows[(rows["outcome"] == FAILED) & rows["property"].isin(("runs", SAYS_SO))]
+    said = [[row["simulator"], row["problem"], _short(str(row["measured"]))] for _, row in ended.iterrows()]
+    return {
+        "failed": table(["simulator", "of", *names], lines) if lines else "",
+        "ended": table(["simulator", "problem", "instead"], said) if said else "",
+    }
+
+
+def _cell(rows: pd.DataFrame) -> str:
+    """What fails of a simulator on a problem."""
+    if not (rows["outcome"] != UNTOLD).any():
+        return "–"
+    return ", ".join(SIGNS.get(name, name) for name in rows[rows["outcome"] == FAILED]["property"]) or "+"
+
+
+def _short(message: str) -> str:
+    words = " ".join(message.split()).partition(". ")[0]
+    return words if len(words) <= LONGEST else f"{words[:LONGEST].rstrip()} ..."
 
 
 STUDY = Study("conformance", __doc__, make, findings_of, tables=tables_of)

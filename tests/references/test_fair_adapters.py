@@ -14,6 +14,7 @@ from studies.bench.collector import Case, Run, attempt
 from studies.bench.solvers import CATALOGUE, RIVALS
 from studies.validation.study import MAKE
 from tests.problems import pendulum
+from twoloop import mechanisms
 from twoloop.mechanisms import four_bar, projection_pendulum
 from twoloop.run.record import Status
 
@@ -22,6 +23,17 @@ FOUR_BAR, PENDULUM = four_bar(), projection_pendulum()
 
 def start(problem, t_end):
     return problem.system, (0.0, t_end), problem.q0, problem.v0
+
+
+# --- solve_dae
+
+
+@pytest.mark.parametrize("tolerance", [3e-8, 1e-8, 1e-9])
+def test_solve_dae_starts_from_rest_with_a_step_that_rounding_does_not_spoil(tolerance):
+    """With its own first step, of 1e-6 of the span, it fails there at these tolerances."""
+    at_rest = mechanisms.pendulum()
+    result = fully_implicit.solve_fully_implicit(*start(at_rest, 0.5), "Radau", tolerance, tolerance)
+    assert result.success, result.message
 
 
 # --- CasADi

@@ -19,6 +19,8 @@ from studies import compare_page
 from studies.bench import figures
 from studies.bench.cli import REPORTS, StudyError
 from tests.processes import run_node
+from twoloop.rows import leaderboard
+from twoloop.rows.row_format import text_of
 
 STAMP = "# full work_precision; `made up`"
 RUNS = [  # case, end, solver, family, called from, tolerance, repetition, CPU, status, message, evaluations, errors
@@ -271,6 +273,29 @@ def test_the_saved_rows_of_the_reports_can_be_shown(tmp_path):
         cells = re.sub(r'<td class="words">.*?</td>', "", shown["runs"])  # messages may speak of a NaN
         assert not re.search(r"NaN|Infinity|undefined", json.dumps(shown["lines"]) + cells), name
     assert math.isfinite(sum(each["floor"] for each in data["mechanisms"]))
+
+
+def test_rows_of_files_are_beside_those_that_are_shipped(tmp_path):
+    shipped = next(row for row in leaderboard.read_rows(leaderboard.ARCHIVE) if row["mechanism"] == "four_bar")
+    mine = {name: shipped[name] for name in ("schema", "mechanism", "processor", "version")} | {"solver": "mine"}
+    mine |= {"t_end": 10, "family": "me", "setting": "h", "value": 0.15, "status": "REACHED_END"}
+    mine |= {"times_s": [0.3, 0.1, 0.2], "error_end": 1e-5, "floor_end": 1e-9}
+    failed = {"value": 1, "status": "RAISED", "times_s": [], "error_end": None, "message": "it fell. Try"}
+    text = text_of([mine, mine | failed])
+    (tmp_path / "mine.jsonl").write_text(text)
+    files = ["archive", str(tmp_path / "mine.jsonl")]
+    data = compare_page.page_data(*compare_page.read(tmp_path, files))
+    place, names = {name: k for k, name in enumerate(data["columns"])}, [each["name"] for each in data["solvers"]]
+    own = [run for run in data["runs"] if run[place["solver"]] == names.index("mine")]
+    assert [[run[place[name]] for name in ("setting", "call_s", "error_q", "said")] for run in own] == [
+        ["h 0.15", 0.2, 1e-5, ""],
+        ["h 1.0", None, None, "RAISED: it fell"],
+    ]
+    (beside,) = {run[place["mechanism"]] for run in own}
+    assert sum(run[place["mechanism"]] == beside for run in data["runs"]) > 100  # all on that processor
+    assert data["mechanisms"][beside]["name"].startswith("four_bar, 10 s at the end, ")
+    compare_page.main(["--out", str(tmp_path), "--with", *files])
+    assert (tmp_path / "compare.html").stat().st_size > 300_000
 
 
 def test_it_needs_rows(tmp_path):

@@ -155,3 +155,14 @@ def test_a_header_gets_an_environment_on_top_of_this_one(tmp_path, monkeypatch, 
     assert "environments" in made and environment(None) != made
     with pytest.raises(StudyError, match="no-such-package-of-anyone cannot be made"):
         environment(["no-such-package-of-anyone"])
+
+
+def test_a_solver_of_references_is_named_without_its_path(case):
+    outsider = Outsider("extensisq_pr9", "pendulum")
+    try:
+        _, status, message, _ = attempt(Run(case, outsider.solver(), 1e-6, "compare"), 0)
+    finally:
+        outsider.end()
+    assert status == "REACHED_END" or "extensisq" in message
+    with pytest.raises(StudyError, match=r"or one of extensisq_pr9, .*sympy_lagrange; given nobody"):
+        Outsider("nobody", "pendulum")

@@ -11,7 +11,7 @@ ORDERS = {RK: 4.0, ALPHA: 2.0, RATTLE: 2.0}
 
 @dataclass(frozen=True)
 class Planted:
-    """A fault: where, which text becomes which, a problem on which it shows, and words of the hint."""
+    """A fault: where, which text becomes which, a problem on which it shows, words of the hint, and steps."""
 
     name: str
     example: str
@@ -19,6 +19,7 @@ class Planted:
     new: str
     problem: str
     words: str
+    steps: tuple[int, ...] = (100, 200)
 
 
 def module_of(example, old="", new=""):
@@ -33,6 +34,11 @@ def module_of(example, old="", new=""):
 MARCH = """            q, v = step_on(problem, t, h, q, v)
             t = end if k == n - 1 else t + h
         rows.append((q, v))"""
+PROJECTED = "            q, v = projected(problem, t, q, v)\n"
+LATE = """            J = problem.jacobian({})
+            v = v - np.linalg.lstsq(J, J @ v + problem.constraint_rate({}), rcond=1e-10)[0]
+"""
+SHAKEN, FINE = "shaken_spring", (100, 200, 400)
 FAULTS = [
     Planted("gamma has the other sign", RK, "problem.gamma(t, q, v)", "-problem.gamma(t, q, v)", "four_bar", "gamma"),
     Planted("gamma is left out", RK, "problem.gamma(t, q, v)", "0.0 * problem.gamma(t, q, v)", "driven_crank", "gamma"),
@@ -87,7 +93,7 @@ FAULTS = [
         "problem.force(t, q, v) / heavy",
         "1.01 * problem.force(t, q, v) / heavy",
         "pendulum",
-        "model",
+        "forces are 1.01 times",
     ),
     Planted(
         "a matrix with units",
@@ -147,6 +153,113 @@ FAULTS = [
         "-problem.constraint(t + h, q",
         "-problem.constraint(t, q",
         "driven_crank",
+        "another instant",
+    ),
+    # found by trying what no hint had been written for
+    Planted(
+        "forces at the time of the start",
+        RK,
+        "problem.force(t, q",
+        "problem.force(problem.t_span[0], q",
+        SHAKEN,
+        "time at the start",
+    ),
+    Planted(
+        "forces at the time since the start", RK, "force(t, q", "force(t - problem.t_span[0], q", SHAKEN, "not at 0"
+    ),
+    Planted(
+        "forces of the first positions",
+        RK,
+        "force(t, q, v)",
+        "force(t, problem.q0, v)",
+        SHAKEN,
+        "positions at the start",
+    ),
+    Planted(
+        "gravity of one body has the other sign",
+        RK,
+        "problem.force(t, q, v) / heavy",
+        "problem.force(t, q, v) * np.where(np.arange(n) == 3, -1.0, 1.0) / heavy",
+        SHAKEN,
+        "force on q[3] (y) is of the other sign",
+    ),
+    Planted(
+        "the second half-step's force is the first's",
+        RATTLE,
+        "problem.force(t, q, middle)",
+        "force",
+        SHAKEN,
+        "First order",
+    ),
+    Planted(
+        "C_t of one step before",
+        RK,
+        PROJECTED,
+        PROJECTED + LATE.format("t, q", "t - h, q"),
+        "driven_crank",
+        "of one step before",
+    ),
+    Planted(
+        "C_q of one step before",
+        RK,
+        PROJECTED,
+        PROJECTED + LATE.format("t - h, q - h * v", "t, q"),
+        "driven_crank",
+        "of one step before",
+    ),
+    Planted("steps that have a longest", RK, "h = (end - t) / n", "h = min((end - t) / n, 0.005)", "pendulum", "clock"),
+    Planted(
+        "a smallest step",
+        RK,
+        "n = round((end - t) / step)",
+        "n = min(2, round((end - t) / step))",
+        "pendulum",
+        "a bound of its own",
+        FINE,
+    ),
+    Planted(
+        "a projection that adds", RK, "return q, v - np", "return q, v + np", "pendulum", "a sign in a projection", FINE
+    ),
+    Planted(
+        "a factor on the velocities",
+        RK,
+        "return q, v - np",
+        "return q, (1.0 - 1e-6) * v - np",
+        "pendulum",
+        "a factor on the velocities",
+        FINE,
+    ),
+    Planted(
+        "impulses along the rows of the end",
+        RATTLE,
+        "solved(M, to, J, 0",
+        "solved(M, J, J, 0",
+        "pendulum",
+        "First order",
+    ),
+    Planted(
+        "single precision",
+        RK,
+        "return q, v - np.linalg",
+        "return q, np.float32(v) - np.linalg",
+        "pendulum",
+        "single precision",
+    ),
+    Planted(
+        "a little damping",
+        ALPHA,
+        "force(t + h, new_q, new_v)",
+        "force(t + h, new_q, new_v) - 1e-3 * new_v",
+        SHAKEN,
+        "a damping",
+        FINE,
+    ),
+    Planted(
+        "multipliers of the middle",
+        ALPHA,
+        "(q, v, lam))\n    ret",
+        "(q, v, 0.5 * (lam + rows[-1][2])))\n    ret",
+        "pendulum",
         "another instant",
     ),
 ]

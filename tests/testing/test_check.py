@@ -11,7 +11,6 @@ from twoloop.testing import check_simulator
 from twoloop.testing.changes import in_a_frame, in_millimetres_and_grams
 from twoloop.testing.known_problems import MAKERS
 
-STEPS = (100, 200)
 LONG = ("andrews", "heavy_top")  # the dearest to evaluate
 NAMED = [fault.words for fault in FAULTS]
 QUICK = [fault for k, fault in enumerate(FAULTS) if fault.problem not in LONG and fault.words not in NAMED[:k]]
@@ -42,7 +41,7 @@ def properties_that_fail(report):
 )
 def test_a_planted_fault_is_found_and_named(fault):
     module = module_of(fault.example, fault.old, fault.new)
-    report = check_simulator(module.simulate, fault.problem, steps=STEPS, order=ORDERS[fault.example])
+    report = check_simulator(module.simulate, fault.problem, steps=fault.steps, order=ORDERS[fault.example])
     assert not report.passed
     assert any(fault.words in failure.hint for failure in report.failures), str(report)
 
@@ -196,6 +195,16 @@ def test_silence_is_found_and_a_word_is_not():
     assert report.failures[0].property == "runs" and "ArithmeticError: stuck at t = 1" in str(report)
     assert report.skipped == (("pendulum", "everything else", "the run did not come to the end"),)
     assert "q is not finite from t = 0.52 s on" in str(check_simulator(partly, "pendulum"))
+
+
+def test_redundant_rows_are_named_where_a_run_ends():
+    def simulate(problem, times, tolerance):
+        J = problem.jacobian(times[0], problem.q0)
+        np.linalg.inv(J @ J.T)
+        raise ArithmeticError("rank")
+
+    assert "A row of C follows" in check_simulator(simulate, "redundant_slider_crank").failures[0].hint
+    assert check_simulator(simulate, "four_bar").failures[0].hint == ""
 
 
 def test_a_coarse_step_may_say_no_and_the_finest_may_not():

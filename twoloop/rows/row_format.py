@@ -3,6 +3,7 @@
 import gzip
 import json
 import math
+import re
 import zlib
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -12,8 +13,14 @@ from typing import Any
 SCHEMA = 1
 REACHED_END = "REACHED_END"
 SETTINGS = ("tol", "h", "err_out")
+LONGEST = 500  # letters of a text
+LARGEST = 10**9  # bytes of a file, as text: beyond, gzip may hide a file that fills the memory
 SHOWN = 20  # mistakes of a file that an exception names
 IDENTITY = ("mechanism", "t_end", "solver", "version", "processor", "setting", "value")  # of a run
+
+TEXT = "printable text"
+TRIMMED = f"no blanks around it, at most {LONGEST} letters"
+_NO_LETTER = re.compile("[^A-Z]+")
 
 Row = dict[str, Any]
 
@@ -45,10 +52,20 @@ def _number(value: Any) -> bool:
         return False
 
 
+def _printable(value: Any) -> bool:
+    return isinstance(value, str) and value.isprintable() and value != "" and len(value) <= LONGEST
+
+
+def _name(value: Any) -> bool:
+    return _printable(value) and value == value.strip()
+
+
 def _text(about: str, needed: bool = False) -> Field:
-    return Field(
-        "printable text", lambda value: isinstance(value, str) and value.isprintable() and value != "", about, needed
-    )
+    return Field(TEXT, _name, about, needed)
+
+
+def _status(value: Any) -> bool:  # "reached_end" would be a failure
+    return _name(value) and (value == REACHED_END or _NO_LETTER.sub("_", value.upper()) != REACHED_END)
 
 
 def _positive(about: str, needed: bool = False) -> Field:
@@ -79,8 +96,8 @@ FIELDS: dict[str, Field] = {
     "processor": _text("model, on which it ran", True),
     "setting": Field(f"one of {', '.join(SETTINGS)}", lambda value: value in SETTINGS, "the number that varies", True),
     "value": _positive("of the setting; of `h` in s", True),
-    "status": _text(f"`{REACHED_END}`, or what happened instead", True),
-    "message": _text("why, where the end was not reached"),
+    "status": Field(TEXT, _status, f"`{REACHED_END}`, as it stands here, or what happened instead", True),
+    "message": Field(TEXT, _printable, "why, where the end was not reached"),
     "times_s": Field("a list of numbers > 0", _times, "CPU times of whole calls, s, one a repetition", True),
     "calibration": _text("what was timed beside the calls, by name and version"),
     "calibration_s": _positive("its CPU time, s, in the same process"),
@@ -133,11 +150,11 @@ def mistakes(lines: Iterable[str]) -> tuple[list[Row], list[str]]:
 def _row(line: str) -> tuple[Row, list[str]]:
     """The row of a line, and what is wrong with it."""
     try:
-        given = json.loads(line, parse_constant=_refused, object_pairs_hook=_once)
+        given = json.loads(line, object_pairs_hook=_once)
     except (ValueError, RecursionError) as error:
-        return {}, [f"not JSON: {error}"]
+        return {}, [f"given {_shown(line.strip())}, expected a JSON object on a line of its own: {error}"]
     if not isinstance(given, dict):
-        return {}, [f"given {_shown(given)}, expected an object of fields"]
+        return {}, [f"given {_shown(given)}, expected a JSON object on a line of its own"]
     if not FIELDS["schema"].holds(given.get("schema")):
         said = f"given {_shown(given['schema'])}" if "schema" in given else "missing"
         return {}, [f"schema: {said}, expected {SCHEMA}, which this version of twoloop reads"]
@@ -147,7 +164,7 @@ def _row(line: str) -> tuple[Row, list[str]]:
         f"{name}: missing, expected {each.expected}" for name, each in FIELDS.items() if each.needed and name not in row
     ]
     wrong += [
-        f"{name}: given {_shown(row[name])}, expected {each.expected}"
+        f"{name}: given {_shown(row[name])}, expected {_expected(name, row[name])}"
         for name, each in FIELDS.items()
         if name in row and not each.holds(row[name])
     ]
@@ -169,8 +186,14 @@ def _together(row: Row) -> Iterable[str]:
         yield f"error: missing, expected it, or error_end, of a run that is {REACHED_END}"
 
 
-def _refused(constant: str) -> None:
-    raise ValueError(f"{constant} is no number of JSON; leave out what is not known")
+def _expected(name: str, given: Any) -> str:
+    """What a field is to be, with a word on what is nearly that."""
+    if name == "status" and _name(given):
+        return f"{REACHED_END} in these letters, or what happened instead"
+    if isinstance(given, str) and FIELDS[name].expected == TEXT:
+        return f"{TEXT}, {TRIMMED}"
+    unknown = "; leave out what is not known" if isinstance(given, float) and not math.isfinite(given) else ""
+    return f"{FIELDS[name].expected}{unknown}"
 
 
 def _once(pairs: list[tuple[str, Any]]) -> Row:
@@ -195,8 +218,11 @@ def read_lines(path: Path) -> list[str]:
         If it cannot be read.
     """
     try:
-        data = path.read_bytes()
-        return (gzip.decompress(data) if path.suffix == ".gz" else data).decode("utf-8").split("\n")
+        with gzip.open(path) if path.suffix == ".gz" else path.open("rb") as file:
+            data = file.read(LARGEST + 1)
+        if len(data) > LARGEST:
+            raise ValueError(f"more than {LARGEST:.0e} bytes; divide it")
+        return data.decode("utf-8-sig").split("\n")  # with the mark that some editors put first
     except (OSError, EOFError, ValueError, zlib.error) as error:
         raise ValueError(f"{path} cannot be read: {error}") from None
 

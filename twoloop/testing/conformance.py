@@ -1,15 +1,17 @@
 """Checks any simulator of mechanisms against known motions."""
 
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from twoloop.testing.changes import in_a_frame, in_millimetres_and_grams
+from twoloop.testing.evidence import Evidence
 from twoloop.testing.findings import Finding, Report
-from twoloop.testing.hints import Evidence, with_hints
+from twoloop.testing.hints import with_hints
 from twoloop.testing.known_motions import N_TIMES
-from twoloop.testing.known_problem import KnownProblem
+from twoloop.testing.known_problem import KnownProblem, Motion
 from twoloop.testing.known_problems import listed, named
 from twoloop.testing.measuring import Observed, Settings
 from twoloop.testing.properties import measured, seen_otherwise
@@ -20,6 +22,10 @@ SAYS_SO = "says that it ends"
 WRONG = (
     "Success with a wrong answer: there is no motion any more. Look whether iterations converge, whether C = 0 holds "
     "at the end of a step, and whether numbers are finite, and raise."
+)
+REDUNDANT = (
+    "A row of C follows from the others here, and [M C_q^T; C_q 0] is singular: take least squares or leave such rows "
+    "out; a simulator that is not meant for them names its problems without this one."
 )
 SEEN = {"frame": in_a_frame, "units": in_millimetres_and_grams}
 
@@ -134,6 +140,7 @@ def check_problem(simulate: Simulate, problem: KnownProblem, settings: Settings)
     findings = [_runs(problem, settings, values, runs)]
     complete = [(value, run) for value, run in zip(values, runs, strict=True) if run.complete]
     if not findings[0].passed:
+        findings = [replace(findings[0], hint=_beginning(simulate, problem, settings, values))]
         return findings, [(problem.name, "everything else", "the run did not come to the end")]
     if len({(run.v is None, run.lam is None) for _, run in complete}) > 1:
         raise TypeError(f"simulate must return the same of q, v and lam in every run; on {problem.name!r} it did not")
@@ -150,6 +157,30 @@ def check_problem(simulate: Simulate, problem: KnownProblem, settings: Settings)
         findings.append(seen_otherwise(observed, settings, name, seen, run, middle))
     failed = {each.property: each for each in findings if not each.passed}
     return with_hints(findings, Evidence(observed, settings, failed, simulate)), skipped
+
+
+def _beginning(simulate: Simulate, problem: KnownProblem, settings: Settings, values: list[float]) -> str:
+    """What the beginning of a motion points to, of a run that does not come to its end."""
+    motion = problem.reference
+    assert motion is not None
+    if "redundant" in problem.tags:
+        return REDUNDANT
+    for n in (N_TIMES // 10, 3):
+        arrays = {name: getattr(motion, name)[: n + 1] for name in ("t", "q", "v", "lam", "growth")}
+        begun = Motion(**arrays, digits={name: each[: n + 1] for name, each in motion.digits.items()})
+        try:
+            runs = [simulated(simulate, problem, begun.t, value) for value in values]
+        except (TypeError, ValueError):  # of another shape: it takes no times but those of the motion
+            return ""
+        if not all(run.complete and run.v is not None for run in runs):
+            continue
+        observed = Observed(problem, begun, values, runs)
+        findings = list(measured(observed, settings))
+        failed = {each.property: each for each in findings if not each.passed}
+        hinted = with_hints(findings, Evidence(observed, settings, failed, simulate))
+        said = next((each.hint for each in hinted if each.hint), "")
+        return f"Of the first {begun.t[-1] - begun.t[0]:.2g} s, which it does run: {said}" if said else ""
+    return ""
 
 
 def properties_of(problem: KnownProblem, settings: Settings) -> list[str]:

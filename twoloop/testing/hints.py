@@ -1,70 +1,18 @@
 """What the pattern of errors of a simulator points to."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import replace
 
 import numpy as np
 
 from twoloop.testing.changes import in_a_frame
+from twoloop.testing.evidence import CLEAR, Evidence
 from twoloop.testing.findings import Finding
-from twoloop.testing.known_problem import Array
-from twoloop.testing.measuring import Observed, Settings, allowed, forces_of_constraints, still_there, violations
+from twoloop.testing.instants import clock, elsewhen, rates_of_time, returned
+from twoloop.testing.measuring import allowed, forces_of_constraints, lam_errors, still_there, violations
 from twoloop.testing.mistakes import mistaken_acceleration
-from twoloop.testing.properties import changes_of, observed_order
-from twoloop.testing.simulated import Simulate, seen_back, simulated
-
-CLEAR = 0.1  # of an error, to which the right explanation reduces it
-
-
-@dataclass(frozen=True, eq=False)
-class Evidence:
-    """The runs of a problem, which properties failed on them, and the simulator to ask again."""
-
-    observed: Observed
-    settings: Settings
-    failed: dict[str, Finding]
-    simulate: Simulate
-
-    @cached_property
-    def position(self) -> Array:
-        """Errors (n_t,) of the coordinates of the finest run."""
-        return self.observed.errors("q")[-1]
-
-    def wrong(self, kind: str) -> bool:
-        """Whether the limit of q or v is wrong, or the error of tolerances."""
-        return bool({f"error of {kind}", f"limit of {kind}"} & set(self.failed))
-
-    def clears(self, q: Array) -> bool:
-        """Whether other coordinates (n_t, n_q) instead of those of the finest run take most of the error away."""
-        motion = self.observed.motion
-        left = np.abs(q - motion.q).max(axis=1) / motion.scales[0]
-        return bool(left.max() < CLEAR * self.position.max())
-
-
-def _output(e: Evidence) -> str:
-    """States that are right, and returned wrongly."""
-    if not e.wrong("q"):
-        return ""
-    q, motion, kinds = e.observed.runs[-1].q, e.observed.motion, e.observed.problem.coordinates
-    if np.ptp(q, axis=0).max() == 0.0:
-        return "Nothing moves: every row is the same."
-    for shift, word in ((1, "late"), (-1, "early")):
-        moved = np.roll(q, -shift, axis=0)
-        moved[[0, -1]] = motion.q[[0, -1]]
-        if e.clears(moved):
-            return (
-                f"The rows are one output time {word}: row k has to be the state at times[k], the first one the start."
-            )
-    angles = np.array([kind in ("angle", "relative") for kind in kinds])
-    turns = np.where(angles, 2.0 * np.pi * np.round((q - motion.q) / (2.0 * np.pi)), 0.0)
-    if turns.any() and e.clears(q - turns):
-        return "Angles differ by whole turns: they have to go on beyond pi, not jump back."
-    euler = np.array([kind[0] == "e" for kind in kinds])
-    nearer = np.where(euler & (np.abs(q + motion.q) < np.abs(q - motion.q)), -q, q)
-    if euler.any() and e.clears(nearer):
-        return "Euler parameters have the other sign: e and -e are one rotation, but q has to be continuous."
-    return ""
+from twoloop.testing.properties import SHORT, changes_of, observed_order
+from twoloop.testing.simulated import seen_back, simulated
 
 
 def _singular(e: Evidence) -> str:
@@ -84,22 +32,10 @@ def _singular(e: Evidence) -> str:
 def _acceleration(e: Evidence) -> str:
     if not e.wrong("q") and not e.wrong("v"):
         return ""
-    by_steps = e.settings.steps is not None
-    mistake = mistaken_acceleration(e.simulate, e.observed.problem, e.observed.settings[-1], by_steps)
+    by_steps, fit = e.settings.steps is not None, not _falls(e)
+    asked = (e.simulate, e.observed.problem, e.observed.settings[-1])
+    mistake = mistaken_acceleration(*asked, by_steps=by_steps, fit=fit)
     return f"The accelerations are wrong: {mistake}." if mistake else ""
-
-
-def _rates_of_time(e: Evidence) -> str:
-    """Velocities with C_q v = 0 where C_t is not zero."""
-    problem, run = e.observed.problem, e.observed.runs[-1]
-    if "velocity constraints" not in e.failed or run.v is None:
-        return ""
-    states = list(zip(run.t, run.q, run.v, strict=True))[1:]
-    rates = np.array([problem.constraint_rate(t, q) for t, q, _ in states])
-    left = np.array([problem.jacobian(t, q) @ v for t, q, v in states])
-    if rates.any() and np.abs(left).max() < CLEAR * np.abs(left + rates).max():
-        return "The velocities obey C_q v = 0 where the constraints move: C_t is left out of C_q v + C_t = 0."
-    return ""
 
 
 def _one_order_less(e: Evidence) -> bool:
@@ -138,6 +74,12 @@ def _velocities(e: Evidence) -> str:
     )
 
 
+GROWS = (
+    "as the steps become shorter: each step adds the same, however short (a factor on the velocities, a sign in a "
+    "projection, an iteration with a tolerance of its own, single precision)."
+)
+
+
 def _drift(e: Evidence) -> str:
     if "constraints" not in e.failed:
         return ""
@@ -161,9 +103,14 @@ def _drift(e: Evidence) -> str:
 
 
 def _unused(e: Evidence) -> str:
-    runs = e.observed.runs
-    same = len(runs) > 1 and np.array_equal(runs[0].q, runs[-1].q)
-    return "The same numbers whatever the tolerance, or the step: it is not used." if same else ""
+    runs, settings = e.observed.runs, e.observed.settings
+    if len(runs) < 2 or not np.array_equal(runs[-2].q, runs[-1].q):
+        return ""
+    if np.array_equal(runs[0].q, runs[-1].q):
+        return "The same numbers whatever the tolerance, or the step: it is not used."
+    return (
+        f"The same numbers at {settings[-2]:.3g} and at {settings[-1]:.3g}: a bound of its own keeps the steps longer."
+    )
 
 
 def _falls(e: Evidence) -> bool:
@@ -171,6 +118,8 @@ def _falls(e: Evidence) -> bool:
     errors = e.observed.errors("q")
     if e.settings.tolerances is not None:
         return len(errors) < 2 or errors[-1].max() <= 0.3 * errors[0].max()
+    if "error of q" in e.failed:  # while it is small: later on there is nothing to compare
+        return e.early_order is not None and e.early_order > 0.5
     value, rest = still_there(errors, changes_of(e.observed, "q"), e.observed.floor("q"))
     return value <= rest and errors[-1].max() < 0.8 * errors[-2].max()
 
@@ -178,6 +127,9 @@ def _falls(e: Evidence) -> bool:
 def _floor(e: Evidence) -> str:
     if not {"limit of q", "limit of v"} & set(e.failed) and (not e.wrong("q") or _falls(e)):
         return ""
+    errors = [each.max() for each in e.observed.errors("q")]
+    if e.settings.steps is not None and errors[-1] > 1.5 * errors[-2]:
+        return f"The error grows from {errors[-2]:.1g} to {errors[-1]:.1g} {GROWS}"
     return (
         f"The error stays at {e.position.max():.1g}, however fine: not the method but the model is wrong "
         "(a mass, a force, a sign), or an iteration, a difference quotient or a penalty ends it."
@@ -187,27 +139,12 @@ def _floor(e: Evidence) -> str:
 def _coarse(e: Evidence) -> str:
     if e.settings.steps is None or not {"error of q", "error of v"} & set(e.failed):
         return ""
-    errors = e.observed.errors("q")
+    errors, seen, said = e.observed.errors("q"), e.early_order, e.settings.order
+    if seen is not None and said is not None and seen < said - SHORT:
+        return f"While it is small, {_order_seen(e, 'q', seen)}"
     return (
         f"The error falls, from {errors[-2].max():.1g} to {errors[-1].max():.1g} by the last refinement, and is "
         "still too large: take more steps."
-    )
-
-
-def _clock(e: Evidence) -> str:
-    """Constraints that hold at the time since the start."""
-    problem, run = e.observed.problem, e.observed.runs[-1]
-    begin = problem.t_span[0]
-    if begin == 0.0 or "constraints" not in e.failed:
-        return ""
-    since, there = (
-        max(np.abs(problem.constraint(t - shift, q)).max() for t, q in zip(run.t[1:], run.q[1:], strict=True))
-        for shift in (begin, 0.0)
-    )
-    return (
-        f"The constraints hold at t - {begin:g} s: time does not begin at 0 here, but at t_span[0] = times[0]."
-        if since < CLEAR * there
-        else ""
     )
 
 
@@ -215,19 +152,28 @@ def _orders(e: Evidence) -> str:
     lost = [e.failed[name] for name in ("order of q", "order of v") if name in e.failed]
     if not lost:
         return ""
-    seen, said = float(lost[0].measured), e.settings.order
-    where = lost[0].property.removeprefix("order of ")
-    if said is not None and seen > 0.6 and abs(said - 1.0 - seen) < 0.4:
-        start = (
-            f"One order of {where} is lost, {seen:.1f} instead of {said:g}: a coefficient, or a term at another time"
+    text = _order_seen(e, lost[0].property.removeprefix("order of "), float(lost[0].measured))
+    return text[0].upper() + text[1:]
+
+
+def _order_seen(e: Evidence, kind: str, seen: float) -> str:
+    """What an order points to that is too small."""
+    what, said = f"the error of {kind}", e.settings.order
+    before = e.order_of(kind, 2) if len(e.observed.runs) > 2 else None
+    if seen < -0.5:
+        return f"{what} grows with the order {seen:.1f} {GROWS}"
+    if seen < 0.5 or (before is not None and seen < before - 0.4):
+        sinks = "no longer falls" if seen < 0.5 else "falls more and more slowly"
+        return (
+            f"{what} {sinks} (order {seen:.1f}): beside the method's error there is one that no step removes "
+            "(a small error of the model, a damping, an iteration that stops early)."
         )
-    elif said is not None:
-        start = f"The order of {where} is {seen:.1f} instead of {said:g}"
-    else:
-        start = f"The error of {where} falls with the order {seen:.1f} only"
-    if 0.6 < seen < 1.4:
-        start += ". First order: something is that of the start of the step (time, velocity, matrix, force)"
-    return f"{start}."
+    lost = said is not None and abs(said - 1.0 - seen) < 0.4
+    text = f"{what} falls with the order {seen:.1f}{'' if said is None else f' instead of {said:g}'}"
+    text += ", one less: a coefficient is wrong, or a term is taken at another time." if lost else "."
+    if seen < 1.4:
+        text += " First order: something is that of the start of the step (time, velocity, matrix, force)."
+    return text
 
 
 def _slack(e: Evidence) -> str:
@@ -243,14 +189,15 @@ def _slack(e: Evidence) -> str:
 
 
 def _multipliers(e: Evidence) -> str:
-    run, problem, motion = e.observed.runs[-1], e.observed.problem, e.observed.motion
+    problem, motion = e.observed.problem, e.observed.motion
+    worst = int(np.argmax([errors.max() for errors in lam_errors(e.observed)]))
+    run = e.observed.runs[worst]
     if run.lam is None:
         return ""
     known = forces_of_constraints(problem, motion, motion.lam)[1:]
     found = forces_of_constraints(problem, motion, run.lam)[1:]
     factor = float((found * known).sum() / (known**2).sum())
-    rest = np.abs(found - factor * known).max() / max(np.abs(found).max(), 1e-300)
-    if rest > 2.0 * CLEAR:
+    if np.abs(found - factor * known).max() > 2.0 * CLEAR * np.abs(found - known).max():
         return (
             "The multipliers belong to another instant (the middle of the step?) or to other positions and velocities "
             "than those returned, or some rows of C are numbered otherwise."
@@ -258,7 +205,7 @@ def _multipliers(e: Evidence) -> str:
     if abs(factor + 1.0) < CLEAR:
         return "The multipliers have the other sign: M a + C_q^T lam = Q."
     if e.settings.steps is not None:
-        h = e.observed.settings[-1]
+        h = e.observed.settings[worst]
         for power, name in ((1, "h"), (2, "h^2")):
             for part, word in ((1.0, ""), (0.5, " / 2")):
                 for sign, minus in ((1.0, ""), (-1.0, "-")):
@@ -299,6 +246,15 @@ def _units(e: Evidence) -> str:
     )
 
 
+def _rates(e: Evidence) -> str:
+    if "velocity constraints" not in e.failed:
+        return ""
+    return (
+        "The velocities do not obey C_q v + C_t = 0, and shorter steps do not mend it: project them after each step; "
+        "where that is done, it ends too early, is in single precision, or takes C_q or C_t of another instant."
+    )
+
+
 def _where(e: Evidence) -> str:
     """Nothing else fits: from when on the motion is another one."""
     motion = e.observed.motion
@@ -312,21 +268,24 @@ def _where(e: Evidence) -> str:
 
 
 MOTION: tuple[Callable[[Evidence], str], ...] = (
-    _output,
+    returned,
+    elsewhen,
     _singular,
     _acceleration,
-    _rates_of_time,
+    rates_of_time,
     _velocities,
-    _clock,
+    clock,
     _unused,
     _drift,
     _floor,
     _orders,
     _coarse,
     _slack,
+    _rates,
     _where,
 )
 OWN: dict[str, Callable[[Evidence], str]] = {"multipliers": _multipliers, "frame": _frame, "units": _units}
+MOVING = ("error of", "limit of", "order of")  # how properties begin that the multipliers follow
 
 
 def with_hints(findings: list[Finding], evidence: Evidence) -> list[Finding]:
@@ -334,10 +293,11 @@ def with_hints(findings: list[Finding], evidence: Evidence) -> list[Finding]:
     general = ""
     if any(name not in OWN for name in evidence.failed):
         general = next((text for rule in MOTION if (text := rule(evidence))), "")
+    moved = any(name.startswith(MOVING) for name in evidence.failed)
     hinted = []
     for finding in findings:
         if not finding.passed and not isinstance(finding.measured, str):
-            own = OWN.get(finding.property)
+            own = None if moved and finding.property == "multipliers" else OWN.get(finding.property)
             finding = replace(finding, hint=own(evidence) if own else general)
         hinted.append(finding)
     return hinted

@@ -24,6 +24,7 @@ MAKERS = {
     maker.__name__: maker
     for maker in (
         pendulums.pendulum,
+        pendulums.shaken_spring,
         linkages.driven_crank,
         linkages.four_bar,
         linkages.redundant_slider_crank,

@@ -13,6 +13,7 @@ PLACES = range(0, 86, 5)  # of the known motion, from which the simulator is sta
 LATER = 10  # output times after which it is looked at
 SURE = 3.0  # times the change by a finer difference quotient, from which on a difference of accelerations is one
 EXPLAINS = 0.15  # of the difference from the true acceleration, which may remain
+FITS = 0.05  # of it where a number is fitted
 Mistake = Callable[[KnownProblem, float, Array, Array], Array]
 
 
@@ -63,6 +64,15 @@ MISTAKES: dict[str, Mistake] = {
     "the forces are those of the start: they are to be taken at (t, q, v)": _with(
         Q=lambda p, t, q, v: p.force(_start(p), p.q0, p.v0)
     ),
+    "the forces are those of the time at the start: they are to be taken at (t, q, v)": _with(
+        Q=lambda p, t, q, v: p.force(_start(p), q, v)
+    ),
+    "the forces are those of the time since the start: t begins at times[0], not at 0": _with(
+        Q=lambda p, t, q, v: p.force(t - _start(p), q, v)
+    ),
+    "the forces are those of the positions at the start: they are to be taken at (t, q, v)": _with(
+        Q=lambda p, t, q, v: p.force(t, p.q0, v)
+    ),
     "only the diagonal of the mass matrix is used": _with(M=lambda p, t, q, v: np.diag(np.diag(p.mass(t, q)))),
     "the mass matrix is that of the start: it is to be taken at (t, q)": _with(
         M=lambda p, t, q, v: p.mass(_start(p), p.q0)
@@ -88,8 +98,13 @@ class Seen:
     free: Array  # directions (n_free, n_q) that the constraints allow
 
 
-def mistaken_acceleration(simulate: Simulate, problem: KnownProblem, setting: float, by_steps: bool) -> str:
-    """Which mistake explains the accelerations of a simulator, or ""; each is started on the known motion."""
+def mistaken_acceleration(
+    simulate: Simulate, problem: KnownProblem, setting: float, *, by_steps: bool, fit: bool
+) -> str:
+    """Which mistake explains the accelerations of a simulator, or ""; each is started on the known motion.
+
+    `fit`: whether a force or a mass may be some times too large, which errors of a coarse method can look like.
+    """
     tries = (_seen(simulate, begun_later(problem, k, LATER + 1), setting, by_steps) for k in _telling(problem))
     places = [seen for seen in tries if seen is not None]
     if len(places) < 2:  # once may be chance
@@ -107,7 +122,39 @@ def mistaken_acceleration(simulate: Simulate, problem: KnownProblem, setting: fl
                 rest += float(np.linalg.norm(project @ (each.a - other)) ** 2)
             if gap > 0.0 and np.sqrt(rest / gap) < least:
                 best, least = name, float(np.sqrt(rest / gap))
+    return best or (_scaled(places) if fit else "")
+
+
+def _scaled(places: list[Seen]) -> str:
+    """Which force or mass, taken some times too large, explains the accelerations by M a - Q = -C_q^T lam, or ""."""
+    pairs: dict[str, list[tuple[Array, Array]]] = {}
+    sure = False
+    for each in places:
+        state = each.t, each.q, each.v
+        M, Q = each.problem.mass(*state[:2]), each.problem.force(*state)
+        off, inertia = each.free @ (M @ each.a - Q), np.diag(M) * each.a
+        sure |= bool(np.linalg.norm(off) > SURE * np.linalg.norm(M, 2) * each.doubt)
+        pairs.setdefault("the forces are", []).append((off, each.free @ Q))
+        for k, kind in enumerate(each.problem.coordinates):
+            pairs.setdefault(f"the force on q[{k}] ({kind}) is", []).append((off, each.free[:, k] * Q[k]))
+            pairs.setdefault(f"the mass or inertia of q[{k}] ({kind}) is", []).append(
+                (off, -each.free[:, k] * inertia[k])
+            )
+    best, least = "", FITS
+    for name, both in pairs.items() if sure else ():
+        off, part = (np.concatenate(each) for each in zip(*both, strict=True))
+        if part.any():
+            more = float(off @ part / (part @ part))
+            rest = float(np.linalg.norm(off - more * part) / np.linalg.norm(off))
+            if rest < least:
+                best, least = f"{name} {_times(1.0 + more)}", rest
     return best
+
+
+def _times(factor: float) -> str:
+    told = {0.0: "left out", -1.0: "of the other sign"}
+    near = next((word for value, word in told.items() if abs(factor - value) < FITS), "")
+    return near or f"{factor:.3g} times as large as given"
 
 
 def _tried(mistake: Mistake, problem: KnownProblem, t: float, q: Array, v: Array) -> Array:

@@ -7,7 +7,7 @@ import numpy as np
 
 from twoloop.testing.known_motions import posed
 from twoloop.testing.known_problem import KnownProblem
-from twoloop.testing.point_equations import DrivenPoint, EndingForce, Place, PointEquations
+from twoloop.testing.point_equations import DrivenPoint, EndingForce, Place, PointEquations, ShakenPoints
 
 GRAVITY = 9.81  # m/s^2
 
@@ -80,6 +80,21 @@ def stiff_spring_pendulum() -> KnownProblem:
     return _points("stiff_spring_pendulum", equations, start, 1.0, "stiff, open chain, planar", note=note)
 
 
+def shaken_spring() -> KnownProblem:
+    """A pendulum with a mass of 0.5 kg on a spring that is shaken by 3 sin(4 t) N, from t = 0.5 s on."""
+    equations = ShakenPoints(
+        3.0,
+        4.0,
+        [1.0, 0.5],
+        [[0.0, -GRAVITY], [0.0, -0.5 * GRAVITY]],
+        [(0, (0.0, 0.0), 1.0)],
+        [(1, 0, 40.0, 0.6)],
+    )
+    note = "forces that depend on positions and on time; and the motion does not begin at t = 0"
+    start, more = ([0.6, -0.8, 0.6, -1.5], np.zeros(4)), {"energy": None, "begin": 0.5, "note": note}
+    return _points("shaken_spring", equations, start, 2.5, "smoke, open chain, planar", **more)
+
+
 def parallelogram() -> KnownProblem:
     """Two upright cranks of 1 m with a coupler of 1 m, which all lie on one line twice a turn."""
     mass = np.array([[2.0, 0.5], [0.5, 2.0]]) / 3.0  # uniform bars of 1 kg by the velocities of their ends
@@ -113,7 +128,7 @@ def out_of_reach() -> KnownProblem:
 
 def force_ends() -> KnownProblem:
     """A pendulum under a drag that is not a number after 1 s."""
-    equations = EndingForce(1.0, [1.0], [[0.0, -GRAVITY]], [(0, (0.0, 0.0), 1.0)])  # type: ignore[arg-type]
+    equations = EndingForce(1.0, [1.0], [[0.0, -GRAVITY]], [(0, (0.0, 0.0), 1.0)])
     note = "a force that is not a number from some time on"
     start, tags = ([1.0, 0.0], [0.0, 0.0]), "no motion to the end, open chain, planar"
     return _points("force_ends", equations, start, 2.0, tags, energy=None, ends=1.0, note=note)

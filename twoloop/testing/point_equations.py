@@ -1,6 +1,7 @@
 """Equations of points on massless links: coordinates are theirs, a row is half the squared length of a link."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -95,6 +96,20 @@ class PointEquations:
         return float(total)
 
 
+class ShakenPoints(PointEquations):
+    """Points, the last of which is pushed along x by amplitude sin(frequency t)."""
+
+    def __init__(self, amplitude: float, frequency: float, *arguments: Any):
+        super().__init__(*arguments)
+        self._amplitude, self._frequency = amplitude, frequency
+
+    def force(self, t: float, q: Array, v: Array) -> Array:
+        """Q (n_q,)."""
+        total = super().force(t, q, v)
+        total[-self.weight.shape[1]] += self._amplitude * np.sin(self._frequency * t)
+        return total
+
+
 class DrivenPoint(PointEquations):
     """A point on a link whose height is prescribed, y = y0 + rate t; beyond the length of the link it is nowhere."""
 
@@ -122,8 +137,8 @@ class DrivenPoint(PointEquations):
 class EndingForce(PointEquations):
     """Points with a drag that is known up to a time only: a square root of what is left of it, NaN beyond."""
 
-    def __init__(self, ends: float, *arguments: ArrayLike):
-        super().__init__(*arguments)  # type: ignore[arg-type]
+    def __init__(self, ends: float, *arguments: Any):
+        super().__init__(*arguments)
         self._ends = ends
 
     def force(self, t: float, q: Array, v: Array) -> Array:

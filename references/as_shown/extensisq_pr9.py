@@ -1,0 +1,21 @@
+"""Pr9 of extensisq in SciPy's solve_ivp, at index 1."""
+
+import numpy as np
+
+from references.driver import imported
+from references.plain_equations import rate_of, start_of
+from twoloop.testing.known_problem import Array, KnownProblem
+
+NAME, PACKAGE, DRIFTS = "Pr9, extensisq", "extensisq", True
+
+
+def simulate(problem: KnownProblem, times: Array, tolerance: float) -> tuple[Array, ...]:
+    """Pr9 of extensisq in SciPy's solve_ivp, at index 1."""
+    from scipy.integrate import solve_ivp
+
+    method = imported("extensisq").Pr9
+    options = {"method": method, "t_eval": times, "rtol": tolerance, "atol": tolerance}
+    found = solve_ivp(lambda t, y: rate_of(problem, t, y), (times[0], times[-1]), start_of(problem), **options)
+    if not found.success:
+        raise RuntimeError(found.message)
+    return tuple(part.T for part in np.split(found.y, 2))

@@ -1,0 +1,38 @@
+"""Radau of solve_dae on the stabilised equations."""
+
+import numpy as np
+
+from references.driver import imported
+from twoloop.testing.known_problem import Array, KnownProblem
+
+NAME, PACKAGE, DRIFTS = "Radau, solve_dae, stabilised", "solve-dae", False
+
+
+def simulate(problem: KnownProblem, times: Array, tolerance: float) -> tuple[Array, ...]:
+    """Radau of solve_dae on the stabilised equations."""
+    solve, (y0, yp0) = imported("solve_dae.integrate").solve_dae, _consistent(problem)
+    options = {"method": "Radau", "t_eval": times, "rtol": tolerance, "atol": tolerance}
+    found = solve(lambda t, y, yp: _residual(problem, t, y, yp), (times[0], times[-1]), y0, yp0, **options)
+    if not found.success:
+        raise RuntimeError(found.message)
+    n, m = problem.n_q, problem.n_c
+    return found.y[:n].T, found.y[n : 2 * n].T, found.yp[2 * n + m :].T
+
+
+def _residual(problem: KnownProblem, t: float, y: Array, yp: Array) -> Array:
+    """F(t, y, y') of the stabilised equations of index 2, y = [q, v, integrals of mu and of lam].
+
+    C. W. Gear, B. Leimkuhler, G. K. Gupta, J. Comput. Appl. Math. 12-13 (1985) 77-90.
+    """
+    n, m = problem.n_q, problem.n_c
+    q, v, J = y[:n], y[n : 2 * n], problem.jacobian(t, y[:n])
+    qp, vp, mu, lam = np.split(yp, [n, 2 * n, 2 * n + m])
+    moves = problem.mass(t, q) @ vp - problem.force(t, q, v) + J.T @ lam
+    return np.concatenate([qp - v + J.T @ mu, moves, problem.constraint(t, q), J @ v + problem.constraint_rate(t, q)])
+
+
+def _consistent(problem: KnownProblem) -> tuple[Array, Array]:
+    """y and y' at the start."""
+    a, lam = problem.acceleration(problem.t_span[0], problem.q0, problem.v0)
+    none = np.zeros(problem.n_c)
+    return np.concatenate([problem.q0, problem.v0, none, none]), np.concatenate([problem.v0, a, none, lam])

@@ -1,0 +1,23 @@
+"""CVODE, Adams, of scikit-sundae at index 1."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from references.driver import imported
+from references.plain_equations import rate_of, start_of
+from twoloop.testing.known_problem import Array, KnownProblem
+
+NAME, PACKAGE, DRIFTS = "CVODE, scikit-sundae", "scikit-sundae", True
+
+
+def simulate(problem: KnownProblem, times: Array, tolerance: float) -> tuple[Array, ...]:
+    """CVODE, Adams, of scikit-sundae at index 1."""
+
+    def rate(t: float, y: Array, yp: NDArray[np.float64]) -> None:
+        yp[:] = rate_of(problem, t, y)
+
+    options = {"method": "Adams", "rtol": tolerance, "atol": tolerance, "max_num_steps": 100_000}
+    found = imported("sksundae.cvode").CVODE(rate, **options).solve(times, start_of(problem))
+    if not found.success:
+        raise RuntimeError(found.message)
+    return tuple(np.split(found.y, 2, axis=1))

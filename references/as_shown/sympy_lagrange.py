@@ -1,0 +1,59 @@
+"""SymPy's equations of points on rods in SciPy's solve_ivp."""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from references.driver import imported
+from references.plain_equations import NoModel, start_of
+from twoloop.testing.known_problem import Array, KnownProblem
+
+NAME, PACKAGE, DRIFTS = "LagrangesMethod, SymPy", "sympy", True
+
+
+def simulate(problem: KnownProblem, times: Array, tolerance: float) -> tuple[Array, ...]:
+    """Point masses on rods by SymPy's LagrangesMethod, its mass matrix and forcing in SciPy's solve_ivp."""
+    from scipy.integrate import solve_ivp
+
+    full = _lagrange(problem)
+    n = problem.n_q
+
+    def rate(t: float, y: Array) -> Array:
+        matrix, forcing = full(*y)
+        rates = np.linalg.solve(matrix, np.ravel(forcing))  # of q and of v, then multipliers
+        return np.asarray(rates[: 2 * n], np.float64)
+
+    options = {"method": "DOP853", "t_eval": times, "rtol": tolerance, "atol": tolerance}
+    found = solve_ivp(rate, (times[0], times[-1]), start_of(problem), **options)
+    if not found.success:
+        raise RuntimeError(found.message)
+    return tuple(part.T for part in np.split(found.y, 2))
+
+
+def _lagrange(problem: KnownProblem) -> Callable[..., tuple[Array, Array]]:
+    """SymPy's equations of a chain of points from the origin, as a function of q and v.
+
+    Raises
+    ------
+    NoModel
+        If the problem is another.
+    """
+    sympy, mechanics = imported("sympy", extra="symbolic"), imported("sympy.physics.mechanics", extra="symbolic")
+    upright = np.allclose(problem.force(0.0, problem.q0, problem.v0)[::2], 0.0)
+    if problem.name not in ("pendulum", "double_pendulum") or not upright:
+        raise NoModel("its model is of points on rods from the origin, y upwards")
+    masses = np.diag(problem.mass(0.0, problem.q0))[::2]
+    t, g = mechanics.dynamicsymbols._t, -problem.force(0.0, problem.q0, problem.v0)[1] / masses[0]
+    q = mechanics.dynamicsymbols(f"q:{problem.n_q}")
+    points, placed = list(zip(q[::2], q[1::2], strict=True)), np.reshape(problem.q0, (-1, 2))
+    kinetic = sum(m * (x.diff(t) ** 2 + y.diff(t) ** 2) / 2 for m, (x, y) in zip(masses, points, strict=True))
+    potential = sum(m * g * y for m, (_, y) in zip(masses, points, strict=True))
+    before = [(0, 0), *points[:-1]]
+    squares = (np.diff(placed, axis=0, prepend=0.0) ** 2).sum(axis=1)
+    rods = [(x - a) ** 2 + (y - b) ** 2 - s for (x, y), (a, b), s in zip(points, before, squares, strict=True)]
+    method = mechanics.LagrangesMethod(kinetic - potential, q, hol_coneqs=rods)
+    method.form_lagranges_equations()
+    plain = sympy.symbols(f"p:{2 * problem.n_q}")
+    names = dict(zip([*(each.diff(t) for each in q), *q], [*plain[problem.n_q :], *plain[: problem.n_q]], strict=True))
+    parts = [part.subs(names) for part in (method.mass_matrix_full, method.forcing_full)]
+    return sympy.lambdify(plain, parts)  # type: ignore[no-any-return]

@@ -1,0 +1,128 @@
+"""Hints of states, of rates or of drives that are those of another instant."""
+
+import numpy as np
+
+from twoloop.testing.evidence import CLEAR, Evidence
+from twoloop.testing.known_problem import Array, Motion
+from twoloop.testing.measuring import HELD_BY_STEPS
+
+DENSE = 20  # points between two times of a known motion
+
+
+def returned(e: Evidence) -> str:
+    """States that are right, and returned wrongly."""
+    if not e.wrong("q"):
+        return ""
+    q, motion, kinds = e.observed.runs[-1].q, e.observed.motion, e.observed.problem.coordinates
+    if np.ptp(q, axis=0).max() == 0.0:
+        return "Nothing moves: every row is the same."
+    for shift, word in ((1, "late"), (-1, "early")):
+        moved = np.roll(q, -shift, axis=0)
+        moved[[0, -1]] = motion.q[[0, -1]]
+        if e.clears(moved):
+            return (
+                f"The rows are one output time {word}: row k has to be the state at times[k], the first one the start."
+            )
+    angles = np.array([kind in ("angle", "relative") for kind in kinds])
+    turns = np.where(angles, 2.0 * np.pi * np.round((q - motion.q) / (2.0 * np.pi)), 0.0)
+    if turns.any() and e.clears(q - turns):
+        return "Angles differ by whole turns: they have to go on beyond pi, not jump back."
+    euler = np.array([kind[0] == "e" for kind in kinds])
+    nearer = np.where(euler & (np.abs(q + motion.q) < np.abs(q - motion.q)), -q, q)
+    if euler.any() and e.clears(nearer):
+        return "Euler parameters have the other sign: e and -e are one rotation, but q has to be continuous."
+    return ""
+
+
+def elsewhen(e: Evidence) -> str:
+    """States of the known motion, all of them later or earlier by a time, or on a clock that goes faster or slower."""
+    run, motion = e.observed.runs[-1], e.observed.motion
+    if run.v is None or not (e.wrong("q") or "order of q" in e.failed):
+        return ""
+    begin, later = motion.t[0], run.t - motion.t[0] > 0.05 * (motion.t[-1] - motion.t[0])
+    own = _nearest(motion, run.q, run.v)
+    ratio = float(np.median((own - begin)[later] / (run.t - begin)[later]))
+    shift = float(np.median((run.t - own)[later]))
+    step = e.observed.settings[-1] if e.settings.steps is not None else np.inf
+    of = ", a step" if abs(abs(shift) / step - 1.0) < CLEAR else ""
+    word = "earlier" if shift > 0.0 else "later"
+    slow = (
+        f"The motion is right and its clock is not: it goes {ratio:.3g} times as fast. The steps do not add up to the "
+        "time between the times (one is cut short, made longer, or left out)."
+    )
+    clocks = {
+        slow: begin + ratio * (run.t - begin),
+        f"The states are those of {abs(shift):.2g} s{of}, {word}.": run.t - shift,
+    }
+    errors = [each[later].max() for each in (e.position, e.observed.errors("v")[-1])]
+    rates = np.gradient(run.q, run.t, axis=0)
+    for text, at in clocks.items():
+        known = _between(motion, np.clip(at, begin, motion.t[-1]))
+        found = zip((run.q, run.v), known, motion.scales, errors, strict=True)
+        if all(np.abs(mine - own)[later].max() / scale < CLEAR * error for mine, own, scale, error in found):
+            # by a clock of their own positions do not change by the velocities; under wrong forces they do
+            off, left = (np.linalg.norm((rates - factor * run.v)[later]) for factor in (1.0, ratio))
+            if text is not slow or left < 0.5 * off:
+                return text
+    return ""
+
+
+def _between(motion: Motion, times: Array) -> tuple[Array, Array]:
+    """States of a motion between its times, by the cubic of Hermite and its derivative."""
+    k = np.clip(np.searchsorted(motion.t, times) - 1, 0, motion.t.size - 2)
+    h = (motion.t[k + 1] - motion.t[k])[:, None]
+    x = (times - motion.t[k])[:, None] / h
+    q, end, v, end_v = motion.q[k], motion.q[k + 1], h * motion.v[k], h * motion.v[k + 1]
+    square, cube = 3.0 * (end - q) - 2.0 * v - end_v, 2.0 * (q - end) + v + end_v
+    return q + x * (v + x * (square + x * cube)), (v + x * (2.0 * square + 3.0 * x * cube)) / h
+
+
+def _nearest(motion: Motion, q: Array, v: Array) -> Array:
+    """Times (n,) at which a motion is nearest to states (n, n_q)."""
+    times = np.linspace(motion.t[0], motion.t[-1], DENSE * (motion.t.size - 1) + 1)
+    known = np.hstack([part / scale for part, scale in zip(_between(motion, times), motion.scales, strict=True)])
+    rates, found = np.gradient(known, times, axis=0), np.hstack([q / motion.scales[0], v / motion.scales[1]])
+    nearest = np.array([np.argmin(np.abs(known - each).max(axis=1)) for each in found])
+    along = ((found - known[nearest]) * rates[nearest]).sum(axis=1) / (rates[nearest] ** 2).sum(axis=1)
+    half = 0.5 * (times[1] - times[0])
+    return np.asarray(times[nearest] + np.clip(along, -half, half), dtype=float)
+
+
+def rates_of_time(e: Evidence) -> str:
+    """Velocities that obey C_q v + C_t = 0 without C_t, or with C_q and C_t of one step before."""
+    problem, run = e.observed.problem, e.observed.runs[-1]
+    if run.v is None or not {"velocity constraints", "order of v", "limit of v"} & set(e.failed):
+        return ""
+    states = list(zip(run.t, run.q, run.v, strict=True))[1:]
+    rates = np.array([problem.constraint_rate(t, q) for t, q, _ in states])
+    left = np.array([problem.jacobian(t, q) @ v for t, q, v in states])
+    off = np.abs(left + rates).max()
+    if rates.any() and np.abs(left).max() < CLEAR * off:
+        return "The velocities obey C_q v = 0 where the constraints move: C_t is left out of C_q v + C_t = 0."
+    if e.settings.steps is None or off < HELD_BY_STEPS:
+        return ""
+    h = e.observed.settings[-1]
+    old_rates = np.array([problem.constraint_rate(t - h, q - h * v) for t, q, v in states])
+    old_left = np.array([problem.jacobian(t - h, q - h * v) @ v for t, q, v in states])
+    others = {"C_t": left + old_rates, "C_q": old_left + rates, "C_q and C_t": old_left + old_rates}
+    name = min(others, key=lambda each: float(np.abs(others[each]).max()))
+    if np.abs(others[name]).max() > 2.0 * CLEAR * off:
+        return ""
+    return f"The velocities obey C_q v + C_t = 0 with {name} of one step before: take them at (t + h, q) of its end."
+
+
+def clock(e: Evidence) -> str:
+    """Constraints that hold at the time since the start."""
+    problem, run = e.observed.problem, e.observed.runs[-1]
+    begin = problem.t_span[0]
+    if begin == 0.0 or "constraints" not in e.failed:
+        return ""
+    since, there = (
+        max(np.abs(problem.constraint(t - shift, q)).max() for t, q in zip(run.t[1:], run.q[1:], strict=True))
+        for shift in (begin, 0.0)
+    )
+    return (
+        f"The constraints hold at t - {begin:g} s: time does not begin at 0 here, but at t_span[0] = times[0]."
+        if since < CLEAR * there
+        else ""
+    )
