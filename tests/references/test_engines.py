@@ -126,7 +126,7 @@ def leaning():
     return model.problem((0.0, 0.1))
 
 
-@pytest.mark.parametrize("engine", [name for name in RIGID if name != "drake"])
+@engines
 def test_the_force_of_a_joint_has_the_sign_of_ours_at_rest_and_its_size_in_motion(engine):
     loop = Loop(leaning())
     # moments about the feet: of the left bar x 1.5 - y 1 = -g 0.5, of the right one with the opposite force
