@@ -144,25 +144,26 @@ def _force(rigid: Rigid, plant: Any, context: Any, bodies: list[Any]) -> Array:
     """Of the first joint that closes a loop: Drake does not tell it, so what its accelerations leave of the balance."""
     if not rigid.loops:
         return UNTOLD
-    rates = plant.get_generalized_acceleration_output_port().Eval(context)
+    try:
+        rates = plant.get_generalized_acceleration_output_port().Eval(context)
+    except RuntimeError:  # as in the step before or after, which says why
+        return UNTOLD
     forces = _module("multibody.tree").MultibodyForces(plant)
     plant.CalcForceElementsContribution(context, forces)
-    rows, mathematics = [], _module("multibody.tree").JacobianWrtVariable.kV
+    rows, by_v = [], _module("multibody.tree").JacobianWrtVariable.kV
     for a, on_a, b, on_b in cut_points(rigid):
         rows.append(
             sum(
                 sign
                 * plant.CalcJacobianTranslationalVelocity(
-                    context, mathematics, bodies[each.number].body_frame(), at, *[plant.world_frame()] * 2
+                    context, by_v, bodies[each.number].body_frame(), at, *[plant.world_frame()] * 2
                 )
-                for each, at, sign in ((a, on_a, -1.0), (b, on_b, 1.0))
+                for each, at, sign in ((a, on_a, 1.0), (b, on_b, -1.0))
             )
         )
     missing = plant.CalcInverseDynamics(context, rates, forces)
     for k in np.flatnonzero(rigid.torques.any(axis=1)):
-        J = plant.CalcJacobianAngularVelocity(
-            context, mathematics, bodies[k].body_frame(), *[plant.world_frame()] * 2
-        )
+        J = plant.CalcJacobianAngularVelocity(context, by_v, bodies[k].body_frame(), *[plant.world_frame()] * 2)
         missing -= J.T @ rigid.torques[k]
     made = np.linalg.lstsq(np.vstack(rows).T, missing, rcond=1e-9)[0].reshape(-1, 3)
     n = {"spherical": 1, "revolute": 2}[rigid.loops[0].kind]
