@@ -315,8 +315,8 @@ def stewart(stiffness: float = 600.0, damping: float = 0.0) -> ModelProblem:
         model.universal("ground", f"cylinder {k}", at=foot, axes=(across, np.cross(along, across)))
         model.prismatic(f"cylinder {k}", f"piston {k}", at=0.5 * (foot + top), axis=along)
         model.spherical(f"piston {k}", "platform", at=top)
-        spring = {"stiffness": stiffness, "damping": damping, "length": 1.05 * float(np.linalg.norm(top - foot))}
-        model.spring("ground", foot, "platform", top, **spring)
+        long = 1.05 * float(np.linalg.norm(top - foot))
+        model.spring("ground", foot, "platform", top, stiffness=stiffness, damping=damping, length=long)
     return model.problem((0.0, 3.0))
 
 

@@ -1,6 +1,7 @@
 """The mechanisms of `closed_loops` driven by a constant torque on the first body, and with a PD motor in a joint."""
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
@@ -44,7 +45,7 @@ def _motorised(build: Make, ending: str) -> Make:
         torque, stiffness, damping = MOTORS[build]
         legs = build is stewart and ending == SERVO
         given = stewart(stiffness, damping) if legs else build()
-        model = given.model
+        model: Any = given.model
         model.name = given.name + ending
         if ending == DRIVEN:
             spatial = model.dimension == 3
