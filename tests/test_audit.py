@@ -2,6 +2,7 @@
 
 import json
 import sys
+from dataclasses import replace
 from importlib.util import find_spec
 
 import numpy as np
@@ -144,6 +145,20 @@ def test_without_mujoco_it_says_so(tmp_path, monkeypatch):
         audit_mjcf(file_with(tmp_path))
 
 
+def test_neither_a_short_step_nor_a_large_model_takes_for_ever(pendulum, monkeypatch):
+    taken = []
+
+    def simulate(problem, times, step):
+        taken.append(round((times[-1] - times[0]) / step))
+        return falling()(problem, times, step)
+
+    audit_simulator(simulate, pendulum, step=1e-9, error=1e-3)
+    assert taken[0] <= 100_000
+    monkeypatch.setattr(step_audit, "KNOWN_WITHIN", 1e-9)
+    with pytest.raises(RuntimeError, match=r"not known beyond .* s: follow it for a shorter time"):
+        audit_simulator(simulate, replace(pendulum, t_span=(0.0, 100.0)), step=1e-2)
+
+
 @pytest.mark.skipif(find_spec("mujoco") is None, reason="MuJoCo is not installed")
 class TestInMuJoCo:
     def test_the_default_has_a_floor_and_the_advice_holds(self, tmp_path, capsys):
@@ -160,6 +175,25 @@ class TestInMuJoCo:
         loop = loop.removeprefix("on every connect and weld: ")
         again = file_with(tmp_path, ('<option timestep="0.002"/>', option), ("<connect", f"<connect {loop}"))
         assert audit_mjcf(again, error=1e-3, t_end=0.5).audits[0].runs[0].error < 1e-3
+
+    def test_a_wrong_reference_is_told(self, tmp_path, monkeypatch):
+        def other(problem, error):
+            (x, R), apart = true(problem, error)
+            return (x + 0.02 * np.linspace(0.0, 1.0, len(x))[:, None, None], R), apart
+
+        true = step_audit.reference
+        monkeypatch.setattr(step_audit, "reference", other)
+        made = audit_mjcf(file_with(tmp_path), error=1e-3, t_end=0.2)
+        assert "Do not trust this audit" in str(made) and not made.advice
+
+    def test_what_the_file_is_off_by_at_its_own_step(self, tmp_path):
+        made = audit_mjcf(file_with(tmp_path), error=1e-2, t_end=0.2)
+        run = next(run for run in made.audits[0].runs if run.step == pytest.approx(2e-3))
+        assert f"As it is, at 2 ms: error {run.error:.2g}, gap" in str(made) and "Do not trust" not in str(made)
+        long = audit_mjcf(file_with(tmp_path, ("0.002", "0.5")), error=1e-2, t_end=0.2)
+        assert "its step is 500 ms, and 4 ms is a 50th of the time" in long.as_it_is
+        lost = file_with(tmp_path, ("<connect", '<connect solref="-1e8 -1e3"'))
+        assert "at 2 ms: failed: MuJoCo warns of BADQACC" in audit_mjcf(lost, error=1e-2, t_end=0.2).as_it_is
 
     @pytest.mark.parametrize(
         "changes",

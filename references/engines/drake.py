@@ -11,6 +11,7 @@ from references.engines.rigid import (
     HINGE,
     SLIDE,
     UNTOLD,
+    Array,
     Motion,
     Prepared,
     Rigid,
@@ -69,7 +70,7 @@ def prepare(rigid: Rigid, settings: Settings = Settings()) -> Prepared:  # noqa:
                 np.array([each.rotation().matrix() for each in poses]),
             )
             v, w = (np.array([getattr(each, part)() for each in twists]) for part in ("translational", "rotational"))
-            return done * h, x, R, v, w, UNTOLD  # it has no output of the forces of ball constraints
+            return done * h, x, R, v, w, _force(rigid, plant, context, bodies)
 
         return march(began, n_steps, n_stored, see, step)
 
@@ -137,6 +138,36 @@ def _joint(name: str, found: list[tuple[str, Any]], frames: list[Any], damping: 
             name, *frames, found[0][1], damping=damping
         )
     raise ValueError(f"Drake is given hinges, slides, balls and universal joints; {name!r} is of {' and '.join(kinds)}")
+
+
+def _force(rigid: Rigid, plant: Any, context: Any, bodies: list[Any]) -> Array:
+    """Of the first joint that closes a loop: Drake does not tell it, so what its accelerations leave of the balance."""
+    if not rigid.loops:
+        return UNTOLD
+    try:
+        rates = plant.get_generalized_acceleration_output_port().Eval(context)
+    except RuntimeError:  # as in the step before or after, which says why
+        return UNTOLD
+    forces = _module("multibody.tree").MultibodyForces(plant)
+    plant.CalcForceElementsContribution(context, forces)
+    rows, by_v = [], _module("multibody.tree").JacobianWrtVariable.kV
+    for a, on_a, b, on_b in cut_points(rigid):
+        rows.append(
+            sum(
+                sign
+                * plant.CalcJacobianTranslationalVelocity(
+                    context, by_v, bodies[each.number].body_frame(), at, *[plant.world_frame()] * 2
+                )
+                for each, at, sign in ((a, on_a, 1.0), (b, on_b, -1.0))
+            )
+        )
+    missing = plant.CalcInverseDynamics(context, rates, forces)
+    for k in np.flatnonzero(rigid.torques.any(axis=1)):
+        J = plant.CalcJacobianAngularVelocity(context, by_v, bodies[k].body_frame(), *[plant.world_frame()] * 2)
+        missing -= J.T @ rigid.torques[k]
+    made = np.linalg.lstsq(np.vstack(rows).T, missing, rcond=1e-9)[0].reshape(-1, 3)
+    n = {"spherical": 1, "revolute": 2}[rigid.loops[0].kind]
+    return made[:n].sum(axis=0)
 
 
 def _start(rigid: Rigid, plant: Any, context: Any, bodies: list[Any]) -> None:

@@ -79,7 +79,7 @@ def _model(rigid: Rigid, planar: bool, q: Any, v: Any) -> tuple[Any, int, Any]:
 
     locked = {"revolute": REVOLUTE, "prismatic": PRISMATIC, "spherical": SPHERICAL, "universal": UNIVERSAL}
     model = Model(rigid.model.gravity)
-    sensor, own = -1, np.eye(3)
+    sensor, own, made_of = -1, np.eye(3), {}
     for body, state, rate in zip(rigid.model.bodies, q, v, strict=True):
         mass, xx, yy, zz, xy, xz, yz = body.inertia.tolist()
         if planar:
@@ -104,18 +104,21 @@ def _model(rigid: Rigid, planar: bool, q: Any, v: Any) -> tuple[Any, int, Any]:
         turned = np.eye(3) if flat else turned
         point = joint.a.in_space(point_of(joint.a, joint))
         made = model.joint(a, b, point, turned, PLANAR_CUT if flat else locked[joint.kind])
+        made_of[joint.name] = made
         if joint.name == rigid.cut:
             sensor, own = model.told(made, True), joint.a.rotation.T @ turned
     for one, at, other, there, values in springs(rigid.model):
         # Exudyn's planar bodies take points in their own axes, see Model.planar_body
         ends = (at, there) if planar else (one.in_space(at), other.in_space(there))
         model.spring(one.number, ends[0], other.number, ends[1], *values)
-    for name, values in hinge_springs(rigid.model).items():
+    for name, (stiffness, damping, angle) in hinge_springs(rigid.model).items():
         joint = next(each for each in rigid.model.joints if each.name == name)
-        if not planar or rigid.model.ground not in (joint.a, joint.b):
+        if not planar:
+            model.twist(made_of[name], stiffness, damping, angle)
+            continue
+        if rigid.model.ground not in (joint.a, joint.b):
             raise ValueError(f"Exudyn is given springs in planar hinges on the ground; {name!r} is another joint")
-        sign = 1.0 if joint.a is rigid.model.ground else -1.0
-        model.turn(joint.body.number, *values[:2], sign * values[2])
+        model.turn(joint.body.number, stiffness, damping, (1.0 if joint.a is rigid.model.ground else -1.0) * angle)
     for k in np.flatnonzero(rigid.torques.any(axis=1)):
         model.torque(int(k), rigid.torques[k])
     model.mbs.Assemble()

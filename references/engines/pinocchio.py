@@ -180,11 +180,20 @@ def _force(
         pin.computeJointJacobians(model, data, q)
         tau = np.zeros(model.nv)
 
+        def rows(body: int) -> Array:
+            frame = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+            return np.asarray(pin.getJointJacobian(model, data, frames[body][0], frame))
+
         def pull(body: int, point: Array, f: Array, torque: Array) -> None:
-            joint, _ = frames[body]
-            if joint:
-                J = pin.getJointJacobian(model, data, joint, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED)
+            if joint := frames[body][0]:
+                J = rows(body)
                 tau[:] += J[:3].T @ f + J[3:].T @ (np.cross(point - data.oMi[joint].translation, f) + torque)
+
+        def speed(body: int, point: Array, v: Array) -> Array:
+            if not (joint := frames[body][0]):
+                return np.zeros(3)
+            twist = rows(body) @ v
+            return np.asarray(twist[:3] + np.cross(twist[3:], point - data.oMi[joint].translation))
 
         zero = np.zeros(3)
         for joint, (stiffness, damping, angle) in hinges:
@@ -192,15 +201,14 @@ def _force(
         for k in turning:
             pull(int(k), zero, zero, rigid.torques[k])
         for a, on_a, b, on_b, (stiffness, damping, length) in known:
-            if damping:
-                raise ValueError("a spring between points is given to Pinocchio without damping")
             ends = [
                 (data.oMi[joint] * origin).act(at)
                 for (joint, origin), at in ((frames[a.number], on_a), (frames[b.number], on_b))
             ]
             along = ends[1] - ends[0]
             long = float(np.linalg.norm(along))
-            f = stiffness * (long - length) / long * along
+            rate = damping and along @ (speed(b.number, ends[1], v) - speed(a.number, ends[0], v)) / long
+            f = (stiffness * (long - length) + damping * rate) / long * along
             pull(a.number, ends[0], f, zero)
             pull(b.number, ends[1], -f, zero)
         return tau

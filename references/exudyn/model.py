@@ -23,6 +23,7 @@ from exudyn.itemInterface import (
     ObjectRigidBody,
     ObjectRigidBody2D,
     SensorObject,
+    TorsionalSpringDamper,
 )
 from numpy.typing import ArrayLike, NDArray
 
@@ -116,6 +117,12 @@ class Model:
         """A torsional spring between the ground and a planar body, at rest where this has turned by an angle."""
         properties: dict[str, Any] = {"stiffness": stiffness, "damping": damping, "offset": angle}
         self.mbs.AddObject(ObjectConnectorCoordinateSpringDamper(markerNumbers=self._coordinate(body, 2), **properties))
+
+    def twist(self, joint: int, stiffness: float, damping: float, angle: float) -> None:
+        """A torsional spring about z of the markers of a joint, at rest where the second has turned by an angle."""
+        markers = self.mbs.GetObject(joint)["markerNumbers"]
+        properties: dict[str, Any] = {"stiffness": stiffness, "damping": damping, "offset": angle}
+        self.mbs.AddObject(TorsionalSpringDamper(markerNumbers=markers, **properties))
 
     def _coordinate(self, body: int, coordinate: int) -> list[int]:
         fixed = self.mbs.AddNode(NodePointGround())

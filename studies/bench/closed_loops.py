@@ -135,14 +135,15 @@ def parallelogram() -> ModelProblem:
     return _linkage("parallelogram", 1.0, 2.0, 1.0, 2.0, 0.5 * math.pi, 8.0).problem((0.0, 2.0))
 
 
-def parallelogram_motion(times: Array) -> tuple[Array, Array, float]:
+def parallelogram_motion(times: Array, torque: float = 0.0) -> tuple[Array, Array, float]:
     """Coordinates and velocities (9, n_t) of the parallelogram that does not fold, and how far two routes differ.
 
+    `torque`: on its crank, N m.
     Its bars turn alike, with a moment of inertia of 2/3 + 2 kg m^2 and the weight of 3 kg at the end of a bar of 1 m.
     """
 
     def rates(t: float, y: Array) -> list[float]:
-        return [y[1], -3.0 * 9.81 * math.cos(y[0]) / (2.0 / 3.0 + 2.0)]
+        return [y[1], (torque - 3.0 * 9.81 * math.cos(y[0])) / (2.0 / 3.0 + 2.0)]
 
     span, start = (0.0, float(times[-1])), [0.5 * math.pi, 8.0]
     runs = [solve_ivp(rates, span, start, each, t_eval=times, rtol=1e-12, atol=1e-12).y for each in ("DOP853", "LSODA")]
@@ -298,7 +299,7 @@ def governor() -> ModelProblem:
     return model.problem((0.0, 5.0))
 
 
-def stewart() -> ModelProblem:
+def stewart(stiffness: float = 600.0, damping: float = 0.0) -> ModelProblem:
     """A platform on six legs, each two bodies that slide on one another, with a spring from base to platform."""
     model = SpatialModel(name="Stewart platform")
     model.body("platform", mass=4.0, inertia=(0.4, 0.4, 0.8), position=(0.0, 0.0, 1.0), velocity=(0.3, 0.1, 0.0))
@@ -314,7 +315,8 @@ def stewart() -> ModelProblem:
         model.universal("ground", f"cylinder {k}", at=foot, axes=(across, np.cross(along, across)))
         model.prismatic(f"cylinder {k}", f"piston {k}", at=0.5 * (foot + top), axis=along)
         model.spherical(f"piston {k}", "platform", at=top)
-        model.spring("ground", foot, "platform", top, stiffness=600.0, length=1.05 * float(np.linalg.norm(top - foot)))
+        long = 1.05 * float(np.linalg.norm(top - foot))
+        model.spring("ground", foot, "platform", top, stiffness=stiffness, damping=damping, length=long)
     return model.problem((0.0, 3.0))
 
 

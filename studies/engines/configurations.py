@@ -74,3 +74,7 @@ BEST: dict[str, Any] = {  # of the gates: the most rigid of an engine
     "pinocchio": pinocchio.Settings("RK4", 1e-3),
     "exudyn_bodies": exudyn_bodies.Settings(),
 }
+PLAIN_AND_BEST = (  # which are run with motors on every mechanism
+    *("MuJoCo, default", "MuJoCo, RK4, solref 2h", "Drake, SAP", "Pinocchio, RK4, Baumgarte"),
+    *("Exudyn, generalized-alpha", f"{NAMES[OURS]}, default"),
+)

@@ -10,21 +10,22 @@ import pandas as pd
 from studies.bench import tables
 from studies.bench.end_states import EXACT
 from studies.bench.engine_runs import LIMIT
+from studies.bench.motorised_loops import DRIVEN, SERVO
 from studies.engines.configurations import CONFIGURATIONS, NAMES, OURS, PACKAGES, Configuration
 from twoloop.audit.step_audit import LOST, order_and_floor
 
-GATE, RUN, VARIANT, ENERGY = "gate", "run", "variant", "energy"  # groups of rows
+GATE, RUN, VARIANT, MOTOR, ENERGY = "gate", "run", "variant", "motor", "energy"  # groups of rows
 ERRORS = (1e-2, 1e-3, 1e-4, 1e-6)
 SET_FOR = ERRORS[:3]  # for which a step is named
 SPEEDS = (1, 100)  # times real time
 PROBED = 5000  # steps, over 10 s or 5 s, of the table of motors, masses, frames and forces
 PROBES = {  # what is asked, of which mechanisms, in which groups, by which measure
-    "crank-rocker; its coupler 100, 10000 times lighter": (
+    "crank-rocker; coupler 1e2, 1e4 times lighter": (
         ("crank-rocker", RUN, "error_q"),
         ("coupler of 1:100", VARIANT, "error_q"),
         ("coupler of 1:10000", VARIANT, "error_q"),
     ),
-    "speed motor; PD motor": (("speed motor", VARIANT, "error_q"), ("PD motor", VARIANT, "error_q")),
+    "all, median: driven; PD motor": ((DRIVEN, MOTOR, "error_q"), (SERVO, MOTOR, "error_q")),
     "RSSR; turned in space": (("RSSR", RUN, "error_q"), ("RSSR, turned", VARIANT, "error_q")),
     "joint force: crank-rocker; RSSR": (("crank-rocker", RUN, "error_f"), ("RSSR", RUN, "error_f")),
     "energy, 100 s: four-bar; RSSR": (("four-bar", ENERGY, "energy"), ("RSSR", ENERGY, "energy")),
@@ -48,6 +49,7 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     found["apart"] = float(runs["floor"].astype(float).max())
     found["configurations"] = [_configuration(each, runs[runs["solver"] == each.name]) for each in CONFIGURATIONS]
     cheapest = [_cheapest(runs[runs["case"] == case]) for case in cases]
+    found["call_over_engines"] = dict(zip(cases, (line["ratio"] for line in cheapest), strict=True))
     for key in ("all", "engines"):  # with ours and without
         found[f"wins_{key}"] = [_counted(line[key][k] for line in cheapest) for k in range(len(ERRORS))]
     found["engines"] = [
@@ -109,14 +111,19 @@ def _priced(runs: pd.DataFrame, error: float, what: str = "call_s") -> float | N
     return float(cost) if cost == cost else float(good[what].min()) if len(good) else None
 
 
-def _cheapest(runs: pd.DataFrame) -> dict[str, list[str | None]]:
-    """At each error the cheapest configuration on a mechanism, of all and of the engines."""
-    line: dict[str, list[str | None]] = {"all": [], "engines": []}
+def _cheapest(runs: pd.DataFrame) -> dict[str, Any]:
+    """At each error the cheapest configuration on a mechanism, of all and of the engines.
+
+    `ratio`: our call at the first error over theirs; None where one of them does not reach it.
+    """
+    line: dict[str, Any] = {"all": [], "engines": [], "ratio": None}
     for error in ERRORS:
         costs = {str(solver): cost for solver, own in runs.groupby("solver") if (cost := _priced(own, error))}
         line["all"].append(min(costs, key=costs.__getitem__, default=None))
-        costs.pop(f"{NAMES[OURS]}, default", None)
+        ours = costs.pop(f"{NAMES[OURS]}, default", None)
         line["engines"].append(min(costs, key=costs.__getitem__, default=None))
+        if error == ERRORS[0] and ours and costs:
+            line["ratio"] = ours / min(costs.values())
     return line
 
 
@@ -157,7 +164,11 @@ def _within(runs: pd.DataFrame, speed: float) -> float:
 
 def _probe(rows: pd.DataFrame, solver: str, case: str, group: str, measure: str) -> float | None:
     """What a configuration is off by with `PROBED` steps, ours with a tolerance of 1e-8; None: not told, or not run."""
-    own = rows[(rows["group"] == group) & (rows["case"] == case) & (rows["solver"] == solver)]
+    own = rows[(rows["group"] == group) & (rows["solver"] == solver)]
+    if group == MOTOR:
+        of_all = own[own["case"].str.endswith(case)][measure].astype(float).fillna(np.inf)
+        return float(of_all.median()) if len(own) and np.isfinite(of_all.median()) else None
+    own = own[own["case"] == case]
     own = own[(own["n_steps"] == PROBED) | (own["tol"] == 1e-8) | (group == ENERGY)]
     value = own[measure].astype(float).min() if len(own) else np.nan
     return float(value) if np.isfinite(value) else None

@@ -15,17 +15,23 @@ from references.engines.rigid import Motion, Prepared, coordinates
 from studies.bench import figures
 from studies.bench.closed_loops import MECHANISMS, VARIANTS, four_bar, rssr
 from studies.bench.engine_runs import INSTANTS, LIMIT, Loop, errors, gate, timed
+from studies.bench.motorised_loops import MOTORISED
 from studies.bench.store import Output, Row
 from studies.bench.study import Study
-from studies.engines.configurations import BEST, CONFIGURATIONS, MODULES, NAMES, OURS, Configuration
-from studies.engines.findings import ENERGY, GATE, RUN, VARIANT, findings_of
+from studies.engines.configurations import BEST, CONFIGURATIONS, MODULES, NAMES, OURS, PLAIN_AND_BEST, Configuration
+from studies.engines.findings import ENERGY, GATE, MOTOR, PROBED, RUN, VARIANT, findings_of
 from twoloop.audit.step_audit import LOST
 
 N_STEPS = (100, 200, 500, 1500, 5000, 15_000, 50_000, 150_000)  # multiples of INSTANTS
 TOLERANCES = (1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10, 1e-11)
-FEWER = {RUN: (N_STEPS, TOLERANCES), VARIANT: ((500, 5000, 50_000), (1e-4, 1e-6, 1e-8))}  # steps, or tolerances
+FEWER = {  # steps, or tolerances
+    RUN: (N_STEPS, TOLERANCES),
+    VARIANT: ((500, 5000, 50_000), (1e-4, 1e-6, 1e-8)),
+    MOTOR: ((PROBED,), (1e-8,)),
+}
 LONG, LONG_STEPS, LONG_INSTANTS, LONG_LIMIT = 100.0, 50_000, 200, 6.0  # s; how it is run; s of CPU
 SHOWN = ("four-bar", "Watt's six-bar", "Andrews' squeezer", "RSSR", "Bricard", "Stewart platform")  # in the figure
+WITH_MOTORS = [each for each in CONFIGURATIONS if each.name in PLAIN_AND_BEST]
 STOPPED = ("NOT_AVAILABLE", "NOT_APPLICABLE", "GATE_FAILED")
 
 
@@ -48,17 +54,15 @@ def gated(make: Callable[[], Any], engine: str) -> tuple[str, str]:
 
 
 def make(output: Output) -> pd.DataFrame:
-    """Rows of the gates, of runs, of motors, masses and turned frames, and of the energy over a long time."""
+    """Rows of the gates, of runs, of masses and turned frames, of motors, and of the energy over a long time."""
     quick = output.call.quick
-    mechanisms = (four_bar, rssr) if quick else MECHANISMS
-    variants = () if quick else VARIANTS
+    groups = {RUN: (four_bar, rssr)} if quick else {RUN: MECHANISMS, VARIANT: VARIANTS, MOTOR: MOTORISED}
     with output.kept() as kept:
         rows: list[Row] = []
-        for build in (*mechanisms, *variants):
-            group = RUN if build in mechanisms else VARIANT
+        for group, build in ((group, build) for group, builds in groups.items() for build in builds):
             for engine in MODULES:
                 rows.append(kept.made(f"{GATE} {build.__name__} {engine}", partial(_gate_row, build, engine)))
-            for each in CONFIGURATIONS:
+            for each in CONFIGURATIONS if group != MOTOR else WITH_MOTORS:
                 cost: list[float] = []  # of the run before, and its steps
                 values: Any = FEWER[group][each.engine == OURS]
                 for value in values[1:4:2] if quick else values:

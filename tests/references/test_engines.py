@@ -23,6 +23,7 @@ from studies.bench.closed_loops import (
     turned_rssr,
 )
 from studies.bench.engine_runs import Loop, errors, gate
+from studies.bench.motorised_loops import MOTORISED
 from twoloop import audit
 from twoloop.audit.poses import gaps
 from twoloop.bodies import PlanarModel, SpatialModel
@@ -114,6 +115,14 @@ def test_motors_do_what_they_should(engine, make):
     assert errors(loop, prepared(engine, without).run(1.0, 2000, 50))["error_q"] > 0.1
 
 
+@engines
+@pytest.mark.parametrize("make", [each for each in MOTORISED if each.__name__ in ("rssr_PD_motor", "stewart_PD_motor")])
+def test_springs_and_dampers_of_joints_and_legs_in_space(engine, make):
+    """The hinge of a crank with a spring and a damper; legs with both, of which Pinocchio has none of its own."""
+    loop = Loop(replace(make(), t_span=(0.0, 0.1)))
+    assert errors(loop, prepared(engine, loop.rigid).run(0.1, 250, 50))["error_q"] < 2e-3
+
+
 def leaning():
     """Two bars that lean on one another, at rest, and a pendulum that moves: forces by hand, without any solver."""
     model = PlanarModel(name="leaning")
@@ -126,13 +135,13 @@ def leaning():
     return model.problem((0.0, 0.1))
 
 
-@pytest.mark.parametrize("engine", [name for name in RIGID if name != "drake"])
+@engines
 def test_the_force_of_a_joint_has_the_sign_of_ours_at_rest_and_its_size_in_motion(engine):
     loop = Loop(leaning())
     # moments about the feet: of the left bar x 1.5 - y 1 = -g 0.5, of the right one with the opposite force
     f = np.linalg.solve([[1.5, -1.0], [1.3, 1.4]], [-9.81 * 0.5, -2.0 * 9.81 * 0.7])
     for told in (loop.reference[0].f, prepared(engine, loop.rigid).run(0.1, 1000, 50).f):
-        np.testing.assert_allclose(told[:, :2], np.tile(f, (51, 1)), rtol=2e-3)
+        np.testing.assert_allclose(told[1:, :2], np.tile(f, (50, 1)), rtol=2e-3)
     turned = Loop(replace(turned_rssr(), t_span=(0.0, 0.2)))
     assert errors(turned, prepared(engine, turned.rigid).run(0.2, 2000, 50))["error_f"] < 0.02
     assert np.isnan(Loop(replace(bricard(), t_span=(0.0, 0.05))).reference[0].f).all()  # not unique

@@ -1,5 +1,8 @@
 """The study of engines: orders and floors, prices and settings turn with the rows; without engines it says so."""
 
+from importlib.util import find_spec
+from pathlib import Path
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -7,6 +10,7 @@ import pytest
 from studies.bench.closed_loops import four_bar
 from studies.bench.render import render
 from studies.engines import study as engines
+from twoloop.audit import audit_mjcf
 from twoloop.audit.step_audit import order_and_floor
 
 STEPS = np.array([1e-2, 3e-3, 1e-3, 3e-4])
@@ -56,6 +60,23 @@ def test_what_to_set_and_what_is_wrong_follow_the_rows():
     assert found["wins_all"][1] == {"MuJoCo": 1}
 
 
+def test_where_our_call_costs_more_is_said():
+    good, ours = made("MuJoCo, RK4, solref 2h", 10.0 * STEPS**2), made("twoloop, default", 1e-1 * STEPS**2, cost=0.1)
+    found, text = said(good, ours, *(each.assign(case="RSSR") for each in (good.assign(call_s=0.01), ours)))
+    assert found["call_over_engines"] == {"four-bar": pytest.approx(0.1), "RSSR": pytest.approx(10.0)}
+    assert "costs no more than the cheapest engine's on 1, more on RSSR (10 times)." in text
+
+
+@pytest.mark.skipif(find_spec("mujoco") is None, reason="MuJoCo is not installed")
+def test_the_settings_of_the_first_screen_hold_on_a_file_by_hand():
+    file = Path(__file__).parents[2] / "reports/engines/four_bar.xml"
+    _, text = said(made("MuJoCo, RK4, solref 2h", 10.0 * STEPS**2))
+    given = file.read_text()
+    assert 'integrator="RK4"' in given and all(each in given for each in text.split("<connect ... ")[1].split("/>")[:1])
+    audit = audit_mjcf(file, error=1e-3, t_end=2.0).audits[0]
+    assert audit.reaching.step >= 2e-3 and audit.order > 1.8 and audit.floor is None
+
+
 def test_the_error_at_a_speed_is_that_of_calls_as_fast():
     slow = made("MuJoCo, RK4, solref 2h", [1e-2, 1e-3, 1e-4, 1e-5], cost=0.005)
     found, _ = said(slow.assign(span=1.0))
@@ -66,15 +87,13 @@ def test_the_error_at_a_speed_is_that_of_calls_as_fast():
 
 def test_motors_and_energies_stand_beside_what_they_change():
     good = made("MuJoCo, RK4, solref 2h", 10.0 * STEPS**2)
-    motor = good.assign(
-        group="variant", case="speed motor", n_steps=[50, 500, 5000, 50_000], error_q=[1.0, 0.1, 0.02, 0.0]
-    )
+    motor = good.assign(group="motor", case=[f"{k}, driven" for k in "abcd"], error_q=[1.0, None, 0.01, 0.03])
     energy = good[:1].assign(group="energy", n_steps=50_000, error_q=None, energy=0.03)
     found, text = said(good, motor, energy)
     cells = {line["label"]: line["cells"] for line in found["probes"]}
-    assert cells["speed motor; PD motor"] == [[None, None], [0.02, None]]
+    assert cells["all, median: driven; PD motor"] == [[None, None], [pytest.approx(0.515), None]]
     assert cells["energy, 100 s: four-bar; RSSR"] == [[None, None], [0.03, None]]
-    assert found["cases"] == ["four-bar"] and "| speed motor; PD motor | –/– | 0.020/– |" in text
+    assert found["cases"] == ["four-bar"] and "| all, median: driven; PD motor | –/– | 0.52/– |" in text
 
 
 def test_an_engine_that_is_not_there_is_a_row(monkeypatch):

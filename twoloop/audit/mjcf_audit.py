@@ -33,6 +33,8 @@ class MjcfAudit:
     left_out : tuple of str
         What neither motion has: contacts, actuators, limits, ...
     notes : tuple of str
+    as_it_is : str
+        The error at the step of the file.
     audits : tuple of Audit
         As the file is; with loops as stiff as a step allows; so, and with RK4.
     advice : str
@@ -43,6 +45,7 @@ class MjcfAudit:
     start: str
     left_out: tuple[str, ...]
     notes: tuple[str, ...]
+    as_it_is: str
     audits: tuple[Audit, ...]
     advice: str
 
@@ -57,7 +60,7 @@ class MjcfAudit:
         ]
         best = min((run.error for audit in self.audits for run in audit.runs if not run.message), default=np.nan)
         end = self.advice or f"Nothing tried reaches an error of {first.error:g}; the smallest is {best:.2g}."
-        return "\n".join([*head, *(f"{audit}\n" for audit in self.audits), end])
+        return "\n".join([*head, *(f"{audit}\n" for audit in self.audits), self.as_it_is, end])
 
     def write(self, path: str | os.PathLike[str]) -> None:
         """Write everything as JSON, or the runs as CSV, by the ending of the path.
@@ -78,7 +81,7 @@ class MjcfAudit:
                 }
                 for each in self.audits
             ]
-            known = {name: getattr(self, name) for name in ("file", "start", "left_out", "notes", "advice")}
+            known = {name: getattr(self, name) for name in ("file", "start", "left_out", "notes", "as_it_is", "advice")}
             file.write_text(json.dumps({**known, "audits": audits}, indent=1) + "\n", encoding="utf-8")
             return
         with file.open("w", encoding="utf-8", newline="") as stream:
@@ -176,10 +179,26 @@ def audit_mjcf(
     notes += [f"Loops gaped by {gap:.2g} m there: they are closed first."] if gap > MOVED else []
     others = [name for name in inside.keyframes if name != key]
     notes += [f"Other starts, by --key: {', '.join(others)}."] if others else []
+    floor = audits[-1].floor or 0.0
+    if floor > error:
+        notes.append(
+            f"Even stiff loops with RK4 end at an error of {floor:.2g}, where none is expected: motions part too fast, "
+            "or MuJoCo moves another mechanism than the one that was read. Do not trust this audit."
+        )
     left_out = tuple(each for each in model.ignored if not each.startswith(("sensor", "keyframe")))
     start = "the pose of the file" if key is None else f"the keyframe {key!r}"
     advice = _advice(inside, audits)
-    return MjcfAudit(os.fspath(path), start, left_out, tuple(notes), tuple(audits), advice)
+    as_it_is = _at(audits[0], inside.step)
+    return MjcfAudit(os.fspath(path), start, left_out, tuple(notes), as_it_is, tuple(audits), advice)
+
+
+def _at(audit: Audit, step: float) -> str:
+    """What the file is off by at its own step, of the runs the one that is nearest."""
+    run = min(audit.runs, key=lambda each: abs(np.log(each.step / step)))
+    if not 0.7 < run.step / step < 1.5:
+        why = "a 50th of the time, the longest tried" if step > run.step else "the shortest tried"
+        return f"As it is the file was not run: its step is {1e3 * step:.4g} ms, and {1e3 * run.step:.4g} ms is {why}."
+    return f"As it is, at {1e3 * run.step:.4g} ms: {run.message or f'error {run.error:.2g}, gap {run.gap:.1g} m'}."
 
 
 def _label(settings: Settings, integrator: str) -> str:

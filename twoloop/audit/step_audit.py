@@ -26,6 +26,8 @@ COARSEST, SETTLED, FINEST = 8.0, 0.25, 2.0**-12  # steps, over the one given; fr
 WELL_BELOW = 0.1  # of the error asked for
 SAME_START = 1e-6  # m, and of axes
 LIMIT = 4.0  # s of CPU that the next run may be expected to take
+MOST_STEPS = 100_000  # of the first run, before which none tells what a step costs
+KNOWN_WITHIN = 60.0  # s that each route to the reference may take
 RESOLVED = 0.1  # how far the routes to the reference may differ, over the error that is asked for
 
 
@@ -118,8 +120,9 @@ def audit_simulator(
     problem : ModelProblem
         Of `model.problem(t_span)`: the mechanism, its start, and how long it is followed.
     step : float
-        The one in use, s, rounded to a part of a 50th of the span. Tried are up to 8 times this, and each half the one
-        before, until the error falls no more, is well below the one asked for, or a run would take more than seconds.
+        The one in use, s, rounded to a part of a 50th of the span. Tried are up to 8 times this, in not more than
+        100,000 steps, and each half the one before, until the error falls no more, is well below the one asked for, or
+        a run would take more than seconds.
     error : float, optional
         Asked for: the largest of any body's centre (m) or axes over the motion.
     label : str, optional
@@ -133,7 +136,7 @@ def audit_simulator(
     TypeError, ValueError
         If an argument is wrong, nothing moves, or `simulate` starts elsewhere, or returns an array of another shape.
     RuntimeError
-        If the two routes to the reference fail, or differ by more than a tenth of `error`.
+        If the two routes to the reference fail, differ by more than a tenth of `error`, or take more than a minute.
     """
     if not isinstance(problem, ModelProblem) or problem.model is None:
         raise TypeError(f"problem must be made by model.problem(...) of twoloop.bodies; given {shown(problem)}")
@@ -142,9 +145,10 @@ def audit_simulator(
     known, apart = reference(problem, error)
     t0, t1 = problem.t_span
     runs: list[AuditedRun] = []
-    n = INSTANTS * max(1, round((t1 - t0) / (step * INSTANTS)))  # so that instants are whole steps apart
-    while n % (2 * INSTANTS) == 0 and (t1 - t0) / n < 0.7 * COARSEST * step:
-        n //= 2
+    parts = max(1, round((t1 - t0) / (step * INSTANTS)))  # so that instants are whole steps apart
+    while parts % 2 == 0 and (t1 - t0) / (INSTANTS * parts) < 0.7 * COARSEST * step:
+        parts //= 2
+    n = INSTANTS * min(parts, MOST_STEPS // INSTANTS)
     # the first run may hold imports and compiling
     while (t1 - t0) / n >= FINEST * step and not (len(runs) > 1 and 2.0 * runs[-1].cpu_s > LIMIT):
         runs.append(_run(simulate, problem, known, n))
@@ -165,6 +169,7 @@ def reference(problem: ModelProblem, error: float) -> tuple[tuple[Array, Array],
         warnings.simplefilter("ignore", ConstraintWarning)
         for method in ("DOP853", "RadauIIA9"):
             options: dict[str, Any] = {"method": method, "rtol": TIGHT, "atol": TIGHT, "t_eval": times}
+            options["time_limit"] = KNOWN_WITHIN
             run = solve_dae(problem.system, problem.t_span, problem.q0, problem.v0, compiled=False, **options)
             if not run.success:
                 raise RuntimeError(
