@@ -4,6 +4,8 @@ import numpy as np
 
 from twoloop.mechanisms.planar import GROUND, PlanarBodies
 from twoloop.mechanisms.spatial_bodies import SpatialBodies
+from twoloop.methods.dop853 import DOP853
+from twoloop.run.run import Run
 
 
 class _Random:
@@ -125,3 +127,9 @@ def dense_solution(system, q, v):
     a = np.linalg.solve(root.T, free + inverse @ ((gamma - rows @ free) / lengths))
     lam = np.linalg.lstsq(G.T, force - M @ a, rcond=1e-9)[0]
     return a, lam, rank, float(values[rank - 1] / values[0])
+
+
+def started_run(system, q):
+    """A run of an explicit method from rest, at its start."""
+    n = system.n_q
+    return Run(system, DOP853().plan(n, 1e-8, 1e-8, False), 0.0, q, 0.0 * q, 1e-8, np.full(n, 1e-8), None)

@@ -5,12 +5,14 @@ import re
 from pathlib import Path
 
 import numba
+import numpy as np
 import pytest
 from numba import types
 
+from twoloop.kernels.compile import own_rules
 from twoloop.kernels.compile.caches import compile_kept
 from twoloop.kernels.compile.linking import KernelCompiler
-from twoloop.kernels.data.common import OPTIONS, compiled, merged
+from twoloop.kernels.data.common import OPTIONS, compiled, inlined, merged
 
 ROOT = Path(__file__).parents[2]
 WITH_KERNELS = {
@@ -62,3 +64,41 @@ def test_the_collection_of_cycles_goes_on_as_it_was(collecting):
         assert gc.isenabled() is collecting
     finally:
         (gc.enable if before else gc.disable)()
+
+
+@inlined
+def _behind(x, k):
+    return x[k:]
+
+
+def _entries(x, n):
+    total = 0.0
+    for k in range(n):
+        view = _behind(x, k)
+        corner = view[0, k] + x[k, 1] * _behind(x, 0)[1, 1]
+        total += max(corner, 0.25) * x[k, k] ** 2
+    return total
+
+
+def test_what_makes_compiling_faster_changes_no_code(monkeypatch):
+    """Numba's own functions and those in their place give the same machine code, up to names that count."""
+    found = []
+    for rules in (own_rules._RULES, [rule for rule in own_rules._RULES if rule[1] == "fix_integer_index"]):
+        monkeypatch.setattr(own_rules, "_RULES", rules)
+        kernel = numba.njit("f8(f8[:, ::1], i8)", pipeline_class=KernelCompiler, **OPTIONS)(_entries)
+        (code,) = kernel.inspect_llvm().values()
+        body = code.split("define ")[1].split("\n}")[0]
+        assert body.count("load double") >= 4
+        found.append(re.sub(r"[%@!.\w\"$<>]*\d+[\w.$<>\"]*", "", body))
+        x = 1.0 + np.arange(12.0).reshape(4, 3)
+        assert kernel(x, 2) == pytest.approx(sum(max(x[k, k] + x[k, 1] * x[1, 1], 0.25) * x[k, k] ** 2 for k in (0, 1)))
+    assert found[0] == found[1]
+
+
+def test_numba_has_its_own_functions_after_a_kernel_and_after_a_failure():
+    before = [vars(owner).get(name) for owner, name, _ in own_rules._RULES]
+    numba.njit("f8(f8)", pipeline_class=KernelCompiler, **OPTIONS)(lambda x: x)
+    with pytest.raises(numba.TypingError):
+        numba.njit("f8(f8)", pipeline_class=KernelCompiler, **OPTIONS)(lambda x: x + "one")
+    assert [vars(owner).get(name) for owner, name, _ in own_rules._RULES] == before
+    assert own_rules._open == [0]

@@ -158,9 +158,9 @@ def _in_lanes(
     """
     q, v, n_steps = out
     system, starts = lanes.system, lanes.starts
-    for name, off in zip(("q0", "v0"), lanes.off(which), strict=True):
+    for off in lanes.off(which):
         for run in which[~(off <= NEAR)].tolist():
-            _check_start(system, starts, run, name)
+            _check_start(system, starts, run)
     within = times[times > starts.t0]
     ends = within if within.size and within[-1] == t1 else np.append(within, t1)
     new_q, new_v = np.full((2, len(which), system.n_q, len(ends)), np.nan)
@@ -192,7 +192,7 @@ def _alone(
         raise _of_run(run, error) from error
 
 
-def _check_start(system: ConstrainedSystem, starts: Starts, run: int, name: str) -> None:
+def _check_start(system: ConstrainedSystem, starts: Starts, run: int) -> None:
     """Raise unless the start of a run is consistent."""
     from twoloop.checks.consistency import check_start
 

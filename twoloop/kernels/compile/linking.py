@@ -4,27 +4,21 @@ Numba optimises each function together with all that it calls and makes machine 
 five is optimised six times, and its machine code is made without ever being called. Here helpers are handed on as
 LLVM's intermediate code, and the kernel at the top is optimised once. Numba's front end, half of the time, leaves out
 what finds nothing to do. Loops are neither unrolled nor vectorised: those
-of a mechanism are short, and the code that tests whether they are costs more than it gains. Nor does an index of a
-kernel count from the end where it is negative, as none is: the code that asks for it would hide from LLVM that elements
-lie side by side.
+of a mechanism are short, and the code that tests whether they are costs more than it gains.
 """
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from functools import cache
 from typing import Any
 from weakref import WeakKeyDictionary
 
 from llvmlite import binding
-from numba import types
 from numba.core.codegen import CPUCodeLibrary, JITCodeLibrary
 from numba.core.compiler import Compiler
 from numba.core.dispatcher import Dispatcher
-from numba.core.targetconfig import ConfigStack
 from numba.core.typed_passes import InlineOverloads, IRLegalization, NopythonRewrites
-from numba.core.types.functions import BaseFunction, Function
 from numba.core.untyped_passes import InlineClosureLikes
-from numba.np import arrayobj
+
+from twoloop.kernels.compile.own_rules import of_kernels, own_rules
 
 
 class _WithoutEnvironment:
@@ -40,6 +34,7 @@ class _WithoutEnvironment:
         """Nothing to set."""
 
 
+@of_kernels
 class _Linked(CPUCodeLibrary):
     """The code of a helper, to be linked into its callers."""
 
@@ -53,10 +48,21 @@ class _Linked(CPUCodeLibrary):
     def _optimize_final_module(self) -> None:
         pass  # its callers do
 
+    def _get_module_for_linking(self) -> Any:
+        """The code as it is, which nothing else uses: numba links a copy."""
+        if self._shared_module is None:
+            self._ensure_finalized()
+            for function in self._final_module.functions:
+                if not function.is_declaration and function.linkage == binding.Linkage.external:
+                    function.linkage = "linkonce_odr"
+            self._shared_module = self._final_module
+        return self._shared_module
+
     def _finalize_final_module(self) -> None:
         self._finalized = True
 
 
+@of_kernels
 class _Whole(JITCodeLibrary):
     """The code of a kernel and of all that it calls."""
 
@@ -73,51 +79,6 @@ class _Vectorized(_Whole):
     """The same, of loops that are worth it."""
 
     vectorized = True
-
-
-_index_from_either_end = arrayobj.fix_integer_index
-
-
-def _index(context: Any, builder: Any, kind: Any, index: Any, size: Any) -> Any:
-    if kind.signed and isinstance(context.active_code_library, (_Linked, _Whole)):
-        return context.cast(builder, index, kind, types.intp)
-    return _index_from_either_end(context, builder, kind, index, size)
-
-
-_plain_call_type: Any = BaseFunction.get_call_type
-_call_types: dict[Any, tuple[Any, Any]] = {}
-
-
-def _call_type(self: Any, context: Any, args: Any, kws: Any) -> Any:
-    """The signature of a call of one of numba's functions, found once for the same types and options.
-
-    Numba tries all implementations of an operator at each call, which is a tenth of a compilation.
-    """
-    options: Any = ConfigStack.top_or_none()
-    key = self, args, tuple(kws.items()), repr(options and options._values)
-    if key not in _call_types:
-        signature = _plain_call_type(self, context, args, kws)
-        _call_types[key] = signature, self._impl_keys[signature.args]
-    signature, self._impl_keys[signature.args] = _call_types[key]
-    return signature
-
-
-_open = [0]  # compilations of kernels, one within another
-
-
-@contextmanager
-def _own_rules() -> Iterator[None]:
-    """These two in the place of numba's while a kernel is compiled; what others compile in this process is theirs."""
-    numbas: Any = Function
-    numbas.get_call_type, arrayobj.fix_integer_index = _call_type, _index
-    _open[0] += 1
-    try:
-        yield
-    finally:
-        _open[0] -= 1
-        if _open[0] == 0:
-            del numbas.get_call_type  # what it inherits is numba's own
-            arrayobj.fix_integer_index = _index_from_either_end
 
 
 # passes over every function that find nothing to do in kernels: functions within functions; whole arrays in an
@@ -156,7 +117,7 @@ class KernelCompiler(_Compiler):
 
     def compile_extra(self, function: Any) -> Any:
         """Compile a function and all that it calls."""
-        with _own_rules():
+        with own_rules():
             return super().compile_extra(function)
 
 

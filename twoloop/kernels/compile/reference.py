@@ -11,10 +11,11 @@ from typing import Any
 import numpy as np
 from llvmlite import ir
 from numba import types
+from numba.core import cgutils
 from numba.core.imputils import lower_getattr_generic
 from numba.core.typing.templates import AbstractTemplate, AttributeTemplate, Signature, infer_getattr
 from numba.extending import NativeValue, lower_builtin, models, register_model, unbox
-from numba.np.arrayobj import make_array, populate_array
+from numba.np.arrayobj import make_array
 from numba.np.numpy_support import as_dtype
 
 from twoloop.kernels.compile.caches import Newest
@@ -164,16 +165,22 @@ def _array(context: Any, builder: Any, typ: Any, pointer: Any, field: str) -> An
     shape = [_load(context, builder, pointer, place + 1 + axis, word) for axis in range(kind.ndim)]
     size = ir.Constant(word, context.get_abi_sizeof(item))
     strides = [size] if kind.ndim == 1 else [builder.mul(shape[1], size), size]
-    array = make_array(kind)(context, builder)
-    populate_array(
-        array,
-        data=_load(context, builder, pointer, place, item.as_pointer()),
-        shape=shape,
-        strides=strides,
-        itemsize=size,
-        meminfo=None,
-    )
-    return array._getvalue()
+    fields = {
+        "meminfo": None,
+        "parent": None,
+        "nitems": shape[0] if kind.ndim == 1 else builder.mul(*shape, flags=["nsw"]),
+        "itemsize": size,
+        "data": _load(context, builder, pointer, place, item.as_pointer()),
+        "shape": cgutils.pack_array(builder, shape),
+        "strides": cgutils.pack_array(builder, strides),
+    }
+    model = context.data_model_manager[kind]
+    array = ir.Constant(context.get_value_type(kind), ir.Undefined)
+    for name, value in fields.items():  # in registers; numba's helper would write them to memory, one by one
+        at = model.get_field_position(name)
+        made = ir.Constant(array.type.elements[at], None) if value is None else value
+        array = builder.insert_value(array, made, at)
+    return array
 
 
 def _define_call(typ: Reference, field: str, signature: Signature) -> None:

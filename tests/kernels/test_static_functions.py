@@ -1,0 +1,143 @@
+"""Large systems of a user's functions: matrices dense or by the values of their entries."""
+
+import numpy as np
+import pytest
+
+from tests.large_systems import started_run
+from tests.problems import worst
+from twoloop import ConstrainedSystem, solve_dae
+from twoloop.mechanisms import spatial_bodies
+from twoloop.mechanisms.planar import GROUND
+from twoloop.mechanisms.spatial_bodies import SpatialBodies
+
+
+def masses_on_rods(n, dense, plain, varying):
+    """A chain of point masses in plain functions, its matrices dense or by values; masses that vary by a millionth."""
+    rows = np.repeat(np.arange(n), [2] + [4] * (n - 1))
+    columns = np.concatenate([[0, 1]] + [[2 * k - 2, 2 * k - 1, 2 * k, 2 * k + 1] for k in range(1, n)])
+
+    def differences(q):
+        return np.diff(np.vstack([np.zeros((1, 2)), q.reshape(n, 2)]), axis=0)
+
+    def values(t, q):
+        d = differences(q)
+        return np.concatenate([d[0], np.hstack([-d[1:], d[1:]]).ravel()])
+
+    def matrix(t, q):
+        made = np.zeros((n, 2 * n))
+        made[rows, columns] = values(t, q)
+        return made
+
+    def masses(t, q):
+        return 1.0 + 1e-6 * np.sin(q)
+
+    options = {"jacobian": matrix} if dense else {"jacobian_values": values, "jacobian_entries": (rows, columns)}
+    both = np.arange(2 * n)
+    if dense:
+        options["mass"] = (lambda t, q: np.diag(masses(t, q))) if varying else np.eye(2 * n)
+    else:
+        options |= {"mass_values": masses if varying else np.ones(2 * n), "mass_entries": (both, both)}
+    system = ConstrainedSystem.from_python(
+        n_q=2 * n,
+        n_c=n,
+        force=lambda t, q, v: np.tile([0.0, -9.81], n),
+        constraint=lambda t, q: 0.5 * ((differences(q) ** 2).sum(axis=1) - 1.0 / n**2),
+        gamma=lambda t, q, v: -(differences(v) ** 2).sum(axis=1),
+        name="masses on rods",
+        **options,
+    )
+    angles = np.linspace(0.1, 1.3, n)
+    return system, np.cumsum(np.column_stack([np.cos(angles), np.sin(angles)]) / n, axis=0).ravel()
+
+
+@pytest.mark.parametrize("varying", [False, True])
+def test_plain_functions_dense_or_by_values(large, varying):
+    found = []
+    for dense, least in ((True, 10**9), (True, 0), (False, 0)):
+        large(least)
+        system, q = masses_on_rods(30, dense, True, varying)
+        run = started_run(system, q)
+        assert (run.static is not None) == (least == 0)
+        found.append(solve_dae(system, (0.0, 0.02), q, 0.0 * q, "DOP853", 1e-8, 1e-8))
+    assert all(result.success for result in found)
+    assert worst(found[0].q[:, -1], found[1].q[:, -1]) < 1e-12
+    assert worst(found[0].q[:, -1], found[2].q[:, -1]) < 1e-12
+
+
+def test_an_entry_that_comes_up_on_the_way_ends_the_static_form(large):
+    """Coordinates that are held, the first of which comes to lean on another where the second is beyond 0.5."""
+    n = 12
+
+    def beyond(x, order=0):
+        return [1.0, 4.0, 12.0][order] * max(0.0, x - 0.5) ** (4 - order)
+
+    def constraint(t, q):
+        return q[:n] + np.eye(n)[0] * beyond(q[1]) * q[n] - np.eye(n)[1] * t
+
+    def jacobian(t, q):
+        made = np.eye(n, 2 * n)
+        made[0, 1], made[0, n] = beyond(q[1], 1) * q[n], beyond(q[1])
+        return made
+
+    def gamma(t, q, v):
+        return -np.eye(n)[0] * (beyond(q[1], 2) * q[n] * v[1] ** 2 + 2.0 * beyond(q[1], 1) * v[1] * v[n])
+
+    system = ConstrainedSystem.from_python(
+        n_q=2 * n,
+        n_c=n,
+        mass=np.eye(2 * n),
+        force=lambda t, q, v: np.ones(2 * n),
+        constraint=constraint,
+        constraint_rate=lambda t, q: -np.eye(n)[1],
+        jacobian=jacobian,
+        gamma=gamma,
+    )
+    ends = []
+    for least in (10**9, 0):
+        large(least)
+        result = solve_dae(system, (0.0, 1.2), np.zeros(2 * n), np.eye(2 * n)[1], "DOP853", time_limit=20.0)
+        assert result.success
+        ends.append(result.q[:, -1])
+    assert abs(ends[0][0]) > 0.05
+    assert worst(*ends) < 1e-9
+
+
+def test_stiff_motion_goes_on_by_newton(large):
+    """By sparse or dense matrices: both ways lead to the same end."""
+    n = 12
+    ends = []
+    for least in (10**9, 0):
+        large(least)
+        system, q = masses_on_rods(n, True, True, False)
+        functions = dict(system.python_functions)
+        functions["force"] = lambda t, q, v: np.tile([0.0, -9.81], n) - 3e3 * v
+        stiff = ConstrainedSystem.from_python(n_q=2 * n, n_c=n, **functions | {"mass": np.eye(2 * n)})
+        result = solve_dae(stiff, (0.0, 2.0), q, 0.0 * q, "auto", 1e-4, 1e-4)
+        assert result.success
+        assert result.stats.n_jacobians > 0
+        ends.append(result.q[:, -1])
+    assert worst(*ends) < 1e-3
+
+
+def test_values_of_spatial_bodies_are_the_entries_of_their_matrices(monkeypatch):
+    monkeypatch.setattr(spatial_bodies, "LARGE", 0)
+    rng = np.random.default_rng(1)
+    bodies, before = SpatialBodies((0.0, 0.0, -9.81)), GROUND
+    for k in range(12):
+        at = rng.normal(size=3)
+        body = bodies.body(f"body {k}", 1.0, (0.01, 0.02, 0.025), at, np.eye(3))
+        one, other = (before, body) if k < 6 else (body, before)
+        if k % 4 == 0:
+            bodies.spherical(one, other, at)
+        elif k % 4 == 1:
+            bodies.universal(one, other, at, (1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
+        else:
+            (bodies.revolute if k % 4 == 2 else bodies.prismatic)(one, other, at, rng.normal(size=3))
+        before = body
+    bodies.prismatic(before, GROUND, np.zeros(3), (0.0, 1.0, 0.0))
+    system, q = bodies.system("spatial"), bodies.start[0] + 0.1 * rng.normal(size=7 * 12)
+    for kind in ("mass", "jacobian"):
+        dense, made = system.evaluate(kind, 0.0, q), np.zeros((system.n_q if kind == "mass" else system.n_c, 7 * 12))
+        np.add.at(made, system.entries[kind], system.evaluate(f"{kind}_values", 0.0, q))
+        assert worst(made, dense) < 1e-14
+        assert len(system.entries[kind][0]) < 0.15 * dense.size
