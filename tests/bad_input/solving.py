@@ -177,6 +177,13 @@ SOLVE = [
         "leave it out, or write the callback without `if`, `abs`, `max`",
     ),
     of_solve(
+        "a force in Python that draws random numbers, or keeps what it did before",
+        lambda: solve(pendulum(force=lambda t, q, v, g=np.random.default_rng(1): g.normal(size=2))),
+        "force of 'pendulum' gives something else when it is called again with the same t, q and v",
+        "let it depend on its arguments alone; a controller that samples sets inputs of `Integrator.step`; steps of a "
+        "constant size (`step_size`) are not checked",
+    ),
+    of_solve(
         "a `Problem` as `system`",
         lambda: solve(linkage()),
         r"system must be a ConstrainedSystem.*problem\.system",
