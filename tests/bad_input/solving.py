@@ -30,6 +30,19 @@ from twoloop.methods.tableaux import gauss
 
 of_solve = cases_of("solve_dae")
 of_argument = partial(argument, "solve_dae", solve)
+
+
+def latch():
+    """A force that keeps the latest time at which it was called."""
+    latest = [0.0]
+
+    def force(t, q, v):
+        latest[0] = max(t, latest[0])
+        return np.array([0.0, -latest[0]])
+
+    return force
+
+
 SOLVE = [
     *of_argument("q0", VECTORS),
     *of_argument("v0", FEW_VECTORS),
@@ -178,7 +191,7 @@ SOLVE = [
     ),
     of_solve(
         "a force in Python that draws random numbers, or keeps what it did before",
-        lambda: solve(pendulum(force=lambda t, q, v, g=np.random.default_rng(1): g.normal(size=2))),
+        lambda: solve(pendulum(force=latch())),
         "force of 'pendulum' gives something else when it is called again with the same t, q and v",
         "let it depend on its arguments alone; a controller that samples sets inputs of `Integrator.step`; steps of a "
         "constant size (`step_size`) are not checked",

@@ -69,7 +69,7 @@ def _derivatives_again(run: "Run", states: Array, first: Array, status: Status, 
 
 
 def unlike_before(system: ConstrainedSystem, states: Array) -> str | None:
-    """Say how a force called in Python gives something else at a state [t, q, v] once others were in between, or None."""
+    """Say how a force called in Python differs at a state [t, q, v] once others were in between, or None."""
     n, made = system.n_q, []
     with warnings.catch_warnings(), np.errstate(all="ignore"):
         warnings.simplefilter("ignore")
@@ -86,8 +86,8 @@ def unlike_before(system: ConstrainedSystem, states: Array) -> str | None:
     k, entry = np.unravel_index(off.argmax(), off.shape)
     return (
         f"force of {system.name!r} gives something else when it is called again with the same t, q and v: at "
-        f"t = {states[k, 0]:.10g} entry {entry} is {once[k, entry]:.9g}, and then {again[k, entry]:.9g}. It must depend "
-        "on its arguments alone: steps are tried, refused, and looked at ahead"
+        f"t = {states[k, 0]:.10g} entry {entry} is {once[k, entry]:.9g}, and then {again[k, entry]:.9g}. It must "
+        "depend on its arguments alone: steps are tried, refused, and looked at ahead"
     )
 
 
