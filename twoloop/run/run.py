@@ -100,7 +100,7 @@ class Run:
         self.control_by(plan)
         self.substituted = False  # whether another plan has taken over, for good
         self.clock[clock.JUMP_FROM] = self.clock[clock.JUMP_TO] = np.inf
-        self.clock[clock.ROUGH_TO] = self.clock[clock.LOOKED_TO] = self.clock[clock.SUDDEN] = -np.inf
+        self.clock[[clock.ROUGH_TO, clock.LOOKED_TO, clock.ALONG_TO, clock.SUDDEN]] = -np.inf
         self.looks_ahead = step_size is None and may_be_sudden(
             system, any("force" in each.kinds for each in plan.traced)
         )

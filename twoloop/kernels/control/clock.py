@@ -64,6 +64,7 @@ H, ERRORS, FAILURES, PARTITIONS, JACOBIANS, N_STEP_COLUMNS = range(6)
     PIVOT_HERE,  # the smallest pivot at the end of the last step, of the static form
     LOOKED_TO,  # up to where changes with time were looked for
     SUDDEN,  # where the next one is that is sudden
+    ALONG_TO,  # up to where they were looked for along the way
     LOOKING,  # 1: while callbacks are called along the way, at states to which the motion may not come
     N_CLOCK,
-) = range(N_PAST, N_PAST + 20)
+) = range(N_PAST, N_PAST + 21)

@@ -1,4 +1,4 @@
-"""Forces, C_t and b that change suddenly on the way: a gust, a blow, a switch, a magnet, between places where steps look.
+"""Forces, C_t and b that change suddenly: a gust, a blow, a switch, a magnet, between two places where steps look.
 
 They are called at times ahead: a call of one callback where a look at the equations is an evaluation. Of what is smooth
 over some of these times second differences are small against the range of the values, less the line from the first to
@@ -9,7 +9,7 @@ ones the state stays that where the step begins, and of what is sharp by place t
 
 import numpy as np
 
-from twoloop.kernels.control.clock import AHEAD, LOOKED_TO, LOOKING, SUDDEN
+from twoloop.kernels.control.clock import AHEAD, ALONG_TO, LOOKED_TO, LOOKING, SPACING, SUDDEN
 from twoloop.kernels.data.common import RTOL, compiled
 from twoloop.kernels.evaluation.constraints import constraint_rates
 from twoloop.kernels.evaluation.gamma import representable
@@ -87,18 +87,29 @@ def sudden_time(f, w, tolerances, t, begin, spacing, last, along, q, v, a):
 
 
 @compiled
-def up_to_sudden(f, w, tolerances, control, clock, spacing, t, size, last, state):
+def _look_along(f, w, tolerances, clock, spacing, t, size, last, q, v, a):
+    """Look along the way of a long step, once."""
+    if clock[ALONG_TO] >= t + (1.0 - NEARLY) * size:
+        return
+    clock[LOOKING] = 1.0
+    first, clock[ALONG_TO] = sudden_time(f, w, tolerances, t, t, size / PLACES, last, 1.0, q, v, a)
+    clock[LOOKING] = 0.0
+    if first == np.inf:
+        clock[LOOKED_TO] = max(clock[LOOKED_TO], t + size)
+    elif first < clock[SUDDEN] or clock[SUDDEN] <= t + NEARLY * spacing:
+        clock[SUDDEN] = clock[LOOKED_TO] = first
+
+
+@compiled
+def up_to_sudden(f, w, tolerances, control, clock, t, size, last, state):
     """The size of a step that does not pass over a sudden change."""
-    n = w.Q.size
+    n, spacing = w.Q.size, control[SPACING]
     q, v, a = state[:n], state[n : 2 * n], state[2 * n : 3 * n]
+    if control[AHEAD] == 1.0 and LONG * spacing < size < (PLACES + NEARLY) * spacing:
+        _look_along(f, w, tolerances, clock, spacing, t, size, last, q, v, a)
     while clock[SUDDEN] <= t + NEARLY * spacing or clock[SUDDEN] == np.inf:
         begin = max(t, clock[LOOKED_TO])
         if begin >= min(t + size, last):
             return size
-        along, apart = 0.0, spacing
-        if LONG * spacing < size < (PLACES + NEARLY) * spacing and begin == t:
-            along, apart = control[AHEAD], size / PLACES if control[AHEAD] > 0.0 else spacing
-        clock[LOOKING] = along
-        clock[SUDDEN], clock[LOOKED_TO] = sudden_time(f, w, tolerances, t, begin, apart, last, along, q, v, a)
-        clock[LOOKING] = 0.0
+        clock[SUDDEN], clock[LOOKED_TO] = sudden_time(f, w, tolerances, t, begin, spacing, last, 0.0, q, v, a)
     return min(size, representable(t, clock[SUDDEN] - t))
