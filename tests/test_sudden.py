@@ -1,5 +1,7 @@
 """Forces that act for a thousandth of the run: steps end where something changes suddenly with time."""
 
+import math
+
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
@@ -29,11 +31,15 @@ def ticking(t, q, v, p):
     return np.array([SIZE * np.cos(np.pi * (t - p[0]) / 6.0) ** 4096, -9.81])
 
 
+def magnet(t, q, v, p):
+    return np.array([SIZE if abs(q[0] - p[0]) < p[1] else 0.0, -9.81])
+
+
 def steady(t, q, v, p):
     return np.array([-p[1] * v[0], -9.81])
 
 
-def pendulum(force, at=1.5, width=WIDTH):
+def pendulum(force, at=1.5, width=WIDTH, compile=True):
     return ConstrainedSystem.from_python(
         n_q=2,
         n_c=1,
@@ -43,7 +49,7 @@ def pendulum(force, at=1.5, width=WIDTH):
         jacobian=lambda t, q, p: np.array([[q[0], q[1]]]),
         gamma=lambda t, q, v, p: np.array([-(v[0] * v[0] + v[1] * v[1])]),
         parameters=[at, width],
-        compile=True,
+        compile=compile,
     )
 
 
@@ -80,6 +86,45 @@ def test_nor_is_a_force_that_is_switched_on_for_that_time(method):
         result = solve_dae(system, (0.0, T_END), *START, method=method, rtol=1e-6, atol=1e-6)
         assert result.success
         assert np.abs(result.q[:, -1] - end(switched, at)).max() < 1e-3
+
+
+def end_behind_edges(at, width):
+    """(x, y) at T_END by the angle under the magnet, begun anew at each of its edges."""
+
+    def rate(t, y):
+        return y[1], np.cos(y[0]) * magnet(t, [np.sin(y[0])], None, (at, width))[0] - 9.81 * np.sin(y[0])
+
+    events = [lambda t, y, edge=edge: np.sin(y[0]) - edge for edge in (at - width, at + width)]
+    for event in events:
+        event.terminal = True
+    t, y = 0.0, np.array([0.0, 3.0])
+    while t < T_END:
+        made = solve_ivp(rate, (t, T_END), y, method="DOP853", rtol=1e-10, atol=1e-10, max_step=2e-3, events=events)
+        t, y = made.t[-1], made.y[:, -1]
+        if made.status == 1:  # beyond the edge
+            y, t = y + 1e-10 * np.array(rate(t, y)), t + 1e-10
+    return np.array([np.sin(y[0]), -np.cos(y[0])])
+
+
+def test_nor_is_what_acts_at_a_place_that_is_passed_in_that_time():
+    at, width = 0.3, 3e-3
+    expected = end_behind_edges(at, width)
+    for compile in (True, False):
+        system = pendulum(magnet, at, width, compile)
+        for method in ("auto", "DOP853", "RadauIIA9"):
+            result = solve_dae(system, (0.0, T_END), START[0], [3.0, 0.0], method, rtol=1e-6, atol=1e-6)
+            assert result.success
+            assert np.abs(result.q[:, -1] - expected).max() < 1e-4
+
+
+def test_a_force_that_raises_where_no_step_comes_is_looked_at_where_steps_begin():
+    """x is at most 1, and its parabola goes beyond."""
+
+    def force(t, q, v, p):
+        return np.array([-math.sqrt(1.0 - q[0] * q[0]) if q[0] < 2.0 else 0.0, -9.81])
+
+    result = solve_dae(pendulum(force, compile=False), (0.0, T_END), START[0], [6.2, 0.0])
+    assert result.success and result.q[0].max() > 0.99
 
 
 def test_nor_in_lanes():

@@ -30,6 +30,19 @@ from twoloop.methods.tableaux import gauss
 
 of_solve = cases_of("solve_dae")
 of_argument = partial(argument, "solve_dae", solve)
+
+
+def latch():
+    """A force that keeps the latest time at which it was called."""
+    latest = [0.0]
+
+    def force(t, q, v):
+        latest[0] = max(t, latest[0])
+        return np.array([0.0, -latest[0]])
+
+    return force
+
+
 SOLVE = [
     *of_argument("q0", VECTORS),
     *of_argument("v0", FEW_VECTORS),
@@ -175,6 +188,13 @@ SOLVE = [
         lambda: solve(pendulum(force=lambda t, q, v: np.array([0.0, -9.81 if q[0] > 0.0 else -1.0])), compiled=True),
         "compiled=True needs equations .*force of 'pendulum': it branches",
         "leave it out, or write the callback without `if`, `abs`, `max`",
+    ),
+    of_solve(
+        "a force in Python that draws random numbers, or keeps what it did before",
+        lambda: solve(pendulum(force=latch())),
+        "force of 'pendulum' gives something else when it is called again with the same t, q and v",
+        "let it depend on its arguments alone; a controller that samples sets inputs of `Integrator.step`; steps of a "
+        "constant size (`step_size`) are not checked",
     ),
     of_solve(
         "a `Problem` as `system`",

@@ -88,7 +88,7 @@ class Traced:
         wrong = None
         with warnings.catch_warnings(), np.errstate(all="ignore"):
             warnings.simplefilter("ignore")
-            around = _around(t0, t1, q, v)
+            around = states_around(t0, t1, q, v)
             for states in (around, *around[:, None, :]):  # all at once, or one by one
                 try:
                     wrong = wrong or self.wrong(system, states, everywhere=False)
@@ -199,7 +199,7 @@ def unchecked(traced: Traced) -> None:
     """No check: of what is not to be run."""
 
 
-def _around(t0: float, t1: float, q: Array, v: Array) -> Array:
+def states_around(t0: float, t1: float, q: Array, v: Array) -> Array:
     """States [t, q, v], a start first, others about it at times of a run, at the speed of its size a second or more."""
     size = sizes(q)
     speed = np.maximum(size, np.abs(v))

@@ -321,7 +321,7 @@ def advance(
             size = goal - t
         if size > control[SPACING] > 0.0 or t < clock[SUDDEN] < t + size:
             whole, last = size, outputs[outputs.size - 1]
-            size = up_to_sudden(f, w, tolerances, clock, control[SPACING], t, whole, last, state[:n], state[n : 2 * n])
+            size = up_to_sudden(f, w, tolerances, control, clock, t, whole, last, state)
             if size < whole:
                 reaches, lands, shortened = False, False, True
         if not reaches and size <= max(NEAR * np.spacing(abs(t)), control[SHORTEST]):

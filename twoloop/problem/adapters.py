@@ -21,6 +21,7 @@ from twoloop.kernels.compile.private import Dispatcher
 Array = NDArray[np.float64]
 
 KIND_NAMES = tuple(KINDS)
+REAL = "fiu"  # kinds of arrays; durations are whole numbers to NumPy, and no forces
 HANDLE_BITS = 52  # so that a handle is a float64 exactly; a foreign one, of another process, matches none of ours
 
 
@@ -55,7 +56,7 @@ def store(kind: str, name: str, t: float, value: Any, out: Array) -> None:
     """Write what a Python function returned to `out`, or say what is wrong with it."""
     try:
         array = np.asarray(value)
-        real = np.issubdtype(array.dtype, np.number) and not np.iscomplexobj(array)
+        real = array.dtype.kind in REAL
     except ValueError:
         real = False
     if not real:

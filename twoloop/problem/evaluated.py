@@ -102,7 +102,8 @@ class EvaluatedEquations:
         if self.n_a > 0 or "jacobian" not in self.entries:
             return self.rows(t, q)
         values, shape = self.jacobian_values(t, q), (self.n_c, self.n_q)
-        made = self.remembered("sparse rows", lambda: SparseRows(*self.entries["jacobian"], values, shape))
+        rows, columns = self.entries["jacobian"]
+        made = self.remembered("sparse rows", lambda: SparseRows(rows, columns, values, shape))
         return made.with_values(made.added(values))  # type: ignore[no-any-return]
 
     def rates(self, t: float, q: ArrayLike) -> Array:

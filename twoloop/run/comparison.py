@@ -1,5 +1,6 @@
 """Callbacks compared once more, where a run went: derivatives, and what was traced of them."""
 
+import warnings
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -8,7 +9,8 @@ from numpy.typing import NDArray
 from twoloop.checks.derivatives import wrong_derivative
 from twoloop.checks.structure import unlike_itself
 from twoloop.generate.exact_derivatives import Territory, exact_derivatives, generic_states
-from twoloop.generate.traced_values import Sample
+from twoloop.generate.traced_values import CLEAR, FEW, Sample
+from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.record import Status
 
 if TYPE_CHECKING:
@@ -40,6 +42,10 @@ def compared(
         if check_derivatives:
             status, message = _derivatives_again(run, states, first, status, message)
         status, message = _traces(run, states, status, message)
+        if status == before and run.system.called_in_python and run.control[run.a.FIXED_STEP] == 0.0:
+            unlike = unlike_before(run.system, states[:: 1 + len(states) // FEW])
+            if unlike is not None:
+                status, message = Status.WRONG_TRACE, f"In the run {unlike}. {message}"
     if status == before:
         territory.add(states)
         run.compared_to[0] = end
@@ -60,6 +66,29 @@ def _derivatives_again(run: "Run", states: Array, first: Array, status: Status, 
         if wrong is not None:
             return Status.WRONG_DERIVATIVE, f"At t = {t:.10g} of the run {wrong} {message}"
     return status, message
+
+
+def unlike_before(system: ConstrainedSystem, states: Array) -> str | None:
+    """Say how a force called in Python differs at a state [t, q, v] once others were in between, or None."""
+    n, made = system.n_q, []
+    with warnings.catch_warnings(), np.errstate(all="ignore"):
+        warnings.simplefilter("ignore")
+        for t, *state in (*states, *states[::-1]):
+            try:
+                made.append(system.force(t, np.array(state[:n]), np.array(state[n:])))
+            except Exception:  # outside what it is made for
+                made.append(np.full(n, np.nan))
+    once, again = np.array(made[: len(states)]), np.array(made[len(states) :][::-1])
+    both = np.isfinite(once) & np.isfinite(again)
+    off = np.where(both, np.abs(once - again), 0.0)
+    if not off.max() > CLEAR * np.abs(once[both]).max(initial=0.0):
+        return None
+    k, entry = np.unravel_index(off.argmax(), off.shape)
+    return (
+        f"force of {system.name!r} gives something else when it is called again with the same t, q and v: at "
+        f"t = {states[k, 0]:.10g} entry {entry} is {once[k, entry]:.9g}, and then {again[k, entry]:.9g}. It must "
+        "depend on its arguments alone: steps are tried, refused, and looked at ahead"
+    )
 
 
 def _traces(run: "Run", states: Any, status: Status, message: str) -> tuple[Status, str]:

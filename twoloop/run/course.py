@@ -145,7 +145,10 @@ class Course:
         except KeyboardInterrupt:
             self.code = INTERRUPTED
         except Exception as error:  # of a callback; beyond a terminal event it does not matter
-            self.code, self.raised = INTERRUPTED, None if self.interrupts.asked else error
+            if run.clock[a.LOOKING] == 1.0 and not self.interrupts.asked:  # at a state to which the run may not come
+                run.clock[a.LOOKING] = self.control[a.AHEAD] = 0.0
+            else:
+                self.code, self.raised = INTERRUPTED, None if self.interrupts.asked else error
 
     def _take(self, t: Array, rows: Array, steps: Array, kinds: NDArray[np.int64]) -> None:
         """Take over what a chunk has stored."""

@@ -10,12 +10,13 @@ from twoloop.generate.derived import standing_for
 from twoloop.generate.exact_derivatives import exact_near
 from twoloop.generate.families import give_bounds, take_bounds
 from twoloop.generate.straight_code import OwnCode
-from twoloop.generate.traced_values import Traced
+from twoloop.generate.traced_values import Traced, states_around
 from twoloop.methods.code_for import Compiled, code_for, may_have_code
 from twoloop.methods.plan import Method
 from twoloop.methods.plans_for import plans_for
 from twoloop.methods.presets import is_preset
 from twoloop.problem.system import ConstrainedSystem
+from twoloop.run.comparison import unlike_before
 from twoloop.run.run import Run
 from twoloop.run.workspace import sparse_factors_pay
 
@@ -116,6 +117,10 @@ def _made(system: ConstrainedSystem, t0: float, q0: Array, v0: Array, asked: Ask
         plan = plan.changed(traced=(*plan.traced, *derived))
     if new:
         give_bounds(given)
+    if system.called_in_python and not fixed:
+        unlike = unlike_before(system, states_around(t0, asked.t1, q0, v0))
+        if unlike is not None:
+            raise ValueError(unlike)
     run = Run(system, plan, t0, q0, v0, asked.rtol, asked.atol, asked.step_size, interiors)
     _set_sizes(run, asked)
     if asked.max_steps is not None:

@@ -51,7 +51,7 @@ MEANINGS: dict[Status, str] = {
     Status.TIME_LIMIT: "the run reached its time_limit",
     Status.ROWS_CONTRADICT: "a constraint that depended on others at the start is violated",
     Status.RATE_JUMPS: "constraint_rate or nonholonomic_rate jumps, and no impulse gives velocities that are allowed",
-    Status.WRONG_TRACE: "a callback gives other values than the operations that were recorded of it",
+    Status.WRONG_TRACE: "a callback gives other values than the operations that were recorded of it, or than before",
 }
 
 

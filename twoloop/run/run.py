@@ -90,7 +90,7 @@ class Run:
         self.control[clock.MAX_STEP] = np.inf
         self.control[clock.FIXED_STEP] = 0.0 if step_size is None else step_size
         self.control[clock.MAX_STEPS] = np.inf
-        self.control[clock.BRIDGE] = self.static is None
+        self.control[clock.BRIDGE], self.control[clock.AHEAD] = self.static is None, 1.0
         rates = system.given.keys() & {"constraint_rate", "nonholonomic_rate", "kinematics"}
         self.control[clock.DRIVEN] = bool(rates)
         first_chunk = FIRST_CHUNK_IN_PYTHON if system.called_in_python else FIRST_CHUNK
@@ -100,7 +100,7 @@ class Run:
         self.control_by(plan)
         self.substituted = False  # whether another plan has taken over, for good
         self.clock[clock.JUMP_FROM] = self.clock[clock.JUMP_TO] = np.inf
-        self.clock[clock.ROUGH_TO] = self.clock[clock.LOOKED_TO] = self.clock[clock.SUDDEN] = -np.inf
+        self.clock[[clock.ROUGH_TO, clock.LOOKED_TO, clock.ALONG_TO, clock.SUDDEN]] = -np.inf
         self.looks_ahead = step_size is None and may_be_sudden(
             system, any("force" in each.kinds for each in plan.traced)
         )

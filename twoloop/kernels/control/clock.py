@@ -36,8 +36,9 @@ GO_ON = -1  # nothing of these yet
     DRIVEN,  # 1: C_t or b may jump
     ROUGH,  # by how much an error may be larger than its estimate where a force jumps, see UNFORESEEN
     SPACING,  # s, of times at which to look ahead for sudden changes; 0: there are none
+    AHEAD,  # 1: these looks go along the way; 0: they stay at the state, as a callback raised on the way
     N_CONTROL,
-) = range(N_RULE, N_RULE + 17)
+) = range(N_RULE, N_RULE + 18)
 
 # places in a row of `out_steps`: the size of an accepted step, and the counters so far; JACOBIANS is 0 after an
 # explicit step of a method that switches
@@ -63,5 +64,7 @@ H, ERRORS, FAILURES, PARTITIONS, JACOBIANS, N_STEP_COLUMNS = range(6)
     PIVOT_HERE,  # the smallest pivot at the end of the last step, of the static form
     LOOKED_TO,  # up to where changes with time were looked for
     SUDDEN,  # where the next one is that is sudden
+    ALONG_TO,  # up to where they were looked for along the way
+    LOOKING,  # 1: while callbacks are called along the way, at states to which the motion may not come
     N_CLOCK,
-) = range(N_PAST, N_PAST + 19)
+) = range(N_PAST, N_PAST + 21)

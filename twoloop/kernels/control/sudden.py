@@ -1,31 +1,37 @@
-"""Forces, C_t and b that change suddenly with time: a gust, a blow, a switch, between two places at which steps look.
+"""Forces, C_t and b that change suddenly: a gust, a blow, a switch, a magnet, between two places where steps look.
 
-They are called at times ahead, at the state where the step begins: a call of one callback where a look at the
-equations is an evaluation. Of what is smooth over some of these times second differences are small against the range
-of the values; of what happens within one or two of them they are as large. A step is to end there.
+They are called at times ahead: a call of one callback where a look at the equations is an evaluation. Of what is smooth
+over some of these times second differences are small against the range of the values, less the line from the first to
+the last; of what happens within one or two of them they are as large. A step is to end there. Long steps are looked at
+along the parabola on which the motion sets out, so that what is sharp by place or speed is seen as well; ahead of short
+ones the state stays that where the step begins, and of what is sharp by place the stages see enough.
 """
 
 import numpy as np
 
-from twoloop.kernels.control.clock import LOOKED_TO, SUDDEN
+from twoloop.kernels.control.clock import AHEAD, ALONG_TO, LOOKED_TO, LOOKING, SPACING, SUDDEN
 from twoloop.kernels.data.common import RTOL, compiled
 from twoloop.kernels.evaluation.constraints import constraint_rates
 from twoloop.kernels.evaluation.gamma import representable
 
 PLACES = 20  # times ahead that are compared
+LONG = 12.0  # spacings of these times: a step along whose way it is looked
 SHARE = 0.1  # of the range: a second difference that is sudden; that of a bell as wide as four of these times
 LEAST = 0.1  # of rtol, times the largest value so far: a range that may matter
 NEARLY = 0.01  # of the spacing of these times: before a sudden change by that is at it
-NOW, BEFORE, EARLIER, LOW, HIGH, BEND, PLACE, LARGEST, N_CHANGES = range(9)  # rows of w.changes
+LARGEST = PLACES + 1  # row of w.changes behind those of the values
+N_CHANGES = PLACES + 2
 
 
 @compiled
-def _call(f, w, time, q, v):
-    """Forces, C_t and b at a time."""
-    now = w.changes[NOW]
+def _call(f, w, time, since, q, v, a, now):
+    """Forces, C_t and b at a time, and at the state `since` seconds after (q, v, a)."""
+    for m in range(q.size):
+        w.x[m] = q[m] + since * (v[m] + 0.5 * since * a[m])
+        w.y[m] = v[m] + since * a[m]
     now[: q.size] = 0.0
-    f.force(time, q, v, f.p, now[: q.size])
-    constraint_rates(f, w, time, q, now[q.size :])
+    f.force(time, w.x, w.y, f.p, now[: q.size])
+    constraint_rates(f, w, time, w.x, now[q.size :])
 
 
 @compiled
@@ -38,48 +44,72 @@ def _largest(values):
 
 
 @compiled
-def sudden_time(f, w, tolerances, t, spacing, last, q, v):
-    """The first of the times ahead at which something changes suddenly, or infinity; and up to where it was looked.
-
-    None is after `last`. A value that is not finite is left to the step.
-    """
-    changes, end, n = w.changes, last, q.size
-    for k in range(PLACES + 1):
-        time = t + k * spacing
-        if time > last:
-            break
-        if k == PLACES:
-            end = time
-        _call(f, w, time, q, v)
-        for j in range(changes.shape[1]):
-            x = changes[NOW, j]
-            changes[LARGEST, j] = max(changes[LARGEST, j], abs(x))
-            if k == 0:
-                changes[LOW, j] = changes[HIGH, j] = x
-                changes[BEND, j] = changes[PLACE, j] = 0.0
-            else:
-                changes[LOW, j], changes[HIGH, j] = min(changes[LOW, j], x), max(changes[HIGH, j], x)
-            if k > 1:
-                bend = abs(x - 2.0 * changes[BEFORE, j] + changes[EARLIER, j])
-                if bend > changes[BEND, j]:
-                    changes[BEND, j], changes[PLACE, j] = bend, k - 1.0
-            changes[EARLIER, j], changes[BEFORE, j] = changes[BEFORE, j], x
-    of_forces, of_rates = _largest(changes[LARGEST, :n]), _largest(changes[LARGEST, n:])
-    first = np.inf
-    for j in range(changes.shape[1]):
-        span, least = changes[HIGH, j] - changes[LOW, j], LEAST * tolerances[RTOL]
-        least *= of_forces if j < n else of_rates
-        if span > least and changes[BEND, j] > SHARE * span:
-            first = min(first, t + changes[PLACE, j] * spacing)
-    return first, min(first, end)
+def _first_bend(values, n, slope, least):
+    """Place of the largest second difference of n + 1 values, less a line, where it is sudden; else 0."""
+    low = high = bend = 0.0
+    place = 0
+    for k in range(1, n + 1):
+        off = values[k] - values[0] - k * slope
+        low, high = min(low, off), max(high, off)
+        if k < n:
+            second = abs(values[k + 1] - 2.0 * values[k] + values[k - 1])
+            if second > bend:
+                bend, place = second, k
+    return place if high - low > least and bend > SHARE * (high - low) else 0
 
 
 @compiled
-def up_to_sudden(f, w, tolerances, clock, spacing, t, size, last, q, v):
-    """The size of a step that does not pass over a sudden change with time."""
+def sudden_time(f, w, tolerances, t, begin, spacing, last, along, q, v, a):
+    """The first of the times ahead at which something changes suddenly, or infinity; and up to where it was looked.
+
+    The state is that at t, the times go from `begin`, none is after `last`; `along` tells whether the state goes with
+    them. A value that is not finite is left to the step.
+    """
+    changes, n = w.changes, 0
+    for k in range(PLACES + 1):
+        time = begin + k * spacing
+        if time > last:
+            break
+        n = k
+        _call(f, w, time, along * (time - t), q, v, a, changes[k])
+        for j in range(changes.shape[1]):
+            changes[LARGEST, j] = max(changes[LARGEST, j], abs(changes[k, j]))
+    least = LEAST * tolerances[RTOL]
+    of_forces, of_rates = least * _largest(changes[LARGEST, : q.size]), least * _largest(changes[LARGEST, q.size :])
+    first = np.inf
+    for j in range(changes.shape[1]):
+        values = changes[:, j]
+        slope = along * (values[n] - values[0]) / max(n, 1)
+        place = _first_bend(values, n, slope, of_forces if j < q.size else of_rates)
+        if place > 0:
+            first = min(first, begin + place * spacing)
+    return first, min(first, begin + PLACES * spacing if n == PLACES else last)
+
+
+@compiled
+def _look_along(f, w, tolerances, clock, spacing, t, size, last, q, v, a):
+    """Look along the way of a long step, once."""
+    if clock[ALONG_TO] >= t + (1.0 - NEARLY) * size:
+        return
+    clock[LOOKING] = 1.0
+    first, clock[ALONG_TO] = sudden_time(f, w, tolerances, t, t, size / PLACES, last, 1.0, q, v, a)
+    clock[LOOKING] = 0.0
+    if first == np.inf:
+        clock[LOOKED_TO] = max(clock[LOOKED_TO], t + size)
+    elif first < clock[SUDDEN] or clock[SUDDEN] <= t + NEARLY * spacing:
+        clock[SUDDEN] = clock[LOOKED_TO] = first
+
+
+@compiled
+def up_to_sudden(f, w, tolerances, control, clock, t, size, last, state):
+    """The size of a step that does not pass over a sudden change."""
+    n, spacing = w.Q.size, control[SPACING]
+    q, v, a = state[:n], state[n : 2 * n], state[2 * n : 3 * n]
+    if control[AHEAD] == 1.0 and LONG * spacing < size < (PLACES + NEARLY) * spacing:
+        _look_along(f, w, tolerances, clock, spacing, t, size, last, q, v, a)
     while clock[SUDDEN] <= t + NEARLY * spacing or clock[SUDDEN] == np.inf:
         begin = max(t, clock[LOOKED_TO])
         if begin >= min(t + size, last):
             return size
-        clock[SUDDEN], clock[LOOKED_TO] = sudden_time(f, w, tolerances, begin, spacing, last, q, v)
+        clock[SUDDEN], clock[LOOKED_TO] = sudden_time(f, w, tolerances, t, begin, spacing, last, 0.0, q, v, a)
     return min(size, representable(t, clock[SUDDEN] - t))
