@@ -27,14 +27,14 @@ from twoloop.run import comparison
 # calls of functions in a second run, which compares callbacks again at four states, and in a third
 MANY, FEW = 820, 250
 ANOTHER = {  # the same in a run from another start, and in one with other parameters
-    "four_bar": (290, 2600),
-    "andrews": (290, 2200),
-    "redundant_slider_crank": (390, 3300),
-    "heavy_top": (290, 2400),
-    "spatial_four_bar": (280, 2450),
-    "spatial_slider_crank": (280, 2400),
-    "closed_chain": (290, 3050),
-    "bricard": (380, 2350),
+    "four_bar": (340, 2600),
+    "andrews": (340, 2200),
+    "redundant_slider_crank": (450, 3300),
+    "heavy_top": (350, 2400),
+    "spatial_four_bar": (340, 2450),
+    "spatial_slider_crank": (340, 2400),
+    "closed_chain": (340, 3050),
+    "bricard": (450, 2350),
 }
 ACROSS = 650  # in one from another start that crosses singular positions
 

@@ -80,7 +80,7 @@ def unlike_before(system: ConstrainedSystem, states: Array) -> str | None:
                 made.append(np.full(n, np.nan))
     once, again = np.array(made[: len(states)]), np.array(made[len(states) :][::-1])
     both = np.isfinite(once) & np.isfinite(again)
-    off = np.where(both, np.abs(once - again), 0.0)
+    off = np.abs(np.subtract(once, again, out=np.zeros_like(once), where=both))
     if not off.max() > CLEAR * np.abs(once[both]).max(initial=0.0):
         return None
     k, entry = np.unravel_index(off.argmax(), off.shape)
