@@ -24,8 +24,8 @@ def write(folder: Path) -> None:
         if file.suffix in SHOWN:
             shutil.copy(file, reports)
     shutil.copytree(ROOT / "reports" / "engines", reports / "engines")  # scripts that a report links
-    index = reports / "README.md"  # from docs/generated/reports the pages are two folders up
-    index.write_text(index.read_text(encoding="utf-8").replace("](../docs/", "](../../"), encoding="utf-8")
+    for report in reports.glob("*.md"):  # from docs/generated/reports the pages are two folders up
+        report.write_text(report.read_text(encoding="utf-8").replace("](../docs/", "](../../"), encoding="utf-8")
     (folder / "which_method.md").write_text(page(ROOT / "reports"), encoding="utf-8")
     (folder / "takes.md").write_text(table(ROOT / "reports"), encoding="utf-8")
     rooms.draw(folder / "rooms.svg")

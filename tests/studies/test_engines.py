@@ -72,7 +72,7 @@ def test_the_settings_of_the_first_screen_hold_on_a_file_by_hand():
     file = Path(__file__).parents[2] / "reports/engines/four_bar.xml"
     _, text = said(made("MuJoCo, RK4, solref 2h", 10.0 * STEPS**2))
     given = file.read_text()
-    assert 'integrator="RK4"' in given and all(each in given for each in text.split("<connect ... ")[1].split("/>")[:1])
+    assert 'integrator="RK4"' in given and all(each in given for each in text.split('anchor="..." ')[1].split("/>")[:1])
     audit = audit_mjcf(file, error=1e-3, t_end=2.0).audits[0]
     assert audit.reaching.step >= 2e-3 and audit.order > 1.8 and audit.floor is None
 
