@@ -168,8 +168,8 @@ def test_every_number_of_the_screen_is_made_again_from_the_rows(tmp_path):
         "of 125, heyoka 1 of 66, IDA and CVODE 0 of 64. With the parameters used in development: the default 7 of 67, "
         "our other methods 5 of 128. ",
         "at least every 5e-4 of a run; a shorter one can be missed, by the default too (gusts of 1e-4 to 0.010 s at "
-        "random times, looked at every 1.5e-3 s: the longer ones make it wrong by over 1e-3 in 0 of 60 runs, the shorter "
-        "in 3 of 40): ",
+        "random times, looked at every 1.5e-3 s: the longer ones make it wrong by over 1e-3 in 0 of 60 runs, the "
+        "shorter in 3 of 40): ",
     ]
     for said in expected:
         assert said in text, said
