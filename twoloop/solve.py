@@ -2,6 +2,7 @@
 
 from __future__ import annotations  # ArrayLike stays a word in help()
 
+import os
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
@@ -28,9 +29,11 @@ from twoloop.methods.plan import Method
 from twoloop.methods.presets import PRESETS
 from twoloop.problem.events import check_events
 from twoloop.problem.system import ConstrainedSystem, check_system
+from twoloop.result.folder import begin_folder, check_folder, end_folder
 from twoloop.result.result import Result, result_of
 from twoloop.run.course import Course
 from twoloop.run.interrupts import Interrupts, not_begun
+from twoloop.run.kept import InMemory, OnDisk
 from twoloop.run.launch import Asked, run_from
 from twoloop.run.recorder import Wanted
 
@@ -61,6 +64,7 @@ def solve_dae(
     time_limit: float | None = None,
     check_derivatives: bool = True,
     compiled: Compiled = "auto",
+    store: str | os.PathLike[str] | None = None,
 ) -> Result:
     """Integrate a constrained mechanical system; its constraints hold at every step.
 
@@ -133,6 +137,10 @@ def solve_dae(
         branch on t, q or v. What near a singular position cannot be trusted to this code is computed without.
         "auto" (default): for small mechanisms with compiled callbacks, whose code takes some tenths of a second. This
         depends on the arguments of the call alone: the same call gives the same numbers whatever ran before.
+    store : str or path, optional
+        A folder to make, for runs of which the memory does not hold all: what the run keeps goes there as it comes,
+        and arrays of the result, the dense solution's too, are read from there as they are used. Events stay in memory.
+        `twoloop.load` reads the folder again, also that of a run that failed or whose process died.
 
     Returns
     -------
@@ -163,6 +171,7 @@ def solve_dae(
     if step_size is not None and step_size > (t1 - t0) * (1.0 + SAME):
         raise ValueError(f"step_size must not exceed the length of t_span, {t1 - t0:g}; given {step_size!r}")
     times = None if t_eval is None else check_times(t_eval, t0, t1, step_size)
+    folder = None if store is None else check_folder(store)
     with Interrupts() as interrupts:
         asked = Asked(
             method=chosen,
@@ -182,7 +191,8 @@ def solve_dae(
         with_code = bool(run.plan.own)
         with _progress_bar(chosen.name, t0, t1) if progress else NO_BAR as report:
             lands = run.plan.lands or step_size is not None or (times is not None and set(times.tolist()) <= {t0, t1})
-            wanted = Wanted(times, lands, bool(dense_output), event_functions)
+            kept = InMemory() if folder is None else begin_folder(folder, system.n_q)
+            wanted = Wanted(times, lands, bool(dense_output), event_functions, kept)
             record = Course(run, t1, wanted, report, time_limit, interrupts).to_end(check_derivatives)
         give_back(run.work)
         untested = record.untested if getattr(chosen, "tested", "all") == "positions" else None
@@ -190,7 +200,10 @@ def solve_dae(
         if own is not None:  # Newmark's own test, of positions, has its place
             rtol, atol[:], untested = own, own, np.ones(len(record.h), dtype=bool)
         told = {"method": chosen.name, "compiled": with_code, "rtol": float(rtol), "atol": atol}
-        return result_of(record, system=system, untested=untested, **told)
+        result = result_of(record, system=system, untested=untested, **told)
+        if isinstance(kept, OnDisk):
+            end_folder(kept, result)
+        return result
     return result_of(not_begun(system, t0, event_functions, chosen.name))
 
 

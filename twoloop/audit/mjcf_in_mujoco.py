@@ -5,13 +5,11 @@ from importlib import import_module
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from twoloop.bodies.model_problem import ModelProblem
 from twoloop.bodies.spatial_model import SpatialModel
+from twoloop.checks.arguments import Array
 from twoloop.mechanisms.rotation import euler_parameters, euler_rates
-
-Array = NDArray[np.float64]
 
 # what `from_mjcf` leaves out and MuJoCo can be run without, by how the words for it begin
 SWITCHED_OFF = (

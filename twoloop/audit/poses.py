@@ -3,11 +3,10 @@
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from twoloop.checks.arguments import Array
 from twoloop.mechanisms.rotation import euler_parameters, rotation_matrix
-
-Array = NDArray[np.float64]
 
 POINTS_STAY = ("revolute", "spherical", "universal", "fixed")  # kinds of joints that keep two points together
 

@@ -7,15 +7,13 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from twoloop.audit.poses import gaps, poses
 from twoloop.bodies.model_problem import ModelProblem
-from twoloop.checks.arguments import check_positive, shown
+from twoloop.checks.arguments import Array, check_positive, shown
 from twoloop.checks.consistency import ConstraintWarning
 from twoloop.solve import solve_dae
 
-Array = NDArray[np.float64]
 Simulate = Callable[[ModelProblem, Array, float], Any]
 
 INSTANTS = 50  # beside the start, at which motions are compared

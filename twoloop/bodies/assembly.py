@@ -11,18 +11,19 @@ from numpy.typing import NDArray
 from scipy.linalg import lapack, null_space
 from scipy.optimize import least_squares
 
-from twoloop.checks.scales import scales_of
+from twoloop.checks.arguments import Array
+from twoloop.checks.scales import TURNS, column_scales, generic_factors, median, scales_of
+from twoloop.checks.sparse_rows import SparseRows, norms
 from twoloop.problem.description import name_and_unit
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.projection import consistent_state
-
-Array = NDArray[np.float64]
 
 SINGULAR = 1e-9  # singular values of scaled rows that count as zero, over the largest
 NEARBY = 0.02  # of the largest coordinate, at least of 1: how far away the joints are looked at once more
 ROUGH = 0.1  # of the largest velocity given: by how much joints may change it
 ROUNDING = 8.0 * np.finfo(np.float64).eps  # of the terms of a constraint
 CLEAR = 1e-12  # reciprocal condition of C_q C_q^T from which the rank is full without a doubt
+TURN = 1e-4  # of the units of coordinates: a way over which it is seen how fast rows turn
 SMALL = 0.05  # rad or m, of a step to where a drive begins ...
 CORRECTIONS = 5  # ... and of Newton's in each
 STAYS = 1e-7  # of the size of the model: what a joint that cannot close leaves open at least
@@ -78,7 +79,9 @@ def positions(
     """
     if system.n_c == 0:
         return guess
-    terms = np.abs(system.jacobian(t, guess)) @ np.where(turning, np.maximum(np.abs(guess), 1.0), np.abs(guess))
+    terms = abs(system.sparse_rows(t, guess)[: system.n_c]) @ np.where(
+        turning, np.maximum(np.abs(guess), 1.0), np.abs(guess)
+    )
     if (np.abs(system.constraint(t, guess)) <= ROUNDING * terms).all():
         return guess
     try:
@@ -222,6 +225,8 @@ def freedom(system: ConstrainedSystem, t: float, q: Array, rows: Mapping[str, tu
     """Degrees of freedom at a start and beside it, and which joints have rows that follow from others."""
     if system.n_c + system.n_a == 0:
         return Freedom(system.n_q, 0, ())
+    if _full_by_entries(system, t, q):
+        return Freedom(system.n_q - system.n_c - system.n_a, 0, ())
     scaled = _scaled(system, t, q)
     if _full_rank(scaled):
         return Freedom(system.n_q - len(scaled), 0, ())
@@ -244,6 +249,35 @@ def freedom(system: ConstrainedSystem, t: float, q: Array, rows: Mapping[str, tu
 def _scaled(system: ConstrainedSystem, t: float, q: Array) -> Array:
     rows = system.rows(t, q)
     return scales_of(system, t, q, rows).scaled(rows)
+
+
+def _full_by_entries(system: ConstrainedSystem, t: float, q: Array) -> bool:
+    """The same as `_full_rank` of large systems that give their entries; False: their full matrices have to say."""
+    rows = system.sparse_rows(t, q)
+    if not isinstance(rows, SparseRows) or len(rows) > rows.shape[1]:
+        return False
+    from scipy.sparse import csc_array  # which takes a while
+    from scipy.sparse.linalg import LinearOperator, onenormest, splu
+
+    size = np.abs(q)
+    columns = column_scales(rows, np.maximum(size, median(size[size > 0.0]) if size.any() else 1.0))
+    way, units = TURN * columns * generic_factors(len(q)), columns[rows.columns]
+    try:
+        sides = [rows.added(system.jacobian_values(t, q + part)) for part in (way, -way)]
+    except Exception:  # outside what the callbacks are made for
+        return False
+    turned = norms(rows.with_values((sides[0] - sides[1]) * units)) / (2.0 * TURN)
+    lengths = np.maximum(norms(rows.with_values(rows.values * units)), TURNS * turned)
+    if not (lengths > 0.0).all():
+        return False
+    scaled = csc_array((rows.values * units / lengths[rows.rows], (rows.rows, rows.columns)), shape=rows.shape)
+    square = (scaled @ scaled.T).tocsc()
+    try:
+        factors = splu(square, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+    except RuntimeError:  # exactly singular
+        return False
+    inverse = LinearOperator(square.shape, matvec=factors.solve, rmatvec=factors.solve, dtype=float)
+    return bool(abs(square).sum(axis=0).max() * onenormest(inverse) < 1.0 / CLEAR)
 
 
 def _full_rank(scaled: Array) -> bool:

@@ -5,20 +5,21 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from twoloop.bodies.documented import documented
 from twoloop.bodies.functions import Function, force_function
 from twoloop.bodies.parameter_layout import NONE
 from twoloop.bodies.parts import Body, BodyDirection, BodyPoint, DryFriction, Force, JointRow, ModelJoint, Numbers
-from twoloop.checks.arguments import check_positive, check_text, check_vector, shown
+from twoloop.checks.arguments import Array, check_positive, check_text, check_vector, shown
 from twoloop.problem.stops import Stop
 
-Array = NDArray[np.float64]
 Points = tuple[Numbers, Numbers]
 
 AXES = ("x", "y", "z")
 
 
+@documented
 class Collection:
     """Bodies, joints and forces, in two or three dimensions."""
 
@@ -35,6 +36,7 @@ class Collection:
         self.forces: list[Force] = []
         self.stops: list[Stop] = []
         self.dry: list[DryFriction] = []
+        self.taken: list[Numbers] = []  # by racks and limits, which go on with these values
 
     def __repr__(self) -> str:
         return (
@@ -201,16 +203,6 @@ class Collection:
             The points, in space in the position given, m.
         length : float, optional
             m. None: their distance in the position given.
-        name : str, optional
-
-        Returns
-        -------
-        ModelJoint
-
-        Raises
-        ------
-        TypeError, ValueError
-            If an argument is wrong.
         """
         first, second = self._body("a", a), self._body("b", b)
         self._different("distance joint", first, second)

@@ -8,16 +8,13 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from twoloop.bodies.row_function import RowFunction
-from twoloop.checks.arguments import check_finite, check_real, shown
+from twoloop.checks.arguments import Array, check_finite, check_real, shown
 from twoloop.generate.calls_on_symbols import as_forms, trace
 from twoloop.generate.derivative import Derivative
 from twoloop.generate.programs import Program, numbers_of, program_of
 from twoloop.generate.tracing import Form, Graph, Untraceable, symbols
-
-Array = NDArray[np.float64]
 
 ARGUMENTS = {1: "(t)", 3: "(t, q, v)"}
 

@@ -5,14 +5,12 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from twoloop.bodies.parameter_layout import FORCE_WIDTH, FORCES, HEAD, N_FORCES
 from twoloop.bodies.parts import Force
 from twoloop.bodies.places import turned
 from twoloop.bodies.tables import Tables
-
-Array = NDArray[np.float64]
+from twoloop.checks.arguments import Array
 
 STEPS = 50  # of Newton's method, which needs three or four
 AGREES = 1e-14  # relative: friction, from step to step
@@ -43,9 +41,8 @@ class LoadedFriction:
         self._numbers = [tables.place(force) + np.arange(_size(force)) for force in tables.loaded]
         self._rows = [self._carrying(force, tables) for force in tables.loaded]
         first = int(tables.p[tables.p.size - HEAD + FORCES]) + FORCE_WIDTH * len(tables.forces)
-        self._units = [
-            first + FORCE_WIDTH * k for k in range(len(self._loaded))
-        ]  # rows of unit motors, behind the forces
+        # rows of unit motors, behind the forces
+        self._units = [first + FORCE_WIDTH * k for k in range(len(self._loaded))]
 
     def _carrying(self, force: Force, tables: Tables) -> list[int]:
         """The rows that carry the load of a joint: those of its point, or across its guide."""

@@ -8,12 +8,14 @@ from typing import Any
 import numpy as np
 
 from twoloop.bodies.collection import Collection
+from twoloop.bodies.documented import documented
 from twoloop.bodies.functions import Function, motion_function
 from twoloop.bodies.parameter_layout import BRAKE, FORCE, PULL, RAIL, RUB, SPRING, TORQUE
 from twoloop.bodies.parts import Body, DryFriction, Force, JointRow, ModelJoint, Numbers
 from twoloop.checks.arguments import check_finite, check_not_negative, check_positive
 
 
+@documented
 class Loads(Collection):
     """Adds springs, forces, motors and drives to a model."""
 
@@ -54,16 +56,6 @@ class Loads(Collection):
             N/m and N s/m.
         length : float, optional
             At which the spring is without force, m. None: the distance of the points in the position given.
-        name : str, optional
-
-        Returns
-        -------
-        Force
-
-        Raises
-        ------
-        TypeError, ValueError
-            If an argument is wrong.
         """
         first, second = self._body("a", a), self._body("b", b)
         self._different("spring", first, second)
@@ -105,26 +97,11 @@ class Loads(Collection):
         angle : float
             By how much b must have turned against a, from the position given, for the spring to be without torque, rad.
             In space b may turn by 0.95 of a turn to either side of that position; there the spring has no value beyond.
-        name : str, optional
-
-        Returns
-        -------
-        Force
-
-        Raises
-        ------
-        TypeError, ValueError
-            If an argument is wrong.
         """
         hinge = self._joint(joint, ("revolute",), "torsion_spring")
         name = self._new_name(f"torsion spring of {hinge.name}", name)
-        values = (
-            check_not_negative("stiffness", stiffness),
-            check_not_negative("damping", damping),
-            check_finite("angle", angle),
-        )
-        names = f"stiffness of {name} (N m/rad)", f"damping of {name} (N m s/rad)", f"angle of {name} (rad)"
-        return self._add_force(self._torsion(name, hinge, Numbers(values, names)))
+        given = {"stiffness": (stiffness, "N m/rad"), "damping": (damping, "N m s/rad"), "angle": (angle, "rad")}
+        return self._add_force(self._torsion(name, hinge, _spring_numbers(name, given)))
 
     def axial_spring(
         self,
@@ -146,26 +123,11 @@ class Loads(Collection):
         length : float
             By how much b must have slid along the axis of a, from its point there, for the spring to be without force,
             m; negative: against the axis.
-        name : str, optional
-
-        Returns
-        -------
-        Force
-
-        Raises
-        ------
-        TypeError, ValueError
-            If an argument is wrong.
         """
         slide = self._joint(joint, ("prismatic",), "axial_spring")
         name = self._new_name(f"spring of {slide.name}", name)
-        values = (
-            check_not_negative("stiffness", stiffness),
-            check_not_negative("damping", damping),
-            check_finite("length", length),
-        )
-        names = f"stiffness of {name} (N/m)", f"damping of {name} (N s/m)", f"length of {name} (m)"
-        return self._add_force(self._along(name, RAIL, slide, Numbers(values, names)))
+        given = {"stiffness": (stiffness, "N/m"), "damping": (damping, "N s/m"), "length": (length, "m")}
+        return self._add_force(self._along(name, RAIL, slide, _spring_numbers(name, given)))
 
     def friction(
         self,
@@ -179,11 +141,11 @@ class Loads(Collection):
     ) -> Force:
         """Friction in a revolute or prismatic joint, by a smooth law: -(f + coefficient load) tanh(rate / speed).
 
-        Dry friction jumps where the motion reverses, and holds at rest; this law does neither: it creeps below that. A
-        small `speed` makes the equations stiff. With a coefficient it grows with the load of the joint: with its force
-        across the axis, times the radius of a hinge; torques and thrust that the joint carries are not counted. The
-        forces in the joints are then found at every evaluation, in Python, and the friction has no value where a
-        coefficient is so large that the joint may jam.
+        Dry friction jumps where the motion reverses, and holds at rest; this law does neither: a joint under a smaller
+        force creeps. A small `speed` makes the equations stiff. With a coefficient it grows with the load of the joint:
+        with its force across the axis, times the radius of a hinge; torques and thrust that the joint carries are not
+        counted. The forces in the joints are then found at every evaluation, in Python, and the friction has no value
+        where a coefficient is so large that the joint may jam.
 
         Parameters
         ----------
@@ -242,16 +204,6 @@ class Loads(Collection):
             The torque or force against sliding, N m or N.
         static : float, optional
             The most that holds the joint while it sticks, at least `f`. None: the same.
-        name : str, optional
-
-        Returns
-        -------
-        DryFriction
-
-        Raises
-        ------
-        TypeError, ValueError
-            If an argument is wrong.
         """
         rubbed = self._joint(joint, ("revolute", "prismatic"), "dry_friction")
         name = self._new_name(f"dry friction of {rubbed.name}", name)
@@ -274,16 +226,6 @@ class Loads(Collection):
         f : array_like (2 or 3,) or callable
             N: a constant force, or f(t) or f(t, q, v) that returns one. The coordinates of a body in `q` and `v` are
             `body.coordinates`.
-        name : str, optional
-
-        Returns
-        -------
-        Force
-
-        Raises
-        ------
-        TypeError, ValueError
-            If an argument is wrong.
         """
         on = self._moving_body("body", body)
         name = self._new_name(f"force on {on.name}", name)
@@ -299,16 +241,6 @@ class Loads(Collection):
         body : Body or str
         f : float, array_like (3,) or callable
             N m: a constant torque, or f(t) or f(t, q, v) that returns one.
-        name : str, optional
-
-        Returns
-        -------
-        Force
-
-        Raises
-        ------
-        TypeError, ValueError
-            If an argument is wrong.
         """
         on = self._moving_body("body", body)
         name = self._new_name(f"torque on {on.name}", name)
@@ -323,16 +255,6 @@ class Loads(Collection):
         joint : ModelJoint or str
         f : float or callable
             N m or N: a number, or f(t) or f(t, q, v) that returns one.
-        name : str, optional
-
-        Returns
-        -------
-        Force
-
-        Raises
-        ------
-        TypeError, ValueError
-            If an argument is wrong.
         """
         moved = self._joint(joint, ("revolute", "prismatic"), "motor")
         name = self._new_name(f"motor of {moved.name}", name)
@@ -373,3 +295,10 @@ class Loads(Collection):
         name = self._new_name(f"drive of {moved.name}", name)
         row = self._drive_row(moved, motion_function(f"motion of {name!r}", motion, rate, acceleration))
         return self._add_joint(ModelJoint(name, "drive", moved.a, moved.b, (row,), moved.point_a, moved.point_b))
+
+
+def _spring_numbers(name: str, given: dict[str, tuple[float, str]]) -> Numbers:
+    """Stiffness, damping and rest of a spring in a joint, with their units; the last may be negative."""
+    checks = check_not_negative, check_not_negative, check_finite
+    values = tuple(check(what, value) for check, (what, (value, _)) in zip(checks, given.items(), strict=True))
+    return Numbers(values, tuple(f"{what} of {name} ({unit})" for what, (_, unit) in given.items()))

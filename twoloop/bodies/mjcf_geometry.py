@@ -5,15 +5,18 @@ See MuJoCo's XML reference, mujoco.readthedocs.io/en/stable/XMLreference.html.
 
 from __future__ import annotations
 
+import os
+import warnings
+import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
+from xml.etree.ElementTree import Element
 
 import numpy as np
-from numpy.typing import NDArray
 
+from twoloop.checks.arguments import Array
 from twoloop.mechanisms.rotation import rotation_matrix
-
-Array = NDArray[np.float64]
 
 DENSITY = 1000.0  # kg/m^3, of geoms that give neither mass nor density
 
@@ -62,6 +65,24 @@ def together(lumps: list[Lump]) -> Lump:
         d = lump.centre - centre
         J += lump.J + lump.mass * (d @ d * np.eye(3) - np.outer(d, d))
     return Lump(mass, centre, J)
+
+
+def root_of(path: str | os.PathLike[str], tag: str) -> Element:
+    """The first element of an XML file, which must have this tag."""
+    try:
+        root = ElementTree.parse(path).getroot()
+    except ElementTree.ParseError as error:
+        raise ValueError(f"{os.fspath(path)!r} is not XML: {error}") from None
+    if root.tag != tag:
+        raise ValueError(f"{os.fspath(path)!r} must begin with <{tag}>; it begins with <{root.tag}>")
+    return root
+
+
+def tell_ignored(path: str | os.PathLike[str], model: Any, ignored: list[str]) -> None:
+    """Note what was not read of a file in its model, and warn whoever called the caller."""
+    model.ignored = tuple(ignored)
+    if ignored:
+        warnings.warn(f"{os.fspath(path)!r}: ignored are {'; '.join(ignored)}", IgnoredWarning, stacklevel=3)
 
 
 def numbers(text: str, n: int, what: str) -> Array:

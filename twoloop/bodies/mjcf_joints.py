@@ -5,13 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from twoloop.bodies.mjcf_geometry import Lump, Pose, together
 from twoloop.bodies.parts import Body, ModelJoint
 from twoloop.bodies.spatial_model import SpatialModel
-
-Array = NDArray[np.float64]
+from twoloop.checks.arguments import Array
 
 SAME = 1e-9  # of directions, and of places over 1 m
 
@@ -65,6 +63,9 @@ def add_joints(model: SpatialModel, parent: Body, child: Body, freed: list[Freed
         If no joint of a model leaves that.
     """
     kinds = sorted(each.kind for each in freed)
+    slid = np.array([each.axis for each in freed if each.kind == "slide"])
+    if len(slid) > 1 and np.linalg.svd(slid, compute_uv=False)[-1] < SAME:
+        raise ValueError(f"the slides of the body {child.name!r} must have axes that do not follow from one another")
     if kinds in (["free"], ["ball", "slide", "slide", "slide"]):
         return None
     hinges, slides = ([each for each in freed if each.kind == kind] for kind in ("hinge", "slide"))

@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 import os
-import warnings
-import xml.etree.ElementTree as ElementTree
 from typing import Any
 from xml.etree.ElementTree import Element
 
 import numpy as np
-from numpy.typing import NDArray
 
-from twoloop.bodies.mjcf_geometry import IgnoredWarning, Lump, Pose, geom_lump, numbers, pose_of
+from twoloop.bodies.mjcf_geometry import Lump, Pose, geom_lump, numbers, pose_of, root_of, tell_ignored
 from twoloop.bodies.mjcf_joints import Freed, Part, add_part, body_of
 from twoloop.bodies.parts import Body, ModelJoint
 from twoloop.bodies.spatial_model import SpatialModel
-
-Array = NDArray[np.float64]
+from twoloop.checks.arguments import Array
 
 SEEN_ONLY = {"asset", "visual", "statistic", "size", "custom", "camera", "light"}  # without effect on the motion
 KNOWN = {"compiler", "option", "default", "worldbody", "equality", "tendon"}
@@ -57,17 +53,10 @@ def from_mjcf(path: str | os.PathLike[str]) -> SpatialModel:
     -----
     The format is described in MuJoCo's XML reference.
     """
-    try:
-        root = ElementTree.parse(path).getroot()
-    except ElementTree.ParseError as error:
-        raise ValueError(f"{os.fspath(path)!r} is not XML: {error}") from None
-    if root.tag != "mujoco":
-        raise ValueError(f"{os.fspath(path)!r} must begin with <mujoco>; it begins with <{root.tag}>")
+    root = root_of(path, "mujoco")
     reader = _Reader(root)
     reader.read()
-    reader.model.ignored = tuple(reader.ignored)
-    if reader.ignored:
-        warnings.warn(f"{os.fspath(path)!r}: ignored are {'; '.join(reader.ignored)}", IgnoredWarning, stacklevel=2)
+    tell_ignored(path, reader.model, reader.ignored)
     return reader.model
 
 
@@ -93,8 +82,10 @@ class _Reader:
             for key in ("density", "viscosity", "wind"):
                 if any(float(x) for x in each.get(key, "0").split()):
                     self.ignored.append(f"{key} of the surrounding medium")
-        flags = (flag.attrib for each in root.findall("option") for flag in each.findall("flag"))
-        disabled = {key for flag in flags for key, value in flag.items() if value == "disable"}
+        flags = {
+            key: value for flag in root.findall("option/flag") for key, value in flag.attrib.items()
+        }  # last counts
+        disabled = {key for key, value in flags.items() if value == "disable"}
         gravity = np.zeros(3) if "gravity" in disabled else gravity
         self.without_loops = bool(disabled & {"constraint", "equality"})
         self.without = {"stiffness"} if "spring" in disabled else set()
@@ -226,10 +217,11 @@ class _Reader:
             self.n_geoms += 1
         if given.get("shellinertia", "false") == "true" and weighs:
             self.ignored.append(f"shellinertia of {what}")
-        lump = geom_lump(given, what, self.degrees, self.sequence)
+        kind = "mesh" if "mesh" in given else given.get("type", "sphere")  # of another type: one that is fitted to it
+        lump = geom_lump(given, what, self.degrees, self.sequence) if kind != "mesh" else None
         weighs = weighs and float(given.get("mass", given.get("density", 1.0))) > 0.0
-        if lump is None and weighs and given.get("type") not in ("plane", "hfield"):
-            self.ignored.append(f"the mass of {what}, which is a {given.get('type')}")
+        if lump is None and weighs and kind not in ("plane", "hfield"):
+            self.ignored.append(f"the mass of {what}, which is a {kind}")
         return lump
 
     def _inertial(self, element: Element, body: str) -> Lump:

@@ -9,15 +9,13 @@ from typing import Any
 from xml.etree.ElementTree import Element, SubElement
 
 import numpy as np
-from numpy.typing import NDArray
 
 from twoloop.bodies.mjcf_geometry import IgnoredWarning
 from twoloop.bodies.parameter_layout import PULL, RAIL, SPRING, TORSION
 from twoloop.bodies.parts import Body, Force, ModelJoint
 from twoloop.bodies.spanning_tree import spanning_tree
+from twoloop.checks.arguments import Array
 from twoloop.mechanisms.rotation import euler_parameters
-
-Array = NDArray[np.float64]
 
 HALF = 0.5  # m, from each other: the two points of a hinge that closes a loop
 

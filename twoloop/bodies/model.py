@@ -19,10 +19,8 @@ from twoloop.bodies.notes import note_of
 from twoloop.bodies.parts import Body, DryFriction, ModelJoint, Numbers
 from twoloop.bodies.sketches import drawing_of
 from twoloop.bodies.tables import Tables
-from twoloop.checks.arguments import check_positive, check_span, check_text, shown
+from twoloop.checks.arguments import Array, check_positive, check_span, check_text, shown
 from twoloop.problem.system import ConstrainedSystem
-
-Array = NDArray[np.float64]
 
 
 class Model(Stops):
@@ -79,6 +77,9 @@ class Model(Stops):
             raise ValueError(f"{self.name!r} has no bodies: add some with body(...) before problem()")
         tables = self._tables(self.joints, values)
         tables.check()
+        for numbers in self.taken:
+            if tables.of(numbers).tolist() != list(numbers.values):
+                raise ValueError(f"{numbers.names[0]} cannot change, as a rack or a limit has it: make the model anew")
         self._check_inertias(tables)
         start = self._start() if guess is None else guess
         about = t_span[0], start, np.zeros_like(start)
@@ -87,16 +88,8 @@ class Model(Stops):
         bare, joints = tables, [joint for joint in self.joints if joint.kind != "drive"]
         if len(joints) < len(self.joints):
             bare = self._tables(joints, values)
-        q = assembly.positions(
-            system if bare is tables else system_of(self.dimension, bare, joints_of(bare), name, about),
-            t_span[0],
-            start,
-            self._turning(),
-            keep,
-            bare.rows,
-            coordinates,
-        )
-        closed = q
+        still = system if bare is tables else system_of(self.dimension, bare, joints_of(bare), name, about)
+        closed = q = assembly.positions(still, t_span[0], start, self._turning(), keep, bare.rows, coordinates)
         if bare is not tables:
             q = assembly.driven_there(system, t_span[0], q, keep)
         self._check_branches(t_span[0], q)
@@ -185,7 +178,7 @@ class Model(Stops):
         """A copy to which nothing is added."""
         other = copy.copy(self)
         other.bodies, other.joints, other.forces = list(self.bodies), list(self.joints), list(self.forces)
-        other.stops, other.dry = list(self.stops), list(self.dry)
+        other.stops, other.dry, other.taken = list(self.stops), list(self.dry), list(self.taken)
         return other
 
     def _turning(self) -> NDArray[np.bool_]:
@@ -214,7 +207,18 @@ class Model(Stops):
 
     def _velocities(self, q: Array) -> tuple[Array, NDArray[np.bool_]]:
         """The velocities given, (n_q,), and which of them are."""
-        raise NotImplementedError
+        given = np.full((len(self.bodies), len(self.coordinate_names)), np.nan)
+        for row, body, state in zip(given, self.bodies, q.reshape(given.shape), strict=True):
+            if body.velocity is not None:
+                row[: self.dimension] = body.velocity
+            if body.angular_velocity is not None:
+                row[self.dimension :] = self._turning_rates(state, body.angular_velocity)
+        known = np.isfinite(given.ravel())
+        return np.where(known, given.ravel(), 0.0), known
+
+    def _turning_rates(self, state: Array, spin: Array) -> Array:
+        """The rates of the coordinates of a body that are rotations, at an angular velocity."""
+        return spin
 
     def _tags(self, freedom: assembly.Freedom) -> tuple[str, ...]:
         closed = False

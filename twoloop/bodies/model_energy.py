@@ -6,30 +6,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from twoloop.bodies.parameter_layout import (
-    BODIES,
-    F_FIRST,
-    F_FIRST_AT,
-    F_KIND,
-    F_MORE,
-    F_ON_FIRST,
-    F_SECOND,
-    F_SECOND_AT,
-    FORCE_WIDTH,
-    FORCES,
-    HEAD,
-    N_FORCES,
-    PLANAR_BODY,
-    PULL,
-    RAIL,
-    SPATIAL_BODY,
-    SPRING,
-    TORSION,
-)
-
-Array = NDArray[np.float64]
+from twoloop.bodies import parameter_layout as layout
+from twoloop.checks.arguments import Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +29,7 @@ class ModelEnergy:
     def __call__(self, t: Any, q: Array, v: Array) -> Any:
         """Of one state, or of the columns of many."""
         q, v = (np.asarray(x).reshape(self._n, -1, *np.shape(x)[1:]) for x in (q, v))
-        size = PLANAR_BODY if self.dimension == 2 else SPATIAL_BODY
+        size = layout.PLANAR_BODY if self.dimension == 2 else layout.SPATIAL_BODY
         bodies = self.p[self.dimension : self.dimension + size * self._n].reshape(-1, size)
         masses, gravity = bodies[:, 0], self.p[: self.dimension]
         total = 0.5 * np.einsum("i,ij...->...", masses, v[:, : self.dimension] ** 2)
@@ -61,14 +40,14 @@ class ModelEnergy:
             J = bodies[:, [1, 4, 5, 4, 2, 6, 5, 6, 3]].reshape(-1, 3, 3)
             spins = _spins(q[:, 3:], v[:, 3:])
             total += 0.5 * np.einsum("ijk,ij...,ik...->...", J, spins, spins)
-        for kind, i, at, j, there, more, on_first in self._forces:
-            if kind in (SPRING, PULL):
+        for kind, i, at, j, there, more, _, on_first in self._forces:
+            if kind in (layout.SPRING, layout.PULL):
                 gap = self._place(q, j, there) - self._place(q, i, at)
                 length = np.sqrt((gap**2).sum(axis=0))
-                total += 0.5 * self.p[more] * (length - (self.p[more + 2] if kind == SPRING else 0.0)) ** 2
-            elif kind == TORSION:
+                total += 0.5 * self.p[more] * (length - (self.p[more + 2] if kind == layout.SPRING else 0.0)) ** 2
+            elif kind == layout.TORSION:
                 total += 0.5 * self.p[more] * (self._turned(q, i, j, at, there) - self.p[more + 2]) ** 2
-            elif kind == RAIL:
+            elif kind == layout.RAIL:
                 gap = self._place(q, j, there) - self._place(q, i, on_first)
                 slid = (self._axis(q, i, at) * gap).sum(axis=0)
                 total += 0.5 * self.p[more] * (slid - self.p[more + 2]) ** 2
@@ -76,14 +55,14 @@ class ModelEnergy:
 
     @property
     def _n(self) -> int:
-        return int(self.p[self.p.size - HEAD + BODIES])
+        return int(self.p[self.p.size - layout.HEAD + layout.BODIES])
 
     @property
     def _forces(self) -> Any:
-        head = self.p[self.p.size - HEAD :].astype(int)
-        first, n = head[FORCES], head[N_FORCES]
-        table = self.p[first : first + FORCE_WIDTH * n].reshape(-1, FORCE_WIDTH).astype(int)
-        return table[:, [F_KIND, F_FIRST, F_FIRST_AT, F_SECOND, F_SECOND_AT, F_MORE, F_ON_FIRST]].tolist()
+        head = self.p[self.p.size - layout.HEAD :].astype(int)
+        first, n = head[layout.FORCES], head[layout.N_FORCES]
+        table = self.p[first : first + layout.FORCE_WIDTH * n].reshape(-1, layout.FORCE_WIDTH).astype(int)
+        return table.tolist()
 
     def _place(self, q: Array, body: int, at: int) -> Array:
         """The point of a body in space, (2 or 3,) or (2 or 3, n_t)."""

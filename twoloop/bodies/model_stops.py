@@ -6,15 +6,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from twoloop.bodies.documented import documented
 from twoloop.bodies.loads import Loads
 from twoloop.bodies.parts import Body, ModelJoint
 from twoloop.bodies.places import placed, turned
-from twoloop.checks.arguments import check_finite
+from twoloop.checks.arguments import Array, check_finite
 from twoloop.problem.stops import Stop
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,6 +46,7 @@ class TurnGap:
         return self.sign * (one - two - self.limit)
 
 
+@documented
 class Stops(Loads):
     """Adds stops to a model, for `twoloop.solve_with_stops`."""
 
@@ -77,16 +76,6 @@ class Stops(Loads):
             Across the plane, to the side on which the point is.
         restitution : float
             From 0 to 1.
-        name : str, optional
-
-        Returns
-        -------
-        Stop
-
-        Raises
-        ------
-        TypeError, ValueError
-            If an argument is wrong.
         """
         one, two = self._body("body", body), self._body("other", other)
         self._different("stop", one, two)

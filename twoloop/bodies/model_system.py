@@ -2,34 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from importlib import import_module
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from twoloop.bodies import parameter_layout as layout
 from twoloop.bodies.functions import Function
 from twoloop.bodies.loaded_friction import LoadedFriction
-from twoloop.bodies.parameter_layout import (
-    ANGLE,
-    FORCE_PROGRAM,
-    HEAD,
-    MOTION_PROGRAM,
-    PERPENDICULAR,
-    RATE,
-    SPRING,
-    TURN,
-)
 from twoloop.bodies.places import placed
 from twoloop.bodies.row_function import RowFunction
 from twoloop.bodies.tables import Tables
-from twoloop.checks.arguments import shown
+from twoloop.checks.arguments import Array, shown
 from twoloop.generate.tracing import Untraceable
 from twoloop.problem.entries import LARGE
 from twoloop.problem.joints import Joint
 from twoloop.problem.system import ConstrainedSystem
-
-Array = NDArray[np.float64]
 
 KINDS = ("mass", "force", "constraint", "jacobian", "constraint_rate", "gamma")
 OF_JOINTS = ("constraint", "jacobian", "gamma")
@@ -50,11 +40,7 @@ def joints_of(tables: Tables) -> list[Joint]:
 
 
 def system_of(
-    dimension: int,
-    tables: Tables,
-    joints: list[Joint],
-    name: str,
-    start: tuple[float, Array, Array],
+    dimension: int, tables: Tables, joints: list[Joint], name: str, start: tuple[float, Array, Array]
 ) -> ConstrainedSystem:
     """The system, whose programs of functions agree with these about the start."""
     callbacks: Any = import_module(f"twoloop.bodies.{'planar' if dimension == 2 else 'spatial'}_callbacks")
@@ -94,9 +80,9 @@ def entries_of(dimension: int, tables: Tables) -> dict[str, NDArray[np.int64]]:
     blocks = [[k] for k in range(3)] + ([[3, 4, 5, 6]] if dimension == 3 else [])
     places = [(width * k + i, width * k + j) for k in range(n) for block in blocks for i in block for j in block]
     named = [(k, 7 * k + j) for k in range(n) for j in range(3, 7)] if dimension == 3 else []
-    turn_alone = (ANGLE,) if dimension == 2 else (PERPENDICULAR, TURN)
+    turn_alone = (layout.ANGLE,) if dimension == 2 else (layout.PERPENDICULAR, layout.TURN)
     row = len(named) // 4
-    for part in (part for joint in tables.joints for part in joint.rows if part.kind != RATE):
+    for part in (part for joint in tables.joints for part in joint.rows if part.kind != layout.RATE):
         skipped = dimension if part.kind in turn_alone else 0
         columns: Any = (*part.first.coordinates[skipped:], *part.second.coordinates[skipped:])
         if isinstance(part.motion, RowFunction):
@@ -120,7 +106,7 @@ def check_forces(tables: Tables, t: float, q: Array, v: Array) -> None:
     for each in tables.functions:
         _check_finite(each, each.at(t, q, v), t)
     for force in tables.forces:
-        if force.kind != SPRING:
+        if force.kind != layout.SPRING:
             continue
         assert force.on_first is not None and force.on_second is not None and force.more is not None
         one = placed(q, force.first, tables.of(force.on_first))
@@ -161,9 +147,12 @@ def _disagreement(tables: Tables, t: float, q: Array, v: Array) -> str:
     """Which function does not give what its program gives; "": none is known."""
     from twoloop.bodies.program_results import results  # whose import compiles
 
-    head, p = tables.p[tables.p.size - HEAD :], tables.p
+    head, p = tables.p[tables.p.size - layout.HEAD :], tables.p
     generic = np.random.default_rng(8)
-    for functions, place in ((tables.motions, head[MOTION_PROGRAM]), (tables.functions, head[FORCE_PROGRAM])):
+    for functions, place in (
+        (tables.motions, head[layout.MOTION_PROGRAM]),
+        (tables.functions, head[layout.FORCE_PROGRAM]),
+    ):
         for number in range(STATES if functions else 0):
             away = generic.uniform(-1.0, 1.0, (2, len(q))) * (number > 0)
             then = t + 0.37 * number
@@ -210,14 +199,11 @@ class InPython:
 
     def mass(self, t: float, q: Array, p: Array) -> Array:
         """M."""
-        made = self._zeros(q, self._n_q, self._n_q)
-        self._callbacks.mass(t, q, p, made)
-        return made
+        return self._filled("mass", (self._n_q, self._n_q), q, lambda: (t, q, p))
 
     def force(self, t: float, q: Array, v: Array, p: Array) -> Array:
         """Q."""
-        made = self._zeros(q, self._n_q)
-        self._callbacks.fill_force(q, v, p, _called(self._functions, t, q, v), made)
+        made = self._filled("fill_force", (self._n_q,), q, lambda: (q, v, p, _called(self._functions, t, q, v)))
         if self.loaded is not None:
             rates = self.nonholonomic_gamma(t, q, v, p) if self._n_rates else np.zeros(0)
             gamma = np.append(self.gamma(t, q, v, p), rates)
@@ -226,44 +212,34 @@ class InPython:
 
     def constraint(self, t: float, q: Array, p: Array) -> Array:
         """C."""
-        made = self._zeros(q, self._n_rows)
-        self._callbacks.fill_constraint(q, p, self._moved(t, q, q), made)
-        return made
+        return self._filled("fill_constraint", (self._n_rows,), q, lambda: (q, p, self._moved(t, q, q)))
 
     def jacobian(self, t: float, q: Array, p: Array) -> Array:
         """C_q."""
-        made = self._zeros(q, self._n_rows, self._n_q)
-        self._callbacks.fill_jacobian(q, p, self._moved(t, q, q), made)
-        return made
+        return self._filled("fill_jacobian", (self._n_rows, self._n_q), q, lambda: (q, p, self._moved(t, q, q)))
 
     def constraint_rate(self, t: float, q: Array, p: Array) -> Array:
         """C_t."""
-        made = self._zeros(q, self._n_rows)
-        self._callbacks.fill_rate(q, p, self._moved(t, q, q), made)
-        return made
+        return self._filled("fill_rate", (self._n_rows,), q, lambda: (q, p, self._moved(t, q, q)))
 
     def gamma(self, t: float, q: Array, v: Array, p: Array) -> Array:
         """The right-hand side of C_q a = gamma."""
-        made = self._zeros(q, self._n_rows)
-        self._callbacks.fill_gamma(q, v, p, self._moved(t, q, v), made)
-        return made
+        return self._filled("fill_gamma", (self._n_rows,), q, lambda: (q, v, p, self._moved(t, q, v)))
 
     def nonholonomic(self, t: float, q: Array, p: Array) -> Array:
         """A."""
-        made = self._zeros(q, self._n_rates, self._n_q)
-        self._callbacks.fill_nonholonomic(p, self._moved(t, q, q), made)
-        return made
+        return self._filled("fill_nonholonomic", (self._n_rates, self._n_q), q, lambda: (p, self._moved(t, q, q)))
 
     def nonholonomic_gamma(self, t: float, q: Array, v: Array, p: Array) -> Array:
         """The right-hand side of A a = Q_a."""
-        made = self._zeros(q, self._n_rates)
-        self._callbacks.fill_nonholonomic_gamma(p, self._moved(t, q, v), made)
-        return made
+        return self._filled("fill_nonholonomic_gamma", (self._n_rates,), q, lambda: (p, self._moved(t, q, v)))
 
-    def _zeros(self, q: Array, *shape: int) -> Array:
+    def _filled(self, fill: str, shape: tuple[int, ...], q: Array, given: Callable[[], tuple[Any, ...]]) -> Array:
         if q.dtype == object:  # symbols, on which the compiled callbacks would say less
             raise Untraceable(self._untraced)
-        return np.zeros(shape)
+        made = np.zeros(shape)
+        getattr(self._callbacks, fill)(*given(), made)
+        return made
 
     def _moved(self, t: float, q: Array, v: Array) -> Array:
         return _called(self._motions, t, q, v)

@@ -5,15 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from twoloop.bodies.assembly import Freedom
 from twoloop.bodies.collection import Collection
 from twoloop.bodies.model_stops import TurnGap
 from twoloop.bodies.tables import TENSOR, Tables
+from twoloop.checks.arguments import Array
 from twoloop.problem.description import name_and_unit
-
-Array = NDArray[np.float64]
 
 MOVED = 1e-6  # of the largest coordinate
 ROUNDED = 0.01  # relative: moments as they are printed

@@ -6,14 +6,11 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from twoloop.bodies.functions import Function
 from twoloop.bodies.parameter_layout import NONE
 from twoloop.bodies.row_function import RowFunction
-from twoloop.checks.arguments import check_vector
-
-Array = NDArray[np.float64]
+from twoloop.checks.arguments import Array, check_vector
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,11 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from twoloop.bodies.parts import Body
-
-Array = NDArray[np.float64]
+from twoloop.checks.arguments import Array
 
 
 def turned(q: Any, body: Body, vector: Any) -> list[Any]:

@@ -2,52 +2,9 @@
 
 import math
 
-import numpy as np
-
-from twoloop.bodies.function_rows import fill_entries, fill_nonholonomic, fill_nonholonomic_gamma, take_entries
-from twoloop.bodies.parameter_layout import (
-    ACROSS,
-    ANGLE,
-    BODIES,
-    BRAKE,
-    DISTANCE,
-    F_FIRST,
-    F_FIRST_AT,
-    F_KIND,
-    F_MORE,
-    F_ON_FIRST,
-    F_RESULT,
-    F_SECOND,
-    F_SECOND_AT,
-    FIRST,
-    FIRST_AT,
-    FORCE,
-    FORCE_PROGRAM,
-    FORCE_WIDTH,
-    FORCES,
-    HEAD,
-    JOINT_WIDTH,
-    JOINTS,
-    KIND,
-    MORE,
-    MOTION,
-    MOTION_PROGRAM,
-    N_FORCES,
-    N_JOINTS,
-    PIN,
-    PLANAR_BODY,
-    PULL,
-    RAIL,
-    RATE,
-    ROW,
-    RUB,
-    SECOND,
-    SECOND_AT,
-    SLIDE,
-    TORQUE,
-    TORSION,
-    WRITTEN,
-)
+from twoloop.bodies import parameter_layout as layout
+from twoloop.bodies import read_tables as tables
+from twoloop.bodies.function_rows import fill_entries, fill_nonholonomic, fill_nonholonomic_gamma, put_entries
 from twoloop.bodies.program_results import result, results
 from twoloop.kernels.compile.caches import helper
 from twoloop.kernels.compile.callbacks import callback
@@ -100,160 +57,150 @@ def turn(row, body, factor):
 @helper
 def fill_constraint(q, p, made, C):
     """C."""
-    first, n = int(p[p.size - HEAD + JOINTS]), int(p[p.size - HEAD + N_JOINTS])
-    for k in range(first, first + JOINT_WIDTH * n, JOINT_WIDTH):
-        kind, row, i, j = int(p[k + KIND]), int(p[k + ROW]), int(p[k + FIRST]), int(p[k + SECOND])
-        more, moved = int(p[k + MORE]), result(made, int(p[k + MOTION]), 0)
-        if kind == RATE:
+    for k in tables.joint_places(p):
+        kind, row, i, at, j, there, more, moved = tables.joint_at(p, k)
+        if kind == layout.RATE:
             continue
-        if kind == WRITTEN:
-            C[row] = made[int(p[k + MOTION])]
+        if kind == layout.WRITTEN:
+            C[row] = made[moved]
             continue
-        if kind == ANGLE:
-            C[row] = angle_of(q, j) - angle_of(q, i) - p[more] - moved
+        if kind == layout.ANGLE:
+            C[row] = angle_of(q, j) - angle_of(q, i) - p[more] - result(made, moved, 0)
             continue
-        ax, ay, _, _ = place(q, i, p, int(p[k + FIRST_AT]))
-        bx, by, _, _ = place(q, j, p, int(p[k + SECOND_AT]))
+        ax, ay, _, _ = place(q, i, p, at)
+        bx, by, _, _ = place(q, j, p, there)
         x, y = bx - ax, by - ay
-        if kind == PIN:
+        if kind == layout.PIN:
             C[row], C[row + 1] = x, y
-        elif kind == DISTANCE:
+        elif kind == layout.DISTANCE:
             C[row] = 0.5 * (x * x + y * y - p[more] * p[more])
         else:
-            fx, fy = direction(q, i, p[more], kind == ACROSS)
-            C[row] = fx * x + fy * y - moved
+            fx, fy = direction(q, i, p[more], kind == layout.ACROSS)
+            C[row] = fx * x + fy * y - result(made, moved, 0)
 
 
 @helper
-def fill_rows(q, p, made, k, Cq, row):
-    """The rows of C_q of the part of a joint that stands at place k, from a row on."""
-    kind, i, j = int(p[k + KIND]), int(p[k + FIRST]), int(p[k + SECOND])
-    if kind == WRITTEN:
-        fill_entries(p, k, made, int(p[k + MOTION]) + 3, Cq[row])
+def fill_rows(q, p, made, k, Cq, row, one, other):
+    """The rows of C_q of the part of a joint at place k, from a row on; its bodies are the one and the other in Cq."""
+    kind, _, i, at, j, there, more, moved = tables.joint_at(p, k)
+    if kind == layout.WRITTEN:
+        fill_entries(p, more, made, moved + 3, Cq[row])
         return
-    if kind == ANGLE:
-        turn(Cq[row], j, 1.0)
-        turn(Cq[row], i, -1.0)
+    if kind == layout.ANGLE:
+        turn(Cq[row], other, 1.0)
+        turn(Cq[row], one, -1.0)
         return
-    ax, ay, adx, ady = place(q, i, p, int(p[k + FIRST_AT]))
-    bx, by, bdx, bdy = place(q, j, p, int(p[k + SECOND_AT]))
+    ax, ay, adx, ady = place(q, i, p, at)
+    bx, by, bdx, bdy = place(q, j, p, there)
     x, y = bx - ax, by - ay
-    if kind == PIN:
-        add(Cq[row], i, -1.0, 0.0, adx, ady)
-        add(Cq[row], j, 1.0, 0.0, bdx, bdy)
-        add(Cq[row + 1], i, 0.0, -1.0, adx, ady)
-        add(Cq[row + 1], j, 0.0, 1.0, bdx, bdy)
-    elif kind == DISTANCE:
-        add(Cq[row], i, -x, -y, adx, ady)
-        add(Cq[row], j, x, y, bdx, bdy)
+    if kind == layout.PIN:
+        add(Cq[row], one, -1.0, 0.0, adx, ady)
+        add(Cq[row], other, 1.0, 0.0, bdx, bdy)
+        add(Cq[row + 1], one, 0.0, -1.0, adx, ady)
+        add(Cq[row + 1], other, 0.0, 1.0, bdx, bdy)
+    elif kind == layout.DISTANCE:
+        add(Cq[row], one, -x, -y, adx, ady)
+        add(Cq[row], other, x, y, bdx, bdy)
     else:
-        fx, fy = direction(q, i, p[int(p[k + MORE])], kind == ACROSS)
-        add(Cq[row], i, -fx, -fy, adx - y, ady + x)
-        add(Cq[row], j, fx, fy, bdx, bdy)
+        fx, fy = direction(q, i, p[more], kind == layout.ACROSS)
+        add(Cq[row], one, -fx, -fy, adx - y, ady + x)
+        add(Cq[row], other, fx, fy, bdx, bdy)
 
 
 @helper
 def fill_jacobian(q, p, made, Cq):
     """C_q; `made`: results of the program of motions."""
-    first, n = int(p[p.size - HEAD + JOINTS]), int(p[p.size - HEAD + N_JOINTS])
-    for k in range(first, first + JOINT_WIDTH * n, JOINT_WIDTH):
-        if int(p[k + KIND]) != RATE:
-            fill_rows(q, p, made, k, Cq, int(p[k + ROW]))
+    for k in tables.joint_places(p):
+        kind, row, i, _, j, _, _, _ = tables.joint_at(p, k)
+        if kind != layout.RATE:
+            fill_rows(q, p, made, k, Cq, row, i, j)
 
 
 @helper
 def fill_rate(q, p, made, Ct):
     """C_t, of drives alone."""
-    first, n = int(p[p.size - HEAD + JOINTS]), int(p[p.size - HEAD + N_JOINTS])
-    for k in range(first, first + JOINT_WIDTH * n, JOINT_WIDTH):
-        if int(p[k + MOTION]) >= 0 and int(p[k + KIND]) != RATE:
-            Ct[int(p[k + ROW])] = -result(made, int(p[k + MOTION]), 1)  # zero of WRITTEN rows
+    for k in tables.joint_places(p):
+        kind, row, _, _, _, _, _, moved = tables.joint_at(p, k)
+        if moved >= 0 and kind != layout.RATE:
+            Ct[row] = -made[moved + 1]  # zero of WRITTEN rows
 
 
 @helper
 def fill_gamma(q, v, p, made, Qd):
     """The right-hand side of C_q a = gamma."""
-    first, n = int(p[p.size - HEAD + JOINTS]), int(p[p.size - HEAD + N_JOINTS])
-    for k in range(first, first + JOINT_WIDTH * n, JOINT_WIDTH):
-        kind, row, i, j = int(p[k + KIND]), int(p[k + ROW]), int(p[k + FIRST]), int(p[k + SECOND])
-        more, moved = int(p[k + MORE]), result(made, int(p[k + MOTION]), 2)
-        if kind == RATE:
+    for k in tables.joint_places(p):
+        kind, row, i, at, j, there, more, moved = tables.joint_at(p, k)
+        if kind == layout.RATE:
             continue
-        if kind == WRITTEN:
-            Qd[row] = made[int(p[k + MOTION]) + 2]
+        if kind == layout.WRITTEN:
+            Qd[row] = made[moved + 2]
             continue
-        if kind == ANGLE:
-            Qd[row] = moved
+        if kind == layout.ANGLE:
+            Qd[row] = result(made, moved, 2)
             continue
-        ax, ay, adx, ady = place(q, i, p, int(p[k + FIRST_AT]))
-        bx, by, bdx, bdy = place(q, j, p, int(p[k + SECOND_AT]))
+        ax, ay, adx, ady = place(q, i, p, at)
+        bx, by, bdx, bdy = place(q, j, p, there)
         au, av, aa, ab = motion(v, i, adx, ady)
         bu, bv, ba, bb = motion(v, j, bdx, bdy)
         x, y, u, w, a, b = bx - ax, by - ay, bu - au, bv - av, ba - aa, bb - ab
-        if kind == PIN:
+        if kind == layout.PIN:
             Qd[row], Qd[row + 1] = -a, -b
-        elif kind == DISTANCE:
+        elif kind == layout.DISTANCE:
             Qd[row] = -u * u - w * w - x * a - y * b
         else:
-            fx, fy = direction(q, i, p[more], kind == ACROSS)
+            fx, fy = direction(q, i, p[more], kind == layout.ACROSS)
             rate = angle_of(v, i)
-            Qd[row] = moved - fx * a - fy * b - 2.0 * rate * (fx * w - fy * u) + rate * rate * (fx * x + fy * y)
+            turned = 2.0 * rate * (fx * w - fy * u)
+            Qd[row] = result(made, moved, 2) - fx * a - fy * b - turned + rate * rate * (fx * x + fy * y)
 
 
 @helper
 def fill_force(q, v, p, made, Q):
     """Q; `made`: results of the program of forces."""
-    for body in range(int(p[p.size - HEAD + BODIES])):
-        mass = p[WEIGHT + PLANAR_BODY * body]
+    for body in range(tables.n_bodies(p)):
+        mass = p[WEIGHT + layout.PLANAR_BODY * body]
         Q[3 * body] += mass * p[0]
         Q[3 * body + 1] += mass * p[1]
-    first, n = int(p[p.size - HEAD + FORCES]), int(p[p.size - HEAD + N_FORCES])
-    for k in range(first, first + FORCE_WIDTH * n, FORCE_WIDTH):
-        kind, i, j, more = int(p[k + F_KIND]), int(p[k + F_FIRST]), int(p[k + F_SECOND]), int(p[k + F_MORE])
-        given = int(p[k + F_RESULT])
-        if kind in (TORQUE, TORSION, BRAKE):
+    for k in tables.force_places(p):
+        kind, i, at, j, there, more, given, on_first = tables.force_at(p, k)
+        if kind in (layout.TORQUE, layout.TORSION, layout.BRAKE):
             rate = angle_of(v, j) - angle_of(v, i)
-            if kind == TORSION:
+            if kind == layout.TORSION:
                 torque = -p[more] * (angle_of(q, j) - angle_of(q, i) - p[more + 2]) - p[more + 1] * rate
-            elif kind == BRAKE:
+            elif kind == layout.BRAKE:
                 torque = -p[more] * math.tanh(rate / p[more + 1])
-            elif given >= 0:
-                torque = made[given]
             else:
-                torque = p[more]
+                torque = made[given] if given >= 0 else p[more]
             turn(Q, j, torque)
             turn(Q, i, -torque)
             continue
-        bx, by, bdx, bdy = place(q, j, p, int(p[k + F_SECOND_AT]))
-        if kind == FORCE:
+        bx, by, bdx, bdy = place(q, j, p, there)
+        if kind == layout.FORCE:
             if given >= 0:
                 add(Q, j, made[given], made[given + 1], bdx, bdy)
             else:
                 add(Q, j, p[more], p[more + 1], bdx, bdy)
             continue
-        at = int(p[k + F_FIRST_AT])
-        if kind in (SLIDE, RAIL, RUB):  # at the point of j, also on i
+        if kind in (layout.SLIDE, layout.RAIL, layout.RUB):  # at the point of j, also on i
             fx, fy = direction(q, i, p[at], False)
             u, w, _, _ = motion(v, j, bdx, bdy)
             if i >= 0:
                 rate = v[3 * i + 2]
                 u, w = u - v[3 * i] + rate * (by - q[3 * i + 1]), w - v[3 * i + 1] - rate * (bx - q[3 * i])
-            if kind == RAIL:
-                ax, ay, _, _ = place(q, i, p, int(p[k + F_ON_FIRST]))
-                push = -p[more] * (fx * (bx - ax) + fy * (by - ay) - p[more + 2]) - p[more + 1] * (fx * u + fy * w)
-            elif kind == RUB:
-                push = -p[more] * math.tanh((fx * u + fy * w) / p[more + 1])
-            elif given >= 0:
-                push = made[given]
+            if kind == layout.RAIL:
+                ax, ay, _, _ = place(q, i, p, on_first)
+                f = -p[more] * (fx * (bx - ax) + fy * (by - ay) - p[more + 2]) - p[more + 1] * (fx * u + fy * w)
+            elif kind == layout.RUB:
+                f = -p[more] * math.tanh((fx * u + fy * w) / p[more + 1])
             else:
-                push = p[more]
-            add(Q, j, push * fx, push * fy, bdx, bdy)
+                f = made[given] if given >= 0 else p[more]
+            add(Q, j, f * fx, f * fy, bdx, bdy)
             if i >= 0:
-                add(Q, i, -push * fx, -push * fy, q[3 * i + 1] - by, bx - q[3 * i])
+                add(Q, i, -f * fx, -f * fy, q[3 * i + 1] - by, bx - q[3 * i])
             continue
         ax, ay, adx, ady = place(q, i, p, at)
         x, y = bx - ax, by - ay
-        if kind == PULL:
+        if kind == layout.PULL:
             x, y = p[more] * x, p[more] * y
         else:
             length = math.sqrt(x * x + y * y)
@@ -268,62 +215,70 @@ def fill_force(q, v, p, made, Q):
 
 @callback("mass")
 def mass(t, q, p, M):
-    for body in range(int(p[p.size - HEAD + BODIES])):
-        at = WEIGHT + PLANAR_BODY * body
+    for body in range(tables.n_bodies(p)):
+        at = WEIGHT + layout.PLANAR_BODY * body
         M[3 * body, 3 * body] = M[3 * body + 1, 3 * body + 1] = p[at]
         M[3 * body + 2, 3 * body + 2] = p[at + 1]
 
 
 @callback("force")
 def force(t, q, v, p, Q):
-    fill_force(q, v, p, results(int(p[p.size - HEAD + FORCE_PROGRAM]), t, q, v, p), Q)
+    fill_force(q, v, p, results(int(p[p.size - layout.HEAD + layout.FORCE_PROGRAM]), t, q, v, p), Q)
 
 
 @callback("constraint")
 def constraint(t, q, p, C):
-    fill_constraint(q, p, results(int(p[p.size - HEAD + MOTION_PROGRAM]), t, q, q, p), C)
+    fill_constraint(q, p, tables.motions(t, q, q, p), C)
 
 
 @callback("jacobian")
 def jacobian(t, q, p, Cq):
-    fill_jacobian(q, p, results(int(p[p.size - HEAD + MOTION_PROGRAM]), t, q, q, p), Cq)
+    fill_jacobian(q, p, tables.motions(t, q, q, p), Cq)
 
 
 @callback("mass_values")
 def mass_values(t, q, p, values):
-    for body in range(int(p[p.size - HEAD + BODIES])):
-        at = WEIGHT + PLANAR_BODY * body
+    for body in range(tables.n_bodies(p)):
+        at = WEIGHT + layout.PLANAR_BODY * body
         values[3 * body] = values[3 * body + 1] = p[at]
         values[3 * body + 2] = p[at + 1]
 
 
 @callback("jacobian_values")
 def jacobian_values(t, q, p, values):
-    made = results(int(p[p.size - HEAD + MOTION_PROGRAM]), t, q, q, p)
-    rows, at = np.zeros((2, q.size), dtype=q.dtype), 0
-    first, n = int(p[p.size - HEAD + JOINTS]), int(p[p.size - HEAD + N_JOINTS])
-    for k in range(first, first + JOINT_WIDTH * n, JOINT_WIDTH):
-        if int(p[k + KIND]) != RATE:
-            fill_rows(q, p, made, k, rows, 0)
-            for row in range(2 if int(p[k + KIND]) == PIN else 1):
-                at = take_entries(p, k, 3, 2 * (int(p[k + KIND]) == ANGLE), rows[row], values, at)
+    made, begin = tables.motions(t, q, q, p), 0
+    for k in tables.joint_places(p):
+        kind, _, i, _, j, _, more, moved = tables.joint_at(p, k)
+        if kind == layout.WRITTEN:
+            begin = put_entries(p, more, made, moved + 3, values, begin)
+        elif kind == layout.ANGLE:
+            for body, sign in ((i, -1.0), (j, 1.0)):
+                if body >= 0:
+                    values[begin] = sign
+                    begin += 1
+        elif kind != layout.RATE:
+            one, n_rows = (0 if i >= 0 else -1), (2 if kind == layout.PIN else 1)
+            other = one + 1 if j >= 0 else -1
+            end = begin + n_rows * 3 * ((i >= 0) + (j >= 0))
+            fill_rows(q, p, made, k, values[begin:end].reshape(n_rows, (end - begin) // n_rows), 0, one, other)
+            begin = end
 
 
 @callback("constraint_rate")
 def constraint_rate(t, q, p, Ct):
-    fill_rate(q, p, results(int(p[p.size - HEAD + MOTION_PROGRAM]), t, q, q, p), Ct)
+    fill_rate(q, p, tables.motions(t, q, q, p), Ct)
 
 
 @callback("gamma")
 def gamma(t, q, v, p, Qd):
-    fill_gamma(q, v, p, results(int(p[p.size - HEAD + MOTION_PROGRAM]), t, q, v, p), Qd)
+    fill_gamma(q, v, p, tables.motions(t, q, v, p), Qd)
 
 
 @callback("nonholonomic")
 def nonholonomic(t, q, p, A):
-    fill_nonholonomic(p, results(int(p[p.size - HEAD + MOTION_PROGRAM]), t, q, q, p), A)
+    fill_nonholonomic(p, tables.motions(t, q, q, p), A)
 
 
 @callback("nonholonomic_gamma")
 def nonholonomic_gamma(t, q, v, p, Qa):
-    fill_nonholonomic_gamma(p, results(int(p[p.size - HEAD + MOTION_PROGRAM]), t, q, v, p), Qa)
+    fill_nonholonomic_gamma(p, tables.motions(t, q, v, p), Qa)

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from twoloop.bodies.documented import documented
 from twoloop.bodies.model import Model
 from twoloop.bodies.parameter_layout import RATE, WRITTEN
 from twoloop.bodies.parts import Body, JointRow, ModelJoint, Numbers
@@ -15,6 +16,7 @@ from twoloop.bodies.row_function import RateFunction, RowFunction
 from twoloop.checks.arguments import check_finite, check_positive
 
 
+@documented
 class Couplings(Model):
     """Adds such joints to a planar model. Their numbers are no parameters of it."""
 
@@ -23,23 +25,14 @@ class Couplings(Model):
     ) -> ModelJoint:
         """Two hinges that turn together: `other` turns by `ratio` times what `one` turns, from the position given.
 
+        Its reaction is a torque on the bodies of `other`.
+
         Parameters
         ----------
         one, other : ModelJoint or str
             Revolute joints; each turns its b on its a. Two wheels on one carrier have it as their a.
         ratio : float
             Negative for wheels that touch from outside: minus the radius of one over that of the other.
-        name : str, optional
-
-        Returns
-        -------
-        ModelJoint
-            Whose reaction is a torque on the bodies of `other`.
-
-        Raises
-        ------
-        TypeError, ValueError
-            If an argument is wrong.
         """
         first, second = self._two(one, "revolute", other, "revolute", "gear")
         factor = check_finite("ratio", ratio)
@@ -59,16 +52,6 @@ class Couplings(Model):
             A revolute and a prismatic joint.
         radius : float
             m; negative where a turn from x to y moves the slide against its axis.
-        name : str, optional
-
-        Returns
-        -------
-        ModelJoint
-
-        Raises
-        ------
-        TypeError, ValueError
-            If an argument is wrong.
         """
         first, second = self._two(pinion, "revolute", slide, "prismatic", "rack")
         factor = check_finite("radius", radius)
@@ -89,6 +72,8 @@ class Couplings(Model):
     ) -> ModelJoint:
         """A wheel, whose centre of mass is its centre, that rolls on a line of a without slipping.
 
+        Its reaction is what the wheel does to a; where a is the ground, what this does to the wheel.
+
         Parameters
         ----------
         a, wheel : Body or str
@@ -97,17 +82,6 @@ class Couplings(Model):
             m.
         axis : array_like (2,) or BodyDirection
             Along the line.
-        name : str, optional
-
-        Returns
-        -------
-        ModelJoint
-            Whose reaction is what the wheel does to a; where a is the ground, what this does to the wheel.
-
-        Raises
-        ------
-        TypeError, ValueError
-            If an argument is wrong.
         """
         first, second, name, named = self._pair("rolling", a, wheel, name, None)
         points = Numbers(named[0].values), Numbers(named[1].values)
@@ -126,6 +100,8 @@ class Couplings(Model):
     def skate(self, body: Body | str, *, at: Any, axis: Any, name: str | None = None) -> ModelJoint:
         """A blade, or a thin wheel seen from above: its point moves along an axis of the body only. Non-holonomic.
 
+        Its reaction is the force across the blade, on the body.
+
         Parameters
         ----------
         body : Body or str
@@ -133,17 +109,6 @@ class Couplings(Model):
             The point, in space in the position given, m.
         axis : array_like (2,) or BodyDirection
             Along the blade, in space in the position given.
-        name : str, optional
-
-        Returns
-        -------
-        ModelJoint
-            Whose reaction is the force across the blade, on the body.
-
-        Raises
-        ------
-        TypeError, ValueError
-            If an argument is wrong.
         """
         on = self._moving_body("body", body)
         name = self._new_name("skate", name, on)

@@ -5,17 +5,17 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from twoloop.bodies.documented import documented
 from twoloop.bodies.functions import Function
 from twoloop.bodies.parameter_layout import ACROSS, ALONG, ANGLE, DISTANCE, PIN, SLIDE, TORQUE, TORSION
 from twoloop.bodies.parts import Body, Force, JointRow, ModelJoint, Numbers
 from twoloop.bodies.planar_couplings import Couplings
-from twoloop.checks.arguments import check_finite, check_positive, check_vector
-
-Array = NDArray[np.float64]
+from twoloop.checks.arguments import Array, check_finite, check_positive, check_vector
 
 
+@documented
 class PlanarModel(Couplings):
     """A mechanism in a plane, from bodies, joints and forces.
 
@@ -73,15 +73,6 @@ class PlanarModel(Couplings):
             Of the centre of mass at the start, m/s. None: it follows from the other velocities.
         angular_velocity : float, optional
             rad/s, likewise.
-
-        Returns
-        -------
-        Body
-
-        Raises
-        ------
-        TypeError, ValueError
-            If an argument is wrong, or something of the model has this name.
         """
         name, place, weight, speed = self._new_body(name, mass, position, velocity)
         check_positive(f"inertia of {name!r}", inertia)
@@ -102,15 +93,6 @@ class PlanarModel(Couplings):
             kg.
         **motion
             `velocity` and `angular_velocity`, as for `body`.
-
-        Returns
-        -------
-        Body
-
-        Raises
-        ------
-        TypeError, ValueError
-            If an argument is wrong.
         """
         one, other = check_vector(f"start of {name!r}", start, 2), check_vector(f"end of {name!r}", end, 2)
         length = float(np.hypot(*(other - one)))
@@ -133,15 +115,6 @@ class PlanarModel(Couplings):
             Of the centre, m.
         **pose
             `angle`, `velocity` and `angular_velocity`, as for `body`.
-
-        Returns
-        -------
-        Body
-
-        Raises
-        ------
-        TypeError, ValueError
-            If an argument is wrong.
         """
         edges = check_vector(f"size of {name!r}", size, 2)
         check_positive(f"mass of {name!r}", mass)
@@ -163,15 +136,6 @@ class PlanarModel(Couplings):
             Of the centre, m.
         **pose
             `angle`, `velocity` and `angular_velocity`, as for `body`.
-
-        Returns
-        -------
-        Body
-
-        Raises
-        ------
-        TypeError, ValueError
-            If an argument is wrong.
         """
         check_positive(f"radius of {name!r}", radius)
         check_positive(f"mass of {name!r}", mass)
@@ -186,16 +150,6 @@ class PlanarModel(Couplings):
             The bodies, or their names.
         at : array_like (2,) or (BodyPoint, BodyPoint)
             Where the pin is, in space in the position given, m; or a point of a and one of b, which are put together.
-        name : str, optional
-
-        Returns
-        -------
-        ModelJoint
-
-        Raises
-        ------
-        TypeError, ValueError
-            If an argument is wrong.
         """
         first, second, name, points = self._pair("revolute", a, b, name, at)
         return self._add_joint(ModelJoint(name, "revolute", first, second, (_pin(first, second, *points),), *points))
@@ -210,16 +164,6 @@ class PlanarModel(Couplings):
             A point on the axis, m.
         axis : array_like (2,) or BodyDirection
             Its direction, of any length; a pair of directions of a and b says how b is turned against a.
-        name : str, optional
-
-        Returns
-        -------
-        ModelJoint
-
-        Raises
-        ------
-        TypeError, ValueError
-            If an argument is wrong.
         """
         first, second, name, points = self._pair("prismatic", a, b, name, at)
         one, other = self._directions(axis, first, second)
@@ -241,16 +185,6 @@ class PlanarModel(Couplings):
         a, b : Body or str
         at : array_like (2,) or (BodyPoint, BodyPoint), optional
             To which the reaction refers, m. None: the centre of mass of b, or of a if b is the ground.
-        name : str, optional
-
-        Returns
-        -------
-        ModelJoint
-
-        Raises
-        ------
-        TypeError, ValueError
-            If an argument is wrong.
         """
         first, second, name, points = self._pair("fixed", a, b, name, at)
         turned = _turn(name, first, second, second.rotation - first.rotation)
@@ -262,6 +196,7 @@ class PlanarModel(Couplings):
 
     def _axis(self, joint: ModelJoint) -> Array:
         assert joint.rows[0].more is not None
+        self.taken.append(joint.rows[0].more)
         (angle,) = joint.rows[0].more.values
         return np.array([np.cos(angle), np.sin(angle)])
 
@@ -294,16 +229,6 @@ class PlanarModel(Couplings):
 
     def _start(self) -> Array:
         return np.concatenate([np.append(body.position, body.rotation) for body in self.bodies])
-
-    def _velocities(self, q: Array) -> tuple[Array, NDArray[np.bool_]]:
-        given = np.full((len(self.bodies), 3), np.nan)
-        for row, body in zip(given, self.bodies, strict=True):
-            if body.velocity is not None:
-                row[:2] = body.velocity
-            if body.angular_velocity is not None:
-                row[2:] = body.angular_velocity
-        known = np.isfinite(given.ravel())
-        return np.where(known, given.ravel(), 0.0), known
 
 
 def _pin(a: Body, b: Body, on_a: Numbers, on_b: Numbers) -> JointRow:

@@ -7,14 +7,12 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from twoloop.checks.arguments import Array
 from twoloop.generate.calls_on_symbols import as_forms, trace
 from twoloop.generate.derivative import Derivative
 from twoloop.generate.programs import numbers_of, program_of
 from twoloop.generate.tracing import Form, Graph, Untraceable, symbols
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,15 +5,13 @@ from __future__ import annotations
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
 from twoloop.bodies.parameter_layout import PULL, SPRING
 from twoloop.bodies.parts import Body
 from twoloop.bodies.tables import Tables
+from twoloop.checks.arguments import Array
 from twoloop.mechanisms.points import Sketch
 from twoloop.problem.drawing import Drawing
-
-Array = NDArray[np.float64]
 
 
 def drawing_of(tables: Tables) -> Drawing:

@@ -8,42 +8,12 @@ import math
 
 import numpy as np
 
-from twoloop.bodies.function_rows import fill_entries, fill_nonholonomic, fill_nonholonomic_gamma, take_entries
-from twoloop.bodies.parameter_layout import (
-    BODIES,
-    FIRST,
-    FIRST_AT,
-    FORCE_PROGRAM,
-    HEAD,
-    JOINT_WIDTH,
-    JOINTS,
-    KIND,
-    LENGTH,
-    MORE,
-    MOTION,
-    MOTION_PROGRAM,
-    N_JOINTS,
-    PERPENDICULAR,
-    PLANE,
-    POINT,
-    RATE,
-    ROW,
-    SECOND,
-    SECOND_AT,
-    SPATIAL_BODY,
-    TURN,
-    WRITTEN,
-)
+from twoloop.bodies import parameter_layout as layout
+from twoloop.bodies.function_rows import fill_entries, fill_nonholonomic, fill_nonholonomic_gamma, put_entries
 from twoloop.bodies.program_results import result, results
+from twoloop.bodies.read_tables import joint_at, joint_places, motions, n_bodies
 from twoloop.bodies.spatial_forces import WEIGHT, fill_force, inertia
-from twoloop.bodies.spatial_places import (
-    motion,
-    place,
-    push_row,
-    turn_row,
-    vector,
-    vector_rate,
-)
+from twoloop.bodies.spatial_places import motion, place, push_row, turn_row, vector, vector_rate
 from twoloop.kernels.compile.caches import helper
 from twoloop.kernels.compile.callbacks import callback
 
@@ -66,20 +36,18 @@ def followed(p, at, made, moved):
 @helper
 def fill_constraint(q, p, made, C):
     """C."""
-    for body in range(int(p[p.size - HEAD + BODIES])):
+    for body in range(n_bodies(p)):
         k = 7 * body + 3
         C[body] = 0.5 * (q[k] * q[k] + q[k + 1] * q[k + 1] + q[k + 2] * q[k + 2] + q[k + 3] * q[k + 3] - 1.0)
-    first, n = int(p[p.size - HEAD + JOINTS]), int(p[p.size - HEAD + N_JOINTS])
-    for k in range(first, first + JOINT_WIDTH * n, JOINT_WIDTH):
-        kind, row, i, j = int(p[k + KIND]), int(p[k + ROW]), int(p[k + FIRST]), int(p[k + SECOND])
-        at, there, more, moved = int(p[k + FIRST_AT]), int(p[k + SECOND_AT]), int(p[k + MORE]), int(p[k + MOTION])
-        if kind == RATE:
+    for k in joint_places(p):
+        kind, row, i, at, j, there, more, moved = joint_at(p, k)
+        if kind == layout.RATE:
             continue
-        if kind == WRITTEN:
-            C[row] = made[int(p[k + MOTION])]
+        if kind == layout.WRITTEN:
+            C[row] = made[moved]
             continue
-        if kind in (PERPENDICULAR, TURN):
-            if kind == TURN:
+        if kind in (layout.PERPENDICULAR, layout.TURN):
+            if kind == layout.TURN:
                 (x, y, z), _, _ = followed(p, at, made, moved)
             else:
                 x, y, z = p[at], p[at + 1], p[at + 2]
@@ -88,14 +56,14 @@ def fill_constraint(q, p, made, C):
             C[row] = ax * bx + ay * by + az * bz
             continue
         bx, by, bz = place(q, j, p, there)
-        if kind == PLANE:
+        if kind == layout.PLANE:
             ax, ay, az = vector(q, i, p[at], p[at + 1], p[at + 2])
             sx, sy, sz = place(q, i, p, more)
             C[row] = ax * (bx - sx) + ay * (by - sy) + az * (bz - sz) - result(made, moved, 0)
             continue
         ax, ay, az = place(q, i, p, at)
         x, y, z = bx - ax, by - ay, bz - az
-        if kind == POINT:
+        if kind == layout.POINT:
             C[row], C[row + 1], C[row + 2] = x, y, z
         else:
             C[row] = 0.5 * (x * x + y * y + z * z - p[more] * p[more])
@@ -104,28 +72,27 @@ def fill_constraint(q, p, made, C):
 @helper
 def fill_rows(q, p, made, k, Cq, row):
     """The rows of C_q of the part of a joint that stands at place k, from a row on."""
-    kind, i, j = int(p[k + KIND]), int(p[k + FIRST]), int(p[k + SECOND])
-    at, there, more = int(p[k + FIRST_AT]), int(p[k + SECOND_AT]), int(p[k + MORE])
-    if kind == WRITTEN:
-        fill_entries(p, k, made, int(p[k + MOTION]) + 3, Cq[row])
+    kind, _, i, at, j, there, more, moved = joint_at(p, k)
+    if kind == layout.WRITTEN:
+        fill_entries(p, more, made, moved + 3, Cq[row])
         return
-    if kind == POINT:
+    if kind == layout.POINT:
         for axis in range(3):
             fx, fy, fz = 1.0 * (axis == 0), 1.0 * (axis == 1), 1.0 * (axis == 2)
             push_row(q, Cq[row + axis], i, p, at, -fx, -fy, -fz)
             push_row(q, Cq[row + axis], j, p, there, fx, fy, fz)
         return
-    if kind == LENGTH:
+    if kind == layout.LENGTH:
         ax, ay, az = place(q, i, p, at)
         bx, by, bz = place(q, j, p, there)
         push_row(q, Cq[row], i, p, at, ax - bx, ay - by, az - bz)
         push_row(q, Cq[row], j, p, there, bx - ax, by - ay, bz - az)
         return
     x, y, z = p[at], p[at + 1], p[at + 2]
-    if kind == TURN:
-        (x, y, z), _, _ = followed(p, at, made, int(p[k + MOTION]))
+    if kind == layout.TURN:
+        (x, y, z), _, _ = followed(p, at, made, moved)
     ax, ay, az = vector(q, i, x, y, z)
-    if kind == PLANE:
+    if kind == layout.PLANE:
         bx, by, bz = place(q, j, p, there)
         sx, sy, sz = place(q, i, p, more)
         push_row(q, Cq[row], j, p, there, ax, ay, az)
@@ -140,58 +107,53 @@ def fill_rows(q, p, made, k, Cq, row):
 @helper
 def fill_jacobian(q, p, made, Cq):
     """C_q; `made`: results of the program of motions."""
-    for body in range(int(p[p.size - HEAD + BODIES])):
+    for body in range(n_bodies(p)):
         for k in range(7 * body + 3, 7 * body + 7):
             Cq[body, k] = q[k]
-    first, n = int(p[p.size - HEAD + JOINTS]), int(p[p.size - HEAD + N_JOINTS])
-    for k in range(first, first + JOINT_WIDTH * n, JOINT_WIDTH):
-        if int(p[k + KIND]) != RATE:
-            fill_rows(q, p, made, k, Cq, int(p[k + ROW]))
+    for k in joint_places(p):
+        kind, row, _, _, _, _, _, _ = joint_at(p, k)
+        if kind != layout.RATE:
+            fill_rows(q, p, made, k, Cq, row)
 
 
 @helper
 def fill_rate(q, p, made, Ct):
     """C_t, of drives alone."""
-    first, n = int(p[p.size - HEAD + JOINTS]), int(p[p.size - HEAD + N_JOINTS])
-    for k in range(first, first + JOINT_WIDTH * n, JOINT_WIDTH):
-        moved = int(p[k + MOTION])
-        if moved >= 0 and int(p[k + KIND]) != RATE:
-            if int(p[k + KIND]) == TURN:
-                there = int(p[k + SECOND_AT])
-                _, (x, y, z), _ = followed(p, int(p[k + FIRST_AT]), made, moved)
-                ax, ay, az = vector(q, int(p[k + FIRST]), x, y, z)
-                bx, by, bz = vector(q, int(p[k + SECOND]), p[there], p[there + 1], p[there + 2])
-                Ct[int(p[k + ROW])] = ax * bx + ay * by + az * bz
-            else:
-                Ct[int(p[k + ROW])] = -result(made, moved, 1)
+    for k in joint_places(p):
+        kind, row, i, at, j, there, _, moved = joint_at(p, k)
+        if moved >= 0 and kind == layout.TURN:
+            _, (x, y, z), _ = followed(p, at, made, moved)
+            ax, ay, az = vector(q, i, x, y, z)
+            bx, by, bz = vector(q, j, p[there], p[there + 1], p[there + 2])
+            Ct[row] = ax * bx + ay * by + az * bz
+        elif moved >= 0 and kind != layout.RATE:
+            Ct[row] = -made[moved + 1]
 
 
 @helper
 def fill_gamma(q, v, p, made, Qd):
     """The right-hand side of C_q a = gamma."""
-    for body in range(int(p[p.size - HEAD + BODIES])):
+    for body in range(n_bodies(p)):
         k = 7 * body + 3
         Qd[body] = -(v[k] * v[k] + v[k + 1] * v[k + 1] + v[k + 2] * v[k + 2] + v[k + 3] * v[k + 3])
-    first, n = int(p[p.size - HEAD + JOINTS]), int(p[p.size - HEAD + N_JOINTS])
-    for k in range(first, first + JOINT_WIDTH * n, JOINT_WIDTH):
-        kind, row, i, j = int(p[k + KIND]), int(p[k + ROW]), int(p[k + FIRST]), int(p[k + SECOND])
-        at, there, more, moved = int(p[k + FIRST_AT]), int(p[k + SECOND_AT]), int(p[k + MORE]), int(p[k + MOTION])
-        if kind == RATE:
+    for k in joint_places(p):
+        kind, row, i, at, j, there, more, moved = joint_at(p, k)
+        if kind == layout.RATE:
             continue
-        if kind == WRITTEN:
-            Qd[row] = made[int(p[k + MOTION]) + 2]
+        if kind == layout.WRITTEN:
+            Qd[row] = made[moved + 2]
             continue
-        if kind in (PERPENDICULAR, TURN):
+        if kind in (layout.PERPENDICULAR, layout.TURN):
             bx, by, bz = vector(q, j, p[there], p[there + 1], p[there + 2])
             bux, buy, buz, bax, bay, baz = vector_rate(q, v, j, p[there], p[there + 1], p[there + 2])
             x, y, z = p[at], p[at + 1], p[at + 2]
             dx, dy, dz = 0.0, 0.0, 0.0
             ex, ey, ez = 0.0, 0.0, 0.0
-            if kind == TURN:
+            if kind == layout.TURN:
                 (x, y, z), (dx, dy, dz), (ex, ey, ez) = followed(p, at, made, moved)
             ax, ay, az = vector(q, i, x, y, z)
             aux, auy, auz, aax, aay, aaz = vector_rate(q, v, i, x, y, z)
-            if kind == TURN:  # the direction changes on body i, too
+            if kind == layout.TURN:  # the direction changes on body i, too
                 fx, fy, fz = vector(q, i, dx, dy, dz)
                 gx, gy, gz, _, _, _ = vector_rate(q, v, i, dx, dy, dz)
                 hx, hy, hz = vector(q, i, ex, ey, ez)
@@ -201,7 +163,7 @@ def fill_gamma(q, v, p, made, Qd):
             Qd[row] -= 2.0 * (aux * bux + auy * buy + auz * buz)
             continue
         bux, buy, buz, bax, bay, baz = motion(q, v, j, p, there)
-        if kind == PLANE:
+        if kind == layout.PLANE:
             ax, ay, az = vector(q, i, p[at], p[at + 1], p[at + 2])
             aux, auy, auz, aax, aay, aaz = vector_rate(q, v, i, p[at], p[at + 1], p[at + 2])
             bx, by, bz = place(q, j, p, there)
@@ -212,7 +174,7 @@ def fill_gamma(q, v, p, made, Qd):
             Qd[row] -= ax * (bax - sax) + ay * (bay - say) + az * (baz - saz)
             continue
         aux, auy, auz, aax, aay, aaz = motion(q, v, i, p, at)
-        if kind == POINT:
+        if kind == layout.POINT:
             Qd[row], Qd[row + 1], Qd[row + 2] = aax - bax, aay - bay, aaz - baz
         else:
             ax, ay, az = place(q, i, p, at)
@@ -225,7 +187,7 @@ def fill_gamma(q, v, p, made, Qd):
 @helper
 def fill_mass(q, p, body, M, first):
     """The block of M of a body, from a row and column on."""
-    m, k = WEIGHT + SPATIAL_BODY * body, 7 * body + 3
+    m, k = WEIGHT + layout.SPATIAL_BODY * body, 7 * body + 3
     e0, e1, e2, e3 = q[k], q[k + 1], q[k + 2], q[k + 3]
     columns = ((-e1, -e2, -e3), (e0, -e3, e2), (e3, e0, -e1), (-e2, e1, e0))  # of G
     for i in range(3):
@@ -239,14 +201,14 @@ def fill_mass(q, p, body, M, first):
 
 @callback("mass")
 def mass(t, q, p, M):
-    for body in range(int(p[p.size - HEAD + BODIES])):
+    for body in range(n_bodies(p)):
         fill_mass(q, p, body, M, 7 * body)
 
 
 @callback("mass_values")
 def mass_values(t, q, p, values):
     block = np.zeros((7, 7), dtype=q.dtype)
-    for body in range(int(p[p.size - HEAD + BODIES])):
+    for body in range(n_bodies(p)):
         fill_mass(q, p, body, block, 0)
         for i in range(3):
             values[19 * body + i] = block[i, i]
@@ -254,51 +216,64 @@ def mass_values(t, q, p, values):
             values[19 * body + 3 + i] = block[3 + i // 4, 3 + i % 4]
 
 
+@helper
+def take_entries(body, skipped, row, values, at):
+    """Move the entries of a row by a body, but the first few, from their places in C_q to values, and clear them."""
+    if body >= 0:
+        for j in range(7 * body + skipped, 7 * (body + 1)):
+            values[at], row[j] = row[j], 0.0
+            at += 1
+    return at
+
+
 @callback("jacobian_values")
 def jacobian_values(t, q, p, values):
-    made, n = results(int(p[p.size - HEAD + MOTION_PROGRAM]), t, q, q, p), int(p[p.size - HEAD + BODIES])
-    for k in range(4 * n):
+    made, at = motions(t, q, q, p), 4 * n_bodies(p)
+    for k in range(at):
         values[k] = q[7 * (k // 4) + 3 + k % 4]
-    rows, at = np.zeros((3, q.size), dtype=q.dtype), 4 * n
-    first, n = int(p[p.size - HEAD + JOINTS]), int(p[p.size - HEAD + N_JOINTS])
-    for k in range(first, first + JOINT_WIDTH * n, JOINT_WIDTH):
-        kind = int(p[k + KIND])
-        if kind != RATE:
+    rows = np.zeros((3, q.size), dtype=q.dtype)
+    for k in joint_places(p):
+        kind, _, i, _, j, _, columns, moved = joint_at(p, k)
+        if kind == layout.WRITTEN:
+            at = put_entries(p, columns, made, moved + 3, values, at)
+        elif kind != layout.RATE:
             fill_rows(q, p, made, k, rows, 0)
-            for row in range(3 if kind == POINT else 1):
-                at = take_entries(p, k, 7, 3 * (kind in (PERPENDICULAR, TURN)), rows[row], values, at)
+            skipped = 3 * (kind in (layout.PERPENDICULAR, layout.TURN))  # entries of rows that turn alone
+            for row in range(3 if kind == layout.POINT else 1):
+                at = take_entries(i, skipped, rows[row], values, at)
+                at = take_entries(j, skipped, rows[row], values, at)
 
 
 @callback("force")
 def force(t, q, v, p, Q):
-    fill_force(q, v, p, results(int(p[p.size - HEAD + FORCE_PROGRAM]), t, q, v, p), Q)
+    fill_force(q, v, p, results(int(p[p.size - layout.HEAD + layout.FORCE_PROGRAM]), t, q, v, p), Q)
 
 
 @callback("constraint")
 def constraint(t, q, p, C):
-    fill_constraint(q, p, results(int(p[p.size - HEAD + MOTION_PROGRAM]), t, q, q, p), C)
+    fill_constraint(q, p, motions(t, q, q, p), C)
 
 
 @callback("jacobian")
 def jacobian(t, q, p, Cq):
-    fill_jacobian(q, p, results(int(p[p.size - HEAD + MOTION_PROGRAM]), t, q, q, p), Cq)
+    fill_jacobian(q, p, motions(t, q, q, p), Cq)
 
 
 @callback("constraint_rate")
 def constraint_rate(t, q, p, Ct):
-    fill_rate(q, p, results(int(p[p.size - HEAD + MOTION_PROGRAM]), t, q, q, p), Ct)
+    fill_rate(q, p, motions(t, q, q, p), Ct)
 
 
 @callback("gamma")
 def gamma(t, q, v, p, Qd):
-    fill_gamma(q, v, p, results(int(p[p.size - HEAD + MOTION_PROGRAM]), t, q, v, p), Qd)
+    fill_gamma(q, v, p, motions(t, q, v, p), Qd)
 
 
 @callback("nonholonomic")
 def nonholonomic(t, q, p, A):
-    fill_nonholonomic(p, results(int(p[p.size - HEAD + MOTION_PROGRAM]), t, q, q, p), A)
+    fill_nonholonomic(p, motions(t, q, q, p), A)
 
 
 @callback("nonholonomic_gamma")
 def nonholonomic_gamma(t, q, v, p, Qa):
-    fill_nonholonomic_gamma(p, results(int(p[p.size - HEAD + MOTION_PROGRAM]), t, q, v, p), Qa)
+    fill_nonholonomic_gamma(p, motions(t, q, v, p), Qa)

@@ -2,42 +2,9 @@
 
 import math
 
-from twoloop.bodies.parameter_layout import (
-    AXIAL,
-    BODIES,
-    BRAKE,
-    F_FIRST,
-    F_FIRST_AT,
-    F_KIND,
-    F_MORE,
-    F_ON_FIRST,
-    F_RESULT,
-    F_SECOND,
-    F_SECOND_AT,
-    FORCE,
-    FORCE_WIDTH,
-    FORCES,
-    HEAD,
-    N_FORCES,
-    PULL,
-    RAIL,
-    RUB,
-    SLIDE,
-    SPATIAL_BODY,
-    TORQUE,
-    TORSION,
-)
-from twoloop.bodies.spatial_places import (
-    centre,
-    motion,
-    move_row,
-    place,
-    push_row,
-    spin,
-    torsion,
-    twist_row,
-    vector,
-)
+from twoloop.bodies import parameter_layout as layout
+from twoloop.bodies.read_tables import force_at, force_places, n_bodies, push, value
+from twoloop.bodies.spatial_places import centre, motion, move_row, place, push_row, spin, torsion, twist_row, vector
 from twoloop.kernels.compile.caches import helper
 from twoloop.mechanisms.rotation import half_spin
 
@@ -57,8 +24,8 @@ def inertia(p, at, x, y, z):
 @helper
 def fill_force(q, v, p, made, Q):
     """Q; `made`: results of the program of forces."""
-    for body in range(int(p[p.size - HEAD + BODIES])):
-        m, k = WEIGHT + SPATIAL_BODY * body, 7 * body + 3
+    for body in range(n_bodies(p)):
+        m, k = WEIGHT + layout.SPATIAL_BODY * body, 7 * body + 3
         move_row(Q, body, p[m] * p[0], p[m] * p[1], p[m] * p[2])
         # -8 G(e')^T J G(e) e': what the kinetic energy leaves when e'' = 0
         u0, u1, u2, u3 = v[k], v[k + 1], v[k + 2], v[k + 3]
@@ -68,40 +35,30 @@ def fill_force(q, v, p, made, Q):
         Q[k + 1] += u0 * x - u3 * y + u2 * z
         Q[k + 2] += u3 * x + u0 * y - u1 * z
         Q[k + 3] += -u2 * x + u1 * y + u0 * z
-    first, n = int(p[p.size - HEAD + FORCES]), int(p[p.size - HEAD + N_FORCES])
-    for k in range(first, first + FORCE_WIDTH * n, FORCE_WIDTH):
-        kind, i, j, more = int(p[k + F_KIND]), int(p[k + F_FIRST]), int(p[k + F_SECOND]), int(p[k + F_MORE])
-        at, there, given = int(p[k + F_FIRST_AT]), int(p[k + F_SECOND_AT]), int(p[k + F_RESULT])
-        if kind == TORQUE:
-            if given >= 0:
-                twist_row(q, Q, j, made[given], made[given + 1], made[given + 2])
+    for k in force_places(p):
+        kind, i, at, j, there, more, given, on_first = force_at(p, k)
+        if kind in (layout.TORQUE, layout.FORCE):
+            x, y = value(p, more, made, given, 0), value(p, more, made, given, 1)
+            z = value(p, more, made, given, 2)
+            if kind == layout.TORQUE:
+                twist_row(q, Q, j, x, y, z)
             else:
-                twist_row(q, Q, j, p[more], p[more + 1], p[more + 2])
+                push_row(q, Q, j, p, there, x, y, z)
             continue
-        if kind == FORCE:
-            if given >= 0:
-                push_row(q, Q, j, p, there, made[given], made[given + 1], made[given + 2])
-            else:
-                push_row(q, Q, j, p, there, p[more], p[more + 1], p[more + 2])
-            continue
-        if kind in (AXIAL, TORSION, BRAKE):  # about an axis of body i
+        if kind in (layout.AXIAL, layout.TORSION, layout.BRAKE):  # about an axis of body i
             x, y, z = vector(q, i, p[at], p[at + 1], p[at + 2])
             ux, uy, uz = spin(q, v, i)
             wx, wy, wz = spin(q, v, j)
             rate = x * (wx - ux) + y * (wy - uy) + z * (wz - uz)
-            if kind == TORSION:
-                push = -torsion(q, i, j, p, at, there, p[more], p[more + 2]) - p[more + 1] * rate
-            elif kind == BRAKE:
-                push = -p[more] * math.tanh(rate / p[more + 1])
-            elif given >= 0:
-                push = made[given]
+            if kind == layout.TORSION:
+                f = -torsion(q, i, j, p, at, there, p[more], p[more + 2]) - p[more + 1] * rate
             else:
-                push = p[more]
-            x, y, z = push * x, push * y, push * z
+                f = push(kind, rate, p, more, made, given)
+            x, y, z = f * x, f * y, f * z
             twist_row(q, Q, j, x, y, z)
             twist_row(q, Q, i, -x, -y, -z)
             continue
-        if kind in (SLIDE, RAIL, RUB):  # along an axis of body i, at the point of j, also on i
+        if kind in (layout.SLIDE, layout.RAIL, layout.RUB):  # along an axis of body i, at the point of j, also on i
             x, y, z = vector(q, i, p[at], p[at + 1], p[at + 2])
             bx, by, bz = place(q, j, p, there)
             cx, cy, cz = centre(q, i)
@@ -111,16 +68,12 @@ def fill_force(q, v, p, made, Q):
             ox, oy, oz = spin(q, v, i)
             wx, wy, wz = wx - ux - oy * cz + oz * cy, wy - uy - oz * cx + ox * cz, wz - uz - ox * cy + oy * cx
             rate = x * wx + y * wy + z * wz
-            if kind == RAIL:
-                ax, ay, az = place(q, i, p, int(p[k + F_ON_FIRST]))
-                push = -p[more] * (x * (bx - ax) + y * (by - ay) + z * (bz - az) - p[more + 2]) - p[more + 1] * rate
-            elif kind == RUB:
-                push = -p[more] * math.tanh(rate / p[more + 1])
-            elif given >= 0:
-                push = made[given]
+            if kind == layout.RAIL:
+                ax, ay, az = place(q, i, p, on_first)
+                f = -p[more] * (x * (bx - ax) + y * (by - ay) + z * (bz - az) - p[more + 2]) - p[more + 1] * rate
             else:
-                push = p[more]
-            x, y, z = push * x, push * y, push * z
+                f = push(kind, rate, p, more, made, given)
+            x, y, z = f * x, f * y, f * z
             push_row(q, Q, j, p, there, x, y, z)
             move_row(Q, i, -x, -y, -z)
             twist_row(q, Q, i, cz * y - cy * z, cx * z - cz * x, cy * x - cx * y)
@@ -128,7 +81,7 @@ def fill_force(q, v, p, made, Q):
         ax, ay, az = place(q, i, p, at)
         bx, by, bz = place(q, j, p, there)
         x, y, z = bx - ax, by - ay, bz - az
-        if kind == PULL:
+        if kind == layout.PULL:
             x, y, z = p[more] * x, p[more] * y, p[more] * z
         else:
             length = math.sqrt(x * x + y * y + z * z)

@@ -6,21 +6,21 @@ import os
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from twoloop.bodies.documented import documented
 from twoloop.bodies.functions import Function
 from twoloop.bodies.parameter_layout import AXIAL, LENGTH, PLANE, POINT, SLIDE, TORSION, TURN
 from twoloop.bodies.parts import Body, Force, JointRow, ModelJoint, Numbers
 from twoloop.bodies.spatial_rows import across, on_line, parallel, perpendiculars, relative
 from twoloop.bodies.wheels import Wheels
-from twoloop.checks.arguments import shown
+from twoloop.checks.arguments import Array, shown
 from twoloop.mechanisms.rotation import euler_parameters, euler_rates, rotation_matrix
-
-Array = NDArray[np.float64]
 
 PERPENDICULAR_TO = 1e-6  # cosine of the angle between the axes of a universal joint, at most
 
 
+@documented
 class SpatialModel(Wheels):
     """A mechanism in space, from bodies, joints and forces.
 
@@ -64,16 +64,6 @@ class SpatialModel(Wheels):
             The bodies, or their names.
         at : array_like (3,) or (BodyPoint, BodyPoint)
             Where, in space in the position given, m; or a point of a and one of b, which are put together.
-        name : str, optional
-
-        Returns
-        -------
-        ModelJoint
-
-        Raises
-        ------
-        TypeError, ValueError
-            If an argument is wrong.
         """
         first, second, name, points = self._pair("spherical", a, b, name, at)
         rows = (JointRow(POINT, 3, first, second, *points),)
@@ -89,16 +79,6 @@ class SpatialModel(Wheels):
             A point on the axis, m.
         axis : array_like (3,) or (BodyDirection, BodyDirection)
             Its direction, of any length.
-        name : str, optional
-
-        Returns
-        -------
-        ModelJoint
-
-        Raises
-        ------
-        TypeError, ValueError
-            If an argument is wrong.
         """
         first, second, name, points = self._pair("revolute", a, b, name, at)
         one, other = self._directions(axis, first, second)
@@ -148,16 +128,6 @@ class SpatialModel(Wheels):
             A point on the axis, m.
         axis : array_like (3,) or (BodyDirection, BodyDirection)
             Its direction, of any length.
-        name : str, optional
-
-        Returns
-        -------
-        ModelJoint
-
-        Raises
-        ------
-        TypeError, ValueError
-            If an argument is wrong.
         """
         first, second, name, points = self._pair("cylindrical", a, b, name, at)
         one, other = self._directions(axis, first, second)
@@ -174,16 +144,6 @@ class SpatialModel(Wheels):
             A point on the axis, m.
         axis : array_like (3,) or (BodyDirection, BodyDirection)
             Its direction, of any length.
-        name : str, optional
-
-        Returns
-        -------
-        ModelJoint
-
-        Raises
-        ------
-        TypeError, ValueError
-            If an argument is wrong.
         """
         first, second, name, points = self._pair("prismatic", a, b, name, at)
         one, other = self._directions(axis, first, second)
@@ -202,16 +162,6 @@ class SpatialModel(Wheels):
             A point in the plane, m.
         axis : array_like (3,) or (BodyDirection, BodyDirection)
             The direction across the plane, of any length.
-        name : str, optional
-
-        Returns
-        -------
-        ModelJoint
-
-        Raises
-        ------
-        TypeError, ValueError
-            If an argument is wrong.
         """
         first, second, name, points = self._pair("planar", a, b, name, at)
         one, other = self._directions(axis, first, second)
@@ -227,16 +177,6 @@ class SpatialModel(Wheels):
         a, b : Body or str
         at : array_like (3,) or (BodyPoint, BodyPoint), optional
             To which the reaction refers, m. None: the centre of mass of b, or of a if b is the ground.
-        name : str, optional
-
-        Returns
-        -------
-        ModelJoint
-
-        Raises
-        ------
-        TypeError, ValueError
-            If an argument is wrong.
         """
         first, second, name, points = self._pair("fixed", a, b, name, at)
         there = second.rotation.T @ first.rotation
@@ -314,15 +254,8 @@ class SpatialModel(Wheels):
     def _start(self) -> Array:
         return np.concatenate([[*body.position, *euler_parameters(body.rotation)] for body in self.bodies])
 
-    def _velocities(self, q: Array) -> tuple[Array, NDArray[np.bool_]]:
-        given = np.full((len(self.bodies), 7), np.nan)
-        for row, body, state in zip(given, self.bodies, q.reshape(-1, 7), strict=True):
-            if body.velocity is not None:
-                row[:3] = body.velocity
-            if body.angular_velocity is not None:
-                row[3:] = euler_rates(state[3:], body.angular_velocity)
-        known = np.isfinite(given.ravel())
-        return np.where(known, given.ravel(), 0.0), known
+    def _turning_rates(self, state: Array, spin: Array) -> Array:
+        return euler_rates(state[3:], spin)
 
     def _check_branches(self, t: float, q: Array) -> None:
         for joint in self.joints:

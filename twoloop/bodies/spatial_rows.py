@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from twoloop.bodies.parameter_layout import PERPENDICULAR, PLANE
 from twoloop.bodies.parts import Body, JointRow, Numbers
-
-Array = NDArray[np.float64]
+from twoloop.checks.arguments import Array
 
 
 def perpendiculars(axis: Array) -> tuple[Array, Array]:

@@ -5,20 +5,20 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from twoloop.bodies.documented import documented
 from twoloop.bodies.model import Model
 from twoloop.bodies.parts import Body
 from twoloop.bodies.spatial_rows import perpendiculars
 from twoloop.bodies.tables import TENSOR
-from twoloop.checks.arguments import check_positive, check_real, check_vector, shown
+from twoloop.checks.arguments import Array, check_positive, check_real, check_vector, shown
 from twoloop.mechanisms.rotation import euler_parameters, rotation_matrix
-
-Array = NDArray[np.float64]
 
 SYMMETRIC = 1e-9  # relative: entries of an inertia
 
 
+@documented
 class SpatialShapes(Model):
     """Adds bodies to a model in space."""
 
@@ -52,15 +52,6 @@ class SpatialShapes(Model):
             Of the centre of mass at the start, m/s. None: it follows from the other velocities.
         angular_velocity : array_like (3,), optional
             Along the axes of space, rad/s, likewise.
-
-        Returns
-        -------
-        Body
-
-        Raises
-        ------
-        TypeError, ValueError
-            If an argument is wrong, or something of the model has this name.
         """
         name, place, weight, speed = self._new_body(name, mass, position, velocity)
         moments = _moments(f"inertia of {name!r}", inertia)
@@ -84,15 +75,6 @@ class SpatialShapes(Model):
             kg.
         **motion
             `velocity` and `angular_velocity`, as for `body`.
-
-        Returns
-        -------
-        Body
-
-        Raises
-        ------
-        TypeError, ValueError
-            If an argument is wrong.
         """
         one, other = check_vector(f"start of {name!r}", start, 3), check_vector(f"end of {name!r}", end, 3)
         length = float(np.linalg.norm(other - one))
@@ -118,15 +100,6 @@ class SpatialShapes(Model):
             Of the centre, m.
         **pose
             `rotation`, `velocity` and `angular_velocity`, as for `body`.
-
-        Returns
-        -------
-        Body
-
-        Raises
-        ------
-        TypeError, ValueError
-            If an argument is wrong.
         """
         squares = check_vector(f"size of {name!r}", size, 3) ** 2
         check_positive(f"mass of {name!r}", mass)
@@ -148,15 +121,6 @@ class SpatialShapes(Model):
             Of the centre, m.
         **pose
             `rotation`, `velocity` and `angular_velocity`, as for `body`.
-
-        Returns
-        -------
-        Body
-
-        Raises
-        ------
-        TypeError, ValueError
-            If an argument is wrong.
         """
         check_positive(f"radius of {name!r}", radius)
         check_positive(f"mass of {name!r}", mass)

@@ -5,22 +5,16 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from twoloop.bodies.functions import is_constant, program_for
 from twoloop.bodies.parameter_layout import AXIAL, BRAKE, NONE, PULL, RAIL, RATE, RUB, SLIDE, SPRING, TORQUE, TORSION
 from twoloop.bodies.parts import Body, Force, JointRow, ModelJoint, Numbers
-from twoloop.checks.arguments import check_not_negative, check_positive
+from twoloop.checks.arguments import Array, check_not_negative, check_positive
 from twoloop.generate.programs import numbers_of
 from twoloop.generate.tracing import Untraceable
 
-Array = NDArray[np.float64]
-
 GRAVITY = ("x", "y", "z")
-MOMENTS = {
-    2: ("moment of inertia",),
-    3: tuple(f"J_{which}" for which in ("xx", "yy", "zz", "xy", "xz", "yz")),
-}
+MOMENTS = {2: ("moment of inertia",), 3: tuple(f"J_{which}" for which in ("xx", "yy", "zz", "xy", "xz", "yz"))}
 
 TENSOR = [0, 3, 4, 3, 1, 5, 4, 5, 2]  # where the entries of a tensor of inertia stand among these
 

@@ -3,23 +3,19 @@
 from __future__ import annotations
 
 import os
-import warnings
-import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 from xml.etree.ElementTree import Element
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from twoloop.bodies.mjcf_geometry import IgnoredWarning, Lump, Pose, numbers, pose_of
+from twoloop.bodies.mjcf_geometry import Lump, Pose, numbers, pose_of, root_of, tell_ignored
 from twoloop.bodies.mjcf_joints import Freed, Part, add_part, body_of
 from twoloop.bodies.parts import Body
 from twoloop.bodies.spatial_model import SpatialModel
-from twoloop.checks.arguments import check_choice, check_finite, check_flag, check_vector
-
-Array = NDArray[np.float64]
+from twoloop.checks.arguments import Array, check_choice, check_finite, check_flag, check_vector
 
 KINDS = {"revolute": "hinge", "continuous": "hinge", "prismatic": "slide", "floating": "free", "fixed": ""}
 CLOSING = ("spherical", "revolute", "universal", "cylindrical", "prismatic", "planar", "fixed")
@@ -100,20 +96,13 @@ def from_urdf(
     -----
     The format is described at wiki.ros.org/urdf/XML.
     """
-    try:
-        root = ElementTree.parse(path).getroot()
-    except ElementTree.ParseError as error:
-        raise ValueError(f"{os.fspath(path)!r} is not XML: {error}") from None
-    if root.tag != "robot":
-        raise ValueError(f"{os.fspath(path)!r} must begin with <robot>; it begins with <{root.tag}>")
+    root = root_of(path, "robot")
     check_flag("free_base", free_base)
     reader = _Reader(root, dict(positions or {}), SpatialModel(gravity, name=root.get("name", "robot")))
     reader.read(free_base)
     for loop in loops:
         reader.close(loop)
-    reader.model.ignored = tuple(reader.ignored)
-    if reader.ignored:
-        warnings.warn(f"{os.fspath(path)!r}: ignored are {'; '.join(reader.ignored)}", IgnoredWarning, stacklevel=2)
+    tell_ignored(path, reader.model, reader.ignored)
     return reader.model
 
 
@@ -279,6 +268,8 @@ def _origin(element: Element, what: str) -> Pose:
     """Where a frame is in that of its parent: xyz, then turned about fixed axes by roll, pitch and yaw."""
     origin = element.find("origin")
     given = {} if origin is None else origin.attrib
+    if "quat_xyzw" in given:
+        raise ValueError(f"{what} has quat_xyzw, which is not read: give rpy")
     turns = numbers(given.get("rpy", "0 0 0"), 3, f"rpy of {what}").tolist()
     return pose_of({"pos": given.get("xyz", "0 0 0"), "euler": " ".join(map(repr, turns))}, what, False, "XYZ")
 

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from twoloop.bodies.documented import documented
 from twoloop.bodies.parameter_layout import RATE, WRITTEN
 from twoloop.bodies.parts import Body, JointRow, ModelJoint, Numbers
 from twoloop.bodies.places import turned
@@ -18,6 +19,7 @@ from twoloop.checks.arguments import check_positive, check_vector
 FLAT = 1e-6  # sine of the angle between axle and normal
 
 
+@documented
 class Wheels(SpatialShapes):
     """Adds such wheels to a model in space."""
 
@@ -33,6 +35,8 @@ class Wheels(SpatialShapes):
     ) -> ModelJoint:
         """A thin wheel, whose centre of mass is its centre, that rolls on a plane of the ground without slipping.
 
+        Its reaction is that on the wheel, about its centre.
+
         Parameters
         ----------
         wheel : Body or str
@@ -42,17 +46,6 @@ class Wheels(SpatialShapes):
             About which the wheel is round, in space in the position given.
         foot, normal : array_like (3,)
             A point of the plane, m, and the direction across it, to the side of the wheel.
-        name : str, optional
-
-        Returns
-        -------
-        ModelJoint
-            Whose reaction is that on the wheel, about its centre.
-
-        Raises
-        ------
-        TypeError, ValueError
-            If an argument is wrong.
         """
         on = self._moving_body("wheel", wheel)
         name = self._new_name("rolling", name, on)

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from twoloop.checks.arguments import Array
 from twoloop.checks.values import MOST
 from twoloop.kernels.compile.caches import names_in, of_library
 from twoloop.kernels.compile.callbacks import KINDS
@@ -22,7 +22,6 @@ from twoloop.kernels.compile.private import Dispatcher
 if TYPE_CHECKING:
     from twoloop.problem.system import ConstrainedSystem
 
-Array = NDArray[np.float64]
 
 OWN = {
     *("twoloop.checks.bounds", "twoloop.generate.tracing", "twoloop.generate.calls_on_symbols"),

@@ -7,9 +7,9 @@ from functools import cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import lapack, null_space
 
+from twoloop.checks.arguments import Array
 from twoloop.checks.bounds import check_bounds
 from twoloop.checks.derivatives import check_derivatives
 from twoloop.checks.rank import eigenvalues, in_words, largest_solution, redundant_rows
@@ -22,7 +22,6 @@ from twoloop.kernels.compile.linking import direct
 if TYPE_CHECKING:
     from twoloop.problem.system import ConstrainedSystem
 
-Array = NDArray[np.float64]
 
 CONSISTENT = 1e-8  # correction that an initial state may need, relative to the size of the mechanism
 SURELY = 0.1  # of that: where no more is needed, there is no doubt
@@ -221,18 +220,8 @@ class Violation:
         falling = np.sqrt(scales.reach * float(np.abs(pull / scales.columns).max()))
         speeds = np.maximum(np.maximum(fastest, np.abs(rate) / scales.rows), falling)
         terms = np.abs(jacobian) @ np.abs(v) + np.abs(rate)
-        values = jacobian @ v + rate
-        return cls(
-            system,
-            t,
-            "C_q v + C_t" if system.n_a == 0 else "(C_q v + C_t, A v + b)",
-            values,
-            terms,
-            jacobian,
-            scales,
-            speeds,
-            np.abs(v),
-        )
+        equation, values = "C_q v + C_t" if system.n_a == 0 else "(C_q v + C_t, A v + b)", jacobian @ v + rate
+        return cls(system, t, equation, values, terms, jacobian, scales, speeds, np.abs(v))
 
     @property
     def excess(self) -> float:

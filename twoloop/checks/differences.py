@@ -14,7 +14,8 @@ import numpy as np
 from numpy.polynomial import chebyshev
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from twoloop.checks.arguments import Array
+
 Function = Callable[[float], Array]
 
 EPS = float(np.finfo(np.float64).eps)

@@ -1,12 +1,10 @@
 """Rows that depend on others: which they are, how they are made of these, and how large solutions can be."""
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import lapack, qr
 
+from twoloop.checks.arguments import Array
 from twoloop.kernels.compile.linking import direct
-
-Array = NDArray[np.float64]
 
 RANK_TOLERANCE = 1e-11  # of the largest diagonal entry of R
 SHOWN = 5  # rows that depend on others, of which the equations are written out

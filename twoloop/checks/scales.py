@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from twoloop.checks.arguments import Array
 from twoloop.checks.bounds import check_callback
 from twoloop.checks.sparse_rows import Rows, SparseRows
 from twoloop.kernels.compile.linking import direct
@@ -21,7 +22,6 @@ from twoloop.kernels.compile.linking import direct
 if TYPE_CHECKING:
     from twoloop.problem.system import ConstrainedSystem
 
-Array = NDArray[np.float64]
 
 FASTEST = 1e9  # times the motion by one's own size in a second: beyond, C_q is nearly zero and the drive is not so fast
 EPS = float(np.finfo(np.float64).eps)

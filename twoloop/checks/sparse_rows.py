@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from twoloop.checks.arguments import Array
+
 Integers = NDArray[np.int64]
 
 

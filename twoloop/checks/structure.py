@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from twoloop.checks.arguments import Array
 from twoloop.checks.differences import EPS, as_far_as_they_differ, defined
 from twoloop.checks.scales import generic_factors, generic_velocities, rows_at
 from twoloop.checks.values import SAME, UNSYMMETRIC, unsymmetric_mass, wrong_values
@@ -15,7 +15,6 @@ from twoloop.kernels.compile.linking import direct
 if TYPE_CHECKING:
     from twoloop.problem.system import ConstrainedSystem
 
-Array = NDArray[np.float64]
 
 NEAR = 1e-3  # of the coordinates: also looked at a little off the start, where symmetry hides terms
 ROUNDED = 100.0  # times rounding of the terms of a constraint, by which values that callbacks share may differ, too

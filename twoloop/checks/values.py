@@ -5,12 +5,12 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
+
+from twoloop.checks.arguments import Array
 
 if TYPE_CHECKING:
     from twoloop.problem.system import ConstrainedSystem
 
-Array = NDArray[np.float64]
 
 SAME = 1e-11  # relative: values that two callbacks must share
 MOST = 4_000_000  # numbers of a dense matrix that is made for a comparison

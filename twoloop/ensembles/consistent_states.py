@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from twoloop.checks.arguments import check_finite, check_indices
+from twoloop.checks.arguments import Array, check_finite, check_indices
 from twoloop.ensembles.starts import (
     AT_ROUNDING,
     NEAR,
@@ -24,8 +24,6 @@ from twoloop.generate.traced_equations import Equations
 from twoloop.generate.tracing import Untraceable
 from twoloop.problem.system import ConstrainedSystem, check_system
 from twoloop.run.projection import consistent_state
-
-Array = NDArray[np.float64]
 
 MOST_ITERATIONS = 12
 STRAIGHT = 0.25  # of a displacement: how far its projection may end from where C_q sends it

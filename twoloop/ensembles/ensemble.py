@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from twoloop.checks.arguments import check_positive, check_size, check_span, check_times, check_tolerance
+from twoloop.checks.arguments import Array, check_positive, check_size, check_span, check_times, check_tolerance
 from twoloop.ensembles.in_lanes import LaneRuns, threads_of
 from twoloop.ensembles.lane_methods import IN_LANES, LaneMethod, lane_methods
 from twoloop.ensembles.runs import Runs
@@ -17,7 +17,6 @@ from twoloop.problem.system import ConstrainedSystem, check_system
 from twoloop.result.result import Result
 from twoloop.solve import check_method, solve_dae
 
-Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 FAR = 1e5  # tolerances, by which a motion that is not chaotic does not end elsewhere

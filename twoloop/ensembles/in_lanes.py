@@ -7,6 +7,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from twoloop.checks.arguments import Array
 from twoloop.ensembles.lane_methods import LaneMethod
 from twoloop.ensembles.starts import Starts, generic_parameters, kit_to_write, over_rounding, system_of
 from twoloop.generate.choices import Choice
@@ -14,7 +15,6 @@ from twoloop.generate.on_arrays import OnArrays
 from twoloop.generate.time_dependence import may_be_sudden
 from twoloop.problem.system import ConstrainedSystem
 
-Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 PLACES = 100  # of a run, at least as many at which the equations are looked at ...

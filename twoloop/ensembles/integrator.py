@@ -22,7 +22,7 @@ from twoloop.solve import check_method, solve_dae
 
 MOST = 64  # systems of other parameters that are kept
 FOR_SAMPLES = {"method", "rtol", "atol", "max_step", "check_derivatives"}
-OF_A_RUN = {"system", "t_span", "q0", "v0", "method", "rtol", "atol", "t_eval"}
+OF_A_RUN = {"system", "t_span", "q0", "v0", "method", "rtol", "atol", "t_eval", "store"}
 
 
 class Integrator:
@@ -64,6 +64,7 @@ class Integrator:
         self._options = {"method": check_method(method), "rtol": rtol, "atol": copy.copy(atol), **options}
         self._systems: dict[bytes, ConstrainedSystem] = {}
         self._sampled: SampledRun | None = None
+        self._started = system
 
     def run(
         self,
@@ -122,19 +123,18 @@ class Integrator:
         t0 = check_finite("t0", t0)
         n, rtol, max_step = self.system.n_q, self._options["rtol"], self._options.get("max_step", np.inf)
         check_positive("max_step", max_step, infinite=True)
-        self._sampled = SampledRun(
-            self.system.with_parameters(self.system.parameters if parameters is None else parameters)
-            if self.system.parameters.size
-            else copy.copy(self.system),
-            self._options["method"],
-            float(rtol),
-            check_tolerance("atol", self._options["atol"], n),
-            float(max_step),
-            self._options.get("check_derivatives", True),
-            t0,
+        self._started = self.system if parameters is None else self._system_of(parameters)
+        system = copy.copy(self.system)
+        if self.system.parameters.size:
+            system = self.system.with_parameters(self.system.parameters if parameters is None else parameters)
+        atol = check_tolerance("atol", self._options["atol"], n)
+        q, v, checks = (
             check_vector("q0", q0, n),
             check_vector("v0", v0, n),
+            self._options.get("check_derivatives", True),
         )
+        asked = self._options["method"], float(rtol), atol, float(max_step), checks
+        self._sampled = SampledRun(system, *asked, t0, q, v)
         if self._sampled.run.said_of_rows:
             warnings.warn(self._sampled.run.said_of_rows, ConstraintWarning, stacklevel=2)
         return self._sampled.state
@@ -180,7 +180,8 @@ class Integrator:
         Returns
         -------
         Result
-            Without a dense solution. `result.changes` says that inputs changed.
+            Without a dense solution. `result.changes` says that inputs changed. Its energy is that of the parameters
+            of the system, whatever inputs changed; it has none if `start` was given others.
 
         Raises
         ------
@@ -189,7 +190,7 @@ class Integrator:
         """
         if self._sampled is None:
             raise ValueError("result has the samples since a start: call integrator.start(t0, q0, v0) first")
-        record = replace(self._sampled.record(), system=self.system, method=self._options["method"].name)
+        record = replace(self._sampled.record(), system=self._started, method=self._options["method"].name)
         atol = check_tolerance("atol", self._options["atol"], self.system.n_q)
         return result_of(record, compiled=False, rtol=float(self._options["rtol"]), atol=atol)
 

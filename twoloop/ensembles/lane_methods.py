@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from twoloop.checks.arguments import Array
 from twoloop.methods.auto import LOOSE, TIGHTEST
 from twoloop.methods.dop853_tableau import B
 from twoloop.methods.plan import Method, least_tolerance
@@ -19,7 +19,6 @@ from twoloop.run.run import FIRST_STEP
 if TYPE_CHECKING:  # it loads kernels
     from twoloop.generate.lane_code import LaneCode
 
-Array = NDArray[np.float64]
 
 STAGES = {"RadauIIA5": 3, "RadauIIA9": 5, "RadauIIA13": 7}  # of the implicit methods
 IN_LANES = ("auto", "Taylor", "DOP853", *STAGES)  # presets that go in lanes

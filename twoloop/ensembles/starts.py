@@ -6,10 +6,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from twoloop.checks.arguments import check_real
+from twoloop.checks.arguments import Array, check_real
 from twoloop.problem.system import ConstrainedSystem
-
-Array = NDArray[np.float64]
 
 AT_ROUNDING = 64.0  # times rounding of its terms: an equation of a start that holds
 NEAR = 1e4  # the same of one that needs no closer look

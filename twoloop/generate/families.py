@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from twoloop.generate.known_numbers import Known, Powers, Record
 from twoloop.generate.tracing import Untraceable
-from twoloop.kernels.compile.caches import Newest, _uncollected
+from twoloop.kernels.compile.caches import Newest, uncollected
 from twoloop.problem.system import ConstrainedSystem
 
 Array = NDArray[np.float64]
@@ -97,7 +97,7 @@ class Family:
         if what not in self._made:
             with self._tracing:
                 if what not in self._made:
-                    with _uncollected():  # what is traced all stays, too
+                    with uncollected():  # what is traced all stays, too
                         self._made[what] = make()
         return self._made[what]
 

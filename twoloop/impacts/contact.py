@@ -5,18 +5,16 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from twoloop.checks.arguments import Array
 from twoloop.generate.derived import standing_for
 from twoloop.generate.traced_values import unchecked
 from twoloop.impacts.gaps import Gaps
 from twoloop.kernels.compile.linking import direct
-from twoloop.kernels.data import common
+from twoloop.kernels.data import codes, noted
 from twoloop.methods.dop853 import DOP853
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.run import Run
-
-Array = NDArray[np.float64]
 
 
 class Closed:
@@ -87,13 +85,13 @@ class Accelerations:
         derived, _ = standing_for(system, unchecked)
         plan = DOP853().plan(system.n_q, 1e-8, 1e-8, False)
         self._run = Run(derived, plan, t, q, v, 1e-8, atol, None)
-        self._run.work.notes[common.GENERATION] = 1.0  # the ranks are known
+        self._run.work.notes[noted.GENERATION] = 1.0  # the ranks are known
         self._n = system.n_q
 
     def at(self, t: float, q: Array, v: Array) -> tuple[Array, Array]:
         """a (n_q,) and [lam; mu]; NaN where there are none."""
         run, n = self._run, self._n
         state = np.concatenate([q, v, np.zeros(len(run.state) - 2 * n)])
-        if direct(run.kernels.start)(run.kit, run.work, t, state) != common.DONE:
+        if direct(run.kernels.start)(run.kit, run.work, t, state) != codes.DONE:
             state[2 * n :] = np.nan
         return state[2 * n : 3 * n], state[3 * n :]

@@ -6,16 +6,13 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from twoloop.checks.arguments import shown
+from twoloop.checks.arguments import Array, shown
 from twoloop.generate.calls_on_symbols import as_forms, trace
 from twoloop.generate.derivative import Derivative
 from twoloop.generate.programs import numbers_of, program_of
 from twoloop.generate.tracing import Form, Graph, Untraceable, symbols
 from twoloop.problem.stops import Stop
-
-Array = NDArray[np.float64]
 
 STATES = 5  # at which what was recorded is compared with the function
 AGREES = 1e-10  # relative

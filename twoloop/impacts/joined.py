@@ -7,14 +7,12 @@ from dataclasses import fields
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from twoloop.checks.arguments import check_real
+from twoloop.checks.arguments import Array, check_real
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.result.result import Result
 from twoloop.run.record import Statistics, Status, explained
-
-Array = NDArray[np.float64]
 
 CHANGES = "velocities jumped in impacts, or stops were closed or joints stuck for a while"
 

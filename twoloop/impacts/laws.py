@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import lsq_linear, nnls
 
+from twoloop.checks.arguments import Array
 from twoloop.problem.system import ConstrainedSystem
-
-Array = NDArray[np.float64]
 
 EVEN = 1e-6  # relative: by how much forces that share a load seek to be alike
 WEIGHT = 1e3  # of that problem, so that its gradients are large beside the tolerance of the solver
@@ -50,9 +48,8 @@ def bounded(D: Array, c: Array, n: int, most: Array) -> Array:
     tiny = np.finfo(np.float64).tiny
     B, y = _squares(D, c)
     size = np.sqrt(D.diagonal().max())
-    unit = max(
-        float(np.linalg.norm(y)) / size, NEGLIGIBLE * float(most.max()), tiny
-    )  # of forces: the problem is solved in numbers of about 1
+    # of forces: the problem is solved in numbers of about 1
+    unit = max(float(np.linalg.norm(y)) / size, NEGLIGIBLE * float(most.max()), tiny)
     bound = np.maximum(most / unit, tiny)
     even = np.zeros((len(most), len(c)))
     even[:, n:] = np.diag(EVEN * np.sqrt(bound.min() / bound))

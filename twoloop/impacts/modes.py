@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from twoloop.checks.arguments import Array
 from twoloop.impacts.contact import Accelerations, Closed
 from twoloop.impacts.gaps import Gap, Gaps
 from twoloop.impacts.joined import Impact, joined
@@ -19,9 +20,8 @@ from twoloop.result.result import Result
 from twoloop.run.record import Status
 from twoloop.solve import solve_dae
 
-Array = NDArray[np.float64]
-
 LOW = 0.01  # of the absolute tolerance: a rebound to less than this height ends in contact
+LOOKS = 2000  # at the gaps of stops in a motion, at least
 ROUNDING = 1e-13  # of the largest coordinate, at least
 LEAST_STEP = 1e-9  # s, or relative: the first of an arc
 NOTHING = 1e-20  # m or rad, also over s: coordinates and rates that rounding alone keeps from zero
@@ -51,13 +51,7 @@ class Motion:
     """
 
     def __init__(
-        self,
-        stops: Sequence[Stop],
-        rubs: Rubbing | Frictionless,
-        t: float,
-        q: Array,
-        v: Array,
-        options: dict[str, Any],
+        self, stops: Sequence[Stop], rubs: Rubbing | Frictionless, t: float, q: Array, v: Array, options: dict[str, Any]
     ):
         self.system, self.rubs, self.stops, self.options = rubs.system, rubs, list(stops), options
         self.t, self.q, self.v = t, q, v
@@ -79,7 +73,7 @@ class Motion:
 
     def to(self, t1: float, times: Array | None) -> Result:
         """Go on to the end."""
-        standing = 0
+        standing, self.every = 0, (t1 - self.t) / LOOKS
         while True:
             before = self.t
             try:
@@ -289,7 +283,9 @@ class Motion:
                 return (g - g0) / (t - t0) if t > t0 else u0
             return g - min(g0, 0.0) + low
 
-        return terminal(closes)
+        event = terminal(closes)
+        event.every = self.every
+        return event
 
     def _changes(self, k: int, sign: int | None, friction: Any) -> Any:
         """The event that ends the mode of a joint."""

@@ -17,7 +17,22 @@ from twoloop.problem.system import ConstrainedSystem, check_system
 from twoloop.result.result import Result
 from twoloop.solve import solve_dae
 
-OF_A_RUN = {"system", "t_span", "q0", "v0", "method", "rtol", "atol", "t_eval", "events", "dense_output", "step_size"}
+OF_A_RUN = {
+    *(
+        "system",
+        "t_span",
+        "q0",
+        "v0",
+        "method",
+        "rtol",
+        "atol",
+        "t_eval",
+        "events",
+        "dense_output",
+        "step_size",
+        "store",
+    )
+}
 
 
 def solve_with_stops(
@@ -66,8 +81,9 @@ def solve_with_stops(
 
     Notes
     -----
-    Impacts are found as events are: a gap that closes and opens again within a quarter of a step is missed; `max_step`
-    helps. The time of an impact is as good as the motion before it.
+    Impacts are found as events are, with looks at the gaps four times a step and every two-thousandth of the motion at
+    least: a gap that closes and opens again between two looks is missed; `max_step` helps. The time of an impact is as
+    good as the motion before it.
     """
     check_system(system)
     t0, t1 = check_span(t_span)

@@ -5,15 +5,14 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from twoloop.checks.arguments import Array
 from twoloop.impacts.laws import NEGLIGIBLE, responses
 from twoloop.problem.system import ConstrainedSystem
 
 if TYPE_CHECKING:
     from twoloop.bodies.model_problem import ModelProblem
 
-Array = NDArray[np.float64]
 
 Signs = list[int | None]  # of joints: in which direction they slide, or one of these
 STICKS, IDLE = 0, None  # held by friction, or by stops and other joints that hold it already

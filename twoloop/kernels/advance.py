@@ -6,63 +6,8 @@
 import numpy as np
 
 from twoloop.kernels.algebra.linalg import copy
-from twoloop.kernels.control.clock import (
-    ALL_OUTPUT_DONE,
-    AT_JUMP,
-    DRIVEN,
-    ERRORS,
-    FAILURE_CODE,
-    FAILURES,
-    FIXED_STEP,
-    FIXED_STEP_FAILED,
-    GIVES_WAY,
-    GO_ON,
-    H_FAILED,
-    H_LIMIT,
-    H_LONG,
-    H_NEXT,
-    HAS_TO_BE_DENSE,
-    HAS_TO_GIVE_WAY,
-    JACOBIANS,
-    JUMP_FROM,
-    JUMP_TO,
-    LEAPS,
-    LIMIT_AGE,
-    LIMIT_FACTOR,
-    LIMIT_MEMORY,
-    LIMIT_START,
-    MAX_ATTEMPTS,
-    MAX_STEP,
-    MAX_STEPS,
-    MAX_STEPS_REACHED,
-    N_FIXED,
-    NEAR_SINGULAR,
-    NEXT_OUTPUT,
-    PARTITIONS,
-    PAUSED,
-    PIVOT_HERE,
-    PROVISIONAL,
-    RANK_LOST,
-    ROUGH,
-    ROUGH_TO,
-    ROWS_VIOLATED,
-    SHORTEST,
-    SPACING,
-    STEP_TOO_SMALL,
-    STORE_ALL,
-    SUDDEN,
-    SYMMETRIC,
-    T_START,
-    H,
-    T,
-)
-from twoloop.kernels.control.controller import (
-    EXPONENT,
-    FACTOR_MIN,
-    SAFETY,
-    factor_of,
-    remember,
-)
+from twoloop.kernels.control import clock as at
+from twoloop.kernels.control.controller import EXPONENT, FACTOR_MIN, SAFETY, factor_of, remember
 from twoloop.kernels.control.landing import NEAR, off_grid, on_grid
 from twoloop.kernels.control.singular import (
     SHORT,
@@ -73,41 +18,29 @@ from twoloop.kernels.control.singular import (
     with_care,
 )
 from twoloop.kernels.control.sudden import up_to_sudden
-from twoloop.kernels.data.common import (
-    DEFECT,
-    DONE,
-    EXPLICIT_STEP,
-    FAULT_KIND,
-    FORM,
-    GAMMA_GIVEN,
-    GAP,
-    INNER_DIVERGED,
-    INTEGERS,
-    KINK_AFTER,
-    KIT,
-    LARGEST_DEFECT,
-    MATRIX,
+from twoloop.kernels.data.codes import DONE, INNER_DIVERGED, NEEDS_DENSE, NOT_FINITE, SINGULAR
+from twoloop.kernels.data.common import INTEGERS, KIT, MATRIX, VECTOR, WORK, f8, i8, kernel, merged
+from twoloop.kernels.data.counters import (
     N_ACCEPTED,
     N_JACOBIANS,
     N_PARTITIONS,
     N_REJECTED_CONVERGENCE,
     N_REJECTED_ERROR,
-    NEEDS_DENSE,
-    NOT_FINITE,
+)
+from twoloop.kernels.data.flags import FORM, GAMMA_GIVEN, STATIC
+from twoloop.kernels.data.noted import (
+    DEFECT,
+    EXPLICIT_STEP,
+    FAULT_KIND,
+    KINK_AFTER,
+    LARGEST_DEFECT,
     ORIENTATION,
     ORIENTATION_NEW,
     PIVOT,
-    SINGULAR,
-    STATIC,
     UNCHECKED,
-    VECTOR,
     WIDEST_GAP,
-    WORK,
-    f8,
-    i8,
-    kernel,
-    merged,
 )
+from twoloop.kernels.data.tolerances import GAP
 from twoloop.kernels.evaluation.calls import (
     accelerations,
     check_redundant,
@@ -159,7 +92,7 @@ def _kink(f, w, t, size, tolerances, accepted, state, new_state):
 def _attempt(f, w, options, memory, tolerances, control, clock, t, size, leaps, state, new_state):
     """A step: its code, its error and the factor by which the next may be longer."""
     w.notes[ORIENTATION_NEW] = 0.0
-    if clock[FAILURE_CODE] == DONE:
+    if clock[at.FAILURE_CODE] == DONE:
         w.notes[FAULT_KIND] = -1.0
     if leaps:
         w.notes[DEFECT] = 0.0
@@ -167,7 +100,7 @@ def _attempt(f, w, options, memory, tolerances, control, clock, t, size, leaps, 
         return DONE, 0.0, 0.0
     w.notes[DEFECT] = -1.0
     code, error, factor = f.attempt(f, w, options, memory, t, size, tolerances, state, new_state)
-    if code == DONE and np.isfinite(error) and control[SYMMETRIC] == 1.0:
+    if code == DONE and np.isfinite(error) and control[at.SYMMETRIC] == 1.0:
         code = take_midpoint(f, w, t + 0.5 * size, state, new_state)
         if code == CHANGED:
             f.settle(f, w, options, memory, tolerances, False)
@@ -182,12 +115,12 @@ def _before_kink(f, w, tolerances, control, clock, t, size, accepted, state, new
     """Whether C_t or b jumps or bends within a step, which is then to end there."""
     kind, low, high = _kink(f, w, t, size, tolerances, accepted, state, new_state)
     if kind == JUMP:
-        clock[JUMP_FROM] = t if low - t <= NEAR * np.spacing(abs(t)) else low
-        clock[JUMP_TO] = high
-        w.notes[KINK_AFTER] = clock[JUMP_FROM]
+        clock[at.JUMP_FROM] = t if low - t <= NEAR * np.spacing(abs(t)) else low
+        clock[at.JUMP_TO] = high
+        w.notes[KINK_AFTER] = clock[at.JUMP_FROM]
         return True
-    if kind == RAMP and accepted and control[FIXED_STEP] == 0.0:
-        clock[H_NEXT] = max(low - t, high - low)
+    if kind == RAMP and accepted and control[at.FIXED_STEP] == 0.0:
+        clock[at.H_NEXT] = max(low - t, high - low)
         return True
     return False
 
@@ -202,41 +135,41 @@ def _failed(f, w, control, clock, t, size, code, retried, state):
     n = w.Q.size
     poor = code in (SINGULAR, INNER_DIVERGED)
     if code == NEEDS_DENSE or lost_at_singular(f, clock, size):
-        return HAS_TO_BE_DENSE
+        return at.HAS_TO_BE_DENSE
     w.counters[N_REJECTED_CONVERGENCE] += 1
     if with_care(f, w, control, clock, size):
-        return GO_ON
-    clock[FAILURE_CODE] = code
-    clock[H_FAILED] = size
-    if code == NOT_FINITE and control[GIVES_WAY] == 1.0:
-        return HAS_TO_GIVE_WAY
-    if control[FIXED_STEP] > 0.0:
+        return at.GO_ON
+    clock[at.FAILURE_CODE] = code
+    clock[at.H_FAILED] = size
+    if code == NOT_FINITE and control[at.GIVES_WAY] == 1.0:
+        return at.HAS_TO_GIVE_WAY
+    if control[at.FIXED_STEP] > 0.0:
         if not poor or t == retried:
-            return NEAR_SINGULAR if near_singular(w, control, clock) else FIXED_STEP_FAILED
+            return at.NEAR_SINGULAR if near_singular(w, control, clock) else at.FIXED_STEP_FAILED
     else:
-        if size < SHORT * clock[H_LONG] and near_singular(w, control, clock):
-            return NEAR_SINGULAR
-        clock[H_LIMIT] = control[LIMIT_FACTOR] * size
-        clock[LIMIT_AGE] = 0.0
-        clock[H_NEXT] = 0.5 * size
+        if size < SHORT * clock[at.H_LONG] and near_singular(w, control, clock):
+            return at.NEAR_SINGULAR
+        clock[at.H_LIMIT] = control[at.LIMIT_FACTOR] * size
+        clock[at.LIMIT_AGE] = 0.0
+        clock[at.H_NEXT] = 0.5 * size
     if poor and renew_partition(f, w, t, state[:n]) != DONE:
-        return HAS_TO_BE_DENSE if f.flags[FORM] == STATIC else RANK_LOST
-    return GO_ON
+        return at.HAS_TO_BE_DENSE if f.flags[FORM] == STATIC else at.RANK_LOST
+    return at.GO_ON
 
 
 @merged
 def _refused(f, w, control, clock, t, size, proposal):
     """What becomes of a step whose error is too large: a shorter one, a tiny one by a spacing, or steps across."""
     w.counters[N_REJECTED_ERROR] += 1
-    clock[FAILURE_CODE] = DONE
+    clock[at.FAILURE_CODE] = DONE
     if with_care(f, w, control, clock, size):
-        return GO_ON
-    clock[H_NEXT] = min(proposal, REFUSED * size, size - np.spacing(abs(t + size)))
+        return at.GO_ON
+    clock[at.H_NEXT] = min(proposal, REFUSED * size, size - np.spacing(abs(t + size)))
     if lost_at_singular(f, clock, size):
-        return HAS_TO_BE_DENSE
-    if size < SHORT * clock[H_LONG] and near_singular(w, control, clock):
-        return NEAR_SINGULAR
-    return GO_ON
+        return at.HAS_TO_BE_DENSE
+    if size < SHORT * clock[at.H_LONG] and near_singular(w, control, clock):
+        return at.NEAR_SINGULAR
+    return at.GO_ON
 
 
 @merged
@@ -250,39 +183,19 @@ def _count(w, tolerances, size, out_step):
     gap = min(size, tolerances[GAP]) if w.notes[DEFECT] >= 0.0 else size
     w.notes[WIDEST_GAP] = max(w.notes[WIDEST_GAP], gap)
     w.notes[ORIENTATION] = w.notes[ORIENTATION_NEW]
-    out_step[H] = size
-    out_step[ERRORS] = w.counters[N_REJECTED_ERROR]
-    out_step[FAILURES] = w.counters[N_REJECTED_CONVERGENCE]
-    out_step[PARTITIONS] = w.counters[N_PARTITIONS]
-    out_step[JACOBIANS] = 0.0 if w.notes[EXPLICIT_STEP] == 1.0 else w.counters[N_JACOBIANS]
+    out_step[at.H] = size
+    out_step[at.ERRORS] = w.counters[N_REJECTED_ERROR]
+    out_step[at.FAILURES] = w.counters[N_REJECTED_CONVERGENCE]
+    out_step[at.PARTITIONS] = w.counters[N_PARTITIONS]
+    out_step[at.JACOBIANS] = 0.0 if w.notes[EXPLICIT_STEP] == 1.0 else w.counters[N_JACOBIANS]
 
 
-_ADVANCE = i8(
-    KIT,
-    WORK,
-    *(VECTOR,) * 9,
-    MATRIX,
-    MATRIX,
-    INTEGERS,
-)
+_ADVANCE = i8(KIT, WORK, *(VECTOR,) * 9, MATRIX, MATRIX, INTEGERS)
 
 
 @kernel(_ADVANCE)
 def advance(
-    f,
-    w,
-    options,
-    memory,
-    tolerances,
-    control,
-    clock,
-    state,
-    new_state,
-    outputs,
-    out_t,
-    out_state,
-    out_steps,
-    filled,
+    f, w, options, memory, tolerances, control, clock, state, new_state, outputs, out_t, out_state, out_steps, filled
 ):
     """Step on from (clock, state) until every time in `outputs` is reached; steps are shortened to land on them.
 
@@ -291,25 +204,25 @@ def advance(
     Stores every accepted step, or with STORE_ALL = 0 the landings only. `filled` counts the rows of
     out_t / out_state and those of out_steps, every accepted step, that this call wrote.
     """
-    fixed = control[FIXED_STEP] > 0.0
+    fixed = control[at.FIXED_STEP] > 0.0
     n = w.Q.size
     retried = np.inf  # where a step of fixed size was tried again with a new partition
     filled[0] = 0
     filled[1] = 0
     attempts = 0.0
     while True:
-        if filled[0] == out_t.size or filled[1] == out_steps.shape[0] or attempts == control[MAX_ATTEMPTS]:
-            return PAUSED
+        if filled[0] == out_t.size or filled[1] == out_steps.shape[0] or attempts == control[at.MAX_ATTEMPTS]:
+            return at.PAUSED
         attempts += 1.0
-        if w.counters[N_ACCEPTED] >= control[MAX_STEPS]:
-            return MAX_STEPS_REACHED
-        t = clock[T]
-        leaps = clock[LEAPS] == 1.0
-        if t == clock[JUMP_FROM] and not leaps:
-            return AT_JUMP
-        target = outputs[int(clock[NEXT_OUTPUT])]
-        goal = min(target, clock[JUMP_TO] if leaps else clock[JUMP_FROM])
-        h = control[FIXED_STEP] if fixed else min(clock[H_NEXT], clock[H_LIMIT], control[MAX_STEP])
+        if w.counters[N_ACCEPTED] >= control[at.MAX_STEPS]:
+            return at.MAX_STEPS_REACHED
+        t = clock[at.T]
+        leaps = clock[at.LEAPS] == 1.0
+        if t == clock[at.JUMP_FROM] and not leaps:
+            return at.AT_JUMP
+        target = outputs[int(clock[at.NEXT_OUTPUT])]
+        goal = min(target, clock[at.JUMP_TO] if leaps else clock[at.JUMP_FROM])
+        h = control[at.FIXED_STEP] if fixed else min(clock[at.H_NEXT], clock[at.H_LIMIT], control[at.MAX_STEP])
         in_grid = 1.0  # steps of the grid that this one is
         if fixed:
             size, in_grid, reaches = on_grid(clock, t, h, target, goal)
@@ -319,88 +232,88 @@ def advance(
         lands = reaches and goal == target
         if reaches:
             size = goal - t
-        if size > control[SPACING] > 0.0 or t < clock[SUDDEN] < t + size:
+        if size > control[at.SPACING] > 0.0 or t < clock[at.SUDDEN] < t + size:
             whole, last = size, outputs[outputs.size - 1]
             size = up_to_sudden(f, w, tolerances, control, clock, t, whole, last, state)
             if size < whole:
                 reaches, lands, shortened = False, False, True
-        if not reaches and size <= max(NEAR * np.spacing(abs(t)), control[SHORTEST]):
-            return STEP_TOO_SMALL
+        if not reaches and size <= max(NEAR * np.spacing(abs(t)), control[at.SHORTEST]):
+            return at.STEP_TOO_SMALL
         code, error, factor = _attempt(
             f, w, options, memory, tolerances, control, clock, t, size, leaps, state, new_state
         )
         # at a jump the embedded formula may agree by chance: until the place is passed, the estimate has to be smaller
-        strict = control[ROUGH] if t < clock[ROUGH_TO] else 1.0
+        strict = control[at.ROUGH] if t < clock[at.ROUGH_TO] else 1.0
         accepted = code == DONE and error * strict <= 1.0
         if accepted and not reaches and ends_at_singular(f, w, control, clock):
             f.settle(f, w, options, memory, tolerances, False)
             w.counters[N_REJECTED_ERROR] += 1
             if not with_care(f, w, control, clock, size):
-                clock[H_NEXT], clock[PIVOT_HERE] = 0.5 * size, w.notes[PIVOT]
+                clock[at.H_NEXT], clock[at.PIVOT_HERE] = 0.5 * size, w.notes[PIVOT]
             continue
-        driven = control[DRIVEN] == 1.0 and not leaps
+        driven = control[at.DRIVEN] == 1.0 and not leaps
         if driven and _before_kink(f, w, tolerances, control, clock, t, size, accepted, state, new_state):
             f.settle(f, w, options, memory, tolerances, False)
             w.counters[N_REJECTED_ERROR] += 1
-            clock[FAILURE_CODE] = DONE
+            clock[at.FAILURE_CODE] = DONE
             continue
         if not leaps:
             f.settle(f, w, options, memory, tolerances, accepted)
         if code != DONE:
             end = _failed(f, w, control, clock, t, size, code, retried, state)
-            if end != GO_ON:
+            if end != at.GO_ON:
                 return end
             if fixed:
                 retried = t
             continue
         if error > UNFORESEEN and not accepted:
-            clock[ROUGH_TO] = t + size
+            clock[at.ROUGH_TO] = t + size
         error *= strict
         if factor == 0.0:
             factor = factor_of(control, clock, size, error)
         elif strict > 1.0 and error > 0.0:  # the step does not know of `strict`, and may want to grow
             factor = min(factor, max(control[FACTOR_MIN], control[SAFETY] * error ** -control[EXPONENT]))
-        proposal = min(size * factor, clock[H_LIMIT])
+        proposal = min(size * factor, clock[at.H_LIMIT])
         if not accepted:
             end = _refused(f, w, control, clock, t, size, proposal)
-            if end != GO_ON:
+            if end != at.GO_ON:
                 return end
             continue
         if w.rows_v.size < w.Rate.size and check_redundant(f, w, t + size, new_state[:n], new_state[n : 2 * n]) != DONE:
-            clock[H_FAILED] = size
-            return ROWS_VIOLATED
+            clock[at.H_FAILED] = size
+            return at.ROWS_VIOLATED
         _count(w, tolerances, size, out_steps[filled[1]])
         filled[1] += 1
-        clock[H_LONG] = max(size, FADING * clock[H_LONG])
+        clock[at.H_LONG] = max(size, FADING * clock[at.H_LONG])
         remember(control, clock, size, error)
-        clock[N_FIXED] += in_grid
+        clock[at.N_FIXED] += in_grid
         if reaches:
-            clock[T] = goal
+            clock[at.T] = goal
         else:
-            clock[T] = clock[T_START] + clock[N_FIXED] * h if fixed else t + size
+            clock[at.T] = clock[at.T_START] + clock[at.N_FIXED] * h if fixed else t + size
         if leaps:
-            clock[JUMP_FROM], clock[LEAPS] = np.inf, 0.0
+            clock[at.JUMP_FROM], clock[at.LEAPS] = np.inf, 0.0
         copy(new_state, state)
-        if lands or control[STORE_ALL] == 1.0:
-            out_t[filled[0]] = clock[T]
+        if lands or control[at.STORE_ALL] == 1.0:
+            out_t[filled[0]] = clock[at.T]
             copy(state, out_state[filled[0]])
             filled[0] += 1
         # a step cut short by an output time says little about the next
-        clock[H_NEXT] = max(proposal, h) if shortened else proposal
-        clock[LIMIT_AGE] += 1.0
-        if clock[LIMIT_AGE] > control[LIMIT_MEMORY]:
-            clock[H_LIMIT] = control[LIMIT_START]
-            clock[FAILURE_CODE] = DONE  # until then it is why steps are short
+        clock[at.H_NEXT] = max(proposal, h) if shortened else proposal
+        clock[at.LIMIT_AGE] += 1.0
+        if clock[at.LIMIT_AGE] > control[at.LIMIT_MEMORY]:
+            clock[at.H_LIMIT] = control[at.LIMIT_START]
+            clock[at.FAILURE_CODE] = DONE  # until then it is why steps are short
         if lands:
-            clock[NEXT_OUTPUT] += 1.0
-            if int(clock[NEXT_OUTPUT]) == outputs.size:
-                return ALL_OUTPUT_DONE
-        if w.counters[N_ACCEPTED] == control[PROVISIONAL] and clock[H_NEXT] <= tolerances[GAP]:
-            clock[H_FAILED] = clock[H_NEXT]
-            return HAS_TO_GIVE_WAY
+            clock[at.NEXT_OUTPUT] += 1.0
+            if int(clock[at.NEXT_OUTPUT]) == outputs.size:
+                return at.ALL_OUTPUT_DONE
+        if w.counters[N_ACCEPTED] == control[at.PROVISIONAL] and clock[at.H_NEXT] <= tolerances[GAP]:
+            clock[at.H_FAILED] = clock[at.H_NEXT]
+            return at.HAS_TO_GIVE_WAY
         if leaps:
-            return PAUSED
-        if control[SYMMETRIC] == 0.0:
+            return at.PAUSED
+        if control[at.SYMMETRIC] == 0.0:
             end = look_at_partition(f, w, control, clock, size, lands, state)
-            if end != GO_ON:
+            if end != at.GO_ON:
                 return end

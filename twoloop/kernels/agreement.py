@@ -4,7 +4,8 @@ import numpy as np
 from numba import types
 
 from twoloop.kernels.compile.callbacks import VECTOR, f8
-from twoloop.kernels.data.common import GAMMA_GIVEN, INTEGERS, KIT, compiled, kernel
+from twoloop.kernels.data.common import INTEGERS, KIT, compiled, kernel
+from twoloop.kernels.data.flags import GAMMA_GIVEN
 
 TABLE = types.float64[:, ::1]
 

@@ -8,40 +8,12 @@ import numpy as np
 from numba import types
 
 from twoloop.kernels.algebra.linalg import copy
-from twoloop.kernels.data.common import (
-    ATOL,
-    DONE,
-    FORM,
-    GAMMA_INACCURATE,
-    GAMMA_REQUIRED,
-    INTEGERS,
-    KIT,
-    MATRIX,
-    NULL_SPACE,
-    RTOL,
-    SINGULAR,
-    VECTOR,
-    WORK,
-    compiled,
-    f8,
-    i8,
-    kernel,
-    merged,
-)
-from twoloop.kernels.data.intervals import (
-    ACCELERATIONS,
-    APART,
-    END_TIME,
-    FIRST_OWN,
-    FIRST_TIME,
-    HIGH,
-    JUMP,
-    KIND,
-    LAST_OWN,
-    LOW,
-    VELOCITIES,
-    WINDOW,
-)
+from twoloop.kernels.data import intervals as kinds
+from twoloop.kernels.data.codes import DONE, GAMMA_INACCURATE, SINGULAR
+from twoloop.kernels.data.common import INTEGERS, KIT, MATRIX, VECTOR, WORK, compiled, f8, i8, kernel, merged
+from twoloop.kernels.data.flags import FORM, NULL_SPACE
+from twoloop.kernels.data.noted import GAMMA_REQUIRED
+from twoloop.kernels.data.tolerances import ATOL, RTOL
 from twoloop.kernels.evaluation.calls import accelerations, find_tangents, renew_partition, restore
 from twoloop.kernels.evaluation.partition import partition_is_poor
 
@@ -58,7 +30,7 @@ def _window(low, high, i, last):
     """First and last of the rows that the polynomial of the interval from row i goes through: centred but at ends."""
     if last > i + 1:  # the interval has states of its own
         return i, last
-    size = min(WINDOW, high - low + 1)
+    size = min(kinds.WINDOW, high - low + 1)
     lo = max(low, min(i + 1 - size // 2, high + 1 - size))
     return lo, lo + size - 1
 
@@ -100,7 +72,7 @@ def _interpolate(states, i, kind, h, s, z, c, size, z_v, c_v, size_v, q, v):
             slope = slope * (s - z[r]) + value
             value = value * (s - z[r]) + c[r, m]
         q[m], v[m] = value + states[i, m], slope / h
-    if kind == APART:
+    if kind == kinds.APART:
         for m in range(n):
             value = c_v[size_v - 1, m]
             for r in range(size_v - 2, -1, -1):
@@ -115,7 +87,7 @@ def _kind(kind, tolerances, h, states, i):
     for m in range(n):
         atol, rtol = tolerances[ATOL + m], tolerances[RTOL]
         if EPS * abs(states[i, m]) > NOISY * h * (atol + rtol * abs(states[i, n + m])):
-            return APART
+            return kinds.APART
     return kind
 
 
@@ -131,21 +103,21 @@ def between(f, w, tolerance, tolerances, t, states, groups, times, z, room, out)
     reduced = f.flags[FORM] == NULL_SPACE  # then w.D is known
     failures = 0
     for g in range(groups.shape[0]):
-        i, last, kind = groups[g, FIRST_OWN], groups[g, LAST_OWN], groups[g, KIND]
+        i, last, kind = groups[g, kinds.FIRST_OWN], groups[g, kinds.LAST_OWN], groups[g, kinds.KIND]
         h = t[last] - t[i]
-        kind = kind if kind == JUMP else _kind(kind, tolerances, h, states, i)
-        lo, hi = _window(groups[g, LOW], groups[g, HIGH], i, last)
-        order = 3 if kind >= ACCELERATIONS else 2
+        kind = kind if kind == kinds.JUMP else _kind(kind, tolerances, h, states, i)
+        lo, hi = _window(groups[g, kinds.LOW], groups[g, kinds.HIGH], i, last)
+        order = 3 if kind >= kinds.ACCELERATIONS else 2
         size = _divided_differences(t, states, lo, hi, i, h, 0, order, z_q, c_q)
-        size_v = _divided_differences(t, states, lo, hi, i, h, n, 2, z_v, c_v) if kind == APART else 0
+        size_v = _divided_differences(t, states, lo, hi, i, h, n, 2, z_v, c_v) if kind == kinds.APART else 0
         # which coordinates are kept is to depend on the time alone, not on what else is asked for
         chosen = False
-        for p in range(groups[g, FIRST_TIME], groups[g, END_TIME]):
+        for p in range(groups[g, kinds.FIRST_TIME], groups[g, kinds.END_TIME]):
             q, v = out[p, :n], out[p, n : 2 * n]
             if times[p] == t[i] or times[p] == t[last]:
                 copy(states[i if times[p] == t[i] else last, : 2 * n], out[p])
                 continue
-            if kind == JUMP:
+            if kind == kinds.JUMP:
                 copy(states[i, : 2 * n], out[p])
                 continue
             s = (times[p] - t[i]) / h
@@ -187,7 +159,7 @@ def _slope_of_velocity(kind, h, s, z, c, size, z_v, c_v, size_v, a):
             slope = slope * (s - z[r]) + value
             value = value * (s - z[r]) + c[r, m]
         a[m] = bend / (h * h)
-    if kind == APART:
+    if kind == kinds.APART:
         for m in range(a.size):
             value, slope = c_v[size_v - 1, m], 0.0
             for r in range(size_v - 2, -1, -1):
@@ -220,24 +192,24 @@ def judge(f, w, tolerance, tolerances, t, states, groups, z, room, rows, out):
     z_q, z_v, c_q, c_v = z[:half], z[half:], room[:half], room[half:]
     q, v, q_1, v_1 = rows[0, :n], rows[0, n:], rows[1, :n], rows[1, n:]
     for g in range(groups.shape[0]):
-        i, last, kind = groups[g, FIRST_OWN], groups[g, LAST_OWN], groups[g, KIND]
+        i, last, kind = groups[g, kinds.FIRST_OWN], groups[g, kinds.LAST_OWN], groups[g, kinds.KIND]
         h = t[last] - t[i]
-        kind = kind if kind == JUMP else _kind(kind, tolerances, h, states, i)
-        lo, hi = _window(groups[g, LOW], groups[g, HIGH], i, last)
-        order = 3 if kind >= ACCELERATIONS else 2
+        kind = kind if kind == kinds.JUMP else _kind(kind, tolerances, h, states, i)
+        lo, hi = _window(groups[g, kinds.LOW], groups[g, kinds.HIGH], i, last)
+        order = 3 if kind >= kinds.ACCELERATIONS else 2
         size = _divided_differences(t, states, lo, hi, i, h, 0, order, z_q, c_q)
-        size_v = _divided_differences(t, states, lo, hi, i, h, n, 2, z_v, c_v) if kind == APART else 0
+        size_v = _divided_differences(t, states, lo, hi, i, h, n, 2, z_v, c_v) if kind == kinds.APART else 0
         out[g] = 0.0
-        if kind < ACCELERATIONS and _even(t, lo, hi):
+        if kind < kinds.ACCELERATIONS and _even(t, lo, hi):
             continue
         if hi - lo > 1:
             for k in range(LOOKS):
                 s = PLACES[k]
                 _interpolate(states, i, kind, h, s, z_q, c_q, size, z_v, c_v, size_v, q, v)
-                shorter = size_v - 2 if kind == APART else 0
+                shorter = size_v - 2 if kind == kinds.APART else 0
                 _interpolate(states, i, kind, h, s, z_q, c_q, size - order, z_v, c_v, shorter, q_1, v_1)
                 out[g] = max(out[g], _off(tolerances, 1.0, 1.0, states, i, q, v, q_1, v_1))
-            if out[g] <= 1.0 or kind == VELOCITIES:
+            if out[g] <= 1.0 or kind == kinds.VELOCITIES:
                 continue
         out[g] = 0.0
         for k in range(LOOKS):

@@ -8,10 +8,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from twoloop.kernels.algebra.elimination import index_size, values_size
+from twoloop.kernels.algebra.elimination import N_COUNTS, N_LISTS, WIDEST, index_size, values_size
 from twoloop.kernels.algebra.lapack import N_ROUTINES
 from twoloop.kernels.control.sudden import N_CHANGES
-from twoloop.kernels.data.common import N_COUNTERS, N_NOTES, WORK, Work
+from twoloop.kernels.data.common import WORK, Work
+from twoloop.kernels.data.counters import N_COUNTERS
+from twoloop.kernels.data.noted import N_NOTES
 from twoloop.kernels.evaluation.kinks import PARTS
 
 MOST_FREE, LARGEST_FREE = 32, 100_000  # workspaces that wait for their next run, and numbers of each of them
@@ -36,13 +38,16 @@ class Layout(NamedTuple):
     """Where the arrays of a workspace of some sizes stand, in one piece of memory for numbers and one for integers.
 
     The table of addresses and shapes is `table` + `of_numbers` times the address of the one + `of_integers` times that
-    of the other.
+    of the other. The first `n_lasting` numbers, and integers, count at the start of a step; others are filled before
+    they are read.
     """
 
     numbers: Places
     integers: Places
     n_numbers: int
     n_integers: int
+    n_lasting: int
+    n_lasting_integers: int
     table: NDArray[np.int64]
     of_numbers: NDArray[np.int64]
     of_integers: NDArray[np.int64]
@@ -82,8 +87,9 @@ def copy_of(work: Work) -> Work:
     """A workspace with the same in it."""
     sizes = work.sizes
     other = _given_back(sizes) or _new(sizes)
-    other.notes.base[:] = work.notes.base
-    other.counters.base[:] = work.counters.base
+    layout = _layout(*sizes)
+    other.notes.base[: layout.n_lasting] = work.notes.base[: layout.n_lasting]
+    other.counters.base[: layout.n_lasting_integers] = work.counters.base[: layout.n_lasting_integers]
     other.changes[:] = 0.0
     return other
 
@@ -108,16 +114,23 @@ def _new(sizes: Sizes) -> Work:
 
 def give_back(work: Work) -> None:
     """Let the next run of the same sizes have this workspace, of which nothing is used any more."""
-    if work.notes.base.size <= LARGEST_FREE and sum(map(len, list(_free.values()))) < MOST_FREE:
-        _free.setdefault(work.sizes, []).append(work)
+    free = _free.pop(work.sizes, [])
+    if work.notes.base.size <= LARGEST_FREE and len(free) < MOST_FREE:
+        free.append(work)
+    _free[work.sizes] = free  # behind those that wait longer
+    for oldest in list(_free)[:-1]:
+        if sum(map(len, list(_free.values()))) <= MOST_FREE:
+            break
+        _free.pop(oldest, None)
 
 
 _free: dict[Sizes, list[Work]] = {}  # those that were given back
 
 
 def _cleared(work: Work) -> Work:
-    work.notes.base[:] = 0.0
-    work.counters.base[:] = 0
+    layout = _layout(*work.sizes)
+    work.notes.base[: layout.n_lasting] = 0.0
+    work.counters.base[: layout.n_lasting_integers] = 0
     work.G_of_S[:] = np.nan
     work.changes[:] = 0.0
     return work
@@ -205,19 +218,20 @@ def _layout(
         "predicted": (r,),
         "notes": (N_NOTES,),
         "nodes": (n_nodes,),
-        "matrices": (n_matrices,),
         **dict.fromkeys(("mass_values", "jacobian_values", "counts", "factors", "pivot_sizes"), (0,)),
         **dict.fromkeys(("unknowns", "solutions"), (0,)),
+        "matrices": (n_matrices,),  # last
     }
     integers: dict[str, tuple[int, ...]] = {
         "places": (n_rows + 1 + n_rows * n_q,),
-        **{"rows": (r,), "dependent": (r,), "independent": (n_q - r,), "index": (index_size(r),)},
+        **{"rows": (r,), "dependent": (r,), "independent": (n_q - r,)},
         **{"rows_v": (r_v,), "dependent_v": (r_v,), "independent_v": (n_q - r_v,), "index_v": (index_size(r_v),)},
         "index_a": (index_size(size),),
         "order": (n_q,),
         "row_order": (n_rows,),
         "counters": (N_COUNTERS,),
         "lapack": (N_ROUTINES,),
+        "index": (index_size(r),),  # last
     }
     rows_of_G, side = n_rows + 1, n_q
     if static is not None:
@@ -226,14 +240,20 @@ def _layout(
         integers |= changed[1]
         rows_of_G, side = (n_rows + 1) * static.dense_jacobian, n_q * static.dense_mass
         n_entries = rows_of_G * n_q
+    of_positions = {name for name in integers if n_a == 0 and f"{name}_v" in integers}  # which velocities share
+    for name in of_positions:
+        del integers[f"{name}_v"]
+    if n_a == 0:
+        del numbers["values_v"]
     of_numbers, n_numbers = _placed(numbers)
     of_integers, n_integers = _placed(integers)
     of_numbers["entries"], of_numbers["G"] = (0, n_entries, (n_entries,)), (0, n_entries, (rows_of_G, n_q))
     of_numbers["M"] = n_entries, n_entries + side * side, (side, side)
+    lists = (N_COUNTS + N_LISTS * min(r, WIDEST)) * r if static is None else 0  # of `index`, for the time of ordering
+    lasting = of_numbers["matrices"][0], of_integers["index"][1] - lists
     if n_a == 0:
         of_numbers["values_v"] = of_numbers["values"]
-        for name in ("rows", "dependent", "independent", "index"):
-            of_integers[f"{name}_v"] = of_integers[name]
+        of_integers |= {f"{name}_v": of_integers[name] for name in of_positions}
     table = np.zeros(WORK.n_words, dtype=np.int64)
     masks = np.zeros((2, WORK.n_words), dtype=np.int64)
     for mask, places in zip(masks, (of_numbers, of_integers), strict=True):
@@ -242,7 +262,7 @@ def _layout(
             table[word], mask[word] = WORD * begin, 1
             table[word + 1 : word + 1 + len(shape)] = shape
     named = [[(name, *place) for name, place in places.items()] for places in (of_numbers, of_integers)]
-    return Layout(named[0], named[1], n_numbers, n_integers, table, masks[0], masks[1])
+    return Layout(named[0], named[1], n_numbers, n_integers, *lasting, table, masks[0], masks[1])
 
 
 def _placed(shapes: Mapping[str, tuple[int, ...]]) -> tuple[dict[str, tuple[int, int, tuple[int, ...]]], int]:

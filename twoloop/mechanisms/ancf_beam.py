@@ -18,35 +18,17 @@ from numpy.typing import ArrayLike
 
 from twoloop.checks.arguments import check_number, check_positive, check_size
 from twoloop.kernels.compile.callbacks import callback
-from twoloop.mechanisms.ancf_element import (
-    FALL,
-    FOURTH,
-    LAME,
-    LENGTH,
-    MASS,
-    N_ELEMENT_PARAMETERS,
-    SECOND,
-    SHEAR,
-    STIFFNESS,
-    elastic_energy,
-    elastic_tangent,
-    force,
-    mass,
-)
+from twoloop.mechanisms import ancf_element as element
+from twoloop.mechanisms.ancf_element import elastic_energy, elastic_tangent
 from twoloop.mechanisms.points import LinearPoints
 from twoloop.problem.drawing import Drawing
+from twoloop.problem.given import callbacks_in
 from twoloop.problem.joints import Joint
 from twoloop.problem.problem import Array, Problem
 from twoloop.problem.system import ConstrainedSystem
 
-__all__ = [
-    "ancf_beam",
-    "elastic_tangent",
-    "midpoint_deflection",
-    "moderately_stiff_beam",
-    "tip_height",
-    "very_flexible_beam",
-]
+__all__ = ["ancf_beam", "elastic_tangent", "midpoint_deflection", "moderately_stiff_beam", "tip_height"]
+__all__ += ["very_flexible_beam"]
 
 GRAVITY = 9.81  # m/s^2
 N_DRAWN = 8  # pieces of the line that an element is drawn as
@@ -54,7 +36,7 @@ LARGEST = 1e50  # of a parameter in SI units: products of a few of them must be 
 STARTS = {"node": "only the base node moving (start='node')", "beam": "all of it moving (start='beam')"}
 
 # p: the parameters of the elements, then those of the base's motion
-AMPLITUDE, FREQUENCY, N_PARAMETERS = range(N_ELEMENT_PARAMETERS, N_ELEMENT_PARAMETERS + 3)
+AMPLITUDE, FREQUENCY, N_PARAMETERS = range(element.N_ELEMENT_PARAMETERS, element.N_ELEMENT_PARAMETERS + 3)
 
 
 @callback("constraint")
@@ -89,7 +71,7 @@ class Energy:
     def __call__(self, t: Any, q: ArrayLike, v: ArrayLike) -> Any:
         """Of one state, or of the columns of many."""
         q, v = np.asarray(q), np.asarray(v)
-        weight = self.p[FALL] * self.M[1::6].sum(axis=0)
+        weight = self.p[element.FALL] * self.M[1::6].sum(axis=0)
         return 0.5 * (v * (self.M @ v)).sum(axis=0) + elastic_energy(q, self.p) + weight @ q
 
 
@@ -179,22 +161,18 @@ def ancf_beam(
     lame = youngs_modulus * poisson_ratio / ((1.0 + poisson_ratio) * (1.0 - 2.0 * poisson_ratio))
     shear = 0.5 * youngs_modulus / (1.0 + poisson_ratio)
     p = np.zeros(N_PARAMETERS)
-    p[LENGTH] = l
-    p[[STIFFNESS, LAME, SHEAR]] = (lame + 2.0 * shear) * area, lame * area, shear * area
-    p[[SECOND, FOURTH]] = height**2 / 12.0, height**4 / 80.0
-    p[[MASS, FALL]] = density * area, gravity
+    p[element.LENGTH] = l
+    p[[element.STIFFNESS, element.LAME, element.SHEAR]] = (lame + 2.0 * shear) * area, lame * area, shear * area
+    p[[element.SECOND, element.FOURTH]] = height**2 / 12.0, height**4 / 80.0
+    p[[element.MASS, element.FALL]] = density * area, gravity
     p[[AMPLITUDE, FREQUENCY]] = amplitude, angular_frequency
 
     name = f"ANCF beam, {n_elements} elements, E = {youngs_modulus:g} N/m^2, start={start!r}"
     system = ConstrainedSystem(
         n_q=6 * (n_elements + 1),
         n_c=2,
-        mass=mass,
-        force=force,
-        constraint=constraint,
-        jacobian=jacobian,
-        constraint_rate=constraint_rate,
-        gamma=gamma,
+        **callbacks_in(vars(element)),
+        **callbacks_in(globals()),
         force_by_q=elastic_tangent,
         parameters=p,
         constant_mass=True,

@@ -13,6 +13,7 @@ import numpy as np
 from twoloop.kernels.compile.callbacks import callback
 from twoloop.mechanisms.computed import computed
 from twoloop.problem.drawing import Drawing
+from twoloop.problem.given import callbacks_in
 from twoloop.problem.problem import Array, Problem, Reference
 from twoloop.problem.system import ConstrainedSystem
 
@@ -158,25 +159,12 @@ def andrews() -> Problem:
     """The mechanism from rest, as published, over 0.03 s."""
     q0 = np.array(
         [
-            -0.0617138900142764496358948458001,
-            0.0,
-            0.455279819163070380255912382449,
-            0.222668390165885884674473185609,
-            0.487364979543842550225598953530,
-            -0.222668390165885884674473185609,
-            1.23054744454982119249735015568,
+            *(-0.0617138900142764496358948458001, 0.0, 0.455279819163070380255912382449),
+            *(0.222668390165885884674473185609, 0.487364979543842550225598953530),
+            *(-0.222668390165885884674473185609, 1.23054744454982119249735015568),
         ]
     )
-    system = ConstrainedSystem(
-        n_q=7,
-        n_c=6,
-        mass=mass,
-        force=force,
-        constraint=constraint,
-        jacobian=jacobian,
-        gamma=gamma,
-        name="Andrews",
-    )
+    system = ConstrainedSystem(n_q=7, n_c=6, **callbacks_in(globals()), name="Andrews")
     return Problem(
         name="Andrews' squeezing mechanism",
         system=system,
@@ -207,34 +195,20 @@ PUBLISHED = Reference(
     t=0.03,
     q=np.array(
         [
-            15.81077119629904,
-            -15.75637105984298,
-            0.04082224013073101,
-            -0.5347301163226948,
-            0.5244099658805304,
-            0.5347301163226948,
-            1.048080741042263,
+            *(15.81077119629904, -15.75637105984298, 0.04082224013073101, -0.5347301163226948),
+            *(0.5244099658805304, 0.5347301163226948, 1.048080741042263),
         ]
     ),
     v=np.array(
         [
-            1139.920302151208,
-            -1424.379294994111,
-            11.03291221937134,
-            19.29337464421385,
-            0.5735699284790808,
-            -19.29337464421385,
-            0.3231791658026955,
+            *(1139.920302151208, -1424.379294994111, 11.03291221937134, 19.29337464421385),
+            *(0.5735699284790808, -19.29337464421385, 0.3231791658026955),
         ]
     ),
     lam=np.array(
         [
-            199.1753333731910,
-            -29.75531228015052,
-            23.06654119098399,
-            31.45271365475927,
-            22.64249232082739,
-            11.61740700019673,
+            *(199.1753333731910, -29.75531228015052, 23.06654119098399, 31.45271365475927),
+            *(22.64249232082739, 11.61740700019673),
         ]
     ),
     source="Test Set for IVP Solvers, andsoln (PSIDE on a Cray C90, tolerances 1e-14), printed with 16 digits",

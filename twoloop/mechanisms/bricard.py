@@ -7,9 +7,9 @@ model: bars of 1 x 0.1 x 0.1 m, 100 kg/m^3, gravity along -y.
 
 import numpy as np
 
-from twoloop.mechanisms.computed import computed
 from twoloop.mechanisms.points import box
 from twoloop.mechanisms.quadratic import ONE, QuadraticSystem, Scalar, difference, fixed
+from twoloop.mechanisms.ready import ready
 from twoloop.problem.joints import Joint
 from twoloop.problem.problem import Array, Problem
 
@@ -89,18 +89,12 @@ def bricard() -> Problem:
     rows = _rows()
     centres = 0.5 * (CORNERS[:5] + CORNERS[1:])
     q0 = np.concatenate([[*centre, *frame.T.ravel()] for centre, frame in zip(centres, FRAMES, strict=True)])
-    return Problem(
-        name="A04 Bricard",
-        system=rows.system("A04 Bricard"),
-        q0=q0,
-        v0=np.zeros(60),
-        t_span=(0.0, 2.0),
-        energy=rows.energy,
+    return ready(
+        *(rows, "A04 Bricard", q0, np.zeros(60), 2.0),
         conserved=True,
         drawing=rows.drawing(_end(1, 0.5)),
         parameters={"length": 1.0, "width": WIDTH, "mass": 1.0, "gravity": GRAVITY},
         note="The run of the benchmark is 10 s long.",
-        reference=computed("A04 Bricard"),
         source=(
             "IFToMM library of benchmarks, A04; RehabEngGroup/MBSbenchmarksInOpenSim, A04_BricardsMechanism.rst; "
             "jgerstmayr/EXUDYN, TestModels/bricardMechanism.py"

@@ -6,8 +6,8 @@ import numpy as np
 from scipy.optimize import brentq
 
 from twoloop.checks.arguments import check_size
-from twoloop.mechanisms.computed import computed
 from twoloop.mechanisms.quadratic import QuadraticSystem, fixed, point
+from twoloop.mechanisms.ready import ready
 from twoloop.problem.problem import Array, Problem
 
 GRAVITY = 9.81
@@ -34,17 +34,11 @@ def double_pendulum() -> Problem:
     rows = _masses(2)
     rows.link("link 1", 0, fixed(0.0, 0.0), 1.0)
     rows.link("link 2", 2, point(0), 1.0)
-    return Problem(
-        name="double pendulum",
-        system=rows.system("double pendulum"),
-        q0=np.array([1.0, 0.0, 2.0, 0.0]),
-        v0=np.zeros(4),
-        t_span=(0.0, 3.0),
-        energy=rows.energy,
+    return ready(
+        *(rows, "double pendulum", np.array([1.0, 0.0, 2.0, 0.0]), np.zeros(4), 3.0),
         conserved=True,
         drawing=rows.drawing(point(2)),
         parameters={"n": 2, "length": 1.0, "mass": 0.5, "gravity": GRAVITY},
-        reference=computed("double pendulum"),
         source="textbook problem; the start was chosen for this project",
         tags=("open chain", "rigid", "planar"),
         purpose="Two degrees of freedom without a closed form: errors grow with the motion, which is chaotic.",
@@ -81,18 +75,13 @@ def closed_chain(n: int = 4) -> Problem:
         rows.link(f"link {i + 1}", 2 * i, point(2 * i - 2) if i > 0 else fixed(0.0, 0.0), length)
     rows.link(f"link {n + 1}", 2 * n - 2, fixed(SLACK, 0.0), length)
     name = f"closed chain of {n}"
-    return Problem(
-        name=name,
+    return ready(
+        *(rows, name, _shape(n)[1:-1].ravel(), np.zeros(2 * n), 1.0),
         system=rows.system(name, bandwidth=2),
-        q0=_shape(n)[1:-1].ravel(),
-        v0=np.zeros(2 * n),
-        t_span=(0.0, 1.0),
-        energy=rows.energy,
         conserved=True,
         drawing=rows.drawing(point(2 * (n // 2))),
         parameters={"n": n, "length": length, "mass": 1.0 / n, "gravity": GRAVITY},
         note="Masses, lengths and start were chosen for this project.",
-        reference=computed(name),
         source="a question of users: SolveDAE/solve_dae, issue 46; moorepants/learn-multibody-dynamics, issue 239",
         tags=("closed chain", "rigid", "planar"),
         purpose=(

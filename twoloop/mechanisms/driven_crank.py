@@ -7,8 +7,8 @@ import cmath
 
 import numpy as np
 
-from twoloop.mechanisms.computed import computed
 from twoloop.mechanisms.planar import GROUND, PlanarBodies, states
+from twoloop.mechanisms.ready import ready
 from twoloop.problem.description import body_names
 from twoloop.problem.problem import Problem
 
@@ -29,14 +29,10 @@ def driven_crank() -> Problem:
     turn = DRIVE["rate"] + DRIVE["amplitude"] * DRIVE["frequency"]
     pin, half = complex(CRANK), cmath.rect(0.5 * ROD, ANGLE)
     pin_v = 1j * turn * pin
-    return Problem(
-        name="driven crank",
-        system=rows.system("driven crank"),
-        q0=states((0.5 * pin, 0.0), (pin + half, ANGLE)),
-        v0=states((0.5 * pin_v, turn), (pin_v + 1j * RATE * half, RATE)),
-        t_span=(0.0, 3.0),
-        energy=rows.energy,
-        drawing=rows.drawing,
+    q0 = states((0.5 * pin, 0.0), (pin + half, ANGLE))
+    v0 = states((0.5 * pin_v, turn), (pin_v + 1j * RATE * half, RATE))
+    return ready(
+        *(rows, "driven crank", q0, v0, 3.0),
         parameters={
             "crank": CRANK,
             "rod": ROD,
@@ -45,7 +41,6 @@ def driven_crank() -> Problem:
             "gravity": GRAVITY,
             "drive": DRIVE,
         },
-        reference=computed("driven crank"),
         source="textbook mechanism; dimensions and start were chosen for this project",
         tags=("open chain", "rigid", "planar", "driven"),
         purpose=(

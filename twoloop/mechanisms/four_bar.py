@@ -18,6 +18,7 @@ from twoloop.kernels.compile.callbacks import callback
 from twoloop.mechanisms.points import GROUND, BodyPoints
 from twoloop.problem.description import body_names
 from twoloop.problem.drawing import Drawing
+from twoloop.problem.given import callbacks_in
 from twoloop.problem.joints import Joint
 from twoloop.problem.problem import Array, Problem, Reference
 from twoloop.problem.system import ConstrainedSystem
@@ -185,12 +186,7 @@ def four_bar(
     system = ConstrainedSystem(
         n_q=9,
         n_c=8,
-        mass=mass,
-        force=force,
-        constraint=constraint,
-        jacobian=jacobian,
-        gamma=gamma,
-        kinematics=kinematics,
+        **callbacks_in(globals()),
         parameters=[L1, L2, L3, ground],
         constant_mass=True,
         joints=_joints(L1, L2, L3, ground),
@@ -275,28 +271,16 @@ _DEFAULT_REFERENCE = Reference(
     t=10.0,
     q=np.array(
         [
-            0.4655397991275497159,
-            0.1824080465009168962,
-            0.3734352752626592493,
-            1.5353585493399318297,
-            -0.4319567411710029097,
-            -0.9219357319797583370,
-            2.5698187502123821138,
-            -0.6143647876719198059,
-            0.9599328424023562726,
+            *(0.4655397991275497159, 0.1824080465009168962, 0.3734352752626592493),
+            *(1.5353585493399318297, -0.4319567411710029097, -0.9219357319797583370),
+            *(2.5698187502123821138, -0.6143647876719198059, 0.9599328424023562726),
         ]
     ),
     v=np.array(
         [
-            -0.1890158742421557267,
-            0.4824042240163405336,
-            1.0362255277000930739,
-            -0.6180230129644702497,
-            0.7827971352095650157,
-            -0.3012041251749048317,
-            -0.4290071387223145229,
-            0.3003929111932244821,
-            -0.6982938269427819115,
+            *(-0.1890158742421557267, 0.4824042240163405336, 1.0362255277000930739),
+            *(-0.6180230129644702497, 0.7827971352095650157, -0.3012041251749048317),
+            *(-0.4290071387223145229, 0.3003929111932244821, -0.6982938269427819115),
         ]
     ),
     source=(

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from twoloop.mechanisms.computed import computed
+from twoloop.mechanisms.ready import ready
 from twoloop.mechanisms.spatial import GROUND
 from twoloop.mechanisms.spatial_bodies import SpatialBodies
 from twoloop.problem.problem import Problem
@@ -50,16 +50,9 @@ def governor() -> Problem:
         end = np.array([side * 0.5 * CUBE, 0.0, HEIGHT])
         rows.spring(slider, end, rod, hinge + 0.5 * LENGTH * along, STIFFNESS, DAMPING, SLACK)
     q0, v0 = rows.start
-    return Problem(
-        name="A05 governor",
-        system=rows.system("A05 governor"),
-        q0=q0,
-        v0=v0,
-        t_span=(0.0, 10.0),
-        energy=rows.energy,
-        drawing=rows.drawing,
+    return ready(
+        *(rows, "A05 governor", q0, v0, 10.0),
         parameters={"stiffness": STIFFNESS, "damping": DAMPING, "rate": RATE, "gravity": GRAVITY},
-        reference=computed("A05 governor"),
         source=(
             "IFToMM library of benchmarks, A05; RehabEngGroup/MBSbenchmarksInOpenSim, A05_FlyballGovernor.rst; "
             "jgerstmayr/EXUDYN, Examples/stiffFlyballGovernorKT.py"

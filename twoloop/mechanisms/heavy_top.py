@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from twoloop.mechanisms.computed import computed
+from twoloop.mechanisms.ready import ready
 from twoloop.mechanisms.spatial import GROUND
 from twoloop.mechanisms.spatial_bodies import SpatialBodies
 from twoloop.problem.problem import Problem, Reference
@@ -20,18 +20,11 @@ def heavy_top() -> Problem:
     body = rows.body("top", MASS, INERTIA, position, np.eye(3), np.cross(SPIN, position), SPIN)
     rows.spherical(body, GROUND, (0.0, 0.0, 0.0))
     q0, v0 = rows.start
-    return Problem(
-        name="heavy top",
-        system=rows.system("heavy top"),
-        q0=q0,
-        v0=v0,
-        t_span=(0.0, 0.2),
-        energy=rows.energy,
+    return ready(
+        *(rows, "heavy top", q0, v0, 0.2),
         conserved=True,
-        drawing=rows.drawing,
         parameters={"mass": MASS, "length": LENGTH, "inertia": INERTIA, "spin": tuple(SPIN), "gravity": GRAVITY},
         note="The inertia is about the centre of mass, as in Exudyn's model; some give it about the fixed point.",
-        reference=computed("heavy top"),
         published=Reference(
             t=0.2,
             q=np.array([np.nan, np.nan, np.nan, -0.70828, 0.43878, 0.54573, 0.0894]),

@@ -11,6 +11,7 @@ import numpy as np
 from twoloop.kernels.compile.callbacks import callback
 from twoloop.mechanisms.points import BodyPoints
 from twoloop.problem.drawing import Drawing
+from twoloop.problem.given import callbacks_in
 from twoloop.problem.joints import Joint
 from twoloop.problem.problem import Array, Problem, Reference
 from twoloop.problem.system import ConstrainedSystem
@@ -62,10 +63,7 @@ def knife_edge() -> Problem:
         n_q=3,
         n_c=0,
         n_a=1,
-        mass=mass,
-        force=force,
-        nonholonomic=nonholonomic,
-        nonholonomic_gamma=nonholonomic_gamma,
+        **callbacks_in(globals()),
         parameters=[MASS, INERTIA, MASS * PULL],
         constant_mass=True,
         joints=[Joint("blade", (0,), (0, 1), (2,))],

@@ -14,6 +14,7 @@ from scipy.special import ellipj, ellipk
 from twoloop.checks.arguments import check_size
 from twoloop.mechanisms.planar import GROUND, PlanarBodies
 from twoloop.mechanisms.quadratic import QuadraticSystem, fixed, point
+from twoloop.mechanisms.ready import ready
 from twoloop.problem.description import body_names
 from twoloop.problem.problem import Array, Condition, Problem, Reference
 
@@ -79,13 +80,8 @@ def n_four_bar(n: int = 2, coordinates: str = "tips") -> Problem:
     tips = [point(2 * i) for i in range(n + 1)]
     drawing = rows.drawing(*tips) if isinstance(rows, QuadraticSystem) else rows.drawing
     # B0 is the tip of the first crank, twice as far from the ground joint as the centre of that crank
-    return Problem(
-        name=name,
-        system=rows.system(name),
-        q0=q0,
-        v0=v0,
-        t_span=(0.0, 10.0),
-        energy=rows.energy,
+    return ready(
+        *(rows, name, q0, v0, 10.0),
         conserved=True,
         drawing=drawing,
         parameters={"n": n, "length": 1.0, "mass": 1.0, "gravity": GRAVITY},

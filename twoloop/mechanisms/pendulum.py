@@ -8,6 +8,7 @@ from scipy.special import ellipj, ellipk
 
 from twoloop.checks.arguments import check_finite
 from twoloop.mechanisms.quadratic import QuadraticSystem, fixed, point
+from twoloop.mechanisms.ready import ready
 from twoloop.problem.problem import Array, Condition, Problem, Reference
 
 CVODE_GRAVITY = 13.7503716360407456549801915596211144  # (2 K(m = 1/2))^2: a quarter of the period is 1/2
@@ -47,13 +48,8 @@ def _pendulum(name: str, gravity: float, side: int, end: float, **known: object)
     motion = Swing(1.0, gravity, side)
     q, v = motion(end)
     lam = np.array([v @ v - gravity * q[1]])
-    return Problem(
-        name=name,
-        system=rows.system(name),
-        q0=np.array([float(side), 0.0]),
-        v0=np.zeros(2),
-        t_span=(0.0, end),
-        energy=rows.energy,
+    return ready(
+        *(rows, name, np.array([float(side), 0.0]), np.zeros(2), end),
         conserved=True,
         drawing=rows.drawing(point(0)),
         parameters={"length": 1.0, "mass": 1.0, "gravity": gravity},

@@ -21,6 +21,7 @@ from twoloop.kernels.compile.callbacks import callback
 from twoloop.mechanisms.points import Sketch
 from twoloop.problem.drawing import Drawing
 from twoloop.problem.entries import LARGE
+from twoloop.problem.given import callbacks_in
 from twoloop.problem.joints import Joint, unused
 from twoloop.problem.problem import Array
 from twoloop.problem.system import ConstrainedSystem
@@ -292,30 +293,16 @@ class PlanarBodies:
         sizes = [len(bodies), len(self._joints), self.gravity]
         moves = any(joint[0] == COORDINATE and (joint[4] or joint[6]) for joint in self._joints)
         n_q = 3 * len(bodies)
-        values: dict[str, Any] = {}
+        given: dict[str, Any] = callbacks_in(globals())
+        if not moves:
+            del given["constraint_rate"]
         if n_q >= LARGE:
-            values = {
-                "mass_values": mass_values,
-                "mass_entries": (range(n_q), range(n_q)),
-                "jacobian_values": jacobian_values,
-                "jacobian_entries": jacobian_entries(self._joints),
-            }
-        return ConstrainedSystem(
-            **values,
-            n_q=n_q,
-            n_c=self.n_c,
-            mass=mass,
-            force=force,
-            constraint=constraint,
-            jacobian=jacobian,
-            constraint_rate=constraint_rate if moves else None,
-            gamma=gamma,
-            kinematics=kinematics,
-            parameters=np.concatenate([sizes, bodies.ravel(), np.ravel(self._joints)]),
-            constant_mass=True,
-            joints=self._named,
-            name=name,
-        )
+            given |= {"mass_entries": (range(n_q), range(n_q)), "jacobian_entries": jacobian_entries(self._joints)}
+        else:
+            del given["mass_values"], given["jacobian_values"]
+        parameters = np.concatenate([sizes, bodies.ravel(), np.ravel(self._joints)])
+        fixed: dict[str, Any] = {"constant_mass": True, "joints": self._named, "name": name}
+        return ConstrainedSystem(n_q=n_q, n_c=self.n_c, parameters=parameters, **given, **fixed)
 
     @property
     def energy(self) -> Energy:

@@ -75,15 +75,18 @@ class Sketch:
     def __init__(self) -> None:
         self.bodies: list[int] = []
         self.points: list[Array] = []
+        self._on: dict[int, list[int]] = {}  # the points of a body
         self.bars: list[tuple[int, int]] = []
         self.traces: list[int] = []
 
     def point(self, body: int, point: Any) -> int:
         """The number of a point, new or known."""
         place = np.asarray(point, dtype=float)
-        for number, (other, known) in enumerate(zip(self.bodies, self.points, strict=True)):
-            if other == body and np.abs(known - place).max() < 1e-12:
+        there = self._on.setdefault(body, [])
+        for number in there:
+            if np.abs(self.points[number] - place).max() < 1e-12:
                 return number
+        there.append(len(self.bodies))
         self.bodies.append(body)
         self.points.append(place)
         return len(self.bodies) - 1

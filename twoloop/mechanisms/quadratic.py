@@ -17,6 +17,7 @@ from twoloop.kernels.compile.caches import helper
 from twoloop.kernels.compile.callbacks import callback
 from twoloop.mechanisms.points import LinearPoints
 from twoloop.problem.drawing import Drawing
+from twoloop.problem.given import callbacks_in
 from twoloop.problem.joints import Joint
 from twoloop.problem.problem import Array
 from twoloop.problem.system import ConstrainedSystem
@@ -148,11 +149,7 @@ class QuadraticSystem:
         return ConstrainedSystem(
             n_q=self.force.size,
             n_c=len(self._constants),
-            mass=mass,
-            force=force,
-            constraint=constraint,
-            jacobian=jacobian,
-            gamma=gamma,
+            **callbacks_in(globals()),
             parameters=np.concatenate([sizes, self.force, self._constants, *tables]),
             constant_mass=True,
             bandwidth=bandwidth,

@@ -13,6 +13,7 @@ import numpy as np
 from twoloop.kernels.compile.callbacks import callback
 from twoloop.mechanisms.computed import computed
 from twoloop.problem.drawing import Drawing
+from twoloop.problem.given import callbacks_in
 from twoloop.problem.problem import Array, Problem
 from twoloop.problem.system import ConstrainedSystem
 
@@ -105,13 +106,7 @@ def rolling_disc() -> Problem:
         n_q=6,
         n_c=1,
         n_a=2,
-        mass=mass,
-        force=force,
-        constraint=constraint,
-        jacobian=jacobian,
-        gamma=gamma,
-        nonholonomic=nonholonomic,
-        nonholonomic_gamma=nonholonomic_gamma,
+        **callbacks_in(globals()),
         name="rolling disc",
     )
     return Problem(

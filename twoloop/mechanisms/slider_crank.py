@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from twoloop.mechanisms.computed import computed
 from twoloop.mechanisms.planar import GROUND, PlanarBodies, states
+from twoloop.mechanisms.ready import ready
 from twoloop.problem.description import body_names
 from twoloop.problem.problem import Array, Problem, Reference
 
@@ -59,17 +59,10 @@ def redundant_slider_crank() -> Problem:
     """The slider-crank with nine rows of rank eight, turning freely under its weight from 8 rad/s of the crank."""
     rows = _rows(True)
     q0, v0, _ = positions(ANGLE, RATE)
-    return Problem(
-        name="redundant slider-crank",
-        system=rows.system("redundant slider-crank"),
-        q0=q0,
-        v0=v0,
-        t_span=(0.0, 2.0),
-        energy=rows.energy,
+    return ready(
+        *(rows, "redundant slider-crank", q0, v0, 2.0),
         conserved=True,
-        drawing=rows.drawing,
         parameters=PARAMETERS,
-        reference=computed("redundant slider-crank"),
         source=SOURCE,
         tags=("closed chain", "rigid", "planar", "redundant"),
         purpose=(
@@ -109,14 +102,9 @@ def driven_slider_crank() -> Problem:
     force = np.tile([0.0, -GRAVITY, 0.0], 3) * np.repeat(MASSES, 3)
     inertia = np.column_stack([MASSES, MASSES, INERTIAS]).ravel()
     lam = np.linalg.solve(system.jacobian(2.0, q).T, force - inertia * a)
-    return Problem(
-        name="driven slider-crank",
+    return ready(
+        *(rows, "driven slider-crank", q0, v0, 2.0),
         system=system,
-        q0=q0,
-        v0=v0,
-        t_span=(0.0, 2.0),
-        energy=rows.energy,
-        drawing=rows.drawing,
         parameters={**PARAMETERS, "drive": DRIVE},
         reference=Reference(
             t=2.0,

@@ -57,6 +57,20 @@ def centre(q, body):
 
 
 @helper
+def put_turned(q, values, place, body, x, y, z, fx, fy, fz):
+    """The derivative of f . (vector of a body) by its Euler parameters into four values; where the next ones are."""
+    if body < 0:
+        return place
+    k = 7 * body + 3
+    d0, d1, d2, d3 = pulled(q[k], q[k + 1], q[k + 2], q[k + 3], x, y, z, fx, fy, fz)
+    values[place] += d0
+    values[place + 1] += d1
+    values[place + 2] += d2
+    values[place + 3] += d3
+    return place + 4
+
+
+@helper
 def turn_row(q, row, body, x, y, z, fx, fy, fz):
     """Add to a row (n_q,) the derivative of f . (vector of a body) by its Euler parameters."""
     if body >= 0:
@@ -215,20 +229,6 @@ def gamma(t, q, v, p, Qd):
         dx, dy, dz = centre(v, j)
         Qd[row] -= 2.0 * (aux * (dx + bux - cx - sux) + auy * (dy + buy - cy - suy) + auz * (dz + buz - cz - suz))
         Qd[row] -= ax * (bax - sax) + ay * (bay - say) + az * (baz - saz)
-
-
-@helper
-def put_turned(q, values, place, body, x, y, z, fx, fy, fz):
-    """The derivative of f . (vector of a body) by its Euler parameters into four values; where the next ones are."""
-    if body < 0:
-        return place
-    k = 7 * body + 3
-    d0, d1, d2, d3 = pulled(q[k], q[k + 1], q[k + 2], q[k + 3], x, y, z, fx, fy, fz)
-    values[place] += d0
-    values[place + 1] += d1
-    values[place + 2] += d2
-    values[place + 3] += d3
-    return place + 4
 
 
 @callback("mass_values")

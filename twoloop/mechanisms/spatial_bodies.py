@@ -12,6 +12,7 @@ from twoloop.mechanisms.rotation import euler_parameters, euler_rates, rotation_
 from twoloop.mechanisms.spatial import DIRECTION, GROUND, PLANE, POINT
 from twoloop.problem.drawing import Drawing
 from twoloop.problem.entries import LARGE
+from twoloop.problem.given import callbacks_in
 from twoloop.problem.joints import Joint, unused
 from twoloop.problem.problem import Array
 from twoloop.problem.system import ConstrainedSystem
@@ -153,33 +154,20 @@ class SpatialBodies:
     def system(self, name: str) -> ConstrainedSystem:
         """The system of what was added so far."""
         n = len(self._bodies)
-        joints = self._joints_after(n)
+        joints = [[joint[0], joint[1] + n, *joint[2:]] for joint in self._joints]  # after the normalisations
         tables = [np.ravel(table) for table in (self._bodies, joints, self._springs)]
-        values: dict[str, Any] = {}
+        given: dict[str, Any] = callbacks_in(vars(spatial))
         if 7 * n >= LARGE:
-            values = {
-                "mass_values": spatial.mass_values,
-                "mass_entries": spatial.mass_entries(n),
-                "jacobian_values": spatial.jacobian_values,
-                "jacobian_entries": spatial.jacobian_entries(n, joints),
-            }
-        return ConstrainedSystem(
-            **values,
-            n_q=7 * n,
-            n_c=n + self.n_joint_rows,
-            mass=spatial.mass,
-            force=spatial.force,
-            constraint=spatial.constraint,
-            jacobian=spatial.jacobian,
-            gamma=spatial.gamma,
-            parameters=np.concatenate([[n, len(self._joints), len(self._springs)], self.gravity, *tables]),
-            joints=[replace(joint, rows=tuple(n + row for row in joint.rows)) for joint in self._named],
-            name=name,
-        )
-
-    def _joints_after(self, n: int) -> list[list[float]]:
-        """The joints, their rows numbered after the n normalisations."""
-        return [[joint[0], joint[1] + n, *joint[2:]] for joint in self._joints]
+            given["mass_entries"], given["jacobian_entries"] = (
+                spatial.mass_entries(n),
+                spatial.jacobian_entries(n, joints),
+            )
+        else:
+            del given["mass_values"], given["jacobian_values"]
+        parameters = np.concatenate([[n, len(self._joints), len(self._springs)], self.gravity, *tables])
+        named = [replace(joint, rows=tuple(n + row for row in joint.rows)) for joint in self._named]
+        sizes: dict[str, Any] = {"n_q": 7 * n, "n_c": n + self.n_joint_rows}
+        return ConstrainedSystem(**sizes, **given, parameters=parameters, joints=named, name=name)
 
     @property
     def start(self) -> tuple[Array, Array]:

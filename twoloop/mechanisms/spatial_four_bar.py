@@ -8,7 +8,7 @@ import math
 
 import numpy as np
 
-from twoloop.mechanisms.computed import computed
+from twoloop.mechanisms.ready import ready
 from twoloop.mechanisms.spatial import GROUND
 from twoloop.mechanisms.spatial_bodies import SpatialBodies
 from twoloop.problem.problem import Array, Problem
@@ -69,18 +69,11 @@ def spatial_four_bar() -> Problem:
     rows.spherical(rocker, coupler, S)
     rows.revolute(rocker, GROUND, D, y)
     q0, v0 = rows.start
-    return Problem(
-        name="spatial four-bar",
-        system=rows.system("spatial four-bar"),
-        q0=q0,
-        v0=v0,
-        t_span=(0.0, 2.0),
-        energy=rows.energy,
+    return ready(
+        *(rows, "spatial four-bar", q0, v0, 2.0),
         conserved=True,
-        drawing=rows.drawing,
         parameters={"crank": CRANK, "coupler": length, "rocker": ROCKER, "D": tuple(D), "masses": MASSES},
         note="Dimensions and start were chosen for this project.",
-        reference=computed("spatial four-bar"),
         source="textbook mechanism (RSSR)",
         tags=("closed chain", "rigid", "spatial"),
         purpose=(

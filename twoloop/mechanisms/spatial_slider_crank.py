@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from twoloop.mechanisms.computed import computed
+from twoloop.mechanisms.ready import ready
 from twoloop.mechanisms.spatial import GROUND
 from twoloop.mechanisms.spatial_bodies import SpatialBodies
 from twoloop.problem.problem import Problem
@@ -42,21 +42,14 @@ def spatial_slider_crank() -> Problem:
     rows.universal(bar, slider, C, cross, x)
     rows.prismatic(GROUND, slider, (0.0, 0.0, 0.0), x)
     q0, v0 = rows.start
-    return Problem(
-        name="spatial slider-crank",
-        system=rows.system("spatial slider-crank"),
-        q0=q0,
-        v0=v0,
-        t_span=(0.0, 5.0),
-        energy=rows.energy,
+    return ready(
+        *(rows, "spatial slider-crank", q0, v0, 5.0),
         conserved=True,
-        drawing=rows.drawing,
         parameters={"crank": CRANK, "rod": ROD, "A": tuple(A), "masses": MASSES, "inertias": INERTIAS},
         note=(
             "The cross of the joint at the slider is such that the rod starts with the angular velocity (1.92, -0.96, "
             "0.48) rad/s of the benchmark."
         ),
-        reference=computed("spatial slider-crank"),
         source=(
             "IFToMM library of benchmarks, spatial rigid slider-crank; jgerstmayr/EXUDYN, "
             "TestModels/sliderCrank3Dbenchmark.py; Haug, Computer-Aided Kinematics and Dynamics (1989), Sect. 12.6"

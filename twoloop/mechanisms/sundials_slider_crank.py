@@ -9,6 +9,7 @@ import numpy as np
 from twoloop.kernels.compile.callbacks import callback
 from twoloop.mechanisms.computed import computed
 from twoloop.problem.drawing import Drawing
+from twoloop.problem.given import callbacks_in
 from twoloop.problem.problem import Array, Problem, Reference
 from twoloop.problem.system import ConstrainedSystem
 
@@ -84,11 +85,7 @@ def sundials_slider_crank() -> Problem:
     system = ConstrainedSystem(
         n_q=3,
         n_c=2,
-        mass=mass,
-        force=force,
-        constraint=constraint,
-        jacobian=jacobian,
-        gamma=gamma,
+        **callbacks_in(globals()),
         parameters=p,
         constant_mass=True,
         name="SUNDIALS slider-crank",

@@ -14,13 +14,7 @@ Plans = tuple[Plan, dict[int, Plan]]
 
 
 def plans_for(
-    system: ConstrainedSystem,
-    method: Method,
-    rtol: float,
-    atol: float,
-    fixed: bool,
-    code: OwnCode | None,
-    check: Check,
+    system: ConstrainedSystem, method: Method, rtol: float, atol: float, fixed: bool, code: OwnCode | None, check: Check
 ) -> Plans:
     """The plans of a run.
 

@@ -11,14 +11,12 @@ from weakref import WeakValueDictionary
 
 import numpy as np
 from numba import njit, objmode
-from numpy.typing import NDArray
 
+from twoloop.checks.arguments import Array
 from twoloop.kernels.compile.caches import digest_of, named_apart, watch
 from twoloop.kernels.compile.callbacks import KINDS, compile_callback
 from twoloop.kernels.compile.closures import stands_for
 from twoloop.kernels.compile.private import Dispatcher
-
-Array = NDArray[np.float64]
 
 KIND_NAMES = tuple(KINDS)
 REAL = "fiu"  # kinds of arrays; durations are whole numbers to NumPy, and no forces

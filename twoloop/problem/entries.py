@@ -7,12 +7,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from twoloop.checks.arguments import shown
+from twoloop.checks.arguments import Array, shown
 from twoloop.kernels.compile.caches import watch
 from twoloop.kernels.compile.callbacks import compile_callback
 from twoloop.kernels.compile.private import Dispatcher
 
-Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Entries = tuple[Integers, Integers]  # rows and columns
 

@@ -7,15 +7,13 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from twoloop.checks.arguments import check_number, check_real
+from twoloop.checks.arguments import Array, check_number, check_real
 from twoloop.checks.bounds import check_callback
 from twoloop.checks.sparse_rows import Rows, SparseRows
 from twoloop.kernels.compile.callbacks import KINDS, STATE
 from twoloop.problem.adapters import store
-
-Array = NDArray[np.float64]
 
 
 class EvaluatedEquations:

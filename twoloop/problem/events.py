@@ -5,11 +5,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from twoloop.checks.arguments import shown
-
-Array = NDArray[np.float64]
+from twoloop.checks.arguments import Array, shown
 
 SAMPLES = 4  # parts of a step, at whose ends the sign is looked at
 PRECISION = 4.0 * float(np.finfo(float).eps)  # of the time of an event, as in SciPy
@@ -98,6 +95,7 @@ class EventSearch:
         self.found: list[list[tuple[float, Array]]] = [[] for _ in events]
         self.ended: tuple[Event, float] | None = None
         self._n_q = len(row) // 2
+        self._every = min((getattr(event.function, "every", np.inf) for event in events), default=np.inf)
         self._values = self._evaluate(t0, row)
         self._at_start = True
 
@@ -108,12 +106,14 @@ class EventSearch:
         """Look at the steps that end at ends[1:], the first of which begins at ends[0]; stop at a terminal event."""
         if len(ends) < 2 or self.ended is not None:
             return
-        parts = np.arange(1, SAMPLES) / SAMPLES
-        inner = ends[:-1, None] + parts * np.diff(ends)[:, None]
-        times = np.column_stack([ends[:-1], inner, ends[1:]])
-        rows = states(np.append(times[:, :-1].ravel(), ends[-1]))
-        for k in range(len(ends) - 1):
-            self._in_step(states, times[k], rows[SAMPLES * k : SAMPLES * (k + 1) + 1])
+        steps = np.diff(ends)
+        counts = np.maximum(SAMPLES, np.ceil(steps / self._every)).astype(int)
+        inner = [end + np.arange(n) / n * h for end, n, h in zip(ends[:-1], counts, steps, strict=True)]
+        times = np.append(np.concatenate(inner), ends[-1])
+        rows, first = states(times), np.append(0, np.cumsum(counts))
+        for k in range(len(steps)):
+            within = slice(first[k], first[k + 1] + 1)
+            self._in_step(states, times[within], rows[within])
             if self.ended is not None:
                 return
             self.reached = float(ends[k + 1])

@@ -17,14 +17,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from twoloop.checks.arguments import Array
 from twoloop.kernels.compile.caches import UNWRITABLE, say_once, sources_folder, watch
 from twoloop.kernels.compile.callbacks import KINDS, compile_callback
 from twoloop.kernels.compile.ownership import make_own, read_own, write_own
 from twoloop.kernels.compile.private import Dispatcher
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

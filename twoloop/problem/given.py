@@ -1,18 +1,16 @@
 """What a system is given: which callbacks, entries and parameters, and what stands for those that are left out."""
 
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from twoloop.checks.arguments import check_real, shown
+from twoloop.checks.arguments import Array, check_real, shown
 from twoloop.kernels.compile.callbacks import KINDS, stand_in
 from twoloop.kernels.compile.private import Dispatcher
 from twoloop.problem.adapters import ConstantMatrix, check_arguments, through_python
 from twoloop.problem.entries import VALUES_OF, Entries, check_entries
 from twoloop.problem.jacobian import differenced_jacobian
-
-Array = NDArray[np.float64]
 
 
 def checked_parameters(parameters: Any) -> Array:
@@ -125,3 +123,8 @@ def in_place_of(kind: str, given: dict[str, Dispatcher]) -> Dispatcher:
     # what is called in Python cannot be watched, and need not be: it is looked up at every call
     watched = ("differences, through Python", "") if constraint is through_python("constraint") else None
     return differenced_jacobian(constraint, watched)
+
+
+def callbacks_in(names: Mapping[str, Any]) -> dict[str, Any]:
+    """The callbacks of a module, each of which has the name of its kind, for a ConstrainedSystem."""
+    return {kind: names[kind] for kind in KINDS if kind in names}

@@ -5,11 +5,8 @@ from dataclasses import dataclass
 from itertools import count
 
 import numpy as np
-from numpy.typing import NDArray
 
-from twoloop.checks.arguments import check_flag, check_real, check_size, check_text, check_vector
-
-Array = NDArray[np.float64]
+from twoloop.checks.arguments import Array, check_flag, check_real, check_size, check_text, check_vector
 
 # numbers of coordinates of a rotation, by those of the translation
 ROTATIONS = {2: (0, 1), 3: (0, 4, 9)}

@@ -8,9 +8,7 @@ from dataclasses import dataclass
 from operator import attrgetter
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-from numpy.typing import NDArray
-
+from twoloop.checks.arguments import Array
 from twoloop.kernels.compile.private import Dispatcher
 from twoloop.problem.adapters import ConstantMatrix
 from twoloop.problem.description import Description
@@ -18,8 +16,6 @@ from twoloop.problem.generated import GeneratedCode, code_of
 
 if TYPE_CHECKING:
     from twoloop.problem.system import ConstrainedSystem
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -6,28 +6,16 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from twoloop.checks.arguments import Array
 from twoloop.problem.description import Description, name_and_unit
 from twoloop.problem.drawing import Drawing
 from twoloop.problem.joints import Joint
 from twoloop.problem.system import ConstrainedSystem
 
-Array = NDArray[np.float64]
-
 TAGS = (
-    "open chain",
-    "closed chain",
-    "rigid",
-    "flexible",
-    "planar",
-    "spatial",
-    "driven",
-    "redundant",
-    "singular",
-    "non-holonomic",
-    "stiff",
-    "dissipative",
+    *("open chain", "closed chain", "rigid", "flexible", "planar", "spatial", "driven", "redundant"),
+    *("singular", "non-holonomic", "stiff", "dissipative"),
 )
 
 

@@ -7,18 +7,15 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from twoloop.checks.arguments import check_flag, check_size
+from twoloop.checks.arguments import Array, check_flag, check_size
 from twoloop.kernels.compile.callbacks import KINDS
 from twoloop.kernels.compile.private import Dispatcher
-from twoloop.kernels.data.common import BANDWIDTH, CONSTANT_MASS, GIVEN, N_FLAGS, PROGRAMS, Functions
+from twoloop.kernels.data.common import PROGRAMS, Functions
+from twoloop.kernels.data.flags import BANDWIDTH, CONSTANT_MASS, GIVEN, N_FLAGS
 from twoloop.kernels.data.kit import Kit
-from twoloop.problem.adapters import (
-    PythonFunctions,
-    compile_returning,
-    through_python,
-)
+from twoloop.problem.adapters import PythonFunctions, compile_returning, through_python
 from twoloop.problem.description import Description
 from twoloop.problem.entries import VALUES_OF, DenseFunction, dense_callback
 from twoloop.problem.evaluated import EvaluatedEquations
@@ -26,8 +23,6 @@ from twoloop.problem.given import checked_entries, checked_parameters, given_cal
 from twoloop.problem.joints import Joint, check_joints
 from twoloop.problem.pickling import made_again, reduced
 from twoloop.problem.system_methods import add_callbacks
-
-Array = NDArray[np.float64]
 
 
 @add_callbacks

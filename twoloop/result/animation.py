@@ -12,13 +12,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from twoloop.checks.arguments import check_positive
+from twoloop.checks.arguments import Array, check_positive
 from twoloop.checks.optional import needed
 from twoloop.run.record import Record
-
-Array = NDArray[np.float64]
 
 RATE = 25  # frames a second
 SHORTEST, LONGEST = 3.0, 12.0  # s, where the user does not say
@@ -142,9 +139,7 @@ def projected(points: Array) -> Array:
     if points.shape[1] == 2:
         return points
     a, e = np.radians([AZIMUTH, ELEVATION])
-    seen = np.array(
-        [[-np.sin(a), np.cos(a), 0.0], [-np.sin(e) * np.cos(a), -np.sin(e) * np.sin(a), np.cos(e)]],
-    )
+    seen = np.array([[-np.sin(a), np.cos(a), 0.0], [-np.sin(e) * np.cos(a), -np.sin(e) * np.sin(a), np.cos(e)]])
     return np.einsum("ij,kjt->kit", seen, points)
 
 

@@ -9,13 +9,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from twoloop.checks.arguments import check_positive, check_tolerance
+from twoloop.checks.arguments import Array, check_positive, check_tolerance
 from twoloop.kernels.data.intervals import APART
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.record import Record
 from twoloop.run.remake import Remade, Remaker, explicit, implicit, tighter
-
-Array = NDArray[np.float64]
 
 PIECES = 200  # of a run: the longest piece, and the longest step with which one is made again, is this part of it
 LIMIT = 200.0  # tolerances: right steps were at most 140 off, those that passed over something 270 and more

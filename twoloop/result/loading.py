@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.problem.system import ConstrainedSystem, check_system
+from twoloop.result.folder import read_folder
 from twoloop.result.result import Result
 from twoloop.result.saved_fields import OF_EVENTS, Fields
 from twoloop.result.storage import ALWAYS, FORMAT, SOMETIMES, check_path
@@ -18,12 +19,12 @@ from twoloop.run.dense_solution import DenseSolution
 
 
 def load(path: str | os.PathLike[str], system: ConstrainedSystem | None = None) -> Result:
-    """Read a result that `Result.save` wrote.
+    """Read a result that `Result.save` wrote, or that is in the folder `store` of `solve_dae`.
 
     Parameters
     ----------
     path : str or path
-        The file.
+        The file, or the folder, of which is read what is used.
     system : ConstrainedSystem, optional
         The system that was solved; only with it `result.sol`, `result.reactions`, `result.energy`, `result.plot` and
         `result.animate` have all that they need. None: `result.sol` is None.
@@ -38,13 +39,13 @@ def load(path: str | os.PathLike[str], system: ConstrainedSystem | None = None) 
     FileNotFoundError
         If there is no such file.
     TypeError, ValueError
-        If the file was not written by `Result.save` or is damaged (says in which field), or holds a result of a system
-        of other sizes.
+        If the file was not written by `Result.save` nor the folder by `solve_dae`, or it is damaged (says in which
+        field), or holds a result of a system of other sizes.
     """
     if system is not None:
         check_system(system)
     path = check_path(path)
-    arrays, words = _read(path)
+    arrays, words = read_folder(path) if path.is_dir() else _read(path)
     known = Fields(str(path), arrays, words)
     if system is not None:
         sizes, given = known.sizes, (system.n_q, system.n_c + system.n_a)
@@ -60,14 +61,9 @@ def load(path: str | os.PathLike[str], system: ConstrainedSystem | None = None) 
     return Result(
         **always,
         **optional,
-        status=known.status,
-        message=known.message,
+        **{name: getattr(known, name) for name in ("status", "message", "rank", "method", "compiled", "changes")},
         stats=known.statistics,
-        rank=known.rank,
         system=system,
-        method=known.method,
-        compiled=known.compiled,
-        changes=known.changes,
         sol=None if system is None or "sol_t" not in arrays else _solution(system, arrays, words),
     )
 

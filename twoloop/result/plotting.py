@@ -6,13 +6,11 @@ import os
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from twoloop.checks.arguments import Array
 from twoloop.checks.optional import needed
 from twoloop.problem.description import name_and_unit
 from twoloop.run.record import Record
-
-Array = NDArray[np.float64]
 
 WIDTH, HEIGHT = 8.0, 2.2  # inches; height of a panel
 LEGEND_MOST = 12  # coordinates that a legend names

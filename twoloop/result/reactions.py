@@ -3,15 +3,12 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from twoloop.checks.arguments import check_text
+from twoloop.checks.arguments import Array, check_text
 from twoloop.checks.sparse_rows import SparseRows
 from twoloop.problem.joints import Joint
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.record import Record
-
-Array = NDArray[np.float64]
 
 NEGLIGIBLE = 1e-6  # relative: a reaction that multipliers without effect on the sum would change by less is unique
 

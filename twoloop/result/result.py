@@ -222,7 +222,8 @@ class Result(Record):
         Notes
         -----
         It does not prove that the errors at the end are small: those of the steps grow along an unstable motion. Nor
-        that the model is right, nor anything of what lasts less than `gap`.
+        that the model is right, nor anything of what lasts less than `gap`. Coordinates and velocities are compared;
+        the accelerations and multipliers of the result, from which `reactions` come, are not.
         """
         return certify(self, rtol, atol)
 

@@ -8,11 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from twoloop.checks.arguments import shown
+from twoloop.checks.arguments import Array, shown
 from twoloop.kernels.data import intervals
 from twoloop.run.record import Statistics, Status
-
-Array = NDArray[np.float64]
 
 STATES = ("q", "v", "a", "lam")
 COUNTS = ("rejected_error", "rejected_convergence", "partitioned")
@@ -20,6 +18,7 @@ NUMBERS = ("rtol", "defect", "widest_gap")  # each may be None
 OF_EVENTS = ("t_events", "q_events", "v_events")
 KINDS = (intervals.APART, intervals.VELOCITIES, intervals.ACCELERATIONS, intervals.ACROSS)
 LARGEST = 2**63
+ROWS = 1024  # of an array that are looked at in one go
 FEWEST = 3  # states of an interval that has some of its own: its ends, and one between them
 
 
@@ -113,13 +112,13 @@ class Fields:
         expected = f"rows of none or at least {FEWEST} increasing times, from one of sol_t to the next, then NaN"
         sizes = there.sum(axis=1)
         self._check("sol_interior_t", times.shape[1] >= FEWEST, f"of at least {FEWEST} columns")
-        for row, here, n in zip(times, there, sizes.tolist(), strict=True):
+        for row, own, here, n in zip(times, states, there, sizes.tolist(), strict=True):
             i = int(np.searchsorted(t, row[0])) if n else 0
             fits = n == 0 or (
                 n >= FEWEST and here[:n].all() and i < len(t) - 1 and row[0] == t[i] and row[n - 1] == t[i + 1]
             )
             self._check("sol_interior_t", bool(fits and (np.diff(row[:n]) > 0.0).all()), expected)
-        self._check("sol_interior_states", bool(np.isfinite(states[there]).all()), "finite where there are times")
+            self._check("sol_interior_states", bool(np.isfinite(own[:n]).all()), "finite where there are times")
 
     def _statistics(self) -> Statistics:
         stats = self._word("stats", dict)
@@ -147,7 +146,8 @@ class Fields:
 
     def _finite(self, name: str, shape: tuple[int | None, ...]) -> Array:
         array = self._array(name, shape)
-        self._check(name, bool(np.isfinite(array).all()), "finite")
+        blocks = np.split(array, range(ROWS, len(array), ROWS))  # that of a folder may be larger than the memory
+        self._check(name, all(np.isfinite(block).all() for block in blocks), "finite")
         return array
 
     def _times(self, name: str, least: int = 0) -> Array:

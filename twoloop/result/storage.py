@@ -7,13 +7,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from twoloop.checks.arguments import shown
 from twoloop.result.saved_fields import COUNTS, NUMBERS, OF_EVENTS, STATES, check_sum
 from twoloop.run.record import Record
-
-Array = NDArray[np.float64]
 
 FORMAT = "twoloop result 1"
 ALWAYS = ("t", *STATES, "h")
@@ -27,8 +24,8 @@ def check_path(path: Any) -> Path:
     return Path(path)
 
 
-def save(result: Record, path: str | os.PathLike[str]) -> None:
-    """Write a result to a file, see `Result.save`."""
+def parts_of(result: Record, inside: bool = True) -> tuple[dict[str, np.ndarray[Any, Any]], dict[str, Any]]:
+    """The arrays of a result by name, with or without states inside of steps, and all else."""
     arrays: dict[str, Any] = {name: getattr(result, name) for name in ALWAYS}
     arrays |= {name: getattr(result, name) for name in SOMETIMES if getattr(result, name) is not None}
     n_events = None if result.t_events is None else len(result.t_events)
@@ -42,8 +39,15 @@ def save(result: Record, path: str | os.PathLike[str]) -> None:
         interpolator, table = result.sol.interpolator, result.sol.table
         arrays |= {"sol_t": table.t, "sol_states": table.states, "sol_kinds": table.kinds}
         words |= {"sol_end": result.sol.t_max, "sol_ranks": interpolator.ranks, "sol_rtol": interpolator.rtol}
-        if interpolator.parts > 1:
-            arrays["sol_interior_t"], arrays["sol_interior_states"] = interpolator.interiors(table)
+        if inside:
+            blocks = zip(*interpolator.interiors(table), strict=True)
+            arrays["sol_interior_t"], arrays["sol_interior_states"] = (np.concatenate(each) for each in blocks)
+    return arrays, words
+
+
+def save(result: Record, path: str | os.PathLike[str]) -> None:
+    """Write a result to a file, see `Result.save`."""
+    arrays, words = parts_of(result)
     words["check_sums"] = {name: check_sum(array) for name, array in arrays.items()}
     with check_path(path).open("wb") as file:
         np.savez(file, words=np.array(json.dumps(words)), allow_pickle=False, **arrays)

@@ -7,21 +7,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from twoloop.checks.arguments import Array
 
 DECADE = 10.0 * (1.0 + 1e-9)  # between two runs that lie farther apart nothing is interpolated
 NEAR = 2.0  # settings that differ by less are nearly the same
 FEWEST = 3  # repetitions that an interval asks for
 LOOSEST = 1e-1  # tolerance of which looser ones are of no use
-BY_TOLERANCE = (
-    "heyoka",
-    "Taylor",
-    "auto",
-    "the default",
-    "ensemble",
-    "solve_dae",
-    "TRBDF2",
-)  # how solvers begin whose order the tolerance sets, or whose loose runs are too rough for a line
+# how solvers begin whose order the tolerance sets, or whose loose runs are too rough for a line
+BY_TOLERANCE = ("heyoka", "Taylor", "auto", "the default", "ensemble", "solve_dae", "TRBDF2")
 INTERVAL = (2.5, 97.5)  # percentiles that count of times drawn again
 LEAST = 1.05  # ratio of times that counts: less is within what machine and order of the calls do
 RESAMPLES, SEED = 1000, 25  # draws of the repetitions

@@ -213,11 +213,7 @@ def chosen(rows: Iterable[Row], mechanism: str, t_end: float | None = None) -> l
 
 
 def leaderboard(
-    mechanism: str,
-    target: float,
-    files: Iterable[Path] = (),
-    t_end: float | None = None,
-    out: Path | None = None,
+    mechanism: str, target: float, files: Iterable[Path] = (), t_end: float | None = None, out: Path | None = None
 ) -> str:
     """The boards of a mechanism at an error as text, of the rows that are shipped and of those in files.
 

@@ -3,16 +3,18 @@
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.generate.traced_values import Sample
 from twoloop.kernels.compile.linking import direct
-from twoloop.kernels.data import common, intervals
+from twoloop.kernels.data import intervals, noted, tolerances
 from twoloop.run.comparison import compared
 from twoloop.run.dense import Interpolator
 from twoloop.run.interrupts import Interrupts, said_of_interrupt
+from twoloop.run.kept import OF_STEPS
 from twoloop.run.messages import message_of, outcome
 from twoloop.run.pace import INTERRUPTED, OUT_OF_TIME, STAGNATED, Pace
 from twoloop.run.passage import beyond, bridge, bridging_kit, give_way, leap
@@ -30,9 +32,9 @@ CHUNK_TO_EVENT = 16  # attempts where an event may end the run: what is computed
 CHUNK_TIME = 0.05  # s of CPU; chunks that take longer do not grow, so that Ctrl-C is heard
 # ends of which it may be said that stability limited the steps
 EXPLAINED_BY_STIFFNESS = {Status.REACHED_END, Status.EVENT, Status.MAX_STEPS, Status.TIME_LIMIT, Status.STAGNATED}
-FIRST_PARTITION = np.array([[0.0, 0.0, 0.0, 1.0, 0.0]])  # before all steps: it is not a renewal
+FIRST_PARTITION = np.array([[0, 0, 1]])  # rejections and partitions before all steps: it is not a renewal
 NO_KINDS = np.zeros(0, dtype=np.int64)  # of intervals within which nothing is wanted
-MOST_SPARE, LARGEST_SPARE = 16, 100_000  # buffers that wait for their next run, and numbers of each of them
+MOST_SPARE, LARGEST_SPARE = 16, 250_000  # buffers that wait for their next run, and numbers of each of them
 _spare: dict[tuple[int, int, int], Buffers] = {}  # buffers, by their sizes, for the next run
 
 
@@ -75,7 +77,10 @@ class Course:
         # the run is looked at after so many attempts, however long the chunks are that the clock allows
         self.between_looks = self.next_look = run.chunk
         self.plan, self.control, self.kit = run.plan, run.control, run.kit  # at the moment: not always the run's own
-        self.step_parts = [FIRST_PARTITION]
+        self.counts = FIRST_PARTITION
+        self.step_parts = [np.empty((0, run.a.N_STEP_COLUMNS))]  # of which nothing is kept yet
+        if self.wanted.kept.finished:
+            self._tell()
         self.filled = np.zeros(2, dtype=np.int64)
         self.pace, self.looks = Pace(run.t0), Looks(run.plan)
         self.sample = Sample(run.t0, run.state, 2 * run.system.n_q)
@@ -112,8 +117,10 @@ class Course:
                 buffers = self._buffers()
             self._go_on(across, n_steps)
             self.report(clock[a.T])
-        if copied and buffers[1].size <= LARGEST_SPARE and len(_spare) < MOST_SPARE:
+        if copied and buffers[1].size <= LARGEST_SPARE:
             _spare[buffers[0].size, buffers[1].size, len(buffers[2])] = buffers
+            for oldest in list(_spare)[:-MOST_SPARE]:
+                _spare.pop(oldest, None)
         if self.wanted.between_steps:
             began = time.process_time()
             recorder.finish()
@@ -155,7 +162,19 @@ class Course:
         run = self.run
         self.sample.add(t, rows, float(run.clock[run.a.T]), run.state)
         self.step_parts.append(steps)
+        if self.wanted.kept.finished:
+            self._tell()
         self.recorder.add(t, rows, kinds)
+
+    def _tell(self) -> None:
+        """Keep what is told of each step."""
+        a, kept = self.run.a, self.wanted.kept
+        steps, self.step_parts = np.concatenate(self.step_parts), self.step_parts[:1]
+        counts = np.concatenate([self.counts, steps[:, a.ERRORS : a.JACOBIANS].astype(np.int64)])
+        self.counts, changes = counts[-1:], counts[1:] - counts[:-1]
+        told = (steps[:, a.H], *changes.T, steps[:, a.JACOBIANS] > 0.0)
+        for name, values in zip(OF_STEPS, told, strict=True):
+            kept.add(name, values)
 
     def _look(self, steps: Array, across: bool, spent: float) -> None:
         """See whether the run gets anywhere, and how long the next chunk may be."""
@@ -199,20 +218,23 @@ class Course:
 
     def _record(self, check_derivatives: bool) -> Record:
         run, recorder, code = self.run, self.recorder, self.code
-        a, n = run.a, run.system.n_q
+        n = run.system.n_q
         t, table = recorder.output()
-        steps, statistics = np.concatenate(self.step_parts), run.statistics(self.cpu)
-        reached = float(run.clock[a.T])
+        statistics, kept = run.statistics(self.cpu), self.wanted.kept
+        self._tell()
+        reached = float(run.clock[run.a.T])
+        if recorder.ended is not None or recorder.broken_off is not None:
+            for name in OF_STEPS:
+                kept.cut(name, recorder.n_steps)
+            statistics = replace(statistics, n_accepted=recorder.n_steps)
         if recorder.ended is not None:
             event, end = recorder.ended
-            steps = steps[: recorder.n_steps + 1]
             if recorder.n_steps > 0:
-                steps[-1, a.H] = recorder.last_step
+                kept.cut("h", recorder.n_steps - 1)
+                kept.add("h", np.array([recorder.last_step]))
             status, message = Status.EVENT, f"{event.name} ended the run at t = {end:.10g}."
-            statistics = replace(statistics, n_accepted=recorder.n_steps)
         if recorder.broken_off is not None:
-            reached, steps = recorder.broken_off, steps[: recorder.n_steps + 1]
-            statistics = replace(statistics, n_accepted=recorder.n_steps)
+            reached = recorder.broken_off
         try:
             if recorder.ended is None:
                 status, message = outcome(run, code, self.t1, self.pace)
@@ -228,31 +250,26 @@ class Course:
             code = INTERRUPTED
         if self.interrupts.asked or recorder.interrupted or (code == INTERRUPTED and recorder.ended is None):
             status, message = Status.INTERRUPTED, said_of_interrupt(reached, table)
-        counts = steps[:, a.ERRORS : a.JACOBIANS].T.astype(np.int64)
-        errors, failures, partitions = counts[:, 1:] - counts[:, :-1]
         t_events, q_events, v_events = recorder.events()
+        of_steps: dict[str, Any] = {name: kept.array(name) for name in OF_STEPS}
         return Record(
             t=t,
             q=table[:, :n].T,
             v=table[:, n : 2 * n].T,
             a=table[:, 2 * n : 3 * n].T,
             lam=table[:, 3 * n :].T,
-            h=steps[1:, a.H],
+            **of_steps,
             status=status,
             message=message_of(run, message + explained(status)),
             stats=statistics,
             rank=run.rank,
             redundant=run.redundant.copy(),  # runs of one start share it
-            rejected_error=errors,
-            rejected_convergence=failures,
-            partitioned=partitions,
-            untested=steps[1:, a.JACOBIANS] > 0.0,
             sol=recorder.solution(),
             t_events=t_events,
             q_events=q_events,
             v_events=v_events,
             defect=run.defect(),
-            widest_gap=float(run.work.notes[common.WIDEST_GAP]),
+            widest_gap=float(run.work.notes[noted.WIDEST_GAP]),
             system=run.system,
         )
 
@@ -271,7 +288,7 @@ class Course:
         n, interpolator = run.system.n_q, None
         if wanted.between_steps:
             ranks = (len(run.work.rows), len(run.work.rows_v))
-            start, atol = run.state[: 3 * n], run.tolerances[common.ATOL :]
+            start, atol = run.state[: 3 * n], run.tolerances[tolerances.ATOL :]
             interiors = {kind: plan.fresh() for kind, plan in run.interiors.items()}
             interpolator = Interpolator(run.system, run.t0, start, run.rtol, atol, ranks, interiors)
         return Recorder(wanted, interpolator, n, run.t0, run.state)

@@ -1,7 +1,7 @@
 """Polynomials through the stored states of a run, put back on the constraints: what dense_solution.py evaluates."""
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from twoloop.checks.consistency import ConstraintWarning, pattern_of
 from twoloop.kernels.compile.linking import direct
-from twoloop.kernels.data import common
+from twoloop.kernels.data import codes, noted
 from twoloop.kernels.data import intervals as names
+from twoloop.kernels.data.tolerances import ATOL, RTOL
 from twoloop.methods.plan import INNER_TOL, Plan
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.static_form import static_form
@@ -41,9 +42,9 @@ def ranks_at(system: ConstrainedSystem, t: float, q: Array, v: Array, rtol: floa
     kit = kit_of(system, t, q)
     work = workspace(system, kit, pattern_of(system, t, q), q, rtol, 0.0)
     state = np.concatenate([q, v, np.zeros(system.n_q + system.n_c + system.n_a)])
-    if advance.start(kit, work, t, state) != common.RANK_DIFFERS:
+    if advance.start(kit, work, t, state) != codes.RANK_DIFFERS:
         return system.n_c, system.n_c + system.n_a
-    return int(work.notes[common.RANK]), int(work.notes[common.RANK_V])
+    return int(work.notes[noted.RANK]), int(work.notes[noted.RANK_V])
 
 
 class Interpolator:
@@ -81,8 +82,8 @@ class Interpolator:
         self.plans = dict(plans)
         self.made_of = (system, t0, row.copy(), rtol, atol, ranks, self.plans)
         self.system, self.rtol, self.ranks = system, rtol, ranks
-        self.tolerances = np.concatenate([np.zeros(common.ATOL), atol])
-        self.tolerances[common.RTOL] = rtol
+        self.tolerances = np.concatenate([np.zeros(ATOL), atol])
+        self.tolerances[RTOL] = rtol
         self.parts = max((plan.parts for plan in self.plans.values()), default=REPAIRED)
         self.parts = max(self.parts, REPAIRED)
         self.static = static_form(system, t0, row[: system.n_q], *self.plans.values())
@@ -103,7 +104,7 @@ class Interpolator:
         self.kit = kit_of(system, t0, q0, None, static)
         pattern = pattern_of(system, t0, q0) if static is None else np.zeros((0, 0))
         self.work = workspace(system, self.kit, pattern, q0, self.rtol, 0.0, self.ranks, static, self.matrices)
-        self.work.notes[common.GENERATION] = 1.0  # the ranks are known
+        self.work.notes[noted.GENERATION] = 1.0  # the ranks are known
         advance.start(self.kit, self.work, t0, np.concatenate([row, np.zeros(system.n_c + system.n_a)]))
         self.repairs: dict[bool, tuple[Plan, Any]] = {}
 
@@ -219,7 +220,7 @@ class Interpolator:
             from twoloop.methods.tableaux import radau_iia
 
             method = RungeKutta(radau_iia(3), outer="newton") if stiff else DOP853()
-            atol = float(self.tolerances[common.ATOL :].min())
+            atol = float(self.tolerances[ATOL:].min())
             plan = method.plan(self.system.n_q, self.rtol, atol, True).changed(parts=REPAIRED)
             q0 = self.made_of[2][: self.system.n_q]
             if plan.matrices > self.matrices:
@@ -246,7 +247,7 @@ class Interpolator:
     def _fill(self, table: Table, plan: Plan, kit: Any, intervals: Groups) -> dict[float, tuple[Array, Array]]:
         """Interior states of these intervals, by when they begin; where that fails, fewer of them, or none."""
         n = self.system.n_q
-        tolerances = np.zeros(common.ATOL + n)  # without an estimate
+        tolerances = np.zeros(ATOL + n)  # without an estimate
         state = np.zeros(3 * n + self.system.n_c + self.system.n_a)
         vectors = (plan.options, plan.memory.copy(), plan.memory, tolerances, state, state.copy())
         filled = {}
@@ -263,30 +264,30 @@ class Interpolator:
             intervals = intervals[~found]
         return filled
 
-    def interiors(self, table: Table) -> tuple[Array, Array]:
-        """The interior states of all m divided intervals, (m, parts + 1) and (m, parts + 1, 3 n_q), for `keep`.
+    def interiors(self, table: Table) -> Iterator[tuple[Array, Array]]:
+        """The interior states of divided intervals, (m, parts + 1) and (m, parts + 1, 3 n_q), for `keep`, in blocks.
 
         NaN where an interval has fewer.
         """
         groups = _groups(table, np.arange(len(table.t) - 1))
-        divided = []
         for block in np.split(groups, range(KEPT, len(groups), KEPT)):
             self._settle(table, block)
             begins = table.t[block[:, names.FIRST_OWN]].tolist()
-            divided += [self.filled[t] for t in begins if t in self.filled]
-        shape = (len(divided), self.parts + 1)
-        t, states = np.full(shape, np.nan), np.full((*shape, table.states.shape[1]), np.nan)
-        for row, (own_t, own) in enumerate(divided):
-            t[row, : len(own_t)], states[row, : len(own)] = own_t, own
-        return t, states
+            divided = [self.filled[t] for t in begins if t in self.filled]
+            shape = (len(divided), self.parts + 1)
+            t, states = np.full(shape, np.nan), np.full((*shape, table.states.shape[1]), np.nan)
+            for row, (own_t, own) in enumerate(divided):
+                t[row, : len(own_t)], states[row, : len(own)] = own_t, own
+            yield t, states
 
     def keep(self, t: Array, states: Array) -> None:
         """Take interior states as they were found before; no others can be found."""
         self.parts, self.judges = t.shape[1] - 1, False
         self._make_room()
-        there = np.isfinite(t)
-        divided = [(own_t[here], own[here]) for own_t, own, here in zip(t, states, there, strict=True) if here[0]]
-        self.filled = {float(own_t[0]): (own_t, own) for own_t, own in divided}
+        sizes = np.isfinite(t).sum(axis=1).tolist()
+        self.filled = {
+            float(own_t[0]): (own_t[:n], own[:n]) for own_t, own, n in zip(t, states, sizes, strict=True) if n
+        }
 
     def complete(self, times: Array, states: Array, out: Array) -> None:
         """Fill rows [a, lam] at rows [q, v] on the constraints."""

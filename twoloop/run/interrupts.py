@@ -67,7 +67,7 @@ def _within_a_users_function(frame: FrameType | None) -> bool:
 
 def said_of_interrupt(t: float, table: Array) -> str:
     """What is said of a run that Ctrl-C ended at t, with these rows [q, v, a, lam]."""
-    gaps = int(np.isnan(table).any(axis=1).sum())
+    gaps = int(np.isnan(table[:, -1:]).sum())  # where one of them is missing, all are
     unknown = f" Accelerations and multipliers are NaN at {gaps} of its times." if gaps else ""
     return f"Interrupted from the keyboard at t = {t:.10g}. The result holds what was computed before.{unknown}"
 

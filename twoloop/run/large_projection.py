@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from twoloop.checks.consistency import is_at_rounding
 from twoloop.kernels.compile.linking import direct
-from twoloop.kernels.data import common
+from twoloop.kernels.data import codes, flags, noted
 from twoloop.kernels.evaluation import tasks
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.static_form import static_form
@@ -30,7 +30,7 @@ class _Metric:
         self.system, self.t, self.rank = system, t, rank
         self.form = form._replace(static=form.static._replace(dense_mass=False), mass_pattern=np.zeros((0, 0)))
         self.kit = kit_of(system, t, q, None, self.form)
-        self.kit.flags[common.CONSTANT_MASS], self.kit.flags[common.MASS_VALUES_GIVEN] = 1, 0
+        self.kit.flags[flags.CONSTANT_MASS], self.kit.flags[flags.MASS_VALUES_GIVEN] = 1, 0
         self.work = workspace(system, self.kit, np.zeros((0, 0)), q, 1e-8, 0.0, (rank, rank), self.form)
         rows, columns = form.mass
         diagonal = np.where(rows == columns, 1.0, 0.0)
@@ -53,11 +53,11 @@ class _Metric:
     def project(self, q: Array, v: Array) -> tuple[Array, Array] | None:
         """q and v on the constraints."""
         q, on_the_way = q.copy(), v.copy()
-        if self.ask(tasks.RENEW, q, v) != common.DONE or self.ask(tasks.RESTORE, q, on_the_way) != common.DONE:
+        if self.ask(tasks.RENEW, q, v) != codes.DONE or self.ask(tasks.RESTORE, q, on_the_way) != codes.DONE:
             return None
         v = v.copy()  # the least change of the velocities is that where positions end
         for task in (tasks.RESTORE, tasks.RESTORE, tasks.TANGENTS):  # twice, to rounding
-            if self.ask(task, q, v) != common.DONE:
+            if self.ask(task, q, v) != codes.DONE:
                 return None
         self.at = q
         return q, v
@@ -73,15 +73,15 @@ def project_sparsely(
     with np.errstate(all="ignore"):
         metric = _Metric(system, t, q, form)
     code = metric.ask(tasks.RENEW, q.copy(), v.copy())
-    if code == common.RANK_DIFFERS:
-        metric = _Metric(system, t, q, form, int(metric.work.notes[common.RANK]))
-    elif code != common.DONE:
+    if code == codes.RANK_DIFFERS:
+        metric = _Metric(system, t, q, form, int(metric.work.notes[noted.RANK]))
+    elif code != codes.DONE:
         return None
     found = metric.project(q, v)
-    if found is None or metric.work.notes[common.PIVOT] < CLEAR:
+    if found is None or metric.work.notes[noted.PIVOT] < CLEAR:
         return None
     there = _Metric(system, t, found[0], form, metric.rank)
-    if there.ask(tasks.RENEW, found[0].copy(), v.copy()) != common.DONE:  # other rows count on the constraints
+    if there.ask(tasks.RENEW, found[0].copy(), v.copy()) != codes.DONE:  # other rows count on the constraints
         return None
     rows, rate = system.sparse_rows(t, found[0]), system.rates(t, found[0])
     if not is_at_rounding(system.constraint(t, found[0]), rows, found[0]):

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 from twoloop.checks.consistency import ConstraintWarning, dependent_rows, least_inertia, not_finite
 from twoloop.checks.rank import in_words, surely_above
-from twoloop.kernels.data import common
+from twoloop.kernels.data import codes, noted
 from twoloop.run.crossings import said_of_crossings, singular_ratio
 from twoloop.run.pace import INTERRUPTED, OUT_OF_TIME, STAGNATED, STAGNATION_STEPS, Pace
 from twoloop.run.record import Status
@@ -19,12 +19,12 @@ CROSSINGS = "\0"  # stands for what is said of singular positions that were cros
 NEXT_TO_END = 1e-3  # of the run: where it stops so close to its end, that is said
 
 _REASONS = {
-    common.DONE: "the error estimate stayed above the tolerances",
-    common.OUTER_DIVERGED: "the outer loop (stages) did not converge",
-    common.INNER_DIVERGED: "the inner loop (Newton on the positions) did not converge",
-    common.SINGULAR: "the dependent columns of the constraint Jacobian became singular",
-    common.MASS_NOT_DEFINITE: "the mass matrix was not positive definite",
-    common.GAMMA_INACCURATE: "gamma by differences missed the tolerance",
+    codes.DONE: "the error estimate stayed above the tolerances",
+    codes.OUTER_DIVERGED: "the outer loop (stages) did not converge",
+    codes.INNER_DIVERGED: "the inner loop (Newton on the positions) did not converge",
+    codes.SINGULAR: "the dependent columns of the constraint Jacobian became singular",
+    codes.MASS_NOT_DEFINITE: "the mass matrix was not positive definite",
+    codes.GAMMA_INACCURATE: "gamma by differences missed the tolerance",
 }
 
 
@@ -88,12 +88,9 @@ def outcome(run: "Run", code: int, t1: float, pace: Pace) -> tuple[Status, str]:
         )
     if code == a.ROWS_VIOLATED:
         return Status.ROWS_CONTRADICT, _contradiction(run)
-    if failure == common.NOT_FINITE:
-        return (
-            Status.NOT_FINITE,
-            f"{stopped}: {said_of_not_finite(run)}. The result holds what was computed before.",
-        )
-    if code == a.RANK_LOST or failure == common.SINGULAR:
+    if failure == codes.NOT_FINITE:
+        return (Status.NOT_FINITE, f"{stopped}: {said_of_not_finite(run)}. The result holds what was computed before.")
+    if code == a.RANK_LOST or failure == codes.SINGULAR:
         rows = dependent_rows(run.system, t, run.state[: run.system.n_q])
         return (
             Status.RANK_LOST,
@@ -101,8 +98,8 @@ def outcome(run: "Run", code: int, t1: float, pace: Pace) -> tuple[Status, str]:
             "coordinates exists at this singular position, and no step led across: end t_span before, take another "
             f"method, or change the geometry.{_end_is_near(run, t1)}",
         )
-    if failure == common.GAMMA_INACCURATE:
-        reached, required = run.work.notes[common.GAMMA_ACCURACY], run.work.notes[common.GAMMA_REQUIRED]
+    if failure == codes.GAMMA_INACCURATE:
+        reached, required = run.work.notes[noted.GAMMA_ACCURACY], run.work.notes[noted.GAMMA_REQUIRED]
         return (
             Status.NOT_CONVERGED,
             f"{stopped}: gamma by differences of C_q and C_t is good to a relative error of {reached:.1g} there, "
@@ -125,7 +122,7 @@ def outcome(run: "Run", code: int, t1: float, pace: Pace) -> tuple[Status, str]:
 
 def _contradiction(run: "Run") -> str:
     """Which row that was left out is violated, and which rows it depended on."""
-    t, n, row = float(run.clock[run.a.T]), run.system.n_q, int(run.work.notes[common.CONTRADICTION])
+    t, n, row = float(run.clock[run.a.T]), run.system.n_q, int(run.work.notes[noted.CONTRADICTION])
     words = in_words(run.system.rows(t, run.state[:n]), [row])
     return (
         f"Stopped at t = {t:.10g}: constraint row {row} depended on others at the start, was left out, and does "
@@ -136,7 +133,7 @@ def _contradiction(run: "Run") -> str:
 
 def _said_of_end(run: "Run") -> str:
     """A warning, and the sentence, where the run ends with constraints that have lost rank."""
-    if not run.crossings and not (run.plan.watchful and run.work.notes[common.NEARLY_SINGULAR] == 1.0):
+    if not run.crossings and not (run.plan.watchful and run.work.notes[noted.NEARLY_SINGULAR] == 1.0):
         return ""
     t, q, rank = float(run.clock[run.a.T]), run.state[: run.system.n_q], run.rank
     if surely_above(LOST_AT_END, run.system.rows(t, q), rank):
@@ -182,7 +179,7 @@ def _near_massless(run: "Run") -> str:
 
 def said_of_not_finite(run: "Run") -> str:
     """Which callback returned a value that is not finite, and when, as far as it is known."""
-    kind, at = int(run.work.notes[common.FAULT_KIND]), float(run.work.notes[common.FAULT_TIME])
+    kind, at = int(run.work.notes[noted.FAULT_KIND]), float(run.work.notes[noted.FAULT_TIME])
     if kind >= 0:
         name = run.functions._fields[kind]
         return f"{name} of {run.system.name!r} returned a value that is not finite at t = {at:.10g}"

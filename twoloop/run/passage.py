@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.kernels.compile.linking import direct
-from twoloop.kernels.data import common
+from twoloop.kernels.data import codes, noted
 from twoloop.kernels.data.kit import Kit
 from twoloop.methods.plan import Plan, kept_plan
 from twoloop.run.impulse import beyond_jump
@@ -31,7 +31,7 @@ def give_way(run: Run) -> None:
     run.substituted = True
     run.control_by(run.plan)
     run.limit_steps()
-    run.clock[run.a.FAILURE_CODE] = common.DONE
+    run.clock[run.a.FAILURE_CODE] = codes.DONE
     run.clock[run.a.H_NEXT] = run.clock[run.a.H_FAILED]
     run.clock[: run.a.N_PAST] = 0.0
 
@@ -72,7 +72,7 @@ def beyond(run: Run, plan: Plan, control: Array, code: int, accepted: int) -> tu
     if code == a.PAUSED and accepted == 0 and run.lengths:
         run.clock[a.H_NEXT], run.clock[a.H_LIMIT] = run.lengths.pop(0), np.inf
         return plan, control, code
-    if code == a.PAUSED and accepted > 0 and (run.work.notes[common.PIVOT] < CLEAR * run.clock[a.LARGEST_PIVOT]):
+    if code == a.PAUSED and accepted > 0 and (run.work.notes[noted.PIVOT] < CLEAR * run.clock[a.LARGEST_PIVOT]):
         run.lengths = [float(run.clock[a.H_LONG]) * part for part in BRIDGES]
         return plan, control, code
     if code not in (a.PAUSED, a.STEP_TOO_SMALL, a.FIXED_STEP_FAILED, a.RANK_LOST):
@@ -93,8 +93,8 @@ def leap(run: Run, t1: float) -> bool:
     if state is None:
         return False
     run.new_state[: 2 * n] = state
-    run.work.notes[common.KINK_BEFORE], run.work.notes[common.KINK_AFTER] = end, np.inf
-    if direct(run.kernels.start)(run.kit, run.work, end, run.new_state) != common.DONE:
+    run.work.notes[noted.KINK_BEFORE], run.work.notes[noted.KINK_AFTER] = end, np.inf
+    if direct(run.kernels.start)(run.kit, run.work, end, run.new_state) != codes.DONE:
         return False
     run.jumps.append(end)
     run.plan.memory[:] = run.memory

@@ -9,6 +9,7 @@ from twoloop.kernels.data.intervals import WINDOW
 from twoloop.problem.events import Event, EventSearch
 from twoloop.run.dense import Interpolator, Table
 from twoloop.run.dense_solution import DenseSolution
+from twoloop.run.kept import Kept
 
 Array = NDArray[np.float64]
 
@@ -27,12 +28,15 @@ class Wanted:
         Whether the dense solution is wanted.
     events : list of Event or None
         None: no events were asked for.
+    kept : InMemory or OnDisk
+        What takes it.
     """
 
     times: Array | None
     lands: bool
     dense: bool
     events: list[Event] | None
+    kept: Kept
 
     @property
     def every_step(self) -> bool:
@@ -68,34 +72,40 @@ class Recorder:
         self._t, self._rows = np.array([t0]), state[None, :].copy()  # the last states, and those not looked at
         self._kinds = np.empty(0, dtype=np.int64)
         self._next = 0  # the first interval of these that was not looked at
-        self._all: list[tuple[Array, Array, NDArray[np.int64]]] = [(self._t, self._rows, self._kinds)]
-        self._outputs: list[tuple[Array, Array]] = []
         self._n_outputs = 0
-        two = 2 * self._n_q
-        self.search = None if wanted.events is None else EventSearch(wanted.events, t0, state[:two])
-        if wanted.times is not None and wanted.lands:
-            self._outputs.append((self._t, self._rows))
-        elif wanted.times is not None:
-            self._outputs.append((self._t[:0], self._rows[:0, :two]))
+        self.search = None if wanted.events is None else EventSearch(wanted.events, t0, state[: 2 * self._n_q])
+        self._add(self._t, self._rows, self._kinds)
+        if wanted.times is not None and not wanted.lands:
+            self._store(self._t[:0], self._rows[:0, : 2 * self._n_q])
 
     def add(self, t: Array, rows: Array, kinds: NDArray[np.int64]) -> None:
         """Take over the states [q, v, a, lam] at which steps ended, and what kind of interval each step is.
 
         Of the kinds there is one a step where states between steps are wanted, else none.
         """
-        if not self.wanted.every_step:
-            self._outputs.append((t, rows))
-            return
-        if self.wanted.times is not None and self.wanted.lands:
-            landed = np.isin(t, self.wanted.times)
-            self._outputs.append((t[landed], rows[landed]))
-        if self.wanted.times is None or self.wanted.dense:
-            self._all.append((t, rows, kinds))
+        self._add(t, rows, kinds)
         if not self.wanted.between_steps:
             return
         self._t, self._rows = np.concatenate([self._t, t]), np.concatenate([self._rows, rows])
         self._kinds = np.concatenate([self._kinds, kinds])
         self._look(len(self._t) - WINDOW)
+
+    def _add(self, t: Array, rows: Array, kinds: NDArray[np.int64]) -> None:
+        wanted, kept = self.wanted, self.wanted.kept
+        if wanted.times is None:
+            self._store(t, rows)
+        elif wanted.lands:  # the ends of the run may not be among the times
+            landed = np.append(wanted.times, np.inf)[np.searchsorted(wanted.times, t)] == t
+            self._store(t[landed], rows[landed])
+        if wanted.dense:
+            kept.add("sol_t", t)
+            kept.add("sol_states", rows[:, : 3 * self._n_q])
+            kept.add("sol_kinds", kinds)
+
+    def _store(self, t: Array, rows: Array) -> None:
+        """Take rows [q, v, a, lam], or [q, v] where the rest is found at the end."""
+        self.wanted.kept.add("t", t)
+        self.wanted.kept.add("states", self._completed(t, rows) if self.wanted.kept.finished else rows)
 
     def finish(self) -> None:
         """No more states come."""
@@ -142,7 +152,7 @@ class Recorder:
             times = self.wanted.times[self._n_outputs :]
             times = times[times <= ends[-1]]
             try:
-                self._outputs.append((times, interpolator.states(table, times)))
+                self._store(times, interpolator.states(table, times))
                 self._n_outputs += len(times)
             except KeyboardInterrupt:
                 self.interrupted = True
@@ -152,29 +162,21 @@ class Recorder:
 
     def output(self) -> tuple[Array, Array]:
         """Times and rows [q, v, a, lam] of the result."""
-        parts = self._outputs if self.wanted.times is not None else [(t, rows) for t, rows, _ in self._all]
-        t, rows = np.concatenate([part[0] for part in parts]), np.concatenate([part[1] for part in parts])
-        if self.wanted.times is not None and self.wanted.lands:
-            landed = np.isin(t, self.wanted.times)  # the ends of the run may not be among them
-            t, rows = t[landed], rows[landed]
-        elif self.wanted.times is not None:
-            rows = self._completed(t, rows)
-        if self.broken_off is not None:
-            kept = t <= self.broken_off
-            return t[kept], rows[kept]
-        if self.search is None or self.search.ended is None:
-            return t, rows
-        event, end = self.search.ended
-        kept = t <= end
-        t, rows = t[kept], rows[kept]
-        if self.wanted.times is None and t[-1] < end:
-            last = self.search.found[event.number][-1][1][None, :]
-            t, rows = np.append(t, end), np.vstack([rows, self._completed(np.array([end]), last)])
-        return t, rows
+        kept, end = self.wanted.kept, self.broken_off if self.ended is None else self.ended[1]
+        if end is not None:
+            n = int(np.searchsorted(kept.array("t"), end, side="right"))
+            kept.cut("t", n)
+            kept.cut("states", n)
+        t = kept.array("t")
+        if self.wanted.times is None and self.last is not None and t[-1] < self.last[0]:
+            last = np.array([self.last[0]])
+            self._store(last, self._completed(last, self.last[1][None, :]))
+            t = kept.array("t")
+        return t, self._completed(t, kept.array("states"))
 
     def _completed(self, times: Array, rows: Array) -> Array:
         """Rows [q, v, a, lam] at rows [q, v]."""
-        if self.interpolator is None:
+        if self.interpolator is None or rows.shape[1] == self._width:
             return rows
         added = np.full((len(times), self._width - rows.shape[1]), np.nan)
         try:
@@ -188,9 +190,8 @@ class Recorder:
         """The dense solution, if it is wanted."""
         if not self.wanted.dense or self.interpolator is None:
             return None
-        t, rows, kinds = (np.concatenate(each) for each in zip(*self._all, strict=True))
-        table = Table(t, np.ascontiguousarray(rows[:, : 3 * self._n_q]), kinds)
-        end = float(t[-1]) if self.broken_off is None else self.broken_off
+        table = Table(*(self.wanted.kept.array(f"sol_{name}") for name in ("t", "states", "kinds")))
+        end = float(table.t[-1]) if self.broken_off is None else self.broken_off
         return DenseSolution(self.interpolator, table, end if self.ended is None else self.ended[1])
 
     def events(self) -> tuple[list[Array], list[Array], list[Array]] | tuple[None, None, None]:

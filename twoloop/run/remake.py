@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from twoloop.kernels.compile.linking import direct
-from twoloop.kernels.data import common
+from twoloop.kernels.data import codes, noted
 from twoloop.methods import dop853_tableau
 from twoloop.methods.dop853 import DOP853
 from twoloop.methods.plan import Method
@@ -84,7 +84,7 @@ class Remaker:
         a, control = self.run.a, self.run.control
         control[a.MAX_STEP], control[a.BRIDGE], control[a.STORE_ALL] = max_step, 0.0, 0.0
         control[a.MAX_ATTEMPTS] = CHUNK
-        self.run.work.notes[common.GAMMA_REQUIRED] = np.inf  # the run has judged its differences
+        self.run.work.notes[noted.GAMMA_REQUIRED] = np.inf  # the run has judged its differences
         rows = (np.empty(len(Remade._fields)), np.empty((len(Remade._fields), len(self.run.state))))
         self.out = (*rows, np.empty((CHUNK, a.N_STEP_COLUMNS)), np.zeros(2, dtype=np.int64))
         self.next_step = np.inf
@@ -103,7 +103,7 @@ class Remaker:
         clock[a.H_LIMIT] = run.plan.limit_start
         clock[a.H_NEXT] = self.next_step if self.next_step < np.inf else FIRST_TRY * (t1 - t0)
         self.next_step = np.inf
-        if run.kernels.start(run.kit, run.work, t0, run.state) != common.DONE:
+        if run.kernels.start(run.kit, run.work, t0, run.state) != codes.DONE:
             return None
         times = np.array([between, t1] if t0 < between < t1 else [t1])
         arrays = (run.plan.options, run.plan.memory, run.tolerances, run.control, clock, run.state, run.new_state)

@@ -7,18 +7,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from twoloop.checks.consistency import (
-    dependent_rows,
-    least_inertia,
-    mass_and_rows,
-    pattern_of,
-)
+from twoloop.checks.consistency import dependent_rows, least_inertia, mass_and_rows, pattern_of
 from twoloop.checks.rank import SHOWN, equations_in_words, in_words
 from twoloop.checks.sparse_rows import Rows, SparseRows, norms
 from twoloop.generate.time_dependence import may_be_sudden
 from twoloop.kernels.compile.linking import direct
 from twoloop.kernels.control.sudden import PLACES
-from twoloop.kernels.data import common
+from twoloop.kernels.data import codes, counters, flags, noted, tolerances
 from twoloop.kernels.evaluation.tasks import SOLVE
 from twoloop.kernels.layout import copy_of, empty
 from twoloop.methods.auto import with_matrix_cost
@@ -81,11 +76,11 @@ class Run:
         # ranks are found anew at every start: those of the last one are a guess, which spares a second workspace
         self.work = self._workspace(*(system.made.get("ranks", ()) if self.static is None else ()))
         self.new_state = np.zeros_like(self.state)
-        self.tolerances = np.zeros(common.ATOL + system.n_q)
-        self.tolerances[common.RTOL] = rtol
-        self.tolerances[common.ESTIMATE] = step_size is None
-        self.tolerances[common.LEAST] = least_tolerance(rtol, self.least_atol)
-        self.tolerances[common.ATOL :] = atol
+        self.tolerances = np.zeros(tolerances.ATOL + system.n_q)
+        self.tolerances[tolerances.RTOL] = rtol
+        self.tolerances[tolerances.ESTIMATE] = step_size is None
+        self.tolerances[tolerances.LEAST] = least_tolerance(rtol, self.least_atol)
+        self.tolerances[tolerances.ATOL :] = atol
         self.control = np.zeros(clock.N_CONTROL)
         self.control[clock.MAX_STEP] = np.inf
         self.control[clock.FIXED_STEP] = 0.0 if step_size is None else step_size
@@ -129,9 +124,9 @@ class Run:
         other.clock[self.a.T] = other.clock[self.a.T_START] = t0
         work = empty(self.work.sizes)
         made_ready(work, self.system, self.kit.flags, other._pattern(q0), q0, self.rtol, self.reuse)
-        work.notes[common.NEARLY_SINGULAR] = 0.0 if self.plan.watchful else 1.0
+        work.notes[noted.NEARLY_SINGULAR] = 0.0 if self.plan.watchful else 1.0
         other.work = work
-        if direct(self.kernels.start)(other.kit, work, t0, other.state) != common.DONE:
+        if direct(self.kernels.start)(other.kit, work, t0, other.state) != codes.DONE:
             return None
         other.redundant, other.said_of_rows = other._redundant_rows()
         return other
@@ -149,7 +144,7 @@ class Run:
             crossings=[],
             jumps=[],
         )
-        if self.static is None and self.kit.flags[common.FORM] == common.AUGMENTED:  # which a run may change
+        if self.static is None and self.kit.flags[flags.FORM] == flags.AUGMENTED:  # which a run may change
             other.kit = kit_with(self.system, self.kit.flags, other.plan)
             other.functions = other.kit.functions
         return other
@@ -171,7 +166,7 @@ class Run:
         pattern = self._pattern(q0) if self.static is None else NONE
         ranks = rank, rank_v
         work = workspace(self.system, self.kit, pattern, q0, self.rtol, self.reuse, ranks, self.static, self.matrices)
-        work.notes[common.NEARLY_SINGULAR] = 0.0 if self.plan.watchful else 1.0
+        work.notes[noted.NEARLY_SINGULAR] = 0.0 if self.plan.watchful else 1.0
         return work
 
     def _pattern(self, q: Array) -> Array:
@@ -181,7 +176,7 @@ class Run:
 
     def is_lost_without_dense(self, code: int) -> bool:
         """Whether the static form found no step, however short, and others may."""
-        reasons = (common.INNER_DIVERGED, common.SINGULAR, common.MASS_NOT_DEFINITE)
+        reasons = (codes.INNER_DIVERGED, codes.SINGULAR, codes.MASS_NOT_DEFINITE)
         return (
             self.static is not None
             and code in (self.a.STEP_TOO_SMALL, self.a.FIXED_STEP_FAILED, self.a.RANK_LOST)
@@ -206,31 +201,31 @@ class Run:
         self.functions = self.kit.functions
         self.work = self._workspace(rank, rank)
         self.work.counters[:] = before.counters
-        kept = [common.LARGEST_DEFECT, common.UNCHECKED, common.WIDEST_GAP, common.KINK_BEFORE, common.KINK_AFTER]
+        kept = [noted.LARGEST_DEFECT, noted.UNCHECKED, noted.WIDEST_GAP, noted.KINK_BEFORE, noted.KINK_AFTER]
         self.work.notes[kept] = before.notes[kept]
         self.control[self.a.BRIDGE] = self.static is None
         clock, a = self.clock, self.a
-        if clock[a.FAILURE_CODE] != common.DONE:
+        if clock[a.FAILURE_CODE] != codes.DONE:
             clock[a.H_NEXT], clock[a.H_LIMIT] = clock[a.H_LONG] or clock[a.H_NEXT], self.plan.limit_start
-            clock[a.FAILURE_CODE] = common.DONE
+            clock[a.FAILURE_CODE] = codes.DONE
         state = self.state.copy()
         code = direct(self.kernels.start)(self.kit, self.work, t, state)
-        if code == common.RANK_DIFFERS:  # as it does where a start at which rows depend on one another was left
-            self.work.notes[common.GENERATION] = 1.0
+        if code == codes.RANK_DIFFERS:  # as it does where a start at which rows depend on one another was left
+            self.work.notes[noted.GENERATION] = 1.0
             code = direct(self.kernels.start)(self.kit, self.work, t, state)
-        if before.notes[common.PIVOT] > 0.0 and largest > 0.0:  # as if it had been looked at in this way all along
-            pivot = self.work.notes[common.PIVOT]
-            self.clock[self.a.LARGEST_PIVOT] = pivot * max(1.0, largest / before.notes[common.PIVOT])
+        if before.notes[noted.PIVOT] > 0.0 and largest > 0.0:  # as if it had been looked at in this way all along
+            pivot = self.work.notes[noted.PIVOT]
+            self.clock[self.a.LARGEST_PIVOT] = pivot * max(1.0, largest / before.notes[noted.PIVOT])
 
     def _begin(self) -> None:
         start = direct(self.kernels.start)
         code = start(self.kit, self.work, self.t0, self.state)
-        if self.static is not None and code == common.RANK_DIFFERS:
-            rank = int(self.work.notes[common.RANK])
+        if self.static is not None and code == codes.RANK_DIFFERS:
+            rank = int(self.work.notes[noted.RANK])
             self.work = self._workspace(rank, rank)
             code = start(self.kit, self.work, self.t0, self.state)
-        if self.static is not None and code not in (common.DONE, common.NOT_FINITE):
-            if self.work.notes[common.SMALLEST] < 0.0:  # M is not definite, nor will it be at another start
+        if self.static is not None and code not in (codes.DONE, codes.NOT_FINITE):
+            if self.work.notes[noted.SMALLEST] < 0.0:  # M is not definite, nor will it be at another start
                 self.system.made["static form"] = None
             self.static = None
             self.kit = kit_of(self.system, self.t0, self.state[: self.system.n_q], self.plan)
@@ -238,24 +233,24 @@ class Run:
             self.control[self.a.BRIDGE] = 1.0
             self.work = self._workspace()
             code = start(self.kit, self.work, self.t0, self.state)
-        if code == common.RANK_DIFFERS:
-            self.system.made["ranks"] = ranks = int(self.work.notes[common.RANK]), int(self.work.notes[common.RANK_V])
+        if code == codes.RANK_DIFFERS:
+            self.system.made["ranks"] = ranks = int(self.work.notes[noted.RANK]), int(self.work.notes[noted.RANK_V])
             self.work = self._workspace(*ranks)
             code = start(self.kit, self.work, self.t0, self.state)
-        if code == common.GAMMA_INACCURATE:  # the first step says so, too, and that run has a result
-            required = self.work.notes[common.GAMMA_REQUIRED]
-            self.work.notes[common.GAMMA_REQUIRED] = np.inf
+        if code == codes.GAMMA_INACCURATE:  # the first step says so, too, and that run has a result
+            required = self.work.notes[noted.GAMMA_REQUIRED]
+            self.work.notes[noted.GAMMA_REQUIRED] = np.inf
             code = start(self.kit, self.work, self.t0, self.state)
-            self.work.notes[common.GAMMA_REQUIRED] = required
-        if code == common.DONE:
+            self.work.notes[noted.GAMMA_REQUIRED] = required
+        if code == codes.DONE:
             return
         n = self.system.n_q
-        if code == common.MASS_NOT_DEFINITE:
+        if code == codes.MASS_NOT_DEFINITE:
             raise ValueError(
                 f"mass of {self.system.name!r} must be positive definite on the velocities that the constraints allow; "
                 f"at t = {self.t0!r} {least_inertia(self.system, self.t0, self.state[:n])[1]}"
             )
-        if code == common.SINGULAR:
+        if code == codes.SINGULAR:
             raise ValueError(
                 f"the accelerations of {self.system.name!r} cannot be found at t = {self.t0!r}: the constraint "
                 f"Jacobian has lost rank there ({dependent_rows(self.system, self.t0, self.state[:n])}). Start from "
@@ -315,7 +310,7 @@ class Run:
         self.clock[self.a.H_NEXT] = first
         self.control[self.a.SHORTEST] = SHORTEST_STEP * first
         self.max_step, self.gap = max_step, LONGEST_UNSEEN * span
-        self.tolerances[common.GAP] = self.gap
+        self.tolerances[tolerances.GAP] = self.gap
         self.limit_steps()
 
     def limit_steps(self) -> None:
@@ -339,26 +334,26 @@ class Run:
 
     def defect(self) -> float | None:
         """The largest defect of the steps, if all looked for it."""
-        checked = self.work.counters[common.N_ACCEPTED] > 0 and self.work.notes[common.UNCHECKED] == 0.0
-        return float(self.work.notes[common.LARGEST_DEFECT]) if checked else None
+        checked = self.work.counters[counters.N_ACCEPTED] > 0 and self.work.notes[noted.UNCHECKED] == 0.0
+        return float(self.work.notes[noted.LARGEST_DEFECT]) if checked else None
 
     def attempts(self) -> int:
         """How many steps were tried so far."""
         c = self.work.counters
-        return int(c[common.N_ACCEPTED] + c[common.N_REJECTED_ERROR] + c[common.N_REJECTED_CONVERGENCE])
+        return int(c[counters.N_ACCEPTED] + c[counters.N_REJECTED_ERROR] + c[counters.N_REJECTED_CONVERGENCE])
 
     def statistics(self, cpu: float) -> Statistics:
         """What was counted, with the CPU time that it took, s."""
         c = self.work.counters.tolist()
         return Statistics(
-            n_accepted=c[common.N_ACCEPTED],
-            n_rejected_error=c[common.N_REJECTED_ERROR],
-            n_rejected_convergence=c[common.N_REJECTED_CONVERGENCE],
-            n_outer=c[common.N_OUTER],
-            n_inner=c[common.N_INNER],
-            n_evaluations=c[common.N_EVALUATIONS],
-            n_partitions=c[common.N_PARTITIONS],
-            n_factorizations=c[common.N_FACTORIZATIONS],
-            n_jacobians=c[common.N_JACOBIANS],
+            n_accepted=c[counters.N_ACCEPTED],
+            n_rejected_error=c[counters.N_REJECTED_ERROR],
+            n_rejected_convergence=c[counters.N_REJECTED_CONVERGENCE],
+            n_outer=c[counters.N_OUTER],
+            n_inner=c[counters.N_INNER],
+            n_evaluations=c[counters.N_EVALUATIONS],
+            n_partitions=c[counters.N_PARTITIONS],
+            n_factorizations=c[counters.N_FACTORIZATIONS],
+            n_jacobians=c[counters.N_JACOBIANS],
             cpu_time=cpu,
         )

@@ -17,13 +17,14 @@ from twoloop.generate.exact_derivatives import exact_near
 from twoloop.generate.traced_values import Traced
 from twoloop.kernels.compile.callbacks import KINDS
 from twoloop.kernels.compile.linking import direct
-from twoloop.kernels.data import common
+from twoloop.kernels.data import codes, noted, tolerances
 from twoloop.methods.auto import Auto
 from twoloop.methods.plan import Method
 from twoloop.methods.taylor import Taylor
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.course import Course
 from twoloop.run.interrupts import Interrupts
+from twoloop.run.kept import InMemory
 from twoloop.run.record import Record, Status
 from twoloop.run.recorder import Wanted
 from twoloop.run.run import LONGEST_UNSEEN, Run
@@ -95,7 +96,7 @@ class SampledRun:
         self.p = system.functions.p[system.called_in_python :]
         self._free: set[int] = set()  # places of parameters that are known to enter forces alone
         self._changed = False
-        self.run.work.notes[common.GENERATION] = 1.0  # the ranks are known
+        self.run.work.notes[noted.GENERATION] = 1.0  # the ranks are known
         self.run.set_sizes(None, max_step, t0 + 1.0)
         self.run.control[self.run.a.STORE_ALL] = 0.0
         self._outputs, self._filled = np.zeros(1), np.zeros(2, dtype=np.int64)
@@ -142,7 +143,7 @@ class SampledRun:
         code = a.PAUSED
         if self._changed or self.system.called_in_python:  # what such functions find in their surroundings may change
             code = self._begin_anew(t)
-        run.gap = run.tolerances[common.GAP] = LONGEST_UNSEEN * (end - self.t0)
+        run.gap = run.tolerances[tolerances.GAP] = LONGEST_UNSEEN * (end - self.t0)
         run.limit_steps()
         self._outputs[0], clock[a.NEXT_OUTPUT], clock[a.T_START], clock[a.N_FIXED] = end, 0.0, t, 0.0
         run.control[a.MAX_ATTEMPTS] = STEPS
@@ -187,7 +188,7 @@ class SampledRun:
             rank=run.rank,
             redundant=run.redundant.copy(),
             untested=steps[:, a.JACOBIANS] > 0.0,
-            widest_gap=float(run.work.notes[common.WIDEST_GAP]),
+            widest_gap=float(run.work.notes[noted.WIDEST_GAP]),
             system=self.system,
             changes=CHANGED,
         )
@@ -204,7 +205,7 @@ class SampledRun:
         run.plan.memory[first:] = run.memory[first:]
         run.clock[: a.N_PAST] = 0.0
         self._changed = False
-        if code != common.DONE:
+        if code != codes.DONE:
             raise RuntimeError(
                 f"the accelerations of {self.system.name!r} cannot be found at t = {t:.10g} with the inputs given: the "
                 "forces are not finite, or the constraints have lost rank"
@@ -215,12 +216,14 @@ class SampledRun:
         """What the compiled loop cannot do by itself: a singular position, a jump, another algebra; or a failure."""
         run = self.run
         run.t0 = float(run.clock[run.a.T])
-        wanted = Wanted(np.array([end]), True, False, None)
+        wanted = Wanted(np.array([end]), True, False, None, InMemory())
         with Interrupts() as interrupts:
             course = Course(run, end, wanted, lambda t: None, None, interrupts)
             record = course.to_end(False)
         run.control[run.a.STORE_ALL] = 0.0
-        self.steps.append(np.concatenate(course.step_parts)[1:])
+        steps = np.zeros((len(record.h), run.a.N_STEP_COLUMNS))
+        steps[:, run.a.H], steps[:, run.a.JACOBIANS] = record.h, record.untested
+        self.steps.append(steps)
         if record.status != Status.REACHED_END:
             raise RuntimeError(f"step of {self.system.name!r}: {record.message}")
 

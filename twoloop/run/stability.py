@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from twoloop.kernels.data import common
+from twoloop.kernels.data import codes
 from twoloop.methods.plan import Plan
 
 Array = NDArray[np.float64]
@@ -95,7 +95,7 @@ def _rates(kit: Any, work: Any, look: Look, directions: list[Array]) -> tuple[fl
     """Angular frequency of the fastest vibration and the fastest rate of decay, 1/s, as far as they dominate."""
     from twoloop.kernels.evaluation import tasks
 
-    if kit.inner(kit, work, tasks.RENEW, look.t, look.q, look.v, 0.0, work.x, work.lam) != common.DONE:
+    if kit.inner(kit, work, tasks.RENEW, look.t, look.q, look.v, 0.0, work.x, work.lam) != codes.DONE:
         return 0.0, 0.0
     squared, opposed_q = _largest(kit, work, look, directions[0], work.independent, False)
     rate, opposed_v = _largest(kit, work, look, directions[1], work.independent_v, True)
@@ -115,7 +115,7 @@ def _largest(
     for _ in range(ITERATIONS):
         Q, V = look.q.copy(), look.v.copy()
         (V if by_v else Q)[places] += size * direction[places]
-        if kit.inner(kit, work, tasks.EVALUATE, look.t, Q, V, INNER_TOL, a, work.lam) != common.DONE:
+        if kit.inner(kit, work, tasks.EVALUATE, look.t, Q, V, INNER_TOL, a, work.lam) != codes.DONE:
             return 0.0, False
         image = (a - look.a)[places]
         longest = float(np.abs(image).max(initial=0.0))

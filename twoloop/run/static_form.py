@@ -7,13 +7,7 @@ from numpy.typing import NDArray
 
 from twoloop.checks.consistency import NEARBY, pattern_of
 from twoloop.kernels.algebra.static_order import bodies_of
-from twoloop.kernels.algebra.static_program import (
-    N_OFF,
-    N_PIVOTS,
-    N_UPDATES,
-    Entries,
-    static_program,
-)
+from twoloop.kernels.algebra.static_program import N_OFF, N_PIVOTS, N_UPDATES, Entries, static_program
 from twoloop.kernels.layout import Static
 from twoloop.methods.plan import Plan
 from twoloop.problem.entries import LARGE

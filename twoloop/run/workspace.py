@@ -9,7 +9,18 @@ from twoloop.checks.consistency import has_definite_mass, least_inertia
 from twoloop.kernels.algebra.banded import banded_pays
 from twoloop.kernels.algebra.lapack import addresses
 from twoloop.kernels.algebra.sparse import sparse_pays
-from twoloop.kernels.data import common
+from twoloop.kernels.data import common, noted
+from twoloop.kernels.data.flags import (
+    AUGMENTED,
+    BANDWIDTH,
+    DENSE_FORM,
+    DIAGONAL_MASS,
+    FORM,
+    MULTIPLIERS,
+    NULL_SPACE,
+    STATIC,
+    STRAIGHT,
+)
 from twoloop.kernels.data.kit import Kit
 from twoloop.kernels.evaluation.operations import N_NODES
 from twoloop.kernels.layout import make_work
@@ -40,7 +51,7 @@ def kit_of(
         functions = system.functions
         return Kit(functions._replace(flags=flags.copy()), inner_loop), functions
 
-    if flags[common.FORM] == common.AUGMENTED:  # which a run may change
+    if flags[FORM] == AUGMENTED:  # which a run may change
         return make()[0]
     made: tuple[Kit, Any] = system.remembered(("general kit", id(system.functions), flags.tobytes()), make)
     return made[0]
@@ -51,7 +62,7 @@ def _static_kit(system: ConstrainedSystem, plan: Plan | None, form: StaticForm) 
     from twoloop.kernels.evaluation.static_inner import static_inner_loop
 
     flags = system.functions.flags.copy()
-    flags[common.FORM] = common.STATIC
+    flags[FORM] = STATIC
     functions = system.functions._replace(flags=flags, static_program=form.program)
     if form.newton is not None:
         functions = functions._replace(newton_program=form.newton)
@@ -71,7 +82,7 @@ def _flags_at(system: ConstrainedSystem, t0: float, q0: Array) -> Array:
     place = (t0, q0.tobytes())
     if definite or system.remembered_at("inertia", place, lambda: least_inertia(system, t0, q0)[0]) > 0.0:
         flags = flags.copy()
-        flags[common.FORM] = common.AUGMENTED
+        flags[FORM] = AUGMENTED
     return flags  # type: ignore[no-any-return]
 
 
@@ -79,19 +90,19 @@ def _flags(system: ConstrainedSystem, t0: float, q0: Array, definite: bool) -> t
     """Flags with dense or banded algebra, and whether sparse factors would pay."""
     flags: Array = system.functions.flags.copy()
     if system.constant_mass:
-        flags[common.DIAGONAL_MASS] = _is_diagonal(system.mass(t0, q0))
+        flags[DIAGONAL_MASS] = _is_diagonal(system.mass(t0, q0))
     reduced = not definite or system.n_q <= 2 * (system.n_c + system.n_a)
-    flags[common.FORM] = common.NULL_SPACE if reduced else common.MULTIPLIERS
+    flags[FORM] = NULL_SPACE if reduced else MULTIPLIERS
     bandwidth = system.bandwidth if definite and system.n_a == 0 else None
     if bandwidth is not None and banded_pays(system.n_q, system.n_c, bandwidth):
-        flags[common.BANDWIDTH], flags[common.FORM] = bandwidth, common.MULTIPLIERS
-    flags[common.DENSE_FORM] = flags[common.FORM]
+        flags[BANDWIDTH], flags[FORM] = bandwidth, MULTIPLIERS
+    flags[DENSE_FORM] = flags[FORM]
     return flags, sparse_factors_pay(system, flags)
 
 
 def sparse_factors_pay(system: ConstrainedSystem, flags: Array) -> bool:
     """Whether sparse factors would pay, which need an M with an inverse, or inertia in all that moves."""
-    return sparse_pays(system.n_q, system.n_c + system.n_a, bool(flags[common.DIAGONAL_MASS]))
+    return sparse_pays(system.n_q, system.n_c + system.n_a, bool(flags[DIAGONAL_MASS]))
 
 
 def _is_diagonal(mass: Array) -> bool:
@@ -107,11 +118,11 @@ def kit_with(system: ConstrainedSystem, flags: Array, plan: Plan) -> Kit:
     kept: dict[Any, tuple[Kit, Any]] = system.remembered("kits", dict)
     # what it names by numbers is held by what is kept
     key = (id(system.functions), flags.tobytes(), *called, plan.instead, *map(id, (*plan.own, *read)))
-    changes = flags[common.FORM] == common.AUGMENTED  # which a run may
+    changes = flags[FORM] == AUGMENTED  # which a run may
     if key in kept:
         return _with_own_flags(kept[key][0]) if changes else kept[key][0]
     flags = flags.copy()
-    flags[common.STRAIGHT] = plan.inner is not None
+    flags[STRAIGHT] = plan.inner is not None
     functions = system.functions._replace(flags=flags)
     made = Kit(functions, *called, inner_loop, plan.instead, plan.own, *read)
     if len(kept) == MOST_KITS:
@@ -145,7 +156,7 @@ def workspace(
     `matrices`: as of a plan.
     """
     flags = kit.flags
-    reduced, augmented = flags[common.DENSE_FORM] == common.NULL_SPACE, flags[common.FORM] == common.AUGMENTED
+    reduced, augmented = flags[DENSE_FORM] == NULL_SPACE, flags[FORM] == AUGMENTED
     programs = [each for each in (kit.jacobian_program, kit.gamma_program) if each.size]
     n_nodes = max((int(each[N_NODES]) for each in programs), default=0)
     sizes = (system.n_q, system.n_c, system.n_a, *ranks, bool(reduced), bool(augmented), n_nodes)
@@ -165,16 +176,16 @@ def made_ready(
     static: StaticForm | None = None,
 ) -> common.Work:
     """A workspace full of zeros with what a run finds in it."""
-    work.notes[common.GAMMA_REQUIRED] = max(rtol, GAMMA_ACCURACY)
-    work.notes[common.GAMMA_SHARE] = 1.0
-    work.notes[common.KINK_BEFORE], work.notes[common.KINK_AFTER] = -np.inf, np.inf
+    work.notes[noted.GAMMA_REQUIRED] = max(rtol, GAMMA_ACCURACY)
+    work.notes[noted.GAMMA_SHARE] = 1.0
+    work.notes[noted.KINK_BEFORE], work.notes[noted.KINK_AFTER] = -np.inf, np.inf
     rounded = ROUNDING * float(np.maximum.reduce(np.abs(q0)))
-    work.notes[common.ROUNDED], work.notes[common.REUSE] = rounded, max(reuse, rounded)
+    work.notes[noted.ROUNDED], work.notes[noted.REUSE] = rounded, max(reuse, rounded)
     if static is not None:
         _fill(work, system, static, q0)
         return work
     work.pattern[:] = pattern
-    if flags[common.BANDWIDTH] >= 0:
+    if flags[BANDWIDTH] >= 0:
         work.lapack[:] = addresses()
     return work
 

@@ -322,10 +322,13 @@ def _check_parameters(problem_of: Any, parameters: Any) -> list[Row]:
 
 
 def _check_options(options: dict[str, Any]) -> dict[str, Any]:
-    known = [name for name in inspect.signature(solve_dae).parameters if name not in ("system", "t_span", "q0", "v0")]
+    of_a_run = ("system", "t_span", "q0", "v0", "store")
+    known = [name for name in inspect.signature(solve_dae).parameters if name not in of_a_run]
     unknown = [name for name in options if name not in known]
     if unknown:
-        raise TypeError(f"sweep has no argument {unknown[0]!r}, nor has solve_dae; options are {', '.join(known)}")
+        raise TypeError(
+            f"sweep has no argument {unknown[0]!r}; those that it hands to solve_dae are {', '.join(known)}"
+        )
     check_method(options.get("method", "SunRadau5"))
     for name in {"rtol", "time_limit"} & set(options):
         check_positive(name, options[name])

@@ -83,12 +83,7 @@ def from_lagrangian(
         return Equations(x, mass, Q, C, W, kinetic + potential, conserved)
 
     return made(
-        x,
-        ["Lagrange", kinetic, potential, lost, F, C, W],
-        derive,
-        rows=(len(C), len(W)),
-        tangents=tangents,
-        name=name,
+        x, ["Lagrange", kinetic, potential, lost, F, C, W], derive, rows=(len(C), len(W)), tangents=tangents, name=name
     )
 
 

@@ -40,24 +40,13 @@ def from_matrices(
         Symmetric mass matrix, of coordinates and time; without rows or columns for constraints.
     Q : list or matrix of one column (n_u,)
         The force, with all that the inertia adds, as `forcing` of SymPy's methods.
-    constraints : list of expressions (n_c,)
-        Each is zero; of coordinates and time.
-    coordinates : list (n_q,)
-        Functions of time.
+    constraints, coordinates, nonholonomic, parameters, tangents, name
+        As for `from_lagrangian`; velocities may be written by speeds.
     speeds : mapping, optional
         From the generalised speeds, in the order of M, to expressions linear in `q.diff(t)`. None: the speeds are the
         derivatives of the coordinates.
-    nonholonomic : list of expressions (n_a,)
-        Each is zero; linear in the velocities, or speeds.
     potential : expression
         V, J: the energy is 1/2 q'^T K^T M K q' + V. It does not change Q; whether Q conserves the energy is found out.
-    parameters : mapping
-        From every other symbol to its value. The values can be changed later without compiling again.
-    tangents : bool
-        Whether to derive the tangents of the force and of the reactions for Newton's method. For stiff forces: they
-        save differences, and double or triple the code; fixed steps in which bodies turn far converge better without.
-    name : str
-        Shown in messages.
 
     Returns
     -------
@@ -97,14 +86,8 @@ def from_matrices(
             Q_of_q = list(transform.T * (sympy.ImmutableMatrix(force) - mass * sympy.ImmutableMatrix(along(u, x))))
         return Equations(x, turned, Q_of_q, C, W, energy, _conserved(x, Q_of_q, [*C, *W], energy))
 
-    return made(
-        x,
-        ["matrices", list(mass), force, u, C, W, V],
-        derive,
-        rows=(len(C), len(W)),
-        tangents=tangents,
-        name=name,
-    )
+    given = ["matrices", list(mass), force, u, C, W, V]
+    return made(x, given, derive, rows=(len(C), len(W)), tangents=tangents, name=name)
 
 
 def _conserved(x: Reader, Q: Sequence[Expr], rows: Sequence[Expr], energy: Expr) -> bool:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import sympy
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from sympy import Basic
 
 from twoloop.checks.arguments import check_flag, check_text, check_vector
@@ -19,8 +19,6 @@ from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.projection import consistent_state
 from twoloop.symbolic.equations import Equations
 from twoloop.symbolic.reading import Reader, number
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -6,12 +6,15 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from twoloop.testing.conformance import check_simulator
     from twoloop.testing.findings import Failure, Finding, Report
+    from twoloop.testing.known_parts import KnownBody, KnownJoint
     from twoloop.testing.known_problem import KnownProblem, Motion
     from twoloop.testing.known_problems import problems
 
 _MODULES = {
     "Failure": "findings",
     "Finding": "findings",
+    "KnownBody": "known_parts",
+    "KnownJoint": "known_parts",
     "KnownProblem": "known_problem",
     "Motion": "known_problem",
     "Report": "findings",
@@ -19,7 +22,8 @@ _MODULES = {
     "problems": "known_problems",
 }
 
-__all__ = ["Failure", "Finding", "KnownProblem", "Motion", "Report", "check_simulator", "problems"]
+__all__ = ["Failure", "Finding", "KnownBody", "KnownJoint", "KnownProblem", "Motion", "Report", "check_simulator"]
+__all__ += ["problems"]
 
 
 def __getattr__(name: str) -> Any:  # pytest imports `plugin` in every run, which is not to cost an import of numpy

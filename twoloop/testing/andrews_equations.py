@@ -6,9 +6,8 @@ gamma are made of the positions of the centres, which are sums of vectors that t
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from twoloop.testing.known_problem import Array
 
 MASSES = np.array([0.04325, 0.00365, 0.02373, 0.00706, 0.07050, 0.00706, 0.05498])  # kg
 INERTIAS = np.array([2.194e-6, 4.410e-7, 5.255e-6, 5.667e-7, 1.169e-5, 5.667e-7, 1.912e-5])  # kg m^2
@@ -16,13 +15,9 @@ A, B, C = np.array([-0.06934, -0.00227]), np.array([-0.03635, 0.03273]), np.arra
 STIFFNESS, UNSTRESSED, TORQUE = 4530.0, 0.07785, 0.033  # N/m, m, N m
 START = np.array(
     [
-        -0.0617138900142764496358948458001,
-        0.0,
-        0.455279819163070380255912382449,
-        0.222668390165885884674473185609,
-        0.487364979543842550225598953530,
-        -0.222668390165885884674473185609,
-        1.23054744454982119249735015568,
+        *(-0.0617138900142764496358948458001, 0.0, 0.455279819163070380255912382449),
+        *(0.222668390165885884674473185609, 0.487364979543842550225598953530),
+        *(-0.222668390165885884674473185609, 1.23054744454982119249735015568),
     ]
 )
 # which angles add up to that of each body
@@ -32,11 +27,7 @@ TURNS[5, 5] = TURNS[5, 6] = TURNS[6, 6] = 1.0
 
 # each point: the sum of vectors (body, x, y) that turn with bodies, from the ground points (0, 0), B, A, A
 SHARED = [(0, 0.007, 0.0), (1, -0.028, 0.0)]  # the joint that the loops share
-LOOPS = [
-    (B, [(2, 0.0, -0.035)]),
-    (A, [(3, 0.0, -0.02), (4, 0.04, 0.0)]),
-    (A, [(5, 0.02, 0.0), (6, 0.0, -0.04)]),
-]
+LOOPS = [(B, [(2, 0.0, -0.035)]), (A, [(3, 0.0, -0.02), (4, 0.04, 0.0)]), (A, [(5, 0.02, 0.0), (6, 0.0, -0.04)])]
 CENTRES = [  # of mass, by vectors of which the position on the body alone counts where the other end is on the ground
     [(0, 0.00092, 0.0)],
     [(0, 0.007, 0.0), (1, -0.0115, 0.0)],

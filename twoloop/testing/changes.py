@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from twoloop.testing.known_parts import GROUND
 from twoloop.testing.known_problem import Array, KnownProblem
 from twoloop.testing.spatial_equations import parameters_of, skew
 
@@ -62,7 +63,22 @@ def in_a_frame(problem: KnownProblem, turn: float = TURN, move: float = 1.0) -> 
             product[0, 1:], product[1:, 0] = -p[1:], p[1:]
             product[1:, 1:] += skew(p[1:])
             T[k : k + 4, k : k + 4] = product
-    return _seen(problem, T, d, np.ones(problem.n_c), 1.0)
+    n = 3 if "z" in kinds else 2
+    return _seen(problem, T, d, np.ones(problem.n_c), 1.0, _parts_in_a_frame(problem, R[:n, :n], shift[:n], turn))
+
+
+def _parts_in_a_frame(problem: KnownProblem, R: Array, shift: Array, turn: float) -> dict[str, Any]:
+    joints = []
+    for joint in problem.joints:
+        told: dict[str, Any] = {}
+        if joint.bodies[1] == GROUND:
+            told["points"] = joint.points[0], R @ joint.points[1] + shift
+            told["axis"] = None if joint.axis is None else R @ joint.axis
+        if joint.motion is not None:
+            angle, *rates = joint.motion
+            told["motion"] = (lambda t, angle=angle: angle(t) + turn, *rates)
+        joints.append(replace(joint, **told))
+    return {"joints": tuple(joints), "gravity": None if problem.gravity is None else R @ problem.gravity}
 
 
 def _rotation(turn: float, spatial: bool) -> tuple[Array, Array]:
@@ -75,16 +91,28 @@ def _rotation(turn: float, spatial: bool) -> tuple[Array, Array]:
 def in_millimetres_and_grams(problem: KnownProblem) -> Seen:
     """The problem with lengths in mm and masses in g; the second stays."""
     T = np.diag([1e3 if kind in "xyz" else 1.0 for kind in problem.coordinates])
-    return _seen(problem, T, np.zeros(problem.n_q), 1e3**problem.row_powers, 1e3 * 1e3**2)
+    parts: dict[str, Any] = {
+        "bodies": tuple(replace(body, mass=1e3 * body.mass, inertia=1e9 * body.inertia) for body in problem.bodies),
+        "joints": tuple(
+            replace(
+                joint,
+                points=(1e3 * joint.points[0], 1e3 * joint.points[1]),
+                length=None if joint.length is None else 1e3 * joint.length,
+            )
+            for joint in problem.joints
+        ),
+        "gravity": None if problem.gravity is None else 1e3 * problem.gravity,
+    }
+    return _seen(problem, T, np.zeros(problem.n_q), 1e3**problem.row_powers, 1e3 * 1e3**2, parts)
 
 
-def _seen(problem: KnownProblem, T: Array, d: Array, rows: Array, work: float) -> Seen:
+def _seen(problem: KnownProblem, T: Array, d: Array, rows: Array, work: float, parts: dict[str, Any]) -> Seen:
     back = np.linalg.inv(T)
 
     def at(q: Array) -> Array:
         return back @ (np.asarray(q, dtype=float) - d)
 
-    changed: dict[str, Any] = {
+    changed: dict[str, Any] = parts | {
         "mass": lambda t, q: work * back.T @ problem.mass(t, at(q)) @ back,
         "force": lambda t, q, v: work * back.T @ problem.force(t, at(q), back @ v),
         "constraint": lambda t, q: rows * problem.constraint(t, at(q)),

@@ -250,8 +250,9 @@ def _rates(e: Evidence) -> str:
     if "velocity constraints" not in e.failed:
         return ""
     return (
-        "The velocities do not obey C_q v + C_t = 0, and shorter steps do not mend it: project them after each step; "
-        "where that is done, it ends too early, is in single precision, or takes C_q or C_t of another instant."
+        "The velocities do not obey C_q v + C_t = 0, and shorter steps do not reduce the violation: project "
+        "them after each step; where that is done, it ends too early, is in single precision, or takes C_q or C_t of "
+        "another instant."
     )
 
 
@@ -268,21 +269,8 @@ def _where(e: Evidence) -> str:
 
 
 MOTION: tuple[Callable[[Evidence], str], ...] = (
-    returned,
-    elsewhen,
-    _singular,
-    _acceleration,
-    rates_of_time,
-    _velocities,
-    clock,
-    _unused,
-    _drift,
-    _floor,
-    _orders,
-    _coarse,
-    _slack,
-    _rates,
-    _where,
+    *(returned, elsewhen, _singular, _acceleration, rates_of_time, _velocities, clock, _unused, _drift),
+    *(_floor, _orders, _coarse, _slack, _rates, _where),
 )
 OWN: dict[str, Callable[[Evidence], str]] = {"multipliers": _multipliers, "frame": _frame, "units": _units}
 MOVING = ("error of", "limit of", "order of")  # how properties begin that the multipliers follow

@@ -4,9 +4,10 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from twoloop.testing.known_parts import Array, KnownBody, KnownJoint
+from twoloop.testing.spatial_equations import half_spin, turned
+
 Quantity = Callable[[float, Array, Array], float]
 
 
@@ -79,6 +80,14 @@ class KnownProblem:
         When C_q loses rank.
     ends : float or None
         When the motion ends: beyond this there is none, and a simulator has to say so.
+    period : float or None
+        After which the motion repeats itself, s, where it does.
+    bodies : tuple of KnownBody
+        Where points or rigid bodies under `gravity`, with `joints`, are the whole problem; else empty.
+    joints : tuple of KnownJoint
+        In the order of their rows.
+    gravity : ndarray (2,) or (3,) or None
+        m/s^2.
     note : str
         What the problem shows.
     """
@@ -101,6 +110,10 @@ class KnownProblem:
     invariants: Mapping[str, Quantity] = field(default_factory=dict)
     singular_times: tuple[float, ...] = ()
     ends: float | None = None
+    period: float | None = None
+    bodies: tuple[KnownBody, ...] = ()
+    joints: tuple[KnownJoint, ...] = ()
+    gravity: Array | None = None
     note: str = ""
 
     def __post_init__(self) -> None:
@@ -122,6 +135,28 @@ class KnownProblem:
     def acceleration(self, t: float, q: Array, v: Array) -> tuple[Array, Array]:
         """Acceleration (n_q,) and multipliers (n_c,) at a consistent state, those of least norm."""
         return solved(self.mass(t, q), self.force(t, q, v), self.jacobian(t, q), self.gamma(t, q, v))
+
+    def reaction(self, joint: KnownJoint, t: float, q: Array, lam: Array) -> tuple[Array, Array]:
+        """Force (n_axes,), N, and torque (0,), (1,) or (3,), N m, of a joint on its first body, about its first point.
+
+        Along the axes of space. With redundant rows they depend on the choice of lam, of which `reference` has the
+        least.
+        """
+        body = self.bodies[joint.bodies[0]]
+        position = q[body.columns]
+        on_body = -self.jacobian(t, q)[joint.rows, body.columns].T @ lam[joint.rows]
+        point = joint.points[0]
+        if body.inertia.size == 0:
+            return on_body, np.zeros(0)
+        n_axes = point.size
+        force, turning = on_body[:n_axes], on_body[n_axes:]
+        if n_axes == 2:
+            s, c = np.sin(position[2]), np.cos(position[2])
+            arm = np.array([c * point[0] - s * point[1], s * point[0] + c * point[1]])
+            return force, turning - (arm[0] * force[1] - arm[1] * force[0])
+        e = position[3:]
+        torque = 0.5 * turned(e, half_spin(e) @ turning)
+        return force, torque - np.cross(turned(e, point), force)
 
     def __repr__(self) -> str:
         return f"KnownProblem({self.name!r}: {', '.join(self.tags)}; n_q = {self.n_q}, n_c = {self.n_c})"

@@ -23,25 +23,12 @@ TAGS = {
 MAKERS = {
     maker.__name__: maker
     for maker in (
-        pendulums.pendulum,
-        pendulums.shaken_spring,
-        linkages.driven_crank,
-        linkages.four_bar,
-        linkages.redundant_slider_crank,
-        spatial_mechanisms.heavy_top,
-        pendulums.out_of_reach,
-        pendulums.double_pendulum,
-        pendulums.heavy_end,
-        pendulums.spherical_pendulum,
-        pendulums.stiff_spring_pendulum,
-        pendulums.closed_chain,
-        pendulums.parallelogram,
-        linkages.crank_rocker,
-        linkages.slider_crank,
-        linkages.driven_slider_crank,
-        linkages.andrews,
-        spatial_mechanisms.spatial_four_bar,
-        pendulums.force_ends,
+        *(pendulums.pendulum, pendulums.shaken_spring, linkages.driven_crank, linkages.four_bar),
+        *(linkages.redundant_slider_crank, spatial_mechanisms.heavy_top, pendulums.out_of_reach),
+        *(pendulums.double_pendulum, pendulums.heavy_end, pendulums.spherical_pendulum),
+        *(pendulums.stiff_spring_pendulum, pendulums.closed_chain, pendulums.parallelogram),
+        *(linkages.crank_rocker, linkages.slider_crank, linkages.driven_slider_crank, linkages.andrews),
+        *(spatial_mechanisms.spatial_four_bar, pendulums.force_ends),
     )
 }
 

@@ -72,7 +72,7 @@ def violations(problem: KnownProblem, run: Simulated, scales: tuple[float, float
         values = [problem.constraint(t, q)]
         if run.v is not None:
             values.append(J @ run.v[k] + problem.constraint_rate(t, q))
-        # rows of the same size, or a rank would depend on the units; near a singular position only what can be mended
+        # rows of the same size, or a rank would depend on the units; near singular positions only what can be corrected
         size = np.linalg.norm(J, axis=1)
         size = np.where(size > 0.0, size, 1.0)[:, None]
         moved = np.linalg.lstsq(J / size, np.column_stack(values) / size, rcond=1e-6)[0]

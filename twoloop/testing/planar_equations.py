@@ -1,14 +1,14 @@
 """Equations of rigid bodies in a plane: coordinates x, y, angle of each, about the centre of mass."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Array = NDArray[np.float64]
+from twoloop.testing.known_parts import GROUND, Array, Drive, KnownBody, KnownJoint
+
 Point = tuple[float, float]
-Drive = tuple[Callable[[float], float], Callable[[float], float], Callable[[float], float]]
-GROUND = -1
 
 
 class PlanarEquations:
@@ -30,23 +30,43 @@ class PlanarEquations:
         self._pins: list[tuple[tuple[int, Point, int, Point], float | None]] = []
         self._rows: list[list[int]] = []
         self._drives: list[tuple[int, int, Drive]] = []
+        self._masses, self._inertias, self._gravity = m, J, np.array([0.0, -gravity])
+        self._joints: list[KnownJoint] = []
 
     def pin(self, i: int, a: Point, j: int, b: Point) -> None:
         """Two rows: point a of body i is point b of body j, or of the ground."""
         self._pins.append(((i, a, j, b), None))
         self._rows.append([self.n_c, self.n_c + 1])
-        self.n_c += 2
+        self._add("revolute", (i, j), (a, b), 2)
 
     def distance(self, i: int, a: Point, j: int, b: Point, length: float) -> None:
         """A row: half the squared distance of the points is half the squared length."""
         self._pins.append(((i, a, j, b), length))
         self._rows.append([self.n_c])
-        self.n_c += 1
+        self._add("distance", (i, j), (a, b), 1, length=length)
 
-    def drive(self, coordinate: int, drive: Drive) -> None:
-        """A row: a coordinate is a function of time, which is given with its two derivatives."""
-        self._drives.append((self.n_c, coordinate, drive))
-        self.n_c += 1
+    def drive(self, body: int, drive: Drive) -> None:
+        """A row: the angle of a body is a function of time, which is given with its two derivatives."""
+        self._drives.append((self.n_c, 3 * body + 2, drive))
+        self._add("drive", (body, GROUND), ((0.0, 0.0), (0.0, 0.0)), 1, motion=drive)
+
+    def slide(self, body: int) -> None:
+        """Two rows: the centre of a body stays on the x axis, and its angle is zero."""
+        for row, coordinate in enumerate((3 * body + 1, 3 * body + 2), self.n_c):
+            self._drives.append((row, coordinate, (lambda t: 0.0, lambda t: 0.0, lambda t: 0.0)))
+        self._add("prismatic", (body, GROUND), ((0.0, 0.0), (0.0, 0.0)), 2, axis=np.array([1.0, 0.0]))
+
+    def _add(self, kind: str, pair: tuple[int, int], points: tuple[Point, Point], n_rows: int, **more: Any) -> None:
+        rows, places = slice(self.n_c, self.n_c + n_rows), (np.array(points[0]), np.array(points[1]))
+        self._joints.append(KnownJoint(kind, pair, places, rows, **more))
+        self.n_c += n_rows
+
+    @property
+    def parts(self) -> dict[str, Any]:
+        """Bodies, joints and gravity as `KnownProblem` names them."""
+        each = enumerate(zip(self._masses, self._inertias, strict=True))
+        bodies = tuple(KnownBody(float(m), np.array([J]), slice(3 * k, 3 * k + 3)) for k, (m, J) in each)
+        return {"bodies": bodies, "joints": tuple(self._joints), "gravity": self._gravity}
 
     def _arm(self, q: Array, body: int, point: Point) -> Array:
         """From the centre of a body to a point of it, in space; of the ground, the point."""

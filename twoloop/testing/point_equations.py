@@ -4,9 +4,10 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Array = NDArray[np.float64]
+from twoloop.testing.known_parts import GROUND, Array, KnownBody, KnownJoint
+
 Place = int | tuple[float, ...]  # the number of a point, or a place of the ground
 
 
@@ -35,13 +36,30 @@ class PointEquations:
         self.weight = np.asarray(weight, dtype=float)
         n_points, n_axes = self.weight.shape
         masses = np.asarray(mass, dtype=float)
+        self._points_alone = masses.ndim == 1 and not springs
         self._mass = np.kron(np.diag(masses) if masses.ndim == 1 else masses, np.eye(n_axes))
         self.n_q, self.n_c = n_points * n_axes, len(links)
         self._across, self._from = self._differences([link[:2] for link in links])
-        self._lengths = np.array([link[2] for link in links])
+        self._links, self._lengths = links, np.array([link[2] for link in links])
         self._spring_across, self._spring_from = self._differences([spring[:2] for spring in springs])
         self._stiffness = np.array([spring[2] for spring in springs])
         self._unstressed = np.array([spring[3] for spring in springs])
+
+    @property
+    def parts(self) -> dict[str, Any]:
+        """Points, links and gravity as `KnownProblem` names them, where they are all that there is."""
+        if not self._points_alone or type(self) is not PointEquations:
+            return {}
+        n_points, n_axes = self.weight.shape
+        masses, at = np.diag(self._mass)[::n_axes], np.zeros(n_axes)
+        columns = [slice(k * n_axes, (k + 1) * n_axes) for k in range(n_points)]
+        joints = []
+        for k, (i, j, length) in enumerate(self._links):
+            ends = [(end, at) if isinstance(end, int) else (GROUND, np.array(end)) for end in (i, j)]
+            pair, points = zip(*ends, strict=True)
+            joints.append(KnownJoint("distance", pair, points, slice(k, k + 1), length=length))
+        bodies = tuple(KnownBody(float(m), np.zeros(0), own) for m, own in zip(masses, columns, strict=True))
+        return {"bodies": bodies, "joints": tuple(joints), "gravity": self.weight[0] / masses[0]}
 
     def _differences(self, pairs: Sequence[tuple[Place, Place]]) -> tuple[Array, Array]:
         """D (n, n_axes, n_q) and d (n, n_axes), such that D q + d are the vectors between the ends."""

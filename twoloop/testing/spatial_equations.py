@@ -3,11 +3,12 @@
 The first rows keep the Euler parameters normalised, half of e.e is 1/2, the next are those of the joints.
 """
 
-import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from typing import Any
 
-Array = NDArray[np.float64]
-GROUND = -1
+import numpy as np
+from numpy.typing import ArrayLike
+
+from twoloop.testing.known_parts import GROUND, Array, KnownBody, KnownJoint
 
 
 def skew(a: Array) -> Array:
@@ -60,6 +61,7 @@ class SpatialEquations:
         self._points: list[tuple[int, int, Array, int, Array]] = []
         self._directions: list[tuple[int, int, Array, int, Array]] = []
         self._n_joint_rows = 0
+        self._axes: dict[int, Array] = {}
 
     @property
     def n_q(self) -> int:
@@ -112,6 +114,7 @@ class SpatialEquations:
             unit = self._fixed_to(i, across / np.linalg.norm(across), False)
             self._directions.append((self._n_joint_rows, i, unit, j, self._fixed_to(j, axis, False)))
             self._n_joint_rows += 1
+        self._axes[len(self._points) - 1] = self._fixed_to(j, axis / np.linalg.norm(axis), False)
 
     def _vector(self, q: Array, body: int, a: Array) -> Array:
         return a if body == GROUND else turned(q[7 * body + 3 : 7 * body + 7], a)
@@ -121,6 +124,18 @@ class SpatialEquations:
 
     def _rate(self, q: Array, v: Array, body: int, a: Array) -> Array:
         return self._vector_by_e(q, body, a) @ (np.zeros(4) if body == GROUND else v[7 * body + 3 : 7 * body + 7])
+
+    @property
+    def parts(self) -> dict[str, Any]:
+        """Bodies, joints and gravity as `KnownProblem` names them."""
+        bodies, joints = [], []
+        for k, (m, J) in enumerate(zip(self._masses, self._inertias, strict=True)):
+            bodies.append(KnownBody(m, np.diag(J), slice(7 * k, 7 * k + 7)))
+        for k, (row, i, a, j, b) in enumerate(self._points):
+            first, axis = len(bodies) + row, self._axes.get(k)
+            kind, n_rows = ("spherical", 3) if axis is None else ("revolute", 5)
+            joints.append(KnownJoint(kind, (i, j), (a, b), slice(first, first + n_rows), axis))
+        return {"bodies": tuple(bodies), "joints": tuple(joints), "gravity": self._gravity}
 
     def mass(self, t: float, q: Array) -> Array:
         """M (n_q, n_q), of rank 6 for each body."""

@@ -26,6 +26,7 @@ def heavy_top() -> KnownProblem:
         SPATIAL_KINDS,
         [0.0, 1.0, 1.0, 1.0],
         invariants={"vertical angular momentum": equations.vertical_momentum},
+        **equations.parts,
         note="a mass matrix of rank 6 of 7; a fast spin beside a slow precession",
     )
 
@@ -51,7 +52,8 @@ def spatial_four_bar() -> KnownProblem:
     powers = [0.0] * 3 + [*joints, 0.0, 0.0, *joints, *joints, *joints, 0.0, 0.0]
     note = "21 coordinates and 19 rows; the coupler may turn about its axis, which nothing else feels"
     kinds = " ".join(3 * [SPATIAL_KINDS])
-    return posed("spatial_four_bar", equations, equations.start, 1.0, "closed chain, spatial", kinds, powers, note=note)
+    more = equations.parts | {"note": note}
+    return posed("spatial_four_bar", equations, equations.start, 1.0, "closed chain, spatial", kinds, powers, **more)
 
 
 def _round_bar(mass: float, length: float) -> tuple[float, float, float]:

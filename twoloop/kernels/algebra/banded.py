@@ -8,16 +8,9 @@ import numpy as np
 
 from twoloop.kernels.algebra.lapack import DPBTRF, DPBTRS, NO_TRANSPOSE, UPPER, call
 from twoloop.kernels.algebra.linalg import lu_factor, lu_solve
-from twoloop.kernels.data.common import (
-    BANDWIDTH,
-    DIAGONAL_MASS,
-    DONE,
-    MASS_NOT_DEFINITE,
-    SINGULAR,
-    compiled,
-    inlined,
-    merged,
-)
+from twoloop.kernels.data.codes import DONE, MASS_NOT_DEFINITE, SINGULAR
+from twoloop.kernels.data.common import compiled, inlined, merged
+from twoloop.kernels.data.flags import BANDWIDTH, DIAGONAL_MASS
 
 # From so many coordinates on a Newton step by banded algebra is the faster one: measured 36 to 75, on chains of
 # bandwidth 1 to 11 and on beams. Evaluations alone, as a fixed-point iteration makes them, gain from about 150 on and

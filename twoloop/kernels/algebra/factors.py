@@ -10,17 +10,8 @@ The factors of one matrix are two arrays: `index`, the program, and `values`. Ve
 elimination: entry k belongs to row rows_of(index)[k] of the Jacobian, that of the solution to columns_of(index)[k].
 """
 
+from twoloop.kernels.algebra import elimination as at
 from twoloop.kernels.algebra.elimination import (
-    DENSE,
-    FIRST_LOWER,
-    N_SLOTS,
-    ORDERED,
-    SIGN,
-    SINGULAR_MATRIX,
-    SIZE,
-    TOO_MANY,
-    WIDTH,
-    ZERO,
     begin,
     begin_lower,
     begin_upper,
@@ -48,25 +39,25 @@ def make_program(G, pattern, rows, columns, index, values):
     r, width = rows.size, G.shape[1]
     begin(index, r)
     matrix = lists_of(index, values)
-    index[WIDTH] = width
-    code = ORDERED
+    index[at.WIDTH] = width
+    code = at.ORDERED
     for i in range(r):
         for k in range(r):
             if pattern[rows[i], columns[k]] != 0.0:
                 number, source = G[rows[i], columns[k]], rows[i] * width + columns[k]
-                if code == ORDERED and not put(matrix, i, k, number, source):
-                    code = TOO_MANY
-    if code == ORDERED:
-        code = order(index, matrix, pattern.size, ZERO)
-    if code == ORDERED:
+                if code == at.ORDERED and not put(matrix, i, k, number, source):
+                    code = at.TOO_MANY
+    if code == at.ORDERED:
+        code = order(index, matrix, pattern.size, at.ZERO)
+    if code == at.ORDERED:
         for k in range(r):
             rows_of(index)[k], columns_of(index)[k] = rows[rows_of(index)[k]], columns[columns_of(index)[k]]
-    elif code == TOO_MANY:
-        index[DENSE] = 1
-        index[SIGN] = 1
+    elif code == at.TOO_MANY:
+        index[at.DENSE] = 1
+        index[at.SIGN] = 1
         copy(rows, rows_of(index))
         copy(columns, columns_of(index))
-    return code != SINGULAR_MATRIX
+    return code != at.SINGULAR_MATRIX
 
 
 @merged
@@ -76,16 +67,16 @@ def factor(entries, index, values):
     Returns the ratio of the smallest to the largest pivot; negative where a pivot is zero or not finite, or multipliers
     have grown, and the order must be chosen anew.
     """
-    r = index[SIZE]
-    if index[DENSE] == 1:
+    r = index[at.SIZE]
+    if index[at.DENSE] == 1:
         A = values[: r * r].reshape((r, r))
         rows, columns = rows_of(index), columns_of(index)
         for i in range(r):
             for k in range(r):
-                A[i, k] = entries[rows[i] * index[WIDTH] + columns[k]]
+                A[i, k] = entries[rows[i] * index[at.WIDTH] + columns[k]]
         return lu_factor(A, pivots_of(index))
-    source = slots(r) + 2 * index[N_SLOTS]
-    for s in range(index[N_SLOTS]):
+    source = slots(r) + 2 * index[at.N_SLOTS]
+    for s in range(index[at.N_SLOTS]):
         values[s] = entries[index[source + s]]
     return run(index, values)
 
@@ -93,7 +84,7 @@ def factor(entries, index, values):
 @merged
 def run(index, values):
     """Run down the program with the entries in `values`; returns what `factor` does."""
-    r, n_slots = index[SIZE], index[N_SLOTS]
+    r, n_slots = index[at.SIZE], index[at.N_SLOTS]
     in_column = slots(r) + n_slots
     target = in_column + 2 * n_slots
     upper, end, lower = begin_upper(r), end_upper(r), begin_lower(r)
@@ -116,7 +107,7 @@ def run(index, values):
     if not growth <= GROWTH:
         return -1.0
     in_row = slots(r)
-    for u in range(r, index[FIRST_LOWER]):  # rows of U with 1 on the diagonal are quicker to solve with
+    for u in range(r, index[at.FIRST_LOWER]):  # rows of U with 1 on the diagonal are quicker to solve with
         values[u] *= values[index[in_row + u]]
     return smallest / largest if r > 0 else 1.0
 
@@ -124,10 +115,10 @@ def run(index, values):
 @merged
 def sign_of(index, values):
     """Sign of the determinant, rows and columns ascending, from the factors."""
-    r = index[SIZE]
-    if index[DENSE] == 1:
+    r = index[at.SIZE]
+    if index[at.DENSE] == 1:
         return lu_sign(values[: r * r].reshape((r, r)), pivots_of(index))
-    sign = 1.0 if index[SIGN] == 1 else -1.0
+    sign = 1.0 if index[at.SIGN] == 1 else -1.0
     for k in range(r):
         if values[k] < 0.0:
             sign = -sign
@@ -137,8 +128,8 @@ def sign_of(index, values):
 @merged
 def solve(index, values, x):
     """Solve for one right-hand side, overwritten."""
-    r, n_slots, first_lower = index[SIZE], index[N_SLOTS], index[FIRST_LOWER]
-    if index[DENSE] == 1:
+    r, n_slots, first_lower = index[at.SIZE], index[at.N_SLOTS], index[at.FIRST_LOWER]
+    if index[at.DENSE] == 1:
         lu_solve(values[: r * r].reshape((r, r)), pivots_of(index), x)
         return
     in_row, in_column = slots(r), slots(r) + n_slots
@@ -160,8 +151,8 @@ def solve_rows(index, values, X, n):
 @merged
 def solve_transposed(index, values, x):
     """Solve with the transposed matrix: x is in the order of columns on entry, in that of rows on return."""
-    r = index[SIZE]
-    if index[DENSE] == 1:
+    r = index[at.SIZE]
+    if index[at.DENSE] == 1:
         A, pivots = values[: r * r].reshape((r, r)), pivots_of(index)
         for k in range(r):
             x[k] *= A[k, k]
@@ -175,7 +166,7 @@ def solve_transposed(index, values, x):
             if p != k:
                 x[k], x[p] = x[p], x[k]
         return
-    n_slots, first_lower = index[N_SLOTS], index[FIRST_LOWER]
+    n_slots, first_lower = index[at.N_SLOTS], index[at.FIRST_LOWER]
     in_row, in_column = slots(r), slots(r) + n_slots
     for s in range(first_lower - 1, r - 1, -1):
         x[index[in_column + s]] -= values[s] * x[index[in_row + s]]

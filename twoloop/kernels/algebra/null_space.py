@@ -6,16 +6,11 @@ independent entries, and (T^T M T) x = T^T (r - M g): M need only be positive de
 
 from twoloop.kernels.algebra.factors import columns_of, rows_of, solve, solve_rows, solve_transposed
 from twoloop.kernels.algebra.linalg import copy, ldl_factor, ldl_solve
-from twoloop.kernels.data.common import (
-    DIAGONAL_MASS,
-    DONE,
-    MASS_NOT_DEFINITE,
-    N_FACTORIZATIONS,
-    NOT_FINITE,
-    compiled,
-    merged,
-)
+from twoloop.kernels.data.codes import DONE, MASS_NOT_DEFINITE, NOT_FINITE
+from twoloop.kernels.data.common import compiled, merged
+from twoloop.kernels.data.counters import N_FACTORIZATIONS
 from twoloop.kernels.data.finite import finite
+from twoloop.kernels.data.flags import DIAGONAL_MASS
 
 
 @compiled

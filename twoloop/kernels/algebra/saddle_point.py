@@ -10,18 +10,11 @@ from twoloop.kernels.algebra.linalg import ldl_factor, ldl_solve
 from twoloop.kernels.algebra.null_space import directions, factor_reduced, reduced_multipliers, solve_reduced
 from twoloop.kernels.algebra.schur import factor_mass, factor_schur, solve_schur
 from twoloop.kernels.algebra.sparse import factor_sparse, solve_sparse
-from twoloop.kernels.data.common import (
-    AUGMENTED,
-    CONSTANT_MASS,
-    DONE,
-    FACTORED,
-    FORM,
-    MULTIPLIERS,
-    N_FACTORIZATIONS,
-    NULL_SPACE,
-    compiled,
-    merged,
-)
+from twoloop.kernels.data.codes import DONE
+from twoloop.kernels.data.common import compiled, merged
+from twoloop.kernels.data.counters import N_FACTORIZATIONS
+from twoloop.kernels.data.flags import AUGMENTED, CONSTANT_MASS, FORM, MULTIPLIERS, NULL_SPACE
+from twoloop.kernels.data.noted import FACTORED
 
 
 @compiled

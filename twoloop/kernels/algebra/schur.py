@@ -7,17 +7,11 @@ import numpy as np
 
 from twoloop.kernels.algebra.banded import banded_mass, factor_banded_mass, solve_banded_mass
 from twoloop.kernels.algebra.linalg import copy, copy_matrix, invert_definite, ldl_factor, ldl_solve
-from twoloop.kernels.data.common import (
-    CONSTANT_MASS,
-    DIAGONAL_MASS,
-    DONE,
-    MASS_NOT_DEFINITE,
-    N_FACTORIZATIONS,
-    NOT_FINITE,
-    SINGULAR,
-    merged,
-)
+from twoloop.kernels.data.codes import DONE, MASS_NOT_DEFINITE, NOT_FINITE, SINGULAR
+from twoloop.kernels.data.common import merged
+from twoloop.kernels.data.counters import N_FACTORIZATIONS
 from twoloop.kernels.data.finite import finite
+from twoloop.kernels.data.flags import CONSTANT_MASS, DIAGONAL_MASS
 
 
 @merged

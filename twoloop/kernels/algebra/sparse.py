@@ -14,21 +14,16 @@ the sign of the determinant, which then is (-1)^r. What is not sparse enough is 
 
 import numpy as np
 
-from twoloop.kernels.algebra.elimination import N_SLOTS, ORDERED, SIZE, TOO_MANY, begin, lists_of, order, put, slots
+from twoloop.kernels.algebra import elimination as at
+from twoloop.kernels.algebra.elimination import begin, lists_of, order, put, slots
 from twoloop.kernels.algebra.factors import columns_of, rows_of, run, sign_of, solve
 from twoloop.kernels.algebra.patterns import note_pattern
-from twoloop.kernels.data.common import (
-    CONSTANT_MASS,
-    DENSE_FORM,
-    DONE,
-    FORM,
-    MASS_NOT_DEFINITE,
-    MASS_SCALE,
-    N_FACTORIZATIONS,
-    NOT_FINITE,
-    compiled,
-)
+from twoloop.kernels.data.codes import DONE, MASS_NOT_DEFINITE, NOT_FINITE
+from twoloop.kernels.data.common import compiled
+from twoloop.kernels.data.counters import N_FACTORIZATIONS
 from twoloop.kernels.data.finite import finite
+from twoloop.kernels.data.flags import CONSTANT_MASS, DENSE_FORM, FORM
+from twoloop.kernels.data.noted import MASS_SCALE
 
 MANY = 8  # rows, and degrees of freedom, from which on this is the fastest form of a chain: measured, about 7
 LARGE = 32  # coordinates, from which on it is with few degrees of freedom, too, unless M is diagonal: about 30
@@ -61,13 +56,13 @@ def _make_program(w):
         for j in range(n):
             source = w.entries.size + i * n + j
             if w.mass_pattern[i, j] != 0.0 and not put(matrix, i, j, scale * w.M[i, j], source):
-                return TOO_MANY
+                return at.TOO_MANY
     for k in range(rows.size):
         for j in range(n):
             if w.pattern[rows[k], j] != 0.0:
                 number, source = w.G[rows[k], j], rows[k] * n + j
                 if not (put(matrix, n + k, j, number, source) and put(matrix, j, n + k, number, source)):
-                    return TOO_MANY
+                    return at.TOO_MANY
     return order(index, matrix, w.pattern.size, 0.0)
 
 
@@ -75,8 +70,8 @@ def _make_program(w):
 def _factor(w):
     """Factors by the program that there is; False: it does not suit these numbers."""
     index, values, scale, first_of_mass = w.index_a, w.values_a, w.notes[MASS_SCALE], w.entries.size
-    source = slots(index[SIZE]) + 2 * index[N_SLOTS]
-    for s in range(index[N_SLOTS]):
+    source = slots(index[at.SIZE]) + 2 * index[at.N_SLOTS]
+    for s in range(index[at.N_SLOTS]):
         place = index[source + s]
         values[s] = w.augmented[place] * (scale if place >= first_of_mass else 1.0)
     return run(index, values) > 0.0
@@ -87,15 +82,15 @@ def factor_sparse(f, w):
     """Factors for the w.M and w.G that there are; f.flags[FORM] is another one on return where they are not sparse."""
     w.counters[N_FACTORIZATIONS] += 1
     new = f.flags[CONSTANT_MASS] == 0 and note_pattern(w.M, w.mass_pattern)
-    if w.index_a[SIZE] == 0 or new or not _factor(w):
+    if w.index_a[at.SIZE] == 0 or new or not _factor(w):
         if not finite(w.M):
             return NOT_FINITE
         code = _make_program(w)
-        if code == TOO_MANY:
+        if code == at.TOO_MANY:
             f.flags[FORM] = f.flags[DENSE_FORM]
             return DONE
-        if code != ORDERED or not _factor(w):
-            w.index_a[SIZE] = 0
+        if code != at.ORDERED or not _factor(w):
+            w.index_a[at.SIZE] = 0
             return MASS_NOT_DEFINITE
     if sign_of(w.index_a, w.values_a) != (1.0 if w.rows_v.size % 2 == 0 else -1.0):
         return MASS_NOT_DEFINITE
@@ -105,7 +100,7 @@ def factor_sparse(f, w):
 @compiled
 def solve_sparse(w, r, c, a):
     """a of M a + G^T lam = r and G a = c; the multipliers of the rows that count go into w.z."""
-    n, size, scale = r.size, w.index_a[SIZE], w.notes[MASS_SCALE]
+    n, size, scale = r.size, w.index_a[at.SIZE], w.notes[MASS_SCALE]
     x, y = w.right[:size], w.right[size:]
     for j in range(n):
         x[j] = scale * r[j]

@@ -78,10 +78,7 @@ def factor(program, counts, values, sizes, least):
     count, and becomes 0 for those whose pivot is below `least` of its size; these are not among the smallest.
     `sizes` is scratch.
     """
-    (
-        n_q,
-        n,
-    ) = program[N_COORDINATES], program[N_PIVOTS]
+    (n_q, n) = program[N_COORDINATES], program[N_PIVOTS]
     order, targets = order_of(program), targets_of(program)
     begin, row_of = columns_of(program)
     for k in range(n):

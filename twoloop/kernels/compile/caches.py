@@ -78,7 +78,7 @@ def compile_kept(
         except RuntimeError:  # numba finds no folder; there is none for what is typed at a prompt
             if Path(inspect.getfile(function)).exists():
                 say_once(UNWRITABLE)
-    with _uncollected():
+    with uncollected():
         dispatcher.compile(signature)
     dispatcher.disable_compile()
     _N_MADE[0] += 1
@@ -86,7 +86,7 @@ def compile_kept(
 
 
 @contextmanager
-def _uncollected() -> Iterator[None]:
+def uncollected() -> Iterator[None]:
     """Without the collection of cycles: what numba makes lives until the end, and that takes a sixth of the time."""
     collecting = gc.isenabled()
     gc.disable()

@@ -11,9 +11,10 @@ from copy import copy
 from typing import Any
 
 from numba import types
-from numba.core import cgutils, event
+from numba.core import cgutils, event, ir
 from numba.core.base import BaseContext
 from numba.core.bytecode import FunctionIdentity
+from numba.core.cpu import CPUContext
 from numba.core.inline_closurecall import InlineWorker
 from numba.core.targetconfig import ConfigStack
 from numba.core.types.functions import BaseFunction, Function
@@ -99,6 +100,36 @@ def _inlined_code(self: Any, function: Any, enable_ssa: bool = False) -> Any:
     return code
 
 
+_LEAVES = {ir.Loc, str, int, bool, type(None)}  # of what a statement holds
+
+
+def _variables(self: Any, held: Any) -> list[Any]:
+    """The variables that a statement names; numba calls a function for each thing that it holds."""
+    if isinstance(held, ir.Var):
+        return [held]
+    if isinstance(held, ir.Inst):
+        return held.list_vars()  # type: ignore[no-any-return]
+    found: list[Any] = []
+    if isinstance(held, (dict, list, tuple)):
+        for each in held.values() if isinstance(held, dict) else held:
+            if type(each) is ir.Var:
+                found.append(each)
+            elif type(each) not in _LEAVES:
+                found += _variables(self, each)
+    return found
+
+
+_load_registries: Any = CPUContext.load_additional_registries
+_loaded: set[int] = set()  # of contexts, which live until the end
+
+
+def _load_once(self: Any) -> None:
+    """What numba implements of Python's and NumPy's functions, which it looks for anew at each function."""
+    if id(self) not in _loaded:
+        _load_registries(self)
+        _loaded.add(id(self))
+
+
 _LOCKS = ("numba:llvm_lock", "numba:compiler_lock")
 
 
@@ -114,6 +145,8 @@ _RULES: list[tuple[Any, str, Callable[..., Any]]] = [
     (arrayobj, "basic_indexing", _indexing),
     (BaseContext, "get_abi_sizeof", _size_of),
     (InlineWorker, "run_untyped_passes", _inlined_code),
+    (ir.Inst, "_rec_list_vars", _variables),
+    (CPUContext, "load_additional_registries", _load_once),
     (event, "start_event", _but_of_locks(event.start_event)),
     (event, "end_event", _but_of_locks(event.end_event)),
 ]

@@ -4,7 +4,8 @@ Without them the energy of a symmetric or symplectic method wanders with the num
 """
 
 from twoloop.kernels.algebra.linalg import copy
-from twoloop.kernels.data.common import ESTIMATE, exact, inlined, merged
+from twoloop.kernels.data.common import exact, inlined, merged
+from twoloop.kernels.data.tolerances import ESTIMATE
 
 N_RESTS = 4  # rows of rests: what rounding took from q and from v, at the last accepted step and in this attempt
 

@@ -7,7 +7,8 @@ at places that lie no further apart than tolerances[GAP].
 
 import numpy as np
 
-from twoloop.kernels.data.common import ATOL, RTOL, compiled
+from twoloop.kernels.data.common import compiled
+from twoloop.kernels.data.tolerances import ATOL, RTOL
 
 ROUNDING = 1e-13  # of the largest acceleration: a defect that is rounding
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from twoloop.kernels.control.clock import MAX_STEP, N_FIXED, T_START
+from twoloop.kernels.control import clock as at
 from twoloop.kernels.data.common import merged
 from twoloop.kernels.evaluation.gamma import representable
 
@@ -18,9 +18,9 @@ def on_grid(clock, t, h, target, goal):
     rounding = NEAR * np.spacing(max(abs(t), abs(target)))
     near = max(1e-6 * h, rounding)
     in_grid = 1.0
-    if target <= clock[T_START] + clock[N_FIXED] * h + near:
+    if target <= clock[at.T_START] + clock[at.N_FIXED] * h + near:
         in_grid = 0.0  # a second output time beside the same point of the grid
-    end = clock[T_START] + (clock[N_FIXED] + in_grid) * h
+    end = clock[at.T_START] + (clock[at.N_FIXED] + in_grid) * h
     reaches = goal <= end + near
     size = h
     if abs(t + h - end) > rounding:
@@ -38,6 +38,6 @@ def off_grid(control, t, h, left, leaps):
     if h > 0.5 * left and not reaches:
         size = 0.5 * left  # two equal steps rather than a long and a tiny one
     size = representable(t, size)
-    if size > control[MAX_STEP]:
+    if size > control[at.MAX_STEP]:
         size = representable(t, size - np.spacing(abs(t + size)))
     return size, reaches

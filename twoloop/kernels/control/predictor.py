@@ -8,8 +8,10 @@ this sign needs a prediction that is nearly exact, as short steps through a sing
 """
 
 from twoloop.kernels.algebra.factors import sign_of
-from twoloop.kernels.data.common import DONE, ESTIMATE, ORIENTATION, ORIENTATION_NEW, merged
-from twoloop.kernels.data.tolerances import allowed
+from twoloop.kernels.data.codes import DONE
+from twoloop.kernels.data.common import merged
+from twoloop.kernels.data.noted import ORIENTATION, ORIENTATION_NEW
+from twoloop.kernels.data.tolerances import ESTIMATE, allowed
 from twoloop.kernels.evaluation.calls import restore
 
 SHARE_OF_MOTION = 0.1  # of the way that the coordinates go in the step: what a prediction may be off at any tolerance

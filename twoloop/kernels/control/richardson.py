@@ -2,7 +2,9 @@
 
 import numpy as np
 
-from twoloop.kernels.data.common import ATOL, DONE, RTOL, compiled
+from twoloop.kernels.data.codes import DONE
+from twoloop.kernels.data.common import compiled
+from twoloop.kernels.data.tolerances import ATOL, RTOL
 from twoloop.kernels.evaluation.calls import restore
 
 

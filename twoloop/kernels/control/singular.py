@@ -1,32 +1,11 @@
 """What a run looks at beside its steps: whether its partition has become poor, and a singular position is near."""
 
-from twoloop.kernels.control.clock import (
-    BRIDGE,
-    FIXED_STEP,
-    GO_ON,
-    H_LIMIT,
-    H_LONG,
-    H_NEXT,
-    LARGEST_PIVOT,
-    NEAR_SINGULAR,
-    PIVOT_HERE,
-    RANK_LOST,
-    T,
-)
-from twoloop.kernels.data.common import (
-    AUGMENTED,
-    BY_GENERAL,
-    DONE,
-    FORM,
-    N_ACCEPTED,
-    NEARLY_SINGULAR,
-    NULL_SPACE,
-    PIVOT,
-    SENSITIVITY,
-    STATIC,
-    STRAIGHT,
-    merged,
-)
+from twoloop.kernels.control import clock as at
+from twoloop.kernels.data.codes import DONE
+from twoloop.kernels.data.common import merged
+from twoloop.kernels.data.counters import N_ACCEPTED
+from twoloop.kernels.data.flags import AUGMENTED, FORM, NULL_SPACE, STATIC, STRAIGHT
+from twoloop.kernels.data.noted import BY_GENERAL, NEARLY_SINGULAR, PIVOT, SENSITIVITY
 from twoloop.kernels.evaluation.calls import find_tangents, renew_partition
 from twoloop.kernels.evaluation.partition import partition_is_poor
 from twoloop.kernels.evaluation.static_factors_at import CAREFUL
@@ -46,7 +25,7 @@ NEARER = 0.25  # of the smallest sine at the start of a step: one that ends near
 @merged
 def near_singular(w, control, clock):
     """Whether C_q was close to losing rank when the partition was chosen, and the caller wants to know."""
-    return control[BRIDGE] == 1.0 and w.notes[PIVOT] < SINGULAR_PIVOT * clock[LARGEST_PIVOT]
+    return control[at.BRIDGE] == 1.0 and w.notes[PIVOT] < SINGULAR_PIVOT * clock[at.LARGEST_PIVOT]
 
 
 @merged
@@ -55,16 +34,16 @@ def ends_at_singular(f, w, control, clock):
 
     Steps cross such a position unharmed where it lies well between their ends.
     """
-    if f.flags[FORM] != STATIC or control[FIXED_STEP] > 0.0:
+    if f.flags[FORM] != STATIC or control[at.FIXED_STEP] > 0.0:
         return False
-    return w.notes[PIVOT] < min(STATIC_SINGULAR * clock[LARGEST_PIVOT], NEARER * clock[PIVOT_HERE])
+    return w.notes[PIVOT] < min(STATIC_SINGULAR * clock[at.LARGEST_PIVOT], NEARER * clock[at.PIVOT_HERE])
 
 
 @merged
 def lost_at_singular(f, clock, size):
     """Whether a step of the static form that came to nothing is so short that others have to try, see bridge.py."""
-    near = clock[PIVOT_HERE] < STATIC_SINGULAR * clock[LARGEST_PIVOT]
-    return f.flags[FORM] == STATIC and near and size < LOST * clock[H_LONG]
+    near = clock[at.PIVOT_HERE] < STATIC_SINGULAR * clock[at.LARGEST_PIVOT]
+    return f.flags[FORM] == STATIC and near and size < LOST * clock[at.H_LONG]
 
 
 @merged
@@ -74,14 +53,14 @@ def with_care(f, w, control, clock, size):
     Stages beside the constraints have accelerations there whose errors grow with the nearness. A step that ends well
     beyond may be made where shorter ones, which end nearer, are not: lengths from the longest of the last ones down.
     """
-    near = clock[PIVOT_HERE] < CARE * clock[LARGEST_PIVOT]
-    if f.flags[FORM] != STATIC or control[FIXED_STEP] > 0.0 or w.notes[NEARLY_SINGULAR] == 1.0 or not near:
+    near = clock[at.PIVOT_HERE] < CARE * clock[at.LARGEST_PIVOT]
+    if f.flags[FORM] != STATIC or control[at.FIXED_STEP] > 0.0 or w.notes[NEARLY_SINGULAR] == 1.0 or not near:
         return False
-    clock[H_NEXT] = LESS * size
+    clock[at.H_NEXT] = LESS * size
     if w.notes[NEARLY_SINGULAR] == 0.0:
         w.notes[NEARLY_SINGULAR] = CAREFUL
-        clock[H_NEXT] = max(size, clock[H_LONG])
-    clock[H_LIMIT] = max(clock[H_LIMIT], clock[H_NEXT])
+        clock[at.H_NEXT] = max(size, clock[at.H_LONG])
+    clock[at.H_LIMIT] = max(clock[at.H_LIMIT], clock[at.H_NEXT])
     return True
 
 
@@ -91,13 +70,13 @@ def look_at_partition(f, w, control, clock, size, lands, state):
 
     The state is full (q, v, a, lam): a new choice of independent coordinates needs no conversion.
     """
-    short = size < SHORT * clock[H_LONG] and control[FIXED_STEP] == 0.0 and not lands
+    short = size < SHORT * clock[at.H_LONG] and control[at.FIXED_STEP] == 0.0 and not lands
     if f.flags[FORM] == STATIC:
-        clock[PIVOT_HERE] = w.notes[PIVOT]
-        clock[LARGEST_PIVOT] = max(clock[LARGEST_PIVOT], w.notes[PIVOT])
-        if w.notes[NEARLY_SINGULAR] == CAREFUL and w.notes[PIVOT] >= CARE * clock[LARGEST_PIVOT]:
+        clock[at.PIVOT_HERE] = w.notes[PIVOT]
+        clock[at.LARGEST_PIVOT] = max(clock[at.LARGEST_PIVOT], w.notes[PIVOT])
+        if w.notes[NEARLY_SINGULAR] == CAREFUL and w.notes[PIVOT] >= CARE * clock[at.LARGEST_PIVOT]:
             w.notes[NEARLY_SINGULAR] = 0.0
-        return GO_ON
+        return at.GO_ON
     n = w.Q.size
     straight = f.flags[STRAIGHT] == 1 and w.notes[BY_GENERAL] == 0.0
     every = 1
@@ -107,17 +86,17 @@ def look_at_partition(f, w, control, clock, size, lands, state):
         every = RARELY
     looked = w.counters[N_ACCEPTED] % every == 0
     if looked and (straight or f.flags[FORM] != NULL_SPACE):
-        find_tangents(f, w, clock[T], state[:n])
-    if looked and partition_is_poor(w) and renew_partition(f, w, clock[T], state[:n]) != DONE:
-        return RANK_LOST
-    clock[LARGEST_PIVOT] = max(clock[LARGEST_PIVOT], w.notes[PIVOT])
-    if w.notes[PIVOT] < SINGULAR_PIVOT * clock[LARGEST_PIVOT]:
+        find_tangents(f, w, clock[at.T], state[:n])
+    if looked and partition_is_poor(w) and renew_partition(f, w, clock[at.T], state[:n]) != DONE:
+        return at.RANK_LOST
+    clock[at.LARGEST_PIVOT] = max(clock[at.LARGEST_PIVOT], w.notes[PIVOT])
+    if w.notes[PIVOT] < SINGULAR_PIVOT * clock[at.LARGEST_PIVOT]:
         w.notes[NEARLY_SINGULAR] = 1.0
-    if size < COLLAPSED * clock[H_LONG] and w.notes[NEARLY_SINGULAR] == 0.0 and control[BRIDGE] == 1.0:
+    if size < COLLAPSED * clock[at.H_LONG] and w.notes[NEARLY_SINGULAR] == 0.0 and control[at.BRIDGE] == 1.0:
         # a motion may go straight towards a singular position, and its partition show nothing of it
-        if renew_partition(f, w, clock[T], state[:n]) != DONE:
-            return RANK_LOST
+        if renew_partition(f, w, clock[at.T], state[:n]) != DONE:
+            return at.RANK_LOST
         w.notes[SENSITIVITY] = 1.0  # as of a partition far from there: this one is not to last
-        if w.notes[PIVOT] < SINGULAR_PIVOT * clock[LARGEST_PIVOT]:
+        if w.notes[PIVOT] < SINGULAR_PIVOT * clock[at.LARGEST_PIVOT]:
             w.notes[NEARLY_SINGULAR] = 1.0
-    return NEAR_SINGULAR if short and near_singular(w, control, clock) else GO_ON
+    return at.NEAR_SINGULAR if short and near_singular(w, control, clock) else at.GO_ON

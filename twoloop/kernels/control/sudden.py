@@ -9,8 +9,9 @@ ones the state stays that where the step begins, and of what is sharp by place t
 
 import numpy as np
 
-from twoloop.kernels.control.clock import AHEAD, ALONG_TO, LOOKED_TO, LOOKING, SPACING, SUDDEN
-from twoloop.kernels.data.common import RTOL, compiled
+from twoloop.kernels.control import clock as at
+from twoloop.kernels.data.common import compiled
+from twoloop.kernels.data.tolerances import RTOL
 from twoloop.kernels.evaluation.constraints import constraint_rates
 from twoloop.kernels.evaluation.gamma import representable
 
@@ -89,27 +90,27 @@ def sudden_time(f, w, tolerances, t, begin, spacing, last, along, q, v, a):
 @compiled
 def _look_along(f, w, tolerances, clock, spacing, t, size, last, q, v, a):
     """Look along the way of a long step, once."""
-    if clock[ALONG_TO] >= t + (1.0 - NEARLY) * size:
+    if clock[at.ALONG_TO] >= t + (1.0 - NEARLY) * size:
         return
-    clock[LOOKING] = 1.0
-    first, clock[ALONG_TO] = sudden_time(f, w, tolerances, t, t, size / PLACES, last, 1.0, q, v, a)
-    clock[LOOKING] = 0.0
+    clock[at.LOOKING] = 1.0
+    first, clock[at.ALONG_TO] = sudden_time(f, w, tolerances, t, t, size / PLACES, last, 1.0, q, v, a)
+    clock[at.LOOKING] = 0.0
     if first == np.inf:
-        clock[LOOKED_TO] = max(clock[LOOKED_TO], t + size)
-    elif first < clock[SUDDEN] or clock[SUDDEN] <= t + NEARLY * spacing:
-        clock[SUDDEN] = clock[LOOKED_TO] = first
+        clock[at.LOOKED_TO] = max(clock[at.LOOKED_TO], t + size)
+    elif first < clock[at.SUDDEN] or clock[at.SUDDEN] <= t + NEARLY * spacing:
+        clock[at.SUDDEN] = clock[at.LOOKED_TO] = first
 
 
 @compiled
 def up_to_sudden(f, w, tolerances, control, clock, t, size, last, state):
     """The size of a step that does not pass over a sudden change."""
-    n, spacing = w.Q.size, control[SPACING]
+    n, spacing = w.Q.size, control[at.SPACING]
     q, v, a = state[:n], state[n : 2 * n], state[2 * n : 3 * n]
-    if control[AHEAD] == 1.0 and LONG * spacing < size < (PLACES + NEARLY) * spacing:
+    if control[at.AHEAD] == 1.0 and LONG * spacing < size < (PLACES + NEARLY) * spacing:
         _look_along(f, w, tolerances, clock, spacing, t, size, last, q, v, a)
-    while clock[SUDDEN] <= t + NEARLY * spacing or clock[SUDDEN] == np.inf:
-        begin = max(t, clock[LOOKED_TO])
+    while clock[at.SUDDEN] <= t + NEARLY * spacing or clock[at.SUDDEN] == np.inf:
+        begin = max(t, clock[at.LOOKED_TO])
         if begin >= min(t + size, last):
             return size
-        clock[SUDDEN], clock[LOOKED_TO] = sudden_time(f, w, tolerances, t, begin, spacing, last, 0.0, q, v, a)
-    return min(size, representable(t, clock[SUDDEN] - t))
+        clock[at.SUDDEN], clock[at.LOOKED_TO] = sudden_time(f, w, tolerances, t, begin, spacing, last, 0.0, q, v, a)
+    return min(size, representable(t, clock[at.SUDDEN] - t))

@@ -18,29 +18,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from twoloop.kernels.algebra.linalg import copy
 from twoloop.kernels.control.controller import ERROR_BEFORE, H_BEFORE, LEAST_ERROR, N_PAST, N_RULE, factor_of
-from twoloop.kernels.data.common import (
-    ATTEMPT,
-    DONE,
-    ESTIMATE,
-    EXPLICIT_STEP,
-    FORCE_BY_Q_GIVEN,
-    FORM,
-    GAP,
-    N_EVALUATIONS,
-    N_JACOBIANS,
-    OUTER_DIVERGED,
-    REUSE,
-    ROUNDED,
-    SETTLE,
-    STATIC,
-    STRAIGHT,
-    Attempt,
-    Step,
-    compiled,
-    inlined,
-    kernel,
-    merged,
-)
+from twoloop.kernels.data.codes import DONE, OUTER_DIVERGED
+from twoloop.kernels.data.common import ATTEMPT, SETTLE, Attempt, Step, compiled, inlined, kernel, merged
+from twoloop.kernels.data.counters import N_EVALUATIONS, N_JACOBIANS
+from twoloop.kernels.data.flags import FORCE_BY_Q_GIVEN, FORM, STATIC, STRAIGHT
+from twoloop.kernels.data.noted import EXPLICIT_STEP, REUSE, ROUNDED
+from twoloop.kernels.data.tolerances import ESTIMATE, GAP
 from twoloop.kernels.evaluation.calls import evaluate, renew_partition
 from twoloop.kernels.evaluation.tasks import PROJECT
 
@@ -102,13 +85,7 @@ N_OPTIONS = N_PAIR + 2 * N_OF_EACH
 
 
 def switching_options(
-    limit: float,
-    looks: int,
-    matrix_cost: float,
-    dearer: float,
-    each: ArrayLike,
-    first: ArrayLike,
-    second: ArrayLike,
+    limit: float, looks: int, matrix_cost: float, dearer: float, each: ArrayLike, first: ArrayLike, second: ArrayLike
 ) -> NDArray[np.float64]:
     """`options`: of the pair, see LIMIT and what follows; then a rule and REUSE_OF of each; then their own."""
     first = np.asarray(first, dtype=np.float64)

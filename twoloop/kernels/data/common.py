@@ -17,10 +17,11 @@ from numba import njit, types
 from numba.extending import typeof_impl
 
 from twoloop.kernels.compile.caches import compile_kept
-from twoloop.kernels.compile.callbacks import KINDS, MATRIX, OPTIONAL, VECTOR, f8
+from twoloop.kernels.compile.callbacks import KINDS, MATRIX, VECTOR, f8
 from twoloop.kernels.compile.linking import HelperCompiler, KernelCompiler, VectorizingCompiler
 from twoloop.kernels.compile.private import Dispatcher
 from twoloop.kernels.compile.reference import Reference
+from twoloop.kernels.data.flags import GIVEN
 
 i8 = types.int64
 INTEGERS = types.int64[::1]
@@ -38,22 +39,6 @@ PROGRAMS = (
 )
 # the callbacks of a mechanism, its parameters, its flags and its programs
 Functions: Any = namedtuple("Functions", [*KINDS, "p", "flags", *PROGRAMS])  # type: ignore[misc]
-
-
-# places in Functions.flags; BANDWIDTH is -1 where linear algebra is not banded; FORM: how accelerations
-# are found, see algebra/saddle_point.py; DENSE_FORM: what it becomes where sparse factors have too many entries;
-# STRAIGHT: 1 where the inner loop is code made for the mechanism, see straight_code.py
-CONSTANT_MASS, DIAGONAL_MASS, BANDWIDTH, FORM, DENSE_FORM, STRAIGHT, FIRST_GIVEN = range(7)
-MULTIPLIERS, NULL_SPACE, AUGMENTED, STATIC = range(4)  # forms; the last has an inner loop of its own, static_inner.py
-GIVEN = {name: place for place, name in enumerate(OPTIONAL, FIRST_GIVEN)}  # whether an optional callback is given
-N_FLAGS = FIRST_GIVEN + len(GIVEN)
-CONSTRAINT_RATE_GIVEN, GAMMA_GIVEN, FORCE_BY_Q_GIVEN, FORCE_BY_V_GIVEN, REACTION_BY_Q_GIVEN, KINEMATICS_GIVEN = (
-    GIVEN[name] for name in ("constraint_rate", "gamma", "force_by_q", "force_by_v", "reaction_by_q", "kinematics")
-)
-NONHOLONOMIC_RATE_GIVEN, NONHOLONOMIC_GAMMA_GIVEN = (
-    GIVEN[name] for name in ("nonholonomic_rate", "nonholonomic_gamma")
-)
-MASS_VALUES_GIVEN, JACOBIAN_VALUES_GIVEN = (GIVEN[name] for name in ("mass_values", "jacobian_values"))
 
 
 class Work(NamedTuple):
@@ -106,10 +91,10 @@ class Work(NamedTuple):
     right: Any  # (2 (n_q + r_v)) right-hand side of the augmented matrix, and scratch
     order: Any  # (n_q) scratch: column order of the full pivoting
     row_order: Any  # (n_c + n_a) scratch: row order
-    counters: Any  # (N_COUNTERS) see below
+    counters: Any  # (N_COUNTERS) see counters.py
     lapack: Any  # addresses of lapack.ROUTINES; 0 where linear algebra is dense
     predicted: Any  # (r) dependent positions that the integration formula gives, before the constraints restore them
-    notes: Any  # (N_NOTES) see below
+    notes: Any  # (N_NOTES) see noted.py
     nodes: Any  # what the operations of a program make
     matrices: Any  # of Newton's method, see steps/newton_memory.py and steps/newton_static.py
     # of the static form alone; there N is n_q + n_c, and what is of no use to it is empty
@@ -143,70 +128,6 @@ WORK = Reference(
 @typeof_impl.register(Work)
 def _type_of_work(value: Any, context: Any) -> Any:
     return WORK
-
-
-# places in Work.counters
-(
-    N_ACCEPTED,
-    N_REJECTED_ERROR,
-    N_REJECTED_CONVERGENCE,
-    N_OUTER,
-    N_INNER,
-    N_EVALUATIONS,
-    N_PARTITIONS,
-    N_FACTORIZATIONS,
-    N_JACOBIANS,
-    N_COUNTERS,
-) = range(10)
-
-# places in Work.notes
-(
-    SENSITIVITY,  # max|Cqd^-1 Cqi| after the first step under this partition; 0: not known yet
-    ORIENTATION,  # sign of det C_qd at the last accepted state under this partition; 0: not known
-    ORIENTATION_NEW,  # ... and at the end of this attempt
-    FAULT_KIND,  # place in Functions of the callback that gave a value that is not finite; -1: none known
-    FAULT_TIME,  # ... and when
-    GAMMA_REQUIRED,  # relative accuracy that Q_d by differences must have, see differences.py
-    GAMMA_SHARE,  # of the longest length over which to difference
-    GAMMA_ACCURACY,  # reached when that share was chosen
-    GAMMA_SCALE,  # largest entry of Q_d so far
-    REUSE,  # correction of a position below which the Jacobian before it serves for velocities and accelerations
-    ROUNDED,  # the same at a state that may be accepted: rounding of the positions
-    GENERATION,  # how many partitions there were
-    RANK,  # of C_q, and of C_q and A, where they are not what the workspace is made for
-    RANK_V,
-    CONTRADICTION,  # row that was taken for redundant and is violated
-    PIVOT,  # smallest of the last full pivoting, rows scaled to 1: small near a singular position
-    NEARLY_SINGULAR,  # 1: the run has come near a singular position, or is not to look for one
-    MASS_SCALE,  # s of the augmented matrix, see algebra/sparse.py
-    FACTORED,  # 1: the factors of the linear problem belong to w.M and w.G
-    KNOWN,  # 1: w.Rate and w.Gamma[:n_c] belong to the state, from the fused callback
-    BY_GENERAL,  # 1: code made for the mechanism left the last state to the general inner loop
-    EXPLICIT_STEP,  # 1: a method that switches took an explicit step
-    DEFECT,  # largest that this attempt found of itself, over what the tolerances allow; -1: it did not look
-    LARGEST_DEFECT,  # of the accepted steps
-    UNCHECKED,  # accepted steps that did not look
-    WIDEST_GAP,  # between two places at which accepted steps looked at the equations, s
-    KINK_BEFORE,  # times between which no jump of C_t or b is known
-    KINK_AFTER,
-    LEANING,  # largest share of a row that counts in a redundant one, as at the first look under this partition
-    SMALLEST,  # of the static form: least pivot of a row over its size, the sine squared of its angle to others
-    N_NOTES,
-) = range(31)
-
-# what a kernel returns: DONE, or why it could not
-(
-    DONE,
-    OUTER_DIVERGED,
-    INNER_DIVERGED,
-    SINGULAR,
-    NOT_FINITE,
-    MASS_NOT_DEFINITE,
-    GAMMA_INACCURATE,
-    RANK_DIFFERS,
-    ROWS_CONTRADICT,
-    NEEDS_DENSE,  # the static form cannot decide it
-) = range(10)
 
 
 class Attempt(NamedTuple):
@@ -277,12 +198,6 @@ OWN_FUNCTIONS = {
     "sum_stages": types.none(*[VECTOR] * 4, f8, VECTOR, VECTOR),
 }
 KIT.add_own_functions(OWN_FUNCTIONS)
-
-
-# places in the array `tolerances` that a step gets; ESTIMATE is 0 for a fixed step, LEAST the smallest tolerance, GAP
-# the time within which the equations are to be looked at once at least; from ATOL on stands the absolute tolerance of
-# each coordinate and its velocity
-RTOL, ESTIMATE, LEAST, GAP, ATOL = range(5)
 
 
 _FOLDER = Path(__file__).parents[1]  # of the kernels

@@ -2,7 +2,9 @@
 
 import numpy as np
 
-from twoloop.kernels.data.common import FAULT_KIND, FAULT_TIME, NOT_FINITE, Functions, compiled
+from twoloop.kernels.data.codes import NOT_FINITE
+from twoloop.kernels.data.common import Functions, compiled
+from twoloop.kernels.data.noted import FAULT_KIND, FAULT_TIME
 
 MASS, FORCE, CONSTRAINT, JACOBIAN, RATE, GAMMA = (
     Functions._fields.index(kind) for kind in ("mass", "force", "constraint", "jacobian", "constraint_rate", "gamma")

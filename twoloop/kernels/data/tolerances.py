@@ -1,6 +1,11 @@
 """What the tolerances allow, eq. (26) of the paper."""
 
-from twoloop.kernels.data.common import ATOL, RTOL, merged
+from twoloop.kernels.data.common import merged
+
+# places in the array `tolerances` that a step gets; ESTIMATE is 0 for a fixed step, LEAST the smallest tolerance, GAP
+# the time within which the equations are to be looked at once at least; from ATOL on stands the absolute tolerance of
+# each coordinate and its velocity
+RTOL, ESTIMATE, LEAST, GAP, ATOL = range(5)
 
 
 @merged

@@ -5,21 +5,12 @@ import numpy as np
 from twoloop.kernels.algebra.banded import banded_mass
 from twoloop.kernels.algebra.saddle_point import factor, least_norm, multipliers, solve
 from twoloop.kernels.algebra.schur import factor_mass
-from twoloop.kernels.data.common import (
-    CONSTANT_MASS,
-    DONE,
-    FACTORED,
-    FORM,
-    GAMMA_GIVEN,
-    GAMMA_SCALE,
-    KNOWN,
-    MULTIPLIERS,
-    N_EVALUATIONS,
-    NONHOLONOMIC_GAMMA_GIVEN,
-    compiled,
-    merged,
-)
+from twoloop.kernels.data.codes import DONE
+from twoloop.kernels.data.common import compiled, merged
+from twoloop.kernels.data.counters import N_EVALUATIONS
 from twoloop.kernels.data.finite import MASS, finite, not_finite, source_of_acceleration
+from twoloop.kernels.data.flags import CONSTANT_MASS, FORM, GAMMA_GIVEN, MULTIPLIERS, NONHOLONOMIC_GAMMA_GIVEN
+from twoloop.kernels.data.noted import FACTORED, GAMMA_SCALE, KNOWN
 from twoloop.kernels.evaluation.gamma import gamma_by_differences
 from twoloop.kernels.evaluation.program import gamma_by_program
 

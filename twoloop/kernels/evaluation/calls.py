@@ -4,44 +4,14 @@ A step gets a `Kit`, the callbacks and this function; the helpers here name its 
 """
 
 from twoloop.kernels.algebra.patterns import has_new_entries
-from twoloop.kernels.data.common import (
-    DONE,
-    INNER,
-    INNER_DIVERGED,
-    KNOWN,
-    REUSE,
-    ROUNDED,
-    SINGULAR,
-    compiled,
-    kernel,
-    merged,
-)
+from twoloop.kernels.data.codes import DONE, INNER_DIVERGED, SINGULAR
+from twoloop.kernels.data.common import INNER, compiled, kernel, merged
+from twoloop.kernels.data.noted import KNOWN, REUSE, ROUNDED
+from twoloop.kernels.evaluation import tasks
 from twoloop.kernels.evaluation.accelerations import accelerate, acceleration_constraint, equilibrate, mass_there
 from twoloop.kernels.evaluation.inner import factor_dependent, positions, redundant_rows_hold, tangents, velocities
 from twoloop.kernels.evaluation.onto_constraints import accelerate_there, to_constraints
-from twoloop.kernels.evaluation.partition import (
-    note_entries,
-    partition_of_midpoint,
-    renew,
-    write_programs,
-)
-from twoloop.kernels.evaluation.tasks import (
-    ACCELERATIONS,
-    EVALUATE,
-    EVALUATE_STATE,
-    EVALUATE_THERE,
-    GAMMA_TASK,
-    MASS_TASK,
-    MIDPOINT,
-    MULTIPLIERS,
-    PATTERN,
-    POSITIONS,
-    PROJECT,
-    REDUNDANT,
-    RENEW,
-    RESTORE,
-    TANGENTS,
-)
+from twoloop.kernels.evaluation.partition import note_entries, partition_of_midpoint, renew, write_programs
 
 ROUNDING = 1e-12  # relative to the largest value: changes of this size no longer shrink
 ROUNDING_OF_Q = 2e-14  # a hundred roundings, see rounding_floor
@@ -57,21 +27,21 @@ def _verify_pattern(w):
 
 @compiled
 def _other_task(f, w, task, t, q, v):
-    if task == TANGENTS:
+    if task == tasks.TANGENTS:
         code = factor_dependent(f, w, t, q)
         if code == DONE:
             tangents(f, w, t, q)
         return code
-    if task == GAMMA_TASK:
+    if task == tasks.GAMMA_TASK:
         w.notes[KNOWN] = 0.0
         return acceleration_constraint(f, w, t, q, v)
-    if task == MASS_TASK:
+    if task == tasks.MASS_TASK:
         return mass_there(f, w, t, q)
-    if task == RENEW:
+    if task == tasks.RENEW:
         return renew(f, w, t, q)
-    if task == MIDPOINT:
+    if task == tasks.MIDPOINT:
         return partition_of_midpoint(f, w, t, q, v)
-    if task == PATTERN:
+    if task == tasks.PATTERN:
         return _verify_pattern(w)
     return redundant_rows_hold(f, w, t, q, v)
 
@@ -79,7 +49,7 @@ def _other_task(f, w, task, t, q, v):
 @merged
 def _all_coordinates(f, w, task, t, q, v, tolerance, a, lam):
     """Tasks of methods that integrate all coordinates."""
-    if task == EVALUATE_THERE:
+    if task == tasks.EVALUATE_THERE:
         return accelerate_there(f, w, t, q, v, a)
     return to_constraints(f, w, t, q, v, tolerance, a, lam)
 
@@ -87,24 +57,24 @@ def _all_coordinates(f, w, task, t, q, v, tolerance, a, lam):
 @kernel(INNER)
 def inner_loop(f, w, task, t, q, v, tolerance, a, lam):
     """What the names of the tasks say, at (t, q, v); see the helpers below."""
-    if task >= TANGENTS:
+    if task >= tasks.TANGENTS:
         return _other_task(f, w, task, t, q, v)
-    if task >= EVALUATE_THERE:
+    if task >= tasks.EVALUATE_THERE:
         return _all_coordinates(f, w, task, t, q, v, tolerance, a, lam)
     code = DONE
-    if task <= POSITIONS:
-        reuse = w.notes[REUSE] if task == EVALUATE else w.notes[ROUNDED]
+    if task <= tasks.POSITIONS:
+        reuse = w.notes[REUSE] if task == tasks.EVALUATE else w.notes[ROUNDED]
         code = positions(f, w, t, q, v, tolerance, reuse)
-        if code == DONE and task != EVALUATE:
+        if code == DONE and task != tasks.EVALUATE:
             code = _verify_pattern(w)
-        if code != DONE or task == POSITIONS:
+        if code != DONE or task == tasks.POSITIONS:
             return code
         velocities(f, w, t, q, v, reuse)
-    if task == RESTORE:
+    if task == tasks.RESTORE:
         return code
-    if task != MULTIPLIERS:
+    if task != tasks.MULTIPLIERS:
         code = accelerate(f, w, t, q, v, a)
-    if code == DONE and task != EVALUATE:
+    if code == DONE and task != tasks.EVALUATE:
         equilibrate(f, w, a, lam)
     return code
 
@@ -115,19 +85,19 @@ def evaluate(f, w, t, q, v, tolerance, a):
 
     Velocities and accelerations are those of a Jacobian whose position is off by w.notes[REUSE] at most.
     """
-    return f.inner(f, w, EVALUATE, t, q, v, tolerance, a, w.lam)
+    return f.inner(f, w, tasks.EVALUATE, t, q, v, tolerance, a, w.lam)
 
 
 @merged
 def evaluate_state(f, w, t, q, v, tolerance, a, lam):
     """The same for a state that may be accepted: exact to rounding, with multipliers."""
-    return f.inner(f, w, EVALUATE_STATE, t, q, v, tolerance, a, lam)
+    return f.inner(f, w, tasks.EVALUATE_STATE, t, q, v, tolerance, a, lam)
 
 
 @merged
 def evaluate_there(f, w, t, q, v, a):
     """Accelerations at (q, v) as they stand, which need not be on the constraints."""
-    return f.inner(f, w, EVALUATE_THERE, t, q, v, 0.0, a, w.lam)
+    return f.inner(f, w, tasks.EVALUATE_THERE, t, q, v, 0.0, a, w.lam)
 
 
 @merged
@@ -138,70 +108,70 @@ def project(f, w, t, q, v, theta, a, lam):
     """
     if w.Rate.size > w.C.size:
         return evaluate_state(f, w, t, q, v, theta, a, lam)
-    code = f.inner(f, w, PROJECT, t, q, v, theta, a, lam)
+    code = f.inner(f, w, tasks.PROJECT, t, q, v, theta, a, lam)
     if code == DONE and has_new_entries(w.G, w.pattern):
-        code = f.inner(f, w, PATTERN, t, q, v, theta, a, lam)
+        code = f.inner(f, w, tasks.PATTERN, t, q, v, theta, a, lam)
     return code
 
 
 @merged
 def restore(f, w, t, q, v, tolerance):
     """Dependents of q and v from their independents; leaves w ready for `accelerations` at this state."""
-    return f.inner(f, w, RESTORE, t, q, v, tolerance, w.x, w.lam)
+    return f.inner(f, w, tasks.RESTORE, t, q, v, tolerance, w.x, w.lam)
 
 
 @merged
 def dependent_positions(f, w, t, q, v, tolerance):
     """Dependents of q from its independents; rows and factors in w are those at q."""
-    return f.inner(f, w, POSITIONS, t, q, v, tolerance, w.x, w.lam)
+    return f.inner(f, w, tasks.POSITIONS, t, q, v, tolerance, w.x, w.lam)
 
 
 @merged
 def accelerations(f, w, t, q, v, a, lam):
     """Eqs. (6)-(8) at a state that was restored just before: accelerations and multipliers."""
-    return f.inner(f, w, ACCELERATIONS, t, q, v, 0.0, a, lam)
+    return f.inner(f, w, tasks.ACCELERATIONS, t, q, v, 0.0, a, lam)
 
 
 @merged
 def multipliers(f, w, t, q, v, a, lam):
     """Those that belong to the accelerations found just before."""
-    return f.inner(f, w, MULTIPLIERS, t, q, v, 0.0, a, lam)
+    return f.inner(f, w, tasks.MULTIPLIERS, t, q, v, 0.0, a, lam)
 
 
 @merged
 def find_tangents(f, w, t, q):
     """Rows and factors at a position on the constraints, and the velocities that they allow, in w.D."""
-    return f.inner(f, w, TANGENTS, t, q, q, 0.0, w.x, w.lam)
+    return f.inner(f, w, tasks.TANGENTS, t, q, q, 0.0, w.x, w.lam)
 
 
 @merged
 def find_gamma(f, w, t, q, v):
     """The right-hand side of the acceleration constraints, in w.Gamma."""
-    return f.inner(f, w, GAMMA_TASK, t, q, v, 0.0, w.x, w.lam)
+    return f.inner(f, w, tasks.GAMMA_TASK, t, q, v, 0.0, w.x, w.lam)
 
 
 @merged
 def prepare_mass(f, w, t, q):
     """M(t, q) and its factors, where they are needed."""
-    return f.inner(f, w, MASS_TASK, t, q, q, 0.0, w.x, w.lam)
+    return f.inner(f, w, tasks.MASS_TASK, t, q, q, 0.0, w.x, w.lam)
 
 
 @merged
 def renew_partition(f, w, t, q):
     """Choose a partition at an accepted state, and note the sign of det C_qd that its motion has to keep."""
-    return f.inner(f, w, RENEW, t, q, q, 0.0, w.x, w.lam)
+    return f.inner(f, w, tasks.RENEW, t, q, q, 0.0, w.x, w.lam)
 
 
 @merged
 def take_midpoint(f, w, t_mid, state, new_state):
     """The partition of the middle of a step, see partition_of_midpoint."""
-    return f.inner(f, w, MIDPOINT, t_mid, state, new_state, 0.0, w.x, w.lam)
+    return f.inner(f, w, tasks.MIDPOINT, t_mid, state, new_state, 0.0, w.x, w.lam)
 
 
 @merged
 def check_redundant(f, w, t, q, v):
     """Whether the rows that were left out hold at an accepted state."""
-    return f.inner(f, w, REDUNDANT, t, q, v, 0.0, w.x, w.lam)
+    return f.inner(f, w, tasks.REDUNDANT, t, q, v, 0.0, w.x, w.lam)
 
 
 @merged

@@ -1,13 +1,7 @@
 """Rows of the constraints on velocities: C_q of C(t, q) = 0, then A of A(t, q) v + b(t, q) = 0."""
 
-from twoloop.kernels.data.common import (
-    AUGMENTED,
-    CONSTRAINT_RATE_GIVEN,
-    FORM,
-    NONHOLONOMIC_RATE_GIVEN,
-    compiled,
-    merged,
-)
+from twoloop.kernels.data.common import compiled, merged
+from twoloop.kernels.data.flags import AUGMENTED, CONSTRAINT_RATE_GIVEN, FORM, NONHOLONOMIC_RATE_GIVEN
 from twoloop.kernels.evaluation.program import jacobian_by_program
 
 

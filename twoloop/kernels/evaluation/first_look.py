@@ -3,23 +3,17 @@
 from numba import types
 
 from twoloop.kernels.algebra.linalg import ldl_factor
-from twoloop.kernels.data.common import (
+from twoloop.kernels.data.common import KIT, MATRIX, VECTOR, exact, f8, i8, kernel
+from twoloop.kernels.data.finite import finite, finite_vector
+from twoloop.kernels.data.flags import (
     CONSTANT_MASS,
     FORCE_BY_Q_GIVEN,
     FORCE_BY_V_GIVEN,
     GAMMA_GIVEN,
     KINEMATICS_GIVEN,
-    KIT,
-    MATRIX,
     NONHOLONOMIC_GAMMA_GIVEN,
     REACTION_BY_Q_GIVEN,
-    VECTOR,
-    exact,
-    f8,
-    i8,
-    kernel,
 )
-from twoloop.kernels.data.finite import finite, finite_vector
 
 # flags of what is found: all is finite, M symmetric, no row empty; the state on the rows but for rounding; an M that
 # varies definite, or not

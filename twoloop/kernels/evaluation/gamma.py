@@ -6,19 +6,9 @@ Two central differences, over a length e and over 2 e, give the derivative to or
 import numpy as np
 
 from twoloop.kernels.algebra.linalg import copy
-from twoloop.kernels.data.common import (
-    DONE,
-    GAMMA_ACCURACY,
-    GAMMA_INACCURATE,
-    GAMMA_REQUIRED,
-    GAMMA_SCALE,
-    GAMMA_SHARE,
-    KINK_AFTER,
-    KINK_BEFORE,
-    compiled,
-    exact,
-    merged,
-)
+from twoloop.kernels.data.codes import DONE, GAMMA_INACCURATE
+from twoloop.kernels.data.common import compiled, exact, merged
+from twoloop.kernels.data.noted import GAMMA_ACCURACY, GAMMA_REQUIRED, GAMMA_SCALE, GAMMA_SHARE, KINK_AFTER, KINK_BEFORE
 from twoloop.kernels.evaluation.constraints import constraint_rates, constraint_rows
 
 LENGTH, SHORTEST = 2e-4, 1e-4  # see longest_difference

@@ -6,25 +6,18 @@ Equation numbers are those of Zhang & Zhang (2016), doi 10.1007/s11071-016-2682-
 import numpy as np
 
 from twoloop.kernels.algebra.factors import columns_of, factor, rows_of, solve, solve_rows
-from twoloop.kernels.data.common import (
+from twoloop.kernels.data.codes import DONE, INNER_DIVERGED, ROWS_CONTRADICT, SINGULAR
+from twoloop.kernels.data.common import compiled, merged
+from twoloop.kernels.data.counters import N_FACTORIZATIONS, N_INNER
+from twoloop.kernels.data.finite import CONSTRAINT, JACOBIAN, finite, not_finite
+from twoloop.kernels.data.flags import (
     CONSTRAINT_RATE_GIVEN,
-    CONTRADICTION,
-    DONE,
-    FACTORED,
     FORM,
-    INNER_DIVERGED,
     KINEMATICS_GIVEN,
-    KNOWN,
-    N_FACTORIZATIONS,
-    N_INNER,
     NONHOLONOMIC_RATE_GIVEN,
     NULL_SPACE,
-    ROWS_CONTRADICT,
-    SINGULAR,
-    compiled,
-    merged,
 )
-from twoloop.kernels.data.finite import CONSTRAINT, JACOBIAN, finite, not_finite
+from twoloop.kernels.data.noted import CONTRADICTION, FACTORED, KNOWN
 from twoloop.kernels.evaluation.constraints import (
     clear_rows,
     constraint_rates,

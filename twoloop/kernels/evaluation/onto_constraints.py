@@ -9,19 +9,12 @@ accelerations to the correction itself: one that is not near rounding is followe
 import numpy as np
 
 from twoloop.kernels.algebra.saddle_point import solve
-from twoloop.kernels.data.common import (
-    DONE,
-    FORM,
-    INNER_DIVERGED,
-    KINEMATICS_GIVEN,
-    KNOWN,
-    N_INNER,
-    NULL_SPACE,
-    PIVOT,
-    ROUNDED,
-    merged,
-)
+from twoloop.kernels.data.codes import DONE, INNER_DIVERGED
+from twoloop.kernels.data.common import merged
+from twoloop.kernels.data.counters import N_INNER
 from twoloop.kernels.data.finite import CONSTRAINT, not_finite
+from twoloop.kernels.data.flags import FORM, KINEMATICS_GIVEN, NULL_SPACE
+from twoloop.kernels.data.noted import KNOWN, PIVOT, ROUNDED
 from twoloop.kernels.evaluation.accelerations import accelerate, equilibrate, factor_there
 from twoloop.kernels.evaluation.constraints import constraint_rates, kinematics, row_residual
 from twoloop.kernels.evaluation.inner import CONTRACTION, MAX_INNER, ROUNDING, factor_dependent, factor_rows, tangents

@@ -2,16 +2,10 @@
 
 import numpy as np
 
-from twoloop.kernels.data.common import (
-    BY_GENERAL,
-    DONE,
-    INNER,
-    N_EVALUATIONS,
-    N_FACTORIZATIONS,
-    N_INNER,
-    ROUNDED,
-    kernel,
-)
+from twoloop.kernels.data.codes import DONE
+from twoloop.kernels.data.common import INNER, kernel
+from twoloop.kernels.data.counters import N_EVALUATIONS, N_FACTORIZATIONS, N_INNER
+from twoloop.kernels.data.noted import BY_GENERAL, ROUNDED
 from twoloop.kernels.evaluation.inner import CONTRACTION, MAX_INNER
 from twoloop.kernels.evaluation.onto_constraints import ABOVE_ROUNDING
 from twoloop.kernels.evaluation.tasks import EVALUATE_THERE, MULTIPLIERS, PROJECT, REDUNDANT, TANGENTS

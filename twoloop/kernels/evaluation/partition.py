@@ -6,23 +6,10 @@ from twoloop.kernels.algebra.elimination import SIZE
 from twoloop.kernels.algebra.factors import factor, make_program, rows_of, sign_of
 from twoloop.kernels.algebra.linalg import copy_matrix
 from twoloop.kernels.algebra.patterns import note_pattern
-from twoloop.kernels.data.common import (
-    DONE,
-    FACTORED,
-    GENERATION,
-    LEANING,
-    N_FACTORIZATIONS,
-    N_PARTITIONS,
-    ORIENTATION,
-    PIVOT,
-    RANK,
-    RANK_DIFFERS,
-    RANK_V,
-    SENSITIVITY,
-    SINGULAR,
-    compiled,
-    merged,
-)
+from twoloop.kernels.data.codes import DONE, RANK_DIFFERS, SINGULAR
+from twoloop.kernels.data.common import compiled, merged
+from twoloop.kernels.data.counters import N_FACTORIZATIONS, N_PARTITIONS
+from twoloop.kernels.data.noted import FACTORED, GENERATION, LEANING, ORIENTATION, PIVOT, RANK, RANK_V, SENSITIVITY
 from twoloop.kernels.evaluation.constraints import constraint_rows
 
 RANK_TOLERANCE = 1e-11  # a pivot below this counts as zero; rows are scaled to 1

@@ -6,47 +6,27 @@ An exact derivative may overflow where the callback does not, as that of tanh do
 import math
 
 from twoloop.kernels.data.common import compiled, exact
-from twoloop.kernels.evaluation.operations import (
-    ARCTANGENT,
-    COSINE,
-    END,
-    EXPONENTIAL,
-    FIRST,
-    HEAD,
-    KIND,
-    LOGARITHM,
-    MADE,
-    N_COLUMNS,
-    N_NODES,
-    N_RESULTS,
-    N_ROWS,
-    N_TERMS,
-    PRODUCT,
-    RECIPROCAL,
-    SECOND,
-    SINE,
-    SQUARE_ROOT,
-)
+from twoloop.kernels.evaluation import operations as op
 
 
 @exact
 def operation(kind, x, y):
     """The result of an operation; y is the second factor of a product."""
-    if kind == PRODUCT:
+    if kind == op.PRODUCT:
         z = x * y
-    elif kind == RECIPROCAL:
+    elif kind == op.RECIPROCAL:
         z = 1.0 / x
-    elif kind == SQUARE_ROOT:
+    elif kind == op.SQUARE_ROOT:
         z = math.sqrt(x)
-    elif kind == EXPONENTIAL:
+    elif kind == op.EXPONENTIAL:
         z = math.exp(x)
-    elif kind == SINE:
+    elif kind == op.SINE:
         z = math.sin(x)
-    elif kind == COSINE:
+    elif kind == op.COSINE:
         z = math.cos(x)
-    elif kind == LOGARITHM:
+    elif kind == op.LOGARITHM:
         z = math.log(x)
-    elif kind == ARCTANGENT:
+    elif kind == op.ARCTANGENT:
         z = math.atan(x)
     else:
         z = x
@@ -65,16 +45,16 @@ def _sum(program, numbers, nodes, terms, coefficients, constant, begin, end):
 @exact
 def _run(program, numbers, nodes, t, q, v):
     """Make all nodes from t, q and v."""
-    n, n_rows = q.size, program[N_ROWS]
-    terms, coefficients = HEAD + N_COLUMNS * n_rows, 2 * n_rows
+    n, n_rows = q.size, program[op.N_ROWS]
+    terms, coefficients = op.HEAD + op.N_COLUMNS * n_rows, 2 * n_rows
     nodes[0] = t
     for j in range(n):
         nodes[1 + j] = q[j]
         nodes[1 + n + j] = v[j]
     for i in range(n_rows):
-        row = HEAD + N_COLUMNS * i
-        begin, middle, end = program[row + FIRST], program[row + SECOND], program[row + END]
-        kind, made = program[row + KIND], program[row + MADE]
+        row = op.HEAD + op.N_COLUMNS * i
+        begin, middle, end = program[row + op.FIRST], program[row + op.SECOND], program[row + op.END]
+        kind, made = program[row + op.KIND], program[row + op.MADE]
         x = _sum(program, numbers, nodes, terms, coefficients, numbers[2 * i], begin, middle)
         y = _sum(program, numbers, nodes, terms, coefficients, numbers[2 * i + 1], middle, end)
         nodes[made] = operation(kind, x, y)
@@ -83,8 +63,8 @@ def _run(program, numbers, nodes, t, q, v):
 @exact
 def _results(program):
     """How many results there are, at which node they begin, and where it stands to what they belong."""
-    n = program[N_RESULTS]
-    return n, program[N_NODES] - n, HEAD + N_COLUMNS * program[N_ROWS] + program[N_TERMS]
+    n = program[op.N_RESULTS]
+    return n, program[op.N_NODES] - n, op.HEAD + op.N_COLUMNS * program[op.N_ROWS] + program[op.N_TERMS]
 
 
 @compiled

@@ -9,24 +9,12 @@ import numpy as np
 from twoloop.kernels.algebra.linalg import copy
 from twoloop.kernels.algebra.static_factors import factor, load, refined
 from twoloop.kernels.algebra.static_program import N_PIVOTS, jacobian_of, mass_of, order_of
-from twoloop.kernels.data.common import (
-    CONSTANT_MASS,
-    DONE,
-    GENERATION,
-    JACOBIAN_VALUES_GIVEN,
-    MASS_VALUES_GIVEN,
-    N_FACTORIZATIONS,
-    N_PARTITIONS,
-    NEEDS_DENSE,
-    PIVOT,
-    RANK,
-    RANK_DIFFERS,
-    RANK_V,
-    SINGULAR,
-    SMALLEST,
-    compiled,
-)
+from twoloop.kernels.data.codes import DONE, NEEDS_DENSE, RANK_DIFFERS, SINGULAR
+from twoloop.kernels.data.common import compiled
+from twoloop.kernels.data.counters import N_FACTORIZATIONS, N_PARTITIONS
 from twoloop.kernels.data.finite import JACOBIAN, MASS, finite_vector, not_finite
+from twoloop.kernels.data.flags import CONSTANT_MASS, JACOBIAN_VALUES_GIVEN, MASS_VALUES_GIVEN
+from twoloop.kernels.data.noted import GENERATION, PIVOT, RANK, RANK_V, SMALLEST
 from twoloop.kernels.evaluation.program import jacobian_by_program
 
 SUSPECT = 1e-6  # a pivot below this share of its size is looked at: that of a redundant row is rounding

@@ -11,23 +11,13 @@ import numpy as np
 from twoloop.kernels.algebra.linalg import copy
 from twoloop.kernels.algebra.patterns import has_new_entries
 from twoloop.kernels.algebra.static_program import jacobian_of
-from twoloop.kernels.data.common import (
-    CONTRADICTION,
-    DONE,
-    GAMMA_GIVEN,
-    INNER,
-    INNER_DIVERGED,
-    N_EVALUATIONS,
-    N_INNER,
-    NEARLY_SINGULAR,
-    NEEDS_DENSE,
-    PIVOT,
-    ROUNDED,
-    ROWS_CONTRADICT,
-    compiled,
-    kernel,
-)
+from twoloop.kernels.data.codes import DONE, INNER_DIVERGED, NEEDS_DENSE, ROWS_CONTRADICT
+from twoloop.kernels.data.common import INNER, compiled, kernel
+from twoloop.kernels.data.counters import N_EVALUATIONS, N_INNER
 from twoloop.kernels.data.finite import CONSTRAINT, FORCE, GAMMA, MASS, RATE, finite_vector, not_finite
+from twoloop.kernels.data.flags import GAMMA_GIVEN
+from twoloop.kernels.data.noted import CONTRADICTION, NEARLY_SINGULAR, PIVOT, ROUNDED
+from twoloop.kernels.evaluation import tasks
 from twoloop.kernels.evaluation.constraints import constraint_rates
 from twoloop.kernels.evaluation.program import gamma_by_program
 from twoloop.kernels.evaluation.static_factors_at import (
@@ -39,21 +29,6 @@ from twoloop.kernels.evaluation.static_factors_at import (
     solve_values,
 )
 from twoloop.kernels.evaluation.static_least_norm import least_norm
-from twoloop.kernels.evaluation.tasks import (
-    ACCELERATIONS,
-    EVALUATE,
-    EVALUATE_THERE,
-    GAMMA_TASK,
-    MASS_TASK,
-    MULTIPLIERS,
-    POSITIONS,
-    PROJECT,
-    REDUNDANT,
-    RENEW,
-    RESTORE,
-    SOLVE,
-    TANGENTS,
-)
 
 MAX_INNER = 25  # Newton iterations
 CONTRACTION = 0.5  # each correction must be at most this times the one before
@@ -214,18 +189,18 @@ def _solve(f, w, r, c, a, lam):
 
 @compiled
 def _other_task(f, w, task, t, q, v, a, lam):
-    if task == TANGENTS:
+    if task == tasks.TANGENTS:
         return factors_there(f, w, t, q)
-    if task == RENEW:
+    if task == tasks.RENEW:
         return choose_rows(f, w, t, q)
-    if task == MASS_TASK:
+    if task == tasks.MASS_TASK:
         mass_values_there(f, w, t, q)
         return DONE if finite_vector(w.mass_values) else not_finite(w.notes, MASS, t, q)
-    if task == GAMMA_TASK:
+    if task == tasks.GAMMA_TASK:
         return _gamma(f, w, t, q, v)
-    if task == REDUNDANT:
+    if task == tasks.REDUNDANT:
         return _redundant_rows_hold(f, w, t, q, v)
-    if task == SOLVE:
+    if task == tasks.SOLVE:
         return _solve(f, w, q, v, a, lam)
     return NEEDS_DENSE
 
@@ -233,21 +208,21 @@ def _other_task(f, w, task, t, q, v, a, lam):
 @kernel(INNER)
 def static_inner_loop(f, w, task, t, q, v, tolerance, a, lam):
     """What the names of the tasks say, at (t, q, v), see calls.py; of SOLVE, q and v are the right-hand side."""
-    if task in (EVALUATE, EVALUATE_THERE):
+    if task in (tasks.EVALUATE, tasks.EVALUATE_THERE):
         code = DONE
-        if task == EVALUATE and w.notes[NEARLY_SINGULAR] == CAREFUL:
+        if task == tasks.EVALUATE and w.notes[NEARLY_SINGULAR] == CAREFUL:
             code = _to_constraints(f, w, t, q, v, tolerance)
         if code == DONE:
             code = factors_there(f, w, t, q)
         return _accelerate(f, w, t, q, v, a) if code == DONE else code
-    if task == MULTIPLIERS:
+    if task == tasks.MULTIPLIERS:
         return _equilibrate(f, w, lam)
-    if task >= TANGENTS:
+    if task >= tasks.TANGENTS:
         return _other_task(f, w, task, t, q, v, a, lam)
     code = DONE
-    if task != ACCELERATIONS:
-        code = _to_constraints(f, w, t, q, v, tolerance if task == PROJECT else 0.0)
-        if code != DONE or task in (RESTORE, POSITIONS):
+    if task != tasks.ACCELERATIONS:
+        code = _to_constraints(f, w, t, q, v, tolerance if task == tasks.PROJECT else 0.0)
+        if code != DONE or task in (tasks.RESTORE, tasks.POSITIONS):
             return code
     code = _accelerate(f, w, t, q, v, a)
     if code != DONE:

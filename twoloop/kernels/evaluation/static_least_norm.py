@@ -14,7 +14,8 @@ is small by s, over the columns' own size, loses the factor 1 + s^2 / SHARE each
 from twoloop.kernels.algebra.linalg import copy
 from twoloop.kernels.algebra.static_factors import factor, solve
 from twoloop.kernels.algebra.static_program import N_OFF, N_PIVOTS, jacobian_of, order_of
-from twoloop.kernels.data.common import DONE, NEEDS_DENSE, compiled
+from twoloop.kernels.data.codes import DONE, NEEDS_DENSE
+from twoloop.kernels.data.common import compiled
 
 SHARE = 1e-11  # of the squares of a column of G: W
 ENOUGH = 1e-14  # of the largest force: what may be left of b

@@ -8,20 +8,7 @@ import math
 from numba import types
 
 from twoloop.kernels.data.common import INTEGERS, KIT, MATRIX, VECTOR, exact, i8, kernel
-from twoloop.kernels.evaluation.operations import (
-    ARCTANGENT,
-    END,
-    EXPONENTIAL,
-    FIRST,
-    KIND,
-    LOGARITHM,
-    MADE,
-    PRODUCT,
-    RECIPROCAL,
-    RESULT,
-    SECOND,
-    SQUARE_ROOT,
-)
+from twoloop.kernels.evaluation import operations as op
 from twoloop.kernels.evaluation.program import operation
 
 VALUE, BOUND = range(2)  # rows of `nodes`
@@ -46,17 +33,17 @@ def _sum(columns, coefficients, constant, nodes, begin, end):
 def _operation(kind, x, dx, y, dy):
     """The result of an operation, and its bound."""
     z = operation(kind, x, y)
-    if kind == PRODUCT:
+    if kind == op.PRODUCT:
         dz = abs(x) * dy + abs(y) * dx
-    elif kind == RECIPROCAL:
+    elif kind == op.RECIPROCAL:
         dz = dx * z * z
-    elif kind == SQUARE_ROOT:
+    elif kind == op.SQUARE_ROOT:
         dz = min(0.5 * dx / z, math.sqrt(dx / EPS)) if dx > 0.0 else 0.0
-    elif kind == EXPONENTIAL:
+    elif kind == op.EXPONENTIAL:
         dz = dx * z
-    elif kind == LOGARITHM:
+    elif kind == op.LOGARITHM:
         dz = dx / abs(x)
-    elif kind == ARCTANGENT:
+    elif kind == op.ARCTANGENT:
         dz = dx / (1.0 + x * x)
     else:
         dz = dx
@@ -68,14 +55,14 @@ def _operation(kind, x, dx, y, dy):
 def _traced(program, columns, coefficients, constants, nodes, values, bounds):
     """Run the program on what stands in the first nodes."""
     for i in range(len(program)):
-        first, second, end = program[i, FIRST], program[i, SECOND], program[i, END]
+        first, second, end = program[i, op.FIRST], program[i, op.SECOND], program[i, op.END]
         x, dx = _sum(columns, coefficients, constants[i, 0], nodes, first, second)
-        if program[i, KIND] == RESULT:
-            values[program[i, MADE]], bounds[program[i, MADE]] = x, dx
+        if program[i, op.KIND] == op.RESULT:
+            values[program[i, op.MADE]], bounds[program[i, op.MADE]] = x, dx
         else:
             y, dy = _sum(columns, coefficients, constants[i, 1], nodes, second, end)
-            z, dz = _operation(program[i, KIND], x, dx, y, dy)
-            nodes[VALUE, program[i, MADE]], nodes[BOUND, program[i, MADE]] = z, dz
+            z, dz = _operation(program[i, op.KIND], x, dx, y, dy)
+            nodes[VALUE, program[i, op.MADE]], nodes[BOUND, program[i, op.MADE]] = z, dz
 
 
 @exact

@@ -14,19 +14,10 @@ g_i = int c_i ds and G_i = int (1 - s) c_i ds give velocities and positions; all
 import numpy as np
 
 from twoloop.kernels.control.predictor import departure, keep_predicted
-from twoloop.kernels.data.common import (
-    ATOL,
-    ATTEMPT,
-    DONE,
-    N_OUTER,
-    RTOL,
-    SETTLE,
-    Attempt,
-    Step,
-    inlined,
-    kernel,
-    merged,
-)
+from twoloop.kernels.data.codes import DONE
+from twoloop.kernels.data.common import ATTEMPT, SETTLE, Attempt, Step, inlined, kernel, merged
+from twoloop.kernels.data.counters import N_OUTER
+from twoloop.kernels.data.tolerances import ATOL, RTOL
 from twoloop.kernels.evaluation.calls import evaluate_there, project
 
 HIGHEST = 12  # order; with orders above 13 the nodes below would not do

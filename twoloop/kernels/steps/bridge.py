@@ -11,20 +11,11 @@ import numpy as np
 from twoloop.kernels.algebra.linalg import copy
 from twoloop.kernels.control.controller import nothing_to_settle
 from twoloop.kernels.control.predictor import keep_predicted
-from twoloop.kernels.data.common import (
-    ATTEMPT,
-    DONE,
-    ESTIMATE,
-    N_OUTER,
-    ORIENTATION,
-    ORIENTATION_NEW,
-    PIVOT,
-    SINGULAR,
-    Attempt,
-    Step,
-    kernel,
-)
-from twoloop.kernels.data.tolerances import allowed
+from twoloop.kernels.data.codes import DONE, SINGULAR
+from twoloop.kernels.data.common import ATTEMPT, Attempt, Step, kernel
+from twoloop.kernels.data.counters import N_OUTER
+from twoloop.kernels.data.noted import ORIENTATION, ORIENTATION_NEW, PIVOT
+from twoloop.kernels.data.tolerances import ESTIMATE, allowed
 from twoloop.kernels.evaluation.calls import accelerations, evaluate_state, find_tangents, renew_partition
 from twoloop.kernels.steps.explicit_step import (
     COARSE,

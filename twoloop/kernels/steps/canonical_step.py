@@ -19,30 +19,12 @@ from twoloop.kernels.control.compensated_sums import N_RESTS, compensated, forge
 from twoloop.kernels.control.convergence import CONVERGED, MAX_ITERATIONS, UNDECIDED, judged
 from twoloop.kernels.control.predictor import departure, keep_predicted
 from twoloop.kernels.control.richardson import conclude
-from twoloop.kernels.data.common import (
-    ATTEMPT,
-    CONSTANT_MASS,
-    DONE,
-    ESTIMATE,
-    MASS_NOT_DEFINITE,
-    N_EVALUATIONS,
-    N_FACTORIZATIONS,
-    N_OUTER,
-    N_PARTITIONS,
-    OUTER_DIVERGED,
-    SETTLE,
-    Attempt,
-    Step,
-    compiled,
-    inlined,
-    kernel,
-)
-from twoloop.kernels.evaluation.calls import (
-    accelerations,
-    dependent_positions,
-    find_gamma,
-    find_tangents,
-)
+from twoloop.kernels.data.codes import DONE, MASS_NOT_DEFINITE, OUTER_DIVERGED
+from twoloop.kernels.data.common import ATTEMPT, SETTLE, Attempt, Step, compiled, inlined, kernel
+from twoloop.kernels.data.counters import N_EVALUATIONS, N_FACTORIZATIONS, N_OUTER, N_PARTITIONS
+from twoloop.kernels.data.flags import CONSTANT_MASS
+from twoloop.kernels.data.tolerances import ESTIMATE
+from twoloop.kernels.evaluation.calls import accelerations, dependent_positions, find_gamma, find_tangents
 from twoloop.kernels.evaluation.gamma import longest_difference
 from twoloop.kernels.steps.stages import EXTRAPOLATION, FARTHEST, INNER_TOL, OUTER_TOL, STAGES, interpolate, tableau_of
 

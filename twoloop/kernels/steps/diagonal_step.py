@@ -20,52 +20,17 @@ from numpy.typing import ArrayLike, NDArray
 
 from twoloop.kernels.algebra.linalg import copy
 from twoloop.kernels.control.predictor import departure, keep_predicted
-from twoloop.kernels.data.common import (
-    ATTEMPT,
-    BANDWIDTH,
-    DONE,
-    ESTIMATE,
-    FORCE_BY_Q_GIVEN,
-    FORM,
-    GENERATION,
-    N_OUTER,
-    OUTER_DIVERGED,
-    SETTLE,
-    STATIC,
-    Attempt,
-    Step,
-    compiled,
-    inlined,
-    kernel,
-    merged,
-)
-from twoloop.kernels.data.tolerances import allowed
+from twoloop.kernels.data.codes import DONE, OUTER_DIVERGED
+from twoloop.kernels.data.common import ATTEMPT, SETTLE, Attempt, Step, compiled, inlined, kernel, merged
+from twoloop.kernels.data.counters import N_OUTER
+from twoloop.kernels.data.flags import BANDWIDTH, FORCE_BY_Q_GIVEN, FORM, STATIC
+from twoloop.kernels.data.noted import GENERATION
+from twoloop.kernels.data.tolerances import ESTIMATE, allowed
 from twoloop.kernels.evaluation.calls import evaluate, evaluate_state, multipliers
+from twoloop.kernels.steps import newton_memory as at
 from twoloop.kernels.steps.iteration_matrix import factor_iteration, filter_by_iteration, solve_iteration
 from twoloop.kernels.steps.lasting import lasting_error
-from twoloop.kernels.steps.newton_memory import (
-    A_MID,
-    A_NEW,
-    CONTRACTION,
-    E_Q,
-    E_V,
-    FRESH,
-    H_FACTORED,
-    HAS_JACOBIAN,
-    HAS_TRIAL,
-    LASTING,
-    N_EIGEN_SCALARS,
-    PARTITION_NUMBER,
-    PREVIOUS,
-    Q_MID,
-    RESIDUAL,
-    TRIAL,
-    V_MID,
-    VELOCITIES,
-    block,
-    memory_size,
-    vector,
-)
+from twoloop.kernels.steps.newton_memory import block, memory_size, vector
 from twoloop.kernels.steps.newton_operator import correct, derivatives_at, factor_systems, filter_error
 from twoloop.kernels.steps.stages import INNER_TOL, N_SCALARS, OUTER_TOL, STAGES, options_array
 
@@ -79,7 +44,7 @@ FILTERED = 3  # times: with fewer the extrapolated method is unstable for vibrat
 # `options` are those of a Newton method of one stage, A = [[gamma]]; then this method's stages, A, c and b - b^, and 1
 # if steps with an error estimate go on from the embedded formula
 PLACE = N_SCALARS + 2 + 5
-TAIL = PLACE + N_EIGEN_SCALARS + 1 + 2 + 4
+TAIL = PLACE + at.N_EIGEN_SCALARS + 1 + 2 + 4
 
 
 def diagonal_options(
@@ -149,17 +114,17 @@ def _one(options):
 @compiled
 def _prepare(f, w, options, memory, t, h, Q, V, F):
     """The factors for an iteration at (Q, V), evaluated just before with accelerations F: DONE, or why not."""
-    if f.flags[FORCE_BY_Q_GIVEN] == 1 or memory[HAS_JACOBIAN] == 0.0:
+    if f.flags[FORCE_BY_Q_GIVEN] == 1 or memory[at.HAS_JACOBIAN] == 0.0:
         multipliers(f, w, t, Q, V, F, w.lam)
-        memory[HAS_JACOBIAN] = 1.0
-        memory[FRESH] = 1.0
-        memory[H_FACTORED] = 0.0
+        memory[at.HAS_JACOBIAN] = 1.0
+        memory[at.FRESH] = 1.0
+        memory[at.H_FACTORED] = 0.0
         if _dense_tangents(f, w):
             return factor_iteration(f, w, memory, t, Q, V, h * _gamma(options))
         code = derivatives_at(f, w, options, memory, _one(options), t, Q, V, F)
         if code != DONE:
             return code
-    if memory[H_FACTORED] != h:
+    if memory[at.H_FACTORED] != h:
         return factor_systems(f, w, options, memory, _one(options), h)
     return DONE
 
@@ -169,9 +134,9 @@ def _solve_stage(f, w, options, memory, t, h, tolerances, A_stage):
     """Newton's method for one stage, predicted in A_stage (1, n_q): DONE, or why not; (Q, V) in Q_MID, V_MID."""
     n = w.Q.size
     z = h * _gamma(options)
-    q_bar, v_bar = block(memory, 1, n, PREVIOUS)[0], block(memory, 1, n, TRIAL)[0]
-    Q, V, F = vector(memory, 1, n, Q_MID), vector(memory, 1, n, V_MID), vector(memory, 1, n, A_MID)
-    residual = block(memory, 1, n, RESIDUAL)
+    q_bar, v_bar = block(memory, 1, n, at.PREVIOUS)[0], block(memory, 1, n, at.TRIAL)[0]
+    Q, V, F = vector(memory, 1, n, at.Q_MID), vector(memory, 1, n, at.V_MID), vector(memory, 1, n, at.A_MID)
+    residual = block(memory, 1, n, at.RESIDUAL)
     a = A_stage[0]
     tangents_given = f.flags[FORCE_BY_Q_GIVEN] == 1
     before = 0.0
@@ -192,14 +157,14 @@ def _solve_stage(f, w, options, memory, t, h, tolerances, A_stage):
                 a[m] = F[m]
         code = _prepare(f, w, options, memory, t, h, Q, V, F)
         if code != DONE:
-            memory[HAS_JACOBIAN] = 0.0
+            memory[at.HAS_JACOBIAN] = 0.0
             return code
         if _dense_tangents(f, w):
             solve_iteration(w, memory, residual[0], a)
         else:
             correct(f, w, options, memory, _one(options), residual, A_stage)
         change = 0.0
-        share = max(z / scale_q, SHARE_OF_VELOCITY * min(memory[LASTING] / scale_q, 1.0 / scale_v))
+        share = max(z / scale_q, SHARE_OF_VELOCITY * min(memory[at.LASTING] / scale_q, 1.0 / scale_v))
         for m in w.independent:
             change = max(change, z * abs(residual[0, m]) * share)
         if not np.isfinite(change):
@@ -207,7 +172,7 @@ def _solve_stage(f, w, options, memory, t, h, tolerances, A_stage):
         contraction = 0.0
         if iteration > 0 and before > 0.0:
             contraction = change / before
-            memory[CONTRACTION] = contraction
+            memory[at.CONTRACTION] = contraction
         if tangents_given and change <= options[OUTER_TOL]:
             break
         if iteration > 0:
@@ -216,8 +181,8 @@ def _solve_stage(f, w, options, memory, t, h, tolerances, A_stage):
             share = 1.0 if tangents_given else SHARE_IF_LINEAR
             if contraction < 1.0 and contraction / (1.0 - contraction) * change <= share * options[OUTER_TOL]:
                 break
-            if contraction > KEPT_WHILE and memory[FRESH] == 0.0:
-                memory[HAS_JACOBIAN] = 0.0
+            if contraction > KEPT_WHILE and memory[at.FRESH] == 0.0:
+                memory[at.HAS_JACOBIAN] = 0.0
         if iteration == MAX_ITERATIONS - 1:
             return OUTER_DIVERGED
         before = change
@@ -248,8 +213,8 @@ def _error(f, w, options, memory, h, tolerances, state, new_state, V_stage, A_st
     """
     n = w.Q.size
     q, v, q1, v1 = state[:n], state[n : 2 * n], new_state[:n], new_state[n : 2 * n]
-    e_q, e_v = vector(memory, 1, n, E_Q), vector(memory, 1, n, E_V)
-    raw, once = vector(memory, 1, n, A_NEW), vector(memory, 1, n, A_MID)
+    e_q, e_v = vector(memory, 1, n, at.E_Q), vector(memory, 1, n, at.E_V)
+    raw, once = vector(memory, 1, n, at.A_NEW), vector(memory, 1, n, at.A_MID)
     count = w.independent.size
     for i in range(count):
         j = w.independent[i]
@@ -266,7 +231,7 @@ def _error(f, w, options, memory, h, tolerances, state, new_state, V_stage, A_st
         j = w.independent[i]
         scale = allowed(tolerances, j, q[j], q1[j])
         error = max(error, abs(e_q[i]) / scale)
-        if options[PLACE + VELOCITIES] == 1.0:
+        if options[PLACE + at.VELOCITIES] == 1.0:
             scale = allowed(tolerances, j, v[j], v1[j])
             error = max(error, abs(e_v[i]) / scale)
     copy(e_v, once)
@@ -278,7 +243,7 @@ def _error(f, w, options, memory, h, tolerances, state, new_state, V_stage, A_st
 @compiled
 def _extrapolate(f, w, options, memory, h, q1, v1):
     """From the end of the step by the formula to that of the embedded one; its difference was filtered twice."""
-    e_q, e_v = vector(memory, 1, w.Q.size, E_Q), vector(memory, 1, w.Q.size, E_V)
+    e_q, e_v = vector(memory, 1, w.Q.size, at.E_Q), vector(memory, 1, w.Q.size, at.E_V)
     for _ in range(2, FILTERED):
         _filter(f, w, options, memory, h, e_q, e_v)
     for i in range(w.independent.size):
@@ -293,7 +258,7 @@ def settle_diagonal(f, w, options, memory, tolerances, accepted):
         s = int(options[TAIL])
         _, A_stage, a_end = _stages(memory, s, w.Q.size)
         copy(A_stage[s - 1], a_end)  # F at the state would magnify what Newton's method left by stiffness
-        memory[FRESH] = 0.0
+        memory[at.FRESH] = 0.0
 
 
 @kernel(ATTEMPT, vectorized=True)
@@ -307,17 +272,17 @@ def diagonal_step(f, w, options, memory, t, h, tolerances, state, new_state):
     q, v, a = state[:n], state[n : 2 * n], state[2 * n : 3 * n]
     q1, v1, a1, lam1 = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n], new_state[3 * n :]
     V_stage, A_stage, a_end = _stages(memory, s, n)
-    if memory[HAS_TRIAL] == 0.0 or memory[PARTITION_NUMBER] != w.notes[GENERATION]:
-        memory[HAS_TRIAL] = 1.0
-        memory[PARTITION_NUMBER] = w.notes[GENERATION]
-        memory[HAS_JACOBIAN] = 0.0
+    if memory[at.HAS_TRIAL] == 0.0 or memory[at.PARTITION_NUMBER] != w.notes[GENERATION]:
+        memory[at.HAS_TRIAL] = 1.0
+        memory[at.PARTITION_NUMBER] = w.notes[GENERATION]
+        memory[at.HAS_JACOBIAN] = 0.0
         copy(a, a_end)
-    if memory[FRESH] == 0.0 and memory[CONTRACTION] > KEPT_WHILE:
-        memory[HAS_JACOBIAN] = 0.0
+    if memory[at.FRESH] == 0.0 and memory[at.CONTRACTION] > KEPT_WHILE:
+        memory[at.HAS_JACOBIAN] = 0.0
     copy(v, V_stage[0])
     copy(a_end, A_stage[0])
-    q_bar, v_bar = block(memory, 1, n, PREVIOUS)[0], block(memory, 1, n, TRIAL)[0]
-    Q, V = vector(memory, 1, n, Q_MID), vector(memory, 1, n, V_MID)
+    q_bar, v_bar = block(memory, 1, n, at.PREVIOUS)[0], block(memory, 1, n, at.TRIAL)[0]
+    Q, V = vector(memory, 1, n, at.Q_MID), vector(memory, 1, n, at.V_MID)
     for j in range(1, s):
         for m in range(n):
             in_q, in_v = 0.0, 0.0
@@ -328,12 +293,12 @@ def diagonal_step(f, w, options, memory, t, h, tolerances, state, new_state):
             v_bar[m] = v[m] + h * in_v
         copy(A_stage[j - 1], A_stage[j])
         code = _solve_stage(f, w, options, memory, t + c[j] * h, h, tolerances, A_stage[j : j + 1])
-        if code != DONE and memory[FRESH] == 0.0:
-            memory[HAS_JACOBIAN] = 0.0
+        if code != DONE and memory[at.FRESH] == 0.0:
+            memory[at.HAS_JACOBIAN] = 0.0
             copy(A_stage[j - 1], A_stage[j])
             code = _solve_stage(f, w, options, memory, t + c[j] * h, h, tolerances, A_stage[j : j + 1])
         if code != DONE:
-            memory[HAS_JACOBIAN] = 0.0
+            memory[at.HAS_JACOBIAN] = 0.0
             return Attempt(code, np.inf, 0.0)
         copy(V, V_stage[j])
     copy(V, v1)

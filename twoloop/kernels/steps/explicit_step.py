@@ -12,23 +12,11 @@ from numpy.typing import ArrayLike, NDArray
 from twoloop.kernels.algebra.linalg import copy
 from twoloop.kernels.control.controller import nothing_to_settle
 from twoloop.kernels.control.predictor import departure, keep_predicted
-from twoloop.kernels.data.common import (
-    ATOL,
-    ATTEMPT,
-    DONE,
-    ESTIMATE,
-    N_EVALUATIONS,
-    N_FACTORIZATIONS,
-    N_OUTER,
-    NEARLY_SINGULAR,
-    RTOL,
-    Attempt,
-    Step,
-    compiled,
-    inlined,
-    kernel,
-    merged,
-)
+from twoloop.kernels.data.codes import DONE
+from twoloop.kernels.data.common import ATTEMPT, Attempt, Step, compiled, inlined, kernel, merged
+from twoloop.kernels.data.counters import N_EVALUATIONS, N_FACTORIZATIONS, N_OUTER
+from twoloop.kernels.data.noted import NEARLY_SINGULAR
+from twoloop.kernels.data.tolerances import ATOL, ESTIMATE, RTOL
 from twoloop.kernels.evaluation.calls import evaluate, evaluate_state, evaluate_there, project
 from twoloop.kernels.evaluation.tasks import EVALUATE_THERE
 

@@ -10,7 +10,9 @@ from twoloop.kernels.algebra.linalg import copy
 from twoloop.kernels.control.compensated_sums import compensated, forget
 from twoloop.kernels.control.convergence import CONVERGED, MAX_ITERATIONS, UNDECIDED, judged
 from twoloop.kernels.control.predictor import restore_predicted
-from twoloop.kernels.data.common import DONE, N_OUTER, OUTER_DIVERGED, compiled, merged
+from twoloop.kernels.data.codes import DONE, OUTER_DIVERGED
+from twoloop.kernels.data.common import compiled, merged
+from twoloop.kernels.data.counters import N_OUTER
 from twoloop.kernels.evaluation.calls import evaluate, restore
 from twoloop.kernels.steps.stages import INNER_TOL, OUTER_TEST, OUTER_TOL, tableau_of
 

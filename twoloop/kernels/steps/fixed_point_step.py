@@ -6,27 +6,12 @@ from twoloop.kernels.algebra.linalg import copy
 from twoloop.kernels.control.compensated_sums import N_RESTS, keep_rest, rests
 from twoloop.kernels.control.controller import nothing_to_settle
 from twoloop.kernels.control.richardson import conclude
-from twoloop.kernels.data.common import (
-    ATTEMPT,
-    DONE,
-    ESTIMATE,
-    SETTLE,
-    Attempt,
-    Step,
-    inlined,
-    kernel,
-)
+from twoloop.kernels.data.codes import DONE
+from twoloop.kernels.data.common import ATTEMPT, SETTLE, Attempt, Step, inlined, kernel
+from twoloop.kernels.data.tolerances import ESTIMATE
 from twoloop.kernels.evaluation.calls import accelerations
 from twoloop.kernels.steps.fixed_point_loops import iterate_accelerations, iterate_first_order
-from twoloop.kernels.steps.stages import (
-    EXTRAPOLATION,
-    FARTHEST,
-    INNER_TOL,
-    STAGES,
-    end_error,
-    interpolate,
-    tableau_of,
-)
+from twoloop.kernels.steps.stages import EXTRAPOLATION, FARTHEST, INNER_TOL, STAGES, end_error, interpolate, tableau_of
 
 SHARE_BESIDE = 0.01  # of end_error, beside Richardson's estimate: it is there for jumps between ends and stages
 SUDDEN = 10.0  # what that has to be in the paper's procedure, which has no such estimate, before it counts

@@ -10,30 +10,14 @@ same: how T and M change with the position, in which there is no stiffness.
 """
 
 from twoloop.kernels.algebra.linalg import copy, ldl_factor, ldl_solve, lu_factor, lu_solve
-from twoloop.kernels.data.common import (
-    DONE,
-    FORCE_BY_V_GIVEN,
-    N_FACTORIZATIONS,
-    N_JACOBIANS,
-    SINGULAR,
-    compiled,
-    inlined,
-)
+from twoloop.kernels.data.codes import DONE, SINGULAR
+from twoloop.kernels.data.common import compiled, inlined
+from twoloop.kernels.data.counters import N_FACTORIZATIONS, N_JACOBIANS
+from twoloop.kernels.data.flags import FORCE_BY_V_GIVEN
 from twoloop.kernels.evaluation.calls import find_tangents
+from twoloop.kernels.steps import newton_memory as at
 from twoloop.kernels.steps.newton_dense import reduce
-from twoloop.kernels.steps.newton_memory import (
-    BY_Q,
-    BY_V,
-    DAMPED,
-    FILTER,
-    Q_MOVED,
-    SYMMETRIC,
-    SYSTEMS,
-    V_MOVED,
-    pivots_of,
-    space,
-    vector,
-)
+from twoloop.kernels.steps.newton_memory import pivots_of, space, vector
 from twoloop.kernels.steps.newton_tangents import tangent_by_q, tangent_by_v
 
 ASYMMETRY = 1e-12  # of the largest entry: what counts as rounding
@@ -57,9 +41,9 @@ def _symmetric(A):
 @compiled
 def _fill(w, memory, n, m, z, H):
     """T^T M T - z^2 T^T K T - z T^T D T into H."""
-    N, Kr, Dr = space(w, n, SYSTEMS), space(w, n, BY_Q), space(w, n, BY_V)
+    N, Kr, Dr = space(w, n, at.SYSTEMS), space(w, n, at.BY_Q), space(w, n, at.BY_V)
     square = z * z
-    if memory[DAMPED] == 1.0:
+    if memory[at.DAMPED] == 1.0:
         for i in range(m * m):
             H[i] = N[i] - square * Kr[i] - z * Dr[i]
     else:
@@ -73,29 +57,29 @@ def factor_iteration(f, w, memory, t, q, v, z):
     n = q.size
     m = w.independent.size
     w.counters[N_JACOBIANS] += 1
-    numbers = space(w, n, FILTER)
-    K, R = numbers.reshape((n, n)), space(w, n, SYSTEMS).reshape((n, n))
-    AT = space(w, n, SYSTEMS + 1)[: n * m].reshape((n, m))
-    code = tangent_by_q(f, w, t, q, v, n - 1, vector(memory, 1, n, Q_MOVED), K, R)
+    numbers = space(w, n, at.FILTER)
+    K, R = numbers.reshape((n, n)), space(w, n, at.SYSTEMS).reshape((n, n))
+    AT = space(w, n, at.SYSTEMS + 1)[: n * m].reshape((n, m))
+    code = tangent_by_q(f, w, t, q, v, n - 1, vector(memory, 1, n, at.Q_MOVED), K, R)
     if code == DONE:
         code = find_tangents(f, w, t, q)
     if code != DONE:
         return code
-    reduce(w, K, AT, _square(space(w, n, BY_Q), m))
-    memory[DAMPED] = f.flags[FORCE_BY_V_GIVEN]
+    reduce(w, K, AT, _square(space(w, n, at.BY_Q), m))
+    memory[at.DAMPED] = f.flags[FORCE_BY_V_GIVEN]
     code = tangent_by_v(f, t, q, v, n - 1, K)
     if code != DONE:
         return code
-    if memory[DAMPED] == 1.0:
-        reduce(w, K, AT, _square(space(w, n, BY_V), m))
-    reduce(w, w.M, AT, _square(space(w, n, SYSTEMS), m))
+    if memory[at.DAMPED] == 1.0:
+        reduce(w, K, AT, _square(space(w, n, at.BY_V), m))
+    reduce(w, w.M, AT, _square(space(w, n, at.SYSTEMS), m))
     w.counters[N_FACTORIZATIONS] += 1
     _fill(w, memory, n, m, z, numbers)
     H = _square(numbers, m)
-    memory[SYMMETRIC] = 0.0
+    memory[at.SYMMETRIC] = 0.0
     if _symmetric(H):
         if ldl_factor(H):
-            memory[SYMMETRIC] = 1.0
+            memory[at.SYMMETRIC] = 1.0
             return DONE
         _fill(w, memory, n, m, z, numbers)  # not definite, as of a compressed beam
     return DONE if lu_factor(H, pivots_of(memory, 1, n, 0)) > 0.0 else SINGULAR
@@ -104,8 +88,8 @@ def factor_iteration(f, w, memory, t, q, v, z):
 @compiled
 def _solve(w, memory, x):
     m = x.size
-    H = _square(space(w, w.Q.size, FILTER), m)
-    if memory[SYMMETRIC] == 1.0:
+    H = _square(space(w, w.Q.size, at.FILTER), m)
+    if memory[at.SYMMETRIC] == 1.0:
         ldl_solve(H, x)
     else:
         lu_solve(H, pivots_of(memory, 1, w.Q.size, 0), x)
@@ -116,7 +100,7 @@ def solve_iteration(w, memory, residual, a):
     """The correction of the independents of a, added; it replaces the residual (n_q)."""
     n = w.Q.size
     m = w.independent.size
-    N, x = _square(space(w, n, SYSTEMS), m), vector(memory, 1, n, V_MOVED)[:m]
+    N, x = _square(space(w, n, at.SYSTEMS), m), vector(memory, 1, n, at.V_MOVED)[:m]
     for i in range(m):
         total = 0.0
         for j in range(m):
@@ -133,8 +117,8 @@ def filter_by_iteration(w, memory, z, e_q, e_v):
     """e_v (n_dof) becomes (I - z^2 J_q - z J_v)^-1 (e_v + z J_q e_q)."""
     n = w.Q.size
     m = e_q.size
-    N, Kr = _square(space(w, n, SYSTEMS), m), _square(space(w, n, BY_Q), m)
-    x = vector(memory, 1, n, V_MOVED)[:m]
+    N, Kr = _square(space(w, n, at.SYSTEMS), m), _square(space(w, n, at.BY_Q), m)
+    x = vector(memory, 1, n, at.V_MOVED)[:m]
     for i in range(m):
         total = 0.0
         for j in range(m):

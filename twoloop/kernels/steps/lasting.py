@@ -9,7 +9,7 @@ import numpy as np
 
 from twoloop.kernels.data.common import compiled
 from twoloop.kernels.data.tolerances import allowed
-from twoloop.kernels.steps.newton_memory import LASTING
+from twoloop.kernels.steps import newton_memory as at
 
 # An error that turns back as slowly as the motion itself does is none of a vibration, and those of the next steps go
 # the same way: it counts as if it lasted so many times as long
@@ -32,8 +32,8 @@ def lasting_error(w, memory, tolerances, z, raw, once, twice, state, new_state):
         largest = max(largest, abs(twice[i]))
         turn = max(turn, abs(twice[i] - 2.0 * once[i] + raw[i]))  # (z J)^2 e
     if largest > 0.0:
-        memory[LASTING] = z * np.sqrt(largest / turn)
-    lasting = memory[LASTING]
+        memory[at.LASTING] = z * np.sqrt(largest / turn)
+    lasting = memory[at.LASTING]
     if lasting * change * TURNS > fastest:
         lasting *= min(TURNS, lasting * change * TURNS / fastest) if fastest > 0.0 else TURNS
     error = 0.0

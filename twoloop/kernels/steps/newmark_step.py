@@ -5,20 +5,10 @@ import numpy as np
 from twoloop.kernels.algebra.linalg import copy
 from twoloop.kernels.control.controller import nothing_to_settle
 from twoloop.kernels.control.predictor import departure
-from twoloop.kernels.data.common import (
-    ATOL,
-    ATTEMPT,
-    DONE,
-    ESTIMATE,
-    N_OUTER,
-    OUTER_DIVERGED,
-    RTOL,
-    Attempt,
-    Step,
-    compiled,
-    kernel,
-    merged,
-)
+from twoloop.kernels.data.codes import DONE, OUTER_DIVERGED
+from twoloop.kernels.data.common import ATTEMPT, Attempt, Step, compiled, kernel, merged
+from twoloop.kernels.data.counters import N_OUTER
+from twoloop.kernels.data.tolerances import ATOL, ESTIMATE, RTOL
 from twoloop.kernels.evaluation.calls import evaluate_state, rounding_floor
 
 MAX_ITERATIONS = 60

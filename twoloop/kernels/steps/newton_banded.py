@@ -22,32 +22,14 @@ from twoloop.kernels.algebra.banded import add_banded_mass_times, factor_bordere
 from twoloop.kernels.algebra.factors import columns_of
 from twoloop.kernels.algebra.lapack import DGBTRF, DGBTRS, ZGBTRF, ZGBTRS
 from twoloop.kernels.algebra.linalg import copy, copy_matrix
-from twoloop.kernels.data.common import (
-    BANDWIDTH,
-    DONE,
-    FORCE_BY_Q_GIVEN,
-    FORCE_BY_V_GIVEN,
-    N_EVALUATIONS,
-    N_FACTORIZATIONS,
-    N_JACOBIANS,
-    NOT_FINITE,
-    compiled,
-    inlined,
-)
+from twoloop.kernels.data.codes import DONE, NOT_FINITE
+from twoloop.kernels.data.common import compiled, inlined
+from twoloop.kernels.data.counters import N_EVALUATIONS, N_FACTORIZATIONS, N_JACOBIANS
+from twoloop.kernels.data.flags import BANDWIDTH, FORCE_BY_Q_GIVEN, FORCE_BY_V_GIVEN
 from twoloop.kernels.evaluation.calls import find_tangents
 from twoloop.kernels.evaluation.constraints import constraint_rows
+from twoloop.kernels.steps import newton_memory as at
 from twoloop.kernels.steps.newton_memory import (
-    A_NEW,
-    BY_Q,
-    BY_V,
-    DAMPED,
-    FILTER,
-    GAMMA0,
-    N_EIGEN_SCALARS,
-    N_REAL,
-    Q_MOVED,
-    SYSTEMS,
-    V_MOVED,
     complex_vector,
     count_eigenvalues,
     eigen_place,
@@ -68,7 +50,7 @@ def _band(numbers, n, b):
 @inlined
 def _constraints(w, n, r, b):
     """What stands behind K: the rows of C_q that count, w.D and the columns of its entries, where K was taken."""
-    numbers = space(w, n, BY_Q)
+    numbers = space(w, n, at.BY_Q)
     start = n * (2 * b + 1)
     Cq = numbers[start : start + r * n].reshape((r, n))
     start += r * n
@@ -123,15 +105,15 @@ def _copy_band(A, b, band):
 @compiled
 def _from_tangents(f, w, memory, s, t, q, v, b):
     n = q.size
-    K, R = space(w, n, FILTER).reshape((n, n)), space(w, n, SYSTEMS).reshape((n, n))
-    code = tangent_by_q(f, w, t, q, v, b, vector(memory, s, n, Q_MOVED), K, R)
+    K, R = space(w, n, at.FILTER).reshape((n, n)), space(w, n, at.SYSTEMS).reshape((n, n))
+    code = tangent_by_q(f, w, t, q, v, b, vector(memory, s, n, at.Q_MOVED), K, R)
     if code != DONE:
         return code
-    _copy_band(K, b, _band(space(w, n, BY_Q), n, b))
-    memory[DAMPED] = f.flags[FORCE_BY_V_GIVEN]
+    _copy_band(K, b, _band(space(w, n, at.BY_Q), n, b))
+    memory[at.DAMPED] = f.flags[FORCE_BY_V_GIVEN]
     code = tangent_by_v(f, t, q, v, b, K)
-    if memory[DAMPED] == 1.0:
-        _copy_band(K, b, _band(space(w, n, BY_V), n, b))
+    if memory[at.DAMPED] == 1.0:
+        _copy_band(K, b, _band(space(w, n, at.BY_V), n, b))
     return code
 
 
@@ -151,31 +133,31 @@ def derivatives(f, w, memory, s, t, q, v):
     copy(columns_of(w.index), columns)
     if f.flags[FORCE_BY_Q_GIVEN] == 1:
         return _from_tangents(f, w, memory, s, t, q, v, b)
-    base, moved = vector(memory, s, n, A_NEW), vector(memory, s, n, Q_MOVED)
+    base, moved = vector(memory, s, n, at.A_NEW), vector(memory, s, n, at.Q_MOVED)
     _unbalanced(f, w, t, q, v)
     copy(w.Q, base)
-    code = _difference_groups(f, w, t, q, v, False, base, moved, b, _band(space(w, n, BY_Q), n, b))
+    code = _difference_groups(f, w, t, q, v, False, base, moved, b, _band(space(w, n, at.BY_Q), n, b))
     if code != DONE:
         return code
     # one displacement of all velocities tells whether there is anything to difference
     for j in range(n):
         moved[j] = displaced_with_all(v[j], j)
     _unbalanced(f, w, t, q, moved)
-    memory[DAMPED] = 0.0
+    memory[at.DAMPED] = 0.0
     for i in range(n):
         if w.Q[i] != base[i]:
-            memory[DAMPED] = 1.0
-    if memory[DAMPED] == 0.0:
+            memory[at.DAMPED] = 1.0
+    if memory[at.DAMPED] == 0.0:
         return DONE
-    return _difference_groups(f, w, t, q, v, True, base, moved, b, _band(space(w, n, BY_V), n, b))
+    return _difference_groups(f, w, t, q, v, True, base, moved, b, _band(space(w, n, at.BY_V), n, b))
 
 
 @compiled
 def _fill(w, memory, s, b, z, numbers):
     """M - z^2 K - z D to where it is factored."""
     n = w.Q.size
-    K, D = _band(space(w, n, BY_Q), n, b), _band(space(w, n, BY_V), n, b)
-    damped = memory[DAMPED] == 1.0
+    K, D = _band(space(w, n, at.BY_Q), n, b), _band(space(w, n, at.BY_V), n, b)
+    damped = memory[at.DAMPED] == 1.0
     target = lu_band(numbers, n, b)
     for i in range(n):
         for j in range(max(0, i - b), min(n, i + b + 1)):
@@ -192,13 +174,13 @@ def factor(f, w, options, memory, s, h):
     b = f.flags[BANDWIDTH]
     place = eigen_place(options, s)
     n_eigen = count_eigenvalues(options, s)
-    n_real = int(options[place + N_REAL])
+    n_real = int(options[place + at.N_REAL])
     Cq, _, _ = _constraints(w, n, w.rows.size, b)
-    numbers = space(w, n, FILTER)
-    _fill(w, memory, s, b, h * options[place + GAMMA0], numbers)
+    numbers = space(w, n, at.FILTER)
+    _fill(w, memory, s, b, h * options[place + at.GAMMA0], numbers)
     w.counters[N_FACTORIZATIONS] += 1
     code = factor_bordered(w, b, Cq, numbers, pivots_of(memory, s, n, 0), DGBTRF, DGBTRS)
-    place += N_EIGEN_SCALARS + s
+    place += at.N_EIGEN_SCALARS + s
     for k in range(n_eigen):
         if code != DONE:
             return code
@@ -240,15 +222,15 @@ def solve(f, w, options, memory, s, k, x):
     b = f.flags[BANDWIDTH]
     n_eigen = count_eigenvalues(options, s)
     pivots = pivots_of(memory, s, n, 1 + k)
-    if k == 0 and options[eigen_place(options, s) + N_REAL] > 0.0:  # the eigenvalue is gamma0
-        real, X = vector(memory, s, n, V_MOVED), vector(memory, s, n, Q_MOVED)
+    if k == 0 and options[eigen_place(options, s) + at.N_REAL] > 0.0:  # the eigenvalue is gamma0
+        real, X = vector(memory, s, n, at.V_MOVED), vector(memory, s, n, at.Q_MOVED)
         for i in range(n):
             real[i] = x[i].real
         _all_coordinates(w, memory, s, b, real, X)
         real[:] = 0.0
         add_banded_mass_times(f, w, X, real)
         pivots = pivots_of(memory, s, n, 0)
-        _solve_for_independents(w, memory, s, b, space(w, n, FILTER), pivots, DGBTRS, real)
+        _solve_for_independents(w, memory, s, b, space(w, n, at.FILTER), pivots, DGBTRS, real)
         for i in range(n):
             x[i] = real[i]
     else:
@@ -264,8 +246,8 @@ def filter_error(f, w, options, memory, s, h, e_q, e_v):
     """e_v becomes (I - z^2 J_q - z J_v)^-1 (e_v + z J_q e_q), z = h gamma0: the first n_dof numbers of each (n_q)."""
     n = w.Q.size
     b = f.flags[BANDWIDTH]
-    z = h * options[eigen_place(options, s) + GAMMA0]
-    K, X = _band(space(w, n, BY_Q), n, b), vector(memory, s, n, Q_MOVED)
+    z = h * options[eigen_place(options, s) + at.GAMMA0]
+    K, X = _band(space(w, n, at.BY_Q), n, b), vector(memory, s, n, at.Q_MOVED)
     _all_coordinates(w, memory, s, b, e_v, X)
     e_v[:] = 0.0
     add_banded_mass_times(f, w, X, e_v)
@@ -274,4 +256,4 @@ def filter_error(f, w, options, memory, s, h, e_q, e_v):
         for j in range(max(0, i - b), min(n, i + b + 1)):
             e_v[i] += z * K[i, b + j - i] * X[j]
     pivots = pivots_of(memory, s, n, 0)
-    _solve_for_independents(w, memory, s, b, space(w, n, FILTER), pivots, DGBTRS, e_v)
+    _solve_for_independents(w, memory, s, b, space(w, n, at.FILTER), pivots, DGBTRS, e_v)

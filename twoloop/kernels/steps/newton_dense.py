@@ -9,36 +9,13 @@ converge.
 
 from twoloop.kernels.algebra.factors import columns_of
 from twoloop.kernels.algebra.linalg import copy, ldl_factor, ldl_solve_rows, lu_factor, lu_solve
-from twoloop.kernels.data.common import (
-    DONE,
-    FORCE_BY_Q_GIVEN,
-    FORCE_BY_V_GIVEN,
-    N_FACTORIZATIONS,
-    N_JACOBIANS,
-    SINGULAR,
-    compiled,
-    inlined,
-)
+from twoloop.kernels.data.codes import DONE, SINGULAR
+from twoloop.kernels.data.common import compiled, inlined
+from twoloop.kernels.data.counters import N_FACTORIZATIONS, N_JACOBIANS
+from twoloop.kernels.data.flags import FORCE_BY_Q_GIVEN, FORCE_BY_V_GIVEN
 from twoloop.kernels.evaluation.calls import evaluate, find_tangents
-from twoloop.kernels.steps.newton_memory import (
-    A_NEW,
-    BY_Q,
-    BY_V,
-    DAMPED,
-    FILTER,
-    GAMMA0,
-    N_EIGEN_SCALARS,
-    N_REAL,
-    Q_MOVED,
-    SYSTEMS,
-    V_MOVED,
-    count_eigenvalues,
-    eigen_place,
-    pivots_of,
-    space,
-    system_space,
-    vector,
-)
+from twoloop.kernels.steps import newton_memory as at
+from twoloop.kernels.steps.newton_memory import count_eigenvalues, eigen_place, pivots_of, space, system_space, vector
 from twoloop.kernels.steps.newton_tangents import DIFFERENCE, displaced_with_all, tangent_by_q, tangent_by_v
 from twoloop.kernels.steps.stages import INNER_TOL
 
@@ -78,24 +55,24 @@ def _from_tangents(f, w, memory, s, t, q, v):
     m = w.independent.size
     w.counters[N_JACOBIANS] += 1
     # factors are not needed any more: their spaces hold K or D, then T^T M T and T^T A
-    K, R = _square(space(w, n, FILTER), n), _square(space(w, n, SYSTEMS), n)
-    code = tangent_by_q(f, w, t, q, v, n - 1, vector(memory, s, n, Q_MOVED), K, R)
+    K, R = _square(space(w, n, at.FILTER), n), _square(space(w, n, at.SYSTEMS), n)
+    code = tangent_by_q(f, w, t, q, v, n - 1, vector(memory, s, n, at.Q_MOVED), K, R)
     if code != DONE:
         return code
-    AT = space(w, n, SYSTEMS + 1)[: n * m].reshape((n, m))
+    AT = space(w, n, at.SYSTEMS + 1)[: n * m].reshape((n, m))
     code = find_tangents(f, w, t, q)
     if code != DONE:
         return code
-    Jq, Jv = _square(space(w, n, BY_Q), m), _square(space(w, n, BY_V), m)
-    N = _square(space(w, n, SYSTEMS), m)
+    Jq, Jv = _square(space(w, n, at.BY_Q), m), _square(space(w, n, at.BY_V), m)
+    N = _square(space(w, n, at.SYSTEMS), m)
     reduce(w, w.M, AT, N)
     if not ldl_factor(N):
         return SINGULAR
     reduce(w, K, AT, Jq)
     ldl_solve_rows(N, Jq)
-    memory[DAMPED] = f.flags[FORCE_BY_V_GIVEN]
+    memory[at.DAMPED] = f.flags[FORCE_BY_V_GIVEN]
     code = tangent_by_v(f, t, q, v, n - 1, K)
-    if code == DONE and memory[DAMPED] == 1.0:
+    if code == DONE and memory[at.DAMPED] == 1.0:
         reduce(w, K, AT, Jv)
         ldl_solve_rows(N, Jv)
     return code
@@ -108,9 +85,9 @@ def derivatives(f, w, options, memory, s, t, q, v, a):
         return _from_tangents(f, w, memory, s, t, q, v)
     n = q.size
     m = w.independent.size
-    Jq, Jv = _square(space(w, n, BY_Q), m), _square(space(w, n, BY_V), m)
-    q_moved, v_moved = vector(memory, s, n, Q_MOVED), vector(memory, s, n, V_MOVED)
-    a_new = vector(memory, s, n, A_NEW)
+    Jq, Jv = _square(space(w, n, at.BY_Q), m), _square(space(w, n, at.BY_V), m)
+    q_moved, v_moved = vector(memory, s, n, at.Q_MOVED), vector(memory, s, n, at.V_MOVED)
+    a_new = vector(memory, s, n, at.A_NEW)
     w.counters[N_JACOBIANS] += 1
     for column in range(m):
         j = w.independent[column]
@@ -132,11 +109,11 @@ def derivatives(f, w, options, memory, s, t, q, v, a):
     code = evaluate(f, w, t, q_moved, v_moved, options[INNER_TOL], a_new)
     if code != DONE:
         return code
-    memory[DAMPED] = 0.0
+    memory[at.DAMPED] = 0.0
     for i in w.independent:
         if a_new[i] != a[i]:
-            memory[DAMPED] = 1.0
-    if memory[DAMPED] == 0.0:
+            memory[at.DAMPED] = 1.0
+    if memory[at.DAMPED] == 0.0:
         return DONE
     for column in range(m):
         j = w.independent[column]
@@ -158,13 +135,13 @@ def factor(w, options, memory, s, h):
     """Factors of I - (h l)^2 J_q - h l J_v for gamma0, real, and for the other eigenvalues l, complex."""
     n = w.Q.size
     m = w.independent.size
-    Jq, Jv = _square(space(w, n, BY_Q), m), _square(space(w, n, BY_V), m)
+    Jq, Jv = _square(space(w, n, at.BY_Q), m), _square(space(w, n, at.BY_V), m)
     place = eigen_place(options, s)
     n_eigen = count_eigenvalues(options, s)
-    n_real = int(options[place + N_REAL])
-    damped = memory[DAMPED] == 1.0
-    filter_matrix = _square(space(w, n, FILTER), m)
-    hl = h * options[place + GAMMA0]
+    n_real = int(options[place + at.N_REAL])
+    damped = memory[at.DAMPED] == 1.0
+    filter_matrix = _square(space(w, n, at.FILTER), m)
+    hl = h * options[place + at.GAMMA0]
     for i in range(m):
         for j in range(m):
             filter_matrix[i, j] = -hl * hl * Jq[i, j]
@@ -174,7 +151,7 @@ def factor(w, options, memory, s, h):
     w.counters[N_FACTORIZATIONS] += 1
     if not lu_factor(filter_matrix, pivots_of(memory, s, n, 0)) > 0.0:
         return SINGULAR
-    place += N_EIGEN_SCALARS + s
+    place += at.N_EIGEN_SCALARS + s
     for k in range(n_eigen):
         z = h * complex(options[place], options[place + 1])
         place += 2 + 4 * s
@@ -198,11 +175,11 @@ def solve(w, options, memory, s, k, x):
     """Solve the k-th eigenvalue's system; x (n_dof) is overwritten."""
     n = w.Q.size
     m = x.size
-    if k == 0 and options[eigen_place(options, s) + N_REAL] > 0.0:  # the eigenvalue is gamma0
-        real = vector(memory, s, n, V_MOVED)[:m]
+    if k == 0 and options[eigen_place(options, s) + at.N_REAL] > 0.0:  # the eigenvalue is gamma0
+        real = vector(memory, s, n, at.V_MOVED)[:m]
         for i in range(m):
             real[i] = x[i].real
-        lu_solve(_square(space(w, n, FILTER), m), pivots_of(memory, s, n, 0), real)
+        lu_solve(_square(space(w, n, at.FILTER), m), pivots_of(memory, s, n, 0), real)
         for i in range(m):
             x[i] = real[i]
     else:
@@ -214,11 +191,11 @@ def filter_error(w, options, memory, s, h, e_q, e_v):
     """e_v becomes (I - (h gamma0)^2 J_q - h gamma0 J_v)^-1 (e_v + h gamma0 J_q e_q), all (n_dof)."""
     n = w.Q.size
     m = e_q.size
-    gamma0 = options[eigen_place(options, s) + GAMMA0]
-    Jq = _square(space(w, n, BY_Q), m)
+    gamma0 = options[eigen_place(options, s) + at.GAMMA0]
+    Jq = _square(space(w, n, at.BY_Q), m)
     for i in range(m):
         total = 0.0
         for j in range(m):
             total += Jq[i, j] * e_q[j]
         e_v[i] += h * gamma0 * total
-    lu_solve(_square(space(w, n, FILTER), m), pivots_of(memory, s, n, 0), e_v)
+    lu_solve(_square(space(w, n, at.FILTER), m), pivots_of(memory, s, n, 0), e_v)

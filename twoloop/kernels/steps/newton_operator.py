@@ -5,18 +5,11 @@ structures serve: newton_dense.py, newton_banded.py where the system has a bandw
 systems, of which all coordinates count as independent.
 """
 
-from twoloop.kernels.data.common import BANDWIDTH, FORM, STATIC, compiled
+from twoloop.kernels.data.common import compiled
+from twoloop.kernels.data.flags import BANDWIDTH, FORM, STATIC
 from twoloop.kernels.steps import newton_banded, newton_dense, newton_static
-from twoloop.kernels.steps.newton_memory import (
-    H_FACTORED,
-    N_EIGEN_SCALARS,
-    N_REAL,
-    Q_STAGE,
-    block,
-    complex_vector,
-    count_eigenvalues,
-    eigen_place,
-)
+from twoloop.kernels.steps import newton_memory as at
+from twoloop.kernels.steps.newton_memory import block, complex_vector, count_eigenvalues, eigen_place
 
 MAX_ITERATIONS = 15
 STAGNATION = 0.1  # of the step tolerance: corrections of this size that no longer shrink are rounding
@@ -41,7 +34,7 @@ def factor_systems(f, w, options, memory, s, h):
         code = newton_banded.factor(f, w, options, memory, s, h)
     else:
         code = newton_dense.factor(w, options, memory, s, h)
-    memory[H_FACTORED] = h
+    memory[at.H_FACTORED] = h
     return code
 
 
@@ -74,11 +67,11 @@ def correct(f, w, options, memory, s, residual, A_stage):
     n = w.Q.size
     m = w.independent.size
     place = eigen_place(options, s)
-    n_real = int(options[place + N_REAL])
+    n_real = int(options[place + at.N_REAL])
     n_eigen = count_eigenvalues(options, s)
     x = complex_vector(memory, s, n, n_eigen, 0)
-    place += N_EIGEN_SCALARS + s
-    d = block(memory, s, n, Q_STAGE)  # free between two evaluations
+    place += at.N_EIGEN_SCALARS + s
+    d = block(memory, s, n, at.Q_STAGE)  # free between two evaluations
     d[:, :] = 0.0
     for k in range(n_eigen):
         row = place + 2

@@ -17,27 +17,13 @@ from twoloop.kernels.algebra.static_lu import factor as factor_lu
 from twoloop.kernels.algebra.static_lu import load, tangents_of
 from twoloop.kernels.algebra.static_lu import solve as solve_lu
 from twoloop.kernels.algebra.static_program import N_OF_MASS, N_OFF, N_PIVOTS, jacobian_of, mass_of
-from twoloop.kernels.data.common import (
-    DONE,
-    N_EVALUATIONS,
-    N_FACTORIZATIONS,
-    N_JACOBIANS,
-    NEEDS_DENSE,
-    NOT_FINITE,
-    SINGULAR,
-    compiled,
-    inlined,
-)
+from twoloop.kernels.data.codes import DONE, NEEDS_DENSE, NOT_FINITE, SINGULAR
+from twoloop.kernels.data.common import compiled, inlined
+from twoloop.kernels.data.counters import N_EVALUATIONS, N_FACTORIZATIONS, N_JACOBIANS
 from twoloop.kernels.data.finite import finite_vector
 from twoloop.kernels.evaluation.static_factors_at import jacobian_values_there
-from twoloop.kernels.steps.newton_memory import (
-    DAMPED,
-    GAMMA0,
-    N_EIGEN_SCALARS,
-    N_REAL,
-    count_eigenvalues,
-    eigen_place,
-)
+from twoloop.kernels.steps import newton_memory as at
+from twoloop.kernels.steps.newton_memory import count_eigenvalues, eigen_place
 from twoloop.kernels.steps.newton_tangents import DIFFERENCE, displaced_with_all
 
 MISSED = 0.2  # of what the entries of a row say of a displacement: more is said by entries that are missing
@@ -180,11 +166,11 @@ def derivatives(f, w, memory, t, q, v):
     for j in range(q.size):
         moved[j] = displaced_with_all(v[j], j)
     _unbalanced(f, w, t, q, moved, False, other)
-    memory[DAMPED] = 0.0
+    memory[at.DAMPED] = 0.0
     for i in range(q.size):
         if other[i] != base[i]:
-            memory[DAMPED] = 1.0
-    if memory[DAMPED] == 0.0:
+            memory[at.DAMPED] = 1.0
+    if memory[at.DAMPED] == 0.0:
         D[:] = 0.0
         return DONE if complete else NEEDS_DENSE
     code = _difference(f, w, t, q, v, True, base, other, moved, D)
@@ -210,9 +196,9 @@ def _factor(f, w, z, values):
 def factor(f, w, options, s, h):
     """Factors for gamma0, real, and for the eigenvalues, complex."""
     place = eigen_place(options, s)
-    n_eigen, n_real = count_eigenvalues(options, s), int(options[place + N_REAL])
-    code = _factor(f, w, h * options[place + GAMMA0], _factors(f, w, 0))
-    place += N_EIGEN_SCALARS + s
+    n_eigen, n_real = count_eigenvalues(options, s), int(options[place + at.N_REAL])
+    code = _factor(f, w, h * options[place + at.GAMMA0], _factors(f, w, 0))
+    place += at.N_EIGEN_SCALARS + s
     for k in range(n_eigen):
         if code == DONE and (k > 0 or n_real == 0):  # else the eigenvalue is gamma0
             z = h * complex(options[place], options[place + 1])
@@ -239,7 +225,7 @@ def solve(f, w, options, s, k, x):
     """Solve the k-th eigenvalue's system; x (n_q) is overwritten."""
     _, _, real, _, right, y = _vectors(f, w)
     n, n_q = y.size, x.size
-    if k == 0 and options[eigen_place(options, s) + N_REAL] > 0.0:  # the eigenvalue is gamma0
+    if k == 0 and options[eigen_place(options, s) + at.N_REAL] > 0.0:  # the eigenvalue is gamma0
         for i in range(n_q):
             real[i] = x[i].real
         _right(f, w, real, right.view(np.float64)[:n])
@@ -257,7 +243,7 @@ def filter_error(f, w, options, s, h, e_q, e_v):
     """e_v becomes (I - z^2 J_q - z J_v)^-1 (e_v + z J_q e_q), z = h gamma0."""
     _, _, K, _, _, _ = _state(f, w)
     _, _, _, _, right, y = _vectors(f, w)
-    z, n = h * options[eigen_place(options, s) + GAMMA0], y.size
+    z, n = h * options[eigen_place(options, s) + at.GAMMA0], y.size
     x = right.view(np.float64)[:n]
     _right(f, w, e_v, x)
     rows, columns, _ = tangents_of(f.newton_program)

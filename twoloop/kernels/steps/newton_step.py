@@ -18,53 +18,16 @@ from numpy.typing import NDArray
 
 from twoloop.kernels.algebra.linalg import copy
 from twoloop.kernels.control.predictor import restore_predicted
-from twoloop.kernels.data.common import (
-    ATTEMPT,
-    DONE,
-    ESTIMATE,
-    FORM,
-    GENERATION,
-    LEAST,
-    N_OUTER,
-    OUTER_DIVERGED,
-    SETTLE,
-    STATIC,
-    Attempt,
-    Step,
-    compiled,
-    kernel,
-)
-from twoloop.kernels.data.tolerances import allowed
+from twoloop.kernels.data.codes import DONE, OUTER_DIVERGED
+from twoloop.kernels.data.common import ATTEMPT, SETTLE, Attempt, Step, compiled, kernel
+from twoloop.kernels.data.counters import N_OUTER
+from twoloop.kernels.data.flags import FORM, STATIC
+from twoloop.kernels.data.noted import GENERATION
+from twoloop.kernels.data.tolerances import ESTIMATE, LEAST, allowed
 from twoloop.kernels.evaluation.calls import accelerations, evaluate, multipliers
+from twoloop.kernels.steps import newton_memory as at
 from twoloop.kernels.steps.lasting import lasting_error
-from twoloop.kernels.steps.newton_memory import (
-    A_MID,
-    A_NEW,
-    CONTRACTION,
-    E_Q,
-    E_V,
-    FRESH,
-    GAMMA0,
-    H_FACTORED,
-    H_PREVIOUS,
-    H_TRIAL,
-    HAS_JACOBIAN,
-    HAS_PREVIOUS,
-    HAS_TRIAL,
-    N_EIGEN_SCALARS,
-    PARTITION_NUMBER,
-    PREVIOUS,
-    Q_MID,
-    Q_STAGE,
-    RESIDUAL,
-    TRIAL,
-    V_MID,
-    V_STAGE,
-    VELOCITIES,
-    block,
-    eigen_place,
-    vector,
-)
+from twoloop.kernels.steps.newton_memory import block, eigen_place, vector
 from twoloop.kernels.steps.newton_operator import (
     MAX_ITERATIONS,
     STAGNATION,
@@ -128,9 +91,9 @@ def _iterate(f, w, options, memory, t, h, tolerances, q, v, A_stage):
     """Newton's method for the stage accelerations, predicted in A_stage: DONE, or why not."""
     s, A, A2, _, _, c = tableau_of(options)
     n = q.size
-    residual = block(memory, s, n, RESIDUAL)
-    Q_stage, V_stage = block(memory, s, n, Q_STAGE), block(memory, s, n, V_STAGE)
-    a_new = vector(memory, s, n, A_NEW)
+    residual = block(memory, s, n, at.RESIDUAL)
+    Q_stage, V_stage = block(memory, s, n, at.Q_STAGE), block(memory, s, n, at.V_STAGE)
+    a_new = vector(memory, s, n, at.A_NEW)
     before = 0.0
     floor = STAGNATION_FIXED
     if tolerances[ESTIMATE] == 1.0:
@@ -179,7 +142,7 @@ def _iterate(f, w, options, memory, t, h, tolerances, q, v, A_stage):
             return OUTER_DIVERGED
         if iteration > 0:
             contraction = change / before if before > 0.0 else 0.0
-            memory[CONTRACTION] = contraction
+            memory[at.CONTRACTION] = contraction
             if contraction >= 0.9:
                 return DONE if change <= floor else OUTER_DIVERGED
             if contraction / (1.0 - contraction) * change <= options[OUTER_TOL]:
@@ -201,7 +164,7 @@ def _filter(f, w, options, memory, h, e_q, e_v):
     m = w.independent.size
     filter_error(f, w, options, memory, s, h, e_q, e_v)
     for i in range(m):
-        e_q[i] += h * options[eigen_place(options, s) + GAMMA0] * e_v[i]
+        e_q[i] += h * options[eigen_place(options, s) + at.GAMMA0] * e_v[i]
 
 
 @compiled
@@ -211,10 +174,10 @@ def _estimate(f, w, options, memory, h, tolerances, state, new_state, A_stage):
     n = w.Q.size
     q, v, a, q1, v1 = state[:n], state[n : 2 * n], state[2 * n : 3 * n], new_state[:n], new_state[n : 2 * n]
     place = eigen_place(options, s)
-    gamma0 = options[place + GAMMA0]
-    e = options[place + N_EIGEN_SCALARS : place + N_EIGEN_SCALARS + s]
-    e_q, e_v = vector(memory, s, n, E_Q), vector(memory, s, n, E_V)
-    raw, once = vector(memory, s, n, A_NEW), vector(memory, s, n, A_MID)
+    gamma0 = options[place + at.GAMMA0]
+    e = options[place + at.N_EIGEN_SCALARS : place + at.N_EIGEN_SCALARS + s]
+    e_q, e_v = vector(memory, s, n, at.E_Q), vector(memory, s, n, at.E_V)
+    raw, once = vector(memory, s, n, at.A_NEW), vector(memory, s, n, at.A_MID)
     for i in range(w.independent.size):
         j = w.independent[i]
         in_q = gamma0 * v[j]
@@ -233,9 +196,9 @@ def _estimate(f, w, options, memory, h, tolerances, state, new_state, A_stage):
     for i in range(w.independent.size):
         j = w.independent[i]
         error = max(error, abs(e_q[i]) / allowed(tolerances, j, q[j], q1[j]))
-        if options[place + VELOCITIES] == 1.0:
+        if options[place + at.VELOCITIES] == 1.0:
             error = max(error, abs(e_v[i]) / allowed(tolerances, j, v[j], v1[j]))
-    if options[place + VELOCITIES] == 1.0:
+    if options[place + at.VELOCITIES] == 1.0:
         return error
     copy(e_v, once)
     _filter(f, w, options, memory, h, e_q, e_v)
@@ -247,13 +210,13 @@ def settle_newton(f, w, options, memory, tolerances, accepted):
     """The stages of an accepted step are what the next one is predicted from; its state is another than the last."""
     s, n = int(options[STAGES]), w.Q.size
     if accepted:
-        memory[FRESH] = 0.0
-        if memory[HAS_TRIAL] == 1.0:
+        memory[at.FRESH] = 0.0
+        if memory[at.HAS_TRIAL] == 1.0:
             for j in range(s):
-                copy(block(memory, s, n, TRIAL)[j], block(memory, s, n, PREVIOUS)[j])
-            memory[H_PREVIOUS] = memory[H_TRIAL]
-            memory[HAS_PREVIOUS] = 1.0
-    memory[HAS_TRIAL] = 0.0
+                copy(block(memory, s, n, at.TRIAL)[j], block(memory, s, n, at.PREVIOUS)[j])
+            memory[at.H_PREVIOUS] = memory[at.H_TRIAL]
+            memory[at.HAS_PREVIOUS] = 1.0
+    memory[at.HAS_TRIAL] = 0.0
 
 
 @kernel(ATTEMPT)
@@ -263,16 +226,16 @@ def newton_step(f, w, options, memory, t, h, tolerances, state, new_state):
     n = w.Q.size
     q, v, a = state[:n], state[n : 2 * n], state[2 * n : 3 * n]
     q1, v1, a1, lam1 = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n], new_state[3 * n :]
-    previous, trial = block(memory, s, n, PREVIOUS), block(memory, s, n, TRIAL)
+    previous, trial = block(memory, s, n, at.PREVIOUS), block(memory, s, n, at.TRIAL)
     weights = memory[memory.size - s :]
-    q_mid, v_mid, a_mid = vector(memory, s, n, Q_MID), vector(memory, s, n, V_MID), vector(memory, s, n, A_MID)
-    if memory[PARTITION_NUMBER] != w.notes[GENERATION]:
-        memory[HAS_JACOBIAN] = 0.0
-        memory[PARTITION_NUMBER] = w.notes[GENERATION]
-    if memory[FRESH] == 0.0 and memory[CONTRACTION] > SLOW:
-        memory[HAS_JACOBIAN] = 0.0
+    q_mid, v_mid, a_mid = vector(memory, s, n, at.Q_MID), vector(memory, s, n, at.V_MID), vector(memory, s, n, at.A_MID)
+    if memory[at.PARTITION_NUMBER] != w.notes[GENERATION]:
+        memory[at.HAS_JACOBIAN] = 0.0
+        memory[at.PARTITION_NUMBER] = w.notes[GENERATION]
+    if memory[at.FRESH] == 0.0 and memory[at.CONTRACTION] > SLOW:
+        memory[at.HAS_JACOBIAN] = 0.0
     while True:
-        if memory[HAS_JACOBIAN] == 0.0:
+        if memory[at.HAS_JACOBIAN] == 0.0:
             # stiff directions turn as the body moves: halfway they are at most half a step's turn from any stage's; at
             # the time of a stage, so that this sees nothing of a force that the stages do not see
             x = middle_node(c) * h
@@ -286,15 +249,15 @@ def newton_step(f, w, options, memory, t, h, tolerances, state, new_state):
             code = derivatives_at(f, w, options, memory, s, t + x, q_mid, v_mid, a_mid)
             if code != DONE:
                 return Attempt(code, np.inf, 0.0)
-            memory[HAS_JACOBIAN] = 1.0
-            memory[FRESH] = 1.0
-            memory[H_FACTORED] = 0.0
-        if abs(memory[H_FACTORED] - h) > SAME_STEP * h:
+            memory[at.HAS_JACOBIAN] = 1.0
+            memory[at.FRESH] = 1.0
+            memory[at.H_FACTORED] = 0.0
+        if abs(memory[at.H_FACTORED] - h) > SAME_STEP * h:
             code = factor_systems(f, w, options, memory, s, h)
             if code != DONE:
-                memory[HAS_JACOBIAN] = 0.0
+                memory[at.HAS_JACOBIAN] = 0.0
                 return Attempt(code, np.inf, 0.0)
-        ratio = h / memory[H_PREVIOUS] if memory[HAS_PREVIOUS] == 1.0 else np.inf
+        ratio = h / memory[at.H_PREVIOUS] if memory[at.HAS_PREVIOUS] == 1.0 else np.inf
         for j in range(s):
             if ratio <= FARTHEST:
                 interpolate(c, 1.0 + ratio * c[j], previous, weights, trial[j])
@@ -303,9 +266,9 @@ def newton_step(f, w, options, memory, t, h, tolerances, state, new_state):
         code = _iterate(f, w, options, memory, t, h, tolerances, q, v, trial)
         if code == DONE:
             break
-        if memory[FRESH] == 1.0:
+        if memory[at.FRESH] == 1.0:
             return Attempt(code, np.inf, 0.0)
-        memory[HAS_JACOBIAN] = 0.0
+        memory[at.HAS_JACOBIAN] = 0.0
     for m in range(n):
         in_q = 0.0
         in_v = 0.0
@@ -322,8 +285,8 @@ def newton_step(f, w, options, memory, t, h, tolerances, state, new_state):
         error = _estimate(f, w, options, memory, h, tolerances, state, new_state, trial)
         error = max(error, off)
     code = accelerations(f, w, t + h, q1, v1, a1, lam1)
-    memory[HAS_TRIAL] = 1.0
-    memory[H_TRIAL] = h
+    memory[at.HAS_TRIAL] = 1.0
+    memory[at.H_TRIAL] = h
     return Attempt(code, error, 0.0)
 
 

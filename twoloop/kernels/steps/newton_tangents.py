@@ -3,7 +3,9 @@
 import numpy as np
 
 from twoloop.kernels.algebra.linalg import copy
-from twoloop.kernels.data.common import DONE, FORCE_BY_V_GIVEN, NOT_FINITE, REACTION_BY_Q_GIVEN, compiled, inlined
+from twoloop.kernels.data.codes import DONE, NOT_FINITE
+from twoloop.kernels.data.common import compiled, inlined
+from twoloop.kernels.data.flags import FORCE_BY_V_GIVEN, REACTION_BY_Q_GIVEN
 from twoloop.kernels.evaluation.constraints import constraint_rows
 
 DIFFERENCE = 1e-7  # displacement for derivatives, relative to max(1, |value|)

@@ -6,17 +6,11 @@ See the head of taylor.py.
 import numpy as np
 
 from twoloop.kernels.algebra.saddle_point import solve_both
-from twoloop.kernels.data.common import DONE, FORM, N_EVALUATIONS, NOT_FINITE, STATIC, compiled, inlined, merged
-from twoloop.kernels.evaluation.operations import (
-    ARCTANGENT,
-    EXPONENTIAL,
-    LOGARITHM,
-    PENDING,
-    PRODUCT,
-    RECIPROCAL,
-    SINE,
-    SQUARE_ROOT,
-)
+from twoloop.kernels.data.codes import DONE, NOT_FINITE
+from twoloop.kernels.data.common import compiled, inlined, merged
+from twoloop.kernels.data.counters import N_EVALUATIONS
+from twoloop.kernels.data.flags import FORM, STATIC
+from twoloop.kernels.evaluation import operations as op
 from twoloop.kernels.evaluation.tasks import SOLVE
 
 # places in `options`: scalars, ORDER being that of the series of q; where each array of the program begins, and where
@@ -144,21 +138,21 @@ def begin_operations(options, table, values, z, x, y):
         for o in range(groups[g + BEGIN], groups[g + END]):
             x[o] += constant[o]
             y[o] += constant_2[o]
-            if kind == PRODUCT:
+            if kind == op.PRODUCT:
                 z[o] = x[o] * y[o]
-            elif kind == RECIPROCAL:
+            elif kind == op.RECIPROCAL:
                 z[o] = y[o] = 1.0 / x[o]
-            elif kind == SQUARE_ROOT:
+            elif kind == op.SQUARE_ROOT:
                 z[o] = x[o] = y[o] = np.sqrt(x[o])
-            elif kind == EXPONENTIAL:
+            elif kind == op.EXPONENTIAL:
                 z[o] = y[o] = np.exp(x[o])
-            elif kind == LOGARITHM:
+            elif kind == op.LOGARITHM:
                 z[o] = np.log(x[o])
-            elif kind == ARCTANGENT:
+            elif kind == op.ARCTANGENT:
                 z[o] = np.arctan(x[o])
-            elif kind == PENDING:
+            elif kind == op.PENDING:
                 z[o] = 0.0
-        if kind == SINE:
+        if kind == op.SINE:
             half = (groups[g + END] - groups[g + BEGIN]) // 2
             for o in range(groups[g + BEGIN], groups[g + BEGIN] + half):
                 z[o] = np.sin(x[o])
@@ -175,10 +169,10 @@ def _operate(options, table, K, values, z, x, y, x0, y0, total):
     for g in range(0, groups.size, N_GROUP):
         kind, first, last = groups[g], groups[g + BEGIN], groups[g + END]
         _gather(options, table + FIRST, groups, g, MORE_FIRST, values, x)
-        if kind == PENDING:
+        if kind == op.PENDING:
             for o in range(first, last):
                 z[o] = total[o] + x[o] * y0[o]
-        elif kind == SINE:
+        elif kind == op.SINE:
             half = (last - first) // 2
             for o in range(first, first + half):
                 p = o + half
@@ -187,17 +181,17 @@ def _operate(options, table, K, values, z, x, y, x0, y0, total):
                 sine, cosine = (total[o] + u * y0[o]) * inverse, (total[p] + u * y0[p]) * inverse
                 z[o], z[p] = sine, cosine
                 y[o], y[p] = cosine, -sine
-        elif kind == PRODUCT:
+        elif kind == op.PRODUCT:
             _gather(options, table + SECOND, groups, g, MORE_SECOND, values, y)
             for o in range(first, last):
                 z[o] = total[o] + x0[o] * y[o] + x[o] * y0[o]
-        elif kind == RECIPROCAL:
+        elif kind == op.RECIPROCAL:
             for o in range(first, last):
                 z[o] = y[o] = -(total[o] + x[o] * y0[o]) * y0[o]
-        elif kind == SQUARE_ROOT:
+        elif kind == op.SQUARE_ROOT:
             for o in range(first, last):
                 z[o] = x[o] = y[o] = 0.5 * (x[o] - total[o]) / x0[o]
-        elif kind == EXPONENTIAL:
+        elif kind == op.EXPONENTIAL:
             for o in range(first, last):
                 x[o] *= K
                 z[o] = y[o] = (total[o] + x[o] * y0[o]) * inverse

@@ -21,49 +21,15 @@ from twoloop.kernels.algebra.linalg import copy
 from twoloop.kernels.algebra.saddle_point import solve_both
 from twoloop.kernels.control.defect import excess
 from twoloop.kernels.control.predictor import departure, keep_predicted
-from twoloop.kernels.data.common import (
-    ATOL,
-    ATTEMPT,
-    DEFECT,
-    DONE,
-    ESTIMATE,
-    GAP,
-    N_OUTER,
-    NEARLY_SINGULAR,
-    RTOL,
-    SETTLE,
-    Attempt,
-    Step,
-    compiled,
-    kernel,
-    merged,
-)
+from twoloop.kernels.data.codes import DONE
+from twoloop.kernels.data.common import ATTEMPT, SETTLE, Attempt, Step, compiled, kernel, merged
+from twoloop.kernels.data.counters import N_OUTER
+from twoloop.kernels.data.noted import DEFECT, NEARLY_SINGULAR
+from twoloop.kernels.data.tolerances import ATOL, ESTIMATE, GAP, RTOL
 from twoloop.kernels.evaluation.calls import evaluate_there, project
 from twoloop.kernels.evaluation.tasks import EVALUATE_THERE
-from twoloop.kernels.steps.recurrences import (
-    ATTEMPTS,
-    KEEP,
-    KNOWN,
-    LENGTH,
-    N_FACTORS,
-    N_MEMORY_SCALARS,
-    NEXT_LENGTH,
-    NEXT_UNIT,
-    ORDER,
-    PASSED,
-    SHORTER,
-    SUSPECT,
-    SUSPECTED,
-    TARGET,
-    THETA,
-    TRIED,
-    UNIT,
-    WHICH,
-    accelerations_found,
-    end_series,
-    expand,
-    series_of,
-)
+from twoloop.kernels.steps import recurrences as at
+from twoloop.kernels.steps.recurrences import accelerations_found, end_series, expand, series_of
 
 ROUNDING = 1e-9  # relative, by which a step may be longer than the series allows
 ALLOWED = 0.3  # of the tolerances: how far from the constraints the end of a step is to be before it is moved there
@@ -85,14 +51,14 @@ def solve_order(f, w, r, c, _t, _unit, _tolerances, a, lam):
 @merged
 def _expand_by_code(f, w, options, memory, t, state, unit):
     """The series by functions made for the mechanism; f.instead solves where their factors cannot."""
-    order, n, n_rows = int(options[ORDER]), w.Q.size, w.Rate.size
-    series = series_of(memory, order, n, memory[TARGET])
-    place = N_MEMORY_SCALARS + 2 * (order + 1) * n
+    order, n, n_rows = int(options[at.ORDER]), w.Q.size, w.Rate.size
+    series = series_of(memory, order, n, memory[at.TARGET])
+    place = at.N_MEMORY_SCALARS + 2 * (order + 1) * n
     r, a = memory[place : place + n], memory[place + n : place + 2 * n]
     place += 2 * n
     c, lam = memory[place : place + n_rows], memory[place + n_rows : place + 2 * n_rows]
     place += 2 * n_rows
-    n_factors = int(options[N_FACTORS])
+    n_factors = int(options[at.N_FACTORS])
     factors, scratch = memory[place : place + n_factors], memory[place + n_factors :]
     q, v = state[:n], state[n : 2 * n]
     have_factors = f.own_factors(t, q, v, f.numbers, factors)
@@ -112,7 +78,7 @@ def _expand_by_code(f, w, options, memory, t, state, unit):
 @merged
 def _find_series(f, w, options, memory, t, state, unit, which, by_code):
     """The series about a state, into one of the two places; by functions made for the mechanism, if there are."""
-    memory[TARGET] = which
+    memory[at.TARGET] = which
     if by_code:
         return _expand_by_code(f, w, options, memory, t, state, unit)
     return expand(f, w, options, memory, t, state, unit)
@@ -176,7 +142,7 @@ def _evaluate(series, unit, order, x, q, v, a):
 def _defect_at(f, w, memory, t, h, s, tolerances, series, order, q, v, a):
     """The defect within the step, at the share s of it, over what is allowed; infinite where there is none."""
     found = accelerations_found(memory, q.size)
-    _evaluate(series, memory[UNIT], order, s * h / memory[UNIT], q, v, found)
+    _evaluate(series, memory[at.UNIT], order, s * h / memory[at.UNIT], q, v, found)
     if evaluate_there(f, w, t + s * h, q, v, a) != DONE:
         return np.inf
     return excess(tolerances, h, order, found, a, q, v)
@@ -199,19 +165,19 @@ def _refused_within(f, w, memory, t, h, tolerances, series, order, q, v, a):
 
     The places looked at are not the same in each attempt, but for the last at which a step was refused.
     """
-    gap, shift = tolerances[GAP], memory[ATTEMPTS] * GOLDEN % 1.0
+    gap, shift = tolerances[GAP], memory[at.ATTEMPTS] * GOLDEN % 1.0
     n_places = 0
     if h > gap:
         n_places = int(np.ceil(h / gap))
     for k in range(-1, n_places):
-        s = (k + shift) / n_places if k >= 0 else (memory[SUSPECT] - t) / h
-        if k < 0 and not (memory[SUSPECTED] == 1.0 and 0.0 < s < 1.0):
+        s = (k + shift) / n_places if k >= 0 else (memory[at.SUSPECT] - t) / h
+        if k < 0 and not (memory[at.SUSPECTED] == 1.0 and 0.0 < s < 1.0):
             continue
         defect = _defect_at(f, w, memory, t, h, s, tolerances, series, order, q, v, a)
         if defect > 1.0 and not _is_noise(f, w, memory, t, h, tolerances, series, order, q, v, a, defect):
-            if memory[SUSPECTED] == 0.0 or t + s * h < memory[SUSPECT]:
-                memory[SUSPECT] = t + s * h
-            memory[SUSPECTED] = 1.0
+            if memory[at.SUSPECTED] == 0.0 or t + s * h < memory[at.SUSPECT]:
+                memory[at.SUSPECT] = t + s * h
+            memory[at.SUSPECTED] = 1.0
             return defect
         w.notes[DEFECT] = max(w.notes[DEFECT], defect)
     return 0.0
@@ -226,34 +192,34 @@ def _shortened(defect, order):
 @kernel(SETTLE)
 def settle_taylor(f, w, options, memory, tolerances, accepted):
     """The series about the end of an accepted step is that about the beginning of the next."""
-    if accepted and memory[TRIED] == 1.0:
-        memory[WHICH] = 1.0 - memory[WHICH]
-        memory[UNIT], memory[LENGTH] = memory[NEXT_UNIT], memory[NEXT_LENGTH]
-    memory[TRIED] = 0.0
+    if accepted and memory[at.TRIED] == 1.0:
+        memory[at.WHICH] = 1.0 - memory[at.WHICH]
+        memory[at.UNIT], memory[at.LENGTH] = memory[at.NEXT_UNIT], memory[at.NEXT_LENGTH]
+    memory[at.TRIED] = 0.0
 
 
 @merged
 def _step(f, w, options, memory, t, h, tolerances, state, new_state, by_code):
     """One attempt, by the series about its beginning; then the series about its end, which sets the next step."""
-    n, order, estimated = w.Q.size, int(options[ORDER]), tolerances[ESTIMATE] == 1.0
+    n, order, estimated = w.Q.size, int(options[at.ORDER]), tolerances[ESTIMATE] == 1.0
     q, v = state[:n], state[n : 2 * n]
     q1, v1, a1, lam1 = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n], new_state[3 * n :]
     w.counters[N_OUTER] += 1
-    if memory[KNOWN] == 0.0:
+    if memory[at.KNOWN] == 0.0:
         copy(state, new_state)
-        code = project(f, w, t, q1, v1, options[THETA], a1, lam1)
+        code = project(f, w, t, q1, v1, options[at.THETA], a1, lam1)
         if code == DONE:
-            code = _find_series(f, w, options, memory, t, new_state, h, memory[WHICH], by_code)
+            code = _find_series(f, w, options, memory, t, new_state, h, memory[at.WHICH], by_code)
         if code != DONE:
             return Attempt(code, np.inf, 0.0)
-        memory[KNOWN], memory[UNIT] = 1.0, h
+        memory[at.KNOWN], memory[at.UNIT] = 1.0, h
         if estimated:
-            memory[LENGTH] = _length(tolerances, series_of(memory, order, n, memory[WHICH]), h, order, n)
-    series, unit = series_of(memory, order, n, memory[WHICH]), memory[UNIT]
-    x = (memory[PASSED] + h) / unit
+            memory[at.LENGTH] = _length(tolerances, series_of(memory, order, n, memory[at.WHICH]), h, order, n)
+    series, unit = series_of(memory, order, n, memory[at.WHICH]), memory[at.UNIT]
+    x = (memory[at.PASSED] + h) / unit
     error, checked, found = 0.0, False, accelerations_found(memory, n)
     if estimated:
-        error = x / memory[LENGTH]  # larger than the estimate of the error, which is a power of it
+        error = x / memory[at.LENGTH]  # larger than the estimate of the error, which is a power of it
         if error > 1.0 + ROUNDING:
             return Attempt(DONE, error, 1.0 / error)
         error = min(error, 1.0)
@@ -261,26 +227,26 @@ def _step(f, w, options, memory, t, h, tolerances, state, new_state, by_code):
         if not checked and h > tolerances[GAP] * (1.0 + ROUNDING):
             return Attempt(DONE, h / tolerances[GAP], tolerances[GAP] / h)
         if checked:
-            memory[ATTEMPTS] += 1.0
-            if memory[SUSPECTED] == 1.0 and memory[SUSPECT] <= t:
-                memory[SUSPECTED] = 0.0
+            memory[at.ATTEMPTS] += 1.0
+            if memory[at.SUSPECTED] == 1.0 and memory[at.SUSPECT] <= t:
+                memory[at.SUSPECTED] = 0.0
             w.notes[DEFECT] = 0.0
             defect = _refused_within(f, w, memory, t, h, tolerances, series, order, q1, v1, a1)
             if defect > 0.0:
                 return Attempt(DONE, min(defect, BEYOND), _shortened(defect, order))
     _evaluate(series, unit, order, x, q1, v1, found)
     keep_predicted(w, q1)
-    code = project(f, w, t + h, q1, v1, options[THETA], a1, lam1)
+    code = project(f, w, t + h, q1, v1, options[at.THETA], a1, lam1)
     if code != DONE:
         return Attempt(code, np.inf, 0.0)
-    if options[KEEP] == 1.0:
-        memory[PASSED] += h
+    if options[at.KEEP] == 1.0:
+        memory[at.PASSED] += h
         return Attempt(DONE, 0.0, 0.0)
     off = departure(w, tolerances, h, q, v, q1)
-    memory[SHORTER], allowed = 1.0, np.inf
+    memory[at.SHORTER], allowed = 1.0, np.inf
     if off > 0.0:  # where growth, or a force ahead, cut the step short of LENGTH, how far short says nothing
         allowed = (ALLOWED / off) ** (1.0 / order)
-        memory[SHORTER] = min(1.0, max(x / memory[LENGTH], 1.0 / GROWTH) * allowed)
+        memory[at.SHORTER] = min(1.0, max(x / memory[at.LENGTH], 1.0 / GROWTH) * allowed)
     if off > 1.0:
         return Attempt(DONE, off, allowed)
     if checked:
@@ -290,21 +256,21 @@ def _step(f, w, options, memory, t, h, tolerances, state, new_state, by_code):
             if not noise:
                 return Attempt(DONE, min(defect, BEYOND), _shortened(defect, order))
             _evaluate(series, unit, order, x, q1, v1, found)
-            code = project(f, w, t + h, q1, v1, options[THETA], a1, lam1)
+            code = project(f, w, t + h, q1, v1, options[at.THETA], a1, lam1)
             if code != DONE:
                 return Attempt(code, np.inf, 0.0)
         w.notes[DEFECT] = max(w.notes[DEFECT], defect)
-    series = series_of(memory, order, n, 1.0 - memory[WHICH])
-    unit = min(memory[LENGTH] * unit, GROWTH * h) if estimated else h
-    code = _find_series(f, w, options, memory, t + h, new_state, unit, 1.0 - memory[WHICH], by_code)
+    series = series_of(memory, order, n, 1.0 - memory[at.WHICH])
+    unit = min(memory[at.LENGTH] * unit, GROWTH * h) if estimated else h
+    code = _find_series(f, w, options, memory, t + h, new_state, unit, 1.0 - memory[at.WHICH], by_code)
     if code != DONE:
         return Attempt(code, np.inf, 0.0)
-    memory[TRIED], memory[NEXT_UNIT] = 1.0, unit
+    memory[at.TRIED], memory[at.NEXT_UNIT] = 1.0, unit
     factor = 0.0
     if estimated:
-        memory[NEXT_LENGTH] = _length(tolerances, series, unit, order, n)
-        shorter = memory[SHORTER] if memory[SHORTER] > 0.0 else 1.0
-        factor = min(shorter * memory[NEXT_LENGTH] * unit / h, GROWTH)
+        memory[at.NEXT_LENGTH] = _length(tolerances, series, unit, order, n)
+        shorter = memory[at.SHORTER] if memory[at.SHORTER] > 0.0 else 1.0
+        factor = min(shorter * memory[at.NEXT_LENGTH] * unit / h, GROWTH)
     return Attempt(DONE, max(error, off), factor)
 
 

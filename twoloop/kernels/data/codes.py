@@ -1,0 +1,14 @@
+"""What a kernel returns: DONE, or why it could not."""
+
+(
+    DONE,
+    OUTER_DIVERGED,
+    INNER_DIVERGED,
+    SINGULAR,
+    NOT_FINITE,
+    MASS_NOT_DEFINITE,
+    GAMMA_INACCURATE,
+    RANK_DIFFERS,
+    ROWS_CONTRADICT,
+    NEEDS_DENSE,  # the static form cannot decide it
+) = range(10)
