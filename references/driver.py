@@ -38,18 +38,16 @@ from inspect import signature
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from references.equations.least_norm import accelerations
 from references.equations.rows import IndependentRows, with_all_rows
 from twoloop.checks.arguments import check_positive, check_span, check_times, check_vector
 from twoloop.checks.consistency import check_start
-from twoloop.problem.problem import Problem
+from twoloop.problem.problem import Array, Problem
 from twoloop.problem.system import ConstrainedSystem, check_system
 from twoloop.result.result import Result
 from twoloop.run.record import Statistics, Status
-
-Array = NDArray[np.float64]
 
 OUTPUTS = 1001  # instants of the default t_eval of solvers that do not store their steps
 
@@ -215,17 +213,10 @@ class Task:
         if self.rows is not None and self.rows.system is not self.rows.all:
             lam = self.rows.multipliers(t, q, lam)
             broken = self.rows.failure(float(t[-1]), q[:, -1]) if t.size else ""
-        return Result(
-            t=t,
-            q=q,
-            v=v,
-            a=a,
-            lam=lam,
-            h=np.empty(0) if h is None else h,
-            status=Status.SOLVER_FAILED if failure or broken else Status.REACHED_END,
-            message=broken + (failure or f"{name} reached the end, t = {self.t1:g}."),
-            stats=Statistics(**{"cpu_time": user_call.seconds or 0.0} | counts),
-        )
+        status = Status.SOLVER_FAILED if failure or broken else Status.REACHED_END
+        message = broken + (failure or f"{name} reached the end, t = {self.t1:g}.")
+        stats = Statistics(**{"cpu_time": user_call.seconds or 0.0} | counts)
+        return Result(t, q, v, a, lam, np.empty(0) if h is None else h, status, message, stats)
 
 
 def check_task(

@@ -36,10 +36,7 @@ Measured = dict[str, list[dict[str, Any]]]  # by benchmark, the repetitions
 def measure(folders: Mapping[str, Path], names: Sequence[str], rounds: int) -> dict[str, Measured]:
     """By side, what each repetition of each benchmark took; the sides take turns, and who is first changes.
 
-    Raises
-    ------
-    StudyError
-        If a process ends before it has answered, with what it said.
+    Raises StudyError if a process ends before it has answered, with what it said.
     """
     measured: dict[str, Measured] = {side: {name: [] for name in names} for side in folders}
     with ExitStack() as stack:
@@ -115,13 +112,7 @@ def _counts(both: Sequence[list[dict[str, Any]]]) -> str:
 
 @contextmanager
 def work_tree(commit: str, repository: Path = ROOT) -> Iterator[Path]:
-    """A work tree of the commit, removed at the end.
-
-    Raises
-    ------
-    StudyError
-        If git cannot make it.
-    """
+    """A work tree of the commit, removed at the end. Raises StudyError if git cannot make it."""
     with tempfile.TemporaryDirectory(prefix="twoloop-bench-") as parent:
         folder = Path(parent) / "tree"
         command = ["git", "-C", str(repository), "worktree"]

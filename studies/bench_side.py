@@ -34,8 +34,7 @@ class Instructions:
             return
         # struct perf_event_attr: hardware event 1, instructions retired
         attributes = struct.pack("IIQQQQQ", 0, 112, 1, 0, 0, 0, EXCLUDED) + bytes(112 - 48)
-        libc = ctypes.CDLL(None, use_errno=True)
-        handle = libc.syscall(number, attributes, 0, -1, -1, 0)
+        handle = ctypes.CDLL(None, use_errno=True).syscall(number, attributes, 0, -1, -1, 0)
         if handle >= 0:
             self.file = open(handle, "rb", buffering=0)  # noqa: SIM115  (for the life of the process)
 

@@ -37,10 +37,7 @@ REFERENCE_LIMIT = 300.0  # s of wall-clock time for each run of the reference
 def load_problem(where: str) -> Problem:
     """The problem that FILE.py:FUNCTION makes, or a ready mechanism by its name.
 
-    Raises
-    ------
-    StudyError
-        If there is no such file or function, or it does not return a `Problem`.
+    Raises StudyError if there is no such file or function, or it does not return a `Problem`.
     """
     try:
         return problem_from(where)
@@ -90,10 +87,7 @@ def beside(outsiders: Mapping[str, Outsider], run: Run, result: Result) -> dict[
 def rows_from(files: Iterable[str], mechanism: str, t_end: float) -> list[Row]:
     """The rows of files that are of this comparison's mechanism; the word "archive" is the file that is shipped.
 
-    Raises
-    ------
-    StudyError
-        If a file has none, or cannot be read.
+    Raises StudyError if a file has none, or cannot be read.
     """
     found = []
     for file in files:

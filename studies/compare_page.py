@@ -20,14 +20,9 @@ from studies.bench.store import Output, plain, read_rows
 
 FILE = "compare.html"
 SOURCES = ("work_precision", "validation")
-MEASURES = {
-    "error_q": "error of positions (m, rad)",
-    "error_v": "error of velocities",
-    "error_lam": "error of multipliers",
-    "energy": "energy error (J)",
-    "violation_q": "largest violation of positions, |C|",
-    "violation_v": "largest violation of velocities",
-}
+MEASURES = {"error_q": "error of positions (m, rad)", "error_v": "error of velocities"}
+MEASURES |= {"error_lam": "error of multipliers", "energy": "energy error (J)"}
+MEASURES |= {"violation_q": "largest violation of positions, |C|", "violation_v": "largest violation of velocities"}
 COSTS = {"call_s": "CPU time of the call (s)", "n_evaluations": "evaluations"}
 DIGITS = 4  # significant, of what the page holds; the CSV files have all
 OPENS = "four-bar, 10 s (work_precision)"
@@ -44,10 +39,7 @@ LIBRARIES = ("chart-4.6.1", "chartjs-plugin-zoom-2.2.0")  # the second extends t
 def read(folder: Path, files: Sequence[str] = ()) -> tuple[pd.DataFrame, dict[str, str]]:
     """One row a run of all studies in a folder and of files of rows, and where these are from.
 
-    Raises
-    ------
-    StudyError
-        If there are no rows at all, or a file is damaged.
+    Raises StudyError if there are no rows at all, or a file is damaged.
     """
     parts, stamps = [], {}
     for name in SOURCES:
@@ -98,17 +90,10 @@ def page_data(rows: pd.DataFrame, stamps: dict[str, str]) -> dict[str, Any]:
             said = "reached the end, but lost the motion"
         mechanism = places[f"{row['mechanism']} ({row['study']})"]
         runs.append([mechanism, numbers[row["solver"]], tables.setting(row), row["called_from"], *values, said])
-    return {
-        "opens": OPENS if OPENS in places else mechanisms[0]["name"],
-        "always": ALWAYS,
-        "mechanisms": mechanisms,
-        "solvers": solvers,
-        "columns": ["mechanism", "solver", "setting", "called", *columns, "said"],
-        "measures": MEASURES,
-        "costs": COSTS,
-        "runs": runs,
-        "stamps": stamps,
-    }
+    found: dict[str, Any] = {"opens": OPENS if OPENS in places else mechanisms[0]["name"], "always": ALWAYS}
+    found |= {"mechanisms": mechanisms, "solvers": solvers}
+    found |= {"columns": ["mechanism", "solver", "setting", "called", *columns, "said"], "measures": MEASURES}
+    return found | {"costs": COSTS, "runs": runs, "stamps": stamps}
 
 
 def looks(solvers: Iterable[str]) -> dict[str, dict[str, Any]]:

@@ -30,9 +30,8 @@ BETWEEN = tuple(float(f"3e-{k}") for k in range(5, 12))  # of ways whose error l
 ERRORS = (1e-4, 1e-6, 1e-8)  # of the worst of the runs, at which ways are compared
 TIGHT, AGREE = 1e-12, 1e-8  # tolerance of references, and how far two unlike methods may end apart with it
 ENSEMBLE, SINGLE, HEYOKA, DIFFRAX = "ensemble", "solve_dae, compiled, one by one", "heyoka, batches", "diffrax, vmap"
-LOOKS: dict[
-    str, tuple[str, str, bool]
-] = {  # whose colour and marker each has: solver, family, whether it keeps the constraints
+# whose colour and marker each has: solver, family, whether it keeps the constraints
+LOOKS: dict[str, tuple[str, str, bool]] = {
     ENSEMBLE: ("Taylor, compiled", "two-loop", True),
     SINGLE: ("auto, compiled", "two-loop", True),
     HEYOKA: ("heyoka", "heyoka", False),
@@ -40,11 +39,8 @@ LOOKS: dict[
 }
 OWN, WAYS, LEAPING = (ENSEMBLE, SINGLE), tuple(LOOKS), (ENSEMBLE, HEYOKA)
 LINKAGES = "random four-bar linkages"
-STARTS = {  # mechanisms whose runs differ by their velocities at the start, and how long they run
-    "andrews": 0.03,
-    "spatial_slider_crank": 2.0,
-    "redundant_slider_crank": 2.0,
-}
+# mechanisms whose runs differ by their velocities at the start, and how long they run
+STARTS = {"andrews": 0.03, "spatial_slider_crank": 2.0, "redundant_slider_crank": 2.0}
 N_RUNS, N_QUICK, N_SINGLE = 256, 16, 32  # N_SINGLE: of those that are made one by one
 SPAN = 6.0  # s, of the linkages
 N_GEOMETRY, N_GEOMETRY_QUICK = (10_000, 1_000_000), (200,)
@@ -84,10 +80,7 @@ def linkages(n: int, t_end: float = SPAN) -> Ensemble:
 def of_starts(name: str, n: int, t_end: float) -> Ensemble:
     """A mechanism with velocities of its own in each run.
 
-    Raises
-    ------
-    StudyError
-        If two unlike methods do not agree where a run ends.
+    Raises StudyError if two unlike methods do not agree where a run ends.
     """
     problem = getattr(mechanisms, name)()
     random = np.random.default_rng(7)
@@ -175,8 +168,7 @@ def with_geometry(n: int) -> dict[str, Any]:
     problem, random = mechanisms.four_bar(), np.random.default_rng(11)
     system, began, failed, singly, spent = problem.system, time.perf_counter(), 0, 0, time.process_time()
     for first in range(0, n, BLOCK):
-        size = (min(BLOCK, n - first), 4)
-        p = system.parameters * (1.0 + SPREAD * random.uniform(-1.0, 1.0, size))
+        p = system.parameters * (1.0 + SPREAD * random.uniform(-1.0, 1.0, (min(BLOCK, n - first), 4)))
         q, v = consistent_states(system, 0.0, problem.q0, problem.v0, parameters=p, keep=[8])
         runs = ensemble(system, (0.0, SPAN), q, v, parameters=p)
         failed, singly = failed + int((~runs.success).sum()), singly + int(runs.singly.sum())
@@ -233,8 +225,7 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
         for verdict in ("ahead", "behind", "undecided", "alone", "missed", "none")
     }
     geometry = rows[rows["group"] == GEOMETRY]
-    refused = rows.reindex(columns=["way", "case", "message"]).dropna()
-    found["refused"] = refused.to_dict("records")
+    found["refused"] = rows.reindex(columns=["way", "case", "message"]).dropna().to_dict("records")
     found["geometry"] = geometry[["n_runs", "wall", "cpu", "n_failed", "n_singly"]].to_dict("records")
     return found
 

@@ -105,13 +105,9 @@ def _stand_in(rows: pd.DataFrame) -> dict[str, Any]:
         return [n for n, found in both.items() if not found[k][what] <= VISIBLE]  # a failed run is off, too
 
     limits = {n: [found[1]["error_y3_short"], found[0]["error_y3_short"]] for n, found in both.items()}
-    return {
-        "n": len(both),
-        "off_coarse": off(0, "error_y3_short"),
-        "off_fine": off(1, "error_y3_short"),
-        "off_long": off(1, "error_y3"),
-        "both": [{"order": n, "limits": each} for n, each in limits.items() if each[0] <= VISIBLE < each[1]],
-    }
+    told: dict[str, Any] = {"n": len(both), "off_coarse": off(0, "error_y3_short")}
+    told |= {"off_fine": off(1, "error_y3_short"), "off_long": off(1, "error_y3")}
+    return told | {"both": [{"order": n, "limits": each} for n, each in limits.items() if each[0] <= VISIBLE < each[1]]}
 
 
 def _cells(rows: pd.DataFrame, order: int) -> list[str]:
@@ -139,23 +135,20 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     lined = rows[(rows["group"] == "line-up") & rows["growth"].notna()].set_index("solver")
     grown, exudyn = (lined[lined["family"] == family]["growth"] for family in ("two-loop", "Exudyn"))
     others = lined[lined["tol"].notna() & (lined["family"] != "two-loop")].groupby("keeps_constraints")["growth"]
-    return {
-        "t_end": float(rows["t_end"].iloc[0]),
-        "problem": rows["problem"].iloc[0],
-        "visible": VISIBLE,
-        "passes": PASSES,
-        "fine": FINE,
-        "procedures": procedures,
-        "procedures_hold": all(one["holds"] for one in procedures),
-        "agree": all(one["error_y3_short"] <= VISIBLE for one in procedures),
-        "agree_long": all(one["error_y3"] <= VISIBLE for one in procedures),
-        "gear": _stand_in(rows),
-        "stand_in": [[str(n), *_cells(rows, n)] for n in GEAR_ORDERS if find(rows, gear(n), COARSE) is not None],
-        "listed": [{name: row[name] for name in told} | {"setting": setting(row)} for row in listed if row is not None],
-        "canonical_growth": grown.get(CANONICAL),
-        "exudyn_growth": [exudyn.min(), exudyn.max()] if len(exudyn) else None,
-        "others_growth": {str(bool(keeps)): [own.min(), own.max()] for keeps, own in others},
-        "growth": [grown.drop(CANONICAL, errors="ignore").min(), grown.drop(CANONICAL, errors="ignore").max()],
+    made: dict[str, Any] = {"t_end": float(rows["t_end"].iloc[0]), "problem": rows["problem"].iloc[0]}
+    made |= {"visible": VISIBLE, "passes": PASSES, "fine": FINE, "procedures": procedures}
+    made |= {"procedures_hold": all(one["holds"] for one in procedures)}
+    made |= {"agree": all(one["error_y3_short"] <= VISIBLE for one in procedures)}
+    made |= {"agree_long": all(one["error_y3"] <= VISIBLE for one in procedures), "gear": _stand_in(rows)}
+    made |= {"stand_in": [[str(n), *_cells(rows, n)] for n in GEAR_ORDERS if find(rows, gear(n), COARSE) is not None]}
+    made |= {
+        "listed": [{name: row[name] for name in told} | {"setting": setting(row)} for row in listed if row is not None]
+    }
+    made |= {"canonical_growth": grown.get(CANONICAL)}
+    made |= {"exudyn_growth": [exudyn.min(), exudyn.max()] if len(exudyn) else None}
+    made |= {"others_growth": {str(bool(keeps)): [own.min(), own.max()] for keeps, own in others}}
+    return made | {
+        "growth": [grown.drop(CANONICAL, errors="ignore").min(), grown.drop(CANONICAL, errors="ignore").max()]
     }
 
 

@@ -91,24 +91,16 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     told = ("solver", "error_q", "n_steps", *names, "retried_switch", "n_evaluations")
     listed = rows[rows["h_median"].notna()]
     switches = int(irk["n_partitions"] - 1)
-    return {
-        "t_end": float(rows["t_end"].iloc[0]),
-        "problem": rows["problem"].iloc[0],
-        "period": four_bar.period(),
-        "long": LONG,
-        "irk": {name: float(irk[name]) for name in names} | {name: int(irk[name]) for name in counts},
-        "newmark": {"retried": float(newmark["retried"])},
-        "holds": bool(irk["share_time"] > 0.5),
-        "ratios": ratios,
-        "longer": min(ratios) > 1.0,
-        "evaluations_per_step": [float(run["n_evaluations"] / run["n_steps"]) for run in (irk, newmark, quarter)],
-        "evaluations_ratio": [float(run["n_evaluations"] / irk["n_evaluations"]) for run in (newmark, quarter)],
-        "switches": switches,
-        "switches_per_period": switches / float(irk["t_end"] / four_bar.period()),
-        "runs": [{name: row[name] for name in told} | {"setting": setting(row)} for _, row in listed.iterrows()],
-        "n_known": len(known),
-        "n_worse_at_switch": int((known["retried_switch"] > known["retried"]).sum()),
-    }
+    found: dict[str, Any] = {"t_end": float(rows["t_end"].iloc[0]), "problem": rows["problem"].iloc[0]}
+    found |= {"period": four_bar.period(), "long": LONG}
+    found |= {"irk": {name: float(irk[name]) for name in names} | {name: int(irk[name]) for name in counts}}
+    found |= {"newmark": {"retried": float(newmark["retried"])}, "holds": bool(irk["share_time"] > 0.5)}
+    found |= {"ratios": ratios, "longer": min(ratios) > 1.0}
+    found |= {"evaluations_per_step": [float(run["n_evaluations"] / run["n_steps"]) for run in (irk, newmark, quarter)]}
+    found |= {"evaluations_ratio": [float(run["n_evaluations"] / irk["n_evaluations"]) for run in (newmark, quarter)]}
+    found |= {"switches": switches, "switches_per_period": switches / float(irk["t_end"] / four_bar.period())}
+    found |= {"runs": [{name: row[name] for name in told} | {"setting": setting(row)} for _, row in listed.iterrows()]}
+    return found | {"n_known": len(known), "n_worse_at_switch": int((known["retried_switch"] > known["retried"]).sum())}
 
 
 def figures_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Figure]:

@@ -7,6 +7,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
+from references.scipy.index1 import ALPHAS, baumgarte
 from studies.bench import figures, tables
 from studies.bench.cases import four_bar
 from studies.bench.cli import StudyError
@@ -14,7 +15,6 @@ from studies.bench.collector import REPEATS, Run
 from studies.bench.metrics import CHECKED, violations
 from studies.bench.render import number
 from studies.bench.solvers import (
-    ALPHAS,
     CATALOGUE,
     CVODE_C,
     CVODE_C_PROJECTED,
@@ -24,7 +24,6 @@ from studies.bench.solvers import (
     IRK,
     LINE_UP,
     OWN_EXPLICIT,
-    baumgarte,
     gear,
     paper_irk_at,
 )
@@ -157,39 +156,23 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     at_each = [costs for target in TARGETS if (costs := tables.costs_at(along, target, doubt=True))]
     first = [min((cost, solver) for solver, (cost, _) in costs.items())[1] for costs in at_each]
     kept = along.groupby("solver")["keeps_constraints"].first()
-    return {
-        "t_end": float(rows["t_end"].iloc[0]),
-        "problem": rows["problem"].iloc[0],
-        "kept": KEPT,
-        "slope": SLOPE,
-        "times": TIMES,
-        "checked": CHECKED,
-        "v35": irk["violation_35"],
-        "v36": irk["violation_36"],
-        "irk_grows": grows(irk, "q"),
-        "n_ours": len(ours),
-        "ours": [ours[f"violation_{level}"].max() for level in LEVELS],
-        "ours_keep": bool((ours[["violation_q", "violation_v"]].max(axis=1) <= KEPT).all()),
-        "ours_growing": [row["solver"] for _, row in known[own].iterrows() if grows(row, "q")],
-        "others_growing": [row["solver"] for row in others],
-        "growing_unprojected": all(not row["keeps_constraints"] for row in others),
-        "growing_to": [min(sizes, default=0.0), max(sizes, default=0.0)],
-        "inner_loose": float(loose[TIGHT]),
-        "both_loose": float(loose[LOOSE]),
-        "inner_alone_kept": bool(loose[TIGHT] <= KEPT),
-        "both_kept": bool(loose[LOOSE] <= KEPT),
-        "baumgarte": [of_alpha.min(), of_alpha.max()],
-        "baumgarte_n": len(of_alpha),
-        "baumgarte_kept": int((of_alpha <= KEPT).sum()),
-        "n_ranked": len(first),
-        "n_kept_first": sum(bool(kept[solver]) for solver in first),
-        "listed": [_told(listed.loc[name]) for name in LISTED if name in listed.index],
-        "targets": TARGETS,
-        "cost": tables.work_precision(along, TARGETS, (*DRAWN, OWN_EXPLICIT, *STABILISED[1::3])),
-        "n_failed": int(failed.sum()),
-        "n_failed_ours": int((failed & (rows["family"] == "two-loop")).sum()),
-        "pairs": [found for names in PAIRS if (found := pair(along, *names))],
-    }
+    told: dict[str, Any] = {"t_end": float(rows["t_end"].iloc[0]), "problem": rows["problem"].iloc[0], "kept": KEPT}
+    told |= {"slope": SLOPE, "times": TIMES, "checked": CHECKED, "v35": irk["violation_35"], "v36": irk["violation_36"]}
+    told |= {"irk_grows": grows(irk, "q"), "n_ours": len(ours)}
+    told |= {"ours": [ours[f"violation_{level}"].max() for level in LEVELS]}
+    told |= {"ours_keep": bool((ours[["violation_q", "violation_v"]].max(axis=1) <= KEPT).all())}
+    told |= {"ours_growing": [row["solver"] for _, row in known[own].iterrows() if grows(row, "q")]}
+    told |= {"others_growing": [row["solver"] for row in others]}
+    told |= {"growing_unprojected": all(not row["keeps_constraints"] for row in others)}
+    told |= {"growing_to": [min(sizes, default=0.0), max(sizes, default=0.0)], "inner_loose": float(loose[TIGHT])}
+    told |= {"both_loose": float(loose[LOOSE]), "inner_alone_kept": bool(loose[TIGHT] <= KEPT)}
+    told |= {"both_kept": bool(loose[LOOSE] <= KEPT), "baumgarte": [of_alpha.min(), of_alpha.max()]}
+    told |= {"baumgarte_n": len(of_alpha), "baumgarte_kept": int((of_alpha <= KEPT).sum()), "n_ranked": len(first)}
+    told |= {"n_kept_first": sum(bool(kept[solver]) for solver in first)}
+    told |= {"listed": [_told(listed.loc[name]) for name in LISTED if name in listed.index], "targets": TARGETS}
+    told |= {"cost": tables.work_precision(along, TARGETS, (*DRAWN, OWN_EXPLICIT, *STABILISED[1::3]))}
+    told |= {"n_failed": int(failed.sum()), "n_failed_ours": int((failed & (rows["family"] == "two-loop")).sum())}
+    return told | {"pairs": [found for names in PAIRS if (found := pair(along, *names))]}
 
 
 def figures_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Figure]:

@@ -13,8 +13,7 @@ def simulate(problem: KnownProblem, times: Array, tolerance: float) -> tuple[Arr
     """Pr9 of extensisq in SciPy's solve_ivp, at index 1."""
     from scipy.integrate import solve_ivp
 
-    method = imported("extensisq").Pr9
-    options = {"method": method, "t_eval": times, "rtol": tolerance, "atol": tolerance}
+    options = {"method": imported("extensisq").Pr9, "t_eval": times, "rtol": tolerance, "atol": tolerance}
     found = solve_ivp(lambda t, y: rate_of(problem, t, y), (times[0], times[-1]), start_of(problem), **options)
     if not found.success:
         raise RuntimeError(found.message)

@@ -33,10 +33,7 @@ def simulate(problem: KnownProblem, times: Array, tolerance: float) -> tuple[Arr
 def _lagrange(problem: KnownProblem) -> Callable[..., tuple[Array, Array]]:
     """SymPy's equations of a chain of points from the origin, as a function of q and v.
 
-    Raises
-    ------
-    NoModel
-        If the problem is another.
+    Raises NoModel if the problem is another.
     """
     sympy, mechanics = imported("sympy", extra="symbolic"), imported("sympy.physics.mechanics", extra="symbolic")
     upright = np.allclose(problem.force(0.0, problem.q0, problem.v0)[::2], 0.0)

@@ -19,15 +19,14 @@ from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from references.driver import ADVICE, Task, TimeLimit, adapter, imported, user_call
 from references.equations.expressions import expressions_at, functions_of
+from references.lines import Line
 from twoloop.checks.arguments import check_choice, check_size
+from twoloop.problem.problem import Array
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.result.result import Result
-
-Array = NDArray[np.float64]
 
 METHODS: dict[str, dict[str, str]] = {  # of CVODES, and how it is set up for each
     "BDF": {},
@@ -150,3 +149,11 @@ def _flags(compiler: str) -> tuple[str, ...]:
     command = [compiler, *FLAGS, "-x", "c", "-fsyntax-only", "-"]
     taken = subprocess.run(command, input=b"int x;\n", capture_output=True).returncode == 0
     return FLAGS if taken else PLAIN
+
+
+HOW: dict[str, Any] = {"keeps": False, "traces": True, "builds_each": True, "builds_span": True}
+LINES = (
+    Line("IDAS, CasADi", "casadi", "CasADi", solve_idas, checked=True, **HOW),
+    Line("CVODES, CasADi", "casadi", "CasADi", solve_cvodes, checked=True, **HOW),
+    Line("CVODES, CasADi, Adams", "casadi", "CasADi", solve_cvodes, {"method": "Adams"}, **HOW),
+)

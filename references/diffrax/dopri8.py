@@ -9,15 +9,13 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from references.driver import ADVICE, Task, TimeLimit, adapter, imported, user_call
 from references.equations.expressions import Expressions, NotSymbolic, expressions_at, functions_of
+from references.lines import Line
 from twoloop.checks.arguments import check_size
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.result.result import Result
-
-Array = NDArray[np.float64]
 
 LARGEST = 9  # coordinates; the compilation of more takes too long
 MOST_STEPS = 10**6  # some seconds, in which compiled code looks at no clock; who gets no farther was "not asked"
@@ -110,3 +108,6 @@ def solved(
     options = {"args": p, "saveat": saveat, "stepsize_controller": controller, "max_steps": most_steps, "throw": False}
     term = diffrax.ODETerm(derivative)
     return diffrax.diffeqsolve(term, diffrax.Dopri8(), t0=t0, t1=t1, dt0=None, y0=y0, **options)
+
+
+LINES = (Line("Dopri8, diffrax", "diffrax", "diffrax", solve_diffrax, keeps=False, checked=True, traces=True),)

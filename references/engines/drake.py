@@ -6,23 +6,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from references.driver import imported
-from references.engines.rigid import (
-    BALL,
-    HINGE,
-    SLIDE,
-    UNTOLD,
-    Array,
-    Motion,
-    Prepared,
-    Rigid,
-    Seen,
-    cut_points,
-    freedoms,
-    hinge_springs,
-    march,
-    point_of,
-    springs,
-)
+from references.engines import rigid as parts
+from references.engines.rigid import BALL, HINGE, SLIDE, UNTOLD, Array, Motion, Prepared, Rigid, Seen
 
 
 class Settings(NamedTuple):
@@ -34,12 +19,8 @@ class Settings(NamedTuple):
 def prepare(rigid: Rigid, settings: Settings = Settings()) -> Prepared:  # noqa: B008
     """The mechanism in Drake; a step is a plant's own, so the call makes the plant.
 
-    Raises
-    ------
-    RuntimeError
-        If Drake is not installed, or refuses to take a step.
-    ValueError
-        If it has no counterpart of a joint.
+    Raises RuntimeError if Drake is not installed, or refuses to take a step. Raises ValueError if it has no counterpart
+    of a joint.
     """
     simulation = _module("systems.analysis")
 
@@ -65,14 +46,12 @@ def prepare(rigid: Rigid, settings: Settings = Settings()) -> Prepared:  # noqa:
         def see() -> Seen:
             poses = [plant.EvalBodyPoseInWorld(context, body) for body in bodies]
             twists = [plant.EvalBodySpatialVelocityInWorld(context, body) for body in bodies]
-            x, R = (
-                np.array([each.translation() for each in poses]),
-                np.array([each.rotation().matrix() for each in poses]),
-            )
+            x = np.array([each.translation() for each in poses])
+            R = np.array([each.rotation().matrix() for each in poses])
             v, w = (np.array([getattr(each, part)() for each in twists]) for part in ("translational", "rotational"))
             return done * h, x, R, v, w, _force(rigid, plant, context, bodies)
 
-        return march(began, n_steps, n_stored, see, step)
+        return parts.march(began, n_steps, n_stored, see, step)
 
     _, bodies = _plant(rigid, settings, 1e-3)
     if refused := run(1e-6, 1, 1).message:
@@ -90,9 +69,8 @@ def _plant(rigid: Rigid, settings: Settings, h: float) -> tuple[Any, list[Any]]:
     mathematics, multibody, tree = (_module(name) for name in ("math", "multibody.plant", "multibody.tree"))
     plant = multibody.MultibodyPlant(0.0 if settings.approximation == "continuous" else h)
     if settings.approximation != "continuous":
-        plant.set_discrete_contact_approximation(
-            getattr(multibody.DiscreteContactApproximation, settings.approximation)
-        )
+        approximations = multibody.DiscreteContactApproximation
+        plant.set_discrete_contact_approximation(getattr(approximations, settings.approximation))
     plant.mutable_gravity_field().set_gravity_vector(rigid.model.gravity)
     made = {rigid.model.ground.number: plant.world_body()}
     for body in rigid.model.bodies:
@@ -101,7 +79,7 @@ def _plant(rigid: Rigid, settings: Settings, h: float) -> tuple[Any, list[Any]]:
         made[body.number] = plant.AddRigidBody(body.name, tree.SpatialInertia(mass, np.zeros(3), unit))
     for body in rigid.model.bodies:
         parent, joint = rigid.parents[body.number]
-        point, found = point_of(body, joint), freedoms(body, joint)
+        point, found = parts.point_of(body, joint), parts.freedoms(body, joint)
         turned = np.eye(3)
         if len(found) == 2:  # the axes of a universal joint
             turned = np.column_stack([found[0][1], found[1][1], np.cross(found[0][1], found[1][1])])
@@ -113,13 +91,13 @@ def _plant(rigid: Rigid, settings: Settings, h: float) -> tuple[Any, list[Any]]:
             pose = mathematics.RigidTransform(mathematics.RotationMatrix.ProjectToRotationMatrix(R), at)
             name = f"{joint.name} on {end.name}"
             frames.append(plant.AddFrame(tree.FixedOffsetFrame(name, made[end.number].body_frame(), pose)))
-        stiffness, damping, angle = hinge_springs(rigid.model).get(joint.name, (0.0, 0.0, 0.0))
+        stiffness, damping, angle = parts.hinge_springs(rigid.model).get(joint.name, (0.0, 0.0, 0.0))
         made_joint = plant.AddJoint(_joint(joint.name, found, frames, damping))
         if stiffness:
             plant.AddForceElement(tree.RevoluteSpring(made_joint, angle, stiffness))
-    for a, on_a, b, on_b in cut_points(rigid):
+    for a, on_a, b, on_b in rigid.cut_points():
         plant.AddBallConstraint(made[a.number], on_a, made[b.number], on_b)
-    for a, on_a, b, on_b, (stiffness, damping, length) in springs(rigid.model):
+    for a, on_a, b, on_b, (stiffness, damping, length) in parts.springs(rigid.model):
         ends = made[a.number], on_a, made[b.number], on_b
         plant.AddForceElement(tree.LinearSpringDamper(*ends, length, stiffness, damping))
     plant.Finalize()
@@ -134,9 +112,8 @@ def _joint(name: str, found: list[tuple[str, Any]], frames: list[Any], damping: 
     if kinds == (HINGE, HINGE):
         return tree.UniversalJoint(name, *frames)
     if kinds in ((HINGE,), (SLIDE,)):
-        return (tree.RevoluteJoint if kinds == (HINGE,) else tree.PrismaticJoint)(
-            name, *frames, found[0][1], damping=damping
-        )
+        made = tree.RevoluteJoint if kinds == (HINGE,) else tree.PrismaticJoint
+        return made(name, *frames, found[0][1], damping=damping)
     raise ValueError(f"Drake is given hinges, slides, balls and universal joints; {name!r} is of {' and '.join(kinds)}")
 
 
@@ -150,24 +127,18 @@ def _force(rigid: Rigid, plant: Any, context: Any, bodies: list[Any]) -> Array:
         return UNTOLD
     forces = _module("multibody.tree").MultibodyForces(plant)
     plant.CalcForceElementsContribution(context, forces)
-    rows, by_v = [], _module("multibody.tree").JacobianWrtVariable.kV
-    for a, on_a, b, on_b in cut_points(rigid):
-        rows.append(
-            sum(
-                sign
-                * plant.CalcJacobianTranslationalVelocity(
-                    context, by_v, bodies[each.number].body_frame(), at, *[plant.world_frame()] * 2
-                )
-                for each, at, sign in ((a, on_a, 1.0), (b, on_b, -1.0))
-            )
-        )
+    by_v, world = _module("multibody.tree").JacobianWrtVariable.kV, [plant.world_frame()] * 2
+
+    def moved(body: Any, at: Array) -> Array:
+        return plant.CalcJacobianTranslationalVelocity(context, by_v, bodies[body.number].body_frame(), at, *world)
+
+    rows = [moved(a, on_a) - moved(b, on_b) for a, on_a, b, on_b in rigid.cut_points()]
     missing = plant.CalcInverseDynamics(context, rates, forces)
     for k in np.flatnonzero(rigid.torques.any(axis=1)):
-        J = plant.CalcJacobianAngularVelocity(context, by_v, bodies[k].body_frame(), *[plant.world_frame()] * 2)
+        J = plant.CalcJacobianAngularVelocity(context, by_v, bodies[k].body_frame(), *world)
         missing -= J.T @ rigid.torques[k]
     made = np.linalg.lstsq(np.vstack(rows).T, missing, rcond=1e-9)[0].reshape(-1, 3)
-    n = {"spherical": 1, "revolute": 2}[rigid.loops[0].kind]
-    return made[:n].sum(axis=0)
+    return made[: {"spherical": 1, "revolute": 2}[rigid.loops[0].kind]].sum(axis=0)
 
 
 def _start(rigid: Rigid, plant: Any, context: Any, bodies: list[Any]) -> None:

@@ -6,19 +6,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from references.driver import imported
-from references.engines.rigid import (
-    UNTOLD,
-    Motion,
-    Prepared,
-    Rigid,
-    axis_of,
-    coordinates,
-    hinge_springs,
-    largest_moment,
-    point_of,
-    springs,
-    states,
-)
+from references.engines import rigid as parts
+from references.engines.rigid import UNTOLD, Motion, Prepared, Rigid
 
 PLANAR_CUT = [1, 1, 0, 0, 0, 0]
 
@@ -33,12 +22,7 @@ class Settings(NamedTuple):
 def prepare(rigid: Rigid, settings: Settings = Settings()) -> Prepared:  # noqa: B008
     """The mechanism in Exudyn; the call holds the making of its model, which a run changes.
 
-    Raises
-    ------
-    RuntimeError
-        If Exudyn is not installed.
-    ValueError
-        If it has no counterpart of a joint.
+    Raises RuntimeError if Exudyn is not installed. Raises ValueError if it has no counterpart of a joint.
     """
     imported("exudyn", extra="references")
     from references.exudyn.run import check_steps
@@ -48,7 +32,7 @@ def prepare(rigid: Rigid, settings: Settings = Settings()) -> Prepared:  # noqa:
     problem = rigid.given if planar else rigid.model.problem((0.0, 1.0))
     dependent = bool(rigid.given.freedom.redundant)
     x, R, v, w = (each[None] for each in (rigid.x, rigid.R, rigid.v, rigid.w))
-    start = coordinates(Motion(np.zeros(1), x, R, v, w, UNTOLD[None], 0.0, 0.0), planar)
+    start = parts.coordinates(Motion(np.zeros(1), x, R, v, w, UNTOLD[None], 0.0, 0.0), planar)
 
     def build() -> Any:
         return _model(rigid, planar, *(each[:, 0].reshape(len(rigid.x), -1) for each in start))
@@ -58,18 +42,19 @@ def prepare(rigid: Rigid, settings: Settings = Settings()) -> Prepared:  # noqa:
         every = n_steps // n_stored
         steps = check_steps(problem, t_end, n_steps, settings.solver, every, None, settings.radius)
         model, sensor, axes = build()
-        reference = np.concatenate(model.reference)
-        made = run_exudyn(model.mbs, model.sensors, reference, steps, None, dependent)
+        made = run_exudyn(model.mbs, model.sensors, np.concatenate(model.reference), steps, None, dependent)
         call = time.process_time() - began
-        parts = states(planar, made.q, made.v)
+        located = parts.states(planar, made.q, made.v)
         f = np.full((made.t.size, 3), np.nan) if sensor < 0 else model.mbs.GetSensorStoredData(sensor)[:, 1:4]
         if not planar and sensor >= 0:
-            f = np.einsum("tij,tj->ti", parts[1][:, rigid.loops[0].a.number] @ axes, f)
-        return Motion(made.t, *parts, f, call, made.stats.cpu_time, "" if made.success else made.message)
+            f = np.einsum("tij,tj->ti", located[1][:, rigid.loops[0].a.number] @ axes, f)
+        return Motion(made.t, *located, f, call, made.stats.cpu_time, "" if made.success else made.message)
 
     made, *_ = build()
     masses, inertias = ([made.mbs.GetObject(body)[name] for body in made.bodies] for name in ("mass", "inertia"))
-    moments = [J if planar else largest_moment(np.array([0.0, *np.array(J)[[0, 1, 2, 5, 4, 3]]])) for J in inertias]
+    moments = [
+        J if planar else parts.largest_moment(np.array([0.0, *np.array(J)[[0, 1, 2, 5, 4, 3]]])) for J in inertias
+    ]
     return Prepared(np.array(masses), np.array(moments), run)
 
 
@@ -89,10 +74,10 @@ def _model(rigid: Rigid, planar: bool, q: Any, v: Any) -> tuple[Any, int, Any]:
     for joint in rigid.model.joints:
         a, b = joint.a.number, joint.b.number
         if planar:
-            made = model.pin(a, tuple(point_of(joint.a, joint)[:2]), b, tuple(point_of(joint.b, joint)[:2]))
+            made = model.pin(a, tuple(parts.point_of(joint.a, joint)[:2]), b, tuple(parts.point_of(joint.b, joint)[:2]))
             sensor = model.told(made, False) if joint.name == rigid.cut else sensor
             continue
-        axes = [end.rotation @ axis_of(end, joint) for end in (joint.a, joint.b)]
+        axes = [end.rotation @ parts.axis_of(end, joint) for end in (joint.a, joint.b)]
         turned = frame(axes[0])
         if joint.kind == "prismatic":
             turned = turned[:, [2, 0, 1]]  # along x
@@ -102,16 +87,16 @@ def _model(rigid: Rigid, planar: bool, q: Any, v: Any) -> tuple[Any, int, Any]:
             raise ValueError(f"Exudyn is given {', '.join(locked)} joints; {joint.name!r} is {joint.kind}")
         flat = rigid.planar and joint.kind == "spherical"
         turned = np.eye(3) if flat else turned
-        point = joint.a.in_space(point_of(joint.a, joint))
+        point = joint.a.in_space(parts.point_of(joint.a, joint))
         made = model.joint(a, b, point, turned, PLANAR_CUT if flat else locked[joint.kind])
         made_of[joint.name] = made
         if joint.name == rigid.cut:
             sensor, own = model.told(made, True), joint.a.rotation.T @ turned
-    for one, at, other, there, values in springs(rigid.model):
+    for one, at, other, there, values in parts.springs(rigid.model):
         # Exudyn's planar bodies take points in their own axes, see Model.planar_body
         ends = (at, there) if planar else (one.in_space(at), other.in_space(there))
         model.spring(one.number, ends[0], other.number, ends[1], *values)
-    for name, (stiffness, damping, angle) in hinge_springs(rigid.model).items():
+    for name, (stiffness, damping, angle) in parts.hinge_springs(rigid.model).items():
         joint = next(each for each in rigid.model.joints if each.name == name)
         if not planar:
             model.twist(made_of[name], stiffness, damping, angle)

@@ -25,12 +25,7 @@ class Settings(NamedTuple):
 def prepare(rigid: Rigid, settings: Settings = Settings()) -> Prepared:  # noqa: B008
     """The mechanism in MuJoCo.
 
-    Raises
-    ------
-    RuntimeError
-        If MuJoCo is not installed.
-    ValueError
-        If MJCF has no counterpart of a joint.
+    Raises RuntimeError if MuJoCo is not installed. Raises ValueError if MJCF has no counterpart of a joint.
     """
     mujoco = imported("mujoco", extra="engines")
     mujoco.set_mju_user_warning(lambda text: None)  # which it would put into a file in the folder of the caller

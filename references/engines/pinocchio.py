@@ -5,28 +5,13 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from references.driver import imported
-from references.engines.rigid import (
-    BALL,
-    SLIDE,
-    UNTOLD,
-    Motion,
-    Prepared,
-    Rigid,
-    Seen,
-    cut_points,
-    freedoms,
-    hinge_springs,
-    march,
-    point_of,
-    springs,
-    tensor,
-)
+from references.engines import rigid as parts
+from references.engines.rigid import BALL, SLIDE, UNTOLD, Motion, Prepared, Rigid, Seen
 from twoloop.bodies.parts import Body
+from twoloop.problem.problem import Array
 
-Array = NDArray[np.float64]
 Acceleration = Callable[[Array, Array], Array]
 
 
@@ -42,17 +27,12 @@ class Settings(NamedTuple):
 def prepare(rigid: Rigid, settings: Settings = Settings()) -> Prepared:  # noqa: B008
     """The mechanism in Pinocchio, its steps taken in Python as its examples do.
 
-    Raises
-    ------
-    RuntimeError
-        If Pinocchio is not installed.
-    ValueError
-        If it has no counterpart of a joint.
+    Raises RuntimeError if Pinocchio is not installed. Raises ValueError if it has no counterpart of a joint.
     """
     pin = imported("pinocchio", "pin", extra="engines")
     model, frames = _tree(pin, rigid)
     constraints = pin.StdVec_RigidConstraintModel()
-    for a, on_a, b, on_b in cut_points(rigid):
+    for a, on_a, b, on_b in rigid.cut_points():
         ends = [
             (joint, origin * pin.SE3(np.eye(3), at))
             for (joint, origin), at in ((frames[a.number], on_a), (frames[b.number], on_b))
@@ -117,7 +97,7 @@ def prepare(rigid: Rigid, settings: Settings = Settings()) -> Prepared:  # noqa:
                 f = turned @ np.sum([each.contact_force.linear for each in list(datas)[:n_points]], axis=0)
             return taken * h, x, R, speeds, spins, f
 
-        return march(began, n_steps, n_stored, see, step)
+        return parts.march(began, n_steps, n_stored, see, step)
 
     own = [model.inertias[frames[k][0]] for k in range(len(rigid.x))]
     moments = [float(np.linalg.eigvalsh(each.inertia)[-1]) for each in own]
@@ -135,16 +115,17 @@ def _tree(pin: Any, rigid: Rigid) -> tuple[Any, dict[int, tuple[int, Any]]]:
         body = ahead.pop()
         parent, joint = rigid.parents[body.number]
         ahead += _children(rigid, body)
-        point = point_of(body, joint)
+        point = parts.point_of(body, joint)
         number, origin = frames[parent.number]
-        there = pin.SE3(parent.rotation.T @ body.rotation, parent.local_point(body.in_space(point)))
-        place = origin * there
-        for k, (kind, axis) in enumerate(freedoms(body, joint)):
+        place = origin * pin.SE3(parent.rotation.T @ body.rotation, parent.local_point(body.in_space(point)))
+        for k, (kind, axis) in enumerate(parts.freedoms(body, joint)):
             kinds = {BALL: pin.JointModelSpherical, SLIDE: pin.JointModelPrismaticUnaligned}
             made = kinds[kind]() if kind == BALL else kinds.get(kind, pin.JointModelRevoluteUnaligned)(axis)
             number = model.addJoint(number, made, place if k == 0 else pin.SE3.Identity(), f"{joint.name} {k + 1}")
         origin = pin.SE3(np.eye(3), -point)
-        model.appendBodyToJoint(number, pin.Inertia(float(body.inertia[0]), np.zeros(3), tensor(body.inertia)), origin)
+        model.appendBodyToJoint(
+            number, pin.Inertia(float(body.inertia[0]), np.zeros(3), parts.tensor(body.inertia)), origin
+        )
         frames[body.number] = number, origin
     return model, frames
 
@@ -166,11 +147,11 @@ def _force(
     pin: Any, rigid: Rigid, model: Any, data: Any, frames: dict[int, tuple[int, Any]]
 ) -> Callable[[Array, Array], Array]:
     """Generalised forces of springs and constant torques, as a function of q and v."""
-    known, turning = springs(rigid.model), np.flatnonzero(rigid.torques.any(axis=1))
+    known, turning = parts.springs(rigid.model), np.flatnonzero(rigid.torques.any(axis=1))
     hinges = [
         (model.joints[frames[body][0]], values)
         for body, (_, joint) in rigid.parents.items()
-        if (values := hinge_springs(rigid.model).get(joint.name))
+        if (values := parts.hinge_springs(rigid.model).get(joint.name))
     ]
     if not known and not hinges and not turning.size:
         zero = np.zeros(model.nv)

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from twoloop.bodies import SpatialModel
 from twoloop.bodies.model_problem import ModelProblem
@@ -19,8 +18,7 @@ from twoloop.bodies.parameter_layout import SPRING, TORQUE, TORSION
 from twoloop.bodies.parts import Body, ModelJoint
 from twoloop.bodies.spanning_tree import spanning_tree
 from twoloop.mechanisms.rotation import G, euler_parameters, euler_rates, rotation_matrix
-
-Array = NDArray[np.float64]
+from twoloop.problem.problem import Array
 
 SLIDE, HINGE, BALL = "slide", "hinge", "ball"
 FREEDOMS = ("revolute", "prismatic", "cylindrical", "universal", "spherical")  # kinds of joints of a tree
@@ -30,50 +28,31 @@ Z = (0.0, 0.0, 1.0)
 
 @dataclass(frozen=True)
 class Motion:
-    """Where the bodies are at some instants, and what it took.
+    """Where the bodies are at some instants, and what it took."""
 
-    Attributes
-    ----------
-    t : ndarray (n_t,)
-        s; the first is 0.
-    x, v, w : ndarray (n_t, n_bodies, 3)
-        Centres of mass (m), their velocities (m/s), angular velocities along the axes of space (rad/s).
-    R : ndarray (n_t, n_bodies, 3, 3)
-        Their columns are the axes of the bodies.
-    f : ndarray (n_t, 3)
-        Force of the first joint that closes a loop on its `body`, along the axes of space, N; NaN: not told.
-    call_s, stepping_s : float
-        CPU time of the call on a model that has been built, and of its steps alone, s.
-    message : str
-        Why it ended before its time; nothing if it did not.
-    """
-
-    t: Array
+    t: Array  # (n_t,); s; the first is 0
+    # x, v, w: (n_t, n_bodies, 3); centres of mass (m), their velocities (m/s), angular velocities along the axes of
+    # space (rad/s)
     x: Array
-    R: Array
+    R: Array  # (n_t, n_bodies, 3, 3); their columns are the axes of the bodies
     v: Array
     w: Array
+    # (n_t, 3); force of the first joint that closes a loop on its `body`, along the axes of space, N; NaN: not told
     f: Array
+    # call_s, stepping_s: CPU time of the call on a model that has been built, and of its steps alone, s
     call_s: float
     stepping_s: float
-    message: str = ""
+    message: str = ""  # why it ended before its time; nothing if it did not
 
 
 @dataclass(frozen=True)
 class Prepared:
-    """A model in an engine.
+    """A model in an engine."""
 
-    Attributes
-    ----------
-    masses, moments : ndarray (n_bodies,)
-        As the engine has them: kg, and the largest principal moment of inertia, kg m^2.
-    run : callable
-        run(t_end, n_steps, n_stored) -> Motion, which begins anew.
-    """
-
+    # masses, moments: (n_bodies,); as the engine has them: kg, and the largest principal moment of inertia, kg m^2
     masses: Array
     moments: Array
-    run: Callable[[float, int, int], Motion]
+    run: Callable[[float, int, int], Motion]  # run(t_end, n_steps, n_stored) -> Motion, which begins anew
 
 
 Seen = tuple[float, Array, Array, Array, Array, Array]  # t, x, R, v, w, f of `Motion` at one instant
@@ -104,43 +83,42 @@ def march(began: float, n_steps: int, n_stored: int, see: Callable[[], Seen], st
 
 @dataclass(frozen=True)
 class Rigid:
-    """A mechanism in space, and how it starts.
-
-    Attributes
-    ----------
-    given : ModelProblem
-    model : SpatialModel
-    planar : bool
-        Whether it was made of a planar one.
-    x, R, v, w : ndarray
-        Of the bodies at the start, as in `Motion` at one instant.
-    parents, loops
-        Of `spanning_tree`.
-    torques : ndarray (n_bodies, 3)
-        Constant ones, N m.
-    """
+    """A mechanism in space, and how it starts."""
 
     given: ModelProblem
     model: SpatialModel
-    planar: bool
+    planar: bool  # whether it was made of a planar one
+    # x, R, v, w: of the bodies at the start, as in `Motion` at one instant
     x: Array
     R: Array
     v: Array
     w: Array
+    # parents, loops: of `spanning_tree`
     parents: dict[int, tuple[Body, ModelJoint]]
     loops: list[ModelJoint]
-    torques: Array
+    torques: Array  # (n_bodies, 3); constant ones, N m
 
     @property
     def cut(self) -> str:
         """The name of the first joint that closes a loop; nothing of a tree."""
         return self.loops[0].name if self.loops else ""
 
+    def cut_points(self) -> list[tuple[Body, Array, Body, Array]]:
+        """Pairs of points that coincide where loops are cut: one pair of a ball, two on the axis of a hinge."""
+        pairs = []
+        for joint in self.loops:
+            if joint.kind not in ("spherical", "revolute"):
+                raise ValueError(f"a loop is closed by a ball or a hinge; {joint.name!r} is {joint.kind}")
+            sides = (0.0,) if joint.kind == "spherical" else (-HALF, HALF)
+            for side in sides:
+                places = [point_of(body, joint) + side * axis_of(body, joint) for body in (joint.a, joint.b)]
+                pairs.append((joint.a, places[0], joint.b, places[1]))
+        return pairs
+
     def rates(self, body: Body) -> Array:
         """Start velocities of the joint above a body, in the order of `freedoms`; a ball's in the axes of the body."""
         parent, joint = self.parents[body.number]
-        point = point_of(body, joint)
-        here = body.position + body.rotation @ point
+        here = body.position + body.rotation @ point_of(body, joint)
         speed, spin = self._twist(body, here) - self._twist(parent, here)
         columns = []
         for kind, axis in freedoms(body, joint):
@@ -194,19 +172,6 @@ def freedoms(body: Body, joint: ModelJoint) -> list[tuple[str, Array]]:
     return [(kind, axis) for kind in kinds]
 
 
-def cut_points(rigid: Rigid) -> list[tuple[Body, Array, Body, Array]]:
-    """Pairs of points that coincide where loops are cut: one pair of a ball, two on the axis of a hinge."""
-    pairs = []
-    for joint in rigid.loops:
-        if joint.kind not in ("spherical", "revolute"):
-            raise ValueError(f"a loop is closed by a ball or a hinge; {joint.name!r} is {joint.kind}")
-        sides = (0.0,) if joint.kind == "spherical" else (-HALF, HALF)
-        for side in sides:
-            places = [point_of(body, joint) + side * axis_of(body, joint) for body in (joint.a, joint.b)]
-            pairs.append((joint.a, places[0], joint.b, places[1]))
-    return pairs
-
-
 def springs(model: Any) -> list[tuple[Body, Array, Body, Array, tuple[float, ...]]]:
     """Both ends of each spring in the axes of the bodies; stiffness, damping, length."""
     return [
@@ -231,11 +196,8 @@ def hinge_springs(model: Any) -> dict[str, tuple[float, float, float]]:
 def rigid_of(problem: ModelProblem) -> Rigid:
     """What engines are given of a model in a plane or in space.
 
-    Raises
-    ------
-    ValueError
-        If it holds a drive, a force that is neither a spring nor a constant torque, or a spring in a joint that closes
-        a loop.
+    Raises ValueError if it holds a drive, a force that is neither a spring nor a constant torque, or a spring in a
+    joint that closes a loop.
     """
     given: Any = problem.model
     wrong = [each.name for each in given.joints if each.kind == "drive"]
@@ -308,10 +270,7 @@ def coordinates(motion: Motion, planar: bool) -> tuple[Array, Array]:
         angles = np.unwrap(np.arctan2(motion.R[..., 1, 0], motion.R[..., 0, 0]), axis=0)
         q, v = (
             np.concatenate(each, axis=2)
-            for each in (
-                (motion.x[..., :2], angles[..., None]),
-                (motion.v[..., :2], motion.w[..., 2:]),
-            )
+            for each in ((motion.x[..., :2], angles[..., None]), (motion.v[..., :2], motion.w[..., 2:]))
         )
     else:
         q, v = np.empty((n_t, n, 7)), np.empty((n_t, n, 7))

@@ -4,13 +4,11 @@ from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
 from references.driver import imported
 from twoloop.mechanisms.planar import GROUND, PlanarBodies
-
-Array = NDArray[np.float64]
+from twoloop.problem.problem import Array
 
 Z = (0.0, 0.0, 1.0)
 
@@ -58,10 +56,7 @@ def _relative(values: Array, body: int, on: int) -> float:
 def mujoco_tree(bodies: PlanarBodies, angles: Array, rates: Array) -> TreeDynamics:
     """The tree in MuJoCo at angles and angular velocities in space (n,); an evaluation is `mj_forward`.
 
-    Raises
-    ------
-    RuntimeError
-        If MuJoCo is not installed.
+    Raises RuntimeError if MuJoCo is not installed.
     """
     mujoco = imported("mujoco", extra="engines")
     spec = mujoco.MjSpec()
@@ -106,10 +101,7 @@ def _in_pinocchio(bodies: PlanarBodies) -> _Pinocchio:
 def pinocchio_tree(bodies: PlanarBodies, angles: Array, rates: Array) -> TreeDynamics:
     """The same in Pinocchio, with its joint about z; an evaluation is `aba`.
 
-    Raises
-    ------
-    RuntimeError
-        If Pinocchio is not installed.
+    Raises RuntimeError if Pinocchio is not installed.
     """
     pin, model, first, parents = _in_pinocchio(bodies)
     data, q, v, tau = model.createData(), *np.zeros((3, model.nv))
@@ -121,10 +113,7 @@ def pinocchio_tree(bodies: PlanarBodies, angles: Array, rates: Array) -> TreeDyn
 def end_by_pinocchio(bodies: PlanarBodies, angles: Array, t_end: float, tolerance: float) -> Array:
     """Coordinates (3 n,) of a tree some time after its release, by SciPy's DOP853 on the accelerations of Pinocchio.
 
-    Raises
-    ------
-    RuntimeError
-        If Pinocchio is not installed.
+    Raises RuntimeError if Pinocchio is not installed.
     """
     pin, model, first, parents = _in_pinocchio(bodies)
     data, y0, tau = model.createData(), np.zeros(2 * model.nv), np.zeros(model.nv)

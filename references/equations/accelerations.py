@@ -13,13 +13,11 @@ from typing import Any
 import numpy as np
 from numba import njit
 from numba.core.dispatcher import Dispatcher
-from numpy.typing import NDArray
 
 from references.equations.linear import OPTIONS, SINGULAR, cholesky, cholesky_solve, kept, lu_factor, lu_solve
-from twoloop.kernels.data.common import GAMMA_GIVEN
+from twoloop.kernels.data.flags import GAMMA_GIVEN
+from twoloop.problem.problem import Array
 from twoloop.problem.system import ConstrainedSystem
-
-Array = NDArray[np.float64]
 
 GAMMA_DIFFERENCE = 1e-3  # displacement over which C_q v + C_t is differenced, divided by max(1, |v|)
 

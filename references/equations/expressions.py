@@ -10,29 +10,22 @@ from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from references.equations.rows import independent_rows
 from twoloop.generate.derivative import Derivative
 from twoloop.generate.traced_equations import Equations, only
 from twoloop.generate.traced_values import Traced
 from twoloop.generate.tracing import Form, Graph, Untraceable, symbols
-from twoloop.kernels.data.common import GAMMA_GIVEN
+from twoloop.kernels.data.flags import GAMMA_GIVEN
 from twoloop.kernels.evaluation import operations
+from twoloop.problem.problem import Array
 from twoloop.problem.system import ConstrainedSystem, check_system
 
-Array = NDArray[np.float64]
 Functions = Mapping[str, Callable[[Any], Any]]  # those of FUNCTIONS that the package has, by name
 Factors = list[tuple[int, Form, list[tuple[int, Form]]]]
 
-FUNCTIONS = {
-    operations.SINE: "sin",
-    operations.COSINE: "cos",
-    operations.SQUARE_ROOT: "sqrt",
-    operations.EXPONENTIAL: "exp",
-    operations.LOGARITHM: "log",
-    operations.ARCTANGENT: "atan",
-}
+FUNCTIONS = {operations.SINE: "sin", operations.COSINE: "cos", operations.SQUARE_ROOT: "sqrt"}
+FUNCTIONS |= {operations.EXPONENTIAL: "exp", operations.LOGARITHM: "log", operations.ARCTANGENT: "atan"}
 
 
 class NotSymbolic(ValueError):

@@ -1,13 +1,11 @@
 """Accelerations and multipliers at states that a solver stored, of least norm where they are not unique."""
 
 import numpy as np
-from numpy.typing import NDArray
 
 from references.equations.accelerations import compiled_gamma
 from references.equations.rows import independent_rows
+from twoloop.problem.problem import Array
 from twoloop.problem.system import ConstrainedSystem
-
-Array = NDArray[np.float64]
 
 SAMPLES = 5  # states at which the rank is looked for: at a singular position more rows depend on others
 

@@ -7,15 +7,13 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from references.diffrax.dopri8 import derivative_of, packages, solved
 from references.driver import imported
 from references.equations.expressions import Expressions
 from references.heyoka.taylor import rates_of
-from twoloop.problem.problem import Problem
+from twoloop.problem.problem import Array, Problem
 
-Array = NDArray[np.float64]
 Solve = Callable[[float], Array]  # tolerance -> q at the end (n_runs, n_q), NaN of what failed
 
 MOST_STEPS = 100_000  # of diffrax
@@ -30,8 +28,7 @@ def by_diffrax(problems: Sequence[Problem], t_end: float) -> Solve:
 
     def one(y0: Any, p: Any, tol: Any) -> Any:
         found = solved(derivative, 0.0, t_end, y0, (tol, tol), diffrax.SaveAt(t1=True), MOST_STEPS, p)
-        good = found.result == diffrax.RESULTS.successful
-        return jax.numpy.where(good, found.ys[-1][:n], jax.numpy.nan)
+        return jax.numpy.where(found.result == diffrax.RESULTS.successful, found.ys[-1][:n], jax.numpy.nan)
 
     run = jax.jit(jax.vmap(one, in_axes=(0, 0, None)))
     return lambda tol: np.array(run(states, parameters, tol))
@@ -65,10 +62,7 @@ def by_heyoka(problems: Sequence[Problem], t_end: float) -> Solve:
 def _gathered(problems: Sequence[Problem]) -> tuple[Expressions, Array, Array]:
     """The equations, states (n_runs, 2 n_q) and parameters (n_runs, n_p) of problems that differ in numbers only.
 
-    Raises
-    ------
-    ValueError
-        If a problem has other callbacks than the first, naming it.
+    Raises ValueError if a problem has other callbacks than the first, naming it.
     """
     first = problems[0]
     for problem in problems:

@@ -11,11 +11,9 @@ from typing import Any
 
 import numpy as np
 from numba.core.dispatcher import Dispatcher
-from numpy.typing import NDArray
 
 from twoloop import ConstrainedSystem, callback
-
-Array = NDArray[np.float64]
+from twoloop.problem.problem import Array
 
 RANK = 1e-9  # of a row, which follows from those before it where it differs from what they span by less
 HOLDS = 1e-6  # of the largest coordinate, 1 at least: how far a position may be from a row that was left out ...
@@ -32,12 +30,7 @@ def with_all_rows(system: ConstrainedSystem) -> ConstrainedSystem:
     """The system for solvers that take its accelerations: A, b and Q_a stand below C_q, C_t and Q_d.
 
     C of these rows is zero: what projects positions leaves them alone, what projects velocities takes them. A system
-    without such rows is returned as it is.
-
-    Raises
-    ------
-    ValueError
-        If Q_a, or Q_d of other rows, is not given.
+    without such rows is returned as it is. Raises ValueError if Q_a, or Q_d of other rows, is not given.
     """
     if system.n_a == 0:
         return system
@@ -58,10 +51,7 @@ class IndependentRows:
     system : ConstrainedSystem
         With these rows only; the one given, where they are all.
 
-    Raises
-    ------
-    ValueError
-        If the start violates a row left out.
+    Raises ValueError if the start violates a row left out.
     """
 
     def __init__(self, system: ConstrainedSystem, t0: float, q0: Array):

@@ -13,26 +13,13 @@ from typing import Any
 
 import exudyn as exu
 import numpy as np
-from exudyn.itemInterface import (
-    LoadMassProportional,
-    MarkerBodyMass,
-    MarkerNodeCoordinate,
-    NodePoint2DSlope1,
-    NodePointGround,
-    NodeRigidBody2D,
-    ObjectANCFCable2D,
-    ObjectBeamGeometricallyExact2D,
-    ObjectConnectorCoordinate,
-)
-from numpy.typing import NDArray
+from exudyn import itemInterface as items
 
 from references.driver import check_problem
 from references.exudyn.run import add_sensors, check_steps, run
 from twoloop.checks.arguments import check_choice
-from twoloop.problem.problem import Problem
+from twoloop.problem.problem import Array, Problem
 from twoloop.result.result import Result
-
-Array = NDArray[np.float64]
 
 MODELS = {
     "cable": "ANCFCable2D: cubic, the section stays normal to the centre line and has no rotary inertia",
@@ -89,7 +76,7 @@ def _model(p: dict[str, Any], model: str) -> tuple[Any, Any, list[list[int]], Ar
     mbs = container.AddSystem()
     n_elements = p["n_elements"]
     length = p["length"] / n_elements
-    node_type, straight = (NodePoint2DSlope1, [1.0, 0.0]) if model == "cable" else (NodeRigidBody2D, [0.0])
+    node_type, straight = (items.NodePoint2DSlope1, [1.0, 0.0]) if model == "cable" else (items.NodeRigidBody2D, [0.0])
     reference = np.array([[k * length, 0.0, *straight] for k in range(n_elements + 1)])
     start = np.zeros_like(reference)
     start[: 1 if p["start"] == "node" else None, 0] = p["amplitude"] * p["angular_frequency"]
@@ -99,9 +86,8 @@ def _model(p: dict[str, Any], model: str) -> tuple[Any, Any, list[list[int]], Ar
     ]
     element = _element(p, model, length)
     for k in range(n_elements):
-        body = mbs.AddObject(element(nodes[k : k + 2]))
-        whole = mbs.AddMarker(MarkerBodyMass(bodyNumber=body))
-        mbs.AddLoad(LoadMassProportional(markerNumber=whole, loadVector=[0.0, -p["gravity"], 0.0]))
+        whole = mbs.AddMarker(items.MarkerBodyMass(bodyNumber=mbs.AddObject(element(nodes[k : k + 2]))))
+        mbs.AddLoad(items.LoadMassProportional(markerNumber=whole, loadVector=[0.0, -p["gravity"], 0.0]))
     _hold(mbs, p, nodes[0])
     sensors = [add_sensors(mbs, node) for node in nodes]
     mbs.Assemble()
@@ -111,21 +97,14 @@ def _model(p: dict[str, Any], model: str) -> tuple[Any, Any, list[list[int]], Ar
 def _element(p: dict[str, Any], model: str, length: float) -> Callable[[list[int]], Any]:
     """An element of the beam between two nodes."""
     area, second_moment = p["height"] * p["width"], p["width"] * p["height"] ** 3 / 12.0
-    section = {
-        "length": length,
-        "massPerLength": p["density"] * area,
-        "bendingStiffness": p["youngs_modulus"] * second_moment,
-        "axialStiffness": p["youngs_modulus"] * area,
-    }
+    section = {"length": length, "massPerLength": p["density"] * area}
+    section |= {"bendingStiffness": p["youngs_modulus"] * second_moment, "axialStiffness": p["youngs_modulus"] * area}
     if model == "cable":
-        return lambda ends: ObjectANCFCable2D(nodeNumbers=ends, **section)
-    return lambda ends: ObjectBeamGeometricallyExact2D(
-        nodeNumbers=ends,
-        crossSectionInertia=p["density"] * second_moment,
-        # without the correction for its distribution over the section, as the element of twoloop has it
-        shearStiffness=0.5 * p["youngs_modulus"] / (1.0 + p["poisson_ratio"]) * area,
-        **section,
-    )
+        return lambda ends: items.ObjectANCFCable2D(nodeNumbers=ends, **section)
+    # the shear without the correction for its distribution over the section, as the element of twoloop has it
+    section |= {"shearStiffness": 0.5 * p["youngs_modulus"] / (1.0 + p["poisson_ratio"]) * area}
+    section |= {"crossSectionInertia": p["density"] * second_moment}
+    return lambda ends: items.ObjectBeamGeometricallyExact2D(nodeNumbers=ends, **section)
 
 
 def _hold(mbs: Any, p: dict[str, Any], node: int) -> None:
@@ -138,9 +117,8 @@ def _hold(mbs: Any, p: dict[str, Any], node: int) -> None:
     def speed(mbs: Any, t: float, itemNumber: int, lOffset: float) -> float:
         return float(amplitude * frequency * math.cos(frequency * t))
 
-    ground = mbs.AddMarker(MarkerNodeCoordinate(nodeNumber=mbs.AddNode(NodePointGround()), coordinate=0))
-    along, across = (mbs.AddMarker(MarkerNodeCoordinate(nodeNumber=node, coordinate=k)) for k in range(2))
-    mbs.AddObject(
-        ObjectConnectorCoordinate(markerNumbers=[ground, along], offsetUserFunction=place, offsetUserFunction_t=speed)
-    )
-    mbs.AddObject(ObjectConnectorCoordinate(markerNumbers=[ground, across]))
+    ground = mbs.AddMarker(items.MarkerNodeCoordinate(nodeNumber=mbs.AddNode(items.NodePointGround()), coordinate=0))
+    along, across = (mbs.AddMarker(items.MarkerNodeCoordinate(nodeNumber=node, coordinate=k)) for k in range(2))
+    moved = {"offsetUserFunction": place, "offsetUserFunction_t": speed}
+    mbs.AddObject(items.ObjectConnectorCoordinate(markerNumbers=[ground, along], **moved))
+    mbs.AddObject(items.ObjectConnectorCoordinate(markerNumbers=[ground, across]))

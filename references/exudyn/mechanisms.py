@@ -8,7 +8,6 @@ from collections.abc import Callable
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
 from references.exudyn.model import GROUND, PRISMATIC, REVOLUTE, SPHERICAL, UNIVERSAL, Model, frame
 from references.exudyn.run import check_steps, run
@@ -16,10 +15,9 @@ from twoloop.mechanisms import bricard, n_four_bar
 from twoloop.mechanisms.bricard import AXES, CORNERS, FRAMES
 from twoloop.mechanisms.governor import BALL, CUBE, DAMPING, DENSITY, HEIGHT, LENGTH, SLACK, STIFFNESS, WIDTH, box
 from twoloop.mechanisms.rotation import euler_parameters, rotated_rate, rotation_matrix
-from twoloop.problem.problem import Problem
+from twoloop.problem.problem import Array, Problem
 from twoloop.result.result import Result
 
-Array = NDArray[np.float64]
 X, Y, Z = np.eye(3)
 REDUNDANT = ("A02", "A04")  # beginnings of names: rows that depend on others, for good or where the motion passes
 
@@ -91,8 +89,7 @@ def solve_exudyn(
 
 def model_of(problem: Problem) -> Model:
     """The model of a problem, assembled."""
-    make = MODELS.get(problem.name, _n_four_bar if problem.name.startswith("A02") else _four_bar)
-    model = make(problem)
+    model = MODELS.get(problem.name, _n_four_bar if problem.name.startswith("A02") else _four_bar)(problem)
     model.mbs.Assemble()
     return model
 
@@ -143,8 +140,7 @@ def _spatial_slider_crank(problem: Problem) -> Model:
 
 
 def _governor(problem: Problem) -> Model:
-    p = problem.parameters
-    model = Model((0.0, 0.0, -p["gravity"]))
+    model = Model((0.0, 0.0, -problem.parameters["gravity"]))
     bar, cube = DENSITY * LENGTH * WIDTH**2, DENSITY * CUBE**3
     centre = (0.5 * bar + BALL) * LENGTH / (bar + BALL)  # of rod and ball, from the hinge
     axial, across, _ = box(bar, LENGTH, WIDTH, WIDTH)

@@ -4,33 +4,12 @@ from typing import Any
 
 import exudyn as exu
 import numpy as np
-from exudyn.itemInterface import (
-    GenericJoint,
-    LoadMassProportional,
-    LoadTorqueVector,
-    MarkerBodyMass,
-    MarkerBodyPosition,
-    MarkerBodyRigid,
-    MarkerNodeCoordinate,
-    NodePointGround,
-    NodeRigidBody2D,
-    NodeRigidBodyEP,
-    ObjectConnectorCoordinate,
-    ObjectConnectorCoordinateSpringDamper,
-    ObjectConnectorSpringDamper,
-    ObjectGround,
-    ObjectJointRevolute2D,
-    ObjectRigidBody,
-    ObjectRigidBody2D,
-    SensorObject,
-    TorsionalSpringDamper,
-)
-from numpy.typing import ArrayLike, NDArray
+from exudyn import itemInterface as items
+from numpy.typing import ArrayLike
 
 from references.exudyn.run import add_sensors
 from twoloop.mechanisms.rotation import rotation_matrix
-
-Array = NDArray[np.float64]
+from twoloop.problem.problem import Array
 
 GROUND = -1
 # locked translations and rotations of the second body in the frame of a joint
@@ -50,11 +29,11 @@ class Model:
         self.sensors: list[list[int]] = []
         self.places: list[tuple[Array, Array]] = []  # centre and rotation matrix of each body at the start
         self.reference: list[Array] = []
-        self.ground = self.mbs.AddObject(ObjectGround(referencePosition=[0.0, 0.0, 0.0]))
+        self.ground = self.mbs.AddObject(items.ObjectGround(referencePosition=[0.0, 0.0, 0.0]))
 
     def _added(self, body: int, node: int, q: Array, place: tuple[Array, Array]) -> int:
-        whole = self.mbs.AddMarker(MarkerBodyMass(bodyNumber=body))
-        self.mbs.AddLoad(LoadMassProportional(markerNumber=whole, loadVector=self.gravity))
+        whole = self.mbs.AddMarker(items.MarkerBodyMass(bodyNumber=body))
+        self.mbs.AddLoad(items.LoadMassProportional(markerNumber=whole, loadVector=self.gravity))
         self.bodies.append(body)
         self.nodes.append(node)
         self.reference.append(np.asarray(q, dtype=float))
@@ -64,15 +43,15 @@ class Model:
 
     def body(self, mass: float, inertia: ArrayLike, q: Array, v: Array) -> int:
         """A body in space: moments xx, yy, zz, yz, xz, xy or the first three, centre and Euler parameters, rates."""
-        node = self.mbs.AddNode(NodeRigidBodyEP(referenceCoordinates=q.tolist(), initialVelocities=v.tolist()))
+        node = self.mbs.AddNode(items.NodeRigidBodyEP(referenceCoordinates=q.tolist(), initialVelocities=v.tolist()))
         moments = [*np.asarray(inertia, dtype=float).tolist(), 0.0, 0.0, 0.0][:6]
-        body = self.mbs.AddObject(ObjectRigidBody(mass=mass, inertia=moments, nodeNumber=node))
+        body = self.mbs.AddObject(items.ObjectRigidBody(mass=mass, inertia=moments, nodeNumber=node))
         return self._added(body, node, q, (q[:3], rotation_matrix(q[3:])))
 
     def planar_body(self, mass: float, inertia: float, q: Array, v: Array) -> int:
         """A body in the plane: centre and angle (3,), and their rates."""
-        node = self.mbs.AddNode(NodeRigidBody2D(referenceCoordinates=q.tolist(), initialVelocities=v.tolist()))
-        body = self.mbs.AddObject(ObjectRigidBody2D(mass=mass, inertia=inertia, nodeNumber=node))
+        node = self.mbs.AddNode(items.NodeRigidBody2D(referenceCoordinates=q.tolist(), initialVelocities=v.tolist()))
+        body = self.mbs.AddObject(items.ObjectRigidBody2D(mass=mass, inertia=inertia, nodeNumber=node))
         return self._added(body, node, q, (np.zeros(3), np.eye(3)))
 
     def _local(self, body: int, point: ArrayLike) -> tuple[int, list[float], Array]:
@@ -89,45 +68,49 @@ class Model:
         for body in (i, j):
             number, local, R = self._local(body, point)
             place = exu.HT(rotation=R.T @ frame, translation=local)  # type: ignore[call-arg]  # its stub lags behind
-            markers.append(self.mbs.AddMarker(MarkerBodyRigid(bodyNumber=number, localHT=place)))
-        return int(self.mbs.AddObject(GenericJoint(markerNumbers=markers, constrainedAxes=locked)))
+            markers.append(self.mbs.AddMarker(items.MarkerBodyRigid(bodyNumber=number, localHT=place)))
+        return int(self.mbs.AddObject(items.GenericJoint(markerNumbers=markers, constrainedAxes=locked)))
 
     def spring(self, i: int, a: ArrayLike, j: int, b: ArrayLike, *data: float) -> None:
         """A spring-damper between points of space at the start: stiffness, damping, length."""
         stiffness, damping, length = data
         markers = [self._marker(*self._local(body, point)[:2]) for body, point in ((i, a), (j, b))]
         properties: dict[str, Any] = {"stiffness": stiffness, "damping": damping, "referenceLength": length}
-        self.mbs.AddObject(ObjectConnectorSpringDamper(markerNumbers=markers, **properties))
+        self.mbs.AddObject(items.ObjectConnectorSpringDamper(markerNumbers=markers, **properties))
 
     def pin(self, i: int, a: tuple[float, float], j: int, b: tuple[float, float]) -> int:
         """A pin between points of two planar bodies, each in the axes of its body."""
         numbers = (self.ground if body == GROUND else self.bodies[body] for body in (i, j))
         markers = [self._marker(number, [*point, 0.0]) for number, point in zip(numbers, (a, b), strict=True)]
-        return int(self.mbs.AddObject(ObjectJointRevolute2D(markerNumbers=markers)))
+        return int(self.mbs.AddObject(items.ObjectJointRevolute2D(markerNumbers=markers)))
 
     def _marker(self, number: int, local: list[float]) -> int:
-        return int(self.mbs.AddMarker(MarkerBodyPosition(bodyNumber=number, localPosition=local)))
+        return int(self.mbs.AddMarker(items.MarkerBodyPosition(bodyNumber=number, localPosition=local)))
 
     def torque(self, body: int, torque: ArrayLike) -> None:
         """A constant torque on a body, along the axes of space."""
-        marker = self.mbs.AddMarker(MarkerBodyRigid(bodyNumber=self.bodies[body]))
-        self.mbs.AddLoad(LoadTorqueVector(markerNumber=marker, loadVector=np.asarray(torque, dtype=float).tolist()))
+        marker = self.mbs.AddMarker(items.MarkerBodyRigid(bodyNumber=self.bodies[body]))
+        self.mbs.AddLoad(
+            items.LoadTorqueVector(markerNumber=marker, loadVector=np.asarray(torque, dtype=float).tolist())
+        )
 
     def turn(self, body: int, stiffness: float, damping: float, angle: float) -> None:
         """A torsional spring between the ground and a planar body, at rest where this has turned by an angle."""
         properties: dict[str, Any] = {"stiffness": stiffness, "damping": damping, "offset": angle}
-        self.mbs.AddObject(ObjectConnectorCoordinateSpringDamper(markerNumbers=self._coordinate(body, 2), **properties))
+        self.mbs.AddObject(
+            items.ObjectConnectorCoordinateSpringDamper(markerNumbers=self._coordinate(body, 2), **properties)
+        )
 
     def twist(self, joint: int, stiffness: float, damping: float, angle: float) -> None:
         """A torsional spring about z of the markers of a joint, at rest where the second has turned by an angle."""
         markers = self.mbs.GetObject(joint)["markerNumbers"]
         properties: dict[str, Any] = {"stiffness": stiffness, "damping": damping, "offset": angle}
-        self.mbs.AddObject(TorsionalSpringDamper(markerNumbers=markers, **properties))
+        self.mbs.AddObject(items.TorsionalSpringDamper(markerNumbers=markers, **properties))
 
     def _coordinate(self, body: int, coordinate: int) -> list[int]:
-        fixed = self.mbs.AddNode(NodePointGround())
+        fixed = self.mbs.AddNode(items.NodePointGround())
         return [
-            self.mbs.AddMarker(MarkerNodeCoordinate(nodeNumber=node, coordinate=k))
+            self.mbs.AddMarker(items.MarkerNodeCoordinate(nodeNumber=node, coordinate=k))
             for node, k in ((fixed, 0), (self.nodes[body], coordinate))
         ]
 
@@ -135,11 +118,11 @@ class Model:
         """A sensor of the force of a joint; `local`: in the axes of its first marker."""
         kind = exu.OutputVariableType.ForceLocal if local else exu.OutputVariableType.Force
         options: dict[str, Any] = {"storeInternal": True, "writeToFile": False, "outputVariableType": kind}
-        return int(self.mbs.AddSensor(SensorObject(objectNumber=joint, **options)))
+        return int(self.mbs.AddSensor(items.SensorObject(objectNumber=joint, **options)))
 
     def hold(self, body: int, coordinate: int) -> None:
         """Keep a coordinate of a body."""
-        self.mbs.AddObject(ObjectConnectorCoordinate(markerNumbers=self._coordinate(body, coordinate)))
+        self.mbs.AddObject(items.ObjectConnectorCoordinate(markerNumbers=self._coordinate(body, coordinate)))
 
 
 def frame(z: ArrayLike) -> Array:

@@ -18,19 +18,8 @@ def solve_pinned(
 ) -> Result:
     """Run planar bodies with pins with one of Exudyn's implicit solvers, with a fixed step, and store the end.
 
-    Parameters
-    ----------
-    problem : Problem
-        Its start and its end are read, not its system.
-    bodies : PlanarBodies
-        Masses, inertias, gravity and pins.
-    n_steps, solver, time_limit
-        As of `references.exudyn.mechanisms.solve_exudyn`.
-
-    Returns
-    -------
-    Result
-        As there.
+    Of the problem start and end are read, not its system; of the bodies masses, inertias, gravity and pins. All else is
+    as of `references.exudyn.mechanisms.solve_exudyn`.
     """
     steps = check_steps(problem, problem.t_span[1], n_steps, solver, n_steps, time_limit)
     model = Model((0.0, -bodies.gravity, 0.0))

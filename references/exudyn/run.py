@@ -13,14 +13,12 @@ from typing import Any, NamedTuple
 import exudyn as exu
 import numpy as np
 from exudyn.itemInterface import SensorNode
-from numpy.typing import NDArray
 
 from references.driver import Task, TimeLimit, check_time_limit, user_call
 from twoloop.checks.arguments import check_choice, check_number, check_positive, check_size
-from twoloop.problem.problem import Problem
+from twoloop.problem.problem import Array, Problem
 from twoloop.result.result import Result
 
-Array = NDArray[np.float64]
 Ours = Callable[[Array, Array, Array], tuple[Array, Array, Array]]
 
 SPECTRAL_RADIUS = 0.9  # Exudyn's default
@@ -32,11 +30,8 @@ SOLVERS = {
     "HHT": "Exudyn's generalized-alpha solver with the coefficients of Hilber, Hughes and Taylor, index 3, fixed step",
 }
 
-_OUTPUTS = (
-    exu.OutputVariableType.Coordinates,  # displacements from the reference position
-    exu.OutputVariableType.Coordinates_t,
-    exu.OutputVariableType.Coordinates_tt,
-)
+# displacements from the reference position, and their derivatives
+_OUTPUTS = tuple(getattr(exu.OutputVariableType, f"Coordinates{by}") for by in ("", "_t", "_tt"))
 
 
 class Steps(NamedTuple):

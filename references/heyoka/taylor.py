@@ -9,14 +9,13 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from references.driver import ADVICE, Task, TimeLimit, adapter, imported, user_call
 from references.equations.expressions import Expressions, expressions_at, functions_of
+from references.lines import Line
+from twoloop.problem.problem import Array
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.result.result import Result
-
-Array = NDArray[np.float64]
 
 LARGEST_UNROLLED = 21  # coordinates; with more, an unrolled integrator may take minutes to build for a tolerance
 STEPS_A_CALL = 100  # between two looks at the clock
@@ -81,3 +80,7 @@ def built(motion: list[tuple[Any, Any]], start: Any, t0: float, tol: float, unro
 def _integrator(system: ConstrainedSystem, t0: float, q0: bytes, v0: bytes, tol: float) -> Any:
     start = [*np.frombuffer(q0), *np.frombuffer(v0)]
     return built(rates_of(expressions_at(system, t0, q0, v0)), start, t0, tol, system.n_q <= LARGEST_UNROLLED)
+
+
+HOW: dict[str, Any] = {"keeps": False, "traces": True, "builds_each": True, "one_tolerance": True}
+LINES = (Line("heyoka", "heyoka", "heyoka", solve_heyoka, checked=True, **HOW),)

@@ -11,12 +11,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from references.paper.four_bar_minimal import MinimalFourBar, absolute, tangent_of
 from twoloop.mechanisms import Problem
+from twoloop.problem.problem import Array
 
-Array = NDArray[np.float64]
 Equations = Callable[[Any], tuple[Any, ...]]  # [angles, rates] -> their rates
 
 INSTANTS = 1000  # of half a period, at which the dead centres of a four-bar are looked for
@@ -29,31 +28,20 @@ class NoMinimalCoordinates(ValueError):
 
 @dataclass(frozen=True)
 class Minimal:
-    """A mechanism in minimal coordinates.
+    """A mechanism in minimal coordinates."""
 
-    Attributes
-    ----------
-    equations : callable
-        equations(functions) -> rates, of which rates(y) gives y', y = [angles, their rates], by these functions: `math`
-        or a module with sin, cos and sqrt of its own.
-    start : tuple of float
-        y at the problem's start.
-    states : callable
-        states(y (2 n, n_t)) -> q, v (n_q, n_t) in the problem's coordinates.
-    """
-
+    # equations(functions) -> rates, of which rates(y) gives y', y = [angles, their rates], by these functions: `math`
+    # or a module with sin, cos and sqrt of its own
     equations: Callable[[Any], Equations]
-    start: tuple[float, ...]
+    start: tuple[float, ...]  # y at the problem's start
+    # states(y (2 n, n_t)) -> q, v (n_q, n_t) in the problem's coordinates
     states: Callable[[Array], tuple[Array, Array]]
 
 
 def minimal(problem: Problem) -> Minimal:
     """The equations of a problem in minimal coordinates.
 
-    Raises
-    ------
-    NoMinimalCoordinates
-        If there are none, or a four-bar has no angle that stays clear of its dead centres.
+    Raises NoMinimalCoordinates if there are none, or a four-bar has no angle that stays clear of its dead centres.
     """
     name = problem.system.name
     if name not in MAKE:
@@ -237,10 +225,5 @@ def _four_bar(problem: Problem) -> Minimal:
 
 OTHERS = ((0, 1, 2), (1, 0, 2), (2, 0, 1))  # a bar and the two others
 HALVES = ((0.5, 0.0, 0.0), (1.0, 0.5, 0.0), (1.0, 1.0, 0.5))  # the way to a bar's centre, in lengths of the bars
-MAKE: dict[str, Callable[[Problem], Minimal]] = {
-    "four-bar": _four_bar,
-    "A01 pendulum": _pendulum,
-    "projection pendulum": _pendulum,
-    "double pendulum": _double_pendulum,
-    "SUNDIALS slider-crank": _slider_crank,
-}
+MAKE: dict[str, Callable[[Problem], Minimal]] = {"four-bar": _four_bar, "A01 pendulum": _pendulum}
+MAKE |= {"projection pendulum": _pendulum, "double pendulum": _double_pendulum, "SUNDIALS slider-crank": _slider_crank}

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 from numba import njit
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from references.driver import Task, check_task, imported
 from references.heyoka import taylor
@@ -18,9 +18,8 @@ from references.minimal.equations import Minimal, minimal
 from references.sundials import cvode_c
 from twoloop.checks.arguments import check_positive
 from twoloop.mechanisms import Problem
+from twoloop.problem.problem import Array
 from twoloop.result.result import Result
-
-Array = NDArray[np.float64]
 
 _KNOWN: dict[int, tuple[Problem, Minimal]] = {}
 

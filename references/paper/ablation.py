@@ -9,17 +9,14 @@ import time
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from references.driver import Task, TimeLimit, adapter
 from references.paper import ablation_kernels as kernels
 from twoloop.checks.arguments import check_choice
-from twoloop.kernels.data.common import GAMMA_GIVEN
+from twoloop.kernels.data.flags import GAMMA_GIVEN
 from twoloop.kernels.data.kit import Kit
 from twoloop.methods.tableaux import Tableau
 from twoloop.result.result import Result
-
-Array = NDArray[np.float64]
 
 VARIANTS = {
     "positions in every stage": "the paper: dependent q and v from the constraints at every stage, in every iteration",
@@ -43,12 +40,7 @@ REASONS = {
 
 @adapter(velocity_rows=False)
 def solve_variant(
-    task: Task,
-    variant: str,
-    tableau: Tableau,
-    *,
-    step: float | None = None,
-    tol: float | None = None,
+    task: Task, variant: str, tableau: Tableau, *, step: float | None = None, tol: float | None = None
 ) -> tuple[Result, float]:
     """Integrate by a Runge-Kutta tableau with one of five ways to keep the constraints.
 
@@ -115,5 +107,4 @@ def solve_variant(
         failure = limit.message(name, t, "take longer steps")
     elif code != kernels.DONE:
         failure = f"{name} failed after t = {t:.10g}: {REASONS[code]}. Take shorter steps."
-    result = task.result(name, rows[0], rows[1:], failure, h=np.diff(rows[0]), **counts)
-    return result, float(where[kernels.MU])
+    return task.result(name, rows[0], rows[1:], failure, h=np.diff(rows[0]), **counts), float(where[kernels.MU])

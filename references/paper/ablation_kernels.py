@@ -6,7 +6,8 @@ import numpy as np
 from numba import njit, types
 
 from references.equations.linear import cholesky, cholesky_solve, compiled_now, lu_factor, lu_solve
-from twoloop.kernels.data.common import CONSTANT_MASS, INTEGERS, KIT, MATRIX, VECTOR
+from twoloop.kernels.data.common import INTEGERS, KIT, MATRIX, VECTOR
+from twoloop.kernels.data.flags import CONSTANT_MASS
 from twoloop.kernels.evaluation.partition import full_pivoting
 
 POSITIONS, FROZEN, PROJECTED, STABILISED, UNPROJECTED = range(5)
@@ -328,27 +329,14 @@ def run(  # type: ignore[no-untyped-def]
 
     The first call fills its one row with the start.
     """
-    w = _Space(
-        np.zeros((n, n)),
-        np.zeros((m, n)),
-        np.zeros((s, m, n)),
-        np.zeros((m, m)),
-        np.zeros((m, m)),
-        np.zeros(m, dtype=np.int64),
-        np.zeros(m),
-        np.zeros((s, n)),
-        np.zeros((s, n)),
-        np.zeros((s, n)),
-        np.zeros((s, m)),
-        np.zeros((s, m)),
-        np.zeros((2, s, m)),
-        np.zeros((s, n)),
-        np.zeros((s, n)),
-        np.zeros(n, dtype=np.int64),
-    )
+    M, Cq, W, S, D = np.zeros((n, n)), np.zeros((m, n)), np.zeros((s, m, n)), np.zeros((m, m)), np.zeros((m, m))
+    pivots, C, lam, mu = np.zeros(m, dtype=np.int64), np.zeros(m), np.zeros((s, m)), np.zeros((s, m))
+    q, v, a, Kq, Kv = np.zeros((s, n)), np.zeros((s, n)), np.zeros((s, n)), np.zeros((s, n)), np.zeros((s, n))
+    off, places = np.zeros((2, s, m)), np.zeros(n, dtype=np.int64)
+    w = _Space(M, Cq, W, S, D, pivots, C, q, v, a, lam, mu, off, Kq, Kv, places)
     if rows.shape[0] == 1:
-        a, lam = state[2 * n : 3 * n], state[3 * n :]
-        good = _accelerate(f, w, t0, state[:n], state[n : 2 * n], a, lam, w.W[0], counters)
+        parts = state[:n], state[n : 2 * n], state[2 * n : 3 * n], state[3 * n :]
+        good = _accelerate(f, w, t0, *parts, w.W[0], counters)
         rows[0, 0] = t0
         rows[0, 1:] = state
         return DONE if good else SINGULAR

@@ -15,12 +15,11 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.integrate import solve_ivp
 
 from twoloop.checks.arguments import check_number, check_positive, check_real, check_vector
-
-Array = NDArray[np.float64]
+from twoloop.problem.problem import Array
 
 RTOL, ATOL = 1e-13, 1e-14
 STEPS = 400  # least number of steps over half a period; the interpolant is then as good as the steps
@@ -84,8 +83,7 @@ class MinimalFourBar:
             raise ValueError(f"branch must be 1 or -1; given {branch!r}")
         self._masses = np.array(density) * self._lengths
         self._gravity = gravity
-        angles = _assemble(self._lengths, ground, theta3, branch)
-        start = np.append(angles, 0.0)
+        start = np.append(_assemble(self._lengths, ground, theta3, branch), 0.0)
         push = self.rate(0.0, start)[3]
         if not abs(push) > 1e-9:
             raise ValueError(f"the linkage must not start in equilibrium; its initial u' is {push:.3g}")
@@ -119,8 +117,7 @@ class MinimalFourBar:
         back = folded > 0.5 * self.period
         folded[back] = self.period - folded[back]
         state = self._dense(folded)
-        angles = state[:3]
-        return absolute(self._lengths, angles, self.tangent(state) * np.where(back, -state[3], state[3]))
+        return absolute(self._lengths, state[:3], self.tangent(state) * np.where(back, -state[3], state[3]))
 
     def _swing(self, start: Array) -> Any:
         """Integrate from rest to the next position of rest."""
@@ -232,13 +229,8 @@ def _tangent_rate(lengths: Array, angles: Array, n: Array) -> Array:
     """Differentiate the tangent along itself, (3,)."""
     L1, L2, L3 = lengths
     th1, th2, th3 = angles
-    return np.array(
-        [
-            L2 * L3 * np.cos(th3 - th2) * (n[2] - n[1]),
-            L3 * L1 * np.cos(th1 - th3) * (n[0] - n[2]),
-            L1 * L2 * np.cos(th2 - th1) * (n[1] - n[0]),
-        ]
-    )
+    areas = np.array([L2 * L3 * np.cos(th3 - th2), L3 * L1 * np.cos(th1 - th3), L1 * L2 * np.cos(th2 - th1)])
+    return areas * np.array([n[2] - n[1], n[0] - n[2], n[1] - n[0]])
 
 
 def _assemble(lengths: Array, ground: float, theta3: float, branch: int) -> Array:

@@ -13,7 +13,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit, types
-from numpy.typing import NDArray
 
 from references.driver import Task, TimeLimit, adapter, user_call
 from references.equations.linear import compiled_now, lu_factor, lu_solve
@@ -21,9 +20,8 @@ from references.scipy.index1 import solve_index1
 from twoloop.checks.arguments import check_choice, check_size, check_times
 from twoloop.kernels.data.common import INTEGERS, KIT, MATRIX
 from twoloop.kernels.data.kit import Kit
+from twoloop.problem.problem import Array
 from twoloop.result.result import Result
-
-Array = NDArray[np.float64]
 
 STARTS = {
     "ramp": "orders 1, 2, ... at the full step until the order is reached",

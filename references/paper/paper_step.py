@@ -3,14 +3,12 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from references.paper.four_bar_minimal import MinimalFourBar
 from twoloop import ConstrainedSystem
 from twoloop.mechanisms import Problem
 from twoloop.methods.tableaux import Tableau
-
-Array = NDArray[np.float64]
+from twoloop.problem.problem import Array
 
 NEWTON_TOL = 1e-14
 MAX_NEWTON = 30
@@ -139,10 +137,7 @@ def advance(
 ) -> tuple[Array, int]:
     """State [q, v] after n steps that cover h together, and how many iterations they took.
 
-    Raises
-    ------
-    RuntimeError
-        If a step does not converge.
+    Raises RuntimeError if a step does not converge.
     """
     count = 0
     for k in range(n):

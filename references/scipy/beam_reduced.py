@@ -8,14 +8,13 @@ import math
 
 import numpy as np
 from numba import njit
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.integrate import solve_ivp
 
 from references.driver import check_problem
 from twoloop.checks.arguments import check_positive, check_times
 from twoloop.mechanisms import Problem
-
-Array = NDArray[np.float64]
+from twoloop.problem.problem import Array
 
 
 def reduced_motion(problem: Problem, t_eval: ArrayLike, tol: float) -> tuple[Array, Array]:

@@ -9,15 +9,14 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from references.driver import CAUSES, Task, TimeLimit, adapter, imported, user_call
+from references.lines import Line
 from references.scipy.steps import Steps
 from references.sundials.residual import Implicit
 from twoloop.checks.arguments import check_choice
+from twoloop.problem.problem import Array
 from twoloop.result.result import Result
-
-Array = NDArray[np.float64]
 
 # of the span. From a start at rest the package's own first step is 1e-6 of it, so short that the rounding of C over it
 # is more than Newton's test asks of the multipliers' integrals; a step that does not converge is halved, and is worse
@@ -105,3 +104,17 @@ class Functions:
         by_yp[:n, :n], by_yp[n : 2 * n, n : 2 * n] = np.eye(n), M
         by_yp[n : 2 * n, 2 * n : 2 * n + m] = by_yp[:n, 2 * n + m :] = Cq.T
         return by_y, by_yp
+
+
+LINES = tuple(
+    Line(
+        *(f"{method}, solve_dae", "solve-dae", "solve_dae", solve_fully_implicit),
+        {"method": method},
+        called_from="Python",
+        rival=method != "BDF",
+        checked=method == "Radau",
+        own_accelerations=True,
+        stores_steps=True,
+    )
+    for method in ("Radau", "Radau9", "BDF")
+)

@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 from numba import njit
 from numba.core.dispatcher import Dispatcher
-from numpy.typing import NDArray
 from scipy.integrate import BDF, DOP853, LSODA, RK45, OdeSolver, Radau
 
 from references.driver import ADVICE, Task, TimeLimit, adapter, imported, user_call
@@ -20,14 +19,15 @@ from references.equations.accelerations import Equations, matrix_of, solve_for
 from references.equations.expressions import NotSymbolic
 from references.equations.linear import OPTIONS, kept
 from references.equations.straight_line import straight_line_jacobian
+from references.lines import Line
 from references.scipy.steps import Steps
 from twoloop.checks.arguments import check_choice, check_positive
+from twoloop.problem.problem import Array
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.result.result import Result
 
-Array = NDArray[np.float64]
-
 METHODS: dict[str, type[OdeSolver]] = {"DOP853": DOP853, "RK45": RK45, "LSODA": LSODA, "Radau": Radau, "BDF": BDF}
+ALPHAS = (1.0, 10.0, 100.0)  # 1/s, of Baumgarte
 PAIR = "Pr9"  # explicit Runge-Kutta pair of extensisq (P. J. Prince), of orders 9(8)
 IMPLICIT = ("LSODA", "Radau", "BDF")  # wholly, or where the problem is stiff
 ONE_STEP = ("DOP853", "RK45")  # explicit, and nothing of them but y and f outlives a step: they can be projected
@@ -264,3 +264,30 @@ def _least_change(L, definite, known, Cq, C, x):  # type: ignore[no-untyped-def]
         if not np.isfinite(change[j]):
             return np.inf
     return largest
+
+
+def baumgarte(method: str, alpha: float) -> str:
+    """Name of one of SciPy's solvers with Baumgarte's stabilisation."""
+    return f"{method}, Baumgarte {alpha:g}"
+
+
+def _line(name: str, method: str, stabilisation: str = "none", **more: Any) -> Line:
+    package = "extensisq" if method == "Pr9" else "scipy"
+    more = {"called_from": "Python", "keeps": False, "stores_steps": True, **more}
+    options = {"method": method, "stabilisation": stabilisation, **more.get("fixed", {})}
+    return Line(name, package, "extensisq" if method == "Pr9" else "SciPy", solve_index1, options, **more)
+
+
+LINES = (
+    _line("LSODA, index 1", "LSODA", checked=True),
+    _line("DOP853, index 1", "DOP853"),
+    _line("RK45, index 1", "RK45", rival=False),
+    _line("DOP853, projected", "DOP853", "projection", keeps=True, checked=True),
+    _line("RK45, projected", "RK45", "projection", keeps=True, rival=False),
+    *(_line(f"{name}, index 1", name) for name in ("Pr9", "Radau", "BDF")),
+    *(
+        _line(baumgarte(name, alpha), name, "baumgarte", rival=False, own_accelerations=True, fixed={"alpha": alpha})
+        for name in ("LSODA", "DOP853")
+        for alpha in ALPHAS
+    ),
+)

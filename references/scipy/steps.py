@@ -5,50 +5,30 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from references.driver import OutOfTimeError, Task, TimeLimit
-
-Array = NDArray[np.float64]
+from twoloop.problem.problem import Array
 
 SMALLEST_STEP = 10.0  # spacings of the numbers at t: SciPy's own limit, which LSODA alone does not have
 
 
 @dataclass
 class Steps:
-    """Steps of one run.
+    """Steps of one run."""
 
-    Attributes
-    ----------
-    make : callable
-        limit -> the solver at its start; the limit is looked at in every evaluation.
-    t0, start : float, ndarray
-        That start: y, or [y, y'].
-    callbacks : object
-        `raised` says whether a callback of the system raised: such an exception comes through, the solver's do not.
-    project : callable or None
-        (t, y) -> whether y, which it moves onto the constraints, is on them.
-    times : ndarray or None
-        When to store the state, by the solver's interpolant; None: at the end of every step.
-    limit : TimeLimit
-    ends : list of float
-        The start, and the ends of the accepted steps, s.
-    stored : list of (float, ndarray)
-        Times and states: y, or [y, y'].
-    failure : str
-        Why it ended, "": it has not failed.
-    """
-
-    make: Callable[[TimeLimit], Any]
+    make: Callable[[TimeLimit], Any]  # limit -> the solver at its start; the limit is looked at in every evaluation
+    # t0, start: that start: y, or [y, y']
     t0: float
     start: Array
+    # `raised` says whether a callback of the system raised: such an exception comes through, the solver's do not
     callbacks: Any
+    # (t, y) -> whether y, which it moves onto the constraints, is on them
     project: Callable[[float, Array], bool] | None
-    times: Array | None
+    times: Array | None  # when to store the state, by the solver's interpolant; None: at the end of every step
     limit: TimeLimit
-    ends: list[float] = field(default_factory=list)
-    stored: list[tuple[float, Array]] = field(default_factory=list)
-    failure: str = ""
+    ends: list[float] = field(default_factory=list)  # the start, and the ends of the accepted steps, s
+    stored: list[tuple[float, Array]] = field(default_factory=list)  # times and states: y, or [y, y']
+    failure: str = ""  # why it ended, "": it has not failed
     solver: Any = None
 
     @classmethod

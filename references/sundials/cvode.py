@@ -8,15 +8,14 @@ from contextlib import redirect_stdout, suppress
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from references.driver import ADVICE, OutOfTimeError, Task, TimeLimit, adapter, imported, user_call
+from references.lines import Line
 from references.scipy.index1 import RightHandSide
 from references.sundials.loop import SMALLEST_STEP
 from twoloop.checks.arguments import check_choice
+from twoloop.problem.problem import Array
 from twoloop.result.result import Result
-
-Array = NDArray[np.float64]
 
 METHODS = ("Adams", "BDF")
 MOST_STEPS = 10**7  # between two output times; its own 500 are soon used up
@@ -75,3 +74,8 @@ def solve_cvode(task: Task, method: str = "Adams", rtol: float = 1e-8, atol: flo
     failure = "" if outcome.success else f"CVODE failed after t = {outcome.t:.10g}: {outcome.message}. {ADVICE}"
     shown = states_at(integrator(TimeLimit(None)), (t0, t1), times[times <= outcome.t], y0)
     return task.result(name, shown.t, shown.y.T, failure, **counts)
+
+
+LINES = (
+    Line("CVODE, Adams", "scikit-sundae", "SUNDIALS", solve_cvode, called_from="Python", keeps=False, checked=True),
+)

@@ -10,28 +10,24 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numba import carray, cfunc, types
-from numpy.typing import NDArray
 
 from references.driver import ADVICE, Task, adapter
 from references.equations.straight_line import straight_line, straight_line_jacobian
+from references.lines import Line
 from references.sundials.cvode_projection import projection_for_cvode
 from references.sundials.library import library, made
 from references.sundials.loop import Memory, run
 from twoloop.checks.arguments import check_choice
+from twoloop.problem.problem import Array
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.result.result import Result
-
-Array = NDArray[np.float64]
 
 METHODS = {"Adams": 1, "BDF": 2}  # CV_ADAMS and CV_BDF
 COUNTERS: dict[str, dict[str, tuple[str, ...]]] = {
     "Adams": {"n_evaluations": ("RhsEvals",), "n_factorizations": (), "n_jacobians": ()},
-    "BDF": {
-        "n_evaluations": ("RhsEvals", "LinRhsEvals"),
-        "n_factorizations": ("LinSolvSetups",),
-        "n_jacobians": ("JacEvals",),
-    },
 }
+COUNTERS["BDF"] = {"n_evaluations": ("RhsEvals", "LinRhsEvals"), "n_factorizations": ("LinSolvSetups",)}
+COUNTERS["BDF"] |= {"n_jacobians": ("JacEvals",)}
 POINTER = types.voidptr
 
 
@@ -135,13 +131,7 @@ def _projection(system: ConstrainedSystem, projected: bool, rtol: float, atol: f
 
 
 def integrate(
-    functions: Functions,
-    start: Array,
-    task: Task,
-    method: str,
-    rtol: float,
-    atol: float,
-    max_step: float | None = None,
+    functions: Functions, start: Array, task: Task, method: str, rtol: float, atol: float, max_step: float | None = None
 ) -> tuple[Array, Array, str, dict[str, int]]:
     """The times that were reached, rows y there, why it failed ("": it did not), and CVODE's counters."""
 
@@ -159,3 +149,15 @@ def integrate(
             solver.call("SetProjFn", functions.projection.address)
 
     return run("CVode", start[None], task, (METHODS[method],), set_up, max_step, COUNTERS[method], ADVICE)
+
+
+LINES = (
+    Line("CVODE from C, Adams", "scikit-sundae", "SUNDIALS", solve_cvode_c, keeps=False, checked=True, traces=True),
+    Line("CVODE from C, BDF", "scikit-sundae", "SUNDIALS", solve_cvode_c, {"method": "BDF"}, keeps=False, traces=True),
+    Line(
+        *("CVODE from C, BDF, projected", "scikit-sundae", "SUNDIALS", solve_cvode_c),
+        {"method": "BDF", "projected": True},
+        checked=True,
+        traces=True,
+    ),
+)

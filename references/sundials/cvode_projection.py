@@ -27,8 +27,7 @@ def projection_for_cvode(
     constraints leave free, as SUNDIALS' example of the pendulum does. The user data are [p, rtol, atol, work]; the
     sizes are constants of the machine code.
     """
-    ends = np.cumsum([n_p, 2, m * n, m * m, m, n]).tolist()
-    after_p, after_tol, after_Cq, after_S, after_r, n_memory = ends
+    after_p, after_tol, after_Cq, after_S, after_r, n_memory = np.cumsum([n_p, 2, m * n, m * m, m, n]).tolist()
     array_of, size = library().N_VGetArrayPointer, 2 * n
     # the same function of an integer, which can be compared with 0, the address of no vector
     array_at = ctypes.CFUNCTYPE(REALS, ctypes.c_ssize_t)(ctypes.cast(array_of, ctypes.c_void_p).value or 0)
@@ -68,11 +67,8 @@ def projection_for_cvode(
 
     @cfunc(types.int32(types.float64, pointer, pointer, types.float64, types.intp, pointer), error_model="numpy")
     def projection(t, y, corr, bound, err, memory):  # type: ignore[no-untyped-def]
-        given, state, data = (
-            carray(array_of(y), (size,)),
-            carray(array_of(corr), (size,)),
-            carray(memory, (n_memory,), np.float64),
-        )
+        given, state = carray(array_of(y), (size,)), carray(array_of(corr), (size,))
+        data = carray(memory, (n_memory,), np.float64)
         p, rtol, atol = data[:after_p], data[after_p], data[after_p + 1]
         Cq, S = data[after_tol:after_Cq].reshape((m, n)), data[after_Cq:after_S].reshape((m, m))
         r, x = data[after_S:after_r], data[after_r:]

@@ -12,25 +12,19 @@ from typing import Any
 
 import numpy as np
 import sksundae
-from numpy.typing import NDArray
 
 from references.driver import CAUSES, Task, TimeLimit, adapter, user_call
+from references.lines import Line
 from references.sundials.loop import SMALLEST_STEP
 from references.sundials.residual import FORMS, NOT_TESTED, Implicit
 from twoloop.checks.arguments import check_choice
+from twoloop.problem.problem import Array
 from twoloop.result.result import Result
-
-Array = NDArray[np.float64]
 
 
 @adapter(independent_rows=True)
 def solve_ida(
-    task: Task,
-    form: str = "index1",
-    rtol: float = 1e-8,
-    atol: float = 1e-8,
-    *,
-    max_step: float | None = None,
+    task: Task, form: str = "index1", rtol: float = 1e-8, atol: float = 1e-8, *, max_step: float | None = None
 ) -> Result:
     """Integrate a constrained mechanical system with IDA.
 
@@ -57,13 +51,8 @@ def solve_ida(
     absolute = np.full(equations.start.shape[1], atol)
     if form == "index1":
         absolute[2 * n :] = NOT_TESTED
-    options = {
-        "rtol": rtol,
-        "atol": absolute,
-        "min_step": SMALLEST_STEP * (t1 - t0),
-        "max_step": task.longest(max_step),
-        "max_num_steps": 10**9,  # per output time
-    }
+    options = {"rtol": rtol, "atol": absolute, "max_num_steps": 10**9}  # of these per output time
+    options |= {"min_step": SMALLEST_STEP * (t1 - t0), "max_step": task.longest(max_step)}
     limit, said = TimeLimit(task.time_limit), io.StringIO()
     solver = _solver(equations, t0, options, limit)
     with redirect_stdout(said), user_call:
@@ -129,3 +118,10 @@ def _solver(equations: Implicit, t0: float, options: dict[str, Any], limit: Time
     residual(t0, state[0], state[1], *space[:3], np.empty(size))  # compiles
     matrix(t0, 1.0, state[0], state[1], *space, np.zeros((size, size)).T)
     return sksundae.ida.IDA(resfn, jacfn=jacfn, **options)
+
+
+HOW: dict[str, Any] = {"called_from": "Python", "own_accelerations": True, "scatters": True}
+LINES = (
+    Line("IDA, index1", "scikit-sundae", "SUNDIALS", solve_ida, {"form": "index1"}, keeps=False, rival=False, **HOW),
+    Line("IDA, stabilised", "scikit-sundae", "SUNDIALS", solve_ida, {"form": "stabilised"}, checked=True, **HOW),
+)

@@ -11,17 +11,15 @@ from typing import Any
 
 import numpy as np
 from numba import carray, cfunc, njit, types
-from numpy.typing import NDArray
 
 from references.driver import Task, adapter
 from references.equations.linear import OPTIONS
+from references.lines import Line
 from references.sundials.library import library
 from references.sundials.loop import RAISED, Memory, run
 from references.sundials.residual import NOT_TESTED, Implicit, Parts, iteration_matrix_at, residual_at
 from twoloop.checks.arguments import check_choice, check_size
 from twoloop.result.result import Result
-
-Array = NDArray[np.float64]
 
 HIGHEST_ORDER = 5  # of IDA
 ERROR_TESTS = ("all", "states", "positions")
@@ -145,3 +143,12 @@ def _compiled(parts: Parts, n: int, m: int, n_p: int) -> tuple[Any, Any]:
         return 0
 
     return residual_of_ida, jacobian_of_ida
+
+
+OF_ORDER_2 = {"max_order": 2, "error_test": "positions"}
+HOW: dict[str, Any] = {"own_accelerations": True, "compiled_callbacks": True, "scatters": True}
+LINES = (
+    Line("IDA from C, stabilised", "scikit-sundae", "SUNDIALS", solve_ida_c, checked=True, **HOW),
+    Line("IDA from C, q and v tested", "scikit-sundae", "SUNDIALS", solve_ida_c, {"error_test": "states"}, **HOW),
+    Line("IDA from C, order 2, positions tested", "scikit-sundae", "SUNDIALS", solve_ida_c, OF_ORDER_2, **HOW),
+)

@@ -25,8 +25,6 @@ from references.sundials.residual import DIFFERENCE
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.result.result import Result
 
-Array = NDArray[np.float64]
-
 
 @adapter(velocity_rows=False)
 def solve_ida_sparse(task: Task, rtol: float = 1e-8, atol: float = 1e-8) -> Result:

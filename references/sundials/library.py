@@ -12,61 +12,28 @@ WRITTEN_FOR = "scikit-sundae 1.2.0 for Linux, with SUNDIALS 7.9.0 (any 7.x), sun
 
 POINTER, INT, LONG, REAL, INDEX = ctypes.c_void_p, ctypes.c_int, ctypes.c_long, ctypes.c_double, ctypes.c_int32
 REALS = ctypes.POINTER(REAL)
-COUNTER = (INT, POINTER, POINTER)
 SUN_COMM_NULL = 0
 
-_OF_EACH = {  # of IDA and of CVODE, after IDA or CVode
-    "Free": (None, POINTER),
-    "SetUserData": (INT, POINTER, POINTER),
-    "SetLinearSolver": (INT, POINTER, POINTER, POINTER),
-    "SetJacFn": (INT, POINTER, POINTER),
-    "SetMaxNumSteps": (INT, POINTER, LONG),
-    **{f"Set{name}": (INT, POINTER, REAL) for name in ("MinStep", "MaxStep", "StopTime")},
-    "GetReturnFlagName": (POINTER, LONG),
-    **{f"GetNum{name}": COUNTER for name in ("Steps", "ErrTestFails", "StepSolveFails", "NonlinSolvIters", "JacEvals")},
-}
-
-# library: function: (what it returns, what it takes ...)
-FUNCTIONS: dict[str, dict[str, tuple[Any, ...]]] = {
-    "core": {
-        "SUNDIALSGetVersionNumber": (INT, *[POINTER] * 3, POINTER, INT),
-        "SUNContext_Create": (INT, INT, POINTER),
-        "SUNContext_ClearErrHandlers": (INT, POINTER),
-        "SUNContext_Free": (INT, POINTER),
-        "N_VGetArrayPointer": (REALS, POINTER),
-        "N_VDestroy": (None, POINTER),
-        "SUNMatDestroy": (None, POINTER),
-        "SUNLinSolFree": (INT, POINTER),
-    },
-    "nvecserial": {"N_VMake_Serial": (POINTER, INDEX, POINTER, POINTER)},
-    "sunmatrixdense": {
-        "SUNDenseMatrix": (POINTER, INDEX, INDEX, POINTER),
-        "SUNDenseMatrix_Data": (REALS, POINTER),
-    },
-    "sunlinsoldense": {"SUNLinSol_Dense": (POINTER, POINTER, POINTER, POINTER)},
-    "ida": {
-        **{f"IDA{name}": types for name, types in _OF_EACH.items()},
-        "IDACreate": (POINTER, POINTER),
-        "IDAInit": (INT, POINTER, POINTER, REAL, POINTER, POINTER),
-        "IDAReInit": (INT, POINTER, REAL, POINTER, POINTER),
-        "IDASVtolerances": (INT, POINTER, REAL, POINTER),
-        "IDASetMaxOrd": (INT, POINTER, INT),
-        "IDASolve": (INT, POINTER, REAL, POINTER, POINTER, POINTER, INT),
-        "IDAGetNumResEvals": COUNTER,
-    },
-    "cvode": {
-        **{f"CVode{name}": types for name, types in _OF_EACH.items()},
-        "CVodeCreate": (POINTER, INT, POINTER),
-        "CVodeInit": (INT, POINTER, POINTER, REAL, POINTER),
-        "CVodeReInit": (INT, POINTER, REAL, POINTER),
-        "CVodeSStolerances": (INT, POINTER, REAL, REAL),
-        "CVodeSetProjFn": (INT, POINTER, POINTER),
-        "SUNNonlinSol_FixedPoint": (POINTER, POINTER, INT, POINTER),
-        "SUNNonlinSolFree_FixedPoint": (INT, POINTER),
-        "CVodeSetNonlinearSolver": (INT, POINTER, POINTER),
-        "CVode": (INT, POINTER, REAL, POINTER, POINTER, INT),
-        **{f"CVodeGetNum{name}": COUNTER for name in ("RhsEvals", "LinRhsEvals", "LinSolvSetups")},
-    },
+# prototypes: a letter a type, that of what is returned first; as in C "-" is void, "p" any pointer, "R" one to
+# reals, "i" int, "l" long int, "x" sunindextype, "r" sunrealtype
+_TYPES = {"-": None, "p": POINTER, "R": REALS, "i": INT, "l": LONG, "x": INDEX, "r": REAL}
+_OF_EACH = (  # of IDA and of CVODE, after IDA or CVode
+    "Free:-p SetUserData:ipp SetLinearSolver:ippp SetJacFn:ipp SetMaxNumSteps:ipl SetMinStep:ipr SetMaxStep:ipr "
+    "SetStopTime:ipr GetReturnFlagName:pl GetNumSteps:ipp GetNumErrTestFails:ipp GetNumStepSolveFails:ipp "
+    "GetNumNonlinSolvIters:ipp GetNumJacEvals:ipp"
+)
+FUNCTIONS = {  # by library
+    "core": "SUNDIALSGetVersionNumber:ippppi SUNContext_Create:iip SUNContext_ClearErrHandlers:ip SUNContext_Free:ip "
+    "N_VGetArrayPointer:Rp N_VDestroy:-p SUNMatDestroy:-p SUNLinSolFree:ip",
+    "nvecserial": "N_VMake_Serial:pxpp",
+    "sunmatrixdense": "SUNDenseMatrix:pxxp SUNDenseMatrix_Data:Rp",
+    "sunlinsoldense": "SUNLinSol_Dense:pppp",
+    "ida": " ".join(f"IDA{each}" for each in _OF_EACH.split()) + " IDACreate:pp IDAInit:ipprpp IDAReInit:iprpp "
+    "IDASVtolerances:iprp IDASetMaxOrd:ipi IDASolve:iprpppi IDAGetNumResEvals:ipp",
+    "cvode": " ".join(f"CVode{each}" for each in _OF_EACH.split()) + " CVodeCreate:pip CVodeInit:ipprp "
+    "CVodeReInit:iprp CVodeSStolerances:iprr CVodeSetProjFn:ipp SUNNonlinSol_FixedPoint:ppip "
+    "SUNNonlinSolFree_FixedPoint:ip CVodeSetNonlinearSolver:ipp CVode:iprppi CVodeGetNumRhsEvals:ipp "
+    "CVodeGetNumLinRhsEvals:ipp CVodeGetNumLinSolvSetups:ipp",
 }
 
 
@@ -95,9 +62,9 @@ def library() -> SimpleNamespace:
             raise _another_wheel(f"there are {len(found)} files scikit_sundae.libs/libsundials_{name}-*, not 1")
         try:
             dll = ctypes.CDLL(found[0])
-            for function, (returned, *taken) in wanted.items():
+            for function, types in (each.split(":") for each in wanted.split()):
                 functions[function] = declared = getattr(dll, function)
-                declared.restype, declared.argtypes = returned, taken
+                declared.restype, *declared.argtypes = (_TYPES[letter] for letter in types)
         except (OSError, AttributeError) as error:
             raise _another_wheel(str(error)) from error
     sundials = SimpleNamespace(**functions)

@@ -7,24 +7,18 @@ from contextlib import ExitStack
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from references.driver import Task, TimeLimit, user_call
 from references.sundials.library import LONG, POINTER, REAL, check, context, library, made
-
-Array = NDArray[np.float64]
+from twoloop.problem.problem import Array
 
 SMALLEST_STEP = 1e-12  # of the length of t_span; without one they shrink their steps towards a NaN without end
 MOST_STEPS = 10**9  # the clock is looked at before
 STEPS_A_CALL = 100  # between two looks at the clock
 NORMAL, ONE_STEP, TSTOP_RETURN, TOO_MUCH_WORK = 1, 2, 1, -1
 RAISED = -1  # what a callback returns that shall not be called again
-COUNTERS = {
-    "n_accepted": ("Steps",),
-    "n_rejected_error": ("ErrTestFails",),
-    "n_rejected_convergence": ("StepSolveFails",),
-    "n_outer": ("NonlinSolvIters",),
-}
+COUNTERS = {"n_accepted": ("Steps",), "n_rejected_error": ("ErrTestFails",)}
+COUNTERS |= {"n_rejected_convergence": ("StepSolveFails",), "n_outer": ("NonlinSolvIters",)}
 
 
 class Memory:

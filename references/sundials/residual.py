@@ -17,16 +17,14 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 from numba.core.dispatcher import Dispatcher
-from numpy.typing import NDArray
 
 from references.driver import Task
 from references.equations.accelerations import compiled_gamma
 from references.equations.least_norm import accelerations
 from references.equations.linear import kept
 from twoloop.kernels.compile.callbacks import stand_in
-from twoloop.kernels.data.common import FORCE_BY_Q_GIVEN, FORCE_BY_V_GIVEN
-
-Array = NDArray[np.float64]
+from twoloop.kernels.data.flags import FORCE_BY_Q_GIVEN, FORCE_BY_V_GIVEN
+from twoloop.problem.problem import Array
 
 FORMS = {
     "index1": "index 1: C_q v' = Q_d; multipliers out of the error test (atol 1e12)",
@@ -76,8 +74,7 @@ class Implicit:
         exact = f.flags[FORCE_BY_Q_GIVEN] == 1 and f.flags[FORCE_BY_V_GIVEN] == 0
         gamma = compiled_gamma(system) if self.index1 else f.gamma
         functions = f.mass, f.force, f.constraint, f.jacobian, f.constraint_rate, gamma, f.force_by_q if exact else None
-        positions = task.n_c if m > task.n_c else ALL
-        self.parts = Parts(self.index1, *functions, positions, system.constant_mass)
+        self.parts = Parts(self.index1, *functions, task.n_c if m > task.n_c else ALL, system.constant_mass)
         self.residual, self.matrix = residual_at(self.parts), iteration_matrix_at(self.parts)
         self.sizes = n, m
         a, lam = (each[:, 0] for each in accelerations(system, np.array([task.t0]), task.y0[:, None]))
@@ -90,8 +87,7 @@ class Implicit:
     def columns(self, y: Array, yp: Array) -> Array:
         """Rows [q v a lam] (3 n_q + n_c, n_t) of unknowns and their derivatives (size, n_t)."""
         n, m = self.sizes
-        lam = (y if self.index1 else yp)[2 * n : 2 * n + m]
-        return np.concatenate([y[: 2 * n], yp[n : 2 * n], lam])
+        return np.concatenate([y[: 2 * n], yp[n : 2 * n], (y if self.index1 else yp)[2 * n : 2 * n + m]])
 
 
 @lru_cache(maxsize=64)

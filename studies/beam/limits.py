@@ -34,8 +34,7 @@ def frequencies(problem: Problem) -> Array:
     q, n = problem.q0, problem.q0.size
     K = np.zeros((n, n))
     elastic_tangent(0.0, q, np.zeros(n), problem.system.functions.p, K)
-    M = problem.system.mass(0.0, q)
-    return np.sqrt(np.maximum(eigh(-K[2:, 2:], M[2:, 2:], eigvals_only=True), 0.0))
+    return np.sqrt(np.maximum(eigh(-K[2:, 2:], problem.system.mass(0.0, q)[2:, 2:], eigvals_only=True), 0.0))
 
 
 def jacobi_limit(tableau: Tableau) -> float:

@@ -88,6 +88,7 @@ def at(runs: pd.DataFrame, error: float) -> dict[str, Any]:
     own = runs["family"] == "two-loop"
     sides = tables.costs_at(runs[own], error), tables.costs_at(runs[~own], error, doubt=True)
     found["verdict"] = tables.compared(*sides)["verdict"]
+    found["ties"] = _ties(tables.costs_at(runs, error), found["best"]["solver"]) if found["best"] else []
     found |= dict.fromkeys(("ida_over_ours", "paper_over_best"))
     ida = min((seconds[name] for name in (IDA_C, IDA_C_ORDER_2) if name in seconds), default=None)
     if ida is not None and found["ours"] is not None:
@@ -95,6 +96,13 @@ def at(runs: pd.DataFrame, error: float) -> dict[str, Any]:
     if PAPER in seconds:
         found["paper_over_best"] = seconds[PAPER] / min(seconds.values())
     return found
+
+
+def _ties(costs: tables.Costs, best: str) -> list[str]:
+    """The solvers whose time over that of the cheapest may be 1, by the repetitions drawn again."""
+    others = [name for name in costs if name != best]
+    over = {name: tables.compared({best: costs[best]}, {name: costs[name]})["interval"] for name in others}
+    return [name for name, interval in over.items() if interval and interval[0] <= 1.0 <= interval[1]]
 
 
 def _longest_step(runs: pd.DataFrame, w_max: float) -> dict[str, Any]:

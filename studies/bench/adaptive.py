@@ -66,27 +66,14 @@ def collect(
 ) -> pd.DataFrame:
     """Rows of all runs that are of use, the repetitions interleaved.
 
-    Parameters
-    ----------
-    todo : sequence of Run
-        Those of one solver on one mechanism from its loosest setting on.
-    kept : KeptRows
-    make : callable
-        make(run, repeat, built) -> row, with case, status, error_q and call_s.
-    all_asked : callable, optional
-        all_asked(run): the solver is asked for all accuracies on this mechanism, however far behind it is.
-    errors : sequence of float, optional
-        The accuracies that are compared, for which solvers that are not far behind the fastest of their side, and
-        those of ALWAYS, are asked between their settings.
-    always_repeated : callable, optional
-        always_repeated(run): repeated, however far behind, as its time is compared with that of another such run.
-    fine : callable, optional
-        fine(run): asked between its settings, however far behind.
+    `todo`: those of one solver on one mechanism from its loosest setting on. `make`: make(run, repeat, built) -> row,
+    with case, status, error_q and call_s. `all_asked`: all_asked(run): the solver is asked for all accuracies on this
+    mechanism, however far behind it is. `errors`: the accuracies that are compared, for which solvers that are not far
+    behind the fastest of their side, and those of ALWAYS, are asked between their settings. `always_repeated`:
+    always_repeated(run): repeated, however far behind, as its time is compared with that of another such run. `fine`:
+    fine(run): asked between its settings, however far behind.
 
-    Returns
-    -------
-    DataFrame
-        In the order of the runs, the repetitions of a run one below the other.
+    The rows are in the order of the runs, the repetitions of a run one below the other.
     """
     built: Warm = set()
     progress: dict[tuple[str, str], _Progress] = defaultdict(_Progress)

@@ -9,12 +9,8 @@ from typing import Any
 def apart(work: Callable[[], Any], limit: float | None = None, cpu: int | None = None) -> Any:
     """What work() returns in a fork of this process, which is ended after `limit` s, or `cpu` s of CPU time, if given.
 
-    Raises
-    ------
-    TimeoutError
-        If it does not come back.
-    EOFError
-        If the process ends without an answer; its argument is the code, as of `multiprocessing.Process.exitcode`.
+    Raises TimeoutError if it does not come back. Raises EOFError if the process ends without an answer; its argument is
+    the code, as of `multiprocessing.Process.exitcode`.
     """
     context = multiprocessing.get_context("fork")
     here, there = context.Pipe(duplex=False)

@@ -27,26 +27,13 @@ class StudyError(Exception):
 
 @dataclass(frozen=True)
 class Call:
-    """How a study was called.
-
-    Attributes
-    ----------
-    study : str
-    quick : bool
-        The small version of some seconds.
-    out : Path
-        Folder of the report.
-    redraw : bool
-        Make report and figures again from the saved rows.
-    command : str
-        For the stamp.
-    """
+    """How a study was called."""
 
     study: str
-    quick: bool
-    out: Path
-    redraw: bool
-    command: str
+    quick: bool  # the small version of some seconds
+    out: Path  # folder of the report
+    redraw: bool  # make report and figures again from the saved rows
+    command: str  # for the stamp
 
 
 def parser(name: str, description: str | None) -> argparse.ArgumentParser:
@@ -88,15 +75,18 @@ def main(work: Callable[[Sequence[str] | None], None], words: Sequence[str] | No
 
 def stamp(command: str) -> str:
     """One line: command, date, commit, machine, versions."""
-    versions = []
-    for package in PACKAGES:
-        try:
-            versions.append(f"{package} {version(package)}")
-        except PackageNotFoundError:
-            versions.append(f"{package} (not installed)")
+    versions = [f"{package} {version_of(package, '(not installed)')}" for package in PACKAGES]
     machine = f"{processor()}, {os.cpu_count()} cores"
     system = f"{platform.system()}, Python {platform.python_version()}"
     return "; ".join([f"`{command}`", date.today().isoformat(), f"commit {commit()}", machine, system, *versions])
+
+
+def version_of(package: str, without: str = "not installed") -> str:
+    """That of an installed package."""
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return without
 
 
 def commit() -> str:

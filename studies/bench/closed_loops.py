@@ -1,10 +1,12 @@
 """Mechanisms with closed loops made of bodies and joints, for programs that take such: a model each, and its time."""
 
 import math
+import sys
+from collections.abc import Iterable
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
@@ -12,36 +14,10 @@ from twoloop.bodies import PlanarModel, SpatialModel
 from twoloop.bodies.model_problem import ModelProblem
 from twoloop.mechanisms import andrews as ready_andrews
 from twoloop.mechanisms import four_bar as ready_four_bar
-from twoloop.mechanisms.andrews import (
-    DA,
-    EE,
-    FF,
-    LENGTH,
-    RA,
-    RR,
-    SA,
-    SB,
-    SC,
-    SD,
-    SPRING,
-    TA,
-    TB,
-    TORQUE,
-    UA,
-    UB,
-    XA,
-    XB,
-    XC,
-    YA,
-    YB,
-    YC,
-    ZT,
-    D,
-    U,
-)
 from twoloop.mechanisms.rotation import rotation_matrix
+from twoloop.problem.problem import Array
 
-Array = NDArray[np.float64]
+numbers = sys.modules[ready_andrews.__module__]  # those of the squeezer
 
 
 def _closing(one: Array, r: float, other: Array, s: float, side: float = 1.0) -> Array:
@@ -54,35 +30,32 @@ def _closing(one: Array, r: float, other: Array, s: float, side: float = 1.0) ->
 
 
 def _linkage(
-    name: str, crank: float, coupler: float, rocker: float, base: float, angle: float, rate: float, ratio: float = 1.0
+    name: str, crank: float, coupler: float, rocker: float, base: float, angle: float, rate: float
 ) -> PlanarModel:
-    """A four-bar linkage of uniform rods of 1 kg/m, the coupler `ratio` times lighter, its crank turning."""
+    """A four-bar linkage of uniform rods of 1 kg/m, its crank turning."""
     O, C = np.zeros(2), np.array([base, 0.0])
     A = crank * np.array([math.cos(angle), math.sin(angle)])
     B = _closing(A, coupler, C, rocker)
     model = PlanarModel(name=name)
     model.rod("crank", O, A, mass=crank, angular_velocity=rate)
-    model.rod("coupler", A, B, mass=coupler / ratio)
+    model.rod("coupler", A, B, mass=coupler)
     model.rod("rocker", B, C, mass=rocker)
-    for pair, at in (
-        (("ground", "crank"), O),
-        (("crank", "coupler"), A),
-        (("coupler", "rocker"), B),
-        (("rocker", "ground"), C),
-    ):
-        model.revolute(*pair, at=at)
+    pins = [("ground", "crank", O), ("crank", "coupler", A), ("coupler", "rocker", B), ("rocker", "ground", C)]
+    return _pinned(model, pins)
+
+
+def _pinned(model: PlanarModel, pins: Iterable[tuple[str, str, Any]]) -> PlanarModel:
+    """The model with hinges between two of its bodies at places."""
+    for a, b, at in pins:
+        model.revolute(a, b, at=at)
     return model
 
 
 def four_bar() -> ModelProblem:
     """The four-bar of the paper, 1, 2 and 1.5 m on 3 m, as the library starts it."""
-    return _published("four-bar").problem((0.0, 10.0))
-
-
-def _published(name: str) -> PlanarModel:
     known = ready_four_bar()
     q, v = known.q0.reshape(3, 3), known.v0.reshape(3, 3)
-    model = PlanarModel(name=name)
+    model = PlanarModel(name="four-bar")
     lengths = (1.0, 2.0, 1.5)
     for k, long in enumerate(lengths):
         motion = {"velocity": v[k, :2], "angular_velocity": v[k, 2]}
@@ -91,43 +64,14 @@ def _published(name: str) -> PlanarModel:
         state[:2] + 0.5 * long * np.array([math.cos(state[2]), math.sin(state[2])])
         for long, state in zip(lengths, q, strict=True)
     ]
-    for pair, at in ((("ground", "bar 1"), (0.0, 0.0)), (("bar 1", "bar 2"), ends[0]), (("bar 2", "bar 3"), ends[1])):
-        model.revolute(*pair, at=at)
-    model.revolute("bar 3", "ground", at=(3.0, 0.0))
-    return model
-
-
-CRANK_ROCKER = (0.5, 2.0, 1.5, 1.8, 0.5, 8.0)
+    names = ["ground", "bar 1", "bar 2", "bar 3", "ground"]
+    pins = zip(names, names[1:], [(0.0, 0.0), ends[0], ends[1], (3.0, 0.0)], strict=False)
+    return _pinned(model, pins).problem((0.0, 10.0))
 
 
 def crank_rocker() -> ModelProblem:
     """A four-bar whose crank turns round: 0.5, 2 and 1.5 m on 1.8 m."""
-    return _linkage("crank-rocker", *CRANK_ROCKER).problem((0.0, 10.0))
-
-
-def light_coupler() -> ModelProblem:
-    """The crank-rocker with a coupler a hundred times lighter."""
-    return _linkage("coupler of 1:100", *CRANK_ROCKER, 100.0).problem((0.0, 10.0))
-
-
-def lighter_coupler() -> ModelProblem:
-    """The crank-rocker with a coupler ten thousand times lighter."""
-    return _linkage("coupler of 1:10000", *CRANK_ROCKER, 1e4).problem((0.0, 10.0))
-
-
-def driven() -> ModelProblem:
-    """The crank-rocker, a motor at its crank: 5 N m s/rad times what is missing to 8 rad/s."""
-    model = _linkage("speed motor", *CRANK_ROCKER)
-    model.torque("crank", 5.0 * 8.0)
-    model.torsion_spring(model.joints[0], stiffness=0.0, damping=5.0)
-    return model.problem((0.0, 10.0))
-
-
-def servo() -> ModelProblem:
-    """The four-bar, a PD motor at its first bar that turns it by 0.5 rad: 200 N m/rad and 5 N m s/rad."""
-    model = _published("PD motor")
-    model.torsion_spring(model.joints[0], stiffness=200.0, damping=5.0, angle=0.5)
-    return model.problem((0.0, 10.0))
+    return _linkage("crank-rocker", 0.5, 2.0, 1.5, 1.8, 0.5, 8.0).problem((0.0, 10.0))
 
 
 def parallelogram() -> ModelProblem:
@@ -164,9 +108,7 @@ def six_bar() -> ModelProblem:
         model.rod(name, start, end, mass=1.0)
     pins = [("ground", "crank", O), ("crank", "coupler", A), ("coupler", "rocker", B), ("rocker", "ground", C)]
     pins += [("coupler", "arm", D_), ("arm", "post", E), ("post", "ground", F)]
-    for a, b, point in pins:
-        model.revolute(a, b, at=point)
-    return model.problem((0.0, 5.0))
+    return _pinned(model, pins).problem((0.0, 5.0))
 
 
 def slider_crank() -> ModelProblem:
@@ -198,28 +140,26 @@ def closed_chain(n: int = 50) -> ModelProblem:
     for k, (one, other) in enumerate(pairwise(points)):
         model.rod(f"bar {k}", one, other, mass=1.0 / n)
     names = ["ground", *(f"bar {k}" for k in range(n)), "ground"]
-    for (a, b), at in zip(pairwise(names), points, strict=True):
-        model.revolute(a, b, at=at)
-    return model.problem((0.0, 0.5))
+    return _pinned(model, zip(names, names[1:], points, strict=False)).problem((0.0, 0.5))
 
 
 def squeezer() -> ModelProblem:
     """Andrews' squeezing mechanism, of seven bodies, three loops, a spring and a constant torque."""
     known = ready_andrews()
     beta, theta, gamma, phi, delta, omega, epsilon = known.q0
-    A, B, C = np.array([XA, YA]), np.array([XB, YB]), np.array([XC, YC])
-    pin = _turned(beta, RR, 0.0)
-    shared = pin + _turned(beta + theta, -D, 0.0)
-    fourth, sixth = A + _turned(delta, ZT, 0.0), A + _turned(epsilon, 0.0, -U)
+    A, B, C = np.array([numbers.XA, numbers.YA]), np.array([numbers.XB, numbers.YB]), np.array([numbers.XC, numbers.YC])
+    pin = _turned(beta, numbers.RR, 0.0)
+    shared = pin + _turned(beta + theta, -numbers.D, 0.0)
+    fourth, sixth = A + _turned(delta, numbers.ZT, 0.0), A + _turned(epsilon, 0.0, -numbers.U)
     model = PlanarModel(gravity=(0.0, 0.0), name="Andrews' squeezer")
     centres = (
-        (_turned(beta, RA, 0.0), beta),
-        (pin + _turned(beta + theta, -DA, 0.0), beta + theta),
-        (B + _turned(gamma, SB, -SA), gamma),
-        (fourth + _turned(phi + delta, 0.0, -EE), phi + delta),
-        (A + _turned(delta, TA, TB), delta),
-        (sixth + _turned(omega + epsilon, FF, 0.0), omega + epsilon),
-        (A + _turned(epsilon, -UB, -UA), epsilon),
+        (_turned(beta, numbers.RA, 0.0), beta),
+        (pin + _turned(beta + theta, -numbers.DA, 0.0), beta + theta),
+        (B + _turned(gamma, numbers.SB, -numbers.SA), gamma),
+        (fourth + _turned(phi + delta, 0.0, -numbers.EE), phi + delta),
+        (A + _turned(delta, numbers.TA, numbers.TB), delta),
+        (sixth + _turned(omega + epsilon, numbers.FF, 0.0), omega + epsilon),
+        (A + _turned(epsilon, -numbers.UB, -numbers.UA), epsilon),
     )
     for k, (mass, inertia, (place, angle)) in enumerate(
         zip(known.parameters["masses"], known.parameters["inertias"], centres, strict=True), 1
@@ -228,10 +168,9 @@ def squeezer() -> ModelProblem:
     pins = [("ground", "K1", (0.0, 0.0)), ("K1", "K2", pin), ("K2", "K3", shared), ("K2", "K4", shared)]
     pins += [("K2", "K6", shared), ("K3", "ground", B), ("K4", "K5", fourth), ("K5", "ground", A)]
     pins += [("K6", "K7", sixth), ("K7", "ground", A)]
-    for a, b, at in pins:
-        model.revolute(a, b, at=at)
-    model.spring("ground", C, "K3", B + _turned(gamma, SD, -SC), stiffness=SPRING, length=LENGTH)
-    model.torque("K1", TORQUE)
+    end = B + _turned(gamma, numbers.SD, -numbers.SC)
+    _pinned(model, pins).spring("ground", C, "K3", end, stiffness=numbers.SPRING, length=numbers.LENGTH)
+    model.torque("K1", numbers.TORQUE)
     return model.problem((0.0, 0.03))
 
 
@@ -239,18 +178,13 @@ def _turned(angle: float, x: float, y: float) -> Array:
     return np.array([math.cos(angle) * x - math.sin(angle) * y, math.sin(angle) * x + math.cos(angle) * y])
 
 
-def rssr() -> ModelProblem:
+UPRIGHT = np.eye(3)
+ASKEW = rotation_matrix(np.array([0.5, 0.7, -0.1, 0.5]))  # about no axis of the frame
+
+
+def rssr(Q: Array = UPRIGHT) -> ModelProblem:
     """A spatial four-bar with two hinges and two ball joints."""
-    return _rssr("RSSR", np.eye(3))
-
-
-def turned_rssr() -> ModelProblem:
-    """The same, turned in space with its gravity, about no axis of the frame."""
-    return _rssr("RSSR, turned", rotation_matrix(np.array([0.5, 0.7, -0.1, 0.5])))
-
-
-def _rssr(name: str, Q: Array) -> ModelProblem:
-    model = SpatialModel(gravity=Q @ [0.0, 0.0, -9.81], name=name)
+    model = SpatialModel(gravity=Q @ [0.0, 0.0, -9.81], name="RSSR")
     O, P, S, T = np.array([(0.0, 0.0, 0.0), (0.3, 0.0, 0.0), (0.9, 0.0, 1.0), (0.9, 0.0, 0.3)]) @ Q.T
     model.rod("crank", O, P, radius=0.02, mass=0.8, angular_velocity=6.0 * Q[:, 2])
     for part, start, end in (("coupler", P, S), ("rocker", T, S)):
@@ -262,11 +196,11 @@ def _rssr(name: str, Q: Array) -> ModelProblem:
     return model.problem((0.0, 5.0))
 
 
-def bricard() -> ModelProblem:
+def bricard(Q: Array = UPRIGHT) -> ModelProblem:
     """Bricard's six hinges, five bars of 1 kg and 1 m and the ground: it moves though its rows seem one too many."""
-    C = np.array([[0, 0, 0], [1, 0, 0], [1, -1, 0], [1, -1, 1], [0, -1, 1], [0, 0, 1]], dtype=float)
-    axes = np.eye(3)[[1, 2, 0, 1, 2, 0]]
-    model = SpatialModel(gravity=(0.0, -9.81, 0.0), name="Bricard")
+    C = np.array([[0, 0, 0], [1, 0, 0], [1, -1, 0], [1, -1, 1], [0, -1, 1], [0, 0, 1]], dtype=float) @ Q.T
+    axes = np.eye(3)[[1, 2, 0, 1, 2, 0]] @ Q.T
+    model = SpatialModel(gravity=Q @ [0.0, -9.81, 0.0], name="Bricard")
     for k in range(5):
         R = np.column_stack([C[k + 1] - C[k], axes[k], np.cross(C[k + 1] - C[k], axes[k])])
         moments = np.array([0.02, 1.01, 1.01]) / 12.0
@@ -277,20 +211,19 @@ def bricard() -> ModelProblem:
     return model.problem((0.0, 10.0))
 
 
-def governor() -> ModelProblem:
+def governor(Q: Array = UPRIGHT) -> ModelProblem:
     """Watt's flyball governor: arms hinged to a turning shaft, links from these to a sleeve that slides on it."""
-    model = SpatialModel(name="flyball governor")
-    y, z = (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
-    spin = (0.0, 0.0, 9.0)
-    model.rod("shaft", (0.0, 0.0, 0.0), z, radius=0.02, mass=1.0, angular_velocity=spin)
+    model = SpatialModel(gravity=Q @ [0.0, 0.0, -9.81], name="flyball governor")
+    x, y, z = Q.T
+    model.rod("shaft", np.zeros(3), z, radius=0.02, mass=1.0, angular_velocity=9.0 * z)
     angle, long = math.radians(35.0), 0.4
     drop, out = long * math.cos(angle), long * math.sin(angle)
-    model.box("sleeve", (0.1, 0.1, 0.1), mass=2.0, position=(0.0, 0.0, 1.0 - 2.0 * drop))
-    model.revolute("ground", "shaft", at=(0.0, 0.0, 0.0), axis=z)
-    model.prismatic("shaft", "sleeve", at=(0.0, 0.0, 1.0 - 2.0 * drop), axis=z)
+    model.box("sleeve", (0.1, 0.1, 0.1), mass=2.0, position=(1.0 - 2.0 * drop) * z, rotation=Q)
+    model.revolute("ground", "shaft", at=np.zeros(3), axis=z)
+    model.prismatic("shaft", "sleeve", at=(1.0 - 2.0 * drop) * z, axis=z)
     for name, side in (("right", 1.0), ("left", -1.0)):
-        top, elbow = np.array([side * 0.05, 0.0, 1.0]), np.array([side * (0.05 + out), 0.0, 1.0 - drop])
-        low = np.array([side * 0.05, 0.0, 1.0 - 2.0 * drop])
+        top, elbow = side * 0.05 * x + z, side * (0.05 + out) * x + (1.0 - drop) * z
+        low = side * 0.05 * x + (1.0 - 2.0 * drop) * z
         model.rod(f"{name} arm", top, elbow, radius=0.02, mass=1.5)
         model.rod(f"{name} link", elbow, low, radius=0.01, mass=0.3)
         model.revolute("shaft", f"{name} arm", at=top, axis=y)
@@ -299,18 +232,19 @@ def governor() -> ModelProblem:
     return model.problem((0.0, 5.0))
 
 
-def stewart(stiffness: float = 600.0, damping: float = 0.0) -> ModelProblem:
+def stewart(Q: Array = UPRIGHT, stiffness: float = 600.0, damping: float = 0.0) -> ModelProblem:
     """A platform on six legs, each two bodies that slide on one another, with a spring from base to platform."""
-    model = SpatialModel(name="Stewart platform")
-    model.body("platform", mass=4.0, inertia=(0.4, 0.4, 0.8), position=(0.0, 0.0, 1.0), velocity=(0.3, 0.1, 0.0))
+    model = SpatialModel(gravity=Q @ [0.0, 0.0, -9.81], name="Stewart platform")
+    moving = {"velocity": Q @ [0.3, 0.1, 0.0], "rotation": Q}
+    model.body("platform", mass=4.0, inertia=(0.4, 0.4, 0.8), position=Q[:, 2], **moving)
     for k in range(6):
         low, high = (math.radians(60.0 * (k // 2 * 2) + side * (1 if k % 2 else -1)) for side in (10.0, 50.0))
-        foot = np.array([math.cos(low), math.sin(low), 0.0])
-        top = np.array([0.5 * math.cos(high), 0.5 * math.sin(high), 1.0])
+        foot = Q @ [math.cos(low), math.sin(low), 0.0]
+        top = Q @ [0.5 * math.cos(high), 0.5 * math.sin(high), 1.0]
         along = (top - foot) / np.linalg.norm(top - foot)
         model.rod(f"cylinder {k}", foot, foot + 0.55 * (top - foot), radius=0.03, mass=0.6)
         model.rod(f"piston {k}", foot + 0.45 * (top - foot), top, radius=0.02, mass=0.4)
-        across = np.cross(along, (0.0, 0.0, 1.0))
+        across = np.cross(along, Q[:, 2])
         across /= np.linalg.norm(across)
         model.universal("ground", f"cylinder {k}", at=foot, axes=(across, np.cross(along, across)))
         model.prismatic(f"cylinder {k}", f"piston {k}", at=0.5 * (foot + top), axis=along)
@@ -320,8 +254,8 @@ def stewart(stiffness: float = 600.0, damping: float = 0.0) -> ModelProblem:
     return model.problem((0.0, 3.0))
 
 
+SPATIAL = (rssr, bricard, governor, stewart)
 MECHANISMS = (
     *(four_bar, crank_rocker, parallelogram, six_bar, slider_crank, squeezer, closed_chain),
-    *(rssr, bricard, governor, stewart),
+    *SPATIAL,
 )
-VARIANTS = (driven, servo, light_coupler, lighter_coupler, turned_rssr)

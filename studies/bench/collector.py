@@ -45,56 +45,29 @@ class NotApplicable(Exception):
 
 @dataclass(frozen=True)
 class Case:
-    """A mechanism, a time span, and what runs are measured by.
+    """A mechanism, a time span, and what runs are measured by."""
 
-    Attributes
-    ----------
-    name : str
-        In tables and rows.
-    problem : Problem
-    t_end : float
-        s, that runs last.
-    known : callable or None
-        known() -> ReferenceMotion where the motion is known; None: two unlike methods make one.
-    n_instants : int
-        Common instants, evenly spaced in (0, t_end].
-    conserved : bool or None
-        Whether the problem's energy is an invariant of the true motion. None: as the problem says, and where it does
-        not, as the reference shows.
-    invariants : mapping
-        Further ones: column to invariant(t, q, v), for columns of states.
-    watched : tuple of int or None
-        Coordinates by which "out of phase" is judged. None: all.
-    step_sizes : tuple of float or None
-        s, for solvers of fixed step. None: t_end over 1000, 3000, 10,000, 30,000 and 100,000.
-    tolerances : tuple of float or None
-        For solvers that have one. None: those of the solver, from 1e-3 down; a stiff case asks for looser ones.
-    time_limit : float
-        CPU seconds that the call of a run may use that its user writes.
-    timed : float
-        s of CPU time: a shorter run is timed by calling it again, CALLS times.
-    tags : tuple of str
-        Class of the problem, "smooth", "stiff", "long", for tables over several cases.
-    note : str
-        What is assumed.
-    t0 : float
-        s, at which runs start; other than 0 for solvers of ours alone, which take their span from `start`.
-    """
-
-    name: str
+    name: str  # in tables and rows
     problem: Problem
-    t_end: float
+    t_end: float  # s, that runs last
+    # known() -> ReferenceMotion where the motion is known; None: two unlike methods make one
     known: Callable[[], ReferenceMotion] | None = None
-    n_instants: int = INSTANTS
+    n_instants: int = INSTANTS  # common instants, evenly spaced in (0, t_end]
+    # whether the problem's energy is an invariant of the true motion. None: as the problem says, and where it does not,
+    # as the reference shows.
     conserved: bool | None = None
+    # further ones: column to invariant(t, q, v), for columns of states
     invariants: Mapping[str, Callable[[Array, Array, Array], Array]] = field(default_factory=dict)
-    watched: tuple[int, ...] | None = None
+    watched: tuple[int, ...] | None = None  # coordinates by which "out of phase" is judged. None: all.
+    # s, for solvers of fixed step. None: t_end over 1000, 3000, 10,000, 30,000 and 100,000.
     step_sizes: tuple[float, ...] | None = None
+    # for solvers that have one. None: those of the solver, from 1e-3 down; a stiff case asks for looser ones.
     tolerances: tuple[float, ...] | None = None
-    time_limit: float = 60.0
-    timed: float = 0.1
-    tags: tuple[str, ...] = ()
-    note: str = ""
+    time_limit: float = 60.0  # CPU seconds that the call of a run may use that its user writes
+    timed: float = 0.1  # s of CPU time: a shorter run is timed by calling it again, CALLS times
+    tags: tuple[str, ...] = ()  # class of the problem, "smooth", "stiff", "long", for tables over several cases
+    note: str = ""  # what is assumed
+    # s, at which runs start; other than 0 for solvers of ours alone, which take their span from `start`
     t0: float = 0.0
 
     @cached_property
@@ -136,53 +109,30 @@ class Case:
 
 @dataclass(frozen=True)
 class Solver:
-    """A solver of the catalogue.
+    """A solver of the catalogue."""
 
-    Attributes
-    ----------
-    name : str
-        Its line in tables and figures.
-    family : str
-        Whose it is: "two-loop" (this project), "SUNDIALS", "SciPy", "Exudyn", "stand-in".
-    called_from : str
-        What calls the mechanism's functions: "compiled" code, or "Python", which costs microseconds a call.
-    keeps_constraints : bool
-        Whether the positions stay on the constraints to the solver's tolerance; False: they drift, or are off by the
-        solver's errors.
-    setting : str
-        What the one number is that varies: "tol" (relative and absolute), "err_out" (the paper's), "h" (fixed step, s).
-    run : callable
-        run(case, value, repeat) -> Result, from 0 to case.t_end, within case.time_limit where the solver has such a
-        limit. `repeat` counts from 0; a solver whose error scatters with rounding alone varies its input by it.
-    values : tuple of float
-        Values of the setting, loose to tight. Empty: those of the case, for "h".
-    fixed : mapping
-        Settings that do not vary, numbers or texts, for the row.
-    traces : bool
-        Whether it runs the mechanism's functions once, or has a model of its own, and calls none during a run.
-    own_accelerations : bool
-        Whether the accelerations in its results are not those of eq. (6) at its q and v.
-    used : callable or None
-        used(value, result) -> what a solver that chooses among methods took, between which nothing is interpolated.
-    builds_each : bool
-        Whether it compiles or builds anew for each value of the setting, not once a case.
-    builds_span : bool
-        Whether what it builds holds the time span, so that its warm-up is a whole run.
-    """
-
-    name: str
-    family: str
+    name: str  # its line in tables and figures
+    family: str  # whose it is: "two-loop" (this project), "SUNDIALS", "SciPy", "Exudyn", "stand-in"
+    # what calls the mechanism's functions: "compiled" code, or "Python", which costs microseconds a call
     called_from: str
+    # whether the positions stay on the constraints to the solver's tolerance; False: they drift, or are off by the
+    # solver's errors
     keeps_constraints: bool
+    # what the one number is that varies: "tol" (relative and absolute), "err_out" (the paper's), "h" (fixed step, s)
     setting: str
+    # run(case, value, repeat) -> Result, from 0 to case.t_end, within case.time_limit where the solver has such a
+    # limit. `repeat` counts from 0; a solver whose error scatters with rounding alone varies its input by it.
     run: Callable[[Case, float, int], Result]
-    values: tuple[float, ...] = ()
+    values: tuple[float, ...] = ()  # values of the setting, loose to tight. Empty: those of the case, for "h".
+    # settings that do not vary, numbers or texts, for the row
     fixed: Mapping[str, float | str] = field(default_factory=dict)
-    own_accelerations: bool = False
+    own_accelerations: bool = False  # whether the accelerations in its results are not those of eq. (6) at its q and v.
+    # whether it runs the mechanism's functions once, or has a model of its own, and calls none during a run
     traces: bool = False
+    # used(value, result) -> what a solver that chooses among methods took, between which nothing is interpolated
     used: Callable[[float, Result], str] | None = None
-    builds_each: bool = False
-    builds_span: bool = False
+    builds_each: bool = False  # whether it compiles or builds anew for each value of the setting, not once a case
+    builds_span: bool = False  # whether what it builds holds the time span, so that its warm-up is a whole run
 
     def took(self, value: float, result: Result | None) -> str:
         """The method that a run took, where the solver chooses; else nothing."""
@@ -197,18 +147,12 @@ class Solver:
 
 @dataclass(frozen=True)
 class Run:
-    """One cell: a solver on a case at one value of its setting, repeated.
-
-    Attributes
-    ----------
-    group : str
-        Part of the study to which the rows belong.
-    """
+    """One cell: a solver on a case at one value of its setting, repeated."""
 
     case: Case
     solver: Solver
     value: float
-    group: str = ""
+    group: str = ""  # part of the study to which the rows belong
     repeats: int = REPEATS
 
     @property
@@ -234,24 +178,12 @@ def collect(runs: Iterable[Run], kept: KeptRows, measure: Measure | None = None)
     alike; what hits its limit or cannot be run is asked once. A run that fails, exceeds its time limit, or cannot be
     made is a row whose status and message say so.
 
-    Parameters
-    ----------
-    runs : iterable of Run
-        No two with the same key.
-    kept : KeptRows
-        Of the study's `Output`; rows are on disk as soon as they are made.
-    measure : callable, optional
-        measure(run, result) -> further columns, of values that JSON holds. Not called where there is no result.
+    `runs`: no two with the same key. `kept`: of the study's `Output`; rows are on disk as soon as they are made.
+    `measure`: measure(run, result) -> further columns, of values that JSON holds. Not called where there is no result.
 
-    Returns
-    -------
-    DataFrame
-        In the order of the runs, the repetitions of a run one below the other.
+    The rows are in the order of the runs, the repetitions of a run one below the other.
 
-    Raises
-    ------
-    ValueError
-        If two runs have the same key.
+    Raises ValueError if two runs have the same key.
     """
     runs = list(runs)
     order = {run.key(k): (run, k) for run in runs for k in range(run.repeats)}
@@ -332,8 +264,7 @@ def from_new_start(run: Run) -> Run:
     case = run.case
     t0 = next(_COUNT) * LATER * case.t_end
     state = case.motion_at_start(t0)
-    problem = replace(case.problem, q0=state.q, v0=state.v)
-    return replace(run, case=replace(case, problem=problem, t0=t0))
+    return replace(run, case=replace(case, problem=replace(case.problem, q0=state.q, v0=state.v), t0=t0))
 
 
 def _may_hold_a_build(run: Run, status: str, spent: float) -> bool:

@@ -50,8 +50,7 @@ def error(given: Array, known: Array | None) -> float | None:
     if known is None or given.shape != known.shape or np.isnan(known).all():
         return None
     there = ~np.isnan(known)
-    difference = float(np.abs(given - known)[there].max())
-    return difference / max(1.0, float(np.abs(known[there]).max()))
+    return float(np.abs(given - known)[there].max()) / max(1.0, float(np.abs(known[there]).max()))
 
 
 def digits(size: float | None, most: float) -> float | None:
@@ -83,11 +82,8 @@ def violations(system: ConstrainedSystem, result: Result) -> dict[str, float]:
     t, q, v, a = float(result.t[-1]), *(np.ascontiguousarray(x[:, -1]) for x in (result.q, result.v, result.a))
     gammas = [system.gamma(t, q, v)] if system.n_c else []
     gammas += [system.nonholonomic_gamma(t, q, v)] if system.n_a else []
-    levels = {
-        "q": system.constraint(t, q) if system.n_c else np.zeros(0),
-        "v": system.velocity_constraint(t, q, v),
-        "a": system.rows(t, q) @ a - np.concatenate(gammas),
-    }
+    levels = {"q": system.constraint(t, q) if system.n_c else np.zeros(0), "v": system.velocity_constraint(t, q, v)}
+    levels |= {"a": system.rows(t, q) @ a - np.concatenate(gammas)}
     return {f"violation_{level}": float(np.abs(size).max(initial=0.0)) for level, size in levels.items()}
 
 

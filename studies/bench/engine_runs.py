@@ -9,18 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from references.engines.rigid import (
-    Motion,
-    Prepared,
-    Rigid,
-    coordinates,
-    largest_moment,
-    rigid_of,
-    states,
-    tensor,
-)
+from references.engines.rigid import Motion, Prepared, Rigid, coordinates, largest_moment, rigid_of, states, tensor
+from studies.bench.changed_loops import DRIVEN
 from studies.bench.closed_loops import parallelogram, parallelogram_motion
-from studies.bench.motorised_loops import DRIVEN
 from studies.bench.store import Array, Row
 from twoloop import ConstraintWarning, solve_dae
 from twoloop.audit.poses import gaps
@@ -71,10 +62,7 @@ class Loop:
     def reference(self) -> tuple[Motion, float]:
         """The motion by a route, and how far another, unlike, ends up from it at any instant.
 
-        Raises
-        ------
-        RuntimeError
-            If one of them fails.
+        Raises RuntimeError if one of them fails.
         """
         if self.problem.name in (PARALLEL, PARALLEL + DRIVEN):  # ours do not cross its singular positions so tightly
             q, v, apart = parallelogram_motion(self.times, self.rigid.torques[0, 2])
@@ -172,13 +160,10 @@ def errors(loop: Loop, motion: Motion) -> Row:
     energies = [loop.problem.energy(each.t, *coordinates(each, rigid.planar)) for each in (motion, known)]
     d = 2 if rigid.planar else 3  # what holds a mechanism in its plane is not unique
     f = np.abs(motion.f - known.f)[1:, :d].max() / np.abs(known.f[:, :d]).max()  # Drake's first step holds no loop
-    return {
-        "error_f": float(f),
-        "error_q": float(off),
-        "error_v": float(np.abs(motion.v - known.v).max() / fastest),
-        "gap": float(gaps(rigid.model, motion.x, motion.R).max()),
-        "energy": float(np.abs(energies[0] - energies[1]).max() / loop.kinetic),
-    }
+    found: dict[str, Any] = {"error_f": float(f), "error_q": float(off)}
+    found |= {"error_v": float(np.abs(motion.v - known.v).max() / fastest)}
+    found |= {"gap": float(gaps(rigid.model, motion.x, motion.R).max())}
+    return found | {"energy": float(np.abs(energies[0] - energies[1]).max() / loop.kinetic)}
 
 
 def timed(run: Callable[[int], Motion]) -> tuple[float, float]:

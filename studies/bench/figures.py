@@ -1,10 +1,12 @@
 """One style for all figures: a colour and a marker for each solver, and the work-precision figure."""
 
+import tomllib
 import zlib
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
 from io import BytesIO
 from itertools import product
+from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
@@ -19,39 +21,19 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
 from studies.bench.runs_by_error import astray, setting_of, used
-from studies.bench.solvers import CATALOGUE, COMPILED, DEFAULT, GEAR_ORDERS, GIVEN, HEYOKA, IRK, IRK_LINE, gear
+from studies.bench.solvers import CATALOGUE, COMPILED, DEFAULT, GEAR_ORDERS, HEYOKA, IRK, IRK_LINE, gear
 from studies.bench.store import Output
 from studies.bench.tables import time_for
 from twoloop.rows.equal_error import DECADE
 
 MOST_LINES = 9
 FIRST = (DEFAULT, *(name for name, method in COMPILED.items() if method == DEFAULT), IRK_LINE, IRK)  # always drawn
-MAIN_RIVALS = (
-    ("heyoka", HEYOKA),
-    ("SUNDIALS", "CVODE"),
-    ("SUNDIALS", "IDA from C"),
-    ("SciPy", ""),
-)  # family, how names begin
+# family, how names begin
+MAIN_RIVALS = (("heyoka", HEYOKA), ("SUNDIALS", "CVODE"), ("SUNDIALS", "IDA from C"), ("SciPy", ""))
 ERROR = "largest position error over the run (m, rad)"
 LEGEND = "solid: twoloop\nfilled: keeps constraints\nno line: a run failed, or\nerrors over a decade apart"
 
-mpl.rcParams.update(
-    {
-        "figure.dpi": 130,
-        "savefig.bbox": "tight",
-        "axes.grid": True,
-        "grid.alpha": 0.3,
-        "axes.spines.top": False,
-        "axes.spines.right": False,
-        "font.size": 9,
-        "legend.frameon": False,
-        "legend.fontsize": 8,
-        "lines.linewidth": 1.2,
-        "lines.markersize": 5,
-        "svg.hashsalt": "twoloop",  # the same figure is the same file
-        "svg.fonttype": "none",
-    }
-)
+plt.style.use(Path(__file__).with_name("bench.mplstyle"))
 
 # Okabe and Ito's colours, told apart by colour-blind readers; a marker besides, and dashes for other families
 BLACK, ORANGE, SKY, GREEN = "#000000", "#E69F00", "#56B4E9", "#009E73"
@@ -59,56 +41,12 @@ YELLOW, BLUE, RED, PINK, GREY, BROWN = "#B39B00", "#0072B2", "#D55E00", "#CC79A7
 VIOLET, MAGENTA, SLATE = "#6A3D9A", "#D4006A", "#2F4F6F"  # more, as ours and others' share none
 OLIVE, CRIMSON, LIME, TAN, ROSE, LAVENDER = "#556B2F", "#8B0000", "#8CC63E", "#C49C6B", "#FF9D9A", "#A99BD8"
 
-# a colour is of one family of solvers alone; in it each has a marker, and those that a work-precision figure mostly
-# draws together have markers of their own
-OURS: dict[str, dict[str, str]] = {
-    RED: {"DOP853 (twoloop)": "o", "DOP853, compiled": "v"},
-    BLACK: {"Adams": "d", "Adams, compiled": "^"},
-    VIOLET: {"auto": "s", "auto, compiled": "P"},
-    MAGENTA: {"Taylor": "D", "Taylor, compiled": "X"},
-    BLUE: {"Gauss12": "D", "Gauss6": "d", "Gauss6, Newton": "X", "Gauss6, momenta, symmetric": "o", "Gauss16": "h"},
-    PINK: {"SunRadau5": "v"},
-    BROWN: {"RadauIIA5": "^", "RadauIIA9": "o", "RadauIIA13": "s", "RadauIIA5, by differences": "<"},
-    OLIVE: {"TRBDF2": "v", "ESDIRK4": "^"},
-    CRIMSON: {"BDF": "P"},
-    GREY: {"Newmark": "h", "PaperNewmark (beta = 1/2)": "X"},
-    SLATE: {"PaperNewmark, beta = 1/4": "s"},
-    YELLOW: {"PaperIRK": "H", "PaperIRK, Atol = Rtol varied": "H"},
-}
-THEIRS: dict[str, dict[str, str]] = {
-    GREEN: {"heyoka": "*"},
-    SKY: {
-        "CVODE from C, Adams": ">",
-        "CVODE from C, BDF": "v",
-        "CVODE from C, BDF, projected": "^",
-        "CVODE, Adams": "h",
-    },
-    ORANGE: {
-        "IDA from C, stabilised": "<",
-        "IDA from C, q and v tested": "v",
-        "IDA, index1": "h",
-        "IDA, stabilised": "s",
-    }
-    | {"IDA from C, order 2, positions tested": "X"},
-    LIME: {"LSODA, index 1": "p", "DOP853, index 1": "8", "DOP853, projected": "X", "DOP853, Baumgarte 10": "^"}
-    | {"Radau, index 1": "d", "BDF, index 1": "D"},
-    TAN: {"Exudyn, GeneralizedAlpha": "D", "Exudyn, TrapezoidalIndex2": "^"}
-    | {"Exudyn, GeneralizedAlpha 0.6": "h", "Exudyn, GeneralizedAlpha 1": "d"},
-    LAVENDER: {"IDAS, CasADi": "d", "CVODES, CasADi": "D", "CVODES, CasADi, Adams": ">", "collocation, CasADi": "v"},
-    ROSE: {"Dopri8, diffrax": "8", "Pr9, index 1": "p"},
-}
+LOOKS = tomllib.loads(Path(__file__).with_name("looks.toml").read_text(encoding="utf-8"))
+OURS, THEIRS = ({globals()[color]: own for color, own in LOOKS[whose].items()} for whose in ("ours", "theirs"))
 STEELS = ("#9AD0D2", "#6FB7B9", "#4A9A9D", "#327D81", "#1E6064", "#0B4447")  # of the stand-in, by its order
-STYLES = {  # solver: colour, marker
-    name: (color, marker) for color, own in (OURS | THEIRS).items() for name, marker in own.items()
-} | {gear(order): look for order, look in zip(GEAR_ORDERS, zip(STEELS, "1234+x", strict=True), strict=True)}
-SAME = {  # the default looks like the method that it is, a tableau like the preset that is made of it
-    GIVEN: DEFAULT,
-    "Sun Radau IIB(3)": "SunRadau5",
-    "Gauss(3)": "Gauss6",
-    "Gauss(3), symmetric partition": "Gauss6",
-    "Radau IIA(3)": "RadauIIA5",
-    "Newmark, β = 1/2": "PaperNewmark (beta = 1/2)",
-}
+STYLES = {name: (color, marker) for color, own in (OURS | THEIRS).items() for name, marker in own.items()}
+STYLES |= {gear(order): look for order, look in zip(GEAR_ORDERS, zip(STEELS, "1234+x", strict=True), strict=True)}
+SAME: dict[str, str] = LOOKS["same"]
 MARKERS = "o^sDvP>d<pX*Hh8"  # those that can be open
 
 
@@ -235,8 +173,7 @@ def _winners(rows: pd.DataFrame, targets: Sequence[float]) -> list[str]:
 
 def _told(rows: pd.DataFrame) -> pd.Series:
     """Whether the reference resolves the error of a run, and the run has not lost the motion."""
-    resolved = rows["error_q"].astype(float) > rows["floor"].astype(float)
-    return resolved & ~astray(rows)
+    return (rows["error_q"].astype(float) > rows["floor"].astype(float)) & ~astray(rows)
 
 
 def with_gaps(runs: pd.DataFrame) -> pd.DataFrame:
@@ -256,12 +193,8 @@ def with_gaps(runs: pd.DataFrame) -> pd.DataFrame:
 def work_precision(rows: pd.DataFrame, solvers: Sequence[str], title: str, error: str = ERROR) -> Figure:
     """CPU time and evaluations over the largest error of a position, a line a solver; `rows` of one case, medians.
 
-    `error` says what the column error_q is. Lines have the gaps of `with_gaps`.
-
-    Raises
-    ------
-    ValueError
-        If there are more than nine lines.
+    `error` says what the column error_q is. Lines have the gaps of `with_gaps`. Raises ValueError if there are more
+    than nine lines.
     """
     if len(solvers) > MOST_LINES:
         raise ValueError(f"a work-precision figure has at most {MOST_LINES} lines; given {len(solvers)}")
@@ -282,12 +215,7 @@ def work_precision(rows: pd.DataFrame, solvers: Sequence[str], title: str, error
         axes.set(xscale="log", yscale="log", xlabel=error, ylabel=what)
     bars = bool((rows["call_q3"] > rows["call_q1"]).any())
     from_python = any(label.endswith(" [P]") for label in left.get_legend_handles_labels()[1])
-    legend(
-        figure,
-        [left],
-        f"{LEGEND}\nleft out: motion lost"
-        + bars * "\nvertical bars: quartiles"
-        + from_python * "\n[P]: called from Python",
-    )
+    told = bars * "\nvertical bars: quartiles" + from_python * "\n[P]: called from Python"
+    legend(figure, [left], f"{LEGEND}\nleft out: motion lost{told}")
     figure.suptitle(title, fontsize=10)
     return figure

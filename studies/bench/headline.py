@@ -44,8 +44,7 @@ def of_error(rows: pd.DataFrame, error: float, given: str = DEFAULT) -> dict[str
 def _compared(own: tables.Costs, others: tables.Costs, *near: tables.Costs) -> dict[str, Any]:
     """`tables.compared`, undecided where near misses of the slower side, of ours or of others, would not be slower."""
     found, (near_own, near_others) = tables.compared(own, others), near
-    courtesy = {"ahead": (own, others | near_others), "behind": (own | near_own, others)}
-    sides = courtesy.get(found["verdict"])
+    sides = {"ahead": (own, others | near_others), "behind": (own | near_own, others)}.get(found["verdict"])
     if sides and tables.compared(*sides)["verdict"] != found["verdict"]:
         found["verdict"] = "undecided"
     return found
@@ -92,24 +91,14 @@ def counted(found: Iterable[Iterable[Mapping[str, Mapping[str, Any]]]]) -> list[
 def price(rows: pd.DataFrame, firsts: pd.DataFrame, case: str) -> dict[str, Any] | None:
     """What a call takes on one mechanism at PRICED, and the first call where code is built; None: it was not run.
 
-    Parameters
-    ----------
-    rows : DataFrame
-        Medians, of all mechanisms and solvers.
-    firsts : DataFrame
-        Rows of `studies.work_precision.first_calls`.
-    case : str
+    `rows`: medians, of all mechanisms and solvers. `firsts`: rows of `studies.work_precision.first_calls`.
 
-    Returns
-    -------
-    dict
-        case, processor ("": not kept), t_end, errors, first_at (tolerance of the first calls, None without them),
-        elsewhere_s (what a call of the default from another start takes longer, None where that was not measured), and
-        lines: name, first_s or None, and at each error solver, call_s, inside_s (of it inside the integrator, of the
-        cheapest run that is good enough; None of rivals), repeats of that run (0: not kept), keeps (the constraints),
-        from_python and near (asked, error and call_s of a run that nearly gets there and takes much less, or None), or
-        in their place why there is none: "not run", "not reached",
-        "not asked".
+    Returns case, processor ("": not kept), t_end, errors, first_at (tolerance of the first calls, None without them),
+    elsewhere_s (what a call of the default from another start takes longer, None where that was not measured), and
+    lines: name, first_s or None, and at each error solver, call_s, inside_s (of it inside the integrator, of the
+    cheapest run that is good enough; None of rivals), repeats of that run (0: not kept), keeps (the constraints),
+    from_python and near (asked, error and call_s of a run that nearly gets there and takes much less, or None), or in
+    their place why there is none: "not run", "not reached", "not asked".
     """
     rows = rows[rows["case"] == case]
     if rows.empty:

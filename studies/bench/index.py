@@ -34,10 +34,7 @@ COSTS = ("call_s", "n_evaluations", "violation_q", "called_from", "keeps")
 def findings(folder: Path) -> dict[str, dict[str, Any]]:
     """What NAME.json of each study holds, for those that have been run into the folder and time what all time.
 
-    Raises
-    ------
-    StudyError
-        If a file is damaged.
+    Raises StudyError if a file is damaged.
     """
     found = {}
     for name in STUDIES:

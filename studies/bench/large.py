@@ -1,17 +1,17 @@
-"""Planar assemblies of n bodies with pins, of any size: open and closed chains, ladders, trees, stars."""
+"""Assemblies of any n bodies: chains, ladders, trees, stars and grids with pins; chains and trees of hinges."""
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from twoloop.mechanisms.planar import GROUND, PlanarBodies
+from twoloop.mechanisms.spatial_bodies import SpatialBodies
+from twoloop.problem.problem import Array
 from twoloop.problem.system import ConstrainedSystem
 
-Array = NDArray[np.float64]
-
 BEND = 0.4  # rad: how far bars lean, so that no two are in line
+TILT = 0.3  # of the axes of hinges, over the part of them across the plane
 LEVEL = 2.4  # rad: of the bars across a ladder, none of whose others come near this direction
 
 
@@ -20,16 +20,13 @@ class Assembly(NamedTuple):
 
     system: ConstrainedSystem
     q: Array
-    bodies: PlanarBodies
+    bodies: Any  # PlanarBodies, or SpatialBodies
 
 
 class Bars:
     """Uniform bars with pins at given places, each 1 / n m long and 1 / n kg heavy.
 
-    Parameters
-    ----------
-    angles : array_like (n,)
-        rad.
+    `angles`: rad.
     """
 
     def __init__(self, angles: Array):
@@ -59,19 +56,22 @@ def _leaning(n: int) -> Array:
     return np.linspace(0.0, 1.2, n) + BEND * np.sin(1.7 * np.arange(n))
 
 
-def open_chain(n: int) -> Assembly:
-    """A chain that hangs on a pin."""
+def _hung(n: int, on: Callable[[int], int]) -> Bars:
+    """Bars of which the first hangs on a pin, and bar k on the end of bar on(k)."""
     bars = Bars(_leaning(n))
     for k in range(n):
-        bars.hang(k, bars.end(k - 1, 1.0) if k else np.zeros(2), k - 1 if k else GROUND, 1.0)
-    return bars.assembly(f"open chain of {n}")
+        bars.hang(k, bars.end(on(k), 1.0) if k else np.zeros(2), on(k) if k else GROUND, 1.0)
+    return bars
+
+
+def open_chain(n: int) -> Assembly:
+    """A chain that hangs on a pin."""
+    return _hung(n, lambda k: k - 1).assembly(f"open chain of {n}")
 
 
 def closed_chain(n: int) -> Assembly:
     """The same with a pin at its other end."""
-    bars = Bars(_leaning(n))
-    for k in range(n):
-        bars.hang(k, bars.end(k - 1, 1.0) if k else np.zeros(2), k - 1 if k else GROUND, 1.0)
+    bars = _hung(n, lambda k: k - 1)
     bars.bodies.pin(n - 1, (bars.half, 0.0), GROUND, tuple(bars.end(n - 1, 1.0)))
     return bars.assembly(f"closed chain of {n}")
 
@@ -79,10 +79,8 @@ def closed_chain(n: int) -> Assembly:
 def ladder(n: int) -> Assembly:
     """Two chains of n // 3 bars, with a bar from joint to joint after each: as many loops, of parallelograms."""
     m = n // 3
-    rails = np.repeat(_leaning(m), 2)
-    bars = Bars(np.concatenate([rails, np.full(m, LEVEL)]))
-    length = 2.0 * bars.half
-    across = length * np.array([np.cos(LEVEL), np.sin(LEVEL)])
+    bars = Bars(np.concatenate([np.repeat(_leaning(m), 2), np.full(m, LEVEL)]))
+    across = 2.0 * bars.half * np.array([np.cos(LEVEL), np.sin(LEVEL)])
     for k in range(m):
         for side, start in ((0, np.zeros(2)), (1, across)):
             here = 2 * k + side
@@ -95,18 +93,70 @@ def ladder(n: int) -> Assembly:
 
 def tree(n: int) -> Assembly:
     """A binary tree."""
-    bars = Bars(_leaning(n))
-    for k in range(n):
-        bars.hang(k, bars.end((k - 1) // 2, 1.0) if k else np.zeros(2), (k - 1) // 2 if k else GROUND, 1.0)
-    return bars.assembly(f"tree of {n}")
+    return _hung(n, lambda k: (k - 1) // 2).assembly(f"tree of {n}")
 
 
 def star(n: int) -> Assembly:
     """All bars on the end of one."""
-    bars = Bars(_leaning(n))
-    for k in range(n):
-        bars.hang(k, bars.end(0, 1.0) if k else np.zeros(2), 0 if k else GROUND, 1.0)
-    return bars.assembly(f"star of {n}")
+    return _hung(n, lambda k: 0).assembly(f"star of {n}")
 
 
-ASSEMBLIES: tuple[Callable[[int], Assembly], ...] = (open_chain, closed_chain, ladder, tree, star)
+def grid(n: int) -> Assembly:
+    """A net that hangs on a corner: beads with bars to the right and below, and at its end what is left as a chain."""
+    side = max(k for k in range(1, n + 1) if 3 * k * k - 2 * k <= n)
+    beads = side**2
+    pairs = [(i, i + 1) for i in range(beads) if (i + 1) % side]
+    n_across = len(pairs)
+    pairs += [(i, i + side) for i in range(beads - side)]
+    tail = range(beads + len(pairs), n)
+    angles = np.full(n, BEND - 0.5 * np.pi)
+    angles[:beads], angles[beads : beads + n_across], angles[tail.start :] = 0.0, BEND, _leaning(len(tail))
+    bars = Bars(angles)
+    right = 3.0 * bars.half * np.array([np.cos(BEND), np.sin(BEND)])
+    below = np.array([right[1], -right[0]])
+    for bead in range(beads):
+        bars.centres[bead] = bead % side * right + bead // side * below
+    bars.bodies.pin(0, (0.0, 0.0), GROUND, (0.0, 0.0))
+    for bar, (one, other) in enumerate(pairs, start=beads):
+        bars.centres[bar] = 0.5 * (bars.centres[one] + bars.centres[other])
+        for sign, bead in ((-1.0, one), (1.0, other)):
+            at = bars.end(bar, sign) - bars.centres[bead]
+            bars.bodies.pin(bar, (sign * bars.half, 0.0), bead, (float(at[0]), float(at[1])))
+    for k in tail:
+        on = k - 1 if k > tail.start else beads - 1
+        bars.hang(k, bars.end(on, 1.0), on, 1.0)
+    return bars.assembly(f"grid of {n}")
+
+
+def in_space(made: Assembly, tilt: float) -> Assembly:
+    """A planar assembly as bodies in space, with hinges that lean from across the plane by `tilt` to all sides."""
+    planar = made.bodies
+    bodies, places = SpatialBodies((0.0, -planar.gravity, 0.0)), made.q.reshape(-1, 3)
+    for k, (x, y, angle) in enumerate(places):
+        c, s, J = np.cos(angle), np.sin(angle), planar.inertias[k]
+        turned = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+        bodies.body(f"bar {k}", planar.masses[k], (0.6 * J, 0.6 * J, J), (x, y, 0.0), turned)
+    for k, (i, (a, b), j, _) in enumerate(planar.pins):
+        (x, y, angle), (c, s) = places[i], (np.cos(places[i, 2]), np.sin(places[i, 2]))
+        axis = (tilt * np.cos(2.0 * k), tilt * np.sin(2.0 * k), 1.0)
+        bodies.revolute(i, j, (x + c * a - s * b, y + s * a + c * b, 0.0), axis)
+    return Assembly(bodies.system(made.system.name + ", in space"), bodies.start[0], bodies)
+
+
+def open_chain_of_hinges(n: int) -> Assembly:
+    """The open chain with hinges whose axes differ."""
+    return in_space(open_chain(n), TILT)
+
+
+def closed_chain_of_hinges(n: int) -> Assembly:
+    """The closed chain with parallel hinges, three rows of which are redundant."""
+    return in_space(closed_chain(n), 0.0)
+
+
+def tree_of_hinges(n: int) -> Assembly:
+    """The tree with hinges whose axes differ."""
+    return in_space(tree(n), TILT)
+
+
+PLANAR: tuple[Callable[[int], Assembly], ...] = (open_chain, closed_chain, ladder, tree, star, grid)
+SPATIAL = (open_chain_of_hinges, closed_chain_of_hinges, tree_of_hinges)

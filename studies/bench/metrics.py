@@ -31,22 +31,11 @@ KEPT = 1e-8  # of the largest kinetic energy: a reference that loses more, or ..
 FLOORS = 1e3  # ... so many times its floor, as errors of velocities are larger, does not keep its energy
 ASTRAY = 0.1  # of the range of a watched coordinate: a run that strays farther is out of phase
 
-COLUMNS: dict[str, Any] = {
-    "error_q": None,  # largest deviation of a position at the common instants, m or rad
-    "error_v": None,
-    "error_end": None,  # of a position at the end
-    "error_v_end": None,
-    "scd": None,  # correct digits at the end, the least over q and v
-    "error_lam": None,
-    "energy": None,  # E - E(0) of greatest magnitude, J
-    "violation_q": None,
-    "violation_v": None,
-    "violation_a": None,
-    "violation_early": None,  # of the positions in the first and in the last tenth of the run
-    "violation_late": None,
-    "lost": True,
-    "astray": True,
-}
+# at the common instants the largest deviations, m or rad, and m/s or rad/s; those at the end, and its correct digits
+COLUMNS: dict[str, Any] = dict.fromkeys(("error_q", "error_v", "error_end", "error_v_end", "scd", "error_lam"))
+# E - E(0) of greatest magnitude, J; violations over the run, of the positions also in its first and its last tenth
+COLUMNS |= dict.fromkeys(("energy", "violation_q", "violation_v", "violation_a", "violation_early", "violation_late"))
+COLUMNS |= {"lost": True, "astray": True}
 
 
 def deviation(result: Result, motion: ReferenceMotion, instants: Array) -> tuple[Array, Array]:
@@ -132,12 +121,8 @@ def keeps_energy(problem: Problem, motion: ReferenceMotion, instants: Array) -> 
 class Scale:
     """What one motion tells of a mechanism's size: by what "lost" and "out of phase" are judged.
 
-    Attributes
-    ----------
-    kinetic : float or None
-        Largest kinetic energy, J; None where the problem has no energy that is conserved.
-    ranges : ndarray (n_q,)
-        Range of each coordinate.
+    `kinetic`: largest kinetic energy, J; None where the problem has no energy that is conserved. `ranges`: range of
+    each coordinate.
     """
 
     def __init__(self, problem: Problem, motion: ReferenceMotion, instants: Array, conserved: bool):

@@ -34,26 +34,12 @@ CHILD = "import sys; sys.path.insert({}, {!r}); from studies.bench.outsider_proc
 class Outsider:
     """A solver of a file on one mechanism, in a process that is started when it is asked, and again when it has died.
 
-    Parameters
-    ----------
-    where : str
-        FILE.py:FUNCTION, or a file of `references.as_shown` by its name.
-    mechanism : str
-        As `problem_from` takes it.
+    `where`: FILE.py:FUNCTION, or a file of `references.as_shown` by its name. `mechanism`: as `problem_from` takes it.
 
-    Attributes
-    ----------
-    name : str
-        In rows.
-    digest : str
-        Of the file.
-    calibrated : float
-        s of the calibration beside the last call (`twoloop.rows.calibration`).
+    `name`: in rows. `digest`: of the file. `calibrated`: s of the calibration beside the last call
+    (`twoloop.rows.calibration`).
 
-    Raises
-    ------
-    StudyError
-        If there is no such file, its header cannot be read or obeyed.
+    Raises StudyError if there is no such file, its header cannot be read or obeyed.
     """
 
     def __init__(self, where: str, mechanism: str):
@@ -76,13 +62,7 @@ class Outsider:
         return Solver(self.name, FILE, "Python", True, "tol", self._run, TOLERANCES, own_accelerations=True)
 
     def start(self) -> None:
-        """Start the process, which loads the file.
-
-        Raises
-        ------
-        StudyError
-            If it cannot.
-        """
+        """Start the process, which loads the file. Raises StudyError if it cannot."""
         self._pipe, there = Pipe()
         given = (str(self.path), self.function, self.mechanism)
         code = CHILD.format(0 if CLONE else len(sys.path), str(ROOT), there.fileno(), given)
@@ -130,10 +110,7 @@ class Outsider:
     def _asked(self, ask: dict[str, Any], limit: float) -> dict[str, Any] | None:
         """The answer of the process; None where it does not come in time.
 
-        Raises
-        ------
-        RuntimeError
-            If the process ends instead.
+        Raises RuntimeError if the process ends instead.
         """
         if self._pipe is None:
             self.start()

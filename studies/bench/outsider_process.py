@@ -5,9 +5,7 @@ Asked and answered in JSON, over a pipe: what the solver prints, imports or brea
 
 import importlib.util
 import json
-import os
 import sys
-import time
 from collections.abc import Callable
 from dataclasses import replace
 from multiprocessing.connection import Connection
@@ -16,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from references.driver import cpu_time
 from references.equations.accelerations import compiled_gamma
 from twoloop.mechanisms import Problem
 from twoloop.mechanisms.user_file import problem_from
@@ -34,33 +33,14 @@ def known_problem(problem: Problem, t0: float, q0: Array, v0: Array, t_end: floa
         gamma_into(t, np.array(q, dtype=float), np.array(v, dtype=float), p, right)
         return right
 
-    return KnownProblem(
-        problem.name,
-        system.mass,
-        system.force,
-        system.constraint,
-        system.jacobian,
-        system.constraint_rate,
-        gamma,
-        problem.energy if problem.conserved else None,
-        q0,
-        v0,
-        (t0, t0 + t_end),
-        problem.tags,
-        tuple(str(each) for each in problem.coordinates),
-        np.ones(system.n_c),
-        note=problem.note,
-    )
+    functions: Any = system.mass, system.force, system.constraint, system.jacobian, system.constraint_rate, gamma
+    energy, coordinates = problem.energy if problem.conserved else None, tuple(map(str, problem.coordinates))
+    about: Any = energy, q0, v0, (t0, t0 + t_end), problem.tags, coordinates, np.ones(system.n_c)
+    return KnownProblem(problem.name, *functions, *about, note=problem.note)  # type: ignore[misc]
 
 
 def loaded(path: Path, function: str) -> Callable[..., Any]:
-    """The function of a file.
-
-    Raises
-    ------
-    AttributeError
-        If there is none; an exception of the file itself comes through.
-    """
+    """The function of a file. Raises AttributeError if there is none; an exception of the file itself comes through."""
     spec = importlib.util.spec_from_file_location(path.stem, path)
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
@@ -85,11 +65,11 @@ def run(simulate: Callable[..., Any], problem: Problem, ask: dict[str, Any]) -> 
 
     def clocked(*given: Any) -> Any:
         nonlocal seconds
-        began = _cpu_time()
+        began = cpu_time()
         try:
             return simulate(*given)
         finally:
-            seconds = _cpu_time() - began
+            seconds = cpu_time() - began
 
     times = np.linspace(*posed.t_span, ask["n_times"])
     calibration = calibration_s()
@@ -102,11 +82,6 @@ def run(simulate: Callable[..., Any], problem: Problem, ask: dict[str, Any]) -> 
     arrays = {"q": found.q.tolist()}
     arrays |= {name: None if part is None else part.tolist() for name, part in (("v", found.v), ("l", found.lam))}
     return arrays | {"seconds": seconds, "calibration_s": min(calibration, calibration_s()), "n_forces": n_forces}
-
-
-def _cpu_time() -> float:
-    """Of this process, of its threads, and of the processes that it has waited for, s."""
-    return time.process_time() + sum(os.times()[2:4])
 
 
 def main(descriptor: int, file: str, function: str, mechanism: str) -> None:

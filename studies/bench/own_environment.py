@@ -26,10 +26,7 @@ HEADER = re.compile(r"(?m)^# /// script\s*$\n(?P<body>(^#(| .*)$\n)+?)^# ///\s*$
 def dependencies(text: str, path: Path) -> list[str] | None:
     """What the inline header of a file asks for; None where there is none.
 
-    Raises
-    ------
-    StudyError
-        If there are several, it is no TOML, or it asks for another version of Python.
+    Raises StudyError if there are several, it is no TOML, or it asks for another version of Python.
     """
     found = list(HEADER.finditer(text))
     if not found:
@@ -52,16 +49,12 @@ def dependencies(text: str, path: Path) -> list[str] | None:
 def environment(wanted: list[str] | None) -> str:
     """The Python of an environment with these packages on top of the present one, made when first asked for.
 
-    Raises
-    ------
-    StudyError
-        If a package cannot be installed.
+    Raises StudyError if a package cannot be installed.
     """
     if wanted is None:
         return sys.executable
     key = hashlib.sha256(json.dumps([sys.prefix, sys.version, sorted(wanted)]).encode()).hexdigest()[:16]
-    kept = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    folder = kept / "twoloop" / "environments" / key
+    folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "twoloop" / "environments" / key
     python = folder / "bin" / "python"
     if (folder / "complete").is_file():
         return str(python)

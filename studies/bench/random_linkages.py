@@ -29,23 +29,12 @@ PLACES = np.array([0, 1, 3, 4, 6, 7])  # the coordinates that are lengths
 
 @dataclass(frozen=True)
 class Drawn:
-    """A linkage, its right state at the end, and how much an error at the start grows until then.
-
-    Attributes
-    ----------
-    problem : Problem
-    kind : str
-        One of KINDS.
-    q : ndarray (9,)
-        Positions at the end, the angles counted from those of the start.
-    sensitivity : float
-        Change of q over that of the initial angle of bar 3.
-    """
+    """A linkage, its right state at the end, and how much an error at the start grows until then."""
 
     problem: Problem
-    kind: str
-    q: Array
-    sensitivity: float
+    kind: str  # one of KINDS
+    q: Array  # (9,); positions at the end, the angles counted from those of the start
+    sensitivity: float  # change of q over that of the initial angle of bar 3
 
 
 def four_lengths(kind: str, generator: np.random.Generator) -> Array:
@@ -113,8 +102,7 @@ def scaled(size: float, densities: tuple[float, float, float]) -> Problem:
 
 def end_of_scaled(size: float, densities: tuple[float, float, float], t_end: float) -> Array:
     """Its positions at t_end: size scales lengths by s and times by sqrt(s), as gravity stays."""
-    problem = four_bar()
-    p = problem.parameters
+    p = four_bar().parameters
     bars = (p["L1"], p["L2"], p["L3"])
     motion = MinimalFourBar(bars, p["L"], p["theta3"], p["branch"], densities, p["gravity"])
     q = motion.states(t_end / np.sqrt(size))[0][:, 0]

@@ -23,21 +23,11 @@ _own_explicit = partial(solve_dae, method="DOP853")
 
 @dataclass(frozen=True)
 class ReferenceMotion:
-    """A motion known at all times.
+    """A motion known at all times."""
 
-    Attributes
-    ----------
-    states : callable
-        states(t (n_t,)) -> q, v (n_q, n_t).
-    floor : float
-        Largest error of a position that it may have: smaller errors of a run cannot be told.
-    source : str
-        Where it comes from.
-    """
-
-    states: Callable[[Array], tuple[Array, Array]]
-    floor: float
-    source: str
+    states: Callable[[Array], tuple[Array, Array]]  # states(t (n_t,)) -> q, v (n_q, n_t)
+    floor: float  # largest error of a position that it may have: smaller errors of a run cannot be told
+    source: str  # where it comes from
 
 
 def make_reference(problem: Problem, t_end: float, time_limit: float | None = None) -> ReferenceMotion:
@@ -48,18 +38,9 @@ def make_reference(problem: Problem, t_end: float, time_limit: float | None = No
     fails, RadauIIA5 (two-loop, Newton's method) beside IDA on the stabilised index-1 form, at 1e-11. The first of a
     pair is stored at four instants in each step of the second, between which the quintic in q, v and a is used.
 
-    Parameters
-    ----------
-    problem : Problem
-    t_end : float
-        s.
-    time_limit : float, optional
-        Wall-clock time that each run may take, s. None: no limit.
+    `t_end`: s. `time_limit`: wall-clock time that each run may take, s. None: no limit.
 
-    Raises
-    ------
-    StudyError
-        If no pair reaches t_end.
+    Raises StudyError if no pair reaches t_end.
     """
     run = problem.system, (0.0, t_end), problem.q0, problem.v0
     said, smooth = [], False

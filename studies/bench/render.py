@@ -84,17 +84,11 @@ def table(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
 
 def environment() -> jinja2.Environment:
     """The environment of all templates: `table(header, rows)`, and filters for numbers, lists, code and stamps."""
-    made = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(TEMPLATES),
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        keep_trailing_newline=True,
-        autoescape=False,  # markdown, from our own data
-    )
+    how: dict[str, Any] = dict.fromkeys(("trim_blocks", "lstrip_blocks", "keep_trailing_newline"), True)
+    how |= {"undefined": jinja2.StrictUndefined, "autoescape": False}  # markdown, from our own data
+    made = jinja2.Environment(loader=jinja2.FileSystemLoader(TEMPLATES), **how)
     made.filters |= {"code": code, "num": number, "power": power, "pct": percent, "listed": listed}
-    made.filters["brief"] = brief
-    made.filters["digit"] = one_digit
+    made.filters |= {"brief": brief, "digit": one_digit}
     made.globals["table"] = table
     return made
 
@@ -102,20 +96,10 @@ def environment() -> jinja2.Environment:
 def render(name: str, findings: Mapping[str, Any], tables: Mapping[str, str], **more: Any) -> str:
     """The text of templates/NAME.md.j2.
 
-    Parameters
-    ----------
-    name : str
-    findings : mapping
-        `f` in the template: the numbers and booleans that are saved as NAME.json.
-    tables : mapping
-        `tables` in the template: ready markdown.
-    **more
-        Further names, such as the stamp.
+    `findings`: `f` in the template: the numbers and booleans that are saved as NAME.json. `tables`: `tables` in the
+    template: ready markdown. `**more`: further names, such as the stamp.
 
-    Raises
-    ------
-    jinja2.UndefinedError
-        If the template uses a name that is not defined.
+    Raises jinja2.UndefinedError if the template uses a name that is not defined.
     """
     text = environment().get_template(f"{name}.md.j2").render(f=findings, tables=tables, **more)
     while "\n\n\n" in text:  # left by conditions that did not hold

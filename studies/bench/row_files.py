@@ -1,15 +1,13 @@
 """Runs in the format of `twoloop.rows`, of the medians that tables are made of, and back."""
 
 from collections.abc import Mapping
-from contextlib import suppress
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from statistics import median
 from typing import Any
 
 import pandas as pd
 
-from studies.bench.cli import StudyError, processor
+from studies.bench.cli import StudyError, processor, version_of
 from studies.bench.collector import FILE
 from studies.bench.mechanism_names import mechanism_of
 from studies.bench.runs_by_error import SETTINGS
@@ -28,24 +26,14 @@ LONGEST = 120  # letters of a message
 
 def versions() -> dict[str, str]:
     """Of the packages compared, those that are installed."""
-    found = {}
-    for package in RIVALS:
-        with suppress(PackageNotFoundError):
-            found[package] = version(package)
-    return found
+    return {package: told for package in RIVALS if (told := version_of(package, ""))}
 
 
 def in_format(run: Mapping[str, Any], columns: Mapping[str, str], versions: Mapping[str, str]) -> Row:
     """The row of a run.
 
-    Parameters
-    ----------
-    run : mapping
-        A line of `tables.medians`.
-    columns : mapping
-        Where it has the errors and floors of the format that are known.
-    versions : mapping
-        Of the rivals' packages, and of solvers from files.
+    `run`: a line of `tables.medians`. `columns`: where it has the errors and floors of the format that are known.
+    `versions`: of the rivals' packages, and of solvers from files.
     """
     family, done = run["family"], run["status"] == REACHED_END
     setting = next(name for name in SETTINGS if run.get(name) == run.get(name, float("nan")))
@@ -57,9 +45,7 @@ def in_format(run: Mapping[str, Any], columns: Mapping[str, str], versions: Mapp
     else:
         row["version"] = versions.get(run["solver"]) or versions.get(package_of(family)) or "unknown"
     row |= {"processor": run.get("processor") or processor(), "setting": setting, "value": run[setting]}
-    row |= {
-        "times_s": [rounded(time) for time in run["times"]] if done else [],
-    }
+    row |= {"times_s": [rounded(time) for time in run["times"]] if done else []}
     row["evaluations"] = None if pd.isna(run["n_evaluations"]) else int(run["n_evaluations"])
     if not done:
         row["message"] = " ".join(str(run["message"]).split())[:LONGEST]
@@ -80,10 +66,7 @@ def package_of(family: str) -> str:
 def rows_of_file(file: str) -> list[Row]:
     """The rows of a file; of the word "archive" those that are shipped.
 
-    Raises
-    ------
-    StudyError
-        If it cannot be read, has none, or a mistake.
+    Raises StudyError if it cannot be read, has none, or a mistake.
     """
     try:
         return read_rows(ARCHIVE if file == "archive" else Path(file))

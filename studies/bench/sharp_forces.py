@@ -112,26 +112,13 @@ def drive(t, p):  # type: ignore[no-untyped-def]
 
 @dataclass(frozen=True)
 class Sharp:
-    """One force, or one drive, with its numbers.
-
-    Attributes
-    ----------
-    family : str
-    parameters : ndarray (SIZE,)
-        Those for the end of the parameters of a mechanism.
-    breaks : tuple of float
-        Times at which it or a derivative jumps.
-    windows : tuple of (float, float)
-        Between which times it does what it does.
-    follows_x : bool
-        Whether it is sharp where the mechanism is, not at a time.
-    """
+    """One force, or one drive, with its numbers."""
 
     family: str
-    parameters: Array
-    breaks: tuple[float, ...] = ()
-    windows: tuple[tuple[float, float], ...] = ()
-    follows_x: bool = False
+    parameters: Array  # (SIZE,); those for the end of the parameters of a mechanism
+    breaks: tuple[float, ...] = ()  # times at which it or a derivative jumps
+    windows: tuple[tuple[float, float], ...] = ()  # between which times it does what it does
+    follows_x: bool = False  # whether it is sharp where the mechanism is, not at a time
 
     @property
     def driven(self) -> bool:

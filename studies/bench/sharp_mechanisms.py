@@ -25,33 +25,18 @@ TINY = 1e-30  # imaginary step: derivatives without differences
 
 @dataclass(frozen=True)
 class Mechanism:
-    """A mechanism under a force or a drive, and its equations of motion.
-
-    Attributes
-    ----------
-    name : str
-    system : ConstrainedSystem
-    q0, v0 : ndarray (n_q,)
-    sharp : Sharp
-    y0 : ndarray
-        Independent coordinates and their rates at the start.
-    rate : callable
-        rate(t, y) -> y'.
-    positions : callable
-        positions(t, y) -> q (n_q,), NaN where it is not told.
-    kicked : callable
-        kicked(y, jump) -> y after a jump of the drive's rate.
-    """
+    """A mechanism under a force or a drive, and its equations of motion."""
 
     name: str
     system: ConstrainedSystem
+    # q0, v0: (n_q,)
     q0: Array
     v0: Array
     sharp: Sharp
-    y0: Array
-    rate: Callable[[float, Array], Array]
-    positions: Callable[[float, Array], Array]
-    kicked: Callable[[Array, float], Array] = lambda y, jump: y
+    y0: Array  # independent coordinates and their rates at the start
+    rate: Callable[[float, Array], Array]  # rate(t, y) -> y'
+    positions: Callable[[float, Array], Array]  # positions(t, y) -> q (n_q,), NaN where it is not told
+    kicked: Callable[[Array, float], Array] = lambda y, jump: y  # kicked(y, jump) -> y after a jump of the drive's rate
 
 
 @numba.njit(cache=True)

@@ -31,29 +31,15 @@ RIGHT, SAID, SILENT = "right", "said so", "wrong and silent"
 
 @dataclass(frozen=True)
 class Motion:
-    """Positions at TIMES, how far two methods are apart there, and how much errors grow.
+    """Positions at TIMES, how far two methods are apart there, and how much errors grow."""
 
-    Attributes
-    ----------
-    q : ndarray (n_times, n_q)
-    apart : float
-    growth : float
-        At least 1: of a disturbance of any independent coordinate or rate, until the end.
-    """
-
-    q: Array
+    q: Array  # (n_times, n_q)
     apart: float
-    growth: float
+    growth: float  # at least 1: of a disturbance of any independent coordinate or rate, until the end
 
 
 def march(mechanism: Mechanism, method: str, tolerance: float, y: Array, begin: float = 0.0) -> dict[float, Array]:
-    """States at those of TIMES from `begin` on.
-
-    Raises
-    ------
-    RuntimeError, ValueError
-        If SciPy's method fails.
-    """
+    """States at those of TIMES from `begin` on. Raises RuntimeError, ValueError if SciPy's method fails."""
     sharp, at = mechanism.sharp, begin
     states: dict[float, Array] = {}
     edges = {*sharp.breaks, *(edge for window in sharp.windows for edge in window)}

@@ -12,18 +12,13 @@ from typing import Any
 
 import numpy as np
 
-from references.casadi.integrators import solve_collocation, solve_cvodes, solve_idas
-from references.diffrax.dopri8 import solve_diffrax
+from references.casadi.integrators import solve_collocation
 from references.equations.expressions import NotSymbolic
-from references.heyoka.taylor import solve_heyoka
+from references.lines import Line, lines
 from references.minimal.equations import NoMinimalCoordinates
 from references.minimal.solvers import solve_cvode_minimal, solve_heyoka_minimal
 from references.paper.gear import solve_gear
-from references.scipy.fully_implicit import solve_fully_implicit
-from references.scipy.index1 import solve_index1
-from references.sundials.cvode import solve_cvode
-from references.sundials.cvode_c import solve_cvode_c
-from references.sundials.ida_c import solve_ida_c
+from references.scipy.index1 import baumgarte
 from studies.bench.collector import Case, NotApplicable, Solver
 from twoloop import Result, RungeKutta, paper_irk, paper_newmark, solve_dae
 from twoloop.methods.auto import LOOSE, TIGHTEST
@@ -54,30 +49,24 @@ RADAU = ("RadauIIA5", "RadauIIA9", "RadauIIA13")
 IMPLICIT = ("SunRadau5", "Gauss6", "Gauss12", *RADAU, "TRBDF2", "ESDIRK4", "Newmark", OWN_BDF)
 PRESETS = (*IMPLICIT, OWN_EXPLICIT, ADAMS, TAYLOR)  # of twoloop, with their own options
 # of ours, beside the rivals
-OWN = (
-    *(*COMPILED, DEFAULT, TAYLOR, ADAMS, OWN_EXPLICIT),
-    *("Gauss12", "Gauss16", *RADAU, "TRBDF2", OWN_BDF),
-)
-IDA_FORMS = ("index1", "stabilised")
+OWN = (*(*COMPILED, DEFAULT, TAYLOR, ADAMS, OWN_EXPLICIT), *("Gauss12", "Gauss16", *RADAU, "TRBDF2", OWN_BDF))
+IDA_INDEX_1 = "IDA, index1"
 EXUDYN = ("GeneralizedAlpha", "TrapezoidalIndex2", "HHT")
 RADII = (1.0, 0.6)  # spectral radii of GeneralizedAlpha, besides Exudyn's default of 0.9; 1 fails on index 3
 HEYOKA, CVODE_C, DIFFRAX = "heyoka", "CVODE from C, Adams", "Dopri8, diffrax"
-IDAS, CVODES = "IDAS, CasADi", "CVODES, CasADi"
+IDAS, CVODES, COLLOCATION = "IDAS, CasADi", "CVODES, CasADi", "collocation, CasADi"
 CVODE_C_PROJECTED = "CVODE from C, BDF, projected"
-ALPHAS = (1.0, 10.0, 100.0)  # 1/s, of Baumgarte
+SAME_IN_LINES = ("own_accelerations", "traces", "builds_each", "builds_span", "fixed")
 GEAR_ORDERS = (1, 2, 3, 4, 5, 6)
 GEAR_STARTS = ("accurate", "ramp")
 
 # other projects' solvers, the same beside ours in every table: called from compiled code, then from Python
 RIVALS = (
-    *(HEYOKA, CVODE_C, "CVODE from C, BDF", CVODE_C_PROJECTED, IDA_C, IDA_C_STATES, IDA_C_ORDER_2, DIFFRAX),
-    *(IDAS, CVODES, "CVODES, CasADi, Adams", "collocation, CasADi", "CVODE, Adams"),
-    *("LSODA, index 1", "DOP853, index 1"),
-    *("DOP853, projected", "Pr9, index 1", "Radau, index 1", "BDF, index 1", "IDA, stabilised"),
-    *("Radau, solve_dae", "Radau9, solve_dae"),
+    *(line.name for line in lines() if line.rival and line.called_from == "compiled"),
+    COLLOCATION,
+    *(line.name for line in lines() if line.rival and line.called_from == "Python"),
     *("Exudyn, GeneralizedAlpha", "Exudyn, GeneralizedAlpha 0.6", "Exudyn, TrapezoidalIndex2"),
 )
-
 # in minimal coordinates, where these have a closed form: no rivals on a DAE, and in no ranking
 MINIMAL_FAMILY = "minimal coordinates"
 MINIMAL = ("heyoka, minimal coordinates", "CVODE from C, minimal coordinates")
@@ -91,8 +80,7 @@ COMPARED = (
 
 
 def _preset(method: str | Method, case: Case, tolerance: float, repeat: int, compiled: Compiled = False) -> Result:
-    limit = case.time_limit
-    return solve_dae(*case.start, method, tolerance, tolerance, time_limit=limit, compiled=compiled)
+    return solve_dae(*case.start, method, tolerance, tolerance, time_limit=case.time_limit, compiled=compiled)
 
 
 def _chosen(tolerance: float, result: Result) -> str:
@@ -117,12 +105,8 @@ def _paper_irk(case: Case, tolerance: float, repeat: int) -> Result:
     return _preset(method, case, tolerance, repeat)
 
 
-def _paper_irk_out(err_in: float, case: Case, err_out: float, repeat: int) -> Result:
-    return _preset(paper_irk(err_in, err_out), case, PAPER_TOL, repeat)
-
-
-def _paper_newmark(beta: float, err_in: float, case: Case, err_out: float, repeat: int) -> Result:
-    return _preset(paper_newmark(err_in, err_out, beta), case, PAPER_TOL, repeat)
+def _paper(make: Callable[[float], Method], case: Case, err_out: float, repeat: int) -> Result:
+    return _preset(make(err_out), case, PAPER_TOL, repeat)
 
 
 def _canonical(case: Case, step: float, repeat: int) -> Result:
@@ -138,29 +122,14 @@ def at_instants(solve: Callable[..., Result], case: Case, **options: Any) -> Res
         raise NotApplicable(str(why)) from None
 
 
-def _along(solve: Callable[..., Result], case: Case, tolerance: float, repeat: int) -> Result:
-    return at_instants(solve, case, rtol=tolerance, atol=tolerance)
-
-
-def _ida(form: str, case: Case, tolerance: float, repeat: int) -> Result:
-    from references.sundials.ida import solve_ida
-
-    # scikit-sundae keeps every step by copying all before it: asked for few instants it is up to three times faster
-    return at_instants(solve_ida, case, form=form, rtol=tolerance * (1.0 + NUDGE * repeat), atol=tolerance)
-
-
-def _ida_c(options: Mapping[str, Any], case: Case, tolerance: float, repeat: int) -> Result:
-    if case.problem.system.called_in_python:
-        raise NotApplicable("IDA from C needs compiled functions; this mechanism is plain Python (see IDA, stabilised)")
-    return at_instants(solve_ida_c, case, rtol=tolerance * (1.0 + NUDGE * repeat), atol=tolerance, **options)
-
-
-def _fully_implicit(method: str, case: Case, tolerance: float, repeat: int) -> Result:
-    return solve_fully_implicit(*case.start, method, tolerance, tolerance, time_limit=case.time_limit)
-
-
-def _heyoka(case: Case, tolerance: float, repeat: int) -> Result:
-    return at_instants(solve_heyoka, case, tol=tolerance)
+def _by_line(line: Line, case: Case, tolerance: float, repeat: int) -> Result:
+    if line.compiled_callbacks and case.problem.system.called_in_python:
+        raise NotApplicable(f"{line.name!r} needs compiled functions; those of this mechanism are plain Python")
+    near = tolerance * (1.0 + NUDGE * repeat * line.scatters)
+    told = {"tol": tolerance} if line.one_tolerance else {"rtol": near, "atol": tolerance}
+    if line.stores_steps:
+        return line.solve(*case.start, time_limit=case.time_limit, **told, **line.options)
+    return at_instants(line.solve, case, **told, **line.options)
 
 
 def _minimal(kind: str, case: Case, tolerance: float, repeat: int) -> Result:
@@ -178,10 +147,6 @@ def _collocation(case: Case, step: float, repeat: int) -> Result:
         return solve_collocation(*case.start, round(case.t_end / step), time_limit=case.time_limit)
     except NotSymbolic as why:
         raise NotApplicable(str(why)) from None
-
-
-def _index1(options: Mapping[str, Any], case: Case, tolerance: float, repeat: int) -> Result:
-    return solve_index1(*case.start, rtol=tolerance, atol=tolerance, time_limit=case.time_limit, **options)
 
 
 def _exudyn(solver: str, options: Mapping[str, float], case: Case, step: float, repeat: int) -> Result:
@@ -203,11 +168,6 @@ def _gear(order: int, start: str, case: Case, step: float, repeat: int) -> Resul
     return solve_gear(*case.start, step, order, start=start, t_eval=kept, time_limit=case.time_limit)
 
 
-def baumgarte(method: str, alpha: float) -> str:
-    """Name of one of SciPy's solvers with Baumgarte's stabilisation."""
-    return f"{method}, Baumgarte {alpha:g}"
-
-
 def gear(order: int, start: str = "accurate") -> str:
     """Name of the stand-in for ADAMS GSTIFF."""
     return f"GSTIFF stand-in, order {order}" + (", ramp" if start == "ramp" else "")
@@ -215,24 +175,19 @@ def gear(order: int, start: str = "accurate") -> str:
 
 def paper_irk_at(err_in: float) -> Solver:
     """The paper's Runge-Kutta procedure along err_out, Atol = Rtol = 1e-5."""
-    run, fixed = partial(_paper_irk_out, err_in), {"err_in": err_in, "tol": PAPER_TOL}
+    run, fixed = partial(_paper, partial(paper_irk, err_in)), {"err_in": err_in, "tol": PAPER_TOL}
     return Solver(IRK, "two-loop", "compiled", True, "err_out", run, ERR_OUT, fixed)
 
 
 def paper_newmark_at(err_in: float, beta: float = 0.5) -> Solver:
     """The paper's Newmark procedure along err_out."""
-    name, run = NEWMARK if beta == 0.5 else QUARTER, partial(_paper_newmark, beta, err_in)
+    name, run = NEWMARK if beta == 0.5 else QUARTER, partial(_paper, partial(paper_newmark, err_in, beta=beta))
     return Solver(name, "two-loop", "compiled", True, "err_out", run, ERR_OUT, {"err_in": err_in})
 
 
 def _solver(name: str, family: str, called_from: str, setting: str, run: Any, **more: Any) -> Solver:
     values = TOLERANCES if setting == "tol" else ()
     return Solver(name, family, called_from, more.pop("keeps", True), setting, run, values, **more)
-
-
-def _index_1(name: str, keeps: bool, method: str, stabilisation: str, **fixed: float) -> Solver:
-    run = partial(_index1, {"method": method, "stabilisation": stabilisation, **fixed})
-    return _solver(name, "SciPy", "Python", "tol", run, keeps=keeps, fixed=fixed, own_accelerations=bool(fixed))
 
 
 def _all() -> Iterator[Solver]:
@@ -251,39 +206,17 @@ def _all() -> Iterator[Solver]:
         used = _chosen if COMPILED.get(preset, preset) == DEFAULT else None
         yield _solver(preset, "two-loop", "compiled", "tol", run, used=used, **more)
     yield _solver(CANONICAL, "two-loop", "compiled", "h", _canonical)
-    own: dict[str, Any] = {"own_accelerations": True}
-    model = own | {"traces": True}
-    for form in IDA_FORMS:
-        keeps, run = form == "stabilised", partial(_ida, form)
-        yield _solver(f"IDA, {form}", "SUNDIALS", "Python", "tol", run, keeps=keeps, **own)
-    of_order_2 = {"max_order": 2, "error_test": "positions"}
-    for name, options in ((IDA_C, {}), (IDA_C_STATES, {"error_test": "states"}), (IDA_C_ORDER_2, of_order_2)):
-        yield _solver(name, "SUNDIALS", "compiled", "tol", partial(_ida_c, options), **own)
-    yield _solver(HEYOKA, "heyoka", "compiled", "tol", _heyoka, keeps=False, builds_each=True, traces=True)
+    for line in lines():
+        told = {each: getattr(line, each) for each in SAME_IN_LINES}
+        run = partial(_by_line, line)
+        yield _solver(line.name, line.family, line.called_from, "tol", run, keeps=line.keeps, **told)
     for name, kind in zip(MINIMAL, ("heyoka", "CVODE"), strict=True):
         more = {"traces": True, "builds_each": kind == "heyoka"}
         yield _solver(name, MINIMAL_FAMILY, "compiled", "tol", partial(_minimal, kind), **more)
-    for name, method in ((CVODE_C, "Adams"), ("CVODE from C, BDF", "BDF"), (CVODE_C_PROJECTED, "BDF")):
-        keeps = name == CVODE_C_PROJECTED
-        run = partial(_along, partial(solve_cvode_c, method=method, projected=keeps))
-        yield _solver(name, "SUNDIALS", "compiled", "tol", run, keeps=keeps, traces=True)
-    yield _solver("CVODE, Adams", "SUNDIALS", "Python", "tol", partial(_along, solve_cvode), keeps=False)
-    yield _solver(DIFFRAX, "diffrax", "compiled", "tol", partial(_along, solve_diffrax), keeps=False, traces=True)
     more = {"builds_each": True, "builds_span": True, "traces": True, "keeps": False}
-    by_adams = partial(solve_cvodes, method="Adams")
-    for name, solve in ((IDAS, solve_idas), (CVODES, solve_cvodes), ("CVODES, CasADi, Adams", by_adams)):
-        yield _solver(name, "CasADi", "compiled", "tol", partial(_along, solve), **more)
-    yield _solver("collocation, CasADi", "CasADi", "compiled", "h", _collocation, **more)
-    for name in ("Radau", "Radau9", "BDF"):
-        yield _solver(f"{name}, solve_dae", "solve_dae", "Python", "tol", partial(_fully_implicit, name), **own)
-    for name in ("LSODA", "DOP853", "RK45", "Radau", "BDF"):
-        yield _index_1(f"{name}, index 1", False, name, "none")
-    run = partial(_index1, {"method": "Pr9"})
-    yield _solver("Pr9, index 1", "extensisq", "Python", "tol", run, keeps=False)
-    for name in ("DOP853", "RK45"):
-        yield _index_1(f"{name}, projected", True, name, "projection")
-    for name, alpha in product(("LSODA", "DOP853"), ALPHAS):
-        yield _index_1(baumgarte(name, alpha), False, name, "baumgarte", alpha=alpha)
+    yield _solver(COLLOCATION, "CasADi", "compiled", "h", _collocation, **more)
+    own: dict[str, Any] = {"own_accelerations": True}
+    model = own | {"traces": True}
     for solver in EXUDYN:
         keeps, run = solver != "TrapezoidalIndex2", partial(_exudyn, solver, {})  # its positions are off by its errors
         yield _solver(f"Exudyn, {solver}", "Exudyn", "compiled", "h", run, keeps=keeps, **model)
@@ -299,21 +232,9 @@ def _all() -> Iterator[Solver]:
 CATALOGUE: dict[str, Solver] = {solver.name: solver for solver in _all()}
 
 # one sensible setting of each, for studies that show a run of every solver: two-loop procedures first
-LINE_UP: dict[str, float] = {
-    IRK: 1e-9,
-    NEWMARK: 1e-9,
-    QUARTER: 1e-9,
-    **dict.fromkeys((GIVEN, *PRESETS), 1e-8),
-    "Newmark": 1e-6,  # of order 2: ten times the steps at 1e-8
-    CANONICAL: 0.01,
-    **{f"IDA, {form}": 1e-8 for form in IDA_FORMS},
-    **dict.fromkeys((IDA_C, HEYOKA, CVODE_C), 1e-8),
-    "LSODA, index 1": 1e-8,
-    "DOP853, index 1": 1e-8,
-    "DOP853, projected": 1e-8,
-    baumgarte("DOP853", 10.0): 1e-8,
-    **{f"Exudyn, {solver}": 1e-3 for solver in EXUDYN},
-    "Exudyn, GeneralizedAlpha 0.6": 1e-3,
-    "Exudyn, GeneralizedAlpha 1": 1e-3,
-    **{gear(order): 1e-3 for order in (2, 5)},
-}
+LINE_UP: dict[str, float] = dict.fromkeys((IRK, NEWMARK, QUARTER), 1e-9) | dict.fromkeys((GIVEN, *PRESETS), 1e-8)
+LINE_UP |= {"Newmark": 1e-6, CANONICAL: 0.01}  # of order 2: ten times the steps at 1e-8
+LINE_UP |= dict.fromkeys((IDA_INDEX_1, "IDA, stabilised", IDA_C, HEYOKA, CVODE_C, "LSODA, index 1"), 1e-8)
+LINE_UP |= dict.fromkeys(("DOP853, index 1", "DOP853, projected", baumgarte("DOP853", 10.0)), 1e-8)
+LINE_UP |= dict.fromkeys((*(f"Exudyn, {solver}" for solver in EXUDYN), "Exudyn, GeneralizedAlpha 0.6"), 1e-3)
+LINE_UP |= dict.fromkeys(("Exudyn, GeneralizedAlpha 1", gear(2), gear(5)), 1e-3)

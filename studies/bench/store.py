@@ -3,6 +3,7 @@
 Nothing is written through a symbolic link: a file is made under a new name in the folder and then renamed.
 """
 
+import csv
 import fcntl
 import hashlib
 import json
@@ -21,13 +22,11 @@ from typing import Any, Self
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
 from studies.bench.cli import ROOT, Call, StudyError, processor
+from twoloop.problem.problem import Array
 
 Row = dict[str, Any]
-Array = NDArray[np.float64]
-
 FOLDERS = ("twoloop", "references", "studies")  # a change in any of these makes kept rows worthless
 NUMERICS = ("numpy", "scipy", "numba")
 # studies whose times are compared, so that no two run at once
@@ -43,16 +42,10 @@ NO_LINK = getattr(os, "O_NOFOLLOW", 0)
 class Output:
     """The files of one run of a study; a context manager that holds the folder's lock.
 
-    Parameters
-    ----------
-    call : Call
-        Its `out` is made if it is not there.
+    `call`: its `out` is made if it is not there.
 
-    Raises
-    ------
-    StudyError
-        If the folder cannot be written to, or another run is using it; if another full run of a study that compares
-        times goes on anywhere on the machine.
+    Raises StudyError if the folder cannot be written to, or another run is using it; if another full run of a study
+    that compares times goes on anywhere on the machine.
     """
 
     def __init__(self, call: Call):
@@ -122,15 +115,14 @@ class Output:
             np.savez_compressed(stream, allow_pickle=False, **curves)  # type: ignore[arg-type]
             self.write(f"{self.call.study}_series.npz", stream.getvalue())
             rows = rows.drop(columns="series")
-        self.write(f"{self.call.study}.csv", f"# {self._kind()}; {line}\n{rows.to_csv(index=False)}")
+        text = rows.to_csv(index=False, quoting=csv.QUOTE_NONNUMERIC)  # a "#" in a message begins no comment
+        self.write(f"{self.call.study}.csv", f"# {self._kind()}; {line}\n{text}")
 
     def load_rows(self, curves: bool = False) -> tuple[pd.DataFrame, str]:
         """Read what `save_rows` wrote, the curves, too, where these are asked for, and the stamp.
 
-        Raises
-        ------
-        StudyError
-            If there are no rows, or they are damaged, of another study, or quick where full ones are asked for.
+        Raises StudyError if there are no rows, or they are damaged, of another study, or quick where full ones are
+        asked for.
         """
         path = self.file(f"{self.call.study}.csv")
         rerun = f"make it again by python -m studies.{self.call.study}"
@@ -181,10 +173,7 @@ class Output:
 def read_rows(path: Path, *columns: str) -> tuple[pd.DataFrame, str]:
     """The rows of a file that `Output.save_rows` wrote, and its first line.
 
-    Raises
-    ------
-    StudyError
-        If the file is damaged, or lacks one of these columns.
+    Raises StudyError if the file is damaged, or lacks one of these columns.
     """
     try:
         first, rest = path.read_text().split("\n", 1)
@@ -206,10 +195,7 @@ def key(row: pd.Series) -> str:
 def alone() -> int:
     """Hold the machine for a study that compares times, by the descriptor that is returned; its end releases it.
 
-    Raises
-    ------
-    StudyError
-        If another such study runs.
+    Raises StudyError if another such study runs.
     """
     path = Path(tempfile.gettempdir(), LOCK)
     try:
@@ -234,16 +220,9 @@ class KeptRows:
     file begins with what the rows depend on. A file with another beginning, or with a line that is not a row, is set
     aside under another name, which is printed; nothing of it is used.
 
-    Parameters
-    ----------
-    path : Path
-    settings : mapping
-        What the rows depend on beside the sources and their own key; anything that JSON holds.
+    `settings`: what the rows depend on beside the sources and their own key; anything that JSON holds.
 
-    Attributes
-    ----------
-    n_resumed : int
-        Rows that an interrupted run left here.
+    `n_resumed`: rows that an interrupted run left here.
     """
 
     def __init__(self, path: Path, settings: Mapping[str, Any]):
@@ -331,10 +310,7 @@ def sources() -> str:
 def plain(value: Any) -> Any:
     """The value as JSON holds it: numpy's types as Python's, what is not finite as None.
 
-    Raises
-    ------
-    TypeError
-        If it is of a type that JSON does not hold.
+    Raises TypeError if it is of a type that JSON does not hold.
     """
     if isinstance(value, Mapping):
         return {str(key): plain(each) for key, each in value.items()}

@@ -62,36 +62,20 @@ def _nothing(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Study:
-    """What a study is made of.
+    """What a study is made of."""
 
-    Attributes
-    ----------
-    name : str
-        Of its files and its template.
-    about : str or None
-        What --help says.
-    make : callable
-        make(output) -> the rows.
-    findings : callable
-        findings(rows) -> what the report and the first screen say, `f` in the template.
-    figures : callable
-        figures(rows, found) -> figures by the name of their file.
-    tables : callable
-        tables(rows, found) -> ready markdown, `tables` in the template, which has `rows`, too.
-    medians : bool
-        Whether these are given medians (`tables.medians`), and the template `tables.failed`: the rows are of `collect`.
-    curves : bool
-        Whether the figures are drawn of curves, in the column "series": by name, those of each row.
-    """
-
-    name: str
-    about: str | None
-    make: Make
+    name: str  # of its files and its template
+    about: str | None  # what --help says
+    make: Make  # make(output) -> the rows
+    # findings(rows) -> what the report and the first screen say, `f` in the template
     findings: Callable[[pd.DataFrame], dict[str, Any]]
+    # figures(rows, found) -> figures by the name of their file
     figures: Callable[[pd.DataFrame, dict[str, Any]], dict[str, Figure]] = _nothing
+    # tables(rows, found) -> ready markdown, `tables` in the template, which has `rows`, too
     tables: Callable[[pd.DataFrame, dict[str, Any]], dict[str, str]] = _nothing
+    # whether these are given medians (`tables.medians`), and the template `tables.failed`: the rows are of `collect`
     medians: bool = False
-    curves: bool = False
+    curves: bool = False  # whether the figures are drawn of curves, in the column "series": by name, those of each row
 
     def main(self, words: Sequence[str] | None = None) -> None:
         """Make the rows, or with --redraw read those that were saved, and write the report."""

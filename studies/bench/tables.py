@@ -17,10 +17,7 @@ TIGHTEST = 1e-13  # tolerance of which tighter ones are of no use
 LIMITED = ("TIME_LIMIT", "MAX_STEPS")  # statuses of runs that we ended
 CAPPED = "steps were not enough|TOO_MUCH_WORK"  # in the messages of adapters whose most steps were used up
 COSTS = ("call_s", "call_q1", "call_q3", "n_evaluations")
-RANKED = (
-    *("family", "called_from", "keeps_constraints", *COSTS),
-    *("violation_q", "violation_v", "energy"),
-)
+RANKED = (*("family", "called_from", "keeps_constraints", *COSTS), *("violation_q", "violation_v", "energy"))
 NEARLY = 1.25  # runs whose error is above one by a smaller factor nearly get there
 UNASKED = "not run at such an error"
 UNLIKE = 3.0  # times the median time of the repetitions of a run: such a one was not the run alone
@@ -147,13 +144,10 @@ def _least(side: Costs) -> tuple[float, Array]:
 def compared(own: Costs, others: Costs) -> dict[str, Any]:
     """Time of the best of others over that of the best of `own` at one error on one case, and what it comes to.
 
-    Returns
-    -------
-    dict
-        ratio; interval, its range over the repetitions drawn again, which is the scatter of these few and no
-        confidence interval, or None; verdict: "ahead" where all of the range is above LEAST, "behind" where it is
-        below 1 / LEAST, else "undecided"; "alone" where no other gets there, "missed" where own does not and another
-        does, "none" where neither does.
+    Returns ratio; interval, its range over the repetitions drawn again, which is the scatter of these few and no
+    confidence interval, or None; verdict: "ahead" where all of the range is above LEAST, "behind" where it is below 1 /
+    LEAST, else "undecided"; "alone" where no other gets there, "missed" where own does not and another does, "none"
+    where neither does.
     """
     if not own or not others:
         verdict = "alone" if own else "missed" if others else "none"
@@ -167,11 +161,8 @@ def compared(own: Costs, others: Costs) -> dict[str, Any]:
 def ranking(rows: pd.DataFrame, target: float) -> pd.DataFrame:
     """The solvers of one case that reach an error, cheapest first; others' only where asked for about so much.
 
-    Returns
-    -------
-    DataFrame
-        solver, family, called_from, keeps_constraints, call_s, call_q1, call_q3, n_evaluations for this error (on the
-        log-log line between two runs), and violation_q, violation_v, energy, setting of the cheapest run near it.
+    Returns solver, family, called_from, keeps_constraints, call_s, call_q1, call_q3, n_evaluations for this error (on
+    the log-log line between two runs), and violation_q, violation_v, energy, setting of the cheapest run near it.
     """
     lines = []
     for solver, runs in by_solver(rows, *COSTS).items():
@@ -240,8 +231,7 @@ def why_not(rows: pd.DataFrame, target: float) -> str:
     """What a table shows for a solver without a time at an error: that of a better run, or why there is none."""
     reached = rows[rows["error_q"].notna()]
     if reached.empty:
-        first = rows["status"].iloc[0]
-        return first.lower().replace("_", " ")
+        return rows["status"].iloc[0].lower().replace("_", " ")
     finer = setting_of(rows) < setting_of(reached).min()
     stopped = bool((stopped_by_us(rows) & finer).any()) and bool((reached["error_q"] > target).all())
     if not stopped and not missed(rows, target):

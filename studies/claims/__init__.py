@@ -9,7 +9,7 @@ from typing import Any
 import pandas as pd
 
 from studies.bench import cli
-from studies.bench.cli import Call, StudyError
+from studies.bench.cli import StudyError
 from studies.bench.index import write_index
 from studies.bench.render import render
 from studies.bench.store import Output
@@ -18,17 +18,10 @@ from studies.claims.rows import STUDIES, Rows, processors, read
 from studies.claims.verdicts import Claim, Judgement, Verdict, load
 
 ERRATA = tomllib.loads(Path(__file__).with_name("errata.toml").read_text())
-COLUMNS = (
-    "section",
-    "statement",
-    "criterion",
-    "fixed",
-    "judge",
-    "stand_in",
-    "inputs",
-    "choice",
-    "assumed",
-)  # of a claim, for claims.csv
+COLUMNS = (  # of a claim, for claims.csv
+    *("section", "statement", "criterion", "fixed", "judge"),
+    *("stand_in", "inputs", "choice", "assumed"),
+)
 Judged = Mapping[str, tuple[Claim, Judgement]]
 
 
@@ -54,31 +47,22 @@ def findings_of(pairs: Judged) -> dict[str, Any]:
             circular.setdefault(claim.circular, []).append(str(k))
     verdicts = [found.verdict for _, found in pairs.values()]
     counted = [(claim, found.verdict) for claim, found in pairs.values() if not claim.choice]
-    return {
-        "n": len(counted),
-        "after": sum(claim.fixed == "after" for claim, _ in counted),
-        "by_stand_in": sum(bool(claim.stand_in) and verdict is not Verdict.NOT_RUN for claim, verdict in counted),
-        "judged": sum(verdict is not Verdict.NOT_RUN for _, verdict in counted),
-        "places": {key: k for k, key in enumerate(pairs, 1)},
-        "counts": {verdict.value: verdicts.count(verdict) for verdict in Verdict},
-        "claims": {key: {"verdict": each.verdict.value, **each.values} for key, (_, each) in pairs.items()},
-        "circular": circular,
-    }
-
-
-def csv_rows(pairs: Judged) -> pd.DataFrame:
-    """One row a claim: verdict, number, criterion, judge."""
-    lines = []
-    for key, (claim, found) in pairs.items():
-        line = {"claim": key, "verdict": found.verdict.value, "number": claim.text(found), "why_not_run": found.why}
-        lines.append(line | {name: getattr(claim, name) for name in COLUMNS})
-    return pd.DataFrame(lines)
+    told: dict[str, Any] = {"n": len(counted), "after": sum(claim.fixed == "after" for claim, _ in counted)}
+    told |= {"by_stand_in": sum(bool(claim.stand_in) and verdict is not Verdict.NOT_RUN for claim, verdict in counted)}
+    told |= {"judged": sum(verdict is not Verdict.NOT_RUN for _, verdict in counted)}
+    told |= {"places": {key: k for k, key in enumerate(pairs, 1)}}
+    told |= {"counts": {verdict.value: verdicts.count(verdict) for verdict in Verdict}}
+    told |= {"claims": {key: {"verdict": each.verdict.value, **each.values} for key, (_, each) in pairs.items()}}
+    return told | {"circular": circular}
 
 
 def report(output: Output, rows: Rows, line: str) -> dict[str, Any]:
     """Write findings, rows and both reports; the findings."""
-    pairs = judged(rows)
-    findings, table = findings_of(pairs) | {"experiments": dict(rows.experiments)}, csv_rows(pairs)
+    pairs, lines = judged(rows), []
+    for key, (claim, found) in pairs.items():
+        told = {"claim": key, "verdict": found.verdict.value, "number": claim.text(found), "why_not_run": found.why}
+        lines.append(told | {name: getattr(claim, name) for name in COLUMNS})
+    findings, table = findings_of(pairs) | {"experiments": dict(rows.experiments)}, pd.DataFrame(lines)
     findings["processors"] = processors(output.path)
     output.save_findings(findings)
     output.save_rows(table, line)
@@ -88,17 +72,11 @@ def report(output: Output, rows: Rows, line: str) -> dict[str, Any]:
     return findings
 
 
-def _make_missing(call: Call) -> None:
-    """Run the studies that have no rows in the folder."""
-    for name in STUDIES:
-        if not (call.out / f"{name}.csv").exists():
-            importlib.import_module(f"studies.{name}").main(["--quick"] * call.quick + ["--out", str(call.out)])
-
-
 def _work(words: Sequence[str] | None) -> None:
     call = cli.parse("claims", __doc__, words)
-    if not call.redraw:
-        _make_missing(call)
+    for name in () if call.redraw else STUDIES:
+        if not (call.out / f"{name}.csv").exists():
+            importlib.import_module(f"studies.{name}").main(["--quick"] * call.quick + ["--out", str(call.out)])
     with Output(call) as output:
         if call.redraw:
             _, line = output.load_rows()

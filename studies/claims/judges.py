@@ -215,8 +215,7 @@ def gstiff(rows: Rows, part: str) -> Judgement:
 
 def stand_in_as_foil(rows: Rows) -> Judgement:
     ours = rows.long("table3", solver=IRK_LINE, problem=DEFAULT)
-    theirs = rows.long("motion", group=GSTIFF_GROUP, solver=gear(5))
-    ratios = common_costs(theirs, ours, TIPS)
+    ratios = common_costs(rows.long("motion", group=GSTIFF_GROUP, solver=gear(5)), ours, TIPS)
     return decide((ratio > 1.0 for ratio in ratios), ratio=span(ratios))
 
 

@@ -25,13 +25,7 @@ class NotRun(Exception):
 
 
 def read(folder: Path) -> dict[str, pd.DataFrame]:
-    """One row a run of every study whose rows are in the folder.
-
-    Raises
-    ------
-    StudyError
-        If a file of rows is damaged.
-    """
+    """One row a run of every study whose rows are in the folder. Raises StudyError if a file of rows is damaged."""
     found = {}
     for name in STUDIES:
         path = folder / f"{name}.csv"
@@ -59,8 +53,7 @@ def _one_a_run(name: str, table: pd.DataFrame) -> pd.DataFrame:
         table = pd.concat([tables.medians(repeated), table[table["repeat"].isna()]], ignore_index=True)
     for column in {"lost", "astray"} & set(table):  # no value: the run gave no result
         table[column] = table[column].map(lambda x: str(x) not in ("False", "0", "0.0"))
-    floor = table["floor"].fillna(0.0) if "floor" in table else 0.0
-    return table.assign(floor=floor)
+    return table.assign(floor=table["floor"].fillna(0.0) if "floor" in table else 0.0)
 
 
 @dataclass(frozen=True)

@@ -88,14 +88,9 @@ class Claim:
             return Judgement(Verdict.NOT_RUN, why=f"the rows lack {column}")
         if not np.isfinite(np.hstack(list(found.values.values()))).all():
             return Judgement(Verdict.NOT_RUN, why="the rows lack a value that decides")
-        marked = {
-            Verdict.HOLDS: Verdict.CIRCULAR
-            if self.circular
-            else Verdict.CONSISTENT
-            if self.stand_in or self.inputs
-            else Verdict.HOLDS,
-            Verdict.FAILS: Verdict.ASSUMED if self.inputs else Verdict.FAILS,
-        }
+        holds = Verdict.CONSISTENT if self.stand_in or self.inputs else Verdict.HOLDS
+        marked = {Verdict.HOLDS: Verdict.CIRCULAR if self.circular else holds}
+        marked |= {Verdict.FAILS: Verdict.ASSUMED if self.inputs else Verdict.FAILS}
         return replace(found, verdict=Verdict.CHOICE if self.choice else marked.get(found.verdict, found.verdict))
 
     def text(self, found: Judgement) -> str:

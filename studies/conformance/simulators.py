@@ -10,16 +10,8 @@ from typing import Any
 import numpy as np
 
 from references import as_shown
-from references.casadi.integrators import solve_cvodes, solve_idas
-from references.diffrax.dopri8 import solve_diffrax
-from references.heyoka.taylor import solve_heyoka
+from references.lines import Line, lines
 from references.plain_equations import NoModel
-from references.scipy.fully_implicit import solve_fully_implicit
-from references.scipy.index1 import solve_index1
-from references.sundials.cvode import solve_cvode
-from references.sundials.cvode_c import solve_cvode_c
-from references.sundials.ida import solve_ida
-from references.sundials.ida_c import solve_ida_c
 from twoloop import ConstrainedSystem, Result, mechanisms, solve_dae
 from twoloop.mechanisms import Problem
 from twoloop.methods.presets import PRESETS
@@ -31,13 +23,8 @@ LOW = {  # methods of order 2 and 3, and at what tolerances they are asked
     **dict.fromkeys(("Newmark", "PaperNewmark"), (1e-3, 1e-4, 1e-5)),
 }
 KINDS = ("mass", "force", "constraint", "jacobian", "constraint_rate", "gamma")
-TWINS: dict[str, Callable[[], Problem]] = {  # problems whose mechanism is a ready one, with compiled functions
-    "pendulum": mechanisms.pendulum,
-    "driven_crank": mechanisms.driven_crank,
-    "four_bar": mechanisms.four_bar,
-    "redundant_slider_crank": mechanisms.redundant_slider_crank,
-    "heavy_top": mechanisms.heavy_top,
-}
+# problems whose mechanism is a ready one, with compiled functions
+TWINS = ("pendulum", "driven_crank", "four_bar", "redundant_slider_crank", "heavy_top")
 OURS, ADAPTERS, SHOWN = "ours", "by our adapters", "as their authors show"
 SAME = ("Gauss8", "Gauss10", "Gauss14")  # one code with tableaux that lie between those that are asked
 STEPS = (1000, 2000, 4000)  # of solvers of fixed steps
@@ -45,24 +32,15 @@ STEPS = (1000, 2000, 4000)  # of solvers of fixed steps
 
 @dataclass(frozen=True)
 class Simulator:
-    """A solver to check.
+    """A solver to check."""
 
-    Attributes
-    ----------
-    name, group, package : str
-        In rows; one of OURS, ADAPTERS, SHOWN; what tells its version.
-    simulate : callable
-    drifts : bool
-        Whether nothing in its equations keeps the positions on the constraints.
-    steps, tolerances : tuple or None
-        Where its steps are of fixed length; where tolerances are not those of the check.
-    """
-
+    # name, group, package: in rows; one of OURS, ADAPTERS, SHOWN; what tells its version
     name: str
     group: str
     package: str
     simulate: Simulate
-    drifts: bool = False
+    drifts: bool = False  # whether nothing in its equations keeps the positions on the constraints
+    # steps, tolerances: where its steps are of fixed length; where tolerances are not those of the check
     steps: tuple[int, ...] | None = None
     tolerances: tuple[float, ...] | None = None
 
@@ -76,12 +54,9 @@ def system_of(problem: KnownProblem) -> ConstrainedSystem:
 def twin_of(problem: KnownProblem) -> Problem:
     """The ready mechanism that a problem is.
 
-    Raises
-    ------
-    NoModel
-        If there is none, or the problem is seen in another frame or in other units.
+    Raises NoModel if there is none, or the problem is seen in another frame or in other units.
     """
-    made = TWINS[problem.name]() if problem.name in TWINS else None
+    made: Problem | None = getattr(mechanisms, problem.name)() if problem.name in TWINS else None
     if made is None:
         raise NoModel("no compiled mechanism of this problem")
     t, q, v = problem.t_span[0], problem.q0, problem.v0
@@ -117,16 +92,26 @@ def ours(method: str, problem: KnownProblem, times: Array, tolerance: float) -> 
     return _by(solve, system, problem, times, tolerance)
 
 
-def by_twin(solve: Callable[..., Result], problem: KnownProblem, times: Array, tolerance: float) -> tuple[Array, ...]:
-    """A solver that needs compiled functions, or runs them on symbols."""
-    return _by(solve, twin_of(problem).system, problem, times, tolerance)
+def by_line(line: Line, problem: KnownProblem, times: Array, tolerance: float) -> tuple[Array, ...]:
+    """A rival, which needs compiled functions, or runs them on symbols."""
+    system, one = twin_of(problem).system, {"tol": tolerance} if line.one_tolerance else None
+    return _by(partial(line.solve, **line.options), system, problem, times, tolerance, one)
+
+
+def coded(problem: KnownProblem, times: Array, tolerance: float) -> tuple[Array, ...]:
+    """The default with code made for the mechanism."""
+    return _by(partial(solve_dae, compiled=True), twin_of(problem).system, problem, times, tolerance)
 
 
 def _by(
-    solve: Callable[..., Result], system: ConstrainedSystem, problem: KnownProblem, times: Array, tol: float
-) -> Any:
-    given: dict[str, Any] = {"t_eval": times}
-    given |= {"tol": tol} if solve is solve_heyoka else {"rtol": tol, "atol": tol}
+    solve: Callable[..., Result],
+    system: ConstrainedSystem,
+    problem: KnownProblem,
+    times: Array,
+    tol: float,
+    told: dict[str, float] | None = None,
+) -> tuple[Array, ...]:
+    given: dict[str, Any] = {"t_eval": times, **(told or {"rtol": tol, "atol": tol})}
     try:
         result = solve(system, (times[0], times[-1]), problem.q0, problem.v0, **given)
     except ValueError as error:  # refused before any work
@@ -142,8 +127,7 @@ def exudyn(problem: KnownProblem, times: Array, step: float) -> tuple[Array, ...
     if not has_model(twin):
         raise NoModel("Exudyn has no model of this problem")
     n = round((times[-1] - times[0]) / step)
-    every = n // (times.size - 1)
-    result = solve_exudyn(twin, float(times[-1]), n, "GeneralizedAlpha", store_every=every)
+    result = solve_exudyn(twin, float(times[-1]), n, "GeneralizedAlpha", store_every=n // (times.size - 1))
     if not result.success:
         raise RuntimeError(result.message)
     return result.q.T, result.v.T
@@ -153,25 +137,11 @@ def simulators() -> list[Simulator]:
     """All that are checked."""
     methods = [each for each in PRESETS if each not in SAME]
     found = [Simulator(each, OURS, "twoloop", partial(ours, each), tolerances=LOW.get(each)) for each in methods]
-    coded = partial(solve_dae, method="auto", compiled=True)
-    found.append(Simulator("auto, compiled", OURS, "twoloop", partial(by_twin, coded)))
-    rivals: dict[str, tuple[str, Any, bool]] = {
-        "heyoka": ("heyoka", solve_heyoka, True),
-        "CVODE from C, Adams": ("scikit-sundae", partial(solve_cvode_c, method="Adams"), True),
-        "CVODE from C, BDF, projected": ("scikit-sundae", partial(solve_cvode_c, method="BDF", projected=True), False),
-        "IDA from C, stabilised": ("scikit-sundae", solve_ida_c, False),
-        "Dopri8, diffrax": ("diffrax", solve_diffrax, True),
-        "IDAS, CasADi": ("casadi", solve_idas, True),
-        "CVODES, CasADi": ("casadi", solve_cvodes, True),
-        "CVODE, Adams": ("scikit-sundae", solve_cvode, True),
-        "IDA, stabilised": ("scikit-sundae", partial(solve_ida, form="stabilised"), False),
-        "DOP853, projected": ("scipy", partial(solve_index1, method="DOP853", stabilisation="projection"), False),
-        "Radau, solve_dae": ("solve-dae", partial(solve_fully_implicit, method="Radau"), False),
-        "LSODA, index 1": ("scipy", partial(solve_index1, method="LSODA", stabilisation="none"), True),
-    }
+    found.append(Simulator("auto, compiled", OURS, "twoloop", coded))
     found += [
-        Simulator(name, ADAPTERS, package, partial(by_twin, solve), drifts)
-        for name, (package, solve, drifts) in rivals.items()
+        Simulator(line.name, ADAPTERS, line.package, partial(by_line, line), not line.keeps)
+        for line in lines()
+        if line.checked
     ]
     found.append(Simulator("Exudyn, GeneralizedAlpha", ADAPTERS, "exudyn", exudyn, steps=STEPS))
     return found + [Simulator(each.NAME, SHOWN, each.PACKAGE, each.simulate, each.DRIFTS) for each in shown()]

@@ -2,16 +2,15 @@
 
 import signal
 import warnings
-from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
-from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from studies.bench.apart import apart
+from studies.bench.cli import version_of
 from studies.bench.render import table
 from studies.bench.store import Output, Row
 from studies.bench.study import Study
@@ -40,8 +39,7 @@ SIGNS = {  # of properties, in the report
 
 def checked(simulator: Simulator, problem: KnownProblem, quick: bool) -> list[Row]:
     """The rows of one simulator on one problem: each property, and what was not measured."""
-    tolerances = (simulator.tolerances or TOLERANCES)[: 2 if quick else None]
-    settings = settings_of(tolerances, simulator.steps, None)
+    settings = settings_of((simulator.tolerances or TOLERANCES)[: 2 if quick else None], simulator.steps, None)
     try:
         findings, skipped = apart(lambda: check_problem(simulator.simulate, problem, settings), cpu=LIMIT)
     except EOFError as error:
@@ -80,19 +78,12 @@ def make(output: Output) -> pd.DataFrame:
     with output.kept() as kept:
         for simulator in chosen:
             told = {"simulator": simulator.name, "group": simulator.group, "package": simulator.package}
-            told["version"] = _version(simulator.package)
+            told["version"] = version_of(simulator.package)
             for problem in [MAKERS[name]() for name in QUICK_PROBLEMS] if quick else problems("smoke"):
                 key = f"{simulator.name} | {problem.name}"
                 found = kept.made(key, lambda s=simulator, p=problem: {"rows": checked(s, p, quick)})["rows"]  # type: ignore[misc]
                 rows += [told | row for row in found]
     return pd.DataFrame(rows)
-
-
-def _version(package: str) -> str:
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return "not installed"
 
 
 def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
@@ -115,14 +106,9 @@ def _line(name: str, rows: pd.DataFrame) -> dict[str, Any]:
     failed = made[made["outcome"] == FAILED]
     what = {str(prop): list(own["problem"]) for prop, own in failed.groupby("property", sort=False)}
     package, of = rows.iloc[0][["package", "version"]]
-    return {
-        "simulator": name,
-        "of": f"{package} {of}",
-        "checked": made["problem"].nunique(),
-        "passed": made["problem"].nunique() - failed["problem"].nunique(),
-        "properties": len(made),
-        "failures": what,
-    }
+    found: dict[str, Any] = {"simulator": name, "of": f"{package} {of}", "checked": made["problem"].nunique()}
+    found |= {"passed": made["problem"].nunique() - failed["problem"].nunique(), "properties": len(made)}
+    return found | {"failures": what}
 
 
 def tables_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, str]:
@@ -156,11 +142,4 @@ def _short(message: str) -> str:
 
 STUDY = Study("conformance", __doc__, make, findings_of, tables=tables_of)
 
-
-def main(words: Sequence[str] | None = None) -> None:
-    """Run the study and write its report."""
-    STUDY.main(words)
-
-
-if __name__ == "__main__":
-    main()
+main = STUDY.main

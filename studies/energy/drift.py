@@ -31,13 +31,9 @@ def windows(t: Array, error: Array, period: float, t_end: float) -> dict[str, Ar
 def drift(t: Array, mean: Array) -> tuple[float, float]:
     """Slope of the windows' means by least squares, and its standard error from the slopes of BLOCKS parts.
 
-    The scatter between blocks is right for a random walk, to which the residuals of one line would be blind, and
-    errs on the safe side for an oscillation.
-
-    Raises
-    ------
-    ValueError
-        If there are fewer than two windows a block, from which no scatter can be told.
+    The scatter between blocks is right for a random walk, to which the residuals of one line would be blind, and errs
+    on the safe side for an oscillation. Raises ValueError if there are fewer than two windows a block, from which no
+    scatter can be told.
     """
     if t.size < 2 * BLOCKS:
         raise ValueError(f"the slope of an energy error needs {2 * BLOCKS} windows or more; given {t.size}: run longer")

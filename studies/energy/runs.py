@@ -134,8 +134,7 @@ def _exudyn(solver: str, case: Case, h: float, repeat: int) -> Result:
     from references.exudyn.mechanisms import solve_exudyn
 
     n_steps = round(case.t_end / h)
-    most = max(1, int(case.t_end / case.n_instants / h))
-    every = next(k for k in range(most, 0, -1) if n_steps % k == 0)
+    every = next(k for k in range(max(1, int(case.t_end / case.n_instants / h)), 0, -1) if n_steps % k == 0)
     return solve_exudyn(case.problem, case.t_end, n_steps, solver, store_every=every)
 
 

@@ -1,49 +1,42 @@
 """What the rows of the engines say: what to set, what it costs, where errors end, and who is wrong without a word."""
 
 from collections.abc import Iterable
-from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from studies.bench import tables
+from studies.bench.changed_loops import DRIVEN, RATIOS, SERVO
+from studies.bench.cli import version_of
+from studies.bench.closed_loops import SPATIAL
 from studies.bench.end_states import EXACT
 from studies.bench.engine_runs import LIMIT
-from studies.bench.motorised_loops import DRIVEN, SERVO
 from studies.engines.configurations import CONFIGURATIONS, NAMES, OURS, PACKAGES, Configuration
 from twoloop.audit.step_audit import LOST, order_and_floor
 
-GATE, RUN, VARIANT, MOTOR, ENERGY = "gate", "run", "variant", "motor", "energy"  # groups of rows
+GATE, RUN, MASS, TURN, MOTOR, ENERGY = "gate", "run", "mass", "turn", "motor", "energy"  # groups of rows
 ERRORS = (1e-2, 1e-3, 1e-4, 1e-6)
 SET_FOR = ERRORS[:3]  # for which a step is named
 SPEEDS = (1, 100)  # times real time
-PROBED = 5000  # steps, over 10 s or 5 s, of the table of motors, masses, frames and forces
-PROBES = {  # what is asked, of which mechanisms, in which groups, by which measure
-    "crank-rocker; coupler 1e2, 1e4 times lighter": (
-        ("crank-rocker", RUN, "error_q"),
-        ("coupler of 1:100", VARIANT, "error_q"),
-        ("coupler of 1:10000", VARIANT, "error_q"),
-    ),
-    "all, median: driven; PD motor": ((DRIVEN, MOTOR, "error_q"), (SERVO, MOTOR, "error_q")),
-    "RSSR; turned in space": (("RSSR", RUN, "error_q"), ("RSSR, turned", VARIANT, "error_q")),
-    "joint force: crank-rocker; RSSR": (("crank-rocker", RUN, "error_f"), ("RSSR", RUN, "error_f")),
-    "energy, 100 s: four-bar; RSSR": (("four-bar", ENERGY, "energy"), ("RSSR", ENERGY, "energy")),
+PROBED = 5000  # steps, of the table of motors, masses, frames and forces
+PROBES = {  # what is asked: mechanisms by the end of their names, groups, and measures, of which the median counts
+    "as made; a body 1e2, 1e4 times lighter": (("", RUN, "error_q"), *((name, MASS, "error_q") for name in RATIOS)),
+    "driven; with a PD motor": ((DRIVEN, MOTOR, "error_q"), (SERVO, MOTOR, "error_q")),
+    "in space; turned": (("in space", RUN, "error_q"), ("", TURN, "error_q")),
+    "force in a joint": (("", RUN, "error_f"),),
+    "energy, 100 s": (("", ENERGY, "energy"),),
 }
+IN_SPACE = tuple(build().name for build in SPATIAL)
 
 
 def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     """Versions, gates, what each configuration is off by, and what an accuracy costs."""
     runs, gates = rows[rows["group"] == RUN], rows[rows["group"] == GATE]
     cases = list(dict.fromkeys(runs["case"]))
-    found: dict[str, Any] = {
-        "cases": cases,
-        "errors": list(ERRORS),
-        "lost": LOST,
-        "limit": LIMIT,
-    }
+    found: dict[str, Any] = {"cases": cases, "errors": list(ERRORS), "lost": LOST, "limit": LIMIT}
     found["absent"] = sorted(set(gates[gates["status"] == "NOT_AVAILABLE"]["family"]))
-    found["versions"] = {NAMES[engine]: _version(package) for engine, package in PACKAGES.items()}
+    found["versions"] = {NAMES[engine]: version_of(package) for engine, package in PACKAGES.items()}
     found["gates"] = gates[gates["status"] != "PASSED"][["case", "solver", "message"]].to_dict("records")
     found["n_gates"] = int((gates["status"] == "PASSED").sum())
     found["apart"] = float(runs["floor"].astype(float).max())
@@ -71,13 +64,6 @@ def _counted(cheapest: Iterable[str | None]) -> dict[str, int]:
     return {name: names.count(name) for name in sorted(set(names), key=lambda each: (-names.count(each), each))}
 
 
-def _version(package: str) -> str:
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return "not installed"
-
-
 def _configuration(each: Configuration, runs: pd.DataFrame) -> dict[str, Any]:
     ended = runs[runs["error_q"].notna()]
     orders, floors, lost = [], [], 0
@@ -87,19 +73,13 @@ def _configuration(each: Configuration, runs: pd.DataFrame) -> dict[str, Any]:
             order, floor = order_and_floor(own["h"], own["error_q"], float(own["floor"].max()))
             orders += [order] if order is not None else []
             floors += [floor] if floor is not None else []
-    return {
-        "name": each.name,
-        "how": each.how,
-        "runs": len(ended),
-        "silent": int((ended["error_q"].astype(float) > EXACT).sum()),
-        "gross": int((ended["error_q"].astype(float) > LOST).sum()),
-        "failed": int((runs["status"] == "FAILED").sum()),
-        "order": [min(orders), float(np.median(orders)), max(orders)] if orders else None,
-        "floor": [min(floors), max(floors)] if floors else None,
-        "n_floors": len(floors),
-        "lost": lost,
-        "gap": float(ended["gap"].astype(float).median()) if len(ended) else None,
-    }
+    found: dict[str, Any] = {"name": each.name, "how": each.how, "runs": len(ended)}
+    found |= {"silent": int((ended["error_q"].astype(float) > EXACT).sum())}
+    found |= {"gross": int((ended["error_q"].astype(float) > LOST).sum())}
+    found |= {"failed": int((runs["status"] == "FAILED").sum())}
+    found |= {"order": [min(orders), float(np.median(orders)), max(orders)] if orders else None}
+    found |= {"floor": [min(floors), max(floors)] if floors else None, "n_floors": len(floors), "lost": lost}
+    return found | {"gap": float(ended["gap"].astype(float).median()) if len(ended) else None}
 
 
 def _priced(runs: pd.DataFrame, error: float, what: str = "call_s") -> float | None:
@@ -162,16 +142,19 @@ def _within(runs: pd.DataFrame, speed: float) -> float:
     return float(fast["error_q"].astype(float).min()) if len(fast) else np.inf
 
 
-def _probe(rows: pd.DataFrame, solver: str, case: str, group: str, measure: str) -> float | None:
-    """What a configuration is off by with `PROBED` steps, ours with a tolerance of 1e-8; None: not told, or not run."""
-    own = rows[(rows["group"] == group) & (rows["solver"] == solver)]
-    if group == MOTOR:
-        of_all = own[own["case"].str.endswith(case)][measure].astype(float).fillna(np.inf)
-        return float(of_all.median()) if len(own) and np.isfinite(of_all.median()) else None
-    own = own[own["case"] == case]
+def _probe(rows: pd.DataFrame, solver: str, of: str, group: str, measure: str) -> float | None:
+    """What a configuration is off by in the median, with `PROBED` steps, ours with a tolerance of 1e-8.
+
+    A run that ends early is off by any amount. None: not run, or off by any amount in the median.
+    """
+    own = rows[(rows["group"] == group) & (rows["solver"] == solver) & rows["status"].isin(("REACHED_END", "FAILED"))]
+    own = own[own["case"].isin(IN_SPACE) if of == "in space" else own["case"].str.endswith(of)]
     own = own[(own["n_steps"] == PROBED) | (own["tol"] == 1e-8) | (group == ENERGY)]
-    value = own[measure].astype(float).min() if len(own) else np.nan
-    return float(value) if np.isfinite(value) else None
+    if own.empty or measure not in own:
+        return None
+    ended = own["status"] == "REACHED_END"
+    value = float(own[measure].astype(float).where(ended, np.inf).median())
+    return value if np.isfinite(value) else None
 
 
 def _step_for(runs: pd.DataFrame, error: float) -> float | None:

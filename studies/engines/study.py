@@ -13,25 +13,24 @@ from matplotlib.figure import Figure
 
 from references.engines.rigid import Motion, Prepared, coordinates
 from studies.bench import figures
-from studies.bench.closed_loops import MECHANISMS, VARIANTS, four_bar, rssr
+from studies.bench.changed_loops import IN_A_FRAME, LIGHTENED, MOTORISED
+from studies.bench.closed_loops import MECHANISMS, four_bar, rssr
 from studies.bench.engine_runs import INSTANTS, LIMIT, Loop, errors, gate, timed
-from studies.bench.motorised_loops import MOTORISED
 from studies.bench.store import Output, Row
 from studies.bench.study import Study
 from studies.engines.configurations import BEST, CONFIGURATIONS, MODULES, NAMES, OURS, PLAIN_AND_BEST, Configuration
-from studies.engines.findings import ENERGY, GATE, MOTOR, PROBED, RUN, VARIANT, findings_of
+from studies.engines.findings import ENERGY, GATE, MASS, MOTOR, PROBED, RUN, TURN, findings_of
 from twoloop.audit.step_audit import LOST
 
 N_STEPS = (100, 200, 500, 1500, 5000, 15_000, 50_000, 150_000)  # multiples of INSTANTS
 TOLERANCES = (1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10, 1e-11)
-FEWER = {  # steps, or tolerances
-    RUN: (N_STEPS, TOLERANCES),
-    VARIANT: ((500, 5000, 50_000), (1e-4, 1e-6, 1e-8)),
-    MOTOR: ((PROBED,), (1e-8,)),
-}
-LONG, LONG_STEPS, LONG_INSTANTS, LONG_LIMIT = 100.0, 50_000, 200, 6.0  # s; how it is run; s of CPU
+# steps, or tolerances
+FEWER: dict[str, Any] = {RUN: (N_STEPS, TOLERANCES), **dict.fromkeys((MASS, MOTOR, TURN), ((PROBED,), (1e-8,)))}
+CHANGED = {MASS: LIGHTENED, TURN: IN_A_FRAME, MOTOR: MOTORISED}
+SHORT = 0.1  # s: motions that last no longer are too fast for the steps of the long ones
+LONG, LONG_STEPS, LONG_INSTANTS, LONG_LIMIT = 100.0, 50_000, 200, 20.0  # s; how it is run; s of CPU
 SHOWN = ("four-bar", "Watt's six-bar", "Andrews' squeezer", "RSSR", "Bricard", "Stewart platform")  # in the figure
-WITH_MOTORS = [each for each in CONFIGURATIONS if each.name in PLAIN_AND_BEST]
+ASKED_MORE = [each for each in CONFIGURATIONS if each.name in PLAIN_AND_BEST]
 STOPPED = ("NOT_AVAILABLE", "NOT_APPLICABLE", "GATE_FAILED")
 
 
@@ -56,13 +55,13 @@ def gated(make: Callable[[], Any], engine: str) -> tuple[str, str]:
 def make(output: Output) -> pd.DataFrame:
     """Rows of the gates, of runs, of masses and turned frames, of motors, and of the energy over a long time."""
     quick = output.call.quick
-    groups = {RUN: (four_bar, rssr)} if quick else {RUN: MECHANISMS, VARIANT: VARIANTS, MOTOR: MOTORISED}
+    groups: dict[str, Any] = {RUN: (four_bar, rssr)} if quick else {RUN: MECHANISMS} | CHANGED
     with output.kept() as kept:
         rows: list[Row] = []
         for group, build in ((group, build) for group, builds in groups.items() for build in builds):
             for engine in MODULES:
                 rows.append(kept.made(f"{GATE} {build.__name__} {engine}", partial(_gate_row, build, engine)))
-            for each in CONFIGURATIONS if group != MOTOR else WITH_MOTORS:
+            for each in CONFIGURATIONS if group == RUN else ASKED_MORE:
                 cost: list[float] = []  # of the run before, and its steps
                 values: Any = FEWER[group][each.engine == OURS]
                 for value in values[1:4:2] if quick else values:
@@ -72,11 +71,12 @@ def make(output: Output) -> pd.DataFrame:
                     rows.append(row)
                     if row["status"] in STOPPED:
                         break
-        for build in () if quick else (four_bar, rssr):
-            rows += [
-                kept.made(f"{ENERGY} {build.__name__} {each.name}", partial(energy_row, build, each))
-                for each in CONFIGURATIONS
-            ]
+        for build in () if quick else MECHANISMS:
+            if loop_of(build).t_end > SHORT:
+                rows += [
+                    kept.made(f"{ENERGY} {build.__name__} {each.name}", partial(energy_row, build, each))
+                    for each in ASKED_MORE
+                ]
     return pd.DataFrame(rows)
 
 
@@ -174,13 +174,8 @@ def energy_row(build: Callable[[], Any], each: Configuration) -> Row:
     return row | {"energy": float(np.abs(energies - energies[0]).max() / loop.kinetic)}
 
 
-LOOKS = {  # engine: colour
-    "MuJoCo": figures.BLUE,
-    "Drake": figures.GREEN,
-    "Pinocchio": figures.ORANGE,
-    "Exudyn": figures.PINK,
-    "twoloop": figures.BLACK,
-}
+COLORS = figures.BLUE, figures.GREEN, figures.ORANGE, figures.PINK, figures.BLACK
+LOOKS = dict(zip(NAMES.values(), COLORS, strict=True))  # engine: colour
 
 
 def figures_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Figure]:
@@ -189,12 +184,8 @@ def figures_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Figure]:
     shown = [case for case in SHOWN if case in set(runs["case"])] or found["cases"]
     columns = min(3, len(shown))
     lines = -(-len(shown) // columns)
-    size: dict[str, Any] = {
-        "figsize": (3.3 * columns + 1.0, 2.9 * lines + 1.2),
-        "layout": "constrained",
-        "squeeze": False,
-    }
-    figure, panels = plt.subplots(lines, columns, sharey=True, **size)
+    size = 3.3 * columns + 1.0, 2.9 * lines + 1.2
+    figure, panels = plt.subplots(lines, columns, sharey=True, figsize=size, layout="constrained", squeeze=False)
     for panel, case in zip(panels.flat, shown, strict=False):
         own, markers = runs[runs["case"] == case], dict.fromkeys(LOOKS, 0)
         for each in CONFIGURATIONS:

@@ -32,7 +32,7 @@ QUICK_OWN, QUICK_SCIPY = (GIVEN, "DOP853", "BDF"), ("DOP853",)
 OF_SHORT = (GIVEN, "DOP853", "RadauIIA5")  # under gusts that a solver may step over, with IDA_C, CVODE_C, HEYOKA ...
 SCIPY_OF_SHORT = ("DOP853",)
 LOOK = LONGEST_UNSEEN / PLACES  # of a run: so often ours look at least at forces that change with time
-LIMITED = ", max_step"  # of others that take no step longer than ours do by default
+LIMITED = ", max_step"  # of others that take no step longer than the time between two looks of ours
 
 # whose a solver is, in the words of the findings
 KINDS = ("default", "ours", "heyoka", "sundials", "scipy", "limited")
@@ -57,10 +57,14 @@ def own(method: str, trap: Trap) -> Result:
     return solve_dae(trap.system, (0.0, trap.t_end), trap.q0, trap.v0, **options)
 
 
+def largest_step(limited: bool, trap: Trap) -> float | None:
+    """`max_step` of another project's solver (s): the trap's own, else the time between two looks of ours, or none."""
+    return trap.steps.get("max_step", LOOK * trap.t_end if limited else None)
+
+
 def other(solve: Callable[..., Result], limited: bool, trap: Trap) -> Result:
-    """Another project's, without a largest step, or with the longest that ours take by default."""
-    longest = LONGEST_UNSEEN * trap.t_end if limited else None
-    options = {"time_limit": trap.time_limit, "max_step": trap.steps.get("max_step", longest)}
+    """Another project's, without a largest step, or with one."""
+    options = {"time_limit": trap.time_limit, "max_step": largest_step(limited, trap)}
     tolerances = {"tol": trap.tolerance} if solve is solve_heyoka else {"rtol": trap.tolerance, "atol": trap.tolerance}
     return solve(trap.system, (0.0, trap.t_end), trap.q0, trap.v0, **tolerances, **options)
 

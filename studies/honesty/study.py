@@ -37,6 +37,7 @@ from studies.honesty.solvers import (
     SCIPY,
     Call,
     kind_of,
+    largest_step,
     solvers,
     why_not,
 )
@@ -44,6 +45,7 @@ from studies.honesty.traps import AGREE as TRUE_TO
 from studies.honesty.traps import FORCE, GROWN, HELD_OUT, HELD_OUT_SEED, INPUT, MISTAKE, SHORT, Trap, held_out, traps
 from twoloop import ConstrainedSystem, solve_dae
 from twoloop.kernels.compile import callbacks
+from twoloop.run.run import LONGEST_UNSEEN
 
 LOOSENESS = 1e3  # an answer is right within so many times the tolerance ...
 LEAST = 1e-10  # ... of which no more is asked than this
@@ -71,10 +73,7 @@ PARTS = {  # of the bars of the figure, in counts of `totals`
 def right_answer(trap: Trap) -> Array | None:
     """Positions at the end by two unlike methods, from one break of the forces to the next; None where there is none.
 
-    Raises
-    ------
-    StudyError
-        If the two agree at no tolerance.
+    Raises StudyError if the two agree at no tolerance.
     """
     if trap.positions is not None:
         return trap.positions(trap.t_end)
@@ -144,6 +143,7 @@ def about(name: str, trap: Trap) -> dict[str, str]:
 def run(name: str, call: Call, trap: Trap, truth: Array | None) -> Row:
     """One cell, in a process of its own that is ended when it does not come back."""
     row: Row = {**about(name, trap), "tol": trap.tolerance, "n_drawn": trap.n_drawn}
+    row["max_step"] = None if name.endswith(OURS) else largest_step(name.endswith(LIMITED), trap)
     began, no_answer = time.monotonic(), {"message": "", "error": None, "warned": ""}
     try:
         row |= apart(partial(cell, call, trap, truth), trap.time_limit + GRACE)
@@ -224,6 +224,8 @@ def findings_of(all_rows: pd.DataFrame) -> dict[str, Any]:
     found["held_out"]["ran"] = [kind for kind in KINDS[:-1] if found["held_out"]["trust"][kind]["n"]]
     short = all_rows[(all_rows["group"] == SHORT) & (all_rows["outcome"] != NOT_RUN)]
     found |= {"short": short_forces.findings_of(short, (SILENT, HANG)), "look": LOOK}
+    # rows without the column are older, of the longest step that ours take
+    found["max_step"] = float(held["max_step"].max()) if "max_step" in held else LONGEST_UNSEEN * T_END
     found |= {"unrolled_to": LARGEST_UNROLLED, "smallest_step": SMALLEST_STEP}
     found |= {"exact": EXACT, "off": LOOSENESS * USUAL, "usual": USUAL, "scipy": list(SCIPY)}
     return found | {"forces_end": T_END, "forces_agree": TRUE_TO, "grown": GROWN}

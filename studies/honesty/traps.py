@@ -138,52 +138,32 @@ def misshapes(Q: Array, t: float, *state: Array) -> Array:
 
 @dataclass(frozen=True)
 class Trap:
-    """What is wrong, on one mechanism.
-
-    Attributes
-    ----------
-    name : str
-    mechanism : str
-    system : ConstrainedSystem
-    q0, v0 : ndarray (n_q,)
-    t_end : float
-    sane : ConstrainedSystem or None
-        The same without the mistake: its motion is the right answer. None: there is none, and whoever reports success
-        is wrong.
-    breaks : tuple of float
-        Times at which the right motion is computed in pieces.
-    positions : callable or None
-        positions(t) -> q, where they are known.
-    group : str
-        INPUT, MISTAKE, FORCE, HELD_OUT or SHORT.
-    tolerance, time_limit : float
-    steps : mapping
-        `step_size`, `first_step` or `max_step`, for solvers whose adapter takes them.
-    unnoticed : ConstrainedSystem or None
-        The system as it is for a solver that never evaluates it where the trap lies.
-    impulse, singular : bool
-        Whether velocities jump, or C_q loses rank on the way.
-    n_drawn : int
-        How many forces were drawn until the motion under one was known.
-    """
+    """What is wrong, on one mechanism."""
 
     name: str
     mechanism: str
     system: ConstrainedSystem
+    # q0, v0: (n_q,)
     q0: Array
     v0: Array
     t_end: float
+    # the same without the mistake: its motion is the right answer. None: there is none, and whoever reports success is
+    # wrong.
     sane: ConstrainedSystem | None = None
-    breaks: tuple[float, ...] = ()
+    breaks: tuple[float, ...] = ()  # times at which the right motion is computed in pieces
+    # positions(t) -> q, where they are known
     positions: Callable[[float], Array] | None = field(default=None, repr=False)
     tolerance: float = 1e-8
     time_limit: float = 10.0
+    # `step_size`, `first_step` or `max_step`, for solvers whose adapter takes them
     steps: Mapping[str, float] = field(default_factory=dict)
+    # the system as it is for a solver that never evaluates it where the trap lies
     unnoticed: ConstrainedSystem | None = None
-    group: str = MISTAKE
+    group: str = MISTAKE  # INPUT, MISTAKE, FORCE, HELD_OUT or SHORT
+    # impulse, singular: whether velocities jump, or C_q loses rank on the way
     impulse: bool = False
     singular: bool = False
-    n_drawn: int = 1
+    n_drawn: int = 1  # how many forces were drawn until the motion under one was known
 
 
 def start(n: int) -> tuple[Array, Array]:
@@ -275,10 +255,7 @@ def masses(sharp: Sharp) -> Mechanism:
 def end_under_force(mechanism: Mechanism) -> Array:
     """Positions at the end by two methods of SciPy in independent coordinates; NaN where they are not compared.
 
-    Raises
-    ------
-    StudyError
-        If the two do not agree.
+    Raises StudyError if the two do not agree.
     """
     ends = [
         mechanism.positions(T_END, march(mechanism, method, tolerance, mechanism.y0)[T_END])

@@ -4,6 +4,7 @@ import math
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 from unittest.mock import patch
 
@@ -31,26 +32,15 @@ weight = GRAVITY  # a global on purpose: numba takes it as it is when it compile
 
 @dataclass(frozen=True)
 class Fault:
-    """One mistake, and where to look for it.
+    """One mistake, and where to look for it."""
 
-    Attributes
-    ----------
-    name, place : str
-        What is wrong, and in what.
-    plant : callable
-        plant() -> a context in which it is.
-    checks : tuple of str
-        Files or tests of pytest, run in this order until one fails. Empty: the run below is the check.
-    problem : Problem or None
-        To be run by `solver` and judged as in `validation`.
-    solver : str
-    """
-
+    # name, place: what is wrong, and in what
     name: str
     place: str
-    plant: Callable[[], AbstractContextManager[Any]] = nullcontext
+    plant: Callable[[], AbstractContextManager[Any]] = nullcontext  # plant() -> a context in which it is
+    # files or tests of pytest, run in this order until one fails. Empty: the run below is the check.
     checks: tuple[str, ...] = ()
-    problem: Problem | None = None
+    problem: Problem | None = None  # to be run by `solver` and judged as in `validation`
     solver: str = "Gauss12"
 
 
@@ -141,14 +131,10 @@ def radius(t, q, p, Cq):  # type: ignore[no-untyped-def]
 
 def pendulum_in_python(**changed: Any) -> ConstrainedSystem:
     """The pendulum of A01 in functions that can be traced, with others in the place of some."""
-    functions = {
-        "mass": lambda t, q: np.eye(2),
-        "force": lambda t, q, v: np.array([0.0, -GRAVITY]),
-        "constraint": lambda t, q: np.array([0.5 * (q @ q - 1.0)]),
-        "jacobian": lambda t, q: q.reshape(1, 2),
-        "gamma": lambda t, q, v: np.array([-(v @ v)]),
-    }
-    return ConstrainedSystem.from_python(n_q=2, n_c=1, name="pendulum", **{**functions, **changed})
+    given: dict[str, Any] = {"mass": lambda t, q: np.eye(2), "force": lambda t, q, v: np.array([0.0, -GRAVITY])}
+    given |= {"constraint": lambda t, q: np.array([0.5 * (q @ q - 1.0)]), "jacobian": lambda t, q: q.reshape(1, 2)}
+    given |= {"gamma": lambda t, q, v: np.array([-(v @ v)])} | changed
+    return ConstrainedSystem.from_python(n_q=2, n_c=1, name="pendulum", **given)
 
 
 def in_trace() -> Iterator[Fault]:
@@ -285,8 +271,14 @@ def in_options() -> Iterator[Fault]:
 def in_adapter() -> Iterator[Fault]:
     """What comes back from our methods and from SciPy's."""
     sound = mechanisms.double_pendulum()
-    for solver, owner, name in (("Gauss12", solvers, "solve_dae"), (SCIPY, solvers, "solve_index1")):
-        whose = "ours" if name == "solve_dae" else "SciPy's"
+    entry = solvers.CATALOGUE[SCIPY]
+
+    def foreign(change: Callable[[Any], Any]) -> Callable[[], AbstractContextManager[Any]]:
+        changed = replace(entry, run=lambda *cell: change(entry.run(*cell)))
+        return lambda: patch.dict(solvers.CATALOGUE, {SCIPY: changed})
+
+    own = partial(_changed, solvers, "solve_dae")
+    for solver, whose, plant in (("Gauss12", "ours", own), (SCIPY, "SciPy's", foreign)):
         for what, change in (
             ("multipliers with the other sign", lambda result: replace(result, lam=-result.lam)),
             ("velocities of the step before", lambda result: replace(result, v=np.roll(result.v, 1, axis=1))),
@@ -295,7 +287,7 @@ def in_adapter() -> Iterator[Fault]:
             ("the end 1e-6 s too early", lambda result: replace(result, q=result.q - 1e-6 * result.v)),
             ("accelerations of the other sign", lambda result: replace(result, a=-result.a)),
         ):
-            yield Fault(f"{what} ({whose})", "adapter", _changed(owner, name, change), problem=sound, solver=solver)
+            yield Fault(f"{what} ({whose})", "adapter", plant(change), problem=sound, solver=solver)
 
 
 def in_report() -> Iterator[Fault]:

@@ -26,7 +26,7 @@ from studies.bench.store import Output, Row
 TESTS = {  # of a kernel whose change compiles nothing but itself, and what is run until a test fails
     "adams": ("tests/kernels/test_adams.py",),
     "bdf": ("tests/kernels/test_orders.py", "tests/kernels/test_bdf.py"),
-    "explicit": ("tests/kernels/test_orders.py", "tests/kernels/test_explicit.py"),
+    "explicit": ("tests/kernels/test_orders.py", "tests/kernels/test_explicit.py", "tests/test_straight_line.py"),
     "newmark": ("tests/kernels/test_newmark.py", "tests/kernels/test_orders.py", "tests/test_fixed_step.py"),
 }
 FOLDERS = ("twoloop", "references", "studies", "tests", "pyproject.toml", "docs", "reports")
@@ -43,25 +43,15 @@ SIGNS = {ast.Add: "+", ast.Sub: "-", ast.Mult: "*", ast.Div: "/"} | {
 
 @dataclass(frozen=True)
 class Mutant:
-    """One change of one place of a file: characters `begin` to `end` of a line become `new`.
+    """One change of one place of a file: characters `begin` to `end` of a line become `new`."""
 
-    Attributes
-    ----------
-    kernel : str
-        Whose file is twoloop/kernels/steps/KERNEL_step.py.
-    line, begin, end : int
-    old, new : str
-    text : str
-        The line as it is.
-    """
-
-    kernel: str
+    kernel: str  # whose file is twoloop/kernels/steps/KERNEL_step.py
     line: int
     begin: int
     end: int
     old: str
     new: str
-    text: str
+    text: str  # the line as it is
 
     @property
     def name(self) -> str:
@@ -146,9 +136,7 @@ def first_failure(folder: Path, tests: Sequence[str]) -> str:
     if process.returncode == 0:
         return ""
     failed = [line.split(" ")[1] for line in text.splitlines() if line.startswith(("FAILED ", "ERROR "))]
-    if failed:
-        return failed[0]
-    return f"the process ended with {process.returncode}"
+    return failed[0] if failed else f"the process ended with {process.returncode}"
 
 
 def row_of(mutant: Mutant, folder: Path) -> Row:

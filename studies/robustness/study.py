@@ -2,7 +2,7 @@
 
 import sys
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -54,7 +54,7 @@ def measured(problem: Problem, method: str, t_end: float, truth: Array, unit: Ar
     return row | {"error": off, "outcome": RIGHT if off <= allowed else SAID if said else SILENT}
 
 
-def linkages(quick: bool) -> Iterator[tuple[str, Callable[[], list[Row]]]]:
+def linkages(quick: bool) -> Iterator[sharp_runs.Part]:
     """Key and rows of every linkage; those without a known motion are drawn again and counted."""
 
     def rows(kind: str, seed: list[int]) -> list[Row]:
@@ -73,7 +73,7 @@ def linkages(quick: bool) -> Iterator[tuple[str, Callable[[], list[Row]]]]:
             yield f"linkage {kind} {k}", partial(rows, kind, [SEED, place, k])
 
 
-def scales(quick: bool) -> Iterator[tuple[str, Callable[[], list[Row]]]]:
+def scales(quick: bool) -> Iterator[sharp_runs.Part]:
     """Key and rows of every size and mass."""
 
     def rows(group: str, value: float) -> list[Row]:
@@ -127,15 +127,11 @@ def long_run(method: str, n_steps: int) -> Row:
     return row | {"energy": float(energy.max())}
 
 
-def long_runs(quick: bool) -> Iterator[tuple[str, Callable[[], list[Row]]]]:
+def long_runs(quick: bool) -> Iterator[sharp_runs.Part]:
     """Key and row of every long run, each made in a process of its own."""
-
-    def rows(method: str, n_steps: int) -> list[Row]:
-        return [apart(partial(long_run, method, n_steps))]
-
     for method in QUICK_METHODS if quick else METHODS:
         for n in LONG_QUICK if quick else LONG_STEPS:
-            yield f"long {method} {n}", partial(rows, method, n)
+            yield f"long {method} {n}", partial(lambda *run: [apart(partial(long_run, *run))], method, n)
 
 
 def make(output: Output) -> pd.DataFrame:

@@ -1,5 +1,6 @@
 """Cost against size: an evaluation of mechanisms of 3 to 3000 bodies, and chains beside others' solvers."""
 
+from itertools import pairwise
 from typing import Any
 
 import matplotlib.pyplot as plt
@@ -30,6 +31,8 @@ from studies.scale.runs import (
 )
 from twoloop.rows.equal_error import resampled
 
+BEND = 0.3  # by which a power from one size to the next differs notably from the fitted one
+
 
 def make(output: Output) -> pd.DataFrame:
     """Rows of evaluations and memory, of trees, of chains, and of those that grow until others stop."""
@@ -51,9 +54,19 @@ def slope(n: Any, times: Any) -> list[float] | None:
     return [float(np.polyfit(x, middle, 1)[0]), *np.percentile(np.polyfit(x, drawn, 1)[0], tables.INTERVAL).tolist()]
 
 
+def powers(us: dict[int, float]) -> list[dict[str, Any]]:
+    """p of cost ~ n^p from one size to the next, from FROM on, by medians."""
+    n = [each for each in us if each >= FROM]
+    return [
+        {"from": low, "to": high, "power": float(np.log(us[high] / us[low]) / np.log(high / low))}
+        for low, high in pairwise(n)
+    ]
+
+
 def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     """Slopes and times by kind of mechanism; chains at equal error."""
     found: dict[str, Any] = {"kinds": [], "chains": [], "from": FROM, "to": TO, "errors": list(ERRORS), "limit": LIMIT}
+    found["once"] = {}
     made = rows[(rows["group"] == EVALUATION) & rows["evaluation_us"].notna()]
     for case, own in made.groupby("case", sort=False):
         by_size = own.groupby("n")
@@ -62,7 +75,9 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
         dear = [n for n in us if any(us[n] > us[m] for m in us if m > n)]
         line = {"case": str(case), "us": us, "dear": dear}
         line["start_s"] = {int(n): float(each["start_s"].median()) for n, each in by_size}
-        found["kinds"].append(line | {"slope": None if dear else slope(list(times), list(times.values()))})
+        fitted, between = None if dear else slope(list(times), list(times.values())), powers(us)
+        apart = [abs(each["power"] - fitted[0]) for each in between] if fitted else []
+        found["kinds"].append(line | {"slope": fitted, "powers": between, "bends": max(apart, default=0.0) > BEND})
     found["failed"] = rows[rows["group"].eq(EVALUATION) & rows["status"].eq("FAILED")][["case", "n"]].to_dict("records")
     chains = rows[rows["group"] == CHAIN].sort_values(
         ["n", "solver", "h", "tol", "repeat"], ascending=[True] * 2 + [False] * 2 + [True]
@@ -79,6 +94,9 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
             "step": steps_of(medians),
             "fastest": [each for error in ERRORS if (each := fastest(medians, error))],
         }
+        found["once"] |= once(medians)
+        least, step = min(of_chain["over_exudyn"], default=0.0), of_chain["step"]
+        of_chain["by_order"] = bool(step) and (step["exudyn"] / step["ours"]) ** 2 < least
         found["chains"].append(of_chain)
     held = rows[rows["group"].eq(MEMORY)]
     held = held[held["memory_mb"].notna()] if len(held) else held
@@ -87,7 +105,7 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     found["trees"] = [line for line in found["trees"] if line["engines"]]
     grown = rows[rows["group"] == UNTIL]
     found["until"] = [_until(str(solver), own) for solver, own in grown.groupby("solver", sort=False)]
-    found |= {"budget": BUDGET, "sparse_ida": SPARSE_IDA, "tolerance": TOLERANCE, "until_end": UNTIL_END}
+    found |= {"budget": BUDGET, "sparse_ida": SPARSE_IDA, "tolerance": TOLERANCE, "until_end": UNTIL_END, "bend": BEND}
     of_reference = rows["reference"].dropna() if "reference" in rows else rows["group"][:0]
     found["references"] = sorted(set(of_reference))
     return found
@@ -109,8 +127,10 @@ def _until(solver: str, rows: pd.DataFrame) -> dict[str, Any]:
     run = rows[rows["status"] == "REACHED_END"]
     stopped = rows[rows["status"] != "REACHED_END"]
     made = {int(row["n"]): {key: row[key] for key in ("build_s", "call_s", "error_q")} for _, row in run.iterrows()}
+    built = [each["build_s"] for each in made.values()]
+    cold = len(built) > 1 and built[0] > built[1]  # the first holds what the package does once in a process
     why = None if stopped.empty else {"n": int(stopped["n"].iloc[0]), "message": str(stopped["message"].iloc[0])}
-    return {"solver": solver, "made": made, "stopped": why}
+    return {"solver": solver, "made": made, "stopped": why, "cold": cold}
 
 
 def over_exudyn(medians: pd.DataFrame, error: float) -> float | None:
@@ -131,26 +151,32 @@ def steps_of(medians: pd.DataFrame) -> dict[str, Any] | None:
     return {"exudyn": exudyn, "ours": STAGES * float((ours["call_s"] / ours["n_evaluations"]).min())}
 
 
+def once(medians: pd.DataFrame) -> dict[str, bool]:
+    """The solvers with settings that were run once where others have repetitions, and whether all of theirs were."""
+    single = (medians["repeats"] == 1) & (medians["repeats"].max() > 1)
+    return {str(name): bool(own.all()) for name, own in single.groupby(medians["solver"], sort=False) if own.any()}
+
+
 def fastest(medians: pd.DataFrame, error: float) -> dict[str, Any] | None:
-    """The rival that is the cheapest at an error, its price and the default's, as in the table; None: one has none."""
-    costs = {str(name): tables.as_good(own, error) for name, own in medians.groupby("solver", sort=False)}
-    for name, own in medians.groupby("solver", sort=False):
-        if (price := tables.time_for(own, error)) == price:
-            costs[str(name)] = price
-    rivals = [
-        name for name in medians[medians["family"] != "two-loop"]["solver"].unique() if costs[name] == costs[name]
-    ]
-    ours = costs.get(DEFAULT, np.nan)
-    if not rivals or not np.isfinite(ours):
+    """The rival that is the cheapest at an error, and its time over the default's; None: one of them has none.
+
+    over: the least and the most that it can be. They differ where one of the two has no run within a decade of the
+    error, so that its price lies between those of the runs on either side.
+    """
+    high = tables.costs_at(medians, error)
+    low = tables.costs_at(medians, error, doubt=True)
+    known = [name for name in medians[medians["family"] != "two-loop"]["solver"].unique() if name in high]
+    if not known or DEFAULT not in high:
         return None
-    best = min(rivals, key=costs.__getitem__)
-    return {"error": error, "solver": best, "run_s": costs[best], "ours_s": ours}
+    best = min(known, key=lambda name: high[name][0])
+    over = [low[best][0] / high[DEFAULT][0], high[best][0] / low[DEFAULT][0]]
+    return {"error": error, "solver": str(best), "over": over}
 
 
 def figures_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Figure]:
     """An evaluation over the number of bodies, and what an accuracy costs on chains."""
     figure, axes = plt.subplots(figsize=(6.4, 4.4), layout="constrained")
-    for line, color, marker in zip(found["kinds"], figures.shades(len(found["kinds"])), "osD^vP", strict=False):
+    for line, color, marker in zip(found["kinds"], figures.shades(len(found["kinds"])), "osD^vPX<>", strict=False):
         axes.plot(list(line["us"]), list(line["us"].values()), marker=marker, color=color, label=line["case"])
     axes.set(xscale="log", yscale="log", xlabel="bodies", ylabel="time of an evaluation, projections included (µs)")
     axes.legend(fontsize=8, title="mechanism")

@@ -72,12 +72,9 @@ def measured(problem: Problem, result: Result) -> dict[str, Any]:
     kinetic = energy - problem.energy(result.t, result.q, 0.0 * result.v)
     stops = rests(result)
     known = len(stops) > 1
-    return {
-        "energy_error": _short(np.abs(energy - energy[0]).max() / kinetic.max(), 4),
-        "half": _short(stops[0], 12) if known else np.nan,
-        "period": _short(stops[1], 12) if known else np.nan,
-        "n_evaluations": result.stats.n_evaluations,
-    }
+    found: dict[str, Any] = {"energy_error": _short(np.abs(energy - energy[0]).max() / kinetic.max(), 4)}
+    found |= {"half": _short(stops[0], 12) if known else np.nan, "period": _short(stops[1], 12) if known else np.nan}
+    return found | {"n_evaluations": result.stats.n_evaluations}
 
 
 def _short(value: float, digits: int) -> float:
@@ -122,23 +119,15 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     wall = {(row["parallel"], int(row["workers"])): float(row["wall"]) for _, row in scaling.iterrows()}
     ratios = {way: wall[way, 1] / wall[way, 2] for way in ("processes", "threads") if (way, 1) in wall}
     returned = np.abs(periodic["period"] - 2.0 * periodic["half"]) / periodic["period"]
-    return {
-        "n": len(linkages),
-        "n_done": len(done),
-        "n_unassembled": int(causes.sum()),
-        "others": failed[~causes]["status"].value_counts().to_dict(),
-        "runs_per_second": int(scaling["n_runs"].iloc[0]) / min(wall.values()),
-        "t_end": SPAN[1],
-        "energy": _quantiles(done["energy_error"]),
-        "worst": {name: float(worst[name]) for name in (*RANGES, "branch", "energy_error")},
-        "n_periodic": len(periodic),
-        "period": _quantiles(periodic["period"]) if len(periodic) else None,
-        "return": _quantiles(returned) if len(periodic) else None,
-        "n_scaling": int(scaling["n_runs"].iloc[0]),
-        "ratios": ratios,
-        "asked": SCALES,
-        "scales": ratios["processes"] >= SCALES if "processes" in ratios else None,
-    }
+    found: dict[str, Any] = {"n": len(linkages), "n_done": len(done), "n_unassembled": int(causes.sum())}
+    found |= {"others": failed[~causes]["status"].value_counts().to_dict()}
+    found |= {"runs_per_second": int(scaling["n_runs"].iloc[0]) / min(wall.values()), "t_end": SPAN[1]}
+    found |= {"energy": _quantiles(done["energy_error"])}
+    found |= {"worst": {name: float(worst[name]) for name in (*RANGES, "branch", "energy_error")}}
+    found |= {"n_periodic": len(periodic), "period": _quantiles(periodic["period"]) if len(periodic) else None}
+    found |= {"return": _quantiles(returned) if len(periodic) else None, "n_scaling": int(scaling["n_runs"].iloc[0])}
+    found |= {"ratios": ratios, "asked": SCALES}
+    return found | {"scales": ratios["processes"] >= SCALES if "processes" in ratios else None}
 
 
 def _quantiles(values: pd.Series) -> dict[str, float]:

@@ -18,16 +18,7 @@ import sympy as sp
 from scipy.optimize import brentq
 from sympy.physics.mechanics import dynamicsymbols
 
-from twoloop import solve_dae
-from twoloop.mechanisms import (
-    closed_chain,
-    driven_crank,
-    four_bar,
-    heavy_top,
-    knife_edge,
-    rolling_disc,
-    sundials_slider_crank,
-)
+from twoloop import mechanisms, solve_dae
 from twoloop.problem import generated
 from twoloop.problem.problem import Problem
 from twoloop.symbolic import SymbolicMechanism, from_lagrangian
@@ -42,8 +33,26 @@ def rates(coordinates: Sequence[Any]) -> list[Any]:
     return [each.diff(t) for each in coordinates]
 
 
-def symbolic_four_bar(tangents: bool = False) -> tuple[Problem, SymbolicMechanism]:
-    problem = four_bar()
+Made = tuple[Problem, SymbolicMechanism]
+MODELS: dict[str, Callable[..., Made]] = {}
+
+
+def model(name: str) -> Callable[[Callable[[], tuple[Any, ...]]], Callable[..., Made]]:
+    """Make of a function that gives a problem, T, V, constraints, q, numbers and options its problem and mechanism."""
+
+    def decorate(parts: Callable[[], tuple[Any, ...]]) -> Callable[..., Made]:
+        def made(tangents: bool = False) -> Made:
+            problem, *energies, values, more = parts()
+            return problem, from_lagrangian(*energies, parameters=values, tangents=tangents, name=name, **more)
+
+        MODELS[name] = made
+        return made
+
+    return decorate
+
+
+@model("four-bar")
+def symbolic_four_bar() -> tuple[Any, ...]:
     q = dynamicsymbols("x1 y1 th1 x2 y2 th2 x3 y3 th3")
     lengths, ground, g = sp.symbols("L1:4"), sp.Symbol("L"), sp.Symbol("g")
     T = V = x = y = sp.S.Zero
@@ -56,35 +65,28 @@ def symbolic_four_bar(tangents: bool = False) -> tuple[Problem, SymbolicMechanis
         constraints += [px - x - dx, py - y - dy]
         x, y = x + 2 * dx, y + 2 * dy
     values = dict(zip([*lengths, ground, g], [1.0, 2.0, 1.5, 3.0, 9.81], strict=True))
-    return problem, from_lagrangian(
-        T, V, [*constraints, y, x - ground], q, parameters=values, tangents=tangents, name="four-bar"
-    )
+    return mechanisms.four_bar(), T, V, [*constraints, y, x - ground], q, values, {}
 
 
-def symbolic_slider_crank(tangents: bool = False) -> tuple[Problem, SymbolicMechanism]:
+@model("slider-crank with spring and damper")
+def symbolic_slider_crank() -> tuple[Any, ...]:
     """With a spring, a damper and a constant force: forces, dissipation and potential each have their part."""
-    problem = sundials_slider_crank()
+    problem = mechanisms.sundials_slider_crank()
     q = crank, slider, rod = dynamicsymbols("crank slider rod")
     p = a, J1, m2, J2, k, c, l0, F = sp.symbols("a J1 m2 J2 k c l0 F")
     w1, u, w2 = rates(q)
     T = (J1 * w1**2 + m2 * u**2 + J2 * w2**2) / 2
     x, y = slider - (sp.cos(rod) + a * sp.cos(crank)) / 2, (sp.sin(rod) + a * sp.sin(crank)) / 2
     length = sp.sqrt(x**2 + y**2)
-    mechanism = from_lagrangian(
-        T,
-        k * (length - l0) ** 2 / 2 - F * (slider + sp.cos(rod)),
-        [slider - sp.cos(rod) - a * sp.cos(crank), -sp.sin(rod) - a * sp.sin(crank)],
-        q,
-        dissipation=c * length.diff(t) ** 2 / 2,
-        parameters={symbol: problem.parameters[symbol.name] for symbol in p},
-        tangents=tangents,
-        name="slider-crank",
-    )
-    return problem, mechanism
+    V = k * (length - l0) ** 2 / 2 - F * (slider + sp.cos(rod))
+    constraints = [slider - sp.cos(rod) - a * sp.cos(crank), -sp.sin(rod) - a * sp.sin(crank)]
+    values = {symbol: problem.parameters[symbol.name] for symbol in p}
+    return problem, T, V, constraints, q, values, {"dissipation": c * length.diff(t) ** 2 / 2}
 
 
-def symbolic_driven_crank(tangents: bool = False) -> tuple[Problem, SymbolicMechanism]:
-    problem = driven_crank()
+@model("driven crank")
+def symbolic_driven_crank() -> tuple[Any, ...]:
+    problem = mechanisms.driven_crank()
     q = x1, y1, th1, x2, y2, th2 = dynamicsymbols("x1 y1 th1 x2 y2 th2")
     u1, v1, w1, u2, v2, w2 = rates(q)
     p = L1, L2, m1, m2, g, start, rate, amplitude, frequency = sp.symbols(
@@ -101,31 +103,23 @@ def symbolic_driven_crank(tangents: bool = False) -> tuple[Problem, SymbolicMech
     known = problem.parameters
     numbers = [known["crank"], known["rod"], *known["masses"], known["gravity"], *known["drive"].values()]
     values = dict(zip(p, numbers, strict=True))
-    return problem, from_lagrangian(
-        T, g * (m1 * y1 + m2 * y2), constraints, q, parameters=values, tangents=tangents, name="driven crank"
-    )
+    return problem, T, g * (m1 * y1 + m2 * y2), constraints, q, values, {}
 
 
-def symbolic_knife_edge(tangents: bool = False) -> tuple[Problem, SymbolicMechanism]:
-    problem = knife_edge()
+@model("knife edge")
+def symbolic_knife_edge() -> tuple[Any, ...]:
+    problem = mechanisms.knife_edge()
     q = x, _, angle = dynamicsymbols("x y angle")
     u, v, w = rates(q)
     m, J, pull = sp.symbols("m J pull")
-    mechanism = from_lagrangian(
-        (m * (u**2 + v**2) + J * w**2) / 2,
-        -pull * x,
-        [],
-        q,
-        nonholonomic=[u * sp.sin(angle) - v * sp.cos(angle)],
-        parameters=dict(zip((m, J, pull), problem.system.parameters.tolist(), strict=True)),
-        tangents=tangents,
-        name="knife edge",
-    )
-    return problem, mechanism
+    values = dict(zip((m, J, pull), problem.system.parameters.tolist(), strict=True))
+    across = {"nonholonomic": [u * sp.sin(angle) - v * sp.cos(angle)]}
+    return problem, (m * (u**2 + v**2) + J * w**2) / 2, -pull * x, [], q, values, across
 
 
-def symbolic_rolling_disc(tangents: bool = False) -> tuple[Problem, SymbolicMechanism]:
-    problem = rolling_disc()
+@model("rolling disc")
+def symbolic_rolling_disc() -> tuple[Any, ...]:
+    problem = mechanisms.rolling_disc()
     q = dynamicsymbols("x y z yaw lean spin")
     z, yaw, lean = q[2:5]
     u, v, w, yaw_rate, ahead, spin_rate = rates(q)
@@ -137,10 +131,7 @@ def symbolic_rolling_disc(tangents: bool = False) -> tuple[Problem, SymbolicMech
     slip = centre + R * (spin_rate - yaw_rate * sp.sin(lean)) * forward + R * ahead * sp.cos(lean) * side
     known = problem.parameters
     values = dict(zip((m, R, g), (known["mass"], known["radius"], known["gravity"]), strict=True))
-    holonomic = [z - R * sp.cos(lean)]
-    return problem, from_lagrangian(
-        T, m * g * z, holonomic, q, nonholonomic=slip, parameters=values, tangents=tangents, name="rolling disc"
-    )
+    return problem, T, m * g * z, [z - R * sp.cos(lean)], q, values, {"nonholonomic": slip}
 
 
 def body_spin(e: Sequence[Any]) -> sp.Matrix:
@@ -157,8 +148,9 @@ def rotation(e: Sequence[Any]) -> sp.Matrix:
     return (e0**2 - f.dot(f)) * sp.eye(3) + 2 * f * f.T + 2 * e0 * cross
 
 
-def symbolic_heavy_top(tangents: bool = False) -> tuple[Problem, SymbolicMechanism]:
-    problem = heavy_top()
+@model("heavy top")
+def symbolic_heavy_top() -> tuple[Any, ...]:
+    problem = mechanisms.heavy_top()
     x, e = dynamicsymbols("x y z"), dynamicsymbols("e0:4")
     m, length, g, *J = sp.symbols("m length g J1:4")
     spin = body_spin(e)
@@ -167,19 +159,7 @@ def symbolic_heavy_top(tangents: bool = False) -> tuple[Problem, SymbolicMechani
     known = problem.parameters
     values = dict(zip((m, length, g, *J), (known["mass"], known["length"], 9.81, *known["inertia"]), strict=True))
     constraints = [(sum(each**2 for each in e) - 1) / 2, *pivot]
-    return problem, from_lagrangian(
-        T, m * g * x[2], constraints, [*x, *e], parameters=values, tangents=tangents, name="heavy top"
-    )
-
-
-MODELS: dict[str, Callable[..., tuple[Problem, SymbolicMechanism]]] = {
-    "four-bar": symbolic_four_bar,
-    "slider-crank with spring and damper": symbolic_slider_crank,
-    "driven crank": symbolic_driven_crank,
-    "knife edge": symbolic_knife_edge,
-    "rolling disc": symbolic_rolling_disc,
-    "heavy top": symbolic_heavy_top,
-}
+    return problem, T, m * g * x[2], constraints, [*x, *e], values, {}
 
 
 def chain_of_positions(n: int, tangents: bool = False) -> SymbolicMechanism:
@@ -217,7 +197,7 @@ CHAINS = {"angles": chain_of_angles, "positions": chain_of_positions}
 def started(coordinates: str, n: int, mechanism: SymbolicMechanism) -> Problem:
     """A chain at rest, not symmetric."""
     if coordinates == "positions":
-        return mechanism.problem(closed_chain(n).q0, np.zeros(2 * n), (0.0, 0.5))
+        return mechanism.problem(mechanisms.closed_chain(n).q0, np.zeros(2 * n), (0.0, 0.5))
     links = n + 1
     half = brentq(lambda a: math.sin(links * a) / (links * math.sin(a)) - SLACK, 1e-6, math.pi / links)
     angles = (2.0 * np.arange(links) - n) * half
@@ -239,14 +219,9 @@ def measured(coordinates: str, n: int, tangents: bool) -> dict[str, Any]:
     for _ in range(REPEATS):
         runs.append(solve())
     costs = [1e6 * (run.stats.cpu_time or 0.0) / (run.stats.n_evaluations or 1) for run in runs]
-    return {
-        "status": runs[-1].status.name,
-        "lines": mechanism.code.source.count("\n"),
-        "derive_s": derived - began,
-        "compile_s": compiled - derived,
-        "start_s": since_start,  # with the imports, and all that runs before
-        "evaluation_us": min(costs),
-    }
+    found = {"status": runs[-1].status.name, "lines": mechanism.code.source.count("\n"), "derive_s": derived - began}
+    # the start with the imports, and all that runs before
+    return found | {"compile_s": compiled - derived, "start_s": since_start, "evaluation_us": min(costs)}
 
 
 if __name__ == "__main__":

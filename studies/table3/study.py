@@ -26,7 +26,7 @@ from studies.bench.solvers import (
     ERR_IN,
     HEYOKA,
     IDA_C,
-    IDA_FORMS,
+    IDA_INDEX_1,
     IRK,
     IRK_LINE,
     NEWMARK,
@@ -87,7 +87,7 @@ def runs(first: Case, second: Case, quick: bool) -> list[Run]:
     for partition in ("lasting", "symmetric"):
         solver = Solver(f"fixed step, {partition}", "two-loop", "compiled", True, "h", partial(_fixed, partition))
         made.append(Run(first, solver, STEP, "partition", 3 if quick else 9))  # they differ by little
-    more = [] if quick else [f"IDA, {form}" for form in IDA_FORMS if form != "stabilised"]
+    more = [] if quick else [IDA_INDEX_1]
     names = [name for name in (*PAPER, *OTHERS, *more) if not (quick and name in COMPILED)]
     for case, names_ in ((first, names),) if quick else ((first, names), (second, PAPER)):
         for name in names_:

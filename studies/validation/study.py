@@ -37,27 +37,13 @@ from twoloop import mechanisms
 from twoloop.mechanisms import Problem
 
 MAKE: tuple[Callable[[], Problem], ...] = (
-    mechanisms.pendulum,
-    mechanisms.projection_pendulum,
-    mechanisms.double_pendulum,
-    mechanisms.driven_crank,
-    mechanisms.andrews,
-    mechanisms.sundials_slider_crank,
-    mechanisms.driven_slider_crank,
-    mechanisms.redundant_slider_crank,
-    partial(mechanisms.closed_chain, 4),
-    partial(mechanisms.closed_chain, 20),
-    partial(mechanisms.n_four_bar, 1),
-    partial(mechanisms.n_four_bar, 2),
-    partial(mechanisms.n_four_bar, 2, "bodies"),
-    partial(mechanisms.n_four_bar, 40),
-    mechanisms.knife_edge,
-    mechanisms.rolling_disc,
-    mechanisms.heavy_top,
-    mechanisms.spatial_slider_crank,
-    mechanisms.spatial_four_bar,
-    mechanisms.bricard,
-    mechanisms.governor,
+    *(mechanisms.pendulum, mechanisms.projection_pendulum, mechanisms.double_pendulum, mechanisms.driven_crank),
+    *(mechanisms.andrews, mechanisms.sundials_slider_crank, mechanisms.driven_slider_crank),
+    *(mechanisms.redundant_slider_crank, partial(mechanisms.closed_chain, 4), partial(mechanisms.closed_chain, 20)),
+    *(partial(mechanisms.n_four_bar, 1), partial(mechanisms.n_four_bar, 2)),
+    *(partial(mechanisms.n_four_bar, 2, "bodies"), partial(mechanisms.n_four_bar, 40)),
+    *(mechanisms.knife_edge, mechanisms.rolling_disc, mechanisms.heavy_top, mechanisms.spatial_slider_crank),
+    *(mechanisms.spatial_four_bar, mechanisms.bricard, mechanisms.governor),
 )
 QUICK = (0, 2, 4, 10, 14)  # places in MAKE
 OWN = (GIVEN, TAYLOR, ADAMS, OWN_EXPLICIT, "Gauss12", "RadauIIA5", OWN_BDF)
@@ -87,16 +73,8 @@ FEWEST = 3  # errors above the reference's own from which a slope is taken
 UNTOLD = (IDA_C, HEYOKA, CVODE_C, CVODE_C_PROJECTED, CVODES)
 APART = (JUDGED, deceived.DECEIVED, MODELLED)  # groups that the table of solvers leaves out
 OUTCOMES = ("right", "inexact", "wrong", "said so", "not run")
-SHORT = {
-    "RANK_LOST": "rank",
-    "TIME_LIMIT": "L",
-    "NOT_APPLICABLE": "–",
-    "NOT_AVAILABLE": "–",
-    "RAISED": "–",
-    "STEP_TOO_SMALL": "step",
-    "SOLVER_FAILED": "failed",
-    "NOT_CONVERGED": "failed",
-}
+SHORT = {"RANK_LOST": "rank", "TIME_LIMIT": "L", "STEP_TOO_SMALL": "step", "SOLVER_FAILED": "failed"}
+SHORT |= {"NOT_CONVERGED": "failed"} | dict.fromkeys(("NOT_APPLICABLE", "NOT_AVAILABLE", "RAISED"), "–")
 NO_FAILURES = ("L", "–")  # of these
 
 
@@ -239,20 +217,11 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     problems = [of_problem(name, own) for name, own in rows.groupby("case", sort=False)]
     wrong = rows[rows["outcome"] == "wrong"][["case", "solver", "family", "tol", "error_q"]].to_dict("records")
     stepped = [of_steps(name, own) for name, own in steps.groupby("solver", sort=False)]
-    found: dict[str, Any] = {
-        "n": len(problems),
-        "tight": TIGHT,
-        "solvers": [of_solver(name, own) for name, own in rows.groupby("solver", sort=False)],
-        "problems": problems,
-        "decades": DECADES,
-        "models": of_models(models),
-        "steps": stepped,
-        "ours_short": short_of_reach(rows),
-        "reach": REACH,
-        "aimed": list(AIMED),
-        "wrong": wrong,
-        "only_others": [line["case"] for line in problems if line["others_right"] and not line["ours_right"]],
-    }
+    found: dict[str, Any] = {"n": len(problems), "tight": TIGHT}
+    found |= {"solvers": [of_solver(name, own) for name, own in rows.groupby("solver", sort=False)]}
+    found |= {"problems": problems, "decades": DECADES, "models": of_models(models), "steps": stepped}
+    found |= {"ours_short": short_of_reach(rows), "reach": REACH, "aimed": list(AIMED), "wrong": wrong}
+    found |= {"only_others": [line["case"] for line in problems if line["others_right"] and not line["ours_right"]]}
     alone = {line["case"]: line["ours_right"] for line in problems if line["ours_right"] and not line["others_right"]}
     others = rows[~ours & (rows["tol"] == TIGHT)]
     found["only_ours"] = [
@@ -290,7 +259,6 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     ):
         found[f"n_{name}"] = {"ours": int((which & ours).sum()), "others": int((which & ~ours).sum())}
     theirs = [line for line in wrong if line["family"] != "two-loop"]
-
     found["wrong_others"] = {
         which: {"n": len(own), "at": sorted({line["tol"] for line in own})}
         | {"elsewhere": sum(line["case"] not in singular for line in own)}
@@ -298,6 +266,11 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
             ("tight", [line for line in theirs if line["tol"] <= USUAL]),
             ("loose", [line for line in theirs if line["tol"] > USUAL]),
         )
+    }
+    found["wrong_others"]["singular"] = sum(line["case"] in singular for line in theirs)
+    at_tight = (rows["tol"] == TIGHT) & (rows["outcome"] == "right")
+    found["right_on"] = {
+        which: dict(rows[at_tight & of]["solver"].value_counts()) for which, of in (("ours", ours), ("others", ~ours))
     }
     return found | {"time_limit": TIME_LIMIT}
 

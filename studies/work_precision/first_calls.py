@@ -119,8 +119,7 @@ def _above_steps(run: Run) -> float:
 
 
 def _run(problem: mechanisms.Problem, solver: str) -> Run:
-    case = replace(case_of(problem), time_limit=LIMIT, timed=rivals.TIMED)
-    return Run(case, CATALOGUE[solver], TOLERANCE)
+    return Run(replace(case_of(problem), time_limit=LIMIT, timed=rivals.TIMED), CATALOGUE[solver], TOLERANCE)
 
 
 def _modules(mechanism: str) -> list[ModuleType]:

@@ -29,8 +29,7 @@ Standings = Sequence[tuple[str, float, Mapping[str, Mapping[str, Any]]]]
 
 def standings(rows: pd.DataFrame, column: str) -> Standings:
     """Who is ahead at each error on each mechanism, by a column of times; `rows`: of all runs."""
-    medians = tables.medians(rows.assign(call_s=rows[column]))
-    cases = medians.groupby("case", sort=False)
+    cases = tables.medians(rows.assign(call_s=rows[column])).groupby("case", sort=False)
     return [(str(case), error, rivals.standing(own, error)) for (case, own), error in product(cases, rivals.DECADES)]
 
 
@@ -94,6 +93,7 @@ def findings_of(table: pd.DataFrame) -> list[dict[str, Any]]:
             apart = np.exp(np.abs(np.log(both["ratio_one"] / both["ratio_other"])))
             ahead = np.where(turned["verdict_one"] == "ahead", one, other)
             line: dict[str, Any] = {"processors": [one, other], "time": time, "n": len(both)}
+            line["ahead"] = [int((both[f"verdict_{side}"] == "ahead").sum()) for side in ("one", "other")]
             line["turned"] = turned[PLACE].assign(ahead_on=ahead).to_dict("records")
             line["over"] = float((both["ratio_other"] / both["ratio_one"]).median())
             line["same_code"] = bool((both["commit_one"] == both["commit_other"]).all())
@@ -103,13 +103,7 @@ def findings_of(table: pd.DataFrame) -> list[dict[str, Any]]:
 
 
 def rows_of(folder: Path) -> tuple[pd.DataFrame, str]:
-    """The rows of `work_precision` in a folder of reports, and their stamp.
-
-    Raises
-    ------
-    StudyError
-        If there are none.
-    """
+    """The rows of `work_precision` in a folder of reports, and their stamp. Raises StudyError if there are none."""
     path = folder / "work_precision.csv"
     if not path.is_file():
         raise StudyError(f"there is no {path}; run python -m studies.work_precision on the other machine")

@@ -81,10 +81,8 @@ def tags() -> dict[str, tuple[str, ...]]:
 def _end_of_second(problem: Problem) -> Reference:
     """Its state after 10 s by Gauss14, from which DOP853 differs in the last of its digits.
 
-    Raises
-    ------
-    StudyError
-        If a run fails, or the equation in one coordinate, which shares nothing with them, does not agree to FAR.
+    Raises StudyError if a run fails, or the equation in one coordinate, which shares nothing with them, does not agree
+    to FAR.
     """
     t_end, ends = 10.0, []
     for method in ("Gauss14", "DOP853"):
@@ -288,14 +286,8 @@ def picture(rows: pd.DataFrame) -> Figure:
         axes.plot(line["error_q"].astype(float), 1e3 * line["call_s"].astype(float), **look)
         once += [line[line["repeats"] == 1]] if "repeats" in line else []
     single = pd.concat(once) if once else rows[:0]
-    alone: dict[str, Any] = {
-        "linestyle": "",
-        "marker": "+",
-        "color": "black",
-        "markersize": 6,
-        "markeredgewidth": 0.6,
-        "zorder": 4,
-    }
+    alone: dict[str, Any] = {"linestyle": "", "marker": "+", "color": "black", "markersize": 6, "markeredgewidth": 0.6}
+    alone |= {"zorder": 4}
     if len(single):
         errors, times = single["error_q"].astype(float), 1e3 * single["call_s"].astype(float)
         axes.plot(errors, times, **alone, label="timed once")

@@ -21,7 +21,7 @@ from studies.bench.solvers import (
     COMPARED_OWN,
     DEFAULT,
     IDA_C_ORDER_2,
-    IDA_FORMS,
+    IDA_INDEX_1,
     IRK_LINE,
     QUARTER,
     RADAU,
@@ -33,7 +33,7 @@ from studies.compare import GROUP, runs_of
 from studies.work_precision import first_calls, goals, minimal, processors, rivals
 
 ERRORS = (1e-2, 1e-4, 1e-6)  # the accuracies of the first screen
-FURTHER = ("Gauss6", IRK_LINE, QUARTER, f"IDA, {IDA_FORMS[0]}")
+FURTHER = ("Gauss6", IRK_LINE, QUARTER, IDA_INDEX_1)
 STIFF = ("TRBDF2", *RADAU[1:], IDA_C_ORDER_2)  # in their place on stiff cases; the paper's: `studies.beam`
 BETWEEN = (7e-4, 5e-4, 3e-4, 2e-4)  # tolerances of the first of these, whose loose runs lie on no line
 IDA = ("IDA from C", "IDA, ")  # how its lines begin; CVODE is of the same family, and IDAS is CasADi's
@@ -131,8 +131,7 @@ def on_the_same_processor(rows: pd.DataFrame, others: pd.DataFrame) -> pd.DataFr
     """The rows of mechanisms that were measured on the processor on which the others were."""
     if "processor" not in rows or "processor" not in others:
         return rows
-    made_on = others.groupby("case")["processor"].first()
-    return rows[rows["processor"] == rows["case"].map(made_on)]
+    return rows[rows["processor"] == rows["case"].map(others.groupby("case")["processor"].first())]
 
 
 def report(output: Output, rows: pd.DataFrame, line: str) -> dict[str, Any]:
@@ -178,14 +177,9 @@ def asked(rows: pd.DataFrame) -> dict[str, Any]:
     others = rows[rows["family"] != "two-loop"]
     pairs = others.groupby(["solver", "case"]).ngroups
     put = [own for _, own in tables.put(others).groupby(["solver", "case"])]
-    return {
-        "n": pairs,
-        "refused": pairs - len(put),
-        "fewer": sum(not tables.missed(own, 0.0) for own in put),
-        "far": adaptive.FAR,
-        "running": adaptive.RUNNING,
-        "limit": rivals.TIME_LIMIT,
-    }
+    found: dict[str, Any] = {"n": pairs, "refused": pairs - len(put)}
+    found |= {"fewer": sum(not tables.missed(own, 0.0) for own in put), "far": adaptive.FAR}
+    return found | {"running": adaptive.RUNNING, "limit": rivals.TIME_LIMIT}
 
 
 def draw(output: Output, findings: dict[str, Any], everywhere: pd.DataFrame, medians: pd.DataFrame) -> None:

@@ -1,6 +1,7 @@
 """The paper's second example, a flexible beam on a moving base, very flexible and moderately stiff."""
 
 from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -52,19 +53,9 @@ def case(kind: str, name: str, quick: bool, t_end: float | None = None) -> Case:
     """One of the beams, SOFT or STIFF, over 2 s; quick: 0.1 s; or over `t_end`."""
     problem, t_end = MAKE[kind](), t_end or (T_END_QUICK if quick else T_END)
     # the base does work on the beam: its energy is no invariant
-    return Case(
-        name,
-        problem,
-        t_end,
-        partial(_known, problem, t_end),
-        conserved=False,
-        watched=(problem.q0.size - 5,),  # the tip's height
-        tolerances=TOLERANCES,
-        time_limit=TIME_LIMIT,
-        timed=0.004 if quick else 0.1,
-        tags=TAGS[kind],
-        note=NOTE,
-    )
+    about: dict[str, Any] = {"conserved": False, "watched": (problem.q0.size - 5,)}  # the tip's height
+    about |= {"tolerances": TOLERANCES, "time_limit": TIME_LIMIT, "timed": 0.004 if quick else 0.1}
+    return Case(name, problem, t_end, partial(_known, problem, t_end), tags=TAGS[kind], note=NOTE, **about)
 
 
 def cases(quick: bool) -> list[Case]:
