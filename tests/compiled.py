@@ -45,8 +45,6 @@ def centripetal(t, q, v, p, Qd):
 
 PENDULUM = {"mass": unit_mass, "force": weight, "constraint": circle, "jacobian": radius, "gamma": centripetal}
 PENDULUM |= {"n_q": 2, "n_c": 1, "constant_mass": True, "name": "pendulum"}
-
-
 SPRUNG_START = [1.0, 0.0, 2.0, 0.0], [0.0, 0.0, 0.0, 0.0]
 
 

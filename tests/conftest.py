@@ -16,7 +16,6 @@ NEED_STUDIES = (
     *("test_docs.py", "test_rooms.py"),
 )
 collect_ignore = [] if find_spec("pandas") and find_spec("matplotlib") else list(NEED_STUDIES)
-
 settings.register_profile("twoloop", deadline=None, derandomize=True, max_examples=25)
 settings.load_profile("twoloop")
 

@@ -53,10 +53,7 @@ def slider_crank(unit, t=0.0, offset=0.0):
 
     def jacobian(t, q):
         return np.array(
-            [
-                [-r * math.sin(q[0]), -l * math.sin(q[1]), -1.0],
-                [r * math.cos(q[0]), l * math.cos(q[1]), 0.0],
-            ]
+            [[-r * math.sin(q[0]), -l * math.sin(q[1]), -1.0], [r * math.cos(q[0]), l * math.cos(q[1]), 0.0]]
         )
 
     def gamma(t, q, v):

@@ -11,7 +11,6 @@ from twoloop.result import result
 
 PAGE = Path(__file__).parents[1] / "docs" / "errors.md"
 LONGEST = 400  # characters of a message
-
 BEGINNING = """# What happens at what mistake
 
 Wrong input raises before any work, and the message names the argument, what was given and what to do. What goes wrong
@@ -20,8 +19,6 @@ later ends the run with a status: `result.status`, `result.message`, and what wa
 Every line below is a test. Written by `python -m tests.errors_page` from `tests/bad_input`, with the messages
 as they were raised; do not edit it by hand.
 """
-
-
 # what stands above the table of a group
 MEANT = {
     "result.certify": """\
@@ -30,7 +27,7 @@ apart than `certificate.gap`, no step of the run ends more than 200 tolerances f
 than the gap may be missed, and so may what moves every step by less than that. How errors of steps grow over the run
 is not bounded, and whether the model is right is not known. One that does not pass gives a `CertificateWarning` that
 says where. [The certificate](certificate.md) has the details.
-""",
+"""
 }
 
 

@@ -1,11 +1,17 @@
 """Random assemblies with loops and redundant rows, and their accelerations by NumPy's dense algebra alone."""
 
 import numpy as np
+from scipy.linalg import lstsq
 
 from twoloop.mechanisms.planar import GROUND, PlanarBodies
 from twoloop.mechanisms.spatial_bodies import SpatialBodies
 from twoloop.methods.dop853 import DOP853
 from twoloop.run.run import Run
+
+
+def _least(A, b):
+    """The least-norm solution of least squares, by orthogonal factors: a fifth of the time of singular values."""
+    return lstsq(A, b, cond=1e-10, lapack_driver="gelsy")[0]
 
 
 class _Random:
@@ -25,7 +31,7 @@ class _Random:
     def v(self, system):
         """Random velocities that the constraints allow."""
         G, v = system.jacobian(0.0, self.q), self.rng.normal(size=system.n_q)
-        return v - np.linalg.pinv(G, rcond=1e-10) @ (G @ v)
+        return v - _least(G, G @ v)
 
 
 class Assembly(_Random):
@@ -78,8 +84,7 @@ class SpatialAssembly(_Random):
         for k, place in enumerate(self.places):
             R, _ = np.linalg.qr(rng.normal(size=(3, 3)))
             mass = 2.0 ** rng.uniform(-0.5, 0.5)
-            moments = tuple(mass * rng.uniform(0.15, 0.27, 3))
-            self.bodies.body(f"body {k}", mass, moments, place, R * np.linalg.det(R))
+            self.bodies.body(f"body {k}", mass, tuple(mass * rng.uniform(0.15, 0.27, 3)), place, R * np.linalg.det(R))
         tree = self.connect(n, loops, doubles)
         for i, j in tree if springs else ():
             one, other = self.near(i), rng.normal(size=3) if j == GROUND else self.near(j)
@@ -125,8 +130,7 @@ def dense_solution(system, q, v):
     inverse = (right[:rank].T / values[:rank]) @ left[:, :rank].T
     free = np.linalg.solve(root, heavy)
     a = np.linalg.solve(root.T, free + inverse @ ((gamma - rows @ free) / lengths))
-    lam = np.linalg.lstsq(G.T, force - M @ a, rcond=1e-9)[0]
-    return a, lam, rank, float(values[rank - 1] / values[0])
+    return a, _least(G.T, force - M @ a), rank, float(values[rank - 1] / values[0])
 
 
 def started_run(system, q):

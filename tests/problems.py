@@ -11,7 +11,8 @@ from tests.compiled import PENDULUM
 from twoloop import ConstrainedSystem, solve_dae
 from twoloop.kernels.compile.caches import compile_kept
 from twoloop.kernels.compile.linking import KernelCompiler
-from twoloop.kernels.data.common import FORCE_BY_Q_GIVEN, OPTIONS, stamp
+from twoloop.kernels.data.common import OPTIONS, stamp
+from twoloop.kernels.data.flags import FORCE_BY_Q_GIVEN
 from twoloop.kernels.data.kit import Kit
 from twoloop.kernels.evaluation.calls import inner_loop
 from twoloop.kernels.steps.explicit_step import EXPLICIT
@@ -57,8 +58,6 @@ def unconstrained(force, n_q=1, **more):
 
 
 # --- pendulum: unit mass on a unit rod, Cartesian coordinates, closed form by elliptic functions
-
-
 PLAIN = {
     "n_q": 2,
     "n_c": 1,
@@ -125,8 +124,7 @@ def pendulum_state(t, angle=-0.5 * np.pi):
     theta = 2.0 * np.arcsin(k * cn / dn)
     rate = -2.0 * k * w * np.sqrt(1.0 - k * k) * sn / dn
     q = np.array([np.sin(theta), -np.cos(theta)])
-    v = rate * np.array([np.cos(theta), np.sin(theta)])
-    return q, v, rate**2 - G * q[1]
+    return q, (rate * np.array([np.cos(theta), np.sin(theta)])), rate**2 - G * q[1]
 
 
 def pendulum_energy(q, v):
@@ -134,13 +132,10 @@ def pendulum_energy(q, v):
 
 
 # --- rheonomic: the same pendulum under a pivot that moves both ways, so that C_t and C_tt are not zero
-
-
 def _pivot(t):
     p = np.array([0.3 * np.sin(3.0 * t), 0.1 * np.cos(5.0 * t)])
     rate = np.array([0.9 * np.cos(3.0 * t), -0.5 * np.sin(5.0 * t)])
-    acceleration = np.array([-2.7 * np.sin(3.0 * t), -2.5 * np.cos(5.0 * t)])
-    return p, rate, acceleration
+    return p, rate, np.array([-2.7 * np.sin(3.0 * t), -2.5 * np.cos(5.0 * t)])
 
 
 def moving_pivot(*, compile=False, gamma=True):
@@ -198,8 +193,6 @@ def moving_pivot_state(t, start=MOVING_PIVOT_START, end=10.0):
 
 
 # --- double pendulum: two unit masses on two unit rods, Cartesian coordinates; two degrees of freedom
-
-
 def double_pendulum(gamma=True):
     def right_side(t, q, v):
         d = v[2:] - v[:2]
@@ -346,8 +339,6 @@ LINKAGES = {"default": four_bar(), "collinear": four_bar(lengths=(0.8, 1.2, 1.0)
 
 
 # --- what every test of a run wants to know
-
-
 def violations(system, result):
     """Largest violation of the position and of the velocity constraints over all stored states."""
     columns = range(result.t.size)
@@ -377,7 +368,6 @@ def event(function, terminal=None, direction=None):
 
 
 # --- runs that end: one that crawls is to fail, not to hang
-
 START = ([-1.0, 0.0], [0.0, 0.0])
 SWING = ConstrainedSystem(**PENDULUM)
 

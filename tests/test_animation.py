@@ -15,7 +15,6 @@ from twoloop.mechanisms import pendulum, spatial_slider_crank
 from twoloop.result.animation import projected
 
 Image = pytest.importorskip("PIL.Image")  # not among the oldest versions
-
 # a document with what the page asks of it; counts what is drawn, and lets time pass frame by frame
 DOCUMENT = """
 const elements = {};
@@ -79,15 +78,12 @@ def test_the_page_of_a_planar_mechanism(swung, tmp_path):
     scene = scene_of(path)
     frames = np.array(scene["frames"])
     assert frames.shape == (76, 2, 2)  # 3 s of 25 pictures, and the last
-    assert scene["times"][::75] == [0.0, 1.0]
-    assert len(scene["fixed"]) == 1
-    lengths = np.linalg.norm(frames[:, 1] - frames[:, 0], axis=1)
-    assert lengths == pytest.approx(np.ones(76), abs=1e-3)
+    assert scene["times"][::75] == [0.0, 1.0] and len(scene["fixed"]) == 1
+    assert np.linalg.norm(frames[:, 1] - frames[:, 0], axis=1) == pytest.approx(np.ones(76), abs=1e-3)
     for frame, t in zip(frames[::15], np.linspace(0.0, 1.0, 76)[::15], strict=True):
         assert frame[1 - scene["fixed"][0]] == pytest.approx(pendulum().motion(t)[0], abs=1e-3)
     (bob,) = np.array(scene["paths"])  # four points for each frame
-    assert bob.shape == (301, 2)
-    assert np.linalg.norm(bob, axis=1) == pytest.approx(np.ones(301), abs=1e-3)
+    assert bob.shape == (301, 2) and np.linalg.norm(bob, axis=1) == pytest.approx(np.ones(301), abs=1e-3)
     np.testing.assert_array_equal(bob[::4], frames[:, 1 - scene["fixed"][0]])
     assert "http" not in path.read_text(encoding="utf-8")  # needs no other file
 
@@ -118,8 +114,7 @@ def test_a_spatial_page_can_be_turned(crank, tmp_path):
 def test_a_gif(swung, tmp_path):
     path = swung.animate(tmp_path / "swing.gif", seconds=1.0)
     with Image.open(path) as picture:
-        assert picture.n_frames == 26
-        assert picture.info["duration"] == 40
+        assert picture.n_frames == 26 and picture.info["duration"] == 40
         first = np.array(picture.convert("RGB"), dtype=int)
         picture.seek(20)
         later = np.array(picture.convert("RGB"), dtype=int)

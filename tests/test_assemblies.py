@@ -64,8 +64,7 @@ KNOWN = [  # each jumped with success before dependents entered the error test
 @pytest.mark.parametrize("tolerance", [0.03, 0.1, 0.3])
 def test_loose_tolerances_on_a_linkage_that_jumped(method, tolerance):
     lengths, ground, theta3, branch = KNOWN[0]
-    problem = four_bar(lengths, ground, theta3, branch)
-    result = run(problem, 10.0, method=method, rtol=tolerance, atol=tolerance)
+    result = run(four_bar(lengths, ground, theta3, branch), 10.0, method=method, rtol=tolerance, atol=tolerance)
     assert result.success, result.message
     assert same_assembly(lengths, ground, result)
 

@@ -180,8 +180,7 @@ def test_a_callback_is_looked_at_once_and_changes_nothing():
     assert given.within_bounds == {"force"}
     force.py_func = None  # what is looked at again would fail now
     given.force(0.0, q, v)
-    assert q.tolist() == Q
-    assert v.tolist() == V
+    assert q.tolist() == Q and v.tolist() == V
 
 
 def test_negative_indices_count_from_the_end_as_in_python():
@@ -193,8 +192,6 @@ def test_negative_indices_count_from_the_end_as_in_python():
 
 
 # --- what the caller passes
-
-
 @pytest.mark.parametrize("make", [system, pendulum], ids=["compiled", "plain"])
 @pytest.mark.parametrize(
     ("kind", "arguments", "error", "words"),

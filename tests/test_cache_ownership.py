@@ -125,8 +125,7 @@ def test_whose_folders_are_in_doubt(tmp_path, monkeypatch, changes, why, above):
     make_own(folder)
     at = folder.parent if above else folder
     seen_as(monkeypatch, at, **changes)
-    assert doubt_of(folder) == (f"{at} {why}" if why else "")
-    assert (own_folder(folder) == folder) == (not why)
+    assert doubt_of(folder) == (f"{at} {why}" if why else "") and (own_folder(folder) == folder) == (not why)
 
 
 def test_a_sticky_folder_above_is_as_good_as_its_owner(tmp_path, monkeypatch):

@@ -154,12 +154,10 @@ def test_without_a_writable_folder_callbacks_and_kernels_run_and_say_so_once(fol
     blocked = block_caches(folder)
     folder.write("kernels", KERNELS)
     values = folder.run(f"from kernels import *; print(twice(1.0), thrice(1.0))\n{RUN}", **blocked)
-    assert values.split() == ["2.0", "3.0", "one", "1.0", "0", "two", "1.0", "0"]
-    assert folder.said.count(UNWRITABLE) == 1
+    assert values.split() == ["2.0", "3.0", "one", "1.0", "0", "two", "1.0", "0"] and folder.said.count(UNWRITABLE) == 1
 
 
 # --- the digests themselves
-
 NAMED = {"values": 1.0}
 
 
@@ -189,8 +187,7 @@ def test_a_digest_follows_the_values_of_any_type(monkeypatch):
         stamp = watch(names_a_dictionary.py_func)
         assert stamp == watch(names_a_dictionary.py_func)
         seen.add(stamp)
-    assert len(seen) == 13
-    assert None not in seen
+    assert len(seen) == 13 and None not in seen
     monkeypatch.setitem(globals(), "NAMED", object())
     assert watch(names_a_dictionary.py_func) is None
 

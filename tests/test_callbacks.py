@@ -13,7 +13,8 @@ from tests.compiled import centripetal, circle, heavy, radius, unit_mass, weight
 from tests.problems import pendulum
 from twoloop import ConstrainedSystem, Status, callback, solve_dae
 from twoloop.kernels.compile.callbacks import KINDS, OPTIONAL
-from twoloop.kernels.data.common import GIVEN, KIT, Functions
+from twoloop.kernels.data.common import KIT, Functions
+from twoloop.kernels.data.flags import GIVEN
 
 SOURCE = """
 import numpy as np
@@ -115,32 +116,25 @@ def test_plain_functions_are_sent_to_from_python(kind):
 
 
 # --- what follows from an entry of the table
-
 MAKERS = {"the class": ConstrainedSystem, "from_python": ConstrainedSystem.from_python}
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_kind_is_known_everywhere(kind):
     entry = KINDS[kind]
-    assert f'"{kind}" ({", ".join(entry.arguments)})' in callback.__doc__
-    assert (kind in GIVEN) == (kind in OPTIONAL)
-    assert kind in Functions._fields
-    assert KIT.functions[kind] == entry.signature
+    assert f'"{kind}" ({", ".join(entry.arguments)})' in callback.__doc__ and (kind in GIVEN) == (kind in OPTIONAL)
+    assert kind in Functions._fields and KIT.functions[kind] == entry.signature
     for name, maker in MAKERS.items():
         assert f"{kind} : " in maker.__doc__, name
-        parameter = inspect.signature(maker).parameters[kind]
-        assert (parameter.default is None) == (kind in OPTIONAL)
-    method = inspect.signature(getattr(pendulum(), kind))
-    assert tuple(method.parameters) == ("t", *entry.state)
+        assert (inspect.signature(maker).parameters[kind].default is None) == (kind in OPTIONAL)
+    assert tuple(inspect.signature(getattr(pendulum(), kind)).parameters) == ("t", *entry.state)
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_contributing_has_a_row_for_each_kind(kind):
     entry = KINDS[kind]
     rows = [line for line in CONTRIBUTING.splitlines() if f'`"{kind}"`' in line]
-    assert len(rows) == 1
-    assert f"`{', '.join(entry.arguments)}`" in rows[0]
-    assert entry.size in rows[0]
+    assert len(rows) == 1 and f"`{', '.join(entry.arguments)}`" in rows[0] and entry.size in rows[0]
 
 
 CONTRIBUTING = (Path(__file__).parents[1] / "CONTRIBUTING.md").read_text()
@@ -166,8 +160,7 @@ def test_what_is_left_out_leaves_zeros(kind):
     assert kind not in system.given
     values = getattr(system, kind)(0.0, *state)
     for value, zeros in zip(values if KINDS[kind].more else [values], system.arrays_of(kind), strict=True):
-        assert value.shape == zeros.shape
-        assert not value.any()
+        assert value.shape == zeros.shape and not value.any()
 
 
 def test_gamma_left_out_cannot_be_called():

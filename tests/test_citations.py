@@ -26,8 +26,7 @@ def test_every_preset_has_a_source_of_its_own(name):
     text, cited = citation(result), keys(citation(result))
     assert f'(method="{name}")' in text.splitlines()[0]
     assert cited[0] == "zhang2016twoloop" and cited[-1] == "twoloop" and len(cited) > 2
-    assert len(cited) == len(set(cited))
-    assert twoloop.__version__ in text
+    assert len(cited) == len(set(cited)) and twoloop.__version__ in text
 
 
 @pytest.mark.parametrize(

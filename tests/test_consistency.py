@@ -123,17 +123,13 @@ def test_a_start_without_rank_names_its_row():
 
 
 # --- consistent_state
-
-
 def test_a_kept_crank_keeps_its_angle_and_its_speed():
     problem = four_bar(theta3=0.4)
     guess = problem.q0 + 0.02 * np.sin(np.arange(9.0))
     speeds = np.zeros(9)
     speeds[CRANK] = 10.0
     q, v = consistent_state(problem.system, 0.0, guess, speeds, keep=[CRANK])
-    assert q[CRANK] == guess[CRANK]
-    assert v[CRANK] == 10.0
-    assert np.abs(problem.system.constraint(0.0, q)).max() < 1e-14
+    assert q[CRANK] == guess[CRANK] and v[CRANK] == 10.0 and np.abs(problem.system.constraint(0.0, q)).max() < 1e-14
     assert np.abs(problem.system.velocity_constraint(0.0, q, v)).max() < 1e-13
     free = consistent_state(problem.system, 0.0, guess, speeds)[1]
     assert abs(free[CRANK] - 10.0) > 0.5  # without keep it changes
@@ -142,11 +138,8 @@ def test_a_kept_crank_keeps_its_angle_and_its_speed():
 def test_it_says_how_far_it_moved():
     state = consistent_state(pendulum(), 0.0, [0.6, -0.7], [1.0, 0.0], keep=[0])
     q, v = state
-    assert len(state) == 2
-    assert worst(q, [0.6, -0.8]) < 1e-15
-    assert worst(v, [1.0, 0.75]) < 1e-15
-    assert state.moved_q.coordinate == state.moved_v.coordinate == 1
-    assert abs(state.moved_q.change + 0.1) < 1e-15
+    assert len(state) == 2 and worst(q, [0.6, -0.8]) < 1e-15 and worst(v, [1.0, 0.75]) < 1e-15
+    assert state.moved_q.coordinate == state.moved_v.coordinate == 1 and abs(state.moved_q.change + 0.1) < 1e-15
     assert abs(state.moved_v.change - 0.75) < 1e-15
     still = consistent_state(pendulum(), 0.0, q, v)
     assert max(abs(still.moved_q.change), abs(still.moved_v.change)) < 1e-15
@@ -156,8 +149,7 @@ def test_it_says_how_far_it_moved():
 def test_what_it_says_survives_a_copy(again):
     state = consistent_state(pendulum(), 0.0, [0.6, -0.7], [1.0, 0.0], keep=[0])
     copied = again(state)
-    assert (copied[0] == state[0]).all()
-    assert copied.moved_q == state.moved_q
+    assert (copied[0] == state[0]).all() and copied.moved_q == state.moved_q
     assert copied.determinant_sign == state.determinant_sign
 
 
@@ -186,8 +178,7 @@ def test_keeping_too_much_is_refused(keep, default_four_bar):
         consistent_state(problem.system, 0.0, problem.q0, np.arange(9.0), keep=keep)
     # what is consistent needs no freedom
     q, v = consistent_state(problem.system, 0.0, problem.q0, problem.v0, keep=keep)
-    assert (q == problem.q0).all()
-    assert (v == problem.v0).all()
+    assert (q == problem.q0).all() and (v == problem.v0).all()
 
 
 @pytest.mark.parametrize("unit", UNITS.values())
@@ -195,9 +186,7 @@ def test_a_projection_can_be_started_from_at_any_scale(unit):
     case = slider_crank(unit)
     system, q = case.system(), np.array(case.q) * [1.0, 1.02, 0.98]
     q, v = consistent_state(system, 0.0, q, [3.0, 0.0, 0.0], keep=[0])
-    assert v[0] == 3.0
-    assert accepted(system, q, v)
-    assert np.abs(system.constraint(0.0, q)).max() < 1e-15 * 10.0 * unit
+    assert v[0] == 3.0 and accepted(system, q, v) and np.abs(system.constraint(0.0, q)).max() < 1e-15 * 10.0 * unit
 
 
 @pytest.mark.parametrize("unit", UNITS.values())

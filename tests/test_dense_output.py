@@ -92,8 +92,7 @@ def test_order_between_the_steps(default_four_bar, exact, method, order, h):
 def test_on_the_constraints_at_ten_thousand_times(default_four_bar):
     result = run(default_four_bar, 10.0, rtol=1e-6, atol=1e-6, dense_output=True)
     position, velocity = violations(default_four_bar.system, result.sol(np.linspace(0.0, 10.0, 10_001)))
-    assert position < 1e-14
-    assert velocity < 1e-13
+    assert position < 1e-14 and velocity < 1e-13
 
 
 @pytest.mark.parametrize("method", ["SunRadau5", "Gauss12", "BDF", "RadauIIA5"])
@@ -107,15 +106,13 @@ def test_at_a_step_the_state_is_the_one_stored(default_four_bar, method):
 def test_accelerations_and_multipliers_belong_to_the_state(default_four_bar):
     result = run(default_four_bar, 1.0, dense_output=True)
     state = result.sol(between(result))
-    assert force_residual(default_four_bar.system, state) < 1e-11
-    assert state.a.shape == state.q.shape
+    assert force_residual(default_four_bar.system, state) < 1e-11 and state.a.shape == state.q.shape
     assert state.lam.shape == (8, state.t.size)
 
 
 def test_a_run_has_the_same_steps_with_and_without(default_four_bar):
     with_it, without = run(default_four_bar, 2.0, dense_output=True), run(default_four_bar, 2.0)
-    assert (with_it.q == without.q).all()
-    assert with_it.stats.n_evaluations == without.stats.n_evaluations
+    assert (with_it.q == without.q).all() and with_it.stats.n_evaluations == without.stats.n_evaluations
     assert without.sol is None
 
 
@@ -126,10 +123,8 @@ def test_times_in_any_order_one_by_one_or_together(times):
     assert together.q.shape == (2, len(times))
     for k, t in enumerate(times):
         alone = sol(t)
-        assert alone.q.shape == alone.v.shape == alone.a.shape == (2,)
-        assert alone.lam.shape == (1,)
-        assert worst(alone.q, together.q[:, k]) < 1e-15
-        assert worst(alone.v, together.v[:, k]) < 1e-15
+        assert alone.q.shape == alone.v.shape == alone.a.shape == (2,) and alone.lam.shape == (1,)
+        assert worst(alone.q, together.q[:, k]) < 1e-15 and worst(alone.v, together.v[:, k]) < 1e-15
         assert worst(alone.q, pendulum_state(t)[0]) < 1e-6
 
 
@@ -170,10 +165,8 @@ def test_vibrations_that_are_stepped_over_leave_no_noise():
     result = solve_dae(*span, "RadauIIA5", 1e-2, 1e-2, dense_output=True)
     known, state = exact.sol(between(result)), result.sol(between(result))
     at_steps = exact.sol(result.t)
-    assert result.stats.n_jacobians > 0
-    assert worst(state.q, known.q) < 3.0 * worst(result.q, at_steps.q)
-    assert worst(state.v, known.v) < 3.0 * worst(result.v, at_steps.v)
-    assert violations(problem.system, state)[0] < 1e-13
+    assert result.stats.n_jacobians > 0 and worst(state.q, known.q) < 3.0 * worst(result.q, at_steps.q)
+    assert worst(state.v, known.v) < 3.0 * worst(result.v, at_steps.v) and violations(problem.system, state)[0] < 1e-13
 
 
 @pytest.mark.parametrize("method", ["SunRadau5", "DOP853"])
@@ -188,8 +181,7 @@ def test_far_from_zero(method):
 @pytest.mark.parametrize("method", ["DOP853", "Gauss8"])
 def test_a_run_of_few_steps_covers_what_was_computed(default_four_bar, method, max_steps):
     result = run(default_four_bar, 1.0, method=method, max_steps=max_steps, dense_output=True)
-    assert result.status == Status.MAX_STEPS
-    assert (result.sol.t_min, result.sol.t_max) == (0.0, result.t[-1])
+    assert result.status == Status.MAX_STEPS and (result.sol.t_min, result.sol.t_max) == (0.0, result.t[-1])
     assert worst(result.sol(0.5 * result.t[-1]).q[:, None], result.q) < 0.1
     with pytest.raises(ValueError, match="must lie within the run"):
         result.sol(1.0)
@@ -197,9 +189,7 @@ def test_a_run_of_few_steps_covers_what_was_computed(default_four_bar, method, m
 
 def test_a_run_without_a_step():
     result = swing(dense_output=True, step_size=2.0, method="Gauss12")
-    assert result.status == Status.NOT_CONVERGED
-    assert result.t.size == 1
-    assert (result.sol(0.0).q == result.q[:, 0]).all()
+    assert result.status == Status.NOT_CONVERGED and result.t.size == 1 and (result.sol(0.0).q == result.q[:, 0]).all()
 
 
 def test_where_no_interior_states_are_found_the_neighbours_serve(default_four_bar, exact, monkeypatch):
@@ -215,8 +205,7 @@ def test_more_intervals_than_are_kept(default_four_bar, exact, monkeypatch):
     at_once = result.sol(t)
     monkeypatch.setattr("twoloop.run.dense.KEPT", 5)
     again = run(default_four_bar, 1.0, method="Gauss6", rtol=1e-8, atol=1e-8, dense_output=True)
-    assert worst(again.sol(t).q, at_once.q) < 1e-12
-    assert len(again.sol.interpolator.filled) <= 10
+    assert worst(again.sol(t).q, at_once.q) < 1e-12 and len(again.sol.interpolator.filled) <= 10
 
 
 @pytest.mark.parametrize("method", ["SunRadau5", "Gauss8"])

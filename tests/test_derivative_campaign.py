@@ -94,8 +94,6 @@ def test_entries_in_each_others_place_are_found(unit):
 
 
 # --- formulas that hold near the start only
-
-
 @pytest.mark.parametrize("unit", UNITS.values())
 @pytest.mark.parametrize("kind", ["jacobian", "gamma"])
 def test_terms_that_vanish_at_the_start_are_found_later(unit, kind):
@@ -180,8 +178,6 @@ def test_no_state_of_a_run_raises_a_false_alarm(problem, end):
 
 
 # --- what is right is accepted
-
-
 def nasty(name, constraint, jacobian, q, t=0.0, **rest):
     return Case(name, len(q), {"constraint": constraint, "jacobian": jacobian, **rest}, q, t)
 
@@ -287,13 +283,10 @@ def ready():
 @pytest.mark.parametrize(("system", "t", "q", "v"), list(ready()))
 def test_correct_systems_are_accepted(system: ConstrainedSystem, t, q, v):
     check_derivatives(system, t, np.array(q, dtype=float))
-    assert system.checked
-    assert wrong_derivative(system, t, np.array(q, dtype=float), np.array(v, dtype=float)) is None
+    assert system.checked and wrong_derivative(system, t, np.array(q, dtype=float), np.array(v, dtype=float)) is None
 
 
 # --- what else is checked at the start
-
-
 def test_a_mass_that_is_not_constant_is_found():
     @callback("mass")
     def mass(t, q, p, M):
@@ -310,5 +303,4 @@ def test_a_bandwidth_is_checked_without_constraints_too():
     coupled = problems.unconstrained(lambda t, q, v: -q[::-1], 2, bandwidth=0, name="free")
     with pytest.raises(ValueError, match="bandwidth of 'free' must be at least 1"):
         solve_dae(coupled, (0.0, 0.1), *problems.START)
-    apart = problems.unconstrained(lambda t, q, v: -q, 2, bandwidth=0)
-    assert solve_dae(apart, (0.0, 0.1), *problems.START).success
+    assert solve_dae(problems.unconstrained(lambda t, q, v: -q, 2, bandwidth=0), (0.0, 0.1), *problems.START).success

@@ -9,7 +9,8 @@ from twoloop import ConstrainedSystem, consistent_state, consistent_states, ense
 from twoloop.generate.derived import standing_for
 from twoloop.generate.traced_equations import Equations
 from twoloop.generate.traced_values import unchecked
-from twoloop.kernels.data.common import DONE, KIT, VECTOR, WORK, f8, i8
+from twoloop.kernels.data.codes import DONE
+from twoloop.kernels.data.common import KIT, VECTOR, WORK, f8, i8
 from twoloop.kernels.evaluation.accelerations import acceleration_constraint
 from twoloop.kernels.evaluation.constraints import constraint_rows
 from twoloop.run.workspace import kit_of, workspace
@@ -61,8 +62,7 @@ def test_they_are_those_of_the_formulas(absent):
     q, v = np.array([0.6, -0.8, 0.3]), np.array([1.0, 2.0, -3.0])
     given, less = bar(), bar(**dict.fromkeys(absent))
     rows, gamma, traced = in_kernels(less, 0.1, q, v)
-    assert traced
-    assert np.allclose(rows, given.jacobian(0.1, q), rtol=1e-14, atol=1e-15)
+    assert traced and np.allclose(rows, given.jacobian(0.1, q), rtol=1e-14, atol=1e-15)
     assert np.allclose(gamma, given.gamma(0.1, q, v), rtol=1e-14, atol=1e-15)
 
 
@@ -120,15 +120,13 @@ def test_a_motion_without_them_is_the_motion_with_them(method):
     for absent in ((), ("gamma",), ("jacobian", "gamma")):
         system = pendulum(**dict.fromkeys(absent))
         ends.append(solve_dae(system, (0.0, 1.0), [0.6, -0.8], [0.8, 0.6], method, 1e-9, 1e-9).q[:, -1])
-    assert np.allclose(ends[1], ends[0], rtol=0.0, atol=1e-12)
-    assert np.allclose(ends[2], ends[0], rtol=0.0, atol=1e-12)
+    assert np.allclose(ends[1], ends[0], rtol=0.0, atol=1e-12) and np.allclose(ends[2], ends[0], rtol=0.0, atol=1e-12)
 
 
 def test_what_branches_is_differenced():
     system = pendulum(jacobian=lambda t, q: q[None, :] if q[0] > -2.0 else 2.0 * q[None, :], gamma=None)
     other, traced = standing_for(system, unchecked)
-    assert other is system and traced == ()
-    assert solve_dae(system, (0.0, 1.0), [0.6, -0.8], [0.8, 0.6]).success
+    assert other is system and traced == () and solve_dae(system, (0.0, 1.0), [0.6, -0.8], [0.8, 0.6]).success
 
 
 def test_all_given_is_left_alone():
@@ -208,12 +206,10 @@ def test_where_a_derivative_overflows_differences_take_its_place():
     system = switched_on(2000.0)
     q0, v0 = consistent_state(system, 0.0, [0.0, 0.3, -0.95], [0.0, 0.0, 0.0])
     rows, gamma, traced = in_kernels(system, 0.0, q0, v0)
-    assert traced
-    assert np.allclose(rows, [[1.0, 0.0, 0.0], [-2.0 * q0[1], 2.0 * q0[1], 2.0 * q0[2]]], atol=1e-7)
+    assert traced and np.allclose(rows, [[1.0, 0.0, 0.0], [-2.0 * q0[1], 2.0 * q0[1], 2.0 * q0[2]]], atol=1e-7)
     assert np.allclose(gamma, 0.0, atol=1e-7)
     result = solve_dae(system, (0.0, 1.0), q0, v0, rtol=1e-6, atol=1e-6)
-    assert result.success
-    assert result.q[0, -1] == pytest.approx(1.0, abs=1e-6)
+    assert result.success and result.q[0, -1] == pytest.approx(1.0, abs=1e-6)
 
 
 def test_where_there_is_no_second_derivative_a_motion_goes_on():
@@ -233,9 +229,7 @@ def test_products_may_be_a_thousand_deep():
 
     system = pendulum(constraint=constraint, jacobian=None, gamma=None)
     rows, gamma, traced = in_kernels(system, 0.0, np.array([1.0, 0.0]), np.array([0.0, 1.0]))
-    assert traced
-    assert np.allclose(rows, [[1.0, 1.0]], rtol=1e-12)
-    assert gamma[0] == pytest.approx(1000.0 * 1e-6, rel=1e-9)
+    assert traced and np.allclose(rows, [[1.0, 1.0]], rtol=1e-12) and gamma[0] == pytest.approx(1000.0 * 1e-6, rel=1e-9)
 
 
 def test_a_result_keeps_the_system_that_was_given():

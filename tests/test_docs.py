@@ -16,7 +16,6 @@ from twoloop.methods.presets import PRESETS
 from twoloop.run.record import explained
 
 mpl = pytest.importorskip("matplotlib")  # not among the oldest versions
-
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 PAGES = sorted(page.stem for page in DOCS.glob("*.md"))
@@ -73,19 +72,15 @@ def test_the_code_of_the_readme(tmp_path, monkeypatch):
 
 
 # --- what the pages promise
-
-
 def test_start_here_has_the_right_motion(names):
     page = names("start")
-    assert page["result"].success and page["other"].success
-    assert page["error"] < 1e-7 and page["violation"] < 1e-13
+    assert page["result"].success and page["other"].success and page["error"] < 1e-7 and page["violation"] < 1e-13
     assert np.ptp(page["energies"]) < 1e-6
     drawing, corners = page["problem"].drawing, [page[name] for name in "OABD"]
     ends = drawing.at(page["result"].q)[np.array(drawing.bars)]
     bars = sorted(np.linalg.norm(b - a, axis=0).mean() for a, b in ends)
     assert bars == pytest.approx(sorted(np.linalg.norm(np.subtract(b, a)) for a, b in pairwise(corners)))
-    assert page["by_hand"].success
-    assert np.abs(page["by_hand"].q[:2, -1] - page["corner"]).max() < 1e-6
+    assert page["by_hand"].success and np.abs(page["by_hand"].q[:2, -1] - page["corner"]).max() < 1e-6
 
 
 def test_a_fit_with_the_step_that_the_page_names_finds_the_masses(names):
@@ -132,15 +127,13 @@ def test_every_kind_of_constraint_does_what_its_section_says(names):
 def test_the_adapter_of_the_page_has_the_order_of_its_method(names):
     page = names("benchmark")
     errors = page["rows"].query("solver == 'RATTLE'")["error_q"].to_numpy()
-    assert errors[0] / errors[1] == pytest.approx(100.0, rel=0.1)
-    assert (page["rows"]["status"] == "REACHED_END").all()
+    assert errors[0] / errors[1] == pytest.approx(100.0, rel=0.1) and (page["rows"]["status"] == "REACHED_END").all()
 
 
 def test_many_runs(names):
     page = names("many_runs")
     assert page["runs"].success.all() and page["q0"].shape == (2000, 9)
-    assert page["result"].success and page["again"].success
-    assert np.ptp(page["high"] - page["low"]) > 1e-3
+    assert page["result"].success and page["again"].success and np.ptp(page["high"] - page["low"]) > 1e-3
     sizes = pictures(page)
     assert min(sizes["tolerances.png"], sizes["workspace.png"]) > 5000
 
@@ -155,26 +148,21 @@ def test_the_red_example_is_as_printed(names):
 
 def test_dense_output(names):
     page = names("between_steps")
-    assert page["state"].q.shape == (9, 10_001)
-    assert np.isfinite(page["state"].lam).all()
+    assert page["state"].q.shape == (9, 10_001) and np.isfinite(page["state"].lam).all()
     assert (page["again"].sol(3.21).q == page["_results"][0].sol(3.21).q).all()
 
 
 def test_reactions(names):
     page = names("between_steps")
     pin = page["pin"]
-    assert pin.force.shape == (2, 1001)
-    assert np.abs(pin.torque).max() < 1e-10 * np.abs(pin.force).max()
+    assert pin.force.shape == (2, 1001) and np.abs(pin.torque).max() < 1e-10 * np.abs(pin.force).max()
     assert page["clamp"].force[:, -1] == pytest.approx([0.0, 29.43], abs=1e-10)
     assert page["clamp"].torque[-1] == pytest.approx(14.715, abs=1e-10)
 
 
 def test_the_third_event_ends_the_run(names):
-    page = names("between_steps")
-    result = page["result"]
-    assert result.status == 1
-    assert result.t_events[0].size == 3
-    assert np.abs(result.q_events[0][:, 8] - 1.0).max() < 1e-14
+    result = names("between_steps")["result"]
+    assert result.status == 1 and result.t_events[0].size == 3 and np.abs(result.q_events[0][:, 8] - 1.0).max() < 1e-14
     assert (result.v_events[0][:, 8] > 0.0).all()
 
 
@@ -184,8 +172,7 @@ def test_impacts(names):
     arcs, problem = page["rebounds"].arcs, page["problem"]
     assert len(arcs) > 3
     for before, after in pairwise(arcs):
-        assert abs(before.q[8, -1] - 1.0) < 1e-14
-        assert after.t[0] == before.t[-1]
+        assert abs(before.q[8, -1] - 1.0) < 1e-14 and after.t[0] == before.t[-1]
         assert after.v[8, 0] == pytest.approx(-0.6 * before.v[8, -1], rel=1e-12)
         # one degree of freedom: of the kinetic energy 0.36 is left
         q, v = before.q[:, -1], before.v[:, -1]
@@ -220,24 +207,19 @@ def test_all_three_are_one_mechanism(names):
             first, *others = (system.evaluate(kind, 0.0, *state) for system in systems)
             assert all(np.abs(other - first).max() < 1e-13 * max(1.0, np.abs(first).max()) for other in others)
     ends = [solve_dae(s, (0.0, 2.0), page["q0"], page["v0"], rtol=1e-8, atol=1e-8).q[:, -1] for s in systems]
-    assert np.ptp(ends, axis=0).max() < 1e-5
-    assert page["problem"].q0 == pytest.approx(page["q0"], abs=1e-14)
+    assert np.ptp(ends, axis=0).max() < 1e-5 and page["problem"].q0 == pytest.approx(page["q0"], abs=1e-14)
     assert page["turned"].q[[0, 2], -1] == pytest.approx(ends[0][[0, 2]], abs=1e-5)  # SymPy's joints
     assert np.ptp(page["energy"]) < 1e-5
 
 
 def test_what_the_page_says_of_the_others(names):
     page = names("your_mechanism")
-    assert page["problem"].conserved
-    assert not page["start"].conserved
-    assert page["heavier"].system.given == page["problem"].system.given
-    assert page["heavier"].parameters["m3"] == 3.0
+    assert page["problem"].conserved and not page["start"].conserved
+    assert page["heavier"].system.given == page["problem"].system.given and page["heavier"].parameters["m3"] == 3.0
     assert np.ptp(page["swing"].energy(page["swung"].t, page["swung"].q, page["swung"].v)) < 1e-4
 
 
 # --- statuses
-
-
 @pytest.mark.parametrize("status", [status for status in Status if status < 0], ids=lambda status: status.name)
 def test_every_failure_leads_to_a_section_with_cause_and_remedy(status):
     assert explained(status) == f" See docs/when_it_fails.md#{status.name.lower()}."
@@ -248,8 +230,7 @@ def test_every_failure_leads_to_a_section_with_cause_and_remedy(status):
 
 def test_the_message_of_a_failed_run_ends_with_it(names):
     result = names("when_it_fails")["result"]
-    assert result.status is Status.NOT_FINITE
-    assert result.message.endswith(explained(Status.NOT_FINITE))
+    assert result.status is Status.NOT_FINITE and result.message.endswith(explained(Status.NOT_FINITE))
 
 
 def test_success_is_not_explained():
@@ -257,7 +238,6 @@ def test_success_is_not_explained():
 
 
 # --- the reference has an entry for all that a user can import
-
 ENTRIES = set(
     re.findall(
         r"^\.\. auto(?:class|function|exception):: (\S+)", (DOCS / "reference.md").read_text("utf-8"), re.MULTILINE
@@ -277,8 +257,6 @@ def test_so_has_every_method_that_a_name_stands_for():
 
 
 # --- links, and what is generated
-
-
 def test_links_lead_to_files_that_are_there():
     """Also on GitHub, but for the pages that only the build makes; headings are checked by the build."""
     for page in PAGES:

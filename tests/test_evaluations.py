@@ -15,7 +15,6 @@ TOLERANCES = (1e-3, 1e-5, 1e-7, 1e-9)
 ERROR = 1e-5  # of a coordinate at the end ...
 LOOSE = {"Newmark": 1e-3}  # ... but of a method of second order
 ELSEWHERE = {"PaperIRK", "PaperNewmark", "TRBDF2", "ESDIRK4"}  # bounded in tests of their own
-
 BOUNDS = {  # on the four-bar, on Andrews' mechanism
     "auto": (290, 27_000),
     "SunRadau5": (830, 70_000),

@@ -68,8 +68,7 @@ def pendulum(parameters, force=spring):
 
 
 def run(system, compiled="auto", method="auto"):
-    length = system.parameters[3]
-    return solve_dae(system, SPAN, [length, 0.0], [0.0, 0.5], method, 1e-10, 1e-10, compiled=compiled)
+    return solve_dae(system, SPAN, [system.parameters[3], 0.0], [0.0, 0.5], method, 1e-10, 1e-10, compiled=compiled)
 
 
 @callback("force")
@@ -118,8 +117,7 @@ def by_knock(t, q, v, p, Q):
 
 @callback("force")
 def by_arrays(t, q, v, p, Q):
-    roots = np.sqrt(p)
-    Q[0], Q[1] = -roots[1] * q[0], -p[0] * 9.81
+    Q[0], Q[1] = -np.sqrt(p)[1] * q[0], -p[0] * 9.81
 
 
 PARAMETERS = [
@@ -132,8 +130,7 @@ PARAMETERS = [
 @pytest.mark.parametrize("parameters", PARAMETERS, ids=str)
 def test_a_run_is_what_it_is_without_code(parameters, method):
     made, expected = (run(pendulum(parameters), compiled, method) for compiled in ("auto", False))
-    assert made.success and expected.success
-    assert made.compiled and expected.compiled is False
+    assert made.success and expected.success and made.compiled and expected.compiled is False
     assert np.abs(made.q[:, -1] - expected.q[:, -1]).max() < 1e-7
 
 
@@ -150,8 +147,7 @@ def test_numbers_of_other_parameters_are_those_that_are_traced_for_them(make):
     expected = StraightLine(other, code.shared.equations.choice, _alone(other).parameters)
     near = np.array([problem.q0, problem.v0]) + random.uniform(-0.1, 0.1, (5, 2, system.n_q))
     states = np.column_stack([np.linspace(0.0, 0.1, 5), near.reshape(5, -1)])
-    assert code.traced.wrong(other, states) is None
-    assert expected.traced.wrong(other, states) is None
+    assert code.traced.wrong(other, states) is None and expected.traced.wrong(other, states) is None
 
 
 @pytest.mark.parametrize("first", [1e-14, 5e-324, 1e30, 1.3000000001, 0.4])

@@ -18,13 +18,7 @@ from twoloop.generate.straight_code import write_function
 from twoloop.generate.straight_line import Factors, Outputs, Solution, StraightLine
 from twoloop.generate.tracing import Form, Graph
 from twoloop.kernels.compile.own_functions import OwnFunctions, object_code
-from twoloop.mechanisms import (
-    andrews,
-    four_bar,
-    heavy_top,
-    rolling_disc,
-    spatial_four_bar,
-)
+from twoloop.mechanisms import andrews, four_bar, heavy_top, rolling_disc, spatial_four_bar
 
 
 def read_by(graph, outputs):
@@ -65,8 +59,7 @@ def test_factors_that_are_kept_solve_for_any_right_hand_side(make):
     M, G = system.mass(0.0, problem.q0), system.rows(0.0, problem.q0)
     r, c = rng.standard_normal(len(M)), rng.standard_normal(len(G))
     _, (a, lam) = compute(solution.graph, solution.solved, (r, c, kept))
-    assert holds
-    assert np.abs(M @ a + G.T @ lam - r).max() < 1e-10 * np.abs(G.T @ lam).max()
+    assert holds and np.abs(M @ a + G.T @ lam - r).max() < 1e-10 * np.abs(G.T @ lam).max()
     assert np.abs(G @ a - c).max() < 1e-10
 
 
@@ -91,8 +84,7 @@ def test_elimination_solves_what_dense_linear_algebra_solves(n, m, seed):
     b = rng.standard_normal(n + m)
     known = dict(enumerate(np.concatenate([matrix.ravel(), b]).tolist()))
     x = [evaluated(form, known) for form in factors.solve(right)]
-    assert np.allclose(x, np.linalg.solve(matrix, b), rtol=1e-6, atol=1e-9)
-    assert len(factors.conditions) == m
+    assert np.allclose(x, np.linalg.solve(matrix, b), rtol=1e-6, atol=1e-9) and len(factors.conditions) == m
     shares = [evaluated(one, known) / evaluated(other, known) for one, other in factors.conditions]
     assert all(0.0 < share < 1.0 + 1e-9 for share in shares)
     assert all(evaluated(form, known) > 0.0 for form in factors.positive)
@@ -138,8 +130,7 @@ def test_beyond_the_angles_that_it_takes_and_where_nothing_is_finite_it_says_so(
 
 
 def test_numbers_that_cancel_leave_no_rounding():
-    graph = Graph()
-    x, y = graph.inputs(2, False)
+    x, y = Graph().inputs(2, False)
     assert not ((0.1 * x + 0.2 * y) * 3.0 - 0.3 * x - 0.6 * y).terms
     assert (1e-12 * x + (0.1 + 0.2) * y - 0.3 * y).terms == {0: 1e-12}
 

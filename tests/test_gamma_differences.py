@@ -68,8 +68,7 @@ def test_what_cannot_reach_the_tolerance_is_a_status():
     q0, v0 = start(shaken(10.0), 10.0)
     run = solve_dae(system, (0.0, 1.0), q0, v0, check_derivatives=False)
     assert run.status is Status.NOT_CONVERGED
-    assert "gamma by differences" in run.message and "Give gamma, or loosen rtol" in run.message
-    assert run.t[0] == 0.0
+    assert "gamma by differences" in run.message and "Give gamma, or loosen rtol" in run.message and run.t[0] == 0.0
 
 
 def test_differences_where_all_coordinates_are_zero():
@@ -80,9 +79,7 @@ def test_differences_where_all_coordinates_are_zero():
         gamma=False,
     )
     run = solve_dae(system, (0.0, 0.5), [0.0, 0.0], [3.0, 0.0], "Gauss8", 1e-9, 1e-9)
-    assert worst(run.a[:, 0], [0.0, 18.0]) < 1e-6
-    energy = 0.5 * (run.v**2).sum(axis=0) + 9.81 * run.q[1]
-    assert worst(energy, 4.5) < 1e-7
+    assert worst(run.a[:, 0], [0.0, 18.0]) < 1e-6 and worst(0.5 * (run.v**2).sum(axis=0) + 9.81 * run.q[1], 4.5) < 1e-7
 
 
 def test_rest_and_a_turning_point_need_no_shorter_differences():

@@ -93,8 +93,7 @@ def test_systems_keep_their_functions_in_other_processes(method):
     with multiprocessing.get_context(method).Pool(1) as pool:
         for k, system in enumerate(systems, 1):  # all but the first arrive where others are already
             there, others = pool.apply(observed_beside_others, (system,))
-            assert there == observed(system)
-            assert others == [[0.0, -98.1]] * 5 * k
+            assert there == observed(system) and others == [[0.0, -98.1]] * 5 * k
         assert pool.apply(energy_at_the_end, (result,)) == (result.energy[-1], "four-bar")
 
 
@@ -126,8 +125,7 @@ def test_changed_parameters_travel():
 
 
 def test_a_compiled_callback_at_the_top_level_travels_by_name():
-    copied = pickle.loads(pickle.dumps(SYSTEMS["compiled"]()))
-    assert copied.functions.force is PENDULUM["force"]
+    assert pickle.loads(pickle.dumps(SYSTEMS["compiled"]())).functions.force is PENDULUM["force"]
 
 
 def test_a_compiled_callback_within_a_function_travels_with_its_source():
@@ -178,6 +176,4 @@ def test_numbers_that_lead_to_no_function_are_refused():
 
 def test_handles_cannot_be_guessed_and_fit_a_float():
     handles = {int(made().functions.p[0]) for _ in range(50)}
-    assert len(handles) == 50
-    assert max(handles) < 2**52
-    assert max(handles) - min(handles) > 2**40
+    assert len(handles) == 50 and max(handles) < 2**52 and max(handles) - min(handles) > 2**40

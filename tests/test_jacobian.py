@@ -28,8 +28,7 @@ def test_it_agrees_with_the_formula(problem):
 
 @pytest.mark.parametrize("root", [False, True], ids=["square", "root"])
 @pytest.mark.parametrize(
-    ("length", "offset"),
-    [(1.0, 0.0), (1e-3, 0.0), (1e-6, 0.0), (1e6, 0.0), (1.0, 3e5), (1e-3, 1e3)],
+    ("length", "offset"), [(1.0, 0.0), (1e-3, 0.0), (1e-6, 0.0), (1e6, 0.0), (1.0, 3e5), (1e-3, 1e3)]
 )
 def test_each_coordinate_has_a_displacement_of_its_own(root, length, offset):
     # a pendulum about (offset, 0); with the root its constraint bends on the scale of the length
@@ -47,11 +46,7 @@ def test_each_coordinate_has_a_displacement_of_its_own(root, length, offset):
 @pytest.mark.parametrize("angle", [0.0, 1e-3, 1.0, 1e3, 1e5])
 def test_angles_of_any_size(angle):
     system = ConstrainedSystem.from_python(
-        n_q=1,
-        n_c=1,
-        mass=np.eye(1),
-        force=lambda t, q, v: np.zeros(1),
-        constraint=lambda t, q: np.sin(3.0 * q + 0.3),
+        n_q=1, n_c=1, mass=np.eye(1), force=lambda t, q, v: np.zeros(1), constraint=lambda t, q: np.sin(3.0 * q + 0.3)
     )
     assert worst(system.jacobian(0.0, [angle]), 3.0 * np.cos(3.0 * angle + 0.3)) < 1e-12
 
@@ -79,20 +74,15 @@ def compiled_pendulum(jacobian):
 def test_a_run_without_jacobian_is_as_good(make):
     result = swing(system=make(jacobian=None), rtol=1e-10, atol=1e-10)
     q, v, lam = pendulum_state(result.t)
-    assert result.success
-    assert worst(result.q, q) < 1e-8
-    assert worst(result.v, v) < 1e-8
-    assert worst(result.lam, lam) < 1e-6
+    assert result.success and worst(result.q, q) < 1e-8 and worst(result.v, v) < 1e-8 and worst(result.lam, lam) < 1e-6
 
 
 def test_differences_of_differences_lose_digits_as_documented():
     q, v = moving_pivot_state(0.0)
     full = moving_pivot()
-    less = functions_of(full) | {"jacobian": None, "gamma": None}
-    system = ConstrainedSystem.from_python(n_q=2, n_c=1, **less)
+    system = ConstrainedSystem.from_python(n_q=2, n_c=1, **functions_of(full) | {"jacobian": None, "gamma": None})
     runs = [solve_dae(each, (0.0, 0.01), q, v, rtol=1e-9, atol=1e-9) for each in (full, system)]
-    assert all(run.success for run in runs)
-    assert 1e-13 < worst(runs[0].lam[:, 0], runs[1].lam[:, 0]) < 1e-8
+    assert all(run.success for run in runs) and 1e-13 < worst(runs[0].lam[:, 0], runs[1].lam[:, 0]) < 1e-8
 
 
 def test_a_constraint_that_goes_out_of_bounds_is_still_found():

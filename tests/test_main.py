@@ -15,7 +15,6 @@ from twoloop.mechanisms import four_bar
 
 pd = pytest.importorskip("pandas")  # not among the oldest versions
 pytest.importorskip("matplotlib")
-
 ROOT = Path(__file__).parents[1]
 FILE = """
 from twoloop.mechanisms import four_bar, heavy_top
@@ -79,8 +78,7 @@ def test_compile_names_every_file(capsys):
     folder = Path(kernels.__file__).parent
     files = {path.relative_to(folder).with_suffix("") for path in folder.rglob("*.py") if path.stem != "__init__"}
     names = {".".join(path.parts) for path in files}
-    assert {line.split()[3] for line in lines[:-1]} == names
-    assert lines[-1].startswith("ready after")
+    assert {line.split()[3] for line in lines[:-1]} == names and lines[-1].startswith("ready after")
 
 
 def test_solve_writes_what_the_endings_say(where, tmp_path, capsys):
@@ -94,8 +92,7 @@ def test_solve_writes_what_the_endings_say(where, tmp_path, capsys):
     for table in (pd.read_csv(files[0], index_col=0), pd.read_parquet(files[1])):
         np.testing.assert_array_equal(table["angle (rad) of bar 3"], alone.q[8])
     np.testing.assert_array_equal(twoloop.load(files[4]).q, alone.q)
-    assert Path(files[2]).read_bytes().startswith(b"\x89PNG")
-    assert "<canvas" in Path(files[3]).read_text()
+    assert Path(files[2]).read_bytes().startswith(b"\x89PNG") and "<canvas" in Path(files[3]).read_text()
 
 
 def test_solve_compiles_the_equations_when_asked_to(where, capsys, monkeypatch):
@@ -159,8 +156,7 @@ def test_mistakes_are_one_line(where, words, says):
 
 
 def test_unknown_commands_and_methods_are_usage_errors(where, capsys):
-    assert ended([]) == 2
-    assert ended(["solve", where, "--method", "Guass8"]) == 2
+    assert ended([]) == 2 and ended(["solve", where, "--method", "Guass8"]) == 2
     assert "invalid choice: 'Guass8'" in capsys.readouterr().err
 
 

@@ -18,8 +18,7 @@ def test_presets_are_those_promised():
 @pytest.mark.parametrize("order", range(4, 17, 2))
 def test_gauss_presets_have_the_order_of_their_name(order):
     tableau = PRESETS[f"Gauss{order}"].tableau
-    assert tableau.order == order
-    assert tableau.stages == order // 2
+    assert tableau.order == order and tableau.stages == order // 2
 
 
 @pytest.mark.parametrize("name", ["SunRadau5", "PaperIRK"])
@@ -34,11 +33,8 @@ def test_methods_are_frozen():
 
 
 def test_papers_newmark_has_beta_as_printed_and_takes_another():
-    assert paper_newmark().beta == 0.5
-    assert paper_newmark().gamma == 0.5
-    assert paper_newmark(beta=0.25).beta == 0.25
-    assert paper_newmark(1e-5, 1e-7).inner_tol == 1e-5
-    assert paper_newmark(1e-5, 1e-7).error_tol == 1e-7
+    assert paper_newmark().beta == 0.5 and paper_newmark().gamma == 0.5 and paper_newmark(beta=0.25).beta == 0.25
+    assert paper_newmark(1e-5, 1e-7).inner_tol == 1e-5 and paper_newmark(1e-5, 1e-7).error_tol == 1e-7
 
 
 def test_papers_presets_name_their_deviations():

@@ -61,8 +61,6 @@ def test_the_tools_of_both_test_runs_are_the_same():
 
 
 # --- private parts of numba: in one folder, of versions that are known, and put back after each compilation
-
-
 def test_other_versions_of_numba_are_refused_with_what_to_install():
     for known in ("0.61.0", "0.68.1", "0.68.0rc1"):
         check_version(known)
@@ -85,6 +83,5 @@ def test_private_parts_of_numba_are_used_in_one_folder():
 def test_numba_is_its_own_after_kernels_were_compiled_or_read():
     from twoloop.kernels import advance
 
-    assert advance.advance.overloads
-    assert arrayobj.fix_integer_index.__module__ == "numba.np.arrayobj"
+    assert advance.advance.overloads and arrayobj.fix_integer_index.__module__ == "numba.np.arrayobj"
     assert "get_call_type" not in vars(Function) and Function.get_call_type is BaseFunction.get_call_type

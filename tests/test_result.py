@@ -24,8 +24,7 @@ def result(status=Status.REACHED_END, n_t=2, stats=None):
 
 
 def test_zero_is_the_end_one_an_event_negative_a_failure():
-    assert Status.REACHED_END == 0
-    assert Status.EVENT == 1
+    assert Status.REACHED_END == 0 and Status.EVENT == 1
     assert all(status < 0 for status in Status if status not in (Status.REACHED_END, Status.EVENT))
     assert len({int(status) for status in Status}) == len(Status)
 
@@ -37,9 +36,7 @@ def test_success_is_a_status_that_is_not_negative(status):
 
 def test_repr_says_status_message_and_the_counts_that_are_known():
     text = repr(result(Status.MAX_STEPS, stats=Statistics(n_accepted=1, n_evaluations=17)))
-    assert "MAX_STEPS" in text
-    assert "Said so." in text
-    assert "n_evaluations=17" in text
+    assert "MAX_STEPS" in text and "Said so." in text and "n_evaluations=17" in text
     assert "n_inner" not in text  # not told
     assert "t[-1]=1" in text
 

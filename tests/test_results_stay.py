@@ -20,8 +20,6 @@ OTHER = [1.0, 2.0, 1.5, 2.9]  # lengths of the default four-bar, its ground a li
 
 
 # --- parameters
-
-
 def test_parameters_cannot_be_written_to(default_four_bar):
     result = run(default_four_bar, 0.5, dense_output=True)
     before, system = result.sol(0.31), default_four_bar.system
@@ -79,10 +77,8 @@ def test_the_energy_of_generated_equations_goes_along():
     q = x, y = [sympy.Function(name)(t) for name in "xy"]
     T = m * sum(each.diff(t) ** 2 for each in q) / 2
     made = from_lagrangian(T, m * g * y, [x**2 + y**2 - 1], q, parameters={m: 2.0, g: 10.0})
-    problem = made.problem([1.0, 0.0], [0.0, 0.0], (0.0, 0.1))
-    system = problem.system.with_parameters([2.0, 5.0])
-    result = solve_dae(system, (0.0, 0.3), [0.6, 0.8], [0.0, 0.0])
-    assert worst(result.energy, 2.0 * 5.0 * 0.8) < 1e-6
+    system = made.problem([1.0, 0.0], [0.0, 0.0], (0.0, 0.1)).system.with_parameters([2.0, 5.0])
+    assert worst(solve_dae(system, (0.0, 0.3), [0.6, 0.8], [0.0, 0.0]).energy, 2.0 * 5.0 * 0.8) < 1e-6
 
 
 @pytest.mark.parametrize("compile", [False, True])
@@ -119,8 +115,6 @@ def test_a_helper_that_writes_to_parameters_is_refused():
 
 
 # --- an event before the first output
-
-
 @pytest.mark.parametrize("options", [{}, {"dense_output": True}, {"method": "SunRadau5"}, {"step_size": 0.125}])
 def test_an_event_before_the_first_output_ends_the_run(options):
     early = event(lambda t, q, v: t - 0.2, terminal=True)
@@ -132,8 +126,6 @@ def test_an_event_before_the_first_output_ends_the_run(options):
 
 
 # --- Ctrl-C
-
-
 class Counted:
     """A function that calls something at one of its calls, or at all from it on."""
 
@@ -181,8 +173,7 @@ def check_part(part, full):
     assert part.q.shape == part.v.shape == part.a.shape == (2, n) and part.lam.shape == (1, n)
     assert (part.t == full.t[:n]).all() and worst_or_zero(part.q, full.q[:, :n]) < 1e-6
     there = np.isfinite(part.a).all(axis=0)
-    assert worst_or_zero(part.a[:, there], full.a[:, :n][:, there]) < 1e-4
-    assert part.h.size == part.stats.n_accepted
+    assert worst_or_zero(part.a[:, there], full.a[:, :n][:, there]) < 1e-4 and part.h.size == part.stats.n_accepted
     for found, known in zip(part.t_events or [], full.t_events or [], strict=True):
         assert worst_or_zero(found, known[: found.size]) < 1e-6
     if part.sol is not None and n:

@@ -50,6 +50,5 @@ def test_errors_of_velocities_count_for_as_long_as_the_motion_lasts():
 def test_times_before_zero_are_like_others(at):
     """What is refused at one place does not hold steps short at another."""
     problem = mechanisms.pendulum()
-    span = (at, at + 1.0)
-    result = solve_dae(problem.system, span, problem.q0, problem.v0, "ESDIRK4", 1e-6, 1e-6)
+    result = solve_dae(problem.system, (at, at + 1.0), problem.q0, problem.v0, "ESDIRK4", 1e-6, 1e-6)
     assert result.stats.n_accepted < 130

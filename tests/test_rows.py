@@ -55,18 +55,7 @@ def row(**more):
     ],
 )
 def test_a_mistake_is_named_by_line_and_field(more, says):
-    rows, found = mistakes(
-        [
-            "",
-            text_of([row()]),
-            text_of(
-                [
-                    row(value=1e-7, **{}) | {},
-                ]
-            ),
-            text_of([row(**more)]),
-        ]
-    )
+    rows, found = mistakes(["", text_of([row()]), text_of([row(value=1e-7, **{}) | {}]), text_of([row(**more)])])
     assert len(rows) == 2 and found and all(each.startswith("line 4: ") for each in found)
     assert any(says.replace("\\\\", "\\") in each for each in found), found
 

@@ -17,30 +17,18 @@ from tests.problems import (
     violations,
     worst,
 )
-from twoloop import (
-    ConstrainedSystem,
-    ConstraintWarning,
-    RungeKutta,
-    Status,
-    paper_irk,
-    paper_newmark,
-    solve_dae,
-)
+from twoloop import ConstrainedSystem, ConstraintWarning, RungeKutta, Status, paper_irk, paper_newmark, solve_dae
 from twoloop.methods.presets import PRESETS
 from twoloop.methods.tableaux import gauss, sun_radau_iib
 
+
 # --- accuracy
-
-
 @pytest.mark.parametrize("constant_mass", [True, False])
 def test_pendulum_in_plain_python_agrees_with_its_closed_form_to_nine_digits(constant_mass):
     times = np.linspace(0.0, 10.0, 21)
-    system = pendulum(constant_mass=constant_mass)
-    result = swing(10.0, system, rtol=1e-10, atol=1e-10, t_eval=times)
+    result = swing(10.0, pendulum(constant_mass=constant_mass), rtol=1e-10, atol=1e-10, t_eval=times)
     q, v, _ = pendulum_state(times)
-    assert result.success
-    assert worst(result.q, q) < 5e-10
-    assert worst(result.v, v) < 2e-9
+    assert result.success and worst(result.q, q) < 5e-10 and worst(result.v, v) < 2e-9
 
 
 # of the others: tests/kernels/adaptive.py; the bounds are about 1.3 times what was counted when they were written
@@ -48,9 +36,7 @@ def test_pendulum_in_plain_python_agrees_with_its_closed_form_to_nine_digits(con
 def test_error_and_price_of_ten_seconds(default_four_bar, method, bound):
     runs = [run(default_four_bar, method=method, rtol=tol, atol=tol) for tol in (1e-4, 1e-6, 1e-8)]
     errors = [worst(result.q[:, -1], default_four_bar.reference.q) for result in runs]
-    assert errors[1] < 0.5 * errors[0]
-    assert errors[2] < 0.5 * errors[1]
-    assert errors[2] < 1e-8
+    assert errors[1] < 0.5 * errors[0] and errors[2] < 0.5 * errors[1] and errors[2] < 1e-8
     assert runs[2].stats.n_evaluations < bound
 
 
@@ -58,27 +44,20 @@ def test_angles_beyond_a_turn():
     # fast enough to go round and round: every coordinate becomes dependent in turn
     result = solve_dae(pendulum(), (0.0, 3.0), [0.0, -1.0], [9.0, 0.0], rtol=1e-9, atol=1e-9)
     energy = pendulum_energy(result.q, result.v)
-    assert result.stats.n_partitions > 8
-    assert worst(energy, energy[0]) < 1e-6
-    assert result.q[1].max() > 0.99
+    assert result.stats.n_partitions > 8 and worst(energy, energy[0]) < 1e-6 and result.q[1].max() > 0.99
 
 
 def test_time_may_start_anywhere(default_four_bar):
     problem = default_four_bar
     late = solve_dae(problem.system, (-3.0, 2.0), problem.q0, problem.v0, rtol=1e-10, atol=1e-10)
-    assert late.t[0] == -3.0
-    assert late.t[-1] == 2.0
+    assert late.t[0] == -3.0 and late.t[-1] == 2.0
     assert worst(late.q[:, -1], trajectory(problem.parameters, [5.0])[0][:, 0]) < 1e-9
 
 
 # --- output
-
-
 def test_every_accepted_step_is_stored_by_default():
     result = swing()
-    assert result.t[0] == 0.0
-    assert result.t[-1] == 2.0
-    assert result.t.size == result.stats.n_accepted + 1
+    assert result.t[0] == 0.0 and result.t[-1] == 2.0 and result.t.size == result.stats.n_accepted + 1
     np.testing.assert_allclose(np.diff(result.t), result.h, rtol=0, atol=1e-14)
     assert (result.q[:, 0] == START[0]).all()
 
@@ -88,37 +67,30 @@ def test_every_accepted_step_is_stored_by_default():
 )
 def test_output_times_are_landed_on_exactly(times):
     result = swing(t_eval=times, rtol=1e-9, atol=1e-9)
-    assert result.success
-    assert (result.t == times).all()
+    assert result.success and (result.t == times).all()
     q, v, _ = pendulum_state(np.array(times))
-    assert worst(result.q, q) < 1e-8
-    assert worst(result.v, v) < 1e-7
+    assert worst(result.q, q) < 1e-8 and worst(result.v, v) < 1e-7
     assert result.h.sum() == pytest.approx(2.0, abs=1e-13)  # the run goes to its end all the same
 
 
 def test_more_output_than_a_buffer_holds(default_four_bar):
     times = np.linspace(0.0, 10.0, 3001)
     result = run(default_four_bar, t_eval=times, method="Gauss6")
-    assert (result.t == times).all()
-    assert worst(result.q, trajectory(default_four_bar.parameters, times)[0]) < 1e-7
+    assert (result.t == times).all() and worst(result.q, trajectory(default_four_bar.parameters, times)[0]) < 1e-7
     assert worst(run(default_four_bar, method="Newmark").h.sum(), 10.0) < 1e-11  # more steps than a buffer holds
 
 
 # --- step sizes
-
-
 def test_first_step_is_tried_first():
     assert swing(first_step=1e-3).h[0] == 1e-3
     # of a run of which it is less than a hundredth, as no longer step is tried
     refused = solve_dae(pendulum(), (0.0, 60.0), *START, first_step=0.5, rtol=1e-10, atol=1e-10)
-    assert refused.h[0] < 0.5
-    assert refused.stats.n_rejected_error + refused.stats.n_rejected_convergence > 0
+    assert refused.h[0] < 0.5 and refused.stats.n_rejected_error + refused.stats.n_rejected_convergence > 0
 
 
 def test_a_first_step_longer_than_the_span_is_cut():
     result = solve_dae(pendulum(), (0.0, 1e-3), *START, first_step=1.0)
-    assert result.success
-    assert result.t[-1] == 1e-3
+    assert result.success and result.t[-1] == 1e-3
 
 
 @pytest.mark.parametrize("method", ["SunRadau5", "PaperIRK", "Newmark", "BDF", "DOP853", "Adams"])
@@ -126,21 +98,14 @@ def test_max_step_is_respected(method):
     free = swing(method=method, rtol=1e-5, atol=1e-5)
     bound = 0.5 * free.h.max()
     bounded = swing(method=method, rtol=1e-5, atol=1e-5, max_step=bound)
-    assert bounded.h.max() <= bound
-    assert bounded.stats.n_accepted >= free.stats.n_accepted
+    assert bounded.h.max() <= bound and bounded.stats.n_accepted >= free.stats.n_accepted
 
 
 # --- endings
-
-
 def test_max_steps_ends_the_run_with_what_there_is():
     whole, part = swing(), swing(max_steps=7)
-    assert part.status == Status.MAX_STEPS
-    assert not part.success
-    assert part.stats.n_accepted == len(part.h) == 7
-    assert part.t.size == 8
-    assert (part.q == whole.q[:, :8]).all()
-    assert "max_steps = 7" in part.message
+    assert part.status == Status.MAX_STEPS and not part.success and part.stats.n_accepted == len(part.h) == 7
+    assert part.t.size == 8 and (part.q == whole.q[:, :8]).all() and "max_steps = 7" in part.message
     assert f"t = {part.t[-1]:.6g}"[:8] in part.message
     assert swing(max_steps=whole.stats.n_accepted).success  # just enough
 
@@ -163,18 +128,14 @@ CROSSING = ((0.0, 2.0), [-1.0, -1.0, 0.0], [1.0, 1.0, 0.0])
 
 def test_a_step_that_ends_on_a_singular_position_is_a_status():
     result = solve_dae(crossing_lines(), *CROSSING, step_size=0.5, t_eval=[0.5, 1.0, 2.0])
-    assert not result.success
-    assert result.status in (Status.RANK_LOST, Status.STEP_TOO_SMALL)
-    assert (result.t == [0.5]).all()
-    assert "t = 0.5:" in result.message
-    assert "singular" in result.message
+    assert not result.success and result.status in (Status.RANK_LOST, Status.STEP_TOO_SMALL)
+    assert (result.t == [0.5]).all() and "t = 0.5:" in result.message and "singular" in result.message
 
 
 def test_an_output_time_on_a_singular_position_is_warned_of():
     with pytest.warns(ConstraintWarning) as caught:
         result = solve_dae(crossing_lines(), *CROSSING, t_eval=[0.5, 1.0, 2.0])
-    assert ["at 1 of " in str(each.message) for each in caught] == [True, True]
-    assert result.success
+    assert ["at 1 of " in str(each.message) for each in caught] == [True, True] and result.success
     assert worst(result.q, np.array([[-0.5, 0.0, 1.0], [-0.5, 0.0, 1.0], [0.0, 0.0, 0.0]])) < 1e-8
     assert np.isnan(result.a[:, 1]).all() and np.isfinite(result.a[:, [0, 2]]).all()
 
@@ -184,27 +145,22 @@ def test_progress_draws_a_bar(capsys):
     quiet = swing()
     assert capsys.readouterr().out == ""
     shown = swing(progress=True)
-    assert "100%" in capsys.readouterr().out
-    assert (shown.q == quiet.q).all()
+    assert "100%" in capsys.readouterr().out and (shown.q == quiet.q).all()
 
 
 # --- statistics
-
-
 @pytest.mark.parametrize("method", ["SunRadau5", "Gauss12", "PaperIRK", "Newmark", "BDF", "DOP853", "PaperNewmark"])
 def test_counts_are_consistent(default_four_bar, method):
     result = run(default_four_bar, 3.0, method=method, rtol=1e-6, atol=1e-6)
     stats = result.stats
     assert len(result.h) == stats.n_accepted == result.t.size - 1
     attempts = stats.n_accepted + stats.n_rejected_error + stats.n_rejected_convergence
-    assert stats.n_outer >= attempts
-    assert stats.n_evaluations >= attempts
+    assert stats.n_outer >= attempts and stats.n_evaluations >= attempts
     if method == "DOP853":
         assert stats.n_inner >= stats.n_accepted  # ends of steps alone are put on the constraints
     else:
         assert stats.n_inner >= stats.n_evaluations - attempts - 1  # every evaluation but those at ends of steps
-    assert 1 <= stats.n_partitions <= stats.n_factorizations
-    assert stats.n_factorizations > stats.n_inner
+    assert 1 <= stats.n_partitions <= stats.n_factorizations and stats.n_factorizations > stats.n_inner
     assert stats.cpu_time > 0.0
 
 
@@ -225,8 +181,7 @@ def test_what_happened_before_each_step_adds_up_to_the_counts(default_four_bar, 
             ("rejected_error", short.stats.n_rejected_error),
             ("rejected_convergence", short.stats.n_rejected_convergence),
         ):
-            assert getattr(short, name).shape == (k,)
-            assert (getattr(short, name) == getattr(whole, name)[:k]).all()
+            assert getattr(short, name).shape == (k,) and (getattr(short, name) == getattr(whole, name)[:k]).all()
             assert getattr(whole, name)[:k].sum() == counted
         assert (short.partitioned == whole.partitioned[:k]).all()
 
@@ -240,14 +195,10 @@ def test_evaluations_are_calls_of_the_force():
 
     result = swing(1.0, pendulum(force=force))
     looks = 2000 + 100 + 40 + 5 + 36  # each twenty begins twice, those of short steps at first; checks at start and end
-    assert 0 <= len(calls) - result.stats.n_evaluations <= looks
-    assert min(calls) >= 0.0
-    assert max(calls) <= 1.0 + 1e-12
+    assert 0 <= len(calls) - result.stats.n_evaluations <= looks and min(calls) >= 0.0 and max(calls) <= 1.0 + 1e-12
 
 
 # --- functions in plain Python
-
-
 @pytest.mark.parametrize("method", ["auto", "DOP853", "Taylor"])
 def test_a_closure_that_changes_is_followed(method):
     gravity = [9.81]
@@ -255,8 +206,7 @@ def test_a_closure_that_changes_is_followed(method):
     heavy = swing(system=system, method=method)
     gravity[0] = 1.0
     light = swing(system=system, method=method)
-    assert worst(heavy.q[:, -1], pendulum_state(2.0)[0]) < 1e-6
-    assert worst(light.q[:, -1], heavy.q[:, -1]) > 0.1
+    assert worst(heavy.q[:, -1], pendulum_state(2.0)[0]) < 1e-6 and worst(light.q[:, -1], heavy.q[:, -1]) > 0.1
     gravity[0] = 9.81
     assert (swing(system=system, method=method).q == heavy.q).all()
 
@@ -286,14 +236,10 @@ def test_systems_do_not_disturb_each_other():
 def test_input_is_not_changed(default_four_bar):
     q0, v0, times = default_four_bar.q0.copy(), default_four_bar.v0.copy(), np.array([0.5, 1.0])
     solve_dae(default_four_bar.system, (0.0, 1.0), q0, v0, t_eval=times)
-    assert (q0 == default_four_bar.q0).all()
-    assert (v0 == 0.0).all()
-    assert (times == [0.5, 1.0]).all()
+    assert (q0 == default_four_bar.q0).all() and (v0 == 0.0).all() and (times == [0.5, 1.0]).all()
 
 
 # --- tolerances of the loops and prices. Bounds are about 1.3 times what was counted when they were written
-
-
 def test_a_loose_outer_loop_is_cheaper_and_worse_a_tight_one_dearer_and_no_better(default_four_bar):
     reference = default_four_bar.reference.q
     cost, error = {}, {}
@@ -301,21 +247,18 @@ def test_a_loose_outer_loop_is_cheaper_and_worse_a_tight_one_dearer_and_no_bette
         result = run(default_four_bar, method=RungeKutta(sun_radau_iib(3), outer_tol=outer_tol))
         cost[outer_tol] = result.stats.n_evaluations
         error[outer_tol] = worst(result.q[:, -1], reference)
-    assert cost[1e-5] < cost[None] < cost[1e-13]
-    assert error[1e-5] > 3.0 * error[None]
+    assert cost[1e-5] < cost[None] < cost[1e-13] and error[1e-5] > 3.0 * error[None]
     assert error[None] < 2.0 * error[1e-13]
 
 
 def test_price_and_accuracy_of_the_papers_method_over_100_s(default_four_bar):
     result = run(default_four_bar, 100.0, method=paper_irk(1e-9, 1e-9), rtol=1e-5, atol=1e-5)
-    assert result.success
-    assert result.stats.n_evaluations < 210_000
+    assert result.success and result.stats.n_evaluations < 210_000
     assert np.median(result.h) > 0.02  # "in most time", Sect. 4.1
     assert violations(default_four_bar.system, result)[0] < 1e-9
     energy = default_four_bar.energy(result.t, result.q, result.v)
     assert worst(energy, energy[0]) < 1e-2
-    truth = trajectory(default_four_bar.parameters, [100.0])[0][:, 0]
-    assert worst(result.q[:, -1], truth) < 1e-2
+    assert worst(result.q[:, -1], trajectory(default_four_bar.parameters, [100.0])[0][:, 0]) < 1e-2
 
 
 @pytest.mark.parametrize("beta", [0.5, 0.25])
@@ -328,8 +271,7 @@ def test_newmark_pays_three_to_five_times_as_much_per_two_decades(default_four_b
     growth = np.array(counts[1:]) / counts[:-1]
     if beta == 0.25:
         growth = growth[1:]  # the run that is lost at 1e-3 is of another motion
-    assert (growth > 3.0).all()
-    assert (growth < 5.0).all()
+    assert (growth > 3.0).all() and (growth < 5.0).all()
     assert spans[0] > 1.0  # err_out = 1e-3 loses the solution
     assert spans[3] < 1e-2
 

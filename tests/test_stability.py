@@ -8,22 +8,9 @@ import numpy as np
 import pytest
 
 from tests.problems import event
-from twoloop import DOP853, ConstrainedSystem, Status, solve_dae
-from twoloop.kernels.data import common
+from twoloop import DOP853, ConstrainedSystem, Status, mechanisms, solve_dae
+from twoloop.kernels.data import codes
 from twoloop.kernels.steps import adams_step as kernels
-from twoloop.mechanisms import (
-    bricard,
-    closed_chain,
-    double_pendulum,
-    four_bar,
-    governor,
-    heavy_top,
-    moderately_stiff_beam,
-    pendulum,
-    rolling_disc,
-    spatial_four_bar,
-    spatial_slider_crank,
-)
 from twoloop.methods import adams, dop853
 from twoloop.run.stability import Looks, said_of_stiffness
 
@@ -38,33 +25,32 @@ def run(problem, end, method, tol, **options):
 @pytest.mark.parametrize(
     ("make", "end", "tol", "method", "what"),
     [
-        (moderately_stiff_beam, 0.1, 1e-2, "Adams", "vibrations of 3.*e.04 rad/s"),
-        (moderately_stiff_beam, 0.1, 1e-4, "Adams", "vibrations of 3.*e.04 rad/s"),
-        (moderately_stiff_beam, 0.3, 1e-2, "DOP853", "vibrations of 3.*e.04 rad/s"),
-        (moderately_stiff_beam, 0.3, 1e-2, DOP853("restored"), "vibrations of 3.*e.04 rad/s"),
-        (governor, 2.0, 1e-4, "Adams", "a decay of .*e.03 1/s"),
-        (governor, 2.0, 1e-4, "DOP853", "a decay of .*e.03 1/s"),
+        (mechanisms.moderately_stiff_beam, 0.1, 1e-2, "Adams", "vibrations of 3.*e.04 rad/s"),
+        (mechanisms.moderately_stiff_beam, 0.1, 1e-4, "Adams", "vibrations of 3.*e.04 rad/s"),
+        (mechanisms.moderately_stiff_beam, 0.3, 1e-2, "DOP853", "vibrations of 3.*e.04 rad/s"),
+        (mechanisms.moderately_stiff_beam, 0.3, 1e-2, DOP853("restored"), "vibrations of 3.*e.04 rad/s"),
+        (mechanisms.governor, 2.0, 1e-4, "Adams", "a decay of .*e.03 1/s"),
+        (mechanisms.governor, 2.0, 1e-4, "DOP853", "a decay of .*e.03 1/s"),
     ],
 )
 def test_steps_at_the_limit_of_stability_are_said_to_be(make, end, tol, method, what):
     result = run(make(), end, method, tol)
-    assert result.success
-    assert result.message.count(STIFF) == 1
+    assert result.success and result.message.count(STIFF) == 1
     assert re.search(what, result.message), result.message
     for name in ("'auto'", "'RadauIIA9'", "'TRBDF2'"):
         assert name in result.message
 
 
 SMOOTH = [
-    (four_bar, 10.0),
-    (pendulum, 10.0),
-    (double_pendulum, 10.0),
-    (lambda: closed_chain(10), 2.0),
-    (heavy_top, 2.0),
-    (bricard, 10.0),
-    (rolling_disc, 5.0),
-    (spatial_four_bar, 5.0),
-    (spatial_slider_crank, 5.0),
+    (mechanisms.four_bar, 10.0),
+    (mechanisms.pendulum, 10.0),
+    (mechanisms.double_pendulum, 10.0),
+    (lambda: mechanisms.closed_chain(10), 2.0),
+    (mechanisms.heavy_top, 2.0),
+    (mechanisms.bricard, 10.0),
+    (mechanisms.rolling_disc, 5.0),
+    (mechanisms.spatial_four_bar, 5.0),
+    (mechanisms.spatial_slider_crank, 5.0),
 ]
 
 
@@ -75,22 +61,21 @@ SMOOTH = [
 def test_smooth_motion_is_not_called_stiff(make, end, tol, method):
     never = event(lambda t, q, v: 1.0, terminal=True)  # has Python look at a run every 16 attempts
     result = run(make(), end, method, tol, events=never)
-    assert result.success
-    assert STIFF not in result.message
+    assert result.success and STIFF not in result.message
 
 
 def test_tight_tolerances_limit_the_steps_of_the_beam_by_accuracy():
     for method, tol in (("Adams", 1e-8), ("DOP853", 1e-6)):
-        assert STIFF not in run(moderately_stiff_beam(), 0.1, method, tol).message
+        assert STIFF not in run(mechanisms.moderately_stiff_beam(), 0.1, method, tol).message
 
 
 def test_methods_for_stiff_motion_and_the_default_say_nothing():
     for method in ("auto", "TRBDF2", "RadauIIA5", "Gauss8"):
-        assert STIFF not in run(moderately_stiff_beam(), 0.1, method, 1e-3).message
+        assert STIFF not in run(mechanisms.moderately_stiff_beam(), 0.1, method, 1e-3).message
 
 
 def test_a_run_that_stops_for_its_steps_says_it_too():
-    result = run(moderately_stiff_beam(), 1.0, "Adams", 1e-3, max_steps=3000)
+    result = run(mechanisms.moderately_stiff_beam(), 1.0, "Adams", 1e-3, max_steps=3000)
     assert result.status is Status.MAX_STEPS
     assert STIFF in result.message and result.message.endswith("See docs/when_it_fails.md#max_steps.")
 
@@ -116,8 +101,7 @@ def test_a_stiff_spring_in_python_is_seen(method, monkeypatch):
         result = solve_dae(stiff, (0.0, 0.3), *start, method=method, rtol=1e-4, atol=1e-4)
         messages.append(result.message)
     found = re.search(r"vibrations of (\S+) rad/s", result.message)
-    assert result.success and found and float(found[1]) == pytest.approx(1e4, rel=0.05)
-    assert messages[0] == messages[1]
+    assert result.success and found and float(found[1]) == pytest.approx(1e4, rel=0.05) and messages[0] == messages[1]
 
 
 def test_a_rate_that_one_look_does_not_show_is_found_by_the_next():
@@ -126,7 +110,7 @@ def test_a_rate_that_one_look_does_not_show_is_found_by_the_next():
     class Kit:
         def inner(self, kit, work, task, t, q, v, tol, a, lam):
             a[:] = [3.0 * v[0], -1e8 * q[1]]
-            return common.DONE
+            return codes.DONE
 
     looks = Looks(DOP853().plan(2, 1e-6, 1e-6, False))
     looks.pass_by(np.full(1000, 6e-4))
@@ -138,10 +122,8 @@ def test_a_rate_that_one_look_does_not_show_is_found_by_the_next():
 
 
 def test_counts_are_those_of_the_run_alone():
-    problem = moderately_stiff_beam()
-    stats = run(problem, 0.1, "Adams", 1e-3).stats
-    attempts = stats.n_accepted + stats.n_rejected_error
-    assert stats.n_evaluations <= 2 * attempts + stats.n_rejected_convergence + 1
+    stats = run(mechanisms.moderately_stiff_beam(), 0.1, "Adams", 1e-3).stats
+    assert stats.n_evaluations <= 2 * (stats.n_accepted + stats.n_rejected_error) + stats.n_rejected_convergence + 1
 
 
 def radius(order, squared, damping):
@@ -198,5 +180,4 @@ def test_few_states_are_kept_of_many():
         looks.pass_by(np.full(16, 1e-3))
         looks.take(float(k), np.zeros(8), 2)
     times = np.array([look.t for look in looks.kept])
-    assert 4 <= len(times) <= 8
-    assert np.ptp(np.diff(times)) == 0.0 and times[-1] > 800.0
+    assert 4 <= len(times) <= 8 and np.ptp(np.diff(times)) == 0.0 and times[-1] > 800.0

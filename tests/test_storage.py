@@ -39,10 +39,8 @@ def test_there_and_back(default_four_bar, tmp_path, method):
     again = twoloop.load(tmp_path / "again.npz", default_four_bar.system)
     t = np.linspace(0.0, 1.0, 57)
     one, other = result.sol(t), again.sol(t)
-    assert np.abs(one.q - other.q).max() < 1e-12
-    assert np.abs(one.v - other.v).max() < 1e-11
-    assert np.abs(one.lam - other.lam).max() < 1e-9
-    assert (again.sol.t_min, again.sol.t_max) == (0.0, 1.0)
+    assert np.abs(one.q - other.q).max() < 1e-12 and np.abs(one.v - other.v).max() < 1e-11
+    assert np.abs(one.lam - other.lam).max() < 1e-9 and (again.sol.t_min, again.sol.t_max) == (0.0, 1.0)
 
 
 def test_without_the_system_there_is_no_dense_solution(default_four_bar, tmp_path):

@@ -10,39 +10,28 @@ from numba import njit
 from tests.compiled import unit_mass
 from tests.problems import pendulum, unconstrained, worst
 from tests.processes import run_python
-from twoloop import ConstrainedSystem, ConstraintWarning, callback
+from twoloop import ConstrainedSystem, ConstraintWarning, callback, mechanisms
 from twoloop.generate import stage_code, straight_code
 from twoloop.generate.straight_code import own_code
 from twoloop.kernels.compile import caches
-from twoloop.kernels.data.common import BY_GENERAL, DONE
-from twoloop.kernels.evaluation import calls
-from twoloop.mechanisms import (
-    andrews,
-    bricard,
-    driven_crank,
-    four_bar,
-    governor,
-    heavy_top,
-    knife_edge,
-    redundant_slider_crank,
-    rolling_disc,
-    spatial_four_bar,
-)
+from twoloop.kernels.data.codes import DONE
+from twoloop.kernels.data.noted import BY_GENERAL
+from twoloop.kernels.evaluation import tasks
 from twoloop.methods.presets import PRESETS
 from twoloop.run.run import Run
 from twoloop.solve import solve_dae
 
 MECHANISMS = [
-    four_bar,
-    andrews,
-    driven_crank,
-    heavy_top,
-    spatial_four_bar,
-    governor,
-    redundant_slider_crank,
-    bricard,
-    knife_edge,
-    rolling_disc,
+    mechanisms.four_bar,
+    mechanisms.andrews,
+    mechanisms.driven_crank,
+    mechanisms.heavy_top,
+    mechanisms.spatial_four_bar,
+    mechanisms.governor,
+    mechanisms.redundant_slider_crank,
+    mechanisms.bricard,
+    mechanisms.knife_edge,
+    mechanisms.rolling_disc,
 ]
 ending_at_a_reference = pytest.mark.filterwarnings("ignore::twoloop.ConstraintWarning")
 
@@ -79,20 +68,22 @@ def test_accelerations_off_the_constraints_are_those_of_the_general_inner_loop(m
         q = problem.q0 + 1e-4 * rng.standard_normal(problem.q0.size)
         v = problem.v0 + 1e-2 * rng.standard_normal(problem.q0.size)
         if general.rank < general.work.Rate.size:  # off the constraints it matters which of redundant rows are kept
-            _, q, v, *_ = inner(general, calls.PROJECT, 0.1, q, v)
-        expected, known = (inner(run, calls.EVALUATE_THERE, 0.1, q, v) for run in (general, own))
+            _, q, v, *_ = inner(general, tasks.PROJECT, 0.1, q, v)
+        expected, known = (inner(run, tasks.EVALUATE_THERE, 0.1, q, v) for run in (general, own))
         assert known[0] == expected[0] == DONE
         assert worst(known[3], expected[3]) < 1e-9 * max(1.0, np.abs(expected[3]).max())
 
 
 @ending_at_a_reference
-@pytest.mark.parametrize("make", [make for make in MECHANISMS if make not in (knife_edge, rolling_disc)])
+@pytest.mark.parametrize(
+    "make", [make for make in MECHANISMS if make not in (mechanisms.knife_edge, mechanisms.rolling_disc)]
+)
 def test_a_state_is_moved_to_the_nearest_on_the_constraints(make):
     problem, rng = make(), np.random.default_rng(4)
     system, run = problem.system, run_of(problem, True)
     q0 = problem.q0 + 1e-6 * rng.standard_normal(problem.q0.size)
     v0 = problem.v0 + 1e-3 * rng.standard_normal(problem.q0.size)
-    code, q, v, a, lam = inner(run, calls.PROJECT, 0.0, q0, v0)
+    code, q, v, a, lam = inner(run, tasks.PROJECT, 0.0, q0, v0)
     assert code == DONE and run.work.notes[BY_GENERAL] == 0.0  # not by the general inner loop
     M, G = system.mass(0.0, q), system.jacobian(0.0, q)
     assert np.abs(system.constraint(0.0, q)).max() < 1e-13 * max(1.0, np.abs(q).max())
@@ -105,8 +96,7 @@ def test_a_state_is_moved_to_the_nearest_on_the_constraints(make):
     size = max(1.0, np.abs(force).max(), np.abs(G.T @ lam).max())
     assert np.abs(M @ a + G.T @ lam - force).max() < 1e-10 * size
     if run.rank < len(lam):  # of least norm
-        unseen = np.linalg.svd(G.T)[2][run.rank :]
-        assert np.abs(unseen @ lam).max() < 1e-8 * np.abs(lam).max()
+        assert np.abs(np.linalg.svd(G.T)[2][run.rank :] @ lam).max() < 1e-8 * np.abs(lam).max()
 
 
 @ending_at_a_reference
@@ -137,8 +127,7 @@ def test_a_mass_that_is_not_definite_any_more_is_said_as_without(method):
         return solve_dae(system, (0.0, 2.0), [0.0, 0.0], [1.0, 1.0], method, 1e-6, 1e-6, compiled=compiled)
 
     general, own = run(False), run(True)
-    assert not own.success and own.status is general.status
-    assert own.t[-1] == pytest.approx(general.t[-1], abs=1e-3)
+    assert not own.success and own.status is general.status and own.t[-1] == pytest.approx(general.t[-1], abs=1e-3)
 
 
 def test_near_a_singular_position_the_general_inner_loop_takes_over():
@@ -159,13 +148,13 @@ def test_near_a_singular_position_the_general_inner_loop_takes_over():
 
     q = v = np.zeros(3)
     run = run_from(system(1.0), q, v, True)
-    assert inner(run, calls.PROJECT, 0.5, q, v)[0] == DONE and run.work.notes[BY_GENERAL] == 0.0
-    assert inner(run, calls.PROJECT, 0.9999, q, v)[0] == DONE and run.work.notes[BY_GENERAL] == 1.0
+    assert inner(run, tasks.PROJECT, 0.5, q, v)[0] == DONE and run.work.notes[BY_GENERAL] == 0.0
+    assert inner(run, tasks.PROJECT, 0.9999, q, v)[0] == DONE and run.work.notes[BY_GENERAL] == 1.0
 
 
 def test_stages_that_the_code_leaves_to_the_general_one():
     """Angles that are too large for its sines, so that none of its values is taken; rounding there is 1e-7."""
-    problem = four_bar()
+    problem = mechanisms.four_bar()
     q0 = problem.q0.copy()
     q0[2::3] += 2e8 * np.pi
     runs = [
@@ -192,8 +181,7 @@ def test_redundant_rows_that_stop_holding_end_the_run():
     with pytest.warns(ConstraintWarning):
         held = solve_dae(system(0.0), (0.0, 1.0), [0.0, 0.0], [1.0, 0.0], "DOP853", compiled=True)
         broken = solve_dae(system(0.1), (0.0, 1.0), [0.0, 0.0], [1.0, 0.0], "DOP853", compiled=True)
-    assert held.success
-    assert not broken.success and broken.status.name == "ROWS_CONTRADICT"
+    assert held.success and not broken.success and broken.status.name == "ROWS_CONTRADICT"
 
 
 @callback("force")
@@ -249,7 +237,7 @@ def test_a_second_process_compiles_nothing():
         p = four_bar(theta3=0.0123)
         solve_dae(p.system, (0.0, 0.1), p.q0, p.v0, "DOP853", compiled=True)
     """
-    problem = four_bar(theta3=0.0123)
+    problem = mechanisms.four_bar(theta3=0.0123)
     solve_dae(problem.system, (0.0, 0.1), problem.q0, problem.v0, "DOP853", compiled=True)
     run_python(program)
 

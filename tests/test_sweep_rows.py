@@ -22,7 +22,6 @@ from twoloop.sweeps import workers
 from twoloop.sweeps.digests import digest_of
 
 pd = pytest.importorskip("pandas")  # not among the oldest versions
-
 GRAVITY = 9.81
 TABLE = np.linspace(0.0, 1.0, 2000)  # its repr leaves most of it out
 QUICK = {"t_span": (0.0, 0.01), "check_derivatives": False}
@@ -30,8 +29,7 @@ RUNS = [{"k": k} for k in range(6)]
 
 
 def swinging(k):
-    system = bare_pendulum(force=force)
-    return Problem("swing", system, np.array([-1.0, 0.0]), np.zeros(2), (0.0, 0.01), energy)
+    return Problem("swing", bare_pendulum(force=force), np.array([-1.0, 0.0]), np.zeros(2), (0.0, 0.01), energy)
 
 
 def force(t, q, v):
@@ -56,8 +54,6 @@ def dying(k):
 
 
 # --- other functions under the same names
-
-
 @pytest.fixture
 def resumes(tmp_path):
     """Whether a sweep of a second function goes on from the file of a first."""
@@ -127,8 +123,7 @@ PAIRS = {
 def test_rows_of_another_function_of_the_same_name_are_refused(name, resumes, monkeypatch):
     first, second = PAIRS[name]
     monkeypatch.setattr("twoloop.sweeps.saved_sweep.described", lambda value: "the same words")
-    assert resumes(first, first)
-    assert not resumes(first, second)
+    assert resumes(first, first) and not resumes(first, second)
 
 
 def test_a_global_that_is_reached_counts_and_others_do_not(tmp_path, monkeypatch):
@@ -173,8 +168,7 @@ def test_code_in_other_files_and_in_classes_counts(tmp_path, monkeypatch):
         digests[case] = digest_of("measure", importlib.import_module("law").measure)
     for name in names:
         sys.modules.pop(name)
-    assert digests.pop("again") == digests["as it was"]
-    assert len(set(digests.values())) == 4
+    assert digests.pop("again") == digests["as it was"] and len(set(digests.values())) == 4
 
 
 def test_what_cannot_be_compared_is_refused_and_runs_without_a_file(tmp_path):
@@ -202,8 +196,6 @@ def test_a_digest_ends_with_what_holds_itself():
 
 
 # --- cells
-
-
 def test_a_parameter_that_is_no_number_goes_on(tmp_path):
     options = {"measure": plain, "parallel": "threads", "out": tmp_path / "rows.parquet", **QUICK}
     runs = [{"k": 1.0}, {"k": float("nan")}, {"k": np.float64("inf")}]
@@ -259,8 +251,6 @@ def test_mistakes_in_cells_come_through_at_once(runs, measure, words):
 
 
 # --- workers that die
-
-
 def test_a_worker_that_dies_costs_its_own_run_alone(tmp_path, monkeypatch):
     monkeypatch.setattr(workers, "RENEWED_AFTER", 0)  # processes grow with what they compile: each ends after a run
     out = tmp_path / "rows.parquet"
@@ -306,8 +296,6 @@ def test_a_worker_that_cannot_begin_is_an_error(monkeypatch):
 
 
 # --- memory
-
-
 def swinging_under(gravity):
     return Problem("swing", pendulum_under(gravity), np.array([-1.0, 0.0]), np.zeros(2), (0.0, 0.01), energy)
 
@@ -330,5 +318,4 @@ def test_what_is_compiled_for_a_run_is_let_go(monkeypatch):
     assert set(rows["status"]) == {"REACHED_END"}, rows["message"].tolist()
     assert len(held) == 8
     gc.collect()
-    assert sum(each() is not None for each in held) <= 2
-    assert len(straight_code._MADE) == len(stage_code._MADE) == 1
+    assert sum(each() is not None for each in held) <= 2 and len(straight_code._MADE) == len(stage_code._MADE) == 1

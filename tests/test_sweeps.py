@@ -10,7 +10,6 @@ from twoloop.sweeps import saved_sweep
 from twoloop.sweeps import sweep as sweeps
 
 pd = pytest.importorskip("pandas")  # not among the oldest versions
-
 ANGLES = [{"theta3": angle} for angle in (0.0, 0.1, 2.0, -0.2, 0.3, 0.05)]  # 2.0 cannot be assembled
 MADE = []  # by `counted`, of threads
 
@@ -52,8 +51,7 @@ def test_rows_are_those_of_single_runs(rows):
     for number in (0, 1, 3, 4, 5):
         problem = linkage(**ANGLES[number])
         alone = solve_dae(problem.system, (0.0, 0.3), problem.q0, problem.v0, rtol=1e-6)
-        assert rows.loc[number, "lowest"] == alone.q[1::3].min()
-        assert rows.loc[number, "status"] == "REACHED_END"
+        assert rows.loc[number, "lowest"] == alone.q[1::3].min() and rows.loc[number, "status"] == "REACHED_END"
         assert rows.loc[number, "system"] == "four-bar"
 
 
@@ -62,8 +60,7 @@ def test_a_failure_is_a_row(rows):
     assert rows.loc[2, "message"].startswith("ValueError: the linkage cannot be assembled with theta3 = 2")
     assert np.isnan(rows.loc[2, "lowest"])
     stopped = sweep(linkage, ANGLES[:2], parallel="threads", t_span=(0.0, 1.0), max_steps=5)
-    assert stopped["status"].tolist() == ["MAX_STEPS", "MAX_STEPS"]
-    assert stopped["n_accepted"].tolist() == [5, 5]
+    assert stopped["status"].tolist() == ["MAX_STEPS", "MAX_STEPS"] and stopped["n_accepted"].tolist() == [5, 5]
 
 
 def test_threads_give_the_same_numbers(rows):
@@ -83,8 +80,7 @@ def test_a_dask_cluster_gives_the_same_numbers(rows):
 
 def test_by_default_ends_and_energy_are_measured():
     rows = sweep(pendulum, [{"start": -1.0}, {"start": 1.0}], workers=1, parallel="threads", t_span=(0.0, 1.0))
-    assert rows["t"].tolist() == [1.0, 1.0]
-    assert rows["energy_error"].between(1e-14, 1e-6).all()
+    assert rows["t"].tolist() == [1.0, 1.0] and rows["energy_error"].between(1e-14, 1e-6).all()
     assert (rows["n_evaluations"] > rows["n_accepted"]).all()
 
 
@@ -107,8 +103,6 @@ def test_of_a_mechanism_of_ones_own_in_threads():
 
 
 # --- going on
-
-
 def test_an_interrupted_sweep_goes_on(tmp_path, monkeypatch):
     out = tmp_path / "rows.parquet"
     options = {"parallel": "threads", "workers": 1, "t_span": (0.0, 0.1), "out": out}
@@ -163,8 +157,6 @@ def test_rows_of_another_sweep_are_refused(tmp_path):
 
 
 # --- mistakes
-
-
 @pytest.mark.parametrize(
     ("arguments", "options", "error", "words"),
     [
@@ -204,8 +196,7 @@ def test_mistakes_come_through_at_once(arguments, options, error, words):
 
 def test_a_later_run_that_raises_is_a_row():
     rows = sweep(linkage, ANGLES[:2], measure=fussy, parallel="threads", t_span=(0.0, 0.01))
-    assert rows["status"].tolist() == ["REACHED_END", "ERROR"]
-    assert rows.loc[1, "message"] == "RuntimeError: too steep"
+    assert rows["status"].tolist() == ["REACHED_END", "ERROR"] and rows.loc[1, "message"] == "RuntimeError: too steep"
 
 
 def test_a_bar(capsys):

@@ -26,12 +26,9 @@ def test_derivatives_of_the_shared_problems(name, t, q, v):
 def test_functions_can_be_called_one_by_one():
     system = pendulum()
     q, v = np.array([0.6, -0.8]), np.array([4.0, 3.0])
-    assert (system.mass(0.0, q) == np.eye(2)).all()
-    assert (system.force(0.0, q, v) == [0.0, -9.81]).all()
-    assert abs(system.constraint(0.0, q)[0]) < 1e-15
-    assert (system.jacobian(0.0, q) == [q]).all()
-    assert (system.constraint_rate(0.0, q) == 0.0).all()
-    assert (system.gamma(0.0, q, v) == -25.0).all()
+    assert (system.mass(0.0, q) == np.eye(2)).all() and (system.force(0.0, q, v) == [0.0, -9.81]).all()
+    assert abs(system.constraint(0.0, q)[0]) < 1e-15 and (system.jacobian(0.0, q) == [q]).all()
+    assert (system.constraint_rate(0.0, q) == 0.0).all() and (system.gamma(0.0, q, v) == -25.0).all()
     assert abs(system.velocity_constraint(0.0, q, v)[0]) < 1e-15
     assert worst(system.velocity_constraint(0.0, q, q), 1.0) < 1e-15
 
@@ -44,8 +41,7 @@ def test_a_mass_array_is_constant_and_copied():
     matrix = np.eye(2)
     system = pendulum(mass=matrix)
     matrix[:] = 0.0
-    assert system.constant_mass
-    assert (system.mass(0.0, np.zeros(2)) == np.eye(2)).all()
+    assert system.constant_mass and (system.mass(0.0, np.zeros(2)) == np.eye(2)).all()
 
 
 def test_a_constant_mass_need_not_be_diagonal():
@@ -61,15 +57,12 @@ def test_a_constant_mass_need_not_be_diagonal():
 
 
 # --- consistent_state
-
-
 @given(st.lists(st.floats(-0.1, 0.1), min_size=9, max_size=9), st.lists(st.floats(-3, 3), min_size=9, max_size=9))
 def test_a_guess_is_projected_and_can_be_started_from(shift, speeds):
     problem = four_bar()
     q, v = consistent_state(problem.system, 0.0, problem.q0 + shift, speeds)
     assert np.abs(problem.system.constraint(0.0, q)).max() < 1e-13
-    assert np.abs(problem.system.velocity_constraint(0.0, q, v)).max() < 1e-12
-    assert worst(q, problem.q0) < 1.0
+    assert np.abs(problem.system.velocity_constraint(0.0, q, v)).max() < 1e-12 and worst(q, problem.q0) < 1.0
     assert solve_dae(problem.system, (0.0, 0.01), q, v).success
 
 
@@ -83,10 +76,8 @@ def test_velocities_change_as_little_as_they_can(default_four_bar):
 def test_moving_constraints_are_projected_at_their_time():
     system = moving_pivot()
     q, v = consistent_state(system, 0.7, [0.9, -0.9], [0.0, 0.0])
-    assert np.abs(system.constraint(0.7, q)).max() < 1e-14
-    assert np.abs(system.constraint(0.0, q)).max() > 1e-2
-    assert np.abs(system.velocity_constraint(0.7, q, v)).max() < 1e-13
-    assert np.abs(v).max() > 0.1
+    assert np.abs(system.constraint(0.7, q)).max() < 1e-14 and np.abs(system.constraint(0.0, q)).max() > 1e-2
+    assert np.abs(system.velocity_constraint(0.7, q, v)).max() < 1e-13 and np.abs(v).max() > 0.1
 
 
 def test_what_cannot_be_projected_says_how_far_it_is():
@@ -116,8 +107,7 @@ def test_plain_functions_take_parameters_last(compile):
     for each, radius in ((system, 1.0), (other, 0.5), (copy.deepcopy(other), 0.5)):
         result = solve_dae(each, (0.0, 1.0), [radius, 0.0], [0.0, 0.0], rtol=1e-9, atol=1e-9)
         expected = pendulum_state(np.sqrt(1.0 / radius), angle=0.5 * np.pi)[0]
-        assert result.success and np.allclose(result.q[:, -1], radius * expected, atol=1e-7)
-        assert result.system is each
+        assert result.success and np.allclose(result.q[:, -1], radius * expected, atol=1e-7) and result.system is each
     assert other.functions[:3] == system.functions[:3]  # nothing is compiled again
 
 
@@ -142,5 +132,4 @@ def test_functions_cannot_change_the_parameters():
         return np.array([0.0, -9.81 * p[0]])
 
     system = bead(force=force)
-    assert system.force(0.0, [1.0, 0.0], [0.0, 0.0])[1] == -9.81 * 5.0
-    assert system.mass(0.0, [1.0, 0.0])[0, 0] == 2.0
+    assert system.force(0.0, [1.0, 0.0], [0.0, 0.0])[1] == -9.81 * 5.0 and system.mass(0.0, [1.0, 0.0])[0, 0] == 2.0

@@ -98,8 +98,7 @@ def defect_up_to_conjugacy(tableau, p):
             change[k, place[rest]] += 1.0
         if len(tree) == 1:
             change[k, place[tree[0]]] -= 1.0
-    beta = np.linalg.lstsq(change, defect, rcond=None)[0]
-    return np.abs(change @ beta - defect).max()
+    return np.abs(change @ np.linalg.lstsq(change, defect, rcond=None)[0] - defect).max()
 
 
 @pytest.mark.parametrize("s", [2, 3, 4])
@@ -108,8 +107,7 @@ def test_sun_is_conjugate_to_a_method_of_one_order_more_and_radau_iia_is_not(s):
     p = 2 * s - 1
     for tableau in (sun_radau_iib(s), radau_iia(s)):
         assert order_defect(tableau, p) < 1e-14 < 1e-5 < order_defect(tableau, p + 1)
-    assert defect_up_to_conjugacy(sun_radau_iib(s), p) < 1e-14
-    assert defect_up_to_conjugacy(radau_iia(s), p) > 1e-6
+    assert defect_up_to_conjugacy(sun_radau_iib(s), p) < 1e-14 and defect_up_to_conjugacy(radau_iia(s), p) > 1e-6
 
 
 def test_the_trees_are_all_there():
@@ -138,8 +136,7 @@ def test_two_stages_of_sun_are_the_known_rationals():
 @pytest.mark.parametrize(("family", "s"), SMALL)
 def test_order_is_what_the_tableau_says_and_no_higher(family, s):
     tableau = FAMILIES[family](s)
-    assert tableau.order == ORDERS[family](s)
-    assert tableau.stages == s
+    assert tableau.order == ORDERS[family](s) and tableau.stages == s
     assert np.abs(tableau.A.sum(axis=1) - tableau.c).max() < 1e-15
     for n in range(1, tableau.order + 1):
         assert order_defect(tableau, n) < 2e-15, n
@@ -165,8 +162,7 @@ def test_simplifying_assumptions_hold(family, s):
 def test_symplectic_families_are_so_to_rounding(family, s):
     tableau = FAMILIES[family](s)
     bA = tableau.b[:, None] * tableau.A
-    assert np.abs(bA + bA.T - np.outer(tableau.b, tableau.b)).max() < 1e-14
-    assert tableau.symplectic
+    assert np.abs(bA + bA.T - np.outer(tableau.b, tableau.b)).max() < 1e-14 and tableau.symplectic
 
 
 @pytest.mark.parametrize("s", [1, 2, 3, 5])

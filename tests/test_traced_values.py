@@ -245,8 +245,7 @@ def test_a_counter_ends_the_run():
         calls[:] = calls[:60]
         system = pendulum(force=force)
         result = run(system, method, compiled=compiled, events=lambda t, q, v: calls.extend(range(200)) or 1.0)
-        assert result.status is Status.WRONG_TRACE
-        assert "force of 'pendulum' does not give" in result.message
+        assert result.status is Status.WRONG_TRACE and "force of 'pendulum' does not give" in result.message
 
 
 @pytest.mark.parametrize("options", [{"method": "Taylor"}, {"method": "Adams", "compiled": True}], ids=str)
@@ -258,8 +257,7 @@ def test_an_event_that_changes_a_callback_ends_the_run(options):
             state["k"] = 2.0
         return 1.0
 
-    system = pendulum(force=lambda t, q, v: WEIGHT - state["k"] * v)
-    result = solve_dae(system, **START, **options, events=switch)
+    result = solve_dae(pendulum(force=lambda t, q, v: WEIGHT - state["k"] * v), **START, **options, events=switch)
     assert result.status is Status.WRONG_TRACE and "entry 0" in result.message
 
 
@@ -294,8 +292,7 @@ STATES = np.column_stack([np.linspace(0.0, 1.0, 9), np.random.default_rng(2).uni
 )
 def test_a_difference_is_named_by_callback_and_entry(kind, entry, function):
     wrong = traced(pendulum(), **{kind: function}).wrong(pendulum(), STATES)
-    assert wrong is not None
-    assert wrong.startswith(f"{kind} of 'pendulum' does not give") and entry in wrong
+    assert wrong is not None and wrong.startswith(f"{kind} of 'pendulum' does not give") and entry in wrong
 
 
 @pytest.mark.parametrize(
@@ -313,8 +310,7 @@ def test_rounding_is_no_difference(function):
 
 def test_what_is_cancelled_exactly_may_be_rounded_in_the_callback():
     system = pendulum(force=lambda t, q, v: np.array([(q[0] + 1e5) - 1e5 - q[0], -9.81]))
-    result = run(system)
-    assert result.success
+    assert run(system).success
 
 
 @pytest.mark.parametrize("force", [Damper().force, Damper(), functools.partial(Damper.force, Damper())])

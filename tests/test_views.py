@@ -24,8 +24,7 @@ def result(default_four_bar):
 
 def test_a_table_with_the_names_of_the_mechanism(result, default_four_bar):
     table = result.to_dataframe()
-    assert table.index.name == "t (s)"
-    assert len(table.columns) == 3 * 9 + 8 + 1
+    assert table.index.name == "t (s)" and len(table.columns) == 3 * 9 + 8 + 1
     np.testing.assert_array_equal(table.index, result.t)
     np.testing.assert_array_equal(table["angle (rad) of bar 3"], result.q[8])
     np.testing.assert_array_equal(table["angle of bar 3, velocity (rad/s)"], result.v[8])
@@ -40,8 +39,7 @@ def test_a_table_without_names():
 
 
 def test_energy_needs_a_problem(result, default_four_bar):
-    assert result.energy.shape == result.t.shape
-    assert np.ptp(result.energy) < 1e-6
+    assert result.energy.shape == result.t.shape and np.ptp(result.energy) < 1e-6
     with pytest.raises(ValueError, match=r"this result knows no energy: put the system into a problem"):
         assert swing().energy is None
     foreign = replace(result, system=None)
@@ -65,20 +63,16 @@ def test_problems_do_not_share_what_they_say_of_one_system():
         twoloop.mechanisms.Problem("x", system, given.q0, given.v0, (0.0, 1.0), given.energy, coordinates=names)
         for names in (("x", "y"), ("along", "up"))
     )
-    assert one.system.description.coordinates == ("x", "y")
-    assert other.system.description.coordinates == ("along", "up")
+    assert one.system.description.coordinates == ("x", "y") and other.system.description.coordinates == ("along", "up")
     assert system.description.coordinates == ()
 
 
 # --- figures
-
-
 def test_panels_for_units_energy_and_violation(result, tmp_path):
     figure = result.plot(tmp_path / "run.png")
     assert (tmp_path / "run.png").read_bytes().startswith(b"\x89PNG")
     labels = [panel.get_ylabel() for panel in figure.axes]
-    assert labels == ["q (m)", "q (rad)", "energy − start (J)", "largest violation"]
-    assert len(figure.axes[0].lines) == 6
+    assert labels == ["q (m)", "q (rad)", "energy − start (J)", "largest violation"] and len(figure.axes[0].lines) == 6
     np.testing.assert_array_equal(figure.axes[1].lines[2].get_ydata(), result.q[8])
     np.testing.assert_array_equal(figure.axes[2].lines[0].get_ydata(), result.energy - result.energy[0])
 
@@ -106,13 +100,10 @@ def test_nonholonomic_rows_are_plotted_too(make):
     problem = make()
     done = solve_dae(problem.system, (0.0, 0.1), problem.q0, problem.v0)
     positions, velocities = violation(done)
-    assert positions.shape == velocities.shape == done.t.shape
-    assert len(done.plot().axes) == len(set(problem.units)) + 2
+    assert positions.shape == velocities.shape == done.t.shape and len(done.plot().axes) == len(set(problem.units)) + 2
 
 
 # --- packages that may be missing, and other processes (see also tests/test_identity.py)
-
-
 def test_missing_packages_say_how_to_install_them(tmp_path):
     source = """
 import sys
@@ -141,7 +132,6 @@ def test_results_of_lambdas_travel_without_their_system():
 
 
 def test_an_energy_without_a_name_says_so():
-    given = twoloop.mechanisms.pendulum()
-    problem = replace(given, energy=lambda t, q, v: 0.0)
+    problem = replace(twoloop.mechanisms.pendulum(), energy=lambda t, q, v: 0.0)
     with pytest.raises(TypeError, match=r"energy of 'A01 pendulum', .*<lambda>, cannot be pickled"):
         pickle.dumps(problem.system)

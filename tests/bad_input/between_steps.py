@@ -46,7 +46,7 @@ def loaded(content, system=None):
 
 
 def event_case(what, events, error, words, advice):
-    return Case("events", what, lambda: solve(events=events), error, words, advice)
+    return Case("events", what, lambda: solve(events=events), words, advice, error)
 
 
 NUMBER = "return one real number, e.g. float(q[0])"
@@ -81,38 +81,21 @@ BETWEEN_STEPS = [
         "result.sol",
         evaluated,
         "t",
-        [
-            (-1e-3, ValueError, "must lie within the run, from 0.0 to 1.0; given -0.001", WITHIN),
-            (
-                [0.5, 2.0],
-                ValueError,
-                "must lie within the run, from 0.0 to 1.0; given 2.0",
-                "ask between start and end",
-            ),
-            (np.nan, ValueError, "must lie within the run.*given nan", "find out where the NaN comes from"),
-            ([[0.1]], ValueError, r"must be a number or have shape \(n,\)", "ravel() it"),
-            ("now", TypeError, "must be an array of real numbers", "give seconds"),
-            (None, TypeError, "must be an array of real numbers", "give seconds"),
-            (True, TypeError, "must be an array of real numbers", "write 1.0"),
-        ],
+        (-1e-3, ValueError, "must lie within the run, from 0.0 to 1.0; given -0.001", WITHIN),
+        ([0.5, 2.0], ValueError, "must lie within the run, from 0.0 to 1.0; given 2.0", "ask between start and end"),
+        (np.nan, ValueError, "must lie within the run.*given nan", "find out where the NaN comes from"),
+        ([[0.1]], ValueError, r"must be a number or have shape \(n,\)", "ravel() it"),
+        ("now", TypeError, "must be an array of real numbers", "give seconds"),
+        (None, TypeError, "must be an array of real numbers", "give seconds"),
+        (True, TypeError, "must be an array of real numbers", "write 1.0"),
     ),
-    of_load(
-        "a file of something else",
-        lambda: loaded(b"text"),
-        "must lead to a file written by Result.save",
-        "give a file that result.save(path) wrote",
+    of_load("a file of something else", lambda: loaded(b"text")).says(
+        "must lead to a file written by Result.save", "give a file that result.save(path) wrote"
     ),
-    of_load(
-        "the result of another system",
-        lambda: loaded(None, linkage().system),
-        r"system must be the one that was solved, with n_q = 2 and n_c \+ n_a = 1",
-        "give the system that was solved",
+    of_load("the result of another system", lambda: loaded(None, linkage().system)).says(
+        r"system must be the one that was solved, with n_q = 2 and n_c \+ n_a = 1", "give the system that was solved"
     ),
-    of_load(
-        "a problem in the place of its system",
-        lambda: loaded(None, linkage()),
-        r"give its system, problem\.system",
-        "give problem.system",
-        TypeError,
+    of_load("a problem in the place of its system", lambda: loaded(None, linkage())).says(
+        r"give its system, problem\.system", "give problem.system", TypeError
     ),
 ]

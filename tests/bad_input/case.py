@@ -2,7 +2,7 @@
 
 import datetime
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any
 
@@ -27,20 +27,27 @@ class Case:
     group: str
     what: str
     call: Callable[[], Any]
-    error: type[Exception] | tuple[type[Exception], ...]
     words: str
     advice: str
+    error: type[Exception] | tuple[type[Exception], ...] = ValueError
 
     @property
     def id(self):
         return f"{self.group}: {self.what}"
 
+    def when(self, call):
+        return replace(self, call=call)
+
+    def says(self, words, advice, error=ValueError):
+        """The case, of words that did not fit into the line of the call."""
+        return replace(self, words=words, advice=advice, error=error)
+
 
 def cases_of(group):
     """What makes the cases of a group: of (what, call, words, advice), and of the error, if it is no ValueError."""
 
-    def case(what, call, words, advice, error=ValueError):
-        return Case(group, what, call, error, words, advice)
+    def case(what, call=None, words="", advice="", error=ValueError):
+        return Case(group, what, call, words, advice, error)
 
     return case
 
@@ -74,10 +81,10 @@ def listed(value):
     return f"({inner})" if isinstance(value, tuple) else f"[{inner}]"
 
 
-def argument(group, call, name, values):
+def argument(group, call, name, *values):
     """A case for each wrong value of one argument: (value, error, words, advice)."""
     return [
-        Case(group, f"`{name}={shown(value)}`", lambda value=value: call(**{name: value}), error, f"{name} {words}", do)
+        Case(group, f"`{name}={shown(value)}`", lambda value=value: call(**{name: value}), f"{name} {words}", do, error)
         for value, error, words, do in values
     ]
 
@@ -106,7 +113,6 @@ VECTORS = [
     ("10", TypeError, "must be an array of real numbers", NUMBERS),
 ]
 FEW_VECTORS = [VECTORS[k] for k in (0, 3, 5, 8, 10, 12, 13, 14)]
-
 POSITIVE = "give a positive number"
 POSITIVES = [
     (0.0, ValueError, "must be positive.*given 0.0", POSITIVE),

@@ -58,17 +58,11 @@ IMPACTS = [
     of_stops(
         "a function in place of a stop", against(lambda t, q: q[0]), "stops must be a Stop", "Stop(gap)", TypeError
     ),
-    of_stops(
-        "a start beyond a stop",
-        against(Stop(lambda t, q: q[8] - 9.0, name="wall")),
-        "on this side of all stops; the gap of 'wall' is",
-        "turn its sign, or start elsewhere",
+    of_stops("a start beyond a stop", against(Stop(lambda t, q: q[8] - 9.0, name="wall"))).says(
+        "on this side of all stops; the gap of 'wall' is", "turn its sign, or start elsewhere"
     ),
-    of_stops(
-        "a gap that branches",
-        against(Stop(lambda t, q: q[8] if q[0] > 0.0 else 1.0)),
-        "gap of 'stop' must be a number made of t and q by numpy's functions",
-        "make two stops of it",
+    of_stops("a gap that branches", against(Stop(lambda t, q: q[8] if q[0] > 0.0 else 1.0))).says(
+        "gap of 'stop' must be a number made of t and q by numpy's functions", "make two stops of it"
     ),
     of_stops(
         "`restitution=1.1`", lambda: Stop(lambda t, q: q[0], 1.1), "restitution of 'stop' must be from 0 to 1", "0 to 1"
@@ -76,105 +70,61 @@ IMPACTS = [
     of_stops(
         "`events=`", against(Stop(lambda t, q: 9.0 - q[8]), events=[]), "no option 'events'", "stops are", TypeError
     ),
-    of_step(
-        "a step before a start",
-        lambda: Integrator(LINKAGE.system).step(1e-3),
-        "step goes on from a start",
-        "call `start(t0, q0, v0)` first",
+    of_step("a step before a start", lambda: Integrator(LINKAGE.system).step(1e-3)).says(
+        "step goes on from a start", "call `start(t0, q0, v0)` first"
     ),
     of_step("`dt=0`", step(0.0), "dt must be positive", "give the length of a sample"),
     of_step("a place that is none", step(inputs={9: 1.0}), "inputs must map places in the parameters", "count from 0"),
     of_step("`inputs=[1.0]` of four", step(inputs=[1.0]), "inputs must be all 4 parameters", "give all, or a mapping"),
     of_step("an input that is not finite", step(inputs={0: np.nan}), "inputs must be finite", "look at the controller"),
-    of_step(
-        "a length that changes on the way",
-        step(inputs={0: 1.5}),
-        "inputs must enter forces alone; that at place 0 enters",
-        "`start` anew with other parameters",
+    of_step("a length that changes on the way", step(inputs={0: 1.5})).says(
+        "inputs must enter forces alone; that at place 0 enters", "`start` anew with other parameters"
     ),
-    of_step(
-        "`method='Taylor'`",
-        lambda: Integrator(LINKAGE.system, "Taylor").start(0.0, LINKAGE.q0, LINKAGE.v0),
-        "must not be 'Taylor'",
-        "take the default",
+    of_step("`method='Taylor'`", lambda: Integrator(LINKAGE.system, "Taylor").start(0.0, LINKAGE.q0, LINKAGE.v0)).says(
+        "must not be 'Taylor'", "take the default"
     ),
-    of_step(
-        "`compiled=True`",
-        lambda: Integrator(LINKAGE.system, compiled=True).start(0.0, LINKAGE.q0, LINKAGE.v0),
-        "start takes no compiled",
-        "leave it out",
+    of_step("`compiled=True`")
+    .when(lambda: Integrator(LINKAGE.system, compiled=True).start(0.0, LINKAGE.q0, LINKAGE.v0))
+    .says("start takes no compiled", "leave it out"),
+    of_model("a gear of one hinge", wheels(lambda model: model.gear("pin 0", "pin 0", ratio=1.0))).says(
+        "a gear needs two joints", "name both"
     ),
-    of_model(
-        "a gear of one hinge",
-        wheels(lambda model: model.gear("pin 0", "pin 0", ratio=1.0)),
-        "a gear needs two joints",
-        "name both",
+    of_model("`ratio=0`", wheels(lambda model: model.gear("pin 0", "pin 1", ratio=0.0))).says(
+        "ratio must not be zero", "fix it instead"
     ),
-    of_model(
-        "`ratio=0`",
-        wheels(lambda model: model.gear("pin 0", "pin 1", ratio=0.0)),
-        "ratio must not be zero",
-        "fix it instead",
+    of_model("a rack of two hinges", wheels(lambda model: model.rack("pin 0", "pin 1", radius=0.1))).says(
+        "needs a prismatic joint", "give a hinge and a slide"
     ),
-    of_model(
-        "a rack of two hinges",
-        wheels(lambda model: model.rack("pin 0", "pin 1", radius=0.1)),
-        "needs a prismatic joint",
-        "give a hinge and a slide",
+    of_model("a wheel of negative radius")
+    .when(wheels(lambda model: model.rolling("ground", "wheel 0", radius=-1.0, axis=(1, 0))))
+    .says("radius must be positive", "turn the axis instead"),
+    of_model("a curve that branches")
+    .when(wheels(lambda model: model.point_on_curve("ground", "wheel 0", at=(0, 0), curve=branching)))
+    .says("must be made of numpy's functions, without branches", "make one formula of it"),
+    of_model("a limit without a number", wheels(lambda model: model.limit("pin 0"))).says(
+        "needs lower, upper, or both", "give one of them"
     ),
-    of_model(
-        "a wheel of negative radius",
-        wheels(lambda model: model.rolling("ground", "wheel 0", radius=-1.0, axis=(1, 0))),
-        "radius must be positive",
-        "turn the axis instead",
+    of_friction("a model without dry friction", lambda: solve_with_friction(rubbed())).says(
+        "'linkage' has no dry friction: add some with model.dry_friction", "or take `solve_dae`"
     ),
-    of_model(
-        "a curve that branches",
-        wheels(lambda model: model.point_on_curve("ground", "wheel 0", at=(0, 0), curve=branching)),
-        "must be made of numpy's functions, without branches",
-        "make one formula of it",
+    of_friction("a system in place of a problem", lambda: solve_with_friction(rubbed("A").system)).says(
+        "problem must be that of a model, what model.problem", "give what `model.problem()` returned", TypeError
     ),
-    of_model(
-        "a limit without a number",
-        wheels(lambda model: model.limit("pin 0")),
-        "needs lower, upper, or both",
-        "give one of them",
+    of_friction("`events=`", lambda: solve_with_friction(rubbed("A"), events=[])).says(
+        "solve_with_friction has no option 'events'", "changes are events of its own", TypeError
     ),
-    of_friction(
-        "a model without dry friction",
-        lambda: solve_with_friction(rubbed()),
-        "'linkage' has no dry friction: add some with model.dry_friction",
-        "or take `solve_dae`",
+    of_friction("`static` below `f`", lambda: rubbed("A", static=0.5)).says(
+        "static must be at least f = 1; given 0.5", "leave it out, or give more"
     ),
-    of_friction(
-        "a system in place of a problem",
-        lambda: solve_with_friction(rubbed("A").system),
-        "problem must be that of a model, what model.problem",
-        "give what `model.problem()` returned",
-        TypeError,
-    ),
-    of_friction(
-        "`events=`",
-        lambda: solve_with_friction(rubbed("A"), events=[]),
-        "solve_with_friction has no option 'events'",
-        "changes are events of its own",
-        TypeError,
-    ),
-    of_friction(
-        "`static` below `f`",
-        lambda: rubbed("A", static=0.5),
-        "static must be at least f = 1; given 0.5",
-        "leave it out, or give more",
-    ),
-    of_friction(
-        "friction in two joints of a linkage with one degree of freedom",
-        lambda: solve_with_friction(rubbed("A", "B")),
+    of_friction("friction in two joints of a linkage with one degree of freedom")
+    .when(lambda: solve_with_friction(rubbed("A", "B")))
+    .says(
         "'dry friction of B' cannot slide by itself.* or it moves as those of 'dry friction of A' do",
         "give one joint all of it",
     ),
-    of_friction(
-        "friction in a joint that is driven",
-        lambda: solve_with_friction(rubbed("A", drive=lambda t: 0.3 * t)),
+    of_friction("friction in a joint that is driven")
+    .when(lambda: solve_with_friction(rubbed("A", drive=lambda t: 0.3 * t)))
+    .says(
         "'dry friction of A' cannot slide by itself: drives or other joints hold it",
         "add it to the torque of the drive",
     ),

@@ -8,11 +8,11 @@ from twoloop import Joint, solve_dae
 
 
 def joint(what, arguments, error, words, advice):
-    return Case("Joint", what, lambda: Joint(*arguments), error, words, advice)
+    return Case("Joint", what, lambda: Joint(*arguments), words, advice, error)
 
 
 def joints(what, given, error, words, advice):
-    return Case("ConstrainedSystem.from_python, joints", what, lambda: make(joints=given), error, words, advice)
+    return Case("ConstrainedSystem.from_python, joints", what, lambda: make(joints=given), words, advice, error)
 
 
 def swing(name):

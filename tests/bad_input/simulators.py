@@ -25,12 +25,8 @@ FALLING = "give tolerances such as (1e-4, 1e-6)"
 MULTIPLES = "give numbers of steps such as (100, 200, 400)"
 NAMES = "give 'smoke', 'all', or names of `problems()`"
 SIMULATORS = [
-    of_check(
-        "the path of a file",
-        lambda: check("solver.py"),
-        "simulate must be a function of .*given str",
-        "import the function",
-        TypeError,
+    of_check("the path of a file", lambda: check("solver.py")).says(
+        "simulate must be a function of .*given str", "import the function", TypeError
     ),
     of_check("a problem that is not there", lambda: check(problems="five_bar"), "problems must be.*'five_bar'", NAMES),
     of_check(
@@ -53,34 +49,21 @@ SIMULATORS = [
     of_check(
         "an order as text", lambda: check(steps=[100, 200], order="4"), "order must be a positive", "write order=4"
     ),
-    of_return(
-        "a column for each time",
-        lambda: returns(lambda n, m: np.zeros((2, n))),
-        r"of shape \(101, 2\).*returned shape \(2, 101\) \(transpose it\)",
-        "return q.T",
+    of_return("a column for each time", lambda: returns(lambda n, m: np.zeros((2, n)))).says(
+        r"of shape \(101, 2\).*returned shape \(2, 101\) \(transpose it\)", "return q.T"
     ),
     of_return("too many columns", lambda: returns(lambda n, m: np.zeros((n, 3))), r"returned shape \(101, 3\)", ROWS),
-    of_return(
-        "one velocity for each time",
-        lambda: returns(lambda n, m: (np.zeros((n, 2)), np.zeros(n))),
-        "return v with a row for each time",
-        ROWS,
+    of_return("one velocity for each time", lambda: returns(lambda n, m: (np.zeros((n, 2)), np.zeros(n)))).says(
+        "return v with a row for each time", ROWS
     ),
-    of_return(
-        "multipliers of another number",
-        lambda: returns(lambda n, m: (np.zeros((n, 2)), None, np.zeros((n, 2)))),
-        r"return lam .*\(101, 1\)",
-        "return one for each row of C",
-    ),
+    of_return("multipliers of another number")
+    .when(lambda: returns(lambda n, m: (np.zeros((n, 2)), None, np.zeros((n, 2)))))
+    .says(r"return lam .*\(101, 1\)", "return one for each row of C"),
     of_return("nothing", lambda: returns(lambda n, m: None), "it returned None", ARRAYS, TypeError),
     of_return("text", lambda: returns(lambda n, m: "done"), "arrays of numbers.*q is str", ARRAYS, TypeError),
     of_return("four things", lambda: returns(lambda n, m: (1, 2, 3, 4)), "a tuple of 4", ARRAYS, TypeError),
-    of_return(
-        "complex numbers",
-        lambda: returns(lambda n, m: np.full((n, 2), 1j)),
-        "arrays of numbers.*complex",
-        "take the real part if that is meant",
-        TypeError,
+    of_return("complex numbers", lambda: returns(lambda n, m: np.full((n, 2), 1j))).says(
+        "arrays of numbers.*complex", "take the real part if that is meant", TypeError
     ),
     of_problems(
         "a tag that is not there", lambda: problems("curly"), "tags must be of smoke.*'curly'", "look at `problem.tags`"

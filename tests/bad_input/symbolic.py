@@ -27,13 +27,12 @@ def matrices(**changed):
 def dependent_speeds():
     frame, origin = ReferenceFrame("N"), Point("O")
     origin.set_vel(frame, 0)
-    rolling = [u1 - u2]
-    kane = KanesMethod(frame, [x, y], [u1], [u1 - xd, u2 - yd], u_dependent=[u2], velocity_constraints=rolling)
+    kane = KanesMethod(frame, [x, y], [u1], [u1 - xd, u2 - yd], u_dependent=[u2], velocity_constraints=[u1 - u2])
     return from_method(kane)
 
 
 def case(what, words, advice, error=ValueError, call=lagrangian, group="symbolic.from_lagrangian", **changed):
-    return Case(group, f"`{what}`", lambda: call(**changed), error, words, advice)
+    return Case(group, f"`{what}`", lambda: call(**changed), words, advice, error)
 
 
 ONE_LIST = "give a list of expressions, each of which is zero"
@@ -180,38 +179,21 @@ SYMBOLIC += [
         "choose other speeds",
         speeds={u1: xd**2, u2: yd},
     ),
-    Case(
-        "symbolic.from_method",
-        "`method=KanesMethod(..., u_dependent=...)`",
-        dependent_speeds,
-        ValueError,
-        "method must have independent coordinates and speeds only",
-        "give its constraints to from_method",
+    cases_of("symbolic.from_method")("`method=KanesMethod(..., u_dependent=...)`", dependent_speeds).says(
+        "method must have independent coordinates and speeds only", "give its constraints to from_method"
     ),
-    Case(
-        "symbolic.from_method",
-        "`method='Kane'`",
-        lambda: from_method("Kane"),
-        TypeError,
+    cases_of("symbolic.from_method")("`method='Kane'`", lambda: from_method("Kane")).says(
         "method must be a LagrangesMethod, a KanesMethod or a System; given 'Kane'",
         "give the object itself; energies go to from_lagrangian",
+        TypeError,
     ),
-    of_mechanism(
-        "`with_parameters({'mass': 2.0})`",
-        lambda: lagrangian().with_parameters({"mass": 2.0}),
-        "parameters must be of m, g, L; given mass",
-        "use the symbols, or their names",
+    of_mechanism("`with_parameters({'mass': 2.0})`", lambda: lagrangian().with_parameters({"mass": 2.0})).says(
+        "parameters must be of m, g, L; given mass", "use the symbols, or their names"
     ),
-    of_mechanism(
-        "`problem(..., t_span=2.0)`",
-        lambda: lagrangian().problem([1.0, 0.0], [0.0, 0.0], 2.0),
-        r"t_span must have shape \(2,\)",
-        "give (start, end)",
+    of_mechanism("`problem(..., t_span=2.0)`", lambda: lagrangian().problem([1.0, 0.0], [0.0, 0.0], 2.0)).says(
+        r"t_span must have shape \(2,\)", "give (start, end)"
     ),
-    of_mechanism(
-        "`problem({'z': 1.0}, ...)`",
-        lambda: lagrangian().problem({"z": 1.0}, [0.0, 0.0], (0.0, 1.0)),
-        "q0 must name coordinates, x, y; given z",
-        "use the coordinates, or their names",
+    of_mechanism("`problem({'z': 1.0}, ...)`", lambda: lagrangian().problem({"z": 1.0}, [0.0, 0.0], (0.0, 1.0))).says(
+        "q0 must name coordinates, x, y; given z", "use the coordinates, or their names"
     ),
 ]

@@ -60,9 +60,7 @@ def test_planets_on_a_carrier():
     planet = model.disc("planet", 0.1, mass=0.5, position=(0.3, 0.0))
     model.revolute("ground", carrier, at=(0.0, 0.0))
     model.fixed("ground", sun)
-    on_carrier = model.revolute(carrier, sun, at=(0.0, 0.0))
-    axle = model.revolute(carrier, planet, at=(0.3, 0.0))
-    model.gear(on_carrier, axle, ratio=-2.0)
+    model.gear(model.revolute(carrier, sun, at=(0.0, 0.0)), model.revolute(carrier, planet, at=(0.3, 0.0)), ratio=-2.0)
     with pytest.warns(match="have rank"):  # the sun is held, and turns about its centre
         problem, result = moved(model)
     np.testing.assert_allclose(result.q[2], 2.0 * TIMES, atol=1e-9)
@@ -100,8 +98,7 @@ def test_a_wheel_that_rolls_down_a_slope_that_slides():
     joint = model.rolling("wedge", "wheel", radius=r, axis=along)
     problem, result = moved(model)
     c = np.cos(tilt)
-    A = np.array([[1.5 * m, m * c], [m * c, m + M]])
-    s, x = np.linalg.solve(A, [-m * GRAVITY * np.sin(tilt), 0.0])
+    s, x = np.linalg.solve(np.array([[1.5 * m, m * c], [m * c, m + M]]), [-m * GRAVITY * np.sin(tilt), 0.0])
     np.testing.assert_allclose(result.q[0], 0.5 * x * TIMES**2, atol=1e-9)
     np.testing.assert_allclose(result.q[5], -0.5 * s / r * TIMES**2, atol=1e-8)
     assert problem.freedom.degrees == 2 and problem.conserved and np.ptp(result.energy) < 1e-9
@@ -120,8 +117,7 @@ def test_a_bead_on_a_cycloid_is_isochronous():
 
     half = 0.9  # of the parameter: the height is 2 r sin(half)^2
     place = (2.0 * r * (half + np.sin(half) * np.cos(half)), 2.0 * r * np.sin(half) ** 2)
-    bead = model.body("bead", mass=1.0, inertia=1.0, position=place)
-    model.point_on_curve("ground", bead, at=place, curve=cycloid)
+    model.point_on_curve("ground", model.body("bead", mass=1.0, inertia=1.0, position=place), at=place, curve=cycloid)
     problem = model.problem()
     quarter = np.pi * np.sqrt(r / GRAVITY)
     result = solve_dae(problem.system, (0.0, 0.9 * quarter), problem.q0, problem.v0, rtol=1e-10, atol=1e-10)
@@ -147,8 +143,7 @@ def test_a_cam_with_a_follower():
     model.point_on_curve(cam, follower, at=(0.0, high), curve=groove)
     model.drive(hinge, lambda t: 3.0 * t)
     _, result = moved(model)
-    phi = 0.5 * np.pi - 0.2 - 3.0 * TIMES
-    np.testing.assert_allclose(result.q[4], 0.3 + 0.05 * np.cos(2.0 * phi), atol=1e-9)
+    np.testing.assert_allclose(result.q[4], 0.3 + 0.05 * np.cos(2.0 * (0.5 * np.pi - 0.2 - 3.0 * TIMES)), atol=1e-9)
 
 
 def test_couplings_with_a_function_that_is_called_in_python():
@@ -206,5 +201,4 @@ def test_a_skate_on_a_slope():
     np.testing.assert_allclose(result.q[:2], scale * np.array([x, y]), atol=1e-9)
     np.testing.assert_allclose(result.q[2], phase, atol=1e-9)
     assert problem.system.n_a == 1 and problem.conserved and np.ptp(result.energy) < 1e-9
-    force = result.reactions(joint.name).force
-    np.testing.assert_allclose(force - [[0.0], [6.0]], 2.0 * result.a[:2], atol=1e-8)
+    np.testing.assert_allclose(result.reactions(joint.name).force - [[0.0], [6.0]], 2.0 * result.a[:2], atol=1e-8)

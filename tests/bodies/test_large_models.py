@@ -6,7 +6,7 @@ import pytest
 from tests.bodies.random_models import Both
 from tests.bodies.test_laws import PLANAR, SPATIAL
 from twoloop import solve_dae
-from twoloop.bodies import PlanarModel
+from twoloop.bodies import PlanarModel, SpatialModel, assembly
 from twoloop.mechanisms.planar import GROUND, PlanarBodies
 from twoloop.problem.entries import scattered
 
@@ -52,3 +52,34 @@ def test_a_long_chain_costs_what_the_tables_of_the_library_cost():
     assert runs[0].stats.n_evaluations <= 1.1 * runs[1].stats.n_evaluations
     sizes = [each.n_mass_values + each.n_jacobian_values for each in (problem.system, system)]
     assert sizes[0] <= 1.5 * sizes[1]
+
+
+def hinges_in_a_row(n, closed, size=1.0, tilt=0.3):
+    """A chain of n rods in space, from 0.3 rad to -0.3 rad, its axes across the plane but for `tilt`."""
+    m, at, before = SpatialModel(gravity=(0.0, -9.81 * size, 0.0)), np.zeros(3), None
+    for k in range(n):
+        angle = 0.3 - 0.6 * k / n + 0.2 * np.sin(k)
+        c, s = np.cos(angle), np.sin(angle)
+        along = size / n * np.array([c, s, 0.0])
+        turned = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+        rod = m.body(f"rod {k}", mass=1.0, inertia=(1e-3 * size**2,) * 3, position=at + along / 2, rotation=turned)
+        axis = (tilt * np.cos(2.0 * k), tilt * np.sin(2.0 * k), 1.0)
+        m.revolute(before or m.ground, rod, at=at, axis=axis, name=f"pin {k}")
+        before, at = rod, at + along
+    if closed:
+        m.revolute(before, m.ground, at=at, axis=(0.0, 0.0, 1.0), name="last")
+    return m
+
+
+@pytest.mark.parametrize("size", [1.0, 1e3, 1e-3])
+@pytest.mark.parametrize(("closed", "tilt", "degrees"), [(False, 0.3, 40), (True, 0.3, 35), (True, 0.0, 38)])
+def test_degrees_of_freedom_by_entries_and_by_dense_matrices(monkeypatch, size, closed, tilt, degrees):
+    """Where the entries tell that all rows are independent, no full matrix of the rows is made."""
+    model, asked = hinges_in_a_row(40, closed, size, tilt), []
+    monkeypatch.setattr(assembly, "_scaled", lambda *of, scaled=assembly._scaled: asked.append(of) or scaled(*of))
+    problem = model.problem()
+    system, q = problem.system, problem.q0
+    found = assembly.freedom(system, 0.0, q, {})
+    assert found.degrees == degrees
+    assert (len(asked) > 0) == (closed and tilt == 0.0)  # three rows follow from others
+    assert (np.linalg.matrix_rank(system.jacobian(0.0, q), 1e-9) == system.n_c) == (not asked)

@@ -10,33 +10,12 @@ import numpy as np
 import pytest
 
 from studies.bench.closed_loops import squeezer
-from twoloop import solve_dae
+from twoloop import mechanisms, solve_dae
 from twoloop.bodies import PlanarModel, SpatialModel
-from twoloop.mechanisms import (
-    andrews,
-    bricard,
-    closed_chain,
-    double_pendulum,
-    driven_crank,
-    driven_slider_crank,
-    four_bar,
-    governor,
-    heavy_top,
-    knife_edge,
-    n_four_bar,
-    pendulum,
-    projection_pendulum,
-    redundant_slider_crank,
-    rolling_disc,
-    spatial_four_bar,
-    spatial_slider_crank,
-    sundials_slider_crank,
-)
 from twoloop.mechanisms.rotation import rotation_matrix
 from twoloop.mechanisms.spatial_four_bar import inertia as round_bar
 
 pytestmark = pytest.mark.filterwarnings("ignore::twoloop.ConstraintWarning")
-
 TIMES = np.linspace(0.0, 1.0, 6)
 
 
@@ -92,7 +71,7 @@ def planar_as_given(known, masses, inertias, gravity=(0.0, -9.81)):
 
 
 def test_four_bar():
-    known = four_bar()
+    known = mechanisms.four_bar()
     lengths, q = np.array([1.0, 2.0, 1.5]), known.q0.reshape(3, 3)
     model = planar_as_given(known, lengths, lengths**3 / 12.0)
     along = [
@@ -134,7 +113,7 @@ def slider_crank(angular_velocity=None):
 def test_redundant_slider_crank():
     model, _, pin, end = slider_crank(angular_velocity=8.0)
     model.distance("slider", end, "crank", pin)
-    made, one, other = both(model.problem((0.0, 2.0)), redundant_slider_crank(), 2.0)
+    made, one, other = both(model.problem((0.0, 2.0)), mechanisms.redundant_slider_crank(), 2.0)
     np.testing.assert_allclose(one, other, atol=1e-8)
     assert "redundant" in made.tags and made.freedom.degrees == 1
     assert [set(group) for group in made.freedom.redundant] == [
@@ -148,19 +127,16 @@ def test_driven_slider_crank(motion):
     derivatives = (
         {}
         if motion == "derived"
-        else {
-            "rate": lambda t: 4.0 + 0.9 * math.cos(3.0 * t),
-            "acceleration": lambda t: -2.7 * math.sin(3.0 * t),
-        }
+        else {"rate": lambda t: 4.0 + 0.9 * math.cos(3.0 * t), "acceleration": lambda t: -2.7 * math.sin(3.0 * t)}
     )
     model.drive(hinge, lambda t: 4.0 * t + 0.3 * np.sin(3.0 * t), **derivatives)
-    made, one, other = both(model.problem((0.0, 2.0)), driven_slider_crank(), 2.0, conserved=False)
+    made, one, other = both(model.problem((0.0, 2.0)), mechanisms.driven_slider_crank(), 2.0, conserved=False)
     np.testing.assert_allclose(one, other, atol=1e-8)
     assert made.freedom.degrees == 0 and "driven" in made.tags
 
 
 def test_andrews():
-    made, one, other = both(squeezer(), andrews(), 0.03, conserved=False, energy=False)
+    made, one, other = both(squeezer(), mechanisms.andrews(), 0.03, conserved=False, energy=False)
     np.testing.assert_allclose(one[2], other[0], atol=1e-7)
     np.testing.assert_allclose(one[8], other[2], atol=1e-8)
     np.testing.assert_allclose(one[14], other[4], atol=1e-8)
@@ -168,7 +144,7 @@ def test_andrews():
 
 
 def test_sundials_slider_crank():
-    known = sundials_slider_crank()
+    known = mechanisms.sundials_slider_crank()
     model = PlanarModel(gravity=(0.0, 0.0))
     tilt = math.asin(-0.5)
     pin, end = np.array([0.0, 0.5]), np.array([math.cos(tilt), 0.0])
@@ -203,7 +179,7 @@ def test_bricard():
     bars.append(model.ground)
     for k in range(6):
         model.revolute(bars[k], bars[k + 1], at=C[k], axis=axes[k])
-    made, one, other = both(model.problem((0.0, 1.0)), bricard(), 1.0)
+    made, one, other = both(model.problem((0.0, 1.0)), mechanisms.bricard(), 1.0)
     np.testing.assert_allclose(one.reshape(5, 7, -1)[:, :3], other.reshape(5, 12, -1)[:, :3], atol=1e-8)
     assert made.freedom.degrees == 1 and len(made.freedom.redundant[0]) == 6
 
@@ -224,7 +200,7 @@ def spatial_as_given(known, masses, inertias, gravity=(0.0, 0.0, -9.81)):
 
 
 def test_spatial_four_bar():
-    known = spatial_four_bar()
+    known = mechanisms.spatial_four_bar()
     masses = known.parameters["masses"].values()
     lengths = (0.3, known.parameters["coupler"], 0.7)
     inertias = [round_bar(mass, long) for mass, long in zip(masses, lengths, strict=True)]
@@ -240,7 +216,7 @@ def test_spatial_four_bar():
 
 
 def test_spatial_slider_crank():
-    known = spatial_slider_crank()
+    known = mechanisms.spatial_slider_crank()
     model = spatial_as_given(known, known.parameters["masses"].values(), known.parameters["inertias"].values())
     x, R = np.array([1.0, 0.0, 0.0]), rotation_matrix(known.q0[10:14])
     A = np.array([0.0, 0.1, 0.12])
@@ -255,7 +231,7 @@ def test_spatial_slider_crank():
 
 
 def test_governor():
-    known = governor()
+    known = mechanisms.governor()
     bar, cube = 0.3, 3.0
     centre = (0.5 * bar + 5.0) / (bar + 5.0)
     axial, across, _ = box(bar, 1.0, 0.01, 0.01)
@@ -278,7 +254,7 @@ def test_governor():
 
 
 def test_heavy_top():
-    known = heavy_top()
+    known = mechanisms.heavy_top()
     model = spatial_as_given(known, [15.0], [(0.234375, 0.46875, 0.234375)])
     model.spherical("ground", "top", at=(0.0, 0.0, 0.0))
     _, one, other = both(model.problem((0.0, 0.2)), known, 0.2)
@@ -286,7 +262,7 @@ def test_heavy_top():
 
 
 def test_driven_crank():
-    known = driven_crank()
+    known = mechanisms.driven_crank()
     model = planar_as_given(known, known.parameters["masses"], known.parameters["inertias"])
     hinge = model.revolute("ground", "crank", at=(0.0, 0.0))
     model.revolute("crank", "rod", at=2.0 * known.q0[:2])
@@ -296,7 +272,7 @@ def test_driven_crank():
 
 
 def test_n_four_bar():
-    known = n_four_bar(2, coordinates="bodies")
+    known = mechanisms.n_four_bar(2, coordinates="bodies")
     model = planar_as_given(known, np.ones(5), np.full(5, 1.0 / 12.0))
     for k in range(3):
         model.revolute("ground", f"crank {k}", at=(k, 0.0))
@@ -305,12 +281,14 @@ def test_n_four_bar():
             model.revolute(f"coupler {k}", f"crank {end}", at=(end, 1.0))
     made, one, other = both(model.problem(), known, 0.5)
     np.testing.assert_allclose(one, other, atol=1e-8)
-    _, one, other = both(made, n_four_bar(2), 0.5, energy=False)  # by the tips of the cranks
+    _, one, other = both(made, mechanisms.n_four_bar(2), 0.5, energy=False)  # by the tips of the cranks
     tips = 2.0 * one.reshape(5, 3, -1)[:3, :2] - np.array([[k, 0.0] for k in range(3)])[:, :, None]
     np.testing.assert_allclose(tips.reshape(6, -1), other, atol=1e-8)
 
 
-@pytest.mark.parametrize("maker", [pendulum, projection_pendulum, double_pendulum, closed_chain])
+@pytest.mark.parametrize(
+    "maker", [mechanisms.pendulum, mechanisms.projection_pendulum, mechanisms.double_pendulum, mechanisms.closed_chain]
+)
 def test_masses_on_links(maker):
     """Masses without extension: bodies that do not turn, as links end at their centres."""
     known = maker()
@@ -322,7 +300,7 @@ def test_masses_on_links(maker):
         here = body.point(0.0, 0.0)
         model.distance(before.body, before, body, here, length=p["length"])
         before = here
-    if maker is closed_chain:
+    if maker is mechanisms.closed_chain:
         model.distance(before.body, before, "ground", (0.8, 0.0), length=p["length"])
     _, one, other = both(model.problem(), known, 1.0)
     np.testing.assert_allclose(one.reshape(-1, 3, 6)[:, :2], other.reshape(-1, 2, 6), atol=1e-8)
@@ -330,7 +308,7 @@ def test_masses_on_links(maker):
 
 
 def test_knife_edge():
-    known = knife_edge()
+    known = mechanisms.knife_edge()
     p = known.parameters
     model = PlanarModel((p["gravity"] * math.sin(p["slope"]), 0.0))
     model.body("blade", mass=p["mass"], inertia=p["inertia"], position=(0.0, 0.0), angular_velocity=p["spin"])
@@ -341,7 +319,7 @@ def test_knife_edge():
 
 
 def test_rolling_disc():
-    known = rolling_disc()
+    known = mechanisms.rolling_disc()
     p = known.parameters
     yaw, lean, _ = p["angles"]
     sy, cy, s, c = math.sin(yaw), math.cos(yaw), math.sin(lean), math.cos(lean)
@@ -353,6 +331,5 @@ def test_rolling_disc():
     model.rolling("disc", radius=p["radius"], axis=R[:, 2])
     made, one, other = both(model.problem(), known, 2.0)
     np.testing.assert_allclose(one[:3], other[:3], atol=1e-8)
-    axis = np.array([rotation_matrix(e)[2, 2] for e in one[3:].T])
-    np.testing.assert_allclose(axis, -np.sin(other[4]), atol=1e-8)
+    np.testing.assert_allclose(np.array([rotation_matrix(e)[2, 2] for e in one[3:].T]), -np.sin(other[4]), atol=1e-8)
     assert made.freedom.degrees == 3

@@ -69,10 +69,7 @@ ODD = {
         hinged(((0, 0, 1), (0, 0, 1)), (0, 0, 0), (0, 0, 1)),
         "1 degree of freedom. Rows follow from others among 'hinge 0', 'hinge 1'.",
     ),
-    "hinges of a door, not in line": (
-        hinged(((0, 0, 1), (0, 0.01, 1)), (0, 0, 0), (0, 0, 1)),
-        "0 degrees of freedom.",
-    ),
+    "hinges of a door, not in line": (hinged(((0, 0, 1), (0, 0.01, 1)), (0, 0, 0), (0, 0, 1)), "0 degrees of freedom."),
     "gears of inconsistent ratios": (both_wheels(2.0, 3.0), "0 degrees of freedom."),
     "a gear twice": (
         both_wheels(-1.0, -1.0),

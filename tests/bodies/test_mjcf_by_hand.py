@@ -8,7 +8,6 @@ from twoloop.bodies import SpatialModel, from_mjcf
 from twoloop.mechanisms.rotation import rotation_matrix
 
 pytestmark = pytest.mark.filterwarnings("ignore::twoloop.ConstraintWarning")
-
 HEAD = '<mujoco><compiler angle="radian"/><default><geom contype="0" conaffinity="0"/></default><worldbody>'
 X, Y, Z = np.eye(3)
 BALL = 0.4 * 1.0 * 0.1**2  # of 1 kg and 0.1 m

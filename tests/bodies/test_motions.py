@@ -9,7 +9,6 @@ from twoloop.bodies import PlanarModel, SpatialModel
 
 TIMES = np.linspace(0.0, 3.0, 7)
 GRAVITY = 9.81
-
 pytestmark = pytest.mark.filterwarnings("ignore::twoloop.ConstraintWarning")  # planar loops in space
 
 
@@ -71,8 +70,7 @@ def test_a_cart_with_a_pendulum_spring_and_motor(feedback):
     def of_state(t, q, v):
         return 3.0 * np.cos(2.0 * t) - 1.5 * v[0] - 0.2 * q[5] ** 2
 
-    model = cart(PlanarModel(), of_state if feedback else of_time, 0.4)
-    problem, result = moved(model)
+    problem, result = moved(cart(PlanarModel(), of_state if feedback else of_time, 0.4))
     M, m, L, J = 2.0, 0.5, 0.6, 0.02
 
     def acceleration(t, z, rate):
@@ -101,8 +99,7 @@ def test_a_pendulum_on_a_driven_arm_in_space():
     problem, result = moved(model)
 
     def acceleration(t, theta, rate):
-        w = 6.0 + 0.5 * np.cos(t)
-        pull = m * l**2 * w**2 * np.sin(theta) * np.cos(theta) - m * GRAVITY * l * np.sin(theta)
+        pull = m * l**2 * (6.0 + 0.5 * np.cos(t)) ** 2 * np.sin(theta) * np.cos(theta) - m * GRAVITY * l * np.sin(theta)
         return pull / (m * l**2 + small)
 
     known = by_hand(acceleration, [0.5, 0.0])
@@ -135,8 +132,7 @@ def test_a_driven_slide_in_space_carries_a_spring_mass():
     known = by_hand(acceleration, [1.0, 0.0])
     place = along @ result.q[7:10]
     rest = by_hand(acceleration, [1.0, along @ result.v[7:10, 0]])
-    assert np.abs(rest[0] - place).max() < 1e-8
-    assert known.shape == rest.shape
+    assert np.abs(rest[0] - place).max() < 1e-8 and known.shape == rest.shape
 
 
 def test_functions_that_branch_are_called_in_python_and_do_the_same():
@@ -174,8 +170,7 @@ def test_a_function_that_remembers_is_called_in_python():
 
 
 def test_many_runs_with_parameters_by_name():
-    model = cart(PlanarModel(), lambda t: 3.0 * np.cos(2.0 * t), 0.4)
-    problem = model.problem((0.0, 1.0))
+    problem = cart(PlanarModel(), lambda t: 3.0 * np.cos(2.0 * t), 0.4).problem((0.0, 1.0))
     P = np.tile(problem.system.parameters, (3, 1))
     P[:, problem.place("stiffness of spring cart-ground")] = (10.0, 20.0, 33.3)
     P[:, problem.place("mass of rod")] = (0.5, 0.7, 1.1)
@@ -271,9 +266,31 @@ def test_a_torsion_spring_in_space_does_not_jump_after_a_turn(method):
     spring = model.torsion_spring(hinge, stiffness=0.05, damping=0.01)
     problem = model.problem((0.0, 10.0))
     result = solve_dae(problem.system, problem.t_span, problem.q0, problem.v0, method, rtol=1e-4, atol=1e-4)
-    assert not result.success
-    assert 0.85 < np.arctan2(result.q[6, -1], result.q[3, -1]) / np.pi <= 0.95
+    assert not result.success and 0.85 < np.arctan2(result.q[6, -1], result.q[3, -1]) / np.pi <= 0.95
     damped = problem.with_parameters({f"stiffness of {spring.name}": 0.0})  # a damper may turn on
     result = solve_dae(damped.system, damped.t_span, damped.q0, damped.v0, method, rtol=1e-6, atol=1e-6)
     rate = 2.0 * (result.q[3, -1] * result.v[6, -1] - result.q[6, -1] * result.v[3, -1])
     assert result.success and rate == pytest.approx(4.0 * np.exp(-0.1), rel=1e-3)
+
+
+@pytest.mark.parametrize("model", [PlanarModel, SpatialModel])
+def test_a_function_that_is_called_in_python_is_not_called_on_symbols(model):
+    seen, model = set(), model()
+    axis = {} if model.dimension == 2 else {"axis": (0.0, 1.0, 0.0)}
+    more = {"inertia": 0.1} if model.dimension == 2 else {"inertia": (0.1, 0.1, 0.1)}
+    bar = model.body("bar", mass=1.0, position=(1.0, 0.0, 0.0)[: model.dimension], **more)
+    pin = model.revolute("ground", bar, at=(0.0, 0.0, 0.0)[: model.dimension], **axis)
+    model.motor(pin, lambda t: seen.add(type(t)) or (1.0 if t < 0.1 else 0.5))
+    problem = model.problem((0.0, 0.2))
+    with pytest.raises(ValueError, match="f of 'motor of"):
+        solve_dae(problem.system, problem.t_span, problem.q0, problem.v0, compiled=True)
+    assert solve_dae(problem.system, problem.t_span, problem.q0, problem.v0).success and seen == {float}
+
+
+def test_docstrings_of_what_adds_to_a_model_are_whole():
+    for model in (PlanarModel, SpatialModel):
+        for name in ("body", "rod", "box", "revolute", "prismatic", "fixed", "distance", "spring", "motor", "limit"):
+            text = getattr(model, name).__doc__
+            parts = [text.index(f"{part}\n") for part in ("Parameters", "Returns", "Raises")]
+            assert parts == sorted(parts), name
+            assert all(text.count(f"{part}\n") == 1 for part in ("Parameters", "Returns", "Raises")), name

@@ -10,7 +10,6 @@ from twoloop import solve_dae
 from twoloop.bodies import PlanarModel, SpatialModel
 
 pytestmark = pytest.mark.filterwarnings("ignore::twoloop.ConstraintWarning")  # loops in space
-
 UNLIKE = ("DOP853", "RadauIIA13")
 
 
@@ -130,8 +129,7 @@ def test_peaucelliers_inversor_draws_a_line():
     assert problem.freedom.degrees == 1
     result = agreed(problem, 0.4)
     # Q is as far beyond the middle of AQ as A before it
-    x = 2.0 * (result.q[12] - result.q[0])
-    np.testing.assert_allclose(x, (1.0 - 0.6**2) / 0.6, atol=1e-12)
+    np.testing.assert_allclose(2.0 * (result.q[12] - result.q[0]), (1.0 - 0.6**2) / 0.6, atol=1e-12)
     assert np.ptp(result.q[13]) > 0.05
 
 
@@ -164,8 +162,7 @@ def test_lazy_tongs_open_all_alike():
     model.spring("ground", places["d0"], f"fall {n - 1}", places[f"d{n}"], stiffness=20.0, length=1.0)
     problem = model.problem()
     assert problem.freedom.degrees == 1
-    result = agreed(problem, 1.0)
-    middles = result.q[:-3].reshape(n, 2, 3, -1)[:, 0, 0]
+    middles = agreed(problem, 1.0).q[:-3].reshape(n, 2, 3, -1)[:, 0, 0]
     np.testing.assert_allclose(middles, np.outer(2 * np.arange(n) + 1, middles[0]), atol=1e-12)
 
 

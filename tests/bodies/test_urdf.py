@@ -87,8 +87,7 @@ def by_hand():
     model.revolute("shoulder", "upper", at=knee, axis=frame @ (0, 1, 1), name="lift")
     weight, there = second @ turned(0, 0.7, 0), knee + second @ (0.4, 0, 0)
     third, rail = weight @ turned(0, 0, 1), there + weight @ (0, 0, 0.1)
-    moments = (0.002, 0.002, 0.003)
-    model.body("slide", mass=0.4, inertia=moments, position=rail + third @ (0.05, 0, 0), rotation=third)
+    model.body("slide", mass=0.4, inertia=(0.002, 0.002, 0.003), position=rail + third @ (0.05, 0, 0), rotation=third)
     model.prismatic("upper", "slide", at=rail, axis=third[:, 0], name="push")
     return model
 
@@ -139,8 +138,7 @@ def test_accelerations_are_those_of_pinocchio(arm, free_base, tmp_path):
     torque = np.zeros(theirs.nv)
     damped = theirs.joints[theirs.getJointId("turn")].idx_v
     torque[damped] = -0.3 * rates[damped]
-    a = pin.aba(theirs, data, q, rates, torque)
-    pin.forwardKinematics(theirs, data, q, rates, a)
+    pin.forwardKinematics(theirs, data, q, rates, pin.aba(theirs, data, q, rates, torque))
     known, v = [], []
     for k in range(1, 1 + len(model.bodies)):
         pose, lever, speed, change = data.oMi[k], theirs.inertias[k].lever, data.v[k], data.a[k]
@@ -211,6 +209,7 @@ def test_a_loop_that_is_given_beside_the_file(tmp_path):
         ('<mass value="0.4"/>', '<mass value="0"/>', "has joints but no mass"),
         ('ixx="', 'ixx="x', "inertia of link 'shoulder' must be 6 finite numbers"),
         ('damping="', 'damping="x', "damping of joint 'turn' must be 1 finite numbers"),
+        ('rpy="0.3 0 0"', 'quat_xyzw="1 0 0 0"', "has quat_xyzw, which is not read: give rpy"),
         ("</robot>", '<link name="slide"/></robot>', "links must have different names; 'slide' is there twice"),
     ],
 )

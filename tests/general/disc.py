@@ -36,7 +36,6 @@ def _disc(name, end, state, redundant):
 
 
 # --- steady rolling in a circle, closed form
-
 LEAN, YAW_RATE = -0.35, 1.1  # the centre of the circle is on the side to which the disc leans
 
 
@@ -57,7 +56,6 @@ def steady_disc(redundant=False):
 
 
 # --- general motion
-
 END = 2.0
 
 

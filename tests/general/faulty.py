@@ -57,7 +57,6 @@ def parted_drives(power):
     At t = 0 both agree in position and in velocity; with power = 3 in acceleration, too.
     """
     zero = power == 2
-
     return ConstrainedSystem.from_python(
         n_q=2,
         n_c=3,

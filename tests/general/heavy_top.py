@@ -39,8 +39,6 @@ def _axis_by_e(e):
 
 
 # --- the models
-
-
 def _rotation(inertia):
     """Mass matrix and inertia forces of the Euler parameters."""
     J = np.diag(inertia)

@@ -30,12 +30,6 @@ def knife_edge_in_space():
     """X, Y, Z, phi: Y and the plane's slope along X; the plane is a holonomic row."""
     tangent, cosine = np.tan(SLOPE), np.cos(SLOPE)
 
-    def rows(t, q):
-        return np.array([[np.sin(q[3]) / cosine, -np.cos(q[3]), 0.0, 0.0]])
-
-    def rows_gamma(t, q, v):
-        return np.array([-v[3] * (v[0] * np.cos(q[3]) / cosine + v[1] * np.sin(q[3]))])
-
     def lifted(t):
         q, v = state(t)
         lift = np.array([[cosine, 0.0, 0.0], [0.0, 1.0, 0.0], [-np.sin(SLOPE), 0.0, 0.0], [0.0, 0.0, 1.0]])
@@ -52,8 +46,8 @@ def knife_edge_in_space():
             constraint=lambda t, q: np.array([q[2] + tangent * q[0]]),
             jacobian=lambda t, q: np.array([[tangent, 0.0, 1.0, 0.0]]),
             gamma=lambda t, q, v: np.zeros(1),
-            nonholonomic=rows,
-            nonholonomic_gamma=rows_gamma,
+            nonholonomic=lambda t, q: np.array([[np.sin(q[3]) / cosine, -np.cos(q[3]), 0.0, 0.0]]),
+            nonholonomic_gamma=lambda t, q, v: np.array([-v[3] * (v[0] * np.cos(q[3]) / cosine + v[1] * np.sin(q[3]))]),
         ),
         end=END,
         state=lifted,

@@ -2,21 +2,11 @@
 
 from functools import cache, partial
 
-from tests.general import (
-    dead_points,
-    disc,
-    faulty,
-    heavy_top,
-    knife_edge,
-    planet,
-    slider_crank,
-    windows,
-)
+from tests.general import dead_points, disc, faulty, heavy_top, knife_edge, planet, slider_crank, windows
 from tests.general.mechanism import known, of_problem
 from tests.mechanisms.motions import known_motions
 
 WINDOWS = (1, 2, 40)
-
 # name -> how it is made; motion that never comes near a point where C_q loses rank
 REGULAR = {
     "redundant slider-crank": slider_crank.redundant_slider_crank,

@@ -11,17 +11,12 @@ def planet(eccentricity=0.2):
         for _ in range(50):  # Kepler's equation, by Newton
             E -= (E - eccentricity * np.sin(E) - t) / (1.0 - eccentricity * np.cos(E))
         b, rate = np.sqrt(1.0 - eccentricity**2), 1.0 / (1.0 - eccentricity * np.cos(E))
-        q = np.array([np.cos(E) - eccentricity, b * np.sin(E)])
-        return q, rate * np.array([-np.sin(E), b * np.cos(E)])
+        return np.array([np.cos(E) - eccentricity, b * np.sin(E)]), rate * np.array([-np.sin(E), b * np.cos(E)])
 
     return Mechanism(
         name="planet",
         system=of_functions(
-            name="planet",
-            n_q=2,
-            n_c=0,
-            mass=np.eye(2),
-            force=lambda t, q, v: -q / (q[0] * q[0] + q[1] * q[1]) ** 1.5,
+            name="planet", n_q=2, n_c=0, mass=np.eye(2), force=lambda t, q, v: -q / (q[0] * q[0] + q[1] * q[1]) ** 1.5
         ),
         end=3.0,
         state=state,

@@ -60,8 +60,7 @@ def test_accelerations_and_multipliers_of_minimum_norm(name, method):
 def test_rank_and_redundant_rows(name, method):
     """What remains without the rows named must be independent, and as many as the rank."""
     m, (result, warned) = mechanism(name), run(name, method)
-    assert result.rank == m.rank
-    assert len(result.redundant) == len(result.lam) - m.rank
+    assert result.rank == m.rank and len(result.redundant) == len(result.lam) - m.rank
     kept = np.delete(m.system().rows(0.0, m.start[0]), result.redundant, axis=0)
     assert np.linalg.matrix_rank(kept, tol=1e-9) == m.rank == len(kept)
     assert len(warned) == (1 if name in REDUNDANT else 0)

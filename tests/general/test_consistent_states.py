@@ -48,8 +48,7 @@ def test_callbacks_that_cannot_be_traced_go_one_by_one():
     system = ConstrainedSystem.from_python(
         n_q=2, n_c=1, mass=np.eye(2), force=lambda t, q, v: np.zeros(2), constraint=circle, parameters=[1.0]
     )
-    random = np.random.default_rng(0)
-    parameters, q = random.uniform(0.9, 1.1, (4, 1)), np.array([0.7, 0.8])
+    parameters, q = np.random.default_rng(0).uniform(0.9, 1.1, (4, 1)), np.array([0.7, 0.8])
     made, _ = consistent_states(system, 0.0, q, np.zeros(2), parameters=parameters)
     assert np.abs(np.linalg.norm(made, axis=1) - parameters[:, 0]).max() < 1e-12
 

@@ -22,8 +22,7 @@ def test_one_start_serves_all_parameters_and_one_set_of_parameters_all_starts():
     runs = ensemble(system, (0.0, 0.5), np.tile(start[0], (9, 1)), start[1])
     known = solve_dae(system, (0.0, 0.5), *start, rtol=1e-11, atol=1e-11)
     assert runs.singly.sum() == 1 and np.abs(runs.q[:, :, -1] - known.q[:, -1]).max() < 1e-7
-    parameters = np.tile(system.parameters, (3, 1))
-    assert len(ensemble(system, (0.0, 0.1), *start, parameters=parameters)) == 3
+    assert len(ensemble(system, (0.0, 0.1), *start, parameters=np.tile(system.parameters, (3, 1)))) == 3
     assert len(ensemble(system, (0.0, 0.1), *start)) == 1
 
 
@@ -48,8 +47,7 @@ def test_what_lanes_cannot_see_is_found_and_made_singly(force, compiled):
     q, v, parameters = drawn(12)
     system = system_of(parameters, mass=np.eye(2), force=force, compile=compiled)
     runs = ensemble(system, (0.0, 1.0), q, v, parameters=parameters)
-    assert runs.success.all()
-    assert far_from_single_runs(runs, range(12), system, (0.0, 1.0), q, v, parameters) < 1e-6
+    assert runs.success.all() and far_from_single_runs(runs, range(12), system, (0.0, 1.0), q, v, parameters) < 1e-6
 
 
 @pytest.mark.parametrize("compiled", [False, True])
@@ -66,8 +64,7 @@ def test_one_run_of_many_that_is_unlike_the_others_is_found(compiled):
     # and no jacobian: it is derived
     system = system_of(parameters, mass=np.eye(2), force=force, jacobian=None, compile=compiled)
     runs = ensemble(system, (0.0, 0.5), q, v, parameters=parameters)
-    assert runs.singly.all()
-    assert far_from_single_runs(runs, [5, one], system, (0.0, 0.5), q, v, parameters) < 1e-6
+    assert runs.singly.all() and far_from_single_runs(runs, [5, one], system, (0.0, 0.5), q, v, parameters) < 1e-6
 
 
 def test_what_cannot_go_in_lanes_says_why():
@@ -77,9 +74,7 @@ def test_what_cannot_go_in_lanes_says_why():
     assert runs.singly.all() and "nonholonomic" in runs.message
     runs = ensemble(system, (0.0, 0.1), q, v, parameters=parameters, method="Adams")
     assert runs.singly.all() and "Adams does not go in lanes" in runs.message
-
-    low = event(lambda t, q, v: q[1] + 0.2, terminal=True)
-    runs = ensemble(system, SPAN, q, v, parameters=parameters, events=low)
+    runs = ensemble(system, SPAN, q, v, parameters=parameters, events=event(lambda t, q, v: q[1] + 0.2, terminal=True))
     assert runs.singly.all() and "events" in runs.message and (runs.status == Status.EVENT).any()
     assert np.isnan(runs.q[runs.status == Status.EVENT][:, :, -1]).all()
 

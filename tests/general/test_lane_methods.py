@@ -49,8 +49,7 @@ def test_runs_are_those_of_another_method_one_by_one(made):
 def test_steps_are_as_many_as_those_of_single_runs(made):
     system, q, v, parameters, options, runs = made
     for run in (3, 60):
-        own = system.with_parameters(parameters[run])
-        n_steps = solve_dae(own, SPAN, q[run], v[run], **options).stats.n_accepted
+        n_steps = solve_dae(system.with_parameters(parameters[run]), SPAN, q[run], v[run], **options).stats.n_accepted
         assert 0.9 * n_steps <= runs.n_steps[run] <= 1.5 * n_steps
 
 
@@ -106,8 +105,7 @@ def springs(n_runs):
     def force(t, q, v, p):
         x, y = q[2] - q[0], q[3] - q[1]
         length = (x * x + y * y) ** 0.5
-        rate = (x * (v[2] - v[0]) + y * (v[3] - v[1])) / length
-        pull = (p[0] * (length - p[2]) + p[1] * rate) / length
+        pull = (p[0] * (length - p[2]) + p[1] * ((x * (v[2] - v[0]) + y * (v[3] - v[1])) / length)) / length
         return np.array([pull * x, pull * y - 9.81, -pull * x, -pull * y - 9.81])
 
     system = ConstrainedSystem.from_python(
@@ -121,8 +119,7 @@ def springs(n_runs):
     )
     angle = random.uniform(0.3, 1.2, n_runs)
     bob = np.column_stack([np.sin(angle), -np.cos(angle)])
-    way = np.column_stack([np.sin(0.5 * angle), -np.cos(0.5 * angle)])
-    return system, np.hstack([bob, bob + p[:, 2:] * way]), p
+    return system, np.hstack([bob, bob + p[:, 2:] * np.column_stack([np.sin(0.5 * angle), -np.cos(0.5 * angle)])]), p
 
 
 def dampers(n_runs):
@@ -152,12 +149,7 @@ def bushings(n_runs):
         s, c, s2, c2 = np.sin(q[2]), np.cos(q[2]), np.sin(q[5]), np.cos(q[5])
         half = 0.5 * p[2]
         return np.array(
-            [
-                q[0] - 0.5 * c,
-                q[1] - 0.5 * s,
-                q[0] + 0.5 * c - q[3] + half * c2,
-                q[1] + 0.5 * s - q[4] + half * s2,
-            ]
+            [q[0] - 0.5 * c, q[1] - 0.5 * s, q[0] + 0.5 * c - q[3] + half * c2, q[1] + 0.5 * s - q[4] + half * s2]
         )
 
     def force(t, q, v, p):

@@ -19,8 +19,7 @@ def test_a_row_given_twice_shares_the_force(method, factor):
         result = solve_dae(held_twice(factor), (0.0, 1.0), *START, method=method, rtol=1e-7, atol=1e-7)
     assert len(caught) == 1
     assert result.success, result.message
-    assert result.rank == 1
-    assert list(result.redundant) in ([0], [1])
+    assert result.rank == 1 and list(result.redundant) in ([0], [1])
     q, _, lam = pendulum_state(result.t)
     loose = 1e-2 if method in ("Newmark", "PaperIRK") else 1e-4
     assert result.q == pytest.approx(q, abs=loose)
@@ -33,10 +32,7 @@ def test_rows_that_part_later_end_the_run(method):
     """Both drives agree at the start, and only there: to go on with one of them would be wrong in silence."""
     with pytest.warns(ConstraintWarning):
         result = solve_dae(parted_drives(3), (0.0, 1.0), [0.0, 0.0], [1.0, 1.0], method=method)
-    assert not result.success
-    assert result.t[-1] < 0.1
-    assert "contradict" in result.message
-    assert "1" in result.message
+    assert not result.success and result.t[-1] < 0.1 and "contradict" in result.message and "1" in result.message
     assert "2" in result.message
 
 

@@ -124,6 +124,20 @@ def test_what_is_more_than_a_force_is_refused():
         assert integrator.result().t.tolist() == [0.0]
 
 
+def test_the_parameters_of_the_start_are_those_of_the_result():
+    """Reactions and energy were those of the parameters of the system."""
+    problem, _ = pendulum()
+    other = problem.with_parameters({"x of revolute rod-ground on rod": -0.3, "gravity along y": -2.0})
+    integrator = Integrator(problem.system)
+    integrator.start(0.0, other.q0, other.v0, parameters=other.system.parameters)
+    integrator.step(0.5)
+    result = integrator.result()
+    np.testing.assert_allclose(result.system.constraint(0.5, result.q[:, -1]), 0.0, atol=1e-12)
+    assert result.description.energy is None
+    with pytest.raises(ValueError, match="reactions need joints"):  # which may be elsewhere, as in a run
+        result.reactions("revolute rod-ground")
+
+
 def test_a_step_that_fails_says_so():
     problem, servo = pendulum()
     integrator = Integrator(problem.system)

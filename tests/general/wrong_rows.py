@@ -68,13 +68,11 @@ ROWS = [
         "ConstrainedSystem.from_python",
         edge,
         "n_a",
-        [
-            (-1, ValueError, "must be at least 0; given -1", COUNT),
-            (1.0, TypeError, r"must be an int; given 1\.0", COUNT),
-            ("1", TypeError, "must be an int; given '1'", COUNT),
-            (True, TypeError, "must be an int; given True", COUNT),
-            (HUGE, ValueError, "must fit into 64 bits", COUNT),
-        ],
+        (-1, ValueError, "must be at least 0; given -1", COUNT),
+        (1.0, TypeError, r"must be an int; given 1\.0", COUNT),
+        ("1", TypeError, "must be an int; given '1'", COUNT),
+        (True, TypeError, "must be an int; given True", COUNT),
+        (HUGE, ValueError, "must fit into 64 bits", COUNT),
     ),
     case(
         "`n_a=1` without `nonholonomic`",

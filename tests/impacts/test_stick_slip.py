@@ -165,8 +165,7 @@ def double_pendulum(kind):
         if flat:
             model.body(name, mass=1.0, inertia=0.1, position=0.5 * (one + other))
         else:
-            place = np.append(0.5 * (one + other), 0.0)
-            model.body(name, mass=1.0, inertia=(0.1, 0.1, 0.1), position=place)
+            model.body(name, mass=1.0, inertia=(0.1, 0.1, 0.1), position=np.append(0.5 * (one + other), 0.0))
         joint = model.revolute("ab"[k - 1] if k else "ground", name, at=one if flat else np.append(one, 0.0), **axis)
         model.dry_friction(joint, (1.0, 0.5)[k], static=(1.6, 0.5)[k])
     return model.problem((0.0, 1.6))

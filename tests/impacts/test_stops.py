@@ -100,8 +100,7 @@ def test_a_rod_falls_on_a_stop_and_bounces():
 
 def test_a_stop_lets_go_when_its_force_would_pull():
     model = PlanarModel()
-    rod = model.rod("rod", (0.0, 0.0), (1.0, 0.0), mass=2.0)
-    pin = model.revolute("ground", rod, at=(0.0, 0.0))
+    pin = model.revolute("ground", model.rod("rod", (0.0, 0.0), (1.0, 0.0), mass=2.0), at=(0.0, 0.0))
     model.motor(pin, lambda t: 12.0 * np.sin(t))
     (stop,) = model.limit(pin, lower=0.0, restitution=0.5)
     _, result = moved(model, 1.2)
@@ -157,8 +156,7 @@ def test_a_box_rocks_to_rest_on_two_corners(restitution):
 def test_a_ball_comes_to_rest_in_a_wedge_at_the_origin():
     model = ball()
     for side in (-1.0, 1.0):
-        normal = (side * np.sin(0.7), np.cos(0.7))
-        model.stop("ball", (0.0, 1.0), "ground", (0.0, 0.0), normal=normal, restitution=0.2)
+        model.stop("ball", (0.0, 1.0), "ground", (0.0, 0.0), normal=(side * np.sin(0.7), np.cos(0.7)), restitution=0.2)
     model.force("ball", (0.0, 1.0), (0.1, 0.0))
     _, result = moved(model, 2.5)
     np.testing.assert_allclose(result.q[:, -1], 0.0, atol=1e-9)
@@ -239,3 +237,16 @@ def test_a_motion_that_begins_at_rest_on_a_stop_has_the_multipliers_of_its_syste
     known = 2.0 * (t**3 - t0**3) - 6.0 * t0**2 * (t - t0) - 0.5 * 9.81 * (t - t0) ** 2
     assert result.q[1, -1] == pytest.approx(known, abs=1e-8)
     np.testing.assert_allclose(np.abs(result.lam[0]), 3.0, atol=1e-8)
+
+
+@pytest.mark.parametrize(("size", "rate"), [(5e-3, 300.0), (5e-2, 20.0)])
+def test_the_first_touch_of_a_shaking_table_is_found(size, rate):
+    """A body that comes slowly, in steps longer than the table takes to shake."""
+    model = PlanarModel(gravity=(0.0, 0.0))
+    model.body("ball", mass=1.0, inertia=0.1, position=(0.0, 0.2), velocity=(0.0, -0.1), angular_velocity=0.3)
+    problem = model.problem((0.0, 5.0))
+    stop = Stop(lambda t, q: q[1] - size * np.sin(rate * t), 0.5)
+    result = solve_with_stops(problem.system, problem.t_span, problem.q0, problem.v0, stop)
+    times = np.linspace(0.0, 5.0, 500_001)
+    first = times[np.flatnonzero(0.2 - 0.1 * times < size * np.sin(rate * times))[0]]
+    assert result.impacts[0].t == pytest.approx(first, abs=1.1e-5)

@@ -6,53 +6,38 @@ import numpy as np
 import pytest
 
 from references.paper.four_bar_minimal import trajectory
-from tests.problems import (
-    LINKAGES,
-    force_residual,
-    moving_pivot,
-    moving_pivot_state,
-    oblique_pendulum,
-    oblique_point,
-    oblique_start,
-    oblique_to_point,
-    pendulum,
-    pendulum_state,
-    run,
-    swing,
-    violations,
-    worst,
-)
+from tests import problems
 from twoloop import solve_dae
 
-linkages = pytest.mark.parametrize("linkage", LINKAGES)
+linkages = pytest.mark.parametrize("linkage", problems.LINKAGES)
 PUSHED = np.array([20.0, -9.81])  # force from 1 s on, where it jumps
 
 
 def four_bar_run(method, tol, end=10.0, linkage="default", **options):
     """The run by the general kernels, and its largest error in q over all stored states."""
-    problem = LINKAGES[linkage]
-    result = run(problem, end, method=method, rtol=tol, atol=tol, compiled=False, **options)
+    problem = problems.LINKAGES[linkage]
+    result = problems.run(problem, end, method=method, rtol=tol, atol=tol, compiled=False, **options)
     assert result.success, result.message
-    return result, worst(result.q, trajectory(problem.parameters, result.t)[0])
+    return result, problems.worst(result.q, trajectory(problem.parameters, result.t)[0])
 
 
 shared_run = cache(four_bar_run)  # for runs that several tests look at
 
 
 def jumping():
-    return pendulum(force=lambda t, q, v: PUSHED if t > 1.0 else PUSHED * [0.0, 1.0])
+    return problems.pendulum(force=lambda t, q, v: PUSHED if t > 1.0 else PUSHED * [0.0, 1.0])
 
 
 @cache
 def at_the_jump():
     """q and v of the pendulum where its force jumps."""
-    before = swing(1.0, method="Gauss8", rtol=1e-12, atol=1e-12)
+    before = problems.swing(1.0, method="Gauss8", rtol=1e-12, atol=1e-12)
     return before.q[:, -1], before.v[:, -1]
 
 
 def after_the_jump(end, method, tol):
     """A run that begins where the force jumps."""
-    return solve_dae(pendulum(force=lambda t, q, v: PUSHED), (1.0, end), *at_the_jump(), method, tol, tol)
+    return solve_dae(problems.pendulum(force=lambda t, q, v: PUSHED), (1.0, end), *at_the_jump(), method, tol, tol)
 
 
 class AdaptiveMethod:
@@ -81,8 +66,7 @@ class AdaptiveMethod:
         runs = [shared_run(self.method, tol, linkage=linkage) for tol in self.tolerances]
         assert all(result.stats.n_partitions > self.partitions for result, _ in runs)
         errors = np.array([error for _, error in runs])
-        assert (errors < self.far * np.array(self.tolerances)).all()
-        assert (errors[1:] < self.gain * errors[:-1]).all()
+        assert (errors < self.far * np.array(self.tolerances)).all() and (errors[1:] < self.gain * errors[:-1]).all()
         steps = np.array([result.stats.n_accepted for result, _ in runs])
         assert (steps[1:] / steps[:-1] < self.more_steps).all()
 
@@ -92,57 +76,60 @@ class AdaptiveMethod:
 
     @linkages
     def test_it_does_not_drift_off_the_constraints(self, linkage):
-        system = LINKAGES[linkage].system
+        system = problems.LINKAGES[linkage].system
         for tol, residual in self.drift:
             result, _ = shared_run(self.method, tol, self.drift_end, linkage)
-            position, velocity = violations(system, result)
-            assert position < self.kept[0]
-            assert velocity < self.kept[1]
-            assert force_residual(system, result) < residual
+            position, velocity = problems.violations(system, result)
+            assert (
+                position < self.kept[0]
+                and velocity < self.kept[1]
+                and problems.force_residual(system, result) < residual
+            )
 
     def test_a_first_step_that_is_too_large_is_refused(self):
         for tol in self.tolerances:
             usual, result = (
-                swing(self.swing_end, method=self.method, rtol=tol, atol=tol, first_step=h)
+                problems.swing(self.swing_end, method=self.method, rtol=tol, atol=tol, first_step=h)
                 for h in (None, self.first_step)
             )
             assert result.success, result.message
             refused = result.stats.n_rejected_error + result.stats.n_rejected_convergence
             assert self.refused[0] <= refused < self.refused[1]
             assert result.stats.n_accepted < self.more_after * usual.stats.n_accepted
-            assert worst(result.q, pendulum_state(result.t)[0]) < self.far_after * tol
+            assert problems.worst(result.q, problems.pendulum_state(result.t)[0]) < self.far_after * tol
 
     def test_a_force_that_jumps_is_passed(self):
         truth = after_the_jump(self.jump_end, "Gauss8", 1e-12)
         for tol, far in self.jump:
-            result = swing(self.jump_end, jumping(), method=self.method, rtol=tol, atol=tol)
+            result = problems.swing(self.jump_end, jumping(), method=self.method, rtol=tol, atol=tol)
             assert result.success, result.message
-            assert worst(result.q[:, -1], truth.q[:, -1]) < far
+            assert problems.worst(result.q[:, -1], truth.q[:, -1]) < far
 
     def test_a_moving_pivot(self):
-        system, times = moving_pivot(compile=True), np.linspace(0.1, 10.0, 100)
-        q, v = moving_pivot_state(times)
-        start, errors = moving_pivot_state(0.0), []
+        system, times = problems.moving_pivot(compile=True), np.linspace(0.1, 10.0, 100)
+        q, v = problems.moving_pivot_state(times)
+        start, errors = problems.moving_pivot_state(0.0), []
         for tol in self.pivot_tolerances:
             result = solve_dae(system, (0.0, 10.0), *start, self.method, tol, tol, t_eval=times, compiled=False)
             assert result.success and result.stats.n_partitions > 5
-            assert max(violations(system, result)) < self.pivot_kept
-            assert force_residual(system, result) < 1e-8
-            errors.append((worst(result.q, q), worst(result.v, v)))
-            assert errors[-1][0] < self.pivot_far * tol
-            assert errors[-1][1] < 10.0 * self.pivot_far * tol
+            assert (
+                max(problems.violations(system, result)) < self.pivot_kept
+                and problems.force_residual(system, result) < 1e-8
+            )
+            errors.append((problems.worst(result.q, q), problems.worst(result.v, v)))
+            assert errors[-1][0] < self.pivot_far * tol and errors[-1][1] < 10.0 * self.pivot_far * tol
         assert (np.diff(np.log10(errors), axis=0) < -1.0).all()
 
     def test_a_full_mass_matrix_that_varies_and_forces_that_depend_on_velocities(self):
         tol = self.oblique_tol
-        result = solve_dae(oblique_pendulum(), (0.0, 5.0), *oblique_start(), self.method, tol, tol)
-        found = *oblique_to_point(result), result.lam
-        for values, known, far in zip(found, oblique_point(result.t), self.oblique_far, strict=True):
-            assert worst(values, known) < far
+        result = solve_dae(problems.oblique_pendulum(), (0.0, 5.0), *problems.oblique_start(), self.method, tol, tol)
+        found = *problems.oblique_to_point(result), result.lam
+        for values, known, far in zip(found, problems.oblique_point(result.t), self.oblique_far, strict=True):
+            assert problems.worst(values, known) < far
 
     def test_plain_python_gives_the_run_of_compiled_functions(self):
         plain, compiled = (
-            swing(method=self.method, system=pendulum(compile=how), compiled=False) for how in (False, True)
+            problems.swing(method=self.method, system=problems.pendulum(compile=how), compiled=False)
+            for how in (False, True)
         )
-        assert plain.stats.n_evaluations == compiled.stats.n_evaluations
-        assert worst(plain.q, compiled.q) < 1e-12
+        assert plain.stats.n_evaluations == compiled.stats.n_evaluations and problems.worst(plain.q, compiled.q) < 1e-12

@@ -10,7 +10,7 @@ from tests.general.runs import error
 from tests.problems import force_residual, functions_of, pendulum, violations, worst
 from twoloop import ConstrainedSystem, ConstraintWarning, Status, solve_dae
 from twoloop.kernels.algebra.sparse import MANY, sparse_pays
-from twoloop.kernels.data import common
+from twoloop.kernels.data import codes, flags
 from twoloop.mechanisms import n_four_bar
 from twoloop.methods.dop853 import DOP853
 from twoloop.run.run import Run
@@ -42,7 +42,7 @@ def started(problem, method=DOP853()):  # noqa: B008
 
 
 def form(run):
-    return int(run.functions.flags[common.FORM])
+    return int(run.functions.flags[flags.FORM])
 
 
 @pytest.mark.filterwarnings("ignore::twoloop.ConstraintWarning")
@@ -73,17 +73,15 @@ def test_a_chain_of_fourteen(choose, closed, method):
         found.append(solve_dae(problem.system, (0.0, 0.05), problem.q0, problem.v0, **options))
     dense, sparse = found
     assert worst(dense.q, sparse.q) < 1e-8 and worst(dense.v, sparse.v) < 1e-6
-    assert force_residual(problem.system, sparse) < 1e-8
-    assert max(violations(problem.system, sparse)) < 1e-9
+    assert force_residual(problem.system, sparse) < 1e-8 and max(violations(problem.system, sparse)) < 1e-9
 
 
 def test_chosen_where_rows_and_degrees_of_freedom_are_many():
     assert sparse_pays(2 * MANY, MANY, True) and sparse_pays(500, 499, False)
     assert not sparse_pays(500, MANY - 1, True) and not sparse_pays(500, 499, True)
-    assert form(started(chain(MANY, False))) == common.AUGMENTED
-    assert form(started(chain(MANY - 1, False))) == common.NULL_SPACE
-    assert form(started(n_four_bar(2))) == common.NULL_SPACE
-    assert form(started(n_four_bar(20))) == common.AUGMENTED
+    assert form(started(chain(MANY, False))) == flags.AUGMENTED
+    assert form(started(chain(MANY - 1, False))) == flags.NULL_SPACE
+    assert form(started(n_four_bar(2))) == flags.NULL_SPACE and form(started(n_four_bar(20))) == flags.AUGMENTED
 
 
 def with_mass(system, mass):
@@ -96,8 +94,7 @@ def full_mass(n):
     """The chain of n with a mass matrix without zeros."""
     problem = chain(n, False)
     system, weight = problem.system, np.random.default_rng(3).normal(size=(2 * n, 2 * n))
-    mass = np.eye(2 * n) + 0.1 * weight @ weight.T / n
-    return with_mass(system, mass), problem
+    return with_mass(system, np.eye(2 * n) + 0.1 * weight @ weight.T / n), problem
 
 
 def test_dense_where_the_factors_are_not_sparse(choose):
@@ -108,7 +105,7 @@ def test_dense_where_the_factors_are_not_sparse(choose):
     turned = solve_dae(system, (0.0, 0.01), problem.q0, problem.v0, "Adams", 1e-8, 1e-8)
     assert worst(dense.q, turned.q) == 0.0 and worst(dense.lam, turned.lam) == 0.0
     problem = type(problem)(**{**vars(problem), "system": system})
-    assert form(started(problem)) == common.NULL_SPACE
+    assert form(started(problem)) == flags.NULL_SPACE
 
 
 def test_an_entry_that_comes_later_is_found(choose):
@@ -128,8 +125,7 @@ def test_an_entry_that_comes_later_is_found(choose):
     for sparse in (False, True):
         choose(sparse)
         ends.append(solve_dae(system, (0.0, 2.0), [0.0, 0.0], [0.0, 0.0], "Adams", 1e-9, 1e-9))
-    assert worst(ends[0].q[:, -1], ends[1].q[:, -1]) < 1e-7
-    assert max(violations(system, ends[1])) < 1e-9
+    assert worst(ends[0].q[:, -1], ends[1].q[:, -1]) < 1e-7 and max(violations(system, ends[1])) < 1e-9
 
 
 @pytest.mark.parametrize("heavy", [False, True])
@@ -144,8 +140,7 @@ def test_a_mass_that_turns_negative_ends_the_run(choose, heavy):
     problem = chain(3, False)
     choose(True)
     result = solve_dae(with_mass(problem.system, mass), (0.0, 1.0), problem.q0, problem.v0, "DOP853", 1e-6, 1e-6)
-    assert not result.success and result.t[-1] <= 0.26
-    assert result.status is not Status.REACHED_END
+    assert not result.success and result.t[-1] <= 0.26 and result.status is not Status.REACHED_END
 
 
 def test_a_mass_negative_at_the_start_is_refused(choose):
@@ -161,7 +156,7 @@ def test_a_program_outlasts_partitions(choose):
     run = started(chain(12, False))
     program = run.work.index_a.copy()
     for _ in range(2):
-        assert run.kernels.start(run.kit, run.work, 0.0, run.state) == common.DONE
+        assert run.kernels.start(run.kit, run.work, 0.0, run.state) == codes.DONE
     assert (run.work.index_a == program).all()
 
 

@@ -4,7 +4,7 @@ import pytest
 from tests.problems import without_tangent, worst
 from twoloop import ConstrainedSystem, consistent_state, solve_dae
 from twoloop.kernels.algebra import lapack
-from twoloop.kernels.data import common
+from twoloop.kernels.data import flags
 from twoloop.mechanisms.ancf_beam import very_flexible_beam
 from twoloop.methods.newmark import Newmark
 from twoloop.methods.runge_kutta import RungeKutta
@@ -80,8 +80,7 @@ def both(system, *args, monkeypatch, **options):
 
 
 def test_other_integers_than_32_bit_are_refused(monkeypatch):
-    table = lapack.scipy.linalg.cython_lapack.__pyx_capi__
-    monkeypatch.setitem(table, "dgbtrf", "void (npy_int64 *, npy_int64 *)")
+    monkeypatch.setitem(lapack.scipy.linalg.cython_lapack.__pyx_capi__, "dgbtrf", "void (npy_int64 *, npy_int64 *)")
     with pytest.raises(ImportError, match=r"cython_lapack\.dgbtrf must take 32-bit integers; it is 'void \(npy_int64"):
         lapack.addresses()
 
@@ -92,8 +91,7 @@ def test_newton_gives_the_same_run_as_dense(monkeypatch, lumped, damping):
     system, q0, v0 = chain(lumped=lumped, damping=damping)
     banded, dense = both(system, (0.0, 0.2), q0, v0, NEWTON, step_size=2e-3, monkeypatch=monkeypatch)
     assert worst(banded.q, dense.q) < 1e-11 and worst(banded.v, dense.v) < 1e-8
-    assert banded.stats.n_outer <= 1.2 * dense.stats.n_outer
-    assert banded.stats.n_evaluations <= dense.stats.n_evaluations
+    assert banded.stats.n_outer <= 1.2 * dense.stats.n_outer and banded.stats.n_evaluations <= dense.stats.n_evaluations
 
 
 @pytest.mark.parametrize("tableau", [gauss(2), radau_iia(2), radau_iia(3)], ids=lambda tableau: tableau.name)
@@ -112,8 +110,7 @@ def test_ends_that_turn_fast(monkeypatch):
     start = consistent_state(system, 0.0, q0, v0)
     banded, dense = both(system, (0.0, 0.5), *start, NEWTON, 1e-6, 1e-6, monkeypatch=monkeypatch)
     assert abs(banded.stats.n_accepted - dense.stats.n_accepted) <= 2
-    assert banded.stats.n_outer <= 1.1 * dense.stats.n_outer
-    assert worst(banded.q[:, -1], dense.q[:, -1]) < 1e-5
+    assert banded.stats.n_outer <= 1.1 * dense.stats.n_outer and worst(banded.q[:, -1], dense.q[:, -1]) < 1e-5
 
 
 @pytest.mark.parametrize("method", [RungeKutta(radau_iia(3)), Newmark()], ids=lambda method: method.name)
@@ -131,21 +128,18 @@ def test_order_on_nonlinear_constraints(monkeypatch):
     errors = [
         worst(solve_dae(system, (0.0, 0.4), q0, v0, NEWTON, step_size=h).q[:, -1], reference) for h in (0.02, 0.01)
     ]
-    assert errors[0] / errors[1] > 25.0
-    assert errors[1] < 1e-6
+    assert errors[0] / errors[1] > 25.0 and errors[1] < 1e-6
 
 
 def test_chosen_by_size():
     def chosen(system, q0, v0):
         run = Run(system, NEWTON.plan(system.n_q, 1e-6, 1e-6, True), 0.0, q0, v0, 1e-6, np.full(system.n_q, 1e-6), 1e-3)
-        return int(run.functions.flags[common.BANDWIDTH])
+        return int(run.functions.flags[flags.BANDWIDTH])
 
     for n_elements, bandwidth in ((4, -1), (8, -1), (16, 11)):
         problem = very_flexible_beam(n_elements)
         assert chosen(problem.system, problem.q0, problem.v0) == bandwidth
-    assert chosen(*chain(20)) == -1
-    assert chosen(*chain(28)) == 3
-    assert chosen(*chain(28, lumped=True)) == 3
+    assert chosen(*chain(20)) == -1 and chosen(*chain(28)) == 3 and chosen(*chain(28, lumped=True)) == 3
     assert chosen(*chain(28, bandwidth=None)) == -1
 
 
@@ -154,8 +148,7 @@ def test_beam_gives_the_same_run_as_dense(monkeypatch):
     banded, dense = both(
         problem.system, (0.0, 0.02), problem.q0, problem.v0, NEWTON, step_size=1e-3, monkeypatch=monkeypatch
     )
-    assert worst(banded.q, dense.q) < 1e-10
-    assert banded.stats.n_outer <= 1.1 * dense.stats.n_outer
+    assert worst(banded.q, dense.q) < 1e-10 and banded.stats.n_outer <= 1.1 * dense.stats.n_outer
 
 
 def test_cost_grows_like_the_number_of_coordinates():
@@ -207,16 +200,12 @@ def test_bandwidth_of_velocities_and_constraints():
             name="four masses",
         )
 
-    def product(t, q):
-        return np.array([q[0] * q[3]])
-
-    def by_q(t, q):
-        return np.array([[q[3], 0.0, 0.0, q[0]]])
-
     q0 = np.array([0.0, 0.2, 0.3, 1.0])
     far = system(lambda t, q, v: np.array([-v[3], 0.0, 0.0, 0.0]), lambda t, q: q[:1], lambda t, q: np.eye(1, 4))
     with pytest.raises(ValueError, match=r"derivative of force by v has the entry \(0, 3\) = -1"):
         solve_dae(far, (0.0, 0.1), q0, np.zeros(4))
-    far = system(lambda t, q, v: -q, product, by_q)
+    far = system(
+        lambda t, q, v: -q, lambda t, q: np.array([q[0] * q[3]]), lambda t, q: np.array([[q[3], 0.0, 0.0, q[0]]])
+    )
     with pytest.raises(ValueError, match=r"second derivative of constraint 0 by q has the entry \(3, 0\) = 1"):
         solve_dae(far, (0.0, 0.1), q0, np.zeros(4))

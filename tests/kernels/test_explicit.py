@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from references.paper.four_bar_minimal import trajectory
-from tests.kernels.adaptive import LINKAGES, AdaptiveMethod, four_bar_run, linkages, shared_run
-from tests.problems import run, violations, worst
+from tests.kernels.adaptive import AdaptiveMethod, four_bar_run, linkages, shared_run
+from tests.problems import LINKAGES, run, violations, worst
 from twoloop import DOP853, ConstrainedSystem, solve_dae
 from twoloop.kernels.steps import explicit_step as explicit
 from twoloop.mechanisms import very_flexible_beam
@@ -26,8 +26,6 @@ class TestDOP853(AdaptiveMethod):
 
 
 # --- the tableau
-
-
 def tableau():
     """A, b, c and the weights of the estimates, as the step reads them."""
     options = DOP853().plan(2, 1e-6, 1e-6, False).options
@@ -86,8 +84,6 @@ def test_the_step_takes_any_explicit_tableau():
 
 
 # --- order and prices
-
-
 @linkages
 def test_fixed_steps_are_of_order_eight(linkage):
     problem = LINKAGES[linkage]
@@ -106,8 +102,7 @@ def test_a_step_is_twelve_evaluations_and_a_refused_one_eleven():
         stats = shared_run("DOP853", tol)[0].stats
         assert stats.n_rejected_convergence == 0 < stats.n_rejected_error
         least = STAGES * stats.n_accepted + (STAGES - 1) * stats.n_rejected_error + 1
-        assert least <= stats.n_evaluations <= least + 2
-        assert stats.n_outer == stats.n_accepted + stats.n_rejected_error
+        assert least <= stats.n_evaluations <= least + 2 and stats.n_outer == stats.n_accepted + stats.n_rejected_error
 
 
 @pytest.mark.parametrize("tol", TestDOP853.tolerances)
@@ -117,20 +112,15 @@ def test_fewer_steps_are_refused_than_taken(tol):
 
 
 # --- constraints
-
-
 def test_a_loose_inner_loop_costs_one_iteration_an_evaluation_and_few_digits():
     # the stages' predictions are so good that one iteration of Newton's method is nearly always enough
     loose, error = four_bar_run(DOP853("restored", inner_tol=1e-2), 1e-6)
     usual, usual_error = four_bar_run(DOP853("restored"), 1e-6)
     assert loose.stats.n_inner < 1.02 * loose.stats.n_evaluations < 0.6 * usual.stats.n_inner
-    assert error < 3.0 * usual_error
-    assert violations(FOUR_BAR.system, loose)[0] < 1e-12
+    assert error < 3.0 * usual_error and violations(FOUR_BAR.system, loose)[0] < 1e-12
 
 
 # --- other methods, other problems
-
-
 def test_the_very_flexible_beam():
     problem, span = very_flexible_beam(), (0.0, 0.1)
     own = solve_dae(problem.system, span, problem.q0, problem.v0, "DOP853", 1e-8, 1e-8)
@@ -141,8 +131,6 @@ def test_the_very_flexible_beam():
 
 
 # --- stability
-
-
 def vibration(w, force=None):
     """Two masses on one line, x1 = 2 x0, on a spring: frequency w; the spring's other end may move."""
     end = force or (lambda t: 0.0)
@@ -164,14 +152,11 @@ def test_fixed_steps_grow_beyond_the_limit_that_the_docstring_names():
     for x in (5.9, 6.0):
         result = solve_dae(vibration(x / 0.01), (0.0, 5.0), [1.0, 2.0], [0.0, 0.0], "DOP853", step_size=0.01)
         amplitudes[x] = np.abs(result.q[0, -20:]).max()
-    assert amplitudes[5.9] < 1e-6
-    assert amplitudes[6.0] > 1e6
+    assert amplitudes[5.9] < 1e-6 and amplitudes[6.0] > 1e6
 
 
 def test_step_size_control_stays_below_the_limit_when_nothing_else_asks_for_it():
     w = 1000.0
     result = solve_dae(vibration(w, np.sin), (0.0, 2.0), [0.0, 0.0], [1.0, 2.0], "DOP853", 1e-4, 1e-4)
-    assert result.success
-    assert worst(result.q[0], np.sin(result.t)) < 1e-3
-    assert 2.5 < w * np.median(result.h) < 6.0
+    assert result.success and worst(result.q[0], np.sin(result.t)) < 1e-3 and 2.5 < w * np.median(result.h) < 6.0
     assert result.stats.n_rejected_error < 0.3 * result.stats.n_accepted

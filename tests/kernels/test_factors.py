@@ -7,17 +7,7 @@ from hypothesis import strategies as st
 
 from tests.chains import chain
 from tests.problems import entry
-from twoloop.kernels.algebra import factors
-from twoloop.kernels.algebra.elimination import (
-    DENSE,
-    FIRST_LOWER,
-    N_HEAD,
-    N_SLOTS,
-    SIZE,
-    WIDEST,
-    index_size,
-    values_size,
-)
+from twoloop.kernels.algebra import elimination, factors
 from twoloop.methods.dop853 import DOP853
 from twoloop.run.run import Run
 
@@ -38,7 +28,7 @@ def sparse_rows(rng, r, n, share):
 
 def program(G, pattern, columns):
     r = len(columns)
-    index, values = np.zeros(index_size(r), dtype=np.int64), np.zeros(values_size(r))
+    index, values = np.zeros(elimination.index_size(r), dtype=np.int64), np.zeros(elimination.values_size(r))
     return make_program(G, pattern, np.arange(r), columns, index, values), index, values
 
 
@@ -54,24 +44,25 @@ def test_factors_solve(r, n_free, share, seed):
         return
     for _ in range(2):  # the second time with other numbers in the same places
         assert factor(G.reshape(-1), index, values) > 0.0
-        row_order, column_order = index[N_HEAD : N_HEAD + r], index[N_HEAD + r : N_HEAD + 2 * r]
+        row_order, column_order = (
+            index[elimination.N_HEAD : elimination.N_HEAD + r],
+            index[elimination.N_HEAD + r : elimination.N_HEAD + 2 * r],
+        )
         places = np.searchsorted(columns, column_order)
         b = (A @ x)[row_order]
         solve(index, values, b)
         assert np.abs(b - x[places]).max() < allowed
         b = (A.T @ x)[places]
         solve_transposed(index, values, b)
-        assert np.abs(b - x[row_order]).max() < allowed
-        assert sign_of(index, values) == np.sign(np.linalg.det(A))
+        assert np.abs(b - x[row_order]).max() < allowed and sign_of(index, values) == np.sign(np.linalg.det(A))
         G *= 2.0
         A = G[:r, columns]
 
 
 def test_dense_factors_where_entries_are_many():
-    G, pattern, columns = sparse_rows(np.random.default_rng(1), WIDEST + 6, WIDEST + 6, 1.0)
+    G, pattern, columns = sparse_rows(np.random.default_rng(1), elimination.WIDEST + 6, elimination.WIDEST + 6, 1.0)
     regular, index, values = program(G, pattern, columns)
-    assert regular and index[DENSE] == 1
-    assert factor(G.reshape(-1), index, values) > 0.0
+    assert regular and index[elimination.DENSE] == 1 and factor(G.reshape(-1), index, values) > 0.0
     assert sign_of(index, values) == np.linalg.slogdet(G[:-1, columns])[0]
 
 
@@ -91,10 +82,13 @@ def work_of(n, closed=False):
 
 def operations(index):
     """Entries of the factors, and subtractions that make them."""
-    r, n_slots = index[SIZE], index[N_SLOTS]
-    begin, end = index[N_HEAD + 3 * r : N_HEAD + 4 * r], index[N_HEAD + 4 * r : N_HEAD + 5 * r]
-    in_column = N_HEAD + 6 * r + 1 + n_slots
-    lower = index[in_column + index[FIRST_LOWER] : in_column + n_slots]
+    r, n_slots = index[elimination.SIZE], index[elimination.N_SLOTS]
+    begin, end = (
+        index[elimination.N_HEAD + 3 * r : elimination.N_HEAD + 4 * r],
+        index[elimination.N_HEAD + 4 * r : elimination.N_HEAD + 5 * r],
+    )
+    in_column = elimination.N_HEAD + 6 * r + 1 + n_slots
+    lower = index[in_column + index[elimination.FIRST_LOWER] : in_column + n_slots]
     return int(n_slots), int((end - begin)[lower].sum())
 
 
@@ -106,6 +100,5 @@ def test_programs_of_a_chain_grow_as_its_length(closed):
         for work in (work_of(20, closed), work_of(160, closed))
     )
     for few, many in zip(small, large, strict=True):
-        assert many[0] / 160 <= 1.2 * few[0] / 20
-        assert many[1] / 160 <= 1.3 * few[1] / 20
+        assert many[0] / 160 <= 1.2 * few[0] / 20 and many[1] / 160 <= 1.3 * few[1] / 20
     assert large[1][0] <= 16 * 160 and large[1][1] <= 16 * 160

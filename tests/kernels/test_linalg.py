@@ -11,7 +11,6 @@ from twoloop.kernels.algebra import linalg
 lu_factor, lu_solve = entry(linalg.lu_factor), entry(linalg.lu_solve)
 ldl_factor, ldl_solve = entry(linalg.ldl_factor), entry(linalg.ldl_solve)
 ldl_solve_rows, invert_definite = entry(linalg.ldl_solve_rows), entry(linalg.invert_definite)
-
 sizes = st.integers(1, 12)
 seeds = st.integers(0, 2**32 - 1)
 
@@ -29,8 +28,7 @@ def test_lu_solves(n, seed):
     factors, b, pivots = A.copy(), A @ x, np.zeros(n, dtype=np.int64)
     ratio = lu_factor(factors, pivots)
     lu_solve(factors, pivots, b)
-    assert 0.0 < ratio <= 1.0
-    assert np.abs(b - x).max() < 1e-13 * np.linalg.cond(A) * max(1.0, np.abs(x).max())
+    assert 0.0 < ratio <= 1.0 and np.abs(b - x).max() < 1e-13 * np.linalg.cond(A) * max(1.0, np.abs(x).max())
 
 
 @given(sizes, seeds)
@@ -65,11 +63,9 @@ def test_invert_definite(n):
     B = np.random.default_rng(n).normal(size=(n, n))
     A = B @ B.T + np.eye(n)
     inverse = A.copy()
-    assert invert_definite(inverse)
-    assert np.abs(inverse @ A - np.eye(n)).max() < 1e-12
+    assert invert_definite(inverse) and np.abs(inverse @ A - np.eye(n)).max() < 1e-12
     A[0, 0] = np.nan
-    assert not invert_definite(A)
-    assert not invert_definite(-np.eye(n))
+    assert not invert_definite(A) and not invert_definite(-np.eye(n))
 
 
 @pytest.mark.parametrize(("n", "m"), [(1, 1), (4, 3), (7, 7)])

@@ -36,9 +36,7 @@ def _code(helper):
 
 def test_what_a_merged_helper_calls_is_not_merged():
     kernel = numba.njit("f8(f8)", pipeline_class=KernelCompiler, **OPTIONS)(lambda x: _short(x))
-    assert kernel(1.0) == 8.0
-    assert "alwaysinline" in _code(_short)
-    assert "alwaysinline" not in _code(_long)
+    assert kernel(1.0) == 8.0 and "alwaysinline" in _code(_short) and "alwaysinline" not in _code(_long)
 
 
 def test_make_compile_compiles_all_kernels():
@@ -74,8 +72,7 @@ def _behind(x, k):
 def _entries(x, n):
     total = 0.0
     for k in range(n):
-        view = _behind(x, k)
-        corner = view[0, k] + x[k, 1] * _behind(x, 0)[1, 1]
+        corner = _behind(x, k)[0, k] + x[k, 1] * _behind(x, 0)[1, 1]
         total += max(corner, 0.25) * x[k, k] ** 2
     return total
 
@@ -100,5 +97,4 @@ def test_numba_has_its_own_functions_after_a_kernel_and_after_a_failure():
     numba.njit("f8(f8)", pipeline_class=KernelCompiler, **OPTIONS)(lambda x: x)
     with pytest.raises(numba.TypingError):
         numba.njit("f8(f8)", pipeline_class=KernelCompiler, **OPTIONS)(lambda x: x + "one")
-    assert [vars(owner).get(name) for owner, name, _ in own_rules._RULES] == before
-    assert own_rules._open == [0]
+    assert [vars(owner).get(name) for owner, name, _ in own_rules._RULES] == before and own_rules._open == [0]

@@ -5,7 +5,7 @@ import pytest
 
 import twoloop.run.newton_form as newton_form
 import twoloop.run.static_form as static_module
-from studies.bench.large import ASSEMBLIES, closed_chain, ladder, open_chain, tree
+from studies.bench.large import PLANAR, closed_chain, grid, ladder, open_chain, tree
 from tests.large_systems import Assembly, SpatialAssembly
 from tests.problems import worst
 from twoloop import ConstrainedSystem, solve_dae
@@ -95,6 +95,13 @@ CASES = {
 }
 
 
+def alike(one, other, allowed):
+    assert worst(one.q[:, -1], other.q[:, -1]) < allowed
+    assert worst(one.lam[:, -1], other.lam[:, -1]) < 1e3 * allowed * max(1.0, np.abs(one.lam[:, -1]).max())
+    assert other.stats.n_outer <= 2.1 * one.stats.n_outer  # derivatives that miss something converge slowly
+    assert other.stats.n_jacobians <= 1.5 * one.stats.n_jacobians + 2
+
+
 @pytest.mark.filterwarnings("ignore::twoloop.ConstraintWarning")
 @pytest.mark.parametrize(
     ("case", "method", "tolerance", "allowed"),
@@ -114,11 +121,7 @@ def test_runs_are_those_of_the_dense_forms(form, case, method, tolerance, allowe
         system, q = CASES[case]()
         ends.append(solve_dae(system, (0.0, 0.03), q, 0.0 * q, method, tolerance, tolerance))
         assert ends[-1].success and left == []
-    one, other = ends
-    assert worst(one.q[:, -1], other.q[:, -1]) < allowed
-    assert worst(one.lam[:, -1], other.lam[:, -1]) < 1e3 * allowed * max(1.0, np.abs(one.lam[:, -1]).max())
-    assert other.stats.n_outer <= 2.1 * one.stats.n_outer  # derivatives that miss something converge slowly
-    assert other.stats.n_jacobians <= 1.5 * one.stats.n_jacobians + 2
+    alike(*ends, allowed)
 
 
 def test_a_force_that_comes_up_between_others_is_found_missing(form):
@@ -141,8 +144,7 @@ def test_a_force_that_comes_up_between_others_is_found_missing(form):
         result = solve_dae(system, (0.0, 0.11), made.q, 0.0 * made.q, "RadauIIA9", 1e-2, 1e-2)
         assert result.success
         ends.append(result)
-    assert len(left) == 1
-    assert worst(ends[0].q[:, -1], ends[1].q[:, -1]) < 1e-2
+    assert len(left) == 1 and worst(ends[0].q[:, -1], ends[1].q[:, -1]) < 1e-2
 
 
 def test_bodies_whose_mass_matrix_is_singular(form):
@@ -167,7 +169,7 @@ def test_bodies_whose_mass_matrix_is_singular(form):
 
 def test_programs_grow_with_the_bodies_and_no_faster():
     """Multiplications of a factorization."""
-    for make in ASSEMBLIES:
+    for make in PLANAR:
         updates = []
         for n in (99, 297):
             made = make(n)
@@ -177,7 +179,7 @@ def test_programs_grow_with_the_bodies_and_no_faster():
             form = static_module.with_newton(system, 0.0, made.q, form)
             updates.append(int(form.newton[N_UPDATES]))
             assert form.matrix_cost() < 3.0 + system.n_q / 8.0  # what a dense one is taken to cost
-        assert updates[1] <= 3.6 * updates[0]
+        assert updates[1] <= (5.2 if make is grid else 3.6) * updates[0]  # of a grid like n^1.5, at best
 
 
 @pytest.mark.filterwarnings("ignore::twoloop.ConstraintWarning")
@@ -204,11 +206,7 @@ def test_spatial_assemblies_with_springs(form, monkeypatch, seed, n, loops, doub
         q, v = made.bodies.start
         ends.append(solve_dae(made.bodies.system("sprung"), (0.0, 0.01), q, v, method, 1e-10, 1e-10, compiled=False))
         assert ends[-1].success and left == []
-    one, other = ends
-    assert worst(one.q[:, -1], other.q[:, -1]) < 1e-9
-    assert worst(one.lam[:, -1], other.lam[:, -1]) < 1e-6 * max(1.0, np.abs(one.lam[:, -1]).max())
-    assert other.stats.n_outer <= 2.1 * one.stats.n_outer
-    assert other.stats.n_jacobians <= 1.5 * one.stats.n_jacobians + 2
+    alike(*ends, 1e-9)
 
 
 def test_a_chain_of_hinges_in_space():
@@ -221,5 +219,4 @@ def test_a_chain_of_hinges_in_space():
         before, at = body, at + along
     system, (q, v) = bodies.system("hinges"), bodies.start
     ends = [solve_dae(system, (0.0, 0.02), q, v, method, 1e-8, 1e-8) for method in ("RadauIIA9", "DOP853")]
-    assert all(end.success for end in ends)
-    assert worst(ends[0].q[:, -1], ends[1].q[:, -1]) < 1e-8
+    assert all(end.success for end in ends) and worst(ends[0].q[:, -1], ends[1].q[:, -1]) < 1e-8

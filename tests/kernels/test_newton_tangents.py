@@ -7,14 +7,7 @@ import numpy as np
 import pytest
 from scipy.linalg import block_diag
 
-from tests.problems import (
-    functions_of,
-    oblique_pendulum,
-    oblique_start,
-    unconstrained,
-    without_tangent,
-    worst,
-)
+from tests.problems import functions_of, oblique_pendulum, oblique_start, unconstrained, without_tangent, worst
 from twoloop import ConstrainedSystem, RungeKutta, solve_dae
 from twoloop.mechanisms import moderately_stiff_beam, very_flexible_beam
 from twoloop.methods.plan import LEAST_ERROR
@@ -98,8 +91,7 @@ def test_tangents_of_a_system_whose_mass_varies():
     tangents = {"force_by_q": differenced("q"), "force_by_v": differenced("v")}
     system = ConstrainedSystem.from_python(n_q=n, n_c=given.n_c, **functions_of(given), **tangents)
     runs = [solve_dae(s, (0.0, 1.0), *oblique_start(), NEWTON, step_size=0.01) for s in (given, system)]
-    assert all(run.success for run in runs)
-    assert worst(runs[0].q, runs[1].q) < 1e-9
+    assert all(run.success for run in runs) and worst(runs[0].q, runs[1].q) < 1e-9
     assert runs[1].stats.n_outer < 2 * runs[0].stats.n_outer
 
 
@@ -117,8 +109,7 @@ def test_tangents_replace_differences(monkeypatch, banded, reaction):
     assert all(run.success for run in runs.values()), [run.message for run in runs.values()]
     assert worst(runs["tangents"].q, runs["differences"].q) < 1e-10
     counts = {name: run.stats for name, run in runs.items()}
-    assert counts["tangents"].n_jacobians > 1
-    assert calls["tangents"]["force_by_q"] >= counts["tangents"].n_jacobians
+    assert counts["tangents"].n_jacobians > 1 and calls["tangents"]["force_by_q"] >= counts["tangents"].n_jacobians
     assert calls["tangents"]["force_by_v"] >= counts["tangents"].n_jacobians
     assert counts["tangents"].n_outer < 1.2 * counts["differences"].n_outer
     # no evaluation goes into derivatives: 3 an iteration, 1 at the midpoint for every Jacobian, 1 a step
@@ -137,8 +128,7 @@ def test_compiled_tangents_are_the_same():
     systems = [unconstrained(force, 2, force_by_q=by_q, compile=compile) for compile in (False, True)]
     runs = [solve_dae(system, (0.0, 1.0), [0.0, 0.0], [1.0, 1.0], NEWTON, 1e-6, 1e-6) for system in systems]
     assert worst(runs[0].q[:, -1], runs[1].q[:, -1]) < 1e-9
-    assert runs[0].stats.n_evaluations == runs[1].stats.n_evaluations
-    assert runs[1].stats.n_jacobians > 0
+    assert runs[0].stats.n_evaluations == runs[1].stats.n_evaluations and runs[1].stats.n_jacobians > 0
 
 
 @pytest.mark.parametrize("n_elements", [4, 16])
@@ -147,8 +137,7 @@ def test_beam_with_its_tangent_makes_the_steps_it_makes_without(n_elements):
         solve_dae(problem.system, (0.0, 0.02), problem.q0, problem.v0, NEWTON, step_size=1e-3)
         for problem in (very_flexible_beam(n_elements), without_tangent(very_flexible_beam(n_elements)))
     ]
-    assert all(run.success for run in runs)
-    assert worst(runs[0].q, runs[1].q) < 1e-9
+    assert all(run.success for run in runs) and worst(runs[0].q, runs[1].q) < 1e-9
     assert runs[0].stats.n_outer <= 1.05 * runs[1].stats.n_outer
 
 

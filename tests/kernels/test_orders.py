@@ -56,6 +56,5 @@ def test_newmark_error_constants_have_the_ratio_that_theory_gives():
     system, start, _ = problem()
     steps = {}
     for beta in (0.25, 0.5):
-        method = Newmark(beta=beta, error_tol=1e-7)
-        steps[beta] = solve_dae(system, (0.0, 2.0), *start, method=method).stats.n_accepted
+        steps[beta] = solve_dae(system, (0.0, 2.0), *start, method=Newmark(beta=beta, error_tol=1e-7)).stats.n_accepted
     assert steps[0.5] / steps[0.25] == pytest.approx(4.0 ** (1.0 / 3.0), rel=0.05)

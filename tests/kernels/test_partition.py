@@ -9,7 +9,7 @@ from references.paper.four_bar_minimal import trajectory
 from tests.problems import called, kit_of, worst
 from twoloop import RungeKutta, solve_dae
 from twoloop.kernels import advance
-from twoloop.kernels.data import common
+from twoloop.kernels.data import codes
 from twoloop.kernels.evaluation.partition import full_pivoting, scale_rows
 from twoloop.kernels.layout import make_work
 from twoloop.mechanisms import four_bar
@@ -30,8 +30,7 @@ def test_dependent_columns_are_regular_and_the_independent_ones_their_complement
     rng = np.random.default_rng(seed)
     A = rng.normal(size=(n_c, n_c + n_free)) * 10.0 ** rng.integers(-4, 5)
     rank, order = pivoted(A)
-    assert rank == n_c
-    assert sorted(order) == list(range(n_c + n_free))
+    assert rank == n_c and sorted(order) == list(range(n_c + n_free))
     dependent, independent = A[:, order[:n_c]], A[:, order[n_c:]]
     assert np.linalg.matrix_rank(dependent) == n_c
     # full pivoting keeps the dependents from moving much faster than the independents
@@ -47,8 +46,7 @@ def test_rank_is_seen(n_c, n_free, seed, data):
 
 
 def test_no_rank_in_zeros_and_nan():
-    assert pivoted(np.zeros((2, 3)))[0] == 0
-    assert pivoted(np.full((2, 3), np.nan))[0] == 0
+    assert pivoted(np.zeros((2, 3)))[0] == 0 and pivoted(np.full((2, 3), np.nan))[0] == 0
 
 
 @given(st.floats(-3.0, 3.0), st.sampled_from([-1, 1]))
@@ -60,7 +58,7 @@ def test_the_chosen_partition_of_the_linkage_is_well_conditioned_everywhere(thet
     system = problem.system
     work = make_work(9, 8)
     state = np.concatenate([problem.q0, problem.v0, np.zeros(17)])
-    assert advance.start(kit_of(system), work, 0.0, state) == common.DONE
+    assert advance.start(kit_of(system), work, 0.0, state) == codes.DONE
     assert sorted([*work.dependent, *work.independent]) == list(range(9))
     Cq = system.jacobian(0.0, problem.q0)
     rates = np.linalg.solve(Cq[:, work.dependent], Cq[:, work.independent])
@@ -114,5 +112,4 @@ def test_symmetric_tableau_and_partition_go_back_where_they_came_from(collinear_
         assert there.success and there.stats.n_partitions > 5
         home = solve_dae(problem.system, span, there.q[:, -1], -there.v[:, -1], method, step_size=h)
         back[partition] = worst(home.q[:, -1], problem.q0)
-    assert (back["symmetric"] < 1e-9) == reversible
-    assert back["lasting"] > 1e-7
+    assert (back["symmetric"] < 1e-9) == reversible and back["lasting"] > 1e-7

@@ -7,18 +7,9 @@ from tests.chains import chain
 from tests.kernels.test_augmented import form, started
 from tests.problems import kept
 from twoloop.kernels.algebra.saddle_point import solve_both
-from twoloop.kernels.data.common import (
-    AUGMENTED,
-    DONE,
-    FORM,
-    KIT,
-    MULTIPLIERS,
-    NULL_SPACE,
-    VECTOR,
-    WORK,
-    f8,
-    i8,
-)
+from twoloop.kernels.data.codes import DONE
+from twoloop.kernels.data.common import KIT, VECTOR, WORK, f8, i8
+from twoloop.kernels.data.flags import AUGMENTED, FORM, MULTIPLIERS, NULL_SPACE
 from twoloop.kernels.evaluation.accelerations import factor_there
 from twoloop.kernels.evaluation.inner import factor_dependent, tangents
 from twoloop.mechanisms import andrews, four_bar, heavy_top, moderately_stiff_beam, n_four_bar

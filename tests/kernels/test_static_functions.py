@@ -56,11 +56,9 @@ def test_plain_functions_dense_or_by_values(large, varying):
     for dense, least in ((True, 10**9), (True, 0), (False, 0)):
         large(least)
         system, q = masses_on_rods(30, dense, True, varying)
-        run = started_run(system, q)
-        assert (run.static is not None) == (least == 0)
+        assert (started_run(system, q).static is not None) == (least == 0)
         found.append(solve_dae(system, (0.0, 0.02), q, 0.0 * q, "DOP853", 1e-8, 1e-8))
-    assert all(result.success for result in found)
-    assert worst(found[0].q[:, -1], found[1].q[:, -1]) < 1e-12
+    assert all(result.success for result in found) and worst(found[0].q[:, -1], found[1].q[:, -1]) < 1e-12
     assert worst(found[0].q[:, -1], found[2].q[:, -1]) < 1e-12
 
 
@@ -70,9 +68,6 @@ def test_an_entry_that_comes_up_on_the_way_ends_the_static_form(large):
 
     def beyond(x, order=0):
         return [1.0, 4.0, 12.0][order] * max(0.0, x - 0.5) ** (4 - order)
-
-    def constraint(t, q):
-        return q[:n] + np.eye(n)[0] * beyond(q[1]) * q[n] - np.eye(n)[1] * t
 
     def jacobian(t, q):
         made = np.eye(n, 2 * n)
@@ -87,7 +82,7 @@ def test_an_entry_that_comes_up_on_the_way_ends_the_static_form(large):
         n_c=n,
         mass=np.eye(2 * n),
         force=lambda t, q, v: np.ones(2 * n),
-        constraint=constraint,
+        constraint=lambda t, q: q[:n] + np.eye(n)[0] * beyond(q[1]) * q[n] - np.eye(n)[1] * t,
         constraint_rate=lambda t, q: -np.eye(n)[1],
         jacobian=jacobian,
         gamma=gamma,
@@ -98,8 +93,7 @@ def test_an_entry_that_comes_up_on_the_way_ends_the_static_form(large):
         result = solve_dae(system, (0.0, 1.2), np.zeros(2 * n), np.eye(2 * n)[1], "DOP853", time_limit=20.0)
         assert result.success
         ends.append(result.q[:, -1])
-    assert abs(ends[0][0]) > 0.05
-    assert worst(*ends) < 1e-9
+    assert abs(ends[0][0]) > 0.05 and worst(*ends) < 1e-9
 
 
 def test_stiff_motion_goes_on_by_newton(large):
@@ -113,8 +107,7 @@ def test_stiff_motion_goes_on_by_newton(large):
         functions["force"] = lambda t, q, v: np.tile([0.0, -9.81], n) - 3e3 * v
         stiff = ConstrainedSystem.from_python(n_q=2 * n, n_c=n, **functions | {"mass": np.eye(2 * n)})
         result = solve_dae(stiff, (0.0, 2.0), q, 0.0 * q, "auto", 1e-4, 1e-4)
-        assert result.success
-        assert result.stats.n_jacobians > 0
+        assert result.success and result.stats.n_jacobians > 0
         ends.append(result.q[:, -1])
     assert worst(*ends) < 1e-3
 
@@ -139,5 +132,4 @@ def test_values_of_spatial_bodies_are_the_entries_of_their_matrices(monkeypatch)
     for kind in ("mass", "jacobian"):
         dense, made = system.evaluate(kind, 0.0, q), np.zeros((system.n_q if kind == "mass" else system.n_c, 7 * 12))
         np.add.at(made, system.entries[kind], system.evaluate(f"{kind}_values", 0.0, q))
-        assert worst(made, dense) < 1e-14
-        assert len(system.entries[kind][0]) < 0.15 * dense.size
+        assert worst(made, dense) < 1e-14 and len(system.entries[kind][0]) < 0.15 * dense.size

@@ -41,8 +41,7 @@ def test_stiffness_is_found_where_steps_are_shorter_than_stability_asks_for():
         solve_dae(problem.system, (0.0, problem.reference.t), problem.q0, problem.v0, method, 1e-9, 1e-9)
         for method in ("auto", "DOP853")
     )
-    assert one.stats.n_jacobians > 5
-    assert one.stats.n_evaluations < 0.1 * other.stats.n_evaluations
+    assert one.stats.n_jacobians > 5 and one.stats.n_evaluations < 0.1 * other.stats.n_evaluations
     assert worst(one.q[:, -1], other.q[:, -1]) < 1e-7
 
 
@@ -62,8 +61,8 @@ def test_steps_that_are_explicit_again_are_not_divided_by_newtons_method():
     problem = moderately_stiff_beam()
     result = solve_dae(problem.system, (0.0, 0.1), problem.q0, problem.v0, "auto", 1e-7, 1e-7, dense_output=True)
     assert result.stats.n_jacobians > 0
-    divided, _ = result.sol.interpolator.interiors(result.sol.table)
-    assert 0 < len(divided) < 0.1 * result.h.size
+    n_divided = sum(len(t) for t, _ in result.sol.interpolator.interiors(result.sol.table))
+    assert 0 < n_divided < 0.1 * result.h.size
 
 
 @pytest.mark.parametrize("compiled", [False, True])
@@ -85,8 +84,7 @@ def test_it_goes_both_ways_during_a_run():
     """A damped spring that is stiff between 1 s and 3 s only."""
     system = sprung_pair(1e7, 2e-3, stiff_for_a_while)
     result = solve_dae(system, (0.0, 8.0), *SPRUNG_START, "auto", 1e-5, 1e-5, max_step=0.2, compiled=False)
-    assert result.success
-    assert result.stats.n_jacobians > 100
+    assert result.success and result.stats.n_jacobians > 100
     by_time = [np.median(result.h[(result.t[1:] > a) & (result.t[1:] <= b)]) for a, b in ((1.5, 2.9), (5.0, 8.0))]
     assert min(by_time) > 4e-4  # explicit steps of the stiff part are 1.5e-4 at most
     first = np.searchsorted(result.t, 3.5)

@@ -19,8 +19,7 @@ def lengths(problem, q):
 def test_every_mechanism_has_a_drawing():
     made = {getattr(mechanisms, name) for name in mechanisms.__all__} - {mechanisms.ancf_beam}
     functions = [each for each in made if not isinstance(each, type)]
-    assert len(functions) == 20
-    assert all(function().drawing.bars for function in functions)
+    assert len(functions) == 20 and all(function().drawing.bars for function in functions)
 
 
 @pytest.mark.parametrize("name", [name for name in EVERY if name not in ("beam", "projection pendulum")])
@@ -70,15 +69,13 @@ def test_the_point_of_the_rim_that_touches_the_plane_is_at_rest():
     q[5] = -0.5 * np.pi  # the first point of the rim is lowest
     before, after = (problem.drawing.at(q + s * e * problem.v0) for s in (-1.0, 1.0))
     speeds = np.linalg.norm(after - before, axis=1)[:-1] / (2.0 * e)
-    assert speeds[0] < 1e-7
-    assert speeds[1:].min() > 0.1
+    assert speeds[0] < 1e-7 and speeds[1:].min() > 0.1
 
 
 def test_the_beam_is_drawn_as_long_as_it_is():
     problem = EVERY["beam"]
     points = problem.drawing.at(problem.q0)
-    assert points[:, 0] == pytest.approx(np.linspace(0.0, 1.0, 33), abs=1e-15)
-    assert not points[:, 1].any()
+    assert points[:, 0] == pytest.approx(np.linspace(0.0, 1.0, 33), abs=1e-15) and not points[:, 1].any()
 
 
 @pytest.mark.parametrize(

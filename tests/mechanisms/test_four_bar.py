@@ -45,9 +45,7 @@ def test_masses_are_those_of_uniform_rods(default_four_bar):
 def test_assembled_linkages_satisfy_their_constraints_on_the_branch_asked_for(L1, L2, L3, ground, theta3, branch):
     problem = assembled(L1, L2, L3, ground, theta3, branch)
     q = problem.q0
-    assert np.abs(problem.system.constraint(0.0, q)).max() < 1e-12
-    assert q[8] == theta3
-    assert (problem.v0 == 0.0).all()
+    assert np.abs(problem.system.constraint(0.0, q)).max() < 1e-12 and q[8] == theta3 and (problem.v0 == 0.0).all()
     joint12 = 2.0 * complex(q[0], q[1])
     joint23 = ground - L3 * np.exp(1j * theta3)
     side = (joint23.conjugate() * joint12).imag  # positive: to the left of the line from O to joint 2-3
@@ -62,15 +60,12 @@ def test_energy_is_kept_by_any_geometry_over_a_short_run(L1, L2, L3, ground, the
     result = solve_dae(problem.system, (0.0, 0.3), problem.q0, problem.v0, rtol=1e-9, atol=1e-9)
     assert result.success, (problem.name, result.message)
     energy = problem.energy(result.t, result.q, result.v)
-    assert worst(energy, energy[0]) < 1e-6
-    assert violations(problem.system, result)[0] < 1e-12
+    assert worst(energy, energy[0]) < 1e-6 and violations(problem.system, result)[0] < 1e-12
 
 
 def test_default_is_marked_as_assumed_and_others_carry_no_reference(default_four_bar, collinear_four_bar):
-    assert "assumed" in default_four_bar.note
-    assert "*assumed*" in four_bar.__doc__
-    assert default_four_bar.reference is not None
-    assert collinear_four_bar.reference is None
+    assert "assumed" in default_four_bar.note and "*assumed*" in four_bar.__doc__
+    assert default_four_bar.reference is not None and collinear_four_bar.reference is None
     p = default_four_bar.parameters
     assert (p["L1"], p["L2"], p["L3"], p["L"], p["gravity"]) == (1.0, 2.0, 1.5, 3.0, 9.81)
 
@@ -98,6 +93,5 @@ def test_default_linkage_for_100_s(default_four_bar):
     q, _ = MinimalFourBar.from_parameters(problem.parameters).states([100.0])
     assert worst(result.q[:, -1], q[:, 0]) < 1e-8
     energy = problem.energy(result.t, result.q, result.v)
-    assert worst(energy, energy[0]) < 1e-9
-    assert violations(problem.system, result)[0] < 1e-9
+    assert worst(energy, energy[0]) < 1e-9 and violations(problem.system, result)[0] < 1e-9
     assert result.q[7].max() < 1e-9  # bar 3 comes back to y = 0 and does not pass it, as the paper says

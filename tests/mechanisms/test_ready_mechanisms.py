@@ -12,22 +12,12 @@ from tests.mechanisms.motions import closed_forms, known_motions
 from tests.mechanisms.motions.integrate import by_scipy
 from tests.problems import row_errors, slope
 from twoloop import ConstraintWarning, mechanisms, solve_dae
-from twoloop.mechanisms import (
-    andrews,
-    driven_slider_crank,
-    four_bar,
-    governor,
-    heavy_top,
-    n_four_bar,
-    sundials_slider_crank,
-    very_flexible_beam,
-)
 from twoloop.mechanisms.sundials_slider_crank import PRINTED
 
 COMPUTED, CLOSED = known_motions(), closed_forms()
 PROBLEMS = {name: problem for name, (problem, *_) in {**COMPUTED, **CLOSED}.items()}
-PROBLEMS["driven slider-crank"] = driven_slider_crank()
-EVERY = {**PROBLEMS, "four-bar": four_bar(), "beam": very_flexible_beam()}
+PROBLEMS["driven slider-crank"] = mechanisms.driven_slider_crank()
+EVERY = {**PROBLEMS, "four-bar": mechanisms.four_bar(), "beam": mechanisms.very_flexible_beam()}
 DAMPED = ("SUNDIALS slider-crank", "A05 governor")
 every = pytest.mark.parametrize("problem", EVERY.values(), ids=EVERY)
 SINGULAR = [name for name, problem in PROBLEMS.items() if "singular" in problem.tags]
@@ -73,12 +63,10 @@ def test_the_start_is_consistent(name):
 def test_it_says_what_it_is(name):
     problem = of(name)
     assert problem.source and problem.purpose and problem.parameters
-    assert {"open chain", "closed chain"} & set(problem.tags)
-    assert {"planar", "spatial"} & set(problem.tags)
+    assert {"open chain", "closed chain"} & set(problem.tags) and {"planar", "spatial"} & set(problem.tags)
     assert len(problem.coordinates) == len(set(problem.coordinates)) == problem.system.n_q
     reference = problem.reference
-    assert reference.source and reference.verified
-    assert set(reference.digits) >= {"q", "v"}
+    assert reference.source and reference.verified and set(reference.digits) >= {"q", "v"}
     assert reference.q.shape == reference.v.shape == (problem.system.n_q,)
     if problem.published is not None:
         assert "computed for this project" not in problem.published.source
@@ -91,18 +79,14 @@ def test_a_tag_must_be_known():
 
 
 # --- references by a second route
-
-
 @pytest.mark.parametrize("name", COMPUTED)
 def test_references_by_equations_in_few_coordinates(name):
     """In double precision by SciPy; the numbers themselves are from extended precision, by extrapolation."""
     problem, (rate, start, known), end = COMPUTED[name]
     reference = problem.reference
-    assert reference.t == end
-    assert min(reference.digits["q"], reference.digits["v"]) >= 12.0
+    assert reference.t == end and min(reference.digits["q"], reference.digits["v"]) >= 12.0
     q, v = known(end, by_scipy(rate, start, end))
-    assert digits(np.array(q, dtype=float), reference.q) > 10.5
-    assert digits(np.array(v, dtype=float), reference.v) > 9.5
+    assert digits(np.array(q, dtype=float), reference.q) > 10.5 and digits(np.array(v, dtype=float), reference.v) > 9.5
 
 
 @pytest.mark.slow
@@ -120,8 +104,7 @@ def test_references_obey_the_mechanisms_own_equations(name):
     problem = of(name)
     system, known = problem.system, problem.reference
     assert np.abs(system.constraint(known.t, known.q)).max(initial=0.0) < 1e-14
-    rates = system.velocity_constraint(known.t, known.q, known.v)
-    assert np.abs(rates).max() < 1e-13 * max(1.0, np.abs(known.v).max())
+    assert np.abs(system.velocity_constraint(known.t, known.q, known.v)).max() < 1e-13 * max(1.0, np.abs(known.v).max())
     assert known.lam.shape == (system.n_c + system.n_a,)
 
 
@@ -137,7 +120,7 @@ def test_closed_forms_by_an_equation(name):
 
 def test_driven_slider_crank_by_other_means():
     """The law of cosines, differences in time, and the power of the drive, whose torque is -lam of the last row."""
-    problem = driven_slider_crank()
+    problem = mechanisms.driven_slider_crank()
     t = problem.reference.t
     q, v, lam = problem.reference.q, problem.reference.v, problem.reference.lam
     angle = 0.5 + 4.0 * t + 0.3 * np.sin(3.0 * t)
@@ -149,26 +132,24 @@ def test_driven_slider_crank_by_other_means():
 
 
 # --- published values
-
-
 def test_andrews_as_published_is_the_state_a_picosecond_later():
-    problem = andrews()
+    problem = mechanisms.andrews()
     known, printed = problem.reference, problem.published
-    assert 9.5 < digits(printed.q, known.q) < 10.5
-    assert digits(printed.q - 1.005e-12 * known.v, known.q) > 12.5
-    assert digits(printed.lam, known.lam) > printed.digits["lam"]
-    assert digits(printed.v, known.v) > printed.digits["v"]
+    assert 9.5 < digits(printed.q, known.q) < 10.5 and digits(printed.q - 1.005e-12 * known.v, known.q) > 12.5
+    assert digits(printed.lam, known.lam) > printed.digits["lam"] and digits(printed.v, known.v) > printed.digits["v"]
 
 
 def test_sundials_slider_crank_as_printed():
-    (rate, start, known), problem = COMPUTED["SUNDIALS slider-crank"][1], sundials_slider_crank()
+    (rate, start, known), problem = COMPUTED["SUNDIALS slider-crank"][1], mechanisms.sundials_slider_crank()
     times = np.array([row[0] for row in PRINTED])
     for row, y in zip(PRINTED, by_scipy(rate, start, times[-1], times).T, strict=True):
         assert np.abs(np.array(row[1:]) - np.array(known(row[0], y)[0], dtype=float)).max() < 4.4e-5
     assert np.abs(problem.published.q - problem.reference.q).max() < 4.4e-5
 
 
-@pytest.mark.parametrize("problem", [heavy_top(), n_four_bar(2)], ids=lambda problem: problem.name)
+@pytest.mark.parametrize(
+    "problem", [mechanisms.heavy_top(), mechanisms.n_four_bar(2)], ids=lambda problem: problem.name
+)
 def test_printed_values_hold_the_digits_said(problem):
     printed = ~np.isnan(problem.published.q)
     assert printed.any()
@@ -176,14 +157,11 @@ def test_printed_values_hold_the_digits_said(problem):
 
 
 # --- runs
-
-
 @pytest.mark.parametrize("method", ["Gauss12", "DOP853"])
 @pytest.mark.parametrize("name", RUN_HERE)
 def test_nine_digits(name, method):
     result, known = end_of(name, method), of(name).reference
-    assert digits(result.q[:, -1], known.q) > 9.0
-    assert digits(result.v[:, -1], known.v) > 7.5
+    assert digits(result.q[:, -1], known.q) > 9.0 and digits(result.v[:, -1], known.v) > 7.5
     assert digits(result.lam[:, -1], known.lam) > 7.0
 
 
@@ -216,19 +194,17 @@ def test_rows_and_powers_are_derivatives(problem, seed):
     assert max(row_errors(system, t, q, v)) < 1e-9
     if problem.name not in DAMPED:
         rate = slope(lambda s: problem.energy(t + s, q + s * v + 0.5 * s * s * a, v + s * a))
-        power = v @ (system.mass(t, q) @ a - system.force(t, q, v))
-        assert rate == pytest.approx(power, rel=1e-10, abs=1e-10)
+        assert rate == pytest.approx(v @ (system.mass(t, q) @ a - system.force(t, q, v)), rel=1e-10, abs=1e-10)
 
 
 def test_the_governor_only_loses_energy():
     result = end_of("A05 governor", "Gauss12")
-    energy = governor().energy(result.t, result.q, result.v)
-    assert np.diff(energy).max() < 1e-9
-    assert energy[0] - energy[-1] > 1e-3
+    energy = mechanisms.governor().energy(result.t, result.q, result.v)
+    assert np.diff(energy).max() < 1e-9 and energy[0] - energy[-1] > 1e-3
 
 
 def test_the_condition_of_a_benchmark():
-    problem = n_four_bar(2)
+    problem = mechanisms.n_four_bar(2)
     times = np.linspace(0.0, problem.condition.t_end, problem.condition.n_outputs)
     q, v = (np.array(each).T for each in zip(*(problem.motion(t) for t in times), strict=True))
     assert problem.condition.error(q, v, q, v) == 0.0

@@ -15,8 +15,7 @@ TURNS = Rotation.random(20, random_state=5)
 @pytest.mark.parametrize("turn", [*TURNS, Rotation.from_rotvec([np.pi, 0.0, 0.0]), Rotation.from_rotvec([0, np.pi, 0])])
 def test_matrix_and_parameters(turn):
     e = euler_parameters(turn.as_matrix())
-    assert rotation_matrix(e) == pytest.approx(turn.as_matrix(), abs=1e-14)
-    assert e @ e == pytest.approx(1.0)
+    assert rotation_matrix(e) == pytest.approx(turn.as_matrix(), abs=1e-14) and e @ e == pytest.approx(1.0)
     spin = RNG.normal(size=3)
     u = euler_rates(e, spin)
     assert 2.0 * rotation_matrix(e) @ G(e) @ u == pytest.approx(spin, abs=1e-14)
@@ -49,8 +48,7 @@ def free_body(spin, gravity=(0.0, 0.0, 0.0)):
 
 def test_a_free_body_obeys_eulers_equations():
     """J w' + w x (J w) = 0 in body axes, with w' of the acceleration that mass, force and the norm give."""
-    spin = np.array([0.4, -0.3, 0.7])
-    rows = free_body(spin, (0.0, -9.81, 0.0))
+    rows = free_body(np.array([0.4, -0.3, 0.7]), (0.0, -9.81, 0.0))
     system, (q, v) = rows.system("body"), rows.start
     matrix = np.block([[system.mass(0.0, q), system.jacobian(0.0, q).T], [system.jacobian(0.0, q), np.zeros((1, 1))]])
     a = np.linalg.solve(matrix, np.append(system.force(0.0, q, v), system.gamma(0.0, q, v)))[:7]

@@ -5,17 +5,7 @@ import pytest
 from references.paper.four_bar_minimal import trajectory
 from references.scipy.index1 import STABILISATIONS, solve_index1
 from references.sundials.residual import FORMS
-from tests.problems import (
-    LINKAGES,
-    moving_pivot,
-    moving_pivot_state,
-    oblique_pendulum,
-    oblique_point,
-    oblique_start,
-    oblique_to_point,
-    violations,
-    worst,
-)
+from tests import problems
 from tests.references.adapters import ADAPTERS, ANY_CALLBACK
 
 # error of q at 10 s for each tolerance: three times the largest of 15 runs that differ in rounding, which alone moves
@@ -53,14 +43,14 @@ def run(name, *start, tol, **options):
 
 @pytest.mark.parametrize(("problem", "name"), BOUNDS)
 def test_agrees_with_the_truth_and_follows_the_tolerance(problem, name):
-    made, times, errors = LINKAGES[problem], [10.0], []
+    made, times, errors = problems.LINKAGES[problem], [10.0], []
     q, v = trajectory(made.parameters, times)
     for tol, bound in BOUNDS[problem, name].items():
         result = run(name, made.system, (0.0, 10.0), made.q0, made.v0, tol=tol)
         assert result.success and result.t[-1] == 10.0 and "reached the end" in result.message
         assert result.t.size == result.h.size + 1 == result.stats.n_accepted + 1
-        errors.append(worst(result.q[:, -1], q[:, 0]))
-        assert errors[-1] < bound and worst(result.v[:, -1], v[:, 0]) < 20.0 * bound
+        errors.append(problems.worst(result.q[:, -1], q[:, 0]))
+        assert errors[-1] < bound and problems.worst(result.v[:, -1], v[:, 0]) < 20.0 * bound
     if "IDA" in name:
         assert errors[0] > 50.0 * errors[2], errors
 
@@ -72,26 +62,26 @@ LOOSE = {"gear": 1e-4, "RK45": 1e-5, "BDF of solve_dae": 1e-4}
 
 @pytest.mark.parametrize("name", ON_ANY)
 def test_time_dependent_constraints_without_a_gamma(name):
-    system, times = moving_pivot(gamma=False), [0.5, 2.0]
-    result = run(name, system, (0.0, 2.0), *moving_pivot_state(0.0), tol=1e-8, t_eval=times)
-    q, v = moving_pivot_state(result.t)
+    system, times = problems.moving_pivot(gamma=False), [0.5, 2.0]
+    result = run(name, system, (0.0, 2.0), *problems.moving_pivot_state(0.0), tol=1e-8, t_eval=times)
+    q, v = problems.moving_pivot_state(result.t)
     far = LOOSE.get(name, 1e-5)
-    assert result.success and worst(result.q, q) < far and worst(result.v, v) < 10.0 * far
+    assert result.success and problems.worst(result.q, q) < far and problems.worst(result.v, v) < 10.0 * far
     held = {"DOP853": 1e-7, "DOP853, baumgarte": 1e-8, "DOP853, projected": 1e-14, "gear": 1e-12}
-    assert violations(system, result)[0] < held.get(name, 1e-5)
+    assert problems.violations(system, result)[0] < held.get(name, 1e-5)
 
 
 @pytest.mark.parametrize("name", ON_ANY)
 def test_full_mass_matrix_that_varies_and_forces_that_depend_on_velocities(name):
-    result = run(name, oblique_pendulum(), (0.0, 2.0), *oblique_start(), tol=1e-8, t_eval=[0.5, 2.0])
-    x, u, lam = oblique_point(result.t)
-    ours, far = oblique_to_point(result), LOOSE.get(name, 1e-5)
-    assert worst(ours[0], x) < far and worst(ours[1], u) < 10.0 * far
-    assert worst(result.lam[0], lam) < (1e3 if "IDA" in name or "solve_dae" in name else 1e2) * far
+    result = run(name, problems.oblique_pendulum(), (0.0, 2.0), *problems.oblique_start(), tol=1e-8, t_eval=[0.5, 2.0])
+    x, u, lam = problems.oblique_point(result.t)
+    ours, far = problems.oblique_to_point(result), LOOSE.get(name, 1e-5)
+    assert problems.worst(ours[0], x) < far and problems.worst(ours[1], u) < 10.0 * far
+    assert problems.worst(result.lam[0], lam) < (1e3 if "IDA" in name or "solve_dae" in name else 1e2) * far
 
 
 def test_the_stabilised_form_of_ida_keeps_both_constraints_and_index_1_drifts():
-    made = LINKAGES["default"]
+    made = problems.LINKAGES["default"]
     start = made.system, (0.0, 10.0), made.q0, made.v0
-    drifted, kept = (violations(made.system, ADAPTERS[f"IDA, {form}"](*start, tol=1e-8)) for form in FORMS)
+    drifted, kept = (problems.violations(made.system, ADAPTERS[f"IDA, {form}"](*start, tol=1e-8)) for form in FORMS)
     assert kept[0] < 1e-7 and kept[1] < 2e-6 and drifted[0] > 20.0 * kept[0]

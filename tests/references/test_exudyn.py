@@ -40,9 +40,7 @@ def final_error(result, name):
 def test_agrees_and_is_of_second_order(name, solver):
     problem = LINKAGES[name]
     coarse, fine = (final_error(solve_exudyn(problem, 10.0, n, solver, store_every=1000), name) for n in (5000, 10000))
-    assert fine[0] < BOUNDS[name, solver]
-    assert 3.5 < coarse[0] / fine[0] < 4.5
-    assert 3.5 < coarse[1] / fine[1] < 4.5
+    assert fine[0] < BOUNDS[name, solver] and 3.5 < coarse[0] / fine[0] < 4.5 and 3.5 < coarse[1] / fine[1] < 4.5
 
 
 @pytest.mark.parametrize("solver", SOLVERS)
@@ -52,8 +50,7 @@ def test_stores_every_step_in_our_order(solver):
     assert result.status is Status.REACHED_END
     assert result.q.shape == result.v.shape == result.a.shape == (9, 1001) and result.lam.shape == (8, 1001)
     assert result.h.size == result.stats.n_accepted == 1000
-    assert np.array_equal(result.q[:, 0], problem.q0) and not result.v[:, 0].any()
-    assert np.isnan(result.lam).all()
+    assert np.array_equal(result.q[:, 0], problem.q0) and not result.v[:, 0].any() and np.isnan(result.lam).all()
     assert max(np.abs(problem.system.constraint(t, q)).max() for t, q in zip(result.t, result.q.T, strict=True)) < 1e-5
     rate = (result.v[:, 2:] - result.v[:, :-2]) / (result.t[2:] - result.t[:-2])
     assert np.abs(rate - result.a[:, 1:-1])[:, 5:].max() < 0.02
@@ -74,8 +71,7 @@ def test_hht_of_most_damping_is_generalized_alpha_of_radius_one_half(monkeypatch
     exudyns = solve_exudyn(problem, 2.0, 200, spectral_radius=0.5)
     default = solve_exudyn(problem, 2.0, 200)
     assert np.abs(ours.q - exudyns.q).max() < 1e-10 and np.abs(ours.a - exudyns.a).max() < 1e-6
-    assert np.abs(ours.q - default.q).max() > 1e-4
-    assert ours.stats.n_outer == exudyns.stats.n_outer
+    assert np.abs(ours.q - default.q).max() > 1e-4 and ours.stats.n_outer == exudyns.stats.n_outer
 
 
 def test_damping_grows_as_the_spectral_radius_falls():
@@ -100,8 +96,7 @@ def test_failure_comes_back_as_a_row(capfd):
     assert result.status is Status.SOLVER_FAILED and not result.success
     assert "SolveDynamic terminated" in result.message and "Take more steps" in result.message
     assert 0.0 < result.t[-1] < 10.0 and result.q.shape == (9, result.t.size)
-    assert result.stats.n_accepted == result.h.size == result.t.size - 1
-    assert capfd.readouterr().out == ""
+    assert result.stats.n_accepted == result.h.size == result.t.size - 1 and capfd.readouterr().out == ""
 
 
 def test_writes_no_files(tmp_path, monkeypatch):
@@ -119,7 +114,6 @@ def test_wrong_arguments_are_named():
 
 
 # --- published mechanisms
-
 PROBLEMS = {problem.name: problem for problem in (make() for make in validation.MAKE)}
 FEWEST = {"spatial slider-crank": 1000, "heavy top": 500, "A04 Bricard": 1000}  # steps from which errors are of order 2
 
@@ -128,8 +122,7 @@ def end_error(problem, n_steps, **options):
     known = problem.reference
     result = solve_exudyn(problem, known.t, n_steps, store_every=n_steps, **options)
     assert result.success, result.message
-    assert np.abs(result.q[:, 0] - problem.q0).max() < 1e-12
-    assert np.abs(result.v[:, 0] - problem.v0).max() < 1e-12
+    assert np.abs(result.q[:, 0] - problem.q0).max() < 1e-12 and np.abs(result.v[:, 0] - problem.v0).max() < 1e-12
     return np.abs(result.q[:, -1] - known.q).max(), np.abs(result.v[:, -1] - known.v).max()
 
 
@@ -167,13 +160,10 @@ def test_frames_are_rotations_with_the_last_column_given():
 
 
 # --- the spectral radius, and why there are no steps by error control
-
-
 @pytest.mark.parametrize("name", MODELS)
 def test_every_model_runs_with_another_radius(name):
     """It was refused where there is a model and an option."""
-    solver = CATALOGUE["Exudyn, GeneralizedAlpha 0.6"]
-    result = solver.run(Case(name, PROBLEMS[name], 0.02), 1e-3, 0)
+    result = CATALOGUE["Exudyn, GeneralizedAlpha 0.6"].run(Case(name, PROBLEMS[name], 0.02), 1e-3, 0)
     assert result.success and result.t[-1] == pytest.approx(0.02)
     assert np.abs(result.q[:, 0] - PROBLEMS[name].q0).max() < 1e-12
 
@@ -187,8 +177,7 @@ def test_any_number_of_steps_can_be_asked_for():
 @pytest.mark.parametrize("name", ["DOPRI5", "ODE23"])
 def test_solvers_with_error_control_refuse_joints(name):
     """When one of them no longer does, it belongs into the catalogue."""
-    problem = four_bar()
-    model = model_of(problem)
+    model = model_of(four_bar())
     settings = exudyn_run._settings(0.1, 10, 1)
     settings.timeIntegration.automaticStepSize = True
     with exudyn_run._silence(), pytest.raises(exu.ModelError, match="constraints that cannot be solved"):

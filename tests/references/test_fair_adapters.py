@@ -26,19 +26,14 @@ def start(problem, t_end):
 
 
 # --- solve_dae
-
-
 @pytest.mark.parametrize("tolerance", [3e-8, 1e-8, 1e-9])
 def test_solve_dae_starts_from_rest_with_a_step_that_rounding_does_not_spoil(tolerance):
     """With its own first step, of 1e-6 of the span, it fails there at these tolerances."""
-    at_rest = mechanisms.pendulum()
-    result = fully_implicit.solve_fully_implicit(*start(at_rest, 0.5), "Radau", tolerance, tolerance)
+    result = fully_implicit.solve_fully_implicit(*start(mechanisms.pendulum(), 0.5), "Radau", tolerance, tolerance)
     assert result.success, result.message
 
 
 # --- CasADi
-
-
 def test_idas_takes_the_steps_that_a_tight_tolerance_needs():
     pytest.importorskip("casadi")
     result = solve_idas(*start(PENDULUM, 120.0), 1e-13, 1e-13, t_eval=[120.0])
@@ -75,8 +70,6 @@ def test_the_alarm_within_casadi_is_a_time_limit(name):
 
 
 # --- diffrax
-
-
 @pytest.mark.slow  # compiles for ten seconds
 def test_diffrax_looks_at_the_clock_before_the_second_run_and_takes_many_steps():
     pytest.importorskip("diffrax")
@@ -88,7 +81,6 @@ def test_diffrax_looks_at_the_clock_before_the_second_run_and_takes_many_steps()
 
 
 # --- mass matrices that are singular without the constraints, as with Euler parameters
-
 QUICK = ("DOP853, index 1", "DOP853, projected", "Pr9, index 1")
 COMPILING = ("LSODA, index 1", "Radau, index 1", "CVODE, Adams", "IDA from C, stabilised")
 EULER = ("heavy top", "spatial slider-crank", "spatial four-bar", "A05 governor")
@@ -107,8 +99,7 @@ def test_every_rival_is_put_to_mechanisms_with_euler_parameters(name, solvers):
             if status == "NOT_AVAILABLE":
                 break
             assert status == "REACHED_END", (solver, message)
-            difference = np.abs(result.q[:, -1] - known.q)
-            errors.append(np.nanmax(difference))
+            errors.append(np.nanmax(np.abs(result.q[:, -1] - known.q)))
         assert not errors or errors[1] < min(1e-5, 0.1 * errors[0]), (solver, errors)
 
 
@@ -127,8 +118,6 @@ def test_a_step_of_scipy_that_is_timed_makes_no_interpolant(monkeypatch):
 
 
 # --- Jacobians
-
-
 def test_implicit_solvers_get_the_analytic_jacobian(monkeypatch):
     """Without it as many evaluations more as there are unknowns, for every Jacobian; the motion is the same."""
     at = start(PENDULUM, 5.0)
@@ -153,8 +142,7 @@ def test_a_jacobian_is_given_only_where_it_is_that_of_the_equations():
     differences = [(function(0.0, y + e) - function(0.0, y - e)) / 2e-6 for e in 1e-6 * np.eye(y.size)]
     assert np.abs(jacobian(0.0, y) - np.transpose(differences)).max() < 1e-6 * np.abs(differences).max()
     assert index1.RightHandSide(system, 0.0, q, 10.0).jacobian(0.0, y) is None  # of other equations
-    in_python = pendulum()
-    assert index1.RightHandSide(in_python, 0.0, np.array([1.0, 0.0]), 0.0).jacobian(0.0, np.eye(4)[0]) is None
+    assert index1.RightHandSide(pendulum(), 0.0, np.array([1.0, 0.0]), 0.0).jacobian(0.0, np.eye(4)[0]) is None
 
 
 def test_solve_dae_differences_once_a_jacobian_and_is_told_the_rest():

@@ -28,24 +28,21 @@ def test_published_state_and_period():
     problem, minimal = PROBLEMS[0], minimal_form(0)
     reference = problem.reference
     q, v = minimal.states([reference.t])
-    assert np.abs(q[:, 0] - reference.q).max() < 1e-13
-    assert np.abs(v[:, 0] - reference.v).max() < 1e-12
+    assert np.abs(q[:, 0] - reference.q).max() < 1e-13 and np.abs(v[:, 0] - reference.v).max() < 1e-12
     assert abs(minimal.period - reference.period) < 1e-13
 
 
 def test_starts_where_the_problem_does(case):
     problem, minimal = case
     q, v = minimal.states([0.0, minimal.period])
-    assert np.abs(q - problem.q0[:, None]).max() < 1e-13
-    assert np.abs(v).max() < 1e-12
+    assert np.abs(q - problem.q0[:, None]).max() < 1e-13 and np.abs(v).max() < 1e-12
 
 
 def test_keeps_energy_and_constraints_for_100_s(case):
     problem, minimal = case
     times = np.linspace(0.0, 100.0, 1001)
     q, v = minimal.states(times)
-    energy = problem.energy(times, q, v)
-    assert np.abs(energy - problem.energy(0.0, problem.q0, problem.v0)).max() < 1e-12
+    assert np.abs(problem.energy(times, q, v) - problem.energy(0.0, problem.q0, problem.v0)).max() < 1e-12
     for k in range(0, times.size, 10):
         assert np.abs(problem.system.constraint(times[k], q[:, k])).max() < 1e-13
         assert np.abs(problem.system.velocity_constraint(times[k], q[:, k], v[:, k])).max() < 1e-13

@@ -8,14 +8,7 @@ from references.equations.least_norm import accelerations
 from references.paper import gear
 from references.paper.four_bar_minimal import trajectory
 from references.paper.gear import HIGHEST, STARTS, _formulas, solve_gear
-from tests.problems import (
-    force_residual,
-    moving_pivot,
-    moving_pivot_state,
-    pendulum,
-    violations,
-    worst,
-)
+from tests.problems import force_residual, moving_pivot, moving_pivot_state, pendulum, violations, worst
 from twoloop.kernels.compile.caches import watch
 from twoloop.mechanisms import four_bar
 from twoloop.run.record import Status
@@ -74,8 +67,7 @@ def test_positions_keep_the_constraints_and_velocities_nearly(order, start):
 
 def test_step_sizes_of_the_paper():
     """0.02 is visibly wrong within 2 s, 0.01 is not, and is wrong in 100 s."""
-    assert worst_errors(run(2.0, 0.02, 2))[0] > 0.03
-    assert worst_errors(run(2.0, 0.01, 2))[0] < 0.02
+    assert worst_errors(run(2.0, 0.02, 2))[0] > 0.03 and worst_errors(run(2.0, 0.01, 2))[0] < 0.02
     assert worst_errors(run(100.0, 0.01, 2))[0] > 1.0
 
 
@@ -136,8 +128,7 @@ def test_a_run_shorter_than_its_start():
 
 def test_machine_code_on_disk_follows_the_factorisations_that_it_holds(monkeypatch):
     before = watch(gear._integrate.py_func)
-    assert before is not None
-    assert watch(gear._integrate.py_func) == before
+    assert before is not None and watch(gear._integrate.py_func) == before
     monkeypatch.setattr(gear, "lu_factor", njit(lambda A, pivots: True))
     assert watch(gear._integrate.py_func) != before
 

@@ -18,7 +18,6 @@ CASES = {
 }
 FOUR_BAR = four_bar()
 ORDER_2 = {"max_order": 2, "error_test": "positions"}
-
 # m, the tip's height at 0.1, 0.2 ... 2 s, by DOP853 on the index-1 equations (index1.py) with rtol = atol =
 # 3e-14. From 1e-12 to 3e-14 they change by less than 1e-13 m up to 1 s and 5e-11 m up to 2 s ("flexible"), and by less
 # than 1e-13 m ("stiff")
@@ -86,8 +85,7 @@ def test_default_steps_follow_the_vibrations_whatever_the_tolerance():
 
 
 def test_order_2_and_positions_step_over_them():
-    assert errors("stiff", result := run("stiff", 1e-6, **ORDER_2))[1] < 4e-3
-    assert result.stats.n_accepted < 8000
+    assert errors("stiff", result := run("stiff", 1e-6, **ORDER_2))[1] < 4e-3 and result.stats.n_accepted < 8000
     assert errors("stiff", run("stiff", 1e-8, **ORDER_2))[1] < 2e-4
     # they do not matter only where the beam is stiff
     assert errors("flexible", run("flexible", 1e-6, **ORDER_2))[1] > 0.1

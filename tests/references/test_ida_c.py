@@ -34,8 +34,6 @@ def run(t_end, tolerance, **options):
 
 
 # --- a pendulum of 1 m whose pivot moves as 0.3 sin 4t along x: M is full and varies, Q depends on v, C on t
-
-
 @callback("mass")
 def mass(t, q, p, M):
     M[0, 0] = 1.0 + 0.1 * q[1] ** 2
@@ -96,8 +94,6 @@ def pendulum(kind=GOOD):
 
 
 # --- accuracy
-
-
 @pytest.mark.parametrize("tolerance", BOUNDS)
 def test_is_what_ida_does_through_python(tolerance):
     times = np.linspace(0.0, 10.0, 101)
@@ -147,8 +143,6 @@ def test_jacobian_is_that_of_the_residual(system, tangent, form):
 
 
 # --- output and statistics
-
-
 def test_output_next_to_the_ends():
     times = [1e-13, 1.0 - 1e-13, 1.0]
     result = run(1.0, 1e-8, t_eval=times)
@@ -159,14 +153,11 @@ def test_counts_follow_the_tolerance_and_not_the_output():
     few, many, tight = run(2.0, 1e-7, t_eval=[2.0]).stats, run(2.0, 1e-7).stats, run(2.0, 1e-9).stats
     assert few.n_accepted == many.n_accepted and few.n_evaluations == many.n_evaluations
     assert few.n_accepted < few.n_evaluations < 2.5 * few.n_accepted  # without the Jacobian's differences
-    assert 0 < few.n_factorizations < 0.2 * few.n_accepted
-    assert tight.n_accepted > 1.5 * few.n_accepted
+    assert 0 < few.n_factorizations < 0.2 * few.n_accepted and tight.n_accepted > 1.5 * few.n_accepted
     assert few.n_rejected_error > 0 and few.n_rejected_convergence == 0 and few.n_outer > 0 and few.cpu_time > 0.0
 
 
 # --- failures
-
-
 @pytest.mark.parametrize(
     ("kind", "flag"),
     [(RAISES, "IDA_RES_FAIL (-8)"), *((kind, "IDA_CONV_FAIL (-4)") for kind in (NAN, MASS, CONSTRAINT, JACOBIAN))],
@@ -175,11 +166,9 @@ def test_a_function_that_fails_comes_back_as_a_row(kind, flag, capfd):
     system, q0, v0 = pendulum(kind)
     result = solve_ida_c(system, (0.0, 2.0), q0, v0, 1e-6, 1e-6, t_eval=[0.5, 0.9, 1.5, 2.0])
     good = solve_ida_c(*pendulum()[:1], (0.0, 2.0), q0, v0, 1e-6, 1e-6, t_eval=[0.5, 0.9])
-    assert result.status is Status.SOLVER_FAILED and not result.success
-    assert f"with {flag}" in result.message
+    assert result.status is Status.SOLVER_FAILED and not result.success and f"with {flag}" in result.message
     assert 0.9 < float(result.message.split("t = ")[1].split()[0]) <= 1.0
-    assert result.t.tolist() == [0.5, 0.9] and np.array_equal(result.q, good.q)
-    assert result.stats.n_accepted > 0
+    assert result.t.tolist() == [0.5, 0.9] and np.array_equal(result.q, good.q) and result.stats.n_accepted > 0
     assert capfd.readouterr() == ("", "")
 
 
@@ -199,15 +188,11 @@ def test_python_functions_are_refused():
 
 @pytest.mark.slow  # what is compiled is as in the tests above, but by from_python
 def test_functions_that_from_python_compiles_are_taken():
-    system = ConstrainedSystem.from_python(compile=True, **PLAIN)
-    result = solve_ida_c(system, (0.0, 1.0), [1.0, 0.0], [0.0, 0.0])
-    assert result.success
-    assert np.abs(0.5 * (result.v**2).sum(axis=0) + 9.81 * result.q[1]).max() < 1e-4
+    result = solve_ida_c(ConstrainedSystem.from_python(compile=True, **PLAIN), (0.0, 1.0), [1.0, 0.0], [0.0, 0.0])
+    assert result.success and np.abs(0.5 * (result.v**2).sum(axis=0) + 9.81 * result.q[1]).max() < 1e-4
 
 
 # --- the wheel
-
-
 @pytest.fixture
 def fresh():
     """The library is looked for again in the test, and after it."""
@@ -221,7 +206,7 @@ def fresh():
     [
         ("files", lambda package: None, "there are 0 files"),
         ("_version", lambda sundials: (8, 1, 0), "SUNDIALS has the version 8.1.0"),
-        ("FUNCTIONS", {"core": {"SUNContext_Make": (None,)}}, "undefined symbol: SUNContext_Make"),
+        ("FUNCTIONS", {"core": "SUNContext_Make:-"}, "undefined symbol: SUNContext_Make"),
     ],
 )
 @pytest.mark.usefixtures("fresh")

@@ -43,8 +43,7 @@ def test_the_motion_is_the_problems(name):
     problem = MAKE[name]()
     t, q, v = motion(problem, problem.reference.t)
     assert np.abs(q[:, 0] - problem.q0).max() < 1e-14 and np.abs(v[:, 0] - problem.v0).max() < 1e-14
-    assert np.abs(q[:, -1] - problem.reference.q).max() < 1e-10
-    assert np.abs(v[:, -1] - problem.reference.v).max() < 1e-9
+    assert np.abs(q[:, -1] - problem.reference.q).max() < 1e-10 and np.abs(v[:, -1] - problem.reference.v).max() < 1e-9
     for k in range(0, t.size, 20):  # on the constraints, by positions and by velocities
         q_k, v_k = np.ascontiguousarray(q[:, k]), np.ascontiguousarray(v[:, k])
         assert np.abs(problem.system.constraint(t[k], q_k)).max() < 1e-13
@@ -80,8 +79,7 @@ def test_a_start_in_motion(name):
     t, q, v = motion(problem, problem.reference.t)
     middle = t.size // 3
     later = replace(problem, q0=q[:, middle].copy(), v0=v[:, middle].copy())
-    end = motion(later, problem.reference.t - t[middle])
-    assert np.abs(end[1][:, -1] - problem.reference.q).max() < 1e-8
+    assert np.abs(motion(later, problem.reference.t - t[middle])[1][:, -1] - problem.reference.q).max() < 1e-8
 
 
 @pytest.mark.parametrize("which", SOLVERS)
@@ -96,8 +94,7 @@ def test_both_solvers_end_at_the_reference(which, name):
     assert np.abs(result.q[:, -1] - problem.reference.q).max() < far
     if problem.reference.lam is not None:
         assert result.lam[:, -1] == pytest.approx(problem.reference.lam, abs=1e3 * far)
-    again = solve(problem, problem.reference.t, t_eval=times)
-    assert np.abs(again.q - result.q).max() < far
+    assert np.abs(solve(problem, problem.reference.t, t_eval=times).q - result.q).max() < far
 
 
 @pytest.mark.parametrize("which", SOLVERS)
@@ -126,10 +123,7 @@ def test_heyoka_at_order_8_has_no_last_terms_of_a_pendulum_released_horizontally
     heyoka = pytest.importorskip("heyoka")
     angle, rate = heyoka.make_vars("angle", "rate")
     start = [0.5 * math.pi + beside, 0.0]
-    equations = [(angle, rate), (rate, -9.81 * heyoka.sin(angle))]
-    integrator = heyoka.taylor_adaptive(equations, start, tol=1e-6)
+    integrator = heyoka.taylor_adaptive([(angle, rate), (rate, -9.81 * heyoka.sin(angle))], start, tol=1e-6)
     integrator.propagate_until(10.0)
     known = solve_ivp(lambda t, y: (y[1], -9.81 * math.sin(y[0])), (0.0, 10.0), start, "DOP853", rtol=1e-12, atol=1e-12)
-    assert integrator.order == 8
-    off = float(np.abs(integrator.state - known.y[:, -1]).max())
-    assert (off < 1e-4) is right
+    assert integrator.order == 8 and (float(np.abs(integrator.state - known.y[:, -1]).max()) < 1e-4) is right

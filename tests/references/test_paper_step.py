@@ -30,8 +30,7 @@ def test_prediction_from_the_step_before_saves_iterations_and_changes_no_result(
     euler, continued = (Step(problem.system, SUN, t + H, H, before.q1, before.v1) for _ in range(2))
     continued.continue_from(before)
     counts = [step.converge(LOOPS) for step in (euler, continued)]
-    assert None not in counts and counts[1] <= counts[0]
-    assert np.abs(euler.q1 - continued.q1).max() < 1e-9
+    assert None not in counts and counts[1] <= counts[0] and np.abs(euler.q1 - continued.q1).max() < 1e-9
 
 
 def test_a_step_far_too_long_does_not_converge():

@@ -13,8 +13,7 @@ SLOW = ("CVODE", "IDA, stabilised", "Radau of solve_dae")
 
 
 @pytest.mark.parametrize(
-    "name",
-    ["DOP853, projected", "IDA from C", *(pytest.param(each, marks=pytest.mark.slow) for each in SLOW)],
+    "name", ["DOP853, projected", "IDA from C", *(pytest.param(each, marks=pytest.mark.slow) for each in SLOW)]
 )
 def test_motion_and_multipliers_of_all_rows_are_those_of_the_reference(name):
     problem = redundant_slider_crank()
@@ -33,8 +32,7 @@ def test_rows_that_are_redundant_by_geometry_are_found_at_the_start():
 
 
 def test_the_rows_that_are_kept_span_all():
-    rng = np.random.default_rng(1)
-    some = rng.standard_normal((3, 6))
+    some = np.random.default_rng(1).standard_normal((3, 6))
     rows = np.stack([some[0], 2.0 * some[0], some[1], some[0] - some[1], np.zeros(6), some[2]])
     assert independent_rows(rows) == (0, 2, 5)
 

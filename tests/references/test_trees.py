@@ -18,8 +18,7 @@ def test_accelerations_of_trees(engine, build):
     q, v, a = (each[2::3, -1] for each in (result.q, result.v, result.a))
     dynamics = ENGINES[engine](made.bodies, q, v)
     dynamics.evaluate()
-    assert np.abs(dynamics.angular() - a).max() < 1e-8 * np.abs(a).max()
-    assert a.shape == (n,)
+    assert np.abs(dynamics.angular() - a).max() < 1e-8 * np.abs(a).max() and a.shape == (n,)
 
 
 def test_the_end_of_a_motion_by_pinocchio():
@@ -34,8 +33,7 @@ def test_ida_with_its_sparse_solver():
     start = made.system, (0.0, 0.05), made.q, 0.0 * made.q
     ours = solve_dae(*start, rtol=1e-10, atol=1e-10)
     other = solve_ida_sparse(*start, rtol=1e-8, atol=1e-8)
-    assert other.success
-    assert np.abs(other.q[:, -1] - ours.q[:, -1]).max() < 1e-5
+    assert other.success and np.abs(other.q[:, -1] - ours.q[:, -1]).max() < 1e-5
     assert np.abs(other.lam[:, 0] - ours.lam[:, 0]).max() < 1e-9 * np.abs(ours.lam[:, 0]).max()
     small = open_chain(4)
     with pytest.raises(ValueError, match="must have jacobian_values"):

@@ -5,30 +5,12 @@ import pandas as pd
 import pytest
 
 from studies import ablation
-from studies.ablation import (
-    FLEXIBLE,
-    FROZEN,
-    GAUSS,
-    LINKAGE,
-    PAPER,
-    PROJECTED,
-    RADAU,
-    RIVALS,
-    STABILISED,
-    SUN,
-    TIME,
-    UNPROJECTED,
-    VARIANTS,
-    costs_at,
-    findings_of,
-    verdict,
-)
 from studies.bench.cli import StudyError
 from studies.bench.collector import attempt
 from tests.studies.of_study import GOOD, found_of, said
 
-FACTORS = {PAPER: (1.0, 3.0, 1.8), FROZEN: (9.0, 9.0, 9.0), PROJECTED: (1.1, 1.2, 1.0)}
-FACTORS |= {STABILISED: (2.0, 2.1, 2.2), UNPROJECTED: (1.05, 1.1, 0.9)}
+FACTORS = {ablation.PAPER: (1.0, 3.0, 1.8), ablation.FROZEN: (9.0, 9.0, 9.0), ablation.PROJECTED: (1.1, 1.2, 1.0)}
+FACTORS |= {ablation.STABILISED: (2.0, 2.1, 2.2), ablation.UNPROJECTED: (1.05, 1.1, 0.9)}
 
 
 def rows():
@@ -36,20 +18,24 @@ def rows():
     good = GOOD | {"floor": 1e-11, "astray": False, "energy": 1e-6}
     good |= {"h": np.nan, "tol": np.nan, "h_median": 0.05, "violation_early": 1e-15, "violation_late": 1e-15}
     lines = []
-    for case, tableau in ((LINKAGE, SUN), (LINKAGE, GAUSS), (FLEXIBLE, SUN)):
-        told = good | {"case": case, "tableau": tableau.name, "t_end": 10.0 if case == LINKAGE else 0.2}
+    for case, tableau in (
+        (ablation.LINKAGE, ablation.SUN),
+        (ablation.LINKAGE, ablation.GAUSS),
+        (ablation.FLEXIBLE, ablation.SUN),
+    ):
+        told = good | {"case": case, "tableau": tableau.name, "t_end": 10.0 if case == ablation.LINKAGE else 0.2}
         for variant, factors in FACTORS.items():
-            drift = 1e-4 if variant == UNPROJECTED else 8e-16
+            drift = 1e-4 if variant == ablation.UNPROJECTED else 8e-16
             each = told | {"solver": variant, "violation_q": drift}
-            order = 1 if variant == FROZEN else tableau.order
-            for k, tol in enumerate(() if tableau is GAUSS else ablation.HALVES[2:13]):
-                counts = dict(zip(("n_evaluations", "n_factorizations", TIME), factors, strict=True))
+            order = 1 if variant == ablation.FROZEN else tableau.order
+            for k, tol in enumerate(() if tableau is ablation.GAUSS else ablation.HALVES[2:13]):
+                counts = dict(zip(("n_evaluations", "n_factorizations", ablation.TIME), factors, strict=True))
                 counts = {what: 1e3 * (k + 2) * factor for what, factor in counts.items()}
-                error = 0.3 * np.sqrt(tol) if variant == FROZEN else 2.0 * tol
+                error = 0.3 * np.sqrt(tol) if variant == ablation.FROZEN else 2.0 * tol
                 lines.append(each | {"group": "controlled", "tol": tol, "error_q": error, **counts})
             for h in (0.005, 0.01, 0.02, 0.1):
                 lines.append(each | {"group": "fixed", "h": h, "error_q": 1.0, "n_evaluations": 1.0 / h})
-                if variant == UNPROJECTED:
+                if variant == ablation.UNPROJECTED:
                     lines[-1] |= {"violation_early": 1e-7, "violation_late": 1e-5}
             lines += [each | {"group": "order", "h": h, "error_q": h**order} for h in ablation.ORDER_STEPS]
     return pd.DataFrame(lines)
@@ -60,7 +46,7 @@ def made():
     return rows()
 
 
-def scaled(made, variant, factor, columns=("n_evaluations", "n_factorizations", TIME)):
+def scaled(made, variant, factor, columns=("n_evaluations", "n_factorizations", ablation.TIME)):
     made = made.copy()
     made.loc[made["solver"] == variant, list(columns)] *= factor
     return made
@@ -74,27 +60,32 @@ def test_the_answer_turns_with_the_rows(made):
         "factorisations, 0.40 times as many by projecting: this code" in text and "could be saved (not tried)" in text
     )
     assert "under this fixed-point iteration its extra multipliers do not pay; what they cost with Newton" in text
-    assert f"added with {SUN.name} and {GAUSS.name}, does this." in text and "without it" not in text
-    radau = made[made["tableau"] == SUN.name].assign(tableau=RADAU.name)
-    radau.loc[radau["solver"] == STABILISED, "violation_q"] = 5e-7
-    assert f"With {RADAU.name}, without it, the violation reaches 5e-7 m" in said(ablation, pd.concat([made, radau]))[1]
+    assert f"added with {ablation.SUN.name} and {ablation.GAUSS.name}, does this." in text and "without it" not in text
+    radau = made[made["tableau"] == ablation.SUN.name].assign(tableau=ablation.RADAU.name)
+    radau.loc[radau["solver"] == ablation.STABILISED, "violation_q"] = 5e-7
+    assert (
+        f"With {ablation.RADAU.name}, without it, the violation reaches 5e-7 m"
+        in said(ablation, pd.concat([made, radau]))[1]
+    )
     assert "the order falls to 1 with every tableau" in text and "solving them in the loop is right" in text
     assert "violation grows: 1e-7 m" in text and "1e-5 m in the last" in text and "nothing is cheaper" in text
-    text = said(ablation, scaled(scaled(made, PROJECTED, 4.0), STABILISED, 0.2))[1]
+    text = said(ablation, scaled(scaled(made, ablation.PROJECTED, 4.0), ablation.STABILISED, 0.2))[1]
     assert "**Answer.** Yes: projecting once a step" in text and "takes no less time at any error compared" in text
     assert "the extra multipliers that the paper calls inefficient save time at every error" in text
-    changed = scaled(scaled(made, PROJECTED, 1.8, (TIME,)), PROJECTED, 0.9, ("n_evaluations",))
-    _, text = said(ablation, scaled(changed, UNPROJECTED, 9.0))
+    changed = scaled(
+        scaled(made, ablation.PROJECTED, 1.8, (ablation.TIME,)), ablation.PROJECTED, 0.9, ("n_evaluations",)
+    )
+    _, text = said(ablation, scaled(changed, ablation.UNPROJECTED, 9.0))
     assert (
         "**Answer.** Not by CPU time in this code: projecting once a step keeps the constraints as well in the" in text
     )
     assert "By evaluations it does not pay either: projecting takes 0.99 times" in text and "not tried" not in text
     assert "nothing is cheaper" not in text
     mixed = made.copy()
-    mixed.loc[(mixed["solver"] == PROJECTED) & (mixed["tol"] < 1e-5), TIME] *= 9.0
-    mixed.loc[mixed["solver"] == PROJECTED, "violation_q"] = 1e-6
+    mixed.loc[(mixed["solver"] == ablation.PROJECTED) & (mixed["tol"] < 1e-5), ablation.TIME] *= 9.0
+    mixed.loc[mixed["solver"] == ablation.PROJECTED, "violation_q"] = 1e-6
     mixed["violation_late"] = mixed["violation_early"]
-    mixed.loc[(mixed["solver"] == FROZEN) & (mixed["group"] == "order"), "error_q"] **= 5
+    mixed.loc[(mixed["solver"] == ablation.FROZEN) & (mixed["group"] == "order"), "error_q"] **= 5
     text = said(ablation, mixed)[1]
     assert "**Answer.** Not in general: projecting once a step keeps the constraints less well" in text
     assert "violation does not grow" in text
@@ -104,36 +95,38 @@ def test_the_answer_turns_with_the_rows(made):
 def test_a_report_is_short_and_a_quick_one_says_so(made, tmp_path, unsaved):
     found = found_of(ablation, tmp_path, made, quick=True)
     text = (tmp_path / "ablation.md").read_text()
-    assert "**Quick run**" in text and "**Quick run**" not in said(ablation, made)[1]
-    assert len(text.split()) < 1000
-    assert found["against"][PROJECTED]["verdicts"]["time"] == "dearer"
+    assert "**Quick run**" in text and "**Quick run**" not in said(ablation, made)[1] and len(text.split()) < 1000
+    assert found["against"][ablation.PROJECTED]["verdicts"]["time"] == "dearer"
 
 
 def test_findings(made):
-    found = findings_of(made)
-    assert found["orders"][PAPER] == pytest.approx({SUN.name: 5.0, GAUSS.name: 4.0})
-    assert found["orders"][FROZEN] == pytest.approx({SUN.name: 1.0, GAUSS.name: 1.0})
-    assert found["against"][PROJECTED]["spans"]["evaluations"] == pytest.approx([1.1] * 3)
+    found = ablation.findings_of(made)
+    assert found["orders"][ablation.PAPER] == pytest.approx({ablation.SUN.name: 5.0, ablation.GAUSS.name: 4.0})
+    assert found["orders"][ablation.FROZEN] == pytest.approx({ablation.SUN.name: 1.0, ablation.GAUSS.name: 1.0})
+    assert found["against"][ablation.PROJECTED]["spans"]["evaluations"] == pytest.approx([1.1] * 3)
     verdicts = {"evaluations": "cheaper", "factorisations": "dearer", "time": "cheaper"}
-    assert found["against"][STABILISED]["verdicts"] == verdicts
-    assert found["longest"][LINKAGE] == dict.fromkeys(VARIANTS, 0.1)
-    assert found["drift"] == [1e-7, 1e-5]
-    astray = made.assign(astray=made["h"] == 0.1)
-    assert findings_of(astray)["longest"][LINKAGE][PAPER] == 0.02
+    assert found["against"][ablation.STABILISED]["verdicts"] == verdicts
+    assert found["longest"][ablation.LINKAGE] == dict.fromkeys(ablation.VARIANTS, 0.1) and found["drift"] == [
+        1e-7,
+        1e-5,
+    ]
+    assert (
+        ablation.findings_of(made.assign(astray=made["h"] == 0.1))["longest"][ablation.LINKAGE][ablation.PAPER] == 0.02
+    )
     failed = made.assign(status=np.where(made["h"] > 0.01, "SOLVER_FAILED", made["status"]))
-    assert findings_of(failed)["longest"][LINKAGE][PAPER] == 0.01
+    assert ablation.findings_of(failed)["longest"][ablation.LINKAGE][ablation.PAPER] == 0.01
 
 
 def test_frozen_is_compared_at_its_best_error_and_no_better_one(made):
-    made = made[(made["solver"] != FROZEN) | (made["tol"] > 9e-7)]
+    made = made[(made["solver"] != ablation.FROZEN) | (made["tol"] > 9e-7)]
     # its best error is 3e-4, at the ninth tolerance; the paper's way has 2e-4 at the fifth
     assert ablation.frozen_ratios(made) == pytest.approx([9.0 * 10 / 6] * 2)
 
 
 def test_no_cost_is_told_across_a_gap_or_beyond_the_runs():
     runs = pd.DataFrame({"error_q": [1e-2, 1e-5, 2e-6], "n_evaluations": [1.0, 4.0, 9.0], "floor": 0.0})
-    assert costs_at(runs, (20**0.5 * 1e-6,), "n_evaluations") == pytest.approx(6.0)
-    assert np.isnan(costs_at(runs, (1e-1, 1e-3, 1e-7), "n_evaluations")).all()
+    assert ablation.costs_at(runs, (20**0.5 * 1e-6,), "n_evaluations") == pytest.approx(6.0)
+    assert np.isnan(ablation.costs_at(runs, (1e-1, 1e-3, 1e-7), "n_evaluations")).all()
 
 
 @pytest.mark.parametrize(
@@ -151,17 +144,17 @@ def test_no_cost_is_told_across_a_gap_or_beyond_the_runs():
     ],
 )
 def test_verdicts(span, word):
-    assert verdict(span) == word
+    assert ablation.verdict(span) == word
 
 
 def test_rows_without_variants_are_refused(made):
     with pytest.raises(StudyError, match="the rows lack variants"):
-        findings_of(made[made["solver"] != PAPER])
+        ablation.findings_of(made[made["solver"] != ablation.PAPER])
 
 
 def test_every_variant_runs_with_both_kinds_of_steps():
-    runs = [run for run in ablation.runs(True) if run.case.name == LINKAGE]
-    assert {run.solver.name for run in runs} == {PAPER, FROZEN, *RIVALS}
+    runs = [run for run in ablation.runs(True) if run.case.name == ablation.LINKAGE]
+    assert {run.solver.name for run in runs} == {ablation.PAPER, ablation.FROZEN, *ablation.RIVALS}
     for run in runs:
         if run.value in (1e-3, 0.04):
             result, status, message, _ = attempt(run, 0)
@@ -172,5 +165,5 @@ def test_every_variant_runs_with_both_kinds_of_steps():
 def test_curves_of_the_figure_are_those_of_one_step_length():
     runs = [run for run in ablation.runs(True) if run.settings.get("h") == ablation.DRAWN_STEP_QUICK]
     curves = [(run, ablation.measure(run, attempt(run, 0)[0])["series"]) for run in runs]
-    assert {run.solver.name for run, each in curves if set(each) == {"violation", "energy"}} == {*VARIANTS}
+    assert {run.solver.name for run, each in curves if set(each) == {"violation", "energy"}} == {*ablation.VARIANTS}
     assert all((run.group == "fixed") == bool(each) for run, each in curves)

@@ -33,8 +33,7 @@ def good(seconds):
 
 
 def first(rows, solver):
-    chosen = rows[(rows["solver"] == solver) & (rows["repeat"] == 0)]
-    return len(chosen)
+    return len(rows[(rows["solver"] == solver) & (rows["repeat"] == 0)])
 
 
 @pytest.mark.parametrize("status", adaptive.ENDING)
@@ -54,8 +53,7 @@ def test_failures_at_two_tolerances_running_end_it():
 def test_far_behind_at_two_settings_running_ends_it_unless_all_is_asked():
     table = (("a", good(0.01)), ("b", good(0.3)), ("c", good(0.15)))
     rows = made(*table)
-    assert [first(rows, name) for name in "abc"] == [5, 2, 5]
-    assert first(made(*table, all_asked=True), "b") == 5
+    assert [first(rows, name) for name in "abc"] == [5, 2, 5] and first(made(*table, all_asked=True), "b") == 5
 
 
 def test_an_error_that_nothing_else_reaches_is_not_far_behind():
@@ -111,8 +109,7 @@ def test_a_solver_is_asked_beyond_its_ends_where_accuracies_are_left_out():
 
 def test_what_is_far_behind_is_not_asked_between_its_settings():
     fast = lambda value: ("REACHED_END", 1e-3 * value, 1e-3)  # noqa: E731
-    slow = asked(lambda value: ("REACHED_END", value, 6e-3), fast=fast)
-    assert len(slow) == 3
+    assert len(asked(lambda value: ("REACHED_END", value, 6e-3), fast=fast)) == 3
 
 
 def test_ours_are_far_behind_by_the_fastest_of_ours_and_the_default_is_asked_in_any_case():

@@ -68,8 +68,7 @@ def test_the_advice_turns_with_the_rows(tmp_path):
     made.loc[made["solver"] == IDA_C_ORDER_2, "call_s"] /= 100.0
     made.loc[made["solver"] == PAPER, "call_s"] /= 100.0
     found = found_of(study, tmp_path, made)["cases"][1]
-    assert found["at"][0]["best"]["solver"] == IDA_C_ORDER_2
-    assert not found["at"][0]["best"]["ours"]
+    assert found["at"][0]["best"]["solver"] == IDA_C_ORDER_2 and not found["at"][0]["best"]["ours"]
     made = rows()
     made.loc[(made["solver"] == IDA_C_ORDER_2) & (made["error_tip"] == 5e-3), "call_s"] = 1e-3
     found = found_of(study, tmp_path, made)["cases"][1]
@@ -153,8 +152,7 @@ def test_whether_vibrations_are_stepped_over_is_read_from_the_steps(tmp_path):
 
 
 def test_the_study_lists_all_cells_once():
-    known = cases(False)
-    made = list(runs(known, False))
+    made = list(runs(cases(False), False))
     assert len({run.key(0) for run in made}) == len(made)
     names = {run.solver.name for run in made}
     assert {PAPER, NEWTON, DIFFERENCES, "BDF", OWN_EXPLICIT, IDA_C, IDA_C_ORDER_2, EXUDYN} <= names
@@ -218,8 +216,7 @@ def test_exudyn_is_measured_against_itself():
 
 def test_theory_of_fixed_point_iteration():
     sun = sun_radau_iib(3)
-    assert abs(jacobi_limit(sun) - 1.0 / 0.215314) < 1e-4
-    assert abs(jacobi_limit(gauss(2)) - 2.0 * np.sqrt(3.0)) < 1e-12
+    assert abs(jacobi_limit(sun) - 1.0 / 0.215314) < 1e-4 and abs(jacobi_limit(gauss(2)) - 2.0 * np.sqrt(3.0)) < 1e-12
     assert abs(gauss_seidel_limit(sun) - 3.2211) < 1e-4
     # of one stage there are no others, whose latest could be used
     assert abs(gauss_seidel_limit(gauss(1)) - jacobi_limit(gauss(1))) < 1e-9

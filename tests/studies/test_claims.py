@@ -274,8 +274,7 @@ def test_report_rows_and_findings(folder):
             and row["number"] in text
             and row["criterion"] == claim.criterion
         )
-    assert "nan" not in text and (folder / "errata.md").exists()
-    assert len(text.split()) < 1000
+    assert "nan" not in text and (folder / "errata.md").exists() and len(text.split()) < 1000
 
 
 def test_report_is_written_again_from_rows(folder):

@@ -39,7 +39,6 @@ RUNS = [  # case, end, solver, family, called from, tolerance, repetition, CPU, 
 COLUMNS = ["case", "t_end", "solver", "family", "called_from", "tol", "repeat", "call_s", "status", "message"]
 COLUMNS += ["n_evaluations", "error_q", "energy"]
 CRANE, SHORT, SWING = (f"{name} s (work_precision)" for name in ("crane, 9", "crane, 0.5", "swing, 1"))
-
 LOOK = """
 const said = [];
 const line = ({ label, data, borderColor, pointStyle, pointRotation, borderDash }) => ({
@@ -156,15 +155,14 @@ def test_the_data_are_the_rows(folder):
     assert len(data["runs"]) == 9  # of the three repetitions the median
     first = data["runs"][0]
     assert [first[place[name]] for name in ("setting", "call_s", "error_q", "energy")] == ["tol 1e-4", 0.02, 1e-4, 1e-5]
-    assert data["runs"][3][place["said"]] == "TIME_LIMIT: Stopped"
-    assert data["runs"][3][place["error_q"]] is None
+    assert data["runs"][3][place["said"]] == "TIME_LIMIT: Stopped" and data["runs"][3][place["error_q"]] is None
     assert [run[place["said"]] for run in data["runs"] if run[place["error_q"]] == 2.5] == [
         "reached the end, but lost the motion"
     ]
 
 
 def test_each_solver_has_a_look_of_its_own_that_of_the_figures_where_there_is_one():
-    names = [*figures.STYLES, "of nobody", "of nobody else", "another"]
+    names = [*figures.STYLES, "a solver without a style", "a second one", "a third one"]
     looks = compare_page.looks(reversed(names))
     assert len({tuple(look.values()) for look in looks.values()}) == len(names)
     for name in ("auto", "DOP853 (twoloop)", "IDA from C, stabilised"):
@@ -236,8 +234,7 @@ def test_what_the_library_does_in_a_browser(folder):
     assert found["pointed"] == ["tol 1e-4"]
     x0, x1, y0, y1 = found["whole"]
     assert x0 < found["zoomed"][0] < 1e-4 < found["zoomed"][1] < x1
-    assert y0 < found["zoomed"][2] < 0.02 < found["zoomed"][3] < y1
-    assert found["back"] == found["whole"]
+    assert y0 < found["zoomed"][2] < 0.02 < found["zoomed"][3] < y1 and found["back"] == found["whole"]
     name, beginning, size = found["saved"]
     assert name == f"{CRANE} error_q.png" and beginning == "data:image/png;base64," and size > 5000
     assert found["asked"] == 0  # the page needs no other file
@@ -281,8 +278,7 @@ def test_rows_of_files_are_beside_those_that_are_shipped(tmp_path):
     mine |= {"t_end": 10, "family": "me", "setting": "h", "value": 0.15, "status": "REACHED_END"}
     mine |= {"times_s": [0.3, 0.1, 0.2], "error_end": 1e-5, "floor_end": 1e-9}
     failed = {"value": 1, "status": "RAISED", "times_s": [], "error_end": None, "message": "it fell. Try"}
-    text = text_of([mine, mine | failed])
-    (tmp_path / "mine.jsonl").write_text(text)
+    (tmp_path / "mine.jsonl").write_text(text_of([mine, mine | failed]))
     files = ["archive", str(tmp_path / "mine.jsonl")]
     data = compare_page.page_data(*compare_page.read(tmp_path, files))
     place, names = {name: k for k, name in enumerate(data["columns"])}, [each["name"] for each in data["solvers"]]
@@ -310,6 +306,5 @@ def test_it_needs_rows(tmp_path):
 
 def test_the_page_has_the_library_its_licence_and_the_stamps(folder):
     text = made(folder).read_text(encoding="utf-8")
-    assert not re.search(r"\bsrc=|<link", text)
-    assert STAMP.removeprefix("# ") in text
+    assert not re.search(r"\bsrc=|<link", text) and STAMP.removeprefix("# ") in text
     assert text.count("MIT License (MIT)") == 2 and "Chart.js v4" in text and "chartjs-plugin-zoom v2" in text

@@ -46,8 +46,7 @@ PERIOD = 2.2489859198
 
 @pytest.fixture(scope="module")
 def loaded(out):
-    output = Output(Call("energy", True, out, False, ""))
-    return output.load_rows(curves=True)[0]
+    return Output(Call("energy", True, out, False, "")).load_rows(curves=True)[0]
 
 
 @pytest.fixture
@@ -304,5 +303,18 @@ def test_short_runs_are_seen_at_every_step():
 
 def test_every_run_of_the_full_study_has_a_key_of_its_own():
     listed = list(runs(False))
-    assert len({run.key(0) for run in listed}) == len(listed) < 110
-    assert {run.case.t_end for run in listed} == {LONG}
+    assert len({run.key(0) for run in listed}) == len(listed) < 110 and {run.case.t_end for run in listed} == {LONG}
+
+
+def test_a_run_counts_as_good_as_the_worst_of_the_tighter_ones():
+    made = pd.DataFrame(
+        {
+            "name": ["a"] * 4 + ["b"] * 2,
+            "tol": [1e-6, 1e-7, 1e-8, np.nan, 1e-6, 1e-8],
+            "h": [np.nan] * 3 + [0.1, np.nan, np.nan],
+            "energy": [1e-4, -1e-2, 1e-5, 1e-9, 1e-3, np.nan],
+            "status": ["REACHED_END"] * 5 + ["SOLVER_FAILED"],
+            "lost": [False] * 5 + [None],
+        }
+    )
+    assert energy.settled(made).tolist() == [1e-2, 1e-2, 1e-5, 1e-9, np.inf, np.inf]

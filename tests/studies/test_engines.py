@@ -1,5 +1,6 @@
 """The study of engines: orders and floors, prices and settings turn with the rows; without engines it says so."""
 
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -7,7 +8,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from studies.bench.closed_loops import four_bar
+from studies.bench.changed_loops import IN_A_FRAME, LIGHTENED
+from studies.bench.closed_loops import ASKEW, MECHANISMS, SPATIAL, four_bar
+from studies.bench.engine_runs import Loop
 from studies.bench.render import render
 from studies.engines import study as engines
 from twoloop.audit import audit_mjcf
@@ -87,13 +90,24 @@ def test_the_error_at_a_speed_is_that_of_calls_as_fast():
 
 def test_motors_and_energies_stand_beside_what_they_change():
     good = made("MuJoCo, RK4, solref 2h", 10.0 * STEPS**2)
-    motor = good.assign(group="motor", case=[f"{k}, driven" for k in "abcd"], error_q=[1.0, None, 0.01, 0.03])
+    motor = good.assign(group="motor", case=[f"{k}, driven" for k in "abcd"], error_q=[1.0, 2.0, 0.01, 0.03])
+    motor = motor.assign(n_steps=5000, status=["REACHED_END", "FAILED", "REACHED_END", "REACHED_END"])
     energy = good[:1].assign(group="energy", n_steps=50_000, error_q=None, energy=0.03)
-    found, text = said(good, motor, energy)
+    skipped = energy.assign(case="other", energy=None, status="TIME_LIMIT")
+    found, text = said(good, motor, energy, skipped)
     cells = {line["label"]: line["cells"] for line in found["probes"]}
-    assert cells["all, median: driven; PD motor"] == [[None, None], [pytest.approx(0.515), None]]
-    assert cells["energy, 100 s: four-bar; RSSR"] == [[None, None], [0.03, None]]
-    assert found["cases"] == ["four-bar"] and "| all, median: driven; PD motor | –/– | 0.52/– |" in text
+    assert cells["driven; with a PD motor"] == [[None, None], [pytest.approx(0.515), None]]  # a failure is any error
+    assert cells["energy, 100 s"] == [[None], [0.03]]
+    assert found["cases"] == ["four-bar"] and "| driven; with a PD motor | –/– | 0.52/– |" in text
+
+
+def test_the_changed_mechanisms_move_as_they_should():
+    turned, upright = (Loop(replace(make(), t_span=(0.0, 0.05))) for make in (IN_A_FRAME[1], SPATIAL[1]))
+    known, there = turned.reference[0], upright.reference[0]
+    np.testing.assert_allclose(known.x, there.x @ ASKEW.T, atol=1e-9)
+    light, heavy = (make().model.bodies[1].inertia for make in (LIGHTENED[2], MECHANISMS[1]))
+    np.testing.assert_allclose(light, heavy / 100.0)
+    assert turned.problem.name.endswith(", turned") and len(LIGHTENED) == 2 * len(MECHANISMS) - 2
 
 
 def test_an_engine_that_is_not_there_is_a_row(monkeypatch):
@@ -130,5 +144,4 @@ def test_the_energy_over_a_long_time_is_of_the_whole_motion(monkeypatch):
 @pytest.mark.slow
 def test_the_quick_run(tmp_path):
     engines.main(["--quick", "--out", str(tmp_path)])
-    text = (tmp_path / "engines.md").read_text()
-    assert "Quick run" in text and (tmp_path / "engines.png").is_file()
+    assert "Quick run" in (tmp_path / "engines.md").read_text() and (tmp_path / "engines.png").is_file()

@@ -50,7 +50,7 @@ def test_runs_that_differ_by_their_starts_have_ends_that_two_methods_agree_on(mo
 
 
 def rows(error=lambda way, tol: tol, **seconds):
-    """Five equal repetitions at all tolerances; a run takes `seconds` at the loosest and twice as long at each next."""
+    """Five equal repetitions at all tolerances; a run takes `seconds` at the loosest, twice that at each next one."""
     head = {"group": ensembles.GROUP, "case": "linkages", "n_runs": 4, "t_end": 6.0, "first_s": 1.0, "n_failed": 0}
     made = [
         head
@@ -71,8 +71,7 @@ def test_sentences_follow_the_rows():
     _, text = said(ensembles, rows(**{ENSEMBLE: 0.1, SINGLE: 0.01, HEYOKA: 0.05}))
     assert f"ahead of heyoka's batches and diffrax in 0 and behind in {len(ERRORS)} of {len(ERRORS)} pairs" in text
     assert "Heyoka, batches is ahead on" in text and "1 of the 1 mechanisms, at errors of 1e-4, 1e-6 and 1e-8" in text
-    assert "with 0.50 to 0.50 of the time." in text
-    assert "10,000 four-bar linkages" in text and "none failed" in text
+    assert "with 0.50 to 0.50 of the time." in text and "10,000 four-bar linkages" in text and "none failed" in text
 
 
 def test_ways_are_compared_at_equal_error_and_not_at_equal_tolerance():

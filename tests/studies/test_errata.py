@@ -88,8 +88,7 @@ def test_energy_at_y3_of_0():
     """The other assembly of the same linkage passes 0 with what bars 1 and 2 have lost since the start."""
     problem = four_bar(branch=1)
     truth = MinimalFourBar.from_parameters(problem.parameters)
-    t = np.linspace(0.0, truth.period, 4001)
-    q, v = truth.states(t)
+    q, v = truth.states(np.linspace(0.0, truth.period, 4001))
     assert problem.energy is not None
     k = np.flatnonzero((q[7, 1:-1] < 0.0) & (q[7, 2:] >= 0.0))[0] + 1  # before it passes
     share = -q[7, k] / (q[7, k + 1] - q[7, k])

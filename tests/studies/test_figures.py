@@ -36,7 +36,12 @@ from tests.studies.of_study import median
 
 NEW = (  # of rivals that no table of styles knows, as a study may bring them
     *("IDA from C, q and v tested", "CVODE from C, BDF, projected", "CVODES, CasADi", "heyoka, minimal coordinates"),
-    *("CVODE from C, minimal coordinates", "Exudyn, GeneralizedAlpha 0.6", "Exudyn, GeneralizedAlpha 1", "nobody's"),
+    *(
+        "CVODE from C, minimal coordinates",
+        "Exudyn, GeneralizedAlpha 0.6",
+        "Exudyn, GeneralizedAlpha 1",
+        "an unknown solver",
+    ),
 )
 FAMILY = {"heyoka": "heyoka", "CVODE from C, Adams": "SUNDIALS", "CVODE, Adams": "SUNDIALS", "LSODA, index 1": "SciPy"}
 FAMILY |= {"IDA from C, stabilised": "SUNDIALS", "DOP853, index 1": "SciPy", "Dopri8, diffrax": "diffrax"}
@@ -100,8 +105,7 @@ def test_no_colour_is_of_ours_and_of_others_nor_of_two_families_drawn_together()
     )
     assert not ours & theirs and not figures.OURS.keys() & figures.THEIRS.keys()
     listed = {family: {pair(name)[0] for name in names} for family, names in FAMILIES.items()}
-    assert all(len(each) == 1 for each in listed.values())
-    assert len(set.union(*listed.values())) == len(listed)
+    assert all(len(each) == 1 for each in listed.values()) and len(set.union(*listed.values())) == len(listed)
 
 
 @pytest.mark.parametrize(
@@ -122,12 +126,7 @@ def test_solvers_of_a_figure_are_told_apart_without_colours(names):
 
 
 @pytest.mark.parametrize(
-    "names",
-    [
-        (energy.SUN, energy.GAUSS, energy.RADAU, energy.NEWMARK),
-        motion.LISTED[:7],
-        step_size.PAPER,
-    ],
+    "names", [(energy.SUN, energy.GAUSS, energy.RADAU, energy.NEWMARK), motion.LISTED[:7], step_size.PAPER]
 )
 def test_solvers_that_are_always_drawn_together_do_not_look_alike(names):
     assert len({pair(name) for name in names}) == len(names)
@@ -260,7 +259,6 @@ def test_the_cells_of_table_3_are_drawn_as_ratios():
     made[6] |= {"lost": True}
     first, second, scale = table3.picture(pd.DataFrame(made)).axes
     told = [[text.get_text() for text in axes.texts] for axes in (first, second)]
-    assert told[0] == ["10"] * 5 + ["1.0", "★"] + ["10"] * 9
-    assert told[1] == ["★", "10", "10", "10"] * 4
+    assert told[0] == ["10"] * 5 + ["1.0", "★"] + ["10"] * 9 and told[1] == ["★", "10", "10", "10"] * 4
     assert first.get_xlabel() == "err_out" and first.get_ylabel() == "err_in"
     assert scale.get_ylabel() == "paper's time / our least"

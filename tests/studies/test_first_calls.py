@@ -23,19 +23,12 @@ def rows(*lines):
 
 
 @pytest.mark.parametrize(
-    ("first", "later", "pays"),
-    [
-        (1.05, 0.1, 11.0),
-        (0.05, 0.1, 1.0),
-        (1.0, 0.2, None),
-        (1.0, 0.3, None),
-    ],
+    ("first", "later", "pays"), [(1.05, 0.1, 11.0), (0.05, 0.1, 1.0), (1.0, 0.2, None), (1.0, 0.3, None)]
 )
 def test_building_pays_from_the_run_in_which_all_runs_together_take_less(first, later, pays):
     line = {"first_call_s": first, "call_s": later, "call_q3": later}
     default = {"first_call_s": 0.1, "call_s": 0.2, "call_q1": 0.2}
-    found = first_calls.pays_from(line, default)
-    assert found == pays
+    assert first_calls.pays_from(line, default) == pays
 
     def total(side, n):
         return side["first_call_s"] + (n - 1) * side["call_s"]

@@ -13,8 +13,7 @@ from twoloop.rows.equal_error import LOOSEST
 def test_the_default_is_compared_with_the_best_of_ours_wherever_one_gets():
     pair = ("auto", "two-loop", "compiled", 1e-3, 2.0), ("Adams", "two-loop", "compiled", 1e-4, 1.0)
     found = goals.of_default(rows(*pair), False)
-    assert (found["n"], found["n_within"], found["n_unreached"]) == (2, 0, 1)
-    assert found["worst"] == 2.0
+    assert (found["n"], found["n_within"], found["n_unreached"]) == (2, 0, 1) and found["worst"] == 2.0
     assert goals.of_default(rows(("auto", "two-loop", "compiled", 1e-3, 2.0)), False)["n_within"] == 1
 
 

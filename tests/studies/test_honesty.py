@@ -11,7 +11,7 @@ import pytest
 from studies.honesty import short_forces
 from studies.honesty import solvers as honesty_solvers
 from studies.honesty import study as honesty
-from studies.honesty.solvers import DEFAULT, IDA_C, KINDS, LIMITED, kind_of, own, solvers, why_not
+from studies.honesty.solvers import DEFAULT, IDA_C, KINDS, LIMITED, LOOK, kind_of, own, solvers, why_not
 from studies.honesty.traps import (
     FORCE,
     GROWN,
@@ -32,8 +32,6 @@ from twoloop.methods.presets import PRESETS
 
 TRAPS = {trap.name: trap for trap in traps(quick=True)}
 SOUND = TRAPS["redundant row"]
-
-
 DOP853 = partial(own, "DOP853")
 
 
@@ -43,8 +41,7 @@ def row_of(trap, call=DOP853):
 
 def test_a_right_answer():
     row = row_of(SOUND)
-    assert row["outcome"] == honesty.RIGHT
-    assert row["error"] < 1e-6
+    assert row["outcome"] == honesty.RIGHT and row["error"] < 1e-6
 
 
 def test_a_wrong_answer_with_success_is_silent():
@@ -102,8 +99,7 @@ def test_traps_in_the_motion_have_a_known_end():
 
 def test_a_solver_of_compiled_functions_is_not_asked_for_python():
     trap = TRAPS["exception in a Python callback after 1 s"]
-    assert why_not(IDA_C, trap)
-    assert not why_not("BDF (twoloop)", trap)
+    assert why_not(IDA_C, trap) and not why_not("BDF (twoloop)", trap)
     assert why_not("LSODA, index 1", TRAPS["first step of 1 s"])
 
 
@@ -237,7 +233,7 @@ def test_a_second_line_has_the_longest_step_of_ours(monkeypatch):
     every["LSODA, index 1"](pulse)
     every["LSODA, index 1" + LIMITED](pulse)
     every["LSODA, index 1"](TRAPS["pulse of 1 ms, max_step half of it"])
-    assert [options["max_step"] for options in asked] == [None, pulse.t_end / 100.0, 5e-4]
+    assert [options["max_step"] for options in asked] == [None, pytest.approx(pulse.t_end * LOOK), 5e-4]
     others = {name for name in every if not name.endswith(honesty.OURS)}
     assert {name + LIMITED for name in others if not name.endswith(LIMITED)} < others
     assert why_not("LSODA, index 1" + LIMITED, TRAPS["pulse of 1 ms, max_step half of it"])
@@ -266,8 +262,16 @@ def test_forces_held_out_are_others_and_counted_apart():
     again = rows_of_forces([(OURS, FORCE)])
     apart = again[again["group"] == FORCE].assign(group=HELD_OUT)
     found, text = said(honesty, pd.concat([rows_of_forces(), apart], ignore_index=True))
+    assert "`max_step`, here 30 ms, which is coarser" in text  # of rows that do not hold it
+    fine = pd.concat([rows_of_forces(), apart.assign(max_step=LOOK * 3.0)], ignore_index=True)
+    assert (
+        "`max_step`, here 1.5 ms. " in said(honesty, fine)[1] or "`max_step`, here 1.5 ms.\n" in said(honesty, fine)[1]
+    )
     assert found["trust"]["default"]["wrong"] == 0 and found["held_out"]["trust"]["default"]["wrong"] == 1
-    assert "| the default | gust | pendulum | 1e-9 |" in text and "with a seed of their own" in text
+    assert (
+        "Silently wrong runs of ours (error): `the default`, gust, pendulum (1e-9)." in text
+        and "with a seed of their own" in text
+    )
 
 
 def test_checks_of_the_input_are_counted_apart():
@@ -280,8 +284,7 @@ def test_checks_of_the_input_are_counted_apart():
 
 def test_a_force_has_a_known_end_and_all_presets_are_asked():
     trap = next(trap for trap in under_forces(quick=False) if trap.name == "tanh friction, width 0.1")
-    assert trap.mechanism == "pendulum"
-    assert row_of(trap)["outcome"] == honesty.RIGHT
+    assert trap.mechanism == "pendulum" and row_of(trap)["outcome"] == honesty.RIGHT
     assert row_of(replace(trap, system=TRAPS["drag"].system))["outcome"] == honesty.SILENT
     asked = {name.removesuffix(" (twoloop)").split(",")[0] for name in solvers(False, FORCE)}
     assert set(PRESETS) - asked == {"PaperIRK", "PaperNewmark"}

@@ -64,14 +64,12 @@ def test_the_report_says_what_the_rows_say(time, said):
 def test_a_run_that_ends_with_a_wrong_state_is_told():
     wrong = pd.concat([in_angles(1.0), in_angles(0.1, error=0.7)], ignore_index=True).assign(tol=1e-9)
     found = minimal.findings_of(wrong, everywhere())
-    assert (found["asked"], found["wrong"]) == (4, 2)
-    assert found["mechanisms"][0]["at"][0]["rival"]["call_s"] == 1.0
+    assert (found["asked"], found["wrong"]) == (4, 2) and found["mechanisms"][0]["at"][0]["rival"]["call_s"] == 1.0
     said = (
-        "Of their 4 runs at tolerances of 1e-3 and tighter 2 end with success and an error above 0.10: "
+        "Of 4 such runs at tolerances of 1e-3 and tighter, 2 report success with an error above 0.10: "
         "1 of `heyoka, minimal coordinates`"
     )
-    assert said in stated(1.0, minimal=found)
-    assert minimal.findings_of(wrong.assign(tol=0.1), everywhere())["wrong"] == 0
+    assert said in stated(1.0, minimal=found) and minimal.findings_of(wrong.assign(tol=0.1), everywhere())["wrong"] == 0
 
 
 def test_no_ranking_of_solvers_with_constraints_sees_them():

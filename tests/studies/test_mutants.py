@@ -44,8 +44,7 @@ def test_a_mutant_is_one_change_of_one_line():
     for mutant in mutants_of("x", SOURCE):
         made = mutant.applied(SOURCE)
         differ = [(a, b) for a, b in zip(SOURCE.splitlines(), made.splitlines(), strict=True) if a != b]
-        assert len(differ) == 1
-        assert ast.dump(ast.parse(made)) != ast.dump(ast.parse(SOURCE))
+        assert len(differ) == 1 and ast.dump(ast.parse(made)) != ast.dump(ast.parse(SOURCE))
 
 
 def test_the_sample_is_the_same_every_time_and_of_all_kernels():

@@ -27,11 +27,9 @@ def test_a_verdict_that_turns_between_two_processors_is_told():
         processors.verdicts(rows(name, *times), STAMP) for name, times in (("A", (1.0, 2.0)), ("B", (2.0, 1.0)))
     )
     (found,) = processors.findings_of(pd.concat([one, other]))
-    assert found["processors"] == ["A", "B"] and found["same_code"]
-    assert found["time"] == "whole call"
+    assert found["processors"] == ["A", "B"] and found["same_code"] and found["time"] == "whole call"
     assert {"case": "A01 pendulum", "error": 1e-6, "who": "auto", "ahead_on": "A"} in found["turned"]
-    assert found["over"] == pytest.approx(0.25, rel=0.01)
-    assert found["apart"] == pytest.approx(4.0, rel=0.01)
+    assert found["over"] == pytest.approx(0.25, rel=0.01) and found["apart"] == pytest.approx(4.0, rel=0.01)
 
 
 def test_the_same_verdict_turns_nowhere():

@@ -36,8 +36,7 @@ def test_numbers_have_two_digits_and_one_exponent_style(value, text):
 
 
 def test_other_styles():
-    assert number(3.4449, 3) == "3.44" and power(1e-9) == "1e-9" and power(0.01) == "1e-2"
-    assert percent(0.123) == "12 %"
+    assert number(3.4449, 3) == "3.44" and power(1e-9) == "1e-9" and power(0.01) == "1e-2" and percent(0.123) == "12 %"
     assert (code("TRBDF2"), code("the default")) == ("`TRBDF2`", "the default")
     assert [listed(words) for words in ([], ["a"], ["a", "b"], ["a", "b", "c"])] == [
         "none",

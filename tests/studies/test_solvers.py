@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 
 from references.paper.four_bar_minimal import trajectory
+from references.scipy.index1 import baumgarte
 from studies import motion, step_size, violation
 from studies.bench.collector import Case
 from studies.bench.headline import OWN_CODE
 from studies.bench.metrics import violations
-from studies.bench.solvers import CATALOGUE, DEFAULT, EXUDYN, GIVEN, IRK, LINE_UP, TOLERANCES, baumgarte, gear
+from studies.bench.solvers import CATALOGUE, DEFAULT, EXUDYN, GIVEN, IRK, LINE_UP, TOLERANCES, gear
 from studies.validation import study as validation
 from twoloop import solve_dae
 from twoloop.mechanisms import four_bar
@@ -76,12 +77,10 @@ def test_the_studies_of_one_line_a_method_run_the_default(study, quick):
 
 
 def test_names_and_flags_agree():
-    assert set(LINE_UP) <= set(CATALOGUE)
-    assert all(solver.name == name for name, solver in CATALOGUE.items())
+    assert set(LINE_UP) <= set(CATALOGUE) and all(solver.name == name for name, solver in CATALOGUE.items())
     assert CATALOGUE["SunRadau5"].family == "two-loop" and CATALOGUE["IDA, index1"].own_accelerations
 
 
 def test_long_runs_of_fixed_steps_are_thinned_and_end_at_the_end():
     result = CATALOGUE[gear(2)].run(Case("four-bar", four_bar(), 0.7), 5e-5, 0)
-    assert result.stats.n_accepted == 14000 and result.t.size == 7001
-    assert result.t[-1] == 0.7
+    assert result.stats.n_accepted == 14000 and result.t.size == 7001 and result.t[-1] == 0.7

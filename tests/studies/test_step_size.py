@@ -43,8 +43,7 @@ def by_solver(made):
 @pytest.mark.usefixtures("unsaved")
 def test_findings_turn_with_the_rows(tmp_path):
     found, n = found_of(step_size, tmp_path, rows()), len(PRESETS) + 3
-    assert found["holds"] and found["longer"]
-    assert found["ratios"] == pytest.approx([200.0, 200.0])
+    assert found["holds"] and found["longer"] and found["ratios"] == pytest.approx([200.0, 200.0])
     assert found["switches"] == 100 and found["switches_per_period"] == pytest.approx(2.2, abs=0.1)
     assert (found["n_known"], found["n_worse_at_switch"]) == (n, n)
 
@@ -54,8 +53,7 @@ def test_findings_turn_with_the_rows(tmp_path):
     made.loc[ours, "retried_switch"] = 0.0
     made.loc[made.index[-1], ["status", "message"]] = ["SOLVER_FAILED", "why"]
     found = found_of(step_size, tmp_path, made)
-    assert not found["holds"] and not found["longer"]
-    assert (found["n_known"], found["n_worse_at_switch"]) == (n, 0)
+    assert not found["holds"] and not found["longer"] and (found["n_known"], found["n_worse_at_switch"]) == (n, 0)
     made.loc[made["solver"] == "Gauss6", "retried_switch"] = 0.9
     assert found_of(step_size, tmp_path, made)["n_worse_at_switch"] == 1
     made["retried_switch"] = np.nan
@@ -67,15 +65,13 @@ def test_of_many_steps_the_extremes_are_drawn():
     h = np.full(t.size, 1e-3)
     h[1234], h[4321] = 1e-5, 1e-1
     drawn = step_size._curve(t, h)
-    assert drawn.shape[1] <= step_size.CURVE
-    assert drawn[1].min() == 1e-5 and drawn[1].max() == 1e-1
+    assert drawn.shape[1] <= step_size.CURVE and drawn[1].min() == 1e-5 and drawn[1].max() == 1e-1
     assert np.array_equal(step_size._curve(t[:9], h[:9]), [t[:9], h[:9]])
 
 
 def test_the_full_study_lists_its_runs_once():
     made = step_size.runs(False)
-    assert len({run.key(0) for run in made}) == len(made)
-    assert "IDA, stabilised" in {run.solver.name for run in made}
+    assert len({run.key(0) for run in made}) == len(made) and "IDA, stabilised" in {run.solver.name for run in made}
 
 
 class TestQuickRun(QuickRun):
@@ -83,8 +79,7 @@ class TestQuickRun(QuickRun):
 
 
 def test_runge_kutta_steps_are_mostly_longer_than_the_papers_002_s(by_solver):
-    assert by_solver.loc[IRK, "share_time"] > 0.99
-    assert 0.03 < by_solver.loc[IRK, "h_median"] < 0.1
+    assert by_solver.loc[IRK, "share_time"] > 0.99 and 0.03 < by_solver.loc[IRK, "h_median"] < 0.1
     assert by_solver.loc[NEWMARK, "share_time"] == 0.0
 
 

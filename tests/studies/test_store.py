@@ -211,3 +211,10 @@ def test_no_committed_report_tells_where_it_was_made():
     paths = [path for path in (ROOT / "reports").iterdir() if path.suffix in (".csv", ".json", ".md")]
     told = [path.stem for path in paths if re.search(r"(?<![\w.])/\w[^ ]*/(studies|twoloop)/", path.read_text())]
     assert set(told) <= {"table3"}
+
+
+def test_a_message_with_a_number_sign_is_no_comment_to_other_readers(tmp_path):
+    made = pd.DataFrame({"message": ["See page.md#time_limit.", None], "outcome": ["said so", "right"], "x": [1, 2]})
+    with Output(Call("energy", False, tmp_path, False, "")) as output:
+        output.save_rows(made, STAMP)
+    assert pd.read_csv(tmp_path / "energy.csv", comment="#").equals(output.load_rows()[0])

@@ -70,8 +70,7 @@ def test_a_ranking_turns_with_the_rows():
     ranked = tables.ranking(made, 1e-3)
     assert ranked["solver"].tolist() == ["a", "b"] and ranked["setting"].tolist() == ["tol 1e-6", "tol 1e-7"]
     made.loc[0, ["call_s", "call_q1", "call_q3"]] = 3.0
-    assert tables.ranking(made, 1e-3)["solver"].tolist() == ["b", "a"]
-    assert tables.ranking(made, 1e-9).empty
+    assert tables.ranking(made, 1e-3)["solver"].tolist() == ["b", "a"] and tables.ranking(made, 1e-9).empty
 
 
 def test_a_cell_that_is_not_reached_says_why():
@@ -174,8 +173,7 @@ def test_a_figure_has_at_most_nine_lines_and_both_formats(tmp_path):
 
 
 def test_the_cheapest_lines_are_the_cheapest():
-    made = rows(*[(f"s{k}", 1e-4, 1.0 + k) for k in range(9)])
-    assert figures.cheapest_lines(made, (1e-3,), 2) == ["s0", "s1"]
+    assert figures.cheapest_lines(rows(*[(f"s{k}", 1e-4, 1.0 + k) for k in range(9)]), (1e-3,), 2) == ["s0", "s1"]
 
 
 def test_repetitions_that_timed_something_else_do_not_count():

@@ -28,41 +28,32 @@ def with_reference(**changed):
 
 def test_a_good_run():
     row = run_of(mechanisms.double_pendulum())
-    assert row["outcome"] == "right"
-    assert min(row["digits_q"], row["digits_v"], row["digits_lam"]) > 8.0
-    assert row["energy"] < 1e-8
-    assert max(row[f"violation_{level}"] for level in "qva") < 1e-9
+    assert row["outcome"] == "right" and min(row["digits_q"], row["digits_v"], row["digits_lam"]) > 8.0
+    assert row["energy"] < 1e-8 and max(row[f"violation_{level}"] for level in "qva") < 1e-9
 
 
 def test_a_reference_that_is_off_makes_a_good_run_inexact_or_wrong():
     known = mechanisms.double_pendulum().reference
     row = run_of(with_reference(q=known.q + 1e-5))
-    assert row["outcome"] == "inexact"
-    assert row["digits_q"] == pytest.approx(5.0, abs=0.3)
+    assert row["outcome"] == "inexact" and row["digits_q"] == pytest.approx(5.0, abs=0.3)
     assert run_of(with_reference(q=known.q + 1e-2))["outcome"] == "wrong"
 
 
 def test_a_velocity_or_multiplier_that_is_not_known_is_not_counted():
     known = mechanisms.double_pendulum().reference
     row = run_of(with_reference(lam=None, v=np.full(4, np.nan)))
-    assert row["digits_lam"] is None
-    assert row["digits_v"] is None
-    assert row["digits_q"] > 8.0
-    assert known.lam is not None
+    assert row["digits_lam"] is None and row["digits_v"] is None and row["digits_q"] > 8.0 and known.lam is not None
 
 
 def test_no_more_digits_than_the_reference_holds():
-    digits = dict.fromkeys(("q", "v", "lam"), 4.0)
-    assert run_of(with_reference(digits=digits))["digits_q"] == 4.0
+    assert run_of(with_reference(digits=dict.fromkeys(("q", "v", "lam"), 4.0)))["digits_q"] == 4.0
 
 
 def test_the_condition_of_the_authors_is_judged_over_its_own_time():
     problem = mechanisms.n_four_bar(1)
     sound = replace(problem, condition=replace(problem.condition, t_end=0.5, n_outputs=20))
     row = run_of(sound, group=end_states.JUDGED)
-    assert row["t_end"] == 0.5
-    assert row["condition"] < 1e-5
-    assert row["outcome"] == "right"
+    assert row["t_end"] == 0.5 and row["condition"] < 1e-5 and row["outcome"] == "right"
     strict = replace(sound, condition=replace(sound.condition, high=0.0))
     assert run_of(strict, group=end_states.JUDGED)["outcome"] == "wrong"
 
@@ -70,8 +61,7 @@ def test_the_condition_of_the_authors_is_judged_over_its_own_time():
 def test_what_an_adapter_does_not_take_is_not_counted_against_its_solver():
     pytest.importorskip("solve_dae")
     row = run_of(mechanisms.knife_edge(), "Radau, solve_dae")
-    assert row["outcome"] == "not run"
-    assert "n_a = 1" in row["message"]
+    assert row["outcome"] == "not run" and "n_a = 1" in row["message"]
 
 
 def made_up(**changed):
@@ -145,8 +135,7 @@ def test_cells_that_are_no_failures_are_hatched():
 
 
 def deceived_row(problem, solver, tolerance):
-    case = end_states.case_of(problem)
-    return deceived.row_of(Run(case, CATALOGUE[solver], tolerance, deceived.DECEIVED, repeats=1))
+    return deceived.row_of(Run(end_states.case_of(problem), CATALOGUE[solver], tolerance, deceived.DECEIVED, repeats=1))
 
 
 def test_steps_that_keep_their_tolerance_and_steps_that_do_not():

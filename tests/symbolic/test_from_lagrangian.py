@@ -23,8 +23,7 @@ def states(problem, count=5):
     """Random positions and velocities about the start, off the constraints."""
     generic = np.random.default_rng(3)
     for _ in range(count):
-        t = generic.uniform(0.0, 2.0)
-        yield t, *(generic.normal(at, 1.0) for at in (problem.q0, problem.v0))
+        yield generic.uniform(0.0, 2.0), *(generic.normal(at, 1.0) for at in (problem.q0, problem.v0))
 
 
 def test_every_callback_is_that_of_the_hand_written_mechanism(pair):
@@ -94,8 +93,7 @@ def test_counts_are_those_of_the_hand_written_mechanism():
         start = mechanism.problem(problem.q0, problem.v0, (0.0, 2.0))
         hand = solve_dae(problem.system, (0.0, 2.0), problem.q0, problem.v0)
         made = solve_dae(start.system, start.t_span, start.q0, start.v0)
-        assert made.stats.n_evaluations == hand.stats.n_evaluations
-        assert made.stats.n_accepted == hand.stats.n_accepted
+        assert made.stats.n_evaluations == hand.stats.n_evaluations and made.stats.n_accepted == hand.stats.n_accepted
         assert np.abs(made.q[:, -1] - hand.q[:, -1]).max() < 1e-9  # the tolerance is 1e-8
 
 

@@ -72,8 +72,7 @@ def test_without_a_folder_all_works_and_it_is_said(tmp_path, monkeypatch, capsys
     monkeypatch.setattr(generated, "sources_folder", lambda: tmp_path / "file" / "equations")
     generated._functions.cache_clear()
     generated.say_once.cache_clear()
-    assert callable(pendulum().code.value("energy"))
-    assert "NUMBA_CACHE_DIR" in capsys.readouterr().err
+    assert callable(pendulum().code.value("energy")) and "NUMBA_CACHE_DIR" in capsys.readouterr().err
 
 
 def test_parameters_change_without_compiling_again(folder):
@@ -110,8 +109,7 @@ except ImportError as error:
 
 
 def test_a_problem_goes_to_another_process_by_its_equations(folder):
-    problem = pendulum().problem([0.3, -0.4], [0.0, 0.0], (0.0, 1.0))
-    (folder / "problem.pickle").write_bytes(pickle.dumps(problem))
+    (folder / "problem.pickle").write_bytes(pickle.dumps(pendulum().problem([0.3, -0.4], [0.0, 0.0], (0.0, 1.0))))
     numbers, energy, compiled, refusal = run_python(UNPICKLED, folder=folder).stdout.splitlines()
     assert [float(each) for each in numbers.split()] == [2.0, -25.0]
     assert float(energy) == pytest.approx(2.0 * 9.81 * -0.4)
@@ -122,5 +120,4 @@ def test_a_problem_goes_to_another_process_by_its_equations(folder):
 def test_a_pickled_system_is_the_same_here():
     system = pendulum().system
     again = pickle.loads(pickle.dumps(system))
-    assert again.given == system.given
-    assert again.parameters.tolist() == system.parameters.tolist()
+    assert again.given == system.given and again.parameters.tolist() == system.parameters.tolist()

@@ -47,13 +47,11 @@ def two_rods(pivot=0):
 def test_lagranges_method_gives_what_the_energies_give(pivot):
     T, V, constraints, q = two_rods(pivot)
     known = from_lagrangian(T, V, constraints, q, parameters=VALUES)
-    method = me.LagrangesMethod(T - V, q, hol_coneqs=constraints)
-    same(from_method(method, parameters=VALUES), known)
+    same(from_method(me.LagrangesMethod(T - V, q, hol_coneqs=constraints), parameters=VALUES), known)
     free = me.LagrangesMethod(T - V, q)
     free.form_lagranges_equations()
     same(from_method(free, constraints=constraints, parameters=VALUES), known)
-    forcing = sp.ImmutableMatrix(free.forcing)
-    same(from_matrices(free.mass_matrix, forcing, constraints, q, parameters=VALUES), known)
+    same(from_matrices(free.mass_matrix, sp.ImmutableMatrix(free.forcing), constraints, q, parameters=VALUES), known)
 
 
 def particles(u_of_rate=None):
@@ -87,8 +85,7 @@ def test_kanes_method_with_linear_kinematics(of_rate):
     known = from_lagrangian(T, V, [], coordinates, parameters=VALUES)
     assert made.energy(0.0, q, v) == pytest.approx(known.energy(0.0, q, v), rel=1e-13)
     assert not made.conserved  # the rail moves
-    free = from_method(kane, potential=V, parameters=VALUES)
-    assert free.conserved
+    assert from_method(kane, potential=V, parameters=VALUES).conserved
     assert not from_method(kane, parameters=VALUES).conserved  # without the potential
 
 
@@ -133,5 +130,4 @@ def test_euler_parameters_with_angular_velocities_as_speeds():
     assert tangent @ evaluated(made, "force", 0.0, q, v) == pytest.approx(
         tangent @ evaluated(known, "force", 0.0, q, v), rel=1e-12, abs=1e-12
     )
-    assert made.energy(0.0, q, v) == pytest.approx(known.energy(0.0, q, v), rel=1e-13)
-    assert made.conserved
+    assert made.energy(0.0, q, v) == pytest.approx(known.energy(0.0, q, v), rel=1e-13) and made.conserved

@@ -49,6 +49,4 @@ def test_derivatives_are_those_of_sympy(expression):
 def test_what_entries_share_is_evaluated_once():
     root = sp.sqrt(a**2 + b**2)
     source = callback_source("force", [{0: sp.sin(root) / root, 1: sp.cos(root), 2: sp.cos(root)}])
-    assert source.count("sqrt") == 1
-    assert source.count("cos") == 1
-    assert source.count("q[0]") == 1
+    assert source.count("sqrt") == 1 and source.count("cos") == 1 and source.count("q[0]") == 1

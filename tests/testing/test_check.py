@@ -33,8 +33,6 @@ def properties_that_fail(report):
 
 
 # --- what is right passes
-
-
 @pytest.mark.parametrize(
     "fault",
     [pytest.param(fault, id=fault.name, marks=[] if fault in QUICK else [pytest.mark.slow]) for fault in FAULTS],
@@ -100,13 +98,10 @@ def test_a_tolerance_that_is_not_passed_on():
 
 def test_index_1_without_projection_leaves_the_constraints():
     report = check_simulator(by_scipy, "pendulum")
-    assert properties_that_fail(report) == {"constraints"}
-    assert "Project" in report.failures[0].hint
+    assert properties_that_fail(report) == {"constraints"} and "Project" in report.failures[0].hint
 
 
 # --- what is returned wrongly, of the known motion itself
-
-
 def singular_branch(problem, q, v, lam):
     """After the first singular position the second crank goes back where the first one goes on."""
     beyond = problem.reference.t > problem.singular_times[0]
@@ -141,8 +136,6 @@ def test_the_known_motion_itself_passes(name):
 
 
 # --- frames and units are the same problem
-
-
 @pytest.mark.parametrize("change", [in_a_frame, in_millimetres_and_grams])
 @pytest.mark.parametrize("name", MAKERS)
 def test_a_problem_seen_otherwise_has_the_same_accelerations(name, change):
@@ -176,8 +169,6 @@ def test_a_frame_turns_distances_into_themselves():
 
 
 # --- failures that are told
-
-
 def test_silence_is_found_and_a_word_is_not():
     def silent(problem, times, tolerance):
         return np.tile(problem.q0, (times.size, 1))
@@ -223,8 +214,6 @@ def test_a_coarse_step_may_say_no_and_the_finest_may_not():
 
 
 # --- the report
-
-
 def test_the_report():
     report = check_simulator(known(lambda problem, q, v, lam: (q + 0.1, None, None)), ["pendulum", "driven_crank"])
     failure = report.failures[0]
@@ -246,8 +235,6 @@ def test_errors_are_over_the_largest_coordinate():
 
 
 # --- wrong answers; wrong arguments are in tests/bad_input/simulators.py
-
-
 def test_answers_that_differ_from_run_to_run():
     def simulate(problem, times, tolerance):
         q = np.tile(problem.q0, (times.size, 1))

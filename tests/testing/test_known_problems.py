@@ -79,8 +79,7 @@ def test_rows_are_derivatives_of_the_constraints(name):
     system, most = system_of(problem), 1.0 if "andrews" not in name else 1e3
     for _ in range(2):
         q = problem.q0 + 0.1 * random.normal(size=problem.n_q)
-        v = random.normal(size=problem.n_q)
-        assert max(row_errors(system, 0.3, q, v)) < 1e-8 * most
+        assert max(row_errors(system, 0.3, q, random.normal(size=problem.n_q))) < 1e-8 * most
     assert problem.row_powers.shape == (system.n_c,) and len(problem.coordinates) == problem.n_q
     state = problem.t_span[0], problem.q0
     near(problem.constraint(*state), np.zeros(problem.n_c))
@@ -95,8 +94,7 @@ def test_the_motion_obeys_the_equations(name):
     motion = problem.reference
     near(motion.q[0], problem.q0)
     near(motion.v[0], problem.v0)
-    assert (motion.t[0], motion.t[-1]) == problem.t_span
-    assert not motion.q.flags.writeable
+    assert (motion.t[0], motion.t[-1]) == problem.t_span and not motion.q.flags.writeable
     for t, q, v, lam in zip(motion.t, motion.q, motion.v, motion.lam, strict=True):
         near(problem.constraint(t, q), np.zeros(problem.n_c), 11.0)
         J = problem.jacobian(t, q)
@@ -106,8 +104,7 @@ def test_the_motion_obeys_the_equations(name):
     for quantity in kept.values():
         values = [quantity(*state) for state in zip(motion.t, motion.q, motion.v, strict=True)]
         assert np.ptp(values) < 1e-9 * max(1.0, np.abs(values).max())
-    assert min(motion.digits["q"].min(), motion.digits["v"].min()) > 9.0
-    assert (motion.growth >= 1.0).all()
+    assert min(motion.digits["q"].min(), motion.digits["v"].min()) > 9.0 and (motion.growth >= 1.0).all()
 
 
 def test_tags():

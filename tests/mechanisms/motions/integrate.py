@@ -39,8 +39,7 @@ def _step(rate, t, y, H):
             last, now = now, last + 2 * h * np.array(rate(t + i * h, now))
         row = [(last + now + h * np.array(rate(t + H, now))) / 2]
         for j in range(k):
-            ratio = np.longdouble(parts) / DIVISIONS[k - 1 - j]
-            row.append(row[j] + (row[j] - table[-1][j]) / (ratio**2 - 1))
+            row.append(row[j] + (row[j] - table[-1][j]) / ((np.longdouble(parts) / DIVISIONS[k - 1 - j]) ** 2 - 1))
         table.append(row)
     return table[-1][-1]
 

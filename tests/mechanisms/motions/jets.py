@@ -84,8 +84,7 @@ def dot(a, b):
 def acceleration(kinetic, potential, speed, damping=0):
     """s'' from pairs (weight, jet) whose squared rates make twice the kinetic energy, and the potential as a jet."""
     inertia = sum(m * jet.u**2 for m, jet in kinetic)
-    bend = sum(m * jet.u * jet.w for m, jet in kinetic)
-    return -(potential.u + damping * speed + bend * speed**2) / inertia
+    return -(potential.u + damping * speed + sum(m * jet.u * jet.w for m, jet in kinetic) * speed**2) / inertia
 
 
 def state(coordinates, speed):

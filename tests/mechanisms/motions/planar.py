@@ -119,8 +119,7 @@ def slider_crank():
     def rate(t, y):
         q = places(Jet(y[0], 1))
         kinetic = [(w, q[3 * k + i]) for k in range(3) for i, w in enumerate((MASSES[k], MASSES[k], inertias[k]))]
-        fall = G * (MASSES[0] * q[1] + MASSES[1] * q[4])
-        return [y[1], acceleration(kinetic, fall, y[1])]
+        return [y[1], acceleration(kinetic, G * (MASSES[0] * q[1] + MASSES[1] * q[4]), y[1])]
 
     return rate, (np.longdouble("0.5"), 8), lambda t, y: state(places(Jet(y[0], 1)), y[1])
 
@@ -130,8 +129,7 @@ def driven_crank():
     r, half, arm = np.longdouble("0.3"), np.longdouble("0.5"), np.longdouble("0.2")
 
     def pin(t):
-        a = np.longdouble("2.5") * t + arm * np.sin(t)
-        return Jet(a, np.longdouble("2.5") + arm * np.cos(t), -arm * np.sin(t))
+        return Jet(np.longdouble("2.5") * t + arm * np.sin(t), np.longdouble("2.5") + arm * np.cos(t), -arm * np.sin(t))
 
     def rate(t, y):
         a = pin(t)

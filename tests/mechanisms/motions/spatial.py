@@ -10,9 +10,8 @@ from tests.mechanisms.motions.planar import PI, G
 
 f = np.longdouble
 
+
 # --- Euler parameters
-
-
 def turned(e, w):
     """e' at the angular velocity w along the axes of space: half the product of quaternions w e."""
     return [
@@ -25,8 +24,7 @@ def turned(e, w):
 
 def product(a, b):
     """The product of two quaternions."""
-    v = a[0] * b[1:] + b[0] * a[1:] + np.cross(a[1:], b[1:])
-    return np.concatenate([[a[0] * b[0] - a[1:] @ b[1:]], v])
+    return np.concatenate([[a[0] * b[0] - a[1:] @ b[1:]], (a[0] * b[1:] + b[0] * a[1:] + np.cross(a[1:], b[1:]))])
 
 
 def carried(e, a):
@@ -50,8 +48,6 @@ def rates(vector, speed):
 
 
 # --- heavy top, by Euler's equations about the fixed point
-
-
 def heavy_top():
     m, across, axial = f(15), f("0.234375") + 15, f("0.46875")
 
@@ -71,8 +67,6 @@ def heavy_top():
 
 
 # --- rolling disc, by the balance of momentum about the contact point in a frame that does not spin
-
-
 def rolling_disc():
     m, r = f(2), f("0.4")
     across, axial = m * r**2 / 4, m * r**2 / 2
@@ -109,8 +103,6 @@ def rolling_disc():
 
 
 # --- knife edge, by the speed along the blade
-
-
 def knife_edge():
     slope, spin = f("0.4"), f("1.7")
 
@@ -176,8 +168,6 @@ def bricard():
 
 
 # --- spatial slider-crank, by the crank angle; the Euler parameters of the rod follow its spin
-
-
 def spatial_slider_crank():
     crank, rod = f("0.08"), f("0.3")
     moments = (f("3.8e-3"), f("2e-4"), f("2e-4"))  # of mass along the rod's axes: (J2 + J3 - J1) / 2 and so on
@@ -190,8 +180,7 @@ def spatial_slider_crank():
         frame = [[x / rod, -B[1] / rod, -B[2] / rod], [zero, -B[2] / across, B[1] / across]]
         frame.append(cross(*frame))
         middle = [x * f(0.5), B[1] * f(0.5), B[2] * f(0.5)]
-        centre = [zero, B[1] + crank / 2 * sin(s), B[2] - crank / 2 * cos(s)]
-        return centre, middle, x, frame
+        return [zero, B[1] + crank / 2 * sin(s), B[2] - crank / 2 * cos(s)], middle, x, frame
 
     def rate(t, y):
         s = Jet(y[0], 1)
@@ -214,13 +203,10 @@ def spatial_slider_crank():
             np.concatenate([first[1], bar_v, turned(y[2:], spin), last[1]]),
         )
 
-    start = parameters([values(d) for d in places(Jet(f(0), 1))[3]])
-    return rate, (0, 6, *start), known
+    return rate, (0, 6, *parameters([values(d) for d in places(Jet(f(0), 1))[3]])), known
 
 
 # --- spatial four-bar, by the crank angle; the coupler does not turn about its own axis, in which it moves
-
-
 def spatial_four_bar():
     crank, rocker, D = f("0.3"), f("0.7"), [f("0.9"), f(0), f("0.3")]
     length = np.sqrt(f("1.36"))
@@ -237,8 +223,7 @@ def spatial_four_bar():
         # phi = angle of (x, z) + arccos(opposite)
         sine = sqrt(Jet(1) - opposite * opposite)
         c, d = (x * opposite - z * sine) / reach, (z * opposite + x * sine) / reach
-        S = [D[0] + rocker * c, Jet(0), D[2] + rocker * d]
-        return P, S, c, d
+        return P, [D[0] + rocker * c, Jet(0), D[2] + rocker * d], c, d
 
     def bar(P, S):
         return [(b - a) / length for a, b in zip(P, S, strict=True)]
@@ -281,8 +266,6 @@ def spatial_four_bar():
 
 
 # --- governor, by the angle of the rods and the height of the slider; the whole turns as its momentum says
-
-
 def governor():
     g, rod, ball, cube = G, f("0.3"), f(5), f(3)
     m = rod + ball
