@@ -55,7 +55,7 @@ def test_iterations_far_away_are_as_many():
     """Changes of positions count over their size, which is a million metres."""
     problem, counts = knife_edge(), []
     for x in (0.0, 1e6):
-        q0 = problem.q0 + [x, x, 0.0]
+        q0 = problem.q0 + np.array([x, x, 0.0])
         counts.append(solve_dae(problem.system, (0.0, 1.0), q0, problem.v0, "Newmark", step_size=1e-3).stats.n_outer)
     assert counts[1] < 1.1 * counts[0]
 

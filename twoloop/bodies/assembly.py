@@ -27,6 +27,7 @@ TURN = 1e-4  # of the units of coordinates: a way over which it is seen how fast
 SMALL = 0.05  # rad or m, of a step to where a drive begins ...
 CORRECTIONS = 5  # ... and of Newton's in each
 STAYS = 1e-7  # of the size of the model: what a joint that cannot close leaves open at least
+ALIKE = 1e-3  # of a misfit by which two that are equal differ by rounding
 
 
 @dataclass(frozen=True)
@@ -127,7 +128,8 @@ def driven_there(system: ConstrainedSystem, t: float, start: Array, keep: Sequen
 def _open(system: ConstrainedSystem, left: Array, rows: Mapping[str, tuple[int, ...]]) -> str:
     """Which joints stay open, by what is left of their rows."""
     misfit = {name: max((float(left[k]) for k in of if k < len(left)), default=0.0) for name, of in rows.items()}
-    worst = max(misfit, key=lambda name: misfit[name])
+    # of misfits that are equal but for rounding the first is named, on every machine
+    worst = next(name for name in misfit if misfit[name] >= (1.0 - ALIKE) * max(misfit.values()))
     others = [name for name in misfit if name != worst and misfit[name] > 0.1 * misfit[worst]]
     also = f" (nor do {', '.join(map(repr, others))})" if others else ""
     return (

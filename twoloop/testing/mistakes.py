@@ -14,6 +14,7 @@ LATER = 10  # output times after which it is looked at
 SURE = 3.0  # times the change by a finer difference quotient, from which on a difference of accelerations is one
 EXPLAINS = 0.15  # of the difference from the true acceleration, which may remain
 FITS = 0.05  # of it where a number is fitted
+ALIKE = 1e-4  # of it by which two fits may differ by rounding and differences
 Mistake = Callable[[KnownProblem, float, Array, Array], Array]
 
 
@@ -140,15 +141,17 @@ def _scaled(places: list[Seen]) -> str:
             pairs.setdefault(f"the mass or inertia of q[{k}] ({kind}) is", []).append(
                 (off, -each.free[:, k] * inertia[k])
             )
-    best, least = "", FITS
+    fits: dict[str, float] = {}
     for name, both in pairs.items() if sure else ():
         off, part = (np.concatenate(each) for each in zip(*both, strict=True))
         if part.any():
             more = float(off @ part / (part @ part))
             rest = float(np.linalg.norm(off - more * part) / np.linalg.norm(off))
-            if rest < least:
-                best, least = f"{name} {_times(1.0 + more)}", rest
-    return best
+            if rest < FITS:
+                fits[f"{name} {_times(1.0 + more)}"] = rest
+    # of a free coordinate the force and the mass are alike: what fits about as well is named too, the force first
+    least = min(fits.values(), default=0.0)
+    return ", or ".join(name for name, rest in fits.items() if rest <= least + ALIKE)
 
 
 def _times(factor: float) -> str:
