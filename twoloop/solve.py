@@ -34,7 +34,7 @@ from twoloop.result.result import Result, result_of
 from twoloop.run.course import Course
 from twoloop.run.interrupts import Interrupts, not_begun
 from twoloop.run.kept import InMemory, OnDisk
-from twoloop.run.launch import Asked, run_from
+from twoloop.run.launch import Asked, record_again, run_from
 from twoloop.run.recorder import Wanted
 
 Array = NDArray[np.float64]
@@ -185,6 +185,15 @@ def solve_dae(
             compiled=compiled,
             check_derivatives=check_derivatives,
         )
+        told = {"method": chosen.name, "rtol": rtol, "atol": atol.copy()}
+        by_positions, own = getattr(chosen, "tested", "all") == "positions", getattr(chosen, "error_tol", None)
+        if times is folder is event_functions is time_limit is own is None and not (dense_output or progress):
+            made = record_again(system, t0, q0, v0, asked)
+            if made is not None and not interrupts.asked:
+                fields, said_of_rows = made
+                if said_of_rows:
+                    warnings.warn(said_of_rows, ConstraintWarning, stacklevel=2)
+                return result_of(fields, **told, **({} if by_positions else {"untested": None}))
         run = run_from(system, t0, q0, v0, asked)
         if run.said_of_rows:
             warnings.warn(run.said_of_rows, ConstraintWarning, stacklevel=2)
@@ -195,16 +204,14 @@ def solve_dae(
             wanted = Wanted(times, lands, bool(dense_output), event_functions, kept)
             record = Course(run, t1, wanted, report, time_limit, interrupts).to_end(check_derivatives)
         give_back(run.work)
-        untested = record.untested if getattr(chosen, "tested", "all") == "positions" else None
-        atol, own = atol.copy(), getattr(chosen, "error_tol", None)
+        told |= {"compiled": with_code, "untested": record.untested if by_positions else None}
         if own is not None:  # Newmark's own test, of positions, has its place
-            rtol, atol[:], untested = own, own, np.ones(len(record.h), dtype=bool)
-        told = {"method": chosen.name, "compiled": with_code, "rtol": float(rtol), "atol": atol}
-        result = result_of(record, system=system, untested=untested, **told)
+            told |= {"rtol": own, "atol": np.full(system.n_q, own), "untested": np.ones(len(record.h), dtype=bool)}
+        result = result_of(vars(record), system=system, **told)
         if isinstance(kept, OnDisk):
             end_folder(kept, result)
         return result
-    return result_of(not_begun(system, t0, event_functions, chosen.name))
+    return result_of(vars(not_begun(system, t0, event_functions, chosen.name)))
 
 
 def _checked(

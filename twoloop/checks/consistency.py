@@ -87,31 +87,71 @@ def check_start(
         Violation.of_velocity(system, t0, q0, v0, full, scales).refuse("v0")
 
 
+class Look:
+    """Arrays for the look of compiled callbacks at one start after another, and what the last one found.
+
+    Attributes
+    ----------
+    mass, rows, pattern : ndarray
+        M, C_q with A, and 1 where rows have entries there or nearby.
+    definite : bool or None
+        Whether an M that varies has an inverse; None: that is in doubt, or M is constant.
+    """
+
+    def __init__(self, system: ConstrainedSystem):
+        from twoloop.kernels.evaluation.first_look import room_size
+
+        n, n_rows, size = system.n_q, system.n_c + system.n_a, room_size(system.n_q, system.n_c, system.n_a)
+        self.system, self._numbers = system, np.zeros(size + n * n + 2 * n_rows * n)
+        self._room, mass, rows, pattern = np.split(self._numbers, np.cumsum([size, n * n, n_rows * n]))
+        self.mass, self.rows, self.pattern = mass.reshape(n, n), rows.reshape(n_rows, n), pattern.reshape(n_rows, n)
+        self._always = _ones(system.n_c), self._room, self.mass, self.rows, _ways(n), self.pattern, LEAST
+        self._sizes = _zeros(n)
+        self.definite: bool | None = None
+
+    def at(self, t: float, q: Array, v: Array) -> int:
+        """Flags of what `first_look` finds at a start."""
+        from twoloop.kernels.evaluation.first_look import DEFINITE, INDEFINITE, look
+
+        self._numbers.fill(0.0)
+        sizes = self.system.made.get("sizes", self._sizes)
+        try:
+            found: int = direct(look)(self.system.kit, t, q, v, sizes, *self._always)
+        except Exception:  # of a callback, which is called by itself then
+            return 0
+        self.definite = bool(found & DEFINITE) if found & (DEFINITE | INDEFINITE) else None
+        return found
+
+    def is_consistent(self, t: float, q: Array, v: Array) -> bool:
+        """Whether a start is consistent beyond doubt, and nothing there would have to be looked at more closely."""
+        from twoloop.kernels.evaluation.first_look import CONSISTENT, IN_ORDER
+
+        found = self.at(t, q, v)
+        return bool(found & IN_ORDER) and (bool(found & CONSISTENT) or self._surely(t, q, v))
+
+    def _surely(self, t: float, q: Array, v: Array) -> bool:
+        """Whether `Violation` would accept the state of the last look beyond doubt."""
+        n, n_c, n_rows = self.system.n_q, self.system.n_c, len(self.rows)
+        force, C, rates = np.split(self._room[: n + n_c + n_rows], (n, n + n_c))
+        return _surely_consistent(self.system, t, q, v, self.mass, force, self.rows, C, rates)
+
+
 def _in_order(system: ConstrainedSystem, t: float, q: Array, v: Array) -> bool:
     """Whether compiled callbacks give nothing at a start that would have to be looked at more closely."""
-    from twoloop.kernels.evaluation.first_look import CONSISTENT, DEFINITE, IN_ORDER, INDEFINITE, look, room_size
+    from twoloop.kernels.evaluation.first_look import CONSISTENT, IN_ORDER
 
     if system.called_in_python or system.entries:
         return False
-    q, v = np.ascontiguousarray(q, dtype=np.float64), np.ascontiguousarray(v, dtype=np.float64)
-    n, n_c, n_rows = system.n_q, system.n_c, system.n_c + system.n_a
-    room, mass, (rows, pattern) = np.zeros(room_size(n, n_c, system.n_a)), np.zeros((n, n)), np.zeros((2, n_rows, n))
-    try:
-        sizes = system.made.get("sizes", _zeros(n))
-        found = direct(look)(system.kit, t, q, v, sizes, _ones(n_c), room, mass, rows, _ways(n), pattern, LEAST)
-    except Exception:  # of a callback, which is called by itself then
-        return False
+    look = Look(system)
+    found = look.at(t, np.ascontiguousarray(q, dtype=np.float64), np.ascontiguousarray(v, dtype=np.float64))
     if not found & IN_ORDER:
         return False
     place = (t, q.tobytes())
-    system.remember_at("pattern", place, pattern)
-    system.remember_at("mass and rows", place, (mass, rows))
-    if found & (DEFINITE | INDEFINITE):
-        system.remember_at("definite mass", _place(system, t, q), bool(found & DEFINITE))
-    if found & CONSISTENT:
-        return True
-    force, C, rates = np.split(room[: n + n_c + n_rows], (n, n + n_c))
-    return _surely_consistent(system, t, q, v, mass, force, rows, C, rates)
+    system.remember_at("pattern", place, look.pattern)
+    system.remember_at("mass and rows", place, (look.mass, look.rows))
+    if look.definite is not None:
+        system.remember_at("definite mass", _place(system, t, q), look.definite)
+    return bool(found & CONSISTENT) or look._surely(t, q, v)
 
 
 def _surely_consistent(

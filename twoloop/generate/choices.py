@@ -50,9 +50,13 @@ class Choice:
         Untraceable
             If M is singular on velocities that the constraints allow.
         """
+        return cls.of(system, *mass_and_rows(system, t, q))
+
+    @classmethod
+    def of(cls, system: ConstrainedSystem, mass: Array, G: Array) -> "Choice":
+        """The same where M and G are known; raises as `at`."""
         from twoloop.kernels.algebra.pivots import STAYS_SINGULAR, choose, room_size
 
-        mass, G = mass_and_rows(system, t, q)
         n_rows = len(G)
         room, chosen = np.empty(room_size(*G.shape)), np.empty(2 + 3 * n_rows, dtype=np.int64)
         constant = system.constant_mass and system.made.get("no weak mass", False)

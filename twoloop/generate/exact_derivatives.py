@@ -86,8 +86,22 @@ class Territory:
 
     def is_due(self) -> bool:
         """Whether callbacks are to be compared wherever the next run goes: the 1st, 2nd, 4th, 8th, ..."""
+        return (self._runs + 1) & self._runs == 0
+
+    def count(self) -> None:
+        """One more run was made."""
         self._runs += 1
-        return self._runs & (self._runs - 1) == 0
+
+    def holds(self, t: Array, states: Array) -> bool:
+        """Whether all states [q, v] of a run, rows at increasing times, lie where others were compared."""
+        if not self._box.size:
+            return False
+        least, largest = self._known
+        return (
+            bool(least[0] <= t[0] and t[-1] <= largest[0])
+            and bool((np.minimum.reduce(states) >= least[1:]).all())
+            and bool((np.maximum.reduce(states) <= largest[1:]).all())
+        )
 
     def without_known(self, states: Array) -> Array:
         """Those of the states, rows, of a run that lie in no place, or next to none, where one was compared."""

@@ -80,7 +80,7 @@ def make_work(
 def empty(sizes: Sizes) -> Work:
     """A workspace of such sizes as another has, full of zeros."""
     given_back = _given_back(sizes)
-    return _new(sizes) if given_back is None else _cleared(given_back)
+    return _new(sizes) if given_back is None else cleared(given_back)
 
 
 def copy_of(work: Work) -> Work:
@@ -127,7 +127,8 @@ def give_back(work: Work) -> None:
 _free: dict[Sizes, list[Work]] = {}  # those that were given back
 
 
-def _cleared(work: Work) -> Work:
+def cleared(work: Work) -> Work:
+    """A workspace as it is when it is new."""
     layout = _layout(*work.sizes)
     work.notes.base[: layout.n_lasting] = 0.0
     work.counters.base[: layout.n_lasting_integers] = 0

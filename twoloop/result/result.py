@@ -3,6 +3,7 @@
 from __future__ import annotations  # so that help shows the names of types as they are written
 
 import os
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -241,8 +242,8 @@ class Result(Record):
         save(self, path)
 
 
-def result_of(record: Record, **more: Any) -> Result:
-    """The result that a record is, with other values of some fields."""
+def result_of(record: Mapping[str, Any], **more: Any) -> Result:
+    """The result with the fields of a record, and other values of some of them."""
     made = object.__new__(Result)  # a frozen class of thirty fields takes microseconds to make
-    vars(made).update(vars(record), **more)
+    vars(made).update(record, **more)
     return made

@@ -28,12 +28,34 @@ def compared(
 
     Compiled ones are not compared again where they were: see Territory.
     """
-    what = (check_derivatives, *map(id, run.traced))  # the system keeps these
-    territory = run.system.remembered(("territory", what), Territory)
+    territory = territory_of(run, check_derivatives)
     everywhere = territory.is_due() or run.system.called_in_python
+    territory.count()
     if not everywhere and end <= run.compared_to[0]:
         return status, message
-    states = sample.states()
+    before = status
+    status, message = compared_at(run, territory, sample.states(), check_derivatives, status, message, everywhere)
+    if status == before:
+        run.compared_to[0] = end
+    return status, message
+
+
+def territory_of(run: "Run", check_derivatives: bool) -> Territory:
+    """Where runs of its system and kind were that callbacks were compared in."""
+    what = (check_derivatives, *map(id, run.traced))  # the system keeps these
+    return run.system.remembered(("territory", what), Territory)  # type: ignore[no-any-return]
+
+
+def compared_at(
+    run: "Run",
+    territory: Territory,
+    states: Array,
+    check_derivatives: bool,
+    status: Status,
+    message: str,
+    everywhere: bool = False,
+) -> tuple[Status, str]:
+    """The same at states [t, q, v] of the run, the last first: those where none was compared, or everywhere."""
     first = states[-1]
     if not everywhere:
         states = territory.without_known(states)
@@ -48,7 +70,6 @@ def compared(
                 status, message = Status.WRONG_TRACE, f"In the run {unlike}. {message}"
     if status == before:
         territory.add(states)
-        run.compared_to[0] = end
     return status, message
 
 

@@ -1,6 +1,6 @@
 """The run of a call, made ready to go: checked, with its plan; kept for equal calls that follow."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +16,7 @@ from twoloop.methods.plan import Method
 from twoloop.methods.plans_for import plans_for
 from twoloop.methods.presets import is_preset
 from twoloop.problem.system import ConstrainedSystem
+from twoloop.run.again import MOST_WAITING, Again
 from twoloop.run.comparison import unlike_before
 from twoloop.run.run import Run
 from twoloop.run.workspace import sparse_factors_pay
@@ -34,6 +35,7 @@ class Kept(NamedTuple):
     code: OwnCode | None
     definite: bool  # whether M was
     moves: bool  # whether what it takes depends on the start by that alone
+    waiting: list[Again]  # arrays for further runs, one a thread
 
 
 class Asked(NamedTuple):
@@ -50,6 +52,32 @@ class Asked(NamedTuple):
     compiled: Compiled
     check_derivatives: bool
 
+    @property
+    def key(self) -> Any:
+        """What calls have in common that ask for the same, but for the end."""
+        return id(self.method), self.atol.tobytes(), self[3:]
+
+
+def record_again(
+    system: ConstrainedSystem, t0: float, q0: Array, v0: Array, asked: Asked
+) -> tuple[dict[str, Any], str] | None:
+    """The record of a run that keeps its steps alone, by the arrays of one before it, and what is said of its rows.
+
+    None where there are none, or where something has to be looked at: then `run_from` begins it.
+    """
+    runs = system.made.get("runs", (None, None))[1]
+    kept: Kept | None = None if runs is None else runs.get(asked.key)
+    if kept is None or not kept.moves or not Again.suits(kept.run):
+        return None
+    try:
+        again = kept.waiting.pop()
+    except IndexError:
+        again = Again(kept.run.again(), kept.code, kept.definite)
+    record = again.record(t0, asked.t1, q0, v0, lambda run: _set_sizes(run, asked), asked.check_derivatives)
+    if len(kept.waiting) < MOST_WAITING:
+        kept.waiting.append(again)
+    return None if record is None else (record, again.run.said_of_rows)
+
 
 def run_from(system: ConstrainedSystem, t0: float, q0: Array, v0: Array, asked: Asked) -> Run:
     """The run of a call: a copy of one that is kept, where the same was asked for, from there or from another start.
@@ -63,7 +91,7 @@ def run_from(system: ConstrainedSystem, t0: float, q0: Array, v0: Array, asked: 
     """
     if system.called_in_python:  # what such functions find in their surroundings may change
         return _made(system, t0, q0, v0, asked)[0]
-    start, call = (t0, q0.tobytes(), v0.tobytes()), (id(asked.method), asked.atol.tobytes(), asked[3:])
+    start, call = (t0, q0.tobytes(), v0.tobytes()), asked.key
     came_from, runs = system.made.get("runs", (None, None))
     kept: Kept | None = None if runs is None else runs.get(call)
     run = None
@@ -85,7 +113,7 @@ def run_from(system: ConstrainedSystem, t0: float, q0: Array, v0: Array, asked: 
             settled = code is not None or not may_have_code(run.system, asked.method, fixed, asked.compiled)
             definite = has_definite_mass(system, t0, q0)
             moves = run.static is None and settled and (definite or not sparse_factors_pay(run.system, run.kit.flags))
-            runs[call] = Kept(run.again(), start, asked.t1, code, definite, moves)
+            runs[call] = Kept(run.again(), start, asked.t1, code, definite, moves, [])
     system.made["runs"] = start, runs
     return run
 

@@ -262,16 +262,13 @@ class Run:
 
     def _redundant_rows(self) -> tuple[NDArray[np.int64], str]:
         """Which rows depend on others at the start, and what is said of them."""
-        n_rows, n = self.system.n_c + self.system.n_a, self.system.n_q
+        n_rows = self.system.n_c + self.system.n_a
         if self.rank == n_rows:
             return np.zeros(0, dtype=np.int64), ""
         left_out = np.ones(n_rows, dtype=bool)
         left_out[self.work.rows_v] = False
         redundant = np.flatnonzero(left_out)
-        rows, a = self._rows(), self.state[2 * n : 3 * n]
-        off = np.abs(rows @ a - self.work.Gamma)
-        allowed = CONTRADICTS * np.maximum(abs(rows) @ np.abs(a) + np.abs(self.work.Gamma), 1.0)
-        wrong = np.flatnonzero(off > allowed).tolist()
+        wrong = self.contradicting(self._rows()).tolist()
         if wrong:
             raise ValueError(
                 f"the constraints of {self.system.name!r} contradict one another at t = {self.t0:g}: "
@@ -282,6 +279,13 @@ class Run:
             f"{self._in_words(redundant.tolist())}. They are left out of the solution and checked at every "
             "step; multipliers are those of least norm. See docs/constraints.md#redundant-rows"
         )
+
+    def contradicting(self, rows: Rows) -> NDArray[np.int64]:
+        """Of C_q and A at the start, rows that depend on others with which the accelerations disagree."""
+        n = self.system.n_q
+        a, gamma = self.state[2 * n : 3 * n], self.work.Gamma
+        allowed = CONTRADICTS * np.maximum(abs(rows) @ np.abs(a) + np.abs(gamma), 1.0)
+        return np.flatnonzero(np.abs(rows @ a - gamma) > allowed)
 
     def _rows(self) -> Rows:
         """C_q and A at the start."""

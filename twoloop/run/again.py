@@ -1,0 +1,161 @@
+"""A run from another start by what an equal run before it left: its arrays, its checks, its plan.
+
+It is the run that `Course` would make, without what is needed only where something happens on the way. Where something
+does, or a start is not beyond doubt, nothing comes of it, and the call goes the long way from its beginning.
+"""
+
+import time
+from collections.abc import Callable
+from dataclasses import MISSING, fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twoloop.checks.consistency import Look
+from twoloop.generate.choices import Choice
+from twoloop.generate.exact_derivatives import Territory
+from twoloop.generate.straight_code import OwnCode
+from twoloop.generate.traced_values import Sample
+from twoloop.generate.tracing import Untraceable
+from twoloop.kernels.compile.linking import direct
+from twoloop.kernels.data import codes, flags, noted
+from twoloop.kernels.layout import cleared
+from twoloop.run.comparison import compared_at, territory_of
+from twoloop.run.messages import outcome
+from twoloop.run.pace import Pace
+from twoloop.run.record import Record, Status
+from twoloop.run.run import Run
+from twoloop.run.workspace import made_ready
+
+Array = NDArray[np.float64]
+
+MOST_WAITING, LARGEST = 4, 500_000  # those of a kind that wait for a call, one a thread; numbers of the states of each
+IN_VAIN = 16  # runs that are not tried after one that did not come to its end
+BEFORE = np.array([[0, 0, 1]])  # rejections and partitions before all steps: the first is not a renewal
+DEFAULTS = {each.name: each.default for each in fields(Record) if each.default is not MISSING}
+
+
+class Again:
+    """The arrays of a run that starts again and again.
+
+    Parameters
+    ----------
+    run : Run
+        A copy at its start, which this one keeps.
+    code : OwnCode or None
+        The machine code that its plan calls.
+    definite : bool
+        Whether M has an inverse at its start.
+    """
+
+    def __init__(self, run: Run, code: OwnCode | None, definite: bool):
+        self.run, self.code, self.definite = run, code, definite
+        self.look, self.rest = Look(run.system), 0
+        self.rows_v = run.work.rows_v.copy()
+        self.clock, self.control, self.tolerances = run.clock.copy(), run.control.copy(), run.tolerances.copy()
+        self.memory, self.flags = run.plan.memory.copy(), run.kit.flags.copy()
+        width = len(run.state)
+        self.t, self.rows = np.empty(run.chunk + 1), np.empty((run.chunk + 1, width))
+        self.steps = np.empty((run.chunk, run.a.N_STEP_COLUMNS))
+        self.buffers = self.t[1:], self.rows[1:], self.steps
+        self.end, self.filled = np.zeros(1), np.zeros(2, dtype=np.int64)
+
+    @staticmethod
+    def suits(run: Run) -> bool:
+        """Whether a run may be made in this way: in one chunk, by one plan, in the dense form."""
+        return run.static is None and run.chunk * len(run.state) <= LARGEST and not run.system.called_in_python
+
+    def record(
+        self, t0: float, t1: float, q0: Array, v0: Array, set_sizes: Callable[[Run], None], check_derivatives: bool
+    ) -> dict[str, Any] | None:
+        """The fields of the record of a run; None where it has to be made the long way."""
+        run = self.run
+        system, a, clock, n = run.system, run.a, run.clock, run.system.n_q
+        territory = territory_of(run, check_derivatives)
+        if self.rest > 0:
+            self.rest -= 1
+            return None
+        if territory.is_due() or (check_derivatives and not system.checked) or not self._begins(t0, q0, v0):
+            return None
+        set_sizes(run)
+        run.control[a.STORE_ALL], run.control[a.MAX_ATTEMPTS], self.end[0] = 1.0, run.chunk, t1
+        self.t[0], self.rows[0] = t0, run.state
+        arrays = run.plan.options, run.plan.memory, run.tolerances, run.control, clock, run.state, run.new_state
+        began = time.process_time()
+        code = direct(run.kernels.advance)(run.kit, run.work, *arrays, self.end, *self.buffers, self.filled)
+        spent = time.process_time() - began
+        singular = run.plan.watchful and run.work.notes[noted.NEARLY_SINGULAR] == 1.0
+        if code != a.ALL_OUTPUT_DONE or singular:
+            self.rest = IN_VAIN
+            return None
+        status, message = outcome(run, code, t1, Pace(t0))
+        n_rows, n_steps = self.filled.tolist()
+        t, rows, steps = self.t[: n_rows + 1].copy(), self.rows[: n_rows + 1].copy(), self.steps[:n_steps]
+        status, message = self._compared(territory, t, rows, check_derivatives, status, message)
+        if status != Status.REACHED_END:
+            return None
+        counts = np.concatenate([BEFORE, steps[:, a.ERRORS : a.JACOBIANS].astype(np.int64)])
+        changes = counts[1:] - counts[:-1]
+        return {
+            **DEFAULTS,
+            "t": t,
+            "q": rows[:, :n].T,
+            "v": rows[:, n : 2 * n].T,
+            "a": rows[:, 2 * n : 3 * n].T,
+            "lam": rows[:, 3 * n :].T,
+            "h": steps[:, a.H].copy(),
+            "rejected_error": changes[:, 0],
+            "rejected_convergence": changes[:, 1],
+            "partitioned": changes[:, 2],
+            "untested": steps[:, a.JACOBIANS] > 0.0,
+            "status": status,
+            "message": message,
+            "stats": run.statistics(spent),
+            "rank": run.rank,
+            "redundant": run.redundant.copy(),
+            "defect": run.defect(),
+            "widest_gap": float(run.work.notes[noted.WIDEST_GAP]),
+            "system": system,
+            "compiled": bool(run.plan.own),
+        }
+
+    def _begins(self, t0: float, q0: Array, v0: Array) -> bool:
+        """Whether a run begins at a start as this one did: consistent, of the same rank, mass and choice of rows."""
+        run, look = self.run, self.look
+        system, n, work = run.system, run.system.n_q, run.work
+        if not look.is_consistent(t0, q0, v0) or (not system.constant_mass and look.definite is not self.definite):
+            return False
+        if self.code is not None:
+            try:
+                choice = Choice.of(system, look.mass, look.rows)
+            except Untraceable:
+                return False
+            if choice != self.code.shared.equations.choice:
+                return False
+        run.t0, run.compared_to[0] = t0, -np.inf
+        run.state[:n], run.state[n : 2 * n], run.state[2 * n :] = q0, v0, 0.0
+        run.clock[:], run.control[:], run.tolerances[:] = self.clock, self.control, self.tolerances
+        run.plan.memory[:] = self.memory
+        if run.kit.flags[flags.FORM] != self.flags[flags.FORM]:
+            run.kit.flags[:] = self.flags
+        run.clock[run.a.T] = run.clock[run.a.T_START] = t0
+        made_ready(cleared(work), system, self.flags, look.pattern, q0, run.rtol, run.reuse)
+        work.notes[noted.NEARLY_SINGULAR] = 0.0 if run.plan.watchful else 1.0
+        if direct(run.kernels.start)(run.kit, work, t0, run.state) != codes.DONE:
+            return False
+        return not run.said_of_rows or (
+            bool((work.rows_v == self.rows_v).all()) and run.contradicting(look.rows).size == 0
+        )
+
+    def _compared(
+        self, territory: Territory, t: Array, rows: Array, check_derivatives: bool, status: Status, message: str
+    ) -> tuple[Status, str]:
+        """Status and message after callbacks were compared at states that lie where none was compared."""
+        territory.count()
+        n = 2 * self.run.system.n_q
+        if territory.holds(t, rows[:, :n]):
+            return status, message
+        sample = Sample(float(t[0]), rows[0], n)
+        sample.add(t[1:], rows[1:], float(t[-1]), rows[-1])
+        return compared_at(self.run, territory, sample.states(), check_derivatives, status, message)
