@@ -105,7 +105,7 @@ class Run:
         self.compared_to = [-np.inf]  # how far callbacks were compared along the motion, in this run or the same before
         self._begin()
         self.rank = len(self.work.rows_v)
-        self.redundant, self.said_of_rows = self._redundant_rows()
+        self.redundant, self.said_of_rows = self.redundant_rows()
 
     def again(self) -> "Run":
         """A copy of this run at its start; this one must not have taken a step."""
@@ -128,7 +128,7 @@ class Run:
         other.work = work
         if direct(self.kernels.start)(other.kit, work, t0, other.state) != codes.DONE:
             return None
-        other.redundant, other.said_of_rows = other._redundant_rows()
+        other.redundant, other.said_of_rows = other.redundant_rows()
         return other
 
     def _copy(self) -> "Run":
@@ -260,23 +260,24 @@ class Run:
             f"the accelerations of {self.system.name!r} cannot be found at t = {self.t0!r}: {said_of_not_finite(self)}"
         )
 
-    def _redundant_rows(self) -> tuple[NDArray[np.int64], str]:
-        """Which rows depend on others at the start, and what is said of them."""
+    def redundant_rows(self, rows: Rows | None = None) -> tuple[NDArray[np.int64], str]:
+        """Which of C_q and A at the start depend on others, and what is said of them; `rows`: where these are known."""
         n_rows = self.system.n_c + self.system.n_a
         if self.rank == n_rows:
             return np.zeros(0, dtype=np.int64), ""
         left_out = np.ones(n_rows, dtype=bool)
         left_out[self.work.rows_v] = False
         redundant = np.flatnonzero(left_out)
-        wrong = self.contradicting(self._rows()).tolist()
+        rows = self._rows() if rows is None else rows
+        wrong = self.contradicting(rows).tolist()
         if wrong:
             raise ValueError(
                 f"the constraints of {self.system.name!r} contradict one another at t = {self.t0:g}: "
-                f"{self._in_words(wrong)}, but not so their accelerations. Correct or leave out one of these rows"
+                f"{self._in_words(rows, wrong)}, but not so their accelerations. Correct or leave out one of these rows"
             )
         return redundant, (
             f"the constraints of {self.system.name!r} have rank {self.rank} of {n_rows} at t = {self.t0:g}: "
-            f"{self._in_words(redundant.tolist())}. They are left out of the solution and checked at every "
+            f"{self._in_words(rows, redundant.tolist())}. They are left out of the solution and checked at every "
             "step; multipliers are those of least norm. See docs/constraints.md#redundant-rows"
         )
 
@@ -294,10 +295,10 @@ class Run:
             return system.sparse_rows(self.t0, q)
         return mass_and_rows(system, self.t0, q)[1]
 
-    def _in_words(self, rows: list[int]) -> str:
+    def _in_words(self, all_rows: Rows, rows: list[int]) -> str:
         """Which rows depend on which others; the factors of the static form tell the shares of the first."""
         q = self.state[: self.system.n_q]
-        counted, all_rows = self.work.rows_v.tolist(), self._rows()
+        counted = self.work.rows_v.tolist()
         if not isinstance(all_rows, SparseRows):
             return in_words(all_rows, rows)
         if self.static is None or set(rows) & set(counted):

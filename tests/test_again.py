@@ -1,0 +1,159 @@
+"""A run by the arrays of the run before it equals that of the long way, which is taken where it cannot be made so."""
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import fields
+
+import numpy as np
+import pytest
+
+from twoloop import ConstraintWarning, mechanisms, solve, solve_dae
+from twoloop.result.result import Result
+
+METHODS = ["auto", "DOP853", "Adams", "Gauss8", "RadauIIA5", "TRBDF2", "BDF"]
+NAMES = [
+    "four_bar",
+    "andrews",
+    "redundant_slider_crank",
+    "rolling_disc",
+    "heavy_top",
+    "driven_slider_crank",
+    "governor",
+]
+
+
+@pytest.fixture
+def taken(monkeypatch):
+    """How calls were made: True by the arrays of a run before."""
+    made, ways = solve.record_again, []
+
+    def watched(*asked):
+        record = made(*asked)
+        ways.append(record is not None)
+        return record
+
+    monkeypatch.setattr(solve, "record_again", watched)
+    return ways
+
+
+def starts(problem, span, n):
+    solution = solve_dae(problem.system, (0.0, 1e-2 * span), problem.q0, problem.v0, dense_output=True).sol
+    return [solution(t) for t in np.linspace(0.0, 1e-2 * span, n)]
+
+
+def runs(problem, states, span, **options):
+    return [
+        solve_dae(problem.system, (float(s.t), float(s.t) + span), s.q, s.v, rtol=1e-6, atol=1e-6, **options)
+        for s in states
+    ]
+
+
+def assert_same(one: Result, other: Result):
+    for name in [each.name for each in fields(Result) if each.name not in ("stats", "system")]:
+        a, b = getattr(one, name), getattr(other, name)
+        assert np.array_equal(a, b) if isinstance(a, np.ndarray) else a == b, name
+        assert type(a) is type(b), name
+    counted = [{k: v for k, v in vars(each.stats).items() if k != "cpu_time"} for each in (one, other)]
+    assert counted[0] == counted[1] and one.stats.cpu_time > 0.0
+    assert vars(one).keys() == vars(other).keys()
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.filterwarnings("ignore::twoloop.ConstraintWarning")
+def test_it_is_the_run_of_the_long_way_to_the_bit(name, method, taken, monkeypatch):
+    problem, other = getattr(mechanisms, name)(), getattr(mechanisms, name)()
+    span = 3e-3 if name == "andrews" else 0.1
+    states = starts(problem, span, 7)
+    by_arrays = runs(problem, states, span, method=method)
+    assert sum(taken) >= 2 or method in ("BDF", "Gauss8")
+    monkeypatch.setattr(solve, "record_again", lambda *asked: None)
+    for one, long in zip(by_arrays, runs(other, states, span, method=method), strict=True):
+        assert_same(one, long)
+
+
+def test_results_do_not_share_arrays(taken):
+    problem = mechanisms.four_bar()
+    results = runs(problem, starts(problem, 1.0, 8), 1.0)
+    kept = [each.q.copy() for each in results]
+    runs(problem, starts(problem, 0.5, 8), 2.0)
+    assert sum(taken) >= 6
+    assert all((each.q == q).all() for each, q in zip(results, kept, strict=True))
+    results[-1].atol[0] = 7.0
+    assert runs(problem, starts(problem, 1.0, 1), 1.0)[0].atol[0] == 1e-6
+
+
+def test_threads_have_arrays_of_their_own(taken):
+    problem = mechanisms.four_bar()
+    states = starts(problem, 1.0, 40)
+    alone = runs(problem, states, 1.0)
+    with ThreadPoolExecutor(4) as pool:
+        together = list(pool.map(lambda state: runs(problem, [state], 1.0)[0], states))
+    assert sum(taken) > 60
+    for one, other in zip(alone, together, strict=True):
+        assert (one.q == other.q).all() and (one.lam == other.lam).all()
+
+
+def test_a_run_of_more_than_one_chunk_goes_the_long_way(taken):
+    problem = mechanisms.four_bar()
+    lengths = [each.h.size for each in runs(problem, starts(problem, 1.0, 6), 30.0, method="DOP853", max_step=0.01)]
+    assert min(lengths) >= 3000 and not any(taken)
+
+
+def test_what_is_wrong_at_a_start_is_said_as_ever(taken):
+    problem = mechanisms.four_bar()
+    states = starts(problem, 1.0, 6)
+    runs(problem, states, 1.0)
+    q0 = states[0].q + np.eye(len(states[0].q))[2] * 1e-3
+    with pytest.raises(ValueError, match=r"q0.*C\(t, q\)"):
+        solve_dae(problem.system, (0.0, 1.0), q0, states[0].v, rtol=1e-6, atol=1e-6)
+    v0 = states[0].v + np.eye(len(q0))[1]
+    with pytest.raises(ValueError, match="v0"):
+        solve_dae(problem.system, (0.0, 1.0), states[0].q, v0, rtol=1e-6, atol=1e-6)
+    runs(problem, states, 1.0)
+    assert taken[-1]
+
+
+def test_a_callback_that_is_wrong_where_no_run_was_is_found(taken):
+    """Within the box of states that were compared nothing is compared again, beyond it all that is new."""
+    from twoloop import ConstrainedSystem, callback
+
+    @callback("mass")
+    def mass(t, q, p, M):
+        M[0, 0] = M[1, 1] = 1.0
+
+    @callback("force")
+    def force(t, q, v, p, Q):
+        Q[1] = -9.81
+
+    @callback("constraint")
+    def constraint(t, q, p, C):
+        C[0] = 0.5 * (q[0] * q[0] + q[1] * q[1] - 1.0)
+
+    @callback("jacobian")
+    def jacobian(t, q, p, Cq):
+        Cq[0, 0] = q[0] if q[1] < 0.5 else 1.01 * q[0]
+        Cq[0, 1] = q[1]
+
+    system = ConstrainedSystem(
+        n_q=2, n_c=1, mass=mass, force=force, constraint=constraint, jacobian=jacobian, name="wrong above"
+    )
+
+    def swing(angle, speed):
+        q0, v0 = [np.sin(angle), -np.cos(angle)], [speed * np.cos(angle), speed * np.sin(angle)]
+        return solve_dae(system, (0.0, 1.0), q0, v0, rtol=1e-6, atol=1e-6)
+
+    assert all(swing(0.3 + 0.01 * k, 0.0).success for k in range(7))
+    assert taken[-1]
+    assert not swing(0.3, 6.5).success
+
+
+@pytest.mark.parametrize("name", ["redundant_slider_crank", "bricard"])
+@pytest.mark.filterwarnings("ignore::twoloop.ConstraintWarning")
+def test_redundant_rows_are_named(name, taken):
+    problem = getattr(mechanisms, name)()
+    states = starts(problem, 1e-6, 7)
+    for state in states:
+        with pytest.warns(ConstraintWarning, match="left out of the solution") as said:
+            result = runs(problem, [state], 0.05)[0]
+        assert f"row(s) {result.redundant.tolist()}" in str(said[0].message)
+    assert sum(taken) >= 2
