@@ -54,7 +54,7 @@ def test_a_repeated_call_takes_few_calls_of_functions(options):
         run(problem, **options)
         profile.disable()
         calls.append(pstats.Stats(profile).total_calls)
-    assert calls[1] < MANY and calls[2] < FEW and calls[4] < FEWEST  # the first compiles callbacks, or checks derivatives
+    assert calls[1] < MANY and calls[2] < FEW and calls[4] < FEWEST  # the first compiles, or checks derivatives
 
 
 def calls_of(function):
