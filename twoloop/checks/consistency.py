@@ -99,8 +99,10 @@ class Look:
     """
 
     def __init__(self, system: ConstrainedSystem):
-        from twoloop.kernels.evaluation.first_look import room_size
+        from twoloop.kernels.evaluation import first_look
+        from twoloop.kernels.evaluation.first_look import look, room_size
 
+        self.flags, self._look = first_look, direct(look)
         n, n_rows, size = system.n_q, system.n_c + system.n_a, room_size(system.n_q, system.n_c, system.n_a)
         self.system, self._numbers = system, np.zeros(size + n * n + 2 * n_rows * n)
         self._room, mass, rows, pattern = np.split(self._numbers, np.cumsum([size, n * n, n_rows * n]))
@@ -111,26 +113,25 @@ class Look:
 
     def at(self, t: float, q: Array, v: Array) -> int:
         """Flags of what `first_look` finds at a start."""
-        from twoloop.kernels.evaluation.first_look import DEFINITE, INDEFINITE, look
-
+        definite, indefinite = self.flags.DEFINITE, self.flags.INDEFINITE
         self._numbers.fill(0.0)
         sizes = self.system.made.get("sizes", self._sizes)
         try:
-            found: int = direct(look)(self.system.kit, t, q, v, sizes, *self._always)
+            found: int = self._look(self.system.kit, t, q, v, sizes, *self._always)
         except Exception:  # of a callback, which is called by itself then
             return 0
-        self.definite = bool(found & DEFINITE) if found & (DEFINITE | INDEFINITE) else None
+        self.definite = bool(found & definite) if found & (definite | indefinite) else None
         return found
 
     def is_consistent(self, t: float, q: Array, v: Array) -> bool:
         """Whether a start is consistent beyond doubt, and nothing there would have to be looked at more closely."""
-        from twoloop.kernels.evaluation.first_look import CONSISTENT, IN_ORDER
-
         found = self.at(t, q, v)
-        return bool(found & IN_ORDER) and (bool(found & CONSISTENT) or self._surely(t, q, v))
+        return bool(found & self.flags.IN_ORDER) and self.is_surely(found, t, q, v)
 
-    def _surely(self, t: float, q: Array, v: Array) -> bool:
-        """Whether `Violation` would accept the state of the last look beyond doubt."""
+    def is_surely(self, found: int, t: float, q: Array, v: Array) -> bool:
+        """Whether `Violation` would accept the state of the last look, which found this, beyond doubt."""
+        if found & self.flags.CONSISTENT:
+            return True
         n, n_c, n_rows = self.system.n_q, self.system.n_c, len(self.rows)
         force, C, rates = np.split(self._room[: n + n_c + n_rows], (n, n + n_c))
         return _surely_consistent(self.system, t, q, v, self.mass, force, self.rows, C, rates)
@@ -138,20 +139,18 @@ class Look:
 
 def _in_order(system: ConstrainedSystem, t: float, q: Array, v: Array) -> bool:
     """Whether compiled callbacks give nothing at a start that would have to be looked at more closely."""
-    from twoloop.kernels.evaluation.first_look import CONSISTENT, IN_ORDER
-
     if system.called_in_python or system.entries:
         return False
     look = Look(system)
     found = look.at(t, np.ascontiguousarray(q, dtype=np.float64), np.ascontiguousarray(v, dtype=np.float64))
-    if not found & IN_ORDER:
+    if not found & look.flags.IN_ORDER:
         return False
     place = (t, q.tobytes())
     system.remember_at("pattern", place, look.pattern)
     system.remember_at("mass and rows", place, (look.mass, look.rows))
     if look.definite is not None:
         system.remember_at("definite mass", _place(system, t, q), look.definite)
-    return bool(found & CONSISTENT) or look._surely(t, q, v)
+    return look.is_surely(found, t, q, v)
 
 
 def _surely_consistent(

@@ -50,24 +50,42 @@ class Choice:
         Untraceable
             If M is singular on velocities that the constraints allow.
         """
-        return cls.of(system, *mass_and_rows(system, t, q))
+        return Chooser(system).choice(*mass_and_rows(system, t, q))
 
-    @classmethod
-    def of(cls, system: ConstrainedSystem, mass: Array, G: Array) -> "Choice":
-        """The same where M and G are known; raises as `at`."""
-        from twoloop.kernels.algebra.pivots import STAYS_SINGULAR, choose, room_size
 
-        n_rows = len(G)
-        room, chosen = np.empty(room_size(*G.shape)), np.empty(2 + 3 * n_rows, dtype=np.int64)
+class Chooser:
+    """The choice for one M and G of a system after another; it is mostly the last one."""
+
+    def __init__(self, system: ConstrainedSystem):
+        from twoloop.kernels.algebra.pivots import choose, room_size
+
+        n_rows = system.n_c + system.n_a
+        self.system, self._choose = system, direct(choose)
+        self._room, self._chosen = np.zeros(room_size(n_rows, system.n_q)), np.zeros(2 + 3 * n_rows, dtype=np.int64)
+        self._decided, self._last = (0, b"", 0.0), Choice((), (), 1.0, 0.0)
+
+    def choice(self, mass: Array, G: Array) -> Choice:
+        """The choice; raises as `Choice.at`."""
+        system, room, chosen = self.system, self._room, self._chosen
         constant = system.constant_mass and system.made.get("no weak mass", False)
-        place = direct(choose)(mass, G, RANK, 0.0 if constant else SINGULAR_MASS, BOUNDS, room, chosen)
-        n_kept, n_added, *places = chosen.tolist()
+        room[0] = 0.0
+        place = self._choose(mass, G, RANK, 0.0 if constant else SINGULAR_MASS, BOUNDS, room, chosen)
+        decided = place, chosen.tobytes(), float(room[0])
+        if decided != self._decided:
+            self._last, self._decided = self._made(place), decided
+        return self._last
+
+    def _made(self, place: int) -> Choice:
+        from twoloop.kernels.algebra.pivots import STAYS_SINGULAR
+
+        system, n_rows = self.system, self.system.n_c + self.system.n_a
+        n_kept, n_added, *places = self._chosen.tolist()
         if n_kept == 0:
-            return cls((), (), 1.0, 0.0)
+            return Choice((), (), 1.0, 0.0)
         if place < 0:
             stays = "stays singular with constraints added" if place == STAYS_SINGULAR else "is too nearly singular"
             raise Untraceable(f"the mass of {system.name!r} {stays}")
         if n_added == 0:
             system.made["no weak mass"] = True
         added = tuple(places[n_rows : n_rows + n_added])
-        return cls(tuple(places[:n_kept]), added, float(room[0]), float(LEAST[place]))
+        return Choice(tuple(places[:n_kept]), added, float(self._room[0]), float(LEAST[place]))

@@ -97,11 +97,8 @@ class Territory:
         if not self._box.size:
             return False
         least, largest = self._known
-        return (
-            bool(least[0] <= t[0] and t[-1] <= largest[0])
-            and bool((np.minimum.reduce(states) >= least[1:]).all())
-            and bool((np.maximum.reduce(states) <= largest[1:]).all())
-        )
+        outside = np.count_nonzero(states < least[1:]) or np.count_nonzero(states > largest[1:])
+        return bool(least[0] <= t[0] and t[-1] <= largest[0] and not outside)
 
     def without_known(self, states: Array) -> Array:
         """Those of the states, rows, of a run that lie in no place, or next to none, where one was compared."""

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.checks.consistency import Look
-from twoloop.generate.choices import Choice
+from twoloop.generate.choices import Chooser
 from twoloop.generate.exact_derivatives import Territory
 from twoloop.generate.straight_code import OwnCode
 from twoloop.generate.traced_values import Sample
@@ -51,7 +51,8 @@ class Again:
 
     def __init__(self, run: Run, code: OwnCode | None, definite: bool):
         self.run, self.code, self.definite = run, code, definite
-        self.look, self.rest = Look(run.system), 0
+        self.look, self.chooser, self.rest = Look(run.system), Chooser(run.system), 0
+        self._start, self._advance = direct(run.kernels.start), direct(run.kernels.advance)
         self.rows_v = run.work.rows_v.copy()
         self.clock, self.control, self.tolerances = run.clock.copy(), run.control.copy(), run.tolerances.copy()
         self.memory, self.flags = run.plan.memory.copy(), run.kit.flags.copy()
@@ -83,7 +84,7 @@ class Again:
         self.t[0], self.rows[0] = t0, run.state
         arrays = run.plan.options, run.plan.memory, run.tolerances, run.control, clock, run.state, run.new_state
         began = time.process_time()
-        code = direct(run.kernels.advance)(run.kit, run.work, *arrays, self.end, *self.buffers, self.filled)
+        code = self._advance(run.kit, run.work, *arrays, self.end, *self.buffers, self.filled)
         spent = time.process_time() - began
         singular = run.plan.watchful and run.work.notes[noted.NEARLY_SINGULAR] == 1.0
         if code != a.ALL_OUTPUT_DONE or singular:
@@ -128,7 +129,7 @@ class Again:
             return False
         if self.code is not None:
             try:
-                choice = Choice.of(system, look.mass, look.rows)
+                choice = self.chooser.choice(look.mass, look.rows)
             except Untraceable:
                 return False
             if choice != self.code.shared.equations.choice:
@@ -142,7 +143,7 @@ class Again:
         run.clock[run.a.T] = run.clock[run.a.T_START] = t0
         made_ready(cleared(work), system, self.flags, look.pattern, q0, run.rtol, run.reuse)
         work.notes[noted.NEARLY_SINGULAR] = 0.0 if run.plan.watchful else 1.0
-        if direct(run.kernels.start)(run.kit, work, t0, run.state) != codes.DONE:
+        if self._start(run.kit, work, t0, run.state) != codes.DONE:
             return False
         if run.said_of_rows and (work.rows_v != self.rows_v).any():  # rounding may decide which row is left out
             run.redundant, run.said_of_rows = run.redundant_rows(look.rows)

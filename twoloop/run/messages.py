@@ -53,12 +53,12 @@ def message_of(run: "Run", words: str) -> Any:
 def outcome(run: "Run", code: int, t1: float, pace: Pace) -> tuple[Status, str]:
     """Status and message for how the run ended."""
     a, t = run.a, float(run.clock[run.a.T])
-    stopped = f"Stopped at t = {t:.10g}"
-    failure = int(run.clock[a.FAILURE_CODE])
     if code == a.ALL_OUTPUT_DONE:
         fixed = ", with a constant step: no error was estimated" if run.control[a.FIXED_STEP] > 0.0 else ""
         said = _said_of_passages(run) + _said_of_end(run)
         return Status.REACHED_END, f"Reached the end, t = {t:g}{fixed}.{said}"
+    stopped = f"Stopped at t = {t:.10g}"
+    failure = int(run.clock[a.FAILURE_CODE])
     if code == INTERRUPTED:
         return Status.INTERRUPTED, ""
     if code == a.MAX_STEPS_REACHED:
