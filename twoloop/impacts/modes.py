@@ -13,7 +13,7 @@ from twoloop.impacts.contact import Accelerations, Closed
 from twoloop.impacts.gaps import Gap, Gaps
 from twoloop.impacts.joined import Impact, joined
 from twoloop.impacts.laws import NEGLIGIBLE, bounded, complementary, impulses, responses
-from twoloop.impacts.rubbing import IDLE, INDEPENDENT, STICKS, Frictionless, Rubbing, Signs
+from twoloop.impacts.rubbing import IDLE, INDEPENDENT, STICKS, Modes, Signs
 from twoloop.problem.stops import Stop
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.result.result import Result
@@ -43,16 +43,14 @@ class Motion:
     Parameters
     ----------
     stops : sequence of Stop
-    rubs : Rubbing or Frictionless
+    rubs : Modes
         The system in its modes.
     t, q, v : float, ndarray (n_q,), ndarray (n_q,)
     options : dict
         Of runs.
     """
 
-    def __init__(
-        self, stops: Sequence[Stop], rubs: Rubbing | Frictionless, t: float, q: Array, v: Array, options: dict[str, Any]
-    ):
+    def __init__(self, stops: Sequence[Stop], rubs: Modes, t: float, q: Array, v: Array, options: dict[str, Any]):
         self.system, self.rubs, self.stops, self.options = rubs.system, rubs, list(stops), options
         self.t, self.q, self.v = t, q, v
         self.e = np.array([stop.restitution for stop in stops])
