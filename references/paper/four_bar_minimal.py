@@ -54,11 +54,8 @@ class MinimalFourBar:
     period : float
         Period of the motion, s.
 
-    Raises
-    ------
-    TypeError, ValueError
-        If an argument is wrong; if the linkage cannot be assembled, starts in equilibrium or singular, does not come to
-        rest again within `LONGEST`, or takes more than `MOST_EVALUATIONS` to get there.
+    Raises TypeError or ValueError if an argument is wrong; if the linkage cannot be assembled, starts in equilibrium or
+    singular, does not come to rest again within `LONGEST`, or takes more than `MOST_EVALUATIONS` to get there.
     """
 
     def __init__(

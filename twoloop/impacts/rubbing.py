@@ -55,10 +55,7 @@ class Rubbing(Modes):
     ----------
     problem : ModelProblem
 
-    Raises
-    ------
-    ValueError
-        If a joint cannot slide by itself.
+    Raises ValueError if a joint cannot slide by itself.
     """
 
     def __init__(self, problem: ModelProblem):
