@@ -45,11 +45,8 @@ class Expressions:
     of_parameters : bool
         Whether the parameters are symbols, too, and not the numbers of the system.
 
-    Raises
-    ------
-    NotSymbolic
-        If the callbacks are Python functions, Q_d is not given, they branch on t, q or v or give near the start what
-        their operations do not give, or the mass stays singular with rows of C_q added.
+    Raises NotSymbolic if the callbacks are Python functions, Q_d is not given, they branch on t, q or v or give near
+    the start what their operations do not give, or the mass stays singular with rows of C_q added.
     """
 
     def __init__(self, system: ConstrainedSystem, t0: float, q0: Array, v0: Array, of_parameters: bool = False):

@@ -102,9 +102,8 @@ def has_model(problem: Problem) -> bool:
 def _four_bar(problem: Problem) -> Model:
     p = problem.parameters
     model, lengths = Model((0.0, -p["gravity"], 0.0)), [p[f"L{i + 1}"] for i in range(3)]
-    for length, q, v in zip(lengths, problem.q0.reshape(3, 3), problem.v0.reshape(3, 3), strict=True):
-        mass = p["density"] * length
-        model.planar_body(mass, mass * length**2 / 12.0, q, v)
+    masses = [p["density"] * length for length in lengths]
+    model.planar_bodies(masses, [m * length**2 / 12.0 for m, length in zip(masses, lengths, strict=True)], problem)
     model.pin(GROUND, (0.0, 0.0), 0, (-0.5 * lengths[0], 0.0))
     for i in range(2):
         model.pin(i, (0.5 * lengths[i], 0.0), i + 1, (-0.5 * lengths[i + 1], 0.0))
@@ -193,8 +192,7 @@ def _n_four_bar(problem: Problem) -> Model:
     n = problem.parameters["n"]
     start = n_four_bar(n, "bodies")
     model = Model((0.0, -problem.parameters["gravity"], 0.0))
-    for q, v in zip(start.q0.reshape(-1, 3), start.v0.reshape(-1, 3), strict=True):
-        model.planar_body(1.0, 1.0 / 12.0, q, v)
+    model.planar_bodies((2 * n + 1) * [1.0], (2 * n + 1) * [1.0 / 12.0], start)
     for i in range(n + 1):
         model.pin(i, (-0.5, 0.0), GROUND, (float(i), 0.0))
     for j in range(n):
@@ -206,9 +204,7 @@ def _n_four_bar(problem: Problem) -> Model:
 def _slider_crank(problem: Problem) -> Model:
     p = problem.parameters
     model = Model((0.0, -p["gravity"], 0.0))
-    starts = zip(problem.q0.reshape(3, 3), problem.v0.reshape(3, 3), strict=True)
-    for mass, inertia, (q, v) in zip(p["masses"], p["inertias"], starts, strict=True):
-        model.planar_body(mass, inertia, q, v)
+    model.planar_bodies(p["masses"], p["inertias"], problem)
     model.pin(0, (-0.5 * p["crank"], 0.0), GROUND, (0.0, 0.0))
     model.pin(1, (-0.5 * p["rod"], 0.0), 0, (0.5 * p["crank"], 0.0))
     model.pin(2, (0.0, 0.0), 1, (0.5 * p["rod"], 0.0))

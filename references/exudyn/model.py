@@ -1,5 +1,6 @@
 """What Exudyn models of rigid bodies are put together from: bodies, joints, springs and weight, all of its own."""
 
+from collections.abc import Iterable
 from typing import Any
 
 import exudyn as exu
@@ -9,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from references.exudyn.run import add_sensors
 from twoloop.mechanisms.rotation import rotation_matrix
-from twoloop.problem.problem import Array
+from twoloop.problem.problem import Array, Problem
 
 GROUND = -1
 # locked translations and rotations of the second body in the frame of a joint
@@ -53,6 +54,12 @@ class Model:
         node = self.mbs.AddNode(items.NodeRigidBody2D(referenceCoordinates=q.tolist(), initialVelocities=v.tolist()))
         body = self.mbs.AddObject(items.ObjectRigidBody2D(mass=mass, inertia=inertia, nodeNumber=node))
         return self._added(body, node, q, (np.zeros(3), np.eye(3)))
+
+    def planar_bodies(self, masses: Iterable[float], inertias: Iterable[float], problem: Problem) -> None:
+        """Bodies in the plane, one after another, which start as those of a problem."""
+        states = zip(problem.q0.reshape(-1, 3), problem.v0.reshape(-1, 3), strict=True)
+        for mass, inertia, state in zip(masses, inertias, states, strict=True):
+            self.planar_body(float(mass), float(inertia), *state)
 
     def _local(self, body: int, point: ArrayLike) -> tuple[int, list[float], Array]:
         """Exudyn's number of a body, a point of space in its axes, and its rotation matrix."""

@@ -23,9 +23,7 @@ def solve_pinned(
     """
     steps = check_steps(problem, problem.t_span[1], n_steps, solver, n_steps, time_limit)
     model = Model((0.0, -bodies.gravity, 0.0))
-    places = zip(problem.q0.reshape(-1, 3), problem.v0.reshape(-1, 3), strict=True)
-    for mass, inertia, (q, v) in zip(bodies.masses, bodies.inertias, places, strict=True):
-        model.planar_body(float(mass), float(inertia), q, v)
+    model.planar_bodies(bodies.masses, bodies.inertias, problem)
     for pin in bodies.pins:
         model.pin(*pin)
     model.mbs.Assemble()

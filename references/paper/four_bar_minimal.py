@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.integrate import solve_ivp
 
-from twoloop.checks.arguments import check_number, check_positive, check_real, check_vector
+from twoloop.checks.arguments import check_finite, check_positive, check_real, check_vector
 from twoloop.problem.problem import Array
 
 RTOL, ATOL = 1e-13, 1e-14
@@ -54,11 +54,8 @@ class MinimalFourBar:
     period : float
         Period of the motion, s.
 
-    Raises
-    ------
-    TypeError, ValueError
-        If an argument is wrong; if the linkage cannot be assembled, starts in equilibrium or singular, does not come to
-        rest again within `LONGEST`, or takes more than `MOST_EVALUATIONS` to get there.
+    Raises TypeError or ValueError if an argument is wrong; if the linkage cannot be assembled, starts in equilibrium or
+    singular, does not come to rest again within `LONGEST`, or takes more than `MOST_EVALUATIONS` to get there.
     """
 
     def __init__(
@@ -76,9 +73,8 @@ class MinimalFourBar:
         check_positive("ground", ground)
         for value in density if isinstance(density, tuple) else (density,):
             check_positive("density", value)
-        for name, value in (("theta3", theta3), ("gravity", gravity)):
-            if not math.isfinite(check_number(name, value)):
-                raise ValueError(f"{name} must be finite; given {value!r}")
+        check_finite("theta3", theta3)
+        check_finite("gravity", gravity)
         if branch not in (-1, 1):
             raise ValueError(f"branch must be 1 or -1; given {branch!r}")
         self._masses = np.array(density) * self._lengths

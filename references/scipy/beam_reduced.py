@@ -33,12 +33,8 @@ def reduced_motion(problem: Problem, t_eval: ArrayLike, tol: float) -> tuple[Arr
     -------
     q, v : ndarray (n_q, n_t)
 
-    Raises
-    ------
-    TypeError, ValueError
-        If an argument is wrong.
-    RuntimeError
-        If DOP853 fails or cannot start: an incomplete reference is of no use.
+    Raises TypeError or ValueError if an argument is wrong. Raises RuntimeError if DOP853 fails or cannot start: an
+    incomplete reference is of no use.
     """
     check_problem(problem, "angular_frequency", "a beam of ancf_beam, on a moving base")
     check_positive("tol", tol)

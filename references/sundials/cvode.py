@@ -13,33 +13,24 @@ from references.driver import ADVICE, OutOfTimeError, Task, TimeLimit, adapter, 
 from references.lines import Line
 from references.scipy.index1 import RightHandSide
 from references.sundials.loop import SMALLEST_STEP
-from twoloop.checks.arguments import check_choice
 from twoloop.problem.problem import Array
 from twoloop.result.result import Result
 
-METHODS = ("Adams", "BDF")
 MOST_STEPS = 10**7  # between two output times; its own 500 are soon used up
 
 
 @adapter(derivatives=False, independent_rows=True)
-def solve_cvode(task: Task, method: str = "Adams", rtol: float = 1e-8, atol: float = 1e-8) -> Result:
-    """Integrate a constrained mechanical system, as the ODE q' = v, v' = a(t, q, v), with CVODE of scikit-sundae.
+def solve_cvode(task: Task, rtol: float = 1e-8, atol: float = 1e-8) -> Result:
+    """Integrate a constrained mechanical system, as the ODE q' = v, v' = a(t, q, v), with Adams' methods in CVODE.
 
     What it was given: a right-hand side that numba compiled, and its analytic Jacobian as straight-line code, up to
     `straight_line.MOST_OPERATIONS`, else differences; timed is the integration to the end, without output.
 
-    Parameters
-    ----------
-    method : {"Adams", "BDF"}
-        Orders up to 12, or up to 5; both with Newton's iteration, scikit-sundae's only one.
-    others : see `references.driver`
+    Their orders are up to 12; with Newton's iteration, scikit-sundae's only one.
 
-    Returns
-    -------
-    Result
-        Of the statistics: n_evaluations, all calls of the right-hand side.
+    Parameters, errors and result are those of `references.driver`; of the statistics n_evaluations, all calls of the
+    right-hand side.
     """
-    check_choice("method", method, METHODS)
     CVODE = imported("sksundae.cvode", "scikit-sundae", "references").CVODE
     from references.sundials.ida import states_at
 
@@ -47,7 +38,7 @@ def solve_cvode(task: Task, method: str = "Adams", rtol: float = 1e-8, atol: flo
     equations = RightHandSide(task.system, t0, task.q0, 0.0)
     y0.setflags(write=False)  # as CVODE hands it over, so that what is compiled here is what it calls
     equations.warm(t0, y0, False)
-    options: dict[str, Any] = {"method": method, "rtol": rtol, "atol": atol, "max_num_steps": MOST_STEPS}
+    options: dict[str, Any] = {"method": "Adams", "rtol": rtol, "atol": atol, "max_num_steps": MOST_STEPS}
     options |= {"min_step": SMALLEST_STEP * (t1 - t0), "max_step": t1 - t0}
     jacobian = equations.jacobian(t0, y0)
 
@@ -67,7 +58,7 @@ def solve_cvode(task: Task, method: str = "Adams", rtol: float = 1e-8, atol: flo
     with redirect_stdout(io.StringIO()), user_call, suppress(OutOfTimeError):  # it prints its failures
         timed.init_step(t0, y0)
         outcome = timed.step(t1, tstop=t1)
-    name, counts = f"CVODE, {method},", {"n_evaluations": int(equations.counters[0])}
+    name, counts = "CVODE, Adams,", {"n_evaluations": int(equations.counters[0])}
     if outcome is None:
         failure = limit.message("CVODE", t0, "take looser tolerances")
         return task.result(name, times[:0], np.empty((y0.size, 0)), failure, **counts)

@@ -72,10 +72,7 @@ def solve_cvode_c(
         The statistics are CVODE's counters, those of the evaluations for the Jacobian included, of the run that is
         timed. The text of a failure has the name of CVODE's flag.
 
-    Raises
-    ------
-    RuntimeError
-        If scikit-sundae is not the one that this was written for.
+    Raises RuntimeError if scikit-sundae is not the one that this was written for.
     """
     check_choice("method", method, tuple(METHODS))
     if projected and method != "BDF":

@@ -70,10 +70,7 @@ def solve_ida_c(
         (n_outer), residual evaluations without those that the differences of the Jacobian take (n_evaluations), and
         Jacobians, each with its factorisation (n_factorizations). The text of a failure has the name of IDA's flag.
 
-    Raises
-    ------
-    RuntimeError
-        If scikit-sundae is not the one that this was written for.
+    Raises RuntimeError if scikit-sundae is not the one that this was written for.
     """
     system = task.system
     if system.called_in_python:

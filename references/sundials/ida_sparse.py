@@ -37,10 +37,7 @@ def solve_ida_sparse(task: Task, rtol: float = 1e-8, atol: float = 1e-8) -> Resu
     others : see `references.driver`
         The result has the start and the end alone.
 
-    Raises
-    ------
-    ValueError
-        If the system has no `jacobian_values` and `mass_values`.
+    Raises ValueError if the system has no `jacobian_values` and `mass_values`.
     """
     system, (t0, t1), limit = task.system, (task.t0, task.t1), TimeLimit(task.time_limit)
     if not {"jacobian", "mass"} <= system.entries.keys():

@@ -41,10 +41,7 @@ FUNCTIONS = {  # by library
 def library() -> SimpleNamespace:
     """The functions of SUNDIALS that are used here, from the files of scikit-sundae.
 
-    Raises
-    ------
-    RuntimeError
-        If scikit-sundae is missing or differs in a way that matters from `WRITTEN_FOR`.
+    Raises RuntimeError if scikit-sundae is missing or differs in a way that matters from `WRITTEN_FOR`.
     """
     try:
         from sksundae._cy_common import config

@@ -40,7 +40,7 @@ ADAPTERS = {
     "DOP853, projected": Adapter("scipy", _of_two(solve_index1, "DOP853", stabilisation="projection")),
     **{f"IDA, {form}": Adapter("sksundae", _of_two(solve_ida, form)) for form in FORMS},
     "IDA from C": Adapter("sksundae", _of_two(solve_ida_c)),
-    "CVODE": Adapter("sksundae", _of_two(solve_cvode, "Adams")),
+    "CVODE": Adapter("sksundae", _of_two(solve_cvode)),
     "CVODE from C, Adams": Adapter("sksundae", _of_two(solve_cvode_c, "Adams")),
     "CVODE from C, BDF": Adapter("sksundae", _of_two(solve_cvode_c, "BDF")),
     "CVODE from C, projected": Adapter("sksundae", _of_two(solve_cvode_c, "BDF", projected=True)),

@@ -8,6 +8,7 @@ from references.equations.least_norm import accelerations as least_norm
 from references.equations.linear import SINGULAR, cholesky
 from references.scipy.index1 import STABILISATIONS, solve_index1
 from tests.general.faulty import SPRING, massless_coordinate
+from tests.mechanisms.make_references import solution
 from tests.problems import moving_pivot, moving_pivot_state, oblique_pendulum, oblique_start, pendulum, worst
 from twoloop import mechanisms, solve_dae
 from twoloop.mechanisms import four_bar, governor, heavy_top, spatial_four_bar, spatial_slider_crank
@@ -67,12 +68,6 @@ def test_singular_matrices():
         accelerations(pendulum(mass=lambda t, q: np.diag([1.0, 0.0])), [0.0], [[1.0], [0.0]], np.zeros((2, 1)))
 
 
-def saddle(M, Cq, Q, Qd):
-    """Accelerations and multipliers by numpy."""
-    matrix = np.block([[M, Cq.T], [Cq, np.zeros((Qd.size, Qd.size))]])
-    return np.split(np.linalg.solve(matrix, np.concatenate([Q, Qd])), [Q.size])
-
-
 SLOW = pytest.mark.slow  # as the heavy top, but larger
 MAKE = [
     four_bar,
@@ -86,7 +81,7 @@ def test_a_mass_that_is_constant_or_singular_alone(make):
     problem = make()
     system, (t0, q, v) = problem.system, (0.0, problem.q0, problem.v0)
     a, lam = accelerations(system, [t0], q[:, None], v[:, None])
-    known = saddle(system.mass(t0, q), system.jacobian(t0, q), system.force(t0, q, v), system.gamma(t0, q, v))
+    known = solution(system, t0, q, v)
     size = max(1.0, *(np.abs(each).max() for each in known))
     assert worst(a[:, 0], known[0]) < 1e-11 * size and worst(lam[:, 0], known[1]) < 1e-11 * size
 
@@ -99,8 +94,7 @@ def test_saddle_points_of_indefinite_matrices(seed):
     M[seed] = M[:, seed] = 0.0
     a, lam = Q.copy(), Qd.copy()
     assert not cholesky(M.copy(), SINGULAR) and saddle_solve(M, Cq, a, lam)
-    for mine, known in zip((a, lam), saddle(M, Cq, Q, Qd), strict=True):
-        assert worst(mine, known) < 1e-10
+    assert worst(M @ a + Cq.T @ lam, Q) < 1e-10 and worst(Cq @ a, Qd) < 1e-10
     Cq[3] = Cq[0] - Cq[1]  # dependent
     assert not saddle_solve(M, Cq, Q.copy(), Qd.copy())
     M[0, 0] = np.nan
@@ -136,9 +130,6 @@ def test_accelerations_and_multipliers_are_those_of_least_norm(make):
     states[0, 3] = np.nan
     found = np.concatenate(least_norm(system, motion.t, states))
     for k in (0, 7, -1):
-        t, q, v = motion.t[k], states[:n, k], states[n:, k]
-        Cq = system.jacobian(t, q)
-        matrix = np.block([[system.mass(t, q), Cq.T], [Cq, np.zeros((len(Cq), len(Cq)))]])
-        right = np.concatenate([system.force(t, q, v), system.gamma(t, q, v)])
-        assert found[:, k] == pytest.approx(np.linalg.lstsq(matrix, right, rcond=None)[0], rel=1e-9, abs=1e-9)
+        known = np.concatenate(solution(system, motion.t[k], states[:n, k], states[n:, k]))
+        assert found[:, k] == pytest.approx(known, rel=1e-9, abs=1e-9)
     assert np.isnan(found[:, 3]).all()

@@ -94,7 +94,6 @@ def test_forces_of_exponentials_and_their_like_are_written_as_code():
 
 # --- what solvers of expressions refuse, and how they fail
 def test_systems_without_expressions_are_refused():
-    pytest.importorskip("sksundae")
     with pytest.raises(ValueError, match="are Python functions, not compiled ones"):
         solve_cvode_c(plain_pendulum(), (0.0, 1.0), [1.0, 0.0], [0.0, 0.0])
 
@@ -110,7 +109,6 @@ def branching(t, q, v, p, Q):
 
 
 def test_a_failure_of_cvode_is_a_result_with_what_came_before_it():
-    pytest.importorskip("sksundae")
     result = solve_cvode_c(
         ConstrainedSystem(**{**PENDULUM, "force": endless}), (0.0, 2.0), [1.0, 0.0], [0.0, 0.0], t_eval=[0.0, 0.5, 1.5]
     )
@@ -119,6 +117,5 @@ def test_a_failure_of_cvode_is_a_result_with_what_came_before_it():
 
 
 def test_callbacks_that_branch_are_refused():
-    pytest.importorskip("sksundae")
     with pytest.raises(ValueError, match="force of 'pendulum': it branches on"):
         solve_cvode_c(ConstrainedSystem(**{**PENDULUM, "force": branching}), (0.0, 2.0), [1.0, 0.0], [0.0, 0.0])

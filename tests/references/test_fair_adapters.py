@@ -124,7 +124,7 @@ def test_implicit_solvers_get_the_analytic_jacobian(monkeypatch):
     solvers = {
         "Radau": lambda: solve_index1(*at, "Radau", 1e-7, 1e-7),
         "BDF": lambda: solve_index1(*at, "BDF", 1e-7, 1e-7),
-        "CVODE": lambda: solve_cvode(*at, "BDF", 1e-7, 1e-7),
+        "CVODE": lambda: solve_cvode(*at, 1e-7, 1e-7),
     }
     exact = {name: solve() for name, solve in solvers.items()}
     monkeypatch.setattr(index1, "straight_line_jacobian", lambda *_: None)

@@ -19,6 +19,7 @@ from references.sundials.residual import FORMS, Implicit, iteration_matrix_at, r
 from tests.problems import PLAIN
 from twoloop import ConstrainedSystem, callback, consistent_state, solve_dae
 from twoloop.mechanisms import four_bar
+from twoloop.problem.given import callbacks_in
 from twoloop.run.record import Status
 
 PROBLEM = four_bar()
@@ -79,17 +80,7 @@ def constraint_rate(t, q, p, Ct):
 
 @cache
 def pendulum(kind=GOOD):
-    system = ConstrainedSystem(
-        n_q=2,
-        n_c=1,
-        mass=mass,
-        force=force,
-        constraint=constraint,
-        jacobian=jacobian,
-        constraint_rate=constraint_rate,
-        parameters=[kind],
-        name="moving pivot",
-    )
+    system = ConstrainedSystem(n_q=2, n_c=1, **callbacks_in(globals()), parameters=[kind], name="moving pivot")
     return system, *consistent_state(system, 0.0, [0.6, -0.8], [0.0, 0.0])
 
 

@@ -7,6 +7,7 @@ from scipy.integrate import solve_ivp
 from references.paper.four_bar_minimal import trajectory
 from references.scipy.index1 import ONE_STEP, STABILISATIONS, solve_index1
 from tests.kernels.adaptive import shared_run
+from tests.mechanisms.make_references import equations
 from tests.problems import LINKAGES, force_residual, pendulum, violations, worst
 from twoloop.run.record import Status
 
@@ -22,10 +23,7 @@ def test_takes_the_steps_of_solve_ivp_on_equations_written_apart():
 
     def rate(t, y):
         q, v = y[:9], y[9:]
-        jacobian = system.jacobian(t, q)
-        matrix = np.block([[system.mass(t, q), jacobian.T], [jacobian, np.zeros((8, 8))]])
-        right = np.concatenate([system.force(t, q, v), system.gamma(t, q, v)])
-        return np.concatenate([v, np.linalg.solve(matrix, right)[:9]])
+        return np.concatenate([v, np.linalg.solve(*equations(system, t, q, v))[:9]])
 
     theirs = solve_ivp(rate, (0.0, 1.0), np.append(problem.q0, problem.v0), "DOP853", rtol=1e-8, atol=1e-8)
     ours = run("default", 1.0)

@@ -8,6 +8,7 @@ import pytest
 
 from references.equations.straight_line import straight_line, straight_line_jacobian
 from references.sundials import cvode_c
+from references.sundials import library as sundials
 from references.sundials.cvode_c import solve_cvode_c
 from references.sundials.cvode_projection import projection_for_cvode
 from references.sundials.ida_c import solve_ida_c
@@ -15,6 +16,7 @@ from studies.bench.figures import STYLES
 from studies.bench.solvers import CATALOGUE, CVODE_C_PROJECTED, IDA_C_STATES, RIVALS
 from twoloop import ConstrainedSystem, callback
 from twoloop.mechanisms import double_pendulum, four_bar, projection_pendulum, spatial_slider_crank
+from twoloop.problem.given import callbacks_in
 
 FOUR_BAR = four_bar()
 PENDULUM = projection_pendulum()
@@ -33,7 +35,6 @@ def error(problem, result):
 
 
 def test_ida_tests_positions_and_velocities_without_the_integrals_of_the_multipliers():
-    pytest.importorskip("sksundae")
     made = {test: run(solve_ida_c, FOUR_BAR, 1e-7, 1e-7, error_test=test) for test in ("states", "positions")}
     assert 1e-9 < error(FOUR_BAR, made["states"]) < 2e-4
     assert made["positions"].stats.n_accepted < 0.8 * made["states"].stats.n_accepted
@@ -77,18 +78,7 @@ def gamma(t, q, v, p, Qd):
     Qd[1] = 2.0 * Qd[0]
 
 
-DRIVEN = ConstrainedSystem(
-    n_q=3,
-    n_c=2,
-    mass=mass,
-    force=force,
-    constraint=constraint,
-    jacobian=jacobian,
-    gamma=gamma,
-    constraint_rate=constraint_rate,
-    parameters=[0.7],
-    name="singular mass",
-)
+DRIVEN = ConstrainedSystem(n_q=3, n_c=2, **callbacks_in(globals()), parameters=[0.7], name="singular mass")
 STATES = {
     "singular mass": (DRIVEN, np.array([0.5, 0.4, 0.2]), np.array([0.3, -0.2, 0.1])),
     "double pendulum": (DOUBLE.system, DOUBLE.q0, DOUBLE.v0),
@@ -115,7 +105,6 @@ def test_the_jacobian_of_the_accelerations_is_their_derivative(name):
 
 
 def test_cvode_takes_the_analytic_jacobian_and_differences_of_what_is_too_long(monkeypatch):
-    pytest.importorskip("sksundae")
     exact = run(solve_cvode_c, PENDULUM, "BDF", 1e-9, 1e-9, t_end=2.0)
     monkeypatch.setattr(cvode_c, "_jacobian", lambda *_: None)
     differenced = run(solve_cvode_c, PENDULUM, "BDF", 1e-9, 1e-9, t_end=2.0)
@@ -137,7 +126,6 @@ def kept(system, t, q, v):
 
 
 def test_cvode_keeps_the_constraints_that_it_projects_onto():
-    pytest.importorskip("sksundae")
     problem = PENDULUM
     free, made = (run(solve_cvode_c, problem, "BDF", 1e-8, 1e-8, projected=each) for each in (False, True))
     assert 1e-14 < error(problem, made) < 6e-5
@@ -147,8 +135,6 @@ def test_cvode_keeps_the_constraints_that_it_projects_onto():
 
 
 def test_the_projection_is_the_shortest_one_and_projects_the_error():
-    sundials = pytest.importorskip("references.sundials.library")
-    pytest.importorskip("sksundae")
     rng, t, f = np.random.default_rng(2), 0.3, DRIVEN.functions
     projection, size = projection_for_cvode(*f[2:5], 3, 2, 1)
     data = np.zeros(size)

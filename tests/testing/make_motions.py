@@ -11,6 +11,7 @@ from itertools import pairwise
 import numpy as np
 from scipy.integrate import solve_ivp
 
+from references.plain_equations import rate_of
 from tests.mechanisms.motions import planar, spatial
 from tests.mechanisms.motions.integrate import by_scipy
 from tests.testing.systems import system_of
@@ -56,14 +57,10 @@ def projected(problem, t, q, v):
 
 def by_index_1(problem, q0, v0, times):
     """States (n_t, n_q) at times by SciPy's DOP853 from one to the next."""
-    n, states = problem.n_q, [np.concatenate([q0, v0])]
-
-    def rate(t, y):
-        return np.concatenate([y[n:], problem.acceleration(t, y[:n], y[n:])[0]])
-
-    for start, end in pairwise(times):
-        y = solve_ivp(rate, (start, end), states[-1], "DOP853", **TIGHT).y[:, -1]
-        states.append(np.concatenate(projected(problem, end, y[:n], y[n:])))
+    states = [np.concatenate([q0, v0])]
+    for span in pairwise(times):
+        y = solve_ivp(lambda t, y: rate_of(problem, t, y), span, states[-1], "DOP853", **TIGHT).y[:, -1]
+        states.append(np.concatenate(projected(problem, span[1], *np.split(y, 2))))
     return np.split(np.array(states), 2, axis=1)
 
 

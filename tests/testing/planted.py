@@ -1,265 +1,134 @@
 """Faults to plant into the integrators of docs/examples: which text becomes which, and what a check should say."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import ModuleType
 
 EXAMPLES = Path(__file__).parents[2] / "docs" / "examples"
 RK, ALPHA, RATTLE = "runge_kutta", "generalised_alpha", "rattle"
 ORDERS = {RK: 4.0, ALPHA: 2.0, RATTLE: 2.0}
+STEPS, FINE = (100, 200), (100, 200, 400)
 
 
 @dataclass(frozen=True)
 class Planted:
-    """A fault: where, which text becomes which, a problem on which it shows, words of the hint, and steps."""
+    """A fault: where, a problem on which it shows, words of the hint, steps, and which texts become which."""
 
     name: str
     example: str
-    old: str
-    new: str
     problem: str
     words: str
-    steps: tuple[int, ...] = (100, 200)
+    steps: tuple[int, ...] = STEPS
+    edits: list[tuple[str, str]] = field(default_factory=list)
 
 
-def module_of(example, old="", new=""):
-    """An example as a module, a text of it replaced."""
+def module_of(example, edits=()):
+    """An example as a module, some texts of it replaced."""
     source = (EXAMPLES / f"{example}.py").read_text(encoding="utf-8")
-    assert old in source, f"{example}.py has no {old!r}"
+    for old, new in edits:
+        assert old in source, f"{example}.py has no {old!r}"
+        source = source.replace(old, new)
     module = ModuleType(example)
-    exec(compile(source.replace(old, new) if old else source, f"{example}.py", "exec"), vars(module))
+    exec(compile(source, f"{example}.py", "exec"), vars(module))
     return module
 
 
-MARCH = """            q, v = step_on(problem, t, h, q, v)
-            t = end if k == n - 1 else t + h
-        rows.append((q, v))"""
-PROJECTED = "            q, v = projected(problem, t, q, v)\n"
-LATE = """            J = problem.jacobian({})
-            v = v - np.linalg.lstsq(J, J @ v + problem.constraint_rate({}), rcond=1e-10)[0]
+# name, example, problem, words and, of faults that few steps do not show, "fine"; below, texts and what they become
+TABLE = """
+gamma has the other sign | runge_kutta | four_bar | gamma
+    problem.gamma(t, q, v) => -problem.gamma(t, q, v)
+gamma is left out | runge_kutta | driven_crank | gamma
+    problem.gamma(t, q, v) => 0.0 * problem.gamma(t, q, v)
+C_tt is left out | runge_kutta | driven_crank | C_tt
+    problem.gamma(t, q, v) => problem.gamma(0.0, q, v)
+lam has the other sign | runge_kutta | pendulum | other sign
+    both[n:] * heavy => -both[n:] * heavy
+a wrong weight | runge_kutta | pendulum | order
+    2.0 * v2 + 2.0 * v3 + v4 => v2 + 3.0 * v3 + v4
+stages at the start of the step | runge_kutta | driven_crank | order
+    (problem, t + 0.5 * h, => (problem, t,
+no projection | runge_kutta | pendulum | Project
+    q, v = projected(problem, t, q, v) => pass
+C_t is left out of the projection | runge_kutta | driven_crank | C_t is left out
+    J @ v + problem.constraint_rate(t, q) => J @ v
+gyroscopic forces are left out | runge_kutta | heavy_top | gyroscopic
+    problem.force(t, q, v) => problem.force(t, q, 0.0 * v)
+only the diagonal of M | runge_kutta | andrews | diagonal
+    M, J = problem.mass(t, q) => M, J = np.diag(np.diag(problem.mass(t, q)))
+M of the start | runge_kutta | andrews | mass matrix is that of the start
+    M, J = problem.mass(t, q) => M, J = problem.mass(t, problem.q0)
+gravity is fixed along -y | runge_kutta | pendulum | direction is fixed
+    problem.force(t, q, v) / heavy => M @ [0.0, -9.81] / heavy
+forces 1 % too large | runge_kutta | pendulum | forces are 1.01 times
+    problem.force(t, q, v) / heavy => 1.01 * problem.force(t, q, v) / heavy
+a matrix with units | runge_kutta | driven_crank | unit
+    np.abs(M).max(), np.linalg.norm(J, axis=1) => 1.0, np.ones(m)
+rows one time late | runge_kutta | pendulum | late
+    np.array(each) for => np.array((each[0], *each[:-1])) for
+angles jump back | runge_kutta | crank_rocker | whole turns
+    np.array(each) for => np.arctan2(np.sin(np.array(each)), np.cos(np.array(each))) for
+silent without convergence | generalised_alpha | out_of_reach | Success with a wrong answer
+    raise RuntimeError(f"Newton => return new_q, new_v, new_a, new_between, lam; raise RuntimeError(f"Newton
+Newton stops early | generalised_alpha | four_bar | too early
+    < 1e-13 => < 1e-4
+a wrong gamma of Newmark | generalised_alpha | pendulum | order
+    GAMMA = 0.5 => GAMMA = 0.6
+forces of the start of the step | generalised_alpha | andrews | First order
+    problem.force(t + h, new_q, new_v) => problem.force(t, q, v)
+impulses for multipliers | generalised_alpha | pendulum | impulses
+    rows.append((q, v, lam)) => rows.append((q, v, lam * step))
+velocities of the middle | rattle | pendulum | middle of the step
+    q, v = step_on(problem, t, h, q, v) => before, (q, v) = q, step_on(problem, t, h, q, v)
+    rows.append((q, v)) => rows.append((q, (q - before) / h))
+velocities are not projected | rattle | pendulum | velocit
+    return q, free + change => return q, free
+the drive of the start of the step | rattle | driven_crank | another instant
+    -problem.constraint(t + h, q => -problem.constraint(t, q
+# found by trying what no hint had been written for
+forces at the time of the start | runge_kutta | shaken_spring | time at the start
+    problem.force(t, q => problem.force(problem.t_span[0], q
+forces at the time since the start | runge_kutta | shaken_spring | not at 0
+    force(t, q => force(t - problem.t_span[0], q
+forces of the first positions | runge_kutta | shaken_spring | positions at the start
+    force(t, q, v) => force(t, problem.q0, v)
+gravity of one body has the other sign | runge_kutta | shaken_spring | force on q[3] (y) is of the other sign
+    problem.force(t, q, v) / heavy => problem.force(t, q, v) * np.where(np.arange(n) == 3, -1.0, 1.0) / heavy
+the second half-step's force is the first's | rattle | shaken_spring | First order
+    problem.force(t, q, middle) => force
+C_t of one step before | runge_kutta | driven_crank | of one step before
+    projected(problem, t, q, v) => projected(problem, t, q, v, h)
+    problem.constraint_rate(t, q) => problem.constraint_rate(t - h, q)
+C_q of one step before | runge_kutta | driven_crank | of one step before
+    projected(problem, t, q, v) => projected(problem, t, q, v, h)
+    J = problem.jacobian(t, q) => J = problem.jacobian(t - h, q - h * v)
+steps that have a longest | runge_kutta | pendulum | clock
+    h = (end - t) / n => h = min((end - t) / n, 0.005)
+a smallest step | runge_kutta | pendulum | a bound of its own | fine
+    n = round((end - t) / step) => n = min(2, round((end - t) / step))
+a projection that adds | runge_kutta | pendulum | a sign in a projection | fine
+    return q, v - np => return q, v + np
+a factor on the velocities | runge_kutta | pendulum | a factor on the velocities | fine
+    return q, v - np => return q, (1.0 - 1e-6) * v - np
+impulses along the rows of the end | rattle | pendulum | First order
+    solved(M, to, J, 0 => solved(M, J, J, 0
+single precision | runge_kutta | pendulum | single precision
+    return q, v - np.linalg => return q, np.float32(v) - np.linalg
+a little damping | generalised_alpha | shaken_spring | a damping | fine
+    force(t + h, new_q, new_v) => force(t + h, new_q, new_v) - 1e-3 * new_v
+multipliers of the middle | generalised_alpha | pendulum | another instant
+    rows.append((q, v, lam)) => rows.append((q, v, 0.5 * (lam + rows[-1][2])))
 """
-SHAKEN, FINE = "shaken_spring", (100, 200, 400)
-FAULTS = [
-    Planted("gamma has the other sign", RK, "problem.gamma(t, q, v)", "-problem.gamma(t, q, v)", "four_bar", "gamma"),
-    Planted("gamma is left out", RK, "problem.gamma(t, q, v)", "0.0 * problem.gamma(t, q, v)", "driven_crank", "gamma"),
-    Planted("C_tt is left out", RK, "problem.gamma(t, q, v)", "problem.gamma(0.0, q, v)", "driven_crank", "C_tt"),
-    Planted("lam has the other sign", RK, "both[n:] * heavy", "-both[n:] * heavy", "pendulum", "other sign"),
-    Planted("a wrong weight", RK, "2.0 * v2 + 2.0 * v3 + v4", "v2 + 3.0 * v3 + v4", "pendulum", "order"),
-    Planted("stages at the start of the step", RK, "(problem, t + 0.5 * h,", "(problem, t,", "driven_crank", "order"),
-    Planted("no projection", RK, "            q, v = projected(problem, t, q, v)\n", "", "pendulum", "Project"),
-    Planted(
-        "C_t is left out of the projection",
-        RK,
-        "J @ v + problem.constraint_rate(t, q)",
-        "J @ v",
-        "driven_crank",
-        "C_t is left out",
-    ),
-    Planted(
-        "gyroscopic forces are left out",
-        RK,
-        "problem.force(t, q, v)",
-        "problem.force(t, q, 0.0 * v)",
-        "heavy_top",
-        "gyroscopic",
-    ),
-    Planted(
-        "only the diagonal of M",
-        RK,
-        "M, J = problem.mass(t, q)",
-        "M, J = np.diag(np.diag(problem.mass(t, q)))",
-        "andrews",
-        "diagonal",
-    ),
-    Planted(
-        "M of the start",
-        RK,
-        "M, J = problem.mass(t, q)",
-        "M, J = problem.mass(t, problem.q0)",
-        "andrews",
-        "mass matrix is that of the start",
-    ),
-    Planted(
-        "gravity is fixed along -y",
-        RK,
-        "problem.force(t, q, v) / heavy",
-        "M @ [0.0, -9.81] / heavy",
-        "pendulum",
-        "direction is fixed",
-    ),
-    Planted(
-        "forces 1 % too large",
-        RK,
-        "problem.force(t, q, v) / heavy",
-        "1.01 * problem.force(t, q, v) / heavy",
-        "pendulum",
-        "forces are 1.01 times",
-    ),
-    Planted(
-        "a matrix with units",
-        RK,
-        "np.abs(M).max(), np.linalg.norm(J, axis=1)",
-        "1.0, np.ones(m)",
-        "driven_crank",
-        "unit",
-    ),
-    Planted("rows one time late", RK, "np.array(each) for", "np.array((each[0], *each[:-1])) for", "pendulum", "late"),
-    Planted(
-        "angles jump back",
-        RK,
-        "np.array(each) for",
-        "np.arctan2(np.sin(np.array(each)), np.cos(np.array(each))) for",
-        "crank_rocker",
-        "whole turns",
-    ),
-    Planted(
-        "silent without convergence",
-        ALPHA,
-        '    raise RuntimeError(f"Newton',
-        '    return new_q, new_v, new_a, new_between, lam\n    raise RuntimeError(f"Newton',
-        "out_of_reach",
-        "Success with a wrong answer",
-    ),
-    Planted("Newton stops early", ALPHA, "< 1e-13", "< 1e-4", "four_bar", "too early"),
-    Planted("a wrong gamma of Newmark", ALPHA, "GAMMA = 0.5", "GAMMA = 0.6", "pendulum", "order"),
-    Planted(
-        "forces of the start of the step",
-        ALPHA,
-        "problem.force(t + h, new_q, new_v)",
-        "problem.force(t, q, v)",
-        "andrews",
-        "First order",
-    ),
-    Planted(
-        "impulses for multipliers",
-        ALPHA,
-        "rows.append((q, v, lam))",
-        "rows.append((q, v, lam * step))",
-        "pendulum",
-        "impulses",
-    ),
-    Planted(
-        "velocities of the middle",
-        RATTLE,
-        MARCH,
-        MARCH.replace("q, v =", "before, (q, v) = q,").replace("((q, v))", "((q, (q - before) / h))"),
-        "pendulum",
-        "middle of the step",
-    ),
-    Planted("velocities are not projected", RATTLE, "return q, free + change", "return q, free", "pendulum", "velocit"),
-    Planted(
-        "the drive of the start of the step",
-        RATTLE,
-        "-problem.constraint(t + h, q",
-        "-problem.constraint(t, q",
-        "driven_crank",
-        "another instant",
-    ),
-    # found by trying what no hint had been written for
-    Planted(
-        "forces at the time of the start",
-        RK,
-        "problem.force(t, q",
-        "problem.force(problem.t_span[0], q",
-        SHAKEN,
-        "time at the start",
-    ),
-    Planted(
-        "forces at the time since the start", RK, "force(t, q", "force(t - problem.t_span[0], q", SHAKEN, "not at 0"
-    ),
-    Planted(
-        "forces of the first positions",
-        RK,
-        "force(t, q, v)",
-        "force(t, problem.q0, v)",
-        SHAKEN,
-        "positions at the start",
-    ),
-    Planted(
-        "gravity of one body has the other sign",
-        RK,
-        "problem.force(t, q, v) / heavy",
-        "problem.force(t, q, v) * np.where(np.arange(n) == 3, -1.0, 1.0) / heavy",
-        SHAKEN,
-        "force on q[3] (y) is of the other sign",
-    ),
-    Planted(
-        "the second half-step's force is the first's",
-        RATTLE,
-        "problem.force(t, q, middle)",
-        "force",
-        SHAKEN,
-        "First order",
-    ),
-    Planted(
-        "C_t of one step before",
-        RK,
-        PROJECTED,
-        PROJECTED + LATE.format("t, q", "t - h, q"),
-        "driven_crank",
-        "of one step before",
-    ),
-    Planted(
-        "C_q of one step before",
-        RK,
-        PROJECTED,
-        PROJECTED + LATE.format("t - h, q - h * v", "t, q"),
-        "driven_crank",
-        "of one step before",
-    ),
-    Planted("steps that have a longest", RK, "h = (end - t) / n", "h = min((end - t) / n, 0.005)", "pendulum", "clock"),
-    Planted(
-        "a smallest step",
-        RK,
-        "n = round((end - t) / step)",
-        "n = min(2, round((end - t) / step))",
-        "pendulum",
-        "a bound of its own",
-        FINE,
-    ),
-    Planted(
-        "a projection that adds", RK, "return q, v - np", "return q, v + np", "pendulum", "a sign in a projection", FINE
-    ),
-    Planted(
-        "a factor on the velocities",
-        RK,
-        "return q, v - np",
-        "return q, (1.0 - 1e-6) * v - np",
-        "pendulum",
-        "a factor on the velocities",
-        FINE,
-    ),
-    Planted(
-        "impulses along the rows of the end",
-        RATTLE,
-        "solved(M, to, J, 0",
-        "solved(M, J, J, 0",
-        "pendulum",
-        "First order",
-    ),
-    Planted(
-        "single precision",
-        RK,
-        "return q, v - np.linalg",
-        "return q, np.float32(v) - np.linalg",
-        "pendulum",
-        "single precision",
-    ),
-    Planted(
-        "a little damping",
-        ALPHA,
-        "force(t + h, new_q, new_v)",
-        "force(t + h, new_q, new_v) - 1e-3 * new_v",
-        SHAKEN,
-        "a damping",
-        FINE,
-    ),
-    Planted(
-        "multipliers of the middle",
-        ALPHA,
-        "(q, v, lam))\n    ret",
-        "(q, v, 0.5 * (lam + rows[-1][2])))\n    ret",
-        "pendulum",
-        "another instant",
-    ),
-]
+
+
+def _faults():
+    found = []
+    for line in TABLE.strip().splitlines():
+        if line.startswith("    "):
+            found[-1].edits.append(tuple(line.strip().split(" => ")))
+        elif not line.startswith("#"):
+            name, example, problem, words, *fine = line.split(" | ")
+            found.append(Planted(name, example, problem, words, FINE if fine else STEPS))
+    return found
+
+
+FAULTS = _faults()

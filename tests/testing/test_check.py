@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
+from references.plain_equations import rate_of, start_of
 from tests.testing.planted import ALPHA, FAULTS, ORDERS, RATTLE, RK, module_of
 from tests.testing.systems import system_of
 from twoloop import solve_dae
@@ -38,7 +39,7 @@ def properties_that_fail(report):
     [pytest.param(fault, id=fault.name, marks=[] if fault in QUICK else [pytest.mark.slow]) for fault in FAULTS],
 )
 def test_a_planted_fault_is_found_and_named(fault):
-    module = module_of(fault.example, fault.old, fault.new)
+    module = module_of(fault.example, fault.edits)
     report = check_simulator(module.simulate, fault.problem, steps=fault.steps, order=ORDERS[fault.example])
     assert not report.passed
     assert any(fault.words in failure.hint for failure in report.failures), str(report)
@@ -81,14 +82,9 @@ def test_twoloop_passes_on_every_problem(name):
 
 def by_scipy(problem, times, tolerance):
     """The equations at index 1, which nothing puts back on the constraints."""
-    n = problem.n_q
-
-    def rate(t, y):
-        return np.concatenate([y[n:], problem.acceleration(t, y[:n], y[n:])[0]])
-
-    start = np.concatenate([problem.q0, problem.v0])
-    y = solve_ivp(rate, (times[0], times[-1]), start, t_eval=times, rtol=tolerance, atol=tolerance).y
-    return y[:n].T, y[n:].T
+    options = {"t_eval": times, "rtol": tolerance, "atol": tolerance}
+    y = solve_ivp(lambda t, y: rate_of(problem, t, y), (times[0], times[-1]), start_of(problem), **options).y
+    return tuple(part.T for part in np.split(y, 2))
 
 
 def test_a_tolerance_that_is_not_passed_on():

@@ -11,19 +11,9 @@ from twoloop import mechanisms
 from twoloop.testing import problems
 from twoloop.testing.known_problems import MAKERS, TAGS
 
-OURS = {
-    "pendulum": mechanisms.pendulum,
-    "double_pendulum": mechanisms.double_pendulum,
-    "closed_chain": mechanisms.closed_chain,
-    "parallelogram": lambda: mechanisms.n_four_bar(1),
-    "four_bar": mechanisms.four_bar,
-    "redundant_slider_crank": mechanisms.redundant_slider_crank,
-    "driven_slider_crank": mechanisms.driven_slider_crank,
-    "driven_crank": mechanisms.driven_crank,
-    "andrews": mechanisms.andrews,
-    "heavy_top": mechanisms.heavy_top,
-    "spatial_four_bar": mechanisms.spatial_four_bar,
-}
+SAME_NAME = ("pendulum", "double_pendulum", "closed_chain", "four_bar", "redundant_slider_crank", "driven_slider_crank")
+SAME_NAME += ("driven_crank", "andrews", "heavy_top", "spatial_four_bar")
+OURS = {name: getattr(mechanisms, name) for name in SAME_NAME} | {"parallelogram": lambda: mechanisms.n_four_bar(1)}
 ALL = {name: maker() for name, maker in MAKERS.items()}
 MOVING = {name: problem for name, problem in ALL.items() if problem.reference is not None}
 

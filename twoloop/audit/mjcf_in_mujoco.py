@@ -41,12 +41,8 @@ class InMuJoCo:
     model : SpatialModel
         Of `from_mjcf` of the same file.
 
-    Raises
-    ------
-    RuntimeError
-        If MuJoCo is not installed.
-    ValueError
-        If it refuses the file, or cannot be run without what the model has not.
+    Raises RuntimeError if MuJoCo is not installed. Raises ValueError if it refuses the file, or cannot be run without
+    what the model has not.
     """
 
     def __init__(self, path: str | os.PathLike[str], model: SpatialModel):
@@ -124,10 +120,7 @@ class InMuJoCo:
     def start(self, key: str | None) -> tuple[Array, Array, float]:
         """Joint coordinates and velocities of a keyframe, or of the file's pose, at which loops are closed; the gap.
 
-        Raises
-        ------
-        ValueError
-            If there is no such keyframe, or loops cannot be closed from there.
+        Raises ValueError if there is no such keyframe, or loops cannot be closed from there.
         """
         mujoco, engine = self.mujoco, self.engine
         data = mujoco.MjData(engine)

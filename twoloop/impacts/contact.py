@@ -37,14 +37,6 @@ class Closed:
         getattr(self._system.functions, kind)(t, *state, self._system.functions.p, out)
         return np.asarray(out)
 
-    def mass(self, t: float, q: Array) -> Array:
-        """M."""
-        return self._of("mass", t, q)
-
-    def force(self, t: float, q: Array, v: Array) -> Array:
-        """Q."""
-        return self._of("force", t, q, v)
-
     def constraint(self, t: float, q: Array) -> Array:
         """C, then the gaps."""
         return np.append(self._of("constraint", t, q), self._gaps.at(t, q, self._still).g[self._which])
@@ -67,8 +59,10 @@ class Closed:
         """The system of these."""
         system = self._system
         functions: dict[str, Any] = {
-            kind: getattr(self, kind) for kind in ("mass", "force", "constraint", "jacobian", "constraint_rate")
+            kind: getattr(self, kind) for kind in ("constraint", "jacobian", "constraint_rate")
         }
+        functions["mass"] = lambda t, q: self._of("mass", t, q)
+        functions["force"] = lambda t, q, v: self._of("force", t, q, v)
         if "gamma" in system.given or system.n_c == 0:
             functions["gamma"] = self.gamma
         for kind in system.given:

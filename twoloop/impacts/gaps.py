@@ -36,10 +36,7 @@ class Gaps:
     t0, q0 : float, ndarray (n_q,)
         A state about which what was recorded is compared with the functions.
 
-    Raises
-    ------
-    ValueError
-        If a gap cannot be run on symbols, or does not give what it gave then.
+    Raises ValueError if a gap cannot be run on symbols, or does not give what it gave then.
     """
 
     def __init__(self, stops: Sequence[Stop], t0: float, q0: Array):

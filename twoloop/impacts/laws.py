@@ -7,23 +7,18 @@ from scipy.optimize import lsq_linear, nnls
 
 from twoloop.checks.arguments import Array
 from twoloop.problem.system import ConstrainedSystem
+from twoloop.run.impulse import NEGLIGIBLE, scaled_equations
 
 EVEN = 1e-6  # relative: by how much forces that share a load seek to be alike
 WEIGHT = 1e3  # of that problem, so that its gradients are large beside the tolerance of the solver
 MOST_STEPS = 1000  # of it
-NEGLIGIBLE = 1e-12  # relative: singular values, and eigenvalues, that count as zero
 
 
 def responses(system: ConstrainedSystem, t: float, q: Array, W: Array) -> Array:
     """How impulses at stops change the velocities, (n_q, k): M X + G^T Y = W^T with G X = 0, all constraints held."""
-    mass, rows = system.mass(t, q), system.rows(t, q)
-    size = float(np.abs(mass).max())
-    lengths = np.linalg.norm(rows, axis=1)
-    lengths[lengths == 0.0] = 1.0
-    scaled = rows / lengths[:, None] * size
-    matrix = np.block([[mass, scaled.T], [scaled, np.zeros((len(rows), len(rows)))]])
-    right = np.vstack([W.T, np.zeros((len(rows), len(W)))])
-    return np.linalg.lstsq(matrix, right, rcond=NEGLIGIBLE)[0][: system.n_q]
+    matrix, lengths, _ = scaled_equations(system, t, q)
+    right = np.vstack([W.T, np.zeros((len(lengths), len(W)))])
+    return np.asarray(np.linalg.lstsq(matrix, right, rcond=NEGLIGIBLE)[0][: system.n_q], dtype=float)
 
 
 def complementary(D: Array, b: Array) -> Array:

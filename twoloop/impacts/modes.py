@@ -13,10 +13,11 @@ from twoloop.impacts.contact import Accelerations, Closed
 from twoloop.impacts.gaps import Gap, Gaps
 from twoloop.impacts.joined import Impact, joined
 from twoloop.impacts.laws import NEGLIGIBLE, bounded, complementary, impulses, responses
-from twoloop.impacts.rubbing import IDLE, INDEPENDENT, STICKS, Frictionless, Rubbing, Signs
+from twoloop.impacts.rubbing import IDLE, INDEPENDENT, STICKS, Modes, Signs
 from twoloop.problem.stops import Stop
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.result.result import Result
+from twoloop.run.impulse import corrected
 from twoloop.run.record import Status
 from twoloop.solve import solve_dae
 
@@ -26,7 +27,6 @@ ROUNDING = 1e-13  # of the largest coordinate, at least
 LEAST_STEP = 1e-9  # s, or relative: the first of an arc
 NOTHING = 1e-20  # m or rad, also over s: coordinates and rates that rounding alone keeps from zero
 STANDS = 1e-13  # relative: arcs that are shorter do not move on in time ...
-CORRECTIONS = 3  # of positions, by Newton's method
 MOST_STANDING = 30  # ... and so many of them in a row end the motion
 REST = 1e-10  # of the largest velocities of the last arc: rates of joints that count as zero
 RELEASED = 1e-7  # relative: less than its friction holds a joint that it has just released
@@ -43,16 +43,14 @@ class Motion:
     Parameters
     ----------
     stops : sequence of Stop
-    rubs : Rubbing or Frictionless
+    rubs : Modes
         The system in its modes.
     t, q, v : float, ndarray (n_q,), ndarray (n_q,)
     options : dict
         Of runs.
     """
 
-    def __init__(
-        self, stops: Sequence[Stop], rubs: Rubbing | Frictionless, t: float, q: Array, v: Array, options: dict[str, Any]
-    ):
+    def __init__(self, stops: Sequence[Stop], rubs: Modes, t: float, q: Array, v: Array, options: dict[str, Any]):
         self.system, self.rubs, self.stops, self.options = rubs.system, rubs, list(stops), options
         self.t, self.q, self.v = t, q, v
         self.e = np.array([stop.restitution for stop in stops])
@@ -257,9 +255,7 @@ class Motion:
 
     def _close(self, system: ConstrainedSystem, resting: tuple[int, ...]) -> None:
         """Put the state on the constraints of a mode, from which it is off by less than the tolerances."""
-        for _ in range(CORRECTIONS):
-            rows, off = system.jacobian(self.t, self.q), system.constraint(self.t, self.q)
-            self.q = self.q - np.linalg.lstsq(rows, off, rcond=NEGLIGIBLE)[0]
+        self.q = corrected(system, self.t, self.q)
         if resting:
             self.q[np.abs(self.q) < NOTHING] = 0.0
             gap = self.gaps.at(self.t, self.q, self.v)

@@ -10,29 +10,15 @@ from numpy.typing import ArrayLike
 
 from twoloop.checks.arguments import check_positive, check_span, check_times, check_tolerance, check_vector, shown
 from twoloop.impacts.modes import Motion
-from twoloop.impacts.rubbing import Frictionless
+from twoloop.impacts.rubbing import Modes
 from twoloop.methods.plan import Method
 from twoloop.problem.stops import Stop
 from twoloop.problem.system import ConstrainedSystem, check_system
 from twoloop.result.result import Result
 from twoloop.solve import solve_dae
 
-OF_A_RUN = {
-    *(
-        "system",
-        "t_span",
-        "q0",
-        "v0",
-        "method",
-        "rtol",
-        "atol",
-        "t_eval",
-        "events",
-        "dense_output",
-        "step_size",
-        "store",
-    )
-}
+OF_A_RUN = {"system", "t_span", "q0", "v0", "method", "rtol", "atol", "t_eval", "step_size"}
+OF_A_RUN |= {"events", "dense_output", "store"}
 
 
 def solve_with_stops(
@@ -93,7 +79,7 @@ def solve_with_stops(
         raise TypeError(f"stops must be a Stop or a list of them; given {shown(stops)}")
     options |= checked_options("solve_with_stops", options, method, rtol, atol, system.n_q)
     times = None if t_eval is None else check_times(t_eval, t0, t1, None)
-    return Motion(stops, Frictionless(system), t0, q, v, options).to(t1, times)
+    return Motion(stops, Modes(system), t0, q, v, options).to(t1, times)
 
 
 def checked_options(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -19,15 +19,13 @@ STICKS, IDLE = 0, None  # held by friction, or by stops and other joints that ho
 INDEPENDENT = 1e-9  # of how a joint yields alone, over the same of a free body
 
 
-class Frictionless:
-    """A system in which nothing sticks: it has one mode."""
-
-    n = 0
-    most = kinetic = np.zeros(0)
-    frozen: ClassVar[dict[int, float]] = {}
+class Modes:
+    """The modes of a system; here of one in which nothing sticks, which has one."""
 
     def __init__(self, system: ConstrainedSystem):
-        self.system = system
+        self.system, self.n = system, 0
+        self.most = self.kinetic = np.zeros(0)
+        self.frozen: dict[int, float] = {}  # friction of joints that are IDLE
 
     def along(self, q: Array, k: int | None = None) -> Array:
         """No directions."""
@@ -46,30 +44,27 @@ class Frictionless:
         return self.system, {}
 
     def turned(self, k: int, system: ConstrainedSystem, row: int, t: float, q: Array) -> float:
-        """Nothing is."""
-        raise NotImplementedError
+        """Sign of the row of a joint that sticks against the direction in which it slides."""
+        return float(np.sign(system.jacobian(t, q)[row] @ self.along(q, k)))
 
 
-class Rubbing:
+class Rubbing(Modes):
     """A model with dry friction in joints, each of which slides, with a sign, or sticks: 0.
 
     Parameters
     ----------
     problem : ModelProblem
 
-    Raises
-    ------
-    ValueError
-        If a joint cannot slide by itself.
+    Raises ValueError if a joint cannot slide by itself.
     """
 
     def __init__(self, problem: ModelProblem):
         assert problem.model is not None
-        self.system, self._problem, self._model, self._rubs = problem.system, problem, problem.model, problem.model.dry
+        super().__init__(problem.system)
+        self._problem, self._model, self._rubs = problem, problem.model, problem.model.dry
         self.n, self.most = len(self._rubs), np.array([rub.static for rub in self._rubs])
         self.kinetic = np.array([rub.kinetic for rub in self._rubs])
         self._pulls = [self._model.pull(rub, problem.parameters) for rub in self._rubs]
-        self.frozen: dict[int, float] = {}  # friction of joints that are IDLE
         self._lasting: dict[tuple[int | None, ...], ConstrainedSystem] = {}
         self._check_independent(problem.t_span[0], problem.q0)
 
@@ -125,10 +120,6 @@ class Rubbing:
         said = f", {', '.join(names)} sticks" if names else ""
         system, rows = self._made(self._problem.name + said, signs, held, t, q)
         return system, {k: rows[rub.name][0] for k, rub in enumerate(self._rubs) if rub.name in names}
-
-    def turned(self, k: int, system: ConstrainedSystem, row: int, t: float, q: Array) -> float:
-        """Sign of the row of a joint that sticks against the direction in which it slides."""
-        return float(np.sign(system.jacobian(t, q)[row] @ self.along(q, k)))
 
     def _made(
         self, name: str, signs: Signs, held: dict[str, float], t: float, q: Array

@@ -38,10 +38,7 @@ def code_for(
     What is left open depends on the arguments of the call alone, so that the same call gives the same numbers whatever
     ran before it.
 
-    Raises
-    ------
-    ValueError
-        If code is asked for and does not go with the method, or cannot be had.
+    Raises ValueError if code is asked for and does not go with the method, or cannot be had.
     """
     if compiled is True:
         _refuse(method, fixed)

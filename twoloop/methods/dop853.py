@@ -5,12 +5,11 @@ from typing import Literal
 
 import numpy as np
 
-from twoloop.checks.arguments import check_choice
 from twoloop.generate.stage_code import compiled_stages
 from twoloop.generate.straight_code import OwnCode
 from twoloop.generate.traced_values import Check, unchecked
 from twoloop.methods import dop853_tableau as tableau
-from twoloop.methods.plan import INNER_TOL, LARGEST_MOVE, ROUGH, Plan, check_tolerances, least_tolerance
+from twoloop.methods.plan import INNER_TOL, LARGEST_MOVE, ROUGH, Plan, check_choices, check_tolerances, least_tolerance
 from twoloop.problem.system import ConstrainedSystem
 
 COARSE_SHARE = 0.1  # of the estimate of order 3 beside that of order 5
@@ -63,7 +62,7 @@ class DOP853:
     code: OwnCode | None = None  # made for one system; solve_dae puts it in
 
     def __post_init__(self) -> None:
-        check_choice("stages", self.stages, ("free", "restored"))
+        check_choices(self)
         check_tolerances(self, "inner_tol")
 
     @property

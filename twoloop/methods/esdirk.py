@@ -6,8 +6,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from twoloop.checks.arguments import check_choice
-from twoloop.methods.plan import INNER_TOL, LEAST_ERROR, Plan, check_tolerances, least_tolerance
+from twoloop.methods.plan import INNER_TOL, LEAST_ERROR, Plan, check_choices, check_tolerances, least_tolerance
 
 Array = NDArray[np.float64]
 
@@ -93,9 +92,8 @@ class ESDIRK:
     tested: Literal["all", "positions"] = "positions"
 
     def __post_init__(self) -> None:
-        check_choice("formula", self.formula, tuple(FORMULAS))
+        check_choices(self)
         check_tolerances(self, "inner_tol", "outer_tol")
-        check_choice("tested", self.tested, ("all", "positions"))
 
     @property
     def name(self) -> str:

@@ -1,12 +1,12 @@
 """What a method hands to a run: its plan; and what the methods share."""
 
-from dataclasses import dataclass
-from typing import Any, Protocol
+from dataclasses import dataclass, fields
+from typing import Any, Literal, Protocol, get_args, get_origin
 
 import numpy as np
 from numpy.typing import NDArray
 
-from twoloop.checks.arguments import check_positive
+from twoloop.checks.arguments import check_choice, check_positive
 from twoloop.kernels.compile.caches import Newest
 
 Array = NDArray[np.float64]
@@ -110,6 +110,13 @@ def check_tolerances(method: Method, *names: str) -> None:
     for name in names:
         if getattr(method, name) is not None:
             check_positive(name, getattr(method, name))
+
+
+def check_choices(method: Any) -> None:
+    """Raise unless each option that is one of some words is one of these."""
+    for option in fields(method):
+        if get_origin(option.type) is Literal:
+            check_choice(option.name, getattr(method, option.name), get_args(option.type))
 
 
 _PLANS = Newest()  # of methods that do not look at the system

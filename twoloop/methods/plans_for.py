@@ -18,10 +18,7 @@ def plans_for(
 ) -> Plans:
     """The plans of a run.
 
-    Raises
-    ------
-    ValueError
-        If the method cannot run the system.
+    Raises ValueError if the method cannot run the system.
     """
     key = (id(method), rtol, atol, fixed, None if code is None else code.shared.equations.choice)
     kept: dict[tuple[object, ...], Plans] = system.remembered("plans", dict)

@@ -5,9 +5,9 @@ from typing import Literal
 
 import numpy as np
 
-from twoloop.checks.arguments import check_choice, shown
+from twoloop.checks.arguments import shown
 from twoloop.methods.auto import switching
-from twoloop.methods.plan import INNER_TOL, LEAST_ERROR, ROUGH, Plan, check_tolerances, outer_tolerance
+from twoloop.methods.plan import INNER_TOL, LEAST_ERROR, ROUGH, Plan, check_choices, check_tolerances, outer_tolerance
 from twoloop.methods.tableaux import Tableau
 
 NEWTON_TOL_FIXED = 1e-12  # the outer tolerance of fixed steps where stiff forces magnify rounding
@@ -96,14 +96,9 @@ class RungeKutta:
             )
         if np.diff(np.sort(self.tableau.c)).min(initial=1.0) < 1e-10:
             raise ValueError(f"tableau must have distinct nodes; those of {self.tableau.name} are {self.tableau.c}")
-        check_choice("outer", self.outer, ("auto", "fixed-point", "newton", "paper"))
-        check_choice("variables", self.variables, ("velocities", "momenta"))
-        check_choice("partition", self.partition, ("lasting", "symmetric"))
-        check_choice("error", self.error, ("richardson", "richardson-paper"))
-        check_choice("tested", self.tested, ("all", "positions"))
+        check_choices(self)
         if self.tested == "positions" and self.outer not in ("auto", "newton"):
             raise ValueError(f"tested='positions' goes with outer='newton' or 'auto' only; given {self.outer!r}")
-        check_choice("outer_test", self.outer_test, ("all", "independent"))
         if self.outer != "fixed-point" and self.variables != "velocities":
             raise ValueError(f"outer={self.outer!r} goes with variables='velocities' only; given {self.variables!r}")
         if self.outer == "paper" and self.partition != "lasting":

@@ -194,10 +194,7 @@ def _why_not(runs: Runs, rows: Sequence[Row], target: float) -> str:
 def chosen(rows: Iterable[Row], mechanism: str, t_end: float | None = None) -> list[Row]:
     """The rows of a mechanism, and of a span, if it is given.
 
-    Raises
-    ------
-    ValueError
-        If there are none.
+    Raises ValueError if there are none.
     """
     rows = list(rows)
     names = {row["mechanism"] for row in rows}
@@ -217,10 +214,7 @@ def leaderboard(
 ) -> str:
     """The boards of a mechanism at an error as text, of the rows that are shipped and of those in files.
 
-    Raises
-    ------
-    ValueError
-        If an argument is out of range, a file is not in the format, or there are no rows.
+    Raises ValueError if an argument is out of range, a file is not in the format, or there are no rows.
     """
     if not 0.0 < target < 1.0:
         raise ValueError(f"--error must be between 0 and 1; given {target:g}")

@@ -212,10 +212,7 @@ def _shown(value: Any) -> str:
 def read_lines(path: Path) -> list[str]:
     """The lines of a file, or of one that gzip has made (.gz).
 
-    Raises
-    ------
-    ValueError
-        If it cannot be read.
+    Raises ValueError if it cannot be read.
     """
     try:
         with gzip.open(path) if path.suffix == ".gz" else path.open("rb") as file:
@@ -230,10 +227,7 @@ def read_lines(path: Path) -> list[str]:
 def read_rows(path: Path) -> list[Row]:
     """The rows of a file.
 
-    Raises
-    ------
-    ValueError
-        If it cannot be read, has none, or a row has a mistake.
+    Raises ValueError if it cannot be read, has none, or a row has a mistake.
     """
     rows, wrong = mistakes(read_lines(path))
     if wrong:

@@ -35,10 +35,7 @@ def digest_of(what: str, value: Any) -> str:
         What the value is, for the message.
     value : object
 
-    Raises
-    ------
-    ValueError
-        If it reaches something whose state cannot be read, such as an open file or a lock.
+    Raises ValueError if it reaches something whose state cannot be read, such as an open file or a lock.
     """
     digest = _OfFunctions()
     try:

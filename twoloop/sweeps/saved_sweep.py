@@ -34,10 +34,7 @@ class Settings:
 def settings(work: tuple[Any, Any, dict[str, Any]]) -> Settings:
     """What the rows of a sweep depend on.
 
-    Raises
-    ------
-    ValueError
-        If something that a function reaches cannot be compared.
+    Raises ValueError if something that a function reaches cannot be compared.
     """
     problem_of, measure, options = work
     words = [described(problem_of), described(measure)] + [described(options)] * bool(options)
@@ -58,10 +55,7 @@ def write(table: Any, path: Path, made_with: Settings) -> None:
 def read(pandas: Any, path: Path, given: list[dict[str, Any]], made_with: Settings) -> dict[int, dict[str, Any]]:
     """The rows of a file by their numbers; none where there is no file.
 
-    Raises
-    ------
-    ValueError
-        If the file is not of this sweep: of other functions, options or parameters.
+    Raises ValueError if the file is not of this sweep: of other functions, options or parameters.
     """
     needed("pyarrow", "pyarrow", "out=")
     if not path.parent.is_dir():

@@ -32,12 +32,7 @@ def in_processes(task: Task, inputs: dict[int, Any], n_workers: int) -> Iterator
     (int, object, str)
         The number of an input and what was made of it, or None and how the worker died.
 
-    Raises
-    ------
-    KeyboardInterrupt
-        If the task raised one.
-    RuntimeError
-        If a worker dies before it can begin.
+    Raises KeyboardInterrupt if the task raised one. Raises RuntimeError if a worker dies before it can begin.
     """
     left = list(reversed(inputs.items()))
     workers: list[_Worker] = []

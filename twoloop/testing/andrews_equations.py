@@ -5,6 +5,9 @@ Equations II, Sect. VII.7, and the Test Set for IVP Solvers, "andrews". The mass
 gamma are made of the positions of the centres, which are sums of vectors that turn with sums of angles.
 """
 
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
 
 from twoloop.testing.known_problem import Array
@@ -60,7 +63,9 @@ def bend(turns: Array, rates: Array, parts: list[tuple[int, float, float]]) -> A
 class AndrewsEquations:
     """The mechanism as published."""
 
-    n_q, n_c = 7, 6
+    coordinates = ("angle", *("relative", "angle") * 3)
+    row_powers = (1.0,) * 6
+    parts: Mapping[str, Any] = {}  # its bodies and joints are not told
 
     def mass(self, t: float, q: Array) -> Array:
         """M (7, 7)."""

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from twoloop.testing.known_problem import Array, KnownProblem, Motion
+from twoloop.testing.known_problem import KnownProblem, Motion
 
 FILE = Path(__file__).with_name("known_motions.npz")
 N_TIMES = 101  # of a motion, at equal distances
@@ -26,29 +26,10 @@ def known_motion(name: str) -> Motion | None:
 
 
 def posed(
-    name: str,
-    equations: Any,
-    start: tuple[Array, Array],
-    end: float,
-    tags: str,
-    kinds: str,
-    powers: Any,
-    begin: float = 0.0,
-    **more: Any,
+    name: str, equations: Any, start: tuple[Any, Any], end: float, tags: str, begin: float = 0.0, **more: Any
 ) -> KnownProblem:
-    """A problem with its known motion; `tags` are divided by commas, `kinds`, of the coordinates, by blanks."""
-    q0, v0 = (np.asarray(each, dtype=float) for each in start)
-    more.setdefault("energy", equations.energy)
-    names = ("mass", "force", "constraint", "jacobian", "constraint_rate", "gamma")
-    return KnownProblem(
-        name=name,
-        **{each: getattr(equations, each) for each in names},
-        q0=q0,
-        v0=v0,
-        t_span=(begin, end),
-        tags=tuple(tags.split(", ")),
-        coordinates=tuple(kinds.split()),
-        row_powers=np.asarray(powers, dtype=float),
-        reference=known_motion(name),
-        **more,
-    )
+    """A problem with its known motion; `tags` are divided by commas."""
+    told = ("mass", "force", "constraint", "jacobian", "constraint_rate", "gamma", "energy", "coordinates")
+    known: dict[str, Any] = {each: getattr(equations, each) for each in told} | {"reference": known_motion(name)}
+    known |= {"t_span": (begin, end), "tags": tuple(tags.split(", ")), "row_powers": np.array(equations.row_powers)}
+    return KnownProblem(name=name, q0=start[0], v0=start[1], **known | equations.parts | more)

@@ -47,12 +47,6 @@ def _moving(equations: PlanarEquations, q0: Array, coordinate: int, rate: float)
     return q0, along * (rate / along[coordinate])
 
 
-def _planar(name: str, equations: PlanarEquations, start: Any, end: float, tags: str, **more: Any) -> KnownProblem:
-    powers = more.pop("powers", [1.0] * equations.n_c)
-    kinds = " ".join(equations.n_q // 3 * ["x y angle"])
-    return posed(name, equations, start, end, tags, kinds, powers, **equations.parts, **more)
-
-
 def four_bar() -> KnownProblem:
     """Uniform rods of 1, 2 and 1.5 m and 1 kg/m on 3 m of ground, released with the third one level."""
     lengths = [1.0, 2.0, 1.5]
@@ -62,8 +56,8 @@ def four_bar() -> KnownProblem:
     second = cmath.phase(1.5 - cmath.rect(1.0, first))
     q0 = _chained(lengths, [first, second, 0.0])
     note = "one loop that swings; which coordinates are independent must change"
-    more = {"period": 2.24898591982587, "note": note}  # by Gauss12 and DOP853 at 1e-13
-    return _planar("four_bar", equations, (q0, np.zeros(9)), 4.0, "smoke, closed chain, planar", **more)
+    start, period = (q0, np.zeros(9)), 2.24898591982587  # by Gauss12 and DOP853 at 1e-13
+    return posed("four_bar", equations, start, 4.0, "smoke, closed chain, planar", note=note, period=period)
 
 
 def crank_rocker() -> KnownProblem:
@@ -72,7 +66,7 @@ def crank_rocker() -> KnownProblem:
     equations = _pinned(lengths, lengths, 1.6)
     q0 = _chained(lengths, [1.0, *_meet(cmath.rect(0.5, 1.0), 1.6, 1.5, 1.2)])
     note = "the crank turns around, its angle grows beyond a turn"
-    return _planar("crank_rocker", equations, _moving(equations, q0, 2, 12.0), 2.0, "closed chain, planar", note=note)
+    return posed("crank_rocker", equations, _moving(equations, q0, 2, 12.0), 2.0, "closed chain, planar", note=note)
 
 
 def _slider_rows() -> PlanarEquations:
@@ -83,9 +77,6 @@ def _slider_rows() -> PlanarEquations:
     equations.pin(2, (0.0, 0.0), 1, (0.6, 0.0))
     equations.slide(2)
     return equations
-
-
-SLIDER_POWERS = [1.0] * 7 + [0.0]
 
 
 def _slider_start(angle: float, rate: float) -> tuple[Array, Array]:
@@ -99,16 +90,16 @@ def slider_crank() -> KnownProblem:
     """A crank of 0.5 m and a rod of 1.2 m, the crank turning at 8 rad/s at the start."""
     equations, start = _slider_rows(), _slider_start(0.5, 8.0)
     note = "eight rows for nine coordinates"
-    return _planar("slider_crank", equations, start, 2.0, "closed chain, planar", note=note, powers=SLIDER_POWERS)
+    return posed("slider_crank", equations, start, 2.0, "closed chain, planar", note=note)
 
 
 def redundant_slider_crank() -> KnownProblem:
     """The slider-crank with a ninth row, the distance of its pins, that follows from the others."""
     equations, start = _slider_rows(), _slider_start(0.5, 8.0)
     equations.distance(2, (0.0, 0.0), 0, (0.25, 0.0), 1.2)
-    tags, powers = "smoke, redundant, closed chain, planar", [*SLIDER_POWERS, 2.0]
+    tags = "smoke, redundant, closed chain, planar"
     note = "multipliers are not unique; the forces of the constraints, C_q^T lam, are"
-    return _planar("redundant_slider_crank", equations, start, 2.0, tags, note=note, powers=powers)
+    return posed("redundant_slider_crank", equations, start, 2.0, tags, note=note)
 
 
 def _turning(start: float, rate: float, amplitude: float, frequency: float) -> Any:
@@ -124,18 +115,8 @@ def driven_slider_crank() -> KnownProblem:
     equations, drive = _slider_rows(), _turning(0.5, 4.0, 0.3, 3.0)
     equations.drive(0, drive)
     note = "as many rows as coordinates: everything is C_t and gamma; and the motion does not begin at t = 0"
-    powers = [*SLIDER_POWERS, 0.0]
-    return _planar(
-        "driven_slider_crank",
-        equations,
-        _slider_start(drive[0](0.5), drive[1](0.5)),
-        2.0,
-        "driven, closed chain, planar",
-        begin=0.5,
-        energy=None,
-        note=note,
-        powers=powers,
-    )
+    start, tags = _slider_start(drive[0](0.5), drive[1](0.5)), "driven, closed chain, planar"
+    return posed("driven_slider_crank", equations, start, 2.0, tags, begin=0.5, energy=None, note=note)
 
 
 def driven_crank() -> KnownProblem:
@@ -149,22 +130,10 @@ def driven_crank() -> KnownProblem:
     q0 = _chained([0.3, 1.0], [0.0, angle])
     v0 = bodies((0.5 * tip_rate, 2.7), (tip_rate - 1j * cmath.rect(0.5, angle), -1.0))
     note = "C_t and its derivative act on the free part; the drive does work"
-    powers = [1.0] * 4 + [0.0]
-    return _planar(
-        "driven_crank",
-        equations,
-        (q0, v0),
-        3.0,
-        "smoke, driven, open chain, planar",
-        energy=None,
-        note=note,
-        powers=powers,
-    )
+    return posed("driven_crank", equations, (q0, v0), 3.0, "smoke, driven, open chain, planar", energy=None, note=note)
 
 
 def andrews() -> KnownProblem:
     """Andrews' squeezing mechanism from rest."""
     note = "three loops, a mass matrix that varies, angular velocities of 1000 rad/s"
-    kinds, powers = "angle relative angle relative angle relative angle", [1.0] * 6
-    start = START, np.zeros(7)
-    return posed("andrews", AndrewsEquations(), start, 0.03, "closed chain, planar", kinds, powers, note=note)
+    return posed("andrews", AndrewsEquations(), (START, np.zeros(7)), 0.03, "closed chain, planar", note=note)

@@ -1,7 +1,6 @@
 """Problems of points on links: pendulums, chains, a parallelogram, and two whose motion ends."""
 
 import math
-from typing import Any
 
 import numpy as np
 
@@ -12,25 +11,19 @@ from twoloop.testing.point_equations import DrivenPoint, EndingForce, Place, Poi
 GRAVITY = 9.81  # m/s^2
 
 
-def _points(name: str, equations: PointEquations, start: tuple[Any, Any], end: float, tags: str, **more: Any) -> Any:
-    n_points, n_axes = equations.weight.shape
-    kinds = " ".join(n_points * ["x", "y", "z"][:n_axes]) if n_axes == 3 else " ".join(n_points * ["x", "y"])
-    return posed(name, equations, start, end, tags, kinds, np.full(equations.n_c, 2.0), **equations.parts, **more)
-
-
 def pendulum() -> KnownProblem:
     """A point of 1 kg on 1 m, released at rest from the horizontal; known in closed form."""
     equations = PointEquations([1.0], [[0.0, -GRAVITY]], [(0, (0.0, 0.0), 1.0)])
     note = "the simplest constrained motion: what is wrong here is the method"
     # 4 sqrt(l / g) K(sin(45 degrees)), Landau & Lifshitz, Mechanics, Sect. 11
-    more = {"period": 4.0 * math.sqrt(1.0 / GRAVITY) * 1.8540746773013719, "note": note}
-    return _points("pendulum", equations, ([-1.0, 0.0], [0.0, 0.0]), 4.0, "smoke, open chain, planar", **more)
+    period, start = 4.0 * math.sqrt(1.0 / GRAVITY) * 1.8540746773013719, ([-1.0, 0.0], [0.0, 0.0])
+    return posed("pendulum", equations, start, 4.0, "smoke, open chain, planar", note=note, period=period)
 
 
 def _double_pendulum(name: str, masses: list[float], end: float, tags: str, note: str) -> KnownProblem:
     weight = [[0.0, -GRAVITY * mass] for mass in masses]
     equations = PointEquations(masses, weight, [(0, (0.0, 0.0), 1.0), (1, 0, 1.0)])
-    return _points(name, equations, ([1.0, 0.0, 2.0, 0.0], np.zeros(4)), end, tags, note=note)
+    return posed(name, equations, ([1.0, 0.0, 2.0, 0.0], np.zeros(4)), end, tags, note=note)
 
 
 def double_pendulum() -> KnownProblem:
@@ -51,7 +44,7 @@ def spherical_pendulum() -> KnownProblem:
     start = [0.6, 0.0, -0.8], [0.4, 1.5, 0.3]
     kept = {"vertical angular momentum": lambda t, q, v: float(q[0] * v[1] - q[1] * v[0])}
     note = "energy and the angular momentum about the vertical are kept"
-    return _points("spherical_pendulum", equations, start, 4.0, "open chain, spatial", invariants=kept, note=note)
+    return posed("spherical_pendulum", equations, start, 4.0, "open chain, spatial", invariants=kept, note=note)
 
 
 def closed_chain() -> KnownProblem:
@@ -66,7 +59,7 @@ def closed_chain() -> KnownProblem:
     angles[:2] = angles[1::-1]
     places = np.cumsum(0.2 * np.column_stack([np.cos(angles), np.sin(angles)]), axis=0)[:4]
     note = "a loop with three degrees of freedom"
-    return _points("closed_chain", equations, (places.ravel(), np.zeros(8)), 1.0, "closed chain, planar", note=note)
+    return posed("closed_chain", equations, (places.ravel(), np.zeros(8)), 1.0, "closed chain, planar", note=note)
 
 
 def stiff_spring_pendulum() -> KnownProblem:
@@ -76,7 +69,7 @@ def stiff_spring_pendulum() -> KnownProblem:
     )
     note = "a vibration of 1 mm and less, 150 times as fast as the motion"
     start = [1.0, 0.0, 1.5, 0.0], np.zeros(4)
-    return _points("stiff_spring_pendulum", equations, start, 1.0, "stiff, open chain, planar", note=note)
+    return posed("stiff_spring_pendulum", equations, start, 1.0, "stiff, open chain, planar", note=note)
 
 
 def shaken_spring() -> KnownProblem:
@@ -85,8 +78,8 @@ def shaken_spring() -> KnownProblem:
         3.0, 4.0, [1.0, 0.5], [[0.0, -GRAVITY], [0.0, -0.5 * GRAVITY]], [(0, (0.0, 0.0), 1.0)], [(1, 0, 40.0, 0.6)]
     )
     note = "forces that depend on positions and on time; and the motion does not begin at t = 0"
-    start, more = ([0.6, -0.8, 0.6, -1.5], np.zeros(4)), {"energy": None, "begin": 0.5, "note": note}
-    return _points("shaken_spring", equations, start, 2.5, "smoke, open chain, planar", **more)
+    start, tags = ([0.6, -0.8, 0.6, -1.5], np.zeros(4)), "smoke, open chain, planar"
+    return posed("shaken_spring", equations, start, 2.5, tags, begin=0.5, energy=None, note=note)
 
 
 def parallelogram() -> KnownProblem:
@@ -94,30 +87,17 @@ def parallelogram() -> KnownProblem:
     mass = np.array([[2.0, 0.5], [0.5, 2.0]]) / 3.0  # uniform bars of 1 kg by the velocities of their ends
     links: list[tuple[int, Place, float]] = [(0, (0.0, 0.0), 1.0), (1, (1.0, 0.0), 1.0), (1, 0, 1.0)]
     equations = PointEquations(mass, [[0.0, -GRAVITY]] * 2, links)
-    start = [0.0, 1.0, 1.0, 1.0], [1.0, 0.0, 1.0, 0.0]
+    start, tags = ([0.0, 1.0, 1.0, 1.0], [1.0, 0.0, 1.0, 0.0]), "singular, closed chain, planar"
     note = "passes its change points, where C_q loses rank and another branch of motion begins"
-    times = (0.70845001, 1.21526181)
-    return _points(
-        "parallelogram", equations, start, 2.0, "singular, closed chain, planar", note=note, singular_times=times
-    )
+    return posed("parallelogram", equations, start, 2.0, tags, note=note, singular_times=(0.70845001, 1.21526181))
 
 
 def out_of_reach() -> KnownProblem:
     """A point on a link of 1 m whose height is driven to 1 m and beyond."""
-    equations = DrivenPoint(1.0, 0.2, 0.5, GRAVITY)
-    x0 = math.sqrt(1.0 - 0.2**2)
-    return posed(
-        "out_of_reach",
-        equations,
-        (np.array([x0, 0.2]), np.array([-0.1 / x0, 0.5])),
-        2.0,
-        "smoke, no motion to the end, driven, planar",
-        "x y",
-        [2.0, 1.0],
-        energy=None,
-        ends=1.6,
-        note="the drive asks for what the link cannot reach",
-    )
+    equations, note = DrivenPoint(1.0, 0.2, 0.5, GRAVITY), "the drive asks for what the link cannot reach"
+    x0, tags = math.sqrt(1.0 - 0.2**2), "smoke, no motion to the end, driven, planar"
+    start = [x0, 0.2], [-0.1 / x0, 0.5]
+    return posed("out_of_reach", equations, start, 2.0, tags, energy=None, ends=1.6, note=note)
 
 
 def force_ends() -> KnownProblem:
@@ -125,4 +105,4 @@ def force_ends() -> KnownProblem:
     equations = EndingForce(1.0, [1.0], [[0.0, -GRAVITY]], [(0, (0.0, 0.0), 1.0)])
     note = "a force that is not a number from some time on"
     start, tags = ([1.0, 0.0], [0.0, 0.0]), "no motion to the end, open chain, planar"
-    return _points("force_ends", equations, start, 2.0, tags, energy=None, ends=1.0, note=note)
+    return posed("force_ends", equations, start, 2.0, tags, energy=None, ends=1.0, note=note)

@@ -24,7 +24,8 @@ class PlanarEquations:
 
     def __init__(self, masses: ArrayLike, inertias: ArrayLike, gravity: float):
         m, J = np.asarray(masses, dtype=float), np.asarray(inertias, dtype=float)
-        self.n_q, self.n_c = 3 * m.size, 0
+        self.n_q, self.coordinates = 3 * m.size, m.size * ("x", "y", "angle")
+        self.row_powers: list[float] = []
         self._diagonal = np.column_stack([m, m, J]).ravel()
         self._force = np.column_stack([0.0 * m, -gravity * m, 0.0 * J]).ravel()
         self._pins: list[tuple[tuple[int, Point, int, Point], float | None]] = []
@@ -37,29 +38,35 @@ class PlanarEquations:
         """Two rows: point a of body i is point b of body j, or of the ground."""
         self._pins.append(((i, a, j, b), None))
         self._rows.append([self.n_c, self.n_c + 1])
-        self._add("revolute", (i, j), (a, b), 2)
+        self._add("revolute", (i, j), (a, b), 1.0, 1.0)
 
     def distance(self, i: int, a: Point, j: int, b: Point, length: float) -> None:
         """A row: half the squared distance of the points is half the squared length."""
         self._pins.append(((i, a, j, b), length))
         self._rows.append([self.n_c])
-        self._add("distance", (i, j), (a, b), 1, length=length)
+        self._add("distance", (i, j), (a, b), 2.0, length=length)
 
     def drive(self, body: int, drive: Drive) -> None:
         """A row: the angle of a body is a function of time, which is given with its two derivatives."""
         self._drives.append((self.n_c, 3 * body + 2, drive))
-        self._add("drive", (body, GROUND), ((0.0, 0.0), (0.0, 0.0)), 1, motion=drive)
+        self._add("drive", (body, GROUND), ((0.0, 0.0), (0.0, 0.0)), 0.0, motion=drive)
 
     def slide(self, body: int) -> None:
         """Two rows: the centre of a body stays on the x axis, and its angle is zero."""
         for row, coordinate in enumerate((3 * body + 1, 3 * body + 2), self.n_c):
             self._drives.append((row, coordinate, (lambda t: 0.0, lambda t: 0.0, lambda t: 0.0)))
-        self._add("prismatic", (body, GROUND), ((0.0, 0.0), (0.0, 0.0)), 2, axis=np.array([1.0, 0.0]))
+        self._add("prismatic", (body, GROUND), ((0.0, 0.0), (0.0, 0.0)), 1.0, 0.0, axis=np.array([1.0, 0.0]))
 
-    def _add(self, kind: str, pair: tuple[int, int], points: tuple[Point, Point], n_rows: int, **more: Any) -> None:
-        rows, places = slice(self.n_c, self.n_c + n_rows), (np.array(points[0]), np.array(points[1]))
+    def _add(self, kind: str, pair: tuple[int, int], points: tuple[Point, Point], *powers: float, **more: Any) -> None:
+        """Note a joint, and the power of the unit of length in each of its rows."""
+        rows, places = slice(self.n_c, self.n_c + len(powers)), (np.array(points[0]), np.array(points[1]))
         self._joints.append(KnownJoint(kind, pair, places, rows, **more))
-        self.n_c += n_rows
+        self.row_powers += powers
+
+    @property
+    def n_c(self) -> int:
+        """Number of rows."""
+        return len(self.row_powers)
 
     @property
     def parts(self) -> dict[str, Any]:

@@ -38,7 +38,8 @@ class PointEquations:
         masses = np.asarray(mass, dtype=float)
         self._points_alone = masses.ndim == 1 and not springs
         self._mass = np.kron(np.diag(masses) if masses.ndim == 1 else masses, np.eye(n_axes))
-        self.n_q, self.n_c = n_points * n_axes, len(links)
+        self.n_q, self.coordinates = n_points * n_axes, n_points * ("x", "y", "z")[:n_axes]
+        self.n_c, self.row_powers = len(links), [2.0] * len(links)
         self._across, self._from = self._differences([link[:2] for link in links])
         self._links, self._lengths = links, np.array([link[2] for link in links])
         self._spring_across, self._spring_from = self._differences([spring[:2] for spring in springs])
@@ -133,7 +134,7 @@ class DrivenPoint(PointEquations):
 
     def __init__(self, length: float, height: float, rate: float, gravity: float):
         super().__init__([1.0], [[0.0, -gravity]], [(0, (0.0, 0.0), length)])
-        self.n_c, self._height, self._rate = 2, height, rate
+        self.n_c, self.row_powers, self._height, self._rate = 2, [2.0, 1.0], height, rate
 
     def constraint(self, t: float, q: Array) -> Array:
         """C (2,)."""

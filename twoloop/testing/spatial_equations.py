@@ -3,6 +3,7 @@
 The first rows keep the Euler parameters normalised, half of e.e is 1/2, the next are those of the joints.
 """
 
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -54,24 +55,33 @@ class SpatialEquations:
 
     def __init__(self, gravity: ArrayLike):
         self._gravity = np.asarray(gravity, dtype=float)
-        self._masses: list[float] = []
-        self._inertias: list[Array] = []
+        self._bodies: list[tuple[float, Array]] = []  # mass and inertia
         self._start: list[Array] = []
         self._rates: list[Array] = []
         self._points: list[tuple[int, int, Array, int, Array]] = []
         self._directions: list[tuple[int, int, Array, int, Array]] = []
-        self._n_joint_rows = 0
+        self._joint_powers: list[float] = []
         self._axes: dict[int, Array] = {}
 
     @property
     def n_q(self) -> int:
         """Number of coordinates."""
-        return 7 * len(self._masses)
+        return 7 * len(self._bodies)
+
+    @property
+    def coordinates(self) -> tuple[str, ...]:
+        """What each coordinate is."""
+        return len(self._bodies) * ("x", "y", "z", "e0", "e1", "e2", "e3")
+
+    @property
+    def row_powers(self) -> list[float]:
+        """Power of the unit of length in each row."""
+        return [0.0] * len(self._bodies) + self._joint_powers
 
     @property
     def n_c(self) -> int:
         """Number of rows."""
-        return len(self._masses) + self._n_joint_rows
+        return len(self.row_powers)
 
     @property
     def start(self) -> tuple[Array, Array]:
@@ -84,11 +94,10 @@ class SpatialEquations:
         """Add a body by its principal moments, its start, and the angular velocity along the axes of space."""
         e = parameters_of(np.asarray(R, dtype=float))
         along = np.asarray(R, dtype=float).T @ np.asarray(spin, dtype=float)
-        self._masses.append(mass)
-        self._inertias.append(np.diag(np.asarray(inertia, dtype=float)))
+        self._bodies.append((mass, np.diag(np.asarray(inertia, dtype=float))))
         self._start.append(np.concatenate([np.asarray(place, dtype=float), e]))
         self._rates.append(np.concatenate([np.asarray(velocity, dtype=float), 0.5 * half_spin(e).T @ along]))
-        return len(self._masses) - 1
+        return len(self._bodies) - 1
 
     def _fixed_to(self, body: int, vector: ArrayLike, from_centre: bool) -> Array:
         """A vector, or a point from the centre, of space at the start along the axes of a body."""
@@ -100,10 +109,9 @@ class SpatialEquations:
 
     def spherical(self, i: int, j: int, point: ArrayLike) -> None:
         """Three rows: both bodies share a point."""
-        ends = (self._fixed_to(body, point, True) for body in (i, j))
-        a, b = ends
-        self._points.append((self._n_joint_rows, i, a, j, b))
-        self._n_joint_rows += 3
+        a, b = (self._fixed_to(body, point, True) for body in (i, j))
+        self._points.append((len(self._joint_powers), i, a, j, b))
+        self._joint_powers += [1.0] * 3
 
     def revolute(self, i: int, j: int, point: ArrayLike, axis: ArrayLike) -> None:
         """Five rows: both bodies share a point and an axis."""
@@ -112,8 +120,8 @@ class SpatialEquations:
         first = np.cross(axis, np.eye(3)[int(np.argmin(np.abs(axis)))])
         for across in (first, np.cross(axis, first)):
             unit = self._fixed_to(i, across / np.linalg.norm(across), False)
-            self._directions.append((self._n_joint_rows, i, unit, j, self._fixed_to(j, axis, False)))
-            self._n_joint_rows += 1
+            self._directions.append((len(self._joint_powers), i, unit, j, self._fixed_to(j, axis, False)))
+            self._joint_powers.append(0.0)
         self._axes[len(self._points) - 1] = self._fixed_to(j, axis / np.linalg.norm(axis), False)
 
     def _vector(self, q: Array, body: int, a: Array) -> Array:
@@ -128,9 +136,8 @@ class SpatialEquations:
     @property
     def parts(self) -> dict[str, Any]:
         """Bodies, joints and gravity as `KnownProblem` names them."""
-        bodies, joints = [], []
-        for k, (m, J) in enumerate(zip(self._masses, self._inertias, strict=True)):
-            bodies.append(KnownBody(m, np.diag(J), slice(7 * k, 7 * k + 7)))
+        joints: list[KnownJoint] = []
+        bodies = [KnownBody(m, np.diag(J), slice(7 * k, 7 * k + 7)) for k, (m, J) in enumerate(self._bodies)]
         for k, (row, i, a, j, b) in enumerate(self._points):
             first, axis = len(bodies) + row, self._axes.get(k)
             kind, n_rows = ("spherical", 3) if axis is None else ("revolute", 5)
@@ -140,26 +147,27 @@ class SpatialEquations:
     def mass(self, t: float, q: Array) -> Array:
         """M (n_q, n_q), of rank 6 for each body."""
         M = np.zeros((self.n_q, self.n_q))
-        for body, (m, J) in enumerate(zip(self._masses, self._inertias, strict=True)):
-            k = 7 * body
-            G = half_spin(q[k + 3 : k + 7])
+        for body, (m, J) in enumerate(self._bodies):
+            k, G = 7 * body, half_spin(q[7 * body + 3 : 7 * body + 7])
             M[k : k + 3, k : k + 3] = m * np.eye(3)
             M[k + 3 : k + 7, k + 3 : k + 7] = 4.0 * G.T @ J @ G
         return M
 
     def force(self, t: float, q: Array, v: Array) -> Array:
         """Q (n_q,): weights, and the terms of the velocities."""
-        Q = np.zeros(self.n_q)
-        for body, (m, J) in enumerate(zip(self._masses, self._inertias, strict=True)):
-            k = 7 * body
-            Q[k : k + 3] = m * self._gravity
-            e, rate = q[k + 3 : k + 7], v[k + 3 : k + 7]
-            Q[k + 3 : k + 7] = -8.0 * half_spin(rate).T @ (J @ (half_spin(e) @ rate))
-        return Q
+        parts: list[Array] = []
+        for m, J, x, u in self._each(q, v):
+            parts += [m * self._gravity, -8.0 * half_spin(u[3:]).T @ (J @ (half_spin(x[3:]) @ u[3:]))]
+        return np.concatenate(parts)
+
+    def _each(self, q: Array, v: Array) -> Iterator[tuple[float, Array, Array, Array]]:
+        """Mass, inertia and state (7,), (7,) of each body."""
+        for (m, J), x, u in zip(self._bodies, q.reshape(-1, 7), v.reshape(-1, 7), strict=True):
+            yield m, J, x, u
 
     def constraint(self, t: float, q: Array) -> Array:
         """C (n_c,)."""
-        n = len(self._masses)
+        n = len(self._bodies)
         C = np.zeros(self.n_c)
         C[:n] = 0.5 * ((q.reshape(n, 7)[:, 3:] ** 2).sum(axis=1) - 1.0)
         for row, i, a, j, b in self._points:
@@ -174,7 +182,7 @@ class SpatialEquations:
 
     def jacobian(self, t: float, q: Array) -> Array:
         """C_q (n_c, n_q)."""
-        n = len(self._masses)
+        n = len(self._bodies)
         J = np.zeros((self.n_c, self.n_q))
         for body in range(n):
             J[body, 7 * body + 3 : 7 * body + 7] = q[7 * body + 3 : 7 * body + 7]
@@ -196,7 +204,7 @@ class SpatialEquations:
 
     def gamma(self, t: float, q: Array, v: Array) -> Array:
         """Right-hand side of C_q a = gamma (n_c,)."""
-        n = len(self._masses)
+        n = len(self._bodies)
         right = np.zeros(self.n_c)
         right[:n] = -(v.reshape(n, 7)[:, 3:] ** 2).sum(axis=1)
         still = np.zeros(3)
@@ -215,19 +223,16 @@ class SpatialEquations:
     def energy(self, t: float, q: Array, v: Array) -> float:
         """Of motion and weight, J."""
         total = 0.0
-        for body, (m, J) in enumerate(zip(self._masses, self._inertias, strict=True)):
-            k = 7 * body
-            spin = 2.0 * half_spin(q[k + 3 : k + 7]) @ v[k + 3 : k + 7]
-            total += float(0.5 * m * v[k : k + 3] @ v[k : k + 3] + 0.5 * spin @ J @ spin)
-            total -= float(m * self._gravity @ q[k : k + 3])
+        for m, J, x, u in self._each(q, v):
+            spin = 2.0 * half_spin(x[3:]) @ u[3:]
+            total += float(0.5 * m * u[:3] @ u[:3] + 0.5 * spin @ J @ spin)
+            total -= float(m * self._gravity @ x[:3])
         return total
 
     def vertical_momentum(self, t: float, q: Array, v: Array) -> float:
         """Angular momentum about the z axis of space, kg m^2/s."""
         total = 0.0
-        for body, (m, J) in enumerate(zip(self._masses, self._inertias, strict=True)):
-            k = 7 * body
-            e = q[k + 3 : k + 7]
-            own = turned(e, J @ (2.0 * half_spin(e) @ v[k + 3 : k + 7]))
-            total += float(own[2] + m * (q[k] * v[k + 1] - q[k + 1] * v[k]))
+        for m, J, x, u in self._each(q, v):
+            own = turned(x[3:], J @ (2.0 * half_spin(x[3:]) @ u[3:]))
+            total += float(own[2] + m * (x[0] * u[1] - x[1] * u[0]))
         return total
