@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from twoloop.generate.choices import Choice
 from twoloop.generate.coefficients import Coefficients
 from twoloop.generate.lane_emitter import LaneEmitter
-from twoloop.generate.lane_series import AT_ONCE, LaneSeries
+from twoloop.generate.lane_series import LaneSeries
 from twoloop.generate.llvm_text import Value, integer
 from twoloop.generate.series import series_program
 from twoloop.generate.straight_code import conditions_hold, results_of
@@ -146,24 +146,19 @@ class LaneCode:
         per_unit = emit.divide(emit.constant(1.0), unit)
         twice = emit.multiply(emit.constant(2.0), emit.multiply(per_unit, per_unit))
         last = emit.pointer(at.series, builder.mul(order, integer(n)))
-        for begin in range(0, n, AT_ONCE):
-            some = range(begin, min(begin + AT_ONCE, n))
-            initial = [value for j in some for value in (emit.load(last, j), zero, zero)]
-            with emit.loop(integer(0), order, initial) as (m, carried, new):
+        for j in range(n):  # one by one: what is carried stays in registers
+            with emit.loop(integer(0), order, [emit.load(last, j), zero, zero]) as (m, (q, v, a), new):
                 power = builder.sub(builder.sub(order, integer(1)), m)
                 row = emit.pointer(at.series, builder.mul(power, integer(n)))
-                for place, j in enumerate(some):
-                    q, v, a = carried[3 * place : 3 * place + 3]
-                    new += [
-                        emit.add(emit.multiply(q, x), emit.load(row, j)),
-                        emit.add(emit.multiply(v, x), q),
-                        emit.add(emit.multiply(a, x), v),
-                    ]
-            for place, j in enumerate(some):
-                q, v, a = new[3 * place : 3 * place + 3]
-                emit.store(q, at.new, j)
-                emit.store(emit.multiply(v, per_unit), at.new, n + j)
-                emit.store(emit.multiply(a, twice), at.found, j)
+                new += [
+                    emit.add(emit.multiply(q, x), emit.load(row, j)),
+                    emit.add(emit.multiply(v, x), q),
+                    emit.add(emit.multiply(a, x), v),
+                ]
+            q, v, a = new
+            emit.store(q, at.new, j)
+            emit.store(emit.multiply(v, per_unit), at.new, n + j)
+            emit.store(emit.multiply(a, twice), at.found, j)
 
     def judge(self, emit: LaneEmitter, order: Value, control: Value, room: Value) -> None:
         """The defect of a step, see control/defect.py, and how far its prediction was off, see control/predictor.py."""

@@ -25,7 +25,7 @@ from twoloop.kernels.evaluation.operations import (
     SQUARE_ROOT,
 )
 
-AT_ONCE = 8  # sums in one loop, in registers
+AT_ONCE = 6  # sums in one loop: where a vector takes two of 16 registers, they are there with their factors
 
 
 class Operation(NamedTuple):

@@ -84,9 +84,10 @@ def _look_within(code, order, control, room, n_places, n_steps):
         for k in range(LANES):
             h, share = room[H * LANES + k], 0.0
             if h > control[GAP]:
-                own = int(min(np.ceil(h / control[GAP]), MOST_PLACES))
-                shift = (n_steps[int(room[WHICH * LANES + k])] + room[REFUSED * LANES + k]) * GOLDEN % 1.0
-                share = (place + shift) / own if place < own else 0.0
+                own = min(np.ceil(h / control[GAP]), MOST_PLACES)
+                shift = GOLDEN * (n_steps[int(room[WHICH * LANES + k])] + room[REFUSED * LANES + k])
+                if place < own:  # less its integer, by floor: fmod would take longer than all else here
+                    share = (place + shift - np.floor(shift)) / own
             room[X * LANES + k] = share * h / room[UNIT * LANES + k]
             room[AHEAD * LANES + k] = room[T * LANES + k] + share * h
             room[FINE * LANES + k] = 1.0
