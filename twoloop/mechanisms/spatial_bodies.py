@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from twoloop.mechanisms import spatial
-from twoloop.mechanisms.points import Sketch
-from twoloop.mechanisms.rotation import euler_parameters, euler_rates, rotation_matrix
+from twoloop.mechanisms.points import Sketch, place_of
+from twoloop.mechanisms.rotation import euler_parameters, euler_rates, perpendiculars, rotation_matrix
 from twoloop.mechanisms.spatial import DIRECTION, GROUND, PLANE, POINT
 from twoloop.problem.drawing import Drawing
 from twoloop.problem.entries import LARGE
@@ -99,7 +99,7 @@ class SpatialBodies:
         self._add(DIRECTION, 1, i, self._along(i, a), j, self._along(j, b), np.zeros(3))
 
     def _parallel(self, i: int, j: int, axis: ArrayLike) -> None:
-        for across in _across(axis):
+        for across in perpendiculars(_unit(axis)):
             self._perpendicular(i, across, j, axis)
 
     def _name(self, kind: str, i: int, j: int, point: ArrayLike, first: int) -> None:
@@ -136,7 +136,7 @@ class SpatialBodies:
     def prismatic(self, i: int, j: int, point: ArrayLike, axis: ArrayLike) -> None:
         """Five rows: body j slides along an axis of body i through a point, and does not turn on it."""
         start = self.n_joint_rows
-        first, second = _across(axis)
+        first, second = perpendiculars(_unit(axis))
         here, there = self._from_centre(i, point), self._from_centre(j, point)
         for across in (first, second):
             self._add(PLANE, 1, i, self._along(i, across), j, there, here)
@@ -213,12 +213,9 @@ class SpatialBodies:
         return Momentum(np.array(self._bodies), np.asarray(point, dtype=float), np.asarray(axis, dtype=float))
 
 
-def _across(axis: ArrayLike) -> tuple[Array, Array]:
-    """Two unit directions, perpendicular to an axis and to each other."""
-    axis = np.asarray(axis, dtype=float)
-    first = np.cross(axis, np.eye(3)[int(np.argmin(np.abs(axis)))])
-    second = np.cross(axis, first)
-    return first / np.linalg.norm(first), second / np.linalg.norm(second)
+def _unit(axis: ArrayLike) -> Array:
+    given = np.asarray(axis, dtype=float)
+    return given / np.linalg.norm(given)
 
 
 def _states(q: Array, v: Array) -> tuple[Array, Array]:
@@ -244,13 +241,14 @@ class Energy:
 
     def __call__(self, t: Any, q: Array, v: Array) -> Any:
         """Of one state, or of the columns of many."""
+        flat = np.asarray(q)
         q, v = _states(q, v)
         masses, inertias = self.bodies[:, 0], self.bodies[:, 1:]
         kinetic = np.einsum("i,ij...->...", masses, v[:, :3] ** 2)
         kinetic += np.einsum("ij,ij...->...", inertias, _spins(q, v) ** 2)
         total = 0.5 * kinetic - np.einsum("i,j,ij...->...", masses, self.gravity, q[:, :3])
         for spring in self.springs:
-            gap = _place(q, int(spring[4]), spring[5:8]) - _place(q, int(spring[0]), spring[1:4])
+            gap = place_of(flat, int(spring[4]), spring[5:8]) - place_of(flat, int(spring[0]), spring[1:4])
             total = total + 0.5 * spring[8] * (np.sqrt((gap**2).sum(axis=0)) - spring[10]) ** 2
         return total
 
@@ -274,10 +272,3 @@ class Momentum:
             moment = np.cross(arm, rate[:3], axis=0) * mass + np.array(own)
             total = total + np.tensordot(self.axis, moment, axes=1)
         return total
-
-
-def _place(q: Array, body: int, point: Array) -> Array:
-    """The point of a body in space, (3,) or (3, n_t)."""
-    if body == GROUND:
-        return point.reshape(3, *(1,) * (q.ndim - 2))
-    return q[body, :3] + np.array(spatial.rotated.py_func(*q[body, 3:], *point))
