@@ -184,6 +184,24 @@ class Collection:
         here, there = self._points(at, first, second)
         return first, second, name, (self._numbers(name, first, here), self._numbers(name, second, there))
 
+    def _weld(self, name: str, a: Body, b: Body, points: Points) -> tuple[JointRow, ...]:
+        """The rows that let two bodies move as one."""
+        raise NotImplementedError
+
+    def fixed(self, a: Body | str, b: Body | str, *, at: Any = None, name: str | None = None) -> ModelJoint:
+        """Both bodies move as one.
+
+        Parameters
+        ----------
+        a, b : Body or str
+        at : array_like (2,) or (3,) or (BodyPoint, BodyPoint), optional
+            To which the reaction refers, m. None: the centre of mass of b, or of a if b is the ground.
+        """
+        first, second, name, points = self._pair("fixed", a, b, name, at)
+        return self._add_joint(
+            ModelJoint(name, "fixed", first, second, self._weld(name, first, second, points), *points)
+        )
+
     def _apart(
         self, kind: str, a: Any, at_a: Any, b: Any, at_b: Any, name: str | None
     ) -> tuple[Body, Body, str, Points, float]:

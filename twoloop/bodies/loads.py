@@ -151,11 +151,6 @@ class Loads(Collection):
             Of friction over load. None: it does not depend on the load.
         radius : float, optional
             Of the pin of a revolute joint with a coefficient, m.
-        name : str, optional
-
-        Returns
-        -------
-        Force
 
         Raises
         ------

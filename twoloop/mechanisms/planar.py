@@ -10,7 +10,6 @@ ground is body -1.
 
 import math
 from collections.abc import Sequence
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -305,14 +304,8 @@ class PlanarBodies:
                 elif point not in ends[body]:
                     ends[body].append(point)
         for body, points in enumerate(ends):
-            if len(points) == 1 and points[0] != (0.0, 0.0):
-                points.append((-points[0][0], -points[0][1]))
-                sketch.trace(body, points[1])
-            if len(points) < 2:
-                side = np.sqrt(6.0 * self.inertias[body] / self.masses[body])  # of the square of that inertia
-                sketch.add_box(body, (side, side))
-            for first, second in pairwise(points):
-                sketch.line((body, first), (body, second))
+            side = np.sqrt(6.0 * self.inertias[body] / self.masses[body])  # of the square of that inertia
+            sketch.add_body(body, points, -1.0, (side, side))
         for i, a, j, _ in self.pins:
             if GROUND not in (i, j):
                 sketch.trace(i, a)

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -123,6 +124,17 @@ class Sketch:
         corners, edges = box(size)
         for i, j in edges:
             self.line((body, corners[i]), (body, corners[j]))
+
+    def add_body(self, body: int, points: Sequence[Any], far: float, size: Any) -> None:
+        """A body as lines between its points: with one beside its centre to `far` times this, with none as a box."""
+        places = [np.asarray(point, dtype=float) for point in points]
+        if len(places) == 1 and places[0].any():
+            places.append(far * places[0])
+            self.trace(body, places[1])
+        if len(places) < 2:
+            self.add_box(body, size)
+        for first, second in pairwise(places):
+            self.line((body, first), (body, second))
 
     def trace(self, body: int, point: Any) -> None:
         """The path of a point."""
