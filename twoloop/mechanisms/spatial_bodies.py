@@ -108,10 +108,10 @@ class SpatialBodies:
             self._drawn.append((i, j, np.asarray(point, dtype=float)))
         body, other = (j, i) if i == GROUND else (i, j)
         name = f"{kind} {self._names[body]}-{'ground' if other == GROUND else self._names[other]}"
-        rows, place = tuple(range(first, self.n_joint_rows)), 7 * body
+        numbered, place = tuple(range(first, self.n_joint_rows)), 7 * body
         position, parameters = tuple(range(place, place + 3)), tuple(range(place + 3, place + 7))
         there = tuple(self._from_centre(body, point))
-        self._named.append(Joint(unused(name, self._named), rows, position, parameters, there))
+        self._named.append(Joint(unused(name, self._named), numbered, position, parameters, there))
 
     def spherical(self, i: int, j: int, point: ArrayLike) -> None:
         """Three rows: both bodies share a point."""
