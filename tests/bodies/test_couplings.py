@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
 
+from tests.bodies.runs import by_hand, moved
 from twoloop import mechanisms, solve_dae
 from twoloop.bodies import PlanarModel, SpatialModel
 
@@ -11,19 +11,9 @@ GRAVITY = 9.81
 TIMES = np.linspace(0.0, 1.0, 6)
 
 
-def moved(model, method="DOP853"):
+def run_of(model, method="DOP853"):
     problem = model.problem((0.0, TIMES[-1]))
-    run = problem.system, problem.t_span, problem.q0, problem.v0, method
-    result = solve_dae(*run, rtol=1e-11, atol=1e-11, t_eval=TIMES)
-    assert result.success, result.message
-    return problem, result
-
-
-def by_hand(acceleration, start):
-    found = solve_ivp(
-        lambda t, y: [y[1], acceleration(t, *y)], (0.0, TIMES[-1]), start, "DOP853", TIMES, rtol=1e-12, atol=1e-13
-    )
-    return found.y
+    return problem, moved(problem, method, t_eval=TIMES)
 
 
 @pytest.mark.parametrize("method", ["DOP853", "auto", "RadauIIA9"])
@@ -35,14 +25,14 @@ def test_a_train_of_gears(method):
     one, other = model.revolute("ground", "small", at=(0.0, 0.0)), model.revolute("ground", "large", at=(0.3, 0.0))
     gear = model.gear(one, other, ratio=-0.5)
     model.motor(one, lambda t: np.cos(t))
-    problem, result = moved(model, method)
+    problem, result = run_of(model, method)
     at, away = np.arctan2(0.05, 0.05), np.hypot(0.05, 0.05)
     inertia = 0.01 + 0.25 * (0.05 + 3.0 * away**2)
 
     def acceleration(t, turned, rate):
         return (np.cos(t) + 0.5 * 3.0 * GRAVITY * away * np.cos(at - 0.5 * turned)) / inertia
 
-    known = by_hand(acceleration, [0.0, 4.0])
+    known = by_hand(acceleration, [0.0, 4.0], TIMES)
     np.testing.assert_allclose(result.q[2] - 0.3, known[0], atol=1e-9)
     np.testing.assert_allclose(result.q[5], -0.5 * known[0], atol=1e-9)
     assert problem.freedom.degrees == 1
@@ -62,7 +52,7 @@ def test_planets_on_a_carrier():
     model.fixed("ground", sun)
     model.gear(model.revolute(carrier, sun, at=(0.0, 0.0)), model.revolute(carrier, planet, at=(0.3, 0.0)), ratio=-2.0)
     with pytest.warns(match="have rank"):  # the sun is held, and turns about its centre
-        problem, result = moved(model)
+        problem, result = run_of(model)
     np.testing.assert_allclose(result.q[2], 2.0 * TIMES, atol=1e-9)
     np.testing.assert_allclose(result.q[8], 3.0 * result.q[2], atol=1e-9)
     assert problem.conserved and np.ptp(result.energy) < 1e-9
@@ -77,12 +67,12 @@ def test_a_rack(tilt):
     slide = model.prismatic("ground", "rack", at=(0.0, -0.2), axis=along)
     model.rack(pinion, slide, radius=0.2)
     model.axial_spring(slide, stiffness=30.0, length=0.1)
-    _, result = moved(model)
+    _, result = run_of(model)
 
     def acceleration(t, s, rate):
         return (-30.0 * (s - 0.1) - 1.5 * GRAVITY * np.sin(tilt)) / (1.5 + 0.5 * 2.0)
 
-    known = by_hand(acceleration, [0.0, 0.0])
+    known = by_hand(acceleration, [0.0, 0.0], TIMES)
     np.testing.assert_allclose(result.q[3:5], np.outer(along, known[0]) + np.array([[0.0], [-0.2]]), atol=1e-9)
     np.testing.assert_allclose(result.q[2], known[0] / 0.2, atol=1e-8)
 
@@ -96,7 +86,7 @@ def test_a_wheel_that_rolls_down_a_slope_that_slides():
     model.disc("wheel", r, mass=m, position=0.5 * along + r * up)
     model.prismatic("ground", "wedge", at=(0.0, 0.0), axis=(1.0, 0.0))
     joint = model.rolling("wedge", "wheel", radius=r, axis=along)
-    problem, result = moved(model)
+    problem, result = run_of(model)
     c = np.cos(tilt)
     s, x = np.linalg.solve(np.array([[1.5 * m, m * c], [m * c, m + M]]), [-m * GRAVITY * np.sin(tilt), 0.0])
     np.testing.assert_allclose(result.q[0], 0.5 * x * TIMES**2, atol=1e-9)
@@ -142,7 +132,7 @@ def test_a_cam_with_a_follower():
 
     model.point_on_curve(cam, follower, at=(0.0, high), curve=groove)
     model.drive(hinge, lambda t: 3.0 * t)
-    _, result = moved(model)
+    _, result = run_of(model)
     np.testing.assert_allclose(result.q[4], 0.3 + 0.05 * np.cos(2.0 * (0.5 * np.pi - 0.2 - 3.0 * TIMES)), atol=1e-9)
 
 
@@ -182,8 +172,7 @@ def test_a_rolling_disc_in_space():
     )
     joint = model.rolling(wheel, radius=r, axis=axle)
     problem = model.problem((0.0, 2.0))
-    found = solve_dae(problem.system, (0.0, 2.0), problem.q0, problem.v0, rtol=1e-10, atol=1e-10)
-    theirs = solve_dae(known.system, (0.0, 2.0), known.q0, known.v0, rtol=1e-10, atol=1e-10)
+    found, theirs = (moved(each, "auto", 1e-10) for each in (problem, known))
     np.testing.assert_allclose(found.q[:3, -1], theirs.q[:3, -1], atol=1e-7)
     assert problem.conserved and np.ptp(found.energy) < 1e-7
     force = found.reactions(joint.name).force
@@ -195,7 +184,7 @@ def test_a_skate_on_a_slope():
     model, spin = PlanarModel(gravity=(0.0, -3.0)), 1.7
     blade = model.body("blade", mass=2.0, inertia=0.3, position=(0.0, 0.0), angular_velocity=spin)
     joint = model.skate(blade, at=(0.0, 0.0), axis=(1.0, 0.0))
-    problem, result = moved(model)
+    problem, result = run_of(model)
     phase, scale = spin * TIMES, 3.0 / spin**2
     x, y = 0.5 * phase + 0.25 * np.sin(2.0 * phase) - np.sin(phase), 0.5 * np.sin(phase) ** 2 + np.cos(phase) - 1.0
     np.testing.assert_allclose(result.q[:2], scale * np.array([x, y]), atol=1e-9)

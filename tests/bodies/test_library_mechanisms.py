@@ -5,12 +5,14 @@ library's tables; where they differ (tips of bars, masses without extension, yaw
 """
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from studies.bench.closed_loops import squeezer
-from twoloop import mechanisms, solve_dae
+from tests.bodies.runs import moved
+from twoloop import mechanisms
 from twoloop.bodies import PlanarModel, SpatialModel
 from twoloop.mechanisms.rotation import rotation_matrix
 from twoloop.mechanisms.spatial_four_bar import inertia as round_bar
@@ -19,26 +21,11 @@ pytestmark = pytest.mark.filterwarnings("ignore::twoloop.ConstraintWarning")
 TIMES = np.linspace(0.0, 1.0, 6)
 
 
-def run(problem, end, tolerance):
-    result = solve_dae(
-        problem.system,
-        (0.0, end),
-        problem.q0,
-        problem.v0,
-        "DOP853",
-        t_eval=end * TIMES,
-        rtol=tolerance,
-        atol=tolerance,
-        compiled=False,
-    )
-    assert result.success, result.message
-    return result
-
-
 def both(made, known, end, tolerance=1e-11, conserved=True, energy=True):
     """Runs of a model's problem and of a ready one; their energies move alike."""
     assert made.conserved == conserved
-    one, other = run(made, end, tolerance), run(known, end, tolerance)
+    runs = (replace(problem, t_span=(0.0, end)) for problem in (made, known))
+    one, other = (moved(run, tolerance=tolerance, t_eval=end * TIMES, compiled=False) for run in runs)
     energies = [problem.energy(each.t, each.q, each.v) for problem, each in ((made, one), (known, other))]
     if energy:
         scale = 1.0 + np.abs(energies[1] - energies[1][0]).max()

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from tests.bodies.random_models import Both
+from tests.bodies.runs import moved
 from twoloop import solve_dae
 from twoloop.bodies import IgnoredWarning, SpatialModel, from_mjcf
 from twoloop.bodies.mjcf_geometry import geom_lump
@@ -47,11 +48,9 @@ def read(text, folder):
     return from_mjcf(path)
 
 
-def end(model, end=0.5, **options):
+def end(model, end=0.5):
     problem = model.problem((0.0, end))
-    result = solve_dae(problem.system, problem.t_span, problem.q0, problem.v0, "DOP853", rtol=1e-11, atol=1e-11)
-    assert result.success
-    return problem, result.q[:, -1].reshape(-1, 7)
+    return problem, moved(problem).q[:, -1].reshape(-1, 7)
 
 
 def about_y(degrees):
@@ -267,10 +266,9 @@ def test_what_flags_disable_is_not_there(flag, loops, springs, dampers, tmp_path
     option = f"<option><flag {flag}='disable'/></option>" if flag else ""
     option = f"<option><flag gravity='disable'/></option>{option}<option><flag gravity='enable'/></option>"
     equality = "<equality><connect body1='a' body2='b' anchor='1 0 0'/></equality>"
-    path = tmp_path / "flags.xml"
-    path.write_text(f"<mujoco>{option}<worldbody>{body.format('a')}{body.format('b')}</worldbody>{equality}</mujoco>")
+    bodies = body.format("a") + body.format("b")
     with pytest.warns(IgnoredWarning, match="contacts between geoms"):
-        model = from_mjcf(path)
+        model = read(f"<mujoco>{option}<worldbody>{bodies}</worldbody>{equality}</mujoco>", tmp_path)
     assert sum(joint.kind == "spherical" for joint in model.joints) == loops and model.gravity[2] == -9.81
     values = [force.more.values[:2] for force in model.forces] or [(0.0, 0.0)]
     assert values[0] == (3.0 * springs, 2.0 * dampers)
@@ -278,35 +276,28 @@ def test_what_flags_disable_is_not_there(flag, loops, springs, dampers, tmp_path
 
 @pytest.mark.parametrize("kind", ["mesh", "box' size='0.1 0.1 0.1' mesh='stone"])  # a box that is fitted to a mesh
 def test_the_mass_of_a_mesh_is_missed_where_it_counts_only(kind, tmp_path):
-    path = tmp_path / "mesh.xml"
     geom = f"<geom type='{kind}' contype='0' conaffinity='0'{{}}/>"
     inertial = "<inertial pos='0 0 1' mass='2' diaginertia='1 1 1'/>"
     for more, weighed in (("", True), (" mass='0'", False), (" density='0'", False)):
         own = f"<body><joint/>{geom.format(more)}<geom size='0.1'/></body>"
-        path.write_text(f"<mujoco><worldbody>{own}</worldbody></mujoco>")
-        model = _read(path)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", IgnoredWarning)
+            model = read(f"<mujoco><worldbody>{own}</worldbody></mujoco>", tmp_path)
         assert any("the mass of" in each for each in model.ignored) == weighed
-    path.write_text(f"<mujoco><worldbody><body><joint/>{geom.format('')}{inertial}</body></worldbody></mujoco>")
-    model = from_mjcf(path)
+    body = f"<body><joint/>{geom.format('')}{inertial}</body>"
+    model = read(f"<mujoco><worldbody>{body}</worldbody></mujoco>", tmp_path)
     assert model.ignored == () and model.bodies[0].inertia[0] == 2.0
-
-
-def _read(path):
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", IgnoredWarning)
-        return from_mjcf(path)
 
 
 def test_what_defaults_leave_to_an_element(tmp_path):
     """Several sections add up, one way to turn replaces another, and sizes that are not given stay."""
-    path = tmp_path / "defaults.xml"
-    path.write_text("""<mujoco>
+    text = """<mujoco>
       <default><geom type="box" size="0.1 0.2 0.3" quat="0.5 0.1 0.8 0" density="300" contype="0"
         conaffinity="0"/></default>
       <default><joint damping="0.5"/><default class="long"><geom size="0.4" euler="0 0 90"/></default></default>
       <worldbody><body name="a"><joint axis="0 1 0"/><geom size="0.5" euler="90 0 0"/></body>
-        <body name="b" pos="3 0 0"><joint axis="0 1 0"/><geom class="long"/></body></worldbody></mujoco>""")
-    model = from_mjcf(path)
+        <body name="b" pos="3 0 0"><joint axis="0 1 0"/><geom class="long"/></body></worldbody></mujoco>"""
+    model = read(text, tmp_path)
     (a, b), spring = model.bodies, model.forces[0]
     mass = 300.0 * 8.0 * 0.5 * 0.2 * 0.3
     moments = mass / 3.0 * np.array([0.2**2 + 0.3**2, 0.5**2 + 0.2**2, 0.5**2 + 0.3**2])  # y and z change places
@@ -322,16 +313,12 @@ def test_sites_between_two_points_and_springs_whose_length_is_elsewhere(tmp_path
       <geom size="0.1" pos="1 0 0"/>
       <site name="s" type="capsule" fromto="0.1 0 0 0.5 0.2 0" size="0.01"/></body></worldbody>
       <tendon><spatial stiffness="{1}" {2}><site site="s"/><site site="w"/></spatial></tendon></mujoco>"""
-    path = tmp_path / "site.xml"
-    path.write_text(text.format("", "30", 'springlength="0.3"'))
-    (spring,) = from_mjcf(path).forces
+    (spring,) = read(text.format("", "30", 'springlength="0.3"'), tmp_path).forces
     np.testing.assert_allclose(spring.on_first.values, [0.3 - 1.0, 0.1, 0.0])
-    path.write_text(text.format('ref="30"', "30", ""))
     with pytest.raises(ValueError, match=r"needs a springlength.*springref"):
-        from_mjcf(path)
-    path.write_text(text.format("", "30 2", ""))
+        read(text.format('ref="30"', "30", ""), tmp_path)
     with pytest.warns(IgnoredWarning, match="tendon: spatial"):
-        assert not from_mjcf(path).forces
+        assert not read(text.format("", "30 2", ""), tmp_path).forces
 
 
 def test_accelerations_of_a_tree_are_those_of_mujoco(tmp_path):

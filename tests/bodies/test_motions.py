@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
 
+from tests.bodies.runs import by_hand, moved
 from twoloop import ensemble, solve_dae
 from twoloop.bodies import PlanarModel, SpatialModel
 
@@ -12,24 +12,9 @@ GRAVITY = 9.81
 pytestmark = pytest.mark.filterwarnings("ignore::twoloop.ConstraintWarning")  # planar loops in space
 
 
-def by_hand(acceleration, state, times=TIMES):
-    """Coordinates and rates of x'' = acceleration(t, x, x')."""
-    n = len(state) // 2
-
-    def rate(t, y):
-        return np.concatenate([y[n:], np.atleast_1d(acceleration(t, y[:n], y[n:]))])
-
-    found = solve_ivp(rate, (0.0, times[-1]), state, "DOP853", times, rtol=1e-12, atol=1e-12)
-    return found.y
-
-
-def moved(model, method="auto", times=TIMES, **options):
+def run_of(model, method="auto", times=TIMES):
     problem = model.problem((0.0, times[-1]))
-    result = solve_dae(
-        problem.system, problem.t_span, problem.q0, problem.v0, method, t_eval=times, rtol=1e-11, atol=1e-11, **options
-    )
-    assert result.success, result.message
-    return problem, result
+    return problem, moved(problem, method, t_eval=times)
 
 
 def test_a_damped_pendulum_with_torsion_spring_and_motor():
@@ -39,13 +24,13 @@ def test_a_damped_pendulum_with_torsion_spring_and_motor():
     pin = model.revolute("ground", bar, at=(0.0, 0.0))
     model.torsion_spring(pin, stiffness=k, damping=c, angle=rest)
     model.motor(pin, lambda t: 2.0 * np.sin(3.0 * t))
-    problem, result = moved(model)
+    problem, result = run_of(model)
 
     def acceleration(t, x, v):
         torque = -k * (x - rest) - c * v + 2.0 * np.sin(3.0 * t) - m * GRAVITY * L * np.cos(x)
         return torque / (J + m * L**2)
 
-    known = by_hand(acceleration, [0.0, 1.5])  # the angle from where the bar is given
+    known = by_hand(acceleration, [0.0, 1.5], TIMES)  # the angle from where the bar is given
     np.testing.assert_allclose(result.q[2] - 0.2, known[0], atol=1e-8)
     np.testing.assert_allclose(result.v[2], known[1], atol=1e-8)
     assert problem.conserved is False
@@ -70,7 +55,7 @@ def test_a_cart_with_a_pendulum_spring_and_motor(feedback):
     def of_state(t, q, v):
         return 3.0 * np.cos(2.0 * t) - 1.5 * v[0] - 0.2 * q[5] ** 2
 
-    problem, result = moved(cart(PlanarModel(), of_state if feedback else of_time, 0.4))
+    problem, result = run_of(cart(PlanarModel(), of_state if feedback else of_time, 0.4))
     M, m, L, J = 2.0, 0.5, 0.6, 0.02
 
     def acceleration(t, z, rate):
@@ -81,7 +66,7 @@ def test_a_cart_with_a_pendulum_spring_and_motor(feedback):
         b = np.array([push + m * L * rate[1] ** 2 * np.sin(turn), -m * GRAVITY * L * np.sin(turn)])
         return np.linalg.solve(A, b)
 
-    known = by_hand(acceleration, [0.0, 0.0, 0.7, 2.0])
+    known = by_hand(acceleration, [0.0, 0.0, 0.7, 2.0], TIMES)
     np.testing.assert_allclose(result.q[0], known[0], atol=1e-8)
     np.testing.assert_allclose(result.q[5] + 0.5 * np.pi, known[1], atol=1e-8)
     assert problem.freedom.degrees == 2
@@ -96,13 +81,13 @@ def test_a_pendulum_on_a_driven_arm_in_space():
     axis = model.revolute("ground", shaft, at=(0.0, 0.0, 0.0), axis=(0.0, 0.0, 1.0))
     model.revolute(shaft, bob, at=(0.0, 0.0, 0.0), axis=(0.0, -1.0, 0.0))
     model.drive(axis, lambda t: 6.0 * t + 0.5 * np.sin(t))
-    problem, result = moved(model)
+    problem, result = run_of(model)
 
     def acceleration(t, theta, rate):
         pull = m * l**2 * (6.0 + 0.5 * np.cos(t)) ** 2 * np.sin(theta) * np.cos(theta) - m * GRAVITY * l * np.sin(theta)
         return pull / (m * l**2 + small)
 
-    known = by_hand(acceleration, [0.5, 0.0])
+    known = by_hand(acceleration, [0.5, 0.0], TIMES)
     np.testing.assert_allclose(-result.q[9] / l, np.cos(known[0]), atol=1e-8)
     assert problem.freedom.degrees == 1 and problem.v0[8] == pytest.approx(6.5 * l * np.sin(0.5))
     # the torque of the drive is the rate of the angular momentum about the axis
@@ -123,15 +108,15 @@ def test_a_driven_slide_in_space_carries_a_spring_mass():
     second = model.prismatic(table, mass, at=(0.0, 0.0, 0.0), axis=along)
     model.spring(table, (0.0, 0.0, 0.0), mass, along, stiffness=30.0, damping=0.2, length=0.9)
     model.motor(second, 0.3)
-    _, result = moved(model)
+    _, result = run_of(model)
 
     def acceleration(t, x, v):
         s, rate = 0.2 * np.sin(5.0 * t), np.cos(5.0 * t)
         return (-30.0 * (x - s - 0.9) - 0.2 * (v - rate) + 0.3) / 0.5
 
-    known = by_hand(acceleration, [1.0, 0.0])
+    known = by_hand(acceleration, [1.0, 0.0], TIMES)
     place = along @ result.q[7:10]
-    rest = by_hand(acceleration, [1.0, along @ result.v[7:10, 0]])
+    rest = by_hand(acceleration, [1.0, along @ result.v[7:10, 0]], TIMES)
     assert np.abs(rest[0] - place).max() < 1e-8 and known.shape == rest.shape
 
 
@@ -142,7 +127,7 @@ def test_functions_that_branch_are_called_in_python_and_do_the_same():
     def branching(t):
         return 3.0 * float(np.cos(2.0 * t)) if t < 1e9 else 0.0
 
-    traced, called = (moved(cart(PlanarModel(), f, 0.4), "DOP853") for f in (smooth, branching))
+    traced, called = (run_of(cart(PlanarModel(), f, 0.4), "DOP853") for f in (smooth, branching))
     assert called[0].system.called_in_python and not traced[0].system.called_in_python
     assert "called in Python" in called[0].note and "converts to a number" in called[0].note
     np.testing.assert_allclose(called[1].q, traced[1].q, atol=1e-9)
@@ -150,10 +135,10 @@ def test_functions_that_branch_are_called_in_python_and_do_the_same():
         ValueError,
         match=r"'Taylor' needs .*: f of 'motor of prismatic cart-ground': .* converts to a number.*if t < 1e9",
     ):
-        moved(cart(PlanarModel(), branching, 0.4), "Taylor")
+        run_of(cart(PlanarModel(), branching, 0.4), "Taylor")
     model = cart(PlanarModel(), branching, 0.4)
     model.drive("revolute cart-rod", lambda t: 2.0 * t + 0.1 * t**2)  # is traced all the same
-    problem, result = moved(model, "DOP853")
+    problem, result = run_of(model, "DOP853")
     np.testing.assert_allclose(result.q[5] - result.q[5, 0], 2.0 * TIMES + 0.1 * TIMES**2, atol=1e-9)
     assert problem.system.constraint_rate(1.0, problem.q0)[-1] == pytest.approx(-2.2)
 
@@ -180,8 +165,7 @@ def test_many_runs_with_parameters_by_name():
         changed = {"stiffness of spring cart-ground (N/m)": P[k, problem.place("stiffness of spring cart-ground")]}
         again = problem.with_parameters({**changed, "mass of rod": P[k, problem.place("mass of rod")]})
         np.testing.assert_allclose(again.system.parameters, P[k])
-        result = solve_dae(again.system, again.t_span, again.q0, again.v0, "DOP853", rtol=1e-11, atol=1e-11)
-        np.testing.assert_allclose(runs.q[k, :, -1], result.q[:, -1], atol=1e-8)
+        np.testing.assert_allclose(runs.q[k, :, -1], moved(again).q[:, -1], atol=1e-8)
 
 
 def loop(turn, move, spatial):
@@ -225,7 +209,7 @@ def test_a_model_turned_and_moved_as_a_whole_moves_alike(spatial):
     if spatial:
         turn = turn @ np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]])
     move, times = np.array([3.0, -4.0, 5.0 * spatial]), np.linspace(0.0, 1.5, 4)
-    one, other = (moved(loop(*place, spatial), "DOP853", times) for place in ((np.eye(3), np.zeros(3)), (turn, move)))
+    one, other = (run_of(loop(*place, spatial), "DOP853", times) for place in ((np.eye(3), np.zeros(3)), (turn, move)))
     n, width = (2, 3) if not spatial else (3, 7)
     there = np.einsum("ij,kjt->kit", turn[:n, :n], one[1].q.reshape(4, width, -1)[:, :n]) + move[:n, None]
     np.testing.assert_allclose(other[1].q.reshape(4, width, -1)[:, :n], there, atol=1e-8)
@@ -238,7 +222,7 @@ def test_a_model_turned_and_moved_as_a_whole_moves_alike(spatial):
 
 def test_a_plane_and_space_agree():
     times = np.linspace(0.0, 1.5, 4)
-    one, other = (moved(loop(np.eye(3), np.zeros(3), spatial), "DOP853", times) for spatial in (False, True))
+    one, other = (run_of(loop(np.eye(3), np.zeros(3), spatial), "DOP853", times) for spatial in (False, True))
     np.testing.assert_allclose(one[1].q.reshape(4, 3, -1)[:, :2], other[1].q.reshape(4, 7, -1)[:, :2], atol=1e-8)
     np.testing.assert_allclose(
         *(problem.energy(result.t, result.q, result.v) for problem, result in (one, other)), atol=1e-7
@@ -250,7 +234,7 @@ def test_a_torsion_spring_in_space_counts_more_than_half_a_turn():
     wheel = model.body("wheel", mass=1.0, inertia=(1.0, 1.0, 2.0), position=(0.0, 0.0, 0.0), angular_velocity=(0, 0, 3))
     hinge = model.revolute("ground", wheel, at=(0.0, 0.0, 0.0), axis=(0.0, 0.0, 5.0))
     model.torsion_spring(hinge, stiffness=0.9)
-    problem, result = moved(model, times=np.linspace(0.0, 5.0, 11))
+    problem, result = run_of(model, times=np.linspace(0.0, 5.0, 11))
     frequency = np.sqrt(0.45)
     angle = 3.0 / frequency * np.sin(frequency * result.t)  # to 256 degrees
     np.testing.assert_allclose(result.q[6], np.sin(0.5 * angle), atol=1e-8)

@@ -5,6 +5,7 @@ import warnings
 import numpy as np
 import pytest
 
+from tests.bodies.runs import moved
 from twoloop import solve_dae
 from twoloop.bodies import IgnoredWarning, Loop, PlanarModel, SpatialModel, from_urdf
 from twoloop.mechanisms.rotation import euler_rates, rotation_matrix
@@ -93,12 +94,8 @@ def by_hand():
 
 
 def test_the_same_by_hand(arm):
-    problems = read(arm, positions=POSITIONS).problem(), by_hand().problem()
-    ends = []
-    for problem in problems:
-        result = solve_dae(problem.system, (0.0, 1.0), problem.q0, problem.v0, "DOP853", rtol=1e-11, atol=1e-11)
-        assert result.success
-        ends.append(result.q[:, -1])
+    problems = [model.problem((0.0, 1.0)) for model in (read(arm, positions=POSITIONS), by_hand())]
+    ends = [moved(problem).q[:, -1] for problem in problems]
     assert problems[0].freedom == problems[1].freedom and problems[0].freedom.degrees == 3
     np.testing.assert_allclose(problems[0].q0, problems[1].q0, atol=1e-14)
     np.testing.assert_allclose(ends[0], ends[1], atol=1e-11)
@@ -178,8 +175,8 @@ def test_a_loop_that_is_given_beside_the_file(tmp_path):
     model = read(path, loops=[loop], positions={"pivot": 1.4, "elbow": -1.2, "foot": 1.9})
     plane = PlanarModel()
     with pytest.warns(match="have rank"):
-        space = model.problem()
-        result = solve_dae(space.system, (0.0, 2.0), space.q0, space.v0, "DOP853", rtol=1e-10, atol=1e-10)
+        space = model.problem((0.0, 2.0))
+        result = moved(space, tolerance=1e-10)
     for k, body in enumerate(model.bodies):
         name, L, q = body.name, BARS[body.name], space.q0[7 * k :]
         axis = rotation_matrix(q[3:7])[:, 0]
@@ -190,8 +187,8 @@ def test_a_loop_that_is_given_beside_the_file(tmp_path):
     plane.revolute("crank", "rod", at=(points["crank"][1], points["rod"][0]))
     plane.revolute("rod", "rocker", at=(points["rod"][1], points["rocker"][1]))
     plane.revolute(base, "rocker", at=(base.point(3.0, 0.0), points["rocker"][0]))
-    flat = plane.problem()
-    known = solve_dae(flat.system, (0.0, 2.0), flat.q0, flat.v0, "DOP853", rtol=1e-10, atol=1e-10)
+    flat = plane.problem((0.0, 2.0))
+    known = moved(flat, tolerance=1e-10)
     assert space.freedom.degrees == flat.freedom.degrees == 1
     ours, theirs = result.q.reshape(3, 7, -1)[:, [0, 2], -1], known.q.reshape(3, 3, -1)[:, :2, -1]
     np.testing.assert_allclose(ours, theirs, atol=1e-8)

@@ -8,7 +8,7 @@ from scipy.interpolate import CubicSpline
 from scipy.linalg import eigh
 
 from references.scipy.beam_reduced import reduced_motion
-from tests.problems import violations, worst
+from tests.problems import run, violations, worst
 from twoloop import solve_dae
 from twoloop.mechanisms import ancf_beam, moderately_stiff_beam, very_flexible_beam
 from twoloop.mechanisms.ancf_beam import elastic_tangent, midpoint_deflection, tip_height
@@ -67,9 +67,7 @@ def test_energy_balance_includes_the_work_of_the_base(case, request):
     # -lam acts on the beam at the base, whose velocity is -C_t: the power is lam . C_t
     problem = request.getfixturevalue(case)
     end = 0.02 if case == "flexible" else 0.002
-    result = solve_dae(
-        problem.system, (0.0, end), problem.q0, problem.v0, "Gauss6", t_eval=np.linspace(0.0, end, 2001), rtol=1e-10
-    )
+    result = run(problem, end, method="Gauss6", t_eval=np.linspace(0.0, end, 2001), rtol=1e-10)
     assert result.success
     rate = np.array([problem.system.constraint_rate(t, problem.q0) for t in result.t]).T
     work = CubicSpline(result.t, (result.lam * rate).sum(axis=0)).antiderivative()(result.t)

@@ -10,8 +10,8 @@ from tests.general.mechanisms import ELSEWHERE
 from tests.mechanisms.make_references import converged, digits
 from tests.mechanisms.motions import closed_forms, known_motions
 from tests.mechanisms.motions.integrate import by_scipy
-from tests.problems import row_errors, slope
-from twoloop import ConstraintWarning, mechanisms, solve_dae
+from tests.problems import row_errors, run, slope
+from twoloop import ConstraintWarning, mechanisms
 from twoloop.mechanisms.sundials_slider_crank import PRINTED
 
 COMPUTED, CLOSED = known_motions(), closed_forms()
@@ -36,16 +36,7 @@ def end_of(name, method):
     problem = of(name)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ConstraintWarning)
-        result = solve_dae(
-            problem.system,
-            (0.0, problem.reference.t),
-            problem.q0,
-            problem.v0,
-            method=method,
-            rtol=1e-10,
-            atol=1e-10,
-            max_steps=200_000,
-        )
+        result = run(problem, problem.reference.t, method=method, rtol=1e-10, atol=1e-10)
     assert result.success, result.message
     return result
 

@@ -184,6 +184,35 @@ class Collection:
         here, there = self._points(at, first, second)
         return first, second, name, (self._numbers(name, first, here), self._numbers(name, second, there))
 
+    def _weld(self, name: str, a: Body, b: Body, points: Points) -> tuple[JointRow, ...]:
+        """The rows that let two bodies move as one."""
+        raise NotImplementedError
+
+    def fixed(self, a: Body | str, b: Body | str, *, at: Any = None, name: str | None = None) -> ModelJoint:
+        """Both bodies move as one.
+
+        Parameters
+        ----------
+        a, b : Body or str
+        at : array_like (2,) or (3,) or (BodyPoint, BodyPoint), optional
+            To which the reaction refers, m. None: the centre of mass of b, or of a if b is the ground.
+        """
+        first, second, name, points = self._pair("fixed", a, b, name, at)
+        return self._add_joint(
+            ModelJoint(name, "fixed", first, second, self._weld(name, first, second, points), *points)
+        )
+
+    def _apart(
+        self, kind: str, a: Any, at_a: Any, b: Any, at_b: Any, name: str | None
+    ) -> tuple[Body, Body, str, Points, float]:
+        """Bodies and name of what is between two points, these points, and their distance in the position given."""
+        first, second = self._body("a", a), self._body("b", b)
+        self._different(kind, first, second)
+        name = self._new_name(kind.removesuffix(" joint"), name, first, second)
+        here, there = self._point("at_a", at_a, first), self._point("at_b", at_b, second)
+        distance = float(np.linalg.norm(first.in_space(here) - second.in_space(there)))
+        return first, second, name, (self._numbers(name, first, here), self._numbers(name, second, there)), distance
+
     def distance(
         self,
         a: Body | str,
@@ -204,16 +233,12 @@ class Collection:
         length : float, optional
             m. None: their distance in the position given.
         """
-        first, second = self._body("a", a), self._body("b", b)
-        self._different("distance joint", first, second)
-        name = self._new_name("distance", name, first, second)
-        here, there = self._point("at_a", at_a, first), self._point("at_b", at_b, second)
+        first, second, name, points, apart = self._apart("distance joint", a, at_a, b, at_b, name)
         if length is None:
-            length = float(np.linalg.norm(first.in_space(here) - second.in_space(there)))
+            length = apart
             if length == 0.0:
                 raise ValueError(f"the points of {name!r} coincide in the position given; give a length, or take a pin")
         check_positive(f"length of {name!r}", length)
-        points = self._numbers(name, first, here), self._numbers(name, second, there)
         long = Numbers((float(length),), (f"length of {name} (m)",))
         row = JointRow(self.distance_kind, 1, first, second, *points, long)
         return self._add_joint(ModelJoint(name, "distance", first, second, (row,), *points))

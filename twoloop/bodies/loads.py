@@ -5,8 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-import numpy as np
-
 from twoloop.bodies.collection import Collection
 from twoloop.bodies.documented import documented
 from twoloop.bodies.functions import Function, motion_function
@@ -57,14 +55,9 @@ class Loads(Collection):
         length : float, optional
             At which the spring is without force, m. None: the distance of the points in the position given.
         """
-        first, second = self._body("a", a), self._body("b", b)
-        self._different("spring", first, second)
-        name = self._new_name("spring", name, first, second)
-        here, there = self._point("at_a", at_a, first), self._point("at_b", at_b, second)
-        distance = float(np.linalg.norm(first.in_space(here) - second.in_space(there)))
+        first, second, name, points, distance = self._apart("spring", a, at_a, b, at_b, name)
         stiffness, damping = check_not_negative("stiffness", stiffness), check_not_negative("damping", damping)
         length = distance if length is None else check_not_negative("length", length)
-        points = self._numbers(name, first, here), self._numbers(name, second, there)
         if length == 0.0:
             if damping:
                 raise ValueError(
@@ -158,11 +151,6 @@ class Loads(Collection):
             Of friction over load. None: it does not depend on the load.
         radius : float, optional
             Of the pin of a revolute joint with a coefficient, m.
-        name : str, optional
-
-        Returns
-        -------
-        Force
 
         Raises
         ------

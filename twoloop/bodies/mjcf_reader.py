@@ -268,32 +268,19 @@ class _Reader:
         if element.tag not in ("connect", "weld"):
             self.ignored.append(f"equality: {_called(element)}")
             return
-        ends: list[tuple[Part | None, Any]] = []
+        if "site1" in given and element.tag == "weld":
+            raise ValueError(f"{_called(element)} between sites is not read; give bodies")
         if "site1" in given:
-            if element.tag == "weld":
-                raise ValueError(f"{_called(element)} between sites is not read; give bodies")
-            ends = [self._site(given[key]) for key in ("site1", "site2")]
-            one, other = (self._of(part) for part, _ in ends)
-            points = tuple(
-                body.point(*body.local_point(place)) for body, (_, place) in zip((one, other), ends, strict=True)
-            )
-            self.model.spherical(
-                one,
-                other,
-                at=points,
-                name=self._free(given.get("name"), f"{element.tag} of {one.name} and {other.name}"),
-            )
-            return
-        frames = [self._frame(given[key]) if key in given else self.frames["world"] for key in ("body1", "body2")]
-        one, other = (self._of(part) for part, _ in frames)
+            (part, here), (other_part, there) = (self._site(given[key]) for key in ("site1", "site2"))
+            one, other = self._of(part), self._of(other_part)
+            at: Any = one.point(*one.local_point(here)), other.point(*other.local_point(there))
+        else:
+            frames = [self._frame(given[key]) if key in given else self.frames["world"] for key in ("body1", "body2")]
+            one, other = (self._of(part) for part, _ in frames)
+            if element.tag == "connect":
+                at = frames[0][1].point(numbers(given.get("anchor", ""), 3, f"anchor of {_called(element)}"))
         if element.tag == "connect":
-            place = frames[0][1].point(numbers(given.get("anchor", ""), 3, f"anchor of {_called(element)}"))
-            self.model.spherical(
-                one,
-                other,
-                at=place,
-                name=self._free(given.get("name"), f"{element.tag} of {one.name} and {other.name}"),
-            )
+            self.model.spherical(one, other, at=at, name=self._name_of(element, given, one, other))
             return
         if float(given.get("torquescale", 1.0)) == 0.0:
             raise ValueError(
@@ -308,9 +295,10 @@ class _Reader:
                 raise ValueError(
                     f"relpose of {_called(element)} must be the one that the bodies have; it is off by {off:.3g}"
                 )
-        self.model.fixed(
-            one, other, name=self._free(given.get("name"), f"{element.tag} of {one.name} and {other.name}")
-        )
+        self.model.fixed(one, other, name=self._name_of(element, given, one, other))
+
+    def _name_of(self, element: Element, given: dict[str, str], one: Body, other: Body) -> str:
+        return self._free(given.get("name"), f"{element.tag} of {one.name} and {other.name}")
 
     def _tendon(self, element: Element) -> None:
         given = self._attributes(element, "main")

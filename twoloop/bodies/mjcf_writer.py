@@ -9,12 +9,12 @@ from typing import Any
 from xml.etree.ElementTree import Element, SubElement
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from twoloop.bodies.mjcf_geometry import IgnoredWarning
 from twoloop.bodies.parameter_layout import PULL, RAIL, SPRING, TORSION
 from twoloop.bodies.parts import Body, Force, ModelJoint
 from twoloop.bodies.spanning_tree import spanning_tree
-from twoloop.checks.arguments import Array
 from twoloop.mechanisms.rotation import euler_parameters
 
 HALF = 0.5  # m, from each other: the two points of a hinge that closes a loop
@@ -78,7 +78,7 @@ class _Writer:
         pose = {"pos": _text(parent.local_point(body.position)), "quat": _text(euler_parameters(R))}
         made = _add(inside, "body", name=body.name, **pose)
         mass, xx, yy, zz, xy, xz, yz = body.inertia.tolist()
-        moments = {"fullinertia": _text(np.array([xx, yy, zz, xy, xz, yz]))}
+        moments = {"fullinertia": _text([xx, yy, zz, xy, xz, yz])}
         _add(made, "inertial", pos="0 0 0", mass=repr(mass), **moments)
         if joint is None:
             _add(made, "freejoint")
@@ -149,23 +149,21 @@ class _Writer:
         tendons = _add(root, "tendon")
         for force in self.tendons:
             assert force.on_first is not None and force.on_second is not None and force.more is not None
-            sites = [f"{force.name} on {body.name}" for body in (force.first, force.second)]
-            for name, body, point in zip(
-                sites, (force.first, force.second), (force.on_first, force.on_second), strict=True
-            ):
-                _add(elements[body.number], "site", name=name, pos=_text(np.array(point.values)))
+            ends = {force.first: force.on_first, force.second: force.on_second}
+            for body, point in ends.items():
+                _add(elements[body.number], "site", name=f"{force.name} on {body.name}", pos=_text(point.values))
             stiffness, damping, length = force.more.values if force.kind == SPRING else (*force.more.values, 0.0, 0.0)
             values = {"stiffness": repr(stiffness), "damping": repr(damping), "springlength": repr(length)}
             spatial = _add(tendons, "spatial", name=force.name, **values)
-            for name in sites:
-                _add(spatial, "site", site=name)
+            for body in ends:
+                _add(spatial, "site", site=f"{force.name} on {body.name}")
 
 
 def _moves(body: Body) -> bool:
     return any(each is not None and each.any() for each in (body.velocity, body.angular_velocity))
 
 
-def _text(values: Array) -> str:
+def _text(values: ArrayLike) -> str:
     return " ".join(map(repr, np.asarray(values, dtype=float).tolist()))
 
 

@@ -28,6 +28,14 @@ class ModelEnergy:
 
     def __call__(self, t: Any, q: Array, v: Array) -> Any:
         """Of one state, or of the columns of many."""
+        from twoloop.mechanisms.points import direction_of, place_of  # whose import compiles
+
+        flat = np.asarray(q)
+
+        def between(i: int, at: int, j: int, there: int) -> Any:
+            here, end = (self.p[k : k + self.dimension] for k in (at, there))
+            return place_of(flat, j, end) - place_of(flat, i, here)
+
         q, v = (np.asarray(x).reshape(self._n, -1, *np.shape(x)[1:]) for x in (q, v))
         size = layout.PLANAR_BODY if self.dimension == 2 else layout.SPATIAL_BODY
         bodies = self.p[self.dimension : self.dimension + size * self._n].reshape(-1, size)
@@ -42,14 +50,15 @@ class ModelEnergy:
             total += 0.5 * np.einsum("ijk,ij...,ik...->...", J, spins, spins)
         for kind, i, at, j, there, more, _, on_first in self._forces:
             if kind in (layout.SPRING, layout.PULL):
-                gap = self._place(q, j, there) - self._place(q, i, at)
-                length = np.sqrt((gap**2).sum(axis=0))
+                length = np.sqrt((between(i, at, j, there) ** 2).sum(axis=0))
                 total += 0.5 * self.p[more] * (length - (self.p[more + 2] if kind == layout.SPRING else 0.0)) ** 2
             elif kind == layout.TORSION:
                 total += 0.5 * self.p[more] * (self._turned(q, i, j, at, there) - self.p[more + 2]) ** 2
             elif kind == layout.RAIL:
-                gap = self._place(q, j, there) - self._place(q, i, on_first)
-                slid = (self._axis(q, i, at) * gap).sum(axis=0)
+                axis = self.p[at : at + 3]
+                if self.dimension == 2:
+                    axis = np.array([np.cos(axis[0]), np.sin(axis[0])])
+                slid = (direction_of(flat, i, axis) * between(i, on_first, j, there)).sum(axis=0)
                 total += 0.5 * self.p[more] * (slid - self.p[more + 2]) ** 2
         return total
 
@@ -63,30 +72,6 @@ class ModelEnergy:
         first, n = head[layout.FORCES], head[layout.N_FORCES]
         table = self.p[first : first + layout.FORCE_WIDTH * n].reshape(-1, layout.FORCE_WIDTH).astype(int)
         return table.tolist()
-
-    def _place(self, q: Array, body: int, at: int) -> Array:
-        """The point of a body in space, (2 or 3,) or (2 or 3, n_t)."""
-        point = self.p[at : at + self.dimension]
-        if body < 0:
-            return point.reshape(-1, *(1,) * (q.ndim - 2))
-        if self.dimension == 2:
-            s, c = np.sin(q[body, 2]), np.cos(q[body, 2])
-            return q[body, :2] + np.array([c * point[0] - s * point[1], s * point[0] + c * point[1]])
-        from twoloop.mechanisms.rotation import rotated  # whose import compiles
-
-        return q[body, :3] + np.array(rotated.py_func(*q[body, 3:], *point))
-
-    def _axis(self, q: Array, body: int, at: int) -> Array:
-        """An axis of a body in space, (2 or 3,) or (2 or 3, n_t)."""
-        if self.dimension == 2:
-            angle = self.p[at] + (q[body, 2] if body >= 0 else np.zeros(q.shape[2:]))
-            return np.array([np.cos(angle), np.sin(angle)])
-        axis = self.p[at : at + 3]
-        if body < 0:
-            return axis.reshape(-1, *(1,) * (q.ndim - 2))
-        from twoloop.mechanisms.rotation import rotated  # whose import compiles
-
-        return np.array(rotated.py_func(*q[body, 3:], *axis))
 
     def _turned(self, q: Array, i: int, j: int, axis: int, zero: int) -> Any:
         if self.dimension == 2:

@@ -140,11 +140,6 @@ class Couplings(Model):
             curve(x, y), zero on the curve; x and y from the centre of mass of a in its axes, of the ground in space, m.
             Such as `lambda x, y: y - 0.1 * np.cos(5.0 * x)`, of numpy's functions without branches. Its gradient must
             not be zero on the curve.
-        name : str, optional
-
-        Returns
-        -------
-        ModelJoint
 
         Raises
         ------

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from twoloop.bodies.collection import Points
 from twoloop.bodies.documented import documented
 from twoloop.bodies.functions import Function
 from twoloop.bodies.parameter_layout import ACROSS, ALONG, ANGLE, DISTANCE, PIN, SLIDE, TORQUE, TORSION
@@ -177,19 +178,8 @@ class PlanarModel(Couplings):
         )
         return self._add_joint(ModelJoint(name, "prismatic", first, second, rows, *points))
 
-    def fixed(self, a: Body | str, b: Body | str, *, at: Any = None, name: str | None = None) -> ModelJoint:
-        """Both bodies move as one.
-
-        Parameters
-        ----------
-        a, b : Body or str
-        at : array_like (2,) or (BodyPoint, BodyPoint), optional
-            To which the reaction refers, m. None: the centre of mass of b, or of a if b is the ground.
-        """
-        first, second, name, points = self._pair("fixed", a, b, name, at)
-        turned = _turn(name, first, second, second.rotation - first.rotation)
-        rows = _pin(first, second, *points), JointRow(ANGLE, 1, first, second, more=turned)
-        return self._add_joint(ModelJoint(name, "fixed", first, second, rows, *points))
+    def _weld(self, name: str, a: Body, b: Body, points: Points) -> tuple[JointRow, ...]:
+        return _pin(a, b, *points), JointRow(ANGLE, 1, a, b, more=_turn(name, a, b, b.rotation - a.rotation))
 
     def _no_rotation(self) -> float:
         return 0.0

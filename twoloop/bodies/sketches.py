@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
-
 import numpy as np
 
 from twoloop.bodies.parameter_layout import PULL, SPRING
@@ -26,14 +24,7 @@ def drawing_of(tables: Tables) -> Drawing:
             elif not any(np.abs(place - other).max() < 1e-12 for other in ends[body.name]):
                 ends[body.name].append(place)
     for body in tables.bodies:
-        points = ends[body.name]
-        if len(points) == 1 and np.any(points[0]):
-            points.append(np.zeros(len(points[0])))
-            sketch.trace(body.number, points[1])
-        if len(points) < 2:
-            sketch.add_box(body.number, _size(body))
-        for first, second in pairwise(points):
-            sketch.line((body.number, first), (body.number, second))
+        sketch.add_body(body.number, ends[body.name], 0.0, _size(body))
     for joint in tables.joints:
         if joint.kind == "revolute" and joint.a.number >= 0 and joint.b.number >= 0:
             sketch.trace(joint.a.number, tables.of(joint.point_a).copy())

@@ -8,14 +8,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from twoloop.bodies.collection import Points
 from twoloop.bodies.documented import documented
 from twoloop.bodies.functions import Function
 from twoloop.bodies.parameter_layout import AXIAL, LENGTH, PLANE, POINT, SLIDE, TORSION, TURN
 from twoloop.bodies.parts import Body, Force, JointRow, ModelJoint, Numbers
-from twoloop.bodies.spatial_rows import across, on_line, parallel, perpendiculars, relative
+from twoloop.bodies.spatial_rows import across, on_line, parallel, relative
 from twoloop.bodies.wheels import Wheels
 from twoloop.checks.arguments import Array, shown
-from twoloop.mechanisms.rotation import euler_parameters, euler_rates, rotation_matrix
+from twoloop.mechanisms.rotation import euler_parameters, euler_rates, perpendiculars, rotation_matrix
 
 PERPENDICULAR_TO = 1e-6  # cosine of the angle between the axes of a universal joint, at most
 
@@ -95,11 +96,6 @@ class SpatialModel(Wheels):
             Its centre, m.
         axes : (array_like (3,), array_like (3,)) or (BodyDirection, BodyDirection)
             The axis in a and the axis in b.
-        name : str, optional
-
-        Returns
-        -------
-        ModelJoint
 
         Raises
         ------
@@ -169,24 +165,6 @@ class SpatialModel(Wheels):
         rows = plane, *parallel(first, one, second, other)
         return self._add_joint(ModelJoint(name, "planar", first, second, rows, *points, (one, other)))
 
-    def fixed(self, a: Body | str, b: Body | str, *, at: Any = None, name: str | None = None) -> ModelJoint:
-        """Both bodies move as one.
-
-        Parameters
-        ----------
-        a, b : Body or str
-        at : array_like (3,) or (BodyPoint, BodyPoint), optional
-            To which the reaction refers, m. None: the centre of mass of b, or of a if b is the ground.
-        """
-        first, second, name, points = self._pair("fixed", a, b, name, at)
-        there = second.rotation.T @ first.rotation
-        pairs = ((0, 1), (0, 2), (1, 2))
-        rows = (
-            JointRow(POINT, 3, first, second, *points),
-            *(across(first, np.eye(3)[i], second, there[:, j]) for i, j in pairs),
-        )
-        return self._add_joint(ModelJoint(name, "fixed", first, second, rows, *points))
-
     def to_mjcf(self, path: str | os.PathLike[str]) -> None:
         """Write the model to a file that MuJoCo reads, see `twoloop.bodies.from_mjcf`.
 
@@ -210,6 +188,11 @@ class SpatialModel(Wheels):
         from twoloop.bodies.mjcf_writer import write
 
         write(self, path)
+
+    def _weld(self, name: str, a: Body, b: Body, points: Points) -> tuple[JointRow, ...]:
+        there = b.rotation.T @ a.rotation
+        pairs = ((0, 1), (0, 2), (1, 2))
+        return JointRow(POINT, 3, a, b, *points), *(across(a, np.eye(3)[i], b, there[:, j]) for i, j in pairs)
 
     def _no_rotation(self) -> Array:
         return np.eye(3)

@@ -7,13 +7,7 @@ import numpy as np
 from twoloop.bodies.parameter_layout import PERPENDICULAR, PLANE
 from twoloop.bodies.parts import Body, JointRow, Numbers
 from twoloop.checks.arguments import Array
-
-
-def perpendiculars(axis: Array) -> tuple[Array, Array]:
-    """Two unit directions, perpendicular to an axis and to each other: right-handed with it."""
-    first = np.cross(axis, np.eye(3)[int(np.argmin(np.abs(axis)))])
-    first /= np.linalg.norm(first)
-    return first, np.cross(axis, first)
+from twoloop.mechanisms.rotation import perpendiculars
 
 
 def across(a: Body, one: Array, b: Body, other: Array) -> JointRow:

@@ -10,10 +10,9 @@ from numpy.typing import ArrayLike
 from twoloop.bodies.documented import documented
 from twoloop.bodies.model import Model
 from twoloop.bodies.parts import Body
-from twoloop.bodies.spatial_rows import perpendiculars
 from twoloop.bodies.tables import TENSOR
 from twoloop.checks.arguments import Array, check_positive, check_real, check_vector, shown
-from twoloop.mechanisms.rotation import euler_parameters, rotation_matrix
+from twoloop.mechanisms.rotation import euler_parameters, perpendiculars, rotation_matrix
 
 SYMMETRIC = 1e-9  # relative: entries of an inertia
 

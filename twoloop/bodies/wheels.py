@@ -12,9 +12,9 @@ from twoloop.bodies.parameter_layout import RATE, WRITTEN
 from twoloop.bodies.parts import Body, JointRow, ModelJoint, Numbers
 from twoloop.bodies.places import turned
 from twoloop.bodies.row_function import RateFunction, RowFunction
-from twoloop.bodies.spatial_rows import perpendiculars
 from twoloop.bodies.spatial_shapes import SpatialShapes
 from twoloop.checks.arguments import check_positive, check_vector
+from twoloop.mechanisms.rotation import perpendiculars
 
 FLAT = 1e-6  # sine of the angle between axle and normal
 

@@ -6,16 +6,13 @@ axis along the chain. (35) of the paper is printed with a cosine of th3 where a 
 """
 
 import math
-from dataclasses import dataclass
 from numbers import Real
-from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from twoloop.checks.arguments import check_finite, check_vector
 from twoloop.kernels.compile.callbacks import callback
-from twoloop.mechanisms.points import GROUND, BodyPoints
+from twoloop.mechanisms.points import GROUND, BodyPoints, PlanarEnergy
 from twoloop.problem.description import body_names
 from twoloop.problem.drawing import Drawing
 from twoloop.problem.given import callbacks_in
@@ -123,21 +120,6 @@ def kinematics(t, q, v, p, C, Cq, Ct, Qd):
     C[7] = x - p[3]
 
 
-@dataclass(frozen=True, eq=False)
-class Energy:
-    """Kinetic plus potential energy of the rods, J, as a function of t, q and v."""
-
-    lengths: Array
-
-    def __call__(self, t: Any, q: ArrayLike, v: ArrayLike) -> Any:
-        """Of one state, or of the columns of many."""
-        q, v = np.asarray(q), np.asarray(v)
-        masses = DENSITY * self.lengths
-        inertias = masses * self.lengths**2 / 12.0
-        kinetic = masses @ (v[0::3] ** 2 + v[1::3] ** 2) + inertias @ v[2::3] ** 2
-        return 0.5 * kinetic + GRAVITY * (masses @ q[1::3])
-
-
 def four_bar(
     lengths: tuple[float, float, float] = DEFAULT_LENGTHS,
     ground: float = DEFAULT_GROUND,
@@ -183,6 +165,7 @@ def four_bar(
     q0 = _assemble(lengths_array, ground, theta3, branch)
     is_default = (*lengths_array.tolist(), ground, theta3, branch) == (*DEFAULT_LENGTHS, DEFAULT_GROUND, 0.0, -1)
     L1, L2, L3 = lengths_array.tolist()
+    masses = DENSITY * lengths_array
     system = ConstrainedSystem(
         n_q=9,
         n_c=8,
@@ -198,7 +181,7 @@ def four_bar(
         q0=q0,
         v0=np.zeros(9),
         t_span=(0.0, 100.0),
-        energy=Energy(lengths_array),
+        energy=PlanarEnergy(masses, masses * lengths_array**2 / 12.0, GRAVITY),
         conserved=True,
         drawing=_drawing(L1, L2, L3, ground),
         parameters={

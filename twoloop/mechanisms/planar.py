@@ -10,15 +10,13 @@ ground is body -1.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
 from twoloop.kernels.compile.caches import helper
 from twoloop.kernels.compile.callbacks import callback
-from twoloop.mechanisms.points import Sketch
+from twoloop.mechanisms.points import PlanarEnergy, Sketch
 from twoloop.problem.drawing import Drawing
 from twoloop.problem.entries import LARGE
 from twoloop.problem.given import callbacks_in
@@ -216,21 +214,6 @@ def jacobian_entries(joints: Sequence[Sequence[float]]) -> tuple[list[int], list
     return rows, columns
 
 
-@dataclass(frozen=True, eq=False)
-class Energy:
-    """Kinetic energy and potential of the weight, J, of one state or of many."""
-
-    masses: Array
-    inertias: Array
-    gravity: float
-
-    def __call__(self, t: Any, q: Array, v: Array) -> Any:
-        """Of one state, or of the columns of many."""
-        q, v = np.asarray(q), np.asarray(v)
-        kinetic = 0.5 * (self.masses @ (v[0::3] ** 2 + v[1::3] ** 2) + self.inertias @ v[2::3] ** 2)
-        return kinetic + self.gravity * (self.masses @ q[1::3])
-
-
 class PlanarBodies:
     """Collects bodies and their joints, which are named by their kind and their bodies: "pin rod-ground".
 
@@ -305,9 +288,9 @@ class PlanarBodies:
         return ConstrainedSystem(n_q=n_q, n_c=self.n_c, parameters=parameters, **given, **fixed)
 
     @property
-    def energy(self) -> Energy:
+    def energy(self) -> PlanarEnergy:
         """Energy as a function of t, q and v."""
-        return Energy(self.masses, self.inertias, self.gravity)
+        return PlanarEnergy(self.masses, self.inertias, self.gravity)
 
     @property
     def drawing(self) -> Drawing:
@@ -321,14 +304,8 @@ class PlanarBodies:
                 elif point not in ends[body]:
                     ends[body].append(point)
         for body, points in enumerate(ends):
-            if len(points) == 1 and points[0] != (0.0, 0.0):
-                points.append((-points[0][0], -points[0][1]))
-                sketch.trace(body, points[1])
-            if len(points) < 2:
-                side = np.sqrt(6.0 * self.inertias[body] / self.masses[body])  # of the square of that inertia
-                sketch.add_box(body, (side, side))
-            for first, second in pairwise(points):
-                sketch.line((body, first), (body, second))
+            side = np.sqrt(6.0 * self.inertias[body] / self.masses[body])  # of the square of that inertia
+            sketch.add_body(body, points, -1.0, (side, side))
         for i, a, j, _ in self.pins:
             if GROUND not in (i, j):
                 sketch.trace(i, a)

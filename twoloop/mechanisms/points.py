@@ -1,7 +1,8 @@
-"""Points of bodies for drawings, by the coordinates that the ready mechanisms have."""
+"""Points of bodies, for drawings and energies, by the coordinates that the ready mechanisms have."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -48,17 +49,38 @@ class BodyPoints:
 
     def __call__(self, q: Array) -> Any:
         """The points at q (n_q,) or (n_q, n_t)."""
-        return np.stack([self._place(q, *each) for each in zip(self.bodies, self.points, strict=True)])
+        return np.stack([place_of(q, *each) for each in zip(self.bodies, self.points, strict=True)])
 
-    def _place(self, q: Array, body: int, point: Array) -> Array:
-        if body == GROUND:
-            return point.reshape(-1, *(1,) * (q.ndim - 1)) + np.zeros(q.shape[1:])
-        if len(point) == 2:
-            x, y, angle = q[3 * body : 3 * body + 3]
-            s, c = np.sin(angle), np.cos(angle)
-            return np.stack([x + c * point[0] - s * point[1], y + s * point[0] + c * point[1]])
-        state = q[7 * body : 7 * body + 7]
-        return state[:3] + np.stack(rotated.py_func(*state[3:], *point))
+
+def direction_of(q: Array, body: int, vector: Array) -> Array:
+    """A vector in the axes of a body, in space, (2 or 3,) or (2 or 3, n_t), at q (n_q,) or (n_q, n_t)."""
+    if body == GROUND:
+        return vector.reshape(-1, *(1,) * (q.ndim - 1)) + np.zeros(q.shape[1:])
+    if len(vector) == 2:
+        s, c = np.sin(q[3 * body + 2]), np.cos(q[3 * body + 2])
+        return np.stack([c * vector[0] - s * vector[1], s * vector[0] + c * vector[1]])
+    return np.stack(rotated.py_func(*q[7 * body + 3 : 7 * body + 7], *vector))
+
+
+def place_of(q: Array, body: int, point: Array) -> Array:
+    """A point of a body in space, likewise; from its centre."""
+    turned, first = direction_of(q, body, point), (3 if len(point) == 2 else 7) * body
+    return turned if body == GROUND else q[first : first + len(point)] + turned
+
+
+@dataclass(frozen=True, eq=False)
+class PlanarEnergy:
+    """Kinetic energy of planar bodies and potential of their weight, J, of one state or of many."""
+
+    masses: Array
+    inertias: Array
+    gravity: float
+
+    def __call__(self, t: Any, q: Array, v: Array) -> Any:
+        """Of one state, or of the columns of many."""
+        q, v = np.asarray(q), np.asarray(v)
+        kinetic = 0.5 * (self.masses @ (v[0::3] ** 2 + v[1::3] ** 2) + self.inertias @ v[2::3] ** 2)
+        return kinetic + self.gravity * (self.masses @ q[1::3])
 
 
 def box(size: Any) -> tuple[Array, list[tuple[int, int]]]:
@@ -102,6 +124,17 @@ class Sketch:
         corners, edges = box(size)
         for i, j in edges:
             self.line((body, corners[i]), (body, corners[j]))
+
+    def add_body(self, body: int, points: Sequence[Any], far: float, size: Any) -> None:
+        """A body as lines between its points: with one beside its centre to `far` times this, with none as a box."""
+        places = [np.asarray(point, dtype=float) for point in points]
+        if len(places) == 1 and places[0].any():
+            places.append(far * places[0])
+            self.trace(body, places[1])
+        if len(places) < 2:
+            self.add_box(body, size)
+        for first, second in pairwise(places):
+            self.line((body, first), (body, second))
 
     def trace(self, body: int, point: Any) -> None:
         """The path of a point."""

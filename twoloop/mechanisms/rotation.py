@@ -104,3 +104,10 @@ def euler_parameters(R: ArrayLike) -> Array:
 def euler_rates(e: ArrayLike, spin: ArrayLike) -> Array:
     """e' (4,) at an angular velocity (3,) along the axes of space."""
     return 0.5 * G(e).T @ (rotation_matrix(e).T @ np.asarray(spin, dtype=float))
+
+
+def perpendiculars(axis: Array) -> tuple[Array, Array]:
+    """Two unit directions, perpendicular to a unit axis and to each other: right-handed with it."""
+    first = np.cross(axis, np.eye(3)[int(np.argmin(np.abs(axis)))])
+    first /= np.linalg.norm(first)
+    return first, np.cross(axis, first)

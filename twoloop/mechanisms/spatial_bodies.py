@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from twoloop.mechanisms import spatial
-from twoloop.mechanisms.points import Sketch
-from twoloop.mechanisms.rotation import euler_parameters, euler_rates, rotation_matrix
+from twoloop.mechanisms.points import Sketch, place_of
+from twoloop.mechanisms.rotation import euler_parameters, euler_rates, perpendiculars, rotation_matrix
 from twoloop.mechanisms.spatial import DIRECTION, GROUND, PLANE, POINT
 from twoloop.problem.drawing import Drawing
 from twoloop.problem.entries import LARGE
@@ -17,6 +17,7 @@ from twoloop.problem.joints import Joint, unused
 from twoloop.problem.problem import Array
 from twoloop.problem.system import ConstrainedSystem
 
+Row = tuple[float, int, Array, int, Array, Array]  # kind, body i, its numbers, body j, its numbers, point s
 NAMES = ("x (m)", "y (m)", "z (m)", "e0", "e1", "e2", "e3")
 
 
@@ -88,61 +89,49 @@ class SpatialBodies:
         given = np.asarray(point, dtype=float)
         return given if body == GROUND else self._along(body, given - self._q[body + 1][:3])
 
-    def _add(self, kind: float, rows: int, i: int, a: Array, j: int, b: Array, s: Array) -> None:
-        self._joints.append([kind, float(self.n_joint_rows), float(i), *a, float(j), *b, *s])
-        self.n_joint_rows += rows
+    def _coincide(self, i: int, j: int, point: ArrayLike) -> Row:
+        return POINT, i, self._from_centre(i, point), j, self._from_centre(j, point), np.zeros(3)
 
-    def _coincide(self, i: int, j: int, point: ArrayLike) -> None:
-        self._add(POINT, 3, i, self._from_centre(i, point), j, self._from_centre(j, point), np.zeros(3))
+    def _perpendicular(self, i: int, a: ArrayLike, j: int, b: ArrayLike) -> Row:
+        return DIRECTION, i, self._along(i, a), j, self._along(j, b), np.zeros(3)
 
-    def _perpendicular(self, i: int, a: ArrayLike, j: int, b: ArrayLike) -> None:
-        self._add(DIRECTION, 1, i, self._along(i, a), j, self._along(j, b), np.zeros(3))
+    def _parallel(self, i: int, j: int, axis: ArrayLike) -> list[Row]:
+        return [self._perpendicular(i, across, j, axis) for across in perpendiculars(_unit(axis))]
 
-    def _parallel(self, i: int, j: int, axis: ArrayLike) -> None:
-        for across in _across(axis):
-            self._perpendicular(i, across, j, axis)
-
-    def _name(self, kind: str, i: int, j: int, point: ArrayLike, first: int) -> None:
-        """Name the rows since `first`: a joint that acts on body i, or, where that is the ground, on body j."""
+    def _add(self, kind: str, i: int, j: int, point: ArrayLike, *rows: Row) -> None:
+        """A joint of these rows, which acts on body i, or, where that is the ground, on body j."""
+        first = self.n_joint_rows
+        for row_kind, one, a, two, b, s in rows:
+            self._joints.append([row_kind, float(self.n_joint_rows), float(one), *a, float(two), *b, *s])
+            self.n_joint_rows += 3 if row_kind == POINT else 1
         if kind != "prismatic":  # whose point stays on neither body
             self._drawn.append((i, j, np.asarray(point, dtype=float)))
         body, other = (j, i) if i == GROUND else (i, j)
         name = f"{kind} {self._names[body]}-{'ground' if other == GROUND else self._names[other]}"
-        rows, place = tuple(range(first, self.n_joint_rows)), 7 * body
+        numbered, place = tuple(range(first, self.n_joint_rows)), 7 * body
         position, parameters = tuple(range(place, place + 3)), tuple(range(place + 3, place + 7))
         there = tuple(self._from_centre(body, point))
-        self._named.append(Joint(unused(name, self._named), rows, position, parameters, there))
+        self._named.append(Joint(unused(name, self._named), numbered, position, parameters, there))
 
     def spherical(self, i: int, j: int, point: ArrayLike) -> None:
         """Three rows: both bodies share a point."""
-        first = self.n_joint_rows
-        self._coincide(i, j, point)
-        self._name("spherical", i, j, point, first)
+        self._add("spherical", i, j, point, self._coincide(i, j, point))
 
     def revolute(self, i: int, j: int, point: ArrayLike, axis: ArrayLike) -> None:
         """Five rows: a hinge at a point."""
-        first = self.n_joint_rows
-        self._coincide(i, j, point)
-        self._parallel(i, j, axis)
-        self._name("revolute", i, j, point, first)
+        self._add("revolute", i, j, point, self._coincide(i, j, point), *self._parallel(i, j, axis))
 
     def universal(self, i: int, j: int, point: ArrayLike, a: ArrayLike, b: ArrayLike) -> None:
         """Four rows: a cross at a point, one axis fixed in body i, the other, perpendicular, in body j."""
-        first = self.n_joint_rows
-        self._coincide(i, j, point)
-        self._perpendicular(i, a, j, b)
-        self._name("universal", i, j, point, first)
+        self._add("universal", i, j, point, self._coincide(i, j, point), self._perpendicular(i, a, j, b))
 
     def prismatic(self, i: int, j: int, point: ArrayLike, axis: ArrayLike) -> None:
         """Five rows: body j slides along an axis of body i through a point, and does not turn on it."""
-        start = self.n_joint_rows
-        first, second = _across(axis)
+        first, second = perpendiculars(_unit(axis))
         here, there = self._from_centre(i, point), self._from_centre(j, point)
-        for across in (first, second):
-            self._add(PLANE, 1, i, self._along(i, across), j, there, here)
-        self._parallel(i, j, axis)
-        self._perpendicular(i, first, j, second)
-        self._name("prismatic", i, j, point, start)
+        planes = [(PLANE, i, self._along(i, across), j, there, here) for across in (first, second)]
+        turns = *self._parallel(i, j, axis), self._perpendicular(i, first, j, second)
+        self._add("prismatic", i, j, point, *planes, *turns)
 
     def spring(
         self, i: int, a: ArrayLike, j: int, b: ArrayLike, stiffness: float, damping: float, length: float
@@ -213,12 +202,9 @@ class SpatialBodies:
         return Momentum(np.array(self._bodies), np.asarray(point, dtype=float), np.asarray(axis, dtype=float))
 
 
-def _across(axis: ArrayLike) -> tuple[Array, Array]:
-    """Two unit directions, perpendicular to an axis and to each other."""
-    axis = np.asarray(axis, dtype=float)
-    first = np.cross(axis, np.eye(3)[int(np.argmin(np.abs(axis)))])
-    second = np.cross(axis, first)
-    return first / np.linalg.norm(first), second / np.linalg.norm(second)
+def _unit(axis: ArrayLike) -> Array:
+    given = np.asarray(axis, dtype=float)
+    return given / np.linalg.norm(given)
 
 
 def _states(q: Array, v: Array) -> tuple[Array, Array]:
@@ -244,13 +230,14 @@ class Energy:
 
     def __call__(self, t: Any, q: Array, v: Array) -> Any:
         """Of one state, or of the columns of many."""
+        flat = np.asarray(q)
         q, v = _states(q, v)
         masses, inertias = self.bodies[:, 0], self.bodies[:, 1:]
         kinetic = np.einsum("i,ij...->...", masses, v[:, :3] ** 2)
         kinetic += np.einsum("ij,ij...->...", inertias, _spins(q, v) ** 2)
         total = 0.5 * kinetic - np.einsum("i,j,ij...->...", masses, self.gravity, q[:, :3])
         for spring in self.springs:
-            gap = _place(q, int(spring[4]), spring[5:8]) - _place(q, int(spring[0]), spring[1:4])
+            gap = place_of(flat, int(spring[4]), spring[5:8]) - place_of(flat, int(spring[0]), spring[1:4])
             total = total + 0.5 * spring[8] * (np.sqrt((gap**2).sum(axis=0)) - spring[10]) ** 2
         return total
 
@@ -274,10 +261,3 @@ class Momentum:
             moment = np.cross(arm, rate[:3], axis=0) * mass + np.array(own)
             total = total + np.tensordot(self.axis, moment, axes=1)
         return total
-
-
-def _place(q: Array, body: int, point: Array) -> Array:
-    """The point of a body in space, (3,) or (3, n_t)."""
-    if body == GROUND:
-        return point.reshape(3, *(1,) * (q.ndim - 2))
-    return q[body, :3] + np.array(spatial.rotated.py_func(*q[body, 3:], *point))
