@@ -35,6 +35,14 @@ def magnet(t, q, v, p):
     return np.array([SIZE if abs(q[0] - p[0]) < p[1] else 0.0, -9.81])
 
 
+def smooth_magnet(t, q, v, p):
+    return np.array([SIZE * np.exp(-(((q[0] - p[0]) / p[1]) ** 2)), -9.81])
+
+
+def teeth(t, q, v, p):
+    return np.array([SIZE * np.cos((q[0] - p[0]) / p[1]) ** 4096, -9.81])
+
+
 def steady(t, q, v, p):
     return np.array([-p[1] * v[0], -9.81])
 
@@ -114,6 +122,24 @@ def test_nor_is_what_acts_at_a_place_that_is_passed_in_that_time():
             assert result.success and np.abs(result.q[:, -1] - expected).max() < 1e-4
 
 
+@pytest.mark.parametrize("options", [{}, {"compiled": False}, {"method": "Taylor"}], ids=str)
+@pytest.mark.parametrize("tolerance", [1e-6, 1e-8])
+def test_nor_is_a_smooth_force_at_such_a_place(options, tolerance):
+    """It is passed at 3/s, a width in a two-thousandth of the run or more."""
+    system = pendulum(smooth_magnet)
+    for at, width in ((0.1, 5e-3), (0.3, 5e-3), (-0.2, 1e-2), (0.4, 1e-2)):
+
+        def rate(t, state, p=(at, width)):
+            along = np.cos(state[0]) * smooth_magnet(t, [np.sin(state[0])], None, p)[0]
+            return state[1], along - 9.81 * np.sin(state[0])
+
+        made = solve_ivp(rate, (0.0, T_END), (0.0, 3.0), method="DOP853", rtol=1e-11, atol=1e-11, max_step=5e-4)
+        expected = np.array([np.sin(made.y[0, -1]), -np.cos(made.y[0, -1])])
+        run = (0.0, T_END), START[0], [3.0, 0.0]
+        result = solve_dae(system.with_parameters([at, width]), *run, rtol=tolerance, atol=tolerance, **options)
+        assert result.success and np.abs(result.q[:, -1] - expected).max() < 1e3 * tolerance
+
+
 def test_a_force_that_raises_where_no_step_comes_is_looked_at_where_steps_begin():
     """x is at most 1, and its parabola goes beyond."""
 
@@ -134,9 +160,11 @@ def test_nor_in_lanes():
 
 
 def test_what_may_act_for_a_short_time():
-    assert all(may_be_sudden(system, False) for system in (*SYSTEMS.values(), pendulum(ticking)))
+    assert all(may_be_sudden(system, False).by_time for system in (*SYSTEMS.values(), pendulum(ticking)))
     smooth = pendulum(vibrating), pendulum(steady), four_bar().system, driven_slider_crank().system
-    assert not any(may_be_sudden(system, False) for system in smooth)
+    assert not any(any(may_be_sudden(system, False)) for system in smooth)
+    for force in (smooth_magnet, teeth):
+        assert may_be_sudden(pendulum(force), False) == (False, True)
 
 
 def test_forces_are_not_called_beyond_the_end_of_a_run():

@@ -44,7 +44,7 @@ class LaneRuns:
 
         self.system, self.starts, self.method = system, starts, method
         generic, varying = generic_parameters(starts.parameters)
-        self.places = PLACES * (OF_SUDDEN if may_be_sudden(system, ran_on_symbols=True) else 1)
+        self.places = PLACES * (OF_SUDDEN if any(may_be_sudden(system, ran_on_symbols=True)) else 1)
         choice = Choice.at(system_of(system, starts, 0), starts.t0, starts.q[0])
         kind = ("lanes", method.series, choice, tuple(varying))  # of which the latest is kept
         make = partial(OwnLanes, system, choice, generic, varying, method.series)

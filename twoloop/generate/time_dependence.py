@@ -1,4 +1,4 @@
-"""Whether forces, C_t or b may change suddenly with time, by what their callbacks are traced to."""
+"""Whether forces, C_t or b may change suddenly, with time or with the state, by what their callbacks are traced to."""
 
 from typing import Any, NamedTuple
 
@@ -6,62 +6,90 @@ from twoloop.generate.families import Evaluator, Family, of_family
 from twoloop.generate.traced_equations import Equations
 from twoloop.generate.traced_values import unchecked
 from twoloop.generate.tracing import Form, Graph, Untraceable
-from twoloop.kernels.evaluation.operations import COSINE, PRODUCT, SINE, SUM
+from twoloop.kernels.evaluation.operations import COSINE, EXPONENTIAL, PRODUCT, SINE, SUM
 from twoloop.problem.system import ConstrainedSystem
 
+BY_TIME = ("force", "constraint_rate", "nonholonomic_rate")  # callbacks that a change with time is looked for in ...
+BY_STATE = ("force", "mass", "jacobian")  # ... and one with the state
 SMOOTH = (PRODUCT, SUM, SINE, COSINE)  # polynomials and vibrations: nothing happens in a short time alone ...
 HIGHEST = 8  # ... up to this degree: a high power of a cosine is a pulse
+HIGHEST_OF_STATE = 32  # degree in q and v up to which it is seen from afar; so are roots and quotients, not exp
 LARGEST = 300  # coordinates: to trace the forces of more takes up to seconds, the looks of a run a tenth of it
-BY_TIME = 1  # the bit of t, the first input of a graph
+TIME = 1  # the bit of t, the first input of a graph
 
 
-class TimeDependence(NamedTuple):
+class Sudden(NamedTuple):
+    """Whether something may act for a short time, at a given time and at given places or speeds."""
+
+    by_time: bool
+    by_state: bool
+
+
+class Dependence(NamedTuple):
     """What is known of a family of systems."""
 
-    is_sudden: bool
+    sudden: Sudden
     kinds: frozenset[str]  # of callbacks that ran on symbols
 
-    def of(self, system: ConstrainedSystem, evaluate: Evaluator) -> "TimeDependence":
+    def of(self, system: ConstrainedSystem, evaluate: Evaluator) -> "Dependence":
         """That of one of the systems: the same."""
         return self
 
 
-def may_be_sudden(system: ConstrainedSystem, ran_on_symbols: bool) -> bool:
-    """Whether a force, C_t or b may act for a short time; so may what cannot be traced.
+def may_be_sudden(system: ConstrainedSystem, ran_on_symbols: bool) -> Sudden:
+    """Whether forces, C_t or b may act for a short time; so may what cannot be traced.
 
     Functions called in Python run on symbols only if the force has done so: they may keep what they are given.
     """
-    if system.n_q > LARGEST or (system.called_in_python and not ran_on_symbols):
-        return True
+    if system.n_q > LARGEST:
+        return Sudden(True, False)
+    if system.called_in_python and not ran_on_symbols:
+        return Sudden(True, True)
     try:
-        known: TimeDependence = of_family(system, "time dependence", _traced(system), unchecked)
+        known: Dependence = of_family(system, "dependence", _traced(system), unchecked)
     except Untraceable:
-        return True
-    return known.is_sudden
+        return Sudden(True, True)
+    return known.sudden
 
 
 def _traced(system: ConstrainedSystem) -> Any:
-    def make(family: Family) -> TimeDependence:
+    def make(family: Family) -> Dependence:
         equations = Equations(system, family.parameters)
-        kinds = ("force", "constraint_rate", "nonholonomic_rate")
-        forms = [form for kind in kinds if kind in system.given for form in equations.of(kind).ravel()]
-        return TimeDependence(_is_sudden(equations.graph, forms), frozenset(equations.graph.traced))
+
+        def needed(kinds: tuple[str, ...]) -> list[int]:
+            forms = [form for kind in kinds if kind in system.given for form in equations.of(kind).ravel()]
+            return equations.graph.needed_by(forms)
+
+        graph = equations.graph
+        sudden = Sudden(_by_time(graph, needed(BY_TIME)), _by_state(graph, needed(BY_STATE), system.n_q))
+        return Dependence(sudden, frozenset(graph.traced))
 
     return make
 
 
-def _is_sudden(graph: Graph, forms: list[Form]) -> bool:
+def _by_time(graph: Graph, needed: list[int]) -> bool:
     degrees = {0: 1}  # in time, or in vibrations with it; 0 of what is not here
-
-    def degree(form: Form | None) -> int:
-        return 0 if form is None else max((degrees.get(i, 0) for i in form.terms), default=0)
-
-    for i in graph.needed_by(forms):
+    for i in needed:
         operation = graph.operations[i]
-        if operation is None or not graph.inputs_of[i] & BY_TIME:
-            continue
-        kind, first, second = operation
-        degrees[i] = degree(first) + degree(second) if kind == PRODUCT else degree(first)
-        if kind not in SMOOTH or degrees[i] > HIGHEST:
-            return True
+        if operation is not None and graph.inputs_of[i] & TIME:
+            degrees[i] = _degree(degrees, *operation)
+            if operation[0] not in SMOOTH or degrees[i] > HIGHEST:
+                return True
     return False
+
+
+def _by_state(graph: Graph, needed: list[int], n_q: int) -> bool:
+    degrees = dict.fromkeys(range(1, 2 * n_q + 1), 1)
+    for i in needed:
+        operation = graph.operations[i]
+        if operation is not None and graph.inputs_of[i] & ~TIME:
+            degrees[i] = _degree(degrees, *operation)
+            if operation[0] == EXPONENTIAL or degrees[i] > HIGHEST_OF_STATE:
+                return True
+    return False
+
+
+def _degree(degrees: dict[int, int], kind: int, *factors: Form | None) -> int:
+    """The degree of a product is the sum of those of its factors; of others that of their argument."""
+    first, *others = (max((degrees.get(i, 0) for i in form.terms), default=0) for form in factors if form is not None)
+    return first + sum(others) if kind == PRODUCT else first

@@ -40,7 +40,7 @@ from twoloop.kernels.data.noted import (
     UNCHECKED,
     WIDEST_GAP,
 )
-from twoloop.kernels.data.tolerances import GAP
+from twoloop.kernels.data.tolerances import GAP, LOOK
 from twoloop.kernels.evaluation.calls import (
     accelerations,
     check_redundant,
@@ -180,7 +180,7 @@ def _count(w, tolerances, size, out_step):
         w.notes[LARGEST_DEFECT] = max(w.notes[LARGEST_DEFECT], w.notes[DEFECT])
     else:
         w.notes[UNCHECKED] += 1.0
-    gap = min(size, tolerances[GAP]) if w.notes[DEFECT] >= 0.0 else size
+    gap = min(size, tolerances[LOOK]) if w.notes[DEFECT] >= 0.0 else size
     w.notes[WIDEST_GAP] = max(w.notes[WIDEST_GAP], gap)
     w.notes[ORIENTATION] = w.notes[ORIENTATION_NEW]
     out_step[at.H] = size

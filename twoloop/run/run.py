@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from twoloop.checks.consistency import dependent_rows, least_inertia, mass_and_rows, pattern_of
 from twoloop.checks.rank import SHOWN, equations_in_words, in_words
 from twoloop.checks.sparse_rows import Rows, SparseRows, norms
-from twoloop.generate.time_dependence import may_be_sudden
+from twoloop.generate.time_dependence import Sudden, may_be_sudden
 from twoloop.kernels.compile.linking import direct
 from twoloop.kernels.control.sudden import PLACES
 from twoloop.kernels.data import codes, counters, flags, noted, tolerances
@@ -30,7 +30,8 @@ Array = NDArray[np.float64]
 FIRST_CHUNK = 1024  # attempts of a small compiled system before Python looks at the run: a look costs 0.2 ms
 FIRST_CHUNK_IN_PYTHON = 64  # ... of one whose callbacks are plain Python functions, which may be slow
 SMALL = 32  # coordinates; chunks of larger systems are shorter in proportion
-LONGEST_UNSEEN = 0.01  # of the run: within this time the equations are looked at once at least
+LONGEST_UNSEEN = 0.01  # of the run: within this time the equations are looked at once at least ...
+SHARPER = 10  # ... and within this part of it by steps that look within, of what may be sharp in q or v
 PROVISIONAL = 10  # steps after which a method that pays for long steps only gives way if they are short
 FIRST_STEP = 0.01  # of the shortest time scale that the initial state shows
 SHORTEST_STEP = 1e-16  # of the first step
@@ -98,9 +99,9 @@ class Run:
         self.substituted = False  # whether another plan has taken over, for good
         self.clock[clock.JUMP_FROM] = self.clock[clock.JUMP_TO] = np.inf
         self.clock[[clock.ROUGH_TO, clock.LOOKED_TO, clock.ALONG_TO, clock.SUDDEN]] = -np.inf
-        self.looks_ahead = step_size is None and may_be_sudden(
-            system, any("force" in each.kinds for each in plan.traced)
-        )
+        ran_on_symbols = any("force" in each.kinds for each in plan.traced)
+        self.sudden = Sudden(False, False) if step_size is not None else may_be_sudden(system, ran_on_symbols)
+        self.control[clock.BY_TIME] = self.sudden.by_time
         self.crossings: list[list[tuple[float, Array]]] = []  # states before and behind steps across singular positions
         self.lengths: list[float] = []  # of steps across such a position that are still to be tried
         self.jumps: list[float] = []  # times at which velocities changed as by an impulse
@@ -316,14 +317,20 @@ class Run:
         first = min(self.first_step(span, self.state) if first_step is None else first_step, span)
         self.clock[self.a.H_NEXT] = first
         self.control[self.a.SHORTEST] = SHORTEST_STEP * first
-        self.max_step, self.gap = max_step, LONGEST_UNSEEN * span
+        self.max_step = max_step
+        self.look_within(span)
+
+    def look_within(self, span: float) -> None:
+        """Set how long a run is of which no hundredth is to pass unseen, s."""
+        self.gap = LONGEST_UNSEEN * span
         self.tolerances[tolerances.GAP] = self.gap
+        self.tolerances[tolerances.LOOK] = self.gap / (SHARPER if self.sudden.by_state else 1)
         self.limit_steps()
 
     def limit_steps(self) -> None:
         """Let no step that does not look at the equations between its ends pass over a hundredth of the run."""
         self.control[self.a.MAX_STEP] = self.max_step if self.plan.looks_within else min(self.max_step, self.gap)
-        self.control[self.a.SPACING] = self.gap / PLACES if self.looks_ahead else 0.0
+        self.control[self.a.SPACING] = self.gap / PLACES if any(self.sudden) else 0.0
 
     def first_step(self, span: float, state: Array) -> float:
         """A share of the time in which velocities and accelerations of a state change the coordinates as a whole."""

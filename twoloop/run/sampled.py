@@ -17,7 +17,7 @@ from twoloop.generate.exact_derivatives import exact_near
 from twoloop.generate.traced_values import Traced
 from twoloop.kernels.compile.callbacks import KINDS
 from twoloop.kernels.compile.linking import direct
-from twoloop.kernels.data import codes, noted, tolerances
+from twoloop.kernels.data import codes, noted
 from twoloop.methods.auto import Auto
 from twoloop.methods.plan import Method
 from twoloop.methods.taylor import Taylor
@@ -27,7 +27,7 @@ from twoloop.run.interrupts import Interrupts
 from twoloop.run.kept import InMemory
 from twoloop.run.record import Record, Status
 from twoloop.run.recorder import Wanted
-from twoloop.run.run import LONGEST_UNSEEN, Run
+from twoloop.run.run import Run
 
 Array = NDArray[np.float64]
 
@@ -143,8 +143,7 @@ class SampledRun:
         code = a.PAUSED
         if self._changed or self.system.called_in_python:  # what such functions find in their surroundings may change
             code = self._begin_anew(t)
-        run.gap = run.tolerances[tolerances.GAP] = LONGEST_UNSEEN * (end - self.t0)
-        run.limit_steps()
+        run.look_within(end - self.t0)
         self._outputs[0], clock[a.NEXT_OUTPUT], clock[a.T_START], clock[a.N_FIXED] = end, 0.0, t, 0.0
         run.control[a.MAX_ATTEMPTS] = STEPS
         steps = self._buffers[2]

@@ -37,8 +37,9 @@ GO_ON = -1  # nothing of these yet
     ROUGH,  # by how much an error may be larger than its estimate where a force jumps, see UNFORESEEN
     SPACING,  # s, of times at which to look ahead for sudden changes; 0: there are none
     AHEAD,  # 1: these looks go along the way; 0: they stay at the state, as a callback raised on the way
+    BY_TIME,  # 1: they stay there ahead of other steps, too, for what may change suddenly with time
     N_CONTROL,
-) = range(N_RULE, N_RULE + 18)
+) = range(N_RULE, N_RULE + 19)
 
 # places in a row of `out_steps`: the size of an accepted step, and the counters so far; JACOBIANS is 0 after an
 # explicit step of a method that switches

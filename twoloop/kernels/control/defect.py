@@ -2,7 +2,7 @@
 
 A step by a Taylor series knows of the forces what they are at its beginning, to all orders, and nothing of what comes
 later: its length follows from the last terms alone. So the equations are evaluated where the step ends, and within it
-at places that lie no further apart than tolerances[GAP].
+at places that lie no further apart than tolerances[LOOK].
 """
 
 import numpy as np

@@ -110,7 +110,7 @@ def up_to_sudden(f, w, tolerances, control, clock, t, size, last, state):
         _look_along(f, w, tolerances, clock, spacing, t, size, last, q, v, a)
     while clock[at.SUDDEN] <= t + NEARLY * spacing or clock[at.SUDDEN] == np.inf:
         begin = max(t, clock[at.LOOKED_TO])
-        if begin >= min(t + size, last):
+        if control[at.BY_TIME] == 0.0 or begin >= min(t + size, last):
             return size
         clock[at.SUDDEN], clock[at.LOOKED_TO] = sudden_time(f, w, tolerances, t, begin, spacing, last, 0.0, q, v, a)
     return min(size, representable(t, clock[at.SUDDEN] - t))

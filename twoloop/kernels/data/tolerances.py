@@ -3,9 +3,9 @@
 from twoloop.kernels.data.common import merged
 
 # places in the array `tolerances` that a step gets; ESTIMATE is 0 for a fixed step, LEAST the smallest tolerance, GAP
-# the time within which the equations are to be looked at once at least; from ATOL on stands the absolute tolerance of
-# each coordinate and its velocity
-RTOL, ESTIMATE, LEAST, GAP, ATOL = range(5)
+# the time within which the equations are to be looked at once at least, LOOK the same of steps that look within; from
+# ATOL on stands the absolute tolerance of each coordinate and its velocity
+RTOL, ESTIMATE, LEAST, GAP, LOOK, ATOL = range(6)
 
 
 @merged

@@ -25,7 +25,7 @@ from twoloop.kernels.data.codes import DONE
 from twoloop.kernels.data.common import ATTEMPT, SETTLE, Attempt, Step, compiled, kernel, merged
 from twoloop.kernels.data.counters import N_OUTER
 from twoloop.kernels.data.noted import DEFECT, NEARLY_SINGULAR
-from twoloop.kernels.data.tolerances import ATOL, ESTIMATE, GAP, RTOL
+from twoloop.kernels.data.tolerances import ATOL, ESTIMATE, GAP, LOOK, RTOL
 from twoloop.kernels.evaluation.calls import evaluate_there, project
 from twoloop.kernels.evaluation.tasks import EVALUATE_THERE
 from twoloop.kernels.steps import recurrences as at
@@ -165,10 +165,10 @@ def _refused_within(f, w, memory, t, h, tolerances, series, order, q, v, a):
 
     The places looked at are not the same in each attempt, but for the last at which a step was refused.
     """
-    gap, shift = tolerances[GAP], memory[at.ATTEMPTS] * GOLDEN % 1.0
+    look, shift = tolerances[LOOK], memory[at.ATTEMPTS] * GOLDEN % 1.0
     n_places = 0
-    if h > gap:
-        n_places = int(np.ceil(h / gap))
+    if h > look:
+        n_places = int(np.ceil(h / look))
     for k in range(-1, n_places):
         s = (k + shift) / n_places if k >= 0 else (memory[at.SUSPECT] - t) / h
         if k < 0 and not (memory[at.SUSPECTED] == 1.0 and 0.0 < s < 1.0):
