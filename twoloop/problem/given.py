@@ -8,7 +8,7 @@ import numpy as np
 from twoloop.checks.arguments import Array, check_real, shown
 from twoloop.kernels.compile.callbacks import KINDS, stand_in
 from twoloop.kernels.compile.private import Dispatcher
-from twoloop.problem.adapters import ConstantMatrix, check_arguments, through_python
+from twoloop.problem.adapters import ConstantMatrix, check_arguments
 from twoloop.problem.entries import VALUES_OF, Entries, check_entries
 from twoloop.problem.jacobian import differenced_jacobian
 
@@ -119,10 +119,7 @@ def in_place_of(kind: str, given: dict[str, Dispatcher]) -> Dispatcher:
     """The callback that stands in for one that is not given."""
     if KINDS[kind].absent != "differences" or "constraint" not in given:
         return stand_in(kind)
-    constraint = given["constraint"]
-    # what is called in Python cannot be watched, and need not be: it is looked up at every call
-    watched = ("differences, through Python", "") if constraint is through_python("constraint") else None
-    return differenced_jacobian(constraint, watched)
+    return differenced_jacobian(given["constraint"])
 
 
 def callbacks_in(names: Mapping[str, Any]) -> dict[str, Any]:
