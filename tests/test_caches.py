@@ -6,8 +6,7 @@ from numba import njit
 
 from tests.own_cache import RUN, Folder, with_kernels
 from tests.processes import run_python
-from twoloop.kernels.compile.caches import UNWRITABLE, watch
-from twoloop.kernels.compile.closures import kept_when_called, stands_for
+from twoloop.kernels.compile.caches import UNWRITABLE, kept_when_called, stands_for, watch
 
 
 @pytest.fixture

@@ -5,6 +5,7 @@ import importlib
 import os
 import sys
 import weakref
+from collections import defaultdict
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 
@@ -14,7 +15,7 @@ import pytest
 from tests.compiled import pendulum_under
 from tests.problems import pendulum as bare_pendulum
 from twoloop import sweep
-from twoloop.generate import stage_code, straight_code
+from twoloop.generate import straight_code
 from twoloop.kernels.compile.caches import Newest
 from twoloop.mechanisms import Problem
 from twoloop.sweeps import sweep as sweeps
@@ -311,11 +312,12 @@ def test_what_is_compiled_for_a_run_is_let_go(monkeypatch):
             held.append(weakref.ref(self))
 
     monkeypatch.setattr(straight_code, "SharedCode", Watched)
-    monkeypatch.setattr(straight_code, "_MADE", Newest())  # what other tests hold has no part in it
+    kept = defaultdict(Newest)
+    monkeypatch.setattr("twoloop.kernels.compile.own_functions._MADE", kept)  # what other tests hold has no part in it
     options = {"measure": plain, "parallel": "threads", "workers": 1, "compiled": True, "method": "DOP853", **QUICK}
     # 0, 1 and -1 stand in the code
     rows = sweep(swinging_under, [{"gravity": gravity} for gravity in (9.0, 1.0, -1.0, 0.0)], **options)
     assert set(rows["status"]) == {"REACHED_END"}, rows["message"].tolist()
     assert len(held) == 8
     gc.collect()
-    assert sum(each() is not None for each in held) <= 2 and len(straight_code._MADE) == len(stage_code._MADE) == 1
+    assert sum(each() is not None for each in held) <= 2 and len(kept["equations"]) == len(kept["stages"]) == 1

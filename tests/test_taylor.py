@@ -1,6 +1,7 @@
 """The Taylor series of the motion: every operation that it knows, every kind of mechanism, and what it refuses."""
 
 import math
+from collections import defaultdict
 
 import numpy as np
 import pytest
@@ -121,7 +122,7 @@ def test_compiled_code_is_read_from_the_disk(monkeypatch):
     problem = mechanisms.four_bar()
     code = own_code(problem.system, 0.0, problem.q0)
     compiled_series.compiled_series(code)  # now it is there
-    monkeypatch.setattr(compiled_series, "_MADE", {})
+    monkeypatch.setattr("twoloop.kernels.compile.own_functions._MADE", defaultdict(dict))
     code.shared.family._made.clear()
     monkeypatch.setattr("twoloop.kernels.compile.own_functions.object_code", None)
     assert "find_order" in compiled_series.compiled_series(code).functions.addresses

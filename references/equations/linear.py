@@ -6,8 +6,7 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from twoloop.kernels.compile.caches import compile_kept, watch
-from twoloop.kernels.compile.closures import kept_when_called
+from twoloop.kernels.compile.caches import compile_kept, kept_when_called, watch
 
 SINGULAR = 1e-13  # a pivot smaller than this, against what stood there, or in its row, is zero
 

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 OWN = {
     *("twoloop.checks.bounds", "twoloop.generate.tracing", "twoloop.generate.calls_on_symbols"),
-    "twoloop.bodies.model_system",
+    *("twoloop.generate.known_numbers", "twoloop.bodies.model_system"),
 }
 MANY = 4096  # parameters that a callback may ask for beyond those that it has, for telling which array is too short
 

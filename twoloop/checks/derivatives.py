@@ -98,7 +98,7 @@ def wrong_derivative(system: ConstrainedSystem, t: float, q: Array, v: Array) ->
     spacing = _spacing(t, q, generic)
     suspicious = False
     if n_c > 0:
-        found = _along_a_run(_along(system, t, q, generic), scale, noise, given, spacing)
+        found = _along_a_run(lambda s: system.constraint(t + s, q + s * generic), scale, noise, given, spacing)
         suspicious = found.disagrees(given, EPS * (abs(jacobian) @ np.abs(generic))[:n_c]).max() > 1.0
     for kind, rows in _gammas(system):
         if suspicious:
@@ -106,11 +106,9 @@ def wrong_derivative(system: ConstrainedSystem, t: float, q: Array, v: Array) ->
         right = defined(lambda kind=kind: system.evaluate(kind, t, q, generic))  # type: ignore[misc]
         if right is None:
             return None
-        given = -right
         noise = EPS * (abs(jacobian) @ np.abs(generic) + np.abs(rate))[rows]
-        rate_along = _along_a_line(system, t, q, generic, rows)
-        found = _along_a_run(rate_along, scale, noise, given, spacing)
-        suspicious = found.disagrees(given, 0.0 * given).max() > 1.0
+        found = _along_a_run(_slowing(system, t, q, generic, rows), scale, noise, right, spacing)
+        suspicious = found.disagrees(right, 0.0 * right).max() > 1.0
     return _wrong_constraint(system, t, q, ANYWHERE) if suspicious else None
 
 
@@ -174,8 +172,8 @@ def _wrong_constraint(system: ConstrainedSystem, t: float, q: Array, sides: tupl
                 continue
             noise = EPS * (abs(jacobian) @ np.abs(v) + np.abs(rate))[rows]
             rounding = _rounding(lambda x, kind=kind, v=v: system.evaluate(kind, t, x, v), given, q)  # type: ignore[misc]
-            turned = _minus(_along_a_line(system, t, q, v, rows))
-            compared = _Comparison(system, kind, t, turned, 0.0, given, spacing=_spacing(t, q, v))
+            slowing = _slowing(system, t, q, v, rows)
+            compared = _Comparison(system, kind, t, slowing, 0.0, given, spacing=_spacing(t, q, v))
             wrong = compared.wrong(min(TIME, _time_scale(q, v)), noise, np.abs(given), rounding, sides)
             if wrong is not None:
                 return wrong
@@ -336,15 +334,6 @@ def _spacing(t: float, q: Array, v: Array) -> float:
     return max(float(np.spacing(abs(t))), float((np.spacing(np.abs(q)) / np.maximum(np.abs(v), 1e-300)).max()))
 
 
-def _along(system: ConstrainedSystem, t: float, q: Array, v: Array) -> Function:
-    """C along a straight motion."""
-    return lambda s: system.constraint(t + s, q + s * v)
-
-
-def _along_a_line(system: ConstrainedSystem, t: float, q: Array, v: Array, rows: slice) -> Function:
-    """Rows of C_q v + C_t and A v + b along a straight motion."""
-    return lambda s: system.velocity_constraint(t + s, q + s * v, v)[rows]
-
-
-def _minus(function: Function) -> Function:
-    return lambda s: -function(s)
+def _slowing(system: ConstrainedSystem, t: float, q: Array, v: Array, rows: slice) -> Function:
+    """Rows of -(C_q v + C_t) and -(A v + b) along a straight motion, whose derivatives are the right-hand sides."""
+    return lambda s: -system.velocity_constraint(t + s, q + s * v, v)[rows]

@@ -126,9 +126,3 @@ def apart(rows: SparseRows) -> list[Integers]:
         groups[group].append(j)
         group_of[j] = group
     return [np.array(group, dtype=np.int64) for group in groups]
-
-
-def rows_of(matrix: Array) -> SparseRows:
-    """The entries of a matrix that are not zero."""
-    rows, columns = np.nonzero(matrix)
-    return SparseRows(rows, columns, matrix[rows, columns], matrix.shape)  # type: ignore[arg-type]

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 
 from twoloop.checks.bounds import Rewritten, place_of
-from twoloop.generate.known_numbers import Known, applied, number
-from twoloop.generate.tracing import FUNCTIONS, OPERATORS, Form, Graph, Refusal, Untraceable, operand
+from twoloop.generate.known_numbers import OPERATORS, Known, Refusal, Untraceable, applied, elementwise, number
+from twoloop.generate.tracing import FUNCTIONS, Form, Graph
 from twoloop.kernels.compile.caches import of_library
 from twoloop.kernels.compile.private import Dispatcher
 
@@ -39,26 +39,17 @@ def trace(function: Callable[..., Any], t: Form, *arguments: Any) -> Any:
     Untraceable
         If it does not run on them, or does with them what it would not do with numbers.
     """
-    graph = t.graph
-    graph.refused, graph.running = "", True
-    try:
-        value = _Traced(lambda python_function: python_function).callback(function)(t, *arguments)
-    except (Refusal, Untraceable) as refusal:
-        raise Untraceable(f"{graph.refused or refusal}{place_of(refusal)}") from None
-    except Exception as error:  # what a callback makes of symbols is its own
-        if not graph.refused:
-            said = (
-                str(error)
-                .partition("\n")[0]
-                .replace("twoloop.generate.tracing.Form", "symbol")
-                .replace("Form", "symbol")
-            )
-            said = f"it does not run on symbols in the place of t, q and v: {type(error).__name__}: {said}"
-            raise Untraceable(f"{said}{place_of(error)}") from error
-    finally:
-        graph.running = False
-    if graph.refused:
-        raise Untraceable(f"{graph.refused}, and catches the exception that says so")
+    graph, value = t.graph, None
+    with graph.watched():
+        try:
+            value = _Traced(lambda python_function: python_function).callback(function)(t, *arguments)
+        except (Refusal, Untraceable) as refusal:
+            raise Untraceable(f"{graph.refused or refusal}{place_of(refusal)}") from None
+        except Exception as error:  # what a callback makes of symbols is its own
+            if not graph.refused:
+                said = str(error).partition("\n")[0].replace("twoloop.generate.tracing.", "").replace("Form", "symbol")
+                said = f"it does not run on symbols in the place of t, q and v: {type(error).__name__}: {said}"
+                raise Untraceable(f"{said}{place_of(error)}") from error
     return value
 
 
@@ -157,7 +148,7 @@ def _either(known: Any, own: Callable[..., Any]) -> Callable[..., Any]:
             remembers = any(type(x) is Known for x in arguments)
             return applied(known.__name__, *arguments) if remembers else known(*arguments)
         if any(isinstance(x, np.ndarray) for x in arguments if type(x) is not Form):
-            return np.frompyfunc(function, len(arguments), 1)(*map(operand, arguments))
+            return elementwise(function, arguments)
         return own(*arguments)
 
     return function

@@ -12,7 +12,7 @@ from twoloop.generate.series import series_program
 from twoloop.generate.series_code import SeriesCode
 from twoloop.generate.straight_code import OwnCode, SharedCode, write_own
 from twoloop.generate.straight_line import Solution
-from twoloop.kernels.compile.caches import Newest, digest_of
+from twoloop.kernels.compile.caches import digest_of
 from twoloop.kernels.compile.own_functions import OwnFunctions, own_functions
 
 LARGEST = 3000  # operations: the time to compile them grows faster than their number
@@ -33,9 +33,6 @@ class CompiledSeries(NamedTuple):
         n, n_rows = self.code.n, self.code.n_rows
         series = 2 * (order + 1) * n
         return N_MEMORY_SCALARS + series + 2 * (n + n_rows) + self.n_factors + self.code.scratch_size(order) + n
-
-
-_MADE = Newest()
 
 
 def compiled_series(code: OwnCode) -> CompiledSeries:
@@ -80,10 +77,7 @@ def _compiled(own: SharedCode) -> CompiledSeries:
             llvm_code.write(module, name, KIT.own_type(name), emit)
         return ["own_factors", "own_solution", *recurrences], str(module)
 
-    made = _MADE.get(key)
-    if made is None:
-        _MADE[key] = made = own_functions("series", _stamp(), key, write)
-    return CompiledSeries(made, code, solution.n_kept, numbers.formulas)
+    return CompiledSeries(own_functions("series", _stamp(), key, write), code, solution.n_kept, numbers.formulas)
 
 
 @cache

@@ -1,17 +1,7 @@
 """Derivatives of traced quantities."""
 
 from twoloop.generate.tracing import Form, Graph
-from twoloop.kernels.evaluation.operations import (
-    ARCTANGENT,
-    COSINE,
-    EXPONENTIAL,
-    LOGARITHM,
-    PRODUCT,
-    RECIPROCAL,
-    SINE,
-    SQUARE_ROOT,
-    SUM,
-)
+from twoloop.kernels.evaluation import operations as op
 
 
 class Derivative:
@@ -52,20 +42,20 @@ class Derivative:
 
     def _of_operation(self, i: int, kind: int, first: Form, second: Form | None) -> Form:
         result, change = Form(self.graph, 0.0, {i: 1.0}), self.of(first)
-        if kind == PRODUCT:
+        if kind == op.PRODUCT:
             assert second is not None
             return change * second + first * self.of(second)
-        if kind == SUM:
+        if kind == op.SUM:
             return change
-        if kind == RECIPROCAL:
+        if kind == op.RECIPROCAL:
             return -(change * result * result)
-        if kind == SQUARE_ROOT:
+        if kind == op.SQUARE_ROOT:
             return change * result.reciprocal() * 0.5
-        if kind == EXPONENTIAL:
+        if kind == op.EXPONENTIAL:
             return change * result
-        if kind == SINE:
+        if kind == op.SINE:
             return change * first.cosine()
-        if kind == COSINE:
+        if kind == op.COSINE:
             return -(change * first.sine())
-        assert kind in (LOGARITHM, ARCTANGENT) and second is not None
+        assert kind in (op.LOGARITHM, op.ARCTANGENT) and second is not None
         return change * second.reciprocal()

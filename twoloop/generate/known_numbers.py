@@ -5,8 +5,10 @@ decides by values (what cancels, which forms are equal), so these must be generi
 """
 
 import math
+import operator
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any, NoReturn
 
 import numpy as np
@@ -19,23 +21,20 @@ Powers = tuple[tuple[int, float], ...]  # atoms and their exponents: a product; 
 MOST_TERMS = 200  # of a sum: each is told apart by all of its terms
 CANCELLED = 8.0 * 2.0**-52  # of a term: what rounding leaves of two that cancel
 NUMBERS = (int, float, np.number)
-FUNCTIONS = {
-    name: getattr(np, name)
-    for name in (
-        "sin",
-        "cos",
-        "tan",
-        "sqrt",
-        "exp",
-        "log",
-        "arctan",
-        "sinh",
-        "cosh",
-        "tanh",
-        "absolute",
-        "hypot",
-        "power",
-    )
+_OF_ONE = ("sin", "cos", "tan", "sqrt", "exp", "log", "arctan", "sinh", "cosh", "tanh", "absolute")
+FUNCTIONS = {name: getattr(np, name) for name in (*_OF_ONE, "hypot", "power")}
+OPERATORS: dict[str, Callable[..., Any]] = {  # of NumPy, as operators of Python
+    "add": operator.add,
+    "subtract": operator.sub,
+    "multiply": operator.mul,
+    "divide": operator.truediv,
+    "power": operator.pow,
+    "float_power": operator.pow,
+    "negative": operator.neg,
+    "positive": operator.pos,
+    "square": lambda x: x * x,
+    "reciprocal": lambda x: 1.0 / x,
+    "hypot": lambda x, y: (x * x + y * y) ** 0.5,
 }
 NAMES = {"atan": "arctan", "fabs": "absolute", "abs": "absolute", "pow": "power", "true_divide": "divide"}
 
@@ -48,7 +47,39 @@ class Refusal(BaseException):
     """Leaves a callback that does not run on symbols: no `except Exception` of its own holds it."""
 
 
-class Record:
+class Symbolic:
+    """What callbacks run on once, in the place of numbers.
+
+    Attributes
+    ----------
+    running : bool
+        Whether a callback runs on it now ...
+    refused : str
+        ... and why it cannot, which it may have caught.
+    """
+
+    running, refused = False, ""
+
+    def refuse(self, reason: str) -> NoReturn:
+        """Leave the callback that runs, and keep the reason."""
+        if not self.running:
+            raise Untraceable(reason)
+        self.refused = self.refused or reason
+        raise Refusal(reason)
+
+    @contextmanager
+    def watched(self) -> Iterator[None]:
+        """While a callback runs: raises Untraceable if it was refused something and has caught that."""
+        self.running, self.refused = True, ""
+        try:
+            yield
+        finally:
+            self.running = False
+        if self.refused:
+            raise Untraceable(f"{self.refused}, and catches the exception that says so")
+
+
+class Record(Symbolic):
     """What numbers were made of: atoms, which are parameters, sums of products of atoms, or functions of these.
 
     Parameters
@@ -58,29 +89,18 @@ class Record:
     varying : sequence of int
         Which of them do.
 
-    Attributes
-    ----------
-    running : bool
-        Whether a callback runs on its numbers, which must not decide by what these are just now ...
-    refused : str
-        ... and that it did, which it may have caught.
+    Notes
+    -----
+    A callback that runs on its numbers must not decide by what these are just now.
     """
 
     def __init__(self, values: Sequence[float], varying: Iterable[int]):
-        self.running, self.refused = False, ""
         self.atoms: list[Any] = [None] * len(values)
         self._places: dict[Any, int] = {}
         self.parameters = np.empty(len(values), dtype=object)
         self.parameters[:] = [float(value) for value in values]
         for place in varying:
             self.parameters[place] = Known(float(values[place]), self, 1.0, ((place, 1.0),))
-
-    def refuse(self, reason: str) -> NoReturn:
-        """Leave the callback that runs, and keep the reason."""
-        if not self.running:
-            raise Untraceable(reason)
-        self.refused = self.refused or reason
-        raise Refusal(reason)
 
     def atom(self, definition: Any) -> Powers:
         """The power of a sum or a function, the one known before if there is one."""
@@ -164,11 +184,7 @@ class Known(float):
             self._decides(f"it calls numpy.{ufunc.__name__} on its parameters")
             plain = (float(each) if type(each) is Known else each for each in inputs)
             return getattr(ufunc, method)(*plain, **options)
-        made = np.frompyfunc(lambda *given: applied(name, *given), len(inputs), 1)(*map(_operand, inputs))
-        if out is None:
-            return made
-        out[0][...] = made
-        return out[0]
+        return elementwise(lambda *given: applied(name, *given), inputs, out)
 
     def _decides(self, reason: str = "it branches on its parameters, or rounds them") -> None:
         """Refuse a callback what is true of this value alone; what traces it may ask."""
@@ -256,7 +272,7 @@ def applied(name: str, *arguments: Any) -> Any:
     name = NAMES.get(name, name)
     if any(not issubclass(type(each), NUMBERS) for each in arguments):  # a symbol, which goes by its own rules
         one, other = arguments
-        return _WITH_SYMBOLS[name](one, other)
+        return OPERATORS[name](one, other)
     numbers = [each if type(each) is Known else float(each) for each in arguments]
     if not any(type(each) is Known for each in numbers):
         return float(getattr(np, name)(*numbers))
@@ -271,16 +287,6 @@ def _function(name: str, *numbers: float) -> Known:
     with np.errstate(all="ignore"):  # a generic number may be where the function has no value
         value = float(FUNCTIONS[name](*map(float, numbers)))
     return Known(value, record, 1.0, record.atom((name, made)))
-
-
-_WITH_SYMBOLS: dict[str, Callable[[Any, Any], Any]] = {
-    "add": lambda x, y: x + y,
-    "subtract": lambda x, y: x - y,
-    "multiply": lambda x, y: x * y,
-    "divide": lambda x, y: x / y,
-    "power": lambda x, y: x**y,
-    "hypot": lambda x, y: (x * x + y * y) ** 0.5,
-}
 
 
 def _operator(name: str, swapped: bool) -> Callable[[Known, Any], Any]:
@@ -316,16 +322,26 @@ Known.__hash__ = float.__hash__  # type: ignore[method-assign]
 for _symbol, _name in {"add": "add", "sub": "subtract", "mul": "multiply", "truediv": "divide", "pow": "power"}.items():
     setattr(Known, f"__{_symbol}__", _operator(_name, False))
     setattr(Known, f"__r{_symbol}__", _operator(_name, True))
-for _name in FUNCTIONS.keys() - {"hypot", "power"}:
+for _name in _OF_ONE:
     setattr(Known, _name, lambda self, name=_name: applied(name, self))  # NumPy calls them on arrays of objects
 
 
+def elementwise(function: Callable[..., Any], inputs: Iterable[Any], out: Any = None) -> Any:
+    """A function of numbers and symbols, for arrays of them, by NumPy, which does not ask these again how to go on."""
+    operands = list(map(_operand, inputs))
+    made = np.frompyfunc(function, len(operands), 1)(*operands)
+    if out is None:
+        return made
+    out[0][...] = made
+    return out[0]
+
+
 def _operand(value: Any) -> Any:
-    """What NumPy takes elementwise without asking `Known` again."""
+    """An array of objects, or of one that is a number of Python's or a symbol, which refuses isinstance."""
     if issubclass(type(value), np.ndarray):
         return value.astype(object)
     made = np.empty((), dtype=object)
-    made[()] = value
+    made[()] = float(value) if issubclass(type(value), np.generic) else value
     return made
 
 

@@ -7,9 +7,6 @@ runs may have parameters of their own.
 import hashlib
 from typing import Any, NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
 from twoloop.generate.choices import Choice
 from twoloop.generate.coefficients import Coefficients
 from twoloop.generate.lane_emitter import LaneEmitter
@@ -23,8 +20,6 @@ from twoloop.kernels.control.defect import ROUNDING
 from twoloop.kernels.control.predictor import FLOOR, LEAST, SHARE_OF_MOTION
 from twoloop.kernels.lanes import lane_room as lanes
 from twoloop.problem.system import ConstrainedSystem
-
-Array = NDArray[np.float64]
 
 LARGEST = 1500  # operations of a series, which take some seconds to compile
 

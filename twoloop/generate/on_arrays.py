@@ -8,27 +8,18 @@ from numpy.typing import NDArray
 
 from twoloop.generate.known_numbers import Record
 from twoloop.generate.tracing import Form, Graph
-from twoloop.kernels.evaluation.operations import (
-    ARCTANGENT,
-    COSINE,
-    EXPONENTIAL,
-    LOGARITHM,
-    PRODUCT,
-    RECIPROCAL,
-    SINE,
-    SQUARE_ROOT,
-)
+from twoloop.kernels.evaluation import operations as op
 
 Array = NDArray[np.float64]
 
 FUNCTIONS: dict[int, Callable[[Any], Any]] = {
-    RECIPROCAL: lambda x: 1.0 / x,
-    SQUARE_ROOT: np.sqrt,
-    EXPONENTIAL: np.exp,
-    SINE: np.sin,
-    COSINE: np.cos,
-    LOGARITHM: np.log,
-    ARCTANGENT: np.arctan,
+    op.RECIPROCAL: lambda x: 1.0 / x,
+    op.SQUARE_ROOT: np.sqrt,
+    op.EXPONENTIAL: np.exp,
+    op.SINE: np.sin,
+    op.COSINE: np.cos,
+    op.LOGARITHM: np.log,
+    op.ARCTANGENT: np.arctan,
 }
 
 
@@ -64,7 +55,7 @@ class OnArrays:
             for i in self.graph.needed_by(forms):
                 kind, first, second = self.graph.operations[i]  # type: ignore[misc]
                 x = value(first)
-                if kind == PRODUCT:
+                if kind == op.PRODUCT:
                     assert second is not None
                     x = x * value(second)
                 values[i] = FUNCTIONS[kind](x) if kind in FUNCTIONS else x

@@ -1,7 +1,7 @@
 """Machine code of one mechanism for lanes, kept on disk by the structure of its equations, and the numbers it reads."""
 
 from collections.abc import Sequence
-from functools import cache
+from functools import cache, cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +24,7 @@ from twoloop.generate.lane_code import LaneCode
 from twoloop.generate.lane_emitter import LaneEmitter
 from twoloop.generate.llvm_text import Module
 from twoloop.generate.tracing import Untraceable
-from twoloop.kernels.compile.caches import Newest, digest_of
+from twoloop.kernels.compile.caches import digest_of
 from twoloop.kernels.compile.own_functions import OwnFunctions, are_kept, own_functions
 from twoloop.kernels.lanes.lane_room import CODE
 from twoloop.problem.system import ConstrainedSystem
@@ -36,8 +36,6 @@ LANE_WRITERS = (lane_code, lane_series, lane_emitter)
 WRITERS = (series, straight_line, straight_code, coefficients, *LANE_WRITERS, llvm_code, llvm_text, llvm_trigonometry)
 
 KIND = "lanes"  # of files on the disk
-
-_MADE = Newest()
 
 
 class OwnLanes:
@@ -63,15 +61,11 @@ class OwnLanes:
             raise Untraceable("it has nonholonomic rows")
         self.record = Record(values.tolist(), varying)
         self.code = LaneCode(system, choice, self.record.parameters, series)
-        self._functions: OwnFunctions | None = _MADE.get(self.code.structure)
 
-    @property
+    @cached_property
     def functions(self) -> OwnFunctions:
         """The code, compiled when it is first asked for."""
-        if self._functions is None:
-            self._functions = own_functions(KIND, _stamp(), self.code.structure, self._write)
-            _MADE[self.code.structure] = self._functions
-        return self._functions
+        return own_functions(KIND, _stamp(), self.code.structure, self._write)
 
     def _write(self) -> tuple[list[str], str]:
         module = Module()
@@ -82,7 +76,7 @@ class OwnLanes:
     @property
     def seconds_to_build(self) -> float:
         """About what the code takes to compile, s; 0 where it is there or on the disk."""
-        if self._functions is not None or are_kept(KIND, _stamp(), self.code.structure):
+        if are_kept(KIND, _stamp(), self.code.structure):
             return 0.0
         return BUILD_SECONDS * self.code.n_quantities
 

@@ -7,13 +7,14 @@ G^T lam + M a are written as few products: terms that share a factor are one pro
 
 from collections.abc import Container, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.generate.families import Evaluator, Family, of_family
-from twoloop.generate.known_numbers import array_of
+from twoloop.generate.known_numbers import array_of, elementwise
 from twoloop.generate.traced_equations import Equations
 from twoloop.generate.traced_values import Check, Traced, unchecked
 from twoloop.generate.tracing import Form, Graph, Untraceable
@@ -152,8 +153,8 @@ def series_program(system: ConstrainedSystem, parameters: Any = None) -> SeriesP
     a, lam = graph.inputs(n, True), graph.inputs(n_rows, True)
     mass, force, jacobian, nonholonomic, rate, nonholonomic_rate = map(equations.of, READ)
     sums = _sums_of(graph)
-    G, mass = (_each_without(sums, each) for each in (np.vstack([jacobian, nonholonomic]), mass))
-    rates, force = (_each_without(sums, each) for each in (np.append(rate, nonholonomic_rate), force))
+    arrays = np.vstack([jacobian, nonholonomic]), mass, np.append(rate, nonholonomic_rate), force
+    G, mass, rates, force = (elementwise(partial(_without_sums, sums), [each]) for each in arrays)
     row_products: dict[Any, Any] = {}
     rows = [_sum_of_products(graph, G[i], v, rates[i], row_products) for i in range(n_rows)]
     reaction_products: dict[Any, Any] = {}
@@ -184,13 +185,6 @@ def _without_sums(sums: dict[int, Form], form: Form) -> Form:
     for i in named:
         total = total + sums[i].times(form.terms[i])
     return total
-
-
-def _each_without(sums: dict[int, Form], forms: Any) -> Any:
-    made = np.empty(forms.shape, dtype=object)
-    for place in np.ndindex(forms.shape):
-        made[place] = _without_sums(sums, forms[place])
-    return made
 
 
 def _sum_of_products(

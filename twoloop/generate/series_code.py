@@ -10,9 +10,6 @@ put together in registers, and the newest coefficients come last in the sums.
 
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from twoloop.generate.coefficients import Coefficients
 from twoloop.generate.llvm_code import ONE, SLACK, ZERO, Emitter, Quantities
 from twoloop.generate.llvm_text import Value, integer
@@ -31,8 +28,6 @@ from twoloop.kernels.evaluation.operations import (
 
 AT_ONCE = 8  # vectors that are summed in one loop, in registers
 FUNCTIONS = {EXPONENTIAL: "exp", LOGARITHM: "log", ARCTANGENT: "atan", SQUARE_ROOT: "sqrt"}
-
-Array = NDArray[np.float64]
 
 
 class SeriesCode:

@@ -15,7 +15,7 @@ from twoloop.generate.llvm_code import SLACK, Emitter
 from twoloop.generate.llvm_text import Module, Value, integer
 from twoloop.generate.series_groups import WIDTH
 from twoloop.generate.straight_code import OwnCode, SharedCode, conditions_hold, results_of
-from twoloop.kernels.compile.caches import Newest, digest_of
+from twoloop.kernels.compile.caches import digest_of
 from twoloop.kernels.compile.own_functions import OwnFunctions, own_functions
 
 AT_ONCE = 16  # vectors that are summed in one loop, in registers
@@ -130,9 +130,6 @@ class CompiledStages(NamedTuple):
         return 4 * self.code.n + self.code.scratch_size()
 
 
-_MADE = Newest()
-
-
 def compiled_stages(of_one: OwnCode, n_stages: int) -> CompiledStages:
     """The code for a mechanism and a method of so many stages, compiled; its machine code is kept on disk."""
     from twoloop.kernels.data.common import KIT
@@ -152,10 +149,7 @@ def compiled_stages(of_one: OwnCode, n_stages: int) -> CompiledStages:
             llvm_code.write(module, name, KIT.own_type(name), emit)
         return list(parts), str(module)
 
-    made = _MADE.get(key)
-    if made is None:
-        _MADE[key] = made = own_functions("stages", _stamp(), key, write)
-    return CompiledStages(made, code)
+    return CompiledStages(own_functions("stages", _stamp(), key, write), code)
 
 
 @cache

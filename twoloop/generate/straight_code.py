@@ -22,8 +22,8 @@ from twoloop.generate.llvm_trigonometry import LARGEST_ANGLE, sine_and_cosine
 from twoloop.generate.straight_line import Outputs, StraightLine
 from twoloop.generate.traced_values import Check, Traced, unchecked
 from twoloop.generate.tracing import Form, Graph, Untraceable
-from twoloop.kernels.compile.caches import Newest, digest_of
-from twoloop.kernels.compile.own_functions import OwnFunctions, own_functions
+from twoloop.kernels.compile.caches import digest_of
+from twoloop.kernels.compile.own_functions import own_functions
 from twoloop.kernels.compile.private import Dispatcher
 from twoloop.kernels.evaluation.operations import (
     ARCTANGENT,
@@ -141,9 +141,6 @@ def write_function(
     llvm_code.write(module, name, kind, emit_all)
 
 
-_MADE = Newest()
-
-
 class SharedCode:
     """Functions made for the equations of a family of systems, compiled, or read from the disk.
 
@@ -168,10 +165,7 @@ class SharedCode:
         structure = repr(list(_described(equations, self.numbers)))
         self.digest = hashlib.sha256((structure + _stamp()).encode()).hexdigest()
         self.projects = equations.closer is not None and equations.nearer is not None
-        made = _MADE.get(self.digest)
-        if made is None:
-            _MADE[self.digest] = made = own_functions("equations", _stamp(), self.digest, self._write)
-        self.functions: OwnFunctions = made
+        self.functions = own_functions("equations", _stamp(), self.digest, self._write)
 
     def of(self, system: ConstrainedSystem, evaluate: Evaluator) -> "OwnCode":
         """The code, and what it reads for one of the systems."""

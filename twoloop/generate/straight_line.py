@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from twoloop.generate.choices import Choice
+from twoloop.generate.known_numbers import elementwise
 from twoloop.generate.traced_equations import Equations, only
 from twoloop.generate.traced_values import Traced
 from twoloop.generate.tracing import Form, Graph, Untraceable
@@ -226,10 +227,7 @@ class StraightLine:
         self.traced = Traced(system, self.graph)
 
     def _made(self, kind: str, v: Sequence[Form] | None = None) -> Any:
-        made = self.equations.of(kind, v)
-        for place in np.ndindex(made.shape):
-            made[place] = made[place].value()
-        return made
+        return elementwise(Form.value, [self.equations.of(kind, v)])
 
     def _redundant(self, rates: Any) -> Outputs:
         left = [k for k in range(self.system.n_c) if k not in self.choice.rows]

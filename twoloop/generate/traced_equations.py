@@ -4,6 +4,7 @@ Series, straight-line code, references and the programs that stand for callbacks
 """
 
 from collections.abc import Sequence
+from contextlib import nullcontext
 from typing import Any
 
 import numpy as np
@@ -38,7 +39,7 @@ class Equations:
     def __init__(self, system: ConstrainedSystem, parameters: Any = None):
         self.system, self.graph = system, Graph()
         self.parameters = system.parameters if parameters is None else parameters
-        self._records = {id(x.record): x.record for x in self.parameters if type(x) is Known}.values()  # one, or none
+        self._watched: Any = next((x.record.watched for x in self.parameters if type(x) is Known), nullcontext)
         (self.t,) = self.graph.inputs(1, False)
         self.q, self.v = self.graph.inputs(system.n_q, False), self.graph.inputs(system.n_q, True)
         self._made: dict[str, Any] = {}
@@ -74,25 +75,18 @@ class Equations:
         out, shape, p = out.astype(object), out.shape, self.parameters.copy()
         arrays = [symbols({"q": self.q, "v": v}[name]) for name in KINDS[kind].state]
         if out.size:
-            for record in self._records:
-                record.running, record.refused = True, ""
             try:
-                if not system.called_in_python:
-                    trace(getattr(system.functions, kind), self.t, *arrays, p, out)
-                elif kind in system.python_functions:
-                    function, more = system.python_functions[kind], (p,) if system.takes_parameters(kind) else ()
-                    out = np.array(trace(function, self.t, *arrays, *more), dtype=object)
-                out = as_forms(graph, out)
-                if out.shape != shape:
-                    raise Untraceable(f"on symbols it returns an array of shape {out.shape}, not {shape}")
-                for record in self._records:
-                    if record.refused:
-                        raise Untraceable(f"{record.refused}, and catches the exception that says so")
+                with self._watched():
+                    if not system.called_in_python:
+                        trace(getattr(system.functions, kind), self.t, *arrays, p, out)
+                    elif kind in system.python_functions:
+                        function, more = system.python_functions[kind], (p,) if system.takes_parameters(kind) else ()
+                        out = np.array(trace(function, self.t, *arrays, *more), dtype=object)
+                    out = as_forms(graph, out)
+                    if out.shape != shape:
+                        raise Untraceable(f"on symbols it returns an array of shape {out.shape}, not {shape}")
             except Untraceable as error:
                 raise Untraceable(f"{kind} of {system.name!r}: {error}") from error
-            finally:
-                for record in self._records:
-                    record.running = False
         graph.traced.setdefault(kind, out.copy())
         return out
 

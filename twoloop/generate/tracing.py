@@ -5,27 +5,26 @@ products and functions of such forms. What is computed twice is one quantity.
 """
 
 import math
-import operator
 from collections.abc import Callable, Iterable
-from typing import Any, NoReturn
+from typing import Any
 
 import numpy as np
 
-from twoloop.generate.known_numbers import Known, Refusal, Untraceable, function_of_number, number
-from twoloop.kernels.evaluation.operations import (
-    ARCTANGENT,
-    COSINE,
-    EXPONENTIAL,
-    LOGARITHM,
-    PRODUCT,
-    RECIPROCAL,
-    SINE,
-    SQUARE_ROOT,
-    SUM,
+from twoloop.generate.known_numbers import (
+    CANCELLED,
+    OPERATORS,
+    Known,
+    Symbolic,
+    elementwise,
+    function_of_number,
+    number,
 )
+from twoloop.generate.known_numbers import (
+    Untraceable as Untraceable,
+)
+from twoloop.kernels.evaluation import operations as op
 
-# the second form of LOGARITHM and ARCTANGENT is what the derivative of the first is divided by
-CANCELLED = 8.0 * 2.0**-52  # of a term: what rounding has left of two that cancel, which depends on their values
+# the second form of a logarithm or an arctangent is what the derivative of the first is divided by
 BRANCHES = "it branches on, or converts to a number, what depends on t, q or v"
 
 # of numbers
@@ -36,7 +35,7 @@ _size = float.__abs__  # a plain number, also of one that knows its parameters
 CONVERTS = "it converts what depends on t, q or v to a number, as functions of math do within methods (numpy's do not)"
 
 
-class Graph:
+class Graph(Symbolic):
     """Quantities, numbered from 0; `operations[i]` is None for an input, else (kind, first form, second form).
 
     `sizes`: how many inputs were made at a time; `traced`: what callbacks gave on symbols, arrays of forms by kind.
@@ -48,17 +47,8 @@ class Graph:
         self.late: list[bool] = []  # whether a quantity depends on more than time and coordinates
         self.inputs_of: list[int] = []  # the inputs that a quantity depends on, a bit each
         self.traced: dict[str, Any] = {}
-        self.running = False  # whether a callback runs on its quantities now ...
-        self.refused = ""  # ... and why it cannot, which it may have caught
         self._known: dict[Any, int] = {}
         self._seen: dict[Any, int] = {}  # factors, in the order in which they came: values have no part in it
-
-    def refuse(self, reason: str) -> NoReturn:
-        """Leave the callback that runs, and keep the reason."""
-        if not self.running:
-            raise Untraceable(reason)
-        self.refused = self.refused or reason
-        raise Refusal(reason)
 
     def inputs(self, n: int, late: bool) -> list["Form"]:
         """New quantities that are given, as forms."""
@@ -103,7 +93,7 @@ class Graph:
         first, second = (self._seen.setdefault(each.key, len(self._seen)) for each in (one, other))
         if second < first:
             one, other = other, one
-        return self.operation(PRODUCT, one, other).times(scale * scale_too)
+        return self.operation(op.PRODUCT, one, other).times(scale * scale_too)
 
 
 def rounded(value: float) -> Any:
@@ -157,7 +147,7 @@ class Form:
 
     def __add__(self, other: Any) -> Any:
         if type(other) is not Form and isinstance(other, np.ndarray):
-            return _each(other, lambda x: x + self)
+            return elementwise(lambda x: x + self, [other])
         other = self._other(other)
         terms = dict(self.terms)
         for i, c in other.terms.items():
@@ -185,7 +175,7 @@ class Form:
 
     def __mul__(self, other: Any) -> Any:
         if type(other) is not Form and isinstance(other, np.ndarray):
-            return _each(other, lambda x: x * self)
+            return elementwise(lambda x: x * self, [other])
         return self.graph.product(self, self._other(other))
 
     __rmul__ = __mul__
@@ -200,14 +190,14 @@ class Form:
 
     def __rpow__(self, base: Any) -> Any:
         if isinstance(base, np.ndarray):
-            return _each(base, lambda x: x**self)
+            return elementwise(lambda x: x**self, [base])
         if base <= 0.0:
             self.graph.refuse(f"it raises {base!r} to a power that depends on t, q or v")
         return (self * LOG(base)).exponential()
 
     def __pow__(self, exponent: Any) -> Any:
         if type(exponent) is not Form and isinstance(exponent, np.ndarray):
-            return _each(exponent, lambda x: self**x)
+            return elementwise(lambda x: self**x, [exponent])
         if type(exponent) is Form or type(exponent) is Known:
             self.graph.refuse("it raises to a power that depends on t, q or v, or on parameters")
         exponent = float(exponent)
@@ -234,44 +224,44 @@ class Form:
         if not self.terms:
             return Form(self.graph, 1.0 / self.constant, {})
         scale, form = self.normalised()
-        return self.graph.operation(RECIPROCAL, form).times(1.0 / scale)
+        return self.graph.operation(op.RECIPROCAL, form).times(1.0 / scale)
 
     def square_root(self) -> "Form":
         """The square root."""
-        return self._function(SQUARE_ROOT, ROOT)
+        return self._function(op.SQUARE_ROOT, ROOT)
 
     def exponential(self) -> "Form":
         """exp x."""
-        return self._function(EXPONENTIAL, EXP)
+        return self._function(op.EXPONENTIAL, EXP)
 
     def sine(self) -> "Form":
         """sin x; sine and cosine are made together, as each needs the other."""
-        self._function(COSINE, COS)
-        return self._function(SINE, SIN)
+        self._function(op.COSINE, COS)
+        return self._function(op.SINE, SIN)
 
     def cosine(self) -> "Form":
         """cos x."""
-        self._function(SINE, SIN)
-        return self._function(COSINE, COS)
+        self._function(op.SINE, SIN)
+        return self._function(op.COSINE, COS)
 
     def value(self) -> "Form":
         """The same as a multiple of one quantity, or as a number."""
         if len(self.terms) + (self.constant != 0.0) < 2:
             return self
         scale, form = self.normalised()
-        return self.graph.operation(SUM, form).times(scale)
+        return self.graph.operation(op.SUM, form).times(scale)
 
     def logarithm(self) -> "Form":
         """log x, whose derivative is x' / x."""
         if not self.terms:
             return Form(self.graph, LOG(self.constant), {})
-        return self.graph.operation(LOGARITHM, self, self)
+        return self.graph.operation(op.LOGARITHM, self, self)
 
     def arctangent(self) -> "Form":
         """atan x, whose derivative is x' / (1 + x^2)."""
         if not self.terms:
             return Form(self.graph, ATAN(self.constant), {})
-        return self.graph.operation(ARCTANGENT, self, self * self + 1.0)
+        return self.graph.operation(op.ARCTANGENT, self, self * self + 1.0)
 
     def _branches(self, *_: Any) -> Any:
         self.graph.refuse(BRANCHES)
@@ -320,26 +310,9 @@ class Form:
             self._branches()
         if function is None or method != "__call__" or options or (out is not None and out[0].dtype != object):
             self.graph.refuse(f"it calls numpy.{ufunc.__name__} on what depends on t, q or v")
-        made = np.frompyfunc(function, len(inputs), 1)(*map(operand, inputs))
-        if out is None:
-            return made
-        out[0][...] = made
-        return out[0]
+        return elementwise(function, inputs, out)
 
 
-OPERATORS: dict[str, Callable[..., Any]] = {
-    "add": operator.add,
-    "subtract": operator.sub,
-    "multiply": operator.mul,
-    "divide": operator.truediv,
-    "power": operator.pow,
-    "float_power": operator.pow,
-    "negative": operator.neg,
-    "positive": operator.pos,
-    "square": lambda x: x * x,
-    "reciprocal": lambda x: 1.0 / x,
-    "hypot": lambda x, y: (x * x + y * y) ** 0.5,
-}
 COMPARISONS = {"less", "less_equal", "greater", "greater_equal", "equal", "not_equal"}
 FUNCTIONS: dict[str, Callable[[Form], Any]] = {
     "sin": Form.sine,
@@ -356,22 +329,6 @@ FUNCTIONS: dict[str, Callable[[Form], Any]] = {
 }
 for _name, _function in FUNCTIONS.items():  # NumPy calls them on arrays of forms by these names
     setattr(Form, _name, _function)
-
-
-def operand(value: Any) -> Any:
-    """An operand with which NumPy does not ask forms how to go on: an array of objects, or a number of Python's."""
-    if type(value) is not Form and isinstance(value, np.ndarray):
-        return value.astype(object)
-    made = np.empty((), dtype=object)
-    made[()] = float(value) if type(value) is not Form and isinstance(value, np.generic) else value
-    return made
-
-
-def _each(array: Any, function: Callable[[Any], Any]) -> Any:
-    made = np.empty(array.shape, dtype=object)
-    for place in np.ndindex(array.shape):
-        made[place] = function(array[place])
-    return made
 
 
 def symbols(forms: Iterable[Form]) -> Any:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from twoloop.checks.arguments import Array, shown
+from twoloop.checks.arguments import shown
 from twoloop.kernels.compile.caches import watch
 from twoloop.kernels.compile.callbacks import compile_callback
 from twoloop.kernels.compile.private import Dispatcher
@@ -49,13 +49,6 @@ def _check_both_triangles(name: str, rows: Integers, columns: Integers) -> None:
     if alone:
         i, j = alone[0]
         raise ValueError(f"{name} must name both triangles of M: ({i}, {j}) is there, and ({j}, {i}) is not")
-
-
-def scattered(values: Array, entries: Entries, shape: tuple[int, int]) -> Array:
-    """The dense matrix of these values; those of one place are added."""
-    made = np.zeros(shape)
-    np.add.at(made, entries, values)
-    return made
 
 
 def dense_callback(kind: str, values: Dispatcher, entries: Entries) -> Dispatcher:

@@ -8,7 +8,7 @@ import numpy as np
 from twoloop.checks.arguments import Array, check_real, shown
 from twoloop.kernels.compile.callbacks import KINDS, stand_in
 from twoloop.kernels.compile.private import Dispatcher
-from twoloop.problem.adapters import ConstantMatrix, check_arguments, through_python
+from twoloop.problem.adapters import ConstantMatrix, check_arguments
 from twoloop.problem.entries import VALUES_OF, Entries, check_entries
 from twoloop.problem.jacobian import differenced_jacobian
 
@@ -34,16 +34,7 @@ def given_callbacks(callbacks: dict[str, Any], n_c: int, n_a: int) -> dict[str, 
     if missing:
         rows = f" with n_a = {n_a}" if "nonholonomic" in missing else ""
         raise TypeError(f"a system{rows} needs {', '.join(missing)}: not given")
-    given = {kind: callbacks[kind] for kind, entry in KINDS.items() if kind in callbacks}
-    if given.get("mass", "") is None:
-        del given["mass"]  # mass_values are there
-    given = {
-        kind: each
-        for kind, each in given.items()
-        if not (
-            KINDS[kind].optional and (each is None or (KINDS[kind].absent != "differences" and each is stand_in(kind)))
-        )
-    }
+    given = {kind: callbacks[kind] for kind in KINDS if not _is_left_out(kind, callbacks)}
     for kind, entry in KINDS.items():
         if kind in given and sizes.get(entry.shape[0], 1) == 0:
             of = "nonholonomic rows" if entry.shape[0] == "n_a" else "constraints"
@@ -55,6 +46,14 @@ def given_callbacks(callbacks: dict[str, Any], n_c: int, n_a: int) -> dict[str, 
     if "force_by_q" not in given and ("force_by_v" in given or "reaction_by_q" in given):
         raise ValueError("force_by_v and reaction_by_q go with force_by_q, which is not given")
     return given
+
+
+def _is_left_out(kind: str, callbacks: dict[str, Any]) -> bool:
+    """Whether a kind is not among callbacks, or as None, or as what stands in its place in another system."""
+    entry, given = KINDS[kind], callbacks.get(kind)
+    if given is None:
+        return kind not in callbacks or entry.optional or kind == "mass"  # in whose place are mass_values
+    return entry.optional and entry.absent != "differences" and given is stand_in(kind)
 
 
 def checked_entries(callbacks: dict[str, Any], n_q: int, n_c: int, mass: Any, jacobian: Any) -> dict[str, Entries]:
@@ -119,10 +118,7 @@ def in_place_of(kind: str, given: dict[str, Dispatcher]) -> Dispatcher:
     """The callback that stands in for one that is not given."""
     if KINDS[kind].absent != "differences" or "constraint" not in given:
         return stand_in(kind)
-    constraint = given["constraint"]
-    # what is called in Python cannot be watched, and need not be: it is looked up at every call
-    watched = ("differences, through Python", "") if constraint is through_python("constraint") else None
-    return differenced_jacobian(constraint, watched)
+    return differenced_jacobian(given["constraint"])
 
 
 def callbacks_in(names: Mapping[str, Any]) -> dict[str, Any]:

@@ -20,7 +20,7 @@ ORDER_6 = (3.0 / 4.0, -3.0 / 20.0, 1.0 / 60.0, 0.0)
 
 
 @cache
-def differenced_jacobian(constraint: Dispatcher, watched: tuple[str, str] | None = None) -> Dispatcher:
+def differenced_jacobian(constraint: Dispatcher) -> Dispatcher:
     """The callback "jacobian" that differences a callback "constraint".
 
     Central differences of order 8 at four displacements to either side, multiples of 1/64 of max(1, |q_j|) for each
@@ -68,4 +68,4 @@ def differenced_jacobian(constraint: Dispatcher, watched: tuple[str, str] | None
                     break
                 h *= SHORTER
 
-    return compile_callback("jacobian", jacobian, watched or watch(jacobian))
+    return compile_callback("jacobian", jacobian, watch(jacobian))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 import pickle
-from dataclasses import dataclass
+from collections.abc import Callable
 from operator import attrgetter
 from typing import TYPE_CHECKING, Any
 
@@ -18,34 +18,19 @@ if TYPE_CHECKING:
     from twoloop.problem.system import ConstrainedSystem
 
 
-@dataclass(frozen=True)
-class ByName:
-    """A compiled callback at the top level of a module."""
+class Packed:
+    """What pickle replaces by what `find` finds in the other process."""
 
-    module: str
-    name: str
+    def __init__(self, find: Callable[..., Any], *arguments: Any):
+        self.found = find, arguments
 
-    def found(self) -> Dispatcher:
-        """The callback, in this process.
-
-        Raises
-        ------
-        AttributeError, ImportError
-            If there is no such module here, or nothing of that name in it.
-        """
-        return attrgetter(self.name)(importlib.import_module(self.module))  # type: ignore[no-any-return]
+    def __reduce__(self) -> tuple[Any, ...]:
+        return self.found
 
 
-@dataclass(frozen=True)
-class FromEquations:
-    """A callback of generated code, which travels as source."""
-
-    code: GeneratedCode
-    kind: str
-
-    def found(self) -> Dispatcher:
-        """The callback, compiled in this process or read from the disk."""
-        return self.code.callback(self.kind)
+def by_name(module: str, name: str) -> Any:
+    """A compiled callback at the top level of a module; AttributeError or ImportError if it is not there."""
+    return attrgetter(name)(importlib.import_module(module))
 
 
 def packed(system_name: str, kind: str, function: Any) -> Any:
@@ -58,28 +43,23 @@ def packed(system_name: str, kind: str, function: Any) -> Any:
     """
     if isinstance(function, Dispatcher):
         if (code := code_of(function)) is not None:
-            return FromEquations(code, kind)
-        named = ByName(function.py_func.__module__, function.py_func.__qualname__)
+            return Packed(GeneratedCode.callback, code, kind)
+        name = function.py_func.__module__, function.py_func.__qualname__
         try:
-            return named if named.found() is function else function
+            return Packed(by_name, *name) if by_name(*name) is function else function
         except (AttributeError, ImportError):  # made within a function: numba sends its source along
             return function
     try:
         pickle.dumps(function)
     except Exception as error:
-        name = getattr(function, "__qualname__", repr(function))
+        named = getattr(function, "__qualname__", repr(function))
         raise TypeError(
-            f"{kind} of {system_name!r}, {name}, cannot be pickled, and so neither can the system: another process "
+            f"{kind} of {system_name!r}, {named}, cannot be pickled, and so neither can the system: another process "
             "finds a function by its name in a module, which a lambda, or a function within a function, does not have. "
             f"Write {kind} at the top level of a module (what it encloses may become attributes of an object with "
             f"__call__), or make the system in that process. Pickle says: {error}"
         ) from None
     return function
-
-
-def unpacked(function: Any) -> Any:
-    """The function that `packed` replaced."""
-    return function.found() if isinstance(function, (ByName, FromEquations)) else function
 
 
 def reduced(system: ConstrainedSystem) -> tuple[Any, ...]:
@@ -107,12 +87,11 @@ def made_again(
     cls: type[ConstrainedSystem],
     plain: bool,
     options: dict[str, Any],
-    packed: dict[str, Any],
+    functions: dict[str, Any],
     flags: Array,
     known: Description,
 ) -> ConstrainedSystem:
     """The system that was pickled, of the functions that this process finds by the same names."""
-    functions = {kind: unpacked(function) for kind, function in packed.items()}
     for kind in ("mass", "mass_values") if plain else ():
         if isinstance(functions.get(kind), ConstantMatrix):
             functions[kind] = functions[kind].matrix

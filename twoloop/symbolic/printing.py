@@ -1,5 +1,6 @@
 """Expressions as Python code: subexpressions that several entries of a callback share are evaluated once."""
 
+import re
 from collections.abc import Sequence
 from typing import Any
 
@@ -9,22 +10,11 @@ from sympy import Expr, Symbol
 from twoloop.kernels.compile.callbacks import KINDS
 from twoloop.symbolic.differentiation import Entries
 
-# SymPy's functions that the equations may have, with their names in math and numpy
-FUNCTIONS = {
-    sympy.sin: ("sin", "sin"),
-    sympy.cos: ("cos", "cos"),
-    sympy.tan: ("tan", "tan"),
-    sympy.asin: ("asin", "arcsin"),
-    sympy.acos: ("acos", "arccos"),
-    sympy.atan: ("atan", "arctan"),
-    sympy.atan2: ("atan2", "arctan2"),
-    sympy.sinh: ("sinh", "sinh"),
-    sympy.cosh: ("cosh", "cosh"),
-    sympy.tanh: ("tanh", "tanh"),
-    sympy.asinh: ("asinh", "arcsinh"),
-    sympy.exp: ("exp", "exp"),
-    sympy.log: ("log", "log"),
-}
+# SymPy's functions that the equations may have; in math they have the same names
+FUNCTIONS = (
+    *(sympy.sin, sympy.cos, sympy.tan, sympy.asin, sympy.acos, sympy.atan, sympy.atan2),
+    *(sympy.sinh, sympy.cosh, sympy.tanh, sympy.asinh, sympy.exp, sympy.log),
+)
 MOST_FACTORS = 4  # integer powers up to this one are written as products
 
 
@@ -33,8 +23,10 @@ class _Printer:
 
     def __init__(self, module: str):
         self.module = module
-        column = 0 if module == "math" else 1
-        self.functions = {function: f"{module}.{names[column]}" for function, names in FUNCTIONS.items()}
+        names = {function: function.__name__ for function in FUNCTIONS}
+        if module == "np":  # of version 1, to which acos is arccos
+            names = {function: re.sub("^a", "arc", name) for function, name in names.items()}
+        self.functions = {function: f"{module}.{name}" for function, name in names.items()}
 
     def sum(self, expression: Expr) -> str:
         """An expression that stands alone, or as an argument."""

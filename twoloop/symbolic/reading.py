@@ -1,6 +1,5 @@
 """The user's expressions in plain symbols: each is checked for what the equations of motion cannot contain."""
 
-import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
@@ -9,7 +8,7 @@ from sympy import Derivative, Expr, Symbol
 from sympy.core.function import AppliedUndef
 from sympy.core.relational import Equality
 
-from twoloop.checks.arguments import check_number
+from twoloop.checks.arguments import check_finite, check_number
 from twoloop.symbolic.differentiation import Differentiation
 from twoloop.symbolic.printing import FUNCTIONS
 
@@ -192,10 +191,7 @@ def number(argument: str, value: Any) -> float:
     """A finite number, SymPy's too."""
     if isinstance(value, sympy.Number) and value.is_real:
         value = float(value)
-    value = check_number(argument, value)
-    if not math.isfinite(value):
-        raise ValueError(f"{argument} must be finite; given {value!r}")
-    return value
+    return check_finite(argument, check_number(argument, value))
 
 
 def _sympified(argument: str, expression: Any) -> Expr:

@@ -19,6 +19,7 @@ from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import numba
 import numpy as np
@@ -266,6 +267,28 @@ def say_once(text: str) -> None:
     print(text, file=sys.stderr, flush=True)
 
 
+def kept_when_called(**options: Any) -> Callable[[Callable[..., Any]], Dispatcher]:
+    """`numba.njit(**options)` for a closure of callbacks, compiled when it is called, with machine code on disk."""
+
+    def decorate(function: Callable[..., Any]) -> Dispatcher:
+        watched = watch(function)
+        dispatcher = njit(**options)(named_apart(function, watched))
+        if watched is not None:
+            with suppress(RuntimeError):  # there is no folder that can be written
+                dispatcher._cache = _Cache(dispatcher.py_func, *watched, "")
+        return dispatcher
+
+    return decorate
+
+
+_STANDS_FOR: WeakKeyDictionary[Dispatcher, str] = WeakKeyDictionary()
+
+
+def stands_for(callback: Dispatcher, what: str) -> None:
+    """Let a callback, which cannot be watched as it goes to Python, be known by this to functions that enclose it."""
+    _STANDS_FOR[callback] = what
+
+
 def watch(function: Callable[..., Any]) -> tuple[str, str] | None:
     """Digests of all that the machine code of a function depends on, and of what it encloses.
 
@@ -356,7 +379,9 @@ class Digest:
         self.names = outer
 
     def _add_helper(self, helper: Dispatcher) -> None:
-        if self._is_new(helper):
+        if helper in _STANDS_FOR:
+            self.add(_STANDS_FOR[helper])
+        elif self._is_new(helper):
             _take_over(helper)
             self.add(sorted(helper.targetoptions.items()))
             self.add_function(helper.py_func)

@@ -5,6 +5,7 @@ for a line of source. What is made for a mechanism is arithmetic on numbers in m
 done, so that LLVM has little to do before it makes machine code of it.
 """
 
+from collections import defaultdict
 from collections.abc import Callable
 from functools import cache
 from typing import Any
@@ -12,7 +13,7 @@ from typing import Any
 from llvmlite import binding
 from numba.core.registry import cpu_target
 
-from twoloop.kernels.compile.caches import UNWRITABLE, Files, say_once, sources_folder
+from twoloop.kernels.compile.caches import UNWRITABLE, Files, Newest, say_once, sources_folder
 
 SINGLE_PASSES = hasattr(binding.ModulePassManager, "add_reassociate_pass")
 
@@ -40,8 +41,11 @@ class OwnFunctions:
         self.addresses = {name: int(self._engine.get_function_address(name)) for name in names}
 
 
+_MADE: dict[str, Newest] = defaultdict(Newest)  # by kind
+
+
 def own_functions(kind: str, stamp: str, key: str, write: Callable[[], tuple[list[str], str]]) -> OwnFunctions:
-    """Functions that `write` writes: their names, and the text of a module; read from the disk where they are kept.
+    """Functions that `write` writes: their names, and the text of a module; from memory or the disk where kept.
 
     Parameters
     ----------
@@ -51,6 +55,8 @@ def own_functions(kind: str, stamp: str, key: str, write: Callable[[], tuple[lis
         What the functions depend on: a digest of what writes them, and of their own content.
     write : callable
     """
+    if (made := _MADE[kind].get(key)) is not None:
+        return made  # type: ignore[no-any-return]
     files, place = _files(kind, stamp), _place(key)
     try:
         kept = files.load(place)
@@ -63,12 +69,13 @@ def own_functions(kind: str, stamp: str, key: str, write: Callable[[], tuple[lis
             files.save(place, kept)
         except OSError:
             say_once(UNWRITABLE)
-    return OwnFunctions(*kept)
+    _MADE[kind][key] = made = OwnFunctions(*kept)
+    return made
 
 
 def are_kept(kind: str, stamp: str, key: str) -> bool:
-    """Whether `own_functions` would find them on the disk."""
-    return _files(kind, stamp).has(_place(key))
+    """Whether `own_functions` would find them."""
+    return key in _MADE[kind] or _files(kind, stamp).has(_place(key))
 
 
 def _files(kind: str, stamp: str) -> Files:
