@@ -88,11 +88,6 @@ def test_two_assemblies_within_reach_are_refused_unless_one_says_otherwise(besid
     assert off(consistent_state(system, 0.0, near, rest, keep=[CRANK]), problems[0].q0) < 1e-3
 
 
-def test_check_assembly_is_a_flag():
-    with pytest.raises(TypeError, match="check_assembly must be True or False; given 'no'"):
-        consistent_state(pendulum(), 0.0, [0.0, -1.0], [0.0, 0.0], check_assembly="no")
-
-
 @pytest.mark.parametrize("beside", [1e-2, 1e-5])
 def test_messages_have_the_digits_that_show_the_difference(beside):
     """A rod whose end is kept next to the height of the pivot: up or down."""
