@@ -90,6 +90,16 @@ def held_twice(factor=1.0, **more):
     return pendulum(**{"n_c": 2, "constant_mass": True, **functions, **more})
 
 
+def driven_cart(place, speed, **more):
+    """A cart that a drive puts at place(t), x, and a bob of 1 kg on a rod of 1 m below it, x and y."""
+    functions = {
+        "constraint": lambda t, q: np.array([q[0] - place(t), 0.5 * ((q[1] - q[0]) ** 2 + q[2] ** 2 - 1.0)]),
+        "constraint_rate": lambda t, q: np.array([-speed(t), 0.0]),
+        "force": lambda t, q, v: np.array([0.0, 0.0, -G]),
+    }
+    return ConstrainedSystem.from_python(**{"n_q": 3, "n_c": 2, "mass": np.eye(3), **functions, **more})
+
+
 def kit_of(system):
     """What the steps of the integrator get of a system."""
     return Kit(system.functions, inner_loop, EXPLICIT)

@@ -6,8 +6,8 @@ That they are motions of the mechanisms: tests/general/test_accuracy.py and test
 import numpy as np
 import pytest
 
-from tests.general import dead_points, heavy_top, windows
-from tests.general.mechanisms import mechanism
+from tests.general import dead_points, heavy_top
+from tests.general.mechanisms import PRINTED_TIP, first_singular_time, mechanism
 from tests.problems import slope
 
 
@@ -25,13 +25,13 @@ def test_height_of_the_top_by_elliptic_functions():
 def test_two_windows_are_the_published_ones():
     """Exudyn's values at two step sizes, extrapolated: its method is of order 2."""
     tip = mechanism("A02, N = 2").state(10.0)[0][:2]
-    coarse, fine = windows.PRINTED_TIP
+    coarse, fine = PRINTED_TIP
     assert tip == pytest.approx(fine + (fine - coarse) / 3.0, abs=5e-8)
 
 
 @pytest.mark.parametrize("n", [1, 2, 40])
 def test_windows_lose_a_rank_each(n):
-    t = windows.first_singular_time(n)
+    t = first_singular_time(n)
     m = mechanism(f"A02, N = {n}")
     singular = np.linalg.svd(m.system().rows(t, m.state(t)[0]), compute_uv=False)
     assert (singular < 1e-12).sum() == n and 0.6 < t < 0.8

@@ -6,9 +6,7 @@ import numpy as np
 import pytest
 
 from tests.general.dead_points import CUSP_TIME, cusp
-from tests.general.mechanisms import SINGULAR, WINDOWS, mechanism
-from tests.general.runs import error, run
-from tests.general.windows import first_singular_time
+from tests.general.mechanisms import SINGULAR, WINDOWS, error, first_singular_time, mechanism, run
 from tests.problems import event, worst
 from twoloop import DOP853, ConstraintWarning, Status, solve_dae
 

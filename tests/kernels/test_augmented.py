@@ -5,8 +5,7 @@ import pytest
 
 import twoloop.run.workspace as workspace_module
 from tests.chains import chain
-from tests.general.mechanisms import mechanism
-from tests.general.runs import error
+from tests.general.mechanisms import error, mechanism
 from tests.problems import force_residual, functions_of, pendulum, violations, worst
 from twoloop import ConstrainedSystem, ConstraintWarning, Status, solve_dae
 from twoloop.kernels.algebra.sparse import MANY, sparse_pays
