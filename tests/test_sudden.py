@@ -1,6 +1,7 @@
 """Forces that act for a thousandth of the run: steps end where something changes suddenly with time."""
 
 import math
+from functools import cache
 
 import numpy as np
 import pytest
@@ -47,6 +48,7 @@ def pendulum(force, at=1.5, width=WIDTH, compile=True):
 SYSTEMS = {"gust": pendulum(gust), "switched": pendulum(switched)}
 
 
+@cache
 def end(force, at):
     """(x, y) at T_END by the angle, in steps that cannot pass over the gust."""
 
