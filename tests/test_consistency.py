@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from tests.derivative_cases import UNITS, lever, linkage, slider_crank
-from tests.problems import pendulum, worst
-from twoloop import ConstrainedSystem, ConstraintWarning, consistent_state, solve_dae
+from tests.problems import pendulum, unconstrained, worst
+from twoloop import ConstraintWarning, consistent_state, solve_dae
 from twoloop.checks.consistency import check_start
 from twoloop.mechanisms import four_bar, n_four_bar, redundant_slider_crank
 
@@ -92,14 +92,8 @@ def test_every_coordinate_counts_in_its_own_unit(case):
 
 def test_redundant_rows_name_what_they_depend_on():
     rows = np.array([[1.0, 0.0, 0.0], [0.0, 1e-3, 0.0], [2.0, -0.5e-3, 0.0]])
-    system = ConstrainedSystem.from_python(
-        n_q=3,
-        n_c=3,
-        mass=np.eye(3),
-        force=lambda t, q, v: np.zeros(3),
-        constraint=lambda t, q: rows @ q,
-        jacobian=lambda t, q: rows,
-    )
+    functions = {"constraint": lambda t, q: rows @ q, "jacobian": lambda t, q: rows}
+    system = unconstrained(lambda t, q, v: np.zeros(3), 3, n_c=3, **functions)
     with pytest.warns(ConstraintWarning, match=r"rank 2 of 3.*row\(s\) \[\d\] depend on the others \(row ") as caught:
         solve_dae(system, (0.0, 1.0), np.zeros(3), np.zeros(3))
     equations = ("row 2 = 2 row 0 - 0.5 row 1", "row 1 = 4 row 0 - 2 row 2", "row 0 = 0.25 row 1 + 0.5 row 2")

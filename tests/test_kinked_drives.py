@@ -5,7 +5,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from tests.problems import driven_cart
+from tests.problems import driven_cart, pendulum
 from twoloop import ConstrainedSystem, Status, solve_dae
 from twoloop.methods.presets import PRESETS
 from twoloop.run.impulse import beyond_jump
@@ -279,11 +279,8 @@ def test_a_skate_whose_blade_is_driven_suddenly():
 
 def test_drives_that_contradict_one_another_end_the_run():
     """Two rows for one coordinate, one of which jumps and not the other."""
-    system = ConstrainedSystem.from_python(
-        n_q=2,
+    system = pendulum(
         n_c=2,
-        mass=np.eye(2),
-        force=lambda t, q, v: np.zeros(2),
         constraint=lambda t, q: np.array([q[0] - max(0.0, t - 0.5), q[0]]),
         jacobian=lambda t, q: np.array([[1.0, 0.0], [1.0, 0.0]]),
         constraint_rate=lambda t, q: np.array([-1.0 if t > 0.5 else 0.0, 0.0]),

@@ -6,8 +6,8 @@ import re
 import numpy as np
 import pytest
 
-from tests.problems import pendulum
-from twoloop import ConstrainedSystem, consistent_state, solve_dae
+from tests.problems import pendulum, unconstrained
+from twoloop import consistent_state, solve_dae
 from twoloop.mechanisms import andrews, bricard, four_bar, heavy_top, n_four_bar, spatial_four_bar, spatial_slider_crank
 
 STRETCHED = np.arccos(0.25)  # theta_3 at which bars 1 and 2 of the linkage of 0.8, 1.2, 1 and 2 m are in line
@@ -19,9 +19,7 @@ def links(t, q, p):
     return 0.5 * np.array([q[0] ** 2 + q[1] ** 2 - p[0] ** 2, d[0] ** 2 + d[1] ** 2 - p[1] ** 2])
 
 
-POINTS = ConstrainedSystem.from_python(
-    n_q=4, n_c=2, mass=np.eye(4), force=lambda t, q, v: np.zeros(4), constraint=links, parameters=[1.0, 1.0]
-)
+POINTS = unconstrained(lambda t, q, v: np.zeros(4), 4, n_c=2, constraint=links, parameters=[1.0, 1.0])
 
 
 def of_points(lengths, angles):

@@ -109,15 +109,8 @@ def springs(n_runs):
         pull = (p[0] * (length - p[2]) + p[1] * ((x * (v[2] - v[0]) + y * (v[3] - v[1])) / length)) / length
         return np.array([pull * x, pull * y - 9.81, -pull * x, -pull * y - 9.81])
 
-    system = ConstrainedSystem.from_python(
-        n_q=4,
-        n_c=1,
-        mass=np.eye(4),
-        force=force,
-        constraint=lambda t, q, p: np.array([0.5 * (q[0] ** 2 + q[1] ** 2 - 1.0)]),
-        parameters=p[0],
-        name="masses on a stiff spring",
-    )
+    circle = lambda t, q, p: np.array([0.5 * (q[0] ** 2 + q[1] ** 2 - 1.0)])  # noqa: E731
+    system = unconstrained(force, 4, n_c=1, constraint=circle, parameters=p[0], name="masses on a stiff spring")
     angle = random.uniform(0.3, 1.2, n_runs)
     bob = np.column_stack([np.sin(angle), -np.cos(angle)])
     return system, np.hstack([bob, bob + p[:, 2:] * np.column_stack([np.sin(0.5 * angle), -np.cos(0.5 * angle)])]), p

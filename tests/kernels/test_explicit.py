@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from tests.kernels.adaptive import AdaptiveMethod, four_bar_run, shared_run
-from tests.problems import LINKAGES, violations, worst
-from twoloop import DOP853, ConstrainedSystem, solve_dae
+from tests.problems import LINKAGES, pendulum, violations, worst
+from twoloop import DOP853, solve_dae
 from twoloop.kernels.steps import explicit_step as explicit
 from twoloop.mechanisms import very_flexible_beam
 
@@ -77,15 +77,12 @@ def test_the_very_flexible_beam():
 def vibration(w, force=None):
     """Two masses on one line, x1 = 2 x0, on a spring: frequency w; the spring's other end may move."""
     end = force or (lambda t: 0.0)
-    return ConstrainedSystem.from_python(
-        n_q=2,
-        n_c=1,
-        mass=np.eye(2),
+    return pendulum(
         force=lambda t, q, v: np.array([-5.0 * w * w * (q[0] - end(t)), 0.0]),
         constraint=lambda t, q: np.array([q[1] - 2.0 * q[0]]),
         jacobian=lambda t, q: np.array([[-2.0, 1.0]]),
         gamma=lambda t, q, v: np.zeros(1),
-        name="vibration",
+        constant_mass=True,
     )
 
 
