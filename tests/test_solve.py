@@ -14,10 +14,11 @@ from tests.problems import (
     pendulum_state,
     run,
     swing,
+    unconstrained,
     violations,
     worst,
 )
-from twoloop import ConstrainedSystem, ConstraintWarning, RungeKutta, Status, paper_irk, paper_newmark, solve_dae
+from twoloop import ConstraintWarning, RungeKutta, Status, paper_irk, paper_newmark, solve_dae
 from twoloop.methods.presets import PRESETS
 from twoloop.methods.tableaux import gauss, sun_radau_iib
 
@@ -85,11 +86,10 @@ def test_max_steps_ends_the_run_with_what_there_is():
 
 def crossing_lines():
     """A point on two lines, x^2 = y^2 and z = 0: no independent coordinate exists where they cross, at t = 1."""
-    return ConstrainedSystem.from_python(
-        n_q=3,
+    return unconstrained(
+        lambda t, q, v: np.zeros(3),
+        3,
         n_c=2,
-        mass=np.eye(3),
-        force=lambda t, q, v: np.zeros(3),
         constraint=lambda t, q: np.array([0.5 * (q[0] ** 2 - q[1] ** 2), q[2]]),
         jacobian=lambda t, q: np.array([[q[0], -q[1], 0.0], [0.0, 0.0, 1.0]]),
         gamma=lambda t, q, v: np.array([v[1] ** 2 - v[0] ** 2, 0.0]),
