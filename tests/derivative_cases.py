@@ -41,10 +41,10 @@ class Case:
         return self.system(**{kind: wrong})
 
 
-def slider_crank(unit, t=0.0, offset=0.0):
+def slider_crank(unit, offset=0.0, crank=0.7, offset_of_guide=0.2):
     """Angles of crank and rod, and the slider, whose coordinate may begin far away."""
-    r, l, e = 1.0 * unit, 2.7 * unit, 0.2 * unit
-    a, b = 0.7, -math.asin((r * math.sin(0.7) - e) / l)
+    r, l, e = 1.0 * unit, 2.7 * unit, offset_of_guide * unit
+    a, b = crank, -math.asin((r * math.sin(crank) - e) / l)
 
     def constraint(t, q):
         return np.array(
@@ -62,7 +62,7 @@ def slider_crank(unit, t=0.0, offset=0.0):
 
     x = r * math.cos(a) + l * math.cos(b)
     functions = {"constraint": constraint, "jacobian": jacobian, "gamma": gamma}
-    return Case(f"slider-crank of {unit:g} m at {offset:g} m", 3, functions, [a, b, x + offset], t)
+    return Case(f"slider-crank of {unit:g} m at {offset:g} m", 3, functions, [a, b, x + offset])
 
 
 def shaken_pendulum(unit, omega=3.0, amplitude=0.1, t=0.0, offset=0.0, only_after_start=False):

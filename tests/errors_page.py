@@ -1,6 +1,7 @@
 """Writes docs/errors.md from the cases of `tests/bad_input`, each really run: python -m tests.errors_page."""
 
 import re
+from functools import cache
 from itertools import groupby
 from pathlib import Path
 
@@ -31,19 +32,25 @@ says where. [The certificate](certificate.md) has the details.
 }
 
 
-def message(case: Case) -> str:
-    """What a mistake gets: the type of the error and its message, without what differs between machines."""
+@cache
+def error_of(case: Case) -> Exception | None:
+    """What a mistake raises; each is made once, by the tests of all cases or for the page."""
     try:
         case.call()
-    except case.error as error:
-        text = re.sub(r"\s+", " ", str(error))
-        text = re.sub(r" at 0x[0-9a-f]+", "", text)
-        text = re.sub(r"'\S*/(run\.npz)'", r"'\1'", text)
-        text = re.sub(r", in `[^`]*` \([^()]*, line \d+\)", "", text)
-        text = re.sub(r"error of about \S+", "error of about ...", text)
-        text = text if len(text) <= LONGEST else f"{text[:LONGEST]} ..."
-        return f"`{type(error).__name__}`: {text}"
-    raise AssertionError(f"{case.id} raises nothing")
+    except Exception as error:
+        return error
+    return None
+
+
+def message(case: Case) -> str:
+    """What a mistake gets: the type of the error and its message, without what differs between machines."""
+    error = error_of(case)
+    text = re.sub(r"\s+", " ", str(error))
+    text = re.sub(r" at 0x[0-9a-f]+", "", text)
+    text = re.sub(r"'\S*/(run\.npz)'", r"'\1'", text)
+    text = re.sub(r", in `[^`]*` \([^()]*, line \d+\)", "", text)
+    text = re.sub(r"error of about \S+", "error of about ...", text)
+    return f"`{type(error).__name__}`: {text if len(text) <= LONGEST else f'{text[:LONGEST]} ...'}"
 
 
 def cell(text: str) -> str:

@@ -137,3 +137,17 @@ def started_run(system, q):
     """A run of an explicit method from rest, at its start."""
     n = system.n_q
     return Run(system, DOP853().plan(n, 1e-8, 1e-8, False), 0.0, q, 0.0 * q, 1e-8, np.full(n, 1e-8), None)
+
+
+def spatial_chain(n, hinges=False):
+    """Bars in space, one hung on another by hinges, or by balls and hinges in turn."""
+    bodies, at, before = SpatialBodies((0.0, 0.0, -9.81)), np.zeros(3), GROUND
+    for k in range(n):
+        along = np.array([0.3, 0.1 * np.sin(k), -0.15])
+        body = bodies.body(f"body {k}", 1.0, (0.01, 0.02, 0.025), at + along / 2, np.eye(3))
+        if k % 2 and not hinges:
+            bodies.spherical(before, body, at)
+        else:
+            bodies.revolute(before, body, at, (0.1 * np.cos(k), 1.0, 0.2 * np.sin(k) + 0.1))
+        before, at = body, at + along
+    return bodies.system("spatial chain"), *bodies.start

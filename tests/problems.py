@@ -90,6 +90,16 @@ def held_twice(factor=1.0, **more):
     return pendulum(**{"n_c": 2, "constant_mass": True, **functions, **more})
 
 
+def driven_cart(place, speed, **more):
+    """A cart that a drive puts at place(t), x, and a bob of 1 kg on a rod of 1 m below it, x and y."""
+    functions = {
+        "constraint": lambda t, q: np.array([q[0] - place(t), 0.5 * ((q[1] - q[0]) ** 2 + q[2] ** 2 - 1.0)]),
+        "constraint_rate": lambda t, q: np.array([-speed(t), 0.0]),
+        "force": lambda t, q, v: np.array([0.0, 0.0, -G]),
+    }
+    return ConstrainedSystem.from_python(**{"n_q": 3, "n_c": 2, "mass": np.eye(3), **functions, **more})
+
+
 def kit_of(system):
     """What the steps of the integrator get of a system."""
     return Kit(system.functions, inner_loop, EXPLICIT)
@@ -158,18 +168,8 @@ def moving_pivot(*, compile=False, gamma=True):
         d, u = q - p, v - rate
         return np.array([d[0] * acceleration[0] + d[1] * acceleration[1] - u[0] * u[0] - u[1] * u[1]])
 
-    return ConstrainedSystem.from_python(
-        n_q=2,
-        n_c=1,
-        mass=lambda t, q: np.eye(2),
-        force=lambda t, q, v: np.array([0.0, -9.81]),
-        constraint=constraint,
-        jacobian=jacobian,
-        constraint_rate=constraint_rate,
-        gamma=right_side if gamma else None,
-        compile=compile,
-        name="moving pivot",
-    )
+    functions = {"constraint": constraint, "jacobian": jacobian, "constraint_rate": constraint_rate}
+    return pendulum(compile=compile, gamma=right_side if gamma else False, **functions, name="moving pivot")
 
 
 MOVING_PIVOT_START = (1.0, 0.5)  # angle from the downward vertical and its rate
@@ -206,17 +206,9 @@ def double_pendulum(gamma=True):
         d0, d1 = q[2] - q[0], q[3] - q[1]
         return 0.5 * np.array([q[0] * q[0] + q[1] * q[1] - 1.0, d0 * d0 + d1 * d1 - 1.0])
 
-    return ConstrainedSystem.from_python(
-        n_q=4,
-        n_c=2,
-        mass=np.eye(4),
-        force=lambda t, q, v: np.array([0.0, -9.81, 0.0, -9.81]),
-        constraint=constraint,
-        jacobian=jacobian,
-        gamma=right_side if gamma else None,
-        compile=True,
-        name="double pendulum",
-    )
+    functions = {"constraint": constraint, "jacobian": jacobian, "gamma": right_side if gamma else None}
+    weights = lambda t, q, v: np.array([0.0, -9.81, 0.0, -9.81])  # noqa: E731
+    return unconstrained(weights, 4, n_c=2, **functions, compile=True, name="double pendulum")
 
 
 def double_pendulum_state(angles, momenta):
@@ -283,14 +275,12 @@ def oblique_pendulum(gamma=True, conservative=False):
         u = _point_jacobian(q) @ v
         return np.array([-(u @ u) - (_point(q) - PIVOT) @ _point_bias(q, v)])
 
-    return ConstrainedSystem.from_python(
-        n_q=2,
-        n_c=1,
+    return pendulum(
         mass=lambda t, q: factor(t) * _point_jacobian(q).T @ _point_jacobian(q),
         force=force,
         constraint=lambda t, q: np.array([0.5 * ((_point(q) - PIVOT) @ (_point(q) - PIVOT) - 1.0)]),
         jacobian=lambda t, q: ((_point(q) - PIVOT) @ _point_jacobian(q))[None, :],
-        gamma=right_side if gamma else None,
+        gamma=right_side if gamma else False,
         name="oblique pendulum",
     )
 

@@ -1,13 +1,14 @@
-"""The public face: what problems and results have, defaults, names, help."""
+"""The public face: what problems, results and statuses have, defaults, names, help."""
 
 import pydoc
+from dataclasses import FrozenInstanceError, replace
 
 import numpy as np
 import pytest
 
 import twoloop
 from tests.problems import PLAIN, START, pendulum_state, worst
-from twoloop import ConstrainedSystem, exported, mechanisms, solve_dae
+from twoloop import ConstrainedSystem, Statistics, Status, exported, mechanisms, solve_dae
 
 
 @pytest.mark.parametrize("make", [mechanisms.four_bar, mechanisms.pendulum])
@@ -45,15 +46,31 @@ def test_names_that_come_when_they_are_asked_for():
         twoloop.solve_ode  # noqa: B018
 
 
-def test_all_that_is_promised_can_be_imported():
-    for name in twoloop.__all__:
-        assert getattr(twoloop, name).__doc__, name
-
-
 @pytest.mark.parametrize("name", twoloop.__all__)
 def test_help_leaves_the_names_of_types_as_they_are(name):
+    assert getattr(twoloop, name).__doc__
     text = pydoc.render_doc(getattr(twoloop, name), renderer=pydoc.plaintext)
     assert "_array_like" not in text and "Union[" not in text
     if name == "solve_dae":
         signature = text.splitlines()[2]
         assert "q0: 'ArrayLike'" in signature and "t_eval: 'ArrayLike | None' = None" in signature
+
+
+def test_zero_is_the_end_one_an_event_and_what_is_negative_a_failure():
+    assert Status.REACHED_END == 0 and Status.EVENT == 1 and len({int(status) for status in Status}) == len(Status)
+    problem = mechanisms.pendulum()
+    result = solve_dae(problem.system, (0.0, 0.1), problem.q0, problem.v0)
+    for status in Status:
+        assert (status < 0) == (status not in (Status.REACHED_END, Status.EVENT))
+        assert replace(result, status=status).success == (status >= 0)
+    with pytest.raises(FrozenInstanceError):
+        result.status = Status.EVENT
+
+
+def test_a_result_says_its_status_its_message_and_the_counts_that_are_known():
+    problem = mechanisms.pendulum()
+    result = solve_dae(problem.system, (0.0, 1.0), problem.q0, problem.v0, t_eval=[1.0])
+    text = repr(replace(result, message="Said so.", stats=Statistics(n_accepted=1, n_evaluations=17)))
+    assert "REACHED_END" in text and "Said so." in text and "n_evaluations=17" in text and "t[-1]=1" in text
+    assert "n_inner" not in text and Statistics().n_inner is None  # not told
+    assert "no output" in repr(replace(result, t=result.t[:0], q=result.q[:, :0]))

@@ -190,11 +190,6 @@ def raising(t, q, v):
     raise KeyError("tip")
 
 
-def test_an_event_that_compares_is_refused():
-    with pytest.raises(TypeError, match=r"events\[0\] must return a number.*(True|False)"):
-        swing(1.0, events=lambda t, q, v: q[0] > 0.0)
-
-
 def test_an_exception_of_an_event_comes_through_with_a_note():
     with pytest.raises(KeyError, match="tip") as caught:
         swing(1.0, events=[clock(0.5), raising])

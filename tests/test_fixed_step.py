@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from tests.problems import START, SWING, pendulum_state, run, swing, worst
-from twoloop import Newmark, RungeKutta, Status, solve_dae
+from twoloop import RungeKutta, Status, solve_dae
 from twoloop.mechanisms import four_bar
 from twoloop.methods.tableaux import gauss, radau_iia, sun_radau_iib
 
@@ -66,13 +66,6 @@ def test_a_fixed_step_lands_on_output_times_near_its_grid(offset, t0):
     result = solve_dae(SWING, (t0, t0 + 2.0), *START, "Gauss8", step_size=h, t_eval=times)
     assert result.success and result.stats.n_accepted == 60 and result.h.sum() == pytest.approx(2.0, abs=1e-9)
     assert np.abs(result.q - pendulum_state(times - t0)[0]).max() < 1e-6
-
-
-@pytest.mark.parametrize(("beta", "gamma"), [(1.0 / 6.0, 0.5), (0.1667, 0.5), (0.25, 0.6)])
-def test_newmark_without_an_error_estimate_wants_a_fixed_step(beta, gamma):
-    with pytest.raises(ValueError, match=r"Newmark with beta.*no error estimate.*step_size"):
-        swing(method=Newmark(beta, gamma))
-    assert swing(method=Newmark(beta, gamma), step_size=0.01, end=0.1).success
 
 
 def test_one_step_over_a_span_that_is_rounded(default_four_bar):

@@ -3,21 +3,14 @@
 import numpy as np
 import pytest
 
-from twoloop import ConstrainedSystem, Status, solve_dae
+from tests import problems
+from twoloop import Status, solve_dae
 
 START = np.array([0.6, -0.8]), np.array([0.4, 0.3])
 
 
 def pendulum(along_x):
-    return ConstrainedSystem.from_python(
-        n_q=2,
-        n_c=1,
-        mass=np.eye(2),
-        force=lambda t, q, v: np.array([along_x(t, q, v), -9.81]),
-        constraint=lambda t, q: np.array([0.5 * (q @ q - 1.0)]),
-        jacobian=lambda t, q: q[None, :],
-        name="pendulum",
-    )
+    return problems.pendulum(force=lambda t, q, v: np.array([along_x(t, q, v), -9.81]), gamma=False, constant_mass=True)
 
 
 def noise():

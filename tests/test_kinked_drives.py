@@ -5,6 +5,7 @@ from functools import cache
 import numpy as np
 import pytest
 
+from tests.problems import driven_cart, pendulum
 from twoloop import ConstrainedSystem, Status, solve_dae
 from twoloop.methods.presets import PRESETS
 from twoloop.run.impulse import beyond_jump
@@ -278,11 +279,8 @@ def test_a_skate_whose_blade_is_driven_suddenly():
 
 def test_drives_that_contradict_one_another_end_the_run():
     """Two rows for one coordinate, one of which jumps and not the other."""
-    system = ConstrainedSystem.from_python(
-        n_q=2,
+    system = pendulum(
         n_c=2,
-        mass=np.eye(2),
-        force=lambda t, q, v: np.zeros(2),
         constraint=lambda t, q: np.array([q[0] - max(0.0, t - 0.5), q[0]]),
         jacobian=lambda t, q: np.array([[1.0, 0.0], [1.0, 0.0]]),
         constraint_rate=lambda t, q: np.array([-1.0 if t > 0.5 else 0.0, 0.0]),
@@ -322,14 +320,10 @@ def test_a_rate_that_has_no_value_where_it_jumps_is_an_impulse(method):
             return 0.5 * np.divide(t - 0.4, np.abs(t - 0.4))
 
     def ends(rate):
-        system = ConstrainedSystem.from_python(
-            n_q=3,
-            n_c=2,
-            mass=np.eye(3),
-            force=lambda t, q, v: np.array([0.0, 0.0, -9.81]),
-            constraint=lambda t, q: np.array([q[0] - 0.5 * abs(t - 0.4), 0.5 * ((q[1] - q[0]) ** 2 + q[2] ** 2 - 1.0)]),
+        system = driven_cart(
+            lambda t: 0.5 * abs(t - 0.4),
+            rate,
             jacobian=lambda t, q: np.array([[1.0, 0.0, 0.0], [q[0] - q[1], q[1] - q[0], q[2]]]),
-            constraint_rate=lambda t, q: np.array([-rate(t), 0.0]),
             gamma=lambda t, q, v: np.array([0.0, -((v[1] - v[0]) ** 2) - v[2] ** 2]),
         )
         result = solve_dae(system, (0.0, 0.6), [0.2, 0.8, -0.8], [-0.5, -0.5, 0.0], method, 1e-8, 1e-8)

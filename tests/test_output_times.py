@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tests.problems import event, run, worst
+from tests.problems import event, pendulum_state, run, swing, worst
 from twoloop import Status
 from twoloop.methods.presets import PRESETS
 from twoloop.run.dense import Interpolator
@@ -33,6 +33,13 @@ def test_they_are_those_of_the_dense_solution(default_four_bar, method):
         assert worst(result.q, state.q) < 1e-14 and worst(result.v, state.v) < 1e-13
         assert worst(result.a, state.a) < 1e-11 and worst(result.lam, state.lam) < 1e-11
     assert alone.sol is None
+
+
+@pytest.mark.parametrize("times", [[0.3, 0.31, 0.7, 1.9], [2.0], [0.0], [0.3, 0.30000001]])
+def test_a_run_goes_to_its_end_whatever_times_are_asked_for(times):
+    result = swing(t_eval=times, rtol=1e-9, atol=1e-9)
+    assert result.success and (result.t == times).all() and worst(result.q, pendulum_state(np.array(times))[0]) < 1e-8
+    assert result.h.sum() == pytest.approx(2.0, abs=1e-13)
 
 
 @pytest.mark.parametrize("chunk", [1, 2, 3, 7])

@@ -3,6 +3,7 @@
 import copy
 import pickle
 import warnings
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -84,24 +85,23 @@ def test_planar_bodies(name):
 
 
 @pytest.mark.parametrize("changed", [{}, {"lengths": (0.8, 1.2, 1.0), "ground": 2.0}], ids=["default", "second"])
-def test_four_bar(changed):
+def test_pins_of_the_four_bar(changed):
+    """Each is at the end of a bar, and the beginning of the next, and carries no torque."""
     problem = mechanisms.four_bar(**changed)
     result = run(problem, 1.0)
     lengths = np.array([problem.parameters[name] for name in ("L1", "L2", "L3")])
-    pins = {name: result.reactions(name) for name in ("O", "1-2", "2-3", "A")}
-    assert problem.joints == problem.system.joints and {joint.name for joint in problem.joints} == set(pins)
-    # the point of a pin between two bars is the end of the one, and the beginning of the other
-    for bar, pin in enumerate(("1-2", "2-3", "A")):
-        angle = result.q[3 * bar + 2]
-        end = result.q[3 * bar : 3 * bar + 2] + 0.5 * lengths[bar] * np.array([np.cos(angle), np.sin(angle)])
-        assert np.abs(end - pins[pin].point).max() < 1e-12
+    pins = [result.reactions(name) for name in ("O", "1-2", "2-3", "A")]
+    assert problem.joints == problem.system.joints and len(problem.joints) == 4
     forces, torques = {}, {}
-    for bar, signs in enumerate(({"O": 1.0, "1-2": -1.0}, {"1-2": 1.0, "2-3": -1.0}, {"2-3": 1.0, "A": 1.0})):
-        forces[bar] = sum(sign * pins[pin].force for pin, sign in signs.items())
-        torques[bar] = sum(sign * moment(pins[pin].point, pins[pin].force) for pin, sign in signs.items())
+    for bar, (before, after) in enumerate(pairwise(pins)):
+        x, y, angle = result.q[3 * bar : 3 * bar + 3]
+        centre, along = np.stack([x, y]), 0.5 * lengths[bar] * np.array([np.cos(angle), np.sin(angle)])
+        assert max(np.abs(centre + along - after.point).max(), np.abs(centre - along - before.point).max()) < 1e-12
+        last = 1.0 if bar == 2 else -1.0  # that of the ground acts on the bar
+        forces[bar] = before.force + last * after.force
+        torques[bar] = moment(before.point, before.force) + last * moment(after.point, after.force)
     check_planar(result, range(3), lengths, lengths**3 / 12.0, forces, torques)
-    for pin in pins.values():  # pins carry no torque
-        assert np.abs(pin.torque).max() < 1e-10 * np.abs(pin.force).max() and pin.unique
+    assert all(np.abs(pin.torque).max() < 1e-10 * np.abs(pin.force).max() and pin.unique for pin in pins)
 
 
 def test_knife_edge():

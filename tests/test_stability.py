@@ -7,8 +7,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from tests.problems import event
-from twoloop import DOP853, ConstrainedSystem, Status, mechanisms, solve_dae
+from tests.problems import event, pendulum
+from twoloop import DOP853, Status, mechanisms, solve_dae
 from twoloop.kernels.data import codes
 from twoloop.kernels.steps import adams_step as kernels
 from twoloop.methods import adams, dop853
@@ -86,12 +86,10 @@ def test_a_stiff_spring_in_python_is_seen(method, monkeypatch):
 
     What is said is the same on a machine that is too busy for long chunks of steps.
     """
-    stiff = ConstrainedSystem.from_python(
+    stiff = pendulum(
         n_q=3,
-        n_c=1,
         mass=np.eye(3),
         force=lambda t, q, v: np.array([0.0, -9.81, -1e8 * (q[2] - np.sin(t)) - np.sin(t)]),
-        constraint=lambda t, q: np.array([0.5 * (q[0] ** 2 + q[1] ** 2 - 1.0)]),
         jacobian=lambda t, q: np.array([[q[0], q[1], 0.0]]),
     )
     start = ([1.0, 0.0, 0.0], [0.0, 0.0, 1.0])

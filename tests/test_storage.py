@@ -1,32 +1,43 @@
-"""Results written to files and read back."""
+"""Results in files, written after a run or as its states come, and read back."""
 
+import os
+import signal
+import subprocess
+import sys
+import tracemalloc
 from dataclasses import fields
 
 import numpy as np
 import pytest
 
 import twoloop
-from tests.problems import event, run, swing
+from tests.problems import event, pendulum, run, swing, worst
+from tests.processes import ROOT
 from twoloop import Result, Statistics, Status
+from twoloop.mechanisms import closed_chain, redundant_slider_crank
+from twoloop.run import course
+
+EVERY = [field.name for field in fields(Result) if field.name != "sol"]
+TELLS = [name for name in EVERY if name not in ("stats", "system", "redundant")]
 
 
 def raised(t, q, v):
     return q[8] - 1.0
 
 
-def same(one, other):
-    """Whether all but the dense solution is the same."""
-    for field in fields(Result):
-        if field.name == "sol":
-            continue
-        a, b = getattr(one, field.name), getattr(other, field.name)
+ENDING = event(lambda t, q, v: q[8] - 1.0, terminal=True)
+
+
+def same(one, other, names=EVERY):
+    for name in names:
+        a, b = getattr(one, name), getattr(other, name)
         if isinstance(a, list):
             assert len(a) == len(b)
-            assert all((x == y).all() and x.shape == y.shape for x, y in zip(a, b, strict=True)), field.name
+            assert all((x == y).all() and x.shape == y.shape for x, y in zip(a, b, strict=True)), name
         elif isinstance(a, np.ndarray):
-            assert a.dtype == b.dtype and a.shape == b.shape and (a == b).all(), field.name
+            assert a.dtype == b.dtype and a.shape == b.shape and (a == b).all(), name
         else:
-            assert type(a) is type(b) and a == b, field.name
+            assert type(a) is type(b) and a == b, name
 
 
 @pytest.mark.parametrize("method", ["SunRadau5", "Gauss12", "BDF", "RadauIIA5", "RadauIIA13", "Taylor"])
@@ -49,8 +60,7 @@ def test_without_the_system_there_is_no_dense_solution(default_four_bar, tmp_pat
 
 
 def test_a_run_that_an_event_ended(default_four_bar, tmp_path):
-    end = event(lambda t, q, v: q[8] - 1.0, terminal=True)
-    result = run(default_four_bar, 1.0, dense_output=True, events=[end, raised])
+    result = run(default_four_bar, 1.0, dense_output=True, events=[ENDING, raised])
     result.save(tmp_path / "run.npz")
     again = twoloop.load(str(tmp_path / "run.npz"), default_four_bar.system)
     same(result, again)
@@ -84,3 +94,115 @@ def test_other_files_are_refused(tmp_path, content):
 def test_a_file_that_is_not_there(tmp_path):
     with pytest.raises(FileNotFoundError):
         twoloop.load(tmp_path / "nothing.npz")
+
+
+# --- runs whose states go to the disk as they come
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"t_eval": np.linspace(0.0, 1.0, 30)},
+        {"t_eval": np.linspace(0.1, 0.9, 30), "dense_output": True, "events": raised},
+        {"method": "RadauIIA13", "dense_output": True},
+        {"step_size": 0.01, "t_eval": [0.5, 0.8], "method": "Gauss12"},
+        {"method": "Newmark", "rtol": 1e-4, "atol": 1e-4},
+        {"dense_output": True, "events": [ENDING]},
+        {"t_eval": [0.0, 0.1, 0.2, 0.9], "events": ENDING},
+        {"max_steps": 5},
+        {"max_steps": 5, "t_eval": [0.3], "dense_output": True},
+    ],
+)
+def test_a_stored_run_is_the_same_as_another(default_four_bar, tmp_path, options):
+    expected, found = (run(default_four_bar, 1.0, **options, **more) for more in ({}, {"store": tmp_path / "run"}))
+    again = twoloop.load(tmp_path / "run", default_four_bar.system)
+    between = "t_eval" in options and "step_size" not in options  # where other times make another partition
+    same(expected, found, [name for name in TELLS if not (between and name in ("a", "lam"))])
+    assert worst(found.a, expected.a) < 1e-10 and worst(found.lam, expected.lam) < 1e-10
+    same(found, again, TELLS)
+    assert again.stats == found.stats
+    if expected.sol is not None:
+        t = np.linspace(expected.sol.t_min, expected.sol.t_max, 101)
+        one, others = expected.sol(t), (found.sol(t), again.sol(t))
+        assert all((getattr(one, name) == getattr(other, name)).all() for other in others for name in ("q", "v", "lam"))
+
+
+def test_redundant_rows_and_another_file_of_it(tmp_path):
+    problem = redundant_slider_crank()
+    with pytest.warns(twoloop.ConstraintWarning):
+        found = run(problem, 0.5, store=tmp_path / "run")
+    again = twoloop.load(tmp_path / "run", problem.system)
+    assert (again.redundant == found.redundant).all() and again.rank == found.rank
+    again.save(tmp_path / "run.npz")
+    same(found, twoloop.load(tmp_path / "run.npz", problem.system), TELLS)
+
+
+@pytest.mark.parametrize("options", [{}, {"t_eval": True}, {"dense_output": True}])
+def test_the_memory_holds_a_part_only(tmp_path, options, monkeypatch):
+    """Counted is what NumPy asks for: files that are mapped are not among it."""
+    monkeypatch.setattr(course, "BUFFER_ROWS", 64)
+    problem, peaks, stored = closed_chain(12), [], []
+    for end in (40.0, 80.0):
+        times = {"t_eval": np.linspace(0.0, end, int(200.0 * end))} if options.get("t_eval") else {}
+        tracemalloc.start()
+        result = run(problem, end, rtol=1e-7, atol=1e-7, max_step=0.005, **options | times, store=tmp_path / f"{end}")
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+        stored.append(sum(getattr(result, name).nbytes for name in ("t", "q", "v", "a", "lam")))
+    assert peaks[1] - peaks[0] < 0.2 * (stored[1] - stored[0])
+    before = result.q[0, 0]
+    result.q[0, 0] = 7.0  # as in memory, and not in the file
+    assert twoloop.load(tmp_path / "80.0").q[0, 0] == before
+
+
+def test_what_is_refused(default_four_bar, tmp_path):
+    with pytest.raises(ValueError, match="q0"):
+        twoloop.solve_dae(default_four_bar.system, (0.0, 1.0), [np.nan] * 9, [0.0] * 9, store=tmp_path / "run")
+    assert not (tmp_path / "run").exists()  # so that the next call may have the name
+    with pytest.raises(ValueError, match="a folder that solve_dae stored a run in"):
+        twoloop.load(tmp_path)
+
+
+def test_a_callback_that_raises_leaves_what_was_there(tmp_path):
+    def broken(t, q, v):
+        if t > 0.5:
+            raise RuntimeError("broken")
+        return np.array([0.0, -9.81])
+
+    with pytest.raises(RuntimeError, match="broken"):
+        swing(system=pendulum(force=broken), max_step=0.001, store=tmp_path / "run")
+    found = twoloop.load(tmp_path / "run")
+    assert found.status is Status.INTERRUPTED and "not brought to its end" in found.message
+    assert found.t[-1] > 0.0 and found.h.size == found.t.size - 1
+
+
+DIES = """
+import os, signal, sys
+from twoloop import solve_dae
+from twoloop.mechanisms import four_bar
+signal.signal(signal.SIGINT, signal.default_int_handler)  # which a shell takes away in the background
+problem, seen = four_bar(), []
+def event(t, q, v):
+    if t > 3.0 and not seen:
+        seen.append(t)
+        os.kill(os.getpid(), getattr(signal, sys.argv[2]))
+    return 1.0
+result = solve_dae(problem.system, (0.0, 5.0), problem.q0, problem.v0, max_step=1e-3, events=event, store=sys.argv[1])
+print(result.status.name, result.t[-1], result.t.size)
+"""
+
+
+@pytest.mark.skipif(os.name == "nt", reason="signals of POSIX")
+@pytest.mark.parametrize("name", ["SIGINT", "SIGKILL"])
+def test_ctrl_c_and_the_death_of_the_process(default_four_bar, tmp_path, name):
+    command = [sys.executable, "-c", DIES, str(tmp_path / "run"), name]
+    out = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    found = twoloop.load(tmp_path / "run", default_four_bar.system)
+    assert found.status is Status.INTERRUPTED and 1.0 < found.t[-1] < 4.5
+    known = run(default_four_bar, 5.0, max_step=1e-3)
+    assert worst(found.q, known.q[:, : found.t.size]) < 1e-10
+    if name == "SIGINT":
+        assert "Interrupted from the keyboard" in found.message
+        assert out.stdout.split() == ["INTERRUPTED", str(found.t[-1]), str(found.t.size)]
+    else:
+        assert out.returncode == -signal.SIGKILL and "not brought to its end" in found.message
+        assert found.h.size in (found.t.size - 1, found.t.size)

@@ -134,16 +134,14 @@ def test_near_a_singular_position_the_general_inner_loop_takes_over():
     """A pin on two guides, y = 0 and y = a x: the rows become parallel as a goes to 0."""
 
     def system(slope):
-        return ConstrainedSystem.from_python(
-            n_q=3,
+        return unconstrained(
+            lambda t, q, v: np.array([0.1, 0.2, -1.0]),
+            3,
             n_c=2,
-            mass=np.eye(3),
-            force=lambda t, q, v: np.array([0.1, 0.2, -1.0]),
             constraint=lambda t, q: np.array([q[1], q[1] - slope * (1.0 - t) * q[0]]),
             jacobian=lambda t, q: np.array([[0.0, 1.0, 0.0], [-slope * (1.0 - t), 1.0, 0.0]]),
             constraint_rate=lambda t, q: np.array([0.0, slope * q[0]]),
             gamma=lambda t, q, v: np.array([0.0, -2.0 * slope * v[0]]),
-            name="guides",
         )
 
     q = v = np.zeros(3)

@@ -1,12 +1,14 @@
 """Forces that act for a thousandth of the run: steps end where something changes suddenly with time."""
 
 import math
+from functools import cache
 
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from twoloop import ConstrainedSystem, ensemble, solve_dae
+from tests import problems
+from twoloop import ensemble, solve_dae
 from twoloop.generate.time_dependence import may_be_sudden
 from twoloop.mechanisms import driven_slider_crank, four_bar
 
@@ -48,22 +50,13 @@ def steady(t, q, v, p):
 
 
 def pendulum(force, at=1.5, width=WIDTH, compile=True):
-    return ConstrainedSystem.from_python(
-        n_q=2,
-        n_c=1,
-        mass=lambda t, q, p: np.eye(2),
-        force=force,
-        constraint=lambda t, q, p: np.array([0.5 * (q[0] * q[0] + q[1] * q[1] - 1.0)]),
-        jacobian=lambda t, q, p: np.array([[q[0], q[1]]]),
-        gamma=lambda t, q, v, p: np.array([-(v[0] * v[0] + v[1] * v[1])]),
-        parameters=[at, width],
-        compile=compile,
-    )
+    return problems.pendulum(compile=compile, force=force, parameters=[at, width])
 
 
 SYSTEMS = {"gust": pendulum(gust), "switched": pendulum(switched)}
 
 
+@cache
 def end(force, at):
     """(x, y) at T_END by the angle, in steps that cannot pass over the gust."""
 
@@ -174,14 +167,5 @@ def test_forces_are_not_called_beyond_the_end_of_a_run():
         latest.append(t)
         return np.array([1.0 if t > 0.5 else 0.0, -9.81])
 
-    system = ConstrainedSystem.from_python(
-        n_q=2,
-        n_c=1,
-        mass=lambda t, q: np.eye(2),
-        force=force,
-        constraint=lambda t, q: np.array([0.5 * (q @ q - 1.0)]),
-        jacobian=lambda t, q: q[None, :],
-        gamma=lambda t, q, v: np.array([-(v @ v)]),
-    )
-    result = solve_dae(system, (0.0, 1.0), *START, t_eval=[0.3, 1.0], method="DOP853")
+    result = solve_dae(problems.pendulum(force=force), (0.0, 1.0), *START, t_eval=[0.3, 1.0], method="DOP853")
     assert result.success and max(latest) <= 1.0

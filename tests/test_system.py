@@ -94,9 +94,8 @@ def bead(**changed):
         "mass": lambda t, q, p: np.array([[p[0], 0.0], [0.0, p[0]]]),
         "force": lambda t, q, v, p: np.array([0.0, -9.81 * p[0]]),
         "constraint": lambda t, q, p: np.array([0.5 * (q[0] * q[0] + q[1] * q[1] - p[1] * p[1])]),
-        "jacobian": lambda t, q: q.reshape((1, 2)),
-    } | changed
-    return ConstrainedSystem.from_python(n_q=2, n_c=1, parameters=[2.0, 1.0], **functions)
+    }
+    return pendulum(**{"gamma": False, "parameters": [2.0, 1.0], **functions, **changed})
 
 
 @pytest.mark.parametrize("compile", [False, pytest.param(True, marks=pytest.mark.slow)])  # those of ensembles do, too

@@ -20,7 +20,7 @@ from twoloop.methods.dop853 import DOP853
 from twoloop.methods.plan import Plan
 
 TABLEAUX = "tests/test_tableaux.py"
-EXPLICIT = "tests/kernels/test_explicit.py::test_the_tableau_satisfies_its_order_conditions"
+EXPLICIT = "tests/test_tableaux.py::test_dop853_is_that_of_scipy"
 TABLES, METRICS, RENDER = (f"tests/studies/test_{name}.py" for name in ("tables", "metrics", "render"))
 
 

@@ -3,17 +3,8 @@
 import numpy as np
 
 from tests.bad_input.case import cases_of, linkage, solve
-from tests.problems import moving_pivot, moving_pivot_state, pendulum
+from tests.problems import functions_of, moving_pivot, moving_pivot_state, pendulum
 from twoloop import ConstrainedSystem
-
-THREE = {
-    "n_q": 3,
-    "n_c": 3,
-    "mass": np.eye(3),
-    "force": lambda t, q, v: np.zeros(3),
-    "constraint": lambda t, q: np.array([q[0], q[1], q[0] + 0.5 * q[1]]),
-    "jacobian": lambda t, q: np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [1.0, 0.5, 0.0]]),
-}
 
 
 def linkage_moved():
@@ -23,16 +14,9 @@ def linkage_moved():
 
 
 def forgotten_rate():
-    right = moving_pivot()
-    system = ConstrainedSystem.from_python(
-        n_q=2,
-        n_c=1,
-        mass=np.eye(2),
-        force=lambda t, q, v: right.force(t, q, v),
-        constraint=lambda t, q: right.constraint(t, q),
-        jacobian=lambda t, q: right.jacobian(t, q),
-        name="moving pivot",
-    )
+    functions = functions_of(moving_pivot())
+    del functions["constraint_rate"], functions["gamma"]
+    system = ConstrainedSystem.from_python(n_q=2, n_c=1, **functions, name="moving pivot")
     return solve(system, (0.0, 0.1), *moving_pivot_state(0.0))
 
 

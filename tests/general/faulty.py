@@ -3,7 +3,7 @@
 import numpy as np
 
 from tests.general.mechanism import G, Mechanism, of_functions, one_coordinate
-from twoloop import ConstrainedSystem
+from tests.problems import pendulum, unconstrained
 
 SPRING = 20.0
 
@@ -39,14 +39,11 @@ def massless_coordinate():
 
 def without_inertia(mass=(1.0, 1.0, 0.0)):
     """A pendulum x, y and a third coordinate that no row holds; by default it has no mass."""
-    return ConstrainedSystem.from_python(
+    return pendulum(
         n_q=3,
-        n_c=1,
         mass=np.diag(mass),
         force=lambda t, q, v: np.array([0.0, -G, 0.0]),
-        constraint=lambda t, q: np.array([0.5 * (q[0] * q[0] + q[1] * q[1] - 1.0)]),
         jacobian=lambda t, q: np.array([[q[0], q[1], 0.0]]),
-        gamma=lambda t, q, v: np.array([-v[0] * v[0] - v[1] * v[1]]),
         name="drifter",
     )
 
@@ -57,11 +54,9 @@ def parted_drives(power):
     At t = 0 both agree in position and in velocity; with power = 3 in acceleration, too.
     """
     zero = power == 2
-    return ConstrainedSystem.from_python(
-        n_q=2,
+    return pendulum(
         n_c=3,
-        mass=np.eye(2),
-        force=lambda t, q, v: np.array([0.0, -G]),
+        constant_mass=True,
         constraint=lambda t, q: np.array([q[1] - q[0], q[0] - np.sin(t), q[0] - np.sin(t) - t**power]),
         jacobian=lambda t, q: np.array([[-1.0, 1.0], [1.0, 0.0], [1.0, 0.0]]),
         constraint_rate=lambda t, q: np.array([0.0, -np.cos(t), -np.cos(t) - power * t ** (power - 1)]),
@@ -72,14 +67,10 @@ def parted_drives(power):
 
 def parted_velocities():
     """Two non-holonomic rows of the same direction at t = 0 that ask for different speeds: none satisfies both."""
-    return ConstrainedSystem.from_python(
-        n_q=2,
-        n_c=0,
+    return unconstrained(
+        lambda t, q, v: np.zeros(2),
+        2,
         n_a=2,
-        mass=np.eye(2),
-        force=lambda t, q, v: np.zeros(2),
-        constraint=None,
-        jacobian=None,
         nonholonomic=lambda t, q: np.array([[1.0, 0.0], [2.0, 0.0]]),
         nonholonomic_rate=lambda t, q: np.array([-1.0, -3.0]),
         name="two speeds",

@@ -1,15 +1,88 @@
-"""All mechanisms with a known motion, by name, each made once."""
+"""All mechanisms with a known motion, by name, each made once; runs of them, and their errors."""
 
+import warnings
 from functools import cache, partial
 
-from tests.general import dead_points, disc, faulty, heavy_top, knife_edge, planet, slider_crank, windows
-from tests.general.mechanism import known, of_problem
-from tests.mechanisms.motions import known_motions
+import numpy as np
+from scipy.optimize import brentq
 
+from tests.general import dead_points, disc, faulty, heavy_top, knife_edge
+from tests.general.mechanism import Mechanism, known, of_functions, of_problem
+from tests.mechanisms.motions import known_motions, planar
+from tests.problems import functions_of, unconstrained
+from twoloop import ConstraintWarning, mechanisms, solve_dae
+from twoloop.mechanisms import n_four_bar
+
+
+def planet(eccentricity=0.2):
+    """No row at all, so that the motion is an ordinary second-order equation. Closed form."""
+
+    def state(t):
+        E = t
+        for _ in range(50):  # Kepler's equation, by Newton
+            E -= (E - eccentricity * np.sin(E) - t) / (1.0 - eccentricity * np.cos(E))
+        b, rate = np.sqrt(1.0 - eccentricity**2), 1.0 / (1.0 - eccentricity * np.cos(E))
+        return np.array([np.cos(E) - eccentricity, b * np.sin(E)]), rate * np.array([-np.sin(E), b * np.cos(E)])
+
+    system = unconstrained(lambda t, q, v: -q / (q[0] * q[0] + q[1] * q[1]) ** 1.5, 2, name="planet")
+    return Mechanism(
+        name="planet",
+        system=lambda: system,
+        end=3.0,
+        state=state,
+        rank=0,
+        energy=lambda q, v: 0.5 * v @ v - 1.0 / np.hypot(q[0], q[1]),
+    )
+
+
+# --- the slider-crank with a redundant row, which says once more, and not linearly, how far pin and slider are apart
+DRIVEN = mechanisms.driven_slider_crank()
+
+
+def redundant_slider_crank():
+    """The ready mechanism."""
+    return of_problem(mechanisms.redundant_slider_crank(), known(planar.slider_crank(), 2.0), 2.0, rank=8)
+
+
+def driven_slider_crank(redundant):
+    """No freedom is left: the motion is the drive's. With redundant=True there are ten rows for nine coordinates."""
+    if not redundant:
+        return of_problem(DRIVEN, DRIVEN.motion, 2.0)
+    free, driven = mechanisms.redundant_slider_crank().system, DRIVEN.system
+
+    def joined(kind):  # the last row of the other is the drive
+        of_free, of_driven = getattr(free, kind), getattr(driven, kind)
+        return lambda *state: np.concatenate([of_free(*state), of_driven(*state)[-1:]])
+
+    rows = {kind: joined(kind) for kind in ("constraint", "jacobian", "constraint_rate", "gamma")}
+    return Mechanism(
+        name="driven slider-crank, redundant",
+        system=of_functions(n_q=9, n_c=10, **functions_of(free) | rows),
+        end=2.0,
+        state=DRIVEN.motion,
+        rank=9,
+    )
+
+
+# --- IFToMM A02 beside the equation for the angle of its cranks
+# the tip of the first crank at 10 s for N = 2, as Exudyn prints it at h = 2.5e-4 and at half of that: order 2
+PRINTED_TIP = np.array([[0.3284552113, 0.9445195467], [0.3284573768, 0.9445187937]])
+
+
+def windows(n, coordinates="tips"):
+    return of_problem(n_four_bar(n, coordinates), known(planar.a02(n, bodies=coordinates == "bodies"), 10.0), 10.0)
+
+
+def first_singular_time(n):
+    """When the cranks first lie on the ground line, to rounding."""
+    return float(brentq(lambda t: n_four_bar(n).motion.crank(t)[0], 0.5, 1.0, xtol=1e-15))
+
+
+# --- all of them
 WINDOWS = (1, 2, 40)
 # name -> how it is made; motion that never comes near a point where C_q loses rank
 REGULAR = {
-    "redundant slider-crank": slider_crank.redundant_slider_crank,
+    "redundant slider-crank": redundant_slider_crank,
     "top of Euler parameters": heavy_top.top_of_euler_parameters,
     "top with its centre": heavy_top.top_with_centre,
     "knife edge": knife_edge.knife_edge,
@@ -18,10 +91,10 @@ REGULAR = {
     "steady disc": disc.steady_disc,
     "wobbling disc": disc.wobbling_disc,
     "wobbling disc, redundant": partial(disc.wobbling_disc, True),
-    "driven slider-crank": partial(slider_crank.driven_slider_crank, False),
-    "driven slider-crank, redundant": partial(slider_crank.driven_slider_crank, True),
+    "driven slider-crank": partial(driven_slider_crank, False),
+    "driven slider-crank, redundant": partial(driven_slider_crank, True),
     "massless coordinate": faulty.massless_coordinate,
-    "planet": planet.planet,
+    "planet": planet,
 }
 # the ready mechanisms that have no other place above; of Bricard's 60 rows, one is redundant
 ELSEWHERE = ("redundant slider-crank", "heavy top", "rolling disc", "closed chain of 10", "closed chain of 20")
@@ -36,8 +109,8 @@ def _ready(name):
 REGULAR |= {name: partial(_ready, name) for name in known_motions() if name not in ELSEWHERE}
 # rank is lost on the way, and the motion goes on
 SINGULAR = {
-    **{f"A02, N = {n}": partial(windows.windows, n) for n in WINDOWS},
-    **{f"A02 of bodies, N = {n}": partial(windows.windows_of_bodies, n) for n in (1, 2)},
+    **{f"A02, N = {n}": partial(windows, n) for n in WINDOWS},
+    **{f"A02 of bodies, N = {n}": partial(windows, n, "bodies") for n in (1, 2)},
     "isosceles slider-crank": dead_points.isosceles_slider_crank,
     "crossing lines": dead_points.crossing_lines,
 }
@@ -48,3 +121,37 @@ REDUNDANT = [name for name in REGULAR if "redundant" in name or name in RANKS]
 @cache
 def mechanism(name):
     return ALL[name]()
+
+
+# --- runs
+TOLERANCE = 5e-11
+
+
+@cache
+def run(name, method, tolerance=TOLERANCE, times=41):
+    """A run, and the warnings about its rows."""
+    m = mechanism(name)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        result = solve_dae(
+            m.system(),
+            (0.0, m.end),
+            *m.start,
+            method=method,
+            rtol=tolerance,
+            atol=tolerance,
+            t_eval=np.linspace(0.0, m.end, times),
+            max_steps=100_000,
+        )
+    return result, [str(each.message) for each in caught if issubclass(each.category, ConstraintWarning)]
+
+
+def relative_error(values, reference):
+    """Largest difference over the largest value, or over 1 where that is less."""
+    return np.abs(values - reference).max() / max(1.0, np.abs(reference).max())
+
+
+def error(m, result):
+    """The larger of the relative errors of positions and velocities over the run."""
+    q, v = m.states(result.t)
+    return max(relative_error(result.q, q), relative_error(result.v, v))

@@ -3,6 +3,7 @@
 import numpy as np
 
 from tests.compiled import PENDULUM, heavy
+from tests.problems import pendulum
 from twoloop import ConstrainedSystem, callback, solve_dae
 
 
@@ -25,10 +26,8 @@ def system_of(parameters, **functions):
         "mass": lambda t, q, p: p[0] * np.eye(2),
         "force": lambda t, q, v, p: np.array([-0.1 * v[0], -0.1 * v[1] - p[0] * p[2]]),
         "constraint": lambda t, q, p: np.array([0.5 * (q @ q - p[1] ** 2)]),
-        "jacobian": lambda t, q: q[None, :],
-        "name": "pendulum",
     }
-    return ConstrainedSystem.from_python(n_q=2, n_c=1, parameters=parameters[0], **{**usual, **functions})
+    return pendulum(**{"gamma": False, "parameters": parameters[0], **usual, **functions})
 
 
 def drawn(n_runs):

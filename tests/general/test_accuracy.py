@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from tests.general.mechanisms import REDUNDANT, REGULAR, mechanism
-from tests.general.runs import relative_error, run
+from tests.general.mechanisms import REDUNDANT, REGULAR, mechanism, relative_error, run
 from tests.mechanisms.make_references import solution
 
 METHODS = ("Gauss12", "DOP853", "Adams")

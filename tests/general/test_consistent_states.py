@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from tests.compiled import unit_mass, weight
+from tests.problems import pendulum
 from twoloop import ConstrainedSystem, callback, consistent_state, consistent_states, mechanisms
 
 
@@ -45,24 +46,18 @@ def test_callbacks_that_cannot_be_traced_go_one_by_one():
     def circle(t, q, p):
         return np.array([q @ q - (p[0] if q[0] < 5.0 else 2.0) ** 2])
 
-    system = ConstrainedSystem.from_python(
-        n_q=2, n_c=1, mass=np.eye(2), force=lambda t, q, v: np.zeros(2), constraint=circle, parameters=[1.0]
-    )
+    system = pendulum(constraint=circle, jacobian=None, gamma=False, parameters=[1.0])
     parameters, q = np.random.default_rng(0).uniform(0.9, 1.1, (4, 1)), np.array([0.7, 0.8])
     made, _ = consistent_states(system, 0.0, q, np.zeros(2), parameters=parameters)
     assert np.abs(np.linalg.norm(made, axis=1) - parameters[:, 0]).max() < 1e-12
 
 
 def test_velocities_that_the_callbacks_deny_are_found_again_one_by_one():
-    system = ConstrainedSystem.from_python(
-        n_q=2,
-        n_c=1,
-        mass=np.eye(2),
-        force=lambda t, q, v: np.zeros(2),
+    system = pendulum(
         constraint=lambda t, q, p: np.array([q[0] - p[0] * t]),
         jacobian=lambda t, q: np.array([[1.0, 0.0]]),
         constraint_rate=lambda t, q, p: np.array([-float(p[0])]),  # which symbols do not see
-        parameters=[1.0],
+        **{"gamma": False, "parameters": [1.0]},
     )
     parameters = np.array([[1.0], [2.0], [3.0]])
     q, v = consistent_states(system, 0.5, [0.4, 0.0], [0.0, 1.0], parameters=parameters)

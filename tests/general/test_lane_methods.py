@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from tests.general.pendulums import far_from_single_runs, pendulums, system_of
+from tests.problems import pendulum, unconstrained
 from twoloop import ConstrainedSystem, ConstraintWarning, Status, ensemble, mechanisms, solve_dae
 from twoloop.ensembles.in_lanes import LaneRuns
 from twoloop.ensembles.lane_methods import STAGES, lane_methods
@@ -108,15 +109,8 @@ def springs(n_runs):
         pull = (p[0] * (length - p[2]) + p[1] * ((x * (v[2] - v[0]) + y * (v[3] - v[1])) / length)) / length
         return np.array([pull * x, pull * y - 9.81, -pull * x, -pull * y - 9.81])
 
-    system = ConstrainedSystem.from_python(
-        n_q=4,
-        n_c=1,
-        mass=np.eye(4),
-        force=force,
-        constraint=lambda t, q, p: np.array([0.5 * (q[0] ** 2 + q[1] ** 2 - 1.0)]),
-        parameters=p[0],
-        name="masses on a stiff spring",
-    )
+    circle = lambda t, q, p: np.array([0.5 * (q[0] ** 2 + q[1] ** 2 - 1.0)])  # noqa: E731
+    system = unconstrained(force, 4, n_c=1, constraint=circle, parameters=p[0], name="masses on a stiff spring")
     angle = random.uniform(0.3, 1.2, n_runs)
     bob = np.column_stack([np.sin(angle), -np.cos(angle)])
     return system, np.hstack([bob, bob + p[:, 2:] * np.column_stack([np.sin(0.5 * angle), -np.cos(0.5 * angle)])]), p
@@ -126,14 +120,9 @@ def dampers(n_runs):
     """A pendulum in a stream that carries it along, through strong drag."""
     random = np.random.default_rng(2)
     p = np.column_stack([10.0 ** random.uniform(3, 5, n_runs), random.uniform(5.0, 12.0, n_runs)])
-    system = ConstrainedSystem.from_python(
-        n_q=2,
-        n_c=1,
-        mass=np.eye(2),
+    system = pendulum(
         force=lambda t, q, v, p: np.array([-p[0] * (v[0] - np.cos(2.0 * t)), -p[0] * v[1] - p[1]]),
-        constraint=lambda t, q, p: np.array([0.5 * (q @ q - 1.0)]),
-        parameters=p[0],
-        name="pendulum in a stream",
+        **{"parameters": p[0], "jacobian": None, "gamma": False, "constant_mass": True, "name": "pendulum in a stream"},
     )
     angle = random.uniform(0.3, 2.0, n_runs)
     return system, np.column_stack([np.sin(angle), -np.cos(angle)]), p
@@ -205,14 +194,8 @@ def test_an_iteration_that_has_ended_in_one_lane_goes_on_in_others_alone():
 def test_vibrations_that_do_not_matter_are_passed_over_as_singly_and_no_others(tolerance):
     """By the methods of the default, which look at what errors of velocities make of the positions."""
     p = np.column_stack([np.geomspace(1e2, 1e8, 9), np.full(9, 2.0)])
-    system = ConstrainedSystem.from_python(
-        n_q=1,
-        n_c=0,
-        mass=np.eye(1),
-        force=lambda t, q, v, p: np.array([-p[0] * (q[0] - np.sin(40.0 * t)) - p[1] * v[0]]),
-        parameters=p[0],
-        name="carried along by a spring",
-    )
+    force = lambda t, q, v, p: np.array([-p[0] * (q[0] - np.sin(40.0 * t)) - p[1] * v[0]])  # noqa: E731
+    system = unconstrained(force, parameters=p[0], name="carried along by a spring")
     q, v, atol = np.zeros((9, 1)), np.full((9, 1), 40.0), np.full(1, tolerance)
     lanes = LaneRuns(system, Starts(0.0, q, v, p), lane_methods("auto", True, 1, tolerance, tolerance)[0])
     out = np.empty((2, 9, 1, 1))

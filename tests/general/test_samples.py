@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from twoloop import ConstrainedSystem, Integrator, load, mechanisms, solve_dae
+from tests import problems
+from twoloop import Integrator, load, mechanisms, solve_dae
 from twoloop.bodies import PlanarModel
 
 M, L, GRAVITY = 1.3, 0.8, 9.81
@@ -91,14 +92,8 @@ def test_plain_functions(given):
         u = torque[0] if given == "closure" else p[1]
         return np.array([-u * q[1], u * q[0] - GRAVITY * p[0]])
 
-    own = (
-        {} if given == "derived" else {"jacobian": lambda t, q: q[None, :], "gamma": lambda t, q, v: -np.array([v @ v])}
-    )
-    system = ConstrainedSystem.from_python(
-        **{"n_q": 2, "n_c": 1, "mass": lambda t, q, p: p[0] * np.eye(2), "force": force, "parameters": [2.0, 0.0]},
-        constraint=lambda t, q: np.array([0.5 * (q @ q - 1.0)]),
-        **own,
-    )
+    less = {"jacobian": None, "gamma": False} if given == "derived" else {}
+    system = problems.pendulum(mass=lambda t, q, p: p[0] * np.eye(2), force=force, parameters=[2.0, 0.0], **less)
     integrator = Integrator(system, rtol=1e-10, atol=1e-10)
     state = integrator.start(0.0, [0.0, -1.0], [0.0, 0.0])
     y = np.zeros(2)

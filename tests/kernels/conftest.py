@@ -14,3 +14,17 @@ def large(monkeypatch):
 
     set_to(0)
     return set_to
+
+
+@pytest.fixture
+def both(large):
+    """What makes the same twice: by the dense forms, and by the static form."""
+
+    def made(make):
+        found = []
+        for least in (10**9, 0):
+            large(least)
+            found.append(make())
+        return found
+
+    return made

@@ -5,8 +5,7 @@ import pytest
 
 import twoloop.run.workspace as workspace_module
 from tests.chains import chain
-from tests.general.mechanisms import mechanism
-from tests.general.runs import error
+from tests.general.mechanisms import error, mechanism
 from tests.problems import force_residual, functions_of, pendulum, violations, worst
 from twoloop import ConstrainedSystem, ConstraintWarning, Status, solve_dae
 from twoloop.kernels.algebra.sparse import MANY, sparse_pays
@@ -35,6 +34,21 @@ def choose(monkeypatch):
     return lambda sparse: monkeypatch.setattr(workspace_module, "sparse_pays", lambda *sizes: sparse)
 
 
+@pytest.fixture
+def both(choose):
+    """What makes the same run twice: by the dense forms and by the sparse matrix."""
+
+    def solved(*start, **options):
+        runs = []
+        for sparse in (False, True):
+            choose(sparse)
+            runs.append(solve_dae(*start, **options))
+            assert runs[-1].success
+        return runs
+
+    return solved
+
+
 def started(problem, method=DOP853()):  # noqa: B008
     n = problem.system.n_q
     plan = method.plan(n, 1e-8, 1e-8, False)
@@ -48,14 +62,9 @@ def form(run):
 @pytest.mark.filterwarnings("ignore::twoloop.ConstraintWarning")
 @pytest.mark.parametrize("method", ["Gauss12", "DOP853", "Adams"])
 @pytest.mark.parametrize("name", KINDS)
-def test_known_motions(choose, name, method):
-    m, tolerance = mechanism(name), 1e-10
-    found = []
-    for sparse in (False, True):
-        choose(sparse)
-        found.append(solve_dae(m.system(), (0.0, 0.5 * m.end), *m.start, method, tolerance, tolerance))
-    dense, sparse = found
-    assert dense.success and sparse.success
+def test_known_motions(both, name, method):
+    m = mechanism(name)
+    dense, sparse = both(m.system(), (0.0, 0.5 * m.end), *m.start, method, 1e-10, 1e-10)
     assert worst(dense.a[:, 0], sparse.a[:, 0]) < 1e-9 * max(1.0, np.abs(dense.a[:, 0]).max())
     assert worst(dense.lam[:, 0], sparse.lam[:, 0]) < 1e-9 * max(1.0, np.abs(dense.lam[:, 0]).max())
     assert error(m, sparse) < max(3.0 * error(m, dense), 1e-8)
@@ -64,14 +73,10 @@ def test_known_motions(choose, name, method):
 
 @pytest.mark.parametrize("method", ["Adams", "DOP853", "Gauss6", "RadauIIA5"])
 @pytest.mark.parametrize("closed", [False, True])
-def test_a_chain_of_fourteen(choose, closed, method):
+def test_a_chain_of_fourteen(both, closed, method):
     problem = chain(14, closed)
     options = {"method": method, "rtol": 1e-10, "atol": 1e-10, "t_eval": np.linspace(0.0, 0.05, 6)}
-    found = []
-    for sparse in (False, True):
-        choose(sparse)
-        found.append(solve_dae(problem.system, (0.0, 0.05), problem.q0, problem.v0, **options))
-    dense, sparse = found
+    dense, sparse = both(problem.system, (0.0, 0.05), problem.q0, problem.v0, **options)
     assert worst(dense.q, sparse.q) < 1e-8 and worst(dense.v, sparse.v) < 1e-6
     assert force_residual(problem.system, sparse) < 1e-8 and max(violations(problem.system, sparse)) < 1e-9
 
@@ -97,18 +102,15 @@ def full_mass(n):
     return with_mass(system, np.eye(2 * n) + 0.1 * weight @ weight.T / n), problem
 
 
-def test_dense_where_the_factors_are_not_sparse(choose):
+def test_dense_where_the_factors_are_not_sparse(both):
     system, problem = full_mass(40)
-    choose(False)
-    dense = solve_dae(system, (0.0, 0.01), problem.q0, problem.v0, "Adams", 1e-8, 1e-8)
-    choose(True)
-    turned = solve_dae(system, (0.0, 0.01), problem.q0, problem.v0, "Adams", 1e-8, 1e-8)
+    dense, turned = both(system, (0.0, 0.01), problem.q0, problem.v0, "Adams", 1e-8, 1e-8)
     assert worst(dense.q, turned.q) == 0.0 and worst(dense.lam, turned.lam) == 0.0
     problem = type(problem)(**{**vars(problem), "system": system})
     assert form(started(problem)) == flags.NULL_SPACE
 
 
-def test_an_entry_that_comes_later_is_found(choose):
+def test_an_entry_that_comes_later_is_found(both):
     """The last mass is first tied by the ground, then from x = 0.05 on, by a row that begins to depend on y."""
 
     def bent(q):
@@ -121,11 +123,8 @@ def test_an_entry_that_comes_later_is_found(choose):
         jacobian=lambda t, q: np.array([[-4.0 * bent(q) ** 3, 1.0]]),
         gamma=lambda t, q, v: np.array([12.0 * bent(q) ** 2 * v[0] ** 2]),
     )
-    ends = []
-    for sparse in (False, True):
-        choose(sparse)
-        ends.append(solve_dae(system, (0.0, 2.0), [0.0, 0.0], [0.0, 0.0], "Adams", 1e-9, 1e-9))
-    assert worst(ends[0].q[:, -1], ends[1].q[:, -1]) < 1e-7 and max(violations(system, ends[1])) < 1e-9
+    one, other = both(system, (0.0, 2.0), [0.0, 0.0], [0.0, 0.0], "Adams", 1e-9, 1e-9)
+    assert worst(one.q[:, -1], other.q[:, -1]) < 1e-7 and max(violations(system, other)) < 1e-9
 
 
 @pytest.mark.parametrize("heavy", [False, True])

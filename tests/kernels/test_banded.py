@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from tests.problems import without_tangent, worst
+from tests.problems import unconstrained, without_tangent, worst
 from twoloop import ConstrainedSystem, consistent_state, solve_dae
 from twoloop.kernels.algebra import lapack
 from twoloop.kernels.data import flags
@@ -171,16 +171,9 @@ def test_bandwidth_too_small(wrong):
 
 
 def test_bandwidth_of_the_mass():
-    system = ConstrainedSystem.from_python(
-        n_q=3,
-        n_c=1,
-        mass=np.array([[2.0, 0.0, 0.5], [0.0, 1.0, 0.0], [0.5, 0.0, 1.0]]),
-        force=lambda t, q, v: -q,
-        constraint=lambda t, q: q[:1],
-        jacobian=lambda t, q: np.eye(1, 3),
-        bandwidth=1,
-        name="far",
-    )
+    mass, rows = np.array([[2.0, 0.0, 0.5], [0.0, 1.0, 0.0], [0.5, 0.0, 1.0]]), {"constraint": lambda t, q: q[:1]}
+    rows |= {"n_c": 1, "jacobian": lambda t, q: np.eye(1, 3)}
+    system = unconstrained(lambda t, q, v: -q, 3, mass=mass, **rows, bandwidth=1, name="far")
     with pytest.raises(
         ValueError, match=r"bandwidth of 'far' must be at least 2: M has the entry \(2, 0\) = 0.5; given"
     ):
@@ -189,16 +182,7 @@ def test_bandwidth_of_the_mass():
 
 def test_bandwidth_of_velocities_and_constraints():
     def system(force, constraint, jacobian):
-        return ConstrainedSystem.from_python(
-            n_q=4,
-            n_c=1,
-            mass=np.eye(4),
-            force=force,
-            constraint=constraint,
-            jacobian=jacobian,
-            bandwidth=1,
-            name="four masses",
-        )
+        return unconstrained(force, 4, n_c=1, constraint=constraint, jacobian=jacobian, bandwidth=1)
 
     q0 = np.array([0.0, 0.2, 0.3, 1.0])
     far = system(lambda t, q, v: np.array([-v[3], 0.0, 0.0, 0.0]), lambda t, q: q[:1], lambda t, q: np.eye(1, 4))

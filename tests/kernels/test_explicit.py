@@ -1,12 +1,11 @@
-"""DOP853 in the two loops: coefficients, order, prices, error control, constraints, the limit of stability."""
+"""DOP853 in the two loops: prices, constraints, stability. Its numbers: test_tableaux.py, its order: test_orders.py."""
 
 import numpy as np
 import pytest
 
-from references.paper.four_bar_minimal import trajectory
-from tests.kernels.adaptive import AdaptiveMethod, four_bar_run, linkages, shared_run
-from tests.problems import LINKAGES, run, violations, worst
-from twoloop import DOP853, ConstrainedSystem, solve_dae
+from tests.kernels.adaptive import AdaptiveMethod, four_bar_run, shared_run
+from tests.problems import LINKAGES, pendulum, violations, worst
+from twoloop import DOP853, solve_dae
 from twoloop.kernels.steps import explicit_step as explicit
 from twoloop.mechanisms import very_flexible_beam
 
@@ -25,26 +24,6 @@ class TestDOP853(AdaptiveMethod):
     swing_end, more_after, far_after = 50.0, 1.2, 1e3
 
 
-# --- the tableau
-def tableau():
-    """A, b, c and the weights of the estimates, as the step reads them."""
-    options = DOP853().plan(2, 1e-6, 1e-6, False).options
-    assert options[explicit.STAGES] == STAGES
-    parts = np.split(options[explicit.N_SCALARS :], np.cumsum([STAGES**2, STAGES, STAGES, STAGES]))
-    return parts[0].reshape(STAGES, STAGES), *parts[1:]
-
-
-def test_the_tableau_satisfies_its_order_conditions():
-    A, b, c, fine, coarse = tableau()
-    np.testing.assert_allclose(A.sum(axis=1), c, atol=1e-14)
-    powers = np.arange(8)
-    np.testing.assert_allclose(c[None, :] ** powers[:, None] @ b, 1.0 / (powers + 1.0), atol=1e-14)
-    # the difference of two formulas of orders 8 and p sees no polynomial of degree below p
-    for weights, order in ((fine, 5), (coarse, 3)):
-        assert np.abs(c[None, :] ** np.arange(order)[:, None] @ weights).max() < 1e-14
-        assert abs(c**order @ weights) > 1e-4
-
-
 @pytest.mark.parametrize(
     ("change", "words"),
     [
@@ -59,42 +38,6 @@ def test_a_tableau_that_is_not_explicit_is_refused(change, words):
     good |= {"fine": np.array([1.0, -1.0]), "coarse": np.array([1.0, -1.0])}
     with pytest.raises(ValueError, match=words):
         explicit.options_array(**{**good, **change}, inner_tol=1e-8)
-
-
-def test_the_step_takes_any_explicit_tableau():
-    """Heun's method: order 2, and its difference from Euler's as both estimates."""
-
-    class Heun(DOP853):
-        def plan(self, n_q, rtol, atol, fixed):
-            plan = super().plan(n_q, rtol, atol, fixed)
-            difference = np.array([-0.5, 0.5])
-            options = explicit.options_array(
-                [[0.0, 0.0], [1.0, 0.0]], [0.5, 0.5], [0.0, 1.0], difference, 0.0 * difference, 1e-8
-            )
-            return type(plan)(plan.step, options, np.zeros(explicit.memory_size(2, n_q)), exponent=0.5)
-
-    errors = []
-    for n in (200, 400):
-        result = run(FOUR_BAR, 1.0, method=Heun(), step_size=1.0 / n)
-        errors.append(worst(result.q, trajectory(FOUR_BAR.parameters, result.t)[0]))
-    assert np.log2(errors[0] / errors[1]) == pytest.approx(2.0, abs=0.3)
-    result, error = four_bar_run(Heun(), 1e-5, 1.0)
-    assert error < 1e-2
-    assert result.stats.n_evaluations <= 2 * result.stats.n_accepted + 2 * result.stats.n_rejected_error + 1
-
-
-# --- order and prices
-@linkages
-def test_fixed_steps_are_of_order_eight(linkage):
-    problem = LINKAGES[linkage]
-    errors = []
-    for n in (60, 120):
-        result = run(problem, 4.0, method="DOP853", step_size=1.0 / n)
-        assert result.success and result.stats.n_partitions > 3
-        q, v = trajectory(problem.parameters, result.t)
-        errors.append((worst(result.q, q), worst(result.v, v)))
-    # from below only: the finer errors are near rounding, which makes it 8.2 to 9.0 with the versions of numba
-    assert np.log2(np.array(errors[0]) / np.array(errors[1])).min() > 7.5
 
 
 def test_a_step_is_twelve_evaluations_and_a_refused_one_eleven():
@@ -134,15 +77,12 @@ def test_the_very_flexible_beam():
 def vibration(w, force=None):
     """Two masses on one line, x1 = 2 x0, on a spring: frequency w; the spring's other end may move."""
     end = force or (lambda t: 0.0)
-    return ConstrainedSystem.from_python(
-        n_q=2,
-        n_c=1,
-        mass=np.eye(2),
+    return pendulum(
         force=lambda t, q, v: np.array([-5.0 * w * w * (q[0] - end(t)), 0.0]),
         constraint=lambda t, q: np.array([q[1] - 2.0 * q[0]]),
         jacobian=lambda t, q: np.array([[-2.0, 1.0]]),
         gamma=lambda t, q, v: np.zeros(1),
-        name="vibration",
+        constant_mass=True,
     )
 
 

@@ -6,13 +6,11 @@ import pytest
 import twoloop.run.newton_form as newton_form
 import twoloop.run.static_form as static_module
 from studies.bench.large import PLANAR, closed_chain, grid, ladder, open_chain, tree
-from tests.large_systems import Assembly, SpatialAssembly
+from tests.large_systems import Assembly, SpatialAssembly, spatial_chain
 from tests.problems import worst
 from twoloop import ConstrainedSystem, solve_dae
 from twoloop.kernels.algebra.static_program import N_UPDATES
 from twoloop.mechanisms import planar, spatial_bodies
-from twoloop.mechanisms.planar import GROUND
-from twoloop.mechanisms.spatial_bodies import SpatialBodies
 from twoloop.run.run import Run
 
 
@@ -151,17 +149,8 @@ def test_bodies_whose_mass_matrix_is_singular(form):
     ends = []
     for static in (False, True):
         left = form(static)
-        bodies, at, before = SpatialBodies((0.0, 0.0, -9.81)), np.zeros(3), GROUND
-        for k in range(5):
-            along = np.array([0.3, 0.1 * np.sin(k), -0.15])
-            body = bodies.body(f"body {k}", 1.0, (0.01, 0.02, 0.025), at + along / 2, np.eye(3))
-            if k % 2:
-                bodies.spherical(before, body, at)
-            else:
-                bodies.revolute(before, body, at, (0.1 * k, 1.0, 0.2))
-            before, at = body, at + along
-        q, v = bodies.start
-        result = solve_dae(bodies.system("spatial chain"), (0.0, 0.1), q, v, "RadauIIA9", 1e-9, 1e-9, compiled=False)
+        system, q, v = spatial_chain(5)
+        result = solve_dae(system, (0.0, 0.1), q, v, "RadauIIA9", 1e-9, 1e-9, compiled=False)
         assert result.success and left == []
         ends.append(result)
     assert worst(ends[0].q[:, -1], ends[1].q[:, -1]) < 1e-9
@@ -211,12 +200,6 @@ def test_spatial_assemblies_with_springs(form, monkeypatch, seed, n, loops, doub
 
 def test_a_chain_of_hinges_in_space():
     """Rows of the hinge on the ground are not among those that stiffen M: else no step was accepted."""
-    bodies, at, before = SpatialBodies((0.0, 0.0, -9.81)), np.zeros(3), GROUND
-    for k in range(15):
-        along = np.array([0.3, 0.1 * np.sin(k), -0.15])
-        body = bodies.body(f"body {k}", 1.0, (0.01, 0.02, 0.025), at + along / 2, np.eye(3))
-        bodies.revolute(before, body, at, (0.1 * np.cos(k), 1.0, 0.2 * np.sin(k)))
-        before, at = body, at + along
-    system, (q, v) = bodies.system("hinges"), bodies.start
+    system, q, v = spatial_chain(15, hinges=True)
     ends = [solve_dae(system, (0.0, 0.02), q, v, method, 1e-8, 1e-8) for method in ("RadauIIA9", "DOP853")]
     assert all(end.success for end in ends) and worst(ends[0].q[:, -1], ends[1].q[:, -1]) < 1e-8

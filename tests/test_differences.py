@@ -1,4 +1,4 @@
-"""C_q by differences of C, where a system gives none."""
+"""What a system does not give, by differences: C_q of C, Gamma of C_q and C_t, as accurate as the tolerance asks."""
 
 import math
 
@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from tests.compiled import PENDULUM, unit_mass, weight
+from tests.derivative_cases import shaken_pendulum
 from tests.problems import functions_of, moving_pivot, moving_pivot_state, pendulum, pendulum_state, swing, worst
-from twoloop import ConstrainedSystem, callback, solve_dae
+from twoloop import ConstrainedSystem, Status, callback, consistent_state, solve_dae
 from twoloop.mechanisms import four_bar, very_flexible_beam
 
 
@@ -93,3 +94,86 @@ def test_a_constraint_that_goes_out_of_bounds_is_still_found():
     system = ConstrainedSystem(n_q=2, n_c=1, mass=unit_mass, force=weight, constraint=constraint, name="far")
     with pytest.raises(ValueError, match=r"jacobian of 'far' goes out of bounds.*q\[10\*\*7\]"):
         system.jacobian(0.0, [0.0, 1.0])
+
+
+# --- Gamma
+AMPLITUDE = 1e-3  # m
+
+
+def opaque(x):
+    """The same numbers; what cannot be traced, so that no derivative of it is known."""
+    return np.maximum(x, -np.inf)
+
+
+def shaken(speed, gamma=True, noise=0.0):
+    """A pendulum of 1 m whose pivot is shaken horizontally with the angular frequency `speed`."""
+    case = shaken_pendulum(1.0, omega=speed, amplitude=AMPLITUDE)
+    changed = {
+        "force": lambda t, q, v: np.array([0.0, -9.81]),
+        "jacobian": lambda t, q: opaque(case.functions["jacobian"](t, q) + noise * np.sin(1e13 * (q[0] + t))),
+    }
+    return case.system(**changed if gamma else changed | {"gamma": None})
+
+
+def start(system, speed):
+    return consistent_state(system, 0.0, [-1.0, 0.0], [AMPLITUDE * speed, 0.0])
+
+
+@pytest.mark.parametrize("method", ["Gauss12", "DOP853", "BDF"])
+@pytest.mark.parametrize("speed", [1.0, 1e3, 2.0 * np.pi * 16e3])
+def test_a_fast_drive(speed, method):
+    exact, differenced = shaken(speed), shaken(speed, gamma=False)
+    span = (0.0, min(3.0, 30.0 / speed))
+    q0, v0 = start(exact, speed)
+    given = solve_dae(exact, span, q0, v0, method, 1e-8, 1e-8)
+    run = solve_dae(differenced, span, q0, v0, method, 1e-8, 1e-8, t_eval=[span[1]])
+    assert given.success and run.success, run.message
+    # equal at the tolerance, relative to the largest value over the run
+    assert worst(run.a[:, -1], given.a[:, -1]) < 1e-7 * np.abs(given.a).max()
+    assert worst(run.lam[:, -1], given.lam[:, -1]) < 1e-7 * np.abs(given.lam).max()
+    assert run.stats.n_accepted < 1.3 * given.stats.n_accepted + 5
+
+
+def test_differences_are_not_lengthened_over_the_drive():
+    # a drive that becomes fast long after the start
+    def angle(t):
+        return 50.0 * t**4
+
+    system = pendulum(
+        constant_mass=True,
+        constraint=lambda t, q: np.array([q[0] - 0.01 * np.sin(angle(t))]),
+        jacobian=lambda t, q: opaque(np.array([[1.0, 0.0]])) + 0.0 * opaque(q[0]),
+        constraint_rate=lambda t, q: np.array([-0.01 * np.cos(angle(t)) * 200.0 * t**3]),
+        gamma=False,
+    )
+    times = np.linspace(0.1, 2.0, 20)
+    run = solve_dae(system, (0.0, 2.0), [0.0, 0.0], [0.0, 0.0], "DOP853", t_eval=times)
+    true = 0.01 * (np.cos(angle(times)) * 600.0 * times**2 - np.sin(angle(times)) * (200.0 * times**3) ** 2)
+    assert run.success, run.message
+    assert worst(run.a[0], true) < 1e-7 * np.abs(true).max()
+
+
+def test_what_cannot_reach_the_tolerance_is_a_status():
+    system = shaken(10.0, gamma=False, noise=1e-9)
+    q0, v0 = start(shaken(10.0), 10.0)
+    run = solve_dae(system, (0.0, 1.0), q0, v0, check_derivatives=False)
+    assert run.status is Status.NOT_CONVERGED
+    assert "gamma by differences" in run.message and "Give gamma, or loosen rtol" in run.message and run.t[0] == 0.0
+
+
+def test_differences_where_all_coordinates_are_zero():
+    """A bead on y = x^2 that passes the vertex."""
+    system = pendulum(
+        constraint=lambda t, q: np.array([q[1] - q[0] ** 2]),
+        jacobian=lambda t, q: opaque(np.array([[-2.0 * q[0], 1.0]])),
+        gamma=False,
+    )
+    run = solve_dae(system, (0.0, 0.5), [0.0, 0.0], [3.0, 0.0], "Gauss8", 1e-9, 1e-9)
+    assert worst(run.a[:, 0], [0.0, 18.0]) < 1e-6 and worst(0.5 * (run.v**2).sum(axis=0) + 9.81 * run.q[1], 4.5) < 1e-7
+
+
+def test_rest_and_a_turning_point_need_no_shorter_differences():
+    system = pendulum(jacobian=lambda t, q: opaque(q[None, :]), gamma=False)
+    at_rest = solve_dae(system, (0.0, 1.0), [0.0, -1.0], [0.0, 0.0])
+    assert at_rest.success and worst(at_rest.q[:, -1], [0.0, -1.0]) < 1e-12
+    assert solve_dae(system, (0.0, 5.0), [1.0, 0.0], [0.0, 0.0], rtol=1e-10, atol=1e-10).success

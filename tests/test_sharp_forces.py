@@ -1,11 +1,74 @@
-"""Steps that check themselves: forces that a series cannot foresee, and that a long step passes over."""
+"""Forces that are sharp in time or in velocity: no method passes over them, and no estimate is too small there."""
+
+from functools import cache
 
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 
-from tests.sharp_forces import AT_REST, START, T_END, brake, drag, gust, pendulum, reference, start_of, stop, switching
-from twoloop import solve_dae
+from tests import problems
+from tests.problems import unconstrained, worst
+from twoloop import mechanisms, solve_dae
 from twoloop.mechanisms import four_bar
+
+T_END = 3.0
+START = (0.9, 0.4)  # angle from below, rad, and its rate
+AT_REST = (0.0, 0.0)
+
+
+def gust(width, at=1.5, size=20.0):
+    def force(t, q, v):
+        return np.array([size * np.exp(-(((t - at) / width) ** 2)), -9.81])
+
+    return force
+
+
+def drag(t, q, v):
+    speed = np.sqrt(v[0] * v[0] + v[1] * v[1])
+    return np.array([-0.6 * speed * v[0], -9.81 - 0.6 * speed * v[1]])
+
+
+def brake(width):
+    def force(t, q, v):
+        along = -3.0 * np.tanh((q[0] * v[1] - q[1] * v[0]) / width)
+        return np.array([-along * q[1], -9.81 + along * q[0]])
+
+    return force
+
+
+def stop(t, q, v):
+    depth = 1000.0 * (q[0] - 0.5)  # softplus, of a stop at x = 0.5
+    return np.array([-8.0 * np.log(1.0 + np.exp(depth)) / 10.0, -9.81])
+
+
+def switching(t, q, v):
+    return np.array([4.0 * np.tanh(50.0 * np.sin(20.0 * t)), -9.81])
+
+
+def pendulum(force):
+    return problems.pendulum(compile=True, constant_mass=True, force=force)
+
+
+def position(angle):
+    return np.array([np.sin(angle), -np.cos(angle)])
+
+
+def start_of(state):
+    angle, rate = state
+    return position(angle), rate * np.array([np.cos(angle), np.sin(angle)])
+
+
+@cache
+def reference(force, state, t_end=T_END):
+    """The end position from the equation of the angle alone, by SciPy with steps too short to pass over anything."""
+
+    def rates(t, y):
+        q, along = position(y[0]), np.array([np.cos(y[0]), np.sin(y[0])])
+        return [y[1], along @ force(t, q, y[1] * along)]
+
+    run = solve_ivp(rates, (0.0, t_end), state, method="DOP853", rtol=1e-12, atol=1e-12, max_step=t_end / 600.0)
+    return position(run.y[0, -1])
+
 
 # forces as they are given, so that references are made once
 FORCES = {
@@ -104,3 +167,52 @@ def test_a_series_that_is_not_finite_says_so(compiled):
     start = pendulum(drag), (0.0, 1.0), *start_of((0.7, 0.0))
     result = solve_dae(*start, "Taylor", rtol=1e-8, atol=1e-8, compiled=compiled)
     assert result.status.name == "NOT_FINITE" and "no derivatives" in result.message and "DOP853" in result.message
+
+
+# --- forces that jump within a step, and errors of velocities that last
+TOL = 1e-8
+W, PUSH, END = 3.0, 10.0, 1.0  # rad/s, m/s^2, s
+TIMES = np.linspace(0.21, 0.79, 8) ** 1.1  # s, on no grid of steps
+
+
+def pushed(at):
+    """A mass on a spring, pushed from a time on."""
+    return unconstrained(lambda t, q, v: np.array([(PUSH if t > at else 0.0) - W * W * q[0]]))
+
+
+def errors(method):
+    """Of position and velocity at the end, over the tolerance, for each time of the jump."""
+    found = []
+    for at in TIMES:
+        result = solve_dae(pushed(at), (0.0, END), [1.0], [0.0], method, TOL, TOL, check_derivatives=False)
+        phase, since = W * END, W * (END - at)
+        q = np.cos(phase) + PUSH / W**2 * (1.0 - np.cos(since))
+        v = -W * np.sin(phase) + PUSH / W * np.sin(since)
+        assert result.success, result.message
+        found.append(max(abs(result.q[0, -1] - q), abs(result.v[0, -1] - v)) / TOL)
+    return found
+
+
+@pytest.mark.parametrize(
+    ("method", "limit"), [("DOP853", 10.0), ("Gauss4", 30.0), ("Gauss8", 20.0), ("ESDIRK4", 30.0), ("PaperIRK", 300.0)]
+)
+def test_a_jump_of_the_force_is_passed_within_the_tolerance(method, limit):
+    """The weights of ESDIRK4 and of its embedded formula agree within 4 %: its estimate was 1/300 of the error."""
+    assert max(errors(method)) < limit
+
+
+def test_errors_of_velocities_count_for_as_long_as_the_motion_lasts():
+    """They turn back no faster than the mechanism moves, and those of many steps add up."""
+    problem = mechanisms.andrews()
+    span = (0.0, 0.05)
+    fine = solve_dae(problem.system, span, problem.q0, problem.v0, "DOP853", 1e-12, 1e-12)
+    result = solve_dae(problem.system, span, problem.q0, problem.v0, "ESDIRK4", TOL, TOL)
+    assert worst(result.q[:, -1], fine.q[:, -1]) < 800.0 * TOL
+
+
+@pytest.mark.parametrize("at", [0.0, -3.0])
+def test_times_before_zero_are_like_others(at):
+    """What is refused at one place does not hold steps short at another."""
+    problem = mechanisms.pendulum()
+    result = solve_dae(problem.system, (at, at + 1.0), problem.q0, problem.v0, "ESDIRK4", 1e-6, 1e-6)
+    assert result.stats.n_accepted < 130
