@@ -46,7 +46,7 @@ class OwnFunctions:
             for name, address in ({} if called is None else called.addresses).items():
                 binding.add_symbol(CALLED + name, address)
             self._engine.finalize_object()
-        self.addresses = {name: int(self._engine.get_function_address(name)) for name in names}
+        self.addresses: dict[str, int] = {name: int(self._engine.get_function_address(name)) for name in names}
 
 
 def own_functions(
@@ -80,7 +80,8 @@ def own_functions(
             files.save(place, kept)
         except OSError:
             say_once(UNWRITABLE)
-    return OwnFunctions(*kept, called)
+    names, content = kept
+    return OwnFunctions(names, content, called)
 
 
 def are_kept(kind: str, stamp: str, key: str) -> bool:
