@@ -1,6 +1,7 @@
 """Forms of a graph as machine code: elimination, sines and cosines to rounding, derivatives of every operation."""
 
 import ctypes
+import gc
 import math
 
 import numpy as np
@@ -17,7 +18,7 @@ from twoloop.generate.llvm_trigonometry import LARGEST_ANGLE
 from twoloop.generate.straight_code import write_function
 from twoloop.generate.straight_line import Factors, Outputs, Solution, StraightLine
 from twoloop.generate.tracing import Form, Graph
-from twoloop.kernels.compile.own_functions import OwnFunctions, object_code
+from twoloop.kernels.compile.own_functions import CALLED, OwnFunctions, object_code
 from twoloop.mechanisms import andrews, four_bar, heavy_top, rolling_disc, spatial_four_bar
 
 
@@ -153,3 +154,21 @@ def test_the_derivative_of_every_operation():
         _, (value,) = compute(graph, Outputs({"slope": [slope]}, []), (np.array([0.7]),))
         e = 1e-5
         assert abs(value[0] - (known(0.7 + e) - known(0.7 - e)) / (2.0 * e)) < 1e-9
+
+
+def test_functions_that_others_call_are_those_they_were_linked_with_and_stay_in_memory():
+    def constant(value):
+        return OwnFunctions(["number"], object_code(f"define i64 @number() {{ ret i64 {value} }}"))
+
+    text = f"""
+        declare i64 @{CALLED}number()
+        define i64 @twice() {{
+            %x = call i64 @{CALLED}number()
+            %y = add i64 %x, %x
+            ret i64 %y
+        }}
+    """
+    made = [OwnFunctions(["twice"], object_code(text), constant(value)) for value in (3, 4)]
+    gc.collect()
+    twice = [ctypes.CFUNCTYPE(ctypes.c_int64)(each.addresses["twice"]) for each in made]
+    assert [each() for each in twice] == [6, 8]

@@ -164,6 +164,19 @@ def test_stages_that_the_code_leaves_to_the_general_one():
     assert own > 0.9 * general  # where the mechanism's own code is taken, half of them
 
 
+@pytest.mark.parametrize(("make", "calls"), [(mechanisms.four_bar, False), (mechanisms.spatial_four_bar, True)])
+def test_stages_compute_accelerations_or_call_the_code_of_long_equations(make, calls):
+    problem = make()
+    code = stage_code.compiled_stages(own_code(problem.system, 0.0, problem.q0), 12).code
+    runs = [
+        solve_dae(problem.system, (0.0, 0.2), problem.q0, problem.v0, "DOP853", 1e-8, 1e-8, compiled=compiled)
+        for compiled in (False, True)
+    ]
+    assert code.calls == calls
+    assert worst(runs[0].q[:, -1], runs[1].q[:, -1]) < 1e-9
+    assert runs[0].stats.n_accepted == runs[1].stats.n_accepted
+
+
 def test_redundant_rows_that_stop_holding_end_the_run():
     def system(drift):
         return pendulum(

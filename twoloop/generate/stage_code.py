@@ -2,8 +2,9 @@
 
 A step by the general code stores each stage, reads it back to find accelerations, stores these and reads them back for
 the next sum. What a processor has stored number by number it cannot read as a vector at once, so that this takes about
-as long as the accelerations of a small mechanism. Here what a sum gives stays in registers. Where the code does not
-serve, the general inner loop finds the accelerations of a stage.
+as long as the accelerations of a small mechanism. Here what a sum gives stays in registers. Long equations have more
+numbers than there are registers: their code is called, not written and compiled again. Where the code does not serve,
+the general inner loop finds the accelerations of a stage.
 """
 
 from collections.abc import Callable
@@ -12,13 +13,14 @@ from typing import Any, NamedTuple
 
 from twoloop.generate import llvm_code
 from twoloop.generate.llvm_code import SLACK, Emitter
-from twoloop.generate.llvm_text import Module, Value, integer
+from twoloop.generate.llvm_text import BIT, Module, Value, integer
 from twoloop.generate.series_groups import WIDTH
 from twoloop.generate.straight_code import OwnCode, SharedCode, conditions_hold, results_of
 from twoloop.kernels.compile.caches import digest_of
-from twoloop.kernels.compile.own_functions import OwnFunctions, own_functions
+from twoloop.kernels.compile.own_functions import CALLED, OwnFunctions, own_functions
 
 AT_ONCE = 16  # vectors that are summed in one loop, in registers
+LONG = 500  # quantities from which on accelerations are called
 
 
 class StageCode:
@@ -32,6 +34,7 @@ class StageCode:
         self.n = own.equations.system.n_q
         self.blocks = -(-2 * self.n // WIDTH)
         self.slopes = self.blocks * WIDTH
+        self.calls = len(own.equations.there.quantities(own.equations.graph)) > LONG
 
     def scratch_size(self) -> int:
         """Length of `scratch`."""
@@ -79,9 +82,11 @@ class StageCode:
         place: Value,
         numbers: Value,
     ) -> Value:
-        """Whether [v, a] of a stage were found; else its [q, v] are put at `place`."""
+        """Whether [v, a] of a stage were found; else its [q, v] are put at `place`, which has room for its a."""
         builder, base, n, emit.numbers = emit.builder, emit.aligned(scratch), self.n, numbers
         stage = self._sum(emit, base, h, weights, which)
+        if self.calls:
+            return self._stage_by_call(emit, scratch, which, stage, t, place)
         outputs = self.equations.there
         written, (a,) = results_of(emit, self.equations.graph, outputs, [t, *stage[: 2 * n]], self.numbers)
         holds = conditions_hold(emit, written, outputs, a)
@@ -92,6 +97,17 @@ class StageCode:
             with otherwise:
                 for i in range(2 * n):
                     emit.store(stage[i], place, i)
+        return holds
+
+    def _stage_by_call(
+        self, emit: Emitter, scratch: Value, which: Value, stage: list[Value], t: Value, place: Value
+    ) -> Value:
+        for i in range(2 * self.n):
+            emit.store(stage[i], place, i)
+        parts = [emit.pointer(place, k * self.n) for k in range(3)]
+        holds = emit.builder.call(CALLED + "own_there", BIT, [t, *parts[:2], emit.numbers, parts[2]])
+        with emit.builder.if_then(holds):
+            self.put(emit, scratch, which, place)
         return holds
 
     def _sum(
@@ -149,7 +165,8 @@ def compiled_stages(of_one: OwnCode, n_stages: int) -> CompiledStages:
             llvm_code.write(module, name, KIT.own_type(name), emit)
         return list(parts), str(module)
 
-    return CompiledStages(own_functions("stages", _stamp(), key, write), code)
+    called = own.functions if code.calls else None
+    return CompiledStages(own_functions("stages", _stamp(), key, write, called), code)
 
 
 @cache

@@ -8,6 +8,7 @@ done, so that LLVM has little to do before it makes machine code of it.
 from collections import defaultdict
 from collections.abc import Callable
 from functools import cache
+from threading import Lock
 from typing import Any
 
 from llvmlite import binding
@@ -15,6 +16,8 @@ from numba.core.registry import cpu_target
 
 from twoloop.kernels.compile.caches import UNWRITABLE, Files, Newest, say_once, sources_folder
 
+CALLED = "called_"
+_LINKING = Lock()  # names of what is called are those of the process, and other code of the same names may be linked
 SINGLE_PASSES = hasattr(binding.ModulePassManager, "add_reassociate_pass")
 
 
@@ -26,6 +29,8 @@ class OwnFunctions:
     names : list of str
     content : bytes
         Of `object_code`.
+    called : OwnFunctions or None
+        Others, which these call by their names after CALLED; they stay in memory with these.
 
     Attributes
     ----------
@@ -33,18 +38,28 @@ class OwnFunctions:
         By their names.
     """
 
-    def __init__(self, names: list[str], content: bytes):
+    def __init__(self, names: list[str], content: bytes, called: "OwnFunctions | None" = None):
         self._engine = binding.create_mcjit_compiler(binding.parse_assembly(""), _machine())
+        self._called = called
         object_file = binding.ObjectFileRef.from_data(content)
         self._engine.add_object_file(object_file)
-        self._engine.finalize_object()
-        self.addresses = {name: int(self._engine.get_function_address(name)) for name in names}
+        with _LINKING:
+            for name, address in ({} if called is None else called.addresses).items():
+                binding.add_symbol(CALLED + name, address)
+            self._engine.finalize_object()
+        self.addresses: dict[str, int] = {name: int(self._engine.get_function_address(name)) for name in names}
 
 
 _MADE: dict[str, Newest] = defaultdict(Newest)  # by kind
 
 
-def own_functions(kind: str, stamp: str, key: str, write: Callable[[], tuple[list[str], str]]) -> OwnFunctions:
+def own_functions(
+    kind: str,
+    stamp: str,
+    key: str,
+    write: Callable[[], tuple[list[str], str]],
+    called: OwnFunctions | None = None,
+) -> OwnFunctions:
     """Functions that `write` writes: their names, and the text of a module; from memory or the disk where kept.
 
     Parameters
@@ -54,6 +69,8 @@ def own_functions(kind: str, stamp: str, key: str, write: Callable[[], tuple[lis
     stamp, key : str
         What the functions depend on: a digest of what writes them, and of their own content.
     write : callable
+    called : OwnFunctions or None
+        See `OwnFunctions`.
     """
     if (made := _MADE[kind].get(key)) is not None:
         return made  # type: ignore[no-any-return]
@@ -69,7 +86,8 @@ def own_functions(kind: str, stamp: str, key: str, write: Callable[[], tuple[lis
             files.save(place, kept)
         except OSError:
             say_once(UNWRITABLE)
-    _MADE[kind][key] = made = OwnFunctions(*kept)
+    names, content = kept
+    _MADE[kind][key] = made = OwnFunctions(names, content, called)
     return made
 
 
