@@ -183,7 +183,7 @@ def best(ranked: pd.DataFrame) -> dict[str, Any] | None:
     if ranked.empty:
         return None
     first = ranked.iloc[0]
-    found = {key: first[key] for key in ("solver", "call_s", "called_from")}
+    found = {key: first[key] for key in ("solver", "call_s", "called_from", "setting")}
     return found | {"keeps": bool(first["keeps_constraints"]), "ours": bool(first["family"] == "two-loop")}
 
 
