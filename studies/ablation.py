@@ -11,7 +11,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from references.paper.ablation import VARIANTS, solve_variant
-from studies.bench import figures
+from studies.bench import figures, tables
 from studies.bench.cases import beam, four_bar
 from studies.bench.cli import StudyError
 from studies.bench.collector import REPEATS, Case, Run, Solver
@@ -43,7 +43,6 @@ ORDER_END, ORDER_STEPS = 1.0, (0.01, 0.005)  # s, of the runs that show the orde
 TARGETS = {LINKAGE: (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6), FLEXIBLE: (1e-4, 1e-5, 1e-6, 1e-7)}  # m, rad
 TOLD = {LINKAGE: (1e-3, 1e-6), FLEXIBLE: (1e-5, 1e-7)}  # those of the table
 ONE = 1.5  # below this an order counts as 1
-DECADE = 10.0  # in error: between runs farther apart no cost is told
 MARGIN = 1.2  # times the cost: dearer; less is no difference
 KEPT = 1e-12  # m; what is violated no more is kept
 GROWS = 2.0  # times the violation of the first tenth of a run in its last
@@ -107,19 +106,8 @@ def measure(run: Run, result: Result) -> dict[str, Any]:
 
 
 def costs_at(along: pd.DataFrame, targets: Sequence[float], what: str) -> Array:
-    """Costs of these errors, on the line between two runs at most a decade of error apart; NaN where there are none."""
-    told = along[["error_q", "floor", what]].to_numpy(dtype=float)
-    told = told[np.isfinite(told).all(axis=1)]
-    errors, costs = np.maximum(told[:, 0], told[:, 1]), told[:, 2]
-    places = np.argsort(errors)
-    errors, costs = errors[places], costs[places]
-    found = np.full(len(targets), np.nan)
-    for k, n_good in enumerate(np.searchsorted(errors, targets, side="right")):
-        if 0 < n_good < errors.size and errors[n_good] <= DECADE * errors[n_good - 1]:
-            beside = slice(n_good - 1, n_good + 1)
-            between = np.exp(np.interp(np.log(targets[k]), np.log(errors[beside]), np.log(costs[beside])))
-            found[k] = min(between, costs[:n_good].min())
-    return found
+    """Costs of these errors, NaN where there are none."""
+    return np.array([tables.time_for(along, target, what) for target in targets])
 
 
 def ratios(rows: pd.DataFrame, rival: str, what: str) -> list[float]:

@@ -84,7 +84,7 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     if not set(PAPER) <= set(paper.index[paper["h_median"].notna()]):
         raise StudyError("the rows lack the paper's procedures; make them again by python -m studies.step_size")
     irk, newmark, quarter = (paper.loc[name] for name in (IRK, NEWMARK, QUARTER))
-    names = ("share_time", "h_median", "h_low", "h_high", "retried")
+    names = ("share_time", "h_median", "retried")
     counts = ("n_steps", "n_rejected_error", "n_rejected_convergence")
     ratios = [float(irk["h_median"] / run["h_median"]) for run in (newmark, quarter)]
     known = rows[rows["retried_switch"].notna()]

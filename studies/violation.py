@@ -127,10 +127,7 @@ def pair(rows: pd.DataFrame, first: str, second: str) -> dict[str, Any] | None:
         if not ratios:
             return None
         found[what] = [min(ratios), max(ratios)]
-    least, most = found["call_s"]
-    same = least >= 1.0 / tables.LEAST and most <= tables.LEAST
-    found |= {"equal": tables.LEAST - 1.0, "same": same}
-    return found | {"dearer": least > tables.LEAST, "cheaper": most < 1.0 / tables.LEAST}
+    return found | {"dearer": found["call_s"][0] > tables.LEAST}
 
 
 def _told(row: pd.Series) -> dict[str, Any]:

@@ -94,11 +94,9 @@ def price(rows: pd.DataFrame, firsts: pd.DataFrame, case: str) -> dict[str, Any]
     `rows`: medians, of all mechanisms and solvers. `firsts`: rows of `studies.work_precision.first_calls`.
 
     Returns case, processor ("": not kept), t_end, errors, first_at (tolerance of the first calls, None without them),
-    elsewhere_s (what a call of the default from another start takes longer, None where that was not measured), and
-    lines: name, first_s or None, and at each error solver, call_s, inside_s (of it inside the integrator, of the
-    cheapest run that is good enough; None of rivals), repeats of that run (0: not kept), keeps (the constraints),
-    from_python and near (asked, error and call_s of a run that nearly gets there and takes much less, or None), or in
-    their place why there is none: "not run", "not reached", "not asked".
+    and lines: name, first_s or None, and at each error solver, call_s, repeats of the cheapest run that is good enough
+    (0: not kept), keeps (the constraints) and near (asked, error and call_s of a run that nearly gets there and takes
+    much less, or None), or in their place why there is none: "not run", "not reached", "not asked".
     """
     rows = rows[rows["case"] == case]
     if rows.empty:
@@ -114,15 +112,7 @@ def price(rows: pd.DataFrame, firsts: pd.DataFrame, case: str) -> dict[str, Any]
         lines.append({"name": name, "first_s": first_s, "at": [_priced(runs, error, rival) for error in PRICED]})
     found = {"case": case, "t_end": float(rows["t_end"].iloc[0]), "errors": list(PRICED), "lines": lines}
     found["processor"] = str(rows["processor"].iloc[0]) if "processor" in rows else ""
-    return found | {"first_at": float(first["tol"].iloc[0]) if len(first) else None, "elsewhere_s": _elsewhere(first)}
-
-
-def _elsewhere(first: pd.DataFrame) -> float | None:
-    """What a call with code takes longer from another start, by rows of first calls on one mechanism."""
-    if first.empty or "elsewhere_s" not in first:
-        return None
-    known = first[first["solver"] == OWN_CODE]["elsewhere_s"].dropna()
-    return float(known.iloc[0]) if len(known) else None
+    return found | {"first_at": float(first["tol"].iloc[0]) if len(first) else None}
 
 
 def _priced(runs: pd.DataFrame, error: float, rival: bool) -> dict[str, Any]:
@@ -131,19 +121,13 @@ def _priced(runs: pd.DataFrame, error: float, rival: bool) -> dict[str, Any]:
     solver = min(costs, key=lambda name: costs[name][0], default=None)
     if solver is not None:
         own, call_s = runs[runs["solver"] == solver], costs[solver][0]
-        line = own.iloc[0]
-        told: dict[str, Any] = {
-            "keeps": bool(line["keeps_constraints"]),
-            "from_python": bool(line["called_from"] == "Python"),
-        }
-        run = tables.run_for(own, error)
-        inside_s = None if rival else float(run.get("inside_s", float("nan")))
-        told |= {"inside_s": inside_s, "near": _near(runs, error, call_s), "repeats": int(run.get("repeats", 0))}
+        told: dict[str, Any] = {"keeps": bool(own.iloc[0]["keeps_constraints"]), "near": _near(runs, error, call_s)}
+        told["repeats"] = int(tables.run_for(own, error).get("repeats", 0))
         return {"solver": solver, "call_s": float(call_s), "why": None} | told
     put = tables.put(runs)
     missed = all(tables.missed(own, error) for _, own in put.groupby("solver"))
     why = "not run" if put.empty else "not reached" if missed else "not asked"
-    return {"solver": None, "call_s": None, "why": why, "keeps": True, "from_python": False, "near": None}
+    return {"solver": None, "call_s": None, "why": why, "keeps": True, "near": None}
 
 
 def _near(runs: pd.DataFrame, error: float, call_s: float) -> dict[str, float] | None:

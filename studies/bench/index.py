@@ -28,7 +28,7 @@ CLASSES = {  # tags of a case and the class of problem that they stand for, in t
 }
 LONG = "long and conservative"
 WHOSE = ("ours", "others")
-COSTS = ("call_s", "n_evaluations", "violation_q", "called_from", "keeps")
+COSTS = ("call_s", "called_from", "keeps")
 
 
 def findings(folder: Path) -> dict[str, dict[str, Any]]:
@@ -72,13 +72,8 @@ def classes(found: dict[str, dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def _entry(label: str, case: dict[str, Any], at: list[dict[str, Any]]) -> dict[str, Any]:
-    reached = [line for line in at if line["ours"] and "ida" in line]
-    over = [line["ida"]["call_s"] / line["ours"]["call_s"] for line in reached if line["ida"]]
-    missed = [line for line in reached if line["ida_missed"]]
     made = {"class": label, "name": case["name"], "t_end": case["t_end"], "at": at, "picks": picks(at)}
-    made |= {"ida_over": over, "ida_misses": [line["accuracy"] for line in missed], "without_drift": []}
-    made["processor"] = case.get("processor", "")
-    return made | {"ida_tightest": max((line["ida_tightest"] for line in missed), default=None)}
+    return made | {"without_drift": [], "processor": case.get("processor", "")}
 
 
 def _at_error(at: dict[str, Any]) -> dict[str, Any]:
@@ -87,14 +82,12 @@ def _at_error(at: dict[str, Any]) -> dict[str, Any]:
     times: of the default, the compiled default and the best of ours. neighbour: a rival that has no run within a
     decade of the error, and has one beside it that is cheaper than the cheapest of others.
     """
-    told = {key: at[key] for key in ("ida", "ida_missed", "ida_tightest", "standing")}
-    line: dict[str, Any] = {"accuracy": power(at["error"]), **told, **dict.fromkeys(WHOSE)}
+    line: dict[str, Any] = {"accuracy": power(at["error"]), "standing": at["standing"], **dict.fromkeys(WHOSE)}
     standing = at["standing"] or {}
     line["times"] = {who: stands["call_s"] for who, stands in standing.items()}
     line["undecided"] = bool(standing) and standing[BEST]["verdict"] == "undecided"
     for which in (which for which in WHOSE if at[which]):
         line[which] = {key: at[which][key] for key in COSTS} | {"solver": at[which]["solver"], "drifts": False}
-        line[which]["setting"] = at[which].get("setting")
     rival = standing.get(BEST, {}).get("rival") or {}
     cheaper = bool(rival.get("solver")) and (
         line["others"] is None or tables.LEAST * rival["call_s"] < line["others"]["call_s"]
@@ -115,47 +108,27 @@ def _at_energy(at: dict[str, Any], equal: float, *kinds: str) -> dict[str, Any]:
         if runs:
             best = min(runs, key=lambda run: float(run["call_s"]))
             line[which] = {key: best[key] for key in COSTS} | {"solver": best["name"], "drifts": not best["calm"]}
-            line[which]["setting"] = best.get("setting")
     costs = sorted(line[which]["call_s"] for which in WHOSE if line[which])
     return line | {"undecided": len(costs) > 1 and costs[0] > (1.0 - equal) * costs[1]}
 
 
 def picks(at: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """The cheapest solvers of all, each with the accuracies at which it is that, its times, and those of others."""
+    """The cheapest solvers of all, each with the accuracies at which it is that, and those where it may be another."""
     made: dict[str, dict[str, Any]] = {}
     for line in at:
-        runs = [(line[which]["call_s"], which) for which in WHOSE if line[which]]
+        runs = [line[which] for which in WHOSE if line[which]]
         if runs:
-            which = min(runs)[1]
-            best, other = line[which], line["others" if which == "ours" else "ours"]
-            new = {"solver": best["solver"], "keeps": best["keeps"], "ours": which == "ours", "asked": True}
-            new["undecided"] = []
-            pick = made.setdefault(best["solver"], new | {"accuracies": [], "call_s": [], "over": []})
+            solver = min(runs, key=lambda run: float(run["call_s"]))["solver"]
+            pick = made.setdefault(solver, {"solver": solver, "accuracies": [], "undecided": []})
             pick["accuracies"].append(line["accuracy"])
-            pick["call_s"].append(best["call_s"])
             pick["undecided"] += [line["accuracy"]] if line["undecided"] else []
-            pick["over"] += [other["call_s"] / best["call_s"]] if other else []
-            # of no other time is known: none gets there only if all were asked to their end, which for energies none is
-            standing = line["standing"]
-            alone = standing is not None and standing[BEST]["verdict"] == "alone"
-            pick["asked"] = pick["asked"] and (other is not None or alone)
     return list(made.values())
-
-
-def advice(entries: Sequence[dict[str, Any]]) -> list[list[dict[str, Any]]]:
-    """The entries in groups: of one class and with the same solvers to pick."""
-    groups: dict[Any, list[dict[str, Any]]] = {}
-    for entry in entries:
-        same = [(pick["solver"], *pick["accuracies"]) for pick in entry["picks"]]
-        groups.setdefault((entry["class"], *same), []).append(entry)
-    return list(groups.values())
 
 
 def rendered(template: str, found: dict[str, dict[str, Any]], **more: Any) -> str:
     """A template of what all studies found, with the classes of problems, what to take, and further names."""
     entries = classes(found)
-    groups = advice(entries)
-    more |= {"classes": entries, "advice": groups, "cases": cases_of(found), "takes": takes(found, groups)}
+    more |= {"classes": entries, "cases": cases_of(found), "takes": takes(found, entries)}
     return render(template, found, {}, default=found.get("work_precision", {}).get("default", ""), **more)
 
 
@@ -173,7 +146,6 @@ def first_screen(folder: Path, quick: bool) -> str:
     told = [at[which] for entry in entries for at in entry["at"] for which in WHOSE if at[which]]
     more["drifting"] = any(best["drifts"] for best in told)
     more["from_python"] = any(best["called_from"] == "Python" for best in told)
-    more["standings"] = found.get("work_precision", {}).get("rivals", {}).get("standings", [])
     return rendered("index", found, quick=quick, docs="../docs/", reports=".", every=True, **more)
 
 

@@ -182,10 +182,9 @@ def best(ranked: pd.DataFrame) -> dict[str, Any] | None:
     """The first line of a ranking as a finding; None where there is none."""
     if ranked.empty:
         return None
-    keys = ("solver", "call_s", "n_evaluations", "called_from", "violation_q", "energy", "setting")
-    found = {key: ranked.iloc[0][key] for key in keys}
-    kept, family = ranked.iloc[0][["keeps_constraints", "family"]]
-    return found | {"keeps": bool(kept), "ours": bool(family == "two-loop")}
+    first = ranked.iloc[0]
+    found = {key: first[key] for key in ("solver", "call_s", "called_from", "setting")}
+    return found | {"keeps": bool(first["keeps_constraints"]), "ours": bool(first["family"] == "two-loop")}
 
 
 def of_both(ranked: pd.DataFrame) -> dict[str, dict[str, Any] | None]:
@@ -219,12 +218,6 @@ def stopped_by_us(rows: pd.DataFrame) -> NDArray[np.bool_]:
     """Which runs a limit of ours ended: the time of a run, or the most steps that an adapter allows."""
     said = rows["message"].fillna("") if "message" in rows else pd.Series("", rows.index)
     return (rows["status"].isin(LIMITED) | said.str.contains(CAPPED)).to_numpy(bool)
-
-
-def tightest(rows: pd.DataFrame) -> float:
-    """The finest setting of one solver on a case at which a run was made that no limit of ours ended; NaN: none was."""
-    made = put(rows[~stopped_by_us(rows)])
-    return float(setting_of(made).min()) if len(made) else float("nan")
 
 
 def why_not(rows: pd.DataFrame, target: float) -> str:

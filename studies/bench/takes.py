@@ -26,13 +26,13 @@ BEAMS = {  # of the study of the beam, and their classes
 BEAM_CLASSES = ("stiff, vibrations irrelevant", "stiff, vibrations wanted")  # which the beam's report judges by the tip
 
 
-def takes(found: Mapping[str, Any], groups: Sequence[Sequence[dict[str, Any]]]) -> list[dict[str, str]]:
-    """For each class of problem (`groups`, those of `index.advice`) and kind of mechanism, what is the cheapest."""
+def takes(found: Mapping[str, Any], entries: Sequence[dict[str, Any]]) -> list[dict[str, str]]:
+    """For each class of problem (`entries`, those of `index.classes`) and kind of mechanism, what is the cheapest."""
     made = found.get("work_precision", {})
     rivals = made.get("rivals", {})
     with_code = set(rivals.get("with_code", []))
     classes: dict[str, list[dict[str, Any]]] = defaultdict(list)
-    for entry in (entry for group in groups for entry in group):
+    for entry in entries:
         classes[entry["class"]].append(entry)
     rows = _of_kinds(rivals, with_code)
     rows += [_of_class(name, own, with_code) for name, own in classes.items() if name not in (*BEAM_CLASSES, LONG)]

@@ -1,5 +1,3 @@
-"""python -m studies.conformance."""
-
-from studies.conformance.study import main
+from studies.conformance import main
 
 main()

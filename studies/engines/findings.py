@@ -43,8 +43,7 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     found["configurations"] = [_configuration(each, runs[runs["solver"] == each.name]) for each in CONFIGURATIONS]
     cheapest = [_cheapest(runs[runs["case"] == case]) for case in cases]
     found["call_over_engines"] = dict(zip(cases, (line["ratio"] for line in cheapest), strict=True))
-    for key in ("all", "engines"):  # with ours and without
-        found[f"wins_{key}"] = [_counted(line[key][k] for line in cheapest) for k in range(len(ERRORS))]
+    found["wins_engines"] = [_counted(line["engines"][k] for line in cheapest) for k in range(len(ERRORS))]
     found["engines"] = [
         line for name in NAMES.values() if (line := _engine(runs[runs["family"] == name], cases)) is not None
     ]
@@ -86,20 +85,18 @@ def _priced(runs: pd.DataFrame, error: float, what: str = "call_s") -> float | N
     """What a configuration takes on a mechanism for an error: between its runs, or of the cheapest that is as good."""
     if runs["error_q"].isna().all():
         return None
-    cost = tables.time_for(runs, error, what)
-    good = runs[runs["error_q"].astype(float) <= error]
-    return float(cost) if cost == cost else float(good[what].min()) if len(good) else None
+    costs = tables.time_for(runs, error, what), tables.as_good(runs, error, what)
+    return next((cost for cost in costs if cost == cost), None)
 
 
 def _cheapest(runs: pd.DataFrame) -> dict[str, Any]:
-    """At each error the cheapest configuration on a mechanism, of all and of the engines.
+    """At each error the cheapest configuration of the engines on a mechanism.
 
     `ratio`: our call at the first error over theirs; None where one of them does not reach it.
     """
-    line: dict[str, Any] = {"all": [], "engines": [], "ratio": None}
+    line: dict[str, Any] = {"engines": [], "ratio": None}
     for error in ERRORS:
         costs = {str(solver): cost for solver, own in runs.groupby("solver") if (cost := _priced(own, error))}
-        line["all"].append(min(costs, key=costs.__getitem__, default=None))
         ours = costs.pop(f"{NAMES[OURS]}, default", None)
         line["engines"].append(min(costs, key=costs.__getitem__, default=None))
         if error == ERRORS[0] and ours and costs:

@@ -18,10 +18,6 @@ METHODS = (  # all presets but the paper's, and code made for the mechanism
     *("Gauss10", "Gauss12", "Gauss14", "Gauss16", "SunRadau5", "RadauIIA5", "RadauIIA9", "RadauIIA13", "TRBDF2"),
     *("ESDIRK4", "BDF", "Newmark"),
 )
-OF_FEATURES = (  # the methods that the grid of features is made of
-    *("auto", "auto, compiled", "Taylor", "Adams", "DOP853", "RadauIIA5", "RadauIIA9", "RadauIIA13", "TRBDF2"),
-    "ESDIRK4",
-)
 TOLERANCES = (1e-4, 1e-6, 1e-8, 1e-10, 1e-12)
 LARGE = 1e-2  # m or rad: an error that a user would not expect at the loosest tolerance, though it counts as right
 SEED, N_MECHANISMS = 25, 144  # every other one with friction: about 3,000 runs
@@ -58,18 +54,6 @@ def random_mechanisms(quick: bool) -> Iterator[Part]:
         kinds = others if k % 2 else rubbing
         family = kinds[k // 2 % len(kinds)]
         yield f"sharp {k} {family}", partial(rows, k, family)
-
-
-def features(quick: bool) -> Iterator[Part]:
-    """Key and rows of each family: one mechanism, some methods, all tolerances."""
-
-    def rows(place: int, family: str) -> list[Row]:
-        mechanism, known, _ = case(family, [SEED, 1000 + place])
-        methods, tolerances = OF_FEATURES[:: 4 if quick else 1], TOLERANCES[:: 4 if quick else 1]
-        return [run(mechanism, known, method, each) for method in methods for each in tolerances]
-
-    for place, family in enumerate(list(families())[:: 8 if quick else 1]):
-        yield f"feature {family}", partial(rows, place, family)
 
 
 def counts(rows: pd.DataFrame) -> dict[str, Any]:
@@ -112,17 +96,3 @@ def within_thousand(runs: pd.DataFrame) -> dict[str, Any]:
     counted = {"within": int(near.sum()), "failed": int(failed.sum()), "beyond": int((~failed & ~near).sum())}
     sizes = {"median": float(over.median()), "most": float(over.max())} if over.notna().any() else {}
     return {"tolerances": THOUSAND, "n": len(runs)} | counted | sizes
-
-
-def main(quick: bool) -> None:
-    """Run the grid of features and print what came out, without a report."""
-    rows: list[Row] = []
-    for key, part in features(quick):
-        rows += part()
-        silent = sum(row["outcome"] == SILENT for row in rows)
-        print(f"{key}: {silent} wrong and silent of {len(rows)} so far", flush=True)
-    frame = pd.DataFrame(rows).assign(value=0.0)
-    print(pd.crosstab(frame["method"], frame["outcome"]).to_string())
-    wrong = frame[frame["outcome"] == SILENT]
-    if len(wrong):
-        print(wrong[["what", "name", "method", "tol", "error", "allowed"]].to_string(index=False))

@@ -1,8 +1,7 @@
 """Random linkages, sizes, masses and long runs: no answer of ours may be wrong and silent."""
 
-import sys
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -201,9 +200,8 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     found["scales"] = alike(limits)
     found["long"] = []
     for _, row in long[long["value"] == long["value"].max()].iterrows():
-        shorter = long[(long["method"] == row["method"]) & (long["value"] < row["value"])].iloc[0]
         line = {key: row[key] for key in ("method", "n_steps", "first_q", "last_q", "first_v", "last_v", "energy")}
-        line |= {"bytes": row["bytes_a_step"], "bytes_shorter": shorter["bytes_a_step"], "reached": row["outcome"]}
+        line["bytes"] = row["bytes_a_step"]
         line["grows"] = any(row[f"last_{level}"] > GROWS * row[f"first_{level}"] for level in "qv")
         found["long"].append(line)
     found["long_grow"] = [line["method"] for line in found["long"] if line["grows"]]
@@ -215,13 +213,5 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     return found | {"least_steps": min(line["n_steps"] for line in found["long"])}
 
 
-def main(words: Sequence[str] | None = None) -> None:
-    """Run the study and write its report; with --features a grid of sharp forces in its place, printed only."""
-    given = sys.argv[1:] if words is None else words
-    if "--features" in given:
-        sharp_runs.main("--quick" in given)
-        return
-    STUDY.main(words)
-
-
 STUDY = Study("robustness", __doc__, make, findings_of)
+main = STUDY.main

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from studies.bench.collector import Run, warm_up
-from studies.bench.end_states import DECADES, EXACT, JUDGED, LEVELS, TIME_LIMIT, case_of, row_of
+from studies.bench.end_states import DECADES, EXACT, JUDGED, TIME_LIMIT, case_of, row_of
 from studies.bench.render import number, power
 from studies.bench.solvers import (
     ADAMS,
@@ -68,7 +68,6 @@ USUAL = 1e-8  # the tolerance of who asks for none: what is wrong at this and ti
 COMPILING = 120.0  # s of CPU of what a solver builds before it runs on a problem
 REACH = {"q": 9, "v": 7, "lam": 5}  # digits aimed at with TIGHT ...
 AIMED = (GIVEN, OWN_EXPLICIT, "Gauss12", "RadauIIA5")  # ... by these
-FEWEST = 3  # errors above the reference's own from which a slope is taken
 # their adapters tell states at given instants, between steps by interpolants: not where a step ends
 UNTOLD = (IDA_C, HEYOKA, CVODE_C, CVODE_C_PROJECTED, CVODES)
 APART = (JUDGED, deceived.DECEIVED, MODELLED)  # groups that the table of solvers leaves out
@@ -125,14 +124,6 @@ def make(output: Output) -> pd.DataFrame:
         return pd.DataFrame([kept.made(run.key(0), partial(made, run)) for run in todo])
 
 
-def slope(own: pd.DataFrame) -> float | None:
-    """Exponent p of error ~ tol^p of one solver on one problem; None with too few errors above the reference's own."""
-    seen = own[own["error_q"].notna() & (own["error_q"] > 10.0 * own["floor"])]
-    if len(seen) < FEWEST:
-        return None
-    return float(np.polyfit(np.log10(seen["tol"]), np.log10(seen["error_q"].astype(float)), 1)[0])
-
-
 def of_solver(name: str, own: pd.DataFrame) -> dict[str, Any]:
     """What the table says of a solver over all problems."""
     tight, outcomes = own[own["tol"] == TIGHT], own["outcome"].value_counts()
@@ -140,13 +131,8 @@ def of_solver(name: str, own: pd.DataFrame) -> dict[str, Any]:
     found |= {what: int(outcomes.get(what, 0)) for what in OUTCOMES}
     found["limit"] = int(((own["outcome"] == "said so") & (own["status"] == "TIME_LIMIT")).sum())
     found["said so"] -= found["limit"]
-    slopes = [p for _, each in own.groupby("case", sort=False) if (p := slope(each)) is not None]
-    found["slope"] = [float(x) for x in np.percentile(slopes, [25, 50, 75])] if slopes else None
     found["ratio"] = (own["error_q"] / own["tol"]).astype(float).median()
-    found |= {what: tight[what].astype(float).median() for what in (f"digits_{level}" for level in LEVELS)}
-    ended = tight[tight["error_q"].notna()]
-    found |= {what: ended[what].astype(float).max() for what in ("energy", *(f"violation_{level}" for level in "qva"))}
-    return found | {"evaluations": tight["n_evaluations"].astype(float).median()}
+    return found | {"digits_q": tight["digits_q"].astype(float).median()}
 
 
 def of_steps(name: str, own: pd.DataFrame) -> dict[str, Any]:

@@ -4,7 +4,8 @@ Errors are those at the end of the reference, which is known there to more digit
 largest of a coordinate, over the largest coordinate where that exceeds 1. A part of `studies.work_precision`.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+from collections import Counter
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cache
 from itertools import product
@@ -39,9 +40,7 @@ RANGES = {  # of errors; none: all of them on the mechanisms that cross singular
     "singular positions": (),
 }
 TYPICAL = (1e-4, 1e-6, 1e-8, 1e-10)  # errors at which the default is compared with the cheapest rival in the median
-SHOWN = DECADES[::2]  # at which the four-bars are judged
-DOWN_TO = 1e-12  # the error down to which no rival was to be ahead
-AHEAD = {"heyoka": 2, "rivals called from Python": 8, "other compiled rivals": 4}  # aimed at on the four-bars
+SHOWN = DECADES[::2]  # by which the lines of the picture are chosen
 HEADLINE = "four-bar"
 SAID = {headline.OWN_CODE: "the default", headline.DEFAULT: "compiled=False"}  # on it
 GEOMETRIES: dict[str, Callable[[], Problem]] = {
@@ -142,36 +141,26 @@ def standing(rows: pd.DataFrame, error: float) -> dict[str, dict[str, Any]]:
 
 def at_decade(rows: pd.DataFrame, error: float) -> dict[str, Any]:
     """The cheapest of ours and of others at one error on one mechanism, and how default and best of ours stand."""
-    both = tables.of_both(tables.ranking(rows, error))
     found: dict[str, Any] = {"error": error, "standing": standing(rows, error)}
-    for which, best in both.items():
-        found[which] = (
-            None if best is None else {key: best[key] for key in ("solver", "call_s", "n_evaluations", "keeps")}
-        )
+    for which, cheapest in tables.of_both(tables.ranking(rows, error)).items():
+        found[which] = cheapest and {key: cheapest[key] for key in ("solver", "call_s")}
     best = found["standing"][headline.BEST]
     if found["others"] is None and best["rival"]["solver"]:  # not asked for about so much
-        found["others"] = best["rival"] | {"n_evaluations": None, "keeps": None}
+        found["others"] = best["rival"]
     return found | {key: best[key] for key in ("ratio", "verdict")}
 
 
 def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
-    """Ratios of the fastest rival to the fastest of ours by mechanism and decade, and what of the goals holds."""
-    by_case = {str(name): own for name, own in rows.groupby("case", sort=False)}
+    """Ratios of the fastest rival to the fastest of ours by mechanism and decade."""
     made: list[dict[str, Any]] = [
-        {"case": name, "tags": list(tags().get(name, ())), "at": [at_decade(own, error) for error in DECADES]}
-        for name, own in by_case.items()
+        {"case": name, "tags": list(tags().get(str(name), ())), "at": [at_decade(own, error) for error in DECADES]}
+        for name, own in rows.groupby("case", sort=False)
     ]
-    every = [at | {"case": each["case"]} for each in made for at in each["at"] if at["ratio"] is not None]
-    behind = [at for at in every if at["verdict"] == "behind"]
-    found: dict[str, Any] = {"mechanisms": made, "n": len(every), "n_behind": len(behind)}
+    every = [at for each in made for at in each["at"] if at["ratio"] is not None]
+    found: dict[str, Any] = {"mechanisms": made, "n": len(every)}
     found["standings"] = headline.counted([at["standing"] for at in each["at"]] for each in made)
-    rivals = [at["standing"][headline.BEST]["rival"]["solver"] for at in behind]
-    found["behind"] = dict(pd.Series(rivals, dtype=object).value_counts())
-    found["behind"] = {str(name): int(count) for name, count in found["behind"].items()}
-    found |= {"down_to": DOWN_TO, "n_behind_down_to": sum(at["error"] >= 0.5 * DOWN_TO for at in behind)}
-    found["n_clear"] = sum(
-        all(at["verdict"] != "behind" for at in each["at"] if at["error"] >= 0.5 * DOWN_TO) for each in made
-    )
+    behind = Counter(at["standing"][headline.BEST]["rival"]["solver"] for at in every if at["verdict"] == "behind")
+    found["behind"] = dict(behind.most_common())
     found["alone"] = [each["case"] for each in made if not any(at["others"] for at in each["at"])]
     asked = {each["case"] for each in made if any(at["verdict"] == "alone" for at in each["at"])}
     found["not_put"] = [name for name in found["alone"] if name not in asked]
@@ -182,9 +171,9 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     python = rows[rows["called_from"] == "Python"]["solver"].unique()
     ahead = [at["standing"][headline.BEST] for at in every if at["standing"][headline.BEST]["verdict"] == "ahead"]
     found["ahead_of_python"] = sum(best["rival"]["solver"] in python for best in ahead)
-    found["residual"], found["shortest"] = residual(rows), shortest(rows)
+    found["shortest"] = shortest(rows)
     found["processors"] = sorted(rows["processor"].dropna().unique()) if "processor" in rows else []
-    return found | {"aims": aims(by_case[name] for name in GEOMETRIES if name in by_case)}
+    return found
 
 
 def _within(made: Sequence[dict[str, Any]], name: str, errors: Sequence[float]) -> dict[str, Any]:
@@ -205,20 +194,6 @@ def _typical(made: Sequence[dict[str, Any]], error: float) -> dict[str, Any] | N
     known = [ratio for ratio in ratios if ratio is not None]
     quartiles = np.percentile(known, (25, 50, 75)).tolist() if known else []
     return {"error": error, "n": len(known), "quartiles": quartiles} if known else None
-
-
-def residual(rows: pd.DataFrame) -> dict[str, Any] | None:
-    """Of rivals that do not enforce the constraints, what is left of these at the end over the error: medians.
-
-    here: on the mechanism whose price is told; least, most: of all mechanisms.
-    """
-    free = rows[(rows["family"] != "two-loop") & ~rows["keeps_constraints"].astype(bool)]
-    shares = (free["violation_q"].astype(float) / free["error_q"].astype(float)).replace(np.inf, np.nan)
-    medians = shares.groupby(free["case"]).median()
-    medians = medians[medians > 0.0]  # the knife edge has no constraint of positions
-    if HEADLINE not in medians:
-        return None
-    return {"here": float(medians[HEADLINE]), "least": float(medians.min()), "most": float(medians.max())}
 
 
 def fewest(rows: pd.DataFrame) -> dict[str, Any]:
@@ -245,24 +220,8 @@ def put(rows: pd.DataFrame) -> dict[str, Any]:
     others = rows[rows["family"] != "two-loop"]
     there = tables.put(others).groupby("case")["solver"].nunique()
     there, n = there.reindex(rows["case"].unique(), fill_value=0), int(others["solver"].nunique())
-    found = {"n": n, "least": int(there.min()), "all": int((there == n).sum()), "mechanisms": len(there)}
+    found = {"n": n, "least": int(there.min()), "mechanisms": len(there)}
     return found | {"counts": tables.LEAST, "nearly": tables.NEARLY}
-
-
-def aims(geometries: Iterable[pd.DataFrame]) -> list[dict[str, Any]]:
-    """Of each kind of rival least and largest time of its fastest over that of our fastest, on the four-bars."""
-    ratios: dict[str, list[float]] = {kind: [] for kind in AHEAD}
-    for rows, error in product(geometries, SHOWN):
-        ranked = tables.ranking(rows, error)
-        ours = ranked["family"] == "two-loop"
-        own, others = ranked[ours]["call_s"], ranked[~ours]
-        heyoka, python = others["solver"] == HEYOKA, others["called_from"] == "Python"
-        for kind, which in zip(AHEAD, (heyoka, python, ~heyoka & ~python), strict=True):
-            times = others[which]["call_s"]
-            if len(own) and len(times):
-                ratios[kind].append(float(times.iloc[0] / own.iloc[0]))
-    told = {kind: {"least": min(found), "most": max(found)} for kind, found in ratios.items() if found}
-    return [{"rivals": kind, "wanted": AHEAD[kind]} | each for kind, each in told.items()]
 
 
 def cell(found: dict[str, Any]) -> str:

@@ -123,12 +123,6 @@ def test_frozen_is_compared_at_its_best_error_and_no_better_one(made):
     assert ablation.frozen_ratios(made) == pytest.approx([9.0 * 10 / 6] * 2)
 
 
-def test_no_cost_is_told_across_a_gap_or_beyond_the_runs():
-    runs = pd.DataFrame({"error_q": [1e-2, 1e-5, 2e-6], "n_evaluations": [1.0, 4.0, 9.0], "floor": 0.0})
-    assert ablation.costs_at(runs, (20**0.5 * 1e-6,), "n_evaluations") == pytest.approx(6.0)
-    assert np.isnan(ablation.costs_at(runs, (1e-1, 1e-3, 1e-7), "n_evaluations")).all()
-
-
 @pytest.mark.parametrize(
     ("span", "word"),
     [

@@ -58,8 +58,7 @@ def rows(solvers=SOLVERS, place=3, case=FOUR_BAR, **changed):
 
 def first_rows(times=FIRST):
     lines = [{"case": FOUR_BAR, "solver": name, "first_call_s": time, "tol": 1e-8} for name, time in times.items()]
-    elsewhere = {"elsewhere_s": [4.7e-4 if line["solver"] == "auto, compiled" else 9.0 for line in lines]}
-    return pd.DataFrame(lines).assign(group=first_calls.GROUP, **elsewhere)
+    return pd.DataFrame(lines).assign(group=first_calls.GROUP)
 
 
 def of_table3(paper=(3.0, 9.0, 12.0), explicit=(0.2, 0.25, 0.25)):
@@ -360,21 +359,6 @@ def test_the_screen_has_few_words_and_sixty_lines_at_most(tmp_path):
     assert len(words) <= 550
     assert fixed + max(len(each.splitlines()) for each in (block, block_of(tmp_path, findings()))) <= 60
     assert "index-3" not in front and "two-loop" not in front.split(BEGIN)[0]
-
-
-@pytest.mark.parametrize(
-    ("verdict", "said"),
-    [("alone", "no other gets there)"), ("unasked", "that was asked, but not all were, or not to their end)")],
-)
-def test_no_other_gets_there_is_said_where_one_was_asked(verdict, said):
-    table = rows({name: line for name, line in SOLVERS.items() if line[0] == "two-loop"}, case="crane")
-    table = table.assign(astray=False)
-    found = work_precision.findings_of(table, [Case("crane", four_bar(), 10.0, tags=("smooth",))])
-    for at in found["cases"][0]["at"]:
-        at["standing"][headline.BEST]["verdict"] = verdict
-    entries = index.classes({"work_precision": found})
-    text = render("advice", {}, {}, advice=index.advice(entries), cases=[], default="auto")
-    assert said in text
 
 
 def test_the_report_on_table_3_has_the_same_sentence(tmp_path):

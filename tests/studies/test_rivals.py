@@ -1,4 +1,4 @@
-"""Every mechanism against the rivals: ratios, goals and sentences follow from the rows; sizes."""
+"""Every mechanism against the rivals: ratios and verdicts follow from the rows."""
 
 from dataclasses import replace
 
@@ -10,7 +10,8 @@ from studies.bench import headline, tables
 from studies.bench.render import render
 from studies.bench.solvers import CATALOGUE, OWN, RIVALS
 from studies.bench.store import KeptRows
-from studies.work_precision import goals, rivals
+from studies.work_precision import rivals
+from studies.work_precision import study as work_precision
 from tests.studies.of_study import median
 from twoloop.rows.equal_error import LOOSEST
 
@@ -34,8 +35,7 @@ def compared(own, heyoka, python=9.0, error=1e-14):
 @pytest.mark.parametrize(("own", "behind"), [(1.0, 0), (3.0, len(rivals.DECADES)), (2.0, 0)])
 def test_ahead_and_behind_follow_the_rows(own, behind):
     found = rivals.findings_of(compared(own, 2.0))
-    assert found["n_behind"] == behind and found["n"] == len(rivals.DECADES)
-    assert found["n_clear"] == (0 if behind else 1) and found["n_behind_down_to"] == max(0, behind - 1)
+    assert found["n"] == len(rivals.DECADES)
     assert found["behind"] == ({"heyoka": behind} if behind else {})
     given, own_code, plain, best = found["standings"]
     assert best["ahead"] == (len(rivals.DECADES) if own == 1.0 else 0) and best["behind"] == behind
@@ -63,14 +63,6 @@ def test_the_headline_names_the_default_with_code_without_and_the_best_in_this_o
     # ahead, behind, undecided, alone, alone of those asked, missed; on mechanisms nowhere behind
     assert lines[0][1:] == lines[1][1:] == lines[2][1:] == [str(count) for count in (0, n, n, n, 0, 0, 2)]
     assert int(lines[3][1]) >= n
-
-
-def test_the_goals_are_of_each_kind_of_rival():
-    heyoka, python = rivals.findings_of(compared(1.0, 2.0, python=7.0))["aims"]  # heyoka is no other compiled one
-    assert (heyoka["rivals"], heyoka["least"], heyoka["most"]) == ("heyoka", 2.0, 2.0)
-    assert (python["wanted"], python["least"]) == (8, 7.0)
-    text = stated(1.0, python=7.0)
-    assert "**Reached**: 2 times as fast as heyoka" in text and "**Missed**: 8 times as fast as rivals" in text
 
 
 def test_where_one_side_does_not_come_there_is_no_ratio():
@@ -127,64 +119,6 @@ def test_repetitions_are_interleaved_and_what_is_refused_is_asked_once():
     assert len(kept) == n_rows
 
 
-def stated(own, heyoka=2.0, python=9.0, **changed):
-    """The text of the report, of rows of the four-bar."""
-    table = compared(own, heyoka, python=python)
-    found = {
-        "cases": [],
-        "first_calls": [],
-        "minimal": {"mechanisms": []},
-        "measured": {"commits": 1, "processors": ["this"]},
-        "default": "auto",
-        "rivals": rivals.findings_of(table),
-    }
-    found |= {"goals": goals.findings_of([], table.assign(case="other"), table)}
-    found |= {"asked": {"n": 4, "refused": 1, "fewer": 0, "far": 20.0, "running": 2, "limit": 1.0}}
-    return render("work_precision", found | changed, {}, stamp="", quick=False)
-
-
-@pytest.mark.parametrize(
-    ("own", "said", "not_said"),
-    [
-        (
-            0.5,
-            ["**Reached**: our best nowhere", "in hindsight | 11 | 0 | 0 |", "on the four-bars: 4.0 to 4.0 times"],
-            ["**Missed**"],
-        ),
-        (1.5, ["**Reached**: our best nowhere", "**Missed**: 2 times as fast as heyoka"], ["**Missed**: our"]),
-        (
-            4.0,
-            ["**Missed**: our best nowhere", "behind in 10 pairs and in 1 at smaller errors (mostly `heyoka`, 11)"],
-            ["**Reached**: our"],
-        ),
-    ],
-)
-def test_sentences_follow_the_rows(own, said, not_said):
-    text = stated(own)
-    assert all(words in text for words in said) and not any(words in text for words in not_said)
-    assert "our adapters refuse 1 of the 4 pairs of rival and mechanism." in text
-
-
-def test_sentences_of_the_goals_follow_the_findings():
-    long = {"case": "four-bar", "t_end": 100.0, "error": 1e-6, "limit": 0.01, "solver": "Adams", "call_s": 0.009}
-    beam = {"case": "beam", "errors": [1e-2], "ratios": [1.5], "lost": False, "ahead": True}
-    beam |= {"ours_miss": [], "ida_misses": [], "ida_unasked": []}
-    default = {"solver": "auto", "compiled": False, "limit": 1.3, "n": 5, "n_unreached": 0, "n_within": 5}
-    default["worst"] = 1.2
-    made = {"long": long, "stiff": [beam], "violation": {"limit": 1e-12, "largest": 1e-15}, "default": [default]}
-    text = stated(1.0, goals=made)
-    assert text.count("**Reached**") == 7 and "**Missed**" not in text and "largest factor" not in text
-    worse = {"long": long | {"call_s": 0.011}, "stiff": [beam | {"ahead": False, "lost": True, "ours_miss": [1e-4]}]}
-    worse |= {"violation": {"limit": 1e-12, "largest": 1e-11}, "default": [default | {"n_within": 4}]}
-    worse["default"][0]["worst"] = 1.4
-    text = stated(1.0, goals=worse)
-    assert text.count("**Missed**") == 4 and "the largest factor is 1.4." in text
-    assert "ours does not reach 1e-4, or was not run." in text
-    asked_less = beam | {"ahead": False, "ida_unasked": [1e-4]}
-    assert "**Undecided**: ahead of IDA" in stated(1.0, goals=made | {"stiff": [asked_less]})
-    assert "none of ours gets there" in stated(1.0, goals=made | {"long": long | {"call_s": None}})
-
-
 @pytest.mark.parametrize(
     ("ours", "theirs", "near_us", "near_them", "verdict"),
     [
@@ -209,3 +143,39 @@ def test_a_win_and_a_loss_hold_against_near_misses_too(ours, theirs, near_us, ne
         lines += [(solver, family, "compiled", times * error, seconds) for times, seconds in runs]
     found = headline.of_error(rows(*lines), error)
     assert found["auto"]["verdict"] == found[headline.BEST]["verdict"] == verdict
+
+
+def test_the_default_is_compared_with_the_best_of_ours_with_code_or_without_it_wherever_one_gets():
+    pair = ("auto", "two-loop", "compiled", 1e-3, 2.0), ("Adams", "two-loop", "compiled", 1e-4, 1.0)
+    found = work_precision.default_over(rows(*pair), False)
+    assert (found["n"], found["n_within"], found["n_unreached"], found["worst"]) == (2, 0, 1, 2.0)
+    times = {"auto": 2.0, "Adams": 1.0, "auto, compiled": 0.5, "DOP853, compiled": 0.2}
+    table = rows(*((solver, "two-loop", "compiled", 1e-3, cpu) for solver, cpu in times.items()))
+    assert [work_precision.default_over(table, compiled)["worst"] for compiled in (False, True)] == [2.0, 2.5]
+
+
+def test_violations_are_those_of_ours_on_the_four_bars():
+    table = pd.concat([compared(1.0, 2.0), rows(("Adams", "two-loop", "compiled", 1e-3, 1.0), case="beam")])
+    table["violation_q"] = [3e-15, 1.0, 1.0, 1.0]
+    assert work_precision.violation(table) == 3e-15
+
+
+def stated(own, heyoka=2.0, python=9.0, **changed):
+    """The text of the report, of rows of the four-bar."""
+    table = compared(own, heyoka, python=python)
+    found = {"cases": [], "first_calls": [], "minimal": {"mechanisms": []}, "default": "auto", "violation": 1e-15}
+    found |= {"rivals": rivals.findings_of(table), "measured": {"commits": 1, "processors": ["this"]}}
+    found["default_over"] = [work_precision.default_over(table, compiled) for compiled in (True, False)]
+    found["asked"] = {"n": 4, "refused": 1, "fewer": 0, "far": 20.0, "running": 2, "limit": 1.0}
+    return render("work_precision", found | changed, {}, stamp="", quick=False)
+
+
+def test_sentences_follow_the_rows():
+    text = stated(0.5)
+    assert "in hindsight | 11 | 0 | 0 |" in text and "is mostly behind" not in text and "code in" not in text
+    assert "our adapters refuse 1 of the 4 pairs of rival and mechanism." in text and "by more than 1e-15 at" in text
+    over = {"n": 5, "n_unreached": 1, "near": 1.3, "worst": 1.4, "n_within": 3}
+    text = stated(4.0, default_over=[over, over | {"worst": None}], violation=None)
+    assert "Our best is mostly behind `heyoka`: in 11 of 11 pairs." in text and "no constraint by" not in text
+    said = "`compiled=True` takes at most 1.3 times as long as the best of our methods with compiled code in 3 of 5"
+    assert f"{said} pairs, and up to 1.4 times (1 not reached)." in text and "`compiled=False` takes" not in text

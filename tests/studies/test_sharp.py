@@ -8,7 +8,6 @@ from studies.bench.sharp_forces import DRIVE_A, SIZE, T_END, families, force_alo
 from studies.bench.sharp_mechanisms import bars, chain, row, slider_crank, slider_in_space
 from studies.bench.sharp_motion import LOOSENESS, RIGHT, SAID, SILENT, Motion, allowed, judged, march, off, positions
 from studies.robustness import sharp_runs
-from studies.robustness import study as robustness
 from twoloop.mechanisms import four_bar, spatial_slider_crank
 
 FORCE = made("gust", 3, (5.0, 0.1, 0.4), windows=((0.0, 1.1),))
@@ -84,7 +83,6 @@ def test_the_runs_go_round_methods_and_tolerances():
     keys = [key for key, _ in sharp_runs.random_mechanisms(quick=False)]
     assert len(set(keys)) == len(keys) and len(keys) * len(sharp_runs.METHODS) >= 3000
     assert ({key.split(" ", 2)[2] for key in keys}) == set(families())
-    assert len(list(sharp_runs.features(quick=False))) >= 26 and len(sharp_runs.TOLERANCES) == 5
 
 
 def test_counts_of_runs():
@@ -99,10 +97,3 @@ def test_counts_of_runs():
     }
     assert found["allowed"] == [{"tol": 1e-4, "median": 0.01, "most": 0.01}]
     assert found["default"]["n"] == 4 and [line["error"] for line in found["default"]["wrong"]] == [0.02]
-
-
-def test_the_grid_of_features_makes_no_report(monkeypatch):
-    asked = []
-    monkeypatch.setattr(sharp_runs, "main", asked.append)
-    robustness.main(["--features", "--quick"])
-    assert asked == [True]

@@ -93,7 +93,6 @@ def alone_of(found):
 def test_findings_turn_with_the_rows():
     found = said(validation, made_up())[0]
     assert found["ours_always"] == ["Gauss12", "BDF"] and found["only_others"] == found["ours_short"] == []
-    assert found["solvers"][0]["slope"] == pytest.approx([1.0, 1.0, 1.0])
     stopped = {"status": "STEP_TOO_SMALL", "outcome": "said so", "error_q": np.nan, "digits_q": np.nan}
     found = said(validation, made_up(where=[("A02, N = 1", "Gauss12"), ("A02, N = 1", "BDF")], what=stopped))[0]
     assert found["ours_always"] == [] and found["only_others"] == ["A02, N = 1"]

@@ -73,7 +73,7 @@ def test_findings_turn_with_the_rows(tmp_path):
     assert found["irk_grows"] and not found["ours_keep"] and found["ours_growing"] == [IRK]
     assert found["others_growing"] == [] and found["baumgarte_kept"] == 4
     assert (found["n_ranked"], found["n_kept_first"]) == (3, 0)
-    assert not found["inner_alone_kept"] and all(pair["cheaper"] for pair in found["pairs"])
+    assert not found["inner_alone_kept"] and not any(pair["dearer"] for pair in found["pairs"])
 
 
 def test_a_run_is_kept_bounded_or_growing():

@@ -4,7 +4,6 @@ import json
 
 import pytest
 
-from studies.bench.index import advice
 from studies.bench.store import WHOLE_CALL
 from studies.bench.takes import call, takes
 from studies.which_method import page, table
@@ -81,11 +80,11 @@ def test_the_table_has_a_row_for_each_class_with_the_cheapest():
     loose = {"solver": "TRBDF2", "accuracies": ["1e-2", "1e-4"], "undecided": []}
     tight = {"solver": "auto, compiled", "accuracies": ["1e-6"], "undecided": []}
     entries = [{"class": "odd", "name": name, "t_end": 2.0, "picks": [loose, tight]} for name in ("a crane", "another")]
-    (row,) = takes({}, advice(entries))
+    (row,) = takes({}, entries)
     assert row["what"] == "odd (a crane and another, 2.0 s)"
     assert row["take"] == '`method="TRBDF2"` (4 of 6 errors), `compiled=True` (2 of 6 errors)'
     entries[1]["picks"] = [loose | {"undecided": ["1e-4"]}, tight]
-    (row,) = takes({}, advice(entries))
+    (row,) = takes({}, entries)
     assert row["take"].startswith('`method="TRBDF2"` (3 of 6 errors)')
 
 
@@ -113,8 +112,3 @@ def test_no_row_of_advice_stands_without_a_finding(tmp_path):
     (tmp_path / "energy.json").write_text(json.dumps(found | {"n_calm": {"even": 2}}))
     without = table(tmp_path)
     assert not any(words in without for words in ("fixed steps", "Radau", "drag", "compiled=True"))
-
-
-def test_both_pages_have_the_same_table(tmp_path):
-    shown = page(tmp_path).partition("## In short\n\n")[2]
-    assert table(tmp_path) == shown.replace("](../", "](").replace("](reports", "](generated/reports")

@@ -5,20 +5,6 @@ import pytest
 from studies.bench import cases
 from studies.bench.solvers import RIVALS
 from studies.work_precision import study as work_precision
-from tests.studies.test_tables import rows
-
-
-def made(*lines):
-    return rows(*lines).assign(case="crane", astray=False, tol=1e-6)
-
-
-def test_the_default_is_judged_by_the_rows():
-    table = made(("auto", 1e-5, 4.0), ("Gauss12", 1e-5, 1.0))
-    assert work_precision.class_of(table, 1e-4)["default_over"] == pytest.approx(4.0)
-    table.loc[1, "call_s"] = 8.0
-    assert work_precision.class_of(table, 1e-4)["default_over"] == pytest.approx(1.0)
-    nothing = work_precision.class_of(table, 1e-9)
-    assert nothing["error"] == 1e-9 and all(nothing[key] is None for key in ("ours", "others", "ida", "default_over"))
 
 
 def test_cases_are_found_by_listing_the_folder():
