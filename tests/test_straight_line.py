@@ -12,6 +12,7 @@ from tests.compiled import unit_mass
 from tests.problems import pendulum, unconstrained, worst
 from tests.processes import run_python
 from twoloop import ConstrainedSystem, ConstraintWarning, callback, mechanisms
+from twoloop.generate import stage_code
 from twoloop.generate.straight_code import own_code
 from twoloop.kernels.compile import caches
 from twoloop.kernels.data.codes import DONE

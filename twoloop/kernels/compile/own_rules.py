@@ -120,14 +120,18 @@ def _variables(self: Any, held: Any) -> list[Any]:
 
 
 _load_registries: Any = CPUContext.load_additional_registries
-_loaded: set[int] = set()  # of contexts, which live until the end
 
 
 def _load_once(self: Any) -> None:
-    """What numba implements of Python's and NumPy's functions, which it looks for anew at each function."""
-    if id(self) not in _loaded:
+    """What numba implements of Python's and NumPy's functions, all of which it imports anew at each function.
+
+    An intrinsic that is first met is put into one of the registries that are there; copies of a context share them.
+    """
+    if self._registries:
+        for registry in list(self._registries):
+            self.install_registry(registry)
+    else:
         _load_registries(self)
-        _loaded.add(id(self))
 
 
 _LOCKS = ("numba:llvm_lock", "numba:compiler_lock")
