@@ -6,7 +6,7 @@ from dataclasses import fields
 import numpy as np
 import pytest
 
-from twoloop import ConstraintWarning, mechanisms, solve, solve_dae
+from twoloop import ConstrainedSystem, ConstraintWarning, callback, mechanisms, solve, solve_dae
 from twoloop.result.result import Result
 
 METHODS = ["auto", "DOP853", "Adams", "Gauss8", "RadauIIA5", "TRBDF2", "BDF"]
@@ -33,6 +33,35 @@ def taken(monkeypatch):
 
     monkeypatch.setattr(solve, "record_again", watched)
     return ways
+
+
+@callback("mass")
+def mass(t, q, p, M):
+    M[0, 0] = M[1, 1] = 1.0
+
+
+@callback("force")
+def weight(t, q, v, p, Q):
+    Q[1] = -9.81
+
+
+@callback("constraint")
+def constraint(t, q, p, C):
+    C[0] = 0.5 * (q[0] * q[0] + q[1] * q[1] - 1.0)
+
+
+@callback("jacobian")
+def gradient(t, q, p, Cq):
+    Cq[0, 0], Cq[0, 1] = q[0], q[1]
+
+
+def unit_pendulum(force=weight, jacobian=gradient):
+    return ConstrainedSystem(n_q=2, n_c=1, mass=mass, force=force, constraint=constraint, jacobian=jacobian)
+
+
+def swing(system, angle, speed):
+    q0, v0 = [np.sin(angle), -np.cos(angle)], [speed * np.cos(angle), speed * np.sin(angle)]
+    return solve_dae(system, (0.0, 1.0), q0, v0, rtol=1e-6, atol=1e-6)
 
 
 def starts(problem, span, n):
@@ -69,6 +98,33 @@ def test_it_is_the_run_of_the_long_way_to_the_bit(name, method, taken, monkeypat
     monkeypatch.setattr(solve, "record_again", lambda *asked: None)
     for one, long in zip(by_arrays, runs(other, states, span, method=method), strict=True):
         assert_same(one, long)
+
+
+def test_where_series_give_way_to_another_method(taken, monkeypatch):
+    problem, other = mechanisms.four_bar(), mechanisms.four_bar()
+    states = starts(problem, 1e-6, 7)
+    by_arrays = runs(problem, states, 10.0)
+    assert sum(taken) >= 3
+    changed = runs(problem, states, 10.0, method="Taylor")[-1].h.size
+    monkeypatch.setattr(solve, "record_again", lambda *asked: None)
+    for one, long in zip(by_arrays, runs(other, states, 10.0), strict=True):
+        assert_same(one, long)
+        assert one.h.size != changed
+
+
+def test_what_a_compiled_callback_raises_comes_through(taken):
+    @callback("force")
+    def force(t, q, v, p, Q):
+        if q[0] > 0.9:
+            raise ValueError("out of range")
+        Q[1] = -9.81
+
+    system = unit_pendulum(force=force)
+    for k in range(7):
+        assert swing(system, 0.3 + 0.01 * k, 0.0).success
+    assert taken[-1]
+    with pytest.raises(ValueError, match="out of range"):
+        swing(system, 0.3, 5.0)
 
 
 def test_results_do_not_share_arrays(taken):
@@ -115,36 +171,16 @@ def test_what_is_wrong_at_a_start_is_said_as_ever(taken):
 
 def test_a_callback_that_is_wrong_where_no_run_was_is_found(taken):
     """Within the box of states that were compared nothing is compared again, beyond it all that is new."""
-    from twoloop import ConstrainedSystem, callback
-
-    @callback("mass")
-    def mass(t, q, p, M):
-        M[0, 0] = M[1, 1] = 1.0
-
-    @callback("force")
-    def force(t, q, v, p, Q):
-        Q[1] = -9.81
-
-    @callback("constraint")
-    def constraint(t, q, p, C):
-        C[0] = 0.5 * (q[0] * q[0] + q[1] * q[1] - 1.0)
 
     @callback("jacobian")
     def jacobian(t, q, p, Cq):
         Cq[0, 0] = q[0] if q[1] < 0.5 else 1.01 * q[0]
         Cq[0, 1] = q[1]
 
-    system = ConstrainedSystem(
-        n_q=2, n_c=1, mass=mass, force=force, constraint=constraint, jacobian=jacobian, name="wrong above"
-    )
-
-    def swing(angle, speed):
-        q0, v0 = [np.sin(angle), -np.cos(angle)], [speed * np.cos(angle), speed * np.sin(angle)]
-        return solve_dae(system, (0.0, 1.0), q0, v0, rtol=1e-6, atol=1e-6)
-
-    assert all(swing(0.3 + 0.01 * k, 0.0).success for k in range(7))
+    system = unit_pendulum(jacobian=jacobian)
+    assert all(swing(system, 0.3 + 0.01 * k, 0.0).success for k in range(7))
     assert taken[-1]
-    assert not swing(0.3, 6.5).success
+    assert not swing(system, 0.3, 6.5).success
 
 
 @pytest.mark.parametrize("name", ["redundant_slider_crank", "bricard"])

@@ -23,7 +23,8 @@ from twoloop.kernels.data import codes, flags, noted
 from twoloop.kernels.layout import cleared
 from twoloop.run.comparison import compared_at, territory_of
 from twoloop.run.messages import outcome
-from twoloop.run.pace import Pace
+from twoloop.run.pace import INTERRUPTED, Pace
+from twoloop.run.passage import give_way
 from twoloop.run.record import Record, Status
 from twoloop.run.run import Run
 from twoloop.run.workspace import made_ready
@@ -55,16 +56,14 @@ class Again:
         self._start, self._advance = direct(run.kernels.start), direct(run.kernels.advance)
         self.rows_v = run.work.rows_v.copy()
         self.clock, self.control, self.tolerances = run.clock.copy(), run.control.copy(), run.tolerances.copy()
-        self.memory, self.flags = run.plan.memory.copy(), run.kit.flags.copy()
-        width = len(run.state)
-        self.t, self.rows = np.empty(run.chunk + 1), np.empty((run.chunk + 1, width))
+        self.plan, self.kit, self.memory, self.flags = run.plan, run.kit, run.plan.memory.copy(), run.kit.flags.copy()
+        self.t, self.rows = np.empty(run.chunk + 1), np.empty((run.chunk + 1, len(run.state)))
         self.steps = np.empty((run.chunk, run.a.N_STEP_COLUMNS))
-        self.buffers = self.t[1:], self.rows[1:], self.steps
         self.end, self.filled = np.zeros(1), np.zeros(2, dtype=np.int64)
 
     @staticmethod
     def suits(run: Run) -> bool:
-        """Whether a run may be made in this way: in one chunk, by one plan, in the dense form."""
+        """Whether a run may be made in this way: in one chunk, in the dense form."""
         return run.static is None and run.chunk * len(run.state) <= LARGEST and not run.system.called_in_python
 
     def record(
@@ -72,7 +71,7 @@ class Again:
     ) -> dict[str, Any] | None:
         """The fields of the record of a run; None where it has to be made the long way."""
         run = self.run
-        system, a, clock, n = run.system, run.a, run.clock, run.system.n_q
+        system, a, n = run.system, run.a, run.system.n_q
         territory = territory_of(run, check_derivatives)
         if self.rest > 0:
             self.rest -= 1
@@ -80,18 +79,14 @@ class Again:
         if territory.is_due() or (check_derivatives and not system.checked) or not self._begins(t0, q0, v0):
             return None
         set_sizes(run)
-        run.control[a.STORE_ALL], run.control[a.MAX_ATTEMPTS], self.end[0] = 1.0, run.chunk, t1
-        self.t[0], self.rows[0] = t0, run.state
-        arrays = run.plan.options, run.plan.memory, run.tolerances, run.control, clock, run.state, run.new_state
         began = time.process_time()
-        code = self._advance(run.kit, run.work, *arrays, self.end, *self.buffers, self.filled)
+        code, n_rows, n_steps = self._steps_to(t1)
         spent = time.process_time() - began
         singular = run.plan.watchful and run.work.notes[noted.NEARLY_SINGULAR] == 1.0
         if code != a.ALL_OUTPUT_DONE or singular:
             self.rest = IN_VAIN
             return None
         status, message = outcome(run, code, t1, Pace(t0))
-        n_rows, n_steps = self.filled.tolist()
         t, rows, steps = self.t[: n_rows + 1].copy(), self.rows[: n_rows + 1].copy(), self.steps[:n_steps]
         status, message = self._compared(territory, t, rows, check_derivatives, status, message)
         if status != Status.REACHED_END:
@@ -118,8 +113,25 @@ class Again:
             "defect": run.defect(),
             "widest_gap": float(run.work.notes[noted.WIDEST_GAP]),
             "system": system,
-            "compiled": bool(run.plan.own),
+            "compiled": bool(self.plan.own),
         }
+
+    def _steps_to(self, t1: float) -> tuple[int, int, int]:
+        """How the steps of one chunk end, with how many states, beside the first, and steps in the arrays."""
+        run, a, n_rows, n_steps = self.run, self.run.a, 0, 0
+        run.control[a.STORE_ALL], run.control[a.MAX_ATTEMPTS], self.end[0] = 1.0, run.chunk, t1
+        self.t[0], self.rows[0] = run.t0, run.state
+        while True:
+            arrays = run.plan.options, run.plan.memory, run.tolerances, run.control, run.clock, run.state, run.new_state
+            room = self.t[n_rows + 1 :], self.rows[n_rows + 1 :], self.steps[n_steps:]
+            try:
+                code = self._advance(run.kit, run.work, *arrays, self.end, *room, self.filled)
+            except Exception:  # of a callback; the long way knows what to do
+                return INTERRUPTED, n_rows, n_steps
+            n_rows, n_steps = n_rows + int(self.filled[0]), n_steps + int(self.filled[1])
+            if code != a.HAS_TO_GIVE_WAY:
+                return code, n_rows, n_steps
+            give_way(run)
 
     def _begins(self, t0: float, q0: Array, v0: Array) -> bool:
         """Whether a run begins at a start as this one did: consistent, of the same rank, mass and choice of rows."""
@@ -137,6 +149,7 @@ class Again:
         run.t0, run.compared_to[0] = t0, -np.inf
         run.state[:n], run.state[n : 2 * n], run.state[2 * n :] = q0, v0, 0.0
         run.clock[:], run.control[:], run.tolerances[:] = self.clock, self.control, self.tolerances
+        run.plan, run.kit, run.functions, run.substituted = self.plan, self.kit, self.kit.functions, False
         run.plan.memory[:] = self.memory
         if run.kit.flags[flags.FORM] != self.flags[flags.FORM]:
             run.kit.flags[:] = self.flags
