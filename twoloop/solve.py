@@ -187,7 +187,7 @@ def solve_dae(
         )
         told = {"method": chosen.name, "rtol": rtol, "atol": atol.copy()}
         by_positions, own = getattr(chosen, "tested", "all") == "positions", getattr(chosen, "error_tol", None)
-        if times is folder is event_functions is time_limit is own is None and not (dense_output or progress):
+        if times is folder is event_functions is own is None and not (dense_output or progress):
             made = record_again(system, t0, q0, v0, asked)
             if made is not None and not interrupts.asked:
                 fields, said_of_rows = made
