@@ -193,3 +193,26 @@ def test_redundant_rows_are_named(name, taken):
             result = runs(problem, [state], 0.05)[0]
         assert f"row(s) {result.redundant.tolist()}" in str(said[0].message)
     assert sum(taken) >= 2
+
+
+@pytest.mark.filterwarnings("ignore::twoloop.ConstraintWarning")
+def test_what_is_said_of_redundant_rows_is_of_this_start(taken, monkeypatch):
+    problem, other = mechanisms.redundant_slider_crank(), mechanisms.redundant_slider_crank()
+    states = starts(problem, 10.0, 7)
+
+    def said(system):
+        with pytest.warns(ConstraintWarning) as warned:
+            runs(system, states, 0.05)
+        return [str(each.message) for each in warned]
+
+    by_arrays = said(problem)
+    assert sum(taken) >= 2
+    monkeypatch.setattr(solve, "record_again", lambda *asked: None)
+    assert by_arrays == said(other)
+
+
+def test_a_result_has_the_system_of_the_call_where_another_stands_for_it(taken):
+    system = unit_pendulum(jacobian=None)
+    results = [swing(system, 0.3 + 0.01 * k, 0.0) for k in range(7)]
+    assert taken[-1]
+    assert all(result.system is system for result in results)
