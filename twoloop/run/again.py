@@ -93,6 +93,7 @@ class Again:
         status, message = self._compared(territory, t, rows, check_derivatives, status, message)
         if status != Status.REACHED_END:
             return None
+        territory.count()  # a run that goes the long way is counted there
         counts = np.concatenate([BEFORE, steps[:, a.ERRORS : a.JACOBIANS].astype(np.int64)])
         changes = counts[1:] - counts[:-1]
         return {
@@ -114,7 +115,6 @@ class Again:
             "redundant": run.redundant.copy(),
             "defect": run.defect(),
             "widest_gap": float(run.work.notes[noted.WIDEST_GAP]),
-            "system": system,
             "compiled": bool(self.plan.own),
         }
 
@@ -168,7 +168,6 @@ class Again:
         self, territory: Territory, t: Array, rows: Array, check_derivatives: bool, status: Status, message: str
     ) -> tuple[Status, str]:
         """Status and message after callbacks were compared at states that lie where none was compared."""
-        territory.count()
         n = 2 * self.run.system.n_q
         if territory.holds(t, rows[:, :n]):
             return status, message
