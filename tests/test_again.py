@@ -59,7 +59,7 @@ def gradient(t, q, p, Cq):
 
 @callback("jacobian")
 def wrong_above(t, q, p, Cq):
-    Cq[0, 0] = q[0] if q[1] < 0.5 else 1.01 * q[0]
+    Cq[0, 0] = q[0] if q[1] < 0.5 else 1.0001 * q[0]
     Cq[0, 1] = q[1]
 
 
