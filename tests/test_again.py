@@ -1,5 +1,6 @@
 """A run by the arrays of the run before it equals that of the long way, which is taken where it cannot be made so."""
 
+import copy
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import fields
 
@@ -7,6 +8,7 @@ import numpy as np
 import pytest
 
 from twoloop import ConstrainedSystem, ConstraintWarning, callback, mechanisms, solve, solve_dae
+from twoloop.generate.exact_derivatives import Territory
 from twoloop.result.result import Result
 
 METHODS = ["auto", "DOP853", "Adams", "Gauss8", "RadauIIA5", "TRBDF2", "BDF"]
@@ -53,6 +55,12 @@ def constraint(t, q, p, C):
 @callback("jacobian")
 def gradient(t, q, p, Cq):
     Cq[0, 0], Cq[0, 1] = q[0], q[1]
+
+
+@callback("jacobian")
+def wrong_above(t, q, p, Cq):
+    Cq[0, 0] = q[0] if q[1] < 0.5 else 1.0001 * q[0]
+    Cq[0, 1] = q[1]
 
 
 def unit_pendulum(force=weight, jacobian=gradient):
@@ -172,12 +180,7 @@ def test_what_is_wrong_at_a_start_is_said_as_ever(taken):
 def test_a_callback_that_is_wrong_where_no_run_was_is_found(taken):
     """Within the box of states that were compared nothing is compared again, beyond it all that is new."""
 
-    @callback("jacobian")
-    def jacobian(t, q, p, Cq):
-        Cq[0, 0] = q[0] if q[1] < 0.5 else 1.01 * q[0]
-        Cq[0, 1] = q[1]
-
-    system = unit_pendulum(jacobian=jacobian)
+    system = unit_pendulum(jacobian=wrong_above)
     assert all(swing(system, 0.3 + 0.01 * k, 0.0).success for k in range(7))
     assert taken[-1]
     assert not swing(system, 0.3, 6.5).success
@@ -193,3 +196,39 @@ def test_redundant_rows_are_named(name, taken):
             result = runs(problem, [state], 0.05)[0]
         assert f"row(s) {result.redundant.tolist()}" in str(said[0].message)
     assert sum(taken) >= 2
+
+
+@pytest.mark.filterwarnings("ignore::twoloop.ConstraintWarning")
+def test_what_is_said_of_redundant_rows_is_of_this_start(taken, monkeypatch):
+    problem, other = mechanisms.redundant_slider_crank(), mechanisms.redundant_slider_crank()
+    states = starts(problem, 10.0, 7)
+
+    def said(system):
+        with pytest.warns(ConstraintWarning) as warned:
+            runs(system, states, 0.05)
+        return [str(each.message) for each in warned]
+
+    by_arrays = said(problem)
+    assert sum(taken) >= 2
+    monkeypatch.setattr(solve, "record_again", lambda *asked: None)
+    assert by_arrays == said(other)
+
+
+def test_a_result_has_the_system_of_the_call(taken):
+    """Also where another stands for it, or was solved before it was copied."""
+    system = unit_pendulum(jacobian=None)
+    for each in (system, copy.copy(system), copy.deepcopy(system)):
+        results = [swing(each, 0.3 + 0.01 * k, 0.0) for k in range(7)]
+        assert taken[-1]
+        assert all(result.system is each for result in results)
+
+
+def test_a_run_in_which_something_is_wrong_counts_once(taken, monkeypatch):
+    """So that it is the 2nd, 4th, 8th, ... that is compared as a whole."""
+    counted, count = [], Territory.count
+    monkeypatch.setattr(Territory, "count", lambda each: counted.append(each) or count(each))
+    system = unit_pendulum(jacobian=wrong_above)
+    assert all(swing(system, 0.3 + 0.01 * k, 0.0).success for k in range(6))
+    assert any(taken)
+    assert not swing(system, 0.3, 6.5).success
+    assert len(counted) == 7

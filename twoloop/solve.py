@@ -193,7 +193,7 @@ def solve_dae(
                 fields, said_of_rows = made
                 if said_of_rows:
                     warnings.warn(said_of_rows, ConstraintWarning, stacklevel=2)
-                return result_of(fields, **told, **({} if by_positions else {"untested": None}))
+                return result_of(fields, system=system, **told, **({} if by_positions else {"untested": None}))
         run = run_from(system, t0, q0, v0, asked)
         if run.said_of_rows:
             warnings.warn(run.said_of_rows, ConstraintWarning, stacklevel=2)

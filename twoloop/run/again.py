@@ -21,6 +21,7 @@ from twoloop.generate.tracing import Untraceable
 from twoloop.kernels.compile.linking import direct
 from twoloop.kernels.data import codes, flags, noted
 from twoloop.kernels.layout import cleared
+from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.comparison import compared_at, territory_of
 from twoloop.run.messages import outcome
 from twoloop.run.pace import INTERRUPTED, Pace
@@ -44,17 +45,18 @@ class Again:
     ----------
     run : Run
         A copy at its start, which this one keeps.
+    system : ConstrainedSystem
+        The one of the call: the run's own may be another, that stands for it.
     code : OwnCode or None
         The machine code that its plan calls.
     definite : bool
         Whether M has an inverse at its start.
     """
 
-    def __init__(self, run: Run, code: OwnCode | None, definite: bool):
-        self.run, self.code, self.definite = run, code, definite
-        self.look, self.chooser, self.rest = Look(run.system), Chooser(run.system), 0
+    def __init__(self, run: Run, system: ConstrainedSystem, code: OwnCode | None, definite: bool):
+        self.run, self.system, self.code, self.definite = run, system, code, definite
+        self.look, self.chooser, self.rest = Look(system), Chooser(system), 0
         self._start, self._advance = direct(run.kernels.start), direct(run.kernels.advance)
-        self.rows_v = run.work.rows_v.copy()
         self.clock, self.control, self.tolerances = run.clock.copy(), run.control.copy(), run.tolerances.copy()
         self.plan, self.kit, self.memory, self.flags = run.plan, run.kit, run.plan.memory.copy(), run.kit.flags.copy()
         self.t, self.rows = np.empty(run.chunk + 1), np.empty((run.chunk + 1, len(run.state)))
@@ -71,7 +73,7 @@ class Again:
     ) -> dict[str, Any] | None:
         """The fields of the record of a run; None where it has to be made the long way."""
         run = self.run
-        system, a, n = run.system, run.a, run.system.n_q
+        system, a, n = self.system, run.a, run.system.n_q
         territory = territory_of(run, check_derivatives)
         if self.rest > 0:
             self.rest -= 1
@@ -91,6 +93,7 @@ class Again:
         status, message = self._compared(territory, t, rows, check_derivatives, status, message)
         if status != Status.REACHED_END:
             return None
+        territory.count()  # a run that goes the long way is counted there
         counts = np.concatenate([BEFORE, steps[:, a.ERRORS : a.JACOBIANS].astype(np.int64)])
         changes = counts[1:] - counts[:-1]
         return {
@@ -112,7 +115,6 @@ class Again:
             "redundant": run.redundant.copy(),
             "defect": run.defect(),
             "widest_gap": float(run.work.notes[noted.WIDEST_GAP]),
-            "system": system,
             "compiled": bool(self.plan.own),
         }
 
@@ -158,16 +160,14 @@ class Again:
         work.notes[noted.NEARLY_SINGULAR] = 0.0 if run.plan.watchful else 1.0
         if self._start(run.kit, work, t0, run.state) != codes.DONE:
             return False
-        if run.said_of_rows and (work.rows_v != self.rows_v).any():  # rounding may decide which row is left out
+        if run.said_of_rows:  # of this time, with factors of this position; rounding may decide which row is left out
             run.redundant, run.said_of_rows = run.redundant_rows(look.rows)
-            self.rows_v[:] = work.rows_v
-        return not run.said_of_rows or run.contradicting(look.rows).size == 0
+        return True
 
     def _compared(
         self, territory: Territory, t: Array, rows: Array, check_derivatives: bool, status: Status, message: str
     ) -> tuple[Status, str]:
         """Status and message after callbacks were compared at states that lie where none was compared."""
-        territory.count()
         n = 2 * self.run.system.n_q
         if territory.holds(t, rows[:, :n]):
             return status, message

@@ -72,7 +72,7 @@ def record_again(
     try:
         again = kept.waiting.pop()
     except IndexError:
-        again = Again(kept.run.again(), kept.code, kept.definite)
+        again = Again(kept.run.again(), system, kept.code, kept.definite)
     record = again.record(t0, asked.t1, q0, v0, lambda run: _set_sizes(run, asked), asked.check_derivatives)
     if len(kept.waiting) < MOST_WAITING:
         kept.waiting.append(again)
