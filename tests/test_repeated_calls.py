@@ -29,15 +29,15 @@ from twoloop.run import comparison
 # calls of functions in a second run, which compares callbacks again at four states, in a third, which makes arrays for
 # the next, and in a fifth, which uses them
 MANY, FEW, FEWEST = 820, 270, 150
-ANOTHER = {  # the same in a run from another start, and in one with other parameters
+ANOTHER = {  # in a run from another start, which names the redundant rows there, and in one with other parameters
     "four_bar": (170, 2600),
     "andrews": (170, 2200),
-    "redundant_slider_crank": (190, 3300),
+    "redundant_slider_crank": (240, 3300),
     "heavy_top": (170, 2400),
     "spatial_four_bar": (160, 2450),
     "spatial_slider_crank": (160, 2400),
     "closed_chain": (170, 3050),
-    "bricard": (180, 2350),
+    "bricard": (240, 2350),
 }
 ACROSS = 650  # in one from another start that crosses singular positions
 
