@@ -87,11 +87,16 @@ def copy_of(work: Work) -> Work:
     """A workspace with the same in it."""
     sizes = work.sizes
     other = _given_back(sizes) or _new(sizes)
-    layout = _layout(*sizes)
-    other.notes.base[: layout.n_lasting] = work.notes.base[: layout.n_lasting]
-    other.counters.base[: layout.n_lasting_integers] = work.counters.base[: layout.n_lasting_integers]
+    for mine, given in zip(lasting(other), lasting(work), strict=True):
+        mine[:] = given
     other.changes[:] = 0.0
     return other
+
+
+def lasting(work: Work) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """The numbers and integers of a workspace that count at the start of a step."""
+    layout = _layout(*work.sizes)
+    return work.notes.base[: layout.n_lasting], work.counters.base[: layout.n_lasting_integers]
 
 
 def _given_back(sizes: Sizes) -> Work | None:
@@ -129,9 +134,8 @@ _free: dict[Sizes, list[Work]] = {}  # those that were given back
 
 def cleared(work: Work) -> Work:
     """A workspace as it is when it is new."""
-    layout = _layout(*work.sizes)
-    work.notes.base[: layout.n_lasting] = 0.0
-    work.counters.base[: layout.n_lasting_integers] = 0
+    for each in lasting(work):
+        each[:] = 0
     work.G_of_S[:] = np.nan
     work.changes[:] = 0.0
     return work

@@ -20,7 +20,7 @@ from twoloop.generate.traced_values import Sample
 from twoloop.generate.tracing import Untraceable
 from twoloop.kernels.compile.linking import direct
 from twoloop.kernels.data import codes, flags, noted
-from twoloop.kernels.layout import cleared
+from twoloop.kernels.layout import cleared, lasting
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.comparison import compared_at, territory_of
 from twoloop.run.messages import outcome
@@ -34,7 +34,7 @@ Array = NDArray[np.float64]
 
 MOST_WAITING, LARGEST = 4, 500_000  # those of a kind that wait for a call, one a thread; numbers of the states of each
 IN_VAIN = 16  # runs that are not tried after one that did not come to its end
-BEFORE = np.array([[0, 0, 1]])  # rejections and partitions before all steps: the first is not a renewal
+BEFORE = 0.0, 0.0, 1.0  # rejections and partitions before all steps: the first is not a renewal
 DEFAULTS = {each.name: each.default for each in fields(Record) if each.default is not MISSING}
 
 
@@ -60,8 +60,12 @@ class Again:
         self.clock, self.control, self.tolerances = run.clock.copy(), run.control.copy(), run.tolerances.copy()
         self.plan, self.kit, self.memory, self.flags = run.plan, run.kit, run.plan.memory.copy(), run.kit.flags.copy()
         self.t, self.rows = np.empty(run.chunk + 1), np.empty((run.chunk + 1, len(run.state)))
-        self.steps = np.empty((run.chunk, run.a.N_STEP_COLUMNS))
+        self.steps = np.zeros((run.chunk + 1, run.a.N_STEP_COLUMNS))  # the first stands for the start
+        self.steps[0, run.a.ERRORS : run.a.JACOBIANS] = BEFORE
         self.end, self.filled = np.zeros(1), np.zeros(2, dtype=np.int64)
+        self.call: tuple[float, float, bytes, bytes] | None = None  # the last one
+        # arrays of its run with copies made at its start, where the one before was equal
+        self.saved: list[tuple[NDArray[Any], NDArray[Any]]] = []
 
     @staticmethod
     def suits(run: Run) -> bool:
@@ -78,9 +82,10 @@ class Again:
         if self.rest > 0:
             self.rest -= 1
             return None
-        if territory.is_due() or (check_derivatives and not system.checked) or not self._begins(t0, q0, v0):
+        if territory.is_due() or (check_derivatives and not system.checked):
             return None
-        set_sizes(run)
+        if not self._is_ready(t0, t1, q0, v0, set_sizes):
+            return None
         began = time.process_time()
         code, n_rows, n_steps = self._steps_to(t1)
         spent = time.process_time() - began
@@ -89,13 +94,15 @@ class Again:
             self.rest = IN_VAIN
             return None
         status, message = outcome(run, code, t1, Pace(t0))
-        t, rows, steps = self.t[: n_rows + 1].copy(), self.rows[: n_rows + 1].copy(), self.steps[:n_steps]
-        status, message = self._compared(territory, t, rows, check_derivatives, status, message)
-        if status != Status.REACHED_END:
-            return None
+        t, rows, steps = self.t[: n_rows + 1].copy(), self.rows[: n_rows + 1].copy(), self.steps[1 : n_steps + 1]
+        if run.compared_to[0] < t1:
+            status, message = self._compared(territory, t, rows, check_derivatives, status, message)
+            if status != Status.REACHED_END:
+                return None
+            run.compared_to[0] = t1
         territory.count()  # a run that goes the long way is counted there
-        counts = np.concatenate([BEFORE, steps[:, a.ERRORS : a.JACOBIANS].astype(np.int64)])
-        changes = counts[1:] - counts[:-1]
+        counts = self.steps[: n_steps + 1, a.ERRORS : a.JACOBIANS]
+        changes = (counts[1:] - counts[:-1]).astype(np.int64)
         return {
             **DEFAULTS,
             "t": t,
@@ -125,7 +132,7 @@ class Again:
         self.t[0], self.rows[0] = run.t0, run.state
         while True:
             arrays = run.plan.options, run.plan.memory, run.tolerances, run.control, run.clock, run.state, run.new_state
-            room = self.t[n_rows + 1 :], self.rows[n_rows + 1 :], self.steps[n_steps:]
+            room = self.t[n_rows + 1 :], self.rows[n_rows + 1 :], self.steps[n_steps + 1 :]
             try:
                 code = self._advance(run.kit, run.work, *arrays, self.end, *room, self.filled)
             except Exception:  # of a callback; the long way knows what to do
@@ -134,6 +141,28 @@ class Again:
             if code != a.HAS_TO_GIVE_WAY:
                 return code, n_rows, n_steps
             give_way(run)
+
+    def _is_ready(self, t0: float, t1: float, q0: Array, v0: Array, set_sizes: Callable[[Run], None]) -> bool:
+        """Whether the run is at its start: one that is asked for again needs no second look."""
+        run, call = self.run, (t0, t1, q0.tobytes(), v0.tobytes())
+        run.plan, run.kit, run.functions, run.substituted = self.plan, self.kit, self.kit.functions, False
+        run.plan.memory[:] = self.memory
+        if run.kit.flags[flags.FORM] != self.flags[flags.FORM]:
+            run.kit.flags[:] = self.flags
+        equal = call == self.call
+        if equal and self.saved:
+            for array, copy in self.saved:
+                array[:] = copy
+            return True
+        self.call, self.saved = None, []
+        if not self._begins(t0, q0, v0):
+            return False
+        set_sizes(run)
+        self.call = call
+        if equal:
+            arrays = *lasting(run.work), run.state, run.clock, run.control
+            self.saved = [(each, each.copy()) for each in arrays]
+        return True
 
     def _begins(self, t0: float, q0: Array, v0: Array) -> bool:
         """Whether a run begins at a start as this one did: consistent, of the same rank, mass and choice of rows."""
@@ -151,10 +180,6 @@ class Again:
         run.t0, run.compared_to[0] = t0, -np.inf
         run.state[:n], run.state[n : 2 * n], run.state[2 * n :] = q0, v0, 0.0
         run.clock[:], run.control[:], run.tolerances[:] = self.clock, self.control, self.tolerances
-        run.plan, run.kit, run.functions, run.substituted = self.plan, self.kit, self.kit.functions, False
-        run.plan.memory[:] = self.memory
-        if run.kit.flags[flags.FORM] != self.flags[flags.FORM]:
-            run.kit.flags[:] = self.flags
         run.clock[run.a.T] = run.clock[run.a.T_START] = t0
         made_ready(cleared(work), system, self.flags, look.pattern, q0, run.rtol, run.reuse)
         work.notes[noted.NEARLY_SINGULAR] = 0.0 if run.plan.watchful else 1.0
