@@ -69,10 +69,16 @@ class Traced:
 
     def of(self, system: ConstrainedSystem, evaluate: Evaluator) -> "Traced":
         """The same of another system of the family."""
+        other = self.with_numbers(evaluate)
+        other.name = system.name
+        return other
+
+    def with_numbers(self, numbers_for: Callable[[Any], Array]) -> "Traced":
+        """The same with other arrays in the place of those of its numbers, which have to be compared first."""
         other = copy.copy(self)
-        constants, coefficients = evaluate(self.program.constants), evaluate(self.program.coefficients)
+        constants, coefficients = numbers_for(self.program.constants), numbers_for(self.program.coefficients)
         other.program = self.program._replace(constants=constants, coefficients=coefficients)
-        other.name, other.trusted = system.name, False
+        other.trusted = False
         return other
 
     def refuse(self, system: ConstrainedSystem, t0: float, t1: float, q: Array, v: Array) -> None:

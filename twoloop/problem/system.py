@@ -133,6 +133,7 @@ class ConstrainedSystem(EvaluatedEquations):
         self.within_bounds: set[str] = set()  # kinds that check_callback has looked at
         self.checked = False  # by check_derivatives
         self.made: dict[Any, Any] = {}  # of its equations: see `remembered`
+        self.kin: dict[Any, Any] = {}  # what it shares with systems of other parameters, see run/launch.py
 
     @property
     def n_mass_values(self) -> int:

@@ -24,6 +24,7 @@ from twoloop.kernels.layout import cleared
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.comparison import compared_at, territory_of
 from twoloop.run.messages import outcome
+from twoloop.run.movable import Kin, Movable
 from twoloop.run.pace import INTERRUPTED, Pace
 from twoloop.run.passage import give_way
 from twoloop.run.record import Record, Status
@@ -51,10 +52,15 @@ class Again:
         The machine code that its plan calls.
     definite : bool
         Whether M has an inverse at its start.
+    kin : Kin, optional
+        What it shares with runs of systems of other parameters, which it may then be made for.
     """
 
-    def __init__(self, run: Run, system: ConstrainedSystem, code: OwnCode | None, definite: bool):
-        self.run, self.system, self.code, self.definite = run, system, code, definite
+    def __init__(
+        self, run: Run, system: ConstrainedSystem, code: OwnCode | None, definite: bool, kin: Kin | None = None
+    ):
+        self.movable = None if kin is None else Movable(kin, run)
+        self.run, self.code, self.definite = run, code, definite
         self.look, self.chooser, self.rest = Look(system), Chooser(system), 0
         self._start, self._advance = direct(run.kernels.start), direct(run.kernels.advance)
         self.clock, self.control, self.tolerances = run.clock.copy(), run.control.copy(), run.tolerances.copy()
@@ -69,16 +75,32 @@ class Again:
         return run.static is None and run.chunk * len(run.state) <= LARGEST and not run.system.called_in_python
 
     def record(
-        self, t0: float, t1: float, q0: Array, v0: Array, set_sizes: Callable[[Run], None], check_derivatives: bool
+        self,
+        system: ConstrainedSystem,
+        t0: float,
+        t1: float,
+        q0: Array,
+        v0: Array,
+        set_sizes: Callable[[Run], None],
+        check_derivatives: bool,
     ) -> dict[str, Any] | None:
-        """The fields of the record of a run; None where it has to be made the long way."""
-        run = self.run
-        system, a, n = self.system, run.a, run.system.n_q
-        territory = territory_of(run, check_derivatives)
+        """The fields of the record of a run of a system; None where it has to be made the long way."""
+        run, movable = self.run, self.movable
+        a, n = run.a, run.system.n_q
         if self.rest > 0:
             self.rest -= 1
             return None
-        if territory.is_due() or (check_derivatives and not system.checked) or not self._begins(t0, q0, v0):
+        if movable is None:
+            territory = territory_of(run, check_derivatives)
+            if territory.is_due() or (check_derivatives and not system.checked):
+                return None
+        else:
+            movable.take(system)
+            territory, self.look.system = movable.kin.territory(check_derivatives), movable.system
+            self.chooser.system = movable.system
+        if not self._begins(t0, q0, v0):
+            return None
+        if movable is not None and not movable.agrees(t1, self.look.mass, check_derivatives):
             return None
         set_sizes(run)
         began = time.process_time()
@@ -168,9 +190,14 @@ class Again:
         self, territory: Territory, t: Array, rows: Array, check_derivatives: bool, status: Status, message: str
     ) -> tuple[Status, str]:
         """Status and message after callbacks were compared at states that lie where none was compared."""
-        n = 2 * self.run.system.n_q
-        if territory.holds(t, rows[:, :n]):
+        n, p = 2 * self.run.system.n_q, None if self.movable is None else self.run.system.functions.p
+        everywhere = p is not None and (territory.is_due() or not territory.knows(p))
+        if not everywhere and territory.holds(t, rows[:, :n]):
             return status, message
         sample = Sample(float(t[0]), rows[0], n)
         sample.add(t[1:], rows[1:], float(t[-1]), rows[-1])
-        return compared_at(self.run, territory, sample.states(), check_derivatives, status, message)
+        states = sample.states()
+        compared = compared_at(self.run, territory, states, check_derivatives, status, message, everywhere)
+        if everywhere and compared[0] == status:
+            territory.add_parameters(p)
+        return compared
