@@ -158,11 +158,11 @@ def solve_dae(
         *(method, rtol, atol, first_step, max_step, max_steps, step_size),
         *(dense_output, progress, time_limit, check_derivatives, compiled),
     )
-    known = system.made.get("options")
+    known = system.shared.get("options")
     if known is None or not all(map(is_, given, known[0])):
         known = given, _checked(system, *given)
         if type(atol) is float:  # an array may be changed by who gives it
-            system.made["options"] = known
+            system.shared["options"] = known
     chosen, rtol, atol, max_step, compiled = known[1]
     event_functions = None if events is None else check_events(events)
     t0, t1 = check_span(t_span)

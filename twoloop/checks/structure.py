@@ -32,10 +32,10 @@ def wrong_kinematics(system: ConstrainedSystem, t: float, q: Array) -> str | Non
     """Compare the fused callback with the separate ones, which are compared with differences."""
     if "kinematics" not in system.given:
         return None
-    rows = system.sparse_rows(t, q)[: system.n_c]
-    v = generic_velocities(rows, system.constraint_rate(t, q), q)[-1]
+    _, rate, rows = _compared(system, t, q, np.zeros(system.n_q))
+    v = generic_velocities(rows, rate, q)[-1]
     for place in (q, q + NEAR * v):
-        if _agree(system, t, place, v):
+        if _compared(system, t, place, v)[0]:
             continue
         separate = {
             "constraint": system.constraint(t, place),
@@ -60,13 +60,18 @@ def wrong_kinematics(system: ConstrainedSystem, t: float, q: Array) -> str | Non
 
 def _agree(system: ConstrainedSystem, t: float, q: Array, v: Array) -> bool:
     """Whether kinematics are not given, or give what the separate callbacks give."""
-    if "kinematics" not in system.given:
-        return True
+    return "kinematics" not in system.given or _compared(system, t, q, v)[0]
+
+
+def _compared(system: ConstrainedSystem, t: float, q: Array, v: Array) -> tuple[bool, Array, Array]:
+    """Whether kinematics give what the separate callbacks give, and C_t and C_q of these."""
     from twoloop.kernels.evaluation.first_look import kinematics_agree
 
-    room = *np.zeros((2, 3 + system.n_q, system.n_c)), np.zeros(system.n_c)
+    n, n_c = system.n_q, system.n_c
+    fused, given = np.zeros((2, 3 + n, n_c))
     state = np.ascontiguousarray(q), np.ascontiguousarray(v)
-    return bool(direct(kinematics_agree)(system.kit, t, *state, *room, SAME, ROUNDED * EPS))
+    agree = direct(kinematics_agree)(system.kit, t, *state, fused, given, np.zeros(n_c), SAME, ROUNDED * EPS)
+    return bool(agree), given[1], given[3:].reshape((n_c, n))
 
 
 def changed_mass(system: ConstrainedSystem, t0: float, q0: Array, t: float, q: Array) -> str | None:

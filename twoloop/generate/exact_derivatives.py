@@ -47,7 +47,8 @@ def _traced(system: ConstrainedSystem, family: Family) -> Traced:
 
 def exact_near(system: ConstrainedSystem, t: float, q: Array, v: Array) -> bool:
     """Whether C_q, C_t and Gamma are, near a start, the derivatives of what callbacks were traced to."""
-    places = [(t + share * TIME, q + share * generic_factors(len(q)) * sizes(q)) for share in NEAR]
+    away = generic_factors(len(q)) * sizes(q)
+    places = [(t + share * TIME, q + share * away) for share in NEAR]
 
     def check(made: Traced) -> None:
         try:

@@ -69,8 +69,8 @@ def record_again(
     """
     runs = system.made.get("runs", (None, None))[1]
     kept: Kept | None = None if runs is None else runs.get(asked.key)
-    if kept is None and system.kin:
-        known = system.kin.get((asked.key, _family_of(system)))
+    if kept is None and (others := system.shared.get("runs")):
+        known = others.get((asked.key, _family_of(system)))
         kept = known if isinstance(known, Kept) else None
     if kept is None or not kept.moves or not Again.suits(kept.run):
         return None
@@ -142,18 +142,16 @@ def _family_of(system: ConstrainedSystem) -> Family:
 
 def _keep_for_kin(system: ConstrainedSystem, run: Run, code: OwnCode | None, asked: Asked) -> None:
     """Keep a run for systems of other parameters, from the second of these on."""
-    call, seen = (asked.key, _family_of(system)), system.functions
-    if call not in system.kin:
-        if len(system.kin) >= MOST:
-            system.kin.clear()
-        system.kin[call] = seen
-    elif type(system.kin[call]) is type(seen) and system.kin[call] is not seen:
+    call, seen, known = (asked.key, _family_of(system)), system.functions, system.shared.get("runs", {})
+    if call not in known:
+        system.shared["runs"] = (known if len(known) < MOST else {}) | {call: seen}
+    elif type(known[call]) is type(seen) and known[call] is not seen:
         try:
             kin = Kin(run, code, asked.method, asked.step_size is not None, asked.compiled)
         except ValueError:
-            system.kin[call] = None
+            known[call] = None
         else:
-            system.kin[call] = _kept_of(run, code, asked, kin)
+            known[call] = _kept_of(run, code, asked, kin)
 
 
 def _moved(kept: Kept, system: ConstrainedSystem, t0: float, q0: Array, v0: Array, asked: Asked) -> Run | None:

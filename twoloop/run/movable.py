@@ -19,7 +19,7 @@ from twoloop.generate.families import family_of, give_bounds
 from twoloop.generate.formulas import Formulas
 from twoloop.generate.straight_code import OwnCode
 from twoloop.generate.traced_equations import runs_on_symbols
-from twoloop.generate.traced_values import unchecked
+from twoloop.generate.traced_values import refuse_wrong, unchecked
 from twoloop.kernels.data.flags import AUGMENTED, BANDWIDTH, DIAGONAL_MASS, FORM
 from twoloop.kernels.data.kit import Kit
 from twoloop.methods.code_for import Compiled, code_for
@@ -146,8 +146,7 @@ class Movable:
         try:
             if with_derivatives:
                 check_derivatives(system, run.t0, q, lambda: exact_near(system, run.t0, q, v))
-            for traced in run.traced:
-                traced.refuse(system, run.t0, t1, q, v)
+            refuse_wrong(run.traced, system, run.t0, t1, q, v)
         except Exception:  # of a callback, too; the long way says what it is
             return False
         return self._mass_agrees
