@@ -19,10 +19,12 @@ from twoloop.generate.straight_code import OwnCode
 from twoloop.generate.traced_values import Sample
 from twoloop.generate.tracing import Untraceable
 from twoloop.kernels.compile.linking import direct
-from twoloop.kernels.data import codes, flags, noted
+from twoloop.kernels.data import codes, flags, noted, tolerances
 from twoloop.kernels.layout import cleared
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.comparison import compared_at, territory_of
+from twoloop.run.dense import Interpolator, Table
+from twoloop.run.fields import kinds_of, of_run, of_steps
 from twoloop.run.messages import outcome
 from twoloop.run.movable import Kin, Movable
 from twoloop.run.pace import INTERRUPTED, Pace
@@ -35,7 +37,6 @@ Array = NDArray[np.float64]
 
 MOST_WAITING, LARGEST = 4, 500_000  # those of a kind that wait for a call, one a thread; numbers of the states of each
 IN_VAIN = 16  # runs that are not tried after one that did not come to its end
-BEFORE = np.array([[0, 0, 1]])  # rejections and partitions before all steps: the first is not a renewal
 DEFAULTS = {each.name: each.default for each in fields(Record) if each.default is not MISSING}
 
 
@@ -67,12 +68,19 @@ class Again:
         self.plan, self.kit, self.memory, self.flags = run.plan, run.kit, run.plan.memory.copy(), run.kit.flags.copy()
         self.t, self.rows = np.empty(run.chunk + 1), np.empty((run.chunk + 1, len(run.state)))
         self.steps = np.empty((run.chunk, run.a.N_STEP_COLUMNS))
+        self.kinds, self.interpolator = np.empty(run.chunk, dtype=np.int64), None
         self.end, self.filled = np.zeros(1), np.zeros(2, dtype=np.int64)
 
     @staticmethod
     def suits(run: Run) -> bool:
         """Whether a run may be made in this way: in one chunk, in the dense form."""
         return run.static is None and run.chunk * len(run.state) <= LARGEST and not run.system.called_in_python
+
+    @staticmethod
+    def interpolates(run: Run) -> bool:
+        """Whether states between its steps may be had in this way: with arrays that serve from start to start."""
+        lands = run.plan.lands or run.control[run.a.FIXED_STEP] > 0.0
+        return not lands and run.kit.flags[flags.FORM] != flags.AUGMENTED
 
     def record(
         self,
@@ -83,8 +91,9 @@ class Again:
         v0: Array,
         set_sizes: Callable[[Run], None],
         check_derivatives: bool,
+        times: Array | None = None,
     ) -> dict[str, Any] | None:
-        """The fields of the record of a run of a system; None where it has to be made the long way."""
+        """The fields of the record of a run of a system, at all steps or at these times; None: make it the long way."""
         run, movable = self.run, self.movable
         a, n = run.a, run.system.n_q
         if self.rest > 0:
@@ -105,6 +114,7 @@ class Again:
         set_sizes(run)
         began = time.process_time()
         code, n_rows, n_steps = self._steps_to(t1)
+        found = None if times is None or code != a.ALL_OUTPUT_DONE else self._between(times, n_rows)
         spent = time.process_time() - began
         singular = run.plan.watchful and run.work.notes[noted.NEARLY_SINGULAR] == 1.0
         if code != a.ALL_OUTPUT_DONE or singular:
@@ -115,28 +125,18 @@ class Again:
         status, message = self._compared(territory, t, rows, check_derivatives, status, message)
         if status != Status.REACHED_END:
             return None
+        if times is not None:
+            t, rows = times.copy(), self._completed(times, found)
+            if rows is None:
+                return None
         territory.count()  # a run that goes the long way is counted there
-        counts = np.concatenate([BEFORE, steps[:, a.ERRORS : a.JACOBIANS].astype(np.int64)])
-        changes = counts[1:] - counts[:-1]
         return {
             **DEFAULTS,
-            "t": t,
-            "q": rows[:, :n].T,
-            "v": rows[:, n : 2 * n].T,
-            "a": rows[:, 2 * n : 3 * n].T,
-            "lam": rows[:, 3 * n :].T,
-            "h": steps[:, a.H].copy(),
-            "rejected_error": changes[:, 0],
-            "rejected_convergence": changes[:, 1],
-            "partitioned": changes[:, 2],
-            "untested": steps[:, a.JACOBIANS] > 0.0,
+            **of_run(run, t, rows),
+            **of_steps(run, steps)[0],
             "status": status,
             "message": message,
             "stats": run.statistics(spent),
-            "rank": run.rank,
-            "redundant": run.redundant.copy(),
-            "defect": run.defect(),
-            "widest_gap": float(run.work.notes[noted.WIDEST_GAP]),
             "compiled": bool(self.plan.own),
         }
 
@@ -152,7 +152,9 @@ class Again:
                 code = self._advance(run.kit, run.work, *arrays, self.end, *room, self.filled)
             except Exception:  # of a callback; the long way knows what to do
                 return INTERRUPTED, n_rows, n_steps
-            n_rows, n_steps = n_rows + int(self.filled[0]), n_steps + int(self.filled[1])
+            taken = self.steps[n_steps : n_steps + int(self.filled[1])]
+            self.kinds[n_steps : n_steps + len(taken)] = kinds_of(run, taken)
+            n_rows, n_steps = n_rows + int(self.filled[0]), n_steps + len(taken)
             if code != a.HAS_TO_GIVE_WAY:
                 return code, n_rows, n_steps
             give_way(run)
@@ -185,6 +187,31 @@ class Again:
         if run.said_of_rows:  # of this time, with factors of this position; rounding may decide which row is left out
             run.redundant, run.said_of_rows = run.redundant_rows(look.rows)
         return True
+
+    def _between(self, times: Array, n_rows: int) -> Array | None:
+        """Rows [q, v] at times of the run; None where they are off the constraints."""
+        run, n = self.run, 3 * self.run.system.n_q
+        table = Table(self.t[: n_rows + 1], self.rows[: n_rows + 1, :n].copy(), self.kinds[:n_rows])
+        if self.interpolator is None:
+            atol, ranks = run.tolerances[tolerances.ATOL :].copy(), (len(run.work.rows), len(run.work.rows_v))
+            start = run.system, run.t0, table.states[0]
+            self.interpolator = Interpolator(*start, run.rtol, atol, ranks, run.interiors)
+            self.interpolator.tells = False
+        else:
+            self.interpolator.begin(run.system, run.t0, table.states[0], self.look.pattern)
+        found = self.interpolator.states(table, times)
+        return found if self.interpolator.failures == 0 else None
+
+    def _completed(self, times: Array, found: Array | None) -> Array | None:
+        """Rows [q, v, a, lam] at these times; None where not all is there."""
+        interpolator = self.interpolator
+        if found is None or interpolator is None:
+            return None
+        added = np.full((len(times), len(self.run.state) - found.shape[1]), np.nan)
+        interpolator.complete(times, found, added)
+        if interpolator.static is not None or interpolator.repairs:  # it is not what it was
+            self.interpolator = None
+        return np.concatenate([found, added], axis=1) if interpolator.failures == 0 else None
 
     def _compared(
         self, territory: Territory, t: Array, rows: Array, check_derivatives: bool, status: Status, message: str

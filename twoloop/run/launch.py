@@ -61,9 +61,9 @@ class Asked(NamedTuple):
 
 
 def record_again(
-    system: ConstrainedSystem, t0: float, q0: Array, v0: Array, asked: Asked
+    system: ConstrainedSystem, t0: float, q0: Array, v0: Array, asked: Asked, times: Array | None = None
 ) -> tuple[dict[str, Any], str] | None:
-    """The record of a run that keeps its steps alone, by the arrays of one before it, and what is said of its rows.
+    """The record of a run by the arrays of one before it, at its steps or at times, and what is said of its rows.
 
     None where there are none, or where something has to be looked at: then `run_from` begins it.
     """
@@ -74,11 +74,14 @@ def record_again(
         kept = known if isinstance(known, Kept) else None
     if kept is None or not kept.moves or not Again.suits(kept.run):
         return None
+    if times is not None and not Again.interpolates(kept.run):
+        return None
     try:
         again = kept.waiting.pop()
     except IndexError:
         again = Again(kept.run.again(), system, kept.code, kept.definite, kept.kin)
-    record = again.record(system, t0, asked.t1, q0, v0, lambda run: _set_sizes(run, asked), asked.check_derivatives)
+    call = asked.t1, q0, v0, lambda run: _set_sizes(run, asked), asked.check_derivatives, times
+    record = again.record(system, t0, *call)
     if len(kept.waiting) < MOST_WAITING:
         kept.waiting.append(again)
     return None if record is None else (record, again.run.said_of_rows)
