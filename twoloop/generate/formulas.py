@@ -1,4 +1,4 @@
-"""Arrays of numbers that are formulas in parameters: kept, and written anew for one system of a family after another."""
+"""Arrays of numbers that are formulas in parameters: written anew for one system of a family after another."""
 
 from collections.abc import Callable
 from typing import Any

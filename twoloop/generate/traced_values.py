@@ -191,9 +191,7 @@ class Sample:
         return np.concatenate(self._parts)
 
 
-def refuse_wrong(
-    traced: Sequence[Traced], system: ConstrainedSystem, t0: float, t1: float, q: Array, v: Array
-) -> None:
+def refuse_wrong(traced: Sequence[Traced], system: ConstrainedSystem, t0: float, t1: float, q: Array, v: Array) -> None:
     """Compare what is not trusted yet at states about the start, spread over the time of a run.
 
     Raises

@@ -19,11 +19,11 @@ from twoloop.generate.straight_code import OwnCode
 from twoloop.generate.traced_values import Sample
 from twoloop.generate.tracing import Untraceable
 from twoloop.kernels.compile.linking import direct
-from twoloop.kernels.data import codes, flags, noted, tolerances
+from twoloop.kernels.data import codes, flags, noted
 from twoloop.kernels.layout import cleared
 from twoloop.problem.system import ConstrainedSystem
+from twoloop.run.between import Between
 from twoloop.run.comparison import compared_at, territory_of
-from twoloop.run.dense import Interpolator, Table
 from twoloop.run.fields import kinds_of, of_run, of_steps
 from twoloop.run.messages import outcome
 from twoloop.run.movable import Kin, Movable
@@ -68,7 +68,7 @@ class Again:
         self.plan, self.kit, self.memory, self.flags = run.plan, run.kit, run.plan.memory.copy(), run.kit.flags.copy()
         self.t, self.rows = np.empty(run.chunk + 1), np.empty((run.chunk + 1, len(run.state)))
         self.steps = np.empty((run.chunk, run.a.N_STEP_COLUMNS))
-        self.kinds, self.interpolator = np.empty(run.chunk, dtype=np.int64), None
+        self.kinds, self.between = np.empty(run.chunk, dtype=np.int64), Between(run)
         self.end, self.filled = np.zeros(1), np.zeros(2, dtype=np.int64)
 
     @staticmethod
@@ -94,8 +94,7 @@ class Again:
         times: Array | None = None,
     ) -> dict[str, Any] | None:
         """The fields of the record of a run of a system, at all steps or at these times; None: make it the long way."""
-        run, movable = self.run, self.movable
-        a, n = run.a, run.system.n_q
+        run, movable, a = self.run, self.movable, self.run.a
         if self.rest > 0:
             self.rest -= 1
             return None
@@ -114,7 +113,9 @@ class Again:
         set_sizes(run)
         began = time.process_time()
         code, n_rows, n_steps = self._steps_to(t1)
-        found = None if times is None or code != a.ALL_OUTPUT_DONE else self._between(times, n_rows)
+        if times is not None and code == a.ALL_OUTPUT_DONE:
+            parts = self.t[: n_rows + 1], self.rows[: n_rows + 1], self.kinds[:n_rows]
+            self.between.find(times, *parts, self.look.pattern)
         spent = time.process_time() - began
         singular = run.plan.watchful and run.work.notes[noted.NEARLY_SINGULAR] == 1.0
         if code != a.ALL_OUTPUT_DONE or singular:
@@ -126,9 +127,10 @@ class Again:
         if status != Status.REACHED_END:
             return None
         if times is not None:
-            t, rows = times.copy(), self._completed(times, found)
-            if rows is None:
+            at_times = self.between.completed(times)
+            if at_times is None:
                 return None
+            t, rows = times.copy(), at_times
         territory.count()  # a run that goes the long way is counted there
         return {
             **DEFAULTS,
@@ -188,43 +190,19 @@ class Again:
             run.redundant, run.said_of_rows = run.redundant_rows(look.rows)
         return True
 
-    def _between(self, times: Array, n_rows: int) -> Array | None:
-        """Rows [q, v] at times of the run; None where they are off the constraints."""
-        run, n = self.run, 3 * self.run.system.n_q
-        table = Table(self.t[: n_rows + 1], self.rows[: n_rows + 1, :n].copy(), self.kinds[:n_rows])
-        if self.interpolator is None:
-            atol, ranks = run.tolerances[tolerances.ATOL :].copy(), (len(run.work.rows), len(run.work.rows_v))
-            start = run.system, run.t0, table.states[0]
-            self.interpolator = Interpolator(*start, run.rtol, atol, ranks, run.interiors)
-            self.interpolator.tells = False
-        else:
-            self.interpolator.begin(run.system, run.t0, table.states[0], self.look.pattern)
-        found = self.interpolator.states(table, times)
-        return found if self.interpolator.failures == 0 else None
-
-    def _completed(self, times: Array, found: Array | None) -> Array | None:
-        """Rows [q, v, a, lam] at these times; None where not all is there."""
-        interpolator = self.interpolator
-        if found is None or interpolator is None:
-            return None
-        added = np.full((len(times), len(self.run.state) - found.shape[1]), np.nan)
-        interpolator.complete(times, found, added)
-        if interpolator.static is not None or interpolator.repairs:  # it is not what it was
-            self.interpolator = None
-        return np.concatenate([found, added], axis=1) if interpolator.failures == 0 else None
-
     def _compared(
         self, territory: Territory, t: Array, rows: Array, check_derivatives: bool, status: Status, message: str
     ) -> tuple[Status, str]:
         """Status and message after callbacks were compared at states that lie where none was compared."""
-        n, p = 2 * self.run.system.n_q, None if self.movable is None else self.run.system.functions.p
-        everywhere = p is not None and (territory.is_due() or not territory.knows(p))
+        n, everywhere = 2 * self.run.system.n_q, False
+        if self.movable is not None:
+            everywhere = territory.is_due() or not territory.knows(self.movable.parameters)
         if not everywhere and territory.holds(t, rows[:, :n]):
             return status, message
         sample = Sample(float(t[0]), rows[0], n)
         sample.add(t[1:], rows[1:], float(t[-1]), rows[-1])
         states = sample.states()
         compared = compared_at(self.run, territory, states, check_derivatives, status, message, everywhere)
-        if everywhere and compared[0] == status:
-            territory.add_parameters(p)
+        if self.movable is not None and compared[0] == status:
+            territory.add_parameters(self.movable.parameters)
         return compared

@@ -3,7 +3,6 @@
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -215,7 +214,6 @@ class Course:
 
     def _record(self, check_derivatives: bool) -> Record:
         run, recorder, code = self.run, self.recorder, self.code
-        n = run.system.n_q
         t, table = recorder.output()
         statistics, kept = run.statistics(self.cpu), self.wanted.kept
         self._tell()
@@ -248,9 +246,9 @@ class Course:
         if self.interrupts.asked or recorder.interrupted or (code == INTERRUPTED and recorder.ended is None):
             status, message = Status.INTERRUPTED, said_of_interrupt(reached, table)
         t_events, q_events, v_events = recorder.events()
+        fields = of_run(run, t, table) | {name: kept.array(name) for name in OF_STEPS}
         return Record(
-            **of_run(run, t, table),
-            **{name: kept.array(name) for name in OF_STEPS},
+            **fields,
             status=status,
             message=message_of(run, message + explained(status)),
             stats=statistics,

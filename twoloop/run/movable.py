@@ -62,9 +62,7 @@ class Kin:
         of_formulas = copy.copy(system)
         of_formulas.made = {("family", family_of): self.family, ("numbers", self.family): lambda array: array}
         own = code_for(of_formulas, method, fixed, compiled, t, q, unchecked)
-        self.plan, self.interiors = plans_for(
-            of_formulas, method, run.rtol, run.least_atol, fixed, own, unchecked
-        )
+        self.plan, self.interiors = plans_for(of_formulas, method, run.rtol, run.least_atol, fixed, own, unchecked)
         self.exact = exact_derivatives(of_formulas)
         self.definite = has_definite_mass(system, t, q)
         new = system.given.keys() - self.family.traced
@@ -105,7 +103,7 @@ class Movable:
         run.plan = self._numbered(kin.plan).fresh()
         run.interiors = {kind: self._numbered(each) for kind, each in kin.interiors.items()}
         run.traced = run.plan.traced
-        self._remembered = {
+        self._remembered: dict[Any, Any] = {
             ("family", family_of): kin.family,
             ("derivatives", family_of): None if kin.exact is None else kin.exact.with_numbers(array),
             ("kit", id(self._functions)): Kit(self._functions),
@@ -114,6 +112,11 @@ class Movable:
         self._take(run.system)
         run.kit = kit_with(self.system, run.kit.flags, run.plan)
         run.functions = run.kit.functions
+
+    @property
+    def parameters(self) -> Array:
+        """The vector that the arrays hold."""
+        return self._functions.p  # type: ignore[no-any-return]
 
     def take(self, system: ConstrainedSystem) -> None:
         """Be for a system of the family."""
@@ -161,7 +164,8 @@ class Movable:
 
 def _told(run: Run) -> list[Any]:
     """All that the plans of a run say, numbers to the bit."""
-    return [run.kit.flags.tobytes(), *_of_plan(run.plan), *(each for plan in run.interiors.values() for each in _of_plan(plan))]
+    plans = [run.plan, *run.interiors.values()]
+    return [run.kit.flags.tobytes(), *(each for plan in plans for each in _of_plan(plan))]
 
 
 def _of_plan(plan: Plan) -> Iterator[Any]:
