@@ -28,7 +28,7 @@ from twoloop.run import comparison
 
 # calls of functions in a second run, which compares callbacks again at four states, in a third, which makes arrays for
 # the next, in a fifth, which uses them, and in a sixth, which begins as that one did
-MANY, FEW, FEWER, FEWEST = 820, 270, 180, 100
+MANY, FEW, FEWER, FEWEST = 820, 270, 190, 120
 ANOTHER = {  # in a run from another start, which names the redundant rows there, and in one with other parameters
     "four_bar": (170, 2600),
     "andrews": (170, 2200),

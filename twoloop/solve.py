@@ -158,11 +158,11 @@ def solve_dae(
         *(method, rtol, atol, first_step, max_step, max_steps, step_size),
         *(dense_output, progress, time_limit, check_derivatives, compiled),
     )
-    known = system.made.get("options")
+    known = system.shared.get("options")
     if known is None or not all(map(is_, given, known[0])):
         known = given, _checked(system, *given)
         if type(atol) is float:  # an array may be changed by who gives it
-            system.made["options"] = known
+            system.shared["options"] = known
     chosen, rtol, atol, max_step, compiled = known[1]
     event_functions = None if events is None else check_events(events)
     t0, t1 = check_span(t_span)
@@ -187,8 +187,9 @@ def solve_dae(
         )
         told = {"method": chosen.name, "rtol": rtol, "atol": atol.copy()}
         by_positions, own = getattr(chosen, "tested", "all") == "positions", getattr(chosen, "error_tol", None)
-        if times is folder is event_functions is own is None and not (dense_output or progress):
-            made = record_again(system, t0, q0, v0, asked)
+        at_ends = times is not None and set(times.tolist()) <= {t0, t1}
+        if folder is event_functions is own is None and not (dense_output or progress or at_ends):
+            made = record_again(system, t0, q0, v0, asked, times)
             if made is not None and not interrupts.asked:
                 fields, said_of_rows = made
                 if said_of_rows:
@@ -199,7 +200,7 @@ def solve_dae(
             warnings.warn(run.said_of_rows, ConstraintWarning, stacklevel=2)
         with_code = bool(run.plan.own)
         with _progress_bar(chosen.name, t0, t1) if progress else NO_BAR as report:
-            lands = run.plan.lands or step_size is not None or (times is not None and set(times.tolist()) <= {t0, t1})
+            lands = run.plan.lands or step_size is not None or at_ends
             kept = InMemory() if folder is None else begin_folder(folder, system.n_q)
             wanted = Wanted(times, lands, bool(dense_output), event_functions, kept)
             record = Course(run, t1, wanted, report, time_limit, interrupts).to_end(check_derivatives)

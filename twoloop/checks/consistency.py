@@ -348,10 +348,11 @@ def mass_and_rows(system: ConstrainedSystem, t: float, q: Array) -> tuple[Array,
 
 def has_definite_mass(system: ConstrainedSystem, t: float, q: Array) -> bool:
     """Whether M has an inverse at a position, and not only on velocities that the constraints allow."""
-    return system.remembered_at("definite mass", _place(system, t, q), lambda: _is_definite(system.mass(t, q)))
+    return system.remembered_at("definite mass", _place(system, t, q), lambda: is_definite(system.mass(t, q)))
 
 
-def _is_definite(mass: Array) -> bool:
+def is_definite(mass: Array) -> bool:
+    """Whether M has an inverse."""
     return bool(eigenvalues(mass)[0] > SINGULAR_MASS * np.abs(mass).max())
 
 

@@ -49,11 +49,12 @@ class Scales:
 
 def sizes(q: Array) -> Array:
     """A first guess at how far each coordinate must move to matter."""
-    size = np.abs(q)
+    size, n = np.abs(q), q.size
     ordered = size.copy()
     ordered.sort()
-    n_zeros = len(q) - np.count_nonzero(size)
-    return np.maximum(size, 1e-3 * _middle(ordered[n_zeros:]) if n_zeros < len(q) else 1e-3)
+    first = n - np.count_nonzero(size)  # that is not zero
+    middle = 0.5 * float(ordered[(first + n - 1) // 2] + ordered[(first + n) // 2]) if first < n else 1.0
+    return np.maximum(size, 1e-3 * middle)
 
 
 @cache

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -22,20 +23,39 @@ MOST = 1_000_000  # numbers of Jacobians that are looked at together
 ROUNDING = 1e-12  # of a difference, relative to the largest entry over the displacement
 
 
-def unlike_itself(system: ConstrainedSystem, t: float, q: Array, v: Array, t0: float, q0: Array) -> str | None:
-    """Say what of M, `kinematics` and values is not as it should be at a position of a run from (t0, q0), or None."""
-    wrong = changed_mass(system, t0, q0, t, q) if system.constant_mass else unsymmetric_mass(system, t, q)
-    return wrong or (None if _agree(system, t, q, v) else wrong_kinematics(system, t, q)) or wrong_values(system, t, q)
+def unlike_itself(
+    system: ConstrainedSystem, states: Sequence[tuple[float, Array, Array]], t0: float, q0: Array
+) -> tuple[float, str] | None:
+    """Say when and what of M, `kinematics` and values is not as it should be at states of a run from (t0, q0), or None.
+
+    Most often all is the same to the bit, which is seen soon.
+    """
+    before = _mass_at(system, t0, q0).tobytes() if system.constant_mass else b""
+    fused = "kinematics" in system.given
+    for t, q, v in states:
+        if not system.constant_mass:
+            wrong = unsymmetric_mass(system, t, q)
+        else:
+            there = defined(lambda t=t, q=q: _mass_at(system, t, q))  # type: ignore[misc]
+            same = there is None or there.tobytes() == before
+            wrong = None if same else changed_mass(system, t0, q0, t, q)
+        if wrong is None and fused and not _compared(system, t, q, v)[0]:
+            wrong = wrong_kinematics(system, t, q)
+        if wrong is None and system.entries:
+            wrong = wrong_values(system, t, q)
+        if wrong is not None:
+            return t, wrong
+    return None
 
 
 def wrong_kinematics(system: ConstrainedSystem, t: float, q: Array) -> str | None:
     """Compare the fused callback with the separate ones, which are compared with differences."""
     if "kinematics" not in system.given:
         return None
-    rows = system.sparse_rows(t, q)[: system.n_c]
-    v = generic_velocities(rows, system.constraint_rate(t, q), q)[-1]
+    _, rate, rows = _compared(system, t, q, 0.0 * q)
+    v = generic_velocities(rows, rate, q)[-1]
     for place in (q, q + NEAR * v):
-        if _agree(system, t, place, v):
+        if _compared(system, t, place, v)[0]:
             continue
         separate = {
             "constraint": system.constraint(t, place),
@@ -58,30 +78,33 @@ def wrong_kinematics(system: ConstrainedSystem, t: float, q: Array) -> str | Non
     return None
 
 
-def _agree(system: ConstrainedSystem, t: float, q: Array, v: Array) -> bool:
-    """Whether kinematics are not given, or give what the separate callbacks give."""
-    if "kinematics" not in system.given:
-        return True
+def _compared(system: ConstrainedSystem, t: float, q: Array, v: Array) -> tuple[bool, Array, Array]:
+    """Whether kinematics give what the separate callbacks give, and C_t and C_q of these."""
     from twoloop.kernels.evaluation.first_look import kinematics_agree
 
-    room = *np.zeros((2, 3 + system.n_q, system.n_c)), np.zeros(system.n_c)
+    n, n_c = system.n_q, system.n_c
+    fused, given = np.zeros((2, 3 + n, n_c))
     state = np.ascontiguousarray(q), np.ascontiguousarray(v)
-    return bool(direct(kinematics_agree)(system.kit, t, *state, *room, SAME, ROUNDED * EPS))
+    agree = direct(kinematics_agree)(system.kit, t, *state, fused, given, np.zeros(n_c), SAME, ROUNDED * EPS)
+    return bool(agree), given[1], given[3:].reshape((n_c, n))
 
 
 def changed_mass(system: ConstrainedSystem, t0: float, q0: Array, t: float, q: Array) -> str | None:
     """Say that a mass is not the same in two places, where it is said to be constant, or None."""
-    kind = "mass_values" if "mass" in system.entries else "mass"
-
-    def mass(t: float, q: Array) -> Array:
-        (made,) = system.arrays_of(kind)
-        getattr(system.functions, kind)(t, np.ascontiguousarray(q), system.functions.p, made)
-        return made
-
-    there = defined(lambda: mass(t, q))
-    if there is None or not np.abs(there - mass(t0, q0)).max() > UNSYMMETRIC * np.abs(there).max():
+    there, before = defined(lambda: _mass_at(system, t, q)), _mass_at(system, t0, q0)
+    if there is None or there.tobytes() == before.tobytes():
+        return None
+    if not np.abs(there - before).max() > UNSYMMETRIC * np.abs(there).max():
         return None
     return f"mass of {system.name!r} is said to be constant (constant_mass=True) and is not"
+
+
+def _mass_at(system: ConstrainedSystem, t: float, q: Array) -> Array:
+    """M, or the values of its entries where these are given."""
+    kind = "mass_values" if "mass" in system.entries else "mass"
+    (made,) = system.arrays_of(kind)
+    getattr(system.functions, kind)(t, np.ascontiguousarray(q), system.functions.p, made)
+    return made
 
 
 def check_bandwidth(system: ConstrainedSystem, bandwidth: int, t: float, q: Array) -> None:

@@ -47,7 +47,8 @@ def _traced(system: ConstrainedSystem, family: Family) -> Traced:
 
 def exact_near(system: ConstrainedSystem, t: float, q: Array, v: Array) -> bool:
     """Whether C_q, C_t and Gamma are, near a start, the derivatives of what callbacks were traced to."""
-    places = [(t + share * TIME, q + share * generic_factors(len(q)) * sizes(q)) for share in NEAR]
+    away = generic_factors(len(q)) * sizes(q)
+    places = [(t + share * TIME, q + share * away) for share in NEAR]
 
     def check(made: Traced) -> None:
         try:
@@ -77,10 +78,11 @@ def _factors(n_states: int, n_q: int) -> Array:
 
 
 class Territory:
-    """Where the states of runs of one system were, at which callbacks were compared: a box of [t, q, v]."""
+    """Where the states of runs were, at which callbacks were compared: a box of [t, q, v], and one of parameters."""
 
     def __init__(self) -> None:
         self._runs = 0
+        self._parameters: tuple[Array, Array] | None = None  # the least and the largest, of runs of many systems
         self._box = np.zeros((2, 0))  # the least and the largest of each number, and the same of what is no new place
         self._known = self._box
 
@@ -107,6 +109,19 @@ class Territory:
         least, largest = self._known
         new = (states < least) | (states > largest)
         return states[new.any(axis=1)] if new.any() else states[:0]
+
+    def knows(self, parameters: Array) -> bool:
+        """Whether parameters lie among those with which callbacks were compared, or next to them."""
+        if self._parameters is None:
+            return False
+        least, largest = self._parameters
+        beside = BESIDE * (largest - least)
+        return bool((least - beside <= parameters).all() and (parameters <= largest + beside).all())
+
+    def add_parameters(self, parameters: Array) -> None:
+        """Take in those of a run in which nothing was wrong."""
+        least, largest = self._parameters or (parameters, parameters)
+        self._parameters = np.minimum(least, parameters), np.maximum(largest, parameters)
 
     def add(self, states: Array) -> None:
         """Take in states of a run in which nothing was wrong."""

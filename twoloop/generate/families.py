@@ -49,6 +49,8 @@ class Family:
     def __init__(self, parameters: Array, classes: NDArray[np.int64]):
         self._classes = classes
         n_numbers = int(np.abs(self._classes).max(initial=0))
+        _, first = np.unique(np.abs(self._classes), return_index=True)
+        self._first = first[self._classes[first] != 0]  # where each number stands first
         self._record = Record(np.random.default_rng(7).uniform(*GENERIC, n_numbers).tolist(), range(n_numbers))
         self.parameters = parameters.astype(object) if self._classes.any() else parameters.copy()
         for place in np.flatnonzero(self._classes).tolist():
@@ -63,12 +65,15 @@ class Family:
 
     def numbers(self, parameters: Array) -> Array:
         """The numbers, one for each class, of a system's parameters."""
-        _, first = np.unique(np.abs(self._classes), return_index=True)
-        return np.abs(parameters[first[self._classes[first] != 0]])
+        return np.abs(parameters[self._first])
+
+    def products(self, parameters: Array) -> Callable[[Powers], Any]:
+        """What gives the products of which formulas are multiples, for a system's parameters."""
+        return self._record.products(self.numbers(parameters))
 
     def evaluator(self, parameters: Array) -> Evaluator:
         """What evaluates formulas for a system's parameters; their arrays are those that are kept with the family."""
-        product = self._record.products(self.numbers(parameters))
+        product = self.products(parameters)
 
         def evaluate(array: Any) -> Array:
             if array.dtype != object:

@@ -39,7 +39,7 @@ class Equations:
     def __init__(self, system: ConstrainedSystem, parameters: Any = None):
         self.system, self.graph = system, Graph()
         self.parameters = system.parameters if parameters is None else parameters
-        self._watched: Any = next((x.record.watched for x in self.parameters if type(x) is Known), nullcontext)
+        self.watched: Any = next((x.record.watched for x in self.parameters if type(x) is Known), nullcontext)
         (self.t,) = self.graph.inputs(1, False)
         self.q, self.v = self.graph.inputs(system.n_q, False), self.graph.inputs(system.n_q, True)
         self._made: dict[str, Any] = {}
@@ -76,7 +76,7 @@ class Equations:
         arrays = [symbols({"q": self.q, "v": v}[name]) for name in KINDS[kind].state]
         if out.size:
             try:
-                with self._watched():
+                with self.watched():
                     if not system.called_in_python:
                         trace(getattr(system.functions, kind), self.t, *arrays, p, out)
                     elif kind in system.python_functions:
@@ -115,6 +115,22 @@ class Equations:
                 total = total + along.of(entry) * u if entry.terms else total
             made[i] = -total
         return made
+
+
+def runs_on_symbols(system: ConstrainedSystem, kind: str, parameters: Any) -> bool:
+    """Whether a compiled callback does the same whatever its arguments are, and these parameters where they vary."""
+    equations = Equations(system, parameters)
+    state = {"q": equations.q, "v": equations.v, "lam": equations.graph.inputs(system.n_c, True)}
+    arrays = [symbols(state[name]) for name in KINDS[kind].state]
+    filled = [array.astype(object) for array in system.arrays_of(kind)]
+    try:
+        with equations.watched():
+            trace(getattr(system.functions, kind), equations.t, *arrays, equations.parameters.copy(), *filled)
+            for array in filled:
+                as_forms(equations.graph, array)
+    except (Untraceable, ArithmeticError, RecursionError):
+        return False
+    return True
 
 
 def only(form: Form) -> int:

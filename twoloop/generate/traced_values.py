@@ -7,7 +7,7 @@ at states spread over the time of the run and about its start, later at states o
 
 import copy
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from typing import Any
 
@@ -69,33 +69,32 @@ class Traced:
 
     def of(self, system: ConstrainedSystem, evaluate: Evaluator) -> "Traced":
         """The same of another system of the family."""
+        other = self.with_numbers(evaluate)
+        other.name = system.name
+        return other
+
+    def with_numbers(self, numbers_for: Callable[[Any], Array]) -> "Traced":
+        """The same with other arrays in the place of those of its numbers, which have to be compared first."""
         other = copy.copy(self)
-        constants, coefficients = evaluate(self.program.constants), evaluate(self.program.coefficients)
+        constants, coefficients = numbers_for(self.program.constants), numbers_for(self.program.coefficients)
         other.program = self.program._replace(constants=constants, coefficients=coefficients)
-        other.name, other.trusted = system.name, False
+        other.trusted = False
         return other
 
     def refuse(self, system: ConstrainedSystem, t0: float, t1: float, q: Array, v: Array) -> None:
-        """Compare at states about the start, spread over the time of a run.
+        """Compare at states about the start, spread over the time of a run: see `refuse_wrong`."""
+        refuse_wrong([self], system, t0, t1, q, v)
 
-        Raises
-        ------
-        Untraceable
-            Naming a callback and an entry.
-        """
-        if self.trusted:
-            return
+    def looked_at(self, system: ConstrainedSystem, around: Array) -> None:
+        """The same at such states, the first of which is the start."""
         wrong = None
-        with warnings.catch_warnings(), np.errstate(all="ignore"):
-            warnings.simplefilter("ignore")
-            around = states_around(t0, t1, q, v)
-            for states in (around, *around[:, None, :]):  # all at once, or one by one
-                try:
-                    wrong = wrong or self.wrong(system, states, everywhere=False)
-                except Exception:  # outside what the callbacks are made for
-                    continue
-                if states is around:
-                    break
+        for states in (around, *around[:, None, :]):  # all at once, or one by one
+            try:
+                wrong = wrong or self.wrong(system, states, everywhere=False)
+            except Exception:  # outside what the callbacks are made for
+                continue
+            if states is around:
+                break
         if wrong is not None:
             raise Untraceable(wrong)
         self.trusted = not system.called_in_python  # whose compiled callbacks do not change any more
@@ -190,6 +189,24 @@ class Sample:
     def states(self) -> Array:
         """All of them, the last first."""
         return np.concatenate(self._parts)
+
+
+def refuse_wrong(traced: Sequence[Traced], system: ConstrainedSystem, t0: float, t1: float, q: Array, v: Array) -> None:
+    """Compare what is not trusted yet at states about the start, spread over the time of a run.
+
+    Raises
+    ------
+    Untraceable
+        Naming a callback and an entry.
+    """
+    new = [each for each in traced if not each.trusted]
+    if not new:
+        return
+    with warnings.catch_warnings(), np.errstate(all="ignore"):
+        warnings.simplefilter("ignore")
+        around = states_around(t0, t1, q, v)
+        for each in new:
+            each.looked_at(system, around)
 
 
 Check = Callable[[Traced], None]

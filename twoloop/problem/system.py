@@ -133,6 +133,7 @@ class ConstrainedSystem(EvaluatedEquations):
         self.within_bounds: set[str] = set()  # kinds that check_callback has looked at
         self.checked = False  # by check_derivatives
         self.made: dict[Any, Any] = {}  # of its equations: see `remembered`
+        self.shared: dict[Any, Any] = {}  # with systems of other parameters: options that were checked, and runs
 
     @property
     def n_mass_values(self) -> int:
@@ -189,17 +190,18 @@ class ConstrainedSystem(EvaluatedEquations):
         TypeError, ValueError
             If the parameters are not as many finite numbers, or the system is made of functions that take none.
         """
-        p, known = checked_parameters(parameters), self.parameters
+        p, size = checked_parameters(parameters), self.functions.p.size - self.called_in_python
         if not self._taking and (self._python is not None or self._returning):
             raise TypeError(
                 f"{self.name!r} has no parameters: it is made by from_python without them. Give it parameters=p, which "
                 "its functions take as their last argument, or make another system of functions that enclose other "
                 "numbers"
             )
-        if p.shape != known.shape:
-            raise ValueError(f"parameters of {self.name!r} must be {known.size} numbers, as they are; given {p.size}")
+        if p.size != size:
+            raise ValueError(f"parameters of {self.name!r} must be {size} numbers, as they are; given {p.size}")
         other = copy.copy(self)
-        p = np.append(self.functions.p[: self.called_in_python], p)  # the handle of Python functions
+        if self.called_in_python:
+            p = np.append(self.functions.p[:1], p)  # the handle of Python functions
         other.functions = self.functions._replace(p=p, flags=self.functions.flags.copy())
         other.within_bounds, other.checked, other.made = set(), False, {}
         other.description = self.description.with_parameters(p)

@@ -22,8 +22,11 @@ from twoloop.kernels.compile.linking import direct
 from twoloop.kernels.data import codes, flags, noted
 from twoloop.kernels.layout import cleared, lasting
 from twoloop.problem.system import ConstrainedSystem
+from twoloop.run.between import Between
 from twoloop.run.comparison import compared_at, territory_of
+from twoloop.run.fields import kinds_of, of_run, of_steps
 from twoloop.run.messages import outcome
+from twoloop.run.movable import Kin, Movable
 from twoloop.run.pace import INTERRUPTED, Pace
 from twoloop.run.passage import give_way
 from twoloop.run.record import Record, Status
@@ -34,7 +37,6 @@ Array = NDArray[np.float64]
 
 MOST_WAITING, LARGEST = 4, 500_000  # those of a kind that wait for a call, one a thread; numbers of the states of each
 IN_VAIN = 16  # runs that are not tried after one that did not come to its end
-BEFORE = 0.0, 0.0, 1.0  # rejections and partitions before all steps: the first is not a renewal
 DEFAULTS = {each.name: each.default for each in fields(Record) if each.default is not MISSING}
 
 
@@ -51,19 +53,24 @@ class Again:
         The machine code that its plan calls.
     definite : bool
         Whether M has an inverse at its start.
+    kin : Kin, optional
+        What it shares with runs of systems of other parameters, which it may then be made for.
     """
 
-    def __init__(self, run: Run, system: ConstrainedSystem, code: OwnCode | None, definite: bool):
-        self.run, self.system, self.code, self.definite = run, system, code, definite
+    def __init__(
+        self, run: Run, system: ConstrainedSystem, code: OwnCode | None, definite: bool, kin: Kin | None = None
+    ):
+        self.movable = None if kin is None else Movable(kin, run)
+        self.run, self.code, self.definite = run, code, definite
         self.look, self.chooser, self.rest = Look(system), Chooser(system), 0
         self._start, self._advance = direct(run.kernels.start), direct(run.kernels.advance)
         self.clock, self.control, self.tolerances = run.clock.copy(), run.control.copy(), run.tolerances.copy()
         self.plan, self.kit, self.memory, self.flags = run.plan, run.kit, run.plan.memory.copy(), run.kit.flags.copy()
         self.t, self.rows = np.empty(run.chunk + 1), np.empty((run.chunk + 1, len(run.state)))
-        self.steps = np.zeros((run.chunk + 1, run.a.N_STEP_COLUMNS))  # the first stands for the start
-        self.steps[0, run.a.ERRORS : run.a.JACOBIANS] = BEFORE
+        self.steps = np.empty((run.chunk, run.a.N_STEP_COLUMNS))
+        self.kinds, self.between = np.empty(run.chunk, dtype=np.int64), Between(run)
         self.end, self.filled = np.zeros(1), np.zeros(2, dtype=np.int64)
-        self.call: tuple[float, float, bytes, bytes] | None = None  # the last one
+        self.call: tuple[int, float, float, bytes, bytes] | None = None  # the last one
         # arrays of its run with copies made at its start, where the one before was equal
         self.saved: list[tuple[NDArray[Any], NDArray[Any]]] = []
 
@@ -72,56 +79,68 @@ class Again:
         """Whether a run may be made in this way: in one chunk, in the dense form."""
         return run.static is None and run.chunk * len(run.state) <= LARGEST and not run.system.called_in_python
 
+    @staticmethod
+    def interpolates(run: Run) -> bool:
+        """Whether states between its steps may be had in this way: with arrays that serve from start to start."""
+        lands = run.plan.lands or run.control[run.a.FIXED_STEP] > 0.0
+        return not lands and run.kit.flags[flags.FORM] != flags.AUGMENTED
+
     def record(
-        self, t0: float, t1: float, q0: Array, v0: Array, set_sizes: Callable[[Run], None], check_derivatives: bool
+        self,
+        system: ConstrainedSystem,
+        t0: float,
+        t1: float,
+        q0: Array,
+        v0: Array,
+        set_sizes: Callable[[Run], None],
+        check_derivatives: bool,
+        times: Array | None = None,
     ) -> dict[str, Any] | None:
-        """The fields of the record of a run; None where it has to be made the long way."""
-        run = self.run
-        system, a, n = self.system, run.a, run.system.n_q
-        territory = territory_of(run, check_derivatives)
+        """The fields of the record of a run of a system, at all steps or at these times; None: make it the long way."""
+        run, movable, a = self.run, self.movable, self.run.a
         if self.rest > 0:
             self.rest -= 1
             return None
-        if territory.is_due() or (check_derivatives and not system.checked):
-            return None
-        if not self._is_ready(t0, t1, q0, v0, set_sizes):
+        if movable is None:
+            territory = territory_of(run, check_derivatives)
+            if territory.is_due() or (check_derivatives and not system.checked):
+                return None
+        else:
+            movable.take(system)
+            territory, self.look.system = movable.kin.territory(check_derivatives), movable.system
+            self.chooser.system = movable.system
+        if not self._is_ready(system, t0, t1, q0, v0, set_sizes, check_derivatives):
             return None
         began = time.process_time()
         code, n_rows, n_steps = self._steps_to(t1)
+        if times is not None and code == a.ALL_OUTPUT_DONE:
+            parts = self.t[: n_rows + 1], self.rows[: n_rows + 1], self.kinds[:n_rows]
+            self.between.find(times, *parts, self.look.pattern)
         spent = time.process_time() - began
         singular = run.plan.watchful and run.work.notes[noted.NEARLY_SINGULAR] == 1.0
         if code != a.ALL_OUTPUT_DONE or singular:
             self.rest = IN_VAIN
             return None
         status, message = outcome(run, code, t1, Pace(t0))
-        t, rows, steps = self.t[: n_rows + 1].copy(), self.rows[: n_rows + 1].copy(), self.steps[1 : n_steps + 1]
-        if run.compared_to[0] < t1:
+        t, rows, steps = self.t[: n_rows + 1].copy(), self.rows[: n_rows + 1].copy(), self.steps[:n_steps]
+        if run.compared_to[0] < t1 or territory.is_due():
             status, message = self._compared(territory, t, rows, check_derivatives, status, message)
             if status != Status.REACHED_END:
                 return None
             run.compared_to[0] = t1
+        if times is not None:
+            at_times = self.between.completed(times)
+            if at_times is None:
+                return None
+            t, rows = times.copy(), at_times
         territory.count()  # a run that goes the long way is counted there
-        counts = self.steps[: n_steps + 1, a.ERRORS : a.JACOBIANS]
-        changes = (counts[1:] - counts[:-1]).astype(np.int64)
         return {
             **DEFAULTS,
-            "t": t,
-            "q": rows[:, :n].T,
-            "v": rows[:, n : 2 * n].T,
-            "a": rows[:, 2 * n : 3 * n].T,
-            "lam": rows[:, 3 * n :].T,
-            "h": steps[:, a.H].copy(),
-            "rejected_error": changes[:, 0],
-            "rejected_convergence": changes[:, 1],
-            "partitioned": changes[:, 2],
-            "untested": steps[:, a.JACOBIANS] > 0.0,
+            **of_run(run, t, rows),
+            **of_steps(run, steps)[0],
             "status": status,
             "message": message,
             "stats": run.statistics(spent),
-            "rank": run.rank,
-            "redundant": run.redundant.copy(),
-            "defect": run.defect(),
-            "widest_gap": float(run.work.notes[noted.WIDEST_GAP]),
             "compiled": bool(self.plan.own),
         }
 
@@ -132,19 +151,30 @@ class Again:
         self.t[0], self.rows[0] = run.t0, run.state
         while True:
             arrays = run.plan.options, run.plan.memory, run.tolerances, run.control, run.clock, run.state, run.new_state
-            room = self.t[n_rows + 1 :], self.rows[n_rows + 1 :], self.steps[n_steps + 1 :]
+            room = self.t[n_rows + 1 :], self.rows[n_rows + 1 :], self.steps[n_steps:]
             try:
                 code = self._advance(run.kit, run.work, *arrays, self.end, *room, self.filled)
             except Exception:  # of a callback; the long way knows what to do
                 return INTERRUPTED, n_rows, n_steps
-            n_rows, n_steps = n_rows + int(self.filled[0]), n_steps + int(self.filled[1])
+            taken = self.steps[n_steps : n_steps + int(self.filled[1])]
+            self.kinds[n_steps : n_steps + len(taken)] = kinds_of(run, taken)
+            n_rows, n_steps = n_rows + int(self.filled[0]), n_steps + len(taken)
             if code != a.HAS_TO_GIVE_WAY:
                 return code, n_rows, n_steps
             give_way(run)
 
-    def _is_ready(self, t0: float, t1: float, q0: Array, v0: Array, set_sizes: Callable[[Run], None]) -> bool:
+    def _is_ready(
+        self,
+        system: ConstrainedSystem,
+        t0: float,
+        t1: float,
+        q0: Array,
+        v0: Array,
+        set_sizes: Callable[[Run], None],
+        check_derivatives: bool,
+    ) -> bool:
         """Whether the run is at its start: one that is asked for again needs no second look."""
-        run, call = self.run, (t0, t1, q0.tobytes(), v0.tobytes())
+        run, call = self.run, (id(system), t0, t1, q0.tobytes(), v0.tobytes())  # of the last call the system is kept
         run.plan, run.kit, run.functions, run.substituted = self.plan, self.kit, self.kit.functions, False
         run.plan.memory[:] = self.memory
         if run.kit.flags[flags.FORM] != self.flags[flags.FORM]:
@@ -156,6 +186,8 @@ class Again:
             return True
         self.call, self.saved = None, []
         if not self._begins(t0, q0, v0):
+            return False
+        if self.movable is not None and not self.movable.agrees(t1, self.look.mass, check_derivatives):
             return False
         set_sizes(run)
         self.call = call
@@ -193,9 +225,15 @@ class Again:
         self, territory: Territory, t: Array, rows: Array, check_derivatives: bool, status: Status, message: str
     ) -> tuple[Status, str]:
         """Status and message after callbacks were compared at states that lie where none was compared."""
-        n = 2 * self.run.system.n_q
-        if territory.holds(t, rows[:, :n]):
+        n, everywhere = 2 * self.run.system.n_q, False
+        if self.movable is not None:
+            everywhere = territory.is_due() or not territory.knows(self.movable.parameters)
+        if not everywhere and territory.holds(t, rows[:, :n]):
             return status, message
         sample = Sample(float(t[0]), rows[0], n)
         sample.add(t[1:], rows[1:], float(t[-1]), rows[-1])
-        return compared_at(self.run, territory, sample.states(), check_derivatives, status, message)
+        states = sample.states()
+        compared = compared_at(self.run, territory, states, check_derivatives, status, message, everywhere)
+        if self.movable is not None and compared[0] == status:
+            territory.add_parameters(self.movable.parameters)
+        return compared

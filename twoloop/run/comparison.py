@@ -80,13 +80,15 @@ def _derivatives_again(run: "Run", states: Array, first: Array, status: Status, 
     some = [(float(each[0]), each[1 : 1 + n], each[1 + n :]) for each in chosen]
     exact = exact_derivatives(run.system)
     fine = exact is not None and exact.wrong(run.system, generic_states(some)) is None
-    for t, q, v in some:
-        wrong = unlike_itself(run.system, t, q, v, float(first[0]), first[1 : 1 + n])
-        if wrong is None and not fine:
-            wrong = wrong_derivative(run.system, t, q, v)
+    found = unlike_itself(run.system, some, float(first[0]), first[1 : 1 + n])
+    for t, q, v in () if fine or found is not None else some:
+        wrong = wrong_derivative(run.system, t, q, v)
         if wrong is not None:
-            return Status.WRONG_DERIVATIVE, f"At t = {t:.10g} of the run {wrong} {message}"
-    return status, message
+            found = t, wrong
+            break
+    if found is None:
+        return status, message
+    return Status.WRONG_DERIVATIVE, f"At t = {found[0]:.10g} of the run {found[1]} {message}"
 
 
 def unlike_before(system: ConstrainedSystem, states: Array) -> str | None:

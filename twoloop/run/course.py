@@ -3,16 +3,16 @@
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.generate.traced_values import Sample
 from twoloop.kernels.compile.linking import direct
-from twoloop.kernels.data import intervals, noted, tolerances
+from twoloop.kernels.data import intervals, tolerances
 from twoloop.run.comparison import compared
 from twoloop.run.dense import Interpolator
+from twoloop.run.fields import BEFORE, kinds_of, of_run, of_steps
 from twoloop.run.interrupts import Interrupts, said_of_interrupt
 from twoloop.run.kept import OF_STEPS
 from twoloop.run.messages import message_of, outcome
@@ -32,7 +32,6 @@ CHUNK_TO_EVENT = 16  # attempts where an event may end the run: what is computed
 CHUNK_TIME = 0.05  # s of CPU; chunks that take longer do not grow, so that Ctrl-C is heard
 # ends of which it may be said that stability limited the steps
 EXPLAINED_BY_STIFFNESS = {Status.REACHED_END, Status.EVENT, Status.MAX_STEPS, Status.TIME_LIMIT, Status.STAGNATED}
-FIRST_PARTITION = np.array([[0, 0, 1]])  # rejections and partitions before all steps: it is not a renewal
 NO_KINDS = np.zeros(0, dtype=np.int64)  # of intervals within which nothing is wanted
 MOST_SPARE, LARGEST_SPARE = 16, 250_000  # buffers that wait for their next run, and numbers of each of them
 _spare: dict[tuple[int, int, int], Buffers] = {}  # buffers, by their sizes, for the next run
@@ -77,7 +76,7 @@ class Course:
         # the run is looked at after so many attempts, however long the chunks are that the clock allows
         self.between_looks = self.next_look = run.chunk
         self.plan, self.control, self.kit = run.plan, run.control, run.kit  # at the moment: not always the run's own
-        self.counts = FIRST_PARTITION
+        self.counts = BEFORE
         self.step_parts = [np.empty((0, run.a.N_STEP_COLUMNS))]  # of which nothing is kept yet
         if self.wanted.kept.finished:
             self._tell()
@@ -168,13 +167,10 @@ class Course:
 
     def _tell(self) -> None:
         """Keep what is told of each step."""
-        a, kept = self.run.a, self.wanted.kept
         steps, self.step_parts = np.concatenate(self.step_parts), self.step_parts[:1]
-        counts = np.concatenate([self.counts, steps[:, a.ERRORS : a.JACOBIANS].astype(np.int64)])
-        self.counts, changes = counts[-1:], counts[1:] - counts[:-1]
-        told = (steps[:, a.H], *changes.T, steps[:, a.JACOBIANS] > 0.0)
-        for name, values in zip(OF_STEPS, told, strict=True):
-            kept.add(name, values)
+        told, self.counts = of_steps(self.run, steps, self.counts)
+        for name, values in told.items():
+            self.wanted.kept.add(name, values)
 
     def _look(self, steps: Array, across: bool, spent: float) -> None:
         """See whether the run gets anywhere, and how long the next chunk may be."""
@@ -218,7 +214,6 @@ class Course:
 
     def _record(self, check_derivatives: bool) -> Record:
         run, recorder, code = self.run, self.recorder, self.code
-        n = run.system.n_q
         t, table = recorder.output()
         statistics, kept = run.statistics(self.cpu), self.wanted.kept
         self._tell()
@@ -251,25 +246,16 @@ class Course:
         if self.interrupts.asked or recorder.interrupted or (code == INTERRUPTED and recorder.ended is None):
             status, message = Status.INTERRUPTED, said_of_interrupt(reached, table)
         t_events, q_events, v_events = recorder.events()
-        of_steps: dict[str, Any] = {name: kept.array(name) for name in OF_STEPS}
+        fields = of_run(run, t, table) | {name: kept.array(name) for name in OF_STEPS}
         return Record(
-            t=t,
-            q=table[:, :n].T,
-            v=table[:, n : 2 * n].T,
-            a=table[:, 2 * n : 3 * n].T,
-            lam=table[:, 3 * n :].T,
-            **of_steps,
+            **fields,
             status=status,
             message=message_of(run, message + explained(status)),
             stats=statistics,
-            rank=run.rank,
-            redundant=run.redundant.copy(),  # runs of one start share it
             sol=recorder.solution(),
             t_events=t_events,
             q_events=q_events,
             v_events=v_events,
-            defect=run.defect(),
-            widest_gap=float(run.work.notes[noted.WIDEST_GAP]),
             system=run.system,
         )
 
@@ -302,7 +288,4 @@ class Course:
             return np.full(len(steps), intervals.JUMP)
         if across:
             return np.full(len(steps), intervals.ACROSS)
-        if run.plan.apart:
-            return np.full(len(steps), intervals.APART)
-        explicit = intervals.ACROSS if run.substituted else intervals.ACCELERATIONS
-        return np.where(steps[:, run.a.JACOBIANS] > 0.0, intervals.VELOCITIES, explicit)
+        return kinds_of(run, steps)

@@ -13,10 +13,11 @@ from twoloop.kernels.compile.linking import direct
 from twoloop.kernels.data import codes, noted
 from twoloop.kernels.data import intervals as names
 from twoloop.kernels.data.tolerances import ATOL, RTOL
+from twoloop.kernels.layout import cleared
 from twoloop.methods.plan import INNER_TOL, Plan
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.static_form import static_form
-from twoloop.run.workspace import kit_of, workspace
+from twoloop.run.workspace import kit_of, made_ready, workspace
 
 Array = NDArray[np.float64]
 Groups = NDArray[np.int64]
@@ -89,6 +90,7 @@ class Interpolator:
         self.static = static_form(system, t0, row[: system.n_q], *self.plans.values())
         self.matrices = max((plan.matrices for plan in self.plans.values()), default=0)
         self._prepare()
+        self.failures, self.tells = 0, True  # of the last call, of which it may warn
         self.filled: dict[float, tuple[Array, Array]] = {}
         self.sound: set[float] = set()  # where intervals begin whose neighbours serve
         self.judges = True
@@ -96,17 +98,31 @@ class Interpolator:
 
     def _prepare(self) -> None:
         """The workspace, and what is called with it."""
-        from twoloop.kernels import advance
-
         system, t0, row = self.made_of[:3]
         q0, static = row[: system.n_q], self.static
         self.kits = {kind: kit_of(system, t0, q0, plan, static) for kind, plan in self.plans.items()}
         self.kit = kit_of(system, t0, q0, None, static)
         pattern = pattern_of(system, t0, q0) if static is None else np.zeros((0, 0))
         self.work = workspace(system, self.kit, pattern, q0, self.rtol, 0.0, self.ranks, static, self.matrices)
+        self._start()
+
+    def _start(self) -> None:
+        from twoloop.kernels import advance
+
+        system, t0, row = self.made_of[:3]
         self.work.notes[noted.GENERATION] = 1.0  # the ranks are known
-        advance.start(self.kit, self.work, t0, np.concatenate([row, np.zeros(system.n_c + system.n_a)]))
+        state = np.concatenate([row, np.zeros(system.n_c + system.n_a)])
+        direct(advance.start)(self.kit, self.work, t0, state)
         self.repairs: dict[bool, tuple[Plan, Any]] = {}
+
+    def begin(self, system: ConstrainedSystem, t0: float, row: Array, pattern: Array) -> None:
+        """Be as new, for a run from another state where the same kits serve, and rows have entries as in `pattern`."""
+        self.made_of = (system, t0, row.copy(), *self.made_of[3:])
+        self.system, self.judges = system, True
+        self.filled, self.sound = {}, set()
+        made_ready(cleared(self.work), system, self.kit.flags, pattern, row[: system.n_q], self.rtol, 0.0)
+        self._start()
+        self.nodes[:], self.room[:], self.rows[:] = 0.0, 0.0, 0.0
 
     def _become_dense(self) -> None:
         """Leave the static form, which could not decide something."""
@@ -131,19 +147,21 @@ class Interpolator:
         if len(times) == 0 or len(table.t) == 1:
             return np.repeat(table.states[:1, : 2 * self.system.n_q], len(times), axis=0)
         intervals = np.searchsorted(table.t[1:-1], times, side="right")
-        first = np.flatnonzero(np.diff(intervals, prepend=-1))
+        (first,) = np.concatenate([[True], intervals[1:] != intervals[:-1]]).nonzero()
         groups = _groups(table, intervals[first])
-        groups[:, names.FIRST_TIME], groups[:, names.END_TIME] = first, np.append(first[1:], len(times))
+        groups[:, names.FIRST_TIME], groups[:-1, names.END_TIME] = first, first[1:]
+        groups[-1, names.END_TIME] = len(times)
         out = np.empty((len(times), 2 * self.system.n_q))
         failures = 0
         others = []
-        for block in np.split(groups, range(KEPT, len(groups), KEPT)):
+        for block in _blocks(groups):
             self._settle(table, block)
             divided, own, rest = self._divided(table, block)
             failures += self._between(divided, own, times, out)
             others.append(rest)
         failures += self._between(table, np.concatenate(others), times, out)
-        if failures > 0:
+        self.failures = failures
+        if failures > 0 and self.tells:
             _warn(f"at {failures} of {len(times)} times the state is interpolated and off the constraints")
         return out
 
@@ -176,7 +194,7 @@ class Interpolator:
         off = np.zeros(len(groups))
         off[inner], off[~inner] = self._judged(divided, own), self._judged(table, rest)
         self.sound.update(table.t[groups[~inner & (off <= OFF), names.FIRST_OWN]].tolist())
-        for k in np.flatnonzero(~(off <= OFF)):
+        for k in (~(off <= OFF)).nonzero()[0]:
             self._repair(table, groups[k], float(off[k]))
 
     def _judged(self, table: Table, groups: Groups) -> Array:
@@ -234,15 +252,16 @@ class Interpolator:
     def _divided(self, table: Table, groups: Groups) -> tuple[Table, Groups, Groups]:
         """A table of interior states, the groups of intervals that are in it, and those of others."""
         begins = table.t[groups[:, names.FIRST_OWN]].tolist()
-        filled = np.array([t in self.filled for t in begins])
-        pairs = [self.filled[t] for t, there in zip(begins, filled, strict=True) if there]
-        sizes = np.array([len(t) for t, _ in pairs], dtype=np.int64)
+        filled = np.array([t in self.filled for t in begins], dtype=bool)
+        pairs = [self.filled[t] for t in begins if t in self.filled]
         own = groups[filled]
+        if not pairs:
+            return Table(table.t[:0], table.states[:0], table.kinds), own, groups
+        t, states = zip(*pairs, strict=True)
+        sizes = np.array(list(map(len, t)), dtype=np.int64)
         own[:, names.LAST_OWN] = own[:, names.HIGH] = np.cumsum(sizes) - 1
         own[:, names.FIRST_OWN] = own[:, names.LOW] = own[:, names.LAST_OWN] - sizes + 1
-        t = np.concatenate([table.t[:0], *(t for t, _ in pairs)])
-        states = np.concatenate([table.states[:0], *(states for _, states in pairs)])
-        return Table(t, states, table.kinds), own, groups[~filled]
+        return Table(np.concatenate(t), np.concatenate(states), table.kinds), own, groups[~filled]
 
     def _fill(self, table: Table, plan: Plan, kit: Any, intervals: Groups) -> dict[float, tuple[Array, Array]]:
         """Interior states of these intervals, by when they begin; where that fails, fewer of them, or none."""
@@ -259,8 +278,8 @@ class Interpolator:
             direct(self.kernels.fill)(kit, self.work, *vectors, table.t, table.states, intervals, out_t, out)
             times, states = out_t.reshape(-1, rows), out.reshape(-1, rows, 3 * n)
             found = np.isfinite(times[:, 0])
-            for k in np.flatnonzero(found):
-                filled[float(times[k, 0])] = (times[k].copy(), states[k].copy())
+            begins = times[:, 0].tolist()
+            filled.update({begins[k]: (times[k], states[k]) for k in found.nonzero()[0].tolist()})
             intervals = intervals[~found]
         return filled
 
@@ -270,7 +289,7 @@ class Interpolator:
         NaN where an interval has fewer.
         """
         groups = _groups(table, np.arange(len(table.t) - 1))
-        for block in np.split(groups, range(KEPT, len(groups), KEPT)):
+        for block in _blocks(groups):
             self._settle(table, block)
             begins = table.t[block[:, names.FIRST_OWN]].tolist()
             divided = [self.filled[t] for t in begins if t in self.filled]
@@ -291,12 +310,19 @@ class Interpolator:
 
     def complete(self, times: Array, states: Array, out: Array) -> None:
         """Fill rows [a, lam] at rows [q, v] on the constraints."""
-        failures = self.kernels.complete(self.kit, self.work, times, np.ascontiguousarray(states), out)
+        complete, times, states = direct(self.kernels.complete), *map(np.ascontiguousarray, (times, states))
+        failures = complete(self.kit, self.work, times, states, out)
         if failures > 0 and self.static is not None:
             self._become_dense()
-            failures = self.kernels.complete(self.kit, self.work, times, np.ascontiguousarray(states), out)
-        if failures > 0:
+            failures = complete(self.kit, self.work, times, states, out)
+        self.failures = failures
+        if failures > 0 and self.tells:
             _warn(f"at {failures} of {len(times)} times there are no accelerations and multipliers; they are NaN")
+
+
+def _blocks(groups: Groups) -> list[Groups]:
+    """Rows of intervals, as many at a time as have their interior states kept."""
+    return [groups[begin : begin + KEPT] for begin in range(0, len(groups), KEPT)]
 
 
 def _groups(table: Table, which: Groups) -> Groups:
@@ -304,7 +330,10 @@ def _groups(table: Table, which: Groups) -> Groups:
     groups = np.zeros((len(which), names.N_COLUMNS), dtype=np.int64)
     groups[:, names.FIRST_OWN], groups[:, names.LAST_OWN] = which, which + 1
     groups[:, names.KIND] = table.kinds[which]
-    jumps = np.flatnonzero(table.kinds == names.JUMP)
+    groups[:, names.HIGH] = len(table.t) - 1
+    (jumps,) = (table.kinds == names.JUMP).nonzero()
+    if not jumps.size:
+        return groups
     behind = np.searchsorted(jumps, which)
     groups[:, names.LOW] = np.append(0, jumps + 1)[behind]
     groups[:, names.HIGH] = np.append(jumps, len(table.t) - 1)[behind]

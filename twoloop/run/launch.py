@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from twoloop.checks.consistency import check_start, has_definite_mass
 from twoloop.generate.derived import standing_for
 from twoloop.generate.exact_derivatives import exact_near
-from twoloop.generate.families import give_bounds, take_bounds
+from twoloop.generate.families import Family, family_of, give_bounds, take_bounds
 from twoloop.generate.straight_code import OwnCode
 from twoloop.generate.traced_values import Traced, states_around
 from twoloop.methods.code_for import Compiled, code_for, may_have_code
@@ -18,6 +18,7 @@ from twoloop.methods.presets import is_preset
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.again import MOST_WAITING, Again
 from twoloop.run.comparison import unlike_before
+from twoloop.run.movable import Kin
 from twoloop.run.run import Run
 from twoloop.run.workspace import sparse_factors_pay
 
@@ -36,6 +37,7 @@ class Kept(NamedTuple):
     definite: bool  # whether M was
     moves: bool  # whether what it takes depends on the start by that alone
     waiting: list[Again]  # arrays for further runs, one a thread
+    kin: Kin | None = None  # what it shares with systems of other parameters
 
 
 class Asked(NamedTuple):
@@ -59,21 +61,27 @@ class Asked(NamedTuple):
 
 
 def record_again(
-    system: ConstrainedSystem, t0: float, q0: Array, v0: Array, asked: Asked
+    system: ConstrainedSystem, t0: float, q0: Array, v0: Array, asked: Asked, times: Array | None = None
 ) -> tuple[dict[str, Any], str] | None:
-    """The record of a run that keeps its steps alone, by the arrays of one before it, and what is said of its rows.
+    """The record of a run by the arrays of one before it, at its steps or at times, and what is said of its rows.
 
     None where there are none, or where something has to be looked at: then `run_from` begins it.
     """
     runs = system.made.get("runs", (None, None))[1]
     kept: Kept | None = None if runs is None else runs.get(asked.key)
+    if kept is None and (others := system.shared.get("runs")):
+        known = others.get((asked.key, _family_of(system)))
+        kept = known if isinstance(known, Kept) else None
     if kept is None or not kept.moves or not Again.suits(kept.run):
+        return None
+    if times is not None and not Again.interpolates(kept.run):
         return None
     try:
         again = kept.waiting.pop()
     except IndexError:
-        again = Again(kept.run.again(), system, kept.code, kept.definite)
-    record = again.record(t0, asked.t1, q0, v0, lambda run: _set_sizes(run, asked), asked.check_derivatives)
+        again = Again(kept.run.again(), system, kept.code, kept.definite, kept.kin)
+    call = asked.t1, q0, v0, lambda run: _set_sizes(run, asked), asked.check_derivatives, times
+    record = again.record(system, t0, *call)
     if len(kept.waiting) < MOST_WAITING:
         kept.waiting.append(again)
     return None if record is None else (record, again.run.said_of_rows)
@@ -103,19 +111,50 @@ def run_from(system: ConstrainedSystem, t0: float, q0: Array, v0: Array, asked: 
         run, code = _moved(kept, system, t0, q0, v0, asked), kept.code
     if run is None:
         run, code = _made(system, t0, q0, v0, asked)
+        if run.system is system:
+            _keep_for_kin(system, run, code, asked)
     if runs is None:  # it may be one of many systems, each of which is taken once
         runs = {}
     elif kept is None or (came_from == start != kept.start):
-        trusted = is_preset(asked.method) and all(traced.trusted for traced in run.traced)
-        if trusted and run.work.notes.base.size <= LARGEST:
+        made = _kept_of(run, code, asked)
+        if made is not None:
             runs = {} if len(runs) == MOST else dict(runs)  # another thread may look at the old one
-            fixed = asked.step_size is not None
-            settled = code is not None or not may_have_code(run.system, asked.method, fixed, asked.compiled)
-            definite = has_definite_mass(system, t0, q0)
-            moves = run.static is None and settled and (definite or not sparse_factors_pay(run.system, run.kit.flags))
-            runs[call] = Kept(run.again(), start, asked.t1, code, definite, moves, [])
+            runs[call] = made
     system.made["runs"] = start, runs
     return run
+
+
+def _kept_of(run: Run, code: OwnCode | None, asked: Asked, kin: Kin | None = None) -> Kept | None:
+    """What is kept of a run at its start, if it may be."""
+    system, n = run.system, run.system.n_q
+    trusted = is_preset(asked.method) and all(traced.trusted for traced in run.traced)
+    if not trusted or run.work.notes.base.size > LARGEST:
+        return None
+    t0, q0, v0 = run.t0, run.state[:n], run.state[n : 2 * n]
+    settled = code is not None or not may_have_code(system, asked.method, asked.step_size is not None, asked.compiled)
+    definite = has_definite_mass(system, t0, q0)
+    moves = run.static is None and settled and (definite or not sparse_factors_pay(system, run.kit.flags))
+    start = t0, q0.tobytes(), v0.tobytes()
+    return Kept(run.again(), start, asked.t1, code, definite, moves, [], kin)
+
+
+def _family_of(system: ConstrainedSystem) -> Family:
+    made: Family = system.remembered(("family", family_of), lambda: family_of(system))
+    return made
+
+
+def _keep_for_kin(system: ConstrainedSystem, run: Run, code: OwnCode | None, asked: Asked) -> None:
+    """Keep a run for systems of other parameters, from the second of these on."""
+    call, seen, known = (asked.key, _family_of(system)), system.functions, system.shared.get("runs", {})
+    if call not in known:
+        system.shared["runs"] = (known if len(known) < MOST else {}) | {call: seen}
+    elif type(known[call]) is type(seen) and known[call] is not seen:
+        try:
+            kin = Kin(run, code, asked.method, asked.step_size is not None, asked.compiled)
+        except ValueError:
+            known[call] = None
+        else:
+            known[call] = _kept_of(run, code, asked, kin)
 
 
 def _moved(kept: Kept, system: ConstrainedSystem, t0: float, q0: Array, v0: Array, asked: Asked) -> Run | None:

@@ -13,6 +13,8 @@ from twoloop.run.kept import Kept
 
 Array = NDArray[np.float64]
 
+PENDING = 1024  # states that wait for a look at the intervals between them, where nothing hurries it
+
 
 @dataclass(frozen=True)
 class Wanted:
@@ -73,6 +75,8 @@ class Recorder:
         self._kinds = np.empty(0, dtype=np.int64)
         self._next = 0  # the first interval of these that was not looked at
         self._n_outputs = 0
+        ends = wanted.events is not None and any(event.terminal < np.inf for event in wanted.events)
+        self._waits_for = 0 if ends or wanted.kept.finished else PENDING
         self.search = None if wanted.events is None else EventSearch(wanted.events, t0, state[: 2 * self._n_q])
         self._add(self._t, self._rows, self._kinds)
         if wanted.times is not None and not wanted.lands:
@@ -88,7 +92,8 @@ class Recorder:
             return
         self._t, self._rows = np.concatenate([self._t, t]), np.concatenate([self._rows, rows])
         self._kinds = np.concatenate([self._kinds, kinds])
-        self._look(len(self._t) - WINDOW)
+        if len(self._t) > self._waits_for:
+            self._look(len(self._t) - WINDOW)
 
     def _add(self, t: Array, rows: Array, kinds: NDArray[np.int64]) -> None:
         wanted, kept = self.wanted, self.wanted.kept
@@ -184,7 +189,7 @@ class Recorder:
         except KeyboardInterrupt:
             self.interrupted = True
             added[np.isnan(added).any(axis=1)] = np.nan  # a row that was half written, too
-        return np.hstack([rows, added])
+        return np.concatenate([rows, added], axis=1)
 
     def solution(self) -> DenseSolution | None:
         """The dense solution, if it is wanted."""

@@ -90,7 +90,7 @@ def _flags(system: ConstrainedSystem, t0: float, q0: Array, definite: bool) -> t
     """Flags with dense or banded algebra, and whether sparse factors would pay."""
     flags: Array = system.functions.flags.copy()
     if system.constant_mass:
-        flags[DIAGONAL_MASS] = _is_diagonal(system.mass(t0, q0))
+        flags[DIAGONAL_MASS] = is_diagonal(system.mass(t0, q0))
     reduced = not definite or system.n_q <= 2 * (system.n_c + system.n_a)
     flags[FORM] = NULL_SPACE if reduced else MULTIPLIERS
     bandwidth = system.bandwidth if definite and system.n_a == 0 else None
@@ -105,7 +105,8 @@ def sparse_factors_pay(system: ConstrainedSystem, flags: Array) -> bool:
     return sparse_pays(system.n_q, system.n_c + system.n_a, bool(flags[DIAGONAL_MASS]))
 
 
-def _is_diagonal(mass: Array) -> bool:
+def is_diagonal(mass: Array) -> bool:
+    """Whether M has no entries beside its diagonal."""
     return np.count_nonzero(mass) == np.count_nonzero(mass.diagonal())
 
 

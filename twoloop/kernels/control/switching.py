@@ -88,7 +88,7 @@ def switching_options(
     limit: float, looks: int, matrix_cost: float, dearer: float, each: ArrayLike, first: ArrayLike, second: ArrayLike
 ) -> NDArray[np.float64]:
     """`options`: of the pair, see LIMIT and what follows; then a rule and REUSE_OF of each; then their own."""
-    first = np.asarray(first, dtype=np.float64)
+    first = np.asarray(first)  # of numbers, or of formulas
     scalars = [limit, float(looks), matrix_cost, dearer, float(first.size)]
     return np.concatenate([scalars, np.asarray(each, dtype=np.float64).ravel(), first, np.asarray(second)])
 

@@ -1,0 +1,178 @@
+"""A run of one system of a family, made ready for others of it: they differ in parameters, which it takes as inputs.
+
+All that depends on parameters stands in arrays of its own: `p`, and numbers that are formulas in it. What decides by
+numbers is decided anew, and the callbacks are compared with one another and with what they were traced to for every
+vector of parameters, as at the first run of a system; along a run where no states or parameters were compared before.
+"""
+
+import copy
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twoloop.checks.consistency import has_definite_mass, is_definite
+from twoloop.checks.derivatives import check_derivatives
+from twoloop.generate.exact_derivatives import Territory, exact_derivatives, exact_near
+from twoloop.generate.families import family_of, give_bounds
+from twoloop.generate.formulas import Formulas
+from twoloop.generate.straight_code import OwnCode
+from twoloop.generate.traced_equations import runs_on_symbols
+from twoloop.generate.traced_values import refuse_wrong, unchecked
+from twoloop.kernels.data.flags import AUGMENTED, BANDWIDTH, DIAGONAL_MASS, FORM
+from twoloop.kernels.data.kit import Kit
+from twoloop.methods.code_for import Compiled, code_for
+from twoloop.methods.plan import Method, Plan
+from twoloop.methods.plans_for import plans_for
+from twoloop.problem.system import ConstrainedSystem
+from twoloop.run.run import Run
+from twoloop.run.workspace import is_diagonal, kit_with
+
+Array = NDArray[np.float64]
+
+NUMBERS = ("options", "numbers", "own_numbers")  # of a plan, that may be formulas
+PARTS = ("interior", "substitute", "within_newton")  # plans that a plan holds
+
+
+class Kin:
+    """What runs share that ask for the same of the systems of a family.
+
+    Parameters
+    ----------
+    run : Run
+        Of one of the systems, at its start, which stays there.
+    code : OwnCode or None
+        The machine code that its plan calls.
+    method, fixed, compiled
+        How it was asked for.
+
+    Raises
+    ------
+    ValueError
+        If not all is known that depends on the parameters.
+    """
+
+    def __init__(self, run: Run, code: OwnCode | None, method: Method, fixed: bool, compiled: Compiled):
+        system, t, q = run.system, run.t0, run.state[: run.system.n_q]
+        self.family, self._territories = family_of(system), dict[bool, Territory]()
+        form, banded = run.kit.flags[FORM], run.kit.flags[BANDWIDTH] >= 0
+        if run.static is not None or form == AUGMENTED or banded or system.entries:
+            raise ValueError("of large systems more is decided by numbers")
+        of_formulas = copy.copy(system)
+        of_formulas.made = {("family", family_of): self.family, ("numbers", self.family): lambda array: array}
+        own = code_for(of_formulas, method, fixed, compiled, t, q, unchecked)
+        self.plan, self.interiors = plans_for(of_formulas, method, run.rtol, run.least_atol, fixed, own, unchecked)
+        self.exact = exact_derivatives(of_formulas)
+        self.definite = has_definite_mass(system, t, q)
+        new = system.given.keys() - self.family.traced
+        self.family.traced |= {kind for kind in new if runs_on_symbols(system, kind, self.family.parameters)}
+        give_bounds(system)
+        if not self.family.within_bounds >= system.given.keys():
+            raise ValueError("a callback may branch on its parameters")
+        made = Movable(self, run.again()).run
+        if (code is None) is not (own is None) or _told(made) != _told(run):
+            raise ValueError("its numbers are not those of the family")
+
+    def territory(self, with_derivatives: bool) -> Territory:
+        """Where callbacks were compared."""
+        return self._territories.setdefault(with_derivatives, Territory())
+
+
+class Movable:
+    """Arrays of a run for the parameters of one system after another.
+
+    Parameters
+    ----------
+    kin : Kin
+    run : Run
+        A copy of that of the kin, at its start. It gets these arrays.
+
+    Attributes
+    ----------
+    given : ConstrainedSystem
+        The system that they are for.
+    system : ConstrainedSystem
+        The same with these arrays, and with what is remembered of it.
+    """
+
+    def __init__(self, kin: Kin, run: Run):
+        self.kin, self.run, self._formulas = kin, run, Formulas()
+        functions, array = run.system.functions, self._formulas.array
+        self._functions = functions._replace(p=functions.p.copy(), flags=functions.flags.copy())
+        run.plan = self._numbered(kin.plan).fresh()
+        run.interiors = {kind: self._numbered(each) for kind, each in kin.interiors.items()}
+        run.traced = run.plan.traced
+        self._remembered: dict[Any, Any] = {
+            ("family", family_of): kin.family,
+            ("derivatives", family_of): None if kin.exact is None else kin.exact.with_numbers(array),
+            ("kit", id(self._functions)): Kit(self._functions),
+            "kits": {},
+        }
+        self._take(run.system)
+        run.kit = kit_with(self.system, run.kit.flags, run.plan)
+        run.functions = run.kit.functions
+
+    @property
+    def parameters(self) -> Array:
+        """The vector that the arrays hold."""
+        return self._functions.p  # type: ignore[no-any-return]
+
+    def take(self, system: ConstrainedSystem) -> None:
+        """Be for a system of the family."""
+        if system is not self.given:
+            self._take(system)
+
+    def _take(self, system: ConstrainedSystem) -> None:
+        self.given = system
+        self._functions.p[:] = system.functions.p
+        self._formulas.write(self.kin.family.products(self._functions.p))
+        self.system = self.run.system = copy.copy(system)
+        self.system.functions, self.system.made = self._functions, self._remembered.copy()
+        self.system.within_bounds.update(self.kin.family.within_bounds)
+        self.system.checked, self._mass_agrees = False, not system.constant_mass
+        self.system.bandwidth = None  # no run of these makes use of it
+        for traced in self.run.traced:
+            traced.trusted = False
+
+    def agrees(self, t1: float, mass: Array, with_derivatives: bool) -> bool:
+        """Whether callbacks at the start of the run, to t1, and about it are as they should be, and M as it was.
+
+        `mass`: M at the start.
+        """
+        run, system, n = self.run, self.system, self.system.n_q
+        q, v = run.state[:n].copy(), run.state[n : 2 * n].copy()
+        if not self._mass_agrees:
+            system.remember_at("definite mass", None, is_definite(mass))
+            known = self.kin.definite, bool(run.kit.flags[DIAGONAL_MASS])
+            self._mass_agrees = known == (has_definite_mass(system, run.t0, q), is_diagonal(mass))
+        try:
+            if with_derivatives:
+                check_derivatives(system, run.t0, q, lambda: exact_near(system, run.t0, q, v))
+            refuse_wrong(run.traced, system, run.t0, t1, q, v)
+        except Exception:  # of a callback, too; the long way says what it is
+            return False
+        return self._mass_agrees
+
+    def _numbered(self, plan: Plan) -> Plan:
+        """A plan with these arrays in the place of formulas."""
+        array, known = self._formulas.array, vars(plan)
+        changes: dict[str, Any] = {name: array(known[name]) for name in NUMBERS if known[name] is not None}
+        changes |= {name: self._numbered(known[name]) for name in PARTS if known[name] is not None}
+        return plan.changed(traced=tuple(each.with_numbers(array) for each in plan.traced), **changes)
+
+
+def _told(run: Run) -> list[Any]:
+    """All that the plans of a run say, numbers to the bit."""
+    plans = [run.plan, *run.interiors.values()]
+    return [run.kit.flags.tobytes(), *(each for plan in plans for each in _of_plan(plan))]
+
+
+def _of_plan(plan: Plan) -> Iterator[Any]:
+    for name, value in vars(plan).items():
+        if isinstance(value, Plan):
+            yield from _of_plan(value)
+        elif name == "traced":
+            yield [part.tobytes() for each in value for part in each.program[:-1]]
+        elif name != "stable_to":  # a function without a name
+            yield value.tobytes() if isinstance(value, np.ndarray) else value
