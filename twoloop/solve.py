@@ -128,7 +128,8 @@ def solve_dae(
         Whether C_q, C_t, gamma and tangents are compared with differences at the first start of a system, and all but
         the tangents again at a few states of runs: with exact derivatives where the callbacks run on symbols, else with
         differences. Of compiled callbacks only states beyond those of earlier runs are compared, and the 2nd, 4th, 8th,
-        ... run as a whole.
+        ... run as a whole. With other parameters (`with_parameters`) they are compared at the start as those of a new
+        system; along runs, where they do not branch on parameters, as if these were coordinates.
     compiled : bool or "auto"
         Whether the equations of the mechanism become machine code of their own, for the methods "auto", "Taylor",
         "DOP853" and "Adams": as a rule two to four times as fast inside the integrator, less over a short call, and not

@@ -112,7 +112,7 @@ class Again:
         if not self._is_ready(system, t0, t1, q0, v0, set_sizes, check_derivatives):
             return None
         began = time.process_time()
-        code, n_rows, n_steps = self._steps_to(t1)
+        code, n_rows, n_steps = self._steps_to(t1, times is not None)
         if times is not None and code == a.ALL_OUTPUT_DONE:
             parts = self.t[: n_rows + 1], self.rows[: n_rows + 1], self.kinds[:n_rows]
             self.between.find(times, *parts, self.look.pattern)
@@ -144,7 +144,7 @@ class Again:
             "compiled": bool(self.plan.own),
         }
 
-    def _steps_to(self, t1: float) -> tuple[int, int, int]:
+    def _steps_to(self, t1: float, with_kinds: bool) -> tuple[int, int, int]:
         """How the steps of one chunk end, with how many states, beside the first, and steps in the arrays."""
         run, a, n_rows, n_steps = self.run, self.run.a, 0, 0
         run.control[a.STORE_ALL], run.control[a.MAX_ATTEMPTS], self.end[0] = 1.0, run.chunk, t1
@@ -156,9 +156,10 @@ class Again:
                 code = self._advance(run.kit, run.work, *arrays, self.end, *room, self.filled)
             except Exception:  # of a callback; the long way knows what to do
                 return INTERRUPTED, n_rows, n_steps
-            taken = self.steps[n_steps : n_steps + int(self.filled[1])]
-            self.kinds[n_steps : n_steps + len(taken)] = kinds_of(run, taken)
-            n_rows, n_steps = n_rows + int(self.filled[0]), n_steps + len(taken)
+            taken = slice(n_steps, n_steps + int(self.filled[1]))
+            if with_kinds:
+                self.kinds[taken] = kinds_of(run, self.steps[taken])
+            n_rows, n_steps = n_rows + int(self.filled[0]), taken.stop
             if code != a.HAS_TO_GIVE_WAY:
                 return code, n_rows, n_steps
             give_way(run)

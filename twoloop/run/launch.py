@@ -1,5 +1,6 @@
 """The run of a call, made ready to go: checked, with its plan; kept for equal calls that follow."""
 
+from contextlib import suppress
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -124,7 +125,7 @@ def run_from(system: ConstrainedSystem, t0: float, q0: Array, v0: Array, asked: 
     return run
 
 
-def _kept_of(run: Run, code: OwnCode | None, asked: Asked, kin: Kin | None = None) -> Kept | None:
+def _kept_of(run: Run, code: OwnCode | None, asked: Asked) -> Kept | None:
     """What is kept of a run at its start, if it may be."""
     system, n = run.system, run.system.n_q
     trusted = is_preset(asked.method) and all(traced.trusted for traced in run.traced)
@@ -135,7 +136,7 @@ def _kept_of(run: Run, code: OwnCode | None, asked: Asked, kin: Kin | None = Non
     definite = has_definite_mass(system, t0, q0)
     moves = run.static is None and settled and (definite or not sparse_factors_pay(system, run.kit.flags))
     start = t0, q0.tobytes(), v0.tobytes()
-    return Kept(run.again(), start, asked.t1, code, definite, moves, [], kin)
+    return Kept(run.again(), start, asked.t1, code, definite, moves, [])
 
 
 def _family_of(system: ConstrainedSystem) -> Family:
@@ -149,12 +150,13 @@ def _keep_for_kin(system: ConstrainedSystem, run: Run, code: OwnCode | None, ask
     if call not in known:
         system.shared["runs"] = (known if len(known) < MOST else {}) | {call: seen}
     elif type(known[call]) is type(seen) and known[call] is not seen:
-        try:
-            kin = Kin(run, code, asked.method, asked.step_size is not None, asked.compiled)
-        except ValueError:
-            known[call] = None
-        else:
-            known[call] = _kept_of(run, code, asked, kin)
+        kept = _kept_of(run, code, asked)
+        if kept is not None and kept.moves and Again.suits(kept.run):
+            fixed = asked.step_size is not None
+            with suppress(ValueError):
+                known[call] = kept._replace(kin=Kin(kept.run, code, asked.method, fixed, asked.compiled))
+                return
+        known[call] = None
 
 
 def _moved(kept: Kept, system: ConstrainedSystem, t0: float, q0: Array, v0: Array, asked: Asked) -> Run | None:
