@@ -171,7 +171,7 @@ def test_a_callback_that_raises_leaves_what_was_there(tmp_path):
     with pytest.raises(RuntimeError, match="broken"):
         swing(system=pendulum(force=broken), max_step=0.001, store=tmp_path / "run")
     found = twoloop.load(tmp_path / "run")
-    assert found.status is Status.INTERRUPTED and "not brought to its end" in found.message
+    assert found.status is Status.INTERRUPTED and "The run was interrupted" in found.message
     assert found.t[-1] > 0.0 and found.h.size == found.t.size - 1
 
 
@@ -204,5 +204,5 @@ def test_ctrl_c_and_the_death_of_the_process(default_four_bar, tmp_path, name):
         assert "Interrupted from the keyboard" in found.message
         assert out.stdout.split() == ["INTERRUPTED", str(found.t[-1]), str(found.t.size)]
     else:
-        assert out.returncode == -signal.SIGKILL and "not brought to its end" in found.message
+        assert out.returncode == -signal.SIGKILL and "The run was interrupted" in found.message
         assert found.h.size in (found.t.size - 1, found.t.size)

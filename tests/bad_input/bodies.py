@@ -152,11 +152,11 @@ BODIES: list[Case] = [
         "leave it out; a pin needs one where its friction has a coefficient",
     ),
     of_planar("friction in proportion to a load that two joints share", lambda: loaded(twice=True)).says(
-        "grows with the load of its joint, which is not determined: rows follow from others among",
+        "depends on the load of its joint, which is not determined: the rows of",
         "make one of them a slot (a distance, or a point on a curve), or give the friction as a number",
     ),
     of_planar("friction so large that a joint may jam", lambda: loaded(coefficient=50.0)).says(
-        "cannot be found at the start: coefficients are so large that a joint may jam",
+        "cannot be computed at the start: the coefficients are so large that a joint may jam",
         "give less; locks that hold themselves have no smooth law",
     ),
     of_planar("a distance of points that coincide", lambda: planar().distance("bar", (1, 0), "block", (1, 0))).says(
@@ -256,14 +256,12 @@ BODIES: list[Case] = [
         r"cannot be put together: the joint '.*' does not close", "look at the lengths around the loop"
     ),
     of_problem("a velocity that joints do not allow", locked).says(
-        "do not allow the velocities given: the rate of angle of bar was to be 2", "give velocities of fewer bodies"
+        "do not allow the velocities given: the rate of angle of bar is given as 2", "give velocities of fewer bodies"
     ),
     of_problem("a velocity across a skate", sideways).says(
-        "do not allow the velocities given: the rate of y of sledge was to be 1", "give one along the blade"
+        "do not allow the velocities given: the rate of y of sledge is given as 1", "give one along the blade"
     ),
-    of_problem(
-        "two drives that contradict", two_drives, "too many constraints for the motion asked", "leave one of them out"
-    ),
+    of_problem("two drives that contradict", two_drives, "the motion is over-constrained", "leave one of them out"),
     of_problem("a drive that begins far away", half_a_turn).says(
         "the bodies end half a turn from it", "give the bodies near to where the motion begins"
     ),

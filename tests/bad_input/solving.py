@@ -165,7 +165,7 @@ SOLVE = [
     *of_argument(
         "store",
         (3, TypeError, "must be a file name or a path; given 3", "give the path of a folder to make"),
-        (".", ValueError, "must be a folder that is still to be made; given '.', which exists", "take another name"),
+        (".", ValueError, "must be a folder that does not exist yet; given '.', which exists", "take another name"),
         ("no/run", ValueError, "must lie in a folder that exists; given 'no.run'", "make the folder above it"),
     ),
     of_solve("`Newmark(beta=1/6)` without `step_size`", lambda: case.solve(method=Newmark(beta=1.0 / 6.0))).says(

@@ -121,8 +121,8 @@ def test_where_the_load_or_the_friction_is_not_determined():
     first = double.prismatic("ground", "block", at=(0.0, 0.0), axis=(1.0, 0.0))
     double.prismatic("ground", "block", at=(1.0, 0.0), axis=(1.0, 0.0))
     double.friction(first, speed=0.1, coefficient=0.1)
-    with pytest.raises(ValueError, match="not determined: rows follow from others among"):
+    with pytest.raises(ValueError, match="not determined: the rows of"):
         double.problem()
     jams, *_ = cart(False, guide=60.0)
-    with pytest.raises(ValueError, match="cannot be found at the start: coefficients are so large"):
+    with pytest.raises(ValueError, match="cannot be computed at the start: the coefficients are so large"):
         jams.problem()

@@ -55,42 +55,42 @@ ODD = {
     ),
     "the same joint twice": (
         added(lambda m: m.revolute("ground", "bar", at=(0, 0))),
-        "Rows follow from others among 'pin', 'revolute bar-ground'.",
+        "The rows of 'pin', 'revolute bar-ground' are dependent.",
     ),
     "a bar on two pins of the ground": (
         added(lambda m: m.revolute("ground", "bar", at=(1, 0))),
-        "3 degrees of freedom. Rows follow from others among 'pin', 'revolute bar-ground'.",
+        "3 degrees of freedom. The rows of 'pin', 'revolute bar-ground' are dependent.",
     ),
     "a pin in a weld": (
         added(lambda m: m.fixed("ground", "bar", name="weld")),
-        "Rows follow from others among 'pin', 'weld'.",
+        "The rows of 'pin', 'weld' are dependent.",
     ),
     "hinges of a door, in line": (
         hinged(((0, 0, 1), (0, 0, 1)), (0, 0, 0), (0, 0, 1)),
-        "1 degree of freedom. Rows follow from others among 'hinge 0', 'hinge 1'.",
+        "1 degree of freedom. The rows of 'hinge 0', 'hinge 1' are dependent.",
     ),
     "hinges of a door, not in line": (hinged(((0, 0, 1), (0, 0.01, 1)), (0, 0, 0), (0, 0, 1)), "0 degrees of freedom."),
     "gears of inconsistent ratios": (both_wheels(2.0, 3.0), "0 degrees of freedom."),
     "a gear twice": (
         both_wheels(-1.0, -1.0),
-        "Rows follow from others among 'gear of pin 0 and pin 1', 'gear of pin 0 and pin 1 2'.",
+        "The rows of 'gear of pin 0 and pin 1', 'gear of pin 0 and pin 1 2' are dependent.",
     ),
     "a curve that is no curve": (
         added(lambda m: m.point_on_curve("ground", "block", at=(1, 0), curve=lambda x, y: 0.0 * x, name="slot")),
-        "Rows follow from others among 'slot'.",
+        "The rows of 'slot' are dependent.",
     ),
     "a point beside its curve": (
         added(lambda m: m.point_on_curve("ground", "block", at=(1.0, 0.2), curve=lambda x, y: y)),
         "Bodies were moved to close the joints, y of block by 0.2 m.",
     ),
-    "a body without a joint": (planar(), "'block' is in no joint, and no force is on it."),
+    "a body without a joint": (planar(), "'block' has no joint, and no force acts on it."),
     "a motor where a drive is": (
         added(lambda m: (m.motor("pin", 1.0), m.drive("pin", lambda t: t))),
         "'motor of pin' acts where 'drive of pin' prescribes the motion",
     ),
     "a stop, which `solve_dae` does not know": (
         added(lambda m: m.limit("pin", lower=-1.0)),
-        "solve_with_stops keeps its stops; solve_dae does not know them.",
+        "solve_with_stops handles its stops; solve_dae ignores them.",
     ),
     "degrees as the angle of a body": (turned(90.0), "angle of arm is 90 rad, more than a turn: angles are in rad"),
     "degrees as a limit": (

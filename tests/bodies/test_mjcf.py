@@ -177,7 +177,7 @@ def test_what_is_not_read_is_listed(tmp_path):
 @pytest.mark.parametrize(
     ("body", "message"),
     [
-        ('<joint/><joint axis="1 0 0"/><joint axis="0 1 0"/><geom size="1"/>', "are none that a model has"),
+        ('<joint/><joint axis="1 0 0"/><joint axis="0 1 0"/><geom size="1"/>', "have no counterpart in a model"),
         ("<joint/>", "has joints but no mass"),
         ('<joint axis="0 0 0"/><geom size="1"/>', "must have a direction"),
         ('<joint/><geom type="capsule" size="1"/>', "must be 2 positive numbers"),

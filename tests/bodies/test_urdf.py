@@ -207,7 +207,7 @@ def test_a_loop_that_is_given_beside_the_file(tmp_path):
         ('ixx="', 'ixx="x', "inertia of link 'shoulder' must be 6 finite numbers"),
         ('damping="', 'damping="x', "damping of joint 'turn' must be 1 finite numbers"),
         ('rpy="0.3 0 0"', 'quat_xyzw="1 0 0 0"', "has quat_xyzw, which is not read: give rpy"),
-        ("</robot>", '<link name="slide"/></robot>', "links must have different names; 'slide' is there twice"),
+        ("</robot>", '<link name="slide"/></robot>', "links must have different names; 'slide' occurs twice"),
     ],
 )
 def test_what_is_wrong_is_named(arm, old, new, message):

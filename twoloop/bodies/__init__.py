@@ -1,4 +1,4 @@
-"""Mechanisms from bodies and joints: masses, joints and forces in, a `Problem` with its equations out."""
+"""Mechanisms built from bodies, joints and forces; a model becomes a `Problem` with its equations of motion."""
 
 from twoloop.bodies.mjcf_geometry import IgnoredWarning
 from twoloop.bodies.mjcf_reader import from_mjcf

@@ -1,4 +1,4 @@
-"""How bodies are put together: positions, then velocities, and what the joints leave free, told by names."""
+"""Assembly of a model: consistent positions and velocities, degrees of freedom and redundant joints."""
 
 from __future__ import annotations
 
@@ -18,30 +18,30 @@ from twoloop.problem.description import name_and_unit
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.projection import consistent_state
 
-SINGULAR = 1e-9  # singular values of scaled rows that count as zero, over the largest
-NEARBY = 0.02  # of the largest coordinate, at least of 1: how far away the joints are looked at once more
-ROUGH = 0.1  # of the largest velocity given: by how much joints may change it
-ROUNDING = 8.0 * np.finfo(np.float64).eps  # of the terms of a constraint
-CLEAR = 1e-12  # reciprocal condition of C_q C_q^T from which the rank is full without a doubt
-TURN = 1e-4  # of the units of coordinates: a way over which it is seen how fast rows turn
-SMALL = 0.05  # rad or m, of a step to where a drive begins ...
-CORRECTIONS = 5  # ... and of Newton's in each
-STAYS = 1e-7  # of the size of the model: what a joint that cannot close leaves open at least
-ALIKE = 1e-3  # of a misfit by which two that are equal differ by rounding
+SINGULAR = 1e-9  # singular values of the scaled Jacobian below this fraction of the largest count as zero
+PERTURBATION = 0.02  # relative to max(1, |q|): displacement at which the rank is determined a second time
+VELOCITY_CHANGE = 0.1  # relative to the largest velocity given: largest change that the joints may require
+ROUNDING = 8.0 * np.finfo(np.float64).eps  # relative to the sum of the absolute terms of a constraint
+FULL_RANK_RCOND = 1e-12  # C_q C_q^T has full rank if its reciprocal condition number exceeds this
+DIFFERENCE_STEP = 1e-4  # relative to the scales of the coordinates: step of the central difference of C_q
+DRIVE_STEP = 0.05  # rad or m: continuation step towards the initial value of a drive
+NEWTON_ITERATIONS = 5  # per continuation step
+OPEN_TOLERANCE = 1e-7  # relative to the size of the model: a larger residual means that a joint does not close
+TIE = 1e-3  # relative: residuals closer than this count as equal
 
 
 @dataclass(frozen=True)
 class Freedom:
-    """What joints leave free.
+    """Degrees of freedom of a model.
 
     Attributes
     ----------
     degrees : int
-        Degrees of freedom: how many velocities are independent.
+        Number of independent velocities in the neighbourhood of the start.
     singular : int
-        How many more there are at the start alone, where the joints lose rank.
+        Number of additional degrees of freedom at the start itself, where C_q loses rank.
     redundant : tuple of tuple of str
-        Groups of joints among which a row follows from the others.
+        Groups of joints with linearly dependent rows.
     """
 
     degrees: int
@@ -58,25 +58,25 @@ def positions(
     rows: Mapping[str, tuple[int, ...]],
     coordinates: Sequence[str],
 ) -> Array:
-    """Bodies moved by the least change so that all joints close.
+    """Return positions that close all joints, as near to the guess as possible.
 
     Parameters
     ----------
     system : ConstrainedSystem
-        Without drives.
+        The system without drives.
     guess : ndarray (n_q,)
     turning : ndarray of bool (n_q,)
-        Which coordinates are rotations.
+        True for coordinates that are rotations.
     keep : sequence of int
-        Which stay as they are.
+        Coordinates that must not change.
     rows : mapping
-        Of each joint, by its name.
+        Row numbers of each joint, by its name.
     coordinates : sequence of str (n_q,)
 
     Raises
     ------
     ValueError
-        Naming the joint that does not close; or if the poses are so far off that they may be put together in two ways.
+        If a joint does not close (the message names it), or the poses are so far off that the assembly is ambiguous.
     """
     if system.n_c == 0:
         return guess
@@ -91,56 +91,56 @@ def positions(
     except ValueError as error:
         reason = re.sub(r"coordinate (\d+)", lambda of: name_and_unit(coordinates[int(of[1])])[0], str(error))
     if len(keep) or reason:
-        found = _nearest(system, t, guess, keep)
+        found = _least_squares_positions(system, t, guess, keep)
         left = np.abs(system.constraint(t, found))
-        if (left > STAYS * np.maximum(terms, terms.max())).any():
-            raise ValueError(_open(system, left, rows))
+        if (left > OPEN_TOLERANCE * np.maximum(terms, terms.max())).any():
+            raise ValueError(_open_joints_message(system, left, rows))
     if reason:
         raise ValueError(f"the bodies of {system.name!r} cannot be put together from the poses given: {reason}")
     return found
 
 
-def driven_there(system: ConstrainedSystem, t: float, start: Array, keep: Sequence[int]) -> Array:
-    """Where drives move bodies whose other joints are closed: in small steps, so that no assembly is left.
+def follow_drives(system: ConstrainedSystem, t: float, start: Array, keep: Sequence[int]) -> Array:
+    """Move the bodies in small steps to the initial values of the drives, staying on the same assembly branch.
 
     Raises
     ------
     ValueError
-        If the joints, or the bodies that are kept, do not let them.
+        If the joints, or the bodies that must not move, prevent it.
     """
     free = np.setdiff1d(np.arange(system.n_q), keep)
     q, values = start.copy(), system.constraint(t, start)
-    n = int(np.ceil(np.abs(values).max() / SMALL))
+    n = int(np.ceil(np.abs(values).max() / DRIVE_STEP))
     for k in range(1, n + 1):
-        for _ in range(CORRECTIONS):
+        for _ in range(NEWTON_ITERATIONS):
             off = system.constraint(t, q) - (1.0 - k / n) * values
             q[free] -= np.linalg.lstsq(system.jacobian(t, q)[:, free], off, rcond=SINGULAR)[0]
         left = np.abs(system.constraint(t, q) - (1.0 - k / n) * values).max()
-        if not left <= STAYS * max(1.0, float(np.abs(values).max())):
+        if not left <= OPEN_TOLERANCE * max(1.0, float(np.abs(values).max())):
             raise ValueError(
-                f"the drives of {system.name!r} ask at t = {t:g} for a position to which the joints do not let the "
-                f"bodies come: they get {(k - 1) / n:.0%} of the way. Give poses nearer to where the motion begins, "
+                f"the drives of {system.name!r} require at t = {t:g} a position that the joints do not permit: the "
+                f"bodies reach {(k - 1) / n:.0%} of the way. Give poses nearer to the start of the motion, "
                 "another motion, or keep fewer bodies"
             )
     return q
 
 
-def _open(system: ConstrainedSystem, left: Array, rows: Mapping[str, tuple[int, ...]]) -> str:
-    """Which joints stay open, by what is left of their rows."""
+def _open_joints_message(system: ConstrainedSystem, left: Array, rows: Mapping[str, tuple[int, ...]]) -> str:
+    """Return the message that names the joints which do not close."""
     misfit = {name: max((float(left[k]) for k in of if k < len(left)), default=0.0) for name, of in rows.items()}
-    # of misfits that are equal but for rounding the first is named, on every machine
-    worst = next(name for name in misfit if misfit[name] >= (1.0 - ALIKE) * max(misfit.values()))
+    # the first of equal residuals, so that the message does not depend on rounding
+    worst = next(name for name in misfit if misfit[name] >= (1.0 - TIE) * max(misfit.values()))
     others = [name for name in misfit if name != worst and misfit[name] > 0.1 * misfit[worst]]
     also = f" (nor do {', '.join(map(repr, others))})" if others else ""
     return (
-        f"the bodies of {system.name!r} cannot be put together: the joint {worst!r} does not close{also}; with the "
-        f"least misfit of all joints {misfit[worst]:.3g} remain in it. Look at lengths, at the points of these joints, "
-        "and at what else holds their bodies"
+        f"the bodies of {system.name!r} cannot be put together: the joint {worst!r} does not close{also}; the "
+        f"least-squares solution leaves a residual of {misfit[worst]:.3g} in it. Check the lengths, the points of "
+        "these joints, and the other joints of their bodies"
     )
 
 
-def _nearest(system: ConstrainedSystem, t: float, guess: Array, keep: Sequence[int]) -> Array:
-    """Where all joints together are off least, near the poses given."""
+def _least_squares_positions(system: ConstrainedSystem, t: float, guess: Array, keep: Sequence[int]) -> Array:
+    """Return the positions near the guess that minimise the norm of the constraints."""
     free = np.setdiff1d(np.arange(system.n_q), keep)
     q = guess.copy()
     if len(free) == 0:
@@ -165,19 +165,19 @@ def _nearest(system: ConstrainedSystem, t: float, guess: Array, keep: Sequence[i
 def velocities(
     system: ConstrainedSystem, t: float, q: Array, given: Array, known: NDArray[np.bool_], coordinates: Sequence[str]
 ) -> Array:
-    """Velocities that the joints allow: those given as they are, the others with the least kinetic energy.
+    """Return velocities that satisfy the constraints: those given, and for the others the least kinetic energy.
 
     Parameters
     ----------
     given : ndarray (n_q,)
     known : ndarray of bool (n_q,)
-        Which of them are given.
+        True where a velocity is given.
     coordinates : sequence of str (n_q,)
 
     Raises
     ------
     ValueError
-        If the joints do not allow the velocities given, or a drive asks for what they do not allow.
+        If the velocities given, or those of the drives, violate the constraints.
     """
     if system.n_c + system.n_a == 0 or not (known.any() or system.rates(t, q).any()):
         return np.where(known, given, 0.0)
@@ -185,14 +185,14 @@ def velocities(
     scales = scales_of(system, t, q, rows)
     scaled = scales.scaled(rows)
     v = np.where(known, given, 0.0) / scales.columns
-    for _ in range(2):  # the second time for rounding
+    for _ in range(2):  # the second pass removes rounding errors
         v = v - np.linalg.lstsq(scaled, scaled @ v + system.rates(t, q) / scales.rows, rcond=SINGULAR)[0]
     left = float(np.abs(scaled @ v + system.rates(t, q) / scales.rows).max(initial=0.0))
     speed = max(float(np.abs(v).max(initial=0.0)), float(np.abs(system.rates(t, q) / scales.rows).max(initial=0.0)))
     if left > SINGULAR * max(speed, 1e-3) * 100.0:
         raise ValueError(
-            f"the drives of {system.name!r} ask at t = {t:g} for velocities that its joints do not allow: too many "
-            "constraints for the motion asked. Leave a drive or a joint out"
+            f"the drives of {system.name!r} require at t = {t:g} velocities that its joints do not allow: the "
+            "motion is over-constrained. Remove a drive or a joint"
         )
     free = null_space(scaled, rcond=SINGULAR)
     target = np.where(known, given, 0.0) / scales.columns
@@ -206,16 +206,16 @@ def velocities(
         inert = free.T @ mass @ free
         v = v - free @ np.linalg.lstsq(inert, free.T @ (mass @ v), rcond=SINGULAR)[0]
     off = np.where(known, np.abs(v - target), 0.0)
-    if off.max(initial=0.0) > ROUGH * size:
+    if off.max(initial=0.0) > VELOCITY_CHANGE * size:
         j = int(off.argmax())
         name, unit = name_and_unit(coordinates[j])
         raise ValueError(
-            f"the joints and drives of {system.name!r} do not allow the velocities given: the rate of {name} was to be "
-            f"{given[j]:.6g}, and the nearest that they allow is {v[j] * scales.columns[j]:.6g}"
-            f"{f' ({unit}/s)' if unit else ''}. Give velocities of fewer bodies (the others follow), or fewer joints"
+            f"the joints and drives of {system.name!r} do not allow the velocities given: the rate of {name} is given "
+            f"as {given[j]:.6g}, and the nearest admissible value is {v[j] * scales.columns[j]:.6g}"
+            f"{f' ({unit}/s)' if unit else ''}. Give fewer velocities (the others are computed), or fewer joints"
         )
     v = v - np.linalg.lstsq(scaled, scaled @ v + system.rates(t, q) / scales.rows, rcond=SINGULAR)[0]
-    at_rest = np.where(~known & (np.abs(v) < ROUNDING * np.abs(v).max()), 0.0, v)  # without what rounding leaves
+    at_rest = np.where(~known & (np.abs(v) < ROUNDING * np.abs(v).max()), 0.0, v)  # rounding errors removed
     rates = system.rates(t, q) / scales.rows
     terms = ROUNDING * (np.abs(scaled) @ np.abs(at_rest) + np.abs(rates))
     if (np.abs(scaled @ at_rest + rates) <= np.maximum(np.abs(scaled @ v + rates), terms)).all():
@@ -224,24 +224,24 @@ def velocities(
 
 
 def freedom(system: ConstrainedSystem, t: float, q: Array, rows: Mapping[str, tuple[int, ...]]) -> Freedom:
-    """Degrees of freedom at a start and beside it, and which joints have rows that follow from others."""
+    """Return the degrees of freedom at the start and near it, and the joints with redundant rows."""
     if system.n_c + system.n_a == 0:
         return Freedom(system.n_q, 0, ())
-    if _full_by_entries(system, t, q):
+    if _has_full_rank_sparse(system, t, q):
         return Freedom(system.n_q - system.n_c - system.n_a, 0, ())
     scaled = _scaled(system, t, q)
-    if _full_rank(scaled):
+    if _has_full_rank(scaled):
         return Freedom(system.n_q - len(scaled), 0, ())
     at_start = _rank(system, t, q)
     beside = at_start
     free = null_space(scaled, rcond=SINGULAR)
     if free.shape[1]:
         direction = free @ np.random.default_rng(3).uniform(0.5, 1.0, free.shape[1])
-        away = q + NEARBY * max(1.0, float(np.abs(q).max())) * direction / np.abs(direction).max()
+        away = q + PERTURBATION * max(1.0, float(np.abs(q).max())) * direction / np.abs(direction).max()
         try:
             there = consistent_state(system, t, away, np.zeros(system.n_q), check_assembly=False)[0]
             beside = max(beside, _rank(system, t, there))
-        except ValueError:  # no way leads there: what is found at the start stands
+        except ValueError:  # no consistent state nearby: keep the rank at the start
             there = q
         q = there if beside > at_start else q
     degrees = system.n_q - beside
@@ -253,22 +253,22 @@ def _scaled(system: ConstrainedSystem, t: float, q: Array) -> Array:
     return scales_of(system, t, q, rows).scaled(rows)
 
 
-def _full_by_entries(system: ConstrainedSystem, t: float, q: Array) -> bool:
-    """The same as `_full_rank` of large systems that give their entries; False: their full matrices have to say."""
+def _has_full_rank_sparse(system: ConstrainedSystem, t: float, q: Array) -> bool:
+    """Return True if a large sparse system certainly has full rank; False if the dense test is needed."""
     rows = system.sparse_rows(t, q)
     if not isinstance(rows, SparseRows) or len(rows) > rows.shape[1]:
         return False
-    from scipy.sparse import csc_array  # which takes a while
+    from scipy.sparse import csc_array  # slow to import
     from scipy.sparse.linalg import LinearOperator, onenormest, splu
 
     size = np.abs(q)
     columns = column_scales(rows, np.maximum(size, median(size[size > 0.0]) if size.any() else 1.0))
-    way, units = TURN * columns * generic_factors(len(q)), columns[rows.columns]
+    way, units = DIFFERENCE_STEP * columns * generic_factors(len(q)), columns[rows.columns]
     try:
         sides = [rows.added(system.jacobian_values(t, q + part)) for part in (way, -way)]
-    except Exception:  # outside what the callbacks are made for
+    except Exception:  # outside the domain of the callbacks
         return False
-    turned = norms(rows.with_values((sides[0] - sides[1]) * units)) / (2.0 * TURN)
+    turned = norms(rows.with_values((sides[0] - sides[1]) * units)) / (2.0 * DIFFERENCE_STEP)
     lengths = np.maximum(norms(rows.with_values(rows.values * units)), TURNS * turned)
     if not (lengths > 0.0).all():
         return False
@@ -279,16 +279,16 @@ def _full_by_entries(system: ConstrainedSystem, t: float, q: Array) -> bool:
     except RuntimeError:  # exactly singular
         return False
     inverse = LinearOperator(square.shape, matvec=factors.solve, rmatvec=factors.solve, dtype=float)
-    return bool(abs(square).sum(axis=0).max() * onenormest(inverse) < 1.0 / CLEAR)
+    return bool(abs(square).sum(axis=0).max() * onenormest(inverse) < 1.0 / FULL_RANK_RCOND)
 
 
-def _full_rank(scaled: Array) -> bool:
-    """Whether all rows are independent without a doubt: far cheaper to say than the rank."""
+def _has_full_rank(scaled: Array) -> bool:
+    """Return True if the rows certainly have full rank; much cheaper than the rank itself."""
     if len(scaled) > scaled.shape[1]:
         return False
     square = scaled @ scaled.T
     factor, info = lapack.dpotrf(square)
-    return bool(info == 0 and lapack.dpocon(factor, np.abs(square).sum(axis=0).max())[0] > CLEAR)
+    return bool(info == 0 and lapack.dpocon(factor, np.abs(square).sum(axis=0).max())[0] > FULL_RANK_RCOND)
 
 
 def _rank(system: ConstrainedSystem, t: float, q: Array) -> int:
@@ -300,9 +300,9 @@ def _rank(system: ConstrainedSystem, t: float, q: Array) -> int:
 def _redundant(
     system: ConstrainedSystem, t: float, q: Array, rows: Mapping[str, tuple[int, ...]]
 ) -> tuple[tuple[str, ...], ...]:
-    """Joints whose rows depend on one another, in groups that have no joint in common."""
+    """Return disjoint groups of joints whose rows are linearly dependent."""
     idle = null_space(_scaled(system, t, q).T, rcond=SINGULAR)
-    part = idle @ idle.T  # the projector onto what rows cancel each other
+    part = idle @ idle.T  # projector onto the null space of C_q^T
     groups: list[set[str]] = []
     involved = {name: list(of) for name, of in rows.items() if np.abs(part[list(of)]).max(initial=0.0) > 1e-6}
     for name, of in involved.items():

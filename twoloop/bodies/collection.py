@@ -1,4 +1,4 @@
-"""What a model collects: bodies, joints and forces under names of their own, and how arguments name them."""
+"""Bodies, joints and forces of a model with unique names, and the interpretation of arguments that refer to them."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ AXES = ("x", "y", "z")
 
 @documented
 class Collection:
-    """Bodies, joints and forces, in two or three dimensions."""
+    """Bodies, joints and forces, in the plane or in space."""
 
     dimension: int
-    distance_kind: int  # of the row of a distance, in the callbacks
+    distance_kind: int  # kind of the row of a distance, see `parameter_layout`
 
     def __init__(self, gravity: ArrayLike, name: str):
         self.gravity = check_vector("gravity", gravity, self.dimension)
@@ -36,7 +36,7 @@ class Collection:
         self.forces: list[Force] = []
         self.stops: list[Stop] = []
         self.dry: list[DryFriction] = []
-        self.taken: list[Numbers] = []  # by racks and limits, which go on with these values
+        self.taken: list[Numbers] = []  # fixed values: racks and limits were made with them
 
     def __repr__(self) -> str:
         return (
@@ -45,7 +45,7 @@ class Collection:
         )
 
     def _no_rotation(self) -> Any:
-        """The angle, or the matrix, of the ground."""
+        """Return the angle or the rotation matrix of the ground."""
         raise NotImplementedError
 
     def _add_body(self, body: Body) -> Body:
@@ -61,7 +61,7 @@ class Collection:
         return force
 
     def _new_name(self, what: str, name: str | None, *bodies: Body) -> str:
-        """A name that nothing else has: the one given, or one of the kind and the bodies."""
+        """Return a unique name: the one given, or one made of the kind and the bodies."""
         known = {each.name for part in (self.bodies, self.joints, self.forces, self.stops) for each in part} | {
             "ground"
         }
@@ -69,7 +69,7 @@ class Collection:
             if not check_text("name", name).strip():
                 raise ValueError(f"name must not be empty; given {name!r}")
             if name in known:
-                raise ValueError(f"name must be new in the model: something is called {name!r} already")
+                raise ValueError(f"name must be unique in the model: {name!r} is already taken")
             return name
         ordered = bodies[::-1] if bodies and bodies[0].number == NONE else bodies
         made = f"{what} {'-'.join(body.name for body in ordered)}" if bodies else what
@@ -79,13 +79,13 @@ class Collection:
         return new
 
     def _body(self, argument: str, given: Any) -> Body:
-        """A body of this model, by itself or by its name."""
+        """Return a body of this model, given as an object or by its name."""
         if isinstance(given, Body):
             if given is self.ground or any(given is body for body in self.bodies):
                 return given
             raise ValueError(f"{argument} must be a body of this model; {given.name!r} belongs to another")
         if not isinstance(given, str):
-            raise TypeError(f"{argument} must be a body, what body(...) returned, or its name; given {shown(given)}")
+            raise TypeError(f"{argument} must be a body, as returned by body(...), or its name; given {shown(given)}")
         for body in (self.ground, *self.bodies):
             if body.name == given:
                 return body
@@ -103,12 +103,12 @@ class Collection:
             raise ValueError(f"a and b of a {kind} must be two bodies; given {a.name!r} twice")
 
     def _joint(self, given: Any, kinds: tuple[str, ...], what: str) -> ModelJoint:
-        """A joint of this model of one of some kinds, by itself or by its name."""
+        """Return a joint of this model that is of one of the given kinds, given as an object or by its name."""
         found = next((joint for joint in self.joints if given is joint or joint.name == given), None)
         if found is None:
             if not isinstance(given, (ModelJoint, str)):
                 raise TypeError(
-                    f"joint must be what revolute(...) and its kin returned, or its name; given {shown(given)}"
+                    f"joint must be a joint, as returned by revolute(...) etc., or its name; given {shown(given)}"
                 )
             if isinstance(given, ModelJoint):
                 raise ValueError(f"joint must be one of this model; {given.name!r} belongs to another")
@@ -119,7 +119,7 @@ class Collection:
         return found
 
     def _point(self, argument: str, given: Any, body: Body) -> Array:
-        """A point in the axes of a body, given there or in space."""
+        """Return a point in the axes of a body, given in these axes or in space."""
         if isinstance(given, BodyPoint):
             if given.body is not body:
                 raise ValueError(f"{argument} must be a point on {body.name!r}; given one on {given.body.name!r}")
@@ -127,7 +127,7 @@ class Collection:
         return body.local_point(check_vector(argument, given, self.dimension))
 
     def _points(self, at: Any, a: Body, b: Body) -> tuple[Array, Array]:
-        """The point of a joint in the axes of both bodies: one in space, or a pair of theirs."""
+        """Return the point of a joint in the axes of both bodies, given as one point in space or as a pair."""
         if isinstance(at, (tuple, list)) and any(isinstance(each, BodyPoint) for each in at):
             if len(at) != 2:
                 raise ValueError(f"at must be a point in space, or a pair of points of a and b; given {shown(at)}")
@@ -141,7 +141,7 @@ class Collection:
         return a.local_point(place), b.local_point(place)
 
     def _direction(self, argument: str, given: Any, body: Body) -> Array:
-        """A unit direction in the axes of a body, given there or in space."""
+        """Return a unit vector in the axes of a body, given in these axes or in space."""
         if isinstance(given, BodyDirection):
             if given.body is not body:
                 raise ValueError(f"{argument} must be a direction on {body.name!r}; given one on {given.body.name!r}")
@@ -154,7 +154,7 @@ class Collection:
         return direction / length
 
     def _directions(self, axis: Any, a: Body, b: Body) -> tuple[Array, Array]:
-        """The axis of a joint in the axes of both bodies."""
+        """Return the axis of a joint in the axes of both bodies."""
         if isinstance(axis, (tuple, list)) and any(isinstance(each, BodyDirection) for each in axis):
             if len(axis) != 2:
                 raise ValueError(f"axis must be a direction, or a pair of directions of a and b; given {shown(axis)}")
@@ -162,12 +162,12 @@ class Collection:
         return self._direction("axis", axis, a), self._direction("axis", axis, b)
 
     def _numbers(self, name: str, body: Body, place: Array) -> Numbers:
-        """The place of a point on a body, named by what is there."""
+        """Return the named coordinates of a point on a body."""
         names = (f"{axis} of {name} on {body.name} (m)" for axis in AXES[: self.dimension])
         return Numbers(tuple(place.tolist()), tuple(names))
 
     def _function(self, name: str, given: Any, size: int, unit: str) -> tuple[Function | None, Numbers | None]:
-        """The f of a force, a torque or a motor: a function, or constant numbers with names."""
+        """Return the f of a force, torque or motor: a function, or named constants."""
         found = force_function(f"f of {name!r}", given, size)
         if isinstance(found, Function):
             return found, None
@@ -175,7 +175,7 @@ class Collection:
         return None, Numbers(tuple(found.tolist()), tuple(f"{part} of {name} ({unit})" for part in parts))
 
     def _pair(self, kind: str, a: Any, b: Any, name: str | None, at: Any) -> tuple[Body, Body, str, Points]:
-        """Bodies and name of a joint, and its point on both; None: the centre of mass of b, or of a on the ground."""
+        """Return bodies, name and points of a joint; default point: the centre of mass of b, or of a on the ground."""
         first, second = self._body("a", a), self._body("b", b)
         self._different(f"{kind} joint", first, second)
         name = self._new_name(kind, name, first, second)
@@ -185,17 +185,17 @@ class Collection:
         return first, second, name, (self._numbers(name, first, here), self._numbers(name, second, there))
 
     def _weld(self, name: str, a: Body, b: Body, points: Points) -> tuple[JointRow, ...]:
-        """The rows that let two bodies move as one."""
+        """Return the rows that fix two bodies to each other."""
         raise NotImplementedError
 
     def fixed(self, a: Body | str, b: Body | str, *, at: Any = None, name: str | None = None) -> ModelJoint:
-        """Both bodies move as one.
+        """Fix two bodies to each other.
 
         Parameters
         ----------
         a, b : Body or str
         at : array_like (2,) or (3,) or (BodyPoint, BodyPoint), optional
-            To which the reaction refers, m. None: the centre of mass of b, or of a if b is the ground.
+            Point of reference of the reaction, m. None: the centre of mass of b, or of a if b is the ground.
         """
         first, second, name, points = self._pair("fixed", a, b, name, at)
         return self._add_joint(
@@ -205,7 +205,7 @@ class Collection:
     def _apart(
         self, kind: str, a: Any, at_a: Any, b: Any, at_b: Any, name: str | None
     ) -> tuple[Body, Body, str, Points, float]:
-        """Bodies and name of what is between two points, these points, and their distance in the position given."""
+        """Return the bodies and name of a part between two points, the points, and their initial distance."""
         first, second = self._body("a", a), self._body("b", b)
         self._different(kind, first, second)
         name = self._new_name(kind.removesuffix(" joint"), name, first, second)
@@ -223,7 +223,7 @@ class Collection:
         length: float | None = None,
         name: str | None = None,
     ) -> ModelJoint:
-        """A massless rod between a point of a and a point of b.
+        """Add a massless rod between a point of a and a point of b.
 
         Parameters
         ----------
@@ -237,14 +237,16 @@ class Collection:
         if length is None:
             length = apart
             if length == 0.0:
-                raise ValueError(f"the points of {name!r} coincide in the position given; give a length, or take a pin")
+                raise ValueError(
+                    f"the points of {name!r} coincide in the position given; give a length, or use a revolute joint"
+                )
         check_positive(f"length of {name!r}", length)
         long = Numbers((float(length),), (f"length of {name} (m)",))
         row = JointRow(self.distance_kind, 1, first, second, *points, long)
         return self._add_joint(ModelJoint(name, "distance", first, second, (row,), *points))
 
     def _new_body(self, name: str, mass: float, position: ArrayLike, velocity: ArrayLike | None) -> tuple[Any, ...]:
-        """What bodies have in two and three dimensions, checked: name, position, mass, velocity."""
+        """Check what bodies in the plane and in space have in common; return name, position, mass and velocity."""
         name = self._new_name("body", check_text("name", name))
         check_positive(f"mass of {name!r}", mass)
         place = check_vector(f"position of {name!r}", position, self.dimension)

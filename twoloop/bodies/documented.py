@@ -1,17 +1,17 @@
-"""What the docstrings of all methods that add to a model end with, written once."""
+"""Appends the common sections to the docstrings of all methods that add to a model."""
 
 import inspect
 from typing import Any
 
-NAME = "name : str, optional\n    For messages and results. None: made of the kind and the bodies.\n"
+NAME = "name : str, optional\n    Used in messages and results. None: made of the kind and the bodies.\n"
 RAISED = "Raises\n------\n"
-RAISES = f"{RAISED}TypeError, ValueError\n    If an argument is wrong, or something of the model has this name."
+RAISES = f"{RAISED}TypeError, ValueError\n    If an argument is invalid, or the name is taken."
 
 
 def documented(cls: Any) -> Any:
-    """Add name, return and, unless it is there, what is raised to docstrings of methods that add to a model."""
+    """Add the sections on name, return value and exceptions to docstrings of methods that add to a model."""
     for method in vars(cls).values():
-        text = inspect.cleandoc(getattr(method, "__doc__", None) or "")  # none by python -OO
+        text = inspect.cleandoc(getattr(method, "__doc__", None) or "")  # python -OO removes docstrings
         adds = inspect.isfunction(method) and "Parameters\n---" in text and "Returns\n---" not in text
         if adds and method.__annotations__["return"] != "None":
             text, raised, which = text.partition(RAISED)

@@ -1,4 +1,4 @@
-"""Rows that are functions of coordinates, in a plane and in space: read from the results of their program."""
+"""Constraint rows given by functions of the coordinates, evaluated from the results of their program."""
 
 from twoloop.bodies.parameter_layout import RATE
 from twoloop.bodies.read_tables import joint_at, joint_places
@@ -7,14 +7,14 @@ from twoloop.kernels.compile.caches import helper
 
 @helper
 def fill_entries(p, columns, made, first_result, entries):
-    """Derivatives by the coordinates that a row depends on, listed from place `columns` on, into entries (n_q,)."""
+    """Add the derivatives with respect to the coordinates listed from `columns` on to entries (n_q,)."""
     for m in range(int(p[columns])):
         entries[int(p[columns + 1 + m])] = made[first_result + m]
 
 
 @helper
 def put_entries(p, columns, made, first_result, values, begin):
-    """The same into values from a place on; where the next begin."""
+    """Store the derivatives in values from `begin` on; return the position after the last."""
     for m in range(int(p[columns])):
         values[begin + m] = made[first_result + m]
     return begin + int(p[columns])
@@ -22,7 +22,7 @@ def put_entries(p, columns, made, first_result, values, begin):
 
 @helper
 def fill_nonholonomic(p, made, A):
-    """A."""
+    """Evaluate A."""
     for k in joint_places(p):
         kind, row, _, _, _, _, columns, result = joint_at(p, k)
         if kind == RATE:
@@ -31,7 +31,7 @@ def fill_nonholonomic(p, made, A):
 
 @helper
 def fill_nonholonomic_gamma(p, made, Qa):
-    """The right-hand side of A a = Q_a."""
+    """Evaluate the right-hand side of A a = Q_a."""
     for k in joint_places(p):
         kind, row, _, _, _, _, _, result = joint_at(p, k)
         if kind == RATE:

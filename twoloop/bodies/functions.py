@@ -1,4 +1,4 @@
-"""Functions that a user gives: forces of t, q and v, motions of t. They are traced once to programs, if they can be."""
+"""Functions given by the user: forces of t, q and v, motions of t. They are traced once to programs where possible."""
 
 from __future__ import annotations
 
@@ -21,21 +21,21 @@ ARGUMENTS = {1: "(t)", 3: "(t, q, v)"}
 
 @dataclass(frozen=True, eq=False)
 class Function:
-    """A function of a force, a torque, a motor, or a motion with its derivatives.
+    """A force, torque or motor torque given as a function, or a motion with its derivatives.
 
     Attributes
     ----------
     name : str
-        Of the argument, and of what has it, for messages.
+        Names the argument and its owner in messages.
     function : callable
     n_arguments : int
-        1: of t; 3: of t, q and v.
+        1: t; 3: t, q and v.
     size : int
-        How many numbers it gives.
+        Number of values returned.
     derivatives : tuple of callable
-        Of a motion: its first and second derivative, if they are given.
+        First and second derivative of a motion, if given.
     traced : ndarray or None
-        Of a motion without: a program of t that gives all three.
+        Program that evaluates a motion and its traced derivatives, if these are not given.
     """
 
     name: str
@@ -47,11 +47,11 @@ class Function:
 
     @property
     def n_results(self) -> int:
-        """How many numbers its program gives: of a motion three."""
+        """Number of results of its program; three for a motion."""
         return 3 if self.derivatives or self.traced is not None else self.size
 
     def at(self, t: float, q: Array, v: Array) -> Array:
-        """What it gives, of the right shape; of a motion its derivatives, too."""
+        """Evaluate the function and check the shape; for a motion, with its derivatives."""
         arguments = (t, q.copy(), v.copy())[: self.n_arguments]
         try:
             made = [self._checked(each(*arguments)) for each in (self.function, *self.derivatives)]
@@ -59,7 +59,7 @@ class Function:
             error.add_note(f"raised by {self.name} at t = {t!r}")
             raise
         if self.traced is not None:
-            from twoloop.bodies.program_results import results  # whose import compiles
+            from twoloop.bodies.program_results import results  # compiled on import
 
             made.append(results(0, t, np.zeros(0), np.zeros(0), self.traced)[1:3])
         return np.concatenate(made)
@@ -72,7 +72,7 @@ class Function:
         return array.reshape(self.size)
 
     def forms(self, graph: Graph, t: Form, q: Sequence[Form], v: Sequence[Form]) -> list[Form]:
-        """What it makes of symbols; raises Untraceable."""
+        """Return the results for symbolic arguments; raise Untraceable if that fails."""
         arguments = (t, symbols(q), symbols(v))[: self.n_arguments]
         made: list[Form] = []
         for each in (self.function, *self.derivatives):
@@ -84,12 +84,12 @@ class Function:
 
 
 def force_function(name: str, given: Any, size: int) -> Function | Array:
-    """A function of t or of t, q and v as it is given, or constant numbers.
+    """Return a function of t or of t, q and v, or constants.
 
     Raises
     ------
     TypeError, ValueError
-        If it is neither.
+        If the argument is neither.
     """
     if callable(given):
         return Function(name, given, _n_arguments(name, given, (1, 3)), size)
@@ -105,17 +105,17 @@ def force_function(name: str, given: Any, size: int) -> Function | Array:
 
 
 def motion_function(name: str, motion: Any, rate: Any, acceleration: Any) -> Function:
-    """A motion of t with its derivatives, which are traced where they are not given.
+    """Return a motion with its derivatives, which are traced if they are not given.
 
     Raises
     ------
     TypeError, ValueError
-        If they are no functions of t, or the derivatives neither given nor found.
+        If an argument is not a function of t, or the derivatives are neither given nor can be traced.
     """
     if not callable(motion):
         raise TypeError(f"{name} must be a function of t, such as lambda t: 0.5 * np.sin(2.0 * t); given {motion!r}")
     if (rate is None) != (acceleration is None):
-        raise TypeError(f"rate and acceleration of {name} go together: give both, or none to have them derived")
+        raise TypeError(f"rate and acceleration of {name} go together: give both, or neither to have them derived")
     for each in (motion, rate, acceleration):
         if each is not None and not callable(each):
             raise TypeError(f"rate and acceleration of {name} must be functions of t; given {each!r}")
@@ -127,14 +127,14 @@ def motion_function(name: str, motion: Any, rate: Any, acceleration: Any) -> Fun
             return replace(function, traced=np.array(numbers_of(program_for([function], 0, True))))
         except Untraceable as error:
             raise ValueError(
-                f"{error}; so its derivatives do not follow from it. Write it with numpy's functions and without "
+                f"{error}; so its derivatives cannot be derived. Write it with numpy functions and without "
                 "branches, or give rate= and acceleration=, its first and second derivative as functions of t"
             ) from None
     return function
 
 
 def motion_forms(function: Function, graph: Graph, t: Form) -> list[Form]:
-    """A motion and two derivatives."""
+    """Return a motion and its first two derivatives as symbols."""
     made = function.forms(graph, t, [], [])
     if not function.derivatives:
         (place,) = t.terms
@@ -144,7 +144,7 @@ def motion_forms(function: Function, graph: Graph, t: Form) -> list[Form]:
 
 
 def program_for(functions: Sequence[Function | RowFunction], n_q: int, motions: bool) -> Program:
-    """One program for all functions, in their order; raises Untraceable."""
+    """Return one program for all functions, in order; raise Untraceable if one cannot be traced."""
     graph = Graph()
     (t,) = graph.inputs(1, False)
     q, v = graph.inputs(n_q, False), graph.inputs(n_q, True)
@@ -161,7 +161,7 @@ def program_for(functions: Sequence[Function | RowFunction], n_q: int, motions: 
 
 
 def is_constant(function: Function | RowFunction) -> bool:
-    """Whether a motion is known to hold its joint still."""
+    """Return True if a motion is known to be constant."""
     if isinstance(function, RowFunction):
         return True
     graph = Graph()
@@ -175,7 +175,7 @@ def _n_arguments(name: str, function: Any, allowed: tuple[int, ...]) -> int:
     expected = " or ".join(ARGUMENTS[n] for n in allowed)
     try:
         parameters = inspect.signature(function).parameters.values()
-    except (TypeError, ValueError):  # built-in functions have none to look at
+    except (TypeError, ValueError):  # built-in functions have no signature
         return allowed[0]
     places = [each for each in parameters if each.kind in (each.POSITIONAL_ONLY, each.POSITIONAL_OR_KEYWORD)]
     needed = sum(each.default is each.empty for each in places)

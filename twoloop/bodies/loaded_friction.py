@@ -1,4 +1,4 @@
-"""Friction in proportion to the load of a joint: with the forces in the joints, found at every evaluation."""
+"""Friction proportional to the load of a joint, which requires the joint forces at every evaluation."""
 
 from __future__ import annotations
 
@@ -12,27 +12,27 @@ from twoloop.bodies.places import turned
 from twoloop.bodies.tables import Tables
 from twoloop.checks.arguments import Array
 
-STEPS = 50  # of Newton's method, which needs three or four
-AGREES = 1e-14  # relative: friction, from step to step
-DEPENDENT = 1e-12  # relative: singular values of rows
+STEPS = 50  # limit of Newton's method, which needs three or four iterations
+AGREES = 1e-14  # relative: change of the friction per iteration at convergence
+DEPENDENT = 1e-12  # relative: smaller singular values of the constraint rows count as zero
 
 
 class LoadedFriction:
-    """Friction -c tanh(rate / speed) |F| of joints, where F are forces in these that depend on the friction in turn.
+    """Friction -c tanh(rate / speed) |F| in joints, where the joint forces F depend on the friction in turn.
 
-    M a + G^T lam = Q + W^T f and G a = gamma give lam = lam_0 + L f. With f = -c |P lam|, c the coefficients times
-    tanh, this has one solution if the spectral radius of the entries c_k |P_k L_l| is below one, as f -> -c |P lam(f)|
-    contracts then. Beyond that a joint may jam, or there may be several (P. Painlevé, Leçons sur le frottement, 1895);
-    there the friction has no value, NaN.
+    M a + G^T lam = Q + W^T f and G a = gamma give lam = lam_0 + L f. With f = -c |P lam|, where c are the coefficients
+    times tanh, the solution is unique if the matrix of the c_k |P_k L_l| has a spectral radius below one, because
+    f -> -c |P lam(f)| is then a contraction. Otherwise a joint may jam or several solutions may exist (P. Painlevé,
+    Leçons sur le frottement, 1895), and the friction is NaN.
 
     Parameters
     ----------
     callbacks : module
-        Of models in a plane or in space.
+        The callbacks of planar or of spatial models.
     tables : Tables
-        Some of whose forces are `loaded`.
+        Tables with `loaded` forces.
     redundant : bool
-        Whether rows of the constraints follow from others, those of these joints excepted.
+        True if constraint rows other than those of these joints may be dependent.
     """
 
     def __init__(self, callbacks: Any, tables: Tables, redundant: bool):
@@ -41,17 +41,17 @@ class LoadedFriction:
         self._numbers = [tables.place(force) + np.arange(_size(force)) for force in tables.loaded]
         self._rows = [self._carrying(force, tables) for force in tables.loaded]
         first = int(tables.p[tables.p.size - HEAD + FORCES]) + FORCE_WIDTH * len(tables.forces)
-        # rows of unit motors, behind the forces
+        # rows of the unit motors, after those of the forces
         self._units = [first + FORCE_WIDTH * k for k in range(len(self._loaded))]
 
     def _carrying(self, force: Force, tables: Tables) -> list[int]:
-        """The rows that carry the load of a joint: those of its point, or across its guide."""
+        """Return the rows that carry the load of a joint: those of its point, or those across its guide."""
         joint = force.joint
         assert joint is not None
         return list(tables.rows[joint.name][: self._dimension - (joint.kind == "prismatic")])
 
     def of(self, q: Array, v: Array, p: Array, Q: Array, M: Array, G: Array, gamma: Array) -> Array:
-        """What it adds to Q, (n_q,)."""
+        """Return the contribution to Q, (n_q,)."""
         W = np.array([self._along(k, q, p) for k in range(len(self._loaded))])
         c = np.array([_slope(p[at], rate) for at, rate in zip(self._numbers, W @ v, strict=True)])
         if not c.any():
@@ -68,7 +68,7 @@ class LoadedFriction:
         return W.T @ _friction(c, loads)
 
     def _along(self, k: int, q: Array, p: Array) -> Array:
-        """By how much a joint turns or slides with the coordinates: the generalised force of a unit motor."""
+        """Return the generalised force of a unit motor in a joint, i.e. the gradient of its displacement."""
         alone, out = p.copy(), np.zeros(len(q))
         alone[: self._dimension] = 0.0  # gravity
         alone[p.size - HEAD + FORCES], alone[p.size - HEAD + N_FORCES] = self._units[k], 1.0
@@ -76,7 +76,7 @@ class LoadedFriction:
         return out
 
     def _across(self, force: Force, q: Array, lam: Array) -> Array:
-        """Of the forces of a hinge in space, those across its axis: the thrust is without friction."""
+        """Return the components of the force in a spatial hinge across its axis; the thrust causes no friction."""
         joint = force.joint
         assert joint is not None
         if self._dimension == 2 or joint.kind == "prismatic":
@@ -91,12 +91,12 @@ def _size(force: Force) -> int:
 
 
 def _slope(numbers: Array, rate: float) -> float:
-    """The coefficient, times the radius of a hinge, times tanh; after the friction without load and the speed."""
+    """Return coefficient times hinge radius times tanh; numbers begin with constant friction and speed."""
     return float(numbers[2:].prod() * np.tanh(rate / numbers[1]))
 
 
 def _friction(c: Array, loads: list[Array]) -> Array:
-    """f of f_k + c_k |x_k + L_k f| = 0, where loads[k] has the columns x_k and L_k; NaN where it may not be unique."""
+    """Solve f_k + c_k |x_k + L_k f| = 0, where loads[k] has the columns x_k and L_k; NaN if f may not be unique."""
     n = len(c)
     coupled = np.array([np.abs(c[k]) * np.linalg.norm(loads[k][:, 1:], axis=0) for k in range(n)])
     f = np.zeros(n)
@@ -106,7 +106,7 @@ def _friction(c: Array, loads: list[Array]) -> Array:
         x = [load[:, 0] + load[:, 1:] @ f for load in loads]
         sizes = np.array([np.linalg.norm(each) for each in x])
         new = -c * sizes
-        if step < STEPS // 2:  # Newton's method; afterwards the map itself, which contracts
+        if step < STEPS // 2:  # Newton's method, then fixed-point iteration, which is a contraction
             slopes = np.array(
                 [each @ load[:, 1:] / max(size, 1e-300) for each, load, size in zip(x, loads, sizes, strict=True)]
             )

@@ -1,4 +1,4 @@
-"""The forces of a model, and the motions that are given."""
+"""Forces and prescribed motions of a model."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Loads(Collection):
         raise NotImplementedError
 
     def _along(self, name: str, kind: int, joint: ModelJoint, numbers: Numbers) -> Force:
-        """A force along the axis of a prismatic joint; about that of a revolute one for friction."""
+        """Return a force along the axis of a prismatic joint; for friction also the torque of a revolute joint."""
         raise NotImplementedError
 
     def spring(
@@ -42,7 +42,7 @@ class Loads(Collection):
         length: float | None = None,
         name: str | None = None,
     ) -> Force:
-        """A spring with a damper between a point of one body and a point of another.
+        """Add a spring and damper between a point of one body and a point of another.
 
         Parameters
         ----------
@@ -53,7 +53,7 @@ class Loads(Collection):
         stiffness, damping : float
             N/m and N s/m.
         length : float, optional
-            At which the spring is without force, m. None: the distance of the points in the position given.
+            Unstressed length, m. None: the distance of the points in the position given.
         """
         first, second, name, points, distance = self._apart("spring", a, at_a, b, at_b, name)
         stiffness, damping = check_not_negative("stiffness", stiffness), check_not_negative("damping", damping)
@@ -79,7 +79,7 @@ class Loads(Collection):
         angle: float = 0.0,
         name: str | None = None,
     ) -> Force:
-        """A torsional spring with a damper in a revolute joint.
+        """Add a torsional spring and damper in a revolute joint.
 
         Parameters
         ----------
@@ -88,8 +88,8 @@ class Loads(Collection):
         stiffness, damping : float
             N m/rad and N m s/rad.
         angle : float
-            By how much b must have turned against a, from the position given, for the spring to be without torque, rad.
-            In space b may turn by 0.95 of a turn to either side of that position; there the spring has no value beyond.
+            Rotation of b relative to a, from the position given, at which the spring has no torque, rad. In space the
+            torque is defined up to 0.95 of a turn to either side of that position.
         """
         hinge = self._joint(joint, ("revolute",), "torsion_spring")
         name = self._new_name(f"torsion spring of {hinge.name}", name)
@@ -105,7 +105,7 @@ class Loads(Collection):
         length: float = 0.0,
         name: str | None = None,
     ) -> Force:
-        """A spring with a damper along a prismatic joint.
+        """Add a spring and damper along a prismatic joint.
 
         Parameters
         ----------
@@ -114,8 +114,7 @@ class Loads(Collection):
         stiffness, damping : float
             N/m and N s/m.
         length : float
-            By how much b must have slid along the axis of a, from its point there, for the spring to be without force,
-            m; negative: against the axis.
+            Displacement of b along the axis of a, from the point on a, at which the spring has no force, m.
         """
         slide = self._joint(joint, ("prismatic",), "axial_spring")
         name = self._new_name(f"spring of {slide.name}", name)
@@ -132,30 +131,30 @@ class Loads(Collection):
         radius: float | None = None,
         name: str | None = None,
     ) -> Force:
-        """Friction in a revolute or prismatic joint, by a smooth law: -(f + coefficient load) tanh(rate / speed).
+        """Add friction in a revolute or prismatic joint with a smooth law: -(f + coefficient load) tanh(rate / speed).
 
-        Dry friction jumps where the motion reverses, and holds at rest; this law does neither: a joint under a smaller
-        force creeps. A small `speed` makes the equations stiff. With a coefficient it grows with the load of the joint:
-        with its force across the axis, times the radius of a hinge; torques and thrust that the joint carries are not
-        counted. The forces in the joints are then found at every evaluation, in Python, and the friction has no value
-        where a coefficient is so large that the joint may jam.
+        Unlike dry friction, this law has no jump at reversal and no sticking: a joint creeps under any small force. A
+        small `speed` makes the equations stiff. With a coefficient, the friction also grows with the load of the joint:
+        its force across the axis, times the radius for a hinge; torques and thrust carried by the joint do not count.
+        The joint forces are then computed at every evaluation, in Python, and the friction is NaN where the
+        coefficient is so large that the joint may jam.
 
         Parameters
         ----------
         joint : ModelJoint or str
         f : float
-            The torque or force at high speed that does not depend on the load, N m or N.
+            Load-independent torque or force at high speed, N m or N.
         speed : float
-            The rate at which three quarters of it are reached, rad/s or m/s.
+            Rate at which three quarters of the limit are reached, rad/s or m/s.
         coefficient : float, optional
-            Of friction over load. None: it does not depend on the load.
+            Friction per load. None: the friction does not depend on the load.
         radius : float, optional
-            Of the pin of a revolute joint with a coefficient, m.
+            Radius of the pin of a revolute joint with a coefficient, m.
 
         Raises
         ------
         TypeError, ValueError
-            If an argument is wrong; by `problem()`, if a load is not determined.
+            If an argument is invalid; raised by `problem()` if a load is not determined.
         """
         rubbed = self._joint(joint, ("revolute", "prismatic"), "friction")
         name = self._new_name(f"friction of {rubbed.name}", name)
@@ -181,17 +180,17 @@ class Loads(Collection):
     def dry_friction(
         self, joint: ModelJoint | str, f: float, *, static: float | None = None, name: str | None = None
     ) -> DryFriction:
-        """Coulomb's friction in a revolute or prismatic joint, which may stick; for `solve_with_friction`.
+        """Add Coulomb friction in a revolute or prismatic joint, which may stick; for `solve_with_friction`.
 
-        It does not depend on the load of the joint. `solve_dae` does not know it.
+        The friction does not depend on the load of the joint. `solve_dae` ignores it.
 
         Parameters
         ----------
         joint : ModelJoint or str
         f : float
-            The torque or force against sliding, N m or N.
+            Kinetic friction torque or force, N m or N.
         static : float, optional
-            The most that holds the joint while it sticks, at least `f`. None: the same.
+            Largest static friction, at least `f`. None: equal to `f`.
         """
         rubbed = self._joint(joint, ("revolute", "prismatic"), "dry_friction")
         name = self._new_name(f"dry friction of {rubbed.name}", name)
@@ -204,7 +203,7 @@ class Loads(Collection):
         return self.dry[-1]
 
     def force(self, body: Body | str, at: Any, f: Any, *, name: str | None = None) -> Force:
-        """A force on a body, along the axes of space, at a point that the body carries along.
+        """Add a force on a body, with components along the axes of space, at a point fixed to the body.
 
         Parameters
         ----------
@@ -222,7 +221,7 @@ class Loads(Collection):
         return self._add_force(Force(name, FORCE, self.ground, on, None, there, more, function))
 
     def torque(self, body: Body | str, f: Any, *, name: str | None = None) -> Force:
-        """A torque on a body: in a plane a number, positive from x to y; in space (3,) along the axes of space.
+        """Add a torque on a body: in the plane a number, positive from x to y; in space (3,) along the axes of space.
 
         Parameters
         ----------
@@ -236,7 +235,7 @@ class Loads(Collection):
         return self._add_force(Force(name, TORQUE, self.ground, on, None, None, more, function))
 
     def motor(self, joint: ModelJoint | str, f: Any, *, name: str | None = None) -> Force:
-        """A torque in a revolute joint, or a force along a prismatic one: on b, and the opposite on a.
+        """Add a torque in a revolute joint, or a force along a prismatic joint, on b, with its reaction on a.
 
         Parameters
         ----------
@@ -257,27 +256,27 @@ class Loads(Collection):
         acceleration: Any = None,
         name: str | None = None,
     ) -> ModelJoint:
-        """A given motion of a revolute or prismatic joint: how far b has turned or slid on a from the position given.
+        """Prescribe the motion of a revolute or prismatic joint: the displacement of b on a from the position given.
 
         Parameters
         ----------
         joint : ModelJoint or str
         motion : callable
-            motion(t), rad or m. At the start of the run the bodies are put where it says.
+            motion(t), rad or m. The bodies are assembled at its initial value.
         rate, acceleration : callable, optional
-            Its first and second derivative, of t. None: they are derived from the motion, exactly, which must then be
-            made of numpy's functions, without branches.
+            First and second derivative as functions of t. None: they are derived exactly from the motion, which must
+            then consist of numpy functions without branches.
         name : str, optional
 
         Returns
         -------
         ModelJoint
-            Whose reaction is the torque or force of the drive.
+            Its reaction is the torque or force of the drive.
 
         Raises
         ------
         TypeError, ValueError
-            If an argument is wrong, or the derivatives are neither given nor found.
+            If an argument is invalid, or the derivatives are neither given nor can be derived.
         """
         moved = self._joint(joint, ("revolute", "prismatic"), "drive")
         name = self._new_name(f"drive of {moved.name}", name)
@@ -286,7 +285,7 @@ class Loads(Collection):
 
 
 def _spring_numbers(name: str, given: dict[str, tuple[float, str]]) -> Numbers:
-    """Stiffness, damping and rest of a spring in a joint, with their units; the last may be negative."""
+    """Return stiffness, damping and unstressed length or angle of a spring in a joint, with their units."""
     checks = check_not_negative, check_not_negative, check_finite
     values = tuple(check(what, value) for check, (what, (value, _)) in zip(checks, given.items(), strict=True))
     return Numbers(values, tuple(f"{what} of {name} ({unit})" for what, (_, unit) in given.items()))

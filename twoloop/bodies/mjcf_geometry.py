@@ -1,4 +1,4 @@
-"""What reading and writing of MJCF share: poses, inertias, and the warning of what is left out.
+"""Poses, inertias and the warning about ignored parts, shared by the reader and the writer of MJCF.
 
 See MuJoCo's XML reference, mujoco.readthedocs.io/en/stable/XMLreference.html.
 """
@@ -18,44 +18,44 @@ import numpy as np
 from twoloop.checks.arguments import Array
 from twoloop.mechanisms.rotation import rotation_matrix
 
-DENSITY = 1000.0  # kg/m^3, of geoms that give neither mass nor density
+DENSITY = 1000.0  # kg/m^3, default of MuJoCo for geoms with neither mass nor density
 
 
 class IgnoredWarning(UserWarning):
-    """What of a file has no counterpart in a model, or of a model in a file."""
+    """Warns that parts of a file have no counterpart in a model, or parts of a model none in a file."""
 
 
 @dataclass(frozen=True)
 class Pose:
-    """Where a frame is in another: origin (3,) and rotation (3, 3)."""
+    """Position (3,) of the origin and rotation matrix (3, 3) of a frame, relative to another."""
 
     x: Array
     R: Array
 
     def then(self, inner: Pose) -> Pose:
-        """Where a frame is that is given within this one."""
+        """Return the pose, in the outer frame, of a frame given relative to this one."""
         return Pose(self.x + self.R @ inner.x, self.R @ inner.R)
 
     def point(self, place: Array) -> Array:
-        """A point of this frame, in the other."""
+        """Return a point of this frame in the outer one."""
         return np.asarray(self.x + self.R @ place)
 
 
 @dataclass(frozen=True)
 class Lump:
-    """A mass with its centre (3,) and its inertia about this (3, 3), in one frame."""
+    """A mass with its centre (3,) and its inertia about that centre (3, 3), in one frame."""
 
     mass: float
     centre: Array
     J: Array
 
-    def seen(self, pose: Pose) -> Lump:
-        """The same from the frame in which its own is given."""
+    def transformed(self, pose: Pose) -> Lump:
+        """Return the same mass in the frame in which `pose` is given."""
         return Lump(self.mass, pose.point(self.centre), pose.R @ self.J @ pose.R.T)
 
 
-def together(lumps: list[Lump]) -> Lump:
-    """Several lumps as one; without mass at the origin."""
+def combined(lumps: list[Lump]) -> Lump:
+    """Return the combination of several masses; without mass at the origin."""
     mass = sum(lump.mass for lump in lumps)
     if not mass > 0.0:
         return Lump(0.0, np.zeros(3), np.zeros((3, 3)))
@@ -68,7 +68,7 @@ def together(lumps: list[Lump]) -> Lump:
 
 
 def root_of(path: str | os.PathLike[str], tag: str) -> Element:
-    """The first element of an XML file, which must have this tag."""
+    """Return the root element of an XML file, which must have this tag."""
     try:
         root = ElementTree.parse(path).getroot()
     except ElementTree.ParseError as error:
@@ -78,15 +78,15 @@ def root_of(path: str | os.PathLike[str], tag: str) -> Element:
     return root
 
 
-def tell_ignored(path: str | os.PathLike[str], model: Any, ignored: list[str]) -> None:
-    """Note what was not read of a file in its model, and warn whoever called the caller."""
+def record_ignored(path: str | os.PathLike[str], model: Any, ignored: list[str]) -> None:
+    """Record in the model what was ignored in its file, and warn the caller of the caller."""
     model.ignored = tuple(ignored)
     if ignored:
         warnings.warn(f"{os.fspath(path)!r}: ignored are {'; '.join(ignored)}", IgnoredWarning, stacklevel=3)
 
 
 def numbers(text: str, n: int, what: str) -> Array:
-    """Numbers of an attribute, of which there must be n."""
+    """Parse the n numbers of an attribute."""
     try:
         found = np.array([float(each) for each in text.split()])
     except ValueError:
@@ -97,7 +97,7 @@ def numbers(text: str, n: int, what: str) -> Array:
 
 
 def pose_of(attributes: Mapping[str, str], what: str, degrees: bool, sequence: str) -> Pose:
-    """The pose that pos and one of quat, axisangle, xyaxes, zaxis and euler give."""
+    """Return the pose given by pos and one of quat, axisangle, xyaxes, zaxis and euler."""
     x = numbers(attributes.get("pos", "0 0 0"), 3, f"pos of {what}")
     return Pose(x, _rotation(attributes, what, np.pi / 180.0 if degrees else 1.0, sequence))
 
@@ -124,7 +124,7 @@ def _rotation(given: Mapping[str, str], what: str, unit: float, sequence: str) -
         R = np.eye(3)
         for letter, turn in zip(sequence, numbers(given["euler"], 3, f"euler of {what}"), strict=True):
             part = _about(np.eye(3)["xyz".index(letter.lower())], unit * turn)
-            R = R @ part if letter.islower() else part @ R  # lower case turns with the frame
+            R = R @ part if letter.islower() else part @ R  # lower case: intrinsic rotation
         return R
     return np.eye(3)
 
@@ -139,7 +139,7 @@ def _about(axis: Array, angle: float) -> Array:
 
 
 def geom_lump(given: Mapping[str, str], what: str, degrees: bool, sequence: str) -> Lump | None:
-    """The mass of a geom, seen from its body; None: it has no volume that is known here."""
+    """Return the mass of a geom in the frame of its body; None: its volume is unknown here."""
     kind = given.get("type", "sphere")
     if kind not in _VOLUMES:
         return None
@@ -158,10 +158,10 @@ def geom_lump(given: Mapping[str, str], what: str, degrees: bool, sequence: str)
         )
     volume, moments = _VOLUMES[kind](size)
     mass = float(given["mass"]) if "mass" in given else float(given.get("density", DENSITY)) * volume
-    return Lump(mass, np.zeros(3), mass * np.diag(moments)).seen(pose)
+    return Lump(mass, np.zeros(3), mass * np.diag(moments)).transformed(pose)
 
 
-# volume, and moments about the axes over the mass
+# volume, and moments of inertia about the axes per unit mass
 
 
 def _ellipsoid(size: Array) -> tuple[float, Array]:
@@ -185,7 +185,7 @@ def _cylinder(size: Array) -> tuple[float, Array]:
 
 
 def _capsule(size: Array) -> tuple[float, Array]:
-    """A cylinder and the halves of a ball, whose centres of mass are 3/8 of the radius from its ends."""
+    """A cylinder and two half balls, whose centres of mass are 3/8 of the radius from its ends."""
     r, h = size[:2]
     whole, (across, _, along) = _cylinder(size)
     ball = 4.0 / 3.0 * np.pi * r**3

@@ -1,4 +1,4 @@
-"""Joints of MJCF, of which a body may have several, as one joint of a model."""
+"""Translation of the joints of an MJCF body, which may have several, to one joint of a model."""
 
 from __future__ import annotations
 
@@ -6,17 +6,17 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from twoloop.bodies.mjcf_geometry import Lump, Pose, together
+from twoloop.bodies.mjcf_geometry import Lump, Pose, combined
 from twoloop.bodies.parts import Body, ModelJoint
 from twoloop.bodies.spatial_model import SpatialModel
 from twoloop.checks.arguments import Array
 
-SAME = 1e-9  # of directions, and of places over 1 m
+SAME = 1e-9  # tolerance of directions, and of positions in m
 
 
 @dataclass(frozen=True)
-class Freed:
-    """A joint as MJCF has it: its kind (hinge, slide, ball), a place and an axis in space, and its other attributes."""
+class FileJoint:
+    """A joint of MJCF: kind (hinge, slide, ball), position and axis in space, and other attributes."""
 
     name: str
     kind: str
@@ -27,26 +27,26 @@ class Freed:
 
 @dataclass
 class Part:
-    """A body that moves, with what is fixed to it: its parent, its frame in space, joints and masses in space."""
+    """A moving body with everything fixed to it: parent, frame, joints and masses, all in space."""
 
     name: str
     parent: Part | None
     pose: Pose
-    freed: list[Freed] = field(default_factory=list)
+    freed: list[FileJoint] = field(default_factory=list)
     lumps: list[Lump] = field(default_factory=list)
     body: Body | None = None
 
 
 def body_of(model: SpatialModel, part: Part | None) -> Body:
-    """The body of a part; None: the ground."""
+    """Return the body of a part; the ground for None."""
     body = model.ground if part is None else part.body
     assert body is not None
     return body
 
 
 def add_part(model: SpatialModel, part: Part) -> ModelJoint | None:
-    """Add the body of a part to a model, and its joint; None: all is free."""
-    lump = together(part.lumps)
+    """Add the body of a part and its joint to a model; return the joint, or None if the body is free."""
+    lump = combined(part.lumps)
     if not lump.mass > 0.0:
         raise ValueError(f"the body {part.name!r} has joints but no mass: give it an <inertial>, or a geom with volume")
     R = part.pose.R
@@ -54,13 +54,13 @@ def add_part(model: SpatialModel, part: Part) -> ModelJoint | None:
     return add_joints(model, body_of(model, part.parent), part.body, part.freed)
 
 
-def add_joints(model: SpatialModel, parent: Body, child: Body, freed: list[Freed]) -> ModelJoint | None:
-    """The joint that leaves what several free; None: all is free.
+def add_joints(model: SpatialModel, parent: Body, child: Body, freed: list[FileJoint]) -> ModelJoint | None:
+    """Add the joint equivalent to several MJCF joints; return it, or None if the body is free.
 
     Raises
     ------
     ValueError
-        If no joint of a model leaves that.
+        If a model has no such joint.
     """
     kinds = sorted(each.kind for each in freed)
     slid = np.array([each.axis for each in freed if each.kind == "slide"])
@@ -83,15 +83,15 @@ def add_joints(model: SpatialModel, parent: Body, child: Body, freed: list[Freed
     if kinds == ["hinge", "slide", "slide"] and all(_across(hinges[0], slide) for slide in slides):
         return model.planar(parent, child, at=hinges[0].at, axis=hinges[0].axis, name=name)
     raise ValueError(
-        f"the joints of the body {child.name!r} ({', '.join(each.kind for each in freed)}) are none that a model has: "
-        "one hinge, slide or ball; a slide and a hinge along one axis; two hinges that cross at right angles; two "
-        "slides and a hinge across both; all six. Put a body with mass between them"
+        f"the joints of the body {child.name!r} ({', '.join(each.kind for each in freed)}) have no counterpart in a "
+        "model: one hinge, slide or ball; a slide and a hinge along one axis; two hinges that cross at right angles; "
+        "two slides and a hinge across both; all six. Put a body with mass between them"
     )
 
 
-def _parallel(one: Freed, other: Freed) -> bool:
+def _parallel(one: FileJoint, other: FileJoint) -> bool:
     return float(np.abs(np.cross(one.axis, other.axis)).max()) < SAME
 
 
-def _across(one: Freed, other: Freed) -> bool:
+def _across(one: FileJoint, other: FileJoint) -> bool:
     return abs(float(one.axis @ other.axis)) < SAME

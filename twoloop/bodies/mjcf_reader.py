@@ -1,4 +1,4 @@
-"""Models from MJCF, the format of MuJoCo: bodies, hinges, slides, balls; loops closed by connect and weld."""
+"""Reads models from MJCF, the format of MuJoCo: bodies, hinges, slides, balls; loops closed by connect and weld."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from twoloop.bodies.mjcf_geometry import Lump, Pose, geom_lump, numbers, pose_of, root_of, tell_ignored
-from twoloop.bodies.mjcf_joints import Freed, Part, add_part, body_of
+from twoloop.bodies.mjcf_geometry import Lump, Pose, geom_lump, numbers, pose_of, record_ignored, root_of
+from twoloop.bodies.mjcf_joints import FileJoint, Part, add_part, body_of
 from twoloop.bodies.parts import Body, ModelJoint
 from twoloop.bodies.spatial_model import SpatialModel
 from twoloop.checks.arguments import Array
@@ -18,17 +18,17 @@ SEEN_ONLY = {"asset", "visual", "statistic", "size", "custom", "camera", "light"
 KNOWN = {"compiler", "option", "default", "worldbody", "equality", "tendon"}
 SOFT = ("armature", "frictionloss")
 DEFAULT_OF = {"spatial": "tendon", "fixed": "tendon", "connect": "equality", "weld": "equality"}  # elements of defaults
-TURNS = {"quat", "axisangle", "xyaxes", "zaxis", "euler"}  # of which an element gives one
-AGREES = 1e-6  # of the pose that a weld asks for
+TURNS = {"quat", "axisangle", "xyaxes", "zaxis", "euler"}  # alternative orientations of an element
+AGREES = 1e-6  # tolerance of the pose that a weld prescribes
 
 
 def from_mjcf(path: str | os.PathLike[str]) -> SpatialModel:
-    """Read a model from an MJCF file, in the pose that the file has (qpos0).
+    """Read a model from an MJCF file, in the reference pose of the file (qpos0).
 
-    Read are bodies with their masses, or those of their geoms; hinge, slide, ball and free joints, and those of their
-    combinations that a `SpatialModel` has; stiffness, damping, ref and springref of hinges and slides; equalities
-    connect and weld, which are exact here and soft in MuJoCo; tendons between two sites as springs; gravity. Bodies
-    without joints are one with their parents.
+    The reader supports bodies with inertials or with masses from their geoms; hinge, slide, ball and free joints, and
+    the combinations for which `SpatialModel` has a joint; stiffness, damping, ref and springref of hinges and slides;
+    the equalities connect and weld, which are exact here and soft in MuJoCo; tendons between two sites as springs; and
+    gravity. Bodies without joints are merged with their parents.
 
     Parameters
     ----------
@@ -37,17 +37,17 @@ def from_mjcf(path: str | os.PathLike[str]) -> SpatialModel:
     Returns
     -------
     SpatialModel
-        `model.ignored` lists what was not read: contacts, limits, actuators, armatures, ...
+        `model.ignored` lists what was ignored: contacts, limits, actuators, armatures, ...
 
     Warns
     -----
     IgnoredWarning
-        If that is not empty.
+        If anything was ignored.
 
     Raises
     ------
     ValueError
-        If the file is no MJCF, needs other files, or has joints or welds that a model has not.
+        If the file is not MJCF, includes other files, or has joints or welds that a model does not support.
 
     Notes
     -----
@@ -56,7 +56,7 @@ def from_mjcf(path: str | os.PathLike[str]) -> SpatialModel:
     root = root_of(path, "mujoco")
     reader = _Reader(root)
     reader.read()
-    tell_ignored(path, reader.model, reader.ignored)
+    record_ignored(path, reader.model, reader.ignored)
     return reader.model
 
 
@@ -74,7 +74,7 @@ class _Reader:
         if compiler.get("coordinate", "local") != "local":
             raise ValueError("coordinates of an MJCF file must be local; global ones were dropped by MuJoCo in 2.3.4")
         self.defaults: dict[str, dict[str, dict[str, str]]] = {"main": {}}
-        for each in root.findall("default"):  # of which there may be several
+        for each in root.findall("default"):
             self._default(each, "main", self.defaults["main"])
         gravity = np.array([0.0, 0.0, -9.81])
         for each in root.findall("option"):
@@ -84,7 +84,7 @@ class _Reader:
                     self.ignored.append(f"{key} of the surrounding medium")
         flags = {
             key: value for flag in root.findall("option/flag") for key, value in flag.attrib.items()
-        }  # last counts
+        }  # the last one counts
         disabled = {key for key, value in flags.items() if value == "disable"}
         gravity = np.zeros(3) if "gravity" in disabled else gravity
         self.without_loops = bool(disabled & {"constraint", "equality"})
@@ -99,7 +99,7 @@ class _Reader:
         self.taken = {"ground", *(each.get("name", "") for each in root.iter("body"))}
 
     def read(self) -> None:
-        """The whole file."""
+        """Read the whole file."""
         for each in self.root:
             if each.tag == "include":
                 raise ValueError(
@@ -141,10 +141,10 @@ class _Reader:
         return pose_of(attributes, what, self.degrees, self.sequence)
 
     def _within(self, element: Element, part: Part | None, pose: Pose, childclass: str) -> None:
-        """What stands in a body, or in the world."""
+        """Read the children of a body, or of the world."""
         lumps: list[Lump] = []
         inertial = element.find("inertial") if self.from_geoms != "true" else None
-        weigh = part is not None and inertial is None and self.from_geoms != "false"  # the geoms
+        weigh = part is not None and inertial is None and self.from_geoms != "false"  # mass from the geoms
         for each in element:
             given = self._attributes(each, childclass)
             if each.tag == "body":
@@ -165,11 +165,11 @@ class _Reader:
         if not weigh:
             lumps = [] if inertial is None else [self._inertial(inertial, element.get("name", "?"))]
         if part is not None:
-            part.lumps += [lump.seen(pose) for lump in lumps]
+            part.lumps += [lump.transformed(pose) for lump in lumps]
 
     def _body(self, element: Element, parent: Part | None, outer: Pose, childclass: str) -> None:
         name = element.get("name", f"body {len(self.frames)}")
-        name = "ground of the file" if name == "ground" else name  # the world is the ground here
+        name = "ground of the file" if name == "ground" else name  # "ground" is reserved
         pose, part = outer.then(self._pose(dict(element.attrib), f"body {name!r}")), parent
         for key in ("mocap", "gravcomp"):
             if element.get(key, "0") not in ("0", "false"):
@@ -183,7 +183,7 @@ class _Reader:
         self.frames[element.get("name", name)] = part, pose
         self._within(element, part, pose, childclass)
 
-    def _joint(self, element: Element, pose: Pose, childclass: str, body: str, number: int) -> Freed:
+    def _joint(self, element: Element, pose: Pose, childclass: str, body: str, number: int) -> FileJoint:
         given = self._attributes(element, childclass)
         name = self._free(element.get("name"), f"joint of {body}" if number == 0 else f"joint {number + 1} of {body}")
         kind = "free" if element.tag == "freejoint" else given.get("type", "hinge")
@@ -197,7 +197,7 @@ class _Reader:
         if not axis.any():
             raise ValueError(f"axis of joint {name!r} must have a direction; given {given['axis']!r}")
         place = numbers(given.get("pos", "0 0 0"), 3, f"pos of joint {name!r}")
-        return Freed(name, kind, pose.point(place), pose.R @ axis / np.linalg.norm(axis), given)
+        return FileJoint(name, kind, pose.point(place), pose.R @ axis / np.linalg.norm(axis), given)
 
     def _soft(self, given: dict[str, str], what: str) -> None:
         for key in SOFT:
@@ -205,7 +205,7 @@ class _Reader:
                 self.ignored.append(f"{key} of {what}")
 
     def _free(self, name: str | None, default: str) -> str:
-        """A name that no other part has: in MJCF bodies, joints and tendons may share one."""
+        """Return an unused name; in MJCF a body, a joint and a tendon may share one."""
         name = default if name is None else name
         while name in self.taken:
             name = f"{default.split()[0]} {name}"
@@ -217,7 +217,7 @@ class _Reader:
             self.n_geoms += 1
         if given.get("shellinertia", "false") == "true" and weighs:
             self.ignored.append(f"shellinertia of {what}")
-        kind = "mesh" if "mesh" in given else given.get("type", "sphere")  # of another type: one that is fitted to it
+        kind = "mesh" if "mesh" in given else given.get("type", "sphere")  # else fitted to the mesh
         lump = geom_lump(given, what, self.degrees, self.sequence) if kind != "mesh" else None
         weighs = weighs and float(given.get("mass", given.get("density", 1.0))) > 0.0
         if lump is None and weighs and kind not in ("plane", "hfield"):
@@ -234,10 +234,10 @@ class _Reader:
             J = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
         else:
             J = np.diag(numbers(given.get("diaginertia", ""), 3, f"diaginertia of {what}"))
-        return Lump(float(given["mass"]), np.zeros(3), J).seen(self._pose(given, what))
+        return Lump(float(given["mass"]), np.zeros(3), J).transformed(self._pose(given, what))
 
     def _add(self, part: Part) -> None:
-        """The body and the joint of a part."""
+        """Add the body and the joint of a part."""
         joint = add_part(self.model, part)
         for freed in part.freed:
             self._springs(freed, joint)
@@ -245,8 +245,8 @@ class _Reader:
     def _of(self, part: Part | None) -> Body:
         return body_of(self.model, part)
 
-    def _springs(self, freed: Freed, joint: ModelJoint | None) -> None:
-        """Spring and damper of a joint, about the value springref, where the file's pose has the value ref."""
+    def _springs(self, freed: FileJoint, joint: ModelJoint | None) -> None:
+        """Add the spring and damper of a joint; it is unstressed at springref, and the pose of the file is ref."""
         stiffness, damping = (freed.attributes.get(key, "0").split() for key in ("stiffness", "damping"))
         if not any(float(x) for x in (*stiffness, *damping)):
             return
@@ -324,7 +324,7 @@ class _Reader:
         )
 
     def _away(self, part: Part | None) -> str:
-        """The name of a joint, from a part to the ground, whose springref is not its ref; "": there is none."""
+        """Return the name of a joint between a part and the ground whose springref differs from its ref, or ""."""
         while part is not None:
             for freed in part.freed:
                 spring, given = (float(freed.attributes.get(key, 0.0)) for key in ("springref", "ref"))
@@ -345,7 +345,7 @@ class _Reader:
 
 
 def _merged(known: dict[str, str], own: dict[str, str]) -> dict[str, str]:
-    """Attributes of an element over those of its defaults: of the ways to turn there is one, of sizes the last stay."""
+    """Merge attributes of an element into its defaults; they have one orientation, and the last sizes stay."""
     kept = {key: value for key, value in known.items() if key not in TURNS or not own.keys() & TURNS}
     sizes = own.get("size", "").split()
     sizes += known.get("size", "").split()[len(sizes) :]

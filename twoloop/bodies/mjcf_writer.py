@@ -1,4 +1,4 @@
-"""A model as MJCF: a tree of bodies with joints, equalities that close loops, springs as stiffness and tendons."""
+"""Writes a model as MJCF: a tree of bodies and joints, equalities that close loops, springs and tendons."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from twoloop.bodies.parts import Body, Force, ModelJoint
 from twoloop.bodies.spanning_tree import spanning_tree
 from twoloop.mechanisms.rotation import euler_parameters
 
-HALF = 0.5  # m, from each other: the two points of a hinge that closes a loop
+HALF = 0.5  # m: distance of the two connect points that represent a hinge closing a loop
 
 
 def write(model: Any, path: str | os.PathLike[str]) -> None:
@@ -52,7 +52,7 @@ class _Writer:
         self.parents, self.loops = spanning_tree(model)
 
     def root(self) -> Element:
-        """The whole file."""
+        """Return the root element of the whole file."""
         root = Element("mujoco", model=self.model.name)
         _add(root, "compiler", angle="radian", autolimits="true")
         _add(root, "option", gravity=_text(self.model.gravity))

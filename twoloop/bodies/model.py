@@ -1,4 +1,4 @@
-"""How models in a plane and in space are put together."""
+"""Assembly of models in the plane and in space."""
 
 from __future__ import annotations
 
@@ -24,36 +24,37 @@ from twoloop.problem.system import ConstrainedSystem
 
 
 class Model(Stops):
-    """What `PlanarModel` and `SpatialModel` share beside their bodies and joints."""
+    """Methods shared by `PlanarModel` and `SpatialModel`."""
 
     coordinate_names: tuple[str, ...]
 
     def problem(
         self, t_span: tuple[float, float] = (0.0, 10.0), *, name: str | None = None, keep: Sequence[Body | str] = ()
     ) -> ModelProblem:
-        """The model put together, ready to run.
+        """Assemble the model.
 
-        Bodies whose poses do not quite fit are moved by the least change until all joints close. Velocities that were
-        given with bodies are kept, the others are those of least kinetic energy that the joints and drives allow.
+        Bodies whose poses do not quite fit are moved as little as possible until all joints close. Velocities given
+        with the bodies are kept; the others minimise the kinetic energy subject to the joints and drives.
 
         Parameters
         ----------
         t_span : (float, float)
             Start and end, s.
         name : str, optional
-            None: that of the model.
+            None: the name of the model.
         keep : sequence of Body or str
-            Bodies that must stay where they are while the others are put together.
+            Bodies that must not move during the assembly.
 
         Returns
         -------
         ModelProblem
-            With the system, a consistent start, energy, joints, drawing, names, and `freedom`.
+            The system, a consistent initial state, energy, joints, drawing, names of coordinates and `freedom`.
 
         Raises
         ------
         TypeError, ValueError
-            If the model has no bodies, a joint cannot close (says which), or the joints do not allow the velocities.
+            If the model has no bodies, a joint cannot close (the message names it), or the velocities given violate the
+            constraints.
         """
         span = check_span(t_span)
         name = self.name if name is None else check_text("name", name)
@@ -72,7 +73,7 @@ class Model(Stops):
         values: Mapping[str, float] | None,
         guess: Array | None,
     ) -> ModelProblem:
-        """What `problem` makes, with parameters and a guess of the positions."""
+        """Assemble the model with other parameter values and a guess of the positions; see `problem`."""
         if not self.bodies:
             raise ValueError(f"{self.name!r} has no bodies: add some with body(...) before problem()")
         tables = self._tables(self.joints, values)
@@ -91,7 +92,7 @@ class Model(Stops):
         still = system if bare is tables else system_of(self.dimension, bare, joints_of(bare), name, about)
         closed = q = assembly.positions(still, t_span[0], start, self._turning(), keep, bare.rows, coordinates)
         if bare is not tables:
-            q = assembly.driven_there(system, t_span[0], q, keep)
+            q = assembly.follow_drives(system, t_span[0], q, keep)
         self._check_branches(t_span[0], q)
         given, known = self._velocities(q)
         v = assembly.velocities(system, t_span[0], q, given, known, coordinates)
@@ -111,7 +112,7 @@ class Model(Stops):
             tags=self._tags(freedom),
             coordinates=coordinates,
             drawing=drawing_of(tables),
-            model=self._as_it_is(),
+            model=self._copy(),
             keep=keep,
             freedom=freedom,
             stops=tuple(self.stops),
@@ -126,26 +127,26 @@ class Model(Stops):
         t: float,
         q: Array,
     ) -> tuple[ConstrainedSystem, dict[str, tuple[int, ...]]]:
-        """The system while dry friction has given values, and some of its joints are held.
+        """Return the system with given dry friction forces and with the sticking joints held.
 
         Parameters
         ----------
         name : str
         values : mapping
-            Parameters by their names.
+            Parameter values by name.
         friction, held : mapping
-            By the names of what rubs: the forces, and how far b has turned or slid on a where it sticks. NaN: it has
-            slid by the time, as that of a gauge.
+            By the names of the dry frictions: the friction forces, and the displacement of b on a where the joint
+            sticks. NaN: the displacement equals t, as for a gauge.
         t, q : float, ndarray (n_q,)
-            A state of it.
+            Time and positions.
 
         Returns
         -------
         ConstrainedSystem
         dict
-            Rows of the joints that are held, by the names of what rubs.
+            Rows of the joints held, by the names of the dry frictions.
         """
-        other = self._as_it_is()
+        other = self._copy()
         for rub in self.dry:
             if rub.name in friction:
                 number = Numbers((friction[rub.name],))
@@ -161,32 +162,32 @@ class Model(Stops):
         return system, {name: tables.rows[f"{name} sticks"] for name in held}
 
     def pull(self, rub: DryFriction, values: Mapping[str, float]) -> ConstrainedSystem:
-        """A system whose force is that of unit friction alone: by how much a joint slides with the coordinates."""
-        other = self._as_it_is()
+        """Return a system whose only force is unit friction in the joint: its slip as a function of the coordinates."""
+        other = self._copy()
         other.gravity, other.forces = np.zeros(self.dimension), [replace(rub.force, more=Numbers((1.0,)))]
         places = {name: value for name, value in values.items() if not name.startswith("gravity")}
         tables, still = other._tables([], places), np.zeros_like(self._start())
         return system_of(self.dimension, tables, [], rub.name, (0.0, self._start(), still))
 
     def _tables(self, joints: Sequence[ModelJoint], values: Mapping[str, float] | None) -> Tables:
-        """The tables of the model with some of its joints, and with other values of its parameters."""
+        """Return the tables of the model restricted to some joints, with other parameter values."""
         tables = Tables(self.gravity, self.bodies, joints, self.forces, self._first_row())
         tables.replaced(values or {})
         return tables
 
-    def _as_it_is(self) -> Model:
-        """A copy to which nothing is added."""
+    def _copy(self) -> Model:
+        """Return a copy that later additions to the model do not change."""
         other = copy.copy(self)
         other.bodies, other.joints, other.forces = list(self.bodies), list(self.joints), list(self.forces)
         other.stops, other.dry, other.taken = list(self.stops), list(self.dry), list(self.taken)
         return other
 
     def _turning(self) -> NDArray[np.bool_]:
-        """Which coordinates are rotations."""
+        """Return which coordinates are rotations, (n_q,)."""
         return np.tile(np.arange(len(self.coordinate_names)) >= self.dimension, len(self.bodies))
 
     def _first_row(self) -> int:
-        """How many rows stand before those of the joints."""
+        """Return the number of rows before those of the joints."""
         return 0
 
     def _check_inertias(self, tables: Tables) -> None:
@@ -199,14 +200,14 @@ class Model(Stops):
         raise NotImplementedError
 
     def _check_branches(self, t: float, q: Array) -> None:
-        """Whether every drive is where it should be, and not half a turn away."""
+        """Raise if a drive starts on the wrong branch, half a turn away from its value."""
 
     def _start(self) -> Array:
-        """The coordinates in the position given, (n_q,)."""
+        """Return the coordinates in the position given, (n_q,)."""
         raise NotImplementedError
 
     def _velocities(self, q: Array) -> tuple[Array, NDArray[np.bool_]]:
-        """The velocities given, (n_q,), and which of them are."""
+        """Return the velocities given, (n_q,), and a mask of those that are given."""
         given = np.full((len(self.bodies), len(self.coordinate_names)), np.nan)
         for row, body, state in zip(given, self.bodies, q.reshape(given.shape), strict=True):
             if body.velocity is not None:
@@ -217,7 +218,7 @@ class Model(Stops):
         return np.where(known, given.ravel(), 0.0), known
 
     def _turning_rates(self, state: Array, spin: Array) -> Array:
-        """The rates of the coordinates of a body that are rotations, at an angular velocity."""
+        """Return the rates of the rotational coordinates of a body with a given angular velocity."""
         return spin
 
     def _tags(self, freedom: assembly.Freedom) -> tuple[str, ...]:

@@ -1,4 +1,4 @@
-"""Energy of a model: kinetic, of the weight, and of its springs."""
+"""Energy of a model: kinetic energy, and potential energy of gravity and springs."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from twoloop.checks.arguments import Array
 
 @dataclass(frozen=True, eq=False)
 class ModelEnergy:
-    """Kinetic energy, potential of the weight and of the springs, J, of one state or of many.
+    """Kinetic energy and potential energies of gravity and springs, J, for one state or many.
 
     Attributes
     ----------
     p : ndarray (n_p,)
-        Parameters of the model.
+        Parameter vector of the model.
     dimension : int
         2 or 3.
     """
@@ -27,8 +27,8 @@ class ModelEnergy:
     dimension: int
 
     def __call__(self, t: Any, q: Array, v: Array) -> Any:
-        """Of one state, or of the columns of many."""
-        from twoloop.mechanisms.points import direction_of, place_of  # whose import compiles
+        """Evaluate the energies of one state, or of many given as columns."""
+        from twoloop.mechanisms.points import direction_of, place_of  # compiled on import
 
         flat = np.asarray(q)
 
@@ -76,7 +76,7 @@ class ModelEnergy:
     def _turned(self, q: Array, i: int, j: int, axis: int, zero: int) -> Any:
         if self.dimension == 2:
             return (q[j, 2] if j >= 0 else 0.0) - (q[i, 2] if i >= 0 else 0.0)
-        from twoloop.bodies.spatial_places import product  # whose import compiles
+        from twoloop.bodies.spatial_places import product  # compiled on import
 
         one, other = (q[body, 3:] if body >= 0 else (1.0, 0.0, 0.0, 0.0) for body in (i, j))
         relative = product.py_func(one[0], -one[1], -one[2], -one[3], *other)
@@ -87,7 +87,7 @@ class ModelEnergy:
 
 
 def _spins(e: Array, u: Array) -> Array:
-    """Angular velocities along the bodies' axes, (n, 3) or (n, 3, n_t)."""
-    from twoloop.mechanisms.rotation import half_spin  # whose import compiles
+    """Return angular velocities in body axes, (n, 3) or (n, 3, n_t)."""
+    from twoloop.mechanisms.rotation import half_spin  # compiled on import
 
     return 2.0 * np.stack(half_spin.py_func(*np.moveaxis(e, 1, 0), *np.moveaxis(u, 1, 0)), axis=1)

@@ -1,4 +1,4 @@
-"""A model put together: the problem, which knows its parameters by name and can be put together with others."""
+"""An assembled model: a problem with named parameters, which can be reassembled with other values."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ if TYPE_CHECKING:
 class ModelProblem(Problem):
     """A `Problem` made of bodies and joints.
 
-    `parameters` are all masses, places, lengths, stiffnesses, ... by name, in the order in which they stand first in
-    `system.parameters`; what follows there says which joint ties which bodies, and must stay as it is.
+    `parameters` maps the names of all masses, positions, lengths, stiffnesses, ... to values, in the order in which
+    they begin `system.parameters`. The rest of that vector encodes the topology and must not be changed.
 
     Attributes
     ----------
     freedom : Freedom
-        Degrees of freedom, and which joints have rows that follow from others.
+        Degrees of freedom, and the joints with redundant rows.
     stops : tuple of Stop
         For `solve_with_stops`.
     """
@@ -37,32 +37,32 @@ class ModelProblem(Problem):
     stops: tuple[Stop, ...] = ()
 
     def place(self, name: str) -> int:
-        """Where a parameter stands in `system.parameters`, by its name with or without the unit.
+        """Return the index of a parameter in `system.parameters`, by its name with or without the unit.
 
         Raises
         ------
         ValueError
-            If there is none of that name.
+            If there is no parameter of that name.
         """
         return self._known(name)[1]
 
     def with_parameters(self, parameters: Mapping[str, float]) -> ModelProblem:
-        """The same model with other values of some parameters, put together again from this start.
+        """Return the same model with other values of some parameters, reassembled from this start.
 
         Parameters
         ----------
         parameters : mapping
-            From names, with or without the unit, to numbers.
+            Values by name, with or without the unit.
 
         Returns
         -------
         ModelProblem
-            Nothing is compiled. Its start is near this one, and has the velocities that were given with the bodies.
+            Its start is near this one and has the velocities given with the bodies. Nothing is recompiled.
 
         Raises
         ------
         TypeError, ValueError
-            If a name is unknown, a number is not finite, or the bodies cannot be put together.
+            If a name is unknown, a value is not finite, or the model cannot be assembled.
         """
         if not isinstance(parameters, Mapping):
             raise TypeError(f"parameters must be a mapping from names to numbers; given {parameters!r}")
@@ -80,7 +80,7 @@ class ModelProblem(Problem):
         state = dict(vars(self))
         try:
             pickle.dumps(self.model)
-        except Exception:  # a function without a name of its own
+        except Exception:  # e.g. a lambda
             state["model"] = None
         return state
 

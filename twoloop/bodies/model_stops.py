@@ -1,4 +1,4 @@
-"""Stops of a model: planes that points of bodies do not cross, and limits of joints."""
+"""Stops of a model: planes that points of bodies cannot cross, and limits of joints."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from twoloop.problem.stops import Stop
 
 @dataclass(frozen=True, eq=False)
 class PlaneGap:
-    """How far a point of one body is above a plane of another, m."""
+    """Distance of a point of one body from a plane of another, m."""
 
     body: Body
     place: Array
@@ -26,21 +26,21 @@ class PlaneGap:
     normal: Array
 
     def __call__(self, t: Any, q: Any) -> Any:
-        """The distance; of numbers or symbols."""
+        """Return the distance, for numbers or symbols."""
         one, two = placed(q, self.body, self.place), placed(q, self.other, self.foot)
         return sum(n * (x - y) for n, x, y in zip(turned(q, self.other, self.normal), one, two, strict=True))
 
 
 @dataclass(frozen=True, eq=False)
 class TurnGap:
-    """How far a planar hinge is from a limit, rad."""
+    """Angle between a planar hinge and its limit, rad."""
 
     joint: ModelJoint
     limit: float
     sign: float
 
     def __call__(self, t: Any, q: Any) -> Any:
-        """The angle that is left; of numbers or symbols."""
+        """Return the remaining angle, for numbers or symbols."""
         ends = (self.joint.b, self.joint.a)
         one, two = (0.0 if body.number < 0 else q[body.coordinates[2]] - body.rotation for body in ends)
         return self.sign * (one - two - self.limit)
@@ -61,21 +61,21 @@ class Stops(Loads):
         restitution: float = 0.0,
         name: str | None = None,
     ) -> Stop:
-        """A plane of one body that a point of another does not cross; without friction.
+        """Add a frictionless plane on one body that a point of another body cannot cross.
 
         Parameters
         ----------
         body : Body or str
         at : array_like (2 or 3,) or BodyPoint
-            Its point, in space in the position given, m.
+            The point, in space in the position given, m.
         other : Body or str
-            With the plane; the ground for a floor or a wall.
+            The body with the plane; the ground for a floor or a wall.
         foot : array_like (2 or 3,) or BodyPoint
             A point of the plane, m.
         normal : array_like (2 or 3,) or BodyDirection
-            Across the plane, to the side on which the point is.
+            Normal of the plane, on the side of the point.
         restitution : float
-            From 0 to 1.
+            Coefficient of restitution, from 0 to 1.
         """
         one, two = self._body("body", body), self._body("other", other)
         self._different("stop", one, two)
@@ -92,17 +92,17 @@ class Stops(Loads):
         restitution: float = 0.0,
         name: str | None = None,
     ) -> tuple[Stop, ...]:
-        """Limits of a joint: a revolute one in a plane, or a prismatic one.
+        """Add limits to a revolute joint in the plane or to a prismatic joint.
 
         Parameters
         ----------
         joint : ModelJoint or str
         lower, upper : float, optional
-            How far b may turn on a, or slide along the axis, from the position given, rad or m. None: without end.
+            Bounds of the displacement of b on a from the position given, rad or m. None: unbounded.
         restitution : float
-            From 0 to 1.
+            Coefficient of restitution, from 0 to 1.
         name : str, optional
-            Before "lower limit" and "upper limit". None: that of the joint.
+            Prefix of the names "lower limit" and "upper limit". None: the name of the joint.
 
         Returns
         -------
@@ -111,7 +111,7 @@ class Stops(Loads):
         Raises
         ------
         TypeError, ValueError
-            If an argument is wrong, or no limit is given.
+            If an argument is invalid, or no limit is given.
         """
         kinds = ("revolute", "prismatic") if self.dimension == 2 else ("prismatic",)
         limited = self._joint(joint, kinds, "limit")
@@ -139,7 +139,7 @@ class Stops(Loads):
         return PlaneGap(joint.b, np.array(joint.point_b.values), joint.a, foot, sign * axis)
 
     def _axis(self, joint: ModelJoint) -> Array:
-        """The axis of a prismatic joint, in the axes of a."""
+        """Return the axis of a prismatic joint in the axes of a."""
         raise NotImplementedError
 
     def _add_stop(self, stop: Stop) -> Stop:

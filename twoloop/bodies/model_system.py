@@ -1,4 +1,4 @@
-"""The system of a model: compiled callbacks that read its tables; in Python where its forces cannot be traced."""
+"""The system of a model: compiled callbacks that read its tables, or Python ones where its forces cannot be traced."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ from twoloop.problem.system import ConstrainedSystem
 
 KINDS = ("mass", "force", "constraint", "jacobian", "constraint_rate", "gamma")
 OF_JOINTS = ("constraint", "jacobian", "gamma")
-STATES = 5  # at which programs are compared with the functions that they were traced from
-AGREES = 1e-10  # relative
-COINCIDE = 1e-12  # relative: points of a spring
-QUIET = np.errstate(divide="ignore", invalid="ignore")  # what is not finite is said by name
+STATES = 5  # at which the traced programs are compared with the original functions
+AGREES = 1e-10  # relative difference between a function and its program
+COINCIDE = 1e-12  # relative distance at which the points of a spring count as coincident
+QUIET = np.errstate(divide="ignore", invalid="ignore")  # reported by name later
 
 
 def joints_of(tables: Tables) -> list[Joint]:
-    """The joints of the system, for `Result.reactions`."""
+    """Return the joints of the system, for `Result.reactions`."""
     made = []
     for joint in tables.joints:
         point = tables.of(joint.point_a if joint.body is joint.a else joint.point_b).tolist()
@@ -42,7 +42,7 @@ def joints_of(tables: Tables) -> list[Joint]:
 def system_of(
     dimension: int, tables: Tables, joints: list[Joint], name: str, start: tuple[float, Array, Array]
 ) -> ConstrainedSystem:
-    """The system, whose programs of functions agree with these about the start."""
+    """Return the system, after a check of its traced programs against the functions near the start."""
     callbacks: Any = import_module(f"twoloop.bodies.{'planar' if dimension == 2 else 'spatial'}_callbacks")
     n_q = (3 if dimension == 2 else 7) * len(tables.bodies)
     kinds = [kind for kind in KINDS if kind in ("mass", "force") or (kind in OF_JOINTS and tables.n_rows)]
@@ -75,7 +75,7 @@ def system_of(
 
 
 def entries_of(dimension: int, tables: Tables) -> dict[str, NDArray[np.int64]]:
-    """Rows and columns of what the callbacks `mass_values` and `jacobian_values` of a model give, in their order."""
+    """Return rows and columns of the entries of the callbacks `mass_values` and `jacobian_values`, in order."""
     width, n = (3 if dimension == 2 else 7), len(tables.bodies)
     blocks = [[k] for k in range(3)] + ([[3, 4, 5, 6]] if dimension == 3 else [])
     places = [(width * k + i, width * k + j) for k in range(n) for block in blocks for i in block for j in block]
@@ -95,14 +95,14 @@ def entries_of(dimension: int, tables: Tables) -> dict[str, NDArray[np.int64]]:
 @QUIET
 def _check_functions(tables: Tables, t: float, q: Array, v: Array) -> None:
     for each in (*tables.motions, *tables.functions):
-        value = each.at(t, q, v)  # says what is wrong with what it returns
+        value = each.at(t, q, v)  # raises if the result has a wrong shape or type
         if each in tables.motions or not np.isfinite(tables.p).all():
             _check_finite(each, value, t)
 
 
 @QUIET
 def check_forces(tables: Tables, t: float, q: Array, v: Array) -> None:
-    """Raise where a force has no value at the start."""
+    """Raise if a force is undefined at the start."""
     for each in tables.functions:
         _check_finite(each, each.at(t, q, v), t)
     for force in tables.forces:
@@ -119,18 +119,18 @@ def check_forces(tables: Tables, t: float, q: Array, v: Array) -> None:
 
 
 def check_loads(tables: Tables, redundant: tuple[tuple[str, ...], ...], Q: Array) -> None:
-    """Raise where friction grows with a load that joints share in any proportion, or has no value at the start."""
+    """Raise if friction depends on an undetermined load, or is undefined at the start."""
     if tables.loaded and not np.isfinite(Q).all():
         raise ValueError(
-            f"{', '.join(repr(each.name) for each in tables.loaded)} cannot be found at the start: coefficients are "
-            "so large that a joint may jam; give smaller ones"
+            f"{', '.join(repr(each.name) for each in tables.loaded)} cannot be computed at the start: the coefficients "
+            "are so large that a joint may jam; give smaller ones"
         )
     for force in tables.loaded:
         group = next((each for each in redundant if force.joint is not None and force.joint.name in each), ())
         if group:
             raise ValueError(
-                f"{force.name!r} grows with the load of its joint, which is not determined: rows follow from others "
-                f"among {', '.join(map(repr, group))}. Take joints that leave more free, or no coefficient"
+                f"{force.name!r} depends on the load of its joint, which is not determined: the rows of "
+                f"{', '.join(map(repr, group))} are dependent. Use joints with more freedom, or no coefficient"
             )
 
 
@@ -138,14 +138,14 @@ def _check_finite(function: Function | RowFunction, value: Array, t: float) -> N
     if not np.isfinite(value).all():
         raise ValueError(
             f"{function.name} must be finite at the start; at t = {t:g} it gives {shown(value)}. Look for divisions by "
-            "zero, and for roots and logarithms of what is not positive; or begin elsewhere"
+            "zero, and for roots and logarithms of non-positive numbers; or start elsewhere"
         )
 
 
 @QUIET
 def _disagreement(tables: Tables, t: float, q: Array, v: Array) -> str:
-    """Which function does not give what its program gives; "": none is known."""
-    from twoloop.bodies.program_results import results  # whose import compiles
+    """Return a message that names the function whose program gives other values; "" if all agree."""
+    from twoloop.bodies.program_results import results  # compiled on import
 
     head, p = tables.p[tables.p.size - layout.HEAD :], tables.p
     generic = np.random.default_rng(8)
@@ -161,7 +161,7 @@ def _disagreement(tables: Tables, t: float, q: Array, v: Array) -> str:
             for each in functions:
                 try:
                     known = each.at(then, one, other)
-                except (ArithmeticError, TypeError):  # outside what it is made for
+                except (ArithmeticError, TypeError):  # outside the domain of the function
                     known = np.full(each.n_results, np.nan)
                 size = each.n_results
                 found, first = made[first : first + len(known)], first + size
@@ -172,7 +172,7 @@ def _disagreement(tables: Tables, t: float, q: Array, v: Array) -> str:
 
 
 class InPython:
-    """The callbacks of a model whose functions are called in Python; the tables are read by the compiled ones.
+    """Callbacks of a model whose functions are called in Python; the compiled ones evaluate the tables.
 
     Parameters
     ----------
@@ -189,7 +189,7 @@ class InPython:
         self.loaded: LoadedFriction | None = None
 
     def redundant(self, t: float, q: Array, v: Array) -> bool:
-        """Whether rows of the constraints follow from others at a state."""
+        """Return True if constraint rows are linearly dependent at a state."""
         rows = self._rows(t, q, self.p)
         return int(np.linalg.matrix_rank(rows)) < len(rows)
 
@@ -198,11 +198,11 @@ class InPython:
         return np.vstack([self.jacobian(t, q, p), rates])
 
     def mass(self, t: float, q: Array, p: Array) -> Array:
-        """M."""
+        """Evaluate M."""
         return self._filled("mass", (self._n_q, self._n_q), q, lambda: (t, q, p))
 
     def force(self, t: float, q: Array, v: Array, p: Array) -> Array:
-        """Q."""
+        """Evaluate Q."""
         made = self._filled("fill_force", (self._n_q,), q, lambda: (q, v, p, _called(self._functions, t, q, v)))
         if self.loaded is not None:
             rates = self.nonholonomic_gamma(t, q, v, p) if self._n_rates else np.zeros(0)
@@ -211,31 +211,31 @@ class InPython:
         return made
 
     def constraint(self, t: float, q: Array, p: Array) -> Array:
-        """C."""
+        """Evaluate C."""
         return self._filled("fill_constraint", (self._n_rows,), q, lambda: (q, p, self._moved(t, q, q)))
 
     def jacobian(self, t: float, q: Array, p: Array) -> Array:
-        """C_q."""
+        """Evaluate C_q."""
         return self._filled("fill_jacobian", (self._n_rows, self._n_q), q, lambda: (q, p, self._moved(t, q, q)))
 
     def constraint_rate(self, t: float, q: Array, p: Array) -> Array:
-        """C_t."""
+        """Evaluate C_t."""
         return self._filled("fill_rate", (self._n_rows,), q, lambda: (q, p, self._moved(t, q, q)))
 
     def gamma(self, t: float, q: Array, v: Array, p: Array) -> Array:
-        """The right-hand side of C_q a = gamma."""
+        """Evaluate the right-hand side of C_q a = gamma."""
         return self._filled("fill_gamma", (self._n_rows,), q, lambda: (q, v, p, self._moved(t, q, v)))
 
     def nonholonomic(self, t: float, q: Array, p: Array) -> Array:
-        """A."""
+        """Evaluate A."""
         return self._filled("fill_nonholonomic", (self._n_rates, self._n_q), q, lambda: (p, self._moved(t, q, q)))
 
     def nonholonomic_gamma(self, t: float, q: Array, v: Array, p: Array) -> Array:
-        """The right-hand side of A a = Q_a."""
+        """Evaluate the right-hand side of A a = Q_a."""
         return self._filled("fill_nonholonomic_gamma", (self._n_rates,), q, lambda: (p, self._moved(t, q, v)))
 
     def _filled(self, fill: str, shape: tuple[int, ...], q: Array, given: Callable[[], tuple[Any, ...]]) -> Array:
-        if q.dtype == object:  # symbols, on which the compiled callbacks would say less
+        if q.dtype == object:  # symbols: the compiled callbacks would raise a less helpful error
             raise Untraceable(self._untraced)
         made = np.zeros(shape)
         getattr(self._callbacks, fill)(*given(), made)

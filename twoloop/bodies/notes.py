@@ -1,4 +1,4 @@
-"""What there is to know of a model that was put together, in words, and what its user may not have meant."""
+"""Remarks on an assembled model: degrees of freedom, redundancy, and likely mistakes."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from twoloop.bodies.tables import TENSOR, Tables
 from twoloop.checks.arguments import Array
 from twoloop.problem.description import name_and_unit
 
-MOVED = 1e-6  # of the largest coordinate
-ROUNDED = 0.01  # relative: moments as they are printed
+MOVED = 1e-6  # relative to the largest coordinate: smaller displacements are not reported
+ROUNDED = 0.01  # relative tolerance of the triangle inequality, for moments of inertia rounded to a few digits
 TURN = 2.0 * np.pi
 
 
@@ -27,7 +27,7 @@ def note_of(
     start: Array,
     coordinates: Sequence[str],
 ) -> str:
-    """Degrees of freedom, redundant rows, and what else is worth a look.
+    """Return remarks on degrees of freedom, redundant rows and possible mistakes.
 
     Parameters
     ----------
@@ -35,7 +35,7 @@ def note_of(
     tables : Tables
     freedom : Freedom
     given, closed, start : ndarray (n_q,)
-        Coordinates as they were given, with all joints closed, and where drives begin.
+        Coordinates as given, with all joints closed, and with the drives at their initial values.
     coordinates : sequence of str (n_q,)
     """
     made = [*_freedom(freedom), *_moved(given, closed, coordinates), *_forgotten(model)]
@@ -48,9 +48,9 @@ def note_of(
 def _freedom(freedom: Freedom) -> Iterator[str]:
     yield f"{freedom.degrees} {'degree' if freedom.degrees == 1 else 'degrees'} of freedom."
     if freedom.singular:
-        yield f"The start is singular: {freedom.singular} more there."
+        yield f"The start is singular: {freedom.singular} more degrees of freedom there."
     for group in freedom.redundant:
-        yield f"Rows follow from others among {', '.join(map(repr, group))}."
+        yield f"The rows of {', '.join(map(repr, group))} are dependent."
 
 
 def _moved(given: Array, closed: Array, coordinates: Sequence[str]) -> Iterator[str]:
@@ -66,19 +66,19 @@ def _forgotten(model: Collection) -> Iterator[str]:
     joined |= {id(body) for each in model.forces for body in (each.first, each.second)}
     for body in model.bodies:
         if model.joints and id(body) not in joined:
-            yield f"{body.name!r} is in no joint, and no force is on it."
+            yield f"{body.name!r} has no joint, and no force acts on it."
     for force in model.forces:
         if force.joint is not None and id(force.joint.point_b) in drives:
             name = drives[id(force.joint.point_b)]
-            yield f"{force.name!r} acts where {name!r} prescribes the motion: it changes the reaction of that alone."
+            yield f"{force.name!r} acts where {name!r} prescribes the motion: it only changes the drive reaction."
     if model.dry:
-        yield "solve_with_friction keeps its dry friction; solve_dae does not know it."
+        yield "solve_with_friction handles its dry friction; solve_dae ignores it."
     if model.stops:
-        yield "solve_with_stops keeps its stops; solve_dae does not know them."
+        yield "solve_with_stops handles its stops; solve_dae ignores them."
 
 
 def _inertias(model: Collection, tables: Tables) -> Iterator[str]:
-    """Moments that no masses have; the equations hold with them all the same."""
+    """Yield bodies whose principal moments violate the triangle inequality; the equations are still well defined."""
     for body in model.bodies if model.dimension == 3 else ():
         first = tables.places[f"mass of {body.name} (kg)"] + 1
         low, middle, high = np.linalg.eigvalsh(tables.p[first : first + 6][TENSOR].reshape(3, 3))
@@ -90,7 +90,7 @@ def _inertias(model: Collection, tables: Tables) -> Iterator[str]:
 
 
 def _turns(model: Collection, tables: Tables, start: Array) -> Iterator[str]:
-    """Angles of more than a turn: they may be degrees."""
+    """Yield angles of more than one turn, which may be meant in degrees."""
     angles = {name: value for name, value in tables.values.items() if name.endswith("(rad)")}
     if model.dimension == 2:
         angles |= {f"angle of {body.name} (rad)": start[body.coordinates[2]] for body in model.bodies}

@@ -1,4 +1,4 @@
-"""What a model is made of: bodies, points on them, joints, forces, and the numbers that these have."""
+"""Parts of a model: bodies, points on them, joints, forces, and their numbers."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from twoloop.checks.arguments import Array, check_vector
 
 @dataclass(frozen=True, eq=False)
 class BodyPoint:
-    """A point in the axes of a body, from its centre of mass, m; `body.point(...)` makes it."""
+    """A point in the axes of a body, relative to its centre of mass, m; made by `body.point(...)`."""
 
     body: Body
     place: Array
@@ -23,7 +23,7 @@ class BodyPoint:
 
 @dataclass(frozen=True, eq=False)
 class BodyDirection:
-    """A direction in the axes of a body; `body.direction(...)` makes it."""
+    """A direction in the axes of a body; made by `body.direction(...)`."""
 
     body: Body
     components: Array
@@ -31,52 +31,52 @@ class BodyDirection:
 
 @dataclass(frozen=True, eq=False)
 class Body:
-    """A rigid body of a model, or its ground; `model.body(...)` makes it.
+    """A rigid body of a model, or its ground; made by `model.body(...)`.
 
     Attributes
     ----------
     name : str
     number : int
-        From 0 in the order in which bodies were added; -1 is the ground.
+        Index in the order of addition, from 0; -1 for the ground.
     coordinates : tuple of int
-        Which of `q` and `v` are the body's: x, y and the angle, or x, y, z and four Euler parameters.
+        Indices of the body in `q` and `v`: x, y and the angle, or x, y, z and four Euler parameters.
     """
 
     name: str
     number: int
     position: Array = field(repr=False)
     rotation: Any = field(repr=False)  # an angle, or a matrix (3, 3)
-    inertia: Array = field(repr=False)  # mass and moments, as they stand in the parameters
+    inertia: Array = field(repr=False)  # mass and moments, in the order of the parameters
     velocity: Array | None = field(default=None, repr=False)
     angular_velocity: Array | None = field(default=None, repr=False)
 
     @property
     def coordinates(self) -> tuple[int, ...]:
-        """Which of q and v are the body's."""
+        """Return the indices of the body in q and v."""
         width = 3 if len(self.position) == 2 else 7
         return () if self.number == NONE else tuple(range(width * self.number, width * (self.number + 1)))
 
     def point(self, *place: float) -> BodyPoint:
-        """A point by its coordinates in the axes of the body, from the centre of mass; on the ground, in space."""
+        """Return a point on the body, by its coordinates in body axes from the centre of mass (ground: in space)."""
         return BodyPoint(self, check_vector(f"point on {self.name!r}", place, len(self.position)))
 
     def direction(self, *components: float) -> BodyDirection:
-        """A direction by its components in the axes of the body."""
+        """Return a direction by its components in the axes of the body."""
         return BodyDirection(self, check_vector(f"direction on {self.name!r}", components, len(self.position)))
 
     def local_direction(self, given: Array) -> Array:
-        """A direction of space, in the axes that the body has in the position given."""
+        """Transform a direction from space to the axes of the body, in the position given."""
         if len(given) == 2:
             s, c = np.sin(self.rotation), np.cos(self.rotation)
             return np.array([c * given[0] + s * given[1], c * given[1] - s * given[0]])
         return np.asarray(self.rotation.T @ given)
 
     def local_point(self, given: Array) -> Array:
-        """A point of space in the axes of the body, from its centre, in the position given."""
+        """Transform a point from space to the axes of the body, relative to its centre, in the position given."""
         return self.local_direction(given - self.position)
 
     def in_space(self, place: Array) -> Array:
-        """A point of the body in space, in the position given."""
+        """Transform a point of the body to space, in the position given."""
         if len(place) == 2:
             s, c = np.sin(self.rotation), np.cos(self.rotation)
             return self.position + np.array([c * place[0] - s * place[1], s * place[0] + c * place[1]])
@@ -85,7 +85,7 @@ class Body:
 
 @dataclass(frozen=True, eq=False)
 class Numbers:
-    """Numbers that stand together in the parameters; those without names are no parameters of the model."""
+    """Consecutive entries of the parameter vector; those without names are not parameters of the model."""
 
     values: tuple[float, ...]
     names: tuple[str, ...] = ()
@@ -93,7 +93,7 @@ class Numbers:
 
 @dataclass(frozen=True, eq=False)
 class JointRow:
-    """Rows of the constraints: a row of the table of joints, see `parameter_layout`."""
+    """Constraint rows: one row of the table of joints, see `parameter_layout`."""
 
     kind: int
     n_rows: int
@@ -107,12 +107,12 @@ class JointRow:
 
 @dataclass(frozen=True, eq=False)
 class ModelJoint:
-    """A joint of a model, or a drive of one; its methods make it.
+    """A joint or drive of a model; made by the methods of the model.
 
     Attributes
     ----------
     name : str
-        By which `Result.reactions` knows it.
+        Name in `Result.reactions`.
     kind : str
     a, b : Body
     """
@@ -122,19 +122,19 @@ class ModelJoint:
     a: Body
     b: Body
     rows: tuple[JointRow, ...] = field(repr=False)
-    point_a: Numbers = field(repr=False)  # in the axes of the body
+    point_a: Numbers = field(repr=False)  # in body axes
     point_b: Numbers = field(repr=False)
-    axes: tuple[Array, ...] = field(default=(), repr=False)  # in space: the axis in those of a and in those of b
+    axes: tuple[Array, ...] = field(default=(), repr=False)  # spatial joints: the axis in the axes of a and of b
 
     @property
     def body(self) -> Body:
-        """The body on which the joint is said to act: `a`, or `b` where that is the ground."""
+        """Return the body on which the reaction is reported: `a`, or `b` if `a` is the ground."""
         return self.b if self.a.number == NONE else self.a
 
 
 @dataclass(frozen=True, eq=False)
 class Force:
-    """A force, a torque or a spring of a model: a row of the table of forces, see `parameter_layout`.
+    """A force, torque or spring of a model: one row of the table of forces, see `parameter_layout`.
 
     Attributes
     ----------
@@ -150,23 +150,23 @@ class Force:
     more: Numbers | None = field(default=None, repr=False)
     function: Function | None = field(default=None, repr=False)
     point_on_first: Numbers | None = field(default=None, repr=False)
-    joint: ModelJoint | None = field(default=None, repr=False)  # in which it is
+    joint: ModelJoint | None = field(default=None, repr=False)  # the joint on which it acts
 
 
 @dataclass(frozen=True, eq=False)
 class DryFriction:
-    """Coulomb's friction in a joint; `model.dry_friction(...)` makes it.
+    """Coulomb friction in a joint; made by `model.dry_friction(...)`.
 
     Attributes
     ----------
     name : str
     joint : ModelJoint
     kinetic, static : float
-        N m or N: while b slides on a, and the most that holds it.
+        Kinetic friction and largest static friction, N m or N.
     """
 
     name: str
     joint: ModelJoint = field(repr=False)
     kinetic: float
     static: float
-    force: Force = field(repr=False)  # on b in the direction of the joint; zero but in a mode
+    force: Force = field(repr=False)  # on b in the direction of the joint; nonzero only within a mode

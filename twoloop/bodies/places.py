@@ -1,4 +1,4 @@
-"""Vectors and points of bodies in space, of numbers or symbols."""
+"""Vectors and points of bodies in space, for numbers or symbols."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from twoloop.checks.arguments import Array
 
 
 def turned(q: Any, body: Body, vector: Any) -> list[Any]:
-    """A vector in the axes of a body, in space; of numbers or symbols."""
+    """Transform a vector from body axes to space, for numbers or symbols."""
     if body.number < 0:
         return list(vector)
     if len(vector) == 2:
@@ -23,6 +23,6 @@ def turned(q: Any, body: Body, vector: Any) -> list[Any]:
 
 
 def placed(q: Any, body: Body, place: Array) -> list[Any]:
-    """A point in the axes of a body, in space."""
+    """Transform a point from body axes to space."""
     moved = turned(q, body, place)
     return moved if body.number < 0 else [q[j] + x for j, x in zip(body.coordinates, moved, strict=False)]

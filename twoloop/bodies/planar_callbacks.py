@@ -1,4 +1,4 @@
-"""The callbacks of all planar models: bodies by x, y of the centre of mass and an angle; p: see `parameter_layout`."""
+"""Callbacks of all planar models; coordinates: centre of mass x, y and angle; for p see `parameter_layout`."""
 
 import math
 
@@ -11,12 +11,12 @@ from twoloop.kernels.compile.callbacks import callback
 from twoloop.mechanisms.planar import motion
 from twoloop.mechanisms.planar import place as place_on
 
-WEIGHT = 2  # numbers of gravity, before those of the bodies
+WEIGHT = 2  # components of gravity, which precede the numbers of the bodies
 
 
 @helper
 def angle_of(q, body):
-    """The angle of a body; also its rate, of v."""
+    """Return the angle of a body, or its rate from v."""
     if body < 0:
         return 0.0
     return q[3 * body + 2]
@@ -24,13 +24,13 @@ def angle_of(q, body):
 
 @helper
 def place(q, body, p, at):
-    """The point of a body whose two numbers stand in p, and its derivative by the angle: x, y, dx, dy."""
+    """Return the point of a body stored at index `at` of p and its derivative by the angle: x, y, dx, dy."""
     return place_on(q, body, p[at], p[at + 1])
 
 
 @helper
 def direction(q, body, angle, across):
-    """The unit vector at an angle from the x axis of a body, or the one across it."""
+    """Return the unit vector at an angle from the x axis of a body, or the one perpendicular to it."""
     total = angle + angle_of(q, body)
     s, c = math.sin(total), math.cos(total)
     if across:
@@ -40,7 +40,7 @@ def direction(q, body, angle, across):
 
 @helper
 def add(row, body, fx, fy, dx, dy):
-    """Add to a row (n_q,) the derivative of fx x + fy y of a point: the generalised force of (fx, fy) there."""
+    """Add to a row (n_q,) the derivative of fx x + fy y of a point, i.e. the generalised force of (fx, fy) there."""
     if body >= 0:
         row[3 * body] += fx
         row[3 * body + 1] += fy
@@ -49,14 +49,14 @@ def add(row, body, fx, fy, dx, dy):
 
 @helper
 def turn(row, body, factor):
-    """Add to a row the derivative of a multiple of the angle: the generalised force of a torque."""
+    """Add to a row the derivative of a multiple of the angle, i.e. the generalised force of a torque."""
     if body >= 0:
         row[3 * body + 2] += factor
 
 
 @helper
 def fill_constraint(q, p, made, C):
-    """C."""
+    """Evaluate C."""
     for k in tables.joint_places(p):
         kind, row, i, at, j, there, more, moved = tables.joint_at(p, k)
         if kind == layout.RATE:
@@ -81,7 +81,7 @@ def fill_constraint(q, p, made, C):
 
 @helper
 def fill_rows(q, p, made, k, Cq, row, one, other):
-    """The rows of C_q of the part of a joint at place k, from a row on; its bodies are the one and the other in Cq."""
+    """Evaluate the rows of C_q of joint row k, from `row` on; `one` and `other` locate its bodies in Cq."""
     kind, _, i, at, j, there, more, moved = tables.joint_at(p, k)
     if kind == layout.WRITTEN:
         fill_entries(p, more, made, moved + 3, Cq[row])
@@ -109,7 +109,7 @@ def fill_rows(q, p, made, k, Cq, row, one, other):
 
 @helper
 def fill_jacobian(q, p, made, Cq):
-    """C_q; `made`: results of the program of motions."""
+    """Evaluate C_q; `made`: results of the program of motions."""
     for k in tables.joint_places(p):
         kind, row, i, _, j, _, _, _ = tables.joint_at(p, k)
         if kind != layout.RATE:
@@ -118,16 +118,16 @@ def fill_jacobian(q, p, made, Cq):
 
 @helper
 def fill_rate(q, p, made, Ct):
-    """C_t, of drives alone."""
+    """Evaluate C_t, which only drives have."""
     for k in tables.joint_places(p):
         kind, row, _, _, _, _, _, moved = tables.joint_at(p, k)
         if moved >= 0 and kind != layout.RATE:
-            Ct[row] = -made[moved + 1]  # zero of WRITTEN rows
+            Ct[row] = -made[moved + 1]  # zero for WRITTEN rows
 
 
 @helper
 def fill_gamma(q, v, p, made, Qd):
-    """The right-hand side of C_q a = gamma."""
+    """Evaluate the right-hand side of C_q a = gamma."""
     for k in tables.joint_places(p):
         kind, row, i, at, j, there, more, moved = tables.joint_at(p, k)
         if kind == layout.RATE:
@@ -156,7 +156,7 @@ def fill_gamma(q, v, p, made, Qd):
 
 @helper
 def fill_force(q, v, p, made, Q):
-    """Q; `made`: results of the program of forces."""
+    """Evaluate Q; `made`: results of the program of forces."""
     for body in range(tables.n_bodies(p)):
         mass = p[WEIGHT + layout.PLANAR_BODY * body]
         Q[3 * body] += mass * p[0]
@@ -181,7 +181,7 @@ def fill_force(q, v, p, made, Q):
             else:
                 add(Q, j, p[more], p[more + 1], bdx, bdy)
             continue
-        if kind in (layout.SLIDE, layout.RAIL, layout.RUB):  # at the point of j, also on i
+        if kind in (layout.SLIDE, layout.RAIL, layout.RUB):  # applied at the point of j on both bodies
             fx, fy = direction(q, i, p[at], False)
             u, w, _, _ = motion(v, j, bdx, bdy)
             if i >= 0:

@@ -1,4 +1,4 @@
-"""Joints in a plane that couple motions: gears, racks, wheels that roll, points on curves."""
+"""Planar joints that couple motions: gears, racks, rolling wheels, points on curves."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ from twoloop.checks.arguments import check_finite, check_positive
 
 @documented
 class Couplings(Model):
-    """Adds such joints to a planar model. Their numbers are no parameters of it."""
+    """Adds couplings to a planar model. Their constants are not parameters of the model."""
 
     def gear(
         self, one: ModelJoint | str, other: ModelJoint | str, *, ratio: float, name: str | None = None
     ) -> ModelJoint:
-        """Two hinges that turn together: `other` turns by `ratio` times what `one` turns, from the position given.
+        """Couple two hinges: `other` turns by `ratio` times the rotation of `one`, from the position given.
 
-        Its reaction is a torque on the bodies of `other`.
+        The reaction is a torque on the bodies of `other`.
 
         Parameters
         ----------
         one, other : ModelJoint or str
-            Revolute joints; each turns its b on its a. Two wheels on one carrier have it as their a.
+            Revolute joints; the rotation is that of b relative to a. For two wheels on one carrier, a is the carrier.
         ratio : float
-            Negative for wheels that touch from outside: minus the radius of one over that of the other.
+            Negative for external gears: minus the radius of `one` over that of `other`.
         """
         first, second = self._two(one, "revolute", other, "revolute", "gear")
         factor = check_finite("ratio", ratio)
@@ -44,14 +44,14 @@ class Couplings(Model):
     def rack(
         self, pinion: ModelJoint | str, slide: ModelJoint | str, *, radius: float, name: str | None = None
     ) -> ModelJoint:
-        """A pinion on a rack: the slide moves by `radius` times what the pinion turns, from the position given.
+        """Couple a pinion to a rack: the slide moves by `radius` times the pinion's rotation since the position given.
 
         Parameters
         ----------
         pinion, slide : ModelJoint or str
             A revolute and a prismatic joint.
         radius : float
-            m; negative where a turn from x to y moves the slide against its axis.
+            m; negative if a rotation from x to y moves the slide against its axis.
         """
         first, second = self._two(pinion, "revolute", slide, "prismatic", "rack")
         factor = check_finite("radius", radius)
@@ -70,18 +70,18 @@ class Couplings(Model):
     def rolling(
         self, a: Body | str, wheel: Body | str, *, radius: float, axis: Any, name: str | None = None
     ) -> ModelJoint:
-        """A wheel, whose centre of mass is its centre, that rolls on a line of a without slipping.
+        """Let a wheel, whose centre of mass is its centre, roll without slipping on a line of a.
 
-        Its reaction is what the wheel does to a; where a is the ground, what this does to the wheel.
+        The reaction is that on a, or on the wheel if a is the ground.
 
         Parameters
         ----------
         a, wheel : Body or str
-            The line is below the wheel in the position given: `radius` to the right of its centre, seen along the axis.
+            In the position given, the line is `radius` to the right of the centre of the wheel, looking along the axis.
         radius : float
             m.
         axis : array_like (2,) or BodyDirection
-            Along the line.
+            Direction of the line.
         """
         first, second, name, named = self._pair("rolling", a, wheel, name, None)
         points = Numbers(named[0].values), Numbers(named[1].values)
@@ -98,9 +98,9 @@ class Couplings(Model):
         return self._coupled(name, "rolling", joint, rows, joint)
 
     def skate(self, body: Body | str, *, at: Any, axis: Any, name: str | None = None) -> ModelJoint:
-        """A blade, or a thin wheel seen from above: its point moves along an axis of the body only. Non-holonomic.
+        """Add a blade, or a thin wheel seen from above: its point moves only along an axis of the body (non-holonomic).
 
-        Its reaction is the force across the blade, on the body.
+        The reaction is the force on the body across the blade.
 
         Parameters
         ----------
@@ -108,7 +108,7 @@ class Couplings(Model):
         at : array_like (2,) or BodyPoint
             The point, in space in the position given, m.
         axis : array_like (2,) or BodyDirection
-            Along the blade, in space in the position given.
+            Direction of the blade, in space in the position given.
         """
         on = self._moving_body("body", body)
         name = self._new_name("skate", name, on)
@@ -129,7 +129,7 @@ class Couplings(Model):
     def point_on_curve(
         self, a: Body | str, b: Body | str, *, at: Any, curve: Callable[[Any, Any], Any], name: str | None = None
     ) -> ModelJoint:
-        """A point of b that stays on a curve of a, as a pin in a slot or the tip of a follower on its cam.
+        """Keep a point of b on a curve of a, like a pin in a slot or the tip of a follower on its cam.
 
         Parameters
         ----------
@@ -137,14 +137,14 @@ class Couplings(Model):
         at : array_like (2,) or BodyPoint
             The point of b, in space in the position given, m.
         curve : callable
-            curve(x, y), zero on the curve; x and y from the centre of mass of a in its axes, of the ground in space, m.
-            Such as `lambda x, y: y - 0.1 * np.cos(5.0 * x)`, of numpy's functions without branches. Its gradient must
-            not be zero on the curve.
+            curve(x, y), zero on the curve, e.g. `lambda x, y: y - 0.1 * np.cos(5.0 * x)`, from numpy functions without
+            branches; x and y in the axes of a relative to its centre of mass (ground: in space), m. Its gradient must
+            not vanish on the curve.
 
         Raises
         ------
         TypeError, ValueError
-            If an argument is wrong, or the curve cannot be run on symbols.
+            If an argument is invalid, or the curve cannot be traced.
         """
         first, second = self._body("a", a), self._body("b", b)
         self._different("point_on_curve", first, second)
@@ -156,7 +156,7 @@ class Couplings(Model):
         points = Numbers(tuple(here)), Numbers(tuple(there))
 
         def off(q: Any) -> Any:
-            return curve(*_seen(q, first, placed(q, second, there)))
+            return curve(*_in_body_axes(q, first, placed(q, second, there)))
 
         joint = ModelJoint(name, "point on curve", first, second, (), *points)
         return self._coupled(name, "point on curve", joint, [off], joint)
@@ -170,7 +170,7 @@ class Couplings(Model):
     def _coupled(
         self, name: str, kind: str, acts: ModelJoint, rows: list[Callable[[Any], Any]], also: ModelJoint
     ) -> ModelJoint:
-        """The joint of rows that are functions of the coordinates of the bodies of two joints."""
+        """Return the joint whose rows are functions of the coordinates of the bodies of two joints."""
         columns = tuple(sorted({j for joint in (acts, also) for body in (joint.a, joint.b) for j in body.coordinates}))
         places = Numbers((float(len(columns)), *map(float, columns)))
         ends = acts.a, acts.b, acts.point_a, acts.point_b
@@ -184,19 +184,19 @@ def _angle(q: Any, body: Body) -> Any:
 
 
 def _turned(q: Any, joint: ModelJoint) -> Any:
-    """By how much b has turned on a since the position given."""
+    """Return the rotation of b relative to a since the position given."""
     return _angle(q, joint.b) - _angle(q, joint.a) - (joint.b.rotation - joint.a.rotation)
 
 
 def _along(q: Any, a: Body, angle: float, here: Any, b: Body, there: Any) -> Any:
-    """How far a point of b is from one of a, along a direction of a."""
+    """Return the displacement of a point of b from a point of a along a direction of a."""
     (x, y), (u, w) = placed(q, a, here), placed(q, b, there)
     total = _angle(q, a) + angle
     return np.cos(total) * (u - x) + np.sin(total) * (w - y)
 
 
-def _seen(q: Any, body: Body, point: list[Any]) -> list[Any]:
-    """A point of space in the axes of a body."""
+def _in_body_axes(q: Any, body: Body, point: list[Any]) -> list[Any]:
+    """Transform a point from space to the axes of a body."""
     if body.number < 0:
         return point
     x, y = (each - q[j] for each, j in zip(point, body.coordinates, strict=False))

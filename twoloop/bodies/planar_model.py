@@ -1,4 +1,4 @@
-"""Models in a plane."""
+"""Models in the plane."""
 
 from __future__ import annotations
 
@@ -18,10 +18,11 @@ from twoloop.checks.arguments import Array, check_finite, check_positive, check_
 
 @documented
 class PlanarModel(Couplings):
-    """A mechanism in a plane, from bodies, joints and forces.
+    """A planar mechanism made of bodies, joints and forces.
 
-    Coordinates are x, y of each body's centre of mass and its angle, positive from x to y. Points and axes are given in
-    space, in the position in which the bodies are given, or on a body by `body.point(...)` and `body.direction(...)`.
+    The coordinates are x, y of the centre of mass of each body and its angle, positive from x to y. Points and axes are
+    given in space, in the position in which the bodies are given, or on a body by `body.point(...)` and
+    `body.direction(...)`.
 
     Parameters
     ----------
@@ -33,12 +34,12 @@ class PlanarModel(Couplings):
     ----------
     ground : Body
     bodies, joints, forces : list
-        What was added so far.
+        The parts added so far.
 
     Raises
     ------
     TypeError, ValueError
-        If an argument is wrong.
+        If an argument is invalid.
     """
 
     dimension = 2
@@ -65,15 +66,15 @@ class PlanarModel(Couplings):
         ----------
         name : str
         mass, inertia : float
-            kg, and kg m^2 about the centre of mass.
+            Mass, kg, and moment of inertia about the centre of mass, kg m^2.
         position : array_like (2,)
             Of the centre of mass, m.
         angle : float
             rad.
         velocity : array_like (2,), optional
-            Of the centre of mass at the start, m/s. None: it follows from the other velocities.
+            Initial velocity of the centre of mass, m/s. None: determined by the other velocities.
         angular_velocity : float, optional
-            rad/s, likewise.
+            Initial angular velocity, rad/s, or None as for `velocity`.
         """
         name, place, weight, speed = self._new_body(name, mass, position, velocity)
         check_positive(f"inertia of {name!r}", inertia)
@@ -83,7 +84,7 @@ class PlanarModel(Couplings):
         return self._add_body(Body(name, len(self.bodies), place, turned, np.array([weight, inertia]), speed, spin))
 
     def rod(self, name: str, start: ArrayLike, end: ArrayLike, *, mass: float, **motion: Any) -> Body:
-        """Add a uniform thin rod between two points of space; its angle is that from `start` to `end`.
+        """Add a uniform thin rod between two points of space; its angle is that of the line from `start` to `end`.
 
         Parameters
         ----------
@@ -143,20 +144,21 @@ class PlanarModel(Couplings):
         return self.body(name, mass=mass, inertia=0.5 * mass * radius**2, position=position, **pose)
 
     def revolute(self, a: Body | str, b: Body | str, *, at: Any, name: str | None = None) -> ModelJoint:
-        """A pin: b turns on a.
+        """Add a revolute joint: b rotates on a about a pin.
 
         Parameters
         ----------
         a, b : Body or str
             The bodies, or their names.
         at : array_like (2,) or (BodyPoint, BodyPoint)
-            Where the pin is, in space in the position given, m; or a point of a and one of b, which are put together.
+            The pin, in space in the position given, m; or a point of a and a point of b, which the joint brings
+            together.
         """
         first, second, name, points = self._pair("revolute", a, b, name, at)
         return self._add_joint(ModelJoint(name, "revolute", first, second, (_pin(first, second, *points),), *points))
 
     def prismatic(self, a: Body | str, b: Body | str, *, at: Any, axis: Any, name: str | None = None) -> ModelJoint:
-        """A slide: b moves along an axis of a, and does not turn on it.
+        """Add a prismatic joint: b slides along an axis of a without rotating on it.
 
         Parameters
         ----------
@@ -164,7 +166,7 @@ class PlanarModel(Couplings):
         at : array_like (2,) or (BodyPoint, BodyPoint)
             A point on the axis, m.
         axis : array_like (2,) or BodyDirection
-            Its direction, of any length; a pair of directions of a and b says how b is turned against a.
+            Direction, of any length; a pair of directions of a and b prescribes the rotation of b relative to a.
         """
         first, second, name, points = self._pair("prismatic", a, b, name, at)
         one, other = self._directions(axis, first, second)
@@ -211,7 +213,7 @@ class PlanarModel(Couplings):
         return Force(name, SLIDE, joint.a, joint.b, joint.rows[0].more, joint.point_b, more, function, joint=joint)
 
     def _along(self, name: str, kind: int, joint: ModelJoint, numbers: Numbers) -> Force:
-        axis = joint.rows[0].more  # None of a revolute one
+        axis = joint.rows[0].more  # None for a revolute joint
         return Force(name, kind, joint.a, joint.b, axis, joint.point_b, numbers, point_on_first=joint.point_a)
 
     def _check_moments(self, name: str, moments: Array) -> None:

@@ -1,4 +1,4 @@
-"""What the functions of a model give: programs that were traced of them and stand in the parameters."""
+"""Evaluation of the traced programs of a model, which are stored in its parameters."""
 
 import numpy as np
 
@@ -11,7 +11,7 @@ N_RESULTS, N_NODES, N_ROWS, N_TERMS, PROGRAM = range(5)
 
 @helper
 def total(nodes, first, p, columns, coefficients, constant, begin, end):
-    """A form: a constant and multiples of nodes."""
+    """Return a constant plus a linear combination of nodes."""
     made = p[constant]
     for k in range(begin, end):
         made = made + p[coefficients + k] * nodes[first + int(p[columns + k])]
@@ -20,7 +20,7 @@ def total(nodes, first, p, columns, coefficients, constant, begin, end):
 
 @helper
 def results(place, t, q, v, p):
-    """The results of the program at a place of p, then all of its nodes; p itself where there is none."""
+    """Return the results of the program at an index of p followed by all its nodes; p itself if there is no program."""
     if place < 0:
         return p
     first, n_rows, n_terms = int(p[place + N_RESULTS]), int(p[place + N_ROWS]), int(p[place + N_TERMS])
@@ -48,7 +48,7 @@ def results(place, t, q, v, p):
 
 @helper
 def result(made, place, order):
-    """A derivative of a motion, zero where there is none."""
+    """Return a derivative of a motion; zero if there is no motion."""
     if place < 0:
         return 0.0
     return made[place + order]

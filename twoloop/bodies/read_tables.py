@@ -1,4 +1,4 @@
-"""How callbacks read the tables of a model in its parameters, see `parameter_layout`, and results of its programs."""
+"""Access to the tables of a model in its parameters, see `parameter_layout`, and to the results of its programs."""
 
 import math
 
@@ -9,47 +9,47 @@ from twoloop.kernels.compile.caches import helper
 
 @helper
 def n_bodies(p):
-    """Number of bodies."""
+    """Return the number of bodies."""
     return int(p[p.size - layout.HEAD + layout.BODIES])
 
 
 @helper
 def joint_places(p):
-    """Where the rows of the table of joints begin."""
+    """Return the index at which the table of joints begins."""
     first, n = int(p[p.size - layout.HEAD + layout.JOINTS]), int(p[p.size - layout.HEAD + layout.N_JOINTS])
     return range(first, first + layout.JOINT_WIDTH * n, layout.JOINT_WIDTH)
 
 
 @helper
 def joint_at(p, k):
-    """A row of it: kind, row of C, bodies i and j each with the place of its numbers, further numbers, motion."""
+    """Return a row of the table: kind, row of C, bodies i and j with their numbers, further numbers, motion."""
     i, at, j, there = int(p[k + 2]), int(p[k + 3]), int(p[k + 4]), int(p[k + 5])
     return int(p[k]), int(p[k + 1]), i, at, j, there, int(p[k + 6]), int(p[k + 7])
 
 
 @helper
 def force_places(p):
-    """Where the rows of the table of forces begin."""
+    """Return the index at which the table of forces begins."""
     first, n = int(p[p.size - layout.HEAD + layout.FORCES]), int(p[p.size - layout.HEAD + layout.N_FORCES])
     return range(first, first + layout.FORCE_WIDTH * n, layout.FORCE_WIDTH)
 
 
 @helper
 def force_at(p, k):
-    """A row of it: kind, bodies i and j each with the place of its numbers, further numbers, result, point of i."""
+    """Return a row of the table: kind, bodies i and j with indices of numbers, further numbers, result, point of i."""
     i, at, j, there = int(p[k + 1]), int(p[k + 2]), int(p[k + 3]), int(p[k + 4])
     return int(p[k]), i, at, j, there, int(p[k + 5]), int(p[k + 6]), int(p[k + 7])
 
 
 @helper
 def motions(t, q, v, p):
-    """Results of the program of motions."""
+    """Return the results of the program of motions."""
     return results(int(p[p.size - layout.HEAD + layout.MOTION_PROGRAM]), t, q, v, p)
 
 
 @helper
 def value(p, more, made, given, i):
-    """A number of a force: of its function, if it is one."""
+    """Return a number of a force, or its function value if it is a function."""
     if given >= 0:
         return made[given + i]
     return p[more + i]
@@ -57,7 +57,7 @@ def value(p, more, made, given, i):
 
 @helper
 def push(kind, rate, p, more, made, given):
-    """What friction or a motor does in a joint that moves at a rate."""
+    """Return the force of friction or of a motor in a joint with the given rate."""
     if kind in (layout.BRAKE, layout.RUB):
         return -p[more] * math.tanh(rate / p[more + 1])
     return value(p, more, made, given, 0)

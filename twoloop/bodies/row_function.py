@@ -1,4 +1,4 @@
-"""Rows of the constraints that are functions of the coordinates: recorded once, with their derivatives."""
+"""Constraint rows given as functions of the coordinates, traced once together with their derivatives."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from twoloop.generate.tracing import Form, Graph, Untraceable, symbols
 
 @dataclass(frozen=True, eq=False)
 class RowFunction:
-    """A row C(q) = 0, of coordinates of some bodies.
+    """A row C(q) = 0 that depends on the coordinates of some bodies.
 
     Attributes
     ----------
     name : str
-        For messages.
+        Used in messages.
     function : callable
-        function(q) -> number, made of operations that can be recorded.
+        function(q) -> number, made of operations that can be traced.
     columns : tuple of int
-        The coordinates that it depends on.
+        Coordinates on which the row depends.
     """
 
     name: str
@@ -46,11 +46,11 @@ class RowFunction:
 
     @property
     def n_results(self) -> int:
-        """C, C_t, gamma, and the derivative by each of its coordinates."""
+        """Number of results: C, C_t, gamma, and the derivative with respect to each coordinate."""
         return 3 + len(self.columns)
 
     def forms(self, graph: Graph, t: Form, q: Sequence[Form], v: Sequence[Form]) -> list[Form]:
-        """These, of symbols."""
+        """Return the results as symbols."""
         value = np.array(trace(lambda _, coordinates: self.function(coordinates), t, symbols(q)), dtype=object)
         if value.shape not in ((), (1,)):
             raise Untraceable(f"on symbols it returns shape {value.shape}")
@@ -62,8 +62,8 @@ class RowFunction:
         return [row, Form(graph, 0.0, {}), bend.times(-1.0), *gradient]
 
     def at(self, t: float, q: Array, v: Array) -> Array:
-        """These, in numbers."""
-        from twoloop.bodies.program_results import results  # whose import compiles
+        """Evaluate the results."""
+        from twoloop.bodies.program_results import results  # compiled on import
 
         n = 1 + max(self.columns)
         return np.asarray(results(0, t, q[:n].copy(), v[:n].copy(), self.traced)[: self.n_results])
@@ -75,11 +75,11 @@ class RateFunction(RowFunction):
 
     @property
     def n_results(self) -> int:
-        """The right-hand side of A a = Q_a, and A at each of its coordinates."""
+        """Number of results: the right-hand side of A a = Q_a, and A for each coordinate."""
         return 1 + len(self.columns)
 
     def forms(self, graph: Graph, t: Form, q: Sequence[Form], v: Sequence[Form]) -> list[Form]:
-        """These, of symbols."""
+        """Return the results as symbols."""
         function: Callable[..., Any] = self.function
         value = trace(lambda _, one, other: function(one, other), t, symbols(q), symbols(v))
         row, one = as_forms(graph, np.array(value, dtype=object).reshape(1))[0], Form(graph, 1.0, {})

@@ -1,4 +1,4 @@
-"""What is drawn of a model: bodies as lines between their joints, springs as lines."""
+"""Drawings of models: bodies as lines between their joints, springs as lines."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from twoloop.problem.drawing import Drawing
 
 
 def drawing_of(tables: Tables) -> Drawing:
-    """Bodies as lines from joint to joint; one with a single joint from its centre, one without as a box."""
+    """Return bodies as lines between joints; with one joint from the centre of mass to it, without joints as a box."""
     sketch = Sketch()
     ends: dict[str, list[Array]] = {body.name: [] for body in tables.bodies}
     for joint in tables.joints:
@@ -37,7 +37,7 @@ def drawing_of(tables: Tables) -> Drawing:
 
 
 def _size(body: Body) -> Array:
-    """Edges of a box, or of a square, of the mass and the moments of a body."""
+    """Return the edges of the box or square with the mass and moments of inertia of a body."""
     mass, moments = body.inertia[0], body.inertia[1:4]
     if len(moments) == 1:
         return np.full(2, np.sqrt(6.0 * moments[0] / mass))

@@ -1,4 +1,4 @@
-"""A model as a tree of bodies and the joints that close loops, as programs in joint coordinates take it."""
+"""Spanning tree of a model and loop-closing joints, as required by programs in joint coordinates."""
 
 from __future__ import annotations
 
@@ -6,18 +6,18 @@ from typing import Any
 
 from twoloop.bodies.parts import Body, ModelJoint
 
-# kinds of joints in the order in which they go into the tree: those that close no loop first
+# kinds of joints in the order in which they enter the tree: those that cannot close a loop first
 TREE = ("prismatic", "cylindrical", "universal", "planar", "revolute", "fixed", "spherical")
 LOOP = ("spherical", "revolute", "fixed")
 
 
 def spanning_tree(model: Any) -> tuple[dict[int, tuple[Body, ModelJoint]], list[ModelJoint]]:
-    """By number of a body its parent and the joint to it; and the joints that close loops.
+    """Return the parent and joint of each body, by its number, and the joints that close loops.
 
     Raises
     ------
     ValueError
-        If MJCF has no counterpart of a joint, or none that closes a loop.
+        If MJCF has no counterpart of a joint, or cannot close a loop with it.
     """
     joints = [each for each in model.joints if each.kind != "drive"]
     wrong = [each for each in joints if each.kind not in TREE]
@@ -26,7 +26,7 @@ def spanning_tree(model: Any) -> tuple[dict[int, tuple[Body, ModelJoint]], list[
     linked = {each.number: {each.number} for each in (model.ground, *model.bodies)}
     edges: list[ModelJoint] = []
     loops: list[ModelJoint] = []
-    # those to the ground before others of their kind: a loop is then cut between bodies that move, in shorter branches
+    # joints to the ground first within each kind: loops are then cut between moving bodies, and branches are shorter
     for joint in sorted(joints, key=lambda each: (TREE.index(each.kind), model.ground not in (each.a, each.b))):
         one, other = linked[joint.a.number], linked[joint.b.number]
         if one is other:

@@ -1,7 +1,7 @@
-"""The callbacks of all spatial models: bodies by centre of mass and Euler parameters; p: see `parameter_layout`.
+"""Callbacks of all spatial models; coordinates: centre of mass and Euler parameters; for p see `parameter_layout`.
 
-The first rows are e.e = 1 of each body, then those of the joints. The mass matrix has the rank 6 of 7 for each body,
-4 G^T J G being of rank 3.
+The first rows are e.e = 1 for each body, followed by those of the joints. The mass matrix has rank 6 of 7 for each
+body, because 4 G^T J G has rank 3.
 """
 
 import math
@@ -20,7 +20,7 @@ from twoloop.kernels.compile.callbacks import callback
 
 @helper
 def followed(p, at, made, moved):
-    """The direction of i that b of j must stay across, when the angle between them is given, and two derivatives."""
+    """Return the direction of i perpendicular to b of j at a prescribed angle, and its first two derivatives."""
     angle, rate, faster = result(made, moved, 0), result(made, moved, 1), result(made, moved, 2)
     s, c = math.sin(angle), math.cos(angle)
     wx, zx = c * p[at + 3] - s * p[at], c * p[at] + s * p[at + 3]
@@ -35,7 +35,7 @@ def followed(p, at, made, moved):
 
 @helper
 def fill_constraint(q, p, made, C):
-    """C."""
+    """Evaluate C."""
     for body in range(n_bodies(p)):
         k = 7 * body + 3
         C[body] = 0.5 * (q[k] * q[k] + q[k + 1] * q[k + 1] + q[k + 2] * q[k + 2] + q[k + 3] * q[k + 3] - 1.0)
@@ -71,7 +71,7 @@ def fill_constraint(q, p, made, C):
 
 @helper
 def fill_rows(q, p, made, k, Cq, row):
-    """The rows of C_q of the part of a joint that stands at place k, from a row on."""
+    """Evaluate the rows of C_q of joint row k, from `row` on."""
     kind, _, i, at, j, there, more, moved = joint_at(p, k)
     if kind == layout.WRITTEN:
         fill_entries(p, more, made, moved + 3, Cq[row])
@@ -106,7 +106,7 @@ def fill_rows(q, p, made, k, Cq, row):
 
 @helper
 def fill_jacobian(q, p, made, Cq):
-    """C_q; `made`: results of the program of motions."""
+    """Evaluate C_q; `made`: results of the program of motions."""
     for body in range(n_bodies(p)):
         for k in range(7 * body + 3, 7 * body + 7):
             Cq[body, k] = q[k]
@@ -118,7 +118,7 @@ def fill_jacobian(q, p, made, Cq):
 
 @helper
 def fill_rate(q, p, made, Ct):
-    """C_t, of drives alone."""
+    """Evaluate C_t, which only drives have."""
     for k in joint_places(p):
         kind, row, i, at, j, there, _, moved = joint_at(p, k)
         if moved >= 0 and kind == layout.TURN:
@@ -132,7 +132,7 @@ def fill_rate(q, p, made, Ct):
 
 @helper
 def fill_gamma(q, v, p, made, Qd):
-    """The right-hand side of C_q a = gamma."""
+    """Evaluate the right-hand side of C_q a = gamma."""
     for body in range(n_bodies(p)):
         k = 7 * body + 3
         Qd[body] = -(v[k] * v[k] + v[k + 1] * v[k + 1] + v[k + 2] * v[k + 2] + v[k + 3] * v[k + 3])
@@ -153,7 +153,7 @@ def fill_gamma(q, v, p, made, Qd):
                 (x, y, z), (dx, dy, dz), (ex, ey, ez) = followed(p, at, made, moved)
             ax, ay, az = vector(q, i, x, y, z)
             aux, auy, auz, aax, aay, aaz = vector_rate(q, v, i, x, y, z)
-            if kind == layout.TURN:  # the direction changes on body i, too
+            if kind == layout.TURN:  # the direction also moves relative to body i
                 fx, fy, fz = vector(q, i, dx, dy, dz)
                 gx, gy, gz, _, _, _ = vector_rate(q, v, i, dx, dy, dz)
                 hx, hy, hz = vector(q, i, ex, ey, ez)
@@ -186,10 +186,10 @@ def fill_gamma(q, v, p, made, Qd):
 
 @helper
 def fill_mass(q, p, body, M, first):
-    """The block of M of a body, from a row and column on."""
+    """Evaluate the diagonal block of M of a body, from row and column `first` on."""
     m, k = WEIGHT + layout.SPATIAL_BODY * body, 7 * body + 3
     e0, e1, e2, e3 = q[k], q[k + 1], q[k + 2], q[k + 3]
-    columns = ((-e1, -e2, -e3), (e0, -e3, e2), (e3, e0, -e1), (-e2, e1, e0))  # of G
+    columns = ((-e1, -e2, -e3), (e0, -e3, e2), (e3, e0, -e1), (-e2, e1, e0))  # columns of G
     for i in range(3):
         M[first + i, first + i] = p[m]
     for j in range(4):
@@ -218,7 +218,7 @@ def mass_values(t, q, p, values):
 
 @helper
 def take_entries(body, skipped, row, values, at):
-    """Move the entries of a row by a body, but the first few, from their places in C_q to values, and clear them."""
+    """Move the entries of a row for a body from C_q to values, without the first `skipped`, and clear them."""
     if body >= 0:
         for j in range(7 * body + skipped, 7 * (body + 1)):
             values[at], row[j] = row[j], 0.0
@@ -238,7 +238,7 @@ def jacobian_values(t, q, p, values):
             at = put_entries(p, columns, made, moved + 3, values, at)
         elif kind != layout.RATE:
             fill_rows(q, p, made, k, rows, 0)
-            skipped = 3 * (kind in (layout.PERPENDICULAR, layout.TURN))  # entries of rows that turn alone
+            skipped = 3 * (kind in (layout.PERPENDICULAR, layout.TURN))  # rows that depend on the rotation only
             for row in range(3 if kind == layout.POINT else 1):
                 at = take_entries(i, skipped, rows[row], values, at)
                 at = take_entries(j, skipped, rows[row], values, at)

@@ -1,4 +1,4 @@
-"""The generalised forces of all spatial models: weight, springs, motors, friction; p: see `parameter_layout`."""
+"""Generalised forces of all spatial models: gravity, springs, motors, friction; for p see `parameter_layout`."""
 
 import math
 
@@ -8,12 +8,12 @@ from twoloop.bodies.spatial_places import centre, motion, move_row, place, push_
 from twoloop.kernels.compile.caches import helper
 from twoloop.mechanisms.rotation import half_spin
 
-WEIGHT = 3  # numbers of gravity, before those of the bodies
+WEIGHT = 3  # components of gravity, which precede the numbers of the bodies
 
 
 @helper
 def inertia(p, at, x, y, z):
-    """J times a vector, in the axes of a body."""
+    """Return J times a vector, in body axes."""
     return (
         p[at + 1] * x + p[at + 4] * y + p[at + 5] * z,
         p[at + 4] * x + p[at + 2] * y + p[at + 6] * z,
@@ -23,11 +23,11 @@ def inertia(p, at, x, y, z):
 
 @helper
 def fill_force(q, v, p, made, Q):
-    """Q; `made`: results of the program of forces."""
+    """Evaluate Q; `made`: results of the program of forces."""
     for body in range(n_bodies(p)):
         m, k = WEIGHT + layout.SPATIAL_BODY * body, 7 * body + 3
         move_row(Q, body, p[m] * p[0], p[m] * p[1], p[m] * p[2])
-        # -8 G(e')^T J G(e) e': what the kinetic energy leaves when e'' = 0
+        # quadratic velocity terms of the kinetic energy: -8 G(e')^T J G(e) e'
         u0, u1, u2, u3 = v[k], v[k + 1], v[k + 2], v[k + 3]
         wx, wy, wz = half_spin(q[k], q[k + 1], q[k + 2], q[k + 3], u0, u1, u2, u3)
         x, y, z = inertia(p, m, -8.0 * wx, -8.0 * wy, -8.0 * wz)
@@ -58,7 +58,7 @@ def fill_force(q, v, p, made, Q):
             twist_row(q, Q, j, x, y, z)
             twist_row(q, Q, i, -x, -y, -z)
             continue
-        if kind in (layout.SLIDE, layout.RAIL, layout.RUB):  # along an axis of body i, at the point of j, also on i
+        if kind in (layout.SLIDE, layout.RAIL, layout.RUB):  # along an axis of body i, at the point of j
             x, y, z = vector(q, i, p[at], p[at + 1], p[at + 2])
             bx, by, bz = place(q, j, p, there)
             cx, cy, cz = centre(q, i)

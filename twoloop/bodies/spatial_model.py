@@ -18,14 +18,14 @@ from twoloop.bodies.wheels import Wheels
 from twoloop.checks.arguments import Array, shown
 from twoloop.mechanisms.rotation import euler_parameters, euler_rates, perpendiculars, rotation_matrix
 
-PERPENDICULAR_TO = 1e-6  # cosine of the angle between the axes of a universal joint, at most
+PERPENDICULAR_TO = 1e-6  # largest cosine of the angle between the axes of a universal joint
 
 
 @documented
 class SpatialModel(Wheels):
-    """A mechanism in space, from bodies, joints and forces.
+    """A spatial mechanism made of bodies, joints and forces.
 
-    Coordinates are x, y, z of each body's centre of mass and the four Euler parameters of its axes. Points and axes are
+    The coordinates are x, y, z of the centre of mass of each body and its four Euler parameters. Points and axes are
     given in space, in the position in which the bodies are given, or on a body by `body.point(...)` and
     `body.direction(...)`.
 
@@ -39,17 +39,17 @@ class SpatialModel(Wheels):
     ----------
     ground : Body
     bodies, joints, forces : list
-        What was added so far.
+        The parts added so far.
     ignored : tuple of str
-        What was not read of a file, see `from_mjcf`.
+        Parts of a file that were ignored, see `from_mjcf`.
 
     Raises
     ------
     TypeError, ValueError
-        If an argument is wrong.
+        If an argument is invalid.
     """
 
-    ignored: tuple[str, ...] = ()  # what of a file has no counterpart, see `from_mjcf`
+    ignored: tuple[str, ...] = ()  # parts of a file without a counterpart
     coordinate_names = ("x (m)", "y (m)", "z (m)", "e0 (-)", "e1 (-)", "e2 (-)", "e3 (-)")
     distance_kind = LENGTH
 
@@ -57,21 +57,22 @@ class SpatialModel(Wheels):
         super().__init__(gravity, name)
 
     def spherical(self, a: Body | str, b: Body | str, *, at: Any, name: str | None = None) -> ModelJoint:
-        """A ball joint: both bodies share a point.
+        """Add a spherical joint: both bodies share a point.
 
         Parameters
         ----------
         a, b : Body or str
             The bodies, or their names.
         at : array_like (3,) or (BodyPoint, BodyPoint)
-            Where, in space in the position given, m; or a point of a and one of b, which are put together.
+            The point, in space in the position given, m; or a point of a and a point of b, which the joint brings
+            together.
         """
         first, second, name, points = self._pair("spherical", a, b, name, at)
         rows = (JointRow(POINT, 3, first, second, *points),)
         return self._add_joint(ModelJoint(name, "spherical", first, second, rows, *points))
 
     def revolute(self, a: Body | str, b: Body | str, *, at: Any, axis: Any, name: str | None = None) -> ModelJoint:
-        """A hinge: b turns on a about an axis.
+        """Add a revolute joint: b rotates on a about an axis.
 
         Parameters
         ----------
@@ -79,7 +80,7 @@ class SpatialModel(Wheels):
         at : array_like (3,) or (BodyPoint, BodyPoint)
             A point on the axis, m.
         axis : array_like (3,) or (BodyDirection, BodyDirection)
-            Its direction, of any length.
+            Direction, of any length.
         """
         first, second, name, points = self._pair("revolute", a, b, name, at)
         one, other = self._directions(axis, first, second)
@@ -87,7 +88,7 @@ class SpatialModel(Wheels):
         return self._add_joint(ModelJoint(name, "revolute", first, second, rows, *points, (one, other)))
 
     def universal(self, a: Body | str, b: Body | str, *, at: Any, axes: Any, name: str | None = None) -> ModelJoint:
-        """A cross: one of its axes is fixed in a, the other, perpendicular, in b.
+        """Add a universal joint: one axis of the cross is fixed in a, the other, perpendicular to it, in b.
 
         Parameters
         ----------
@@ -100,7 +101,7 @@ class SpatialModel(Wheels):
         Raises
         ------
         TypeError, ValueError
-            If an argument is wrong, or the axes are not perpendicular.
+            If an argument is invalid, or the axes are not perpendicular.
         """
         if not isinstance(axes, (tuple, list, np.ndarray)) or len(axes) != 2:
             raise ValueError(f"axes must be two directions, the axis in a and the axis in b; given {shown(axes)}")
@@ -115,7 +116,7 @@ class SpatialModel(Wheels):
         return self._add_joint(ModelJoint(name, "universal", first, second, rows, *points, (one, other)))
 
     def cylindrical(self, a: Body | str, b: Body | str, *, at: Any, axis: Any, name: str | None = None) -> ModelJoint:
-        """A sleeve: b slides along an axis of a, and turns about it.
+        """Add a cylindrical joint: b slides along an axis of a and rotates about it.
 
         Parameters
         ----------
@@ -123,7 +124,7 @@ class SpatialModel(Wheels):
         at : array_like (3,) or (BodyPoint, BodyPoint)
             A point on the axis, m.
         axis : array_like (3,) or (BodyDirection, BodyDirection)
-            Its direction, of any length.
+            Direction, of any length.
         """
         first, second, name, points = self._pair("cylindrical", a, b, name, at)
         one, other = self._directions(axis, first, second)
@@ -131,7 +132,7 @@ class SpatialModel(Wheels):
         return self._add_joint(ModelJoint(name, "cylindrical", first, second, rows, *points, (one, other)))
 
     def prismatic(self, a: Body | str, b: Body | str, *, at: Any, axis: Any, name: str | None = None) -> ModelJoint:
-        """A slide: b moves along an axis of a, and does not turn on it.
+        """Add a prismatic joint: b slides along an axis of a without rotating on it.
 
         Parameters
         ----------
@@ -139,7 +140,7 @@ class SpatialModel(Wheels):
         at : array_like (3,) or (BodyPoint, BodyPoint)
             A point on the axis, m.
         axis : array_like (3,) or (BodyDirection, BodyDirection)
-            Its direction, of any length.
+            Direction, of any length.
         """
         first, second, name, points = self._pair("prismatic", a, b, name, at)
         one, other = self._directions(axis, first, second)
@@ -149,7 +150,7 @@ class SpatialModel(Wheels):
         return self._add_joint(ModelJoint(name, "prismatic", first, second, rows, *points, (one, other)))
 
     def planar(self, a: Body | str, b: Body | str, *, at: Any, axis: Any, name: str | None = None) -> ModelJoint:
-        """A table: b slides in a plane of a, and turns about the axis across it.
+        """Add a planar joint: b slides in a plane of a and rotates about its normal.
 
         Parameters
         ----------
@@ -157,7 +158,7 @@ class SpatialModel(Wheels):
         at : array_like (3,) or (BodyPoint, BodyPoint)
             A point in the plane, m.
         axis : array_like (3,) or (BodyDirection, BodyDirection)
-            The direction across the plane, of any length.
+            Normal of the plane, of any length.
         """
         first, second, name, points = self._pair("planar", a, b, name, at)
         one, other = self._directions(axis, first, second)
@@ -168,8 +169,8 @@ class SpatialModel(Wheels):
     def to_mjcf(self, path: str | os.PathLike[str]) -> None:
         """Write the model to a file that MuJoCo reads, see `twoloop.bodies.from_mjcf`.
 
-        Joints become hinges, slides and balls of a tree of bodies; those that close loops, connect and weld. Springs
-        become stiffness and damping of joints, and tendons.
+        Joints become hinges, slides and balls of a tree of bodies; joints that close loops become connect and weld
+        equalities. Springs become stiffness and damping of joints, or tendons.
 
         Parameters
         ----------
@@ -178,12 +179,12 @@ class SpatialModel(Wheels):
         Warns
         -----
         IgnoredWarning
-            If there are velocities, forces, motors, drives or friction: these have no place in such a file.
+            If the model has velocities, forces, motors, drives or friction, which the file does not contain.
 
         Raises
         ------
         ValueError
-            If MJCF has no counterpart of a joint, or none that closes a loop.
+            If MJCF has no counterpart of a joint, or cannot close a loop with it.
         """
         from twoloop.bodies.mjcf_writer import write
 
@@ -215,7 +216,7 @@ class SpatialModel(Wheels):
         here, there = (euler_parameters(body.rotation) for body in (joint.a, joint.b))
         w = here[0] * there[0] + here[1:] @ there[1:]
         x = here[0] * there[1:] - there[0] * here[1:] - np.cross(here[1:], there[1:])
-        zero = zero if zero @ np.append(w, x) > 0.0 else -zero  # of both signs the one that the bodies start with
+        zero = zero if zero @ np.append(w, x) > 0.0 else -zero  # the sign of the initial Euler parameters
         axis, start = Numbers(tuple(one)), Numbers(tuple(zero))
         return Force(name, TORSION, joint.a, joint.b, axis, start, numbers, joint=joint)
 
@@ -255,6 +256,6 @@ class SpatialModel(Wheels):
             first, second = np.array(row.on_first.values).reshape(2, 3)
             if np.cos(angle) * (first @ there) + np.sin(angle) * (second @ there) < 0.0:
                 raise ValueError(
-                    f"{joint.name!r} is to begin at {angle:.6g} rad from the position given, which is so far away that "
-                    "the bodies end half a turn from it: give their poses nearer to where the motion begins"
+                    f"{joint.name!r} starts {angle:.6g} rad from the position given, so far away that the bodies are "
+                    "assembled half a turn from it: give poses nearer to the start of the motion"
                 )

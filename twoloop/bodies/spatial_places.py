@@ -1,6 +1,6 @@
-"""Vectors and points of spatial bodies, their rates, and the generalised forces at them: helpers of the callbacks.
+"""Vectors and points of spatial bodies, their rates, and generalised forces: helpers of the callbacks.
 
-Coordinates of a body: x, y, z of the centre of mass and the Euler parameters of its axes; see `mechanisms.rotation`.
+Coordinates of a body: x, y, z of the centre of mass and Euler parameters; see `mechanisms.rotation`.
 """
 
 import math
@@ -14,7 +14,7 @@ FARTHEST = -math.cos(0.95 * math.pi)  # 0.95 of a turn
 
 @helper
 def place(q, body, p, at):
-    """The point of a body whose three numbers stand in p."""
+    """Return the point of a body stored at index `at` of p."""
     x, y, z = vector(q, body, p[at], p[at + 1], p[at + 2])
     cx, cy, cz = centre(q, body)
     return cx + x, cy + y, cz + z
@@ -22,7 +22,7 @@ def place(q, body, p, at):
 
 @helper
 def motion(q, v, body, p, at):
-    """Velocity of that point, and what its acceleration has without v'."""
+    """Return the velocity of that point and the part of its acceleration that does not depend on v'."""
     ux, uy, uz, ax, ay, az = vector_rate(q, v, body, p[at], p[at + 1], p[at + 2])
     cx, cy, cz = centre(v, body)
     return cx + ux, cy + uy, cz + uz, ax, ay, az
@@ -30,7 +30,7 @@ def motion(q, v, body, p, at):
 
 @helper
 def push_row(q, row, body, p, at, fx, fy, fz):
-    """Add to a row the derivative of f . (point of a body): the generalised force of f there."""
+    """Add to a row the derivative of f . (point of a body), i.e. the generalised force of f there."""
     move_row(row, body, fx, fy, fz)
     turn_row(q, row, body, p[at], p[at + 1], p[at + 2], fx, fy, fz)
 
@@ -50,7 +50,7 @@ def twist_row(q, row, body, x, y, z):
 
 @helper
 def spin(q, v, body):
-    """Angular velocity in space."""
+    """Return the angular velocity in space."""
     if body < 0:
         return 0.0, 0.0, 0.0
     k = 7 * body + 3
@@ -60,7 +60,7 @@ def spin(q, v, body):
 
 @helper
 def parameters_of(q, body):
-    """Euler parameters."""
+    """Return the Euler parameters."""
     if body < 0:
         return 1.0, 0.0, 0.0, 0.0
     k = 7 * body + 3
@@ -69,7 +69,7 @@ def parameters_of(q, body):
 
 @helper
 def product(a0, a1, a2, a3, b0, b1, b2, b3):
-    """Euler parameters of two rotations, the second first."""
+    """Return the Euler parameters of the composition of two rotations, the second one applied first."""
     return (
         a0 * b0 - a1 * b1 - a2 * b2 - a3 * b3,
         a0 * b1 + a1 * b0 + a2 * b3 - a3 * b2,
@@ -80,10 +80,10 @@ def product(a0, a1, a2, a3, b0, b1, b2, b3):
 
 @helper
 def torsion(q, i, j, p, axis, zero, stiffness, angle):
-    """The torque of a spring by how much body j has turned about an axis (3 numbers in p) of body i, less an angle.
+    """Return the torque of a spring on the rotation of body j about an axis (3 numbers in p) of body i, minus an angle.
 
-    The turn is counted from the Euler parameters of j relative to i at `zero` in p. These tell turns apart only within
-    one to either side, where it would jump: a spring has no value, NaN, a bit before.
+    The rotation is measured from the relative Euler parameters stored at `zero` in p. These are unique only within one
+    turn to either side, where the angle would jump; the torque is NaN shortly before.
     """
     e0, e1, e2, e3 = parameters_of(q, i)
     b0, b1, b2, b3 = parameters_of(q, j)
@@ -92,5 +92,5 @@ def torsion(q, i, j, p, axis, zero, stiffness, angle):
     s = x * p[axis] + y * p[axis + 1] + z * p[axis + 2]
     r = math.sqrt(c * c + s * s)
     left = c + FARTHEST * r
-    root = math.sqrt(stiffness * left)  # a damper alone, of no stiffness, turns on
+    root = math.sqrt(stiffness * left)  # a damper without stiffness has no such limit
     return root * root / left * (4.0 * math.atan(s / (c + r)) - angle)

@@ -1,4 +1,4 @@
-"""Bodies of models in space: their mass, inertia and pose, or a shape that has them."""
+"""Bodies of spatial models: mass, inertia and pose, given directly or by a shape."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from twoloop.bodies.tables import TENSOR
 from twoloop.checks.arguments import Array, check_positive, check_real, check_vector, shown
 from twoloop.mechanisms.rotation import euler_parameters, perpendiculars, rotation_matrix
 
-SYMMETRIC = 1e-9  # relative: entries of an inertia
+SYMMETRIC = 1e-9  # relative tolerance of the symmetry of an inertia tensor
 
 
 @documented
 class SpatialShapes(Model):
-    """Adds bodies to a model in space."""
+    """Adds bodies to a spatial model."""
 
     dimension = 3
 
@@ -42,15 +42,15 @@ class SpatialShapes(Model):
         mass : float
             kg.
         inertia : array_like (3,) or (3, 3)
-            About the centre of mass along the axes of the body, kg m^2: three moments, or the whole tensor.
+            Principal moments or inertia tensor about the centre of mass in body axes, kg m^2.
         position : array_like (3,)
             Of the centre of mass, m.
         rotation : array_like (3, 3), optional
-            Its columns are the axes of the body. None: those of space.
+            Rotation matrix whose columns are the body axes in space. None: the identity.
         velocity : array_like (3,), optional
-            Of the centre of mass at the start, m/s. None: it follows from the other velocities.
+            Initial velocity of the centre of mass, m/s. None: determined by the other velocities.
         angular_velocity : array_like (3,), optional
-            Along the axes of space, rad/s, likewise.
+            Initial angular velocity in space, rad/s, or None as for `velocity`.
         """
         name, place, weight, speed = self._new_body(name, mass, position, velocity)
         moments = _moments(f"inertia of {name!r}", inertia)
@@ -61,7 +61,7 @@ class SpatialShapes(Model):
         return self._add_body(Body(name, len(self.bodies), place, R, np.append(weight, moments), speed, spin))
 
     def rod(self, name: str, start: ArrayLike, end: ArrayLike, *, radius: float, mass: float, **motion: Any) -> Body:
-        """Add a uniform round bar between two points of space; the first axis of the body leads from start to end.
+        """Add a uniform cylinder between two points of space; the first axis of the body points from start to end.
 
         Parameters
         ----------
@@ -130,7 +130,7 @@ class SpatialShapes(Model):
 
 
 def _rotation(name: str, given: ArrayLike) -> Array:
-    """A rotation matrix, orthonormal to rounding."""
+    """Return a rotation matrix, orthonormal to rounding."""
     R = check_real(name, given)
     try:
         return rotation_matrix(euler_parameters(R))
@@ -141,7 +141,7 @@ def _rotation(name: str, given: ArrayLike) -> Array:
 
 
 def _moments(name: str, given: ArrayLike) -> Array:
-    """J_xx, J_yy, J_zz, J_xy, J_xz, J_yz of three moments or of a tensor."""
+    """Return J_xx, J_yy, J_zz, J_xy, J_xz, J_yz from three moments or a tensor."""
     J = check_real(name, given)
     if J.shape not in ((3,), (3, 3)) or not np.isfinite(J).all():
         raise ValueError(

@@ -1,4 +1,4 @@
-"""The parameters of a model: numbers with names, tables of joints and forces, programs; see `parameter_layout`."""
+"""Parameter vector of a model: named numbers, tables of joints and forces, programs; see `parameter_layout`."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from twoloop.generate.tracing import Untraceable
 GRAVITY = ("x", "y", "z")
 MOMENTS = {2: ("moment of inertia",), 3: tuple(f"J_{which}" for which in ("xx", "yy", "zz", "xy", "xz", "yz"))}
 
-TENSOR = [0, 3, 4, 3, 1, 5, 4, 5, 2]  # where the entries of a tensor of inertia stand among these
+TENSOR = [0, 3, 4, 3, 1, 5, 4, 5, 2]  # indices of the entries of the inertia tensor in MOMENTS
 
 
 class Tables:
@@ -27,21 +27,21 @@ class Tables:
     gravity : ndarray (2 or 3,)
     bodies, joints, forces : sequence
     first_row : int
-        Of the joints: how many rows stand before them.
+        Number of rows before those of the joints.
 
     Attributes
     ----------
     p : ndarray
     places : dict
-        Where the numbers with names stand in p, from 0 on.
+        Indices of the named numbers in p, from 0 on.
     rows : dict
-        Rows of C of each joint, by its name.
+        Row numbers of C of each joint, by its name.
     motions, functions : list of Function
-        Drives and forces that are functions, in the order of their results.
+        Drives and forces given as functions, in the order of their results.
     loaded : list of Force
-        Friction in proportion to the load of its joint. Unit motors in these joints stand behind the forces.
+        Frictions proportional to the load of a joint. Unit motors in these joints follow the forces.
     untraced : str
-        Why these do not stand in p as programs; "": they do, or there are none.
+        Why the functions are not stored in p as programs; "" if they are, or there are none.
     """
 
     def __init__(
@@ -58,7 +58,7 @@ class Tables:
         self._values: list[float] = []
         self._constants: list[float] = []
         self._known: dict[int, int] = {}
-        self._keep: list[Numbers] = []  # so that no other gets the identity of one
+        self._keep: list[Numbers] = []  # keeps the ids valid
         dimension = len(gravity)
         self._place(Numbers(tuple(gravity), tuple(f"gravity along {axis} (m/s^2)" for axis in GRAVITY[:dimension])))
         for body in bodies:
@@ -79,17 +79,17 @@ class Tables:
 
     @property
     def values(self) -> dict[str, float]:
-        """The numbers with names."""
+        """Return the named numbers."""
         return {name: float(self.p[place]) for name, place in self.places.items()}
 
     def of(self, numbers: Numbers) -> Array:
-        """Some numbers as they stand in p."""
+        """Return some numbers from p."""
         place = self._at(numbers)
         return self.p[place : place + len(numbers.values)]
 
     @property
     def conserve(self) -> bool:
-        """Whether nothing in the model changes its energy: no damper, force, torque or motor, no drive that moves."""
+        """Return True if the model conserves energy: no damper, force, torque, motor, or moving drive."""
         for force in self.forces:
             numbers = np.zeros(0) if force.more is None else self.of(force.more)
             if force.kind in (SPRING, TORSION, RAIL):
@@ -101,7 +101,7 @@ class Tables:
         return all(is_constant(motion) for motion in self.motions)
 
     def check(self) -> None:
-        """Raise where a number has a sign that it cannot have."""
+        """Raise if a number has a wrong sign."""
         parts: list[Force | JointRow] = [*self.forces, *(row for joint in self.joints for row in joint.rows)]
         for part in parts:
             rubs = isinstance(part, Force) and part.kind in (BRAKE, RUB)
@@ -115,13 +115,13 @@ class Tables:
                     check_not_negative(name, value)
 
     def replaced(self, values: Mapping[str, float]) -> None:
-        """Put other values in the place of those that are here."""
+        """Replace values of named numbers."""
         for name, value in values.items():
             if name in self.places:
                 self.p[self.places[name]] = value
 
     def place(self, force: Force) -> int:
-        """Where the numbers of a force stand in p."""
+        """Return the index in p of the numbers of a force."""
         return self._at(force.more)
 
     def _place_all(self, *parts: Numbers | None) -> None:
@@ -132,12 +132,12 @@ class Tables:
     def _place(self, numbers: Numbers) -> None:
         self._keep.append(numbers)
         if not numbers.names:
-            self._known[id(numbers)] = NONE - 1 - len(self._constants)  # counted back from NONE until all are known
+            self._known[id(numbers)] = NONE - 1 - len(self._constants)  # provisional index, counted down from NONE
             self._constants += numbers.values
             return
         self._known[id(numbers)] = len(self._values)
         for name, value in zip(numbers.names, numbers.values, strict=True):
-            while name in self.places:  # names of bodies and joints can add up to the same
+            while name in self.places:  # combinations of names of bodies and joints may coincide
                 name = f"other {name}"
             self.places[name] = len(self._values)
             self._values.append(value)
@@ -200,6 +200,6 @@ class Tables:
 
 
 def _of(quantity: str, name: str) -> str:
-    """Of "mass (kg)" and "crank" make "mass of crank (kg)"."""
+    """Return e.g. "mass of crank (kg)" for "mass (kg)" and "crank"."""
     head, unit = quantity.split(" (")
     return f"{head} of {name} ({unit}"

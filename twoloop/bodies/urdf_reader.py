@@ -1,4 +1,4 @@
-"""Models from URDF, the format of robots: a tree of links and joints; loops are given beside it."""
+"""Reads models from URDF, the robot description format: a tree of links and joints; loops are given separately."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ from xml.etree.ElementTree import Element
 import numpy as np
 from numpy.typing import ArrayLike
 
-from twoloop.bodies.mjcf_geometry import Lump, Pose, numbers, pose_of, root_of, tell_ignored
-from twoloop.bodies.mjcf_joints import Freed, Part, add_part, body_of
+from twoloop.bodies.mjcf_geometry import Lump, Pose, numbers, pose_of, record_ignored, root_of
+from twoloop.bodies.mjcf_joints import FileJoint, Part, add_part, body_of
 from twoloop.bodies.parts import Body
 from twoloop.bodies.spatial_model import SpatialModel
 from twoloop.checks.arguments import Array, check_choice, check_finite, check_flag, check_vector
 
 KINDS = {"revolute": "hinge", "continuous": "hinge", "prismatic": "slide", "floating": "free", "fixed": ""}
 CLOSING = ("spherical", "revolute", "universal", "cylindrical", "prismatic", "planar", "fixed")
-WITHOUT_EFFECT = {"link", "joint", "material"}  # what is read, and colours
+WITHOUT_EFFECT = {"link", "joint", "material"}  # supported elements, and colours
 
 
 @dataclass(frozen=True)
 class Loop:
-    """A joint that closes a loop of a file that has only trees.
+    """A joint that closes a loop, which a URDF file cannot contain.
 
     Attributes
     ----------
@@ -33,11 +33,11 @@ class Loop:
     a, b : str
         Names of links; "ground".
     at : array_like (3,)
-        In the frame of link a, m.
+        The joint in the frame of link a, m.
     at_b : array_like (3,), optional
-        The point of b in the frame of link b, which is put there. None: they meet in the position read.
+        The joint in the frame of link b, m. None: the point that coincides with `at` in the position read.
     axis, axis_b : array_like (3,), optional
-        Directions in the frames of a and of b. None for b: that of a, in the position read.
+        Directions in the frames of a and b. None for b: that of a in the position read.
     name : str, optional
     """
 
@@ -61,36 +61,36 @@ def from_urdf(
 ) -> SpatialModel:
     """Read a model from a URDF file.
 
-    Read are links with their inertials, joints of the kinds revolute, continuous, prismatic, floating and fixed, and
-    their damping. Links that are fixed to others are one with them.
+    The reader supports links with inertials, joints of the types revolute, continuous, prismatic, floating and fixed,
+    and their damping. Links fixed to others are merged with them.
 
     Parameters
     ----------
     path : path-like
     loops : sequence of Loop
-        Joints that close loops, which such a file cannot have.
+        Joints that close loops, which a URDF file cannot contain.
     positions : mapping, optional
-        From names of joints to angles or displacements, rad or m: the position of the bodies. Others are zero.
+        Angles or displacements by names of joints, rad or m, that define the position of the bodies. Default: zero.
     free_base : bool
-        Whether the root link moves freely; otherwise it is fixed to the ground.
+        If True, the root link moves freely; otherwise it is fixed to the ground.
     gravity : array_like (3,)
-        m/s^2, which such a file does not have.
+        m/s^2; a URDF file does not contain it.
 
     Returns
     -------
     SpatialModel
-        Its bodies have the names of links, and the axes of their frames. `model.ignored` lists what was not read:
-        limits, friction, mimicry, collisions, transmissions, ...
+        Its bodies have the names of the links and the axes of their frames. `model.ignored` lists what was ignored:
+        limits, friction, mimic joints, collisions, transmissions, ...
 
     Warns
     -----
     IgnoredWarning
-        If that is not empty.
+        If anything was ignored.
 
     Raises
     ------
     TypeError, ValueError
-        If the file is no URDF or no tree, a link that moves has no mass, or an argument is wrong.
+        If the file is not URDF or not a tree, a moving link has no mass, or an argument is invalid.
 
     Notes
     -----
@@ -102,7 +102,7 @@ def from_urdf(
     reader.read(free_base)
     for loop in loops:
         reader.close(loop)
-    tell_ignored(path, reader.model, reader.ignored)
+    record_ignored(path, reader.model, reader.ignored)
     return reader.model
 
 
@@ -113,7 +113,7 @@ class _Reader:
         if len(self.links) < len(root.findall("link")):
             names = [_name(each) for each in root.findall("link")]
             twice = next(name for name in names if names.count(name) > 1)
-            raise ValueError(f"links must have different names; {twice!r} is there twice")
+            raise ValueError(f"links must have different names; {twice!r} occurs twice")
         self.joints = root.findall("joint")
         self.ignored += [
             f"{each.tag} {each.get('name') or each.get('reference') or ''!s}".rstrip()
@@ -123,12 +123,12 @@ class _Reader:
         self.positions = {name: check_finite(f"positions[{name!r}]", value) for name, value in positions.items()}
         unknown = self.positions.keys() - {_name(each) for each in self.joints}
         if unknown:
-            raise ValueError(f"positions has {min(unknown)!r}, and the file no joint of that name")
+            raise ValueError(f"positions has {min(unknown)!r}, but the file has no joint of that name")
         self.frames: dict[str, tuple[Part | None, Pose]] = {}
         self.collisions = 0
 
     def read(self, free_base: bool) -> None:
-        """All links, from the root on."""
+        """Read all links, starting at the root."""
         children: dict[str, list[Element]] = {name: [] for name in self.links}
         parents: dict[str, str] = {}
         for joint in self.joints:
@@ -143,7 +143,7 @@ class _Reader:
         here = Pose(np.zeros(3), np.eye(3))
         base = None
         if free_base:
-            base = Part(roots[0], None, here, [Freed("base", "free", np.zeros(3), np.array([0.0, 0.0, 1.0]), {})])
+            base = Part(roots[0], None, here, [FileJoint("base", "free", np.zeros(3), np.array([0.0, 0.0, 1.0]), {})])
         parts = [] if base is None else [base]
         self._link(roots[0], base, here)
         ahead = [roots[0]]
@@ -166,7 +166,7 @@ class _Reader:
             self.ignored.append("contacts between links")
 
     def close(self, loop: Loop) -> None:
-        """A joint that closes a loop."""
+        """Add a joint that closes a loop."""
         kind = check_choice("kind of a loop", loop.kind, CLOSING) or loop.kind
         (part, here), (other, there) = (self._frame(name) for name in (loop.a, loop.b))
         one, two = body_of(self.model, part), body_of(self.model, other)
@@ -199,7 +199,7 @@ class _Reader:
         return name
 
     def _joint(self, joint: Element, parent: Part | None, outer: Pose) -> list[Part]:
-        """The link behind a joint, and the part that it begins, if it moves."""
+        """Read the child link of a joint; return its part if the link moves."""
         name, kind = _name(joint), joint.get("type", "")
         if kind not in KINDS:
             raise ValueError(f"type of joint {name!r} must be one of {', '.join(KINDS)}; given {kind!r}")
@@ -225,8 +225,8 @@ class _Reader:
         if kind == "fixed":
             self._link(child, parent, pose)
             return []
-        own = f"joint {name}" if name in self.links else name  # in URDF both may have one name
-        moved = Freed(own, KINDS[kind], pose.x, pose.R @ axis, attributes)
+        own = f"joint {name}" if name in self.links else name  # in URDF a link and a joint may share a name
+        moved = FileJoint(own, KINDS[kind], pose.x, pose.R @ axis, attributes)
         if kind == "prismatic":
             pose = pose.then(Pose(value * axis, np.eye(3)))
         elif kind != "floating":
@@ -237,7 +237,7 @@ class _Reader:
         return [part]
 
     def _link(self, name: str, part: Part | None, pose: Pose) -> None:
-        """The frame and the mass of a link."""
+        """Record the frame and the mass of a link."""
         self.frames[name] = part, pose
         element = self.links[name]
         self.collisions += element.find("collision") is not None
@@ -254,7 +254,7 @@ class _Reader:
         )
         J = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
         (value,) = numbers(mass.get("value", ""), 1, f"mass of link {name!r}")
-        part.lumps.append(Lump(float(value), np.zeros(3), J).seen(pose.then(_origin(inertial, what))))
+        part.lumps.append(Lump(float(value), np.zeros(3), J).transformed(pose.then(_origin(inertial, what))))
 
 
 def _name(element: Element) -> str:
@@ -265,7 +265,7 @@ def _name(element: Element) -> str:
 
 
 def _origin(element: Element, what: str) -> Pose:
-    """Where a frame is in that of its parent: xyz, then turned about fixed axes by roll, pitch and yaw."""
+    """Return the pose of a frame in its parent: translation xyz, then roll, pitch and yaw about fixed axes."""
     origin = element.find("origin")
     given = {} if origin is None else origin.attrib
     if "quat_xyzw" in given:

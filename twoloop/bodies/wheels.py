@@ -1,4 +1,4 @@
-"""Wheels that roll on a plane in space, without slipping: non-holonomic."""
+"""Wheels that roll without slipping on a plane in space (non-holonomic)."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from twoloop.bodies.spatial_shapes import SpatialShapes
 from twoloop.checks.arguments import check_positive, check_vector
 from twoloop.mechanisms.rotation import perpendiculars
 
-FLAT = 1e-6  # sine of the angle between axle and normal
+FLAT = 1e-6  # smallest sine of the angle between axle and normal
 
 
 @documented
 class Wheels(SpatialShapes):
-    """Adds such wheels to a model in space."""
+    """Adds rolling wheels to a spatial model."""
 
     def rolling(
         self,
@@ -33,9 +33,9 @@ class Wheels(SpatialShapes):
         normal: ArrayLike = (0.0, 0.0, 1.0),
         name: str | None = None,
     ) -> ModelJoint:
-        """A thin wheel, whose centre of mass is its centre, that rolls on a plane of the ground without slipping.
+        """Let a thin wheel, whose centre of mass is its centre, roll without slipping on a plane of the ground.
 
-        Its reaction is that on the wheel, about its centre.
+        The reaction is that on the wheel, about its centre.
 
         Parameters
         ----------
@@ -43,9 +43,9 @@ class Wheels(SpatialShapes):
         radius : float
             m.
         axis : array_like (3,) or BodyDirection
-            About which the wheel is round, in space in the position given.
+            Axle of the wheel, in space in the position given.
         foot, normal : array_like (3,)
-            A point of the plane, m, and the direction across it, to the side of the wheel.
+            A point of the plane, m, and its normal on the side of the wheel.
         """
         on = self._moving_body("wheel", wheel)
         name = self._new_name("rolling", name, on)
@@ -84,7 +84,7 @@ class Wheels(SpatialShapes):
 
 
 def _upright(n: Any, axle: Any) -> tuple[Any, Any]:
-    """Cosine and sine of the angle between a normal and the axle."""
+    """Return cosine and sine of the angle between a normal and the axle."""
     cosine = sum(one * other for one, other in zip(n, axle, strict=True))
     return cosine, np.sqrt(1.0 - cosine * cosine)
 

@@ -1,1 +1,1 @@
-"""What comes out: the result, and what can be made of it."""
+"""The result of a run and its views."""

@@ -1,4 +1,4 @@
-"""A mechanism in its motion, as a page, a GIF or a film: lines, fixed points, and the paths of some points."""
+"""Animation of a mechanism as an HTML page, GIF or film: lines, fixed points, and the paths of some points."""
 
 from __future__ import annotations
 
@@ -17,33 +17,33 @@ from twoloop.checks.arguments import Array, check_positive
 from twoloop.checks.optional import needed
 from twoloop.run.record import Record
 
-RATE = 25  # frames a second
-SHORTEST, LONGEST = 3.0, 12.0  # s, where the user does not say
-AZIMUTH, ELEVATION = -60.0, 22.0  # degrees, from where a spatial mechanism is seen
+RATE = 25  # frames per second
+SHORTEST, LONGEST = 3.0, 12.0  # s, unless the user gives a duration
+AZIMUTH, ELEVATION = -60.0, 22.0  # degrees: view of a spatial mechanism
 WIDTH, HEIGHTS, MARGIN = 480, (200, 480), 28  # pixels
-COLORS = 64  # of a GIF
-FINER = 2  # pictures are drawn this much larger and reduced: lines have smooth edges
-FINER_PATHS = 4  # points of a path for each frame
-STILL = 1e-3  # of the extent: a point that moves less is fixed
-JOINTS_MOST = 12  # points of a planar mechanism that are drawn as circles
+COLORS = 64  # palette size of a GIF
+FINER = 2  # oversampling factor, for antialiasing
+FINER_PATHS = 4  # points of a path per frame
+STILL = 1e-3  # relative to the extent: a point that moves less counts as fixed
+JOINTS_MOST = 12  # largest number of points of a planar mechanism drawn as circles
 BAR, TRACE, FIXED, PAPER = "#1f4e79", "#e07b39", "#444444", "#ffffff"
 SUFFIXES = (".html", ".gif", ".mp4")
 
 
 @dataclass(frozen=True)
 class Scene:
-    """What the pictures show.
+    """Contents of the frames.
 
     Attributes
     ----------
     name : str
     times : ndarray (n,)
-        Of the frames, s.
+        Times of the frames, s.
     points : ndarray (n_points, 2 or 3, n)
     paths : ndarray (n_traces, 2 or 3, FINER_PATHS (n - 1) + 1)
-        Of the points whose paths are drawn.
+        Paths drawn.
     bars, traces, fixed, joints : list
-        Pairs of points that a line joins, and points whose paths are drawn, that stay, that are drawn as circles.
+        Pairs of points connected by a line; points with paths, fixed points, and points drawn as circles.
     """
 
     name: str
@@ -72,7 +72,7 @@ def animate(result: Record, path: str | os.PathLike[str], seconds: float | None)
         path.write_text(page(scene), encoding="utf-8")
     elif path.suffix.lower() == ".gif":
         made = pictures(scene)
-        palette = made[-1].quantize(COLORS)  # one for all: by then the paths are drawn, too
+        palette = made[-1].quantize(COLORS)  # from the last frame, which has the whole paths
         first, *others = [picture.quantize(palette=palette, dither=0) for picture in made]
         first.save(path, save_all=True, append_images=others, duration=1000 // RATE, loop=0, optimize=True)
     else:
@@ -96,14 +96,14 @@ def _scene(result: Record, n_frames: int) -> Scene:
 
 
 def _positions(result: Record, times: Array) -> Array:
-    """Coordinates (n_q, n) at the times of the frames."""
+    """Return the coordinates (n_q, n) at the times of the frames."""
     if result.sol is not None:
         return np.asarray(result.sol(times).q)
-    from scipy.interpolate import BPoly  # takes a tenth of a second to import, and few results need it
+    from scipy.interpolate import BPoly  # slow to import
 
     states = np.stack([result.q.T, result.v.T, result.a.T], axis=1)
     made = np.empty((len(result.q), len(times)))
-    first = np.append(0, np.flatnonzero(np.diff(result.t) == 0.0) + 1)  # of the pieces between impacts
+    first = np.append(0, np.flatnonzero(np.diff(result.t) == 0.0) + 1)  # starts of the arcs between impacts
     for begin, end in zip(first, np.append(first[1:], len(result.t)), strict=True):
         if end - begin > 1:
             own = (times >= result.t[begin]) & (times <= result.t[end - 1])
@@ -112,7 +112,7 @@ def _positions(result: Record, times: Array) -> Array:
 
 
 def page(scene: Scene) -> str:
-    """A page without further files: the points as numbers, and the script that draws them."""
+    """Return a self-contained HTML page with the points as numbers and a script that draws them."""
     extent = float(np.ptp(scene.points, axis=(0, 2)).max()) or 1.0
     decimals = max(0, 4 - int(np.floor(np.log10(extent))))
     data = {
@@ -135,7 +135,7 @@ def page(scene: Scene) -> str:
 
 
 def projected(points: Array) -> Array:
-    """Points of space (n_points, 3, n) as they are seen, (n_points, 2, n); those of a plane as they are."""
+    """Project points in space (n_points, 3, n) to the view plane, (n_points, 2, n); planar points are unchanged."""
     if points.shape[1] == 2:
         return points
     a, e = np.radians([AZIMUTH, ELEVATION])
@@ -144,7 +144,7 @@ def projected(points: Array) -> Array:
 
 
 def pictures(scene: Scene) -> list[Any]:
-    """A picture of Pillow for each frame."""
+    """Return a Pillow image for each frame."""
     image, draw = (needed(f"PIL.{module}", "pillow", "a GIF or a film") for module in ("Image", "ImageDraw"))
     seen, paths = projected(scene.points), projected(scene.paths)
     both = np.concatenate([np.moveaxis(each, 1, 0).reshape(2, -1) for each in (seen, paths)], axis=1)

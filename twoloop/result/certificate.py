@@ -1,6 +1,6 @@
-"""`result.certify()`: a run looked at again, piece by piece, by a method and at places of its own."""
+"""`result.certify()`: independent verification of a run, interval by interval, with another method."""
 
-from __future__ import annotations  # ArrayLike stays a word in help()
+from __future__ import annotations  # help() shows ArrayLike by name
 
 import warnings
 from collections.abc import Iterator
@@ -15,45 +15,48 @@ from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.record import Record
 from twoloop.run.remake import Remade, Remaker, explicit, implicit, tighter
 
-PIECES = 200  # of a run: the longest piece, and the longest step with which one is made again, is this part of it
-LIMIT = 200.0  # tolerances: right steps were at most 140 off, those that passed over something 270 and more
-ROUNDING = 1e-14  # of the largest coordinate or velocity: what no step can be expected to hold
-SEVERAL = 100.0  # the defect of several steps in one piece, from which on each is looked at
-ENOUGH = 3  # wrong steps of a piece, after which the others are not looked at
-NEGLIGIBLE = 1e-10  # singular values of the rows below this share of the largest are zero
-USUAL = 10.0  # growth of an error between two states that says nothing of what is between them
-MOST, MOST_A_STEP = 400, 32  # attempts at steps that a piece may take, and as many more for each step of the run in it
-LOOSER = (10.0, 100.0)  # times the tolerances of a piece, where it cannot be made again with them
+PIECES = 200  # the run is divided into at least this many intervals, also the bound of the step size
+LIMIT = 200.0  # tolerances: in tests correct steps had at most 140, steps that missed a feature at least 270
+ROUNDING = 1e-14  # relative to the largest coordinate or velocity: deviation attributed to rounding
+SPLIT = 100.0  # defect of an interval above which its steps are checked one by one
+MAX_WRONG = 3  # wrong steps after which the rest of an interval is skipped
+NEGLIGIBLE = 1e-10  # relative: smaller singular values of the rows count as zero
+USUAL_GROWTH = 10.0  # error growth over an interval up to which the defect is not corrected for it
+MAX_ATTEMPTS, MAX_ATTEMPTS_PER_STEP = (
+    400,
+    32,
+)  # attempted steps allowed per interval, plus those per step of the run in it
+LOOSER = (10.0, 100.0)  # factors of the tolerances with which a failed reintegration is repeated
 
 
 class CertificateWarning(UserWarning):
-    """A run does not pass its certificate: some of it is further from the equations than its tolerances allow."""
+    """A run does not pass its certificate: its defect is larger than the tolerances allow."""
 
 
 @dataclass(frozen=True)
 class Certificate:
-    """What a second look at a run found.
+    """Outcome of the verification of a run.
 
-    `print(certificate)` says it in words; as a truth value it is `passed`.
+    `print(certificate)` shows the message; the truth value is `passed`.
 
     Attributes
     ----------
     defect : float
-        The largest distance between a stored state and that which the equations lead to from the one stored before it,
-        over the tolerance of a step.
+        Largest distance between a stored state and the state obtained by integration from the previous stored state,
+        divided by the tolerance of a step.
     t : float
-        Where that was found: the start of the step, s.
+        Start of the step with the largest defect, s.
     gap : float
-        The widest gap between two places at which the equations were looked at, s: what lasts less may be missed.
+        Longest time between two evaluations of the equations, s: shorter features may be missed.
     limit : float
-        The largest `defect` of a run that passes.
+        Largest `defect` of a run that passes.
     unseen : tuple of (float, float)
-        Start and end, s, of parts of the run of which nothing can be said: they could not be made again, as near a
-        singular position, or errors grow hundredfold within a step.
+        Start and end, s, of intervals that could not be verified: reintegration failed, e.g. near a singular position,
+        or errors grow more than a hundredfold within a step.
     passed : bool
-        Whether `defect` is at most `limit`, and nothing is unseen.
+        True if `defect` is at most `limit` and `unseen` is empty.
     message : str
-        The same in words.
+        The outcome in words.
     """
 
     defect: float
@@ -72,7 +75,7 @@ class Certificate:
 
 
 def certify(result: Record, rtol: float | None, atol: ArrayLike | None) -> Certificate:
-    """The certificate of a result, see `Result.certify`."""
+    """Return the certificate of a result, see `Result.certify`."""
     if result.system is None:
         raise ValueError(
             "certify needs the system: read a file by twoloop.load(path, system), give a result of another solver "
@@ -80,55 +83,55 @@ def certify(result: Record, rtol: float | None, atol: ArrayLike | None) -> Certi
         )
     if result.changes:
         raise ValueError(
-            f"certify looks at one run of one system; in this result {result.changes}"
+            f"certify verifies a single run of a single system; in this result {result.changes}"
             f"{': certify its parts, result.arcs' if result.arcs else ''}"
         )
-    look = _Look(result, result.system, *_tolerances(result, result.system.n_q, rtol, atol))
-    defect, where = 0.0, float(look.t[0])
+    checker = _Checker(result, result.system, *_tolerances(result, result.system.n_q, rtol, atol))
+    defect, where = 0.0, float(checker.t[0])
     unseen: list[tuple[float, float]] = []
-    for i, j, found in look.pieces():
+    for i, j, found in checker.pieces():
         if not np.isfinite(found):
-            start = unseen.pop()[0] if unseen and unseen[-1][1] == look.t[i] else float(look.t[i])
-            unseen.append((start, float(look.t[j])))
+            start = unseen.pop()[0] if unseen and unseen[-1][1] == checker.t[i] else float(checker.t[i])
+            unseen.append((start, float(checker.t[j])))
         elif found > defect:
-            defect, where = found, float(look.t[i])
-    gap = max([look.gap, *(end - start for start, end in unseen)])
+            defect, where = found, float(checker.t[i])
+    gap = max([checker.gap, *(end - start for start, end in unseen)])
     passed = defect <= LIMIT and not unseen
-    message = _in_words(result, defect, where, gap, unseen)
+    message = _message(result, defect, where, gap, unseen)
     if defect > LIMIT:
         warnings.warn(message, CertificateWarning, stacklevel=3)
     return Certificate(defect, where, gap, LIMIT, tuple(unseen), passed, message)
 
 
 def _tolerances(result: Record, n_q: int, rtol: float | None, atol: ArrayLike | None) -> tuple[float, Array]:
-    """Those given, else those of the run; and what is wrong with them or the result, if anything is."""
+    """Return the tolerances given, or those of the run; raise ValueError if none are known."""
     if result.t.size < 2:
         raise ValueError(f"certify needs a result with two times or more; this one has {result.t.size}")
     rtol, atol = result.rtol if rtol is None else rtol, result.atol if atol is None else atol
     if rtol is None or atol is None:
         raise ValueError(
-            "certify needs tolerances, and this result does not know any (another solver made it, or it is of an older "
+            "certify needs tolerances, and this result does not contain any (it comes from another solver or an older "
             "file): give rtol and atol"
         )
     check_positive("rtol", rtol)
     return float(rtol), check_tolerance("atol", atol, n_q)
 
 
-class _Look:
-    """The states of a result, and what makes the pieces between them again.
+class _Checker:
+    """Verifies the intervals between the states of a result by reintegration.
 
     Attributes
     ----------
     t, states : ndarray (n,), (n, 2 n_q)
-        All that are known, rows [q, v].
+        All states known, as rows [q, v].
     gap : float
-        The widest so far, s.
+        Longest time between evaluations so far, s.
     """
 
     def __init__(self, result: Record, system: ConstrainedSystem, rtol: float, atol: Array):
         self.result, self.sol, self.system, self.rtol, self.atol = result, result.sol, system, rtol, atol
         self.t, self.states = result.t, np.vstack([result.q, result.v]).T
-        if result.sol is not None:  # the states at all steps, and those stored at other times
+        if result.sol is not None:  # add the states at the steps
             table = result.sol.table
             inside = table.t <= result.sol.t_max
             states = np.vstack([self.states, table.states[inside, : self.states.shape[1]]])
@@ -142,13 +145,13 @@ class _Look:
         self.remakers: dict[tuple[str, float], Remaker] = {}
 
     def _steps(self, result: Record) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-        """How many steps of the run touch each interval, and whether one of them left velocities untested."""
+        """Return the number of steps of the run in each interval, and whether one of them did not test velocities."""
         n, m = len(self.t) - 1, len(result.h)
         untested = np.zeros(m, dtype=bool) if result.untested is None else result.untested
         start = self.t[0] if result.sol is None else result.sol.t_min
         ends = start + np.cumsum(result.h)
         near = 1e-9 * (self.t[-1] - self.t[0])
-        if m == 0 or (result.success and abs(ends[-1] - self.t[-1]) > near):  # it is not known where the steps were
+        if m == 0 or (result.success and abs(ends[-1] - self.t[-1]) > near):  # the positions of the steps are unknown
             return np.full(n, -(-m // n) + 1), np.full(n, untested.any())
         first = np.minimum(np.searchsorted(ends, self.t[:-1] + near), m - 1)
         last = np.minimum(np.searchsorted(ends, self.t[1:] - near), m - 1)
@@ -156,82 +159,82 @@ class _Look:
         return last - first + 1, before[last + 1] > before[first]
 
     def pieces(self) -> Iterator[tuple[int, int, float]]:
-        """First and last state of each piece, and its defect; infinite where it cannot be made again."""
+        """Yield first and last state of each interval and its defect; infinite if reintegration fails."""
         i, last = 0, len(self.t) - 1
         while i < last:
             j = i + 1
             while j < last and self.t[j + 1] - self.t[i] <= self.longest and self.untested[j] == self.untested[i]:
                 j += 1
             found = self._defect(i, j)
-            if SEVERAL < found < np.inf and j > i + 1:
-                yield from self._steps_of(i, j)
-                if self.untested[i]:  # what a velocity is off by shows in the positions of later steps only
+            if SPLIT < found < np.inf and j > i + 1:
+                yield from self._single_steps(i, j)
+                if self.untested[i]:  # velocity errors show up in the positions of later steps only
                     yield i, j, found / (j - i)
             else:
                 yield i, j, found
             i = j
 
-    def _steps_of(self, i: int, j: int) -> Iterator[tuple[int, int, float]]:
-        """The same for the steps of a piece that is off: by the errors of many, or by some that are wrong."""
+    def _single_steps(self, i: int, j: int) -> Iterator[tuple[int, int, float]]:
+        """Yield the same for the steps of an interval with a large defect: many small errors, or a few wrong steps."""
         wrong = 0
         for k in range(i, j):
             found = self._defect(k, k + 1)
             wrong += found > LIMIT
-            if wrong == ENOUGH and not np.isfinite(found):
+            if wrong == MAX_WRONG and not np.isfinite(found):
                 yield k, j, found
             else:
                 yield k, k + 1, found
-            if wrong == ENOUGH:
+            if wrong == MAX_WRONG:
                 return
 
     def _defect(self, i: int, j: int) -> float:
-        """The defect from state i to state j, the smaller one of two unlike methods where the first finds too much."""
+        """Return the defect from state i to state j: that of one method, or the smaller of two if it is too large."""
         newton = bool(self.result.stats.n_jacobians) and (self.result.untested is None or self.untested[i])
         stiff = "positions" if self.untested[i] else "all"
         order = (stiff, "explicit") if newton else ("explicit", stiff)
         found = [(np.inf, "")]
         for method in order:
-            found.append((self._by(method, 1.0, i, j), method))
+            found.append((self._defect_by(method, 1.0, i, j), method))
             least, by = min(found)
             if least <= LIMIT or (least < np.inf and j > i + 1):
                 return least
-        if least < np.inf:  # is it the step, or does whatever is there grow so?
+        if least < np.inf:  # is the step wrong, or do errors grow this fast?
             growth = self._growth(by, i, j)
-            return least / (growth if growth > USUAL else 1.0) if growth <= LIMIT else np.inf
-        for looser in LOOSER:  # near a singular position rounding may allow no better
+            return least / (growth if growth > USUAL_GROWTH else 1.0) if growth <= LIMIT else np.inf
+        for looser in LOOSER:  # near a singular position rounding may prevent the full accuracy
             for method in order:
-                least = self._by(method, looser, i, j)
+                least = self._defect_by(method, looser, i, j)
                 if least < np.inf:
                     return least
         return np.inf
 
-    def _by(self, method: str, looser: float, i: int, j: int) -> float:
-        """The defect from state i to state j by a method, at tolerances so much looser."""
-        made = self._again(method, looser, self.states[i], i, j)
+    def _defect_by(self, method: str, looser: float, i: int, j: int) -> float:
+        """Return the defect from state i to state j by one method, with tolerances relaxed by a factor."""
+        made = self._remake(method, looser, self.states[i], i, j)
         if made is None:
             return np.inf
         at_end = self._distance(made.end, self.states[j], i, j)
-        several = 1 if j > i + 1 else int(self.n_steps[i])  # of a run that kept no state between them
-        return max(at_end, self._off_between(made.between, i, j)) / float(np.sqrt(several))
+        several = 1 if j > i + 1 else int(self.n_steps[i])  # steps without stored states between them
+        return max(at_end, self._deviation_between(made.between, i, j)) / float(np.sqrt(several))
 
-    def _off_between(self, state: Array, i: int, j: int) -> float:
-        """How far the dense solution is from a state made again, over the tolerance."""
-        t = self._between(i, j)
+    def _deviation_between(self, state: Array, i: int, j: int) -> float:
+        """Return the deviation of the dense solution from a reintegrated state, divided by the tolerance."""
+        t = self._check_time(i, j)
         if self.sol is None or not self.t[i] < t < self.t[j]:
             return 0.0
         table = self.sol.table
-        if table.kinds[np.searchsorted(table.t, t) - 1] == APART:  # there the states themselves are not as good
+        if table.kinds[np.searchsorted(table.t, t) - 1] == APART:  # interpolation is less accurate than the states here
             return 0.0
         found = self.sol(t)
         return self._distance(state, np.concatenate([found.q, found.v]), i, j)
 
     def _growth(self, method: str, i: int, j: int) -> float:
-        """How many times the tolerance an error of about that size at state i is at state j."""
-        one, other = (self._again(method, 1.0, start, i, j) for start in (self.states[i], self._beside(i)))
+        """Return the factor by which an error of the size of the tolerance grows from state i to state j."""
+        one, other = (self._remake(method, 1.0, start, i, j) for start in (self.states[i], self._perturbed(i)))
         return np.inf if one is None or other is None else self._distance(one.end, other.end, i, j)
 
-    def _beside(self, i: int) -> Array:
-        """A state beside state i, as far from it as the tolerances allow, on the constraints."""
+    def _perturbed(self, i: int) -> Array:
+        """Return a state on the constraints that differs from state i by about the tolerances."""
         t, system = float(self.t[i]), self.system
         change = self._allowed(self.states[i]) * np.where(np.arange(self.states.shape[1]) % 3 == 1, -1.0, 1.0)
         q, v = (self.states[i] + change).reshape(2, -1)
@@ -245,13 +248,13 @@ class _Look:
         return np.tile(self.atol, 2) + self.rtol * np.abs(state) + self.rounding
 
     def _distance(self, state: Array, other: Array, i: int, j: int) -> float:
-        """The largest difference of two states over the tolerance, in what the steps between i and j have tested."""
-        with np.errstate(invalid="ignore"):  # of states that are not finite: what comes out is NaN, and not looked at
+        """Return the largest difference of two states over the tolerance, in the components that the steps tested."""
+        with np.errstate(invalid="ignore"):  # states that are not finite give NaN
             error = np.abs(state - other) / self._allowed(other)
         return float((error[: len(self.atol)] if self.untested[i:j].any() else error).max())
 
-    def _again(self, method: str, looser: float, start: Array, i: int, j: int) -> Remade | None:
-        """The states up to state j, made again from `start` in the place of state i."""
+    def _remake(self, method: str, looser: float, start: Array, i: int, j: int) -> Remade | None:
+        """Integrate from `start` at the time of state i to state j; None if that fails."""
         key = (method, looser)
         if key not in self.remakers:
             made = explicit() if method == "explicit" else implicit(method == "all")
@@ -260,44 +263,43 @@ class _Look:
             self.remakers[key] = Remaker(self.system, float(self.t[0]), q, v, made, rtol, atol, self.longest)
         remaker = self.remakers[key]
         t0, t1 = float(self.t[i]), float(self.t[j])
-        most = MOST + MOST_A_STEP * (int(self.n_steps[i:j].sum()) + int((t1 - t0) / self.longest))
-        found = remaker.to(t0, start, self._between(i, j), t1, most if looser == 1.0 else MOST)
+        most = MAX_ATTEMPTS + MAX_ATTEMPTS_PER_STEP * (int(self.n_steps[i:j].sum()) + int((t1 - t0) / self.longest))
+        found = remaker.to(t0, start, self._check_time(i, j), t1, most if looser == 1.0 else MAX_ATTEMPTS)
         if found is not None:
             self.gap = max(self.gap, found.longest * remaker.spacing)
         return found
 
-    def _between(self, i: int, j: int) -> float:
-        """A time between the states i and j, in the middle of the longest interval; that of state j without `sol`."""
+    def _check_time(self, i: int, j: int) -> float:
+        """Return the midpoint of the longest interval between states i and j; without `sol` the time of state j."""
         if self.sol is None:
             return float(self.t[j])
         k = i + int(np.diff(self.t[i : j + 1]).argmax())
         return float(0.5 * (self.t[k] + self.t[k + 1]))
 
 
-def _in_words(result: Record, defect: float, where: float, gap: float, unseen: list[tuple[float, float]]) -> str:
-    """What was found, what it proves and what not."""
+def _message(result: Record, defect: float, where: float, gap: float, unseen: list[tuple[float, float]]) -> str:
+    """Return the outcome in words."""
     of = result.method or "the run"
     parts = []
     if defect > LIMIT:
         parts.append(
-            f"Not passed: from t = {where:.6g} on a step of {of} ends {defect:.2g} times its tolerance away from where "
-            f"the equations lead ({LIMIT:g} times would pass). Something within it was passed over, or the tolerance "
-            "is not held: limit max_step, or take another method."
+            f"Not passed: the step of {of} that starts at t = {where:.6g} ends {defect:.2g} times its tolerance away "
+            f"from the solution of the equations (limit: {LIMIT:g}). It missed a feature, or the tolerance is not met: "
+            "limit max_step, or use another method."
         )
     else:
         parts.append(
-            f"{'Passed' if not unseen else 'Passed in part'}: made again from its own states, no part of the run ends "
-            f"more than {defect:.2g} times the tolerance of a step away from what is stored ({LIMIT:g} times would "
-            "pass)."
+            f"{'Passed' if not unseen else 'Passed in part'}: reintegrated from the stored states, no part of the run "
+            f"ends more than {defect:.2g} times the tolerance of a step away from the next stored state (limit: "
+            f"{LIMIT:g})."
         )
     if unseen:
         spans = ", ".join(f"{start:.6g} to {end:.6g}" for start, end in unseen[:3]) + (", ..." if unseen[3:] else "")
         parts.append(
-            f"Nothing can be said of t = {spans}, where no step could be made again, or errors "
-            "grow too fast to tell a wrong one."
+            f"Not verified: t = {spans}, where reintegration failed, or errors grow too fast to detect a wrong step."
         )
     parts.append(
-        f"The equations were looked at every {gap:.2g} s or closer: what lasts less may be missed. How errors of steps "
-        "grow over the run is not certified, nor is the model."
+        f"The equations were evaluated every {gap:.2g} s or closer: shorter features may be missed. Neither the growth "
+        "of errors over the run nor the model is certified."
     )
     return " ".join(parts)

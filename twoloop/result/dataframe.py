@@ -1,4 +1,4 @@
-"""A result as a table."""
+"""A result as a table of pandas."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from twoloop.run.record import Record
 
 
 def to_dataframe(result: Record) -> Any:
-    """A row an instant, see `Result.to_dataframe`."""
+    """Return a table with one row per stored time, see `Result.to_dataframe`."""
     pandas = needed("pandas", "pandas", "to_dataframe")
     known = result.coordinates
     columns = dict(zip(known, result.q, strict=True))
@@ -23,6 +23,6 @@ def to_dataframe(result: Record) -> Any:
 
 
 def _derivative(coordinate: str, what: str, per: str) -> str:
-    """A name with its unit, such as "x of crank, velocity (m/s)" for "x of crank (m)"."""
+    """Return the name of a derivative with its unit, e.g. "x of crank, velocity (m/s)" for "x of crank (m)"."""
     name, unit = name_and_unit(coordinate)
     return f"{name}, {what} ({unit or 1}/{per})"

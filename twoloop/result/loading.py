@@ -1,4 +1,4 @@
-"""Results out of files: NumPy's npz, without pickle."""
+"""Reads results from files in NumPy's npz format, without pickle."""
 
 import json
 import os
@@ -19,28 +19,28 @@ from twoloop.run.dense_solution import DenseSolution
 
 
 def load(path: str | os.PathLike[str], system: ConstrainedSystem | None = None) -> Result:
-    """Read a result that `Result.save` wrote, or that is in the folder `store` of `solve_dae`.
+    """Read a result written by `Result.save`, or stored in a folder by `solve_dae(..., store=folder)`.
 
     Parameters
     ----------
     path : str or path
-        The file, or the folder, of which is read what is used.
+        The file, or the folder, whose arrays are memory-mapped.
     system : ConstrainedSystem, optional
-        The system that was solved; only with it `result.sol`, `result.reactions`, `result.energy`, `result.plot` and
-        `result.animate` have all that they need. None: `result.sol` is None.
+        The system that was solved, required by `result.sol`, `result.reactions`, `result.energy`, `result.plot` and
+        `result.animate`. None: `result.sol` is None.
 
     Returns
     -------
     Result
-        As it was saved.
+        The result as saved.
 
     Raises
     ------
     FileNotFoundError
         If there is no such file.
     TypeError, ValueError
-        If the file was not written by `Result.save` nor the folder by `solve_dae`, or it is damaged (says in which
-        field), or holds a result of a system of other sizes.
+        If the file was not written by `Result.save`, or the folder not by `solve_dae`; if it is damaged (the message
+        names the field); or if the system has other sizes.
     """
     if system is not None:
         check_system(system)
@@ -69,7 +69,7 @@ def load(path: str | os.PathLike[str], system: ConstrainedSystem | None = None) 
 
 
 def _read(path: Path) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
-    """Arrays and words of a file, whatever is in it, or that it is none of ours."""
+    """Return the arrays and other fields of a file; raise ValueError if it was not written by `Result.save`."""
     ours = f"path must lead to a file written by Result.save; {str(path)!r}"
     arrays: dict[str, NDArray[Any]] = {}
     field = ""
@@ -80,14 +80,14 @@ def _read(path: Path) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
                     field = f": {name.removesuffix('.npy')} cannot be read"
                     with archive.open(name) as member:
                         arrays[name.removesuffix(".npy")] = np.lib.format.read_array(member, allow_pickle=False)
-                        if member.read(1):  # which also compares the check sum of the archive
-                            raise ValueError("the array is followed by something else")
+                        if member.read(1):  # reading to the end verifies the checksum of the archive
+                            raise ValueError("the array is followed by other data")
             field = ""
             words = json.loads(str(arrays["words"]))
-        except Exception as error:  # a damaged archive raises nearly anything
+        except Exception as error:  # a damaged archive may raise any exception
             raise ValueError(f"{ours} is none{field} ({type(error).__name__}: {error})") from error
     if not isinstance(words, dict) or words.get("format") != FORMAT:
-        raise ValueError(f"{ours} holds something else")
+        raise ValueError(f"{ours} has other contents")
     return arrays, words
 
 
@@ -101,7 +101,7 @@ def _solution(system: ConstrainedSystem, arrays: dict[str, Any], words: dict[str
             f"system must be the one that was solved: ranks of its constraints are {list(ranks)} at the start of the "
             f"run; sol_ranks in the file are {words['sol_ranks']}"
         )
-    atol = arrays.get("atol", np.full(system.n_q, rtol))  # older files have none
+    atol = arrays.get("atol", np.full(system.n_q, rtol))  # absent in older files
     interpolator = Interpolator(system, start, row, rtol, atol, ranks)
     if "sol_interior_t" in arrays:
         interpolator.keep(arrays["sol_interior_t"], arrays["sol_interior_states"])

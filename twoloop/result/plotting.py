@@ -1,4 +1,4 @@
-"""A result as a figure: coordinates, energy, violation of the constraints."""
+"""Plots of a result: coordinates, energy, violation of the constraints."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from twoloop.problem.description import name_and_unit
 from twoloop.run.record import Record
 
 WIDTH, HEIGHT = 8.0, 2.2  # inches; height of a panel
-LEGEND_MOST = 12  # coordinates that a legend names
+LEGEND_MOST = 12  # largest number of coordinates in a legend
 
 
 def plot(result: Record, path: str | os.PathLike[str] | None) -> Any:
-    """A figure of a result, see `Result.plot`."""
+    """Return a figure of a result, see `Result.plot`."""
     if result.t.size == 0:
         raise ValueError(f"plot needs a result with output; this one has none: {result.message}")
-    # without pyplot: no display, no state, no backend of the user's that would change
+    # without pyplot: needs no display and leaves the user's backend alone
     figure_class = needed("matplotlib.figure", "matplotlib", "plot").Figure
     units: dict[str, list[int]] = {}
     for k, coordinate in enumerate(result.coordinates):
@@ -59,7 +59,7 @@ def _coordinates(panel: Any, result: Record, unit: str, chosen: list[int]) -> No
 def _violation(panel: Any, result: Record) -> None:
     positions, velocities = violation(result)
     for values, label in ((positions, "|C|"), (velocities, "|d/dt C|, |A v + b|")):
-        if (values > 0.0).any():  # a logarithm has no place for zeros
+        if (values > 0.0).any():  # a logarithmic axis cannot show zeros
             panel.semilogy(result.t, np.where(values > 0.0, values, np.nan), lw=1.0, label=label)
         else:
             panel.plot([], [], label=f"{label}: 0")
@@ -68,7 +68,7 @@ def _violation(panel: Any, result: Record) -> None:
 
 
 def violation(result: Record) -> tuple[Array, Array]:
-    """Largest violation of the positions, and of the velocities, (n_t,), at the times of a result with its system."""
+    """Return the largest violations of the position and of the velocity constraints, (n_t,) each."""
     system: Any = result.system
     states = list(zip(result.t.tolist(), result.q.T, result.v.T, strict=True))
     positions = [np.abs(system.constraint(t, q)).max(initial=0.0) if system.n_c else 0.0 for t, q, _ in states]

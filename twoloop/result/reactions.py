@@ -1,4 +1,4 @@
-"""Forces and torques of joints, from the multipliers of a result."""
+"""Joint forces and torques from the multipliers of a result."""
 
 from dataclasses import dataclass
 
@@ -10,28 +10,28 @@ from twoloop.problem.joints import Joint
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.record import Record
 
-NEGLIGIBLE = 1e-6  # relative: a reaction that multipliers without effect on the sum would change by less is unique
+NEGLIGIBLE = 1e-6  # relative: a reaction counts as unique if the null space of C_q^T changes it by less
 
 
 @dataclass(frozen=True)
 class Reaction:
-    """What a joint does to its body; the other body, or the ground, gets the opposite force and torque.
+    """Force and torque of a joint on its body; the other body, or the ground, gets the opposite.
 
-    Vectors are along the axes of space, one column an instant of `Result.t`.
+    Components along the axes of space, one column per time of `Result.t`.
 
     Attributes
     ----------
     force : ndarray (2 or 3, n_t)
-        N, on the body.
+        Force on the body, N.
     torque : ndarray (n_t,) or (3, n_t)
-        N m, on the body, about `point`; planar ones positive from x to y. Zero for a point mass.
+        Torque on the body about `point`, N m; in the plane positive from x to y. Zero for a point mass.
     point : ndarray (2 or 3, n_t)
-        Where the point of the joint is in space, m.
+        Position of the joint in space, m.
     unique : bool
-        Whether the multipliers determine the reaction. False where rows of the joint depend on rows outside it, so
-        that the load may be shared among joints in any proportion: `force` and `torque` are then those of the
-        multipliers of least norm. The sum C_q^T lam, hence the sum of all reactions on a body, is unique all the same.
-        Decided at the first time of the result; positions where rank is lost later on are not looked for.
+        True if the reaction is uniquely determined. False where rows of the joint depend on other rows, so that joints
+        may share the load in any proportion: `force` and `torque` are then those of the multipliers of minimum norm.
+        The sum C_q^T lam, hence the sum of all reactions on a body, is unique in any case. Determined at the first
+        time of the result; later losses of rank are not detected.
     """
 
     force: Array
@@ -41,7 +41,7 @@ class Reaction:
 
 
 def reaction(result: Record, name: str) -> Reaction:
-    """Reaction of a named joint, see `Result.reactions`."""
+    """Return the reaction of a named joint, see `Result.reactions`."""
     check_text("name", name)
     if result.system is None or not result.system.joints:
         raise ValueError(
@@ -64,7 +64,7 @@ def reaction(result: Record, name: str) -> Reaction:
 
 
 def _rows(system: ConstrainedSystem, joint: Joint, t: float, q: Array) -> Array:
-    """Derivatives of the joint's equations by the coordinates of its body."""
+    """Return the derivatives of the joint's rows with respect to the coordinates of its body."""
     columns = joint.translation + joint.rotation
     if joint.equations is not None:
         return (joint.equations @ system.rows(t, q))[np.ix_(joint.rows, columns)]
@@ -73,7 +73,7 @@ def _rows(system: ConstrainedSystem, joint: Joint, t: float, q: Array) -> Array:
 
 
 def _point(joint: Joint, q: Array) -> Array:
-    """The point of the joint in space, (2 or 3, n_t)."""
+    """Return the position of the joint in space, (2 or 3, n_t)."""
     origin, angles = q[list(joint.translation)], q[list(joint.rotation)]
     if joint.point is None:
         return origin
@@ -84,7 +84,7 @@ def _point(joint: Joint, q: Array) -> Array:
         s, c = np.sin(angles[0]), np.cos(angles[0])
         point = np.stack([c * point[0] - s * point[1], s * point[0] + c * point[1]])
     elif len(angles) == 4:
-        from twoloop.mechanisms.rotation import rotated  # whose import compiles
+        from twoloop.mechanisms.rotation import rotated  # compiled on import
 
         point = np.stack(rotated.py_func(*angles, *point))
     elif len(angles) == 9:
@@ -93,7 +93,7 @@ def _point(joint: Joint, q: Array) -> Array:
 
 
 def _force_and_torque(joint: Joint, q: Array, point: Array, generalized: Array) -> tuple[Array, Array]:
-    """Force, and torque about the point, of a generalised force (n, n_t) on the coordinates of the body."""
+    """Return force and torque about the point equivalent to a generalised force (n, n_t) on the body."""
     dimension = len(joint.translation)
     force, turning = generalized[:dimension], generalized[dimension:]
     angles, arm = q[list(joint.rotation)], point - q[list(joint.translation)]
@@ -101,17 +101,17 @@ def _force_and_torque(joint: Joint, q: Array, point: Array, generalized: Array) 
         return force, np.zeros(force.shape[1:] if dimension == 2 else force.shape)
     if dimension == 2:
         return force, turning[0] - (arm[0] * force[1] - arm[1] * force[0])
-    if len(turning) == 4:  # e' = G^T spin / 2, so that the torque is G g / 2 along the axes of the body
-        from twoloop.mechanisms.rotation import half_spin, rotated  # whose import compiles
+    if len(turning) == 4:  # e' = G^T spin / 2, so the torque in body axes is G g / 2
+        from twoloop.mechanisms.rotation import half_spin, rotated  # compiled on import
 
         torque = 0.5 * np.stack(rotated.py_func(*angles, *half_spin.py_func(*angles, *turning)))
-    else:  # each column of the matrix turns like an arm
+    else:  # each column of the matrix rotates like a lever arm
         torque = np.cross(angles.reshape(3, 3, -1), turning.reshape(3, 3, -1), axis=1).sum(axis=0)
     return force, torque - np.cross(arm, force, axis=0)
 
 
 def _unique(result: Record, system: ConstrainedSystem, joint: Joint) -> bool:
-    """Whether no multipliers with C_q^T lam = 0 change the reaction, at the first time of the result."""
+    """Return True if no multipliers with C_q^T lam = 0 change the reaction, at the first time of the result."""
     n_rows = len(result.lam)
     if result.t.size == 0 or result.rank == n_rows:
         return True

@@ -1,4 +1,4 @@
-"""What a file of a result may hold: each field is checked before anything relies on it, compiled code above all."""
+"""Validation of the fields of a saved result, before anything, compiled code above all, relies on them."""
 
 import math
 import zlib
@@ -18,32 +18,32 @@ NUMBERS = ("rtol", "defect", "widest_gap")  # each may be None
 OF_EVENTS = ("t_events", "q_events", "v_events")
 KINDS = (intervals.APART, intervals.VELOCITIES, intervals.ACCELERATIONS, intervals.ACROSS)
 LARGEST = 2**63
-ROWS = 1024  # of an array that are looked at in one go
-FEWEST = 3  # states of an interval that has some of its own: its ends, and one between them
+ROWS = 1024  # rows of an array checked at a time
+FEWEST = 3  # smallest number of states of an interval with interior states, including its ends
 
 
 def check_sum(array: NDArray[Any]) -> int:
-    """Of the values of an array in their order, by which arrays in each other's place are found."""
+    """Return a checksum of the values of an array, which detects interchanged arrays."""
     return zlib.crc32(np.ascontiguousarray(array).tobytes())
 
 
 def _is_number(value: Any) -> bool:
-    """Of JSON, where an integer may have any number of digits."""
+    """Return True for a number of JSON, in which integers may have any number of digits."""
     return math.isfinite(value) if type(value) is float else type(value) is int and abs(value) < LARGEST
 
 
 class Fields:
-    """Arrays and words of a file, whose fields are looked at one by one.
+    """Arrays and other fields of a file, which are checked one by one.
 
     Raises
     ------
     ValueError
-        Naming the field, what was expected and what was found.
+        If a field is invalid; the message names the field, the expected and the actual value.
     """
 
     def __init__(self, path: str, arrays: dict[str, NDArray[Any]], words: dict[str, Any]):
         self.path, self.arrays, self.words = path, arrays, words
-        for name, expected in self._word("check_sums", dict, {}).items():  # older files have none
+        for name, expected in self._word("check_sums", dict, {}).items():  # absent in older files
             if name not in arrays or check_sum(arrays[name]) != expected:
                 raise self._wrong(name, "what was saved under this name", "something else" if name in arrays else None)
         n_t = len(self._times("t"))
@@ -69,7 +69,8 @@ class Fields:
             rows = self._array("redundant", (None,), np.int64)
             fits = len(set(rows.tolist())) == len(rows) == n_rows - (self.rank or 0)
             self._check("redundant", fits and bool(((rows >= 0) & (rows < n_rows)).all()), "rows beside `rank` others")
-        self.message, self.method = self._word("message", str), self._word("method", str, "")  # older files: no method
+        self.message = self._word("message", str)
+        self.method = self._word("method", str, "")  # absent in older files  # new field
         self.changes = self._word("changes", str, "")
         self.compiled: bool | None = None if words.get("compiled") is None else self._word("compiled", bool)
         self.status = Status(self._choice("status", [int(each) for each in Status]))
@@ -83,7 +84,7 @@ class Fields:
             self._check_solution()
 
     def _check_solution(self) -> None:
-        """The table of the dense solution, with what finds states in it."""
+        """Check the table of the dense solution and its lookup data."""
         n_q, n_rows = self.sizes
         t = self._times("sol_t", least=1)
         self._check("sol_t", bool((np.diff(t) > 0.0).all()), "increasing times")
@@ -105,7 +106,7 @@ class Fields:
             self._check_interior(t)
 
     def _check_interior(self, t: Array) -> None:
-        """States within intervals: a row each, the first and the last at its ends, NaN behind the last."""
+        """Check states within intervals: one row each, first and last at its ends, NaN after the last."""
         times = self._array("sol_interior_t", (None, None))
         states = self._array("sol_interior_states", (*times.shape, 3 * self.sizes[0]))
         there = np.isfinite(times)
@@ -133,7 +134,7 @@ class Fields:
         return Statistics(**stats)
 
     def _array(self, name: str, shape: tuple[int | None, ...], dtype: type = np.float64) -> NDArray[Any]:
-        """The array of a name, of a shape in which None stands for any length."""
+        """Return an array by name and check its shape, in which None stands for any length."""
         array = self.arrays.get(name)
         sizes = ", ".join("n" if size is None else str(size) for size in shape) + ("," if len(shape) == 1 else "")
         expected = f"an array of {np.dtype(dtype).name} of shape ({sizes})"
@@ -146,7 +147,7 @@ class Fields:
 
     def _finite(self, name: str, shape: tuple[int | None, ...]) -> Array:
         array = self._array(name, shape)
-        blocks = np.split(array, range(ROWS, len(array), ROWS))  # that of a folder may be larger than the memory
+        blocks = np.split(array, range(ROWS, len(array), ROWS))  # an array in a folder may exceed the memory
         self._check(name, all(np.isfinite(block).all() for block in blocks), "finite")
         return array
 

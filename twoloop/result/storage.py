@@ -1,4 +1,4 @@
-"""Results into files: NumPy's npz, without pickle."""
+"""Writes results to files in NumPy's npz format, without pickle."""
 
 import json
 import os
@@ -18,14 +18,14 @@ SOMETIMES = (*COUNTS, "redundant", "atol", "untested")
 
 
 def check_path(path: Any) -> Path:
-    """Return `path` as a Path, or say that it is none."""
+    """Return `path` as a Path; raise TypeError if it is not a path."""
     if not isinstance(path, (str, os.PathLike)) or "\0" in str(path):
         raise TypeError(f"path must be a file name or a path; given {shown(path)} of type {type(path).__name__}")
     return Path(path)
 
 
 def parts_of(result: Record, inside: bool = True) -> tuple[dict[str, np.ndarray[Any, Any]], dict[str, Any]]:
-    """The arrays of a result by name, with or without states inside of steps, and all else."""
+    """Return the arrays of a result by name, with or without states within steps, and all other fields."""
     arrays: dict[str, Any] = {name: getattr(result, name) for name in ALWAYS}
     arrays |= {name: getattr(result, name) for name in SOMETIMES if getattr(result, name) is not None}
     n_events = None if result.t_events is None else len(result.t_events)
@@ -35,7 +35,7 @@ def parts_of(result: Record, inside: bool = True) -> tuple[dict[str, np.ndarray[
     words |= {"stats": asdict(result.stats), "rank": result.rank, "n_events": n_events, "method": result.method}
     words |= {"compiled": result.compiled, "changes": result.changes}
     words |= {name: getattr(result, name) for name in NUMBERS}
-    if result.sol is not None and not result.arcs:  # whose solution is theirs
+    if result.sol is not None and not result.arcs:  # the solution of a joined result consists of those of its arcs
         interpolator, table = result.sol.interpolator, result.sol.table
         arrays |= {"sol_t": table.t, "sol_states": table.states, "sol_kinds": table.kinds}
         words |= {"sol_end": result.sol.t_max, "sol_ranks": interpolator.ranks, "sol_rtol": interpolator.rtol}
