@@ -69,8 +69,9 @@ bench: compile ## two commits side by side: make bench BASE=main [HEAD=branch] [
 	@$(RUN) -m studies.bench_commits $(BASE) $(if $(HEAD),--head $(HEAD)) $(ARGS)
 
 # the inner loop first, which all others need; then two processes of about equal work, neither of which imports, and so
-# compiles, what the other does: what Newton's matrices and large systems have in common is in one of them
-compile: install ## compile the kernels, on two cores
+# compiles, what the other does: what Newton's matrices and large systems have in common is in one of them. Callbacks are
+# last: each worker of the tests would begin by compiling them
+compile: install ## compile the kernels, and the callbacks of bodies, mechanisms and studies, on two cores
 	@$(RUN) -c "from twoloop.kernels.evaluation import calls, own_inner; from twoloop.kernels.control import controller"
 	@$(RUN) -c "from twoloop.kernels.steps import diagonal_step, newton_step; \
 	from twoloop.kernels.evaluation import static_inner; from twoloop.kernels.lanes import lane_implicit" & \
@@ -80,6 +81,9 @@ compile: install ## compile the kernels, on two cores
 	from twoloop.kernels.lanes import lane_dop853, lane_runs, lane_taylor; \
 	from twoloop.kernels.steps import adams_step, bdf_step, bridge, canonical_step, explicit_step, \
 	fixed_point_step, newmark_step, taylor_step" && wait $$!
+	@$(RUN) -c "from twoloop.bodies import planar_callbacks, spatial_callbacks" & \
+	$(RUN) -c "from twoloop.mechanisms import *; from studies.bench import sharp_callbacks; from studies.honesty import traps" \
+	&& wait $$!
 
 # files in the order of their names: sorted by how many tests they have, long ones with few tests would come last
 SHARED := -n 2 --dist loadfile --no-loadscope-reorder

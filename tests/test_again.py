@@ -7,6 +7,7 @@ from dataclasses import fields
 import numpy as np
 import pytest
 
+from tests.compiled import PENDULUM
 from twoloop import ConstrainedSystem, ConstraintWarning, callback, mechanisms, solve, solve_dae
 from twoloop.generate.exact_derivatives import Territory
 from twoloop.result.result import Result
@@ -37,34 +38,10 @@ def taken(monkeypatch):
     return ways
 
 
-@callback("mass")
-def mass(t, q, p, M):
-    M[0, 0] = M[1, 1] = 1.0
-
-
-@callback("force")
-def weight(t, q, v, p, Q):
-    Q[1] = -9.81
-
-
-@callback("constraint")
-def constraint(t, q, p, C):
-    C[0] = 0.5 * (q[0] * q[0] + q[1] * q[1] - 1.0)
-
-
-@callback("jacobian")
-def gradient(t, q, p, Cq):
-    Cq[0, 0], Cq[0, 1] = q[0], q[1]
-
-
 @callback("jacobian")
 def wrong_above(t, q, p, Cq):
     Cq[0, 0] = q[0] if q[1] < 0.5 else 1.0001 * q[0]
     Cq[0, 1] = q[1]
-
-
-def unit_pendulum(force=weight, jacobian=gradient):
-    return ConstrainedSystem(n_q=2, n_c=1, mass=mass, force=force, constraint=constraint, jacobian=jacobian)
 
 
 def swing(system, angle, speed):
@@ -132,7 +109,7 @@ def test_what_a_compiled_callback_raises_comes_through(taken):
             raise ValueError("out of range")
         Q[1] = -9.81
 
-    system = unit_pendulum(force=force)
+    system = ConstrainedSystem(**PENDULUM | {"force": force})
     for k in range(7):
         assert swing(system, 0.3 + 0.01 * k, 0.0).success
     assert taken[-1]
@@ -185,7 +162,7 @@ def test_what_is_wrong_at_a_start_is_said_as_ever(taken):
 def test_a_callback_that_is_wrong_where_no_run_was_is_found(taken):
     """Within the box of states that were compared nothing is compared again, beyond it all that is new."""
 
-    system = unit_pendulum(jacobian=wrong_above)
+    system = ConstrainedSystem(**PENDULUM | {"jacobian": wrong_above})
     assert all(swing(system, 0.3 + 0.01 * k, 0.0).success for k in range(7))
     assert taken[-1]
     assert not swing(system, 0.3, 6.5).success
@@ -221,7 +198,7 @@ def test_what_is_said_of_redundant_rows_is_of_this_start(taken, monkeypatch):
 
 def test_a_result_has_the_system_of_the_call(taken):
     """Also where another stands for it, or was solved before it was copied."""
-    system = unit_pendulum(jacobian=None)
+    system = ConstrainedSystem(**PENDULUM | {"jacobian": None, "gamma": None})
     for each in (system, copy.copy(system), copy.deepcopy(system)):
         results = [swing(each, 0.3 + 0.01 * k, 0.0) for k in range(7)]
         assert taken[-1]
@@ -232,7 +209,7 @@ def test_a_run_in_which_something_is_wrong_counts_once(taken, monkeypatch):
     """So that it is the 2nd, 4th, 8th, ... that is compared as a whole."""
     counted, count = [], Territory.count
     monkeypatch.setattr(Territory, "count", lambda each: counted.append(each) or count(each))
-    system = unit_pendulum(jacobian=wrong_above)
+    system = ConstrainedSystem(**PENDULUM | {"jacobian": wrong_above})
     assert all(swing(system, 0.3 + 0.01 * k, 0.0).success for k in range(6))
     assert any(taken)
     assert not swing(system, 0.3, 6.5).success

@@ -234,32 +234,42 @@ def test_one_code_serves_all_numbers(method, monkeypatch):
     assert len(made["equations"]) == 1
 
 
-def test_a_second_process_compiles_nothing():
+@pytest.fixture
+def own_disk(monkeypatch, tmp_path):
+    """A folder for code of this test alone: other processes write into that of the user, and remove the oldest there."""
+    monkeypatch.setattr("twoloop.kernels.compile.own_functions.sources_folder", lambda: tmp_path)
+    monkeypatch.setattr("twoloop.kernels.compile.own_functions._MADE", defaultdict(dict))
+    return tmp_path
+
+
+def test_a_second_process_compiles_nothing(own_disk):
     program = """
+        import sys
+        from pathlib import Path
         from twoloop import solve_dae
         from twoloop.generate import straight_code
+        from twoloop.kernels.compile import own_functions
         from twoloop.mechanisms import four_bar
 
         def refuse(*given):
             raise AssertionError("compiled again")
 
-        straight_code.Written.operation = refuse
-        p = four_bar(theta3=0.0123)
+        straight_code.Written.operation = own_functions.object_code = refuse
+        own_functions.sources_folder = lambda: Path(sys.argv[1])
+        p = four_bar()
         solve_dae(p.system, (0.0, 0.1), p.q0, p.v0, "DOP853", compiled=True)
     """
-    problem = mechanisms.four_bar(theta3=0.0123)
+    problem = mechanisms.four_bar()
     solve_dae(problem.system, (0.0, 0.1), problem.q0, problem.v0, "DOP853", compiled=True)
-    run_python(program)
+    run_python(program, own_disk)
 
 
-def test_of_code_on_the_disk_the_newest_is_kept(monkeypatch, tmp_path):
+def test_of_code_on_the_disk_the_newest_is_kept(monkeypatch, own_disk):
     monkeypatch.setattr(caches, "MOST_KEPT", 2)
-    monkeypatch.setattr("twoloop.kernels.compile.own_functions.sources_folder", lambda: tmp_path)
-    monkeypatch.setattr("twoloop.kernels.compile.own_functions._MADE", defaultdict(dict))
     for stiffness in (1.0, -1.0, 2.0):  # 1 and -1 stand in the code
         system = ConstrainedSystem(
             n_q=1, n_c=0, mass=unit_mass, force=spring, constant_mass=True, parameters=[stiffness]
         )
         assert solve_dae(system, (0.0, 0.1), [1.0], [0.0], "DOP853", compiled=True).success
     for kind in ("equations", "stages"):
-        assert len(list(tmp_path.glob(f"{kind}.*.nbc"))) == 2
+        assert len(list(own_disk.glob(f"{kind}.*.nbc"))) == 2

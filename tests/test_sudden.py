@@ -53,7 +53,7 @@ def pendulum(force, at=1.5, width=WIDTH, compile=True):
     return problems.pendulum(compile=compile, force=force, parameters=[at, width])
 
 
-SYSTEMS = {"gust": pendulum(gust), "switched": pendulum(switched)}
+SYSTEMS = {"gust": pendulum(gust), "switched": pendulum(switched), "smooth magnet": pendulum(smooth_magnet)}
 
 
 @cache
@@ -115,21 +115,26 @@ def test_nor_is_what_acts_at_a_place_that_is_passed_in_that_time():
             assert result.success and np.abs(result.q[:, -1] - expected).max() < 1e-4
 
 
+@cache
+def end_behind_a_place(at, width):
+    """(x, y) at T_END by the angle, in steps that cannot pass over the smooth magnet."""
+
+    def rate(t, state):
+        along = math.cos(state[0]) * SIZE * math.exp(-(((math.sin(state[0]) - at) / width) ** 2))
+        return state[1], along - 9.81 * math.sin(state[0])
+
+    made = solve_ivp(rate, (0.0, T_END), (0.0, 3.0), method="DOP853", rtol=1e-11, atol=1e-11, max_step=5e-4)
+    return np.array([np.sin(made.y[0, -1]), -np.cos(made.y[0, -1])])
+
+
 @pytest.mark.parametrize("options", [{}, {"compiled": False}, {"method": "Taylor"}], ids=str)
 @pytest.mark.parametrize("tolerance", [1e-6, 1e-8])
 def test_nor_is_a_smooth_force_at_such_a_place(options, tolerance):
     """It is passed at 3/s, a width in a two-thousandth of the run or more."""
-    system = pendulum(smooth_magnet)
     for at, width in ((0.1, 5e-3), (0.3, 5e-3), (-0.2, 1e-2), (0.4, 1e-2)):
-
-        def rate(t, state, p=(at, width)):
-            along = np.cos(state[0]) * smooth_magnet(t, [np.sin(state[0])], None, p)[0]
-            return state[1], along - 9.81 * np.sin(state[0])
-
-        made = solve_ivp(rate, (0.0, T_END), (0.0, 3.0), method="DOP853", rtol=1e-11, atol=1e-11, max_step=5e-4)
-        expected = np.array([np.sin(made.y[0, -1]), -np.cos(made.y[0, -1])])
+        system, expected = SYSTEMS["smooth magnet"].with_parameters([at, width]), end_behind_a_place(at, width)
         run = (0.0, T_END), START[0], [3.0, 0.0]
-        result = solve_dae(system.with_parameters([at, width]), *run, rtol=tolerance, atol=tolerance, **options)
+        result = solve_dae(system, *run, rtol=tolerance, atol=tolerance, **options)
         assert result.success and np.abs(result.q[:, -1] - expected).max() < 1e3 * tolerance
 
 
@@ -153,11 +158,11 @@ def test_nor_in_lanes():
 
 
 def test_what_may_act_for_a_short_time():
-    assert all(may_be_sudden(system, False).by_time for system in (*SYSTEMS.values(), pendulum(ticking)))
+    assert all(may_be_sudden(each, False).by_time for each in (SYSTEMS["gust"], SYSTEMS["switched"], pendulum(ticking)))
     smooth = pendulum(vibrating), pendulum(steady), four_bar().system, driven_slider_crank().system
     assert not any(any(may_be_sudden(system, False)) for system in smooth)
-    for force in (smooth_magnet, teeth):
-        assert may_be_sudden(pendulum(force), False) == (False, True)
+    for system in (SYSTEMS["smooth magnet"], pendulum(teeth)):
+        assert may_be_sudden(system, False) == (False, True)
 
 
 def test_forces_are_not_called_beyond_the_end_of_a_run():
