@@ -65,7 +65,7 @@ def resumes(tmp_path):
         try:
             sweep(swinging, RUNS[:1], measure=second, **common | options)
         except ValueError as error:
-            assert "bear the same names and are not the same: measure changed since" in str(error)
+            assert "functions or values that have changed: measure (its code" in str(error)
             return False
         return True
 
