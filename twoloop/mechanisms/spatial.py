@@ -1,4 +1,4 @@
-"""The callbacks of all mechanisms of spatial bodies: Euler parameters, joints, spring-dampers, weight.
+"""Common callbacks of spatial mechanisms: Euler parameters, joints, spring-dampers, gravity.
 
 Coordinates of a body: x, y, z of the centre of mass and e0, e1, e2, e3 (see `rotation`); its axes are the principal
 ones. The callbacks are compiled once for all mechanisms; the parameters hold what
@@ -8,7 +8,7 @@ ones. The callbacks are compiled once for all mechanisms; the parameters hold wh
          (kind, row, i, a (3,), j, b (3,), s (3,))...,  (i, a (3,), j, b (3,), k, c, length)...]
 
 The first rows are e.e = 1 of each body, then those of the joints. Vectors are in the axes of their body; the ground is
-body -1. The mass matrix has the rank 6 of 7 for each body, 4 G^T J G being of rank 3.
+body -1. The mass matrix has rank 6 of 7 for each body, because 4 G^T J G has rank 3.
 """
 
 from collections.abc import Sequence
@@ -111,7 +111,7 @@ def force(t, q, v, p, Q):
     for body in range(n):
         m, k = HEAD + 4 * body, 7 * body + 3
         move_row(Q, body, p[m] * p[3], p[m] * p[4], p[m] * p[5])
-        # -8 G(e')^T J G(e) e': what the kinetic energy leaves when e'' = 0
+        # quadratic velocity terms of the kinetic energy: -8 G(e')^T J G(e) e'
         wx, wy, wz = half_spin(q[k], q[k + 1], q[k + 2], q[k + 3], v[k], v[k + 1], v[k + 2], v[k + 3])
         x, y, z = -8.0 * p[m + 1] * wx, -8.0 * p[m + 2] * wy, -8.0 * p[m + 3] * wz
         u0, u1, u2, u3 = v[k], v[k + 1], v[k + 2], v[k + 3]
@@ -282,7 +282,7 @@ def jacobian_values(t, q, p, values):
 
 
 def mass_entries(n: int) -> tuple[list[int], list[int]]:
-    """Rows and columns of what `mass_values` gives of n bodies, in its order."""
+    """Return rows and columns of the entries of `mass_values` for n bodies, in order."""
     rows, columns = [], []
     for first in range(0, 7 * n, 7):
         turned = range(first + 3, first + 7)
@@ -292,7 +292,7 @@ def mass_entries(n: int) -> tuple[list[int], list[int]]:
 
 
 def jacobian_entries(n: int, joints: Sequence[Sequence[float]]) -> tuple[list[int], list[int]]:
-    """Rows and columns of what `jacobian_values` gives of n bodies, in its order."""
+    """Return rows and columns of the entries of `jacobian_values` for n bodies, in order."""
     rows = [body for body in range(n) for _ in TURNED]
     columns = [7 * body + k for body in range(n) for k in TURNED]
 
