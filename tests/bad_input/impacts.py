@@ -62,7 +62,7 @@ IMPACTS = [
         "gaps must not be negative at q0; that of 'wall' is", "turn its sign, or start elsewhere"
     ),
     of_stops("a gap that branches", against(Stop(lambda t, q: q[8] if q[0] > 0.0 else 1.0))).says(
-        "gap of 'stop' must be a number made of t and q by numpy's functions", "make two stops of it"
+        "gap of 'stop' must be a number computed from t and q by numpy functions", "make two stops of it"
     ),
     of_stops(
         "`restitution=1.1`", lambda: Stop(lambda t, q: q[0], 1.1), "restitution of 'stop' must be from 0 to 1", "0 to 1"
