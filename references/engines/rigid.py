@@ -39,7 +39,7 @@ class Motion:
     w: Array
     # (n_t, 3); force of the first joint that closes a loop on its `body`, along the axes of space, N; NaN: not reported
     f: Array
-    # call_s, stepping_s: CPU time of the call on a model that has been built, and of its steps alone, s
+    # call_s, stepping_s: CPU time of the call on an existing model, and of its steps only, s
     call_s: float
     stepping_s: float
     message: str = ""  # why the run ended early; empty if it did not

@@ -30,8 +30,8 @@ class NoMinimalCoordinates(ValueError):
 class Minimal:
     """A mechanism in minimal coordinates."""
 
-    # equations(functions) -> rates, of which rates(y) gives y', y = [angles, their rates], by these functions: `math`
-    # or a module with sin, cos and sqrt of its own
+    # equations(functions) -> rates, with rates(y) -> y', y = [angles, their rates]; functions: `math` or another module
+    # with sin, cos and sqrt
     equations: Callable[[Any], Equations]
     start: tuple[float, ...]  # initial y
     # states(y (2 n, n_t)) -> q, v (n_q, n_t) in the problem's coordinates

@@ -238,7 +238,7 @@ class Collection:
             length = apart
             if length == 0.0:
                 raise ValueError(
-                    f"the points of {name!r} coincide in the position given; give a length, or a joint that keeps them together"
+                    f"the points of {name!r} coincide in the position given; give a length or use a joint"
                 )
         check_positive(f"length of {name!r}", length)
         long = Numbers((float(length),), (f"length of {name} (m)",))

@@ -33,7 +33,7 @@ GROUND = -1
 
 @helper
 def place(q, body, a, b):
-    """The point (a, b) of a body, and its derivative by the angle: x, y, dx, dy."""
+    """Return the point (a, b) of a body and its derivative with respect to the angle: x, y, dx, dy."""
     if body < 0:
         return a, b, 0.0, 0.0
     s, c = math.sin(q[3 * body + 2]), math.cos(q[3 * body + 2])
@@ -43,7 +43,7 @@ def place(q, body, a, b):
 
 @helper
 def motion(v, body, dx, dy):
-    """Velocity of a point whose derivative by the angle is (dx, dy), and what its acceleration has without v'."""
+    """Return the velocity of a point and the part of its acceleration without v'; (dx, dy): derivative by the angle."""
     if body < 0:
         return 0.0, 0.0, 0.0, 0.0
     w = v[3 * body + 2]
@@ -52,7 +52,7 @@ def motion(v, body, dx, dy):
 
 @helper
 def add_row(Cq, row, body, fx, fy, dx, dy):
-    """Add to a row the derivative of fx x + fy y of a point by the coordinates of its body."""
+    """Add to a row the derivative of fx x + fy y of a point with respect to the coordinates of its body."""
     if body >= 0:
         Cq[row, 3 * body] += fx
         Cq[row, 3 * body + 1] += fy

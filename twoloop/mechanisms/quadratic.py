@@ -28,7 +28,7 @@ ONE: Scalar = {None: 1.0}
 
 @helper
 def places(n_q, p):
-    """Where the constants, the entries of the mass, the linear and the quadratic terms begin."""
+    """Return the offsets of the constants, the mass entries, the linear and the quadratic terms."""
     constants = 4 + n_q
     entries = constants + int(p[0])
     linear = entries + 3 * int(p[1])

@@ -14,7 +14,7 @@ from twoloop.problem.problem import Array
 
 @helper
 def rotated(e0, e1, e2, e3, x, y, z):
-    """R(e) (x, y, z), homogeneous of degree two in e."""
+    """Return R(e) (x, y, z), homogeneous of degree two in e."""
     d = e0 * e0 - e1 * e1 - e2 * e2 - e3 * e3
     s = 2.0 * (e1 * x + e2 * y + e3 * z)
     return (
@@ -26,7 +26,7 @@ def rotated(e0, e1, e2, e3, x, y, z):
 
 @helper
 def rotated_rate(e0, e1, e2, e3, u0, u1, u2, u3, x, y, z):
-    """The derivative of R(e) (x, y, z) where e' = u."""
+    """Return the time derivative of R(e) (x, y, z) for e' = u."""
     d = 2.0 * (e0 * u0 - e1 * u1 - e2 * u2 - e3 * u3)
     s = 2.0 * (e1 * x + e2 * y + e3 * z)
     r = 2.0 * (u1 * x + u2 * y + u3 * z)
@@ -39,7 +39,7 @@ def rotated_rate(e0, e1, e2, e3, u0, u1, u2, u3, x, y, z):
 
 @helper
 def pulled(e0, e1, e2, e3, x, y, z, fx, fy, fz):
-    """The derivative of f . R(e) (x, y, z) by e: the generalised force of f at that point."""
+    """Return the gradient of f . R(e) (x, y, z) in e, i.e. the generalised force of f at that point."""
     fa = fx * x + fy * y + fz * z
     s = e1 * x + e2 * y + e3 * z
     r = e1 * fx + e2 * fy + e3 * fz
@@ -54,7 +54,7 @@ def pulled(e0, e1, e2, e3, x, y, z, fx, fy, fz):
 
 @helper
 def half_spin(e0, e1, e2, e3, u0, u1, u2, u3):
-    """G(e) u: half the angular velocity in the body's axes where e' = u."""
+    """Return G(e) u, half the angular velocity in body axes for e' = u."""
     return (
         -e1 * u0 + e0 * u1 + e3 * u2 - e2 * u3,
         -e2 * u0 - e3 * u1 + e0 * u2 + e1 * u3,

@@ -30,7 +30,7 @@ MOVED, TURNED = (0, 1, 2), (3, 4, 5, 6)  # coordinates of a body
 
 @helper
 def vector(q, body, x, y, z):
-    """A vector that turns with a body, in space."""
+    """Return a body-fixed vector in space."""
     if body < 0:
         return x, y, z
     k = 7 * body + 3
@@ -39,7 +39,7 @@ def vector(q, body, x, y, z):
 
 @helper
 def vector_rate(q, v, body, x, y, z):
-    """Its derivative, and twice R(e') a, which is its second one where e'' = 0."""
+    """Return its time derivative, and 2 R(e') a, its second derivative for e'' = 0."""
     if body < 0:
         return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     k = 7 * body + 3
@@ -50,7 +50,7 @@ def vector_rate(q, v, body, x, y, z):
 
 @helper
 def centre(q, body):
-    """The centre of mass; also the velocity, of v."""
+    """Return the centre of mass, or its velocity from v."""
     if body < 0:
         return 0.0, 0.0, 0.0
     return q[7 * body], q[7 * body + 1], q[7 * body + 2]
@@ -58,7 +58,7 @@ def centre(q, body):
 
 @helper
 def put_turned(q, values, place, body, x, y, z, fx, fy, fz):
-    """The derivative of f . (vector of a body) by its Euler parameters into four values; where the next ones are."""
+    """Store the gradient of f . (vector of a body) in the Euler parameters as four values; return the next index."""
     if body < 0:
         return place
     k = 7 * body + 3
@@ -72,7 +72,7 @@ def put_turned(q, values, place, body, x, y, z, fx, fy, fz):
 
 @helper
 def turn_row(q, row, body, x, y, z, fx, fy, fz):
-    """Add to a row (n_q,) the derivative of f . (vector of a body) by its Euler parameters."""
+    """Add to a row (n_q,) the gradient of f . (vector of a body) in its Euler parameters."""
     if body >= 0:
         k = 7 * body + 3
         d0, d1, d2, d3 = pulled(q[k], q[k + 1], q[k + 2], q[k + 3], x, y, z, fx, fy, fz)
@@ -84,7 +84,7 @@ def turn_row(q, row, body, x, y, z, fx, fy, fz):
 
 @helper
 def move_row(row, body, fx, fy, fz):
-    """Add to a row the derivative of f . (centre of a body)."""
+    """Add to a row the gradient of f . (centre of a body)."""
     if body >= 0:
         row[7 * body] += fx
         row[7 * body + 1] += fy

@@ -178,7 +178,7 @@ def _digest(given: Any) -> str:
     known: dict[Basic, bytes] = {}
 
     def of(each: Any) -> bytes:
-        """Of an expression by way of its parts, each of which is looked at once."""
+        """Return the digest of an expression from those of its subexpressions, each computed once."""
         if isinstance(each, (list, tuple)):
             return hashlib.sha256(b"list" + b"".join(map(of, each))).digest()
         if not isinstance(each, Basic):
