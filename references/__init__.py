@@ -1,1 +1,1 @@
-"""The mechanisms of twoloop through other solvers; every adapter of one returns a `twoloop.result.result.Result`."""
+"""Adapters that run the mechanisms of twoloop with other solvers; each returns a `twoloop.result.result.Result`."""

@@ -1,30 +1,30 @@
-"""What the adapters of all solvers share: their arguments, checked, a limit on the time of a run, and its `Result`.
+"""Common parts of all adapters: checked arguments, a time limit, and the `Result`.
 
-`adapter` makes of solve(task, options ...) a function solve(system, t_span, q0, v0, options ...), and all take:
+`adapter` turns solve(task, options ...) into solve(system, t_span, q0, v0, options ...). Common parameters:
 
 system : ConstrainedSystem
-    The problem. Callbacks are compiled into what the solver calls at the first run (a few seconds). Solvers that take
-    expressions want compiled callbacks which give Q_d and do not branch on t, q or v.
+    The problem. Its callbacks are compiled into the solver's functions at the first run (a few seconds). Solvers that
+    take expressions require compiled callbacks with Q_d that do not branch on t, q or v.
 t_span : (float, float)
-    Start and end, s; the end after the start.
+    Start and end, s, in increasing order.
 q0, v0 : array_like (n_q,)
     Consistent initial coordinates and velocities.
 rtol, atol : float
-    The solver's tolerances of q and v; `tol` of a solver that has one.
+    The solver's tolerances for q and v; `tol` for a solver with a single tolerance.
 t_eval : array_like, optional
-    Increasing times in t_span at which to store the solution, by the solver's own interpolation, in a second run of
-    the same steps that is not timed. None: `OUTPUTS` times, evenly, if the adapter does not say that it stores steps.
+    Increasing output times in t_span, by the solver's own interpolation, in a second run with the same steps that is
+    not timed. None: `OUTPUTS` equidistant times, unless the adapter stores the steps.
 time_limit : float, optional
-    Wall-clock time that the integration may take, s. A run past it is a failed one. None: no limit.
+    Wall-clock limit of the integration, s. A run that exceeds it fails. None: no limit.
 max_step : float, optional
-    Of some, the longest step that the solver may take, s. None: the length of t_span.
+    Some adapters: the largest step, s. None: the length of t_span.
 
-They return a `Result`, with the sign of M a + C_q^T lam = Q, and `a` and `lam` of eq. (6) at the stored states if the
-adapter does not say otherwise. `h` is empty where steps are not stored; `cpu_time` is that of the call that a user
-writes (`user_call`). A failure gives what was computed before it, `Status.SOLVER_FAILED` and the solver's text.
+They return a `Result`, with the sign of M a + C_q^T lam = Q, and `a` and `lam` from eq. (6) at the stored states
+unless stated otherwise. `h` is empty if steps are not stored; `cpu_time` is that of the call that a user writes
+(`user_call`). A failed run returns the states computed so far, `Status.SOLVER_FAILED` and the solver's message.
 
-They raise TypeError or ValueError, before any work, for a wrong argument, naming it, RuntimeError for a package that is
-not installed; an exception of a Python callback comes through.
+They raise TypeError or ValueError before any work, naming the invalid argument, and RuntimeError if a package is not
+installed. Exceptions of Python callbacks are passed on.
 """
 
 import math
@@ -49,32 +49,32 @@ from twoloop.problem.system import ConstrainedSystem, check_system
 from twoloop.result.result import Result
 from twoloop.run.record import Statistics, Status
 
-OUTPUTS = 1001  # instants of the default t_eval of solvers that do not store their steps
+OUTPUTS = 1001  # default number of output times of solvers that do not store their steps
 
 CAUSES = "Look for a discontinuity, a singular position or a value that is not finite near this time, or try"
 ADVICE = f"{CAUSES} other tolerances or another method."
-POSITIVE = {"rtol", "atol", "tol", "step", "max_step"}  # options that are numbers above 0, where they are given
+POSITIVE = {"rtol", "atol", "tol", "step", "max_step"}  # options that must be positive if given
 
 
 def cpu_time() -> float:
-    """CPU time of this process and of the compilers that it called, s."""
+    """Return the CPU time of this process and of the compilers that it called, s."""
     return time.process_time() + sum(os.times()[2:4])
 
 
 class UserCall:
-    """The CPU time of the call that a user of a solver writes, by the clock of the process.
+    """CPU time of the call that a user of a solver writes.
 
-    An adapter does more than that: our checks, the building of what a user keeps, a second run for the output,
-    accelerations and multipliers. It puts what its solver's documentation has for a second run into
-    `with user_call:`. Whatever marks nothing is timed whole.
+    An adapter does more than that: checks, construction of objects that a user would keep, a second run for the output,
+    accelerations and multipliers. It wraps the code that the solver's documentation shows for a repeated run in
+    `with user_call:`. Adapters that do not use it are timed as a whole.
 
     Attributes
     ----------
     seconds : float or None
-        Of the last call that was marked.
+        CPU time of the last call measured.
     ended : float or None
-        `cpu_time` at the end of the first that was marked since this was None: what was built before it is in it, and
-        nothing of a second run for the output.
+        `cpu_time` at the end of the first call since this was None: it includes construction, but no second run for
+        the output.
     """
 
     def __init__(self) -> None:
@@ -91,25 +91,25 @@ class UserCall:
         self.ended = cpu_time() if self.ended is None else self.ended
 
     def forget(self) -> None:
-        """Make this as new, before a run: an exception may have come while the last call ended."""
+        """Reset before a run, because an exception may have interrupted the end of the last call."""
         self.seconds = self.ended = self._began = None
 
     def so_far(self) -> float:
-        """CPU time of the call under way, s; 0.0 outside of it."""
+        """Return the CPU time of the current call, s; 0.0 outside of a call."""
         return 0.0 if self._began is None else time.process_time() - self._began
 
 
-user_call = UserCall()  # one: a process makes one run at a time
+user_call = UserCall()  # a process makes one run at a time
 
 
 class OutOfTimeError(Exception):
-    """The time limit passed within an evaluation; raised and caught inside an adapter."""
+    """The time limit was exceeded within an evaluation; raised and caught inside an adapter."""
 
 
 class TimeLimit:
-    """The wall-clock time that a run may take, from the moment this is made; None: no limit.
+    """Wall-clock limit of a run, counted from the construction of this object; None: no limit.
 
-    `exceeded` says whether a look at the clock has found the run past it.
+    `exceeded` is True once a check has found the run past its limit.
     """
 
     def __init__(self, seconds: float | None):
@@ -118,29 +118,29 @@ class TimeLimit:
         self.exceeded = False
 
     def passed(self) -> bool:
-        """Look at the clock: whether the run is past its limit."""
+        """Return True if the run has exceeded its limit."""
         if time.monotonic() > self.deadline:
             self.exceeded = True
         return self.exceeded
 
     def check(self) -> None:
-        """Raise `OutOfTimeError` when the run is past its limit."""
+        """Raise `OutOfTimeError` if the run has exceeded its limit."""
         if self.passed():
             raise OutOfTimeError
 
     def message(self, name: str, t: float, advice: str) -> str:
-        """Say that the solver of this name was stopped at t, and what to do."""
+        """Return the message for a solver stopped at t, with advice."""
         return f"{name} was stopped at t = {t:.10g} by time_limit = {self.seconds:g} s. Raise time_limit, or {advice}."
 
 
 def check_time_limit(time_limit: float | None) -> None:
-    """Say what is wrong with a time limit."""
+    """Raise an error if a time limit is invalid."""
     if time_limit is not None:
         check_positive("time_limit", time_limit)
 
 
 def imported(module: str, name: str = "", extra: str = "peers") -> Any:
-    """An optional package, or a module of it."""
+    """Return an optional package, or a module of it."""
     try:
         return import_module(module)
     except ImportError as error:
@@ -150,7 +150,7 @@ def imported(module: str, name: str = "", extra: str = "peers") -> Any:
 
 
 def check_problem(problem: Any, parameter: str, expected: str) -> Problem:
-    """Return `problem` if it is a `Problem` that has this parameter, as those of one mechanism have."""
+    """Return `problem` if it is a `Problem` with this parameter, which identifies its mechanism."""
     if not isinstance(problem, Problem) or parameter not in problem.parameters:
         given = f"the Problem {problem.name!r}" if isinstance(problem, Problem) else repr(problem)
         raise TypeError(f"problem must be {expected}; given {given}")
@@ -159,7 +159,7 @@ def check_problem(problem: Any, parameter: str, expected: str) -> Problem:
 
 @dataclass(frozen=True)
 class Task:
-    """The arguments of a run, checked; `system` has the rows A v + b = 0 below those of C, of which there are n_c."""
+    """Checked arguments of a run; `system` has the rows A v + b = 0 below the n_c rows of C."""
 
     system: ConstrainedSystem
     n_c: int
@@ -173,37 +173,37 @@ class Task:
 
     @property
     def y0(self) -> Array:
-        """The start [q, v]."""
+        """Return the initial state [q, v]."""
         return np.concatenate([self.q0, self.v0])
 
     @property
     def key(self) -> tuple[ConstrainedSystem, float, bytes, bytes]:
-        """What equations that are made for a start are kept by."""
+        """Return the cache key of equations built for an initial state."""
         return self.system, self.t0, self.q0.tobytes(), self.v0.tobytes()
 
     @property
     def instants(self) -> Array:
-        """When to store the solution: the times given, or `OUTPUTS` evenly."""
+        """Return the output times: those given, or `OUTPUTS` equidistant ones."""
         return np.linspace(self.t0, self.t1, OUTPUTS) if self.times is None else self.times
 
     def longest(self, max_step: float | None) -> float:
-        """The longest step that a solver may take: what is asked for, or the whole run."""
+        """Return the largest step: the one given, or the length of the run."""
         return min(math.inf if max_step is None else max_step, self.t1 - self.t0)
 
     def result(self, name: str, t: Array, rows: Array, failure: str = "", *, h: Any = None, **counts: Any) -> Result:
-        """The Result of a solver of this name.
+        """Return the Result of a run.
 
         Parameters
         ----------
         t : ndarray (n_t,)
         rows : ndarray (3 n_q + n_c, n_t) or (2 n_q, n_t)
-            [q v a lam], or [q v], to which `a` and `lam` of eq. (6) are added.
+            [q v a lam], or [q v], which is completed by `a` and `lam` from eq. (6).
         failure : str
-            The message of a run that failed; "": it reached the end.
+            Message of a failed run; "": it reached the end.
         h : ndarray, optional
-            Its steps.
+            Step sizes.
         counts
-            Those of `Statistics` that it tells, and cpu_time, if that is not of the last `user_call`.
+            Fields of `Statistics` known to the solver, and cpu_time, if it is not that of the last `user_call`.
         """
         n = self.system.n_q
         if len(rows) == 2 * n:
@@ -230,10 +230,10 @@ def check_task(
     derivatives: bool = True,
     independent_rows: bool = False,
 ) -> Task:
-    """Say what is wrong with an argument of a run, or return all of them.
+    """Return the checked arguments of a run; raise an error if one is invalid.
 
-    `derivatives`: whether those of the constraints are checked, which who traces the callbacks does otherwise;
-    `independent_rows`: whether to leave out rows of C_q that follow from others.
+    `derivatives`: check those of the constraints (adapters that trace the callbacks do so elsewhere);
+    `independent_rows`: remove dependent rows of C_q.
     """
     check_system(system)
     t0, t1 = check_span(t_span)
@@ -247,9 +247,9 @@ def check_task(
 
 
 def adapter(*, velocity_rows: bool = True, **checks: bool) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Make of solve(task, options ...) what is called with a system, a span and a start, all of which it checks.
+    """Turn solve(task, options ...) into a function of a system, a span and an initial state, which are checked.
 
-    `velocity_rows`: whether it takes rows A v + b = 0; `checks`: see `check_task`.
+    `velocity_rows`: rows A v + b = 0 are supported; `checks`: see `check_task`.
     """
 
     def decorate(solve: Callable[..., Any]) -> Callable[..., Any]:
@@ -266,7 +266,7 @@ def adapter(*, velocity_rows: bool = True, **checks: bool) -> Callable[[Callable
             if system.n_a > 0 and not velocity_rows:
                 raise ValueError(
                     f"system must have constraints on positions only: this adapter has no rows A v + b = 0; given "
-                    f"{system.name!r} with n_a = {system.n_a}. Take one of the accelerations, or solve_dae"
+                    f"{system.name!r} with n_a = {system.n_a}. Use one based on accelerations, or solve_dae"
                 )
             user_call.seconds = None
             return solve(**given)

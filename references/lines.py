@@ -1,4 +1,4 @@
-"""Lines of rivals in tables and figures: the file of each adapter lists its own, and studies find them by place."""
+"""Solvers compared in tables and figures: each adapter's module lists its own in `LINES`."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -13,34 +13,34 @@ from twoloop.result.result import Result
 
 @dataclass(frozen=True)
 class Line:
-    """A solver with tolerances, by a function that `references.driver.adapter` has made."""
+    """A solver with tolerances, given by a function made by `references.driver.adapter`."""
 
     name: str
-    package: str  # what tells its version
-    family: str  # whose it is
+    package: str  # name of the package, which provides the version
+    family: str  # project
     solve: Callable[..., Result]
     options: Mapping[str, Any] = field(default_factory=dict)
-    called_from: str = "compiled"  # what calls the mechanism's functions; "Python" costs microseconds a call
+    called_from: str = "compiled"  # caller of the mechanism's functions; "Python" costs microseconds per call
     # whether the positions stay on the constraints to the solver's tolerance
     keeps: bool = True
-    rival: bool = True  # whether it stands beside ours in every table
-    checked: bool = False  # whether `conformance` checks it; one setting of each solver
+    rival: bool = True  # included in all tables
+    checked: bool = False  # checked by `conformance`; one setting per solver
     # as of `studies.bench.collector.Solver`
     own_accelerations: bool = False
     traces: bool = False
     builds_each: bool = False
     builds_span: bool = False
-    stores_steps: bool = False  # whether it is to store its steps, not states at instants
-    compiled_callbacks: bool = False  # whether it refuses functions in Python
-    one_tolerance: bool = False  # whether it takes `tol`, and not `rtol` and `atol`
-    scatters: bool = False  # whether its error scatters with rounding: repeats get tolerances a little apart
+    stores_steps: bool = False  # stores its steps instead of output times
+    compiled_callbacks: bool = False  # requires compiled functions
+    one_tolerance: bool = False  # takes `tol` instead of `rtol` and `atol`
+    scatters: bool = False  # error scatters with rounding: repetitions use slightly different tolerances
     # as a row tells them
     fixed: Mapping[str, float | str] = field(default_factory=dict)
 
 
 @cache
 def lines() -> tuple[Line, ...]:
-    """Those of every module of this folder that has `LINES`; called from compiled code first."""
+    """Return the lines of all modules in this folder; solvers called from compiled code first."""
     here = Path(__file__).parent
     names = sorted(each.name for each in walk_packages([str(here)], "references.") if not each.ispkg)
     found = [line for name in names for line in getattr(import_module(name), "LINES", ())]

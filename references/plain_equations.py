@@ -1,4 +1,4 @@
-"""The equations of a problem in plain numpy, for solvers that are called with nothing else."""
+"""Equations of a known problem in plain numpy."""
 
 import numpy as np
 
@@ -6,15 +6,15 @@ from twoloop.testing.known_problem import Array, KnownProblem
 
 
 class NoModel(Exception):
-    """Raised where a solver has no model of a problem: nothing is said of it."""
+    """A solver has no model of the problem, so that nothing can be concluded."""
 
 
 def rate_of(problem: KnownProblem, t: float, y: Array) -> Array:
-    """y' (2 n_q,) of the equations at index 1, y = [q, v]."""
+    """Return y' (2 n_q,) of the index-1 equations, y = [q, v]."""
     q, v = np.split(y, 2)
     return np.concatenate([v, problem.acceleration(t, q, v)[0]])
 
 
 def start_of(problem: KnownProblem) -> Array:
-    """y at the start (2 n_q,)."""
+    """Return the initial y (2 n_q,)."""
     return np.concatenate([problem.q0, problem.v0])

@@ -155,7 +155,7 @@ def test_neither_a_short_step_nor_a_large_model_takes_for_ever(pendulum, monkeyp
     audit_simulator(simulate, pendulum, step=1e-9, error=1e-3)
     assert taken[0] <= 100_000
     monkeypatch.setattr(step_audit, "KNOWN_WITHIN", 1e-9)
-    with pytest.raises(RuntimeError, match=r"not known beyond .* s: follow it for a shorter time"):
+    with pytest.raises(RuntimeError, match=r"ends at .* s: use a shorter time span"):
         audit_simulator(simulate, replace(pendulum, t_span=(0.0, 100.0)), step=1e-2)
 
 
@@ -231,7 +231,7 @@ class TestInMuJoCo:
         key = '<keyframe><key name="swung" qpos="0.3 0 0" qvel="3 0 0"/><key qpos="0 0 0"/></keyframe>'
         path = file_with(tmp_path, end(key))
         made = audit_mjcf(path, error=1e-2, t_end=0.2, key="swung")
-        assert any("gaped by 0.25 m" in note for note in made.notes) and "'swung'" in made.start
+        assert any("were open by 0.25 m" in note for note in made.notes) and "'swung'" in made.start
         assert made.audits[-1].runs[-1].error < 1e-3
         with pytest.raises(ValueError, match="no keyframe 'no'; it has swung, 1"):
             audit_mjcf(path, key="no")

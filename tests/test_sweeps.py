@@ -161,10 +161,10 @@ def test_rows_of_another_sweep_are_refused(tmp_path):
     ("arguments", "options", "error", "words"),
     [
         ((None, ANGLES), {}, TypeError, "problem_of must be a function that returns a Problem; given None"),
-        ((linkage, []), {}, ValueError, "parameters must be of one run at least"),
+        ((linkage, []), {}, ValueError, "parameters must contain at least one run"),
         ((linkage, [0.1]), {}, TypeError, r"parameters\[0\] must be a mapping of names to values; given 0.1"),
         ((linkage, [{"theta3": 0.1}, {"x": 1}]), {}, ValueError, r"all have the same names; .*\[1\] \['x'\]"),
-        ((lambda status: None, [{"status": 1}]), {}, ValueError, "must not be named as the columns.*'status'"),
+        ((lambda status: None, [{"status": 1}]), {}, ValueError, "the name of a standard column; given 'status'"),
         (
             (linkage, ANGLES),
             {"parallel": "fork"},

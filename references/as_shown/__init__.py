@@ -1,6 +1,6 @@
-"""Solvers of other projects as their own documentation shows them, a file each, found by its place.
+"""Solvers of other projects as shown in their documentation, one file each.
 
-A file has `NAME`, as tables show it, `PACKAGE`, as pip knows it, `DRIFTS`, whether nothing keeps its positions on the
-constraints, and `simulate(problem, times, tolerance)`, which `twoloop.testing.check_simulator` and
-`python -m studies.compare --solver` take. Packages are imported when it is called.
+A file defines `NAME` for tables, `PACKAGE` for pip, `DRIFTS`, True if positions are not kept on the constraints, and
+`simulate(problem, times, tolerance)` for `twoloop.testing.check_simulator` and `python -m studies.compare --solver`.
+Packages are imported when it is called.
 """

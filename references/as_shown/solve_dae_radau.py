@@ -20,7 +20,7 @@ def simulate(problem: KnownProblem, times: Array, tolerance: float) -> tuple[Arr
 
 
 def _residual(problem: KnownProblem, t: float, y: Array, yp: Array) -> Array:
-    """F(t, y, y') of the stabilised equations of index 2, y = [q, v, integrals of mu and of lam].
+    """Return F(t, y, y') of the stabilised index-2 equations, y = [q, v, integrals of mu and of lam].
 
     C. W. Gear, B. Leimkuhler, G. K. Gupta, J. Comput. Appl. Math. 12-13 (1985) 77-90.
     """
@@ -32,7 +32,7 @@ def _residual(problem: KnownProblem, t: float, y: Array, yp: Array) -> Array:
 
 
 def _consistent(problem: KnownProblem) -> tuple[Array, Array]:
-    """y and y' at the start."""
+    """Return consistent initial y and y'."""
     a, lam = problem.acceleration(problem.t_span[0], problem.q0, problem.v0)
     none = np.zeros(problem.n_c)
     return np.concatenate([problem.q0, problem.v0, none, none]), np.concatenate([problem.v0, a, none, lam])

@@ -1,4 +1,4 @@
-"""SymPy's equations of points on rods in SciPy's solve_ivp."""
+"""SymPy's equations of point masses on rods, integrated by SciPy's solve_ivp."""
 
 from collections.abc import Callable
 
@@ -12,7 +12,7 @@ NAME, PACKAGE, DRIFTS = "LagrangesMethod, SymPy", "sympy", True
 
 
 def simulate(problem: KnownProblem, times: Array, tolerance: float) -> tuple[Array, ...]:
-    """Point masses on rods by SymPy's LagrangesMethod, its mass matrix and forcing in SciPy's solve_ivp."""
+    """Integrate SymPy's LagrangesMethod for point masses on rods, its mass matrix and forcing, by SciPy's solve_ivp."""
     from scipy.integrate import solve_ivp
 
     full = _lagrange(problem)
@@ -20,7 +20,7 @@ def simulate(problem: KnownProblem, times: Array, tolerance: float) -> tuple[Arr
 
     def rate(t: float, y: Array) -> Array:
         matrix, forcing = full(*y)
-        rates = np.linalg.solve(matrix, np.ravel(forcing))  # of q and of v, then multipliers
+        rates = np.linalg.solve(matrix, np.ravel(forcing))  # rates of q and v, then multipliers
         return np.asarray(rates[: 2 * n], np.float64)
 
     options = {"method": "DOP853", "t_eval": times, "rtol": tolerance, "atol": tolerance}
@@ -31,9 +31,9 @@ def simulate(problem: KnownProblem, times: Array, tolerance: float) -> tuple[Arr
 
 
 def _lagrange(problem: KnownProblem) -> Callable[..., tuple[Array, Array]]:
-    """SymPy's equations of a chain of points from the origin, as a function of q and v.
+    """Return SymPy's equations of a chain of points from the origin, as a function of q and v.
 
-    Raises NoModel if the problem is another.
+    Raises NoModel for other problems.
     """
     sympy, mechanics = imported("sympy", extra="symbolic"), imported("sympy.physics.mechanics", extra="symbolic")
     upright = np.allclose(problem.force(0.0, problem.q0, problem.v0)[::2], 0.0)

@@ -1,7 +1,7 @@
 """Dopri8 of diffrax (P. Kidger) on a ConstrainedSystem: the right-hand side traced by JAX and compiled with the loop.
 
-The equations are those that `equations.expressions` makes of the callbacks. Constraints are not kept. The package is
-optional: `make peers`, or the extra `peers`.
+The equations come from `equations.expressions`. Constraints drift. The package is optional: `make peers`, or the extra
+`peers`.
 """
 
 from collections.abc import Callable
@@ -17,22 +17,21 @@ from twoloop.checks.arguments import check_size
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.result.result import Result
 
-LARGEST = 9  # coordinates; the compilation of more takes too long
-MOST_STEPS = 10**6  # some seconds, in which compiled code looks at no clock; who gets no farther was "not asked"
+LARGEST = 9  # coordinates; larger systems take too long to compile
+MOST_STEPS = 10**6  # some seconds, because compiled code cannot check the clock
 
 
 @adapter(derivatives=False)
 def solve_diffrax(task: Task, rtol: float = 1e-8, atol: float = 1e-8, *, most_steps: int = MOST_STEPS) -> Result:
     """Integrate a constrained mechanical system, as the ODE q' = v, v' = a(t, q, v), with diffrax's Dopri8.
 
-    What it was given: 64-bit numbers; the whole integration compiled once a system, tolerances being arguments; the
-    integral controller of its default, which is quicker here than a proportional one; `DirectAdjoint` is not needed,
-    for nothing is differentiated; the run that is timed stores the end alone. Between steps: the interpolant, of
-    order 8.
+    Settings: 64-bit numbers; the whole integration compiled once per system, with the tolerances as arguments; the
+    default integral controller, which is faster here than a proportional one; no adjoint, because nothing is
+    differentiated; the timed run stores the final state only. Output by the interpolant of order 8.
 
-    Parameters, errors and result are those of `references.driver`, of at most `LARGEST` coordinates; of the statistics
-    n_accepted, n_rejected_error and n_evaluations (13 a step). Compiled code does not look at the clock: a run ends
-    after `most_steps` steps, rejected ones included, and one that took longer than the time limit is a failed one.
+    Parameters, errors and result as in `references.driver`, for at most `LARGEST` coordinates; statistics: n_accepted,
+    n_rejected_error and n_evaluations (13 per step). Compiled code does not check the clock: a run ends after
+    `most_steps` steps, including rejected ones, and counts as failed if it took longer than the time limit.
     """
     most_steps, system = check_size("most_steps", most_steps, 1), task.system
     t0, t1, times, start = task.t0, task.t1, task.instants, task.y0
@@ -61,7 +60,7 @@ def solve_diffrax(task: Task, rtol: float = 1e-8, atol: float = 1e-8, *, most_st
 
 @lru_cache(maxsize=256)
 def _compiled(system: ConstrainedSystem, t0: float, q0: bytes, v0: bytes, most_steps: int) -> Callable[..., Any]:
-    """(t0, t1, y0, rtol, atol, times) -> states as rows, what failed ("": nothing), steps, rejected ones."""
+    """Return (t0, t1, y0, rtol, atol, times) -> states as rows, error message or "", steps, rejected steps."""
     jax, diffrax = packages()
     derivative = derivative_of(expressions_at(system, t0, q0, v0))
 
@@ -79,14 +78,14 @@ def _compiled(system: ConstrainedSystem, t0: float, q0: bytes, v0: bytes, most_s
 
 
 def packages() -> tuple[Any, Any]:
-    """JAX, set to numbers of 64 bits, and diffrax."""
+    """Return JAX, set to 64-bit numbers, and diffrax."""
     diffrax, jax = imported("diffrax"), imported("jax")
     jax.config.update("jax_enable_x64", True)
     return jax, diffrax
 
 
 def derivative_of(equations: Expressions) -> Callable[[Any, Any, Any], Any]:
-    """(t, y, parameters or None) -> y', y = [q, v], as diffrax calls it."""
+    """Return (t, y, parameters or None) -> y', y = [q, v], in diffrax's signature."""
     (jax, _), n = packages(), equations.system.n_q
     functions = functions_of(jax.numpy)
 
@@ -101,7 +100,7 @@ def derivative_of(equations: Expressions) -> Callable[[Any, Any, Any], Any]:
 def solved(
     derivative: Any, t0: Any, t1: Any, y0: Any, tolerances: tuple[Any, Any], saveat: Any, most_steps: int, p: Any = None
 ) -> Any:
-    """What diffrax makes of it, by Dopri8 with the controller of its default."""
+    """Return diffrax's solution by Dopri8 with its default controller."""
     _, diffrax = packages()
     rtol, atol = tolerances
     controller = diffrax.PIDController(rtol=rtol, atol=atol)

@@ -1,1 +1,1 @@
-"""Physics engines on mechanisms made of bodies and joints, each with a model of its own and a fixed step."""
+"""Physics engines with fixed steps, each with its own model of mechanisms made of bodies and joints."""

@@ -7,20 +7,20 @@ import numpy as np
 
 from references.driver import imported
 from references.engines import rigid as parts
-from references.engines.rigid import BALL, HINGE, SLIDE, UNTOLD, Array, Motion, Prepared, Rigid, Seen
+from references.engines.rigid import BALL, HINGE, SLIDE, UNTOLD, Array, Motion, Prepared, Rigid, State
 
 
 class Settings(NamedTuple):
-    """The approximation of a discrete plant; "continuous": a plant without steps of its own."""
+    """The discrete contact approximation of the plant; "continuous": a plant integrated by Drake's simulator."""
 
     approximation: str = "kSap"
 
 
 def prepare(rigid: Rigid, settings: Settings = Settings()) -> Prepared:  # noqa: B008
-    """The mechanism in Drake; a step is a plant's own, so the call makes the plant.
+    """Build the mechanism in Drake; the step belongs to the plant, so each call makes a plant.
 
-    Raises RuntimeError if Drake is not installed, or refuses to take a step. Raises ValueError if it has no counterpart
-    of a joint.
+    Raises RuntimeError if Drake is not installed or rejects a step. Raises ValueError if it has no counterpart of a
+    joint.
     """
     simulation = _module("systems.analysis")
 
@@ -43,7 +43,7 @@ def prepare(rigid: Rigid, settings: Settings = Settings()) -> Prepared:  # noqa:
                 return str(error).strip().splitlines()[0]
             return ""
 
-        def see() -> Seen:
+        def see() -> State:
             poses = [plant.EvalBodyPoseInWorld(context, body) for body in bodies]
             twists = [plant.EvalBodySpatialVelocityInWorld(context, body) for body in bodies]
             x = np.array([each.translation() for each in poses])
@@ -118,12 +118,12 @@ def _joint(name: str, found: list[tuple[str, Any]], frames: list[Any], damping: 
 
 
 def _force(rigid: Rigid, plant: Any, context: Any, bodies: list[Any]) -> Array:
-    """Of the first joint that closes a loop: Drake does not tell it, so what its accelerations leave of the balance."""
+    """Return the force of the first loop-closing joint, from the balance of accelerations; Drake does not report it."""
     if not rigid.loops:
         return UNTOLD
     try:
         rates = plant.get_generalized_acceleration_output_port().Eval(context)
-    except RuntimeError:  # as in the step before or after, which says why
+    except RuntimeError:  # reported by an adjacent step
         return UNTOLD
     forces = _module("multibody.tree").MultibodyForces(plant)
     plant.CalcForceElementsContribution(context, forces)

@@ -1,4 +1,4 @@
-"""Exudyn: rigid bodies with Euler parameters, or planar ones with pins, and joints between these, all of its own."""
+"""Exudyn: rigid bodies with Euler parameters, or planar bodies with pins, with Exudyn's joints."""
 
 import time
 from typing import Any, NamedTuple
@@ -13,14 +13,14 @@ PLANAR_CUT = [1, 1, 0, 0, 0, 0]
 
 
 class Settings(NamedTuple):
-    """A solver of `references.exudyn.run`; the spectral radius of generalized-alpha, None: Exudyn's 0.9."""
+    """A solver of `references.exudyn.run`; spectral radius of generalized-alpha, None: Exudyn's 0.9."""
 
     solver: str = "GeneralizedAlpha"
     radius: float | None = None
 
 
 def prepare(rigid: Rigid, settings: Settings = Settings()) -> Prepared:  # noqa: B008
-    """The mechanism in Exudyn; the call holds the making of its model, which a run changes.
+    """Build the mechanism in Exudyn; the call includes making the model, because a run modifies it.
 
     Raises RuntimeError if Exudyn is not installed. Raises ValueError if it has no counterpart of a joint.
     """
@@ -59,7 +59,7 @@ def prepare(rigid: Rigid, settings: Settings = Settings()) -> Prepared:  # noqa:
 
 
 def _model(rigid: Rigid, planar: bool, q: Any, v: Any) -> tuple[Any, int, Any]:
-    """The model, a sensor of the force of the first joint that closes a loop, and its axes in its first body."""
+    """Return the model, a sensor of the force of the first loop-closing joint, and its axes in its first body."""
     from references.exudyn.model import PRISMATIC, REVOLUTE, SPHERICAL, UNIVERSAL, Model, frame
 
     locked = {"revolute": REVOLUTE, "prismatic": PRISMATIC, "spherical": SPHERICAL, "universal": UNIVERSAL}
@@ -75,7 +75,7 @@ def _model(rigid: Rigid, planar: bool, q: Any, v: Any) -> tuple[Any, int, Any]:
         a, b = joint.a.number, joint.b.number
         if planar:
             made = model.pin(a, tuple(parts.point_of(joint.a, joint)[:2]), b, tuple(parts.point_of(joint.b, joint)[:2]))
-            sensor = model.told(made, False) if joint.name == rigid.cut else sensor
+            sensor = model.force_sensor(made, False) if joint.name == rigid.cut else sensor
             continue
         axes = [end.rotation @ parts.axis_of(end, joint) for end in (joint.a, joint.b)]
         turned = frame(axes[0])
@@ -91,9 +91,9 @@ def _model(rigid: Rigid, planar: bool, q: Any, v: Any) -> tuple[Any, int, Any]:
         made = model.joint(a, b, point, turned, PLANAR_CUT if flat else locked[joint.kind])
         made_of[joint.name] = made
         if joint.name == rigid.cut:
-            sensor, own = model.told(made, True), joint.a.rotation.T @ turned
+            sensor, own = model.force_sensor(made, True), joint.a.rotation.T @ turned
     for one, at, other, there, values in parts.springs(rigid.model):
-        # Exudyn's planar bodies take points in their own axes, see Model.planar_body
+        # Exudyn's planar bodies take points in body axes, see Model.planar_body
         ends = (at, there) if planar else (one.in_space(at), other.in_space(there))
         model.spring(one.number, ends[0], other.number, ends[1], *values)
     for name, (stiffness, damping, angle) in parts.hinge_springs(rigid.model).items():

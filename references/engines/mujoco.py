@@ -1,4 +1,4 @@
-"""MuJoCo: the file that `to_mjcf` writes, with an integrator and the softness of the constraints that close loops."""
+"""MuJoCo: the file written by `to_mjcf`, with an integrator and the softness of loop-closing constraints."""
 
 import tempfile
 import time
@@ -10,12 +10,12 @@ from xml.etree import ElementTree
 import numpy as np
 
 from references.driver import imported
-from references.engines.rigid import BALL, Motion, Prepared, Rigid, Seen, freedoms, march
+from references.engines.rigid import BALL, Motion, Prepared, Rigid, State, freedoms, march
 from twoloop.bodies.mjcf_geometry import IgnoredWarning
 
 
 class Settings(NamedTuple):
-    """Integrator of MuJoCo; solref and solimp of what closes loops, None: its defaults."""
+    """MuJoCo's integrator; solref and solimp of the loop-closing constraints, None: its defaults."""
 
     integrator: str = "Euler"
     solref: str | None = None
@@ -23,15 +23,15 @@ class Settings(NamedTuple):
 
 
 def prepare(rigid: Rigid, settings: Settings = Settings()) -> Prepared:  # noqa: B008
-    """The mechanism in MuJoCo.
+    """Build the mechanism in MuJoCo.
 
     Raises RuntimeError if MuJoCo is not installed. Raises ValueError if MJCF has no counterpart of a joint.
     """
     mujoco = imported("mujoco", extra="engines")
-    mujoco.set_mju_user_warning(lambda text: None)  # which it would put into a file in the folder of the caller
+    mujoco.set_mju_user_warning(lambda text: None)  # by default MuJoCo writes them to a file in the working directory
     model = mujoco.MjModel.from_xml_string(file_of(rigid, settings))
     bodies = [model.body(body.name).id for body in rigid.model.bodies]
-    of_cut = rigid.cut, f"{rigid.cut} 2"  # of a hinge, two connects
+    of_cut = rigid.cut, f"{rigid.cut} 2"  # a hinge is closed by two connects
     connects = [k for k in range(model.neq) if model.equality(k).name in of_cut]
 
     def run(t_end: float, n_steps: int, n_stored: int) -> Motion:
@@ -51,7 +51,7 @@ def prepare(rigid: Rigid, settings: Settings = Settings()) -> Prepared:  # noqa:
             numbers = data.warning.number
             return f"MuJoCo warns of {mujoco.mjtWarning(int(numbers.argmax())).name}" if numbers.any() else ""
 
-        def see() -> Seen:
+        def see() -> State:
             mujoco.mj_kinematics(model, data)
             mujoco.mj_comPos(model, data)
             mujoco.mj_comVel(model, data)
@@ -60,7 +60,7 @@ def prepare(rigid: Rigid, settings: Settings = Settings()) -> Prepared:  # noqa:
                 mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_BODY, body, row, 0)
             poses = data.xpos[bodies].copy(), data.xmat[bodies].reshape(-1, 3, 3).copy()
             state = data.time, *poses, twists[:, 3:], twists[:, :3]
-            mujoco.mj_forward(model, data)  # forces belong to the step before
+            mujoco.mj_forward(model, data)  # without this, forces are those of the previous step
             own = (data.efc_type == mujoco.mjtConstraint.mjCNSTR_EQUALITY) & np.isin(data.efc_id, connects)
             return *state, data.efc_force[own].reshape(-1, 3).sum(axis=0)
 
@@ -70,9 +70,9 @@ def prepare(rigid: Rigid, settings: Settings = Settings()) -> Prepared:  # noqa:
 
 
 def file_of(rigid: Rigid, settings: Settings) -> str:
-    """The text of `to_mjcf` with these settings."""
+    """Return the text of `to_mjcf` with these settings."""
     with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
-        warnings.simplefilter("ignore", IgnoredWarning)  # start velocities and torques are put into the data
+        warnings.simplefilter("ignore", IgnoredWarning)  # initial velocities and torques are set in the data
         path = Path(folder, "model.xml")
         rigid.model.to_mjcf(path)
         root = ElementTree.parse(path).getroot()

@@ -1,4 +1,4 @@
-"""Pinocchio: a tree in joint coordinates, loops by its constrained dynamics, and a loop of steps around it."""
+"""Pinocchio: a tree in joint coordinates, loops by its constrained dynamics, with a time-stepping loop in Python."""
 
 import time
 from collections.abc import Callable
@@ -8,7 +8,7 @@ import numpy as np
 
 from references.driver import imported
 from references.engines import rigid as parts
-from references.engines.rigid import BALL, SLIDE, UNTOLD, Motion, Prepared, Rigid, Seen
+from references.engines.rigid import BALL, SLIDE, UNTOLD, Motion, Prepared, Rigid, State
 from twoloop.bodies.parts import Body
 from twoloop.problem.problem import Array
 
@@ -16,16 +16,16 @@ Acceleration = Callable[[Array, Array], Array]
 
 
 class Settings(NamedTuple):
-    """How a step is taken, semi-implicit ("Euler") or by "RK4"; mu and iterations, None: the defaults; Baumgarte's."""
+    """Semi-implicit ("Euler") or "RK4" steps; mu and iterations, None: the defaults; Baumgarte's parameter."""
 
     integrator: str = "Euler"
     mu: float | None = None
     iterations: int = 20
-    baumgarte: float | None = None  # 1/s: both of its roots
+    baumgarte: float | None = None  # 1/s: double root
 
 
 def prepare(rigid: Rigid, settings: Settings = Settings()) -> Prepared:  # noqa: B008
-    """The mechanism in Pinocchio, its steps taken in Python as its examples do.
+    """Build the mechanism in Pinocchio, with steps in Python as in its examples.
 
     Raises RuntimeError if Pinocchio is not installed. Raises ValueError if it has no counterpart of a joint.
     """
@@ -78,7 +78,7 @@ def prepare(rigid: Rigid, settings: Settings = Settings()) -> Prepared:  # noqa:
             taken += n
             return ""
 
-        def see() -> Seen:
+        def see() -> State:
             pin.forwardKinematics(model, data, q, v)
             poses, twists = [], []
             for k in range(len(rigid.x)):
@@ -105,11 +105,11 @@ def prepare(rigid: Rigid, settings: Settings = Settings()) -> Prepared:  # noqa:
 
 
 def _tree(pin: Any, rigid: Rigid) -> tuple[Any, dict[int, tuple[int, Any]]]:
-    """The model, and by number of a body its joint and where its centre of mass is in this."""
+    """Return the model, and for each body its joint and the position of its centre of mass relative to it."""
     model = pin.Model()
     model.gravity = pin.Motion(np.array(rigid.model.gravity), np.zeros(3))
     frames = {rigid.model.ground.number: (0, pin.SE3.Identity())}
-    # each body right after its parent's others: joints in another order silently give wrong accelerations
+    # depth-first order: joints in another order silently give wrong accelerations
     ahead = _children(rigid, rigid.model.ground)
     while ahead:
         body = ahead.pop()
@@ -146,7 +146,7 @@ def _start(rigid: Rigid, frames: dict[int, tuple[int, Any]], model: Any) -> Arra
 def _force(
     pin: Any, rigid: Rigid, model: Any, data: Any, frames: dict[int, tuple[int, Any]]
 ) -> Callable[[Array, Array], Array]:
-    """Generalised forces of springs and constant torques, as a function of q and v."""
+    """Return the generalised forces of springs and constant torques as a function of q and v."""
     known, turning = parts.springs(rigid.model), np.flatnonzero(rigid.torques.any(axis=1))
     hinges = [
         (model.joints[frames[body][0]], values)
@@ -198,7 +198,7 @@ def _force(
 
 
 def _rates(model: Any) -> Callable[[Array, Array], Array]:
-    """dq/dt as a function of q and v: quaternions (x, y, z, w) of ball joints turn in the axes of the body."""
+    """Return dq/dt as a function of q and v; quaternions (x, y, z, w) of ball joints rotate in body axes."""
     balls = [(each.idx_q, each.idx_v) for each in model.joints if each.nq == 4]
     if not balls:
         return lambda q, v: v
@@ -216,7 +216,7 @@ def _rates(model: Any) -> Callable[[Array, Array], Array]:
 
 
 def _runge_kutta(a: Acceleration, rate: Acceleration, q: Array, v: Array, h: float) -> tuple[Array, Array]:
-    """A step of the classical method of order 4, quaternions as four numbers."""
+    """Return a step of the classical fourth-order Runge-Kutta method, with quaternions as four numbers."""
     a1, u1 = a(q, v), rate(q, v)
     a2, u2 = a(q + 0.5 * h * u1, v2 := v + 0.5 * h * a1), rate(q + 0.5 * h * u1, v2)
     a3, u3 = a(q + 0.5 * h * u2, v3 := v + 0.5 * h * a2), rate(q + 0.5 * h * u2, v3)

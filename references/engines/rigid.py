@@ -1,8 +1,8 @@
-"""What the models of all engines are read off: poses and twists of bodies in space, joints of a tree, cuts of loops.
+"""Common data of all engine models: poses and twists of bodies in space, joints of a tree, cuts of loops.
 
-Every engine is given the same: each body's mass and inertia about its centre of mass, a tree of joints whose
-coordinates are zero at the start, and the joints that close loops. A planar mechanism is put into the plane z = 0; its
-hinges that close loops become ball joints there, for the hinges of the tree keep it in the plane.
+Every engine gets the same data: each body's mass and inertia about its centre of mass, a tree of joints whose
+coordinates are zero at the start, and the loop-closing joints. A planar mechanism is placed in the plane z = 0; its
+loop-closing hinges become ball joints, because the hinges of the tree keep it in the plane.
 """
 
 import time
@@ -21,28 +21,28 @@ from twoloop.mechanisms.rotation import G, euler_parameters, euler_rates, rotati
 from twoloop.problem.problem import Array
 
 SLIDE, HINGE, BALL = "slide", "hinge", "ball"
-FREEDOMS = ("revolute", "prismatic", "cylindrical", "universal", "spherical")  # kinds of joints of a tree
-HALF = 0.5  # m, from each other: the two points of a hinge that closes a loop
+FREEDOMS = ("revolute", "prismatic", "cylindrical", "universal", "spherical")  # kinds of joints supported in the tree
+HALF = 0.5  # m: distance of the two points that represent a loop-closing hinge
 Z = (0.0, 0.0, 1.0)
 
 
 @dataclass(frozen=True)
 class Motion:
-    """Where the bodies are at some instants, and what it took."""
+    """Poses and velocities of the bodies at some times, and the cost of the run."""
 
     t: Array  # (n_t,); s; the first is 0
     # x, v, w: (n_t, n_bodies, 3); centres of mass (m), their velocities (m/s), angular velocities along the axes of
     # space (rad/s)
     x: Array
-    R: Array  # (n_t, n_bodies, 3, 3); their columns are the axes of the bodies
+    R: Array  # (n_t, n_bodies, 3, 3); the columns are the body axes
     v: Array
     w: Array
-    # (n_t, 3); force of the first joint that closes a loop on its `body`, along the axes of space, N; NaN: not told
+    # (n_t, 3); force of the first joint that closes a loop on its `body`, along the axes of space, N; NaN: not reported
     f: Array
-    # call_s, stepping_s: CPU time of the call on a model that has been built, and of its steps alone, s
+    # call_s, stepping_s: CPU time of the call on an existing model, and of its steps only, s
     call_s: float
     stepping_s: float
-    message: str = ""  # why it ended before its time; nothing if it did not
+    message: str = ""  # why the run ended early; empty if it did not
 
 
 @dataclass(frozen=True)
@@ -52,17 +52,17 @@ class Prepared:
     # masses, moments: (n_bodies,); as the engine has them: kg, and the largest principal moment of inertia, kg m^2
     masses: Array
     moments: Array
-    run: Callable[[float, int, int], Motion]  # run(t_end, n_steps, n_stored) -> Motion, which begins anew
+    run: Callable[[float, int, int], Motion]  # run(t_end, n_steps, n_stored) -> Motion, from the start
 
 
-Seen = tuple[float, Array, Array, Array, Array, Array]  # t, x, R, v, w, f of `Motion` at one instant
+State = tuple[float, Array, Array, Array, Array, Array]  # t, x, R, v, w, f of `Motion` at one instant
 UNTOLD = np.full(3, np.nan)
 
 
-def march(began: float, n_steps: int, n_stored: int, see: Callable[[], Seen], step: Callable[[int], str]) -> Motion:
-    """The motion of an engine that has been set up since `began`: step(n) takes n steps, and says why if it cannot.
+def march(began: float, n_steps: int, n_stored: int, see: Callable[[], State], step: Callable[[int], str]) -> Motion:
+    """Return the motion of an engine set up since `began`; step(n) takes n steps and returns an error message or "".
 
-    States are stored at n_stored instants about evenly spaced beside the start, after whole steps.
+    States are stored at the start and after whole steps at n_stored roughly equidistant times.
     """
     stored, spent, message = [see()], 0.0, ""
     ends = np.unique(np.round(np.linspace(0, n_steps, n_stored + 1)).astype(int))
@@ -83,11 +83,11 @@ def march(began: float, n_steps: int, n_stored: int, see: Callable[[], Seen], st
 
 @dataclass(frozen=True)
 class Rigid:
-    """A mechanism in space, and how it starts."""
+    """A mechanism in space with its initial state."""
 
     given: ModelProblem
     model: SpatialModel
-    planar: bool  # whether it was made of a planar one
+    planar: bool  # made from a planar mechanism
     # x, R, v, w: of the bodies at the start, as in `Motion` at one instant
     x: Array
     R: Array
@@ -100,11 +100,11 @@ class Rigid:
 
     @property
     def cut(self) -> str:
-        """The name of the first joint that closes a loop; nothing of a tree."""
+        """Return the name of the first loop-closing joint; "" for a tree."""
         return self.loops[0].name if self.loops else ""
 
     def cut_points(self) -> list[tuple[Body, Array, Body, Array]]:
-        """Pairs of points that coincide where loops are cut: one pair of a ball, two on the axis of a hinge."""
+        """Return pairs of coincident points where loops are cut: one for a ball, two on the axis for a hinge."""
         pairs = []
         for joint in self.loops:
             if joint.kind not in ("spherical", "revolute"):
@@ -116,7 +116,7 @@ class Rigid:
         return pairs
 
     def rates(self, body: Body) -> Array:
-        """Start velocities of the joint above a body, in the order of `freedoms`; a ball's in the axes of the body."""
+        """Return initial velocities of the joint above a body, in the order of `freedoms`; of a ball in body axes."""
         parent, joint = self.parents[body.number]
         here = body.position + body.rotation @ point_of(body, joint)
         speed, spin = self._twist(body, here) - self._twist(parent, here)
@@ -136,28 +136,28 @@ class Rigid:
 
 
 def largest_moment(inertia: Array) -> float:
-    """The largest principal moment of a body's numbers: mass, xx, yy, zz, xy, xz, yz."""
+    """Return the largest principal moment for the numbers of a body: mass, xx, yy, zz, xy, xz, yz."""
     return float(np.linalg.eigvalsh(tensor(inertia))[-1])
 
 
 def tensor(inertia: Array) -> Array:
-    """The tensor (3, 3) of such numbers."""
+    """Return the inertia tensor (3, 3) for these numbers."""
     _, xx, yy, zz, xy, xz, yz = inertia
     return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
 
 
 def point_of(body: Body, joint: ModelJoint) -> Array:
-    """The point of a joint in the axes of one of its bodies."""
+    """Return the point of a joint in the axes of one of its bodies."""
     return np.array((joint.point_a if body is joint.a else joint.point_b).values)
 
 
 def axis_of(body: Body, joint: ModelJoint) -> Array:
-    """The axis of a joint in the axes of one of its bodies; z of a ball's, which has none."""
+    """Return the axis of a joint in the axes of one of its bodies; z for a ball, which has none."""
     return joint.axes[0 if body is joint.a else 1] if joint.axes else body.rotation.T @ np.array(Z)
 
 
 def freedoms(body: Body, joint: ModelJoint) -> list[tuple[str, Array]]:
-    """What the joint above a body allows, in the order of MuJoCo's file: kind and axis in the axes of the body."""
+    """Return the freedoms of the joint above a body, in the order of MuJoCo's file: kind and axis in body axes."""
     if joint.kind not in FREEDOMS:
         raise ValueError(f"a joint of a tree must be {', '.join(FREEDOMS)}; {joint.name!r} is {joint.kind}")
     if joint.kind == "spherical":
@@ -173,7 +173,7 @@ def freedoms(body: Body, joint: ModelJoint) -> list[tuple[str, Array]]:
 
 
 def springs(model: Any) -> list[tuple[Body, Array, Body, Array, tuple[float, ...]]]:
-    """Both ends of each spring in the axes of the bodies; stiffness, damping, length."""
+    """Return both ends of each spring in body axes, with stiffness, damping and length."""
     return [
         (f.first, np.array(f.on_first.values), f.second, np.array(f.on_second.values), f.more.values)
         for f in model.forces
@@ -182,22 +182,22 @@ def springs(model: Any) -> list[tuple[Body, Array, Body, Array, tuple[float, ...
 
 
 def hinge_springs(model: Any) -> dict[str, tuple[float, float, float]]:
-    """By name of a hinge stiffness and damping of the spring in it, and the angle from the start at which it rests."""
+    """Return by name of a hinge its spring: stiffness, damping, and the unstressed angle from the start."""
     found = {}
     for each in model.forces:
         if each.kind == TORSION:
             stiffness, damping, angle = each.more.values
-            if model.dimension == 2:  # whose springs rest at an angle between the axes of the bodies
+            if model.dimension == 2:  # the unstressed angle is between the body axes
                 angle -= each.second.rotation - each.first.rotation
             found[each.joint.name] = stiffness, damping, angle
     return found
 
 
 def rigid_of(problem: ModelProblem) -> Rigid:
-    """What engines are given of a model in a plane or in space.
+    """Return the data for the engines of a planar or spatial model.
 
-    Raises ValueError if it holds a drive, a force that is neither a spring nor a constant torque, or a spring in a
-    joint that closes a loop.
+    Raises ValueError if it contains a drive, a force other than a spring or a constant torque, or a spring in a
+    loop-closing joint.
     """
     given: Any = problem.model
     wrong = [each.name for each in given.joints if each.kind == "drive"]
@@ -205,7 +205,7 @@ def rigid_of(problem: ModelProblem) -> Rigid:
     cuts = {joint.name for joint in spanning_tree(given)[1]}
     wrong += [name for name in hinge_springs(given) if name in cuts]
     if wrong:
-        raise ValueError(f"engines are given bodies, joints, springs and constant torques alone; not {wrong[0]!r}")
+        raise ValueError(f"engines support bodies, joints, springs and constant torques only; not {wrong[0]!r}")
     planar = given.dimension == 2
     x, R, v, w = (each[0] for each in states(planar, problem.q0[:, None], problem.v0[:, None]))
     model = _in_space(given, x, R, v, w) if planar else given
@@ -219,7 +219,7 @@ def rigid_of(problem: ModelProblem) -> Rigid:
 
 
 def _in_space(given: Any, x: Array, R: Array, v: Array, w: Array) -> SpatialModel:
-    """A planar model in the plane z = 0, its loops cut at balls."""
+    """Return a planar model placed in the plane z = 0, with loops cut at ball joints."""
     model = SpatialModel((*given.gravity, 0.0), name=given.name)
     for k, body in enumerate(given.bodies):
         mass, J = body.inertia
@@ -245,7 +245,7 @@ def _in_space(given: Any, x: Array, R: Array, v: Array, w: Array) -> SpatialMode
 
 
 def states(planar: bool, q: Array, v: Array) -> tuple[Array, Array, Array, Array]:
-    """x, R, v, w of `Motion` from the coordinates (n_q, n_t) of a model in a plane or in space."""
+    """Return x, R, v, w of `Motion` for coordinates (n_q, n_t) of a planar or spatial model."""
     n_t = q.shape[1]
     shaped, rates = (each.T.reshape(n_t, -1, 3 if planar else 7) for each in (q, v))
     n = shaped.shape[1]

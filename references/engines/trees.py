@@ -1,4 +1,4 @@
-"""Trees of planar bodies with pins in MuJoCo and Pinocchio, for what an evaluation of their dynamics takes."""
+"""Trees of planar bodies with pins in MuJoCo and Pinocchio, to measure the cost of an evaluation of the dynamics."""
 
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
@@ -14,16 +14,16 @@ Z = (0.0, 0.0, 1.0)
 
 
 class TreeDynamics(NamedTuple):
-    """A tree at a state: `evaluate` makes its accelerations, `angular` tells those of the bodies in space (n,)."""
+    """A tree at a state: `evaluate` computes its accelerations, `angular` returns those of the bodies in space (n,)."""
 
     evaluate: Callable[[], Any]
     angular: Callable[[], Array]
 
 
 def _outwards(bodies: PlanarBodies) -> Iterator[tuple[int, Array, int, Array]]:
-    """Each body, its centre from its pin, on which body it hangs, and where from the pin of that one.
+    """Yield each body, its centre relative to its pin, its parent, and the pin relative to the parent's pin.
 
-    In the axes of the bodies; a branch at a time, as Pinocchio needs it.
+    In body axes, in depth-first order, as required by Pinocchio.
     """
     hanging: dict[int, list[tuple[int, Array, Array]]] = {}
     for i, (x, y), j, (u, w) in bodies.pins:
@@ -37,12 +37,12 @@ def _outwards(bodies: PlanarBodies) -> Iterator[tuple[int, Array, int, Array]]:
 
 
 def _moments(J: float) -> list[float]:
-    """Of a body in space that turns about z alone."""
+    """Return the inertia of a body in space that only rotates about z."""
     return [0.6 * J, 0.6 * J, J]
 
 
 def _in_space(parents: list[tuple[int, int]], relative: Array) -> Array:
-    """Sums of what belongs to the joints, by body, from the ground outwards."""
+    """Return sums of joint quantities from the ground to each body."""
     made = np.zeros(len(relative))
     for body, on in parents:
         made[body] = relative[body] + (0.0 if on == GROUND else made[on])
@@ -80,7 +80,7 @@ def mujoco_tree(bodies: PlanarBodies, angles: Array, rates: Array) -> TreeDynami
 class _Pinocchio(NamedTuple):
     pin: Any
     model: Any
-    first: list[int]  # of each body: the place of its joint among the coordinates
+    first: list[int]  # index of the joint coordinate of each body
     parents: list[tuple[int, int]]
 
 
@@ -99,7 +99,7 @@ def _in_pinocchio(bodies: PlanarBodies) -> _Pinocchio:
 
 
 def pinocchio_tree(bodies: PlanarBodies, angles: Array, rates: Array) -> TreeDynamics:
-    """The same in Pinocchio, with its joint about z; an evaluation is `aba`.
+    """Return the same in Pinocchio, with joints about z; an evaluation is `aba`.
 
     Raises RuntimeError if Pinocchio is not installed.
     """
@@ -111,7 +111,7 @@ def pinocchio_tree(bodies: PlanarBodies, angles: Array, rates: Array) -> TreeDyn
 
 
 def end_by_pinocchio(bodies: PlanarBodies, angles: Array, t_end: float, tolerance: float) -> Array:
-    """Coordinates (3 n,) of a tree some time after its release, by SciPy's DOP853 on the accelerations of Pinocchio.
+    """Return coordinates (3 n,) of a tree some time after its release, by SciPy's DOP853 with Pinocchio's `aba`.
 
     Raises RuntimeError if Pinocchio is not installed.
     """

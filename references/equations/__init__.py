@@ -1,1 +1,1 @@
-"""The equations of a mechanism in the forms that other solvers take."""
+"""Equations of a mechanism in the forms required by other solvers."""

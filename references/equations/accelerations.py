@@ -1,9 +1,9 @@
 """Accelerations and multipliers of any ConstrainedSystem, compiled from its callbacks, for solvers in Python.
 
-Eq. (6), M a + C_q^T lam = Q and C_q a = Q_d, is solved by the Schur complement S = C_q M^-1 C_q^T where M is positive
-definite, and else, as with Euler parameters, as it stands, by elimination with row exchanges. What is compiled are
-closures over the callbacks, one for each set of them: solvers call from Python, where each first-class function that
-is an argument, as in twoloop's kernels, costs tens of microseconds a call.
+Eq. (6), M a + C_q^T lam = Q and C_q a = Q_d, is solved by the Schur complement S = C_q M^-1 C_q^T if M is positive
+definite, and otherwise, as with Euler parameters, as a whole by Gaussian elimination with row exchanges. The compiled
+functions are closures over the callbacks: solvers call from Python, where passing first-class functions as arguments,
+as in twoloop's kernels, costs tens of microseconds per call.
 """
 
 from collections.abc import Callable
@@ -21,11 +21,11 @@ from twoloop.problem.system import ConstrainedSystem
 
 GAMMA_DIFFERENCE = 1e-3  # displacement over which C_q v + C_t is differenced, divided by max(1, |v|)
 
-CONSTANT, DIAGONAL, SADDLE = 1, 2, 4  # bits of what is known of the mass matrix; the last: it is not definite
+CONSTANT, DIAGONAL, SADDLE = 1, 2, 4  # flags of the mass matrix; SADDLE: not definite
 
 
 class Equations:
-    """The compiled eq. (6) of one system, with what it takes besides t, q and v."""
+    """The compiled eq. (6) of one system, with its workspaces and constants."""
 
     def __init__(self, system: ConstrainedSystem, t0: float, q0: Array):
         f = system.functions
@@ -46,7 +46,7 @@ class Equations:
                 )
 
     def at_points(self, t: Array, states: Array, alpha: float = 0.0) -> tuple[Array, Array]:
-        """Accelerations and multipliers at states (2 n_q, n_t), with Baumgarte's terms when alpha > 0.
+        """Return accelerations and multipliers at states (2 n_q, n_t), with Baumgarte's terms if alpha > 0.
 
         NaN where the matrix is singular.
         """
@@ -60,7 +60,7 @@ class Equations:
 
 
 def compiled_gamma(system: ConstrainedSystem) -> Callable[..., None]:
-    """(t, q, v, p, Qd) -> None: the callback where the system has one, else differences; Qd arrives full of zeros."""
+    """Return (t, q, v, p, Qd) -> None: the callback if there is one, otherwise differences; Qd is initially zero."""
     f = system.functions
     return f.gamma if f.flags[GAMMA_GIVEN] else _gamma_by_differences(f.jacobian, f.constraint_rate)
 
@@ -102,7 +102,7 @@ def _accelerations(
     constraint_rate: Dispatcher,
     gamma: Callable[..., None],
 ) -> Callable[..., Any]:
-    """(t, q, v, alpha, p, factors, known, a, lam) -> success: eqs. (6)-(8), with Baumgarte's terms when alpha > 0."""
+    """Return (t, q, v, alpha, p, factors, known, a, lam) -> success: eqs. (6)-(8), Baumgarte's terms if alpha > 0."""
     mass_at = matrix_of(mass)
 
     @kept
@@ -130,7 +130,7 @@ def _accelerations(
 
 @lru_cache(maxsize=64)
 def matrix_of(mass: Dispatcher) -> Callable[..., Any]:
-    """(t, q, p, factors, known) -> the factors of M and True, or, where it is not positive definite, M and False."""
+    """Return (t, q, p, factors, known) -> the factors of M and True, or M and False if it is not positive definite."""
 
     @kept
     def mass_at(t, q, p, factors, known):  # type: ignore[no-untyped-def]
@@ -150,13 +150,13 @@ def matrix_of(mass: Dispatcher) -> Callable[..., Any]:
 
 @njit(**OPTIONS)
 def saddle_solve(M, Cq, a, lam):  # type: ignore[no-untyped-def]
-    """Eq. (6) as it stands: a holds Q and becomes the accelerations, lam holds Q_d and becomes the multipliers.
+    """Solve eq. (6) as a whole; Q in a is overwritten by the accelerations, Q_d in lam by the multipliers.
 
     Returns False where the matrix is singular or has values that are not finite.
     """
     m, n = Cq.shape
     K, x, pivots = np.zeros((n + m, n + m)), np.empty(n + m), np.zeros(n + m, dtype=np.int64)
-    for i in range(n):  # by elements: the assignment of one slice to another doubles the time of compiling
+    for i in range(n):  # elementwise: slice assignment doubles the compile time
         x[i] = a[i]
         for j in range(n):
             K[i, j] = M[i, j]
@@ -176,7 +176,7 @@ def saddle_solve(M, Cq, a, lam):  # type: ignore[no-untyped-def]
 
 @njit(**OPTIONS)
 def times_inverse(L, known, x):  # type: ignore[no-untyped-def]
-    """x becomes M^-1 x."""
+    """Overwrite x with M^-1 x."""
     if known & DIAGONAL:
         for j in range(x.size):
             x[j] *= L[j, j] * L[j, j]
@@ -186,9 +186,9 @@ def times_inverse(L, known, x):  # type: ignore[no-untyped-def]
 
 @njit(**OPTIONS)
 def solve_for(L, definite, known, Cq, a, lam):  # type: ignore[no-untyped-def]
-    """Eq. (6), by eqs. (7) and (8): a holds Q and becomes the accelerations, lam holds Q_d and becomes the multipliers.
+    """Solve eq. (6) by eqs. (7) and (8); Q in a is overwritten by the accelerations, Q_d in lam by the multipliers.
 
-    `L`: the factors of M, or M itself where it is not definite. Returns False where the matrix is singular.
+    `L`: the factors of M, or M itself if it is not definite. Return False if the matrix is singular.
     """
     if not definite:
         return saddle_solve(L, Cq, a, lam)

@@ -1,8 +1,8 @@
-"""The accelerations of a compiled mechanism as expressions of another package, for solvers that take nothing else.
+"""The accelerations of a compiled mechanism as expressions of another package.
 
-`twoloop.generate` traces the callbacks into a graph of operations, and differentiates it. Here eq. (6),
-M a + C_q^T lam = Q and C_q a = Q_d, is eliminated on that graph, without what is zero by its structure, in an order of
-little fill; then the graph is written as expressions of a package, an operation at a time.
+`twoloop.generate` traces the callbacks into a graph of operations and differentiates it. Here eq. (6),
+M a + C_q^T lam = Q and C_q a = Q_d, is factorised on that graph, exploiting structural zeros, in an elimination order
+with little fill-in; then the graph is translated to expressions of a package, operation by operation.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -21,7 +21,7 @@ from twoloop.kernels.evaluation import operations
 from twoloop.problem.problem import Array
 from twoloop.problem.system import ConstrainedSystem, check_system
 
-Functions = Mapping[str, Callable[[Any], Any]]  # those of FUNCTIONS that the package has, by name
+Functions = Mapping[str, Callable[[Any], Any]]  # elementary functions of the package, by name
 Factors = list[tuple[int, Form, list[tuple[int, Form]]]]
 
 FUNCTIONS = {operations.SINE: "sin", operations.COSINE: "cos", operations.SQUARE_ROOT: "sqrt"}
@@ -29,21 +29,21 @@ FUNCTIONS |= {operations.EXPONENTIAL: "exp", operations.LOGARITHM: "log", operat
 
 
 class NotSymbolic(ValueError):
-    """Raised for a system whose equations cannot be had as expressions; the text says why."""
+    """Raised if the equations of a system cannot be expressed symbolically; the message contains the reason."""
 
 
 class Expressions:
-    """The equations of one system, as functions of symbols.
+    """The equations of one system as functions of symbols.
 
     Parameters
     ----------
     system : ConstrainedSystem
-        Of compiled callbacks that do not branch on q or v.
+        A system with compiled callbacks that do not branch on q or v.
     t0 : float
     q0, v0 : ndarray (n_q,)
-        A consistent state, at which redundant rows are looked for.
+        A consistent state, at which redundant rows are determined.
     of_parameters : bool
-        Whether the parameters are symbols, too, and not the numbers of the system.
+        True: the parameters are symbols; False: the numbers of the system.
 
     Raises NotSymbolic if the callbacks are Python functions, Q_d is not given, they branch on t, q or v or give near
     the start what their operations do not give, or the mass stays singular with rows of C_q added.
@@ -70,16 +70,16 @@ class Expressions:
             raise NotSymbolic(str(error)) from error
 
     def _forms(self, traced: Equations) -> tuple[Any, ...]:
-        """M, C_q, Q and Q_d as arrays of forms; of the rows that are kept."""
+        """Return M, C_q, Q and Q_d of the rows that are kept, as arrays of forms."""
         mass, jacobian, force, gamma = (traced.of(kind) for kind in ("mass", "jacobian", "force", "gamma"))
         return mass, jacobian[self.rows], force, gamma[self.rows]
 
     @cached_property
     def factors(self) -> Factors:
-        """Those of the matrix of eq. (6)."""
+        """Factors of the matrix of eq. (6)."""
         matrix, n = {(i, j): self.mass[i, j] for i, j in _nonzero(self.mass)}, self.system.n_q
-        for k in self.added:  # M + C_q^T C_q has the same accelerations
-            places = [i for i, entry in enumerate(self.jacobian[k]) if _is_there(entry)]
+        for k in self.added:  # M + C_q^T C_q gives the same accelerations
+            places = [i for i, entry in enumerate(self.jacobian[k]) if _is_nonzero(entry)]
             for i in places:
                 for j in places:
                     term = self.jacobian[k, i] * self.jacobian[k, j]
@@ -89,7 +89,7 @@ class Expressions:
         return _factored(matrix, _order(matrix, n, n + len(self.rows)))
 
     def _solved(self, force: Any, gamma: Any) -> list[Form]:
-        """Accelerations and multipliers of eq. (6) for a right-hand side."""
+        """Return accelerations and multipliers of eq. (6) for a right-hand side."""
         right = [*force]
         for k in self.added:
             for i, entry in enumerate(self.jacobian[k]):
@@ -98,13 +98,13 @@ class Expressions:
 
     @cached_property
     def solution(self) -> list[Form]:
-        """Accelerations and multipliers of eq. (6)."""
+        """Return accelerations and multipliers of eq. (6)."""
         return self._solved(self.force, self.gamma)
 
     def derivatives(self) -> Iterator[list[Form]]:
-        """The derivatives of the accelerations by each of [q, v], as 2 n_q lists (n_q,) of forms.
+        """Yield the derivatives of the accelerations with respect to each of [q, v], as 2 n_q lists (n_q,) of forms.
 
-        The matrix of eq. (6) is factorised once: its derivatives times the solution go to the right-hand side.
+        The matrix of eq. (6) is factorised once; its derivatives times the solution go to the right-hand side.
         """
         n, graph = self.system.n_q, self.traced.graph
         for unknown in (*self.traced.q, *self.traced.v):
@@ -123,21 +123,21 @@ class Expressions:
     def accelerations(
         self, functions: Functions, t: Any, q: Sequence[Any], v: Sequence[Any], parameters: Sequence[Any] = ()
     ) -> list[Any]:
-        """The accelerations (n_q,) of eq. (6) as expressions; `parameters`: symbols, if it is of these."""
-        written = Written(self.traced.graph, functions, [t, *q, *v, *parameters])
+        """Return the accelerations (n_q,) of eq. (6) as expressions; `parameters`: symbols, if they are symbolic."""
+        written = Printed(self.traced.graph, functions, [t, *q, *v, *parameters])
         return written.each(self.solution[: self.system.n_q])
 
 
 @lru_cache(maxsize=64)
 def expressions_at(system: ConstrainedSystem, t0: float, q0: bytes, v0: bytes) -> Expressions:
-    """The equations about a start, of which the arrays' bytes are given, made once."""
+    """Return the equations for a start, given as the bytes of its arrays; cached."""
     return Expressions(system, t0, np.frombuffer(q0).copy(), np.frombuffer(v0).copy())
 
 
-class Written:
-    """The quantities of a graph as expressions of a package, each written once.
+class Printed:
+    """Translates the quantities of a graph to expressions of a package, each once.
 
-    `inputs` are the expressions of the graph's first quantities.
+    `inputs` are the expressions of the inputs of the graph.
     """
 
     def __init__(self, graph: Graph, functions: Functions, inputs: Sequence[Any]):
@@ -146,7 +146,7 @@ class Written:
         self.forms: dict[Any, Any] = {}
 
     def each(self, forms: Iterable[Form]) -> list[Any]:
-        """The expressions of forms; a number is a float."""
+        """Return the expressions of forms; a constant is a float."""
         forms = list(forms)
         for i in self.graph.needed_by(forms):
             if i not in self.known:
@@ -165,11 +165,11 @@ class Written:
             return 1.0 / x
         try:
             return self.functions[FUNCTIONS[kind]](x)
-        except Exception as error:  # each package has its own for what it cannot do
+        except Exception as error:  # packages raise different exceptions for unsupported functions
             raise NotSymbolic(f"{FUNCTIONS[kind]} cannot be had as an expression: {error!r}") from error
 
     def _sum(self, form: Form) -> Any:
-        """c + sum_i c_i x_i, the negative terms last."""
+        """Return c + sum_i c_i x_i, with negative terms last."""
         if form.key not in self.forms:
             total: Any = float(form.constant)
             for i, c in sorted(form.terms.items(), key=lambda term: term[1] < 0.0):
@@ -183,21 +183,21 @@ class Written:
 
 
 def functions_of(package: Any) -> dict[str, Callable[[Any], Any]]:
-    """Those of FUNCTIONS that a package has under these names."""
+    """Return the functions of FUNCTIONS provided by a package under these names."""
     return {name: getattr(package, name) for name in FUNCTIONS.values() if hasattr(package, name)}
 
 
-def _is_there(form: Form) -> bool:
+def _is_nonzero(form: Form) -> bool:
     return bool(form.terms) or form.constant != 0.0
 
 
 def _nonzero(forms: Any) -> list[tuple[int, ...]]:
-    """Places of what is not zero by its structure."""
-    return [place for place in np.ndindex(forms.shape) if _is_there(forms[place])]
+    """Return the indices of structural nonzeros."""
+    return [place for place in np.ndindex(forms.shape) if _is_nonzero(forms[place])]
 
 
 def _rows_for_mass(mass: Array, jacobian: Array) -> list[int]:
-    """Rows k for which M + sum C_k^T C_k is positive definite; none where M is."""
+    """Return rows k for which M + sum C_k^T C_k is positive definite; none if M is."""
     chosen: list[int] = []
     rank = np.linalg.matrix_rank(mass)
     order = np.argsort([np.count_nonzero(row) for row in jacobian], kind="stable")
@@ -214,9 +214,9 @@ def _rows_for_mass(mass: Array, jacobian: Array) -> list[int]:
 
 
 def _order(matrix: Iterable[tuple[int, int]], n: int, size: int) -> list[int]:
-    """An order of elimination: least degree first, a row of C_q only after all its coordinates.
+    """Return an elimination order by minimum degree, with each row of C_q after all its coordinates.
 
-    The pivots are then those of definite matrices: M, and -C_q M^-1 C_q^T.
+    The pivots are then those of the definite matrices M and -C_q M^-1 C_q^T.
     """
     neighbours: list[set[int]] = [set() for _ in range(size)]
     for i, j in matrix:
@@ -237,7 +237,7 @@ def _order(matrix: Iterable[tuple[int, int]], n: int, size: int) -> list[int]:
 
 
 def _factored(matrix: dict[tuple[int, int], Form], order: list[int]) -> Factors:
-    """Factors LDL^T, in this order, of a symmetric matrix; entries that are not in `matrix` are zero."""
+    """Return the LDL^T factors, in this order, of a symmetric matrix; entries not in `matrix` are zero."""
     rows: list[dict[int, Form]] = [{} for _ in order]
     for (i, j), entry in matrix.items():
         rows[i][j] = entry
@@ -255,7 +255,7 @@ def _factored(matrix: dict[tuple[int, int], Form], order: list[int]) -> Factors:
 
 
 def _substituted(factors: Factors, right: list[Form]) -> list[Form]:
-    """The solution of the factorised system."""
+    """Return the solution of the factorised system."""
     solution = list(right)
     for i, _, column in factors:
         solution[i] = solution[i].value()

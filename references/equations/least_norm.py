@@ -1,4 +1,4 @@
-"""Accelerations and multipliers at states that a solver stored, of least norm where they are not unique."""
+"""Accelerations and multipliers at stored states, with minimum norm of non-unique multipliers."""
 
 import numpy as np
 
@@ -7,11 +7,11 @@ from references.equations.rows import independent_rows
 from twoloop.problem.problem import Array
 from twoloop.problem.system import ConstrainedSystem
 
-SAMPLES = 5  # states at which the rank is looked for: at a singular position more rows depend on others
+SAMPLES = 5  # states at which the rank is determined, because it may be lower at singular positions
 
 
 def accelerations(system: ConstrainedSystem, t: Array, states: Array) -> tuple[Array, Array]:
-    """Accelerations and multipliers of eq. (6) at states (2 n_q, n_t); NaN where a state is not finite."""
+    """Return accelerations and multipliers of eq. (6) at states (2 n_q, n_t); NaN if a state is not finite."""
     n, m, f, gamma = system.n_q, system.n_c, system.functions, compiled_gamma(system)
     rows, finite = np.ascontiguousarray(states.T), np.isfinite(states).all(axis=0)
     matrices, right = np.zeros((t.size, n + m, n + m)), np.zeros((t.size, n + m))
@@ -32,7 +32,7 @@ def accelerations(system: ConstrainedSystem, t: Array, states: Array) -> tuple[A
 
 
 def _solved(matrices: Array, right: Array, n: int) -> Array:
-    """Solutions (n_t, n + n_c) of linear equations with the matrices [M C_q^T; C_q 0], of least norm."""
+    """Return minimum-norm solutions (n_t, n + n_c) of equations with the matrices [M C_q^T; C_q 0]."""
     Cq = matrices[:, n:, :n]
     some = np.unique(np.linspace(0, len(Cq) - 1, SAMPLES).astype(int))
     chosen = np.array(max((independent_rows(each) for each in Cq[some]), key=len), dtype=int)
@@ -42,7 +42,7 @@ def _solved(matrices: Array, right: Array, n: int) -> Array:
     except np.linalg.LinAlgError:
         return np.asarray(np.linalg.pinv(matrices, hermitian=True) @ right[:, :, None])[:, :, 0]
     lam = solution[:, n:]
-    if chosen.size < Cq.shape[1]:  # C_q = T C_r: of all with T^T lam = lam_r the one of least norm
+    if chosen.size < Cq.shape[1]:  # C_q = T C_r: minimum-norm lam with T^T lam = lam_r
         Cr = Cq[:, chosen]
         T = np.linalg.solve(Cr @ Cr.mT, Cr @ Cq.mT).mT
         lam = T @ np.linalg.solve(T.mT @ T, lam)

@@ -1,4 +1,4 @@
-"""Compiled linear algebra of the references: their own, so that nothing of twoloop's is in what it is compared with."""
+"""Compiled linear algebra of the references, independent of twoloop's."""
 
 from collections.abc import Callable
 from typing import Any
@@ -8,27 +8,27 @@ from numba import njit
 
 from twoloop.kernels.compile.caches import compile_kept, kept_when_called, watch
 
-SINGULAR = 1e-13  # a pivot smaller than this, against what stood there, or in its row, is zero
+SINGULAR = 1e-13  # relative to the original entry, or to its row: smaller pivots count as zero
 
 OPTIONS: dict[str, Any] = {"error_model": "numpy", "fastmath": {"contract", "reassoc", "nsz", "arcp"}}
 
 
 def compiled_now(signature: Any) -> Callable[[Callable[..., Any]], Any]:
-    """Compile for any mechanism, and keep the machine code on disk until it or something that it calls changes."""
+    """Compile for any mechanism, and cache the machine code on disk until it or something that it calls changes."""
     return lambda function: compile_kept(function, signature, watch(function), error_model="numpy")
 
 
-# a function of the callbacks that it encloses: compiled when it is called, for the types that it is called with, and
-# read from the disk in later processes where callbacks and code are the same
+# a closure over callbacks: compiled when it is called, for its argument types, and read from the disk in later
+# processes if callbacks and code are the same
 kept = kept_when_called(**OPTIONS)
 
 
 @njit(**OPTIONS)
 def cholesky(A, lost=0.0):  # type: ignore[no-untyped-def]
-    """Cholesky's factor of A in its lower half, with the reciprocals of the pivots; whether A is definite.
+    """Overwrite the lower half of A with its Cholesky factor, with reciprocal pivots; return whether A is definite.
 
-    A pivot that is no more than `lost` times what stood there is zero, and so is its column: `cholesky_solve` leaves
-    that unknown out.
+    A pivot of at most `lost` times its original value is set to zero with its column, so that `cholesky_solve` omits
+    that unknown.
     """
     n, definite = A.shape[0], True
     for k in range(n):
@@ -36,7 +36,7 @@ def cholesky(A, lost=0.0):  # type: ignore[no-untyped-def]
         for j in range(k):
             A[k, k] -= A[k, j] * A[k, j]
         definite = definite and A[k, k] > lost * abs(before)
-        if A[k, k] <= lost * abs(before):  # not so of NaN, which stays
+        if A[k, k] <= lost * abs(before):  # False for NaN, which is kept
             for i in range(k, n):
                 A[i, k] = 0.0
             continue
@@ -50,7 +50,7 @@ def cholesky(A, lost=0.0):  # type: ignore[no-untyped-def]
 
 @njit(**OPTIONS)
 def cholesky_solve(L, x):  # type: ignore[no-untyped-def]
-    """x becomes A^-1 x, of the A of these factors."""
+    """Overwrite x with A^-1 x, for the factors of A."""
     n = x.size
     for i in range(n):
         for j in range(i):
@@ -64,9 +64,9 @@ def cholesky_solve(L, x):  # type: ignore[no-untyped-def]
 
 @njit(**OPTIONS)
 def lu_factor(A, pivots):  # type: ignore[no-untyped-def]
-    """A becomes its factors, with scaled row exchanges, row k with row pivots[k].
+    """Overwrite A with its LU factors, with scaled row exchanges of row k and row pivots[k].
 
-    Returns False where A is singular or has values that are not finite.
+    Return False if A is singular or has values that are not finite.
     """
     n, scale = A.shape[0], np.zeros(A.shape[0])
     for i in range(n):
@@ -95,7 +95,7 @@ def lu_factor(A, pivots):  # type: ignore[no-untyped-def]
 
 @njit(**OPTIONS)
 def lu_solve(A, pivots, x):  # type: ignore[no-untyped-def]
-    """x becomes A^-1 x, of the A of these factors."""
+    """Overwrite x with A^-1 x, for the factors of A."""
     n = x.size
     for k in range(n):
         x[k], x[pivots[k]] = x[pivots[k]], x[k]

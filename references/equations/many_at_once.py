@@ -1,4 +1,4 @@
-"""Many motions of one mechanism, of different parameters and starts, in one call: diffrax by vmap, heyoka in batches.
+"""Many motions of one mechanism with different parameters and starts: diffrax by vmap, heyoka in batches.
 
 Each is built once and takes parameters as arguments; both packages are optional: `make peers`, or the extra `peers`.
 """
@@ -14,14 +14,14 @@ from references.equations.expressions import Expressions
 from references.heyoka.taylor import rates_of
 from twoloop.problem.problem import Array, Problem
 
-Solve = Callable[[float], Array]  # tolerance -> q at the end (n_runs, n_q), NaN of what failed
+Solve = Callable[[float], Array]  # tolerance -> final q (n_runs, n_q), NaN for failed runs
 
 MOST_STEPS = 100_000  # of diffrax
 CALLBACKS = ("mass", "force", "constraint", "jacobian", "constraint_rate", "gamma")
 
 
 def by_diffrax(problems: Sequence[Problem], t_end: float) -> Solve:
-    """Dopri8 of diffrax over all runs by `vmap`, compiled once at the first call."""
+    """Return diffrax's Dopri8 over all runs by `vmap`, compiled at the first call."""
     jax, diffrax = packages()
     equations, states, parameters = _gathered(problems)
     derivative, n = derivative_of(equations), equations.system.n_q
@@ -35,7 +35,7 @@ def by_diffrax(problems: Sequence[Problem], t_end: float) -> Solve:
 
 
 def by_heyoka(problems: Sequence[Problem], t_end: float) -> Solve:
-    """heyoka's Taylor integrator in batches as wide as the processor's vectors, built once a tolerance."""
+    """Return heyoka's Taylor integrator in batches as wide as the vector registers, built once per tolerance."""
     package = imported("heyoka")
     equations, states, parameters = _gathered(problems)
     n, width, made = equations.system.n_q, package.recommended_simd_size(), {}
@@ -50,7 +50,7 @@ def by_heyoka(problems: Sequence[Problem], t_end: float) -> Solve:
         for group in groups:
             integrator.set_time(0.0)
             integrator.state[:] = states[group].T
-            integrator.pars[:] = parameters[group, : len(integrator.pars)].T  # those up to the last that is used
+            integrator.pars[:] = parameters[group, : len(integrator.pars)].T  # only those that are used
             integrator.propagate_until(t_end)
             good = [result[0] == package.taylor_outcome.time_limit for result in integrator.propagate_res]
             ends[group[good]] = integrator.state[:n, good].T
@@ -60,9 +60,9 @@ def by_heyoka(problems: Sequence[Problem], t_end: float) -> Solve:
 
 
 def _gathered(problems: Sequence[Problem]) -> tuple[Expressions, Array, Array]:
-    """The equations, states (n_runs, 2 n_q) and parameters (n_runs, n_p) of problems that differ in numbers only.
+    """Return equations, states (n_runs, 2 n_q) and parameters (n_runs, n_p) of problems differing in numbers only.
 
-    Raises ValueError if a problem has other callbacks than the first, naming it.
+    Raises ValueError, naming the problem, if its callbacks differ from those of the first.
     """
     first = problems[0]
     for problem in problems:
@@ -71,6 +71,6 @@ def _gathered(problems: Sequence[Problem]) -> tuple[Expressions, Array, Array]:
             raise ValueError(f"problems must have the callbacks of the first, {first.name!r}; given {problem.name!r}")
     states = np.array([np.concatenate([problem.q0, problem.v0]) for problem in problems])
     parameters = np.array([problem.system.functions.p for problem in problems])
-    vary = bool((parameters != parameters[0]).any())  # else they are numbers in the expressions
+    vary = bool((parameters != parameters[0]).any())  # otherwise constants in the expressions
     equations = Expressions(first.system, 0.0, first.q0, first.v0, of_parameters=vary)
     return equations, states, parameters if vary else parameters[:, :0]

@@ -1,9 +1,9 @@
-"""Rows of C_q and of A for other solvers: those of A v + b = 0 below those of C, and none that follow from others.
+"""Rows of C_q and A for other solvers: A v + b = 0 is appended below C, and dependent rows are removed.
 
-To eq. (6) rows A v + b = 0 are further rows of C_q a = Q_d. Rows that follow from others would make the matrices of
-most solvers singular: a user of such a solver leaves them out of the mechanism. So do the adapters of IDA, CVODE, SciPy
-and solve_dae; those of solvers that take expressions do it in `references.equations.expressions`. A row that depends on
-others at the start may become independent later, so every row left out is checked at the end of the run.
+In eq. (6), rows A v + b = 0 are further rows of C_q a = Q_d. Dependent rows would make the matrices of most solvers
+singular, so a user of such a solver removes them from the mechanism. So do the adapters of IDA, CVODE, SciPy and
+solve_dae; those of solvers that take expressions do it in `references.equations.expressions`. A row that is dependent
+at the start may become independent later, so every removed row is checked at the end of the run.
 """
 
 from functools import lru_cache
@@ -15,9 +15,9 @@ from numba.core.dispatcher import Dispatcher
 from twoloop import ConstrainedSystem, callback
 from twoloop.problem.problem import Array
 
-RANK = 1e-9  # of a row, which follows from those before it where it differs from what they span by less
-HOLDS = 1e-6  # of the largest coordinate, 1 at least: how far a position may be from a row that was left out ...
-BEYOND = 1e3  # ... in addition to this many times its distance from the rows that were kept
+RANK = 1e-9  # relative: a row closer than this to the span of the previous rows counts as dependent
+HOLDS = 1e-6  # relative to max(1, |q|): allowed violation of a removed row ...
+BEYOND = 1e3  # ... plus this multiple of the violation of the rows kept
 ROWS = ("constraint", "jacobian", "constraint_rate", "gamma")
 NOT_WITH_MORE_ROWS = (
     *("kinematics", "reaction_by_q", "force_by_q", "force_by_v"),
@@ -27,10 +27,10 @@ NOT_WITH_MORE_ROWS = (
 
 @lru_cache(maxsize=64)
 def with_all_rows(system: ConstrainedSystem) -> ConstrainedSystem:
-    """The system for solvers that take its accelerations: A, b and Q_a stand below C_q, C_t and Q_d.
+    """Return the system with A, b and Q_a appended to C_q, C_t and Q_d, for solvers of the acceleration equations.
 
-    C of these rows is zero: what projects positions leaves them alone, what projects velocities takes them. A system
-    without such rows is returned as it is. Raises ValueError if Q_a, or Q_d of other rows, is not given.
+    C of these rows is zero, so projections of positions ignore them, and projections of velocities include them. A
+    system without such rows is returned unchanged. Raises ValueError if Q_a, or Q_d of other rows, is not given.
     """
     if system.n_a == 0:
         return system
@@ -44,14 +44,14 @@ def with_all_rows(system: ConstrainedSystem) -> ConstrainedSystem:
 
 
 class IndependentRows:
-    """The rows of C_q that do not follow from others at the start, for a solver that is to have no others.
+    """The rows of C_q that are independent at the start, for a solver that does not support others.
 
     Attributes
     ----------
     system : ConstrainedSystem
-        With these rows only; the one given, where they are all.
+        The system with these rows only; the one given if all are independent.
 
-    Raises ValueError if the start violates a row left out.
+    Raises ValueError if the start violates a removed row.
     """
 
     def __init__(self, system: ConstrainedSystem, t0: float, q0: Array):
@@ -66,8 +66,8 @@ class IndependentRows:
                 )
 
     def failure(self, t: float, q: Array) -> str:
-        """What is wrong with the end of a run, at which rows that were left out do not hold; "" where they do."""
-        broken = self._broken(t, np.ascontiguousarray(q)) if np.isfinite(q).all() else []  # the solver says so
+        """Return an error message if a removed row is violated at the end of a run, or ""."""
+        broken = self._broken(t, np.ascontiguousarray(q)) if np.isfinite(q).all() else []  # reported by the solver
         if not broken:
             return ""
         return (
@@ -76,14 +76,14 @@ class IndependentRows:
         )
 
     def _broken(self, t: float, q: Array) -> list[int]:
-        """Rows that were left out and do not hold at (t, q)."""
+        """Return the removed rows that are violated at (t, q)."""
         lengths = np.linalg.norm(self.all.jacobian(t, q), axis=1)
         distances = np.abs(self.all.constraint(t, q)) / np.where(lengths > 0.0, lengths, 1.0)
         limit = HOLDS * max(1.0, float(np.abs(q).max())) + BEYOND * float(distances[list(self.kept)].max(initial=0.0))
         return [int(k) for k in np.flatnonzero(distances > limit) if k not in self.kept]
 
     def multipliers(self, t: Array, q: Array, lam: Array) -> Array:
-        """Those of all rows (n_c + n_a, n_t): with C_q = T C_r, of all with T^T lam = lam_r those of least norm."""
+        """Return the multipliers of all rows (n_c + n_a, n_t): minimum-norm lam with T^T lam = lam_r, C_q = T C_r."""
         forces, n_c = np.full((self.all.n_c, t.size), np.nan), len(self.kept)
         for k in np.flatnonzero(np.isfinite(q).all(axis=0)):
             at = float(t[k]), np.ascontiguousarray(q[:, k])
@@ -93,7 +93,7 @@ class IndependentRows:
 
 
 def independent_rows(jacobian: Array) -> tuple[int, ...]:
-    """Rows of C_q, the first ones, that do not follow from those before."""
+    """Return the rows of C_q that are independent of those before."""
     rows: list[int] = []
     basis = np.zeros((0, jacobian.shape[1]))
     for k, row in enumerate(jacobian):
@@ -107,7 +107,7 @@ def independent_rows(jacobian: Array) -> tuple[int, ...]:
 
 @lru_cache(maxsize=64)
 def _with_rows(system: ConstrainedSystem, kept: tuple[int, ...], n_a: int) -> ConstrainedSystem:
-    """The system with these rows, of C and below them of A, as rows of C; and, as they are, n_a rows of A."""
+    """Return the system with some rows of C, and of A below them, as rows of C; plus n_a unchanged rows of A."""
     f, more = system.functions, n_a < system.n_a
     left_out = NOT_WITH_MORE_ROWS if more else ("kinematics", "reaction_by_q")
     given = {kind: function for kind, function in system.given.items() if kind not in left_out}
@@ -122,7 +122,7 @@ def _with_rows(system: ConstrainedSystem, kept: tuple[int, ...], n_a: int) -> Co
 def _rows(
     kept: tuple[int, ...], m: int, n_a: int, of_c: tuple[Dispatcher, ...], of_a: tuple[Dispatcher, ...]
 ) -> dict[str, Dispatcher]:
-    """The callbacks of the rows that are kept, of m of C and below them n_a of A."""
+    """Return the callbacks of the rows kept, of m rows of C and n_a rows of A below them."""
     constraint, jacobian, constraint_rate, gamma = of_c
     nonholonomic, nonholonomic_rate, nonholonomic_gamma = of_a or of_c[1:]
 

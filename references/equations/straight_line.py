@@ -1,7 +1,7 @@
-"""Accelerations of one mechanism, and their Jacobian, as straight-line machine code, for solvers of compiled functions.
+"""Accelerations of one mechanism, and their Jacobian, as straight-line machine code, for compiled solvers.
 
-The equations come from `equations.expressions`: every loop unrolled, every zero left out, common terms computed once.
-That is the fastest right-hand side that a foreign solver driven from compiled code can be given here.
+The equations come from `equations.expressions`: loops are unrolled, structural zeros removed, common subexpressions
+computed once. This is the fastest right-hand side available here for a foreign solver driven from compiled code.
 """
 
 import math
@@ -11,33 +11,33 @@ from typing import Any
 
 from numba import njit
 
-from references.equations.expressions import FUNCTIONS, Expressions, Written, expressions_at, functions_of
+from references.equations.expressions import FUNCTIONS, Expressions, Printed, expressions_at, functions_of
 from references.equations.linear import OPTIONS
 from twoloop.problem.system import ConstrainedSystem
 
 COMMUTES = "+*"
-MOST_OPERATIONS = 3000  # of a Jacobian: numba takes two or three milliseconds for each
+MOST_OPERATIONS = 3000  # limit for a Jacobian: numba takes two or three milliseconds per operation
 
 
 class Program:
-    """Operations on two values and functions of one, each of which is written once, and their names."""
+    """A list of named binary operations and function calls without duplicates."""
 
     def __init__(self) -> None:
         self.names: dict[tuple[str, ...], str] = {}
 
     def value(self, *what: str) -> "Value":
-        """The value of (left, operator, right) or of (function, argument)."""
+        """Return the value of (left, operator, right) or of (function, argument)."""
         return Value(self, self.names.setdefault(what, f"x{len(self.names)}"))
 
     @property
     def lines(self) -> list[str]:
-        """Those of its code."""
+        """Return the lines of its code."""
         texts = (" ".join(what) if len(what) == 3 else "{}({})".format(*what) for what in self.names)
         return [f"{name} = {text}" for name, text in zip(self.names.values(), texts, strict=True)]
 
 
 class Value:
-    """A value of a program, by its name there."""
+    """A named value of a program."""
 
     def __init__(self, program: Program, name: str):
         self.program, self.name = program, name
@@ -69,22 +69,22 @@ class Value:
 
 
 def program_of(equations: Expressions) -> tuple[Program, list[str]]:
-    """The program of the accelerations, of the values t, q0, q1, ..., v0, v1, ..., and the names of its results."""
+    """Return the program of the accelerations in the values t, q0, q1, ..., v0, v1, ..., and its results' names."""
     program = Program()
-    made = _written(equations, program).each(equations.solution[: equations.system.n_q])
+    made = _printed(equations, program).each(equations.solution[: equations.system.n_q])
     return program, [_name(each) for each in made]
 
 
-def _written(equations: Expressions, program: Program) -> Written:
-    """What writes forms into a program, of the values t, q0, q1, ..., v0, v1, ..."""
+def _printed(equations: Expressions, program: Program) -> Printed:
+    """Return the translator of forms to a program in the values t, q0, q1, ..., v0, v1, ..."""
     names = ["t", *(f"{letter}{i}" for letter in "qv" for i in range(equations.system.n_q))]
     functions = {name: lambda x, name=name: program.value(name, x.name) for name in FUNCTIONS.values()}  # type: ignore[misc]
-    return Written(equations.traced.graph, functions, [Value(program, name) for name in names])
+    return Printed(equations.traced.graph, functions, [Value(program, name) for name in names])
 
 
 @lru_cache(maxsize=256)
 def straight_line(system: ConstrainedSystem, t0: float, q0: bytes, v0: bytes) -> Callable[..., Any]:
-    """(t, y, rate) -> None: y' of y = [q, v] into `rate`, compiled; q0, v0: the bytes of the start."""
+    """Return compiled (t, y, rate) -> None: y' of y = [q, v]; q0, v0: the bytes of the start."""
     n = system.n_q
     program, names = program_of(expressions_at(system, t0, q0, v0))
     results = [f"rate[{i}] = v{i}" for i in range(n)] + [f"rate[{n + i}] = {name}" for i, name in enumerate(names)]
@@ -93,13 +93,13 @@ def straight_line(system: ConstrainedSystem, t0: float, q0: bytes, v0: bytes) ->
 
 @lru_cache(maxsize=256)
 def straight_line_jacobian(system: ConstrainedSystem, t0: float, q0: bytes, v0: bytes) -> Callable[..., Any] | None:
-    """(t, y, columns) -> None: what is not zero of d y'[i]/d y[k] into columns[k, i], compiled.
+    """Return compiled (t, y, columns) -> None: the nonzeros of d y'[i]/d y[k] in columns[k, i].
 
-    None where that takes more than `MOST_OPERATIONS`, as on mechanisms of a dozen coordinates and more.
+    None if it takes more than `MOST_OPERATIONS`, as for mechanisms with a dozen coordinates or more.
     """
     n, program = system.n_q, Program()
     equations = expressions_at(system, t0, q0, v0)
-    written = _written(equations, program)
+    written = _printed(equations, program)
     results = [f"columns[{n + i}, {i}] = 1.0" for i in range(n)]
     for k, column in enumerate(equations.derivatives()):
         made = written.each(column)
@@ -115,7 +115,7 @@ def _name(made: Any) -> str:
 
 
 def _machine_code(system: ConstrainedSystem, into: str, program: Program, results: list[str]) -> Callable[..., Any]:
-    """(t, y, into) -> None: the program at y = [q, v], and then what writes its results."""
+    """Return compiled (t, y, into) -> None: the program at y = [q, v], and the assignment of its results."""
     n = system.n_q
     lines = [f"q{i} = y[{i}]" for i in range(n)] + [f"v{i} = y[{n + i}]" for i in range(n)] + program.lines + results
     scope: dict[str, Any] = functions_of(math)

@@ -1,1 +1,1 @@
-"""Exudyn: models of its own."""
+"""Exudyn models and their runs."""

@@ -1,10 +1,10 @@
-"""The beam on a moving base as Exudyn models of its own: a cable without shear, or a geometrically exact beam.
+"""The beam on a moving base with Exudyn's own models: a cable without shear, or a geometrically exact beam.
 
-Nothing comes from twoloop's equations but the data of the beam and of its base. Both models are of slender beams, with
-E A, E I and, the second, G A: they know nothing of the stretch of the thickness, nor of Poisson's ratio otherwise. The
-elements of `twoloop.mechanisms.ancf_beam` approach them as the mesh gets finer and the section slender, where Poisson's
-ratio is 0. Where it is not, the elements lock, and it is a cable of (lambda + 2 mu)/E times the stiffness that they
-approach. How closely, tests/references/test_exudyn_beam.py says.
+Only the data of the beam and its base are shared with twoloop. Both are models of slender beams with E A, E I and, in
+the second, G A, without thickness deformation or other effects of Poisson's ratio. For Poisson's ratio 0, the elements
+of `twoloop.mechanisms.ancf_beam` converge to them as the mesh is refined and the section becomes slender. Otherwise
+the elements lock and converge to a cable of (lambda + 2 mu)/E times the stiffness; tests/references/test_exudyn_beam.py
+measures how closely.
 """
 
 import math
@@ -42,17 +42,17 @@ def solve_exudyn_beam(
     Parameters
     ----------
     problem : Problem
-        From `twoloop.mechanisms.ancf_beam`; only `parameters` are read.
+        Problem of `twoloop.mechanisms.ancf_beam`; only its `parameters` are used.
     t_end, n_steps, solver, store_every, time_limit : see `references.exudyn.mechanisms.solve_exudyn`
     model : {"cable", "shear"}
-        `MODELS` describes each in a line fit for a table. The first converges far faster with the mesh.
+        `MODELS` has a description of each for tables. The first converges much faster with mesh refinement.
 
     Returns
     -------
     Result
-        q, v, a (6 (n_elements + 1), n_t) in the order of `ancf_beam`, so that its `tip_height` and
-        `midpoint_deflection` read them. What the model has not is NaN: the directors, and with "shear" the slopes as
-        well. `lam` (2, n_t) is NaN too. All else as in `references.exudyn.mechanisms.solve_exudyn`.
+        q, v, a (6 (n_elements + 1), n_t) in the order of `ancf_beam`, as required by its `tip_height` and
+        `midpoint_deflection`. Quantities missing in the model are NaN: the directors, with "shear" also the slopes.
+        `lam` (2, n_t) is NaN too. Otherwise as in `references.exudyn.mechanisms.solve_exudyn`.
     """
     check_problem(problem, "youngs_modulus", "a beam of twoloop.mechanisms.ancf_beam")
     steps = check_steps(problem, t_end, n_steps, solver, store_every, time_limit)
@@ -62,7 +62,7 @@ def solve_exudyn_beam(
     kept = 4 if model == "cable" else 2  # of x, y, slopes the first model has all, the second x, y and an angle
 
     def among_six(coordinates: Array) -> Array:
-        """Exudyn's coordinates of the nodes among six a node."""
+        """Insert Exudyn's coordinates into six coordinates per node."""
         ours = np.full((n_nodes, 6, coordinates.shape[1]), np.nan)
         ours[:, :kept] = coordinates.reshape(n_nodes, -1, coordinates.shape[1])[:, :kept]
         return ours.reshape(-1, coordinates.shape[1])
@@ -71,7 +71,7 @@ def solve_exudyn_beam(
 
 
 def _model(p: dict[str, Any], model: str) -> tuple[Any, Any, list[list[int]], Array]:
-    """Exudyn's container, the system in it, the sensors [node][output], and the reference coordinates [node]."""
+    """Return Exudyn's container, its system, the sensors [node][output], and the reference coordinates [node]."""
     container = exu.SystemContainer()
     mbs = container.AddSystem()
     n_elements = p["n_elements"]
@@ -95,20 +95,20 @@ def _model(p: dict[str, Any], model: str) -> tuple[Any, Any, list[list[int]], Ar
 
 
 def _element(p: dict[str, Any], model: str, length: float) -> Callable[[list[int]], Any]:
-    """An element of the beam between two nodes."""
+    """Return an element of the beam between two nodes."""
     area, second_moment = p["height"] * p["width"], p["width"] * p["height"] ** 3 / 12.0
     section = {"length": length, "massPerLength": p["density"] * area}
     section |= {"bendingStiffness": p["youngs_modulus"] * second_moment, "axialStiffness": p["youngs_modulus"] * area}
     if model == "cable":
         return lambda ends: items.ObjectANCFCable2D(nodeNumbers=ends, **section)
-    # the shear without the correction for its distribution over the section, as the element of twoloop has it
+    # without shear correction factor, as in twoloop's element
     section |= {"shearStiffness": 0.5 * p["youngs_modulus"] / (1.0 + p["poisson_ratio"]) * area}
     section |= {"crossSectionInertia": p["density"] * second_moment}
     return lambda ends: items.ObjectBeamGeometricallyExact2D(nodeNumbers=ends, **section)
 
 
 def _hold(mbs: Any, p: dict[str, Any], node: int) -> None:
-    """Move a node as amplitude sin(angular_frequency t) along x, and hold it along y."""
+    """Prescribe a node's motion, amplitude sin(angular_frequency t) along x and zero along y."""
     amplitude, frequency = p["amplitude"], p["angular_frequency"]
 
     def place(mbs: Any, t: float, itemNumber: int, lOffset: float) -> float:

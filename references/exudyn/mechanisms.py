@@ -1,7 +1,7 @@
-"""The four-bar linkage and published mechanisms as Exudyn models: bodies, joints, springs and weight of its own.
+"""The four-bar linkage and published mechanisms as Exudyn models with Exudyn's bodies, joints, springs and gravity.
 
-Nothing comes from twoloop's equations but masses, inertias, geometry and the state at the start. Spatial bodies have
-Euler parameters, as ours have, but for the bars of A04, whose rotation matrices are computed from them.
+Only masses, inertias, geometry and the initial state are shared with twoloop. Spatial bodies have Euler parameters,
+like ours, except for the bars of A04, whose rotation matrices are computed from them.
 """
 
 from collections.abc import Callable
@@ -19,7 +19,7 @@ from twoloop.problem.problem import Array, Problem
 from twoloop.result.result import Result
 
 X, Y, Z = np.eye(3)
-REDUNDANT = ("A02", "A04")  # beginnings of names: rows that depend on others, for good or where the motion passes
+REDUNDANT = ("A02", "A04")  # prefixes of names of mechanisms with rows that are dependent, always or at some positions
 
 
 def solve_exudyn(
@@ -32,37 +32,36 @@ def solve_exudyn(
     store_every: int = 1,
     time_limit: float | None = None,
 ) -> Result:
-    """Run a mechanism with one of Exudyn's implicit solvers, with a fixed step.
+    """Run a mechanism with one of Exudyn's implicit solvers with a fixed step.
 
     Parameters
     ----------
     problem : Problem
-        One of those in `MODELS`, by its name, of A02, or of `twoloop.mechanisms.four_bar`. Its parameters and its start
-        are read, not its system.
+        One of those named in `MODELS`, A02, or of `twoloop.mechanisms.four_bar`. Its parameters and initial state are
+        used, not its system.
     t_end : float
         End, s; the run starts at 0.
     n_steps : int
         Number of steps.
     solver : {"GeneralizedAlpha", "TrapezoidalIndex2", "HHT"}
-        `SOLVERS` describes each in a line fit for a table.
+        `SOLVERS` has a description of each for tables.
 
         "GeneralizedAlpha": J. Chung and G. M. Hulbert, J. Appl. Mech. 60 (1993) 371-375, on index 3 by M. Arnold and
         O. Bruels, Multibody Syst. Dyn. 18 (2007) 185-202. From the spectral radius r at infinite frequency
         alpha_m = (2 r - 1)/(r + 1), alpha_f = r/(r + 1), gamma = 1/2 - alpha_m + alpha_f, beta = (gamma + 1/2)^2/4.
 
         "HHT": alpha_m = 0, alpha_f = -alpha, gamma = (1 - 2 alpha)/2, beta = (1 - alpha)^2/4 (Hilber, Hughes and
-        Taylor, Earthq. Eng. Struct. Dyn. 5 (1977) 283-292). Exudyn has no setting for it: its settings know alpha_m
-        and alpha_f through r only, and r = 1/2, where alpha_m vanishes, is HHT with alpha = -1/3. For the others its
-        solver is started and its four coefficients are overwritten before the first step, with MSC Adams' alpha of
-        -0.3. This is the formula of HHT-I3, not its step-size control.
+        Taylor, Earthq. Eng. Struct. Dyn. 5 (1977) 283-292). Exudyn has no option for it: alpha_m and alpha_f depend on
+        r only, and r = 1/2, where alpha_m vanishes, is HHT with alpha = -1/3. Therefore the four coefficients of the
+        solver are overwritten before the first step, with MSC Adams' alpha of -0.3. This is the formula of HHT-I3
+        without its step-size control.
     spectral_radius : float, optional
-        Of "GeneralizedAlpha" alone, 0 (most damping) to 1 (none). None: 0.9, Exudyn's default. With 1 the index-3
-        form is weakly unstable: on the four-bar linkage the run fails within seconds, whatever the step.
+        For "GeneralizedAlpha" only, from 0 (most damping) to 1 (none). None: 0.9, Exudyn's default. With 1 the index-3
+        form is weakly unstable: on the four-bar linkage the run fails within seconds for any step.
     store_every : int
-        Store the start and every so many steps; `n_steps` must be a multiple of it.
+        Number of steps between stored states; `n_steps` must be a multiple of it.
     time_limit : float, optional
-        Wall-clock time that the run may take, s, looked at after every step. A run past it is a failed one. None: no
-        limit.
+        Wall-clock limit of the run, s, checked after every step. A run that exceeds it fails. None: no limit.
 
     Returns
     -------
@@ -88,14 +87,14 @@ def solve_exudyn(
 
 
 def model_of(problem: Problem) -> Model:
-    """The model of a problem, assembled."""
+    """Return the assembled model of a problem."""
     model = MODELS.get(problem.name, _n_four_bar if problem.name.startswith("A02") else _four_bar)(problem)
     model.mbs.Assemble()
     return model
 
 
 def has_model(problem: Problem) -> bool:
-    """Whether there is a model of a problem."""
+    """Return True if there is a model of a problem."""
     return problem.name in MODELS or problem.name.startswith("A02") or "L3" in problem.parameters
 
 
@@ -120,7 +119,7 @@ def _heavy_top(problem: Problem) -> Model:
 
 
 def _states(problem: Problem) -> list[tuple[Array, Array]]:
-    """States (7,), (7,) of the bodies at the start."""
+    """Return the initial states (7,), (7,) of the bodies."""
     return list(zip(problem.q0.reshape(-1, 7), problem.v0.reshape(-1, 7), strict=True))
 
 
@@ -141,7 +140,7 @@ def _spatial_slider_crank(problem: Problem) -> Model:
 def _governor(problem: Problem) -> Model:
     model = Model((0.0, 0.0, -problem.parameters["gravity"]))
     bar, cube = DENSITY * LENGTH * WIDTH**2, DENSITY * CUBE**3
-    centre = (0.5 * bar + BALL) * LENGTH / (bar + BALL)  # of rod and ball, from the hinge
+    centre = (0.5 * bar + BALL) * LENGTH / (bar + BALL)  # centre of mass of rod and ball, from the hinge
     axial, across, _ = box(bar, LENGTH, WIDTH, WIDTH)
     across += bar * (centre - 0.5 * LENGTH) ** 2 + BALL * (LENGTH - centre) ** 2
     rod = (bar + BALL, (axial, across, across))
@@ -171,7 +170,7 @@ def _bricard(problem: Problem) -> Model:
 
 
 def _with_matrices(q: Array, v: Array, a: Array) -> tuple[Array, Array, Array]:
-    """Bars by their centres and rotation matrices in place of Euler parameters."""
+    """Return the bars by centres and rotation matrices instead of Euler parameters."""
     places, rates = [], []
     for x, u in zip(q.reshape(5, 7, -1), v.reshape(5, 7, -1), strict=True):
         places += [x[:3], *np.array([rotation_matrix(e).T for e in x[3:].T]).reshape(-1, 9).T[None]]
@@ -180,7 +179,7 @@ def _with_matrices(q: Array, v: Array, a: Array) -> tuple[Array, Array, Array]:
 
 
 def _with_tips(q: Array, v: Array, a: Array) -> tuple[Array, Array, Array]:
-    """The tips of the n + 1 cranks in place of the 2 n + 1 bars."""
+    """Return the tips of the n + 1 cranks instead of the 2 n + 1 bars."""
     n, n_t = len(q) // 6, q.shape[1]
     x, u = (each.reshape(-1, 3, n_t)[: n + 1, :2] for each in (q, v))
     ground = np.column_stack([np.arange(n + 1.0), np.zeros(n + 1)])

@@ -1,4 +1,4 @@
-"""Exudyn models of planar bodies with pins, of any number: bodies and joints of its own, by sparse factors."""
+"""Exudyn models of any number of planar bodies with pins, solved by sparse factorisation."""
 
 import numpy as np
 
@@ -16,10 +16,10 @@ def solve_pinned(
     solver: str = "GeneralizedAlpha",
     time_limit: float | None = None,
 ) -> Result:
-    """Run planar bodies with pins with one of Exudyn's implicit solvers, with a fixed step, and store the end.
+    """Run planar bodies with pins by one of Exudyn's implicit solvers with a fixed step, and store the final state.
 
-    Of the problem start and end are read, not its system; of the bodies masses, inertias, gravity and pins. All else is
-    as of `references.exudyn.mechanisms.solve_exudyn`.
+    The initial state and time span of the problem are used, not its system; and masses, inertias, gravity and pins of
+    the bodies. Otherwise as in `references.exudyn.mechanisms.solve_exudyn`.
     """
     steps = check_steps(problem, problem.t_span[1], n_steps, solver, n_steps, time_limit)
     model = Model((0.0, -bodies.gravity, 0.0))

@@ -1,9 +1,9 @@
-"""What the Exudyn models share: sensors, a run with a fixed step, silence, statistics.
+"""Common parts of Exudyn models: sensors, fixed-step runs, suppressed output, statistics.
 
-There is no line with error control. Of `adaptiveStep` of the implicit solvers Exudyn's documentation says "the step
-size may be reduced if step fails; no automatic stepsize control"; those with error control (`automaticStepSize`:
-DOPRI5, ODE23) are explicit and refuse joints: "explicit integrator detected object 2 which contains constraints that
-cannot be solved" (1.13.6).
+There is no variant with error control. For `adaptiveStep` of the implicit solvers Exudyn's documentation states "the
+step size may be reduced if step fails; no automatic stepsize control"; the solvers with error control
+(`automaticStepSize`: DOPRI5, ODE23) are explicit and reject joints: "explicit integrator detected object 2 which
+contains constraints that cannot be solved" (1.13.6).
 """
 
 import contextlib
@@ -22,8 +22,8 @@ from twoloop.result.result import Result
 Ours = Callable[[Array, Array, Array], tuple[Array, Array, Array]]
 
 SPECTRAL_RADIUS = 0.9  # Exudyn's default
-SPARSE = 90  # coordinates from which on its sparse solver is the faster one
-ALPHA = -0.3  # of HHT; the default of MSC Adams, whose HHT integrator is the usual one on index 3
+SPARSE = 90  # coordinates above which its sparse solver is faster
+ALPHA = -0.3  # HHT's alpha, the default of MSC Adams, whose HHT integrator is the usual one for index 3
 SOLVERS = {
     "GeneralizedAlpha": "Exudyn generalized-alpha, spectral radius 0.9, index 3, fixed step",
     "TrapezoidalIndex2": "Exudyn trapezoidal rule, index 2, fixed step",
@@ -35,7 +35,7 @@ _OUTPUTS = tuple(getattr(exu.OutputVariableType, f"Coordinates{by}") for by in (
 
 
 class Steps(NamedTuple):
-    """The arguments that all models take, checked."""
+    """The checked arguments common to all models."""
 
     task: Task
     n_steps: int
@@ -53,7 +53,7 @@ def check_steps(
     time_limit: float | None,
     spectral_radius: float | None = None,
 ) -> Steps:
-    """Return the arguments, with Exudyn's default of the radius, or say what is wrong with one."""
+    """Return the checked arguments, with Exudyn's default radius; raise an error if one is invalid."""
     check_positive("t_end", t_end)
     check_time_limit(time_limit)
     n_steps, store_every = check_size("n_steps", n_steps, 1), check_size("store_every", store_every, 1)
@@ -71,7 +71,7 @@ def check_steps(
 
 
 def add_sensors(mbs: Any, node: int) -> list[int]:
-    """Sensors of a node's coordinates, velocities and accelerations."""
+    """Add sensors of a node's coordinates, velocities and accelerations."""
     options = {"nodeNumber": node, "storeInternal": True, "writeToFile": False}
     return [mbs.AddSensor(SensorNode(**options, outputVariableType=output)) for output in _OUTPUTS]
 
@@ -86,8 +86,8 @@ def run(
 ) -> Result:
     """Solve an assembled system whose nodes have these sensors and reference coordinates.
 
-    `ours` makes coordinates, velocities and accelerations of a problem of those of Exudyn; None: they are Exudyn's.
-    With dependent rows, which Exudyn's usual linear solver cannot treat, a dense one leaves out what is singular.
+    `ours` converts Exudyn's coordinates, velocities and accelerations to those of the problem; None: they are the same.
+    With dependent rows, which Exudyn's default linear solver does not support, a dense one ignores singular rows.
     """
     task, n_steps, solver, store_every, radius = steps
     settings = _settings(task.t1, n_steps, store_every)
@@ -104,7 +104,7 @@ def run(
     t = tables[0][0][:, 0]
     q, v, a = (np.concatenate([node[k][:, 1:] for node in tables], axis=1).T for k in range(len(_OUTPUTS)))
     did = mbs.sys["dynamicSolver"].it
-    made = did.currentStepIndex - (2 if failure else 1)  # the index counts from 1, and the failed step
+    made = did.currentStepIndex - (2 if failure else 1)  # the index starts at 1 and includes the failed step
     message = ""
     if not failure and made < n_steps:
         message = limit.message("Exudyn", did.currentTime, "take fewer steps")
@@ -118,7 +118,7 @@ def run(
 
 
 def _solve(mbs: Any, settings: Any, solver: str, limit: TimeLimit) -> str:
-    """Run one of Exudyn's own solvers; the text of a failure, or nothing, also when it stopped at the time limit."""
+    """Run one of Exudyn's own solvers; return an error message, or "" for success or at the time limit."""
     before = exu.special.solver.timeout
     exu.special.solver.timeout = -1 if limit.seconds is None else limit.seconds
     try:
@@ -131,12 +131,12 @@ def _solve(mbs: Any, settings: Any, solver: str, limit: TimeLimit) -> str:
 
 
 def _solve_hht(mbs: Any, settings: Any, limit: TimeLimit) -> str:
-    """Run the generalized-alpha solver with HHT's coefficients; the text of a failure, or nothing."""
+    """Run the generalized-alpha solver with HHT's coefficients; return an error message or ""."""
     if limit.seconds is not None:
-        # Exudyn's own timeout does not know when a solver started by hand began; this call costs 0.4 us a step
+        # Exudyn's own timeout does not work for a solver started manually; this call costs 0.4 us per step
         mbs.SetPostStepUserFunction(lambda mbs, t: not limit.passed())
     solver: Any = exu.MainSolverImplicitSecondOrder()
-    mbs.sys["dynamicSolver"] = solver  # where SolveDynamic leaves it, too
+    mbs.sys["dynamicSolver"] = solver  # as SolveDynamic does
     solver.InitializeSolver(mbs, settings)
     solver.alphaM, solver.alphaF = 0.0, -ALPHA
     solver.newmarkBeta, solver.newmarkGamma = 0.25 * (1.0 - ALPHA) ** 2, 0.5 - ALPHA
@@ -162,7 +162,7 @@ def _settings(t_end: float, n_steps: int, store_every: int) -> Any:
 
 @contextlib.contextmanager
 def _silence() -> Iterator[None]:
-    """Keep Exudyn, whose console switch is global, from printing."""
+    """Suppress the output of Exudyn, whose console switch is global."""
     before = exu.config.printToConsole
     exu.config.printToConsole = False
     try:

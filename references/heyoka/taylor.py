@@ -1,8 +1,8 @@
 """The Taylor integrator of heyoka.py (F. Biscani and D. Izzo, MNRAS 504 (2021) 2614-2628) on a ConstrainedSystem.
 
-It takes the right-hand side as its expressions, here those that `equations.expressions` makes of the callbacks, and
-compiles a Taylor series of the whole for each mechanism and each tolerance, which sets the order. Steps follow from the
-radius of convergence. It does not keep the constraints. The package is optional: `make peers`, or the extra `peers`.
+It takes the right-hand side as expressions, here from `equations.expressions`, and compiles a Taylor integrator for
+each mechanism and each tolerance, which determines the order. The step size follows from the radius of convergence. The
+constraints drift. The package is optional: `make peers`, or the extra `peers`.
 """
 
 from functools import lru_cache
@@ -17,21 +17,21 @@ from twoloop.problem.problem import Array
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.result.result import Result
 
-LARGEST_UNROLLED = 21  # coordinates; with more, an unrolled integrator may take minutes to build for a tolerance
-STEPS_A_CALL = 100  # between two looks at the clock
+LARGEST_UNROLLED = 21  # coordinates; for larger systems an unrolled integrator may take minutes to build per tolerance
+STEPS_A_CALL = 100  # between two checks of the clock
 
 
 @adapter(derivatives=False)
 def solve_heyoka(task: Task, tol: float = 1e-8, *, max_step: float | None = None) -> Result:
     """Integrate a constrained mechanical system, as the ODE q' = v, v' = a(t, q, v), with heyoka's Taylor integrator.
 
-    What it was given: the accelerations eliminated symbolically, without structural zeros, in an order of least fill;
-    `fast_math`; its default, the unrolled form (`compact_mode=False`, faster than the compact one) up to
-    `LARGEST_UNROLLED` coordinates; timed is a second use of the integrator, as its tutorials have it: time and state
-    are set, and `propagate_until` is called, without output. The clock is looked at every `STEPS_A_CALL` steps.
+    Settings: accelerations eliminated symbolically, exploiting structural zeros, in a minimum-degree order;
+    `fast_math`; the default, unrolled form (`compact_mode=False`, faster than the compact one) up to
+    `LARGEST_UNROLLED` coordinates. The timed call is a second use of the integrator, as in its tutorials: time and
+    state are set, and `propagate_until` is called without output. The clock is checked every `STEPS_A_CALL` steps.
 
-    Parameters, errors and result are those of `references.driver`; of the statistics n_accepted. The integrator is kept
-    for the next run of the same system, start and tolerance, its machine code in heyoka's own cache on disk.
+    Parameters, errors and result as in `references.driver`; statistics: n_accepted. The integrator is cached for the
+    next run of the same system, start and tolerance, and its machine code in heyoka's own cache on disk.
     """
     made = integrate(_integrator(*task.key, tol), task.y0, task, task.longest(max_step))
     name, times, rows, failure, steps = made
@@ -39,7 +39,7 @@ def solve_heyoka(task: Task, tol: float = 1e-8, *, max_step: float | None = None
 
 
 def integrate(integrator: Any, start: Array, task: Task, longest: float) -> tuple[str, Array, Array, str, int]:
-    """Its name, the times that were reached, rows y there, why it failed ("": it did not), and its steps."""
+    """Return the integrator's name, times reached, rows y there, error message or "", and number of steps."""
     outcomes, limit, steps = imported("heyoka").taylor_outcome, TimeLimit(task.time_limit), 0
     with user_call:
         integrator.time, integrator.state[:] = task.t0, start
@@ -51,17 +51,17 @@ def integrate(integrator: Any, start: Array, task: Task, longest: float) -> tupl
     reached, failure = float(integrator.time), ""
     if outcome == outcomes.step_limit:
         failure = limit.message("heyoka", reached, "take looser tolerances")
-    elif outcome != outcomes.time_limit:  # which is what heyoka calls the end
+    elif outcome != outcomes.time_limit:  # heyoka's status at the end time
         failure = f"heyoka failed after t = {reached:.10g} with {outcome.name}. {ADVICE}"
     kept = task.instants[task.instants <= (reached if failure else task.t1)]
     integrator.time, integrator.state[:] = task.t0, start
-    grid = kept if kept.size and kept[0] == task.t0 else np.append(task.t0, kept)  # it must begin where the state is
+    grid = kept if kept.size and kept[0] == task.t0 else np.append(task.t0, kept)  # must start at the current time
     rows = integrator.propagate_grid(grid, max_delta_t=longest)[-1][grid.size - kept.size :]
     return f"heyoka, order {integrator.order},", kept, rows, failure, steps
 
 
 def rates_of(equations: Expressions, parameters: list[Any] | None = None) -> list[tuple[Any, Any]]:
-    """heyoka's variables q, v and their rates."""
+    """Return heyoka's variables q, v and their rates."""
     package, n = imported("heyoka"), equations.system.n_q
     symbols = package.make_vars(*(f"{name}{i}" for name in "qv" for i in range(n)))
     state = package.time, symbols[:n], symbols[n:]
@@ -71,7 +71,7 @@ def rates_of(equations: Expressions, parameters: list[Any] | None = None) -> lis
 
 
 def built(motion: list[tuple[Any, Any]], start: Any, t0: float, tol: float, unrolled: bool) -> Any:
-    """The integrator of variables and their rates."""
+    """Return the integrator of variables and their rates."""
     options = {"time": t0, "tol": tol, "fast_math": True, "compact_mode": not unrolled}
     return imported("heyoka").taylor_adaptive(motion, start, **options)
 

@@ -1,8 +1,8 @@
-"""Equations of motion in minimal coordinates, where loops close in closed form: what one has without constraints.
+"""Equations of motion in minimal coordinates, for mechanisms whose loops close in closed form.
 
-One or two angles and Lagrange's equations for them, by hand, from the parameters of a problem alone. Each equation is
-written once: for floats (`math`), for compiled code (numba takes `math` too), and for expressions (heyoka has functions
-of the same names).
+One or two angles with Lagrange's equations derived by hand, from the parameters of a problem only. Each equation is
+written once, for floats (`math`), compiled code (numba supports `math`), and expressions (heyoka has functions of the
+same names).
 """
 
 import math
@@ -18,34 +18,34 @@ from twoloop.problem.problem import Array
 
 Equations = Callable[[Any], tuple[Any, ...]]  # [angles, rates] -> their rates
 
-INSTANTS = 1000  # of half a period, at which the dead centres of a four-bar are looked for
-NEAREST = 1e-2  # sine of the angle between the two other bars, below which an angle is near its dead centre
+INSTANTS = 1000  # per half period, at which the distance from dead centres of a four-bar is determined
+NEAREST = 1e-2  # sine of the angle between the two other bars that counts as a dead centre
 
 
 class NoMinimalCoordinates(ValueError):
-    """Raised for a problem of which there are no equations in minimal coordinates."""
+    """Raised for a problem without equations in minimal coordinates."""
 
 
 @dataclass(frozen=True)
 class Minimal:
     """A mechanism in minimal coordinates."""
 
-    # equations(functions) -> rates, of which rates(y) gives y', y = [angles, their rates], by these functions: `math`
-    # or a module with sin, cos and sqrt of its own
+    # equations(functions) -> rates, with rates(y) -> y', y = [angles, their rates]; functions: `math` or another module
+    # with sin, cos and sqrt
     equations: Callable[[Any], Equations]
-    start: tuple[float, ...]  # y at the problem's start
+    start: tuple[float, ...]  # initial y
     # states(y (2 n, n_t)) -> q, v (n_q, n_t) in the problem's coordinates
     states: Callable[[Array], tuple[Array, Array]]
 
 
 def minimal(problem: Problem) -> Minimal:
-    """The equations of a problem in minimal coordinates.
+    """Return the equations of a problem in minimal coordinates.
 
-    Raises NoMinimalCoordinates if there are none, or a four-bar has no angle that stays clear of its dead centres.
+    Raises NoMinimalCoordinates if there are none, or a four-bar has no angle that stays away from its dead centres.
     """
     name = problem.system.name
     if name not in MAKE:
-        raise NoMinimalCoordinates(f"there are equations in minimal coordinates of {', '.join(MAKE)}; given {name!r}")
+        raise NoMinimalCoordinates(f"equations in minimal coordinates exist for {', '.join(MAKE)}; given {name!r}")
     return MAKE[name](problem)
 
 
@@ -88,7 +88,7 @@ def _double_pendulum(problem: Problem) -> Minimal:
 
 
 def _chain(problem: Problem, equations: Callable[[Any], Equations]) -> Minimal:
-    """Links of one length, hanging from the origin one below the other, by their angles from the downward vertical."""
+    """Return links of equal length in a chain from the origin, by their angles from the downward vertical."""
     length = problem.parameters["length"]
 
     def states(y: Array) -> tuple[Array, Array]:
@@ -104,9 +104,9 @@ def _chain(problem: Problem, equations: Callable[[Any], Equations]) -> Minimal:
 
 
 def _slider_crank(problem: Problem) -> Minimal:
-    """The angle of the crank; the rod's is asin(-a sin th), as a < 1.
+    """One angle, that of the crank; the rod's is asin(-a sin th), as a < 1.
 
-    Both ends of the spring are at half the height of the pin, so that it is half as long as the slider is far.
+    Both ends of the spring are at half the height of the pin, so its length is half the distance of the slider.
     """
     a, J1, m2, J2, k, c, l0, F = (problem.parameters[name] for name in ("a", "J1", "m2", "J2", "k", "c", "l0", "F"))
 
@@ -117,7 +117,7 @@ def _slider_crank(problem: Problem) -> Minimal:
             s, w = sin(y[0]), y[1]
             cc, s2 = cos(y[0]), -a * s
             c2 = sqrt(1.0 - s2 * s2)
-            rod = -a * cc / c2  # derivatives by the angle: of the rod's, of the slider's place; then the second ones
+            rod = -a * cc / c2  # first derivatives by the angle, of the rod angle and slider position; then second ones
             slide = -s2 * rod - a * s
             rod_2 = (s2 * (rod * rod) + a * s) / c2
             slide_2 = -c2 * (rod * rod) - s2 * rod_2 - a * cc
@@ -141,10 +141,10 @@ def _slider_crank(problem: Problem) -> Minimal:
 
 
 def _four_bar(problem: Problem) -> Minimal:
-    """One angle: that of a bar such that the two others are not in line anywhere on the motion.
+    """One angle, that of a bar such that the two others are never collinear on the motion.
 
-    Where the others are, of lengths La and Lb, follows from R = La e_a + Lb e_b = (L, 0) - Lk e_k: e_a is along R by
-    (R^2 + La^2 - Lb^2) / (2 R^2) and across it by a root whose sign stays.
+    The others, of lengths La and Lb, follow from R = La e_a + Lb e_b = (L, 0) - Lk e_k: the component of La e_a along R
+    is (R^2 + La^2 - Lb^2) / (2 R^2) times R, and the perpendicular one is a root of constant sign.
     """
     p = problem.parameters
     lengths, ground, density, gravity = (p["L1"], p["L2"], p["L3"]), p["L"], p["density"], p["gravity"]
@@ -154,11 +154,11 @@ def _four_bar(problem: Problem) -> Minimal:
     best = max(range(3), key=lambda k: np.abs(between[k]).min())
     own, a, b = OTHERS[best]
     if np.ptp(np.sign(between[best])) or np.abs(between[best]).min() < NEAREST:
-        raise NoMinimalCoordinates(f"every angle of {problem.name!r} comes to its dead centre on this motion")
-    side = -math.copysign(1.0, between[best][0])  # of e_a: to the left of R where e_b lies to the right
+        raise NoMinimalCoordinates(f"every angle of {problem.name!r} reaches its dead centre on this motion")
+    side = -math.copysign(1.0, between[best][0])  # e_a is to the left of R if e_b is to the right
     Lk, La, Lb = lengths[own], lengths[a], lengths[b]
     masses = [density * length for length in lengths]
-    # x of the centre of bar i = sum of HALVES[i] L e: as factors of the three bars in the order k, a, b
+    # centre of bar i = sum of HALVES[i] L e; factors of the three bars in the order k, a, b
     arms = [[masses[i], *(HALVES[i][j] * lengths[j] for j in (own, a, b))] for i in range(3)]
     (m1, k1, a1, b1), (m2, k2, a2, b2), (m3, k3, a3, b3) = arms
     Jk, Ja, Jb = (masses[i] * lengths[i] ** 2 / 12.0 for i in (own, a, b))
@@ -175,18 +175,18 @@ def _four_bar(problem: Problem) -> Minimal:
             ax, az = along * x - across * z, along * z + across * x
             ca, sa, cb, sb = ax / La, az / La, (x - ax) / Lb, (z - az) / Lb
             sine = sb * ca - cb * sa
-            # derivatives of the two angles by the one: the closure's first, then its second, projected on e_b and e_a
+            # derivatives of the two angles by the independent one: first and second, from the loop closure
             na = -Lk * (sb * ck - cb * sk) / (La * sine)
             nb = Lk * (sa * ck - ca * sk) / (Lb * sine)
             ra, rb = na * na, nb * nb
             wx, wz = Lk * ck + La * ra * ca + Lb * rb * cb, Lk * sk + La * ra * sa + Lb * rb * sb
             da, db = (wx * cb + wz * sb) / (La * sine), -(wx * ca + wz * sa) / (Lb * sine)
-            # of the bars' vectors e, first and second
+            # first and second derivatives of the bars' vectors e
             kx, kz, ax, az, bx, bz = -sk, ck, -sa * na, ca * na, -sb * nb, cb * nb
             kxx, kzz = -ck, -sk
             axx, azz = -ca * ra - sa * da, -sa * ra + ca * da
             bxx, bzz = -cb * rb - sb * db, -sb * rb + cb * db
-            # of the centres
+            # and of the centres
             x1, z1 = k1 * kx + a1 * ax + b1 * bx, k1 * kz + a1 * az + b1 * bz
             x2, z2 = k2 * kx + a2 * ax + b2 * bx, k2 * kz + a2 * az + b2 * bz
             x3, z3 = k3 * kx + a3 * ax + b3 * bx, k3 * kz + a3 * az + b3 * bz
@@ -202,7 +202,7 @@ def _four_bar(problem: Problem) -> Minimal:
         return rates
 
     def turns(angle: Array) -> dict[int, Array]:
-        """The three angles, continuous in the one: R turns with its bar only where that is longer than the ground."""
+        """Return the three angles, continuous in the independent one: R rotates only if its bar exceeds the ground."""
         bar = np.exp(1j * angle)
         chord = ground - Lk * bar
         along = 0.5 * (np.abs(chord) ** 2 + La**2 - Lb**2) / np.abs(chord) ** 2
@@ -224,6 +224,6 @@ def _four_bar(problem: Problem) -> Minimal:
 
 
 OTHERS = ((0, 1, 2), (1, 0, 2), (2, 0, 1))  # a bar and the two others
-HALVES = ((0.5, 0.0, 0.0), (1.0, 0.5, 0.0), (1.0, 1.0, 0.5))  # the way to a bar's centre, in lengths of the bars
+HALVES = ((0.5, 0.0, 0.0), (1.0, 0.5, 0.0), (1.0, 1.0, 0.5))  # path to the centre of a bar, in lengths of the bars
 MAKE: dict[str, Callable[[Problem], Minimal]] = {"four-bar": _four_bar, "A01 pendulum": _pendulum}
 MAKE |= {"projection pendulum": _pendulum, "double pendulum": _double_pendulum, "SUNDIALS slider-crank": _slider_crank}

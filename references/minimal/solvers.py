@@ -1,7 +1,7 @@
-"""heyoka and CVODE on a mechanism in minimal coordinates (`minimal.equations`): no constraints, nothing drifts.
+"""heyoka and CVODE on a mechanism in minimal coordinates (`minimal.equations`), where no constraints can drift.
 
-Each is used as on redundant coordinates (`heyoka.taylor`, `sundials.cvode_c`), with the options that are
-best there, and timed the same: a second use of what was built.
+Each is used as for redundant coordinates (`heyoka.taylor`, `sundials.cvode_c`), with the options that are best there,
+and the same timing of a second use of the integrator.
 """
 
 import math
@@ -34,29 +34,29 @@ def solve_heyoka_minimal(
 ) -> Result:
     """Integrate a mechanism in minimal coordinates by heyoka's Taylor integrator.
 
-    From rest with level links, three of four terms of a pendulum's series are zero. At some orders these are the two by
-    which heyoka measures its steps: the first is then far too long, and the run ends with success and a wrong state.
-    The remedy is another tolerance; nothing is done about it here.
+    From rest with level links, three of four terms of a pendulum's series vanish. At some orders these include the two
+    from which heyoka determines its step: the first step is then much too long, and the run succeeds with a wrong
+    state. Another tolerance avoids this; it is not handled here.
 
     Parameters
     ----------
     problem : Problem
-        One that `minimal` has equations of.
+        A problem supported by `minimal`.
     t_end : float
-        s; from 0 on, from the problem's start.
+        End time, s; the run starts at 0 with the problem's initial state.
     tol : float
-        heyoka's one tolerance.
+        heyoka's tolerance.
     t_eval, time_limit : see `references.driver`
 
     Returns
     -------
     Result
-        In the problem's coordinates, `a` and `lam` from eq. (6); of the statistics n_accepted.
+        In the problem's coordinates, `a` and `lam` from eq. (6); statistics: n_accepted.
 
     Raises
     ------
     NoMinimalCoordinates
-        A ValueError, if there are no equations of the problem.
+        A ValueError, if there are no equations for the problem.
     """
     check_positive("tol", tol)
     own, task = _checked(problem, t_end, t_eval, time_limit)
@@ -76,7 +76,7 @@ def solve_cvode_minimal(
 ) -> Result:
     """Integrate a mechanism in minimal coordinates by CVODE's Adams methods, driven from C.
 
-    Parameters, errors and result are those of `solve_heyoka_minimal`, but for CVODE's two tolerances and its counters.
+    Parameters, errors and result as for `solve_heyoka_minimal`, except for CVODE's two tolerances and its counters.
     """
     check_positive("rtol", rtol)
     check_positive("atol", atol)
@@ -89,7 +89,7 @@ def solve_cvode_minimal(
 def _checked(
     problem: Problem, t_end: float, t_eval: ArrayLike | None, time_limit: float | None
 ) -> tuple[Minimal, Task]:
-    """The equations of a problem, made once for that object, as what is built of them is kept by them; and the task."""
+    """Return the equations of a problem, cached per object because integrators are cached with them, and the task."""
     if not isinstance(problem, Problem):
         raise TypeError(f"problem must be a Problem of twoloop.mechanisms; given {problem!r}")
     start = problem.system, (0.0, t_end), problem.q0, problem.v0
@@ -109,7 +109,7 @@ def _integrator(own: Minimal, tol: float) -> Any:
 
 @lru_cache(maxsize=64)
 def _right_hand_side(own: Minimal) -> Any:
-    """CVODE's right-hand side function."""
+    """Return CVODE's right-hand side function."""
     rates, size = njit(error_model="numpy")(own.equations(math)), len(own.start)
 
     @njit(error_model="numpy")
@@ -122,5 +122,5 @@ def _right_hand_side(own: Minimal) -> Any:
 
 
 def _states(own: Minimal, task: Task, rows: Array) -> Array:
-    """[q, v] (2 n_q, n_t) of [angles, rates] as rows."""
+    """Return [q, v] (2 n_q, n_t) for [angles, rates] given as rows."""
     return np.concatenate(own.states(rows.T)) if len(rows) else np.empty((2 * task.system.n_q, 0))

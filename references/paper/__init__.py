@@ -1,1 +1,1 @@
-"""What the paper is judged by: its step in NumPy, its idea alone, a stand-in for ADAMS, the linkage in one angle."""
+"""References for the paper: its step in NumPy, an ablation, a substitute for ADAMS, the minimal four-bar."""

@@ -1,7 +1,7 @@
-"""The paper's idea alone: five ways to keep the constraints in one Runge-Kutta code, which share all that is not it.
+"""Ablation of the paper's idea: five ways of treating the constraints in otherwise identical Runge-Kutta codes.
 
-Tableau, fixed-point loop over the stages, factorisations, convergence test and step-size control are the same for all.
-What differs is what becomes of a stage's coordinates and of the end of a step: the branches on `variant` in
+Tableau, fixed-point iteration over the stages, factorisations, convergence test and step-size control are the same. The
+variants differ in the treatment of the stages' coordinates and of the end of a step: see the branches on `variant` in
 `references.paper.ablation_kernels`.
 """
 
@@ -25,14 +25,14 @@ VARIANTS = {
     "stabilised index 2": "Gear, Gupta & Leimkuhler: M q' = M v - C_q^T mu, C = 0 and C_q v + C_t = 0 at the stages",
     "unprojected": "index 1: all coordinates integrated, constraints left to themselves",
 }
-FROZEN_ORDER = 1  # of a step with dependents frozen, whatever the tableau
+FROZEN_ORDER = 1  # order with dependents frozen, for any tableau
 
-LOOP_SHARE = 1e-4  # tolerance of the stage loop over that of the step, as 1e-9 over 1e-5 in the paper
-LEAST_LOOP = 1e-11  # on the beam rounding leaves 1e-12
-CHUNK = 100  # steps of a compiled call, after which the clock is read
-FIRST = 1e-3  # of the time span, the first step under control
+LOOP_SHARE = 1e-4  # tolerance of the stage iteration relative to that of the step, as 1e-9 to 1e-5 in the paper
+LEAST_LOOP = 1e-11  # rounding errors on the beam are about 1e-12
+CHUNK = 100  # steps per compiled call, after which the clock is checked
+FIRST = 1e-3  # first step with step-size control, relative to the time span
 REASONS = {
-    kernels.NOT_CONVERGED: "the stage loop does not converge",
+    kernels.NOT_CONVERGED: "the stage iteration does not converge",
     kernels.SINGULAR: "a matrix is singular, or the constraints cannot be solved",
     kernels.TOO_SMALL: "the step has become too small",
 }
@@ -42,37 +42,37 @@ REASONS = {
 def solve_variant(
     task: Task, variant: str, tableau: Tableau, *, step: float | None = None, tol: float | None = None
 ) -> tuple[Result, float]:
-    """Integrate by a Runge-Kutta tableau with one of five ways to keep the constraints.
+    """Integrate by a Runge-Kutta tableau with one of five treatments of the constraints.
 
     Parameters
     ----------
     variant : str
-        One of `VARIANTS`, which says what each does.
+        One of `VARIANTS`, which describes each.
     tableau : Tableau
-        With an invertible A, not an explicit one.
+        Implicit, with an invertible A.
     step : float, optional
-        A fixed step, s: the nearest that goes into t_span a whole number of times.
+        Fixed step size, s, rounded so that t_span is a multiple of it.
     tol : float, optional
-        Instead of a fixed step: rtol = atol of eqs. (26), (27), (31), by a step and two halves, the latter kept. The
-        loop over the stages ends at a change of 1e-4 tol, relative to max(1, |y|), at least 1e-11, as with fixed steps.
+        Instead of a fixed step: rtol = atol of eqs. (26), (27), (31), from one step and two half steps, keeping the
+        latter. The stage iteration ends at a change of 1e-4 tol relative to max(1, |y|), but at least 1e-11, which is
+        used for fixed steps.
     others : see `references.driver`
-        The system has `gamma`, and constraints on positions that do not depend on one another; no t_eval.
+        The system must have `gamma` and independent position constraints; no t_eval.
 
     Returns
     -------
     result : Result
-        At the ends of the steps; `a` and `lam` of eq. (6) there. Of the statistics: n_evaluations, times that forces
-        were evaluated and the equations of motion solved; n_factorizations, of C_qd, C_q M^-1 C_q^T, a varying M, and
-        partitions; n_outer, sweeps over all stages; n_inner, Newton iterations for positions.
+        States at the ends of steps, with `a` and `lam` from eq. (6). Statistics: n_evaluations of forces with solution
+        of the equations of motion; n_factorizations, of C_qd, C_q M^-1 C_q^T, a varying M, and partitions; n_outer,
+        sweeps over all stages; n_inner, Newton iterations for positions.
     mu : float
-        Largest |mu| of the stabilised form, of its M q' = M v - C_q^T mu; 0 of the others.
+        Largest |mu| of the stabilised form, M q' = M v - C_q^T mu; 0 for the others.
 
-    Notes
-    -----
-    All stages of a sweep are made from those of the one before, the first from the accelerations at the beginning of
-    the step. The stabilised form has its multipliers from the residuals of the stages, by a Newton step with the
-    matrices of each stage; where the last stage is not the end of the step, the end is put onto the constraints as with
-    projection (U. Ascher and L. Petzold, SIAM J. Numer. Anal. 28 (1991) 1097-1120), else the method loses its order.
+    Notes ----- All stages of a sweep are computed from those of the previous sweep; the first uses the accelerations at
+    the start of the step. The multipliers of the stabilised form follow from the residuals of the stages by a Newton
+    step with the matrices of each stage. Unless the last stage is the end of the step, the end is projected onto the
+    constraints (U. Ascher and L. Petzold, SIAM J. Numer. Anal. 28 (1991) 1097-1120); otherwise the method loses its
+    order.
     """
     check_choice("variant", variant, tuple(VARIANTS))
     if (step is None) == (tol is None):
@@ -93,7 +93,7 @@ def solve_variant(
     state, chunks = np.concatenate([task.y0, np.zeros(n + m)]), [np.empty((1, 1 + 3 * n + m))]
     given = n, m, s, which, order, *coefficients, task.t0, task.t1, n_steps, tol, loop_tol, state, where
     limit, began = TimeLimit(task.time_limit), time.process_time()
-    code = kernels.run(Kit(system.functions), *given, chunks[0], counters)  # a and lam of the start
+    code = kernels.run(Kit(system.functions), *given, chunks[0], counters)  # initial a and lam
     while code == kernels.DONE and where[kernels.T] < task.t1 and not limit.passed():
         chunks.append(np.empty((CHUNK, 1 + 3 * n + m)))
         before = counters[kernels.STEPS]

@@ -1,4 +1,4 @@
-"""The compiled steps of `paper.ablation`: one stage loop, in which variants differ by branches on `variant`."""
+"""The compiled steps of `paper.ablation`: one stage iteration, with branches on `variant`."""
 
 from typing import Any, NamedTuple
 
@@ -13,20 +13,20 @@ from twoloop.kernels.evaluation.partition import full_pivoting
 POSITIONS, FROZEN, PROJECTED, STABILISED, UNPROJECTED = range(5)
 
 SAFETY, FASTEST, SLOWEST = 0.9, 5.0, 0.5  # fac, facmax, facmin of the paper
-AGAIN, HELD = 0.7, 10  # of a step that did not converge the longest one allowed for so many steps
+AGAIN, HELD = 0.7, 10  # after divergence: bound of the step, relative to the failed one, for this many steps
 MOST_SWEEPS, MOST_NEWTON = 100, 10
-HOPELESS = 1e3  # times the first change of the stages: the loop diverges
-KEPT = 1e-9  # correction of q at which the constraints are solved: what is left is its square
-LEAST_STEP = 1e-12  # of the time span
-ROUNDING = 1e-14  # of coefficients: where they differ by less, the last stage is the end of the step
+HOPELESS = 1e3  # relative to the first change of the stages: divergence
+KEPT = 1e-9  # correction of q at convergence; the remaining error is its square
+LEAST_STEP = 1e-12  # relative to the time span
+ROUNDING = 1e-14  # tolerance of the test whether the last stage is the end of the step
 
 DONE, NOT_CONVERGED, SINGULAR, TOO_SMALL = range(4)
 EVALUATIONS, FACTORIZATIONS, SWEEPS, NEWTON, STEPS, REFUSED, DIVERGED, PARTITIONS, N_COUNTERS = range(9)
-COUNTERS = (  # those, as `Statistics` calls them
+COUNTERS = (  # names in `Statistics`
     *("n_evaluations", "n_factorizations", "n_outer", "n_inner", "n_accepted"),
     *("n_rejected_error", "n_rejected_convergence", "n_partitions"),
 )
-T, H, LONGEST, HOLD, MU, N_PLACES = range(6)  # places in `where`: the step-size control, and the largest |mu|
+T, H, LONGEST, HOLD, MU, N_PLACES = range(6)  # indices in `where`: step-size control and largest |mu|
 
 
 class _Space(NamedTuple):
@@ -52,7 +52,7 @@ class _Space(NamedTuple):
 
 @njit(error_model="numpy")
 def _matrices(f, w, t, q, W, counters):  # type: ignore[no-untyped-def]
-    """C_q, C_q M^-1 and the factors of C_q M^-1 C_q^T at q; False if they are singular."""
+    """Compute C_q, C_q M^-1 and the factors of C_q M^-1 C_q^T at q; return False if they are singular."""
     m, n = w.Cq.shape
     if f.flags[CONSTANT_MASS] == 0 or counters[EVALUATIONS] == 0:
         w.M[:, :] = 0.0
@@ -76,7 +76,7 @@ def _matrices(f, w, t, q, W, counters):  # type: ignore[no-untyped-def]
 
 @njit(error_model="numpy")
 def _free(f, w, t, q, v, a, counters):  # type: ignore[no-untyped-def]
-    """a = M^-1 Q."""
+    """Compute a = M^-1 Q."""
     a[:] = 0.0
     f.force(t, q, v, f.p, a)
     cholesky_solve(w.M, a)
@@ -85,7 +85,7 @@ def _free(f, w, t, q, v, a, counters):  # type: ignore[no-untyped-def]
 
 @njit(error_model="numpy")
 def _loaded(a, W, lam):  # type: ignore[no-untyped-def]
-    """a -= M^-1 C_q^T lam."""
+    """Subtract M^-1 C_q^T lam from a."""
     for i in range(lam.size):
         for j in range(a.size):
             a[j] -= W[i, j] * lam[i]
@@ -93,7 +93,7 @@ def _loaded(a, W, lam):  # type: ignore[no-untyped-def]
 
 @njit(error_model="numpy")
 def _accelerate(f, w, t, q, v, a, lam, W, counters):  # type: ignore[no-untyped-def]
-    """a and lam of eq. (6); False if it is singular."""
+    """Compute a and lam of eq. (6); return False if it is singular."""
     if not _matrices(f, w, t, q, W, counters):
         return False
     _free(f, w, t, q, v, a, counters)
@@ -110,7 +110,7 @@ def _accelerate(f, w, t, q, v, a, lam, W, counters):  # type: ignore[no-untyped-
 
 @njit(error_model="numpy")
 def _residual(f, w, t, q, v, r):  # type: ignore[no-untyped-def]
-    """r = C_q v + C_t, with the C_q of w."""
+    """Compute r = C_q v + C_t with the C_q of w."""
     r[:] = 0.0
     f.constraint_rate(t, q, f.p, r)
     for i in range(r.size):
@@ -120,7 +120,7 @@ def _residual(f, w, t, q, v, r):  # type: ignore[no-untyped-def]
 
 @njit(error_model="numpy")
 def _satisfy(f, w, t, q, v, enough, counters):  # type: ignore[no-untyped-def]
-    """Dependent positions by eq. (15), to a last correction of `enough`, then dependent velocities by eq. (14)."""
+    """Solve eq. (15) for dependent positions, until a correction is below `enough`, and eq. (14) for velocities."""
     m = w.C.size
     correction, tries = np.inf, 0
     while True:
@@ -156,7 +156,7 @@ def _satisfy(f, w, t, q, v, enough, counters):  # type: ignore[no-untyped-def]
 
 @njit(error_model="numpy")
 def _project(f, w, t, q, v, counters):  # type: ignore[no-untyped-def]
-    """Put q and v onto the constraints by the least change in the norm of M; False if that does not converge."""
+    """Project q and v onto the constraints orthogonally in the norm of M; return False if that does not converge."""
     correction, tries = np.inf, 0
     while True:
         if not _matrices(f, w, t, q, w.W[0], counters):
@@ -177,7 +177,7 @@ def _project(f, w, t, q, v, counters):  # type: ignore[no-untyped-def]
 
 @njit(error_model="numpy")
 def _least_change(w, W, x):  # type: ignore[no-untyped-def]
-    """x -= M^-1 C_q^T S^-1 C; the largest change over max(1, |x|)."""
+    """Subtract M^-1 C_q^T S^-1 C from x; return the largest change relative to max(1, |x|)."""
     cholesky_solve(w.S, w.C)
     largest = 0.0
     for j in range(x.size):
@@ -186,14 +186,14 @@ def _least_change(w, W, x):  # type: ignore[no-untyped-def]
             change += W[i, j] * w.C[i]
         x[j] -= change
         change = abs(change) / max(1.0, abs(x[j]))
-        if not change <= largest:  # also true for NaN
+        if not change <= largest:  # True for NaN
             largest = change
     return largest
 
 
 @njit(error_model="numpy")
 def _partition(f, w, t, q, counters):  # type: ignore[no-untyped-def]
-    """Choose the dependent coordinates by Gauss elimination with full pivoting; False if rows depend on one another."""
+    """Choose the dependent coordinates by Gaussian elimination with full pivoting; return False for dependent rows."""
     m, n = w.Cq.shape
     P = np.zeros((m, n))
     f.jacobian(t, q, f.p, P)
@@ -206,7 +206,7 @@ def _partition(f, w, t, q, counters):  # type: ignore[no-untyped-def]
 
 @njit(error_model="numpy")
 def _combine(y, h, weights, K, out):  # type: ignore[no-untyped-def]
-    """out = y + h sum(weights K)."""
+    """Compute out = y + h sum(weights K)."""
     for i in range(y.size):
         total = 0.0
         for j in range(weights.size):
@@ -216,10 +216,10 @@ def _combine(y, h, weights, K, out):  # type: ignore[no-untyped-def]
 
 @njit(error_model="numpy")
 def _update(y, h, K, new, largest):  # type: ignore[no-untyped-def]
-    """K becomes new; the largest change of h K over max(1, |y|), or `largest`."""
+    """Overwrite K with new; return the largest change of h K relative to max(1, |y|), or `largest`."""
     for i in range(y.size):
         change = h * abs(new[i] - K[i]) / max(1.0, abs(y[i]))
-        if not change <= largest:  # also true for NaN
+        if not change <= largest:  # True for NaN
             largest = change
         K[i] = new[i]
     return largest
@@ -227,7 +227,7 @@ def _update(y, h, K, new, largest):  # type: ignore[no-untyped-def]
 
 @njit(error_model="numpy")
 def _sweep(f, w, variant, A, c, inverse, t, h, q, v, loop_tol, counters):  # type: ignore[no-untyped-def]
-    """Make all stages from the last ones: the largest change; NaN if a matrix is singular."""
+    """Compute all stages from the previous ones; return the largest change; NaN if a matrix is singular."""
     s, m = w.lam.shape
     change = 0.0
     for j in range(s):
@@ -250,7 +250,7 @@ def _sweep(f, w, variant, A, c, inverse, t, h, q, v, loop_tol, counters):  # typ
                     f.constraint(t_j, q_j, f.p, w.C)
                 else:
                     _residual(f, w, t_j, q_j, v_j, w.C)
-                _least_change(w, w.W[j], y)  # as the multipliers' corrections will move the stage
+                _least_change(w, w.W[j], y)  # effect of the corrections of the multipliers on the stage
                 w.off[k, j] = w.C
             _free(f, w, t_j, q_j, v_j, w.a[j], counters)
         elif not _accelerate(f, w, t_j, q_j, v_j, w.a[j], w.lam[j], w.W[j], counters):
@@ -274,7 +274,7 @@ def _sweep(f, w, variant, A, c, inverse, t, h, q, v, loop_tol, counters):  # typ
 def _step(  # type: ignore[no-untyped-def]
     f, w, variant, A, b, c, inverse, t, h, start, end, loop_tol, where, counters
 ):
-    """A step from the state `start` = [q v a lam] to `end`; DONE or why not."""
+    """Take a step from the state `start` = [q v a lam] to `end`; return DONE or an error code."""
     s, n = w.q.shape
     q, v = start[:n], start[n : 2 * n]
     if variant <= FROZEN and not _partition(f, w, t, q, counters):
@@ -309,7 +309,7 @@ def _step(  # type: ignore[no-untyped-def]
 
 @njit(error_model="numpy")
 def _error(n, tol, states):  # type: ignore[no-untyped-def]
-    """Eq. (27), over positions and velocities of a step's beginning, its end by one step, half way, and by two."""
+    """Return eq. (27) for positions and velocities from the states at start, end (one step), middle, and end (two)."""
     total = 0.0
     for i in range(2 * n):
         scale = tol + tol * max(abs(states[0, i]), abs(states[1, i]))
@@ -325,9 +325,9 @@ _SIZES, _TABLEAU = (_I8,) * 5, (MATRIX, VECTOR, VECTOR, MATRIX)
 def run(  # type: ignore[no-untyped-def]
     f, n, m, s, variant, order, A, b, c, inverse, t0, t1, n_steps, tol, loop_tol, state, where, rows, counters
 ):
-    """As many steps as `rows` has, each a row [t q v a lam], of `n_steps` equal ones or, if that is 0, under control.
+    """Take one step per row of `rows`, each [t q v a lam]: `n_steps` equal ones, or under control if that is 0.
 
-    The first call fills its one row with the start.
+    The first call fills its single row with the initial state.
     """
     M, Cq, W, S, D = np.zeros((n, n)), np.zeros((m, n)), np.zeros((s, m, n)), np.zeros((m, m)), np.zeros((m, m))
     pivots, C, lam, mu = np.zeros(m, dtype=np.int64), np.zeros(m), np.zeros((s, m)), np.zeros((s, m))
@@ -343,7 +343,7 @@ def run(  # type: ignore[no-untyped-def]
     w.M[:, :] = 0.0
     f.mass(where[T], state[:n], f.p, w.M)
     cholesky(w.M)
-    states = np.zeros((4, state.size))  # beginning, end by one step, half way, end by two
+    states = np.zeros((4, state.size))  # start, end by one step, middle, end by two half steps
     made = 0
     while made < rows.shape[0] and where[T] < t1:
         t, h = where[T], where[H]

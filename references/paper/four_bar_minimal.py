@@ -1,11 +1,11 @@
-"""The four-bar linkage with one degree of freedom: a truth that shares nothing with the absolute coordinates.
+"""The four-bar linkage with one degree of freedom: a reference independent of the absolute coordinates.
 
 The three angles (th1, th2, th3) of a closed loop move along a curve. Its tangent is the cross product of the two
 gradients of the loop closure,
 
     N = (L2 L3 sin(th3 - th2), L3 L1 sin(th1 - th3), L1 L2 sin(th2 - th1)),
 
-which vanishes only where all three bars are in line, so that no angle has to be singled out as the independent one.
+which vanishes only if all three bars are collinear, so that no angle has to be chosen as the independent one.
 With th' = N u and the kinetic energy m(th) u^2 / 2, the motion is one scalar equation for u.
 """
 
@@ -22,17 +22,17 @@ from twoloop.checks.arguments import check_finite, check_positive, check_real, c
 from twoloop.problem.problem import Array
 
 RTOL, ATOL = 1e-13, 1e-14
-STEPS = 400  # least number of steps over half a period; the interpolant is then as good as the steps
-LONGEST = 1000.0  # s; a linkage that has not come to rest by then started too near an equilibrium
-MOST_EVALUATIONS = 200_000  # of the equation of motion, each of the two times; about 10 s of time
+STEPS = 400  # smallest number of steps per half period, so that the interpolant is as accurate as the steps
+LONGEST = 1000.0  # s; a linkage not at rest by then started too near an equilibrium
+MOST_EVALUATIONS = 200_000  # evaluations of the equation of motion per integration; about 10 s
 
 
 class MinimalFourBar:
     """Motion of a four-bar linkage of uniform rods, released from rest under gravity.
 
-    Such a motion is periodic: it swings between two positions of rest, and back the same way. Half a period is
-    integrated (DOP853, rtol 1e-13) and all other times are folded into it, so the error grows only by the number of
-    periods times the error of the period (about 1e-15 s): after 100 s about 1e-12.
+    The motion is periodic: it swings back and forth between two positions of rest. Half a period is integrated (DOP853,
+    rtol 1e-13) and all other times are mapped to it, so the error grows only with the number of periods times the error
+    of the period (about 1e-15 s): after 100 s about 1e-12.
 
     Parameters
     ----------
@@ -45,7 +45,7 @@ class MinimalFourBar:
     branch : {-1, 1}
         1: joint 1-2 lies above the line from O to joint 2-3; -1: below.
     density : float or (float, float, float)
-        Mass per length of the rods, or of each, kg/m.
+        Mass per length of all rods, or of each rod, kg/m.
     gravity : float
         m/s^2, along -y.
 
@@ -54,8 +54,8 @@ class MinimalFourBar:
     period : float
         Period of the motion, s.
 
-    Raises TypeError or ValueError if an argument is wrong; if the linkage cannot be assembled, starts in equilibrium or
-    singular, does not come to rest again within `LONGEST`, or takes more than `MOST_EVALUATIONS` to get there.
+    Raises TypeError or ValueError if an argument is invalid, the linkage cannot be assembled, starts in equilibrium or
+    at a singular position, does not come to rest within `LONGEST`, or needs more than `MOST_EVALUATIONS`.
     """
 
     def __init__(
@@ -89,17 +89,17 @@ class MinimalFourBar:
 
     @classmethod
     def from_parameters(cls, parameters: Mapping[str, Any]) -> "MinimalFourBar":
-        """Make the linkage of `four_bar(...).parameters`: L1, L2, L3, L, theta3, branch, density, gravity."""
+        """Return the linkage of `four_bar(...).parameters`: L1, L2, L3, L, theta3, branch, density, gravity."""
         p = parameters
         return cls((p["L1"], p["L2"], p["L3"]), p["L"], p["theta3"], p["branch"], p["density"], p["gravity"])
 
     def states(self, times: ArrayLike) -> tuple[Array, Array]:
-        """Absolute coordinates and velocities at any times.
+        """Return absolute coordinates and velocities at any times.
 
         Parameters
         ----------
         times : array_like (n_t,)
-            s, any sign and order.
+            Times, s, in any order, possibly negative.
 
         Returns
         -------
@@ -142,17 +142,17 @@ class MinimalFourBar:
         return fine
 
     def coordinates(self, state: Array) -> Array:
-        """Absolute coordinates (9,) of a state [th1, th2, th3, u]."""
+        """Return absolute coordinates (9,) of a state [th1, th2, th3, u]."""
         return absolute(self._lengths, state[:3], self.tangent(state) * state[3])[0]
 
     def tangent(self, state: Array) -> Array:
-        """Rates of the three angles of a state over its u."""
+        """Return the rates of the three angles of a state divided by u."""
         return tangent_of(self._lengths, state[:3])
 
     def rate(self, t: float, state: Array, torque: float = 0.0) -> Array:
-        """(th', u') from Lagrange's equation for u, with a torque on the first bar.
+        """Return (th', u') from Lagrange's equation for u, with a torque on the first bar.
 
-        x and y are the centres' displacements along the tangent.
+        x and y are the displacements of the centres along the tangent.
         """
         L, masses = self._lengths, self._masses
         angles, u = state[:3], state[3]
@@ -168,18 +168,18 @@ class MinimalFourBar:
 
 
 def trajectory(parameters: Mapping[str, Any], times: ArrayLike) -> tuple[Array, Array]:
-    """States of the linkage of `four_bar(...).parameters` at `times`; see `MinimalFourBar.states`."""
+    """Return states of the linkage of `four_bar(...).parameters` at `times`; see `MinimalFourBar.states`."""
     return _linkage(tuple(sorted(parameters.items()))).states(times)
 
 
 @lru_cache(maxsize=64)
 def _linkage(parameters: tuple[tuple[str, Any], ...]) -> MinimalFourBar:
-    """Integrate the motion once for all times that are asked of it."""
+    """Return the linkage, integrated once."""
     return MinimalFourBar.from_parameters(dict(parameters))
 
 
 def _counted(rate: Callable[[float, Array], Array]) -> Callable[[float, Array], Array]:
-    """Return the same function, which ends with an error where SciPy's integrator would go on without end."""
+    """Return the function with a limit on its evaluations, because SciPy's integrator might never stop."""
     count = 0
 
     def counted(t: float, state: Array) -> Array:
@@ -199,7 +199,7 @@ def _counted(rate: Callable[[float, Array], Array]) -> Callable[[float, Array], 
 
 
 def absolute(lengths: Array, angles: Array, rates: Array) -> tuple[Array, Array]:
-    """Absolute coordinates and velocities (9,) or (9, n) of a chain of bars with these angles and their rates."""
+    """Return absolute coordinates and velocities (9,) or (9, n) of a chain of bars with these angles and rates."""
     q, v = np.empty((9, *angles.shape[1:])), np.empty((9, *angles.shape[1:]))
     q[0::3], q[1::3] = _centres(lengths, np.cos(angles)), _centres(lengths, np.sin(angles))
     v[0::3] = _centres(lengths, -np.sin(angles) * rates)
@@ -209,20 +209,20 @@ def absolute(lengths: Array, angles: Array, rates: Array) -> tuple[Array, Array]
 
 
 def _centres(lengths: Array, directions: Array) -> Array:
-    """One coordinate of the centres of a chain of bars with these direction cosines (3,) or (3, n)."""
+    """Return one coordinate of the centres of a chain of bars with these direction cosines (3,) or (3, n)."""
     bars = lengths.reshape(-1, *(1,) * (directions.ndim - 1)) * directions
     return np.cumsum(bars, axis=0) - 0.5 * bars
 
 
 def tangent_of(lengths: Array, angles: Array) -> Array:
-    """Direction in which the angles can move, (3,) or (3, n)."""
+    """Return the direction in which the angles can move, (3,) or (3, n)."""
     L1, L2, L3 = lengths
     th1, th2, th3 = angles
     return np.array([L2 * L3 * np.sin(th3 - th2), L3 * L1 * np.sin(th1 - th3), L1 * L2 * np.sin(th2 - th1)])
 
 
 def _tangent_rate(lengths: Array, angles: Array, n: Array) -> Array:
-    """Differentiate the tangent along itself, (3,)."""
+    """Return the derivative of the tangent along itself, (3,)."""
     L1, L2, L3 = lengths
     th1, th2, th3 = angles
     areas = np.array([L2 * L3 * np.cos(th3 - th2), L3 * L1 * np.cos(th1 - th3), L1 * L2 * np.cos(th2 - th1)])
@@ -230,7 +230,7 @@ def _tangent_rate(lengths: Array, angles: Array, n: Array) -> Array:
 
 
 def _assemble(lengths: Array, ground: float, theta3: float, branch: int) -> Array:
-    """Find the three angles: joint 1-2 is where the circles about O and about joint 2-3 meet."""
+    """Return the three angles; joint 1-2 is the intersection of the circles about O and joint 2-3."""
     L1, L2, L3 = lengths
     joint = complex(ground, 0.0) - L3 * complex(math.cos(theta3), math.sin(theta3))
     distance = abs(joint)

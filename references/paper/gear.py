@@ -1,9 +1,9 @@
-"""Backward differentiation with a fixed step and order on the index-3 form: the stand-in for ADAMS GSTIFF.
+"""BDF with a fixed step and order on the index-3 form, as a substitute for ADAMS GSTIFF.
 
-ADAMS is not at hand. What it calls GSTIFF is Gear's method on the index-3 equations in variable order and step, with
-fixed coefficients and its own error test and starting procedure. This is a stand-in for it, not a copy: the same
-formulas and the same equations, at a step and an order that stay as they are given, as a run with HMAX = HINIT is
-meant. Numbers from here say what such formulas do; they are not numbers of ADAMS.
+ADAMS is not available. Its GSTIFF is Gear's method on the index-3 equations with variable order and step, fixed
+coefficients, and its own error test and starting procedure. This is a substitute, not a copy: the same formulas and
+equations with a fixed step and order, as intended by HMAX = HINIT. Its numbers show the behaviour of such formulas;
+they are not numbers of ADAMS.
 """
 
 import math
@@ -31,12 +31,12 @@ HIGHEST = 6  # BDF of order 7 is unstable for any step
 
 START_TOLERANCE = 1e-12
 MAX_NEWTON = 10
-NEWTON_TOL = 1e-12  # the last correction of a coordinate, relative to max(1, |q|)
-SLOW = 0.1  # a correction that is not this much smaller than the last one asks for a new Newton matrix
-DIFFERENCE = 1e-7  # displacement for the derivatives of the residual, relative to max(1, |q|)
-FIRST_STEPS = 100  # of the first call of the compiled loop
-CALL = 0.05  # s; the steps of a call are doubled until one takes that long, for a call itself costs some 0.1 ms
-WHOLE = 1e-6  # how far, in steps, the length of t_span may be from a whole number of them
+NEWTON_TOL = 1e-12  # correction of a coordinate at convergence, relative to max(1, |q|)
+SLOW = 0.1  # larger ratios of successive corrections trigger a new Newton matrix
+DIFFERENCE = 1e-7  # step of finite differences of the residual, relative to max(1, |q|)
+FIRST_STEPS = 100  # steps of the first call of the compiled loop
+CALL = 0.05  # s; the number of steps per call is doubled up to this time, because a call costs 0.1 ms
+WHOLE = 1e-6  # tolerance, in steps, of the test that t_span is a multiple of the step
 
 DONE, NOT_CONVERGED, SINGULAR, NOT_FINITE = range(4)
 _REASONS = {
@@ -44,17 +44,17 @@ _REASONS = {
     SINGULAR: "Newton's matrix is singular",
     NOT_FINITE: "Newton's method meets values that are not finite",
 }
-NEWTON, MATRICES, STEPS, STORED, N_COUNTERS = range(5)  # places in the counters
+NEWTON, MATRICES, STEPS, STORED, N_COUNTERS = range(5)  # indices of the counters
 _I8, _F8 = types.int64, types.float64
 _INTEGRATE = _I8(*(KIT, _I8, MATRIX, MATRIX, _I8, _I8, _F8, _F8, _I8, MATRIX, INTEGERS, MATRIX, INTEGERS))
 
 
 @adapter(velocity_rows=False)
 def solve_gear(task: Task, step: float, order: int = 2, *, start: str = "ramp") -> Result:
-    """Integrate the index-3 equations by BDF with a fixed step and order: the stand-in for ADAMS GSTIFF.
+    """Integrate the index-3 equations by BDF with a fixed step and order, as a substitute for ADAMS GSTIFF.
 
     At t_{n+1} the unknowns q, v and lam satisfy q' = v and M v' + C_q^T lam = Q, with q' and v' by the backward
-    differentiation formula of the order, and C = 0. Neither C_q v + C_t = 0 nor C_q a = Q_d is asked for.
+    differentiation formula of the order, and C = 0. Neither C_q v + C_t = 0 nor C_q a = Q_d is imposed.
 
     Parameters
     ----------
@@ -63,42 +63,39 @@ def solve_gear(task: Task, step: float, order: int = 2, *, start: str = "ramp") 
     order : int
         1 to 6.
     start : {"ramp", "accurate"}
-        Where the first `order` states come from.
+        Computation of the first `order` states.
 
-        "ramp": the order grows from 1 by one a step, as in Gear's codes (C. W. Gear, Commun. ACM 14 (1971) 176-179),
-        GSTIFF among them. Those choose a small first step; here the first step is as long as the others, and the
-        start costs an error of order 2 in the step, whatever the order. Where the start is not at rest, the first
-        few multipliers and accelerations are wrong by what does not vanish with the step: after the first step the
-        centripetal part of them is half of what it should be.
+        "ramp": the order increases from 1 by one per step, as in Gear's codes (C. W. Gear, Commun. ACM 14 (1971)
+        176-179) including GSTIFF. These choose a small first step; here all steps are equal, so the start causes an
+        error of order 2 in the step for any order. Unless the start is at rest, the first few multipliers and
+        accelerations have errors that do not vanish with the step: after the first step their centripetal part is half
+        of the correct value.
 
-        "accurate": by `solve_index1` with projection and tolerances 1e-12, what a start under tight error control
-        would give. Not counted in cpu_time. Shows the error of the formula alone.
+        "accurate": by `solve_index1` with projection and tolerances of 1e-12, like a start with tight error control, to
+        show the error of the formula alone. Not included in cpu_time.
     others : see `references.driver`
-        t_span is a whole number of steps long; t_eval, of which None is every step, holds multiples of the step from
-        t_span[0] on. The clock is looked at about every `CALL` seconds.
+        t_span must be a multiple of the step; t_eval (None: every step) contains multiples of the step after
+        t_span[0]. The clock is checked about every `CALL` seconds.
 
     Returns
     -------
     Result
-        `a` is the BDF derivative of v, `lam` (with the sign of M a + C_q^T lam = Q) what Newton's method found; in the
-        states of the start that no formula made, both are those of eq. (6). `h` holds all steps made. Of the
-        statistics: n_accepted, n_outer (Newton iterations) and n_factorizations (Newton matrices, their derivatives by
-        differences). When Newton's method fails, the text has the time. A run that reaches the end may be wrong:
-        nothing controls the error. At small steps an undamped motion loses energy at the orders 1, 2, 5 and 6 and gains
-        it at 3 and 4.
+        `a` is the BDF derivative of v, `lam` (with the sign of M a + C_q^T lam = Q) the solution of Newton's method; at
+        starting states not computed by a formula, both are from eq. (6). `h` contains all steps. Statistics:
+        n_accepted, n_outer (Newton iterations) and n_factorizations (Newton matrices, by finite differences). If
+        Newton's method fails, the message contains the time. A completed run may be wrong, because the error is not
+        controlled. At small steps an undamped motion loses energy with orders 1, 2, 5 and 6, and gains it with 3 and 4.
 
     Notes
     -----
-    With q = q* + h b v and v = v* + h b a, where q* and v* are combinations of the past and b is the formula's
-    coefficient, v and a follow from q; the equation of motion is multiplied by (h b)^2, and (h b)^2 lam is the unknown.
-    Newton's matrix [[M + O(h), C_q^T], [C_q, 0]] then has a condition number that does not grow as h becomes small.
+    With q = q* + h b v and v = v* + h b a, where q* and v* are combinations of past values and b is the coefficient of
+    the formula, v and a follow from q; the equation of motion is multiplied by (h b)^2, and (h b)^2 lam is the unknown.
+    The condition number of Newton's matrix [[M + O(h), C_q^T], [C_q, 0]] is then bounded as h tends to zero.
     """
     system, n, t0, length = task.system, task.system.n_q, task.t0, task.t1 - task.t0
     n_steps = round(length / step)
     if n_steps < 1 or abs(length / step - n_steps) > WHOLE:
-        raise ValueError(
-            f"step must go a whole number of times into t_span, whose length is {length!r}; given {step!r}"
-        )
+        raise ValueError(f"step must divide t_span, whose length is {length!r}, into whole steps; given {step!r}")
     if check_size("order", order, 1) > HIGHEST:
         raise ValueError(f"order must be at most {HIGHEST}, BDF of higher order is unstable; given {order}")
     check_choice("start", start, tuple(STARTS))
@@ -136,7 +133,7 @@ def solve_gear(task: Task, step: float, order: int = 2, *, start: str = "ramp") 
 
 
 def _first_states(task: Task, times: Array) -> Result:
-    """States at the first times; of a failed run those before its failure."""
+    """Return the states at the first times; for a failed run those before its failure."""
     if times.size == 1:
         return task.result("the start", times, task.y0[:, None])
     options: dict[str, Any] = {"stabilisation": "projection", "t_eval": times, "time_limit": task.time_limit}
@@ -145,7 +142,7 @@ def _first_states(task: Task, times: Array) -> Result:
 
 
 def _formulas() -> Array:
-    """Coefficients of orders 1 to 6, a row each: b and alpha_i, then the weights that extrapolate from k past values.
+    """Return the coefficients of orders 1 to 6, one row each: b and alpha_i, then weights of extrapolation.
 
     y_0 = h b y'_0 + sum_i alpha_i y_-i, from sum_{j=1}^k 1/j nabla^j y_0 = h y'_0 (Hairer, Norsett & Wanner I, III.1).
     """
@@ -171,7 +168,7 @@ class _Space(NamedTuple):
 
 @njit(error_model="numpy")
 def _residual(f, w, t, q, forces, q_past, v_past, hb, r):  # type: ignore[no-untyped-def]
-    """r = [(h b)^2 (M a - Q) + C_q^T forces, C] at q, with v left in w.v and C_q in w.Cq."""
+    """Compute r = [(h b)^2 (M a - Q) + C_q^T forces, C] at q, leaving v in w.v and C_q in w.Cq."""
     n, m = q.size, forces.size
     w.M[:, :] = 0.0
     w.Cq[:, :] = 0.0
@@ -195,7 +192,7 @@ def _residual(f, w, t, q, forces, q_past, v_past, hb, r):  # type: ignore[no-unt
 
 @njit(error_model="numpy")
 def _matrix(f, w, t, q, forces, q_past, v_past, hb, r, there, J):  # type: ignore[no-untyped-def]
-    """Derivative of the residual r by [q, forces]; those of the equation of motion by q by differences."""
+    """Compute the derivative of the residual r with respect to [q, forces], partly by differences."""
     n, m = q.size, forces.size
     J[:, :] = 0.0
     for k in range(m):
@@ -214,7 +211,7 @@ def _matrix(f, w, t, q, forces, q_past, v_past, hb, r, there, J):  # type: ignor
 
 @njit(error_model="numpy")
 def _newton(f, w, t, q, forces, q_past, v_past, hb, r, there, J, pivots, counters):  # type: ignore[no-untyped-def]
-    """Solve for q and forces = (h b)^2 lam, from what they hold; return DONE or why not."""
+    """Solve for q and forces = (h b)^2 lam from their initial values; return DONE or an error code."""
     n = q.size
     before, renew = np.inf, True
     for _ in range(MAX_NEWTON):
@@ -246,9 +243,9 @@ def _newton(f, w, t, q, forces, q_past, v_past, hb, r, there, J, pivots, counter
 def _integrate(  # type: ignore[no-untyped-def]
     f, n, given, past, first, last, t0, h, order, formulas, keep, rows, counters
 ):
-    """Steps `first` to `last`; `keep` holds the numbers of those to store.
+    """Take steps `first` to `last` and store those numbered in `keep`.
 
-    `given`, `past` and `rows` hold states [q v a lam]: of the start, of step i in row i % HIGHEST, those stored.
+    `given`, `past` and `rows` contain states [q v a lam]: of the start; of step i in row i % HIGHEST; those stored.
     """
     m = given.shape[1] - 3 * n
     w = _Space(np.zeros((n, n)), np.zeros((m, n)), np.zeros(n), np.zeros(m), np.zeros(n))

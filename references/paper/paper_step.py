@@ -1,4 +1,4 @@
-"""The paper's equations and its outer loop in plain NumPy, apart from the kernels, to look inside a single step."""
+"""The paper's equations and outer loop in plain NumPy, independent of the kernels, for the analysis of single steps."""
 
 from dataclasses import dataclass
 
@@ -13,11 +13,11 @@ from twoloop.problem.problem import Array
 NEWTON_TOL = 1e-14
 MAX_NEWTON = 30
 MAX_ITERATIONS = 200  # as in the kernel
-HOPELESS = 1e6  # a change from one iteration to the next beyond which nothing converges any more
+HOPELESS = 1e6  # a change per iteration above this means divergence
 
 
 def true_states(problem: Problem, n: int) -> list[tuple[float, Array, Array]]:
-    """Times and true states of a linkage at n phases of a period, rest left out."""
+    """Return times and exact states of a linkage at n phases of a period, without rest positions."""
     truth = MinimalFourBar.from_parameters(problem.parameters)
     t = truth.period * (np.arange(n) + 0.37) / n
     q, v = truth.states(t)
@@ -25,7 +25,7 @@ def true_states(problem: Problem, n: int) -> list[tuple[float, Array, Array]]:
 
 
 def independents(jacobian: Array) -> list[int]:
-    """Gauss elimination with full pivoting: the columns that hold no pivot are the independent coordinates."""
+    """Return the independent coordinates: the columns without pivots in Gaussian elimination with full pivoting."""
     matrix, columns = jacobian.copy(), list(range(jacobian.shape[1]))
     for k in range(len(matrix)):
         row, column = (int(place) for place in np.unravel_index(np.abs(matrix[k:, k:]).argmax(), matrix[k:, k:].shape))
@@ -37,12 +37,12 @@ def independents(jacobian: Array) -> list[int]:
 
 
 def choice(n_q: int, independent: list[int]) -> Array:
-    """I_in of (14), (15)."""
+    """Return I_in of (14), (15)."""
     return np.eye(n_q)[independent]
 
 
 def kkt(system: ConstrainedSystem, t: float, q: Array, v: Array) -> tuple[Array, Array]:
-    """Accelerations and multipliers from (6), solved whole."""
+    """Return accelerations and multipliers from (6), solved as a whole."""
     jacobian = system.jacobian(t, q)
     zero = np.zeros((system.n_c, system.n_c))
     matrix = np.block([[system.mass(t, q), jacobian.T], [jacobian, zero]])
@@ -57,9 +57,9 @@ class Step:
     Attributes
     ----------
     A_stage, V_stage : ndarray (s, n_q)
-        The stages' K = [a, v].
+        Stage derivatives K = [a, v].
     q1, v1 : ndarray (n_q,)
-        End of the step after the last iteration, on the constraints.
+        End of the step after the last iteration, satisfying the constraints.
     """
 
     system: ConstrainedSystem
@@ -79,13 +79,13 @@ class Step:
         self.A_stage, self.V_stage = np.tile(a1, (stages, 1)), np.tile(self.v1, (stages, 1))
 
     def continue_from(self, before: "Step") -> None:
-        """Predict the stages from those of the step before, by the polynomial through them, instead of by Euler."""
+        """Predict the stages by extrapolating the collocation polynomial of the previous step, instead of by Euler."""
         x, c = (before.h + self.h * self.tableau.c) / before.h, self.tableau.c
         weights = np.linalg.solve(np.vander(c).T, np.vander(x, len(c)).T).T
         self.A_stage, self.V_stage = weights @ before.A_stage, weights @ before.V_stage
 
     def dependents(self, t: float, q: Array, v: Array) -> tuple[Array, Array]:
-        """Dependent positions by (15), dependent velocities by (14)."""
+        """Return dependent positions by (15) and dependent velocities by (14)."""
         q = q.copy()
         for _ in range(MAX_NEWTON):
             matrix = np.vstack([self.system.jacobian(t, q), self.I_in])
@@ -99,7 +99,7 @@ class Step:
         return q, v
 
     def iterate(self) -> tuple[float, float]:
-        """One iteration, stage after stage; the change of all coordinates by (32), corrected, and the norm of (33)."""
+        """Perform one iteration, stage by stage; return the change by (32), corrected, and the norm of (33)."""
         old = np.concatenate([self.q1, self.v1])
         A, b, c = self.tableau.A, self.tableau.b, self.tableau.c
         for j in range(self.tableau.stages):
@@ -112,14 +112,14 @@ class Step:
         return float(np.max(np.abs(new - old) / np.maximum(np.abs(new), 1.0))), float(np.linalg.norm(new - old))
 
     def _moved(self, weights: Array) -> tuple[Array, Array]:
-        """y_n + h sum(weights K) for the independents; the others stay at the beginning of the step."""
+        """Return y_n + h sum(weights K) for the independents; the others keep their values at the start of the step."""
         q, v, i = self.q.copy(), self.v.copy(), self.independent
         q[i] += self.h * weights @ self.V_stage[:, i]
         v[i] += self.h * weights @ self.A_stage[:, i]
         return q, v
 
     def converge(self, tolerance: float) -> int | None:
-        """Iterate until (32) holds, which takes so many iterations; None: it does not, whatever (33) says."""
+        """Iterate until (32) holds and return the number of iterations; None if it does not converge."""
         for n in range(1, MAX_ITERATIONS + 1):
             try:
                 change, size = self.iterate()
@@ -135,7 +135,7 @@ class Step:
 def advance(
     system: ConstrainedSystem, tableau: Tableau, t: float, h: float, q: Array, v: Array, n: int, tolerance: float
 ) -> tuple[Array, int]:
-    """State [q, v] after n steps that cover h together, and how many iterations they took.
+    """Return the state [q, v] after n steps that cover h together, and the number of iterations.
 
     Raises RuntimeError if a step does not converge.
     """

@@ -1,1 +1,1 @@
-"""SciPy's solvers and those with its interface, on the index-1 form or on the equations as they are."""
+"""SciPy's solvers and solvers with its interface, on the index-1 form or on the implicit equations."""

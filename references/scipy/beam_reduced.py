@@ -1,7 +1,7 @@
-"""The beam on its moving base without constraints: the base's two coordinates put in, the others by SciPy's DOP853.
+"""The beam on its moving base without constraints: the motion of the base is substituted, the rest solved by DOP853.
 
-It shares the force and the mass of the beam with `twoloop`, and nothing else: no constraints, no multipliers, no
-partition, and another integrator.
+Only the forces and the mass of the beam are shared with `twoloop`: there are no constraints, multipliers or
+partitions, and the integrator is a different one.
 """
 
 import math
@@ -18,14 +18,14 @@ from twoloop.problem.problem import Array
 
 
 def reduced_motion(problem: Problem, t_eval: ArrayLike, tol: float) -> tuple[Array, Array]:
-    """Coordinates and velocities of an `ancf_beam`, integrated without its constraints.
+    """Return coordinates and velocities of an `ancf_beam`, integrated without its constraints.
 
     Parameters
     ----------
     problem : Problem
-        From `twoloop.mechanisms.ancf_beam`.
+        Problem of `twoloop.mechanisms.ancf_beam`.
     t_eval : array_like (n_t,)
-        Increasing times, s, from 0 on; steps are not shortened to land on them.
+        Increasing times from 0, s; output by interpolation.
     tol : float
         rtol = atol, for coordinates and velocities.
 
@@ -33,8 +33,7 @@ def reduced_motion(problem: Problem, t_eval: ArrayLike, tol: float) -> tuple[Arr
     -------
     q, v : ndarray (n_q, n_t)
 
-    Raises TypeError or ValueError if an argument is wrong. Raises RuntimeError if DOP853 fails or cannot start: an
-    incomplete reference is of no use.
+    Raises TypeError or ValueError if an argument is invalid. Raises RuntimeError if DOP853 fails or cannot start.
     """
     check_problem(problem, "angular_frequency", "a beam of ancf_beam, on a moving base")
     check_positive("tol", tol)
@@ -48,7 +47,7 @@ def reduced_motion(problem: Problem, t_eval: ArrayLike, tol: float) -> tuple[Arr
         return _rate(t, y, force, p, fixed)  # type: ignore[no-any-return]
 
     y0, run = np.concatenate([problem.q0[2:], problem.v0[2:]]), f"DOP853 with rtol = atol = {tol:g} on {problem.name}"
-    if not np.isfinite(rate(0.0, y0)).all():  # SciPy's first step would be NaN, and tried without end
+    if not np.isfinite(rate(0.0, y0)).all():  # SciPy would try a first step of NaN forever
         raise RuntimeError(f"{run} cannot start: the accelerations are not finite")
     solution = solve_ivp(rate, (0.0, times[-1]), y0, "DOP853", times, rtol=tol, atol=tol)
     if not solution.success:
@@ -60,7 +59,7 @@ def reduced_motion(problem: Problem, t_eval: ArrayLike, tol: float) -> tuple[Arr
 
 @njit
 def _rate(t, y, force, p, fixed):  # type: ignore[no-untyped-def]
-    """y' of y = [q, v] without the base's coordinates."""
+    """Return y' of y = [q, v] without the coordinates of the base."""
     inverse, coupling, amplitude, frequency = fixed
     n = coupling.size + 2
     q, v, Q = np.zeros(n), np.zeros(n), np.zeros(n)

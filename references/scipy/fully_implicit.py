@@ -1,7 +1,7 @@
 """Radau IIA and BDF for F(t, y, y') = 0 of the package solve_dae (J. Breuling), on any ConstrainedSystem.
 
-The equations are those of `sundials.residual` in the form "stabilised", residual and Jacobian compiled by it; the
-methods are Python. The package is optional: `pip install solve_dae`, or the extra `peers` of this project.
+The equations are those of `sundials.residual` in the form "stabilised", with compiled residual and Jacobian; the
+methods are in Python. The package is optional: `pip install solve_dae`, or the extra `peers` of this project.
 """
 
 import time
@@ -18,20 +18,20 @@ from twoloop.checks.arguments import check_choice
 from twoloop.problem.problem import Array
 from twoloop.result.result import Result
 
-# of the span. From a start at rest the package's own first step is 1e-6 of it, so short that the rounding of C over it
-# is more than Newton's test asks of the multipliers' integrals; a step that does not converge is halved, and is worse
+# relative to the span. From rest the package chooses 1e-6 of it, where rounding errors of C divided by the step exceed
+# Newton's tolerance for the integrals of the multipliers; halving the step after a failure makes it worse
 FIRST_STEP = 1e-3
 METHODS: dict[str, dict[str, int]] = {"Radau": {"stages": 3}, "Radau9": {"stages": 5}, "BDF": {}}
 
 
 @adapter(velocity_rows=False, independent_rows=True)
 def solve_fully_implicit(task: Task, method: str = "Radau", rtol: float = 1e-8, atol: float = 1e-8) -> Result:
-    """Integrate a constrained mechanical system with a method of the package solve_dae.
+    """Integrate a constrained mechanical system by a method of the package solve_dae.
 
     Parameters
     ----------
     method : {"Radau", "Radau9", "BDF"}
-        Radau IIA of 3 stages (order 5) or 5 stages (order 9), or BDF of orders 1 to 5 with NDF coefficients.
+        Radau IIA with 3 stages (order 5) or 5 stages (order 9), or BDF of orders 1 to 5 with NDF coefficients.
     rtol, atol : float
         Tolerances of all unknowns: q, v and the integrals Lam, Mu of the multipliers.
     others : see `references.driver`
@@ -40,8 +40,8 @@ def solve_fully_implicit(task: Task, method: str = "Radau", rtol: float = 1e-8, 
     Returns
     -------
     Result
-        `a` and `lam` are derivatives of unknowns; between steps those of the interpolant. `h` holds all accepted steps.
-        Of the statistics: n_accepted, n_evaluations (residuals, without those of the difference Jacobian) and
+        `a` and `lam` are derivatives of unknowns, between steps those of the interpolant. `h` contains all accepted
+        steps. Statistics: n_accepted, n_evaluations (residuals, without those of the difference Jacobian) and
         n_factorizations.
     """
     check_choice("method", method, tuple(METHODS))
@@ -66,7 +66,7 @@ def solve_fully_implicit(task: Task, method: str = "Radau", rtol: float = 1e-8, 
 
 
 class Functions:
-    """F(t, y, y') and its derivatives as the package calls them."""
+    """F(t, y, y') and its derivatives in the signatures of the package."""
 
     def __init__(self, task: Task):
         self.form, self.matrix = (form := Implicit(task, "stabilised")), form.matrix
@@ -75,11 +75,11 @@ class Functions:
         self.jacobians(task.t0, *form.start)
 
     def residual(self, limit: TimeLimit) -> Callable[[float, Array, Array], Array]:
-        """F, which looks at the clock."""
+        """Return F with a check of the time limit."""
         residual, space = self.form.residual, self.form.space[:3]
 
         def function(t: float, y: Array, yp: Array) -> Array:
-            if time.monotonic() > limit.deadline:  # a call of `limit` would be 3 % of an evaluation
+            if time.monotonic() > limit.deadline:  # inlined: calling `limit` would cost 3 % of an evaluation
                 limit.check()
             out = np.empty_like(y)
             try:
@@ -92,11 +92,11 @@ class Functions:
         return function
 
     def jacobians(self, t: float, y: Array, yp: Array) -> tuple[Array, Array]:
-        """dF/dy, which is differenced, and dF/dy', which is M, C_q^T and ones."""
+        """Return dF/dy, by differences, and dF/dy', which consists of M, C_q^T and ones."""
         (n, m), (by_y, by_yp) = self.form.sizes, np.zeros((2, y.size, y.size))
         try:
             self.matrix(t, 0.0, y, yp, *self.form.space, by_y.T)
-            self.form.residual(t, y, yp, *self.form.space[:3], np.empty_like(y))  # leaves M and C_q as they are at y
+            self.form.residual(t, y, yp, *self.form.space[:3], np.empty_like(y))  # evaluates M and C_q at y
         except BaseException:
             self.raised = True
             raise

@@ -1,7 +1,7 @@
-"""SciPy's solvers on the index-1 ODE y = [q, v] of any ConstrainedSystem: plain, Baumgarte's, or with projection.
+"""SciPy's solvers on the index-1 ODE y = [q, v] of any ConstrainedSystem: plain, with Baumgarte's terms, or projected.
 
 The accelerations are those of `equations.accelerations`; the right-hand side is compiled, and called from Python once
-an evaluation. Nothing here uses the integrator of twoloop.
+per evaluation. The integrator of twoloop is not used.
 """
 
 import time
@@ -27,10 +27,10 @@ from twoloop.problem.system import ConstrainedSystem
 from twoloop.result.result import Result
 
 METHODS: dict[str, type[OdeSolver]] = {"DOP853": DOP853, "RK45": RK45, "LSODA": LSODA, "Radau": Radau, "BDF": BDF}
-ALPHAS = (1.0, 10.0, 100.0)  # 1/s, of Baumgarte
+ALPHAS = (1.0, 10.0, 100.0)  # 1/s: Baumgarte's parameter
 PAIR = "Pr9"  # explicit Runge-Kutta pair of extensisq (P. J. Prince), of orders 9(8)
-IMPLICIT = ("LSODA", "Radau", "BDF")  # wholly, or where the problem is stiff
-ONE_STEP = ("DOP853", "RK45")  # explicit, and nothing of them but y and f outlives a step: they can be projected
+IMPLICIT = ("LSODA", "Radau", "BDF")  # always, or for stiff problems
+ONE_STEP = ("DOP853", "RK45")  # explicit, with no state but y and f between steps, so projection is possible
 STABILISATIONS = {
     "none": "C_q a = Q_d; drifts off the constraints",
     "baumgarte": "C_q a = Q_d - 2 alpha (C_q v + C_t) - alpha^2 C (Baumgarte 1972)",
@@ -38,7 +38,7 @@ STABILISATIONS = {
 }
 ALPHA = 10.0  # 1/s, see solve_index1
 
-PROJECTED = 1e-10  # correction of q, relative to max(1, |q|), at which a projection ends: what is left is its square
+PROJECTED = 1e-10  # correction of q at convergence, relative to max(1, |q|); the remaining error is its square
 MAX_PROJECTIONS = 10  # Newton iterations of a projection
 
 
@@ -53,50 +53,50 @@ def solve_index1(
     alpha: float | None = None,
     max_step: float | None = None,
 ) -> Result:
-    """Integrate a constrained mechanical system as the ODE q' = v, v' = a(t, q, v) with one of SciPy's solvers.
+    """Integrate a constrained mechanical system as the ODE q' = v, v' = a(t, q, v) by one of SciPy's solvers.
 
     Parameters
     ----------
     method : {"DOP853", "RK45", "LSODA", "Radau", "BDF", "Pr9"}
         The solver of `scipy.integrate`, or of extensisq (`PAIR`: on the four-bar the best of its pairs at tight
-        tolerances). The implicit ones get the analytic Jacobian as straight-line code, where the equations
-        can be had as expressions of up to `straight_line.MOST_OPERATIONS`, without Baumgarte's terms; else they
-        difference the right-hand side.
+        tolerances). The implicit ones get the analytic Jacobian as straight-line code, if the equations have at most
+        `straight_line.MOST_OPERATIONS` operations as expressions, without Baumgarte's terms; otherwise they use finite
+        differences.
     stabilisation : {"none", "baumgarte", "projection"}
-        `STABILISATIONS` describes each in a line fit for a table.
+        `STABILISATIONS` has a description of each for tables.
 
-        "baumgarte": J. Baumgarte, Comput. Methods Appl. Mech. Eng. 1 (1972) 1-16. Of his two parameters, in
-        C'' + 2 alpha C' + beta^2 C = 0, beta = alpha, so that a violation decays as (1 + alpha t) exp(-alpha t),
-        without oscillation. It is fed anew by every step, and so stays bounded but does not vanish.
+        "baumgarte": J. Baumgarte, Comput. Methods Appl. Mech. Eng. 1 (1972) 1-16. In
+        C'' + 2 alpha C' + beta^2 C = 0 we set beta = alpha, so that a violation decays as (1 + alpha t) exp(-alpha t),
+        without oscillation. Every step adds to the violation, which is therefore bounded but does not vanish.
 
         "projection": E. Eich, SIAM J. Numer. Anal. 30 (1993) 1467-1482. After every accepted step the positions are
-        moved onto C = 0 by Newton's method, then the velocities onto C_q v + C_t = 0, both by the least change in the
-        norm of the mass matrix; the next step begins with a right-hand side evaluated there (one more evaluation a
-        step). States interpolated to `t_eval` are projected too. Only for "DOP853" and "RK45": the others go on from
-        a history that a projection would have to change with y.
+        projected onto C = 0 by Newton's method, then the velocities onto C_q v + C_t = 0, both orthogonally in the norm
+        of the mass matrix; the next step starts with a right-hand side evaluated there (one more evaluation per step).
+        States interpolated to `t_eval` are projected too. Only for "DOP853" and "RK45": the others keep a history that
+        would have to be projected as well.
     alpha : float, optional
-        Baumgarte's parameter, 1/s; only with stabilisation="baumgarte". None: 10. Nothing tells the right value, for
-        it is a rate of the problem; 1 to 10 is called typical (MapleSim's manual of its exports). On the four-bar
-        linkage (period 2.25 s, DOP853, tolerances 1e-6 and 1e-9, 100 s) 10 costs 21 and 13 % more evaluations than no
-        stabilisation, and its error is 1/300 and 1/35; from 20 on the cost grows with alpha: the ODE becomes stiff.
+        Baumgarte's parameter, 1/s; only with stabilisation="baumgarte". None: 10. The right value is problem-dependent;
+        1 to 10 is typical according to MapleSim's manual of its exports. On the four-bar linkage (period 2.25 s,
+        DOP853, tolerances 1e-6 and 1e-9, 100 s) 10 costs 21 and 13 % more evaluations than no stabilisation, and the
+        error is 1/300 and 1/35; above 20 the cost grows with alpha, because the ODE becomes stiff.
     others : see `references.driver`
         t_eval None: every step.
 
     Returns
     -------
     Result
-        `a` and `lam` computed from the stored q and v as in the right-hand side, so with Baumgarte's terms where they
-        are used. `h` holds all accepted steps. Of the statistics: n_accepted; n_evaluations, all evaluations of the
-        right-hand side, those for a difference Jacobian and after a projection included, those for the interpolant not;
-        n_factorizations, SciPy's LU count, for "Radau" and "BDF".
+        `a` and `lam` are computed from the stored q and v as in the right-hand side, with Baumgarte's terms if used.
+        `h` contains all accepted steps. Statistics: n_accepted; n_evaluations of the right-hand side, including those
+        for difference Jacobians and after projections, excluding those for the interpolant; n_factorizations, SciPy's
+        LU count, for "Radau" and "BDF".
     """
     check_choice("method", method, (*METHODS, PAIR))
     check_choice("stabilisation", stabilisation, tuple(STABILISATIONS))
     projected, damped = stabilisation == "projection", stabilisation == "baumgarte"
     if projected and method not in ONE_STEP:
         raise ValueError(
-            f"stabilisation='projection' needs an explicit one-step method, {' or '.join(ONE_STEP)}: the others carry "
-            f"what a projection does not change from step to step; given method={method!r}"
+            f"stabilisation='projection' needs an explicit one-step method, {' or '.join(ONE_STEP)}: the others keep a "
+            f"history that is not projected; given method={method!r}"
         )
     if alpha is not None:
         check_positive("alpha", alpha)
@@ -128,7 +128,7 @@ def solve_index1(
 
 
 class RightHandSide(Equations):
-    """The ODE of one system as SciPy calls it, and the projection onto its constraints."""
+    """The ODE of one system in SciPy's signature, and the projection onto its constraints."""
 
     def __init__(self, system: ConstrainedSystem, t0: float, q0: Array, alpha: float):
         super().__init__(system, t0, q0)
@@ -140,11 +140,11 @@ class RightHandSide(Equations):
         self.raised = False  # a callback raised an exception
 
     def function(self, limit: TimeLimit) -> Callable[[float, Array], Array]:
-        """y' = f(t, y) as SciPy calls it."""
+        """Return y' = f(t, y) in SciPy's signature."""
         derivative, n_c, alpha = self.derivative, self.system.n_c, self.alpha
         p, factors, known, counters = self.system.functions.p, self.factors, self.known, self.counters
 
-        monotonic, deadline = time.monotonic, limit.deadline  # a call of `limit` would be 3 % of an evaluation
+        monotonic, deadline = time.monotonic, limit.deadline  # inlined: calling `limit` would cost 3 % of an evaluation
 
         def fun(t, y):  # type: ignore[no-untyped-def]
             if monotonic() > deadline:
@@ -158,7 +158,7 @@ class RightHandSide(Equations):
         return fun  # type: ignore[no-any-return]
 
     def jacobian(self, t: float, y: Array) -> Callable[[float, Array], Array] | None:
-        """df/dy as SciPy calls it, compiled; None where it cannot be had, or is too long to be compiled."""
+        """Return df/dy in SciPy's signature, compiled; None if it is not available, or too long to compile."""
         try:
             derivatives = (
                 None if self.alpha > 0.0 else straight_line_jacobian(self.system, t, *map(bytes, np.split(y, 2)))
@@ -177,11 +177,11 @@ class RightHandSide(Equations):
         return jac
 
     def project(self, t: float, y: Array) -> bool:
-        """Move y onto the constraints; False if that does not converge."""
+        """Project y onto the constraints; return False if that does not converge."""
         return bool(self.projection(t, y, self.system.n_c, self.system.functions.p, self.factors, self.known))
 
     def warm(self, t: float, y: Array, projection: bool) -> None:
-        """Compile what the run calls, so that its time does not hold that."""
+        """Compile everything that the run calls, so that it is not timed."""
         self.function(TimeLimit(None))(t, y)
         if projection:
             self.project(t, y.copy())
@@ -190,7 +190,7 @@ class RightHandSide(Equations):
 
 @lru_cache(maxsize=64)
 def _derivative(accelerate: Callable[..., Any]) -> Callable[..., Any]:
-    """(t, y, n_c, alpha, p, factors, known, counters) -> y'."""
+    """Return (t, y, n_c, alpha, p, factors, known, counters) -> y'."""
 
     @kept
     def derivative(t, y, m, alpha, p, factors, known, counters):  # type: ignore[no-untyped-def]
@@ -211,7 +211,7 @@ def _derivative(accelerate: Callable[..., Any]) -> Callable[..., Any]:
 def _projection(
     mass: Dispatcher, constraint: Dispatcher, jacobian: Dispatcher, constraint_rate: Dispatcher
 ) -> Callable[..., Any]:
-    """(t, y, n_c, p, factors, known) -> success; y is projected in place, positions by Newton, then velocities."""
+    """Return (t, y, n_c, p, factors, known) -> success, which projects y in place: positions, then velocities."""
     mass_at = matrix_of(mass)
 
     @kept
@@ -254,7 +254,7 @@ def _projection(
 
 @njit(**OPTIONS)
 def _least_change(L, definite, known, Cq, C, x):  # type: ignore[no-untyped-def]
-    """x -= d of M d + C_q^T mu = 0 and C_q d = C, and the largest change; infinite when that is singular. C is lost."""
+    """Subtract d from x, with M d + C_q^T mu = 0, C_q d = C; return the largest change, inf if singular. Destroys C."""
     change, largest = np.zeros(x.size), 0.0
     if not solve_for(L, definite, known, Cq, change, C):
         return np.inf
@@ -267,7 +267,7 @@ def _least_change(L, definite, known, Cq, C, x):  # type: ignore[no-untyped-def]
 
 
 def baumgarte(method: str, alpha: float) -> str:
-    """Name of one of SciPy's solvers with Baumgarte's stabilisation."""
+    """Return the name of one of SciPy's solvers with Baumgarte's stabilisation."""
     return f"{method}, Baumgarte {alpha:g}"
 
 

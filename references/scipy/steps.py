@@ -1,4 +1,4 @@
-"""The loop over the steps of a solver with SciPy's interface: what it stores, how it ends."""
+"""Time-stepping loop of a solver with SciPy's interface: stored states and termination."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -9,14 +9,14 @@ import numpy as np
 from references.driver import OutOfTimeError, Task, TimeLimit
 from twoloop.problem.problem import Array
 
-SMALLEST_STEP = 10.0  # spacings of the numbers at t: SciPy's own limit, which LSODA alone does not have
+SMALLEST_STEP = 10.0  # units in the last place of t: SciPy's own limit, which LSODA lacks
 
 
 @dataclass
 class Steps:
     """Steps of one run."""
 
-    make: Callable[[TimeLimit], Any]  # limit -> the solver at its start; the limit is looked at in every evaluation
+    make: Callable[[TimeLimit], Any]  # limit -> the solver at its start; the limit is checked in every evaluation
     # t0, start: that start: y, or [y, y']
     t0: float
     start: Array
@@ -24,50 +24,50 @@ class Steps:
     callbacks: Any
     # (t, y) -> whether y, which it moves onto the constraints, is on them
     project: Callable[[float, Array], bool] | None
-    times: Array | None  # when to store the state, by the solver's interpolant; None: at the end of every step
+    times: Array | None  # output times, by the solver's interpolant; None: the end of every step
     limit: TimeLimit
-    ends: list[float] = field(default_factory=list)  # the start, and the ends of the accepted steps, s
+    ends: list[float] = field(default_factory=list)  # start and ends of the accepted steps, s
     stored: list[tuple[float, Array]] = field(default_factory=list)  # times and states: y, or [y, y']
-    failure: str = ""  # why it ended, "": it has not failed
+    failure: str = ""  # error message; "": no failure
     solver: Any = None
 
     @classmethod
     def timed(cls, task: Task, make: Any, start: Array, callbacks: Any, project: Any = None) -> "Steps":
-        """The run whose time is told: it stores every step, or nothing, if the task has times for its output."""
+        """Return the timed run, which stores every step, or nothing if the task has output times."""
         times = None if task.times is None else task.times[:0]
         return cls(make, task.t0, start, callbacks, project, times, TimeLimit(task.time_limit))
 
     @property
     def t(self) -> Array:
-        """When states were stored."""
+        """Return the times of the stored states."""
         return np.array([t for t, _ in self.stored])
 
     @property
     def states(self) -> Array:
-        """The states that were stored, one a column."""
+        """Return the stored states, one per column."""
         return np.array([y for _, y in self.stored]).reshape(-1, self.start.size).T
 
     def go(self) -> None:
-        """Integrate to the solver's end or to a failure."""
+        """Integrate to the end or to a failure."""
         self.ends.append(self.t0)
         if self.times is None or self.t0 in self.times[:1]:
             self.stored.append((self.t0, self.start))
         try:
             self.solver = self.make(self.limit)
-            wanted = self.times.size if self.times is not None and self.times.size else np.inf  # of stored states
+            wanted = self.times.size if self.times is not None and self.times.size else np.inf  # number of output times
             while self.solver.status == "running" and not self.failure and len(self.stored) < wanted:
                 self.failure = self._attempt()
                 if not self.failure:
                     self._accept()
         except OutOfTimeError:
             self.failure = "out of time"
-        except ValueError as error:  # the implicit solvers' linear algebra refuses NaN in this way
+        except ValueError as error:  # raised by the implicit solvers' linear algebra for NaN
             if self.callbacks.raised:
                 raise
             self.failure = str(error)
 
     def again(self, times: Array | None) -> "Steps":
-        """The same steps, untimed, with the states at those of the times that were reached; itself for None."""
+        """Return the same steps, untimed, with the states at the given times that were reached; itself for None."""
         if times is None:
             return self
         given = self.make, self.t0, self.start, self.callbacks, self.project
@@ -78,7 +78,7 @@ class Steps:
         return shown
 
     def message(self, name: str, advice: str) -> str:
-        """What is said of a failure; "" if there was none."""
+        """Return the message of a failure; "" if there was none."""
         if self.limit.exceeded:
             return self.limit.message(name, self.ends[-1], "take looser tolerances or another method")
         failed = f"{name} failed after t = {self.ends[-1]:.10g}: {self.failure.rstrip('.')}. {advice}"
@@ -89,11 +89,11 @@ class Steps:
         return np.concatenate([solver.y, solver.yp]) if hasattr(solver, "yp") else solver.y.copy()
 
     def _attempt(self) -> str:
-        """Make a step, and return why it failed."""
+        """Take a step; return an error message or ""."""
         solver, message = self.solver, self.solver.step()
         if solver.status == "failed":
             return str(message)
-        # LSODA would go on in both cases, without end in the second
+        # LSODA would continue in both cases, forever in the second
         if not np.isfinite(self._state()).all():
             return f"the state at t = {solver.t:.10g} is not finite"
         if solver.status == "running" and solver.t - self.ends[-1] < SMALLEST_STEP * np.spacing(abs(solver.t)):
@@ -101,7 +101,7 @@ class Steps:
         return ""
 
     def _accept(self) -> None:
-        """Project and store what a step gave."""
+        """Project and store the state after a step."""
         solver, t = self.solver, float(self.solver.t)
         due: list[float] = []
         if self.times is not None:
@@ -109,7 +109,7 @@ class Steps:
             due = self.times[first:last].tolist()
         inside = [moment for moment in due if moment != t]
         if inside:
-            # before the projection: the interpolant belongs to the solver's own y and f
+            # before the projection, because the interpolant depends on the solver's own y and f
             interpolant = solver.dense_output()
             for moment in inside:
                 state = np.array(interpolant(moment)).ravel()

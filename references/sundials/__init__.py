@@ -1,1 +1,1 @@
-"""SUNDIALS: IDA and CVODE through scikit-sundae, and driven from C."""
+"""SUNDIALS' IDA and CVODE, through scikit-sundae and driven from C."""

@@ -1,6 +1,6 @@
-"""SUNDIALS CVODE through scikit-sundae, as its users call it: the right-hand side is a compiled function behind Python.
+"""SUNDIALS CVODE through scikit-sundae, as its users call it: the compiled right-hand side is called through Python.
 
-The equations are those of `scipy.index1` without stabilisation. Without Python in its way: `sundials.cvode_c`.
+The equations are those of `scipy.index1` without stabilisation. See `sundials.cvode_c` for CVODE without Python.
 """
 
 import io
@@ -16,27 +16,26 @@ from references.sundials.loop import SMALLEST_STEP
 from twoloop.problem.problem import Array
 from twoloop.result.result import Result
 
-MOST_STEPS = 10**7  # between two output times; its own 500 are soon used up
+MOST_STEPS = 10**7  # between two output times; the default of 500 is too small
 
 
 @adapter(derivatives=False, independent_rows=True)
 def solve_cvode(task: Task, rtol: float = 1e-8, atol: float = 1e-8) -> Result:
     """Integrate a constrained mechanical system, as the ODE q' = v, v' = a(t, q, v), with Adams' methods in CVODE.
 
-    What it was given: a right-hand side that numba compiled, and its analytic Jacobian as straight-line code, up to
-    `straight_line.MOST_OPERATIONS`, else differences; timed is the integration to the end, without output.
+    Settings: a compiled right-hand side, and its analytic Jacobian as straight-line code, up to
+    `straight_line.MOST_OPERATIONS`, otherwise differences; orders up to 12; Newton's iteration, the only one available
+    in scikit-sundae. The integration to the end without output is timed.
 
-    Their orders are up to 12; with Newton's iteration, scikit-sundae's only one.
-
-    Parameters, errors and result are those of `references.driver`; of the statistics n_evaluations, all calls of the
-    right-hand side.
+    Parameters, errors and result as in `references.driver`; statistics: n_evaluations, all calls of the right-hand
+    side.
     """
     CVODE = imported("sksundae.cvode", "scikit-sundae", "references").CVODE
     from references.sundials.ida import states_at
 
     t0, t1, times, y0 = task.t0, task.t1, task.instants, task.y0
     equations = RightHandSide(task.system, t0, task.q0, 0.0)
-    y0.setflags(write=False)  # as CVODE hands it over, so that what is compiled here is what it calls
+    y0.setflags(write=False)  # read-only as in CVODE, so that the same signature is compiled
     equations.warm(t0, y0, False)
     options: dict[str, Any] = {"method": "Adams", "rtol": rtol, "atol": atol, "max_num_steps": MOST_STEPS}
     options |= {"min_step": SMALLEST_STEP * (t1 - t0), "max_step": t1 - t0}
@@ -55,7 +54,7 @@ def solve_cvode(task: Task, rtol: float = 1e-8, atol: float = 1e-8) -> Result:
 
     limit = TimeLimit(task.time_limit)
     timed, outcome = integrator(limit), None
-    with redirect_stdout(io.StringIO()), user_call, suppress(OutOfTimeError):  # it prints its failures
+    with redirect_stdout(io.StringIO()), user_call, suppress(OutOfTimeError):  # CVODE prints its failures
         timed.init_step(t0, y0)
         outcome = timed.step(t1, tstop=t1)
     name, counts = "CVODE, Adams,", {"n_evaluations": int(equations.counters[0])}

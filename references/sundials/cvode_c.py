@@ -1,7 +1,7 @@
-"""SUNDIALS CVODE without Python in its way: the library of scikit-sundae, driven by ctypes, its right-hand side in C.
+"""SUNDIALS CVODE without Python overhead: the library of scikit-sundae, by ctypes, with a compiled right-hand side.
 
-The equations are y' = f(t, y), y = [q, v], with the accelerations as straight-line machine code. The constraints are
-not kept, unless CVODE is given a projection. See `references.sundials.ida_c` for what the library promises.
+The equations are y' = f(t, y), y = [q, v], with the accelerations as straight-line machine code. The constraints drift
+unless CVODE projects. See `references.sundials.ida_c` for the library.
 """
 
 from collections.abc import Callable
@@ -32,7 +32,7 @@ POINTER = types.voidptr
 
 
 class Functions(NamedTuple):
-    """What CVODE is given: compiled functions, or None of those that it shall do without, and their data."""
+    """Compiled functions for CVODE, or None, and their user data."""
 
     rate: Any
     jacobian: Any = None
@@ -52,27 +52,27 @@ def solve_cvode_c(
 ) -> Result:
     """Integrate a constrained mechanical system, as the ODE q' = v, v' = a(t, q, v), with CVODE driven from C.
 
-    What it was given: accelerations as straight-line code of the one mechanism (`equations.straight_line`); Adams with
-    fixed-point iteration, as SUNDIALS advises where nothing is stiff, BDF with Newton's, dense and with the analytic
-    Jacobian as straight-line code, up to `straight_line.MOST_OPERATIONS` (which compile in a few seconds), else with
-    differences; timed is a second use of CVODE's memory. The clock is looked at every `STEPS_A_CALL` steps.
+    Settings: accelerations as straight-line code of the mechanism (`equations.straight_line`); Adams with fixed-point
+    iteration, as SUNDIALS recommends for non-stiff problems; BDF with Newton's iteration, dense with the analytic
+    Jacobian as straight-line code, up to `straight_line.MOST_OPERATIONS` (compiled in a few seconds), otherwise by
+    differences. A second use of CVODE's memory is timed. The clock is checked every `STEPS_A_CALL` steps.
 
     Parameters
     ----------
     method : {"Adams", "BDF"}
-        Orders up to 12, or up to 5.
+        Orders up to 12 or 5, respectively.
     projected : bool
-        Whether CVODE projects each step, and its estimate of the error, onto C = 0 and C_q v + C_t = 0
-        (`sundials.cvode_projection`), which it can with BDF alone. What it interpolates for t_eval is not projected.
+        True: CVODE projects each step, and its error estimate, onto C = 0 and C_q v + C_t = 0
+        (`sundials.cvode_projection`); BDF only. States interpolated for t_eval are not projected.
     others : see `references.driver`
 
     Returns
     -------
     Result
-        The statistics are CVODE's counters, those of the evaluations for the Jacobian included, of the run that is
-        timed. The text of a failure has the name of CVODE's flag.
+        The statistics are CVODE's counters of the timed run, including evaluations for the Jacobian. The message of a
+        failure contains the name of CVODE's flag.
 
-    Raises RuntimeError if scikit-sundae is not the one that this was written for.
+    Raises RuntimeError if the version of scikit-sundae is not supported.
     """
     check_choice("method", method, tuple(METHODS))
     if projected and method != "BDF":
@@ -84,7 +84,7 @@ def solve_cvode_c(
 
 
 def right_hand_side(derivative: Callable[..., Any], size: int) -> Any:
-    """CVODE's right-hand side function, of a compiled (t, y, rate) -> None."""
+    """Return CVODE's right-hand side function for a compiled (t, y, rate) -> None."""
     array_of = library().N_VGetArrayPointer
 
     @cfunc(types.int32(types.float64, POINTER, POINTER, POINTER), error_model="numpy")
@@ -102,7 +102,7 @@ def _rate(system: ConstrainedSystem, t0: float, q0: bytes, v0: bytes) -> Any:
 
 @lru_cache(maxsize=256)
 def _jacobian(system: ConstrainedSystem, t0: float, q0: bytes, v0: bytes) -> Any:
-    """CVODE's Jacobian function; None where it is too long to be compiled."""
+    """Return CVODE's Jacobian function; None if it is too long to compile."""
     derivatives = straight_line_jacobian(system, t0, q0, v0)
     if derivatives is None:
         return None
@@ -110,14 +110,14 @@ def _jacobian(system: ConstrainedSystem, t0: float, q0: bytes, v0: bytes) -> Any
 
     @cfunc(types.int32(types.float64, *[POINTER] * 7), error_model="numpy")
     def jacobian(t, y, rate, J, memory, work1, work2, work3):  # type: ignore[no-untyped-def]
-        derivatives(t, carray(array_of(y), (size,)), carray(matrix_of(J), (size, size)))  # CVODE has set J to zero
+        derivatives(t, carray(array_of(y), (size,)), carray(matrix_of(J), (size, size)))  # CVODE initialises J to zero
         return 0
 
     return jacobian
 
 
 def _projection(system: ConstrainedSystem, projected: bool, rtol: float, atol: float) -> tuple[Any, Array]:
-    """CVODE's projection function, None without one, and the user data."""
+    """Return CVODE's projection function, or None, and the user data."""
     f = system.functions
     if not projected or system.n_c == 0:
         return None, np.empty(0)
@@ -130,7 +130,7 @@ def _projection(system: ConstrainedSystem, projected: bool, rtol: float, atol: f
 def integrate(
     functions: Functions, start: Array, task: Task, method: str, rtol: float, atol: float, max_step: float | None = None
 ) -> tuple[Array, Array, str, dict[str, int]]:
-    """The times that were reached, rows y there, why it failed ("": it did not), and CVODE's counters."""
+    """Return the times reached, rows y there, error message or "", and CVODE's counters."""
 
     def set_up(solver: Memory) -> None:
         solver.call("Init", functions.rate.address, task.t0, *solver.vectors)

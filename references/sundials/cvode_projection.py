@@ -12,20 +12,19 @@ from references.equations.linear import SINGULAR, cholesky, cholesky_solve
 from references.sundials.library import REALS, library
 from references.sundials.loop import RAISED
 
-MOST_ITERATIONS = 10  # of Newton's, which is done after one or two
-AGAIN = 1  # what a projection returns that failed, for CVODE to try a shorter step
+MOST_ITERATIONS = 10  # Newton's method usually needs one or two
+AGAIN = 1  # return value of a failed projection, which makes CVODE reduce the step
 
 
 @lru_cache(maxsize=64)
 def projection_for_cvode(
     constraint: Dispatcher, jacobian: Dispatcher, constraint_rate: Dispatcher, n: int, m: int, n_p: int
 ) -> tuple[Any, int]:
-    """CVODE's projection function, and the number of floats that its user data must hold.
+    """Return CVODE's projection function, and the number of floats in its user data.
 
-    Positions move by the shortest Newton corrections onto C = 0 until one is below CVODE's bound in its own norm, then
-    velocities by the shortest one onto C_q v + C_t = 0; the estimate of the error is projected onto what the
-    constraints leave free, as SUNDIALS' example of the pendulum does. The user data are [p, rtol, atol, work]; the
-    sizes are constants of the machine code.
+    Positions are projected onto C = 0 by minimum-norm Newton corrections until one is below CVODE's bound in its norm,
+    then velocities onto C_q v + C_t = 0; the error estimate is projected onto the tangent space, as in SUNDIALS'
+    pendulum example. The user data are [p, rtol, atol, work]; the sizes are constants of the machine code.
     """
     after_p, after_tol, after_Cq, after_S, after_r, n_memory = np.cumsum([n_p, 2, m * n, m * m, m, n]).tolist()
     array_of, size = library().N_VGetArrayPointer, 2 * n
@@ -34,7 +33,7 @@ def projection_for_cvode(
 
     @njit(error_model="numpy")
     def factors(t, q, p, Cq, S):  # type: ignore[no-untyped-def]
-        """Of C_q C_q^T at q, in the lower half of S; zero in the columns of redundant rows."""
+        """Factorise C_q C_q^T at q in the lower half of S; zero in the columns of redundant rows."""
         Cq[:, :] = 0.0
         jacobian(t, q, p, Cq)
         for i in range(m):
@@ -46,7 +45,7 @@ def projection_for_cvode(
 
     @njit(error_model="numpy")
     def shortest(Cq, S, r, x):  # type: ignore[no-untyped-def]
-        """The shortest x (n,) with C_q x = r; r is used up."""
+        """Compute the minimum-norm x (n,) with C_q x = r; destroys r."""
         cholesky_solve(S, r)
         x[:] = 0.0
         for i in range(m):
@@ -55,7 +54,7 @@ def projection_for_cvode(
 
     @njit(error_model="numpy")
     def remove(Cq, S, r, x, from_v):  # type: ignore[no-untyped-def]
-        """Take from a velocity what the constraints do not allow; r has C_t, or zeros."""
+        """Project a velocity onto the tangent space; r contains C_t, or zeros."""
         for i in range(m):
             for j in range(n):
                 r[i] += Cq[i, j] * from_v[j]
@@ -72,7 +71,7 @@ def projection_for_cvode(
         p, rtol, atol = data[:after_p], data[after_p], data[after_p + 1]
         Cq, S = data[after_tol:after_Cq].reshape((m, n)), data[after_Cq:after_S].reshape((m, m))
         r, x = data[after_S:after_r], data[after_r:]
-        for k in range(size):  # the assignment of one slice to another doubles the time of compiling
+        for k in range(size):  # elementwise: slice assignment doubles the compile time
             state[k] = given[k]
         q, v = state[:n], state[n:]
         try:

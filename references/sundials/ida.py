@@ -1,7 +1,7 @@
-"""SUNDIALS IDA, by scikit-sundae, on any ConstrainedSystem: residual and Jacobian compiled from its callbacks.
+"""SUNDIALS IDA through scikit-sundae on any ConstrainedSystem, with compiled residual and Jacobian.
 
-IDA solves F(t, y, y') = 0 by variable-order BDF (orders 1 to 5); `sundials.residual` has F. Nothing here uses the
-integrator of twoloop.
+IDA solves F(t, y, y') = 0 by variable-order BDF (orders 1 to 5), with F from `sundials.residual`. The integrator of
+twoloop is not used.
 """
 
 import io
@@ -31,27 +31,27 @@ def solve_ida(
     Parameters
     ----------
     form : {"index1", "stabilised"}
-        How the index is reduced: `sundials.residual`.
+        Index reduction, see `sundials.residual`.
     rtol, atol : float
-        IDA's tolerances for q, v (and Lam, Mu in the stabilised form). At a given tolerance the error at the end
-        scatters by a factor of 2 to 24 (15 runs) with rounding alone, which changes IDA's choice of steps and orders.
+        IDA's tolerances for q, v (and Lam, Mu in the stabilised form). At a given tolerance, rounding alone changes
+        IDA's choice of steps and orders, so that the final error scatters by a factor of 2 to 24 (15 runs).
     others : see `references.driver`
-        t_eval None: every step is stored, which scikit-sundae does by copying all before it. The Jacobian is by
-        differences; with `force_by_q` what is differenced is the residual without the force.
+        t_eval None: every step is stored, for which scikit-sundae copies all previous ones. The Jacobian is computed by
+        differences; with `force_by_q`, of the residual without the force.
 
     Returns
     -------
     Result
-        `a` and `lam` as IDA has them. `h` holds the steps when every step is stored. Of the statistics IDA tells
-        residual evaluations (n_evaluations), Jacobian evaluations, each with its factorisation (n_factorizations), and,
-        when every step is stored, n_accepted.
+        `a` and `lam` are IDA's. `h` contains the steps if every step is stored. Statistics: residual evaluations
+        (n_evaluations), Jacobian evaluations, each with a factorisation (n_factorizations), and, if every step is
+        stored, n_accepted.
     """
     check_choice("form", form, tuple(FORMS))
     equations, n, t0, t1 = Implicit(task, form), task.system.n_q, task.t0, task.t1
     absolute = np.full(equations.start.shape[1], atol)
     if form == "index1":
         absolute[2 * n :] = NOT_TESTED
-    options = {"rtol": rtol, "atol": absolute, "max_num_steps": 10**9}  # of these per output time
+    options = {"rtol": rtol, "atol": absolute, "max_num_steps": 10**9}  # steps per output time
     options |= {"min_step": SMALLEST_STEP * (t1 - t0), "max_step": task.longest(max_step)}
     limit, said = TimeLimit(task.time_limit), io.StringIO()
     solver = _solver(equations, t0, options, limit)
@@ -71,7 +71,7 @@ def solve_ida(
         told = " ".join([outcome.message, *said.getvalue().split()])
         advice = f"{CAUSES} the other form or other tolerances."
         failure = f"IDA failed after t = {end:.10g} with status {outcome.status}: {told} {advice}"
-    keep = np.diff(shown.t, prepend=-np.inf) > 0.0  # a failed run comes with its last state twice
+    keep = np.diff(shown.t, prepend=-np.inf) > 0.0  # a failed run contains its last state twice
     t, rows = shown.t[keep], equations.columns(shown.y.T, shown.yp.T)[:, keep]
     counts = {"n_evaluations": int(outcome.nfev), "n_factorizations": int(outcome.njev)}
     if task.times is not None:
@@ -80,11 +80,11 @@ def solve_ida(
 
 
 def states_at(solver: Any, span: tuple[float, float], times: Array, *start: Array) -> SimpleNamespace:
-    """The states of a solver of scikit-sundae at times that the same steps have reached before."""
+    """Return the states of a solver of scikit-sundae at times reached before, with the same steps."""
     t0, t1 = span
     shown = [solver.init_step(t0, *start)]
     if times.size and times[-1] > t0:
-        solver.step(t1, "onestep", t1)  # the length of the first step depends on where it is to go
+        solver.step(t1, "onestep", t1)  # the first step size depends on the end time
         shown += [solver.step(stop, tstop=t1) for stop in times[times > t0].tolist()]
     if not (times.size and times[0] == t0):
         shown = shown[1:]
@@ -94,24 +94,24 @@ def states_at(solver: Any, span: tuple[float, float], times: Array, *start: Arra
 
 
 def _solver(equations: Implicit, t0: float, options: dict[str, Any], limit: TimeLimit) -> Any:
-    """scikit-sundae's IDA, of compiled functions behind Python ones.
+    """Return scikit-sundae's IDA with compiled functions called through Python.
 
-    Past the time limit the residual is NaN: IDA then fails and returns what it has, which is lost with an exception.
+    After the time limit the residual is NaN, so that IDA fails and returns its states; with an exception they are lost.
     """
     residual, matrix, space, state = equations.residual, equations.matrix, equations.space, equations.start.copy()
-    monotonic, deadline = time.monotonic, limit.deadline  # a call of `limit` would be 3 % of an evaluation
+    monotonic, deadline = time.monotonic, limit.deadline  # inlined: calling `limit` would cost 3 % of an evaluation
 
     def resfn(t, y, yp, res):  # type: ignore[no-untyped-def]
         if monotonic() > deadline and limit.passed():
             res[:] = np.nan
         else:
-            state[0], state[1] = y, yp  # which are read-only arrays
+            state[0], state[1] = y, yp  # copies of read-only arrays
             residual(t, state[0], state[1], *space[:3], res)
 
     def jacfn(t, y, yp, res, cj, JJ):  # type: ignore[no-untyped-def]
         if not limit.exceeded:
             state[0], state[1] = y, yp
-            JJ[:] = 0.0  # it arrives as the last call left it
+            JJ[:] = 0.0  # contains the values of the last call
             matrix(t, cj, state[0], state[1], *space, JJ.T)
 
     size = state.shape[1]

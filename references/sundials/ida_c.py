@@ -1,9 +1,9 @@
-"""SUNDIALS IDA without Python in its way: the wheel's own library, driven by ctypes, with residual and Jacobian in C.
+"""SUNDIALS IDA without Python overhead: the wheel's library, by ctypes, with compiled residual and Jacobian.
 
-scikit-sundae calls back into Python for every residual and Jacobian, which costs several times what IDA itself does on
-a small system. Here IDA gets the addresses of functions that numba compiled, as it would in a C program. The form is
-"stabilised" of `sundials.residual`. The library comes with scikit-sundae, whose files carry a hash in their names and
-promise nothing to others: this was written for `WRITTEN_FOR`, and says so when it meets another.
+scikit-sundae calls Python for every residual and Jacobian, which costs several times the work of IDA itself on a small
+system. Here IDA gets the addresses of functions compiled by numba, as in a C program. The form is "stabilised" of
+`sundials.residual`. The library is a private part of scikit-sundae, with a hash in its file names: only `WRITTEN_FOR`
+is supported, and other versions are rejected.
 """
 
 from functools import lru_cache
@@ -21,7 +21,7 @@ from references.sundials.residual import NOT_TESTED, Implicit, Parts, iteration_
 from twoloop.checks.arguments import check_choice, check_size
 from twoloop.result.result import Result
 
-HIGHEST_ORDER = 5  # of IDA
+HIGHEST_ORDER = 5  # IDA's limit
 ERROR_TESTS = ("all", "states", "positions")
 COUNTERS = {"n_evaluations": ("ResEvals",), "n_factorizations": ("JacEvals",)}
 ADVICE = (
@@ -42,35 +42,36 @@ def solve_ida_c(
 ) -> Result:
     """Integrate a constrained mechanical system with IDA, in the form "stabilised", without Python in the integration.
 
-    The Jacobian is exact but for the columns of q and the derivatives of Q by v, which are compiled differences; with
-    `force_by_q` but for the derivatives of C_q and of a varying mass by q. A constant mass matrix is evaluated once.
+    The Jacobian is exact except for the columns of q and the derivatives of Q with respect to v, which are compiled
+    differences; with `force_by_q`, except for the derivatives of C_q and of a varying mass with respect to q. A
+    constant mass matrix is evaluated once.
 
-    Highest order and error test are for systems with fast vibrations that hardly matter. Velocities keep these in the
-    error test however loose it is, and the BDF of orders 3 to 5 are unstable for undamped ones that the step does not
-    resolve. With orders up to 2, and only positions tested, IDA may step over them: on the moderately stiff beam
+    `max_order` and `error_test` are for systems with fast vibrations of small amplitude. With velocities in the error
+    test these must be resolved at any tolerance, and BDF of orders 3 to 5 is unstable for undamped vibrations that are
+    not resolved. With orders up to 2, and only positions tested, IDA may step over them: on the moderately stiff beam
     (`twoloop.mechanisms`, 2 s) that brings the tip's height to 1e-3 m in 3,500 steps, where the defaults take 115,000
-    even at tolerances of 1e-3, and reach 6e-6 m. On the very flexible beam, whose large motion the vibrations do
-    change, nothing is gained.
+    even at tolerances of 1e-3, and reach 6e-6 m. On the very flexible beam, whose vibrations affect the large motion,
+    nothing is gained.
 
     Parameters
     ----------
     max_order : int
-        The highest order of the BDF, 1 to 5.
+        Highest order of the BDF, 1 to 5.
     error_test : {"all", "states", "positions"}
-        What the error test, and that of Newton's iteration, sees: all unknowns, q and v, or q alone. IDA's norm is a
-        mean over all unknowns: the fewer it sees, the looser the same tolerance. q may then have an error
-        sqrt((2 n_q + 2 n_c)/n_q) times as large, and q and v one sqrt(1 + n_c/n_q) times as large.
+        Unknowns in the error test and the convergence test: all, q and v, or q alone. IDA's norm is a mean over all
+        unknowns, so the same tolerance is looser with fewer tested: the error of q may be sqrt((2 n_q + 2 n_c)/n_q)
+        times as large, that of q and v sqrt(1 + n_c/n_q) times.
     others : see `references.driver` and, for rtol and atol, `sundials.ida.solve_ida`
-        The system is of compiled callbacks. The clock is looked at every `STEPS_A_CALL` steps.
+        The system must have compiled callbacks. The clock is checked every `STEPS_A_CALL` steps.
 
     Returns
     -------
     Result
-        `a` and `lam` as IDA has them. The statistics are IDA's own counters: steps and failed steps, Newton iterations
-        (n_outer), residual evaluations without those that the differences of the Jacobian take (n_evaluations), and
-        Jacobians, each with its factorisation (n_factorizations). The text of a failure has the name of IDA's flag.
+        `a` and `lam` are IDA's. The statistics are IDA's counters: steps and failed steps, Newton iterations (n_outer),
+        residual evaluations without those for differences of the Jacobian (n_evaluations), and Jacobians, each with a
+        factorisation (n_factorizations). The message of a failure contains the name of IDA's flag.
 
-    Raises RuntimeError if scikit-sundae is not the one that this was written for.
+    Raises RuntimeError if the version of scikit-sundae is not supported.
     """
     system = task.system
     if system.called_in_python:
@@ -102,8 +103,8 @@ def solve_ida_c(
 
 @lru_cache(maxsize=64)
 def _compiled(parts: Parts, n: int, m: int, n_p: int) -> tuple[Any, Any]:
-    """IDA's residual and Jacobian functions; their user data are the arrays of `Implicit.space`, one after another."""
-    size = 2 * (n + m)  # a constant of the machine code, as the others
+    """Return IDA's residual and Jacobian functions; their user data are the arrays of `Implicit.space` in sequence."""
+    size = 2 * (n + m)  # constant of the machine code
     ends = np.cumsum([n_p, n * n, m * n, n * n, size, size, size]).tolist()
     after_p, after_M, after_Cq, after_K, after_y, after_here, n_memory = ends
     array_of, matrix_of, pointer = library().N_VGetArrayPointer, library().SUNDenseMatrix_Data, types.voidptr
@@ -132,7 +133,7 @@ def _compiled(parts: Parts, n: int, m: int, n_p: int) -> tuple[Any, Any]:
     @cfunc(types.int32(types.float64, types.float64, *[pointer] * 8), **OPTIONS)
     def jacobian_of_ida(t, cj, y, yp, res, J, memory, work1, work2, work3):  # type: ignore[no-untyped-def]
         p, M, Cq, K, moved, here, there = space(memory)
-        columns = carray(matrix_of(J), (size, size))  # which IDA has set to zero
+        columns = carray(matrix_of(J), (size, size))  # initialised to zero by IDA
         try:
             iteration_matrix(t, cj, vector(y), vector(yp), p, M, Cq, K, moved, here, there, columns)
         except Exception:

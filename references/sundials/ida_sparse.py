@@ -1,8 +1,8 @@
-"""SUNDIALS IDA with its sparse solver, by scikit-sundae, on a system that gives the values of its entries alone.
+"""SUNDIALS IDA with its sparse solver, through scikit-sundae, for a system that provides its nonzero entries.
 
-The equations are the stabilised ones of residual.py, the linear equations are solved by SuperLU_MT, which the wheels of
-scikit-sundae hold, and the Jacobian is by differences of columns that have no row in common. Both functions are
-compiled; what calls them is Python.
+The equations are the stabilised ones of residual.py, the linear solver is SuperLU_MT, which is included in the wheels
+of scikit-sundae, and the Jacobian is computed by differences of groups of columns without common rows. Both functions
+are compiled and called through Python.
 """
 
 import warnings
@@ -35,13 +35,13 @@ def solve_ida_sparse(task: Task, rtol: float = 1e-8, atol: float = 1e-8) -> Resu
     rtol, atol : float
         IDA's tolerances for q, v, Lam and Mu.
     others : see `references.driver`
-        The result has the start and the end alone.
+        The result contains the initial and final states only.
 
     Raises ValueError if the system has no `jacobian_values` and `mass_values`.
     """
     system, (t0, t1), limit = task.system, (task.t0, task.t1), TimeLimit(task.time_limit)
     if not {"jacobian", "mass"} <= system.entries.keys():
-        raise ValueError(f"system must have jacobian_values and mass_values; {system.name!r} has not")
+        raise ValueError(f"system must have jacobian_values and mass_values; {system.name!r} does not")
     f, n, m = system.functions, system.n_q, system.n_c
     residual = _residual_of(f.mass_values, f.force, f.constraint, f.constraint_rate, f.jacobian_values)
     entries = tuple(np.asarray(each) for name in ("mass", "jacobian") for each in system.entries[name])
@@ -51,7 +51,7 @@ def solve_ida_sparse(task: Task, rtol: float = 1e-8, atol: float = 1e-8) -> Resu
     groups, matrix = groups_of(pattern), _matrix_of(residual)
 
     def resfn(t, y, yp, res):  # type: ignore[no-untyped-def]
-        residual(n, t, np.array(y), np.array(yp), f.p, *space, res)  # which are read-only arrays
+        residual(n, t, np.array(y), np.array(yp), f.p, *space, res)  # copies of read-only arrays
         if limit.passed():
             res[:] = np.nan
 
@@ -63,7 +63,7 @@ def solve_ida_sparse(task: Task, rtol: float = 1e-8, atol: float = 1e-8) -> Resu
     steps = {"min_step": SMALLEST_STEP * (t1 - t0), "max_step": t1 - t0, "max_num_steps": 10**9}
     sparse = {"linsolver": "sparse", "sparsity": pattern, "jacfn": jacfn}
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # that the pattern is not used for differences of its own, which take longer
+        warnings.simplefilter("ignore")  # about the unused pattern
         solver: Any = sksundae.ida.IDA(resfn, rtol=rtol, atol=atol, **sparse, **steps)
     jacfn(t0, y, yp, y, 1.0, np.zeros(pattern.nnz))  # compiles
     resfn(t0, y, yp, np.zeros_like(y))
@@ -81,21 +81,21 @@ def solve_ida_sparse(task: Task, rtol: float = 1e-8, atol: float = 1e-8) -> Resu
 
 
 def pattern_of_residual(system: ConstrainedSystem) -> csc_array:
-    """Where the residual changes with the unknowns q, v, Lam, Mu and their rates, 1, (n, n)."""
+    """Return the sparsity pattern (n, n) of the residual in the unknowns q, v, Lam, Mu and their rates."""
     n, m = system.n_q, system.n_c
     M, G = (
         coo_array((np.ones(len(rows)), (rows, columns)), shape=(size, n))
         for size, (rows, columns) in ((n, system.entries["mass"]), (m, system.entries["jacobian"]))
     )
-    both, one = G.T @ G, eye_array(n)  # C_q^T lam changes with all coordinates that share a row
+    both, one = G.T @ G, eye_array(n)  # C_q^T lam couples coordinates that share a row
     blocks = [[one + both, one, None, G.T], [both, M, G.T, None], [G, None, None, None], [G, G, None, None]]
     made = csc_array(bmat(blocks) != 0.0)
-    # with indices of 64 bits scikit-sundae fails, in the end by a damaged heap
+    # 64-bit indices make scikit-sundae corrupt the heap
     return csc_array((made.data, made.indices.astype(np.int32), made.indptr.astype(np.int32)), shape=made.shape)
 
 
 def groups_of(pattern: csc_array) -> NDArray[np.int64]:
-    """The group of each column (n,): those of one have no row in common."""
+    """Return the group of each column (n,), such that columns of a group have no common row."""
     near = csc_array(pattern.T @ pattern)
     groups = np.full(near.shape[1], -1)
     for j in range(groups.size):
@@ -108,7 +108,7 @@ def groups_of(pattern: csc_array) -> NDArray[np.int64]:
 def _residual_of(
     mass: Dispatcher, force: Dispatcher, constraint: Dispatcher, rate: Dispatcher, jacobian: Dispatcher
 ) -> Callable[..., None]:
-    """(n_q, t, y, y', p, rows and columns of M and of C_q, room for their values, res) -> None: the residual."""
+    """Return (n_q, t, y, y', p, rows and columns of M and C_q, workspaces for their values, res) -> None."""
 
     @njit(**OPTIONS)
     def residual(n, t, y, yp, p, rows, columns, row_of, column_of, M, G, res):  # type: ignore[no-untyped-def]
@@ -135,7 +135,7 @@ def _residual_of(
 
 @lru_cache(maxsize=8)
 def _matrix_of(residual: Callable[..., None]) -> Callable[..., None]:
-    """The same with cj behind t, and groups, beginnings and rows of columns, values: dF/dy + cj dF/dy'."""
+    """Return the same with cj after t, and groups, pointers, rows and values of the columns: dF/dy + cj dF/dy'."""
 
     @njit(**OPTIONS)
     def matrix(n, t, cj, y, yp, p, r, c, r_of, c_of, M, G, groups, begin, rows, values):  # type: ignore[no-untyped-def]

@@ -1,4 +1,4 @@
-"""SUNDIALS IDA's and CVODE's functions by ctypes, from the library inside scikit-sundae: private to that wheel."""
+"""IDA's and CVODE's functions by ctypes, from the SUNDIALS library inside scikit-sundae, private to the wheel."""
 
 import ctypes
 from collections.abc import Callable
@@ -14,10 +14,10 @@ POINTER, INT, LONG, REAL, INDEX = ctypes.c_void_p, ctypes.c_int, ctypes.c_long, 
 REALS = ctypes.POINTER(REAL)
 SUN_COMM_NULL = 0
 
-# prototypes: a letter a type, that of what is returned first; as in C "-" is void, "p" any pointer, "R" one to
-# reals, "i" int, "l" long int, "x" sunindextype, "r" sunrealtype
+# prototypes, one letter per type, starting with the return type: "-" void, "p" any pointer, "R" pointer to reals,
+# "i" int, "l" long int, "x" sunindextype, "r" sunrealtype
 _TYPES = {"-": None, "p": POINTER, "R": REALS, "i": INT, "l": LONG, "x": INDEX, "r": REAL}
-_OF_EACH = (  # of IDA and of CVODE, after IDA or CVode
+_OF_EACH = (  # functions with the prefix IDA or CVode
     "Free:-p SetUserData:ipp SetLinearSolver:ippp SetJacFn:ipp SetMaxNumSteps:ipl SetMinStep:ipr SetMaxStep:ipr "
     "SetStopTime:ipr GetReturnFlagName:pl GetNumSteps:ipp GetNumErrTestFails:ipp GetNumStepSolveFails:ipp "
     "GetNumNonlinSolvIters:ipp GetNumJacEvals:ipp"
@@ -39,9 +39,9 @@ FUNCTIONS = {  # by library
 
 @lru_cache(maxsize=1)
 def library() -> SimpleNamespace:
-    """The functions of SUNDIALS that are used here, from the files of scikit-sundae.
+    """Return the functions of SUNDIALS used here, from the files of scikit-sundae.
 
-    Raises RuntimeError if scikit-sundae is missing or differs in a way that matters from `WRITTEN_FOR`.
+    Raises RuntimeError if scikit-sundae is missing or incompatible with `WRITTEN_FOR`.
     """
     try:
         from sksundae._cy_common import config
@@ -71,13 +71,13 @@ def library() -> SimpleNamespace:
 
 
 def check(name: str, flag: int) -> None:
-    """Raise unless the function of this name returned 0."""
+    """Raise RuntimeError unless the function of this name returned 0."""
     if flag != 0:
         raise RuntimeError(f"{name} of SUNDIALS failed with {flag}")
 
 
 def made(stack: ExitStack, name: str, free: Callable[[Any], Any], *arguments: Any) -> Any:
-    """What the function of this name makes; freed at the end of the stack."""
+    """Return an object created by the function of this name; it is freed when the stack is closed."""
     pointer = POINTER(getattr(library(), name)(*arguments))
     if not pointer:
         raise MemoryError(f"{name} of SUNDIALS failed")
@@ -86,7 +86,7 @@ def made(stack: ExitStack, name: str, free: Callable[[Any], Any], *arguments: An
 
 
 def context(stack: ExitStack) -> Any:
-    """What all objects of SUNDIALS belong to; without the error handlers, which print."""
+    """Return a SUNDIALS context without the error handlers, which print."""
     sundials, pointer = library(), POINTER()
     check("SUNContext_Create", sundials.SUNContext_Create(SUN_COMM_NULL, ctypes.byref(pointer)))
     stack.callback(sundials.SUNContext_Free, ctypes.byref(pointer))

@@ -1,4 +1,4 @@
-"""IDA's or CVODE's memory, and the one loop over their steps that both are driven by from compiled code."""
+"""IDA's or CVODE's memory, and the common time-stepping loop of the drivers from compiled code."""
 
 import ctypes
 import itertools
@@ -12,17 +12,17 @@ from references.driver import Task, TimeLimit, user_call
 from references.sundials.library import LONG, POINTER, REAL, check, context, library, made
 from twoloop.problem.problem import Array
 
-SMALLEST_STEP = 1e-12  # of the length of t_span; without one they shrink their steps towards a NaN without end
-MOST_STEPS = 10**9  # the clock is looked at before
-STEPS_A_CALL = 100  # between two looks at the clock
+SMALLEST_STEP = 1e-12  # relative to the length of t_span; without a limit the step is reduced forever at a NaN
+MOST_STEPS = 10**9  # the time limit takes effect earlier
+STEPS_A_CALL = 100  # between two checks of the clock
 NORMAL, ONE_STEP, TSTOP_RETURN, TOO_MUCH_WORK = 1, 2, 1, -1
-RAISED = -1  # what a callback returns that shall not be called again
+RAISED = -1  # return value of a callback for an unrecoverable error
 COUNTERS = {"n_accepted": ("Steps",), "n_rejected_error": ("ErrTestFails",)}
 COUNTERS |= {"n_rejected_convergence": ("StepSolveFails",), "n_outer": ("NonlinSolvIters",)}
 
 
 class Memory:
-    """The memory of IDA (`kind` "IDA") or CVODE ("CVode") over its vectors, which are the rows of `state`."""
+    """The memory of IDA (`kind` "IDA") or CVODE ("CVode"), whose vectors are the rows of `state`."""
 
     def __init__(self, stack: ExitStack, kind: str, start: Array, task: Task, *given: int):
         self.kind, self.state, self.start, self.task = kind, start.copy(), start, task
@@ -33,17 +33,17 @@ class Memory:
         self.reached = REAL(task.t0)
 
     def vector(self, values: Array) -> Any:
-        """SUNDIALS' vector over an array."""
+        """Return a SUNDIALS vector that wraps an array."""
         free = self.sundials.N_VDestroy
         return made(self.stack, "N_VMake_Serial", free, values.size, values.ctypes.data, self.own)
 
     def call(self, name: str, *arguments: Any) -> None:
-        """Call one of its functions, which must return 0."""
+        """Call a function, which must return 0."""
         check(f"{self.kind}{name}", getattr(self.sundials, f"{self.kind}{name}")(self.memory, *arguments))
 
     def solve_dense(self, jacobian: Any) -> None:
-        """Newton's method with a dense matrix; None: a Jacobian by differences."""
-        # not banded: ordered by nodes, the beam of 4 elements has bandwidths 23 and 21 of 64, and nothing to gain
+        """Use Newton's method with a dense matrix; None: a Jacobian by differences."""
+        # not banded: ordered by nodes, the beam of 4 elements has bandwidths 23 and 21 of 64, too large for a gain
         size, destroy = self.state.shape[1], self.sundials.SUNMatDestroy
         matrix = made(self.stack, "SUNDenseMatrix", destroy, size, size, self.own)
         linear = made(self.stack, "SUNLinSol_Dense", self.sundials.SUNLinSolFree, self.vectors[0], matrix, self.own)
@@ -52,27 +52,27 @@ class Memory:
             self.call("SetJacFn", jacobian.address)
 
     def bound_steps(self, longest: float) -> None:
-        """Set its limits on steps, and its end."""
+        """Set the limits of the step size, and the stop time."""
         self.call("SetMaxNumSteps", STEPS_A_CALL)
         self.call("SetMaxStep", longest)
         self.call("SetMinStep", SMALLEST_STEP * (self.task.t1 - self.task.t0))
         self.call("SetStopTime", self.task.t1)
 
     def restart(self) -> None:
-        """Begin at the start, as one does who keeps the memory."""
+        """Reinitialise at the start, like a user who keeps the memory."""
         self.state[:] = self.start
         self.call("ReInit", self.task.t0, *self.vectors)
         self.reached.value = self.task.t0
 
     def solve(self, stop: float, mode: int) -> int:
-        """Its flag after steps to `stop`, or after one."""
+        """Return the flag after steps to `stop`, or after one step."""
         place = ctypes.byref(self.reached)
         if self.kind == "IDA":
             return int(self.sundials.IDASolve(self.memory, stop, place, *self.vectors, mode))
         return int(self.sundials.CVode(self.memory, stop, *self.vectors, place, mode))
 
     def go_to_the_end(self, limit: TimeLimit) -> int:
-        """Its last flag; past the time limit that of a run stopped at its greatest number of steps."""
+        """Return the last flag; after the time limit that of a run stopped by the number of steps."""
         flag = TOO_MUCH_WORK
         for calls in itertools.count(1):
             flag = TOO_MUCH_WORK if limit.passed() else self.solve(self.task.t1, NORMAL)
@@ -81,11 +81,11 @@ class Memory:
         return flag
 
     def rows_at(self, times: Array) -> Array:
-        """The state (n_t, k n) at times that the same steps have reached before, or at those before a failure."""
+        """Return the states (n_t, k n) at times reached before with the same steps, or those before a failure."""
         flag, rows = 0, np.empty((times.size, self.state.size))
         for k, stop in enumerate(times.tolist()):
             if stop > self.task.t0:
-                if k == 0 or times[k - 1] <= self.task.t0:  # the length of the first step depends on where it goes
+                if k == 0 or times[k - 1] <= self.task.t0:  # the first step size depends on the end time
                     self.solve(self.task.t1, ONE_STEP)
                 while flag != TSTOP_RETURN:
                     flag = self.solve(stop, NORMAL)
@@ -97,13 +97,13 @@ class Memory:
         return rows
 
     def counted(self, what: str) -> int:
-        """One of its counters."""
+        """Return a counter."""
         number = LONG()
         self.call(f"GetNum{what}", ctypes.byref(number))
         return number.value
 
     def failure(self, flag: int, limit: TimeLimit, advice: str) -> str:
-        """What is said of a run that ended with this flag."""
+        """Return the message of a run that ended with this flag."""
         name, t = self.kind.upper(), self.reached.value
         if limit.exceeded:
             return limit.message(name, t, "take looser tolerances")
@@ -112,7 +112,7 @@ class Memory:
         return f"{name} failed after t = {t:.10g} with {self.flag_name(flag)} ({flag}). {advice}"
 
     def flag_name(self, flag: int) -> str:
-        """SUNDIALS' name of a flag; the text is ours to free."""
+        """Return SUNDIALS' name of a flag; the caller must free the text."""
         text = getattr(self.sundials, f"{self.kind}GetReturnFlagName")(flag)
         name = ctypes.string_at(text).decode()
         free = ctypes.CDLL(None).free
@@ -131,10 +131,10 @@ def run(
     counters: Mapping[str, tuple[str, ...]],
     advice: str,
 ) -> tuple[Array, Array, str, dict[str, int]]:
-    """The times that were reached, the states there as rows, why it failed ("": it did not), and its counters.
+    """Return the times reached, states there as rows, error message or "", and counters.
 
-    Timed is a second use of a memory, as SUNDIALS' guides have it: ReInit, and steps to the end without output. The
-    output has a memory of its own: CVODE's ReInit does not forget when it projected last.
+    A second use of the memory is timed, as in SUNDIALS' guides: ReInit, and steps to the end without output. The output
+    run has a memory of its own, because CVODE's ReInit does not reset the time of the last projection.
     """
     longest = task.longest(max_step)
 

@@ -1,12 +1,12 @@
-"""IDA's residual and the derivatives of it as machine code, from the callbacks of a ConstrainedSystem.
+"""IDA's residual and its derivatives as machine code, from the callbacks of a ConstrainedSystem.
 
-IDA solves F(t, y, y') = 0. The index-3 equations are brought to index 1 in one of two ways, of which `FORMS` has a line
-fit for a table:
+IDA solves F(t, y, y') = 0. The index-3 equations are reduced to index 1 in one of two ways, described for tables in
+`FORMS`:
 
 "index1": unknowns q, v, lam; q' = v, M v' + C_q^T lam = Q, C_q v' = Q_d. Drifts off the constraints.
 
 "stabilised": Gear, Gupta and Leimkuhler (1985) with the multipliers as time derivatives of further unknowns Lam, Mu;
-q' = v - C_q^T Mu', M v' + C_q^T Lam' = Q, C = 0, C_q v + C_t = 0. Rows A v + b = 0 stand below C_q v + C_t = 0; their
+q' = v - C_q^T Mu', M v' + C_q^T Lam' = Q, C = 0, C_q v + C_t = 0. Rows A v + b = 0 follow C_q v + C_t = 0; their
 Mu is zero.
 """
 
@@ -30,15 +30,15 @@ FORMS = {
     "index1": "index 1: C_q v' = Q_d; multipliers out of the error test (atol 1e12)",
     "stabilised": "GGL, integrated multipliers: C = 0 and C_q v + C_t = 0; multipliers' integrals in the error test",
 }
-NOT_TESTED = 1e12  # the absolute tolerance that takes an unknown out of IDA's error test, and out of Newton's
-ALL = 10**9  # rows that are of C: there are none of A v + b = 0 below
-DIFFERENCE = 1e-7  # displacement for the derivatives of the residual, relative to max(1, |value|)
+NOT_TESTED = 1e12  # absolute tolerance that excludes an unknown from IDA's error and convergence tests
+ALL = 10**9  # all rows belong to C: there are no rows A v + b = 0
+DIFFERENCE = 1e-7  # step of finite differences of the residual, relative to max(1, |value|)
 
 
 class Parts(NamedTuple):
-    """What the functions of a system are compiled of; they take the sizes from M and C_q.
+    """Functions of a system from which the residual is compiled; sizes follow from M and C_q.
 
-    `positions`: how many rows are of C. `tangent`: dQ/dq, if nothing of the force is to be differenced.
+    `positions`: number of rows of C. `tangent`: dQ/dq, if the force need not be differenced.
     """
 
     index1: bool
@@ -59,11 +59,11 @@ class Implicit:
     Attributes
     ----------
     start : ndarray (2, size)
-        Unknowns and their derivatives; accelerations and multipliers by eq. (6).
+        Initial unknowns and derivatives; accelerations and multipliers from eq. (6).
     space : tuple of ndarray
-        What the compiled functions take: p, M, which stays if it is constant, C_q, dQ/dq, and scratch.
+        Arguments of the compiled functions: p, M, which is kept if it is constant, C_q, dQ/dq, and workspace.
     parts : Parts
-        What they are compiled of.
+        Functions from which they are compiled.
     residual, matrix : callable
         See `residual_at` and `iteration_matrix_at`.
     """
@@ -85,14 +85,14 @@ class Implicit:
         self.space = f.p, mass, np.zeros((m, n)), np.zeros((n, n)), *np.zeros((3, self.start.shape[1]))
 
     def columns(self, y: Array, yp: Array) -> Array:
-        """Rows [q v a lam] (3 n_q + n_c, n_t) of unknowns and their derivatives (size, n_t)."""
+        """Return rows [q v a lam] (3 n_q + n_c, n_t) for unknowns and derivatives (size, n_t)."""
         n, m = self.sizes
         return np.concatenate([y[: 2 * n], yp[n : 2 * n], (y if self.index1 else yp)[2 * n : 2 * n + m]])
 
 
 @lru_cache(maxsize=64)
 def residual_at(parts: Parts) -> Callable[..., None]:
-    """(t, y, y', p, M, Cq, res) -> None: the residual; M and C_q are left as they are at q."""
+    """Return (t, y, y', p, M, Cq, res) -> None: the residual; M and C_q are evaluated at q on return."""
     index1, mass, force, constraint, jacobian, constraint_rate, gamma, _, positions, constant_mass = parts
 
     @kept
@@ -138,14 +138,14 @@ def residual_at(parts: Parts) -> Callable[..., None]:
 
 @njit
 def _no_force(t, q, v, p, Q):  # type: ignore[no-untyped-def]
-    """Stand in for the force in what is differenced beside an exact tangent."""
+    """Replace the force in differences where its exact tangent is used."""
 
 
 @lru_cache(maxsize=64)
 def iteration_matrix_at(parts: Parts) -> Callable[..., None]:
-    """(t, cj, y, y', p, M, Cq, K, moved, here, there, J) -> None: dF/dy + cj dF/dy', J[j] its column j.
+    """Return (t, cj, y, y', p, M, Cq, K, moved, here, there, J) -> None: dF/dy + cj dF/dy', J[j] its column j.
 
-    J arrives full of zeros. With a tangent, what is differenced is the residual without the force.
+    J is initially zero. With a tangent, the residual without the force is differenced.
     """
     index1, mass, force, _, jacobian, _, gamma, tangent, positions, constant_mass = parts
     exact = tangent is not None
@@ -204,7 +204,7 @@ def iteration_matrix_at(parts: Parts) -> Callable[..., None]:
             q[j] = y[j]
             for i in range(2 * n):
                 J[j, i] = (there[i] - here[i]) / step
-            for i in range(2 * n if index1 else 2 * n + m, y.size):  # C_q stands above
+            for i in range(2 * n if index1 else 2 * n + m, y.size):  # C_q is above
                 J[j, i] = (there[i] - here[i]) / step
             J[j, j] += cj
         if exact:

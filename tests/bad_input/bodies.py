@@ -109,7 +109,7 @@ def point_of_another():
 
 
 BODIES: list[Case] = [
-    of_planar("a name twice", body(name="bar"), "something is called 'bar' already", "give each part its own name"),
+    of_planar("a name twice", body(name="bar"), "'bar' is already taken", "give each part its own name"),
     of_planar("`name=''`", body(name=""), "name must not be empty", "give a name"),
     of_planar("`name=3`", body(name=3), "name must be a string; given 3", "give text", TypeError),
     of_planar("`mass=-1`", body(mass=-1), "mass of 'arm' must be positive", "give a positive mass"),
@@ -227,7 +227,7 @@ BODIES: list[Case] = [
     ),
     of_planar("a number for a motion", drive(1.0), "must be a function of t", "give lambda t: ...", TypeError),
     of_planar("a motion that branches", drive(lambda t: 0.0 if t < 1.0 else t)).says(
-        "derivatives do not follow from it.*give rate= and acceleration=",
+        "cannot be differentiated exactly.*give rate= and acceleration=",
         "give its derivatives, or write it without branches",
     ),
     of_planar("`rate` without `acceleration`", drive(lambda t: t, rate=lambda t: 1.0)).says(
@@ -253,7 +253,7 @@ BODIES: list[Case] = [
     .says("axes of 'universal bar-ground' must be perpendicular", "give the two axes of the cross"),
     of_problem("a model without bodies", lambda: PlanarModel().problem(), "has no bodies", "add bodies first"),
     of_problem("a loop that cannot close", lambda: rough(2.3)).says(
-        r"cannot be put together: the joint '.*' does not close", "look at the lengths around the loop"
+        r"cannot be assembled: the joint '.*' does not close", "look at the lengths around the loop"
     ),
     of_problem("a velocity that joints do not allow", locked).says(
         "do not allow the velocities given: the rate of angle of bar is given as 2", "give velocities of fewer bodies"
@@ -263,7 +263,7 @@ BODIES: list[Case] = [
     ),
     of_problem("two drives that contradict", two_drives, "the motion is over-constrained", "leave one of them out"),
     of_problem("a drive that begins far away", half_a_turn).says(
-        "the bodies end half a turn from it", "give the bodies near to where the motion begins"
+        "assembled half a turn from it", "give the bodies near to where the motion begins"
     ),
     of_problem("an unknown parameter", lambda: rough(1.9).with_parameters({"mass of three": 1.0})).says(
         "'arms' has no parameter 'mass of three'", "names are in problem.parameters"
@@ -292,7 +292,7 @@ BODIES: list[Case] = [
         "take a revolute joint for points that coincide",
     ),
     of_problem("a length that no longer fits", lambda: rough(1.9).with_parameters({"x of end on ground": 2.5})).says(
-        "cannot be put together", "change other lengths with it"
+        "cannot be assembled", "change other lengths with it"
     ),
     of_problem(
         "another axis of a slide with a limit or a rack",

@@ -59,10 +59,10 @@ IMPACTS = [
         "a function in place of a stop", against(lambda t, q: q[0]), "stops must be a Stop", "Stop(gap)", TypeError
     ),
     of_stops("a start beyond a stop", against(Stop(lambda t, q: q[8] - 9.0, name="wall"))).says(
-        "on this side of all stops; the gap of 'wall' is", "turn its sign, or start elsewhere"
+        "gaps must not be negative at q0; that of 'wall' is", "turn its sign, or start elsewhere"
     ),
     of_stops("a gap that branches", against(Stop(lambda t, q: q[8] if q[0] > 0.0 else 1.0))).says(
-        "gap of 'stop' must be a number made of t and q by numpy's functions", "make two stops of it"
+        "gap of 'stop' must be a number computed from t and q by numpy functions", "make two stops of it"
     ),
     of_stops(
         "`restitution=1.1`", lambda: Stop(lambda t, q: q[0], 1.1), "restitution of 'stop' must be from 0 to 1", "0 to 1"
@@ -108,7 +108,7 @@ IMPACTS = [
         "'linkage' has no dry friction: add some with model.dry_friction", "or take `solve_dae`"
     ),
     of_friction("a system in place of a problem", lambda: solve_with_friction(rubbed("A").system)).says(
-        "problem must be that of a model, what model.problem", "give what `model.problem()` returned", TypeError
+        "problem must be a model's problem, as returned", "give what `model.problem()` returned", TypeError
     ),
     of_friction("`events=`", lambda: solve_with_friction(rubbed("A"), events=[])).says(
         "solve_with_friction has no option 'events'", "changes are events of its own", TypeError
@@ -119,7 +119,7 @@ IMPACTS = [
     of_friction("friction in two joints of a linkage with one degree of freedom")
     .when(lambda: solve_with_friction(rubbed("A", "B")))
     .says(
-        "'dry friction of B' cannot slide by itself.* or it moves as those of 'dry friction of A' do",
+        "'dry friction of B' cannot slide by itself.* or its motion depends on 'dry friction of A'",
         "give one joint all of it",
     ),
     of_friction("friction in a joint that is driven")

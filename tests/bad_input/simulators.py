@@ -42,8 +42,8 @@ SIMULATORS = [
     of_check("one number of steps", lambda: check(steps=[100]), "steps must be two or more", MULTIPLES),
     of_check("a number instead of steps", lambda: check(steps=100), "steps must be a list", MULTIPLES, TypeError),
     of_check("steps between the times", lambda: check(steps=[100, 250]), "each a multiple of 100", MULTIPLES),
-    of_check("fewer and fewer steps", lambda: check(steps=[200, 100]), "growing numbers of steps", MULTIPLES),
-    of_check("steps in seconds", lambda: check(steps=[1e-2, 1e-3]), "growing numbers of steps", MULTIPLES),
+    of_check("fewer and fewer steps", lambda: check(steps=[200, 100]), "two or more increasing numbers", MULTIPLES),
+    of_check("steps in seconds", lambda: check(steps=[1e-2, 1e-3]), "two or more increasing numbers", MULTIPLES),
     of_check("an order without steps", lambda: check(order=4), "order is for simulators of fixed steps", MULTIPLES),
     of_check("an order of 0", lambda: check(steps=[100, 200], order=0.0), "order must be a positive", "leave it out"),
     of_check(

@@ -166,7 +166,7 @@ SOLVE = [
         "store",
         (3, TypeError, "must be a file name or a path; given 3", "give the path of a folder to make"),
         (".", ValueError, "must be a folder that does not exist yet; given '.', which exists", "take another name"),
-        ("no/run", ValueError, "must lie in a folder that exists; given 'no.run'", "make the folder above it"),
+        ("no/run", ValueError, "must be inside an existing folder; given 'no.run'", "make the folder above it"),
     ),
     of_solve("`Newmark(beta=1/6)` without `step_size`", lambda: case.solve(method=Newmark(beta=1.0 / 6.0))).says(
         "Newmark with beta = 0.166667.*has no error estimate", "give step_size, or take beta=1/4"

@@ -59,7 +59,7 @@ def test_poses_from_which_two_assemblies_can_be_meant_are_refused():
     model.revolute(ground, one, at=(ground.point(0.0, 0.0), one.point(-0.5, 0.0)))
     model.revolute(one, two, at=(one.point(0.5, 0.0), two.point(-0.5, 0.0)))
     model.revolute(two, ground, at=(two.point(0.5, 0.0), ground.point(1.7, 0.0)))
-    with pytest.raises(ValueError, match="cannot be put together") as caught:
+    with pytest.raises(ValueError, match="cannot be assembled") as caught:
         model.problem()
     assert "coordinate " not in str(caught.value)
 

@@ -196,5 +196,5 @@ def test_wheels_that_mesh_come_to_rest():
 
 def test_what_the_problem_says_of_dry_friction():
     problem = rotor(1.0)
-    assert "solve_with_friction keeps its dry friction" in problem.note and not problem.conserved
+    assert "solve_with_friction handles its dry friction" in problem.note and not problem.conserved
     assert not any("friction" in name for name in problem.parameters)

@@ -190,7 +190,7 @@ def test_redundant_rows_are_named_where_a_run_ends():
         np.linalg.inv(J @ J.T)
         raise ArithmeticError("rank")
 
-    assert "A row of C follows" in check_simulator(simulate, "redundant_slider_crank").failures[0].hint
+    assert "A row of C depends" in check_simulator(simulate, "redundant_slider_crank").failures[0].hint
     assert check_simulator(simulate, "four_bar").failures[0].hint == ""
 
 

@@ -1,4 +1,4 @@
-"""What a simulator with fixed steps is off by on mechanisms with rigid joints, and which step and settings it needs."""
+"""Audit of fixed-step simulators on mechanisms with rigid joints: errors, and the step and settings required."""
 
 from twoloop.audit.mjcf_audit import MjcfAudit, audit_mjcf
 from twoloop.audit.poses import coordinates

@@ -1,4 +1,4 @@
-"""Which integrator, solref and time step MuJoCo needs on the closed loops of an MJCF file."""
+"""Finds the integrator, solref and time step that MuJoCo needs for the closed loops of an MJCF file."""
 
 import csv
 import json
@@ -18,27 +18,27 @@ from twoloop.checks.arguments import check_positive
 from twoloop.run.projection import consistent_state
 
 CANDIDATES = (Settings(stiff=True), Settings("RK4", stiff=True))
-CHANGE = 1.4  # by how much a setting must be cheaper than one that changes less of the file
+CHANGE = 1.4  # a setting that changes more of the file must be cheaper by this factor
 ENDINGS = (".json", ".csv")
 
 
 @dataclass(frozen=True)
 class MjcfAudit:
-    """What MuJoCo is off by on a file, as it is and with stiffer loops; `print(audit)`.
+    """Errors of MuJoCo on a file, as given and with stiffer loops; `print(audit)` shows them.
 
     Attributes
     ----------
     file, start : str
-        What was run, and from where.
+        The file, and the initial state.
     left_out : tuple of str
-        What neither motion has: contacts, actuators, limits, ...
+        Parts of the file that are omitted from both motions: contacts, actuators, limits, ...
     notes : tuple of str
     as_it_is : str
-        The error at the step of the file.
+        Description of the error at the step of the file.
     audits : tuple of Audit
-        As the file is; with loops as stiff as a step allows; so, and with RK4.
+        With the settings of the file; with loops as stiff as the step allows; the same with RK4.
     advice : str
-        What to write into the file for the error asked for, and what it costs; empty if nothing tried reaches it.
+        Settings for the requested error and their cost; empty if none of the audits reaches it.
     """
 
     file: str
@@ -63,12 +63,12 @@ class MjcfAudit:
         return "\n".join([*head, *(f"{audit}\n" for audit in self.audits), self.as_it_is, end])
 
     def write(self, path: str | os.PathLike[str]) -> None:
-        """Write everything as JSON, or the runs as CSV, by the ending of the path.
+        """Write everything as JSON, or the runs as CSV, by the suffix of the path.
 
         Raises
         ------
         ValueError
-            If it ends otherwise.
+            If the suffix is neither.
         """
         file = Path(path)
         check_ending(file)
@@ -91,7 +91,7 @@ class MjcfAudit:
 
 
 def _counted(left_out: tuple[str, ...]) -> list[str]:
-    """What is left out; of several joints as "limits of 8 joints"."""
+    """Return what is left out, with several items combined, e.g. "limits of 8 joints"."""
     parts = [each.partition(" of joint ")[::2] for each in left_out]
     found: dict[str, None] = {}
     for each, (what, joint) in zip(left_out, parts, strict=True):
@@ -101,7 +101,7 @@ def _counted(left_out: tuple[str, ...]) -> list[str]:
 
 
 def check_ending(file: Path) -> None:
-    """Raise a ValueError if an audit cannot be written to a file of this name."""
+    """Raise ValueError if an audit cannot be written to a file with this suffix."""
     if file.suffix not in ENDINGS:
         raise ValueError(f"--out takes a file that ends in {' or '.join(ENDINGS)}; given {str(file)!r}")
 
@@ -113,21 +113,21 @@ def _row(run: AuditedRun) -> dict[str, Any]:
 def audit_mjcf(
     path: str | os.PathLike[str], *, error: float = 1e-3, t_end: float = 2.0, key: str | None = None
 ) -> MjcfAudit:
-    """Compare MuJoCo's motion of a file with the motion of its rigid loops, and find what an error takes.
+    """Compare MuJoCo's motion of a file with that of its rigid loops, and find settings for a requested error.
 
-    Steps and settings are tried in turn: those of the file, then loops as stiff as a step allows (solref of twice the
-    step, the least that MuJoCo takes unless told otherwise), with the file's integrator and with RK4.
+    Three settings are run with several steps: those of the file, then loops as stiff as the step allows (solref of
+    twice the step, the smallest value that MuJoCo accepts by default), with the file's integrator and with RK4.
 
     Parameters
     ----------
     path : path-like
         An MJCF file with loops closed by connect or weld.
     error : float, optional
-        Asked for: the largest of any body's centre (m) or axes over the motion.
+        Requested error: the largest over all times of any body's centre (m) or axes.
     t_end : float, optional
-        How long the motion is followed, s.
+        Duration of the motion, s.
     key : str, optional
-        Keyframe from which it starts, by its name, or its number if it has none. None: the pose of the file, at rest.
+        Name of the initial keyframe, or its number if unnamed. None: the pose of the file, at rest.
 
     Returns
     -------
@@ -136,14 +136,14 @@ def audit_mjcf(
     Raises
     ------
     RuntimeError
-        If MuJoCo is not installed, or the motion of rigid loops is not known to that error.
+        If MuJoCo is not installed, or the reference motion is less accurate than the requested error.
     ValueError
-        If an argument is wrong, the file has no loop, nothing moves, or MuJoCo's model of masses, springs, dampers and
-        loops is not the one that `from_mjcf` reads.
+        If an argument is invalid, the file has no loop, nothing moves, or MuJoCo's masses, springs, dampers or loops
+        differ from those of `from_mjcf`.
 
     Notes
     -----
-    `twoloop.bodies.from_mjcf` says what is read. What it ignores is switched off in MuJoCo, too, and listed.
+    Parts of the file ignored by `twoloop.bodies.from_mjcf` are disabled in MuJoCo as well, and listed.
     """
     check_positive("error", error)
     check_positive("t_end", t_end)
@@ -152,7 +152,7 @@ def audit_mjcf(
         model = from_mjcf(path)
     inside = InMuJoCo(path, model)
     mujoco = inside.mujoco
-    mujoco.set_mju_user_warning(lambda text: None)  # which it would put into a file in the folder of the caller
+    mujoco.set_mju_user_warning(lambda text: None)  # by default MuJoCo writes them to a file in the working directory
     try:
         qpos, qvel, gap = inside.start(key)
         problem = model.problem((0.0, t_end))
@@ -176,14 +176,14 @@ def audit_mjcf(
     finally:
         mujoco.set_mju_user_warning(None)
     notes = [problem.note]
-    notes += [f"Loops gaped by {gap:.2g} m there: they are closed first."] if gap > MOVED else []
+    notes += [f"The loops were open by {gap:.2g} m there and are closed first."] if gap > MOVED else []
     others = [name for name in inside.keyframes if name != key]
     notes += [f"Other starts, by --key: {', '.join(others)}."] if others else []
     floor = audits[-1].floor or 0.0
     if floor > error:
         notes.append(
-            f"Even stiff loops with RK4 end at an error of {floor:.2g}, where none is expected: motions part too fast, "
-            "or MuJoCo moves another mechanism than the one that was read. Do not trust this audit."
+            f"Even stiff loops with RK4 have an error of {floor:.2g}, much more than expected: neighbouring motions "
+            "diverge too fast, or MuJoCo's mechanism differs from the one that was read. Do not trust this audit."
         )
     left_out = tuple(each for each in model.ignored if not each.startswith(("sensor", "keyframe")))
     start = "the pose of the file" if key is None else f"the keyframe {key!r}"
@@ -193,7 +193,7 @@ def audit_mjcf(
 
 
 def _at(audit: Audit, step: float) -> str:
-    """What the file is off by at its own step, of the runs the one that is nearest."""
+    """Return the error of the file at its own step, from the run with the nearest step."""
     run = min(audit.runs, key=lambda each: abs(np.log(each.step / step)))
     if not 0.7 < run.step / step < 1.5:
         why = "a 50th of the time, the longest tried" if step > run.step else "the shortest tried"
@@ -208,11 +208,11 @@ def _label(settings: Settings, integrator: str) -> str:
 
 
 def _advice(inside: InMuJoCo, audits: list[Audit]) -> str:
-    """What to write into the file: of the settings that reach the error the cheapest, or nearly."""
+    """Return the settings that reach the error: the cheapest, or the one with fewer changes if it costs little more."""
     costs = {k: run.cpu_s for k, audit in enumerate(audits) if (run := audit.reaching)}
     if not costs:
         return ""
-    k = next(k for k, cost in costs.items() if cost <= CHANGE * min(costs.values()))  # the least change
+    k = next(k for k, cost in costs.items() if cost <= CHANGE * min(costs.values()))  # fewest changes
     audit, run, settings = audits[k], audits[k].reaching, (Settings(), *CANDIDATES)[k]
     assert run is not None
     option = f'timestep="{run.step:.6g}" integrator="{settings.integrator or inside.integrator}"'

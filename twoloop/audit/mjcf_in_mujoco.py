@@ -1,4 +1,4 @@
-"""An MJCF file in MuJoCo and as a model of rigid joints: one start, one set of forces, compared before they move."""
+"""An MJCF file in MuJoCo and as a model with rigid joints, with the same start and forces, compared beforehand."""
 
 import os
 from importlib import import_module
@@ -11,38 +11,38 @@ from twoloop.bodies.spatial_model import SpatialModel
 from twoloop.checks.arguments import Array
 from twoloop.mechanisms.rotation import euler_parameters, euler_rates
 
-# what `from_mjcf` leaves out and MuJoCo can be run without, by how the words for it begin
+# prefixes of ignored parts that can be disabled in MuJoCo
 SWITCHED_OFF = (
     *("contacts between", "contact", "limits of", "armature of", "frictionloss of", "actuator", "sensor", "keyframe"),
     *("gravcomp of", "stiffness and damping of joint", "equality", "tendon"),
     *("density of the", "viscosity of the", "wind of the"),
 )
 OFF = ("CONTACT", "LIMIT", "FRICTIONLOSS", "ACTUATION")
-SAME = 1e-6  # of masses and forces that both have, over the largest
-CLOSED, MOVED = 1e-12, 1e-6  # m: gaps of a closed loop; a start that was moved more is told
-INTEGRATORS = ("Euler", "RK4", "implicit", "implicitfast")  # as MJCF spells them, in MuJoCo's order
-ITERATIONS, TOLERANCE = 100, 1e-8  # MuJoCo's defaults, of the solver of constraints
-DISPLACED = 0.3  # m and rad, of every joint, where forces are compared
+SAME = 1e-6  # tolerance of masses and forces, relative to the largest
+CLOSED, MOVED = 1e-12, 1e-6  # m: gap of a closed loop; smallest displacement of the start that is reported
+INTEGRATORS = ("Euler", "RK4", "implicit", "implicitfast")  # in MuJoCo's order
+ITERATIONS, TOLERANCE = 100, 1e-8  # MuJoCo's defaults for its constraint solver
+DISPLACED = 0.3  # m and rad: joint displacements at which forces are compared
 
 
 class Settings(NamedTuple):
-    """What of MuJoCo is set for a run; None: what the file says. `stiff`: loops as stiff as a step allows."""
+    """MuJoCo's settings of a run; None: as in the file. `stiff`: loops as stiff as the step allows."""
 
     integrator: str | None = None
     stiff: bool = False
 
 
 class InMuJoCo:
-    """A file in MuJoCo, without what the model of rigid joints has not.
+    """A file in MuJoCo, without the parts that the model with rigid joints lacks.
 
     Parameters
     ----------
     path : path-like
     model : SpatialModel
-        Of `from_mjcf` of the same file.
+        The model read by `from_mjcf` from the same file.
 
-    Raises RuntimeError if MuJoCo is not installed. Raises ValueError if it refuses the file, or cannot be run without
-    what the model has not.
+    Raises RuntimeError if MuJoCo is not installed. Raises ValueError if MuJoCo rejects the file, or a part that the
+    model lacks cannot be disabled.
     """
 
     def __init__(self, path: str | os.PathLike[str], model: SpatialModel):
@@ -52,13 +52,13 @@ class InMuJoCo:
             raise RuntimeError("mujoco is not installed: pip install mujoco") from None
         if kept := [each for each in model.ignored if not each.startswith(SWITCHED_OFF)]:
             raise ValueError(
-                f"the model of rigid joints is without {'; '.join(kept)}, which MuJoCo cannot be run without: "
-                "take it out of the file, or write it out (MuJoCo's mj_saveLastXML)"
+                f"the model of rigid joints lacks {'; '.join(kept)}, which cannot be disabled in MuJoCo: "
+                "remove it from the file, or expand it (MuJoCo's mj_saveLastXML)"
             )
         try:
             self.engine = self.mujoco.MjModel.from_xml_path(os.fspath(path))
         except ValueError as error:
-            raise ValueError(f"MuJoCo refuses the file: {' '.join(str(error).split())}") from None
+            raise ValueError(f"MuJoCo rejects the file: {' '.join(str(error).split())}") from None
         self.model = model
         self._switch_off()
         engine = self.engine
@@ -68,11 +68,11 @@ class InMuJoCo:
             raise ValueError(f"MuJoCo has {len(self.bodies)} bodies with joints, the model {len(model.bodies)}")
         if not len(self.loops):
             raise ValueError(
-                "no connect and no weld is active: the file has no loop, and the joints of a tree do not gape"
+                "no connect and no weld is active: the file has no loop, and the joints of a tree cannot open"
             )
         data = self.mujoco.MjData(engine)
         self.mujoco.mj_kinematics(engine, data)
-        self.centres = np.empty((len(self.bodies), 3))  # of mass, with what is fixed to a body, in its frame
+        self.centres = np.empty((len(self.bodies), 3))  # centres of mass in body frames, with fixed parts
         for centre, body in zip(self.centres, self.bodies, strict=True):
             group = np.flatnonzero(engine.body_weldid == body)
             place = np.average(data.xipos[group], axis=0, weights=engine.body_mass[group])
@@ -83,7 +83,7 @@ class InMuJoCo:
         self.loop_numbers = engine.eq_solref.copy(), engine.eq_solimp.copy()
 
     def _switch_off(self) -> None:
-        """Leave out of MuJoCo's model what the model of rigid joints has not."""
+        """Disable in MuJoCo's model the parts that the model of rigid joints lacks."""
         mujoco, engine = self.mujoco, self.engine
         for name in OFF:
             engine.opt.disableflags |= getattr(mujoco.mjtDisableBit, f"mjDSBL_{name}")
@@ -113,14 +113,14 @@ class InMuJoCo:
 
     @property
     def keyframes(self) -> list[str]:
-        """Names of the keyframes; numbers of those without."""
+        """Return the names of the keyframes, or their numbers if unnamed."""
         kind = self.mujoco.mjtObj.mjOBJ_KEY
         return [self.mujoco.mj_id2name(self.engine, kind, k) or str(k) for k in range(self.engine.nkey)]
 
     def start(self, key: str | None) -> tuple[Array, Array, float]:
-        """Joint coordinates and velocities of a keyframe, or of the file's pose, at which loops are closed; the gap.
+        """Return joint coordinates and velocities of a keyframe, or of the file's pose, with closed loops, and the gap.
 
-        Raises ValueError if there is no such keyframe, or loops cannot be closed from there.
+        Raises ValueError if there is no such keyframe, or the loops cannot be closed from there.
         """
         mujoco, engine = self.mujoco, self.engine
         data = mujoco.MjData(engine)
@@ -137,14 +137,14 @@ class InMuJoCo:
             mujoco.mj_integratePos(engine, data.qpos, -np.linalg.lstsq(rows, off, rcond=1e-9)[0], 1.0)
         else:
             raise ValueError(
-                f"the loops gape by {gap:.2g} m at the start, and cannot be closed from there (left: "
+                f"the loops are open by {gap:.2g} m at the start, and cannot be closed from there (residual: "
                 f"{np.abs(off).max():.2g}): start from a keyframe in which they are closed (--key)"
             )
         data.qvel[:] -= np.linalg.lstsq(rows, rows @ data.qvel, rcond=1e-9)[0]
         return data.qpos.copy(), data.qvel.copy(), float(gap or 0.0)
 
     def _rows(self, data: Any) -> tuple[Array, Array]:
-        """Rows (n, nv) of the loops, and how far these are from closed, (n,)."""
+        """Return the rows (n, nv) of the loops and their residuals (n,)."""
         mujoco, engine = self.mujoco, self.engine
         given, engine.opt.jacobian = engine.opt.jacobian, mujoco.mjtJacobian.mjJAC_DENSE
         mujoco.mj_forward(engine, data)
@@ -153,7 +153,7 @@ class InMuJoCo:
         return data.efc_J.reshape(-1, engine.nv)[own].copy(), data.efc_pos[own].copy()
 
     def coordinates(self, data: Any) -> tuple[Array, Array]:
-        """Those of the model (n_q,), and how they change with each of MuJoCo's velocities, (n_q, nv)."""
+        """Return the coordinates of the model (n_q,) and their derivatives by MuJoCo's velocities, (n_q, nv)."""
         n, nv = len(self.bodies), self.engine.nv
         q, by_v = np.empty((n, 7)), np.empty((n, 7, nv))
         moved, turned = np.empty((3, nv)), np.empty((3, nv))
@@ -171,10 +171,10 @@ class InMuJoCo:
         return np.append(data.xpos[self.bodies[k]] + R @ self.centres[k], euler_parameters(R))
 
     def compare(self, problem: ModelProblem, start: Array) -> None:
-        """Raise a ValueError if masses, forces, dampers or loops are not those of the model of rigid joints.
+        """Raise ValueError if masses, forces, dampers or loops differ from those of the model of rigid joints.
 
-        Mass matrices and generalised forces of the tree are compared in MuJoCo's coordinates, at a displaced position;
-        the directions that loops allow, at the start.
+        Mass matrices and generalised forces of the tree are compared in MuJoCo's coordinates at a displaced position,
+        and the admissible velocities of the loops at the start.
         """
         mujoco, engine = self.mujoco, self.engine
         data = mujoco.MjData(engine)
@@ -189,7 +189,7 @@ class InMuJoCo:
             return data.qfrc_passive - data.qfrc_bias, by_v.T @ system.force(0.0, q, by_v @ v)
 
         def damping(k: int) -> tuple[Array, Array]:
-            (one, own), (other, theirs) = forces(unit[k]), forces(-unit[k])  # what is quadratic in velocities cancels
+            (one, own), (other, theirs) = forces(unit[k]), forces(-unit[k])  # quadratic velocity terms cancel
             return 0.5 * (one - other), 0.5 * (own - theirs)
 
         still = forces(np.zeros(engine.nv))
@@ -218,12 +218,12 @@ class InMuJoCo:
             dof = int(off.reshape(-1, self.engine.nv).max(axis=0).argmax())
             body = self.model.bodies[int(np.flatnonzero(self.bodies == self.engine.dof_bodyid[dof])[0])].name
             raise ValueError(
-                f"MuJoCo's model is not the one that was read: {what} differ by {off.max() / largest:.2g} of the "
-                f"largest, most at a joint of {body!r}. MuJoCo has something there that `from_mjcf` has not"
+                f"MuJoCo's model differs from the one that was read: {what} differ by {off.max() / largest:.2g} of "
+                f"the largest, most at a joint of {body!r}. MuJoCo has something there that `from_mjcf` lacks"
             )
 
     def simulator(self, qpos: Array, qvel: Array, settings: Settings) -> Any:
-        """What `audit_simulator` takes, from a start and with settings."""
+        """Return a function for `audit_simulator`, with a given start and settings."""
         mujoco, engine = self.mujoco, self.engine
 
         def simulate(problem: ModelProblem, times: Array, step: float) -> Array:
@@ -244,7 +244,7 @@ class InMuJoCo:
         return simulate
 
     def set(self, settings: Settings, step: float) -> None:
-        """Set MuJoCo's model for steps of a length."""
+        """Set up MuJoCo's model for a step size."""
         engine, option = self.engine, self.engine.opt
         option.timestep = step
         option.integrator = INTEGRATORS.index(settings.integrator or self.integrator)
@@ -257,7 +257,7 @@ class InMuJoCo:
 
     @property
     def good_solver(self) -> tuple[int, int, float]:
-        """What the solver of constraints is set to where loops are stiff: what the file says, if that is not worse."""
+        """Return the constraint solver settings for stiff loops: those of the file, unless they are worse."""
         _, iterations, tolerance = self.solver
         newton = int(self.mujoco.mjtSolver.mjSOL_NEWTON)
         return newton, max(iterations, ITERATIONS), min(tolerance, TOLERANCE)

@@ -1,4 +1,4 @@
-"""Where the bodies of a model are: poses from coordinates, and how far joints gape."""
+"""Poses of the bodies of a model from its coordinates, and gaps of its joints."""
 
 from typing import Any
 
@@ -8,11 +8,11 @@ from numpy.typing import ArrayLike
 from twoloop.checks.arguments import Array
 from twoloop.mechanisms.rotation import euler_parameters, rotation_matrix
 
-POINTS_STAY = ("revolute", "spherical", "universal", "fixed")  # kinds of joints that keep two points together
+POINTS_STAY = ("revolute", "spherical", "universal", "fixed")  # kinds of joints that keep two points coincident
 
 
 def poses(model: Any, q: Array) -> tuple[Array, Array]:
-    """Centres of mass (n_t, n, d) and axes (n_t, n, d, d), as columns, of coordinates (n_t, n_q) in d dimensions."""
+    """Return centres of mass (n_t, n, d) and axes as columns (n_t, n, d, d), for d-dimensional q (n_t, n_q)."""
     d = model.dimension
     parts = q.reshape(len(q), len(model.bodies), 3 if d == 2 else 7)
     R = np.empty((*parts.shape[:2], d, d))
@@ -27,14 +27,14 @@ def poses(model: Any, q: Array) -> tuple[Array, Array]:
 
 
 def coordinates(x: ArrayLike, R: ArrayLike) -> Array:
-    """Coordinates of the problem of a `SpatialModel`, of poses that another program has computed.
+    """Return the coordinates of the problem of a `SpatialModel` for poses computed by another program.
 
     Parameters
     ----------
     x : array_like (n_t, n_bodies, 3)
         Centres of mass in the order of `model.bodies`, m.
     R : array_like (n_t, n_bodies, 3, 3)
-        Their columns are the axes of the bodies.
+        Rotation matrices; their columns are the axes of the bodies.
 
     Returns
     -------
@@ -43,7 +43,7 @@ def coordinates(x: ArrayLike, R: ArrayLike) -> Array:
     Raises
     ------
     ValueError
-        If shapes do not fit, or one of R is no rotation matrix.
+        If the shapes are inconsistent, or an R is not a rotation matrix.
     """
     x, R = np.asarray(x, dtype=float), np.asarray(R, dtype=float)
     if x.ndim != 3 or x.shape[2] != 3 or R.shape != (*x.shape, 3):
@@ -53,7 +53,7 @@ def coordinates(x: ArrayLike, R: ArrayLike) -> Array:
 
 
 def gaps(model: Any, x: Array, R: Array) -> Array:
-    """Largest distance between points that joints put together, m, at each instant (n_t,); of slides, across them."""
+    """Return the largest distance (n_t,) of points that joints keep coincident, m; for slides, across the axis."""
     found = np.zeros(len(x))
     for joint in model.joints:
         slides = joint.kind in ("prismatic", "cylindrical") and len(joint.axes) > 0

@@ -1,4 +1,4 @@
-"""A simulator with fixed steps against the motion of rigid joints: error, order, floor, gap and cost, step by step."""
+"""Compares a fixed-step simulator with the motion of rigid joints: error, order, floor, gap and cost per step size."""
 
 import time
 import warnings
@@ -16,21 +16,21 @@ from twoloop.solve import solve_dae
 
 Simulate = Callable[[ModelProblem, Array, float], Any]
 
-INSTANTS = 50  # beside the start, at which motions are compared
-TIGHT = 1e-12  # tolerance of both routes to the reference
-LOST = 0.1  # an error from which on a motion is another one
-FLAT = 1.5  # factor by which errors of two steps differ at most where they no longer fall
-COARSEST, SETTLED, FINEST = 8.0, 0.25, 2.0**-12  # steps, over the one given; from the second on a floor is one
-WELL_BELOW = 0.1  # of the error asked for
-SAME_START = 1e-6  # m, and of axes
-LIMIT = 4.0  # s of CPU that the next run may be expected to take
-MOST_STEPS = 100_000  # of the first run, before which none tells what a step costs
-KNOWN_WITHIN = 60.0  # s that each route to the reference may take
-RESOLVED = 0.1  # how far the routes to the reference may differ, over the error that is asked for
+INSTANTS = 50  # comparison times after the start
+TIGHT = 1e-12  # tolerance of both references
+LOST = 0.1  # larger errors mean that the motion is a different one
+FLAT = 1.5  # errors that decrease by less than this factor count as a floor
+COARSEST, SETTLED, FINEST = 8.0, 0.25, 2.0**-12  # relative to the step given; a floor needs a step <= SETTLED
+WELL_BELOW = 0.1  # relative to the requested error
+SAME_START = 1e-6  # tolerance of the initial poses, m and components of axes
+LIMIT = 4.0  # CPU time, s, up to which the next run is attempted
+MOST_STEPS = 100_000  # limit for the first run, when the cost of a step is unknown
+KNOWN_WITHIN = 60.0  # s: time limit of each reference
+RESOLVED = 0.1  # largest difference of the references, relative to the requested error
 
 
 class AuditedRun(NamedTuple):
-    """A run with steps of one length; `error` and `gap` are NaN where it failed, and `message` says why.
+    """A run with one step size; `error` and `gap` are NaN if it failed, and `message` says why.
 
     Attributes
     ----------
@@ -38,9 +38,9 @@ class AuditedRun(NamedTuple):
         s.
     n_steps : int
     error : float
-        Largest over the instants, of any body's centre (m) or axes.
+        Largest error over all times of any body's centre (m) or axes.
     gap : float
-        Largest distance between points that joints put together, m.
+        Largest distance between points that joints keep coincident, m.
     cpu_s : float
         CPU time of the call, s.
     """
@@ -55,7 +55,7 @@ class AuditedRun(NamedTuple):
 
 @dataclass(frozen=True)
 class Audit:
-    """What a simulator is off by, at steps from long to short; `print(audit)`.
+    """Errors of a simulator for steps from long to short; `print(audit)` shows them.
 
     Attributes
     ----------
@@ -63,12 +63,12 @@ class Audit:
     t_end : float
         s.
     error : float
-        Asked for.
+        Requested error.
     apart : float
-        How far the two routes to the reference differ.
+        Difference of the two references.
     runs : tuple of AuditedRun
     order, floor : float or None
-        Observed order, the median between steps where the error falls; the error that shorter steps no longer lower.
+        Observed order, the median over steps where the error decreases; the error that shorter steps do not reduce.
     """
 
     label: str
@@ -81,7 +81,7 @@ class Audit:
 
     @property
     def reaching(self) -> AuditedRun | None:
-        """The run with the longest step that has the error asked for, as all with shorter ones have, one at least."""
+        """Return the run with the longest step such that it and all shorter steps, at least one, reach the error."""
         found: AuditedRun | None = None
         for k, each in enumerate(reversed(self.runs)):
             if not each.error <= self.error:
@@ -105,24 +105,24 @@ class Audit:
 def audit_simulator(
     simulate: Simulate, problem: ModelProblem, *, step: float, error: float = 1e-3, label: str = "simulator"
 ) -> Audit:
-    """Run a simulator with fixed steps on a model of bodies and joints, and compare it with the motion of rigid joints.
+    """Run a fixed-step simulator on a model of bodies and joints, and compare it with the motion of rigid joints.
 
-    The reference is `solve_dae` by two unlike methods, DOP853 and RadauIIA9, at 1e-12.
+    The reference is `solve_dae` with two different methods, DOP853 and RadauIIA9, at tolerances of 1e-12.
 
     Parameters
     ----------
     simulate : callable
-        simulate(problem, times, step) -> q (n_t, n_q), or a tuple that begins with q: the coordinates of `problem` at
-        the times (n_t,), s, the first of which is the start, a row for each; the times are whole steps apart. Where it
-        cannot go on it raises an exception, or returns NaN.
+        simulate(problem, times, step) -> q (n_t, n_q), or a tuple that begins with q: the coordinates of `problem`, one
+        row for each of the times (n_t,), s. The first time is the start; the times are multiples of the step. If the
+        simulator fails, it raises an exception or returns NaN.
     problem : ModelProblem
-        Of `model.problem(t_span)`: the mechanism, its start, and how long it is followed.
+        Result of `model.problem(t_span)`: mechanism, initial state and time span.
     step : float
-        The one in use, s, rounded to a part of a 50th of the span. Tried are up to 8 times this, in not more than
-        100,000 steps, and each half the one before, until the error falls no more, is well below the one asked for, or
-        a run would take more than seconds.
+        Step in use, s, rounded so that a 50th of the span is a multiple of it. The steps start at up to 8 times this,
+        with at most 100,000 steps, and are halved until the error stops decreasing or is well below the requested one,
+        or a run would take more than a few seconds.
     error : float, optional
-        Asked for: the largest of any body's centre (m) or axes over the motion.
+        Requested error: the largest over all times of any body's centre (m) or axes.
     label : str, optional
 
     Returns
@@ -132,9 +132,9 @@ def audit_simulator(
     Raises
     ------
     TypeError, ValueError
-        If an argument is wrong, nothing moves, or `simulate` starts elsewhere, or returns an array of another shape.
+        If an argument is invalid, nothing moves, or `simulate` has another start or returns an array of wrong shape.
     RuntimeError
-        If the two routes to the reference fail, differ by more than a tenth of `error`, or take more than a minute.
+        If a reference fails or takes more than a minute, or the two differ by more than a tenth of `error`.
     """
     if not isinstance(problem, ModelProblem) or problem.model is None:
         raise TypeError(f"problem must be made by model.problem(...) of twoloop.bodies; given {shown(problem)}")
@@ -143,16 +143,16 @@ def audit_simulator(
     known, apart = reference(problem, error)
     t0, t1 = problem.t_span
     runs: list[AuditedRun] = []
-    parts = max(1, round((t1 - t0) / (step * INSTANTS)))  # so that instants are whole steps apart
+    parts = max(1, round((t1 - t0) / (step * INSTANTS)))  # so that the comparison times are multiples of the step
     while parts % 2 == 0 and (t1 - t0) / (INSTANTS * parts) < 0.7 * COARSEST * step:
         parts //= 2
     n = INSTANTS * min(parts, MOST_STEPS // INSTANTS)
-    # the first run may hold imports and compiling
+    # the first run may include imports and compilation
     while (t1 - t0) / n >= FINEST * step and not (len(runs) > 1 and 2.0 * runs[-1].cpu_s > LIMIT):
         runs.append(_run(simulate, problem, known, n))
         own = [run for run in runs if not run.message]
         order, floor = order_and_floor([run.step for run in own], [run.error for run in own], apart)
-        at_rest = floor is not None and (t1 - t0) / n <= SETTLED * step  # long steps may lose the motion alike
+        at_rest = floor is not None and (t1 - t0) / n <= SETTLED * step  # long steps may just lose the motion
         if at_rest or (len(own) > 3 and own[-1].error < max(WELL_BELOW * error, 10.0 * apart)):
             break
         n *= 2
@@ -160,7 +160,7 @@ def audit_simulator(
 
 
 def reference(problem: ModelProblem, error: float) -> tuple[tuple[Array, Array], float]:
-    """Poses at the instants, and how far those of another method are from them at most."""
+    """Return the poses at the comparison times, and their largest difference from those of another method."""
     times = np.linspace(*problem.t_span, INSTANTS + 1)
     found = []
     with warnings.catch_warnings():
@@ -171,15 +171,15 @@ def reference(problem: ModelProblem, error: float) -> tuple[tuple[Array, Array],
             run = solve_dae(problem.system, problem.t_span, problem.q0, problem.v0, compiled=False, **options)
             if not run.success:
                 raise RuntimeError(
-                    f"the motion of rigid joints is not known beyond {run.t[-1]:.3g} s: follow it for a shorter time, "
-                    f"or from another start. {method}: {run.message}"
+                    f"the reference motion ends at {run.t[-1]:.3g} s: use a shorter time span, "
+                    f"or another start. {method}: {run.message}"
                 )
             found.append(poses(problem.model, run.q.T))
     apart = _off(*found)
     if apart > RESOLVED * error:
         raise RuntimeError(
             f"the motion is not known to {error:g}: two references differ by {apart:.2g} within {problem.t_span[1]:g} "
-            "s. Neighbouring motions part too fast, as they do past singular positions; follow it for a shorter time"
+            "s. Neighbouring motions diverge too fast, e.g. near singular positions; use a shorter time span"
         )
     if np.abs(found[0][0] - found[0][0][0]).max() + np.abs(found[0][1] - found[0][1][0]).max() < 1e-9:
         raise ValueError("nothing moves: the start is at rest in equilibrium; start elsewhere, or with a velocity")
@@ -212,9 +212,9 @@ def _off(one: tuple[Array, Array], other: tuple[Array, Array]) -> float:
 
 
 def order_and_floor(h: Any, error: Any, least: float) -> tuple[float | None, float | None]:
-    """Observed order, the median between steps where the error falls, and the error that shorter steps do not lower.
+    """Return the observed order, the median over decreasing errors, and the error that shorter steps do not reduce.
 
-    `least` is what the reference resolves. None: not enough runs to tell, or no floor in sight.
+    `least` is the accuracy of the reference. None: not enough runs, or no floor reached.
     """
     order = np.argsort(-np.asarray(h, dtype=float))
     h, error = np.asarray(h, dtype=float)[order], np.asarray(error, dtype=float)[order]

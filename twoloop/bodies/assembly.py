@@ -96,7 +96,7 @@ def positions(
         if (left > OPEN_TOLERANCE * np.maximum(terms, terms.max())).any():
             raise ValueError(_open_joints_message(system, left, rows))
     if reason:
-        raise ValueError(f"the bodies of {system.name!r} cannot be put together from the poses given: {reason}")
+        raise ValueError(f"the bodies of {system.name!r} cannot be assembled from the poses given: {reason}")
     return found
 
 
@@ -133,7 +133,7 @@ def _open_joints_message(system: ConstrainedSystem, left: Array, rows: Mapping[s
     others = [name for name in misfit if name != worst and misfit[name] > 0.1 * misfit[worst]]
     also = f" (nor do {', '.join(map(repr, others))})" if others else ""
     return (
-        f"the bodies of {system.name!r} cannot be put together: the joint {worst!r} does not close{also}; the "
+        f"the bodies of {system.name!r} cannot be assembled: the joint {worst!r} does not close{also}; the "
         f"least-squares solution leaves a residual of {misfit[worst]:.3g} in it. Check the lengths, the points of "
         "these joints, and the other joints of their bodies"
     )

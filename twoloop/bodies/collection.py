@@ -237,9 +237,7 @@ class Collection:
         if length is None:
             length = apart
             if length == 0.0:
-                raise ValueError(
-                    f"the points of {name!r} coincide in the position given; give a length, or use a revolute joint"
-                )
+                raise ValueError(f"the points of {name!r} coincide in the position given; give a length or use a joint")
         check_positive(f"length of {name!r}", length)
         long = Numbers((float(length),), (f"length of {name} (m)",))
         row = JointRow(self.distance_kind, 1, first, second, *points, long)

@@ -127,7 +127,7 @@ def motion_function(name: str, motion: Any, rate: Any, acceleration: Any) -> Fun
             return replace(function, traced=np.array(numbers_of(program_for([function], 0, True))))
         except Untraceable as error:
             raise ValueError(
-                f"{error}; so its derivatives cannot be derived. Write it with numpy functions and without "
+                f"{error}; so it cannot be differentiated exactly. Write it with numpy functions and without "
                 "branches, or give rate= and acceleration=, its first and second derivative as functions of t"
             ) from None
     return function

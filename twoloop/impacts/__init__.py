@@ -1,1 +1,1 @@
-"""Motion against stops: impacts with restitution, and rest in contact."""
+"""Impacts with restitution on stops, rest in contact, and dry friction."""

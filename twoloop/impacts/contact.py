@@ -1,4 +1,4 @@
-"""A system with some of its stops closed: constraints that hold as long as their forces push."""
+"""A system with some of its stops closed: additional constraints, valid while the contact forces push."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.run import Run
 
 
-class Closed:
-    """The functions of a system whose constraints are joined by the gaps of some stops.
+class WithContacts:
+    """Callbacks of a system extended by the gaps of closed stops as constraints.
 
     Parameters
     ----------
     system : ConstrainedSystem
     gaps : Gaps
     which : list of int
-        The stops that are closed.
+        Indices of the closed stops.
     """
 
     def __init__(self, system: ConstrainedSystem, gaps: Gaps, which: list[int]):
@@ -38,25 +38,25 @@ class Closed:
         return np.asarray(out)
 
     def constraint(self, t: float, q: Array) -> Array:
-        """C, then the gaps."""
+        """Evaluate C, followed by the gaps."""
         return np.append(self._of("constraint", t, q), self._gaps.at(t, q, self._still).g[self._which])
 
     def jacobian(self, t: float, q: Array) -> Array:
-        """C_q, then their gradients."""
+        """Evaluate C_q, followed by the gradients of the gaps."""
         rows = self._system.jacobian(t, q) if self._system.n_c else np.zeros((0, self._system.n_q))
         return np.vstack([rows, self._gaps.at(t, q, self._still).W[self._which]])
 
     def constraint_rate(self, t: float, q: Array) -> Array:
-        """C_t, then theirs."""
+        """Evaluate C_t, followed by the time derivatives of the gaps."""
         return np.append(self._system.constraint_rate(t, q), self._gaps.at(t, q, self._still).u[self._which])
 
     def gamma(self, t: float, q: Array, v: Array) -> Array:
-        """The right-hand side of C_q a = gamma, and theirs."""
+        """Evaluate the right-hand side of C_q a = gamma, followed by that of the gaps."""
         own = self._of("gamma", t, q, v) if self._system.n_c else np.zeros(0)
         return np.append(own, -self._gaps.at(t, q, v).bend[self._which])
 
     def made(self, names: str) -> ConstrainedSystem:
-        """The system of these."""
+        """Return the system with these callbacks."""
         system = self._system
         functions: dict[str, Any] = {
             kind: getattr(self, kind) for kind in ("constraint", "jacobian", "constraint_rate")
@@ -73,7 +73,7 @@ class Closed:
 
 
 class Accelerations:
-    """Accelerations and multipliers of a system at any state, as its runs find them."""
+    """Accelerations and multipliers of a system at any state, computed as in its runs."""
 
     def __init__(self, system: ConstrainedSystem, t: float, q: Array, v: Array, atol: Array):
         derived, _ = standing_for(system, unchecked)
@@ -83,7 +83,7 @@ class Accelerations:
         self._n = system.n_q
 
     def at(self, t: float, q: Array, v: Array) -> tuple[Array, Array]:
-        """a (n_q,) and [lam; mu]; NaN where there are none."""
+        """Return a (n_q,) and [lam; mu]; NaN if they do not exist."""
         run, n = self._run, self._n
         state = np.concatenate([q, v, np.zeros(len(run.state) - 2 * n)])
         if direct(run.kernels.start)(run.kit, run.work, t, state) != codes.DONE:

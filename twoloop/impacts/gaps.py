@@ -1,4 +1,4 @@
-"""The gaps of stops with their derivatives, from operations that are recorded once."""
+"""Gap functions of stops with their derivatives, traced once."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from twoloop.generate.programs import numbers_of, program_of
 from twoloop.generate.tracing import Form, Graph, Untraceable, symbols
 from twoloop.problem.stops import Stop
 
-STATES = 5  # at which what was recorded is compared with the function
-AGREES = 1e-10  # relative
+STATES = 5  # at which the traced program is compared with the function
+AGREES = 1e-10  # relative difference between the function and its program
 
 
 class Gap(NamedTuple):
-    """Of k stops: gaps, their rates, what their second derivatives have without v', and their gradients (k, n_q)."""
+    """Values for k stops: gaps, their rates, the part of the second derivatives without v', and gradients (k, n_q)."""
 
     g: Array
     u: Array
@@ -28,15 +28,15 @@ class Gap(NamedTuple):
 
 
 class Gaps:
-    """The gaps of all stops.
+    """The gap functions of all stops.
 
     Parameters
     ----------
     stops : sequence of Stop
     t0, q0 : float, ndarray (n_q,)
-        A state about which what was recorded is compared with the functions.
+        State near which the traced programs are compared with the functions.
 
-    Raises ValueError if a gap cannot be run on symbols, or does not give what it gave then.
+    Raises ValueError if a gap function cannot be traced, or disagrees with its trace.
     """
 
     def __init__(self, stops: Sequence[Stop], t0: float, q0: Array):
@@ -50,8 +50,8 @@ class Gaps:
                 gap = as_forms(graph, np.array(trace(stop.gap, t, symbols(q)), dtype=object).reshape(1))[0]
             except (Untraceable, ValueError) as error:
                 raise ValueError(
-                    f"gap of {stop.name!r} must be a number made of t and q by numpy's functions, without branches: "
-                    f"{error}"
+                    f"gap of {stop.name!r} must be a number computed from t and q by numpy functions, without "
+                    f"branches: {error}"
                 ) from None
             made += _with_derivatives(graph, gap, t, q, v)
         program = program_of(graph, 1 + 2 * self._n_q, dict(enumerate(made)))
@@ -59,8 +59,8 @@ class Gaps:
         self._compare(stops, t0, q0)
 
     def at(self, t: float, q: Array, v: Array) -> Gap:
-        """All of them at a state."""
-        from twoloop.bodies.program_results import results  # whose import compiles
+        """Evaluate the gaps at a state."""
+        from twoloop.bodies.program_results import results  # compiled on import
 
         made = results(0, t, q, v, self._p)[: self.n * (3 + self._n_q)].reshape(self.n, 3 + self._n_q)
         return Gap(made[:, 0], made[:, 1], made[:, 2], made[:, 3:])
@@ -77,13 +77,13 @@ class Gaps:
                     raise ValueError(f"gap of {stop.name!r} must return a finite number; it returned {shown(value)}")
                 if np.isfinite(value) and abs(value - own) > AGREES * (1.0 + abs(own)):
                     raise ValueError(
-                        f"gap of {stop.name!r} does not give at t = {t:g} what it gave when it was recorded: it must "
-                        "depend on t and q alone, without branches"
+                        f"gap of {stop.name!r} has another value at t = {t:g} than when it was traced: it must depend "
+                        "on t and q alone, without branches"
                     )
 
 
 def _with_derivatives(graph: Graph, gap: Form, t: Form, q: Sequence[Form], v: Sequence[Form]) -> list[Form]:
-    """A gap, its rate, what its second derivative has without v', and its gradient."""
+    """Return a gap, its rate, the part of its second derivative without v', and its gradient."""
     one = Form(graph, 1.0, {})
     (time,), places = t.terms, [next(iter(each.terms)) for each in q]
     along = {time: one, **dict(zip(places, v, strict=True))}

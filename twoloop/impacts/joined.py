@@ -1,4 +1,4 @@
-"""Runs from impact to impact as one result."""
+"""Joins the arcs between impacts into one result."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ CHANGES = "velocities jumped in impacts, or stops were closed or joints stuck fo
 
 
 class Impact(NamedTuple):
-    """An impact: when, s; at which stops; velocities before and after (n_q,); impulses, N s (N m s of an angle)."""
+    """An impact: time, s; stops; velocities before and after (n_q,); impulses, N s (N m s for an angle)."""
 
     t: float
     stops: tuple[str, ...]
@@ -28,7 +28,7 @@ class Impact(NamedTuple):
 
 
 class ArcState(NamedTuple):
-    """The state at a time, or at times (n,): q, v, a (n_q,) or (n_q, n), lam (n_c + n_a,) or (n_c + n_a, n)."""
+    """State at a time, or at times (n,): q, v, a (n_q,) or (n_q, n), lam (n_c + n_a,) or (n_c + n_a, n)."""
 
     t: Any
     q: Array
@@ -38,13 +38,13 @@ class ArcState(NamedTuple):
 
 
 class ArcSolution:
-    """`result.sol` of a motion of several arcs: at an impact the state is that after it.
+    """`result.sol` of a motion of several arcs; at an impact it returns the state after it.
 
     Attributes
     ----------
     arcs : tuple of Result
     t_min, t_max : float
-        The times that it covers, s.
+        Time interval covered, s.
     """
 
     def __init__(self, arcs: Sequence[Result], n_c: int, n_a: int):
@@ -52,12 +52,12 @@ class ArcSolution:
         self.t_min, self.t_max = float(arcs[0].t[0]), float(arcs[-1].t[-1])
 
     def __call__(self, t: ArrayLike) -> ArcState:
-        """The state at a time or at times (n,) in any order.
+        """Return the state at a time, or at times (n,) in any order.
 
         Raises
         ------
         TypeError, ValueError
-            If t is no number or vector, or not within the run.
+            If t is not a number or vector, or outside the run.
         """
         times = check_real("t", t)
         if times.ndim > 1 or not ((times >= self.t_min) & (times <= self.t_max)).all():
@@ -84,7 +84,7 @@ class ArcSolution:
 
 
 def own_rows(lam: Array, n_c: int, n_rows: int) -> Array:
-    """The multipliers of a system itself, without those of closed stops, which stand behind those of C."""
+    """Return the multipliers of the system itself, without those of closed stops, which follow those of C."""
     return np.vstack([lam[:n_c], lam[len(lam) - (n_rows - n_c) :]])
 
 
@@ -96,7 +96,7 @@ def joined(
     stagnated: str,
     tale: str,
 ) -> Result:
-    """One result of all arcs, at the ends of their steps or at output times; `tale` ends its message."""
+    """Return one result of all arcs, at the ends of their steps or at output times; `tale` ends its message."""
     last, n_rows = arcs[-1], system.n_c + system.n_a
     table: list[Array]
     if times is None:
@@ -121,7 +121,7 @@ def joined(
         rank=arcs[0].rank,
         redundant=arcs[0].redundant,
         **known,
-        sol=ArcSolution(arcs, system.n_c, system.n_a),  # type: ignore[arg-type]  # called alike
+        sol=ArcSolution(arcs, system.n_c, system.n_a),  # type: ignore[arg-type]  # same interface
         widest_gap=max(arc.widest_gap or 0.0 for arc in arcs),
         system=system,
         method=arcs[0].method,

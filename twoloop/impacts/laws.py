@@ -1,4 +1,4 @@
-"""The laws of stops without friction: of impacts, and of the forces that keep a gap closed."""
+"""Frictionless contact laws: impulses, and forces that keep gaps closed."""
 
 from __future__ import annotations
 
@@ -9,22 +9,22 @@ from twoloop.checks.arguments import Array
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.impulse import NEGLIGIBLE, scaled_equations
 
-EVEN = 1e-6  # relative: by how much forces that share a load seek to be alike
-WEIGHT = 1e3  # of that problem, so that its gradients are large beside the tolerance of the solver
-MOST_STEPS = 1000  # of it
+EVEN = 1e-6  # relative weight of the regularisation that distributes a shared load evenly
+WEIGHT = 1e3  # scales the problem so that its gradients exceed the tolerance of the solver
+MOST_STEPS = 1000  # iterations of the solver
 
 
 def responses(system: ConstrainedSystem, t: float, q: Array, W: Array) -> Array:
-    """How impulses at stops change the velocities, (n_q, k): M X + G^T Y = W^T with G X = 0, all constraints held."""
+    """Return the velocity changes (n_q, k) by unit impulses: M X + G^T Y = W^T with G X = 0, for all constraints."""
     matrix, lengths, _ = scaled_equations(system, t, q)
     right = np.vstack([W.T, np.zeros((len(lengths), len(W)))])
     return np.asarray(np.linalg.lstsq(matrix, right, rcond=NEGLIGIBLE)[0][: system.n_q], dtype=float)
 
 
 def complementary(D: Array, b: Array) -> Array:
-    """Numbers x >= 0 with D x + b >= 0, and x 0 where this is positive; D symmetric and positive semidefinite.
+    """Solve the linear complementarity problem x >= 0, D x + b >= 0, x^T (D x + b) = 0; D symmetric semidefinite.
 
-    They minimise x^T D x / 2 + b^T x: a problem of least squares, |B x - y| with B^T B = D and B^T y = -b.
+    x minimises x^T D x / 2 + b^T x: the non-negative least-squares problem |B x - y| with B^T B = D and B^T y = -b.
     """
     if not len(b):
         return np.zeros(0)
@@ -35,15 +35,15 @@ def complementary(D: Array, b: Array) -> Array:
 
 
 def bounded(D: Array, c: Array, n: int, most: Array) -> Array:
-    """Forces that minimise x^T D x / 2 + c^T x: what has room leaves no acceleration D x + c.
+    """Return forces that minimise x^T D x / 2 + c^T x subject to bounds: D x + c vanishes where no bound is active.
 
-    The first n, of stops, are not negative, the others, of friction, are within `most`. Where they share a load in any
-    proportion, they do so evenly: the sum of x^2 / most is added with a small weight.
+    The first n, of stops, are non-negative; the others, of friction, are bounded by `most`. The sum of x^2 / most is
+    added with a small weight, so that a load that could be shared in any proportion is shared evenly.
     """
     tiny = np.finfo(np.float64).tiny
     B, y = _squares(D, c)
     size = np.sqrt(D.diagonal().max())
-    # of forces: the problem is solved in numbers of about 1
+    # scale of the forces, so that the unknowns are of order 1
     unit = max(float(np.linalg.norm(y)) / size, NEGLIGIBLE * float(most.max()), tiny)
     bound = np.maximum(most / unit, tiny)
     even = np.zeros((len(most), len(c)))
@@ -56,7 +56,7 @@ def bounded(D: Array, c: Array, n: int, most: Array) -> Array:
 
 
 def _squares(D: Array, b: Array) -> tuple[Array, Array]:
-    """B and y of |B x - y|, with B^T B = D and B^T y = -b."""
+    """Return B and y with B^T B = D and B^T y = -b."""
     values, vectors = np.linalg.eigh(0.5 * (D + D.T))
     kept = values > NEGLIGIBLE * values.max(initial=0.0)
     roots = np.sqrt(values[kept])
@@ -64,9 +64,9 @@ def _squares(D: Array, b: Array) -> tuple[Array, Array]:
 
 
 def impulses(D: Array, u: Array, restitution: Array) -> Array:
-    """Impulses at k stops of rates u, by Moreau's law: those that open with less than e times the old speed have one.
+    """Return the impulses at k stops with rates u by Moreau's law.
 
     J. J. Moreau, Unilateral contact and dry friction in finite freedom dynamics, CISM 302 (1988): u+ + e u- >= 0, the
-    impulse is not negative, and one of both is zero. The energy does not grow where all e are the same.
+    impulse is non-negative, and their product is zero. The energy does not increase if all e are equal.
     """
     return complementary(D, (1.0 + restitution) * u)

@@ -1,4 +1,4 @@
-"""A motion in modes: arcs between impacts, contact and release, sliding and sticking."""
+"""Piecewise integration of a motion: arcs between impacts, contact and release, sliding and sticking."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.checks.arguments import Array
-from twoloop.impacts.contact import Accelerations, Closed
+from twoloop.impacts.contact import Accelerations, WithContacts
 from twoloop.impacts.gaps import Gap, Gaps
 from twoloop.impacts.joined import Impact, joined
 from twoloop.impacts.laws import NEGLIGIBLE, bounded, complementary, impulses, responses
@@ -21,37 +21,37 @@ from twoloop.run.impulse import corrected
 from twoloop.run.record import Status
 from twoloop.solve import solve_dae
 
-LOW = 0.01  # of the absolute tolerance: a rebound to less than this height ends in contact
-LOOKS = 2000  # at the gaps of stops in a motion, at least
-ROUNDING = 1e-13  # of the largest coordinate, at least
-LEAST_STEP = 1e-9  # s, or relative: the first of an arc
-NOTHING = 1e-20  # m or rad, also over s: coordinates and rates that rounding alone keeps from zero
-STANDS = 1e-13  # relative: arcs that are shorter do not move on in time ...
-MOST_STANDING = 30  # ... and so many of them in a row end the motion
-REST = 1e-10  # of the largest velocities of the last arc: rates of joints that count as zero
-RELEASED = 1e-7  # relative: less than its friction holds a joint that it has just released
-AT_MOST = 1e-9  # relative: friction that holds with all that it has
+LOW = 0.01  # relative to the absolute tolerance: a rebound below this height ends in contact
+SAMPLES = 2000  # smallest number of evaluations of the gaps over a motion
+ROUNDING = 1e-13  # relative to max(1, |q|)
+LEAST_STEP = 1e-9  # first step of an arc, relative to max(1 s, t)
+ZERO = 1e-20  # m or rad, or per s: smaller coordinates and rates are rounding errors
+STALLED = 1e-13  # relative to max(1 s, t): shorter arcs count as stalled ...
+MAX_STALLED = 30  # ... and this many stalled arcs in a row end the motion
+AT_REST = 1e-10  # relative to the largest velocities of the last arc: smaller joint rates count as zero
+RELEASED = 1e-7  # relative reduction of the static friction of a joint just released, which prevents chattering
+AT_MOST = 1e-9  # relative: margin of a joint held by its full friction
 
 
 class Undetermined(ValueError):
-    """No share of the load among joints that stick, and stops, was found that they can bear."""
+    """No admissible distribution of the load among sticking joints and stops was found."""
 
 
 class Motion:
-    """What is known of a motion: its state, which stops are closed, and which joints stick.
+    """State of a motion: coordinates, closed stops, and sticking joints.
 
     Parameters
     ----------
     stops : sequence of Stop
-    rubs : Modes
-        The system in its modes.
+    modes : Modes
+        Provides the system in each mode.
     t, q, v : float, ndarray (n_q,), ndarray (n_q,)
     options : dict
-        Of runs.
+        Options of the runs.
     """
 
-    def __init__(self, stops: Sequence[Stop], rubs: Modes, t: float, q: Array, v: Array, options: dict[str, Any]):
-        self.system, self.rubs, self.stops, self.options = rubs.system, rubs, list(stops), options
+    def __init__(self, stops: Sequence[Stop], modes: Modes, t: float, q: Array, v: Array, options: dict[str, Any]):
+        self.system, self.modes, self.stops, self.options = modes.system, modes, list(stops), options
         self.t, self.q, self.v = t, q, v
         self.e = np.array([stop.restitution for stop in stops])
         self.gaps = Gaps(stops, t, q)
@@ -59,54 +59,54 @@ class Motion:
         wrong = np.flatnonzero(self.gaps.at(t, q, v).g < -100.0 * self.low)
         if wrong.size:
             gap = float(self.gaps.at(t, q, v).g[wrong[0]])
-            raise ValueError(f"q0 must be on this side of all stops; the gap of {stops[wrong[0]].name!r} is {gap:.3g}")
+            raise ValueError(f"gaps must not be negative at q0; that of {stops[wrong[0]].name!r} is {gap:.3g}")
         self.arcs: list[Result] = []
         self.impacts: list[Impact] = []
-        self.let_go: list[int] = []  # stops whose force has just become zero
-        self.speeds = np.abs(v)  # the largest of the last arc
-        self.still: set[int] = set()  # joints that have stopped, or stick
-        self.released: set[int] = set()  # those that stuck until now
+        self.opened: list[int] = []  # stops whose force has just vanished
+        self.speeds = np.abs(v)  # largest velocities of the last arc
+        self.still: set[int] = set()  # joints that have stopped or stick
+        self.released: set[int] = set()  # joints that stuck in the last arc
         self._known: dict[tuple[int, tuple[int, ...]], tuple[ConstrainedSystem, ConstrainedSystem]] = {}
         self._forces: dict[int, tuple[ConstrainedSystem, Accelerations]] = {}
 
     def to(self, t1: float, times: Array | None) -> Result:
-        """Go on to the end."""
-        standing, self.every = 0, (t1 - self.t) / LOOKS
+        """Integrate to the end."""
+        stalled, self.every = 0, (t1 - self.t) / SAMPLES
         while True:
             before = self.t
             try:
-                self._arc(*self._meet(), t1)
+                self._run_arc(*self._resolve(), t1)
             except Undetermined as error:
                 if not self.arcs:
                     raise
-                return joined(self.system, self.arcs, self.impacts, times, f"Stopped: {error}", self._tale)
+                return joined(self.system, self.arcs, self.impacts, times, f"Stopped: {error}", self._summary)
             last = self.arcs[-1]
             if last.status != Status.EVENT or self.t >= t1:
-                return joined(self.system, self.arcs, self.impacts, times, "", self._tale)
-            standing = standing + 1 if self.t - before <= STANDS * max(1.0, abs(self.t)) else 0
-            if standing == MOST_STANDING:
+                return joined(self.system, self.arcs, self.impacts, times, "", self._summary)
+            stalled = stalled + 1 if self.t - before <= STALLED * max(1.0, abs(self.t)) else 0
+            if stalled == MAX_STALLED:
                 names = dict.fromkeys(name for impact in self.impacts[-9:] for name in impact.stops)
                 of = f" ({', '.join(map(repr, names))})" if names else ""
                 said = (
-                    f"Stopped at t = {self.t:.10g}: {standing} impacts or other changes in a row at this time{of}. "
+                    f"Stopped at t = {self.t:.10g}: {stalled} impacts or other changes in a row at this time{of}. "
                     "Look for stops that push against each other, or loosen atol"
                 )
-                return joined(self.system, self.arcs, self.impacts, times, said, self._tale)
+                return joined(self.system, self.arcs, self.impacts, times, said, self._summary)
 
     @property
-    def _tale(self) -> str:
+    def _summary(self) -> str:
         changes = f"{len(self.arcs) - 1} changes between sliding and sticking."
-        if self.stops and self.rubs.n:
-            return f"{len(self.impacts)} impacts, {len(self.arcs) - 1} changes of what slides, sticks or rests."
-        return changes if self.rubs.n else f"{len(self.impacts)} impacts."
+        if self.stops and self.modes.n:
+            return f"{len(self.impacts)} impacts, {len(self.arcs) - 1} changes of sliding, sticking or contact."
+        return changes if self.modes.n else f"{len(self.impacts)} impacts."
 
-    def _meet(self) -> tuple[Signs, tuple[int, ...]]:
-        """What happens at this instant: the velocities after it, who slides where (0: sticks), and who stays closed."""
+    def _resolve(self) -> tuple[Signs, tuple[int, ...]]:
+        """Apply an impact; return the sliding direction of each joint (0: sticks) and the stops that stay closed."""
         gap = self.gaps.at(self.t, self.q, self.v)
         near = np.flatnonzero(gap.g <= self.low)
         slow = np.zeros(near.size, dtype=bool)
         if near.size:
-            slow = self._hit(gap, near) & ~np.isin(near, self.let_go)  # the force of those is zero but for rounding
+            slow = self._apply_impulses(gap, near) & ~np.isin(near, self.opened)  # an opened stop has no force
         closing = near[slow]
         signs, of = self._sliding(self.v)
         if not closing.size and not of:
@@ -114,14 +114,14 @@ class Motion:
         a, c_rubs = self._free(signs, of, self.v)
         gap = self.gaps.at(self.t, self.q, self.v)
         c = np.append(gap.W[closing] @ a + gap.bend[closing], c_rubs)
-        W = np.vstack([gap.W[closing], self.rubs.along(self.q)[of]])
+        W = np.vstack([gap.W[closing], self.modes.along(self.q)[of]])
         D = W @ responses(self.system, self.t, self.q, W)
         if not of:
             return signs, tuple(closing[complementary(D, c) > 0.0].tolist())
         n = len(closing)
         force = bounded(D, c, n, self._most(of))
-        left = (D @ force + c)[n:]  # how the joints accelerate
-        terms = (np.abs(D) @ np.abs(force) + np.abs(c))[n:] + D.diagonal()[n:] * self.rubs.most[of]
+        left = (D @ force + c)[n:]  # accelerations of the joints
+        terms = (np.abs(D) @ np.abs(force) + np.abs(c))[n:] + D.diagonal()[n:] * self.modes.most[of]
         pushes = force[:n] > 0.0
         base = np.flatnonzero(pushes).tolist()
         for k, sign, slides, at in zip(
@@ -131,34 +131,34 @@ class Motion:
         return signs, tuple(closing[pushes].tolist())
 
     def _most(self, of: list[int]) -> Array:
-        """What can hold joints that are at rest; less of one that was just released."""
-        low = np.minimum(self.rubs.kinetic, (1.0 - RELEASED) * self.rubs.most)
-        return np.array([(low if k in self.released else self.rubs.most)[k] for k in of])
+        """Return the friction available to joints at rest; slightly reduced for those just released."""
+        low = np.minimum(self.modes.kinetic, (1.0 - RELEASED) * self.modes.most)
+        return np.array([(low if k in self.released else self.modes.most)[k] for k in of])
 
     def _sticks(self, k: int, force: float, D: Array, at: int, base: list[int], n_pushing: int) -> int | None:
-        """STICKS, or IDLE where stops that push, and joints that stick, hold the joint already.
+        """Return STICKS, or IDLE if pushing stops and sticking joints already hold the joint.
 
-        Then its friction stays as it is until one of these lets go; where stops alone hold the joint, it has none.
+        The friction of an idle joint stays constant until one of these releases it; it is zero if stops alone hold it.
         """
         known = np.linalg.lstsq(D[np.ix_(base, base)], D[base, at], rcond=NEGLIGIBLE)[0]
         if D[at, at] - D[at, base] @ known > INDEPENDENT * D[at, at]:
             base.append(at)
             return STICKS
-        self.rubs.frozen[k] = force if np.abs(known[n_pushing:]).max(initial=0.0) > INDEPENDENT else 0.0
+        self.modes.frozen[k] = force if np.abs(known[n_pushing:]).max(initial=0.0) > INDEPENDENT else 0.0
         return IDLE
 
-    def _hit(self, gap: Gap, near: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Change the velocities by the impulses at stops that are closed, and say which of these would hardly open."""
-        X = responses(self.system, self.t, self.q, gap.W[near])  # dry friction has no impulse
+    def _apply_impulses(self, gap: Gap, near: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Apply the impulses at closed stops to the velocities; return which of these stops would hardly open."""
+        X = responses(self.system, self.t, self.q, gap.W[near])  # dry friction causes no impulse
         D = gap.W[near] @ X
         before, u = self.v, gap.u[near]
         P = impulses(D, u, self.e[near])
         v = before + X @ P
-        slow = self._slow(near, v)
+        slow = self._hardly_open(near, v)
         if (slow & (P > 0.0) & (self.e[near] > 0.0)).any():
             P = impulses(D, u, np.where(slow, 0.0, self.e[near]))
             v = before + X @ P
-            slow = self._slow(near, v)
+            slow = self._hardly_open(near, v)
         hit = P > 0.0
         if hit.any():
             names = tuple(self.stops[k].name for k in near[hit])
@@ -167,12 +167,12 @@ class Motion:
         self.v = v
         return slow
 
-    def _slow(self, near: NDArray[np.int64], v: Array) -> NDArray[np.bool_]:
-        """Which of these stops would open by less than what counts."""
+    def _hardly_open(self, near: NDArray[np.int64], v: Array) -> NDArray[np.bool_]:
+        """Return which stops would rebound by less than the relevant height."""
         signs, of = self._sliding(v)
         a, c = self._free(signs, of, v)
         if of:
-            W = self.rubs.along(self.q)[of]
+            W = self.modes.along(self.q)[of]
             X = responses(self.system, self.t, self.q, W)
             a = a + X @ bounded(W @ X, c, 0, self._most(of))
         gap = self.gaps.at(self.t, self.q, v)
@@ -182,17 +182,17 @@ class Motion:
         )
 
     def _sliding(self, v: Array) -> tuple[Signs, list[int]]:
-        """In which direction each joint slides, and those that are at rest."""
-        W = self.rubs.along(self.q)
+        """Return the sliding direction of each joint, and the joints at rest."""
+        W = self.modes.along(self.q)
         u = W @ v
-        moves = np.abs(u) > REST * (np.abs(W) @ self.speeds)
+        moves = np.abs(u) > AT_REST * (np.abs(W) @ self.speeds)
         slow = [k for k in range(len(u)) if k in self.still or k in self.released or not moves[k]]
         return [0 if k in slow else int(np.sign(u[k])) for k in range(len(u))], slow
 
     def _free(self, signs: Signs, of: list[int], v: Array) -> tuple[Array, Array]:
-        """Accelerations while no stop pushes and joints at rest have no friction, and those of these joints."""
-        a = self._accelerations(self.rubs.free(signs, self.t, self.q)).at(self.t, self.q, v)[0]
-        return a, self.rubs.accelerations(signs, of, self.t, self.q, v, a)
+        """Return accelerations of coordinates and of joints at rest, without contact forces and friction at rest."""
+        a = self._accelerations(self.modes.free(signs, self.t, self.q)).at(self.t, self.q, v)[0]
+        return a, self.modes.accelerations(signs, of, self.t, self.q, v, a)
 
     def _accelerations(self, system: ConstrainedSystem, kept: bool = True) -> Accelerations:
         if id(system) in self._forces:
@@ -202,26 +202,26 @@ class Motion:
             self._forces[id(system)] = system, made
         return made
 
-    def _closed(self, system: ConstrainedSystem, resting: tuple[int, ...], kept: bool) -> ConstrainedSystem:
-        """A system while some stops are closed."""
+    def _with_contacts(self, system: ConstrainedSystem, resting: tuple[int, ...], kept: bool) -> ConstrainedSystem:
+        """Return a system with some stops closed."""
         if not resting:
             return system
         key = id(system), resting
         if key in self._known:
             return self._known[key][1]
         names = ", ".join(self.stops[k].name for k in resting)
-        made = Closed(system, self.gaps, list(resting)).made(names)
+        made = WithContacts(system, self.gaps, list(resting)).made(names)
         if kept:
             self._known[key] = system, made
         return made
 
-    def _arc(self, signs: Signs, resting: tuple[int, ...], t1: float) -> None:
-        """A run until a gap closes or lets go, or a joint stops or is released."""
-        mode, rows = self.rubs.mode(signs, self.t, self.q)
-        lasting = not {STICKS, IDLE} & set(signs)  # what sticks does so at places of its own
-        system = self._closed(mode, resting, lasting)
-        if system.n_c and (resting or self.rubs.n):
-            self._close(system, resting)
+    def _run_arc(self, signs: Signs, resting: tuple[int, ...], t1: float) -> None:
+        """Integrate until a gap closes or opens, or a joint stops or is released."""
+        mode, rows = self.modes.mode(signs, self.t, self.q)
+        lasting = not {STICKS, IDLE} & set(signs)  # the rows of sticking joints depend on where they stick
+        system = self._with_contacts(mode, resting, lasting)
+        if system.n_c and (resting or self.modes.n):
+            self._project(system, resting)
         start = self.gaps.at(self.t, self.q, self.v)
         holds = self._accelerations(system, lasting) if resting or STICKS in signs else None
 
@@ -230,7 +230,7 @@ class Motion:
             return float(holds.at(t, q, v)[1][row])
 
         def friction(k: int, t: float, q: Array, v: Array) -> float:
-            return -multiplier(rows[k], t, q, v) * self.rubs.turned(k, system, rows[k], t, q)
+            return -multiplier(rows[k], t, q, v) * self.modes.turned(k, system, rows[k], t, q)
 
         def pulls(k: int) -> Any:
             row = mode.n_c + resting.index(k)
@@ -240,7 +240,7 @@ class Motion:
         events += [pulls(k) if k in resting else self._closes(k, start) for k in range(len(self.stops))]
         options = {**self.options, "check_derivatives": self.options.get("check_derivatives", True) and not self.arcs}
         if self.arcs and self.options.get("first_step") is None and self.arcs[-1].h.size:
-            least = LEAST_STEP * max(1.0, abs(self.t))  # coordinates next to zero have no size to choose a step by
+            least = LEAST_STEP * max(1.0, abs(self.t))  # coordinates near zero have no scale for an initial step
             options["first_step"] = min(max(0.1 * float(self.arcs[-1].h.max()), least), t1 - self.t)
         arc = solve_dae(system, (self.t, t1), self.q, self.v, events=events, dense_output=True, **options)
         self.arcs.append(arc)
@@ -249,25 +249,25 @@ class Motion:
             self.t, self.q, self.v = float(arc.t[-1]), arc.q[:, -1].copy(), arc.v[:, -1].copy()
         over = {k for k in range(len(events)) if arc.t_events is not None and arc.t_events[k].size}
         n = len(signs)
-        self.let_go = [k for k in resting if n + k in over]
+        self.opened = [k for k in resting if n + k in over]
         self.released = {k for k in over if k < n and signs[k] == STICKS}
         self.still = {k for k in range(n) if (not signs[k]) != (k in over)}
 
-    def _close(self, system: ConstrainedSystem, resting: tuple[int, ...]) -> None:
-        """Put the state on the constraints of a mode, from which it is off by less than the tolerances."""
+    def _project(self, system: ConstrainedSystem, resting: tuple[int, ...]) -> None:
+        """Project the state onto the constraints of a mode, from which it deviates by less than the tolerances."""
         self.q = corrected(system, self.t, self.q)
         if resting:
-            self.q[np.abs(self.q) < NOTHING] = 0.0
+            self.q[np.abs(self.q) < ZERO] = 0.0
             gap = self.gaps.at(self.t, self.q, self.v)
             W, u = gap.W[list(resting)], gap.u[list(resting)]
             X = responses(self.system, self.t, self.q, W)
             self.v = self.v - X @ np.linalg.lstsq(W @ X, u, rcond=NEGLIGIBLE)[0]
         rows, off = system.rows(self.t, self.q), system.velocity_constraint(self.t, self.q, self.v)
         self.v = self.v - np.linalg.lstsq(rows, off, rcond=NEGLIGIBLE)[0]
-        self.v[np.abs(self.v) < max(NOTHING, 1e-16 * float(self.speeds.max()))] = 0.0
+        self.v[np.abs(self.v) < max(ZERO, 1e-16 * float(self.speeds.max()))] = 0.0
 
     def _closes(self, k: int, start: Gap) -> Any:
-        """The event of a gap that is open, or about to open: zero where it is as closed as it was at the start."""
+        """Return the event of a gap that is open or about to open; zero where it is as closed as at the start."""
         g0, u0, t0, low = float(start.g[k]), float(start.u[k]), self.t, self.low
         opens = u0 > 0.0 and u0 * u0 > low * 1e-6
 
@@ -284,29 +284,29 @@ class Motion:
         return event
 
     def _changes(self, k: int, sign: int | None, friction: Any) -> Any:
-        """The event that ends the mode of a joint."""
+        """Return the event that ends the mode of a joint."""
         if sign is IDLE:
             return terminal(lambda t, q, v: 1.0)
         return terminal(self._slips(k, friction) if sign == STICKS else self._stops(k, sign))
 
     def _stops(self, k: int, sign: int) -> Any:
-        """The event of a joint that comes to rest; one that begins to slide is at rest at first."""
-        u0 = sign * float(self.rubs.along(self.q, k) @ self.v)
+        """Return the event of a joint that comes to rest; a joint that begins to slide is at rest initially."""
+        u0 = sign * float(self.modes.along(self.q, k) @ self.v)
         least = u0 - self.low if k in self.still or k in self.released else 0.0
-        return lambda t, q, v: sign * float(self.rubs.along(q, k) @ v) - least
+        return lambda t, q, v: sign * float(self.modes.along(q, k) @ v) - least
 
     def _slips(self, k: int, friction: Any) -> Any:
-        """The event of a joint that needs more than its friction; one that needs all of it may do so at once."""
-        most = self.rubs.most[k]
+        """Return the event of a joint that needs more than its friction; one that needs all of it may slip at once."""
+        most = self.modes.most[k]
         needed = abs(friction(k, self.t, self.q, self.v))
         if needed > (1.0 + RELEASED) * most:
-            raise Undetermined(f"at t = {self.t:.10g} a joint that sticks needs {needed:.10g}, and has {most:.10g}")
+            raise Undetermined(f"at t = {self.t:.10g} a sticking joint needs {needed:.10g}, but has {most:.10g}")
         if needed > (1.0 - AT_MOST) * most:
             most = max(most, needed) * (1.0 + AT_MOST)
         return lambda t, q, v: most - abs(friction(k, t, q, v))
 
 
 def terminal(event: Any) -> Any:
-    """An event that ends a run where it falls through zero."""
+    """Make an event terminal, with direction from positive to negative."""
     event.terminal, event.direction = True, -1
     return event

@@ -1,4 +1,4 @@
-"""solve_with_stops: arcs of a motion from impact to impact, and at rest on stops."""
+"""`solve_with_stops`: arcs between impacts, and rest in contact with stops."""
 
 from __future__ import annotations
 
@@ -34,42 +34,41 @@ def solve_with_stops(
     t_eval: ArrayLike | None = None,
     **options: Any,
 ) -> Result:
-    """Integrate a system that runs against stops: impacts with restitution, rest in contact, and release.
+    """Integrate a system with stops: impacts with restitution, rest in contact, and release.
 
-    An impact changes the velocities by impulses at the stops that are closed, along with those of all constraints:
-    M (v+ - v-) + C_q^T p = W^T P, with C_q v+ + C_t = 0. Where several stops are closed, Moreau's law says which
-    have an impulse. Rebounds become lower by the square of the restitution; one that would be lower than a hundredth of
-    `atol` ends in contact: the gap is then a constraint as long as its force pushes. There is no friction.
+    An impact changes the velocities by impulses at the closed stops and the impulses of all constraints:
+    M (v+ - v-) + C_q^T p = W^T P, with C_q v+ + C_t = 0. Where several stops are closed, the impulses follow from
+    Moreau's law. The rebound height decreases by the square of the restitution; a rebound below a hundredth of `atol`
+    ends in contact: the gap is then a constraint as long as its force pushes. There is no friction.
 
     Parameters
     ----------
     system, t_span, q0, v0, method, rtol, atol
-        As for `solve_dae`. The gaps must be open, or closed, at the start.
+        As for `solve_dae`. The gaps must not be negative at the start.
     stops : Stop or sequence of Stop
-        Such as `Stop(lambda t, q: q[1], restitution=0.5)`; `problem.stops` of a model that has some.
+        E.g. `Stop(lambda t, q: q[1], restitution=0.5)`, or `problem.stops` of a model.
     t_eval : array_like, optional
-        Times at which to store the states. None: the ends of steps; at an impact there are two columns, before and
-        after it.
+        Output times. None: the ends of steps, with two columns at an impact, before and after it.
     **options
         Further keyword arguments of `solve_dae`: max_step, compiled, time_limit (of each arc), ...
 
     Returns
     -------
     Result
-        `.impacts` has what happened when, `.arcs` the runs from one to the next, `.sol` the state at any time. `.lam`
-        are multipliers of the system; an arc at rest on stops has theirs, too, behind those of its constraints C: the
-        force of a stop is the negative.
+        `.impacts` lists the impacts, `.arcs` the runs between them, `.sol` is the state at any time. `.lam` are the
+        multipliers of the system; in an arc with closed stops, those of the stops follow those of C, and the force of
+        a stop is the negative of its multiplier.
 
     Raises
     ------
     TypeError, ValueError
-        If an argument is wrong, a gap cannot be run on symbols, or is negative at the start.
+        If an argument is invalid, or a gap cannot be traced or is negative at the start.
 
     Notes
     -----
-    Impacts are found as events are, with looks at the gaps four times a step and every two-thousandth of the motion at
-    least: a gap that closes and opens again between two looks is missed; `max_step` helps. The time of an impact is as
-    good as the motion before it.
+    Impacts are located like events, with evaluations of the gaps four times per step and at least at every
+    two-thousandth of the motion: a gap that closes and opens again between two evaluations is missed; reduce
+    `max_step` if needed. The time of an impact is as accurate as the motion before it.
     """
     check_system(system)
     t0, t1 = check_span(t_span)
@@ -85,7 +84,7 @@ def solve_with_stops(
 def checked_options(
     caller: str, options: dict[str, Any], method: str | Method, rtol: float, atol: ArrayLike, n_q: int
 ) -> dict[str, Any]:
-    """Method and tolerances as options of runs, beside others that must be known."""
+    """Return options of runs that include method and tolerances; raise TypeError for unknown options."""
     known = inspect.signature(solve_dae).parameters.keys() - OF_A_RUN
     wrong = [name for name in options if name not in known]
     if wrong:

@@ -1,4 +1,4 @@
-"""What sticks and slides: the systems of a model with dry friction in its modes, or of one without."""
+"""The modes of a system: sliding and sticking of joints with dry friction; or the single mode without friction."""
 
 from __future__ import annotations
 
@@ -14,48 +14,48 @@ if TYPE_CHECKING:
     from twoloop.bodies.model_problem import ModelProblem
 
 
-Signs = list[int | None]  # of joints: in which direction they slide, or one of these
-STICKS, IDLE = 0, None  # held by friction, or by stops and other joints that hold it already
-INDEPENDENT = 1e-9  # of how a joint yields alone, over the same of a free body
+Signs = list[int | None]  # for each joint the sliding direction, or one of the following
+STICKS, IDLE = 0, None  # held by friction; held already by stops and other joints
+INDEPENDENT = 1e-9  # relative: smallest compliance of a joint with the others held, compared with a free joint
 
 
 class Modes:
-    """The modes of a system; here of one in which nothing sticks, which has one."""
+    """Base class: a system without friction, which has a single mode."""
 
     def __init__(self, system: ConstrainedSystem):
         self.system, self.n = system, 0
         self.most = self.kinetic = np.zeros(0)
-        self.frozen: dict[int, float] = {}  # friction of joints that are IDLE
+        self.frozen: dict[int, float] = {}  # constant friction of IDLE joints
 
     def along(self, q: Array, k: int | None = None) -> Array:
-        """No directions."""
+        """Return the gradients of the joint displacements: none."""
         return np.zeros((0, len(q)))
 
     def free(self, signs: Signs, t: float, q: Array) -> ConstrainedSystem:
-        """The system."""
+        """Return the system."""
         return self.system
 
     def accelerations(self, signs: Signs, of: list[int], t: float, q: Array, v: Array, a: Array) -> Array:
-        """None."""
+        """Return the accelerations of joints at rest: none."""
         return np.zeros(0)
 
     def mode(self, signs: Signs, t: float, q: Array) -> tuple[ConstrainedSystem, dict[int, int]]:
-        """The system, without rows of what sticks."""
+        """Return the system; there are no rows of sticking joints."""
         return self.system, {}
 
     def turned(self, k: int, system: ConstrainedSystem, row: int, t: float, q: Array) -> float:
-        """Sign of the row of a joint that sticks against the direction in which it slides."""
+        """Return the sign of the row of a sticking joint relative to its sliding direction."""
         return float(np.sign(system.jacobian(t, q)[row] @ self.along(q, k)))
 
 
-class Rubbing(Modes):
+class FrictionModes(Modes):
     """A model with dry friction in joints, each of which slides, with a sign, or sticks: 0.
 
     Parameters
     ----------
     problem : ModelProblem
 
-    Raises ValueError if a joint cannot slide by itself.
+    Raises ValueError if a joint cannot slide independently of the others.
     """
 
     def __init__(self, problem: ModelProblem):
@@ -69,13 +69,13 @@ class Rubbing(Modes):
         self._check_independent(problem.t_span[0], problem.q0)
 
     def along(self, q: Array, k: int | None = None) -> Array:
-        """By how much joints slide with the coordinates, (n, n_q); or one of them, (n_q,)."""
+        """Return the gradients of the joint displacements, (n, n_q); or of one joint, (n_q,)."""
         if k is None:
             return np.array([self.along(q, each) for each in range(self.n)])
         return self._pulls[k].force(0.0, q, np.zeros_like(q))
 
     def _check_independent(self, t: float, q: Array) -> None:
-        """Raise unless each joint can slide while the others stick: else their shares are not determined."""
+        """Raise unless each joint can slide while the others stick; otherwise the frictions are not determined."""
         W = self.along(q)
         D = W @ responses(self.system, t, q, W)
         scale = (W**2).sum(axis=1) / float(np.abs(self.system.mass(t, q)).max())
@@ -86,19 +86,19 @@ class Rubbing(Modes):
                 others = ", ".join(repr(each.name) for each in self._rubs[:k])
                 raise ValueError(
                     f"the joint of {rub.name!r} cannot slide by itself: drives or other joints hold it"
-                    f"{f', or it moves as those of {others} do' if k else ''}, so that its friction is not determined "
-                    "while it sticks; leave it out, and give another joint all of the friction"
+                    f"{f', or its motion depends on {others}' if k else ''}, so that its friction is not determined "
+                    "while it sticks; remove it and assign all of the friction to another joint"
                 )
 
     def free(self, signs: Signs, t: float, q: Array) -> ConstrainedSystem:
-        """The system while some joints slide and the others are without friction."""
+        """Return the system with some joints sliding and the others without friction."""
         known = tuple(signs)
         if known not in self._lasting:
             self._lasting[known] = self._made(self._problem.name, signs, {}, t, q)[0]
         return self._lasting[known]
 
     def accelerations(self, signs: Signs, of: list[int], t: float, q: Array, v: Array, a: Array) -> Array:
-        """How joints that are at rest begin to slide, where the coordinates have the accelerations a."""
+        """Return the accelerations of joints at rest for given accelerations a of the coordinates."""
         if not of:
             return np.zeros(0)
         held, rows = self.mode(signs, t, q)
@@ -106,7 +106,7 @@ class Rubbing(Modes):
         return np.array([self.turned(k, held, rows[k], t, q) * (R[rows[k]] @ a - gamma[rows[k]]) for k in of])
 
     def mode(self, signs: Signs, t: float, q: Array) -> tuple[ConstrainedSystem, dict[int, int]]:
-        """The system while some joints slide, and those that stick do so where they are; the rows of these."""
+        """Return the system with some joints sliding and the others held in place, and the rows of the latter."""
         if not {STICKS, IDLE} & set(signs):
             return self.free(signs, t, q), {}
         names = [rub.name for rub, sign in zip(self._rubs, signs, strict=True) if sign == STICKS]
@@ -115,7 +115,7 @@ class Rubbing(Modes):
         held = {}
         for rub in (rub for rub in self._rubs if rub.name in names):
             (row,) = rows[rub.name]
-            turns = self._model.dimension == 3 and rub.joint.kind == "revolute"  # whose row is A cos t + B sin t
+            turns = self._model.dimension == 3 and rub.joint.kind == "revolute"  # its row is A cos t + B sin t
             held[rub.name] = float(np.arctan2(-first[row], other[row]) if turns else first[row])
         said = f", {', '.join(names)} sticks" if names else ""
         system, rows = self._made(self._problem.name + said, signs, held, t, q)

@@ -1,6 +1,6 @@
 """Ready problems, each with its invariants and, where one exists, a reference.
 
-A mechanism is imported when it is asked for: the first import compiles its callbacks.
+A mechanism is imported on first access, because its first import compiles its callbacks.
 """
 
 import sys
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from twoloop.mechanisms.spatial_slider_crank import spatial_slider_crank
     from twoloop.mechanisms.sundials_slider_crank import sundials_slider_crank
 
-_ELSEWHERE = {  # names that are not those of their modules
+_ELSEWHERE = {  # functions whose modules have other names
     "closed_chain": "chain",
     "double_pendulum": "chain",
     "driven_slider_crank": "slider_crank",
@@ -57,7 +57,7 @@ def __dir__() -> list[str]:
 
 
 class _Package(ModuleType):
-    """A package in which `four_bar` is the function: Python would put the submodule of that name in its place."""
+    """A package in which `four_bar` is the function; Python would replace it by the submodule of that name."""
 
     def __setattr__(self, name: str, value: Any) -> None:
         if isinstance(value, ModuleType) and name in __all__:

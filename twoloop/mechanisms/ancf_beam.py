@@ -1,11 +1,11 @@
-"""The flexible beam on a moving base of Sect. 4.2, of the elements of `ancf_element`.
+"""The flexible beam on a moving base of Sect. 4.2, with the elements of `ancf_element`.
 
 The beam of Hussein, Negrut & Shabana (2008), doi 10.1007/s11071-007-9328-9: pinned to a base that moves along x.
-Coordinates: 6 a node (see `ancf_element`), 6 (n + 1) for n elements, the base first and the tip last.
+Coordinates: 6 per node (see `ancf_element`), 6 (n + 1) for n elements, from the base to the tip.
 
-The element locks: its director does not vary over the thickness, so bending cannot relieve the stress across it, and
-acts with (lambda + 2 mu) in place of E. At Poisson's ratio 0.3 that makes the beam (lambda + 2 mu)/E = 1.346 times as
-stiff in bending as Euler and Bernoulli say, however fine the mesh. This is part of the benchmark and stays.
+The element locks: its director is constant over the thickness, so the transverse stress is not relieved in bending,
+and (lambda + 2 mu) acts in place of E. At Poisson's ratio 0.3 the bending stiffness is (lambda + 2 mu)/E = 1.346 times
+that of the Euler-Bernoulli beam, for any mesh. This is part of the benchmark and is kept.
 """
 
 import math
@@ -31,8 +31,8 @@ __all__ = ["ancf_beam", "elastic_tangent", "midpoint_deflection", "moderately_st
 __all__ += ["very_flexible_beam"]
 
 GRAVITY = 9.81  # m/s^2
-N_DRAWN = 8  # pieces of the line that an element is drawn as
-LARGEST = 1e50  # of a parameter in SI units: products of a few of them must be numbers, too
+N_DRAWN = 8  # segments drawn per element
+LARGEST = 1e50  # bound of the parameters in SI units, so that products of a few of them are finite
 STARTS = {"node": "only the base node moving (start='node')", "beam": "all of it moving (start='beam')"}
 
 # p: the parameters of the elements, then those of the base's motion
@@ -69,7 +69,7 @@ class Energy:
     p: Array
 
     def __call__(self, t: Any, q: ArrayLike, v: ArrayLike) -> Any:
-        """Of one state, or of the columns of many."""
+        """Evaluate for one state, or for many given as columns."""
         q, v = np.asarray(q), np.asarray(v)
         weight = self.p[element.FALL] * self.M[1::6].sum(axis=0)
         return 0.5 * (v * (self.M @ v)).sum(axis=0) + elastic_energy(q, self.p) + weight @ q
@@ -89,9 +89,10 @@ def ancf_beam(
     width: float = 0.02,
     gravity: float = GRAVITY,
 ) -> Problem:
-    """A beam pinned to a base that moves by amplitude sin(angular_frequency t) along x, gravity along -y.
+    """A beam pinned to a base that moves by amplitude sin(angular_frequency t) along x, with gravity along -y.
 
-    It starts straight along +x. Constraints: C_1 = r_x(base) - amplitude sin(angular_frequency t), C_2 = r_y(base).
+    It is initially straight along +x. Constraints:
+    C_1 = r_x(base) - amplitude sin(angular_frequency t), C_2 = r_y(base).
     The base does work on the beam: d(energy)/dt = lam . C_t.
 
     Parameters
@@ -99,20 +100,20 @@ def ancf_beam(
     n_elements : int
         Number of equal elements n; the problem has 6 (n + 1) coordinates.
     start : {"node", "beam"}
-        Velocities at t = 0, where the base already moves. "node": those of the base node only, the others rest.
-        "beam": the whole beam moves with the base.
+        Velocities at t = 0, where the base already moves. "node": only the base node moves. "beam": the whole beam
+        moves with the base.
     youngs_modulus : float
         N/m^2.
     amplitude : float
-        Of the base, m; its sign counts.
+        Amplitude of the base, m; may be negative.
     angular_frequency : float
-        Of the base, rad/s.
+        Angular frequency of the base, rad/s.
     poisson_ratio : float
-        Between -1 and 1/2, ends excluded.
+        Between -1 and 1/2, exclusive.
     density : float
         kg/m^3.
     length, height, width : float
-        Of the beam, m; height lies in the plane of motion.
+        Dimensions of the beam, m; height is in the plane of motion.
     gravity : float
         m/s^2, at least 0.
 
@@ -176,7 +177,7 @@ def ancf_beam(
         force_by_q=elastic_tangent,
         parameters=p,
         constant_mass=True,
-        bandwidth=11,  # a node's neighbours
+        bandwidth=11,  # neighbouring nodes
         joints=[Joint("base", (0, 1), (0, 1))],
         name=name,
     )
@@ -210,7 +211,7 @@ def ancf_beam(
 
 
 def _centre_line(n_elements: int, l: float) -> Drawing:
-    """The beam's middle as a line of `N_DRAWN` pieces an element: cubic, and linear in the coordinates."""
+    """Return the centre line as `N_DRAWN` segments per element: cubic, and linear in the coordinates."""
     n = n_elements * N_DRAWN
     matrix = np.zeros((n + 1, 2, 6 * (n_elements + 1)))
     for k in range(n + 1):
@@ -232,10 +233,10 @@ def _centre_line(n_elements: int, l: float) -> Drawing:
 def very_flexible_beam(n_elements: int = 4, start: str = "node") -> Problem:
     """The paper's beam of 2e6 N/m^2 on a base that moves by -0.02 m sin(10 pi t); see `ancf_beam`.
 
-    With 4 elements the straight beam's frequencies reach from 0 (it turns about the pin) over 1.771, 6.220 and 14.75 to
-    3358.5 rad/s. The lowest bending frequency is 19 % above Euler and Bernoulli's 1.4836 rad/s: (lambda + 2 mu)/E =
-    1.346 on the bending stiffness by locking, another 1.059 by the coarse mesh, and 1.194^2 = 1.346 x 1.059.
-    Its large motion is not converged either: with 4, 8 and 16 elements the tip's height at 1 s is 0.301, 0.001 and
+    With 4 elements the frequencies of the straight beam are 0 (rotation about the pin), 1.771, 6.220, 14.75, ...,
+    3358.5 rad/s. The lowest bending frequency is 19 % above the Euler-Bernoulli value of 1.4836 rad/s: locking
+    increases the bending stiffness by (lambda + 2 mu)/E = 1.346, the coarse mesh by 1.059, and 1.194^2 = 1.346 x 1.059.
+    The large motion is not converged either: with 4, 8 and 16 elements the tip's height at 1 s is 0.301, 0.001 and
     -0.091 m.
     """
     return ancf_beam(n_elements, start, youngs_modulus=2e6, amplitude=-0.02, angular_frequency=10.0 * math.pi)
@@ -250,19 +251,19 @@ def moderately_stiff_beam(n_elements: int = 4, start: str = "node") -> Problem:
 
 
 def tip_height(q: ArrayLike) -> Any:
-    """The second coordinate of the last node, m, of q (n_q,) or (n_q, n_t)."""
+    """Return the y coordinate of the last node, m, of q (n_q,) or (n_q, n_t)."""
     return np.asarray(q)[-5]
 
 
 def midpoint_deflection(q: ArrayLike) -> Any:
-    """The distance of the beam's middle from the chord base-tip, m, of q (n_q,) or (n_q, n_t).
+    """Return the distance of the beam's midpoint from the chord base-tip, m, of q (n_q,) or (n_q, n_t).
 
-    Positive to the left of the way from the base to the tip.
+    Positive to the left of the direction from the base to the tip.
 
     Raises
     ------
     ValueError
-        If the number of elements is odd: the middle is then no node.
+        If the number of elements is odd, so that there is no node at the midpoint.
     """
     q = np.asarray(q)
     n_elements = len(q) // 6 - 1

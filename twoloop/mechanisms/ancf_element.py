@@ -21,13 +21,13 @@ from twoloop.kernels.compile.callbacks import callback
 from twoloop.kernels.data.common import compiled
 from twoloop.problem.problem import Array
 
-# places in p: length of an element; lambda + 2 mu, lambda and mu times the area of the cross-section, N; means of y^2
+# indices in p: length of an element; lambda + 2 mu, lambda and mu times the area of the cross-section, N; means of y^2
 # and y^4 over the thickness; mass of a unit of length, kg/m; gravity along -y, m/s^2
 LENGTH, STIFFNESS, LAME, SHEAR, SECOND, FOURTH, MASS, FALL, N_ELEMENT_PARAMETERS = range(9)
 
 
 def _gauss_points() -> Array:
-    """A row for each of 5 Gauss points on [0, 1]: weight, and what multiplies (r_B - r_A)/l, s_A, s_B and d_B."""
+    """Return for each of 5 Gauss points on [0, 1]: weight, and factors of (r_B - r_A)/l, s_A, s_B and d_B."""
     x, w = np.polynomial.legendre.leggauss(5)
     xi = 0.5 * (1.0 + x)
     return np.column_stack([0.5 * w, 6.0 * xi * (1.0 - xi), (1.0 - xi) * (1.0 - 3.0 * xi), xi * (3.0 * xi - 2.0), xi])
@@ -38,7 +38,7 @@ POINTS = _gauss_points()
 
 @compiled
 def _resultants(sx, sy, kx, ky, dx, dy, p):
-    """Derivatives of the energy of a unit of length, where r_x = s + y k and r_y = d.
+    """Return derivatives of the energy per unit length, where r_x = s + y k and r_y = d.
 
     eps_11 = axial + y s.k + y^2 kk, eps_22 = thick, 2 eps_12 = s.d + y k.d; their parts have the resultants n0, n1,
     n2, m0, g0, g1.
@@ -108,7 +108,7 @@ def element_tangent(e, p, K):
     for g in range(5):
         w = -POINTS[g, 0] * l
         xi = POINTS[g, 4]
-        # what the vectors r_A, s_A, r_B, s_B contribute to s, and d_A, d_B to k and d
+        # contributions of the vectors r_A, s_A, r_B, s_B to s, and of d_A, d_B to k and d
         places = (0, 2, 6, 8)
         in_s = (-POINTS[g, 1] / l, POINTS[g, 2], POINTS[g, 1] / l, POINTS[g, 3])
         in_k = (-1.0 / l, 1.0 / l)
@@ -215,13 +215,13 @@ def force(t, q, v, p, Q):
 
 @callback("force_by_q")
 def elastic_tangent(t, q, v, p, K):
-    """Derivative dQ/dq of `force`, into K (n_q, n_q) full of zeros: symmetric, and only neighbouring nodes couple."""
+    """Add the derivative dQ/dq of `force` to K (n_q, n_q): symmetric, couples neighbouring nodes only."""
     for first in range(0, q.size - 6, 6):
         element_tangent(q[first : first + 12], p, K[first : first + 12, first : first + 12])
 
 
 def elastic_energy(q: Array, p: Array) -> Any:
-    """Elastic energy of a chain of equal elements, J, of q (n_q,) or (n_q, n_t)."""
+    """Return the elastic energy of a chain of equal elements, J, for q (n_q,) or (n_q, n_t)."""
     nodes = q.reshape(-1, 3, 2, *q.shape[1:])
     (rA, sA, dA), (rB, sB, dB) = np.moveaxis(nodes[:-1], 1, 0), np.moveaxis(nodes[1:], 1, 0)
     l, j2, j4 = p[LENGTH], p[SECOND], p[FOURTH]

@@ -26,7 +26,7 @@ D, DA, E, EA, RR, RA, SS, SA, SB, SC, SD = (
 )  # fmt: skip
 TA, TB, U, UA, UB, ZF, ZT, FA = 0.02308, 0.00916, 0.04, 0.01228, 0.00449, 0.02, 0.04, 0.01421
 SPRING, LENGTH, TORQUE = 4530.0, 0.07785, 0.033
-EE, FF = E - EA, ZF - FA  # of the centres of bodies 4 and 6 from the joint that both loops share
+EE, FF = E - EA, ZF - FA  # distances of the centres of bodies 4 and 6 from the joint shared by both loops
 
 PARAMETERS = {
     "masses": (M1, M2, M3, M4, M5, M6, M7),
@@ -55,7 +55,7 @@ def mass(t, q, p, M):
 @callback("force")
 def force(t, q, v, p, Q):
     s, c = math.sin(q[2]), math.cos(q[2])
-    x, y = SD * c + SC * s, SD * s - SC * c  # from B to the end of the spring
+    x, y = SD * c + SC * s, SD * s - SC * c  # vector from B to the end of the spring
     dx, dy = x + XB - XC, y + YB - YC
     length = math.hypot(dx, dy)
     pull = -SPRING * (length - LENGTH) / length
@@ -70,7 +70,7 @@ def force(t, q, v, p, Q):
 
 @callback("constraint")
 def constraint(t, q, p, C):
-    x = RR * math.cos(q[0]) - D * math.cos(q[0] + q[1])  # the joint that the three loops share
+    x = RR * math.cos(q[0]) - D * math.cos(q[0] + q[1])  # joint shared by the three loops
     y = RR * math.sin(q[0]) - D * math.sin(q[0] + q[1])
     C[0] = x - SS * math.sin(q[2]) - XB
     C[1] = y + SS * math.cos(q[2]) - YB
@@ -117,10 +117,10 @@ def gamma(t, q, v, p, Qd):
 
 @dataclass(frozen=True, eq=False)
 class Energy:
-    """Kinetic energy, that of the spring, and the potential -TORQUE beta of the constant torque, J."""
+    """Kinetic energy, spring energy, and the potential -TORQUE beta of the constant torque, J."""
 
     def __call__(self, t: Any, q: Array, v: Array) -> Any:
-        """Of one state, or of the columns of many."""
+        """Evaluate for one state, or for many given as columns."""
         q, v = np.asarray(q), np.asarray(v)
         kinetic = np.empty(q.shape[1:])
         for place in np.ndindex(*q.shape[1:]):
@@ -132,12 +132,12 @@ class Energy:
         return kinetic + 0.5 * SPRING * (length - LENGTH) ** 2 - TORQUE * q[0]
 
 
-# of the joints below: crank, coupler, the triangle of body 3, the spring, and the two bars of each further loop
+# pairs of the joints below: crank, coupler, the triangle of body 3, the spring, and the two bars of each other loop
 BARS = ((0, 1), (1, 2), (2, 3), (2, 4), (3, 4), (4, 5), (2, 6), (6, 7), (2, 8), (8, 7))
 
 
 def joints(q: Array) -> Array:
-    """Where the bodies meet: (9, 2) or (9, 2, n_t)."""
+    """Return the positions of the joints: (9, 2) or (9, 2, n_t)."""
 
     def along(angle: Any) -> Array:
         return np.stack([np.cos(angle), np.sin(angle)])
@@ -156,7 +156,7 @@ def joints(q: Array) -> Array:
 
 
 def andrews() -> Problem:
-    """The mechanism from rest, as published, over 0.03 s."""
+    """The mechanism released from rest, as published, over 0.03 s."""
     q0 = np.array(
         [
             *(-0.0617138900142764496358948458001, 0.0, 0.455279819163070380255912382449),

@@ -1,8 +1,8 @@
 """IFToMM's A04, Bricard's mechanism, with all 60 rows: five bars of 1 m and 1 kg on the edges of a cube, six hinges.
 
-Each bar has the coordinates of its centre and the three columns of its rotation matrix, hence a constant mass matrix;
-six rows keep these orthonormal, five make a hinge. The sixth bar is the ground. Geometry and inertia as in the Exudyn
-model: bars of 1 x 0.1 x 0.1 m, 100 kg/m^3, gravity along -y.
+The coordinates of each bar are its centre and the three columns of its rotation matrix, so the mass matrix is
+constant. Six rows per bar enforce orthonormality; a hinge has five rows. The sixth bar is the ground. Geometry and
+inertia as in the Exudyn model: bars of 1 x 0.1 x 0.1 m, 100 kg/m^3, gravity along -y.
 """
 
 import numpy as np
@@ -16,32 +16,32 @@ from twoloop.problem.problem import Array, Problem
 GRAVITY = 9.81
 WIDTH = 0.1  # m, of the bars
 CORNERS = np.array([[0, 0, 0], [1, 0, 0], [1, -1, 0], [1, -1, 1], [0, -1, 1], [0, 0, 1]], dtype=float)
-AXES = np.eye(3)[[1, 2, 0, 1, 2, 0]]  # of the hinges at the corners
+AXES = np.eye(3)[[1, 2, 0, 1, 2, 0]]  # axes of the hinges at the corners
 BARS = np.roll(CORNERS, -1, axis=0) - CORNERS
-# columns: along the bar, along the hinge at its start, and across both
+# columns: along the bar, along the hinge at its start, and perpendicular to both
 FRAMES = np.array([np.array([bar, axis, np.cross(bar, axis)]).T for bar, axis in zip(BARS, AXES, strict=True)])[:5]
 MASSES = np.tile(np.repeat([1.0, 1.0 / 12.0, 0.01 / 12.0, 0.01 / 12.0], 3), 5)  # kg, and the second moments of a bar
 Vector = list[Scalar]
 
 
 def _vector(bar: int, k: int) -> Vector:
-    """The centre (k = 0) or column k of the rotation matrix of a bar."""
+    """Return the centre (k = 0) or column k of the rotation matrix of a bar."""
     return [{12 * bar + 3 * k + i: 1.0} for i in range(3)]
 
 
 def _place(bar: int, point: Array) -> Vector:
-    """A point of a bar, from its centre along its axes."""
+    """Return a point of a bar, given in body axes relative to the centre."""
     parts = (1.0, *point.tolist())
     return [{12 * bar + 3 * k + i: part for k, part in enumerate(parts) if part} for i in range(3)]
 
 
 def _end(bar: int, s: float) -> Vector:
-    """The point at s, from -0.5 to 0.5, along a bar."""
+    """Return the point at s, from -0.5 to 0.5, along a bar."""
     return _place(bar, np.array([s, 0.0, 0.0]))
 
 
 def _carried(bar: int, direction: Array) -> Vector:
-    """A direction of the start, carried along by a bar."""
+    """Return a body-fixed direction, given at the start."""
     parts = FRAMES[bar].T @ direction
     return [{12 * bar + 3 * k + i: float(parts[k - 1]) for k in (1, 2, 3)} for i in range(3)]
 
@@ -51,7 +51,7 @@ def _dot(a: Vector, b: Vector) -> list[tuple[float, Scalar, Scalar]]:
 
 
 def _joint(hinge: int, rows: list[int]) -> Joint:
-    """The hinge at a corner: what it does to the bar that begins there, at the last corner to the bar that ends."""
+    """Return the hinge at a corner, acting on the bar that starts there; at the last corner, on the bar that ends."""
     bar, s = (hinge, -0.5) if hinge < 5 else (4, 0.5)
     other = "ground" if hinge in (0, 5) else f"bar {hinge}"
     position, columns = tuple(range(12 * bar, 12 * bar + 3)), tuple(range(12 * bar + 3, 12 * bar + 12))
@@ -85,7 +85,7 @@ def _rows() -> QuadraticSystem:
 
 
 def bricard() -> Problem:
-    """The mechanism from rest, on the edges of a cube: 60 rows of rank 59, one degree of freedom."""
+    """The mechanism released from rest on the edges of a cube: 60 rows of rank 59, one degree of freedom."""
     rows = _rows()
     centres = 0.5 * (CORNERS[:5] + CORNERS[1:])
     q0 = np.concatenate([[*centre, *frame.T.ravel()] for centre, frame in zip(centres, FRAMES, strict=True)])

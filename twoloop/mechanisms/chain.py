@@ -12,11 +12,11 @@ from twoloop.problem.problem import Array, Problem
 
 GRAVITY = 9.81
 N_MOST = 20
-SLACK = 0.8  # distance of the pins of a closed chain over the length of its links
+SLACK = 0.8  # distance of the pins of a closed chain relative to the total length of its links
 
 
 def _masses(n: int) -> QuadraticSystem:
-    """n masses of 1 / n kg, no row yet."""
+    """Return n masses of 1 / n kg, without rows."""
     weight = np.zeros(2 * n)
     weight[1::2] = -GRAVITY / n
     return QuadraticSystem(np.eye(2 * n) / n, weight)
@@ -29,7 +29,7 @@ def _names(n: int) -> tuple[str, ...]:
 def double_pendulum() -> Problem:
     """Two masses of 1/2 kg on two links of 1 m, released from rest with both links level.
 
-    The motion is chaotic, which over the 3 s of the usual run costs about a digit.
+    The motion is chaotic, which costs about one digit over the usual run of 3 s.
     """
     rows = _masses(2)
     rows.link("link 1", 0, fixed(0.0, 0.0), 1.0)
@@ -47,10 +47,10 @@ def double_pendulum() -> Problem:
 
 
 def closed_chain(n: int = 4) -> Problem:
-    """A chain of n equal masses whose both ends are pinned: n + 1 links, n - 1 degrees of freedom.
+    """A chain of n equal masses pinned at both ends: n + 1 links, n - 1 degrees of freedom.
 
-    The links are together 1 m long, the pins 0.8 m apart. The chain is released at rest from a regular polygon
-    through the pins whose first two links are exchanged, so that the motion has no symmetry.
+    The total length of the links is 1 m, the distance of the pins 0.8 m. The chain is released from a regular polygon
+    through the pins whose first two links are exchanged, so that the motion is not symmetric.
 
     Parameters
     ----------
@@ -93,9 +93,9 @@ def closed_chain(n: int = 4) -> Problem:
 
 
 def _shape(n: int) -> Array:
-    """Pins and masses (n + 2, 2) at the start."""
+    """Return the initial positions of pins and masses (n + 2, 2)."""
     links = n + 1
-    # a regular arc of `links` chords of equal length that together span SLACK: sin(links a) / (links sin(a)) = SLACK
+    # an arc of `links` equal chords with span SLACK: sin(links a) / (links sin(a)) = SLACK
     a = brentq(lambda a: math.sin(links * a) / (links * math.sin(a)) - SLACK, 1e-6, math.pi / links, xtol=1e-15)
     angles = (2.0 * np.arange(links) - n) * a
     angles[:2] = angles[1::-1]

@@ -1,7 +1,7 @@
-"""References computed for this project: the numbers of `references.json`, by `tests/mechanisms/make_references.py`.
+"""References computed for this project by `tests/mechanisms/make_references.py`, stored in `references.json`.
 
-Each is the end of a motion by equations in few coordinates, integrated in extended precision. They share nothing with
-the callbacks of the mechanism; the multipliers are those of its own matrices at that state.
+Each is the final state of a motion in minimal coordinates, integrated in extended precision, independently of the
+callbacks of the mechanism. The multipliers are computed from its own matrices at that state.
 """
 
 import json
@@ -22,7 +22,7 @@ def _all() -> dict[str, Any]:
 
 
 def computed(name: str) -> Reference | None:
-    """The reference of the problem of this name, or None where none was computed."""
+    """Return the reference of a problem by name; None if there is none."""
     known = _all().get(name)
     if known is None:
         return None

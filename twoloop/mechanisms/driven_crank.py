@@ -1,6 +1,6 @@
-"""A pendulum that hangs from the pin of a crank which is driven at a prescribed angle; one degree of freedom is left.
+"""A pendulum on the pin of a crank with prescribed angle; one degree of freedom.
 
-Bodies x, y, angle of the crank, a rod of 0.3 m that turns about its end, and of the pendulum, a uniform rod of 1 m.
+Coordinates x, y, angle of the crank, a rod of 0.3 m pinned at its end, and of the pendulum, a uniform rod of 1 m.
 """
 
 import cmath
@@ -17,11 +17,11 @@ CRANK, ROD = 0.3, 1.0  # m
 MASSES = (0.4, 1.0)  # kg
 INERTIAS = (MASSES[0] * CRANK**2 / 12.0, MASSES[1] * ROD**2 / 12.0)  # kg m^2
 DRIVE = {"start": 0.0, "rate": 2.5, "amplitude": 0.2, "frequency": 1.0}
-ANGLE, RATE = 0.4 - 0.5 * np.pi, -1.0  # of the pendulum at the start, from the x axis, rad and rad/s
+ANGLE, RATE = 0.4 - 0.5 * np.pi, -1.0  # initial angle of the pendulum from the x axis, rad, and its rate, rad/s
 
 
 def driven_crank() -> Problem:
-    """The crank at the angle 2.5 t + 0.2 sin(t), and the pendulum 0.4 rad off the vertical at -1 rad/s."""
+    """The crank at the angle 2.5 t + 0.2 sin(t); the pendulum starts 0.4 rad off the vertical at -1 rad/s."""
     rows = PlanarBodies(("crank", "rod"), MASSES, INERTIAS, GRAVITY)
     rows.pin(0, (-0.5 * CRANK, 0.0), GROUND, (0.0, 0.0))
     rows.pin(1, (-0.5 * ROD, 0.0), 0, (0.5 * CRANK, 0.0))

@@ -1,8 +1,8 @@
 """The planar four-bar linkage of Sect. 4.1: nine coordinates, eight constraints, one degree of freedom.
 
 Coordinates [x1 y1 th1 x2 y2 th2 x3 y3 th3]: the centres and angles of three uniform rods that form a chain from the
-ground joint O = (0, 0) over the joints 1-2 and 2-3 to the ground joint A = (L, 0). All angles are measured from the x
-axis along the chain. (35) of the paper is printed with a cosine of th3 where a sine belongs.
+ground joint O = (0, 0) via the joints 1-2 and 2-3 to the ground joint A = (L, 0). All angles are measured from the x
+axis along the chain. Eq. (35) of the paper is printed with the cosine of th3 instead of the sine.
 """
 
 import math
@@ -45,7 +45,7 @@ def force(t, q, v, p, Q):
 
 @callback("constraint")
 def constraint(t, q, p, C):
-    x = 0.0  # the joint at the beginning of bar i
+    x = 0.0  # joint at the start of bar i
     y = 0.0
     for i in range(3):
         dx = 0.5 * p[i] * math.cos(q[3 * i + 2])
@@ -128,8 +128,8 @@ def four_bar(
 ) -> Problem:
     """A four-bar linkage of uniform rods of 1 kg/m under gravity 9.81 m/s^2, released from rest.
 
-    The default geometry is *assumed*: Table 2 of the paper, which held the parameters, is lost. It agrees with what
-    the text says of the motion: bar 3 starts horizontal, and its centre comes back to y = 0 and does not pass it.
+    The default geometry is *assumed*, because Table 2 of the paper with the parameters is lost. It agrees with the
+    motion described in the text: bar 3 starts horizontally, and its centre returns to y = 0 without crossing it.
 
     Parameters
     ----------
@@ -145,7 +145,7 @@ def four_bar(
     Returns
     -------
     Problem
-        With a reference at 10 s for the default geometry.
+        It has a reference at 10 s for the default geometry.
 
     Raises
     ------
@@ -204,14 +204,14 @@ def four_bar(
 
 
 def _joints(L1: float, L2: float, L3: float, ground: float) -> list[Joint]:
-    """The four pins, each as it acts on the bar that begins there, A on bar 3.
+    """Return the four pins, each acting on the bar that starts there; A acts on bar 3.
 
-    A row of C places a bar, or A, by the whole chain from O, so that a pin is a difference of rows.
+    A row of C locates a bar, or A, through the whole chain from O, so a pin corresponds to a difference of rows.
     """
     E = np.eye(8)
-    E[2:6, 0:4] -= np.eye(4)  # pins 1-2 and 2-3: the position of a bar less that of the one before
+    E[2:6, 0:4] -= np.eye(4)  # pins 1-2 and 2-3: difference to the previous bar
     E[6:, :] = 0.0
-    E[6, [4, 7]] = E[7, [5, 6]] = 1.0  # pin A: the end of bar 3 from its own centre, x and then y
+    E[6, [4, 7]] = E[7, [5, 6]] = 1.0  # pin A: the end of bar 3, x and y
     bars = [((3 * i, 3 * i + 1), (3 * i + 2,)) for i in range(3)]
     return [
         Joint("O", (0, 1), *bars[0], point=(0.0, 0.0), in_space=True, equations=E),
@@ -227,7 +227,7 @@ def _drawing(L1: float, L2: float, L3: float, ground: float) -> Drawing:
 
 
 def _assemble(lengths: Array, ground: float, theta3: float, branch: int) -> Array:
-    """The nine coordinates at rest, by the triangle of bars 1 and 2."""
+    """Return the nine coordinates at the start, from the triangle of bars 1 and 2."""
     L1, L2, L3 = lengths.tolist()
     x = ground - L3 * math.cos(theta3)  # joint 2-3
     y = -L3 * math.sin(theta3)

@@ -13,10 +13,10 @@ GRAVITY = 9.81  # m/s^2, along -z
 DENSITY = 3000.0  # kg/m^3
 LENGTH, WIDTH, CUBE = 1.0, 0.01, 0.1  # m: shaft and rods; slider
 BALL = 5.0  # kg, at the end of each rod
-ANGLE = math.radians(30.0)  # of the rods below the horizontal at the start
-HEIGHT = 0.5  # m, of the slider at the start
+ANGLE = math.radians(30.0)  # initial angle of the rods below the horizontal
+HEIGHT = 0.5  # m, initial height of the slider
 STIFFNESS, DAMPING, SLACK = 8e5, 4e4, 0.5  # N/m, N s/m, m
-RATE = 2.0 * math.pi  # of the whole at the start, rad/s
+RATE = 2.0 * math.pi  # initial angular velocity, rad/s
 
 
 def box(mass: float, x: float, y: float, z: float) -> tuple[float, float, float]:
@@ -25,9 +25,9 @@ def box(mass: float, x: float, y: float, z: float) -> tuple[float, float, float]
 
 
 def governor() -> Problem:
-    """The stiff version: springs of 8e5 N/m, dampers of 4e4 N s/m, turning at 2 pi rad/s at the start.
+    """The stiff version: springs of 8e5 N/m, dampers of 4e4 N s/m, initial angular velocity 2 pi rad/s.
 
-    Two models of Exudyn have springs of 4000 N/m and turn at 0.16 of that: another problem.
+    Two models of Exudyn are a different problem, with springs of 4000 N/m and 0.16 of that angular velocity.
     """
     z, y = np.array([0.0, 0.0, 1.0]), np.array([0.0, 1.0, 0.0])
     spin = RATE * z
@@ -37,7 +37,7 @@ def governor() -> Problem:
     slider = rows.body("slider", cube, box(cube, CUBE, CUBE, CUBE), HEIGHT * z, np.eye(3), spin=spin)
     rows.revolute(shaft, GROUND, (0.0, 0.0, 0.0), z)
     rows.prismatic(shaft, slider, HEIGHT * z, z)
-    centre = (0.5 * bar + BALL) * LENGTH / (bar + BALL)  # of rod and ball, from the hinge
+    centre = (0.5 * bar + BALL) * LENGTH / (bar + BALL)  # centre of mass of rod and ball, from the hinge
     axial, across, _ = box(bar, LENGTH, WIDTH, WIDTH)
     across += bar * (centre - 0.5 * LENGTH) ** 2 + BALL * (LENGTH - centre) ** 2
     for name, side in (("rod A", 1.0), ("rod B", -1.0)):

@@ -1,4 +1,4 @@
-"""A spinning heavy top on a fixed point, by its centre of mass and Euler parameters."""
+"""A spinning heavy top with a fixed point, described by its centre of mass and Euler parameters."""
 
 import numpy as np
 
@@ -14,7 +14,7 @@ SPIN = np.array([0.0, 150.0, -4.61538])  # rad/s at the start
 
 
 def heavy_top() -> Problem:
-    """The top of the benchmark for Lie-group integrators: its axis level at the start, 150 rad/s about it."""
+    """The top of the benchmark for Lie-group integrators: its axis initially level, spinning at 150 rad/s."""
     rows = SpatialBodies((0.0, 0.0, -GRAVITY))
     position = np.array([0.0, LENGTH, 0.0])
     body = rows.body("top", MASS, INERTIA, position, np.eye(3), np.cross(SPIN, position), SPIN)

@@ -1,4 +1,4 @@
-"""A knife edge on an inclined plane: one non-holonomic row, closed form.
+"""A knife edge on an inclined plane: one non-holonomic row, with a closed-form solution.
 
 Bloch, Nonholonomic Mechanics and Control (2003), Sect. 1.6. x points down the slope, phi is the angle of the blade.
 """
@@ -45,12 +45,12 @@ def nonholonomic_gamma(t, q, v, p, Qa):
 
 
 def energy(t: Any, q: Array, v: Array) -> Any:
-    """Kinetic energy and potential on the slope, J, of one state or of many."""
+    """Return the kinetic energy plus the potential on the slope, J, for one state or many."""
     return 0.5 * (MASS * (v[0] ** 2 + v[1] ** 2) + INERTIA * v[2] ** 2) - MASS * PULL * q[0]
 
 
 def motion(t: float) -> tuple[Array, Array]:
-    """States q, v (3,) at t: a cycloid across the slope."""
+    """Return the states q, v (3,) at t: a cycloid across the slope."""
     s, c = math.sin(SPIN * t), math.cos(SPIN * t)
     scale = PULL / (2.0 * SPIN**2)
     q = np.array([scale * s * s, scale * (SPIN * t - s * c), SPIN * t])
@@ -58,7 +58,7 @@ def motion(t: float) -> tuple[Array, Array]:
 
 
 def knife_edge() -> Problem:
-    """The blade pointing down the slope, at rest but for its turn of 1.7 rad/s, which stays constant."""
+    """The blade initially pointing down the slope, at rest except for its constant spin of 1.7 rad/s."""
     system = ConstrainedSystem(
         n_q=3,
         n_c=0,

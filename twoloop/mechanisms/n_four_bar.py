@@ -1,7 +1,7 @@
 """IFToMM's A02, the N-four-bar mechanism: N windows, 2N + 1 uniform bars of 1 m and 1 kg, cranks upright at the start.
 
-C_q loses N ranks whenever the cranks lie on the ground line, where N + 1 branches of motion meet; the synchronous one,
-on which all couplers stay level, goes through.
+The rank of C_q drops by N whenever the cranks lie on the ground line, where N + 1 branches of motion meet; on the
+synchronous branch all couplers stay level.
 """
 
 import math
@@ -24,23 +24,23 @@ SETS = ("tips", "bodies")
 
 @dataclass(frozen=True)
 class Synchronous:
-    """The motion on which the cranks stay parallel, by Jacobi's elliptic functions.
+    """The motion with parallel cranks, by Jacobi's elliptic functions.
 
-    phi'' = -w^2 cos(phi), w^2 = g 3 (3n + 1) / (2 (4n + 1)), from phi = pi/2 at -1 rad/s: a pendulum that turns over.
+    phi'' = -w^2 cos(phi), w^2 = g 3 (3n + 1) / (2 (4n + 1)), from phi = pi/2 at -1 rad/s: a rotating pendulum.
     """
 
     n: int
     coordinates: str
 
     def crank(self, t: float) -> tuple[float, float]:
-        """Angle of the cranks from the ground line and its rate."""
+        """Return the angle of the cranks from the ground line and its rate."""
         w = math.sqrt(GRAVITY * 3.0 * (3 * self.n + 1) / (2.0 * (4 * self.n + 1)))
         k = 2.0 * w / math.sqrt(1.0 + 4.0 * w * w)
         _, _, dn, amplitude = ellipj(ellipk(k * k) - w * t / k, k * k)
         return 2.0 * float(amplitude) - 0.5 * math.pi, -2.0 * w / k * float(dn)
 
     def __call__(self, t: float) -> tuple[Array, Array]:
-        """States q, v (n_q,) at t."""
+        """Return the states q, v (n_q,) at t."""
         angle, rate = self.crank(t)
         z, w = complex(math.cos(angle), math.sin(angle)), rate * complex(-math.sin(angle), math.cos(angle))
         if self.coordinates == "tips":
@@ -61,8 +61,8 @@ def n_four_bar(n: int = 2, coordinates: str = "tips") -> Problem:
     n : int
         Number of windows.
     coordinates : {"tips", "bodies"}
-        "tips": x and y of the tips of the n + 1 cranks, and a row for the length of each of the 2n + 1 bars.
-        "bodies": centre and angle of each bar, cranks first, and two rows for each joint.
+        "tips": x and y of the tips of the n + 1 cranks, with one row for the length of each of the 2n + 1 bars.
+        "bodies": centre and angle of each bar, cranks first, with two rows per joint.
 
     Raises
     ------
@@ -125,7 +125,7 @@ def n_four_bar(n: int = 2, coordinates: str = "tips") -> Problem:
 
 
 def _printed(n_q: int) -> Reference:
-    """The tip of the first crank as Exudyn prints it at h = 1.25e-4; its error, by that at 2h, is 7e-7."""
+    """Return the tip of the first crank as printed by Exudyn at h = 1.25e-4; its error, estimated from 2h, is 7e-7."""
     q = np.full(n_q, np.nan)
     q[:2] = 0.3284573768, 0.9445187937
     return Reference(

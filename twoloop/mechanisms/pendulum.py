@@ -1,4 +1,4 @@
-"""The planar pendulum in Cartesian coordinates, with its closed form: IFToMM's A01 and SUNDIALS' projection example."""
+"""The planar pendulum in Cartesian coordinates with its closed-form solution: IFToMM's A01 and SUNDIALS' example."""
 
 import math
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ CVODE_GRAVITY = 13.7503716360407456549801915596211144  # (2 K(m = 1/2))^2: a qua
 
 @dataclass(frozen=True)
 class Swing:
-    """Motion of a pendulum of length L released at rest from the horizontal, by Jacobi's elliptic functions.
+    """Motion of a pendulum of length L released from the horizontal, by Jacobi's elliptic functions.
 
     With k^2 = 1/2 and u = sqrt(g / L) t, the angle from the downward vertical is 2 arcsin(k sn(K - u)) (Whittaker,
     Analytical Dynamics, Sect. 44).
@@ -27,7 +27,7 @@ class Swing:
     side: int
 
     def __call__(self, t: float) -> tuple[Array, Array]:
-        """States q, v (2,) at t."""
+        """Return the states q, v (2,) at t."""
         pace, m = math.sqrt(self.gravity / self.length), 0.5
         sn, cn, dn, _ = ellipj(ellipk(m) - pace * t, m)
         # sin and cos of twice arcsin(k sn), whose cosine is dn
@@ -71,17 +71,17 @@ def _pendulum(name: str, gravity: float, side: int, end: float, **known: object)
 
 
 def pendulum(start: float = -1.0) -> Problem:
-    """The pendulum of IFToMM's library of benchmarks, A01: 1 kg on 1 m, released at rest from the horizontal.
+    """The pendulum A01 of IFToMM's library of benchmarks: 1 kg on 1 m, released from the horizontal.
 
     Parameters
     ----------
     start : {-1, 1}
-        x at the start, m: -1 as in MBSbenchmarksInOpenSim, 1 as in the specification of the library.
+        Initial x, m: -1 as in MBSbenchmarksInOpenSim, 1 as in the specification of the library.
 
     Raises
     ------
     TypeError, ValueError
-        If `start` is neither.
+        If `start` is neither -1 nor 1.
     """
     if check_finite("start", start) not in (-1.0, 1.0):
         raise ValueError(f"start must be -1 or 1 (m, x of the bob at the start); given {start!r}")
@@ -110,7 +110,7 @@ def pendulum(start: float = -1.0) -> Problem:
 
 
 def projection_pendulum() -> Problem:
-    """The pendulum of SUNDIALS' example of projection: its period is exactly 2 s, so that 30 s end at the start."""
+    """The pendulum of SUNDIALS' projection example: its period is exactly 2 s, so that it returns after 30 s."""
     return _pendulum(
         "projection pendulum",
         CVODE_GRAVITY,

@@ -1,4 +1,4 @@
-"""What mechanisms of planar bodies share: x, y of the centre of mass and the angle of each; pins, distances, guides.
+"""Common callbacks of planar mechanisms: x, y of the centre of mass and angle of each body; pins, distances, drives.
 
 The callbacks are compiled once for all of them; the parameters hold the joints, which `PlanarBodies` collects::
 
@@ -33,7 +33,7 @@ GROUND = -1
 
 @helper
 def place(q, body, a, b):
-    """The point (a, b) of a body, and its derivative by the angle: x, y, dx, dy."""
+    """Return the point (a, b) of a body and its derivative with respect to the angle: x, y, dx, dy."""
     if body < 0:
         return a, b, 0.0, 0.0
     s, c = math.sin(q[3 * body + 2]), math.cos(q[3 * body + 2])
@@ -43,7 +43,7 @@ def place(q, body, a, b):
 
 @helper
 def motion(v, body, dx, dy):
-    """Velocity of a point whose derivative by the angle is (dx, dy), and what its acceleration has without v'."""
+    """Return the velocity of a point and the part of its acceleration without v'; (dx, dy): derivative by the angle."""
     if body < 0:
         return 0.0, 0.0, 0.0, 0.0
     w = v[3 * body + 2]
@@ -52,7 +52,7 @@ def motion(v, body, dx, dy):
 
 @helper
 def add_row(Cq, row, body, fx, fy, dx, dy):
-    """Add to a row the derivative of fx x + fy y of a point by the coordinates of its body."""
+    """Add to a row the derivative of fx x + fy y of a point with respect to the coordinates of its body."""
     if body >= 0:
         Cq[row, 3 * body] += fx
         Cq[row, 3 * body + 1] += fy
@@ -197,7 +197,7 @@ def jacobian_values(t, q, p, values):
 
 
 def jacobian_entries(joints: Sequence[Sequence[float]]) -> tuple[list[int], list[int]]:
-    """Rows and columns of what `jacobian_values` gives, in its order."""
+    """Return rows and columns of the entries of `jacobian_values`, in order."""
     rows, columns = [], []
     for kind, first, i, _, _, j, *_ in joints:
         row = int(first)
@@ -215,12 +215,12 @@ def jacobian_entries(joints: Sequence[Sequence[float]]) -> tuple[list[int], list
 
 
 class PlanarBodies:
-    """Collects bodies and their joints, which are named by their kind and their bodies: "pin rod-ground".
+    """Collects planar bodies and joints, which are named by kind and bodies: "pin rod-ground".
 
     Parameters
     ----------
     names : sequence of str
-        Of the bodies.
+        Names of the bodies.
     masses, inertias : sequence of float
         kg, and kg m^2 about the centre of mass.
     gravity : float
@@ -248,30 +248,30 @@ class PlanarBodies:
     def _between(
         self, kind: str, i: int, a: tuple[float, float], j: int, b: tuple[float, float]
     ) -> tuple[str, int, tuple[float, float]]:
-        """Name of a joint, the body on which it acts (i, or j where i is the ground), and the point of this body."""
+        """Return the name of a joint, the body on which it acts (i, or j if i is the ground), and its point there."""
         body, other, point = (j, i, b) if i == GROUND else (i, j, a)
         return f"{kind} {self.names[body]}-{'ground' if other == GROUND else self.names[other]}", body, point
 
     def pin(self, i: int, a: tuple[float, float], j: int, b: tuple[float, float]) -> int:
-        """Two rows: point a of body i is point b of body j (or of the ground); returns the first one's number."""
+        """Add two rows: point a of body i coincides with point b of body j (or of the ground); return the first row."""
         self.pins.append((i, a, j, b))
         return self._add(PIN, 2, [i, *a, j, *b, 0.0], *self._between("pin", i, a, j, b))
 
     def distance(self, i: int, a: tuple[float, float], j: int, b: tuple[float, float], length: float) -> int:
-        """A row: both points are `length` apart."""
+        """Add one row: the points are `length` apart."""
         return self._add(DISTANCE, 1, [i, *a, j, *b, 0.5 * length**2], *self._between("distance", i, a, j, b))
 
     def drive(
         self, coordinate: int, start: float, rate: float = 0.0, amplitude: float = 0.0, frequency: float = 0.0
     ) -> int:
-        """A row: a coordinate is start + rate t + amplitude sin(frequency t); by default it is held."""
+        """Add one row: a coordinate is start + rate t + amplitude sin(frequency t); by default it is constant."""
         body, part = divmod(coordinate, 3)
         name = f"drive of {('x', 'y', 'angle')[part]} of {self.names[body]}"
         numbers = [coordinate, start, rate, GROUND, amplitude, frequency, 0.0]
         return self._add(COORDINATE, 1, numbers, name, body, (0.0, 0.0))
 
     def system(self, name: str) -> ConstrainedSystem:
-        """The system of the joints so far."""
+        """Return the system of the joints added so far."""
         bodies = np.column_stack([self.masses, self.inertias])
         sizes = [len(bodies), len(self._joints), self.gravity]
         moves = any(joint[0] == COORDINATE and (joint[4] or joint[6]) for joint in self._joints)
@@ -289,12 +289,12 @@ class PlanarBodies:
 
     @property
     def energy(self) -> PlanarEnergy:
-        """Energy as a function of t, q and v."""
+        """Return the energy as a function of t, q and v."""
         return PlanarEnergy(self.masses, self.inertias, self.gravity)
 
     @property
     def drawing(self) -> Drawing:
-        """Bodies as lines between their pins; with one pin a uniform rod, or a square where that is the centre."""
+        """Return bodies as lines between their pins; with one pin a uniform rod, or a square if it is at the centre."""
         sketch = Sketch()
         ends: list[list[tuple[float, float]]] = [[] for _ in self.names]
         for i, a, j, b in self.pins:
@@ -313,5 +313,5 @@ class PlanarBodies:
 
 
 def states(*bodies: tuple[complex, float]) -> Array:
-    """Coordinates (3 n,) of bodies, each given as x + i y and an angle; velocities likewise."""
+    """Return the coordinates (3 n,) of bodies, or their velocities, each given as x + i y and an angle."""
     return np.array([[z.real, z.imag, angle] for z, angle in bodies]).ravel()

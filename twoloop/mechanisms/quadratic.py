@@ -1,4 +1,4 @@
-"""What mechanisms share whose mass and force are constant and whose constraints are quadratic.
+"""Common callbacks of mechanisms with constant mass and force and quadratic constraints.
 
 Points and vectors fixed to bodies as coordinates ("natural" coordinates) give such constraints. The callbacks are
 compiled once for all of them; the parameters hold the terms, which `QuadraticSystem` collects::
@@ -28,7 +28,7 @@ ONE: Scalar = {None: 1.0}
 
 @helper
 def places(n_q, p):
-    """Where the constants, the entries of the mass, the linear and the quadratic terms begin."""
+    """Return the offsets of the constants, the mass entries, the linear and the quadratic terms."""
     constants = 4 + n_q
     entries = constants + int(p[0])
     linear = entries + 3 * int(p[1])
@@ -79,13 +79,13 @@ def gamma(t, q, v, p, Qd):
 
 @dataclass(frozen=True, eq=False)
 class Energy:
-    """Kinetic energy under a constant mass and potential of a constant force, J, of one state or of many."""
+    """Kinetic energy with a constant mass and potential of a constant force, J, for one state or many."""
 
     mass: Array
     force: Array
 
     def __call__(self, t: Any, q: Array, v: Array) -> Any:
-        """Of one state, or of the columns of many."""
+        """Evaluate for one state, or for many given as columns."""
         q, v = np.asarray(q), np.asarray(v)
         return 0.5 * np.einsum("i...,ij,j...->...", v, self.mass, v) - self.force @ q
 
@@ -110,7 +110,7 @@ class QuadraticSystem:
         self._quadratic: list[tuple[float, ...]] = []
 
     def row(self, *products: tuple[float, Scalar, Scalar]) -> int:
-        """A row: the sum of c a b over the products (c, a, b) of two scalars is zero; returns its number."""
+        """Add a row: the sum of c a b over the products (c, a, b) of two scalars is zero; return its number."""
         number, constant = len(self._constants), 0.0
         for factor, first, second in products:
             for i, a in first.items():
@@ -126,23 +126,23 @@ class QuadraticSystem:
         return number
 
     def distance(self, first: Sequence[Scalar], second: Sequence[Scalar], length: float) -> int:
-        """A row: half the squared distance of two points, each a list of scalars, is half the squared length."""
+        """Add a row: half the squared distance of two points, each a list of scalars, is half the squared length."""
         self.line(second, first)
         parts = [(0.5, difference(a, b), difference(a, b)) for a, b in zip(first, second, strict=True)]
         return self.row(*parts, (-0.5 * length**2, ONE, ONE))
 
     def line(self, first: Sequence[Scalar], second: Sequence[Scalar]) -> None:
-        """A line of the drawing between two points; `distance` and `link` draw theirs."""
+        """Add a line between two points to the drawing; `distance` and `link` draw theirs."""
         self._lines.append((first, second))
 
     def link(self, name: str, i: int, other: Sequence[Scalar], length: float) -> int:
-        """A row, and a joint of this name: the point mass at q[i], q[i + 1] keeps its distance from another point."""
+        """Add a row and a joint of this name: point mass q[i], q[i + 1] keeps its distance from another point."""
         row = self.distance(point(i), other, length)
         self.joints.append(Joint(name, (row,), (i, i + 1)))
         return row
 
     def system(self, name: str, bandwidth: int | None = None) -> ConstrainedSystem:
-        """The system of the rows so far."""
+        """Return the system of the rows so far."""
         entries = [(i, j, self.mass[i, j]) for i, j in np.argwhere(self.mass)]
         sizes = [len(self._constants), len(entries), len(self._linear), len(self._quadratic)]
         tables = [np.ravel(table) for table in (entries, self._linear, self._quadratic)]
@@ -159,11 +159,11 @@ class QuadraticSystem:
 
     @property
     def energy(self) -> Energy:
-        """Energy as a function of t, q and v."""
+        """Return the energy as a function of t, q and v."""
         return Energy(self.mass, self.force)
 
     def drawing(self, *traced: Sequence[Scalar]) -> Drawing:
-        """The lines so far, and the paths of the points given."""
+        """Return the lines so far, and the paths of the points given."""
         points: list[Sequence[Scalar]] = []
 
         def number(place: Sequence[Scalar]) -> int:
@@ -185,7 +185,7 @@ class QuadraticSystem:
 
 
 def difference(a: Scalar, b: Scalar) -> Scalar:
-    """The scalar a - b."""
+    """Return the scalar a - b."""
     result = dict(a)
     for place, value in b.items():
         result[place] = result.get(place, 0.0) - value
@@ -193,10 +193,10 @@ def difference(a: Scalar, b: Scalar) -> Scalar:
 
 
 def point(i: int) -> list[Scalar]:
-    """The planar point whose coordinates are q[i], q[i + 1]."""
+    """Return the planar point with coordinates q[i], q[i + 1]."""
     return [{i: 1.0}, {i + 1: 1.0}]
 
 
 def fixed(*position: float) -> list[Scalar]:
-    """A point or a vector of the ground."""
+    """Return a point or vector of the ground."""
     return [{None: float(x)} for x in position]

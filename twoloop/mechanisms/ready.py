@@ -1,4 +1,4 @@
-"""How files of mechanisms make their problem of the rows that they have collected."""
+"""Assembles a ready problem from the rows collected."""
 
 from typing import Any
 
@@ -8,7 +8,7 @@ from twoloop.problem.problem import Problem
 
 
 def ready(rows: Any, name: str, q0: Array, v0: Array, end: float, **known: Any) -> Problem:
-    """The problem of rows that were collected, from t = 0 on; what is `known` stands in the place of what they say."""
+    """Return the problem of the rows collected, starting at t = 0; `known` overrides their attributes."""
     known = {"energy": rows.energy, "drawing": rows.drawing, **known}
     known.setdefault("reference", computed(name))
     system = known.pop("system", None) or rows.system(name)

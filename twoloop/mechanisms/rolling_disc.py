@@ -1,7 +1,7 @@
-"""A thin disc that rolls on a horizontal plane without slipping: one holonomic row and two non-holonomic ones.
+"""A thin disc rolling without slipping on a horizontal plane: one holonomic and two non-holonomic rows.
 
 Coordinates: x, y, z of the centre, yaw, lean from the vertical, spin. The disc touches the plane (z = R cos(lean)), and
-the point of contact is at rest along x and y.
+the contact point has zero velocity along x and y.
 """
 
 import math
@@ -79,14 +79,14 @@ def nonholonomic_gamma(t, q, v, p, Qa):
 
 
 def energy(t: Any, q: Array, v: Array) -> Any:
-    """Kinetic energy and potential of the weight, J, of one state or of many."""
+    """Return the kinetic energy plus the potential of gravity, J, for one state or many."""
     ahead, upright, turn = v[4], v[3] * np.cos(q[4]), v[5] - v[3] * np.sin(q[4])
     spin = ACROSS * (ahead**2 + upright**2) + AXIAL * turn**2
     return 0.5 * (MASS * (v[0] ** 2 + v[1] ** 2 + v[2] ** 2) + spin) + MASS * GRAVITY * q[2]
 
 
 def rim(q: Array) -> Array:
-    """Points of the rim, which turn with the disc, and the point of contact: (N_RIM + 1, 3) or (N_RIM + 1, 3, n_t)."""
+    """Return points fixed to the rim, and the contact point: (N_RIM + 1, 3) or (N_RIM + 1, 3, n_t)."""
     sy, cy, s, c = np.sin(q[3]), np.cos(q[3]), np.sin(q[4]), np.cos(q[4])
     ahead = np.stack([cy, sy, np.zeros_like(cy)])
     upright = np.stack([s * sy, -s * cy, c])
@@ -96,7 +96,7 @@ def rim(q: Array) -> Array:
 
 
 def rolling_disc() -> Problem:
-    """A disc of 2 kg and 0.4 m that leans by 0.3 rad at the start, and wobbles as it rolls."""
+    """A disc of 2 kg and 0.4 m radius that initially leans by 0.3 rad, and wobbles as it rolls."""
     yaw, lean, _ = ANGLES
     turn = UPRIGHT / math.cos(lean)
     sy, cy = math.sin(yaw), math.cos(yaw)

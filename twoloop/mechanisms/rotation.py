@@ -1,7 +1,7 @@
-"""Rotation by Euler parameters e = (e0, e1, e2, e3): helpers of compiled callbacks, and of the start of a mechanism.
+"""Rotation by Euler parameters e = (e0, e1, e2, e3): helpers of compiled callbacks and of initial states.
 
-R(e) a = (e0^2 - f.f) a + 2 f (f.a) + 2 e0 f x a with f = (e1, e2, e3) is quadratic in e. So the acceleration of a
-vector that turns with a body is twice R(e') a where e'' = 0. See Nikravesh, Computer-Aided Analysis of Mechanical
+R(e) a = (e0^2 - f.f) a + 2 f (f.a) + 2 e0 f x a with f = (e1, e2, e3) is quadratic in e. So the acceleration of
+a body-fixed vector for e'' = 0 is twice R(e') a. See Nikravesh, Computer-Aided Analysis of Mechanical
 Systems (1988), Sect. 6.
 """
 
@@ -14,7 +14,7 @@ from twoloop.problem.problem import Array
 
 @helper
 def rotated(e0, e1, e2, e3, x, y, z):
-    """R(e) (x, y, z), homogeneous of degree two in e."""
+    """Return R(e) (x, y, z), homogeneous of degree two in e."""
     d = e0 * e0 - e1 * e1 - e2 * e2 - e3 * e3
     s = 2.0 * (e1 * x + e2 * y + e3 * z)
     return (
@@ -26,7 +26,7 @@ def rotated(e0, e1, e2, e3, x, y, z):
 
 @helper
 def rotated_rate(e0, e1, e2, e3, u0, u1, u2, u3, x, y, z):
-    """The derivative of R(e) (x, y, z) where e' = u."""
+    """Return the time derivative of R(e) (x, y, z) for e' = u."""
     d = 2.0 * (e0 * u0 - e1 * u1 - e2 * u2 - e3 * u3)
     s = 2.0 * (e1 * x + e2 * y + e3 * z)
     r = 2.0 * (u1 * x + u2 * y + u3 * z)
@@ -39,7 +39,7 @@ def rotated_rate(e0, e1, e2, e3, u0, u1, u2, u3, x, y, z):
 
 @helper
 def pulled(e0, e1, e2, e3, x, y, z, fx, fy, fz):
-    """The derivative of f . R(e) (x, y, z) by e: the generalised force of f at that point."""
+    """Return the gradient of f . R(e) (x, y, z) in e, i.e. the generalised force of f at that point."""
     fa = fx * x + fy * y + fz * z
     s = e1 * x + e2 * y + e3 * z
     r = e1 * fx + e2 * fy + e3 * fz
@@ -54,7 +54,7 @@ def pulled(e0, e1, e2, e3, x, y, z, fx, fy, fz):
 
 @helper
 def half_spin(e0, e1, e2, e3, u0, u1, u2, u3):
-    """G(e) u: half the angular velocity in the body's axes where e' = u."""
+    """Return G(e) u, half the angular velocity in body axes for e' = u."""
     return (
         -e1 * u0 + e0 * u1 + e3 * u2 - e2 * u3,
         -e2 * u0 - e3 * u1 + e0 * u2 + e1 * u3,
@@ -63,13 +63,13 @@ def half_spin(e0, e1, e2, e3, u0, u1, u2, u3):
 
 
 def G(e: ArrayLike) -> Array:
-    """The matrix G (3, 4) of e: the angular velocity in the body's axes is 2 G e'."""
+    """Return the matrix G (3, 4) of e: the angular velocity in body axes is 2 G e'."""
     e0, e1, e2, e3 = np.asarray(e, dtype=float)
     return np.array([[-e1, e0, e3, -e2], [-e2, -e3, e0, e1], [-e3, e2, -e1, e0]])
 
 
 def rotation_matrix(e: ArrayLike) -> Array:
-    """R (3, 3) of unit Euler parameters: columns are the body's axes."""
+    """Return R (3, 3) for unit Euler parameters; its columns are the body axes."""
     e = np.asarray(e, dtype=float)
     f = e[1:]
     cross = np.array([[0.0, -f[2], f[1]], [f[2], 0.0, -f[0]], [-f[1], f[0], 0.0]])
@@ -77,7 +77,7 @@ def rotation_matrix(e: ArrayLike) -> Array:
 
 
 def euler_parameters(R: ArrayLike) -> Array:
-    """Unit Euler parameters (4,) of a rotation matrix: of both signs that with e0 > 0, or the largest if e0 is zero.
+    """Return unit Euler parameters (4,) of a rotation matrix, with e0 > 0, or the largest positive if e0 is zero.
 
     Raises
     ------
@@ -87,7 +87,7 @@ def euler_parameters(R: ArrayLike) -> Array:
     R = np.asarray(R, dtype=float)
     if R.shape != (3, 3) or not np.abs(R.T @ R - np.eye(3)).max() <= 1e-9 or np.linalg.det(R) < 0.0:
         raise ValueError(f"R must be a rotation matrix (3, 3), orthonormal and right-handed; given {R!r}")
-    # the symmetric matrix 4 e e^T, whose column with the largest diagonal is free of cancellation
+    # the column of 4 e e^T with the largest diagonal entry is free of cancellation
     d = R[0, 0] + R[1, 1] + R[2, 2]
     E = np.empty((4, 4))
     E[0, 0] = 1.0 + d
@@ -102,12 +102,12 @@ def euler_parameters(R: ArrayLike) -> Array:
 
 
 def euler_rates(e: ArrayLike, spin: ArrayLike) -> Array:
-    """e' (4,) at an angular velocity (3,) along the axes of space."""
+    """Return e' (4,) for an angular velocity (3,) in space."""
     return 0.5 * G(e).T @ (rotation_matrix(e).T @ np.asarray(spin, dtype=float))
 
 
 def perpendiculars(axis: Array) -> tuple[Array, Array]:
-    """Two unit directions, perpendicular to a unit axis and to each other: right-handed with it."""
+    """Return two unit vectors perpendicular to a unit axis and to each other, right-handed with it."""
     first = np.cross(axis, np.eye(3)[int(np.argmin(np.abs(axis)))])
     first /= np.linalg.norm(first)
     return first, np.cross(axis, first)

@@ -1,7 +1,7 @@
 """A planar slider-crank of three bodies in absolute coordinates: with a redundant row, and driven.
 
-Bodies x, y, angle of crank, rod and slider. The redundant row says once more, and not linearly, that the crank pin is
-as far from the slider as the rod is long.
+Coordinates x, y, angle of crank, rod and slider. The redundant row is the distance of the crank pin from the slider,
+which equals the length of the rod.
 """
 
 import cmath
@@ -40,7 +40,7 @@ def _rows(redundant: bool) -> PlanarBodies:
 
 
 def positions(angle: float, rate: float, acceleration: float = 0.0) -> tuple[Array, Array, Array]:
-    """Coordinates, velocities and accelerations (9,) at an angle of the crank, from the triangle."""
+    """Return coordinates, velocities and accelerations (9,) for an angle of the crank, from the triangle."""
     pin = cmath.rect(CRANK, angle)
     pin_v, pin_a = 1j * rate * pin, (1j * acceleration - rate**2) * pin
     tilt = -math.asin(pin.imag / ROD)
@@ -56,7 +56,7 @@ def positions(angle: float, rate: float, acceleration: float = 0.0) -> tuple[Arr
 
 
 def redundant_slider_crank() -> Problem:
-    """The slider-crank with nine rows of rank eight, turning freely under its weight from 8 rad/s of the crank."""
+    """The slider-crank with nine rows of rank eight, moving freely under gravity; the crank starts at 8 rad/s."""
     rows = _rows(True)
     q0, v0, _ = positions(ANGLE, RATE)
     return ready(
@@ -75,15 +75,15 @@ def redundant_slider_crank() -> Problem:
 
 @dataclass(frozen=True)
 class Driven:
-    """The motion of the driven slider-crank, which is that of the drive: no freedom is left."""
+    """The motion of the driven slider-crank, determined by the drive."""
 
     def __call__(self, t: float) -> tuple[Array, Array]:
-        """States q, v (9,) at t."""
+        """Return the states q, v (9,) at t."""
         q, v, _ = self.full(t)
         return q, v
 
     def full(self, t: float) -> tuple[Array, Array, Array]:
-        """The same with the accelerations."""
+        """Return states and accelerations at t."""
         start, rate, amplitude, frequency = DRIVE.values()
         s, c = math.sin(frequency * t), math.cos(frequency * t)
         return positions(
@@ -92,7 +92,7 @@ class Driven:
 
 
 def driven_slider_crank() -> Problem:
-    """The slider-crank, its crank at the angle 0.5 + 4 t + 0.3 sin(3 t): nine rows for nine coordinates."""
+    """The slider-crank with the crank angle 0.5 + 4 t + 0.3 sin(3 t): nine rows for nine coordinates."""
     rows = _rows(False)
     rows.drive(2, **DRIVE)
     motion = Driven()

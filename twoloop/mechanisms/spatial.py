@@ -1,4 +1,4 @@
-"""The callbacks of all mechanisms of spatial bodies: Euler parameters, joints, spring-dampers, weight.
+"""Common callbacks of spatial mechanisms: Euler parameters, joints, spring-dampers, gravity.
 
 Coordinates of a body: x, y, z of the centre of mass and e0, e1, e2, e3 (see `rotation`); its axes are the principal
 ones. The callbacks are compiled once for all mechanisms; the parameters hold what
@@ -8,7 +8,7 @@ ones. The callbacks are compiled once for all mechanisms; the parameters hold wh
          (kind, row, i, a (3,), j, b (3,), s (3,))...,  (i, a (3,), j, b (3,), k, c, length)...]
 
 The first rows are e.e = 1 of each body, then those of the joints. Vectors are in the axes of their body; the ground is
-body -1. The mass matrix has the rank 6 of 7 for each body, 4 G^T J G being of rank 3.
+body -1. The mass matrix has rank 6 of 7 for each body, because 4 G^T J G has rank 3.
 """
 
 from collections.abc import Sequence
@@ -30,7 +30,7 @@ MOVED, TURNED = (0, 1, 2), (3, 4, 5, 6)  # coordinates of a body
 
 @helper
 def vector(q, body, x, y, z):
-    """A vector that turns with a body, in space."""
+    """Return a body-fixed vector in space."""
     if body < 0:
         return x, y, z
     k = 7 * body + 3
@@ -39,7 +39,7 @@ def vector(q, body, x, y, z):
 
 @helper
 def vector_rate(q, v, body, x, y, z):
-    """Its derivative, and twice R(e') a, which is its second one where e'' = 0."""
+    """Return its time derivative, and 2 R(e') a, its second derivative for e'' = 0."""
     if body < 0:
         return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     k = 7 * body + 3
@@ -50,7 +50,7 @@ def vector_rate(q, v, body, x, y, z):
 
 @helper
 def centre(q, body):
-    """The centre of mass; also the velocity, of v."""
+    """Return the centre of mass, or its velocity from v."""
     if body < 0:
         return 0.0, 0.0, 0.0
     return q[7 * body], q[7 * body + 1], q[7 * body + 2]
@@ -58,7 +58,7 @@ def centre(q, body):
 
 @helper
 def put_turned(q, values, place, body, x, y, z, fx, fy, fz):
-    """The derivative of f . (vector of a body) by its Euler parameters into four values; where the next ones are."""
+    """Store the gradient of f . (vector of a body) in the Euler parameters as four values; return the next index."""
     if body < 0:
         return place
     k = 7 * body + 3
@@ -72,7 +72,7 @@ def put_turned(q, values, place, body, x, y, z, fx, fy, fz):
 
 @helper
 def turn_row(q, row, body, x, y, z, fx, fy, fz):
-    """Add to a row (n_q,) the derivative of f . (vector of a body) by its Euler parameters."""
+    """Add to a row (n_q,) the gradient of f . (vector of a body) in its Euler parameters."""
     if body >= 0:
         k = 7 * body + 3
         d0, d1, d2, d3 = pulled(q[k], q[k + 1], q[k + 2], q[k + 3], x, y, z, fx, fy, fz)
@@ -84,7 +84,7 @@ def turn_row(q, row, body, x, y, z, fx, fy, fz):
 
 @helper
 def move_row(row, body, fx, fy, fz):
-    """Add to a row the derivative of f . (centre of a body)."""
+    """Add to a row the gradient of f . (centre of a body)."""
     if body >= 0:
         row[7 * body] += fx
         row[7 * body + 1] += fy
@@ -111,7 +111,7 @@ def force(t, q, v, p, Q):
     for body in range(n):
         m, k = HEAD + 4 * body, 7 * body + 3
         move_row(Q, body, p[m] * p[3], p[m] * p[4], p[m] * p[5])
-        # -8 G(e')^T J G(e) e': what the kinetic energy leaves when e'' = 0
+        # quadratic velocity terms of the kinetic energy: -8 G(e')^T J G(e) e'
         wx, wy, wz = half_spin(q[k], q[k + 1], q[k + 2], q[k + 3], v[k], v[k + 1], v[k + 2], v[k + 3])
         x, y, z = -8.0 * p[m + 1] * wx, -8.0 * p[m + 2] * wy, -8.0 * p[m + 3] * wz
         u0, u1, u2, u3 = v[k], v[k + 1], v[k + 2], v[k + 3]
@@ -282,7 +282,7 @@ def jacobian_values(t, q, p, values):
 
 
 def mass_entries(n: int) -> tuple[list[int], list[int]]:
-    """Rows and columns of what `mass_values` gives of n bodies, in its order."""
+    """Return rows and columns of the entries of `mass_values` for n bodies, in order."""
     rows, columns = [], []
     for first in range(0, 7 * n, 7):
         turned = range(first + 3, first + 7)
@@ -292,7 +292,7 @@ def mass_entries(n: int) -> tuple[list[int], list[int]]:
 
 
 def jacobian_entries(n: int, joints: Sequence[Sequence[float]]) -> tuple[list[int], list[int]]:
-    """Rows and columns of what `jacobian_values` gives of n bodies, in its order."""
+    """Return rows and columns of the entries of `jacobian_values` for n bodies, in order."""
     rows = [body for body in range(n) for _ in TURNED]
     columns = [7 * body + k for body in range(n) for k in TURNED]
 

@@ -1,4 +1,4 @@
-"""How a mechanism of spatial bodies is put together: bodies at their start, joints and springs between them."""
+"""Assembles mechanisms of spatial bodies from their initial poses, joints and springs."""
 
 from dataclasses import dataclass, replace
 from typing import Any
@@ -24,7 +24,7 @@ NAMES = ("x (m)", "y (m)", "z (m)", "e0", "e1", "e2", "e3")
 class SpatialBodies:
     """Collects bodies, joints and springs. Points and directions are given in space, at the start.
 
-    Joints are named by their kind and their bodies: "revolute crank-ground" is what the ground does to the crank.
+    Joints are named by kind and bodies: "revolute crank-ground" is the reaction of the ground on the crank.
 
     Parameters
     ----------
@@ -41,9 +41,9 @@ class SpatialBodies:
         self._v: list[Array] = [np.zeros(0)]
         self._R: list[Array] = []
         self._joints: list[list[float]] = []
-        self._named: list[Joint] = []  # rows not counting the normalisations
+        self._named: list[Joint] = []  # row numbers without the normalisations
         self._springs: list[list[float]] = []
-        self._drawn: list[tuple[int, int, Array]] = []  # bodies of a joint, and its point at the start
+        self._drawn: list[tuple[int, int, Array]] = []  # bodies of a joint, and its initial position
 
     def body(
         self,
@@ -55,7 +55,7 @@ class SpatialBodies:
         velocity: ArrayLike = (0.0, 0.0, 0.0),
         spin: ArrayLike = (0.0, 0.0, 0.0),
     ) -> int:
-        """Add a body, and return its number.
+        """Add a body and return its index.
 
         Parameters
         ----------
@@ -65,7 +65,7 @@ class SpatialBodies:
         inertia : (float, float, float)
             Principal moments about the centre of mass, kg m^2.
         position, velocity : array_like (3,)
-            Of the centre of mass, m and m/s.
+            Position and velocity of the centre of mass, m and m/s.
         R : array_like (3, 3)
             Rotation matrix, whose columns are the principal axes.
         spin : array_like (3,)
@@ -80,12 +80,12 @@ class SpatialBodies:
         return len(self._bodies) - 1
 
     def _along(self, body: int, direction: ArrayLike) -> Array:
-        """A direction in the axes of a body."""
+        """Transform a direction from space to body axes, at the start."""
         given = np.asarray(direction, dtype=float)
         return given if body == GROUND else self._R[body].T @ given
 
     def _from_centre(self, body: int, point: ArrayLike) -> Array:
-        """A point in the axes of a body, from its centre."""
+        """Transform a point from space to body axes, relative to the centre, at the start."""
         given = np.asarray(point, dtype=float)
         return given if body == GROUND else self._along(body, given - self._q[body + 1][:3])
 
@@ -99,12 +99,12 @@ class SpatialBodies:
         return [self._perpendicular(i, across, j, axis) for across in perpendiculars(_unit(axis))]
 
     def _add(self, kind: str, i: int, j: int, point: ArrayLike, *rows: Row) -> None:
-        """A joint of these rows, which acts on body i, or, where that is the ground, on body j."""
+        """Add a joint with these rows, acting on body i, or on body j if i is the ground."""
         first = self.n_joint_rows
         for row_kind, one, a, two, b, s in rows:
             self._joints.append([row_kind, float(self.n_joint_rows), float(one), *a, float(two), *b, *s])
             self.n_joint_rows += 3 if row_kind == POINT else 1
-        if kind != "prismatic":  # whose point stays on neither body
+        if kind != "prismatic":  # its point is fixed to neither body
             self._drawn.append((i, j, np.asarray(point, dtype=float)))
         body, other = (j, i) if i == GROUND else (i, j)
         name = f"{kind} {self._names[body]}-{'ground' if other == GROUND else self._names[other]}"
@@ -114,19 +114,19 @@ class SpatialBodies:
         self._named.append(Joint(unused(name, self._named), numbered, position, parameters, there))
 
     def spherical(self, i: int, j: int, point: ArrayLike) -> None:
-        """Three rows: both bodies share a point."""
+        """Add three rows: both bodies share a point."""
         self._add("spherical", i, j, point, self._coincide(i, j, point))
 
     def revolute(self, i: int, j: int, point: ArrayLike, axis: ArrayLike) -> None:
-        """Five rows: a hinge at a point."""
+        """Add five rows: a hinge at a point."""
         self._add("revolute", i, j, point, self._coincide(i, j, point), *self._parallel(i, j, axis))
 
     def universal(self, i: int, j: int, point: ArrayLike, a: ArrayLike, b: ArrayLike) -> None:
-        """Four rows: a cross at a point, one axis fixed in body i, the other, perpendicular, in body j."""
+        """Add four rows: a cross at a point, one axis fixed in body i, the other, perpendicular, in body j."""
         self._add("universal", i, j, point, self._coincide(i, j, point), self._perpendicular(i, a, j, b))
 
     def prismatic(self, i: int, j: int, point: ArrayLike, axis: ArrayLike) -> None:
-        """Five rows: body j slides along an axis of body i through a point, and does not turn on it."""
+        """Add five rows: body j slides along an axis of body i through a point, without rotating on it."""
         first, second = perpendiculars(_unit(axis))
         here, there = self._from_centre(i, point), self._from_centre(j, point)
         planes = [(PLANE, i, self._along(i, across), j, there, here) for across in (first, second)]
@@ -136,12 +136,12 @@ class SpatialBodies:
     def spring(
         self, i: int, a: ArrayLike, j: int, b: ArrayLike, stiffness: float, damping: float, length: float
     ) -> None:
-        """A spring-damper between the point a of body i and b of body j: N/m, N s/m, m."""
+        """Add a spring-damper between the point a of body i and b of body j: N/m, N s/m, m."""
         here, there = self._from_centre(i, a), self._from_centre(j, b)
         self._springs.append([float(i), *here, float(j), *there, stiffness, damping, length])
 
     def system(self, name: str) -> ConstrainedSystem:
-        """The system of what was added so far."""
+        """Return the system of all parts added."""
         n = len(self._bodies)
         joints = [[joint[0], joint[1] + n, *joint[2:]] for joint in self._joints]  # after the normalisations
         tables = [np.ravel(table) for table in (self._bodies, joints, self._springs)]
@@ -160,24 +160,24 @@ class SpatialBodies:
 
     @property
     def start(self) -> tuple[Array, Array]:
-        """States q, v (n_q,) at the start."""
+        """Return the initial state q, v (n_q,)."""
         return np.concatenate(self._q), np.concatenate(self._v)
 
     @property
     def coordinates(self) -> tuple[str, ...]:
-        """Names of the coordinates."""
+        """Return the names of the coordinates."""
         return tuple(f"{coordinate} of {name}" for name in self._names for coordinate in NAMES)
 
     @property
     def energy(self) -> "Energy":
-        """Energy as a function of t, q and v."""
+        """Return the energy as a function of t, q and v."""
         return Energy(np.array(self._bodies), self.gravity, np.array(self._springs).reshape(-1, spatial.SPRING))
 
     @property
     def drawing(self) -> Drawing:
         """Each body as the box of its mass and moments, with lines from the centre to its joints; springs as lines.
 
-        Paths are those of joints between two bodies, and of the centres of bodies with a single joint.
+        Paths are drawn for joints between two bodies, and for the centres of bodies with a single joint.
         """
         sketch = Sketch()
         for body, (mass, *moments) in enumerate(self._bodies):
@@ -198,7 +198,7 @@ class SpatialBodies:
         return sketch.drawing
 
     def momentum(self, point: ArrayLike, axis: ArrayLike) -> "Momentum":
-        """Angular momentum about an axis of space through a point, as a function of t, q and v."""
+        """Return the angular momentum about an axis of space through a point, as a function of t, q and v."""
         return Momentum(np.array(self._bodies), np.asarray(point, dtype=float), np.asarray(axis, dtype=float))
 
 
@@ -208,28 +208,28 @@ def _unit(axis: ArrayLike) -> Array:
 
 
 def _states(q: Array, v: Array) -> tuple[Array, Array]:
-    """States of the bodies (n, 7) or (n, 7, n_t)."""
+    """Return the states of the bodies, (n, 7) or (n, 7, n_t)."""
     q, v = np.asarray(q), np.asarray(v)
     shape = (-1, 7, *q.shape[1:])
     return q.reshape(shape), v.reshape(shape)
 
 
 def _spins(q: Array, v: Array) -> Array:
-    """Angular velocities along the bodies' axes, (n, 3) or (n, 3, n_t)."""
+    """Return angular velocities in body axes, (n, 3) or (n, 3, n_t)."""
     e, u = np.moveaxis(q[:, 3:], 1, 0), np.moveaxis(v[:, 3:], 1, 0)
     return 2.0 * np.stack(spatial.half_spin.py_func(*e, *u), axis=1)
 
 
 @dataclass(frozen=True, eq=False)
 class Energy:
-    """Kinetic energy, potential of the weight and of the springs, J, of one state or of many."""
+    """Kinetic energy, potentials of gravity and springs, J, for one state or many."""
 
     bodies: Array
     gravity: Array
     springs: Array
 
     def __call__(self, t: Any, q: Array, v: Array) -> Any:
-        """Of one state, or of the columns of many."""
+        """Evaluate for one state, or for many given as columns."""
         flat = np.asarray(q)
         q, v = _states(q, v)
         masses, inertias = self.bodies[:, 0], self.bodies[:, 1:]
@@ -244,14 +244,14 @@ class Energy:
 
 @dataclass(frozen=True, eq=False)
 class Momentum:
-    """Angular momentum about an axis of space through a point, kg m^2/s, of one state or of many."""
+    """Angular momentum about an axis of space through a point, kg m^2/s, for one state or many."""
 
     bodies: Array
     point: Array
     axis: Array
 
     def __call__(self, t: Any, q: Array, v: Array) -> Any:
-        """Of one state, or of the columns of many."""
+        """Evaluate for one state, or for many given as columns."""
         q, v = _states(q, v)
         spins = _spins(q, v)
         total: Any = 0.0

@@ -1,7 +1,7 @@
-"""A spatial four-bar linkage, RSSR: crank and rocker on hinges that are not parallel, a coupler on two ball joints.
+"""A spatial four-bar linkage, RSSR: crank and rocker on non-parallel hinges, coupler on two ball joints.
 
-The crank turns about z through the origin, the rocker about y through D. The coupler may also turn about its own axis,
-which no force resists: a second degree of freedom that the rest does not feel.
+The crank rotates about z through the origin, the rocker about y through D. The rotation of the coupler about its own
+axis is a second, decoupled degree of freedom.
 """
 
 import math
@@ -16,20 +16,20 @@ from twoloop.problem.problem import Array, Problem
 GRAVITY = 9.81  # m/s^2, along -z
 CRANK, ROCKER = 0.3, 0.7  # m
 D = np.array([0.9, 0.0, 0.3])  # m
-START = (0.0, 0.5 * math.pi)  # angles of crank (from x) and rocker (from x, towards z) at the start
-RATE = 5.0  # of the crank at the start, rad/s
+START = (0.0, 0.5 * math.pi)  # initial angles of crank (from x) and rocker (from x, towards z)
+RATE = 5.0  # initial rate of the crank, rad/s
 MASSES = {"crank": 0.6, "coupler": 1.0, "rocker": 0.8}  # kg
 RADIUS = 0.02  # m, of all three round bars
 
 
 def inertia(mass: float, length: float) -> tuple[float, float, float]:
-    """Principal moments of a round bar along its first axis, kg m^2."""
+    """Return the principal moments of a round bar along its first axis, kg m^2."""
     across = mass * (length**2 / 12.0 + RADIUS**2 / 4.0)
     return 0.5 * mass * RADIUS**2, across, across
 
 
 def frame(along: Array, up: Array) -> Array:
-    """Rotation matrix whose first column points along a bar, and the second across `up` and it."""
+    """Return a rotation matrix whose first column is along a bar, and the second perpendicular to `up` and it."""
     x = along / np.linalg.norm(along)
     y = np.cross(up, x)
     y = y / np.linalg.norm(y)
@@ -37,7 +37,7 @@ def frame(along: Array, up: Array) -> Array:
 
 
 def spatial_four_bar() -> Problem:
-    """The RSSR linkage under its weight, its crank level and turning at 5 rad/s at the start."""
+    """The RSSR linkage under gravity, its crank initially level and rotating at 5 rad/s."""
     theta, phi = START
     P = CRANK * np.array([math.cos(theta), math.sin(theta), 0.0])
     P_v = CRANK * RATE * np.array([-math.sin(theta), math.cos(theta), 0.0])
@@ -47,7 +47,7 @@ def spatial_four_bar() -> Problem:
     phi_rate = (bar @ P_v) / (bar @ turned)
     S, S_v = D + arm, phi_rate * turned
     length = float(np.linalg.norm(bar))
-    spin = np.cross(bar, S_v - P_v) / length**2  # without a turn about its own axis
+    spin = np.cross(bar, S_v - P_v) / length**2  # no rotation about its own axis
     up, y = np.array([0.0, 0.0, 1.0]), np.array([0.0, 1.0, 0.0])
     rows = SpatialBodies((0.0, 0.0, -GRAVITY))
     m = MASSES
@@ -62,7 +62,7 @@ def spatial_four_bar() -> Problem:
         D + 0.5 * arm,
         frame(arm, y),
         0.5 * S_v,
-        -phi_rate * y,  # from x towards z is against the right hand about y
+        -phi_rate * y,  # from x towards z is negative about y
     )
     rows.revolute(crank, GROUND, (0.0, 0.0, 0.0), up)
     rows.spherical(coupler, crank, P)

@@ -12,13 +12,13 @@ from twoloop.problem.problem import Problem
 GRAVITY = 9.81  # m/s^2, along -z
 CRANK, ROD = 0.08, 0.3  # m
 A = np.array([0.0, 0.1, 0.12])  # m, hinge of the crank
-RATE = 6.0  # of the crank at the start, rad/s about x
+RATE = 6.0  # initial rate of the crank about x, rad/s
 MASSES = {"crank": 0.12, "rod": 0.5, "slider": 2.0}  # kg
 INERTIAS = {"crank": (1e-4, 1e-4, 1e-5), "rod": (4e-4, 4e-3, 4e-3), "slider": (1e-4, 1e-4, 1e-4)}  # kg m^2
 
 
 def spatial_slider_crank() -> Problem:
-    """The mechanism with its crank upright at 6 rad/s, under its weight."""
+    """The mechanism under gravity, its crank initially upright and rotating at 6 rad/s."""
     x = np.array([1.0, 0.0, 0.0])
     up = np.array([0.0, 0.0, CRANK])
     B, B_v = A + up, np.cross(RATE * x, up)
@@ -26,7 +26,7 @@ def spatial_slider_crank() -> Problem:
     rod = C - B
     C_v = (rod @ B_v) / rod[0] * x
     along = rod / ROD
-    cross = np.cross(along, x)  # the axis of the cross that is fixed to the rod stays perpendicular to the slider's x
+    cross = np.cross(along, x)  # axis of the cross fixed to the rod, perpendicular to the slider's x
     cross /= np.linalg.norm(cross)
     R = np.column_stack([along, cross, np.cross(along, cross)])
     # spin = along x along' + w along, with w such that (spin x cross) . x = 0

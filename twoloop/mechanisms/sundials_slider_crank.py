@@ -25,7 +25,7 @@ def mass(t, q, p, M):
 @callback("force")
 def force(t, q, v, p, Q):
     a, s1, c1, s2, c2 = p[0], math.sin(q[0]), math.cos(q[0]), math.sin(q[2]), math.cos(q[2])
-    # the spring, from the middle of the crank to that of the rod
+    # the spring connects the midpoints of crank and rod
     x, y = q[1] - 0.5 * (c2 + a * c1), -0.5 * (s2 + a * s1)
     xv, yv = v[1] + 0.5 * (s2 * v[2] + a * s1 * v[0]), -0.5 * (c2 * v[2] + a * c1 * v[0])
     length = math.hypot(x, y)
@@ -56,12 +56,12 @@ def gamma(t, q, v, p, Qd):
 
 @dataclass(frozen=True, eq=False)
 class Energy:
-    """Kinetic energy, that of the spring, and the potential of F; the damper takes of it."""
+    """Kinetic energy, spring energy, and the potential of F; the damper dissipates it."""
 
     p: Array
 
     def __call__(self, t: Any, q: Array, v: Array) -> Any:
-        """Of one state, or of the columns of many."""
+        """Evaluate for one state, or for many given as columns."""
         q, v = np.asarray(q), np.asarray(v)
         a, J1, m2, J2, k, _, l0, F = self.p
         x = q[1] - 0.5 * (np.cos(q[2]) + a * np.cos(q[0]))
@@ -71,7 +71,7 @@ class Energy:
 
 
 def joints(q: Array) -> Array:
-    """Crank's centre, crank pin, slider, both ends of the spring: (5, 2) or (5, 2, n_t)."""
+    """Return crank centre, crank pin, slider, and both ends of the spring: (5, 2) or (5, 2, n_t)."""
     zero = np.zeros_like(q[0])
     pin = PARAMETERS["a"] * np.stack([np.cos(q[0]), np.sin(q[0])])
     slider = np.stack([q[1], zero])
@@ -79,7 +79,7 @@ def joints(q: Array) -> Array:
 
 
 def sundials_slider_crank() -> Problem:
-    """The mechanism from rest, its crank upright, over 10 s."""
+    """The mechanism released from rest with its crank upright, over 10 s."""
     p = np.array(list(PARAMETERS.values()))
     tilt = math.asin(-PARAMETERS["a"])
     system = ConstrainedSystem(

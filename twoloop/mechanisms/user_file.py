@@ -1,4 +1,4 @@
-"""Problems named on a command line: FILE.py:FUNCTION of the user's own, or a ready mechanism by its name."""
+"""Problems named on the command line: FILE.py:FUNCTION of the user, or a ready mechanism by name."""
 
 import importlib.util
 import inspect
@@ -15,13 +15,13 @@ EXPECTED = "give FILE.py:FUNCTION, such as crane.py:crane, or a ready mechanism,
 
 
 def problem_from(where: str) -> Problem:
-    """The problem that FILE.py:FUNCTION makes, or the ready mechanism of that name.
+    """Return the problem made by FILE.py:FUNCTION, or the ready mechanism of that name.
 
     Raises
     ------
     ValueError
-        If there is no such file, function or mechanism, or it takes arguments, or does not return a `Problem`; an
-        exception of the file itself comes through.
+        If there is no such file, function or mechanism, or it takes arguments, or does not return a `Problem`.
+        Exceptions of the file itself are passed on.
     """
     if where.replace("-", "_").isidentifier():
         names = [name for name in mechanisms.__all__ if inspect.isfunction(getattr(mechanisms, name))]
@@ -54,7 +54,7 @@ def _function_of_a_file(where: str) -> Callable[..., Any]:
         raise ValueError(f"{path} is not a Python file")
     module = importlib.util.module_from_spec(spec)
     sys.modules[path.stem] = module
-    sys.path.insert(0, str(path.parent.resolve()))  # for files beside it
+    sys.path.insert(0, str(path.parent.resolve()))  # for imports from the same folder
     spec.loader.exec_module(module)
     maker = getattr(module, function, None)
     if not callable(maker):
@@ -64,7 +64,7 @@ def _function_of_a_file(where: str) -> Callable[..., Any]:
 
 
 def _candidates(module: ModuleType) -> str:
-    """The functions of a file that could make a problem."""
+    """Return a text with the functions of a file that could make a problem."""
     names = [
         name
         for name, value in vars(module).items()
@@ -74,10 +74,10 @@ def _candidates(module: ModuleType) -> str:
 
 
 def _arguments(maker: Callable[..., Any]) -> list[str]:
-    """What a function cannot be called without."""
+    """Return the required arguments of a function."""
     try:
         parameters = inspect.signature(maker).parameters.values()
-    except ValueError:  # a built-in that does not say
+    except ValueError:  # a built-in function without a signature
         return []
     several = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
     return [each.name for each in parameters if each.default is each.empty and each.kind not in several]

@@ -52,7 +52,7 @@ class Certificate:
         Largest `defect` of a run that passes.
     unseen : tuple of (float, float)
         Start and end, s, of intervals that could not be verified: reintegration failed, e.g. near a singular position,
-        or errors grow more than a hundredfold within a step.
+        or errors grow more than 200-fold within a step.
     passed : bool
         True if `defect` is at most `limit` and `unseen` is empty.
     message : str

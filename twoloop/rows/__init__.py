@@ -1,1 +1,1 @@
-"""Rows of runs of solvers, as they are shipped and exchanged: their format, costs at equal error, the leaderboard."""
+"""Rows with the results of solver runs: their exchange format, cost at equal error, and the leaderboard."""

@@ -1,9 +1,9 @@
-"""What is timed beside the calls of solvers, so that their times on several machines can be laid side by side.
+"""A calibration timed along with solver calls, which makes times on different machines comparable.
 
-It is a fixed number of steps of the classical Runge-Kutta method on a pendulum with its multiplier, in numpy: the small
-arrays and calls from Python of which most of the time of a solver in Python goes, which any environment can do, always
-the same operations, of no version of a solver. Machine code scales otherwise from processor to processor, and Python's
-versions differ in speed: rows name both.
+It is a fixed number of steps of the classical Runge-Kutta method on a pendulum with its multiplier, in numpy. Like a
+solver in Python, it spends its time in calls and small arrays; it runs in any environment and does not depend on the
+version of a solver. Machine code scales differently between processors, and versions of Python differ in speed: rows
+contain both.
 """
 
 import time
@@ -11,9 +11,9 @@ import time
 import numpy as np
 from numpy.typing import NDArray
 
-CALIBRATION = "rk4-pendulum-1"  # another name whenever a line below changes
+CALIBRATION = "rk4-pendulum-1"  # rename whenever the code below changes
 STEPS = 200
-REPEATS = 3  # of which the fastest counts
+REPEATS = 3  # the fastest counts
 
 
 def _rate(state: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -23,7 +23,7 @@ def _rate(state: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def calibration_s() -> float:
-    """CPU time of the calibration, s: of three in a row the least."""
+    """Return the CPU time of the calibration, s: the minimum of three repetitions."""
     times = []
     for _ in range(REPEATS):
         state, h, began = np.array([1.0, 0.0, 0.0, 0.0]), 0.01, time.process_time()

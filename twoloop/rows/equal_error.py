@@ -1,4 +1,4 @@
-"""The runs of one solver on one mechanism, by error: which are good enough, and what an error between them costs."""
+"""Runs of one solver on one mechanism, sorted by error: cost at a target error by interpolation."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cache, lru_cache
@@ -9,31 +9,31 @@ from numpy.typing import NDArray
 
 from twoloop.checks.arguments import Array
 
-DECADE = 10.0 * (1.0 + 1e-9)  # between two runs that lie farther apart nothing is interpolated
-NEAR = 2.0  # settings that differ by less are nearly the same
-FEWEST = 3  # repetitions that an interval asks for
-LOOSEST = 1e-1  # tolerance of which looser ones are of no use
-# how solvers begin whose order the tolerance sets, or whose loose runs are too rough for a line
+DECADE = 10.0 * (1.0 + 1e-9)  # no interpolation between runs whose errors differ by more
+NEAR = 2.0  # settings within this factor count as nearly equal
+FEWEST = 3  # repetitions required for a confidence interval
+LOOSEST = 1e-1  # loosest useful tolerance
+# prefixes of solvers whose order depends on the tolerance, or whose loose runs do not follow a line
 BY_TOLERANCE = ("heyoka", "Taylor", "auto", "the default", "ensemble", "solve_dae", "TRBDF2")
-INTERVAL = (2.5, 97.5)  # percentiles that count of times drawn again
-LEAST = 1.05  # ratio of times that counts: less is within what machine and order of the calls do
-RESAMPLES, SEED = 1000, 25  # draws of the repetitions
+INTERVAL = (2.5, 97.5)  # percentiles of the bootstrap distribution
+LEAST = 1.05  # smallest relevant ratio of times; less is within the variation of machine and order of calls
+RESAMPLES, SEED = 1000, 25  # bootstrap resamples of the repetitions
 
 
 @cache
 def _rounds(n: int) -> NDArray[np.int64]:
-    """Rounds of n repetitions, drawn again (RESAMPLES, n): the same for all runs, as rounds are interleaved."""
+    """Return resampled rounds (RESAMPLES, n): the same for all runs, because their repetitions are interleaved."""
     return np.random.default_rng(SEED).integers(0, n, (RESAMPLES, n))
 
 
 def resampled(times: Iterable[Sequence[float]]) -> Array:
-    """Medians of the times of each run over rounds drawn again (n_runs, RESAMPLES); NaN of fewer than three."""
-    drawn = [_medians_drawn(tuple(own)) if len(own) >= FEWEST else np.full(RESAMPLES, np.nan) for own in times]
+    """Return bootstrap medians of the times of each run (n_runs, RESAMPLES); NaN for fewer than three repetitions."""
+    drawn = [_bootstrap_medians(tuple(own)) if len(own) >= FEWEST else np.full(RESAMPLES, np.nan) for own in times]
     return np.array(drawn).reshape(-1, RESAMPLES)
 
 
 @lru_cache(maxsize=20_000)
-def _medians_drawn(times: tuple[float, ...]) -> Array:
+def _bootstrap_medians(times: tuple[float, ...]) -> Array:
     return np.asarray(np.median(np.array(times)[_rounds(len(times))], axis=1))
 
 
@@ -41,14 +41,14 @@ Place = tuple[int, float | None]
 
 
 class Runs:
-    """The runs of one solver on one case that have an error and this cost, by error, in arrays.
+    """The runs of one solver on one case with a known error and cost, sorted by error, as arrays.
 
-    A table of 70 columns takes minutes where it is sorted and cut for every solver and every error.
+    Arrays, because sorting and slicing a table of 70 columns for every solver and error takes minutes.
     """
 
     def __init__(self, columns: Mapping[str, NDArray[Any]], rows: NDArray[np.int64], what: str, solver: str):
         errors, settings = columns["error_q"][rows], columns["setting"][rows]
-        order = np.argsort(errors, kind="stable")  # NaN last
+        order = np.argsort(errors, kind="stable")  # NaN sorts last
         known = order[~np.isnan(errors[order]) & ~np.isnan(columns[what][rows][order])]
         self.columns, self.rows = columns, rows[known]
         self.floor = float(np.fmax.reduce(columns["floor"][self.rows], initial=-np.inf))
@@ -59,27 +59,27 @@ class Runs:
         self.loosest = best if (settings[np.isnan(errors)] > best).any() else LOOSEST
 
     def of(self, column: str) -> NDArray[Any]:
-        """What stands in a column."""
+        """Return a column."""
         return self.columns[column][self.rows]
 
     def drawn(self) -> Array:
-        """`resampled` of the times; NaN where these are not known."""
+        """Return `resampled` times; NaN if they are unknown."""
         known = "times" in self.columns
         return resampled(self.of("times")) if known else np.full((len(self.rows), RESAMPLES), np.nan)
 
     def used(self, k: int) -> str:
-        """The method that the solver took in a run, if it chooses."""
+        """Return the method used in a run by a solver that chooses its method."""
         taken = self.of("used")[k] if "used" in self.columns else ""
         return taken if isinstance(taken, str) else ""
 
 
 def place_of(runs: Runs, target: float, unasked: bool = False) -> Place | None:
-    """How many runs of one solver, by error, are good enough, and where between them and the next the target is.
+    """Return the number of runs that reach a target error, and the position of the target on the log-log line.
 
-    All of these count, however much better they are: a user who wants an error takes the cheapest run that has it.
-    None: no run is so good, or, unless `unasked`, none was asked for about this: within a decade below the target, at
-    the loosest setting that the solver can run, or at nearly the same setting as a looser one that is not good enough
-    (the solver leaps over the target). The place between two runs, on the log-log line through them, is None where
+    All runs below the target count, however accurate: a user takes the cheapest run that reaches the error. Return
+    None if no run reaches it, or, unless `unasked`, if no run aimed at it: none is within a decade below the target, at
+    the loosest setting that the solver can run, or at nearly the same setting as a looser run above the target (the
+    error jumps over the target). The position on the log-log line through the two runs around the target is None if
     they are more than a decade apart, or of different methods or orders.
     """
     errors, settings = runs.errors, runs.settings
@@ -100,9 +100,9 @@ def place_of(runs: Runs, target: float, unasked: bool = False) -> Place | None:
 
 
 def cost_at(costs: Array, place: Place) -> Array:
-    """The least cost (of each draw, if there are many) at a place; `costs`: a row a run, by error."""
+    """Return the least cost (per resample, if there are many) at a target; `costs`: one row per run, by error."""
     n_good, share = place
-    best = np.fmin.reduce(costs[:n_good])  # NaN: draws of runs made once, as others are cheaper
+    best = np.fmin.reduce(costs[:n_good])  # NaN: runs without repetitions
     if share is None:
         return np.asarray(best)
     with np.errstate(invalid="ignore"):
@@ -111,5 +111,5 @@ def cost_at(costs: Array, place: Place) -> Array:
 
 
 def cheapest(runs: Runs, place: Place) -> int:
-    """The row of the cheapest run at a place."""
+    """Return the index of the cheapest run at a target."""
     return int(runs.rows[np.argmin(runs.of("call_s")[: place[0]])])

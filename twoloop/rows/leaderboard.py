@@ -1,4 +1,4 @@
-"""Which solver takes how long for an error on a mechanism, of the rows that are shipped or of a file of one's own."""
+"""Time of each solver for an error on a mechanism, from the rows shipped or from the user's files."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -24,19 +24,19 @@ CALL = (
 
 @dataclass(frozen=True)
 class Entry:
-    """A solver that was run for an error.
+    """A solver with its time at an error.
 
     Attributes
     ----------
     solver, version, called_from : str
     seconds : float
-        At the error: on the log-log line between two runs, or of the cheapest that is as good.
+        Time at the error: interpolated log-log between two runs, or that of the cheapest run that reaches it.
     over : float
-        The time over that of the first.
+        Time relative to that of the first.
     doubt : {"", "undecided", "few runs"}
-        Whether it is told apart from the first, by repetitions drawn again and a margin of 5 %.
+        Whether it differs significantly from the first, by a bootstrap of the repetitions and a margin of 5 %.
     calibrated : float or None
-        The time over that of the calibration timed beside it.
+        Time relative to that of the calibration in the same process.
     evaluations : float or None
     keeps_constraints : bool or None
     """
@@ -54,7 +54,7 @@ class Entry:
 
 @dataclass(frozen=True)
 class Board:
-    """The solvers on one mechanism, on one processor, at one error.
+    """Ranking of the solvers on one mechanism, on one processor, at one error.
 
     Attributes
     ----------
@@ -64,11 +64,11 @@ class Board:
     measure : {"error_end", "error"}
     processor : str
     target : float
-        The error.
+        Target error.
     entries : list of Entry
         Cheapest first.
     others : list of (str, str)
-        Solvers without a time at the error, and why.
+        Solvers without a time at the error, with reasons.
     """
 
     mechanism: str
@@ -102,13 +102,13 @@ class Board:
 
 
 def seconds(value: float) -> str:
-    """A time in s, ms or us with three digits."""
+    """Return a time in s, ms or us with three digits."""
     size, unit = next((each for each in ((1.0, "s"), (1e-3, "ms")) if value >= 0.9995 * each[0]), (1e-6, "us"))
     return f"{value / size:.3g} {unit}"
 
 
 def columns_of(rows: Sequence[Row], measure: str) -> dict[str, NDArray[Any]]:
-    """What `Runs` looks at, of rows of one mechanism and span."""
+    """Return the columns that `Runs` requires, for rows of one mechanism and span."""
     floor = "floor" if measure == "error" else "floor_end"
     known = [row.get(measure) if row["status"] == REACHED_END else None for row in rows]
     found: dict[str, Any] = {
@@ -127,7 +127,7 @@ def columns_of(rows: Sequence[Row], measure: str) -> dict[str, NDArray[Any]]:
 
 
 def boards(rows: Sequence[Row], target: float) -> list[Board]:
-    """A board for each mechanism, span, processor and measure of error that the rows have."""
+    """Return a board for each mechanism, span, processor and error measure in the rows."""
     groups: dict[tuple[Any, ...], list[Row]] = {}
     for row in rows:
         groups.setdefault((row["mechanism"], row["t_end"], row["processor"]), []).append(row)
@@ -141,7 +141,7 @@ def boards(rows: Sequence[Row], target: float) -> list[Board]:
 
 
 def _ranked(rows: Sequence[Row], measure: str, target: float) -> tuple[list[Entry], list[tuple[str, str]]]:
-    """The solvers that get to an error, cheapest first, and why others have no time there."""
+    """Return the solvers that reach an error, cheapest first, and the reasons for all others."""
     columns = columns_of(rows, measure)
     solvers = list(dict.fromkeys((row["solver"], row["version"], row["setting"]) for row in rows))
     timed, others = [], []
@@ -149,7 +149,7 @@ def _ranked(rows: Sequence[Row], measure: str, target: float) -> tuple[list[Entr
         own = [k for k, row in enumerate(rows) if (row["solver"], row["version"], row["setting"]) == solver]
         reached = [rows[k] for k in own if rows[k]["status"] == REACHED_END]
         if reached and not any(measure in row for row in reached):
-            continue  # measured by the other error
+            continue  # has the other error measure
         runs = Runs(columns, np.array(own), "call_s", solver[0])
         place = place_of(runs, target)
         if place is None:
@@ -178,7 +178,7 @@ def _entry(cost: float, drawn: NDArray[Any], row: Row, least: float, least_drawn
 
 
 def _why_not(runs: Runs, rows: Sequence[Row], target: float) -> str:
-    """Why a solver has no time at an error."""
+    """Return the reason why a solver has no time at an error."""
     if not runs.errors.size:
         row = rows[0]
         return f"{row['status'].lower().replace('_', ' ')}: {row.get('message', '')}".removesuffix(": ")
@@ -192,7 +192,7 @@ def _why_not(runs: Runs, rows: Sequence[Row], target: float) -> str:
 
 
 def chosen(rows: Iterable[Row], mechanism: str, t_end: float | None = None) -> list[Row]:
-    """The rows of a mechanism, and of a span, if it is given.
+    """Return the rows of a mechanism, and of a span if given.
 
     Raises ValueError if there are none.
     """
@@ -212,7 +212,7 @@ def chosen(rows: Iterable[Row], mechanism: str, t_end: float | None = None) -> l
 def leaderboard(
     mechanism: str, target: float, files: Iterable[Path] = (), t_end: float | None = None, out: Path | None = None
 ) -> str:
-    """The boards of a mechanism at an error as text, of the rows that are shipped and of those in files.
+    """Return the boards of a mechanism at an error as text, from the rows shipped and those in files.
 
     Raises ValueError if an argument is out of range, a file is not in the format, or there are no rows.
     """
@@ -226,7 +226,7 @@ def leaderboard(
 
 
 def _draw(found: Sequence[Board], rows: Sequence[Row], out: Path) -> None:
-    """Error and time of all runs, a panel a board."""
+    """Plot error and time of all runs, one panel per board."""
     import matplotlib.pyplot as plt
 
     figure, panels = plt.subplots(1, len(found), figsize=(6.4 * len(found), 5.6), squeeze=False, layout="constrained")
@@ -236,7 +236,7 @@ def _draw(found: Sequence[Board], rows: Sequence[Row], out: Path) -> None:
             for row in rows
             if (row["mechanism"], row["t_end"], row["processor"]) == (board.mechanism, board.t_end, board.processor)
         ]
-        for k, entry in enumerate(board.entries[:10]):  # others are not told apart by the eye
+        for k, entry in enumerate(board.entries[:10]):  # more would be indistinguishable
             own = [row for row in of_board if row["solver"] == entry.solver and row["version"] == entry.version]
             points = [(row[board.measure], np.median(row["times_s"])) for row in own if row.get(board.measure)]
             axes.loglog(*zip(*sorted(points), strict=True), f"{'os^vDPX*d>'[k]}-", ms=4, lw=0.8, label=entry.solver)

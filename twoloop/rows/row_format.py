@@ -1,4 +1,4 @@
-"""The format of rows: a solver at one setting on one mechanism is a JSON object, a line of a file of its own."""
+"""Format of rows: one solver at one setting on one mechanism, as a JSON object on a line of its own."""
 
 import gzip
 import json
@@ -13,10 +13,10 @@ from typing import Any
 SCHEMA = 1
 REACHED_END = "REACHED_END"
 SETTINGS = ("tol", "h", "err_out")
-LONGEST = 500  # letters of a text
-LARGEST = 10**9  # bytes of a file, as text: beyond, gzip may hide a file that fills the memory
-SHOWN = 20  # mistakes of a file that an exception names
-IDENTITY = ("mechanism", "t_end", "solver", "version", "processor", "setting", "value")  # of a run
+LONGEST = 500  # characters of a text
+LARGEST = 10**9  # bytes of a file, uncompressed, as a guard against decompression bombs
+SHOWN = 20  # errors listed in an exception
+IDENTITY = ("mechanism", "t_end", "solver", "version", "processor", "setting", "value")  # identifies a run
 
 TEXT = "printable text"
 TRIMMED = f"no blanks around it, at most {LONGEST} letters"
@@ -27,16 +27,16 @@ Row = dict[str, Any]
 
 @dataclass(frozen=True)
 class Field:
-    """What stands in a field of a row.
+    """A field of a row.
 
     Attributes
     ----------
     expected : str
     holds : callable
-        Whether a value, as JSON has it, is one.
+        Predicate for valid JSON values.
     about : str
     needed : bool
-        Whether it may not be left out. null is the same as left out.
+        True if the field is mandatory. null is equivalent to a missing field.
     """
 
     expected: str
@@ -48,7 +48,7 @@ class Field:
 def _number(value: Any) -> bool:
     try:
         return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-    except OverflowError:  # an integer beyond all floats
+    except OverflowError:  # an integer too large for a float
         return False
 
 
@@ -64,7 +64,7 @@ def _text(about: str, needed: bool = False) -> Field:
     return Field(TEXT, _name, about, needed)
 
 
-def _status(value: Any) -> bool:  # "reached_end" would be a failure
+def _status(value: Any) -> bool:  # reject other spellings, which would count as failures
     return _name(value) and (value == REACHED_END or _NO_LETTER.sub("_", value.upper()) != REACHED_END)
 
 
@@ -123,12 +123,12 @@ FIELDS: dict[str, Field] = {
 
 
 def mistakes(lines: Iterable[str]) -> tuple[list[Row], list[str]]:
-    """The rows that lines of text hold, and what is wrong with them: line, field, what is given, what is expected.
+    """Return the valid rows in lines of text, and the errors: line, field, given and expected value.
 
     Returns
     -------
     list of dict
-        Of the lines without a mistake; a field that is null is left out.
+        Rows of the lines without errors; null fields are omitted.
     list of str
     """
     rows, found, seen = [], [], dict[tuple[Any, ...], int]()
@@ -148,7 +148,7 @@ def mistakes(lines: Iterable[str]) -> tuple[list[Row], list[str]]:
 
 
 def _row(line: str) -> tuple[Row, list[str]]:
-    """The row of a line, and what is wrong with it."""
+    """Return the row of a line, and its errors."""
     try:
         given = json.loads(line, object_pairs_hook=_once)
     except (ValueError, RecursionError) as error:
@@ -168,11 +168,11 @@ def _row(line: str) -> tuple[Row, list[str]]:
         for name, each in FIELDS.items()
         if name in row and not each.holds(row[name])
     ]
-    return row, wrong or list(_together(row))
+    return row, wrong or list(_joint_errors(row))
 
 
-def _together(row: Row) -> Iterable[str]:
-    """What fields ask of one another."""
+def _joint_errors(row: Row) -> Iterable[str]:
+    """Yield violations of conditions that involve several fields."""
     for error, floor in (("error", "floor"), ("error_end", "floor_end")):
         if error in row and floor not in row:
             yield f"{floor}: missing, expected a number >= 0 beside {error}"
@@ -187,7 +187,7 @@ def _together(row: Row) -> Iterable[str]:
 
 
 def _expected(name: str, given: Any) -> str:
-    """What a field is to be, with a word on what is nearly that."""
+    """Return the expected value of a field, with a hint for similar values."""
     if name == "status" and _name(given):
         return f"{REACHED_END} in these letters, or what happened instead"
     if isinstance(given, str) and FIELDS[name].expected == TEXT:
@@ -210,7 +210,7 @@ def _shown(value: Any) -> str:
 
 
 def read_lines(path: Path) -> list[str]:
-    """The lines of a file, or of one that gzip has made (.gz).
+    """Return the lines of a file, which may be compressed by gzip (.gz).
 
     Raises ValueError if it cannot be read.
     """
@@ -219,15 +219,15 @@ def read_lines(path: Path) -> list[str]:
             data = file.read(LARGEST + 1)
         if len(data) > LARGEST:
             raise ValueError(f"more than {LARGEST:.0e} bytes; divide it")
-        return data.decode("utf-8-sig").split("\n")  # with the mark that some editors put first
+        return data.decode("utf-8-sig").split("\n")  # optional byte order mark
     except (OSError, EOFError, ValueError, zlib.error) as error:
         raise ValueError(f"{path} cannot be read: {error}") from None
 
 
 def read_rows(path: Path) -> list[Row]:
-    """The rows of a file.
+    """Return the rows of a file.
 
-    Raises ValueError if it cannot be read, has none, or a row has a mistake.
+    Raises ValueError if it cannot be read, has no rows, or a row is invalid.
     """
     rows, wrong = mistakes(read_lines(path))
     if wrong:
@@ -239,5 +239,5 @@ def read_rows(path: Path) -> list[Row]:
 
 
 def text_of(rows: Iterable[Row]) -> str:
-    """Rows as the lines of a file."""
+    """Return rows as the lines of a file."""
     return "".join(json.dumps(row, separators=(",", ":"), ensure_ascii=False, allow_nan=False) + "\n" for row in rows)

@@ -1,1 +1,1 @@
-"""Many runs of one mechanism, in processes, with rows that are kept."""
+"""Many runs of one mechanism in parallel, with rows that are saved."""

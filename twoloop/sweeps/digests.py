@@ -1,4 +1,4 @@
-"""What a function does, in one number: its code, what it encloses, and all that these name, wherever it stands."""
+"""Digest of a function: its code, the values that it encloses, and everything these refer to."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ from twoloop.problem.system import ConstrainedSystem
 
 INSTALLED = {"site-packages", "dist-packages"}  # folders
 PLAIN = (bool, int, float, complex, str, bytes)
-# of a class, what neither its author wrote nor its objects use
+# attributes of a class that do not affect its behaviour
 SKIPPED = {"__dict__", "__weakref__", "__doc__", "__module__", "__firstlineno__", "__static_attributes__"}
-# of a system, what its runs depend on
+# attributes of a system that affect its runs
 OF_SYSTEM = ("n_q", "n_c", "n_a", "parameters", "constant_mass", "bandwidth", "given", "python_functions", "_returning")
 
 
 def digest_of(what: str, value: Any) -> str:
-    """A digest of a value, with the code of all functions that it reaches, and of the values that these name.
+    """Return a digest of a value, including the code of all functions that it reaches and the values they refer to.
 
     Parameters
     ----------
     what : str
-        What the value is, for the message.
+        Name of the value in messages.
     value : object
 
     Raises ValueError if it reaches something whose state cannot be read, such as an open file or a lock.
@@ -42,15 +42,15 @@ def digest_of(what: str, value: Any) -> str:
         digest.add(value)
     except CannotBeWatched as why:
         raise ValueError(
-            f"{what} reaches {why}, whose state cannot be read, so that it cannot be decided whether rows that are "
-            "kept are of the same functions. Make it inside of the function, or leave `out` away"
+            f"{what} reaches {why}, whose state cannot be read, so that saved rows cannot be matched with "
+            "the functions. Create it inside the function, or omit `out`"
         ) from None
     return digest.hash.hexdigest()
 
 
 @cache
 def digest_of_package() -> str:
-    """A digest of the sources of this package."""
+    """Return a digest of the sources of this package."""
     digest, folder = hashlib.sha256(), Path(__file__).parents[1]
     for path in sorted(folder.rglob("*.py")):
         digest.update(f"{path.relative_to(folder)}\n".encode() + path.read_bytes())
@@ -58,14 +58,14 @@ def digest_of_package() -> str:
 
 
 class _OfFunctions(Digest):
-    """Follows plain functions, classes and objects, too; what is installed stands for itself by name and version."""
+    """Follows plain functions, classes and objects as well; installed code is represented by its name and version."""
 
     def __init__(self) -> None:
         super().__init__()
-        self.places: dict[int, int] = {}  # of what was met, by id ...
-        self.met: list[Any] = []  # ... which is kept, so that no other object gets that id
+        self.places: dict[int, int] = {}  # index of each object visited, by id ...
+        self.met: list[Any] = []  # ... the objects, kept alive so that ids are not reused
         self.within_object = False
-        self.open: list[int] = []  # containers that are being looked at
+        self.open: list[int] = []  # containers being visited
 
     def add(self, value: Any) -> None:
         """Add a value of any type."""
@@ -74,7 +74,7 @@ class _OfFunctions(Digest):
         elif isinstance(value, np.ndarray) and value.dtype.hasobject:
             self.add([str(value.dtype), value.shape, value.ravel().tolist()])
         elif isinstance(value, PLAIN) and not isinstance(value, np.generic) and type(value) not in PLAIN:
-            self._add_name(value)  # of a class of its own, whose repr may say anything
+            self._add_name(value)  # instance of a subclass, whose repr is not reliable
         else:
             super().add(value)
 
@@ -84,13 +84,13 @@ class _OfFunctions(Digest):
             return
         self.open.append(id(value))
         try:
-            if isinstance(value, (set, frozenset)):  # whose order differs from process to process
+            if isinstance(value, (set, frozenset)):  # their order differs between processes
                 self.hash.update(f"<{type(value).__qualname__}>{sorted(map(self._alone, value))}".encode())
             elif isinstance(value, types.MappingProxyType):
                 self.add(dict(value))
             elif type(value) in (tuple, list, dict):
                 super().add(value)
-            else:  # of a class of its own
+            else:  # instance of a subclass
                 self._add_object(value)
         finally:
             self.open.pop()
@@ -107,7 +107,7 @@ class _OfFunctions(Digest):
     def _add_module(self, module: types.ModuleType) -> None:
         if _installed(module.__name__):
             self.hash.update(f"{module.__name__} {_version(module.__name__)}".encode())
-        elif self.within_object:  # whose methods may name anything in it
+        elif self.within_object:  # methods may refer to anything in the module
             self.hash.update(Path(str(module.__file__)).read_bytes())
         else:
             super()._add_module(module)
@@ -149,24 +149,24 @@ class _OfFunctions(Digest):
             self._add_object(value)
 
     def _add_object(self, value: Any) -> None:
-        """An object by what it would be made of again, as for a pickle."""
+        """Add an object by its pickle representation."""
         try:
             parts = value.__reduce_ex__(4)
         except Exception:
             raise CannotBeWatched(f"an object of type {type(value).__qualname__}") from None
         self.add(type(value))
-        if isinstance(parts, str):  # what stands in a module under this name
+        if isinstance(parts, str):  # the name of a global of a module
             self.hash.update(f"{getattr(value, '__module__', '')}.{parts}".encode())
             return
         outer, self.within_object = self.within_object, True
         self.met.append(parts)
-        for part in parts:  # items of a container come as an iterator
+        for part in parts:  # the items of a container are an iterator
             self.add(list(part) if hasattr(part, "__next__") else part)
         self.within_object = outer
 
 
 def _installed(module: str | None) -> bool:
-    """Whether a module is Python's, of this package, or was installed: such code changes with its version."""
+    """Return True if a module belongs to Python or this package, or was installed: its version identifies it."""
     top = (module or "").partition(".")[0]
     if top in LIBRARIES or top == "twoloop":
         return True
@@ -179,7 +179,7 @@ def _version(module: str) -> str:
 
 
 def described(value: Any) -> str:
-    """A value in words, for messages: a function by where it stands, as its address differs from process to process."""
+    """Return a value in words, for messages; a function by its location, as addresses differ between processes."""
     if isinstance(value, (list, tuple)):
         return f"[{', '.join(map(described, value))}]"
     if isinstance(value, Mapping):

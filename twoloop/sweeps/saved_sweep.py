@@ -1,4 +1,4 @@
-"""The rows of a sweep in a file of Parquet, from which an interrupted one goes on."""
+"""Saves the rows of a sweep to a Parquet file, from which an interrupted sweep resumes."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ TWOLOOP = "twoloop itself"
 
 @dataclass(frozen=True)
 class Settings:
-    """What the rows depend on beside their parameters.
+    """Everything the rows depend on other than their parameters.
 
     Attributes
     ----------
     words : str
-        By names, for messages.
+        Description for messages.
     digests : dict
-        The code and the values of all that is reached, by what reaches it.
+        Digests of code and values, by name.
     """
 
     words: str
@@ -32,9 +32,9 @@ class Settings:
 
 
 def settings(work: tuple[Any, Any, dict[str, Any]]) -> Settings:
-    """What the rows of a sweep depend on.
+    """Return everything on which the rows of a sweep depend.
 
-    Raises ValueError if something that a function reaches cannot be compared.
+    Raises ValueError if a value that a function refers to cannot be compared.
     """
     problem_of, measure, options = work
     words = [described(problem_of), described(measure)] + [described(options)] * bool(options)
@@ -44,7 +44,7 @@ def settings(work: tuple[Any, Any, dict[str, Any]]) -> Settings:
 
 
 def write(table: Any, path: Path, made_with: Settings) -> None:
-    """Write the rows, whole or not at all."""
+    """Write the rows atomically."""
     needed("pyarrow", "pyarrow", "out=")
     table.attrs |= {KEY: made_with.words, DIGESTS: made_with.digests}
     new = path.with_name(f".{path.name}.new")
@@ -53,16 +53,16 @@ def write(table: Any, path: Path, made_with: Settings) -> None:
 
 
 def read(pandas: Any, path: Path, given: list[dict[str, Any]], made_with: Settings) -> dict[int, dict[str, Any]]:
-    """The rows of a file by their numbers; none where there is no file.
+    """Return the rows of a file by run number; empty if there is no file.
 
-    Raises ValueError if the file is not of this sweep: of other functions, options or parameters.
+    Raises ValueError if the file belongs to a sweep with other functions, options or parameters.
     """
     needed("pyarrow", "pyarrow", "out=")
     if not path.parent.is_dir():
         raise ValueError(f"out must be a file in a folder that exists; given {str(path)!r}")
     if not path.exists():
         return {}
-    advice = "Give another file, or remove this one to begin anew"
+    advice = "Give another file, or remove this one to start over"
     try:
         table = pandas.read_parquet(path, engine="pyarrow")
     except Exception as error:
@@ -76,8 +76,8 @@ def read(pandas: Any, path: Path, given: list[dict[str, Any]], made_with: Settin
     other = [what for what, digest in made_with.digests.items() if digests.get(what) != digest]
     if other:
         raise ValueError(
-            f"out, {str(path)!r}, holds runs of functions or values that bear the same names and are not the same: "
-            f"{', '.join(other)} changed since (its code, what it encloses, or a global that it reaches). {advice}"
+            f"out, {str(path)!r}, holds runs of functions or values that have changed: "
+            f"{', '.join(other)} (its code, what it encloses, or a global that it uses). {advice}"
         )
     rows = {int(number): row for number, row in zip(table.index, table.to_dict("records"), strict=True)}
     for number, row in rows.items():
@@ -89,5 +89,5 @@ def read(pandas: Any, path: Path, given: list[dict[str, Any]], made_with: Settin
 
 
 def same(kept: Any, value: Any) -> bool:
-    """Whether a cell holds a value; one that is no number equals itself here."""
+    """Return True if a cell holds a value; NaN equals NaN here."""
     return bool(kept == value or (kept != kept and value != value))

@@ -1,4 +1,4 @@
-"""Many runs of one mechanism: different parameters and starts, side by side, failures as rows, resumable."""
+"""Many runs of one mechanism with different parameters and starts: parallel, with failures as rows, resumable."""
 
 from __future__ import annotations
 
@@ -30,19 +30,19 @@ if TYPE_CHECKING:
 Row = dict[str, Any]
 Work = tuple[Callable[..., Any], Callable[..., Any], dict[str, Any]]  # problem_of, measure, options
 
-OWN = ("status", "message", "seconds")  # columns of every row
-ERROR = "ERROR"  # the status of a run that raised instead of ending
+OWN = ("status", "message", "seconds")  # columns of all rows
+ERROR = "ERROR"  # status of a run that raised an exception
 PARALLEL = ("processes", "threads")
-LARGEST_INTEGER = 2**63  # of a table's column, and above
-BATCHES = 16  # tasks for each thread or worker of a cluster, so that all end at about the same time ...
-LARGEST_BATCH = 16  # ... of this many runs at most
+LARGEST_INTEGER = 2**63  # integers must be smaller to fit into a column
+BATCHES = 16  # tasks per thread or cluster worker, for load balancing ...
+LARGEST_BATCH = 16  # ... with at most this many runs each
 SAVE_EVERY = 10.0  # s
 
 
 def ends(problem: Problem, result: Result) -> dict[str, Any]:
-    """What a sweep measures where it is not told: the last time, steps, evaluations and the largest energy error.
+    """Return the default measures of a sweep: last time, steps, evaluations and the largest energy error.
 
-    The latter is NaN unless the problem says that its energy is an invariant.
+    The energy error is NaN unless the problem declares its energy an invariant.
     """
     energy = result.energy if problem.conserved and result.t.size else np.array([np.nan])
     return {
@@ -68,63 +68,61 @@ def sweep(
 ) -> Any:
     """Solve a mechanism for many sets of parameters.
 
-    The first run is made here: it compiles what is missing, once for all workers, and a mistake in `problem_of`,
-    `measure` or `options` comes through at once. After that, a run that fails is a row that says why, also one in which
-    its process dies.
+    The first run is made in the calling process: it compiles what is missing once for all workers, and an error in
+    `problem_of`, `measure` or `options` is raised at once. Afterwards, a run that fails, or whose process dies, becomes
+    a row with the reason.
 
     Parameters
     ----------
     problem_of : callable
-        ``problem_of(**parameters)`` gives a `Problem`, such as a ready mechanism or a function of one's own.
-        A `ValueError` of it, for a geometry that does not assemble, is a row.
+        ``problem_of(**parameters)`` returns a `Problem`: a ready mechanism or a function of your own. If it raises
+        `ValueError`, e.g. for a geometry that does not assemble, the run becomes a row with this error.
     parameters : sequence of mappings
-        One for each run, all with the same names. Values are numbers, strings, or True and False, under one name of
-        one kind.
+        One mapping per run, all with the same names. Values are numbers, strings or booleans, of the same kind under
+        each name.
     measure : callable
-        ``measure(problem, result)`` gives a mapping of further columns, whose values are numbers, strings, True and
-        False or None, in one column of one kind. By default the last time, counts, and the largest energy error, NaN
-        unless the problem says that its energy is an invariant (`conserved`).
+        ``measure(problem, result)`` returns a mapping of further columns with numbers, strings, booleans or None, of
+        one kind per column. Default: the last time, counts, and the largest energy error, which is NaN unless the
+        problem declares its energy an invariant (`conserved`).
     workers : int, optional
-        Processes or threads. None: one for each core.
+        Number of processes or threads. None: one per core.
     parallel : {"processes", "threads"}
-        Processes are new ones that read the compiled code from the cache; functions must then be at the top level of a
-        module, and a script must start its sweep under `if __name__ == "__main__"`. Threads share all, take any
-        functions, and fall short where runs are so short that Python's share counts: kernels release its lock,
-        the checks before and after a run do not.
+        Processes are spawned and read the compiled code from the cache; functions must then be at the top level of a
+        module, and a script must start its sweep under `if __name__ == "__main__"`. Threads accept any functions but
+        scale badly for short runs: the kernels release Python's lock, the checks before and after a run do not.
     client : dask.distributed.Client, optional
-        Run on its cluster instead. `workers` and `parallel` do not count then.
+        Run on its cluster instead; `workers` and `parallel` are then ignored.
     out : path, optional
-        A file of Parquet (needs pyarrow) in which rows are kept, every ten seconds and at the end, also after Ctrl-C.
-        If it exists, the runs that it has are not made again, failed ones neither. The file knows the code of the
-        functions, what they enclose and the globals that they reach, and the version of this package: with others
-        it is refused.
+        Parquet file (needs pyarrow) to which rows are saved every ten seconds and at the end, also after Ctrl-C. If it
+        exists, its runs are not repeated, including failed ones. It stores digests of the functions, of what they
+        enclose and the globals that they use, and the version of this package: a file with others is rejected.
     progress : bool
-        Show a bar (needs rich).
+        Show a progress bar (needs rich).
     t_span : (float, float), optional
-        Of all runs, s. None: that of each problem.
+        Time span of all runs, s. None: that of each problem.
     **options
-        Of `solve_dae`: method, rtol, t_eval, events, time_limit, ... With check_derivatives=False, once the derivatives
-        are known to be right, short runs take a little less time.
+        Keyword arguments of `solve_dae`: method, rtol, t_eval, events, time_limit, ... Once the derivatives are known
+        to be right, check_derivatives=False makes short runs slightly faster.
 
     Returns
     -------
     pandas.DataFrame
-        A row for each run, in the order of `parameters`, whose place is the index "run". Columns: the parameters,
-        "status" (of `Result.status`, or "ERROR" where the run raised an exception), "message", "seconds" of wall-clock
-        time, and what was measured.
+        One row per run in the order of `parameters`, indexed by "run". Columns: the parameters, "status" (that of
+        `Result.status`, or "ERROR" if the run raised an exception), "message", "seconds" of wall-clock time, and the
+        measures.
 
     Raises
     ------
     ImportError
-        If pandas, pyarrow, dask or rich is missing where it is needed.
+        If pandas, pyarrow, dask or rich is required but missing.
     TypeError, ValueError
-        If an argument is wrong, functions cannot be sent to other processes, or `out` holds another sweep.
+        If an argument is invalid, functions cannot be sent to other processes, or `out` belongs to another sweep.
 
     Notes
     -----
-    Every run is one of `solve_dae`, none goes in lanes: `measure` may ask for all that a `Result` has, a run that takes
-    its process down takes no other with it, and a row is the same however the runs are divided, or interrupted. Where
-    runs differ in parameters and starts alone, and states at given times are enough, `ensemble` makes many more.
+    Every run is a separate call of `solve_dae`: `measure` has access to the whole `Result`, a crash affects a single
+    run, and rows do not depend on how the runs are distributed or interrupted. If runs differ in parameters and starts
+    only, and states at given times suffice, `ensemble` is much faster.
     """
     check_choice("parallel", parallel, PARALLEL)
     check_flag("progress", progress)
@@ -168,7 +166,7 @@ def sweep(
 def _all_rows(
     work: Work, given: list[Row], left: list[int], n_workers: int, parallel: str, client: Any
 ) -> Generator[tuple[int, Row]]:
-    """Numbers and rows of the runs that are left, as they come; the first is made here."""
+    """Yield numbers and rows of the remaining runs as they finish; the first run is made in this process."""
     if not left:
         return
     yield left[0], one_run(work, given[left[0]], first=True)
@@ -182,7 +180,7 @@ def _all_rows(
 
 
 def _by_executor(executor: Executor, work: Work, rest: dict[int, Row], n_workers: int) -> Iterator[tuple[int, Row]]:
-    """Rows by threads or a cluster, in batches; a batch that is lost, with the worker that was at it, run by run."""
+    """Yield rows from threads or a cluster, in batches; a batch lost with its worker is repeated run by run."""
     size = min(max(len(rest) // (BATCHES * n_workers), 1), LARGEST_BATCH)
     tasks: dict[Future[list[Row]], list[int]] = {}
 
@@ -210,12 +208,12 @@ def _by_executor(executor: Executor, work: Work, rest: dict[int, Row], n_workers
 
 
 def batch(work: Work, given: list[Row]) -> list[Row]:
-    """The rows of some runs, in the worker that makes them."""
+    """Return the rows of some runs; executed by a worker."""
     return [one_run(work, each) for each in given]
 
 
 def one_run(work: Work, given: Row, first: bool = False) -> Row:
-    """The columns of a run beside its parameters; of the first, mistakes in the functions are not rows."""
+    """Return the columns of a run other than its parameters; in the first run, errors in the functions are raised."""
     problem_of, measure, options = work
     began = time.perf_counter()
     try:
@@ -257,7 +255,7 @@ def _check_measured(measured: Any, known: set[str]) -> Row:
 
 
 def _kind(value: Any) -> str | None:
-    """Which kind of column a cell is for; None: any, as what is no number, or that it is for none."""
+    """Return the kind of column that a cell belongs to; None if it fits any (a missing number) or no column."""
     if isinstance(value, bool):
         return "True and False"
     if isinstance(value, float) or (isinstance(value, int) and -LARGEST_INTEGER <= value < LARGEST_INTEGER):
@@ -266,7 +264,7 @@ def _kind(value: Any) -> str | None:
 
 
 def _fitting(row: Row, kinds: dict[str, str]) -> Row:
-    """A row as it fits into the columns, whose kinds grow; a file holds one kind in a column, and no broken text."""
+    """Return a row that fits the columns, whose kinds are extended; a Parquet column has one kind and valid text."""
     row = {k: value.encode(errors="replace").decode() if isinstance(value, str) else value for k, value in row.items()}
     for name, value in row.items():
         kind = _kind(value)
@@ -287,7 +285,7 @@ def _check_parameters(problem_of: Any, parameters: Any) -> list[Row]:
             f"given {shown(parameters)}"
         )
     if not parameters:
-        raise ValueError("parameters must be of one run at least; given none")
+        raise ValueError("parameters must contain at least one run; given none")
     signature, made = inspect.signature(problem_of), []
     kinds: dict[str, str] = {}
     for number, each in enumerate(parameters):
@@ -299,7 +297,7 @@ def _check_parameters(problem_of: Any, parameters: Any) -> list[Row]:
             )
         taken = sorted(set(each) & {*OWN, "run"})
         if taken:
-            raise ValueError(f"parameters must not be named as the columns of every row are; given {taken[0]!r}")
+            raise ValueError(f"parameters must not have the name of a standard column; given {taken[0]!r}")
         plain = {name: value.item() if isinstance(value, np.generic) else value for name, value in each.items()}
         for name, value in plain.items():
             kind = _kind(value)
@@ -348,7 +346,7 @@ def _check_pickles(work: Work) -> None:
 
 @contextmanager
 def _bar(progress: bool, n: int) -> Iterator[Callable[[int], None]]:
-    """A function that takes the number of rows; draws a bar when asked to."""
+    """Yield a function that takes the number of finished rows and draws a progress bar if requested."""
     if not progress:
         yield lambda done: None
         return

@@ -1,4 +1,4 @@
-"""Tasks in processes of their own, each of which may die: the task that it was at says so, all others are done."""
+"""Tasks in separate processes, each of which may die without affecting other tasks."""
 
 from __future__ import annotations
 
@@ -10,27 +10,27 @@ from typing import Any
 
 from twoloop.kernels.compile.caches import n_made
 
-RENEWED_AFTER = 150  # functions that a worker compiled or read: LLVM keeps some MB of each as long as the process lives
-LOOK_EVERY = 1.0  # s, at workers that say nothing: a process that one of them started may hold its connection open
+RENEWED_AFTER = 150  # compiled functions per worker before it is replaced: LLVM keeps some MB of each
+LOOK_EVERY = 1.0  # s between checks that workers are alive: a child of a dead worker may keep its connection open
 
 Task = Callable[[Any], Any]
 
 
 def in_processes(task: Task, inputs: dict[int, Any], n_workers: int) -> Iterator[tuple[int, Any, str]]:
-    """What a task makes of each input, as it comes.
+    """Yield the outcome of a task for each input, as they finish.
 
     Parameters
     ----------
     task : callable
-        task(input) -> what can be pickled; it raises nothing but KeyboardInterrupt.
+        task(input) -> picklable object; it raises no exception but KeyboardInterrupt.
     inputs : dict
-        By their numbers.
+        Inputs by number.
     n_workers : int
 
     Yields
     ------
     (int, object, str)
-        The number of an input and what was made of it, or None and how the worker died.
+        The number of an input and its outcome, or None and how the worker died.
 
     Raises KeyboardInterrupt if the task raised one. Raises RuntimeError if a worker dies before it can begin.
     """
@@ -57,10 +57,10 @@ def in_processes(task: Task, inputs: dict[int, Any], n_workers: int) -> Iterator
 
 
 class _Worker:
-    """A process, and the number of the input that it is at."""
+    """A process, and the number of the input that it is working on."""
 
     def __init__(self, task: Task, first: tuple[int, Any]):
-        # not forked: a fork of a process with threads may stand still
+        # spawned: a fork of a process with threads may deadlock
         context = multiprocessing.get_context("spawn")
         self.connection, far = context.Pipe()
         self.process = context.Process(target=_serve, args=(far, task))
@@ -70,7 +70,7 @@ class _Worker:
         self.begin(first)
 
     def begin(self, entry: tuple[int, Any]) -> None:
-        """Hand it an input."""
+        """Send an input to the worker."""
         self.number: int | None = entry[0]
         try:
             self.connection.send(entry[1])
@@ -78,9 +78,9 @@ class _Worker:
             self.dead = True
 
     def answers(self) -> Iterator[tuple[int, Any]]:
-        """What it has made since; notes when it dies."""
+        """Yield the outcomes since the last call; note if the worker has died."""
         try:
-            alive = self.process.is_alive()  # asked first: what a process said before it died counts
+            alive = self.process.is_alive()  # before polling, so that nothing sent before the death is lost
             while self.connection.poll():
                 said = self.connection.recv()
                 if said == "ready":
@@ -97,7 +97,7 @@ class _Worker:
             self.dead = True
 
     def how_it_died(self) -> str:
-        """In words."""
+        """Return the cause of death in words."""
         self.process.join(10.0 * LOOK_EVERY)
         code = self.process.exitcode
         if code is not None and code < 0:
@@ -107,12 +107,12 @@ class _Worker:
         if not self.began:
             raise RuntimeError(
                 f"a worker process {how} before its first run, see what it says above. A script must start its sweep "
-                "under if __name__ == '__main__', and functions must stand in a module that another process can import"
+                "under if __name__ == '__main__', and functions must be in a module that another process can import"
             )
         return f"the worker process {how} in this run"
 
     def end(self) -> None:
-        """End it, whatever it is doing."""
+        """Terminate the worker."""
         self.connection.close()
         self.process.terminate()
         self.process.join(LOOK_EVERY)
@@ -122,8 +122,8 @@ class _Worker:
 
 
 def _serve(connection: Connection, task: Task) -> None:
-    """What a worker does: answer until no more is asked."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's business
+    """Main loop of a worker: process inputs until there are no more."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C
     before = n_made()
     connection.send("ready")
     while True:

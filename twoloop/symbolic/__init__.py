@@ -1,4 +1,4 @@
-"""Mechanisms from SymPy: energies or matrices in, a compiled `ConstrainedSystem` out. Needs the extra `symbolic`."""
+"""Mechanisms from SymPy expressions: energies or matrices become a compiled `ConstrainedSystem`. Extra `symbolic`."""
 
 try:
     import sympy

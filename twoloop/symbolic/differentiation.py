@@ -1,7 +1,7 @@
-"""Derivatives of expressions that share their parts: each part is differentiated once.
+"""Differentiation of expressions with common subexpressions: each subexpression is differentiated once.
 
-`Expr.diff` goes through a sum of products anew for every derivative; for a chain of ten links that takes ten times as
-long.
+`Expr.diff` traverses a sum of products again for every derivative, which takes ten times as long for a chain of ten
+links.
 """
 
 from collections.abc import Iterable, Sequence
@@ -12,18 +12,18 @@ from sympy import Expr, Symbol
 
 ZERO, ONE = sympy.S.Zero, sympy.S.One
 
-Entries = dict[Any, Expr]  # place in an array to expression, zeros left out
+Entries = dict[Any, Expr]  # nonzero entries of an array by index
 
 
 class Differentiation:
-    """Differentiates expressions in plain symbols, and remembers what it has seen."""
+    """Differentiates expressions in plain symbols with memoisation."""
 
     def __init__(self) -> None:
         self._symbols: dict[Expr, frozenset[Symbol]] = {}
         self._known: dict[tuple[Expr, Symbol], Expr] = {}
 
     def symbols_of(self, expression: Expr) -> frozenset[Symbol]:
-        """What an expression depends on."""
+        """Return the symbols on which an expression depends."""
         if expression.is_Symbol:
             return frozenset((expression,))
         found = self._symbols.get(expression)
@@ -33,7 +33,7 @@ class Differentiation:
         return found
 
     def by(self, expression: Expr, symbol: Symbol) -> Expr:
-        """The derivative of an expression by a symbol."""
+        """Return the derivative of an expression with respect to a symbol."""
         if expression == symbol:
             return ONE
         if symbol not in self.symbols_of(expression):
@@ -57,7 +57,7 @@ class Differentiation:
         return sympy.Add(*(expression.fdiff(i + 1) * self.by(each, symbol) for i, each in inner))
 
     def rows(self, expressions: Sequence[Expr], symbols: Sequence[Symbol]) -> Entries:
-        """The entries (i, j) of the Jacobian of expressions by symbols."""
+        """Return the entries (i, j) of the Jacobian of expressions with respect to symbols."""
         places = {symbol: j for j, symbol in enumerate(symbols)}
         return filled(
             ((i, j), self.by(expression, symbol))
@@ -67,7 +67,7 @@ class Differentiation:
         )
 
     def symmetric(self, expressions: Sequence[Expr], symbols: Sequence[Symbol]) -> Entries:
-        """The same where the expressions are derivatives of one by the symbols: each pair of entries once."""
+        """Return the same for a gradient: the symmetric entries of the Hessian are computed once."""
         upper = filled(
             ((i, j), self.by(expression, symbols[j]))
             for i, expression in enumerate(expressions)
@@ -77,5 +77,5 @@ class Differentiation:
 
 
 def filled(entries: Iterable[tuple[Any, Expr]]) -> Entries:
-    """Entries that are not zero."""
+    """Return the nonzero entries."""
     return {place: entry for place, entry in entries if entry != 0}

@@ -1,4 +1,4 @@
-"""Equations of motion in plain symbols, and every derivative that the callbacks need."""
+"""Equations of motion in plain symbols, with all derivatives required by the callbacks."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,18 +18,18 @@ class Equations:
     Attributes
     ----------
     symbols : Reader
-        What the expressions are made of.
+        The symbols of the expressions.
     M : matrix (n_q, n_q)
-        Symmetric, of which the upper triangle counts; free of velocities.
+        Mass matrix, independent of the velocities; the upper triangle is used.
     Q : sequence (n_q,)
-        The force.
+        Generalised forces.
     C : sequence (n_c,)
-        The constraints on positions.
+        Position constraints.
     W : sequence (n_a,)
-        The non-holonomic ones, A v + b, linear in v.
+        Non-holonomic constraints A v + b, linear in v.
     energy : expression
     conserved : bool
-        Whether it is an invariant.
+        True if the energy is an invariant.
     """
 
     symbols: Reader
@@ -42,13 +42,13 @@ class Equations:
 
     @property
     def constant_mass(self) -> bool:
-        """Whether M depends neither on t nor on q."""
+        """Return True if M depends neither on t nor on q."""
         moving = {self.symbols.t, *self.symbols.q}
         return not any(entry.free_symbols & moving for entry in self.M)
 
     def source(self, tangents: bool) -> str:
-        """The generated code: a function for each callback, and the energy."""
-        tangents = tangents and not self.W  # Newton's method takes none beside non-holonomic rows
+        """Return the generated code: a function for each callback, and the energy."""
+        tangents = tangents and not self.W  # not supported with non-holonomic rows
         arrays = self._callbacks() | (self._tangents() if tangents else {})
         constant = self.constant_mass
         known = {
@@ -61,7 +61,7 @@ class Equations:
         return "\n\n".join([*parts, energy_source(self.energy)])
 
     def _bandwidth(self) -> int:
-        """How far apart coordinates are numbered of which M, the force or one constraint has both."""
+        """Return the largest distance of two coordinates coupled by M, the force or a constraint."""
         x, d = self.symbols, self.symbols.differentiation
         places = {symbol: j for symbols in (x.q, x.v) for j, symbol in enumerate(symbols)}
         entries = [*enumerate(self.Q), *((j, entry) for (_, j), entry in d.rows(self.C, x.q).items())]
@@ -102,7 +102,7 @@ class Equations:
 
 
 def along(expressions: Sequence[Expr], x: Reader) -> list[Expr]:
-    """The derivatives of expressions by time, less what the accelerations contribute."""
+    """Return the time derivatives of expressions without the terms in the accelerations."""
     rates: list[list[Expr]] = [[x.differentiation.by(each, x.t)] for each in expressions]
     for (i, j), entry in x.differentiation.rows(expressions, x.q).items():
         rates[i].append(entry * x.v[j])
@@ -110,12 +110,12 @@ def along(expressions: Sequence[Expr], x: Reader) -> list[Expr]:
 
 
 def accelerations(expressions: Sequence[Expr], x: Reader) -> list[Expr]:
-    """The right-hand side of the equations for the accelerations that keep expressions in q and v constant."""
+    """Return the right-hand side of the acceleration equations that keep expressions in q and v constant."""
     return [-each for each in along(expressions, x)]
 
 
 def linear(argument: str, expressions: Sequence[Expr], x: Reader) -> Entries:
-    """The derivatives by the velocities of expressions that are linear in them, or say that they are not."""
+    """Return the derivatives with respect to the velocities; raise ValueError unless these are constant in v."""
     rows, velocities = x.differentiation.rows(expressions, x.v), set(x.v)
     for (i, j), entry in rows.items():
         if x.differentiation.symbols_of(entry) & velocities:

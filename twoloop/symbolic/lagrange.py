@@ -25,7 +25,7 @@ def from_lagrangian(
     tangents: bool = False,
     name: str = "mechanism",
 ) -> SymbolicMechanism:
-    """Derive M and Q from energies, all derivatives of the constraints, and make a compiled system of them.
+    """Derive M and Q from energies and all derivatives of the constraints, and compile the system.
 
     M = T_vv and Q = T_q - (T_v)_q v - (T_v)_t - V_q - D_v + F. M^-1 is never formed.
 
@@ -34,24 +34,26 @@ def from_lagrangian(
     T : expression
         Kinetic energy, J, at most quadratic in the velocities `q.diff(t)`.
     V : expression
-        Potential energy, J, of coordinates and time.
+        Potential energy, J, depending on coordinates and time.
     constraints : list of expressions (n_c,)
-        Each is zero; of coordinates and time. Empty for equations without constraints on positions.
+        Expressions in coordinates and time that vanish. Empty if there are no position constraints.
     coordinates : list (n_q,)
-        Functions of time, as `sympy.physics.mechanics.dynamicsymbols` makes them.
+        Functions of time, as created by `sympy.physics.mechanics.dynamicsymbols`.
     forces : mapping or list (n_q,), optional
-        Generalised forces F; a mapping goes from coordinates to expressions.
+        Generalised forces F; a mapping has coordinates as keys.
     dissipation : expression
-        Rayleigh's function D, W: its derivatives by the velocities are subtracted from the forces.
+        Rayleigh dissipation function D, W: its derivatives with respect to the velocities are subtracted from the
+        forces.
     nonholonomic : list of expressions (n_a,)
-        Each is zero; linear in the velocities.
+        Expressions linear in the velocities that vanish.
     parameters : mapping
-        From every other symbol to its value. The values can be changed later without compiling again.
+        Values of all other symbols. They can be changed later without recompilation.
     tangents : bool
-        Whether to derive the tangents of the force and of the reactions for Newton's method. For stiff forces: they
-        save differences, and double or triple the code; fixed steps in which bodies turn far converge better without.
+        If True, derive the Jacobians of the forces and reactions for Newton's method. Useful for stiff forces: they
+        replace finite differences, but double or triple the code. Fixed steps with large rotations converge better
+        without.
     name : str
-        Shown in messages.
+        Used in messages.
 
     Returns
     -------
@@ -61,8 +63,9 @@ def from_lagrangian(
     Raises
     ------
     TypeError, ValueError
-        If an expression has an unknown symbol or is not smooth, if a constraint depends on velocities or on no
-        coordinate, if T is not quadratic or `nonholonomic` not linear in the velocities, or if `forces` do not fit.
+        If an expression has an unknown symbol or is not smooth; if a constraint depends on velocities or on no
+        coordinate; if T is not quadratic or `nonholonomic` not linear in the velocities; or if `forces` have a wrong
+        size or unknown coordinates.
     """
     x = Reader(coordinates, parameters)
     kinetic, potential = x.read("T", T, VELOCITIES), x.read("V", V, POSITIONS)
@@ -88,7 +91,7 @@ def from_lagrangian(
 
 
 def read_rows(x: Reader, constraints: Any, nonholonomic: Any) -> tuple[list[Expr], list[Expr]]:
-    """Both kinds of constraints, each of which must depend on something that moves."""
+    """Return both kinds of constraints, each of which must depend on a coordinate or velocity."""
     C = x.read_all("constraints", constraints, POSITIONS)
     W = x.read_all("nonholonomic", nonholonomic, VELOCITIES)
     for argument, rows, symbols, names in (

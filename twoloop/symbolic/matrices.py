@@ -1,4 +1,4 @@
-"""Equations of motion from a mass matrix and a force, in velocities or in generalised speeds."""
+"""Equations of motion from a mass matrix and forces, in velocities or generalised speeds."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -12,7 +12,7 @@ from twoloop.symbolic.lagrange import read_rows
 from twoloop.symbolic.mechanism import SymbolicMechanism, made
 from twoloop.symbolic.reading import POSITIONS, VELOCITIES, Reader, column, sequence, square
 
-SAME = 1e-9  # relative: what counts as equal
+SAME = 1e-9  # relative tolerance of equality
 PROBES = 3
 
 
@@ -29,24 +29,25 @@ def from_matrices(
     tangents: bool = False,
     name: str = "mechanism",
 ) -> SymbolicMechanism:
-    """Make a compiled system of M u' = Q, and derive all derivatives of the constraints.
+    """Compile the system of M u' = Q, with all derivatives of the constraints.
 
-    With speeds u = K(t, q) q' + k(t, q) the equations become those of the coordinates: the mass is K^T M K, the force
-    K^T (Q - M (K' q' + k')).
+    With speeds u = K(t, q) q' + k(t, q) the equations are transformed to the coordinates: the mass matrix is K^T M K,
+    the force K^T (Q - M (K' q' + k')).
 
     Parameters
     ----------
     M : matrix (n_u, n_u)
-        Symmetric mass matrix, of coordinates and time; without rows or columns for constraints.
+        Symmetric mass matrix, depending on coordinates and time, without rows or columns for constraints.
     Q : list or matrix of one column (n_u,)
-        The force, with all that the inertia adds, as `forcing` of SymPy's methods.
+        Forces including velocity-dependent inertia terms, like `forcing` of SymPy's methods.
     constraints, coordinates, nonholonomic, parameters, tangents, name
-        As for `from_lagrangian`; velocities may be written by speeds.
+        As for `from_lagrangian`; velocities may be expressed by speeds.
     speeds : mapping, optional
-        From the generalised speeds, in the order of M, to expressions linear in `q.diff(t)`. None: the speeds are the
+        Generalised speeds, in the order of M, as expressions linear in `q.diff(t)`. None: the speeds are the
         derivatives of the coordinates.
     potential : expression
-        V, J: the energy is 1/2 q'^T K^T M K q' + V. It does not change Q; whether Q conserves the energy is found out.
+        Potential energy V, J, of the energy 1/2 q'^T K^T M K q' + V. It does not change Q; conservation of the energy
+        is checked numerically.
 
     Returns
     -------
@@ -56,7 +57,7 @@ def from_matrices(
     Raises
     ------
     TypeError, ValueError
-        As for `from_lagrangian`; also if M is not square, not symmetric or depends on velocities, if Q has another
+        As for `from_lagrangian`; also if M is not square, not symmetric or depends on velocities, if Q has a wrong
         size, or if a speed is not linear in the velocities.
     """
     if speeds is not None and not isinstance(speeds, Mapping):
@@ -91,7 +92,7 @@ def from_matrices(
 
 
 def _conserved(x: Reader, Q: Sequence[Expr], rows: Sequence[Expr], energy: Expr) -> bool:
-    """Whether the force gives as much power as the energy loses, and constraints, none of which may move, give none."""
+    """Return True if the energy is conserved: the forces balance its change, and no constraint moves."""
     still = dict.fromkeys(x.v, ZERO)
     moving = any(row.has(x.t) or (row.xreplace(still) != 0 and row.free_symbols & set(x.v)) for row in rows)
     return not moving and _cancel([*(v * q for v, q in zip(x.v, Q, strict=True)), *along([energy], x)])
@@ -106,7 +107,7 @@ def _check_symmetric(M: sympy.MatrixBase) -> None:
 
 
 def _cancel(terms: Sequence[Expr]) -> bool:
-    """Whether terms add up to nothing, at a few points: what is equal need not be written in the same way."""
+    """Return True if terms sum to zero at a few points, since equal expressions may have different forms."""
     symbols = sorted(set().union(*(term.free_symbols for term in terms)), key=str)
     for probe in range(PROBES):
         values = {symbol: Float(0.3 + (0.618034 * (k + 1) * (probe + 1)) % 1.0) for k, symbol in enumerate(symbols)}

@@ -21,11 +21,11 @@ def from_method(
     tangents: bool = False,
     name: str = "mechanism",
 ) -> SymbolicMechanism:
-    """Make a compiled system of what sympy.physics.mechanics describes.
+    """Compile the system described by an object of sympy.physics.mechanics.
 
-    Constraints are those of the `LagrangesMethod` or the `System`, then those given here. A `KanesMethod` must be of
-    the tree without its loops, all coordinates and speeds independent; it may have been asked for its equations or not
-    if it knows its bodies. As many speeds as coordinates are wanted, linear in their derivatives.
+    The constraints are those of the `LagrangesMethod` or the `System`, followed by those given here. A `KanesMethod`
+    must describe the tree without loops, with independent coordinates and speeds; its equations need not have been
+    formed if it has its bodies. There must be as many speeds as coordinates, linear in the derivatives of these.
 
     Parameters
     ----------
@@ -71,7 +71,7 @@ def from_method(
 
 
 def _tree(system: System) -> KanesMethod:
-    """Kane's equations of a system without its constraints, which become rows of ours."""
+    """Return Kane's equations of a system without its constraints."""
     loads = [*system.loads, *(load for actuator in system.actuators for load in actuator.to_loads())]
     if len(system.u_aux):
         raise ValueError("method must have no auxiliary speeds: reactions come from the multipliers")
@@ -81,7 +81,7 @@ def _tree(system: System) -> KanesMethod:
 
 
 def _speeds(kane: KanesMethod) -> dict[Any, Any]:
-    """The generalised speeds as functions of the velocities, from the kinematic equations."""
+    """Return the generalised speeds as functions of the velocities, from the kinematic equations."""
     if len(kane._udep) or len(kane._qdep):
         raise ValueError(
             "method must have independent coordinates and speeds only: leave u_dependent, q_dependent and the "
@@ -95,7 +95,7 @@ def _speeds(kane: KanesMethod) -> dict[Any, Any]:
     if len(u) != len(q):
         raise ValueError(
             f"method must have as many speeds as coordinates; given {len(u)} and {len(q)}. Use from_matrices, whose "
-            "speeds= takes each as a formula of the velocities, such as those of Euler parameters"
+            "speeds= takes expressions in the velocities, e.g. for Euler parameters"
         )
     by_u = kane.forcing_kin.jacobian(u)  # mass_matrix_kin q' = forcing_kin, linear in u
     rest = kane.forcing_kin.xreplace(dict.fromkeys(u, sympy.S.Zero))

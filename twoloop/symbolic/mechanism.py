@@ -1,4 +1,4 @@
-"""What the constructors return: generated code with the numbers that belong to it."""
+"""`SymbolicMechanism`, the return value of the constructors: generated code with its parameter values."""
 
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
@@ -23,9 +23,9 @@ from twoloop.symbolic.reading import Reader, number
 
 @dataclass(frozen=True)
 class SymbolicMechanism:
-    """A mechanism made from SymPy's expressions.
+    """A mechanism generated from SymPy expressions.
 
-    Holds no expressions any more, so that it can be pickled.
+    It contains no expressions, so it can be pickled.
 
     Attributes
     ----------
@@ -33,11 +33,11 @@ class SymbolicMechanism:
     coordinates : tuple of str (n_q,)
         Names of the coordinates.
     n_c, n_a : int
-        Number of constraints on positions, and of non-holonomic ones.
+        Numbers of position constraints and of non-holonomic constraints.
     parameters : mapping
-        Name to value, in the order of `p`.
+        Values by name, in the order of `p`.
     code : GeneratedCode
-        The callbacks and the energy; `code.source` is what was made of the equations.
+        The callbacks and the energy; `code.source` is the generated source.
     """
 
     name: str
@@ -49,7 +49,7 @@ class SymbolicMechanism:
 
     @cached_property
     def system(self) -> ConstrainedSystem:
-        """The compiled system. The first time that equations are met this takes seconds, see docs/your_mechanism.md."""
+        """The compiled system. Compilation takes seconds for new equations, see docs/your_mechanism.md."""
         callbacks: dict[str, Any] = {kind: self.code.callback(kind) for kind in self.code.kinds}
         return ConstrainedSystem(
             n_q=len(self.coordinates),
@@ -64,12 +64,12 @@ class SymbolicMechanism:
 
     @property
     def energy(self) -> GeneratedEnergy:
-        """energy(t, q, v), J, of one state or of the columns of many."""
+        """energy(t, q, v), J, for one state or for many given as columns."""
         return GeneratedEnergy(self.code, self._vector)
 
     @property
     def conserved(self) -> bool:
-        """Whether the energy is an invariant."""
+        """True if the energy is an invariant."""
         return bool(self.code.value("CONSERVED"))
 
     @property
@@ -77,17 +77,17 @@ class SymbolicMechanism:
         return tuple(self.parameters.values())
 
     def with_parameters(self, parameters: Mapping[Any, Any]) -> "SymbolicMechanism":
-        """The same equations with other values of some parameters; nothing is derived or compiled again.
+        """Return the same equations with other values of some parameters, without recompilation.
 
         Parameters
         ----------
         parameters : mapping
-            From symbols, or their names, to numbers.
+            Values by symbol or name.
 
         Raises
         ------
         TypeError, ValueError
-            If a parameter is unknown or its value no finite number.
+            If a parameter is unknown or its value is not a finite number.
         """
         values = {str(symbol): number(f"parameters[{symbol}]", value) for symbol, value in parameters.items()}
         unknown = [name for name in values if name not in self.parameters]
@@ -104,19 +104,19 @@ class SymbolicMechanism:
         keep: Sequence[Any] = (),
         note: str = "",
     ) -> Problem:
-        """The mechanism with a start, which is moved onto the constraints by `consistent_state`.
+        """Return the mechanism with an initial state, which `consistent_state` projects onto the constraints.
 
         Parameters
         ----------
         q0, v0 : array_like (n_q,) or mapping
-            Positions and velocities at the start; a mapping goes from coordinates, or their names, to numbers, and
-            those not in it are guessed as 0.
+            Initial positions and velocities. A mapping has coordinates or their names as keys; the initial guess of
+            missing ones is 0.
         t_span : (float, float)
             Start and end, s.
         keep : sequence
-            Coordinates, or their names, that must keep their values and velocities.
+            Coordinates, or their names, whose values and velocities must not change.
         note : str
-            What is assumed.
+            Remarks on assumptions.
 
         Raises
         ------
@@ -164,9 +164,9 @@ def made(
     tangents: bool,
     name: str,
 ) -> SymbolicMechanism:
-    """The mechanism of equations, which are derived unless an earlier process did.
+    """Return the mechanism of equations, which are derived unless their code is in the cache.
 
-    `given` is all that they follow from, in plain symbols; `rows` is (n_c, n_a).
+    `given` contains everything that determines the equations, in plain symbols; `rows` is (n_c, n_a).
     """
     check_text("name", name)
     key = _digest([*given, check_flag("tangents", tangents), len(reader.q), len(reader.p)])
@@ -178,7 +178,7 @@ def _digest(given: Any) -> str:
     known: dict[Basic, bytes] = {}
 
     def of(each: Any) -> bytes:
-        """Of an expression by way of its parts, each of which is looked at once."""
+        """Return the digest of an expression from those of its subexpressions, each computed once."""
         if isinstance(each, (list, tuple)):
             return hashlib.sha256(b"list" + b"".join(map(of, each))).digest()
         if not isinstance(each, Basic):
@@ -193,6 +193,6 @@ def _digest(given: Any) -> str:
 
 @cache
 def _version() -> bytes:
-    """Digest of what makes code of expressions: this package and SymPy."""
+    """Return a digest of the versions of this package and SymPy."""
     files = sorted(Path(__file__).parent.glob("*.py"))
     return hashlib.sha256(sympy.__version__.encode() + b"".join(file.read_bytes() for file in files)).digest()

@@ -1,4 +1,4 @@
-"""Expressions as Python code: subexpressions that several entries of a callback share are evaluated once."""
+"""Prints expressions as Python code; common subexpressions of the entries of a callback are evaluated once."""
 
 import re
 from collections.abc import Sequence
@@ -10,26 +10,26 @@ from sympy import Expr, Symbol
 from twoloop.kernels.compile.callbacks import KINDS
 from twoloop.symbolic.differentiation import Entries
 
-# SymPy's functions that the equations may have; in math they have the same names
+# supported functions of SymPy; they have the same names in math
 FUNCTIONS = (
     *(sympy.sin, sympy.cos, sympy.tan, sympy.asin, sympy.acos, sympy.atan, sympy.atan2),
     *(sympy.sinh, sympy.cosh, sympy.tanh, sympy.asinh, sympy.exp, sympy.log),
 )
-MOST_FACTORS = 4  # integer powers up to this one are written as products
+MOST_FACTORS = 4  # integer powers up to this are written as products
 
 
 class _Printer:
-    """Writes an expression with the functions of `math` or of `np`; all numbers are floats."""
+    """Prints expressions with the functions of `math` or `np`; all numbers are floats."""
 
     def __init__(self, module: str):
         self.module = module
         names = {function: function.__name__ for function in FUNCTIONS}
-        if module == "np":  # of version 1, to which acos is arccos
+        if module == "np":  # numpy 1 has arccos, not acos
             names = {function: re.sub("^a", "arc", name) for function, name in names.items()}
         self.functions = {function: f"{module}.{name}" for function, name in names.items()}
 
     def sum(self, expression: Expr) -> str:
-        """An expression that stands alone, or as an argument."""
+        """Print an expression that stands alone or is an argument."""
         text = ""
         for term in sympy.Add.make_args(expression):
             negative = term.could_extract_minus_sign() and not term.is_Add
@@ -38,7 +38,7 @@ class _Printer:
         return text
 
     def product(self, expression: Expr) -> str:
-        """An expression as a term of a sum."""
+        """Print an expression as a term of a sum."""
         above, below = [], []
         for factor in sympy.Mul.make_args(expression):
             if factor.is_Pow and factor.exp.is_Rational and factor.exp < 0:
@@ -51,7 +51,7 @@ class _Printer:
         return f"{text}/{below[0]}" if len(below) == 1 else f"{text}/({'*'.join(below)})"
 
     def factor(self, expression: Expr) -> str:
-        """An expression as a factor of a product."""
+        """Print an expression as a factor of a product."""
         if expression.is_Symbol:
             return str(expression.name)
         if expression.is_Number or isinstance(expression, sympy.NumberSymbol):
@@ -64,7 +64,7 @@ class _Printer:
         return f"({self.sum(expression)})"
 
     def power(self, base: Expr, exponent: Expr) -> str:
-        """A power, in parentheses where it needs them; small integer ones as products."""
+        """Print a power, parenthesised if necessary; small integer powers as products."""
         if exponent == sympy.S.Half:
             return f"{self.module}.sqrt({self.sum(base)})"
         text = self.factor(base)
@@ -78,7 +78,7 @@ class _Printer:
 
 
 def callback_source(kind: str, arrays: Sequence[Entries]) -> str:
-    """The source of a callback that fills the arrays of its kind, which arrive full of zeros."""
+    """Return the source of a callback that fills the arrays of its kind, which are initially zero."""
     entry = KINDS[kind]
     targets = [
         (f"{name}[{', '.join(map(str, place)) if isinstance(place, tuple) else place}]", expression)
@@ -94,7 +94,7 @@ def callback_source(kind: str, arrays: Sequence[Entries]) -> str:
 
 
 def energy_source(energy: Expr) -> str:
-    """The source of energy(t, q, v, p), of one state or of the columns of many."""
+    """Return the source of energy(t, q, v, p), for one state or for many given as columns."""
     lines, values = _evaluated([energy], _Printer("np"))
     return _function("energy", ("t", "q", "v", "p"), [*lines, f"return {values[0]}"])
 
@@ -104,7 +104,7 @@ def _function(name: str, arguments: Sequence[str], lines: Sequence[str]) -> str:
 
 
 def _evaluated(expressions: list[Expr], printer: _Printer) -> tuple[list[str], list[str]]:
-    """Lines that evaluate what the expressions share, and the expressions after them."""
+    """Return lines that evaluate common subexpressions, and the expressions in terms of these."""
     shared, reduced = sympy.cse(expressions, symbols=_numbered(), order="none", list=True)
     used = set().union(*(each.free_symbols for each in [*reduced, *(value for _, value in shared)]), set())
     loads = [

@@ -1,4 +1,4 @@
-"""The user's expressions in plain symbols: each is checked for what the equations of motion cannot contain."""
+"""Conversion of the user's expressions to plain symbols, with checks for unsupported terms."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
@@ -14,7 +14,7 @@ from twoloop.symbolic.printing import FUNCTIONS
 
 SMOOTH = (sympy.Add, sympy.Mul, sympy.Pow, sympy.Number, sympy.NumberSymbol, *FUNCTIONS)
 NOT_SMOOTH = (sympy.Abs, sympy.sign, sympy.Heaviside, sympy.DiracDelta, sympy.Piecewise, sympy.Max, sympy.Min)
-POSITIONS, VELOCITIES = "positions", "velocities"  # what an expression may depend on, beside t and the parameters
+POSITIONS, VELOCITIES = "positions", "velocities"  # permitted dependence, besides t and the parameters
 
 
 class Reader:
@@ -23,22 +23,22 @@ class Reader:
     Parameters
     ----------
     coordinates : sequence
-        Functions of time, as `dynamicsymbols` makes them.
+        Functions of time, as created by `dynamicsymbols`.
     parameters : mapping
-        From symbols to numbers.
+        Values by symbol.
     speeds : mapping
-        From generalised speeds (functions of time) to expressions in the coordinates and their derivatives.
+        Generalised speeds (functions of time) as expressions in the coordinates and their derivatives.
 
     Attributes
     ----------
     names : tuple of str
-        Of the coordinates.
+        Names of the coordinates.
     values : dict
-        Name to value of the parameters, in the order of `p`.
+        Values of the parameters by name, in the order of `p`.
     t, q, v, p : symbols
-        Of the generated code.
+        Symbols of the generated code.
     differentiation : Differentiation
-        Of expressions in these symbols.
+        Derivatives of expressions in these symbols.
     """
 
     def __init__(self, coordinates: Any, parameters: Any, speeds: Mapping[Any, Any] | None = None):
@@ -60,20 +60,20 @@ class Reader:
         self.speeds = {u: self.read(f"speeds[{u}]", each, VELOCITIES) for u, each in (speeds or {}).items()}
 
     def read(self, argument: str, expression: Any, depends: str) -> Expr:
-        """An expression in the plain symbols.
+        """Return an expression in plain symbols.
 
         Raises
         ------
         TypeError, ValueError
-            If it is no expression, or holds an unknown symbol, a velocity where none may be, an acceleration, or a
-            function that is not smooth.
+            If it is not an expression, or contains an unknown symbol, a velocity that is not permitted, an
+            acceleration, or a function that is not smooth.
         """
         expression = _sympified(argument, expression)
         self._check(argument, expression, depends)
         return expression.xreplace(self._known | self._velocities | self.speeds)
 
     def read_all(self, argument: str, expressions: Any, depends: str) -> list[Expr]:
-        """Each of a list of expressions."""
+        """Return a list of expressions in plain symbols."""
         given = sequence(argument, expressions)
         return [self.read(f"{argument}[{i}]", each, depends) for i, each in enumerate(given)]
 
@@ -128,7 +128,7 @@ class Reader:
 
 
 def sequence(argument: str, given: Any) -> list[Any]:
-    """The entries of a list, a tuple or a matrix of one column."""
+    """Return the entries of a list, a tuple or a matrix of one column."""
     if given is None:
         return []
     if isinstance(given, sympy.MatrixBase):
@@ -139,10 +139,10 @@ def sequence(argument: str, given: Any) -> list[Any]:
 
 
 def square(argument: str, given: Any, n: int) -> sympy.MatrixBase:
-    """A matrix (n, n) of expressions."""
+    """Return a matrix (n, n) of expressions."""
     try:
         matrix = sympy.ImmutableMatrix(given)
-    except Exception:  # SymPy raises what comes: TypeError, ValueError, its own ones
+    except Exception:  # SymPy raises TypeError, ValueError and others
         raise TypeError(f"{argument} must be a SymPy matrix of shape ({n}, {n}); given {given!r}") from None
     if matrix.shape != (n, n):
         raise ValueError(f"{argument} must have shape ({n}, {n}), a row and a column a speed; given {matrix.shape}")
@@ -150,7 +150,7 @@ def square(argument: str, given: Any, n: int) -> sympy.MatrixBase:
 
 
 def column(argument: str, given: Any, n: int, each: str) -> list[Any]:
-    """A list of n expressions, one for each of something."""
+    """Return a list of n expressions."""
     entries = sequence(argument, given)
     if len(entries) != n:
         raise ValueError(f"{argument} must have {n} entries, one for each {each}; given {len(entries)}")
@@ -188,7 +188,7 @@ def _values_of(parameters: Any, time: Symbol) -> dict[str, float]:
 
 
 def number(argument: str, value: Any) -> float:
-    """A finite number, SymPy's too."""
+    """Return a finite number, also from SymPy numbers."""
     if isinstance(value, sympy.Number) and value.is_real:
         value = float(value)
     return check_finite(argument, check_number(argument, value))
@@ -205,4 +205,4 @@ def _sympified(argument: str, expression: Any) -> Expr:
         raise TypeError(f"{argument} must be a SymPy expression; given {expression!r}") from None
     if not isinstance(expression, Expr):
         raise TypeError(f"{argument} must be a SymPy expression; given {expression!r}")
-    return expression.doit()  # derivatives of products that were left as they were written
+    return expression.doit()  # evaluates unevaluated derivatives

@@ -1,4 +1,4 @@
-"""Known motions of mechanisms, and a check of any simulator against them; imports numpy only."""
+"""Mechanisms with known motions, and a conformance check of any simulator against them; needs numpy only."""
 
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
@@ -26,7 +26,7 @@ __all__ = ["Failure", "Finding", "KnownBody", "KnownJoint", "KnownProblem", "Mot
 __all__ += ["problems"]
 
 
-def __getattr__(name: str) -> Any:  # pytest imports `plugin` in every run, which is not to cost an import of numpy
+def __getattr__(name: str) -> Any:  # lazy: pytest imports `plugin` in every run
     if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)

@@ -1,8 +1,8 @@
 """Andrews' squeezing mechanism: seven bodies, three loops that share a joint, driven by a constant torque.
 
 Angles beta, Theta, gamma, Phi, delta, Omega, epsilon and constants as in Hairer & Wanner, Solving Ordinary Differential
-Equations II, Sect. VII.7, and the Test Set for IVP Solvers, "andrews". The mass matrix, the terms of the velocities and
-gamma are made of the positions of the centres, which are sums of vectors that turn with sums of angles.
+Equations II, Sect. VII.7, and the Test Set for IVP Solvers, "andrews". The mass matrix, the velocity terms and gamma
+are computed from the centres of mass, which are sums of vectors rotated by sums of angles.
 """
 
 from collections.abc import Mapping
@@ -23,15 +23,15 @@ START = np.array(
         *(-0.222668390165885884674473185609, 1.23054744454982119249735015568),
     ]
 )
-# which angles add up to that of each body
+# rows: the angles whose sum is the angle of a body
 TURNS = np.zeros((7, 7))
 TURNS[0, 0] = TURNS[1, 0] = TURNS[1, 1] = TURNS[2, 2] = TURNS[3, 3] = TURNS[3, 4] = TURNS[4, 4] = 1.0
 TURNS[5, 5] = TURNS[5, 6] = TURNS[6, 6] = 1.0
 
-# each point: the sum of vectors (body, x, y) that turn with bodies, from the ground points (0, 0), B, A, A
-SHARED = [(0, 0.007, 0.0), (1, -0.028, 0.0)]  # the joint that the loops share
+# each point is a sum of vectors (body, x, y) in body axes, starting at the ground points (0, 0), B, A, A
+SHARED = [(0, 0.007, 0.0), (1, -0.028, 0.0)]  # the joint shared by the loops
 LOOPS = [(B, [(2, 0.0, -0.035)]), (A, [(3, 0.0, -0.02), (4, 0.04, 0.0)]), (A, [(5, 0.02, 0.0), (6, 0.0, -0.04)])]
-CENTRES = [  # of mass, by vectors of which the position on the body alone counts where the other end is on the ground
+CENTRES = [  # of mass, as sums of vectors
     [(0, 0.00092, 0.0)],
     [(0, 0.007, 0.0), (1, -0.0115, 0.0)],
     [(2, 0.01874, 0.01043)],
@@ -40,23 +40,23 @@ CENTRES = [  # of mass, by vectors of which the position on the body alone count
     [(6, 0.0, -0.04), (5, 0.02 - 0.01421, 0.0)],
     [(6, 0.01228, -0.00449)],
 ]
-SPRING = [(2, 0.02, -0.018)]  # its end on body 3
+SPRING = [(2, 0.02, -0.018)]  # attachment point on body 3
 
 
 def vector(turns: Array, parts: list[tuple[int, float, float]]) -> Array:
-    """Parts (n_parts, 2) of a point, each turned with its body."""
+    """Return the parts (n_parts, 2) of a point, each rotated with its body."""
     s, c = np.sin(turns), np.cos(turns)
     return np.array([[c[i] * x - s[i] * y, s[i] * x + c[i] * y] for i, x, y in parts])
 
 
 def vector_by_q(turns: Array, parts: list[tuple[int, float, float]]) -> Array:
-    """Derivative (2, 7) of the sum of the parts by the seven angles."""
+    """Return the derivative (2, 7) of the sum of the parts with respect to the seven angles."""
     around = vector(turns, parts) @ np.array([[0.0, 1.0], [-1.0, 0.0]])
     return around.T @ TURNS[[part[0] for part in parts]]
 
 
 def bend(turns: Array, rates: Array, parts: list[tuple[int, float, float]]) -> Array:
-    """Second derivative (2,) of the sum of the parts at constant angular velocities."""
+    """Return the second time derivative (2,) of the sum of the parts at constant angular velocities."""
     return -(rates[[part[0] for part in parts]] ** 2) @ vector(turns, parts)
 
 
@@ -65,10 +65,10 @@ class AndrewsEquations:
 
     coordinates = ("angle", *("relative", "angle") * 3)
     row_powers = (1.0,) * 6
-    parts: Mapping[str, Any] = {}  # its bodies and joints are not told
+    parts: Mapping[str, Any] = {}  # bodies and joints are not given
 
     def mass(self, t: float, q: Array) -> Array:
-        """M (7, 7)."""
+        """Return M (7, 7)."""
         turns = TURNS @ q
         M = TURNS.T @ (INERTIAS[:, None] * TURNS)
         for m, parts in zip(MASSES, CENTRES, strict=True):
@@ -77,7 +77,7 @@ class AndrewsEquations:
         return M
 
     def force(self, t: float, q: Array, v: Array) -> Array:
-        """Q (7,): torque, spring, and the terms of the velocities."""
+        """Return Q (7,): torque, spring, and velocity terms."""
         turns, rates = TURNS @ q, TURNS @ v
         Q = TORQUE * np.eye(7)[0]
         for m, parts in zip(MASSES, CENTRES, strict=True):
@@ -90,28 +90,28 @@ class AndrewsEquations:
         return B + vector(turns, SPRING).sum(axis=0) - C
 
     def constraint(self, t: float, q: Array) -> Array:
-        """C (6,)."""
+        """Return C (6,)."""
         turns = TURNS @ q
         shared = vector(turns, SHARED).sum(axis=0)
         return np.concatenate([shared - ground - vector(turns, parts).sum(axis=0) for ground, parts in LOOPS])
 
     def jacobian(self, t: float, q: Array) -> Array:
-        """C_q (6, 7)."""
+        """Return C_q (6, 7)."""
         turns = TURNS @ q
         shared = vector_by_q(turns, SHARED)
         return np.vstack([shared - vector_by_q(turns, parts) for _, parts in LOOPS])
 
     def constraint_rate(self, t: float, q: Array) -> Array:
-        """C_t (6,), zero."""
+        """Return C_t (6,), zero."""
         return np.zeros(6)
 
     def gamma(self, t: float, q: Array, v: Array) -> Array:
-        """Right-hand side of C_q a = gamma (6,)."""
+        """Return the right-hand side (6,) of C_q a = gamma."""
         turns, rates = TURNS @ q, TURNS @ v
         shared = bend(turns, rates, SHARED)
         return np.concatenate([bend(turns, rates, parts) - shared for _, parts in LOOPS])
 
     def energy(self, t: float, q: Array, v: Array) -> float:
-        """Of motion and spring, and the potential of the constant torque, J."""
+        """Return the kinetic energy plus the potentials of the spring and the constant torque, J."""
         stretch = np.linalg.norm(self._spring(TURNS @ q)) - UNSTRESSED
         return float(0.5 * v @ self.mass(t, q) @ v + 0.5 * STIFFNESS * stretch**2 - TORQUE * q[0])

@@ -1,4 +1,4 @@
-"""The same problem seen otherwise: from a turned and moved frame, in other units, or begun later."""
+"""Transformed versions of a problem: rotated and translated frame, other units, or a later start."""
 
 from dataclasses import dataclass, replace
 from typing import Any
@@ -9,24 +9,24 @@ from twoloop.testing.known_parts import GROUND
 from twoloop.testing.known_problem import Array, KnownProblem
 from twoloop.testing.spatial_equations import parameters_of, skew
 
-TURN, AXIS = 0.7, np.array([1.0, 2.0, -1.5]) / np.sqrt(7.25)  # rad, and the axis in space
-MOVE = np.array([1.7, -2.3, 0.9])  # of the largest length among the coordinates
+TURN, AXIS = 0.7, np.array([1.0, 2.0, -1.5]) / np.sqrt(7.25)  # rotation angle, rad, and its axis in space
+MOVE = np.array([1.7, -2.3, 0.9])  # translation relative to the largest length among the coordinates
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
-    """A problem in coordinates T q + d, and the way back.
+class Transformed:
+    """A problem in the coordinates T q + d, and the inverse transformation.
 
     Attributes
     ----------
     problem : KnownProblem
-        What a simulator gets; without `reference`.
+        The problem given to the simulator; without `reference`.
     T : ndarray (n_q, n_q)
     d : ndarray (n_q,)
     rows : ndarray (n_c,)
-        Factors of the rows of C.
+        Scale factors of the rows of C.
     work : float
-        Factor of energies.
+        Scale factor of energies.
     """
 
     problem: KnownProblem
@@ -36,7 +36,7 @@ class Seen:
     work: float
 
     def back(self, q: Array, v: Array | None, lam: Array | None) -> tuple[Array, Array | None, Array | None]:
-        """Rows of states in the coordinates of the original problem."""
+        """Transform states, given as rows, back to the coordinates of the original problem."""
         inverse = np.linalg.inv(self.T)
         return (
             (q - self.d) @ inverse.T,
@@ -45,8 +45,8 @@ class Seen:
         )
 
 
-def in_a_frame(problem: KnownProblem, turn: float = TURN, move: float = 1.0) -> Seen:
-    """The problem in a frame that is turned, rad, and moved, in multiples of some times its size."""
+def in_a_frame(problem: KnownProblem, turn: float = TURN, move: float = 1.0) -> Transformed:
+    """Return the problem in a frame rotated by `turn`, rad, and translated by `move` times the default."""
     T, d = np.eye(problem.n_q), np.zeros(problem.n_q)
     kinds = problem.coordinates
     lengths = [abs(value) for kind, value in zip(kinds, problem.q0, strict=True) if kind in "xyz"]
@@ -58,13 +58,13 @@ def in_a_frame(problem: KnownProblem, turn: float = TURN, move: float = 1.0) -> 
             T[k : k + n, k : k + n], d[k : k + n] = R[:n, :n], shift[:n]
         elif kind == "angle":
             d[k] = turn
-        elif kind == "e0":  # the product of two quaternions, which is linear in each
+        elif kind == "e0":  # the product of two quaternions is linear in each
             product = p[0] * np.eye(4)
             product[0, 1:], product[1:, 0] = -p[1:], p[1:]
             product[1:, 1:] += skew(p[1:])
             T[k : k + 4, k : k + 4] = product
     n = 3 if "z" in kinds else 2
-    return _seen(problem, T, d, np.ones(problem.n_c), 1.0, _parts_in_a_frame(problem, R[:n, :n], shift[:n], turn))
+    return _change(problem, T, d, np.ones(problem.n_c), 1.0, _parts_in_a_frame(problem, R[:n, :n], shift[:n], turn))
 
 
 def _parts_in_a_frame(problem: KnownProblem, R: Array, shift: Array, turn: float) -> dict[str, Any]:
@@ -82,14 +82,14 @@ def _parts_in_a_frame(problem: KnownProblem, R: Array, shift: Array, turn: float
 
 
 def _rotation(turn: float, spatial: bool) -> tuple[Array, Array]:
-    """A rotation matrix (3, 3) and its Euler parameters (4,); in a plane about z."""
+    """Return a rotation matrix (3, 3) and its Euler parameters (4,); in the plane about z."""
     axis = AXIS if spatial else np.array([0.0, 0.0, 1.0])
     R = np.eye(3) + np.sin(turn) * skew(axis) + (1.0 - np.cos(turn)) * skew(axis) @ skew(axis)
     return R, parameters_of(R)
 
 
-def in_millimetres_and_grams(problem: KnownProblem) -> Seen:
-    """The problem with lengths in mm and masses in g; the second stays."""
+def in_millimetres_and_grams(problem: KnownProblem) -> Transformed:
+    """Return the problem with lengths in mm and masses in g; the unit of time stays s."""
     T = np.diag([1e3 if kind in "xyz" else 1.0 for kind in problem.coordinates])
     parts: dict[str, Any] = {
         "bodies": tuple(replace(body, mass=1e3 * body.mass, inertia=1e9 * body.inertia) for body in problem.bodies),
@@ -103,10 +103,10 @@ def in_millimetres_and_grams(problem: KnownProblem) -> Seen:
         ),
         "gravity": None if problem.gravity is None else 1e3 * problem.gravity,
     }
-    return _seen(problem, T, np.zeros(problem.n_q), 1e3**problem.row_powers, 1e3 * 1e3**2, parts)
+    return _change(problem, T, np.zeros(problem.n_q), 1e3**problem.row_powers, 1e3 * 1e3**2, parts)
 
 
-def _seen(problem: KnownProblem, T: Array, d: Array, rows: Array, work: float, parts: dict[str, Any]) -> Seen:
+def _change(problem: KnownProblem, T: Array, d: Array, rows: Array, work: float, parts: dict[str, Any]) -> Transformed:
     back = np.linalg.inv(T)
 
     def at(q: Array) -> Array:
@@ -124,11 +124,11 @@ def _seen(problem: KnownProblem, T: Array, d: Array, rows: Array, work: float, p
     if energy is not None:
         changed["energy"] = lambda t, q, v: work * energy(t, at(q), back @ v)
     changed |= {"q0": T @ problem.q0 + d, "v0": T @ problem.v0, "reference": None, "invariants": {}}
-    return Seen(replace(problem, **changed), T, d, rows, work)
+    return Transformed(replace(problem, **changed), T, d, rows, work)
 
 
 def begun_later(problem: KnownProblem, k: int, n_intervals: int) -> KnownProblem:
-    """The problem from the k-th state of its known motion on, for some intervals between its times."""
+    """Return the problem started at the k-th state of its known motion, for some intervals between its times."""
     motion = problem.reference
     assert motion is not None
     span = float(motion.t[k]), float(motion.t[k] + n_intervals * (motion.t[1] - motion.t[0]))

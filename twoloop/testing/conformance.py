@@ -1,4 +1,4 @@
-"""Checks any simulator of mechanisms against known motions."""
+"""Conformance check of simulators of mechanisms against known motions."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
@@ -14,20 +14,20 @@ from twoloop.testing.known_motions import N_TIMES
 from twoloop.testing.known_problem import KnownProblem, Motion
 from twoloop.testing.known_problems import listed, named
 from twoloop.testing.measuring import Observed, Settings
-from twoloop.testing.properties import measured, seen_otherwise
+from twoloop.testing.properties import in_transformed, measured
 from twoloop.testing.simulated import Simulate, Simulated, simulated
 
 Skipped = tuple[str, str, str]
 SAYS_SO = "says that it ends"
 WRONG = (
-    "Success with a wrong answer: there is no motion any more. Look whether iterations converge, whether C = 0 holds "
-    "at the end of a step, and whether numbers are finite, and raise."
+    "Success with a wrong answer: the motion has ended. Check that iterations converge, that C = 0 holds at the end of "
+    "a step, and that numbers are finite; otherwise raise."
 )
 REDUNDANT = (
-    "A row of C follows from the others here, and [M C_q^T; C_q 0] is singular: take least squares or leave such rows "
-    "out; a simulator that is not meant for them names its problems without this one."
+    "A row of C depends on the others here, and [M C_q^T; C_q 0] is singular: use least squares or remove such rows; "
+    "for a simulator that does not support them, exclude this problem."
 )
-SEEN = {"frame": in_a_frame, "units": in_millimetres_and_grams}
+TRANSFORMATIONS = {"frame": in_a_frame, "units": in_millimetres_and_grams}
 
 
 def check_simulator(
@@ -38,23 +38,23 @@ def check_simulator(
     steps: Sequence[int] | None = None,
     order: float | None = None,
 ) -> Report:
-    """Run a simulator of mechanisms on problems whose motions are known, and say what does not hold.
+    """Run a simulator of mechanisms on problems with known motions, and report the properties that fail.
 
     Parameters
     ----------
     simulate : callable
         simulate(problem, times, tolerance) -> q (n_t, n_q), or (q, v), or (q, v, lam) with lam (n_t, n_c) of
-        M a + C_q^T lam = Q: the states at `times` (n_t,), s, the first of which is the start, a row for each. Where it
-        cannot go on it raises an exception, of any class, or returns NaN from there on. `problem` is a `KnownProblem`.
+        M a + C_q^T lam = Q: one row for each of the `times` (n_t,), s, the first of which is the start. If the
+        simulator fails, it raises any exception, or returns NaN from there on. `problem` is a `KnownProblem`.
     problems : {"smoke", "all"}, str, or sequence of str and KnownProblem
-        A few that together take little time, all, or those named (`twoloop.testing.problems`).
+        A quick selection, all problems, or those named (`twoloop.testing.problems`).
     tolerances : sequence of float
-        From the largest to the smallest.
+        Tolerances in decreasing order.
     steps : sequence of int, optional
-        For simulators of fixed steps, instead of `tolerances`: numbers of steps over the span of each problem, each a
-        multiple of 100, so that steps end at the times. `simulate` then gets the length of the step, s.
+        For fixed-step simulators, instead of `tolerances`: numbers of steps over the span of each problem, multiples of
+        100, so that steps end at the times. `simulate` then gets the step size, s.
     order : float, optional
-        With `steps`: the order that the method has. None: anything from 0.7 up passes.
+        With `steps`: the order of the method. None: an observed order of 0.7 or more passes.
 
     Returns
     -------
@@ -64,25 +64,25 @@ def check_simulator(
     Raises
     ------
     TypeError, ValueError
-        If an argument is out of range, or `simulate` returns no arrays, or arrays of another shape.
+        If an argument is out of range, or `simulate` does not return arrays of the expected shape.
 
     Notes
     -----
-    What is measured on each problem, and what passes. Errors are over the largest coordinate (velocity) of the motion,
-    or 1; G is the growth of perturbations up to an instant (`Motion.growth`), so that errors on a chaotic motion may
-    grow with it.
+    Properties and limits on each problem. Errors are relative to the largest coordinate (velocity) of the motion, or
+    1; G is the growth of perturbations up to a time (`Motion.growth`), which allows for errors on chaotic motions.
 
     - *error of q, v*: with tolerances at most 1000 G times the tolerance, and 0.3; with steps 0.3 at the finest.
-    - *limit of q, v* (steps): what is left when steps go to zero. The finest run's error is at most three times what
-      the last refinement changed; if not, it is one of the model.
-    - *order of q, v* (steps): the fall of the errors at the last refinement, at least `order` - 0.6.
+    - *limit of q, v* (steps): the error as the steps tend to zero. The error of the finest run is at most three times
+      the change by the last refinement; otherwise the model is wrong.
+    - *order of q, v* (steps): the observed order of the last refinement, at least `order` - 0.6.
     - *constraints*, *velocity constraints*: the distances from C = 0 and C_q v + C_t = 0, at most 10 and 100 tolerances
-      at all times; with steps 1e-8, or velocities' distances that fall with the steps.
-    - *energy* and other invariants: drift over the largest kinetic energy, as three errors of q; with steps as limits.
-    - *multipliers*: errors of the forces C_q^T lam, unique also with redundant rows, over the largest.
-    - *frame*, *units*: the errors of the same problem in a frame that is turned and moved, and in mm and g.
-    - *runs*: all tolerances, or the two finest steps, reach the end; a coarse one may say that it does not.
-    - *says that it ends*: on problems that have no motion beyond some time, an exception, or NaN.
+      at all times; with steps 1e-8, or, for velocities, decreasing with the steps.
+    - *energy* and other invariants: drift relative to the largest kinetic energy, at most three times the limit for q;
+      with steps a limit as above.
+    - *multipliers*: relative errors of the forces C_q^T lam, which are unique also with redundant rows.
+    - *frame*, *units*: the errors of the same problem in a rotated and translated frame, and in mm and g.
+    - *runs*: all tolerances, or the two finest steps, reach the end; coarser runs may report a failure.
+    - *says that it ends*: on problems without a motion beyond some time, an exception or NaN.
 
     Examples
     --------
@@ -104,7 +104,7 @@ def check_simulator(
 
 
 def settings_of(tolerances: Sequence[float], steps: Sequence[int] | None, order: float | None) -> Settings:
-    """The settings of a check, their values looked at."""
+    """Return the validated settings of a check."""
     if order is not None and not (_number(order) and order > 0.0):
         raise ValueError(f"order must be a positive number; given {order!r}")
     if steps is not None:
@@ -112,7 +112,7 @@ def settings_of(tolerances: Sequence[float], steps: Sequence[int] | None, order:
         whole = all(isinstance(n, int | np.integer) and n > 0 and n % (N_TIMES - 1) == 0 for n in given)
         if not whole or len(given) < 2 or given != sorted(set(given)):
             raise ValueError(
-                f"steps must be two or more growing numbers of steps, each a multiple of {N_TIMES - 1}; given {steps!r}"
+                f"steps must be two or more increasing numbers, each a multiple of {N_TIMES - 1}; given {steps!r}"
             )
         return Settings(None, tuple(given), order)
     if order is not None:
@@ -130,17 +130,17 @@ def _number(value: Any) -> bool:
 
 
 def check_problem(simulate: Simulate, problem: KnownProblem, settings: Settings) -> tuple[list[Finding], list[Skipped]]:
-    """All properties on one problem, and those that could not be measured."""
+    """Return the findings for all properties of one problem, and those that were not measured."""
     values, motion = settings.of(problem), problem.reference
     if problem.ends is not None:
-        return [_says_so(simulate, problem, values[-1])], []
+        return [_ends(simulate, problem, values[-1])], []
     if motion is None:
         raise ValueError(f"problems must have a known motion; {problem.name!r} has no reference")
     runs = [simulated(simulate, problem, motion.t, value) for value in values]
     findings = [_runs(problem, settings, values, runs)]
     complete = [(value, run) for value, run in zip(values, runs, strict=True) if run.complete]
     if not findings[0].passed:
-        findings = [replace(findings[0], hint=_beginning(simulate, problem, settings, values))]
+        findings = [replace(findings[0], hint=_hint_from_start(simulate, problem, settings, values))]
         return findings, [(problem.name, "everything else", "the run did not come to the end")]
     if len({(run.v is None, run.lam is None) for _, run in complete}) > 1:
         raise TypeError(f"simulate must return the same of q, v and lam in every run; on {problem.name!r} it did not")
@@ -148,19 +148,19 @@ def check_problem(simulate: Simulate, problem: KnownProblem, settings: Settings)
     findings += measured(observed, settings)
     skipped: list[Skipped] = []
     middle = observed.settings[len(observed.settings) // 2]
-    for name, change in SEEN.items():
+    for name, change in TRANSFORMATIONS.items():
         if any(not each.passed and each.property in ("error of q", "limit of q") for each in findings):
             skipped.append((problem.name, name, "the motion itself is wrong"))
             continue
         seen = change(problem)
         run = simulated(simulate, seen.problem, motion.t, middle)
-        findings.append(seen_otherwise(observed, settings, name, seen, run, middle))
+        findings.append(in_transformed(observed, settings, name, seen, run, middle))
     failed = {each.property: each for each in findings if not each.passed}
     return with_hints(findings, Evidence(observed, settings, failed, simulate)), skipped
 
 
-def _beginning(simulate: Simulate, problem: KnownProblem, settings: Settings, values: list[float]) -> str:
-    """What the beginning of a motion points to, of a run that does not come to its end."""
+def _hint_from_start(simulate: Simulate, problem: KnownProblem, settings: Settings, values: list[float]) -> str:
+    """Return a hint from the first part of a run that does not reach the end."""
     motion = problem.reference
     assert motion is not None
     if "redundant" in problem.tags:
@@ -170,7 +170,7 @@ def _beginning(simulate: Simulate, problem: KnownProblem, settings: Settings, va
         begun = Motion(**arrays, digits={name: each[: n + 1] for name, each in motion.digits.items()})
         try:
             runs = [simulated(simulate, problem, begun.t, value) for value in values]
-        except (TypeError, ValueError):  # of another shape: it takes no times but those of the motion
+        except (TypeError, ValueError):  # the simulator accepts no other times than those of the motion
             return ""
         if not all(run.complete and run.v is not None for run in runs):
             continue
@@ -184,17 +184,17 @@ def _beginning(simulate: Simulate, problem: KnownProblem, settings: Settings, va
 
 
 def properties_of(problem: KnownProblem, settings: Settings) -> list[str]:
-    """Names of the properties that can be found on a problem, of a simulator that returns q, v and lam."""
+    """Return the names of the properties measured on a problem for a simulator that returns q, v and lam."""
     if problem.ends is not None:
         return [SAYS_SO]
     kinds = ("error of",) if settings.tolerances else ("error of", "limit of", "order of")
     names = ["runs", *(f"{kind} {which}" for which in "qv" for kind in kinds), "constraints", "velocity constraints"]
     kept = [*problem.invariants, *([] if problem.energy is None else ["energy"])]
-    return [*names, *kept, "multipliers", *SEEN]
+    return [*names, *kept, "multipliers", *TRANSFORMATIONS]
 
 
 def _runs(problem: KnownProblem, settings: Settings, values: list[float], runs: list[Simulated]) -> Finding:
-    """Whether the runs that have to come to the end do: with fixed steps the two finest; a coarse one may say no."""
+    """Check that the required runs reach the end: with fixed steps the two finest."""
     needed = list(zip(values, runs, strict=True))[0 if settings.tolerances else -2 :]
     for value, run in needed:
         if not run.complete:
@@ -210,8 +210,8 @@ def _first_not_finite(run: Simulated) -> str:
     return "no numbers"
 
 
-def _says_so(simulate: Simulate, problem: KnownProblem, setting: float) -> Finding:
-    """A problem that has no motion beyond some time: the only right answer is to say so."""
+def _ends(simulate: Simulate, problem: KnownProblem, setting: float) -> Finding:
+    """Check a problem without a motion beyond some time: the simulator must report a failure."""
     assert problem.ends is not None
     run = simulated(simulate, problem, np.linspace(*problem.t_span, N_TIMES), setting)
     beyond = run.q[run.t > problem.ends + 1e-9]

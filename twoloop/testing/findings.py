@@ -1,4 +1,4 @@
-"""What a check found: rows, and the report of them."""
+"""Findings of a check, and their report."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -6,18 +6,18 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Finding:
-    """A property of a simulator on a problem.
+    """Outcome for one property of a simulator on a problem.
 
     Attributes
     ----------
     problem, property : str
     measured : float or str
-        A number, or what happened instead.
+        A number, or a description.
     allowed : float or str
-        The largest number that passes (of an order, the smallest), or what had to happen.
+        Largest number that passes (for an order, the smallest), or the required outcome.
     passed : bool
     hint : str
-        What the pattern of errors points to; empty where it passed.
+        Likely cause; empty if passed.
     """
 
     problem: str
@@ -30,7 +30,7 @@ class Finding:
 
 @dataclass(frozen=True)
 class Failure:
-    """A property that does not hold: problem, property, what was measured and what is allowed, and a hint."""
+    """A failed property: problem, property, measured and allowed value, and a hint."""
 
     problem: str
     property: str
@@ -45,14 +45,14 @@ class Failure:
 
 @dataclass(frozen=True)
 class Report:
-    """What `check_simulator` found.
+    """Outcome of `check_simulator`.
 
     Attributes
     ----------
     findings : tuple of Finding
-        Every property of every problem, also those that hold.
+        All properties of all problems, passed or failed.
     skipped : tuple of (str, str, str)
-        Problem, property and why it was not measured.
+        Problem, property and the reason why it was not measured.
     """
 
     findings: tuple[Finding, ...]
@@ -60,12 +60,12 @@ class Report:
 
     @property
     def passed(self) -> bool:
-        """Whether every property that was measured holds."""
+        """True if all measured properties passed."""
         return not self.failures
 
     @property
     def failures(self) -> tuple[Failure, ...]:
-        """Those that do not, in the order of the problems."""
+        """The failed properties, in the order of the problems."""
         return tuple(
             Failure(each.problem, each.property, each.measured, each.allowed, each.hint)
             for each in self.findings
@@ -85,7 +85,7 @@ class Report:
         return "\n".join(lines)
 
     def to_markdown(self) -> str:
-        """The report as tables in Markdown: failures with hints, then everything that was measured."""
+        """Return the report as Markdown tables: failures with hints, then all measured properties."""
         lines = [f"# Simulator check: {_count(len(self.failures))}", ""]
         if self.failures:
             lines += ["| problem | property | measured | allowed | hint |", "|---|---|--:|--:|---|"]
@@ -115,5 +115,5 @@ def _in_order(names: Iterable[str]) -> list[str]:
 
 
 def shown(value: float | str) -> str:
-    """A number with three digits, or words as they are."""
+    """Return a number with three digits, or a text unchanged."""
     return value if isinstance(value, str) else f"{value:.3g}"

@@ -1,4 +1,4 @@
-"""What the pattern of errors of a simulator points to."""
+"""Hints at the likely cause of the errors of a simulator."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -8,11 +8,11 @@ import numpy as np
 from twoloop.testing.changes import in_a_frame
 from twoloop.testing.evidence import CLEAR, Evidence
 from twoloop.testing.findings import Finding
-from twoloop.testing.instants import clock, elsewhen, rates_of_time, returned
+from twoloop.testing.instants import clock, rates_of_time, returned, shifted_in_time
 from twoloop.testing.measuring import allowed, forces_of_constraints, lam_errors, still_there, violations
 from twoloop.testing.mistakes import mistaken_acceleration
 from twoloop.testing.properties import SHORT, changes_of, observed_order
-from twoloop.testing.simulated import seen_back, simulated
+from twoloop.testing.simulated import simulated, transformed_back
 
 
 def _singular(e: Evidence) -> str:
@@ -39,7 +39,7 @@ def _acceleration(e: Evidence) -> str:
 
 
 def _one_order_less(e: Evidence) -> bool:
-    """Whether velocities converge an order more slowly than positions."""
+    """Return True if velocities converge with one order less than positions."""
     orders = [observed_order(e.observed, kind) for kind in "qv"] if "order of v" in e.failed else []
     return len(orders) == 2 and None not in orders and float(orders[1] or 0.0) < float(orders[0] or 0.0) - 0.5
 
@@ -69,7 +69,7 @@ def _velocities(e: Evidence) -> str:
             return f"Positions are right and velocities are not. {text}"
     held = "" if "velocity constraints" not in e.failed else " They do not obey C_q v + C_t = 0 either: project them."
     return (
-        "Positions are right and velocities are not: they come from another instant, or not from the final "
+        "Positions are right and velocities are not: they belong to another time, or not to the final "
         f"iteration, or were not corrected with the positions.{held}"
     )
 
@@ -114,11 +114,11 @@ def _unused(e: Evidence) -> str:
 
 
 def _falls(e: Evidence) -> bool:
-    """Whether the error of q goes on falling."""
+    """Return True if the error of q keeps decreasing."""
     errors = e.observed.errors("q")
     if e.settings.tolerances is not None:
         return len(errors) < 2 or errors[-1].max() <= 0.3 * errors[0].max()
-    if "error of q" in e.failed:  # while it is small: later on there is nothing to compare
+    if "error of q" in e.failed:  # while the error is small
         return e.early_order is not None and e.early_order > 0.5
     value, rest = still_there(errors, changes_of(e.observed, "q"), e.observed.floor("q"))
     return value <= rest and errors[-1].max() < 0.8 * errors[-2].max()
@@ -157,7 +157,7 @@ def _orders(e: Evidence) -> str:
 
 
 def _order_seen(e: Evidence, kind: str, seen: float) -> str:
-    """What an order points to that is too small."""
+    """Return the likely cause of an observed order that is too small."""
     what, said = f"the error of {kind}", e.settings.order
     before = e.order_of(kind, 2) if len(e.observed.runs) > 2 else None
     if seen < -0.5:
@@ -222,7 +222,7 @@ def _frame(e: Evidence) -> str:
     wrong = []
     for name, turn, move in (("turned", 0.7, 0.0), ("moved", 0.0, 1.0)):
         seen = in_a_frame(e.observed.problem, turn, move)
-        run = seen_back(simulated(e.simulate, seen.problem, motion.t, middle), seen)
+        run = transformed_back(simulated(e.simulate, seen.problem, motion.t, middle), seen)
         error = np.abs(run.q - motion.q).max() / motion.scales[0] if run.complete else np.inf
         if error > least:
             wrong.append(name)
@@ -257,7 +257,7 @@ def _rates(e: Evidence) -> str:
 
 
 def _where(e: Evidence) -> str:
-    """Nothing else fits: from when on the motion is another one."""
+    """Return, as a last resort, the time from which the motion is wrong."""
     motion = e.observed.motion
     off = np.flatnonzero(e.position > 0.01)
     if not off.size:
@@ -269,15 +269,15 @@ def _where(e: Evidence) -> str:
 
 
 MOTION: tuple[Callable[[Evidence], str], ...] = (
-    *(returned, elsewhen, _singular, _acceleration, rates_of_time, _velocities, clock, _unused, _drift),
+    *(returned, shifted_in_time, _singular, _acceleration, rates_of_time, _velocities, clock, _unused, _drift),
     *(_floor, _orders, _coarse, _slack, _rates, _where),
 )
 OWN: dict[str, Callable[[Evidence], str]] = {"multipliers": _multipliers, "frame": _frame, "units": _units}
-MOVING = ("error of", "limit of", "order of")  # how properties begin that the multipliers follow
+MOVING = ("error of", "limit of", "order of")  # prefixes of properties on which the multipliers depend
 
 
 def with_hints(findings: list[Finding], evidence: Evidence) -> list[Finding]:
-    """The findings, those that failed with what their pattern points to."""
+    """Return the findings with hints added to the failures."""
     general = ""
     if any(name not in OWN for name in evidence.failed):
         general = next((text for rule in MOTION if (text := rule(evidence))), "")

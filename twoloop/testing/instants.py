@@ -1,4 +1,4 @@
-"""Hints of states, of rates or of drives that are those of another instant."""
+"""Hints for states, rates or drives that belong to another time."""
 
 import numpy as np
 
@@ -6,11 +6,11 @@ from twoloop.testing.evidence import CLEAR, Evidence
 from twoloop.testing.known_problem import Array, Motion
 from twoloop.testing.measuring import HELD_BY_STEPS
 
-DENSE = 20  # points between two times of a known motion
+DENSE = 20  # interpolation points per interval of a known motion
 
 
 def returned(e: Evidence) -> str:
-    """States that are right, and returned wrongly."""
+    """Return a hint for states that are right but returned wrongly."""
     if not e.wrong("q"):
         return ""
     q, motion, kinds = e.observed.runs[-1].q, e.observed.motion, e.observed.problem.coordinates
@@ -34,8 +34,8 @@ def returned(e: Evidence) -> str:
     return ""
 
 
-def elsewhen(e: Evidence) -> str:
-    """States of the known motion, all of them later or earlier by a time, or on a clock that goes faster or slower."""
+def shifted_in_time(e: Evidence) -> str:
+    """Return a hint for states shifted in time, or on a clock that runs fast or slow."""
     run, motion = e.observed.runs[-1], e.observed.motion
     if run.v is None or not (e.wrong("q") or "order of q" in e.failed):
         return ""
@@ -60,7 +60,7 @@ def elsewhen(e: Evidence) -> str:
         known = _between(motion, np.clip(at, begin, motion.t[-1]))
         found = zip((run.q, run.v), known, motion.scales, errors, strict=True)
         if all(np.abs(mine - own)[later].max() / scale < CLEAR * error for mine, own, scale, error in found):
-            # by a clock of their own positions do not change by the velocities; under wrong forces they do
+            # with a wrong clock the positions do not change at the rate of the velocities; with wrong forces they do
             off, left = (np.linalg.norm((rates - factor * run.v)[later]) for factor in (1.0, ratio))
             if text is not slow or left < 0.5 * off:
                 return text
@@ -68,7 +68,7 @@ def elsewhen(e: Evidence) -> str:
 
 
 def _between(motion: Motion, times: Array) -> tuple[Array, Array]:
-    """States of a motion between its times, by the cubic of Hermite and its derivative."""
+    """Interpolate the states of a motion by cubic Hermite polynomials and their derivatives."""
     k = np.clip(np.searchsorted(motion.t, times) - 1, 0, motion.t.size - 2)
     h = (motion.t[k + 1] - motion.t[k])[:, None]
     x = (times - motion.t[k])[:, None] / h
@@ -78,7 +78,7 @@ def _between(motion: Motion, times: Array) -> tuple[Array, Array]:
 
 
 def _nearest(motion: Motion, q: Array, v: Array) -> Array:
-    """Times (n,) at which a motion is nearest to states (n, n_q)."""
+    """Return the times (n,) at which a motion is nearest to states (n, n_q)."""
     times = np.linspace(motion.t[0], motion.t[-1], DENSE * (motion.t.size - 1) + 1)
     known = np.hstack([part / scale for part, scale in zip(_between(motion, times), motion.scales, strict=True)])
     rates, found = np.gradient(known, times, axis=0), np.hstack([q / motion.scales[0], v / motion.scales[1]])
@@ -89,7 +89,7 @@ def _nearest(motion: Motion, q: Array, v: Array) -> Array:
 
 
 def rates_of_time(e: Evidence) -> str:
-    """Velocities that obey C_q v + C_t = 0 without C_t, or with C_q and C_t of one step before."""
+    """Return a hint for velocities that satisfy C_q v + C_t = 0 without C_t, or with terms of the previous step."""
     problem, run = e.observed.problem, e.observed.runs[-1]
     if run.v is None or not {"velocity constraints", "order of v", "limit of v"} & set(e.failed):
         return ""
@@ -112,7 +112,7 @@ def rates_of_time(e: Evidence) -> str:
 
 
 def clock(e: Evidence) -> str:
-    """Constraints that hold at the time since the start."""
+    """Return a hint for constraints evaluated at the time since the start."""
     problem, run = e.observed.problem, e.observed.runs[-1]
     begin = problem.t_span[0]
     if begin == 0.0 or "constraints" not in e.failed:

@@ -1,4 +1,4 @@
-"""Reads the known motions of the wheel, which tests/testing/make_motions.py writes, and puts problems together."""
+"""Reads the known motions in the wheel, written by tests/testing/make_motions.py, and assembles problems."""
 
 from functools import cache
 from pathlib import Path
@@ -9,12 +9,12 @@ import numpy as np
 from twoloop.testing.known_problem import KnownProblem, Motion
 
 FILE = Path(__file__).with_name("known_motions.npz")
-N_TIMES = 101  # of a motion, at equal distances
+N_TIMES = 101  # equidistant times of a motion
 
 
 @cache
 def known_motion(name: str) -> Motion | None:
-    """The motion of a problem, read-only; None where none is stored."""
+    """Return the motion of a problem, read-only; None if none is stored."""
     with np.load(FILE, allow_pickle=False) as file:
         if f"{name}/t" not in file:
             return None
@@ -28,7 +28,7 @@ def known_motion(name: str) -> Motion | None:
 def posed(
     name: str, equations: Any, start: tuple[Any, Any], end: float, tags: str, begin: float = 0.0, **more: Any
 ) -> KnownProblem:
-    """A problem with its known motion; `tags` are divided by commas."""
+    """Return a problem with its known motion; `tags` are separated by commas."""
     told = ("mass", "force", "constraint", "jacobian", "constraint_rate", "gamma", "energy", "coordinates")
     known: dict[str, Any] = {each: getattr(equations, each) for each in told} | {"reference": known_motion(name)}
     known |= {"t_span": (begin, end), "tags": tuple(tags.split(", ")), "row_powers": np.array(equations.row_powers)}

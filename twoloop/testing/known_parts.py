@@ -1,4 +1,4 @@
-"""Bodies and joints of a known problem, for simulators that are given these."""
+"""Bodies and joints of a known problem, for simulators that are based on these."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -13,16 +13,16 @@ GROUND = -1
 
 @dataclass(frozen=True, eq=False)
 class KnownBody:
-    """A point, or a rigid body about its centre of mass.
+    """A point mass, or a rigid body with its centre of mass as reference.
 
     Attributes
     ----------
     mass : float
         kg.
     inertia : ndarray (0,), (1,) or (3,)
-        kg m^2: none of a point, the moment in the plane, the principal moments along the axes of the body.
+        kg m^2: empty for a point, the moment in the plane, or the principal moments in body axes.
     columns : slice
-        Its coordinates in q: of the centre of mass, then an angle or four Euler parameters.
+        Its coordinates in q: centre of mass, then an angle or four Euler parameters.
     """
 
     mass: float
@@ -32,26 +32,26 @@ class KnownBody:
 
 @dataclass(frozen=True, eq=False)
 class KnownJoint:
-    """A joint of two bodies, or of a body and the ground.
+    """A joint between two bodies, or a body and the ground.
 
     Attributes
     ----------
     kind : str
-        "revolute", "spherical" (both bodies share a point), "distance" (of two points), "prismatic" (in the plane: the
-        body's point stays on a line of the ground, and its angle as it is) or "drive" (the angle of the first body is
-        a function of time).
+        "revolute", "spherical" (both bodies share a point), "distance" (of two points), "prismatic" (in the plane: a
+        point of the body stays on a line of the ground, and its angle is constant) or "drive" (the angle of the first
+        body is a function of time).
     bodies : (int, int)
-        Numbers in `KnownProblem.bodies`; -1 is the ground.
+        Indices in `KnownProblem.bodies`; -1 is the ground.
     points : (ndarray, ndarray)
-        On each body from its centre along its axes, of the ground in space, m.
+        Point on each body in body axes, relative to its centre; on the ground in space, m.
     rows : slice
         Its rows of C.
     axis : ndarray or None
-        Direction along the axes of the second body: of a hinge in space, (3,), or of the line of a slider, (2,).
+        Direction in the axes of the second body: of a spatial hinge, (3,), or of the line of a slider, (2,).
     length : float or None
-        m, of a distance.
+        Length of a distance, m.
     motion : tuple of callable or None
-        Of a drive: the angle as a function of time, rad, and its two derivatives.
+        The angle of a drive as a function of time, rad, and its first two derivatives.
     """
 
     kind: str

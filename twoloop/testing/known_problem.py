@@ -1,4 +1,4 @@
-"""A problem whose motion is known: its equations as functions of numpy arrays, its start, and what is known."""
+"""A problem with a known motion: equations as functions of numpy arrays, initial state, and reference."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -13,21 +13,21 @@ Quantity = Callable[[float, Array, Array], float]
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """A motion that is known from two unlike routes.
+    """A reference motion confirmed by two different methods.
 
     Attributes
     ----------
     t : ndarray (n_t,)
-        Times, s, at equal distances from the start to the end of the problem.
+        Equidistant times from the start to the end of the problem, s.
     q, v : ndarray (n_t, n_q)
-        Coordinates and velocities, a row for each time.
+        Coordinates and velocities, one row per time.
     lam : ndarray (n_t, n_c)
-        Multipliers of M a + C_q^T lam = Q, those of least norm where rows are redundant.
+        Multipliers of M a + C_q^T lam = Q; of minimum norm if rows are redundant.
     digits : dict of str to ndarray (n_t,)
-        "q", "v", "lam": decimals on which the routes agree, over max(1, largest value of the motion).
+        "q", "v", "lam": decimals on which the two methods agree, relative to max(1, largest value of the motion).
     growth : ndarray (n_t,)
-        By which factor, at most, a perturbation of the state at an earlier time has grown, q and v each relative
-        to its largest value. At least 1.
+        Largest growth factor of a perturbation of an earlier state, with q and v relative to their largest values.
+        At least 1.
     """
 
     t: Array
@@ -39,20 +39,20 @@ class Motion:
 
     @property
     def scales(self) -> tuple[float, float]:
-        """Largest coordinate and velocity of the motion, at least 1: what errors are relative to."""
+        """Return the largest coordinate and velocity of the motion, at least 1, to which errors are relative."""
         return max(1.0, float(np.abs(self.q).max())), max(1.0, float(np.abs(self.v).max()))
 
 
 @dataclass(frozen=True, eq=False)
 class KnownProblem:
-    """Equations M(t, q) a + C_q^T lam = Q(t, q, v), C(t, q) = 0, a start, and what is known of the motion.
+    """Equations M(t, q) a + C_q^T lam = Q(t, q, v), C(t, q) = 0, initial state, and known properties of the motion.
 
     Attributes
     ----------
     name : str
-        As `problems` and `check_simulator` take it.
+        Name for `problems` and `check_simulator`.
     mass : callable
-        mass(t, q) -> M (n_q, n_q), of full rank on the directions that C_q allows.
+        mass(t, q) -> M (n_q, n_q), nonsingular on the null space of C_q.
     force : callable
         force(t, q, v) -> Q (n_q,).
     constraint, jacobian, constraint_rate : callable
@@ -60,36 +60,36 @@ class KnownProblem:
     gamma : callable
         gamma(t, q, v) -> right-hand side (n_c,) of C_q a = gamma.
     energy : callable or None
-        energy(t, q, v) -> J, where the motion keeps it.
+        energy(t, q, v) -> J, if it is conserved.
     q0, v0 : ndarray (n_q,)
-        Consistent start, read-only.
+        Consistent initial state, read-only.
     t_span : (float, float)
         Start and end of the motion, s.
     tags : tuple of str
-        Of `TAGS`.
+        Keys of `TAGS`.
     coordinates : tuple of str
-        What each is: "x", "y", "z" of a point, m; "angle" in the plane from the x axis, "relative" to another body,
-        rad; "e0" ... "e3", Euler parameters.
+        Kind of each coordinate: "x", "y", "z" of a point, m; "angle" in the plane from the x axis, or "relative" to
+        another body, rad; "e0" ... "e3", Euler parameters.
     row_powers : ndarray (n_c,)
         Power of the unit of length in each row of C: 1 for m, 2 for m^2, 0 for an angle.
     reference : Motion or None
-        The known motion; None where there is none to the end.
+        The known motion; None if the motion does not exist up to the end.
     invariants : mapping of str to callable
-        Further functions of (t, q, v) that the motion keeps.
+        Further conserved functions of (t, q, v).
     singular_times : tuple of float
-        When C_q loses rank.
+        Times at which C_q loses rank.
     ends : float or None
-        When the motion ends: beyond this there is none, and a simulator has to say so.
+        Time beyond which no motion exists, so that a simulator must report a failure.
     period : float or None
-        After which the motion repeats itself, s, where it does.
+        Period of the motion, s, if it is periodic.
     bodies : tuple of KnownBody
-        Where points or rigid bodies under `gravity`, with `joints`, are the whole problem; else empty.
+        Points or rigid bodies, if these, `joints` and `gravity` make up the whole problem; otherwise empty.
     joints : tuple of KnownJoint
-        In the order of their rows.
+        Joints in the order of their rows.
     gravity : ndarray (2,) or (3,) or None
         m/s^2.
     note : str
-        What the problem shows.
+        Purpose of the problem.
     """
 
     name: str
@@ -117,7 +117,7 @@ class KnownProblem:
     note: str = ""
 
     def __post_init__(self) -> None:
-        for name in ("q0", "v0"):  # a simulator that steps in place is not to change the start of its next run
+        for name in ("q0", "v0"):  # read-only: a simulator might step in place
             start = np.array(getattr(self, name), dtype=float)
             start.flags.writeable = False
             object.__setattr__(self, name, start)
@@ -133,14 +133,14 @@ class KnownProblem:
         return self.row_powers.size
 
     def acceleration(self, t: float, q: Array, v: Array) -> tuple[Array, Array]:
-        """Acceleration (n_q,) and multipliers (n_c,) at a consistent state, those of least norm."""
+        """Return the acceleration (n_q,) and multipliers (n_c,) at a consistent state; minimum norm."""
         return solved(self.mass(t, q), self.force(t, q, v), self.jacobian(t, q), self.gamma(t, q, v))
 
     def reaction(self, joint: KnownJoint, t: float, q: Array, lam: Array) -> tuple[Array, Array]:
-        """Force (n_axes,), N, and torque (0,), (1,) or (3,), N m, of a joint on its first body, about its first point.
+        """Return force (n_axes,), N, and torque (0,), (1,) or (3,), N m, of a joint on its first body, at its point.
 
-        Along the axes of space. With redundant rows they depend on the choice of lam, of which `reference` has the
-        least.
+        Components along the axes of space. With redundant rows they depend on the choice of lam; that of `reference`
+        has minimum norm.
         """
         body = self.bodies[joint.bodies[0]]
         position = q[body.columns]
@@ -163,16 +163,16 @@ class KnownProblem:
 
 
 def solved(M: Array, Q: Array, J: Array, right: Array) -> tuple[Array, Array]:
-    """Solution a, lam of M a + J^T lam = Q, J a = right, of least norm in lam."""
+    """Return the solution a, lam of M a + J^T lam = Q, J a = right, with minimum norm of lam."""
     n, m = J.shape[1], J.shape[0]
     matrix = np.block([[M, J.T], [J, np.zeros((m, m))]])
     scale = np.ones(n + m)
-    for _ in range(5):  # in any units all rows get a largest entry of 1 (Ruiz 2001), before ranks are told
+    for _ in range(5):  # equilibration (Ruiz 2001), so that ranks do not depend on units
         size = np.abs(scale[:, None] * matrix * scale).max(axis=1)
         scale /= np.sqrt(np.where(size > 0.0, size, 1.0))
     right = scale * np.concatenate([Q, right])
     whole, _, rank, _ = np.linalg.lstsq(scale[:, None] * matrix * scale, right, rcond=1e-12)
     a, lam = np.split(scale * whole, [n])
-    if rank < n + m:  # of least norm in units of the rows, not in those just chosen
+    if rank < n + m:  # minimum norm in the original units of the rows
         lam = np.linalg.lstsq(J.T, J.T @ lam, rcond=1e-11)[0]
     return a, lam

@@ -1,4 +1,4 @@
-"""The problems whose motions are known, by name and by tag."""
+"""Problems with known motions, by name and by tag."""
 
 from collections.abc import Iterable
 from typing import Any
@@ -34,28 +34,28 @@ MAKERS = {
 
 
 def problems(tags: str | Iterable[str] | None = None) -> list[KnownProblem]:
-    """Problems whose motions are known, in plain numpy: to test a simulator with.
+    """Return problems with known motions in plain numpy, to test a simulator.
 
     Parameters
     ----------
     tags : str or sequence of str, optional
-        Of `KnownProblem.tags`: those that have all of them. None: every problem.
+        Tags of `KnownProblem.tags` that the problems must have. None: all problems.
 
     Returns
     -------
     list of KnownProblem
-        Equations, start, and the known motion, `reference`.
+        Problems with equations, initial state, and the known motion `reference`.
 
     Raises
     ------
     ValueError
-        If no problem has such a tag.
+        If a tag is unknown.
 
     Notes
     -----
-    The motions in the wheel were made by two unlike routes, and hold the decimals on which these agree
-    (`Motion.digits`): twoloop's Gauss method, and SciPy's DOP853 on equations in few coordinates, or on those of
-    index 1 with projections.
+    The motions in the wheel were computed by two different methods, whose agreement is stored in `Motion.digits`:
+    twoloop's Gauss method, and SciPy's DOP853 on equations in minimal coordinates, or on the index-1 equations with
+    projection.
 
     Examples
     --------
@@ -72,7 +72,7 @@ def problems(tags: str | Iterable[str] | None = None) -> list[KnownProblem]:
 
 
 def named(choice: str | KnownProblem | Iterable[str | KnownProblem]) -> list[KnownProblem]:
-    """The problems of a choice: "smoke", "all", a name, or names and problems."""
+    """Return the problems selected by "smoke", "all", a name, or names and problems."""
     if isinstance(choice, str) and choice in ("smoke", "all"):
         return problems("smoke" if choice == "smoke" else None)
     chosen: list[KnownProblem] = []
@@ -89,7 +89,7 @@ def named(choice: str | KnownProblem | Iterable[str | KnownProblem]) -> list[Kno
 
 
 def listed(name: str, given: Any) -> list[Any]:
-    """The members of a list that was given, or the one text."""
+    """Return the elements of a list, or a single text as a list."""
     if not isinstance(given, Iterable):
         raise TypeError(f"{name} must be a list; given {given!r}")
     return [given] if isinstance(given, str) else list(given)

@@ -1,4 +1,4 @@
-"""Problems of rigid bodies in a plane: four-bars, slider-cranks, a driven crank, Andrews' mechanism."""
+"""Planar rigid-body problems: four-bars, slider-cranks, a driven crank, Andrews' mechanism."""
 
 import cmath
 import math
@@ -15,7 +15,7 @@ GRAVITY = 9.81  # m/s^2
 
 
 def _pinned(rods_: list[float], masses: list[float], ground: float) -> PlanarEquations:
-    """Rods in a chain from the origin to a ground joint on the x axis."""
+    """Return rods in a chain from the origin to a ground joint on the x axis."""
     equations = PlanarEquations(masses, rods(rods_, masses), GRAVITY)
     equations.pin(0, (-0.5 * rods_[0], 0.0), GROUND, (0.0, 0.0))
     for i in range(1, len(rods_)):
@@ -25,7 +25,7 @@ def _pinned(rods_: list[float], masses: list[float], ground: float) -> PlanarEqu
 
 
 def _chained(lengths: list[float], angles: list[float]) -> Array:
-    """Coordinates of rods that follow one another from the origin."""
+    """Return the coordinates of rods in a chain starting at the origin."""
     states, end = [], 0j
     for length, angle in zip(lengths, angles, strict=True):
         states.append((end + cmath.rect(0.5 * length, angle), angle))
@@ -33,8 +33,8 @@ def _chained(lengths: list[float], angles: list[float]) -> Array:
     return bodies(*states)
 
 
-def _meet(tip: complex, ground: float, second: float, third: float) -> list[float]:
-    """Angles of two rods from a tip to a ground joint, their joint above the line between."""
+def _two_rods(tip: complex, ground: float, second: float, third: float) -> list[float]:
+    """Return the angles of two rods from a tip to a ground joint, with their joint above the connecting line."""
     gap = ground - tip
     corner = math.acos((second**2 + abs(gap) ** 2 - third**2) / (2.0 * second * abs(gap)))
     angle = cmath.phase(gap) + corner
@@ -42,7 +42,7 @@ def _meet(tip: complex, ground: float, second: float, third: float) -> list[floa
 
 
 def _moving(equations: PlanarEquations, q0: Array, coordinate: int, rate: float) -> tuple[Array, Array]:
-    """A start of a mechanism with one freedom, of which a coordinate has a given rate."""
+    """Return an initial state of a mechanism with one degree of freedom, with a given rate of one coordinate."""
     along = np.linalg.svd(equations.jacobian(0.0, q0))[2][-1]
     return q0, along * (rate / along[coordinate])
 
@@ -51,7 +51,7 @@ def four_bar() -> KnownProblem:
     """Uniform rods of 1, 2 and 1.5 m and 1 kg/m on 3 m of ground, released with the third one level."""
     lengths = [1.0, 2.0, 1.5]
     equations = _pinned(lengths, lengths, 3.0)
-    # joint 2-3 is (1.5, 0): the joint 1-2 lies below
+    # joint 2-3 is at (1.5, 0), joint 1-2 below it
     first = -math.acos((1.0 + 2.25 - 4.0) / 3.0)
     second = cmath.phase(1.5 - cmath.rect(1.0, first))
     q0 = _chained(lengths, [first, second, 0.0])
@@ -64,7 +64,7 @@ def crank_rocker() -> KnownProblem:
     """Uniform rods of 0.5, 1.5 and 1.2 m and 1 kg/m on 1.6 m of ground, the crank turning at 12 rad/s at the start."""
     lengths = [0.5, 1.5, 1.2]
     equations = _pinned(lengths, lengths, 1.6)
-    q0 = _chained(lengths, [1.0, *_meet(cmath.rect(0.5, 1.0), 1.6, 1.5, 1.2)])
+    q0 = _chained(lengths, [1.0, *_two_rods(cmath.rect(0.5, 1.0), 1.6, 1.5, 1.2)])
     note = "the crank turns around, its angle grows beyond a turn"
     return posed("crank_rocker", equations, _moving(equations, q0, 2, 12.0), 2.0, "closed chain, planar", note=note)
 
@@ -94,7 +94,7 @@ def slider_crank() -> KnownProblem:
 
 
 def redundant_slider_crank() -> KnownProblem:
-    """The slider-crank with a ninth row, the distance of its pins, that follows from the others."""
+    """The slider-crank with a dependent ninth row, the distance of its pins."""
     equations, start = _slider_rows(), _slider_start(0.5, 8.0)
     equations.distance(2, (0.0, 0.0), 0, (0.25, 0.0), 1.2)
     tags = "smoke, redundant, closed chain, planar"
@@ -111,7 +111,7 @@ def _turning(start: float, rate: float, amplitude: float, frequency: float) -> A
 
 
 def driven_slider_crank() -> KnownProblem:
-    """The slider-crank, its crank at the angle 0.5 + 4 t + 0.3 sin(3 t), from t = 0.5 s on: no freedom is left."""
+    """The slider-crank with prescribed crank angle 0.5 + 4 t + 0.3 sin(3 t) from t = 0.5 s: no degree of freedom."""
     equations, drive = _slider_rows(), _turning(0.5, 4.0, 0.3, 3.0)
     equations.drive(0, drive)
     note = "as many rows as coordinates: everything is C_t and gamma; and the motion does not begin at t = 0"
@@ -120,7 +120,7 @@ def driven_slider_crank() -> KnownProblem:
 
 
 def driven_crank() -> KnownProblem:
-    """A rod of 1 m that hangs from the pin of a crank of 0.3 m, which is driven at the angle 2.5 t + 0.2 sin(t)."""
+    """A rod of 1 m hanging from the pin of a crank of 0.3 m, which is driven at the angle 2.5 t + 0.2 sin(t)."""
     masses = [0.4, 1.0]
     equations = PlanarEquations(masses, rods([0.3, 1.0], masses), GRAVITY)
     equations.pin(0, (-0.15, 0.0), GROUND, (0.0, 0.0))

@@ -1,4 +1,4 @@
-"""Errors of runs against the known motion, and what a tolerance or a step allows."""
+"""Errors of runs relative to the known motion, and the limits for a tolerance or step size."""
 
 from dataclasses import dataclass
 
@@ -7,14 +7,14 @@ import numpy as np
 from twoloop.testing.known_problem import Array, KnownProblem, Motion, Quantity
 from twoloop.testing.simulated import Simulated
 
-SAFETY = 1000.0  # tolerances that an error may have, times the growth of perturbations: a tolerance is one of steps
-MOST = 0.3  # an error that no tolerance allows
-HELD = 10.0  # tolerances by which positions may be off the constraints, at any time
-HELD_RATES = 100.0  # and velocities
-HELD_BY_STEPS = 1e-8  # what positions may be off the constraints in runs of fixed steps, whatever their length
-ROUNDING = 1e-9  # of such runs, times the growth: errors below are not compared
-UNRESOLVED = 1e-2  # what steps longer than a stiff vibration may leave, however long they are
-LAM_DIGITS = 6.0  # of the known multipliers, below which these are not compared
+SAFETY = 1000.0  # allowed global error in tolerances (which apply per step), times the growth of perturbations
+MOST = 0.3  # largest error allowed at any tolerance
+HELD = 10.0  # allowed position constraint violation, in tolerances
+HELD_RATES = 100.0  # allowed velocity constraint violation, in tolerances
+HELD_BY_STEPS = 1e-8  # allowed position constraint violation with fixed steps
+ROUNDING = 1e-9  # with fixed steps, times the growth: smaller errors are not compared
+UNRESOLVED = 1e-2  # error allowed for steps that do not resolve a stiff vibration
+LAM_DIGITS = 6.0  # digits of the known multipliers required for a comparison
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,7 @@ class Settings:
     order: float | None
 
     def of(self, problem: KnownProblem) -> list[float]:
-        """What the simulator gets: tolerances, or the length of the steps, s."""
+        """Return the settings for the simulator: tolerances, or step sizes, s."""
         if self.tolerances is not None:
             return list(self.tolerances)
         assert self.steps is not None
@@ -35,7 +35,7 @@ class Settings:
 
 @dataclass(frozen=True, eq=False)
 class Observed:
-    """The runs of a problem that came to the end, from the coarsest to the finest, with their settings."""
+    """The completed runs of a problem, from the coarsest to the finest, with their settings."""
 
     problem: KnownProblem
     motion: Motion
@@ -43,36 +43,36 @@ class Observed:
     runs: list[Simulated]
 
     def errors(self, kind: str) -> list[Array]:
-        """Errors (n_t,) of "q" or "v" of each run, over the largest value of the motion."""
+        """Return the errors (n_t,) of "q" or "v" of each run, relative to the largest value of the motion."""
         scale = dict(zip("qv", self.motion.scales, strict=True))[kind]
         known = getattr(self.motion, kind)
         return [np.abs(getattr(run, kind) - known).max(axis=1) / scale for run in self.runs]
 
     @property
     def rounding(self) -> Array:
-        """What is not compared in runs of fixed steps (n_t,)."""
+        """Return the errors (n_t,) attributed to rounding in fixed-step runs."""
         stiff = UNRESOLVED if "stiff" in self.problem.tags else 0.0
         return ROUNDING * self.motion.growth + stiff
 
     def floor(self, kind: str) -> Array:
-        """What is not told from rounding (n_t,): the digits of the reference, and rounding that has grown."""
+        """Return the smallest meaningful errors (n_t,): accuracy of the reference and amplified rounding."""
         return 10.0 * 10.0 ** -self.motion.digits[kind] + 0.1 * ROUNDING * self.motion.growth
 
 
 def allowed(motion: Motion, tolerance: float) -> Array:
-    """The largest error (n_t,) at a tolerance, without the floor."""
+    """Return the largest allowed error (n_t,) at a tolerance, without the floor."""
     return np.minimum(MOST, SAFETY * tolerance * motion.growth)
 
 
 def violations(problem: KnownProblem, run: Simulated, scales: tuple[float, float]) -> tuple[Array, Array | None]:
-    """Least distances (n_t,) of q and v from the constraints, over the largest values of the motion."""
+    """Return the distances (n_t,) of q and v from the constraints, relative to the largest values of the motion."""
     off, rates = np.zeros(run.t.size), np.zeros(run.t.size)
     for k, (t, q) in enumerate(zip(run.t, run.q, strict=True)):
         J = problem.jacobian(t, q)
         values = [problem.constraint(t, q)]
         if run.v is not None:
             values.append(J @ run.v[k] + problem.constraint_rate(t, q))
-        # rows of the same size, or a rank would depend on the units; near singular positions only what can be corrected
+        # scaled rows, so that the rank does not depend on units; near singular positions only the correctable part
         size = np.linalg.norm(J, axis=1)
         size = np.where(size > 0.0, size, 1.0)[:, None]
         moved = np.linalg.lstsq(J / size, np.column_stack(values) / size, rcond=1e-6)[0]
@@ -83,7 +83,7 @@ def violations(problem: KnownProblem, run: Simulated, scales: tuple[float, float
 
 
 def drifts(problem: KnownProblem, quantity: Quantity, run: Simulated, motion: Motion) -> Array:
-    """Change (n_t,) of an invariant, over the range of the kinetic energy, or over the invariant itself."""
+    """Return the change (n_t,) of an invariant relative to the range of the kinetic energy, or to the invariant."""
     assert run.v is not None
     values = np.array([quantity(*state) for state in zip(run.t, run.q, run.v, strict=True)])
     known = quantity(problem.t_span[0], problem.q0, problem.v0)
@@ -94,24 +94,24 @@ def drifts(problem: KnownProblem, quantity: Quantity, run: Simulated, motion: Mo
 
 
 def forces_of_constraints(problem: KnownProblem, motion: Motion, lam: Array) -> Array:
-    """C_q^T lam (n_t, n_q) on the known motion: unique also where multipliers are not."""
+    """Return C_q^T lam (n_t, n_q) on the known motion, unique even if the multipliers are not."""
     states = zip(motion.t, motion.q, lam, strict=True)
     return np.array([problem.jacobian(t, q).T @ own for t, q, own in states])
 
 
 def lam_errors(observed: Observed) -> list[Array]:
-    """Errors (n_t,) of the forces of the constraints of each run, over the largest; 0 where they are not known."""
+    """Return the relative errors (n_t,) of the constraint forces of each run; 0 where they are unknown."""
     problem, motion = observed.problem, observed.motion
     known = forces_of_constraints(problem, motion, motion.lam)
     scale = max(1e-12, np.abs(known).max())
     told = motion.digits["lam"] > LAM_DIGITS
-    told[0] = False  # at the start many have none yet
+    told[0] = False  # many simulators have no multipliers at the start
     found = [forces_of_constraints(problem, motion, run.lam) for run in observed.runs if run.lam is not None]
     return [np.where(told, np.abs(forces - known).max(axis=1) / scale, 0.0) for forces in found]
 
 
 def order(coarse: Array, fine: Array, ratio: float, floor: Array) -> float | None:
-    """Observed order of errors (n_t,) of two runs, over the times where both are far from rounding and from 1."""
+    """Return the observed order from errors (n_t,) of two runs, at times where both are above rounding and below 1."""
     usable = np.logical_and.accumulate(coarse < 0.1) & (np.maximum.accumulate(fine) > 10.0 * floor)
     if not usable.any() or fine[usable].max() == 0.0:
         return None
@@ -119,9 +119,9 @@ def order(coarse: Array, fine: Array, ratio: float, floor: Array) -> float | Non
 
 
 def still_there(errors: list[Array], changes: list[Array], floor: Array) -> tuple[float, float]:
-    """An error of the finest run, and what may be left there: three times its change by the last refinement.
+    """Return an error of the finest run and its limit: three times the change by the last refinement.
 
-    Of the errors that are not small beside the largest; small ones may be zeros on the way.
+    Errors much smaller than the largest are ignored, because they may be zero crossings.
     """
     rest = np.maximum(3.0 * np.maximum.accumulate(changes[-1]), floor)
     worst = int(np.argmax(np.where(errors[-1] > 0.1 * errors[-1].max(), errors[-1] / rest, 0.0)))

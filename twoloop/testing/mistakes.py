@@ -1,4 +1,4 @@
-"""What a simulator takes for the acceleration, told from its velocities, and which mistake would make it so."""
+"""Identifies mistakes in a simulator from its accelerations, which are estimated from its velocities."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -9,17 +9,17 @@ from twoloop.testing.changes import begun_later
 from twoloop.testing.known_problem import Array, KnownProblem, solved
 from twoloop.testing.simulated import Simulate, simulated
 
-PLACES = range(0, 86, 5)  # of the known motion, from which the simulator is started
-LATER = 10  # output times after which it is looked at
-SURE = 3.0  # times the change by a finer difference quotient, from which on a difference of accelerations is one
-EXPLAINS = 0.15  # of the difference from the true acceleration, which may remain
-FITS = 0.05  # of it where a number is fitted
-ALIKE = 1e-4  # of it by which two fits may differ by rounding and differences
+START_INDICES = range(0, 86, 5)  # indices of the known motion from which the simulator is started
+N_LATER = 10  # number of output times after which its acceleration is measured
+SURE = 3.0  # a difference of accelerations is significant above this multiple of the estimated error
+EXPLAINS = 0.15  # largest remaining fraction of the difference for an accepted explanation
+FITS = 0.05  # the same for explanations with a fitted factor
+TIE = 1e-4  # fits whose residuals differ by less count as equal
 Mistake = Callable[[KnownProblem, float, Array, Array], Array]
 
 
 def _with(**edits: Callable[..., Array]) -> Mistake:
-    """The acceleration with some of M, Q, J and gamma replaced."""
+    """Return the acceleration with some of M, Q, J and gamma replaced."""
 
     def mistaken(problem: KnownProblem, t: float, q: Array, v: Array) -> Array:
         parts = {
@@ -86,8 +86,8 @@ MISTAKES: dict[str, Mistake] = {
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
-    """An acceleration as a simulator has it at a state of its own, how far it is known, and the true one."""
+class ObservedAcceleration:
+    """Acceleration of a simulator at one of its states, its uncertainty, and the true one."""
 
     problem: KnownProblem
     t: float
@@ -96,23 +96,23 @@ class Seen:
     a: Array
     doubt: float
     true: Array
-    free: Array  # directions (n_free, n_q) that the constraints allow
+    free: Array  # basis (n_free, n_q) of the admissible directions
 
 
 def mistaken_acceleration(
     simulate: Simulate, problem: KnownProblem, setting: float, *, by_steps: bool, fit: bool
 ) -> str:
-    """Which mistake explains the accelerations of a simulator, or ""; each is started on the known motion.
+    """Return the mistake that explains the accelerations of a simulator started on the known motion, or "".
 
-    `fit`: whether a force or a mass may be some times too large, which errors of a coarse method can look like.
+    `fit`: also try forces or masses that are wrong by a factor, which errors of a coarse method can resemble.
     """
-    tries = (_seen(simulate, begun_later(problem, k, LATER + 1), setting, by_steps) for k in _telling(problem))
+    tries = (_observed(simulate, begun_later(problem, k, N_LATER + 1), setting, by_steps) for k in _starts(problem))
     places = [seen for seen in tries if seen is not None]
-    if len(places) < 2:  # once may be chance
+    if len(places) < 2:  # a single one may be a coincidence
         return ""
     best, least = "", EXPLAINS
     for name, mistake in MISTAKES.items():
-        others = [_tried(mistake, each.problem, each.t, each.q, each.v) for each in places]
+        others = [_acceleration_with(mistake, each.problem, each.t, each.q, each.v) for each in places]
         for free_only in (False, True):
             rest, gap = 0.0, 0.0
             for each, other in zip(places, others, strict=True):
@@ -126,8 +126,8 @@ def mistaken_acceleration(
     return best or (_scaled(places) if fit else "")
 
 
-def _scaled(places: list[Seen]) -> str:
-    """Which force or mass, taken some times too large, explains the accelerations by M a - Q = -C_q^T lam, or ""."""
+def _scaled(places: list[ObservedAcceleration]) -> str:
+    """Return the force or mass that explains the accelerations if wrong by a factor, or ""."""
     pairs: dict[str, list[tuple[Array, Array]]] = {}
     sure = False
     for each in places:
@@ -149,9 +149,9 @@ def _scaled(places: list[Seen]) -> str:
             rest = float(np.linalg.norm(off - more * part) / np.linalg.norm(off))
             if rest < FITS:
                 fits[f"{name} {_times(1.0 + more)}"] = rest
-    # of a free coordinate the force and the mass are alike: what fits about as well is named too, the force first
+    # force and mass of a free coordinate are equivalent: name all that fit, the force first
     least = min(fits.values(), default=0.0)
-    return ", or ".join(name for name, rest in fits.items() if rest <= least + ALIKE)
+    return ", or ".join(name for name, rest in fits.items() if rest <= least + TIE)
 
 
 def _times(factor: float) -> str:
@@ -160,38 +160,38 @@ def _times(factor: float) -> str:
     return near or f"{factor:.3g} times as large as given"
 
 
-def _tried(mistake: Mistake, problem: KnownProblem, t: float, q: Array, v: Array) -> Array:
+def _acceleration_with(mistake: Mistake, problem: KnownProblem, t: float, q: Array, v: Array) -> Array:
     try:
         return mistake(problem, t, q, v)
     except np.linalg.LinAlgError:
         return np.full(q.size, np.nan)
 
 
-def _telling(problem: KnownProblem) -> list[int]:
-    """Three places of the motion after which most mistakes show, away from singular positions."""
+def _starts(problem: KnownProblem) -> list[int]:
+    """Return three start times, away from singular positions, after which most mistakes are visible."""
     motion = problem.reference
     assert motion is not None
     shows = {}
-    for k in PLACES:
-        t, q, v = motion.t[k + LATER], motion.q[k + LATER], motion.v[k + LATER]
+    for k in START_INDICES:
+        t, q, v = motion.t[k + N_LATER], motion.q[k + N_LATER], motion.v[k + N_LATER]
         if any(motion.t[k] - 0.03 * t < singular < 1.03 * t for singular in problem.singular_times):
             continue
-        later = begun_later(problem, k, LATER + 1)
+        later = begun_later(problem, k, N_LATER + 1)
         true = later.acceleration(t, q, v)[0]
-        changes = [np.abs(_tried(mistake, later, t, q, v) - true).max() for mistake in MISTAKES.values()]
+        changes = [np.abs(_acceleration_with(mistake, later, t, q, v) - true).max() for mistake in MISTAKES.values()]
         shows[k] = sum(change > 0.1 * np.abs(true).max() for change in changes)
     return sorted(shows, key=lambda k: -shows[k])[:3]
 
 
-def _seen(simulate: Simulate, problem: KnownProblem, setting: float, by_steps: bool) -> Seen | None:
-    """A state of a run near its end, and the acceleration there by differences; None where it does not run."""
+def _observed(simulate: Simulate, problem: KnownProblem, setting: float, by_steps: bool) -> ObservedAcceleration | None:
+    """Return a state near the end of a run and its acceleration by differences; None if the run fails."""
     first, last = problem.t_span
-    interval = (last - first) / (LATER + 1)
+    interval = (last - first) / (N_LATER + 1)
     step = 0.125 * interval
-    times = first + interval * LATER + step * np.arange(-2.0, 3.0)
+    times = first + interval * N_LATER + step * np.arange(-2.0, 3.0)
     try:
         run = simulated(simulate, problem, np.concatenate([[first], times]), step if by_steps else setting)
-    except (TypeError, ValueError):  # of another shape: it takes no times but those of the motion
+    except (TypeError, ValueError):  # the simulator accepts no other times than those of the motion
         return None
     if not run.complete:
         return None
@@ -206,4 +206,4 @@ def _seen(simulate: Simulate, problem: KnownProblem, setting: float, by_steps: b
     true, J = problem.acceleration(t, q, v)[0], problem.jacobian(t, q)
     values, directions = np.linalg.svd(J)[1:]
     free = directions[int((values > 1e-9 * values[0]).sum()) :]
-    return Seen(problem, t, q, v, a, float(np.linalg.norm(a - rough)), true, free)
+    return ObservedAcceleration(problem, t, q, v, a, float(np.linalg.norm(a - rough)), true, free)

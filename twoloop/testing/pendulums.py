@@ -1,4 +1,4 @@
-"""Problems of points on links: pendulums, chains, a parallelogram, and two whose motion ends."""
+"""Problems of point masses on links: pendulums, chains, a parallelogram, and two whose motion ends."""
 
 import math
 
@@ -12,7 +12,7 @@ GRAVITY = 9.81  # m/s^2
 
 
 def pendulum() -> KnownProblem:
-    """A point of 1 kg on 1 m, released at rest from the horizontal; known in closed form."""
+    """A point of 1 kg on a link of 1 m, released from the horizontal; period known in closed form."""
     equations = PointEquations([1.0], [[0.0, -GRAVITY]], [(0, (0.0, 0.0), 1.0)])
     note = "the simplest constrained motion: what is wrong here is the method"
     # 4 sqrt(l / g) K(sin(45 degrees)), Landau & Lifshitz, Mechanics, Sect. 11
@@ -39,7 +39,7 @@ def heavy_end() -> KnownProblem:
 
 
 def spherical_pendulum() -> KnownProblem:
-    """A point of 1 kg on 1 m in space, on its way around."""
+    """A point of 1 kg on a link of 1 m in space, with an initial horizontal velocity."""
     equations = PointEquations([1.0], [[0.0, 0.0, -GRAVITY]], [(0, (0.0, 0.0, 0.0), 1.0)])
     start = [0.6, 0.0, -0.8], [0.4, 1.5, 0.3]
     kept = {"vertical angular momentum": lambda t, q, v: float(q[0] * v[1] - q[1] * v[0])}
@@ -48,7 +48,7 @@ def spherical_pendulum() -> KnownProblem:
 
 
 def closed_chain() -> KnownProblem:
-    """Four masses on five links of 0.2 m between pins 0.8 m apart, released from a polygon without symmetry."""
+    """Four masses on five links of 0.2 m between pins 0.8 m apart, released from an asymmetric polygon."""
     links: list[tuple[int, Place, float]] = [(0, (0.0, 0.0), 0.2), (3, (0.8, 0.0), 0.2)]
     links[1:1] = [(i, i - 1, 0.2) for i in (1, 2, 3)]
     equations = PointEquations(np.full(4, 0.25), [[0.0, -GRAVITY / 4.0]] * 4, links)
@@ -63,7 +63,7 @@ def closed_chain() -> KnownProblem:
 
 
 def stiff_spring_pendulum() -> KnownProblem:
-    """A pendulum with a small mass on a spring that would vibrate at some 1000 rad/s."""
+    """A pendulum with a small mass on a spring with an eigenfrequency of about 1000 rad/s."""
     equations = PointEquations(
         [1.0, 0.1], [[0.0, -GRAVITY], [0.0, -0.1 * GRAVITY]], [(0, (0.0, 0.0), 1.0)], [(1, 0, 1e5, 0.5)]
     )
@@ -73,7 +73,7 @@ def stiff_spring_pendulum() -> KnownProblem:
 
 
 def shaken_spring() -> KnownProblem:
-    """A pendulum with a mass of 0.5 kg on a spring that is shaken by 3 sin(4 t) N, from t = 0.5 s on."""
+    """A pendulum with a mass of 0.5 kg on a spring, excited by 3 sin(4 t) N from t = 0.5 s."""
     equations = ShakenPoints(
         3.0, 4.0, [1.0, 0.5], [[0.0, -GRAVITY], [0.0, -0.5 * GRAVITY]], [(0, (0.0, 0.0), 1.0)], [(1, 0, 40.0, 0.6)]
     )
@@ -83,8 +83,8 @@ def shaken_spring() -> KnownProblem:
 
 
 def parallelogram() -> KnownProblem:
-    """Two upright cranks of 1 m with a coupler of 1 m, which all lie on one line twice a turn."""
-    mass = np.array([[2.0, 0.5], [0.5, 2.0]]) / 3.0  # uniform bars of 1 kg by the velocities of their ends
+    """Two upright cranks of 1 m with a coupler of 1 m, which are collinear twice per turn."""
+    mass = np.array([[2.0, 0.5], [0.5, 2.0]]) / 3.0  # uniform bars of 1 kg, in the velocities of their ends
     links: list[tuple[int, Place, float]] = [(0, (0.0, 0.0), 1.0), (1, (1.0, 0.0), 1.0), (1, 0, 1.0)]
     equations = PointEquations(mass, [[0.0, -GRAVITY]] * 2, links)
     start, tags = ([0.0, 1.0, 1.0, 1.0], [1.0, 0.0, 1.0, 0.0]), "singular, closed chain, planar"
@@ -101,7 +101,7 @@ def out_of_reach() -> KnownProblem:
 
 
 def force_ends() -> KnownProblem:
-    """A pendulum under a drag that is not a number after 1 s."""
+    """A pendulum with a drag that is NaN after 1 s."""
     equations = EndingForce(1.0, [1.0], [[0.0, -GRAVITY]], [(0, (0.0, 0.0), 1.0)])
     note = "a force that is not a number from some time on"
     start, tags = ([1.0, 0.0], [0.0, 0.0]), "no motion to the end, open chain, planar"

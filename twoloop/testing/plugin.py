@@ -1,6 +1,6 @@
-"""Plugin of pytest: `--simulator MODULE:FUNCTION` adds a test for each problem and property; `reference_motion`.
+"""pytest plugin: `--simulator MODULE:FUNCTION` adds a test for each problem and property; fixture `reference_motion`.
 
-pytest imports it in every run where twoloop is installed: numpy comes with the first use.
+pytest imports it in every run where twoloop is installed, so numpy is imported on first use only.
 """
 
 import importlib
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """Options of the command line, and the list of known failures in pyproject.toml."""
+    """Add the command-line options, and the list of known failures in pyproject.toml."""
     group = parser.getgroup("twoloop", "check of a simulator of mechanisms")
     group.addoption(
         "--simulator", metavar="MODULE:FUNCTION", help="simulate(problem, times, tolerance or step) to check"
@@ -27,8 +27,8 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     group.addoption("--simulator-problems", metavar="NAMES", default="smoke", help="smoke, all, or names with commas")
     group.addoption("--simulator-steps", metavar="N,N,...", help="for fixed steps: numbers of steps over the span")
     group.addoption("--simulator-order", type=float, metavar="P", help="for fixed steps: the order of the method")
-    group.addoption("--simulator-report", metavar="FILE", help="write all that was measured as Markdown")
-    known = "failures of --simulator that are known, a line each: PROBLEM: PROPERTY"
+    group.addoption("--simulator-report", metavar="FILE", help="write all measurements as Markdown")
+    known = "known failures of --simulator, one per line: PROBLEM: PROPERTY"
     parser.addini("simulator_known_failures", known, type="linelist", default=[])
 
 
@@ -50,15 +50,15 @@ def reference_motion() -> "Callable[[str], Motion]":
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """With a report, keep what the tests measured, also those that ran in other processes."""
+    """With a report, collect the measurements, including those of other processes."""
     path = config.getoption("simulator_report")
     if path is not None and not hasattr(config, "workerinput"):
-        config.pluginmanager.register(_Kept(Path(path)), "twoloop_simulator_report")
+        config.pluginmanager.register(_Findings(Path(path)), "twoloop_simulator_report")
 
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(session: pytest.Session, config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Add the tests, before -k chooses among them."""
+    """Add the tests before -k selects among them."""
     if config.getoption("simulator") is None:
         return
     from twoloop.testing.conformance import properties_of, settings_of
@@ -87,7 +87,7 @@ def pytest_collection_modifyitems(session: pytest.Session, config: pytest.Config
 
 
 def _loaded(where: str, folder: Path) -> Callable[..., Any]:
-    """The function that "module:function" or "file.py:function" names."""
+    """Return the function named by "module:function" or "file.py:function"."""
     module_name, _, function = where.rpartition(":")
     try:
         if not module_name:
@@ -110,11 +110,11 @@ def _loaded(where: str, folder: Path) -> Callable[..., Any]:
 
 
 class DoesNotHold(Exception):
-    """A property of the simulator that does not hold."""
+    """A property of the simulator that fails."""
 
 
 class _Suite(pytest.Collector):
-    """A problem: its runs are made once, by the first of its tests."""
+    """One problem, whose runs are made by the first of its tests."""
 
     ask: "tuple[Callable[..., Any], KnownProblem, Settings]"
     _found: "tuple[dict[str, Finding], dict[str, str]] | None" = None
@@ -124,7 +124,7 @@ class _Suite(pytest.Collector):
 
     @property
     def found(self) -> "tuple[dict[str, Finding], dict[str, str]]":
-        """What was found by property, and why the rest was not measured."""
+        """Return the findings by property, and the reasons why others were not measured."""
         if self._found is None:
             from twoloop.testing.conformance import check_problem
 
@@ -134,7 +134,7 @@ class _Suite(pytest.Collector):
 
 
 class _Property(pytest.Item):
-    """A property of the simulator on a problem."""
+    """One property of the simulator on a problem."""
 
     def runtest(self) -> None:
         findings, skipped = self.parent.found  # type: ignore[union-attr]
@@ -157,8 +157,8 @@ class _Property(pytest.Item):
         return self.path, None, self.nodeid
 
 
-class _Kept:
-    """The findings of a session, for the report."""
+class _Findings:
+    """Collects the findings of a session for the report."""
 
     def __init__(self, path: Path):
         self._path, self._rows = path, list[tuple[dict[str, Any], bool]]()

@@ -1,4 +1,4 @@
-"""Equations of points on massless links: coordinates are theirs, a row is half the squared length of a link."""
+"""Equations of point masses on massless links; a row is half the squared length of a link."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -8,20 +8,20 @@ from numpy.typing import ArrayLike
 
 from twoloop.testing.known_parts import GROUND, Array, KnownBody, KnownJoint
 
-Place = int | tuple[float, ...]  # the number of a point, or a place of the ground
+Place = int | tuple[float, ...]  # index of a point, or a ground point
 
 
 class PointEquations:
-    """Points in a plane or in space with links of fixed length and springs.
+    """Point masses in the plane or in space with links of fixed length and springs.
 
     Parameters
     ----------
     mass : array_like (n_points,) or (n_points, n_points)
-        Of the points, kg; a matrix where bars between them are lumped consistently.
+        Masses of the points, kg; a matrix for the consistent mass of bars between them.
     weight : array_like (n_points, n_axes)
         Constant force on each point, N.
     links : sequence of (place, place, float)
-        Ends, each the number of a point or a place of the ground, and the length, m.
+        Ends, each the index of a point or a ground point, and the length, m.
     springs : sequence of (place, place, float, float)
         Ends, stiffness in N/m and unstressed length in m.
     """
@@ -48,7 +48,7 @@ class PointEquations:
 
     @property
     def parts(self) -> dict[str, Any]:
-        """Points, links and gravity as `KnownProblem` names them, where they are all that there is."""
+        """Return points, links and gravity as arguments of `KnownProblem`, if these make up the whole problem."""
         if not self._points_alone or type(self) is not PointEquations:
             return {}
         n_points, n_axes = self.weight.shape
@@ -63,7 +63,7 @@ class PointEquations:
         return {"bodies": bodies, "joints": tuple(joints), "gravity": self.weight[0] / masses[0]}
 
     def _differences(self, pairs: Sequence[tuple[Place, Place]]) -> tuple[Array, Array]:
-        """D (n, n_axes, n_q) and d (n, n_axes), such that D q + d are the vectors between the ends."""
+        """Return D (n, n_axes, n_q) and d (n, n_axes) such that D q + d are the vectors between the ends."""
         n_points, n_axes = self.weight.shape
         across, start = np.zeros((len(pairs), n_axes, n_points, n_axes)), np.zeros((len(pairs), n_axes))
         for k, ends in enumerate(pairs):
@@ -75,11 +75,11 @@ class PointEquations:
         return across.reshape(len(pairs), n_axes, n_points * n_axes), start
 
     def mass(self, t: float, q: Array) -> Array:
-        """M (n_q, n_q)."""
+        """Return M (n_q, n_q)."""
         return self._mass.copy()
 
     def force(self, t: float, q: Array, v: Array) -> Array:
-        """Q (n_q,): weights and springs."""
+        """Return Q (n_q,): weights and springs."""
         total = self.weight.ravel().copy()
         if self._stiffness.size:
             arms = self._spring_across @ q + self._spring_from
@@ -89,25 +89,25 @@ class PointEquations:
         return total
 
     def constraint(self, t: float, q: Array) -> Array:
-        """C (n_c,)."""
+        """Return C (n_c,)."""
         arms = self._across @ q + self._from
         return 0.5 * ((arms**2).sum(axis=1) - self._lengths**2)
 
     def jacobian(self, t: float, q: Array) -> Array:
-        """C_q (n_c, n_q)."""
+        """Return C_q (n_c, n_q)."""
         arms = self._across @ q + self._from
         return (arms[:, None, :] @ self._across)[:, 0, :]
 
     def constraint_rate(self, t: float, q: Array) -> Array:
-        """C_t (n_c,), zero."""
+        """Return C_t (n_c,), zero."""
         return np.zeros(self.n_c)
 
     def gamma(self, t: float, q: Array, v: Array) -> Array:
-        """Right-hand side of C_q a = gamma (n_c,)."""
+        """Return the right-hand side (n_c,) of C_q a = gamma."""
         return -((self._across @ v) ** 2).sum(axis=1)
 
     def energy(self, t: float, q: Array, v: Array) -> float:
-        """Of motion, weight and springs, J."""
+        """Return the kinetic and potential energy, J."""
         total = 0.5 * v @ self._mass @ v - self.weight.ravel() @ q
         if self._stiffness.size:
             lengths = np.linalg.norm(self._spring_across @ q + self._spring_from, axis=1)
@@ -116,51 +116,51 @@ class PointEquations:
 
 
 class ShakenPoints(PointEquations):
-    """Points, the last of which is pushed along x by amplitude sin(frequency t)."""
+    """Points, the last of which is excited along x by amplitude sin(frequency t)."""
 
     def __init__(self, amplitude: float, frequency: float, *arguments: Any):
         super().__init__(*arguments)
         self._amplitude, self._frequency = amplitude, frequency
 
     def force(self, t: float, q: Array, v: Array) -> Array:
-        """Q (n_q,)."""
+        """Return Q (n_q,)."""
         total = super().force(t, q, v)
         total[-self.weight.shape[1]] += self._amplitude * np.sin(self._frequency * t)
         return total
 
 
 class DrivenPoint(PointEquations):
-    """A point on a link whose height is prescribed, y = y0 + rate t; beyond the length of the link it is nowhere."""
+    """A point on a link with prescribed height y = y0 + rate t; no solution beyond the length of the link."""
 
     def __init__(self, length: float, height: float, rate: float, gravity: float):
         super().__init__([1.0], [[0.0, -gravity]], [(0, (0.0, 0.0), length)])
         self.n_c, self.row_powers, self._height, self._rate = 2, [2.0, 1.0], height, rate
 
     def constraint(self, t: float, q: Array) -> Array:
-        """C (2,)."""
+        """Return C (2,)."""
         return np.append(super().constraint(t, q), q[1] - self._height - self._rate * t)
 
     def jacobian(self, t: float, q: Array) -> Array:
-        """C_q (2, 2)."""
+        """Return C_q (2, 2)."""
         return np.vstack([super().jacobian(t, q), [0.0, 1.0]])
 
     def constraint_rate(self, t: float, q: Array) -> Array:
-        """C_t (2,)."""
+        """Return C_t (2,)."""
         return np.array([0.0, -self._rate])
 
     def gamma(self, t: float, q: Array, v: Array) -> Array:
-        """Right-hand side of C_q a = gamma (2,)."""
+        """Return the right-hand side (2,) of C_q a = gamma."""
         return np.append(super().gamma(t, q, v), 0.0)
 
 
 class EndingForce(PointEquations):
-    """Points with a drag that is known up to a time only: a square root of what is left of it, NaN beyond."""
+    """Points with a drag proportional to the square root of the remaining time, NaN beyond."""
 
     def __init__(self, ends: float, *arguments: Any):
         super().__init__(*arguments)
         self._ends = ends
 
     def force(self, t: float, q: Array, v: Array) -> Array:
-        """Q (n_q,)."""
+        """Return Q (n_q,)."""
         with np.errstate(invalid="ignore"):
             return super().force(t, q, v) - np.sqrt(self._ends - t) * v

@@ -1,11 +1,11 @@
-"""The properties of a simulator on one problem: each is measured on its runs, and passes or not."""
+"""The properties of a simulator on one problem, measured on its runs."""
 
 from collections.abc import Iterator
 from itertools import pairwise
 
 import numpy as np
 
-from twoloop.testing.changes import Seen
+from twoloop.testing.changes import Transformed
 from twoloop.testing.findings import Finding
 from twoloop.testing.known_problem import Array, Quantity
 from twoloop.testing.measuring import (
@@ -23,14 +23,14 @@ from twoloop.testing.measuring import (
     still_there,
     violations,
 )
-from twoloop.testing.simulated import Simulated, seen_back
+from twoloop.testing.simulated import Simulated, transformed_back
 
-LEAST_ORDER = 0.7  # of a method of whose order nothing is said
-SHORT = 0.6  # by which an observed order may fall short of the one that was said
+LEAST_ORDER = 0.7  # required order if none is given
+SHORT = 0.6  # tolerance of the observed order
 
 
 def measured(observed: Observed, settings: Settings) -> Iterator[Finding]:
-    """All properties that these runs show."""
+    """Yield all properties that can be measured on these runs."""
     finest = observed.runs[-1]
     kinds = ["q"] if finest.v is None else ["q", "v"]
     for kind in kinds:
@@ -46,7 +46,7 @@ def measured(observed: Observed, settings: Settings) -> Iterator[Finding]:
 
 
 def _worst(name: str, observed: Observed, found: list[Array], limits: list[Array]) -> Finding:
-    """The worst place over all runs."""
+    """Return the finding at the worst place over all runs."""
     ratios = [np.max(errors / limit) for errors, limit in zip(found, limits, strict=True)]
     k = int(np.argmax(ratios))
     worst = int(np.argmax(found[k] / limits[k]))
@@ -55,13 +55,13 @@ def _worst(name: str, observed: Observed, found: list[Array], limits: list[Array
 
 
 def errors_at_tolerances(observed: Observed, settings: Settings, kind: str) -> Iterator[Finding]:
-    """Largest error at the tolerance where it is largest beside what is allowed."""
+    """Yield the error at the tolerance where it is largest relative to its limit."""
     limits = [allowed(observed.motion, setting) + observed.floor(kind) for setting in observed.settings]
     yield _worst(f"error of {kind}", observed, observed.errors(kind), limits)
 
 
 def errors_by_steps(observed: Observed, settings: Settings, kind: str) -> Iterator[Finding]:
-    """Error with the finest steps, what is left of it for steps that go to zero, and the order."""
+    """Yield the error with the finest steps, its limit as the steps tend to zero, and the order."""
     name, errors = observed.problem.name, observed.errors(kind)
     worst, floor = float(errors[-1].max()), observed.rounding + observed.floor(kind)
     yield Finding(name, f"error of {kind}", worst, MOST, worst <= MOST)
@@ -77,14 +77,14 @@ def errors_by_steps(observed: Observed, settings: Settings, kind: str) -> Iterat
 
 
 def changes_of(observed: Observed, kind: str) -> list[Array]:
-    """By how much the runs change from each setting to the next (n_t,), over the largest value of the motion."""
+    """Return the changes (n_t,) from each setting to the next, relative to the largest value of the motion."""
     scale = dict(zip("qv", observed.motion.scales, strict=True))[kind]
     values = [getattr(run, kind) for run in observed.runs]
     return [np.abs(fine - coarse).max(axis=1) / scale for coarse, fine in pairwise(values)]
 
 
 def observed_order(observed: Observed, kind: str) -> float | None:
-    """The order of the errors over the last refinement; where the limit is wrong, that of the changes."""
+    """Return the order of the errors over the last refinement; that of the changes if the limit is wrong."""
     floor = observed.rounding + observed.floor(kind)
     errors, changes, steps = observed.errors(kind), changes_of(observed, kind), observed.settings
     value, rest = still_there(errors, changes, floor)
@@ -94,9 +94,9 @@ def observed_order(observed: Observed, kind: str) -> float | None:
 
 
 def constraints(observed: Observed, settings: Settings) -> Iterator[Finding]:
-    """Distances of positions and velocities from the constraints.
+    """Yield the distances of positions and velocities from the constraints.
 
-    With fixed steps those of the velocities may also vanish with the steps, as they do where only positions are held.
+    With fixed steps those of the velocities may also vanish with the step size, as for methods that only enforce C = 0.
     """
     found = [violations(observed.problem, run, observed.motion.scales) for run in observed.runs]
     floor = 10.0 * 10.0 ** -observed.motion.digits["q"] + 1e-12
@@ -116,7 +116,7 @@ def constraints(observed: Observed, settings: Settings) -> Iterator[Finding]:
 
 
 def invariant(observed: Observed, settings: Settings, name: str, quantity: Quantity) -> Finding:
-    """Drift of the energy, or of another invariant."""
+    """Return the drift of the energy, or of another invariant."""
     motion = observed.motion
     found = [drifts(observed.problem, quantity, run, motion) for run in observed.runs]
     floor = 10.0 * (observed.floor("q") + observed.floor("v"))
@@ -127,7 +127,7 @@ def invariant(observed: Observed, settings: Settings, name: str, quantity: Quant
 
 
 def multipliers(observed: Observed, settings: Settings) -> Finding:
-    """Errors of C_q^T lam."""
+    """Return the errors of C_q^T lam."""
     found, motion = lam_errors(observed), observed.motion
     floor = observed.floor("v") + 10.0 * 10.0 ** -motion.digits["lam"]
     if settings.tolerances:
@@ -142,22 +142,22 @@ def multipliers(observed: Observed, settings: Settings) -> Finding:
 
 
 def _vanishing(observed: Observed, name: str, found: list[Array], floor: Array) -> Finding:
-    """Passes where the finest run's error is at most three times its change by the last refinement."""
+    """Pass if the error of the finest run is at most three times its change by the last refinement."""
     worst = float(found[-1].max())
     limit = min(MOST, max(float(np.max(floor)), 3.0 * float(np.abs(found[-1] - found[-2]).max())))
     return Finding(observed.problem.name, name, worst, limit, worst <= limit)
 
 
-def seen_otherwise(
-    observed: Observed, settings: Settings, name: str, seen: Seen, run: Simulated, setting: float
+def in_transformed(
+    observed: Observed, settings: Settings, name: str, seen: Transformed, run: Simulated, setting: float
 ) -> Finding:
-    """The error of a run of the problem in another frame, or in other units, beside that of the original."""
+    """Return the error of a run in another frame or other units, compared with that of the original."""
     problem, motion = observed.problem, observed.motion
     if not run.complete:
         what = run.error or "numbers that are not finite"
         return Finding(problem.name, name, what, "a run, as of the original", False)
     base = observed.errors("q")[observed.settings.index(setting)]
-    there = Observed(problem, motion, [setting], [seen_back(run, seen)])
+    there = Observed(problem, motion, [setting], [transformed_back(run, seen)])
     if settings.tolerances:
         limit = np.maximum(allowed(motion, setting), 10.0 * base.max()) + observed.floor("q")
     else:

@@ -1,4 +1,4 @@
-"""Calls a simulator and looks at what it returns."""
+"""Calls a simulator and validates its output."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from twoloop.testing.changes import Seen
+from twoloop.testing.changes import Transformed
 from twoloop.testing.known_problem import Array, KnownProblem
 
 Simulate = Callable[[KnownProblem, Array, float], Any]
@@ -14,7 +14,7 @@ Simulate = Callable[[KnownProblem, Array, float], Any]
 
 @dataclass(frozen=True, eq=False)
 class Simulated:
-    """What a simulator returned: states (n_t, n_q), multipliers (n_t, n_c), or how it failed."""
+    """Output of a simulator: states (n_t, n_q), multipliers (n_t, n_c), or the error message."""
 
     t: Array
     q: Array
@@ -24,13 +24,13 @@ class Simulated:
 
     @property
     def complete(self) -> bool:
-        """Whether every number is one."""
+        """True if all numbers are finite."""
         given = [each for each in (self.q, self.v, self.lam) if each is not None]
         return not self.error and all(np.isfinite(each).all() for each in given)
 
 
 def simulated(simulate: Simulate, problem: KnownProblem, times: Array, setting: float) -> Simulated:
-    """A run of a problem. An exception is a failure that says so; a wrong shape is raised."""
+    """Run a simulator on a problem. An exception of the simulator is a failed run; a wrong shape raises."""
     try:
         returned = simulate(problem, times.copy(), setting)
     except Exception as error:
@@ -52,13 +52,13 @@ def simulated(simulate: Simulate, problem: KnownProblem, times: Array, setting: 
     return Simulated(times, q, v, lam)
 
 
-def seen_back(run: Simulated, seen: Seen) -> Simulated:
-    """A run of a problem that was seen otherwise, in the coordinates of the original."""
+def transformed_back(run: Simulated, seen: Transformed) -> Simulated:
+    """Return a run of a transformed problem in the coordinates of the original."""
     return Simulated(run.t, *seen.back(run.q, run.v, run.lam), run.error)
 
 
 def _checked(problem: KnownProblem, name: str, part: Any, shape: tuple[int, int]) -> Array | None:
-    """An array of the shape asked for; None where none is given."""
+    """Return an array of the expected shape; None for None."""
     if part is None:
         return None
     try:

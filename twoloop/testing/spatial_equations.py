@@ -1,6 +1,6 @@
-"""Equations of rigid bodies in space: x, y, z of the centre of mass and four Euler parameters of each.
+"""Equations of spatial rigid bodies: centre of mass and four Euler parameters of each.
 
-The first rows keep the Euler parameters normalised, half of e.e is 1/2, the next are those of the joints.
+The first rows normalise the Euler parameters, e.e / 2 = 1/2; the rows of the joints follow.
 """
 
 from collections.abc import Iterator
@@ -13,30 +13,30 @@ from twoloop.testing.known_parts import GROUND, Array, KnownBody, KnownJoint
 
 
 def skew(a: Array) -> Array:
-    """The matrix of the cross product with a vector (3,)."""
+    """Return the matrix of the cross product with a vector (3,)."""
     return np.array([[0.0, -a[2], a[1]], [a[2], 0.0, -a[0]], [-a[1], a[0], 0.0]])
 
 
 def turned(e: Array, a: Array) -> Array:
-    """R(e) a, a quadratic form of the Euler parameters (4,)."""
+    """Return R(e) a, a quadratic form in the Euler parameters (4,)."""
     u = e[1:]
     return (e[0] ** 2 - u @ u) * a + 2.0 * u * (u @ a) + 2.0 * e[0] * np.cross(u, a)
 
 
 def turned_by_e(e: Array, a: Array) -> Array:
-    """Derivative (3, 4) of R(e) a by the Euler parameters, which is linear in these."""
+    """Return the derivative (3, 4) of R(e) a with respect to the Euler parameters, which is linear in these."""
     u = e[1:]
     by_u = (u @ a) * np.eye(3) + np.outer(u, a) - np.outer(a, u) - e[0] * skew(a)
     return 2.0 * np.column_stack([e[0] * a + np.cross(u, a), by_u])
 
 
 def half_spin(e: Array) -> Array:
-    """G (3, 4): the angular velocity along the axes of the body is 2 G e'."""
+    """Return G (3, 4): the angular velocity in body axes is 2 G e'."""
     return np.column_stack([-e[1:], e[0] * np.eye(3) - skew(e[1:])])
 
 
 def parameters_of(R: Array) -> Array:
-    """Euler parameters (4,) of a rotation matrix, by the largest of the four, the sign such that e0 is not negative."""
+    """Return the Euler parameters (4,) of a rotation matrix, computed from the largest one, with e0 >= 0."""
     products = np.empty((4, 4))
     products[0, 0], products[1:, 1:] = 1.0 + np.trace(R), R + R.T + (1.0 - np.trace(R)) * np.eye(3)
     products[0, 1:] = products[1:, 0] = R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]
@@ -45,7 +45,7 @@ def parameters_of(R: Array) -> Array:
 
 
 class SpatialEquations:
-    """Bodies under their weight; add them with `body`, then joints in the order of their rows.
+    """Bodies under gravity; add them with `body`, then joints in the order of their rows.
 
     Parameters
     ----------
@@ -70,7 +70,7 @@ class SpatialEquations:
 
     @property
     def coordinates(self) -> tuple[str, ...]:
-        """What each coordinate is."""
+        """Kinds of the coordinates."""
         return len(self._bodies) * ("x", "y", "z", "e0", "e1", "e2", "e3")
 
     @property
@@ -85,13 +85,13 @@ class SpatialEquations:
 
     @property
     def start(self) -> tuple[Array, Array]:
-        """States q, v (n_q,) as the bodies were added."""
+        """Return the initial state q, v (n_q,) of the bodies as added."""
         return np.concatenate(self._start), np.concatenate(self._rates)
 
     def body(
         self, mass: float, inertia: ArrayLike, place: ArrayLike, R: ArrayLike, velocity: ArrayLike, spin: ArrayLike
     ) -> int:
-        """Add a body by its principal moments, its start, and the angular velocity along the axes of space."""
+        """Add a body by its principal moments, initial state, and angular velocity in space."""
         e = parameters_of(np.asarray(R, dtype=float))
         along = np.asarray(R, dtype=float).T @ np.asarray(spin, dtype=float)
         self._bodies.append((mass, np.diag(np.asarray(inertia, dtype=float))))
@@ -100,7 +100,7 @@ class SpatialEquations:
         return len(self._bodies) - 1
 
     def _fixed_to(self, body: int, vector: ArrayLike, from_centre: bool) -> Array:
-        """A vector, or a point from the centre, of space at the start along the axes of a body."""
+        """Transform an initial vector or point from space to body axes, the point relative to the centre."""
         given = np.asarray(vector, dtype=float)
         if body == GROUND:
             return given
@@ -108,13 +108,13 @@ class SpatialEquations:
         return turned(e * np.array([1.0, -1.0, -1.0, -1.0]), given - r if from_centre else given)
 
     def spherical(self, i: int, j: int, point: ArrayLike) -> None:
-        """Three rows: both bodies share a point."""
+        """Add three rows: both bodies share a point."""
         a, b = (self._fixed_to(body, point, True) for body in (i, j))
         self._points.append((len(self._joint_powers), i, a, j, b))
         self._joint_powers += [1.0] * 3
 
     def revolute(self, i: int, j: int, point: ArrayLike, axis: ArrayLike) -> None:
-        """Five rows: both bodies share a point and an axis."""
+        """Add five rows: both bodies share a point and an axis."""
         self.spherical(i, j, point)
         axis = np.asarray(axis, dtype=float)
         first = np.cross(axis, np.eye(3)[int(np.argmin(np.abs(axis)))])
@@ -135,7 +135,7 @@ class SpatialEquations:
 
     @property
     def parts(self) -> dict[str, Any]:
-        """Bodies, joints and gravity as `KnownProblem` names them."""
+        """Return bodies, joints and gravity as arguments of `KnownProblem`."""
         joints: list[KnownJoint] = []
         bodies = [KnownBody(m, np.diag(J), slice(7 * k, 7 * k + 7)) for k, (m, J) in enumerate(self._bodies)]
         for k, (row, i, a, j, b) in enumerate(self._points):
@@ -145,7 +145,7 @@ class SpatialEquations:
         return {"bodies": tuple(bodies), "joints": tuple(joints), "gravity": self._gravity}
 
     def mass(self, t: float, q: Array) -> Array:
-        """M (n_q, n_q), of rank 6 for each body."""
+        """Return M (n_q, n_q), of rank 6 for each body."""
         M = np.zeros((self.n_q, self.n_q))
         for body, (m, J) in enumerate(self._bodies):
             k, G = 7 * body, half_spin(q[7 * body + 3 : 7 * body + 7])
@@ -154,19 +154,19 @@ class SpatialEquations:
         return M
 
     def force(self, t: float, q: Array, v: Array) -> Array:
-        """Q (n_q,): weights, and the terms of the velocities."""
+        """Return Q (n_q,): weights and velocity terms."""
         parts: list[Array] = []
         for m, J, x, u in self._each(q, v):
             parts += [m * self._gravity, -8.0 * half_spin(u[3:]).T @ (J @ (half_spin(x[3:]) @ u[3:]))]
         return np.concatenate(parts)
 
     def _each(self, q: Array, v: Array) -> Iterator[tuple[float, Array, Array, Array]]:
-        """Mass, inertia and state (7,), (7,) of each body."""
+        """Yield mass, inertia and state (7,), (7,) of each body."""
         for (m, J), x, u in zip(self._bodies, q.reshape(-1, 7), v.reshape(-1, 7), strict=True):
             yield m, J, x, u
 
     def constraint(self, t: float, q: Array) -> Array:
-        """C (n_c,)."""
+        """Return C (n_c,)."""
         n = len(self._bodies)
         C = np.zeros(self.n_c)
         C[:n] = 0.5 * ((q.reshape(n, 7)[:, 3:] ** 2).sum(axis=1) - 1.0)
@@ -181,7 +181,7 @@ class SpatialEquations:
         return C
 
     def jacobian(self, t: float, q: Array) -> Array:
-        """C_q (n_c, n_q)."""
+        """Return C_q (n_c, n_q)."""
         n = len(self._bodies)
         J = np.zeros((self.n_c, self.n_q))
         for body in range(n):
@@ -199,18 +199,18 @@ class SpatialEquations:
         return J
 
     def constraint_rate(self, t: float, q: Array) -> Array:
-        """C_t (n_c,), zero."""
+        """Return C_t (n_c,), zero."""
         return np.zeros(self.n_c)
 
     def gamma(self, t: float, q: Array, v: Array) -> Array:
-        """Right-hand side of C_q a = gamma (n_c,)."""
+        """Return the right-hand side (n_c,) of C_q a = gamma."""
         n = len(self._bodies)
         right = np.zeros(self.n_c)
         right[:n] = -(v.reshape(n, 7)[:, 3:] ** 2).sum(axis=1)
         still = np.zeros(3)
 
         def bend(body: int, a: Array) -> Array:
-            """The second derivative of a vector that turns with a body, where e'' = 0."""
+            """Return the second derivative of a body-fixed vector for e'' = 0."""
             return still if body == GROUND else 2.0 * turned(v[7 * body + 3 : 7 * body + 7], a)
 
         for row, i, a, j, b in self._points:
@@ -221,7 +221,7 @@ class SpatialEquations:
         return right
 
     def energy(self, t: float, q: Array, v: Array) -> float:
-        """Of motion and weight, J."""
+        """Return the kinetic and potential energy, J."""
         total = 0.0
         for m, J, x, u in self._each(q, v):
             spin = 2.0 * half_spin(x[3:]) @ u[3:]
@@ -230,7 +230,7 @@ class SpatialEquations:
         return total
 
     def vertical_momentum(self, t: float, q: Array, v: Array) -> float:
-        """Angular momentum about the z axis of space, kg m^2/s."""
+        """Return the angular momentum about the z axis of space, kg m^2/s."""
         total = 0.0
         for m, J, x, u in self._each(q, v):
             own = turned(x[3:], J @ (2.0 * half_spin(x[3:]) @ u[3:]))
