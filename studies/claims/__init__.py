@@ -1,4 +1,4 @@
-"""What of the paper's claims holds: a verdict and a number for each, computed from the rows of all studies."""
+"""Which of the paper's claims hold: a verdict and a number for each, computed from the rows of all studies."""
 
 import importlib
 import tomllib

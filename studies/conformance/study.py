@@ -123,8 +123,8 @@ def tables_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, str]:
     ended = rows[(rows["outcome"] == FAILED) & rows["property"].isin(("runs", SAYS_SO))]
     said = [[row["simulator"], row["problem"], _short(str(row["measured"]))] for _, row in ended.iterrows()]
     return {
-        "failed": table(["simulator", "of", *names], lines) if lines else "",
-        "ended": table(["simulator", "problem", "instead"], said) if said else "",
+        "failed": table(["simulator", "version", *names], lines) if lines else "",
+        "ended": table(["simulator", "problem", "what happened"], said) if said else "",
     }
 
 

@@ -1,4 +1,4 @@
-"""Table 3 of the paper: computation time of both two-loop procedures over their tolerances, beside other solvers."""
+"""Table 3 of the paper: computation time of both two-loop procedures over their tolerances, and of other solvers."""
 
 from functools import partial
 from typing import Any

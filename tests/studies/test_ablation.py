@@ -57,7 +57,7 @@ def test_the_answer_turns_with_the_rows(made):
     assert "Not by CPU time in this code: projecting once a step keeps the constraints as well, and takes " in text
     assert "By evaluations it does, slightly: projecting takes 1.1 times as many in the median" in text
     assert (
-        "factorisations, 0.40 times as many by projecting: this code" in text and "could be saved (not tried)" in text
+        "factorisations: 0.40 times as many with projection. This code" in text and "could be saved (not tried)" in text
     )
     assert "under this fixed-point iteration its extra multipliers do not pay; what they cost with Newton" in text
     assert f"added with {ablation.SUN.name} and {ablation.GAUSS.name}, does this." in text and "without it" not in text
