@@ -236,7 +236,7 @@ def test_one_code_serves_all_numbers(method, monkeypatch):
 
 @pytest.fixture
 def own_disk(monkeypatch, tmp_path):
-    """A folder for code of this test alone: other processes write into that of the user, and remove the oldest there."""
+    """A folder for code of this test alone: from that of the user other processes remove the oldest."""
     monkeypatch.setattr("twoloop.kernels.compile.own_functions.sources_folder", lambda: tmp_path)
     monkeypatch.setattr("twoloop.kernels.compile.own_functions._MADE", defaultdict(dict))
     return tmp_path
