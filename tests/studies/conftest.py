@@ -8,7 +8,7 @@ import pandas as pd
 import pytest
 
 from studies import ablation, motion, step_size, violation
-from studies.bench import figures, store
+from studies.bench import collector, figures, store
 from studies.energy import study as energy
 
 
@@ -23,7 +23,9 @@ def out(request, tmp_path_factory):
     """The folder of a quick run of the study of a module of tests, its `STUDIED`."""
     study = request.module.STUDIED.STUDY
     folder = tmp_path_factory.mktemp(study.name)
-    with mpl.rc_context({"savefig.bbox": "standard"}):  # the tight one draws each figure twice
+    with mpl.rc_context({"savefig.bbox": "standard"}), pytest.MonkeyPatch.context() as patch:
+        # the tight box draws each figure twice; times may hold a build, for the sake of which each run is made twice
+        patch.setattr(collector, "_may_hold_a_build", lambda *told: False)
         study.main(["--quick", "--out", str(folder)])
     return folder
 
