@@ -46,17 +46,16 @@ def _largest(values):
 
 @compiled
 def _first_bend(values, n, slope, least):
-    """Place of the largest second difference of n + 1 values, less a line, where it is sudden; else 0."""
-    low = high = bend = 0.0
-    place = 0
+    """The first place where the second difference of n + 1 values, less a line, is sudden; else 0."""
+    low = high = 0.0
     for k in range(1, n + 1):
         off = values[k] - values[0] - k * slope
         low, high = min(low, off), max(high, off)
-        if k < n:
-            second = abs(values[k + 1] - 2.0 * values[k] + values[k - 1])
-            if second > bend:
-                bend, place = second, k
-    return place if high - low > least and bend > SHARE * (high - low) else 0
+    if high - low > least:
+        for k in range(1, n):
+            if abs(values[k + 1] - 2.0 * values[k] + values[k - 1]) > SHARE * (high - low):
+                return k
+    return 0
 
 
 @compiled
@@ -89,14 +88,15 @@ def sudden_time(f, w, tolerances, t, begin, spacing, last, along, q, v, a):
 
 @compiled
 def _look_along(f, w, tolerances, clock, spacing, t, size, last, q, v, a):
-    """Look along the way of a long step, once."""
+    """Look along the way of a step, or of all that begin as soon, once."""
     if clock[at.ALONG_TO] >= t + (1.0 - NEARLY) * size:
         return
+    way = min(max(size, LONG * spacing), last - t)
     clock[at.LOOKING] = 1.0
-    first, clock[at.ALONG_TO] = sudden_time(f, w, tolerances, t, t, size / PLACES, last, 1.0, q, v, a)
+    first, clock[at.ALONG_TO] = sudden_time(f, w, tolerances, t, t, way / PLACES, last, 1.0, q, v, a)
     clock[at.LOOKING] = 0.0
     if first == np.inf:
-        clock[at.LOOKED_TO] = max(clock[at.LOOKED_TO], t + size)
+        clock[at.LOOKED_TO] = max(clock[at.LOOKED_TO], t + way)
     elif first < clock[at.SUDDEN] or clock[at.SUDDEN] <= t + NEARLY * spacing:
         clock[at.SUDDEN] = clock[at.LOOKED_TO] = first
 
@@ -106,7 +106,8 @@ def up_to_sudden(f, w, tolerances, control, clock, t, size, last, state):
     """The size of a step that does not pass over a sudden change."""
     n, spacing = w.Q.size, control[at.SPACING]
     q, v, a = state[:n], state[n : 2 * n], state[2 * n : 3 * n]
-    if control[at.AHEAD] == 1.0 and LONG * spacing < size < (PLACES + NEARLY) * spacing:
+    shortest = (1.0 if control[at.BY_STATE] == 1.0 else LONG) * spacing
+    if control[at.AHEAD] == 1.0 and shortest < size < (PLACES + NEARLY) * spacing:
         _look_along(f, w, tolerances, clock, spacing, t, size, last, q, v, a)
     while clock[at.SUDDEN] <= t + NEARLY * spacing or clock[at.SUDDEN] == np.inf:
         begin = max(t, clock[at.LOOKED_TO])
