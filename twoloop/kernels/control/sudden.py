@@ -2,9 +2,10 @@
 
 They are called at times ahead: a call of one callback where a look at the equations is an evaluation. Of what is smooth
 over some of these times second differences are small against the range of the values, less the line from the first to
-the last; of what happens within one or two of them they are as large. A step is to end there. Long steps are looked at
-along the parabola on which the motion sets out, so that what is sharp by place or speed is seen as well; ahead of short
-ones the state stays that where the step begins, and of what is sharp by place the stages see enough.
+the last; of what happens within one or two of them they are as large. A step is to end there. Where something may be
+sharp by place or speed, steps longer than the spacing of these times are looked at along the parabola on which the
+motion sets out: each long one, and at once all short ones that end within LONG spacings. Ahead of others the state
+stays that where the step begins.
 """
 
 import numpy as np
@@ -16,7 +17,7 @@ from twoloop.kernels.evaluation.constraints import constraint_rates
 from twoloop.kernels.evaluation.gamma import representable
 
 PLACES = 20  # times ahead that are compared
-LONG = 12.0  # spacings of these times: a step along whose way it is looked
+LONG = 12.0  # spacings of these times: the shortest way along which it is looked
 SHARE = 0.1  # of the range: a second difference that is sudden; that of a bell as wide as four of these times
 LEAST = 0.1  # of rtol, times the largest value so far: a range that may matter
 NEARLY = 0.01  # of the spacing of these times: before a sudden change by that is at it
@@ -88,7 +89,7 @@ def sudden_time(f, w, tolerances, t, begin, spacing, last, along, q, v, a):
 
 @compiled
 def _look_along(f, w, tolerances, clock, spacing, t, size, last, q, v, a):
-    """Look along the way of a step, or of all that begin as soon, once."""
+    """Look along the way of a step, and of those behind it that end within LONG spacings, once."""
     if clock[at.ALONG_TO] >= t + (1.0 - NEARLY) * size:
         return
     way = min(max(size, LONG * spacing), last - t)

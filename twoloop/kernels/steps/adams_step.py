@@ -28,16 +28,21 @@ GROWTH, SHRINKAGE = 1.2, 0.5  # limits of the step factor ...
 START_GROWTH = 2.0  # ... while the order still rises with every step
 LEAST_FACTOR = 0.1  # after a step whose dependents are far from the prediction
 RESTART_AFTER = 3  # failures in a row, after which the method begins again with order 1
-# of h times a difference, the error of velocities by orders from 0 where all steps are equal: a step that is much shorter
-# than those before it has less, but not where the force jumps within it
-EQUAL_STEPS = np.ones(HIGHEST + 1)
-for _k in range(1, HIGHEST + 1):
-    EQUAL_STEPS[_k] = -np.sum(EQUAL_STEPS[:_k] / np.arange(_k + 1.0, 1.0, -1.0))
-EQUAL_STEPS = np.abs(EQUAL_STEPS)
 
 # eight Gauss nodes on [0, 1]: exact for c_i and (1 - s) c_i up to i = 15
 NODES, WEIGHTS = (0.5 * (1.0 + x) if k == 0 else 0.5 * x for k, x in enumerate(np.polynomial.legendre.leggauss(8)))
 REST = WEIGHTS * (1.0 - NODES)
+
+
+def _equal_steps():
+    """|g_k - g_k+1| of equal steps, by the orders k from 0: what the error of velocities is of h times a difference."""
+    made = np.ones(HIGHEST + 1)
+    for k in range(1, HIGHEST + 1):
+        made[k] = -np.sum(made[:k] / np.arange(k + 1.0, 1.0, -1.0))
+    return np.abs(made)
+
+
+EQUAL_STEPS = _equal_steps()  # a step much shorter than those before has less, but not where the force jumps within it
 
 # places in `options`
 THETA, N_OPTIONS = range(2)  # a second evaluation that moved a position by more is repeated
