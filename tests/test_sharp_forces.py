@@ -201,6 +201,15 @@ def test_a_jump_of_the_force_is_passed_within_the_tolerance(method, limit):
     assert max(errors(method)) < limit
 
 
+def test_a_short_step_of_adams_does_not_hide_a_jump():
+    """Of a step much shorter than those before it the order's formula says an error of 1/1000 of that of the jump."""
+    system = unconstrained(lambda t, q, v, p: np.array([(p[1] if t > p[0] else 0.0) - W * W * q[0]]), parameters=[0, 0])
+    for at, push in np.random.default_rng(3).uniform((0.1, -1.0), (0.9, 2.0), (40, 2)):
+        result = solve_dae(system.with_parameters([at, 10.0**push]), (0.0, END), [1.0], [0.0], "Adams", TOL, TOL)
+        v = -W * np.sin(W * END) + 10.0**push / W * np.sin(W * (END - at))
+        assert abs(result.v[0, -1] - v) < 10.0 * TOL * (1.0 + abs(v))
+
+
 def test_errors_of_velocities_count_for_as_long_as_the_motion_lasts():
     """They turn back no faster than the mechanism moves, and those of many steps add up."""
     problem = mechanisms.andrews()

@@ -115,6 +115,14 @@ def test_nor_is_what_acts_at_a_place_that_is_passed_in_that_time():
             assert result.success and np.abs(result.q[:, -1] - expected).max() < 1e-4
 
 
+@pytest.mark.parametrize("method", ["Adams", "BDF"])
+def test_nor_is_it_by_steps_shorter_than_a_170th_of_the_run(method):
+    for at, width in ((-0.35, 3e-3), (0.15, 3e-3), (0.15, 5e-3), (0.45, 5e-3)):
+        run = (0.0, T_END), START[0], [3.0, 0.0], method
+        result = solve_dae(pendulum(magnet, at, width), *run, rtol=1e-6, atol=1e-6)
+        assert result.success and np.abs(result.q[:, -1] - end_behind_edges(at, width)).max() < 1e-4
+
+
 @cache
 def end_behind_a_place(at, width):
     """(x, y) at T_END by the angle, in steps that cannot pass over the smooth magnet."""

@@ -38,8 +38,9 @@ GO_ON = -1  # nothing of these yet
     SPACING,  # s, of times at which to look ahead for sudden changes; 0: there are none
     AHEAD,  # 1: these looks go along the way; 0: they stay at the state, as a callback raised on the way
     BY_TIME,  # 1: they stay there ahead of other steps, too, for what may change suddenly with time
+    BY_STATE,  # 1: they go along the way of short steps, too, for what may be sharp by place or speed
     N_CONTROL,
-) = range(N_RULE, N_RULE + 19)
+) = range(N_RULE, N_RULE + 20)
 
 # places in a row of `out_steps`: the size of an accepted step, and the counters so far; JACOBIANS is 0 after an
 # explicit step of a method that switches

@@ -2,9 +2,10 @@
 
 They are called at times ahead: a call of one callback where a look at the equations is an evaluation. Of what is smooth
 over some of these times second differences are small against the range of the values, less the line from the first to
-the last; of what happens within one or two of them they are as large. A step is to end there. Long steps are looked at
-along the parabola on which the motion sets out, so that what is sharp by place or speed is seen as well; ahead of short
-ones the state stays that where the step begins, and of what is sharp by place the stages see enough.
+the last; of what happens within one or two of them they are as large. A step is to end there. Where something may be
+sharp by place or speed, steps longer than the spacing of these times are looked at along the parabola on which the
+motion sets out: each long one, and at once all short ones that end within LONG spacings. Ahead of others the state
+stays that where the step begins.
 """
 
 import numpy as np
@@ -16,7 +17,7 @@ from twoloop.kernels.evaluation.constraints import constraint_rates
 from twoloop.kernels.evaluation.gamma import representable
 
 PLACES = 20  # times ahead that are compared
-LONG = 12.0  # spacings of these times: a step along whose way it is looked
+LONG = 12.0  # spacings of these times: the shortest way along which it is looked
 SHARE = 0.1  # of the range: a second difference that is sudden; that of a bell as wide as four of these times
 LEAST = 0.1  # of rtol, times the largest value so far: a range that may matter
 NEARLY = 0.01  # of the spacing of these times: before a sudden change by that is at it
@@ -46,17 +47,16 @@ def _largest(values):
 
 @compiled
 def _first_bend(values, n, slope, least):
-    """Place of the largest second difference of n + 1 values, less a line, where it is sudden; else 0."""
-    low = high = bend = 0.0
-    place = 0
+    """The first place where the second difference of n + 1 values, less a line, is sudden; else 0."""
+    low = high = 0.0
     for k in range(1, n + 1):
         off = values[k] - values[0] - k * slope
         low, high = min(low, off), max(high, off)
-        if k < n:
-            second = abs(values[k + 1] - 2.0 * values[k] + values[k - 1])
-            if second > bend:
-                bend, place = second, k
-    return place if high - low > least and bend > SHARE * (high - low) else 0
+    if high - low > least:
+        for k in range(1, n):
+            if abs(values[k + 1] - 2.0 * values[k] + values[k - 1]) > SHARE * (high - low):
+                return k
+    return 0
 
 
 @compiled
@@ -89,14 +89,15 @@ def sudden_time(f, w, tolerances, t, begin, spacing, last, along, q, v, a):
 
 @compiled
 def _look_along(f, w, tolerances, clock, spacing, t, size, last, q, v, a):
-    """Look along the way of a long step, once."""
+    """Look along the way of a step, and of those behind it that end within LONG spacings, once."""
     if clock[at.ALONG_TO] >= t + (1.0 - NEARLY) * size:
         return
+    way = min(max(size, LONG * spacing), last - t)
     clock[at.LOOKING] = 1.0
-    first, clock[at.ALONG_TO] = sudden_time(f, w, tolerances, t, t, size / PLACES, last, 1.0, q, v, a)
+    first, clock[at.ALONG_TO] = sudden_time(f, w, tolerances, t, t, way / PLACES, last, 1.0, q, v, a)
     clock[at.LOOKING] = 0.0
     if first == np.inf:
-        clock[at.LOOKED_TO] = max(clock[at.LOOKED_TO], t + size)
+        clock[at.LOOKED_TO] = max(clock[at.LOOKED_TO], t + way)
     elif first < clock[at.SUDDEN] or clock[at.SUDDEN] <= t + NEARLY * spacing:
         clock[at.SUDDEN] = clock[at.LOOKED_TO] = first
 
@@ -106,7 +107,8 @@ def up_to_sudden(f, w, tolerances, control, clock, t, size, last, state):
     """The size of a step that does not pass over a sudden change."""
     n, spacing = w.Q.size, control[at.SPACING]
     q, v, a = state[:n], state[n : 2 * n], state[2 * n : 3 * n]
-    if control[at.AHEAD] == 1.0 and LONG * spacing < size < (PLACES + NEARLY) * spacing:
+    shortest = (1.0 if control[at.BY_STATE] == 1.0 else LONG) * spacing
+    if control[at.AHEAD] == 1.0 and shortest < size < (PLACES + NEARLY) * spacing:
         _look_along(f, w, tolerances, clock, spacing, t, size, last, q, v, a)
     while clock[at.SUDDEN] <= t + NEARLY * spacing or clock[at.SUDDEN] == np.inf:
         begin = max(t, clock[at.LOOKED_TO])

@@ -33,6 +33,17 @@ RESTART_AFTER = 3  # failures in a row, after which the method begins again with
 NODES, WEIGHTS = (0.5 * (1.0 + x) if k == 0 else 0.5 * x for k, x in enumerate(np.polynomial.legendre.leggauss(8)))
 REST = WEIGHTS * (1.0 - NODES)
 
+
+def _equal_steps():
+    """|g_k - g_k+1| of equal steps, by the orders k from 0: what the error of velocities is of h times a difference."""
+    made = np.ones(HIGHEST + 1)
+    for k in range(1, HIGHEST + 1):
+        made[k] = -np.sum(made[:k] / np.arange(k + 1.0, 1.0, -1.0))
+    return np.abs(made)
+
+
+EQUAL_STEPS = _equal_steps()  # a step much shorter than those before has less, but not where the force jumps within it
+
 # places in `options`
 THETA, N_OPTIONS = range(2)  # a second evaluation that moved a position by more is repeated
 # places in `memory`: scalars, rows of coefficients (N_TERMS + 1 each), then tables; see _tables
@@ -245,6 +256,7 @@ def _next(memory, h, k, table, d, n):
             elif above < (0.5 * error if k == 1 else error):
                 order, expected = k + 1, above
     memory[NEXT_ORDER] = float(order)
+    error = max(error, h * EQUAL_STEPS[k] * v0)
     if not np.isfinite(error):
         return np.inf, 0.0
     if error > 1.0:
