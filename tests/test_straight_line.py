@@ -12,8 +12,10 @@ from tests.compiled import unit_mass
 from tests.problems import pendulum, unconstrained, worst
 from tests.processes import run_python
 from twoloop import ConstrainedSystem, ConstraintWarning, callback, mechanisms
-from twoloop.generate import stage_code
-from twoloop.generate.straight_code import own_code
+from twoloop.generate import parts_code, stage_code
+from twoloop.generate.choices import Choice
+from twoloop.generate.straight_code import SharedCode, own_code
+from twoloop.generate.straight_line import StraightLine
 from twoloop.kernels.compile import caches
 from twoloop.kernels.data.codes import DONE
 from twoloop.kernels.data.noted import BY_GENERAL
@@ -98,6 +100,30 @@ def test_a_state_is_moved_to_the_nearest_on_the_constraints(make):
     assert np.abs(M @ a + G.T @ lam - force).max() < 1e-10 * size
     if run.rank < len(lam):  # of least norm
         assert np.abs(np.linalg.svd(G.T)[2][run.rank :] @ lam).max() < 1e-8 * np.abs(lam).max()
+
+
+@pytest.mark.parametrize("make", [mechanisms.four_bar, mechanisms.redundant_slider_crank, mechanisms.rolling_disc])
+def test_equations_in_parts_give_the_same(make, monkeypatch):
+    problem, rng = make(), np.random.default_rng(5)
+    n, choice = problem.system.n_q, Choice.at(problem.system, 0.0, problem.q0)
+    q = problem.q0 + 1e-6 * rng.standard_normal(n)
+    v = problem.v0 + 1e-3 * rng.standard_normal(n)
+    made = []
+    for long in (10**6, 0):
+        monkeypatch.setattr(parts_code, "LONG", long)
+        code = SharedCode(StraightLine(problem.system, choice), None)
+        assert (code.parts is not None) == (long == 0)
+        plan = PRESETS["DOP853"].plan(n, 1e-8, 1e-8, False)
+        plan = replace(plan, inner=code.inner, own=(code.functions,), numbers=code.numbers.values)
+        run = Run(problem.system, plan, 0.0, problem.q0, problem.v0, 1e-8, np.full(n, 1e-8), None)
+        for task in (tasks.EVALUATE_THERE, *([tasks.PROJECT] if code.projects else [])):
+            run.work.notes[BY_GENERAL] = 0.0
+            found = inner(run, task, 0.0, q, v)
+            assert found[0] == DONE and run.work.notes[BY_GENERAL] == 0.0  # not by the general inner loop
+            made.append(np.concatenate(found[1:]))
+    half = len(made) // 2
+    for one, other in zip(made[:half], made[half:], strict=True):
+        assert np.abs(one - other).max() < 1e-10 * np.abs(one).max()
 
 
 @ending_at_a_reference
@@ -247,7 +273,7 @@ def test_a_second_process_compiles_nothing(tmp_path):
         import sys
         from pathlib import Path
         from twoloop import solve_dae
-        from twoloop.generate import straight_code
+        from twoloop.generate import written
         from twoloop.kernels.compile import own_functions
         from twoloop.mechanisms import four_bar
 
@@ -255,7 +281,7 @@ def test_a_second_process_compiles_nothing(tmp_path):
             raise AssertionError("compiled again")
 
         if sys.argv[2] == "second":
-            straight_code.Written.operation = own_functions.object_code = refuse
+            written.Written.operation = own_functions.object_code = refuse
         own_functions.sources_folder = lambda: Path(sys.argv[1])
         p = four_bar()
         solve_dae(p.system, (0.0, 0.1), p.q0, p.v0, "DOP853", compiled=True)

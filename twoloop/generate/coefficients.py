@@ -1,7 +1,8 @@
 """Numbers that code made for a mechanism reads when it runs: one code serves all mechanisms of its structure."""
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -78,11 +79,14 @@ class Coefficients:
         """The same of a form."""
         return self.of(tuple(form.terms.items()), form.constant)
 
-    def structure(self, graph: Graph, forms: Iterable[Form]) -> Iterable[Any]:
-        """What code for these forms depends on, the values of its numbers apart."""
+    def structure(
+        self, graph: Graph, forms: Iterable[Form], kept: Mapping[int, int] = MappingProxyType({})
+    ) -> Iterable[Any]:
+        """What code for these forms depends on, the values of its numbers apart; `kept`: at which places others are."""
         forms = list(forms)
-        needed = graph.needed_by(forms)
-        name = {i: k for k, i in enumerate(needed)}
+        needed = graph.needed_by(forms, kept)
+        name: dict[int, Any] = {i: k for k, i in enumerate(needed)}
+        name |= {i: f"kept {place}" for i, place in kept.items()}
 
         def told(form: Form) -> Any:
             terms, constant = self.of_form(form)

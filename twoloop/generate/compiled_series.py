@@ -11,7 +11,6 @@ from twoloop.generate.llvm_text import Module
 from twoloop.generate.series import series_program
 from twoloop.generate.series_code import SeriesCode
 from twoloop.generate.straight_code import OwnCode, SharedCode, write_own
-from twoloop.generate.straight_line import Solution
 from twoloop.kernels.compile.caches import digest_of
 from twoloop.kernels.compile.own_functions import OwnFunctions, own_functions
 
@@ -59,15 +58,16 @@ def _compiled(own: SharedCode) -> CompiledSeries:
             f"it out"
         )
     numbers = Coefficients()
-    code, solution = SeriesCode(program, numbers), Solution(own.equations)
-    structure = [own.digest, program.n_q, program.n_rows, code.groups.structure, solution.n_kept]
-    structure += numbers.structure(solution.graph, solution.solved.forms)
+    code = SeriesCode(program, numbers)
+    structure = [own.digest, program.n_q, program.n_rows, code.groups.structure]
     key = hashlib.sha256(repr(structure).encode()).hexdigest()
 
     def write() -> tuple[list[str], str]:
-        module = Module()
-        write_own(module, "own_factors", own.equations.graph, solution.kept, own.numbers)
-        write_own(module, "own_solution", solution.graph, solution.solved, numbers)
+        module, names = Module(), ["own_solution"]
+        write_own(module, "own_solution", own.solution.graph, own.solution.solved, own.numbers)
+        if own.parts is None:
+            names.append("own_factors")
+            write_own(module, "own_factors", own.equations.graph, own.solution.kept, own.numbers)
         recurrences: dict[str, Callable[..., Any]] = {
             "begin_series": code.begin,
             "find_order": code.find_order,
@@ -75,9 +75,10 @@ def _compiled(own: SharedCode) -> CompiledSeries:
         }
         for name, emit in recurrences.items():
             llvm_code.write(module, name, KIT.own_type(name), emit)
-        return ["own_factors", "own_solution", *recurrences], str(module)
+        return [*names, *recurrences], str(module)
 
-    return CompiledSeries(own_functions("series", _stamp(), key, write), code, solution.n_kept, numbers.formulas)
+    functions = own_functions("series", _stamp(), key, write)
+    return CompiledSeries(functions, code, own.solution.n_kept, numbers.formulas)
 
 
 @cache

@@ -13,9 +13,9 @@ from twoloop.generate.lane_emitter import LaneEmitter
 from twoloop.generate.lane_series import LaneSeries
 from twoloop.generate.llvm_text import Value, integer
 from twoloop.generate.series import series_program
-from twoloop.generate.straight_code import conditions_hold, results_of
 from twoloop.generate.straight_line import Outputs, Solution, StraightLine
 from twoloop.generate.tracing import Untraceable
+from twoloop.generate.written import conditions_hold, results_of
 from twoloop.kernels.control.defect import ROUNDING
 from twoloop.kernels.control.predictor import FLOOR, LEAST, SHARE_OF_MOTION
 from twoloop.kernels.lanes import lane_room as lanes
@@ -56,7 +56,7 @@ class LaneCode:
         self.n_numbers = self.numbers.n_varying
         parts = [equations.there, equations.closer, equations.nearer, equations.redundant]
         parts += [self.solution.kept] if series else []
-        counts = [len(each.quantities(equations.graph)) for each in parts if each is not None]
+        counts = [len(each.quantities(equations.graph)) for each in parts]
         counts += [len(self.solution.solved.quantities(self.solution.graph))] if series else []
         self.n_quantities = sum(counts)
 
@@ -78,9 +78,7 @@ class LaneCode:
             told += list(self.recurrences.structure)
             parts.append(self.solution.kept)
         for outputs in parts:
-            if outputs is not None:
-                told += [{name: len(forms) for name, forms in outputs.arrays.items()}, len(outputs.conditions)]
-                told += list(numbers.structure(equations.graph, outputs.forms))
+            told += [outputs.sizes, *numbers.structure(equations.graph, outputs.forms)]
         if self.recurrences is not None:
             told += list(numbers.structure(self.solution.graph, self.solution.solved.forms))
         return hashlib.sha256(repr(told).encode()).hexdigest()
@@ -219,8 +217,7 @@ class LaneCode:
         """The same and velocities, and accelerations and multipliers there."""
         self._project(emit, self.equations.nearer, order, control, room)
 
-    def _project(self, emit: LaneEmitter, outputs: Outputs | None, order: Value, control: Value, room: Value) -> None:
-        assert outputs is not None
+    def _project(self, emit: LaneEmitter, outputs: Outputs, order: Value, control: Value, room: Value) -> None:
         select, at = emit.builder.select, self._at(emit, order, control, room)
         inputs = self._new(emit, room, at)
         written, arrays = results_of(emit, self.equations.graph, outputs, inputs, self.numbers)

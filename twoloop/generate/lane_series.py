@@ -6,14 +6,14 @@ Factors of products stand in rows, one for each order; a factor that several pro
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-from twoloop.generate import llvm_trigonometry, straight_code
+from twoloop.generate import llvm_trigonometry
 from twoloop.generate.coefficients import Coefficients, Terms
 from twoloop.generate.lane_emitter import LaneEmitter
 from twoloop.generate.llvm_code import Quantities
 from twoloop.generate.llvm_text import Value, integer
 from twoloop.generate.series import SeriesProgram, Sums, Table
-from twoloop.generate.straight_code import results_of
 from twoloop.generate.straight_line import Solution
+from twoloop.generate.written import FUNCTIONS, results_of
 from twoloop.kernels.evaluation.operations import (
     ARCTANGENT,
     EXPONENTIAL,
@@ -216,7 +216,7 @@ class LaneSeries:
             elif kind == RECIPROCAL:
                 values = [emit.divide(one, x)]
             else:
-                values = [emit.function(straight_code.FUNCTIONS[kind], x)]
+                values = [emit.function(FUNCTIONS[kind], x)]
                 if kind in (LOGARITHM, ARCTANGENT):
                     divisor = known.sum(*second)
                     row.store(second, divisor)

@@ -97,9 +97,9 @@ class Module:
         self._declared: dict[str, str] = {}
         self._functions: list[Builder] = []
 
-    def function(self, name: str, result: str, arguments: Sequence[str]) -> "Builder":
-        """A new function, in whose first block operations are put."""
-        made = Builder(self, name, result, arguments)
+    def function(self, name: str, result: str, arguments: Sequence[str], internal: bool = False) -> "Builder":
+        """A new function, in whose first block operations are put; `internal`: only others of the module call it."""
+        made = Builder(self, name, result, arguments, internal)
         self._functions.append(made)
         return made
 
@@ -108,15 +108,17 @@ class Module:
         self._declared[name] = f"declare {result} @{name}({', '.join(arguments)})"
 
     def __str__(self) -> str:
-        parts = [*self._declared.values(), *(function.text() for function in self._functions), "!0 = !{}"]
+        defined = {function.name for function in self._functions}
+        declared = [text for name, text in self._declared.items() if name not in defined]
+        parts = [*declared, *(function.text() for function in self._functions), "!0 = !{}"]
         return "\n".join(parts)
 
 
 class Builder:
     """Appends operations to the blocks of a function."""
 
-    def __init__(self, module: Module, name: str, result: str, arguments: Sequence[str]):
-        self.module, self.name, self.result = module, name, result
+    def __init__(self, module: Module, name: str, result: str, arguments: Sequence[str], internal: bool = False):
+        self.module, self.name, self.result, self.internal = module, name, result, internal
         self.arguments = [Value(kind, f"%a{k}") for k, kind in enumerate(arguments)]
         self._n = 0
         self._blocks: list[Block] = []
@@ -126,7 +128,8 @@ class Builder:
         """The definition of the function."""
         arguments = ", ".join(map(str, self.arguments))
         body = "\n".join(block.text() for block in self._blocks)
-        return f"define {self.result} @{self.name}({arguments}) {{\n{body}\n}}"
+        linkage = "internal " if self.internal else ""
+        return f"define {linkage}{self.result} @{self.name}({arguments}) noinline {{\n{body}\n}}"
 
     def append_block(self) -> Block:
         """A new block."""
@@ -188,6 +191,18 @@ class Builder:
         """The value of a function of the module, or of one that is declared by this."""
         self.module.declare(name, kind, [value.type for value in arguments])
         return self._value(kind, f"call {kind} @{name}({', '.join(map(str, arguments))})")
+
+    def room(self, kind: str, size: int) -> Value:
+        """Memory for some values, until the function ends."""
+        return self._value(f"{kind}*", f"alloca {kind}, {integer(max(size, 1))}, align 64")
+
+    def leave_unless(self, condition: Value) -> None:
+        """End the function where a condition does not hold, which is its result."""
+        go_on, leave = self.append_block(), self.append_block()
+        self.branch(condition, go_on, leave)
+        self.block = leave
+        self.ret(Value(BIT, "false"))
+        self.block = go_on
 
     def gep(self, base: Value, place: Value) -> Value:
         """A pointer some elements further on."""

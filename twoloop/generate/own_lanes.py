@@ -15,8 +15,8 @@ from twoloop.generate import (
     llvm_text,
     llvm_trigonometry,
     series,
-    straight_code,
     straight_line,
+    written,
 )
 from twoloop.generate.choices import Choice
 from twoloop.generate.known_numbers import Record
@@ -33,7 +33,7 @@ Array = NDArray[np.float64]
 
 BUILD_SECONDS = 3e-4  # for a quantity, about
 LANE_WRITERS = (lane_code, lane_series, lane_emitter)
-WRITERS = (series, straight_line, straight_code, coefficients, *LANE_WRITERS, llvm_code, llvm_text, llvm_trigonometry)
+WRITERS = (series, straight_line, written, coefficients, *LANE_WRITERS, llvm_code, llvm_text, llvm_trigonometry)
 
 KIND = "lanes"  # of files on the disk
 

@@ -15,12 +15,12 @@ from twoloop.generate import llvm_code
 from twoloop.generate.llvm_code import SLACK, Emitter
 from twoloop.generate.llvm_text import BIT, Module, Value, integer
 from twoloop.generate.series_groups import WIDTH
-from twoloop.generate.straight_code import OwnCode, SharedCode, conditions_hold, results_of
+from twoloop.generate.straight_code import OwnCode, SharedCode
+from twoloop.generate.written import conditions_hold, results_of
 from twoloop.kernels.compile.caches import digest_of
 from twoloop.kernels.compile.own_functions import CALLED, OwnFunctions, own_functions
 
 AT_ONCE = 16  # vectors that are summed in one loop, in registers
-LONG = 500  # quantities from which on accelerations are called
 
 
 class StageCode:
@@ -34,7 +34,7 @@ class StageCode:
         self.n = own.equations.system.n_q
         self.blocks = -(-2 * self.n // WIDTH)
         self.slopes = self.blocks * WIDTH
-        self.calls = len(own.equations.there.quantities(own.equations.graph)) > LONG
+        self.calls = own.parts is not None
 
     def scratch_size(self) -> int:
         """Length of `scratch`."""

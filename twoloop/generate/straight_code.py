@@ -5,110 +5,30 @@ hundred of them. The code is kept on disk as that of the kernels.
 """
 
 import hashlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from twoloop.generate import coefficients, llvm_code, llvm_text, llvm_trigonometry, straight_line
+from twoloop.generate import coefficients, llvm_code, llvm_text, llvm_trigonometry, parts_code, straight_line, written
 from twoloop.generate.choices import Choice
 from twoloop.generate.coefficients import Coefficients
 from twoloop.generate.families import Evaluator, Family, of_family
-from twoloop.generate.llvm_code import Emitter, Quantities
-from twoloop.generate.llvm_text import DOUBLE, Module, Value
-from twoloop.generate.llvm_trigonometry import LARGEST_ANGLE, sine_and_cosine
-from twoloop.generate.straight_line import Outputs, StraightLine
+from twoloop.generate.llvm_code import Emitter
+from twoloop.generate.llvm_text import Module, Value
+from twoloop.generate.parts_code import PartsCode
+from twoloop.generate.straight_line import Outputs, Solution, StraightLine
 from twoloop.generate.traced_values import Check, Traced, unchecked
-from twoloop.generate.tracing import Form, Graph, Untraceable
+from twoloop.generate.tracing import Graph, Untraceable
+from twoloop.generate.written import conditions_hold, inputs_of, results_of
 from twoloop.kernels.compile.caches import digest_of
 from twoloop.kernels.compile.own_functions import own_functions
 from twoloop.kernels.compile.private import Dispatcher
-from twoloop.kernels.evaluation.operations import (
-    ARCTANGENT,
-    COSINE,
-    EXPONENTIAL,
-    LOGARITHM,
-    PRODUCT,
-    RECIPROCAL,
-    SINE,
-    SQUARE_ROOT,
-    SUM,
-)
 from twoloop.problem.system import ConstrainedSystem
 
 Array = NDArray[np.float64]
-
-FUNCTIONS = {SQUARE_ROOT: "sqrt", EXPONENTIAL: "exp", LOGARITHM: "log", ARCTANGENT: "atan"}
-
-
-class Written:
-    """Values of the quantities of a graph, as they are written into a function."""
-
-    def __init__(self, emit: Emitter, numbers: Coefficients):
-        self.emit, self.numbers = emit, numbers
-        self.angles: list[Value] = []  # of sines and cosines
-        self._known = Quantities(emit, self._missing)
-        self._pairs: dict[Any, tuple[Value, Value]] = {}
-
-    def _missing(self, quantity: int) -> Value:
-        raise KeyError(quantity)  # every quantity is defined before it is used
-
-    def define(self, quantity: int, value: Value) -> None:
-        """Say what an input is."""
-        self._known.define(quantity, value)
-
-    def form(self, form: Form) -> Value:
-        """The value of a form."""
-        return self._known.sum(*self.numbers.of_form(form))
-
-    def operation(self, quantity: int, kind: int, first: Form, second: Form | None) -> None:
-        """Compute a quantity."""
-        emit, x = self.emit, self.form(first)
-        if kind == PRODUCT:
-            assert second is not None
-            value = emit.multiply(x, self.form(second))
-        elif kind == SUM:
-            value = x
-        elif kind == RECIPROCAL:
-            value = emit.divide(emit.constant(1.0), x)
-        elif kind in (SINE, COSINE):
-            if first.key not in self._pairs:
-                self.angles.append(x)
-                self._pairs[first.key] = sine_and_cosine(emit, x)
-            value = self._pairs[first.key][kind == COSINE]
-        else:
-            value = emit.function(FUNCTIONS[kind], x)
-        self._known.define(quantity, value)
-
-
-def results_of(
-    emit: Emitter, graph: Graph, outputs: Outputs, inputs: Sequence[Value], numbers: Coefficients
-) -> tuple[Written, list[list[Value]]]:
-    """Arrays that code computes from the inputs of a graph, in their order."""
-    written = Written(emit, numbers)
-    for quantity, value in enumerate(inputs):
-        written.define(quantity, value)
-    for i in outputs.quantities(graph):
-        operation = graph.operations[i]
-        assert operation is not None
-        written.operation(i, *operation)
-    return written, [[written.form(form) for form in forms] for forms in outputs.arrays.values()]
-
-
-def conditions_hold(emit: Emitter, written: Written, outputs: Outputs, values: Sequence[Value]) -> Value:
-    """Whether what was written holds: its conditions, angles that are not too large, and values that are finite."""
-    builder, zero = emit.builder, emit.constant(0.0)
-    total = zero
-    for value in values:  # what is not finite becomes NaN
-        total = emit.add(total, emit.multiply(value, zero))
-    holds = builder.compare("fcmp oeq", total, zero)
-    pairs = [(written.form(one), written.form(other)) for one, other in outputs.conditions]
-    pairs += [(emit.constant(LARGEST_ANGLE), emit.function("fabs", angle)) for angle in written.angles]
-    for one, other in pairs:
-        holds = builder.both(holds, builder.compare("fcmp ogt", one, other))
-    return holds
 
 
 def write_function(
@@ -127,9 +47,7 @@ def write_function(
     def emit_all(emit: Emitter, *arguments: Value) -> Value:
         n_given = len(graph.sizes)
         given, emit.numbers, filled = arguments[:n_given], arguments[n_given], arguments[n_given + 1 :]
-        inputs: list[Value] = []
-        for argument, size in zip(given, graph.sizes, strict=True):
-            inputs += [argument] if argument.type == DOUBLE else [emit.load(argument, j) for j in range(size)]
+        inputs = inputs_of(emit, graph, given)
         written, results = results_of(emit, graph, outputs, inputs, numbers)
         holds = conditions_hold(emit, written, outputs, results[0])
         with emit.builder.if_then(holds):
@@ -151,8 +69,10 @@ class SharedCode:
 
     Attributes
     ----------
+    solution : Solution
+        Of them.
     numbers : Coefficients
-        Of the equations.
+        Of both.
     digest : str
         Of all that the functions depend on, the values of these apart.
     functions : OwnFunctions
@@ -162,9 +82,13 @@ class SharedCode:
 
     def __init__(self, equations: StraightLine, family: Family):
         self.equations, self.family, self.numbers = equations, family, Coefficients()
-        structure = repr(list(_described(equations, self.numbers)))
+        self.projects, self.parts = equations.projects, None
+        if parts_code.is_long(equations):
+            self.parts = PartsCode(equations, self.numbers)
+        self.solution = Solution(equations) if self.parts is None else self.parts.solution
+        self.outputs = self._outputs()
+        structure = repr(list(self._described()))
         self.digest = hashlib.sha256((structure + _stamp()).encode()).hexdigest()
-        self.projects = equations.closer is not None and equations.nearer is not None
         self.functions = own_functions("equations", _stamp(), self.digest, self._write)
 
     def of(self, system: ConstrainedSystem, evaluate: Evaluator) -> "OwnCode":
@@ -178,15 +102,36 @@ class SharedCode:
 
         return own_inner.own_inner_loop if self.projects else own_inner.own_evaluations
 
+    def _outputs(self) -> dict[str, Outputs]:
+        """What functions compute that are no parts of others."""
+        equations = self.equations
+        outputs = {"own_redundant": equations.redundant} if self.projects else {}
+        if self.parts is None:
+            outputs["own_there"] = equations.there
+            if self.projects:
+                outputs |= {"own_closer": equations.closer, "own_nearer": equations.nearer}
+        return outputs
+
+    def _described(self) -> Iterable[Any]:
+        equations, solution, numbers = self.equations, self.solution, self.numbers
+        yield equations.system.n_q, equations.choice.rows, equations.choice.added
+        for outputs in (*self.outputs.values(), solution.kept):
+            yield outputs.sizes, list(numbers.structure(equations.graph, outputs.forms))
+        if self.parts is not None:
+            for outputs in self.parts.at_position.values():
+                yield outputs.sizes, list(numbers.structure(equations.graph, outputs.forms, solution.known))
+        others = [] if self.parts is None else self.parts.with_factors.values()
+        for outputs in (solution.solved, *others):
+            yield outputs.sizes, list(numbers.structure(solution.graph, outputs.forms))
+
     def _write(self) -> tuple[list[str], str]:
+        from twoloop.kernels.data.common import KIT
+
         module, equations = Module(), self.equations
-        outputs: dict[str, Any] = {"own_there": equations.there}
-        if self.projects:
-            outputs |= {"own_closer": equations.closer, "own_nearer": equations.nearer}
-            outputs |= {"own_redundant": equations.redundant}
-        for name, each in outputs.items():
-            write_own(module, name, equations.graph, each, self.numbers)
-        return list(outputs), str(module)
+        for name, outputs in self.outputs.items():
+            write_own(module, name, equations.graph, outputs, self.numbers)
+        parts = [] if self.parts is None else self.parts.write(module, KIT.own_type)
+        return [*self.outputs, *parts], str(module)
 
 
 class OwnCode(NamedTuple):
@@ -237,17 +182,10 @@ def own_code(system: ConstrainedSystem, t0: float, q0: Array, check: Check = unc
     return made
 
 
-def _described(equations: StraightLine, numbers: Coefficients) -> Iterable[Any]:
-    yield equations.system.n_q, equations.choice.rows, equations.choice.added
-    for outputs in (equations.there, equations.closer, equations.nearer, equations.redundant):
-        if outputs is not None:
-            yield {name: len(forms) for name, forms in outputs.arrays.items()}, len(outputs.conditions)
-            yield list(numbers.structure(equations.graph, outputs.forms))
-
-
 @cache
 def _stamp() -> str:
     """A digest of what writes the functions, and of what they are called as."""
     from twoloop.kernels.data.common import KIT
 
-    return digest_of(repr(KIT), __file__, straight_line, coefficients, llvm_code, llvm_text, llvm_trigonometry)
+    writers = (straight_line, coefficients, llvm_code, llvm_text, llvm_trigonometry, parts_code, written)
+    return digest_of(repr(KIT), __file__, *writers)

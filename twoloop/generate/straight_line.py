@@ -12,8 +12,9 @@ is not to be used. The same factors give the nearest position and velocity on th
 M is singular, rows g of G are added, M + g^T g, which changes neither. Of redundant rows those that count are kept.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Container, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -44,9 +45,14 @@ class Outputs:
     arrays: dict[str, list[Form]]
     conditions: list[tuple[Form, Form]]
 
-    def quantities(self, graph: Graph) -> list[int]:
-        """What all of this is made of, inputs apart, in an order in which it can be computed."""
-        return graph.needed_by(self.forms)
+    def quantities(self, graph: Graph, known: Container[int] = ()) -> list[int]:
+        """What all of this is made of, inputs and what is known apart, in an order in which it can be computed."""
+        return graph.needed_by(self.forms, known)
+
+    @property
+    def sizes(self) -> tuple[dict[str, int], int]:
+        """Of the arrays, and how many conditions there are."""
+        return {name: len(forms) for name, forms in self.arrays.items()}, len(self.conditions)
 
     @property
     def forms(self) -> list[Form]:
@@ -187,11 +193,16 @@ class StraightLine:
         Its first quantities are t, q and v.
     there : Outputs
         "a" (n_q,), the accelerations at (q, v) as they stand.
-    closer : Outputs or None
-        "q" (n_q,), moved by a step of Newton's method towards the constraints, and "moved" (n_q,), by how much. None:
-        there are rows of A, which leave positions free.
-    nearer : Outputs or None
+    solved : Outputs
+        The same, and "lam" (n_c + n_a,), 0 for rows that do not count; without conditions.
+    projects : bool
+        Whether there are `closer` and `nearer`. Rows of A leave positions free.
+    closer : Outputs
+        "q" (n_q,), moved by a step of Newton's method towards the constraints, and "moved" (n_q,), by how much.
+    nearer : Outputs
         The same, "v" (n_q,) on the rows at the position before the move, and "a" (n_q,), "lam" (n_c,) for these.
+    off, faster : Outputs
+        "c" (n_c,) of the moves to positions and to velocities on the rows.
     redundant : Outputs
         No arrays; its conditions are that the rows of C_q that do not count hold, too.
     traced : Traced
@@ -207,7 +218,8 @@ class StraightLine:
         self.equations = Equations(system, parameters)
         self.system, self.choice, self.graph = system, choice, self.equations.graph
         self.nothing = Form(self.graph, 0.0, {})
-        n, n_a, (self.q, self.v) = system.n_q, system.n_a, (self.equations.q, self.equations.v)
+        n, (self.q, self.v) = system.n_q, (self.equations.q, self.equations.v)
+        self.projects = system.n_a == 0
         self.mass = self._made("mass")
         rows = [self._made("jacobian"), self._made("nonholonomic")]
         rates = [self._made("constraint_rate"), self._made("nonholonomic_rate")]
@@ -216,15 +228,16 @@ class StraightLine:
         self.factors = Factors(self._matrix(), n + len(self.rows), n)
         self.conditions = [(pivot, alone.times(choice.least)) for pivot, alone in self.factors.conditions]
         self.conditions += [(pivot, self.nothing) for pivot in self.factors.positive if pivot.terms]
-        self.there = Outputs({"a": self._accelerations(self.v)[:n]}, self.conditions)
+        solution = self._accelerations(self.v)
+        self.there = Outputs({"a": solution[:n]}, self.conditions)
+        self.solved = Outputs({"a": solution[:n], "lam": self._spread(solution[n:])}, [])
         self.redundant = self._redundant(np.concatenate(rates))
-        self.closer: Outputs | None = None
-        self.nearer: Outputs | None = None
-        if n_a == 0:
-            self._add_projection()
+        self._bound()
+        self.traced = Traced(system, self.graph)
+
+    def _bound(self) -> None:
         if len(self.graph.operations) > MOST:
             raise Untraceable(f"its equations are more than {MOST} operations")
-        self.traced = Traced(system, self.graph)
 
     def _made(self, kind: str, v: Sequence[Form] | None = None) -> Any:
         return elementwise(Form.value, [self.equations.of(kind, v)])
@@ -272,90 +285,180 @@ class StraightLine:
                 right[i] = right[i] + (entry * gamma[k]).times(self.choice.scale)
         return self.factors.solve([*right, *(gamma[k] for k in self.choice.rows)])
 
-    def _add_projection(self) -> None:
-        n = self.system.n_q
-        off = self._made("constraint")[list(self.choice.rows)]
-        moved = self.factors.solve([*([self.nothing] * n), *(-each for each in off)])[:n]
+    def _spread(self, counting: Sequence[Form]) -> list[Form]:
+        """Numbers for all rows from those for the rows that count, the others 0."""
+        numbers = [self.nothing] * len(self.all_rows)
+        for k, number in zip(self.choice.rows, counting, strict=True):
+            numbers[k] = number
+        return numbers
+
+    @cached_property
+    def off(self) -> Outputs:
+        """See the class."""
+        return Outputs({"c": self._spread([-each for each in self._made("constraint")[list(self.choice.rows)]])}, [])
+
+    @cached_property
+    def faster(self) -> Outputs:
+        """See the class."""
         faster = []
         for row, rate in zip(self.rows, self.rates, strict=True):
             total = rate
             for entry, u in zip(row, self.v, strict=True):
                 total = total + entry * u
             faster.append(-total)
-        change = self.factors.solve([*([self.nothing] * n), *faster])[:n]
-        v = [(one + other).value() for one, other in zip(self.v, change, strict=True)]
-        solution = self._accelerations(v)
+        return Outputs({"c": self._spread(faster)}, [])
+
+    @cached_property
+    def closer(self) -> Outputs:
+        """See the class."""
+        moved = self._correction(self.off)
         position = {"moved": moved, "q": [one + other for one, other in zip(self.q, moved, strict=True)]}
-        self.closer = Outputs(position, self.conditions)
-        lam = self._of_least_norm(solution[n:])
-        self.nearer = Outputs({"a": solution[:n], **position, "v": v, "lam": lam}, self.conditions)
+        return Outputs(position, self.conditions)
 
-    def _of_least_norm(self, known: Sequence[Form]) -> list[Form]:
-        """Multipliers of all rows from those of the rows that count.
+    @cached_property
+    def nearer(self) -> Outputs:
+        """See the class."""
+        n, rows, position = self.system.n_q, self.choice.rows, self.closer.arrays
+        v = [(one + other).value() for one, other in zip(self.v, self._correction(self.faster), strict=True)]
+        solution = self._accelerations(v)
+        lam = of_least_norm(self.graph, solution[n:], self.all_rows, rows, self.factors.solve)
+        self._bound()
+        return Outputs({"a": solution[:n], **position, "v": v, "lam": lam}, self.conditions)
 
-        A row that does not is a combination of these, by the numbers Z; less its part in the null space of G^T, spanned
-        by e_i - sum_k Z_ik e_k, lam has least norm.
-        """
-        n, rows = self.system.n_q, self.choice.rows
-        lam = [self.nothing] * len(self.all_rows)
-        for k, value in zip(rows, known, strict=True):
-            lam[k] = value
-        others = [k for k in range(len(lam)) if k not in rows]
-        Z = [self.factors.solve([*self.all_rows[k], *([self.nothing] * len(rows))])[n:] for k in others]
-        gram = {
-            (i, j): sum((x * y for x, y in zip(one, other, strict=True)), Form(self.graph, float(i == j), {}))
-            for i, one in enumerate(Z)
-            for j, other in enumerate(Z)
-        }
-        parts = [sum((-(x * y) for x, y in zip(one, known, strict=True)), self.nothing) for one in Z]
-        for row, one, part in zip(others, Z, Factors(gram, len(Z), len(Z)).solve(parts), strict=True):
-            lam[row] = lam[row] - part
-            for k, x in zip(rows, one, strict=True):
-                lam[k] = lam[k] + part * x
-        return lam
+    def _correction(self, c: Outputs) -> list[Form]:
+        n = self.system.n_q
+        return self.factors.solve([*([self.nothing] * n), *(c.arrays["c"][k] for k in self.choice.rows)])[:n]
+
+
+def of_least_norm(
+    graph: Graph,
+    known: Sequence[Form],
+    all_rows: Any,
+    rows: Sequence[int],
+    solve: Callable[[Sequence[Form]], list[Form]],
+) -> list[Form]:
+    """Multipliers of all rows from those of the rows that count.
+
+    A row that does not is a combination of these, by the numbers Z; less its part in the null space of G^T, spanned
+    by e_i - sum_k Z_ik e_k, lam has least norm.
+    """
+    nothing = Form(graph, 0.0, {})
+    lam = [nothing] * len(all_rows)
+    for k, value in zip(rows, known, strict=True):
+        lam[k] = value
+    others = [k for k in range(len(lam)) if k not in rows]
+    Z = [solve([*all_rows[k], *([nothing] * len(rows))])[len(all_rows[k]) :] for k in others]
+    gram = {
+        (i, j): sum((x * y for x, y in zip(one, other, strict=True)), Form(graph, float(i == j), {}))
+        for i, one in enumerate(Z)
+        for j, other in enumerate(Z)
+    }
+    parts = [sum((-(x * y) for x, y in zip(one, known, strict=True)), nothing) for one in Z]
+    for row, one, part in zip(others, Z, Factors(gram, len(Z), len(Z)).solve(parts), strict=True):
+        lam[row] = lam[row] - part
+        for k, x in zip(rows, one, strict=True):
+            lam[k] = lam[k] + part * x
+    return lam
 
 
 class Solution:
     """M a + G^T lam = r with G a = c, by the factors of a position that are kept.
 
+    Parameters
+    ----------
+    equations : StraightLine
+    more : sequence of Outputs
+        Of the equations: what these share with the factors is kept, too.
+
     Attributes
     ----------
-    kept, n_kept : Outputs, int
-        Of the equations: what is to be kept, and how many numbers.
+    known : dict
+        Quantities of the equations, and at which place each is kept.
+    kept : Outputs
+        Of the equations: what is to be kept.
     graph : Graph
-        Its inputs are r (n_q,), c (n_c + n_a,) and what was kept.
+        Its inputs are r (n_q,), c (n_c + n_a,) and the factors, which are kept first.
     solved : Outputs
         "a" (n_q,) and "lam" (n_c + n_a,); 0 for rows that do not count.
+    correction : Outputs
+        "x" (n_q,), the solution where r is 0, in the metric of M.
+    least : Outputs
+        "lam" (n_c,) of least norm, where c is "lam" of `solved`.
     """
 
-    def __init__(self, equations: StraightLine):
-        factors, choice = equations.factors, equations.choice
-        added = [form for k in choice.added for form in equations.all_rows[k]]
-        forms = [*added, *(form for block in factors.blocks for row in block.inverse for form in row)]
+    def __init__(self, equations: StraightLine, more: Sequence[Outputs] = ()):
+        factors, self._choice, self._n = equations.factors, equations.choice, equations.system.n_q
+        n_rows, rows = len(equations.all_rows), self._choice.rows
+        others = [k for k in range(n_rows) if k not in rows] if more else []
+        forms = [form for k in (*self._choice.added, *others) for form in equations.all_rows[k]]
+        forms += [form for block in factors.blocks for row in block.inverse for form in row]
         forms += [form for block in factors.blocks for _, row in block.below for form in row]
-        known = sorted({i for form in forms for i in form.terms})
-        self.n_kept = len(known)
-        self.kept = Outputs({"kept": [Form(equations.graph, 0.0, {i: 1.0}) for i in known]}, equations.conditions)
-        self.graph, n = Graph(), equations.system.n_q
-        r, c = self.graph.inputs(n, False), self.graph.inputs(len(equations.all_rows), False)
-        places = dict(zip(known, (only(form) for form in self.graph.inputs(len(known), False)), strict=True))
+        factors_kept = sorted({i for form in forms for i in form.terms})
+        shared = _shared(equations.graph, factors_kept, more)
+        self.known = {i: k for k, i in enumerate([*factors_kept, *shared])}
+        kept = [Form(equations.graph, 0.0, {i: 1.0}) for i in self.known]
+        self.kept = Outputs({"kept": kept}, equations.conditions)
+        self.graph = Graph()
+        self._r, self._c = self.graph.inputs(self._n, False), self.graph.inputs(n_rows, False)
+        places = [only(form) for form in self.graph.inputs(len(factors_kept), False)]
 
         def here(form: Form) -> Form:
-            return Form(self.graph, form.constant, {places[i]: x for i, x in form.terms.items()})
+            return Form(self.graph, form.constant, {places[self.known[i]]: x for i, x in form.terms.items()})
 
-        for k in choice.added:
-            r = [one + (here(x) * c[k]).times(choice.scale) for one, x in zip(r, equations.all_rows[k], strict=True)]
-        blocks = [
+        self._blocks = [
             Block(
-                places, [[here(x) for x in row] for row in inverse], [(j, [here(x) for x in row]) for j, row in below]
+                block.places,
+                [[here(x) for x in row] for row in block.inverse],
+                [(j, [here(x) for x in row]) for j, row in block.below],
             )
-            for places, inverse, below in factors.blocks
+            for block in factors.blocks
         ]
-        solution = solve(blocks, [*r, *(c[k] for k in choice.rows)])
-        lam = [Form(self.graph, 0.0, {})] * len(c)
-        for k, value in zip(choice.rows, solution[n:], strict=True):
+        self._rows = {k: [here(x) for x in equations.all_rows[k]] for k in (*self._choice.added, *others)}
+        self._nothing = Form(self.graph, 0.0, {})
+        self.solved = self._solved()
+
+    @property
+    def n_kept(self) -> int:
+        """How many numbers are kept."""
+        return len(self.known)
+
+    def _solve(self, right: Sequence[Form]) -> list[Form]:
+        return solve(self._blocks, right)
+
+    def _counting(self) -> list[Form]:
+        return [self._c[k] for k in self._choice.rows]
+
+    def _solved(self) -> Outputs:
+        r, lam = self._r, [self._nothing] * len(self._c)
+        for k in self._choice.added:
+            r = [one + (x * self._c[k]).times(self._choice.scale) for one, x in zip(r, self._rows[k], strict=True)]
+        solution = self._solve([*r, *self._counting()])
+        for k, value in zip(self._choice.rows, solution[self._n :], strict=True):
             lam[k] = value
-        self.solved = Outputs({"a": solution[:n], "lam": lam}, [])
+        return Outputs({"a": solution[: self._n], "lam": lam}, [])
+
+    @cached_property
+    def correction(self) -> Outputs:
+        """See the class."""
+        return Outputs({"x": self._solve([*([self._nothing] * self._n), *self._counting()])[: self._n]}, [])
+
+    @cached_property
+    def least(self) -> Outputs:
+        """See the class."""
+        rows = [self._rows.get(k, []) for k in range(len(self._c))]
+        return Outputs({"lam": of_least_norm(self.graph, self._counting(), rows, self._choice.rows, self._solve)}, [])
+
+
+def _shared(graph: Graph, kept: Sequence[int], more: Sequence[Outputs]) -> list[int]:
+    """What more outputs take of the quantities that what is kept is made of."""
+    made = set(graph.needed_by(Form(graph, 0.0, {i: 1.0}) for i in kept))
+    found = {i for outputs in more for form in outputs.forms for i in form.terms}
+    for outputs in more:
+        for j in outputs.quantities(graph, made):
+            operation = graph.operations[j]
+            assert operation is not None
+            found |= {i for form in operation[1:] if isinstance(form, Form) for i in form.terms}
+    return sorted(found & made - set(kept))
 
 
 def _is_zero(form: Form) -> bool:

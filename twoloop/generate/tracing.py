@@ -5,7 +5,7 @@ products and functions of such forms. What is computed twice is one quantity.
 """
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Container, Iterable
 from typing import Any
 
 import numpy as np
@@ -72,14 +72,14 @@ class Graph(Symbolic):
             self.inputs_of.append(bits)
         return Form(self, 0.0, {self._known[key]: 1.0})
 
-    def needed_by(self, forms: Iterable["Form"]) -> list[int]:
-        """What forms are made of, inputs apart, in an order in which it can be computed."""
+    def needed_by(self, forms: Iterable["Form"], known: Container[int] = ()) -> list[int]:
+        """What forms are made of, inputs and what is known apart, in an order in which it can be computed."""
         found: set[int] = set()
         ahead = [i for form in forms for i in form.terms]
         while ahead:
             i = ahead.pop()
             operation = self.operations[i]
-            if i not in found and operation is not None:
+            if i not in found and operation is not None and i not in known:
                 found.add(i)
                 ahead += [j for form in operation[1:] if isinstance(form, Form) for j in form.terms]
         return sorted(found)

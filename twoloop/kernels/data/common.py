@@ -182,7 +182,7 @@ OWN_FUNCTIONS = {
     "own_closer": types.boolean(f8, VECTOR, VECTOR, VECTOR, VECTOR, VECTOR),
     "own_nearer": types.boolean(f8, *[VECTOR] * 8),
     "own_redundant": types.boolean(f8, VECTOR, VECTOR, VECTOR, VECTOR),
-    # of series: factors (t, q, v, numbers, factors), and the solution with them (r, c, factors, own_numbers, a, lam)
+    # of series: factors (t, q, v, numbers, factors), and the solution with them (r, c, factors, numbers, a, lam)
     "own_factors": types.boolean(f8, VECTOR, VECTOR, VECTOR, VECTOR),
     "own_solution": types.boolean(*[VECTOR] * 6),
     # (scratch, series, r, c, lam, t, unit, state, own_numbers)

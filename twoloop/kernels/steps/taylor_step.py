@@ -69,7 +69,7 @@ def _expand_by_code(f, w, options, memory, t, state, unit):
     f.begin_series(scratch, series, r, c, lam, t, unit, state, f.own_numbers)
     for k in range(1, order):
         f.find_order(scratch, series, r, c, t, unit, k, f.own_numbers)
-        if not have_factors or not f.own_solution(r, c, factors, f.own_numbers, a, lam):  # M a + G^T lam = r, G a = c
+        if not have_factors or not f.own_solution(r, c, factors, f.numbers, a, lam):  # M a + G^T lam = r, G a = c
             f.instead(f, w, r, c, t, unit, r, a, lam)
         f.take_order(scratch, series, a, lam, unit, k, f.own_numbers)
     return end_series(w, order, series)

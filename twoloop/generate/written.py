@@ -1,0 +1,121 @@
+"""Operations of a graph as they are written into a function of LLVM, and whether what they compute is to be used."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+from twoloop.generate.coefficients import Coefficients
+from twoloop.generate.llvm_code import Emitter, Quantities
+from twoloop.generate.llvm_text import DOUBLE, Value
+from twoloop.generate.llvm_trigonometry import LARGEST_ANGLE, sine_and_cosine
+from twoloop.generate.straight_line import Outputs
+from twoloop.generate.tracing import Form, Graph
+from twoloop.kernels.evaluation.operations import (
+    ARCTANGENT,
+    COSINE,
+    EXPONENTIAL,
+    LOGARITHM,
+    PRODUCT,
+    RECIPROCAL,
+    SINE,
+    SQUARE_ROOT,
+    SUM,
+)
+
+FUNCTIONS = {SQUARE_ROOT: "sqrt", EXPONENTIAL: "exp", LOGARITHM: "log", ARCTANGENT: "atan"}
+
+Place = tuple[Value, int]
+NOWHERE: Mapping[int, Place] = {}
+
+
+class Written:
+    """Values of the quantities of a graph, as they are written into a function.
+
+    Parameters
+    ----------
+    emit : Emitter
+    numbers : Coefficients
+    places : dict, optional
+        Arrays and places in them at which quantities stand that were found before.
+    """
+
+    def __init__(self, emit: Emitter, numbers: Coefficients, places: Mapping[int, Place] = NOWHERE):
+        self.emit, self.numbers, self._places = emit, numbers, places
+        self.angles: list[Value] = []  # of sines and cosines
+        self._known = Quantities(emit, self._missing)
+        self._pairs: dict[Any, tuple[Value, Value]] = {}
+
+    def _missing(self, quantity: int) -> Value:
+        return self.emit.load(*self._places[quantity])  # others are defined before they are used
+
+    def define(self, quantity: int, value: Value) -> None:
+        """Say what an input is."""
+        self._known.define(quantity, value)
+
+    def value(self, quantity: int) -> Value:
+        """The value of a quantity."""
+        return self._known.value(quantity)
+
+    def form(self, form: Form) -> Value:
+        """The value of a form."""
+        return self._known.sum(*self.numbers.of_form(form))
+
+    def operation(self, quantity: int, kind: int, first: Form, second: Form | None) -> None:
+        """Compute a quantity."""
+        emit, x = self.emit, self.form(first)
+        if kind == PRODUCT:
+            assert second is not None
+            value = emit.multiply(x, self.form(second))
+        elif kind == SUM:
+            value = x
+        elif kind == RECIPROCAL:
+            value = emit.divide(emit.constant(1.0), x)
+        elif kind in (SINE, COSINE):
+            if first.key not in self._pairs:
+                self.angles.append(x)
+                self._pairs[first.key] = sine_and_cosine(emit, x)
+            value = self._pairs[first.key][kind == COSINE]
+        else:
+            value = emit.function(FUNCTIONS[kind], x)
+        self._known.define(quantity, value)
+
+    def write(self, graph: Graph, quantities: Iterable[int], places: Mapping[int, Place] = NOWHERE) -> None:
+        """Compute quantities, in their order; what has a place is stored there at once."""
+        for i in quantities:
+            operation = graph.operations[i]
+            assert operation is not None
+            self.operation(i, *operation)
+            if i in places:
+                self.emit.store(self._known.value(i), *places[i])
+
+
+def inputs_of(emit: Emitter, graph: Graph, given: Sequence[Value]) -> list[Value]:
+    """The inputs of a graph, which are given as numbers or in memory."""
+    inputs: list[Value] = []
+    for argument, size in zip(given, graph.sizes, strict=True):
+        inputs += [argument] if argument.type == DOUBLE else [emit.load(argument, j) for j in range(size)]
+    return inputs
+
+
+def results_of(
+    emit: Emitter, graph: Graph, outputs: Outputs, inputs: Sequence[Value], numbers: Coefficients
+) -> tuple[Written, list[list[Value]]]:
+    """Arrays that code computes from the inputs of a graph, in their order."""
+    written = Written(emit, numbers)
+    for quantity, value in enumerate(inputs):
+        written.define(quantity, value)
+    written.write(graph, outputs.quantities(graph))
+    return written, [[written.form(form) for form in forms] for forms in outputs.arrays.values()]
+
+
+def conditions_hold(emit: Emitter, written: Written, outputs: Outputs, values: Sequence[Value]) -> Value:
+    """Whether what was written holds: its conditions, angles that are not too large, and values that are finite."""
+    builder, zero = emit.builder, emit.constant(0.0)
+    total = zero
+    for value in values:  # what is not finite becomes NaN
+        total = emit.add(total, emit.multiply(value, zero))
+    holds = builder.compare("fcmp oeq", total, zero)
+    pairs = [(written.form(one), written.form(other)) for one, other in outputs.conditions]
+    pairs += [(emit.constant(LARGEST_ANGLE), emit.function("fabs", angle)) for angle in written.angles]
+    for one, other in pairs:
+        holds = builder.both(holds, builder.compare("fcmp ogt", one, other))
+    return holds
