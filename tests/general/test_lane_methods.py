@@ -204,7 +204,18 @@ def test_vibrations_that_do_not_matter_are_passed_over_as_singly_and_no_others(t
     for run in (1, 5, 8):
         alone = solve_dae(system.with_parameters(p[run]), (0.0, 4.0), q[run], v[run], **options)
         assert made[run] == 1 and 130 < 0.9 * alone.stats.n_accepted <= n_steps[run] <= 1.3 * alone.stats.n_accepted
-        assert np.abs(out[0, run, :, 0] - alone.q[:, -1]).max() < 100.0 * tolerance
+        # the motion itself: errors of single runs come to a hundred tolerances where steps pass over vibrations
+        assert abs(out[0, run, 0, 0] - _carried_along(*p[run], 40.0, 4.0)) < 100.0 * tolerance
+
+
+def _carried_along(k, c, w, t):
+    """The solution of x'' = k (sin w t - x) - c x' that begins at 0 with velocity w."""
+    size = (k - w * w) ** 2 + (c * w) ** 2
+    sine, cosine = k * (k - w * w) / size, -k * c * w / size
+    decay, frequency = -0.5 * c, np.sqrt(k - 0.25 * c * c)
+    other = (w * (1.0 - sine) + decay * cosine) / frequency
+    vibration = other * np.sin(frequency * t) - cosine * np.cos(frequency * t)
+    return sine * np.sin(w * t) + cosine * np.cos(w * t) + np.exp(decay * t) * vibration
 
 
 @pytest.mark.parametrize("name", STAGES)

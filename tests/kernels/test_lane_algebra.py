@@ -29,7 +29,7 @@ def test_systems_are_solved_with_rows_exchanged_as_each_lane_needs(imaginary):
     called(lane_algebra.solve_lanes, flat, matrix, pivots, N, apart, pivots + N)
     found = room[pivots + N :].reshape(2, N, LANES)[:parts]
     assert np.abs(found - x[:parts].transpose(0, 2, 1)).max() < 1e-4 and (room[FINE] == 1.0).all()
-    assert np.abs(found - x[:parts].transpose(0, 2, 1))[:, :, [0, 1, 3, 4, 5, 6, 7]].max() < 1e-11
+    assert np.delete(np.abs(found - x[:parts].transpose(0, 2, 1)), 2, axis=2).max() < 1e-11
 
 
 def test_a_singular_matrix_is_noted_in_its_lane_alone():
@@ -38,4 +38,4 @@ def test_a_singular_matrix_is_noted_in_its_lane_alone():
     room[N_FIELDS : N_FIELDS + N * N] = np.eye(N).reshape(-1, 1)
     room[N_FIELDS + 6, 3] = 0.0
     called(lane_algebra.factor_lanes, room.ravel(), N_FIELDS, N_FIELDS + N * N, N, 0)
-    assert room[FINE].tolist() == [1, 1, 1, 0, 1, 1, 1, 1]
+    assert np.flatnonzero(room[FINE] != 1.0).tolist() == [3]

@@ -5,6 +5,7 @@ runs may have parameters of their own.
 """
 
 import hashlib
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 from twoloop.generate.choices import Choice
@@ -21,6 +22,7 @@ from twoloop.kernels.control.predictor import FLOOR, LEAST, SHARE_OF_MOTION
 from twoloop.kernels.lanes import lane_room as lanes
 from twoloop.problem.system import ConstrainedSystem
 
+AT_ONCE = 3  # coordinates whose Horner schemes run side by side: of each three numbers are carried, in 16 registers
 LARGEST = 1500  # operations of a series, which take some seconds to compile
 
 
@@ -139,19 +141,20 @@ class LaneCode:
         per_unit = emit.divide(emit.constant(1.0), unit)
         twice = emit.multiply(emit.constant(2.0), emit.multiply(per_unit, per_unit))
         last = emit.pointer(at.series, builder.mul(order, integer(n)))
-        for j in range(n):  # one by one: what is carried stays in registers
-            with emit.loop(integer(0), order, [emit.load(last, j), zero, zero]) as (m, (q, v, a), new):
+        for begin in range(0, n, AT_ONCE):
+            some = range(begin, min(begin + AT_ONCE, n))
+            initial = [each for j in some for each in (emit.load(last, j), zero, zero)]
+            with emit.loop(integer(0), order, initial) as (m, carried, new):
                 power = builder.sub(builder.sub(order, integer(1)), m)
                 row = emit.pointer(at.series, builder.mul(power, integer(n)))
-                new += [
-                    emit.add(emit.multiply(q, x), emit.load(row, j)),
-                    emit.add(emit.multiply(v, x), q),
-                    emit.add(emit.multiply(a, x), v),
-                ]
-            q, v, a = new
-            emit.store(q, at.new, j)
-            emit.store(emit.multiply(v, per_unit), at.new, n + j)
-            emit.store(emit.multiply(a, twice), at.found, j)
+                for j, (q, v, a) in zip(some, _threes(carried), strict=True):
+                    a = emit.add(emit.multiply(a, x), v)  # first, so that each takes the register of the one before
+                    v = emit.add(emit.multiply(v, x), q)
+                    new += [emit.add(emit.multiply(q, x), emit.load(row, j)), v, a]
+            for j, (q, v, a) in zip(some, _threes(new), strict=True):
+                emit.store(q, at.new, j)
+                emit.store(emit.multiply(v, per_unit), at.new, n + j)
+                emit.store(emit.multiply(a, twice), at.found, j)
 
     def judge(self, emit: LaneEmitter, order: Value, control: Value, room: Value) -> None:
         """The defect of a step, see control/defect.py, and how far its prediction was off, see control/predictor.py."""
@@ -263,6 +266,10 @@ class _Places(NamedTuple):
     lam: Value
     series: Value
     scratch: Value
+
+
+def _threes(values: list[Value]) -> Iterator[tuple[Value, Value, Value]]:
+    return zip(values[::3], values[1::3], values[2::3], strict=True)
 
 
 def _chosen(emit: LaneEmitter, room: Value) -> Value:

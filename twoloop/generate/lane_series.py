@@ -25,7 +25,8 @@ from twoloop.kernels.evaluation.operations import (
     SQUARE_ROOT,
 )
 
-AT_ONCE = 6  # sums in one loop: where a vector takes two of 16 registers, they are there with their factors
+ZEROS = -1  # the row before that of order 0
+AT_ONCE = 6  # sums in one loop: with more, what is carried does not stay in 16 registers
 
 
 class Operation(NamedTuple):
@@ -40,8 +41,8 @@ class Operation(NamedTuple):
 class LaneSeries:
     """Writes the recurrences of a program.
 
-    `scratch` holds, lane vectors each: what the factors keep; r; the divisors of inverse functions; and rows of
-    factors of order 0, 1 and so on, behind sums that are carried to the next order.
+    `scratch` holds, lane vectors each: what the factors keep; r; the divisors of inverse functions; sums that are
+    carried to the next order; a row of zeros; and rows of factors of order 0, 1 and so on.
     """
 
     def __init__(self, program: SeriesProgram, solution: Solution, numbers: Coefficients, n: int, n_rows: int):
@@ -63,8 +64,9 @@ class LaneSeries:
         self.r = solution.n_kept
         self.divisors = self.r + n
         self.carried = self.divisors + len(self._divisors)
-        self.table = self.carried + len(self.sums_ahead)
         self.width = len(self.slots)
+        self.zeros = self.carried + len(self.sums_ahead)
+        self.table = self.zeros + self.width
 
     def scratch_size(self, order: int) -> int:
         """Length of `scratch`, in vectors."""
@@ -153,12 +155,17 @@ class LaneSeries:
         following = builder.add(k, integer(1))
         q = emit.pointer(out, builder.mul(k, integer(n)))
         order, zero = emit.number(k), emit.constant(0.0)
-        time = builder.select(builder.compare("icmp eq", k, integer(1)), unit, zero)
+        none_below = builder.compare("icmp eq", k, integer(1))
+        time = builder.select(none_below, unit, zero)
         known = Quantities(emit, lambda i: emit.load(q, i - 1) if i else time)
         row = _Row(self, emit, self._row(emit, scratch, k))
         inverse = emit.divide(emit.constant(1.0), order)
-        self._operate(emit, known, self.early, row, scratch, k, order, inverse)
-        ahead = self._sums(emit, self.sums_ahead, scratch, following)
+        first = self._row(emit, scratch, builder.select(none_below, integer(ZEROS), integer(1)))
+        row_before = _Row(self, emit, self._row(emit, scratch, builder.sub(k, integer(1))))
+        sums = self._sums(emit, scratch, k)
+        edges = _Edges(sums, first, self._row(emit, scratch, integer(1)), row_before)
+        self._operate(emit, known, self.early, row, scratch, edges, order, inverse)
+        ahead = {pair: edges.ahead(pair, row) for pair in self.sums_ahead}
         for place, pair in enumerate(self.sums_ahead):
             emit.store(ahead[pair], scratch, self.carried + place)
         per_unit = emit.divide(emit.constant(1.0), unit)
@@ -181,12 +188,11 @@ class LaneSeries:
             before.define(1 + 2 * n + j, a[j])
         for i in range(self.n_rows):
             before.define(1 + 3 * n + i, lam[i])
-        row_before = _Row(self, emit, self._row(emit, scratch, builder.sub(k, integer(1))))
         for operations, values, into in ((self.early, known, row), (self.late, before, row_before)):
             for operation in operations:
                 if operation.kind == PENDING and operation.results[0] not in self._carried:
                     into.store(operation.second, values.sum(operation.second[0]))
-        self._operate(emit, known, self.late, row, scratch, k, order, inverse)
+        self._operate(emit, known, self.late, row, scratch, edges, order, inverse)
         for place, (terms, _) in self.balance:
             emit.store(known.sum(terms), scratch, self.r + place)
 
@@ -231,22 +237,31 @@ class LaneSeries:
                 known.define(result, value)
                 row.store((((result, 1.0),), 0.0), value, "if used")
 
-    def _sums(
-        self, emit: LaneEmitter, pairs: list[tuple[int, int]], scratch: Value, order: Value
-    ) -> dict[tuple[int, int], Value]:
-        """Of pairs of factors, the sum of X[j] Y[order - j] over 0 < j < order."""
+    def _sums(self, emit: LaneEmitter, scratch: Value, k: Value) -> dict[tuple[tuple[int, int], bool], Value]:
+        """Of pairs of factors, the sum of X[j] Y[k - j] over 1 < j < k; of those ahead, that of X[j] Y[k + 1 - j].
+
+        What they miss is added when it is known: so all of them are in one loop, which waits for nothing of the order
+        before, and have the rows in common that they load.
+        """
         builder = emit.builder
-        sums: dict[tuple[int, int], Value] = {}
-        for begin in range(0, len(pairs), AT_ONCE):
-            some = pairs[begin : begin + AT_ONCE]
-            with emit.loop(integer(1), order, [emit.constant(0.0)] * len(some)) as (j, totals, new):
-                x, y = self._row(emit, scratch, j), self._row(emit, scratch, builder.sub(order, j))
+        wanted = [(pair, True) for pair in self.sums_ahead]
+        found = {pair for each in (*self.early, *self.late) for pair in self._factors(each)}
+        wanted += [(pair, False) for pair in found - set(self.sums_ahead)]
+        wanted.sort(key=lambda each: each[0][::-1] if each[1] else each[0])  # by what has a row in common
+        sums: dict[tuple[tuple[int, int], bool], Value] = {}
+        following = builder.add(k, integer(1))
+        for begin in range(0, len(wanted), AT_ONCE):
+            some = wanted[begin : begin + AT_ONCE]
+            with emit.loop(integer(2), k, [emit.constant(0.0)] * len(some)) as (j, totals, new):
+                up, down = self._row(emit, scratch, j), self._row(emit, scratch, builder.sub(following, j))
+                below = self._row(emit, scratch, builder.sub(j, integer(1)))
                 loaded: dict[tuple[Value, int], Value] = {}
-                for (i, k), total in zip(some, totals, strict=True):
-                    for base, place in ((x, i), (y, k)):
+                for ((x, y), ahead), total in zip(some, totals, strict=True):
+                    places = ((up, x), (down, y)) if ahead else ((down, x), (below, y))
+                    for base, place in places:
                         if (base, place) not in loaded:
                             loaded[base, place] = emit.load(base, place)
-                    new.append(emit.add(total, emit.multiply(loaded[x, i], loaded[y, k])))
+                    new.append(emit.add(total, emit.multiply(*(loaded[each] for each in places))))
             sums |= dict(zip(some, new, strict=True))
         return sums
 
@@ -257,15 +272,18 @@ class LaneSeries:
         operations: list[Operation],
         row: "_Row",
         scratch: Value,
-        k: Value,
+        edges: "_Edges",
         order: Value,
         inverse: Value,
     ) -> None:
         """An order that is not 0; of what waits, what is known before."""
         pairs = list(dict.fromkeys(pair for operation in operations for pair in self._factors(operation)))
-        there = {pair: self.carried + place for place, pair in enumerate(self.sums_ahead) if pair in pairs}
-        sums = self._sums(emit, [pair for pair in pairs if pair not in there], scratch, k)
-        sums |= {pair: emit.load(scratch, place) for pair, place in there.items()}
+        sums = {}
+        for pair in pairs:
+            if pair in self.sums_ahead:
+                sums[pair] = emit.load(scratch, self.carried + self.sums_ahead.index(pair))
+            else:
+                sums[pair] = edges.now(pair)
         begin = emit.pointer(scratch, self.table)
         for operation in operations:
             kind, results, (first, _), (second, _) = operation
@@ -311,11 +329,35 @@ class _Row:
 
     def __init__(self, code: LaneSeries, emit: LaneEmitter, base: Value):
         self.code, self.emit, self.base = code, emit, base
-        self.stored: set[int] = set()
+        self._stored: dict[int, Value] = {}
 
     def store(self, key: Any, value: Value, when: str = "") -> None:
         """Put a factor in its place; "if used": it may have none."""
         place = self.code.slots.get(tuple(key)) if when else self.code.slots[tuple(key)]
-        if place is not None and place not in self.stored:
-            self.stored.add(place)
+        if place is not None and place not in self._stored:
+            self._stored[place] = value
             self.emit.store(value, self.base, place)
+
+    def load(self, place: int) -> Value:
+        """What stands in a place."""
+        return self._stored[place] if place in self._stored else self.emit.load(self.base, place)
+
+
+class _Edges(NamedTuple):
+    """What the sums of an order k miss; `first` is the row of order 1, of zeros where k is 1 itself."""
+
+    sums: dict[tuple[tuple[int, int], bool], Value]
+    first: Value
+    one: Value  # the row of order 1
+    before: _Row  # of order k - 1
+
+    def now(self, pair: tuple[int, int]) -> Value:
+        """The sum of X[j] Y[k - j] over 0 < j < k."""
+        emit, (x, y) = self.before.emit, pair
+        return emit.add(self.sums[pair, False], emit.multiply(emit.load(self.first, x), self.before.load(y)))
+
+    def ahead(self, pair: tuple[int, int], row: _Row) -> Value:
+        """The sum of X[j] Y[k + 1 - j] over 0 < j <= k, from the row of order k."""
+        emit, (x, y) = self.before.emit, pair
+        total = emit.add(self.sums[pair, True], emit.multiply(row.load(x), emit.load(self.first, y)))
+        return emit.add(total, emit.multiply(emit.load(self.one, x), row.load(y)))

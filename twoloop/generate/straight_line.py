@@ -90,10 +90,13 @@ class Factors:
         self.conditions: list[tuple[Form, Form]] = []
         self.positive: list[Form] = []
         alone: dict[int, Any] = {}
-        for places in _order(rows, n):
-            pivots = [[rows[i].pop(j).value() for j in places] for i in places]
+        pairs = _pairs(rows, n)
+        for places in [*pairs, *_order(rows, n, pairs)]:
+            nothing = Form(rows[places[0]][places[0]].graph, 0.0, {})
+            pivots = [[rows[i].pop(j, nothing).value() for j in places] for i in places]
             inverse = self._inverse(pivots, [alone.get(i) for i in places])
-            entries = [(j, [rows[i][j].value() for i in places]) for j in rows[places[0]]]
+            others = dict.fromkeys(j for i in places for j in rows[i])
+            entries = [(j, [rows[i].get(j, nothing).value() for i in places]) for j in others]
             below = [(j, [_dot(row, values).value() for row in inverse]) for j, values in entries]
             for j, multiples in below:
                 for k, values in entries:
@@ -102,7 +105,7 @@ class Factors:
                         alone[j] = alone.get(j, 0.0) - change
                     rows[j][k] = rows[j][k] - change if k in rows[j] else -change
                 for i in places:
-                    del rows[j][i]
+                    rows[j].pop(i, None)
             self.blocks.append(Block(places, inverse, below))
 
     def _inverse(self, pivots: list[list[Form]], alone: list[Any]) -> list[list[Form]]:
@@ -137,24 +140,52 @@ def _dot(one: Sequence[Form], other: Sequence[Form]) -> Form:
 
 
 def solve(blocks: Sequence[Block], right: Sequence[Form]) -> list[Form]:
-    """The solution for a right-hand side."""
+    """The solution for a right-hand side; multiples of one quantity are summed up before they are multiplied by it."""
     solution = list(right)
+    owed: list[list[tuple[Form, Form]]] = [[] for _ in right]
     for places, _, below in blocks:
         for i in places:
-            solution[i] = solution[i].value()
+            solution[i] = (solution[i] - _gathered(owed[i])).value()
         for j, multiples in below:
-            solution[j] = solution[j] - _dot(multiples, [solution[i] for i in places])
+            owed[j] += [(multiple, solution[i]) for multiple, i in zip(multiples, places, strict=True)]
     for places, inverse, below in reversed(blocks):
         known = [solution[i] for i in places]
         for place, (i, row) in enumerate(zip(places, inverse, strict=True)):
-            total = _dot(row, known)
-            for j, multiples in below:
-                total = total - multiples[place] * solution[j]
-            solution[i] = total.value()
+            found = [(multiples[place], solution[j]) for j, multiples in below]
+            solution[i] = (_dot(row, known) - _gathered(found)).value()
     return solution
 
 
-def _order(rows: list[dict[int, Form]], n: int) -> list[tuple[int, ...]]:
+def _gathered(products: Sequence[tuple[Form, Form]]) -> Any:
+    """The sum of products, those of multiples of one factor as one."""
+    total: Any = 0.0
+    groups: dict[Any, tuple[Form, Form]] = {}
+    for one, other in products:
+        if not one.terms:
+            total = total + other.times(one.constant)
+            continue
+        scale, factor = one.normalised()
+        before = groups.get(factor.key)
+        other = other.times(scale)
+        groups[factor.key] = (factor, other if before is None else before[1] + other)
+    for factor, other in groups.values():
+        total = total + factor * other.value()
+    return total
+
+
+def _pairs(rows: list[dict[int, Form]], n: int) -> list[tuple[int, int]]:
+    """Coordinates and rows of G that give them: by a number, each in one row alone, of a mass that is a number.
+
+    The rank of G is that of the rows without such pairs, and as many more: they take no condition, and no division.
+    """
+    pairs: dict[int, int] = {}  # by rows
+    for i, row in enumerate(rows[:n]):
+        if len(row) == 2 and i in row and max(row) >= n and not any(entry.terms for entry in row.values()):
+            pairs.setdefault(max(row), i)
+    return [(i, k) for k, i in pairs.items()]
+
+
+def _order(rows: list[dict[int, Form]], n: int, pairs: Sequence[tuple[int, int]]) -> list[tuple[int, ...]]:
     """Least degree first; a row from n on only after all that it has below n; in pairs where their neighbours agree.
 
     Among equals those first that wait for the fewest divisions: what does not depend on one another runs side by side.
@@ -162,6 +193,11 @@ def _order(rows: list[dict[int, Form]], n: int) -> list[tuple[int, ...]]:
     neighbours = [set(row) - {i} for i, row in enumerate(rows)]
     waits = [{j for j in neighbours[i] if j < n} if i >= n else set() for i in range(len(rows))]
     left, order, depth = set(range(len(rows))), [], [0] * len(rows)
+    for places in pairs:
+        left -= set(places)
+        _eliminate(neighbours, places)
+        for j in left:
+            waits[j] -= set(places)
     while left:
         i = min((j for j in left if not waits[j]), key=lambda j: (len(neighbours[j]), depth[j], j))
         ready = [j for j in neighbours[i] if not waits[j] and (j < n) == (i < n)]
@@ -169,11 +205,18 @@ def _order(rows: list[dict[int, Form]], n: int) -> list[tuple[int, ...]]:
         places = (i, *sorted(alike)[:1])
         order.append(places)
         left -= set(places)
-        for j in neighbours[i] - set(places):
-            neighbours[j] = (neighbours[j] | neighbours[i]) - {*places, j}
+        for j in _eliminate(neighbours, places):
             waits[j] -= set(places)
             depth[j] = max(depth[j], depth[i] + 1)
     return order
+
+
+def _eliminate(neighbours: list[set[int]], places: Sequence[int]) -> set[int]:
+    """The neighbours of places, which become neighbours of one another in their stead."""
+    around = set().union(*(neighbours[i] for i in places)) - set(places)
+    for j in around:
+        neighbours[j] = (neighbours[j] | around) - {*places, j}
+    return around
 
 
 class StraightLine:

@@ -152,3 +152,9 @@ def _machine() -> Any:
     options: dict[str, Any] = {"opt": 1}  # 2 takes a quarter longer and finds nothing more in straight lines
     cpu_target.target_context.codegen()._customize_tm_options(options)
     return binding.Target.from_triple(_triple()).create_target_machine(**options)
+
+
+def has_wide_vectors() -> bool:
+    """Whether vectors of the processor, as numba sees it, hold eight doubles."""
+    _, _, features = cpu_target.target_context.codegen().magic_tuple()
+    return "+avx512f" in features.split(",")

@@ -42,16 +42,18 @@ def sum_rows(weights, rows, total):
             total[m] += (a * rows[k, m] + b * rows[k + 1, m]) + (c * rows[k + 2, m] + d * rows[k + 3, m])
 
 
-@compiled
-def add_product(room, target, x, y, sign):
-    """target += sign x y, in each lane; all is read before it is written, as LLVM knows of no places apart."""
-    t, p, q = target * LANES, x * LANES, y * LANES
+@merged
+def _add_four(room, t, p, q, sign):
     t0, t1 = room[t] + sign * room[p] * room[q], room[t + 1] + sign * room[p + 1] * room[q + 1]
     t2, t3 = room[t + 2] + sign * room[p + 2] * room[q + 2], room[t + 3] + sign * room[p + 3] * room[q + 3]
-    t4, t5 = room[t + 4] + sign * room[p + 4] * room[q + 4], room[t + 5] + sign * room[p + 5] * room[q + 5]
-    t6, t7 = room[t + 6] + sign * room[p + 6] * room[q + 6], room[t + 7] + sign * room[p + 7] * room[q + 7]
     room[t], room[t + 1], room[t + 2], room[t + 3] = t0, t1, t2, t3
-    room[t + 4], room[t + 5], room[t + 6], room[t + 7] = t4, t5, t6, t7
+
+
+@compiled
+def add_product(room, target, x, y, sign):
+    """target += sign x y, in each lane; four are read before they are written, as LLVM knows of no places apart."""
+    for k in range(0, LANES, 4):
+        _add_four(room, target * LANES + k, x * LANES + k, y * LANES + k, sign)
 
 
 @merged
@@ -63,17 +65,13 @@ def _larger(room, most, error, factor, one, other, atol, rtol):
 @compiled
 def enlarge(room, most, error, factor, one, other, atol, rtol):
     """`most` is at least |error| factor / (atol + rtol max(|one|, |other|)), in each lane."""
-    m, e, f, x, y = most * LANES, error * LANES, factor * LANES, one * LANES, other * LANES
-    m0 = _larger(room, m, e, f, x, y, atol, rtol)
-    m1 = _larger(room, m + 1, e + 1, f + 1, x + 1, y + 1, atol, rtol)
-    m2 = _larger(room, m + 2, e + 2, f + 2, x + 2, y + 2, atol, rtol)
-    m3 = _larger(room, m + 3, e + 3, f + 3, x + 3, y + 3, atol, rtol)
-    m4 = _larger(room, m + 4, e + 4, f + 4, x + 4, y + 4, atol, rtol)
-    m5 = _larger(room, m + 5, e + 5, f + 5, x + 5, y + 5, atol, rtol)
-    m6 = _larger(room, m + 6, e + 6, f + 6, x + 6, y + 6, atol, rtol)
-    m7 = _larger(room, m + 7, e + 7, f + 7, x + 7, y + 7, atol, rtol)
-    room[m], room[m + 1], room[m + 2], room[m + 3] = m0, m1, m2, m3
-    room[m + 4], room[m + 5], room[m + 6], room[m + 7] = m4, m5, m6, m7
+    for k in range(0, LANES, 4):
+        m, e, f, x, y = most * LANES + k, error * LANES + k, factor * LANES + k, one * LANES + k, other * LANES + k
+        m0 = _larger(room, m, e, f, x, y, atol, rtol)
+        m1 = _larger(room, m + 1, e + 1, f + 1, x + 1, y + 1, atol, rtol)
+        m2 = _larger(room, m + 2, e + 2, f + 2, x + 2, y + 2, atol, rtol)
+        m3 = _larger(room, m + 3, e + 3, f + 3, x + 3, y + 3, atol, rtol)
+        room[m], room[m + 1], room[m + 2], room[m + 3] = m0, m1, m2, m3
 
 
 @merged

@@ -6,11 +6,11 @@ from numba import types
 from numba.extending import typeof_impl
 
 from twoloop.kernels.compile.callbacks import VECTOR
-from twoloop.kernels.compile.own_functions import OwnFunctions
+from twoloop.kernels.compile.own_functions import OwnFunctions, has_wide_vectors
 from twoloop.kernels.compile.reference import Reference
 from twoloop.kernels.data.common import INTEGERS, merged
 
-LANES = 8  # doubles of a vector: those of AVX-512, or of two narrower ones
+LANES = 8 if has_wide_vectors() else 4  # runs side by side: of two vectors each number would take two registers
 
 # vectors in `room`, one number for each lane; behind them STATE, NEW, PREDICTED, ... as `places` has it
 (
