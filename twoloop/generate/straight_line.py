@@ -192,12 +192,13 @@ def _order(rows: list[dict[int, Form]], n: int, pairs: Sequence[tuple[int, int]]
     """
     neighbours = [set(row) - {i} for i, row in enumerate(rows)]
     waits = [{j for j in neighbours[i] if j < n} if i >= n else set() for i in range(len(rows))]
-    left, order, depth = set(range(len(rows))), [], [0] * len(rows)
-    for places in pairs:
-        left -= set(places)
-        _eliminate(neighbours, places)
+    order: list[tuple[int, ...]] = []
+    left, depth = set(range(len(rows))), [0] * len(rows)
+    for pair in pairs:
+        left -= set(pair)
+        _eliminate(neighbours, pair)
         for j in left:
-            waits[j] -= set(places)
+            waits[j] -= set(pair)
     while left:
         i = min((j for j in left if not waits[j]), key=lambda j: (len(neighbours[j]), depth[j], j))
         ready = [j for j in neighbours[i] if not waits[j] and (j < n) == (i < n)]
