@@ -282,11 +282,11 @@ def test_callbacks_along_runs_are_compared_by_the_doubling_rule(monkeypatch):
 
 
 CALLS = {  # in a call with other parameters: beyond those before, and among them
-    "four_bar": (790, 530),
-    "heavy_top": (760, 510),
-    "spatial_four_bar": (690, 460),
-    "bricard": (700, 530),
-    "redundant_slider_crank": (1120, 860),
+    "four_bar": (920, 640),
+    "heavy_top": (900, 620),
+    "spatial_four_bar": (830, 570),
+    "bricard": (830, 640),
+    "redundant_slider_crank": (1450, 1170),
 }
 AT_TIMES = 240  # more where the solution is wanted at times
 

@@ -148,7 +148,7 @@ def test_counts_tell_what_the_variants_do():
 
 def test_what_does_not_converge_or_takes_too_long_is_a_failed_result():
     result, _ = run(PAPER, step=1.0)
-    assert result.status is Status.SOLVER_FAILED and "the stage loop does not converge" in result.message
+    assert result.status is Status.SOLVER_FAILED and "the stage iteration does not converge" in result.message
     result, _ = run(PAPER, t_end=1e4, step=0.01, time_limit=0.05)
     assert result.status is Status.SOLVER_FAILED and "time_limit = 0.05" in result.message and result.t[-1] < 1e4
 

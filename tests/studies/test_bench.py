@@ -106,7 +106,7 @@ def test_the_first_call_of_a_setting_is_made_again_where_it_may_hold_a_build(kep
         return ours(case, value, repeat)
 
     with kept:
-        rows = collect([Run(case(timed=0.1), solver(building), 1e-6, repeats=2)], kept)
+        rows = collect([Run(case(timed=0.25), solver(building), 1e-6, repeats=2)], kept)
     assert counted == [0, 0, 0, 0, 0, 1, 1, 1, 1]  # the build, the call that says how long one takes, and three; ...
     assert (rows["call_s"] < 0.3).all() and (rows["calls"] == 3).all()
 

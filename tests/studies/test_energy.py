@@ -270,7 +270,7 @@ def test_cheaper_runs_that_drift_are_told_beside_those_that_do_not(rows, found_o
     rows = changed(rows, f"case == '{SWITCHING}' and solver == '{OWN_EXPLICIT}'", call_s=2.0)
     found = found_of(rows)["long"]["calm_ours"]
     assert found["fixed"] and found["drifting_explicit"] and found["over_drifting"] == [3.0, 3.0]
-    said = "made with fixed steps, and take 3.0 times as long as explicit methods of ours whose energy drifts"
+    said = "have fixed steps, and take 3.0 times as long as explicit methods of ours whose energy drifts"
     assert said in (tmp_path / "energy.md").read_text()
     assert found_of(changed(rows, own, slope=1.0))["long"]["calm_ours"]["labels"] == []
     assert "None of ours is without drift." in (tmp_path / "energy.md").read_text()

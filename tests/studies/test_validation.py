@@ -117,7 +117,7 @@ def test_findings_turn_with_the_rows():
 def test_a_solver_that_was_run_and_was_inexact_is_not_called_one_that_was_not_run():
     inexact = {"outcome": "inexact", "error_q": 2e-5, "digits_q": 4.7}
     _, text = said(validation, made_up(where=[("double pendulum", "LSODA, index 1")], what=inexact))
-    ours = "- On double pendulum only ours are right: `Gauss12` and `BDF`. Of the others, run and inexact: "
+    ours = "- On double pendulum only ours are right: `Gauss12` and `BDF`. The others are inexact: "
     assert ours + "`LSODA, index 1` (2e-5).\n" in text and "not run" not in text
 
 
