@@ -8,6 +8,7 @@ import pytest
 from hypothesis import settings
 
 from tests.problems import LINKAGES
+from twoloop import solve
 
 # not collected where the packages of the studies, or of the documentation, are not installed: `make test-oldest`
 NEED_STUDIES = (
@@ -43,3 +44,17 @@ def interruptible():
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, before)
+
+
+@pytest.fixture
+def taken(monkeypatch):
+    """How calls were made: True by the arrays of a run before."""
+    made, ways = solve.record_again, []
+
+    def watched(*asked):
+        record = made(*asked)
+        ways.append(record is not None)
+        return record
+
+    monkeypatch.setattr(solve, "record_again", watched)
+    return ways

@@ -24,20 +24,6 @@ NAMES = [
 ]
 
 
-@pytest.fixture
-def taken(monkeypatch):
-    """How calls were made: True by the arrays of a run before."""
-    made, ways = solve.record_again, []
-
-    def watched(*asked):
-        record = made(*asked)
-        ways.append(record is not None)
-        return record
-
-    monkeypatch.setattr(solve, "record_again", watched)
-    return ways
-
-
 @callback("jacobian")
 def wrong_above(t, q, p, Cq):
     Cq[0, 0] = q[0] if q[1] < 0.5 else 1.0001 * q[0]

@@ -16,7 +16,8 @@ from twoloop.generate.derivative import Derivative
 from twoloop.generate.llvm_text import Module
 from twoloop.generate.llvm_trigonometry import LARGEST_ANGLE
 from twoloop.generate.straight_code import write_function
-from twoloop.generate.straight_line import Factors, Outputs, Solution, StraightLine
+from twoloop.generate.straight_line import Outputs, Solution, StraightLine
+from twoloop.generate.symbolic_factors import Factors
 from twoloop.generate.tracing import Form, Graph
 from twoloop.kernels.compile.own_functions import CALLED, OwnFunctions, object_code
 from twoloop.mechanisms import andrews, four_bar, heavy_top, rolling_disc, spatial_four_bar

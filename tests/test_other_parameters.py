@@ -16,20 +16,6 @@ NAMES = ["four_bar", "redundant_slider_crank", "heavy_top", "knife_edge", "close
 GRAVITY = 9.81
 
 
-@pytest.fixture
-def taken(monkeypatch):
-    """How calls were made: True by the arrays of a run before."""
-    made, ways = solve.record_again, []
-
-    def watched(*asked):
-        record = made(*asked)
-        ways.append(record is not None)
-        return record
-
-    monkeypatch.setattr(solve, "record_again", watched)
-    return ways
-
-
 def the_long_way(monkeypatch):
     monkeypatch.setattr(solve, "record_again", lambda *asked: None)
 

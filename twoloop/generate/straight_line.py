@@ -15,12 +15,13 @@ M is singular, rows g of G are added, M + g^T g, which changes neither. Of redun
 from collections.abc import Callable, Container, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from twoloop.generate.choices import Choice
 from twoloop.generate.known_numbers import elementwise
+from twoloop.generate.symbolic_factors import Block, Factors, solve
 from twoloop.generate.traced_equations import Equations, only
 from twoloop.generate.traced_values import Traced
 from twoloop.generate.tracing import Form, Graph, Untraceable
@@ -59,165 +60,6 @@ class Outputs:
         """All of them."""
         forms = [form for array in self.arrays.values() for form in array]
         return [*forms, *(form for condition in self.conditions for form in condition)]
-
-
-class Block(NamedTuple):
-    """One or two places that are eliminated together, which takes one division."""
-
-    places: tuple[int, ...]
-    inverse: list[list[Form]]  # of the pivots
-    below: list[tuple[int, list[Form]]]  # rows of L
-
-
-class Factors:
-    """L D L^T of a symmetric matrix of forms, by an order that a definite matrix of this pattern allows.
-
-    Attributes
-    ----------
-    blocks : list of Block
-        In the order of elimination.
-    conditions : list of (Form, Form)
-        Two numbers for each row from `n` on, the first over the second: its pivot over what it is without the others.
-    positive : list of Form
-        Coefficients that are positive where the matrix of the first `n` is definite.
-    """
-
-    def __init__(self, matrix: dict[tuple[int, int], Form], size: int, n: int):
-        rows: list[dict[int, Form]] = [{} for _ in range(size)]
-        for (i, j), value in matrix.items():
-            rows[i][j] = value
-        self.blocks: list[Block] = []
-        self.conditions: list[tuple[Form, Form]] = []
-        self.positive: list[Form] = []
-        alone: dict[int, Any] = {}
-        pairs = _pairs(rows, n)
-        for places in [*pairs, *_order(rows, n, pairs)]:
-            nothing = Form(rows[places[0]][places[0]].graph, 0.0, {})
-            pivots = [[rows[i].pop(j, nothing).value() for j in places] for i in places]
-            inverse = self._inverse(pivots, [alone.get(i) for i in places])
-            others = dict.fromkeys(j for i in places for j in rows[i])
-            entries = [(j, [rows[i].get(j, nothing).value() for i in places]) for j in others]
-            below = [(j, [_dot(row, values).value() for row in inverse]) for j, values in entries]
-            for j, multiples in below:
-                for k, values in entries:
-                    change = _dot(multiples, values)
-                    if j == k >= n > places[0]:
-                        alone[j] = alone.get(j, 0.0) - change
-                    rows[j][k] = rows[j][k] - change if k in rows[j] else -change
-                for i in places:
-                    rows[j].pop(i, None)
-            self.blocks.append(Block(places, inverse, below))
-
-    def _inverse(self, pivots: list[list[Form]], alone: list[Any]) -> list[list[Form]]:
-        """The inverse of one or two pivots; of rows of G, conditions too."""
-        own = [None if each is None else each.value() for each in alone]
-        a = pivots[0][0]
-        if own[0] is None:
-            self.positive.append(a)
-        else:
-            self.conditions.append((-a, -own[0]))
-        if len(pivots) == 1:
-            return [[a.reciprocal()]]
-        b, c = pivots[0][1], pivots[1][1]
-        determinant = (a * c - b * b).value()
-        if own[1] is None:
-            self.positive.append(determinant)
-        else:
-            self.conditions.append((determinant, (a * own[1]).value()))
-        inverse = determinant.reciprocal()
-        return [[(c * inverse).value(), (-b * inverse).value()], [(-b * inverse).value(), (a * inverse).value()]]
-
-    def solve(self, right: Sequence[Form]) -> list[Form]:
-        """The solution for a right-hand side."""
-        return solve(self.blocks, right)
-
-
-def _dot(one: Sequence[Form], other: Sequence[Form]) -> Form:
-    total = one[0] * other[0]
-    for x, y in zip(one[1:], other[1:], strict=True):
-        total = total + x * y
-    return total
-
-
-def solve(blocks: Sequence[Block], right: Sequence[Form]) -> list[Form]:
-    """The solution for a right-hand side; multiples of one quantity are summed up before they are multiplied by it."""
-    solution = list(right)
-    owed: list[list[tuple[Form, Form]]] = [[] for _ in right]
-    for places, _, below in blocks:
-        for i in places:
-            solution[i] = (solution[i] - _gathered(owed[i])).value()
-        for j, multiples in below:
-            owed[j] += [(multiple, solution[i]) for multiple, i in zip(multiples, places, strict=True)]
-    for places, inverse, below in reversed(blocks):
-        known = [solution[i] for i in places]
-        for place, (i, row) in enumerate(zip(places, inverse, strict=True)):
-            found = [(multiples[place], solution[j]) for j, multiples in below]
-            solution[i] = (_dot(row, known) - _gathered(found)).value()
-    return solution
-
-
-def _gathered(products: Sequence[tuple[Form, Form]]) -> Any:
-    """The sum of products, those of multiples of one factor as one."""
-    total: Any = 0.0
-    groups: dict[Any, tuple[Form, Form]] = {}
-    for one, other in products:
-        if not one.terms:
-            total = total + other.times(one.constant)
-            continue
-        scale, factor = one.normalised()
-        before = groups.get(factor.key)
-        other = other.times(scale)
-        groups[factor.key] = (factor, other if before is None else before[1] + other)
-    for factor, other in groups.values():
-        total = total + factor * other.value()
-    return total
-
-
-def _pairs(rows: list[dict[int, Form]], n: int) -> list[tuple[int, int]]:
-    """Coordinates and rows of G that give them: by a number, each in one row alone, of a mass that is a number.
-
-    The rank of G is that of the rows without such pairs, and as many more: they take no condition, and no division.
-    """
-    pairs: dict[int, int] = {}  # by rows
-    for i, row in enumerate(rows[:n]):
-        if len(row) == 2 and i in row and max(row) >= n and not any(entry.terms for entry in row.values()):
-            pairs.setdefault(max(row), i)
-    return [(i, k) for k, i in pairs.items()]
-
-
-def _order(rows: list[dict[int, Form]], n: int, pairs: Sequence[tuple[int, int]]) -> list[tuple[int, ...]]:
-    """Least degree first; a row from n on only after all that it has below n; in pairs where their neighbours agree.
-
-    Among equals those first that wait for the fewest divisions: what does not depend on one another runs side by side.
-    """
-    neighbours = [set(row) - {i} for i, row in enumerate(rows)]
-    waits = [{j for j in neighbours[i] if j < n} if i >= n else set() for i in range(len(rows))]
-    order: list[tuple[int, ...]] = []
-    left, depth = set(range(len(rows))), [0] * len(rows)
-    for pair in pairs:
-        left -= set(pair)
-        _eliminate(neighbours, pair)
-        for j in left:
-            waits[j] -= set(pair)
-    while left:
-        i = min((j for j in left if not waits[j]), key=lambda j: (len(neighbours[j]), depth[j], j))
-        ready = [j for j in neighbours[i] if not waits[j] and (j < n) == (i < n)]
-        alike = [j for j in ready if neighbours[j] | {j} == neighbours[i] | {i}]
-        places = (i, *sorted(alike)[:1])
-        order.append(places)
-        left -= set(places)
-        for j in _eliminate(neighbours, places):
-            waits[j] -= set(places)
-            depth[j] = max(depth[j], depth[i] + 1)
-    return order
-
-
-def _eliminate(neighbours: list[set[int]], places: Sequence[int]) -> set[int]:
-    """The neighbours of places, which become neighbours of one another in their stead."""
-    around = set().union(*(neighbours[i] for i in places)) - set(places)
-    for j in around:
-        neighbours[j] = (neighbours[j] | around) - {*places, j}
-    return around
 
 
 class StraightLine:
