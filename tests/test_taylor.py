@@ -201,3 +201,22 @@ def test_a_function_that_returns_the_wrong_shape_on_symbols_is_refused():
 def test_the_method_alone_says_what_it_needs():
     with pytest.raises(ValueError, match="for_system"):
         Taylor().plan(2, 1e-8, 1e-8, False)
+
+
+@pytest.mark.parametrize("compiled", [False, True])
+@pytest.mark.parametrize("span", [1e-9, 1e-3, 10.0])
+def test_the_first_step_is_as_long_as_the_series_at_the_start_allows(span, compiled):
+    problem = mechanisms.heavy_top()
+    given = problem.system, (0.0, span), problem.q0, problem.v0, "Taylor", 1e-8, 1e-8
+    result = solve_dae(*given, compiled=compiled)
+    if span < 0.01:
+        assert result.h.tolist() == [span]
+    else:
+        assert result.h[0] > 0.5 * result.h[1]
+
+
+def test_a_first_step_that_is_given_is_taken():
+    problem = mechanisms.heavy_top()
+    for method in ("Taylor", "auto"):
+        result = solve_dae(problem.system, (0.0, 0.1), problem.q0, problem.v0, method, first_step=1e-5)
+        assert result.h[0] == 1e-5

@@ -274,6 +274,9 @@ def advance(
         elif strict > 1.0 and error > 0.0:  # the step does not know of `strict`, and may want to grow
             factor = min(factor, max(control[FACTOR_MIN], control[SAFETY] * error ** -control[EXPONENT]))
         proposal = min(size * factor, clock[at.H_LIMIT])
+        if not accepted and factor > 1.0:
+            clock[at.H_NEXT] = size if control[at.FIRST_GIVEN] == 1.0 else proposal
+            continue
         if not accepted:
             end = _refused(f, w, control, clock, t, size, proposal)
             if end != at.GO_ON:

@@ -315,7 +315,7 @@ class Run:
         """Set the first and the largest step, s."""
         span = t1 - self.t0
         first = min(self.first_step(span, self.state) if first_step is None else first_step, span)
-        self.clock[self.a.H_NEXT] = first
+        self.clock[self.a.H_NEXT], self.control[self.a.FIRST_GIVEN] = first, float(first_step is not None)
         self.control[self.a.SHORTEST] = SHORTEST_STEP * first
         self.max_step = max_step
         self.look_within(span)

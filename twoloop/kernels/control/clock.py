@@ -39,8 +39,9 @@ GO_ON = -1  # nothing of these yet
     AHEAD,  # 1: these looks go along the way; 0: they stay at the state, as a callback raised on the way
     BY_TIME,  # 1: they stay there ahead of other steps, too, for what may change suddenly with time
     BY_STATE,  # 1: they go along the way of short steps, too, for what may be sharp by place or speed
+    FIRST_GIVEN,  # 1: the first step is the user's, and not a guess that may become longer
     N_CONTROL,
-) = range(N_RULE, N_RULE + 20)
+) = range(N_RULE, N_RULE + 21)
 
 # places in a row of `out_steps`: the size of an accepted step, and the counters so far; JACOBIANS is 0 after an
 # explicit step of a method that switches

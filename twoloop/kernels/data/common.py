@@ -136,7 +136,8 @@ class Attempt(NamedTuple):
     code : DONE, or why it could not be made.
     error : over the tolerances; it is accepted from 1 down. A step that is longer than the method allows, and was not
         made, is wrong by as many times as it is too long.
-    factor : the length that the method asks for next, over this one; 0: the controller chooses it from the error.
+    factor : the length that the method asks for next, over this one; 0: the controller chooses it from the error. Over
+        1 after an error over 1: the step was a guess, and was not made, as a longer one will do.
     """
 
     code: int

@@ -39,6 +39,8 @@ GOLDEN = 0.6180339887498949  # multiples of it, less their integers, lie evenly 
 BEYOND = 1e300  # in place of an infinite defect, where a function has no value within the step
 MOST_SHORTENED = 0.1  # a step that is refused for its defect
 GROWTH = 5.0  # of the step from one to the next, at most: coefficients belong to the unit of the step before
+FARTHEST = 1e6  # of the guess for the first step: no power of it overflows
+TOO_SHORT = 2.0  # the error of a first step that is not made, as the series allows a longer one
 
 
 @kernel(ATTEMPT)
@@ -215,6 +217,8 @@ def _step(f, w, options, memory, t, h, tolerances, state, new_state, by_code):
         memory[at.KNOWN], memory[at.UNIT] = 1.0, h
         if estimated:
             memory[at.LENGTH] = _length(tolerances, series_of(memory, order, n, memory[at.WHICH]), h, order, n)
+            if memory[at.LENGTH] > GROWTH:
+                return Attempt(DONE, TOO_SHORT, min(memory[at.LENGTH], FARTHEST))
     series, unit = series_of(memory, order, n, memory[at.WHICH]), memory[at.UNIT]
     x = (memory[at.PASSED] + h) / unit
     error, checked, found = 0.0, False, accelerations_found(memory, n)
