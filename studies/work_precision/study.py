@@ -132,6 +132,7 @@ def report(output: Output, rows: pd.DataFrame, line: str) -> dict[str, Any]:
     findings["measured"] = measured_on(rows)
     findings["repetition"] = {"calls": int(part(rows, rivals.GROUP)["calls"].max()), "below": rivals.TIMED}
     findings["repetition"] |= {"once": made_once(everywhere), "outclassed": adaptive.OUTCLASSED}
+    findings["repetition"] |= means_over_medians(part(rows, rivals.GROUP))
     findings["price"] = headline.price(everywhere, part(rows, first_calls.GROUP), rivals.HEADLINE)
     findings["minimal"] = minimal.findings_of(in_angles if in_angles.empty else tables.medians(in_angles), everywhere)
     findings |= {} if output.call.quick else processors.kept(output, rows, line, found)
@@ -140,6 +141,14 @@ def report(output: Output, rows: pd.DataFrame, line: str) -> dict[str, Any]:
     text = render("work_precision", findings, {}, stamp=line, quick=output.call.quick)
     output.write("work_precision.md", text)
     return findings
+
+
+def means_over_medians(rows: pd.DataFrame) -> dict[str, Any]:
+    """How many times its median call the mean call of a repetition takes, of ours and of others, in the median."""
+    if "call_mean_s" not in rows or rows["call_mean_s"].isna().all():
+        return {}
+    over = (rows["call_mean_s"] / rows["call_s"])[rows["calls"] > 1].groupby(rows["family"] == "two-loop").median()
+    return {"mean": {"ours": over.get(True), "others": over.get(False)}}
 
 
 def unlike(medians: pd.DataFrame) -> dict[str, Any]:
