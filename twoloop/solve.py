@@ -31,10 +31,11 @@ from twoloop.problem.events import check_events
 from twoloop.problem.system import ConstrainedSystem, check_system
 from twoloop.result.folder import begin_folder, check_folder, end_folder
 from twoloop.result.result import Result, result_of
+from twoloop.run.asked import Asked
 from twoloop.run.course import Course
 from twoloop.run.interrupts import Interrupts, not_begun
 from twoloop.run.kept import InMemory, OnDisk
-from twoloop.run.launch import Asked, record_again, run_from
+from twoloop.run.launch import record_again, run_from
 from twoloop.run.recorder import Wanted
 
 Array = NDArray[np.float64]

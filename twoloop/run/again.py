@@ -5,7 +5,6 @@ does, or a start is not beyond doubt, nothing comes of it, and the call goes the
 """
 
 import time
-from collections.abc import Callable
 from dataclasses import MISSING, fields
 from typing import Any
 
@@ -22,6 +21,7 @@ from twoloop.kernels.compile.linking import direct
 from twoloop.kernels.data import codes, flags, noted
 from twoloop.kernels.layout import cleared, lasting
 from twoloop.problem.system import ConstrainedSystem
+from twoloop.run.asked import Asked
 from twoloop.run.between import Between
 from twoloop.run.comparison import compared_at, territory_of
 from twoloop.run.fields import kinds_of, of_run, of_steps
@@ -89,15 +89,13 @@ class Again:
         self,
         system: ConstrainedSystem,
         t0: float,
-        t1: float,
         q0: Array,
         v0: Array,
-        set_sizes: Callable[[Run], None],
-        check_derivatives: bool,
+        asked: Asked,
         times: Array | None = None,
     ) -> dict[str, Any] | None:
         """The fields of the record of a run of a system, at all steps or at these times; None: make it the long way."""
-        run, movable, a = self.run, self.movable, self.run.a
+        run, movable, a, t1, check_derivatives = self.run, self.movable, self.run.a, asked.t1, asked.check_derivatives
         if self.rest > 0:
             self.rest -= 1
             return None
@@ -109,7 +107,7 @@ class Again:
             movable.take(system)
             territory, self.look.system = movable.kin.territory(check_derivatives), movable.system
             self.chooser.system = movable.system
-        if not self._is_ready(system, t0, t1, q0, v0, set_sizes, check_derivatives):
+        if not self._is_ready(system, t0, q0, v0, asked):
             return None
         began = time.process_time()
         code, n_rows, n_steps = self._steps_to(t1, times is not None)
@@ -164,18 +162,12 @@ class Again:
                 return code, n_rows, n_steps
             give_way(run)
 
-    def _is_ready(
-        self,
-        system: ConstrainedSystem,
-        t0: float,
-        t1: float,
-        q0: Array,
-        v0: Array,
-        set_sizes: Callable[[Run], None],
-        check_derivatives: bool,
-    ) -> bool:
+    def _is_ready(self, system: ConstrainedSystem, t0: float, q0: Array, v0: Array, asked: Asked) -> bool:
         """Whether the run is at its start: one that is asked for again needs no second look."""
-        run, call = self.run, (id(system), t0, t1, q0.tobytes(), v0.tobytes())  # of the last call the system is kept
+        run, call = (
+            self.run,
+            (id(system), t0, asked.t1, q0.tobytes(), v0.tobytes()),
+        )  # of the last call the system is kept
         run.plan, run.kit, run.functions, run.substituted = self.plan, self.kit, self.kit.functions, False
         run.plan.memory[:] = self.memory
         if run.kit.flags[flags.FORM] != self.flags[flags.FORM]:
@@ -188,9 +180,9 @@ class Again:
         self.call, self.saved = None, []
         if not self._begins(t0, q0, v0):
             return False
-        if self.movable is not None and not self.movable.agrees(t1, self.look.mass, check_derivatives):
+        if self.movable is not None and not self.movable.agrees(asked.t1, self.look.mass, asked.check_derivatives):
             return False
-        set_sizes(run)
+        asked.set_sizes(run)
         self.call = call
         if equal:
             arrays = *lasting(run.work), run.state, run.clock, run.control

@@ -12,12 +12,12 @@ from twoloop.generate.exact_derivatives import exact_near
 from twoloop.generate.families import Family, family_of, give_bounds, take_bounds
 from twoloop.generate.straight_code import OwnCode
 from twoloop.generate.traced_values import Traced, states_around
-from twoloop.methods.code_for import Compiled, code_for, may_have_code
-from twoloop.methods.plan import Method
+from twoloop.methods.code_for import code_for, may_have_code
 from twoloop.methods.plans_for import plans_for
 from twoloop.methods.presets import is_preset
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.again import MOST_WAITING, Again
+from twoloop.run.asked import Asked
 from twoloop.run.comparison import unlike_before
 from twoloop.run.movable import Kin
 from twoloop.run.run import Run
@@ -41,26 +41,6 @@ class Kept(NamedTuple):
     kin: Kin | None = None  # what it shares with systems of other parameters
 
 
-class Asked(NamedTuple):
-    """What a call asks of a run, beside what it is to keep; `solve_dae` says what the names mean."""
-
-    method: Method
-    atol: Array
-    t1: float
-    rtol: float
-    step_size: float | None
-    first_step: float | None
-    max_step: float
-    max_steps: int | None
-    compiled: Compiled
-    check_derivatives: bool
-
-    @property
-    def key(self) -> Any:
-        """What calls have in common that ask for the same, but for the end."""
-        return id(self.method), self.atol.tobytes(), self[3:]
-
-
 def record_again(
     system: ConstrainedSystem, t0: float, q0: Array, v0: Array, asked: Asked, times: Array | None = None
 ) -> tuple[dict[str, Any], str] | None:
@@ -81,8 +61,7 @@ def record_again(
         again = kept.waiting.pop()
     except IndexError:
         again = Again(kept.run.again(), system, kept.code, kept.definite, kept.kin)
-    call = asked.t1, q0, v0, lambda run: _set_sizes(run, asked), asked.check_derivatives, times
-    record = again.record(system, t0, *call)
+    record = again.record(system, t0, q0, v0, asked, times)
     if len(kept.waiting) < MOST_WAITING:
         kept.waiting.append(again)
     return None if record is None else (record, again.run.said_of_rows)
@@ -107,7 +86,7 @@ def run_from(system: ConstrainedSystem, t0: float, q0: Array, v0: Array, asked: 
     if kept is not None and kept.start == start:
         run, code = kept.run.again(), kept.code
         if kept.t1 != asked.t1:
-            _set_sizes(run, asked)
+            asked.set_sizes(run)
     elif kept is not None and kept.moves:
         run, code = _moved(kept, system, t0, q0, v0, asked), kept.code
     if run is None:
@@ -166,7 +145,7 @@ def _moved(kept: Kept, system: ConstrainedSystem, t0: float, q0: Array, v0: Arra
         return None
     run = kept.run.at(t0, q0, v0) if has_definite_mass(system, t0, q0) == kept.definite else None
     if run is not None:
-        _set_sizes(run, asked)
+        asked.set_sizes(run)
     return run
 
 
@@ -191,7 +170,7 @@ def _made(system: ConstrainedSystem, t0: float, q0: Array, v0: Array, asked: Ask
         if unlike is not None:
             raise ValueError(unlike)
     run = Run(system, plan, t0, q0, v0, asked.rtol, asked.atol, asked.step_size, interiors)
-    _set_sizes(run, asked)
+    asked.set_sizes(run)
     if asked.max_steps is not None:
         run.control[run.a.MAX_STEPS] = asked.max_steps
     return run, code
@@ -204,8 +183,3 @@ def _check_start(system: ConstrainedSystem, t0: float, q0: Array, v0: Array, der
         check_start(system, t0, q0, v0, derivatives=derivatives, exact=lambda: exact_near(system, t0, q0, v0))
 
     system.remembered_at(("start", derivatives), (t0, q0.tobytes(), v0.tobytes()), check)
-
-
-def _set_sizes(run: Run, asked: Asked) -> None:
-    if asked.step_size is None:
-        run.set_sizes(asked.first_step, asked.max_step, asked.t1)
