@@ -6,7 +6,9 @@ import pytest
 from tests import problems
 from tests.problems import kept, worst
 from twoloop import ConstrainedSystem, consistent_state, consistent_states, ensemble, mechanisms, solve_dae
+from twoloop.generate import derived
 from twoloop.generate.derived import standing_for
+from twoloop.generate.programs import program_of
 from twoloop.generate.traced_equations import Equations
 from twoloop.generate.traced_values import unchecked
 from twoloop.kernels.data.codes import DONE
@@ -229,3 +231,37 @@ def test_products_may_be_a_thousand_deep():
 def test_a_result_keeps_the_system_that_was_given():
     system = pendulum(jacobian=None, gamma=None)
     assert solve_dae(system, (0.0, 0.1), [0.6, -0.8], [0.0, 0.0]).system is system
+
+
+BEAD = {  # on a circle of radius p[1]
+    "n_q": 2,
+    "n_c": 1,
+    "mass": np.eye(2),
+    "force": lambda t, q, v, p: np.array([0.0, -p[0]]),
+    "constraint": lambda t, q, p: np.array([0.5 * (q[0] * q[0] + q[1] * q[1] - p[1] * p[1])]),
+    "parameters": [9.81, 1.1],
+    "compile": True,
+}
+
+
+def branches(t, q, v, p):
+    return np.array([0.0, -p[0] if p[0] < 10.0 else 0.0])
+
+
+@pytest.mark.parametrize("force", [BEAD["force"], branches], ids=["formulas", "a branch on a parameter"])
+def test_systems_of_other_parameters_share_what_was_derived(force, monkeypatch):
+    system = ConstrainedSystem.from_python(**BEAD | {"force": force})
+    solve_dae(system, (0.0, 1.0), [1.1, 0.0], [0.0, 0.0])
+    made = []
+    monkeypatch.setattr(derived, "program_of", lambda *given: made.append(given) or program_of(*given))
+    for gravity, radius in ((9.7, 1.2), (10.1, 1.3), (9.9, 1.4)):
+        other = system.with_parameters([gravity, radius])
+        whole = {"jacobian": lambda t, q: q[None, :], "gamma": lambda t, q, v: np.array([-(v @ v)])}
+        given = {kind: BEAD[kind] for kind in ("n_q", "n_c", "mass")} | whole
+        fall = -gravity if force is not branches or gravity < 10.0 else 0.0
+        radial = {"constraint": lambda t, q, r=radius: np.array([0.5 * (q @ q - r * r)])}
+        radial |= {"force": lambda t, q, v, fall=fall: np.array([0.0, fall])}
+        expected = solve_dae(ConstrainedSystem.from_python(**given | radial), (0.0, 1.0), [radius, 0.0], [0.0, 0.0])
+        result = solve_dae(other, (0.0, 1.0), [radius, 0.0], [0.0, 0.0])
+        assert worst(result.q[:, -1], expected.q[:, -1]) < 1e-6
+    assert not made or force is branches

@@ -99,7 +99,8 @@ def solve_dae(
         the same with and without. None: every accepted step is stored. With `step_size`, and the two methods of the
         paper, nothing is interpolated: steps are shortened to land on the times.
     first_step : float, optional
-        First step to try, s. None: chosen from the velocities and accelerations at the start.
+        First step to try, s. None: chosen from the velocities and accelerations at the start, or from the Taylor series
+        there.
     max_step : float
         Largest step, s. Methods that do not look at the equations between the ends and stages of their steps, all but
         "Taylor", take none that is longer than a hundredth of the run in any case. Forces and drives are looked at with

@@ -2,10 +2,12 @@
 
 import copy
 from collections.abc import Sequence
-from typing import Any
+from functools import partial
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from twoloop.generate.families import Evaluator, Family, of_family
 from twoloop.generate.programs import Program, program_of
 from twoloop.generate.traced_equations import Equations
 from twoloop.generate.traced_values import Check, Traced
@@ -17,6 +19,44 @@ ROWS = {"jacobian": "n_c", "gamma": "n_c", "nonholonomic_gamma": "n_a"}  # what 
 MOST = 20_000  # operations of a program
 
 
+class Derived:
+    """Programs in the place of what no callback gives, made once for all systems of a family.
+
+    Parameters
+    ----------
+    programs : dict
+        By name, each with the places to which its results belong.
+    traced : Traced
+        What they were traced from.
+    """
+
+    def __init__(self, programs: dict[str, tuple[Program, list[int]]], traced: Traced):
+        self.programs, self.traced, self.kinds = programs, traced, traced.kinds
+
+    def of(self, system: ConstrainedSystem, evaluate: Evaluator) -> "Standing":
+        """What stands for one of the systems."""
+        functions: dict[str, Any] = {}
+        for name, (program, places) in self.programs.items():
+            constants, coefficients = evaluate(program.constants), evaluate(program.coefficients)
+            vectors = _packed(program._replace(constants=constants, coefficients=coefficients), places)
+            functions |= dict(zip((f"{name}_program", f"{name}_numbers"), vectors, strict=True))
+        other = copy.copy(system)
+        other.functions = system.functions._replace(**functions)
+        return Standing(other, self.traced.of(system, evaluate))
+
+
+class Standing(NamedTuple):
+    """A system with such programs, and what they were traced from."""
+
+    system: ConstrainedSystem
+    traced: Traced
+
+    @property
+    def kinds(self) -> frozenset[str]:
+        """Kinds of callbacks that were traced."""
+        return self.traced.kinds
+
+
 def standing_for(system: ConstrainedSystem, check: Check) -> tuple[ConstrainedSystem, tuple[Traced, ...]]:
     """The system with programs in the place of C_q and Gamma that no callback gives, and what they were traced from.
 
@@ -25,34 +65,22 @@ def standing_for(system: ConstrainedSystem, check: Check) -> tuple[ConstrainedSy
     absent = [kind for kind, size in ROWS.items() if getattr(system, size) and kind not in system.given]
     if not absent:
         return system, ()
-    made = system.remembered("programs", lambda: _made(system, absent))
-    if made is None:
-        return system, ()
-    other, traced = made
     try:
-        check(traced)
+        made: Standing = of_family(system, "programs", partial(_made, system, absent), lambda made: check(made.traced))
     except Untraceable:
         return system, ()
-    return other, (traced,)
+    return made.system, (made.traced,)
 
 
-def _made(system: ConstrainedSystem, absent: Sequence[str]) -> tuple[ConstrainedSystem, Traced] | None:
-    """The system with programs, as vectors; None: the constraints cannot be traced, or are too long."""
-    equations = Equations(system)
-    try:
-        results = _results(equations, absent)
-    except Untraceable:
-        return None
-    programs: dict[str, Any] = {}
-    for name, forms in results.items():
+def _made(system: ConstrainedSystem, absent: Sequence[str], family: Family) -> Derived:
+    equations = Equations(system, family.parameters)
+    programs = {}
+    for name, forms in _results(equations, absent).items():
         program = program_of(equations.graph, 1 + 2 * system.n_q, dict(enumerate(forms.values())))
         if len(program.rows) > MOST:
-            return None
-        vectors = _packed(program, list(forms))
-        programs |= dict(zip((f"{name}_program", f"{name}_numbers"), vectors, strict=True))
-    other = copy.copy(system)
-    other.functions = system.functions._replace(**programs)
-    return other, Traced(system, equations.graph)
+            raise Untraceable(f"{name} takes {len(program.rows)} operations")
+        programs[name] = program, list(forms)
+    return Derived(programs, Traced(system, equations.graph))
 
 
 def _results(equations: Equations, absent: Sequence[str]) -> dict[str, dict[int, Form]]:
