@@ -43,11 +43,11 @@ def collect(kept: KeptRows, quick: bool) -> pd.DataFrame:
     return adaptive.collect(runs(quick), kept, rivals.row_at_end, lambda run: True, () if quick else ERRORS)
 
 
-def at_error(rows: pd.DataFrame, others: pd.DataFrame, error: float) -> dict[str, Any]:
-    """How the best of ours with constraints stands beside the cheapest in minimal coordinates (`rows`) at one error."""
-    ours = others[others["family"] == "two-loop"]
-    found = headline.of_error(pd.concat([ours, rows], ignore_index=True), error)[headline.BEST]
-    return found | {"error": error}
+def at_errors(rows: pd.DataFrame, others: pd.DataFrame) -> list[dict[str, Any]]:
+    """How the best of ours with constraints stands at each error beside the cheapest without (`rows`)."""
+    both = pd.concat([others[others["family"] == "two-loop"], rows], ignore_index=True)
+    found = headline.of_errors(both, ERRORS)
+    return [at[headline.BEST] | {"error": error} for error, at in zip(ERRORS, found, strict=True)]
 
 
 def findings_of(rows: pd.DataFrame, everywhere: pd.DataFrame) -> dict[str, Any]:
@@ -55,7 +55,7 @@ def findings_of(rows: pd.DataFrame, everywhere: pd.DataFrame) -> dict[str, Any]:
     made: list[dict[str, Any]] = []
     for name, own in rows.groupby("case", sort=False) if len(rows) else ():
         others = everywhere[everywhere["case"] == name]
-        made.append({"case": str(name), "at": [at_error(own, others, error) for error in ERRORS]})
+        made.append({"case": str(name), "at": at_errors(own, others)})
     pairs = [at for each in made for at in each["at"] if at["ratio"] is not None]
     verdicts, ratios = [each["verdict"] for each in pairs], [each["ratio"] for each in pairs]
     found: dict[str, Any] = {"mechanisms": made, "n": len(pairs), "wrong_from": WRONG}

@@ -7,7 +7,7 @@ added by `python -m studies.work_precision.processors FOLDER`, the folder of rep
 import re
 import sys
 from collections.abc import Mapping, Sequence
-from itertools import combinations, product
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +30,12 @@ Standings = Sequence[tuple[str, float, Mapping[str, Mapping[str, Any]]]]
 def standings(rows: pd.DataFrame, column: str) -> Standings:
     """Who is ahead at each error on each mechanism, by a column of times; `rows`: of all runs."""
     cases = tables.medians(rows.assign(call_s=rows[column])).groupby("case", sort=False)
-    return [(str(case), error, rivals.standing(own, error)) for (case, own), error in product(cases, rivals.DECADES)]
+    decades = rivals.DECADES
+    return [
+        (str(case), error, at)
+        for case, own in cases
+        for error, at in zip(decades, rivals.standings(own, decades), strict=True)
+    ]
 
 
 def verdicts(rows: pd.DataFrame, stamp: str, known: Standings = ()) -> pd.DataFrame:

@@ -5,7 +5,7 @@ Four cases are run at length, over their whole motion; all others, with more riv
 
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import product
+from itertools import chain
 from typing import Any
 
 import pandas as pd
@@ -55,9 +55,10 @@ def runs(case: Case, quick: bool) -> list[Run]:
     return made + [replace(run, value=value) for run in rough for value in BETWEEN]
 
 
-def class_of(rows: pd.DataFrame, error: float) -> dict[str, Any]:
-    """The cheapest of ours and of others on one case at one error, and how the default does."""
-    return {"error": error, "standing": rivals.standing(rows, error)} | tables.of_both(tables.ranking(rows, error))
+def classes_of(rows: pd.DataFrame) -> list[dict[str, Any]]:
+    """The cheapest of ours and of others on one case at each error, and how the default does."""
+    made = zip(ERRORS, rivals.standings(rows, ERRORS), tables.rankings(rows, ERRORS), strict=True)
+    return [{"error": error, "standing": at} | tables.of_both(ranked) for error, at, ranked in made]
 
 
 def findings_of(rows: pd.DataFrame, known: Sequence[Case]) -> dict[str, Any]:
@@ -69,7 +70,7 @@ def findings_of(rows: pd.DataFrame, known: Sequence[Case]) -> dict[str, Any]:
             raise StudyError(f"the rows have none of {case.name}; make them again by python -m studies.work_precision")
         slug = "_".join("".join(letter if letter.isalnum() else " " for letter in case.name).split())
         found: dict[str, Any] = {"name": case.name, "tags": list(case.tags), "t_end": case.t_end}
-        found |= {"at": [class_of(runs, error) for error in ERRORS], "figure": f"work_precision_{slug}.png"}
+        found |= {"at": classes_of(runs), "figure": f"work_precision_{slug}.png"}
         listed.append(found | {"processor": str(runs["processor"].iloc[0]) if "processor" in runs else ""})
     return {"cases": listed, "default": DEFAULT}
 
@@ -156,8 +157,8 @@ def default_over(rows: pd.DataFrame, compiled: bool) -> dict[str, Any]:
     """
     default = headline.OWN_CODE if compiled else DEFAULT
     own, over = rows[(rows["family"] == "two-loop") & (rows["solver"].isin(list(COMPILED)) == compiled)], []
-    for (_, runs), error in product(own.groupby("case", sort=False), rivals.DECADES):
-        ranked = tables.ranking(runs, error)
+    by_case = (tables.rankings(runs, rivals.DECADES) for _, runs in own.groupby("case", sort=False))
+    for ranked in chain.from_iterable(by_case):
         mine = ranked[ranked["solver"] == default]["call_s"]
         over += [float(mine.iloc[0] / ranked["call_s"].iloc[0]) if len(mine) else None] if len(ranked) else []
     reached = [each for each in over if each is not None]
