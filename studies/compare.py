@@ -172,17 +172,13 @@ def _work(words: Sequence[str] | None) -> None:
     unknown = [name for name in given.solvers or () if name not in CATALOGUE]
     if unknown:
         raise StudyError(f"no solver is called {unknown[0]!r}; there are: {'; '.join(CATALOGUE)}")
-    if any(not error > 0.0 for error in given.errors):
-        raise StudyError("--errors must be positive")
-    if not given.reference_limit > 0.0:
-        raise StudyError(f"--reference-limit must be positive; given {given.reference_limit:g}")
-    if not given.time_limit > 0.0:
-        raise StudyError(f"--time-limit must be positive; given {given.time_limit:g}")
     given.out = given.out or Path("compare")
     problem = load_problem(given.where)
     t_end = problem.t_span[1] if given.t_end is None else given.t_end
-    if not t_end > 0.0:
-        raise StudyError(f"--t-end must be positive; given {t_end:g}")
+    positive = {"errors": given.errors, "reference-limit": [given.reference_limit], "time-limit": [given.time_limit]}
+    for name, values in (positive | {"t-end": [t_end]}).items():
+        if wrong := [value for value in values if not value > 0.0]:
+            raise StudyError(f"--{name} must be positive; given {wrong[0]:g}")
     known = partial(known_of, problem, t_end, given.reference_limit)
     limits: dict[str, Any] = {"time_limit": given.time_limit, "timed": 0.004 if given.quick else 0.02}
     case = Case(problem.name, problem, t_end, known, note=problem.note, **limits)

@@ -1,4 +1,4 @@
-"""The beam study from its runs to its report."""
+"""The stiff beam of Sect. 4.2: the paper's procedure beside Newton's method as the outer loop, IDA and others."""
 
 import itertools
 from typing import Any
@@ -7,7 +7,6 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-import studies.beam as package
 from studies.beam.limits import GAUSS_SEIDEL, JACOBI, along_rows, limit_rows
 from studies.beam.runs import DIFFERENCES, EXUDYN, NEWTON, PAPER, TARGETS, by_tip, cases, collected, runs
 from studies.beam.sensitivity import MESH, sensitivity_rows
@@ -180,5 +179,5 @@ def figures_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Figure]:
     return made
 
 
-STUDY = Study("beam", package.__doc__, make, findings_of, figures_of, tables_of, medians=True)
+STUDY = Study("beam", __doc__, make, findings_of, figures_of, tables_of, medians=True)
 main = STUDY.main

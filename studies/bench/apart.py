@@ -1,9 +1,24 @@
-"""Work in a process of its own, which may hang or die."""
+"""Work that may hang or die, in a process of its own; and calls that may raise, with what they warn of."""
 
 import multiprocessing
 import resource
+import warnings
 from collections.abc import Callable
 from typing import Any
+
+from studies.bench.store import Row
+from twoloop import Result
+
+
+def heard(call: Callable[[], Result]) -> tuple[Result | None, Row]:
+    """The result of a call, or None; its status and message, or what was raised; and what it warned of."""
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        try:
+            result, told = (made := call()), {"status": made.status.name, "message": made.message}
+        except Exception as error:  # of whatever kind: a row
+            result, told = None, {"status": "RAISED", "message": f"{type(error).__name__}: {error}"}
+    return result, told | {"warned": " / ".join(str(each.message) for each in said)}
 
 
 def apart(work: Callable[[], Any], limit: float | None = None, cpu: int | None = None) -> Any:

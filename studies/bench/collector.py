@@ -17,6 +17,8 @@ import pandas as pd
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from references.driver import user_call
+from references.equations.expressions import NotSymbolic
+from references.minimal.equations import NoMinimalCoordinates
 from studies.bench import metrics
 from studies.bench.alarm import Alarm
 from studies.bench.reference_motion import ReferenceMotion, make_reference
@@ -56,8 +58,6 @@ class Case:
     # whether the problem's energy is an invariant of the true motion. None: as the problem says, and where it does not,
     # as the reference shows.
     conserved: bool | None = None
-    # further ones: column to invariant(t, q, v), for columns of states
-    invariants: Mapping[str, Callable[[Array, Array, Array], Array]] = field(default_factory=dict)
     watched: tuple[int, ...] | None = None  # coordinates by which "out of phase" is judged. None: all.
     # s, for solvers of fixed step. None: t_end over 1000, 3000, 10,000, 30,000 and 100,000.
     step_sizes: tuple[float, ...] | None = None
@@ -224,8 +224,7 @@ def row_of(run: Run, k: int, measure: Measure | None, warm: Warm) -> Row:
     if result is None:
         return row | metrics.COLUMNS
     try:
-        given = case.problem, result, case.reference, case.instants, case.scale, case.watched, dict(case.invariants)
-        row |= metrics.measure(*given)
+        row |= metrics.measure(case, result)
         return row if measure is None else row | measure(run, result)
     except (ArithmeticError, ValueError, np.linalg.LinAlgError) as error:  # the rest of the night goes on
         why = f"{status}, but it cannot be measured: {type(error).__name__}: {error}"
@@ -305,7 +304,7 @@ def attempt(run: Run, repeat: int, around: float | None = None) -> tuple[Result 
             began = time.process_time()
             result = run.solver.run(run.case, run.value, repeat)
             spent = time.process_time() - began
-    except NotApplicable as why:
+    except (NotApplicable, NotSymbolic, NoMinimalCoordinates) as why:  # of ours, and of adapters
         status, message = "NOT_APPLICABLE", str(why)
     except ImportError as error:
         status, message = "NOT_AVAILABLE", str(error)

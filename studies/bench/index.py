@@ -4,6 +4,7 @@ import importlib
 import json
 from collections.abc import Sequence
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 from studies.bench import tables
@@ -27,6 +28,14 @@ CLASSES = {  # tags of a case and the class of problem that they stand for, in t
     ("stiff", "vibrations wanted"): "stiff, vibrations wanted",
 }
 LONG = "long and conservative"
+
+
+def module_of(name: str) -> ModuleType:
+    """The module of a study, a file or `study` in a folder: its docstring, and `main`."""
+    found = importlib.import_module(f"studies.{name}")
+    return importlib.import_module(f"studies.{name}.study") if hasattr(found, "__path__") else found
+
+
 WHOSE = ("ours", "others")
 COSTS = ("call_s", "called_from", "keeps")
 
@@ -136,7 +145,7 @@ def first_screen(folder: Path, quick: bool) -> str:
     """The text of README.md of a folder of reports."""
     studies = []
     for name in STUDIES:
-        about = (importlib.import_module(f"studies.{name}").__doc__ or "").splitlines()[0].rstrip(".").split(":")[0]
+        about = (module_of(name).__doc__ or "").splitlines()[0].rstrip(".").split(":")[0]
         names = ("compare.html",) if name == "compare_page" else (f"{name}.md", f"{name}.png")
         files = [each for each in names if (folder / each).is_file()]
         studies.append({"name": name, "about": about, "file": files[0] if files else None})

@@ -37,6 +37,7 @@ from studies.energy.runs import (
 SHARES = (1e-3, 1e-5, 1e-7)  # of the largest kinetic energy: energy errors at which costs are compared
 EQUAL = 0.1  # costs that differ by less count as equal: runs share the machine and are made once
 KEEPING = f"{GAUSS}, symmetric partition"
+FATES = dict.fromkeys(DRIFTING, "drift") | {each: each for each in (NO_DRIFT, IS_LOST, IRREGULAR)}  # in one word
 DRAWN = (DEFAULT, OWN_CODE, OWN_EXPLICIT, IDA_C, HEYOKA, CVODE_C, TRAPEZOIDAL, KEEPING, IRK)  # over cost
 
 
@@ -77,17 +78,15 @@ def told(row: pd.Series) -> dict[str, Any]:
     return found | {"keeps": bool(row["keeps_constraints"])}
 
 
-def _fate(verdict: str) -> str:
-    """What became of the energy in one word, of a verdict."""
-    return "drift" if verdict in DRIFTING else verdict if verdict in (NO_DRIFT, IS_LOST, IRREGULAR) else "fail"
+def ended(rows: pd.DataFrame) -> pd.Series:
+    """Which runs reached their end and have not lost the motion."""
+    return (rows["status"] == "REACHED_END") & ~rows["lost"].fillna(True).astype(bool)
 
 
 def settled(rows: pd.DataFrame) -> pd.Series:
     """Largest energy error of each run and of those of its solver with tighter settings; inf where one did not end."""
-    ended = (rows["status"] == "REACHED_END") & ~rows["lost"].fillna(True).astype(bool)
-    runs = rows.assign(
-        worst=rows["energy"].abs().where(ended, np.inf), setting=setting_of(rows), fixed=rows["h"].notna()
-    )
+    worst = rows["energy"].abs().where(ended(rows), np.inf)
+    runs = rows.assign(worst=worst, setting=setting_of(rows), fixed=rows["h"].notna())
     return runs.sort_values("setting").groupby(["name", "fixed"])["worst"].cummax().reindex(rows.index)
 
 
@@ -98,7 +97,7 @@ def cheapest(rows: pd.DataFrame) -> dict[str, Any] | None:
 
 def long_of(rows: pd.DataFrame) -> dict[str, Any]:
     """The class "long and conservative": what small energy errors cost with a drift and without, alternatives."""
-    reached = rows.assign(worst=settled(rows))[(rows["status"] == "REACHED_END") & ~rows["lost"].astype(bool)]
+    reached = rows.assign(worst=settled(rows))[ended(rows)]
     calm, own = reached["verdict"] == NO_DRIFT, reached["family"] == "two-loop"
     kinetic = float(reached["kinetic"].iloc[0])
     at = []
@@ -114,11 +113,11 @@ def long_of(rows: pd.DataFrame) -> dict[str, Any]:
         level["pays"] = free is not None and over * (1.0 - EQUAL) > 1.0
         at.append(level | {"equal": free is not None and 1.0 - EQUAL <= over <= 1.0 / (1.0 - EQUAL)})
     bounds = [level["energy"] for level in at[1:]]
-    lucky = [reached[(reached["energy"].abs() <= bound) & (reached["worst"] > bound)] for bound in bounds]
+    lucky = [cheapest(reached[(reached["energy"].abs() <= bound) & (reached["worst"] > bound)]) for bound in bounds]
     kept = [level["no_drift"]["ours"] for level in at[1:] if level["no_drift"]["ours"]]
-    both = [(level["no_drift"]["ours"], level["drift"]["ours"]) for level in at[1:]]
-    over_drifting = [one["call_s"] / other["call_s"] for one, other in both if one and other]
-    rivals = [other for one, other in both if one and other]
+    sides = [(level["no_drift"]["ours"], level["drift"]["ours"]) for level in at[1:]]
+    both = [side for side in sides if all(side)]
+    over_drifting = [one["call_s"] / other["call_s"] for one, other in both]
     listed = rows[rows["group"].isin(("other", "controlled"))]
     places = [run["energy"].abs().fillna(np.inf).idxmin() for _, run in listed.groupby("name", sort=False)]
     return {
@@ -128,16 +127,12 @@ def long_of(rows: pd.DataFrame) -> dict[str, Any]:
         "kinetic": kinetic,
         "no_drift": at[0]["no_drift"],
         "at": at[1:],
-        "lucky": [
-            told(own.loc[own["call_s"].idxmin()]) | {"within": bound}
-            for own, bound in zip(lucky, bounds, strict=True)
-            if len(own)
-        ],
+        "lucky": [run | {"within": bound} for run, bound in zip(lucky, bounds, strict=True) if run],
         "calm_ours": {
             "labels": list(dict.fromkeys(run["label"] for run in kept)),
             "fixed": bool(kept) and all(run["fixed_steps"] for run in kept),
             "over_drifting": [min(over_drifting), max(over_drifting)] if over_drifting else None,
-            "drifting_explicit": bool(rivals) and all(run["explicit"] for run in rivals),
+            "drifting_explicit": bool(both) and all(other["explicit"] for _, other in both),
         },
         "n_pays": sum(level["pays"] for level in at[1:]),
         "n_equal": sum(level["equal"] for level in at[1:]),
@@ -184,7 +179,7 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
         "uneven_drifts": bool(fixed[kinds["uneven"]]["verdict"].isin(DRIFTING).all()),
         "n_controlled": len(controlled),
         "controlled_steady": [told(run) | {"case": run["case"]} for _, run in steady.iterrows()],
-        "lasting": dict(Counter(fixed[kinds["lasting"]]["verdict"].map(_fate))),
+        "lasting": dict(Counter(FATES.get(each, "fail") for each in fixed[kinds["lasting"]]["verdict"])),
         "paper": {name: told(pick(rows, motion, IRK, group="controlled")) for name, motion in both.items()},
         "failed": int((rows["status"] != "REACHED_END").sum()),
         "problems": {name: rows[rows["case"] == motion]["problem"].iloc[0] for name, motion in both.items()},
@@ -200,8 +195,8 @@ def figures_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Figure]:
 def cost_figure(rows: pd.DataFrame) -> Figure:
     """Cost of the long run over its largest energy error, on the geometry whose partition changes."""
     long = rows[rows["case"] == SWITCHING]
-    ended = (long["status"] == "REACHED_END") & ~long["lost"].fillna(True).astype(bool)
-    long = long.assign(error_q=long["energy"].abs().where(ended), floor=0.0, solver=long["name"], astray=False)
+    errors = long["energy"].abs().where(ended(long))
+    long = long.assign(error_q=errors, floor=0.0, solver=long["name"], astray=False)
     long = long[long["solver"].isin(DRAWN) & ((long["solver"] != KEEPING) | long["h"].notna())]
     title = f"{number(long['t_end'].iloc[0])} s, each run timed once; ringed: no drift"
     figure = figures.work_precision(long, DRAWN, title, "largest energy error over the run (J)")

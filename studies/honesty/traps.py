@@ -131,11 +131,6 @@ def fails(Q: Array, t: float, *state: Array) -> Array:
     return Q
 
 
-def misshapes(Q: Array, t: float, *state: Array) -> Array:
-    """One force too few after 1 s."""
-    return Q if t <= 1.0 else Q[:-1]
-
-
 @dataclass(frozen=True)
 class Trap:
     """What is wrong, on one mechanism."""
@@ -212,6 +207,7 @@ def of_chain(n: int) -> list[Trap]:
     def trap(name: str, made: ConstrainedSystem, sane: ConstrainedSystem | None, t_end: float = 2.0, **more: object):  # type: ignore[no-untyped-def]
         return Trap(name, f"chain of {n}", made, **({"q0": q0, "v0": v0} | more), t_end=t_end, sane=sane)  # type: ignore[arg-type]
 
+    shorter = lambda Q, t, *state: Q if t <= 1.0 else Q[:-1]  # noqa: E731
     across = np.zeros(2 * n)
     across[:2] = 1e-2 * q0[:2]
     fast = system(AMPLITUDE=0.01, OMEGA=1e3)
@@ -225,7 +221,7 @@ def of_chain(n: int) -> list[Trap]:
         trap("NaN in the force after 1 s", system(NAN=1.0), None),
         trap("exception in a callback after 1 s", system(RAISES=1.0), None),
         trap("exception in a Python callback after 1 s", python_copy(system(), force=fails), None),
-        trap("wrong shape from a Python callback after 1 s", python_copy(system(), force=misshapes), None),
+        trap("wrong shape from a Python callback after 1 s", python_copy(system(), force=shorter), None),
         trap("one wrong entry of C_q", system(WRONG=1e-3), system(), group=INPUT),
         trap("force that jumps", push, push, breaks=(0.7,)),
         trap("pulse of 1 ms", pulse, pulse, breaks=(1.0, 1.001), unnoticed=system()),

@@ -79,21 +79,15 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
         apart = [abs(each["power"] - fitted[0]) for each in between] if fitted else []
         found["kinds"].append(line | {"slope": fitted, "powers": between, "bends": max(apart, default=0.0) > BEND})
     found["failed"] = rows[rows["group"].eq(EVALUATION) & rows["status"].eq("FAILED")][["case", "n"]].to_dict("records")
-    chains = rows[rows["group"] == CHAIN].sort_values(
-        ["n", "solver", "h", "tol", "repeat"], ascending=[True] * 2 + [False] * 2 + [True]
-    )
+    order = {"n": True, "solver": True, "h": False, "tol": False, "repeat": True}
+    chains = rows[rows["group"] == CHAIN].sort_values([*order], ascending=[*order.values()])
     for n, own in chains.groupby("n"):
         medians = tables.medians(own.reset_index(drop=True))
-        of_chain: dict[str, Any] = {
-            "n": int(n),
-            "t_end": CHAINS[int(n)],
-            "lines": tables.work_precision(medians, ERRORS),
-        }
+        of_chain: dict[str, Any] = {"n": int(n), "t_end": CHAINS[int(n)]}
+        of_chain["lines"] = tables.work_precision(medians, ERRORS)
         of_chain["over_exudyn"] = [ratio for error in ERRORS if (ratio := over_exudyn(medians, error))]
-        of_chain |= {
-            "step": steps_of(medians),
-            "fastest": [each for error in ERRORS if (each := fastest(medians, error))],
-        }
+        of_chain["step"] = steps_of(medians)
+        of_chain["fastest"] = [each for error in ERRORS if (each := fastest(medians, error))]
         found["once"] |= once(medians)
         least, step = min(of_chain["over_exudyn"], default=0.0), of_chain["step"]
         of_chain["by_order"] = bool(step) and (step["exudyn"] / step["ours"]) ** 2 < least
@@ -116,9 +110,9 @@ def _beside_engines(line: dict[str, Any], rows: pd.DataFrame) -> dict[str, Any]:
     found: dict[str, Any] = {"case": line["case"], "ours": line["us"], "engines": {}, "start_s": {}}
     right = rows[rows["case"].eq(line["case"]) & rows["status"].eq("REACHED_END")]
     for engine, own in right.groupby("solver", sort=False):
-        by_size = own.groupby("n")
-        found["engines"][str(engine)] = {int(n): float(each["evaluation_us"].median()) for n, each in by_size}
-        found["start_s"][str(engine)] = {int(n): float(each["start_s"].median()) for n, each in by_size}
+        by_size = own.groupby("n")[["evaluation_us", "start_s"]].median()
+        found["engines"][str(engine)] = by_size["evaluation_us"].to_dict()
+        found["start_s"][str(engine)] = by_size["start_s"].to_dict()
     return found
 
 
@@ -193,13 +187,9 @@ def figures_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Figure]:
         panel.set(xscale="log", yscale="log", xlabel="error of q at the end, over max(1, max |q|)", title=f"{n} bars")
         panel.grid(alpha=0.3)
     panels[0][0].set_ylabel("CPU time of the call (s)")
-    shown = {label: line for axes in panels[0] for line, label in zip(*axes.get_legend_handles_labels(), strict=True)}
-    second.legend(shown.values(), shown, loc="outside lower center", ncols=3, fontsize=8)
+    figures.legend(second, panels[0], below=3)
     return {"scale": figure, "scale_chains": second}
 
 
 STUDY = Study("scale", __doc__, make, findings_of, figures_of)
 main = STUDY.main
-
-if __name__ == "__main__":
-    main()

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import tempfile
 from functools import partial
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -72,15 +73,10 @@ def compared(name: str) -> Row:
 def make(output: Output) -> pd.DataFrame:
     """All rows."""
     quick = output.call.quick
-    sizes = [
-        (coordinates, n, tangents)
-        for n in (QUICK_SIZES if quick else SIZES)
-        for coordinates in ("positions", "angles")
-        for tangents in ((False,) if quick else (False, True))
-    ]
+    sizes = product(QUICK_SIZES if quick else SIZES, ("positions", "angles"), (False,) if quick else (False, True))
     names = list(MODELS)[: QUICK_MODELS if quick else None]
     with output.kept() as kept:
-        rows = [kept.made(str(which), partial(made, *which)) for which in sizes]
+        rows = [kept.made(str((which, n, tangents)), partial(made, which, n, tangents)) for n, which, tangents in sizes]
         return pd.DataFrame(rows + [kept.made(name, partial(compared, name)) for name in names])
 
 
@@ -89,16 +85,14 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     sizes, twins = rows[rows["group"] == "size"], rows[rows["group"] == "twin"]
     done = sizes[sizes["status"] == "REACHED_END"]
     ratios = twins["twin_us"] / twins["hand_us"]
-    largest = done[done["n"] == done["n"].max()]
-    with_tangents = largest[largest["tangents"] & (largest["case"] == "angles")]
-    without = largest[~largest["tangents"] & (largest["case"] == "angles")]
+    largest = done[(done["n"] == done["n"].max()) & (done["case"] == "angles")]
+    parts = [largest[largest["tangents"] == which]["compile_s"] for which in (False, True)]
+    failed = sizes[sizes["status"] != "REACHED_END"]
     return {
         "n": None if done.empty else int(done["n"].max()),
-        "failed": [
-            f"{row.case}, n = {row.n:g}: {row.status}" for row in sizes.itertuples() if row.status != "REACHED_END"
-        ],
+        "failed": [f"{row.case}, n = {row.n:g}: {row.status}" for row in failed.itertuples()],
         "second_s": None if done.empty else [float(done["second_s"].median()), float(done["second_s"].max())],
-        "compile_s": [None if part.empty else float(part["compile_s"].max()) for part in (without, with_tangents)],
+        "compile_s": [None if part.empty else float(part.max()) for part in parts],
         "ratio": [float(ratios.min()), float(ratios.max())],
         "other_counts": twins["case"][twins["twin_evaluations"] != twins["hand_evaluations"]].tolist(),
     }

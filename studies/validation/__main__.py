@@ -1,3 +1,3 @@
-from studies.validation import main
+from studies.validation.study import main
 
 main()

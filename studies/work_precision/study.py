@@ -203,7 +203,3 @@ def draw(output: Output, findings: dict[str, Any], everywhere: pd.DataFrame, med
 def main(words: Sequence[str] | None = None) -> None:
     """Run the study and write its report."""
     study.run_rows("work_precision", __doc__, words, make, report)
-
-
-if __name__ == "__main__":
-    main()
