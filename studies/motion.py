@@ -141,15 +141,13 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     made |= {"agree": all(one["error_y3_short"] <= VISIBLE for one in procedures)}
     made |= {"agree_long": all(one["error_y3"] <= VISIBLE for one in procedures), "gear": _stand_in(rows)}
     made |= {"stand_in": [[str(n), *_cells(rows, n)] for n in GEAR_ORDERS if find(rows, gear(n), COARSE) is not None]}
-    made |= {
-        "listed": [{name: row[name] for name in told} | {"setting": setting(row)} for row in listed if row is not None]
-    }
+    known = [row for row in listed if row is not None]
+    made |= {"listed": [{name: row[name] for name in told} | {"setting": setting(row)} for row in known]}
     made |= {"canonical_growth": grown.get(CANONICAL)}
     made |= {"exudyn_growth": [exudyn.min(), exudyn.max()] if len(exudyn) else None}
     made |= {"others_growth": {str(bool(keeps)): [own.min(), own.max()] for keeps, own in others}}
-    return made | {
-        "growth": [grown.drop(CANONICAL, errors="ignore").min(), grown.drop(CANONICAL, errors="ignore").max()]
-    }
+    grown = grown.drop(CANONICAL, errors="ignore")
+    return made | {"growth": [grown.min(), grown.max()]}
 
 
 def _draw(panel: Axes, rows: Iterable[pd.Series | None], curve: str, t: Array, **more: Any) -> None:

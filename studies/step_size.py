@@ -13,7 +13,7 @@ from studies.bench import figures
 from studies.bench.cases import four_bar
 from studies.bench.cases.four_bar import Y3
 from studies.bench.cli import StudyError
-from studies.bench.collector import Case, Run, Solver
+from studies.bench.collector import Run, Solver
 from studies.bench.solvers import CATALOGUE, GIVEN, IRK, NEWMARK, PRESETS, QUARTER
 from studies.bench.store import Array
 from studies.bench.study import Study, rows_of
@@ -29,17 +29,14 @@ CURVE = 1200  # steps that a figure draws one by one; of more, the shortest and 
 MARKS = {"error": ("x", "error too large, shortened"), "convergence": ("v", "not converged, shortened")}
 
 
-def _ida(case: Case, tolerance: float, repeat: int) -> Result:
-    return solve_ida(*case.start, "stabilised", tolerance, tolerance)
-
-
 def runs(quick: bool) -> list[Run]:
     """The paper's procedures at its settings; the other adaptive solvers at its Atol = Rtol."""
     case = replace(four_bar.cases(quick)[0], timed=0.0)  # times are not compared here
     made = [Run(case, CATALOGUE[name], ERR_OUT, "paper", 1) for name in (IRK, NEWMARK, QUARTER)]
     made += [Run(case, CATALOGUE[name], TOL, "two-loop", 1) for name in (GIVEN, *PRESETS)]
     # the catalogue's IDA stores its states at common instants only, and not its steps
-    ida = Solver("IDA, stabilised", "SUNDIALS", "Python", True, "tol", _ida, own_accelerations=True)
+    run = lambda case, tol, _: solve_ida(*case.start, "stabilised", tol, tol)  # noqa: E731
+    ida = Solver("IDA, stabilised", "SUNDIALS", "Python", True, "tol", run, own_accelerations=True)
     others = [*([] if quick else [ida]), *(CATALOGUE[name] for name in OTHERS)]
     return made + [Run(case, solver, TOL, "others", 1) for solver in others]
 

@@ -108,8 +108,13 @@ def collect(
     return pd.DataFrame([kept[key] for key in keys if key in kept])
 
 
+def is_ours(run: Run) -> bool:
+    """Whether a run is by one of our solvers."""
+    return run.solver.family == "two-loop"
+
+
 def _side(run: Run) -> Side:
-    return run.case.name, run.solver.family == "two-loop"
+    return run.case.name, is_ours(run)
 
 
 def between(

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import track
 
 from references.driver import user_call
 from references.equations.expressions import NotSymbolic
@@ -193,16 +193,10 @@ def collect(runs: Iterable[Run], kept: KeptRows, measure: Measure | None = None)
     left = [(run, k) for k in rounds for run in runs if k < run.repeats and run.key(k) not in kept]
     for case in {id(run.case): run.case for run, _ in left}.values():
         _ = case.scale  # makes the reference, which is not to be timed with anything
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    bar = Progress(*columns, disable=not sys.stdout.isatty())
     warm: Warm = set()
-    with bar as progress:
-        task = progress.add_task("".ljust(50), total=len(order), completed=len(order) - len(left))
-        for run, k in left:
-            if k > 0 and kept[run.key(0)]["status"] in ONCE:
-                continue
+    for run, k in track(left, "runs", disable=not sys.stdout.isatty()):
+        if k == 0 or kept[run.key(0)]["status"] not in ONCE:
             kept.add(run.key(k), row_of(run, k, measure, warm))
-            progress.update(task, advance=1, description=f"{run.case.name}: {run.solver.name}"[:50].ljust(50))
     return pd.DataFrame([kept[key] for key in order if key in kept])
 
 

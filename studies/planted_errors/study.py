@@ -170,8 +170,8 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
         who = next((who for who, begins in BEGINS.items() if caught_by.startswith(begins)), TESTS)
         by[who] += 1
         stopped += of_model and who == ITSELF
-    found = {"n": len(rows), "missed": rows["fault"][missed].tolist(), "by": by, "tolerance": TOLERANCE}
-    return found | {"models": {"n": int(models.sum()), "stopped": int(stopped)}}
+    found = {"n": len(rows), "missed": rows["fault"][missed].tolist(), "by": by}
+    return found | {"models": {"n": int(models.sum()), "stopped": int(stopped)}, "tolerance": TOLERANCE}
 
 
 def report(output: Output, rows: pd.DataFrame, line: str) -> None:

@@ -1,6 +1,7 @@
 """Table 3 of the paper: computation time of both two-loop procedures over their tolerances, and of other solvers."""
 
 from functools import partial
+from itertools import chain
 from typing import Any
 
 import matplotlib.pyplot as plt
@@ -108,16 +109,12 @@ def make(output: Output) -> pd.DataFrame:
     def row(run: Run, repeat: int, built: Warm) -> Row:
         return row_of(run, repeat, highest, built)
 
-    def ours(run: Run) -> bool:
-        return run.solver.family == "two-loop"
-
     quick = output.call.quick
-    first, second = four_bar.cases(quick)
-    todo = runs(first, second, quick)
+    todo, errors = runs(*four_bar.cases(quick), quick), () if quick else TARGETS
     compared = [run for run in todo if run.group == "comparison"]
     with output.kept() as kept:
         rows = collect([run for run in todo if run.group != "comparison"], kept, highest)
-        more = adaptive.collect(compared, kept, row, lambda run: True, () if quick else TARGETS, ours)
+        more = adaptive.collect(compared, kept, row, lambda run: True, errors, adaptive.is_ours)
     return pd.concat([rows, more], ignore_index=True)
 
 
@@ -177,9 +174,8 @@ def counts(rows: pd.DataFrame) -> str:
     """A table of evaluations and error of both procedures with err_in = 1e-9, on which they hardly depend."""
 
     def told(cell: pd.Series | None) -> str:
-        return (
-            "not run" if cell is None else f"{number(float(cell['n_evaluations']))}; {number(float(cell['error_q']))}"
-        )
+        values = ["not run"] if cell is None else [number(float(cell[key])) for key in ("n_evaluations", "error_q")]
+        return "; ".join(values)
 
     lines = [
         [name, *(told(machine(rows, group, ERR_IN, err_out)) for err_out in TOLERANCES)]
@@ -212,7 +208,7 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     found["newmark_in_two_groups"] = in_two_groups(newmark["times"])
     found["ratio_evaluations"] = newmark["n_evaluations"] / irk["n_evaluations"]
     ratios = _newmark_over_irk(first)
-    over = [ratio for each in ratios.values() for ratio in each]
+    over = list(chain(*ratios.values()))
     found["newmark_over_irk"] = [min(over), max(over)] if over else []
     found["newmark_errors"] = list(ratios)
     found["newmark_dearer_everywhere"] = bool(over and min(over) > 1.0)

@@ -13,7 +13,7 @@ import pandas as pd
 from references.heyoka.taylor import LARGEST_UNROLLED
 from studies.bench import adaptive, cases, figures, headline, study, tables
 from studies.bench.cli import StudyError
-from studies.bench.collector import Case, Run, Warm, row_of
+from studies.bench.collector import Case, Run, row_of
 from studies.bench.render import number, render
 from studies.bench.row_files import versions
 from studies.bench.solvers import (
@@ -29,7 +29,7 @@ from studies.bench.solvers import (
     RIVALS,
     TOLERANCES,
 )
-from studies.bench.store import KeptRows, Output, Row
+from studies.bench.store import KeptRows, Output
 from studies.compare import GROUP, runs_of
 from studies.work_precision import first_calls, minimal, processors, rivals
 
@@ -93,11 +93,8 @@ def make(output: Output) -> pd.DataFrame:
 def at_length(known: Sequence[Case], quick: bool, kept: KeptRows) -> pd.DataFrame:
     """The rows of cases over their whole motion."""
     made = [run for case in known for run in runs(case, quick)]
-    return adaptive.collect(made, kept, _row, lambda run: True, () if quick else ERRORS)
-
-
-def _row(run: Run, repeat: int, built: Warm) -> Row:
-    return row_of(run, repeat, None, built)
+    row = lambda run, repeat, built: row_of(run, repeat, None, built)  # noqa: E731
+    return adaptive.collect(made, kept, row, lambda run: True, () if quick else ERRORS)
 
 
 def part(rows: pd.DataFrame, group: str = GROUP) -> pd.DataFrame:
