@@ -14,11 +14,10 @@ import pandas as pd
 from studies.bench import cli, figures, tables
 from studies.bench.cli import StudyError
 from studies.bench.collector import FILE, REPEATS, Case, Run, Solver, collect
-from studies.bench.mechanism_names import mechanism_of
 from studies.bench.outsider import N_TIMES, Outsider
 from studies.bench.reference_motion import ReferenceMotion, check_published, make_reference
 from studies.bench.render import number, power, render, table
-from studies.bench.row_files import in_format, rows_of_file, versions
+from studies.bench.row_files import in_format, mechanism_of, rows_of_file, versions
 from studies.bench.solvers import CATALOGUE, COMPARED
 from studies.bench.store import Output, Row
 from twoloop import Result

@@ -15,8 +15,8 @@ from studies.bench.cli import StudyError
 from studies.bench.index import write_index
 from studies.bench.render import TEMPLATES
 from studies.bench.row_files import as_runs, rows_of_file
-from studies.bench.runs_by_error import SETTINGS
 from studies.bench.store import Output, plain, read_rows
+from studies.bench.tables import SETTINGS
 
 FILE = "compare.html"
 SOURCES = ("work_precision", "validation")

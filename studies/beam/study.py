@@ -7,9 +7,8 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from studies.beam.limits import GAUSS_SEIDEL, JACOBI, along_rows, limit_rows
+from studies.beam.limits import GAUSS_SEIDEL, JACOBI, MESH, along_rows, limit_rows, sensitivity_rows
 from studies.beam.runs import DIFFERENCES, EXUDYN, NEWTON, PAPER, TARGETS, by_tip, cases, collected, runs
-from studies.beam.sensitivity import MESH, sensitivity_rows
 from studies.bench import figures, tables
 from studies.bench.cases.beam import SOFT, STIFF
 from studies.bench.cli import StudyError

@@ -20,7 +20,7 @@ from references.driver import user_call
 from references.equations.expressions import NotSymbolic
 from references.minimal.equations import NoMinimalCoordinates
 from studies.bench import metrics
-from studies.bench.alarm import Alarm
+from studies.bench.apart import Alarm
 from studies.bench.reference_motion import ReferenceMotion, make_reference
 from studies.bench.store import Array, KeptRows, Row
 from twoloop import ConstrainedSystem, Result, Statistics, solve_dae

@@ -20,10 +20,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
-from studies.bench.runs_by_error import astray, setting_of, used
 from studies.bench.solvers import CATALOGUE, COMPILED, DEFAULT, GEAR_ORDERS, HEYOKA, IRK, IRK_LINE, gear
 from studies.bench.store import Output
-from studies.bench.tables import time_for
+from studies.bench.tables import astray, setting_of, time_for, used
 from twoloop.rows.equal_error import DECADE
 
 MOST_LINES = 9

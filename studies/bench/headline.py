@@ -11,8 +11,8 @@ from typing import Any
 import pandas as pd
 
 from studies.bench import tables
-from studies.bench.runs_by_error import SETTINGS, by_solver
 from studies.bench.solvers import COMPILED, DEFAULT, GIVEN, HEYOKA
+from studies.bench.tables import SETTINGS, by_solver
 
 OWN_CODE = next(name for name, method in COMPILED.items() if method == DEFAULT)
 BEST = "best of ours"

@@ -12,10 +12,9 @@ from studies.bench import figures
 from studies.bench.cli import StudyError
 from studies.bench.headline import OWN_CODE
 from studies.bench.render import number
-from studies.bench.runs_by_error import setting_of
 from studies.bench.solvers import CVODE_C, DEFAULT, HEYOKA, IDA_C, IRK, OWN_EXPLICIT
 from studies.bench.study import Study, rows_of
-from studies.bench.tables import setting, where
+from studies.bench.tables import setting, setting_of, where
 from studies.energy.drift import DRIFTING, IRREGULAR, IS_LOST, NO_DRIFT, bound, verdict
 from studies.energy.runs import (
     BASIC,

@@ -18,7 +18,6 @@ from studies.bench.collector import REPEATS, Case, Run, Solver, Warm, collect, r
 from studies.bench.headline import OWN_CODE
 from studies.bench.metrics import ASTRAY, LOST
 from studies.bench.render import number, power, table
-from studies.bench.runs_by_error import used
 from studies.bench.solvers import (
     ADAMS,
     CATALOGUE,
@@ -39,6 +38,7 @@ from studies.bench.solvers import (
 )
 from studies.bench.store import Array, Output, Row
 from studies.bench.study import Study
+from studies.bench.tables import used
 from studies.table3.causes import (
     FAMILIES,
     PAPER_IRK,

@@ -23,9 +23,9 @@ from studies.bench.cli import StudyError
 from studies.bench.collector import REPEATS, Run, Warm, warm_up
 from studies.bench.end_states import case_of, row_of
 from studies.bench.render import number, power
-from studies.bench.runs_by_error import by_solver
 from studies.bench.solvers import CATALOGUE, HEYOKA, OWN, RIVALS, TAYLOR
 from studies.bench.store import KeptRows, Row
+from studies.bench.tables import by_solver
 from studies.validation.study import MAKE
 from twoloop import mechanisms, solve_dae
 from twoloop.mechanisms import Problem, Reference

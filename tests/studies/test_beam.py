@@ -9,9 +9,18 @@ import pytest
 from studies import beam
 from studies.beam import runs as beam_runs
 from studies.beam import study
-from studies.beam.limits import GAUSS_SEIDEL, JACOBI, STOPPED_AT, frequencies, gauss_seidel_limit, jacobi_limit
+from studies.beam.limits import (
+    CHANGES,
+    GAUSS_SEIDEL,
+    JACOBI,
+    MESH,
+    START,
+    STOPPED_AT,
+    frequencies,
+    gauss_seidel_limit,
+    jacobi_limit,
+)
 from studies.beam.runs import DIFFERENCES, EXUDYN, NEWTON, PAPER, cases, measure, runs
-from studies.beam.sensitivity import CHANGES, MESH, START
 from studies.beam.study import TARGETS, findings_of
 from studies.bench import index
 from studies.bench.cases import load

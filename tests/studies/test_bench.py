@@ -11,7 +11,7 @@ import pytest
 
 from references.driver import user_call
 from studies.bench import collector as bench
-from studies.bench.alarm import TimeLimit
+from studies.bench.apart import TimeLimit
 from studies.bench.collector import Case, NotApplicable, Run, Solver, collect
 from studies.bench.reference_motion import Quintic, ReferenceMotion, check_published, make_reference
 from studies.bench.solvers import CATALOGUE
