@@ -5,7 +5,7 @@ import traceback
 
 from studies.bench import cli
 from studies.bench.cli import CLONE, REPORTS, ROOT
-from studies.bench.index import STUDIES, module_of, put_in_readme
+from studies.bench.index import STUDIES, module_of, put_in_readme, run_study
 
 USAGE = "usage: python -m studies [NAME | all | readme | compare FILE.py:FUNCTION] [--quick] [--out DIR] [--redraw]"
 
@@ -17,7 +17,7 @@ def main() -> None:
     elif name == "readme":  # its generated block alone, from the findings of all studies
         cli.main(lambda words: put_in_readme(REPORTS, ROOT / "README.md"), words)
     elif name in (*STUDIES, "compare"):
-        module_of(name).main(words)
+        run_study(name, words)
     elif name and name not in ("-h", "--help"):
         sys.exit(f"{USAGE}; given {name}, which is none of {', '.join(STUDIES)}")
     else:
@@ -33,7 +33,7 @@ def run_all(words: list[str]) -> None:
     for name in STUDIES:
         print(f"--- {name}", flush=True)
         try:
-            module_of(name).main(words)
+            run_study(name, words)
         except SystemExit as end:
             if not isinstance(end.code, str):  # Ctrl-C, --help, wrong options
                 raise

@@ -137,7 +137,6 @@ def _work(words: Sequence[str] | None) -> None:
 
 
 def main(words: Sequence[str] | None = None) -> None:
-    """Compare two commits."""
     cli.main(_work, words)
 
 

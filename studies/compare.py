@@ -100,7 +100,6 @@ def rows_from(files: Iterable[str], mechanism: str, t_end: float) -> list[Row]:
 
 
 def findings_of(rows: pd.DataFrame, case: Case, errors: Sequence[float]) -> dict[str, Any]:
-    """What the report says, from the medians."""
     floor = float(rows["floor"].iloc[0])
     found: dict[str, Any] = {"name": case.name, "t_end": case.t_end, "floor": floor, "n_instants": case.n_instants}
     found |= {"python": case.problem.system.called_in_python, "unresolved": [e for e in errors if e < floor]}
@@ -214,7 +213,6 @@ def _work(words: Sequence[str] | None) -> None:
 
 
 def main(words: Sequence[str] | None = None) -> None:
-    """Compare solvers on a mechanism of the user's own."""
     cli.main(_work, words)
 
 

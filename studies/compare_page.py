@@ -133,7 +133,6 @@ def _work(words: Sequence[str] | None) -> None:
 
 
 def main(words: Sequence[str] | None = None) -> None:
-    """Write compare.html from the rows in the folder."""
     cli.main(_work, words)
 
 

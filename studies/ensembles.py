@@ -178,7 +178,6 @@ def with_geometry(n: int) -> dict[str, Any]:
 
 
 def make(output: Output) -> pd.DataFrame:
-    """All rows."""
     quick, rows = output.call.quick, []
     n = N_QUICK if quick else N_RUNS
     sets = [lambda: linkages(n), *(lambda name=name, t=t: of_starts(name, n, t) for name, t in STARTS.items())]
@@ -247,7 +246,6 @@ def figures_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Figure]:
 
 
 STUDY = Study("ensembles", __doc__, make, findings_of, figures_of)
-main = STUDY.main
 
 if __name__ == "__main__":
-    main()
+    STUDY.main()

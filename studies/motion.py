@@ -123,7 +123,6 @@ def _cells(rows: pd.DataFrame, order: int) -> list[str]:
 
 
 def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
-    """What the report says, from the medians."""
     procedures = []
     for run in (find(rows, IRK), find(rows, NEWMARK)):
         if run is None or pd.isna(run["error_y3"]):
@@ -208,7 +207,6 @@ def figures_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Figure]:
 
 
 STUDY = Study("motion", __doc__, rows_of(runs, measure), findings_of, figures_of, medians=True, curves=True)
-main = STUDY.main
 
 if __name__ == "__main__":
-    main()
+    STUDY.main()

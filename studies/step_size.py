@@ -76,7 +76,6 @@ def _curve(t: Array, h: Array) -> Array:
 
 
 def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
-    """What the report says, from the medians."""
     paper = rows[rows["group"] == "paper"].set_index("solver")
     if not set(PAPER) <= set(paper.index[paper["h_median"].notna()]):
         raise StudyError("the rows lack the paper's procedures; make them again by python -m studies.step_size")
@@ -127,7 +126,6 @@ def figures_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Figure]:
 
 
 STUDY = Study("step_size", __doc__, rows_of(runs, measure), findings_of, figures_of, medians=True, curves=True)
-main = STUDY.main
 
 if __name__ == "__main__":
-    main()
+    STUDY.main()

@@ -131,7 +131,6 @@ def pair(rows: pd.DataFrame, first: str, second: str) -> dict[str, Any] | None:
 
 
 def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
-    """What the report says, from the medians."""
     line_up, loops, along = (rows[rows["group"] == group] for group in ("line-up", "loops", "tolerances"))
     ours = line_up[line_up["family"] == "two-loop"]
     irk, loose = ours[ours["solver"] == IRK], loops.set_index("err_out")["violation_q"]
@@ -193,7 +192,6 @@ def figures_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Figure]:
 
 
 STUDY = Study("violation", __doc__, rows_of(runs, measure), findings_of, figures_of, medians=True, curves=True)
-main = STUDY.main
 
 if __name__ == "__main__":
-    main()
+    STUDY.main()

@@ -1,3 +1,3 @@
-from studies.beam.study import main
+from studies.beam.study import STUDY
 
-main()
+STUDY.main()

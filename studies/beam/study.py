@@ -25,7 +25,6 @@ LISTED = (PAPER, NEWMARK, QUARTER, NEWTON, DIFFERENCES, OWN_EXPLICIT, IDA_C, IDA
 
 
 def make(output: Output) -> pd.DataFrame:
-    """Make all rows."""
     quick = output.call.quick
     known = cases(quick)
     with output.kept() as kept:
@@ -35,7 +34,6 @@ def make(output: Output) -> pd.DataFrame:
 
 
 def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
-    """All findings; `rows` are medians."""
     runs = by_tip(rows)
     w_max = {case: float(part["straight"].iloc[0]) for case, part in _of(rows, "along").groupby("case")}
     cases = [_case(rows, runs[runs["case"] == case], case, w_max[case]) for case in (SOFT, STIFF)]
@@ -179,4 +177,3 @@ def figures_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Figure]:
 
 
 STUDY = Study("beam", __doc__, make, findings_of, figures_of, tables_of, medians=True)
-main = STUDY.main

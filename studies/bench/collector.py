@@ -103,7 +103,6 @@ class Case:
         return self.problem.system, (self.t0, self.t0 + self.t_end), self.problem.q0, self.problem.v0
 
     def steps(self) -> tuple[float, ...]:
-        """Fixed steps, s."""
         return self.step_sizes or tuple(self.t_end / n for n in (1e3, 3e3, 1e4, 3e4, 1e5))
 
 

@@ -31,9 +31,15 @@ LONG = "long and conservative"
 
 
 def module_of(name: str) -> ModuleType:
-    """The module of a study, a file or `study` in a folder: its docstring, and `main`."""
+    """The module of a study, a file or `study` in a folder."""
     found = importlib.import_module(f"studies.{name}")
     return importlib.import_module(f"studies.{name}.study") if hasattr(found, "__path__") else found
+
+
+def run_study(name: str, words: Sequence[str]) -> None:
+    """Run a study for a command line: the `STUDY` of its module, or its `main`."""
+    module = module_of(name)
+    getattr(module, "STUDY", module).main(words)
 
 
 WHOSE = ("ours", "others")

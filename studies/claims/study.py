@@ -9,7 +9,7 @@ import pandas as pd
 
 from studies.bench import cli
 from studies.bench.cli import StudyError
-from studies.bench.index import module_of, write_index
+from studies.bench.index import run_study, write_index
 from studies.bench.render import render
 from studies.bench.store import Output
 from studies.claims import beam_judges, experiments, judges
@@ -70,7 +70,7 @@ def _work(words: Sequence[str] | None) -> None:
     call = cli.parse("claims", __doc__, words)
     for name in () if call.redraw else STUDIES:
         if not (call.out / f"{name}.csv").exists():
-            module_of(name).main(["--quick"] * call.quick + ["--out", str(call.out)])
+            run_study(name, ["--quick"] * call.quick + ["--out", str(call.out)])
     with Output(call) as output:
         if call.redraw:
             _, line = output.load_rows()
@@ -86,5 +86,4 @@ def _work(words: Sequence[str] | None) -> None:
 
 
 def main(words: Sequence[str] | None = None) -> None:
-    """Run the study and write its report."""
     cli.main(_work, words)

@@ -1,3 +1,3 @@
-from studies.conformance.study import main
+from studies.conformance.study import STUDY
 
-main()
+STUDY.main()

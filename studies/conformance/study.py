@@ -65,7 +65,6 @@ def _row(simulator: Simulator, finding: Finding) -> Row:
 
 
 def make(output: Output) -> pd.DataFrame:
-    """Check everything."""
     quick, rows = output.call.quick, list[Row]()
     chosen = [each for each in simulators() if not quick or each.name in QUICK]
     warnings.simplefilter("ignore", ConstraintWarning)
@@ -138,5 +137,3 @@ def _short(message: str) -> str:
 
 
 STUDY = Study("conformance", __doc__, make, findings_of, tables=tables_of)
-
-main = STUDY.main

@@ -119,25 +119,16 @@ def long_of(rows: pd.DataFrame) -> dict[str, Any]:
     over_drifting = [one["call_s"] / other["call_s"] for one, other in both]
     listed = rows[rows["group"].isin(("other", "controlled"))]
     places = [run["energy"].abs().fillna(np.inf).idxmin() for _, run in listed.groupby("name", sort=False)]
-    return {
-        "case": SWITCHING,
-        "problem": rows["problem"].iloc[0],
-        "t_end": float(rows["t_end"].iloc[0]),
-        "kinetic": kinetic,
-        "no_drift": at[0]["no_drift"],
-        "at": at[1:],
-        "lucky": [run | {"within": bound} for run, bound in zip(lucky, bounds, strict=True) if run],
-        "calm_ours": {
-            "labels": list(dict.fromkeys(run["label"] for run in kept)),
-            "fixed": bool(kept) and all(run["fixed_steps"] for run in kept),
-            "over_drifting": [min(over_drifting), max(over_drifting)] if over_drifting else None,
-            "drifting_explicit": bool(both) and all(other["explicit"] for _, other in both),
-        },
-        "n_pays": sum(level["pays"] for level in at[1:]),
-        "n_equal": sum(level["equal"] for level in at[1:]),
-        "equal": EQUAL,
-        "alternatives": [told(rows.loc[place]) for place in places],  # of each the run of least error
-    }
+    calm_ours: dict[str, Any] = {"labels": list(dict.fromkeys(run["label"] for run in kept))}
+    calm_ours["fixed"] = bool(kept) and all(run["fixed_steps"] for run in kept)
+    calm_ours["over_drifting"] = [min(over_drifting), max(over_drifting)] if over_drifting else None
+    calm_ours["drifting_explicit"] = bool(both) and all(other["explicit"] for _, other in both)
+    found = {"case": SWITCHING, "problem": rows["problem"].iloc[0], "t_end": float(rows["t_end"].iloc[0])}
+    found |= {"kinetic": kinetic, "no_drift": at[0]["no_drift"], "at": at[1:]}
+    found["lucky"] = [run | {"within": bound} for run, bound in zip(lucky, bounds, strict=True) if run]
+    found |= {"calm_ours": calm_ours, "n_pays": sum(level["pays"] for level in at[1:])}
+    found |= {"n_equal": sum(level["equal"] for level in at[1:]), "equal": EQUAL}
+    return found | {"alternatives": [told(rows.loc[place]) for place in places]}  # of each the run of least error
 
 
 def variants_of(fixed: pd.DataFrame) -> list[dict[str, Any]]:
@@ -152,7 +143,6 @@ def variants_of(fixed: pd.DataFrame) -> list[dict[str, Any]]:
 
 
 def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
-    """What the report and the first screen say."""
     rows = judged(rows)
     fixed = where(rows, group="fixed", case=SWITCHING)
     even = fixed["partition"] == "symmetric"
@@ -163,30 +153,24 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     chosen = ((SUN,), (GAUSS,), (SUN, MOMENTA), (RADAU,))
     sun, gauss, canonical, radau = (told(pick(rows, ONE, *which)) for which in chosen)
     both = {"one": ONE, "switching": SWITCHING}
-    return {
-        "long": long_of(rows[rows["case"] == SWITCHING]),
-        "sun": sun,
-        "gauss": gauss,
-        "radau": radau,
-        "radau_over_sun": abs(radau["drift"] / sun["drift"]) if sun["drifts"] and radau["drifts"] else None,
-        "canonical": canonical,
-        "sun_over_gauss": abs(sun["drift"]) / gauss["bound"],
-        "sun_over_canonical": abs(sun["drift"]) / canonical["bound"],
-        "variants": variants_of(rows[rows["group"] == "fixed"]),
-        "n": {name: len(each) for name, each in calm.items()},
-        "n_calm": {name: int(each.sum()) for name, each in calm.items()},
-        "uneven_drifts": bool(fixed[kinds["uneven"]]["verdict"].isin(DRIFTING).all()),
-        "n_controlled": len(controlled),
-        "controlled_steady": [told(run) | {"case": run["case"]} for _, run in steady.iterrows()],
-        "lasting": dict(Counter(FATES.get(each, "fail") for each in fixed[kinds["lasting"]]["verdict"])),
-        "paper": {name: told(pick(rows, motion, IRK, group="controlled")) for name, motion in both.items()},
-        "failed": int((rows["status"] != "REACHED_END").sum()),
-        "problems": {name: rows[rows["case"] == motion]["problem"].iloc[0] for name, motion in both.items()},
-    }
+    found = {"long": long_of(rows[rows["case"] == SWITCHING]), "sun": sun, "gauss": gauss, "radau": radau}
+    found["radau_over_sun"] = abs(radau["drift"] / sun["drift"]) if sun["drifts"] and radau["drifts"] else None
+    found |= {"canonical": canonical, "sun_over_gauss": abs(sun["drift"]) / gauss["bound"]}
+    found["sun_over_canonical"] = abs(sun["drift"]) / canonical["bound"]
+    found["variants"] = variants_of(rows[rows["group"] == "fixed"])
+    found |= {"n": {name: len(each) for name, each in calm.items()}}
+    found |= {"n_calm": {name: int(each.sum()) for name, each in calm.items()}}
+    found["uneven_drifts"] = bool(fixed[kinds["uneven"]]["verdict"].isin(DRIFTING).all())
+    found["n_controlled"] = len(controlled)
+    found["controlled_steady"] = [told(run) | {"case": run["case"]} for _, run in steady.iterrows()]
+    found["lasting"] = dict(Counter(FATES.get(each, "fail") for each in fixed[kinds["lasting"]]["verdict"]))
+    found["paper"] = {name: told(pick(rows, motion, IRK, group="controlled")) for name, motion in both.items()}
+    found["failed"] = int((rows["status"] != "REACHED_END").sum())
+    found["problems"] = {name: rows[rows["case"] == motion]["problem"].iloc[0] for name, motion in both.items()}
+    return found
 
 
 def figures_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Figure]:
-    """Both figures of the report."""
     rows = judged(rows)
     return {"energy_cost": cost_figure(rows), "energy_long": time_figure(rows)}
 
@@ -226,4 +210,3 @@ def time_figure(rows: pd.DataFrame) -> Figure:
 
 
 STUDY = Study("energy", __doc__, rows_of(runs, measure), findings_of, figures_of, medians=True, curves=True)
-main = STUDY.main

@@ -200,4 +200,3 @@ def figures_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Figure]:
 
 
 STUDY = Study("engines", __doc__, make, findings_of, figures_of)
-main = STUDY.main

@@ -1,3 +1,3 @@
-from studies.honesty.study import main
+from studies.honesty.study import STUDY
 
-main()
+STUDY.main()

@@ -352,4 +352,3 @@ def picture(totals: Sequence[dict[str, Any]]) -> Figure:
 
 
 STUDY = Study("honesty", __doc__, make, findings_of, figures_of)
-main = STUDY.main

@@ -319,6 +319,5 @@ def in_report() -> Iterator[Fault]:
 
 
 def all_faults() -> list[Fault]:
-    """All of them, each on its own."""
     made = (in_mechanism, in_trace, in_reference, in_tableau, in_options, in_adapter, in_report)
     return [fault for make in made for fault in make()]

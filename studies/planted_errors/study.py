@@ -153,7 +153,6 @@ def check_sound(faults: Sequence[Fault]) -> int:
 
 
 def make(output: Output) -> pd.DataFrame:
-    """Plant all faults, one after another."""
     faults = all_faults()
     if output.call.quick:
         faults = [fault for k, fault in enumerate(faults) if fault.place == "trace" or k % QUICK == 0]
@@ -163,7 +162,6 @@ def make(output: Output) -> pd.DataFrame:
 
 
 def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
-    """What the report says."""
     missed, by = rows["caught_by"] == NONE, {ITSELF: 0, KNOWN: 0, BOUNDS: 0, TESTS: 0}
     models, stopped = rows["place"] == "mechanism", 0
     for caught_by, of_model in zip(rows["caught_by"][~missed], models[~missed], strict=True):
@@ -175,7 +173,6 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
 
 
 def report(output: Output, rows: pd.DataFrame, line: str) -> None:
-    """Write findings and report."""
     found = findings_of(rows)
     mutants = output.path / "mutants.json"
     found["mutants"] = json.loads(mutants.read_text()) if mutants.is_file() else None
@@ -188,5 +185,4 @@ def report(output: Output, rows: pd.DataFrame, line: str) -> None:
 
 
 def main(words: Sequence[str] | None = None) -> None:
-    """Run the study and write its report."""
     study.run_rows("planted_errors", __doc__, words, make, report)

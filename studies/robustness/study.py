@@ -12,8 +12,8 @@ from studies.bench.apart import apart
 from studies.bench.random_linkages import KINDS, PLACES, draw, end_of_scaled, scaled
 from studies.bench.render import power
 from studies.bench.sharp_motion import RIGHT, SAID, SILENT, graded
-from studies.bench.store import Array, Output, Row
-from studies.bench.study import Study
+from studies.bench.store import Array, Row
+from studies.bench.study import Study, kept_rows
 from studies.robustness import sharp_runs
 from twoloop import solve_dae
 from twoloop.mechanisms import Problem, four_bar
@@ -127,16 +127,6 @@ def long_runs(quick: bool) -> Iterator[sharp_runs.Part]:
             yield f"long {method} {n}", partial(lambda *run: [apart(partial(long_run, *run))], method, n)
 
 
-def make(output: Output) -> pd.DataFrame:
-    """Make all rows, those kept from an unfinished run aside."""
-    rows: list[Row] = []
-    with output.kept() as kept:
-        for part in (linkages, sharp_runs.random_mechanisms, scales, long_runs):
-            for key, run in part(output.call.quick):
-                rows += kept.made(key, lambda run=run: {"rows": run()})["rows"]  # type: ignore[misc]
-    return pd.DataFrame(rows)
-
-
 def counts_of(own: pd.DataFrame) -> dict[str, Any]:
     """Outcomes, and the largest share of the allowed error of runs that reach the end."""
     done = own[own["error"].notna()]
@@ -172,7 +162,6 @@ def _said(line: dict[str, Any]) -> str:
 
 
 def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
-    """What the report says."""
     drawn, long = rows[rows["group"] == "linkage"], rows[rows["group"] == "long"]
     silent = rows[(rows["outcome"] == SILENT) & (rows["group"] != sharp_runs.SHARP)]
     found: dict[str, Any] = {"tolerance": TOLERANCE, "looseness": LOOSENESS, "t_end": T_END, "grows": GROWS}
@@ -202,5 +191,4 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     return found | {"least_steps": min(line["n_steps"] for line in found["long"])}
 
 
-STUDY = Study("robustness", __doc__, make, findings_of)
-main = STUDY.main
+STUDY = Study("robustness", __doc__, kept_rows(linkages, sharp_runs.random_mechanisms, scales, long_runs), findings_of)

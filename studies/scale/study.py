@@ -10,8 +10,7 @@ from matplotlib.figure import Figure
 
 from studies.bench import figures, tables
 from studies.bench.solvers import DEFAULT
-from studies.bench.store import Output
-from studies.bench.study import Study
+from studies.bench.study import Study, kept_rows
 from studies.scale.rivals import BUDGET, TREE, UNTIL, UNTIL_END, trees, until
 from studies.scale.runs import (
     CHAIN,
@@ -32,14 +31,6 @@ from studies.scale.runs import (
 from twoloop.rows.equal_error import resampled
 
 BEND = 0.3  # by which a power from one size to the next differs notably from the fitted one
-
-
-def make(output: Output) -> pd.DataFrame:
-    """Rows of evaluations and memory, of trees, of chains, and of those that grow until others stop."""
-    quick = output.call.quick
-    with output.kept() as kept:
-        groups = evaluations, trees, chains, until
-        return pd.DataFrame([kept.made(key, row) for group in groups for key, row in group(quick)])
 
 
 def slope(n: Any, times: Any) -> list[float] | None:
@@ -191,5 +182,4 @@ def figures_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Figure]:
     return {"scale": figure, "scale_chains": second}
 
 
-STUDY = Study("scale", __doc__, make, findings_of, figures_of)
-main = STUDY.main
+STUDY = Study("scale", __doc__, kept_rows(evaluations, trees, chains, until), findings_of, figures_of)

@@ -7,6 +7,7 @@ import json
 import subprocess
 import sys
 import tempfile
+from collections.abc import Callable, Iterator
 from functools import partial
 from itertools import product
 from typing import Any
@@ -15,8 +16,8 @@ import numpy as np
 import pandas as pd
 
 from studies.bench.cli import ROOT
-from studies.bench.store import Output, Row
-from studies.bench.study import Study
+from studies.bench.store import Row
+from studies.bench.study import Study, kept_rows
 from studies.symbolic_size.models import MODELS, REPEATS
 from twoloop import solve_dae
 from twoloop.mechanisms import Problem
@@ -70,18 +71,16 @@ def compared(name: str) -> Row:
     return row
 
 
-def make(output: Output) -> pd.DataFrame:
-    """All rows."""
-    quick = output.call.quick
+def rows_of(quick: bool) -> Iterator[tuple[str, Callable[[], Row]]]:
+    """Keys of chains and twins, and what makes their rows."""
     sizes = product(QUICK_SIZES if quick else SIZES, ("positions", "angles"), (False,) if quick else (False, True))
-    names = list(MODELS)[: QUICK_MODELS if quick else None]
-    with output.kept() as kept:
-        rows = [kept.made(str((which, n, tangents)), partial(made, which, n, tangents)) for n, which, tangents in sizes]
-        return pd.DataFrame(rows + [kept.made(name, partial(compared, name)) for name in names])
+    for n, which, tangents in sizes:
+        yield str((which, n, tangents)), partial(made, which, n, tangents)
+    for name in list(MODELS)[: QUICK_MODELS if quick else None]:
+        yield name, partial(compared, name)
 
 
 def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
-    """What the report says."""
     sizes, twins = rows[rows["group"] == "size"], rows[rows["group"] == "twin"]
     done = sizes[sizes["status"] == "REACHED_END"]
     ratios = twins["twin_us"] / twins["hand_us"]
@@ -98,5 +97,4 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     }
 
 
-STUDY = Study("symbolic_size", __doc__, make, findings_of)
-main = STUDY.main
+STUDY = Study("symbolic_size", __doc__, kept_rows(rows_of), findings_of)

@@ -185,7 +185,6 @@ def counts(rows: pd.DataFrame) -> str:
 
 
 def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
-    """What the report says, from the medians."""
     first = rows[rows["problem"] == rows["problem"].iloc[0]]
     irk, newmark = (machine(first, group, ERR_IN, ERR_IN) for group in FAMILIES)
     if irk is None or newmark is None:
@@ -302,4 +301,3 @@ def tables_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, str]:
 
 
 STUDY = Study("table3", __doc__, make, findings_of, figures_of, tables_of, medians=True)
-main = STUDY.main

@@ -107,7 +107,6 @@ def modelled(made: Sequence[Callable[[], Problem]], quick: bool) -> Iterator[Run
 
 
 def make(output: Output) -> pd.DataFrame:
-    """Make all rows, those kept from an unfinished run aside."""
     todo, warm = runs(output.call.quick), set[tuple[Any, ...]]()
 
     def made(run: Run) -> Row:
@@ -194,7 +193,6 @@ def short_of_reach(rows: pd.DataFrame) -> list[dict[str, Any]]:
 
 
 def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
-    """What the report says."""
     judged, steps = rows[rows["group"] == JUDGED], rows[rows["group"] == deceived.DECEIVED]
     models = rows[rows["group"] == MODELLED]
     rows = rows[~rows["group"].isin(APART)]
@@ -297,4 +295,3 @@ def _short(row: pd.Series) -> str:
 
 
 STUDY = Study("validation", __doc__, make, findings_of, figures_of)
-main = STUDY.main

@@ -54,7 +54,6 @@ def replaced(rows: pd.DataFrame, part: Part, new: pd.DataFrame) -> pd.DataFrame:
 
 
 def main(words: Sequence[str] | None = None) -> None:
-    """Measure parts again, one after another."""
     names, known = list(sys.argv[1:] if words is None else words), parts()
     unknown = [name for name in names if name not in known]
     if unknown or not names:

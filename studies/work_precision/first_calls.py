@@ -38,13 +38,9 @@ from twoloop import Result, mechanisms
 
 GROUP = "first call"
 BUILDING = (*COMPILED, HEYOKA, CVODE_C, IDA_C, DIFFRAX, "IDAS, CasADi")  # for whom code is built
-MECHANISMS = {  # and how each is made
-    "four-bar": "four_bar",
-    "SUNDIALS slider-crank": "sundials_slider_crank",
-    "Andrews' squeezing mechanism": "andrews",
-    "spatial four-bar": "spatial_four_bar",
-    "heavy top": "heavy_top",
-}
+MECHANISMS = {"four-bar": "four_bar", "SUNDIALS slider-crank": "sundials_slider_crank"}  # and how each is made
+MECHANISMS |= {"Andrews' squeezing mechanism": "andrews", "spatial four-bar": "spatial_four_bar"}
+MECHANISMS |= {"heavy top": "heavy_top"}
 QUICK = (DEFAULT, "auto, compiled")
 TOLERANCE = ERROR = 1e-8  # of the calls in processes of their own; of the calls that are laid side by side, m or rad
 TIMES = ("first_call_s", "call_s", "call_q1", "call_q3")

@@ -42,8 +42,7 @@ def verdicts(rows: pd.DataFrame, stamp: str, known: Standings = ()) -> pd.DataFr
     """Who is ahead by the time of the call and by that inside; `rows`: of all runs; `known`: the first, if it is."""
     commit = re.search(r"commit (\w+)", stamp)
     rows = rows[rows["group"] == rivals.GROUP]
-    made_on = rows.groupby("case")["processor"].first()  # a mechanism is measured on one, at one commit
-    made_at = rows.groupby("case")["commit"].first() if "commit" in rows else pd.Series(dtype=str)
+    made = rows.reindex(columns=["case", "processor", "commit"]).groupby("case").first().fillna("")  # one each
     lines = []
     for time, column in TIMES.items():
         if column not in rows:
@@ -52,9 +51,8 @@ def verdicts(rows: pd.DataFrame, stamp: str, known: Standings = ()) -> pd.DataFr
         for case, error, standing in found:
             for who, at in standing.items():
                 if who != headline.GIVEN and at["verdict"] in ("ahead", "behind", "undecided"):
-                    at_commit = made_at.get(case) or (commit[1] if commit else "")
-                    line = {"processor": made_on[case], "commit": at_commit}
-                    line |= {"time": time, "case": case, "error": error}
+                    line = {"processor": made.loc[case, "processor"], "time": time, "case": case, "error": error}
+                    line["commit"] = made.loc[case, "commit"] or (commit[1] if commit else "")
                     lines.append({**line, "who": who, "ratio": float(f"{at['ratio']:.3g}"), "verdict": at["verdict"]})
     return pd.DataFrame(lines, columns=["processor", "commit", "time", *PLACE, "ratio", "verdict"])
 
@@ -116,7 +114,6 @@ def rows_of(folder: Path) -> tuple[pd.DataFrame, str]:
 
 
 def main(words: Sequence[str] | None = None) -> None:
-    """Add the rows of another machine."""
     (folder,) = sys.argv[1:] if words is None else words
     path = REPORTS / FILE
     added(path, verdicts(*rows_of(Path(folder)))).to_csv(path, index=False)

@@ -76,12 +76,10 @@ def findings_of(rows: pd.DataFrame, known: Sequence[Case]) -> dict[str, Any]:
 
 
 def known_cases(quick: bool) -> list[Case]:
-    """The cases at length."""
     return [replace(case, time_limit=TIME_LIMIT) for case in cases.load(quick) if not quick or case.name in QUICK_CASES]
 
 
 def make(output: Output) -> pd.DataFrame:
-    """Make all rows."""
     quick = output.call.quick
     with output.kept() as kept:
         made = [at_length(known_cases(quick), quick, kept)]
@@ -116,7 +114,6 @@ def on_the_same_processor(rows: pd.DataFrame, others: pd.DataFrame) -> pd.DataFr
 
 
 def report(output: Output, rows: pd.DataFrame, line: str) -> dict[str, Any]:
-    """Write findings, figures and report; the findings."""
     everywhere = tables.medians(part(rows, rivals.GROUP))
     known, medians = known_cases(output.call.quick), tables.medians(part(rows).reindex(columns=rows.columns))
     found = rivals.findings_of(everywhere)
@@ -187,7 +184,6 @@ def asked(rows: pd.DataFrame) -> dict[str, Any]:
 
 
 def draw(output: Output, findings: dict[str, Any], everywhere: pd.DataFrame, medians: pd.DataFrame) -> None:
-    """Write all figures."""
     for case in findings["cases"]:
         own = medians[medians["case"] == case["name"]]
         lines = figures.lines_of(own, ERRORS)
@@ -198,5 +194,4 @@ def draw(output: Output, findings: dict[str, Any], everywhere: pd.DataFrame, med
 
 
 def main(words: Sequence[str] | None = None) -> None:
-    """Run the study and write its report."""
     study.run_rows("work_precision", __doc__, words, make, report)
