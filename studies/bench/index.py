@@ -52,15 +52,13 @@ def findings(folder: Path) -> dict[str, dict[str, Any]]:
     Raises StudyError if a file is damaged.
     """
     found = {}
-    for name in STUDIES:
-        path = folder / f"{name}.json"
-        if path.is_file():
-            try:
-                told = json.loads(path.read_text())
-            except ValueError as error:
-                raise StudyError(f"{path} cannot be read ({error}); run python -m studies.{name} again") from None
-            if name not in TIMED or told.get("timed") == WHOLE_CALL:  # others are to be run again
-                found[name] = told
+    for path in (path for name in STUDIES if (path := folder / f"{name}.json").is_file()):
+        try:
+            told = json.loads(path.read_text())
+        except ValueError as error:
+            raise StudyError(f"{path} cannot be read ({error}); run python -m studies.{path.stem} again") from None
+        if path.stem not in TIMED or told.get("timed") == WHOLE_CALL:  # others are to be run again
+            found[path.stem] = told
     return found
 
 

@@ -107,6 +107,15 @@ def _paper(make: Callable[[float], Method], case: Case, err_out: float, repeat: 
     return _preset(make(err_out), case, PAPER_TOL, repeat)
 
 
+def _canonical(case: Case, step: float, repeat: int) -> Result:
+    method = RungeKutta(gauss(3), variables="momenta", partition="symmetric")
+    return solve_dae(*case.start, method=method, step_size=step, time_limit=case.time_limit)
+
+
+def _collocation(case: Case, step: float, repeat: int) -> Result:
+    return solve_collocation(*case.start, round(case.t_end / step), time_limit=case.time_limit)
+
+
 def at_instants(solve: Callable[..., Result], case: Case, **options: Any) -> Result:
     """A run of a solver that tells its states at the common instants."""
     return solve(*case.start, t_eval=np.append(0.0, case.instants), time_limit=case.time_limit, **options)
@@ -185,9 +194,7 @@ def _all() -> Iterator[Solver]:
         more: dict[str, Any] = {"builds_each": True, "traces": True} if preset in COMPILED else {}
         used = _chosen if COMPILED.get(preset, preset) == DEFAULT else None
         yield _solver(preset, "two-loop", "compiled", "tol", run, used=used, **more)
-    method = RungeKutta(gauss(3), variables="momenta", partition="symmetric")
-    in_steps = lambda case, h, _: solve_dae(*case.start, method, step_size=h, time_limit=case.time_limit)  # noqa: E731
-    yield _solver(CANONICAL, "two-loop", "compiled", "h", in_steps)
+    yield _solver(CANONICAL, "two-loop", "compiled", "h", _canonical)
     for line in lines():
         told = {each: getattr(line, each) for each in SAME_IN_LINES}
         run = partial(_by_line, line)
@@ -196,8 +203,7 @@ def _all() -> Iterator[Solver]:
         more = {"traces": True, "builds_each": kind == "heyoka"}
         yield _solver(name, MINIMAL_FAMILY, "compiled", "tol", partial(_minimal, kind), **more)
     more = {"builds_each": True, "builds_span": True, "traces": True, "keeps": False}
-    run = lambda case, h, _: solve_collocation(*case.start, round(case.t_end / h), time_limit=case.time_limit)  # noqa: E731
-    yield _solver(COLLOCATION, "CasADi", "compiled", "h", run, **more)
+    yield _solver(COLLOCATION, "CasADi", "compiled", "h", _collocation, **more)
     own: dict[str, Any] = {"own_accelerations": True}
     model = own | {"traces": True}
     for solver in EXUDYN:

@@ -153,7 +153,8 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     chosen = ((SUN,), (GAUSS,), (SUN, MOMENTA), (RADAU,))
     sun, gauss, canonical, radau = (told(pick(rows, ONE, *which)) for which in chosen)
     both = {"one": ONE, "switching": SWITCHING}
-    found = {"long": long_of(rows[rows["case"] == SWITCHING]), "sun": sun, "gauss": gauss, "radau": radau}
+    found: dict[str, Any] = {"long": long_of(rows[rows["case"] == SWITCHING]), "sun": sun, "gauss": gauss}
+    found["radau"] = radau
     found["radau_over_sun"] = abs(radau["drift"] / sun["drift"]) if sun["drifts"] and radau["drifts"] else None
     found |= {"canonical": canonical, "sun_over_gauss": abs(sun["drift"]) / gauss["bound"]}
     found["sun_over_canonical"] = abs(sun["drift"]) / canonical["bound"]

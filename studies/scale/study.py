@@ -83,11 +83,10 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
         least, step = min(of_chain["over_exudyn"], default=0.0), of_chain["step"]
         of_chain["by_order"] = bool(step) and (step["exudyn"] / step["ours"]) ** 2 < least
         found["chains"].append(of_chain)
-    held = rows[rows["group"].eq(MEMORY)]
-    held = held[held["memory_mb"].notna()] if len(held) else held
-    found["memory"] = {int(row["n"]): float(row["memory_mb"]) for _, row in held.iterrows()}
-    found["trees"] = [_beside_engines(line, rows[rows["group"] == TREE]) for line in found["kinds"]]
-    found["trees"] = [line for line in found["trees"] if line["engines"]]
+    held = rows[rows["group"].eq(MEMORY)].reindex(columns=["n", "memory_mb"]).dropna()
+    found["memory"] = {int(n): float(mb) for n, mb in held.itertuples(index=False)}
+    beside = (_beside_engines(line, rows[rows["group"] == TREE]) for line in found["kinds"])
+    found["trees"] = [line for line in beside if line["engines"]]
     grown = rows[rows["group"] == UNTIL]
     found["until"] = [_until(str(solver), own) for solver, own in grown.groupby("solver", sort=False)]
     found |= {"budget": BUDGET, "sparse_ida": SPARSE_IDA, "tolerance": TOLERANCE, "until_end": UNTIL_END, "bend": BEND}

@@ -110,7 +110,8 @@ def make(output: Output) -> pd.DataFrame:
         return row_of(run, repeat, highest, built)
 
     quick = output.call.quick
-    todo, errors = runs(*four_bar.cases(quick), quick), () if quick else TARGETS
+    first, second = four_bar.cases(quick)
+    todo, errors = runs(first, second, quick), () if quick else TARGETS
     compared = [run for run in todo if run.group == "comparison"]
     with output.kept() as kept:
         rows = collect([run for run in todo if run.group != "comparison"], kept, highest)
