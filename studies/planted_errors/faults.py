@@ -109,24 +109,9 @@ def in_mechanism() -> Iterator[Fault]:
     )
 
 
-@callback("mass")
-def unit(t, q, p, M):  # type: ignore[no-untyped-def]
-    M[0, 0] = M[1, 1] = 1.0
-
-
 @callback("force")
 def frozen(t, q, v, p, Q):  # type: ignore[no-untyped-def]
     Q[1] = -weight
-
-
-@callback("constraint")
-def circle(t, q, p, C):  # type: ignore[no-untyped-def]
-    C[0] = 0.5 * (q[0] * q[0] + q[1] * q[1] - 1.0)
-
-
-@callback("jacobian")
-def radius(t, q, p, Cq):  # type: ignore[no-untyped-def]
-    Cq[0, 0], Cq[0, 1] = q[0], q[1]
 
 
 def pendulum_in_python(**changed: Any) -> ConstrainedSystem:
@@ -158,12 +143,11 @@ def in_trace() -> Iterator[Fault]:
 
         return force
 
-    in_numba = ConstrainedSystem(
-        n_q=2, n_c=1, mass=unit, force=frozen, constraint=circle, jacobian=radius, name="pendulum"
-    )
+    sound = mechanisms.pendulum()
+    given: dict[str, Any] = sound.system.given | {"force": frozen, "parameters": sound.system.parameters}
+    in_numba = ConstrainedSystem(n_q=2, n_c=1, name="pendulum", **given)
     lopsided = pendulum_in_python(mass=lambda t, q: np.array([[1.0, 0.1 * q[1]], [0.0, 1.0]]))
     changed = partial(patch, "studies.planted_errors.faults.weight", OTHER)
-    sound = mechanisms.pendulum()
     for name, system, plant in (
         ("a branch that tracing loses behind try/except", pendulum_in_python(force=swallowed), nullcontext),
         ("a branch on the type of t", pendulum_in_python(force=by_type), nullcontext),

@@ -42,7 +42,7 @@ def verdicts(rows: pd.DataFrame, stamp: str, known: Standings = ()) -> pd.DataFr
     """Who is ahead by the time of the call and by that inside; `rows`: of all runs; `known`: the first, if it is."""
     commit = re.search(r"commit (\w+)", stamp)
     rows = rows[rows["group"] == rivals.GROUP]
-    made = rows.reindex(columns=["case", "processor", "commit"]).groupby("case").first().fillna("")  # one each
+    made = rows.reindex(columns=["case", "processor", "commit"]).groupby("case").first()  # on one, at one commit
     lines = []
     for time, column in TIMES.items():
         if column not in rows:
@@ -52,7 +52,8 @@ def verdicts(rows: pd.DataFrame, stamp: str, known: Standings = ()) -> pd.DataFr
             for who, at in standing.items():
                 if who != headline.GIVEN and at["verdict"] in ("ahead", "behind", "undecided"):
                     line = {"processor": made.loc[case, "processor"], "time": time, "case": case, "error": error}
-                    line["commit"] = made.loc[case, "commit"] or (commit[1] if commit else "")
+                    at_commit = made.loc[case, "commit"]
+                    line["commit"] = at_commit if isinstance(at_commit, str) else commit[1] if commit else ""
                     lines.append({**line, "who": who, "ratio": float(f"{at['ratio']:.3g}"), "verdict": at["verdict"]})
     return pd.DataFrame(lines, columns=["processor", "commit", "time", *PLACE, "ratio", "verdict"])
 
