@@ -166,7 +166,8 @@ def costs_at(rows: pd.DataFrame | Mapping[str, Runs], target: float, doubt: bool
 def nearly_there(rows: pd.DataFrame, target: float) -> pd.DataFrame:
     """The runs of one case that miss an error by a factor of less than NEARLY, on the motion of the reference."""
     errors = errors_of(rows)
-    return rows[(errors > target) & (errors <= NEARLY * target) & ~astray(rows) & rows["call_s"].notna()]
+    near = (errors > target) & (errors <= NEARLY * target)
+    return rows[near & ~astray(rows).to_numpy() & ~np.isnan(rows["call_s"].to_numpy(float))] if near.any() else rows[:0]
 
 
 def near_misses(rows: pd.DataFrame, target: float) -> Costs:
