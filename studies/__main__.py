@@ -1,12 +1,11 @@
 """List the studies (`python -m studies`), run one (`python -m studies table3`) or all (`python -m studies all`)."""
 
-import importlib
 import sys
 import traceback
 
 from studies.bench import cli
 from studies.bench.cli import CLONE, REPORTS, ROOT
-from studies.bench.index import STUDIES, put_in_readme
+from studies.bench.index import STUDIES, module_of, put_in_readme, run_study
 
 USAGE = "usage: python -m studies [NAME | all | readme | compare FILE.py:FUNCTION] [--quick] [--out DIR] [--redraw]"
 
@@ -18,15 +17,14 @@ def main() -> None:
     elif name == "readme":  # its generated block alone, from the findings of all studies
         cli.main(lambda words: put_in_readme(REPORTS, ROOT / "README.md"), words)
     elif name in (*STUDIES, "compare"):
-        importlib.import_module(f"studies.{name}").main(words)
+        run_study(name, words)
     elif name and name not in ("-h", "--help"):
         sys.exit(f"{USAGE}; given {name}, which is none of {', '.join(STUDIES)}")
     else:
         if name:
             print(USAGE)
         for study in STUDIES:
-            module = importlib.import_module(f"studies.{study}")
-            print(f"python -m studies.{study:10s} {(module.__doc__ or '').splitlines()[0]}")
+            print(f"python -m studies.{study:10s} {(module_of(study).__doc__ or '').splitlines()[0]}")
 
 
 def run_all(words: list[str]) -> None:
@@ -35,7 +33,7 @@ def run_all(words: list[str]) -> None:
     for name in STUDIES:
         print(f"--- {name}", flush=True)
         try:
-            importlib.import_module(f"studies.{name}").main(words)
+            run_study(name, words)
         except SystemExit as end:
             if not isinstance(end.code, str):  # Ctrl-C, --help, wrong options
                 raise

@@ -119,15 +119,16 @@ def ratios(rows: pd.DataFrame, rival: str, what: str) -> list[float]:
     return [ratio for ratio in found if np.isfinite(ratio)]
 
 
-def frozen_ratios(rows: pd.DataFrame, what: str = "n_evaluations") -> list[float]:
-    """Least costs of the best runs with dependents frozen over those of the paper's runs that are as good or better."""
+def frozen_ratios(rows: pd.DataFrame) -> list[float]:
+    """Evaluations of the best runs with dependents frozen over the least of the paper's runs as good or better."""
     found = []
     controlled = where(rows, group="controlled").dropna(subset="error_q")
     for _, both in controlled.groupby(["case", "tableau"], sort=False):
         one, other = where(both, solver=FROZEN), where(both, solver=PAPER)
         if len(one) and (other["error_q"] <= one["error_q"].min()).any():
             finest = one.loc[one["error_q"].astype(float).idxmin()]
-            found.append(float(finest[what] / other[other["error_q"] <= finest["error_q"]][what].min()))
+            good = other[other["error_q"] <= finest["error_q"]]
+            found.append(float(finest["n_evaluations"] / good["n_evaluations"].min()))
     return found
 
 
@@ -155,7 +156,6 @@ def verdict(span: list[float] | None) -> str:
 
 
 def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
-    """What the report says, from the medians."""
     if not {*VARIANTS} <= set(rows["solver"]) or "tableau" not in rows:
         raise StudyError("the rows lack variants; make them again by python -m studies.ablation")
     controlled = where(rows, group="controlled")
@@ -173,30 +173,23 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     drawn = {variant: _at_drawn(rows, variant) for variant in VARIANTS}
     drift, nothing = drawn[UNPROJECTED], {"violation_q": np.nan, "energy": np.nan}
     costs = [costs[FROZEN]["evaluations"] for costs in (each["costs"] for each in cases.values())]
-    return {
-        "cases": [{"name": name, "t_end": float(where(rows, case=name)["t_end"].iloc[0])} for name in cases],
-        "tableaux": tableaux,
-        "against": against,
-        "margin": MARGIN,
-        "n_compared": len(ratios(rows, PROJECTED, "n_evaluations")),
-        "frozen": {"at_least": _span(frozen_ratios(rows)), "best": frozen.to_dict()},
-        "orders": orders,
-        "frozen_order_one": all(value < ONE for value in orders[FROZEN].values()),
-        "kept": kept,
-        # a step that does not end in a stage is projected in the stabilised form
-        "projected_at_end": [name for name in at_end if name in tableaux],
-        "stabilised_alone": {name: float(x) for name, x in stabilised.items() if name not in at_end},
-        "kept_as_well": kept[PROJECTED] <= max(KEPT, kept[PAPER]),
-        # in the first and in the last tenth of the run that the figure shows
-        "drift": None if drift is None else [float(drift["violation_early"]), float(drift["violation_late"])],
-        "grows": GROWS,
-        **{what: {name: each[what] for name, each in cases.items()} for what in ("longest", "median_h", "costs")},
-        "tolerance": float(SAME_TOLERANCE),
-        "told": {name: list(TOLD[name]) for name in cases},
-        "drawn": {name: nothing if row is None else row[[*nothing]].abs().to_dict() for name, row in drawn.items()},
-        "drawn_step": _drawn(where(rows, group="fixed")),
-        "frozen_reaches_none": not np.isfinite(np.concatenate(costs)).any(),
-    }
+    t_end = rows.groupby("case", sort=False)["t_end"].first().astype(float)
+    found: dict[str, Any] = {"cases": [{"name": name, "t_end": t_end[name]} for name in cases], "tableaux": tableaux}
+    found |= {"against": against, "margin": MARGIN, "n_compared": len(ratios(rows, PROJECTED, "n_evaluations"))}
+    found |= {"frozen": {"at_least": _span(frozen_ratios(rows)), "best": frozen.to_dict()}, "orders": orders}
+    found |= {"frozen_order_one": all(value < ONE for value in orders[FROZEN].values()), "kept": kept}
+    # a step that does not end in a stage is projected in the stabilised form
+    found["projected_at_end"] = [name for name in at_end if name in tableaux]
+    found["stabilised_alone"] = {name: float(x) for name, x in stabilised.items() if name not in at_end}
+    found["kept_as_well"] = kept[PROJECTED] <= max(KEPT, kept[PAPER])
+    # in the first and in the last tenth of the run that the figure shows
+    found["drift"] = None if drift is None else [float(drift[f"violation_{part}"]) for part in ("early", "late")]
+    found["grows"] = GROWS
+    found |= {what: {name: each[what] for name, each in cases.items()} for what in ("longest", "median_h", "costs")}
+    found |= {"tolerance": float(SAME_TOLERANCE), "told": {name: list(TOLD[name]) for name in cases}}
+    found["drawn"] = {key: nothing if row is None else row[[*nothing]].abs().to_dict() for key, row in drawn.items()}
+    found["drawn_step"] = _drawn(where(rows, group="fixed"))
+    return found | {"frozen_reaches_none": not np.isfinite(np.concatenate(costs)).any()}
 
 
 def of_case(name: str, rows: pd.DataFrame) -> dict[str, Any]:
@@ -268,7 +261,6 @@ def _look(variant: str) -> dict[str, Any]:
 
 
 STUDY = Study("ablation", __doc__, rows_of(runs, measure), findings_of, figures_of, medians=True, curves=True)
-main = STUDY.main
 
 if __name__ == "__main__":
-    main()
+    STUDY.main()

@@ -92,22 +92,13 @@ def compared(measured: Mapping[str, Measured], sides: tuple[str, str]) -> Iterat
         times = [median(each["cpu"] for each in runs) for runs in both]
         ratio = times[1] / times[0] if times[0] else float("nan")
         verdict = "=" if abs(ratio - 1.0) < NOISE else number(ratio)
-        yield [*cells, *(number(1e6 * value) for value in times), verdict, _instructions(both), _counts(both)]
-
-
-def _instructions(both: Sequence[list[dict[str, Any]]]) -> str:
-    counted = [[each["instructions"] for each in runs if each["instructions"] is not None] for runs in both]
-    if not all(counted):
-        return "not counted here"
-    old, new = (median(values) for values in counted)
-    return f"{number(old, 4)} → {number(new, 4)}"
-
-
-def _counts(both: Sequence[list[dict[str, Any]]]) -> str:
-    old, new = (runs[-1]["counts"] for runs in both)
-    if old == new:
-        return ", ".join(f"{value} {what}" for what, value in new.items()) or "–"
-    return ", ".join(f"{old.get(what, '–')} → {value} {what}" for what, value in new.items())
+        counted = [[each["instructions"] for each in runs if each["instructions"] is not None] for runs in both]
+        instructions = " → ".join(number(median(values), 4) for values in counted if all(counted))
+        old, new = (runs[-1]["counts"] for runs in both)
+        before = {what: "" if old == new else f"{old.get(what, '–')} → " for what in new}
+        counts = ", ".join(f"{before[what]}{value} {what}" for what, value in new.items())
+        cells += [*(number(1e6 * value) for value in times), verdict]
+        yield [*cells, instructions or "not counted here", counts or "–"]
 
 
 @contextmanager
@@ -146,7 +137,6 @@ def _work(words: Sequence[str] | None) -> None:
 
 
 def main(words: Sequence[str] | None = None) -> None:
-    """Compare two commits."""
     cli.main(_work, words)
 
 

@@ -14,11 +14,10 @@ import pandas as pd
 from studies.bench import cli, figures, tables
 from studies.bench.cli import StudyError
 from studies.bench.collector import FILE, REPEATS, Case, Run, Solver, collect
-from studies.bench.mechanism_names import mechanism_of
 from studies.bench.outsider import N_TIMES, Outsider
 from studies.bench.reference_motion import ReferenceMotion, check_published, make_reference
 from studies.bench.render import number, power, render, table
-from studies.bench.row_files import in_format, rows_of_file, versions
+from studies.bench.row_files import in_format, mechanism_of, rows_of_file, versions
 from studies.bench.solvers import CATALOGUE, COMPARED
 from studies.bench.store import Output, Row
 from twoloop import Result
@@ -101,7 +100,6 @@ def rows_from(files: Iterable[str], mechanism: str, t_end: float) -> list[Row]:
 
 
 def findings_of(rows: pd.DataFrame, case: Case, errors: Sequence[float]) -> dict[str, Any]:
-    """What the report says, from the medians."""
     floor = float(rows["floor"].iloc[0])
     found: dict[str, Any] = {"name": case.name, "t_end": case.t_end, "floor": floor, "n_instants": case.n_instants}
     found |= {"python": case.problem.system.called_in_python, "unresolved": [e for e in errors if e < floor]}
@@ -172,17 +170,13 @@ def _work(words: Sequence[str] | None) -> None:
     unknown = [name for name in given.solvers or () if name not in CATALOGUE]
     if unknown:
         raise StudyError(f"no solver is called {unknown[0]!r}; there are: {'; '.join(CATALOGUE)}")
-    if any(not error > 0.0 for error in given.errors):
-        raise StudyError("--errors must be positive")
-    if not given.reference_limit > 0.0:
-        raise StudyError(f"--reference-limit must be positive; given {given.reference_limit:g}")
-    if not given.time_limit > 0.0:
-        raise StudyError(f"--time-limit must be positive; given {given.time_limit:g}")
     given.out = given.out or Path("compare")
     problem = load_problem(given.where)
     t_end = problem.t_span[1] if given.t_end is None else given.t_end
-    if not t_end > 0.0:
-        raise StudyError(f"--t-end must be positive; given {t_end:g}")
+    positive = {"errors": given.errors, "reference-limit": [given.reference_limit], "time-limit": [given.time_limit]}
+    for name, values in (positive | {"t-end": [t_end]}).items():
+        if wrong := [value for value in values if not value > 0.0]:
+            raise StudyError(f"--{name} must be positive; given {wrong[0]:g}")
     known = partial(known_of, problem, t_end, given.reference_limit)
     limits: dict[str, Any] = {"time_limit": given.time_limit, "timed": 0.004 if given.quick else 0.02}
     case = Case(problem.name, problem, t_end, known, note=problem.note, **limits)
@@ -219,7 +213,6 @@ def _work(words: Sequence[str] | None) -> None:
 
 
 def main(words: Sequence[str] | None = None) -> None:
-    """Compare solvers on a mechanism of the user's own."""
     cli.main(_work, words)
 
 

@@ -15,8 +15,8 @@ from studies.bench.cli import StudyError
 from studies.bench.index import write_index
 from studies.bench.render import TEMPLATES
 from studies.bench.row_files import as_runs, rows_of_file
-from studies.bench.runs_by_error import SETTINGS
 from studies.bench.store import Output, plain, read_rows
+from studies.bench.tables import SETTINGS
 
 FILE = "compare.html"
 SOURCES = ("work_precision", "validation")
@@ -80,14 +80,11 @@ def page_data(rows: pd.DataFrame, stamps: dict[str, str]) -> dict[str, Any]:
     places = {each["name"]: k for k, each in enumerate(mechanisms)}
     columns = [*COSTS, *MEASURES]
     runs = []
-    for _, row in rows.iterrows():
-        values = [
-            float(f"{abs(row[name]):.{DIGITS}g}") if name in row and pd.notna(row[name]) else None for name in columns
-        ]
-        done = row["status"] == "REACHED_END"
-        said = "" if done else f"{row['status']}: {str(row['message']).split('. ')[0]}"
-        if done and row.get("astray") in (True, "True"):
-            said = "reached the end, but lost the motion"
+    for row in rows.reindex(columns=list(dict.fromkeys([*rows, *columns]))).to_dict("records"):
+        values = [None if pd.isna(row[name]) else float(f"{abs(row[name]):.{DIGITS}g}") for name in columns]
+        said = "reached the end, but lost the motion" if row.get("astray") in (True, "True") else ""
+        if row["status"] != "REACHED_END":
+            said = f"{row['status']}: {str(row['message']).split('. ')[0]}"
         mechanism = places[f"{row['mechanism']} ({row['study']})"]
         runs.append([mechanism, numbers[row["solver"]], tables.setting(row), row["called_from"], *values, said])
     found: dict[str, Any] = {"opens": OPENS if OPENS in places else mechanisms[0]["name"], "always": ALWAYS}
@@ -136,7 +133,6 @@ def _work(words: Sequence[str] | None) -> None:
 
 
 def main(words: Sequence[str] | None = None) -> None:
-    """Write compare.html from the rows in the folder."""
     cli.main(_work, words)
 
 

@@ -178,7 +178,6 @@ def with_geometry(n: int) -> dict[str, Any]:
 
 
 def make(output: Output) -> pd.DataFrame:
-    """All rows."""
     quick, rows = output.call.quick, []
     n = N_QUICK if quick else N_RUNS
     sets = [lambda: linkages(n), *(lambda name=name, t=t: of_starts(name, n, t) for name, t in STARTS.items())]
@@ -211,27 +210,20 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
         n_runs, t_end = (own_rows[name].iloc[0] for name in ("n_runs", "t_end"))
         found["cases"].append({"case": case, "n_runs": int(n_runs), "t_end": float(t_end), "at": at})
         found["repeats"] = int(medians["repeats"].max())
-    every = [line["ratio"] for each in found["cases"] for line in each["at"] if line["ratio"] is not None]
+    lines = [line | {"case": each["case"]} for each in found["cases"] for line in each["at"]]
+    every = [line["ratio"] for line in lines if line["ratio"] is not None]
     found["ratios"] = [min(every), max(every)] if every else None
-    found["rivals_ahead"] = [
-        {"case": each["case"], "error": line["error"], "ratio": line["ratio"], "way": _best_rival(line["run_s"])}
-        for each in found["cases"]
-        for line in each["at"]
-        if line["verdict"] == "behind"
-    ]
+    found["rivals_ahead"] = []
+    for line in (line for line in lines if line["verdict"] == "behind"):
+        best = min(set(line["run_s"]) - set(OWN), key=line["run_s"].__getitem__)
+        found["rivals_ahead"].append({key: line[key] for key in ("case", "error", "ratio")} | {"way": best})
     found["n_single"] = N_SINGLE
-    found["verdicts"] = {
-        verdict: sum(line["verdict"] == verdict for each in found["cases"] for line in each["at"])
-        for verdict in ("ahead", "behind", "undecided", "alone", "missed", "none")
-    }
+    names = ("ahead", "behind", "undecided", "alone", "missed", "none")
+    found["verdicts"] = {name: sum(line["verdict"] == name for line in lines) for name in names}
     geometry = rows[rows["group"] == GEOMETRY]
     found["refused"] = rows.reindex(columns=["way", "case", "message"]).dropna().to_dict("records")
     found["geometry"] = geometry[["n_runs", "wall", "cpu", "n_failed", "n_singly"]].to_dict("records")
     return found
-
-
-def _best_rival(run_s: dict[str, float]) -> str:
-    return min((name for name in run_s if name not in OWN), key=run_s.__getitem__)
 
 
 def figures_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Figure]:
@@ -249,13 +241,11 @@ def figures_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Figure]:
         axes.set(xscale="log", yscale="log", xlabel="largest error of q at the end (m, rad)", title=case)
         axes.grid(alpha=0.3)
     panels[0][0].set_ylabel("CPU time of a run (µs)")
-    shown = {label: line for axes in panels[0] for line, label in zip(*axes.get_legend_handles_labels(), strict=True)}
-    figure.legend(shown.values(), shown, loc="outside lower center", ncols=len(shown), fontsize=9)
+    figures.legend(figure, panels[0], below=len(WAYS))
     return {"ensembles": figure}
 
 
 STUDY = Study("ensembles", __doc__, make, findings_of, figures_of)
-main = STUDY.main
 
 if __name__ == "__main__":
-    main()
+    STUDY.main()

@@ -123,7 +123,6 @@ def _cells(rows: pd.DataFrame, order: int) -> list[str]:
 
 
 def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
-    """What the report says, from the medians."""
     procedures = []
     for run in (find(rows, IRK), find(rows, NEWMARK)):
         if run is None or pd.isna(run["error_y3"]):
@@ -141,15 +140,13 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     made |= {"agree": all(one["error_y3_short"] <= VISIBLE for one in procedures)}
     made |= {"agree_long": all(one["error_y3"] <= VISIBLE for one in procedures), "gear": _stand_in(rows)}
     made |= {"stand_in": [[str(n), *_cells(rows, n)] for n in GEAR_ORDERS if find(rows, gear(n), COARSE) is not None]}
-    made |= {
-        "listed": [{name: row[name] for name in told} | {"setting": setting(row)} for row in listed if row is not None]
-    }
+    known = [row for row in listed if row is not None]
+    made |= {"listed": [{name: row[name] for name in told} | {"setting": setting(row)} for row in known]}
     made |= {"canonical_growth": grown.get(CANONICAL)}
     made |= {"exudyn_growth": [exudyn.min(), exudyn.max()] if len(exudyn) else None}
     made |= {"others_growth": {str(bool(keeps)): [own.min(), own.max()] for keeps, own in others}}
-    return made | {
-        "growth": [grown.drop(CANONICAL, errors="ignore").min(), grown.drop(CANONICAL, errors="ignore").max()]
-    }
+    grown = grown.drop(CANONICAL, errors="ignore")
+    return made | {"growth": [grown.min(), grown.max()]}
 
 
 def _draw(panel: Axes, rows: Iterable[pd.Series | None], curve: str, t: Array, **more: Any) -> None:
@@ -210,7 +207,6 @@ def figures_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Figure]:
 
 
 STUDY = Study("motion", __doc__, rows_of(runs, measure), findings_of, figures_of, medians=True, curves=True)
-main = STUDY.main
 
 if __name__ == "__main__":
-    main()
+    STUDY.main()

@@ -13,7 +13,7 @@ from studies.bench import figures
 from studies.bench.cases import four_bar
 from studies.bench.cases.four_bar import Y3
 from studies.bench.cli import StudyError
-from studies.bench.collector import Case, Run, Solver
+from studies.bench.collector import Run, Solver
 from studies.bench.solvers import CATALOGUE, GIVEN, IRK, NEWMARK, PRESETS, QUARTER
 from studies.bench.store import Array
 from studies.bench.study import Study, rows_of
@@ -29,17 +29,14 @@ CURVE = 1200  # steps that a figure draws one by one; of more, the shortest and 
 MARKS = {"error": ("x", "error too large, shortened"), "convergence": ("v", "not converged, shortened")}
 
 
-def _ida(case: Case, tolerance: float, repeat: int) -> Result:
-    return solve_ida(*case.start, "stabilised", tolerance, tolerance)
-
-
 def runs(quick: bool) -> list[Run]:
     """The paper's procedures at its settings; the other adaptive solvers at its Atol = Rtol."""
     case = replace(four_bar.cases(quick)[0], timed=0.0)  # times are not compared here
     made = [Run(case, CATALOGUE[name], ERR_OUT, "paper", 1) for name in (IRK, NEWMARK, QUARTER)]
     made += [Run(case, CATALOGUE[name], TOL, "two-loop", 1) for name in (GIVEN, *PRESETS)]
     # the catalogue's IDA stores its states at common instants only, and not its steps
-    ida = Solver("IDA, stabilised", "SUNDIALS", "Python", True, "tol", _ida, own_accelerations=True)
+    run = lambda case, tol, _: solve_ida(*case.start, "stabilised", tol, tol)  # noqa: E731
+    ida = Solver("IDA, stabilised", "SUNDIALS", "Python", True, "tol", run, own_accelerations=True)
     others = [*([] if quick else [ida]), *(CATALOGUE[name] for name in OTHERS)]
     return made + [Run(case, solver, TOL, "others", 1) for solver in others]
 
@@ -79,7 +76,6 @@ def _curve(t: Array, h: Array) -> Array:
 
 
 def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
-    """What the report says, from the medians."""
     paper = rows[rows["group"] == "paper"].set_index("solver")
     if not set(PAPER) <= set(paper.index[paper["h_median"].notna()]):
         raise StudyError("the rows lack the paper's procedures; make them again by python -m studies.step_size")
@@ -130,7 +126,6 @@ def figures_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Figure]:
 
 
 STUDY = Study("step_size", __doc__, rows_of(runs, measure), findings_of, figures_of, medians=True, curves=True)
-main = STUDY.main
 
 if __name__ == "__main__":
-    main()
+    STUDY.main()

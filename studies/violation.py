@@ -130,14 +130,7 @@ def pair(rows: pd.DataFrame, first: str, second: str) -> dict[str, Any] | None:
     return found | {"dearer": found["call_s"][0] > tables.LEAST}
 
 
-def _told(row: pd.Series) -> dict[str, Any]:
-    """A run as a line of the table."""
-    found = {name: row[name] for name in ("solver", "called_from", "error_q", "violation_q", "violation_v")}
-    return found | {"setting": tables.setting(row), "kinds": [kind(row, level) for level in "qv"]}
-
-
 def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
-    """What the report says, from the medians."""
     line_up, loops, along = (rows[rows["group"] == group] for group in ("line-up", "loops", "tolerances"))
     ours = line_up[line_up["family"] == "two-loop"]
     irk, loose = ours[ours["solver"] == IRK], loops.set_index("err_out")["violation_q"]
@@ -166,7 +159,12 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     told |= {"both_kept": bool(loose[LOOSE] <= KEPT), "baumgarte": [of_alpha.min(), of_alpha.max()]}
     told |= {"baumgarte_n": len(of_alpha), "baumgarte_kept": int((of_alpha <= KEPT).sum()), "n_ranked": len(first)}
     told |= {"n_kept_first": sum(bool(kept[solver]) for solver in first)}
-    told |= {"listed": [_told(listed.loc[name]) for name in LISTED if name in listed.index], "targets": TARGETS}
+    columns = ["solver", "called_from", "error_q", "violation_q", "violation_v"]
+    lines = [listed.loc[name] for name in LISTED if name in listed.index]
+    told["listed"] = [
+        {**row[columns], "setting": tables.setting(row), "kinds": [kind(row, level) for level in "qv"]} for row in lines
+    ]
+    told["targets"] = TARGETS
     told |= {"cost": tables.work_precision(along, TARGETS, (*DRAWN, OWN_EXPLICIT, *STABILISED[1::3]))}
     told |= {"n_failed": int(failed.sum()), "n_failed_ours": int((failed & (rows["family"] == "two-loop")).sum())}
     return told | {"pairs": [found for names in PAIRS if (found := pair(along, *names))]}
@@ -194,7 +192,6 @@ def figures_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Figure]:
 
 
 STUDY = Study("violation", __doc__, rows_of(runs, measure), findings_of, figures_of, medians=True, curves=True)
-main = STUDY.main
 
 if __name__ == "__main__":
-    main()
+    STUDY.main()

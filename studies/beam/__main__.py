@@ -1,3 +1,3 @@
-from studies.beam import main
+from studies.beam.study import STUDY
 
-main()
+STUDY.main()

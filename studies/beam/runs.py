@@ -48,11 +48,6 @@ def without_tangent(problem: Problem) -> ConstrainedSystem:
     return ConstrainedSystem(**sizes, **f, constant_mass=True, name=problem.name)  # type: ignore[arg-type]
 
 
-def _differenced(case: Case, tol: float, repeat: int) -> Result:
-    problem = case.problem
-    return solve_dae(without_tangent(problem), (0.0, case.t_end), problem.q0, problem.v0, NEWTON, tol, tol)
-
-
 def _exudyn(case: Case, step: float, repeat: int) -> Result:
     from references.exudyn.beam import solve_exudyn_beam
 
@@ -62,9 +57,13 @@ def _exudyn(case: Case, step: float, repeat: int) -> Result:
 
 def solvers() -> dict[str, Solver]:
     """The line-up by name: the catalogue's, and those that only this study has."""
+
+    def differenced(case: Case, tol: float, repeat: int) -> Result:
+        return solve_dae(without_tangent(case.problem), *case.start[1:], NEWTON, tol, tol)
+
     made: list[Solver] = [replace(CATALOGUE[IRK_LINE], name=PAPER)]
     made += [CATALOGUE[name] for name in (NEWMARK, QUARTER, *RADAU)]
-    made.append(Solver(DIFFERENCES, "two-loop", "compiled", True, "tol", _differenced))
+    made.append(Solver(DIFFERENCES, "two-loop", "compiled", True, "tol", differenced))
     made += [CATALOGUE[name] for name in (*OURS, *OTHERS)]
     made.append(Solver(EXUDYN, "Exudyn", "compiled, base in Python", True, "h", _exudyn))
     return {solver.name: solver for solver in made}
@@ -98,15 +97,10 @@ def collected(todo: Iterator[Run], kept: KeptRows, quick: bool) -> pd.DataFrame:
         row = row_of(run, repeat, measure, built)
         return row | {"error_all": row.get("error_q"), "error_q": row.get("error_tip")}
 
-    chosen = list(todo)
-    asked = [run for run in chosen if run.solver.name != EXUDYN]
-
-    def ours(run: Run) -> bool:
-        return run.solver.family == "two-loop"
-
-    rows = adaptive.collect(asked, kept, make, ours, () if quick else TARGETS, ours)
-    own = adaptive.collect([run for run in chosen if run.solver.name == EXUDYN], kept, make, lambda run: True)
-    return pd.concat([rows, own], ignore_index=True)
+    chosen, errors = list(todo), () if quick else TARGETS
+    own, asked = ([run for run in chosen if (run.solver.name == EXUDYN) is which] for which in (True, False))
+    rows = adaptive.collect(asked, kept, make, adaptive.is_ours, errors, adaptive.is_ours)
+    return pd.concat([rows, adaptive.collect(own, kept, make, lambda run: True)], ignore_index=True)
 
 
 @lru_cache

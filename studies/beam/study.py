@@ -1,4 +1,4 @@
-"""The beam study from its runs to its report."""
+"""The stiff beam of Sect. 4.2: the paper's procedure beside Newton's method as the outer loop, IDA and others."""
 
 import itertools
 from typing import Any
@@ -7,10 +7,8 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-import studies.beam as package
-from studies.beam.limits import GAUSS_SEIDEL, JACOBI, along_rows, limit_rows
+from studies.beam.limits import GAUSS_SEIDEL, JACOBI, MESH, along_rows, limit_rows, sensitivity_rows
 from studies.beam.runs import DIFFERENCES, EXUDYN, NEWTON, PAPER, TARGETS, by_tip, cases, collected, runs
-from studies.beam.sensitivity import MESH, sensitivity_rows
 from studies.bench import figures, tables
 from studies.bench.cases.beam import SOFT, STIFF
 from studies.bench.cli import StudyError
@@ -27,7 +25,6 @@ LISTED = (PAPER, NEWMARK, QUARTER, NEWTON, DIFFERENCES, OWN_EXPLICIT, IDA_C, IDA
 
 
 def make(output: Output) -> pd.DataFrame:
-    """Make all rows."""
     quick = output.call.quick
     known = cases(quick)
     with output.kept() as kept:
@@ -37,7 +34,6 @@ def make(output: Output) -> pd.DataFrame:
 
 
 def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
-    """All findings; `rows` are medians."""
     runs = by_tip(rows)
     w_max = {case: float(part["straight"].iloc[0]) for case, part in _of(rows, "along").groupby("case")}
     cases = [_case(rows, runs[runs["case"] == case], case, w_max[case]) for case in (SOFT, STIFF)]
@@ -180,5 +176,4 @@ def figures_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Figure]:
     return made
 
 
-STUDY = Study("beam", package.__doc__, make, findings_of, figures_of, tables_of, medians=True)
-main = STUDY.main
+STUDY = Study("beam", __doc__, make, findings_of, figures_of, tables_of, medians=True)

@@ -108,8 +108,13 @@ def collect(
     return pd.DataFrame([kept[key] for key in keys if key in kept])
 
 
+def is_ours(run: Run) -> bool:
+    """Whether a run is by one of our solvers."""
+    return run.solver.family == "two-loop"
+
+
 def _side(run: Run) -> Side:
-    return run.case.name, run.solver.family == "two-loop"
+    return run.case.name, is_ours(run)
 
 
 def between(
@@ -136,13 +141,10 @@ def between(
         if inside and apart > APART and loose / tight > NEAR and (close[loose] or close[tight]):
             asked.append(float(np.sqrt(loose * tight)))
     asked += _beyond(own[0], made, error, close, sorted(rows), errors)
-    tidy = [_tidy(own[0], value) for value in asked]
+    # the nearest tolerances of two digits, or the nearest steps of which the motion takes a whole number
+    t_end, steps = own[0].case.t_end, own[0].solver.setting == "h"
+    tidy = [t_end / round(t_end / value) if steps else float(f"{value:.2g}") for value in asked]
     return [replace(own[0], value=value) for value in dict.fromkeys(tidy) if value not in rows]
-
-
-def _tidy(run: Run, value: float) -> float:
-    """The nearest tolerance of two digits, or the nearest step of which the motion takes a whole number."""
-    return run.case.t_end / round(run.case.t_end / value) if run.solver.setting == "h" else float(f"{value:.2g}")
 
 
 def _beyond(

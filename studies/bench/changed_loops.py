@@ -33,53 +33,33 @@ MOTORS: dict[Make, tuple[float, float, float]] = {
 LIGHT = {loops.closed_chain: 25, loops.stewart: 0, loops.bricard: 2}  # number of the body, else the second one
 
 
-def _named(make: Make, build: Make, ending: str) -> Make:
-    make.__name__ = build.__name__ + ending.replace(", ", "_").replace(" ", "_")
-    return make
+def _changed(build: Callable[..., ModelProblem], ending: str) -> Make:
+    """What makes a mechanism whose name ends so."""
 
-
-def _motorised(build: Make, ending: str) -> Make:
     def make() -> ModelProblem:
         torque, stiffness, damping = MOTORS[build]
         legs = build is loops.stewart and ending == SERVO
-        given = loops.stewart(stiffness=stiffness, damping=damping) if legs else build()
+        options: dict[str, Any] = {"Q": loops.ASKEW} if ending == TURNED else {}
+        given = build(**options | ({"stiffness": stiffness, "damping": damping} if legs else {}))
         model: Any = given.model
         model.name = given.name + ending
         if ending == DRIVEN:
             spatial = model.dimension == 3
             axis = model.joints[0].axes[0] if spatial and build is not loops.stewart else np.array([0.0, 0.0, 1.0])
             model.torque(model.bodies[0].name, torque * axis if spatial else torque)
-        elif not legs:
+        elif ending == SERVO and not legs:
             hinge = model.joints[2 if build is loops.governor else 0]  # an arm: without its spin a governor folds
             model.torsion_spring(hinge, stiffness=stiffness, damping=damping, angle=ANGLE)
+        elif ending in RATIOS:
+            model.bodies[LIGHT.get(build, 1)].inertia[:] /= RATIOS[ending]  # mass and moments
         return model.problem(given.t_span)
 
-    return _named(make, build, ending)
+    make.__name__ = build.__name__ + ending.replace(", ", "_").replace(" ", "_")
+    return make
 
 
-def _lightened(build: Make, ending: str) -> Make:
-    def make() -> ModelProblem:
-        given = build()
-        model: Any = given.model
-        model.name = given.name + ending
-        model.bodies[LIGHT.get(build, 1)].inertia[:] /= RATIOS[ending]  # mass and moments
-        return model.problem(given.t_span)
-
-    return _named(make, build, ending)
-
-
-def _turned(build: Callable[..., ModelProblem]) -> Make:
-    def make() -> ModelProblem:
-        given = build(loops.ASKEW)
-        model: Any = given.model
-        model.name = given.name + TURNED
-        return model.problem(given.t_span)
-
-    return _named(make, build, TURNED)
-
-
-MOTORISED = tuple(_motorised(build, ending) for build in MOTORS for ending in (DRIVEN, SERVO))
+MOTORISED = tuple(_changed(build, ending) for build in MOTORS for ending in (DRIVEN, SERVO))
 # without the parallelogram, whose known motion is that of its own masses
 _OTHERS = [build for build in loops.MECHANISMS if build is not loops.parallelogram]
-LIGHTENED = tuple(_lightened(build, ending) for build in _OTHERS for ending in RATIOS)
-IN_A_FRAME = tuple(_turned(build) for build in loops.SPATIAL)
+LIGHTENED = tuple(_changed(build, ending) for build in _OTHERS for ending in RATIOS)
+IN_A_FRAME = tuple(_changed(build, TURNED) for build in loops.SPATIAL)

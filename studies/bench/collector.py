@@ -14,11 +14,13 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import track
 
 from references.driver import user_call
+from references.equations.expressions import NotSymbolic
+from references.minimal.equations import NoMinimalCoordinates
 from studies.bench import metrics
-from studies.bench.alarm import Alarm
+from studies.bench.apart import Alarm
 from studies.bench.reference_motion import ReferenceMotion, make_reference
 from studies.bench.store import Array, KeptRows, Row
 from twoloop import ConstrainedSystem, Result, Statistics, solve_dae
@@ -56,8 +58,6 @@ class Case:
     # whether the problem's energy is an invariant of the true motion. None: as the problem says, and where it does not,
     # as the reference shows.
     conserved: bool | None = None
-    # further ones: column to invariant(t, q, v), for columns of states
-    invariants: Mapping[str, Callable[[Array, Array, Array], Array]] = field(default_factory=dict)
     watched: tuple[int, ...] | None = None  # coordinates by which "out of phase" is judged. None: all.
     # s, for solvers of fixed step. None: t_end over 1000, 3000, 10,000, 30,000 and 100,000.
     step_sizes: tuple[float, ...] | None = None
@@ -103,7 +103,6 @@ class Case:
         return self.problem.system, (self.t0, self.t0 + self.t_end), self.problem.q0, self.problem.v0
 
     def steps(self) -> tuple[float, ...]:
-        """Fixed steps, s."""
         return self.step_sizes or tuple(self.t_end / n for n in (1e3, 3e3, 1e4, 3e4, 1e5))
 
 
@@ -193,16 +192,10 @@ def collect(runs: Iterable[Run], kept: KeptRows, measure: Measure | None = None)
     left = [(run, k) for k in rounds for run in runs if k < run.repeats and run.key(k) not in kept]
     for case in {id(run.case): run.case for run, _ in left}.values():
         _ = case.scale  # makes the reference, which is not to be timed with anything
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    bar = Progress(*columns, disable=not sys.stdout.isatty())
     warm: Warm = set()
-    with bar as progress:
-        task = progress.add_task("".ljust(50), total=len(order), completed=len(order) - len(left))
-        for run, k in left:
-            if k > 0 and kept[run.key(0)]["status"] in ONCE:
-                continue
+    for run, k in track(left, "runs", disable=not sys.stdout.isatty()):
+        if k == 0 or kept[run.key(0)]["status"] not in ONCE:
             kept.add(run.key(k), row_of(run, k, measure, warm))
-            progress.update(task, advance=1, description=f"{run.case.name}: {run.solver.name}"[:50].ljust(50))
     return pd.DataFrame([kept[key] for key in order if key in kept])
 
 
@@ -224,8 +217,7 @@ def row_of(run: Run, k: int, measure: Measure | None, warm: Warm) -> Row:
     if result is None:
         return row | metrics.COLUMNS
     try:
-        given = case.problem, result, case.reference, case.instants, case.scale, case.watched, dict(case.invariants)
-        row |= metrics.measure(*given)
+        row |= metrics.measure(case, result)
         return row if measure is None else row | measure(run, result)
     except (ArithmeticError, ValueError, np.linalg.LinAlgError) as error:  # the rest of the night goes on
         why = f"{status}, but it cannot be measured: {type(error).__name__}: {error}"
@@ -306,7 +298,7 @@ def attempt(run: Run, repeat: int, around: float | None = None) -> tuple[Result 
             began = time.process_time()
             result = run.solver.run(run.case, run.value, repeat)
             spent = time.process_time() - began
-    except NotApplicable as why:
+    except (NotApplicable, NotSymbolic, NoMinimalCoordinates) as why:  # of ours, and of adapters
         status, message = "NOT_APPLICABLE", str(why)
     except ImportError as error:
         status, message = "NOT_AVAILABLE", str(error)

@@ -80,10 +80,10 @@ def condition_error(run: Run, result: Result) -> float | None:
 def violations(system: ConstrainedSystem, result: Result) -> dict[str, float]:
     """Largest residuals of the constraints at the end in position, velocity and acceleration, all rows."""
     t, q, v, a = float(result.t[-1]), *(np.ascontiguousarray(x[:, -1]) for x in (result.q, result.v, result.a))
-    gammas = [system.gamma(t, q, v)] if system.n_c else []
-    gammas += [system.nonholonomic_gamma(t, q, v)] if system.n_a else []
+    gammas = ((system.n_c, system.gamma), (system.n_a, system.nonholonomic_gamma))
+    bias = np.concatenate([gamma(t, q, v) for n, gamma in gammas if n])
     levels = {"q": system.constraint(t, q) if system.n_c else np.zeros(0), "v": system.velocity_constraint(t, q, v)}
-    levels |= {"a": system.rows(t, q) @ a - np.concatenate(gammas)}
+    levels |= {"a": system.rows(t, q) @ a - bias}
     return {f"violation_{level}": float(np.abs(size).max(initial=0.0)) for level, size in levels.items()}
 
 
@@ -109,13 +109,12 @@ def row_of(run: Run) -> Row:
         result, status, message, times = timed(run, 0)
     row |= {**times, "status": status, "message": message, "warnings": len(said)}
     row["used"] = run.solver.took(run.value, result)
-    stats = None if result is None else result.stats
     for name in ("n_accepted", "n_evaluations"):
-        row[name] = None if stats is None else getattr(stats, name)
+        row[name] = None if result is None else getattr(result.stats, name)
     known = truth(problem, case.t_end)
-    row |= {f"error_{level}": None for level in LEVELS} | {f"digits_{level}": None for level in LEVELS}
-    row |= {"floor": 10.0 ** -known.digits["q"], "energy": None, "condition": None}
-    row |= {f"violation_{level}": None for level in "qva"}
+    unknown = [f"{what}_{level}" for what in ("error", "digits") for level in LEVELS]
+    row |= dict.fromkeys((*unknown, "energy", "condition", *(f"violation_{level}" for level in "qva")))
+    row["floor"] = 10.0 ** -known.digits["q"]
     if result is not None and result.t.size > 1 and np.isfinite(result.q).all():
         row |= {"energy": drift(problem, result), **violations(problem.system, result)}
         if result.success and abs(result.t[-1] - case.t_end) < 1e-9 * case.t_end:

@@ -36,21 +36,17 @@ class Loop:
 
     @cached_property
     def rigid(self) -> Rigid:
-        """As engines are given it."""
         return rigid_of(self.problem)
 
     @property
     def t_end(self) -> float:
-        """Its time, s."""
         return self.problem.t_span[1]
 
     @cached_property
     def times(self) -> Array:
-        """The instants, with the start."""
         return np.linspace(0.0, self.t_end, INSTANTS + 1)
 
     def ours(self, tolerance: float, method: str = "auto", times: Array | None = None, t0: float = 0.0) -> Any:
-        """A run of ours."""
         options: dict[str, Any] = {"method": method, "rtol": tolerance, "atol": tolerance, "t_eval": times}
         options |= {} if method == "auto" else {"compiled": False}  # references are no reason to compile
         with warnings.catch_warnings():

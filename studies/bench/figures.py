@@ -20,10 +20,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
-from studies.bench.runs_by_error import astray, setting_of, used
 from studies.bench.solvers import CATALOGUE, COMPILED, DEFAULT, GEAR_ORDERS, HEYOKA, IRK, IRK_LINE, gear
 from studies.bench.store import Output
-from studies.bench.tables import time_for
+from studies.bench.tables import astray, setting_of, time_for, used
 from twoloop.rows.equal_error import DECADE
 
 MOST_LINES = 9
@@ -92,13 +91,14 @@ def shades(n: int) -> list[Any]:
     return list(plt.get_cmap("viridis")(np.linspace(0.0, 0.85, n)))
 
 
-def legend(figure: Figure, axes: Iterable[Axes], title: str | None = None) -> None:
-    """One legend for all panels, right of them, each label once."""
+def legend(figure: Figure, axes: Iterable[Axes], title: str | None = None, below: int = 0) -> None:
+    """One legend for all panels, each label once; right of them, or in so many columns below."""
     entries: dict[str, Any] = {}
     for panel in axes:
         for handle, label in zip(*panel.get_legend_handles_labels(), strict=True):
             entries.setdefault(label, handle)
-    figure.legend(entries.values(), entries.keys(), loc="outside right upper", title=title)
+    place: dict[str, Any] = {"loc": "outside lower center", "ncols": below, "fontsize": 8} if below else {}
+    figure.legend(entries.values(), entries.keys(), **{"loc": "outside right upper", "title": title} | place)
 
 
 def label_decades(figure: Figure) -> None:
@@ -141,14 +141,14 @@ def cheapest_lines(rows: pd.DataFrame, targets: Sequence[float], most: int = MOS
     return [solver for solver in dict.fromkeys(rows["solver"]) if solver in best]
 
 
-def lines_of(rows: pd.DataFrame, targets: Sequence[float], most: int = MOST_LINES) -> list[str]:
+def lines_of(rows: pd.DataFrame, targets: Sequence[float]) -> list[str]:
     """The solvers that a figure of a case shows, of those with errors that can be told.
 
     The default, compiled too, and the paper's procedure; the cheapest of the main rivals that got anywhere, and of all
     at each target; of ours the cheapest others, those at a target first, as many as there is room for.
     """
     seen = rows[_told(rows)]
-    first = [name for name in FIRST if (seen["solver"] == name).any()][:most]
+    first = [name for name in FIRST if (seen["solver"] == name).any()]
     rivals: list[str] = []
     for family, begins in MAIN_RIVALS:
         own = seen[(seen["family"] == family) & seen["solver"].str.startswith(begins)]
@@ -160,7 +160,7 @@ def lines_of(rows: pd.DataFrame, targets: Sequence[float], most: int = MOST_LINE
         name for name in _winners(rows[rows["solver"].isin(seen[~of_us]["solver"])], targets) if name not in rivals
     ]
     ours = rows[rows["solver"].isin(seen[of_us & ~seen["solver"].isin(first)]["solver"])]
-    room = max(0, most - len(first) - len(rivals))
+    room = max(0, MOST_LINES - len(first) - len(rivals))
     chosen = list(dict.fromkeys([*_winners(ours, targets), *cheapest_lines(ours, targets, room)]))[:room]
     return [*first, *(name for name in dict.fromkeys(ours["solver"]) if name in chosen), *rivals]
 

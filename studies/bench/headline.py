@@ -12,6 +12,7 @@ import pandas as pd
 
 from studies.bench import tables
 from studies.bench.solvers import COMPILED, DEFAULT, GIVEN, HEYOKA
+from studies.bench.tables import SETTINGS, by_solver
 
 OWN_CODE = next(name for name, method in COMPILED.items() if method == DEFAULT)
 BEST = "best of ours"
@@ -21,23 +22,32 @@ PRICED = (1e-4, 1e-6)  # errors of the price on the first screen
 CHEAPER = 1.2  # by which a run that nearly gets there takes less time, where that is to be said
 FROM_C = ("CVODE from C", "IDA from C")  # each in several settings, the best of which counts
 SCIPY = "SciPy's best"
+LOOKED_AT = (  # columns by which solvers are compared
+    *("solver", "family", "status", "message", "error_q", "floor", "astray", "used", "times", "call_s"),
+    *SETTINGS,
+)
 
 
-def of_error(rows: pd.DataFrame, error: float, given: str = DEFAULT) -> dict[str, dict[str, Any]]:
-    """How each of WHOSE stands on one case at one error, by the best of each.
+def of_errors(rows: pd.DataFrame, errors: Iterable[float], given: str = DEFAULT) -> list[dict[str, dict[str, Any]]]:
+    """How each of WHOSE stands on one case at each of some errors, by the best of each.
 
     `rows`: medians, of all solvers; `given`: the solver that the default is on this case.
     """
-    ours, found = rows["family"] == "two-loop", {}
-    own, others = tables.costs_at(rows[ours], error), tables.costs_at(rows[~ours], error, doubt=True)
-    near = tables.near_misses(rows[~ours], error)
-    for name in WHOSE:
-        solver = given if name == GIVEN else name
-        side, which = (own, ours) if name == BEST else (_only(own, solver), rows["solver"] == solver)
-        compared = _compared(side, others, tables.near_misses(rows[which], error), near)
-        if compared["verdict"] == "alone" and not asked(rows[~ours], error):
-            compared["verdict"] = "unasked"
-        found[name] = _told(side) | {"rival": _told(others)} | compared
+    rows, found = rows[[name for name in LOOKED_AT if name in rows]], []
+    ours = rows["family"] == "two-loop"
+    solvers = {name: given if name == GIVEN else name for name in WHOSE}
+    parts = {name: rows[ours if name == BEST else rows["solver"] == solver] for name, solver in solvers.items()}
+    rivals, sides = rows[~ours], [by_solver(rows[which], "call_s") for which in (ours, ~ours)]
+    for error in errors:
+        own, others = tables.costs_at(sides[0], error), tables.costs_at(sides[1], error, doubt=True)
+        near, at = tables.near_misses(rivals, error), {}
+        for name, solver in solvers.items():
+            side = {each: cost for each, cost in own.items() if name == BEST or each == solver}
+            compared = _compared(side, others, tables.near_misses(parts[name], error), near)
+            if compared["verdict"] == "alone" and not asked(rivals, error):
+                compared["verdict"] = "unasked"
+            at[name] = _told(side) | {"rival": _told(others)} | compared
+        found.append(at)
     return found
 
 
@@ -60,10 +70,6 @@ def _told(costs: tables.Costs) -> dict[str, Any]:
     """The cheapest."""
     best = min(costs, key=lambda name: costs[name][0], default=None)
     return {"solver": best, "call_s": None if best is None else costs[best][0]}
-
-
-def _only(costs: tables.Costs, name: str) -> tables.Costs:
-    return {name: costs[name]} if name in costs else {}
 
 
 def counted(found: Iterable[Iterable[Mapping[str, Mapping[str, Any]]]]) -> list[dict[str, Any]]:

@@ -4,6 +4,7 @@ import importlib
 import json
 from collections.abc import Sequence
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 from studies.bench import tables
@@ -27,6 +28,20 @@ CLASSES = {  # tags of a case and the class of problem that they stand for, in t
     ("stiff", "vibrations wanted"): "stiff, vibrations wanted",
 }
 LONG = "long and conservative"
+
+
+def module_of(name: str) -> ModuleType:
+    """The module of a study, a file or `study` in a folder."""
+    found = importlib.import_module(f"studies.{name}")
+    return importlib.import_module(f"studies.{name}.study") if hasattr(found, "__path__") else found
+
+
+def run_study(name: str, words: Sequence[str]) -> None:
+    """Run a study for a command line: the `STUDY` of its module, or its `main`."""
+    module = module_of(name)
+    getattr(module, "STUDY", module).main(words)
+
+
 WHOSE = ("ours", "others")
 COSTS = ("call_s", "called_from", "keeps")
 
@@ -37,15 +52,13 @@ def findings(folder: Path) -> dict[str, dict[str, Any]]:
     Raises StudyError if a file is damaged.
     """
     found = {}
-    for name in STUDIES:
-        path = folder / f"{name}.json"
-        if path.is_file():
-            try:
-                told = json.loads(path.read_text())
-            except ValueError as error:
-                raise StudyError(f"{path} cannot be read ({error}); run python -m studies.{name} again") from None
-            if name not in TIMED or told.get("timed") == WHOLE_CALL:  # others are to be run again
-                found[name] = told
+    for path in (path for name in STUDIES if (path := folder / f"{name}.json").is_file()):
+        try:
+            told = json.loads(path.read_text())
+        except ValueError as error:
+            raise StudyError(f"{path} cannot be read ({error}); run python -m studies.{path.stem} again") from None
+        if path.stem not in TIMED or told.get("timed") == WHOLE_CALL:  # others are to be run again
+            found[path.stem] = told
     return found
 
 
@@ -136,7 +149,7 @@ def first_screen(folder: Path, quick: bool) -> str:
     """The text of README.md of a folder of reports."""
     studies = []
     for name in STUDIES:
-        about = (importlib.import_module(f"studies.{name}").__doc__ or "").splitlines()[0].rstrip(".").split(":")[0]
+        about = (module_of(name).__doc__ or "").splitlines()[0].rstrip(".").split(":")[0]
         names = ("compare.html",) if name == "compare_page" else (f"{name}.md", f"{name}.png")
         files = [each for each in names if (folder / each).is_file()]
         studies.append({"name": name, "about": about, "file": files[0] if files else None})

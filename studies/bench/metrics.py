@@ -12,7 +12,6 @@ Measured once (four-bar, 10 s; SunRadau5, Gauss12, DOP853 and BDF of twoloop at 
 and the error by anything from 2e-6 (DOP853 at 1e-5, whose steps it cuts short) to 44 (BDF at 1e-5).
 """
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -62,12 +61,12 @@ def correct_digits(deviation: Array, truth: Array) -> float:
     return float(-np.log10(max(relative.max(initial=0.0), 1e-17)))
 
 
-def violations(system: ConstrainedSystem, result: Result, most: int = CHECKED) -> tuple[Array, dict[str, Array]]:
+def violations(system: ConstrainedSystem, result: Result) -> tuple[Array, dict[str, Array]]:
     """Times, and at each the largest residual of the constraints in position, velocity and acceleration.
 
-    At no more than `most` of the stored instants, evenly chosen; "a" is C_q a - Q_d with the solver's accelerations.
+    At CHECKED of the stored instants at most; "a" is C_q a - Q_d with the solver's accelerations.
     """
-    chosen = np.unique(np.linspace(0, result.t.size - 1, most).astype(int))
+    chosen = np.unique(np.linspace(0, result.t.size - 1, CHECKED).astype(int))
     gamma, p = compiled_gamma(system), system.functions.p
     levels = {level: np.empty(chosen.size) for level in "qva"}
     for i, k in enumerate(chosen):
@@ -134,35 +133,24 @@ class Scale:
             self.kinetic = float((problem.energy(times, q, v) - problem.energy(times, q, 0.0 * v)).max())
 
 
-def measure(
-    problem: Problem,
-    result: Result,
-    motion: ReferenceMotion,
-    instants: Array,
-    scale: Scale,
-    watched: tuple[int, ...] | None,
-    invariants: dict[str, Callable[[Array, Array, Array], Array]],
-) -> dict[str, Any]:
-    """The columns of a row that say how good a run was; those of a run that did not reach its end are partly None."""
-    row = dict(COLUMNS)
+def measure(case: Any, result: Result) -> dict[str, Any]:
+    """The columns of a row that say how good a run of a `Case` was; some are None where it did not reach its end."""
+    row, problem, motion, scale = dict(COLUMNS), case.problem, case.reference, case.scale
     if result.t.size < 2 or not np.isfinite(result.q).all():
         return row
     system, t, q, v = problem.system, result.t, result.q, result.v
     if scale.kinetic is not None:
         drift = problem.energy(t, q, v) - problem.energy(t[0], problem.q0, problem.v0)
         row["energy"] = float(drift[np.abs(drift).argmax()])
-    for name, invariant in invariants.items():
-        change = invariant(t, q, v) - invariant(t[:1], q[:, :1], v[:, :1])
-        row[name] = float(change[np.abs(change).argmax()])
     times, levels = violations(system, result)
     row |= {f"violation_{level}": float(size.max()) for level, size in levels.items()}
     row["violation_early"] = float(levels["q"][times <= 0.1 * times[-1]].max())
     row["violation_late"] = float(levels["q"][times >= 0.9 * times[-1]].max())
-    end = float(instants[-1])
+    end = float(case.instants[-1])
     # Exudyn adds up its steps, so its last time is the end only to rounding
     if not (result.success and abs(t[-1] - end) < 1e-9 * end):
         return row
-    dq, dv = deviation(result, motion, instants)
+    dq, dv = deviation(result, motion, case.instants)
     q_end, v_end = (state[:, 0] for state in motion.states(np.array([end])))
     last_q, last_v = q[:, -1] - q_end, v[:, -1] - v_end
     last, truth = np.concatenate([last_q, last_v]), np.concatenate([q_end, v_end])
@@ -170,7 +158,7 @@ def measure(
     row["error_end"], row["error_v_end"] = float(np.abs(last_q).max()), float(np.abs(last_v).max())
     row["scd"], row["error_lam"] = correct_digits(last, truth), _error_lam(system, result, motion)
     row["lost"] = scale.kinetic is not None and abs(row["energy"]) > LOST * scale.kinetic
-    places = np.arange(system.n_q) if watched is None else np.array(watched)
+    places = np.arange(system.n_q) if case.watched is None else np.array(case.watched)
     moving = places[scale.ranges[places] > 0.0]
     row["astray"] = bool((np.abs(dq[moving]).max(axis=1) > ASTRAY * scale.ranges[moving]).any())
     return row

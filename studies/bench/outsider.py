@@ -51,7 +51,8 @@ class Outsider:
             raise StudyError(f"--solver takes FILE.py:FUNCTION, a file that there is, or one of {known}; given {where}")
         data = self.path.read_bytes()
         self.name, self.digest = f"{self.path.name}:{self.function}", hashlib.sha256(data).hexdigest()[:10]
-        self.mechanism, self.calibrated = _absolute(mechanism), float("nan")
+        model, _, maker = mechanism.rpartition(":")  # a file, as it is found from another folder
+        self.mechanism, self.calibrated = f"{Path(model).resolve()}:{maker}" if model else mechanism, float("nan")
         self._python = environment(dependencies(data.decode("utf-8", "replace"), self.path))
         self._process: subprocess.Popen[bytes] | None = None
         self._pipe: Connection | None = None
@@ -90,9 +91,8 @@ class Outsider:
             return _failed(case, self._spent)
         answer = self._asked(ask, case.time_limit)
         if answer is None:
-            self._spent = (
-                f"Not back by time_limit = {case.time_limit:g} s at the tolerance {tolerance:g}, and asked no more."
-            )
+            limit = f"time_limit = {case.time_limit:g} s"
+            self._spent = f"Not back by {limit} at the tolerance {tolerance:g}, and asked no more."
             return _failed(case, self._spent)
         if "failure" in answer:
             return _failed(case, answer["failure"])
@@ -147,9 +147,3 @@ def _failed(case: Case, message: str) -> Result:
     _, (t0, _), q0, v0 = case.start
     start = (np.array([t0]), q0[:, None], v0[:, None], 0.0 * q0[:, None], np.zeros((case.problem.system.n_c, 1)))
     return Result(*start, np.empty(0), Status.SOLVER_FAILED, message, Statistics(cpu_time=0.0))
-
-
-def _absolute(mechanism: str) -> str:
-    """The mechanism, as it is found from another folder."""
-    file, colon, function = mechanism.rpartition(":")
-    return f"{Path(file).resolve()}{colon}{function}" if file else mechanism

@@ -85,7 +85,6 @@ def run(simulate: Callable[..., Any], problem: Problem, ask: dict[str, Any]) -> 
 
 
 def main(descriptor: int, file: str, function: str, mechanism: str) -> None:
-    """Answer until the pipe is closed."""
     connection = Connection(descriptor)
     try:
         problem, simulate = problem_from(mechanism), loaded(Path(file), function)

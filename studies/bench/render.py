@@ -17,12 +17,10 @@ def number(value: Any, digits: int = 2) -> str:
 
     Integers below 10,000 are written in full, powers of ten without a mantissa of 1 (1e-9).
     """
-    if value is None or (isinstance(value, float) and math.isnan(value)):
+    if value is None or value != value:
         return "–"
     if isinstance(value, bool) or not isinstance(value, int | float):
         value = float(value)  # a numpy scalar; anything else raises
-        if math.isnan(value):
-            return "–"
     if value == 0:
         return "0"
     if math.isinf(value):

@@ -1,5 +1,6 @@
 """Runs in the format of `twoloop.rows`, of the medians that tables are made of, and back."""
 
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from statistics import median
@@ -9,11 +10,30 @@ import pandas as pd
 
 from studies.bench.cli import StudyError, processor, version_of
 from studies.bench.collector import FILE
-from studies.bench.mechanism_names import mechanism_of
-from studies.bench.runs_by_error import SETTINGS
+from studies.bench.tables import SETTINGS
 from twoloop import __version__
 from twoloop.rows.leaderboard import ARCHIVE
 from twoloop.rows.row_format import REACHED_END, SCHEMA, Row, read_rows
+
+READY = {  # by the names of their problems, where these are others
+    "Andrews' squeezing mechanism": "andrews",
+    "SUNDIALS slider-crank": "sundials_slider_crank",
+    "A01 pendulum": "pendulum",
+    "A02, N = 2": "n_four_bar",
+    "A04 Bricard": "bricard",
+    "A05 governor": "governor",
+    "closed chain of 4": "closed_chain",
+    "four-bar 1, 2, 1.5 m on 3 m": "four_bar",
+    "four-bar 0.8, 1.2, 1 m on 2 m": "four_bar_second",
+    "ANCF beam, 4 elements, E = 2e+08 N/m^2, start='node'": "moderately_stiff_beam",
+    "ANCF beam, 4 elements, E = 2e+06 N/m^2, start='node'": "very_flexible_beam",
+}
+
+
+def mechanism_of(name: str) -> str:
+    """The name in rows of a problem, or of a case."""
+    return READY.get(name) or re.sub(r"\W+", "_", name).strip("_").lower()
+
 
 RIVALS = ("heyoka", "scikit-sundae", "scipy", "extensisq", "diffrax", "casadi", "solve-dae", "exudyn")
 PACKAGES = {"SUNDIALS": "scikit-sundae", "solve_dae": "solve-dae"}  # of families that are called otherwise

@@ -29,38 +29,41 @@ def chain_force(t, q, v, p, Q):  # type: ignore[no-untyped-def]
 
 @callback("constraint")
 def chain_constraint(t, q, p, C):  # type: ignore[no-untyped-def]
-    for k in range(C.size):
+    for i in range(C.size):
+        k, scale = i % (q.size // 2), 1.0 + i // (q.size // 2)  # a further row repeats one
         x = q[2 * k] - (drive(t, p)[0] if k == 0 else q[2 * k - 2])
         y = q[2 * k + 1] - (0.0 if k == 0 else q[2 * k - 1])
-        C[k] = 0.5 * (x * x + y * y - p[k] * p[k])
+        C[i] = 0.5 * (x * x + y * y - p[k] * p[k]) * scale
 
 
 @callback("jacobian")
 def chain_jacobian(t, q, p, Cq):  # type: ignore[no-untyped-def]
-    for k in range(Cq.shape[0]):
-        x = q[2 * k] - (drive(t, p)[0] if k == 0 else q[2 * k - 2])
-        y = q[2 * k + 1] - (0.0 if k == 0 else q[2 * k - 1])
-        Cq[k, 2 * k] = x
-        Cq[k, 2 * k + 1] = y
+    for i in range(Cq.shape[0]):
+        k, scale = i % (q.size // 2), 1.0 + i // (q.size // 2)
+        x = scale * (q[2 * k] - (drive(t, p)[0] if k == 0 else q[2 * k - 2]))
+        y = scale * (q[2 * k + 1] - (0.0 if k == 0 else q[2 * k - 1]))
+        Cq[i, 2 * k] = x
+        Cq[i, 2 * k + 1] = y
         if k > 0:
-            Cq[k, 2 * k - 2] = -x
-            Cq[k, 2 * k - 1] = -y
+            Cq[i, 2 * k - 2] = -x
+            Cq[i, 2 * k - 1] = -y
 
 
 @callback("constraint_rate")
 def chain_rate(t, q, p, Ct):  # type: ignore[no-untyped-def]
     f, rate, _ = drive(t, p)
-    Ct[0] = -(q[0] - f) * rate
+    for i in range(0, Ct.size, q.size // 2):
+        Ct[i] = -(1.0 + i // (q.size // 2)) * (q[0] - f) * rate
 
 
 @callback("gamma")
 def chain_gamma(t, q, v, p, Qd):  # type: ignore[no-untyped-def]
     f, rate, second = drive(t, p)
-    for k in range(Qd.size):
+    for i in range(Qd.size):
+        k, scale = i % (q.size // 2), 1.0 + i // (q.size // 2)
         x = v[2 * k] - (rate if k == 0 else v[2 * k - 2])
         y = v[2 * k + 1] - (0.0 if k == 0 else v[2 * k - 1])
-        Qd[k] = -(x * x + y * y)
-    Qd[0] += (q[0] - f) * second
+        Qd[i] = scale * ((q[0] - f) * second * (k == 0) - (x * x + y * y))
 
 
 # --- of a slider-crank of points, p = [crank, rod, two masses, ...]: x, y of the crank's end and x of the slider

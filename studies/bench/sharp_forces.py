@@ -94,7 +94,7 @@ def force_along(t, x, v, p):  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True)
 def drive(t, p):  # type: ignore[no-untyped-def]
-    """A given motion and its first two derivatives: none, a kink, a gust or a step."""
+    """A given motion and its first two derivatives: none, a kink, a gust, a step or a sine."""
     first = p.size - SIZE
     kind = int(p[first + DRIVE])
     a, b, c = p[first + DRIVE_A], p[first + DRIVE_B], p[first + DRIVE_C]
@@ -107,6 +107,8 @@ def drive(t, p):  # type: ignore[no-untyped-def]
     if kind == 3:
         s = math.tanh((t - c) / b)
         return a * s, a / b * (1.0 - s * s), -2.0 * a / (b * b) * s * (1.0 - s * s)
+    if kind == 4:
+        return a * math.sin(b * t), a * b * math.cos(b * t), -b * b * a * math.sin(b * t)
     return 0.0, 0.0, 0.0
 
 

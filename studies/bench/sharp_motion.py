@@ -5,16 +5,18 @@ second, unlike method says how good it is, disturbed starts how much errors grow
 """
 
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from scipy.integrate import solve_ivp
 
+from studies.bench.apart import heard
 from studies.bench.sharp_forces import DRIVE_A, T_END, families
 from studies.bench.sharp_mechanisms import Mechanism, drawn
 from studies.bench.store import Array, Row
-from twoloop import solve_dae
+from twoloop import Result, solve_dae
 
 TIMES = np.linspace(0.0, T_END, 13)  # s, at which positions are compared
 RTOL, CHECK, DISTURBED = 1e-13, 1e-12, 1e-9  # of the motion, of the one to compare it with, and of disturbed ones
@@ -119,16 +121,16 @@ def allowed(known: Motion, tolerance: float, n_jumps: int = 0) -> float:
 def judged(mechanism: Mechanism, known: Motion, method: str, tolerance: float, time_limit: float, **more: Any) -> Row:
     """A run and its outcome."""
     limit = allowed(known, tolerance, len(mechanism.sharp.breaks))
-    row: Row = {"status": "", "message": "", "error": None, "allowed": limit, "warned": ""}
     options: dict[str, Any] = {"rtol": tolerance, "atol": tolerance, "time_limit": time_limit, "t_eval": TIMES, **more}
-    with warnings.catch_warnings(record=True) as said:
-        warnings.simplefilter("always")
-        try:
-            result = solve_dae(mechanism.system, (0.0, T_END), mechanism.q0, mechanism.v0, method, **options)
-        except Exception as error:  # of whatever kind: a row
-            return row | {"status": "RAISED", "message": f"{type(error).__name__}: {error}", "outcome": SAID}
-    row |= {"status": result.status.name, "message": result.message}
-    if not result.success:
+    start = mechanism.system, (0.0, T_END), mechanism.q0, mechanism.v0
+    return graded(lambda: solve_dae(*start, method, **options), lambda result: off(result.q.T, known.q), limit)
+
+
+def graded(call: Callable[[], Result], error: Callable[[Result], float], allowed: float) -> Row:
+    """A call and its outcome, by the error of its result and that which is allowed."""
+    result, row = heard(call)
+    row |= {"error": None, "allowed": allowed, "n_evaluations": None}
+    if result is None or not result.success:
         return row | {"outcome": SAID}
-    row |= {"error": off(result.q.T, known.q), "warned": " / ".join(str(each.message) for each in said)}
-    return row | {"outcome": RIGHT if row["error"] <= row["allowed"] else SAID if said else SILENT}
+    row |= {"error": error(result), "n_evaluations": result.stats.n_evaluations}
+    return row | {"outcome": RIGHT if row["error"] <= allowed else SAID if row["warned"] else SILENT}

@@ -13,9 +13,7 @@ from typing import Any
 import numpy as np
 
 from references.casadi.integrators import solve_collocation
-from references.equations.expressions import NotSymbolic
 from references.lines import Line, lines
-from references.minimal.equations import NoMinimalCoordinates
 from references.minimal.solvers import solve_cvode_minimal, solve_heyoka_minimal
 from references.paper.gear import solve_gear
 from references.scipy.index1 import baumgarte
@@ -114,12 +112,13 @@ def _canonical(case: Case, step: float, repeat: int) -> Result:
     return solve_dae(*case.start, method=method, step_size=step, time_limit=case.time_limit)
 
 
+def _collocation(case: Case, step: float, repeat: int) -> Result:
+    return solve_collocation(*case.start, round(case.t_end / step), time_limit=case.time_limit)
+
+
 def at_instants(solve: Callable[..., Result], case: Case, **options: Any) -> Result:
-    """A run of a solver that tells its states at the common instants; `NotApplicable` where it needs expressions."""
-    try:
-        return solve(*case.start, t_eval=np.append(0.0, case.instants), time_limit=case.time_limit, **options)
-    except NotSymbolic as why:
-        raise NotApplicable(str(why)) from None
+    """A run of a solver that tells its states at the common instants."""
+    return solve(*case.start, t_eval=np.append(0.0, case.instants), time_limit=case.time_limit, **options)
 
 
 def _by_line(line: Line, case: Case, tolerance: float, repeat: int) -> Result:
@@ -134,19 +133,9 @@ def _by_line(line: Line, case: Case, tolerance: float, repeat: int) -> Result:
 
 def _minimal(kind: str, case: Case, tolerance: float, repeat: int) -> Result:
     more: dict[str, Any] = {"t_eval": np.append(0.0, case.instants), "time_limit": case.time_limit}
-    try:
-        if kind == "heyoka":
-            return solve_heyoka_minimal(case.problem, case.t_end, tolerance, **more)
-        return solve_cvode_minimal(case.problem, case.t_end, tolerance, tolerance, **more)
-    except NoMinimalCoordinates as why:
-        raise NotApplicable(str(why)) from None
-
-
-def _collocation(case: Case, step: float, repeat: int) -> Result:
-    try:
-        return solve_collocation(*case.start, round(case.t_end / step), time_limit=case.time_limit)
-    except NotSymbolic as why:
-        raise NotApplicable(str(why)) from None
+    if kind == "heyoka":
+        return solve_heyoka_minimal(case.problem, case.t_end, tolerance, **more)
+    return solve_cvode_minimal(case.problem, case.t_end, tolerance, tolerance, **more)
 
 
 def _exudyn(solver: str, options: Mapping[str, float], case: Case, step: float, repeat: int) -> Result:

@@ -2,6 +2,8 @@
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from functools import partial
+from itertools import chain
 from typing import Any
 
 import pandas as pd
@@ -11,7 +13,7 @@ from studies.bench import cli, figures, tables
 from studies.bench.collector import Measure, Run, collect
 from studies.bench.index import write_index
 from studies.bench.render import render, table
-from studies.bench.store import Output
+from studies.bench.store import Output, Row
 
 Make = Callable[[Output], pd.DataFrame]
 
@@ -52,6 +54,22 @@ def rows_of(runs: Callable[[bool], Iterable[Run]], measure: Measure) -> Make:
     def make(output: Output) -> pd.DataFrame:
         with output.kept() as kept:
             return collect(runs(output.call.quick), kept, measure)
+
+    return make
+
+
+def kept_rows(*parts: Callable[[bool], Iterable[tuple[str, Callable[[], Any]]]]) -> Make:
+    """What makes the rows of part(quick), of keys and of functions that return a row, or a list of rows."""
+
+    def kept_row(run: Callable[[], Any]) -> Row:
+        made = run()
+        return dict(made) if isinstance(made, dict) else {"rows": made}
+
+    def make(output: Output) -> pd.DataFrame:
+        keyed = chain.from_iterable(part(output.call.quick) for part in parts)
+        with output.kept() as kept:
+            made = [kept.made(key, partial(kept_row, run)) for key, run in keyed]
+        return pd.DataFrame([row for each in made for row in each.get("rows", [each])])
 
     return make
 

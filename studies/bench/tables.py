@@ -1,6 +1,6 @@
 """From the rows of all repetitions to medians with quartiles, cost at equal error, rankings."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -9,9 +9,54 @@ from numpy.typing import NDArray
 
 from studies.bench.collector import NOTHING_RUN
 from studies.bench.render import number, power
-from studies.bench.runs_by_error import astray, by_solver, errors_of, runs_with, setting_of
 from studies.bench.store import Array
-from twoloop.rows.equal_error import DECADE, FEWEST, INTERVAL, LEAST, cheapest, cost_at, place_of, resampled
+from twoloop.rows.equal_error import DECADE, FEWEST, INTERVAL, LEAST, Runs, cheapest, cost_at, place_of, resampled
+
+SETTINGS = ("err_out", "h", "tol")  # a procedure along err_out has a tol, too, which does not vary
+
+
+def setting_of(rows: pd.DataFrame) -> Array:
+    """Value of the setting that varies, of each row; NaN where there is none."""
+    found = np.full(len(rows), np.nan)
+    for name in SETTINGS:
+        if name in rows:
+            found = np.where(np.isnan(found), rows[name].to_numpy(float), found)
+    return found
+
+
+def _columns(rows: pd.DataFrame, *more: str) -> dict[str, NDArray[Any]]:
+    """Columns that are looked at, and more numbers, as arrays."""
+    found: dict[str, NDArray[Any]] = {name: rows[name].to_numpy(float) for name in ("error_q", "floor", *more)}
+    found |= {name: rows[name].to_numpy() for name in ("used", "times") if name in rows}
+    return found | {"setting": setting_of(rows), "astray": astray(rows).to_numpy()}
+
+
+def runs_with(rows: pd.DataFrame, what: str) -> Runs:
+    """Those of rows of one solver."""
+    solver = str(rows["solver"].iloc[0]) if len(rows) and "solver" in rows else ""
+    return Runs(_columns(rows, what), np.arange(len(rows)), what, solver)
+
+
+def by_solver(rows: pd.DataFrame, *costs: str) -> dict[str, Runs]:
+    """Those of each solver, in order of appearance; runs without the first of the costs are left out."""
+    columns = _columns(rows, *costs)
+    codes, names = pd.factorize(rows["solver"])
+    return {str(name): Runs(columns, np.flatnonzero(codes == k), costs[0], str(name)) for k, name in enumerate(names)}
+
+
+def used(run: pd.Series) -> str:
+    """The method that a solver took which chooses; a file has nothing where there is none."""
+    return run["used"] if isinstance(run.get("used"), str) else ""
+
+
+def astray(runs: pd.DataFrame) -> pd.Series:
+    """Which runs have another motion than the reference; none where that was not looked at."""
+    return runs["astray"].isin((True, "True")) if "astray" in runs else pd.Series(False, runs.index)
+
+
+def errors_of(runs: pd.DataFrame) -> Array:
+    return np.maximum(runs["error_q"].to_numpy(float), runs["floor"].to_numpy(float))
+
 
 TIGHTEST = 1e-13  # tolerance of which tighter ones are of no use
 LIMITED = ("TIME_LIMIT", "MAX_STEPS")  # statuses of runs that we ended
@@ -97,31 +142,32 @@ def run_for(rows: pd.DataFrame, target: float) -> pd.Series:
 Costs = dict[str, tuple[float, Array]]  # by solver the time at an error, and draws of it (RESAMPLES,)
 
 
-def costs_at(rows: pd.DataFrame, target: float, doubt: bool = False) -> Costs:
+def costs_at(rows: pd.DataFrame | Mapping[str, Runs], target: float, doubt: bool = False) -> Costs:
     """Of the solvers of one case that get to an error, what the cheapest run takes that is good enough.
 
-    `doubt`: of those that were not asked for about so much, the next looser run counts as good enough, so that no
-    solver is ahead of another for want of a run. A run out of phase does not.
+    `rows`: as a table, or grouped by `by_solver` where several errors are asked for. `doubt`: of those that were not
+    asked for about so much, the next looser run counts as good enough, so that no solver is ahead of another for want
+    of a run. A run out of phase does not.
     """
     found = {}
-    for solver, runs in by_solver(rows, "call_s").items():
+    for solver, runs in (by_solver(rows, "call_s") if isinstance(rows, pd.DataFrame) else rows).items():
         place = place_of(runs, target, unasked=True)
         if place is None:
             continue
         if doubt and place_of(runs, target) is None:
             n_good = place[0]
             place = n_good + (n_good < len(runs.errors) and not runs.of("astray")[n_good]), None
-        costs, drawn = runs.of("call_s"), runs.drawn()
-        if np.isnan(drawn[np.argmin(costs[: place[0]])]).any():  # of the cheapest it is not known
-            drawn[:] = np.nan
-        found[solver] = float(cost_at(costs, place)), cost_at(drawn, place)
+        costs, drawn = runs.of("call_s"), runs.drawn
+        known = not np.isnan(drawn[np.argmin(costs[: place[0]])]).any()  # of the cheapest
+        found[solver] = float(cost_at(costs, place)), cost_at(drawn if known else np.nan * drawn, place)
     return found
 
 
 def nearly_there(rows: pd.DataFrame, target: float) -> pd.DataFrame:
     """The runs of one case that miss an error by a factor of less than NEARLY, on the motion of the reference."""
     errors = errors_of(rows)
-    return rows[(errors > target) & (errors <= NEARLY * target) & ~astray(rows) & rows["call_s"].notna()]
+    near = (errors > target) & (errors <= NEARLY * target)
+    return rows[near & ~astray(rows).to_numpy() & ~np.isnan(rows["call_s"].to_numpy(float))] if near.any() else rows[:0]
 
 
 def near_misses(rows: pd.DataFrame, target: float) -> Costs:
@@ -164,18 +210,25 @@ def ranking(rows: pd.DataFrame, target: float) -> pd.DataFrame:
     Returns solver, family, called_from, keeps_constraints, call_s, call_q1, call_q3, n_evaluations for this error (on
     the log-log line between two runs), and violation_q, violation_v, energy, setting of the cheapest run near it.
     """
-    lines = []
-    for solver, runs in by_solver(rows, *COSTS).items():
-        ours = rows.iloc[runs.rows[0]]["family"] == "two-loop" if len(runs.rows) else False
-        place = place_of(runs, target, unasked=ours)
-        if place is None:
-            continue
-        run = rows.iloc[cheapest(runs, place)]
-        line = {"solver": solver, **{key: run[key] for key in ("family", "called_from", "keeps_constraints")}}
-        line |= {what: float(cost_at(runs.of(what), place)) for what in COSTS}
-        line |= {key: run[key] for key in ("violation_q", "violation_v", "energy")}
-        lines.append(line | {"setting": setting(run)})
-    return pd.DataFrame(lines, columns=["solver", *RANKED, "setting"]).sort_values("call_s", ignore_index=True)
+    return rankings(rows, (target,))[0]
+
+
+def rankings(rows: pd.DataFrame, targets: Sequence[float]) -> list[pd.DataFrame]:
+    """The `ranking` at each of some errors."""
+    grouped, ranked = by_solver(rows, *COSTS), []
+    told = {name: rows[name].to_numpy() for name in (*RANKED, *SETTINGS) if name in rows and name not in COSTS}
+    for target in targets:
+        lines = []
+        for solver, runs in grouped.items():
+            ours = len(runs.rows) > 0 and told["family"][runs.rows[0]] == "two-loop"
+            if (place := place_of(runs, target, unasked=ours)) is None:
+                continue
+            run = {name: column[cheapest(runs, place)] for name, column in told.items()}
+            line = run | {what: float(cost_at(runs.of(what), place)) for what in COSTS}
+            lines.append(line | {"solver": solver, "setting": setting(run)})
+        made = pd.DataFrame(lines, columns=["solver", *RANKED, "setting"])
+        ranked.append(made.sort_values("call_s", ignore_index=True))
+    return ranked
 
 
 def best(ranked: pd.DataFrame) -> dict[str, Any] | None:
@@ -263,7 +316,7 @@ def with_quartiles(middle: float, low: float, high: float) -> str:
     return texts[1] if near else f"{texts[1]} ({texts[0]}–{texts[2]})"
 
 
-def setting(row: pd.Series) -> str:
+def setting(row: Mapping[str, Any]) -> str:
     """Name and value of the setting that varies."""
     return next(f"{name} {number(row[name])}" for name in ("h", "err_out", "tol") if pd.notna(row.get(name)))
 

@@ -38,8 +38,11 @@ def takes(found: Mapping[str, Any], entries: Sequence[dict[str, Any]]) -> list[d
     rows += [_of_class(name, own, with_code) for name, own in classes.items() if name not in (*BEAM_CLASSES, LONG)]
     rows += [_by_the_tip(case) for case in found.get("beam", {}).get("cases", []) if case["name"] in BEAMS]
     rows += [_of_energy(entry, "four-bar" in with_code) for entry in classes[LONG]]
-    rows += _at_once(found.get("ensembles", {}).get("cases", [])) + _singly(made.get("first_calls", []))
-    return rows + _in_angles(made.get("minimal", {}))
+    rows += _at_once(found.get("ensembles", {}).get("cases", []))
+    coded = (f"{DEFAULT}, compiled", HEYOKA)
+    paid = [_paid(line) for line in made.get("first_calls", []) if line["pays"] and line["solver"] in coded]
+    singly = {"what": "many single calls", "take": f"{' and '.join(paid)}, against `compiled=False`"}
+    return rows + [singly] * bool(paid) + _in_angles(made.get("minimal", {}))
 
 
 def _of_class(name: str, entries: Sequence[dict[str, Any]], with_code: set[str]) -> dict[str, str]:
@@ -112,10 +115,8 @@ def _crossed(rivals: Mapping[str, Any], own: Sequence[Mapping[str, Any]]) -> str
     """Who is ahead where the motion crosses singular positions."""
     verdicts = [at["verdict"] for each in own for at in each["at"]]
     ahead, behind = verdicts.count("ahead"), verdicts.count("behind")
-    standing = next(
-        (each["standings"][0] for each in rivals.get("ranges", []) if each["name"].startswith(SINGULAR)), None
-    )
-    default = f", the default in {standing['ahead']} and {standing['behind']}" if standing else ""
+    ranges = {each["name"].partition(" ")[0]: each["standings"][0] for each in rivals.get("ranges", [])}
+    default = ", the default in {ahead} and {behind}".format(**ranges[SINGULAR]) if SINGULAR in ranges else ""
     whose = "one of our methods" if ahead > behind else "another project's solver"
     return f"{whose} (our best is ahead in {ahead} and behind in {behind} comparisons{default})"
 
@@ -127,8 +128,7 @@ def _by_error(at: Sequence[Mapping[str, Any]]) -> str:
         run = _first(line)
         if run:
             by[call(run["solver"]) if line["verdict"] in DECIDED else ""].append(line["error"])
-    by.pop("", None)
-    spans = {who: (power(max(errors)), power(min(errors))) for who, errors in by.items()}
+    spans = {who: (power(max(errors)), power(min(errors))) for who, errors in by.items() if who}
     said = [f"{who} ({high}{f' to {low}' if low != high else ''})" for who, (high, low) in spans.items()]
     return ", ".join(said) or "no solver compared reaches these errors"
 
@@ -159,12 +159,6 @@ def _at_once(cases: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
         best = Counter(min(at["run_s"], key=at["run_s"].get) if at["verdict"] in DECIDED else "" for at in each["at"])
         won.update([solver if 2 * n > best.total() else "" for solver, n in best.most_common(1)])
     return [{"what": "many runs in one call", "take": _shares(won, "mechanisms", False)}] if won.total() else []
-
-
-def _singly(first_calls: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
-    """After how many single calls what is built has paid."""
-    paid = [_paid(line) for line in first_calls if line["pays"] and line["solver"] in (f"{DEFAULT}, compiled", HEYOKA)]
-    return [{"what": "many single calls", "take": f"{' and '.join(paid)}, against `compiled=False`"}] if paid else []
 
 
 def _paid(line: Mapping[str, Any]) -> str:

@@ -1,3 +1,3 @@
-from studies.claims import main
+from studies.claims.study import main
 
 main()

@@ -3,7 +3,7 @@
 import numpy as np
 import pandas as pd
 
-from studies.beam.sensitivity import PARAMETERS
+from studies.beam.limits import PARAMETERS
 from studies.bench.solvers import (
     ADAMS,
     COMPILED,

@@ -43,7 +43,6 @@ SWING, SWING_STEP, SWING_STEPS = (2.0, 0.0), 0.2, 100  # a pendulum's start (rad
 
 
 def make(quick: bool) -> dict[str, float]:
-    """All of them."""
     linkage = four_bar()
     states = true_states(linkage, 8 if quick else 40)
     found = local_error(linkage, states) | predictor(linkage, states) | values_alone(linkage)

@@ -26,12 +26,8 @@ class NotRun(Exception):
 
 def read(folder: Path) -> dict[str, pd.DataFrame]:
     """One row a run of every study whose rows are in the folder. Raises StudyError if a file of rows is damaged."""
-    found = {}
-    for name in STUDIES:
-        path = folder / f"{name}.csv"
-        if path.is_file():
-            found[name] = _one_a_run(name, read_rows(path)[0])
-    return found
+    paths = [path for name in STUDIES if (path := folder / f"{name}.csv").is_file()]
+    return {path.stem: _one_a_run(path.stem, read_rows(path)[0]) for path in paths}
 
 
 def processors(folder: Path) -> dict[str, list[str]]:

@@ -95,15 +95,9 @@ class Claim:
 
     def text(self, found: Judgement) -> str:
         """The numbers of a judgement in the words of `claims.toml`."""
-        texts = {name: _text(value) for name, value in found.values.items()}
+        each = {name: value if isinstance(value, list) else [value] for name, value in found.values.items()}
+        texts = {name: "–".join(dict.fromkeys(map(number, values))) for name, values in each.items()}
         return self.number.format(**texts) if texts else "–"
-
-
-def _text(value: Any) -> str:
-    if not isinstance(value, list):
-        return number(value)
-    low, high = (number(x) for x in value)
-    return low if low == high else f"{low}–{high}"
 
 
 def load() -> list[Claim]:

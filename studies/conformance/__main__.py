@@ -1,3 +1,3 @@
-from studies.conformance import main
+from studies.conformance.study import STUDY
 
-main()
+STUDY.main()

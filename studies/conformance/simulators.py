@@ -82,25 +82,25 @@ def _returned(result: Result, problem: KnownProblem, times: Array, system: Const
     return q, v, np.array(own)
 
 
-def ours(method: str, problem: KnownProblem, times: Array, tolerance: float) -> tuple[Array, ...]:
-    """A method of ours, on compiled functions where there are any, as those of a problem cost ten times as much."""
-    solve = partial(solve_dae, method=method)
+def ours(method: str, compiled: bool, problem: KnownProblem, times: Array, tolerance: float) -> tuple[Array, ...]:
+    """A method of ours, on compiled functions where there are any, as those of a problem cost ten times as much.
+
+    `compiled`: with code made for the mechanism, which needs such.
+    """
     try:
         system = twin_of(problem).system
     except NoModel:
+        if compiled:
+            raise
         system = system_of(problem)
-    return _by(solve, system, problem, times, tolerance)
+    options: dict[str, Any] = {"compiled": True} if compiled else {}
+    return _by(partial(solve_dae, method=method, **options), system, problem, times, tolerance)
 
 
 def by_line(line: Line, problem: KnownProblem, times: Array, tolerance: float) -> tuple[Array, ...]:
     """A rival, which needs compiled functions, or runs them on symbols."""
     system, one = twin_of(problem).system, {"tol": tolerance} if line.one_tolerance else None
     return _by(partial(line.solve, **line.options), system, problem, times, tolerance, one)
-
-
-def coded(problem: KnownProblem, times: Array, tolerance: float) -> tuple[Array, ...]:
-    """The default with code made for the mechanism."""
-    return _by(partial(solve_dae, compiled=True), twin_of(problem).system, problem, times, tolerance)
 
 
 def _by(
@@ -136,13 +136,10 @@ def exudyn(problem: KnownProblem, times: Array, step: float) -> tuple[Array, ...
 def simulators() -> list[Simulator]:
     """All that are checked."""
     methods = [each for each in PRESETS if each not in SAME]
-    found = [Simulator(each, OURS, "twoloop", partial(ours, each), tolerances=LOW.get(each)) for each in methods]
-    found.append(Simulator("auto, compiled", OURS, "twoloop", coded))
-    found += [
-        Simulator(line.name, ADAPTERS, line.package, partial(by_line, line), not line.keeps)
-        for line in lines()
-        if line.checked
-    ]
+    found = [Simulator(each, OURS, "twoloop", partial(ours, each, False), tolerances=LOW.get(each)) for each in methods]
+    found.append(Simulator("auto, compiled", OURS, "twoloop", partial(ours, "auto", True)))
+    checked = [line for line in lines() if line.checked]
+    found += [Simulator(each.name, ADAPTERS, each.package, partial(by_line, each), not each.keeps) for each in checked]
     found.append(Simulator("Exudyn, GeneralizedAlpha", ADAPTERS, "exudyn", exudyn, steps=STEPS))
     return found + [Simulator(each.NAME, SHOWN, each.PACKAGE, each.simulate, each.DRIFTS) for each in shown()]
 

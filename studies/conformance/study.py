@@ -1,4 +1,4 @@
-"""Which solvers pass the check of `twoloop.testing`, that anyone can run on a simulator: ours, rivals, and how."""
+"""Which solvers pass the check of `twoloop.testing`: ours, rivals by our adapters, rivals as their authors show."""
 
 import signal
 import warnings
@@ -65,7 +65,6 @@ def _row(simulator: Simulator, finding: Finding) -> Row:
 
 
 def make(output: Output) -> pd.DataFrame:
-    """Check everything."""
     quick, rows = output.call.quick, list[Row]()
     chosen = [each for each in simulators() if not quick or each.name in QUICK]
     warnings.simplefilter("ignore", ConstraintWarning)
@@ -91,12 +90,9 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     found: dict[str, Any] = {"groups": {}, "n_problems": int(rows["problem"].nunique()), "limit": LIMIT}
     for group in (OURS, ADAPTERS, SHOWN):
         lines = [_line(str(name), own) for name, own in rows[rows["group"] == group].groupby("simulator", sort=False)]
-        passed = [line["simulator"] for line in lines if line["checked"] and not line["failures"]]
-        found["groups"][group] = {
-            "lines": lines,
-            "passed": passed,
-            "n": len([line for line in lines if line["checked"]]),
-        }
+        checked = [line for line in lines if line["checked"]]
+        passed = [line["simulator"] for line in checked if not line["failures"]]
+        found["groups"][group] = {"lines": lines, "passed": passed, "n": len(checked)}
     outcomes = rows["outcome"].value_counts()
     return found | {"outcomes": {each: int(outcomes.get(each, 0)) for each in (PASSED, FAILED, UNTOLD)}}
 
@@ -141,5 +137,3 @@ def _short(message: str) -> str:
 
 
 STUDY = Study("conformance", __doc__, make, findings_of, tables=tables_of)
-
-main = STUDY.main

@@ -1,3 +1,3 @@
-from studies.energy import main
+from studies.energy.study import STUDY
 
-main()
+STUDY.main()

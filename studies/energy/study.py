@@ -12,10 +12,9 @@ from studies.bench import figures
 from studies.bench.cli import StudyError
 from studies.bench.headline import OWN_CODE
 from studies.bench.render import number
-from studies.bench.runs_by_error import setting_of
 from studies.bench.solvers import CVODE_C, DEFAULT, HEYOKA, IDA_C, IRK, OWN_EXPLICIT
 from studies.bench.study import Study, rows_of
-from studies.bench.tables import setting, where
+from studies.bench.tables import setting, setting_of, where
 from studies.energy.drift import DRIFTING, IRREGULAR, IS_LOST, NO_DRIFT, bound, verdict
 from studies.energy.runs import (
     BASIC,
@@ -37,6 +36,7 @@ from studies.energy.runs import (
 SHARES = (1e-3, 1e-5, 1e-7)  # of the largest kinetic energy: energy errors at which costs are compared
 EQUAL = 0.1  # costs that differ by less count as equal: runs share the machine and are made once
 KEEPING = f"{GAUSS}, symmetric partition"
+FATES = dict.fromkeys(DRIFTING, "drift") | {each: each for each in (NO_DRIFT, IS_LOST, IRREGULAR)}  # in one word
 DRAWN = (DEFAULT, OWN_CODE, OWN_EXPLICIT, IDA_C, HEYOKA, CVODE_C, TRAPEZOIDAL, KEEPING, IRK)  # over cost
 
 
@@ -77,17 +77,15 @@ def told(row: pd.Series) -> dict[str, Any]:
     return found | {"keeps": bool(row["keeps_constraints"])}
 
 
-def _fate(verdict: str) -> str:
-    """What became of the energy in one word, of a verdict."""
-    return "drift" if verdict in DRIFTING else verdict if verdict in (NO_DRIFT, IS_LOST, IRREGULAR) else "fail"
+def ended(rows: pd.DataFrame) -> pd.Series:
+    """Which runs reached their end and have not lost the motion."""
+    return (rows["status"] == "REACHED_END") & ~rows["lost"].fillna(True).astype(bool)
 
 
 def settled(rows: pd.DataFrame) -> pd.Series:
     """Largest energy error of each run and of those of its solver with tighter settings; inf where one did not end."""
-    ended = (rows["status"] == "REACHED_END") & ~rows["lost"].fillna(True).astype(bool)
-    runs = rows.assign(
-        worst=rows["energy"].abs().where(ended, np.inf), setting=setting_of(rows), fixed=rows["h"].notna()
-    )
+    worst = rows["energy"].abs().where(ended(rows), np.inf)
+    runs = rows.assign(worst=worst, setting=setting_of(rows), fixed=rows["h"].notna())
     return runs.sort_values("setting").groupby(["name", "fixed"])["worst"].cummax().reindex(rows.index)
 
 
@@ -98,7 +96,7 @@ def cheapest(rows: pd.DataFrame) -> dict[str, Any] | None:
 
 def long_of(rows: pd.DataFrame) -> dict[str, Any]:
     """The class "long and conservative": what small energy errors cost with a drift and without, alternatives."""
-    reached = rows.assign(worst=settled(rows))[(rows["status"] == "REACHED_END") & ~rows["lost"].astype(bool)]
+    reached = rows.assign(worst=settled(rows))[ended(rows)]
     calm, own = reached["verdict"] == NO_DRIFT, reached["family"] == "two-loop"
     kinetic = float(reached["kinetic"].iloc[0])
     at = []
@@ -114,36 +112,23 @@ def long_of(rows: pd.DataFrame) -> dict[str, Any]:
         level["pays"] = free is not None and over * (1.0 - EQUAL) > 1.0
         at.append(level | {"equal": free is not None and 1.0 - EQUAL <= over <= 1.0 / (1.0 - EQUAL)})
     bounds = [level["energy"] for level in at[1:]]
-    lucky = [reached[(reached["energy"].abs() <= bound) & (reached["worst"] > bound)] for bound in bounds]
+    lucky = [cheapest(reached[(reached["energy"].abs() <= bound) & (reached["worst"] > bound)]) for bound in bounds]
     kept = [level["no_drift"]["ours"] for level in at[1:] if level["no_drift"]["ours"]]
-    both = [(level["no_drift"]["ours"], level["drift"]["ours"]) for level in at[1:]]
-    over_drifting = [one["call_s"] / other["call_s"] for one, other in both if one and other]
-    rivals = [other for one, other in both if one and other]
+    sides = [(level["no_drift"]["ours"], level["drift"]["ours"]) for level in at[1:]]
+    both = [side for side in sides if all(side)]
+    over_drifting = [one["call_s"] / other["call_s"] for one, other in both]
     listed = rows[rows["group"].isin(("other", "controlled"))]
     places = [run["energy"].abs().fillna(np.inf).idxmin() for _, run in listed.groupby("name", sort=False)]
-    return {
-        "case": SWITCHING,
-        "problem": rows["problem"].iloc[0],
-        "t_end": float(rows["t_end"].iloc[0]),
-        "kinetic": kinetic,
-        "no_drift": at[0]["no_drift"],
-        "at": at[1:],
-        "lucky": [
-            told(own.loc[own["call_s"].idxmin()]) | {"within": bound}
-            for own, bound in zip(lucky, bounds, strict=True)
-            if len(own)
-        ],
-        "calm_ours": {
-            "labels": list(dict.fromkeys(run["label"] for run in kept)),
-            "fixed": bool(kept) and all(run["fixed_steps"] for run in kept),
-            "over_drifting": [min(over_drifting), max(over_drifting)] if over_drifting else None,
-            "drifting_explicit": bool(rivals) and all(run["explicit"] for run in rivals),
-        },
-        "n_pays": sum(level["pays"] for level in at[1:]),
-        "n_equal": sum(level["equal"] for level in at[1:]),
-        "equal": EQUAL,
-        "alternatives": [told(rows.loc[place]) for place in places],  # of each the run of least error
-    }
+    calm_ours: dict[str, Any] = {"labels": list(dict.fromkeys(run["label"] for run in kept))}
+    calm_ours["fixed"] = bool(kept) and all(run["fixed_steps"] for run in kept)
+    calm_ours["over_drifting"] = [min(over_drifting), max(over_drifting)] if over_drifting else None
+    calm_ours["drifting_explicit"] = bool(both) and all(other["explicit"] for _, other in both)
+    found = {"case": SWITCHING, "problem": rows["problem"].iloc[0], "t_end": float(rows["t_end"].iloc[0])}
+    found |= {"kinetic": kinetic, "no_drift": at[0]["no_drift"], "at": at[1:]}
+    found["lucky"] = [run | {"within": bound} for run, bound in zip(lucky, bounds, strict=True) if run]
+    found |= {"calm_ours": calm_ours, "n_pays": sum(level["pays"] for level in at[1:])}
+    found |= {"n_equal": sum(level["equal"] for level in at[1:]), "equal": EQUAL}
+    return found | {"alternatives": [told(rows.loc[place]) for place in places]}  # of each the run of least error
 
 
 def variants_of(fixed: pd.DataFrame) -> list[dict[str, Any]]:
@@ -158,7 +143,6 @@ def variants_of(fixed: pd.DataFrame) -> list[dict[str, Any]]:
 
 
 def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
-    """What the report and the first screen say."""
     rows = judged(rows)
     fixed = where(rows, group="fixed", case=SWITCHING)
     even = fixed["partition"] == "symmetric"
@@ -169,30 +153,25 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     chosen = ((SUN,), (GAUSS,), (SUN, MOMENTA), (RADAU,))
     sun, gauss, canonical, radau = (told(pick(rows, ONE, *which)) for which in chosen)
     both = {"one": ONE, "switching": SWITCHING}
-    return {
-        "long": long_of(rows[rows["case"] == SWITCHING]),
-        "sun": sun,
-        "gauss": gauss,
-        "radau": radau,
-        "radau_over_sun": abs(radau["drift"] / sun["drift"]) if sun["drifts"] and radau["drifts"] else None,
-        "canonical": canonical,
-        "sun_over_gauss": abs(sun["drift"]) / gauss["bound"],
-        "sun_over_canonical": abs(sun["drift"]) / canonical["bound"],
-        "variants": variants_of(rows[rows["group"] == "fixed"]),
-        "n": {name: len(each) for name, each in calm.items()},
-        "n_calm": {name: int(each.sum()) for name, each in calm.items()},
-        "uneven_drifts": bool(fixed[kinds["uneven"]]["verdict"].isin(DRIFTING).all()),
-        "n_controlled": len(controlled),
-        "controlled_steady": [told(run) | {"case": run["case"]} for _, run in steady.iterrows()],
-        "lasting": dict(Counter(fixed[kinds["lasting"]]["verdict"].map(_fate))),
-        "paper": {name: told(pick(rows, motion, IRK, group="controlled")) for name, motion in both.items()},
-        "failed": int((rows["status"] != "REACHED_END").sum()),
-        "problems": {name: rows[rows["case"] == motion]["problem"].iloc[0] for name, motion in both.items()},
-    }
+    found: dict[str, Any] = {"long": long_of(rows[rows["case"] == SWITCHING]), "sun": sun, "gauss": gauss}
+    found["radau"] = radau
+    found["radau_over_sun"] = abs(radau["drift"] / sun["drift"]) if sun["drifts"] and radau["drifts"] else None
+    found |= {"canonical": canonical, "sun_over_gauss": abs(sun["drift"]) / gauss["bound"]}
+    found["sun_over_canonical"] = abs(sun["drift"]) / canonical["bound"]
+    found["variants"] = variants_of(rows[rows["group"] == "fixed"])
+    found |= {"n": {name: len(each) for name, each in calm.items()}}
+    found |= {"n_calm": {name: int(each.sum()) for name, each in calm.items()}}
+    found["uneven_drifts"] = bool(fixed[kinds["uneven"]]["verdict"].isin(DRIFTING).all())
+    found["n_controlled"] = len(controlled)
+    found["controlled_steady"] = [told(run) | {"case": run["case"]} for _, run in steady.iterrows()]
+    found["lasting"] = dict(Counter(FATES.get(each, "fail") for each in fixed[kinds["lasting"]]["verdict"]))
+    found["paper"] = {name: told(pick(rows, motion, IRK, group="controlled")) for name, motion in both.items()}
+    found["failed"] = int((rows["status"] != "REACHED_END").sum())
+    found["problems"] = {name: rows[rows["case"] == motion]["problem"].iloc[0] for name, motion in both.items()}
+    return found
 
 
 def figures_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Figure]:
-    """Both figures of the report."""
     rows = judged(rows)
     return {"energy_cost": cost_figure(rows), "energy_long": time_figure(rows)}
 
@@ -200,8 +179,8 @@ def figures_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Figure]:
 def cost_figure(rows: pd.DataFrame) -> Figure:
     """Cost of the long run over its largest energy error, on the geometry whose partition changes."""
     long = rows[rows["case"] == SWITCHING]
-    ended = (long["status"] == "REACHED_END") & ~long["lost"].fillna(True).astype(bool)
-    long = long.assign(error_q=long["energy"].abs().where(ended), floor=0.0, solver=long["name"], astray=False)
+    errors = long["energy"].abs().where(ended(long))
+    long = long.assign(error_q=errors, floor=0.0, solver=long["name"], astray=False)
     long = long[long["solver"].isin(DRAWN) & ((long["solver"] != KEEPING) | long["h"].notna())]
     title = f"{number(long['t_end'].iloc[0])} s, each run timed once; ringed: no drift"
     figure = figures.work_precision(long, DRAWN, title, "largest energy error over the run (J)")
@@ -232,4 +211,3 @@ def time_figure(rows: pd.DataFrame) -> Figure:
 
 
 STUDY = Study("energy", __doc__, rows_of(runs, measure), findings_of, figures_of, medians=True, curves=True)
-main = STUDY.main

@@ -1,3 +1,3 @@
-from studies.engines import main
+from studies.engines.study import STUDY
 
-main()
+STUDY.main()

@@ -26,7 +26,6 @@ class Configuration:
 
     @property
     def name(self) -> str:
-        """In tables and rows."""
         return f"{NAMES[self.engine]}, {self.label}"
 
 

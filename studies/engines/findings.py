@@ -1,6 +1,6 @@
 """What the rows of the engines say: what to set, what it costs, where errors end, and who is wrong without a word."""
 
-from collections.abc import Iterable
+from collections import Counter
 from typing import Any
 
 import numpy as np
@@ -42,11 +42,12 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     found["apart"] = float(runs["floor"].astype(float).max())
     found["configurations"] = [_configuration(each, runs[runs["solver"] == each.name]) for each in CONFIGURATIONS]
     cheapest = [_cheapest(runs[runs["case"] == case]) for case in cases]
+    cheapest_of = [line["engines"] for line in cheapest]
     found["call_over_engines"] = dict(zip(cases, (line["ratio"] for line in cheapest), strict=True))
-    found["wins_engines"] = [_counted(line["engines"][k] for line in cheapest) for k in range(len(ERRORS))]
-    found["engines"] = [
-        line for name in NAMES.values() if (line := _engine(runs[runs["family"] == name], cases)) is not None
-    ]
+    wins = [Counter(sorted(each.split(", ")[0] for each in names if each)) for names in zip(*cheapest_of, strict=True)]
+    found["wins_engines"] = [dict(each.most_common()) for each in wins]
+    engines = [_engine(runs[runs["family"] == name], cases) for name in NAMES.values()]
+    found["engines"] = [line for line in engines if line is not None]
     found["set_for"], found["speeds"] = list(SET_FOR), list(SPEEDS)
     found["probed"] = [CONFIGURATIONS[0].name, *(line["solver"] for line in found["engines"])]
     found["probes"] = [
@@ -55,12 +56,6 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     ]
     found["exact"] = EXACT
     return found
-
-
-def _counted(cheapest: Iterable[str | None]) -> dict[str, int]:
-    """On how many mechanisms each engine is the cheapest."""
-    names = [solver.split(", ")[0] for solver in cheapest if solver]
-    return {name: names.count(name) for name in sorted(set(names), key=lambda each: (-names.count(each), each))}
 
 
 def _configuration(each: Configuration, runs: pd.DataFrame) -> dict[str, Any]:
@@ -121,22 +116,15 @@ def _engine(runs: pd.DataFrame, cases: list[str]) -> dict[str, Any] | None:
     }
     for error in ERRORS:
         reached = [own for own in by_case.values() if _priced(own, error)]
-        medians = {
-            what: float(np.median([_priced(own, error, what) or np.nan for own in reached]))
-            for what in ("call_s", "stepping_s")
-            if reached
-        }
-        line["at"].append({"reached": len(reached), **medians})
-    for speed in SPEEDS:
-        least = [_within(own, speed) for own in by_case.values()]
-        line["speeds"].append(float(np.median(least)) if np.isfinite(np.median(least)) else None)
+        line["at"].append({"reached": len(reached)})
+        for what in ("call_s", "stepping_s") if reached else ():
+            line["at"][-1][what] = float(np.median([_priced(own, error, what) or np.nan for own in reached]))
+    for speed in SPEEDS:  # of the calls so many times faster than real time the least error; infinite: none
+        runs_ = [own.astype({"call_s": float, "span": float, "error_q": float}) for own in by_case.values()]
+        least = [own["error_q"][own["call_s"] <= own["span"] / speed].min() for own in runs_]
+        middle = float(np.median(np.nan_to_num(least, nan=np.inf)))
+        line["speeds"].append(middle if np.isfinite(middle) else None)
     return line
-
-
-def _within(runs: pd.DataFrame, speed: float) -> float:
-    """The least error of the runs on a mechanism with calls so many times faster than real time; infinite: none."""
-    fast = runs[runs["error_q"].notna() & (runs["call_s"].astype(float) <= runs["span"].astype(float) / speed)]
-    return float(fast["error_q"].astype(float).min()) if len(fast) else np.inf
 
 
 def _probe(rows: pd.DataFrame, solver: str, of: str, group: str, measure: str) -> float | None:

@@ -60,7 +60,9 @@ def make(output: Output) -> pd.DataFrame:
         rows: list[Row] = []
         for group, build in ((group, build) for group, builds in groups.items() for build in builds):
             for engine in MODULES:
-                rows.append(kept.made(f"{GATE} {build.__name__} {engine}", partial(_gate_row, build, engine)))
+                status, message = gated(build, engine)
+                told = {"solver": NAMES[engine], "family": NAMES[engine], "status": status, "message": message}
+                rows.append(kept.made(f"{GATE} {build.__name__} {engine}", partial(_row, GATE, build, **told)))
             for each in CONFIGURATIONS if group == RUN else ASKED_MORE:
                 cost: list[float] = []  # of the run before, and its steps
                 values: Any = FEWER[group][each.engine == OURS]
@@ -85,11 +87,6 @@ def _row(group: str, build: Callable[[], Any], **more: Any) -> Row:
     loop = loop_of(build)
     known = {"group": group, "case": loop.problem.name, "span": loop.t_end}
     return {**known, **dict.fromkeys(names), "message": "", **more}
-
-
-def _gate_row(build: Callable[[], Any], engine: str) -> Row:
-    status, message = gated(build, engine)
-    return _row(GATE, build, solver=NAMES[engine], family=NAMES[engine], status=status, message=message)
 
 
 def _prepared(build: Callable[[], Any], each: Configuration) -> tuple[Prepared | None, Row]:
@@ -117,18 +114,14 @@ def run_row(build: Callable[[], Any], each: Configuration, value: float, before:
             return row | why
         if before and before[0] * value / before[1] > LIMIT:
             return row | {"status": "TIME_LIMIT", "message": f"not run: would take more than {LIMIT:g} s"}
-        run = partial(prepared.run, loop.t_end, int(value), INSTANTS)
-        again = partial(_again, prepared, loop.t_end, int(value))
+        run, alone = (partial(prepared.run, loop.t_end, int(value), n) for n in (INSTANTS, 1))
+        again = lambda k: alone()  # noqa: E731
     motion = run()
     if motion.message:
         return row | {"status": "FAILED", "message": motion.message, "call_s": motion.call_s}
     call, stepping = timed(again) if group == RUN else (motion.call_s, motion.stepping_s)
     row |= {"call_s": call, "stepping_s": stepping, "floor": loop.reference[1]}
     return row | errors(loop, motion)
-
-
-def _again(prepared: Prepared, t_end: float, n_steps: int, k: int) -> Motion:
-    return prepared.run(t_end, n_steps, 1)
 
 
 def _ours(loop: Loop, tolerance: float) -> tuple[Callable[[], Motion], Callable[[int], Motion]]:
@@ -202,12 +195,8 @@ def figures_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Figure]:
         panel.set_xlabel("error of positions (m, or of the axes)")
     for panel in panels[:, 0]:
         panel.set_ylabel("CPU time of the call (ms)")
-    entries = {
-        label: handle for panel in panels.flat for handle, label in zip(*panel.get_legend_handles_labels(), strict=True)
-    }
-    figure.legend(entries.values(), entries, loc="outside lower center", ncols=3, fontsize=8)
+    figures.legend(figure, panels.flat, below=3)
     return {"engines": figure}
 
 
 STUDY = Study("engines", __doc__, make, findings_of, figures_of)
-main = STUDY.main

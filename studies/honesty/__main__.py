@@ -1,3 +1,3 @@
-from studies.honesty import main
+from studies.honesty.study import STUDY
 
-main()
+STUDY.main()

@@ -19,6 +19,10 @@ from twoloop.run.run import LONGEST_UNSEEN
 OWN = (GIVEN, "Taylor", "Adams", "DOP853", "Gauss12", "RadauIIA5", "BDF")
 IDA, IDA_C, CVODE_C, HEYOKA = "IDA, stabilised", "IDA from C", "CVODE from C, Adams", "heyoka, Taylor"
 PROJECTED = "CVODE from C, BDF, projected"
+OTHERS: dict[str, Callable[..., Result]] = {  # but for SciPy's
+    **{IDA: partial(solve_ida, form="stabilised"), IDA_C: solve_ida_c, CVODE_C: partial(solve_cvode_c, method="Adams")},
+    **{HEYOKA: solve_heyoka, PROJECTED: partial(solve_cvode_c, method="BDF", projected=True)},
+}
 COMPILED_ONLY = (IDA_C, CVODE_C, PROJECTED, HEYOKA)
 SCIPY = ("LSODA", "DOP853", "Radau", "BDF")
 OF_FORCES = (  # further ones of ours under sharp forces: all presets but the paper's, which follow it to the letter
@@ -72,15 +76,11 @@ def other(solve: Callable[..., Result], limited: bool, trap: Trap) -> Result:
 def solvers(quick: bool, group: str = MISTAKE) -> dict[str, Call]:
     """Name to call, of those that are run on a group of traps; ours first, then others without `max_step` and with."""
     ours = OF_SHORT if group == SHORT else (*OWN, *(OF_FORCES if group in (FORCE, HELD_OUT) else ()))
-    theirs = SCIPY_OF_SHORT if group == SHORT else SCIPY
+    theirs = QUICK_SCIPY if quick else SCIPY_OF_SHORT if group == SHORT else SCIPY
+    left_out = OTHERS if quick else (IDA, PROJECTED) if group == SHORT else ()
     made: dict[str, Call] = {f"{name}{OURS}": partial(own, name) for name in (QUICK_OWN if quick else ours)}
-    others: dict[str, Callable[..., Result]] = {}
-    if not quick:
-        others = {} if group == SHORT else {IDA: partial(solve_ida, form="stabilised")}
-        others |= {IDA_C: solve_ida_c}
-        others |= {CVODE_C: partial(solve_cvode_c, method="Adams"), HEYOKA: solve_heyoka}
-        others |= {} if group == SHORT else {PROJECTED: partial(solve_cvode_c, method="BDF", projected=True)}
-    others |= {f"{name}, index 1": partial(solve_index1, method=name) for name in (QUICK_SCIPY if quick else theirs)}
+    others = {name: solve for name, solve in OTHERS.items() if name not in left_out}
+    others |= {f"{name}, index 1": partial(solve_index1, method=name) for name in theirs}
     made |= {name: partial(other, solve, False) for name, solve in others.items()}
     if group not in (INPUT, SHORT):  # to whose checks steps do not matter; of which max_step is the remedy
         made |= {name + LIMITED: partial(other, solve, True) for name, solve in others.items()}

@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from references.heyoka.taylor import LARGEST_UNROLLED
 from references.sundials.loop import SMALLEST_STEP
 from studies.bench import figures
-from studies.bench.apart import apart
+from studies.bench.apart import apart, heard
 from studies.bench.cli import StudyError
 from studies.bench.end_states import EXACT
 from studies.bench.render import power
@@ -105,20 +105,14 @@ def _end(system: ConstrainedSystem, trap: Trap, method: str, tolerance: float) -
 
 def cell(call: Call, trap: Trap, truth: Array | None) -> Row:
     """Make a run: what came of it."""
-    made: Row = {"status": "", "message": "", "error": None, "warned": "", "asked": True}
-    with warnings.catch_warnings(record=True) as said:
-        warnings.simplefilter("always")
-        try:
-            result = call(trap)
-            made |= {"status": result.status.name, "message": result.message}
-            if result.success and truth is not None:
-                made["error"] = float(np.nanmax(np.abs(result.q[:, -1] - truth)))
-            if result.success and trap.unnoticed is not None:
-                without = call(replace(trap, system=trap.unnoticed))
-                made["asked"] = not np.array_equal(result.q, without.q)
-        except Exception as error:
-            made |= {"status": "RAISED", "message": f"{type(error).__name__}: {error}"}
-    return made | {"warned": " / ".join(str(each.message) for each in said)}
+    result, made = heard(partial(call, trap))
+    made |= {"error": None, "asked": True}
+    if result is not None and result.success and truth is not None:
+        made["error"] = float(np.nanmax(np.abs(result.q[:, -1] - truth)))
+    if result is not None and result.success and trap.unnoticed is not None:
+        without, _ = heard(partial(call, replace(trap, system=trap.unnoticed)))
+        made["asked"] = without is None or not np.array_equal(result.q, without.q)
+    return made
 
 
 def outcome(row: Row, trap: Trap, has_answer: bool) -> str:
@@ -298,9 +292,8 @@ def of_mistakes(rows: pd.DataFrame) -> dict[str, Any]:
     ran = rows[rows["outcome"] != NOT_RUN]
     found: dict[str, Any] = {"n_traps": rows["trap"].nunique(), "n_cells": len(ran), "traps": of_traps(ran)}
     alike = {str(trap): set(own["outcome"]) for trap, own in ran.groupby("trap", sort=False)}
-    for key, outcome in (("all_say_so", SAID), ("all_right", RIGHT)):
-        found[key] = [trap for trap, outcomes in alike.items() if outcomes == {outcome}]
-    found["missed_by_all"] = [trap for trap, outcomes in alike.items() if outcomes <= {SILENT, HANG}]
+    for key, outcomes in (("all_say_so", {SAID}), ("all_right", {RIGHT}), ("missed_by_all", {SILENT, HANG})):
+        found[key] = [trap for trap, seen in alike.items() if seen <= outcomes]
     found["counts"] = {str(name): counts_of(own) for name, own in rows.groupby("solver", sort=False)}
     found |= {"looseness": LOOSENESS, "grace": GRACE, "agree": AGREE}
     return found | {f"{whose}_bad": lines for whose, lines in bad_in(rows).items()}
@@ -359,4 +352,3 @@ def picture(totals: Sequence[dict[str, Any]]) -> Figure:
 
 
 STUDY = Study("honesty", __doc__, make, findings_of, figures_of)
-main = STUDY.main

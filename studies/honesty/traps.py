@@ -1,6 +1,7 @@
 """Traps: systems and starts on which a solver goes wrong unless it notices, each on two mechanisms.
 
-One set of compiled callbacks serves those on chains of point masses: what makes the trap stands in the parameters.
+One set of compiled callbacks serves those on chains of point masses, that of `sharp_callbacks` with a force of its own:
+what makes the trap stands in the parameters.
 """
 
 import math
@@ -13,7 +14,8 @@ import numpy as np
 
 from studies.bench.cli import StudyError
 from studies.bench.random_linkages import end_of
-from studies.bench.sharp_forces import FRICTIONS, GUSTS, T_END, Sharp, families
+from studies.bench.sharp_callbacks import CHAIN, chain_force, chain_jacobian
+from studies.bench.sharp_forces import FRICTIONS, GUSTS, T_END, Sharp, families, made
 from studies.bench.sharp_mechanisms import Mechanism, bars, row, slider_in_space
 from studies.bench.sharp_mechanisms import chain as chain_of
 from studies.bench.sharp_motion import CHECK, RTOL, march, motion, off
@@ -40,88 +42,30 @@ FORCES = (  # families of `sharp_forces`
 UNKNOWN_IN_SPACE = FORCES[-4:]  # two methods do not agree to AGREE there: the truth is not known
 KINK = "drive with a kink"
 QUICK_FORCES = ("drag", "gust of 30 ms", KINK)
-# places in the parameters: gravity, mass of the last point, stiffness of a spring that holds it, begin and end of a
-# force along x and its size, when the force becomes NaN, when it raises, wrong entry of C_q, amplitude and frequency
-# of the pivot, where the spring is at rest
-G, LAST, SPRING, BEGIN, END, PUSH, NAN, RAISES, WRONG, AMPLITUDE, OMEGA, REST = range(12)
-SANE = (9.81, 1.0, 0.0, NEVER, NEVER, 0.0, NEVER, NEVER, 0.0, 0.0, 0.0, 0.0)
-
-
-@callback("mass")
-def mass(t, q, p, M):  # type: ignore[no-untyped-def]
-    for i in range(q.size):
-        M[i, i] = p[1] if i >= q.size - 2 else 1.0
+# places in the parameters behind lengths and masses, of what makes the trap: a spring that holds the last point, and
+# where it is at rest; begin and end of a force along x and its size, when the force becomes NaN, when it raises, a
+# wrong entry of C_q
+SPRING, REST, BEGIN, END, PUSH, NAN, RAISES, WRONG = range(8)
+SANE = (0.0, 0.0, NEVER, NEVER, 0.0, NEVER, NEVER, 0.0)
 
 
 @callback("force")
 def force(t, q, v, p, Q):  # type: ignore[no-untyped-def]
-    if t > p[7]:
-        raise ValueError("the trap's callback raises")
     n = q.size
-    for i in range(1, n, 2):
-        Q[i] = -p[0] * (p[1] if i == n - 1 else 1.0)
-    Q[n - 2] -= p[2] * (q[n - 2] - p[11])
-    if p[3] < t <= p[4]:
-        Q[n - 2] += p[5]
-    if t > p[6]:
+    if t > p[n + RAISES]:
+        raise ValueError("the trap's callback raises")
+    chain_force(t, q, v, p, Q)
+    Q[n - 2] -= p[n + SPRING] * (q[n - 2] - p[n + REST])
+    if p[n + BEGIN] < t <= p[n + END]:
+        Q[n - 2] += p[n + PUSH]
+    if t > p[n + NAN]:
         Q[n - 2] = math.nan
-
-
-@callback("constraint")
-def constraint(t, q, p, C):  # type: ignore[no-untyped-def]
-    n = q.size // 2
-    for i in range(C.size):
-        k = i % n  # a further row repeats one
-        x = q[0] - p[9] * math.sin(p[10] * t) if k == 0 else q[2 * k] - q[2 * k - 2]
-        y = q[1] if k == 0 else q[2 * k + 1] - q[2 * k - 1]
-        C[i] = 0.5 * (x * x + y * y - 1.0) * (1.0 + i // n)
 
 
 @callback("jacobian")
 def jacobian(t, q, p, Cq):  # type: ignore[no-untyped-def]
-    n = q.size // 2
-    for i in range(Cq.shape[0]):
-        k, scale = i % n, 1.0 + i // n
-        if k == 0:
-            Cq[i, 0] = scale * (q[0] - p[9] * math.sin(p[10] * t))
-            Cq[i, 1] = scale * q[1]
-        else:
-            for axis in range(2):
-                apart = scale * (q[2 * k + axis] - q[2 * k - 2 + axis])
-                Cq[i, 2 * k + axis] = apart
-                Cq[i, 2 * k - 2 + axis] = -apart
-    Cq[0, 1] += p[8]
-
-
-@callback("constraint_rate")
-def constraint_rate(t, q, p, Ct):  # type: ignore[no-untyped-def]
-    n = q.size // 2
-    rate = p[9] * p[10] * math.cos(p[10] * t)
-    for i in range(0, Ct.size, n):
-        Ct[i] = -(1.0 + i // n) * (q[0] - p[9] * math.sin(p[10] * t)) * rate
-
-
-@callback("gamma")
-def gamma(t, q, v, p, Qd):  # type: ignore[no-untyped-def]
-    n = q.size // 2
-    rate = p[9] * p[10] * math.cos(p[10] * t)
-    second = -p[10] * p[10] * p[9] * math.sin(p[10] * t)
-    for i in range(Qd.size):
-        k = i % n
-        x = v[0] - rate if k == 0 else v[2 * k] - v[2 * k - 2]
-        y = v[1] if k == 0 else v[2 * k + 1] - v[2 * k - 1]
-        Qd[i] = -(x * x + y * y)
-        if k == 0:
-            Qd[i] += (q[0] - p[9] * math.sin(p[10] * t)) * second
-        Qd[i] *= 1.0 + i // n
-
-
-def chain(n: int, parameters: Array, rows: int = 0) -> ConstrainedSystem:
-    """A chain of n points a metre apart that hangs from a pivot, the first `rows` of its constraints twice."""
-    functions: dict[str, Any] = {"mass": mass, "force": force, "constraint": constraint, "jacobian": jacobian}
-    functions |= {"constraint_rate": constraint_rate, "gamma": gamma}
-    about: dict[str, Any] = {"parameters": parameters, "constant_mass": True, "name": f"chain of {n}"}
-    return ConstrainedSystem(n_q=2 * n, n_c=n + rows, **functions, **about)
+    chain_jacobian(t, q, p, Cq)
+    Cq[0, 1] += p[q.size + WRONG]
 
 
 def fails(Q: Array, t: float, *state: Array) -> Array:
@@ -129,11 +73,6 @@ def fails(Q: Array, t: float, *state: Array) -> Array:
     if t > 1.0:
         raise KeyError("the trap's callback raises")
     return Q
-
-
-def misshapes(Q: Array, t: float, *state: Array) -> Array:
-    """One force too few after 1 s."""
-    return Q if t <= 1.0 else Q[:-1]
 
 
 @dataclass(frozen=True)
@@ -203,29 +142,36 @@ def of_chain(n: int) -> list[Trap]:
     """The traps on one chain."""
     q0, v0 = start(n)
 
-    def system(rows: int = 0, **changed: float) -> ConstrainedSystem:
-        p = np.array(SANE)
+    def system(
+        rows: int = 0, last: float = 1.0, drive: tuple[float, float] = (0.0, 0.0), **changed: float
+    ) -> ConstrainedSystem:
+        """A metre between points of 1 kg, the `last` but one; the first `rows` of the constraints twice."""
+        own = np.array(SANE)
         for name, value in changed.items():
-            p[globals()[name]] = value
-        return chain(n, p, rows)
+            own[globals()[name]] = value
+        p = np.concatenate([np.ones(2 * n - 1), [last], own, made("", 4, drive, drives=True).parameters])
+        functions = CHAIN | {"force": force, "jacobian": jacobian}
+        about: dict[str, Any] = {"parameters": p, "constant_mass": True, "name": f"chain of {n}"}
+        return ConstrainedSystem(n_q=2 * n, n_c=n + rows, **functions, **about)
 
-    def trap(name: str, made: ConstrainedSystem, sane: ConstrainedSystem | None, t_end: float = 2.0, **more: object):  # type: ignore[no-untyped-def]
-        return Trap(name, f"chain of {n}", made, **({"q0": q0, "v0": v0} | more), t_end=t_end, sane=sane)  # type: ignore[arg-type]
+    def trap(name: str, given: ConstrainedSystem, sane: ConstrainedSystem | None, t_end: float = 2.0, **more: object):  # type: ignore[no-untyped-def]
+        return Trap(name, f"chain of {n}", given, **({"q0": q0, "v0": v0} | more), t_end=t_end, sane=sane)  # type: ignore[arg-type]
 
+    shorter = lambda Q, t, *state: Q if t <= 1.0 else Q[:-1]  # noqa: E731
     across = np.zeros(2 * n)
     across[:2] = 1e-2 * q0[:2]
-    fast = system(AMPLITUDE=0.01, OMEGA=1e3)
+    fast = system(drive=(0.01, 1e3))
     moving = np.zeros(2 * n)
     moving[::2] = 0.01 * 1e3  # all points with the pivot
     push, pulse = system(BEGIN=0.7, END=NEVER, PUSH=20.0), system(BEGIN=1.0, END=1.001, PUSH=1e3)
-    spring, heavy = system(SPRING=1e7, REST=q0[-2]), system(LAST=1e10)
+    spring, heavy = system(SPRING=1e7, REST=q0[-2]), system(last=1e10)
     return [
         trap("inconsistent positions", system(), None, q0=q0 + across / 10.0, group=INPUT),
         trap("inconsistent velocities", system(), None, v0=across, group=INPUT),
         trap("NaN in the force after 1 s", system(NAN=1.0), None),
         trap("exception in a callback after 1 s", system(RAISES=1.0), None),
         trap("exception in a Python callback after 1 s", python_copy(system(), force=fails), None),
-        trap("wrong shape from a Python callback after 1 s", python_copy(system(), force=misshapes), None),
+        trap("wrong shape from a Python callback after 1 s", python_copy(system(), force=shorter), None),
         trap("one wrong entry of C_q", system(WRONG=1e-3), system(), group=INPUT),
         trap("force that jumps", push, push, breaks=(0.7,)),
         trap("pulse of 1 ms", pulse, pulse, breaks=(1.0, 1.001), unnoticed=system()),

@@ -1,3 +1,3 @@
-from studies.planted_errors import main
+from studies.planted_errors.study import main
 
 main()

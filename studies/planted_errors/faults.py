@@ -109,24 +109,9 @@ def in_mechanism() -> Iterator[Fault]:
     )
 
 
-@callback("mass")
-def unit(t, q, p, M):  # type: ignore[no-untyped-def]
-    M[0, 0] = M[1, 1] = 1.0
-
-
 @callback("force")
 def frozen(t, q, v, p, Q):  # type: ignore[no-untyped-def]
     Q[1] = -weight
-
-
-@callback("constraint")
-def circle(t, q, p, C):  # type: ignore[no-untyped-def]
-    C[0] = 0.5 * (q[0] * q[0] + q[1] * q[1] - 1.0)
-
-
-@callback("jacobian")
-def radius(t, q, p, Cq):  # type: ignore[no-untyped-def]
-    Cq[0, 0], Cq[0, 1] = q[0], q[1]
 
 
 def pendulum_in_python(**changed: Any) -> ConstrainedSystem:
@@ -158,12 +143,11 @@ def in_trace() -> Iterator[Fault]:
 
         return force
 
-    in_numba = ConstrainedSystem(
-        n_q=2, n_c=1, mass=unit, force=frozen, constraint=circle, jacobian=radius, name="pendulum"
-    )
-    lopsided = pendulum_in_python(mass=lambda t, q: np.array([[1.0, 0.1 * q[1]], [0.0, 1.0]]))
-    changed = lambda: patch("studies.planted_errors.faults.weight", OTHER)  # noqa: E731
     sound = mechanisms.pendulum()
+    given: dict[str, Any] = sound.system.given | {"force": frozen, "parameters": sound.system.parameters}
+    in_numba = ConstrainedSystem(n_q=2, n_c=1, name="pendulum", **given)
+    lopsided = pendulum_in_python(mass=lambda t, q: np.array([[1.0, 0.1 * q[1]], [0.0, 1.0]]))
+    changed = partial(patch, "studies.planted_errors.faults.weight", OTHER)
     for name, system, plant in (
         ("a branch that tracing loses behind try/except", pendulum_in_python(force=swallowed), nullcontext),
         ("a branch on the type of t", pendulum_in_python(force=by_type), nullcontext),
@@ -211,25 +195,22 @@ def in_tableau() -> Iterator[Fault]:
         A[0, -1] += 1e-6
         return A, pair[1]
 
-    def mirrored(c: Array) -> Array:
-        return np.sort(1.0 - c)
-
-    def row(name: str, owner: Any, attribute: str, change: Callable[[Any], Any]) -> Fault:
-        return Fault(name, "tableau", _changed(owner, attribute, change), (TABLEAUX,))
-
-    yield row("an a_ij off by 1e-6", tableaux, "_collocation", off)
-    yield row("weights in the other order", tableaux, "_collocation", lambda pair: (pair[0], pair[1][::-1]))
-    yield row("A transposed", tableaux, "_collocation", lambda pair: (pair[0].T.copy(), pair[1]))
-    yield row("nodes mirrored", tableaux, "_nodes", mirrored)
-    yield row("one node off by 1e-9", tableaux, "_nodes", lambda c: c + 1e-9 * (np.arange(c.size) == 0))
-    yield row("A of Sun's family off by 1e-9", tableaux, "_symplectic_average", lambda A: A + 1e-9 * np.eye(len(A)))
-    average = lambda A, b: A  # noqa: E731
-    plain = lambda: patch.object(tableaux, "_symplectic_average", average)  # noqa: E731
+    faults: list[tuple[str, str, Callable[[Any], Any]]] = [
+        ("an a_ij off by 1e-6", "_collocation", off),
+        ("weights in the other order", "_collocation", lambda pair: (pair[0], pair[1][::-1])),
+        ("A transposed", "_collocation", lambda pair: (pair[0].T.copy(), pair[1])),
+        ("nodes mirrored", "_nodes", lambda c: np.sort(1.0 - c)),
+        ("one node off by 1e-9", "_nodes", lambda c: c + 1e-9 * (np.arange(c.size) == 0)),
+        ("A of Sun's family off by 1e-9", "_symplectic_average", lambda A: A + 1e-9 * np.eye(len(A))),
+    ]
+    for name, attribute, change in faults:
+        yield Fault(name, "tableau", _changed(tableaux, attribute, change), (TABLEAUX,))
+    plain = partial(patch.object, tableaux, "_symplectic_average", lambda A, b: A)
     yield Fault("the symplectic average left out", "tableau", plain, (TABLEAUX,))
     for name in ("A", "B", "C", "E3", "E5"):
         array = getattr(dop853_tableau, name).copy()
         array[np.unravel_index(np.flatnonzero(array)[1], array.shape)] += 1e-6
-        plant = lambda name=name, array=array: patch.object(dop853_tableau, name, array)  # noqa: E731
+        plant = partial(patch.object, dop853_tableau, name, array)
         yield Fault(f"a number of DOP853's {name} off by 1e-6", "tableau", plant, (EXPLICIT,))
 
 
@@ -264,7 +245,7 @@ def in_options() -> Iterator[Fault]:
         system, t_span, q0, v0, method, rtol, atol = arguments
         return original(system, t_span, q0, v0, method, 1e4 * rtol, 1e4 * atol, **named)
 
-    loose = lambda: patch.object(solvers, "solve_dae", looser)  # noqa: E731
+    loose = partial(patch.object, solvers, "solve_dae", looser)
     yield Fault("tolerances handed on 1e4 times too large", "options", loose, problem=pendulum)
 
 
@@ -275,7 +256,7 @@ def in_adapter() -> Iterator[Fault]:
 
     def foreign(change: Callable[[Any], Any]) -> Callable[[], AbstractContextManager[Any]]:
         changed = replace(entry, run=lambda *cell: change(entry.run(*cell)))
-        return lambda: patch.dict(solvers.CATALOGUE, {SCIPY: changed})
+        return partial(patch.dict, solvers.CATALOGUE, {SCIPY: changed})
 
     own = partial(_changed, solvers, "solve_dae")
     for solver, whose, plant in (("Gauss12", "ours", own), (SCIPY, "SciPy's", foreign)):
@@ -302,16 +283,13 @@ def in_report() -> Iterator[Fault]:
     def halved(levels: tuple[Any, dict[str, Array]]) -> tuple[Any, dict[str, Array]]:
         return levels[0], {level: 0.0 * size for level, size in levels[1].items()}
 
-    def late(pair: tuple[Array, Array]) -> tuple[Array, Array]:
-        return pair[0] * 1.5, pair[1]
-
     yield fault("columns of the table of costs swapped", tables, "work_precision", columns_swapped, TABLES)
     yield fault("costs at equal error 10 % too small", tables, "time_for", lambda time: 0.9 * time, TABLES)
     yield fault("a ranking that begins with the dearest", tables, "ranking", lambda rows: rows.iloc[::-1], TABLES)
     yield fault("no reason given for an empty cell", tables, "why_not", lambda text: "–", TABLES)
     yield fault("failed runs left out", tables, "medians", lambda rows: rows[rows["status"] == "REACHED_END"], TABLES)
     yield fault("violations counted as 0", metrics, "violations", halved, METRICS)
-    yield fault("deviations 1.5 times too large", metrics, "deviation", late, METRICS)
+    yield fault("deviations 1.5 times too large", metrics, "deviation", lambda q_v: (1.5 * q_v[0], q_v[1]), METRICS)
     yield fault("digits by the natural logarithm", metrics, "correct_digits", lambda x: x * math.log(10.0), METRICS)
     yield fault("errors of multipliers left out", metrics, "_error_lam", lambda size: None, METRICS)
     yield fault("minus signs lost", render, "number", lambda text: text.replace("−", ""), RENDER)
@@ -319,6 +297,5 @@ def in_report() -> Iterator[Fault]:
 
 
 def all_faults() -> list[Fault]:
-    """All of them, each on its own."""
     made = (in_mechanism, in_trace, in_reference, in_tableau, in_options, in_adapter, in_report)
     return [fault for make in made for fault in make()]

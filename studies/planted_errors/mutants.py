@@ -36,9 +36,8 @@ NONE = "none"
 ARGUED = tomllib.loads(Path(__file__).with_name("argued.toml").read_text())
 SWAPPED = {ast.Add: "-", ast.Sub: "+", ast.Mult: "/", ast.Div: "*"}
 COMPARED = {ast.Lt: "<=", ast.LtE: "<", ast.Gt: ">=", ast.GtE: ">", ast.Eq: "!=", ast.NotEq: "=="}
-SIGNS = {ast.Add: "+", ast.Sub: "-", ast.Mult: "*", ast.Div: "/"} | {
-    **{ast.Lt: "<", ast.LtE: "<=", ast.Gt: ">", ast.GtE: ">=", ast.Eq: "==", ast.NotEq: "!="}
-}
+SIGNS = {ast.Add: "+", ast.Sub: "-", ast.Mult: "*", ast.Div: "/", ast.Lt: "<", ast.LtE: "<="}
+SIGNS |= {ast.Gt: ">", ast.GtE: ">=", ast.Eq: "==", ast.NotEq: "!="}
 
 
 @dataclass(frozen=True)
@@ -55,7 +54,6 @@ class Mutant:
 
     @property
     def name(self) -> str:
-        """For tables and keys."""
         return f"{self.kernel}.py:{self.line}:{self.begin} {self.old} -> {self.new}"
 
     def applied(self, source: str) -> str:
@@ -188,12 +186,10 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
 
 
 def report(output: Output, rows: pd.DataFrame, line: str) -> None:
-    """Write the findings; planted_errors.md shows them."""
     output.save_findings(findings_of(rows) | {"made": line})
 
 
 def main(words: Sequence[str] | None = None) -> None:
-    """Run the study."""
     study.run_rows("mutants", __doc__, words, make, report)
 
 

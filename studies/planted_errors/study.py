@@ -153,7 +153,6 @@ def check_sound(faults: Sequence[Fault]) -> int:
 
 
 def make(output: Output) -> pd.DataFrame:
-    """Plant all faults, one after another."""
     faults = all_faults()
     if output.call.quick:
         faults = [fault for k, fault in enumerate(faults) if fault.place == "trace" or k % QUICK == 0]
@@ -162,24 +161,18 @@ def make(output: Output) -> pd.DataFrame:
         return pd.DataFrame([kept.made(fault.name, partial(row_of, fault)) for fault in faults])
 
 
-def catcher(caught_by: str) -> str:
-    """Who catches a fault: `solve_dae` as it stands, a comparison with a known motion, bounds of a run, or a test."""
-    return next((who for who, begins in BEGINS.items() if caught_by.startswith(begins)), TESTS)
-
-
 def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
-    """What the report says."""
-    missed = rows[rows["caught_by"] == NONE]
-    who = rows[rows["caught_by"] != NONE]["caught_by"].map(catcher)
-    by = {each: int((who == each).sum()) for each in (ITSELF, KNOWN, BOUNDS, TESTS)}
-    models = rows["place"] == "mechanism"
-    of_models = {"n": int(models.sum()), "stopped": int((who[models.reindex(who.index)] == ITSELF).sum())}
-    missed_ones = missed["fault"].tolist()
-    return {"n": len(rows), "missed": missed_ones, "by": by, "models": of_models, "tolerance": TOLERANCE}
+    missed, by = rows["caught_by"] == NONE, {ITSELF: 0, KNOWN: 0, BOUNDS: 0, TESTS: 0}
+    models, stopped = rows["place"] == "mechanism", 0
+    for caught_by, of_model in zip(rows["caught_by"][~missed], models[~missed], strict=True):
+        who = next((who for who, begins in BEGINS.items() if caught_by.startswith(begins)), TESTS)
+        by[who] += 1
+        stopped += of_model and who == ITSELF
+    found = {"n": len(rows), "missed": rows["fault"][missed].tolist(), "by": by}
+    return found | {"models": {"n": int(models.sum()), "stopped": int(stopped)}, "tolerance": TOLERANCE}
 
 
 def report(output: Output, rows: pd.DataFrame, line: str) -> None:
-    """Write findings and report."""
     found = findings_of(rows)
     mutants = output.path / "mutants.json"
     found["mutants"] = json.loads(mutants.read_text()) if mutants.is_file() else None
@@ -192,5 +185,4 @@ def report(output: Output, rows: pd.DataFrame, line: str) -> None:
 
 
 def main(words: Sequence[str] | None = None) -> None:
-    """Run the study and write its report."""
     study.run_rows("planted_errors", __doc__, words, make, report)

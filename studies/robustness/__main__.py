@@ -1,3 +1,3 @@
-from studies.robustness import main
+from studies.robustness.study import STUDY
 
-main()
+STUDY.main()

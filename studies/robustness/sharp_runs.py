@@ -62,9 +62,9 @@ def counts(rows: pd.DataFrame) -> dict[str, Any]:
     silent = rows[rows["outcome"] == SILENT]
 
     def of(own: pd.DataFrame) -> dict[str, int]:
-        ran = own[~refused[own.index]]
-        line = {what: int((ran["outcome"] == what).sum()) for what in (RIGHT, SAID, SILENT)}
-        return {"n": len(ran), "refused": len(own) - len(ran)} | line
+        ran = own["outcome"][~refused[own.index]]
+        counts = {what: int((ran == what).sum()) for what in (RIGHT, SAID, SILENT)}
+        return {"n": len(ran), "refused": len(own) - len(ran)} | counts
 
     found: dict[str, Any] = of(rows) | {"n_mechanisms": len(rows.groupby(["what", "name", "value"], dropna=False))}
     found["methods"] = [{"method": str(name)} | of(own) for name, own in rows.groupby("method", sort=False)]
@@ -74,17 +74,11 @@ def counts(rows: pd.DataFrame) -> dict[str, Any]:
     groups = silent.groupby(["method", "what"], sort=False)
     found["silent"] = [{"method": str(name), "what": str(what), "n": len(own)} for (name, what), own in groups]
     by_tolerance = rows.groupby("tol")["allowed"].agg(["median", "max"]).sort_index(ascending=False)
-    found["allowed"] = [
-        {"tol": float(tol), "median": float(line["median"]), "most": float(line["max"])}
-        for tol, line in by_tolerance.iterrows()
-    ]
+    found["allowed"] = by_tolerance.reset_index().rename(columns={"max": "most"}).to_dict("records")
     misled = silent[silent["method"] == DEFAULT].sort_values("error", ascending=False)
-    found["default"] = {
-        "method": DEFAULT,
-        "n": int(((rows["method"] == DEFAULT) & ~refused).sum()),
-        "wrong": misled[["what", "name", "tol", "error"]].to_dict("records"),
-    }
-    found["within_thousand"] = within_thousand(rows[(rows["method"] == DEFAULT) & ~refused])
+    own = rows[(rows["method"] == DEFAULT) & ~refused]
+    wrong = misled[["what", "name", "tol", "error"]].to_dict("records")
+    found |= {"default": {"method": DEFAULT, "n": len(own), "wrong": wrong}, "within_thousand": within_thousand(own)}
     return found | {"jumps": JUMPS}
 
 

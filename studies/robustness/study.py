@@ -1,6 +1,5 @@
 """Random linkages, sizes, masses and long runs: no answer of ours may be wrong and silent."""
 
-import warnings
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
@@ -12,9 +11,9 @@ import pandas as pd
 from studies.bench.apart import apart
 from studies.bench.random_linkages import KINDS, PLACES, draw, end_of_scaled, scaled
 from studies.bench.render import power
-from studies.bench.sharp_motion import RIGHT, SAID, SILENT
-from studies.bench.store import Array, Output, Row
-from studies.bench.study import Study
+from studies.bench.sharp_motion import RIGHT, SAID, SILENT, graded
+from studies.bench.store import Array, Row
+from studies.bench.study import Study, kept_rows
 from studies.robustness import sharp_runs
 from twoloop import solve_dae
 from twoloop.mechanisms import Problem, four_bar
@@ -38,19 +37,14 @@ LONG_LIMIT = 600.0  # s
 
 def measured(problem: Problem, method: str, t_end: float, truth: Array, unit: Array, allowed: float) -> Row:
     """A run and its outcome: the error is the largest of those of the coordinates, each over its unit."""
-    row: Row = {"method": method, "status": "", "message": "", "error": None, "allowed": allowed}
     options: dict[str, Any] = {"rtol": TOLERANCE, "atol": TOLERANCE, "time_limit": TIME_LIMIT}
-    with warnings.catch_warnings(record=True) as said:
-        warnings.simplefilter("always")
-        try:
-            result = solve_dae(problem.system, (0.0, t_end), problem.q0, problem.v0, method, **options)
-        except ValueError as error:
-            return row | {"status": "RAISED", "message": str(error), "outcome": SAID}
-    row |= {"status": result.status.name, "message": result.message, "n_evaluations": result.stats.n_evaluations}
-    if not result.success:
-        return row | {"outcome": SAID}
-    off = float(np.abs((result.q[:, -1] - truth) / unit).max())
-    return row | {"error": off, "outcome": RIGHT if off <= allowed else SAID if said else SILENT}
+    start = problem.system, (0.0, t_end), problem.q0, problem.v0
+    made = graded(
+        lambda: solve_dae(*start, method, **options),
+        lambda result: float(np.abs((result.q[:, -1] - truth) / unit).max()),
+        allowed,
+    )
+    return {"method": method} | made
 
 
 def linkages(quick: bool) -> Iterator[sharp_runs.Part]:
@@ -133,16 +127,6 @@ def long_runs(quick: bool) -> Iterator[sharp_runs.Part]:
             yield f"long {method} {n}", partial(lambda *run: [apart(partial(long_run, *run))], method, n)
 
 
-def make(output: Output) -> pd.DataFrame:
-    """Make all rows, those kept from an unfinished run aside."""
-    rows: list[Row] = []
-    with output.kept() as kept:
-        for part in (linkages, sharp_runs.random_mechanisms, scales, long_runs):
-            for key, run in part(output.call.quick):
-                rows += kept.made(key, lambda run=run: {"rows": run()})["rows"]  # type: ignore[misc]
-    return pd.DataFrame(rows)
-
-
 def counts_of(own: pd.DataFrame) -> dict[str, Any]:
     """Outcomes, and the largest share of the allowed error of runs that reach the end."""
     done = own[own["error"].notna()]
@@ -178,7 +162,6 @@ def _said(line: dict[str, Any]) -> str:
 
 
 def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
-    """What the report says."""
     drawn, long = rows[rows["group"] == "linkage"], rows[rows["group"] == "long"]
     silent = rows[(rows["outcome"] == SILENT) & (rows["group"] != sharp_runs.SHARP)]
     found: dict[str, Any] = {"tolerance": TOLERANCE, "looseness": LOOSENESS, "t_end": T_END, "grows": GROWS}
@@ -188,30 +171,24 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     found["sharp"] = sharp_runs.counts(rows[rows["group"] == sharp_runs.SHARP])
     stopped = drawn[drawn["outcome"] == SAID]
     found["n_stopped"], found["n_stopped_rank"] = len(stopped), int(stopped["message"].str.contains("rank").sum())
-    found["linkages"] = [
-        {"method": name, "kind": kind, **counts_of(own)}
-        for (name, kind), own in drawn.groupby(["method", "what"], sort=False)
-    ]
+    kinds = drawn.groupby(["method", "what"], sort=False)
+    found["linkages"] = [{"method": name, "kind": kind, **counts_of(own)} for (name, kind), own in kinds]
     found["silent"] = silent[["group", "what", "value", "method", "error", "allowed"]].to_dict("records")
     limits = {
         group: {name: limits_of(own) for name, own in rows[rows["group"] == group].groupby("method", sort=False)}
         for group in ("size", "density", "ratio")
     }
     found["scales"] = alike(limits)
-    found["long"] = []
-    for _, row in long[long["value"] == long["value"].max()].iterrows():
-        line = {key: row[key] for key in ("method", "n_steps", "first_q", "last_q", "first_v", "last_v", "energy")}
-        line["bytes"] = row["bytes_a_step"]
-        line["grows"] = any(row[f"last_{level}"] > GROWS * row[f"first_{level}"] for level in "qv")
-        found["long"].append(line)
+    told = ["method", "n_steps", "first_q", "last_q", "first_v", "last_v", "energy"]
+    longest = long[long["value"] == long["value"].max()]
+    grow = (longest["last_q"] > GROWS * longest["first_q"]) | (longest["last_v"] > GROWS * longest["first_v"])
+    found["long"] = longest[told].assign(bytes=longest["bytes_a_step"], grows=grow).to_dict("records")
     found["long_grow"] = [line["method"] for line in found["long"] if line["grows"]]
     found["most_bytes"] = max(line["bytes"] for line in found["long"])
-    sizes = list(limits["size"].values())
-    ends = [(line["low"], line["high"]) for line in sizes if line["low"] is not None and line["high"] is not None]
-    lows, highs = zip(*ends, strict=True) if len(ends) == len(sizes) else ((np.inf,), (0.0,))
-    found["sizes"] = [max(lows), min(highs)] if max(lows) <= min(highs) else None
+    ends = pd.DataFrame(limits["size"].values())[["low", "high"]].astype(float)
+    sizes = [float(ends["low"].max()), float(ends["high"].min())]
+    found["sizes"] = sizes if ends.notna().all(axis=None) and sizes[0] <= sizes[1] else None
     return found | {"least_steps": min(line["n_steps"] for line in found["long"])}
 
 
-STUDY = Study("robustness", __doc__, make, findings_of)
-main = STUDY.main
+STUDY = Study("robustness", __doc__, kept_rows(linkages, sharp_runs.random_mechanisms, scales, long_runs), findings_of)

@@ -1,3 +1,3 @@
-from studies.scale import main
+from studies.scale.study import STUDY
 
-main()
+STUDY.main()

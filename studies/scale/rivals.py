@@ -3,6 +3,7 @@
 import time
 from collections.abc import Callable
 from functools import cache, partial
+from itertools import product
 
 import numpy as np
 
@@ -26,14 +27,10 @@ BUDGET = 20.0  # s of CPU time, of building and of a call
 
 def trees(quick: bool) -> Keyed:
     """Rows of accelerations of trees in engines."""
-    for repeat in range(1 if quick else ROUNDS):
-        for n in QUICK_SIZES[1:] if quick else TREE_SIZES:
-            for build in TREES:
-                for engine in ENGINES:
-                    yield (
-                        f"{TREE} | {build.__name__} | {n} | {engine} | {repeat}",
-                        partial(tree_row, build, n, engine, repeat),
-                    )
+    rounds, sizes = range(1 if quick else ROUNDS), QUICK_SIZES[1:] if quick else TREE_SIZES
+    for repeat, n, build, engine in product(rounds, sizes, TREES, ENGINES):
+        key = f"{TREE} | {build.__name__} | {n} | {engine} | {repeat}"
+        yield key, partial(tree_row, build, n, engine, repeat)
 
 
 @cache

@@ -157,7 +157,8 @@ def ends(n: int, t_end: float) -> tuple[np.ndarray, str]:
 def solver_of(name: str) -> Solver:
     """A solver of the catalogue, IDA with sparse factors, or Exudyn with bodies and joints of its own."""
     if name == SPARSE_IDA:
-        return Solver(name, "SUNDIALS", "Python", True, "tol", _ida)
+        ida = lambda case, tol, _: at_instants(solve_ida_sparse, case, rtol=tol, atol=tol)  # noqa: E731
+        return Solver(name, "SUNDIALS", "Python", True, "tol", ida)
     if name not in EXUDYN:
         return CATALOGUE[name]
 
@@ -166,10 +167,6 @@ def solver_of(name: str) -> Solver:
         return solve_pinned(case.problem, bodies, round(case.t_end / step), EXUDYN[name], case.time_limit)
 
     return replace(CATALOGUE[name], run=run)
-
-
-def _ida(case: Case, tolerance: float, repeat: int) -> Result:
-    return at_instants(solve_ida_sparse, case, rtol=tolerance, atol=tolerance)
 
 
 def error_of(n: int, t_end: float, result: Result) -> float:

@@ -10,8 +10,7 @@ from matplotlib.figure import Figure
 
 from studies.bench import figures, tables
 from studies.bench.solvers import DEFAULT
-from studies.bench.store import Output
-from studies.bench.study import Study
+from studies.bench.study import Study, kept_rows
 from studies.scale.rivals import BUDGET, TREE, UNTIL, UNTIL_END, trees, until
 from studies.scale.runs import (
     CHAIN,
@@ -32,14 +31,6 @@ from studies.scale.runs import (
 from twoloop.rows.equal_error import resampled
 
 BEND = 0.3  # by which a power from one size to the next differs notably from the fitted one
-
-
-def make(output: Output) -> pd.DataFrame:
-    """Rows of evaluations and memory, of trees, of chains, and of those that grow until others stop."""
-    quick = output.call.quick
-    with output.kept() as kept:
-        groups = evaluations, trees, chains, until
-        return pd.DataFrame([kept.made(key, row) for group in groups for key, row in group(quick)])
 
 
 def slope(n: Any, times: Any) -> list[float] | None:
@@ -79,30 +70,23 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
         apart = [abs(each["power"] - fitted[0]) for each in between] if fitted else []
         found["kinds"].append(line | {"slope": fitted, "powers": between, "bends": max(apart, default=0.0) > BEND})
     found["failed"] = rows[rows["group"].eq(EVALUATION) & rows["status"].eq("FAILED")][["case", "n"]].to_dict("records")
-    chains = rows[rows["group"] == CHAIN].sort_values(
-        ["n", "solver", "h", "tol", "repeat"], ascending=[True] * 2 + [False] * 2 + [True]
-    )
+    order = {"n": True, "solver": True, "h": False, "tol": False, "repeat": True}
+    chains = rows[rows["group"] == CHAIN].sort_values([*order], ascending=[*order.values()])
     for n, own in chains.groupby("n"):
         medians = tables.medians(own.reset_index(drop=True))
-        of_chain: dict[str, Any] = {
-            "n": int(n),
-            "t_end": CHAINS[int(n)],
-            "lines": tables.work_precision(medians, ERRORS),
-        }
+        of_chain: dict[str, Any] = {"n": int(n), "t_end": CHAINS[int(n)]}
+        of_chain["lines"] = tables.work_precision(medians, ERRORS)
         of_chain["over_exudyn"] = [ratio for error in ERRORS if (ratio := over_exudyn(medians, error))]
-        of_chain |= {
-            "step": steps_of(medians),
-            "fastest": [each for error in ERRORS if (each := fastest(medians, error))],
-        }
+        of_chain["step"] = steps_of(medians)
+        of_chain["fastest"] = [each for error in ERRORS if (each := fastest(medians, error))]
         found["once"] |= once(medians)
         least, step = min(of_chain["over_exudyn"], default=0.0), of_chain["step"]
         of_chain["by_order"] = bool(step) and (step["exudyn"] / step["ours"]) ** 2 < least
         found["chains"].append(of_chain)
-    held = rows[rows["group"].eq(MEMORY)]
-    held = held[held["memory_mb"].notna()] if len(held) else held
-    found["memory"] = {int(row["n"]): float(row["memory_mb"]) for _, row in held.iterrows()}
-    found["trees"] = [_beside_engines(line, rows[rows["group"] == TREE]) for line in found["kinds"]]
-    found["trees"] = [line for line in found["trees"] if line["engines"]]
+    held = rows[rows["group"].eq(MEMORY)].reindex(columns=["n", "memory_mb"]).dropna()
+    found["memory"] = {int(n): float(mb) for n, mb in held.itertuples(index=False)}
+    beside = (_beside_engines(line, rows[rows["group"] == TREE]) for line in found["kinds"])
+    found["trees"] = [line for line in beside if line["engines"]]
     grown = rows[rows["group"] == UNTIL]
     found["until"] = [_until(str(solver), own) for solver, own in grown.groupby("solver", sort=False)]
     found |= {"budget": BUDGET, "sparse_ida": SPARSE_IDA, "tolerance": TOLERANCE, "until_end": UNTIL_END, "bend": BEND}
@@ -116,9 +100,9 @@ def _beside_engines(line: dict[str, Any], rows: pd.DataFrame) -> dict[str, Any]:
     found: dict[str, Any] = {"case": line["case"], "ours": line["us"], "engines": {}, "start_s": {}}
     right = rows[rows["case"].eq(line["case"]) & rows["status"].eq("REACHED_END")]
     for engine, own in right.groupby("solver", sort=False):
-        by_size = own.groupby("n")
-        found["engines"][str(engine)] = {int(n): float(each["evaluation_us"].median()) for n, each in by_size}
-        found["start_s"][str(engine)] = {int(n): float(each["start_s"].median()) for n, each in by_size}
+        by_size = own.groupby("n")[["evaluation_us", "start_s"]].median()
+        found["engines"][str(engine)] = by_size["evaluation_us"].to_dict()
+        found["start_s"][str(engine)] = by_size["start_s"].to_dict()
     return found
 
 
@@ -193,13 +177,8 @@ def figures_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Figure]:
         panel.set(xscale="log", yscale="log", xlabel="error of q at the end, over max(1, max |q|)", title=f"{n} bars")
         panel.grid(alpha=0.3)
     panels[0][0].set_ylabel("CPU time of the call (s)")
-    shown = {label: line for axes in panels[0] for line, label in zip(*axes.get_legend_handles_labels(), strict=True)}
-    second.legend(shown.values(), shown, loc="outside lower center", ncols=3, fontsize=8)
+    figures.legend(second, panels[0], below=3)
     return {"scale": figure, "scale_chains": second}
 
 
-STUDY = Study("scale", __doc__, make, findings_of, figures_of)
-main = STUDY.main
-
-if __name__ == "__main__":
-    main()
+STUDY = Study("scale", __doc__, kept_rows(evaluations, trees, chains, until), findings_of, figures_of)

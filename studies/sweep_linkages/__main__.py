@@ -1,3 +1,3 @@
-from studies.sweep_linkages import main
+from studies.sweep_linkages.study import STUDY
 
-main()
+STUDY.main()

@@ -58,10 +58,8 @@ def rests(result: Result) -> Array:
     """Times after the start at which the linkage is at rest."""
     assert result.t_events is not None and result.v_events is not None
     least = AT_REST * np.abs(result.v).max()
-    found = [
-        t[np.abs(v).max(axis=1, initial=0.0) < least] for t, v in zip(result.t_events, result.v_events, strict=True)
-    ]
-    times = np.sort(np.concatenate(found))
+    events = zip(result.t_events, result.v_events, strict=True)
+    times = np.sort(np.concatenate([t[np.abs(v).max(axis=1, initial=0.0) < least] for t, v in events]))
     times = times[times > SAME]
     return times[np.diff(times, prepend=0.0) > SAME]
 
@@ -71,9 +69,9 @@ def measured(problem: Problem, result: Result) -> dict[str, Any]:
     energy = result.energy
     kinetic = energy - problem.energy(result.t, result.q, 0.0 * result.v)
     stops = rests(result)
-    known = len(stops) > 1
+    half, period = stops[:2] if len(stops) > 1 else (np.nan, np.nan)
     found: dict[str, Any] = {"energy_error": _short(np.abs(energy - energy[0]).max() / kinetic.max(), 4)}
-    found |= {"half": _short(stops[0], 12) if known else np.nan, "period": _short(stops[1], 12) if known else np.nan}
+    found |= {"half": _short(half, 12), "period": _short(period, 12)}
     return found | {"n_evaluations": result.stats.n_evaluations}
 
 
@@ -106,7 +104,6 @@ def make(output: Output) -> pd.DataFrame:
 
 
 def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
-    """What the report says."""
     linkages = rows[rows["group"] == "linkages"]
     done = linkages[linkages["status"] == "REACHED_END"]
     if not len(done):
@@ -147,4 +144,3 @@ def figures_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Figure]:
 
 
 STUDY = Study("sweep_linkages", __doc__, make, findings_of, figures_of)
-main = STUDY.main

@@ -1,3 +1,3 @@
-from studies.symbolic_size import main
+from studies.symbolic_size.study import STUDY
 
-main()
+STUDY.main()

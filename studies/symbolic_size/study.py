@@ -7,15 +7,17 @@ import json
 import subprocess
 import sys
 import tempfile
+from collections.abc import Callable, Iterator
 from functools import partial
+from itertools import product
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from studies.bench.cli import ROOT
-from studies.bench.store import Output, Row
-from studies.bench.study import Study
+from studies.bench.store import Row
+from studies.bench.study import Study, kept_rows
 from studies.symbolic_size.models import MODELS, REPEATS
 from twoloop import solve_dae
 from twoloop.mechanisms import Problem
@@ -69,40 +71,30 @@ def compared(name: str) -> Row:
     return row
 
 
-def make(output: Output) -> pd.DataFrame:
-    """All rows."""
-    quick = output.call.quick
-    sizes = [
-        (coordinates, n, tangents)
-        for n in (QUICK_SIZES if quick else SIZES)
-        for coordinates in ("positions", "angles")
-        for tangents in ((False,) if quick else (False, True))
-    ]
-    names = list(MODELS)[: QUICK_MODELS if quick else None]
-    with output.kept() as kept:
-        rows = [kept.made(str(which), partial(made, *which)) for which in sizes]
-        return pd.DataFrame(rows + [kept.made(name, partial(compared, name)) for name in names])
+def rows_of(quick: bool) -> Iterator[tuple[str, Callable[[], Row]]]:
+    """Keys of chains and twins, and what makes their rows."""
+    sizes = product(QUICK_SIZES if quick else SIZES, ("positions", "angles"), (False,) if quick else (False, True))
+    for n, which, tangents in sizes:
+        yield str((which, n, tangents)), partial(made, which, n, tangents)
+    for name in list(MODELS)[: QUICK_MODELS if quick else None]:
+        yield name, partial(compared, name)
 
 
 def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
-    """What the report says."""
     sizes, twins = rows[rows["group"] == "size"], rows[rows["group"] == "twin"]
     done = sizes[sizes["status"] == "REACHED_END"]
     ratios = twins["twin_us"] / twins["hand_us"]
-    largest = done[done["n"] == done["n"].max()]
-    with_tangents = largest[largest["tangents"] & (largest["case"] == "angles")]
-    without = largest[~largest["tangents"] & (largest["case"] == "angles")]
+    largest = done[(done["n"] == done["n"].max()) & (done["case"] == "angles")]
+    parts = [largest[largest["tangents"] == which]["compile_s"] for which in (False, True)]
+    failed = sizes[sizes["status"] != "REACHED_END"]
     return {
         "n": None if done.empty else int(done["n"].max()),
-        "failed": [
-            f"{row.case}, n = {row.n:g}: {row.status}" for row in sizes.itertuples() if row.status != "REACHED_END"
-        ],
+        "failed": [f"{row.case}, n = {row.n:g}: {row.status}" for row in failed.itertuples()],
         "second_s": None if done.empty else [float(done["second_s"].median()), float(done["second_s"].max())],
-        "compile_s": [None if part.empty else float(part["compile_s"].max()) for part in (without, with_tangents)],
+        "compile_s": [None if part.empty else float(part.max()) for part in parts],
         "ratio": [float(ratios.min()), float(ratios.max())],
         "other_counts": twins["case"][twins["twin_evaluations"] != twins["hand_evaluations"]].tolist(),
     }
 
 
-STUDY = Study("symbolic_size", __doc__, make, findings_of)
-main = STUDY.main
+STUDY = Study("symbolic_size", __doc__, kept_rows(rows_of), findings_of)

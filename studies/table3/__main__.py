@@ -1,3 +1,3 @@
-from studies.table3 import main
+from studies.table3.study import STUDY
 
-main()
+STUDY.main()

@@ -1,6 +1,7 @@
 """Table 3 of the paper: computation time of both two-loop procedures over their tolerances, and of other solvers."""
 
 from functools import partial
+from itertools import chain
 from typing import Any
 
 import matplotlib.pyplot as plt
@@ -17,7 +18,6 @@ from studies.bench.collector import REPEATS, Case, Run, Solver, Warm, collect, r
 from studies.bench.headline import OWN_CODE
 from studies.bench.metrics import ASTRAY, LOST
 from studies.bench.render import number, power, table
-from studies.bench.runs_by_error import used
 from studies.bench.solvers import (
     ADAMS,
     CATALOGUE,
@@ -38,6 +38,7 @@ from studies.bench.solvers import (
 )
 from studies.bench.store import Array, Output, Row
 from studies.bench.study import Study
+from studies.bench.tables import used
 from studies.table3.causes import (
     FAMILIES,
     PAPER_IRK,
@@ -108,16 +109,13 @@ def make(output: Output) -> pd.DataFrame:
     def row(run: Run, repeat: int, built: Warm) -> Row:
         return row_of(run, repeat, highest, built)
 
-    def ours(run: Run) -> bool:
-        return run.solver.family == "two-loop"
-
     quick = output.call.quick
     first, second = four_bar.cases(quick)
-    todo = runs(first, second, quick)
+    todo, errors = runs(first, second, quick), () if quick else TARGETS
     compared = [run for run in todo if run.group == "comparison"]
     with output.kept() as kept:
         rows = collect([run for run in todo if run.group != "comparison"], kept, highest)
-        more = adaptive.collect(compared, kept, row, lambda run: True, () if quick else TARGETS, ours)
+        more = adaptive.collect(compared, kept, row, lambda run: True, errors, adaptive.is_ours)
     return pd.concat([rows, more], ignore_index=True)
 
 
@@ -177,9 +175,8 @@ def counts(rows: pd.DataFrame) -> str:
     """A table of evaluations and error of both procedures with err_in = 1e-9, on which they hardly depend."""
 
     def told(cell: pd.Series | None) -> str:
-        return (
-            "not run" if cell is None else f"{number(float(cell['n_evaluations']))}; {number(float(cell['error_q']))}"
-        )
+        values = ["not run"] if cell is None else [number(float(cell[key])) for key in ("n_evaluations", "error_q")]
+        return "; ".join(values)
 
     lines = [
         [name, *(told(machine(rows, group, ERR_IN, err_out)) for err_out in TOLERANCES)]
@@ -189,7 +186,6 @@ def counts(rows: pd.DataFrame) -> str:
 
 
 def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
-    """What the report says, from the medians."""
     first = rows[rows["problem"] == rows["problem"].iloc[0]]
     irk, newmark = (machine(first, group, ERR_IN, ERR_IN) for group in FAMILIES)
     if irk is None or newmark is None:
@@ -212,7 +208,7 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     found["newmark_in_two_groups"] = in_two_groups(newmark["times"])
     found["ratio_evaluations"] = newmark["n_evaluations"] / irk["n_evaluations"]
     ratios = _newmark_over_irk(first)
-    over = [ratio for each in ratios.values() for ratio in each]
+    over = list(chain(*ratios.values()))
     found["newmark_over_irk"] = [min(over), max(over)] if over else []
     found["newmark_errors"] = list(ratios)
     found["newmark_dearer_everywhere"] = bool(over and min(over) > 1.0)
@@ -306,4 +302,3 @@ def tables_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, str]:
 
 
 STUDY = Study("table3", __doc__, make, findings_of, figures_of, tables_of, medians=True)
-main = STUDY.main

@@ -1,3 +1,3 @@
-from studies.validation import main
+from studies.validation.study import STUDY
 
-main()
+STUDY.main()

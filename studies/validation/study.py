@@ -107,7 +107,6 @@ def modelled(made: Sequence[Callable[[], Problem]], quick: bool) -> Iterator[Run
 
 
 def make(output: Output) -> pd.DataFrame:
-    """Make all rows, those kept from an unfinished run aside."""
     todo, warm = runs(output.call.quick), set[tuple[Any, ...]]()
 
     def made(run: Run) -> Row:
@@ -147,12 +146,11 @@ def of_models(models: pd.DataFrame) -> dict[str, Any] | None:
     if models.empty:
         return None
     steps = (models["t_end"] / models["h"]).round()
-    fine = models[steps == steps.max()].set_index(["case", "solver"])
-    coarse = models[steps == steps.min()].set_index(["case", "solver"])
-    errors, before = (own["error_q"].astype(float).dropna() for own in (fine, coarse))
+    runs = models.assign(steps=steps).set_index(["case", "solver"])
+    errors, before = (runs[runs["steps"] == n]["error_q"].astype(float) for n in (steps.max(), steps.min()))
     orders = (np.log(before / errors) / np.log(steps.max() / steps.min())).dropna()
     found: dict[str, Any] = {"n": models["case"].nunique(), "n_steps": int(steps.max())}
-    found |= {"errors": [float(errors.min()), float(errors.max())], "failed": int(fine["error_q"].isna().sum())}
+    found |= {"errors": [float(errors.min()), float(errors.max())], "failed": int(errors.isna().sum())}
     return found | {"orders": [float(orders.min()), float(orders.max())] if len(orders) else []}
 
 
@@ -182,7 +180,6 @@ def short_of_reach(rows: pd.DataFrame) -> list[dict[str, Any]]:
     found: dict[str, dict[str, Any]] = {}
     references = {problem.name: problem.reference for problem in (make() for make in MAKE)}
     for _, row in rows[(rows["tol"] == TIGHT) & rows["solver"].isin(AIMED)].iterrows():
-        about = {"case": row["case"], "solver": row["solver"]}
         got, known = {level: row[f"digits_{level}"] for level in REACH}, references[row["case"]]
         assert known is not None
         short = [level for level, wanted in REACH.items() if got[level] < wanted < known.digits.get(level, 0.0)]
@@ -190,16 +187,16 @@ def short_of_reach(rows: pd.DataFrame) -> list[dict[str, Any]]:
         if short or stopped:
             of = found.setdefault(row["case"], {"case": row["case"], "stopped": [], "short": []})
             of["stopped"] += stopped
+            about = {"case": row["case"], "solver": row["solver"]}
             of["short"] += [about | {"level": level, "digits": float(got[level])} for level in short]
     return list(found.values())
 
 
 def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
-    """What the report says."""
     judged, steps = rows[rows["group"] == JUDGED], rows[rows["group"] == deceived.DECEIVED]
     models = rows[rows["group"] == MODELLED]
     rows = rows[~rows["group"].isin(APART)]
-    ours, ended = rows["family"] == "two-loop", rows["outcome"].isin(("right", "inexact", "wrong"))
+    ours = rows["family"] == "two-loop"
     problems = [of_problem(name, own) for name, own in rows.groupby("case", sort=False)]
     wrong = rows[rows["outcome"] == "wrong"][["case", "solver", "family", "tol", "error_q"]].to_dict("records")
     stepped = [of_steps(name, own) for name, own in steps.groupby("solver", sort=False)]
@@ -225,35 +222,24 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     }
     found["ours_always"] = [name for name in OWN if all(name in line["ours_right"] for line in problems)]
     found["judged"] = [of_condition(str(name), own) for name, own in judged.groupby("case", sort=False)]
+    decided, of_us = judged[judged["outcome"].isin(("right", "wrong"))], judged["family"] == "two-loop"
     found["judged_wrong"] = {
-        which: {
-            "n": int(own["outcome"].isin(("right", "wrong")).sum()),
-            "wrong": int((own["outcome"] == "wrong").sum()),
-        }
-        for which, own in (
-            ("ours", judged[judged["family"] == "two-loop"]),
-            ("others", judged[judged["family"] != "two-loop"]),
-        )
+        which: {"n": len(own), "wrong": int((own["outcome"] == "wrong").sum())}
+        for which, own in (("ours", decided[of_us]), ("others", decided[~of_us]))
     }
     found["judged_at"] = sorted(map(float, judged["tol"].unique()), reverse=True)
     found["ours_wrong_tight"] = [line for line in wrong if line["family"] == "two-loop" and line["tol"] == TIGHT]
     found["exact"] = EXACT
-    for name, which in (
-        ("inexact", rows["outcome"] == "inexact"),
-        ("wrong", rows["outcome"] == "wrong"),
-        ("ended", ended),
-    ):
+    for name, outcomes in (("inexact", ["inexact"]), ("wrong", ["wrong"]), ("ended", ["right", "inexact", "wrong"])):
+        which = rows["outcome"].isin(outcomes)
         found[f"n_{name}"] = {"ours": int((which & ours).sum()), "others": int((which & ~ours).sum())}
-    theirs = [line for line in wrong if line["family"] != "two-loop"]
-    found["wrong_others"] = {
-        which: {"n": len(own), "at": sorted({line["tol"] for line in own})}
-        | {"elsewhere": sum(line["case"] not in singular for line in own)}
-        for which, own in (
-            ("tight", [line for line in theirs if line["tol"] <= USUAL]),
-            ("loose", [line for line in theirs if line["tol"] > USUAL]),
-        )
-    }
-    found["wrong_others"]["singular"] = sum(line["case"] in singular for line in theirs)
+    theirs = rows[(rows["outcome"] == "wrong") & ~ours]
+    away, usual = ~theirs["case"].isin(singular), theirs["tol"] <= USUAL
+    found["wrong_others"] = {}
+    for name, which in (("tight", usual), ("loose", ~usual)):
+        line = {"n": int(which.sum()), "at": sorted(set(theirs["tol"][which]))}
+        found["wrong_others"][name] = line | {"elsewhere": int((which & away).sum())}
+    found["wrong_others"]["singular"] = int((~away).sum())
     at_tight = (rows["tol"] == TIGHT) & (rows["outcome"] == "right")
     found["right_on"] = {
         which: dict(rows[at_tight & of]["solver"].value_counts()) for which, of in (("ours", ours), ("others", ~ours))
@@ -309,4 +295,3 @@ def _short(row: pd.Series) -> str:
 
 
 STUDY = Study("validation", __doc__, make, findings_of, figures_of)
-main = STUDY.main

@@ -1,3 +1,3 @@
-from studies.work_precision import main
+from studies.work_precision.study import main
 
 main()

@@ -32,16 +32,16 @@ class Part:
 
 def parts() -> dict[str, Part]:
     """What can be measured again, by name."""
-    found = {name: Part(rivals.GROUP, name, partial(_of_rivals, name)) for name in rivals.problems(False)}
+    runs = rivals.runs(False)
+    found = {
+        name: Part(rivals.GROUP, name, partial(rivals.collect, [run for run in runs if run.case.name == name]))
+        for name in rivals.problems(False)
+    }
     for case in study.known_cases(False):
         found[case.name + AT_LENGTH] = Part(LENGTH, case.name, partial(study.at_length, [case], False))
     found["first calls"] = Part(first_calls.GROUP, None, partial(first_calls.collect, quick=False))
     found[minimal.GROUP] = Part(minimal.GROUP, None, partial(minimal.collect, quick=False))
     return found
-
-
-def _of_rivals(name: str, kept: KeptRows) -> pd.DataFrame:
-    return rivals.collect([run for run in rivals.runs(False) if run.case.name == name], kept)
 
 
 def replaced(rows: pd.DataFrame, part: Part, new: pd.DataFrame) -> pd.DataFrame:
@@ -54,7 +54,6 @@ def replaced(rows: pd.DataFrame, part: Part, new: pd.DataFrame) -> pd.DataFrame:
 
 
 def main(words: Sequence[str] | None = None) -> None:
-    """Measure parts again, one after another."""
     names, known = list(sys.argv[1:] if words is None else words), parts()
     unknown = [name for name in names if name not in known]
     if unknown or not names:

@@ -41,7 +41,6 @@ def made_of(folder: Path) -> str:
 
 
 def main(words: Sequence[str] | None = None) -> None:
-    """Write the archive."""
     text = made_of(REPORTS)
     ARCHIVE.write_bytes(gzip.compress(text.encode(), 9, mtime=0))
     print(f"wrote {text.count(chr(10))} rows, {ARCHIVE.stat().st_size / 1e3:.0f} kB, to {ARCHIVE}")

@@ -38,13 +38,9 @@ from twoloop import Result, mechanisms
 
 GROUP = "first call"
 BUILDING = (*COMPILED, HEYOKA, CVODE_C, IDA_C, DIFFRAX, "IDAS, CasADi")  # for whom code is built
-MECHANISMS = {  # and how each is made
-    "four-bar": "four_bar",
-    "SUNDIALS slider-crank": "sundials_slider_crank",
-    "Andrews' squeezing mechanism": "andrews",
-    "spatial four-bar": "spatial_four_bar",
-    "heavy top": "heavy_top",
-}
+MECHANISMS = {"four-bar": "four_bar", "SUNDIALS slider-crank": "sundials_slider_crank"}  # and how each is made
+MECHANISMS |= {"Andrews' squeezing mechanism": "andrews", "spatial four-bar": "spatial_four_bar"}
+MECHANISMS |= {"heavy top": "heavy_top"}
 QUICK = (DEFAULT, "auto, compiled")
 TOLERANCE = ERROR = 1e-8  # of the calls in processes of their own; of the calls that are laid side by side, m or rad
 TIMES = ("first_call_s", "call_s", "call_q1", "call_q3")
@@ -83,7 +79,9 @@ def in_process(name: str, solver: str) -> Row:
 def times_of(name: str, solver: str) -> Row:
     """The same in this process."""
     attempt(_run(mechanisms.double_pendulum(), solver), 0)
-    modules = _modules(MECHANISMS[name])
+    make = getattr(mechanisms, MECHANISMS[name])
+    callbacks = [function.py_func.__module__ for function in make().system.given.values()]
+    modules = [importlib.import_module(each) for each in dict.fromkeys([*callbacks, make.__module__])]
     user_call.ended = None
     began = cpu_time()
     run = _run(getattr(_compiled_anew(modules), MECHANISMS[name])(), solver)
@@ -120,13 +118,6 @@ def _above_steps(run: Run) -> float:
 
 def _run(problem: mechanisms.Problem, solver: str) -> Run:
     return Run(replace(case_of(problem), time_limit=LIMIT, timed=rivals.TIMED), CATALOGUE[solver], TOLERANCE)
-
-
-def _modules(mechanism: str) -> list[ModuleType]:
-    """Those in which the callbacks of a ready mechanism stand, and that in which it is made."""
-    make = getattr(mechanisms, mechanism)
-    callbacks = [function.py_func.__module__ for function in make().system.given.values()]
-    return [importlib.import_module(name) for name in dict.fromkeys([*callbacks, make.__module__])]
 
 
 def _compiled_anew(modules: list[ModuleType]) -> ModuleType:

@@ -43,32 +43,30 @@ def collect(kept: KeptRows, quick: bool) -> pd.DataFrame:
     return adaptive.collect(runs(quick), kept, rivals.row_at_end, lambda run: True, () if quick else ERRORS)
 
 
-def at_error(rows: pd.DataFrame, others: pd.DataFrame, error: float) -> dict[str, Any]:
-    """How the best of ours with constraints stands beside the cheapest in minimal coordinates (`rows`) at one error."""
-    ours = others[others["family"] == "two-loop"]
-    found = headline.of_error(pd.concat([ours, rows], ignore_index=True), error)[headline.BEST]
-    return found | {"error": error}
+def at_errors(rows: pd.DataFrame, others: pd.DataFrame) -> list[dict[str, Any]]:
+    """How the best of ours with constraints stands at each error beside the cheapest without (`rows`)."""
+    both = pd.concat([others[others["family"] == "two-loop"], rows], ignore_index=True)
+    found = headline.of_errors(both, ERRORS)
+    return [at[headline.BEST] | {"error": error} for error, at in zip(ERRORS, found, strict=True)]
 
 
 def findings_of(rows: pd.DataFrame, everywhere: pd.DataFrame) -> dict[str, Any]:
     """By mechanism and error, minimal coordinates beside constraints; `rows` and `everywhere` (`rivals`): medians."""
-    made: list[dict[str, Any]] = []
-    for name, own in rows.groupby("case", sort=False) if len(rows) else ():
-        others = everywhere[everywhere["case"] == name]
-        made.append({"case": str(name), "at": [at_error(own, others, error) for error in ERRORS]})
+    rows = rows if len(rows) else pd.DataFrame(columns=["case", "solver", "tol", "error_q"])
+    made: list[dict[str, Any]] = [
+        {"case": str(name), "at": at_errors(own, everywhere[everywhere["case"] == name])}
+        for name, own in rows.groupby("case", sort=False)
+    ]
     pairs = [at for each in made for at in each["at"] if at["ratio"] is not None]
     verdicts, ratios = [each["verdict"] for each in pairs], [each["ratio"] for each in pairs]
     found: dict[str, Any] = {"mechanisms": made, "n": len(pairs), "wrong_from": WRONG}
-    asked = rows[rows["error_q"].notna() & (rows["tol"] <= ASKED)] if len(rows) else pd.DataFrame({"error_q": []})
-    found |= {"asked": len(asked), "wrong": int((asked["error_q"].astype(float) > WRONG).sum())}
+    asked = rows[rows["error_q"].notna() & (rows["tol"] <= ASKED)]
     wrong = asked[asked["error_q"].astype(float) > WRONG]
-    by_series = wrong[wrong["solver"].str.startswith(HEYOKA)] if len(wrong) else wrong
-    released = set(by_series["case"]) if len(by_series) else set()
-    found["level"] = sorted(released) if released and released <= LEVEL else []
-    found["wrong_by"] = [
-        {"solver": str(name), "n": len(own)}
-        for name, own in (wrong.groupby("solver", sort=False) if len(wrong) else ())
-    ]
+    found |= {"asked": len(asked), "wrong": len(wrong)}
+    released = set(wrong["case"][wrong["solver"].astype(str).str.startswith(HEYOKA)])
+    found["level"] = sorted(released) if released <= LEVEL else []
+    counts = wrong["solver"].value_counts(sort=False)
+    found["wrong_by"] = [{"solver": str(name), "n": int(n)} for name, n in counts.items()]
     found |= {f"n_{verdict}": verdicts.count(verdict) for verdict in ("ahead", "behind", "undecided")}
     sizes = (min(ratios), float(np.median(ratios)), max(ratios)) if ratios else (None, None, None)
     return found | dict(zip(("least", "median", "most"), sizes, strict=True))

@@ -7,7 +7,7 @@ added by `python -m studies.work_precision.processors FOLDER`, the folder of rep
 import re
 import sys
 from collections.abc import Mapping, Sequence
-from itertools import combinations, product
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -30,15 +30,19 @@ Standings = Sequence[tuple[str, float, Mapping[str, Mapping[str, Any]]]]
 def standings(rows: pd.DataFrame, column: str) -> Standings:
     """Who is ahead at each error on each mechanism, by a column of times; `rows`: of all runs."""
     cases = tables.medians(rows.assign(call_s=rows[column])).groupby("case", sort=False)
-    return [(str(case), error, rivals.standing(own, error)) for (case, own), error in product(cases, rivals.DECADES)]
+    decades = rivals.DECADES
+    return [
+        (str(case), error, at)
+        for case, own in cases
+        for error, at in zip(decades, rivals.standings(own, decades), strict=True)
+    ]
 
 
 def verdicts(rows: pd.DataFrame, stamp: str, known: Standings = ()) -> pd.DataFrame:
     """Who is ahead by the time of the call and by that inside; `rows`: of all runs; `known`: the first, if it is."""
     commit = re.search(r"commit (\w+)", stamp)
     rows = rows[rows["group"] == rivals.GROUP]
-    made_on = rows.groupby("case")["processor"].first()  # a mechanism is measured on one, at one commit
-    made_at = rows.groupby("case")["commit"].first() if "commit" in rows else pd.Series(dtype=str)
+    made = rows.reindex(columns=["case", "processor", "commit"]).groupby("case").first()  # on one, at one commit
     lines = []
     for time, column in TIMES.items():
         if column not in rows:
@@ -47,9 +51,9 @@ def verdicts(rows: pd.DataFrame, stamp: str, known: Standings = ()) -> pd.DataFr
         for case, error, standing in found:
             for who, at in standing.items():
                 if who != headline.GIVEN and at["verdict"] in ("ahead", "behind", "undecided"):
-                    at_commit = made_at.get(case) or (commit[1] if commit else "")
-                    line = {"processor": made_on[case], "commit": at_commit}
-                    line |= {"time": time, "case": case, "error": error}
+                    line = {"processor": made.loc[case, "processor"], "time": time, "case": case, "error": error}
+                    at_commit = made.loc[case, "commit"]
+                    line["commit"] = at_commit if isinstance(at_commit, str) else commit[1] if commit else ""
                     lines.append({**line, "who": who, "ratio": float(f"{at['ratio']:.3g}"), "verdict": at["verdict"]})
     return pd.DataFrame(lines, columns=["processor", "commit", "time", *PLACE, "ratio", "verdict"])
 
@@ -111,7 +115,6 @@ def rows_of(folder: Path) -> tuple[pd.DataFrame, str]:
 
 
 def main(words: Sequence[str] | None = None) -> None:
-    """Add the rows of another machine."""
     (folder,) = sys.argv[1:] if words is None else words
     path = REPORTS / FILE
     added(path, verdicts(*rows_of(Path(folder)))).to_csv(path, index=False)

@@ -8,7 +8,6 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cache
-from itertools import product
 from typing import Any
 
 import matplotlib.pyplot as plt
@@ -26,6 +25,7 @@ from studies.bench.end_states import case_of, row_of
 from studies.bench.render import number, power
 from studies.bench.solvers import CATALOGUE, HEYOKA, OWN, RIVALS, TAYLOR
 from studies.bench.store import KeptRows, Row
+from studies.bench.tables import by_solver
 from studies.validation.study import MAKE
 from twoloop import mechanisms, solve_dae
 from twoloop.mechanisms import Problem, Reference
@@ -134,26 +134,29 @@ def given_on(case: str) -> str:
     return headline.OWN_CODE if problem is not None and is_small(problem.system) else headline.DEFAULT
 
 
-def standing(rows: pd.DataFrame, error: float) -> dict[str, dict[str, Any]]:
-    """How the default and ours stand on one mechanism at one error; `rows`: its medians."""
-    return headline.of_error(rows, error, given_on(str(rows["case"].iloc[0])))
+def standings(rows: pd.DataFrame, errors: Sequence[float]) -> list[dict[str, dict[str, Any]]]:
+    """How the default and ours stand on one mechanism at each error; `rows`: its medians."""
+    return headline.of_errors(rows, errors, given_on(str(rows["case"].iloc[0])))
 
 
-def at_decade(rows: pd.DataFrame, error: float) -> dict[str, Any]:
-    """The cheapest of ours and of others at one error on one mechanism, and how default and best of ours stand."""
-    found: dict[str, Any] = {"error": error, "standing": standing(rows, error)}
-    for which, cheapest in tables.of_both(tables.ranking(rows, error)).items():
-        found[which] = cheapest and {key: cheapest[key] for key in ("solver", "call_s")}
-    best = found["standing"][headline.BEST]
-    if found["others"] is None and best["rival"]["solver"]:  # not asked for about so much
-        found["others"] = best["rival"]
-    return found | {key: best[key] for key in ("ratio", "verdict")}
+def at_decades(rows: pd.DataFrame) -> list[dict[str, Any]]:
+    """The cheapest of ours and of others by decade on one mechanism, and how default and best of ours stand."""
+    made = []
+    for error, standing, ranked in zip(DECADES, standings(rows, DECADES), tables.rankings(rows, DECADES), strict=True):
+        found: dict[str, Any] = {"error": error, "standing": standing}
+        for which, cheapest in tables.of_both(ranked).items():
+            found[which] = cheapest and {key: cheapest[key] for key in ("solver", "call_s")}
+        best = standing[headline.BEST]
+        if found["others"] is None and best["rival"]["solver"]:  # not asked for about so much
+            found["others"] = best["rival"]
+        made.append(found | {key: best[key] for key in ("ratio", "verdict")})
+    return made
 
 
 def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     """Ratios of the fastest rival to the fastest of ours by mechanism and decade."""
     made: list[dict[str, Any]] = [
-        {"case": name, "tags": list(tags().get(str(name), ())), "at": [at_decade(own, error) for error in DECADES]}
+        {"case": name, "tags": list(tags().get(str(name), ())), "at": at_decades(own)}
         for name, own in rows.groupby("case", sort=False)
     ]
     every = [at for each in made for at in each["at"] if at["ratio"] is not None]
@@ -211,10 +214,11 @@ def shortest(rows: pd.DataFrame) -> dict[str, Any]:
     On the same mechanism: rows of different days may differ by the speed of the machine.
     """
     ours, below = rows[rows["family"] == "two-loop"].astype({"call_s": float}).groupby("case")["call_s"].min(), []
-    for (case, own), error in product(rows[rows["family"] != "two-loop"].groupby("case", sort=False), DECADES):
-        costs = tables.costs_at(own, error)
-        best = min(costs, key=lambda name: costs[name][0], default=None)
-        below += [best] if best is not None and costs[best][0] < ours.get(case, 0.0) else []
+    for case, own in rows[rows["family"] != "two-loop"].groupby("case", sort=False):
+        grouped = by_solver(own, "call_s")
+        for costs in (tables.costs_at(grouped, error) for error in DECADES):
+            best = min(costs, key=lambda name: costs[name][0], default=None)
+            below += [best] if best is not None and costs[best][0] < ours.get(case, 0.0) else []
     return {"call_s": float(ours.min()), "n": len(below), "heyoka": below.count(HEYOKA)}
 
 

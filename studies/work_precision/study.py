@@ -5,7 +5,7 @@ Four cases are run at length, over their whole motion; all others, with more riv
 
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import product
+from itertools import chain
 from typing import Any
 
 import pandas as pd
@@ -13,7 +13,7 @@ import pandas as pd
 from references.heyoka.taylor import LARGEST_UNROLLED
 from studies.bench import adaptive, cases, figures, headline, study, tables
 from studies.bench.cli import StudyError
-from studies.bench.collector import Case, Run, Warm, row_of
+from studies.bench.collector import Case, Run, row_of
 from studies.bench.render import number, render
 from studies.bench.row_files import versions
 from studies.bench.solvers import (
@@ -29,7 +29,7 @@ from studies.bench.solvers import (
     RIVALS,
     TOLERANCES,
 )
-from studies.bench.store import KeptRows, Output, Row
+from studies.bench.store import KeptRows, Output
 from studies.compare import GROUP, runs_of
 from studies.work_precision import first_calls, minimal, processors, rivals
 
@@ -55,9 +55,10 @@ def runs(case: Case, quick: bool) -> list[Run]:
     return made + [replace(run, value=value) for run in rough for value in BETWEEN]
 
 
-def class_of(rows: pd.DataFrame, error: float) -> dict[str, Any]:
-    """The cheapest of ours and of others on one case at one error, and how the default does."""
-    return {"error": error, "standing": rivals.standing(rows, error)} | tables.of_both(tables.ranking(rows, error))
+def classes_of(rows: pd.DataFrame) -> list[dict[str, Any]]:
+    """The cheapest of ours and of others on one case at each error, and how the default does."""
+    made = zip(ERRORS, rivals.standings(rows, ERRORS), tables.rankings(rows, ERRORS), strict=True)
+    return [{"error": error, "standing": at} | tables.of_both(ranked) for error, at, ranked in made]
 
 
 def findings_of(rows: pd.DataFrame, known: Sequence[Case]) -> dict[str, Any]:
@@ -69,18 +70,16 @@ def findings_of(rows: pd.DataFrame, known: Sequence[Case]) -> dict[str, Any]:
             raise StudyError(f"the rows have none of {case.name}; make them again by python -m studies.work_precision")
         slug = "_".join("".join(letter if letter.isalnum() else " " for letter in case.name).split())
         found: dict[str, Any] = {"name": case.name, "tags": list(case.tags), "t_end": case.t_end}
-        found |= {"at": [class_of(runs, error) for error in ERRORS], "figure": f"work_precision_{slug}.png"}
+        found |= {"at": classes_of(runs), "figure": f"work_precision_{slug}.png"}
         listed.append(found | {"processor": str(runs["processor"].iloc[0]) if "processor" in runs else ""})
     return {"cases": listed, "default": DEFAULT}
 
 
 def known_cases(quick: bool) -> list[Case]:
-    """The cases at length."""
     return [replace(case, time_limit=TIME_LIMIT) for case in cases.load(quick) if not quick or case.name in QUICK_CASES]
 
 
 def make(output: Output) -> pd.DataFrame:
-    """Make all rows."""
     quick = output.call.quick
     with output.kept() as kept:
         made = [at_length(known_cases(quick), quick, kept)]
@@ -92,11 +91,8 @@ def make(output: Output) -> pd.DataFrame:
 def at_length(known: Sequence[Case], quick: bool, kept: KeptRows) -> pd.DataFrame:
     """The rows of cases over their whole motion."""
     made = [run for case in known for run in runs(case, quick)]
-    return adaptive.collect(made, kept, _row, lambda run: True, () if quick else ERRORS)
-
-
-def _row(run: Run, repeat: int, built: Warm) -> Row:
-    return row_of(run, repeat, None, built)
+    row = lambda run, repeat, built: row_of(run, repeat, None, built)  # noqa: E731
+    return adaptive.collect(made, kept, row, lambda run: True, () if quick else ERRORS)
 
 
 def part(rows: pd.DataFrame, group: str = GROUP) -> pd.DataFrame:
@@ -118,7 +114,6 @@ def on_the_same_processor(rows: pd.DataFrame, others: pd.DataFrame) -> pd.DataFr
 
 
 def report(output: Output, rows: pd.DataFrame, line: str) -> dict[str, Any]:
-    """Write findings, figures and report; the findings."""
     everywhere = tables.medians(part(rows, rivals.GROUP))
     known, medians = known_cases(output.call.quick), tables.medians(part(rows).reindex(columns=rows.columns))
     found = rivals.findings_of(everywhere)
@@ -165,8 +160,8 @@ def default_over(rows: pd.DataFrame, compiled: bool) -> dict[str, Any]:
     """
     default = headline.OWN_CODE if compiled else DEFAULT
     own, over = rows[(rows["family"] == "two-loop") & (rows["solver"].isin(list(COMPILED)) == compiled)], []
-    for (_, runs), error in product(own.groupby("case", sort=False), rivals.DECADES):
-        ranked = tables.ranking(runs, error)
+    by_case = (tables.rankings(runs, rivals.DECADES) for _, runs in own.groupby("case", sort=False))
+    for ranked in chain.from_iterable(by_case):
         mine = ranked[ranked["solver"] == default]["call_s"]
         over += [float(mine.iloc[0] / ranked["call_s"].iloc[0]) if len(mine) else None] if len(ranked) else []
     reached = [each for each in over if each is not None]
@@ -198,7 +193,6 @@ def asked(rows: pd.DataFrame) -> dict[str, Any]:
 
 
 def draw(output: Output, findings: dict[str, Any], everywhere: pd.DataFrame, medians: pd.DataFrame) -> None:
-    """Write all figures."""
     for case in findings["cases"]:
         own = medians[medians["case"] == case["name"]]
         lines = figures.lines_of(own, ERRORS)
@@ -209,9 +203,4 @@ def draw(output: Output, findings: dict[str, Any], everywhere: pd.DataFrame, med
 
 
 def main(words: Sequence[str] | None = None) -> None:
-    """Run the study and write its report."""
     study.run_rows("work_precision", __doc__, words, make, report)
-
-
-if __name__ == "__main__":
-    main()

@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 
 from studies import ablation as study
-from studies.beam.sensitivity import PARAMETERS
+from studies.beam.limits import PARAMETERS
 from studies.bench.solvers import GEAR_ORDERS, IMPLICIT, IRK, IRK_LINE, NEWMARK, QUARTER, gear
 from studies.table3.causes import FAMILIES, PAPER_IRK, PAPER_NEWMARK, TOLERANCES
 from twoloop.mechanisms import four_bar

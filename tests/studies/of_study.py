@@ -19,6 +19,11 @@ def told(name):
     return of_solver | {"keeps_constraints": solver.keeps_constraints}
 
 
+def line(good, group, name, value, **more):
+    """A row of a group, of a solver at a value of its setting."""
+    return {**good, **told(name), "group": group, CATALOGUE[name].setting: value, **more}
+
+
 def median(solver, error, seconds, **more):
     """A row of the medians of one run, of ours and on the constraints unless it is told otherwise."""
     row = GOOD | {"solver": solver, "family": "two-loop", "called_from": "compiled", "keeps_constraints": True}

@@ -37,7 +37,7 @@ def test_it_writes_each_part_at_once(tmp_path, monkeypatch):
     (tmp_path / "work_precision.csv").write_text(f"# full work_precision; stamp\n{KEPT.to_csv(index=False)}")
     call = cli.parse("work_precision", None, ["--out", str(tmp_path)])
     monkeypatch.setattr(again.cli, "parse", lambda *_: call)
-    monkeypatch.setattr(again, "_of_rivals", lambda name, kept: rows((rivals.GROUP, name, 9.0, "")))
+    monkeypatch.setattr(rivals, "collect", lambda todo, kept: rows((rivals.GROUP, todo[0].case.name, 9.0, "")))
     again.main(["double pendulum"])
     with Output(call) as output:
         made, line = output.load_rows()

@@ -5,8 +5,7 @@ import inspect
 import pandas as pd
 
 from studies.bench.cli import REPORTS
-from studies.bench.mechanism_names import READY, mechanism_of
-from studies.bench.row_files import package_of, rounded
+from studies.bench.row_files import READY, mechanism_of, package_of, rounded
 from studies.bench.store import read_rows
 from studies.work_precision import archive
 from twoloop import mechanisms

@@ -56,7 +56,7 @@ def test_the_most_steps_that_an_adapter_allows_are_a_limit_of_ours(message):
 def standing_beside(*rivals):
     ours = rows(("auto", 1e-7, 0.1)).assign(tol=LOOSEST, times=[(0.1,) * 5])
     named = [own.assign(solver=f"rival {k}") for k, own in enumerate(rivals)]
-    return headline.of_error(pd.concat([ours, *named], ignore_index=True), ERROR)["auto"]["verdict"]
+    return headline.of_errors(pd.concat([ours, *named], ignore_index=True), [ERROR])[0]["auto"]["verdict"]
 
 
 def test_ours_is_alone_only_if_all_that_were_put_were_asked_to_their_end():

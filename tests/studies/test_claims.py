@@ -6,10 +6,11 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from studies import claims
 from studies.bench.solvers import IRK, NEWMARK, QUARTER
-from studies.claims import beam_judges, experiments, judge_of, judged, judges
+from studies.claims import beam_judges, experiments, judges
+from studies.claims import study as claims
 from studies.claims.rows import STUDIES, Rows, processors, read
+from studies.claims.study import JUDGES, judged
 from studies.claims.verdicts import Claim, Judgement, Verdict, load
 from studies.table3.causes import PAPER_IRK, PAPER_NEWMARK, TOLERANCES
 from tests.studies.claim_rows import EXPERIMENTS, MADE
@@ -136,7 +137,7 @@ OTHER_NUMBERS = [
 
 def verdict(key, tables, numbers=EXPERIMENTS):
     claim = next(claim for claim in CLAIMS if claim.key == key)
-    return claim.judgement(judge_of(claim), Rows(tables, numbers)).verdict
+    return claim.judgement(JUDGES[claim.judge], Rows(tables, numbers)).verdict
 
 
 def with_changed(tables, study, where, changes):
@@ -182,7 +183,7 @@ def test_every_claim_is_seen_to_turn():
 )
 def test_what_the_paper_chose_has_a_number_and_no_verdict(key, number, value, tables):
     claim = next(claim for claim in CLAIMS if claim.key == key)
-    found = [claim.judgement(judge_of(claim), Rows(tables, EXPERIMENTS | more)) for more in ({}, {number: value})]
+    found = [claim.judgement(JUDGES[claim.judge], Rows(tables, EXPERIMENTS | more)) for more in ({}, {number: value})]
     assert [each.verdict for each in found] == [CHOICE, CHOICE] and len({claim.text(each) for each in found}) == 2
     assert beam_judges.limit_reset_34(Rows(tables, {})).verdict is FAILS
     few = with_changed(tables, "beam", "solver == 'PaperIRK'", {"n_rejected_convergence": 1.0})

@@ -8,8 +8,9 @@ import pytest
 
 from studies.bench.render import render
 from studies.bench.solvers import NEWMARK, QUARTER
-from studies.claims import experiments, findings_of, judge_of
+from studies.claims import experiments
 from studies.claims.rows import BEAMS, NotRun, Rows
+from studies.claims.study import JUDGES, findings_of
 from studies.claims.verdicts import Judgement, Verdict, load, span_known
 from twoloop import Result, paper_irk, solve_dae
 from twoloop.mechanisms import four_bar
@@ -72,7 +73,7 @@ def test_no_jacobian_is_an_advantage_only_where_it_is_everywhere():
     table = pd.DataFrame(rows).assign(floor=0.0)
 
     def verdict(numbers):
-        return claim.judgement(judge_of(claim), Rows({"beam": table}, numbers)).verdict
+        return claim.judgement(JUDGES[claim.judge], Rows({"beam": table}, numbers)).verdict
 
     assert verdict(numbers) is Verdict.HOLDS
     for key in numbers:
@@ -100,5 +101,5 @@ def test_newmark_is_compared_where_no_run_of_it_is_bad():
     linkage = linkage.assign(problem=four_bar().name, t_end=100.0, floor=0.0, err_in=np.nan)
     beam.loc[(beam["case"] == "moderately stiff") & (beam["solver"] != "PaperIRK"), "tol"] = 1e-3
     claim = next(claim for claim in load() if claim.key == "more_efficient")
-    found = claim.judgement(judge_of(claim), Rows({"beam": beam, "table3": linkage.assign(tol=1e-3)}, {}))
+    found = claim.judgement(JUDGES[claim.judge], Rows({"beam": beam, "table3": linkage.assign(tol=1e-3)}, {}))
     assert found.verdict is not Verdict.NOT_RUN and found.values["stiff"] == [1.0, 1.0]

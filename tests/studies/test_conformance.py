@@ -110,7 +110,7 @@ def said_with_tables(rows):
 
 @pytest.mark.slow  # SymPy
 def test_a_quick_run(tmp_path):
-    study.main(["--quick", "--out", str(tmp_path)])
+    study.STUDY.main(["--quick", "--out", str(tmp_path)])
     rows = pd.read_csv(tmp_path / "conformance.csv", comment="#")
     assert set(rows["simulator"]) == set(study.QUICK)
     done = rows[(rows["problem"] == "pendulum") & (rows["property"] == "error of q")]

@@ -141,5 +141,5 @@ def test_the_energy_over_a_long_time_is_of_the_whole_motion(monkeypatch):
 
 @pytest.mark.slow
 def test_the_quick_run(tmp_path):
-    engines.main(["--quick", "--out", str(tmp_path)])
+    engines.STUDY.main(["--quick", "--out", str(tmp_path)])
     assert "Quick run" in (tmp_path / "engines.md").read_text() and (tmp_path / "engines.png").is_file()

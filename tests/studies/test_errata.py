@@ -9,7 +9,7 @@ from scipy.integrate import DOP853, RK45
 from references.paper.four_bar_minimal import MinimalFourBar
 from references.paper.paper_step import Step, choice, independents, kkt, true_states
 from studies.bench.render import render
-from studies.claims import ERRATA
+from studies.claims.study import ERRATA
 from twoloop.mechanisms import four_bar, very_flexible_beam
 from twoloop.methods.tableaux import sun_radau_iib
 

@@ -233,7 +233,7 @@ def test_a_price_that_is_missing_says_why():
 def test_ours_alone_is_said_only_where_others_were_asked(changed, verdict):
     mine = {name: line for name, line in SOLVERS.items() if line[0] == "two-loop"}
     table = pd.concat([rows(mine), rows({"heyoka": SOLVERS["heyoka"]}, **changed)], ignore_index=True)
-    found = headline.of_error(table, 1e-4)
+    found = headline.of_errors(table, [1e-4])[0]
     assert {standing["verdict"] for standing in found.values()} == {verdict}
     line = headline.counted([[found]])[0]
     assert (line["alone"], line["unasked"], line["missed"]) == (int(verdict == "alone"), int(verdict == "unasked"), 0)

@@ -43,7 +43,7 @@ def test_a_failing_study_is_named_and_the_others_run(monkeypatch, capsys):
         return Study(name.removeprefix("studies."))
 
     monkeypatch.setattr(command, "STUDIES", ("good", "bad", "missing", "last"))
-    monkeypatch.setattr(command.importlib, "import_module", load)
+    monkeypatch.setattr(index.importlib, "import_module", load)
     monkeypatch.setattr(sys, "argv", ["studies", "all", "--quick"])
     with pytest.raises(SystemExit, match=r"2 of 4 studies failed.*bad, missing") as exit_:
         command.main()
@@ -62,7 +62,7 @@ def test_the_block_of_the_readme_is_written_by_its_name(monkeypatch):
 
 def test_one_study_runs_by_its_name(monkeypatch):
     ran = []
-    monkeypatch.setattr(command.importlib, "import_module", lambda name: type("S", (), {"main": ran.append}))
+    monkeypatch.setattr(index.importlib, "import_module", lambda name: type("S", (), {"main": ran.append}))
     monkeypatch.setattr(sys, "argv", ["studies", "table3", "--quick"])
     command.main()
     assert ran == [["--quick"]]

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from studies.bench import metrics
+from studies.bench.collector import Case
 from studies.bench.reference_motion import ReferenceMotion
 from tests.problems import held_twice, pendulum, pendulum_energy, pendulum_state
 from twoloop import solve_dae
@@ -27,9 +28,9 @@ def good(problem):
     return solve_dae(problem.system, (0.0, T_END), problem.q0, problem.v0, rtol=1e-10, atol=1e-10)
 
 
-def measured(problem, result, watched=None):
-    scale = metrics.Scale(problem, MOTION, INSTANTS, conserved=True)
-    return metrics.measure(problem, result, MOTION, INSTANTS, scale, watched, {})
+def measured(problem, result, watched=None, conserved=True):
+    told = {"n_instants": INSTANTS.size, "watched": watched, "conserved": conserved}
+    return metrics.measure(Case("pendulum", problem, T_END, lambda: MOTION, **told), result)
 
 
 def test_a_good_run(problem, good):
@@ -68,8 +69,7 @@ def test_a_run_that_ended_early_has_no_error_and_is_lost(problem, good):
 
 
 def test_energy_is_judged_only_where_it_is_conserved(problem, good):
-    scale = metrics.Scale(problem, MOTION, INSTANTS, conserved=False)
-    row = metrics.measure(problem, good, MOTION, INSTANTS, scale, None, {})
+    row = measured(problem, good, conserved=False)
     assert row["energy"] is None and not row["lost"]
 
 

@@ -1,13 +1,15 @@
 """The motion study: its sentences turn with the rows, and what must hold in the rows of a quick run."""
 
+from itertools import product
+
 import numpy as np
 import pandas as pd
 import pytest
 
 from studies import motion
-from studies.bench.solvers import CANONICAL, CATALOGUE, GEAR_ORDERS, IRK, LINE_UP, NEWMARK, gear
+from studies.bench.solvers import CANONICAL, GEAR_ORDERS, IRK, LINE_UP, NEWMARK, gear
 from studies.motion import VISIBLE, find
-from tests.studies.of_study import GOOD, QuickRun, found_of, told
+from tests.studies.of_study import GOOD, QuickRun, found_of, line
 
 STUDIED = motion
 
@@ -18,17 +20,11 @@ def rows():
     good |= {"call_s": 1.0, "n_evaluations": 1e4, "kinetic": 22.5, "range_y3": 0.726, "err_out": np.nan}
     good |= {"error_y3": 5e-3, "error_y3_short": 1e-6, "top": 0.0, "top_late": -1e-4, "energy": -1e-3, "growth": 2.0}
     good |= {"good_until": 100.0, "lost": False, "astray": False, "h": np.nan, "tol": np.nan}
-    lines = []
-
-    def add(group, name, value, **more):
-        lines.append({**good, **told(name), "group": group, CATALOGUE[name].setting: value, **more})
-
-    for name, value in LINE_UP.items():
-        add("line-up", name, value, growth=1.0 if name == CANONICAL else 2.0)
-    for order in GEAR_ORDERS:
-        for step in (0.02, 0.01, 0.005):
-            short = 0.2 * (50.0 * step) ** order / 4.0 ** (order - 1)
-            add("GSTIFF stand-in", gear(order), step, error_y3_short=short, error_y3=10.0 * short)
+    growth = {name: 1.0 if name == CANONICAL else 2.0 for name in LINE_UP}
+    lines = [line(good, "line-up", name, value, growth=growth[name]) for name, value in LINE_UP.items()]
+    for order, step in product(GEAR_ORDERS, (0.02, 0.01, 0.005)):
+        short = 0.2 * (50.0 * step) ** order / 4.0 ** (order - 1)
+        lines.append(line(good, "GSTIFF stand-in", gear(order), step, error_y3_short=short, error_y3=10.0 * short))
     return pd.DataFrame(lines)
 
 

@@ -141,7 +141,7 @@ def test_a_win_and_a_loss_hold_against_near_misses_too(ours, theirs, near_us, ne
         runs = [(0.01, good)] if good else []  # more than a decade better: nothing is interpolated
         runs += [(near[0], near[1])] if near else []
         lines += [(solver, family, "compiled", times * error, seconds) for times, seconds in runs]
-    found = headline.of_error(rows(*lines), error)
+    found = headline.of_errors(rows(*lines), [error])[0]
     assert found["auto"]["verdict"] == found[headline.BEST]["verdict"] == verdict
 
 

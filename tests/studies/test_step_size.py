@@ -5,9 +5,9 @@ import pandas as pd
 import pytest
 
 from studies import step_size
-from studies.bench.solvers import CATALOGUE, IRK, NEWMARK, PRESETS, QUARTER
+from studies.bench.solvers import IRK, NEWMARK, PRESETS, QUARTER
 from studies.step_size import OTHERS, PAPER
-from tests.studies.of_study import GOOD, QuickRun, found_of, told
+from tests.studies.of_study import GOOD, QuickRun, found_of, line
 
 STUDIED = step_size
 
@@ -21,17 +21,9 @@ def rows():
     good |= {"err_out": np.nan, "tol": np.nan}
     newmark = {"h_median": 3e-4, "n_steps": 300_000, "n_evaluations": 1e6, "retried": 1e-3, "retried_switch": 0.1}
     untold = ("n_partitions", "retried", "retried_switch", "n_rejected_error", "n_rejected_convergence")
-    lines = []
-
-    def add(group, name, value, **more):
-        lines.append({**good, **told(name), "group": group, CATALOGUE[name].setting: value, **more})
-
-    for name in PAPER:
-        add("paper", name, 1e-9, **({} if name == IRK else newmark))
-    for name in PRESETS:
-        add("two-loop", name, 1e-5)
-    for name in OTHERS:
-        add("others", name, 1e-5, **dict.fromkeys(untold))
+    lines = [line(good, "paper", name, 1e-9, **({} if name == IRK else newmark)) for name in PAPER]
+    lines += [line(good, "two-loop", name, 1e-5) for name in PRESETS]
+    lines += [line(good, "others", name, 1e-5, **dict.fromkeys(untold)) for name in OTHERS]
     return pd.DataFrame(lines)
 
 

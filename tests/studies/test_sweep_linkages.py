@@ -93,9 +93,9 @@ def test_findings_follow_the_rows():
 
 
 def test_the_quick_study(tmp_path):
-    study.main(["--quick", "--out", str(tmp_path)])
+    study.STUDY.main(["--quick", "--out", str(tmp_path)])
     report = (tmp_path / "sweep_linkages.md").read_text()
     assert not list(tmp_path.glob("*.parquet"))  # of unfinished runs only
     assert "Quick run" in report and "Processes are compared in the full run only" in report
-    study.main(["--quick", "--redraw", "--out", str(tmp_path)])
+    study.STUDY.main(["--quick", "--redraw", "--out", str(tmp_path)])
     assert (tmp_path / "sweep_linkages.md").read_text().split("\n", 4)[4] == report.split("\n", 4)[4]

@@ -1,7 +1,7 @@
 """Runs of one solver on one mechanism, sorted by error: cost at a target error by interpolation."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from functools import cache, lru_cache
+from functools import cache, cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -62,6 +62,7 @@ class Runs:
         """Return a column."""
         return self.columns[column][self.rows]
 
+    @cached_property
     def drawn(self) -> Array:
         """Return `resampled` times; NaN if they are unknown."""
         known = "times" in self.columns

@@ -155,7 +155,7 @@ def _ranked(rows: Sequence[Row], measure: str, target: float) -> tuple[list[Entr
         if place is None:
             others.append((solver[0], _why_not(runs, [rows[k] for k in own], target)))
             continue
-        drawn = cost_at(runs.drawn(), place)
+        drawn = cost_at(runs.drawn, place)
         timed.append((float(cost_at(runs.of("call_s"), place)), drawn, rows[cheapest(runs, place)]))
     timed.sort(key=lambda each: each[0])
     return [_entry(*each, *timed[0][:2]) for each in timed], others

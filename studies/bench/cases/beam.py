@@ -59,5 +59,4 @@ def case(kind: str, name: str, quick: bool, t_end: float | None = None) -> Case:
 
 
 def cases(quick: bool) -> list[Case]:
-    """Both beams."""
     return [case(kind, f"{kind} beam", quick) for kind in MAKE]
