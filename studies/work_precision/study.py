@@ -139,11 +139,17 @@ def report(output: Output, rows: pd.DataFrame, line: str) -> dict[str, Any]:
 
 
 def means_over_medians(rows: pd.DataFrame) -> dict[str, Any]:
-    """How many times its median call the mean call of a repetition takes, of ours and of others, in the median."""
-    if "call_mean_s" not in rows or rows["call_mean_s"].isna().all():
+    """How many times its median call the mean call of a repetition takes, of ours and of others, in the median.
+
+    `before`: mechanisms whose rows are older, and hold the mean of a few calls in the place of the median of more.
+    """
+    several = rows[rows["calls"] > 1]
+    if "call_mean_s" not in rows or several["call_mean_s"].isna().all():
         return {}
-    over = (rows["call_mean_s"] / rows["call_s"])[rows["calls"] > 1].groupby(rows["family"] == "two-loop").median()
-    return {"mean": {"ours": over.get(True), "others": over.get(False)}}
+    old = several[several["call_mean_s"].isna()]
+    over = (several["call_mean_s"] / several["call_s"]).groupby(several["family"] == "two-loop").median()
+    before = {"cases": sorted(old["case"].unique()), "calls": int(old["calls"].max())} if len(old) else None
+    return {"mean": {"ours": over.get(True), "others": over.get(False)}, "before": before}
 
 
 def unlike(medians: pd.DataFrame) -> dict[str, Any]:
