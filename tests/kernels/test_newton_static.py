@@ -6,7 +6,8 @@ import pytest
 import twoloop.run.newton_form as newton_form
 import twoloop.run.static_form as static_module
 from studies.bench.large import PLANAR, closed_chain, grid, ladder, open_chain, tree
-from tests.large_systems import Assembly, SpatialAssembly, spatial_chain
+from studies.bench.random_assemblies import PlanarAssembly, SpatialAssembly
+from tests.large_systems import spatial_chain
 from tests.problems import worst
 from twoloop import ConstrainedSystem, solve_dae
 from twoloop.kernels.algebra.static_program import N_UPDATES
@@ -80,7 +81,7 @@ def branched(n):
 
 
 def redundant(n):
-    made = Assembly(5, n, 2, 2)
+    made = PlanarAssembly(5, n, 2, 2)
     return sprung(made.bodies, made.q, made.pairs[1:n]), made.q
 
 
