@@ -12,6 +12,7 @@ from studies.bench import figures, tables
 from studies.bench.solvers import DEFAULT
 from studies.bench.store import Output
 from studies.bench.study import Study
+from studies.scale.agreement import agreements, found_of
 from studies.scale.rivals import BUDGET, TREE, UNTIL, UNTIL_END, trees, until
 from studies.scale.runs import (
     CHAIN,
@@ -35,10 +36,10 @@ BEND = 0.3  # by which a power from one size to the next differs notably from th
 
 
 def make(output: Output) -> pd.DataFrame:
-    """Rows of evaluations and memory, of trees, of chains, and of those that grow until others stop."""
+    """Rows of agreement, of evaluations and memory, of trees, of chains, and of those that grow until others stop."""
     quick = output.call.quick
     with output.kept() as kept:
-        groups = evaluations, trees, chains, until
+        groups = agreements, evaluations, trees, chains, until
         return pd.DataFrame([kept.made(key, row) for group in groups for key, row in group(quick)])
 
 
@@ -66,7 +67,7 @@ def powers(us: dict[int, float]) -> list[dict[str, Any]]:
 def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     """Slopes and times by kind of mechanism; chains at equal error."""
     found: dict[str, Any] = {"kinds": [], "chains": [], "from": FROM, "to": TO, "errors": list(ERRORS), "limit": LIMIT}
-    found["once"] = {}
+    found |= {"once": {}, "agreement": found_of(rows)}
     made = rows[(rows["group"] == EVALUATION) & rows["evaluation_us"].notna()]
     for case, own in made.groupby("case", sort=False):
         by_size = own.groupby("n")

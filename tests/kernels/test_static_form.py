@@ -80,7 +80,7 @@ def test_random_assemblies_agree_with_dense_algebra(any_size, kind, number, most
 @pytest.mark.parametrize("ratio", [1e6, 1e10])
 def test_mass_ratios(any_size, ratio):
     decided = 0
-    for seed in range(4):
+    for seed in range(12):
         assembly = PlanarAssembly(seed, 30, 2, 0, heaviest=ratio)
         system = assembly.bodies.system("heavy and light")
         v = np.zeros(system.n_q)
@@ -89,8 +89,8 @@ def test_mass_ratios(any_size, ratio):
             continue
         decided += 1
         root, a = np.sqrt(np.diag(system.mass(0.0, assembly.q))), dense_solution(system, assembly.q, v).a
-        assert worst(root * started.a, root * a) < 1e-8 * np.abs(root * a).max()
-    assert decided >= 3
+        assert worst(root * started.a, root * a) < 1e-10 * np.abs(root * a).max()
+    assert decided >= 10
 
 
 def test_projection_is_that_in_the_metric_of_the_masses(any_size):
