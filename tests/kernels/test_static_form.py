@@ -1,16 +1,18 @@
 """Large systems by sparse factors with a static program, against dense algebra in NumPy and the other forms."""
 
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 import twoloop.run.static_form as static_module
-from studies.bench.large import LEVEL, PLANAR, closed_chain, grid, in_space, ladder, open_chain
+from studies.bench.large import LEVEL, PLANAR, closed_chain, grid, in_space, ladder, open_chain, tree_of_hinges
 from studies.bench.random_assemblies import PlanarAssembly, SpatialAssembly, dense_solution, drawn
 from tests.large_systems import spatial_chain, started_run
 from tests.problems import worst
 from twoloop import ConstraintWarning, Status, consistent_state, mechanisms, solve_dae
+from twoloop.checks.values import MOST
 from twoloop.kernels import advance
 from twoloop.kernels.algebra.static_program import N_UPDATES
 from twoloop.kernels.data import codes, noted
@@ -206,6 +208,18 @@ def test_programs_grow_with_the_bodies_and_no_faster(large):
             assert run.work.notes.base.size + run.work.counters.base.size < 120 * system.n_q  # nothing n_c x n_q
         assert updates[999] <= (50.0 if make is grid else 10.6) * updates[99]  # of a grid like n^1.5, at best
         assert updates[999] <= (800 if make is grid else 150) * 999
+
+
+@pytest.mark.parametrize(("build", "n"), [(open_chain, 1000), (ladder, 1000), (tree_of_hinges, 400)])
+def test_starts_make_no_full_matrix_beyond_those_of_four_million_numbers(build, n):
+    for size in (40, n):  # the first one loads the kernels
+        made = build(size)
+        system = made.system
+        tracemalloc.start()
+        solve_dae(system, (0.0, 1.0), made.q, 0.0 * made.q, "DOP853", max_steps=2, compiled=False)
+        most = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+    assert system.n_c * system.n_q > MOST and most < 0.7 * 8 * system.n_c * system.n_q
 
 
 def test_small_mechanisms_have_the_forms_that_they_had():
