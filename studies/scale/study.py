@@ -100,7 +100,6 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
         of_chain["by_order"] = bool(step) and (step["exudyn"] / step["ours"]) ** 2 < least
         found["chains"].append(of_chain)
     held = rows[rows["group"].eq(MEMORY)]
-    held = held[held["memory_mb"].notna()] if len(held) else held
     found["memory"] = {int(row["n"]): float(row["memory_mb"]) for _, row in held.iterrows()}
     found["trees"] = [_beside_engines(line, rows[rows["group"] == TREE]) for line in found["kinds"]]
     found["trees"] = [line for line in found["trees"] if line["engines"]]

@@ -49,7 +49,7 @@ def test_slopes_and_ratios_follow_the_rows():
     assert found["chains"][0]["fastest"][0] == {"error": 1e-3, "solver": EXUDYN, "over": pytest.approx([50.0, 50.0])}
     assert f"| 20 | 1.0 | at least 50 | `{EXUDYN}`: at least 50 |" in text
     assert [each["power"] for each in found["kinds"][0]["powers"]] == pytest.approx([1.0, 1.0])
-    assert "| open chain | 1.0 | 1.0 | 1.0 |" in text and "One power does not describe" not in text
+    assert "| open chain | 1.00 (1.00–1.00) | 1.0 | 1.0 |" in text and "One power does not describe" not in text
     found, text = said(pd.concat([evaluations(2.0), chains(ours=1.0, exudyn=0.5)], ignore_index=True))
     assert found["kinds"][0]["slope"][0] == pytest.approx(2.0)
     assert f"| 20 | 1.0 | at least 0.50 | `{EXUDYN}`: at most 0.50 |" in text
