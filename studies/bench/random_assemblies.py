@@ -24,6 +24,7 @@ class RandomAssembly:
     """A tree of joints, joints that close loops, and joints between pairs of bodies that have one already."""
 
     q: Array
+    places: Array
     bodies: Any
     rng: np.random.Generator
     pairs: list[tuple[int, int]]
@@ -39,6 +40,14 @@ class RandomAssembly:
         for _ in range(doubles):
             self.close(*self.pairs[int(self.rng.integers(len(self.pairs)))])
         return tree
+
+    def join(self, i: int, j: int) -> None:
+        """Connect two bodies."""
+        raise NotImplementedError
+
+    def close(self, i: int, j: int) -> None:
+        """Connect two bodies that hang together already."""
+        self.join(i, j)
 
     def v(self, system: ConstrainedSystem) -> Array:
         """Random velocities that the constraints allow."""
@@ -65,8 +74,6 @@ class PlanarAssembly(RandomAssembly):
         at = self.places[i, :2] + self.rng.normal(size=2)
         self.pairs.append((i, j))
         self.bodies.pin(i, self.on(i, at), j, tuple(at) if j == GROUND else self.on(j, at))
-
-    close = join
 
     def on(self, k: int, at: Array) -> tuple[float, float]:
         """A place in the axes of a body."""

@@ -78,7 +78,7 @@ def evaluation(build: Callable[[int], Assembly], n: int, repeat: int) -> Row:
 
 
 def memory(n: int) -> Row:
-    """What Python and NumPy allocate at most for a run of a few steps, all of which are kept; kernels allocate nothing."""
+    """What Python and NumPy allocate at most for a run of a few steps, all of them kept; kernels allocate nothing."""
     _steps(problem_of(open_chain(min(SIZES[3:])), 1.0), 1)  # what is loaded once
     tracemalloc.start()
     _steps(problem_of(open_chain(n), 1.0), STEPS[0])
