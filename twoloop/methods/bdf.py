@@ -29,8 +29,9 @@ class BDF:
     at the rate of the truncation error; large ones may do either from order 3 on. The fixed point limits h to about
     the reciprocal of the largest frequency or rate of decay: stiff problems need small steps.
 
-    With outer="newton" the outer loop is Newton's method, and stiff problems take long steps. Its matrices, and those
-    of the constraints, are sparse where systems are large.
+    With outer="newton" the outer loop is Newton's method, and stiff problems take long steps; with fixed steps the
+    order rises from 1, a step at a time. The matrices are sparse where systems are large, with either outer loop: then
+    all coordinates are integrated, and the end of each step is put on the constraints.
 
     Parameters
     ----------
