@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from studies.bench import figures, tables
 from studies.bench.solvers import DEFAULT
 from studies.bench.study import Study, kept_rows
+from studies.scale.agreement import agreements, found_of
 from studies.scale.rivals import BUDGET, TREE, UNTIL, UNTIL_END, trees, until
 from studies.scale.runs import (
     CHAIN,
@@ -57,7 +58,7 @@ def powers(us: dict[int, float]) -> list[dict[str, Any]]:
 def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     """Slopes and times by kind of mechanism; chains at equal error."""
     found: dict[str, Any] = {"kinds": [], "chains": [], "from": FROM, "to": TO, "errors": list(ERRORS), "limit": LIMIT}
-    found["once"] = {}
+    found |= {"once": {}, "agreement": found_of(rows)}
     made = rows[(rows["group"] == EVALUATION) & rows["evaluation_us"].notna()]
     for case, own in made.groupby("case", sort=False):
         by_size = own.groupby("n")
@@ -181,4 +182,4 @@ def figures_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Figure]:
     return {"scale": figure, "scale_chains": second}
 
 
-STUDY = Study("scale", __doc__, kept_rows(evaluations, trees, chains, until), findings_of, figures_of)
+STUDY = Study("scale", __doc__, kept_rows(agreements, evaluations, trees, chains, until), findings_of, figures_of)

@@ -115,3 +115,34 @@ def test_the_last_fixed_step_may_be_short():
     for end in (1.01, 1.0001):  # half a step, and one too short for the history
         result = swing(end, method="BDF", step_size=0.02)
         assert result.success and worst(result.q[:, -1], pendulum_state(end)[0]) < 1e-4
+
+
+# --- Newton's method as the outer loop
+def test_newtons_method_takes_the_steps_of_the_fixed_point_where_nothing_is_stiff():
+    for tol in (1e-5, 1e-8):
+        (one, error), (other, same) = (four_bar_run(BDF(outer=outer), tol, 3.0) for outer in ("fixed-point", "newton"))
+        assert same < 1.2 * error and abs(other.stats.n_accepted - one.stats.n_accepted) < 0.02 * one.stats.n_accepted
+        assert other.stats.n_outer <= 1.1 * one.stats.n_outer and 0 < other.stats.n_jacobians < 30
+
+
+def test_newtons_method_takes_long_steps_in_a_viscous_fluid():
+    """A pendulum whose drag lets it creep: rates of 1e4 per second, which last a thousandth of the motion."""
+
+    def viscous(t, q, v):
+        return np.array([0.0, -9.81]) - 1e4 * v
+
+    found = {}
+    for outer in ("fixed-point", "newton"):
+        options = {"method": BDF(outer=outer), "rtol": 1e-5, "atol": 1e-5}
+        found[outer] = swing(1.0, pendulum(force=viscous), **options)
+        assert found[outer].success
+    one, other = found["fixed-point"], found["newton"]
+    assert worst(one.q[:, -1], other.q[:, -1]) < 1e-4 and other.stats.n_accepted < 0.02 * one.stats.n_accepted
+
+
+def test_fixed_steps_by_newtons_method_have_the_order_that_was_asked_for():
+    errors = []
+    for h in (0.002, 0.001):
+        result = swing(1.0, method=BDF(2, outer="newton"), step_size=h)
+        errors.append(worst(result.q[:, -1], pendulum_state(result.t[-1:])[0][:, 0]))
+    assert 3.0 < errors[0] / errors[1] < 5.0

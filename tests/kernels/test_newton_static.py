@@ -6,9 +6,10 @@ import pytest
 import twoloop.run.newton_form as newton_form
 import twoloop.run.static_form as static_module
 from studies.bench.large import PLANAR, closed_chain, grid, ladder, open_chain, tree
-from tests.large_systems import Assembly, SpatialAssembly, spatial_chain
+from studies.bench.random_assemblies import PlanarAssembly, SpatialAssembly
+from tests.large_systems import spatial_chain
 from tests.problems import worst
-from twoloop import ConstrainedSystem, solve_dae
+from twoloop import BDF, ConstrainedSystem, solve_dae
 from twoloop.kernels.algebra.static_program import N_UPDATES
 from twoloop.mechanisms import planar, spatial_bodies
 from twoloop.run.run import Run
@@ -80,7 +81,7 @@ def branched(n):
 
 
 def redundant(n):
-    made = Assembly(5, n, 2, 2)
+    made = PlanarAssembly(5, n, 2, 2)
     return sprung(made.bodies, made.q, made.pairs[1:n]), made.q
 
 
@@ -110,6 +111,9 @@ def alike(one, other, allowed):
         ("tree", "RadauIIA5", 1e-9, 1e-9),
         ("redundant rows", "RadauIIA9", 1e-10, 1e-9),
         ("closed chain", "TRBDF2", 1e-5, 1e-5),
+        ("closed chain", "BDF", 1e-7, 1e-6),
+        ("ladder", BDF(outer="newton"), 1e-7, 1e-6),
+        ("redundant rows", BDF(outer="newton"), 1e-7, 1e-6),
     ],
 )
 def test_runs_are_those_of_the_dense_forms(form, case, method, tolerance, allowed):

@@ -1,5 +1,6 @@
 """Large systems by sparse factors with a static program, against dense algebra in NumPy and the other forms."""
 
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
@@ -7,9 +8,11 @@ import pytest
 
 import twoloop.run.static_form as static_module
 from studies.bench.large import LEVEL, PLANAR, closed_chain, grid, in_space, ladder, open_chain
-from tests.large_systems import Assembly, SpatialAssembly, dense_solution, spatial_chain, started_run
+from studies.bench.random_assemblies import PlanarAssembly, SpatialAssembly, dense_solution, drawn
+from tests.large_systems import spatial_chain, started_run
 from tests.problems import worst
 from twoloop import ConstraintWarning, Status, consistent_state, mechanisms, solve_dae
+from twoloop.checks.values import MOST
 from twoloop.kernels import advance
 from twoloop.kernels.algebra.static_program import N_UPDATES
 from twoloop.kernels.data import codes, noted
@@ -44,21 +47,15 @@ class Started:
         return q, v
 
 
-def compare(seed, most, kind=Assembly):
-    """The larger error of accelerations and multipliers of a random assembly; None where dense has to decide."""
-    rng = np.random.default_rng(seed)
-    n = int(rng.integers(5, most))
-    assembly = kind(seed, n, int(rng.integers(0, max(1, n // 5))), int(rng.choice([0, 0, 1, 3])))
+def compare(assembly):
+    """The error of accelerations and multipliers of a random assembly; None where dense has to decide."""
     system = assembly.bodies.system("random")
     v = assembly.v(system)
-    a, lam, rank, nearest = dense_solution(system, assembly.q, v)
-    started = Started(system, assembly.q, v)
+    exact, started = dense_solution(system, assembly.q, v), Started(system, assembly.q, v)
     if started.code == codes.NEEDS_DENSE:
         return None
-    assert started.code == codes.DONE and started.rank == rank
-    allowed = max(1.0, 1e-5 / nearest)  # what is nearly singular takes digits from both
-    errors = worst(started.a, a) / np.abs(a).max(), worst(started.lam, lam) / np.abs(lam).max()
-    return max(errors) / allowed
+    assert started.code == codes.DONE and started.rank == exact.rank
+    return exact.error(started.a, started.lam)
 
 
 @pytest.fixture
@@ -67,37 +64,39 @@ def any_size(large, monkeypatch):
     monkeypatch.setattr(static_module, "SPARSE", 1e9)
 
 
-@pytest.mark.parametrize(("kind", "number", "most"), [(Assembly, 16, 80), (SpatialAssembly, 12, 30)])
+@pytest.mark.parametrize(
+    ("kind", "number", "most"),
+    [
+        (PlanarAssembly, 16, 80),
+        (SpatialAssembly, 12, 30),
+        pytest.param(PlanarAssembly, 130, 300, marks=pytest.mark.slow),
+        pytest.param(SpatialAssembly, 70, 300, marks=pytest.mark.slow),
+    ],
+)
 def test_random_assemblies_agree_with_dense_algebra(any_size, kind, number, most):
-    found = [compare(seed, most, kind) for seed in range(number)]
+    """Trees and loops of 5 bodies and more, most with redundant rows; the two hundred that are slow take a minute."""
+    found = [compare(drawn(kind, seed, most)) for seed in range(number)]
     assert max(error for error in found if error is not None) < 1e-9 and found.count(None) <= number // 12
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("kind", "number", "most"), [(Assembly, 150, 300), (SpatialAssembly, 50, 120)])
-def test_more_random_assemblies_agree_with_dense_algebra(any_size, kind, number, most):
-    found = [compare(seed, most, kind) for seed in range(1000, 1000 + number)]
-    assert max(error for error in found if error is not None) < 1e-9 and found.count(None) <= number // 20
 
 
 @pytest.mark.parametrize("ratio", [1e6, 1e10])
 def test_mass_ratios(any_size, ratio):
     decided = 0
-    for seed in range(4):
-        assembly = Assembly(seed, 30, 2, 0, heaviest=ratio)
+    for seed in range(12):
+        assembly = PlanarAssembly(seed, 30, 2, 0, heaviest=ratio)
         system = assembly.bodies.system("heavy and light")
         v = np.zeros(system.n_q)
         started = Started(system, assembly.q, v)
         if started.code == codes.NEEDS_DENSE:
             continue
         decided += 1
-        root, (a, *_) = np.sqrt(np.diag(system.mass(0.0, assembly.q))), dense_solution(system, assembly.q, v)
-        assert worst(root * started.a, root * a) < 1e-8 * np.abs(root * a).max()
-    assert decided >= 3
+        root, a = np.sqrt(np.diag(system.mass(0.0, assembly.q))), dense_solution(system, assembly.q, v).a
+        assert worst(root * started.a, root * a) < 1e-10 * np.abs(root * a).max()
+    assert decided >= 10
 
 
 def test_projection_is_that_in_the_metric_of_the_masses(any_size):
-    assembly = Assembly(3, 40, 4, 1)
+    assembly = PlanarAssembly(3, 40, 4, 1)
     system = assembly.bodies.system("projected")
     started = Started(system, assembly.q, np.zeros(system.n_q))
     rng = np.random.default_rng(1)
@@ -154,7 +153,7 @@ def test_the_default_of_large_systems_with_values_of_entries_is_explicit_by_dop8
 
 
 def test_redundant_rows_are_named_and_held(both):
-    assembly = Assembly(5, 24, 2, 2)
+    assembly = PlanarAssembly(5, 24, 2, 2)
     system, q = assembly.bodies.system("redundant"), assembly.q
 
     def run():
@@ -170,7 +169,7 @@ def test_redundant_rows_are_named_and_held(both):
 
 def test_many_redundant_rows(any_size):
     """More than eighty, with multipliers of least norm."""
-    assembly = Assembly(3, 60, 0, 90)
+    assembly = PlanarAssembly(3, 60, 0, 90)
     system = assembly.bodies.system("many pins twice")
     v = assembly.v(system)
     a, lam, rank, _ = dense_solution(system, assembly.q, v)
@@ -209,6 +208,18 @@ def test_programs_grow_with_the_bodies_and_no_faster(large):
             assert run.work.notes.base.size + run.work.counters.base.size < 120 * system.n_q  # nothing n_c x n_q
         assert updates[999] <= (50.0 if make is grid else 10.6) * updates[99]  # of a grid like n^1.5, at best
         assert updates[999] <= (800 if make is grid else 150) * 999
+
+
+@pytest.mark.parametrize("build", [open_chain, ladder])
+def test_starts_make_no_full_matrix_beyond_those_of_four_million_numbers(build):
+    for size in (40, 1000):  # the first one loads the kernels
+        made = build(size)
+        system = made.system
+        tracemalloc.start()
+        solve_dae(system, (0.0, 1.0), made.q, 0.0 * made.q, "DOP853", max_steps=2, compiled=False)
+        most = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+    assert system.n_c * system.n_q > MOST and most < 0.7 * 8 * system.n_c * system.n_q
 
 
 def test_small_mechanisms_have_the_forms_that_they_had():

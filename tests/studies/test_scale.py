@@ -6,7 +6,7 @@ import pytest
 
 from studies.bench.large import PLANAR, SPATIAL, open_chain
 from studies.bench.render import render
-from studies.scale import rivals, runs
+from studies.scale import agreement, rivals, runs
 from studies.scale import study as scale
 
 EXUDYN = "Exudyn, GeneralizedAlpha"
@@ -49,7 +49,7 @@ def test_slopes_and_ratios_follow_the_rows():
     assert found["chains"][0]["fastest"][0] == {"error": 1e-3, "solver": EXUDYN, "over": pytest.approx([50.0, 50.0])}
     assert f"| 20 | 1.0 | at least 50 | `{EXUDYN}`: at least 50 |" in text
     assert [each["power"] for each in found["kinds"][0]["powers"]] == pytest.approx([1.0, 1.0])
-    assert "| open chain | 1.0 | 1.0 | 1.0 |" in text and "One power does not describe" not in text
+    assert "| open chain | 1.00 (1.00–1.00) | 1.0 | 1.0 |" in text and "One power does not describe" not in text
     found, text = said(pd.concat([evaluations(2.0), chains(ours=1.0, exudyn=0.5)], ignore_index=True))
     assert found["kinds"][0]["slope"][0] == pytest.approx(2.0)
     assert f"| 20 | 1.0 | at least 0.50 | `{EXUDYN}`: at most 0.50 |" in text
@@ -107,6 +107,17 @@ def test_a_failed_size_is_named_and_in_no_fit():
     rows = pd.concat([evaluations(), failed[failed["n"] == 1000].assign(case="star"), chains()], ignore_index=True)
     found, text = said(rows)
     assert [line["case"] for line in found["kinds"]] == ["open chain"] and "star of 1000" in text
+
+
+def test_random_assemblies_that_disagree_with_dense_algebra_are_said_to():
+    made = [row() for _, row in agreement.agreements(True)]
+    rows = pd.concat([pd.DataFrame(made), evaluations(), chains()], ignore_index=True)
+    found, text = said(rows)
+    assert [line["number"] for line in found["agreement"]] == [agreement.QUICK] * 2
+    assert all(line["worst"] < 1e-9 and line["redundant"] > 0 for line in found["agreement"])
+    assert text.count("all ranks are right") == 2
+    rows.loc[0, ["status", "message", "error_q"]] = ["FAILED", "rank 3 in the place of 4", None]
+    assert "1 failed: rank 3 in the place of 4." in said(rows)[1]
 
 
 @pytest.mark.parametrize("build", [*PLANAR, *SPATIAL])

@@ -232,7 +232,7 @@ class PlanarBodies:
         self.masses, self.inertias = np.asarray(masses, dtype=float), np.asarray(inertias, dtype=float)
         self.gravity, self.n_c = gravity, 0
         self._joints: list[list[float]] = []
-        self._named: list[Joint] = []
+        self._named: dict[str, Joint] = {}
         self.pins: list[tuple[int, tuple[float, float], int, tuple[float, float]]] = []
 
     def _add(
@@ -240,7 +240,8 @@ class PlanarBodies:
     ) -> int:
         first = 3 * body
         numbered = tuple(range(self.n_c, self.n_c + rows))
-        self._named.append(Joint(unused(name, self._named), numbered, (first, first + 1), (first + 2,), point))
+        name = unused(name, self._named)
+        self._named[name] = Joint(name, numbered, (first, first + 1), (first + 2,), point)
         self._joints.append([kind, float(self.n_c), *numbers])
         self.n_c += rows
         return self.n_c - rows
@@ -281,10 +282,11 @@ class PlanarBodies:
             del given["constraint_rate"]
         if n_q >= LARGE:
             given |= {"mass_entries": (range(n_q), range(n_q)), "jacobian_entries": jacobian_entries(self._joints)}
+            del given["kinematics"]  # which fills a full matrix
         else:
             del given["mass_values"], given["jacobian_values"]
         parameters = np.concatenate([sizes, bodies.ravel(), np.ravel(self._joints)])
-        fixed: dict[str, Any] = {"constant_mass": True, "joints": self._named, "name": name}
+        fixed: dict[str, Any] = {"constant_mass": True, "joints": list(self._named.values()), "name": name}
         return ConstrainedSystem(n_q=n_q, n_c=self.n_c, parameters=parameters, **given, **fixed)
 
     @property

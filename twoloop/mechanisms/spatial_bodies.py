@@ -41,7 +41,7 @@ class SpatialBodies:
         self._v: list[Array] = [np.zeros(0)]
         self._R: list[Array] = []
         self._joints: list[list[float]] = []
-        self._named: list[Joint] = []  # row numbers without the normalisations
+        self._named: dict[str, Joint] = {}  # row numbers without the normalisations
         self._springs: list[list[float]] = []
         self._drawn: list[tuple[int, int, Array]] = []  # bodies of a joint, and its initial position
 
@@ -111,7 +111,8 @@ class SpatialBodies:
         numbered, place = tuple(range(first, self.n_joint_rows)), 7 * body
         position, parameters = tuple(range(place, place + 3)), tuple(range(place + 3, place + 7))
         there = tuple(self._from_centre(body, point))
-        self._named.append(Joint(unused(name, self._named), numbered, position, parameters, there))
+        name = unused(name, self._named)
+        self._named[name] = Joint(name, numbered, position, parameters, there)
 
     def spherical(self, i: int, j: int, point: ArrayLike) -> None:
         """Add three rows: both bodies share a point."""
@@ -154,7 +155,7 @@ class SpatialBodies:
         else:
             del given["mass_values"], given["jacobian_values"]
         parameters = np.concatenate([[n, len(self._joints), len(self._springs)], self.gravity, *tables])
-        named = [replace(joint, rows=tuple(n + row for row in joint.rows)) for joint in self._named]
+        named = [replace(joint, rows=tuple(n + row for row in joint.rows)) for joint in self._named.values()]
         sizes: dict[str, Any] = {"n_q": 7 * n, "n_c": n + self.n_joint_rows}
         return ConstrainedSystem(**sizes, **given, parameters=parameters, joints=named, name=name)
 

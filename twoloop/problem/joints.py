@@ -1,6 +1,6 @@
 """Joints: which rows of the constraints hold which body, and where; what `Result.reactions` needs to know."""
 
-from collections.abc import Iterable
+from collections.abc import Container
 from dataclasses import dataclass
 from itertools import count
 
@@ -85,9 +85,8 @@ class Joint:
             object.__setattr__(self, "equations", check_real(f"equations of {self.name!r}", self.equations))
 
 
-def unused(name: str, joints: Iterable[Joint]) -> str:
+def unused(name: str, names: Container[str]) -> str:
     """`name`, or with a number where joints between the same bodies have it already: "pin a-b 2"."""
-    names = {joint.name for joint in joints}
     return name if name not in names else next(new for k in count(2) if (new := f"{name} {k}") not in names)
 
 
@@ -96,9 +95,9 @@ def check_joints(joints: object, n_q: int, n_rows: int) -> tuple[Joint, ...]:
     if not isinstance(joints, (tuple, list)) or not all(isinstance(joint, Joint) for joint in joints):
         raise TypeError(f"joints must be a list of twoloop.Joint; given {joints!r}")
     names = [joint.name for joint in joints]
-    twice = [name for name in names if names.count(name) > 1]
-    if twice:
-        raise ValueError(f"joints must have names of their own; given {twice[0]!r} twice")
+    if len(set(names)) < len(names):
+        twice = next(name for name in names if names.count(name) > 1)
+        raise ValueError(f"joints must have names of their own; given {twice!r} twice")
     for joint in joints:
         if max(joint.rows) >= n_rows:
             raise ValueError(

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from twoloop.kernels.algebra.linalg import copy
 from twoloop.kernels.control.predictor import departure
 from twoloop.kernels.data.codes import DONE, OUTER_DIVERGED
-from twoloop.kernels.data.common import ATTEMPT, SETTLE, Attempt, Step, compiled, inlined, kernel
+from twoloop.kernels.data.common import ATTEMPT, SETTLE, Attempt, Step, compiled, inlined, kernel, merged
 from twoloop.kernels.data.counters import N_OUTER
 from twoloop.kernels.data.tolerances import ATOL, ESTIMATE, RTOL
 from twoloop.kernels.evaluation.calls import accelerations, evaluate_state, rounding_floor
@@ -34,7 +34,7 @@ GROWTH = 2.0  # the most by which a step grows
 
 # places in `options`: scalars, then the parameter block of the Gauss steps
 HIGHEST, INNER_TOL, OUTER_TOL, N_SCALARS = range(4)
-# places in `memory`: scalars, rows of coefficients, then vectors; see _coefficients and _blocks
+# places in `memory`: scalars, rows of coefficients, then vectors; see _coefficients and blocks_of
 (
     HAS_TRIAL,  # whether the last attempt left differences at its end
     ORDER,
@@ -67,7 +67,7 @@ def _coefficients(memory, row):
 
 
 @inlined
-def _blocks(memory, n):
+def blocks_of(memory, n):
     """Differences and trial differences (N_DIFFERENCES, 2 n), prediction and its rate (2 n), scratch."""
     o = N_MEMORY_SCALARS + N_ROWS * N_DIFFERENCES
     size = N_DIFFERENCES * 2 * n
@@ -77,10 +77,10 @@ def _blocks(memory, n):
     return differences, trial, memory[o : o + 2 * n], memory[o + 2 * n : o + 4 * n], memory[o + 4 * n :]
 
 
-@kernel(SETTLE)
-def settle_bdf(f, w, options, memory, tolerances, accepted):
+@compiled
+def settle(memory, n, accepted):
     """Make the trial differences the history, if the attempt was accepted."""
-    differences, trial, _, _, _ = _blocks(memory, w.Q.size)
+    differences, trial, _, _, _ = blocks_of(memory, n)
     left = memory[HAS_TRIAL]
     memory[HAS_TRIAL] = 0.0
     if left == 0.0:
@@ -95,6 +95,12 @@ def settle_bdf(f, w, options, memory, tolerances, accepted):
     memory[AGE] = memory[AGE] + 1.0 if memory[ORDER] == memory[NEXT_ORDER] else 0.0
     memory[ORDER] = memory[NEXT_ORDER]
     memory[DEPTH] = memory[NEXT_DEPTH]
+
+
+@kernel(SETTLE)
+def settle_bdf(f, w, options, memory, tolerances, accepted):
+    """As `settle` says."""
+    settle(memory, w.Q.size, accepted)
 
 
 @compiled
@@ -137,18 +143,23 @@ def _predict(memory, differences, trial, h, prediction, rate):
                 rate[m] += in_rate * trial[j, m]
 
 
-@compiled
-def _correct(f, w, options, t, h, k, prediction, rate, new_state, a_new):
-    """Solve y = prediction + c (y' - rate) at t for the independents: a fixed-point iteration on their accelerations.
-
-    c is h over 1 + 1/2 + ... + 1/k. On return the whole new state is consistent.
-    """
-    n = w.Q.size
-    q1, v1, a1, lam1 = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n], new_state[3 * n :]
+@merged
+def spread(h, k):
+    """c = h / (1 + 1/2 + ... + 1/k)."""
     leading = 0.0
     for j in range(k):
         leading += 1.0 / (j + 1.0)
-    c = h / leading
+    return h / leading
+
+
+@compiled
+def _correct(f, w, options, t, c, prediction, rate, new_state, a_new):
+    """Solve y = prediction + c (y' - rate) at t for the independents: a fixed-point iteration on their accelerations.
+
+    On return the whole new state is consistent.
+    """
+    n = w.Q.size
+    q1, v1, a1, lam1 = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n], new_state[3 * n :]
     copy(prediction, new_state[: 2 * n])  # dependents: where Newton starts
     copy(rate[n:], a1)
     before = np.inf
@@ -273,32 +284,27 @@ def _gauss_step(f, w, options, tolerances, t, h, state, new_state, scratch):
     return code
 
 
-@kernel(ATTEMPT)
-def bdf_step(f, w, options, memory, t, h, tolerances, state, new_state):
-    """One attempt: predict from the history, correct, and choose the order and the size of the next step.
+@compiled
+def begin_step(memory, blocks, state, h, lowest):
+    """Predict the end of a step; a history that begins has this order at first. The order of the step."""
+    differences, trial, prediction, rate, _ = blocks
+    if memory[DEPTH] == 0.0:
+        _begin(memory, differences, state, h, lowest)
+    _predict(memory, differences, trial, h, prediction, rate)
+    return int(memory[ORDER])
 
-    Fixed steps are of the highest order; the history that it needs comes from as many Gauss steps.
-    """
+
+@compiled
+def end_step(w, options, memory, blocks, h, tolerances, state, new_state):
+    """Judge the corrected end of a step, and choose the order and the size of the next one."""
     n = w.Q.size
     y, y1 = state[: 2 * n], new_state[: 2 * n]
-    differences, trial, prediction, rate, scratch = _blocks(memory, n)
-    fixed = tolerances[ESTIMATE] == 0.0
-    if memory[DEPTH] == 0.0:
-        _begin(memory, differences, state, h, 0.0 if fixed else 1.0)
-    k = int(memory[ORDER])
-    _predict(memory, differences, trial, h, prediction, rate)
-    if fixed and k < options[HIGHEST]:
-        code = _gauss_step(f, w, options, tolerances, t, h, state, new_state, scratch)
-    else:
-        code = _correct(f, w, options, t + h, h, k, prediction, rate, new_state, scratch[:n])
-    if code != DONE:
-        return Attempt(code, np.inf, 0.0)
-    d = prediction
+    _, trial, d, _, _ = blocks
     for m in range(2 * n):
-        d[m] = y1[m] - prediction[m]
+        d[m] = y1[m] - d[m]
     error, factor = 0.0, 0.0
-    if fixed:
-        memory[NEXT_ORDER] = min(k + 1, int(options[HIGHEST]))
+    if tolerances[ESTIMATE] == 0.0:
+        memory[NEXT_ORDER] = min(memory[ORDER] + 1.0, options[HIGHEST])
     else:
         error, factor = _judge(options, memory, tolerances, trial, y, y1, d)
         off = departure(w, tolerances, h, y[:n], y[n:], y1[:n])
@@ -308,6 +314,26 @@ def bdf_step(f, w, options, memory, t, h, tolerances, state, new_state):
     memory[HAS_TRIAL] = 1.0
     _extend(memory, trial, y1, d)
     return Attempt(DONE, error, factor)
+
+
+@kernel(ATTEMPT)
+def bdf_step(f, w, options, memory, t, h, tolerances, state, new_state):
+    """One attempt: predict from the history, correct, and choose the order and the size of the next step.
+
+    Fixed steps are of the highest order; the history that it needs comes from as many Gauss steps.
+    """
+    n = w.Q.size
+    blocks = blocks_of(memory, n)
+    _, _, prediction, rate, scratch = blocks
+    fixed = tolerances[ESTIMATE] == 0.0
+    k = begin_step(memory, blocks, state, h, 0.0 if fixed else 1.0)
+    if fixed and k < options[HIGHEST]:
+        code = _gauss_step(f, w, options, tolerances, t, h, state, new_state, scratch)
+    else:
+        code = _correct(f, w, options, t + h, spread(h, k), prediction, rate, new_state, scratch[:n])
+    if code != DONE:
+        return Attempt(code, np.inf, 0.0)
+    return end_step(w, options, memory, blocks, h, tolerances, state, new_state)
 
 
 BDF = Step(bdf_step, settle_bdf)

@@ -31,7 +31,7 @@ from twoloop.kernels.steps import newton_memory as at
 from twoloop.kernels.steps.iteration_matrix import factor_iteration, filter_by_iteration, solve_iteration
 from twoloop.kernels.steps.lasting import lasting_error
 from twoloop.kernels.steps.newton_memory import block, memory_size, vector
-from twoloop.kernels.steps.newton_operator import correct, derivatives_at, factor_systems, filter_error
+from twoloop.kernels.steps.newton_operator import SAME_STEP, correct, derivatives_at, factor_systems, filter_error
 from twoloop.kernels.steps.stages import INNER_TOL, N_SCALARS, OUTER_TOL, STAGES, options_array
 
 MAX_ITERATIONS = 8
@@ -124,13 +124,13 @@ def _prepare(f, w, options, memory, t, h, Q, V, F):
         code = derivatives_at(f, w, options, memory, _one(options), t, Q, V, F)
         if code != DONE:
             return code
-    if memory[at.H_FACTORED] != h:
+    if abs(memory[at.H_FACTORED] - h) > SAME_STEP * h:
         return factor_systems(f, w, options, memory, _one(options), h)
     return DONE
 
 
 @compiled
-def _solve_stage(f, w, options, memory, t, h, tolerances, A_stage):
+def solve_stage(f, w, options, memory, t, h, tolerances, A_stage):
     """Newton's method for one stage, predicted in A_stage (1, n_q): DONE, or why not; (Q, V) in Q_MID, V_MID."""
     n = w.Q.size
     z = h * _gamma(options)
@@ -292,11 +292,11 @@ def diagonal_step(f, w, options, memory, t, h, tolerances, state, new_state):
             q_bar[m] = q[m] + h * in_q
             v_bar[m] = v[m] + h * in_v
         copy(A_stage[j - 1], A_stage[j])
-        code = _solve_stage(f, w, options, memory, t + c[j] * h, h, tolerances, A_stage[j : j + 1])
+        code = solve_stage(f, w, options, memory, t + c[j] * h, h, tolerances, A_stage[j : j + 1])
         if code != DONE and memory[at.FRESH] == 0.0:
             memory[at.HAS_JACOBIAN] = 0.0
             copy(A_stage[j - 1], A_stage[j])
-            code = _solve_stage(f, w, options, memory, t + c[j] * h, h, tolerances, A_stage[j : j + 1])
+            code = solve_stage(f, w, options, memory, t + c[j] * h, h, tolerances, A_stage[j : j + 1])
         if code != DONE:
             memory[at.HAS_JACOBIAN] = 0.0
             return Attempt(code, np.inf, 0.0)

@@ -12,6 +12,7 @@ from twoloop.kernels.steps import newton_memory as at
 from twoloop.kernels.steps.newton_memory import block, complex_vector, count_eigenvalues, eigen_place
 
 MAX_ITERATIONS = 15
+SAME_STEP = 1e-9  # relative: steps are differences of times, and the same step is rounded otherwise at another time
 STAGNATION = 0.1  # of the step tolerance: corrections of this size that no longer shrink are rounding
 
 

@@ -30,6 +30,7 @@ from twoloop.kernels.steps.lasting import lasting_error
 from twoloop.kernels.steps.newton_memory import block, eigen_place, vector
 from twoloop.kernels.steps.newton_operator import (
     MAX_ITERATIONS,
+    SAME_STEP,
     STAGNATION,
     correct,
     derivatives_at,
@@ -38,7 +39,6 @@ from twoloop.kernels.steps.newton_operator import (
 )
 from twoloop.kernels.steps.stages import FARTHEST, INNER_TOL, OUTER_TOL, STAGES, interpolate, middle_node, tableau_of
 
-SAME_STEP = 1e-9  # relative: steps are differences of times, and the same step is rounded otherwise at another time
 SLOW = 0.05  # contraction above which the derivatives are renewed before the next step
 STAGNATION_FIXED = 1e-9  # as STAGNATION, for fixed steps, relative to max(1, |value|)
 
