@@ -12,6 +12,7 @@ from twoloop.generate.exact_derivatives import exact_near
 from twoloop.generate.families import Family, family_of, give_bounds, take_bounds
 from twoloop.generate.straight_code import OwnCode
 from twoloop.generate.traced_values import Traced, states_around
+from twoloop.kernels.data import noted
 from twoloop.methods.code_for import Compiled, code_for, may_have_code
 from twoloop.methods.plan import Method
 from twoloop.methods.plans_for import plans_for
@@ -207,5 +208,6 @@ def _check_start(system: ConstrainedSystem, t0: float, q0: Array, v0: Array, der
 
 
 def _set_sizes(run: Run, asked: Asked) -> None:
+    run.work.notes[noted.KINK_AFTER] = asked.t1  # a drive may have a kink at the end
     if asked.step_size is None:
         run.set_sizes(asked.first_step, asked.max_step, asked.t1)

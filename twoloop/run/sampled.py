@@ -219,7 +219,7 @@ class SampledRun:
         with Interrupts() as interrupts:
             course = Course(run, end, wanted, lambda t: None, None, interrupts)
             record = course.to_end(False)
-        run.control[run.a.STORE_ALL] = 0.0
+        run.control[run.a.STORE_ALL], run.work.notes[noted.KINK_AFTER] = 0.0, np.inf
         steps = np.zeros((len(record.h), run.a.N_STEP_COLUMNS))
         steps[:, run.a.H], steps[:, run.a.JACOBIANS] = record.h, record.untested
         self.steps.append(steps)
