@@ -173,6 +173,9 @@ class Integrator:
             check_system(self.system)
         if not (type(dt) is float and 0.0 < dt < np.inf):
             check_positive("dt", dt)
+        t = self._sampled.t
+        if t + dt == t:
+            raise ValueError(f"dt must reach the next floating-point number after t = {t!r}; given {dt!r}")
         if inputs is not None:
             self._sampled.set(inputs)
         return self._sampled.step(float(dt))

@@ -10,6 +10,7 @@ from twoloop.checks.arguments import Array, shown
 
 SAMPLES = 4  # parts of a step, at whose ends the sign is looked at
 PRECISION = 4.0 * float(np.finfo(float).eps)  # of the time of an event, as in SciPy
+MOST = 3000  # iterations of Brent's method, which halves the interval at least every 53rd time: for zeros of high order
 
 States = Callable[[Array], Array]  # rows [q, v] at sorted times
 
@@ -168,7 +169,7 @@ def _root(event: Event, states: States, ends: tuple[float, float], values: tuple
         q, v = np.split(states(np.array([t]))[0], 2)
         return event(t, q, v)
 
-    return float(brentq(at, *ends, xtol=PRECISION, rtol=PRECISION))
+    return float(brentq(at, *ends, xtol=PRECISION, rtol=PRECISION, maxiter=MOST))
 
 
 def crosses(direction: float, g: float, g_new: float) -> bool:
