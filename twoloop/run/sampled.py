@@ -96,7 +96,7 @@ class SampledRun:
         self.run = self._run_from(t0, q0, v0)
         self.p = system.functions.p[system.called_in_python :]
         self._free: set[int] = set()  # places of parameters that are known to enter forces alone
-        self._changed = False
+        self._changed = self._failed = False
         self._outputs, self._filled = np.zeros(1), np.zeros(2, dtype=np.int64)
         self._buffers = np.empty(1), np.empty((1, len(self.run.state))), np.empty((STEPS, self.run.a.N_STEP_COLUMNS))
         self.rows, self.times, self.steps = list[Array](), list[float](), list[Array]()
