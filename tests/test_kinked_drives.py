@@ -385,3 +385,31 @@ def test_differences_of_constraints_that_hardly_bend_are_judged_by_rounding():
     v0 = [3.0 * radius * np.cos(angle), 3.0 * radius * np.sin(angle), 0.0, 3.0]
     result = solve_dae(wheel, (0.0, 3.0), [0.0, 0.0, angle, 0.0], v0)
     assert result.success and abs(result.q[3, -1] - 9.0) < 1e-7
+
+
+@pytest.mark.parametrize("t0", [0.0, 1e5, 1e6])
+def test_a_late_start_leaves_room_for_differences_on_one_side(t0):
+    """A drive of a kilohertz, with lengths of differences that are a few spacings of time at a start as late."""
+    size, rate, end = 1e-3, 6e3, 0.02
+    system = ConstrainedSystem.from_python(
+        n_q=2,
+        n_c=1,
+        mass=np.eye(2),
+        force=lambda t, q, v: np.array([0.0, -9.81]),
+        constraint=lambda t, q: np.array([0.5 * ((q[0] - place(t)) ** 2 + q[1] ** 2 - 1.0)]),
+        jacobian=lambda t, q: np.array([[q[0] - place(t), q[1]]]),
+        constraint_rate=lambda t, q: np.array([-(q[0] - place(t)) * size * rate * np.cos(rate * (t - t0))]),
+    )
+
+    def place(t):
+        return size * np.sin(rate * (t - t0)) if t > -1.0 else 0.0
+
+    start = [np.sin(0.5), -np.cos(0.5)], [size * rate, 0.0]
+    result = solve_dae(system, (t0, t0 + end), *start, "RadauIIA5", rtol=1e-5, atol=1e-5)
+    angle = solve_ivp(
+        lambda t, y: [y[1], -9.81 * np.sin(y[0]) + size * rate * rate * np.sin(rate * t) * np.cos(y[0])],
+        *((0.0, end), [0.5, 0.0], "DOP853"),
+        rtol=1e-12,
+        atol=1e-12,
+    ).y[0, -1]
+    assert result.success and abs(result.q[1, -1] + np.cos(angle)) < 1e-4

@@ -57,8 +57,9 @@ def _differences(f, w, t, q, v, e, first, last):
     """Gamma by differences over e and 2 e; its largest entry, the largest disagreement and the largest G v."""
     twice = w.Gamma_tried[0]
     side = _side(w.notes, t, e)
-    if side != 0.0:
-        e = representable(t, ONE_SIDED_LENGTH * e)
+    shorter = representable(t, ONE_SIDED_LENGTH * e)
+    if side != 0.0 and shorter > 0.0:
+        e = shorter
     terms = 0.0
     for i in range(first, last):
         w.Gamma[i] = 0.0
