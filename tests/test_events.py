@@ -199,3 +199,8 @@ def test_an_exception_of_an_event_comes_through_with_a_note():
 def test_a_value_that_is_wrong_later_is_named_with_its_time():
     with pytest.raises(ValueError, match=r"events\[0\] must return a finite number; at t = 0\.\d+ it returned nan"):
         swing(1.0, events=lambda t, q, v: np.nan if t > 0.3 else 1.0)
+
+
+def test_a_zero_of_high_order_is_found(oscillator):
+    result = solve_dae(oscillator, (0.0, 10.0), [0.0], [1.0], events=lambda t, q, v: (t - 4.0) ** 3)
+    assert result.t_events[0] == pytest.approx([4.0], abs=1e-4)

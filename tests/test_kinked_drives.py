@@ -4,6 +4,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 
 from tests.problems import driven_cart, pendulum
 from twoloop import ConstrainedSystem, Status, solve_dae
@@ -331,3 +332,84 @@ def test_a_rate_that_has_no_value_where_it_jumps_is_an_impulse(method):
         return result.q[:, -1]
 
     assert np.abs(ends(half) - ends(lambda t: 0.5 * np.sign(t - 0.4))).max() < 1e-6
+
+
+def hung(at, jump, after_too):
+    """A pendulum below a pivot that turns back at a time; gamma is by differences, as the drive branches."""
+
+    def speed(t):
+        return jump if t > at or (after_too and t == at) else -jump
+
+    return ConstrainedSystem.from_python(
+        n_q=2,
+        n_c=1,
+        mass=np.eye(2),
+        force=lambda t, q, v: np.array([0.0, -9.81]),
+        constraint=lambda t, q: np.array([0.5 * ((q[0] - jump * abs(t - at)) ** 2 + q[1] ** 2 - 1.0)]),
+        jacobian=lambda t, q: np.array([[q[0] - jump * abs(t - at), q[1]]]),
+        constraint_rate=lambda t, q: np.array([-(q[0] - jump * abs(t - at)) * speed(t)]),
+    )
+
+
+@pytest.mark.parametrize("method", ["auto", "RadauIIA5", "Gauss6", "BDF", "Newmark", "TRBDF2"])
+@pytest.mark.parametrize("at", [0.0, 1.0])
+def test_a_run_may_start_and_end_at_a_kink(method, at):
+    speed = 0.6 if at == 0.0 else -0.6
+    angle, rate = solve_ivp(
+        lambda t, y: [y[1], -9.81 * np.sin(y[0])], (0.0, 1.0), [0.5, 0.3], method="DOP853", rtol=1e-12, atol=1e-12
+    ).y[:, -1]
+    start = [0.6 * at + np.sin(0.5), -np.cos(0.5)], [speed + 0.3 * np.cos(0.5), 0.3 * np.sin(0.5)]
+    result = solve_dae(hung(at, 0.6, at == 0.0), (0.0, 1.0), *start, method, rtol=1e-6, atol=1e-6)
+    assert result.success and abs(result.q[:, -1] - [0.6 * (1.0 - at) + np.sin(angle), -np.cos(angle)]).max() < 1e-5
+    along = np.array([np.cos(angle), np.sin(angle)])
+    assert abs(result.v[:, -1] - [speed, 0.0] - rate * along).max() < 1e-5
+    assert abs(along @ result.a[:, -1] + 9.81 * np.sin(angle)) < 1e-4
+
+
+def test_differences_of_constraints_that_hardly_bend_are_judged_by_rounding():
+    """Nothing turns and nothing pushes: gamma is zero, and what differences leave of it is rounding."""
+    angle, radius = 0.7, 0.4
+    wheel = ConstrainedSystem.from_python(
+        n_q=4,
+        n_c=1,
+        n_a=2,
+        mass=np.diag([1.0, 1.0, 0.2, 0.1]),
+        force=lambda t, q, v: np.array([0.0, 0.0, 0.1 * np.sin(t), -v[3] if v[3] > 5.0 else 0.0]),
+        constraint=lambda t, q: np.array([q[2] - np.interp(t, [1.0, 2.0], [angle, 1.0])]),
+        jacobian=lambda t, q: np.array([[0.0, 0.0, 1.0, 0.0]]),
+        constraint_rate=lambda t, q: np.array([angle - 1.0 if 1.0 <= t < 2.0 else 0.0]),
+        nonholonomic=lambda t, q: np.array(
+            [[1.0, 0.0, 0.0, -radius * np.cos(q[2])], [0.0, 1.0, 0.0, -radius * np.sin(q[2])]]
+        ),
+    )
+    v0 = [3.0 * radius * np.cos(angle), 3.0 * radius * np.sin(angle), 0.0, 3.0]
+    result = solve_dae(wheel, (0.0, 3.0), [0.0, 0.0, angle, 0.0], v0)
+    assert result.success and abs(result.q[3, -1] - 9.0) < 1e-7
+
+
+@pytest.mark.parametrize("t0", [0.0, 1e5, 1e6])
+def test_a_late_start_leaves_room_for_differences_on_one_side(t0):
+    """A drive of a kilohertz, with lengths of differences that are a few spacings of time at a start as late."""
+    size, rate, end = 1e-3, 6e3, 0.02
+    system = ConstrainedSystem.from_python(
+        n_q=2,
+        n_c=1,
+        mass=np.eye(2),
+        force=lambda t, q, v: np.array([0.0, -9.81]),
+        constraint=lambda t, q: np.array([0.5 * ((q[0] - place(t)) ** 2 + q[1] ** 2 - 1.0)]),
+        jacobian=lambda t, q: np.array([[q[0] - place(t), q[1]]]),
+        constraint_rate=lambda t, q: np.array([-(q[0] - place(t)) * size * rate * np.cos(rate * (t - t0))]),
+    )
+
+    def place(t):
+        return size * np.sin(rate * (t - t0)) if t > -1.0 else 0.0
+
+    start = [np.sin(0.5), -np.cos(0.5)], [size * rate, 0.0]
+    result = solve_dae(system, (t0, t0 + end), *start, "RadauIIA5", rtol=1e-5, atol=1e-5)
+    angle = solve_ivp(
+        lambda t, y: [y[1], -9.81 * np.sin(y[0]) + size * rate * rate * np.sin(rate * t) * np.cos(y[0])],
+        *((0.0, end), [0.5, 0.0], "DOP853"),
+        rtol=1e-12,
+        atol=1e-12,
+    ).y[0, -1]
+    assert result.success and abs(result.q[1, -1] + np.cos(angle)) < 1e-4

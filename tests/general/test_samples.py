@@ -165,3 +165,48 @@ def test_redundant_rows():
         state = integrator.step(0.05, inputs={problem.place("value of servo"): u})
         turned, rate = turned + 0.05 * rate + 0.5 * u / inertia * 0.05**2, rate + u / inertia * 0.05
     np.testing.assert_allclose(state.q[2::3], [0.0, *[0.5 * np.pi + turned] * 3], atol=1e-7)
+
+
+@pytest.mark.parametrize("method", ["auto", "RadauIIA5", "BDF"])
+def test_after_a_step_that_failed_the_next_goes_on_from_the_last_sample(method):
+    def force(t, q, v, p):
+        push = p[0] if t < p[1] else np.nan
+        return np.array([-push * q[1], push * q[0] - 9.81])
+
+    system = problems.pendulum(force=force, parameters=[0.0, 9.0])
+    integrator, straight = (Integrator(system, method) for _ in range(2))
+    start = [np.sin(0.5), -np.cos(0.5)], [0.3 * np.cos(0.5), 0.3 * np.sin(0.5)]
+    for each in (integrator, straight):
+        each.start(0.0, *start)
+        each.step(0.1)
+    with pytest.raises(RuntimeError, match="not finite"):
+        integrator.step(1.0, inputs={0: 5.0, 1: 0.7})
+    with pytest.raises(RuntimeError):  # the inputs are the same
+        integrator.step(1.0)
+    state, other = integrator.step(0.2, inputs={0: 0.0, 1: 9.0}), straight.step(0.2)
+    np.testing.assert_allclose(state.q, other.q, atol=1e-6)
+    assert state.t == other.t == integrator.result().t[-1]
+    assert integrator.result().h.sum() == pytest.approx(state.t)
+
+
+def test_what_a_force_raises_leaves_the_last_sample():
+    def force(t, q, v, p):
+        if t > p[0]:
+            raise OSError("no reading")
+        return np.array([0.0, -9.81])
+
+    integrator = Integrator(problems.pendulum(force=force, parameters=[0.3]))
+    integrator.start(0.0, [1.0, 0.0], [0.0, 0.0])
+    with pytest.raises(OSError, match="no reading"):
+        integrator.step(0.5)
+    state = integrator.step(0.5, inputs=[9.0])
+    expected = solve_dae(problems.pendulum(), (0.0, 0.5), [1.0, 0.0], [0.0, 0.0]).q[:, -1]
+    assert state.t == 0.5
+    np.testing.assert_allclose(state.q, expected, atol=1e-7)
+
+
+def test_a_sample_that_time_cannot_resolve_is_refused():
+    integrator = Integrator(problems.pendulum())
+    integrator.start(1e9, [1.0, 0.0], [0.0, 0.0])
+    with pytest.raises(ValueError, match=r"dt must reach the next floating-point number after t = 1000000000\.0"):
+        integrator.step(1e-9)

@@ -250,3 +250,24 @@ def test_the_first_touch_of_a_shaking_table_is_found(size, rate):
     times = np.linspace(0.0, 5.0, 500_001)
     first = times[np.flatnonzero(0.2 - 0.1 * times < size * np.sin(rate * times))[0]]
     assert result.impacts[0].t == pytest.approx(first, abs=1.1e-5)
+
+
+@pytest.mark.parametrize("method", ["auto", "RadauIIA5", "BDF"])
+@pytest.mark.parametrize("above", [1e-4, 1e-6, 1e-8])
+def test_a_ball_that_grazes_a_ceiling_between_two_looks_hits_it(above, method):
+    """The gap is closed for 0.1 ms to 9 ms, and looked at every 0.5 ms or more rarely."""
+    height, e, end = 0.437, 0.5, 1.0
+    system = ConstrainedSystem.from_python(n_q=1, n_c=0, mass=np.eye(1), force=lambda t, q, v: np.array([-GRAVITY]))
+    speed, hit = np.sqrt(2.0 * GRAVITY * (height + above)), np.sqrt(2.0 * GRAVITY * above)
+    ceiling = Stop(lambda t, q: height - q[0], e, "ceiling")
+    result = solve_with_stops(system, (0.0, end), [0.0], [speed], ceiling, method, **TIGHT)
+    assert len(result.impacts) == 1
+    rest = end - (speed - hit) / GRAVITY
+    assert abs(result.v[0, -1] + e * hit + GRAVITY * rest) < 1e-4 * hit + 1e-6
+
+
+def test_a_ball_that_does_not_reach_a_ceiling_does_not_hit_it():
+    system = ConstrainedSystem.from_python(n_q=1, n_c=0, mass=np.eye(1), force=lambda t, q, v: np.array([-GRAVITY]))
+    speed = np.sqrt(2.0 * GRAVITY * (0.437 - 1e-8))
+    result = solve_with_stops(system, (0.0, 1.0), [0.0], [speed], Stop(lambda t, q: 0.437 - q[0], 0.5), **TIGHT)
+    assert result.success and not result.impacts and abs(result.v[0, -1] - speed + GRAVITY) < 1e-8

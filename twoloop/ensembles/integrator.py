@@ -120,6 +120,7 @@ class Integrator:
         for name in self._options.keys() - FOR_SAMPLES:
             if self._options[name] not in (None, False, "auto"):
                 raise ValueError(f"start takes no {name}, which is for run alone; the integrator was made with it")
+        check_system(self.system)
         t0 = check_finite("t0", t0)
         n, rtol, max_step = self.system.n_q, self._options["rtol"], self._options.get("max_step", np.inf)
         check_positive("max_step", max_step, infinite=True)
@@ -168,8 +169,13 @@ class Integrator:
         """
         if self._sampled is None:
             raise ValueError("step goes on from a start: call integrator.start(t0, q0, v0) first")
+        if self.system.enclosed is not None:
+            check_system(self.system)
         if not (type(dt) is float and 0.0 < dt < np.inf):
             check_positive("dt", dt)
+        t = self._sampled.t
+        if t + dt == t:
+            raise ValueError(f"dt must reach the next floating-point number after t = {t!r}; given {dt!r}")
         if inputs is not None:
             self._sampled.set(inputs)
         return self._sampled.step(float(dt))

@@ -280,7 +280,7 @@ class Motion:
             return g - min(g0, 0.0) + low
 
         event = terminal(closes)
-        event.every = self.every
+        event.every, event.gap_rate = self.every, lambda t, q, v: float(self.gaps.at(t, q, v).u[k])
         return event
 
     def _changes(self, k: int, sign: int | None, friction: Any) -> Any:

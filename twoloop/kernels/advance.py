@@ -33,6 +33,7 @@ from twoloop.kernels.data.noted import (
     EXPLICIT_STEP,
     FAULT_KIND,
     KINK_AFTER,
+    KINK_BEFORE,
     LARGEST_DEFECT,
     ORIENTATION,
     ORIENTATION_NEW,
@@ -62,6 +63,7 @@ def start(f, w, t, state):
     """Factor the mass matrix, choose the partition, and complete the state (q, v given) by a and lam."""
     n = w.Q.size
     q, v = state[:n], state[n : 2 * n]
+    w.notes[KINK_BEFORE] = t  # a drive may have a kink at the start
     code = prepare_mass(f, w, t, q)
     if code == DONE:
         code = renew_partition(f, w, t, q)

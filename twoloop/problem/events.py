@@ -10,6 +10,7 @@ from twoloop.checks.arguments import Array, shown
 
 SAMPLES = 4  # parts of a step, at whose ends the sign is looked at
 PRECISION = 4.0 * float(np.finfo(float).eps)  # of the time of an event, as in SciPy
+MOST = 3000  # iterations of Brent's method, which halves the interval at least every 53rd time: for zeros of high order
 
 States = Callable[[Array], Array]  # rows [q, v] at sorted times
 
@@ -96,6 +97,7 @@ class EventSearch:
         self.ended: tuple[Event, float] | None = None
         self._n_q = len(row) // 2
         self._every = min((getattr(event.function, "every", np.inf) for event in events), default=np.inf)
+        self._rates = [each for event in events if (each := getattr(event.function, "gap_rate", None)) is not None]
         self._values = self._evaluate(t0, row)
         self._at_start = True
 
@@ -113,7 +115,7 @@ class EventSearch:
         rows, first = states(times), np.append(0, np.cumsum(counts))
         for k in range(len(steps)):
             within = slice(first[k], first[k + 1] + 1)
-            self._in_step(states, times[within], rows[within])
+            self._in_step(states, *self._with_turns(states, times[within], rows[within]))
             if self.ended is not None:
                 return
             self.reached = float(ends[k + 1])
@@ -122,6 +124,22 @@ class EventSearch:
         """Forget what was found in a step whose search was interrupted."""
         if self.ended is None:
             self.found = [[(t, row) for t, row in found if t <= self.reached] for found in self.found]
+
+    def _with_turns(self, states: States, times: Array, rows: Array) -> tuple[Array, Array]:
+        """Samples, and between them those at which a gap ceases to close: it may be open at both and not there."""
+        if not self._rates:
+            return times, rows
+        states_at = zip(times.tolist(), *np.split(rows, 2, axis=1), strict=True)
+        values = np.array([[rate(*state) for rate in self._rates] for state in states_at])
+        turns = [
+            _root(self._rates[j], states, (float(times[k]), float(times[k + 1])), (values[k, j], values[k + 1, j]))
+            for k, j in np.argwhere((values[:-1] < 0.0) & (values[1:] > 0.0))
+        ]
+        if not turns:
+            return times, rows
+        new = np.unique(turns)
+        places = np.searchsorted(times, new)
+        return np.insert(times, places, new), np.insert(rows, places, states(new), axis=0)
 
     def _in_step(self, states: States, times: Array, rows: Array) -> None:
         """Events between samples of one step."""
@@ -153,7 +171,7 @@ class EventSearch:
                 self.ended = (event, t)
 
 
-def _root(event: Event, states: States, ends: tuple[float, float], values: tuple[float, float]) -> float:
+def _root(event: Callable[..., float], states: States, ends: tuple[float, float], values: tuple[float, float]) -> float:
     """When an event is zero between two times at which its values are known, to rounding."""
     from scipy.optimize import brentq  # takes a tenth of a second to import, and few runs need it
 
@@ -168,7 +186,7 @@ def _root(event: Event, states: States, ends: tuple[float, float], values: tuple
         q, v = np.split(states(np.array([t]))[0], 2)
         return event(t, q, v)
 
-    return float(brentq(at, *ends, xtol=PRECISION, rtol=PRECISION))
+    return float(brentq(at, *ends, xtol=PRECISION, rtol=PRECISION, maxiter=MOST))
 
 
 def crosses(direction: float, g: float, g_new: float) -> bool:

@@ -17,6 +17,7 @@ from twoloop.kernels.data.flags import BANDWIDTH, CONSTANT_MASS, GIVEN, N_FLAGS
 from twoloop.kernels.data.kit import Kit
 from twoloop.problem.adapters import PythonFunctions, compile_returning, through_python
 from twoloop.problem.description import Description
+from twoloop.problem.enclosed import Enclosed
 from twoloop.problem.entries import VALUES_OF, DenseFunction, dense_callback
 from twoloop.problem.evaluated import EvaluatedEquations
 from twoloop.problem.given import checked_entries, checked_parameters, given_callbacks, in_place_of, plain_functions
@@ -114,6 +115,8 @@ class ConstrainedSystem(EvaluatedEquations):
                     f"({', '.join(entry.arguments)}); given {function!r}. Plain Python functions enter by "
                     "ConstrainedSystem.from_python"
                 )
+        enclosed = Enclosed(self.given)
+        self.enclosed = enclosed if enclosed.any else None
         self._scatter()
         flags = np.zeros(N_FLAGS, dtype=np.int64)
         flags[CONSTANT_MASS] = self.constant_mass
@@ -238,7 +241,8 @@ class ConstrainedSystem(EvaluatedEquations):
             `with_parameters` makes a system of others, of which nothing is compiled again.
         compile : bool
             False: the functions are called as they are, with copies of q and v. True: numba compiles them, with
-            the values of closures and globals as they are now; they must not write to their arguments.
+            the values of closures and globals as they are now: once these change, calls are refused. The functions
+            must not write to their arguments.
         mass_entries, jacobian_entries : (rows, columns), optional
             As for the class.
         bandwidth : int, optional
@@ -334,9 +338,12 @@ class ConstrainedSystem(EvaluatedEquations):
 
 
 def check_system(system: object) -> None:
-    """Raise unless a ConstrainedSystem is given."""
+    """Raise unless a ConstrainedSystem is given, whose compiled functions enclose what they did when compiled."""
     if isinstance(system, ConstrainedSystem):
-        return
+        change = None if system.enclosed is None else system.enclosed.change()
+        if change is None:
+            return
+        raise ValueError(change.message(system.name))
     inner = getattr(system, "system", None)
     if isinstance(inner, ConstrainedSystem):
         raise TypeError(

@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from twoloop.kernels.data import noted
 from twoloop.methods.code_for import Compiled
 from twoloop.methods.plan import Method
 from twoloop.run.run import Run
@@ -30,6 +31,7 @@ class Asked(NamedTuple):
         return id(self.method), self.atol.tobytes(), self[3:]
 
     def set_sizes(self, run: Run) -> None:
-        """Set the first and the largest step of a run, where they are not constant."""
+        """Set the first and the largest step of a run, where these vary, and where a drive may have a kink."""
+        run.work.notes[noted.KINK_AFTER] = self.t1
         if self.step_size is None:
             run.set_sizes(self.first_step, self.max_step, self.t1)

@@ -93,7 +93,7 @@ def leap(run: Run, t1: float) -> bool:
     if state is None:
         return False
     run.new_state[: 2 * n] = state
-    run.work.notes[noted.KINK_BEFORE], run.work.notes[noted.KINK_AFTER] = end, np.inf
+    run.work.notes[noted.KINK_AFTER] = t1
     if direct(run.kernels.start)(run.kit, run.work, end, run.new_state) != codes.DONE:
         return False
     run.jumps.append(end)

@@ -105,6 +105,7 @@ class Remaker:
         self.next_step = np.inf
         if run.kernels.start(run.kit, run.work, t0, run.state) != codes.DONE:
             return None
+        run.work.notes[noted.KINK_AFTER] = t1
         times = np.array([between, t1] if t0 < between < t1 else [t1])
         arrays = (run.plan.options, run.plan.memory, run.tolerances, run.control, clock, run.state, run.new_state)
         found: list[Array] = []

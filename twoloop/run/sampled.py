@@ -89,21 +89,26 @@ class SampledRun:
         def check(traced: Traced) -> None:
             traced.refuse(system, t0, t0 + 1.0, q0, v0)
 
-        derived, _ = standing_for(system, check)  # by what inputs must not enter
-        plan = method.plan(system.n_q, rtol, float(atol.min()), False)
-        self.run = Run(derived, plan, t0, q0, v0, rtol, atol, None)
+        self._derived, _ = standing_for(system, check)  # by what inputs must not enter
+        self._plan = method.plan(system.n_q, rtol, float(atol.min()), False)
         self.system, self.method, self.max_step, self.t0 = system, method, max_step, t0
+        self._tolerances = rtol, atol
+        self.run = self._run_from(t0, q0, v0)
         self.p = system.functions.p[system.called_in_python :]
         self._free: set[int] = set()  # places of parameters that are known to enter forces alone
-        self._changed = False
-        self.run.work.notes[noted.GENERATION] = 1.0  # the ranks are known
-        self.run.set_sizes(None, max_step, t0 + 1.0)
-        self.run.control[self.run.a.STORE_ALL] = 0.0
+        self._changed = self._failed = False
         self._outputs, self._filled = np.zeros(1), np.zeros(2, dtype=np.int64)
         self._buffers = np.empty(1), np.empty((1, len(self.run.state))), np.empty((STEPS, self.run.a.N_STEP_COLUMNS))
         self.rows, self.times, self.steps = list[Array](), list[float](), list[Array]()
         self.cpu = 0.0
         self._note(t0)
+
+    def _run_from(self, t: float, q: Array, v: Array) -> Run:
+        run = Run(self._derived, self._plan.fresh(), t, q, v, *self._tolerances, None)
+        run.work.notes[noted.GENERATION] = 1.0  # the ranks are known
+        run.set_sizes(None, self.max_step, t + 1.0)
+        run.control[run.a.STORE_ALL] = 0.0
+        return run
 
     @property
     def t(self) -> float:
@@ -135,12 +140,14 @@ class SampledRun:
             self._write(place, float(values[place]))
 
     def step(self, dt: float) -> SampledState:
-        """Go on by dt, and note the state there."""
+        """Go on by dt, and note the state there; after a failure, from the last sample."""
+        if self._failed:
+            self._return()
         run, a, clock = self.run, self.run.a, self.run.clock
         t = self.times[-1]
         end = t + dt
         began = time.process_time()
-        code = a.PAUSED
+        code, self._failed = a.PAUSED, True  # until it is at its end: a callback may raise, too
         if self._changed or self.system.called_in_python:  # what such functions find in their surroundings may change
             code = self._begin_anew(t)
         run.look_within(end - self.t0)
@@ -171,12 +178,13 @@ class SampledRun:
         row.setflags(write=False)
         self.rows.append(row)
         self.times.append(t)
+        self._n_steps, self._failed = len(self.steps), False
 
     def record(self) -> Record:
         """All states at samples so far."""
         run, a, n = self.run, self.run.a, self.run.system.n_q
         table = np.array(self.rows)
-        steps = np.concatenate([np.empty((0, a.N_STEP_COLUMNS)), *self.steps])
+        steps = np.concatenate([np.empty((0, a.N_STEP_COLUMNS)), *self.steps[: self._n_steps]])
         return Record(
             *(np.array(self.times), table[:, :n].T, table[:, n : 2 * n].T, table[:, 2 * n : 3 * n].T),
             lam=table[:, 3 * n :].T,
@@ -203,13 +211,24 @@ class SampledRun:
             first = N_SCALARS + 2 * run.system.n_q
         run.plan.memory[first:] = run.memory[first:]
         run.clock[: a.N_PAST] = 0.0
-        self._changed = False
         if code != codes.DONE:
             raise RuntimeError(
                 f"the accelerations of {self.system.name!r} cannot be found at t = {t:.10g} with the inputs given: the "
                 "forces are not finite, or the constraints have lost rank"
             )
+        self._changed = False
         return int(a.PAUSED)
+
+    def _return(self) -> None:
+        """Go back to the last sample: the run stands where it failed, with whatever it tried there."""
+        before, n = self.run, self.system.n_q
+        try:
+            self.run = self._run_from(self.t, self.rows[-1][:n], self.rows[-1][n : 2 * n])
+        except ValueError as error:
+            raise RuntimeError(f"step goes on from the last sample, where it cannot begin: {error}") from None
+        self.run.work.counters[:] = before.work.counters
+        del self.steps[self._n_steps :]
+        self._changed = False
 
     def _by_course(self, end: float) -> None:
         """What the compiled loop cannot do by itself: a singular position, a jump, another algebra; or a failure."""
@@ -219,7 +238,7 @@ class SampledRun:
         with Interrupts() as interrupts:
             course = Course(run, end, wanted, lambda t: None, None, interrupts)
             record = course.to_end(False)
-        run.control[run.a.STORE_ALL] = 0.0
+        run.control[run.a.STORE_ALL], run.work.notes[noted.KINK_AFTER] = 0.0, np.inf
         steps = np.zeros((len(record.h), run.a.N_STEP_COLUMNS))
         steps[:, run.a.H], steps[:, run.a.JACOBIANS] = record.h, record.untested
         self.steps.append(steps)

@@ -17,6 +17,8 @@ CERTAIN = 1e-9  # relative disagreement below which nothing but rounding is left
 LENGTHEN = 1e-11  # relative disagreement below which a longer length loses nothing and has less rounding
 # of values at 0, e, 2 e and 4 e: derivatives of order 2 over e and over 2 e
 ONE_SIDED, ONE_SIDED_TWICE = (-1.5, 2.0, -0.5, 0.0), (-0.75, 0.0, 1.0, -0.25)
+ONE_SIDED_LENGTH = 1.0 / 16.0  # their error is of lower order: a shorter length, so that none has to be looked for
+ROUNDING = 1e-14  # of the terms of G v over the longest length: where they cancel, Gamma cannot be had better
 ENOUGH = 0.01  # of the required accuracy: a change by less ends the search for a length
 
 
@@ -44,16 +46,21 @@ def longest_difference(q, v):
 @merged
 def _side(notes, t, e):
     """On which side of t differences may be taken for the sake of a known jump of C_t or b; 0: on both."""
-    if t + 2.0 * e > notes[KINK_AFTER]:
-        return -1.0
-    return 1.0 if t - 2.0 * e < notes[KINK_BEFORE] else 0.0
+    before, after = t - notes[KINK_BEFORE], notes[KINK_AFTER] - t
+    if min(before, after) >= 2.0 * e:
+        return 0.0
+    return 1.0 if after >= before else -1.0
 
 
 @compiled
 def _differences(f, w, t, q, v, e, first, last):
-    """Gamma by differences over e and 2 e; its largest entry and the largest disagreement of the two."""
+    """Gamma by differences over e and 2 e; its largest entry, the largest disagreement and the largest G v."""
     twice = w.Gamma_tried[0]
     side = _side(w.notes, t, e)
+    shorter = representable(t, ONE_SIDED_LENGTH * e)
+    if side != 0.0 and shorter > 0.0:
+        e = shorter
+    terms = 0.0
     for i in range(first, last):
         w.Gamma[i] = 0.0
         twice[i] = 0.0
@@ -67,6 +74,7 @@ def _differences(f, w, t, q, v, e, first, last):
         for i in range(first, last):
             for j in range(v.size):
                 w.g[i] += w.Gx[i, j] * v[j]
+                terms = max(terms, abs(w.Gx[i, j] * v[j]))
             if side != 0.0:
                 w.Gamma[i] -= ONE_SIDED[k] * w.g[i] / (side * e)
                 twice[i] -= ONE_SIDED_TWICE[k] * w.g[i] / (side * e)
@@ -81,8 +89,8 @@ def _differences(f, w, t, q, v, e, first, last):
         w.Gamma[i] = (4.0 * w.Gamma[i] - twice[i]) / 3.0
         largest = max(largest, abs(w.Gamma[i]))
         if not np.isfinite(w.Gamma[i]):
-            return np.nan, np.nan
-    return largest, disagreement
+            return np.nan, np.nan, terms
+    return largest, disagreement, terms
 
 
 @merged
@@ -104,7 +112,7 @@ def _choose_length(f, w, t, q, v, longest, first, last):
         if e <= 0.0:
             break
         copy(w.Gamma, w.Gamma_tried[1])
-        largest, disagreement = _differences(f, w, t, q, v, e, first, last)
+        largest, disagreement, _ = _differences(f, w, t, q, v, e, first, last)
         if np.isnan(largest):
             return DONE
         w.notes[GAMMA_SCALE] = max(w.notes[GAMMA_SCALE], largest)
@@ -134,10 +142,11 @@ def gamma_by_differences(f, w, t, q, v, first, last):
     longest = longest_difference(q, v)
     e = representable(t, w.notes[GAMMA_SHARE] * longest)
     if e > 0.0:
-        largest, disagreement = _differences(f, w, t, q, v, e, first, last)
+        largest, disagreement, terms = _differences(f, w, t, q, v, e, first, last)
         if np.isnan(largest) or disagreement == 0.0 or w.notes[GAMMA_SCALE] == 0.0:
             return DONE  # what is not finite is found where it is used; without a scale nothing can be judged
-        w.notes[GAMMA_SCALE] = max(w.notes[GAMMA_SCALE], largest)
+        rounding = ROUNDING * terms / longest
+        w.notes[GAMMA_SCALE] = max(w.notes[GAMMA_SCALE], largest, rounding / w.notes[GAMMA_REQUIRED])
         if disagreement < LENGTHEN * w.notes[GAMMA_SCALE]:
             w.notes[GAMMA_SHARE] = min(1.0, 2.0 * w.notes[GAMMA_SHARE])
         if disagreement <= _limit(w.notes):
