@@ -191,6 +191,12 @@ def _slack(e: Evidence) -> str:
     )
 
 
+OTHER_MULTIPLIERS = (
+    "The multipliers belong to another instant (the middle of the step?) or to other positions and velocities than "
+    "those returned, or some rows of C are numbered otherwise."
+)
+
+
 def _multipliers(e: Evidence) -> str:
     problem, motion = e.observed.problem, e.observed.motion
     worst = int(np.argmax([errors.max() for errors in lam_errors(e.observed)]))
@@ -201,10 +207,7 @@ def _multipliers(e: Evidence) -> str:
     found = forces_of_constraints(problem, motion, run.lam)[1:]
     factor = float((found * known).sum() / (known**2).sum())
     if np.abs(found - factor * known).max() > 2.0 * CLEAR * np.abs(found - known).max():
-        return (
-            "The multipliers belong to another instant (the middle of the step?) or to other positions and velocities "
-            "than those returned, or some rows of C are numbered otherwise."
-        )
+        return OTHER_MULTIPLIERS
     if abs(factor + 1.0) < CLEAR:
         return "The multipliers have the other sign: M a + C_q^T lam = Q."
     if e.settings.steps is not None:
@@ -290,7 +293,8 @@ def with_hints(findings: list[Finding], evidence: Evidence) -> list[Finding]:
     hinted = []
     for finding in findings:
         if not finding.passed and finding.property not in ("runs", "says that it ends"):
-            own = None if moved and finding.property == "multipliers" else OWN.get(finding.property)
-            finding = replace(finding, hint=own(evidence) if own else general)
+            own = OWN.get(finding.property)
+            text = own(evidence) if own else general
+            finding = replace(finding, hint=general if moved and text == OTHER_MULTIPLIERS else text)
         hinted.append(finding)
     return hinted

@@ -131,5 +131,8 @@ def clock(e: Evidence) -> str:
         return ""
     if shift == begin:
         return f"The constraints hold at t - {begin:g} s: time does not begin at 0 here, but at t_span[0] = times[0]."
-    of, word = shift / e.observed.settings[-1], "before" if shift > 0.0 else "after"
-    return f"The constraints hold at the time {abs(of):g} steps {word} that of the state: t is not advanced with it."
+    of, word = abs(shift) / e.observed.settings[-1], "earlier" if shift > 0.0 else "later"
+    return (
+        f"C = 0 holds at another instant than that of the state, {of:g} step{'s' * (of != 1.0)} {word}: t is not "
+        "advanced with the state, or twice."
+    )
