@@ -93,8 +93,8 @@ def _drift(e: Evidence) -> str:
     if e.settings.steps is not None and found[-2].max() > 1.5 * off.max():
         return (
             "The violation of C falls with the steps and does not grow along the run: C = 0 is asked for at another "
-            "instant than that of the state (t instead of t + h?), of a state that is changed afterwards, or only for "
-            "its derivatives (Baumgarte)."
+            "instant than that of the state (t instead of t + h?), of a state that is changed afterwards, by too few "
+            "iterations, or only for its derivatives (Baumgarte)."
         )
     return (
         "The violation of C is there from the first steps and does not grow: an iteration for the positions stops too "
