@@ -50,6 +50,7 @@ from twoloop.result.result import Result
 from twoloop.run.record import Statistics, Status
 
 OUTPUTS = 1001  # default number of output times of solvers that do not store their steps
+STORED = 5000  # about as many steps of a fixed-step solver are stored for the studies
 
 CAUSES = "Look for a discontinuity, a singular position or a value that is not finite near this time, or try"
 ADVICE = f"{CAUSES} other tolerances or another method."
@@ -147,6 +148,16 @@ def imported(module: str, name: str = "", extra: str = "peers") -> Any:
         name = name or module.partition(".")[0]
         how = f"make {extra}, or pip" if extra in ("peers", "engines") else "pip"
         raise RuntimeError(f"{name} is not installed: {how} install 'twoloop[{extra}]'") from error
+
+
+class Deferred:
+    """A module of an optional package of the extra `references`, imported at the first use of one of its names."""
+
+    def __init__(self, module: str, name: str = ""):
+        self._module, self._name = module, name
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(imported(self._module, self._name, "references"), name)
 
 
 def check_problem(problem: Any, parameter: str, expected: str) -> Problem:

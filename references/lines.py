@@ -13,7 +13,7 @@ from twoloop.result.result import Result
 
 @dataclass(frozen=True)
 class Line:
-    """A solver with tolerances, given by a function made by `references.driver.adapter`."""
+    """A solver, given by a function made by `references.driver.adapter`, or of a problem as `of_problem` says."""
 
     name: str
     package: str  # name of the package, which provides the version
@@ -25,6 +25,8 @@ class Line:
     keeps: bool = True
     rival: bool = True  # included in all tables
     checked: bool = False  # checked by `conformance`; one setting per solver
+    setting: str = "tol"  # the number that varies; "h": a fixed step, which `solve` takes as `step`
+    of_problem: bool = False  # solve(problem, t_end, ...), with equations of its own; otherwise of a system
     # as of `studies.bench.collector.Solver`
     own_accelerations: bool = False
     traces: bool = False
@@ -38,10 +40,14 @@ class Line:
     fixed: Mapping[str, float | str] = field(default_factory=dict)
 
 
+class CannotRun(Exception):
+    """Raised by a solver that cannot run a mechanism; the message says why."""
+
+
 @cache
 def lines() -> tuple[Line, ...]:
-    """Return the lines of all modules in this folder; solvers called from compiled code first."""
+    """Return the lines of all modules in this folder: solvers called from compiled code, from Python, of problems."""
     here = Path(__file__).parent
     names = sorted(each.name for each in walk_packages([str(here)], "references.") if not each.ispkg)
     found = [line for name in names for line in getattr(import_module(name), "LINES", ())]
-    return tuple(sorted(found, key=lambda line: line.called_from == "Python"))
+    return tuple(sorted(found, key=lambda line: (line.of_problem, line.called_from == "Python", line.setting == "h")))

@@ -150,9 +150,16 @@ def _flags(compiler: str) -> tuple[str, ...]:
     return FLAGS if taken else PLAIN
 
 
+def _by_step(
+    system: ConstrainedSystem, t_span: tuple[float, float], *start: Array, step: float, **options: Any
+) -> Result:
+    return solve_collocation(system, t_span, *start, round((t_span[1] - t_span[0]) / step), **options)  # type: ignore[no-any-return]
+
+
 HOW: dict[str, Any] = {"keeps": False, "traces": True, "builds_each": True, "builds_span": True}
 LINES = (
     Line("IDAS, CasADi", "casadi", "CasADi", solve_idas, checked=True, **HOW),
     Line("CVODES, CasADi", "casadi", "CasADi", solve_cvodes, checked=True, **HOW),
+    Line("collocation, CasADi", "casadi", "CasADi", _by_step, setting="h", stores_steps=True, **HOW),
     Line("CVODES, CasADi, Adams", "casadi", "CasADi", solve_cvodes, {"method": "Adams"}, **HOW),
 )

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from references.equations.rows import independent_rows
+from references.lines import CannotRun
 from twoloop.generate.derivative import Derivative
 from twoloop.generate.traced_equations import Equations, only
 from twoloop.generate.traced_values import Traced
@@ -28,7 +29,7 @@ FUNCTIONS = {operations.SINE: "sin", operations.COSINE: "cos", operations.SQUARE
 FUNCTIONS |= {operations.EXPONENTIAL: "exp", operations.LOGARITHM: "log", operations.ARCTANGENT: "atan"}
 
 
-class NotSymbolic(ValueError):
+class NotSymbolic(CannotRun, ValueError):
     """Raised if the equations of a system cannot be expressed symbolically; the message contains the reason."""
 
 

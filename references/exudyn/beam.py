@@ -11,12 +11,10 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-import exudyn as exu
 import numpy as np
-from exudyn import itemInterface as items
 
 from references.driver import check_problem
-from references.exudyn.run import add_sensors, check_steps, run
+from references.exudyn.run import add_sensors, check_steps, exu, items, run
 from twoloop.checks.arguments import check_choice
 from twoloop.problem.problem import Array, Problem
 from twoloop.result.result import Result

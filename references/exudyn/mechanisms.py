@@ -6,11 +6,14 @@ like ours, except for the bars of A04, whose rotation matrices are computed from
 
 from collections.abc import Callable
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 
+from references.driver import STORED
 from references.exudyn.model import GROUND, PRISMATIC, REVOLUTE, SPHERICAL, UNIVERSAL, Model, frame
-from references.exudyn.run import check_steps, run
+from references.exudyn.run import SOLVERS, check_steps, run
+from references.lines import CannotRun, Line
 from twoloop.mechanisms import bricard, n_four_bar
 from twoloop.mechanisms.bricard import AXES, CORNERS, FRAMES
 from twoloop.mechanisms.governor import BALL, CUBE, DAMPING, DENSITY, HEIGHT, LENGTH, SLACK, STIFFNESS, WIDTH, box
@@ -219,3 +222,40 @@ MODELS: dict[str, Callable[[Problem], Model]] = {
     "A04 Bricard": _bricard,
     "A05 governor": _governor,
 }
+
+
+def solve_by_step(problem: Problem, t_end: float, *, step: float, **options: Any) -> Result:
+    """As `solve_exudyn`, with steps of about `step`, s, of which about `STORED` are stored; raises CannotRun."""
+    if not has_model(problem):
+        raise CannotRun(f"Exudyn needs a model of its own for every mechanism; there is none of {problem.name!r}")
+    store_every = max(1, round(t_end / step) // STORED)
+    n_steps = store_every * round(round(t_end / step) / store_every)
+    return solve_exudyn(problem, t_end, n_steps, store_every=store_every, **options)
+
+
+RADII = (1.0, 0.6)  # spectral radii besides Exudyn's default of 0.9; 1 fails on index 3
+MODEL: dict[str, Any] = {"own_accelerations": True, "traces": True, "setting": "h", "of_problem": True}
+MODEL |= {"stores_steps": True}
+ALPHA = "Exudyn, GeneralizedAlpha"
+LINES = (
+    Line(ALPHA, "exudyn", "Exudyn", solve_by_step, **MODEL),
+    *(
+        Line(
+            *(f"{ALPHA} {radius:g}", "exudyn", "Exudyn", solve_by_step, {"spectral_radius": radius}),
+            rival=radius < 1.0,
+            fixed={"spectral_radius": radius},
+            **MODEL,
+        )
+        for radius in RADII
+    ),
+    *(
+        Line(
+            *(f"Exudyn, {solver}", "exudyn", "Exudyn", solve_by_step, {"solver": solver}),
+            keeps=solver != "TrapezoidalIndex2",  # its positions are off by its errors
+            rival=solver == "TrapezoidalIndex2",
+            **MODEL,
+        )
+        for solver in SOLVERS
+        if solver != "GeneralizedAlpha"
+    ),
+)

@@ -3,12 +3,10 @@
 from collections.abc import Iterable
 from typing import Any
 
-import exudyn as exu
 import numpy as np
-from exudyn import itemInterface as items
 from numpy.typing import ArrayLike
 
-from references.exudyn.run import add_sensors
+from references.exudyn.run import add_sensors, exu, items
 from twoloop.mechanisms.rotation import rotation_matrix
 from twoloop.problem.problem import Array, Problem
 

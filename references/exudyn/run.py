@@ -10,14 +10,14 @@ import contextlib
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
-import exudyn as exu
 import numpy as np
-from exudyn.itemInterface import SensorNode
 
-from references.driver import Task, TimeLimit, check_time_limit, user_call
+from references.driver import Deferred, Task, TimeLimit, check_time_limit, user_call
 from twoloop.checks.arguments import check_choice, check_number, check_positive, check_size
 from twoloop.problem.problem import Array, Problem
 from twoloop.result.result import Result
+
+exu, items = Deferred("exudyn"), Deferred("exudyn.itemInterface", "exudyn")
 
 Ours = Callable[[Array, Array, Array], tuple[Array, Array, Array]]
 
@@ -31,7 +31,7 @@ SOLVERS = {
 }
 
 # displacements from the reference position, and their derivatives
-_OUTPUTS = tuple(getattr(exu.OutputVariableType, f"Coordinates{by}") for by in ("", "_t", "_tt"))
+_OUTPUTS = ("Coordinates", "Coordinates_t", "Coordinates_tt")
 
 
 class Steps(NamedTuple):
@@ -73,7 +73,8 @@ def check_steps(
 def add_sensors(mbs: Any, node: int) -> list[int]:
     """Add sensors of a node's coordinates, velocities and accelerations."""
     options = {"nodeNumber": node, "storeInternal": True, "writeToFile": False}
-    return [mbs.AddSensor(SensorNode(**options, outputVariableType=output)) for output in _OUTPUTS]
+    outputs = [getattr(exu.OutputVariableType, output) for output in _OUTPUTS]
+    return [mbs.AddSensor(items.SensorNode(**options, outputVariableType=output)) for output in outputs]
 
 
 def run(

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from references.lines import CannotRun
 from references.paper.four_bar_minimal import MinimalFourBar, absolute, tangent_of
 from twoloop.mechanisms import Problem
 from twoloop.problem.problem import Array
@@ -22,7 +23,7 @@ INSTANTS = 1000  # per half period, at which the distance from dead centres of a
 NEAREST = 1e-2  # sine of the angle between the two other bars that counts as a dead centre
 
 
-class NoMinimalCoordinates(ValueError):
+class NoMinimalCoordinates(CannotRun, ValueError):
     """Raised for a problem without equations in minimal coordinates."""
 
 

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 
 from references.driver import Task, check_task, imported
 from references.heyoka import taylor
+from references.lines import Line
 from references.minimal.equations import Minimal, minimal
 from references.sundials import cvode_c
 from twoloop.checks.arguments import check_positive
@@ -124,3 +125,17 @@ def _right_hand_side(own: Minimal) -> Any:
 def _states(own: Minimal, task: Task, rows: Array) -> Array:
     """Return [q, v] (2 n_q, n_t) for [angles, rates] given as rows."""
     return np.concatenate(own.states(rows.T)) if len(rows) else np.empty((2 * task.system.n_q, 0))
+
+
+# in minimal coordinates, where these have a closed form: no rivals on a DAE, and in no ranking
+FAMILY = "minimal coordinates"
+OWN: dict[str, Any] = {"rival": False, "of_problem": True, "traces": True}
+LINES = (
+    Line(
+        *(f"heyoka, {FAMILY}", "heyoka", FAMILY, solve_heyoka_minimal),
+        one_tolerance=True,
+        builds_each=True,
+        **OWN,
+    ),
+    Line(f"CVODE from C, {FAMILY}", "scikit-sundae", FAMILY, solve_cvode_minimal, **OWN),
+)

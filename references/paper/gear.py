@@ -14,13 +14,16 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import njit, types
 
+from references.driver import STORED as STEPS_STORED
 from references.driver import Task, TimeLimit, adapter, user_call
 from references.equations.linear import compiled_now, lu_factor, lu_solve
+from references.lines import Line
 from references.scipy.index1 import solve_index1
 from twoloop.checks.arguments import check_choice, check_size, check_times
 from twoloop.kernels.data.common import INTEGERS, KIT, MATRIX
 from twoloop.kernels.data.kit import Kit
 from twoloop.problem.problem import Array
+from twoloop.problem.system import ConstrainedSystem
 from twoloop.result.result import Result
 
 STARTS = {
@@ -282,3 +285,31 @@ def _integrate(  # type: ignore[no-untyped-def]
             rows[counters[STORED]] = new
             counters[STORED] += 1
     return DONE
+
+
+def solve_gear_stored(
+    system: ConstrainedSystem, t_span: tuple[float, float], *start: Array, step: float, order: int, **options: Any
+) -> Result:
+    """As `solve_gear`; about `STEPS_STORED` steps are stored."""
+    n_steps = round((t_span[1] - t_span[0]) / step)
+    kept = t_span[0] + np.arange(0, n_steps, max(1, n_steps // STEPS_STORED)) * step
+    return solve_gear(system, t_span, *start, step, order, t_eval=np.append(kept, t_span[1]), **options)  # type: ignore[no-any-return]
+
+
+def name_of(order: int, start: str = "accurate") -> str:
+    """Return the name of a line."""
+    return f"GSTIFF stand-in, order {order}" + (", ramp" if start == "ramp" else "")
+
+
+LINES = tuple(
+    Line(
+        *(name_of(order, start), "twoloop", "stand-in", solve_gear_stored, {"order": order, "start": start}),
+        rival=False,
+        setting="h",
+        stores_steps=True,
+        own_accelerations=True,
+        fixed={"order": order},
+    )
+    for order in range(1, HIGHEST + 1)
+    for start in ("accurate", "ramp")
+)

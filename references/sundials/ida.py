@@ -11,15 +11,16 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
-import sksundae
 
-from references.driver import CAUSES, Task, TimeLimit, adapter, user_call
+from references.driver import CAUSES, Deferred, Task, TimeLimit, adapter, user_call
 from references.lines import Line
 from references.sundials.loop import SMALLEST_STEP
 from references.sundials.residual import FORMS, NOT_TESTED, Implicit
 from twoloop.checks.arguments import check_choice
 from twoloop.problem.problem import Array
 from twoloop.result.result import Result
+
+ida = Deferred("sksundae.ida", "scikit-sundae")
 
 
 @adapter(independent_rows=True)
@@ -117,7 +118,7 @@ def _solver(equations: Implicit, t0: float, options: dict[str, Any], limit: Time
     size = state.shape[1]
     residual(t0, state[0], state[1], *space[:3], np.empty(size))  # compiles
     matrix(t0, 1.0, state[0], state[1], *space, np.zeros((size, size)).T)
-    return sksundae.ida.IDA(resfn, jacfn=jacfn, **options)
+    return ida.IDA(resfn, jacfn=jacfn, **options)
 
 
 HOW: dict[str, Any] = {"called_from": "Python", "own_accelerations": True, "scatters": True}

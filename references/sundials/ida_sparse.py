@@ -11,19 +11,20 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-import sksundae
 from numba import njit
 from numba.core.dispatcher import Dispatcher
 from numpy.typing import NDArray
 from scipy.sparse import bmat, coo_array, csc_array, eye_array
 
-from references.driver import CAUSES, Task, TimeLimit, adapter, user_call
+from references.driver import CAUSES, Deferred, Task, TimeLimit, adapter, user_call
 from references.equations.least_norm import accelerations
 from references.equations.linear import OPTIONS
 from references.sundials.loop import SMALLEST_STEP
 from references.sundials.residual import DIFFERENCE
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.result.result import Result
+
+ida = Deferred("sksundae.ida", "scikit-sundae")
 
 
 @adapter(velocity_rows=False)
@@ -64,7 +65,7 @@ def solve_ida_sparse(task: Task, rtol: float = 1e-8, atol: float = 1e-8) -> Resu
     sparse = {"linsolver": "sparse", "sparsity": pattern, "jacfn": jacfn}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # about the unused pattern
-        solver: Any = sksundae.ida.IDA(resfn, rtol=rtol, atol=atol, **sparse, **steps)
+        solver: Any = ida.IDA(resfn, rtol=rtol, atol=atol, **sparse, **steps)
     jacfn(t0, y, yp, y, 1.0, np.zeros(pattern.nnz))  # compiles
     resfn(t0, y, yp, np.zeros_like(y))
     with user_call:

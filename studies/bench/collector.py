@@ -17,8 +17,7 @@ import pandas as pd
 from rich.progress import track
 
 from references.driver import user_call
-from references.equations.expressions import NotSymbolic
-from references.minimal.equations import NoMinimalCoordinates
+from references.lines import CannotRun
 from studies.bench import metrics
 from studies.bench.apart import Alarm
 from studies.bench.reference_motion import ReferenceMotion, make_reference
@@ -298,7 +297,7 @@ def attempt(run: Run, repeat: int, around: float | None = None) -> tuple[Result 
             began = time.process_time()
             result = run.solver.run(run.case, run.value, repeat)
             spent = time.process_time() - began
-    except (NotApplicable, NotSymbolic, NoMinimalCoordinates) as why:  # of ours, and of adapters
+    except (NotApplicable, CannotRun) as why:  # of ours, and of adapters
         status, message = "NOT_APPLICABLE", str(why)
     except ImportError as error:
         status, message = "NOT_AVAILABLE", str(error)

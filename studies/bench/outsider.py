@@ -13,6 +13,7 @@ from contextlib import suppress
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import Any
 
 import numpy as np
@@ -56,7 +57,7 @@ class Outsider:
         self._python = environment(dependencies(data.decode("utf-8", "replace"), self.path))
         self._process: subprocess.Popen[bytes] | None = None
         self._pipe: Connection | None = None
-        self._spent = ""
+        self._spent, self._said = "", list[str]()  # the last line of its errors
 
     def solver(self) -> Solver:
         """Its entry in a catalogue."""
@@ -69,13 +70,14 @@ class Outsider:
         code = CHILD.format(0 if CLONE else len(sys.path), str(ROOT), there.fileno(), given)
         # a group of its own, so that what it starts ends with it
         options: dict[str, Any] = {"pass_fds": [there.fileno()], "start_new_session": True, "cwd": self.path.parent}
-        options |= dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.DEVNULL)
-        self._process = subprocess.Popen([self._python, "-P", "-c", code], **options)
+        options |= dict.fromkeys(("stdin", "stdout"), subprocess.DEVNULL)
+        self._errors = TemporaryFile()  # noqa: SIM115  # until the file is loaded; `end` closes it
+        self._process = subprocess.Popen([self._python, "-P", "-c", code], stderr=self._errors, **options)
         there.close()
         try:
             said = self._asked({}, START) or {"failure": f"not loaded in {START:g} s"}
         except RuntimeError as error:
-            said = {"failure": str(error)}
+            said = {"failure": ": ".join([str(error), *self._said])}
         if said["failure"]:
             self.end()
             raise StudyError(f"{self.path} is no solver: {said['failure']}")
@@ -139,6 +141,9 @@ class Outsider:
         with suppress(ProcessLookupError, PermissionError):
             os.killpg(self._process.pid, signal.SIGKILL)
         self._process.wait()
+        with self._errors:
+            self._errors.seek(0)
+            self._said = self._errors.read().decode("utf-8", "replace").strip().splitlines()[-1:]
         self._process = self._pipe = None
 
 

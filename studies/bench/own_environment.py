@@ -53,7 +53,7 @@ def environment(wanted: list[str] | None) -> str:
     """
     if wanted is None:
         return sys.executable
-    key = hashlib.sha256(json.dumps([sys.prefix, sys.version, sorted(wanted)]).encode()).hexdigest()[:16]
+    key = hashlib.sha256(json.dumps([2, sys.prefix, sys.version, sorted(wanted)]).encode()).hexdigest()[:16]
     folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "twoloop" / "environments" / key
     python = folder / "bin" / "python"
     if (folder / "complete").is_file():
@@ -62,7 +62,8 @@ def environment(wanted: list[str] | None) -> str:
     venv.create(folder, with_pip=False, symlinks=True)
     packages = sysconfig.get_path("purelib", "venv", {"base": str(folder), "platbase": str(folder)})
     present = dict.fromkeys([*site.getsitepackages(), sysconfig.get_path("platlib")])
-    Path(packages, "present.pth").write_text("\n".join(present) + "\n")
+    # by a call, so that .pth files of the present environment are read, by which editable installs are found
+    Path(packages, "present.pth").write_text("".join(f"import site; site.addsitedir({each!r})\n" for each in present))
     if wanted:
         uv = shutil.which("uv")
         install = [uv, "pip", "install", "-q", "--python", str(python)] if uv else [sys.executable, "-m", "pip", "-q"]

@@ -1,21 +1,21 @@
 """The catalogue: every solver that the studies compare, one entry each, usable on any case.
 
-An adapter that needs a model of its own (Exudyn) or compiled functions (IDA from C) raises `NotApplicable` for a case
-that it cannot run, which becomes a row. Foreign packages are imported when they are used, here or in `references/`, so
-that one that is not installed is a row too.
+Rivals are the `LINES` of `references/`, found by their place. One that needs a model of its own (Exudyn) or compiled
+functions (IDA from C) refuses a case that it cannot run, which becomes a row. Foreign packages are imported when they
+are used, so that one that is not installed is a row too.
 """
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from functools import partial
-from itertools import product
 from typing import Any
 
 import numpy as np
 
-from references.casadi.integrators import solve_collocation
+from references.exudyn.run import SOLVERS as EXUDYN_SOLVERS
 from references.lines import Line, lines
-from references.minimal.solvers import solve_cvode_minimal, solve_heyoka_minimal
-from references.paper.gear import solve_gear
+from references.minimal.solvers import FAMILY as MINIMAL_FAMILY
+from references.paper.gear import HIGHEST
+from references.paper.gear import name_of as gear
 from references.scipy.index1 import baumgarte
 from studies.bench.collector import Case, NotApplicable, Solver
 from twoloop import Result, RungeKutta, paper_irk, paper_newmark, solve_dae
@@ -29,7 +29,6 @@ ERR_OUT = (1e-3, 1e-5, 1e-7, 1e-9)  # of the paper's procedures
 ERR_IN = 1e-9  # err_in and ...
 PAPER_TOL = 1e-5  # ... Atol = Rtol of the paper
 NEWTON_SHARE = 0.1  # of the steps with a new Jacobian, from which on a run of the default counts as implicit
-STORED = 5000  # about as many steps of a fixed-step solver are stored
 NUDGE = 1e-5  # IDA's error scatters with rounding: repeats differ by this in rtol, and the median error is shown
 
 IRK, NEWMARK, QUARTER = "PaperIRK", "PaperNewmark (beta = 1/2)", "PaperNewmark, beta = 1/4"
@@ -49,25 +48,17 @@ PRESETS = (*IMPLICIT, OWN_EXPLICIT, ADAMS, TAYLOR)  # of twoloop, with their own
 # of ours, beside the rivals
 OWN = (*(*COMPILED, DEFAULT, TAYLOR, ADAMS, OWN_EXPLICIT), *("Gauss12", "Gauss16", *RADAU, "TRBDF2", OWN_BDF))
 IDA_INDEX_1 = "IDA, index1"
-EXUDYN = ("GeneralizedAlpha", "TrapezoidalIndex2", "HHT")
-RADII = (1.0, 0.6)  # spectral radii of GeneralizedAlpha, besides Exudyn's default of 0.9; 1 fails on index 3
+EXUDYN = tuple(EXUDYN_SOLVERS)
 HEYOKA, CVODE_C, DIFFRAX = "heyoka", "CVODE from C, Adams", "Dopri8, diffrax"
 IDAS, CVODES, COLLOCATION = "IDAS, CasADi", "CVODES, CasADi", "collocation, CasADi"
 CVODE_C_PROJECTED = "CVODE from C, BDF, projected"
 SAME_IN_LINES = ("own_accelerations", "traces", "builds_each", "builds_span", "fixed")
-GEAR_ORDERS = (1, 2, 3, 4, 5, 6)
-GEAR_STARTS = ("accurate", "ramp")
+GEAR_ORDERS = tuple(range(1, HIGHEST + 1))
 
 # other projects' solvers, the same beside ours in every table: called from compiled code, then from Python
-RIVALS = (
-    *(line.name for line in lines() if line.rival and line.called_from == "compiled"),
-    COLLOCATION,
-    *(line.name for line in lines() if line.rival and line.called_from == "Python"),
-    *("Exudyn, GeneralizedAlpha", "Exudyn, GeneralizedAlpha 0.6", "Exudyn, TrapezoidalIndex2"),
-)
+RIVALS = tuple(line.name for line in lines() if line.rival)
 # in minimal coordinates, where these have a closed form: no rivals on a DAE, and in no ranking
-MINIMAL_FAMILY = "minimal coordinates"
-MINIMAL = ("heyoka, minimal coordinates", "CVODE from C, minimal coordinates")
+MINIMAL = tuple(line.name for line in lines() if line.family == MINIMAL_FAMILY)
 
 # of ours what `compare` and the cases at length run, and with rivals enough for a mechanism of a user's own
 COMPARED_OWN = ("auto, compiled", DEFAULT, TAYLOR, ADAMS, OWN_EXPLICIT, "Gauss12", "SunRadau5", "RadauIIA5", "BDF")
@@ -112,54 +103,22 @@ def _canonical(case: Case, step: float, repeat: int) -> Result:
     return solve_dae(*case.start, method=method, step_size=step, time_limit=case.time_limit)
 
 
-def _collocation(case: Case, step: float, repeat: int) -> Result:
-    return solve_collocation(*case.start, round(case.t_end / step), time_limit=case.time_limit)
-
-
 def at_instants(solve: Callable[..., Result], case: Case, **options: Any) -> Result:
     """A run of a solver that tells its states at the common instants."""
     return solve(*case.start, t_eval=np.append(0.0, case.instants), time_limit=case.time_limit, **options)
 
 
-def _by_line(line: Line, case: Case, tolerance: float, repeat: int) -> Result:
+def _by_line(line: Line, case: Case, value: float, repeat: int) -> Result:
     if line.compiled_callbacks and case.problem.system.called_in_python:
         raise NotApplicable(f"{line.name!r} needs compiled functions; those of this mechanism are plain Python")
-    near = tolerance * (1.0 + NUDGE * repeat * line.scatters)
-    told = {"tol": tolerance} if line.one_tolerance else {"rtol": near, "atol": tolerance}
-    if line.stores_steps:
-        return line.solve(*case.start, time_limit=case.time_limit, **told, **line.options)
-    return at_instants(line.solve, case, **told, **line.options)
-
-
-def _minimal(kind: str, case: Case, tolerance: float, repeat: int) -> Result:
-    more: dict[str, Any] = {"t_eval": np.append(0.0, case.instants), "time_limit": case.time_limit}
-    if kind == "heyoka":
-        return solve_heyoka_minimal(case.problem, case.t_end, tolerance, **more)
-    return solve_cvode_minimal(case.problem, case.t_end, tolerance, tolerance, **more)
-
-
-def _exudyn(solver: str, options: Mapping[str, float], case: Case, step: float, repeat: int) -> Result:
-    from references.exudyn.mechanisms import has_model, solve_exudyn
-
-    n_steps = round(case.t_end / step)
-    store_every = max(1, n_steps // STORED)
-    n_steps = store_every * round(n_steps / store_every)  # of which it asks for a multiple
-    if not has_model(case.problem):
-        why = f"Exudyn needs a model of its own for every mechanism; there is none of {case.problem.name!r}"
-        raise NotApplicable(why)
-    more = {"store_every": store_every, "time_limit": case.time_limit, **options}
-    return solve_exudyn(case.problem, case.t_end, n_steps, solver, **more)  # type: ignore[arg-type]
-
-
-def _gear(order: int, start: str, case: Case, step: float, repeat: int) -> Result:
-    n_steps = round(case.t_end / step)
-    kept = np.append(np.arange(0, n_steps, max(1, n_steps // STORED)) * step, case.t_end)
-    return solve_gear(*case.start, step, order, start=start, t_eval=kept, time_limit=case.time_limit)
-
-
-def gear(order: int, start: str = "accurate") -> str:
-    """Name of the stand-in for ADAMS GSTIFF."""
-    return f"GSTIFF stand-in, order {order}" + (", ramp" if start == "ramp" else "")
+    near = value * (1.0 + NUDGE * repeat * line.scatters)
+    told: dict[str, Any] = {"step": value} if line.setting == "h" else {"rtol": near, "atol": value}
+    if line.one_tolerance:
+        told = {"tol": value}
+    if not line.stores_steps:
+        told["t_eval"] = np.append(0.0, case.instants)
+    start = (case.problem, case.t_end) if line.of_problem else case.start
+    return line.solve(*start, time_limit=case.time_limit, **told, **line.options)
 
 
 def paper_irk_at(err_in: float) -> Solver:
@@ -198,24 +157,7 @@ def _all() -> Iterator[Solver]:
     for line in lines():
         told = {each: getattr(line, each) for each in SAME_IN_LINES}
         run = partial(_by_line, line)
-        yield _solver(line.name, line.family, line.called_from, "tol", run, keeps=line.keeps, **told)
-    for name, kind in zip(MINIMAL, ("heyoka", "CVODE"), strict=True):
-        more = {"traces": True, "builds_each": kind == "heyoka"}
-        yield _solver(name, MINIMAL_FAMILY, "compiled", "tol", partial(_minimal, kind), **more)
-    more = {"builds_each": True, "builds_span": True, "traces": True, "keeps": False}
-    yield _solver(COLLOCATION, "CasADi", "compiled", "h", _collocation, **more)
-    own: dict[str, Any] = {"own_accelerations": True}
-    model = own | {"traces": True}
-    for solver in EXUDYN:
-        keeps, run = solver != "TrapezoidalIndex2", partial(_exudyn, solver, {})  # its positions are off by its errors
-        yield _solver(f"Exudyn, {solver}", "Exudyn", "compiled", "h", run, keeps=keeps, **model)
-    for radius in RADII:
-        fixed = {"spectral_radius": radius}
-        run = partial(_exudyn, "GeneralizedAlpha", fixed)
-        yield _solver(f"Exudyn, GeneralizedAlpha {radius:g}", "Exudyn", "compiled", "h", run, fixed=fixed, **model)
-    for order, start in product(GEAR_ORDERS, GEAR_STARTS):
-        run, fixed = partial(_gear, order, start), {"order": order}
-        yield _solver(gear(order, start), "stand-in", "compiled", "h", run, fixed=fixed, **own)
+        yield _solver(line.name, line.family, line.called_from, line.setting, run, keeps=line.keeps, **told)
 
 
 CATALOGUE: dict[str, Solver] = {solver.name: solver for solver in _all()}

@@ -1,6 +1,6 @@
 """The adapters of other solvers in one table, for the tests of what holds for each."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from typing import Any, NamedTuple
 
 import pytest
@@ -57,7 +57,6 @@ COMPILES = {"Dopri8"}  # for ten seconds
 ANY_CALLBACK = tuple(name for name in ADAPTERS if name not in OF_EXPRESSIONS and "from C" not in name)  # Python's, too
 
 
-def each(*left_out: str, of: Any = tuple(ADAPTERS)) -> list[Any]:
-    """Names of adapters; those that compile for long are slow."""
-    marks = {name: pytest.mark.slow for name in COMPILES}
-    return [pytest.param(name, marks=marks.get(name, ())) for name in of if name not in left_out]
+def each(*left_out: str, of: Any = tuple(ADAPTERS), slow: Collection[str] = COMPILES) -> list[Any]:
+    """Names of adapters, of which some are slow: those that compile for long, or those given."""
+    return [pytest.param(name, marks=[pytest.mark.slow] * (name in slow)) for name in of if name not in left_out]

@@ -24,10 +24,12 @@ from tests.problems import pendulum
 from tests.references.adapters import ADAPTERS, ANY_CALLBACK, each
 from tests.test_bounds import FAR, NO_TANGENT, Q, V, beyond, system
 from twoloop import ConstrainedSystem
-from twoloop.mechanisms import four_bar, knife_edge, projection_pendulum, rolling_disc, very_flexible_beam
+from twoloop.mechanisms import double_pendulum, four_bar, knife_edge, rolling_disc, very_flexible_beam
 from twoloop.run.record import Status
+from twoloop.testing.known_problems import MAKERS
 
-PROBLEM, PENDULUM = four_bar(), projection_pendulum()
+PROBLEM, SMALL = four_bar(), double_pendulum()  # code for the second compiles in a fifth of the time
+KNOWN = MAKERS["double_pendulum"]().reference  # its motion
 LONG = 1e6  # s of motion: none of the solvers is there within the limits below
 MOST = 20.0  # s: far above what a run with a limit needs, far below what the run would take
 TIMES = np.linspace(0.0, 2.0, 201)
@@ -45,42 +47,52 @@ RIGHT = {
     **{"IDAS": 5e-6, "collocation": 2e-7, "Dopri8": 2e-8, "CVODES": 1e-5, "gear": 0.05, "Radau9 of solve_dae": 1e-7},
     **{"IDA, index1": 1.1e-5, "IDA, stabilised": 3e-6, "IDA from C": 2.4e-5},
 }
+# and of the double pendulum at 3 s: three to six times
+RIGHT_ON_SMALL = {
+    **{"heyoka": 2e-6, "CVODE from C, Adams": 5e-7, "CVODE from C, BDF": 4e-6, "CVODE": 2e-6, "Pr9": 2e-11},
+    **{"IDAS": 1.5e-6, "collocation": 1e-9, "Dopri8": 2e-8, "CVODES": 4e-6, "gear": 4e-4, "Radau9 of solve_dae": 3e-12},
+    **{"IDA, index1": 1e-6, "IDA, stabilised": 2e-7, "IDA from C": 2e-7},
+}
 
 
+@pytest.mark.parametrize("problem", [SMALL, pytest.param(PROBLEM, marks=pytest.mark.slow)], ids=lambda each: each.name)
 @pytest.mark.parametrize("name", each(of=RIGHT))
-def test_a_rival_is_right_on_the_four_bar_and_measured(name):
-    result = ADAPTERS[name](*start(PROBLEM), tol=1e-6 if name == "heyoka" else 1e-9)
+def test_a_rival_is_right_and_measured(name, problem):
+    result = ADAPTERS[name](*start(problem), tol=1e-6 if name == "heyoka" else 1e-9)
+    system, n, end = problem.system, problem.system.n_q, result.q[:, -1].copy()
     assert result.success, result.message
-    assert result.t[0] == 0.0 and result.t[-1] == pytest.approx(PROBLEM.reference.t, abs=1e-12)
-    assert 1e-14 < np.abs(result.q[:, -1] - PROBLEM.reference.q).max() < RIGHT[name]
-    assert result.q.shape == result.v.shape == result.a.shape == (9, result.t.size) and result.lam.shape[0] == 8
-    residual = PROBLEM.system.mass(0.0, result.q[:, -1].copy()) @ result.a[:, -1]
-    residual += PROBLEM.system.jacobian(0.0, result.q[:, -1].copy()).T @ result.lam[:, -1]
+    assert result.t[0] == 0.0 and result.t[-1] == pytest.approx(problem.reference.t, abs=1e-12)
+    bounds = RIGHT if problem is PROBLEM else RIGHT_ON_SMALL
+    assert 1e-14 < np.abs(end - problem.reference.q).max() < bounds[name]
+    assert result.q.shape == result.v.shape == result.a.shape == (n, result.t.size)
+    assert result.lam.shape == (system.n_c, result.t.size)
+    residual = system.mass(0.0, end) @ result.a[:, -1] + system.jacobian(0.0, end).T @ result.lam[:, -1]
     off = 0.1 if name.startswith(("IDA, ", "IDA f")) or "solve_dae" in name else 1e-8  # derivatives of unknowns
-    assert np.allclose(residual, PROBLEM.system.force(0.0, result.q[:, -1].copy(), result.v[:, -1].copy()), atol=off)
+    assert np.allclose(residual, system.force(0.0, end, result.v[:, -1].copy()), atol=off)
     assert 0.0 < result.stats.cpu_time < 60.0
 
 
 # --- output
-AT = [[1.0], [0.0, 0.25, 1.0], [0.5], [0.0, 1.0]]
+AT = [[1.0], [0.0, 0.26, 1.0], [0.5], [0.0, 1.0]]
 
 
 @pytest.mark.parametrize("name", each("collocation"))
 def test_output_is_at_the_times_asked_for(name):
-    at, far = start(PROBLEM, 1.0), 2e-2 if name == "RK45" else 1e-3
+    at, far = start(SMALL, 1.0), 2e-2 if name == "RK45" else 1e-3
     for times in AT:
         result = ADAPTERS[name](*at, t_eval=times)
         assert result.success and result.t == pytest.approx(times, abs=1e-12)
         assert name == "gear" or result.t.tolist() == times
-        q, v = trajectory(PROBLEM.parameters, times)
-        assert np.abs(result.q - q).max() < far and np.abs(result.v - v).max() < 10.0 * far
-        assert result.q.shape == result.v.shape == result.a.shape == (9, len(times)) and result.lam.shape[0] == 8
-        assert times[0] > 0.0 or np.array_equal(result.q[:, 0], PROBLEM.q0)
+        known = np.searchsorted(KNOWN.t, np.array(times) - 1e-9)
+        assert np.abs(result.q.T - KNOWN.q[known]).max() < far
+        assert np.abs(result.v.T - KNOWN.v[known]).max() < 10.0 * far
+        assert result.q.shape == result.v.shape == result.a.shape == (4, len(times)) and result.lam.shape[0] == 2
+        assert times[0] > 0.0 or np.array_equal(result.q[:, 0], SMALL.q0)
 
 
 @pytest.mark.parametrize("name", each("collocation", "Dopri8", "gear", "IDAS", "CVODES", "heyoka"))
 def test_output_takes_no_step_and_no_evaluation_of_the_run_that_is_timed(name):
-    solve, at = ADAPTERS[name], start(PENDULUM, 2.0)
+    solve, at = ADAPTERS[name], start(SMALL, 2.0)
     end, many = (solve(*at, tol=1e-7, t_eval=times) for times in ([2.0], TIMES))
     assert end.success and many.success and np.array_equal(many.t, TIMES)
     counts = [(run.stats.n_accepted, run.stats.n_evaluations, run.stats.n_factorizations) for run in (end, many)]
@@ -100,11 +112,11 @@ OWN_MODEL = {
 STOPPED = {
     **OWN_MODEL,
     **{
-        name: lambda solve=ADAPTERS[name], **options: solve(*start(PROBLEM, LONG), **options)
+        name: lambda solve=ADAPTERS[name], **options: solve(*start(SMALL, LONG), **options)
         for name in (*ANY_CALLBACK, "IDA from C")
         if name != "gear"  # asked for 1e9 steps, it would make a table of them
     },
-    "gear": lambda **options: ADAPTERS["gear"](*start(PROBLEM, 1e4), t_eval=[0.0, 0.01, 1e4], **options),
+    "gear": lambda **options: ADAPTERS["gear"](*start(SMALL, 1e4), t_eval=[0.0, 0.01, 1e4], **options),
 }
 
 
@@ -123,14 +135,14 @@ def test_a_run_past_its_time_limit_is_a_row(name):
     assert 0.0 < float(result.message.split("t = ")[1].split()[0]) < LONG
     assert result.t.size > 1 or name == "IDA from C"  # whose output times are 1000 s apart here
     known = np.isfinite(result.q).any(axis=1)
-    assert known.sum() >= 9 and np.isfinite(result.q[known]).all() and (np.diff(result.t) > 0.0).all()
+    assert known.sum() >= 4 and np.isfinite(result.q[known]).all() and (np.diff(result.t) > 0.0).all()
 
 
 @pytest.mark.parametrize("name", ["heyoka", "CVODE from C, Adams", "collocation", "IDA from C", "DOP853"])
 def test_a_run_past_its_limit_is_not_run_again_to_its_end(name):
     short = name == "collocation"  # which is not stopped within
     more = {} if short else {"t_eval": [LONG]}
-    result = ADAPTERS[name](*start(PROBLEM, 1.0 if short else LONG), time_limit=1e-9 if short else 0.01, **more)
+    result = ADAPTERS[name](*start(SMALL, 1.0 if short else LONG), time_limit=1e-9 if short else 0.01, **more)
     assert result.status is Status.SOLVER_FAILED and "time_limit" in result.message and result.t.size == 0
 
 
@@ -138,7 +150,7 @@ def test_a_run_past_its_limit_is_not_run_again_to_its_end(name):
 def test_a_limit_that_is_not_reached_changes_nothing(name):
     # more steps than between two looks at the clock, where those are counted
     times = [0.0, 0.25, 1.0]
-    free, limited = (ADAPTERS[name](*start(PROBLEM, 1.0), t_eval=times, time_limit=limit) for limit in (None, 600.0))
+    free, limited = (ADAPTERS[name](*start(SMALL, 1.0), t_eval=times, time_limit=limit) for limit in (None, 600.0))
     assert free.success and limited.success
     for field in ("t", "q", "v", "a", "lam", "h"):
         assert np.array_equal(getattr(free, field), getattr(limited, field)), field
@@ -146,7 +158,7 @@ def test_a_limit_that_is_not_reached_changes_nothing(name):
 
 
 def test_the_accurate_start_of_gear_is_within_the_limit():
-    result = solve_gear(*start(PROBLEM, 1.0), 0.01, 3, start="accurate", time_limit=1e-9)
+    result = solve_gear(*start(SMALL, 1.0), 0.01, 3, start="accurate", time_limit=1e-9)
     assert result.status is Status.SOLVER_FAILED
     assert "The accurate start failed. DOP853 was stopped at t = 0 by time_limit = 1e-09 s" in result.message
 
@@ -163,7 +175,7 @@ HAVE_LONGEST = [name for name in ADAPTERS if name.startswith(("IDA,", "IDA f", "
 
 @pytest.mark.parametrize("name", ["DOP853", "RK45", "LSODA", "Radau", "BDF", *HAVE_LONGEST])
 def test_no_step_is_longer(name):
-    solve, at, t_end, max_step = ADAPTERS[name], start(PENDULUM, 0.2), 0.2, 1e-3
+    solve, at, t_end, max_step = ADAPTERS[name], start(SMALL, 0.2), 0.2, 1e-3
     free, bound = solve(*at, tol=1e-4), solve(*at, tol=1e-4, max_step=max_step)
     assert free.success and bound.success
     assert bound.stats.n_accepted >= 0.999 * t_end / max_step > 1.2 * free.stats.n_accepted
@@ -223,11 +235,13 @@ def test_exudyn_ends_where_its_model_is_not_finite(solver):
 
 
 # --- rows A v + b = 0
-ROLLING = ("DOP853", "DOP853, projected", "heyoka", "CVODE from C, Adams", "IDA, stabilised", "IDA from C")
-ON_AN_EDGE = ("CVODE from C, projected", "IDAS", "IDA, index1", "Dopri8")
+# `Task` adds them for every adapter; of the adapters that read callbacks in one way, one is not slow
+ROLLING = ("DOP853", "heyoka", "IDA from C", "DOP853, projected", "CVODE from C, Adams", "IDA, stabilised")
+ON_AN_EDGE = ("IDAS", "CVODE from C, projected", "IDA, index1", "Dopri8")
+SLOW = (*ROLLING[3:], *ON_AN_EDGE[1:])
 
 
-@pytest.mark.parametrize("name", each(of=(*ROLLING, *ON_AN_EDGE)))
+@pytest.mark.parametrize("name", each(of=(*ROLLING, *ON_AN_EDGE), slow=SLOW))
 def test_the_motion_is_right_and_the_rows_hold(name):
     problem = rolling_disc() if name in ROLLING else knife_edge()
     result = ADAPTERS[name](*start(problem), tol=1e-10 if name == "heyoka" else 1e-9)

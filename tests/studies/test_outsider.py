@@ -1,5 +1,6 @@
 """Solvers from files: what they return, and everything that can go wrong with them, which is a row."""
 
+import subprocess
 from dataclasses import replace
 
 import numpy as np
@@ -115,6 +116,24 @@ def test_files_that_are_no_solver(tmp_path):
     outsider = Outsider(f"{path}:solve", "pendulum")
     with pytest.raises(StudyError, match=r"mine\.py is no solver: SystemExit: 0"):
         outsider.start()
+
+
+def test_a_process_that_dies_while_it_loads_says_why(tmp_path):
+    path = tmp_path / "dying.py"
+    path.write_text("import os, sys\nprint('no licence', file=sys.stderr, flush=True)\nos._exit(3)\n")
+    with pytest.raises(StudyError, match="ended with status 3: no licence"):
+        Outsider(f"{path}:solve", "pendulum").start()
+
+
+def test_an_environment_has_the_editable_installs_of_the_present_one(tmp_path, monkeypatch):
+    present, elsewhere = tmp_path / "present", tmp_path / "elsewhere"
+    for folder in (present, elsewhere):
+        folder.mkdir()
+    (present / "mine.pth").write_text(f"{elsewhere}\n")
+    (elsewhere / "my_package.py").write_text("")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setattr(own_environment.site, "getsitepackages", lambda: [str(present)])
+    subprocess.run([environment([]), "-c", "import my_package"], check=True)
 
 
 def test_files_that_are_not_there(tmp_path):

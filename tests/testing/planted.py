@@ -59,7 +59,7 @@ M of the start | runge_kutta | andrews | mass matrix is that of the start
     M, J = problem.mass(t, q) => M, J = problem.mass(t, problem.q0)
 gravity is fixed along -y | runge_kutta | pendulum | direction is fixed
     problem.force(t, q, v) / heavy => M @ [0.0, -9.81] / heavy
-forces 1 % too large | runge_kutta | pendulum | forces are 1.01 times
+forces 1 % too large | runge_kutta | pendulum | forces are 1 % too large
     problem.force(t, q, v) / heavy => 1.01 * problem.force(t, q, v) / heavy
 a matrix with units | runge_kutta | driven_crank | unit
     np.abs(M).max(), np.linalg.norm(J, axis=1) => 1.0, np.ones(m)

@@ -131,6 +131,23 @@ def test_the_known_motion_itself_passes(name):
     assert properties_that_fail(report) == {"frame", "units"}  # for these it does not know
 
 
+def test_a_run_that_blows_up_is_not_called_early():
+    """Without its last row, which has most of the error, it would look so."""
+    blown = 20.0 ** (np.arange(101.0)[:, None] - 99.0)
+    report = check_simulator(known(lambda problem, q, v, lam: (q + blown, None, None)), "pendulum")
+    assert report.failures and not any("one output time" in failure.hint for failure in report.failures)
+
+
+def test_a_run_that_fails_in_other_units_has_a_hint():
+    def simulate(problem, times, tolerance):
+        if problem.mass(times[0], problem.q0).max() > 100.0:
+            raise ArithmeticError("a pivot is too large")
+        return by_scipy(problem, times, tolerance)
+
+    failure = next(each for each in check_simulator(simulate, "pendulum").failures if each.property == "units")
+    assert "a pivot is too large" in failure.measured and "fails in mm and g" in failure.hint
+
+
 # --- frames and units are the same problem
 @pytest.mark.parametrize("change", [in_a_frame, in_millimetres_and_grams])
 @pytest.mark.parametrize("name", MAKERS)

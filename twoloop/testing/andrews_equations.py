@@ -66,6 +66,10 @@ class AndrewsEquations:
     coordinates = ("angle", *("relative", "angle") * 3)
     row_powers = (1.0,) * 6
     parts: Mapping[str, Any] = {}  # bodies and joints are not given
+    parameters: Mapping[str, Any] = {
+        **{"masses": MASSES, "inertias": INERTIAS, "torque": TORQUE},
+        **{"spring_stiffnesses": [STIFFNESS], "spring_lengths": [UNSTRESSED]},
+    }
 
     def mass(self, t: float, q: Array) -> Array:
         """Return M (7, 7)."""

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from twoloop.testing.known_parts import GROUND
-from twoloop.testing.known_problem import Array, KnownProblem
+from twoloop.testing.known_problem import DIMENSIONS, Array, KnownProblem
 from twoloop.testing.spatial_equations import parameters_of, skew
 
 TURN, AXIS = 0.7, np.array([1.0, 2.0, -1.5]) / np.sqrt(7.25)  # rotation angle, rad, and its axis in space
@@ -78,7 +78,11 @@ def _parts_in_a_frame(problem: KnownProblem, R: Array, shift: Array, turn: float
             angle, *rates = joint.motion
             told["motion"] = (lambda t, angle=angle: angle(t) + turn, *rates)
         joints.append(replace(joint, **told))
-    return {"joints": tuple(joints), "gravity": None if problem.gravity is None else R @ problem.gravity}
+    parameters = dict(problem.parameters)
+    if "gravity" in parameters:
+        parameters["gravity"] = R @ parameters["gravity"]
+    gravity = None if problem.gravity is None else R @ problem.gravity
+    return {"joints": tuple(joints), "gravity": gravity, "parameters": parameters}
 
 
 def _rotation(turn: float, spatial: bool) -> tuple[Array, Array]:
@@ -102,6 +106,9 @@ def in_millimetres_and_grams(problem: KnownProblem) -> Transformed:
             for joint in problem.joints
         ),
         "gravity": None if problem.gravity is None else 1e3 * problem.gravity,
+        "parameters": {
+            name: value * 1e3 ** sum(DIMENSIONS[name]) for name, value in problem.parameters.items()
+        },  # a metre is 1e3 mm, and a kilogram 1e3 g
     }
     return _change(problem, T, np.zeros(problem.n_q), 1e3**problem.row_powers, 1e3 * 1e3**2, parts)
 

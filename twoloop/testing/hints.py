@@ -9,7 +9,7 @@ from twoloop.testing.changes import in_a_frame
 from twoloop.testing.evidence import CLEAR, Evidence
 from twoloop.testing.findings import Finding
 from twoloop.testing.instants import clock, rates_of_time, returned, shifted_in_time
-from twoloop.testing.measuring import allowed, forces_of_constraints, lam_errors, still_there, violations
+from twoloop.testing.measuring import HELD_BY_STEPS, allowed, forces_of_constraints, lam_errors, still_there, violations
 from twoloop.testing.mistakes import mistaken_acceleration
 from twoloop.testing.properties import SHORT, changes_of, observed_order
 from twoloop.testing.simulated import simulated, transformed_back
@@ -85,7 +85,7 @@ def _drift(e: Evidence) -> str:
         return ""
     found = [violations(e.observed.problem, run, e.observed.motion.scales)[0] for run in e.observed.runs]
     off = found[-1]
-    if any(each[-30:].max() > 4.0 * each[1:11].max() for each in found):
+    if all(each[-30:].max() > 4.0 * each[1:11].max() for each in found if each.max() > HELD_BY_STEPS):
         return (
             "The violation of C grows along the run: only accelerations (or velocities) obey the constraints. Project "
             "positions and velocities after each step, or stabilise (GGL; Baumgarte leaves a rest)."
@@ -93,8 +93,8 @@ def _drift(e: Evidence) -> str:
     if e.settings.steps is not None and found[-2].max() > 1.5 * off.max():
         return (
             "The violation of C falls with the steps and does not grow along the run: C = 0 is asked for at another "
-            "instant than that of the state (t instead of t + h?), of a state that is changed afterwards, or only for "
-            "its derivatives (Baumgarte)."
+            "instant than that of the state (t instead of t + h?), of a state that is changed afterwards, by too few "
+            "iterations, or only for its derivatives (Baumgarte)."
         )
     return (
         "The violation of C is there from the first steps and does not grow: an iteration for the positions stops too "
@@ -107,7 +107,10 @@ def _unused(e: Evidence) -> str:
     if len(runs) < 2 or not np.array_equal(runs[-2].q, runs[-1].q):
         return ""
     if np.array_equal(runs[0].q, runs[-1].q):
-        return "The same numbers whatever the tolerance, or the step: it is not used."
+        return (
+            "The same numbers whatever the tolerance, or the step: it is not used; or every interval between two times "
+            "is one step at all of them, and the equations or the projection at its end are wrong."
+        )
     return (
         f"The same numbers at {settings[-2]:.3g} and at {settings[-1]:.3g}: a bound of its own keeps the steps longer."
     )
@@ -188,6 +191,12 @@ def _slack(e: Evidence) -> str:
     )
 
 
+OTHER_MULTIPLIERS = (
+    "The multipliers belong to another instant (the middle of the step?) or to other positions and velocities than "
+    "those returned, or some rows of C are numbered otherwise."
+)
+
+
 def _multipliers(e: Evidence) -> str:
     problem, motion = e.observed.problem, e.observed.motion
     worst = int(np.argmax([errors.max() for errors in lam_errors(e.observed)]))
@@ -198,10 +207,7 @@ def _multipliers(e: Evidence) -> str:
     found = forces_of_constraints(problem, motion, run.lam)[1:]
     factor = float((found * known).sum() / (known**2).sum())
     if np.abs(found - factor * known).max() > 2.0 * CLEAR * np.abs(found - known).max():
-        return (
-            "The multipliers belong to another instant (the middle of the step?) or to other positions and velocities "
-            "than those returned, or some rows of C are numbered otherwise."
-        )
+        return OTHER_MULTIPLIERS
     if abs(factor + 1.0) < CLEAR:
         return "The multipliers have the other sign: M a + C_q^T lam = Q."
     if e.settings.steps is not None:
@@ -240,9 +246,11 @@ def _frame(e: Evidence) -> str:
 
 
 def _units(e: Evidence) -> str:
+    how = "fails" if isinstance(e.failed["units"].measured, str) else "is wrong"
     return (
-        "Right in m and kg, wrong in mm and g: a constant in the code has a unit (an absolute tolerance, a penalty, a "
-        "regularisation, the acceleration of gravity, a step of differences)."
+        f"The simulator is right in m and kg and {how} in mm and g: a constant in the code has a unit (an absolute "
+        "tolerance, a penalty, a regularisation, the acceleration of gravity, a step of differences), or a matrix of "
+        "mixed units is solved without scaling."
     )
 
 
@@ -284,8 +292,9 @@ def with_hints(findings: list[Finding], evidence: Evidence) -> list[Finding]:
     moved = any(name.startswith(MOVING) for name in evidence.failed)
     hinted = []
     for finding in findings:
-        if not finding.passed and not isinstance(finding.measured, str):
-            own = None if moved and finding.property == "multipliers" else OWN.get(finding.property)
-            finding = replace(finding, hint=own(evidence) if own else general)
+        if not finding.passed and finding.property not in ("runs", "says that it ends"):
+            own = OWN.get(finding.property)
+            text = own(evidence) if own else general
+            finding = replace(finding, hint=general if moved and text == OTHER_MULTIPLIERS else text)
         hinted.append(finding)
     return hinted

@@ -17,9 +17,9 @@ def returned(e: Evidence) -> str:
     if np.ptp(q, axis=0).max() == 0.0:
         return "Nothing moves: every row is the same."
     for shift, word in ((1, "late"), (-1, "early")):
-        moved = np.roll(q, -shift, axis=0)
-        moved[[0, -1]] = motion.q[[0, -1]]
-        if e.clears(moved):
+        rows = np.arange(1, len(q) - 1) + shift  # an end has no row beside it
+        moved = np.abs(q[rows] - motion.q[1:-1]).max() / motion.scales[0]
+        if moved < CLEAR * e.position[rows].max():
             return (
                 f"The rows are one output time {word}: row k has to be the state at times[k], the first one the start."
             )
@@ -112,17 +112,27 @@ def rates_of_time(e: Evidence) -> str:
 
 
 def clock(e: Evidence) -> str:
-    """Return a hint for constraints evaluated at the time since the start."""
+    """Return a hint for constraints that hold at another time than that of the state."""
     problem, run = e.observed.problem, e.observed.runs[-1]
-    begin = problem.t_span[0]
-    if begin == 0.0 or "constraints" not in e.failed:
+    if "constraints" not in e.failed:
         return ""
-    since, there = (
-        max(np.abs(problem.constraint(t - shift, q)).max() for t, q in zip(run.t[1:], run.q[1:], strict=True))
-        for shift in (begin, 0.0)
-    )
+    begin, steps = problem.t_span[0], list[float]()
+    if e.settings.steps is not None:
+        h = e.observed.settings[-1]
+        half_steps = round(2.0 * (run.t[1] - run.t[0]) / h)
+        steps = [0.5 * h * k for k in range(-half_steps, half_steps + 1)]
+    states = list(zip(run.t[1:], run.q[1:], strict=True))
+
+    def left(shift: float) -> float:
+        return float(max(np.abs(problem.constraint(t - shift, q)).max() for t, q in states))
+
+    shift = min([begin, *steps], key=left)
+    if not left(shift) < CLEAR * left(0.0):
+        return ""
+    if shift == begin:
+        return f"The constraints hold at t - {begin:g} s: time does not begin at 0 here, but at t_span[0] = times[0]."
+    of, word = abs(shift) / e.observed.settings[-1], "earlier" if shift > 0.0 else "later"
     return (
-        f"The constraints hold at t - {begin:g} s: time does not begin at 0 here, but at t_span[0] = times[0]."
-        if since < CLEAR * there
-        else ""
+        f"C = 0 holds at another instant than that of the state, {of:g} step{'s' * (of != 1.0)} {word}: t is not "
+        "advanced with the state, or twice."
     )

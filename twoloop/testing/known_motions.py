@@ -32,4 +32,5 @@ def posed(
     told = ("mass", "force", "constraint", "jacobian", "constraint_rate", "gamma", "energy", "coordinates")
     known: dict[str, Any] = {each: getattr(equations, each) for each in told} | {"reference": known_motion(name)}
     known |= {"t_span": (begin, end), "tags": tuple(tags.split(", ")), "row_powers": np.array(equations.row_powers)}
+    known["parameters"] = {key: np.array(value, dtype=float) for key, value in equations.parameters.items()}
     return KnownProblem(name=name, q0=start[0], v0=start[1], **known | equations.parts | more)

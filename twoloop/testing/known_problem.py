@@ -9,6 +9,11 @@ from twoloop.testing.known_parts import Array, KnownBody, KnownJoint
 from twoloop.testing.spatial_equations import half_spin, turned
 
 Quantity = Callable[[float, Array, Array], float]
+DIMENSIONS = {  # of parameters: powers of the units of length and mass; the unit of time is s
+    **{"masses": (0, 1), "inertias": (2, 1), "gravity": (1, 0), "lengths": (1, 0), "spring_stiffnesses": (0, 1)},
+    **{"spring_lengths": (1, 0), "force_amplitude": (1, 1), "force_frequency": (0, 0), "drive_height": (1, 0)},
+    **{"drive_rate": (1, 0), "torque": (2, 1)},
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,6 +93,9 @@ class KnownProblem:
         Joints in the order of their rows.
     gravity : ndarray (2,) or (3,) or None
         m/s^2.
+    parameters : mapping of str to ndarray
+        Constants of the equations, by the names of `DIMENSIONS`: masses and moments of the bodies, gravity, lengths of
+        links and so on. Points of bodies are with `joints`.
     note : str
         Purpose of the problem.
     """
@@ -114,6 +122,7 @@ class KnownProblem:
     bodies: tuple[KnownBody, ...] = ()
     joints: tuple[KnownJoint, ...] = ()
     gravity: Array | None = None
+    parameters: Mapping[str, Array] = field(default_factory=dict)
     note: str = ""
 
     def __post_init__(self) -> None:

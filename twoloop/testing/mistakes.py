@@ -157,6 +157,8 @@ def _scaled(places: list[ObservedAcceleration]) -> str:
 def _times(factor: float) -> str:
     told = {0.0: "left out", -1.0: "of the other sign"}
     near = next((word for value, word in told.items() if abs(factor - value) < FITS), "")
+    if not near and abs(factor - 1.0) < 0.1:
+        return f"{100.0 * abs(factor - 1.0):.2g} % too {'large' if factor > 1.0 else 'small'}"
     return near or f"{factor:.3g} times as large as given"
 
 

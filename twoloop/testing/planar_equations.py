@@ -69,6 +69,11 @@ class PlanarEquations:
         return len(self.row_powers)
 
     @property
+    def parameters(self) -> dict[str, Array]:
+        """Return the constants as `KnownProblem.parameters`."""
+        return {"masses": self._masses, "inertias": self._inertias, "gravity": self._gravity}
+
+    @property
     def parts(self) -> dict[str, Any]:
         """Return bodies, joints and gravity as arguments of `KnownProblem`."""
         each = enumerate(zip(self._masses, self._inertias, strict=True))

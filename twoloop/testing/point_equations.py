@@ -47,6 +47,17 @@ class PointEquations:
         self._unstressed = np.array([spring[3] for spring in springs])
 
     @property
+    def parameters(self) -> dict[str, ArrayLike]:
+        """Return the constants as `KnownProblem.parameters`; of bars, their lengths and masses are in M."""
+        n_axes = self.weight.shape[1]
+        told: dict[str, ArrayLike] = {"masses": self._mass[::n_axes, ::n_axes], "lengths": self._lengths}
+        if np.count_nonzero(told["masses"]) == len(self.weight):
+            told["masses"] = np.diag(self._mass)[::n_axes]
+        if self._stiffness.size:
+            told |= {"spring_stiffnesses": self._stiffness, "spring_lengths": self._unstressed}
+        return told | {"gravity": self.weight[0] / self._mass.sum(axis=0)[0]}
+
+    @property
     def parts(self) -> dict[str, Any]:
         """Return points, links and gravity as arguments of `KnownProblem`, if these make up the whole problem."""
         if not self._points_alone or type(self) is not PointEquations:
@@ -122,6 +133,11 @@ class ShakenPoints(PointEquations):
         super().__init__(*arguments)
         self._amplitude, self._frequency = amplitude, frequency
 
+    @property
+    def parameters(self) -> dict[str, ArrayLike]:
+        """Return the constants, and those of the excitation."""
+        return super().parameters | {"force_amplitude": self._amplitude, "force_frequency": self._frequency}
+
     def force(self, t: float, q: Array, v: Array) -> Array:
         """Return Q (n_q,)."""
         total = super().force(t, q, v)
@@ -135,6 +151,11 @@ class DrivenPoint(PointEquations):
     def __init__(self, length: float, height: float, rate: float, gravity: float):
         super().__init__([1.0], [[0.0, -gravity]], [(0, (0.0, 0.0), length)])
         self.n_c, self.row_powers, self._height, self._rate = 2, [2.0, 1.0], height, rate
+
+    @property
+    def parameters(self) -> dict[str, ArrayLike]:
+        """Return the constants, and those of the drive."""
+        return super().parameters | {"drive_height": self._height, "drive_rate": self._rate}
 
     def constraint(self, t: float, q: Array) -> Array:
         """Return C (2,)."""

@@ -134,6 +134,12 @@ class SpatialEquations:
         return self._vector_by_e(q, body, a) @ (np.zeros(4) if body == GROUND else v[7 * body + 3 : 7 * body + 7])
 
     @property
+    def parameters(self) -> dict[str, Any]:
+        """Return the constants as `KnownProblem.parameters`; the moments (n_bodies, 3) are principal ones."""
+        masses, inertias = zip(*self._bodies, strict=True)
+        return {"masses": masses, "inertias": [np.diag(J) for J in inertias], "gravity": self._gravity}
+
+    @property
     def parts(self) -> dict[str, Any]:
         """Return bodies, joints and gravity as arguments of `KnownProblem`."""
         joints: list[KnownJoint] = []
