@@ -26,6 +26,11 @@ def worst(a, b):
     return float(np.abs(np.asarray(a) - np.asarray(b)).max(initial=0.0))
 
 
+def some_of(one, other, each=3):
+    """Pairs in which each of `other` is with a few of `one`, and each of these with a few of those."""
+    return [(a, other[(i + 2 * k) % len(other)]) for i, a in enumerate(one) for k in range(each)]
+
+
 def without_tangent(problem):
     """The problem, its system made to difference the force."""
     problem.system.functions.flags[FORCE_BY_Q_GIVEN] = 0

@@ -159,7 +159,7 @@ def test_a_call_is_that_of_a_new_system_whatever_was_called_before(name):
         t = float(motion.t[k])
         return solve_dae(system, (t, t + 0.05), motion.q[:, k].copy(), motion.v[:, k].copy(), **options)
 
-    for options in WAYS:
+    for options in WAYS[EVERY.index(name) % 2 :: 2]:
         new, results = [told(call(make().system, k, options)) for k in range(3)], []
         for k in (0, 0, 0, 1, 2, 1):
             results.append((k, call(problem.system, k, options)))
