@@ -27,8 +27,9 @@ def worst(a, b):
 
 
 def some_of(one, other, each=3):
-    """Pairs in which each of `other` is with a few of `one`, and each of these with a few of those."""
-    return [(a, other[(i + 2 * k) % len(other)]) for i, a in enumerate(one) for k in range(each)]
+    """Pairs in which each of `one` is with a few of `other`, evenly spread, and each of these with a few of those."""
+    n = len(other)
+    return [(a, other[(i + k * n // each) % n]) for i, a in enumerate(one) for k in range(each)]
 
 
 def without_tangent(problem):

@@ -191,8 +191,7 @@ def steep_ramp(width):
 
 
 @pytest.mark.parametrize(
-    ("width", "method"),
-    some_of((1e-3, 1e-4, 1e-8), ("auto", "Gauss4", "Gauss16", "RadauIIA9", "SunRadau5", "BDF"), 4),
+    ("width", "method"), some_of((1e-3, 1e-4, 1e-8), ("auto", "Gauss4", "Gauss16", "RadauIIA9", "SunRadau5", "BDF"), 4)
 )
 def test_a_steep_ramp_is_none(method, width):
     system, expected = steep_ramp(width)

@@ -150,23 +150,24 @@ def told(result):
 @pytest.mark.parametrize("name", EVERY)
 @pytest.mark.filterwarnings("ignore::twoloop.ConstraintWarning")
 def test_a_call_is_that_of_a_new_system_whatever_was_called_before(name):
-    """The same call again, from other starts, in workspaces that were used; and no later call changes a result."""
+    """The same call again, to other ends, from other starts, in used workspaces; and no later call changes a result."""
     make = partial(getattr(mechanisms, name), *SIZES.get(name, ()))
     problem = make()
     motion = solve_dae(problem.system, (0.0, 0.2), problem.q0, problem.v0, t_eval=[0.0, 0.1, 0.2])
 
-    def call(system, k, options):
+    def call(system, k, span, options):
         t = float(motion.t[k])
-        return solve_dae(system, (t, t + 0.05), motion.q[:, k].copy(), motion.v[:, k].copy(), **options)
+        return solve_dae(system, (t, t + span), motion.q[:, k].copy(), motion.v[:, k].copy(), **options)
 
     for options in WAYS[EVERY.index(name) % 2 :: 2]:
-        new, results = [told(call(make().system, k, options)) for k in range(3)], []
-        for k in (0, 0, 0, 1, 2, 1):
-            results.append((k, call(problem.system, k, options)))
+        calls, results = [(0, 0.05), (0, 0.05), (0, 0.05), (0, 0.03), (1, 0.05), (2, 0.05), (1, 0.05)], []
+        new = {each: told(call(make().system, *each, options)) for each in calls}
+        for each in calls:
+            results.append((each, call(problem.system, *each, options)))
             for work in chain.from_iterable(_free.values()):
                 work.notes.base[:], work.counters.base[:] = np.nan, 10**6  # whatever a run has left
-        for k, result in results:
-            assert told(result) == new[k], (options, k)
+        for each, result in results:
+            assert told(result) == new[each], (options, each)
 
 
 def test_workspaces_of_other_sizes_do_not_keep_that_of_a_repeated_call_out():
