@@ -103,13 +103,6 @@ def test_at_a_step_the_state_is_the_one_stored(default_four_bar, method):
     assert worst(state.a, result.a) < 1e-11 and worst(state.lam, result.lam) < 1e-11
 
 
-def test_accelerations_and_multipliers_belong_to_the_state(default_four_bar):
-    result = run(default_four_bar, 1.0, dense_output=True)
-    state = result.sol(between(result))
-    assert force_residual(default_four_bar.system, state) < 1e-11 and state.a.shape == state.q.shape
-    assert state.lam.shape == (8, state.t.size)
-
-
 def test_a_run_has_the_same_steps_with_and_without(default_four_bar):
     with_it, without = run(default_four_bar, 2.0, dense_output=True), run(default_four_bar, 2.0)
     assert (with_it.q == without.q).all() and with_it.stats.n_evaluations == without.stats.n_evaluations

@@ -268,7 +268,8 @@ def own_disk(monkeypatch, tmp_path):
     return tmp_path
 
 
-def test_a_second_process_compiles_nothing(own_disk):
+def test_a_second_process_compiles_nothing(own_disk, monkeypatch):
+    monkeypatch.setattr("twoloop.generate.families._FAMILIES", {})  # without what another test has made
     problem = mechanisms.four_bar()
     solve_dae(problem.system, (0.0, 0.1), problem.q0, problem.v0, "DOP853", compiled=True)
     program = """
