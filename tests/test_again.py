@@ -162,7 +162,7 @@ def test_redundant_rows_are_named(name, taken):
     for state in states:
         with pytest.warns(ConstraintWarning, match="left out of the solution") as said:
             result = runs(problem, [state], 0.05)[0]
-        assert f"row(s) {result.redundant.tolist()}" in str(said[0].message)
+        assert f"row(s) {result.redundant.tolist()}" in str(said[0].message) and said[0].filename == __file__
     assert sum(taken) >= 2
 
 

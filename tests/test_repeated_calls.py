@@ -4,7 +4,6 @@ import copy
 import cProfile
 import pickle
 import pstats
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import FrozenInstanceError, replace
 from functools import partial
 from itertools import chain
@@ -13,7 +12,7 @@ import numpy as np
 import pytest
 
 from tests.problems import pendulum
-from twoloop import ConstraintWarning, mechanisms, solve_dae
+from twoloop import mechanisms, solve_dae
 from twoloop.checks.consistency import check_start
 from twoloop.generate.choices import Choice
 from twoloop.generate.exact_derivatives import Territory, exact_derivatives, generic_states
@@ -185,22 +184,6 @@ def test_workspaces_of_other_sizes_do_not_keep_that_of_a_repeated_call_out():
     _free.update(before)
 
 
-def test_runs_at_a_time_do_not_share_a_workspace():
-    problem = mechanisms.four_bar()
-    alone = run(problem)
-    with ThreadPoolExecutor(4) as pool:
-        results = list(pool.map(lambda _: run(problem), range(40)))
-    assert all(np.array_equal(alone.q, result.q) for result in results)
-
-
-def test_redundant_rows_are_named_where_the_user_calls_in_every_run():
-    problem = mechanisms.redundant_slider_crank()
-    for _ in range(3):
-        with pytest.warns(ConstraintWarning, match="have rank") as told:
-            run(problem)
-        assert told[0].filename == __file__
-
-
 def test_plans_are_kept_for_few_tolerances():
     problem = mechanisms.pendulum()
     for k in range(2 * MOST):
@@ -286,15 +269,6 @@ def test_every_start_that_is_not_the_last_is_checked(monkeypatch):
         solve_dae(problem.system, (0.0, 0.1), q0, problem.v0)
     # the first and the last start are known, and the runs that two calls in a row asked for
     assert [np.array_equal(q, problem.q0) for q in looked] == [True, False, True]
-
-
-def test_a_wrong_start_is_refused_after_a_good_one_and_again():
-    problem = mechanisms.pendulum()
-    run(problem)
-    for _ in range(2):
-        with pytest.raises(ValueError, match="q0 is not consistent"):
-            solve_dae(problem.system, (0.0, 1.0), 1.1 * problem.q0, problem.v0)
-    assert run(problem).success
 
 
 def test_a_plan_is_that_of_the_choice_of_its_code():
