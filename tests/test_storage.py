@@ -1,6 +1,7 @@
 """Results in files, written after a run or as its states come, and read back."""
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -159,6 +160,7 @@ def test_the_memory_holds_a_part_only(tmp_path, options, monkeypatch):
     """Counted is what NumPy asks for: files that are mapped are not among it."""
     monkeypatch.setattr(course, "BUFFER_ROWS", 64)
     problem, peaks, stored = closed_chain(12), [], []
+    run(problem, 0.1, dense_output=True)  # traced and compiled
     for end in (10.0, 20.0):
         times = {"t_eval": np.linspace(0.0, end, int(200.0 * end))} if options.get("t_eval") else {}
         tracemalloc.start()
@@ -191,6 +193,10 @@ def test_a_callback_that_raises_leaves_what_was_there(tmp_path):
     found = twoloop.load(tmp_path / "run")
     assert found.status is Status.INTERRUPTED and "The run was interrupted" in found.message
     assert found.t[-1] > 0.0 and found.h.size == found.t.size - 1
+    shutil.copytree(tmp_path / "run", tmp_path / "killed")  # by a signal, with one array written and others not
+    np.save(tmp_path / "killed" / "t.npy", found.t[:-1])
+    found = twoloop.load(tmp_path / "killed")
+    assert found.q.shape == found.v.shape == (2, found.t.size) and found.lam.shape == (1, found.t.size)
 
 
 DIES = """
