@@ -64,7 +64,9 @@ SOLVE = [
     ),
     *of_argument("rtol", *case.POSITIVES, case.INFINITE, case.LIST, case.NONE),
     *of_argument("atol", *case.POSITIVES, case.INFINITE, case.SHORT_ATOL),
-    *of_argument("atol", ([1e-6, 0.0], case.WRONG, "must be", "give positive tolerances")).says(
+    *of_argument(
+        "atol",
+        ([1e-6, 0.0], case.WRONG, "must be", "give positive tolerances"),
         ([1e-6, np.nan], case.WRONG, "must be", "give positive tolerances"),
         ([True, True], case.WRONG, "must be", "give positive tolerances"),
         (["small", "small"], case.WRONG, "must be", "give positive tolerances"),
@@ -97,8 +99,8 @@ SOLVE = [
         (case.HUGE, ValueError, "must fit into 64 bits", "leave it out for no limit"),
     ),
     *of_argument(
-        "method", ("RK45", ValueError, "must be one of auto.*given 'RK45'", "take one of the names listed")
-    ).says(
+        "method",
+        ("RK45", ValueError, "must be one of auto.*given 'RK45'", "take one of the names listed"),
         (None, TypeError, "must be a name .*given None", "leave it out for the default"),
         (5, TypeError, "must be a name .*given 5", "take a name or a method object"),
     ),
@@ -127,7 +129,6 @@ SOLVE = [
         lambda: case.solve(
             pendulum(force=lambda t, q, v: np.array([0.0, -9.81 if q[0] > 0.0 else -1.0])), compiled=True
         ),
-    ).says(
         "compiled=True needs equations .*force of 'pendulum': it branches",
         "leave it out, or write the callback without `if`, `abs`, `max`",
     ),
@@ -162,8 +163,8 @@ SOLVE = [
         (1, TypeError, "must be True or False; given 1", "give True or False"),
     ),
     *of_argument(
-        "store", (3, TypeError, "must be a file name or a path; given 3", "give the path of a folder to make")
-    ).says(
+        "store",
+        (3, TypeError, "must be a file name or a path; given 3", "give the path of a folder to make"),
         (".", ValueError, "must be a folder that does not exist yet; given '.', which exists", "take another name"),
         ("no/run", ValueError, "must be inside an existing folder; given 'no.run'", "make the folder above it"),
     ),
