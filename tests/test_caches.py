@@ -8,7 +8,7 @@ from numba import njit
 
 from tests.own_cache import RUN, Folder, with_kernels
 from tests.processes import run_python
-from twoloop.kernels.compile.caches import UNWRITABLE, kept_when_called, stands_for, watch
+from twoloop.kernels.compile.caches import UNWRITABLE, Files, kept_when_called, stands_for, watch
 
 
 @pytest.fixture
@@ -124,6 +124,18 @@ def test_what_changes_in_other_files_and_damage_make_machine_code_stale(folder):
     known = {name: (2.0, 1) for name in VALUES} | {"nothing": (1.0, 1), "what_cannot_be_watched": (2.0, 0)}
     assert folder.values() == known | damaged
     assert folder.values() == known
+
+
+def test_a_file_with_one_changed_bit_counts_as_missing(tmp_path):
+    files, data = Files(tmp_path, "numbers", "stamp"), np.arange(20.0).tobytes()
+    files.save("key", data)
+    (path,) = tmp_path.iterdir()
+    content = path.read_bytes()
+    for place in range(0, len(content), 5):
+        path.write_bytes(content[:place] + bytes([content[place] ^ 1]) + content[place + 1 :])
+        assert files.load("key") is None, place
+    path.write_bytes(content)
+    assert files.load("key") == data
 
 
 def block_caches(folder):
