@@ -33,6 +33,11 @@ def circle(t, q, p, C):
     C[0] = 0.5 * (q[0] * q[0] + q[1] * q[1] - 1.0)
 
 
+@callback("constraint")
+def circle_of_length(t, q, p, C):
+    C[0] = 0.5 * (q[0] * q[0] + q[1] * q[1] - p[1] * p[1])
+
+
 @callback("jacobian")
 def radius(t, q, p, Cq):
     Cq[0, 0], Cq[0, 1] = q[0], q[1]

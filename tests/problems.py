@@ -26,6 +26,12 @@ def worst(a, b):
     return float(np.abs(np.asarray(a) - np.asarray(b)).max(initial=0.0))
 
 
+def some_of(one, other, each=3):
+    """Pairs in which each of `one` is with a few of `other`, evenly spread, and each of these with a few of those."""
+    n = len(other)
+    return [(a, other[(i + k * n // each) % n]) for i, a in enumerate(one) for k in range(each)]
+
+
 def without_tangent(problem):
     """The problem, its system made to difference the force."""
     problem.system.functions.flags[FORCE_BY_Q_GIVEN] = 0

@@ -11,21 +11,6 @@ from tests.problems import PLAIN, START, pendulum_state, worst
 from twoloop import ConstrainedSystem, Statistics, Status, exported, mechanisms, solve_dae
 
 
-@pytest.mark.parametrize("make", [mechanisms.four_bar, mechanisms.pendulum])
-def test_what_a_problem_and_a_result_have(make):
-    problem = make()
-    result = solve_dae(problem.system, problem.t_span, problem.q0, problem.v0, rtol=1e-8, atol=1e-8)
-    n_t = result.t.size
-    assert result.q.shape == result.v.shape == result.a.shape == (problem.system.n_q, n_t)
-    assert result.lam.shape == (problem.system.n_c, n_t) and result.success and result.status == 0 and result.message
-    assert result.t[-1] == problem.t_span[1]
-    counts = {name: value for name, value in vars(result.stats).items() if name.startswith("n_")}
-    assert len(counts) > 7 and all(isinstance(value, int) for value in counts.values()) and result.stats.cpu_time > 0.0
-    assert result.h.shape == (result.stats.n_accepted,) and result.sol is None and result.t_events is None
-    assert isinstance(problem.name, str) and isinstance(problem.parameters, dict)
-    assert worst(result.energy, result.energy[0]) < 1e-5
-
-
 def test_arguments_that_are_left_out_are_as_documented():
     """With all of them given, a run is that of the few that are needed."""
     few = ConstrainedSystem.from_python(**PLAIN)

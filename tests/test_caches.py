@@ -8,7 +8,7 @@ from numba import njit
 
 from tests.own_cache import RUN, Folder, with_kernels
 from tests.processes import run_python
-from twoloop.kernels.compile.caches import UNWRITABLE, kept_when_called, stands_for, watch
+from twoloop.kernels.compile.caches import UNWRITABLE, Files, kept_when_called, stands_for, watch
 
 
 @pytest.fixture
@@ -93,7 +93,14 @@ for scale in (1, 10):
 INNER = "import numba\n@numba.njit\ndef inner(x):\n    return {0}.0 * x\n"
 
 
-def test_what_changes_in_other_files_makes_machine_code_stale(folder):
+DAMAGES = {  # what stands in the file of a callback instead of its machine code
+    "a_float": lambda data: b"",
+    "a_helper": lambda data: data[: len(data) // 2],
+    "a_helper_of_a_module": lambda data: bytes(len(data)),
+}
+
+
+def test_what_changes_in_other_files_and_damage_make_machine_code_stale(folder):
     folder.mechanism(**VALUES)
     folder.write("own_caches", OWN_CACHES + KERNELS)  # does not change
     folder.write("systems", SYSTEMS)
@@ -105,20 +112,6 @@ def test_what_changes_in_other_files_makes_machine_code_stale(folder):
         changed = {name: (factor, 0) for name in VALUES} | {"force_1": (factor, 0), "force_10": (10.0 * factor, 0)}
         assert folder.values(f"{RUN}\nimport systems") == changed | same
         assert folder.said.count(ANNOUNCED) == 1 - kept  # of the kernels
-    never = {"what_cannot_be_watched": (2.0, 0)}
-    assert folder.values() == {name: (2.0, 1) for name in VALUES} | {"nothing": (1.0, 1)} | never
-
-
-DAMAGES = {
-    "empty": lambda data: b"",
-    "truncated": lambda data: data[: len(data) // 2],
-    "zeros": lambda data: bytes(len(data)),
-}
-
-
-def test_damaged_files_and_those_of_other_functions_are_rebuilt(folder):
-    folder.mechanism(**{name: "q[0]" for name in DAMAGES}, one="q[0]", two="2.0 * q[0]")
-    folder.values()
 
     def file(name):
         (found,) = folder.cache.glob(f"*/mechanism.{name}-*.nbc")
@@ -126,10 +119,23 @@ def test_damaged_files_and_those_of_other_functions_are_rebuilt(folder):
 
     for name, damage in DAMAGES.items():
         file(name).write_bytes(damage(file(name).read_bytes()))
-    file("one").write_bytes(file("two").read_bytes())
-    sound = {name: 1.0 for name in (*DAMAGES, "one")}
-    assert folder.values() == {name: (value, 0) for name, value in sound.items()} | {"two": (2.0, 1)}
-    assert folder.values() == {name: (value, 1) for name, value in sound.items()} | {"two": (2.0, 1)}
+    file("the_default_of_a_helper").write_bytes(file("nothing").read_bytes())  # that of another function
+    damaged = {name: (2.0, 0) for name in (*DAMAGES, "the_default_of_a_helper")}
+    known = {name: (2.0, 1) for name in VALUES} | {"nothing": (1.0, 1), "what_cannot_be_watched": (2.0, 0)}
+    assert folder.values() == known | damaged
+    assert folder.values() == known
+
+
+def test_a_file_with_one_changed_bit_counts_as_missing(tmp_path):
+    files, data = Files(tmp_path, "numbers", "stamp"), np.arange(20.0).tobytes()
+    files.save("key", data)
+    (path,) = tmp_path.iterdir()
+    content = path.read_bytes()
+    for place in range(0, len(content), 5):
+        path.write_bytes(content[:place] + bytes([content[place] ^ 1]) + content[place + 1 :])
+        assert files.load("key") is None, place
+    path.write_bytes(content)
+    assert files.load("key") == data
 
 
 def block_caches(folder):

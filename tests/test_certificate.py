@@ -13,7 +13,7 @@ import pytest
 
 from tests.compiled import PENDULUM
 from tests.problems import run
-from twoloop import CertificateWarning, ConstrainedSystem, Statistics, callback, load, mechanisms, solve_dae
+from twoloop import CertificateWarning, ConstrainedSystem, Statistics, callback, mechanisms, solve_dae
 from twoloop.run.dense_solution import DenseSolution
 
 END = 3.0
@@ -167,14 +167,6 @@ def test_a_run_that_an_event_ended(default_four_bar):
     end.terminal = True
     for options in ({}, {"dense_output": True}, {"t_eval": np.linspace(0.0, 5.0, 51)}):
         assert silently(run(default_four_bar, 5.0, events=end, **options))
-
-
-def test_a_result_from_a_file_has_the_same_certificate(default_four_bar, tmp_path):
-    result = run(default_four_bar, 0.5, dense_output=True)
-    result.save(tmp_path / "run.npz")
-    assert load(tmp_path / "run.npz", default_four_bar.system).certify() == result.certify()
-    with pytest.raises(ValueError, match=r"certify needs the system: .* twoloop\.load\(path, system\)"):
-        load(tmp_path / "run.npz").certify()
 
 
 def test_a_result_of_another_solver(default_four_bar):

@@ -8,7 +8,7 @@ import pytest
 
 import twoloop
 from tests.problems import swing
-from twoloop import Result, RungeKutta, Statistics, Status, citation, load
+from twoloop import Result, RungeKutta, Statistics, Status, citation
 from twoloop.methods.presets import PRESETS
 from twoloop.methods.tableaux import gauss, lobatto_iiie
 from twoloop.result.citations import ENTRIES, METHODS
@@ -56,12 +56,6 @@ def test_entries_are_all_used_and_agree_with_the_citation_file():
     assert re.search(r"year: (\d+)", given)[1] in ENTRIES["paper"]
     plain = ENTRIES["paper"].replace("{", "").replace("}", "").replace("--", "–")
     assert re.search(r"type: article\n    title: (.*)", given)[1] in plain
-
-
-def test_a_result_from_a_file_is_cited_alike(tmp_path):
-    result = swing(0.1, method="Gauss8")
-    result.save(tmp_path / "run.npz")
-    assert citation(load(tmp_path / "run.npz")) == citation(result)
 
 
 def test_what_cannot_be_cited():

@@ -116,13 +116,17 @@ def test_a_fast_bar_is_as_right_without_gamma_as_with():
     assert errors[1] <= 1.01 * errors[0] + 1e-12
 
 
-@pytest.mark.parametrize("method", ["auto", "RadauIIA5", "PaperIRK", "Taylor"])
-def test_a_motion_without_them_is_the_motion_with_them(method):
+@pytest.mark.parametrize(
+    ("method", "compiled"),
+    [("auto", "auto"), ("auto", True), ("RadauIIA5", "auto"), ("PaperIRK", "auto"), ("Taylor", "auto")],
+)
+def test_a_motion_without_them_is_the_motion_with_them(method, compiled):
     ends = []
     for absent in ((), ("gamma",), ("jacobian", "gamma")):
         system = pendulum(**dict.fromkeys(absent))
-        ends.append(solve_dae(system, (0.0, 1.0), [0.6, -0.8], [0.8, 0.6], method, 1e-9, 1e-9).q[:, -1])
-    assert np.allclose(ends[1], ends[0], rtol=0.0, atol=1e-12) and np.allclose(ends[2], ends[0], rtol=0.0, atol=1e-12)
+        run = solve_dae(system, (0.0, 1.0), [0.6, -0.8], [0.8, 0.6], method, 1e-9, 1e-9, compiled=compiled)
+        ends.append(run.q[:, -1])
+    assert np.ptp(ends, axis=0).max() < 1e-12
 
 
 def test_what_branches_is_differenced():
@@ -179,14 +183,6 @@ def test_an_ensemble_follows_where_a_derivative_is_a_sum():
     runs = ensemble(system, (0.0, 1.0), q, v, parameters=parameters)
     alone = solve_dae(driven_along_a_rail(parameters[8]), (0.0, 1.0), q[8], v[8], method="DOP853", compiled=False)
     assert runs.success.all() and worst(runs.q[8, :, -1], alone.q[:, -1]) < 1e-6
-
-
-def test_code_made_for_a_mechanism_needs_no_jacobian():
-    ends = [
-        solve_dae(system, (0.0, 1.0), [0.6, -0.8], [0.8, 0.6], rtol=1e-9, atol=1e-9, compiled=True).q[:, -1]
-        for system in (pendulum(), pendulum(jacobian=None, gamma=None))
-    ]
-    assert np.allclose(*ends, rtol=0.0, atol=1e-11)
 
 
 def switched_on(rapidity):

@@ -5,9 +5,9 @@ import math
 import numpy as np
 import pytest
 
-from tests.compiled import PENDULUM, unit_mass, weight
+from tests.compiled import unit_mass, weight
 from tests.derivative_cases import shaken_pendulum
-from tests.problems import functions_of, moving_pivot, moving_pivot_state, pendulum, pendulum_state, swing, worst
+from tests.problems import functions_of, moving_pivot, moving_pivot_state, pendulum, worst
 from twoloop import ConstrainedSystem, Status, callback, consistent_state, solve_dae
 from twoloop.mechanisms import four_bar, very_flexible_beam
 
@@ -65,17 +65,6 @@ def test_its_cost_is_what_the_documentation_says():
     system.jacobian(0.0, [0.6, -0.8])
     assert calls[0] == 8 * system.n_q
     assert "8 n_q calls of constraint" in ConstrainedSystem.from_python.__doc__.replace("\n            ", " ")
-
-
-def compiled_pendulum(jacobian):
-    return ConstrainedSystem(**PENDULUM | {"jacobian": jacobian})
-
-
-@pytest.mark.parametrize("make", [pendulum, compiled_pendulum])
-def test_a_run_without_jacobian_is_as_good(make):
-    result = swing(system=make(jacobian=None), rtol=1e-10, atol=1e-10)
-    q, v, lam = pendulum_state(result.t)
-    assert result.success and worst(result.q, q) < 1e-8 and worst(result.v, v) < 1e-8 and worst(result.lam, lam) < 1e-6
 
 
 def test_differences_of_differences_lose_digits_as_documented():

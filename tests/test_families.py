@@ -134,7 +134,7 @@ def test_a_run_is_what_it_is_without_code(parameters, method):
     assert np.abs(made.q[:, -1] - expected.q[:, -1]).max() < 1e-7
 
 
-@pytest.mark.parametrize("make", MECHANISMS)
+@pytest.mark.parametrize("make", [*MECHANISMS[:-1], pytest.param(governor, marks=pytest.mark.slow)])
 def test_numbers_of_other_parameters_are_those_that_are_traced_for_them(make):
     problem, random = make(), np.random.default_rng(2)
     system = problem.system

@@ -10,7 +10,7 @@ import pytest
 from tests.problems import pendulum
 from tests.test_callbacks import PENDULUM
 from twoloop import ConstrainedSystem, callback, solve_dae
-from twoloop.mechanisms import four_bar, very_flexible_beam
+from twoloop.mechanisms import four_bar
 from twoloop.problem.adapters import PythonFunctions
 
 Q, V = [-0.6, -0.8], [0.4, -0.3]
@@ -148,16 +148,6 @@ def test_functions_without_a_name_of_their_own_say_so(force, compiled):
     with pytest.raises(TypeError, match=words):
         pickle.dumps(system)
     assert copy.deepcopy(system).force(0.0, Q, V).tolist() == [0.0, 0.0]  # needs no name
-
-
-@pytest.mark.parametrize("problem", [four_bar(), four_bar(theta3=0.3), very_flexible_beam()], ids=lambda p: p.name)
-@pytest.mark.parametrize("copied", [copy.deepcopy, lambda problem: pickle.loads(pickle.dumps(problem))])
-def test_problems_can_be_copied(problem, copied):
-    other = copied(problem)
-    assert observed(other.system) == observed(problem.system)
-    assert other.energy(0.0, other.q0, other.v0) == problem.energy(0.0, problem.q0, problem.v0)
-    assert (other.q0 == problem.q0).all()
-    assert (other.name, other.note, other.parameters) == (problem.name, problem.note, problem.parameters)
 
 
 def test_numbers_that_lead_to_no_function_are_refused():

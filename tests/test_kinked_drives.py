@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from tests.problems import driven_cart, pendulum
+from tests.problems import driven_cart, pendulum, some_of
 from twoloop import ConstrainedSystem, Status, solve_dae
 from twoloop.methods.presets import PRESETS
 from twoloop.run.impulse import beyond_jump
@@ -15,7 +15,8 @@ from twoloop.run.impulse import beyond_jump
 MIXED = np.random.default_rng(5).normal(size=(5, 5)) * 0.3
 MASS = np.diag([1.0, 2.0, 2.0, 1.0, 1.0]) + MIXED @ MIXED.T
 LOW_ORDER = ("TRBDF2", "ESDIRK4", "Newmark", "PaperNewmark", "PaperIRK")
-TRACED = ("Taylor",)  # refuses callbacks that branch
+# Taylor refuses callbacks that branch; of Gauss' methods the shortest, the middle one and the longest
+METHODS = [name for name in PRESETS if name not in ("Taylor", "Gauss6", "Gauss10", "Gauss12", "Gauss14")]
 
 
 def driven(place, speed, acceleration, gamma=True, mass=MASS):
@@ -118,7 +119,7 @@ def off(result, expected):
 
 @pytest.mark.parametrize(
     ("case", "method"),
-    [(CASES[0], name) for name in PRESETS if name not in TRACED] + [(CASES[1], name) for name in FAMILIES],
+    [(CASES[0], name) for name in METHODS] + [(CASES[1], name) for name in FAMILIES],
     indirect=["case"],
 )
 def test_a_jump_is_an_impulse(case, method):
@@ -190,8 +191,9 @@ def steep_ramp(width):
     return system, end_of(system, max_step=0.005)
 
 
-@pytest.mark.parametrize("width", [1e-3, 1e-4, 1e-8])
-@pytest.mark.parametrize("method", ["auto", "Gauss4", "Gauss16", "RadauIIA9", "BDF", "SunRadau5"])
+@pytest.mark.parametrize(
+    ("width", "method"), some_of((1e-3, 1e-4, 1e-8), ("auto", "Gauss4", "Gauss16", "RadauIIA9", "SunRadau5", "BDF"), 4)
+)
 def test_a_steep_ramp_is_none(method, width):
     system, expected = steep_ramp(width)
     result = solve_dae(system, (0.0, END), START, velocities(system), method, 1e-6, 1e-6)

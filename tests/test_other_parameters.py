@@ -7,6 +7,8 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 
+from tests.compiled import centripetal, circle_of_length, heavy, radius
+from tests.problems import some_of
 from tests.test_again import assert_same
 from twoloop import ConstrainedSystem, Integrator, callback, consistent_state, mechanisms, solve, solve_dae
 from twoloop.run import comparison
@@ -39,8 +41,7 @@ def other(problem, k):
     return (changed, *(consistent_state(changed, 0.0, q, v) if problem.system.name == "four-bar" else (q, v)))
 
 
-@pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize(("name", "method"), some_of(NAMES, METHODS))
 @pytest.mark.filterwarnings("ignore::twoloop.ConstraintWarning")
 def test_it_is_the_run_of_the_long_way_to_the_bit(name, method, taken, monkeypatch):
     problem, new = made(name), made(name)
@@ -61,32 +62,12 @@ def test_it_is_the_run_of_the_long_way_to_the_bit(name, method, taken, monkeypat
 # Pendulums of mass p[0] and length p[1], in p[2] of the gravity
 
 
-@callback("mass")
-def mass(t, q, p, M):
-    M[0, 0] = M[1, 1] = p[0]
-
-
 @callback("force")
-def force(t, q, v, p, Q):
+def weight(t, q, v, p, Q):
     Q[1] = -p[0] * p[2]
 
 
-@callback("constraint")
-def constraint(t, q, p, C):
-    C[0] = 0.5 * (q[0] * q[0] + q[1] * q[1] - p[1] * p[1])
-
-
-@callback("jacobian")
-def jacobian(t, q, p, Cq):
-    Cq[0, 0], Cq[0, 1] = q[0], q[1]
-
-
-@callback("gamma")
-def gamma(t, q, v, p, Qd):
-    Qd[0] = -(v[0] * v[0] + v[1] * v[1])
-
-
-FUNCTIONS = {"mass": mass, "force": force, "constraint": constraint, "jacobian": jacobian, "gamma": gamma}
+FUNCTIONS = {"mass": heavy, "force": weight, "constraint": circle_of_length, "jacobian": radius, "gamma": centripetal}
 FIRST = (1.3, 1.1, GRAVITY)
 
 

@@ -1,14 +1,12 @@
 """Reactions against Newton's and Euler's laws, body by body, from accelerations and applied forces alone."""
 
 import copy
-import pickle
 import warnings
 from itertools import pairwise
 
 import numpy as np
 import pytest
 
-import twoloop
 from tests.compiled import PENDULUM
 from tests.problems import held_twice
 from twoloop import ConstrainedSystem, ConstraintWarning, Joint, mechanisms, solve_dae
@@ -333,20 +331,3 @@ def test_names():
 )
 def test_mechanisms_without_absolute_coordinates_have_no_joints(make):
     assert make().joints == ()
-
-
-def test_results_in_files(tmp_path):
-    problem = mechanisms.four_bar()
-    result = run(problem, 0.1)
-    result.save(tmp_path / "run.npz")
-    with pytest.raises(ValueError, match=r"twoloop.load\(path, system\)"):
-        twoloop.load(tmp_path / "run.npz").reactions("O")
-    again = twoloop.load(tmp_path / "run.npz", problem.system)
-    assert (again.reactions("O").force == result.reactions("O").force).all()
-
-
-def test_copies_and_pickles_keep_joints():
-    system = hanging()
-    for other in (copy.copy(system), copy.deepcopy(system), pickle.loads(pickle.dumps(system))):
-        assert [joint.name for joint in other.joints] == ["link"]
-        assert solve_dae(other, (0.0, 0.1), *BOB).reactions("link").force[1] == pytest.approx(9.81, abs=1e-12)

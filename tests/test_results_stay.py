@@ -81,10 +81,9 @@ def test_the_energy_of_generated_equations_goes_along():
     assert worst(solve_dae(system, (0.0, 0.3), [0.6, 0.8], [0.0, 0.0]).energy, 2.0 * 5.0 * 0.8) < 1e-6
 
 
-@pytest.mark.parametrize("compile", [False, True])
-def test_functions_without_parameters_say_so(compile):
+def test_functions_without_parameters_say_so():
     with pytest.raises(TypeError, match=r"'pendulum' has no parameters: it is made by from_python without them"):
-        pendulum(compile=compile).with_parameters([1.0])
+        pendulum().with_parameters([1.0])
 
 
 @pytest.mark.parametrize("wrong", [[1.0], [[1.0, 2.0, 1.5, 3.0]], [1.0, 2.0, 1.5, np.nan], np.zeros(0)])

@@ -23,15 +23,6 @@ from twoloop.methods.presets import PRESETS
 from twoloop.methods.tableaux import gauss, sun_radau_iib
 
 
-# --- accuracy
-@pytest.mark.parametrize("constant_mass", [True, False])
-def test_pendulum_in_plain_python_agrees_with_its_closed_form_to_nine_digits(constant_mass):
-    times = np.linspace(0.0, 10.0, 21)
-    result = swing(10.0, pendulum(constant_mass=constant_mass), rtol=1e-10, atol=1e-10, t_eval=times)
-    q, v, _ = pendulum_state(times)
-    assert result.success and worst(result.q, q) < 5e-10 and worst(result.v, v) < 2e-9
-
-
 def test_angles_beyond_a_turn():
     # fast enough to go round and round: every coordinate becomes dependent in turn
     result = solve_dae(pendulum(), (0.0, 3.0), [0.0, -1.0], [9.0, 0.0], rtol=1e-9, atol=1e-9)

@@ -1,10 +1,12 @@
 """Results in files, written after a run or as its states come, and read back."""
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
 import tracemalloc
+from contextlib import nullcontext
 from dataclasses import fields
 
 import numpy as np
@@ -57,6 +59,23 @@ def test_there_and_back(default_four_bar, tmp_path, method):
 def test_without_the_system_there_is_no_dense_solution(default_four_bar, tmp_path):
     run(default_four_bar, 0.2, dense_output=True).save(tmp_path / "run")
     assert twoloop.load(tmp_path / "run").sol is None  # the name is as given, without .npz
+
+
+@pytest.mark.parametrize(
+    ("says", "needs"),
+    [
+        (lambda result: result.certify(), "certify needs the system"),
+        (lambda result: result.reactions("O").force.tolist(), "reactions"),
+        (twoloop.citation, ""),
+    ],
+    ids=["certificate", "reactions", "citation"],
+)
+def test_a_result_from_a_file_says_what_it_said(default_four_bar, tmp_path, says, needs):
+    result = run(default_four_bar, 0.5, dense_output=True)
+    result.save(tmp_path / "run.npz")
+    assert says(twoloop.load(tmp_path / "run.npz", default_four_bar.system)) == says(result)
+    with pytest.raises(ValueError, match=rf"{needs}.*twoloop\.load\(path, system\)") if needs else nullcontext():
+        says(twoloop.load(tmp_path / "run.npz"))
 
 
 def test_a_run_that_an_event_ended(default_four_bar, tmp_path):
@@ -141,7 +160,8 @@ def test_the_memory_holds_a_part_only(tmp_path, options, monkeypatch):
     """Counted is what NumPy asks for: files that are mapped are not among it."""
     monkeypatch.setattr(course, "BUFFER_ROWS", 64)
     problem, peaks, stored = closed_chain(12), [], []
-    for end in (40.0, 80.0):
+    run(problem, 0.1, dense_output=True)  # traced and compiled
+    for end in (10.0, 20.0):
         times = {"t_eval": np.linspace(0.0, end, int(200.0 * end))} if options.get("t_eval") else {}
         tracemalloc.start()
         result = run(problem, end, rtol=1e-7, atol=1e-7, max_step=0.005, **options | times, store=tmp_path / f"{end}")
@@ -151,7 +171,7 @@ def test_the_memory_holds_a_part_only(tmp_path, options, monkeypatch):
     assert peaks[1] - peaks[0] < 0.2 * (stored[1] - stored[0])
     before = result.q[0, 0]
     result.q[0, 0] = 7.0  # as in memory, and not in the file
-    assert twoloop.load(tmp_path / "80.0").q[0, 0] == before
+    assert twoloop.load(tmp_path / "20.0").q[0, 0] == before
 
 
 def test_what_is_refused(default_four_bar, tmp_path):
@@ -173,6 +193,10 @@ def test_a_callback_that_raises_leaves_what_was_there(tmp_path):
     found = twoloop.load(tmp_path / "run")
     assert found.status is Status.INTERRUPTED and "The run was interrupted" in found.message
     assert found.t[-1] > 0.0 and found.h.size == found.t.size - 1
+    shutil.copytree(tmp_path / "run", tmp_path / "killed")  # by a signal, with one array written and others not
+    np.save(tmp_path / "killed" / "t.npy", found.t[:-1])
+    found = twoloop.load(tmp_path / "killed")
+    assert found.q.shape == found.v.shape == (2, found.t.size) and found.lam.shape == (1, found.t.size)
 
 
 DIES = """

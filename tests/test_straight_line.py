@@ -268,7 +268,10 @@ def own_disk(monkeypatch, tmp_path):
     return tmp_path
 
 
-def test_a_second_process_compiles_nothing(tmp_path):
+def test_a_second_process_compiles_nothing(own_disk, monkeypatch):
+    monkeypatch.setattr("twoloop.generate.families._FAMILIES", {})  # without what another test has made
+    problem = mechanisms.four_bar()
+    solve_dae(problem.system, (0.0, 0.1), problem.q0, problem.v0, "DOP853", compiled=True)
     program = """
         import sys
         from pathlib import Path
@@ -280,14 +283,12 @@ def test_a_second_process_compiles_nothing(tmp_path):
         def refuse(*given):
             raise AssertionError("compiled again")
 
-        if sys.argv[2] == "second":
-            written.Written.operation = own_functions.object_code = refuse
+        written.Written.operation = own_functions.object_code = refuse
         own_functions.sources_folder = lambda: Path(sys.argv[1])
         p = four_bar()
         solve_dae(p.system, (0.0, 0.1), p.q0, p.v0, "DOP853", compiled=True)
     """
-    for which in ("first", "second"):  # this process may have its code from a test before
-        run_python(program, tmp_path, which)
+    run_python(program, own_disk)
 
 
 def test_of_code_on_the_disk_the_newest_is_kept(monkeypatch, own_disk):

@@ -255,11 +255,11 @@ def test_mistakes_in_cells_come_through_at_once(runs, measure, words):
 def test_a_worker_that_dies_costs_its_own_run_alone(tmp_path, monkeypatch):
     monkeypatch.setattr(workers, "RENEWED_AFTER", 0)  # processes grow with what they compile: each ends after a run
     out = tmp_path / "rows.parquet"
-    rows = sweep(dying, RUNS[:5], measure=plain, workers=2, out=out, **QUICK)
-    assert rows["status"].tolist() == ["REACHED_END", "ERROR", "ERROR", "REACHED_END", "REACHED_END"]
+    rows = sweep(dying, RUNS[:4], measure=plain, workers=2, out=out, **QUICK)
+    assert rows["status"].tolist() == ["REACHED_END", "ERROR", "ERROR", "REACHED_END"]
     assert rows.loc[1, "message"] == "the worker process ended with exit code 3 in this run"
     assert rows.loc[2, "message"] == "SystemExit: enough"
-    assert rows.loc[[0, 3, 4], "process"].nunique() == 3 and rows.loc[0, "process"] == os.getpid()
+    assert rows.loc[0, "process"] == os.getpid() != rows.loc[3, "process"]
     pd.testing.assert_frame_equal(pd.read_parquet(out), rows, check_dtype=False)
 
 

@@ -86,16 +86,6 @@ def test_constant_steps_have_the_order_asked_for(order):
     assert order - 0.5 < np.log2(errors[0] / errors[1]) < order + 1.0
 
 
-@pytest.mark.parametrize("make", [mechanisms.four_bar, mechanisms.rolling_disc])
-def test_code_compiled_for_a_mechanism_gives_the_same_run(make):
-    problem = make()
-    start = (problem.system, (0.0, problem.reference.t), problem.q0, problem.v0)
-    runs = [solve_dae(*start, Taylor(16), 1e-9, 1e-9, compiled=compiled) for compiled in (False, True)]
-    assert abs(runs[1].stats.n_accepted - runs[0].stats.n_accepted) <= 2  # lengths of steps depend on rounding
-    per_step = [run.stats.n_evaluations / run.stats.n_outer for run in runs]
-    assert abs(per_step[1] - per_step[0]) < 0.5 and np.abs(runs[1].q[:, -1] - runs[0].q[:, -1]).max() < 1e-8
-
-
 @pytest.mark.filterwarnings("ignore::twoloop.ConstraintWarning")
 @pytest.mark.parametrize("name", PROBLEMS)
 def test_steps_by_compiled_code_are_the_same_to_rounding(name):

@@ -278,9 +278,7 @@ BODIES: list[Case] = [
             .problem()
             .with_parameters({"damping of s": -1.0})
         ),
-        r"damping of s \(N m s/rad\) must not be negative; given -1.0",
-        "give zero or more",
-    ),
+    ).says(r"damping of s \(N m s/rad\) must not be negative; given -1.0", "give zero or more"),
     of_problem(
         "a distance that becomes zero",
         lambda: (
@@ -288,16 +286,12 @@ BODIES: list[Case] = [
             .problem()
             .with_parameters({"length of d": 0.0})
         ),
-        r"length of d \(m\) must be positive",
-        "take a revolute joint for points that coincide",
-    ),
+    ).says(r"length of d \(m\) must be positive", "take a revolute joint for points that coincide"),
     of_problem("a length that no longer fits", lambda: rough(1.9).with_parameters({"x of end on ground": 2.5})).says(
         "cannot be assembled", "change other lengths with it"
     ),
     of_problem(
         "another axis of a slide with a limit or a rack",
         lambda: limited().with_parameters({"angle of slide on ground": 0.1}),
-        r"angle of slide on ground \(rad\) cannot change",
-        "make the model anew",
-    ),
+    ).says(r"angle of slide on ground \(rad\) cannot change", "make the model anew"),
 ]

@@ -53,9 +53,7 @@ START = [
         lambda: solve(
             pendulum(constraint=lambda t, q: np.zeros(1), jacobian=lambda t, q: np.zeros((1, 2)), gamma=False)
         ),
-        r"row\(s\) \[0\] of the constraint Jacobian of .* are zero",
-        "leave out the row named",
-    ),
+    ).says(r"row\(s\) \[0\] of the constraint Jacobian of .* are zero", "leave out the row named"),
     of_start("a mass matrix that is not symmetric")
     .when(lambda: solve(pendulum(mass=lambda t, q: np.array([[1.0, 0.5], [0.0, 1.0]]))))
     .says("mass of 'pendulum' must be symmetric.*0.5", "correct the mass matrix"),

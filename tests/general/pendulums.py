@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from tests.compiled import PENDULUM, heavy
+from tests.compiled import PENDULUM, circle_of_length, heavy
 from tests.problems import pendulum
 from twoloop import ConstrainedSystem, callback, solve_dae
 
@@ -10,11 +10,6 @@ from twoloop import ConstrainedSystem, callback, solve_dae
 @callback("force")
 def weight_and_drag(t, q, v, p, Q):
     Q[0], Q[1] = -0.1 * v[0], -0.1 * v[1] - p[0] * p[2]
-
-
-@callback("constraint")
-def circle_of_length(t, q, p, C):
-    C[0] = 0.5 * (q[0] * q[0] + q[1] * q[1] - p[1] * p[1])
 
 
 COMPILED = PENDULUM | {"mass": heavy, "force": weight_and_drag, "constraint": circle_of_length, "constant_mass": False}

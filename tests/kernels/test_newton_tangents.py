@@ -101,9 +101,9 @@ def test_tangents_replace_differences(monkeypatch, banded, reaction):
     monkeypatch.setattr(workspace_module, "banded_pays", lambda *sizes: banded)
     calls = {"differences": {}, "tangents": {}}
     runs = {
-        "differences": solve_dae(spring(calls["differences"]), (0.0, 0.25), *START, NEWTON, step_size=5e-3),
+        "differences": solve_dae(spring(calls["differences"]), (0.0, 0.15), *START, NEWTON, step_size=5e-3),
         "tangents": solve_dae(
-            spring(calls["tangents"], **TANGENTS, **reaction), (0.0, 0.25), *START, NEWTON, step_size=5e-3
+            spring(calls["tangents"], **TANGENTS, **reaction), (0.0, 0.15), *START, NEWTON, step_size=5e-3
         ),
     }
     assert all(run.success for run in runs.values()), [run.message for run in runs.values()]

@@ -1,5 +1,6 @@
 """What is drawn of the ready mechanisms: bars keep their lengths, pins stay, and lines meet where joints are."""
 
+import copy
 import pickle
 
 import numpy as np
@@ -7,6 +8,7 @@ import pytest
 
 from tests.mechanisms.test_ready_mechanisms import EVERY, every
 from twoloop import Drawing, mechanisms
+from twoloop.kernels.compile.callbacks import KINDS
 
 SPRINGS = {"Andrews' squeezing mechanism": 1, "SUNDIALS slider-crank": 1, "A05 governor": 2}
 
@@ -40,8 +42,15 @@ def test_many_states_at_once_are_those_one_by_one(problem):
 
 
 @every
-def test_problems_can_be_sent_to_other_processes(problem):
-    other = pickle.loads(pickle.dumps(problem))
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda problem: pickle.loads(pickle.dumps(problem))])
+def test_problems_can_be_copied_and_sent_to_other_processes(problem, copied):
+    other, t, v = copied(problem), 0.3, problem.v0 + 0.1
+    assert vars(other).keys() == vars(problem).keys() and other.parameters == problem.parameters
+    assert repr(other.system.joints) == repr(problem.system.joints) == repr(other.joints)
+    for kind in set(problem.system.given) - {"kinematics"}:
+        state = {"q": problem.q0, "v": v, "lam": np.ones(problem.system.n_c)}
+        given = [state[name] for name in KINDS[kind].state]
+        np.testing.assert_array_equal(getattr(other.system, kind)(t, *given), getattr(problem.system, kind)(t, *given))
     np.testing.assert_array_equal(other.drawing.at(problem.q0), problem.drawing.at(problem.q0))
     assert other.energy(0.0, other.q0, other.v0) == problem.energy(0.0, problem.q0, problem.v0)
     assert other.system.description.coordinates == problem.coordinates == other.coordinates
