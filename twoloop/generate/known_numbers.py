@@ -134,11 +134,11 @@ class Record(Symbolic):
 
         def product(powers: Powers) -> Any:
             if powers not in products:
-                total = None
-                for place, exponent in powers:
-                    factor = atom(place) if exponent == 1.0 else atom(place) ** exponent
-                    total = factor if total is None else total * factor
-                products[powers] = total
+                *before, (place, exponent) = powers
+                if before:
+                    products[powers] = product(tuple(before)) * product(powers[-1:])
+                else:
+                    products[powers] = atom(place) if exponent == 1.0 else atom(place) ** exponent
             return products[powers]
 
         def atom(place: int) -> Any:
