@@ -60,7 +60,7 @@ class LaneCode:
         self.structure = self._structure()
         self.n_numbers = self.numbers.n_varying
         parts = [equations.there, equations.closer, equations.nearer, equations.redundant]
-        parts += [self.solution.kept] if series else []
+        parts += [self.solution.kept, equations.there] if series else []  # `look` has the latter, too
         counts = [len(each.quantities(equations.graph)) for each in parts]
         counts += [len(self.solution.solved.quantities(self.solution.graph))] if series else []
         self.n_quantities = sum(counts)
