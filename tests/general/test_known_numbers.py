@@ -44,4 +44,4 @@ def test_what_cancels_is_gone():
 def test_parameters_that_do_not_vary_are_plain_numbers():
     record = Record([0.7, 1.9], [1])
     assert type(record.parameters[0]) is float and type(record.parameters[1]) is Known
-    assert record.evaluate([record.parameters[0], 2.0], np.array([[5.0, 6.0]])).tolist() == [[0.7, 2.0]]
+    assert record.evaluate([record.parameters[1]], np.array([[5.0, 6.0]])).tolist() == [[6.0]]

@@ -10,9 +10,9 @@ from numpy.typing import ArrayLike, NDArray
 from twoloop.checks.arguments import Array, check_finite, check_indices
 from twoloop.ensembles.starts import (
     AT_ROUNDING,
-    NEAR,
     Starts,
     all_starts,
+    far_off,
     generic_parameters,
     kit_to_write,
     over_rounding,
@@ -83,8 +83,8 @@ def consistent_states(
             break
     # of others compiled callbacks may go out of the bounds of their arrays, which single calls look at
     traced = np.flatnonzero(fine)
-    off = _off(system, starts.t0, starts.parameters[traced], made_q[traced], made_v[traced])
-    fine[traced] = off <= NEAR * np.finfo(float).eps
+    made = Starts(t, made_q[traced], made_v[traced], starts.parameters[traced])
+    fine[traced] = ~far_off(kit_to_write(system), made)
     for run in np.flatnonzero(~fine).tolist():
         try:
             found = consistent_state(system_of(system, starts, run), t, starts.q[run], starts.v[run], keep=keep)
@@ -92,15 +92,6 @@ def consistent_states(
             raise ValueError(f"guess {run}: {error}") from error
         made_q[run], made_v[run] = found
     return made_q, made_v
-
-
-def _off(system: ConstrainedSystem, t: float, parameters: Array, q: Array, v: Array) -> Array:
-    """What the callbacks say of states: the largest |C| and |C_q v + C_t| over what their terms come to."""
-    from twoloop.kernels.agreement import violation
-
-    room, worst = np.zeros(system.n_c * (system.n_q + 2)), np.zeros(len(q))
-    violation(*kit_to_write(system), t, parameters, q, v, room, worst)
-    return worst
 
 
 def _together(system: ConstrainedSystem, starts: Starts, kept: list[int]) -> tuple[Array, Array, NDArray[np.bool_]]:

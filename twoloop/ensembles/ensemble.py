@@ -11,7 +11,7 @@ from twoloop.checks.arguments import Array, check_positive, check_size, check_sp
 from twoloop.ensembles.in_lanes import LaneRuns, threads_of
 from twoloop.ensembles.lane_methods import IN_LANES, LaneMethod, lane_methods
 from twoloop.ensembles.runs import Runs
-from twoloop.ensembles.starts import NEAR, Starts, all_starts, system_of
+from twoloop.ensembles.starts import Starts, all_starts, far_off, system_of
 from twoloop.generate.tracing import Untraceable
 from twoloop.problem.system import ConstrainedSystem, check_system
 from twoloop.result.result import Result
@@ -157,9 +157,8 @@ def _in_lanes(
     """
     q, v, n_steps = out
     system, starts = lanes.system, lanes.starts
-    for off in lanes.off(which):
-        for run in which[~(off <= NEAR)].tolist():
-            _check_start(system, starts, run)
+    for run in which[far_off(lanes.kit, starts)[which]].tolist():
+        _check_start(system, starts, run)
     within = times[times > starts.t0]
     ends = within if within.size and within[-1] == t1 else np.append(within, t1)
     new_q, new_v = np.full((2, len(which), system.n_q, len(ends)), np.nan)

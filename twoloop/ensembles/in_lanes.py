@@ -9,9 +9,8 @@ from numpy.typing import NDArray
 
 from twoloop.checks.arguments import Array
 from twoloop.ensembles.lane_methods import LaneMethod
-from twoloop.ensembles.starts import Starts, generic_parameters, kit_to_write, over_rounding, system_of
+from twoloop.ensembles.starts import Starts, generic_parameters, kit_to_write, system_of
 from twoloop.generate.choices import Choice
-from twoloop.generate.on_arrays import OnArrays
 from twoloop.generate.time_dependence import may_be_sudden
 from twoloop.problem.system import ConstrainedSystem
 
@@ -42,28 +41,13 @@ class LaneRuns:
     def __init__(self, system: ConstrainedSystem, starts: Starts, method: LaneMethod):
         from twoloop.generate.own_lanes import OwnLanes  # compiled, or read from the cache, at the first ensemble
 
-        self.system, self.starts, self.method = system, starts, method
+        self.system, self.starts, self.method, self.kit = system, starts, method, kit_to_write(system)
         generic, varying = generic_parameters(starts.parameters)
         self.places = PLACES * (OF_SUDDEN if any(may_be_sudden(system, ran_on_symbols=True)) else 1)
         choice = Choice.at(system_of(system, starts, 0), starts.t0, starts.q[0])
         kind = ("lanes", method.series, choice, tuple(varying))  # of which the latest is kept
         make = partial(OwnLanes, system, choice, generic, varying, method.series)
         self.own: OwnLanes = system.remembered_at(kind, generic.tobytes(), make)
-
-    def off(self, which: Integers) -> tuple[Array, Array]:
-        """max|C| and max|C_q v + C_t| of these starts, over what rounding may leave of their terms."""
-        starts, equations = self.starts, self.own.code.equations.equations
-        kinds = [equations.of(kind) for kind in ("constraint", "jacobian", "constraint_rate")]
-        off = np.empty((2, len(which)))
-        for begin in range(0, len(which), LARGEST):
-            rows = which[begin : begin + LARGEST]
-            q, v = starts.q[rows], starts.v[rows]
-            arrays = OnArrays(equations.graph, self.own.record, starts.parameters[rows])
-            C, G, rate = arrays.evaluate(kinds, starts.t0, q, v)
-            faster = np.einsum("rij,rj->ri", G, v) + rate
-            off[0, begin : begin + LARGEST] = over_rounding(C, G, q)
-            off[1, begin : begin + LARGEST] = over_rounding(faster, G, v, rate)
-        return off[0], off[1]
 
     def make(
         self,
@@ -130,7 +114,7 @@ class LaneRuns:
         room, worst = np.zeros(n * (n + 1) + system.n_c * (n + 3)), np.zeros(len(which))
         arrays = self.starts.parameters[which], q, v, ends[:, :n], ends[:, n:]
         chosen = (np.ascontiguousarray(each) for each in arrays)
-        disagreement(*kit_to_write(system), t1, AGREES, atol, *chosen, room, worst)
+        disagreement(*self.kit, t1, AGREES, atol, *chosen, room, worst)
         return ~(worst <= 1.0)
 
 

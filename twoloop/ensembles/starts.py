@@ -72,6 +72,16 @@ def kit_to_write(system: ConstrainedSystem) -> tuple[Any, NDArray[np.int64]]:
     return Kit(own.functions), np.array([system.n_q, system.n_c, int(system.called_in_python)], dtype=np.int64)
 
 
+def far_off(kit: tuple[Any, NDArray[np.int64]], starts: Starts) -> NDArray[np.bool_]:
+    """Of which starts callbacks say that C or C_q v + C_t is more than what rounding of their terms may leave."""
+    from twoloop.kernels.agreement import violation
+
+    functions, sizes = kit
+    room, worst = np.zeros(int(sizes[1] * (sizes[0] + 2))), np.zeros(len(starts.q))
+    violation(functions, sizes, starts.t0, starts.parameters, starts.q, starts.v, room, worst)
+    return ~(worst <= NEAR * np.finfo(float).eps)
+
+
 def generic_parameters(parameters: Array) -> tuple[Array, list[int]]:
     """Parameters between those of some runs, bound by no rule but a linear one of all, and which of them vary."""
     varies = (parameters != parameters[:1]).any(axis=0)
@@ -81,10 +91,9 @@ def generic_parameters(parameters: Array) -> tuple[Array, list[int]]:
     return np.where(varies, weights @ rows / weights.sum(), parameters[0]), np.flatnonzero(varies).tolist()
 
 
-def over_rounding(values: Array, rows: Array, state: Array, rate: Array | float = 0.0) -> Array:
-    """The largest of some values G x + rate, or of constraints, over what rounding of the largest x may leave of it."""
-    largest = np.abs(state).max(axis=-1, keepdims=True, initial=0.0)
-    terms = np.abs(rows).sum(axis=-1) * largest + np.abs(rate)
+def over_rounding(values: Array, rows: Array, state: Array) -> Array:
+    """The largest of some constraints, with rows C_q, over what rounding of the largest coordinate may leave of it."""
+    terms = np.abs(rows).sum(axis=-1) * np.abs(state).max(axis=-1, keepdims=True, initial=0.0)
     with np.errstate(divide="ignore", invalid="ignore"):
         off: Array = np.where(values == 0.0, 0.0, np.abs(values) / (np.finfo(float).eps * terms))
     return off.max(axis=-1, initial=0.0)

@@ -134,11 +134,11 @@ class Record(Symbolic):
 
         def product(powers: Powers) -> Any:
             if powers not in products:
-                total = None
-                for place, exponent in powers:
-                    factor = atom(place) if exponent == 1.0 else atom(place) ** exponent
-                    total = factor if total is None else total * factor
-                products[powers] = total
+                *before, (place, exponent) = powers
+                if before:
+                    products[powers] = product(tuple(before)) * product(powers[-1:])
+                else:
+                    products[powers] = atom(place) if exponent == 1.0 else atom(place) ** exponent
             return products[powers]
 
         def atom(place: int) -> Any:
@@ -154,14 +154,17 @@ class Record(Symbolic):
 
         return product
 
-    def evaluate(self, numbers: Sequence[float], parameters: Array) -> Array:
+    def evaluate(self, numbers: Sequence["Known"], parameters: Array) -> Array:
         """What numbers are for other parameters (n_runs, n_p): (n_runs, len(numbers))."""
-        value = self.on(parameters)
-        made = np.empty((len(parameters), len(numbers)))
+        product = self.products(parameters)
+        places = {powers: k for k, powers in enumerate(dict.fromkeys(each.powers for each in numbers))}
+        products = np.empty((len(places), len(parameters)))
         with np.errstate(all="ignore"):
-            for k, each in enumerate(numbers):
-                made[:, k] = value(each)
-        return made
+            for powers, k in places.items():
+                products[k] = product(powers)
+            scales = np.array([[each.scale] for each in numbers]).reshape(-1, 1)
+            made = scales * products[[places[each.powers] for each in numbers]]
+        return np.ascontiguousarray(made.T)
 
 
 class Known(float):

@@ -5,6 +5,7 @@ runs may have parameters of their own.
 """
 
 import hashlib
+import math
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
@@ -22,6 +23,8 @@ from twoloop.kernels.control.predictor import FLOOR, LEAST, SHARE_OF_MOTION
 from twoloop.kernels.lanes import lane_room as lanes
 from twoloop.problem.system import ConstrainedSystem
 
+GOLDEN = 0.6180339887498949
+MOST_PARTS = 1000.0  # of a step, between places that are looked at
 AT_ONCE = 3  # coordinates whose Horner schemes run side by side: of each three numbers are carried, in 16 registers
 LARGEST = 1500  # operations of a series, which take some seconds to compile
 
@@ -57,7 +60,7 @@ class LaneCode:
         self.structure = self._structure()
         self.n_numbers = self.numbers.n_varying
         parts = [equations.there, equations.closer, equations.nearer, equations.redundant]
-        parts += [self.solution.kept] if series else []
+        parts += [self.solution.kept, equations.there] if series else []  # `look` has the latter, too
         counts = [len(each.quantities(equations.graph)) for each in parts]
         counts += [len(self.solution.solved.quantities(self.solution.graph))] if series else []
         self.n_quantities = sum(counts)
@@ -117,16 +120,16 @@ class LaneCode:
         scales = []
         for j in range(n):
             q, v = (emit.function("fabs", emit.load(at.series, i)) for i in (j, n + j))
-            of_q = emit.divide(one, emit.add(atol[j], emit.multiply(rtol, q)))
-            of_v = emit.divide(one, emit.add(emit.multiply(atol[j], unit), emit.multiply(rtol, v)))
-            scales.append((of_q, of_v))
+            of_q, of_v = (
+                emit.add(atol[j], emit.multiply(rtol, q)),
+                emit.add(emit.multiply(atol[j], unit), emit.multiply(rtol, v)),
+            )
+            scales.append(emit.divide(one, emit.smaller(of_q, emit.divide(of_v, emit.number(order)))))
         for back in (0, 1):
             power = builder.sub(order, integer(back))
-            row, factor = emit.pointer(at.series, builder.mul(power, integer(n))), emit.number(power)
-            largest = emit.constant(0.0)
-            for j, (of_q, of_v) in enumerate(scales):
-                size = emit.function("fabs", emit.load(row, j))
-                largest = emit.larger(emit.multiply(size, emit.larger(of_q, emit.multiply(factor, of_v))), largest)
+            row, largest = emit.pointer(at.series, builder.mul(power, integer(n))), emit.constant(0.0)
+            for j, scale in enumerate(scales):
+                largest = emit.larger(emit.multiply(emit.function("fabs", emit.load(row, j)), scale), largest)
             found.append(largest)
         logarithms = [
             emit.divide(emit.logarithm(value), emit.number(power))
@@ -135,9 +138,13 @@ class LaneCode:
         emit.store(emit.exponential(emit.negative(emit.larger(*logarithms))), room, lanes.LENGTH)
 
     def evaluate(self, emit: LaneEmitter, order: Value, control: Value, room: Value) -> None:
-        """The state and its accelerations by the series, X units of time on, by Horner's scheme."""
-        builder, n, at = emit.builder, self.n, self._at(emit, order, control, room)
-        x, unit, zero = emit.load(room, lanes.X), emit.load(room, lanes.UNIT), emit.constant(0.0)
+        """The state and its accelerations by the series, X units of time on."""
+        self._evaluate(emit, self._at(emit, order, control, room), emit.load(room, lanes.X))
+
+    def _evaluate(self, emit: LaneEmitter, at: "_Places", x: Value) -> None:
+        """The same by Horner's scheme."""
+        builder, n, order = emit.builder, self.n, at.order
+        unit, zero = emit.load(at.room, lanes.UNIT), emit.constant(0.0)
         per_unit = emit.divide(emit.constant(1.0), unit)
         twice = emit.multiply(emit.constant(2.0), emit.multiply(per_unit, per_unit))
         last = emit.pointer(at.series, builder.mul(order, integer(n)))
@@ -156,11 +163,63 @@ class LaneCode:
                 emit.store(emit.multiply(v, per_unit), at.new, n + j)
                 emit.store(emit.multiply(a, twice), at.found, j)
 
-    def judge(self, emit: LaneEmitter, order: Value, control: Value, room: Value) -> None:
-        """The defect of a step, see control/defect.py, and how far its prediction was off, see control/predictor.py."""
+    def look(self, emit: LaneEmitter, order: Value, control: Value, room: Value) -> None:
+        """WORST, the largest defect at places within the step, none further than the gap from the next, or an end.
+
+        SHIFT, multiples of the golden section less their integers, moves the places as far as the gap allows.
+        """
+        builder, at = emit.builder, self._at(emit, order, control, room)
+        h, gap = emit.load(room, lanes.H), emit.splat(builder.load(builder.gep(control, integer(lanes.GAP))))
+        zero, one, two = (emit.constant(x) for x in (0.0, 1.0, 2.0))
+        parts = emit.function("ceil", emit.divide(h, gap))
+        parts = emit.larger(emit.smaller(parts, emit.constant(MOST_PARTS)), one)
+        part = emit.divide(h, parts)
+        shift = emit.add(emit.load(room, lanes.SHIFT), emit.constant(GOLDEN))
+        shift = emit.subtract(shift, builder.select(builder.compare("fcmp oge", shift, one), one, zero))
+        emit.store(shift, room, lanes.SHIFT)
+        moved = emit.multiply(
+            emit.subtract(emit.multiply(two, shift), one), emit.larger(emit.subtract(gap, part), zero)
+        )
+        with emit.loop(integer(1), emit.largest_whole(parts), [zero]) as (place, (worst,), new):
+            number = emit.number(place)
+            looks = builder.compare("fcmp olt", number, parts)
+            x = builder.select(looks, emit.add(emit.multiply(number, part), moved), zero)
+            emit.store(emit.add(emit.load(room, lanes.T), x), room, lanes.AHEAD)
+            self._evaluate(emit, at, emit.divide(x, emit.load(room, lanes.UNIT)))
+            holds, a = self._there(emit, room, at)
+            defect = builder.select(holds, self._defect(emit, control, at, a), emit.constant(math.inf))
+            new.append(emit.largest_of(builder.select(looks, defect, zero), worst))
+        emit.store(new[0], room, lanes.WORST)
+
+    def defect(self, emit: LaneEmitter, order: Value, control: Value, room: Value) -> None:
+        """The defect of a step at its end."""
+        at = self._at(emit, order, control, room)
+        a = [emit.load(at.a, j) for j in range(self.n)]
+        emit.store(self._defect(emit, control, at, a), room, lanes.DEFECT)
+
+    def _defect(self, emit: LaneEmitter, control: Value, at: "_Places", a: list[Value]) -> Value:
+        """How far accelerations by the series are from those at NEW, over the tolerances, see control/defect.py."""
+        n, (rtol, atol) = self.n, self._tolerances(emit, control)
+        steps, h = emit.number(at.order), emit.load(at.room, lanes.H)
+        share, per_share = emit.divide(h, steps), emit.divide(steps, h)  # infinite where h is 0: of q nothing is asked
+        largest = worst = emit.constant(0.0)
+        for each in a:
+            largest = emit.larger(emit.function("fabs", each), largest)
+        floor = emit.multiply(emit.constant(ROUNDING), largest)
+        for j, each in enumerate(a):
+            defect = emit.function("fabs", emit.subtract(emit.load(at.found, j), each))
+            of_q, of_v = (
+                emit.add(atol[j], emit.multiply(rtol, emit.function("fabs", emit.load(at.new, place))))
+                for place in (j, n + j)
+            )
+            allowed = emit.smallest_of(of_v, emit.multiply(of_q, per_share))
+            worst = emit.largest_of(emit.divide(emit.subtract(defect, floor), allowed), worst)
+        return emit.multiply(share, worst)
+
+    def departure(self, emit: LaneEmitter, order: Value, control: Value, room: Value) -> None:
+        """How far the prediction of a step was off, see control/predictor.py."""
         n, at, (rtol, atol) = self.n, self._at(emit, order, control, room), self._tolerances(emit, control)
         h = emit.load(room, lanes.H)
-        share = emit.divide(h, emit.number(order))
 
         def size(base: Value, place: int) -> Value:
             return emit.function("fabs", emit.load(base, place))
@@ -168,25 +227,16 @@ class LaneCode:
         def apart(one: Value, other: Value, place: int) -> Value:
             return emit.function("fabs", emit.subtract(emit.load(one, place), emit.load(other, place)))
 
-        largest = motion = worst = off = emit.constant(0.0)
+        motion = off = emit.constant(0.0)
         for j in range(n):
-            largest = emit.larger(size(at.a, j), largest)
             way = emit.larger(emit.multiply(h, size(at.state, n + j)), apart(at.new, at.state, j))
             motion = emit.larger(way, motion)
-        floor = emit.multiply(emit.constant(ROUNDING), largest)
         motion = emit.multiply(emit.constant(SHARE_OF_MOTION), motion)
         for j in range(n):
-            defect = apart(at.found, at.a, j)
-            defect = emit.multiply(share, emit.subtract(defect, floor))
-            of_q = emit.add(atol[j], emit.multiply(rtol, size(at.new, j)))
-            of_v = emit.add(atol[j], emit.multiply(rtol, size(at.new, n + j)))
-            worst = emit.largest_of(emit.divide(defect, of_v), worst)
-            worst = emit.largest_of(emit.divide(emit.multiply(defect, share), of_q), worst)
-            scale = emit.larger(of_q, emit.add(atol[j], emit.multiply(rtol, size(at.state, j))))
+            scale = emit.add(atol[j], emit.multiply(rtol, emit.larger(size(at.new, j), size(at.state, j))))
             allowed = emit.add(motion, emit.multiply(emit.constant(FLOOR), scale))
             allowed = emit.larger(emit.smaller(scale, allowed), emit.constant(LEAST))
             off = emit.largest_of(emit.divide(apart(at.predicted, at.new, j), allowed), off)
-        emit.store(worst, room, lanes.DEFECT)
         emit.store(off, room, lanes.OFF)
 
     def take(self, emit: LaneEmitter, order: Value, control: Value, room: Value) -> None:
@@ -210,7 +260,7 @@ class LaneCode:
         following = emit.builder.add(order, integer(1))
         scratch = emit.pointer(begin, emit.builder.mul(following, integer(self.n)))
         state, new, predicted, found, a, lam = (emit.pointer(room, place) for place in fixed)
-        return _Places(state, new, predicted, found, a, lam, begin, scratch)
+        return _Places(order, room, state, new, predicted, found, a, lam, begin, scratch)
 
     def closer(self, emit: LaneEmitter, order: Value, control: Value, room: Value) -> None:
         """Move positions of lanes that FINE names towards the constraints."""
@@ -239,11 +289,16 @@ class LaneCode:
 
     def there(self, emit: LaneEmitter, order: Value, control: Value, room: Value) -> None:
         """Accelerations at a state as it stands."""
-        at, outputs = self._at(emit, order, control, room), self.equations.there
-        written, (a,) = results_of(emit, self.equations.graph, outputs, self._new(emit, room, at), self.numbers)
+        at = self._at(emit, order, control, room)
+        holds, a = self._there(emit, room, at)
         for k, value in enumerate(a):
             emit.store(value, at.a, k)
-        _keep_fine(emit, room, conditions_hold(emit, written, outputs, a))
+        _keep_fine(emit, room, holds)
+
+    def _there(self, emit: LaneEmitter, room: Value, at: "_Places") -> tuple[Value, list[Value]]:
+        outputs = self.equations.there
+        written, (a,) = results_of(emit, self.equations.graph, outputs, self._new(emit, room, at), self.numbers)
+        return conditions_hold(emit, written, outputs, a), a
 
     def redundant(self, emit: LaneEmitter, order: Value, control: Value, room: Value) -> None:
         """Whether the rows that do not count hold, too."""
@@ -256,8 +311,10 @@ class LaneCode:
 
 
 class _Places(NamedTuple):
-    """Pointers to what stands in `room`, see kernels/lanes/lane_room.py."""
+    """The order, and pointers to `room` and to what stands there, see kernels/lanes/lane_room.py."""
 
+    order: Value
+    room: Value
     state: Value
     new: Value
     predicted: Value

@@ -72,6 +72,11 @@ class LaneEmitter(Emitter):
         """The smaller of two numbers."""
         return self.builder.select(self.builder.compare("fcmp olt", a, b), a, b)
 
+    def largest_whole(self, x: Value) -> Value:
+        """The largest number of all lanes, which is whole, as an integer."""
+        largest = self.builder.call(f"llvm.vector.reduce.fmax.{self.suffix}", DOUBLE, [x])
+        return self.builder.convert("fptosi", largest, INTEGER)
+
     def logarithm(self, x: Value) -> Value:
         """log2 x to a hundredth of a per cent of 1, of what is not negative, as if none were below SMALLEST."""
         builder = self.builder
@@ -97,6 +102,10 @@ class LaneEmitter(Emitter):
         for coefficient in coefficients[1:]:
             total = self.fused(total, x, self.constant(coefficient))
         return total
+
+    def smallest_of(self, a: Value, b: Value) -> Value:
+        """The smaller of two numbers; the first where one is NaN, which stays."""
+        return self.builder.select(self.builder.compare("fcmp ult", a, b), a, b)
 
     def largest_of(self, a: Value, b: Value) -> Value:
         """The larger of two numbers; the first where it is NaN, which stays."""

@@ -24,9 +24,10 @@ from twoloop.kernels.evaluation.operations import (
     SINE,
     SQUARE_ROOT,
 )
+from twoloop.kernels.lanes.lane_room import LANES
 
 ZEROS = -1  # the row before that of order 0
-AT_ONCE = 6  # sums in one loop: with more, what is carried does not stay in 16 registers
+AT_ONCE = 12 if LANES == 8 else 6  # sums in one loop: with more, what is carried does not stay in 32, or 16, registers
 
 
 class Operation(NamedTuple):
@@ -126,15 +127,15 @@ class LaneSeries:
         kind, results, first, second = operation
         if results[0] in self._carried:
             return []
-        own = [self._slot(((result, 1.0),), 0.0) for result in results]
         if kind in (PRODUCT, PENDING):
             return [(self._slot(*first), self._slot(*second))]
+        if kind in (LOGARITHM, ARCTANGENT):
+            return [(self._slot("scaled", ((results[0], 1.0),), 0.0), self._slot(*second))]
+        own = [self._slot(((result, 1.0),), 0.0) for result in results]
         if kind == RECIPROCAL:
             return [(self._slot(*first), own[0])]
         if kind == SQUARE_ROOT:
             return [(own[0], own[0])]
-        if kind in (LOGARITHM, ARCTANGENT):
-            return [(self._slot("scaled", ((results[0], 1.0),), 0.0), self._slot(*second))]
         x = self._slot("scaled", *first)
         return [(x, own[1]), (x, own[0])] if kind == SINE else [(x, own[0])]
 

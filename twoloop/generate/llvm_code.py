@@ -29,7 +29,7 @@ ZERO, ONE = constant(DOUBLE, 0.0), constant(DOUBLE, 1.0)
 ALIGNMENT = 64  # bytes, of a line of the cache, in two of which no vector lies
 SLACK = ALIGNMENT // 8  # doubles that are lost where vectors begin at the next such place
 # functions of LLVM; others are those of libm
-INTRINSICS = {name: f"llvm.{name}" for name in ("sin", "cos", "exp", "log", "sqrt", "rint", "fabs")}
+INTRINSICS = {name: f"llvm.{name}" for name in ("sin", "cos", "exp", "log", "sqrt", "rint", "ceil", "fabs")}
 
 
 class Emitter:

@@ -134,7 +134,7 @@ def end_steps(code, settings, control, room, predicted_v):
     project_lanes(code, order, control, room, n, new)
     if settings[CHECKS_REDUNDANT] == 1:
         code.redundant(order, control, room)
-    code.judge(order, control, room)
+    code.departure(order, control, room)
     for i in range(n * LANES):
         room[predicted_v * LANES + i] -= room[(new + n) * LANES + i]
     for j in range(n):

@@ -42,23 +42,26 @@ LANES = 8 if has_wide_vectors() else 4  # runs side by side: of two vectors each
     H_LIMIT,  # of steps, after one that failed ...
     LIMIT_AGE,  # ... so many steps ago
     ROUGH_TO,  # where the last step ended that was refused for a sudden error
+    SHIFT,  # by which places within a step are moved
     PAST,  # of controller.py, of one lane after the other
     _MORE_PAST,
     N_FIELDS,
-) = range(31)
+) = range(32)
 # functions made for a mechanism, (order, control, room), on what lies in `room`
 TASKS = (
     "closer",  # positions of NEW, at AHEAD, moved towards the constraints, by MOVED
     "nearer",  # the same and velocities, and A and LAM there
     "there",  # A at NEW as it stands
     "redundant",  # whether rows that do not count hold at NEW
-    "judge",  # DEFECT and OFF: of a step H from STATE by PREDICTED to NEW
+    "departure",  # OFF: of a step H from STATE by PREDICTED to NEW
     "take",  # NEW becomes STATE where ACCEPTED
 )
 TASKS_OF_SERIES = (
     "series",  # coefficients about STATE at T, in units of time UNIT
     "lengths",  # LENGTH of the step at which the last two terms are within the tolerances, in units
+    "look",  # WORST: the largest defect within a step H
     "evaluate",  # NEW and FOUND: the state and its accelerations by the series, X units of time on
+    "defect",  # DEFECT: of A at NEW, the end of a step H
 )
 CODE = Reference("LaneKit", {})
 CODE.add_own_functions(dict.fromkeys((*TASKS, *TASKS_OF_SERIES), types.none(types.int64, VECTOR, VECTOR)))

@@ -11,7 +11,6 @@ from twoloop.kernels.lanes.lane_room import (
     DEFECT,
     FINE,
     FRESH,
-    GAP,
     LANES,
     LENGTH,
     LONGEST,
@@ -21,12 +20,12 @@ from twoloop.kernels.lanes.lane_room import (
     ORDER,
     REFUSED,
     RUNNING,
+    SHIFT,
     SHORTEST,
     STEP,
     T0,
     T1,
     UNIT,
-    WHICH,
     WORST,
     H,
     N,
@@ -41,8 +40,6 @@ ALLOWED = 0.3  # as in taylor_step.py
 MOST_SHORTENED, GROWTH = 0.1, 5.0
 MOST_REFUSED = 10  # one after another
 FIRST_UNIT = 0.01  # of the span
-MOST_PLACES = 1000  # within a step
-GOLDEN = 0.6180339887498949
 
 
 @compiled
@@ -51,7 +48,7 @@ def _begin(room, control):
     for k in range(LANES):
         if room[FRESH * LANES + k] == 1.0:
             room[UNIT * LANES + k] = FIRST_UNIT * (control[T1] - control[T0])
-            room[LONGEST * LANES + k] = np.inf
+            room[LONGEST * LANES + k], room[SHIFT * LANES + k] = np.inf, 0.0
         elif room[ACCEPTED * LANES + k] == 1.0:
             h = room[H * LANES + k]
             room[UNIT * LANES + k] = min(room[LENGTH * LANES + k] * room[UNIT * LANES + k], GROWTH * h)
@@ -59,10 +56,10 @@ def _begin(room, control):
 
 @compiled
 def _choose_steps(room, control, status):
-    """The step of each lane; how many places are to be looked at within the longest."""
-    n_places, t1 = 0, control[T1]
+    """The step of each lane."""
+    t1 = control[T1]
     for k in range(LANES):
-        room[H * LANES + k] = room[WORST * LANES + k] = 0.0
+        room[H * LANES + k] = 0.0
         if room[RUNNING * LANES + k] == 1.0:
             unit, t = room[UNIT * LANES + k], room[T * LANES + k]
             h = min(room[LENGTH * LANES + k] * unit, room[LONGEST * LANES + k])
@@ -72,32 +69,6 @@ def _choose_steps(room, control, status):
             if not (room[FINE * LANES + k] == 1.0 and h > SHORTEST * max(abs(t), abs(t1))):
                 leave(room, status, k)
                 room[H * LANES + k] = 0.0
-            elif h > control[GAP]:
-                n_places = max(n_places, int(min(np.ceil(h / control[GAP]), MOST_PLACES)))
-    return n_places
-
-
-@compiled
-def _look_within(code, order, control, room, n_places, n_steps):
-    """WORST: the largest defect of each lane at places that lie no further apart than the gap."""
-    for place in range(n_places):
-        for k in range(LANES):
-            h, share = room[H * LANES + k], 0.0
-            if h > control[GAP]:
-                own = min(np.ceil(h / control[GAP]), MOST_PLACES)
-                shift = GOLDEN * (n_steps[int(room[WHICH * LANES + k])] + room[REFUSED * LANES + k])
-                if place < own:  # less its integer, by floor: fmod would take longer than all else here
-                    share = (place + shift - np.floor(shift)) / own
-            room[X * LANES + k] = share * h / room[UNIT * LANES + k]
-            room[AHEAD * LANES + k] = room[T * LANES + k] + share * h
-            room[FINE * LANES + k] = 1.0
-        code.evaluate(order, control, room)
-        code.there(order, control, room)
-        code.judge(order, control, room)
-        for k in range(LANES):
-            if room[X * LANES + k] > 0.0:
-                defect = room[DEFECT * LANES + k] if room[FINE * LANES + k] == 1.0 else np.inf
-                room[WORST * LANES + k] = max(room[WORST * LANES + k], defect)
 
 
 @compiled
@@ -115,7 +86,8 @@ def _make_steps(code, order, control, room, n, n_rows, n_numbers, checks_redunda
     project_lanes(code, order, control, room, n, new)
     if checks_redundant == 1:
         code.redundant(order, control, room)
-    code.judge(order, control, room)
+    code.departure(order, control, room)
+    code.defect(order, control, room)
     for k in range(LANES):
         room[ACCEPTED * LANES + k] = 0.0
         if room[RUNNING * LANES + k] == 0.0:
@@ -153,7 +125,6 @@ def step_by_series(code, settings, control, options, room, status, n_steps, with
     fill_field(room, FINE, 1.0)
     code.series(order, control, room)
     code.lengths(order, control, room)
-    n_places = _choose_steps(room, control, status)
-    if n_places > 0:
-        _look_within(code, order, control, room, n_places, n_steps)
+    _choose_steps(room, control, status)
+    code.look(order, control, room)
     _make_steps(code, order, control, room, n, n_rows, n_numbers, settings[CHECKS_REDUNDANT], status)
