@@ -242,6 +242,7 @@ class SpatialModel(Wheels):
         return euler_rates(state[3:], spin)
 
     def _check_branches(self, t: float, q: Array) -> None:
+        super()._check_branches(t, q)
         for joint in self.joints:
             row = joint.rows[0]
             if row.kind != TURN or row.motion is None:
