@@ -43,6 +43,12 @@ def geared(ratio):
     return lambda: model.gear("pin a", "pin b", ratio=ratio)
 
 
+def rubs_in_space():
+    model = SpatialModel()
+    ball = model.sphere("ball", 0.1, mass=1.0, position=(0.0, 0.0, 1.0))
+    model.stop(ball, (0.0, 0.0, 0.9), "ground", (0.0, 0.0, 0.0), normal=(0.0, 0.0, 1.0), friction=0.3)
+
+
 def rubbed(*joints, drive=None, **friction):
     """Of a four-bar with friction in some joints, A, B, C and D."""
     model, points = PlanarModel(name="linkage"), [(0.0, 0.0), (0.0, 1.0), (2.0, 1.5), (2.5, 0.0)]
@@ -95,6 +101,14 @@ IMPACTS = [
     of_step("`compiled=True`")
     .when(lambda: Integrator(LINKAGE.system, compiled=True).start(0.0, LINKAGE.q0, LINKAGE.v0))
     .says("start takes no compiled", "leave it out"),
+    of_model("friction of a stop in space", rubs_in_space).says(
+        "must be zero, as stops rub in the plane only", "leave it out, or make the model in a plane"
+    ),
+    of_stops("friction without a slide", lambda: Stop(lambda t, q: q[0], friction=0.3)).says(
+        "slide of 'stop' must be a function of t and q, as it rubs",
+        "say how far the point is along the surface",
+        TypeError,
+    ),
     of_model("a gear of one hinge", wheels(lambda model: model.gear("pin 0", "pin 0", ratio=1.0))).says(
         "a gear needs two joints", "name both"
     ),
