@@ -18,7 +18,7 @@ from shapes import Shape, ball, bar, box, circle, face, rectangle, seen, tube
 
 from twoloop import consistent_state
 from twoloop.bodies import PlanarModel, SpatialModel
-from twoloop.mechanisms.rotation import euler_rates, rotation_matrix
+from twoloop.bodies.rotation import euler_rates, rotation_matrix
 
 Array = NDArray[np.float64]
 

@@ -3,8 +3,8 @@
 import numpy as np
 from scipy.linalg import lstsq
 
+from twoloop.bodies import SpatialModel
 from twoloop.mechanisms.planar import GROUND, PlanarBodies
-from twoloop.mechanisms.spatial_bodies import SpatialBodies
 from twoloop.methods.dop853 import DOP853
 from twoloop.run.run import Run
 
@@ -62,6 +62,9 @@ class Assembly(_Random):
         c, s = np.cos(angle), np.sin(angle)
         return float(c * x + s * y), float(c * y - s * x)
 
+    def system(self, name):
+        return self.bodies.system(name)
+
     @property
     def q(self):
         return self.places.ravel()
@@ -76,19 +79,22 @@ class SpatialAssembly(_Random):
 
     def __init__(self, seed, n, loops=0, doubles=0, springs=()):
         rng = self.rng = np.random.default_rng(seed)
-        self.places, self.bodies, self.pairs = (
-            rng.normal(size=(n, 3)) * np.cbrt(n),
-            SpatialBodies((0.0, 0.0, -9.81)),
-            [],
-        )
+        self.places, self.model, self.pairs = rng.normal(size=(n, 3)) * np.cbrt(n), SpatialModel(), []
         for k, place in enumerate(self.places):
             R, _ = np.linalg.qr(rng.normal(size=(3, 3)))
             mass = 2.0 ** rng.uniform(-0.5, 0.5)
-            self.bodies.body(f"body {k}", mass, tuple(mass * rng.uniform(0.15, 0.27, 3)), place, R * np.linalg.det(R))
+            moments = tuple(mass * rng.uniform(0.15, 0.27, 3))
+            self.model.body(f"body {k}", mass=mass, inertia=moments, position=place, rotation=R * np.linalg.det(R))
         tree = self.connect(n, loops, doubles)
         for i, j in tree if springs else ():
             one, other = self.near(i), rng.normal(size=3) if j == GROUND else self.near(j)
-            self.bodies.spring(i, one, j, other, *springs, 1.1 * float(np.linalg.norm(one - other)))
+            given = dict(zip(("stiffness", "damping"), springs, strict=True))
+            self.model.spring(
+                self.body(i), one, self.body(j), other, length=1.1 * float(np.linalg.norm(one - other)), **given
+            )
+
+    def body(self, k):
+        return self.model.ground if k == GROUND else self.model.bodies[k]
 
     def near(self, k):
         """A random place near a body."""
@@ -100,17 +106,20 @@ class SpatialAssembly(_Random):
         at, a, b = self.near(i), *np.linalg.qr(self.rng.normal(size=(3, 2)))[0].T
         first, second = (i, j) if self.rng.integers(2) else (j, i)
         kind = self.rng.choice(["spherical", "revolute", "universal", "prismatic"])
-        axes = {"spherical": (), "universal": (a, b)}.get(kind, (a,))
-        getattr(self.bodies, kind)(first, second, at, *axes)
+        axes = {"spherical": {}, "universal": {"axes": (a, b)}}.get(kind, {"axis": a})
+        getattr(self.model, kind)(self.body(first), self.body(second), at=at, **axes)
 
     def close(self, i, j):
         """A ball that closes a loop, or is one more on two bodies."""
         self.pairs.append((i, j))
-        self.bodies.spherical(i, j, self.near(i))
+        self.model.spherical(self.body(i), self.body(j), at=self.near(i))
+
+    def system(self, name):
+        return self.model.problem(name=name).system
 
     @property
     def q(self):
-        return self.bodies.start[0]
+        return self.model.problem().q0
 
 
 def dense_solution(system, q, v):
@@ -141,13 +150,15 @@ def started_run(system, q):
 
 def spatial_chain(n, hinges=False):
     """Bars in space, one hung on another by hinges, or by balls and hinges in turn."""
-    bodies, at, before = SpatialBodies((0.0, 0.0, -9.81)), np.zeros(3), GROUND
+    model, at = SpatialModel(name="spatial chain"), np.zeros(3)
+    before = model.ground
     for k in range(n):
         along = np.array([0.3, 0.1 * np.sin(k), -0.15])
-        body = bodies.body(f"body {k}", 1.0, (0.01, 0.02, 0.025), at + along / 2, np.eye(3))
+        body = model.body(f"body {k}", mass=1.0, inertia=(0.01, 0.02, 0.025), position=at + along / 2)
         if k % 2 and not hinges:
-            bodies.spherical(before, body, at)
+            model.spherical(before, body, at=at)
         else:
-            bodies.revolute(before, body, at, (0.1 * np.cos(k), 1.0, 0.2 * np.sin(k) + 0.1))
+            model.revolute(before, body, at=at, axis=(0.1 * np.cos(k), 1.0, 0.2 * np.sin(k) + 0.1))
         before, at = body, at + along
-    return bodies.system("spatial chain"), *bodies.start
+    problem = model.problem()
+    return problem.system, problem.q0, problem.v0

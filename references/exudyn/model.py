@@ -9,7 +9,7 @@ from exudyn import itemInterface as items
 from numpy.typing import ArrayLike
 
 from references.exudyn.run import add_sensors
-from twoloop.mechanisms.rotation import rotation_matrix
+from twoloop.bodies.rotation import rotation_matrix
 from twoloop.problem.problem import Array, Problem
 
 GROUND = -1

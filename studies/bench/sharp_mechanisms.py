@@ -18,7 +18,9 @@ from studies.bench.sharp_callbacks import GRAVITY
 from studies.bench.sharp_forces import Sharp, drive, force_along
 from studies.bench.store import Array
 from twoloop import ConstrainedSystem
-from twoloop.mechanisms import four_bar, spatial, spatial_slider_crank
+from twoloop.bodies import spatial_callbacks
+from twoloop.bodies.parameter_layout import HEAD
+from twoloop.mechanisms import four_bar, spatial_slider_crank
 
 TINY = 1e-30  # imaginary step: derivatives without differences
 
@@ -172,10 +174,10 @@ def slider_crank(sharp: Sharp, crank: float, rod: float, masses: Array, angle: f
     )
 
 
-def under_force(system: ConstrainedSystem, force: Any, own: Array, **more: Any) -> ConstrainedSystem:
-    """A ready system with another force, whose parameters come after its own."""
+def under_force(system: ConstrainedSystem, force: Any, parameters: Array, **more: Any) -> ConstrainedSystem:
+    """A ready system with another force, and its parameters with those of this."""
     about: dict[str, Any] = {"n_q": system.n_q, "n_c": system.n_c, "name": system.name}
-    return ConstrainedSystem(force=force, parameters=np.append(system.parameters, own), **about, **more)
+    return ConstrainedSystem(force=force, parameters=parameters, **about, **more)
 
 
 def bars(sharp: Sharp) -> Mechanism:
@@ -184,7 +186,8 @@ def bars(sharp: Sharp) -> Mechanism:
     q0, v0 = problem.q0, problem.v0
     own = sharp.on(5.0, float(q0[2]), 1.0, 1.0)
     rows = {name: getattr(linkage, name) for name in ("mass", "constraint", "jacobian", "gamma", "kinematics")}
-    system = under_force(problem.system, callbacks.four_bar_force, own, constant_mass=True, **rows)
+    parameters = np.append(problem.system.parameters, own)
+    system = under_force(problem.system, callbacks.four_bar_force, parameters, constant_mass=True, **rows)
     motion = MinimalFourBar.from_parameters(problem.parameters)
 
     def rate(t: float, y: Array) -> Array:
@@ -201,8 +204,10 @@ def slider_in_space(sharp: Sharp) -> Mechanism:
     problem = spatial_slider_crank()
     q0, known = problem.q0, problem.parameters
     own = sharp.on(10.0, float(q0[14]), 0.1, 0.5)
-    rows = {name: getattr(spatial, name) for name in ("mass", "constraint", "jacobian", "gamma")}
-    system = under_force(problem.system, callbacks.slider_force, own, **rows)
+    rows = {name: getattr(spatial_callbacks, name) for name in ("mass", "constraint", "jacobian", "gamma")}
+    given = problem.system.parameters
+    parameters = np.concatenate([given[:-HEAD], own, given[-HEAD:]])  # a model's parameters end with its head
+    system = under_force(problem.system, callbacks.slider_force, parameters, **rows)
     r, rod, (_, y_A, z_A) = known["crank"], known["rod"], known["A"]
     crank_mass, rod_mass, slider_mass = (known["masses"][name] for name in ("crank", "rod", "slider"))
     J = np.array(known["inertias"]["rod"])

@@ -14,7 +14,7 @@ from studies.bench.closed_loops import squeezer
 from tests.bodies.runs import moved
 from twoloop import mechanisms
 from twoloop.bodies import PlanarModel, SpatialModel
-from twoloop.mechanisms.rotation import rotation_matrix
+from twoloop.bodies.rotation import rotation_matrix
 from twoloop.mechanisms.spatial_four_bar import inertia as round_bar
 
 pytestmark = pytest.mark.filterwarnings("ignore::twoloop.ConstraintWarning")

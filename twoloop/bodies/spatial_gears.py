@@ -11,10 +11,10 @@ import numpy as np
 from twoloop.bodies.gears import Gears, Row
 from twoloop.bodies.parts import Body, ModelJoint
 from twoloop.bodies.places import placed, turned
+from twoloop.bodies.rotation import euler_parameters
 from twoloop.bodies.row_function import RowFunction
 from twoloop.bodies.spatial_rows import relative
 from twoloop.checks.arguments import Array
-from twoloop.mechanisms.rotation import euler_parameters
 
 MOST_TEETH = 1000
 EXACT = 4.0 * np.finfo(np.float64).eps  # relative difference of a ratio and its fraction
