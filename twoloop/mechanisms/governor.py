@@ -1,6 +1,7 @@
 """IFToMM's A05, Watt's flyball governor whose coupler rods are stiff spring-dampers."""
 
 import math
+from typing import Any
 
 import numpy as np
 
@@ -34,7 +35,7 @@ def governor() -> Problem:
     model, turning = SpatialModel(-GRAVITY * z, name="A05 governor"), {"angular_velocity": spin}
     bar, cube = DENSITY * LENGTH * WIDTH**2, DENSITY * CUBE**3
     moments = box(bar, WIDTH, WIDTH, LENGTH), box(cube, CUBE, CUBE, CUBE)
-    still = {"velocity": (0.0, 0.0, 0.0), **turning}
+    still: dict[str, Any] = {"velocity": (0.0, 0.0, 0.0), **turning}
     model.body("shaft", mass=bar, inertia=moments[0], position=0.5 * LENGTH * z, **still)
     model.body("slider", mass=cube, inertia=moments[1], position=HEIGHT * z, **still)
     model.revolute("shaft", "ground", at=(0.0, 0.0, 0.0), axis=z)
