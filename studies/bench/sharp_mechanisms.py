@@ -132,15 +132,15 @@ def turning(
     system: ConstrainedSystem,
     start: tuple[Array, Array],
     y0: tuple[float, float],
-    sharp: Sharp,
+    sharp: tuple[Sharp, Array],
     energies: Callable[[Any], tuple[Any, Any, Any]],
     positions: Callable[[float, Array], Array],
 ) -> Mechanism:
-    """A mechanism with one freedom, the angle s, by Lagrange's equation.
+    """A mechanism with one freedom, the angle s, by Lagrange's equation, under a force given with its numbers here.
 
     energies(s) -> inertia, potential and the coordinate along which the force acts, for complex s, too.
     """
-    p = system.parameters
+    force, p = sharp
 
     def rate(t: float, y: Array) -> Array:
         inertia, potential, x = energies(complex(y[0], TINY))
@@ -149,7 +149,7 @@ def turning(
         bend = 0.5 * inertia.imag / TINY * y[1] ** 2
         return np.array([y[1], (push * slope - potential.imag / TINY - bend) / inertia.real])
 
-    return Mechanism(name, system, *start, sharp, np.array(y0), rate, positions)
+    return Mechanism(name, system, *start, force, np.array(y0), rate, positions)
 
 
 def slider_crank(sharp: Sharp, crank: float, rod: float, masses: Array, angle: float, speed: float) -> Mechanism:
@@ -170,7 +170,7 @@ def slider_crank(sharp: Sharp, crank: float, rod: float, masses: Array, angle: f
     slope = energies(complex(angle, TINY))[2].imag / TINY
     v0 = speed * np.array([-crank * np.sin(angle), crank * np.cos(angle), slope])
     return turning(
-        system.name, system, (positions(0.0, np.array([angle])), v0), (angle, speed), sharp, energies, positions
+        system.name, system, (positions(0.0, np.array([angle])), v0), (angle, speed), (sharp, p), energies, positions
     )
 
 
@@ -246,7 +246,7 @@ def slider_in_space(sharp: Sharp) -> Mechanism:
         return q
 
     rate0 = 6.0  # rad/s, of the benchmark
-    return turning("spatial slider-crank", system, (q0, problem.v0), (0.0, rate0), sharp, energies, positions)
+    return turning("spatial slider-crank", system, (q0, problem.v0), (0.0, rate0), (sharp, own), energies, positions)
 
 
 KINDS = ("1", "2", "3", "row", "slider")
