@@ -18,7 +18,7 @@ from shapes import Shape, ball, bar, box, circle, face, rectangle, seen, tube
 
 from twoloop import consistent_state
 from twoloop.bodies import PlanarModel, SpatialModel
-from twoloop.mechanisms.rotation import euler_rates, rotation_matrix
+from twoloop.bodies.rotation import euler_rates, rotation_matrix
 
 Array = NDArray[np.float64]
 
@@ -212,6 +212,32 @@ SPATIAL = (
         {"ground": tube((0, 0, -0.4), (0, 0, 0.0), 0.15), "b": box((0.95, 0.0, 0.3), (0.5, 0.3, 0.3))},
         ({"b": (-0.15, 0.0, 0.35, 0.0, 0.0, 0.0)}, {"b": (0.0, 0.45, 0.0, 0.0, 0.0, 0.0)}),
         (("ground", (0.0, 0.0, 0.0), "b", (0.7, 0.0, 0.3)),),
+    ),
+    Kind(
+        "Gear",
+        "Two hinges that turn in a ratio of whole numbers; their axes may have any direction.",
+        'model.revolute("ground", "a", at=(0.0, 0.0, 0.0), axis=(0.0, 0.0, 1.0), name="one")\n'
+        'model.revolute("ground", "b", at=(0.6, 0.0, 0.3), axis=(1.0, 0.0, 0.0), name="other")\n'
+        'model.gear("one", "other", ratio=2 / 1)',
+        {
+            "a": [*tube((0, 0, -0.05), (0, 0, 0.05), 0.6, 36), *box((0.25, 0, 0.08), (0.5, 0.06, 0.06))],
+            "b": [*tube((0.55, 0, 0.3), (0.65, 0, 0.3), 0.3, 24), *box((0.7, 0, 0.42), (0.06, 0.06, 0.24))],
+        },
+        ({"a": (0.0, 0.0, 0.0, 0.0, 0.0, 0.3), "b": (0.0, 0.0, 0.0, 0.6, 0.0, 0.0, 0.6, 0.0, 0.3)},),
+        only_forth=True,
+    ),
+    Kind(
+        "Rack",
+        "A pinion on a rack: a hinge and a slide that move together.",
+        'model.revolute("ground", "a", at=(0.0, 0.0, 0.3), axis=(0.0, 1.0, 0.0), name="pinion")\n'
+        'model.prismatic("ground", "b", at=(0.0, 0.0, 0.0), axis=(1.0, 0.0, 0.0), name="slide")\n'
+        'model.rack("pinion", "slide", radius=-0.3)',
+        {
+            "a": [*tube((0, -0.05, 0.3), (0, 0.05, 0.3), 0.3, 24), *box((0.1, -0.07, 0.3), (0.2, 0.04, 0.05))],
+            "b": box((0.0, 0.0, -0.06), (1.8, 0.2, 0.12)),
+        },
+        ({"a": (0.0, 0.0, 0.0, 0.0, -0.9, 0.0, 0.0, 0.0, 0.3), "b": (0.27, 0.0, 0.0, 0.0, 0.0, 0.0)},),
+        only_forth=True,
     ),
     Kind(
         "Rolling",

@@ -9,7 +9,7 @@ FOLDER = Path(__file__).resolve().parents[1] / "twoloop"
 ROOMS = (  # from the lowest: each imports from itself and from those before it
     *("kernels.compile", "kernels.data", "kernels.algebra", "kernels.evaluation", "kernels.control", "kernels.steps"),
     *("kernels.lanes", "kernels", "checks", "problem", "generate", "methods", "run"),
-    *("mechanisms", "bodies", "symbolic"),
+    *("bodies", "mechanisms", "symbolic"),
     *("result", "solve", "impacts", "ensembles", "sweeps", "testing", "rows", "audit"),
 )
 CALLS = {"__init__", "__main__", "exported", "solve"}  # flat

@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from twoloop.mechanisms.planar import GROUND
-from twoloop.mechanisms.spatial_bodies import SpatialBodies
+from twoloop.bodies import SpatialModel
 from twoloop.methods.dop853 import DOP853
 from twoloop.run.run import Run
 
@@ -16,13 +15,15 @@ def started_run(system, q):
 
 def spatial_chain(n, hinges=False):
     """Bars in space, one hung on another by hinges, or by balls and hinges in turn."""
-    bodies, at, before = SpatialBodies((0.0, 0.0, -9.81)), np.zeros(3), GROUND
+    model, at = SpatialModel(name="spatial chain"), np.zeros(3)
+    before = model.ground
     for k in range(n):
         along = np.array([0.3, 0.1 * np.sin(k), -0.15])
-        body = bodies.body(f"body {k}", 1.0, (0.01, 0.02, 0.025), at + along / 2, np.eye(3))
+        body = model.body(f"body {k}", mass=1.0, inertia=(0.01, 0.02, 0.025), position=at + along / 2)
         if k % 2 and not hinges:
-            bodies.spherical(before, body, at)
+            model.spherical(before, body, at=at)
         else:
-            bodies.revolute(before, body, at, (0.1 * np.cos(k), 1.0, 0.2 * np.sin(k) + 0.1))
+            model.revolute(before, body, at=at, axis=(0.1 * np.cos(k), 1.0, 0.2 * np.sin(k) + 0.1))
         before, at = body, at + along
-    return bodies.system("spatial chain"), *bodies.start
+    problem = model.problem()
+    return problem.system, problem.q0, problem.v0

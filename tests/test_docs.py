@@ -286,7 +286,7 @@ def test_the_page_of_joints_shows_every_joint(tmp_path):
         }
         assert joints - {"drive"} == set(re.findall(r"model\.(\w+)\(", text))
     pictures = re.findall(r"\]\((joint-[\w-]+\.svg)\)", plane + space)
-    assert len(set(pictures)) == len(pictures) == 18
+    assert len(set(pictures)) == len(pictures) == 20
     assert all((tmp_path / picture).stat().st_size > 1000 for picture in pictures)
     assert (
         "With it, the body has 1 degree of freedom" in plane and "With it, the body has 5 degrees of freedom" in space

@@ -10,9 +10,9 @@ import pytest
 from tests.compiled import PENDULUM
 from tests.problems import held_twice
 from twoloop import ConstrainedSystem, ConstraintWarning, Joint, mechanisms, solve_dae
+from twoloop.bodies.rotation import G, rotation_matrix
 from twoloop.mechanisms import governor as governor_of
 from twoloop.mechanisms.governor import ANGLE, CUBE, DAMPING, HEIGHT, LENGTH, SLACK, STIFFNESS
-from twoloop.mechanisms.rotation import G, rotation_matrix
 
 DOWN = np.array([0.0, -9.81])
 

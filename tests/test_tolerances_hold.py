@@ -8,8 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from tests.problems import pendulum_state, unconstrained, worst
 from twoloop import mechanisms, solve_dae
-from twoloop.mechanisms.spatial import GROUND
-from twoloop.mechanisms.spatial_bodies import SpatialBodies
+from twoloop.bodies import SpatialModel
 
 
 def test_errors_of_many_short_steps_do_not_add_up():
@@ -35,17 +34,19 @@ def turned_four_bar(seed):
     x = (1.0 - 4.0 + 1.5**2) / 3.0  # where bars of 1 and 2 m meet, between the ends (0, 0) and (1.5, 0)
     points = np.array([[0.0, 0.0, 0.0], [x, -np.sqrt(1.0 - x * x), 0.0], [1.5, 0.0, 0.0], [3.0, 0.0, 0.0]]) @ turn.T
     z = turn[:, 2]
-    rows = SpatialBodies(-9.81 * turn[:, 1])
-    last = GROUND
+    model = SpatialModel(-9.81 * turn[:, 1], name="turned four-bar")
+    last = model.ground
     for k, (a, b) in enumerate(pairwise(points)):
         length = np.linalg.norm(b - a)
         along = (b - a) / length
         inertia = (1e-3 * length, length**3 / 12.0, length**3 / 12.0)
-        bar = rows.body(f"bar {k + 1}", length, inertia, 0.5 * (a + b), np.column_stack([along, np.cross(z, along), z]))
-        rows.revolute(bar, last, a, z)
+        pose = {"position": 0.5 * (a + b), "rotation": np.column_stack([along, np.cross(z, along), z])}
+        bar = model.body(f"bar {k + 1}", mass=length, inertia=inertia, **pose)
+        model.revolute(bar, last, at=a, axis=z)
         last = bar
-    rows.spherical(last, GROUND, points[-1])
-    return rows.system("turned four-bar"), *rows.start
+    model.spherical(last, model.ground, at=points[-1])
+    problem = model.problem()
+    return problem.system, problem.q0, problem.v0
 
 
 @pytest.mark.filterwarnings("ignore::twoloop.ConstraintWarning")

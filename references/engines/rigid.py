@@ -16,8 +16,8 @@ from twoloop.bodies import SpatialModel
 from twoloop.bodies.model_problem import ModelProblem
 from twoloop.bodies.parameter_layout import SPRING, TORQUE, TORSION
 from twoloop.bodies.parts import Body, ModelJoint
+from twoloop.bodies.rotation import G, euler_parameters, euler_rates, rotation_matrix
 from twoloop.bodies.spanning_tree import spanning_tree
-from twoloop.mechanisms.rotation import G, euler_parameters, euler_rates, rotation_matrix
 from twoloop.problem.problem import Array
 
 SLIDE, HINGE, BALL = "slide", "hinge", "ball"

@@ -14,10 +14,10 @@ from references.driver import STORED
 from references.exudyn.model import GROUND, PRISMATIC, REVOLUTE, SPHERICAL, UNIVERSAL, Model, frame
 from references.exudyn.run import SOLVERS, check_steps, run
 from references.lines import CannotRun, Line
+from twoloop.bodies.rotation import euler_parameters, rotated_rate, rotation_matrix
 from twoloop.mechanisms import bricard, n_four_bar
 from twoloop.mechanisms.bricard import AXES, CORNERS, FRAMES
 from twoloop.mechanisms.governor import BALL, CUBE, DAMPING, DENSITY, HEIGHT, LENGTH, SLACK, STIFFNESS, WIDTH, box
-from twoloop.mechanisms.rotation import euler_parameters, rotated_rate, rotation_matrix
 from twoloop.problem.problem import Array, Problem
 from twoloop.result.result import Result
 

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from references.exudyn.run import add_sensors, exu, items
-from twoloop.mechanisms.rotation import rotation_matrix
+from twoloop.bodies.rotation import rotation_matrix
 from twoloop.problem.problem import Array, Problem
 
 GROUND = -1

@@ -12,9 +12,9 @@ from scipy.optimize import brentq
 
 from twoloop.bodies import PlanarModel, SpatialModel
 from twoloop.bodies.model_problem import ModelProblem
+from twoloop.bodies.rotation import rotation_matrix
 from twoloop.mechanisms import andrews as ready_andrews
 from twoloop.mechanisms import four_bar as ready_four_bar
-from twoloop.mechanisms.rotation import rotation_matrix
 from twoloop.problem.problem import Array
 
 numbers = sys.modules[ready_andrews.__module__]  # those of the squeezer

@@ -5,8 +5,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from twoloop.bodies import SpatialModel
 from twoloop.mechanisms.planar import GROUND, PlanarBodies
-from twoloop.mechanisms.spatial_bodies import SpatialBodies
 from twoloop.problem.problem import Array
 from twoloop.problem.system import ConstrainedSystem
 
@@ -20,7 +20,7 @@ class Assembly(NamedTuple):
 
     system: ConstrainedSystem
     q: Array
-    bodies: Any  # PlanarBodies, or SpatialBodies
+    bodies: Any  # PlanarBodies, or the problem of a model in space
 
 
 class Bars:
@@ -131,16 +131,24 @@ def grid(n: int) -> Assembly:
 def in_space(made: Assembly, tilt: float) -> Assembly:
     """A planar assembly as bodies in space, with hinges that lean from across the plane by `tilt` to all sides."""
     planar = made.bodies
-    bodies, places = SpatialBodies((0.0, -planar.gravity, 0.0)), made.q.reshape(-1, 3)
+    model, places = SpatialModel((0.0, -planar.gravity, 0.0)), made.q.reshape(-1, 3)
     for k, (x, y, angle) in enumerate(places):
         c, s, J = np.cos(angle), np.sin(angle), planar.inertias[k]
         turned = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-        bodies.body(f"bar {k}", planar.masses[k], (0.6 * J, 0.6 * J, J), (x, y, 0.0), turned)
+        model.body(
+            f"bar {k}",
+            mass=planar.masses[k],
+            inertia=(0.6 * J, 0.6 * J, J),
+            position=(x, y, 0.0),
+            rotation=turned,
+        )
     for k, (i, (a, b), j, _) in enumerate(planar.pins):
         (x, y, angle), (c, s) = places[i], (np.cos(places[i, 2]), np.sin(places[i, 2]))
         axis = (tilt * np.cos(2.0 * k), tilt * np.sin(2.0 * k), 1.0)
-        bodies.revolute(i, j, (x + c * a - s * b, y + s * a + c * b, 0.0), axis)
-    return Assembly(bodies.system(made.system.name + ", in space"), bodies.start[0], bodies)
+        ends = model.bodies[i], model.ground if j == GROUND else model.bodies[j]
+        model.revolute(*ends, at=(x + c * a - s * b, y + s * a + c * b, 0.0), axis=axis)
+    problem = model.problem(name=f"{made.system.name}, in space")
+    return Assembly(problem.system, problem.q0, problem)
 
 
 def open_chain_of_hinges(n: int) -> Assembly:

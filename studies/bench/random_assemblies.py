@@ -6,8 +6,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.linalg import lstsq
 
+from twoloop.bodies import SpatialModel
 from twoloop.mechanisms.planar import GROUND, PlanarBodies
-from twoloop.mechanisms.spatial_bodies import SpatialBodies
 from twoloop.problem.problem import Array
 from twoloop.problem.system import ConstrainedSystem
 
@@ -25,7 +25,6 @@ class RandomAssembly:
 
     q: Array
     places: Array
-    bodies: Any
     rng: np.random.Generator
     pairs: list[tuple[int, int]]
 
@@ -48,6 +47,10 @@ class RandomAssembly:
     def close(self, i: int, j: int) -> None:
         """Connect two bodies that hang together already."""
         self.join(i, j)
+
+    def system(self, name: str) -> ConstrainedSystem:
+        """Its equations."""
+        raise NotImplementedError
 
     def v(self, system: ConstrainedSystem) -> Array:
         """Random velocities that the constraints allow."""
@@ -81,6 +84,10 @@ class PlanarAssembly(RandomAssembly):
         c, s = np.cos(angle), np.sin(angle)
         return float(c * x + s * y), float(c * y - s * x)
 
+    def system(self, name: str) -> ConstrainedSystem:
+        """Its equations."""
+        return self.bodies.system(name)
+
 
 class SpatialAssembly(RandomAssembly):
     """Bodies at random places in space: hinges, balls, crosses and slides, and balls that close loops.
@@ -91,17 +98,23 @@ class SpatialAssembly(RandomAssembly):
 
     def __init__(self, seed: int, n: int, loops: int = 0, doubles: int = 0, springs: tuple[float, ...] = ()):
         rng = self.rng = np.random.default_rng(seed)
-        self.places, self.pairs = rng.normal(size=(n, 3)) * np.cbrt(n), []
-        self.bodies = SpatialBodies((0.0, 0.0, -9.81))
+        self.places, self.pairs, self.model = rng.normal(size=(n, 3)) * np.cbrt(n), [], SpatialModel()
         for k, place in enumerate(self.places):
             R, _ = np.linalg.qr(rng.normal(size=(3, 3)))
             mass = 2.0 ** rng.uniform(-0.5, 0.5)
-            self.bodies.body(f"body {k}", mass, tuple(mass * rng.uniform(0.15, 0.27, 3)), place, R * np.linalg.det(R))
+            moments = tuple(mass * rng.uniform(0.15, 0.27, 3))
+            self.model.body(f"body {k}", mass=mass, inertia=moments, position=place, rotation=R * np.linalg.det(R))
         tree = self.connect(n, loops, doubles)
         for i, j in tree if springs else ():
             one, other = self.near(i), rng.normal(size=3) if j == GROUND else self.near(j)
-            self.bodies.spring(i, one, j, other, *springs, 1.1 * float(np.linalg.norm(one - other)))
-        self.q = self.bodies.start[0]
+            given: dict[str, Any] = dict(zip(("stiffness", "damping"), springs, strict=True))
+            given["length"] = 1.1 * float(np.linalg.norm(one - other))
+            self.model.spring(self.body(i), one, self.body(j), other, **given)
+        self.q = self.model.problem().q0
+
+    def body(self, k: int) -> Any:
+        """A body of the model, or its ground."""
+        return self.model.ground if k == GROUND else self.model.bodies[k]
 
     def near(self, k: int) -> Array:
         """A random place near a body."""
@@ -113,13 +126,17 @@ class SpatialAssembly(RandomAssembly):
         at, a, b = self.near(i), *np.linalg.qr(self.rng.normal(size=(3, 2)))[0].T
         first, second = (i, j) if self.rng.integers(2) else (j, i)
         kind = self.rng.choice(["spherical", "revolute", "universal", "prismatic"])
-        axes = {"spherical": (), "universal": (a, b)}.get(kind, (a,))
-        getattr(self.bodies, kind)(first, second, at, *axes)
+        axes: Any = {"spherical": {}, "universal": {"axes": (a, b)}}.get(kind, {"axis": a})
+        getattr(self.model, kind)(self.body(first), self.body(second), at=at, **axes)
 
     def close(self, i: int, j: int) -> None:
         """A ball that closes a loop, or is one more on two bodies."""
         self.pairs.append((i, j))
-        self.bodies.spherical(i, j, self.near(i))
+        self.model.spherical(self.body(i), self.body(j), at=self.near(i))
+
+    def system(self, name: str) -> ConstrainedSystem:
+        """Its equations."""
+        return self.model.problem(name=name).system
 
 
 class DenseSolution(NamedTuple):

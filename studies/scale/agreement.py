@@ -30,7 +30,7 @@ def agreements(quick: bool) -> Keyed:
 def agreement(case: str, kind: Callable[..., RandomAssembly], seed: int) -> Row:
     """An assembly at random velocities that its constraints allow, by whatever form a run takes for it."""
     made = drawn(kind, seed)
-    system = made.bodies.system("random")
+    system = made.system("random")
     v = made.v(system)
     exact = dense_solution(system, made.q, v)
     row: Row = {"group": AGREEMENT, "case": case, "n": len(made.places), "repeat": seed, "error_q": None}

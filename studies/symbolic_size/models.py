@@ -142,7 +142,7 @@ def body_spin(e: Sequence[Any]) -> sp.Matrix:
 
 
 def rotation(e: Sequence[Any]) -> sp.Matrix:
-    """The rotation matrix of Euler parameters, homogeneous of degree two as in `twoloop.mechanisms.rotation`."""
+    """The rotation matrix of Euler parameters, homogeneous of degree two as in `twoloop.bodies.rotation`."""
     e0, f = e[0], sp.Matrix(e[1:])
     cross = sp.Matrix([[0, -e[3], e[2]], [e[3], 0, -e[1]], [-e[2], e[1], 0]])
     return (e0**2 - f.dot(f)) * sp.eye(3) + 2 * f * f.T + 2 * e0 * cross

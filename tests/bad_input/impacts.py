@@ -4,7 +4,7 @@ import numpy as np
 
 from tests.bad_input.case import cases_of
 from twoloop import Integrator, Stop, solve_with_friction, solve_with_stops
-from twoloop.bodies import PlanarModel
+from twoloop.bodies import PlanarModel, SpatialModel
 from twoloop.mechanisms import four_bar
 
 LINKAGE = four_bar()
@@ -32,6 +32,21 @@ def wheels(call):
         model.disc(f"wheel {k}", 0.1, mass=1.0, position=(0.2 * k, 0.0))
         model.revolute("ground", f"wheel {k}", at=(0.2 * k, 0.0), name=f"pin {k}")
     return lambda: call(model)
+
+
+def geared(ratio):
+    """Two wheels in space, with a gear."""
+    model = SpatialModel()
+    for k, name in enumerate("ab"):
+        model.sphere(name, 0.1, mass=1.0, position=(0.0, 0.0, k))
+        model.revolute("ground", name, at=(0.0, 0.0, k), axis=(0.0, 0.0, 1.0), name=f"pin {name}")
+    return lambda: model.gear("pin a", "pin b", ratio=ratio)
+
+
+def rubs_in_space():
+    model = SpatialModel()
+    ball = model.sphere("ball", 0.1, mass=1.0, position=(0.0, 0.0, 1.0))
+    model.stop(ball, (0.0, 0.0, 0.9), "ground", (0.0, 0.0, 0.0), normal=(0.0, 0.0, 1.0), friction=0.3)
 
 
 def rubbed(*joints, drive=None, **friction):
@@ -86,11 +101,22 @@ IMPACTS = [
     of_step("`compiled=True`")
     .when(lambda: Integrator(LINKAGE.system, compiled=True).start(0.0, LINKAGE.q0, LINKAGE.v0))
     .says("start takes no compiled", "leave it out"),
+    of_model("friction of a stop in space", rubs_in_space).says(
+        "must be zero, as stops rub in the plane only", "leave it out, or make the model in a plane"
+    ),
+    of_stops("friction without a slide", lambda: Stop(lambda t, q: q[0], friction=0.3)).says(
+        "slide of 'stop' must be a function of t and q, as it rubs",
+        "say how far the point is along the surface",
+        TypeError,
+    ),
     of_model("a gear of one hinge", wheels(lambda model: model.gear("pin 0", "pin 0", ratio=1.0))).says(
         "a gear needs two joints", "name both"
     ),
     of_model("`ratio=0`", wheels(lambda model: model.gear("pin 0", "pin 1", ratio=0.0))).says(
         "ratio must not be zero", "fix it instead"
+    ),
+    of_model("a gear in space whose ratio is none of teeth", geared(np.pi)).says(
+        "must be a ratio of whole numbers up to 1000, such as -17 / 43", "give the numbers of teeth"
     ),
     of_model("a rack of two hinges", wheels(lambda model: model.rack("pin 0", "pin 1", radius=0.1))).says(
         "needs a prismatic joint", "give a hinge and a slide"

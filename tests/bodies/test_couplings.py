@@ -77,6 +77,107 @@ def test_a_rack(tilt):
     np.testing.assert_allclose(result.q[2], known[0] / 0.2, atol=1e-8)
 
 
+def bevel(ratio, axis, **motion):
+    """Two wheels in space on axes of their own, the second with its weight beside its axis; and their hinges."""
+    model = SpatialModel()
+    model.body("one", mass=1.0, inertia=(0.1, 0.1, 0.2), position=(0.0, 0.0, 0.0), **motion)
+    model.body("two", mass=2.0, inertia=(0.5, 0.4, 0.3), position=(1.0, 0.2, 0.1))
+    hinges = (
+        model.revolute("ground", "one", at=(0.0, 0.0, 0.0), axis=(0.0, 0.0, 1.0)),
+        model.revolute("two", "ground", at=(1.0, 0.0, 0.0), axis=-np.array(axis)),  # the ground second: same sense
+    )
+    return model, hinges, model.gear(*hinges, ratio=ratio)
+
+
+@pytest.mark.parametrize("ratio", [-17.0 / 43.0, 2.0, 0.5, -3.0 / 7.0])
+@pytest.mark.parametrize("method", ["DOP853", "RadauIIA9"])
+def test_bevel_gears(ratio, method):
+    """Through many turns, of which Euler parameters know nothing."""
+    axis = np.array([0.6, 0.0, 0.8])
+    model, (one, _), gear = bevel(ratio, axis, angular_velocity=(0.0, 0.0, 20.0))
+    model.motor(one, lambda t: 5.0 * np.cos(t))
+    problem, result = run_of(model, method)
+    arm, J = np.array([0.0, 0.2, 0.1]), np.diag([0.5, 0.4, 0.3])
+    across = arm - axis * (axis @ arm)
+    inertia = axis @ J @ axis + 2.0 * across @ across
+
+    def load(turned):  # torque of the weight about the axis, against that of the gear
+        here = np.cos(turned) * across + np.sin(turned) * np.cross(axis, across)
+        return 2.0 * GRAVITY * (axis @ np.cross(here + axis * (axis @ arm), (0.0, 0.0, 1.0)))
+
+    def acceleration(t, turned, rate):
+        return (5.0 * np.cos(t) - ratio * load(ratio * turned)) / (0.2 + ratio**2 * inertia)
+
+    known = by_hand(acceleration, [0.0, 20.0], TIMES)
+    assert known[0, -1] > 3.0 * np.pi
+    np.testing.assert_allclose(result.q[[3, 6]], [np.cos(0.5 * known[0]), np.sin(0.5 * known[0])], atol=2e-8)
+    half = 0.5 * ratio * known[0]
+    np.testing.assert_allclose(result.q[10:14], [np.cos(half), *np.outer(axis, np.sin(half))], atol=2e-8)
+    assert problem.freedom.degrees == 1 and not problem.freedom.redundant
+    torque = result.reactions(gear.name).torque[:, 0] @ axis  # on the second wheel
+    alpha = ratio * acceleration(0.0, 0.0, 20.0)
+    np.testing.assert_allclose(torque, inertia * alpha + load(0.0), atol=1e-6)
+
+
+def test_planets_in_space_turn_as_those_in_a_plane():
+    ends = []
+    for spatial in (False, True):
+        model = SpatialModel((0.0, 0.0, 0.0)) if spatial else PlanarModel((0.0, 0.0))
+        more = (0.0,) if spatial else ()
+        axis = {"axis": (0.0, 0.0, 1.0)} if spatial else {}
+        spin = (0.0, 0.0, 2.0) if spatial else 2.0
+        for name, x in (("carrier", 0.15), ("sun", 0.0), ("planet", 0.3)):
+            moment = np.full(3, 0.02) if spatial else 0.02
+            given = {"angular_velocity": spin} if name == "carrier" else {}
+            model.body(name, mass=1.0, inertia=moment, position=(x, 0.0, *more), **given)
+        model.revolute("ground", "carrier", at=(0.0, 0.0, *more), **axis)
+        sun = model.revolute("carrier", "sun", at=(0.0, 0.0, *more), **axis)
+        planet = model.revolute("carrier", "planet", at=(0.3, 0.0, *more), **axis)
+        model.gear(sun, planet, ratio=-2.0 / 3.0)
+        model.torsion_spring(sun, stiffness=3.0)
+        model.motor(planet, lambda t: np.sin(5.0 * t))
+        _, result = run_of(model)
+        q, width = result.q, 7 if spatial else 3
+        angles = 2.0 * np.arctan2(q[6::7], q[3::7]) if spatial else q[2::3]
+        ends.append([q[::width], q[1::width], np.cos(angles), np.sin(angles)])
+    np.testing.assert_allclose(*ends, atol=1e-8)
+
+
+def test_a_rack_in_space():
+    """A rack on a slope in space and a pinion across it, through turns; and in a drive that begins elsewhere."""
+    model, along = SpatialModel(), np.array([0.6, 0.48, 0.64])
+    model.body("pinion", mass=2.0, inertia=(0.02, 0.02, 0.04), position=(0.0, 0.0, 0.0))
+    model.body("rack", mass=1.5, inertia=(0.1, 0.1, 0.1), position=(0.0, -0.2, 0.0))
+    pinion = model.revolute("ground", "pinion", at=(0.0, 0.0, 0.0), axis=(0.0, 0.0, 1.0))
+    slide = model.prismatic("ground", "rack", at=(0.0, -0.2, 0.0), axis=along)
+    rack = model.rack(pinion, slide, radius=-0.2)
+    model.axial_spring(slide, stiffness=30.0, length=-0.1)
+    problem, result = run_of(model)
+    mass = 1.5 + 0.04 / 0.2**2
+    known = by_hand(lambda t, s, rate: (-30.0 * (s + 0.1) - 1.5 * GRAVITY * along[2]) / mass, [0.0, 0.0], TIMES)
+    np.testing.assert_allclose(result.q[7:10], np.outer(along, known[0]) + np.array([[0.0], [-0.2], [0.0]]), atol=1e-9)
+    turned = -known[0] / 0.2
+    assert np.abs(turned).max() > np.pi and problem.freedom.degrees == 1
+    np.testing.assert_allclose(result.q[[3, 6]], [np.cos(0.5 * turned), np.sin(0.5 * turned)], atol=1e-8)
+    force = result.reactions(rack.name).force.T @ along  # on the rack
+    np.testing.assert_allclose(force, -0.04 / 0.2**2 * (result.a[7:10].T @ along), atol=1e-7)
+    model.drive(pinion, lambda t: 0.9 + t)
+    np.testing.assert_allclose(model.problem().q0[7:10] - [0.0, -0.2, 0.0], -0.2 * 0.9 * along, atol=1e-12)
+
+
+def test_a_gear_in_space_stays_at_its_tooth_when_bodies_are_assembled():
+    model, (one, _), _ = bevel(-200.0 / 201.0, (0.0, 0.6, 0.8))
+    model.drive(one, lambda t: 0.8 + 3.0 * t)
+    problem = model.problem()
+    half = -0.4 * 200.0 / 201.0
+    np.testing.assert_allclose(problem.q0[10:14], [np.cos(half), 0.0, *np.array([0.6, 0.8]) * np.sin(half)], atol=1e-12)
+    other = problem.q0.copy()  # at the next tooth
+    half += np.pi / 201.0
+    other[10:14] = np.cos(half), 0.0, 0.6 * np.sin(half), 0.8 * np.sin(half)
+    with pytest.raises(ValueError, match=r"does not mesh at t = 0 as in the position given: .* is 0.03125"):
+        model._check_branches(0.0, other)
+
+
 def test_a_wheel_that_rolls_down_a_slope_that_slides():
     """A disc on a wedge on a level floor: the classical pair of equations."""
     m, M, r, tilt = 1.0, 2.0, 0.1, 0.5

@@ -6,7 +6,7 @@ import pytest
 from tests.bodies.newton_euler import Bodies
 from tests.bodies.random_models import Both
 from twoloop import consistent_state
-from twoloop.mechanisms.rotation import G, rotation_matrix
+from twoloop.bodies.rotation import G, rotation_matrix
 
 
 def accelerations(system, t, q, v):

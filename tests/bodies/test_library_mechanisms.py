@@ -1,7 +1,8 @@
 """The ready mechanisms of the library that are made of bodies, as models of bodies and joints: the same to rounding.
 
-All but the beams, which bend. Where coordinates are the same, accelerations at the states of a motion are those of the
-library's tables; where they differ (tips of bars, masses without extension, yaw, lean and spin), motions are compared.
+All but the beams, which bend, and the spatial ones that are models themselves. Where coordinates are the same,
+accelerations at the states of a motion are those of the library's tables; where they differ (tips of bars, masses
+without extension, yaw, lean and spin), motions are compared.
 """
 
 import math
@@ -14,8 +15,7 @@ from studies.bench.closed_loops import squeezer
 from tests.bodies.runs import moved
 from twoloop import mechanisms
 from twoloop.bodies import PlanarModel, SpatialModel
-from twoloop.mechanisms.rotation import rotation_matrix
-from twoloop.mechanisms.spatial_four_bar import inertia as round_bar
+from twoloop.bodies.rotation import rotation_matrix
 
 pytestmark = pytest.mark.filterwarnings("ignore::twoloop.ConstraintWarning")
 TIMES = np.linspace(0.0, 1.0, 6)
@@ -169,83 +169,6 @@ def test_bricard():
     made, one, other = both(model.problem((0.0, 1.0)), mechanisms.bricard(), 1.0)
     np.testing.assert_allclose(one.reshape(5, 7, -1)[:, :3], other.reshape(5, 12, -1)[:, :3], atol=1e-8)
     assert made.freedom.degrees == 1 and len(made.freedom.redundant[0]) == 6
-
-
-def spatial_as_given(known, masses, inertias, gravity=(0.0, 0.0, -9.81)):
-    """A model with bodies as a problem of spatial bodies starts."""
-    model = SpatialModel(gravity)
-    names = [each.split(" of ")[1] for each in known.coordinates[::7]]
-    q, v = known.q0.reshape(-1, 7), known.v0.reshape(-1, 7)
-    for name, mass, moments, state, rate in zip(names, masses, inertias, q, v, strict=True):
-        e, u = state[3:], rate[3:]
-        R = rotation_matrix(e)
-        spin = 2.0 * (e[0] * u[1:] - u[0] * e[1:] + np.cross(e[1:], u[1:]))
-        model.body(
-            name, mass=mass, inertia=moments, position=state[:3], rotation=R, velocity=rate[:3], angular_velocity=spin
-        )
-    return model
-
-
-def test_spatial_four_bar():
-    known = mechanisms.spatial_four_bar()
-    masses = known.parameters["masses"].values()
-    lengths = (0.3, known.parameters["coupler"], 0.7)
-    inertias = [round_bar(mass, long) for mass, long in zip(masses, lengths, strict=True)]
-    model = spatial_as_given(known, masses, inertias)
-    D = np.array([0.9, 0.0, 0.3])
-    model.revolute("ground", "crank", at=(0.0, 0.0, 0.0), axis=(0.0, 0.0, 3.0))
-    model.spherical("crank", "coupler", at=(0.3, 0.0, 0.0))
-    model.spherical("coupler", "rocker", at=np.add(D, (0.0, 0.0, 0.7)))
-    model.revolute("rocker", "ground", at=D, axis=(0.0, 1.0, 0.0))
-    made, one, other = both(model.problem((0.0, 2.0)), known, 2.0)
-    np.testing.assert_allclose(one, other, atol=1e-8)
-    assert made.freedom.degrees == 2
-
-
-def test_spatial_slider_crank():
-    known = mechanisms.spatial_slider_crank()
-    model = spatial_as_given(known, known.parameters["masses"].values(), known.parameters["inertias"].values())
-    x, R = np.array([1.0, 0.0, 0.0]), rotation_matrix(known.q0[10:14])
-    A = np.array([0.0, 0.1, 0.12])
-    end = known.q0[14:17]
-    model.revolute("crank", "ground", at=A, axis=x)
-    model.spherical("crank", "rod", at=np.add(A, (0.0, 0.0, 0.08)))
-    model.universal("rod", "slider", at=end, axes=(R[:, 1], x))
-    model.prismatic("ground", "slider", at=(0.0, 0.0, 0.0), axis=x)
-    made, one, other = both(model.problem((0.0, 5.0)), known, 5.0)
-    np.testing.assert_allclose(one, other, atol=1e-8)
-    assert made.freedom.degrees == 1
-
-
-def test_governor():
-    known = mechanisms.governor()
-    bar, cube = 0.3, 3.0
-    centre = (0.5 * bar + 5.0) / (bar + 5.0)
-    axial, across, _ = box(bar, 1.0, 0.01, 0.01)
-    across += bar * (centre - 0.5) ** 2 + 5.0 * (1.0 - centre) ** 2
-    rod = (axial, across, across)
-    masses = (bar, cube, bar + 5.0, bar + 5.0)
-    inertias = (box(bar, 0.01, 0.01, 1.0), box(cube, 0.1, 0.1, 0.1), rod, rod)
-    model = spatial_as_given(known, masses, inertias)
-    z, y = np.array([0.0, 0.0, 1.0]), np.array([0.0, 1.0, 0.0])
-    model.revolute("ground", "shaft", at=(0.0, 0.0, 0.0), axis=z)
-    model.prismatic("shaft", "slider", at=0.5 * z, axis=z)
-    for name, side in (("rod A", 1.0), ("rod B", -1.0)):
-        hinge, end = np.array([side * 0.05, 0.0, 1.0]), np.array([side * 0.05, 0.0, 0.5])
-        along = np.array([side * math.cos(math.radians(30.0)), 0.0, -math.sin(math.radians(30.0))])
-        model.revolute("shaft", name, at=hinge, axis=y)
-        model.spring(name, hinge + 0.5 * along, "slider", end, stiffness=8e5, damping=4e4, length=0.5)
-    made, one, other = both(model.problem((0.0, 0.02)), known, 0.02, tolerance=1e-10, conserved=False)
-    np.testing.assert_allclose(one, other, atol=1e-8)
-    assert made.freedom.degrees == 4
-
-
-def test_heavy_top():
-    known = mechanisms.heavy_top()
-    model = spatial_as_given(known, [15.0], [(0.234375, 0.46875, 0.234375)])
-    model.spherical("ground", "top", at=(0.0, 0.0, 0.0))
-    _, one, other = both(model.problem((0.0, 0.2)), known, 0.2)
-    np.testing.assert_allclose(one, other, atol=1e-8)
 
 
 def test_driven_crank():

@@ -10,7 +10,7 @@ from tests.bodies.runs import moved
 from twoloop import solve_dae
 from twoloop.bodies import IgnoredWarning, SpatialModel, from_mjcf
 from twoloop.bodies.mjcf_geometry import geom_lump
-from twoloop.mechanisms.rotation import rotation_matrix
+from twoloop.bodies.rotation import rotation_matrix
 
 pytestmark = pytest.mark.filterwarnings("ignore::twoloop.ConstraintWarning")
 LEG = """

@@ -5,7 +5,7 @@ import pytest
 
 from tests.bodies.runs import moved
 from twoloop.bodies import SpatialModel, from_mjcf
-from twoloop.mechanisms.rotation import rotation_matrix
+from twoloop.bodies.rotation import rotation_matrix
 
 pytestmark = pytest.mark.filterwarnings("ignore::twoloop.ConstraintWarning")
 HEAD = '<mujoco><compiler angle="radian"/><default><geom contype="0" conaffinity="0"/></default><worldbody>'

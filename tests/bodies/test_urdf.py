@@ -8,7 +8,7 @@ import pytest
 from tests.bodies.runs import moved
 from twoloop import solve_dae
 from twoloop.bodies import IgnoredWarning, Loop, PlanarModel, SpatialModel, from_urdf
-from twoloop.mechanisms.rotation import euler_rates, rotation_matrix
+from twoloop.bodies.rotation import euler_rates, rotation_matrix
 
 ARM = """<?xml version="1.0"?>
 <robot name="arm">

@@ -49,7 +49,7 @@ class Started:
 
 def compare(assembly):
     """The error of accelerations and multipliers of a random assembly; None where dense has to decide."""
-    system = assembly.bodies.system("random")
+    system = assembly.system("random")
     v = assembly.v(system)
     exact, started = dense_solution(system, assembly.q, v), Started(system, assembly.q, v)
     if started.code == codes.NEEDS_DENSE:
@@ -84,7 +84,7 @@ def test_mass_ratios(any_size, ratio):
     decided = 0
     for seed in range(12):
         assembly = PlanarAssembly(seed, 30, 2, 0, heaviest=ratio)
-        system = assembly.bodies.system("heavy and light")
+        system = assembly.system("heavy and light")
         v = np.zeros(system.n_q)
         started = Started(system, assembly.q, v)
         if started.code == codes.NEEDS_DENSE:
@@ -97,7 +97,7 @@ def test_mass_ratios(any_size, ratio):
 
 def test_projection_is_that_in_the_metric_of_the_masses(any_size):
     assembly = PlanarAssembly(3, 40, 4, 1)
-    system = assembly.bodies.system("projected")
+    system = assembly.system("projected")
     started = Started(system, assembly.q, np.zeros(system.n_q))
     rng = np.random.default_rng(1)
     q = expected = assembly.q + 1e-4 * rng.normal(size=system.n_q)
@@ -154,11 +154,11 @@ def test_the_default_of_large_systems_with_values_of_entries_is_explicit_by_dop8
 
 def test_redundant_rows_are_named_and_held(both):
     assembly = PlanarAssembly(5, 24, 2, 2)
-    system, q = assembly.bodies.system("redundant"), assembly.q
+    system, q = assembly.system("redundant"), assembly.q
 
     def run():
         with pytest.warns(ConstraintWarning, match="depend on the others"):
-            return solve_dae(assembly.bodies.system("redundant"), (0.0, 0.02), q, 0.0 * q, "DOP853", 1e-9, 1e-9)
+            return solve_dae(assembly.system("redundant"), (0.0, 0.02), q, 0.0 * q, "DOP853", 1e-9, 1e-9)
 
     other, result = both(run)
     assert result.success and result.rank == other.rank == system.n_c - len(result.redundant)
@@ -170,7 +170,7 @@ def test_redundant_rows_are_named_and_held(both):
 def test_many_redundant_rows(any_size):
     """More than eighty, with multipliers of least norm."""
     assembly = PlanarAssembly(3, 60, 0, 90)
-    system = assembly.bodies.system("many pins twice")
+    system = assembly.system("many pins twice")
     v = assembly.v(system)
     a, lam, rank, _ = dense_solution(system, assembly.q, v)
     started = Started(system, assembly.q, v)
@@ -287,7 +287,8 @@ def test_bodies_whose_mass_matrix_is_singular(any_size, both):
 def test_parallel_hinges_have_three_redundant_rows_a_loop(any_size, build, n, loops):
     made = build(n)
     hinged = in_space(made, 0.0)
-    system, (q, v) = hinged.system, hinged.bodies.start
+    system, q = hinged.system, hinged.q
+    v = 0.0 * q
     planar_one, one = Started(made.system, made.q, 0.0 * made.q), Started(system, q, v)
     assert (planar_one.code, one.code) == (codes.DONE, codes.DONE)
     assert (planar_one.rank, one.rank) == (made.system.n_c, system.n_c - 3 * loops)

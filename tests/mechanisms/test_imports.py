@@ -29,7 +29,7 @@ def test_a_mechanism_imports_no_other_and_its_name_is_a_function_also_after_an_i
     )
     assert not first & {f"twoloop.kernels.{name}" for name in ("lanes.lane_room", "evaluation.calls", "advance")}
     none, one, other = map(mechanisms_among, after)
-    assert none == set() and one == {"four_bar", "points", "rotation"}
+    assert none == set() and one == {"four_bar"}
     assert {"four_bar", "heavy_top"} <= other and "andrews" not in other
 
 

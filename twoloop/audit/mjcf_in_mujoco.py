@@ -7,9 +7,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from twoloop.bodies.model_problem import ModelProblem
+from twoloop.bodies.rotation import euler_parameters, euler_rates
 from twoloop.bodies.spatial_model import SpatialModel
 from twoloop.checks.arguments import Array
-from twoloop.mechanisms.rotation import euler_parameters, euler_rates
 
 # prefixes of ignored parts that can be disabled in MuJoCo
 SWITCHED_OFF = (

@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from twoloop.bodies.rotation import euler_parameters, rotation_matrix
 from twoloop.checks.arguments import Array
-from twoloop.mechanisms.rotation import euler_parameters, rotation_matrix
 
 POINTS_STAY = ("revolute", "spherical", "universal", "fixed")  # kinds of joints that keep two points coincident
 

@@ -215,7 +215,8 @@ def velocities(
             f"{f' ({unit}/s)' if unit else ''}. Give fewer velocities (the others are computed), or fewer joints"
         )
     v = v - np.linalg.lstsq(scaled, scaled @ v + system.rates(t, q) / scales.rows, rcond=SINGULAR)[0]
-    at_rest = np.where(~known & (np.abs(v) < ROUNDING * np.abs(v).max()), 0.0, v)  # rounding errors removed
+    near = np.where(known, target, 0.0)
+    at_rest = np.where(np.abs(v - near) < ROUNDING * np.abs(v).max(), near, v)  # rounding errors removed
     rates = system.rates(t, q) / scales.rows
     terms = ROUNDING * (np.abs(scaled) @ np.abs(at_rest) + np.abs(rates))
     if (np.abs(scaled @ at_rest + rates) <= np.maximum(np.abs(scaled @ v + rates), terms)).all():

@@ -15,8 +15,8 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
+from twoloop.bodies.rotation import rotation_matrix
 from twoloop.checks.arguments import Array
-from twoloop.mechanisms.rotation import rotation_matrix
 
 DENSITY = 1000.0  # kg/m^3, default of MuJoCo for geoms with neither mass nor density
 

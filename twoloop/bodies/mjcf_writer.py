@@ -14,8 +14,8 @@ from numpy.typing import ArrayLike
 from twoloop.bodies.mjcf_geometry import IgnoredWarning
 from twoloop.bodies.parameter_layout import PULL, RAIL, SPRING, TORSION
 from twoloop.bodies.parts import Body, Force, ModelJoint
+from twoloop.bodies.rotation import euler_parameters
 from twoloop.bodies.spanning_tree import spanning_tree
-from twoloop.mechanisms.rotation import euler_parameters
 
 HALF = 0.5  # m: distance of the two connect points that represent a hinge closing a loop
 

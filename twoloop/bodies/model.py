@@ -200,7 +200,7 @@ class Model(Stops):
         raise NotImplementedError
 
     def _check_branches(self, t: float, q: Array) -> None:
-        """Raise if a drive starts on the wrong branch, half a turn away from its value."""
+        """Raise if a drive starts half a turn away from its value, or a gear at another tooth."""
 
     def _start(self) -> Array:
         """Return the coordinates in the position given, (n_q,)."""

@@ -28,7 +28,7 @@ class ModelEnergy:
 
     def __call__(self, t: Any, q: Array, v: Array) -> Any:
         """Evaluate the energies of one state, or of many given as columns."""
-        from twoloop.mechanisms.points import direction_of, place_of  # compiled on import
+        from twoloop.bodies.points import direction_of, place_of  # compiled on import
 
         flat = np.asarray(q)
 
@@ -88,6 +88,6 @@ class ModelEnergy:
 
 def _spins(e: Array, u: Array) -> Array:
     """Return angular velocities in body axes, (n, 3) or (n, 3, n_t)."""
-    from twoloop.mechanisms.rotation import half_spin  # compiled on import
+    from twoloop.bodies.rotation import half_spin  # compiled on import
 
     return 2.0 * np.stack(half_spin.py_func(*np.moveaxis(e, 1, 0), *np.moveaxis(u, 1, 0)), axis=1)

@@ -11,7 +11,7 @@ from twoloop.bodies.documented import documented
 from twoloop.bodies.loads import Loads
 from twoloop.bodies.parts import Body, ModelJoint
 from twoloop.bodies.places import placed, turned
-from twoloop.checks.arguments import Array, check_finite
+from twoloop.checks.arguments import Array, check_finite, check_not_negative
 from twoloop.problem.stops import Stop
 
 
@@ -29,6 +29,16 @@ class PlaneGap:
         """Return the distance, for numbers or symbols."""
         one, two = placed(q, self.body, self.place), placed(q, self.other, self.foot)
         return sum(n * (x - y) for n, x, y in zip(turned(q, self.other, self.normal), one, two, strict=True))
+
+
+@dataclass(frozen=True, eq=False)
+class PlaneSlide(PlaneGap):
+    """Displacement of a point of one body along a line of another, m."""
+
+    def __call__(self, t: Any, q: Any) -> Any:
+        """Return the displacement, for numbers or symbols."""
+        x, y = self.normal
+        return PlaneGap(self.body, self.place, self.other, self.foot, np.array([y, -x]))(t, q)
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,9 +69,10 @@ class Stops(Loads):
         *,
         normal: Any,
         restitution: float = 0.0,
+        friction: float = 0.0,
         name: str | None = None,
     ) -> Stop:
-        """Add a frictionless plane on one body that a point of another body cannot cross.
+        """Add a plane on one body that a point of another body cannot cross.
 
         Parameters
         ----------
@@ -76,12 +87,17 @@ class Stops(Loads):
             Normal of the plane, on the side of the point.
         restitution : float
             Coefficient of restitution, from 0 to 1.
+        friction : float
+            Coefficient of Coulomb friction; in space it must be zero.
         """
         one, two = self._body("body", body), self._body("other", other)
         self._different("stop", one, two)
         name = self._new_name("stop", name, one, two)
         places = self._point("at", at, one), two, self._point("foot", foot, two), self._direction("normal", normal, two)
-        return self._add_stop(Stop(PlaneGap(one, *places), restitution, name))
+        if check_not_negative("friction", friction) and self.dimension == 3:
+            raise ValueError(f"friction of {name!r} must be zero, as stops rub in the plane only; given {friction!r}")
+        slide = PlaneSlide(one, *places) if friction else None
+        return self._add_stop(Stop(PlaneGap(one, *places), restitution, name, friction, slide))
 
     def limit(
         self,

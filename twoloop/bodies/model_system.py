@@ -67,6 +67,7 @@ def system_of(
         if tables.loaded:
             made.loaded = LoadedFriction(callbacks, tables, made.redundant(*start))
         return ConstrainedSystem.from_python(**options, **{kind: getattr(made, kind) for kind in kinds})
+    kinds += ["kinematics"] if tables.n_rows and dimension == 2 else []
     given = {kind: getattr(callbacks, kind) for kind in kinds}
     if n_q >= LARGE and tables.n_rows:
         given |= {"mass_values": callbacks.mass_values, "jacobian_values": callbacks.jacobian_values}

@@ -12,6 +12,8 @@ from twoloop.bodies.parameter_layout import NONE
 from twoloop.bodies.row_function import RowFunction
 from twoloop.checks.arguments import Array, check_vector
 
+ROUNDING = 4.0 * np.finfo(np.float64).eps
+
 
 @dataclass(frozen=True, eq=False)
 class BodyPoint:
@@ -69,11 +71,11 @@ class Body:
         if len(given) == 2:
             s, c = np.sin(self.rotation), np.cos(self.rotation)
             return np.array([c * given[0] + s * given[1], c * given[1] - s * given[0]])
-        return np.asarray(self.rotation.T @ given)
+        return _without_rounding(self.rotation.T @ given, float(np.abs(given).max()))
 
     def local_point(self, given: Array) -> Array:
         """Transform a point from space to the axes of the body, relative to its centre, in the position given."""
-        return self.local_direction(given - self.position)
+        return _without_rounding(self.local_direction(given - self.position), np.abs((*given, *self.position)).max())
 
     def in_space(self, place: Array) -> Array:
         """Transform a point of the body to space, in the position given."""
@@ -81,6 +83,11 @@ class Body:
             s, c = np.sin(self.rotation), np.cos(self.rotation)
             return self.position + np.array([c * place[0] - s * place[1], s * place[0] + c * place[1]])
         return np.asarray(self.position + self.rotation @ place)
+
+
+def _without_rounding(components: Array, size: float) -> Array:
+    """Return zeros for components that are rounding errors of numbers of a size: equations are shorter without them."""
+    return np.where(np.abs(components) > ROUNDING * size, components, 0.0)
 
 
 @dataclass(frozen=True, eq=False)

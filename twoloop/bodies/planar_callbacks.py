@@ -5,11 +5,10 @@ import math
 from twoloop.bodies import parameter_layout as layout
 from twoloop.bodies import read_tables as tables
 from twoloop.bodies.function_rows import fill_entries, fill_nonholonomic, fill_nonholonomic_gamma, put_entries
+from twoloop.bodies.planar_places import motion, place_on
 from twoloop.bodies.program_results import result, results
 from twoloop.kernels.compile.caches import helper
 from twoloop.kernels.compile.callbacks import callback
-from twoloop.mechanisms.planar import motion
-from twoloop.mechanisms.planar import place as place_on
 
 WEIGHT = 2  # components of gravity, which precede the numbers of the bodies
 
@@ -55,28 +54,44 @@ def turn(row, body, factor):
 
 
 @helper
+def put_constraint(q, p, made, k, C):
+    """Evaluate C of joint row k."""
+    kind, row, i, at, j, there, more, moved = tables.joint_at(p, k)
+    if kind == layout.WRITTEN:
+        C[row] = made[moved]
+        return
+    if kind == layout.ANGLE:
+        C[row] = angle_of(q, j) - angle_of(q, i) - p[more] - result(made, moved, 0)
+        return
+    ax, ay, _, _ = place(q, i, p, at)
+    bx, by, _, _ = place(q, j, p, there)
+    x, y = bx - ax, by - ay
+    if kind == layout.PIN:
+        C[row], C[row + 1] = x, y
+    elif kind == layout.DISTANCE:
+        C[row] = 0.5 * (x * x + y * y - p[more] * p[more])
+    else:
+        fx, fy = direction(q, i, p[more], kind == layout.ACROSS)
+        C[row] = fx * x + fy * y - result(made, moved, 0)
+
+
+@helper
 def fill_constraint(q, p, made, C):
     """Evaluate C."""
     for k in tables.joint_places(p):
-        kind, row, i, at, j, there, more, moved = tables.joint_at(p, k)
-        if kind == layout.RATE:
-            continue
-        if kind == layout.WRITTEN:
-            C[row] = made[moved]
-            continue
-        if kind == layout.ANGLE:
-            C[row] = angle_of(q, j) - angle_of(q, i) - p[more] - result(made, moved, 0)
-            continue
-        ax, ay, _, _ = place(q, i, p, at)
-        bx, by, _, _ = place(q, j, p, there)
-        x, y = bx - ax, by - ay
-        if kind == layout.PIN:
-            C[row], C[row + 1] = x, y
-        elif kind == layout.DISTANCE:
-            C[row] = 0.5 * (x * x + y * y - p[more] * p[more])
-        else:
-            fx, fy = direction(q, i, p[more], kind == layout.ACROSS)
-            C[row] = fx * x + fy * y - result(made, moved, 0)
+        if p[k] != layout.RATE:
+            put_constraint(q, p, made, k, C)
+
+
+@helper
+def pin_rows(Cq, row, one, other, adx, ady, bdx, bdy):
+    """Evaluate the two rows of a pin."""
+    if one >= 0:
+        Cq[row, 3 * one], Cq[row, 3 * one + 2] = -1.0, -adx
+        Cq[row + 1, 3 * one + 1], Cq[row + 1, 3 * one + 2] = -1.0, -ady
+    if other >= 0:
+        Cq[row, 3 * other], Cq[row, 3 * other + 2] = 1.0, bdx
+        Cq[row + 1, 3 * other + 1], Cq[row + 1, 3 * other + 2] = 1.0, bdy
 
 
 @helper
@@ -94,10 +109,7 @@ def fill_rows(q, p, made, k, Cq, row, one, other):
     bx, by, bdx, bdy = place(q, j, p, there)
     x, y = bx - ax, by - ay
     if kind == layout.PIN:
-        add(Cq[row], one, -1.0, 0.0, adx, ady)
-        add(Cq[row], other, 1.0, 0.0, bdx, bdy)
-        add(Cq[row + 1], one, 0.0, -1.0, adx, ady)
-        add(Cq[row + 1], other, 0.0, 1.0, bdx, bdy)
+        pin_rows(Cq, row, one, other, adx, ady, bdx, bdy)
     elif kind == layout.DISTANCE:
         add(Cq[row], one, -x, -y, adx, ady)
         add(Cq[row], other, x, y, bdx, bdy)
@@ -126,32 +138,37 @@ def fill_rate(q, p, made, Ct):
 
 
 @helper
+def put_gamma(q, v, p, made, k, Qd):
+    """Evaluate the right-hand side of C_q a = gamma of joint row k."""
+    kind, row, i, at, j, there, more, moved = tables.joint_at(p, k)
+    if kind == layout.WRITTEN:
+        Qd[row] = made[moved + 2]
+        return
+    if kind == layout.ANGLE:
+        Qd[row] = result(made, moved, 2)
+        return
+    ax, ay, adx, ady = place(q, i, p, at)
+    bx, by, bdx, bdy = place(q, j, p, there)
+    au, av, aa, ab = motion(v, i, adx, ady)
+    bu, bv, ba, bb = motion(v, j, bdx, bdy)
+    x, y, u, w, a, b = bx - ax, by - ay, bu - au, bv - av, ba - aa, bb - ab
+    if kind == layout.PIN:
+        Qd[row], Qd[row + 1] = -a, -b
+    elif kind == layout.DISTANCE:
+        Qd[row] = -u * u - w * w - x * a - y * b
+    else:
+        fx, fy = direction(q, i, p[more], kind == layout.ACROSS)
+        rate = angle_of(v, i)
+        turned = 2.0 * rate * (fx * w - fy * u)
+        Qd[row] = result(made, moved, 2) - fx * a - fy * b - turned + rate * rate * (fx * x + fy * y)
+
+
+@helper
 def fill_gamma(q, v, p, made, Qd):
     """Evaluate the right-hand side of C_q a = gamma."""
     for k in tables.joint_places(p):
-        kind, row, i, at, j, there, more, moved = tables.joint_at(p, k)
-        if kind == layout.RATE:
-            continue
-        if kind == layout.WRITTEN:
-            Qd[row] = made[moved + 2]
-            continue
-        if kind == layout.ANGLE:
-            Qd[row] = result(made, moved, 2)
-            continue
-        ax, ay, adx, ady = place(q, i, p, at)
-        bx, by, bdx, bdy = place(q, j, p, there)
-        au, av, aa, ab = motion(v, i, adx, ady)
-        bu, bv, ba, bb = motion(v, j, bdx, bdy)
-        x, y, u, w, a, b = bx - ax, by - ay, bu - au, bv - av, ba - aa, bb - ab
-        if kind == layout.PIN:
-            Qd[row], Qd[row + 1] = -a, -b
-        elif kind == layout.DISTANCE:
-            Qd[row] = -u * u - w * w - x * a - y * b
-        else:
-            fx, fy = direction(q, i, p[more], kind == layout.ACROSS)
-            rate = angle_of(v, i)
-            turned = 2.0 * rate * (fx * w - fy * u)
-            Qd[row] = result(made, moved, 2) - fx * a - fy * b - turned + rate * rate * (fx * x + fy * y)
+        if p[k] != layout.RATE:
+            put_gamma(q, v, p, made, k, Qd)
 
 
 @helper
@@ -234,6 +251,25 @@ def constraint(t, q, p, C):
 @callback("jacobian")
 def jacobian(t, q, p, Cq):
     fill_jacobian(q, p, tables.motions(t, q, q, p), Cq)
+
+
+@callback("kinematics")
+def kinematics(t, q, v, p, C, Cq, Ct, Qd):
+    made = tables.motions(t, q, v, p)
+    for k in tables.joint_places(p):
+        kind, row, i, at, j, there, _, _ = tables.joint_at(p, k)
+        if kind == layout.PIN:  # most joints are pins: each of their sines is needed once
+            ax, ay, adx, ady = place(q, i, p, at)
+            bx, by, bdx, bdy = place(q, j, p, there)
+            _, _, aa, ab = motion(v, i, adx, ady)
+            _, _, ba, bb = motion(v, j, bdx, bdy)
+            C[row], C[row + 1], Qd[row], Qd[row + 1] = bx - ax, by - ay, aa - ba, ab - bb
+            pin_rows(Cq, row, i, j, adx, ady, bdx, bdy)
+        elif kind != layout.RATE:
+            put_constraint(q, p, made, k, C)
+            fill_rows(q, p, made, k, Cq, row, i, j)
+            put_gamma(q, v, p, made, k, Qd)
+    fill_rate(q, p, made, Ct)
 
 
 @callback("mass_values")

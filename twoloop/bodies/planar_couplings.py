@@ -1,4 +1,4 @@
-"""Planar joints that couple motions: gears, racks, rolling wheels, points on curves."""
+"""Planar joints that couple motions: rolling wheels, blades, points on curves, and the rows of gears and racks."""
 
 from __future__ import annotations
 
@@ -8,64 +8,30 @@ from typing import Any
 import numpy as np
 
 from twoloop.bodies.documented import documented
-from twoloop.bodies.model import Model
-from twoloop.bodies.parameter_layout import RATE, WRITTEN
+from twoloop.bodies.gears import Gears, Row
+from twoloop.bodies.parameter_layout import RATE
 from twoloop.bodies.parts import Body, JointRow, ModelJoint, Numbers
 from twoloop.bodies.places import placed, turned
-from twoloop.bodies.row_function import RateFunction, RowFunction
-from twoloop.checks.arguments import check_finite, check_positive
+from twoloop.bodies.row_function import RateFunction
+from twoloop.checks.arguments import check_positive
 
 
 @documented
-class Couplings(Model):
+class Couplings(Gears):
     """Adds couplings to a planar model. Their constants are not parameters of the model."""
 
-    def gear(
-        self, one: ModelJoint | str, other: ModelJoint | str, *, ratio: float, name: str | None = None
-    ) -> ModelJoint:
-        """Couple two hinges: `other` turns by `ratio` times the rotation of `one`, from the position given.
+    def _gear_row(self, one: ModelJoint, other: ModelJoint, ratio: float) -> Row:
+        return lambda q: _turned(q, other) - ratio * _turned(q, one)
 
-        The reaction is a torque on the bodies of `other`.
-
-        Parameters
-        ----------
-        one, other : ModelJoint or str
-            Revolute joints; the rotation is that of b relative to a. For two wheels on one carrier, a is the carrier.
-        ratio : float
-            Negative for external gears: minus the radius of `one` over that of `other`.
-        """
-        first, second = self._two(one, "revolute", other, "revolute", "gear")
-        factor = check_finite("ratio", ratio)
-        if factor == 0.0:
-            raise ValueError("ratio must not be zero: the other hinge would be held; use fixed(...) for that")
-        name = self._new_name(f"gear of {first.name} and {second.name}", name)
-        return self._coupled(name, "gear", second, [lambda q: _turned(q, second) - factor * _turned(q, first)], first)
-
-    def rack(
-        self, pinion: ModelJoint | str, slide: ModelJoint | str, *, radius: float, name: str | None = None
-    ) -> ModelJoint:
-        """Couple a pinion to a rack: the slide moves by `radius` times the pinion's rotation since the position given.
-
-        Parameters
-        ----------
-        pinion, slide : ModelJoint or str
-            A revolute and a prismatic joint.
-        radius : float
-            m; negative if a rotation from x to y moves the slide against its axis.
-        """
-        first, second = self._two(pinion, "revolute", slide, "prismatic", "rack")
-        factor = check_finite("radius", radius)
-        if factor == 0.0:
-            raise ValueError("radius must not be zero: the slide would be held; use fixed(...) for that")
-        name = self._new_name(f"rack of {first.name} and {second.name}", name)
-        angle = float(np.arctan2(*self._axis(second)[::-1]))
-        ends = [np.array(point.values) for point in (second.point_a, second.point_b)]
+    def _rack_row(self, pinion: ModelJoint, slide: ModelJoint, radius: float) -> Row:
+        angle = float(np.arctan2(*self._axis(slide)[::-1]))
+        ends = [np.array(point.values) for point in (slide.point_a, slide.point_b)]
 
         def slid(q: Any) -> Any:
-            return _along(q, second.a, angle, ends[0], second.b, ends[1])
+            return _along(q, slide.a, angle, ends[0], slide.b, ends[1])
 
         start = slid(self._start())
-        return self._coupled(name, "rack", second, [lambda q: slid(q) - start - factor * _turned(q, first)], first)
+        return lambda q: slid(q) - start - radius * _turned(q, pinion)
 
     def rolling(
         self, a: Body | str, wheel: Body | str, *, radius: float, axis: Any, name: str | None = None
@@ -160,23 +126,6 @@ class Couplings(Model):
 
         joint = ModelJoint(name, "point on curve", first, second, (), *points)
         return self._coupled(name, "point on curve", joint, [off], joint)
-
-    def _two(self, one: Any, kind: str, other: Any, other_kind: str, what: str) -> tuple[ModelJoint, ModelJoint]:
-        first, second = self._joint(one, (kind,), what), self._joint(other, (other_kind,), what)
-        if first is second:
-            raise ValueError(f"a {what} needs two joints; given {first.name!r} twice")
-        return first, second
-
-    def _coupled(
-        self, name: str, kind: str, acts: ModelJoint, rows: list[Callable[[Any], Any]], also: ModelJoint
-    ) -> ModelJoint:
-        """Return the joint whose rows are functions of the coordinates of the bodies of two joints."""
-        columns = tuple(sorted({j for joint in (acts, also) for body in (joint.a, joint.b) for j in body.coordinates}))
-        places = Numbers((float(len(columns)), *map(float, columns)))
-        ends = acts.a, acts.b, acts.point_a, acts.point_b
-        functions = (RowFunction(f"{kind} {name!r}", row, columns) for row in rows)
-        made = tuple(JointRow(WRITTEN, 1, *ends, places, each) for each in functions)
-        return self._add_joint(ModelJoint(name, kind, acts.a, acts.b, made, acts.point_a, acts.point_b))
 
 
 def _angle(q: Any, body: Body) -> Any:

@@ -6,9 +6,9 @@ import numpy as np
 
 from twoloop.bodies.parameter_layout import PULL, SPRING
 from twoloop.bodies.parts import Body
+from twoloop.bodies.points import Sketch
 from twoloop.bodies.tables import Tables
 from twoloop.checks.arguments import Array
-from twoloop.mechanisms.points import Sketch
 from twoloop.problem.drawing import Drawing
 
 

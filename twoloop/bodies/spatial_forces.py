@@ -4,9 +4,9 @@ import math
 
 from twoloop.bodies import parameter_layout as layout
 from twoloop.bodies.read_tables import force_at, force_places, n_bodies, push, value
+from twoloop.bodies.rotation import half_spin
 from twoloop.bodies.spatial_places import centre, motion, move_row, place, push_row, spin, torsion, twist_row, vector
 from twoloop.kernels.compile.caches import helper
-from twoloop.mechanisms.rotation import half_spin
 
 WEIGHT = 3  # components of gravity, which precede the numbers of the bodies
 

@@ -13,10 +13,10 @@ from twoloop.bodies.documented import documented
 from twoloop.bodies.functions import Function
 from twoloop.bodies.parameter_layout import AXIAL, LENGTH, PLANE, POINT, SLIDE, TORSION, TURN
 from twoloop.bodies.parts import Body, Force, JointRow, ModelJoint, Numbers
+from twoloop.bodies.rotation import euler_parameters, euler_rates, perpendiculars, rotation_matrix
 from twoloop.bodies.spatial_rows import across, on_line, parallel, relative
 from twoloop.bodies.wheels import Wheels
 from twoloop.checks.arguments import Array, shown
-from twoloop.mechanisms.rotation import euler_parameters, euler_rates, perpendiculars, rotation_matrix
 
 PERPENDICULAR_TO = 1e-6  # largest cosine of the angle between the axes of a universal joint
 
@@ -242,6 +242,7 @@ class SpatialModel(Wheels):
         return euler_rates(state[3:], spin)
 
     def _check_branches(self, t: float, q: Array) -> None:
+        super()._check_branches(t, q)
         for joint in self.joints:
             row = joint.rows[0]
             if row.kind != TURN or row.motion is None:

@@ -5,11 +5,59 @@ Coordinates of a body: x, y, z of the centre of mass and Euler parameters; see `
 
 import math
 
+from twoloop.bodies.rotation import half_spin, pulled, rotated, rotated_rate
 from twoloop.kernels.compile.caches import helper
-from twoloop.mechanisms.rotation import half_spin, rotated
-from twoloop.mechanisms.spatial import centre, move_row, turn_row, vector, vector_rate
 
 FARTHEST = -math.cos(0.95 * math.pi)  # 0.95 of a turn
+
+
+@helper
+def vector(q, body, x, y, z):
+    """Return a body-fixed vector in space."""
+    if body < 0:
+        return x, y, z
+    k = 7 * body + 3
+    return rotated(q[k], q[k + 1], q[k + 2], q[k + 3], x, y, z)
+
+
+@helper
+def vector_rate(q, v, body, x, y, z):
+    """Return its time derivative, and 2 R(e') a, its second derivative for e'' = 0."""
+    if body < 0:
+        return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    k = 7 * body + 3
+    ux, uy, uz = rotated_rate(q[k], q[k + 1], q[k + 2], q[k + 3], v[k], v[k + 1], v[k + 2], v[k + 3], x, y, z)
+    ax, ay, az = rotated(v[k], v[k + 1], v[k + 2], v[k + 3], x, y, z)
+    return ux, uy, uz, 2.0 * ax, 2.0 * ay, 2.0 * az
+
+
+@helper
+def centre(q, body):
+    """Return the centre of mass, or its velocity from v."""
+    if body < 0:
+        return 0.0, 0.0, 0.0
+    return q[7 * body], q[7 * body + 1], q[7 * body + 2]
+
+
+@helper
+def turn_row(q, row, body, x, y, z, fx, fy, fz):
+    """Add to a row (n_q,) the gradient of f . (vector of a body) in its Euler parameters."""
+    if body >= 0:
+        k = 7 * body + 3
+        d0, d1, d2, d3 = pulled(q[k], q[k + 1], q[k + 2], q[k + 3], x, y, z, fx, fy, fz)
+        row[k] += d0
+        row[k + 1] += d1
+        row[k + 2] += d2
+        row[k + 3] += d3
+
+
+@helper
+def move_row(row, body, fx, fy, fz):
+    """Add to a row the gradient of f . (centre of a body)."""
+    if body >= 0:
+        row[7 * body] += fx
+        row[7 * body + 1] += fy
+        row[7 * body + 2] += fz
 
 
 @helper

@@ -6,8 +6,8 @@ import numpy as np
 
 from twoloop.bodies.parameter_layout import PERPENDICULAR, PLANE
 from twoloop.bodies.parts import Body, JointRow, Numbers
+from twoloop.bodies.rotation import perpendiculars
 from twoloop.checks.arguments import Array
-from twoloop.mechanisms.rotation import perpendiculars
 
 
 def across(a: Body, one: Array, b: Body, other: Array) -> JointRow:

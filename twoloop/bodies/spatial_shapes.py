@@ -8,17 +8,17 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from twoloop.bodies.documented import documented
-from twoloop.bodies.model import Model
 from twoloop.bodies.parts import Body
+from twoloop.bodies.rotation import euler_parameters, perpendiculars, rotation_matrix
+from twoloop.bodies.spatial_gears import SpatialGears
 from twoloop.bodies.tables import TENSOR
 from twoloop.checks.arguments import Array, check_positive, check_real, check_vector, shown
-from twoloop.mechanisms.rotation import euler_parameters, perpendiculars, rotation_matrix
 
 SYMMETRIC = 1e-9  # relative tolerance of the symmetry of an inertia tensor
 
 
 @documented
-class SpatialShapes(Model):
+class SpatialShapes(SpatialGears):
     """Adds bodies to a spatial model."""
 
     dimension = 3

@@ -11,10 +11,10 @@ from twoloop.bodies.documented import documented
 from twoloop.bodies.parameter_layout import RATE, WRITTEN
 from twoloop.bodies.parts import Body, JointRow, ModelJoint, Numbers
 from twoloop.bodies.places import turned
+from twoloop.bodies.rotation import perpendiculars
 from twoloop.bodies.row_function import RateFunction, RowFunction
 from twoloop.bodies.spatial_shapes import SpatialShapes
 from twoloop.checks.arguments import check_positive, check_vector
-from twoloop.mechanisms.rotation import perpendiculars
 
 FLAT = 1e-6  # smallest sine of the angle between axle and normal
 

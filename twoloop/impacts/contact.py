@@ -1,4 +1,4 @@
-"""A system with some of its stops closed: additional constraints, valid while the contact forces push."""
+"""A system with some of its stops closed, sliding or sticking: additional constraints and friction."""
 
 from __future__ import annotations
 
@@ -9,28 +9,52 @@ import numpy as np
 from twoloop.checks.arguments import Array
 from twoloop.generate.derived import standing_for
 from twoloop.generate.traced_values import unchecked
-from twoloop.impacts.gaps import Gaps
+from twoloop.impacts.gaps import Gap, Gaps
 from twoloop.kernels.compile.linking import direct
 from twoloop.kernels.data import codes, noted
 from twoloop.methods.dop853 import DOP853
 from twoloop.problem.system import ConstrainedSystem
+from twoloop.run.impulse import NEGLIGIBLE
 from twoloop.run.run import Run
 
 
 class WithContacts:
-    """Callbacks of a system extended by the gaps of closed stops as constraints.
+    """Callbacks of a system extended by the gaps of closed stops as constraints, and by their friction.
 
     Parameters
     ----------
     system : ConstrainedSystem
-    gaps : Gaps
+    gaps, slides : Gaps
     which : list of int
         Indices of the closed stops.
+    sticks : dict
+        Displacements along the surface that do not change, by indices of slides: these are constraints as well.
+    slips : list of (int, int, float)
+        For each stop that slides: its place in `which`, the index of its slide, and its coefficient of friction, with
+        the sign of the sliding.
     """
 
-    def __init__(self, system: ConstrainedSystem, gaps: Gaps, which: list[int]):
+    def __init__(
+        self,
+        system: ConstrainedSystem,
+        gaps: Gaps,
+        slides: Gaps,
+        which: list[int],
+        sticks: dict[int, float],
+        slips: list[tuple[int, int, float]],
+    ):
         self._system, self._gaps, self._which = system, gaps, which
+        self._slides, self._held, self._slips = slides, list(sticks), slips
+        self._from = np.array(list(sticks.values()))
         self._still = np.zeros(system.n_q)
+        self._derived = standing_for(system, unchecked)[0] if slips else system
+
+    def _rows(self, t: float, q: Array, v: Array) -> Gap:
+        """Return the gaps of closed stops, followed by the displacements that do not change."""
+        parts = self._gaps.at(t, q, v), self._slides.at(t, q, v)
+        both = (np.concatenate([one[self._which], other[self._held]]) for one, other in zip(*parts, strict=True))
+        made = Gap(*both)
+        return made._replace(g=made.g - np.append(np.zeros(len(self._which)), self._from))
 
     def _of(self, kind: str, t: float, *state: Array) -> Array:
         (out,) = self._system.arrays_of(kind)
@@ -39,21 +63,37 @@ class WithContacts:
 
     def constraint(self, t: float, q: Array) -> Array:
         """Evaluate C, followed by the gaps."""
-        return np.append(self._of("constraint", t, q), self._gaps.at(t, q, self._still).g[self._which])
+        return np.append(self._of("constraint", t, q), self._rows(t, q, self._still).g)
 
     def jacobian(self, t: float, q: Array) -> Array:
         """Evaluate C_q, followed by the gradients of the gaps."""
         rows = self._system.jacobian(t, q) if self._system.n_c else np.zeros((0, self._system.n_q))
-        return np.vstack([rows, self._gaps.at(t, q, self._still).W[self._which]])
+        return np.vstack([rows, self._rows(t, q, self._still).W])
 
     def constraint_rate(self, t: float, q: Array) -> Array:
         """Evaluate C_t, followed by the time derivatives of the gaps."""
-        return np.append(self._system.constraint_rate(t, q), self._gaps.at(t, q, self._still).u[self._which])
+        return np.append(self._system.constraint_rate(t, q), self._rows(t, q, self._still).u)
 
     def gamma(self, t: float, q: Array, v: Array) -> Array:
         """Evaluate the right-hand side of C_q a = gamma, followed by that of the gaps."""
         own = self._of("gamma", t, q, v) if self._system.n_c else np.zeros(0)
-        return np.append(own, -self._gaps.at(t, q, v).bend[self._which])
+        return np.append(own, -self._rows(t, q, v).bend)
+
+    def force(self, t: float, q: Array, v: Array) -> Array:
+        """Evaluate Q, and the friction of the stops that slide, which follows from their forces."""
+        Q = self._of("force", t, q, v)
+        if not self._slips:
+            return Q
+        system, contact, slides = self._derived, self._rows(t, q, v), self._slides.at(t, q, v).W
+        rows = np.vstack([system.rows(t, q), contact.W])
+        own = [system.gamma(t, q, v)] if system.n_c else []
+        own += [system.nonholonomic_gamma(t, q, v)] if system.n_a else []
+        n, first = system.n_q, system.n_q + system.n_c + system.n_a
+        K = np.block([[self._of("mass", t, q), rows.T], [rows, np.zeros((len(rows),) * 2)]])
+        for place, k, coefficient in self._slips:
+            K[:n, first + place] -= coefficient * slides[k]
+        found = np.linalg.lstsq(K, np.concatenate([Q, *own, -contact.bend]), rcond=NEGLIGIBLE)[0]
+        return Q + sum(coefficient * found[first + place] * slides[k] for place, k, coefficient in self._slips)
 
     def made(self, names: str) -> ConstrainedSystem:
         """Return the system with these callbacks."""
@@ -62,13 +102,17 @@ class WithContacts:
             kind: getattr(self, kind) for kind in ("constraint", "jacobian", "constraint_rate")
         }
         functions["mass"] = lambda t, q: self._of("mass", t, q)
-        functions["force"] = lambda t, q, v: self._of("force", t, q, v)
+        functions["force"] = self.force
         if "gamma" in system.given or system.n_c == 0:
             functions["gamma"] = self.gamma
         for kind in system.given:
             if kind.startswith("nonholonomic"):
                 functions[kind] = getattr(system, kind)
-        sizes: dict[str, Any] = {"n_q": system.n_q, "n_c": system.n_c + len(self._which), "n_a": system.n_a}
+        sizes: dict[str, Any] = {
+            "n_q": system.n_q,
+            "n_c": system.n_c + len(self._which) + len(self._held),
+            "n_a": system.n_a,
+        }
         return ConstrainedSystem.from_python(**sizes, **functions, name=f"{system.name} on {names}")
 
 

@@ -28,10 +28,11 @@ class Gap(NamedTuple):
 
 
 class Gaps:
-    """The gap functions of all stops.
+    """Gap functions of stops, or the slides of those that rub.
 
     Parameters
     ----------
+    what : "gap" or "slide"
     stops : sequence of Stop
     t0, q0 : float, ndarray (n_q,)
         State near which the traced programs are compared with the functions.
@@ -39,18 +40,18 @@ class Gaps:
     Raises ValueError if a gap function cannot be traced, or disagrees with its trace.
     """
 
-    def __init__(self, stops: Sequence[Stop], t0: float, q0: Array):
-        self.n, self._n_q = len(stops), len(q0)
+    def __init__(self, what: str, stops: Sequence[Stop], t0: float, q0: Array):
+        self.n, self._n_q, self._what = len(stops), len(q0), what
         graph = Graph()
         (t,) = graph.inputs(1, False)
         q, v = graph.inputs(self._n_q, False), graph.inputs(self._n_q, True)
         made: list[Form] = []
         for stop in stops:
             try:
-                gap = as_forms(graph, np.array(trace(stop.gap, t, symbols(q)), dtype=object).reshape(1))[0]
+                gap = as_forms(graph, np.array(trace(getattr(stop, what), t, symbols(q)), dtype=object).reshape(1))[0]
             except (Untraceable, ValueError) as error:
                 raise ValueError(
-                    f"gap of {stop.name!r} must be a number computed from t and q by numpy functions, without "
+                    f"{what} of {stop.name!r} must be a number computed from t and q by numpy functions, without "
                     f"branches: {error}"
                 ) from None
             made += _with_derivatives(graph, gap, t, q, v)
@@ -77,13 +78,15 @@ class Gaps:
             t, q = t0 + 0.37 * k, q0 + each
             found = self.at(t, q, np.zeros_like(q)).g
             for stop, own in zip(stops, found, strict=True):
-                value: Any = stop.gap(t, q.copy())
+                value: Any = getattr(stop, self._what)(t, q.copy())
                 if k == 0 and not (np.ndim(value) == 0 and np.isfinite(value)):
-                    raise ValueError(f"gap of {stop.name!r} must return a finite number; it returned {shown(value)}")
+                    raise ValueError(
+                        f"{self._what} of {stop.name!r} must return a finite number; it returned {shown(value)}"
+                    )
                 if np.isfinite(value) and abs(value - own) > AGREES * (1.0 + abs(own)):
                     raise ValueError(
-                        f"gap of {stop.name!r} has another value at t = {t:g} than when it was traced: it must depend "
-                        "on t and q alone, without branches"
+                        f"{self._what} of {stop.name!r} has another value at t = {t:g} than when it was traced: it "
+                        "must depend on t and q alone, without branches"
                     )
 
 

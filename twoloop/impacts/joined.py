@@ -18,13 +18,17 @@ CHANGES = "velocities jumped in impacts, or stops were closed or joints stuck fo
 
 
 class Impact(NamedTuple):
-    """An impact: time, s; stops; velocities before and after (n_q,); impulses, N s (N m s for an angle)."""
+    """An impact: time, s; stops; velocities before and after (n_q,); impulses of the stops and of their friction.
+
+    Impulses are in N s (N m s for an angle); those of friction act along `slide`, and are zero without friction.
+    """
 
     t: float
     stops: tuple[str, ...]
     v_before: Array
     v_after: Array
     impulses: Array
+    friction: Array
 
 
 class ArcState(NamedTuple):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -11,8 +12,9 @@ from numpy.typing import NDArray
 from twoloop.checks.arguments import Array
 from twoloop.impacts.contact import Accelerations, WithContacts
 from twoloop.impacts.gaps import Gap, Gaps
+from twoloop.impacts.grip import AT_REST, Grip, Mode
 from twoloop.impacts.joined import Impact, joined
-from twoloop.impacts.laws import NEGLIGIBLE, bounded, complementary, impulses, responses
+from twoloop.impacts.laws import NEGLIGIBLE, Undetermined, bounded, coulomb, impulses, responses
 from twoloop.impacts.rubbing import IDLE, INDEPENDENT, STICKS, Modes, Signs
 from twoloop.problem.stops import Stop
 from twoloop.problem.system import ConstrainedSystem
@@ -28,13 +30,8 @@ LEAST_STEP = 1e-9  # first step of an arc, relative to max(1 s, t)
 ZERO = 1e-20  # m or rad, or per s: smaller coordinates and rates are rounding errors
 STALLED = 1e-13  # relative to max(1 s, t): shorter arcs count as stalled ...
 MAX_STALLED = 30  # ... and this many stalled arcs in a row end the motion
-AT_REST = 1e-10  # relative to the largest velocities of the last arc: smaller joint rates count as zero
 RELEASED = 1e-7  # relative reduction of the static friction of a joint just released, which prevents chattering
 AT_MOST = 1e-9  # relative: margin of a joint held by its full friction
-
-
-class Undetermined(ValueError):
-    """No admissible distribution of the load among sticking joints and stops was found."""
 
 
 class Motion:
@@ -54,7 +51,7 @@ class Motion:
         self.system, self.modes, self.stops, self.options = modes.system, modes, list(stops), options
         self.t, self.q, self.v = t, q, v
         self.e = np.array([stop.restitution for stop in stops])
-        self.gaps = Gaps(stops, t, q)
+        self.gaps, self.grip = Gaps("gap", stops, t, q), Grip(stops, t, q)
         self.low = max(LOW * float(options["atol"].min()), ROUNDING * max(1.0, float(np.abs(q).max())))
         wrong = np.flatnonzero(self.gaps.at(t, q, v).g < -100.0 * self.low)
         if wrong.size:
@@ -66,7 +63,7 @@ class Motion:
         self.speeds = np.abs(v)  # largest velocities of the last arc
         self.still: set[int] = set()  # joints that have stopped or stick
         self.released: set[int] = set()  # joints that stuck in the last arc
-        self._known: dict[tuple[int, tuple[int, ...]], tuple[ConstrainedSystem, ConstrainedSystem]] = {}
+        self._known: dict[Any, tuple[ConstrainedSystem, ConstrainedSystem]] = {}
         self._forces: dict[int, tuple[ConstrainedSystem, Accelerations]] = {}
 
     def to(self, t1: float, times: Array | None) -> Result:
@@ -75,7 +72,7 @@ class Motion:
         while True:
             before = self.t
             try:
-                self._run_arc(*self._resolve(), t1)
+                self._run_arc(self._resolve(), t1)
             except Undetermined as error:
                 if not self.arcs:
                     raise
@@ -96,12 +93,12 @@ class Motion:
     @property
     def _summary(self) -> str:
         changes = f"{len(self.arcs) - 1} changes between sliding and sticking."
-        if self.stops and self.modes.n:
+        if self.stops and (self.modes.n or self.grip.place):
             return f"{len(self.impacts)} impacts, {len(self.arcs) - 1} changes of sliding, sticking or contact."
         return changes if self.modes.n else f"{len(self.impacts)} impacts."
 
-    def _resolve(self) -> tuple[Signs, tuple[int, ...]]:
-        """Apply an impact; return the sliding direction of each joint (0: sticks) and the stops that stay closed."""
+    def _resolve(self) -> Mode:
+        """Apply an impact; return which joints and stops slide or stick, and which stops stay closed."""
         gap = self.gaps.at(self.t, self.q, self.v)
         near = np.flatnonzero(gap.g <= self.low)
         slow = np.zeros(near.size, dtype=bool)
@@ -110,25 +107,26 @@ class Motion:
         closing = near[slow]
         signs, of = self._sliding(self.v)
         if not closing.size and not of:
-            return signs, ()
+            return Mode(signs)
         a, c_rubs = self._free(signs, of, self.v)
         gap = self.gaps.at(self.t, self.q, self.v)
-        c = np.append(gap.W[closing] @ a + gap.bend[closing], c_rubs)
-        W = np.vstack([gap.W[closing], self.modes.along(self.q)[of]])
+        touch, slide, rubs = self.grip.rows(closing.tolist(), self.t, self.q, self.v, self.speeds)
+        c = np.concatenate([gap.W[closing] @ a + gap.bend[closing], c_rubs, slide.W @ a + slide.bend])
+        W = np.vstack([gap.W[closing], self.modes.along(self.q)[of], slide.W])
         D = W @ responses(self.system, self.t, self.q, W)
-        if not of:
-            return signs, tuple(closing[complementary(D, c) > 0.0].tolist())
-        n = len(closing)
-        force = bounded(D, c, n, self._most(of))
-        left = (D @ force + c)[n:]  # accelerations of the joints
-        terms = (np.abs(D) @ np.abs(force) + np.abs(c))[n:] + D.diagonal()[n:] * self.modes.most[of]
+        n, last = len(closing), len(closing) + len(of)
+        low = np.array([(1.0 - RELEASED) if k in self.grip.released else 1.0 for k in touch])
+        force, slides = coulomb(D, c, self._most(of), rubs._replace(coefficient=rubs.coefficient * low))
         pushes = force[:n] > 0.0
         base = np.flatnonzero(pushes).tolist()
-        for k, sign, slides, at in zip(
-            of, np.sign(left), np.abs(left) > AT_MOST * terms, range(n, n + len(of)), strict=True
-        ):
-            signs[k] = int(sign) if slides else self._sticks(k, force[at], D, at, base, pushes.sum())
-        return signs, tuple(closing[pushes].tolist())
+        left = (D @ force + c)[n:last]  # accelerations of the joints
+        terms = (np.abs(D) @ np.abs(force) + np.abs(c))[n:last] + D.diagonal()[n:last] * self.modes.most[of]
+        for k, sign, moves, at in zip(of, np.sign(left), np.abs(left) > AT_MOST * terms, range(n, last), strict=True):
+            signs[k] = int(sign) if moves else self._sticks(k, force[at], D, at, base, pushes.sum())
+        rubbing = [(k, last + i, int(slides[i])) for i, k in enumerate(touch) if pushes[rubs.normal[i]]]
+        sticks = self.grip.groups(D, base, {k: at for k, at, sign in rubbing if not sign})
+        slips = {k: sign for k, _, sign in rubbing if sign}
+        return Mode(signs, tuple(closing[pushes].tolist()), slips, sticks)
 
     def _most(self, of: list[int]) -> Array:
         """Return the friction available to joints at rest; slightly reduced for those just released."""
@@ -149,21 +147,27 @@ class Motion:
 
     def _apply_impulses(self, gap: Gap, near: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Apply the impulses at closed stops to the velocities; return which of these stops would hardly open."""
-        X = responses(self.system, self.t, self.q, gap.W[near])  # dry friction causes no impulse
-        D = gap.W[near] @ X
-        before, u = self.v, gap.u[near]
-        P = impulses(D, u, self.e[near])
+        touch, slide, rubs = self.grip.rows(near.tolist(), self.t, self.q, self.v, self.speeds)
+        rubs = rubs._replace(sign=0 * rubs.sign)  # the direction after the impact counts
+        W = np.vstack([gap.W[near], slide.W])
+        X = responses(self.system, self.t, self.q, W)  # dry friction of joints causes no impulse
+        D, n = W @ X, len(near)
+        before, u = self.v, np.append(gap.u[near], slide.u)
+        u[np.abs(u) <= ROUNDING * (np.abs(W) @ self.speeds)] = 0.0
+        P = impulses(D, u, self.e[near], rubs)
         v = before + X @ P
         slow = self._hardly_open(near, v)
-        if (slow & (P > 0.0) & (self.e[near] > 0.0)).any():
-            P = impulses(D, u, np.where(slow, 0.0, self.e[near]))
+        if (slow & (P[:n] > 0.0) & (self.e[near] > 0.0)).any():
+            P = impulses(D, u, np.where(slow, 0.0, self.e[near]), rubs)
             v = before + X @ P
             slow = self._hardly_open(near, v)
-        hit = P > 0.0
+        hit = P[:n] > 0.0
         if hit.any():
             names = tuple(self.stops[k].name for k in near[hit])
-            self.impacts.append(Impact(self.t, names, before.copy(), v.copy(), P[hit]))
-            self.still, self.released = set(), set()
+            rubbed = {k: float(x) for k, x in zip(touch, P[n:], strict=True)}
+            along = np.array([rubbed.get(k, 0.0) for k in near[hit].tolist()])
+            self.impacts.append(Impact(self.t, names, before.copy(), v.copy(), P[:n][hit], along))
+            self.still, self.released, self.grip.still, self.grip.released = set(), set(), set(), set()
         self.v = v
         return slow
 
@@ -202,24 +206,31 @@ class Motion:
             self._forces[id(system)] = system, made
         return made
 
-    def _with_contacts(self, system: ConstrainedSystem, resting: tuple[int, ...], kept: bool) -> ConstrainedSystem:
+    def _with_contacts(self, system: ConstrainedSystem, mode: Mode, kept: bool) -> ConstrainedSystem:
         """Return a system with some stops closed."""
+        resting, grip = mode.resting, self.grip
         if not resting:
             return system
-        key = id(system), resting
-        if key in self._known:
+        key = id(system), resting, tuple(mode.slips.items())
+        if kept and key in self._known:
             return self._known[key][1]
-        names = ", ".join(self.stops[k].name for k in resting)
-        made = WithContacts(system, self.gaps, list(resting)).made(names)
+        held = {k for group in mode.sticks.values() for k in group}
+        names = ", ".join(f"{self.stops[k].name}{' (sticks)' if k in held else ''}" for k in resting)
+        here = grip.slides.at(self.t, self.q, self.v).g
+        sticks = {grip.place[k]: float(here[grip.place[k]]) for k in mode.sticks}
+        slips = [(resting.index(k), grip.place[k], sign * grip.coefficient(k)) for k, sign in mode.slips.items()]
+        made = WithContacts(system, self.gaps, grip.slides, list(resting), sticks, slips).made(names)
         if kept:
             self._known[key] = system, made
         return made
 
-    def _run_arc(self, signs: Signs, resting: tuple[int, ...], t1: float) -> None:
-        """Integrate until a gap closes or opens, or a joint stops or is released."""
-        mode, rows = self.modes.mode(signs, self.t, self.q)
-        lasting = not {STICKS, IDLE} & set(signs)  # the rows of sticking joints depend on where they stick
-        system = self._with_contacts(mode, resting, lasting)
+    def _run_arc(self, mode: Mode, t1: float) -> None:
+        """Integrate until a gap closes or opens, or a joint or a stop that rubs comes to rest or is released."""
+        signs, resting = mode.signs, mode.resting
+        free, rows = self.modes.mode(signs, self.t, self.q)
+        # the rows of what sticks depend on where it sticks
+        lasting = not {STICKS, IDLE} & set(signs) and not mode.sticks
+        system = self._with_contacts(free, mode, lasting)
         if system.n_c and (resting or self.modes.n):
             self._project(system, resting)
         start = self.gaps.at(self.t, self.q, self.v)
@@ -233,11 +244,19 @@ class Motion:
             return -multiplier(rows[k], t, q, v) * self.modes.turned(k, system, rows[k], t, q)
 
         def pulls(k: int) -> Any:
-            row = mode.n_c + resting.index(k)
+            row = free.n_c + resting.index(k)
             return terminal(lambda t, q, v: -multiplier(row, t, q, v))
+
+        def grips(row: int, group: list[int], t: float, q: Array, v: Array) -> tuple[float, float]:
+            loads = [(free.n_c + resting.index(k), self.grip.coefficient(k)) for k in group]
+            return multiplier(row, t, q, v), sum(-mu * multiplier(at, t, q, v) for at, mu in loads)
 
         events = [self._changes(k, sign, friction) for k, sign in enumerate(signs)]
         events += [pulls(k) if k in resting else self._closes(k, start) for k in range(len(self.stops))]
+        n = len(events)
+        events += [terminal(self._rests(k, sign)) for k, sign in mode.slips.items()]
+        for row, group in enumerate(mode.sticks.values(), free.n_c + len(resting)):
+            events.append(terminal(self._slips(partial(grips, row, group))))
         options = {**self.options, "check_derivatives": self.options.get("check_derivatives", True) and not self.arcs}
         if self.arcs and self.options.get("first_step") is None and self.arcs[-1].h.size:
             least = LEAST_STEP * max(1.0, abs(self.t))  # coordinates near zero have no scale for an initial step
@@ -248,6 +267,7 @@ class Motion:
             self.speeds = np.abs(arc.v).max(axis=1)
             self.t, self.q, self.v = float(arc.t[-1]), arc.q[:, -1].copy(), arc.v[:, -1].copy()
         over = {k for k in range(len(events)) if arc.t_events is not None and arc.t_events[k].size}
+        self.grip.change(mode, {k for i, k in enumerate([*mode.slips, *mode.sticks], n) if i in over})
         n = len(signs)
         self.opened = [k for k in resting if n + k in over]
         self.released = {k for k in over if k < n and signs[k] == STICKS}
@@ -287,7 +307,16 @@ class Motion:
         """Return the event that ends the mode of a joint."""
         if sign is IDLE:
             return terminal(lambda t, q, v: 1.0)
-        return terminal(self._slips(k, friction) if sign == STICKS else self._stops(k, sign))
+        if sign != STICKS:
+            return terminal(self._stops(k, sign))
+        return terminal(self._slips(lambda t, q, v: (friction(k, t, q, v), self.modes.most[k])))
+
+    def _rests(self, k: int, sign: int) -> Any:
+        """Return the event of a stop that ceases to slide; one that begins to slide is at rest initially."""
+        place, slides = self.grip.place[k], self.grip.slides
+        u0 = sign * float(slides.at(self.t, self.q, self.v).u[place])
+        least = u0 - self.low if k in self.grip.still | self.grip.released else 0.0
+        return lambda t, q, v: sign * float(slides.at(t, q, v).u[place]) - least
 
     def _stops(self, k: int, sign: int) -> Any:
         """Return the event of a joint that comes to rest; a joint that begins to slide is at rest initially."""
@@ -295,15 +324,18 @@ class Motion:
         least = u0 - self.low if k in self.still or k in self.released else 0.0
         return lambda t, q, v: sign * float(self.modes.along(q, k) @ v) - least
 
-    def _slips(self, k: int, friction: Any) -> Any:
-        """Return the event of a joint that needs more than its friction; one that needs all of it may slip at once."""
-        most = self.modes.most[k]
-        needed = abs(friction(k, self.t, self.q, self.v))
-        if needed > (1.0 + RELEASED) * most:
-            raise Undetermined(f"at t = {self.t:.10g} a sticking joint needs {needed:.10g}, but has {most:.10g}")
-        if needed > (1.0 - AT_MOST) * most:
-            most = max(most, needed) * (1.0 + AT_MOST)
-        return lambda t, q, v: most - abs(friction(k, t, q, v))
+    def _slips(self, grips: Any) -> Any:
+        """Return the event of friction that is exceeded, from what is needed and there; all of it may slip at once."""
+        needed, most = grips(self.t, self.q, self.v)
+        if abs(needed) > (1.0 + RELEASED) * most:
+            raise Undetermined(f"at t = {self.t:.10g} friction of {abs(needed):.10g} is needed, but it has {most:.10g}")
+        room = max(1.0, abs(needed) / most) * (1.0 + AT_MOST) if abs(needed) > (1.0 - AT_MOST) * most else 1.0
+
+        def left(t: float, q: Array, v: Array) -> float:
+            needed, most = grips(t, q, v)
+            return float(room * most - abs(needed))
+
+        return left
 
 
 def terminal(event: Any) -> Any:

@@ -39,7 +39,12 @@ def solve_with_stops(
     An impact changes the velocities by impulses at the closed stops and the impulses of all constraints:
     M (v+ - v-) + C_q^T p = W^T P, with C_q v+ + C_t = 0. Where several stops are closed, the impulses follow from
     Moreau's law. The rebound height decreases by the square of the restitution; a rebound below a hundredth of `atol`
-    ends in contact: the gap is then a constraint as long as its force pushes. There is no friction.
+    ends in contact: the gap is then a constraint as long as its force pushes.
+
+    Stops with friction slide or stick while they are closed, by Coulomb's law. In an impact, the impulse of friction
+    stops the sliding, if the coefficient times the impulse of the stop suffices; otherwise it has that value and
+    opposes the sliding after the impact. A run ends where forces with friction are not unique (a jam), or where the
+    law would add energy, as is possible for a large restitution.
 
     Parameters
     ----------
@@ -57,7 +62,7 @@ def solve_with_stops(
     Result
         `.impacts` lists the impacts, `.arcs` the runs between them, `.sol` is the state at any time. `.lam` are the
         multipliers of the system; in an arc with closed stops, those of the stops follow those of C, and the force of
-        a stop is the negative of its multiplier.
+        a stop is the negative of its multiplier. Stops that stick have a row each, after those of all gaps.
 
     Raises
     ------

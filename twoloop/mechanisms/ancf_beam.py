@@ -16,11 +16,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from twoloop.bodies.points import LinearPoints
 from twoloop.checks.arguments import check_number, check_positive, check_size
 from twoloop.kernels.compile.callbacks import callback
 from twoloop.mechanisms import ancf_element as element
 from twoloop.mechanisms.ancf_element import elastic_energy, elastic_tangent
-from twoloop.mechanisms.points import LinearPoints
 from twoloop.problem.drawing import Drawing
 from twoloop.problem.given import callbacks_in
 from twoloop.problem.joints import Joint

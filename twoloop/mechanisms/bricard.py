@@ -7,7 +7,7 @@ inertia as in the Exudyn model: bars of 1 x 0.1 x 0.1 m, 100 kg/m^3, gravity alo
 
 import numpy as np
 
-from twoloop.mechanisms.points import box
+from twoloop.bodies.points import box
 from twoloop.mechanisms.quadratic import ONE, QuadraticSystem, Scalar, difference, fixed
 from twoloop.mechanisms.ready import ready
 from twoloop.problem.joints import Joint

@@ -10,9 +10,9 @@ from numbers import Real
 
 import numpy as np
 
+from twoloop.bodies.points import GROUND, BodyPoints, PlanarEnergy
 from twoloop.checks.arguments import check_finite, check_vector
 from twoloop.kernels.compile.callbacks import callback
-from twoloop.mechanisms.points import GROUND, BodyPoints, PlanarEnergy
 from twoloop.problem.description import body_names
 from twoloop.problem.drawing import Drawing
 from twoloop.problem.given import callbacks_in

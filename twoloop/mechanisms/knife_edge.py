@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from twoloop.bodies.points import BodyPoints
 from twoloop.kernels.compile.callbacks import callback
-from twoloop.mechanisms.points import BodyPoints
 from twoloop.problem.drawing import Drawing
 from twoloop.problem.given import callbacks_in
 from twoloop.problem.joints import Joint

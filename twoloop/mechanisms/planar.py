@@ -14,9 +14,10 @@ from typing import Any
 
 import numpy as np
 
+from twoloop.bodies.planar_places import motion, place_on
+from twoloop.bodies.points import PlanarEnergy, Sketch
 from twoloop.kernels.compile.caches import helper
 from twoloop.kernels.compile.callbacks import callback
-from twoloop.mechanisms.points import PlanarEnergy, Sketch
 from twoloop.problem.drawing import Drawing
 from twoloop.problem.entries import LARGE
 from twoloop.problem.given import callbacks_in
@@ -29,25 +30,6 @@ DISTANCE = 1.0  # half the squared distance of the points is `value`: one row
 COORDINATE = 2.0  # q[i] = ax + ay t + bx sin(by t): one row
 WIDTH = 9  # numbers of a joint
 GROUND = -1
-
-
-@helper
-def place(q, body, a, b):
-    """Return the point (a, b) of a body and its derivative with respect to the angle: x, y, dx, dy."""
-    if body < 0:
-        return a, b, 0.0, 0.0
-    s, c = math.sin(q[3 * body + 2]), math.cos(q[3 * body + 2])
-    x, y = c * a - s * b, s * a + c * b
-    return q[3 * body] + x, q[3 * body + 1] + y, -y, x
-
-
-@helper
-def motion(v, body, dx, dy):
-    """Return the velocity of a point and the part of its acceleration without v'; (dx, dy): derivative by the angle."""
-    if body < 0:
-        return 0.0, 0.0, 0.0, 0.0
-    w = v[3 * body + 2]
-    return v[3 * body] + w * dx, v[3 * body + 1] + w * dy, -w * w * dy, w * w * dx
 
 
 @helper
@@ -80,8 +62,8 @@ def constraint(t, q, p, C):
         if p[k] == COORDINATE:
             C[row] = q[i] - p[k + 3] - p[k + 4] * t - p[k + 6] * math.sin(p[k + 7] * t)
             continue
-        ax, ay, _, _ = place(q, i, p[k + 3], p[k + 4])
-        bx, by, _, _ = place(q, j, p[k + 6], p[k + 7])
+        ax, ay, _, _ = place_on(q, i, p[k + 3], p[k + 4])
+        bx, by, _, _ = place_on(q, j, p[k + 6], p[k + 7])
         if p[k] == PIN:
             C[row], C[row + 1] = ax - bx, ay - by
         else:
@@ -96,8 +78,8 @@ def jacobian(t, q, p, Cq):
         if p[k] == COORDINATE:
             Cq[row, i] = 1.0
             continue
-        ax, ay, adx, ady = place(q, i, p[k + 3], p[k + 4])
-        bx, by, bdx, bdy = place(q, j, p[k + 6], p[k + 7])
+        ax, ay, adx, ady = place_on(q, i, p[k + 3], p[k + 4])
+        bx, by, bdx, bdy = place_on(q, j, p[k + 6], p[k + 7])
         if p[k] == PIN:
             add_row(Cq, row, i, 1.0, 0.0, adx, ady)
             add_row(Cq, row, j, -1.0, 0.0, bdx, bdy)
@@ -124,8 +106,8 @@ def gamma(t, q, v, p, Qd):
         if p[k] == COORDINATE:
             Qd[row] = -p[k + 6] * p[k + 7] ** 2 * math.sin(p[k + 7] * t)
             continue
-        ax, ay, adx, ady = place(q, i, p[k + 3], p[k + 4])
-        bx, by, bdx, bdy = place(q, j, p[k + 6], p[k + 7])
+        ax, ay, adx, ady = place_on(q, i, p[k + 3], p[k + 4])
+        bx, by, bdx, bdy = place_on(q, j, p[k + 6], p[k + 7])
         au, av, aa, ab = motion(v, i, adx, ady)
         bu, bv, ba, bb = motion(v, j, bdx, bdy)
         if p[k] == PIN:
@@ -146,8 +128,8 @@ def kinematics(t, q, v, p, C, Cq, Ct, Qd):
             Ct[row] = -p[k + 4] - p[k + 6] * frequency * c
             Qd[row] = -p[k + 6] * frequency**2 * s
             continue
-        ax, ay, adx, ady = place(q, i, p[k + 3], p[k + 4])
-        bx, by, bdx, bdy = place(q, j, p[k + 6], p[k + 7])
+        ax, ay, adx, ady = place_on(q, i, p[k + 3], p[k + 4])
+        bx, by, bdx, bdy = place_on(q, j, p[k + 6], p[k + 7])
         au, av, aa, ab = motion(v, i, adx, ady)
         bu, bv, ba, bb = motion(v, j, bdx, bdy)
         if p[k] == PIN:
@@ -180,8 +162,8 @@ def jacobian_values(t, q, p, values):
             values[place_of] = 1.0
             place_of += 1
             continue
-        ax, ay, adx, ady = place(q, i, p[k + 3], p[k + 4])
-        bx, by, bdx, bdy = place(q, j, p[k + 6], p[k + 7])
+        ax, ay, adx, ady = place_on(q, i, p[k + 3], p[k + 4])
+        bx, by, bdx, bdy = place_on(q, j, p[k + 6], p[k + 7])
         fx, fy = ax - bx, ay - by
         for body, sign, dx, dy in ((i, 1.0, adx, ady), (j, -1.0, bdx, bdy)):
             if body < 0:

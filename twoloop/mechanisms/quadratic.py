@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
+from twoloop.bodies.points import LinearPoints
 from twoloop.kernels.compile.caches import helper
 from twoloop.kernels.compile.callbacks import callback
-from twoloop.mechanisms.points import LinearPoints
 from twoloop.problem.drawing import Drawing
 from twoloop.problem.given import callbacks_in
 from twoloop.problem.joints import Joint

@@ -6,12 +6,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from twoloop.checks.arguments import check_finite, check_text
+from twoloop.checks.arguments import check_finite, check_not_negative, check_text
 
 
 @dataclass(frozen=True)
 class Stop:
-    """A one-sided constraint without friction: its gap stays at zero or above, by impacts or by a force.
+    """A one-sided constraint: its gap stays at zero or above, by impacts or by a force, and it may rub.
 
     Attributes
     ----------
@@ -21,6 +21,10 @@ class Stop:
     restitution : float
         From 0 to 1: the speed at which the gap opens after an impact over that at which it closed before.
     name : str
+    friction : float
+        Coefficient of Coulomb friction, zero or more.
+    slide : callable, optional
+        slide(t, q), m: how far the point in contact is along the surface, for friction in a plane.
 
     Raises
     ------
@@ -31,6 +35,8 @@ class Stop:
     gap: Callable[[Any, Any], Any]
     restitution: float = 0.0
     name: str = "stop"
+    friction: float = 0.0
+    slide: Callable[[Any, Any], Any] | None = None
 
     def __post_init__(self) -> None:
         check_text("name", self.name)
@@ -39,3 +45,5 @@ class Stop:
         value = check_finite(f"restitution of {self.name!r}", self.restitution)
         if not 0.0 <= value <= 1.0:
             raise ValueError(f"restitution of {self.name!r} must be from 0 to 1; given {value!r}")
+        if check_not_negative(f"friction of {self.name!r}", self.friction) and not callable(self.slide):
+            raise TypeError(f"slide of {self.name!r} must be a function of t and q, as it rubs; given {self.slide!r}")

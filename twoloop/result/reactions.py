@@ -84,7 +84,7 @@ def _point(joint: Joint, q: Array) -> Array:
         s, c = np.sin(angles[0]), np.cos(angles[0])
         point = np.stack([c * point[0] - s * point[1], s * point[0] + c * point[1]])
     elif len(angles) == 4:
-        from twoloop.mechanisms.rotation import rotated  # compiled on import
+        from twoloop.bodies.rotation import rotated  # compiled on import
 
         point = np.stack(rotated.py_func(*angles, *point))
     elif len(angles) == 9:
@@ -102,7 +102,7 @@ def _force_and_torque(joint: Joint, q: Array, point: Array, generalized: Array) 
     if dimension == 2:
         return force, turning[0] - (arm[0] * force[1] - arm[1] * force[0])
     if len(turning) == 4:  # e' = G^T spin / 2, so the torque in body axes is G g / 2
-        from twoloop.mechanisms.rotation import half_spin, rotated  # compiled on import
+        from twoloop.bodies.rotation import half_spin, rotated  # compiled on import
 
         torque = 0.5 * np.stack(rotated.py_func(*angles, *half_spin.py_func(*angles, *turning)))
     else:  # each column of the matrix rotates like a lever arm

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from twoloop.mechanisms.rotation import rotated
+from twoloop.bodies.rotation import rotated
 from twoloop.problem.drawing import Drawing
 from twoloop.problem.problem import Array
 
