@@ -73,7 +73,7 @@ bench: compile ## two commits side by side: make bench BASE=main [HEAD=branch] [
 # last: each worker of the tests would begin by compiling them
 compile: install ## compile the kernels, and the callbacks of bodies, mechanisms and studies, on two cores
 	@$(RUN) -c "from twoloop.kernels.evaluation import calls, own_inner; from twoloop.kernels.control import controller"
-	@$(RUN) -c "from twoloop.kernels.steps import diagonal_step, newton_step; \
+	@$(RUN) -c "from twoloop.kernels.steps import bdf_newton_step, diagonal_step, newton_step; \
 	from twoloop.kernels.evaluation import static_inner; from twoloop.kernels.lanes import lane_implicit" & \
 	$(RUN) -c "from twoloop.kernels import advance, agreement, interpolation; \
 	from twoloop.kernels.algebra import independent, pivots, scaling; from twoloop.kernels.control import switching; \

@@ -129,7 +129,7 @@ def test_accelerations_and_multipliers_are_those_of_least_norm(make):
     states = np.concatenate([motion.q, motion.v])
     states[0, 3] = np.nan
     found = np.concatenate(least_norm(system, motion.t, states))
-    for k in (0, 7, -1):
+    for k in (0, 2, -1):
         known = np.concatenate(solution(system, motion.t[k], states[:n, k], states[n:, k]))
         assert found[:, k] == pytest.approx(known, rel=1e-9, abs=1e-9)
     assert np.isnan(found[:, 3]).all()

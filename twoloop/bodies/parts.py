@@ -75,7 +75,8 @@ class Body:
 
     def local_point(self, given: Array) -> Array:
         """Transform a point from space to the axes of the body, relative to its centre, in the position given."""
-        return _without_rounding(self.local_direction(given - self.position), np.abs((*given, *self.position)).max())
+        place = self.local_direction(given - self.position)
+        return place if len(given) == 2 else _without_rounding(place, np.abs((*given, *self.position)).max())
 
     def in_space(self, place: Array) -> Array:
         """Transform a point of the body to space, in the position given."""

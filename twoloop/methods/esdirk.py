@@ -103,6 +103,7 @@ class ESDIRK:
     def plan(self, n_q: int, rtol: float, atol: float, fixed: bool) -> Plan:
         """Make the method ready for a run of n_q coordinates."""
         from twoloop.kernels.steps import diagonal_step as kernels
+        from twoloop.kernels.steps.diagonal_stage import diagonal_memory, diagonal_options
         from twoloop.kernels.steps.newton_memory import n_matrices
 
         make, order = FORMULAS[self.formula]
@@ -115,10 +116,10 @@ class ESDIRK:
         inner_tol = INNER_TOL if self.inner_tol is None else self.inner_tol
         return Plan(
             kernels.DIAGONAL,
-            kernels.diagonal_options(
+            diagonal_options(
                 A, A.sum(axis=1), A[-1] - embedded, inner_tol, outer_tol, self.tested == "all", order == 2
             ),
-            kernels.diagonal_memory(len(embedded), n_q),
+            diagonal_memory(len(embedded), n_q),
             matrices=n_matrices(1),
             projects=True,
             exponent=exponent,

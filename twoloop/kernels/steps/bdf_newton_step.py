@@ -1,6 +1,6 @@
 """Steps of the backward differentiation formulas whose outer loop is Newton's method, for stiff problems.
 
-The formula y = p + c (y' - p') is a stage of diagonal_step.py with z = c: V = v_bar + c a and Q = q_bar + c V, where
+The formula y = p + c (y' - p') is a stage of diagonal_stage.py with z = c: V = v_bar + c a and Q = q_bar + c V, where
 v_bar and q_bar are p - c p'. History, estimates and orders are those of bdf_step.py.
 """
 
@@ -15,7 +15,7 @@ from twoloop.kernels.data.noted import GENERATION
 from twoloop.kernels.evaluation.calls import evaluate_state
 from twoloop.kernels.steps import bdf_step as bdf
 from twoloop.kernels.steps import newton_memory as at
-from twoloop.kernels.steps.diagonal_step import KEPT_WHILE, diagonal_options, solve_stage
+from twoloop.kernels.steps.diagonal_stage import KEPT_WHILE, diagonal_options, solve_stage
 from twoloop.kernels.steps.newton_memory import block, vector
 
 ONE_STAGE = ([[0.0, 0.0], [0.0, 1.0]], [0.0, 1.0], [0.0, 0.0])  # of gamma = 1: its step is c
