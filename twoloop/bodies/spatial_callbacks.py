@@ -10,8 +10,8 @@ import numpy as np
 
 from twoloop.bodies import parameter_layout as layout
 from twoloop.bodies.function_rows import fill_entries, fill_nonholonomic, fill_nonholonomic_gamma, put_entries
-from twoloop.bodies.program_results import result, results
-from twoloop.bodies.read_tables import joint_at, joint_places, motions, n_bodies
+from twoloop.bodies.program_results import result
+from twoloop.bodies.read_tables import joint_at, joint_places, made_by, motions, n_bodies
 from twoloop.bodies.spatial_forces import WEIGHT, fill_force, inertia
 from twoloop.bodies.spatial_places import motion, place, push_row, turn_row, vector, vector_rate
 from twoloop.kernels.compile.caches import helper
@@ -246,7 +246,7 @@ def jacobian_values(t, q, p, values):
 
 @callback("force")
 def force(t, q, v, p, Q):
-    fill_force(q, v, p, results(int(p[p.size - layout.HEAD + layout.FORCE_PROGRAM]), t, q, v, p), Q)
+    fill_force(q, v, p, made_by(layout.FORCE_PROGRAM, t, q, v, p), Q)
 
 
 @callback("constraint")

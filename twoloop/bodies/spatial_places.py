@@ -7,11 +7,12 @@ import math
 
 from twoloop.bodies.rotation import half_spin, pulled, rotated, rotated_rate
 from twoloop.kernels.compile.caches import helper
+from twoloop.kernels.data.common import inlined
 
 FARTHEST = -math.cos(0.95 * math.pi)  # 0.95 of a turn
 
 
-@helper
+@inlined
 def vector(q, body, x, y, z):
     """Return a body-fixed vector in space."""
     if body < 0:
@@ -20,7 +21,7 @@ def vector(q, body, x, y, z):
     return rotated(q[k], q[k + 1], q[k + 2], q[k + 3], x, y, z)
 
 
-@helper
+@inlined
 def vector_rate(q, v, body, x, y, z):
     """Return its time derivative, and 2 R(e') a, its second derivative for e'' = 0."""
     if body < 0:
@@ -31,7 +32,7 @@ def vector_rate(q, v, body, x, y, z):
     return ux, uy, uz, 2.0 * ax, 2.0 * ay, 2.0 * az
 
 
-@helper
+@inlined
 def centre(q, body):
     """Return the centre of mass, or its velocity from v."""
     if body < 0:
@@ -51,7 +52,7 @@ def turn_row(q, row, body, x, y, z, fx, fy, fz):
         row[k + 3] += d3
 
 
-@helper
+@inlined
 def move_row(row, body, fx, fy, fz):
     """Add to a row the gradient of f . (centre of a body)."""
     if body >= 0:
@@ -60,7 +61,7 @@ def move_row(row, body, fx, fy, fz):
         row[7 * body + 2] += fz
 
 
-@helper
+@inlined
 def place(q, body, p, at):
     """Return the point of a body stored at index `at` of p."""
     x, y, z = vector(q, body, p[at], p[at + 1], p[at + 2])
@@ -68,7 +69,7 @@ def place(q, body, p, at):
     return cx + x, cy + y, cz + z
 
 
-@helper
+@inlined
 def motion(q, v, body, p, at):
     """Return the velocity of that point and the part of its acceleration that does not depend on v'."""
     ux, uy, uz, ax, ay, az = vector_rate(q, v, body, p[at], p[at + 1], p[at + 2])
