@@ -62,7 +62,7 @@ def test_what_others_can_write_is_not_loaded(user, monkeypatch):
     value, hits, said = user()
     assert (value, hits) == (2.0, 0) and not user.planted.exists()
     assert said.count("can be written by everybody (mode 666), and is not loaded but compiled again") == 1
-    assert user() == (2.0, 1, "")  # mended
+    assert user() == (2.0, 1, "")  # repaired
     plant(user.file(), user.planted)
     user.cache.chmod(0o777)  # above the folder of the file
     monkeypatch.setenv("XDG_CACHE_HOME", str(user.home))

@@ -90,7 +90,7 @@ def test_joints(joint, freedoms):
         rows.body(str(k), 1.0, (1.0, 1.0, 1.0), RNG.normal(size=3), TURNS[k + 1].as_matrix())
     joint(rows)
     system, (q, _) = rows.system("joint"), rows.start
-    assert np.abs(system.constraint(0.0, q)).max() < 1e-15
+    assert np.abs(system.constraint(0.0, q)).max() < 1e-14
     assert np.linalg.matrix_rank(system.jacobian(0.0, q)) == system.n_c == 14 - freedoms
     assert max(row_errors(system, 0.0, q + 0.1 * RNG.normal(size=14), RNG.normal(size=14))) < 1e-8
 

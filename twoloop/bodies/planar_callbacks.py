@@ -6,7 +6,7 @@ from twoloop.bodies import parameter_layout as layout
 from twoloop.bodies import read_tables as tables
 from twoloop.bodies.function_rows import fill_entries, fill_nonholonomic, fill_nonholonomic_gamma, put_entries
 from twoloop.bodies.planar_places import motion, place_on
-from twoloop.bodies.program_results import result, results
+from twoloop.bodies.program_results import result
 from twoloop.kernels.compile.caches import helper
 from twoloop.kernels.compile.callbacks import callback
 
@@ -240,7 +240,7 @@ def mass(t, q, p, M):
 
 @callback("force")
 def force(t, q, v, p, Q):
-    fill_force(q, v, p, results(int(p[p.size - layout.HEAD + layout.FORCE_PROGRAM]), t, q, v, p), Q)
+    fill_force(q, v, p, tables.made_by(layout.FORCE_PROGRAM, t, q, v, p), Q)
 
 
 @callback("constraint")

@@ -20,9 +20,7 @@ def total(nodes, first, p, columns, coefficients, constant, begin, end):
 
 @helper
 def results(place, t, q, v, p):
-    """Return the results of the program at an index of p followed by all its nodes; p itself if there is no program."""
-    if place < 0:
-        return p
+    """Return the results of the program at an index of p followed by all its nodes."""
     first, n_rows, n_terms = int(p[place + N_RESULTS]), int(p[place + N_ROWS]), int(p[place + N_TERMS])
     rows = place + PROGRAM
     columns = rows + N_COLUMNS * n_rows

@@ -43,7 +43,7 @@ def force_at(p, k):
 
 @inlined
 def made_by(program, t, q, v, p):
-    """Return the results of a program, or p without one: the call of a long function takes longer than short rows."""
+    """Return the results of a program, or p if there is none: the call itself takes longer than a row of C."""
     place = int(p[p.size - layout.HEAD + program])
     if place < 0:
         return p

@@ -1,6 +1,6 @@
 """Vectors and points of spatial bodies, their rates, and generalised forces: helpers of the callbacks.
 
-Coordinates of a body: x, y, z of the centre of mass and Euler parameters; see `mechanisms.rotation`.
+Coordinates of a body: x, y, z of the centre of mass and Euler parameters; see `rotation`.
 """
 
 import math

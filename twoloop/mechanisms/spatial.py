@@ -15,7 +15,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from twoloop.bodies.rotation import half_spin, pulled, rotated, rotated_rate
+from twoloop.bodies.rotation import half_spin, pulled
+from twoloop.bodies.spatial_places import centre, vector, vector_rate
 from twoloop.kernels.compile.caches import helper
 from twoloop.kernels.compile.callbacks import callback
 
@@ -26,34 +27,6 @@ JOINT, SPRING = 13, 11  # numbers of each
 HEAD = 6
 GROUND = -1
 MOVED, TURNED = (0, 1, 2), (3, 4, 5, 6)  # coordinates of a body
-
-
-@helper
-def vector(q, body, x, y, z):
-    """Return a body-fixed vector in space."""
-    if body < 0:
-        return x, y, z
-    k = 7 * body + 3
-    return rotated(q[k], q[k + 1], q[k + 2], q[k + 3], x, y, z)
-
-
-@helper
-def vector_rate(q, v, body, x, y, z):
-    """Return its time derivative, and 2 R(e') a, its second derivative for e'' = 0."""
-    if body < 0:
-        return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-    k = 7 * body + 3
-    ux, uy, uz = rotated_rate(q[k], q[k + 1], q[k + 2], q[k + 3], v[k], v[k + 1], v[k + 2], v[k + 3], x, y, z)
-    ax, ay, az = rotated(v[k], v[k + 1], v[k + 2], v[k + 3], x, y, z)
-    return ux, uy, uz, 2.0 * ax, 2.0 * ay, 2.0 * az
-
-
-@helper
-def centre(q, body):
-    """Return the centre of mass, or its velocity from v."""
-    if body < 0:
-        return 0.0, 0.0, 0.0
-    return q[7 * body], q[7 * body + 1], q[7 * body + 2]
 
 
 @helper

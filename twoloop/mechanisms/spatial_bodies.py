@@ -7,7 +7,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from twoloop.bodies.points import Sketch, place_of
-from twoloop.bodies.rotation import euler_parameters, euler_rates, perpendiculars, rotation_matrix
+from twoloop.bodies.rotation import (
+    euler_parameters,
+    euler_rates,
+    half_spin,
+    perpendiculars,
+    rotated,
+    rotation_matrix,
+)
 from twoloop.mechanisms import spatial
 from twoloop.mechanisms.spatial import DIRECTION, GROUND, PLANE, POINT
 from twoloop.problem.drawing import Drawing
@@ -218,7 +225,7 @@ def _states(q: Array, v: Array) -> tuple[Array, Array]:
 def _spins(q: Array, v: Array) -> Array:
     """Return angular velocities in body axes, (n, 3) or (n, 3, n_t)."""
     e, u = np.moveaxis(q[:, 3:], 1, 0), np.moveaxis(v[:, 3:], 1, 0)
-    return 2.0 * np.stack(spatial.half_spin.py_func(*e, *u), axis=1)
+    return 2.0 * np.stack(half_spin.py_func(*e, *u), axis=1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -258,7 +265,7 @@ class Momentum:
         total: Any = 0.0
         for (mass, *inertia), state, rate, spin in zip(self.bodies, q, v, spins, strict=True):
             arm = state[:3] - self.point.reshape(3, *(1,) * (state.ndim - 1))
-            own = spatial.rotated.py_func(*state[3:], *(np.array(inertia) * spin.T).T)
+            own = rotated.py_func(*state[3:], *(np.array(inertia) * spin.T).T)
             moment = np.cross(arm, rate[:3], axis=0) * mass + np.array(own)
             total = total + np.tensordot(self.axis, moment, axes=1)
         return total
