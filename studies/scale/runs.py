@@ -13,7 +13,7 @@ from references.engines.trees import end_by_pinocchio
 from references.exudyn.pinned import solve_pinned
 from references.sundials.ida_sparse import solve_ida_sparse
 from studies.bench.collector import Case, Run, Solver, called_from, timed
-from studies.bench.large import PLANAR, SPATIAL, Assembly, grid, open_chain
+from studies.bench.large import PLANAR, SPATIAL, Assembly, closed_chain_of_hinges, open_chain
 from studies.bench.solvers import CATALOGUE, CVODE_C, DEFAULT, at_instants
 from studies.bench.store import Row
 from twoloop import Result, solve_dae
@@ -22,11 +22,12 @@ from twoloop.mechanisms import Problem
 EVALUATION, MEMORY, CHAIN = "evaluation", "memory", "chain"  # groups of rows
 Keyed = Iterator[tuple[str, Callable[[], Row]]]  # what a row is kept by, and what makes it
 SIZES, QUICK_SIZES = (3, 10, 30, 100, 300, 1000, 3000), (3, 10)
-LARGEST = 1000  # grids and assemblies in space: a larger grid is not ordered within minutes
 METHOD, TOLERANCE = "DOP853", 1e-6
 FROM, TO = 30, 1000  # bodies, between which the slope is fitted
-SKIPPED, STEPS = 3, (24, 6)  # steps that set a run up, and steps timed: more of small mechanisms
-MANY = 300  # bodies, from which on the smaller number of steps is timed
+SKIPPED, STEPS = 3, 6  # steps that set a run up, and steps timed: few, as motions differ later by size
+MANY, AGAIN = 300, 5  # bodies, below which the steps are timed so many times
+LARGEST_REDUNDANT = 1000  # bodies of a model with redundant rows: it finds their rank by dense matrices
+KEPT = 24  # steps of the run whose memory is asked for
 ROUNDS, REPEATS = 3, 3
 CHAINS = {20: 1.0, 100: 0.3, 400: 0.15}  # bodies, and how long they move, s: later they are chaotic
 ERRORS = (1e-3, 1e-4, 1e-5)  # at the end, over max(1, max |q|)
@@ -52,36 +53,45 @@ def evaluations(quick: bool) -> Keyed:
     """Rows of our evaluations, then of the memory."""
     for repeat in range(1 if quick else ROUNDS):
         for n in QUICK_SIZES if quick else SIZES:
-            for build in (*PLANAR, *SPATIAL) if n <= LARGEST else [each for each in PLANAR if each is not grid]:
+            for build in (*PLANAR, *SPATIAL):
+                if build is closed_chain_of_hinges and n > LARGEST_REDUNDANT:
+                    continue
                 yield f"{EVALUATION} | {build.__name__} | {n} | {repeat}", partial(evaluation, build, n, repeat)
     for n in QUICK_SIZES if quick else SIZES[3:]:
         yield f"{MEMORY} | {n}", partial(memory, n)
 
 
 def evaluation(build: Callable[[int], Assembly], n: int, repeat: int) -> Row:
-    """Time of an evaluation, with its share of projections and all else of a step, and of a first call."""
+    """Time of an evaluation, with its share of projections and all else of a step, and of a first call.
+
+    passes: of the projection, in a step: many where stages are put on the constraints too, near a singular position.
+    """
     case = build.__name__.replace("_", " ")
     row: Row = {"group": EVALUATION, "case": case, "solver": f"{METHOD} (twoloop)", "n": n, "repeat": repeat}
-    row |= {"evaluation_us": None, "step_us": None, "start_s": None, "status": "", "message": ""}
+    row |= {"evaluation_us": None, "step_us": None, "passes": None, "start_s": None, "status": "", "message": ""}
     began = time.process_time()
     problem = problem_of(build(n), 1.0)
-    steps = STEPS[n >= MANY]
+    times = []
     try:
         few = _steps(problem, SKIPPED)
         row["start_s"] = time.process_time() - began - few.stats.cpu_time
-        many = _steps(problem, SKIPPED + steps)
+        for _ in range(1 if n >= MANY else AGAIN):
+            few, many = _steps(problem, SKIPPED), _steps(problem, SKIPPED + STEPS)
+            times.append(1e6 * (many.stats.cpu_time - few.stats.cpu_time))
     except (RuntimeError, ValueError) as error:  # a row that says so, and no point of the fit
         return row | {"status": "FAILED", "message": str(error)}
-    spent = 1e6 * (many.stats.cpu_time - few.stats.cpu_time)
+    spent = float(np.median(times))
     evaluations = (many.stats.n_evaluations or 0) - (few.stats.n_evaluations or 0)
-    return row | {"step_us": spent / steps, "evaluation_us": spent / evaluations, "status": "REACHED_END"}
+    passes = ((many.stats.n_inner or 0) - (few.stats.n_inner or 0)) / STEPS
+    row |= {"step_us": spent / STEPS, "evaluation_us": spent / evaluations, "passes": passes}
+    return row | {"status": "REACHED_END"}
 
 
 def memory(n: int) -> Row:
     """What Python and NumPy allocate at most for a run of a few steps, all of them kept; kernels allocate nothing."""
     _steps(problem_of(open_chain(min(SIZES[3:])), 1.0), 1)  # what is loaded once
     tracemalloc.start()
-    _steps(problem_of(open_chain(n), 1.0), STEPS[0])
+    _steps(problem_of(open_chain(n), 1.0), KEPT)
     most = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     row: Row = {"group": MEMORY, "case": "open chain", "n": n, "repeat": 0, "status": "REACHED_END"}

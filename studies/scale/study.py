@@ -31,6 +31,7 @@ from studies.scale.runs import (
 )
 from twoloop.rows.equal_error import resampled
 
+CAREFUL = 5.0  # passes of the projection in a step, beyond which stages are put on the constraints too
 BEND = 0.3  # by which a power from one size to the next differs notably from the fitted one
 
 
@@ -66,6 +67,8 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
         us = {n: float(np.median(each)) for n, each in times.items()}
         dear = [n for n in us if any(us[n] > us[m] for m in us if m > n)]
         line = {"case": str(case), "us": us, "dear": dear}
+        near = own[own["passes"] > CAREFUL] if "passes" in own else own[:0]
+        line["careful"] = sorted({int(n) for n in near["n"]})
         line["start_s"] = {int(n): float(each["start_s"].median()) for n, each in by_size}
         fitted, between = None if dear else slope(list(times), list(times.values())), powers(us)
         apart = [abs(each["power"] - fitted[0]) for each in between] if fitted else []
@@ -77,11 +80,11 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
         medians = tables.medians(own.reset_index(drop=True))
         of_chain: dict[str, Any] = {"n": int(n), "t_end": CHAINS[int(n)]}
         of_chain["lines"] = tables.work_precision(medians, ERRORS)
-        of_chain["over_exudyn"] = [ratio for error in ERRORS if (ratio := over_exudyn(medians, error))]
+        of_chain["over_exudyn"] = {error: ratio for error in ERRORS if (ratio := over_exudyn(medians, error))}
         of_chain["step"] = steps_of(medians)
         of_chain["fastest"] = [each for error in ERRORS if (each := fastest(medians, error))]
         found["once"] |= once(medians)
-        least, step = min(of_chain["over_exudyn"], default=0.0), of_chain["step"]
+        least, step = min(of_chain["over_exudyn"].values(), default=0.0), of_chain["step"]
         of_chain["by_order"] = bool(step) and (step["exudyn"] / step["ours"]) ** 2 < least
         found["chains"].append(of_chain)
     held = rows[rows["group"].eq(MEMORY)].reindex(columns=["n", "memory_mb"]).dropna()

@@ -14,7 +14,7 @@ from tests.problems import worst
 from twoloop import ConstraintWarning, Status, consistent_state, mechanisms, solve_dae
 from twoloop.checks.values import MOST
 from twoloop.kernels import advance
-from twoloop.kernels.algebra.static_program import N_UPDATES
+from twoloop.kernels.algebra import static_program
 from twoloop.kernels.data import codes, noted
 from twoloop.kernels.evaluation import tasks
 from twoloop.mechanisms.planar import GROUND, PlanarBodies
@@ -202,7 +202,7 @@ def test_programs_grow_with_the_bodies_and_no_faster(large):
         updates = {}
         for n in (99, 999):
             system, q, _ = make(n)
-            updates[n] = int(static_form(system, 0.0, q).program[N_UPDATES])
+            updates[n] = int(static_form(system, 0.0, q).program[static_program.N_UPDATES])
             run = started_run(system, q)
             assert run.static is not None
             assert run.work.notes.base.size + run.work.counters.base.size < 120 * system.n_q  # nothing n_c x n_q
@@ -298,3 +298,13 @@ def test_parallel_hinges_have_three_redundant_rows_a_loop(any_size, build, n, lo
     reaction = np.bincount(columns, system.jacobian_values(0.0, q) * one.lam[rows], system.n_q)
     inertia = np.bincount(i, system.mass_values(0.0, q) * one.a[j], system.n_q)
     assert worst(inertia + reaction, system.force(0.0, q, v)) < 1e-8 * np.abs(reaction).max()
+
+
+def test_a_large_program_is_made_where_it_is_sparse(monkeypatch):
+    monkeypatch.setattr(static_program, "FEW_UPDATES", 0)
+    none, n = (np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)), 300
+    each = np.arange(n)
+    chain = np.concatenate([each, each[1:]]), np.concatenate([each, each[:-1]])
+    full = np.divmod(np.arange(n * n), n)
+    assert static_program.program_in_order(each, n, chain, none, ()) is not None
+    assert static_program.program_in_order(each, n, full, none, ()) is None

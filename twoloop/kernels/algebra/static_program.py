@@ -20,7 +20,9 @@ Entries = tuple[Integers, Integers]  # rows and columns
 
 # places in the program; then what `_sections` names
 N_COORDINATES, N_PIVOTS, N_OFF, N_UPDATES, N_OF_MASS, N_OF_JACOBIAN, N_STIFFENED, N_HEAD = range(8)
-MOST_UPDATES = 3_000_000  # multiplications of a program: beyond, the matrix is not sparse
+FEW_UPDATES = 3_000_000  # multiplications of a program: up to here, it pays for any matrix of this kind ...
+SPARSE = 1e-3  # ... and beyond, where they are at most this share of n^3 ...
+MOST_UPDATES = 30_000_000  # ... and no more than this, for their memory: four bytes each
 
 
 def static_program(
@@ -59,7 +61,7 @@ def program_in_order(
     low, high = np.minimum(rows, columns), np.maximum(rows, columns)
     below = _columns_of_factors(n, low, high)
     sizes = np.array([len(each) for each in below], dtype=np.int64)
-    if (sizes * (sizes + 1) // 2).sum() > MOST_UPDATES:
+    if (sizes * (sizes + 1) // 2).sum() > max(FEW_UPDATES, min(MOST_UPDATES, SPARSE * n**3)):
         return None
     begin = np.concatenate([[0], np.cumsum(sizes)])
     row_of = np.concatenate([np.zeros(0, np.int64), *below])
