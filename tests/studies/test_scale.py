@@ -49,7 +49,7 @@ def test_slopes_and_ratios_follow_the_rows():
     assert found["chains"][0]["fastest"][0] == {"error": 1e-3, "solver": EXUDYN, "over": pytest.approx([50.0, 50.0])}
     assert f"| 20 | 1.0 | 50 (1e-3), 50 (1e-4), 50 (1e-5) | `{EXUDYN}`: at least 50 |" in text
     assert [each["power"] for each in found["kinds"][0]["powers"]] == pytest.approx([1.0, 1.0])
-    assert "| open chain | 1.00 (1.00–1.00) | 1.0 | 1.0 |" in text and "One power does not describe" not in text
+    assert "| 200 | 1.00 (1.00–1.00) | 0.20 | 0.50 |" in text and "One power does not describe" not in text
     found, text = said(pd.concat([evaluations(2.0), chains(ours=1.0, exudyn=0.5)], ignore_index=True))
     assert found["kinds"][0]["slope"][0] == pytest.approx(2.0)
     assert f"| 20 | 1.0 | 0.50 (1e-3), 0.50 (1e-4), 0.50 (1e-5) | `{EXUDYN}`: at most 0.50 |" in text
@@ -67,7 +67,7 @@ def test_sizes_whose_stages_are_put_on_the_constraints_are_marked():
     rows = evaluations(passes=2.0)
     rows.loc[rows["n"] == 100, "passes"] = 12.0
     text = said(pd.concat([rows, chains()], ignore_index=True))[1]
-    assert "| open chain | 2.0 | 6.0 | 20† | 200 |" in text and "†: near a singular position" in text
+    assert "| open chain | 2.0 | 6.0 | 20† | 200 | 1.00 (" in text and "†: near a singular position" in text
     assert "†" not in said(pd.concat([evaluations(passes=2.0), chains()], ignore_index=True))[1]
 
 
