@@ -4,7 +4,7 @@ import time
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -46,9 +46,8 @@ class Loop:
     def times(self) -> Array:
         return np.linspace(0.0, self.t_end, INSTANTS + 1)
 
-    def ours(self, tolerance: float, method: str = "auto", times: Array | None = None, t0: float = 0.0) -> Any:
-        options: dict[str, Any] = {"method": method, "rtol": tolerance, "atol": tolerance, "t_eval": times}
-        options |= {} if method == "auto" else {"compiled": False}  # references are no reason to compile
+    def ours(self, tolerance: float, times: Array | None = None, t0: float = 0.0, **more: Any) -> Any:
+        options: dict[str, Any] = {"rtol": tolerance, "atol": tolerance, "t_eval": times, **more}
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", ConstraintWarning)
             problem = self.problem
@@ -63,7 +62,8 @@ class Loop:
         if self.problem.name in (PARALLEL, PARALLEL + DRIVEN):  # ours do not cross its singular positions so tightly
             q, v, apart = parallelogram_motion(self.times, self.rigid.torques[0, 2])
             return self.motion(q, v), apart
-        runs = [self.ours(TIGHT, method, self.times) for method in ("DOP853", "RadauIIA9")]
+        plain = partial(self.ours, TIGHT, self.times, compiled=False)  # references are no reason to compile
+        runs = [plain(method=method) for method in ("DOP853", "RadauIIA9")]
         if not all(run.success for run in runs):
             raise RuntimeError(next(run.message for run in runs if not run.success))
         one, other = (self.motion(run.q, run.v, self.force(run)) for run in runs)
@@ -99,7 +99,7 @@ class Loop:
     def start_rates(self) -> dict[float, tuple[Array, Array]]:
         """Changes of v and w within the times of the gates, by these."""
         spans = [0.0, *sorted({share * self.t_end for share, _ in GATES})]
-        run = self.ours(TIGHT, "DOP853", np.array(spans))
+        run = self.ours(TIGHT, np.array(spans), method="DOP853", compiled=False)
         _, _, v, w = states(self.rigid.planar, run.q, run.v)
         return {span: (v[k] - v[0], w[k] - w[0]) for k, span in enumerate(spans)}
 

@@ -49,7 +49,8 @@ CONFIGURATIONS = (
     _of("pinocchio", "RK4, mu 1e-8", "as before, with `ProximalSettings(1e-14, 1e-8, 20)`", "RK4", 1e-8, 20, 10.0),
     _of("exudyn_bodies", "generalized-alpha"),
     _of("exudyn_bodies", "trapezoidal", "`TrapezoidalIndex2`", "TrapezoidalIndex2"),
-    Configuration(OURS, "default"),
+    Configuration(OURS, "default", "auto"),
+    Configuration(OURS, "compiled=True", True),  # `settings` of ours: `compiled` of solve_dae
 )
 # of the gates: the most rigid of an engine
 BEST: dict[str, Any] = {"mujoco": RIGID, "drake": drake.Settings(), "pinocchio": pinocchio.Settings("RK4", 1e-3)}

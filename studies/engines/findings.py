@@ -12,7 +12,7 @@ from studies.bench.cli import version_of
 from studies.bench.closed_loops import SPATIAL
 from studies.bench.end_states import EXACT
 from studies.bench.engine_runs import LIMIT
-from studies.engines.configurations import CONFIGURATIONS, NAMES, OURS, PACKAGES, Configuration
+from studies.engines.configurations import CONFIGURATIONS, NAMES, OURS, PACKAGES, PLAIN_AND_BEST, Configuration
 from twoloop.audit.step_audit import LOST, order_and_floor
 
 GATE, RUN, MASS, TURN, MOTOR, ENERGY = "gate", "run", "mass", "turn", "motor", "energy"  # groups of rows
@@ -27,6 +27,7 @@ PROBES = {  # what is asked: mechanisms by the end of their names, groups, and m
     "force in a joint": (("", RUN, "error_f"),),
     "energy, 100 s": (("", ENERGY, "energy"),),
 }
+OWN = tuple(each.name for each in CONFIGURATIONS if each.engine == OURS)
 IN_SPACE = tuple(build().name for build in SPATIAL)
 
 
@@ -43,13 +44,18 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     found["configurations"] = [_configuration(each, runs[runs["solver"] == each.name]) for each in CONFIGURATIONS]
     cheapest = [_cheapest(runs[runs["case"] == case]) for case in cases]
     cheapest_of = [line["engines"] for line in cheapest]
-    found["call_over_engines"] = dict(zip(cases, (line["ratio"] for line in cheapest), strict=True))
+    found["call_over_engines"] = {
+        name: {case: line["ratios"].get(name) for case, line in zip(cases, cheapest, strict=True)} for name in OWN
+    }
     wins = [Counter(sorted(each.split(", ")[0] for each in names if each)) for names in zip(*cheapest_of, strict=True)]
     found["wins_engines"] = [dict(each.most_common()) for each in wins]
-    engines = [_engine(runs[runs["family"] == name], cases) for name in NAMES.values()]
+    others = [runs[runs["family"] == name] for engine, name in NAMES.items() if engine != OURS]
+    engines = [_engine(each, cases) for each in (*others, *(runs[runs["solver"] == name] for name in OWN))]
     found["engines"] = [line for line in engines if line is not None]
     found["set_for"], found["speeds"] = list(SET_FOR), list(SPEEDS)
+    found["own"] = list(OWN)
     found["probed"] = [CONFIGURATIONS[0].name, *(line["solver"] for line in found["engines"])]
+    found["probed"] = [name for name in found["probed"] if name in PLAIN_AND_BEST]
     found["probes"] = [
         {"label": label, "cells": [[_probe(rows, solver, *each) for each in asked] for solver in found["probed"]]}
         for label, asked in PROBES.items()
@@ -87,15 +93,15 @@ def _priced(runs: pd.DataFrame, error: float, what: str = "call_s") -> float | N
 def _cheapest(runs: pd.DataFrame) -> dict[str, Any]:
     """At each error the cheapest configuration of the engines on a mechanism.
 
-    `ratio`: our call at the first error over theirs; None where one of them does not reach it.
+    `ratios`: our calls at the first error over theirs, where both reach it.
     """
-    line: dict[str, Any] = {"engines": [], "ratio": None}
+    line: dict[str, Any] = {"engines": [], "ratios": {}}
     for error in ERRORS:
         costs = {str(solver): cost for solver, own in runs.groupby("solver") if (cost := _priced(own, error))}
-        ours = costs.pop(f"{NAMES[OURS]}, default", None)
+        ours = {name: costs.pop(name) for name in OWN if name in costs}
         line["engines"].append(min(costs, key=costs.__getitem__, default=None))
-        if error == ERRORS[0] and ours and costs:
-            line["ratio"] = ours / min(costs.values())
+        if error == ERRORS[0] and costs:
+            line["ratios"] = {name: cost / min(costs.values()) for name, cost in ours.items()}
     return line
 
 
@@ -109,7 +115,8 @@ def _engine(runs: pd.DataFrame, cases: list[str]) -> dict[str, Any] | None:
         return None
     solver = min(ranked)[2]
     by_case = {str(case): own for case, own in runs[runs["solver"] == solver].groupby("case")}
-    line: dict[str, Any] = {"name": solver.split(", ")[0], "solver": solver, "at": [], "speeds": []}
+    name = solver if solver in OWN else solver.split(", ")[0]
+    line: dict[str, Any] = {"name": name, "solver": solver, "at": [], "speeds": []}
     line["how"] = next(each.how for each in CONFIGURATIONS if each.name == solver)
     line["steps"] = {
         case: [_step_for(by_case[case], error) if case in by_case else None for error in SET_FOR] for case in cases

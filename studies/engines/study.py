@@ -106,7 +106,7 @@ def run_row(build: Callable[[], Any], each: Configuration, value: float, before:
     row = _row(group, build, solver=each.name, family=NAMES[each.engine], status="REACHED_END")
     if each.engine == OURS:
         row |= {"tol": value}
-        run, again = _ours(loop, value)
+        run, again = _ours(loop, value, each.settings)
     else:
         row |= {"h": loop.t_end / value, "n_steps": int(value)}
         prepared, why = _prepared(build, each)
@@ -116,7 +116,10 @@ def run_row(build: Callable[[], Any], each: Configuration, value: float, before:
             return row | {"status": "TIME_LIMIT", "message": f"not run: would take more than {LIMIT:g} s"}
         run, alone = (partial(prepared.run, loop.t_end, int(value), n) for n in (INSTANTS, 1))
         again = lambda k: alone()  # noqa: E731
-    motion = run()
+    try:
+        motion = run()
+    except ValueError as error:  # a mechanism for which no code can be made
+        return row | {"status": "NOT_APPLICABLE", "message": str(error)}
     if motion.message:
         return row | {"status": "FAILED", "message": motion.message, "call_s": motion.call_s}
     call, stepping = timed(again) if group == RUN else (motion.call_s, motion.stepping_s)
@@ -124,16 +127,16 @@ def run_row(build: Callable[[], Any], each: Configuration, value: float, before:
     return row | errors(loop, motion)
 
 
-def _ours(loop: Loop, tolerance: float) -> tuple[Callable[[], Motion], Callable[[int], Motion]]:
+def _ours(loop: Loop, tolerance: float, compiled: Any) -> tuple[Callable[[], Motion], Callable[[int], Motion]]:
     def run() -> Motion:
         began = time.process_time()
-        made = loop.ours(tolerance, times=loop.times)
+        made = loop.ours(tolerance, loop.times, compiled=compiled)
         motion = loop.motion(made.q, made.v, loop.force(made), time.process_time() - began, made.stats.cpu_time)
         return motion if made.success else replace(motion, message=made.message)
 
     def again(k: int) -> Motion:
         began = time.process_time()
-        made = loop.ours(tolerance, t0=1e-9 * (k + 1) * loop.t_end)  # a start that no call has had
+        made = loop.ours(tolerance, t0=1e-9 * (k + 1) * loop.t_end, compiled=compiled)  # a start that no call has had
         call = time.process_time() - began
         return loop.motion(made.q[:, :1], made.v[:, :1], None, call, made.stats.cpu_time)
 

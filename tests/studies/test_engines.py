@@ -61,11 +61,26 @@ def test_what_to_set_and_what_is_wrong_follow_the_rows():
     assert "| four-bar | 10/10/3.0 |" in text and "Not installed, and so without rows: Drake." in text
 
 
-def test_where_our_call_costs_more_is_said():
+def test_where_our_calls_cost_more_is_said():
     good, ours = made("MuJoCo, RK4, solref 2h", 10.0 * STEPS**2), made("twoloop, default", 1e-1 * STEPS**2, cost=0.1)
-    found, text = said(good, ours, *(each.assign(case="RSSR") for each in (good.assign(call_s=0.01), ours)))
-    assert found["call_over_engines"] == {"four-bar": pytest.approx(0.1), "RSSR": pytest.approx(10.0)}
-    assert "costs no more than the cheapest engine's on 1, more on RSSR (10 times)." in text
+    compiled = made("twoloop, compiled=True", 1e-1 * STEPS**2, cost=0.01)
+    found, text = said(good, ours, compiled, *(each.assign(case="RSSR") for each in (good.assign(call_s=0.01), ours)))
+    over = found["call_over_engines"]
+    assert over["twoloop, default"] == {"four-bar": pytest.approx(0.1), "RSSR": pytest.approx(10.0)}
+    assert over["twoloop, compiled=True"] == {"four-bar": pytest.approx(0.01), "RSSR": None}
+    assert "- `twoloop, default`: no dearer on 1, dearer on RSSR (10 times)." in text
+    assert "- `twoloop, compiled=True`: no dearer on 1, not compared on RSSR." in text
+    assert found["wins_engines"][1] == {"MuJoCo": 2}  # of engines alone
+    assert "| twoloop, compiled=True |" in text and text.count("twoloop, compiled=True |") == 2
+
+
+def test_a_mechanism_without_code_is_a_row(monkeypatch):
+    def refused(*_, **__):
+        raise ValueError("compiled=True needs equations that can be written down")
+
+    monkeypatch.setattr(engines.Loop, "ours", refused)
+    row = engines.run_row(four_bar, engines.CONFIGURATIONS[-1], 1e-3, [])
+    assert row["status"] == "NOT_APPLICABLE" and "written down" in row["message"] and row["call_s"] is None
 
 
 @pytest.mark.skipif(find_spec("mujoco") is None, reason="MuJoCo is not installed")
