@@ -1,5 +1,6 @@
 """Conformance check of simulators of mechanisms against known motions."""
 
+import threading
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import Any
@@ -13,11 +14,13 @@ from twoloop.testing.hints import with_hints
 from twoloop.testing.known_motions import N_TIMES
 from twoloop.testing.known_problem import KnownProblem, Motion
 from twoloop.testing.known_problems import listed, named
+from twoloop.testing.limited import NO_BOUND, Limited
 from twoloop.testing.measuring import Observed, Settings
 from twoloop.testing.properties import in_transformed, measured
 from twoloop.testing.simulated import Simulate, Simulated, simulated
 
 Skipped = tuple[str, str, str]
+TIME_LIMIT = 120.0  # s
 SAYS_SO = "says that it ends"
 WRONG = (
     "Success with a wrong answer: the motion has ended. Check that iterations converge, that C = 0 holds at the end of "
@@ -37,6 +40,7 @@ def check_simulator(
     tolerances: Sequence[float] = (1e-4, 1e-6, 1e-8),
     steps: Sequence[int] | None = None,
     order: float | None = None,
+    time_limit: float | None = TIME_LIMIT,
 ) -> Report:
     """Run a simulator of mechanisms on problems with known motions, and report the properties that fail.
 
@@ -55,6 +59,10 @@ def check_simulator(
         100, so that steps end at the times. `simulate` then gets the step size, s.
     order : float, optional
         With `steps`: the order of the method. None: an observed order of 0.7 or more passes.
+    time_limit : float, optional
+        Wall-clock time of a run, s; a longer one fails. Runs are made in a thread: one that hangs is stopped as soon as
+        it is in Python code, and left behind if it waits elsewhere. Machine code that holds the interpreter's lock cannot
+        be stopped. None: no limit, and runs in the calling thread, where a debugger and signals work.
 
     Returns
     -------
@@ -81,7 +89,8 @@ def check_simulator(
       with steps a limit as above.
     - *multipliers*: relative errors of the forces C_q^T lam, which are unique also with redundant rows.
     - *frame*, *units*: the errors of the same problem in a rotated and translated frame, and in mm and g.
-    - *runs*: all tolerances, or the two finest steps, reach the end; coarser runs may report a failure.
+    - *runs*: all tolerances, or the two finest steps, reach the end; coarser runs may report a failure. No run passes
+      `time_limit`.
     - *says that it ends*: on problems without a motion beyond some time, an exception or NaN.
 
     Examples
@@ -93,7 +102,7 @@ def check_simulator(
     """
     if not callable(simulate):
         raise TypeError(f"simulate must be a function of (problem, times, tolerance); given {type(simulate).__name__}")
-    settings = settings_of(tolerances, steps, order)
+    settings = settings_of(tolerances, steps, order, time_limit)
     findings: list[Finding] = []
     skipped: list[Skipped] = []
     for problem in named(problems):
@@ -103,8 +112,12 @@ def check_simulator(
     return Report(tuple(findings), tuple(skipped))
 
 
-def settings_of(tolerances: Sequence[float], steps: Sequence[int] | None, order: float | None) -> Settings:
+def settings_of(
+    tolerances: Sequence[float], steps: Sequence[int] | None, order: float | None, time_limit: float | None
+) -> Settings:
     """Return the validated settings of a check."""
+    if time_limit is not None and not (_number(time_limit) and 0.0 < time_limit < threading.TIMEOUT_MAX):
+        raise ValueError(f"time_limit must be a positive number of seconds, or None; given {time_limit!r}")
     if order is not None and not (_number(order) and order > 0.0):
         raise ValueError(f"order must be a positive number; given {order!r}")
     if steps is not None:
@@ -114,7 +127,7 @@ def settings_of(tolerances: Sequence[float], steps: Sequence[int] | None, order:
             raise ValueError(
                 f"steps must be two or more increasing numbers, each a multiple of {N_TIMES - 1}; given {steps!r}"
             )
-        return Settings(None, tuple(given), order)
+        return Settings(None, tuple(given), order, time_limit)
     if order is not None:
         raise ValueError(f"order is for simulators of fixed steps, with steps=; given {order!r} without")
     values = listed("tolerances", tolerances)
@@ -122,7 +135,7 @@ def settings_of(tolerances: Sequence[float], steps: Sequence[int] | None, order:
         raise ValueError(f"tolerances must be numbers between 0 and 1; given {tolerances!r}")
     if values != sorted(set(values), reverse=True):
         raise ValueError(f"tolerances must fall from the first to the last; given {tolerances!r}")
-    return Settings(tuple(float(value) for value in values), None, None)
+    return Settings(tuple(float(value) for value in values), None, None, time_limit)
 
 
 def _number(value: Any) -> bool:
@@ -131,16 +144,20 @@ def _number(value: Any) -> bool:
 
 def check_problem(simulate: Simulate, problem: KnownProblem, settings: Settings) -> tuple[list[Finding], list[Skipped]]:
     """Return the findings for all properties of one problem, and those that were not measured."""
-    values, motion = settings.of(problem), problem.reference
+    values, motion, limited = settings.of(problem), problem.reference, Limited(simulate, settings.time_limit)
     if problem.ends is not None:
-        return [_ends(simulate, problem, values[-1])], []
+        return [_ends(limited, problem, values[-1])], []
     if motion is None:
         raise ValueError(f"problems must have a known motion; {problem.name!r} has no reference")
-    runs = [simulated(simulate, problem, motion.t, value) for value in values]
+    runs = [simulated(limited, problem, motion.t, value) for value in values]
     findings = [_runs(problem, settings, values, runs)]
     complete = [(value, run) for value, run in zip(values, runs, strict=True) if run.complete]
     if not findings[0].passed:
-        findings = [replace(findings[0], hint=_hint_from_start(simulate, problem, settings, values))]
+        findings = [
+            replace(
+                findings[0], hint=NO_BOUND if limited.over else _hint_from_start(limited, problem, settings, values)
+            )
+        ]
         return findings, [(problem.name, "everything else", "the run did not come to the end")]
     if len({(run.v is None, run.lam is None) for _, run in complete}) > 1:
         raise TypeError(f"simulate must return the same of q, v and lam in every run; on {problem.name!r} it did not")
@@ -152,11 +169,14 @@ def check_problem(simulate: Simulate, problem: KnownProblem, settings: Settings)
         if any(not each.passed and each.property in ("error of q", "limit of q") for each in findings):
             skipped.append((problem.name, name, "the motion itself is wrong"))
             continue
+        if limited.over:
+            skipped.append((problem.name, name, "a run before it did not end"))
+            continue
         seen = change(problem)
-        run = simulated(simulate, seen.problem, motion.t, middle)
+        run = simulated(limited, seen.problem, motion.t, middle)
         findings.append(in_transformed(observed, settings, name, seen, run, middle))
     failed = {each.property: each for each in findings if not each.passed}
-    return with_hints(findings, Evidence(observed, settings, failed, simulate)), skipped
+    return with_hints(findings, Evidence(observed, settings, failed, limited)), skipped
 
 
 def _hint_from_start(simulate: Simulate, problem: KnownProblem, settings: Settings, values: list[float]) -> str:
@@ -195,7 +215,8 @@ def properties_of(problem: KnownProblem, settings: Settings) -> list[str]:
 
 def _runs(problem: KnownProblem, settings: Settings, values: list[float], runs: list[Simulated]) -> Finding:
     """Check that the required runs reach the end: with fixed steps the two finest."""
-    needed = list(zip(values, runs, strict=True))[0 if settings.tolerances else -2 :]
+    made = list(zip(values, runs, strict=True))
+    needed = [each for each in made if each[1].hung] or made[0 if settings.tolerances else -2 :]
     for value, run in needed:
         if not run.complete:
             what = run.error or _first_not_finite(run)
@@ -215,7 +236,7 @@ def _ends(simulate: Simulate, problem: KnownProblem, setting: float) -> Finding:
     assert problem.ends is not None
     run = simulated(simulate, problem, np.linspace(*problem.t_span, N_TIMES), setting)
     beyond = run.q[run.t > problem.ends + 1e-9]
-    said = bool(run.error) or not np.isfinite(beyond).all(axis=1).any()
+    said = not run.hung and (bool(run.error) or not np.isfinite(beyond).all(axis=1).any())
     what = run.error or ("NaN" if said else f"finite numbers to t = {problem.t_span[1]:.3g} s")
     return Finding(
         problem.name,
@@ -223,5 +244,5 @@ def _ends(simulate: Simulate, problem: KnownProblem, setting: float) -> Finding:
         what,
         f"an exception, or NaN from t = {problem.ends:.3g} s on",
         said,
-        "" if said else WRONG,
+        "" if said else NO_BOUND if run.hung else WRONG,
     )
