@@ -61,8 +61,8 @@ def check_simulator(
         With `steps`: the order of the method. None: an observed order of 0.7 or more passes.
     time_limit : float, optional
         Wall-clock time of a run, s; a longer one fails. Runs are made in a thread: one that hangs is stopped as soon as
-        it is in Python code, and left behind if it waits elsewhere. Machine code that holds the interpreter's lock cannot
-        be stopped. None: no limit, and runs in the calling thread, where a debugger and signals work.
+        it is in Python code, and left behind if it waits elsewhere. Machine code that holds the interpreter's lock
+        cannot be stopped. None: no limit, and runs in the calling thread, where a debugger and signals work.
 
     Returns
     -------
