@@ -8,10 +8,10 @@ import numpy as np
 from twoloop.testing.changes import in_a_frame
 from twoloop.testing.evidence import CLEAR, Evidence
 from twoloop.testing.findings import Finding
-from twoloop.testing.instants import clock, rates_of_time, returned, shifted_in_time
+from twoloop.testing.instants import between_steps, clock, rates_of_time, returned, shifted_in_time
 from twoloop.testing.measuring import HELD_BY_STEPS, allowed, forces_of_constraints, lam_errors, still_there, violations
 from twoloop.testing.mistakes import mistaken_acceleration
-from twoloop.testing.properties import SHORT, changes_of, observed_order
+from twoloop.testing.properties import SHORT, changes_of, observed_order, same_at_last
 from twoloop.testing.simulated import simulated, transformed_back
 
 
@@ -104,7 +104,7 @@ def _drift(e: Evidence) -> str:
 
 def _unused(e: Evidence) -> str:
     runs, settings = e.observed.runs, e.observed.settings
-    if len(runs) < 2 or not np.array_equal(runs[-2].q, runs[-1].q):
+    if not same_at_last(e.observed):
         return ""
     if np.array_equal(runs[0].q, runs[-1].q):
         return (
@@ -254,6 +254,13 @@ def _units(e: Evidence) -> str:
     )
 
 
+def _precision(e: Evidence) -> str:
+    return (
+        "All states are numbers of single precision, which has 7 digits and cannot hold such a tolerance: look for "
+        "float32 among the arrays, or in the settings of the simulator."
+    )
+
+
 def _rates(e: Evidence) -> str:
     if "velocity constraints" not in e.failed:
         return ""
@@ -277,11 +284,13 @@ def _where(e: Evidence) -> str:
 
 
 MOTION: tuple[Callable[[Evidence], str], ...] = (
-    *(returned, shifted_in_time, _singular, _acceleration, rates_of_time, _velocities, clock, _unused, _drift),
-    *(_floor, _orders, _coarse, _slack, _rates, _where),
+    *(returned, shifted_in_time, _singular, rates_of_time, _acceleration, _velocities, clock, _unused, between_steps),
+    *(_drift, _floor, _orders, _coarse, _slack, _rates, _where),
 )
-OWN: dict[str, Callable[[Evidence], str]] = {"multipliers": _multipliers, "frame": _frame, "units": _units}
-MOVING = ("error of", "limit of", "order of")  # prefixes of properties on which the multipliers depend
+OWN: dict[str, Callable[[Evidence], str]] = {
+    **{"multipliers": _multipliers, "frame": _frame, "units": _units, "precision": _precision}
+}
+MOVING = ("error of", "limit of", "order of")  # prefixes of properties of the motion itself
 
 
 def with_hints(findings: list[Finding], evidence: Evidence) -> list[Finding]:

@@ -11,6 +11,7 @@ from twoloop.testing.simulated import Simulate, simulated
 
 START_INDICES = range(0, 86, 5)  # indices of the known motion from which the simulator is started
 N_LATER = 10  # number of output times after which its acceleration is measured
+CLEAR = 0.2  # places whose accelerations are known to this part go before others
 SURE = 3.0  # a difference of accelerations is significant above this multiple of the estimated error
 EXPLAINS = 0.15  # largest remaining fraction of the difference for an accepted explanation
 FITS = 0.05  # the same for explanations with a fitted factor
@@ -62,12 +63,19 @@ MISTAKES: dict[str, Mistake] = {
     "the forces that depend on the velocities (gyroscopic, centrifugal) are left out": _with(
         Q=lambda p, t, q, v: p.force(t, q, 0.0 * v)
     ),
+    "the forces that depend on the velocities (gyroscopic, centrifugal) have the other sign": _with(
+        Q=lambda p, t, q, v: 2.0 * p.force(t, q, 0.0 * v) - p.force(t, q, v)
+    ),
+    "the forces that depend on the velocities (gyroscopic, centrifugal) are twice as large": _with(
+        Q=lambda p, t, q, v: 2.0 * p.force(t, q, v) - p.force(t, q, 0.0 * v)
+    ),
     "the forces are those of the start: they are to be taken at (t, q, v)": _with(
         Q=lambda p, t, q, v: p.force(_start(p), p.q0, p.v0)
     ),
     "the forces are those of the time at the start: they are to be taken at (t, q, v)": _with(
         Q=lambda p, t, q, v: p.force(_start(p), q, v)
     ),
+    "the forces are those of t = 0: they are to be taken at (t, q, v)": _with(Q=lambda p, t, q, v: p.force(0.0, q, v)),
     "the forces are those of the time since the start: t begins at times[0], not at 0": _with(
         Q=lambda p, t, q, v: p.force(t - _start(p), q, v)
     ),
@@ -107,7 +115,9 @@ def mistaken_acceleration(
     `fit`: also try forces or masses that are wrong by a factor, which errors of a coarse method can resemble.
     """
     tries = (_observed(simulate, begun_later(problem, k, N_LATER + 1), setting, by_steps) for k in _starts(problem))
-    places = [seen for seen in tries if seen is not None]
+    seen = [each for each in tries if each is not None]
+    clear = [each for each in seen if each.doubt < CLEAR * max(np.linalg.norm(each.a), np.linalg.norm(each.true))]
+    places = clear if len(clear) > 1 else seen
     if len(places) < 2:  # a single one may be a coincidence
         return ""
     best, least = "", EXPLAINS
