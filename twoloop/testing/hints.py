@@ -67,6 +67,8 @@ def _velocities(e: Evidence) -> str:
     for text, other in others.items():
         if np.linalg.norm((run.v - other)[start:]) < 2.0 * CLEAR * error:
             return f"Positions are right and velocities are not. {text}"
+    if e.settings.tolerances and e.observed.errors("v")[-1].max() < CLEAR * e.observed.errors("v")[0].max():
+        return ""  # they converge
     held = "" if "velocity constraints" not in e.failed else " They do not obey C_q v + C_t = 0 either: project them."
     return (
         "Positions are right and velocities are not: they belong to another time, or not to the final "
@@ -182,11 +184,10 @@ def _order_seen(e: Evidence, kind: str, seen: float) -> str:
 def _slack(e: Evidence) -> str:
     if e.settings.tolerances is None or not (e.wrong("q") or e.wrong("v")):
         return ""
-    errors = e.observed.errors("q")
-    limits = [allowed(e.observed.motion, setting).max() for setting in e.observed.settings]
-    over = errors[-1].max() / limits[-1]
+    worst = [each for each in e.failed.values() if each.property.startswith("error of")]
+    over = max(float(each.measured) / float(each.allowed) for each in worst)
     return (
-        f"The error falls with the tolerance, and is {over:.1g} times what is allowed at the last: the estimate of the "
+        f"The error falls with the tolerance, and is {over:.1g} times what is allowed: the estimate of the "
         "error is too small, or leaves out some coordinates, or the tolerance is not passed on."
     )
 
