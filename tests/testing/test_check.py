@@ -44,7 +44,7 @@ def properties_that_fail(report):
 )
 def test_a_planted_fault_is_found_and_named(fault):
     module = module_of(fault.example, fault.edits)
-    report = check_simulator(module.simulate, fault.problem, steps=fault.steps, order=ORDERS[fault.example])
+    report = check_simulator(module.simulate, fault.problem, **fault.options)
     assert not report.passed
     assert any(fault.words in failure.hint for failure in report.failures), str(report)
 

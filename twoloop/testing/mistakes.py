@@ -15,6 +15,7 @@ CLEAR = 0.2  # places whose accelerations are known to this part go before other
 SURE = 3.0  # a difference of accelerations is significant above this multiple of the estimated error
 EXPLAINS = 0.15  # largest remaining fraction of the difference for an accepted explanation
 FITS = 0.05  # the same for explanations with a fitted factor
+DAMPING = "there is a force (a damping?) of"
 TIE = 1e-4  # fits whose residuals differ by less count as equal
 Mistake = Callable[[KnownProblem, float, Array, Array], Array]
 
@@ -146,6 +147,7 @@ def _scaled(places: list[ObservedAcceleration]) -> str:
         off, inertia = each.free @ (M @ each.a - Q), np.diag(M) * each.a
         sure |= bool(np.linalg.norm(off) > SURE * np.linalg.norm(M, 2) * each.doubt)
         pairs.setdefault("the forces are", []).append((off, each.free @ Q))
+        pairs.setdefault(DAMPING, []).append((off, each.free @ each.v))
         for k, kind in enumerate(each.problem.coordinates):
             pairs.setdefault(f"the force on q[{k}] ({kind}) is", []).append((off, each.free[:, k] * Q[k]))
             pairs.setdefault(f"the mass or inertia of q[{k}] ({kind}) is", []).append(
@@ -158,7 +160,7 @@ def _scaled(places: list[ObservedAcceleration]) -> str:
             more = float(off @ part / (part @ part))
             rest = float(np.linalg.norm(off - more * part) / np.linalg.norm(off))
             if rest < FITS:
-                fits[f"{name} {_times(1.0 + more)}"] = rest
+                fits[f"{name} {more:.2g} v" if name == DAMPING else f"{name} {_times(1.0 + more)}"] = rest
     # force and mass of a free coordinate are equivalent: name all that fit, the force first
     least = min(fits.values(), default=0.0)
     return ", or ".join(name for name, rest in fits.items() if rest <= least + TIE)
