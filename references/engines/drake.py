@@ -7,6 +7,7 @@ import numpy as np
 
 from references.driver import imported
 from references.engines import rigid as parts
+from references.engines.engine import Configured, Engine
 from references.engines.rigid import BALL, HINGE, SLIDE, UNTOLD, Array, Motion, Prepared, Rigid, State
 
 
@@ -155,3 +156,13 @@ def _start(rigid: Rigid, plant: Any, context: Any, bodies: list[Any]) -> None:
         forces.append(force)
     if forces:
         plant.get_applied_spatial_force_input_port().FixValue(context, forces)
+
+
+ENGINE = Engine(
+    *("Drake", "drake", prepare, Settings()),
+    (
+        Configured("SAP", Settings(), "`kSap`", everywhere=True),
+        Configured("TAMSI", Settings("kTamsi"), "`kTamsi`"),
+        Configured("continuous", Settings("continuous"), "a plant with step 0"),
+    ),
+)

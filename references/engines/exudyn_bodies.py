@@ -7,6 +7,7 @@ import numpy as np
 
 from references.driver import imported
 from references.engines import rigid as parts
+from references.engines.engine import Configured, Engine
 from references.engines.rigid import UNTOLD, Motion, Prepared, Rigid
 
 PLANAR_CUT = [1, 1, 0, 0, 0, 0]
@@ -108,3 +109,12 @@ def _model(rigid: Rigid, planar: bool, q: Any, v: Any) -> tuple[Any, int, Any]:
         model.torque(int(k), rigid.torques[k])
     model.mbs.Assemble()
     return model, sensor, own
+
+
+ENGINE = Engine(
+    *("Exudyn", "exudyn", prepare, Settings()),
+    (
+        Configured("generalized-alpha", Settings(), everywhere=True),
+        Configured("trapezoidal", Settings("TrapezoidalIndex2"), "`TrapezoidalIndex2`"),
+    ),
+)

@@ -10,6 +10,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from references.driver import imported
+from references.engines.engine import Configured, Engine
 from references.engines.rigid import BALL, Motion, Prepared, Rigid, State, freedoms, march
 from twoloop.bodies.mjcf_geometry import IgnoredWarning
 
@@ -83,3 +84,16 @@ def file_of(rigid: Rigid, settings: Settings) -> str:
             if value is not None:
                 element.set(name, value)
     return ElementTree.tostring(root, encoding="unicode")
+
+
+SOFT, RIGID = Settings("RK4", "0.002 1", "0.999 0.9999 0.001"), Settings("RK4", "1e-9 1", "0.9999 0.9999 0.001")
+_CONNECTS = '`integrator="RK4"`; on connects'
+ENGINE = Engine(
+    *("MuJoCo", "mujoco", prepare, RIGID),
+    (
+        Configured("default", Settings(), everywhere=True),
+        Configured("RK4", Settings("RK4"), '`integrator="RK4"`'),
+        Configured("RK4, solref 2 ms", SOFT, f'{_CONNECTS} `solref="{SOFT[1]}" solimp="{SOFT[2]}"`'),
+        Configured("RK4, solref 2h", RIGID, f'{_CONNECTS} `solref="{RIGID[1]}" solimp="{RIGID[2]}"`', everywhere=True),
+    ),
+)

@@ -8,6 +8,7 @@ import numpy as np
 
 from references.driver import imported
 from references.engines import rigid as parts
+from references.engines.engine import Configured, Engine
 from references.engines.rigid import BALL, SLIDE, UNTOLD, Motion, Prepared, Rigid, State
 from twoloop.bodies.parts import Body
 from twoloop.problem.problem import Array
@@ -222,3 +223,16 @@ def _runge_kutta(a: Acceleration, rate: Acceleration, q: Array, v: Array, h: flo
     a3, u3 = a(q + 0.5 * h * u2, v3 := v + 0.5 * h * a2), rate(q + 0.5 * h * u2, v3)
     a4, u4 = a(q + h * u3, v4 := v + h * a3), rate(q + h * u3, v4)
     return q + h / 6.0 * (u1 + 2.0 * (u2 + u3) + u4), v + h / 6.0 * (a1 + 2.0 * (a2 + a3) + a4)
+
+
+_PROXIMAL = "`ProximalSettings(1e-14, 1e-3, 20)`, `Kp` 100, `Kd` 20"
+_EULER, _RK4, _STIFF = (Settings(*each, 20, 10.0) for each in (("Euler", 1e-3), ("RK4", 1e-3), ("RK4", 1e-8)))
+ENGINE = Engine(
+    *("Pinocchio", "pin", prepare, Settings("RK4", 1e-3)),
+    (
+        Configured("default", Settings()),
+        Configured("Euler, Baumgarte", _EULER, f"semi-implicit Euler; {_PROXIMAL}"),
+        Configured("RK4, Baumgarte", _RK4, f"RK4 of q and v; {_PROXIMAL}", everywhere=True),
+        Configured("RK4, mu 1e-8", _STIFF, "as before, with `ProximalSettings(1e-14, 1e-8, 20)`"),
+    ),
+)

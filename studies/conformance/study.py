@@ -39,7 +39,7 @@ SIGNS = {  # of properties, in the report
 
 def checked(simulator: Simulator, problem: KnownProblem, quick: bool) -> list[Row]:
     """The rows of one simulator on one problem: each property, and what was not measured."""
-    settings = settings_of((simulator.tolerances or TOLERANCES)[: 2 if quick else None], simulator.steps, None)
+    settings = settings_of((simulator.tolerances or TOLERANCES)[: 2 if quick else None], simulator.steps, None, None)
     try:
         findings, skipped = apart(lambda: check_problem(simulator.simulate, problem, settings), cpu=LIMIT)
     except EOFError as error:

@@ -6,13 +6,14 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from references.engines.engine import engines
 from studies.bench import tables
 from studies.bench.changed_loops import DRIVEN, RATIOS, SERVO
 from studies.bench.cli import version_of
 from studies.bench.closed_loops import SPATIAL
 from studies.bench.end_states import EXACT
 from studies.bench.engine_runs import LIMIT
-from studies.engines.configurations import CONFIGURATIONS, NAMES, OURS, PACKAGES, PLAIN_AND_BEST, Configuration
+from studies.engines.configurations import AS_IT_COMES, CONFIGURATIONS, NAMES, OURS, Configuration
 from twoloop.audit.step_audit import LOST, order_and_floor
 
 GATE, RUN, MASS, TURN, MOTOR, ENERGY = "gate", "run", "mass", "turn", "motor", "energy"  # groups of rows
@@ -37,7 +38,7 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     cases = list(dict.fromkeys(runs["case"]))
     found: dict[str, Any] = {"cases": cases, "errors": list(ERRORS), "lost": LOST, "limit": LIMIT}
     found["absent"] = sorted(set(gates[gates["status"] == "NOT_AVAILABLE"]["family"]))
-    found["versions"] = {NAMES[engine]: version_of(package) for engine, package in PACKAGES.items()}
+    found["versions"] = {each.name: version_of(each.package) for each in engines().values()}
     found["gates"] = gates[gates["status"] != "PASSED"][["case", "solver", "message"]].to_dict("records")
     found["n_gates"] = int((gates["status"] == "PASSED").sum())
     found["apart"] = float(runs["floor"].astype(float).max())
@@ -50,12 +51,10 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     wins = [Counter(sorted(each.split(", ")[0] for each in names if each)) for names in zip(*cheapest_of, strict=True)]
     found["wins_engines"] = [dict(each.most_common()) for each in wins]
     others = [runs[runs["family"] == name] for engine, name in NAMES.items() if engine != OURS]
-    engines = [_engine(each, cases) for each in (*others, *(runs[runs["solver"] == name] for name in OWN))]
-    found["engines"] = [line for line in engines if line is not None]
-    found["set_for"], found["speeds"] = list(SET_FOR), list(SPEEDS)
-    found["own"] = list(OWN)
-    found["probed"] = [CONFIGURATIONS[0].name, *(line["solver"] for line in found["engines"])]
-    found["probed"] = [name for name in found["probed"] if name in PLAIN_AND_BEST]
+    lines = [_engine(each, cases) for each in (*others, *(runs[runs["solver"] == name] for name in OWN))]
+    found["engines"] = [line for line in lines if line is not None]
+    found["set_for"], found["speeds"], found["own"] = list(SET_FOR), list(SPEEDS), list(OWN)
+    found["probed"] = [AS_IT_COMES, *(line["solver"] for line in found["engines"] if line["solver"] not in OWN[1:])]
     found["probes"] = [
         {"label": label, "cells": [[_probe(rows, solver, *each) for each in asked] for solver in found["probed"]]}
         for label, asked in PROBES.items()

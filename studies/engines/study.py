@@ -11,6 +11,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
+from references.engines.engine import engines
 from references.engines.rigid import Motion, Prepared, coordinates
 from studies.bench import figures
 from studies.bench.changed_loops import IN_A_FRAME, LIGHTENED, MOTORISED
@@ -18,7 +19,7 @@ from studies.bench.closed_loops import MECHANISMS, four_bar, rssr
 from studies.bench.engine_runs import INSTANTS, LIMIT, Loop, errors, gate, timed
 from studies.bench.store import Output, Row
 from studies.bench.study import Study
-from studies.engines.configurations import BEST, CONFIGURATIONS, MODULES, NAMES, OURS, PLAIN_AND_BEST, Configuration
+from studies.engines.configurations import CONFIGURATIONS, NAMES, OURS, Configuration
 from studies.engines.findings import ENERGY, GATE, MASS, MOTOR, PROBED, RUN, TURN, findings_of
 from twoloop.audit.step_audit import LOST
 
@@ -30,7 +31,7 @@ CHANGED = {MASS: LIGHTENED, TURN: IN_A_FRAME, MOTOR: MOTORISED}
 SHORT = 0.1  # s: motions that last no longer are too fast for the steps of the long ones
 LONG, LONG_STEPS, LONG_INSTANTS, LONG_LIMIT = 100.0, 50_000, 200, 20.0  # s; how it is run; s of CPU
 SHOWN = ("four-bar", "Watt's six-bar", "Andrews' squeezer", "RSSR", "Bricard", "Stewart platform")  # in the figure
-ASKED_MORE = [each for each in CONFIGURATIONS if each.name in PLAIN_AND_BEST]
+ASKED_MORE = [each for each in CONFIGURATIONS if each.everywhere]
 STOPPED = ("NOT_AVAILABLE", "NOT_APPLICABLE", "GATE_FAILED")
 
 
@@ -43,8 +44,9 @@ def loop_of(make: Callable[[], Any]) -> Loop:
 @cache
 def gated(make: Callable[[], Any], engine: str) -> tuple[str, str]:
     """Status and message of the gates of an engine's model of a mechanism."""
+    asked = engines()[engine]
     try:
-        wrong = gate(loop_of(make), MODULES[engine].prepare(loop_of(make).rigid, BEST[engine]))
+        wrong = gate(loop_of(make), asked.prepare(loop_of(make).rigid, asked.most_rigid))
     except RuntimeError as error:
         return ("NOT_AVAILABLE" if "not installed" in str(error) else "FAILED"), str(error).strip().splitlines()[0]
     except ValueError as error:
@@ -59,7 +61,7 @@ def make(output: Output) -> pd.DataFrame:
     with output.kept() as kept:
         rows: list[Row] = []
         for group, build in ((group, build) for group, builds in groups.items() for build in builds):
-            for engine in MODULES:
+            for engine in engines():
                 status, message = gated(build, engine)
                 told = {"solver": NAMES[engine], "family": NAMES[engine], "status": status, "message": message}
                 rows.append(kept.made(f"{GATE} {build.__name__} {engine}", partial(_row, GATE, build, **told)))
@@ -95,7 +97,7 @@ def _prepared(build: Callable[[], Any], each: Configuration) -> tuple[Prepared |
     if status != "PASSED":
         return None, {"status": status, "message": message}
     try:
-        return MODULES[each.engine].prepare(loop_of(build).rigid, each.settings), {}
+        return engines()[each.engine].prepare(loop_of(build).rigid, each.settings), {}
     except RuntimeError as error:
         return None, {"status": "NOT_APPLICABLE", "message": str(error).strip().splitlines()[0]}
 
@@ -170,8 +172,17 @@ def energy_row(build: Callable[[], Any], each: Configuration) -> Row:
     return row | {"energy": float(np.abs(energies - energies[0]).max() / loop.kinetic)}
 
 
-COLORS = figures.BLUE, figures.GREEN, figures.ORANGE, figures.PINK, figures.BLACK
-LOOKS = dict(zip(NAMES.values(), COLORS, strict=True))  # engine: colour
+COLORS = (
+    figures.GREEN,
+    figures.PINK,
+    figures.BLUE,
+    figures.ORANGE,
+    figures.SKY,
+    figures.RED,
+    figures.BROWN,
+    figures.YELLOW,
+)
+LOOKS = dict(zip(NAMES.values(), COLORS, strict=False)) | {NAMES[OURS]: figures.BLACK}  # engine: colour
 
 
 def figures_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Figure]:

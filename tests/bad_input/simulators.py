@@ -49,6 +49,9 @@ SIMULATORS = [
     of_check(
         "an order as text", lambda: check(steps=[100, 200], order="4"), "order must be a positive", "write order=4"
     ),
+    of_check(
+        "no time", lambda: check(time_limit=0), "time_limit must be a positive number", "leave it out, or give None"
+    ),
     of_return("a column for each time", lambda: returns(lambda n, m: np.zeros((2, n)))).says(
         r"of shape \(101, 2\).*returned shape \(2, 101\) \(transpose it\)", "return q.T"
     ),

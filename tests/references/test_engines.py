@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from references.engines import drake, exudyn_bodies, mujoco, pinocchio
+from references.engines import engine as catalogue
+from references.engines import exudyn_bodies, mujoco, pinocchio
 from references.engines.rigid import coordinates, rigid_of
 from studies.bench import closed_loops
 from studies.bench.changed_loops import IN_A_FRAME, LIGHTENED, MOTORISED
@@ -16,19 +17,17 @@ from twoloop.audit.poses import gaps
 from twoloop.bodies import PlanarModel, SpatialModel
 from twoloop.bodies.parameter_layout import TORSION
 
-RIGID = {
-    "mujoco": (mujoco, mujoco.Settings("RK4", "1e-9 1", "0.9999 0.9999 0.001"), "mujoco"),
-    "drake": (drake, drake.Settings(), "pydrake"),
-    "pinocchio": (pinocchio, pinocchio.Settings("RK4", 1e-8), "pinocchio"),
-    "exudyn": (exudyn_bodies, exudyn_bodies.Settings(), "exudyn"),
-}
-engines = pytest.mark.parametrize("engine", RIGID)
+ENGINES = catalogue.engines()
+engines = pytest.mark.parametrize("engine", ENGINES)
 
 
 def prepared(engine, rigid):
-    module, settings, package = RIGID[engine]
-    pytest.importorskip(package)
-    return module.prepare(rigid, settings)
+    try:
+        return ENGINES[engine].prepare(rigid, ENGINES[engine].most_rigid)
+    except RuntimeError as error:
+        if "not installed" in str(error):
+            pytest.skip(str(error))
+        raise
 
 
 @pytest.fixture(scope="module")
@@ -130,7 +129,9 @@ def test_the_force_of_a_joint_has_the_sign_of_ours_at_rest_and_its_size_in_motio
     assert np.isnan(Loop(replace(closed_loops.bricard(), t_span=(0.0, 0.05))).reference[0].f).all()  # not unique
 
 
-@pytest.mark.parametrize(("engine", "order"), [("mujoco", 1.7), ("drake", 0.8), ("pinocchio", 3.5), ("exudyn", 1.8)])
+@pytest.mark.parametrize(
+    ("engine", "order"), [("mujoco", 1.7), ("drake", 0.8), ("pinocchio", 3.5), ("exudyn_bodies", 1.8)]
+)
 def test_errors_fall_with_the_step(engine, order):
     loop = Loop(replace(closed_loops.rssr(), t_span=(0.0, 0.2)))
     run = prepared(engine, loop.rigid).run
@@ -139,7 +140,7 @@ def test_errors_fall_with_the_step(engine, order):
     assert off[1]["error_v"] < 0.05 and off[1]["gap"] < 1e-3
 
 
-@pytest.mark.parametrize("engine", ["pinocchio", "exudyn"])
+@pytest.mark.parametrize("engine", ["pinocchio", "exudyn_bodies"])
 def test_an_engine_is_audited_by_a_small_adapter(engine):
     problem = replace(closed_loops.rssr(), t_span=(0.0, 0.2))
     run = prepared(engine, rigid_of(problem)).run

@@ -9,11 +9,12 @@ from tests.problems import held_twice, pendulum
 from tests.references.adapters import ADAPTERS
 from twoloop.mechanisms import bricard, redundant_slider_crank
 
-SLOW = ("CVODE", "IDA, stabilised", "Radau of solve_dae")
+SLOW = ("CVODE, Adams", "IDA, stabilised", "Radau, solve_dae")
 
 
 @pytest.mark.parametrize(
-    "name", ["DOP853, projected", "IDA from C", *(pytest.param(each, marks=pytest.mark.slow) for each in SLOW)]
+    "name",
+    ["DOP853, projected", "IDA from C, stabilised", *(pytest.param(each, marks=pytest.mark.slow) for each in SLOW)],
 )
 def test_motion_and_multipliers_of_all_rows_are_those_of_the_reference(name):
     problem = redundant_slider_crank()

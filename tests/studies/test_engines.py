@@ -127,7 +127,8 @@ def test_an_engine_that_is_not_there_is_a_row(monkeypatch):
     def absent(rigid, settings):
         raise RuntimeError("mujoco is not installed: make engines")
 
-    monkeypatch.setattr(engines.MODULES["mujoco"], "prepare", absent)
+    found = {name: engine._replace(prepare=absent) for name, engine in engines.engines().items()}
+    monkeypatch.setattr(engines, "engines", lambda: found)
     engines.gated.cache_clear()
     row = engines.run_row(four_bar, engines.CONFIGURATIONS[0], 100, [])
     engines.gated.cache_clear()

@@ -1,12 +1,12 @@
-"""Faults to plant into the integrators of docs/examples: which text becomes which, and what a check should say."""
+"""Faults to plant into small integrators: which text becomes which, and what a check should say."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import ModuleType
 
-EXAMPLES = Path(__file__).parents[2] / "docs" / "examples"
+EXAMPLES, OTHERS = Path(__file__).parents[2] / "docs" / "examples", Path(__file__).parent / "integrators"
 RK, ALPHA, RATTLE = "runge_kutta", "generalised_alpha", "rattle"
-ORDERS = {RK: 4.0, ALPHA: 2.0, RATTLE: 2.0}
+ORDERS = {RK: 4.0, ALPHA: 2.0, RATTLE: 2.0, "half_explicit": 2.0, "hht": 2.0}  # others take tolerances
 STEPS, FINE = (100, 200), (100, 200, 400)
 
 
@@ -21,10 +21,16 @@ class Planted:
     steps: tuple[int, ...] = STEPS
     edits: list[tuple[str, str]] = field(default_factory=list)
 
+    @property
+    def options(self):
+        """Of `check_simulator`."""
+        return {"steps": self.steps, "order": ORDERS[self.example]} if self.example in ORDERS else {}
+
 
 def module_of(example, edits=()):
     """An example as a module, some texts of it replaced."""
-    source = (EXAMPLES / f"{example}.py").read_text(encoding="utf-8")
+    folder = EXAMPLES if (EXAMPLES / f"{example}.py").exists() else OTHERS
+    source = (folder / f"{example}.py").read_text(encoding="utf-8")
     for old, new in edits:
         assert old in source, f"{example}.py has no {old!r}"
         source = source.replace(old, new)
@@ -34,7 +40,7 @@ def module_of(example, edits=()):
 
 
 # name, example, problem, words and, of faults that few steps do not show, "fine"; below, texts and what they become
-TABLE = """
+TABLE = r"""
 gamma has the other sign | runge_kutta | four_bar | gamma
     problem.gamma(t, q, v) => -problem.gamma(t, q, v)
 gamma is left out | runge_kutta | driven_crank | gamma
@@ -117,6 +123,61 @@ a little damping | generalised_alpha | shaken_spring | a damping | fine
     force(t + h, new_q, new_v) => force(t + h, new_q, new_v) - 1e-3 * new_v
 multipliers of the middle | generalised_alpha | pendulum | another instant
     rows.append((q, v, lam)) => rows.append((q, v, 0.5 * (lam + rows[-1][2])))
+# in integrators that were written for this
+a tolerance of its own | dormand_prince | four_bar | it is not used
+    / scale_v) / tolerance => / scale_v) / 1e-5
+an estimate of one coordinate | dormand_prince | heavy_end | leaves out some coordinates
+    np.abs(error_q).max() / scale_q => np.abs(error_q[0]) / scale_q
+    np.abs(error_v).max() / scale_v) => 0.0)
+a misprint in the tableau | dormand_prince | pendulum | the estimate of the error
+    -25360 / 2187 => -25306 / 2187
+states between steps by straight lines | dormand_prince | pendulum | between the steps
+    h = 1e-3 * (times[-1] - times[0]) => h, told = 1e-3 * (times[-1] - times[0]), [(t, q, v)]
+    for end in times[1:]: => for end in times[-1:]:
+    if ratio <= 1.0: => if ratio <= 1.0 and not told.append((t + step, new_q, new_v)):
+    return tuple(np.array(each) for => at, *s = (np.array(each) for
+    zip(*rows, strict=True)) => zip(*told)); return tuple(np.array([np.interp(times, at, x) for x in y.T]).T for y in s)
+states of single precision | dormand_prince | pendulum | single precision
+    return q, v - => return np.float32(q), np.float32(v) -
+    rows.append((q, v, => rows.append((q, np.float32(v),
+a projection at the time before | dormand_prince | driven_crank | projection at its end
+    projected(problem, t + h, qk, vk) => projected(problem, t, qk, vk)
+damping in steps by tolerance | dormand_prince | four_bar | a damping
+    problem.force(t, q, v) => problem.force(t, q, v) - 0.02 * v
+C_t is left out of an update | half_explicit | driven_crank | C_t is left out
+    J @ v + problem.constraint_rate(*end) => J @ v
+M of the first position | half_explicit | heavy_top | mass matrix is that of the start
+    problem.mass(*at[:2]) => problem.mass(problem.t_span[0], problem.q0)
+only the diagonal of M in an update | half_explicit | heavy_top | diagonal
+    M, to, Q = problem.mass(*at[:2]) => M, to, Q = np.diag(np.diag(problem.mass(*at[:2])))
+the forces of the first stage | half_explicit | pendulum | First order
+    (t + 0.5 * h, half_q, half_v), (t => (t, q, v), (t
+one step too few | half_explicit | pendulum | its clock is not
+    for k in range(n): => for k in range(n - 1):
+the last iterate is not taken | half_explicit | pendulum | too early
+    q = q + change => new = q + change
+    < 1e-13 * max(1.0, np.abs(q).max()): => < 1e-5:
+    raise FloatingPointError("no position on the constraints") => raise FloatingPointError("no")
+    return q => return q\n        q = new
+an iteration with a unit | half_explicit | pendulum | fails in mm and g
+    < 1e-13 * max(1.0, np.abs(q).max()) => < 1e-13
+velocities of the output time before | half_explicit | pendulum | output time before
+    return tuple(np.array(each) for each in => q, v, lam = (np.array(each) for each in
+    zip(*rows, strict=True)) => zip(*rows)); return q, np.vstack([v[:1], v[:-1]]), lam
+forces of t = 0 | hht | shaken_spring | of t = 0
+    problem.force(t, q, v)\n    ) => problem.force(0.0, q, v)\n    )
+gyroscopic forces twice | hht | heavy_top | twice as large | fine
+    problem.force(t, q, v)\n    ) => 2.0 * problem.force(t, q, v) + problem.force(t, q, 0.0 * v)\n    )
+forces of the velocity before | hht | shaken_spring | First order
+    equations(problem, new_t, new_q, new_v, => equations(problem, t, new_q, v,
+velocities projected at the time before | hht | driven_crank | C_t of one step before
+    rows.append(told(problem, end, => rows.append(told(problem, end - h,
+multipliers of the weighted equations | hht | shaken_spring | 0.9 times those
+    *state[:2], state[3])) => *state[:2], 0.9 * state[3]))
+a start without acceleration | hht | driven_crank | First order
+    (q, v, a, lam, a) => (q, v, 0.0 * a, lam, 0.0 * a)
+a place that is fixed | hht | shaken_spring | distance from the origin | fine
+    problem.force(t, q, v)\n    ) => problem.force(t, q, v) - 0.2 * q * (np.abs(q).max() > 3.0)\n    )
 """
 
 
@@ -124,7 +185,7 @@ def _faults():
     found = []
     for line in TABLE.strip().splitlines():
         if line.startswith("    "):
-            found[-1].edits.append(tuple(line.strip().split(" => ")))
+            found[-1].edits.append(tuple(text.replace("\\n", "\n") for text in line.strip().split(" => ")))
         elif not line.startswith("#"):
             name, example, problem, words, *fine = line.split(" | ")
             found.append(Planted(name, example, problem, words, FINE if fine else STEPS))

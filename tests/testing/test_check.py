@@ -1,5 +1,9 @@
 """`check_simulator`: what it measures, what it finds, what it says of it, and what it refuses."""
 
+import threading
+from contextlib import suppress
+from time import sleep
+
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
@@ -40,7 +44,7 @@ def properties_that_fail(report):
 )
 def test_a_planted_fault_is_found_and_named(fault):
     module = module_of(fault.example, fault.edits)
-    report = check_simulator(module.simulate, fault.problem, steps=fault.steps, order=ORDERS[fault.example])
+    report = check_simulator(module.simulate, fault.problem, **fault.options)
     assert not report.passed
     assert any(fault.words in failure.hint for failure in report.failures), str(report)
 
@@ -199,6 +203,70 @@ def test_silence_is_found_and_a_word_is_not():
     assert report.failures[0].property == "runs" and "ArithmeticError: stuck at t = 1" in str(report)
     assert report.skipped == (("pendulum", "everything else", "the run did not come to the end"),)
     assert "q is not finite from t = 0.52 s on" in str(check_simulator(partly, "pendulum"))
+
+
+def hanging(where, how):
+    """A simulator that does not end on some runs."""
+    example = module_of(RK).simulate
+
+    def simulate(problem, times, step):
+        while where(problem, times, step):
+            how()
+        return example(problem, times, step)
+
+    return simulate
+
+
+def beaten():
+    """Work whose exceptions are all caught."""
+    with suppress(Exception):
+        sum(range(100))
+
+
+HANGS = [
+    (lambda problem, times, step: True, "runs"),
+    (lambda problem, times, step: step > 0.019, "runs"),  # the coarse run alone, which may fail but not hang
+    (lambda problem, times, step: problem.reference is None and times.size == 101, "frame"),
+]
+
+
+@pytest.mark.parametrize("how", [beaten, lambda: sleep(3600.0)], ids=["in Python", "elsewhere"])
+@pytest.mark.parametrize(("where", "which"), HANGS, ids=["always", "coarse", "frame"])
+def test_a_run_that_hangs_is_a_failure_and_the_check_ends(where, which, how):
+    report = check_simulator(hanging(where, how), "pendulum", steps=(100, 200), order=4, time_limit=0.5)
+    assert [failure.property for failure in report.failures] == [which]
+    assert report.failures[0].measured.startswith("did not end within 0.5 s")
+    assert which != "frame" or ("pendulum", "units", "a run before it did not end") in report.skipped
+
+
+def test_hanging_is_no_way_to_say_that_a_motion_ends():
+    report = check_simulator(hanging(lambda *given: True, beaten), "out_of_reach", time_limit=0.2)
+    assert report.failures[0].measured == "did not end within 0.2 s" and "no bound" in report.failures[0].hint
+
+
+def test_a_run_that_was_stopped_does_not_go_on():
+    before = threading.active_count()
+    check_simulator(hanging(lambda *given: True, beaten), "pendulum", time_limit=0.2)
+    assert threading.active_count() == before
+
+
+def test_without_a_limit_runs_are_in_the_calling_thread():
+    seen = set()
+
+    def simulate(problem, times, tolerance):
+        seen.add(threading.current_thread())
+        raise ArithmeticError("no")
+
+    check_simulator(simulate, "pendulum", time_limit=None)
+    assert seen == {threading.current_thread()}
+
+
+def test_what_is_no_failure_of_a_run_goes_to_the_caller():
+    def simulate(problem, times, tolerance):
+        pytest.skip("not here")
+
+    with pytest.raises(pytest.skip.Exception, match="not here"):
+        check_simulator(simulate, "pendulum")
 
 
 def test_redundant_rows_are_named_where_a_run_ends():

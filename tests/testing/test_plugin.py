@@ -68,6 +68,16 @@ def test_a_faulty_one_and_known_failures(tmp_path):
     assert done.returncode == 1 and "XPASS(strict)" in done.stdout  # what was known to fail does not
 
 
+def test_one_that_hangs_fails(tmp_path):
+    text = "def simulate(problem, times, step):\n    while True:\n        pass\n"
+    (tmp_path / "hangs.py").write_text(text, encoding="utf-8")
+    simulator = ["--simulator", "hangs.py:simulate", "--simulator-problems", "pendulum,out_of_reach"]
+    done = run_pytest(tmp_path, *simulator, *QUICK, "--simulator-time-limit", "0.2")
+    assert done.returncode == 1 and "2 failed" in done.stdout
+    assert "pendulum: runs: did not end within 0.2 s" in done.stdout
+    assert "out_of_reach: says that it ends: did not end within 0.2 s" in done.stdout
+
+
 @pytest.mark.parametrize(
     ("where", "words"),
     [
@@ -91,11 +101,12 @@ def test_what_is_no_simulator(tmp_path, where, words):
         ("simulator_steps", "30", "steps must be two or more"),
         ("simulator_steps", "many", "invalid literal"),
         ("simulator_order", 2.0, "order is for simulators of fixed steps"),
+        ("simulator_time_limit", -1.0, "time_limit must be a positive number of seconds"),
     ],
 )
 def test_wrong_options(tmp_path, option, value, words):
     (tmp_path / "still.py").write_text(FAULTY, encoding="utf-8")
-    options = {"simulator": "still.py:simulate", "simulator_problems": "smoke", option: value}
-    config = SimpleNamespace(getoption=options.get, invocation_params=SimpleNamespace(dir=tmp_path))
+    options = {"simulator": "still.py:simulate", "simulator_problems": "smoke", "simulator_time_limit": 60.0}
+    config = SimpleNamespace(getoption=(options | {option: value}).get, invocation_params=SimpleNamespace(dir=tmp_path))
     with pytest.raises(pytest.UsageError, match=f"--simulator: {words}"):
         plugin.pytest_collection_modifyitems(None, config, [])

@@ -8,10 +8,10 @@ import numpy as np
 from twoloop.testing.changes import in_a_frame
 from twoloop.testing.evidence import CLEAR, Evidence
 from twoloop.testing.findings import Finding
-from twoloop.testing.instants import clock, rates_of_time, returned, shifted_in_time
+from twoloop.testing.instants import between_steps, clock, rates_of_time, returned, shifted_in_time
 from twoloop.testing.measuring import HELD_BY_STEPS, allowed, forces_of_constraints, lam_errors, still_there, violations
 from twoloop.testing.mistakes import mistaken_acceleration
-from twoloop.testing.properties import SHORT, changes_of, observed_order
+from twoloop.testing.properties import SHORT, changes_of, observed_order, same_at_last
 from twoloop.testing.simulated import simulated, transformed_back
 
 
@@ -67,6 +67,8 @@ def _velocities(e: Evidence) -> str:
     for text, other in others.items():
         if np.linalg.norm((run.v - other)[start:]) < 2.0 * CLEAR * error:
             return f"Positions are right and velocities are not. {text}"
+    if e.settings.tolerances and e.observed.errors("v")[-1].max() < CLEAR * e.observed.errors("v")[0].max():
+        return ""  # they converge
     held = "" if "velocity constraints" not in e.failed else " They do not obey C_q v + C_t = 0 either: project them."
     return (
         "Positions are right and velocities are not: they belong to another time, or not to the final "
@@ -104,7 +106,7 @@ def _drift(e: Evidence) -> str:
 
 def _unused(e: Evidence) -> str:
     runs, settings = e.observed.runs, e.observed.settings
-    if len(runs) < 2 or not np.array_equal(runs[-2].q, runs[-1].q):
+    if not same_at_last(e.observed):
         return ""
     if np.array_equal(runs[0].q, runs[-1].q):
         return (
@@ -182,11 +184,10 @@ def _order_seen(e: Evidence, kind: str, seen: float) -> str:
 def _slack(e: Evidence) -> str:
     if e.settings.tolerances is None or not (e.wrong("q") or e.wrong("v")):
         return ""
-    errors = e.observed.errors("q")
-    limits = [allowed(e.observed.motion, setting).max() for setting in e.observed.settings]
-    over = errors[-1].max() / limits[-1]
+    worst = [each for each in e.failed.values() if each.property.startswith("error of")]
+    over = max(float(each.measured) / float(each.allowed) for each in worst)
     return (
-        f"The error falls with the tolerance, and is {over:.1g} times what is allowed at the last: the estimate of the "
+        f"The error falls with the tolerance, and is {over:.1g} times what is allowed: the estimate of the "
         "error is too small, or leaves out some coordinates, or the tolerance is not passed on."
     )
 
@@ -254,6 +255,13 @@ def _units(e: Evidence) -> str:
     )
 
 
+def _precision(e: Evidence) -> str:
+    return (
+        "All states are numbers of single precision, which has 7 digits and cannot hold such a tolerance: look for "
+        "float32 among the arrays, or in the settings of the simulator."
+    )
+
+
 def _rates(e: Evidence) -> str:
     if "velocity constraints" not in e.failed:
         return ""
@@ -277,11 +285,13 @@ def _where(e: Evidence) -> str:
 
 
 MOTION: tuple[Callable[[Evidence], str], ...] = (
-    *(returned, shifted_in_time, _singular, _acceleration, rates_of_time, _velocities, clock, _unused, _drift),
-    *(_floor, _orders, _coarse, _slack, _rates, _where),
+    *(returned, shifted_in_time, _singular, rates_of_time, _acceleration, _velocities, clock, _unused, between_steps),
+    *(_drift, _floor, _orders, _coarse, _slack, _rates, _where),
 )
-OWN: dict[str, Callable[[Evidence], str]] = {"multipliers": _multipliers, "frame": _frame, "units": _units}
-MOVING = ("error of", "limit of", "order of")  # prefixes of properties on which the multipliers depend
+OWN: dict[str, Callable[[Evidence], str]] = {
+    **{"multipliers": _multipliers, "frame": _frame, "units": _units, "precision": _precision}
+}
+MOVING = ("error of", "limit of", "order of")  # prefixes of properties of the motion itself
 
 
 def with_hints(findings: list[Finding], evidence: Evidence) -> list[Finding]:

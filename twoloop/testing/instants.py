@@ -5,6 +5,7 @@ import numpy as np
 from twoloop.testing.evidence import CLEAR, Evidence
 from twoloop.testing.known_problem import Array, Motion
 from twoloop.testing.measuring import HELD_BY_STEPS
+from twoloop.testing.simulated import simulated
 
 DENSE = 20  # interpolation points per interval of a known motion
 
@@ -65,6 +66,25 @@ def shifted_in_time(e: Evidence) -> str:
             if text is not slow or left < 0.5 * off:
                 return text
     return ""
+
+
+def between_steps(e: Evidence) -> str:
+    """Return a hint for states that are right at the end of a run and wrong at times within."""
+    if e.settings.tolerances is None:
+        return ""
+    run, motion = e.observed.runs[-1], e.observed.motion
+    for k in np.argsort(-e.position)[:3]:  # the worst times, at which runs are now ended
+        short = simulated(e.simulate, e.observed.problem, motion.t[: k + 1], e.observed.settings[-1])
+        if (
+            k < 2
+            or not short.complete
+            or np.abs(short.q[-1] - motion.q[k]).max() > CLEAR * np.abs(run.q[k] - motion.q[k]).max()
+        ):
+            return ""
+    return (
+        "Right where a run ends, and wrong at the same times within a longer one: the states between the steps are "
+        "interpolated too coarsely (linearly?). End a step at each of the times, or interpolate by values and rates."
+    )
 
 
 def _between(motion: Motion, times: Array) -> tuple[Array, Array]:

@@ -19,11 +19,12 @@ LAM_DIGITS = 6.0  # digits of the known multipliers required for a comparison
 
 @dataclass(frozen=True)
 class Settings:
-    """Tolerances, or numbers of equal steps over the span, from the coarsest to the finest."""
+    """Tolerances, or numbers of equal steps over the span, from the coarsest to the finest; seconds of a run."""
 
     tolerances: tuple[float, ...] | None
     steps: tuple[int, ...] | None
     order: float | None
+    time_limit: float | None
 
     def of(self, problem: KnownProblem) -> list[float]:
         """Return the settings for the simulator: tolerances, or step sizes, s."""

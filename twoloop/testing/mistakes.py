@@ -11,9 +11,11 @@ from twoloop.testing.simulated import Simulate, simulated
 
 START_INDICES = range(0, 86, 5)  # indices of the known motion from which the simulator is started
 N_LATER = 10  # number of output times after which its acceleration is measured
+CLEAR = 0.2  # places whose accelerations are known to this part go before others
 SURE = 3.0  # a difference of accelerations is significant above this multiple of the estimated error
 EXPLAINS = 0.15  # largest remaining fraction of the difference for an accepted explanation
 FITS = 0.05  # the same for explanations with a fitted factor
+DAMPING = "there is a force (a damping?) of"
 TIE = 1e-4  # fits whose residuals differ by less count as equal
 Mistake = Callable[[KnownProblem, float, Array, Array], Array]
 
@@ -62,12 +64,19 @@ MISTAKES: dict[str, Mistake] = {
     "the forces that depend on the velocities (gyroscopic, centrifugal) are left out": _with(
         Q=lambda p, t, q, v: p.force(t, q, 0.0 * v)
     ),
+    "the forces that depend on the velocities (gyroscopic, centrifugal) have the other sign": _with(
+        Q=lambda p, t, q, v: 2.0 * p.force(t, q, 0.0 * v) - p.force(t, q, v)
+    ),
+    "the forces that depend on the velocities (gyroscopic, centrifugal) are twice as large": _with(
+        Q=lambda p, t, q, v: 2.0 * p.force(t, q, v) - p.force(t, q, 0.0 * v)
+    ),
     "the forces are those of the start: they are to be taken at (t, q, v)": _with(
         Q=lambda p, t, q, v: p.force(_start(p), p.q0, p.v0)
     ),
     "the forces are those of the time at the start: they are to be taken at (t, q, v)": _with(
         Q=lambda p, t, q, v: p.force(_start(p), q, v)
     ),
+    "the forces are those of t = 0: they are to be taken at (t, q, v)": _with(Q=lambda p, t, q, v: p.force(0.0, q, v)),
     "the forces are those of the time since the start: t begins at times[0], not at 0": _with(
         Q=lambda p, t, q, v: p.force(t - _start(p), q, v)
     ),
@@ -107,7 +116,9 @@ def mistaken_acceleration(
     `fit`: also try forces or masses that are wrong by a factor, which errors of a coarse method can resemble.
     """
     tries = (_observed(simulate, begun_later(problem, k, N_LATER + 1), setting, by_steps) for k in _starts(problem))
-    places = [seen for seen in tries if seen is not None]
+    seen = [each for each in tries if each is not None]
+    clear = [each for each in seen if each.doubt < CLEAR * max(np.linalg.norm(each.a), np.linalg.norm(each.true))]
+    places = clear if len(clear) > 1 else seen
     if len(places) < 2:  # a single one may be a coincidence
         return ""
     best, least = "", EXPLAINS
@@ -136,6 +147,7 @@ def _scaled(places: list[ObservedAcceleration]) -> str:
         off, inertia = each.free @ (M @ each.a - Q), np.diag(M) * each.a
         sure |= bool(np.linalg.norm(off) > SURE * np.linalg.norm(M, 2) * each.doubt)
         pairs.setdefault("the forces are", []).append((off, each.free @ Q))
+        pairs.setdefault(DAMPING, []).append((off, each.free @ each.v))
         for k, kind in enumerate(each.problem.coordinates):
             pairs.setdefault(f"the force on q[{k}] ({kind}) is", []).append((off, each.free[:, k] * Q[k]))
             pairs.setdefault(f"the mass or inertia of q[{k}] ({kind}) is", []).append(
@@ -148,7 +160,7 @@ def _scaled(places: list[ObservedAcceleration]) -> str:
             more = float(off @ part / (part @ part))
             rest = float(np.linalg.norm(off - more * part) / np.linalg.norm(off))
             if rest < FITS:
-                fits[f"{name} {_times(1.0 + more)}"] = rest
+                fits[f"{name} {more:.2g} v" if name == DAMPING else f"{name} {_times(1.0 + more)}"] = rest
     # force and mass of a free coordinate are equivalent: name all that fit, the force first
     least = min(fits.values(), default=0.0)
     return ", or ".join(name for name, rest in fits.items() if rest <= least + TIE)

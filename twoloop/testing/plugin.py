@@ -27,6 +27,8 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     group.addoption("--simulator-problems", metavar="NAMES", default="smoke", help="smoke, all, or names with commas")
     group.addoption("--simulator-steps", metavar="N,N,...", help="for fixed steps: numbers of steps over the span")
     group.addoption("--simulator-order", type=float, metavar="P", help="for fixed steps: the order of the method")
+    limit = "seconds of a run, 0 for no limit (to debug)"
+    group.addoption("--simulator-time-limit", type=float, default=120.0, metavar="S", help=limit)
     group.addoption("--simulator-report", metavar="FILE", help="write all measurements as Markdown")
     known = "known failures of --simulator, one per line: PROBLEM: PROPERTY"
     parser.addini("simulator_known_failures", known, type="linelist", default=[])
@@ -71,6 +73,7 @@ def pytest_collection_modifyitems(session: pytest.Session, config: pytest.Config
             (1e-4, 1e-6, 1e-8),
             None if steps is None else [int(part) for part in steps.split(",")],
             config.getoption("simulator_order"),
+            config.getoption("simulator_time_limit") or None,
         )
         problems = named(chosen if chosen in ("smoke", "all") else chosen.split(","))
     except ValueError as error:

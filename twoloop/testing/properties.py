@@ -26,6 +26,7 @@ from twoloop.testing.measuring import (
 from twoloop.testing.simulated import Simulated, transformed_back
 
 LEAST_ORDER = 0.7  # required order if none is given
+UNUSED = 0.01  # part of the allowed error that is allowed at the last tolerance if it changes nothing
 SHORT = 0.6  # tolerance of the observed order
 
 
@@ -35,6 +36,9 @@ def measured(observed: Observed, settings: Settings) -> Iterator[Finding]:
     kinds = ["q"] if finest.v is None else ["q", "v"]
     for kind in kinds:
         yield from (errors_at_tolerances if settings.tolerances else errors_by_steps)(observed, settings, kind)
+    if settings.tolerances and settings.tolerances[-1] < float(np.finfo(np.float32).eps):
+        single = is_single(finest)
+        yield Finding(observed.problem.name, "precision", "single" if single else "double", "double", not single)
     yield from constraints(observed, settings)
     if finest.v is not None:
         problem = observed.problem
@@ -56,8 +60,22 @@ def _worst(name: str, observed: Observed, found: list[Array], limits: list[Array
 
 def errors_at_tolerances(observed: Observed, settings: Settings, kind: str) -> Iterator[Finding]:
     """Yield the error at the tolerance where it is largest relative to its limit."""
-    limits = [allowed(observed.motion, setting) + observed.floor(kind) for setting in observed.settings]
+    limits = [allowed(observed.motion, setting) for setting in observed.settings]
+    if same_at_last(observed):  # a tolerance that changes nothing must be met with room to spare
+        limits[-1] = limits[-1] * UNUSED
+    limits = [limit + observed.floor(kind) for limit in limits]
     yield _worst(f"error of {kind}", observed, observed.errors(kind), limits)
+
+
+def same_at_last(observed: Observed) -> bool:
+    """Return True if the last two settings give the same numbers."""
+    return len(observed.runs) > 1 and np.array_equal(observed.runs[-2].q, observed.runs[-1].q)
+
+
+def is_single(run: Simulated) -> bool:
+    """Return True if all states after the start are numbers of single precision."""
+    given = [each[1:] for each in (run.q, run.v) if each is not None]
+    return all(np.array_equal(each, each.astype(np.float32)) for each in given)
 
 
 def errors_by_steps(observed: Observed, settings: Settings, kind: str) -> Iterator[Finding]:

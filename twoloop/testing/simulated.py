@@ -8,6 +8,7 @@ import numpy as np
 
 from twoloop.testing.changes import Transformed
 from twoloop.testing.known_problem import Array, KnownProblem
+from twoloop.testing.limited import DidNotEnd
 
 Simulate = Callable[[KnownProblem, Array, float], Any]
 
@@ -21,6 +22,7 @@ class Simulated:
     v: Array | None
     lam: Array | None
     error: str = ""
+    hung: bool = False  # passed the time limit
 
     @property
     def complete(self) -> bool:
@@ -34,8 +36,9 @@ def simulated(simulate: Simulate, problem: KnownProblem, times: Array, setting: 
     try:
         returned = simulate(problem, times.copy(), setting)
     except Exception as error:
-        nothing = np.full((times.size, problem.n_q), np.nan)
-        return Simulated(times, nothing, None, None, f"{type(error).__name__}: {error}".strip().rstrip(":"))
+        hung, nothing = isinstance(error, DidNotEnd), np.full((times.size, problem.n_q), np.nan)
+        said = f"{'' if hung else f'{type(error).__name__}: '}{error}".strip().rstrip(":")
+        return Simulated(times, nothing, None, None, said, hung)
     parts = returned if isinstance(returned, tuple) else (returned,)
     if not 1 <= len(parts) <= 3:
         raise TypeError(
