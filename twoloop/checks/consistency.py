@@ -104,7 +104,7 @@ class Look:
 
         self.flags, self._look = first_look, direct(look)
         n, n_rows, size = system.n_q, system.n_c + system.n_a, room_size(system.n_q, system.n_c, system.n_a)
-        self.system, self._numbers = system, np.zeros(size + n * n + 2 * n_rows * n)
+        self.system, self._kit, self._numbers = system, system.kit, np.zeros(size + n * n + 2 * n_rows * n)
         self._room, mass, rows, pattern = np.split(self._numbers, np.cumsum([size, n * n, n_rows * n]))
         self.mass, self.rows, self.pattern = mass.reshape(n, n), rows.reshape(n_rows, n), pattern.reshape(n_rows, n)
         self._always = _ones(system.n_c), self._room, self.mass, self.rows, _ways(n), self.pattern, LEAST
@@ -117,7 +117,7 @@ class Look:
         self._numbers.fill(0.0)
         sizes = self.system.made.get("sizes", self._sizes)
         try:
-            found: int = self._look(self.system.kit, t, q, v, sizes, *self._always)
+            found: int = self._look(self._kit, t, q, v, sizes, *self._always)
         except Exception:  # of a callback, which is called by itself then
             return 0
         self.definite = bool(found & definite) if found & (definite | indefinite) else None

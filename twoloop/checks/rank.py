@@ -65,31 +65,30 @@ def redundant_rows(scaled: Array) -> list[int]:
 
 def in_words(jacobian: Array, redundant: list[int]) -> str:
     """Which rows depend on which others, with the coefficients where these are few: many differ from start to start."""
-    others = [i for i in range(len(jacobian)) if i not in redundant]
-    shares = _combinations(jacobian[others], jacobian[redundant[:SHOWN]])
-    return equations_in_words(redundant, others, shares, np.linalg.norm(jacobian, axis=1))
+    from twoloop.kernels.algebra.independent import shares_of_others
+
+    (n_rows, n_q), shown = jacobian.shape, redundant[:SHOWN]
+    others = [i for i in range(n_rows) if i not in redundant]
+    most, rest = min(len(others), n_q) + 1, np.empty((len(others), n_q))
+    lengths, shares = np.zeros(n_rows), np.zeros((len(shown), len(others)))
+    order, kept = np.array([*others, *shown]), np.zeros(n_rows, dtype=np.int64)
+    room = np.zeros((most, n_q)), np.zeros((most, most)), kept
+    if not direct(shares_of_others)(jacobian, order, RANK_TOLERANCE, rest, *room, shares, lengths):
+        shares[:] = np.linalg.lstsq(rest.T, jacobian[shown].T, rcond=None)[0].T
+    return equations_in_words(redundant, others, shares, lengths)
 
 
 def equations_in_words(redundant: list[int], others: list[int], shares: Array, lengths: Array) -> str:
     """The same from the shares (SHOWN, n) that the others have in the first rows, and the lengths of all rows."""
-    equations = []
-    for i, factors in zip(redundant, shares, strict=False):
-        parts = np.abs(factors) * lengths[others]
-        of = np.flatnonzero(parts > 1e-9 * lengths[i])
+    equations, sizes = [], lengths.tolist()
+    for i, factors in zip(redundant, shares.tolist(), strict=False):
+        of = [k for k, j in enumerate(others) if abs(factors[k]) * sizes[j] > 1e-9 * sizes[i]]
         if len(of) > MOST_TERMS:
             named = ", ".join(str(others[k]) for k in of[:MOST_NAMED])
             also = f" and {len(of) - MOST_NAMED} more" if len(of) > MOST_NAMED else ""
             equations.append(f"row {i} on rows {named}{also}")
             continue
-        terms = [f"{factors[k]:.4g} row {others[k]}" for k in of]
-        equations.append(f"row {i} = {' + '.join(terms).replace('+ -', '- ') or '0'}")
+        terms = " + ".join([f"{factors[k]:.4g} row {others[k]}" for k in of])
+        equations.append(f"row {i} = {terms.replace('+ -', '- ') or '0'}")
     more = ", ..." if len(redundant) > SHOWN else ""
     return f"row(s) {redundant} depend on the others ({', '.join(equations)}{more})"
-
-
-def _combinations(others: Array, rows: Array) -> Array:
-    """Which combination of others each row is, by least squares where it is none."""
-    basis, factors, kept = orthogonalised(others, RANK_TOLERANCE)
-    if len(kept) < len(others):
-        return np.linalg.lstsq(others.T, rows.T, rcond=None)[0].T  # type: ignore[return-value]
-    return lapack.dtrtrs(factors, basis @ rows.T, lower=1, trans=1)[0].T  # type: ignore[no-any-return]

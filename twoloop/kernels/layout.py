@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from twoloop.kernels.algebra.elimination import N_COUNTS, N_LISTS, WIDEST, index_size, values_size
 from twoloop.kernels.algebra.lapack import N_ROUTINES
+from twoloop.kernels.compile.linking import direct
 from twoloop.kernels.control.sudden import N_CHANGES
 from twoloop.kernels.data.common import WORK, Work
 from twoloop.kernels.data.counters import N_COUNTERS
@@ -134,11 +135,16 @@ _free: dict[Sizes, list[Work]] = {}  # those that were given back
 
 def cleared(work: Work) -> Work:
     """A workspace as it is when it is new."""
-    for each in lasting(work):
-        each[:] = 0
-    work.G_of_S[:] = np.nan
-    work.changes[:] = 0.0
+    direct(short_loops().clear)(work, *lasting(work))
     return work
+
+
+@cache
+def short_loops() -> Any:
+    """The module of that name: compiled, or read from the disk, when it is first asked for."""
+    from twoloop.kernels import short_loops
+
+    return short_loops
 
 
 def _of_static_form(n_q: int, n_c: int, rank: int, static: Static) -> tuple[dict[str, tuple[int, ...]], ...]:

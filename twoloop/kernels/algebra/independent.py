@@ -71,3 +71,28 @@ def size_of_inverse(factors, n, column):
             column[i] = value / factors[i, i]
             total += column[i] * column[i]
     return math.sqrt(total)
+
+
+@kernel(types.boolean(MATRIX, INTEGERS, f8, MATRIX, MATRIX, MATRIX, INTEGERS, MATRIX, VECTOR), vectorized=True)
+def shares_of_others(rows, order, least, others, basis, factors, kept, shares, lengths):
+    """Whether `others` are independent; then which combination of these each of some rows is, by least squares.
+
+    `order` has the places among all `rows` of those to put into `others`, then of those to find the shares of;
+    `lengths` become those of all rows, and the rest is as in `first_rows`.
+    """
+    n = len(others)
+    for i in range(len(rows)):
+        lengths[i] = math.sqrt(_dot(rows[i], rows[i]))
+    for k in range(n):
+        for j in range(rows.shape[1]):
+            others[k, j] = rows[order[k], j]
+    if first_rows(others, least, basis, factors, kept) < n:
+        return False
+    for i in range(len(shares)):
+        for k in range(n):
+            shares[i, k] = _dot(basis[k], rows[order[n + i]])
+        for k in range(n - 1, -1, -1):
+            for j in range(k + 1, n):
+                shares[i, k] -= factors[j, k] * shares[i, j]
+            shares[i, k] /= factors[k, k]
+    return True
