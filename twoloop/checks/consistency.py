@@ -12,7 +12,7 @@ from scipy.linalg import lapack, null_space
 from twoloop.checks.arguments import Array
 from twoloop.checks.bounds import check_bounds
 from twoloop.checks.derivatives import check_derivatives
-from twoloop.checks.rank import eigenvalues, in_words, largest_solution, redundant_rows
+from twoloop.checks.rank import eigenvalues, in_words, least_solution, redundant_rows
 from twoloop.checks.scales import EPS, Scales, rows_at, scales_of
 from twoloop.checks.sparse_rows import Rows, SparseRows, largest_in_rows
 from twoloop.checks.values import UNSYMMETRIC, unsymmetric_mass
@@ -164,31 +164,39 @@ def _surely_consistent(
     C: Array,
     rates: Array,
 ) -> bool:
-    """Whether `Violation` would accept a state beyond doubt, by what is cheaper than singular values.
+    """Whether `Violation` would accept a state beyond doubt, without singular values.
 
-    The largest that corrections can be stands for each of them, the row that allows least for all, at a share of what
-    it allows, and the least that accelerations M^-1 Q can be for these; what rounding explains is left out.
+    Corrections are the same; they must be less than a share of what is accepted, without what rounding explains, and
+    with the least that accelerations M^-1 Q can be.
     """
     scales = scales_of(system, t, q, rows)
-    times = largest_solution(scales.scaled(rows))
     fastest = np.where(rows != 0.0, np.abs(v) / scales.columns, 0.0).max(axis=1)
     speeds = np.maximum(fastest, np.abs(rates) / scales.rows)
     if lapack.dpotrf(mass)[1] == 0:
         pull = float((np.abs(force) / (np.abs(mass) @ scales.columns)).max())
         speeds = np.maximum(speeds, np.sqrt(scales.reach * pull))
-    off = float(np.linalg.norm((rows @ v + rates) / scales.rows))
-    if not times * off <= SURELY * CONSISTENT * speeds.min():
+    if not _surely_small(rows, rows @ v + rates, scales, speeds):
         return False
     if system.n_a > 0:
         if system.n_c == 0:
             return True
         rows = rows[: system.n_c]
         scales = scales_of(system, t, q, rows)
-        times = largest_solution(scales.scaled(rows))
-    consistent = times * float(np.linalg.norm(C / scales.rows)) <= SURELY * CONSISTENT * scales.reach.min()
+    consistent = _surely_small(rows, C, scales, scales.reach)
     if consistent:  # how far coordinates move until they matter, at the next start as well, beside what rounding is
         system.made["sizes"] = scales.by_coordinate(scales.reach, rows)
-    return bool(consistent)
+    return consistent
+
+
+def _surely_small(rows: Array, values: Array, scales: Scales, per_row: Array) -> bool:
+    """Whether the correction that values ask for, and what it leaves, are far below what is accepted."""
+    found = least_solution(scales.scaled(rows), values / scales.rows)
+    if found is None:
+        return False
+    x, left = found
+    allowed = SURELY * CONSISTENT * scales.by_coordinate(per_row, rows)
+    small = np.abs(scales.columns * x) <= allowed
+    return bool(small.all() and (np.abs(left) <= SURELY * CONSISTENT * per_row).all())
 
 
 def is_at_rounding(values: Array, rows: Rows, state: Array, rate: Array | float = 0.0) -> bool:

@@ -1,5 +1,7 @@
 """Rows that depend on others: which they are, how they are made of these, and how large solutions can be."""
 
+import math
+
 import numpy as np
 from scipy.linalg import lapack, qr
 
@@ -9,6 +11,7 @@ from twoloop.kernels.compile.linking import direct
 RANK_TOLERANCE = 1e-11  # of the largest diagonal entry of R
 SHOWN = 5  # rows that depend on others, of which the equations are written out
 MOST_TERMS, MOST_NAMED = 3, 8  # rows on which another depends: named with their coefficients, and named at all
+WEAK = 1e-9  # of the largest singular value: directions that a pseudo-inverse has beyond doubt
 NO_DIRECTION = 1e-12  # of a row: what rounding leaves of it without its part in others that it depends on
 
 
@@ -31,15 +34,21 @@ def orthogonalised(rows: Array, least: float) -> tuple[Array, Array, list[int]]:
     return basis[:n], factors[:n, :n], kept[:n].tolist()
 
 
-def largest_solution(rows: Array) -> float:
-    """How many times as large as values the solution of least norm, or by least squares, is at most; 1 if it is less.
+def least_solution(rows: Array, values: Array) -> tuple[Array, Array] | None:
+    """What the pseudo-inverse of rows, of length 1 or less, makes of values, and what that leaves of these.
 
-    What is below NO_DIRECTION of a row counts as dependent on others.
+    None where a direction is so weak that it may count or not.
     """
-    from twoloop.kernels.algebra.independent import size_of_inverse
+    from twoloop.kernels.algebra import independent
 
-    _, factors, kept = orthogonalised(rows, NO_DIRECTION)
-    return max(1.0, direct(size_of_inverse)(np.ascontiguousarray(factors), len(kept), np.zeros(len(kept))))
+    n_rows, n_q = rows.shape
+    most, kept, x, left = min(n_rows, n_q) + 1, np.zeros(n_rows, dtype=np.int64), np.zeros(n_q), values.copy()
+    basis, factors, shares = np.zeros((most, n_q)), np.zeros((most, most)), np.zeros((n_rows, most))
+    gram, parts = np.zeros((n_rows, n_rows)), np.zeros((2, n_rows))
+    room = basis, factors, kept, shares, gram, parts
+    n = direct(independent.least_solution)(np.ascontiguousarray(rows), left, NO_DIRECTION, *room, x)
+    inverse = direct(independent.size_of_inverse)(factors, n, parts[0])
+    return (x, left) if WEAK * math.sqrt(n_rows) * inverse < 1.0 else None
 
 
 def surely_above(ratio: float, rows: Array, rank: int) -> bool:
@@ -80,9 +89,10 @@ def in_words(jacobian: Array, redundant: list[int]) -> str:
 
 def equations_in_words(redundant: list[int], others: list[int], shares: Array, lengths: Array) -> str:
     """The same from the shares (SHOWN, n) that the others have in the first rows, and the lengths of all rows."""
-    equations, sizes = [], lengths.tolist()
-    for i, factors in zip(redundant, shares.tolist(), strict=False):
-        of = [k for k, j in enumerate(others) if abs(factors[k]) * sizes[j] > 1e-9 * sizes[i]]
+    equations = []
+    counts = np.abs(shares) * lengths[others] > 1e-9 * lengths[redundant[: len(shares)], None]
+    for i, factors, which in zip(redundant, shares.tolist(), counts, strict=False):
+        of = which.nonzero()[0].tolist()
         if len(of) > MOST_TERMS:
             named = ", ".join(str(others[k]) for k in of[:MOST_NAMED])
             also = f" and {len(of) - MOST_NAMED} more" if len(of) > MOST_NAMED else ""

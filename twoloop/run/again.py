@@ -76,8 +76,7 @@ class Again:
         self.look, self.chooser, self.rest = Look(looked_at), Chooser(looked_at), 0
         self._start, self._advance = direct(run.kernels.start), direct(run.kernels.advance)
         self.plan, self.kit, self.flags = run.plan, run.kit, run.kit.flags.copy()
-        cleared(run.work)
-        self.begins = _copied(run.clock, run.control, run.tolerances, run.plan.memory, *lasting(run.work))
+        self.begins = _copied(run.clock, run.control, run.tolerances, run.plan.memory)
         self.t, self.rows = np.empty(run.chunk + 1), np.empty((run.chunk + 1, len(run.state)))
         self.steps = np.empty((run.chunk, run.a.N_STEP_COLUMNS))
         self.kinds, self.between = np.empty(run.chunk, dtype=np.int64), Between(run)
@@ -190,7 +189,7 @@ class Again:
         asked.set_sizes(run, t1)
         self.call = call
         if equal:
-            self.saved = _copied(*(array for array, _ in self.begins), run.state)
+            self.saved = _copied(*(array for array, _ in self.begins), *lasting(run.work), run.state)
         return True
 
     def _begins(self, t0: float, q0: Array, v0: Array) -> bool:
@@ -210,7 +209,7 @@ class Again:
         run.state[:n], run.state[n : 2 * n], run.state[2 * n :] = q0, v0, 0.0
         _restore(self.begins)
         run.clock[run.a.T] = run.clock[run.a.T_START] = t0
-        made_ready(work, system, self.flags, look.pattern, q0, run.rtol, run.reuse)
+        made_ready(cleared(work), system, self.flags, look.pattern, q0, run.rtol, run.reuse)
         work.notes[noted.NEARLY_SINGULAR] = 0.0 if run.plan.watchful else 1.0
         if self._start(run.kit, work, t0, run.state) != codes.DONE:
             return False

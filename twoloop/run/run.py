@@ -265,7 +265,7 @@ class Run:
         n_rows = self.system.n_c + self.system.n_a
         if self.rank == n_rows:
             return np.zeros(0, dtype=np.int64), ""
-        counted = self.work.rows_v.tolist()
+        counted = set(self.work.rows_v.tolist())
         redundant = [i for i in range(n_rows) if i not in counted]
         rows = self._rows() if rows is None else rows
         wrong = self.contradicting(rows).tolist()
