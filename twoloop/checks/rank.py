@@ -82,7 +82,9 @@ def in_words(jacobian: Array, redundant: list[int]) -> str:
     lengths, shares = np.zeros(n_rows), np.zeros((len(shown), len(others)))
     order, kept = np.array([*others, *shown]), np.zeros(n_rows, dtype=np.int64)
     room = np.zeros((most, n_q)), np.zeros((most, most)), kept
-    if not direct(shares_of_others)(jacobian, order, RANK_TOLERANCE, rest, *room, shares, lengths):
+    if not direct(shares_of_others)(
+        np.ascontiguousarray(jacobian), order, RANK_TOLERANCE, rest, *room, shares, lengths
+    ):
         shares[:] = np.linalg.lstsq(rest.T, jacobian[shown].T, rcond=None)[0].T
     return equations_in_words(redundant, others, shares, lengths)
 

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from twoloop.kernels.algebra.elimination import N_COUNTS, N_LISTS, WIDEST, index_size, values_size
 from twoloop.kernels.algebra.lapack import N_ROUTINES
-from twoloop.kernels.compile.linking import direct
 from twoloop.kernels.control.sudden import N_CHANGES
 from twoloop.kernels.data.common import WORK, Work
 from twoloop.kernels.data.counters import N_COUNTERS
@@ -135,7 +134,9 @@ _free: dict[Sizes, list[Work]] = {}  # those that were given back
 
 def cleared(work: Work) -> Work:
     """A workspace as it is when it is new."""
-    direct(short_loops().clear)(work, *lasting(work))
+    for each in lasting(work):
+        each[:] = 0
+    work.G_of_S[:] = np.nan
     return work
 
 

@@ -11,9 +11,9 @@ from twoloop.kernels.data.common import INTEGERS, MATRIX, VECTOR, WORK, f8, i8, 
 ROUNDING = 1e-15  # of the largest coordinate: corrections of this size are rounding
 
 
-@kernel(types.void(WORK, VECTOR, INTEGERS))
-def clear(w, numbers, integers):
-    """Make a workspace as it is when it is new; `numbers` and `integers` are what counts at the start of a step."""
+@kernel(types.void(WORK, VECTOR, INTEGERS, MATRIX, VECTOR, f8, f8))
+def make_ready(w, numbers, integers, pattern, q, accuracy, reuse):
+    """Make a workspace as it is before a run from q; `numbers` and `integers` are what counts at the start of a step."""
     for k in range(numbers.size):
         numbers[k] = 0.0
     for k in range(integers.size):
@@ -21,14 +21,9 @@ def clear(w, numbers, integers):
     for i in range(w.G_of_S.shape[0]):
         for j in range(w.G_of_S.shape[1]):
             w.G_of_S[i, j] = math.nan
-    for i in range(w.changes.shape[0]):
-        for j in range(w.changes.shape[1]):
-            w.changes[i, j] = 0.0
-
-
-@kernel(types.void(WORK, VECTOR, f8, f8))
-def note_start(w, q, accuracy, reuse):
-    """What a run from q finds among the notes of its workspace."""
+    for i in range(pattern.shape[0]):
+        for j in range(pattern.shape[1]):
+            w.pattern[i, j] = pattern[i, j]
     rounded = 0.0
     for j in range(q.size):
         rounded = max(rounded, ROUNDING * abs(q[j]))

@@ -243,5 +243,5 @@ class Result(Record):
 def result_of(record: Mapping[str, Any], **more: Any) -> Result:
     """Return a result with the fields of a record, some of them replaced."""
     made = object.__new__(Result)  # avoids the slow constructor of a frozen dataclass with thirty fields
-    vars(made).update(record, **more)
+    object.__setattr__(made, "__dict__", {**record, **more})
     return made

@@ -18,7 +18,7 @@ from twoloop.generate.traced_values import Sample
 from twoloop.generate.tracing import Untraceable
 from twoloop.kernels.compile.linking import direct
 from twoloop.kernels.data import codes, flags, noted
-from twoloop.kernels.layout import cleared, lasting
+from twoloop.kernels.layout import lasting
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.asked import Asked
 from twoloop.run.between import Between
@@ -76,7 +76,10 @@ class Again:
         self.look, self.chooser, self.rest = Look(looked_at), Chooser(looked_at), 0
         self._start, self._advance = direct(run.kernels.start), direct(run.kernels.advance)
         self.plan, self.kit, self.flags = run.plan, run.kit, run.kit.flags.copy()
-        self.begins = _copied(run.clock, run.control, run.tolerances, run.plan.memory)
+        arrays = run.clock, run.control, run.tolerances  # as parts of one, which is copied at once
+        numbers = np.concatenate(arrays)
+        run.clock, run.control, run.tolerances = np.split(numbers, np.cumsum([each.size for each in arrays[:2]]))
+        self.begins = _copied(numbers, run.plan.memory)
         self.t, self.rows = np.empty(run.chunk + 1), np.empty((run.chunk + 1, len(run.state)))
         self.steps = np.empty((run.chunk, run.a.N_STEP_COLUMNS))
         self.kinds, self.between = np.empty(run.chunk, dtype=np.int64), Between(run)
@@ -209,7 +212,7 @@ class Again:
         run.state[:n], run.state[n : 2 * n], run.state[2 * n :] = q0, v0, 0.0
         _restore(self.begins)
         run.clock[run.a.T] = run.clock[run.a.T_START] = t0
-        made_ready(cleared(work), system, self.flags, look.pattern, q0, run.rtol, run.reuse)
+        made_ready(work, system, self.flags, look.pattern, q0, run.rtol, run.reuse)
         work.notes[noted.NEARLY_SINGULAR] = 0.0 if run.plan.watchful else 1.0
         if self._start(run.kit, work, t0, run.state) != codes.DONE:
             return False

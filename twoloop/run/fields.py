@@ -19,6 +19,7 @@ Integers = NDArray[np.int64]
 
 COUNTED = [each.name for each in fields(Statistics) if each.name != "cpu_time"]
 COUNTERS = itemgetter(*(getattr(counters, name.upper()) for name in COUNTED))
+LATER = (*OF_STEPS, "stats")  # fields that are put together when they are asked for
 BEFORE = np.array([0, 0, 1])  # rejections and partitions before all steps: the first partition is not a renewal
 
 
@@ -34,7 +35,7 @@ def told_later(steps: Array, counted: Integers, cpu: float) -> dict[str, Later]:
     """The same of all steps of a run, and its statistics, once one of them is asked for; from copies of arrays."""
     steps, counted = steps.copy(), counted.copy()
     later = Later(lambda: of_steps(steps, BEFORE.copy()) | {"stats": statistics(counted, cpu)})
-    return dict.fromkeys((*OF_STEPS, "stats"), later)
+    return dict.fromkeys(LATER, later)
 
 
 def statistics(counted: Integers, cpu: float) -> Statistics:

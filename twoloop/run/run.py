@@ -284,8 +284,10 @@ class Run:
         """Of C_q and A at the start, rows that depend on others with which the accelerations disagree."""
         n = self.system.n_q
         a, gamma = self.state[2 * n : 3 * n], self.work.Gamma
-        allowed = CONTRADICTS * np.maximum(abs(rows) @ np.abs(a) + np.abs(gamma), 1.0)
-        return np.flatnonzero(np.abs(rows @ a - gamma) > allowed)
+        off = np.abs(rows @ a - gamma)
+        if off.max() <= CONTRADICTS:  # the least that is allowed
+            return np.zeros(0, dtype=np.int64)
+        return np.flatnonzero(off > CONTRADICTS * np.maximum(abs(rows) @ np.abs(a) + np.abs(gamma), 1.0))
 
     def _rows(self) -> Rows:
         """C_q and A at the start."""
@@ -296,10 +298,9 @@ class Run:
 
     def _in_words(self, all_rows: Rows, rows: list[int]) -> str:
         """Which rows depend on which others; the factors of the static form tell the shares of the first."""
-        q = self.state[: self.system.n_q]
-        counted = self.work.rows_v.tolist()
         if not isinstance(all_rows, SparseRows):
             return in_words(all_rows, rows)
+        q, counted = self.state[: self.system.n_q], self.work.rows_v.tolist()
         if self.static is None or set(rows) & set(counted):
             return in_words(self.system.rows(self.t0, q), rows)
         shares, zero, x = np.zeros((min(SHOWN, len(rows)), len(all_rows))), np.zeros(len(all_rows)), np.zeros_like(q)

@@ -24,7 +24,7 @@ from twoloop.kernels.data.flags import (
 )
 from twoloop.kernels.data.kit import Kit
 from twoloop.kernels.evaluation.operations import N_NODES
-from twoloop.kernels.layout import make_work, short_loops
+from twoloop.kernels.layout import lasting, make_work, short_loops
 from twoloop.methods.plan import Plan
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.static_form import StaticForm
@@ -176,12 +176,11 @@ def made_ready(
     reuse: float,
     static: StaticForm | None = None,
 ) -> common.Work:
-    """A workspace full of zeros with what a run finds in it."""
-    direct(short_loops().note_start)(work, q0, max(rtol, GAMMA_ACCURACY), reuse)
+    """A workspace with what a run finds in it, whatever the one before has left."""
+    direct(short_loops().make_ready)(work, *lasting(work), pattern, q0, max(rtol, GAMMA_ACCURACY), reuse)
     if static is not None:
         _fill(work, system, static, q0)
         return work
-    work.pattern[:] = pattern
     if flags[BANDWIDTH] >= 0:
         work.lapack[:] = addresses()
     return work
