@@ -13,7 +13,7 @@ ROUNDING = 1e-15  # of the largest coordinate: corrections of this size are roun
 
 @kernel(types.void(WORK, VECTOR, INTEGERS, MATRIX, VECTOR, f8, f8))
 def make_ready(w, numbers, integers, pattern, q, accuracy, reuse):
-    """Make a workspace as it is before a run from q; `numbers` and `integers` are what counts at the start of a step."""
+    """Make a workspace as it is before a run from q; `numbers` and `integers` are what counts when a step begins."""
     for k in range(numbers.size):
         numbers[k] = 0.0
     for k in range(integers.size):

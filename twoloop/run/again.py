@@ -76,9 +76,9 @@ class Again:
         self.look, self.chooser, self.rest = Look(looked_at), Chooser(looked_at), 0
         self._start, self._advance = direct(run.kernels.start), direct(run.kernels.advance)
         self.plan, self.kit, self.flags = run.plan, run.kit, run.kit.flags.copy()
-        arrays = run.clock, run.control, run.tolerances  # as parts of one, which is copied at once
-        numbers = np.concatenate(arrays)
-        run.clock, run.control, run.tolerances = np.split(numbers, np.cumsum([each.size for each in arrays[:2]]))
+        numbers = np.concatenate([run.clock, run.control, run.tolerances])  # to be copied at once
+        i, j = run.clock.size, run.clock.size + run.control.size
+        run.clock, run.control, run.tolerances = numbers[:i], numbers[i:j], numbers[j:]
         self.begins = _copied(numbers, run.plan.memory)
         self.t, self.rows = np.empty(run.chunk + 1), np.empty((run.chunk + 1, len(run.state)))
         self.steps = np.empty((run.chunk, run.a.N_STEP_COLUMNS))
