@@ -76,6 +76,22 @@ def test_it_is_the_run_of_the_long_way_to_the_bit(name, method, taken, monkeypat
         assert_same(one, long)
 
 
+@pytest.mark.parametrize("method", ["auto", "RadauIIA5", "PaperIRK"])
+@pytest.mark.parametrize("at", [(1,), (0, 1), (0,)])
+def test_states_at_the_ends_are_those_of_the_long_way_to_the_bit(method, at, taken, monkeypatch):
+    def at_ends(problem):
+        ends = [np.array([float(s.t), float(s.t) + 0.1])[list(at)] for s in states]
+        return [runs(problem, [s], 0.1, method=method, t_eval=t)[0] for s, t in zip(states, ends, strict=True)]
+
+    problem, other = mechanisms.four_bar(), mechanisms.four_bar()
+    states = repeated(starts(problem, 0.1, 7))
+    by_arrays = at_ends(problem)
+    assert all(taken[-6:-1])
+    monkeypatch.setattr(solve, "record_again", lambda *asked: None)
+    for one, long in zip(by_arrays, at_ends(other), strict=True):
+        assert_same(one, long)
+
+
 def test_where_series_give_way_to_another_method(taken, monkeypatch):
     problem, other = mechanisms.four_bar(), mechanisms.four_bar()
     states = repeated(starts(problem, 1e-6, 7))

@@ -176,23 +176,20 @@ def solve_dae(
     times = None if t_eval is None else check_times(t_eval, t0, t1, step_size)
     folder = None if store is None else check_folder(store)
     with Interrupts() as interrupts:
-        chosen, own = asked.method, getattr(asked.method, "error_tol", None)
-        told = {"system": system, "method": chosen.name, "rtol": asked.rtol, "atol": asked.atol.copy()}
-        if getattr(chosen, "tested", "all") != "positions":
-            told["untested"] = None
+        own, told = asked.own_tolerance, asked.told | {"system": system, "atol": asked.atol.copy()}
         at_ends = times is not None and set(times.tolist()) <= {t0, t1}
-        if folder is event_functions is own is None and not (dense_output or progress or at_ends):
-            made = record_again(system, t0, t1, q0, v0, asked, times)
+        if folder is event_functions is own is None and not (dense_output or progress):
+            made = record_again(system, t0, t1, q0, v0, asked, times, at_ends)
             if made is not None and not interrupts.asked:
                 fields, said_of_rows = made
                 if said_of_rows:
                     warnings.warn(said_of_rows, ConstraintWarning, stacklevel=2)
-                return result_of(fields, **told)
+                return result_of(fields | told)
         run = run_from(system, t0, t1, q0, v0, asked)
         if run.said_of_rows:
             warnings.warn(run.said_of_rows, ConstraintWarning, stacklevel=2)
         with_code = bool(run.plan.own)
-        with _progress_bar(chosen.name, t0, t1) if progress else NO_BAR as report:
+        with _progress_bar(asked.method.name, t0, t1) if progress else NO_BAR as report:
             lands = run.plan.lands or step_size is not None or at_ends
             kept = InMemory() if folder is None else begin_folder(folder, system.n_q)
             wanted = Wanted(times, lands, bool(dense_output), event_functions, kept)
@@ -200,7 +197,7 @@ def solve_dae(
         give_back(run.work)
         if own is not None:  # Newmark's own test, of positions, has its place
             told |= {"rtol": own, "atol": np.full(system.n_q, own), "untested": np.ones(len(record.h), dtype=bool)}
-        result = result_of(vars(record), compiled=with_code, **told)
+        result = result_of(vars(record) | told | {"compiled": with_code})
         if isinstance(kept, OnDisk):
             end_folder(kept, result)
         return result

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.checks.consistency import Look
-from twoloop.generate.choices import Chooser
+from twoloop.generate.choices import Choice, Chooser
 from twoloop.generate.straight_code import OwnCode
 from twoloop.generate.traced_values import Sample
 from twoloop.generate.tracing import Untraceable
@@ -75,6 +75,7 @@ class Again:
         looked_at = system if self.movable is None else self.movable.system
         self.look, self.chooser, self.rest = Look(looked_at), Chooser(looked_at), 0
         self._start, self._advance = direct(run.kernels.start), direct(run.kernels.advance)
+        self.choice: Choice | None = None
         self.plan, self.kit, self.flags = run.plan, run.kit, run.kit.flags.copy()
         numbers = np.concatenate([run.clock, run.control, run.tolerances])  # to be copied at once
         i, j = run.clock.size, run.clock.size + run.control.size
@@ -107,8 +108,10 @@ class Again:
         v0: Array,
         asked: Asked,
         times: Array | None,
+        at_ends: bool,
     ) -> dict[str, Any] | None:
         """The fields of the record of a run of a system, at all steps or at these times; None: make it the long way."""
+        between = None if at_ends else times
         run, movable, a, territory = self.run, self.movable, self.run.a, self.territory
         if self.rest > 0:
             self.rest -= 1
@@ -122,10 +125,10 @@ class Again:
         if not self._is_ready(system, t0, t1, q0, v0, asked):
             return None
         began = time.process_time()
-        code, n_rows, n_steps = self._steps_to(t1, times is not None)
-        if times is not None and code == a.ALL_OUTPUT_DONE:
+        code, n_rows, n_steps = self._steps_to(t1, between is not None)
+        if between is not None and code == a.ALL_OUTPUT_DONE:
             parts = self.t[: n_rows + 1], self.rows[: n_rows + 1], self.kinds[:n_rows]
-            self.between.find(times, *parts, self.look.pattern)
+            self.between.find(between, *parts, self.look.pattern)
         spent = time.process_time() - began
         singular = run.plan.watchful and run.work.notes[noted.NEARLY_SINGULAR] == 1.0
         if code != a.ALL_OUTPUT_DONE or singular:
@@ -139,7 +142,7 @@ class Again:
                 return None
             run.compared_to[0] = t1
         if times is not None:
-            at_times = self.between.completed(times)
+            at_times = rows[[0 if time == t0 else -1 for time in times]] if at_ends else self.between.completed(times)
             if at_times is None:
                 return None
             t, rows = times.copy(), at_times
@@ -206,8 +209,10 @@ class Again:
                 choice = self.chooser.choice(look.mass, look.rows)
             except Untraceable:
                 return False
-            if choice != self.code.shared.equations.choice:
-                return False
+            if choice is not self.choice:  # the last one that was the same as that of the code
+                if choice != self.code.shared.equations.choice:
+                    return False
+                self.choice = choice
         run.t0, run.compared_to[0] = t0, -np.inf
         run.state[:n], run.state[n : 2 * n], run.state[2 * n :] = q0, v0, 0.0
         _restore(self.begins)

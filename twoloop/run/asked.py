@@ -33,6 +33,18 @@ class Asked:
         sizes = self.first_step, self.max_step, self.max_steps, self.step_size
         return id(self.method), self.rtol, self.atol.tobytes(), *sizes, self.compiled, self.check_derivatives
 
+    @cached_property
+    def own_tolerance(self) -> float | None:
+        """That of a test of positions which a method has for itself."""
+        own: float | None = getattr(self.method, "error_tol", None)
+        return own
+
+    @cached_property
+    def told(self) -> dict[str, Any]:
+        """What a result says of these; `untested` is None where all steps are tested, else of the run."""
+        tested = getattr(self.method, "tested", "all")
+        return {"method": self.method.name, "rtol": self.rtol} | ({} if tested == "positions" else {"untested": None})
+
     def set_sizes(self, run: Run, t1: float) -> None:
         """Set the first and the largest step of a run to t1, where these vary, and where a drive may have a kink."""
         run.work.notes[noted.KINK_AFTER] = t1

@@ -42,9 +42,18 @@ class Kept(NamedTuple):
 
 
 def record_again(
-    system: ConstrainedSystem, t0: float, t1: float, q0: Array, v0: Array, asked: Asked, times: Array | None
+    system: ConstrainedSystem,
+    t0: float,
+    t1: float,
+    q0: Array,
+    v0: Array,
+    asked: Asked,
+    times: Array | None,
+    at_ends: bool,
 ) -> tuple[dict[str, Any], str] | None:
     """The record of a run by the arrays of one before it, at its steps or at times, and what is said of its rows.
+
+    `at_ends`: whether these times are its start and its end, or one of them.
 
     None where there are none, or where something has to be looked at: then `run_from` begins it.
     """
@@ -55,13 +64,13 @@ def record_again(
         kept = known if isinstance(known, Kept) else None
     if kept is None or kept.waiting is None:
         return None
-    if times is not None and not Again.interpolates(kept.run):
+    if times is not None and not at_ends and not Again.interpolates(kept.run):
         return None
     try:
         again = kept.waiting.pop()
     except IndexError:
         again = Again(kept.run.again(), system, kept.code, kept.definite, asked.check_derivatives, kept.kin)
-    record = again.record(system, t0, t1, q0, v0, asked, times)
+    record = again.record(system, t0, t1, q0, v0, asked, times, at_ends)
     if len(kept.waiting) < MOST_WAITING:
         kept.waiting.append(again)
     return None if record is None else (record, again.run.said_of_rows)
