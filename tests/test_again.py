@@ -92,6 +92,22 @@ def test_states_at_the_ends_are_those_of_the_long_way_to_the_bit(method, at, tak
         assert_same(one, long)
 
 
+@pytest.mark.parametrize(("name", "method"), some_of(NAMES, METHODS))
+@pytest.mark.filterwarnings("ignore::twoloop.ConstraintWarning")
+def test_the_solution_between_the_steps_is_that_of_the_long_way_to_the_bit(name, method, taken, monkeypatch):
+    problem, other = getattr(mechanisms, name)(), getattr(mechanisms, name)()
+    span = 3e-3 if name == "andrews" else 0.1
+    states = repeated(starts(problem, span, 7))
+    by_arrays = [each.sol for each in runs(problem, states, span, method=method, dense_output=True)]
+    assert all(taken[-6:-1])
+    monkeypatch.setattr(solve, "record_again", lambda *asked: None)
+    for one, long in zip(by_arrays, runs(other, states, span, method=method, dense_output=True), strict=True):
+        times = np.random.default_rng(2).uniform(one.t_min, one.t_max, 9)
+        assert (one.t_min, one.t_max) == (long.sol.t_min, long.sol.t_max)
+        for kind in ("q", "v", "a", "lam"):
+            assert np.array_equal(getattr(one(times), kind), getattr(long.sol(times), kind)), kind
+
+
 def test_where_series_give_way_to_another_method(taken, monkeypatch):
     problem, other = mechanisms.four_bar(), mechanisms.four_bar()
     states = repeated(starts(problem, 1e-6, 7))

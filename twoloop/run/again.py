@@ -6,7 +6,7 @@ does, or a start is not beyond doubt, nothing comes of it, and the call goes the
 
 import time
 from dataclasses import MISSING, fields
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,8 +21,10 @@ from twoloop.kernels.data import codes, flags, noted
 from twoloop.kernels.layout import lasting
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.asked import Asked
-from twoloop.run.between import Between
+from twoloop.run.between import Between, interpolator_of
 from twoloop.run.comparison import compared_at, territory_of
+from twoloop.run.dense import Table
+from twoloop.run.dense_solution import DenseSolution
 from twoloop.run.fields import kinds_of, of_run, told_later
 from twoloop.run.messages import outcome
 from twoloop.run.movable import Kin, Movable
@@ -39,6 +41,19 @@ MOST_WAITING, LARGEST = 4, 500_000  # those of a kind that wait for a call, one 
 IN_VAIN = 16  # runs that are not tried after one that did not come to its end
 DEFAULTS = {each.name: each.default for each in fields(Record) if each.default is not MISSING}
 NO_PACE = Pace(0.0)  # of a run that came to its end at once
+
+
+class Output(NamedTuple):
+    """What is wanted of a run: the states at times, which may be its ends alone, and whether there is to be `sol`."""
+
+    times: Array | None
+    at_ends: bool
+    dense: bool
+
+    @property
+    def between(self) -> Array | None:
+        """Times between its steps."""
+        return None if self.at_ends else self.times
 
 
 class Again:
@@ -107,11 +122,10 @@ class Again:
         q0: Array,
         v0: Array,
         asked: Asked,
-        times: Array | None,
-        at_ends: bool,
+        output: Output,
     ) -> dict[str, Any] | None:
-        """The fields of the record of a run of a system, at all steps or at these times; None: make it the long way."""
-        between = None if at_ends else times
+        """The fields of the record of a run of a system; None: make it the long way."""
+        between = output.between
         run, movable, a, territory = self.run, self.movable, self.run.a, self.territory
         if self.rest > 0:
             self.rest -= 1
@@ -125,7 +139,7 @@ class Again:
         if not self._is_ready(system, t0, t1, q0, v0, asked):
             return None
         began = time.process_time()
-        code, n_rows, n_steps = self._steps_to(t1, between is not None)
+        code, n_rows, n_steps = self._steps_to(t1, between is not None or output.dense)
         if between is not None and code == a.ALL_OUTPUT_DONE:
             parts = self.t[: n_rows + 1], self.rows[: n_rows + 1], self.kinds[:n_rows]
             self.between.find(between, *parts, self.look.pattern)
@@ -141,11 +155,18 @@ class Again:
             if status != Status.REACHED_END:
                 return None
             run.compared_to[0] = t1
-        if times is not None:
-            at_times = rows[[0 if time == t0 else -1 for time in times]] if at_ends else self.between.completed(times)
+        sol = None
+        if output.dense:
+            table = Table(t, rows[:, : 3 * system.n_q].copy(), self.kinds[:n_steps].copy())
+            sol = DenseSolution(interpolator_of(run, table.states[0]), table, t1)
+        if output.times is not None:
+            if between is None:
+                at_times: Array | None = rows[[0 if time == t0 else -1 for time in output.times]]
+            else:
+                at_times = self.between.completed(between)
             if at_times is None:
                 return None
-            t, rows = times.copy(), at_times
+            t, rows = output.times.copy(), at_times
         territory.count()  # a run that goes the long way is counted there
         return {
             **DEFAULTS,
@@ -154,6 +175,7 @@ class Again:
             "status": status,
             "message": message,
             "compiled": bool(self.plan.own),
+            "sol": sol,
         }
 
     def _steps_to(self, t1: float, with_kinds: bool) -> tuple[int, int, int]:

@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from twoloop.generate.traced_values import Sample
 from twoloop.kernels.compile.linking import direct
-from twoloop.kernels.data import intervals, tolerances
+from twoloop.kernels.data import intervals
+from twoloop.run.between import interpolator_of
 from twoloop.run.comparison import compared
-from twoloop.run.dense import Interpolator
 from twoloop.run.fields import BEFORE, kinds_of, of_run, of_steps, statistics
 from twoloop.run.interrupts import Interrupts, said_of_interrupt
 from twoloop.run.kept import OF_STEPS
@@ -269,14 +269,9 @@ class Course:
 
     def _recorder(self) -> Recorder:
         """What takes the states; where some are to lie between steps, with what finds them."""
-        run, wanted = self.run, self.wanted
-        n, interpolator = run.system.n_q, None
-        if wanted.between_steps:
-            ranks = (len(run.work.rows), len(run.work.rows_v))
-            start, atol = run.state[: 3 * n], run.tolerances[tolerances.ATOL :]
-            interiors = {kind: plan.fresh() for kind, plan in run.interiors.items()}
-            interpolator = Interpolator(run.system, run.t0, start, run.rtol, atol, ranks, interiors)
-        return Recorder(wanted, interpolator, n, run.t0, run.state)
+        run, n = self.run, self.run.system.n_q
+        interpolator = interpolator_of(run, run.state[: 3 * n]) if self.wanted.between_steps else None
+        return Recorder(self.wanted, interpolator, n, run.t0, run.state)
 
     def _kinds(self, steps: Array, across: bool, leaps: bool) -> NDArray[np.int64]:
         """What kind of interval each of these accepted steps is, for the solution between them."""

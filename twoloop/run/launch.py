@@ -16,7 +16,7 @@ from twoloop.methods.code_for import code_for, may_have_code
 from twoloop.methods.plans_for import plans_for
 from twoloop.methods.presets import is_preset
 from twoloop.problem.system import ConstrainedSystem
-from twoloop.run.again import MOST_WAITING, Again
+from twoloop.run.again import MOST_WAITING, Again, Output
 from twoloop.run.asked import Asked
 from twoloop.run.comparison import unlike_before
 from twoloop.run.movable import Kin
@@ -48,12 +48,9 @@ def record_again(
     q0: Array,
     v0: Array,
     asked: Asked,
-    times: Array | None,
-    at_ends: bool,
+    output: Output,
 ) -> tuple[dict[str, Any], str] | None:
-    """The record of a run by the arrays of one before it, at its steps or at times, and what is said of its rows.
-
-    `at_ends`: whether these times are its start and its end, or one of them.
+    """The record of a run by the arrays of one before it, and what is said of its rows.
 
     None where there are none, or where something has to be looked at: then `run_from` begins it.
     """
@@ -64,13 +61,15 @@ def record_again(
         kept = known if isinstance(known, Kept) else None
     if kept is None or kept.waiting is None:
         return None
-    if times is not None and not at_ends and not Again.interpolates(kept.run):
+    if output.dense and (output.between is not None or kept.kin is not None):
+        return None  # both have the same states within steps; what belongs to kin takes other parameters
+    if output.between is not None and not Again.interpolates(kept.run):
         return None
     try:
         again = kept.waiting.pop()
     except IndexError:
         again = Again(kept.run.again(), system, kept.code, kept.definite, asked.check_derivatives, kept.kin)
-    record = again.record(system, t0, t1, q0, v0, asked, times, at_ends)
+    record = again.record(system, t0, t1, q0, v0, asked, output)
     if len(kept.waiting) < MOST_WAITING:
         kept.waiting.append(again)
     return None if record is None else (record, again.run.said_of_rows)
