@@ -104,29 +104,32 @@ class Look:
 
         self.flags, self._look = first_look, direct(look)
         n, n_rows, size = system.n_q, system.n_c + system.n_a, room_size(system.n_q, system.n_c, system.n_a)
-        self.system, self._kit, self._numbers = system, system.kit, np.zeros(size + n * n + 2 * n_rows * n)
-        self._room, mass, rows, pattern = np.split(self._numbers, np.cumsum([size, n * n, n_rows * n]))
+        self.system, looked = system, np.zeros(size + n * n + 2 * n_rows * n)
+        self._room, mass, rows, pattern = np.split(looked, np.cumsum([size, n * n, n_rows * n]))
         self.mass, self.rows, self.pattern = mass.reshape(n, n), rows.reshape(n_rows, n), pattern.reshape(n_rows, n)
-        self._always = _ones(system.n_c), self._room, self.mass, self.rows, _ways(n), self.pattern, LEAST
-        self._sizes = _zeros(n)
+        self.arrays = {
+            **{"looked": looked, "lam": _ones(system.n_c), "room": self._room, "mass": self.mass, "rows": self.rows},
+            **{"ways": _ways(n), "pattern": self.pattern, "least": LEAST},
+        }
+        self._nothing = _zeros(n)
         self.definite: bool | None = None
 
     def at(self, t: float, q: Array, v: Array) -> int:
         """Flags of what `first_look` finds at a start."""
         definite, indefinite = self.flags.DEFINITE, self.flags.INDEFINITE
-        self._numbers.fill(0.0)
-        sizes = self.system.made.get("sizes", self._sizes)
+        looked, *arrays = self.arrays.values()
+        looked.fill(0.0)
         try:
-            found: int = self._look(self._kit, t, q, v, sizes, *self._always)
+            found: int = self._look(self.system.kit, t, q, v, self.sizes(), *arrays)
         except Exception:  # of a callback, which is called by itself then
             return 0
         self.definite = bool(found & definite) if found & (definite | indefinite) else None
         return found
 
-    def is_consistent(self, t: float, q: Array, v: Array) -> bool:
-        """Whether a start is consistent beyond doubt, and nothing there would have to be looked at more closely."""
-        found = self.at(t, q, v)
-        return bool(found & self.flags.IN_ORDER) and self.is_surely(found, t, q, v)
+    def sizes(self) -> Array:
+        """What no coordinate is less than in what counts as rounding: what a start before has shown, or nothing."""
+        sizes: Array = self.system.made.get("sizes", self._nothing)
+        return sizes
 
     def is_surely(self, found: int, t: float, q: Array, v: Array) -> bool:
         """Whether `Violation` would accept the state of the last look, which found this, beyond doubt."""

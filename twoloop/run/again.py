@@ -11,16 +11,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from twoloop.checks.consistency import Look
-from twoloop.generate.choices import Choice, Chooser
 from twoloop.generate.straight_code import OwnCode
 from twoloop.generate.traced_values import Sample
-from twoloop.generate.tracing import Untraceable
 from twoloop.kernels.compile.linking import direct
-from twoloop.kernels.data import codes, flags, noted
-from twoloop.kernels.layout import lasting
+from twoloop.kernels.data import flags, noted
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.asked import Asked
+from twoloop.run.beginning import Beginning
 from twoloop.run.between import Between, interpolator_of
 from twoloop.run.comparison import compared_at, territory_of
 from twoloop.run.dense import Table
@@ -32,10 +29,8 @@ from twoloop.run.pace import INTERRUPTED, Pace
 from twoloop.run.passage import give_way
 from twoloop.run.record import Record, Status
 from twoloop.run.run import Run
-from twoloop.run.workspace import made_ready
 
 Array = NDArray[np.float64]
-Copied = tuple[NDArray[Any], NDArray[Any]]  # an array and what was in it
 
 MOST_WAITING, LARGEST = 4, 500_000  # those of a kind that wait for a call, one a thread; numbers of the states of each
 IN_VAIN = 16  # runs that are not tried after one that did not come to its end
@@ -85,23 +80,18 @@ class Again:
         kin: Kin | None,
     ):
         self.movable = None if kin is None else Movable(kin, run)
-        self.run, self.code, self.definite, self.check_derivatives = run, code, definite, check_derivatives
+        self.run, self.check_derivatives = run, check_derivatives
         self.territory = territory_of(run, check_derivatives) if kin is None else kin.territory(check_derivatives)
-        looked_at = system if self.movable is None else self.movable.system
-        self.look, self.chooser, self.rest = Look(looked_at), Chooser(looked_at), 0
-        self._start, self._advance = direct(run.kernels.start), direct(run.kernels.advance)
-        self.choice: Choice | None = None
+        self.beginning = Beginning(run, system if self.movable is None else self.movable.system, code, definite)
+        self.look, self.rest, self._advance = self.beginning.look, 0, direct(run.kernels.advance)
         self.plan, self.kit, self.flags = run.plan, run.kit, run.kit.flags.copy()
-        numbers = np.concatenate([run.clock, run.control, run.tolerances])  # to be copied at once
-        i, j = run.clock.size, run.clock.size + run.control.size
-        run.clock, run.control, run.tolerances = numbers[:i], numbers[i:j], numbers[j:]
-        self.begins = _copied(numbers, run.plan.memory)
         self.t, self.rows = np.empty(run.chunk + 1), np.empty((run.chunk + 1, len(run.state)))
         self.steps = np.empty((run.chunk, run.a.N_STEP_COLUMNS))
         self.kinds, self.between = np.empty(run.chunk, dtype=np.int64), Between(run)
         self.end, self.filled = np.zeros(1), np.zeros(2, dtype=np.int64)
         self.call: tuple[int, float, float, bytes, bytes] | None = None  # the last one
-        self.saved: list[Copied] = []  # made at its start, where the one before was equal
+        # arrays with copies made at its start, where the one before was equal
+        self.saved: list[tuple[NDArray[Any], NDArray[Any]]] = []
 
     @staticmethod
     def suits(run: Run) -> bool:
@@ -135,7 +125,7 @@ class Again:
                 return None
         else:
             movable.take(system)
-            self.look.system = self.chooser.system = movable.system
+            self.look.system = movable.system
         if not self._is_ready(system, t0, t1, q0, v0, asked):
             return None
         began = time.process_time()
@@ -207,44 +197,21 @@ class Again:
             run.kit.flags[:] = self.flags
         equal = call == self.call
         if equal and self.saved:
-            _restore(self.saved)
+            for array, copy in self.saved:
+                array[:] = copy
             return True
         self.call, self.saved = None, []
-        if not self._begins(t0, q0, v0):
+        if not self.beginning.at(t0, q0, v0):
             return False
+        run.t0, run.compared_to[0] = t0, -np.inf
+        if run.said_of_rows:  # of this time, with factors of this position; rounding may decide which row is left out
+            run.redundant, run.said_of_rows = run.redundant_rows(self.look.rows)
         if self.movable is not None and not self.movable.agrees(t1, self.look.mass, self.check_derivatives):
             return False
         asked.set_sizes(run, t1)
         self.call = call
         if equal:
-            self.saved = _copied(*(array for array, _ in self.begins), *lasting(run.work), run.state)
-        return True
-
-    def _begins(self, t0: float, q0: Array, v0: Array) -> bool:
-        """Whether a run begins at a start as this one did: consistent, of the same rank, mass and choice of rows."""
-        run, look = self.run, self.look
-        system, n, work = run.system, run.system.n_q, run.work
-        if not look.is_consistent(t0, q0, v0) or (not system.constant_mass and look.definite is not self.definite):
-            return False
-        if self.code is not None:
-            try:
-                choice = self.chooser.choice(look.mass, look.rows)
-            except Untraceable:
-                return False
-            if choice is not self.choice:  # the last one that was the same as that of the code
-                if choice != self.code.shared.equations.choice:
-                    return False
-                self.choice = choice
-        run.t0, run.compared_to[0] = t0, -np.inf
-        run.state[:n], run.state[n : 2 * n], run.state[2 * n :] = q0, v0, 0.0
-        _restore(self.begins)
-        run.clock[run.a.T] = run.clock[run.a.T_START] = t0
-        made_ready(work, system, self.flags, look.pattern, q0, run.rtol, run.reuse)
-        work.notes[noted.NEARLY_SINGULAR] = 0.0 if run.plan.watchful else 1.0
-        if self._start(run.kit, work, t0, run.state) != codes.DONE:
-            return False
-        if run.said_of_rows:  # of this time, with factors of this position; rounding may decide which row is left out
-            run.redundant, run.said_of_rows = run.redundant_rows(look.rows)
+            self.saved = [(each, each.copy()) for each in (*self.beginning.lasting, run.state)]
         return True
 
     def _compared(self, t: Array, rows: Array, status: Status, message: str) -> tuple[Status, str]:
@@ -261,12 +228,3 @@ class Again:
         if self.movable is not None and compared[0] == status:
             territory.add_parameters(self.movable.parameters)
         return compared
-
-
-def _copied(*arrays: NDArray[Any]) -> list[Copied]:
-    return [(each, each.copy()) for each in arrays]
-
-
-def _restore(copied: list[Copied]) -> None:
-    for array, copy in copied:
-        array[:] = copy
