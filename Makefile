@@ -75,7 +75,7 @@ compile: install ## compile the kernels, and the callbacks of bodies, mechanisms
 	@$(RUN) -c "from twoloop.kernels.evaluation import calls, own_inner; from twoloop.kernels.control import controller"
 	@$(RUN) -c "from twoloop.kernels.steps import bdf_newton_step, diagonal_step, newton_step; \
 	from twoloop.kernels.evaluation import static_inner; from twoloop.kernels.lanes import lane_implicit" & \
-	$(RUN) -c "from twoloop.kernels import advance, agreement, interpolation; \
+	$(RUN) -c "from twoloop.kernels import advance, agreement, interpolation, short_loops; \
 	from twoloop.kernels.algebra import independent, pivots, scaling; from twoloop.kernels.control import switching; \
 	from twoloop.kernels.evaluation import first_look, traced; \
 	from twoloop.kernels.lanes import lane_dop853, lane_runs, lane_taylor; \

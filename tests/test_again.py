@@ -76,6 +76,38 @@ def test_it_is_the_run_of_the_long_way_to_the_bit(name, method, taken, monkeypat
         assert_same(one, long)
 
 
+@pytest.mark.parametrize("method", ["auto", "RadauIIA5", "PaperIRK"])
+@pytest.mark.parametrize("at", [(1,), (0, 1), (0,)])
+def test_states_at_the_ends_are_those_of_the_long_way_to_the_bit(method, at, taken, monkeypatch):
+    def at_ends(problem):
+        ends = [np.array([float(s.t), float(s.t) + 0.1])[list(at)] for s in states]
+        return [runs(problem, [s], 0.1, method=method, t_eval=t)[0] for s, t in zip(states, ends, strict=True)]
+
+    problem, other = mechanisms.four_bar(), mechanisms.four_bar()
+    states = repeated(starts(problem, 0.1, 7))
+    by_arrays = at_ends(problem)
+    assert all(taken[-6:-1])
+    monkeypatch.setattr(solve, "record_again", lambda *asked: None)
+    for one, long in zip(by_arrays, at_ends(other), strict=True):
+        assert_same(one, long)
+
+
+@pytest.mark.parametrize(("name", "method"), some_of(NAMES, METHODS))
+@pytest.mark.filterwarnings("ignore::twoloop.ConstraintWarning")
+def test_the_solution_between_the_steps_is_that_of_the_long_way_to_the_bit(name, method, taken, monkeypatch):
+    problem, other = getattr(mechanisms, name)(), getattr(mechanisms, name)()
+    span = 3e-3 if name == "andrews" else 0.1
+    states = repeated(starts(problem, span, 7))
+    by_arrays = [each.sol for each in runs(problem, states, span, method=method, dense_output=True)]
+    assert all(taken[-6:-1])
+    monkeypatch.setattr(solve, "record_again", lambda *asked: None)
+    for one, long in zip(by_arrays, runs(other, states, span, method=method, dense_output=True), strict=True):
+        times = np.random.default_rng(2).uniform(one.t_min, one.t_max, 9)
+        assert (one.t_min, one.t_max) == (long.sol.t_min, long.sol.t_max)
+        for kind in ("q", "v", "a", "lam"):
+            assert np.array_equal(getattr(one(times), kind), getattr(long.sol(times), kind)), kind
+
+
 def test_where_series_give_way_to_another_method(taken, monkeypatch):
     problem, other = mechanisms.four_bar(), mechanisms.four_bar()
     states = repeated(starts(problem, 1e-6, 7))

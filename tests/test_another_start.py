@@ -14,7 +14,9 @@ from twoloop.checks.scales import scales_of
 from twoloop.generate.families import family_of
 
 
-@pytest.mark.parametrize("name", ["redundant_slider_crank", "driven_crank", "rolling_disc", "spatial_four_bar"])
+@pytest.mark.parametrize(
+    "name", ["redundant_slider_crank", "driven_crank", "rolling_disc", "spatial_four_bar", "bricard", "n_four_bar"]
+)
 @pytest.mark.filterwarnings("ignore::twoloop.ConstraintWarning")
 def test_what_is_accepted_without_singular_values_is_accepted_by_them(name):
     problem, random = getattr(mechanisms, name)(), np.random.default_rng(4)

@@ -249,13 +249,13 @@ def test_callbacks_along_runs_are_compared_by_the_doubling_rule(monkeypatch):
 
 
 CALLS = {  # in a call with other parameters: beyond those before, and among them
-    "four_bar": (920, 640),
-    "heavy_top": (900, 620),
-    "spatial_four_bar": (830, 570),
-    "bricard": (830, 640),
-    "redundant_slider_crank": (1450, 1170),
+    "four_bar": (830, 560),
+    "heavy_top": (720, 470),
+    "spatial_four_bar": (670, 420),
+    "bricard": (640, 450),
+    "redundant_slider_crank": (1330, 1090),
 }
-AT_TIMES = 240  # more where the solution is wanted at times
+AT_TIMES = 210  # more where the solution is wanted at times
 
 
 @pytest.mark.parametrize("name", CALLS)

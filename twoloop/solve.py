@@ -31,6 +31,7 @@ from twoloop.problem.events import check_events
 from twoloop.problem.system import ConstrainedSystem, check_system
 from twoloop.result.folder import begin_folder, check_folder, end_folder
 from twoloop.result.result import Result, result_of
+from twoloop.run.again import Output
 from twoloop.run.asked import Asked
 from twoloop.run.course import Course
 from twoloop.run.interrupts import Interrupts, not_begun
@@ -166,7 +167,7 @@ def solve_dae(
         known = given, _checked(system, *given)
         if type(atol) is float:  # an array may be changed by who gives it
             system.shared["options"] = known
-    chosen, rtol, atol, max_step, compiled = known[1]
+    asked: Asked = known[1]
     event_functions = None if events is None else check_events(events)
     t0, t1 = check_span(t_span)
     q0 = check_vector("q0", q0, system.n_q)
@@ -176,46 +177,32 @@ def solve_dae(
     times = None if t_eval is None else check_times(t_eval, t0, t1, step_size)
     folder = None if store is None else check_folder(store)
     with Interrupts() as interrupts:
-        asked = Asked(
-            method=chosen,
-            rtol=rtol,
-            atol=atol,
-            t1=t1,
-            step_size=step_size,
-            first_step=first_step,
-            max_step=max_step,
-            max_steps=max_steps,
-            compiled=compiled,
-            check_derivatives=check_derivatives,
-        )
-        told = {"method": chosen.name, "rtol": rtol, "atol": atol.copy()}
-        by_positions, own = getattr(chosen, "tested", "all") == "positions", getattr(chosen, "error_tol", None)
+        own, told = asked.own_tolerance, asked.told | {"system": system, "atol": asked.atol.copy()}
         at_ends = times is not None and set(times.tolist()) <= {t0, t1}
-        if folder is event_functions is own is None and not (dense_output or progress or at_ends):
-            made = record_again(system, t0, q0, v0, asked, times)
+        if folder is event_functions is own is None and not progress:
+            made = record_again(system, t0, t1, q0, v0, asked, Output(times, at_ends, bool(dense_output)))
             if made is not None and not interrupts.asked:
                 fields, said_of_rows = made
                 if said_of_rows:
                     warnings.warn(said_of_rows, ConstraintWarning, stacklevel=2)
-                return result_of(fields, system=system, **told, **({} if by_positions else {"untested": None}))
-        run = run_from(system, t0, q0, v0, asked)
+                return result_of(fields | told)
+        run = run_from(system, t0, t1, q0, v0, asked)
         if run.said_of_rows:
             warnings.warn(run.said_of_rows, ConstraintWarning, stacklevel=2)
         with_code = bool(run.plan.own)
-        with _progress_bar(chosen.name, t0, t1) if progress else NO_BAR as report:
+        with _progress_bar(asked.method.name, t0, t1) if progress else NO_BAR as report:
             lands = run.plan.lands or step_size is not None or at_ends
             kept = InMemory() if folder is None else begin_folder(folder, system.n_q)
             wanted = Wanted(times, lands, bool(dense_output), event_functions, kept)
             record = Course(run, t1, wanted, report, time_limit, interrupts).to_end(check_derivatives)
         give_back(run.work)
-        told |= {"compiled": with_code, "untested": record.untested if by_positions else None}
         if own is not None:  # Newmark's own test, of positions, has its place
             told |= {"rtol": own, "atol": np.full(system.n_q, own), "untested": np.ones(len(record.h), dtype=bool)}
-        result = result_of(vars(record), system=system, **told)
+        result = result_of(vars(record) | told | {"compiled": with_code})
         if isinstance(kept, OnDisk):
             end_folder(kept, result)
         return result
-    return result_of(vars(not_begun(system, t0, event_functions, chosen.name)))
+    return result_of(vars(not_begun(system, t0, event_functions, asked.method.name)))
 
 
 def _checked(
@@ -232,7 +219,7 @@ def _checked(
     time_limit: Any,
     check_derivatives: Any,
     compiled: Any,
-) -> tuple[Method, float, Array, float, Compiled]:
+) -> Asked:
     """The options of a call as a run needs them; raises where one is wrong."""
     check_flag("dense_output", dense_output)
     if progress is not None:
@@ -263,7 +250,8 @@ def _checked(
             f"method with variables='momenta' needs constraints on positions only: there are no canonical variables "
             f"for the n_a = {system.n_a} nonholonomic rows of {system.name!r}. Take variables='velocities'"
         )
-    return chosen, float(rtol), atol, float(max_step), compiled
+    sizes = first_step, float(max_step), max_steps, step_size
+    return Asked(chosen, float(rtol), atol, *sizes, compiled, bool(check_derivatives))
 
 
 def check_method(method: str | Method) -> Method:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from twoloop.checks.rank import largest_solution, orthogonalised
+from twoloop.checks.rank import least_solution, orthogonalised
 from twoloop.checks.scales import column_scales
 from twoloop.generate.choices import BOUNDS, LEAST, RANK, SINGULAR_MASS
 from twoloop.kernels.algebra.pivots import STAYS_SINGULAR, choose, room_size
@@ -20,10 +20,22 @@ def test_the_first_rows_that_no_others_add_up_to(rows, kept):
     assert np.allclose(factors @ basis, rows[which], atol=1e-14) and not np.triu(factors, 1).any()
 
 
-@pytest.mark.parametrize("rows", [ROWS, DEPENDENT, ROWS * 10.0 ** np.arange(-4, 1)[:, None]], ids=str)
-def test_no_solution_is_larger(rows):
-    inverse, bound = np.linalg.pinv(rows, rcond=1e-10), largest_solution(rows)
-    assert max(np.linalg.norm(inverse, 2), 1.0) <= bound <= max(np.linalg.norm(inverse), 1.0) * 10.0
+@pytest.mark.parametrize(
+    "rows", [ROWS, DEPENDENT, DEPENDENT.T, ROWS * 10.0 ** np.arange(-4, 1)[:, None], np.zeros((2, 8))], ids=str
+)
+def test_the_least_solution_is_that_of_the_pseudo_inverse(rows):
+    values = RANDOM.standard_normal(len(rows))
+    x, left = least_solution(rows, values)
+    expected = np.linalg.pinv(rows, rcond=1e-10) @ values
+    size = np.abs(expected).max(initial=1.0)
+    assert np.allclose(x, expected, atol=1e-9 * size) and np.allclose(left, values - rows @ expected, atol=1e-9 * size)
+
+
+@pytest.mark.parametrize(("near", "known"), [(1e-14, True), (1e-11, False), (1e-9, False), (1e-7, True)])
+def test_where_a_direction_may_count_or_not_there_is_no_least_solution(near, known):
+    rows = np.vstack([ROWS[:3], ROWS[0] + near * ROWS[3]]) / 4.0
+    found = least_solution(rows, np.ones(4))
+    assert (found is not None) is known
 
 
 def chosen(mass, G):

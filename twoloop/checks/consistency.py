@@ -12,7 +12,7 @@ from scipy.linalg import lapack, null_space
 from twoloop.checks.arguments import Array
 from twoloop.checks.bounds import check_bounds
 from twoloop.checks.derivatives import check_derivatives
-from twoloop.checks.rank import eigenvalues, in_words, largest_solution, redundant_rows
+from twoloop.checks.rank import eigenvalues, in_words, least_solution, redundant_rows
 from twoloop.checks.scales import EPS, Scales, rows_at, scales_of
 from twoloop.checks.sparse_rows import Rows, SparseRows, largest_in_rows
 from twoloop.checks.values import UNSYMMETRIC, unsymmetric_mass
@@ -104,29 +104,32 @@ class Look:
 
         self.flags, self._look = first_look, direct(look)
         n, n_rows, size = system.n_q, system.n_c + system.n_a, room_size(system.n_q, system.n_c, system.n_a)
-        self.system, self._numbers = system, np.zeros(size + n * n + 2 * n_rows * n)
-        self._room, mass, rows, pattern = np.split(self._numbers, np.cumsum([size, n * n, n_rows * n]))
+        self.system, looked = system, np.zeros(size + n * n + 2 * n_rows * n)
+        self._room, mass, rows, pattern = np.split(looked, np.cumsum([size, n * n, n_rows * n]))
         self.mass, self.rows, self.pattern = mass.reshape(n, n), rows.reshape(n_rows, n), pattern.reshape(n_rows, n)
-        self._always = _ones(system.n_c), self._room, self.mass, self.rows, _ways(n), self.pattern, LEAST
-        self._sizes = _zeros(n)
+        self.arrays = {
+            **{"looked": looked, "lam": _ones(system.n_c), "room": self._room, "mass": self.mass, "rows": self.rows},
+            **{"ways": _ways(n), "pattern": self.pattern, "least": LEAST},
+        }
+        self._nothing = _zeros(n)
         self.definite: bool | None = None
 
     def at(self, t: float, q: Array, v: Array) -> int:
         """Flags of what `first_look` finds at a start."""
         definite, indefinite = self.flags.DEFINITE, self.flags.INDEFINITE
-        self._numbers.fill(0.0)
-        sizes = self.system.made.get("sizes", self._sizes)
+        looked, *arrays = self.arrays.values()
+        looked.fill(0.0)
         try:
-            found: int = self._look(self.system.kit, t, q, v, sizes, *self._always)
+            found: int = self._look(self.system.kit, t, q, v, self.sizes(), *arrays)
         except Exception:  # of a callback, which is called by itself then
             return 0
         self.definite = bool(found & definite) if found & (definite | indefinite) else None
         return found
 
-    def is_consistent(self, t: float, q: Array, v: Array) -> bool:
-        """Whether a start is consistent beyond doubt, and nothing there would have to be looked at more closely."""
-        found = self.at(t, q, v)
-        return bool(found & self.flags.IN_ORDER) and self.is_surely(found, t, q, v)
+    def sizes(self) -> Array:
+        """What no coordinate is less than in what counts as rounding: what a start before has shown, or nothing."""
+        sizes: Array = self.system.made.get("sizes", self._nothing)
+        return sizes
 
     def is_surely(self, found: int, t: float, q: Array, v: Array) -> bool:
         """Whether `Violation` would accept the state of the last look, which found this, beyond doubt."""
@@ -164,31 +167,39 @@ def _surely_consistent(
     C: Array,
     rates: Array,
 ) -> bool:
-    """Whether `Violation` would accept a state beyond doubt, by what is cheaper than singular values.
+    """Whether `Violation` would accept a state beyond doubt, without singular values.
 
-    The largest that corrections can be stands for each of them, the row that allows least for all, at a share of what
-    it allows, and the least that accelerations M^-1 Q can be for these; what rounding explains is left out.
+    Corrections are the same; they must be less than a share of what is accepted, without what rounding explains, and
+    with the least that accelerations M^-1 Q can be.
     """
     scales = scales_of(system, t, q, rows)
-    times = largest_solution(scales.scaled(rows))
     fastest = np.where(rows != 0.0, np.abs(v) / scales.columns, 0.0).max(axis=1)
     speeds = np.maximum(fastest, np.abs(rates) / scales.rows)
     if lapack.dpotrf(mass)[1] == 0:
         pull = float((np.abs(force) / (np.abs(mass) @ scales.columns)).max())
         speeds = np.maximum(speeds, np.sqrt(scales.reach * pull))
-    off = float(np.linalg.norm((rows @ v + rates) / scales.rows))
-    if not times * off <= SURELY * CONSISTENT * speeds.min():
+    if not _surely_small(rows, rows @ v + rates, scales, speeds):
         return False
     if system.n_a > 0:
         if system.n_c == 0:
             return True
         rows = rows[: system.n_c]
         scales = scales_of(system, t, q, rows)
-        times = largest_solution(scales.scaled(rows))
-    consistent = times * float(np.linalg.norm(C / scales.rows)) <= SURELY * CONSISTENT * scales.reach.min()
+    consistent = _surely_small(rows, C, scales, scales.reach)
     if consistent:  # how far coordinates move until they matter, at the next start as well, beside what rounding is
         system.made["sizes"] = scales.by_coordinate(scales.reach, rows)
-    return bool(consistent)
+    return consistent
+
+
+def _surely_small(rows: Array, values: Array, scales: Scales, per_row: Array) -> bool:
+    """Whether the correction that values ask for, and what it leaves, are far below what is accepted."""
+    found = least_solution(scales.scaled(rows), values / scales.rows)
+    if found is None:
+        return False
+    x, left = found
+    allowed = SURELY * CONSISTENT * scales.by_coordinate(per_row, rows)
+    small = np.abs(scales.columns * x) <= allowed
+    return bool(small.all() and (np.abs(left) <= SURELY * CONSISTENT * per_row).all())
 
 
 def is_at_rounding(values: Array, rows: Rows, state: Array, rate: Array | float = 0.0) -> bool:

@@ -1,5 +1,7 @@
 """Rows that depend on others: which they are, how they are made of these, and how large solutions can be."""
 
+import math
+
 import numpy as np
 from scipy.linalg import lapack, qr
 
@@ -9,6 +11,7 @@ from twoloop.kernels.compile.linking import direct
 RANK_TOLERANCE = 1e-11  # of the largest diagonal entry of R
 SHOWN = 5  # rows that depend on others, of which the equations are written out
 MOST_TERMS, MOST_NAMED = 3, 8  # rows on which another depends: named with their coefficients, and named at all
+WEAK = 1e-9  # of the largest singular value: directions that a pseudo-inverse has beyond doubt
 NO_DIRECTION = 1e-12  # of a row: what rounding leaves of it without its part in others that it depends on
 
 
@@ -31,15 +34,21 @@ def orthogonalised(rows: Array, least: float) -> tuple[Array, Array, list[int]]:
     return basis[:n], factors[:n, :n], kept[:n].tolist()
 
 
-def largest_solution(rows: Array) -> float:
-    """How many times as large as values the solution of least norm, or by least squares, is at most; 1 if it is less.
+def least_solution(rows: Array, values: Array) -> tuple[Array, Array] | None:
+    """What the pseudo-inverse of rows, of length 1 or less, makes of values, and what that leaves of these.
 
-    What is below NO_DIRECTION of a row counts as dependent on others.
+    None where a direction is so weak that it may count or not.
     """
-    from twoloop.kernels.algebra.independent import size_of_inverse
+    from twoloop.kernels.algebra import independent
 
-    _, factors, kept = orthogonalised(rows, NO_DIRECTION)
-    return max(1.0, direct(size_of_inverse)(np.ascontiguousarray(factors), len(kept), np.zeros(len(kept))))
+    n_rows, n_q = rows.shape
+    most, kept, x, left = min(n_rows, n_q) + 1, np.zeros(n_rows, dtype=np.int64), np.zeros(n_q), values.copy()
+    basis, factors, shares = np.zeros((most, n_q)), np.zeros((most, most)), np.zeros((n_rows, most))
+    gram, parts = np.zeros((n_rows, n_rows)), np.zeros((2, n_rows))
+    room = basis, factors, kept, shares, gram, parts
+    n = direct(independent.least_solution)(np.ascontiguousarray(rows), left, NO_DIRECTION, *room, x)
+    inverse = direct(independent.size_of_inverse)(factors, n, parts[0])
+    return (x, left) if WEAK * math.sqrt(n_rows) * inverse < 1.0 else None
 
 
 def surely_above(ratio: float, rows: Array, rank: int) -> bool:
@@ -65,31 +74,33 @@ def redundant_rows(scaled: Array) -> list[int]:
 
 def in_words(jacobian: Array, redundant: list[int]) -> str:
     """Which rows depend on which others, with the coefficients where these are few: many differ from start to start."""
-    others = [i for i in range(len(jacobian)) if i not in redundant]
-    shares = _combinations(jacobian[others], jacobian[redundant[:SHOWN]])
-    return equations_in_words(redundant, others, shares, np.linalg.norm(jacobian, axis=1))
+    from twoloop.kernels.algebra.independent import shares_of_others
+
+    (n_rows, n_q), shown = jacobian.shape, redundant[:SHOWN]
+    others = [i for i in range(n_rows) if i not in redundant]
+    most, rest = min(len(others), n_q) + 1, np.empty((len(others), n_q))
+    lengths, shares = np.zeros(n_rows), np.zeros((len(shown), len(others)))
+    order, kept = np.array([*others, *shown]), np.zeros(n_rows, dtype=np.int64)
+    room = np.zeros((most, n_q)), np.zeros((most, most)), kept
+    if not direct(shares_of_others)(
+        np.ascontiguousarray(jacobian), order, RANK_TOLERANCE, rest, *room, shares, lengths
+    ):
+        shares[:] = np.linalg.lstsq(rest.T, jacobian[shown].T, rcond=None)[0].T
+    return equations_in_words(redundant, others, shares, lengths)
 
 
 def equations_in_words(redundant: list[int], others: list[int], shares: Array, lengths: Array) -> str:
     """The same from the shares (SHOWN, n) that the others have in the first rows, and the lengths of all rows."""
     equations = []
-    for i, factors in zip(redundant, shares, strict=False):
-        parts = np.abs(factors) * lengths[others]
-        of = np.flatnonzero(parts > 1e-9 * lengths[i])
+    counts = np.abs(shares) * lengths[others] > 1e-9 * lengths[redundant[: len(shares)], None]
+    for i, factors, which in zip(redundant, shares.tolist(), counts, strict=False):
+        of = which.nonzero()[0].tolist()
         if len(of) > MOST_TERMS:
             named = ", ".join(str(others[k]) for k in of[:MOST_NAMED])
             also = f" and {len(of) - MOST_NAMED} more" if len(of) > MOST_NAMED else ""
             equations.append(f"row {i} on rows {named}{also}")
             continue
-        terms = [f"{factors[k]:.4g} row {others[k]}" for k in of]
-        equations.append(f"row {i} = {' + '.join(terms).replace('+ -', '- ') or '0'}")
+        terms = " + ".join([f"{factors[k]:.4g} row {others[k]}" for k in of])
+        equations.append(f"row {i} = {terms.replace('+ -', '- ') or '0'}")
     more = ", ..." if len(redundant) > SHOWN else ""
     return f"row(s) {redundant} depend on the others ({', '.join(equations)}{more})"
-
-
-def _combinations(others: Array, rows: Array) -> Array:
-    """Which combination of others each row is, by least squares where it is none."""
-    basis, factors, kept = orthogonalised(others, RANK_TOLERANCE)
-    if len(kept) < len(others):
-        return np.linalg.lstsq(others.T, rows.T, rcond=None)[0].T  # type: ignore[return-value]
-    return lapack.dtrtrs(factors, basis @ rows.T, lower=1, trans=1)[0].T  # type: ignore[no-any-return]

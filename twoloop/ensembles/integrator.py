@@ -198,7 +198,7 @@ class Integrator:
             raise ValueError("result has the samples since a start: call integrator.start(t0, q0, v0) first")
         record = replace(self._sampled.record(), system=self._started, method=self._options["method"].name)
         atol = check_tolerance("atol", self._options["atol"], self.system.n_q)
-        return result_of(vars(record), compiled=False, rtol=float(self._options["rtol"]), atol=atol)
+        return result_of(vars(record) | {"compiled": False, "rtol": float(self._options["rtol"]), "atol": atol})
 
     def _system_of(self, parameters: ArrayLike) -> ConstrainedSystem:
         made = self.system.with_parameters(parameters)

@@ -11,6 +11,8 @@ from twoloop.generate.families import Family, of_family
 from twoloop.generate.traced_equations import OF_ROWS, Equations
 from twoloop.generate.traced_values import Check, Traced, unchecked
 from twoloop.generate.tracing import Untraceable
+from twoloop.kernels.compile.linking import direct
+from twoloop.kernels.layout import short_loops
 from twoloop.problem.system import ConstrainedSystem
 
 Array = NDArray[np.float64]
@@ -94,13 +96,9 @@ class Territory:
         """One more run was made."""
         self._runs += 1
 
-    def holds(self, t: Array, states: Array) -> bool:
-        """Whether all states [q, v] of a run, rows at increasing times, lie where others were compared."""
-        if not self._box.size:
-            return False
-        least, largest = self._known
-        outside = np.count_nonzero(states < least[1:]) or np.count_nonzero(states > largest[1:])
-        return bool(least[0] <= t[0] and t[-1] <= largest[0] and not outside)
+    def holds(self, t: Array, rows: Array) -> bool:
+        """Whether all states of a run, rows that begin with [q, v], lie where others were compared."""
+        return self._box.size > 0 and direct(short_loops().lies_within)(t, rows, self._known)
 
     def without_known(self, states: Array) -> Array:
         """Those of the states, rows, of a run that lie in no place, or next to none, where one was compared."""

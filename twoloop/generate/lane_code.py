@@ -60,7 +60,7 @@ class LaneCode:
         self.structure = self._structure()
         self.n_numbers = self.numbers.n_varying
         parts = [equations.there, equations.closer, equations.nearer, equations.redundant]
-        parts += [self.solution.kept, equations.there] if series else []  # `look` has the latter, too
+        parts += [self.solution.kept] if series else []
         counts = [len(each.quantities(equations.graph)) for each in parts]
         counts += [len(self.solution.solved.quantities(self.solution.graph))] if series else []
         self.n_quantities = sum(counts)
@@ -68,7 +68,7 @@ class LaneCode:
     @property
     def tasks(self) -> tuple[str, ...]:
         """What there is code for."""
-        return lanes.TASKS if self.recurrences is None else (*lanes.TASKS, *lanes.TASKS_OF_SERIES)
+        return *lanes.TASKS, *(lanes.TASKS_OF_STAGES if self.recurrences is None else lanes.TASKS_OF_SERIES)
 
     def series_size(self, order: int) -> int:
         """Length of the memory that a series of an order takes and works in, in vectors."""

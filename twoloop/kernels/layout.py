@@ -137,8 +137,15 @@ def cleared(work: Work) -> Work:
     for each in lasting(work):
         each[:] = 0
     work.G_of_S[:] = np.nan
-    work.changes[:] = 0.0
     return work
+
+
+@cache
+def short_loops() -> Any:
+    """The module of that name: compiled, or read from the disk, when it is first asked for."""
+    from twoloop.kernels import short_loops
+
+    return short_loops
 
 
 def _of_static_form(n_q: int, n_c: int, rank: int, static: Static) -> tuple[dict[str, tuple[int, ...]], ...]:

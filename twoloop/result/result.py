@@ -3,7 +3,6 @@
 from __future__ import annotations  # help() shows types by name
 
 import os
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -240,8 +239,8 @@ class Result(Record):
         save(self, path)
 
 
-def result_of(record: Mapping[str, Any], **more: Any) -> Result:
-    """Return a result with the fields of a record, some of them replaced."""
+def result_of(fields: dict[str, Any]) -> Result:
+    """Return a result with these fields, which it takes over."""
     made = object.__new__(Result)  # avoids the slow constructor of a frozen dataclass with thirty fields
-    vars(made).update(record, **more)
+    object.__setattr__(made, "__dict__", fields)
     return made

@@ -6,38 +6,49 @@ does, or a start is not beyond doubt, nothing comes of it, and the call goes the
 
 import time
 from dataclasses import MISSING, fields
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from twoloop.checks.consistency import Look
-from twoloop.generate.choices import Chooser
-from twoloop.generate.exact_derivatives import Territory
 from twoloop.generate.straight_code import OwnCode
 from twoloop.generate.traced_values import Sample
-from twoloop.generate.tracing import Untraceable
 from twoloop.kernels.compile.linking import direct
-from twoloop.kernels.data import codes, flags, noted
-from twoloop.kernels.layout import cleared, lasting
+from twoloop.kernels.data import flags, noted
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.asked import Asked
-from twoloop.run.between import Between
+from twoloop.run.beginning import Beginning
+from twoloop.run.between import Between, interpolator_of
 from twoloop.run.comparison import compared_at, territory_of
-from twoloop.run.fields import kinds_of, of_run, of_steps
+from twoloop.run.dense import Table
+from twoloop.run.dense_solution import DenseSolution
+from twoloop.run.fields import kinds_of, of_run, told_later
 from twoloop.run.messages import outcome
 from twoloop.run.movable import Kin, Movable
 from twoloop.run.pace import INTERRUPTED, Pace
 from twoloop.run.passage import give_way
 from twoloop.run.record import Record, Status
 from twoloop.run.run import Run
-from twoloop.run.workspace import made_ready
 
 Array = NDArray[np.float64]
 
 MOST_WAITING, LARGEST = 4, 500_000  # those of a kind that wait for a call, one a thread; numbers of the states of each
 IN_VAIN = 16  # runs that are not tried after one that did not come to its end
 DEFAULTS = {each.name: each.default for each in fields(Record) if each.default is not MISSING}
+NO_PACE = Pace(0.0)  # of a run that came to its end at once
+
+
+class Output(NamedTuple):
+    """What is wanted of a run: the states at times, which may be its ends alone, and whether there is to be `sol`."""
+
+    times: Array | None
+    at_ends: bool
+    dense: bool
+
+    @property
+    def between(self) -> Array | None:
+        """Times between its steps."""
+        return None if self.at_ends else self.times
 
 
 class Again:
@@ -53,25 +64,33 @@ class Again:
         The machine code that its plan calls.
     definite : bool
         Whether M has an inverse at its start.
-    kin : Kin, optional
+    check_derivatives : bool
+        As it was asked for.
+    kin : Kin or None
         What it shares with runs of systems of other parameters, which it may then be made for.
     """
 
     def __init__(
-        self, run: Run, system: ConstrainedSystem, code: OwnCode | None, definite: bool, kin: Kin | None = None
+        self,
+        run: Run,
+        system: ConstrainedSystem,
+        code: OwnCode | None,
+        definite: bool,
+        check_derivatives: bool,
+        kin: Kin | None,
     ):
         self.movable = None if kin is None else Movable(kin, run)
-        self.run, self.code, self.definite = run, code, definite
-        self.look, self.chooser, self.rest = Look(system), Chooser(system), 0
-        self._start, self._advance = direct(run.kernels.start), direct(run.kernels.advance)
-        self.clock, self.control, self.tolerances = run.clock.copy(), run.control.copy(), run.tolerances.copy()
-        self.plan, self.kit, self.memory, self.flags = run.plan, run.kit, run.plan.memory.copy(), run.kit.flags.copy()
+        self.run, self.check_derivatives = run, check_derivatives
+        self.territory = territory_of(run, check_derivatives) if kin is None else kin.territory(check_derivatives)
+        self.beginning = Beginning(run, system if self.movable is None else self.movable.system, code, definite)
+        self.look, self.rest, self._advance = self.beginning.look, 0, direct(run.kernels.advance)
+        self.plan, self.kit, self.flags = run.plan, run.kit, run.kit.flags.copy()
         self.t, self.rows = np.empty(run.chunk + 1), np.empty((run.chunk + 1, len(run.state)))
         self.steps = np.empty((run.chunk, run.a.N_STEP_COLUMNS))
         self.kinds, self.between = np.empty(run.chunk, dtype=np.int64), Between(run)
         self.end, self.filled = np.zeros(1), np.zeros(2, dtype=np.int64)
         self.call: tuple[int, float, float, bytes, bytes] | None = None  # the last one
-        # arrays of its run with copies made at its start, where the one before was equal
+        # arrays with copies made at its start, where the one before was equal
         self.saved: list[tuple[NDArray[Any], NDArray[Any]]] = []
 
     @staticmethod
@@ -89,57 +108,64 @@ class Again:
         self,
         system: ConstrainedSystem,
         t0: float,
+        t1: float,
         q0: Array,
         v0: Array,
         asked: Asked,
-        times: Array | None = None,
+        output: Output,
     ) -> dict[str, Any] | None:
-        """The fields of the record of a run of a system, at all steps or at these times; None: make it the long way."""
-        run, movable, a, t1, check_derivatives = self.run, self.movable, self.run.a, asked.t1, asked.check_derivatives
+        """The fields of the record of a run of a system; None: make it the long way."""
+        between = output.between
+        run, movable, a, territory = self.run, self.movable, self.run.a, self.territory
         if self.rest > 0:
             self.rest -= 1
             return None
         if movable is None:
-            territory = territory_of(run, check_derivatives)
-            if territory.is_due() or (check_derivatives and not system.checked):
+            if territory.is_due() or (self.check_derivatives and not system.checked):
                 return None
         else:
             movable.take(system)
-            territory, self.look.system = movable.kin.territory(check_derivatives), movable.system
-            self.chooser.system = movable.system
-        if not self._is_ready(system, t0, q0, v0, asked):
+            self.look.system = movable.system
+        if not self._is_ready(system, t0, t1, q0, v0, asked):
             return None
         began = time.process_time()
-        code, n_rows, n_steps = self._steps_to(t1, times is not None)
-        if times is not None and code == a.ALL_OUTPUT_DONE:
+        code, n_rows, n_steps = self._steps_to(t1, between is not None or output.dense)
+        if between is not None and code == a.ALL_OUTPUT_DONE:
             parts = self.t[: n_rows + 1], self.rows[: n_rows + 1], self.kinds[:n_rows]
-            self.between.find(times, *parts, self.look.pattern)
+            self.between.find(between, *parts, self.look.pattern)
         spent = time.process_time() - began
         singular = run.plan.watchful and run.work.notes[noted.NEARLY_SINGULAR] == 1.0
         if code != a.ALL_OUTPUT_DONE or singular:
             self.rest = IN_VAIN
             return None
-        status, message = outcome(run, code, t1, Pace(t0))
-        t, rows, steps = self.t[: n_rows + 1].copy(), self.rows[: n_rows + 1].copy(), self.steps[:n_steps]
+        status, message = outcome(run, code, t1, NO_PACE)
+        t, rows = self.t[: n_rows + 1].copy(), self.rows[: n_rows + 1].copy()
         if run.compared_to[0] < t1 or territory.is_due():
-            status, message = self._compared(territory, t, rows, check_derivatives, status, message)
+            status, message = self._compared(t, rows, status, message)
             if status != Status.REACHED_END:
                 return None
             run.compared_to[0] = t1
-        if times is not None:
-            at_times = self.between.completed(times)
+        sol = None
+        if output.dense:
+            table = Table(t, rows[:, : 3 * system.n_q].copy(), self.kinds[:n_steps].copy())
+            sol = DenseSolution(interpolator_of(run, table.states[0]), table, t1)
+        if output.times is not None:
+            if between is None:
+                at_times: Array | None = rows[[0 if time == t0 else -1 for time in output.times]]
+            else:
+                at_times = self.between.completed(between)
             if at_times is None:
                 return None
-            t, rows = times.copy(), at_times
+            t, rows = output.times.copy(), at_times
         territory.count()  # a run that goes the long way is counted there
         return {
             **DEFAULTS,
             **of_run(run, t, rows),
-            **of_steps(run, steps)[0],
+            **told_later(self.steps[:n_steps], run.work.counters, spent),
             "status": status,
             "message": message,
-            "stats": run.statistics(spent),
             "compiled": bool(self.plan.own),
+            "sol": sol,
         }
 
     def _steps_to(self, t1: float, with_kinds: bool) -> tuple[int, int, int]:
@@ -162,14 +188,11 @@ class Again:
                 return code, n_rows, n_steps
             give_way(run)
 
-    def _is_ready(self, system: ConstrainedSystem, t0: float, q0: Array, v0: Array, asked: Asked) -> bool:
+    def _is_ready(self, system: ConstrainedSystem, t0: float, t1: float, q0: Array, v0: Array, asked: Asked) -> bool:
         """Whether the run is at its start: one that is asked for again needs no second look."""
-        run, call = (
-            self.run,
-            (id(system), t0, asked.t1, q0.tobytes(), v0.tobytes()),
-        )  # of the last call the system is kept
-        run.plan, run.kit, run.functions, run.substituted = self.plan, self.kit, self.kit.functions, False
-        run.plan.memory[:] = self.memory
+        run, call = self.run, (id(system), t0, t1, q0.tobytes(), v0.tobytes())  # of the last call the system is kept
+        if run.substituted:
+            run.plan, run.kit, run.functions, run.substituted = self.plan, self.kit, self.kit.functions, False
         if run.kit.flags[flags.FORM] != self.flags[flags.FORM]:
             run.kit.flags[:] = self.flags
         equal = call == self.call
@@ -178,55 +201,30 @@ class Again:
                 array[:] = copy
             return True
         self.call, self.saved = None, []
-        if not self._begins(t0, q0, v0):
+        if not self.beginning.at(t0, q0, v0):
             return False
-        if self.movable is not None and not self.movable.agrees(asked.t1, self.look.mass, asked.check_derivatives):
+        run.t0, run.compared_to[0] = t0, -np.inf
+        if run.said_of_rows:  # of this time, with factors of this position; rounding may decide which row is left out
+            run.redundant, run.said_of_rows = run.redundant_rows(self.look.rows)
+        if self.movable is not None and not self.movable.agrees(t1, self.look.mass, self.check_derivatives):
             return False
-        asked.set_sizes(run)
+        asked.set_sizes(run, t1)
         self.call = call
         if equal:
-            arrays = *lasting(run.work), run.state, run.clock, run.control
-            self.saved = [(each, each.copy()) for each in arrays]
+            self.saved = [(each, each.copy()) for each in (*self.beginning.lasting, run.state)]
         return True
 
-    def _begins(self, t0: float, q0: Array, v0: Array) -> bool:
-        """Whether a run begins at a start as this one did: consistent, of the same rank, mass and choice of rows."""
-        run, look = self.run, self.look
-        system, n, work = run.system, run.system.n_q, run.work
-        if not look.is_consistent(t0, q0, v0) or (not system.constant_mass and look.definite is not self.definite):
-            return False
-        if self.code is not None:
-            try:
-                choice = self.chooser.choice(look.mass, look.rows)
-            except Untraceable:
-                return False
-            if choice != self.code.shared.equations.choice:
-                return False
-        run.t0, run.compared_to[0] = t0, -np.inf
-        run.state[:n], run.state[n : 2 * n], run.state[2 * n :] = q0, v0, 0.0
-        run.clock[:], run.control[:], run.tolerances[:] = self.clock, self.control, self.tolerances
-        run.clock[run.a.T] = run.clock[run.a.T_START] = t0
-        made_ready(cleared(work), system, self.flags, look.pattern, q0, run.rtol, run.reuse)
-        work.notes[noted.NEARLY_SINGULAR] = 0.0 if run.plan.watchful else 1.0
-        if self._start(run.kit, work, t0, run.state) != codes.DONE:
-            return False
-        if run.said_of_rows:  # of this time, with factors of this position; rounding may decide which row is left out
-            run.redundant, run.said_of_rows = run.redundant_rows(look.rows)
-        return True
-
-    def _compared(
-        self, territory: Territory, t: Array, rows: Array, check_derivatives: bool, status: Status, message: str
-    ) -> tuple[Status, str]:
+    def _compared(self, t: Array, rows: Array, status: Status, message: str) -> tuple[Status, str]:
         """Status and message after callbacks were compared at states that lie where none was compared."""
-        n, everywhere = 2 * self.run.system.n_q, False
+        n, territory, everywhere = 2 * self.run.system.n_q, self.territory, False
         if self.movable is not None:
             everywhere = territory.is_due() or not territory.knows(self.movable.parameters)
-        if not everywhere and territory.holds(t, rows[:, :n]):
+        if not everywhere and territory.holds(t, rows):
             return status, message
         sample = Sample(float(t[0]), rows[0], n)
         sample.add(t[1:], rows[1:], float(t[-1]), rows[-1])
         states = sample.states()
-        compared = compared_at(self.run, territory, states, check_derivatives, status, message, everywhere)
+        compared = compared_at(self.run, territory, states, self.check_derivatives, status, message, everywhere)
         if self.movable is not None and compared[0] == status:
             territory.add_parameters(self.movable.parameters)
         return compared

@@ -1,6 +1,8 @@
-"""What a call asks of a run, beside what it is to keep."""
+"""What the options of a call ask of a run, beside what it is to keep."""
 
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,27 +13,40 @@ from twoloop.methods.plan import Method
 from twoloop.run.run import Run
 
 
-class Asked(NamedTuple):
+@dataclass(frozen=True)
+class Asked:
     """The options of a call; `solve_dae` says what the names mean."""
 
     method: Method
-    atol: NDArray[np.float64]
-    t1: float
     rtol: float
-    step_size: float | None
+    atol: NDArray[np.float64]
     first_step: float | None
     max_step: float
     max_steps: int | None
+    step_size: float | None
     compiled: Compiled
     check_derivatives: bool
 
-    @property
+    @cached_property
     def key(self) -> Any:
-        """What calls have in common that ask for the same, but for the end."""
-        return id(self.method), self.atol.tobytes(), self[3:]
+        """What calls have in common that ask for the same."""
+        sizes = self.first_step, self.max_step, self.max_steps, self.step_size
+        return id(self.method), self.rtol, self.atol.tobytes(), *sizes, self.compiled, self.check_derivatives
 
-    def set_sizes(self, run: Run) -> None:
-        """Set the first and the largest step of a run, where these vary, and where a drive may have a kink."""
-        run.work.notes[noted.KINK_AFTER] = self.t1
+    @cached_property
+    def own_tolerance(self) -> float | None:
+        """That of a test of positions which a method has for itself."""
+        own: float | None = getattr(self.method, "error_tol", None)
+        return own
+
+    @cached_property
+    def told(self) -> dict[str, Any]:
+        """What a result says of these; `untested` is None where all steps are tested, else of the run."""
+        tested = getattr(self.method, "tested", "all")
+        return {"method": self.method.name, "rtol": self.rtol} | ({} if tested == "positions" else {"untested": None})
+
+    def set_sizes(self, run: Run, t1: float) -> None:
+        """Set the first and the largest step of a run to t1, where these vary, and where a drive may have a kink."""
+        run.work.notes[noted.KINK_AFTER] = t1
         if self.step_size is None:
-            run.set_sizes(self.first_step, self.max_step, self.t1)
+            run.set_sizes(self.first_step, self.max_step, t1)

@@ -32,8 +32,7 @@ class Between:
         table = Table(t, rows[:, : 3 * run.system.n_q].copy(), kinds)
         known = self._interpolator
         if known is None:
-            atol, ranks = run.tolerances[tolerances.ATOL :].copy(), (len(run.work.rows), len(run.work.rows_v))
-            known = Interpolator(run.system, run.t0, table.states[0], run.rtol, atol, ranks, run.interiors)
+            known = interpolator_of(run, table.states[0])
             known.tells = False
         else:
             known.begin(run.system, run.t0, table.states[0], pattern)
@@ -49,3 +48,10 @@ class Between:
         if known.static is not None or known.repairs:  # it is not what it was
             self._interpolator = None
         return np.concatenate([found, added], axis=1) if known.failures == 0 else None
+
+
+def interpolator_of(run: Run, row: Array) -> Interpolator:
+    """What finds states between the steps of a run, which starts with this row [q, v, a]."""
+    ranks, atol = (len(run.work.rows), len(run.work.rows_v)), run.tolerances[tolerances.ATOL :]
+    interiors = {kind: plan.fresh() for kind, plan in run.interiors.items()}
+    return Interpolator(run.system, run.t0, row, run.rtol, atol, ranks, interiors)

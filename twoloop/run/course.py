@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 
 from twoloop.generate.traced_values import Sample
 from twoloop.kernels.compile.linking import direct
-from twoloop.kernels.data import intervals, tolerances
+from twoloop.kernels.data import intervals
+from twoloop.run.between import interpolator_of
 from twoloop.run.comparison import compared
-from twoloop.run.dense import Interpolator
-from twoloop.run.fields import BEFORE, kinds_of, of_run, of_steps
+from twoloop.run.fields import BEFORE, kinds_of, of_run, of_steps, statistics
 from twoloop.run.interrupts import Interrupts, said_of_interrupt
 from twoloop.run.kept import OF_STEPS
 from twoloop.run.messages import message_of, outcome
@@ -76,7 +76,7 @@ class Course:
         # the run is looked at after so many attempts, however long the chunks are that the clock allows
         self.between_looks = self.next_look = run.chunk
         self.plan, self.control, self.kit = run.plan, run.control, run.kit  # at the moment: not always the run's own
-        self.counts = BEFORE
+        self.counts = BEFORE.copy()
         self.step_parts = [np.empty((0, run.a.N_STEP_COLUMNS))]  # of which nothing is kept yet
         if self.wanted.kept.finished:
             self._tell()
@@ -168,8 +168,7 @@ class Course:
     def _tell(self) -> None:
         """Keep what is told of each step."""
         steps, self.step_parts = np.concatenate(self.step_parts), self.step_parts[:1]
-        told, self.counts = of_steps(self.run, steps, self.counts)
-        for name, values in told.items():
+        for name, values in of_steps(steps, self.counts).items():
             self.wanted.kept.add(name, values)
 
     def _look(self, steps: Array, across: bool, spent: float) -> None:
@@ -215,13 +214,13 @@ class Course:
     def _record(self, check_derivatives: bool) -> Record:
         run, recorder, code = self.run, self.recorder, self.code
         t, table = recorder.output()
-        statistics, kept = run.statistics(self.cpu), self.wanted.kept
+        stats, kept = statistics(run.work.counters, self.cpu), self.wanted.kept
         self._tell()
         reached = float(run.clock[run.a.T])
         if recorder.ended is not None or recorder.broken_off is not None:
             for name in OF_STEPS:
                 kept.cut(name, recorder.n_steps)
-            statistics = replace(statistics, n_accepted=recorder.n_steps)
+            stats = replace(stats, n_accepted=recorder.n_steps)
         if recorder.ended is not None:
             event, end = recorder.ended
             if recorder.n_steps > 0:
@@ -251,7 +250,7 @@ class Course:
             **fields,
             status=status,
             message=message_of(run, message + explained(status)),
-            stats=statistics,
+            stats=stats,
             sol=recorder.solution(),
             t_events=t_events,
             q_events=q_events,
@@ -270,14 +269,9 @@ class Course:
 
     def _recorder(self) -> Recorder:
         """What takes the states; where some are to lie between steps, with what finds them."""
-        run, wanted = self.run, self.wanted
-        n, interpolator = run.system.n_q, None
-        if wanted.between_steps:
-            ranks = (len(run.work.rows), len(run.work.rows_v))
-            start, atol = run.state[: 3 * n], run.tolerances[tolerances.ATOL :]
-            interiors = {kind: plan.fresh() for kind, plan in run.interiors.items()}
-            interpolator = Interpolator(run.system, run.t0, start, run.rtol, atol, ranks, interiors)
-        return Recorder(wanted, interpolator, n, run.t0, run.state)
+        run, n = self.run, self.run.system.n_q
+        interpolator = interpolator_of(run, run.state[: 3 * n]) if self.wanted.between_steps else None
+        return Recorder(self.wanted, interpolator, n, run.t0, run.state)
 
     def _kinds(self, steps: Array, across: bool, leaps: bool) -> NDArray[np.int64]:
         """What kind of interval each of these accepted steps is, for the solution between them."""

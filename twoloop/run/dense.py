@@ -13,7 +13,6 @@ from twoloop.kernels.compile.linking import direct
 from twoloop.kernels.data import codes, noted
 from twoloop.kernels.data import intervals as names
 from twoloop.kernels.data.tolerances import ATOL, RTOL
-from twoloop.kernels.layout import cleared
 from twoloop.methods.plan import INNER_TOL, Plan
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.static_form import static_form
@@ -120,7 +119,7 @@ class Interpolator:
         self.made_of = (system, t0, row.copy(), *self.made_of[3:])
         self.system, self.judges = system, True
         self.filled, self.sound = {}, set()
-        made_ready(cleared(self.work), system, self.kit.flags, pattern, row[: system.n_q], self.rtol, 0.0)
+        made_ready(self.work, system, self.kit.flags, pattern, row[: system.n_q], self.rtol, 0.0)
         self._start()
         self.nodes[:], self.room[:], self.rows[:] = 0.0, 0.0, 0.0
 

@@ -1,38 +1,57 @@
 """Fields of a record that come from the arrays of a run, whoever took it to its end."""
 
+from dataclasses import fields
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from twoloop.kernels.data import intervals, noted
+from twoloop.kernels.compile.linking import direct
+from twoloop.kernels.data import counters, intervals, noted
+from twoloop.kernels.layout import short_loops
 from twoloop.run.kept import OF_STEPS
+from twoloop.run.record import Later, Statistics
 from twoloop.run.run import Run
 
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
-BEFORE = np.array([[0, 0, 1]])  # rejections and partitions before all steps: the first partition is not a renewal
+COUNTED = [each.name for each in fields(Statistics) if each.name != "cpu_time"]
+COUNTERS = itemgetter(*(getattr(counters, name.upper()) for name in COUNTED))
+LATER = (*OF_STEPS, "stats")  # fields that are put together when they are asked for
+BEFORE = np.array([0, 0, 1])  # rejections and partitions before all steps: the first partition is not a renewal
 
 
-def of_steps(run: Run, steps: Array, counts: Integers = BEFORE) -> tuple[dict[str, NDArray[Any]], Integers]:
-    """What is told of each step, by the names of OF_STEPS, and the counts after them; `counts`: those before."""
-    a = run.a
-    counts = np.concatenate([counts, steps[:, a.ERRORS : a.JACOBIANS].astype(np.int64)])
-    changes = counts[1:] - counts[:-1]
-    told = (steps[:, a.H].copy(), *changes.T, steps[:, a.JACOBIANS] > 0.0)
-    return dict(zip(OF_STEPS, told, strict=True)), counts[-1:]
+def of_steps(steps: Array, counts: Integers) -> dict[str, NDArray[Any]]:
+    """What is told of each step, by the names of OF_STEPS; `counts`, those before the steps, become those after."""
+    n = len(steps)
+    h, changes, untested = np.empty(n), np.empty((3, n), dtype=np.int64), np.empty(n, dtype=np.bool_)
+    direct(short_loops().tell_steps)(steps, counts, h, changes, untested)
+    return dict(zip(OF_STEPS, (h, *changes, untested), strict=True))
+
+
+def told_later(steps: Array, counted: Integers, cpu: float) -> dict[str, Later]:
+    """The same of all steps of a run, and its statistics, once one of them is asked for; from copies of arrays."""
+    steps, counted = steps.copy(), counted.copy()
+    later = Later(lambda: of_steps(steps, BEFORE.copy()) | {"stats": statistics(counted, cpu)})
+    return dict.fromkeys(LATER, later)
+
+
+def statistics(counted: Integers, cpu: float) -> Statistics:
+    """What was counted in a workspace, with the CPU time that it took, s."""
+    return Statistics(**dict(zip(COUNTED, COUNTERS(counted.tolist()), strict=True)), cpu_time=cpu)
 
 
 def of_run(run: Run, t: Array, table: Array) -> dict[str, Any]:
     """The trajectory, of rows [q, v, a, lam], and what is known of the run as a whole."""
-    n = run.system.n_q
+    n, columns = run.system.n_q, table.T
     return {
         "t": t,
-        "q": table[:, :n].T,
-        "v": table[:, n : 2 * n].T,
-        "a": table[:, 2 * n : 3 * n].T,
-        "lam": table[:, 3 * n :].T,
+        "q": columns[:n],
+        "v": columns[n : 2 * n],
+        "a": columns[2 * n : 3 * n],
+        "lam": columns[3 * n :],
         "rank": run.rank,
         "redundant": run.redundant.copy(),  # runs of one start share it
         "defect": run.defect(),

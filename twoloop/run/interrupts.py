@@ -7,7 +7,6 @@ which may take long and from which every caller expects exceptions; elsewhere it
 
 import _signal  # type: ignore[import-not-found]  # `signal` makes enumerations of handlers, which takes 8 microseconds
 import signal
-import threading
 from types import FrameType, TracebackType
 from typing import Any
 
@@ -39,10 +38,12 @@ class Interrupts:
         self._stands_in = False
 
     def __enter__(self) -> "Interrupts":
-        if threading.current_thread() is threading.main_thread():  # no other may set handlers, and none gets signals
-            self._stands_in = _signal.getsignal(signal.SIGINT) is signal.default_int_handler
+        self._stands_in = _signal.getsignal(signal.SIGINT) is signal.default_int_handler
         if self._stands_in:
-            _signal.signal(signal.SIGINT, self._heard)
+            try:
+                _signal.signal(signal.SIGINT, self._heard)
+            except ValueError:  # in threads other than the main one, which get no signals
+                self._stands_in = False
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: Any, trace: TracebackType | None) -> bool:

@@ -16,7 +16,7 @@ from twoloop.methods.code_for import code_for, may_have_code
 from twoloop.methods.plans_for import plans_for
 from twoloop.methods.presets import is_preset
 from twoloop.problem.system import ConstrainedSystem
-from twoloop.run.again import MOST_WAITING, Again
+from twoloop.run.again import MOST_WAITING, Again, Output
 from twoloop.run.asked import Asked
 from twoloop.run.comparison import unlike_before
 from twoloop.run.movable import Kin
@@ -37,14 +37,20 @@ class Kept(NamedTuple):
     code: OwnCode | None
     definite: bool  # whether M was
     moves: bool  # whether what it takes depends on the start by that alone
-    waiting: list[Again]  # arrays for further runs, one a thread
+    waiting: list[Again] | None  # arrays for further runs, one a thread; None: they are not made in this way
     kin: Kin | None = None  # what it shares with systems of other parameters
 
 
 def record_again(
-    system: ConstrainedSystem, t0: float, q0: Array, v0: Array, asked: Asked, times: Array | None = None
+    system: ConstrainedSystem,
+    t0: float,
+    t1: float,
+    q0: Array,
+    v0: Array,
+    asked: Asked,
+    output: Output,
 ) -> tuple[dict[str, Any], str] | None:
-    """The record of a run by the arrays of one before it, at its steps or at times, and what is said of its rows.
+    """The record of a run by the arrays of one before it, and what is said of its rows.
 
     None where there are none, or where something has to be looked at: then `run_from` begins it.
     """
@@ -53,21 +59,23 @@ def record_again(
     if kept is None and (others := system.shared.get("runs")):
         known = others.get((asked.key, _family_of(system)))
         kept = known if isinstance(known, Kept) else None
-    if kept is None or not kept.moves or not Again.suits(kept.run):
+    if kept is None or kept.waiting is None:
         return None
-    if times is not None and not Again.interpolates(kept.run):
+    if output.dense and (output.between is not None or kept.kin is not None):
+        return None  # both have the same states within steps; what belongs to kin takes other parameters
+    if output.between is not None and not Again.interpolates(kept.run):
         return None
     try:
         again = kept.waiting.pop()
     except IndexError:
-        again = Again(kept.run.again(), system, kept.code, kept.definite, kept.kin)
-    record = again.record(system, t0, q0, v0, asked, times)
+        again = Again(kept.run.again(), system, kept.code, kept.definite, asked.check_derivatives, kept.kin)
+    record = again.record(system, t0, t1, q0, v0, asked, output)
     if len(kept.waiting) < MOST_WAITING:
         kept.waiting.append(again)
     return None if record is None else (record, again.run.said_of_rows)
 
 
-def run_from(system: ConstrainedSystem, t0: float, q0: Array, v0: Array, asked: Asked) -> Run:
+def run_from(system: ConstrainedSystem, t0: float, t1: float, q0: Array, v0: Array, asked: Asked) -> Run:
     """The run of a call: a copy of one that is kept, where the same was asked for, from there or from another start.
 
     Kept are those of presets, compiled callbacks and trusted traces, from the second call of a system on.
@@ -78,25 +86,25 @@ def run_from(system: ConstrainedSystem, t0: float, q0: Array, v0: Array, asked: 
         If the start is refused, the method cannot run the system, or asked-for code cannot be had.
     """
     if system.called_in_python:  # what such functions find in their surroundings may change
-        return _made(system, t0, q0, v0, asked)[0]
+        return _made(system, t0, t1, q0, v0, asked)[0]
     start, call = (t0, q0.tobytes(), v0.tobytes()), asked.key
     came_from, runs = system.made.get("runs", (None, None))
     kept: Kept | None = None if runs is None else runs.get(call)
     run = None
     if kept is not None and kept.start == start:
         run, code = kept.run.again(), kept.code
-        if kept.t1 != asked.t1:
-            asked.set_sizes(run)
+        if kept.t1 != t1:
+            asked.set_sizes(run, t1)
     elif kept is not None and kept.moves:
-        run, code = _moved(kept, system, t0, q0, v0, asked), kept.code
+        run, code = _moved(kept, system, t0, t1, q0, v0, asked), kept.code
     if run is None:
-        run, code = _made(system, t0, q0, v0, asked)
+        run, code = _made(system, t0, t1, q0, v0, asked)
         if run.system is system:
-            _keep_for_kin(system, run, code, asked)
+            _keep_for_kin(system, run, code, t1, asked)
     if runs is None:  # it may be one of many systems, each of which is taken once
         runs = {}
     elif kept is None or (came_from == start != kept.start):
-        made = _kept_of(run, code, asked)
+        made = _kept_of(run, code, t1, asked)
         if made is not None:
             runs = {} if len(runs) == MOST else dict(runs)  # another thread may look at the old one
             runs[call] = made
@@ -104,7 +112,7 @@ def run_from(system: ConstrainedSystem, t0: float, q0: Array, v0: Array, asked: 
     return run
 
 
-def _kept_of(run: Run, code: OwnCode | None, asked: Asked) -> Kept | None:
+def _kept_of(run: Run, code: OwnCode | None, t1: float, asked: Asked) -> Kept | None:
     """What is kept of a run at its start, if it may be."""
     system, n = run.system, run.system.n_q
     trusted = is_preset(asked.method) and all(traced.trusted for traced in run.traced)
@@ -115,7 +123,7 @@ def _kept_of(run: Run, code: OwnCode | None, asked: Asked) -> Kept | None:
     definite = has_definite_mass(system, t0, q0)
     moves = run.static is None and settled and (definite or not sparse_factors_pay(system, run.kit.flags))
     start = t0, q0.tobytes(), v0.tobytes()
-    return Kept(run.again(), start, asked.t1, code, definite, moves, [])
+    return Kept(run.again(), start, t1, code, definite, moves, [] if moves and Again.suits(run) else None)
 
 
 def _family_of(system: ConstrainedSystem) -> Family:
@@ -123,14 +131,14 @@ def _family_of(system: ConstrainedSystem) -> Family:
     return made
 
 
-def _keep_for_kin(system: ConstrainedSystem, run: Run, code: OwnCode | None, asked: Asked) -> None:
+def _keep_for_kin(system: ConstrainedSystem, run: Run, code: OwnCode | None, t1: float, asked: Asked) -> None:
     """Keep a run for systems of other parameters, from the second of these on."""
     call, seen, known = (asked.key, _family_of(system)), system.functions, system.shared.get("runs", {})
     if call not in known:
         system.shared["runs"] = (known if len(known) < MOST else {}) | {call: seen}
     elif type(known[call]) is type(seen) and known[call] is not seen:
-        kept = _kept_of(run, code, asked)
-        if kept is not None and kept.moves and Again.suits(kept.run):
+        kept = _kept_of(run, code, t1, asked)
+        if kept is not None and kept.waiting is not None:
             fixed = asked.step_size is not None
             with suppress(ValueError):
                 known[call] = kept._replace(kin=Kin(kept.run, code, asked.method, fixed, asked.compiled))
@@ -138,25 +146,29 @@ def _keep_for_kin(system: ConstrainedSystem, run: Run, code: OwnCode | None, ask
         known[call] = None
 
 
-def _moved(kept: Kept, system: ConstrainedSystem, t0: float, q0: Array, v0: Array, asked: Asked) -> Run | None:
+def _moved(
+    kept: Kept, system: ConstrainedSystem, t0: float, t1: float, q0: Array, v0: Array, asked: Asked
+) -> Run | None:
     """A run from another start; None where something else suits that."""
     _check_start(system, t0, q0, v0, asked.check_derivatives)
     if kept.code is not None and not kept.code.serves(system, t0, q0):
         return None
     run = kept.run.at(t0, q0, v0) if has_definite_mass(system, t0, q0) == kept.definite else None
     if run is not None:
-        asked.set_sizes(run)
+        asked.set_sizes(run, t1)
     return run
 
 
-def _made(system: ConstrainedSystem, t0: float, q0: Array, v0: Array, asked: Asked) -> tuple[Run, OwnCode | None]:
+def _made(
+    system: ConstrainedSystem, t0: float, t1: float, q0: Array, v0: Array, asked: Asked
+) -> tuple[Run, OwnCode | None]:
     fixed, given, new = asked.step_size is not None, system, not system.checked
     if new:
         take_bounds(system)
     _check_start(system, t0, q0, v0, asked.check_derivatives)
 
     def check(traced: Traced) -> None:
-        traced.refuse(system, t0, asked.t1, q0, v0)
+        traced.refuse(system, t0, t1, q0, v0)
 
     system, derived = standing_for(system, check)
     code = code_for(system, asked.method, fixed, asked.compiled, t0, q0, check)
@@ -166,11 +178,11 @@ def _made(system: ConstrainedSystem, t0: float, q0: Array, v0: Array, asked: Ask
     if new:
         give_bounds(given)
     if system.called_in_python and not fixed:
-        unlike = unlike_before(system, states_around(t0, asked.t1, q0, v0))
+        unlike = unlike_before(system, states_around(t0, t1, q0, v0))
         if unlike is not None:
             raise ValueError(unlike)
     run = Run(system, plan, t0, q0, v0, asked.rtol, asked.atol, asked.step_size, interiors)
-    asked.set_sizes(run)
+    asked.set_sizes(run, t1)
     if asked.max_steps is not None:
         run.control[run.a.MAX_STEPS] = asked.max_steps
     return run, code

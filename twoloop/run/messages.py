@@ -8,7 +8,7 @@ from twoloop.checks.rank import in_words, surely_above
 from twoloop.kernels.data import codes, noted
 from twoloop.run.crossings import said_of_crossings, singular_ratio
 from twoloop.run.pace import INTERRUPTED, OUT_OF_TIME, STAGNATED, STAGNATION_STEPS, Pace
-from twoloop.run.record import Status
+from twoloop.run.record import Later, Status
 
 if TYPE_CHECKING:
     from twoloop.run.run import Run
@@ -44,10 +44,12 @@ def message_of(run: "Run", words: str) -> Any:
         return words
     system, crossings, now, rank = run.system, run.crossings, (float(run.clock[run.a.T]), run.state), run.rank
 
-    def made() -> str:
-        return words.replace(CROSSINGS, said_of_crossings(system, crossings, now, rank))
+    def made() -> dict[str, str]:
+        return {"message": words.replace(CROSSINGS, said_of_crossings(system, crossings, now, rank))}
 
-    return made() if system.called_in_python else made  # what such functions find in their surroundings may change
+    if system.called_in_python:  # what such functions find in their surroundings may change
+        return made()["message"]
+    return Later(made)
 
 
 def outcome(run: "Run", code: int, t1: float, pace: Pace) -> tuple[Status, str]:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from twoloop.problem.description import Description
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.dense_solution import DenseSolution
+from twoloop.run.kept import OF_STEPS
 
 Array = NDArray[np.float64]
 
@@ -173,7 +174,7 @@ class Record:
         return found
 
     def __getstate__(self) -> dict[str, Any]:
-        state = vars(self) | {"message": self.message}
+        state = {each.name: getattr(self, each.name) for each in fields(self)}
         try:
             pickle.dumps(self.system)
         except TypeError:  # of functions without a name of their own
@@ -189,19 +190,37 @@ class Record:
         return f"Result({self.status.name}: {self.message} n_t={self.t.size}, {end}; {counts})"
 
 
-class _Message:
-    """A message that may be put together when it is first asked for."""
+class Later:
+    """Stands in the place of fields that are put together when one of them is first asked for.
 
-    def __get__(self, record: Any, owner: Any = None) -> str:
+    Parameters
+    ----------
+    make : callable
+        Returns these fields by name.
+    """
+
+    def __init__(self, make: Callable[[], dict[str, Any]]):
+        self.make = make
+
+
+class _MayComeLater:
+    """A field in whose place there may be `Later`."""
+
+    def __init__(self, name: str):
+        self.name = name
+
+    def __get__(self, record: Any, owner: Any = None) -> Any:
         if record is None:
-            raise AttributeError("message")  # there is no default
+            raise AttributeError(self.name)  # its default stands with the fields of the class
         known = vars(record)
-        if not isinstance(known["message"], str):
-            known["message"] = known["message"]()
-        return known["message"]  # type: ignore[no-any-return]
+        later = known[self.name]
+        if type(later) is Later:
+            known.update({name: made for name, made in later.make().items() if known[name] is later})
+        return known[self.name]
 
-    def __set__(self, record: Any, message: str | Callable[[], str]) -> None:
-        vars(record)["message"] = message
+    def __set__(self, record: Any, value: Any) -> None:
+        vars(record)[self.name] = value
 
 
-Record.message = _Message()  # type: ignore[assignment]  # behind the decorator, which would take it for a default
+for _name in ("message", "stats", *OF_STEPS):  # behind the decorator, which would take it for a default
+    setattr(Record, _name, _MayComeLater(_name))

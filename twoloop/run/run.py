@@ -1,7 +1,6 @@
 """One run: its arrays, at its start, with what the kernels keep in them."""
 
 from collections.abc import Mapping
-from dataclasses import fields
 from types import MappingProxyType
 from typing import Any
 
@@ -16,12 +15,11 @@ from twoloop.kernels.compile.linking import direct
 from twoloop.kernels.control.sudden import PLACES
 from twoloop.kernels.data import codes, counters, flags, noted, tolerances
 from twoloop.kernels.evaluation.tasks import SOLVE
-from twoloop.kernels.layout import copy_of, empty
+from twoloop.kernels.layout import copy_of, empty, short_loops
 from twoloop.methods.auto import with_matrix_cost
 from twoloop.methods.plan import Plan, least_tolerance
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.messages import said_of_not_finite
-from twoloop.run.record import Statistics
 from twoloop.run.static_form import static_form, with_newton
 from twoloop.run.workspace import kit_of, kit_with, made_ready, workspace
 
@@ -36,7 +34,6 @@ PROVISIONAL = 10  # steps after which a method that pays for long steps only giv
 FIRST_STEP = 0.01  # of the shortest time scale that the initial state shows
 SHORTEST_STEP = 1e-16  # of the first step
 NONE = np.zeros((0, 0))
-COUNTED = {each.name: getattr(counters, each.name.upper()) for each in fields(Statistics) if each.name != "cpu_time"}
 CONTRADICTS = 1e-6  # relative: what the accelerations of redundant rows may differ by
 
 
@@ -268,9 +265,8 @@ class Run:
         n_rows = self.system.n_c + self.system.n_a
         if self.rank == n_rows:
             return np.zeros(0, dtype=np.int64), ""
-        left_out = np.ones(n_rows, dtype=bool)
-        left_out[self.work.rows_v] = False
-        redundant = np.flatnonzero(left_out)
+        counted = set(self.work.rows_v.tolist())
+        redundant = [i for i in range(n_rows) if i not in counted]
         rows = self._rows() if rows is None else rows
         wrong = self.contradicting(rows).tolist()
         if wrong:
@@ -278,9 +274,9 @@ class Run:
                 f"the constraints of {self.system.name!r} contradict one another at t = {self.t0:g}: "
                 f"{self._in_words(rows, wrong)}, but not so their accelerations. Correct or leave out one of these rows"
             )
-        return redundant, (
+        return np.array(redundant), (
             f"the constraints of {self.system.name!r} have rank {self.rank} of {n_rows} at t = {self.t0:g}: "
-            f"{self._in_words(rows, redundant.tolist())}. They are left out of the solution and checked at every "
+            f"{self._in_words(rows, redundant)}. They are left out of the solution and checked at every "
             "step; multipliers are those of least norm. See docs/constraints.md#redundant-rows"
         )
 
@@ -288,8 +284,10 @@ class Run:
         """Of C_q and A at the start, rows that depend on others with which the accelerations disagree."""
         n = self.system.n_q
         a, gamma = self.state[2 * n : 3 * n], self.work.Gamma
-        allowed = CONTRADICTS * np.maximum(abs(rows) @ np.abs(a) + np.abs(gamma), 1.0)
-        return np.flatnonzero(np.abs(rows @ a - gamma) > allowed)
+        off = np.abs(rows @ a - gamma)
+        if off.max() <= CONTRADICTS:  # the least that is allowed
+            return np.zeros(0, dtype=np.int64)
+        return np.flatnonzero(off > CONTRADICTS * np.maximum(abs(rows) @ np.abs(a) + np.abs(gamma), 1.0))
 
     def _rows(self) -> Rows:
         """C_q and A at the start."""
@@ -300,10 +298,9 @@ class Run:
 
     def _in_words(self, all_rows: Rows, rows: list[int]) -> str:
         """Which rows depend on which others; the factors of the static form tell the shares of the first."""
-        q = self.state[: self.system.n_q]
-        counted = self.work.rows_v.tolist()
         if not isinstance(all_rows, SparseRows):
             return in_words(all_rows, rows)
+        q, counted = self.state[: self.system.n_q], self.work.rows_v.tolist()
         if self.static is None or set(rows) & set(counted):
             return in_words(self.system.rows(self.t0, q), rows)
         shares, zero, x = np.zeros((min(SHOWN, len(rows)), len(all_rows))), np.zeros(len(all_rows)), np.zeros_like(q)
@@ -335,29 +332,15 @@ class Run:
     def first_step(self, span: float, state: Array) -> float:
         """A share of the time in which velocities and accelerations of a state change the coordinates as a whole."""
         n = self.system.n_q
-        q, v, a = np.maximum.reduce(np.abs(state[: 3 * n]).reshape(3, n), axis=1).tolist()
-        q = max(q, self.least_atol)  # all coordinates zero: there is no other length
-        scales = [span]
-        if v > 0.0:
-            scales.append(q / v)
-        if a > 0.0:
-            scales.append(float(np.sqrt(q / a)))
-        if v > 0.0 and a > 0.0 and v / a > FIRST_STEP * min(scales):  # not at what is next to rest
-            scales.append(v / a)
-        return FIRST_STEP * min(scales)
+        return direct(short_loops().first_step)(state, n, self.least_atol, span, FIRST_STEP)  # type: ignore[no-any-return]
 
     def defect(self) -> float | None:
         """The largest defect of the steps, if all looked for it."""
-        checked = self.work.counters[counters.N_ACCEPTED] > 0 and self.work.notes[noted.UNCHECKED] == 0.0
-        return float(self.work.notes[noted.LARGEST_DEFECT]) if checked else None
+        notes = self.work.notes
+        checked = self.work.counters[counters.N_ACCEPTED] > 0 and notes[noted.UNCHECKED] == 0.0
+        return float(notes[noted.LARGEST_DEFECT]) if checked else None
 
     def attempts(self) -> int:
         """How many steps were tried so far."""
         c = self.work.counters
         return int(c[counters.N_ACCEPTED] + c[counters.N_REJECTED_ERROR] + c[counters.N_REJECTED_CONVERGENCE])
-
-    def statistics(self, cpu: float) -> Statistics:
-        """What was counted, with the CPU time that it took, s."""
-        c, made = self.work.counters.tolist(), object.__new__(Statistics)  # a frozen class takes microseconds to make
-        vars(made).update({name: c[place] for name, place in COUNTED.items()}, cpu_time=cpu)
-        return made

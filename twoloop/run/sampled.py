@@ -23,6 +23,7 @@ from twoloop.methods.plan import Method
 from twoloop.methods.taylor import Taylor
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.course import Course
+from twoloop.run.fields import statistics
 from twoloop.run.interrupts import Interrupts
 from twoloop.run.kept import InMemory
 from twoloop.run.record import Record, Status
@@ -191,7 +192,7 @@ class SampledRun:
             h=steps[:, a.H],
             status=Status.REACHED_END,
             message=f"Stepped to t = {self.t:g} in {len(self.times) - 1} samples.",
-            stats=run.statistics(self.cpu),
+            stats=statistics(run.work.counters, self.cpu),
             rank=run.rank,
             redundant=run.redundant.copy(),
             untested=steps[:, a.JACOBIANS] > 0.0,

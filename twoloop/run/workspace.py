@@ -9,7 +9,8 @@ from twoloop.checks.consistency import has_definite_mass, least_inertia
 from twoloop.kernels.algebra.banded import banded_pays
 from twoloop.kernels.algebra.lapack import addresses
 from twoloop.kernels.algebra.sparse import sparse_pays
-from twoloop.kernels.data import common, noted
+from twoloop.kernels.compile.linking import direct
+from twoloop.kernels.data import common
 from twoloop.kernels.data.flags import (
     AUGMENTED,
     BANDWIDTH,
@@ -23,7 +24,7 @@ from twoloop.kernels.data.flags import (
 )
 from twoloop.kernels.data.kit import Kit
 from twoloop.kernels.evaluation.operations import N_NODES
-from twoloop.kernels.layout import make_work
+from twoloop.kernels.layout import lasting, make_work, short_loops
 from twoloop.methods.plan import Plan
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.static_form import StaticForm
@@ -32,7 +33,6 @@ Array = NDArray[np.float64]
 
 GAMMA_ACCURACY = 1e-11  # relative; differences of C_q and C_t cannot be asked for more
 MOST_KITS = 16  # that are kept with a system
-ROUNDING = 1e-15  # of the largest coordinate: corrections of this size are rounding
 
 
 def kit_of(
@@ -176,16 +176,11 @@ def made_ready(
     reuse: float,
     static: StaticForm | None = None,
 ) -> common.Work:
-    """A workspace full of zeros with what a run finds in it."""
-    work.notes[noted.GAMMA_REQUIRED] = max(rtol, GAMMA_ACCURACY)
-    work.notes[noted.GAMMA_SHARE] = 1.0
-    work.notes[noted.KINK_BEFORE], work.notes[noted.KINK_AFTER] = -np.inf, np.inf
-    rounded = ROUNDING * float(np.maximum.reduce(np.abs(q0)))
-    work.notes[noted.ROUNDED], work.notes[noted.REUSE] = rounded, max(reuse, rounded)
+    """A workspace with what a run finds in it, whatever the one before has left."""
+    direct(short_loops().make_ready)(work, *lasting(work), pattern, q0, max(rtol, GAMMA_ACCURACY), reuse)
     if static is not None:
         _fill(work, system, static, q0)
         return work
-    work.pattern[:] = pattern
     if flags[BANDWIDTH] >= 0:
         work.lapack[:] = addresses()
     return work

@@ -4,6 +4,7 @@ import math
 
 from numba import types
 
+from twoloop.kernels.algebra.linalg import ldl_factor, ldl_solve
 from twoloop.kernels.data.common import INTEGERS, MATRIX, VECTOR, compiled, f8, i8, kernel, merged
 
 
@@ -55,6 +56,17 @@ def independent_rows(G, least, basis, factors, kept):
     return first_rows(G, least, basis, factors, kept)
 
 
+@merged
+def _find_shares(n, basis, factors, row, shares):
+    """Which combination of n rows that count another row is, by least squares where it is none."""
+    for k in range(n):
+        shares[k] = _dot(basis[k], row)
+    for k in range(n - 1, -1, -1):
+        for j in range(k + 1, n):
+            shares[k] -= factors[j, k] * shares[j]
+        shares[k] /= factors[k, k]
+
+
 @kernel(types.float64(MATRIX, i8, VECTOR))
 def size_of_inverse(factors, n, column):
     """The root of the sum of squares of the entries of the inverse of a lower triangle of n rows; `column` is scratch.
@@ -71,3 +83,59 @@ def size_of_inverse(factors, n, column):
             column[i] = value / factors[i, i]
             total += column[i] * column[i]
     return math.sqrt(total)
+
+
+@kernel(types.boolean(MATRIX, INTEGERS, f8, MATRIX, MATRIX, MATRIX, INTEGERS, MATRIX, VECTOR), vectorized=True)
+def shares_of_others(rows, order, least, others, basis, factors, kept, shares, lengths):
+    """Whether `others` are independent; then which combination of these each of some rows is, by least squares.
+
+    `order` has the places among all `rows` of those to put into `others`, then of those to find the shares of;
+    `lengths` become those of all rows, and the rest is as in `first_rows`.
+    """
+    n = len(others)
+    for i in range(len(rows)):
+        lengths[i] = math.sqrt(_dot(rows[i], rows[i]))
+    for k in range(n):
+        for j in range(rows.shape[1]):
+            others[k, j] = rows[order[k], j]
+    if first_rows(others, least, basis, factors, kept) < n:
+        return False
+    for i in range(len(shares)):
+        _find_shares(n, basis, factors, rows[order[n + i]], shares[i])
+    return True
+
+
+@kernel(i8(MATRIX, VECTOR, f8, MATRIX, MATRIX, INTEGERS, MATRIX, MATRIX, MATRIX, VECTOR), vectorized=True)
+def least_solution(rows, values, least, basis, factors, kept, shares, gram, parts, x):
+    """The x of least norm that gives rows these values, by least squares; how many rows count, as in `first_rows`.
+
+    Where S are the shares that the rows y that count have in the others, of values b, these are least squares for
+    y + S^T z with (1 + S S^T) z = b - S y. `values` become what x leaves of them; `parts` has room for y and z.
+    """
+    n, m = first_rows(rows, least, basis, factors, kept), 0
+    y, z = parts[0], parts[1]
+    for i in range(len(rows)):
+        if i - m < n and kept[i - m] == i:
+            y[i - m] = values[i]
+            continue
+        _find_shares(n, basis, factors, rows[i], shares[m])
+        z[m] = values[i]
+        m += 1
+    for i in range(m):
+        for k in range(n):
+            z[i] -= shares[i, k] * y[k]
+        for j in range(m):
+            gram[i, j] = _dot(shares[i], shares[j]) + (1.0 if i == j else 0.0)
+    ldl_factor(gram[:m, :m])
+    ldl_solve(gram[:m, :m], z[:m])
+    for k in range(n):
+        for i in range(m):
+            y[k] += shares[i, k] * z[i]
+        for j in range(k):
+            y[k] -= factors[k, j] * y[j]
+        y[k] /= factors[k, k]
+        for j in range(x.size):
+            x[j] += y[k] * basis[k, j]
+    for i in range(len(rows)):
+        values[i] -= _dot(rows[i], x)
+    return n

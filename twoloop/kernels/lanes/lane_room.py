@@ -51,11 +51,11 @@ LANES = 8 if has_wide_vectors() else 4  # runs side by side: of two vectors each
 TASKS = (
     "closer",  # positions of NEW, at AHEAD, moved towards the constraints, by MOVED
     "nearer",  # the same and velocities, and A and LAM there
-    "there",  # A at NEW as it stands
     "redundant",  # whether rows that do not count hold at NEW
     "departure",  # OFF: of a step H from STATE by PREDICTED to NEW
     "take",  # NEW becomes STATE where ACCEPTED
 )
+TASKS_OF_STAGES = ("there",)  # A at NEW as it stands
 TASKS_OF_SERIES = (
     "series",  # coefficients about STATE at T, in units of time UNIT
     "lengths",  # LENGTH of the step at which the last two terms are within the tolerances, in units
@@ -64,7 +64,8 @@ TASKS_OF_SERIES = (
     "defect",  # DEFECT: of A at NEW, the end of a step H
 )
 CODE = Reference("LaneKit", {})
-CODE.add_own_functions(dict.fromkeys((*TASKS, *TASKS_OF_SERIES), types.none(types.int64, VECTOR, VECTOR)))
+ALL_TASKS = (*TASKS, *TASKS_OF_STAGES, *TASKS_OF_SERIES)
+CODE.add_own_functions(dict.fromkeys(ALL_TASKS, types.none(types.int64, VECTOR, VECTOR)))
 # of a method, (code, settings, control, options, room, status, n_steps, within): a step H of each lane that runs, and
 # whether it is ACCEPTED, with its end in NEW, A and LAM; or, `within` the step that was just accepted, NEW, X seconds
 # after its beginning, of the lanes that FINE names, off the constraints as yet
@@ -82,7 +83,7 @@ class LaneKit:
     """The functions made for a mechanism and the step of a method, as kernels get them."""
 
     def __init__(self, own: OwnFunctions, step: Any):
-        self.__dict__.update(dict.fromkeys((*TASKS, *TASKS_OF_SERIES), 0))
+        self.__dict__.update(dict.fromkeys(ALL_TASKS, 0))
         self.__dict__.update(own.addresses)
         self.own, self.step = own, step
         self.table = CODE.table(self)
