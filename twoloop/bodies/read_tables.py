@@ -3,7 +3,7 @@
 import math
 
 from twoloop.bodies import parameter_layout as layout
-from twoloop.bodies.program_results import results
+from twoloop.bodies.program_results import results_within
 from twoloop.kernels.data.common import inlined
 
 
@@ -47,7 +47,7 @@ def made_by(program, t, q, v, p):
     place = int(p[p.size - layout.HEAD + program])
     if place < 0:
         return p
-    return results(place, t, q, v, p)
+    return results_within(place, t, q, v, p)
 
 
 @inlined
