@@ -13,7 +13,7 @@ from twoloop.bodies.function_rows import fill_entries, fill_nonholonomic, fill_n
 from twoloop.bodies.program_results import result
 from twoloop.bodies.read_tables import joint_at, joint_places, made_by, motions, n_bodies
 from twoloop.bodies.spatial_forces import WEIGHT, fill_force, inertia
-from twoloop.bodies.spatial_places import motion, place, push_row, turn_row, vector, vector_rate
+from twoloop.bodies.spatial_places import motion, place, push_row, put_point_rows, turn_row, vector, vector_rate
 from twoloop.kernels.compile.caches import helper
 from twoloop.kernels.compile.callbacks import callback
 
@@ -77,10 +77,8 @@ def fill_rows(q, p, made, k, Cq, row):
         fill_entries(p, more, made, moved + 3, Cq[row])
         return
     if kind == layout.POINT:
-        for axis in range(3):
-            fx, fy, fz = 1.0 * (axis == 0), 1.0 * (axis == 1), 1.0 * (axis == 2)
-            push_row(q, Cq[row + axis], i, p, at, -fx, -fy, -fz)
-            push_row(q, Cq[row + axis], j, p, there, fx, fy, fz)
+        put_point_rows(q, Cq, row, i, p[at], p[at + 1], p[at + 2], -1.0)
+        put_point_rows(q, Cq, row, j, p[there], p[there + 1], p[there + 2], 1.0)
         return
     if kind == layout.LENGTH:
         ax, ay, az = place(q, i, p, at)
