@@ -16,6 +16,7 @@ from twoloop.bodies.spatial_forces import WEIGHT, fill_force, inertia
 from twoloop.bodies.spatial_places import motion, place, push_row, put_point_rows, turn_row, vector, vector_rate
 from twoloop.kernels.compile.caches import helper
 from twoloop.kernels.compile.callbacks import callback
+from twoloop.kernels.data.common import inlined
 
 
 @helper
@@ -69,7 +70,7 @@ def fill_constraint(q, p, made, C):
             C[row] = 0.5 * (x * x + y * y + z * z - p[more] * p[more])
 
 
-@helper
+@inlined
 def fill_rows(q, p, made, k, Cq, row):
     """Evaluate the rows of C_q of joint row k, from `row` on."""
     kind, _, i, at, j, there, more, moved = joint_at(p, k)
