@@ -44,17 +44,8 @@ def force_at(p, k):
 
 @inlined
 def made_by(program, t, q, v, p):
-    """Return the results of a program, or p if there is none: the call itself takes longer than a row of C."""
-    place = int(p[p.size - layout.HEAD + program])
-    if place < 0:
-        return p
-    return results_within(place, t, q, v, p)
-
-
-@inlined
-def motions(t, q, v, p):
-    """Return the results of the program of motions."""
-    return made_by(layout.MOTION_PROGRAM, t, q, v, p)
+    """Return the results of a program of the model."""
+    return results_within(int(p[p.size - layout.HEAD + program]), t, q, v, p)
 
 
 @helper

@@ -51,7 +51,12 @@ def turned(e0, e1, e2, e3, x, y, z):
 def pulled(e0, e1, e2, e3, x, y, z, fx, fy, fz):
     """Return the gradient of f . R(e) (x, y, z) in e, i.e. the generalised force of f at that point."""
     s, wx, wy, wz = turned(e0, e1, e2, e3, x, y, z)
-    return wx * fx + wy * fy + wz * fz, s * fx + wy * fz - wz * fy, s * fy + wz * fx - wx * fz, s * fz + wx * fy - wy * fx
+    return (
+        wx * fx + wy * fy + wz * fz,
+        s * fx + wy * fz - wz * fy,
+        s * fy + wz * fx - wx * fz,
+        s * fz + wx * fy - wy * fx,
+    )
 
 
 @helper
