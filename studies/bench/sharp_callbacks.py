@@ -3,11 +3,12 @@
 from typing import Any
 
 from studies.bench.sharp_forces import drive, force_along
+from twoloop.bodies import spatial_callbacks
+from twoloop.bodies.parameter_layout import HEAD
 from twoloop.kernels.compile.callbacks import callback
-from twoloop.mechanisms import spatial
 
 GRAVITY = 9.81  # m/s^2
-spatial_force = spatial.force
+spatial_force = spatial_callbacks.force
 
 # --- callbacks of a chain of points, p = [n lengths, n masses, ...], that hangs from a pivot driven along x
 
@@ -152,7 +153,7 @@ def four_bar_force(t, q, v, p, Q):  # type: ignore[no-untyped-def]
 @callback("force")
 def slider_force(t, q, v, p, Q):  # type: ignore[no-untyped-def]
     spatial_force(t, q, v, p, Q)
-    Q[14] += force_along(t, q[14], v[14], p)
+    Q[14] += force_along(t, q[14], v[14], p[: p.size - HEAD])
 
 
 CHAIN: dict[str, Any] = {"mass": chain_mass, "force": chain_force, "constraint": chain_constraint}

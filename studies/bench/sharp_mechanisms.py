@@ -18,7 +18,9 @@ from studies.bench.sharp_callbacks import GRAVITY
 from studies.bench.sharp_forces import Sharp, drive, force_along
 from studies.bench.store import Array
 from twoloop import ConstrainedSystem
-from twoloop.mechanisms import four_bar, spatial, spatial_slider_crank
+from twoloop.bodies import spatial_callbacks
+from twoloop.bodies.parameter_layout import HEAD
+from twoloop.mechanisms import four_bar, spatial_slider_crank
 
 TINY = 1e-30  # imaginary step: derivatives without differences
 
@@ -130,15 +132,15 @@ def turning(
     system: ConstrainedSystem,
     start: tuple[Array, Array],
     y0: tuple[float, float],
-    sharp: Sharp,
+    sharp: tuple[Sharp, Array],
     energies: Callable[[Any], tuple[Any, Any, Any]],
     positions: Callable[[float, Array], Array],
 ) -> Mechanism:
-    """A mechanism with one freedom, the angle s, by Lagrange's equation.
+    """A mechanism with one freedom, the angle s, by Lagrange's equation, under a force given with its numbers here.
 
     energies(s) -> inertia, potential and the coordinate along which the force acts, for complex s, too.
     """
-    p = system.parameters
+    force, p = sharp
 
     def rate(t: float, y: Array) -> Array:
         inertia, potential, x = energies(complex(y[0], TINY))
@@ -147,7 +149,7 @@ def turning(
         bend = 0.5 * inertia.imag / TINY * y[1] ** 2
         return np.array([y[1], (push * slope - potential.imag / TINY - bend) / inertia.real])
 
-    return Mechanism(name, system, *start, sharp, np.array(y0), rate, positions)
+    return Mechanism(name, system, *start, force, np.array(y0), rate, positions)
 
 
 def slider_crank(sharp: Sharp, crank: float, rod: float, masses: Array, angle: float, speed: float) -> Mechanism:
@@ -168,14 +170,14 @@ def slider_crank(sharp: Sharp, crank: float, rod: float, masses: Array, angle: f
     slope = energies(complex(angle, TINY))[2].imag / TINY
     v0 = speed * np.array([-crank * np.sin(angle), crank * np.cos(angle), slope])
     return turning(
-        system.name, system, (positions(0.0, np.array([angle])), v0), (angle, speed), sharp, energies, positions
+        system.name, system, (positions(0.0, np.array([angle])), v0), (angle, speed), (sharp, p), energies, positions
     )
 
 
-def under_force(system: ConstrainedSystem, force: Any, own: Array, **more: Any) -> ConstrainedSystem:
-    """A ready system with another force, whose parameters come after its own."""
+def under_force(system: ConstrainedSystem, force: Any, parameters: Array, **more: Any) -> ConstrainedSystem:
+    """A ready system with another force, and its parameters with those of this."""
     about: dict[str, Any] = {"n_q": system.n_q, "n_c": system.n_c, "name": system.name}
-    return ConstrainedSystem(force=force, parameters=np.append(system.parameters, own), **about, **more)
+    return ConstrainedSystem(force=force, parameters=parameters, **about, **more)
 
 
 def bars(sharp: Sharp) -> Mechanism:
@@ -184,7 +186,8 @@ def bars(sharp: Sharp) -> Mechanism:
     q0, v0 = problem.q0, problem.v0
     own = sharp.on(5.0, float(q0[2]), 1.0, 1.0)
     rows = {name: getattr(linkage, name) for name in ("mass", "constraint", "jacobian", "gamma", "kinematics")}
-    system = under_force(problem.system, callbacks.four_bar_force, own, constant_mass=True, **rows)
+    parameters = np.append(problem.system.parameters, own)
+    system = under_force(problem.system, callbacks.four_bar_force, parameters, constant_mass=True, **rows)
     motion = MinimalFourBar.from_parameters(problem.parameters)
 
     def rate(t: float, y: Array) -> Array:
@@ -201,8 +204,10 @@ def slider_in_space(sharp: Sharp) -> Mechanism:
     problem = spatial_slider_crank()
     q0, known = problem.q0, problem.parameters
     own = sharp.on(10.0, float(q0[14]), 0.1, 0.5)
-    rows = {name: getattr(spatial, name) for name in ("mass", "constraint", "jacobian", "gamma")}
-    system = under_force(problem.system, callbacks.slider_force, own, **rows)
+    rows = {name: getattr(spatial_callbacks, name) for name in ("mass", "constraint", "jacobian", "gamma")}
+    given = problem.system.parameters
+    parameters = np.concatenate([given[:-HEAD], own, given[-HEAD:]])  # a model's parameters end with its head
+    system = under_force(problem.system, callbacks.slider_force, parameters, **rows)
     r, rod, (_, y_A, z_A) = known["crank"], known["rod"], known["A"]
     crank_mass, rod_mass, slider_mass = (known["masses"][name] for name in ("crank", "rod", "slider"))
     J = np.array(known["inertias"]["rod"])
@@ -241,7 +246,7 @@ def slider_in_space(sharp: Sharp) -> Mechanism:
         return q
 
     rate0 = 6.0  # rad/s, of the benchmark
-    return turning("spatial slider-crank", system, (q0, problem.v0), (0.0, rate0), sharp, energies, positions)
+    return turning("spatial slider-crank", system, (q0, problem.v0), (0.0, rate0), (sharp, own), energies, positions)
 
 
 KINDS = ("1", "2", "3", "row", "slider")

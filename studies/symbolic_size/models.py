@@ -158,7 +158,7 @@ def symbolic_heavy_top() -> tuple[Any, ...]:
     pivot = sp.Matrix(x) + rotation(e) * sp.Matrix([0, -length, 0])
     known = problem.parameters
     values = dict(zip((m, length, g, *J), (known["mass"], known["length"], 9.81, *known["inertia"]), strict=True))
-    constraints = [(sum(each**2 for each in e) - 1) / 2, *pivot]
+    constraints = [(sum(each**2 for each in e) - 1) / 2, *(-pivot)]
     return problem, T, m * g * x[2], constraints, [*x, *e], values, {}
 
 

@@ -6,9 +6,6 @@ import pytest
 from tests.large_systems import started_run
 from tests.problems import worst
 from twoloop import ConstrainedSystem, solve_dae
-from twoloop.mechanisms import spatial_bodies
-from twoloop.mechanisms.planar import GROUND
-from twoloop.mechanisms.spatial_bodies import SpatialBodies
 
 
 def masses_on_rods(n, dense, varying):
@@ -106,26 +103,3 @@ def test_stiff_motion_goes_on_by_newton(both):
     one, other = both(run)
     assert all(each.success and each.stats.n_jacobians > 0 for each in (one, other))
     assert worst(one.q[:, -1], other.q[:, -1]) < 1e-3
-
-
-def test_values_of_spatial_bodies_are_the_entries_of_their_matrices(monkeypatch):
-    monkeypatch.setattr(spatial_bodies, "LARGE", 0)
-    rng = np.random.default_rng(1)
-    bodies, before = SpatialBodies((0.0, 0.0, -9.81)), GROUND
-    for k in range(12):
-        at = rng.normal(size=3)
-        body = bodies.body(f"body {k}", 1.0, (0.01, 0.02, 0.025), at, np.eye(3))
-        one, other = (before, body) if k < 6 else (body, before)
-        if k % 4 == 0:
-            bodies.spherical(one, other, at)
-        elif k % 4 == 1:
-            bodies.universal(one, other, at, (1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
-        else:
-            (bodies.revolute if k % 4 == 2 else bodies.prismatic)(one, other, at, rng.normal(size=3))
-        before = body
-    bodies.prismatic(before, GROUND, np.zeros(3), (0.0, 1.0, 0.0))
-    system, q = bodies.system("spatial"), bodies.start[0] + 0.1 * rng.normal(size=7 * 12)
-    for kind in ("mass", "jacobian"):
-        dense, made = system.evaluate(kind, 0.0, q), np.zeros((system.n_q if kind == "mass" else system.n_c, 7 * 12))
-        np.add.at(made, system.entries[kind], system.evaluate(f"{kind}_values", 0.0, q))
-        assert worst(made, dense) < 1e-14 and len(system.entries[kind][0]) < 0.15 * dense.size

@@ -68,11 +68,18 @@ def system_of(
             made.loaded = LoadedFriction(callbacks, tables, made.redundant(*start))
         return ConstrainedSystem.from_python(**options, **{kind: getattr(made, kind) for kind in kinds})
     kinds += ["kinematics"] if tables.n_rows and dimension == 2 else []
-    given = {kind: getattr(callbacks, kind) for kind in kinds}
     if n_q >= LARGE and tables.n_rows:
-        given |= {"mass_values": callbacks.mass_values, "jacobian_values": callbacks.jacobian_values}
+        kinds += ["mass_values", "jacobian_values"]
         options |= {f"{kind}_entries": found for kind, found in entries_of(dimension, tables).items()}
+    given = {kind: _callback(dimension, kind, tables) for kind in kinds}
     return ConstrainedSystem(**options, constant_mass=dimension == 2, **given)
+
+
+def _callback(dimension: int, kind: str, tables: Tables) -> Any:
+    """Return the callback of a kind, from the module of those that evaluate programs if it needs one."""
+    programmed = tables.functions if kind == "force" else tables.motions
+    name = "programs" if programmed and kind not in ("mass", "mass_values") else "callbacks"
+    return getattr(import_module(f"twoloop.bodies.{'planar' if dimension == 2 else 'spatial'}_{name}"), kind)
 
 
 def entries_of(dimension: int, tables: Tables) -> dict[str, NDArray[np.int64]]:

@@ -1,10 +1,14 @@
-"""Callbacks of all planar models; coordinates: centre of mass x, y and angle; for p see `parameter_layout`."""
+"""Callbacks of planar models; coordinates: centre of mass x, y and angle; for p see `parameter_layout`.
+
+Those here read no results of programs, and are given p in their place; `planar_programs` has those of models with
+motions or forces that are functions.
+"""
 
 import math
 
 from twoloop.bodies import parameter_layout as layout
 from twoloop.bodies import read_tables as tables
-from twoloop.bodies.function_rows import fill_entries, fill_nonholonomic, fill_nonholonomic_gamma, put_entries
+from twoloop.bodies.function_rows import fill_entries, put_entries
 from twoloop.bodies.planar_places import motion, place_on
 from twoloop.bodies.program_results import result
 from twoloop.kernels.compile.caches import helper
@@ -230,32 +234,9 @@ def fill_force(q, v, p, made, Q):
         add(Q, j, -x, -y, bdx, bdy)
 
 
-@callback("mass")
-def mass(t, q, p, M):
-    for body in range(tables.n_bodies(p)):
-        at = WEIGHT + layout.PLANAR_BODY * body
-        M[3 * body, 3 * body] = M[3 * body + 1, 3 * body + 1] = p[at]
-        M[3 * body + 2, 3 * body + 2] = p[at + 1]
-
-
-@callback("force")
-def force(t, q, v, p, Q):
-    fill_force(q, v, p, tables.made_by(layout.FORCE_PROGRAM, t, q, v, p), Q)
-
-
-@callback("constraint")
-def constraint(t, q, p, C):
-    fill_constraint(q, p, tables.motions(t, q, q, p), C)
-
-
-@callback("jacobian")
-def jacobian(t, q, p, Cq):
-    fill_jacobian(q, p, tables.motions(t, q, q, p), Cq)
-
-
-@callback("kinematics")
-def kinematics(t, q, v, p, C, Cq, Ct, Qd):
-    made = tables.motions(t, q, v, p)
+@helper
+def fill_kinematics(q, v, p, made, C, Cq, Ct, Qd):
+    """Evaluate C, C_q, C_t and gamma together."""
     for k in tables.joint_places(p):
         kind, row, i, at, j, there, _, _ = tables.joint_at(p, k)
         if kind == layout.PIN:  # most joints are pins: each of their sines is needed once
@@ -272,17 +253,10 @@ def kinematics(t, q, v, p, C, Cq, Ct, Qd):
     fill_rate(q, p, made, Ct)
 
 
-@callback("mass_values")
-def mass_values(t, q, p, values):
-    for body in range(tables.n_bodies(p)):
-        at = WEIGHT + layout.PLANAR_BODY * body
-        values[3 * body] = values[3 * body + 1] = p[at]
-        values[3 * body + 2] = p[at + 1]
-
-
-@callback("jacobian_values")
-def jacobian_values(t, q, p, values):
-    made, begin = tables.motions(t, q, q, p), 0
+@helper
+def fill_values(q, p, made, values):
+    """Evaluate the entries of C_q."""
+    begin = 0
     for k in tables.joint_places(p):
         kind, _, i, _, j, _, more, moved = tables.joint_at(p, k)
         if kind == layout.WRITTEN:
@@ -300,21 +274,47 @@ def jacobian_values(t, q, p, values):
             begin = end
 
 
-@callback("constraint_rate")
-def constraint_rate(t, q, p, Ct):
-    fill_rate(q, p, tables.motions(t, q, q, p), Ct)
+@callback("mass", allocates=False)
+def mass(t, q, p, M):
+    for body in range(tables.n_bodies(p)):
+        at = WEIGHT + layout.PLANAR_BODY * body
+        M[3 * body, 3 * body] = M[3 * body + 1, 3 * body + 1] = p[at]
+        M[3 * body + 2, 3 * body + 2] = p[at + 1]
 
 
-@callback("gamma")
+@callback("mass_values", allocates=False)
+def mass_values(t, q, p, values):
+    for body in range(tables.n_bodies(p)):
+        at = WEIGHT + layout.PLANAR_BODY * body
+        values[3 * body] = values[3 * body + 1] = p[at]
+        values[3 * body + 2] = p[at + 1]
+
+
+@callback("force", allocates=False)
+def force(t, q, v, p, Q):
+    fill_force(q, v, p, p, Q)
+
+
+@callback("constraint", allocates=False)
+def constraint(t, q, p, C):
+    fill_constraint(q, p, p, C)
+
+
+@callback("jacobian", allocates=False)
+def jacobian(t, q, p, Cq):
+    fill_jacobian(q, p, p, Cq)
+
+
+@callback("jacobian_values", allocates=False)
+def jacobian_values(t, q, p, values):
+    fill_values(q, p, p, values)
+
+
+@callback("gamma", allocates=False)
 def gamma(t, q, v, p, Qd):
-    fill_gamma(q, v, p, tables.motions(t, q, v, p), Qd)
+    fill_gamma(q, v, p, p, Qd)
 
 
-@callback("nonholonomic")
-def nonholonomic(t, q, p, A):
-    fill_nonholonomic(p, tables.motions(t, q, q, p), A)
-
-
-@callback("nonholonomic_gamma")
-def nonholonomic_gamma(t, q, v, p, Qa):
-    fill_nonholonomic_gamma(p, tables.motions(t, q, v, p), Qa)
+@callback("kinematics", allocates=False)
+def kinematics(t, q, v, p, C, Cq, Ct, Qd):
+    fill_kinematics(q, v, p, p, C, Cq, Ct, Qd)

@@ -3,6 +3,7 @@
 import numpy as np
 
 from twoloop.kernels.compile.caches import helper
+from twoloop.kernels.data.common import inlined
 from twoloop.kernels.evaluation.operations import END, FIRST, KIND, MADE, N_COLUMNS, RESULT, SECOND
 from twoloop.kernels.evaluation.program import operation
 
@@ -19,14 +20,13 @@ def total(nodes, first, p, columns, coefficients, constant, begin, end):
 
 
 @helper
-def results(place, t, q, v, p):
-    """Return the results of the program at an index of p followed by all its nodes."""
+def fill_results(place, t, q, v, p, nodes):
+    """Evaluate the results of the program at an index of p, followed by all its nodes."""
     first, n_rows, n_terms = int(p[place + N_RESULTS]), int(p[place + N_ROWS]), int(p[place + N_TERMS])
     rows = place + PROGRAM
     columns = rows + N_COLUMNS * n_rows
     coefficients = columns + n_terms
     constants = coefficients + n_terms
-    nodes = np.zeros(first + int(p[place + N_NODES]))
     nodes[first] = t
     for j in range(q.size):
         nodes[first + 1 + j] = q[j]
@@ -41,7 +41,17 @@ def results(place, t, q, v, p):
             nodes[made] = x
         else:
             nodes[first + made] = operation(kind, x, y)
+
+
+@inlined
+def results_within(place, t, q, v, p):
+    """Return the results of the program at an index of p, followed by all its nodes."""
+    nodes = np.zeros(int(p[place + N_RESULTS]) + int(p[place + N_NODES]))
+    fill_results(place, t, q, v, p, nodes)
     return nodes
+
+
+results = results_within.py_func  # for Python
 
 
 @helper

@@ -3,38 +3,39 @@
 import math
 
 from twoloop.bodies import parameter_layout as layout
-from twoloop.bodies.program_results import results
+from twoloop.bodies.program_results import results_within
+from twoloop.kernels.compile.caches import helper
 from twoloop.kernels.data.common import inlined
 
 
-@inlined
+@helper
 def n_bodies(p):
     """Return the number of bodies."""
     return int(p[p.size - layout.HEAD + layout.BODIES])
 
 
-@inlined
+@helper
 def joint_places(p):
     """Return the index at which the table of joints begins."""
     first, n = int(p[p.size - layout.HEAD + layout.JOINTS]), int(p[p.size - layout.HEAD + layout.N_JOINTS])
     return range(first, first + layout.JOINT_WIDTH * n, layout.JOINT_WIDTH)
 
 
-@inlined
+@helper
 def joint_at(p, k):
     """Return a row of the table: kind, row of C, bodies i and j with their numbers, further numbers, motion."""
     i, at, j, there = int(p[k + 2]), int(p[k + 3]), int(p[k + 4]), int(p[k + 5])
     return int(p[k]), int(p[k + 1]), i, at, j, there, int(p[k + 6]), int(p[k + 7])
 
 
-@inlined
+@helper
 def force_places(p):
     """Return the index at which the table of forces begins."""
     first, n = int(p[p.size - layout.HEAD + layout.FORCES]), int(p[p.size - layout.HEAD + layout.N_FORCES])
     return range(first, first + layout.FORCE_WIDTH * n, layout.FORCE_WIDTH)
 
 
-@inlined
+@helper
 def force_at(p, k):
     """Return a row of the table: kind, bodies i and j with indices of numbers, further numbers, result, point of i."""
     i, at, j, there = int(p[k + 1]), int(p[k + 2]), int(p[k + 3]), int(p[k + 4])
@@ -43,20 +44,11 @@ def force_at(p, k):
 
 @inlined
 def made_by(program, t, q, v, p):
-    """Return the results of a program, or p if there is none: the call itself takes longer than a row of C."""
-    place = int(p[p.size - layout.HEAD + program])
-    if place < 0:
-        return p
-    return results(place, t, q, v, p)
+    """Return the results of a program of the model."""
+    return results_within(int(p[p.size - layout.HEAD + program]), t, q, v, p)
 
 
-@inlined
-def motions(t, q, v, p):
-    """Return the results of the program of motions."""
-    return made_by(layout.MOTION_PROGRAM, t, q, v, p)
-
-
-@inlined
+@helper
 def value(p, more, made, given, i):
     """Return a number of a force, or its function value if it is a function."""
     if given >= 0:
@@ -64,7 +56,7 @@ def value(p, more, made, given, i):
     return p[more + i]
 
 
-@inlined
+@helper
 def push(kind, rate, p, more, made, given):
     """Return the force of friction or of a motor in a joint with the given rate."""
     if kind in (layout.BRAKE, layout.RUB):

@@ -38,17 +38,24 @@ def rotated_rate(e0, e1, e2, e3, u0, u1, u2, u3, x, y, z):
 
 
 @helper
+def turned(e0, e1, e2, e3, x, y, z):
+    """Return 2 (f.a, e0 a + f x a) with f = (e1, e2, e3): s, w, of which the derivatives of R(e) a by e are made.
+
+    That by e0 is w; that of component i by component j of f is s, if i = j, else plus or minus the third one of w.
+    """
+    x, y, z = 2.0 * x, 2.0 * y, 2.0 * z
+    return e1 * x + e2 * y + e3 * z, e0 * x + e2 * z - e3 * y, e0 * y + e3 * x - e1 * z, e0 * z + e1 * y - e2 * x
+
+
+@helper
 def pulled(e0, e1, e2, e3, x, y, z, fx, fy, fz):
     """Return the gradient of f . R(e) (x, y, z) in e, i.e. the generalised force of f at that point."""
-    fa = fx * x + fy * y + fz * z
-    s = e1 * x + e2 * y + e3 * z
-    r = e1 * fx + e2 * fy + e3 * fz
-    cx, cy, cz = y * fz - z * fy, z * fx - x * fz, x * fy - y * fx  # a x f
+    s, wx, wy, wz = turned(e0, e1, e2, e3, x, y, z)
     return (
-        2.0 * (e0 * fa + e1 * cx + e2 * cy + e3 * cz),
-        2.0 * (s * fx + r * x - fa * e1 + e0 * cx),
-        2.0 * (s * fy + r * y - fa * e2 + e0 * cy),
-        2.0 * (s * fz + r * z - fa * e3 + e0 * cz),
+        wx * fx + wy * fy + wz * fz,
+        s * fx + wy * fz - wz * fy,
+        s * fy + wz * fx - wx * fz,
+        s * fz + wx * fy - wy * fx,
     )
 
 

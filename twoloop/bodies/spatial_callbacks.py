@@ -1,4 +1,7 @@
-"""Callbacks of all spatial models; coordinates: centre of mass and Euler parameters; for p see `parameter_layout`.
+"""Callbacks of spatial models; coordinates: centre of mass and Euler parameters; for p see `parameter_layout`.
+
+Those here read no results of programs, and are given p in their place; `spatial_programs` has those of models with
+motions or forces that are functions.
 
 The first rows are e.e = 1 for each body, followed by those of the joints. The mass matrix has rank 6 of 7 for each
 body, because 4 G^T J G has rank 3.
@@ -9,13 +12,14 @@ import math
 import numpy as np
 
 from twoloop.bodies import parameter_layout as layout
-from twoloop.bodies.function_rows import fill_entries, fill_nonholonomic, fill_nonholonomic_gamma, put_entries
+from twoloop.bodies.function_rows import fill_entries, put_entries
 from twoloop.bodies.program_results import result
-from twoloop.bodies.read_tables import joint_at, joint_places, made_by, motions, n_bodies
+from twoloop.bodies.read_tables import joint_at, joint_places, n_bodies
 from twoloop.bodies.spatial_forces import WEIGHT, fill_force, inertia
-from twoloop.bodies.spatial_places import motion, place, push_row, turn_row, vector, vector_rate
+from twoloop.bodies.spatial_places import motion, place, push_row, put_point_rows, turn_row, vector, vector_rate
 from twoloop.kernels.compile.caches import helper
 from twoloop.kernels.compile.callbacks import callback
+from twoloop.kernels.data.common import inlined
 
 
 @helper
@@ -69,7 +73,7 @@ def fill_constraint(q, p, made, C):
             C[row] = 0.5 * (x * x + y * y + z * z - p[more] * p[more])
 
 
-@helper
+@inlined
 def fill_rows(q, p, made, k, Cq, row):
     """Evaluate the rows of C_q of joint row k, from `row` on."""
     kind, _, i, at, j, there, more, moved = joint_at(p, k)
@@ -77,10 +81,8 @@ def fill_rows(q, p, made, k, Cq, row):
         fill_entries(p, more, made, moved + 3, Cq[row])
         return
     if kind == layout.POINT:
-        for axis in range(3):
-            fx, fy, fz = 1.0 * (axis == 0), 1.0 * (axis == 1), 1.0 * (axis == 2)
-            push_row(q, Cq[row + axis], i, p, at, -fx, -fy, -fz)
-            push_row(q, Cq[row + axis], j, p, there, fx, fy, fz)
+        put_point_rows(q, Cq, row, i, p[at], p[at + 1], p[at + 2], -1.0)
+        put_point_rows(q, Cq, row, j, p[there], p[there + 1], p[there + 2], 1.0)
         return
     if kind == layout.LENGTH:
         ax, ay, az = place(q, i, p, at)
@@ -199,7 +201,7 @@ def fill_mass(q, p, body, M, first):
             M[first + 3 + i, first + 3 + j] = columns[i][0] * x + columns[i][1] * y + columns[i][2] * z
 
 
-@callback("mass")
+@callback("mass", allocates=False)
 def mass(t, q, p, M):
     for body in range(n_bodies(p)):
         fill_mass(q, p, body, M, 7 * body)
@@ -226,12 +228,12 @@ def take_entries(body, skipped, row, values, at):
     return at
 
 
-@callback("jacobian_values")
-def jacobian_values(t, q, p, values):
-    made, at = motions(t, q, q, p), 4 * n_bodies(p)
+@helper
+def fill_values(q, p, made, rows, values):
+    """Evaluate the entries of C_q; `rows` (3, n_q): zeros, which they are again afterwards."""
+    at = 4 * n_bodies(p)
     for k in range(at):
         values[k] = q[7 * (k // 4) + 3 + k % 4]
-    rows = np.zeros((3, q.size), dtype=q.dtype)
     for k in joint_places(p):
         kind, _, i, _, j, _, columns, moved = joint_at(p, k)
         if kind == layout.WRITTEN:
@@ -244,36 +246,26 @@ def jacobian_values(t, q, p, values):
                 at = take_entries(j, skipped, rows[row], values, at)
 
 
-@callback("force")
+@callback("force", allocates=False)
 def force(t, q, v, p, Q):
-    fill_force(q, v, p, made_by(layout.FORCE_PROGRAM, t, q, v, p), Q)
+    fill_force(q, v, p, p, Q)
 
 
-@callback("constraint")
+@callback("constraint", allocates=False)
 def constraint(t, q, p, C):
-    fill_constraint(q, p, motions(t, q, q, p), C)
+    fill_constraint(q, p, p, C)
 
 
-@callback("jacobian")
+@callback("jacobian", allocates=False)
 def jacobian(t, q, p, Cq):
-    fill_jacobian(q, p, motions(t, q, q, p), Cq)
+    fill_jacobian(q, p, p, Cq)
 
 
-@callback("constraint_rate")
-def constraint_rate(t, q, p, Ct):
-    fill_rate(q, p, motions(t, q, q, p), Ct)
+@callback("jacobian_values")
+def jacobian_values(t, q, p, values):
+    fill_values(q, p, p, np.zeros((3, q.size), dtype=q.dtype), values)
 
 
-@callback("gamma")
+@callback("gamma", allocates=False)
 def gamma(t, q, v, p, Qd):
-    fill_gamma(q, v, p, motions(t, q, v, p), Qd)
-
-
-@callback("nonholonomic")
-def nonholonomic(t, q, p, A):
-    fill_nonholonomic(p, motions(t, q, q, p), A)
-
-
-@callback("nonholonomic_gamma")
-def nonholonomic_gamma(t, q, v, p, Qa):
-    fill_nonholonomic_gamma(p, motions(t, q, v, p), Qa)
+    fill_gamma(q, v, p, p, Qd)

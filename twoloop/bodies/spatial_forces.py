@@ -22,19 +22,8 @@ def inertia(p, at, x, y, z):
 
 
 @helper
-def fill_force(q, v, p, made, Q):
-    """Evaluate Q; `made`: results of the program of forces."""
-    for body in range(n_bodies(p)):
-        m, k = WEIGHT + layout.SPATIAL_BODY * body, 7 * body + 3
-        move_row(Q, body, p[m] * p[0], p[m] * p[1], p[m] * p[2])
-        # quadratic velocity terms of the kinetic energy: -8 G(e')^T J G(e) e'
-        u0, u1, u2, u3 = v[k], v[k + 1], v[k + 2], v[k + 3]
-        wx, wy, wz = half_spin(q[k], q[k + 1], q[k + 2], q[k + 3], u0, u1, u2, u3)
-        x, y, z = inertia(p, m, -8.0 * wx, -8.0 * wy, -8.0 * wz)
-        Q[k] += -u1 * x - u2 * y - u3 * z
-        Q[k + 1] += u0 * x - u3 * y + u2 * z
-        Q[k + 2] += u3 * x + u0 * y - u1 * z
-        Q[k + 3] += -u2 * x + u1 * y + u0 * z
+def put_forces(q, v, p, made, Q):
+    """Add springs, motors, friction, given forces and torques."""
     for k in force_places(p):
         kind, i, at, j, there, more, given, on_first = force_at(p, k)
         if kind in (layout.TORQUE, layout.FORCE):
@@ -93,3 +82,21 @@ def fill_force(q, v, p, made, Q):
             x, y, z = pull * x, pull * y, pull * z
         push_row(q, Q, i, p, at, x, y, z)
         push_row(q, Q, j, p, there, -x, -y, -z)
+
+
+@helper
+def fill_force(q, v, p, made, Q):
+    """Evaluate Q; `made`: results of the program of forces."""
+    for body in range(n_bodies(p)):
+        m, k = WEIGHT + layout.SPATIAL_BODY * body, 7 * body + 3
+        move_row(Q, body, p[m] * p[0], p[m] * p[1], p[m] * p[2])
+        # quadratic velocity terms of the kinetic energy: -8 G(e')^T J G(e) e'
+        u0, u1, u2, u3 = v[k], v[k + 1], v[k + 2], v[k + 3]
+        wx, wy, wz = half_spin(q[k], q[k + 1], q[k + 2], q[k + 3], u0, u1, u2, u3)
+        x, y, z = inertia(p, m, -8.0 * wx, -8.0 * wy, -8.0 * wz)
+        Q[k] += -u1 * x - u2 * y - u3 * z
+        Q[k + 1] += u0 * x - u3 * y + u2 * z
+        Q[k + 2] += u3 * x + u0 * y - u1 * z
+        Q[k + 3] += -u2 * x + u1 * y + u0 * z
+    if p[p.size - layout.HEAD + layout.N_FORCES] > 0:
+        put_forces(q, v, p, made, Q)

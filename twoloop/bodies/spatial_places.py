@@ -5,14 +5,14 @@ Coordinates of a body: x, y, z of the centre of mass and Euler parameters; see `
 
 import math
 
-from twoloop.bodies.rotation import half_spin, pulled, rotated, rotated_rate
+from twoloop.bodies.rotation import half_spin, pulled, rotated, rotated_rate, turned
 from twoloop.kernels.compile.caches import helper
 from twoloop.kernels.data.common import inlined
 
 FARTHEST = -math.cos(0.95 * math.pi)  # 0.95 of a turn
 
 
-@inlined
+@helper
 def vector(q, body, x, y, z):
     """Return a body-fixed vector in space."""
     if body < 0:
@@ -32,7 +32,7 @@ def vector_rate(q, v, body, x, y, z):
     return ux, uy, uz, 2.0 * ax, 2.0 * ay, 2.0 * az
 
 
-@inlined
+@helper
 def centre(q, body):
     """Return the centre of mass, or its velocity from v."""
     if body < 0:
@@ -52,7 +52,19 @@ def turn_row(q, row, body, x, y, z, fx, fy, fz):
         row[k + 3] += d3
 
 
-@inlined
+@helper
+def put_point_rows(q, rows, first, body, x, y, z, sign):
+    """Store three rows (n_q,), the derivatives of a point of a body, or minus these."""
+    if body >= 0:
+        k = 7 * body + 3
+        s, wx, wy, wz = turned(q[k], q[k + 1], q[k + 2], q[k + 3], sign * x, sign * y, sign * z)
+        rows[first, k - 3] = rows[first + 1, k - 2] = rows[first + 2, k - 1] = sign
+        rows[first, k], rows[first, k + 1], rows[first, k + 2], rows[first, k + 3] = wx, s, wz, -wy
+        rows[first + 1, k], rows[first + 1, k + 1], rows[first + 1, k + 2], rows[first + 1, k + 3] = wy, -wz, s, wx
+        rows[first + 2, k], rows[first + 2, k + 1], rows[first + 2, k + 2], rows[first + 2, k + 3] = wz, wy, -wx, s
+
+
+@helper
 def move_row(row, body, fx, fy, fz):
     """Add to a row the gradient of f . (centre of a body)."""
     if body >= 0:
@@ -61,7 +73,7 @@ def move_row(row, body, fx, fy, fz):
         row[7 * body + 2] += fz
 
 
-@inlined
+@helper
 def place(q, body, p, at):
     """Return the point of a body stored at index `at` of p."""
     x, y, z = vector(q, body, p[at], p[at + 1], p[at + 2])

@@ -1,12 +1,13 @@
 """IFToMM's A05, Watt's flyball governor whose coupler rods are stiff spring-dampers."""
 
 import math
+from typing import Any
 
 import numpy as np
 
-from twoloop.mechanisms.ready import ready
-from twoloop.mechanisms.spatial import GROUND
-from twoloop.mechanisms.spatial_bodies import SpatialBodies
+from twoloop.bodies.spatial_model import SpatialModel
+from twoloop.mechanisms.momentum import Momentum
+from twoloop.mechanisms.ready import ready_model
 from twoloop.problem.problem import Problem
 
 GRAVITY = 9.81  # m/s^2, along -z
@@ -31,12 +32,14 @@ def governor() -> Problem:
     """
     z, y = np.array([0.0, 0.0, 1.0]), np.array([0.0, 1.0, 0.0])
     spin = RATE * z
-    rows = SpatialBodies(-GRAVITY * z)
+    model, turning = SpatialModel(-GRAVITY * z, name="A05 governor"), {"angular_velocity": spin}
     bar, cube = DENSITY * LENGTH * WIDTH**2, DENSITY * CUBE**3
-    shaft = rows.body("shaft", bar, box(bar, WIDTH, WIDTH, LENGTH), 0.5 * LENGTH * z, np.eye(3), spin=spin)
-    slider = rows.body("slider", cube, box(cube, CUBE, CUBE, CUBE), HEIGHT * z, np.eye(3), spin=spin)
-    rows.revolute(shaft, GROUND, (0.0, 0.0, 0.0), z)
-    rows.prismatic(shaft, slider, HEIGHT * z, z)
+    moments = box(bar, WIDTH, WIDTH, LENGTH), box(cube, CUBE, CUBE, CUBE)
+    still: dict[str, Any] = {"velocity": (0.0, 0.0, 0.0), **turning}
+    model.body("shaft", mass=bar, inertia=moments[0], position=0.5 * LENGTH * z, **still)
+    model.body("slider", mass=cube, inertia=moments[1], position=HEIGHT * z, **still)
+    model.revolute("shaft", "ground", at=(0.0, 0.0, 0.0), axis=z)
+    model.prismatic("shaft", "slider", at=HEIGHT * z, axis=z)
     centre = (0.5 * bar + BALL) * LENGTH / (bar + BALL)  # centre of mass of rod and ball, from the hinge
     axial, across, _ = box(bar, LENGTH, WIDTH, WIDTH)
     across += bar * (centre - 0.5 * LENGTH) ** 2 + BALL * (LENGTH - centre) ** 2
@@ -45,13 +48,14 @@ def governor() -> Problem:
         hinge = np.array([side * 0.5 * CUBE, 0.0, LENGTH])
         position = hinge + centre * along
         R = np.column_stack([along, side * y, np.cross(along, side * y)])
-        rod = rows.body(name, bar + BALL, (axial, across, across), position, R, np.cross(spin, position), spin)
-        rows.revolute(rod, shaft, hinge, y)
-        end = np.array([side * 0.5 * CUBE, 0.0, HEIGHT])
-        rows.spring(slider, end, rod, hinge + 0.5 * LENGTH * along, STIFFNESS, DAMPING, SLACK)
-    q0, v0 = rows.start
-    return ready(
-        *(rows, "A05 governor", q0, v0, 10.0),
+        pose = {"position": position, "rotation": R, "velocity": np.cross(spin, position), **turning}
+        model.body(name, mass=bar + BALL, inertia=(axial, across, across), **pose)
+        model.revolute(name, "shaft", at=hinge, axis=y)
+        ends = np.array([side * 0.5 * CUBE, 0.0, HEIGHT]), name, hinge + 0.5 * LENGTH * along
+        model.spring("slider", *ends, stiffness=STIFFNESS, damping=DAMPING, length=SLACK)
+    bodies = np.array([[bar, *moments[0]], [cube, *moments[1]], *2 * [[bar + BALL, axial, across, across]]])
+    return ready_model(
+        *(model, 10.0),
         parameters={"stiffness": STIFFNESS, "damping": DAMPING, "rate": RATE, "gravity": GRAVITY},
         source=(
             "IFToMM library of benchmarks, A05; RehabEngGroup/MBSbenchmarksInOpenSim, A05_FlyballGovernor.rst; "
@@ -63,6 +67,5 @@ def governor() -> Problem:
             "The angular momentum about the shaft is kept, and the energy never grows."
         ),
         conserved=False,
-        invariants={"angular momentum about the shaft (kg m^2/s)": rows.momentum((0.0, 0.0, 0.0), z)},
-        coordinates=rows.coordinates,
+        invariants={"angular momentum about the shaft (kg m^2/s)": Momentum(bodies, np.zeros(3), z)},
     )

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from twoloop.mechanisms.ready import ready
-from twoloop.mechanisms.spatial import GROUND
-from twoloop.mechanisms.spatial_bodies import SpatialBodies
+from twoloop.bodies.spatial_model import SpatialModel
+from twoloop.mechanisms.momentum import Momentum
+from twoloop.mechanisms.ready import ready_model
 from twoloop.problem.problem import Problem, Reference
 
 GRAVITY = 9.81
@@ -15,13 +15,13 @@ SPIN = np.array([0.0, 150.0, -4.61538])  # rad/s at the start
 
 def heavy_top() -> Problem:
     """The top of the benchmark for Lie-group integrators: its axis initially level, spinning at 150 rad/s."""
-    rows = SpatialBodies((0.0, 0.0, -GRAVITY))
-    position = np.array([0.0, LENGTH, 0.0])
-    body = rows.body("top", MASS, INERTIA, position, np.eye(3), np.cross(SPIN, position), SPIN)
-    rows.spherical(body, GROUND, (0.0, 0.0, 0.0))
-    q0, v0 = rows.start
-    return ready(
-        *(rows, "heavy top", q0, v0, 0.2),
+    model, position = SpatialModel((0.0, 0.0, -GRAVITY), name="heavy top"), np.array([0.0, LENGTH, 0.0])
+    motion = {"velocity": np.cross(SPIN, position), "angular_velocity": SPIN}
+    model.body("top", mass=MASS, inertia=INERTIA, position=position, **motion)
+    model.spherical("top", "ground", at=(0.0, 0.0, 0.0))
+    momentum = Momentum(np.array([[MASS, *INERTIA]]), np.zeros(3), np.array([0.0, 0.0, 1.0]))
+    return ready_model(
+        *(model, 0.2),
         conserved=True,
         parameters={"mass": MASS, "length": LENGTH, "inertia": INERTIA, "spin": tuple(SPIN), "gravity": GRAVITY},
         note="The inertia is about the centre of mass, as in Exudyn's model; some give it about the fixed point.",
@@ -41,6 +41,5 @@ def heavy_top() -> Problem:
             "A mass matrix of rank 6 of 7, and a fast spin beside a slow precession; energy and the angular momentum "
             "about the vertical are kept by the true motion."
         ),
-        invariants={"vertical angular momentum (kg m^2/s)": rows.momentum((0.0, 0.0, 0.0), (0.0, 0.0, 1.0))},
-        coordinates=rows.coordinates,
+        invariants={"vertical angular momentum (kg m^2/s)": momentum},
     )

@@ -8,9 +8,8 @@ import math
 
 import numpy as np
 
-from twoloop.mechanisms.ready import ready
-from twoloop.mechanisms.spatial import GROUND
-from twoloop.mechanisms.spatial_bodies import SpatialBodies
+from twoloop.bodies.spatial_model import SpatialModel
+from twoloop.mechanisms.ready import ready_model
 from twoloop.problem.problem import Array, Problem
 
 GRAVITY = 9.81  # m/s^2, along -z
@@ -49,28 +48,20 @@ def spatial_four_bar() -> Problem:
     length = float(np.linalg.norm(bar))
     spin = np.cross(bar, S_v - P_v) / length**2  # no rotation about its own axis
     up, y = np.array([0.0, 0.0, 1.0]), np.array([0.0, 1.0, 0.0])
-    rows = SpatialBodies((0.0, 0.0, -GRAVITY))
-    m = MASSES
-    crank = rows.body("crank", m["crank"], inertia(m["crank"], CRANK), 0.5 * P, frame(P, up), 0.5 * P_v, RATE * up)
-    coupler = rows.body(
-        "coupler", m["coupler"], inertia(m["coupler"], length), 0.5 * (P + S), frame(bar, y), 0.5 * (P_v + S_v), spin
-    )
-    rocker = rows.body(
-        "rocker",
-        m["rocker"],
-        inertia(m["rocker"], ROCKER),
-        D + 0.5 * arm,
-        frame(arm, y),
-        0.5 * S_v,
-        -phi_rate * y,  # from x towards z is negative about y
-    )
-    rows.revolute(crank, GROUND, (0.0, 0.0, 0.0), up)
-    rows.spherical(coupler, crank, P)
-    rows.spherical(rocker, coupler, S)
-    rows.revolute(rocker, GROUND, D, y)
-    q0, v0 = rows.start
-    return ready(
-        *(rows, "spatial four-bar", q0, v0, 2.0),
+    model = SpatialModel((0.0, 0.0, -GRAVITY), name="spatial four-bar")
+    for name, long, place, turned, velocity, rate in (
+        ("crank", CRANK, 0.5 * P, frame(P, up), 0.5 * P_v, RATE * up),
+        ("coupler", length, 0.5 * (P + S), frame(bar, y), 0.5 * (P_v + S_v), spin),
+        ("rocker", ROCKER, D + 0.5 * arm, frame(arm, y), 0.5 * S_v, -phi_rate * y),  # from x to z is negative about y
+    ):
+        pose = {"position": place, "rotation": turned, "velocity": velocity, "angular_velocity": rate}
+        model.body(name, mass=MASSES[name], inertia=inertia(MASSES[name], long), **pose)
+    model.revolute("crank", "ground", at=(0.0, 0.0, 0.0), axis=up)
+    model.spherical("coupler", "crank", at=P)
+    model.spherical("rocker", "coupler", at=S)
+    model.revolute("rocker", "ground", at=D, axis=y)
+    return ready_model(
+        *(model, 2.0),
         conserved=True,
         parameters={"crank": CRANK, "coupler": length, "rocker": ROCKER, "D": tuple(D), "masses": MASSES},
         note="Dimensions and start were chosen for this project.",
@@ -80,5 +71,4 @@ def spatial_four_bar() -> Problem:
             "A spatial loop by Euler parameters, 21 coordinates and 19 constraints, with a singular mass matrix and a "
             "freedom, the coupler's turn about its axis, that nothing else feels."
         ),
-        coordinates=rows.coordinates,
     )

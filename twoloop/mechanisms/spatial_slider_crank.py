@@ -4,9 +4,8 @@ import math
 
 import numpy as np
 
-from twoloop.mechanisms.ready import ready
-from twoloop.mechanisms.spatial import GROUND
-from twoloop.mechanisms.spatial_bodies import SpatialBodies
+from twoloop.bodies.spatial_model import SpatialModel
+from twoloop.mechanisms.ready import ready_model
 from twoloop.problem.problem import Problem
 
 GRAVITY = 9.81  # m/s^2, along -z
@@ -33,17 +32,20 @@ def spatial_slider_crank() -> Problem:
     turn = np.cross(rod, C_v - B_v) / ROD**2
     normal = np.cross(cross, x)
     spin = turn - (turn @ normal) / (along @ normal) * along
-    rows = SpatialBodies((0.0, 0.0, -GRAVITY))
-    crank = rows.body("crank", MASSES["crank"], INERTIAS["crank"], A + 0.5 * up, np.eye(3), 0.5 * B_v, RATE * x)
-    bar = rows.body("rod", MASSES["rod"], INERTIAS["rod"], 0.5 * (B + C), R, 0.5 * (B_v + C_v), spin)
-    slider = rows.body("slider", MASSES["slider"], INERTIAS["slider"], C, np.eye(3), C_v)
-    rows.revolute(crank, GROUND, A, x)
-    rows.spherical(bar, crank, B)
-    rows.universal(bar, slider, C, cross, x)
-    rows.prismatic(GROUND, slider, (0.0, 0.0, 0.0), x)
-    q0, v0 = rows.start
-    return ready(
-        *(rows, "spatial slider-crank", q0, v0, 5.0),
+    model = SpatialModel((0.0, 0.0, -GRAVITY), name="spatial slider-crank")
+    for name, place, turned, velocity, rate in (
+        ("crank", A + 0.5 * up, np.eye(3), 0.5 * B_v, RATE * x),
+        ("rod", 0.5 * (B + C), R, 0.5 * (B_v + C_v), spin),
+        ("slider", C, np.eye(3), C_v, 0.0 * x),
+    ):
+        pose = {"position": place, "rotation": turned, "velocity": velocity, "angular_velocity": rate}
+        model.body(name, mass=MASSES[name], inertia=INERTIAS[name], **pose)
+    model.revolute("crank", "ground", at=A, axis=x)
+    model.spherical("rod", "crank", at=B)
+    model.universal("rod", "slider", at=C, axes=(cross, x))
+    model.prismatic("ground", "slider", at=(0.0, 0.0, 0.0), axis=x)
+    return ready_model(
+        *(model, 5.0),
         conserved=True,
         parameters={"crank": CRANK, "rod": ROD, "A": tuple(A), "masses": MASSES, "inertias": INERTIAS},
         note=(
@@ -56,5 +58,4 @@ def spatial_slider_crank() -> Problem:
         ),
         tags=("closed chain", "rigid", "spatial"),
         purpose="A spatial loop with four kinds of joint and one degree of freedom, by Euler parameters.",
-        coordinates=rows.coordinates,
     )

@@ -305,8 +305,12 @@ def watch(function: Callable[..., Any]) -> tuple[str, str] | None:
 
 
 def helper(function: Callable[..., Any]) -> Any:
-    """A decorator for what compiled callbacks call: numba's, with our cache."""
-    dispatcher = njit(function)
+    """A decorator for what compiled callbacks call: numba's, with our cache.
+
+    Such a function allocates nothing, so that it needs no numba runtime, whose counts of references to arrays take
+    longer than a row of C_q.
+    """
+    dispatcher = njit(_nrt=False, error_model="numpy")(function)
     dispatcher.enable_caching()
     _take_over(dispatcher)
     return dispatcher

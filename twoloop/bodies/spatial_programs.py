@@ -1,0 +1,57 @@
+"""Callbacks of spatial models with motions or forces that are functions, whose programs stand in p."""
+
+import numpy as np
+
+from twoloop.bodies.function_rows import fill_nonholonomic, fill_nonholonomic_gamma
+from twoloop.bodies.parameter_layout import FORCE_PROGRAM, MOTION_PROGRAM
+from twoloop.bodies.read_tables import made_by
+from twoloop.bodies.spatial_callbacks import (
+    fill_constraint,
+    fill_force,
+    fill_gamma,
+    fill_jacobian,
+    fill_rate,
+    fill_values,
+)
+from twoloop.kernels.compile.callbacks import callback
+
+
+@callback("force")
+def force(t, q, v, p, Q):
+    fill_force(q, v, p, made_by(FORCE_PROGRAM, t, q, v, p), Q)
+
+
+@callback("constraint")
+def constraint(t, q, p, C):
+    fill_constraint(q, p, made_by(MOTION_PROGRAM, t, q, q, p), C)
+
+
+@callback("jacobian")
+def jacobian(t, q, p, Cq):
+    fill_jacobian(q, p, made_by(MOTION_PROGRAM, t, q, q, p), Cq)
+
+
+@callback("jacobian_values")
+def jacobian_values(t, q, p, values):
+    rows = np.zeros((3, q.size), dtype=q.dtype)
+    fill_values(q, p, made_by(MOTION_PROGRAM, t, q, q, p), rows, values)
+
+
+@callback("constraint_rate")
+def constraint_rate(t, q, p, Ct):
+    fill_rate(q, p, made_by(MOTION_PROGRAM, t, q, q, p), Ct)
+
+
+@callback("gamma")
+def gamma(t, q, v, p, Qd):
+    fill_gamma(q, v, p, made_by(MOTION_PROGRAM, t, q, v, p), Qd)
+
+
+@callback("nonholonomic")
+def nonholonomic(t, q, p, A):
+    fill_nonholonomic(p, made_by(MOTION_PROGRAM, t, q, q, p), A)
+
+
+@callback("nonholonomic_gamma")
+def nonholonomic_gamma(t, q, v, p, Qa):
+    fill_nonholonomic_gamma(p, made_by(MOTION_PROGRAM, t, q, v, p), Qa)
