@@ -271,3 +271,24 @@ def test_a_ball_that_does_not_reach_a_ceiling_does_not_hit_it():
     speed = np.sqrt(2.0 * GRAVITY * (0.437 - 1e-8))
     result = solve_with_stops(system, (0.0, 1.0), [0.0], [speed], Stop(lambda t, q: 0.437 - q[0], 0.5), **TIGHT)
     assert result.success and not result.impacts and abs(result.v[0, -1] - speed + GRAVITY) < 1e-8
+
+
+def test_two_stops_on_one_side_of_which_one_moves():
+    """The stop whose rebound is the faster one hits, also where the other closes at another rate."""
+    stops = [
+        Stop(lambda t, q: -q[0] + 0.5 * t, restitution=1.0, name="moving"),
+        Stop(lambda t, q: -q[0], restitution=0.5, name="fixed"),
+    ]
+    free = ConstrainedSystem.from_python(n_q=1, n_c=0, mass=np.eye(1), force=lambda t, q, v: np.zeros(1))
+    result = solve_with_stops(free, (0.0, 1.0), [0.0], [1.0], stops)
+    assert result.success and [impact.stops for impact in result.impacts] == [("fixed",)]
+    np.testing.assert_allclose(result.q[0, -1], -0.5)
+
+
+def test_two_stops_that_close_on_a_body_end_the_run():
+    """The wall on the right leaves the body on the floor on the left, and comes back."""
+    stops = [Stop(lambda t, q: q[0], name="left"), Stop(lambda t, q: -q[0] - 0.1 * t * (t - 0.2), name="right")]
+    pushed = ConstrainedSystem.from_python(n_q=1, n_c=0, mass=np.eye(1), force=lambda t, q, v: -np.ones(1))
+    result = solve_with_stops(pushed, (0.0, 1.0), [0.0], [0.0], stops, time_limit=20.0)
+    assert result.status == Status.STAGNATED and "push against each other" in result.message
+    np.testing.assert_allclose(result.t[-1], 0.2)

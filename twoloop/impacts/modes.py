@@ -76,7 +76,14 @@ class Motion:
             except Undetermined as error:
                 if not self.arcs:
                     raise
-                return joined(self.system, self.arcs, self.impacts, times, f"Stopped: {error}", self._summary)
+                return joined(
+                    self.system,
+                    self.arcs,
+                    self.impacts,
+                    times,
+                    f"Stopped at t = {self.t:.10g}: {error}.",
+                    self._summary,
+                )
             last = self.arcs[-1]
             if last.status != Status.EVENT or self.t >= t1:
                 return joined(self.system, self.arcs, self.impacts, times, "", self._summary)
@@ -86,7 +93,7 @@ class Motion:
                 of = f" ({', '.join(map(repr, names))})" if names else ""
                 said = (
                     f"Stopped at t = {self.t:.10g}: {stalled} impacts or other changes in a row at this time{of}. "
-                    "Look for stops that push against each other, or loosen atol"
+                    "Look for stops that push against each other, or loosen atol."
                 )
                 return joined(self.system, self.arcs, self.impacts, times, said, self._summary)
 
@@ -328,7 +335,7 @@ class Motion:
         """Return the event of friction that is exceeded, from what is needed and there; all of it may slip at once."""
         needed, most = grips(self.t, self.q, self.v)
         if abs(needed) > (1.0 + RELEASED) * most:
-            raise Undetermined(f"at t = {self.t:.10g} friction of {abs(needed):.10g} is needed, but it has {most:.10g}")
+            raise Undetermined(f"friction of {abs(needed):.10g} is needed, but it has {most:.10g}")
         room = max(1.0, abs(needed) / most) * (1.0 + AT_MOST) if abs(needed) > (1.0 - AT_MOST) * most else 1.0
 
         def left(t: float, q: Array, v: Array) -> float:
