@@ -49,8 +49,8 @@ def complementary(D: Array, b: Array) -> Array:
     if not len(b):
         return np.zeros(0)
     x = nnls(*_squares(D, b))[0]
-    held = x > 0.0
-    x[held] = np.linalg.lstsq(D[np.ix_(held, held)], -b[held], rcond=NEGLIGIBLE)[0]
+    active = x > 0.0
+    x[active] = np.linalg.lstsq(D[np.ix_(active, active)], -b[active], rcond=NEGLIGIBLE)[0]
     return np.maximum(x, 0.0)
 
 
@@ -77,6 +77,11 @@ def bounded(D: Array, c: Array, n: int, most: Array) -> Array:
     return np.asarray(unit * np.clip(x, *limits))
 
 
+def held(D: Array, c: Array, n: int, most: Array) -> Array:
+    """Return forces of n stops, and of joints that friction of at most `most` holds, for free accelerations c."""
+    return bounded(D, c, n, most) if len(most) else complementary(D, c)
+
+
 def coulomb(D: Array, c: Array, most: Array, rubs: Rubs) -> tuple[Array, NDArray[np.int64]]:
     """Return forces at stops, in joints at rest, and at stops that rub; and the directions in which the latter slide.
 
@@ -95,7 +100,7 @@ def coulomb(D: Array, c: Array, most: Array, rubs: Rubs) -> tuple[Array, NDArray
         new[rub] = -rubs.sign * load
         right, bounds = (c + D @ new)[kept], np.append(most, load[~moving])
         inner = D[np.ix_(kept, kept)]
-        new[kept] = bounded(inner, right, n, bounds) if len(bounds) else complementary(inner, right)
+        new[kept] = held(inner, right, n, bounds)
         change, x = np.abs(new - x).max(), new
         if change <= AGREES * np.abs(x).max() + least:
             break

@@ -14,7 +14,7 @@ from twoloop.impacts.contact import Accelerations, WithContacts
 from twoloop.impacts.gaps import Gap, Gaps
 from twoloop.impacts.grip import AT_REST, Grip, Mode
 from twoloop.impacts.joined import Impact, joined
-from twoloop.impacts.laws import NEGLIGIBLE, Undetermined, bounded, coulomb, impulses, responses
+from twoloop.impacts.laws import NEGLIGIBLE, Undetermined, coulomb, held, impulses, responses
 from twoloop.impacts.rubbing import IDLE, INDEPENDENT, STICKS, Modes, Signs
 from twoloop.problem.stops import Stop
 from twoloop.problem.system import ConstrainedSystem
@@ -25,6 +25,7 @@ from twoloop.solve import solve_dae
 
 LOW = 0.01  # relative to the absolute tolerance: a rebound below this height ends in contact
 SAMPLES = 2000  # smallest number of evaluations of the gaps over a motion
+CLOSED = 1e3  # squares of rates, over this height and the accelerations, of stops that may press one another
 ROUNDING = 1e-13  # relative to max(1, |q|)
 LEAST_STEP = 1e-9  # first step of an arc, relative to max(1 s, t)
 ZERO = 1e-20  # m or rad, or per s: smaller coordinates and rates are rounding errors
@@ -87,7 +88,7 @@ class Motion:
             last = self.arcs[-1]
             if last.status != Status.EVENT or self.t >= t1:
                 return joined(self.system, self.arcs, self.impacts, times, "", self._summary)
-            stalled = stalled + 1 if self.t - before <= STALLED * max(1.0, abs(self.t)) else 0
+            stalled = stalled + 1 if self._at_once(before) else 0
             if stalled == MAX_STALLED:
                 names = dict.fromkeys(name for impact in self.impacts[-9:] for name in impact.stops)
                 of = f" ({', '.join(map(repr, names))})" if names else ""
@@ -96,6 +97,9 @@ class Motion:
                     "Look for stops that push against each other, or loosen atol."
                 )
                 return joined(self.system, self.arcs, self.impacts, times, said, self._summary)
+
+    def _at_once(self, before: float) -> bool:
+        return self.t - before <= STALLED * max(1.0, abs(self.t))
 
     @property
     def _summary(self) -> str:
@@ -179,18 +183,19 @@ class Motion:
         return slow
 
     def _hardly_open(self, near: NDArray[np.int64], v: Array) -> NDArray[np.bool_]:
-        """Return which stops would rebound by less than the relevant height."""
+        """Return which stops would rebound by less than the relevant height, pressed together by the others."""
         signs, of = self._sliding(v)
-        a, c = self._free(signs, of, v)
-        if of:
-            W = self.modes.along(self.q)[of]
-            X = responses(self.system, self.t, self.q, W)
-            a = a + X @ bounded(W @ X, c, 0, self._most(of))
+        a, c_rubs = self._free(signs, of, v)
         gap = self.gaps.at(self.t, self.q, v)
-        c, u = (gap.W @ a + gap.bend)[near], gap.u[near]
-        return np.asarray(
-            u * np.abs(u) <= 2.0 * self.low * np.maximum(-c, 0.0) + ROUNDING * np.abs(v).max() ** 2, dtype=bool
-        )
+        u, c = gap.u[near], gap.W[near] @ a + gap.bend[near]
+        rounding = ROUNDING * np.abs(v).max() ** 2
+        touch = u * np.abs(u) <= CLOSED * self.low * np.abs(c).max() + rounding
+        W = np.vstack([gap.W[near[touch]], self.modes.along(self.q)[of]])
+        D, n = W @ responses(self.system, self.t, self.q, W), int(touch.sum())
+        force = held(D, np.append(c[touch], c_rubs), n, self._most(of))
+        press = np.zeros(len(near))
+        press[touch] = (D.diagonal() * force)[:n]
+        return np.asarray(u * np.abs(u) <= 2.0 * self.low * press + rounding, dtype=bool)
 
     def _sliding(self, v: Array) -> tuple[Signs, list[int]]:
         """Return the sliding direction of each joint, and the joints at rest."""
@@ -272,11 +277,14 @@ class Motion:
         self.arcs.append(arc)
         if arc.t.size:
             self.speeds = np.abs(arc.v).max(axis=1)
-            self.t, self.q, self.v = float(arc.t[-1]), arc.q[:, -1].copy(), arc.v[:, -1].copy()
+            before, self.t = self.t, float(arc.t[-1])
+            if not self._at_once(before):  # else parallel stops take over from one another, with forces of rounding
+                self.opened = []
+            self.q, self.v = arc.q[:, -1].copy(), arc.v[:, -1].copy()
         over = {k for k in range(len(events)) if arc.t_events is not None and arc.t_events[k].size}
         self.grip.change(mode, {k for i, k in enumerate([*mode.slips, *mode.sticks], n) if i in over})
         n = len(signs)
-        self.opened = [k for k in resting if n + k in over]
+        self.opened += [k for k in resting if n + k in over]
         self.released = {k for k in over if k < n and signs[k] == STICKS}
         self.still = {k for k in range(n) if (not signs[k]) != (k in over)}
 
