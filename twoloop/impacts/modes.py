@@ -24,7 +24,7 @@ from twoloop.run.record import Status
 from twoloop.solve import solve_dae
 
 LOW = 0.01  # relative to the absolute tolerance: a rebound below this height ends in contact
-SAMPLES = 2000  # smallest number of evaluations of the gaps over a motion
+SAMPLES = 2000  # smallest number of evaluations of gaps, forces and rates of sliding over a motion
 CLOSED = 1e3  # squares of rates, over this height and the accelerations, of stops that may press one another
 ROUNDING = 1e-13  # relative to max(1, |q|)
 LEAST_STEP = 1e-9  # first step of an arc, relative to max(1 s, t)
@@ -269,6 +269,8 @@ class Motion:
         events += [terminal(self._rests(k, sign)) for k, sign in mode.slips.items()]
         for row, group in enumerate(mode.sticks.values(), free.n_c + len(resting)):
             events.append(terminal(self._slips(partial(grips, row, group))))
+        for event in events:
+            event.every = self.every
         options = {**self.options, "check_derivatives": self.options.get("check_derivatives", True) and not self.arcs}
         if self.arcs and self.options.get("first_step") is None and self.arcs[-1].h.size:
             least = LEAST_STEP * max(1.0, abs(self.t))  # coordinates near zero have no scale for an initial step
@@ -315,7 +317,7 @@ class Motion:
             return g - min(g0, 0.0) + low
 
         event = terminal(closes)
-        event.every, event.gap_rate = self.every, lambda t, q, v: float(self.gaps.at(t, q, v).u[k])
+        event.gap_rate = lambda t, q, v: float(self.gaps.at(t, q, v).u[k])
         return event
 
     def _changes(self, k: int, sign: int | None, friction: Any) -> Any:
