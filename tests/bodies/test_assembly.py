@@ -304,3 +304,16 @@ def test_a_spring_without_length_has_force_where_its_ends_meet():
     np.testing.assert_allclose(result.q[0], 1.5 * np.sin(2.0 * result.t), atol=1e-8)
     assert problem.freedom.degrees == 3 and problem.conserved
     np.testing.assert_allclose(problem.energy(result.t, result.q, result.v), 9.0, atol=1e-8)
+
+
+@pytest.mark.parametrize("on", [("belt",) * 2, ("belt",) * 3, ("belt", "belt", "ground")])
+def test_bodies_that_are_given_at_rest_on_one_that_is_driven(on):
+    """What is left of zero velocities is the rounding of the speed of the drive."""
+    model = PlanarModel((0.0, 0.0))
+    model.body("belt", mass=1.0, inertia=1.0, position=(0.0, -1.0))
+    model.drive(model.prismatic("ground", "belt", at=(0.0, -1.0), axis=(1.0, 0.0)), lambda t: 0.3 * t)
+    for k, name in enumerate(on):
+        model.body(f"block {k}", mass=1.5, inertia=1.0, position=(0.0, float(k)), velocity=(0.0, 0.0))
+        model.prismatic(name, f"block {k}", at=(0.0, float(k)), axis=(1.0, 0.0))
+    v0 = model.problem().v0
+    np.testing.assert_allclose(v0, 0.3 * np.eye(len(v0))[0], atol=1e-15)

@@ -198,3 +198,16 @@ def test_what_the_problem_says_of_dry_friction():
     problem = rotor(1.0)
     assert "solve_with_friction handles its dry friction" in problem.note and not problem.conserved
     assert not any("friction" in name for name in problem.parameters)
+
+
+def test_a_short_push_releases_a_joint_that_sticks():
+    """For a two-hundredth of the run friction is exceeded, by little, while nothing else moves."""
+    model = PlanarModel((0.0, 0.0))
+    model.body("block", mass=1.0, inertia=1.0, position=(0.0, 0.0))
+    guide = model.prismatic("ground", "block", at=(0.0, 0.0), axis=(1.0, 0.0))
+    model.dry_friction(guide, 1.0)
+    model.motor(guide, lambda t: 0.5 + 0.6 * np.exp(-(((t - 5.0) / 0.05) ** 2)))
+    result = solve_with_friction(model.problem((0.0, 10.0)), **TIGHT)
+    start = 5.0 - 0.05 * np.sqrt(np.log(1.2))
+    assert result.success and changes(result)[0] == pytest.approx(start, abs=1e-8)
+    assert result.q[0, -1] == pytest.approx(1.0476e-4, rel=1e-4)

@@ -271,3 +271,53 @@ def test_a_ball_that_does_not_reach_a_ceiling_does_not_hit_it():
     speed = np.sqrt(2.0 * GRAVITY * (0.437 - 1e-8))
     result = solve_with_stops(system, (0.0, 1.0), [0.0], [speed], Stop(lambda t, q: 0.437 - q[0], 0.5), **TIGHT)
     assert result.success and not result.impacts and abs(result.v[0, -1] - speed + GRAVITY) < 1e-8
+
+
+def test_two_stops_on_one_side_of_which_one_moves():
+    """The stop whose rebound is the faster one hits, also where the other closes at another rate."""
+    stops = [
+        Stop(lambda t, q: -q[0] + 0.5 * t, restitution=1.0, name="moving"),
+        Stop(lambda t, q: -q[0], restitution=0.5, name="fixed"),
+    ]
+    free = ConstrainedSystem.from_python(n_q=1, n_c=0, mass=np.eye(1), force=lambda t, q, v: np.zeros(1))
+    result = solve_with_stops(free, (0.0, 1.0), [0.0], [1.0], stops)
+    assert result.success and [impact.stops for impact in result.impacts] == [("fixed",)]
+    np.testing.assert_allclose(result.q[0, -1], -0.5)
+
+
+def test_two_stops_that_close_on_a_body_end_the_run():
+    """The wall on the right leaves the body on the floor on the left, and comes back."""
+    stops = [Stop(lambda t, q: q[0], name="left"), Stop(lambda t, q: -q[0] - 0.1 * t * (t - 0.2), name="right")]
+    pushed = ConstrainedSystem.from_python(n_q=1, n_c=0, mass=np.eye(1), force=lambda t, q, v: -np.ones(1))
+    result = solve_with_stops(pushed, (0.0, 1.0), [0.0], [0.0], stops, time_limit=20.0)
+    assert result.status == Status.STAGNATED and "push against each other" in result.message
+    np.testing.assert_allclose(result.t[-1], 0.2)
+
+
+def test_parallel_stops_let_go_at_once():
+    """Both hold the same coordinate; none takes over the force of the other, which is zero but for rounding."""
+    for seed in range(6):
+        mass, k, lift, rate, phase = np.random.default_rng(seed).uniform([1, 1, 12, 2, 0], [3, 9, 20, 4, 1])
+
+        def force(t, q, v, k=k, lift=lift, rate=rate, phase=phase):
+            return np.array([-10.0 + lift * np.sin(rate * t + phase) - k * (q[0] - 0.1)])
+
+        lifted = ConstrainedSystem.from_python(n_q=1, n_c=0, mass=np.diag([mass]), force=force)
+        stops = [Stop(lambda t, q: q[0], name="one"), Stop(lambda t, q: 3.0 * q[0], name="other")]
+        result = solve_with_stops(lifted, (0.0, 0.9), [0.0], [0.0], stops)
+        assert result.success, result.message
+        alone = solve_with_stops(lifted, (0.0, 0.9), [0.0], [0.0], stops[0])
+        np.testing.assert_allclose(result.q[:, -1], alone.q[:, -1], atol=1e-8)
+
+
+def test_rebounds_from_a_wall_towards_which_another_turns_the_load_die_out():
+    """Without the wall on the left, the load would lift the body off the slope."""
+    pressed = ConstrainedSystem.from_python(n_q=2, n_c=0, mass=np.eye(2), force=lambda t, q, v: np.array([-6.0, -1.0]))
+    groove = [
+        Stop(lambda t, q: q[0], name="wall"),
+        Stop(lambda t, q: 0.8 * q[1] - 0.6 * q[0], restitution=0.5, name="slope"),
+    ]
+    result = solve_with_stops(pressed, (0.0, 3.0), [0.0, 0.1], [0.0, 0.0], groove, time_limit=20.0)
+    assert result.success and np.abs(result.q[:, -1]).max() < 1e-9, result.message
+    times = [impact.t for impact in result.impacts]
+    assert len(times) < 40 and times[-1] == pytest.approx(np.sqrt(0.2) * (1.0 + 0.5) / (1.0 - 0.5), abs=1e-4)

@@ -206,7 +206,7 @@ def velocities(
         inert = free.T @ mass @ free
         v = v - free @ np.linalg.lstsq(inert, free.T @ (mass @ v), rcond=SINGULAR)[0]
     off = np.where(known, np.abs(v - target), 0.0)
-    if off.max(initial=0.0) > VELOCITY_CHANGE * size:
+    if off.max(initial=0.0) > max(VELOCITY_CHANGE * size, SINGULAR * speed):
         j = int(off.argmax())
         name, unit = name_and_unit(coordinates[j])
         raise ValueError(

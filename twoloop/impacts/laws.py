@@ -17,6 +17,8 @@ WEIGHT = 1e3  # scales the problem so that its gradients exceed the tolerance of
 MOST_STEPS = 1000  # iterations of the solver
 MOST_LOADS = 200  # fixed-point iterations of the loads that bound the friction ...
 AGREES = 1e-10  # ... until they change by less, relative to the largest
+OUTSIDE = 1e-9  # relative: smallest part of rates and accelerations outside the range of D; smaller ones are rounding
+FITS = 1e-6  # relative: largest rate or acceleration at which a stop may still close
 SLIDES = 1e-9  # relative to the terms of an acceleration: smaller ones are none
 
 
@@ -47,8 +49,8 @@ def complementary(D: Array, b: Array) -> Array:
     if not len(b):
         return np.zeros(0)
     x = nnls(*_squares(D, b))[0]
-    held = x > 0.0
-    x[held] = np.linalg.lstsq(D[np.ix_(held, held)], -b[held], rcond=NEGLIGIBLE)[0]
+    active = x > 0.0
+    x[active] = np.linalg.lstsq(D[np.ix_(active, active)], -b[active], rcond=NEGLIGIBLE)[0]
     return np.maximum(x, 0.0)
 
 
@@ -68,9 +70,16 @@ def bounded(D: Array, c: Array, n: int, most: Array) -> Array:
     even[:, n:] = np.diag(EVEN * np.sqrt(bound.min() / bound))
     matrix, right = np.vstack([B / size, even]), np.append(y / (size * unit), 0.0 * most)
     limits = np.append(np.zeros(n), -bound), np.append(np.full(n, np.inf), bound)
-    return np.asarray(
-        unit * lsq_linear(WEIGHT * matrix, WEIGHT * right, limits, "bvls", tol=1e-14, max_iter=MOST_STEPS).x
-    )
+    found = lsq_linear(WEIGHT * matrix, WEIGHT * right, limits, "bvls", tol=1e-14, max_iter=MOST_STEPS)
+    x, free = found.x, found.active_mask == 0
+    left = (D @ x + c / unit)[free]  # by the small weight
+    x[free] -= np.linalg.lstsq(D[np.ix_(free, free)], left, rcond=NEGLIGIBLE)[0]
+    return np.asarray(unit * np.clip(x, *limits))
+
+
+def held(D: Array, c: Array, n: int, most: Array) -> Array:
+    """Return forces of n stops, and of joints that friction of at most `most` holds, for free accelerations c."""
+    return bounded(D, c, n, most) if len(most) else complementary(D, c)
 
 
 def coulomb(D: Array, c: Array, most: Array, rubs: Rubs) -> tuple[Array, NDArray[np.int64]]:
@@ -91,13 +100,15 @@ def coulomb(D: Array, c: Array, most: Array, rubs: Rubs) -> tuple[Array, NDArray
         new[rub] = -rubs.sign * load
         right, bounds = (c + D @ new)[kept], np.append(most, load[~moving])
         inner = D[np.ix_(kept, kept)]
-        new[kept] = bounded(inner, right, n, bounds) if len(bounds) else complementary(inner, right)
+        new[kept] = held(inner, right, n, bounds)
         change, x = np.abs(new - x).max(), new
         if change <= AGREES * np.abs(x).max() + least:
             break
     else:
         raise Undetermined("friction of stops is so large that their forces are not determined: they may jam")
     left, terms = D @ x + c, np.abs(D) @ np.abs(x) + np.abs(c)
+    if left[:n].min(initial=0.0) < -FITS * np.abs(c).max(initial=0.0):
+        raise Undetermined("stops push against each other: no motion opens all of them or keeps them closed")
     slides = np.where(moving, rubs.sign, np.sign(left[rub]) * (np.abs(left[rub]) > SLIDES * terms[rub])).astype(int)
     return (_solved(D, c, x, n, Rubs(rubs.normal, rubs.coefficient, slides)) if n_rubs else x), slides
 
@@ -123,11 +134,16 @@ def _solved(D: Array, c: Array, x: Array, n: int, rubs: Rubs) -> Array:
 
 
 def _squares(D: Array, b: Array) -> tuple[Array, Array]:
-    """Return B and y with B^T B = D and B^T y = -b."""
+    """Return B and y with B^T B = D and B^T y = -b.
+
+    Where rows of stops depend on one another, b may have a part outside the range of D: of parallel stops, which close
+    at different rates. B has a small row for it.
+    """
     values, vectors = np.linalg.eigh(0.5 * (D + D.T))
-    kept = values > NEGLIGIBLE * values.max(initial=0.0)
-    roots = np.sqrt(values[kept])
-    return roots[:, None] * vectors[:, kept].T, -(vectors[:, kept].T @ b) / roots
+    along, least = vectors.T @ b, NEGLIGIBLE * values.max(initial=0.0)
+    kept = (values > least) | (np.abs(along) > OUTSIDE * np.abs(b).max(initial=0.0))
+    roots = np.sqrt(np.maximum(values[kept], least))
+    return roots[:, None] * vectors[:, kept].T, -along[kept] / roots
 
 
 def impulses(D: Array, u: Array, restitution: Array, rubs: Rubs) -> Array:

@@ -14,7 +14,7 @@ from twoloop.impacts.contact import Accelerations, WithContacts
 from twoloop.impacts.gaps import Gap, Gaps
 from twoloop.impacts.grip import AT_REST, Grip, Mode
 from twoloop.impacts.joined import Impact, joined
-from twoloop.impacts.laws import NEGLIGIBLE, Undetermined, bounded, coulomb, impulses, responses
+from twoloop.impacts.laws import NEGLIGIBLE, Undetermined, coulomb, held, impulses, responses
 from twoloop.impacts.rubbing import IDLE, INDEPENDENT, STICKS, Modes, Signs
 from twoloop.problem.stops import Stop
 from twoloop.problem.system import ConstrainedSystem
@@ -24,7 +24,8 @@ from twoloop.run.record import Status
 from twoloop.solve import solve_dae
 
 LOW = 0.01  # relative to the absolute tolerance: a rebound below this height ends in contact
-SAMPLES = 2000  # smallest number of evaluations of the gaps over a motion
+SAMPLES = 2000  # smallest number of evaluations of gaps, forces and rates of sliding over a motion
+CLOSED = 1e3  # squares of rates, over this height and the accelerations, of stops that may press one another
 ROUNDING = 1e-13  # relative to max(1, |q|)
 LEAST_STEP = 1e-9  # first step of an arc, relative to max(1 s, t)
 ZERO = 1e-20  # m or rad, or per s: smaller coordinates and rates are rounding errors
@@ -76,19 +77,29 @@ class Motion:
             except Undetermined as error:
                 if not self.arcs:
                     raise
-                return joined(self.system, self.arcs, self.impacts, times, f"Stopped: {error}", self._summary)
+                return joined(
+                    self.system,
+                    self.arcs,
+                    self.impacts,
+                    times,
+                    f"Stopped at t = {self.t:.10g}: {error}.",
+                    self._summary,
+                )
             last = self.arcs[-1]
             if last.status != Status.EVENT or self.t >= t1:
                 return joined(self.system, self.arcs, self.impacts, times, "", self._summary)
-            stalled = stalled + 1 if self.t - before <= STALLED * max(1.0, abs(self.t)) else 0
+            stalled = stalled + 1 if self._at_once(before) else 0
             if stalled == MAX_STALLED:
                 names = dict.fromkeys(name for impact in self.impacts[-9:] for name in impact.stops)
                 of = f" ({', '.join(map(repr, names))})" if names else ""
                 said = (
                     f"Stopped at t = {self.t:.10g}: {stalled} impacts or other changes in a row at this time{of}. "
-                    "Look for stops that push against each other, or loosen atol"
+                    "Look for stops that push against each other, or loosen atol."
                 )
                 return joined(self.system, self.arcs, self.impacts, times, said, self._summary)
+
+    def _at_once(self, before: float) -> bool:
+        return self.t - before <= STALLED * max(1.0, abs(self.t))
 
     @property
     def _summary(self) -> str:
@@ -172,18 +183,19 @@ class Motion:
         return slow
 
     def _hardly_open(self, near: NDArray[np.int64], v: Array) -> NDArray[np.bool_]:
-        """Return which stops would rebound by less than the relevant height."""
+        """Return which stops would rebound by less than the relevant height, pressed together by the others."""
         signs, of = self._sliding(v)
-        a, c = self._free(signs, of, v)
-        if of:
-            W = self.modes.along(self.q)[of]
-            X = responses(self.system, self.t, self.q, W)
-            a = a + X @ bounded(W @ X, c, 0, self._most(of))
+        a, c_rubs = self._free(signs, of, v)
         gap = self.gaps.at(self.t, self.q, v)
-        c, u = (gap.W @ a + gap.bend)[near], gap.u[near]
-        return np.asarray(
-            u * np.abs(u) <= 2.0 * self.low * np.maximum(-c, 0.0) + ROUNDING * np.abs(v).max() ** 2, dtype=bool
-        )
+        u, c = gap.u[near], gap.W[near] @ a + gap.bend[near]
+        rounding = ROUNDING * np.abs(v).max() ** 2
+        touch = u * np.abs(u) <= CLOSED * self.low * np.abs(c).max() + rounding
+        W = np.vstack([gap.W[near[touch]], self.modes.along(self.q)[of]])
+        D, n = W @ responses(self.system, self.t, self.q, W), int(touch.sum())
+        force = held(D, np.append(c[touch], c_rubs), n, self._most(of))
+        press = np.zeros(len(near))
+        press[touch] = (D.diagonal() * force)[:n]
+        return np.asarray(u * np.abs(u) <= 2.0 * self.low * press + rounding, dtype=bool)
 
     def _sliding(self, v: Array) -> tuple[Signs, list[int]]:
         """Return the sliding direction of each joint, and the joints at rest."""
@@ -257,6 +269,8 @@ class Motion:
         events += [terminal(self._rests(k, sign)) for k, sign in mode.slips.items()]
         for row, group in enumerate(mode.sticks.values(), free.n_c + len(resting)):
             events.append(terminal(self._slips(partial(grips, row, group))))
+        for event in events:
+            event.every = self.every
         options = {**self.options, "check_derivatives": self.options.get("check_derivatives", True) and not self.arcs}
         if self.arcs and self.options.get("first_step") is None and self.arcs[-1].h.size:
             least = LEAST_STEP * max(1.0, abs(self.t))  # coordinates near zero have no scale for an initial step
@@ -265,11 +279,14 @@ class Motion:
         self.arcs.append(arc)
         if arc.t.size:
             self.speeds = np.abs(arc.v).max(axis=1)
-            self.t, self.q, self.v = float(arc.t[-1]), arc.q[:, -1].copy(), arc.v[:, -1].copy()
+            before, self.t = self.t, float(arc.t[-1])
+            if not self._at_once(before):  # else parallel stops take over from one another, with forces of rounding
+                self.opened = []
+            self.q, self.v = arc.q[:, -1].copy(), arc.v[:, -1].copy()
         over = {k for k in range(len(events)) if arc.t_events is not None and arc.t_events[k].size}
         self.grip.change(mode, {k for i, k in enumerate([*mode.slips, *mode.sticks], n) if i in over})
         n = len(signs)
-        self.opened = [k for k in resting if n + k in over]
+        self.opened += [k for k in resting if n + k in over]
         self.released = {k for k in over if k < n and signs[k] == STICKS}
         self.still = {k for k in range(n) if (not signs[k]) != (k in over)}
 
@@ -300,7 +317,7 @@ class Motion:
             return g - min(g0, 0.0) + low
 
         event = terminal(closes)
-        event.every, event.gap_rate = self.every, lambda t, q, v: float(self.gaps.at(t, q, v).u[k])
+        event.gap_rate = lambda t, q, v: float(self.gaps.at(t, q, v).u[k])
         return event
 
     def _changes(self, k: int, sign: int | None, friction: Any) -> Any:
@@ -328,7 +345,7 @@ class Motion:
         """Return the event of friction that is exceeded, from what is needed and there; all of it may slip at once."""
         needed, most = grips(self.t, self.q, self.v)
         if abs(needed) > (1.0 + RELEASED) * most:
-            raise Undetermined(f"at t = {self.t:.10g} friction of {abs(needed):.10g} is needed, but it has {most:.10g}")
+            raise Undetermined(f"friction of {abs(needed):.10g} is needed, but it has {most:.10g}")
         room = max(1.0, abs(needed) / most) * (1.0 + AT_MOST) if abs(needed) > (1.0 - AT_MOST) * most else 1.0
 
         def left(t: float, q: Array, v: Array) -> float:
