@@ -33,7 +33,7 @@ ANOTHER = {  # in a run from another start, which names the redundant rows there
     "andrews": (90, 710),
     "redundant_slider_crank": (140, 1330),
     "heavy_top": (90, 720),
-    "spatial_four_bar": (90, 670),
+    "spatial_four_bar": (90, 780),
     "spatial_slider_crank": (90, 630),
     "closed_chain": (90, 700),
     "bricard": (150, 640),
