@@ -32,7 +32,7 @@ ANOTHER = {  # in a run from another start, which names the redundant rows there
     "four_bar": (90, 840),
     "andrews": (90, 710),
     "redundant_slider_crank": (140, 1330),
-    "heavy_top": (90, 720),
+    "heavy_top": (110, 720),  # whose starts ask for two codes in turn
     "spatial_four_bar": (90, 670),
     "spatial_slider_crank": (90, 630),
     "closed_chain": (90, 700),
