@@ -108,6 +108,21 @@ def test_the_solution_between_the_steps_is_that_of_the_long_way_to_the_bit(name,
             assert np.array_equal(getattr(one(times), kind), getattr(long.sol(times), kind)), kind
 
 
+@pytest.mark.parametrize("name", ["redundant_slider_crank", "heavy_top"])
+@pytest.mark.filterwarnings("ignore::twoloop.ConstraintWarning")
+def test_starts_that_ask_for_other_code_keep_no_arrays_out(name, taken, monkeypatch):
+    problem, other = getattr(mechanisms, name)(), getattr(mechanisms, name)()
+    span = 0.3 * (problem.t_span[1] - problem.t_span[0])
+    solution = solve_dae(problem.system, (0.0, span), problem.q0, problem.v0, dense_output=True).sol
+    states = [solution(t) for t in np.random.default_rng(3).uniform(0.0, span, 60)]
+    by_arrays = runs(problem, states, 0.1)
+    *_, kept = problem.system.made["runs"][1].values()
+    assert len({id(each.code) for each in kept}) > 1 and sum(taken) > 30
+    monkeypatch.setattr(solve, "record_again", lambda *asked: None)
+    for one, long in zip(by_arrays, runs(other, states, 0.1), strict=True):
+        assert_same(one, long)
+
+
 def test_where_series_give_way_to_another_method(taken, monkeypatch):
     problem, other = mechanisms.four_bar(), mechanisms.four_bar()
     states = repeated(starts(problem, 1e-6, 7))

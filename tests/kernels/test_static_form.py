@@ -32,7 +32,7 @@ class Started:
         self.system, self.kit = system, kit_of(system, 0.0, q, None, form)
         ranks = (None, None)
         for _ in range(2):
-            self.work = workspace(system, self.kit, None, q, 1e-8, 0.0, ranks, form)
+            self.work = workspace(system, self.kit, np.zeros((0, 0)), q, 1e-8, 0.0, ranks, form)
             state = np.concatenate([q, v, np.zeros(n + system.n_c)])
             self.code = advance.start(self.kit, self.work, 0.0, state)
             if self.code != codes.RANK_DIFFERS:

@@ -25,7 +25,8 @@ from twoloop.run.workspace import sparse_factors_pay
 
 Array = NDArray[np.float64]
 
-MOST, LARGEST = 16, 100_000  # runs that are kept with a system, and numbers of each
+MOST, LARGEST = 16, 100_000  # what is kept of with a system, for calls that ask for the same; numbers of each run
+MOST_ALIKE = 3  # runs that are kept for such calls, as starts may ask for other code
 
 
 class Kept(NamedTuple):
@@ -54,12 +55,22 @@ def record_again(
 
     None where there are none, or where something has to be looked at: then `run_from` begins it.
     """
-    runs = system.made.get("runs", (None, None))[1]
-    kept: Kept | None = None if runs is None else runs.get(asked.key)
-    if kept is None and (others := system.shared.get("runs")):
+    alike = _runs_of(system)[1].get(asked.key, ())
+    if not alike and (others := system.shared.get("runs")):
         known = others.get((asked.key, _family_of(system)))
-        kept = known if isinstance(known, Kept) else None
-    if kept is None or kept.waiting is None:
+        alike = (known,) if isinstance(known, Kept) else ()
+    for kept in alike:
+        made = _by_arrays_of(kept, system, t0, t1, q0, v0, asked, output)
+        if made is not None:
+            return made
+    return None
+
+
+def _by_arrays_of(
+    kept: Kept, system: ConstrainedSystem, t0: float, t1: float, q0: Array, v0: Array, asked: Asked, output: Output
+) -> tuple[dict[str, Any], str] | None:
+    """The same by the arrays of one of those that are kept."""
+    if kept.waiting is None:
         return None
     if output.dense and (output.between is not None or kept.kin is not None):
         return None  # both have the same states within steps; what belongs to kin takes other parameters
@@ -88,28 +99,35 @@ def run_from(system: ConstrainedSystem, t0: float, t1: float, q0: Array, v0: Arr
     if system.called_in_python:  # what such functions find in their surroundings may change
         return _made(system, t0, t1, q0, v0, asked)[0]
     start, call = (t0, q0.tobytes(), v0.tobytes()), asked.key
-    came_from, runs = system.made.get("runs", (None, None))
-    kept: Kept | None = None if runs is None else runs.get(call)
-    run = None
-    if kept is not None and kept.start == start:
+    came_from, runs, before = _runs_of(system)
+    alike = runs.get(call, ())
+    run, kept = None, next((each for each in alike if each.start == start), None)
+    if kept is not None:
         run, code = kept.run.again(), kept.code
         if kept.t1 != t1:
             asked.set_sizes(run, t1)
-    elif kept is not None and kept.moves:
-        run, code = _moved(kept, system, t0, t1, q0, v0, asked), kept.code
+    for each in alike:
+        if run is None and each.moves:
+            run, kept, code = _moved(each, system, t0, t1, q0, v0, asked), each, each.code
     if run is None:
-        run, code = _made(system, t0, t1, q0, v0, asked)
+        (run, code), kept = _made(system, t0, t1, q0, v0, asked), None
         if run.system is system:
             _keep_for_kin(system, run, code, t1, asked)
-    if runs is None:  # it may be one of many systems, each of which is taken once
-        runs = {}
-    elif kept is None or (came_from == start != kept.start):
+    new = not alike or before == id(code) if kept is None else came_from == start != kept.start
+    if new and came_from is not None:  # it may be one of many systems, each of which is taken once
         made = _kept_of(run, code, t1, asked)
         if made is not None:
             runs = {} if len(runs) == MOST else dict(runs)  # another thread may look at the old one
-            runs[call] = made
-    system.made["runs"] = start, runs
+            runs[call] = made, *[each for each in alike if each is not kept][: MOST_ALIKE - 1]
+    system.made["runs"] = start, runs, id(code) if kept is None else None
     return run
+
+
+def _runs_of(system: ConstrainedSystem) -> tuple[Any, dict[Any, tuple[Kept, ...]], int | None]:
+    """Where the last run began, what is kept of runs, and the code of the last one, if it was not one of these."""
+    nothing: dict[Any, tuple[Kept, ...]] = {}
+    known: tuple[Any, dict[Any, tuple[Kept, ...]], int | None] = system.made.get("runs", (None, nothing, None))
+    return known
 
 
 def _kept_of(run: Run, code: OwnCode | None, t1: float, asked: Asked) -> Kept | None:

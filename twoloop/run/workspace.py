@@ -177,7 +177,8 @@ def made_ready(
     static: StaticForm | None = None,
 ) -> common.Work:
     """A workspace with what a run finds in it, whatever the one before has left."""
-    direct(short_loops().make_ready)(work, *lasting(work), pattern, q0, max(rtol, GAMMA_ACCURACY), reuse)
+    given = map(np.ascontiguousarray, (pattern, q0))
+    direct(short_loops().make_ready)(work, *lasting(work), *given, max(rtol, GAMMA_ACCURACY), reuse)
     if static is not None:
         _fill(work, system, static, q0)
         return work
