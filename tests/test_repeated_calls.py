@@ -29,23 +29,13 @@ from twoloop.run import comparison
 # the next, in a fifth, which uses them, and in a sixth, which begins as that one did
 MANY, FEW, FEWER, FEWEST = 780, 380, 125, 80
 ANOTHER = {  # in a run from another start, which names the redundant rows there, and in one with other parameters
-<<<<<<< HEAD
-    "four_bar": (90, 840),
-    "andrews": (90, 710),
-    "redundant_slider_crank": (140, 1330),
-    "heavy_top": (90, 720),
-    "spatial_four_bar": (90, 780),
-    "spatial_slider_crank": (90, 630),
-    "closed_chain": (90, 700),
-=======
     "four_bar": (95, 840),
     "andrews": (95, 710),
     "redundant_slider_crank": (145, 1330),
     "heavy_top": (115, 720),  # whose starts ask for two codes in turn
-    "spatial_four_bar": (95, 670),
+    "spatial_four_bar": (95, 780),
     "spatial_slider_crank": (95, 630),
     "closed_chain": (95, 700),
->>>>>>> ad1f215d32ed6d012b9cdd2b978c28e4db508dc2
     "bricard": (150, 640),
 }
 AT_ENDS, DENSE = 55, 250  # more where the end alone is wanted, and with the solution between the steps

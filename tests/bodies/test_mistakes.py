@@ -128,3 +128,11 @@ def test_a_model_without_mistakes_has_a_short_note():
 def test_at_least_twenty_kinds_of_mistakes_in_joints_are_caught():
     raised = [case for case in (*BODIES, *IMPACTS) if case.group.startswith(GROUP[:6])]
     assert len(raised) >= 50 and len(ODD) >= 12
+
+
+def test_points_that_coincide_but_for_rounding_have_no_distance():
+    model, knee = SpatialModel(), (0.7, 0.2, 0.1)
+    model.rod("shank", (0.1, 0.3, 0.0), knee, radius=0.02, mass=1.0)
+    model.rod("thigh", knee, (0.4, 0.9, 1.3), radius=0.02, mass=1.0)
+    with pytest.raises(ValueError, match="coincide in the position given"):
+        model.distance("shank", knee, "thigh", knee)

@@ -3,13 +3,14 @@
 Dimensions are published ones where a source is named; masses are chosen here.
 """
 
+import xml.etree.ElementTree as ET
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from tests.bodies.runs import moved
-from twoloop.bodies import PlanarModel, SpatialModel
+from twoloop.bodies import PlanarModel, SpatialModel, from_mjcf
 
 pytestmark = pytest.mark.filterwarnings("ignore::twoloop.ConstraintWarning")  # loops in space
 UNLIKE = ("DOP853", "RadauIIA13")
@@ -215,6 +216,83 @@ def test_a_delta_robot():
     result = agreed(problem, 0.5)
     np.testing.assert_allclose(result.q[3:7], np.repeat([[1.0], [0.0], [0.0], [0.0]], 9, axis=1), atol=1e-9)
     assert np.ptp(result.q[:3], axis=1).max() > 0.01
+
+
+# Agility Robotics' Cassie by the Dynamic Robotics Laboratory of Oregon State University, cassie-mujoco-sim,
+# model/cassie.xml, without armatures, limits and the damping of its ball: parent, place, axes x and y; joint, damping
+# and stiffness; centre of mass, mass, moments xx, yy, zz, xy, xz, yz
+CASSIE = {
+    "hip-roll": (
+        *("pelvis", "0.021 0.135 0", "0 0 -1 0 1 0", "hinge", 1.0, 0.0, "-0.01793 0.0001 -0.04428", 1.82),
+        "0.003431 0.003793 0.002135 -6.65e-07 -0.00084 3.99e-06",
+    ),
+    "hip-yaw": (
+        *("hip-roll", "0 0 -0.07", "0 0 1 0 1 0", "hinge", 1.0, 0.0, "0 -1e-05 -0.034277", 1.171),
+        "0.002443 0.002803 0.000842 -4e-08 2.462e-07 -2.71e-08",
+    ),
+    "hip-pitch": (
+        *("hip-yaw", "0 0 -0.09", "0 0 -1 1 0 0", "hinge", 1.0, 0.0, "0.05946 5e-05 -0.03581", 5.52),
+        "0.010898 0.029714 0.030257 -0.0002669 -5.721e-05 9.17e-06",
+    ),
+    "achilles-rod": (
+        *("hip-pitch", "0 0 0.045", "0.7922 -0.60599 -0.072096 0.60349 0.79547 -0.054922", "ball", 0.0, 0.0),
+        *("0.24719 0 0", 0.1567, "3.754e-06 0.004487 0.004488 -3.74e-08 -1.61e-08 0"),
+    ),
+    "knee": (
+        *("hip-pitch", "0.12 0 0.0045", "0.70711 -0.70711 0 0.70711 0.70711 0", "hinge", 1.0, 0.0),
+        *("0.023 0.03207 -0.002181", 0.7578, "0.001376 0.0010335 0.0021637 -0.00039744 -4.085e-05 -5.374e-05"),
+    ),
+    "knee-spring": (
+        *("knee", "0.06068 0.08241 0", "1 0 0 0 1 0", "", 0.0, 0.0, "0.0836 0.0034 0", 0.186),
+        "5.215e-05 0.00041205 0.0003669 6.87e-06 0 0",
+    ),
+    "shin": (
+        *("knee", "0.06068 0.04741 0", "1 0 0 0 1 0", "hinge", 0.1, 1500.0, "0.18338 0.001169 0.0002123", 0.577),
+        "0.00035939 0.014728 0.014707 -0.00020981 2.266e-05 -1.2e-07",
+    ),
+    "tarsus": (
+        *("shin", "0.43476 0.02 0", "0.52992 0.84805 0 -0.84805 0.52992 0", "hinge", 0.1, 0.0),
+        *("0.11046 -0.03058 -0.00131", 0.782, "0.00039238 0.013595 0.013674 0.00023651 -4.987e-05 -4.82e-06"),
+    ),
+    "heel-spring": (
+        *("tarsus", "-0.01269 -0.03059 0.00092", "-0.91211 0.40829 0.036948 -0.40992 -0.90952 -0.068841", "hinge"),
+        *(0.0, 1250.0, "0.081 0.0022 0", 0.126, "2.959e-05 0.00022231 0.0002007 7.15e-06 -6e-07 1e-07"),
+    ),
+    "foot-crank": (
+        *("tarsus", "0.058 -0.034 0.02275", "1 0 0 0 1 0", "hinge", 1.0, 0.0, "0.00493 2e-05 -0.00215", 0.1261),
+        "2.6941e-05 4.9621e-05 6.3362e-05 -2.1e-09 -3.9623e-06 -1.09e-08",
+    ),
+    "plantar-rod": (
+        *("foot-crank", "0.055 0 -0.00791", "1 0 0 0 1 0", "hinge", 0.0, 0.0, "0.17792 0 0", 0.1186),
+        "2.779e-06 0.001774 0.001775 -2.34e-08 -8.1e-09 0",
+    ),
+    "foot": (
+        *("tarsus", "0.408 -0.04 0", "1 0 0 0 1 0", "hinge", 1.0, 0.0, "0.00474 0.02748 -0.00014", 0.1498),
+        "0.00017388 0.00016793 0.00033261 0.00011814 1.36e-06 -4e-07",
+    ),
+}
+
+
+def test_cassies_leg(tmp_path):
+    """Its pelvis is held; of eight freedoms five have motors, two have springs, and a rod turns about itself."""
+    bodies = {"pelvis": ET.Element("body", name="pelvis", pos="0 0 1.01")}
+    for name, (parent, place, axes, joint, damping, stiffness, centre, mass, moments) in CASSIE.items():
+        body = bodies[name] = ET.SubElement(bodies[parent], "body", name=name, pos=place, xyaxes=axes)
+        ET.SubElement(body, "inertial", pos=centre, mass=str(mass), fullinertia=moments)
+        if joint:
+            ET.SubElement(body, "joint", type=joint, damping=str(damping), stiffness=str(stiffness))
+    root = ET.Element("mujoco", model="Cassie's leg")
+    ET.SubElement(root, "worldbody").append(bodies["pelvis"])
+    loops = ET.SubElement(root, "equality")
+    ET.SubElement(loops, "connect", body1="plantar-rod", body2="foot", anchor="0.35012 0 0")
+    ET.SubElement(loops, "connect", body1="achilles-rod", body2="heel-spring", anchor="0.5012 0 0")
+    ET.ElementTree(root).write(tmp_path / "leg.xml")
+    model = from_mjcf(tmp_path / "leg.xml")
+    problem = model.problem()
+    assert problem.freedom.degrees == 8 and not model.ignored
+    result = agreed(problem, 0.1)
+    foot = next(body for body in model.bodies if body.name == "foot")
+    assert np.abs(np.diff(result.q[list(foot.coordinates[:3])][:, [0, -1]])).max() > 0.01
 
 
 def test_bennetts_linkage():

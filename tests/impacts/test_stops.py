@@ -98,6 +98,38 @@ def test_a_rod_falls_on_a_stop_and_bounces():
         assert np.abs(problem.system.velocity_constraint(impact.t, q, impact.v_after)).max() < 1e-12
 
 
+def test_a_bar_bounces_on_its_ends_to_rest_and_keeps_its_velocity_along_the_floor():
+    """Free flights are known; the shortest of them take microseconds."""
+    m, length, e, along = 1.4, 0.8, 0.45, 0.2
+    y, angle, v, spin, t, known = 0.37, 0.23, 0.0, 1.1, 0.0, []
+    half = 0.5 * length * np.array([np.cos(angle), np.sin(angle)])
+    model, middle = PlanarModel(name="bar"), np.array([0.0, y])
+    bar = model.rod("bar", middle - half, middle + half, mass=m, velocity=(along, 0.0), angular_velocity=spin)
+    for end in (-0.5, 0.5):
+        model.stop(bar, bar.point(end * length, 0.0), "ground", (0.0, 0.0), normal=(0.0, 1.0), restitution=e)
+    _, result = moved(model, 3.0)
+
+    def gap(x, side):
+        return y + v * x - 0.5 * GRAVITY * x * x + side * 0.5 * length * np.sin(angle + spin * x)
+
+    later = np.linspace(1e-6, 0.5, 20001)
+    while len(known) < 12:
+        falls = []
+        for side in (-1.0, 1.0):
+            k = np.flatnonzero((gap(later, side)[:-1] > 0.0) & (gap(later, side)[1:] <= 0.0))
+            falls += [(brentq(gap, later[k[0]], later[k[0] + 1], (side,), 1e-15), side)] if k.size else []
+        x, side = min(falls)
+        t, y, angle, v = t + x, y + v * x - 0.5 * GRAVITY * x * x, angle + spin * x, v - GRAVITY * x
+        arm, J = side * 0.5 * length * np.cos(angle), m * length**2 / 12.0
+        impulse = -(1.0 + e) * (v + arm * spin) / (1.0 / m + arm**2 / J)
+        v, spin = v + impulse / m, spin + impulse * arm / J
+        known.append(t)
+    np.testing.assert_allclose([impact.t for impact in result.impacts][:12], known, atol=1e-10)
+    assert np.ptp([impact.v_after[0] for impact in result.impacts]) < 1e-10  # no stop pushes along the floor
+    np.testing.assert_allclose(result.q[:, -1], [along * 3.0, 0.0, 0.0], atol=3e-10)
+    np.testing.assert_allclose(result.v[:, -1], [along, 0.0, 0.0], atol=1e-10)
+
+
 def test_a_stop_lets_go_when_its_force_would_pull():
     model = PlanarModel()
     pin = model.revolute("ground", model.rod("rod", (0.0, 0.0), (1.0, 0.0), mass=2.0), at=(0.0, 0.0))

@@ -10,7 +10,17 @@ from numpy.typing import ArrayLike
 from twoloop.bodies.documented import documented
 from twoloop.bodies.functions import Function, force_function
 from twoloop.bodies.parameter_layout import NONE
-from twoloop.bodies.parts import Body, BodyDirection, BodyPoint, DryFriction, Force, JointRow, ModelJoint, Numbers
+from twoloop.bodies.parts import (
+    COINCIDE,
+    Body,
+    BodyDirection,
+    BodyPoint,
+    DryFriction,
+    Force,
+    JointRow,
+    ModelJoint,
+    Numbers,
+)
 from twoloop.checks.arguments import Array, check_positive, check_text, check_vector, shown
 from twoloop.problem.stops import Stop
 
@@ -210,7 +220,10 @@ class Collection:
         self._different(kind, first, second)
         name = self._new_name(kind.removesuffix(" joint"), name, first, second)
         here, there = self._point("at_a", at_a, first), self._point("at_b", at_b, second)
-        distance = float(np.linalg.norm(first.in_space(here) - second.in_space(there)))
+        one, other = first.in_space(here), second.in_space(there)
+        distance = float(np.linalg.norm(one - other))
+        if distance <= COINCIDE * np.abs((one, other)).max():  # but for rounding
+            distance = 0.0
         return first, second, name, (self._numbers(name, first, here), self._numbers(name, second, there)), distance
 
     def distance(

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from twoloop.bodies import parameter_layout as layout
 from twoloop.bodies.functions import Function
 from twoloop.bodies.loaded_friction import LoadedFriction
+from twoloop.bodies.parts import COINCIDE
 from twoloop.bodies.places import placed
 from twoloop.bodies.row_function import RowFunction
 from twoloop.bodies.tables import Tables
@@ -25,7 +26,6 @@ KINDS = ("mass", "force", "constraint", "jacobian", "constraint_rate", "gamma")
 OF_JOINTS = ("constraint", "jacobian", "gamma")
 STATES = 5  # at which the traced programs are compared with the original functions
 AGREES = 1e-10  # relative difference between a function and its program
-COINCIDE = 1e-12  # relative distance at which the points of a spring count as coincident
 QUIET = np.errstate(divide="ignore", invalid="ignore")  # reported by name later
 
 

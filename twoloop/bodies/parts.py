@@ -13,6 +13,7 @@ from twoloop.bodies.row_function import RowFunction
 from twoloop.checks.arguments import Array, check_vector
 
 ROUNDING = 4.0 * np.finfo(np.float64).eps
+COINCIDE = 1e-12  # relative distance at which two points count as coincident
 
 
 @dataclass(frozen=True, eq=False)

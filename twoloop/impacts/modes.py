@@ -277,18 +277,35 @@ class Motion:
             options["first_step"] = min(max(0.1 * float(self.arcs[-1].h.max()), least), t1 - self.t)
         arc = solve_dae(system, (self.t, t1), self.q, self.v, events=events, dense_output=True, **options)
         self.arcs.append(arc)
+        over = {k for k in range(len(events)) if arc.t_events is not None and arc.t_events[k].size}
+        self.grip.change(mode, {k for i, k in enumerate([*mode.slips, *mode.sticks], n) if i in over})
+        n = len(signs)
         if arc.t.size:
             self.speeds = np.abs(arc.v).max(axis=1)
             before, self.t = self.t, float(arc.t[-1])
             if not self._at_once(before):  # else parallel stops take over from one another, with forces of rounding
                 self.opened = []
             self.q, self.v = arc.q[:, -1].copy(), arc.v[:, -1].copy()
-        over = {k for k in range(len(events)) if arc.t_events is not None and arc.t_events[k].size}
-        self.grip.change(mode, {k for i, k in enumerate([*mode.slips, *mode.sticks], n) if i in over})
-        n = len(signs)
+            if any(n + k in over for k in range(len(self.stops)) if k not in resting):
+                self.v = self._landing(arc)
         self.opened += [k for k in resting if n + k in over]
         self.released = {k for k in over if k < n and signs[k] == STICKS}
         self.still = {k for k in range(n) if (not signs[k]) != (k in over)}
+
+    def _landing(self, arc: Result) -> Array:
+        """Return the velocities at the end of an arc that ends in an impact.
+
+        The slope of a polynomial over short steps multiplies rounding of q. Where that may be more than the tolerance,
+        and explains how far the velocities are from those by Simpson's rule for the last step, the latter are taken.
+        """
+        v, h = arc.v[:, -1].copy(), float(arc.t[-1] - arc.t[-2]) if arc.t.size > 1 else 0.0
+        noise, least = ROUNDING * max(1.0, float(np.abs(arc.q[:, -1]).max())), 0.1 * float(self.options["atol"].min())
+        if not 0.0 < h * least <= noise:
+            return v
+        assert arc.sol is not None
+        middle = arc.sol(float(arc.t[-2]) + 0.5 * h)
+        summed = arc.v[:, -2] + h / 6.0 * (arc.a[:, -2] + 4.0 * middle.a + arc.a[:, -1])
+        return summed if least < np.abs(summed - v).max() <= noise / h else v
 
     def _project(self, system: ConstrainedSystem, resting: tuple[int, ...]) -> None:
         """Project the state onto the constraints of a mode, from which it deviates by less than the tolerances."""

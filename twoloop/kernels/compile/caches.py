@@ -310,7 +310,8 @@ def helper(function: Callable[..., Any]) -> Any:
     Such a function allocates nothing, so that it needs no numba runtime, whose counts of references to arrays take
     longer than a row of C_q.
     """
-    dispatcher = njit(_nrt=False, error_model="numpy")(function)
+    options: dict[str, Any] = {"_nrt": False, "error_model": "numpy"}
+    dispatcher = njit(**options)(function)
     dispatcher.enable_caching()
     _take_over(dispatcher)
     return dispatcher
