@@ -71,6 +71,15 @@ def test_integrators_that_faults_are_planted_into_pass_without_them(example):
     assert report.passed, str(report)
 
 
+def test_a_simulator_that_takes_no_other_times_gets_a_hint():
+    def simulate(problem, times, tolerance):
+        motion = MAKERS[problem.name]().reference
+        return motion.q + tolerance**0.1 * np.sin(40.0 * motion.t)[:, None]
+
+    report = check_simulator(simulate, "pendulum")
+    assert report.failures and all(failure.hint for failure in report.failures)
+
+
 def test_an_order_is_measured_again_before_it_fails():
     """Errors of this method nearly vanish at 400 steps, after which they seem to fall slowly."""
     report = check_simulator(module_of("half_explicit").simulate, "four_bar", steps=(200, 400, 800), order=2)
