@@ -9,7 +9,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from references.plain_equations import rate_of, start_of
-from tests.testing.planted import ALPHA, FAULTS, ORDERS, RATTLE, RK, module_of
+from tests.testing.planted import ALPHA, FAULTS, ORDERS, OTHERS, RATTLE, RK, module_of
 from tests.testing.systems import system_of
 from twoloop import solve_dae
 from twoloop.testing import check_simulator
@@ -61,6 +61,29 @@ def test_sound_integrators_pass_on_every_problem(name):
         if name not in beyond.get(example, ()):
             report = check_simulator(module_of(example).simulate, name, steps=steps, order=ORDERS[example])
             assert report.passed, str(report)
+
+
+@pytest.mark.parametrize("example", [path.stem for path in OTHERS.glob("*.py")])
+@pytest.mark.slow
+def test_integrators_that_faults_are_planted_into_pass_without_them(example):
+    options = {"steps": (200, 400, 800), "order": ORDERS[example]} if example in ORDERS else {}
+    report = check_simulator(module_of(example).simulate, "smoke", **options)
+    assert report.passed, str(report)
+
+
+def test_a_simulator_that_takes_no_other_times_gets_a_hint():
+    def simulate(problem, times, tolerance):
+        motion = MAKERS[problem.name]().reference
+        return motion.q + tolerance**0.1 * np.sin(40.0 * motion.t)[:, None]
+
+    report = check_simulator(simulate, "pendulum")
+    assert report.failures and all(failure.hint for failure in report.failures)
+
+
+def test_an_order_is_measured_again_before_it_fails():
+    """Errors of this method nearly vanish at 400 steps, after which they seem to fall slowly."""
+    report = check_simulator(module_of("half_explicit").simulate, "four_bar", steps=(200, 400, 800), order=2)
+    assert report.passed and min(each.measured for each in report.findings if "order" in each.property) > 1.4
 
 
 def by_twoloop(problem, times, tolerance):
