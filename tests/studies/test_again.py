@@ -43,6 +43,7 @@ def test_it_writes_each_part_at_once(tmp_path, monkeypatch):
         made, line = output.load_rows()
     assert line == "stamp" and made["call_s"].tolist() == [1.0, 3.0, 4.0, 9.0]
     assert made["processor"].tolist()[-1] == cli.processor() and made["commit"].tolist()[-1] == cli.commit()
+    assert made["calibration_s"].notna().tolist() == [False, False, False, True]  # of which the archive has the ratio
 
 
 @pytest.mark.parametrize("words", [[], ["five-bar"]])
