@@ -48,9 +48,9 @@ def traps(quick: bool) -> Iterator[Trap]:
 
 
 def findings_of(ran: pd.DataFrame, wrong: Sequence[str]) -> dict[str, Any]:
-    """Of each solver the runs with a `wrong` outcome, off by over EXACT, by width; of the default by length, too.
+    """Of each solver the runs with a `wrong` outcome, off by over EXACT, by width.
 
-    Of a gust longer than the time between two looks, twice its width is.
+    Of the default also the widths of which some runs are that ("some"), and those of which none is ("none").
     """
     gross = ran["outcome"].isin(wrong) & ~(ran["error"].astype(float) <= EXACT)
     widths = [width for width in WIDTHS if (ran["trap"] == name_of(width)).any()]
@@ -58,8 +58,10 @@ def findings_of(ran: pd.DataFrame, wrong: Sequence[str]) -> dict[str, Any]:
     for solver, own in ran.groupby("solver", sort=False):
         by = [gross[own.index[own["trap"] == name_of(width)]] for width in widths]
         lines.append({"solver": str(solver), "at": [{"n": len(each), "gross": int(each.sum())} for each in by]})
-    mine = ran["solver"] == DEFAULT
-    seen = ran["trap"].isin([name_of(width) for width in widths if 2.0 * width >= LOOK * T_END])
-    by_length = {"longer": gross[mine & seen], "shorter": gross[mine & ~seen]}
-    found = {"widths": widths, "solvers": lines, "n": len(ran), "look": LOOK * T_END}
-    return found | {"default": {name: {"n": len(own), "gross": int(own.sum())} for name, own in by_length.items()}}
+    found = {"widths": widths, "solvers": lines, "n": len(ran), "look": LOOK * T_END, "default": {}}
+    for at in (line["at"] for line in lines if line["solver"] == DEFAULT):
+        for name, some in (("some", True), ("none", False)):
+            own = [(width, each) for width, each in zip(widths, at, strict=True) if bool(each["gross"]) is some]
+            counts = {key: sum(each[key] for _, each in own) for key in ("n", "gross")}
+            found["default"][name] = counts | {"widths": [width for width, _ in own]}
+    return found
