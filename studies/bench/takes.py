@@ -184,7 +184,8 @@ def _in_angles(minimal: Mapping[str, Any]) -> list[dict[str, str]]:
     whose = listed(f"`{each['solver'].partition(',')[0]}`" for each in minimal.get("wrong_by", []))
     told = f"faster than our best in {pairs}, {share}"
     if minimal.get("wrong"):
-        told += f"; {minimal['wrong']} of {minimal['asked']} runs, of {whose}, silently wrong by over {number(minimal['wrong_from'])}"
+        told += f"; {minimal['wrong']} of {minimal['asked']} runs, of {whose}, silently wrong"
+        told += f" by over {number(minimal['wrong_from'])}"
     return [{"what": "loops that close in closed form", "take": f"an ODE in angles{who} ({told})"}]
 
 
