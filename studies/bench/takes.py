@@ -62,7 +62,7 @@ def _shares(won: Mapping[str, int], of: str, coded: bool) -> str:
     total, ranked = sum(won.values()), sorted(won.items(), key=lambda item: -item[1])
     counts = [(call(solver, coded), n) for solver, n in ranked if solver and n]
     if counts and 2 * counts[0][1] <= total:
-        return f"no clear choice ({', '.join(f'{who} {n}' for who, n in counts)} of {total} {of})"
+        return f"no clear choice (of {total} {of}: {', '.join(f'{who} {n}' for who, n in counts)})"
     return ", ".join(f"{who} ({n} of {total} {of})" for who, n in counts) or ("no clear choice" if total else "")
 
 

@@ -267,9 +267,9 @@ def test_of_a_kind_of_mechanism_it_is_counted_who_is_the_cheapest():
     assert row == {"what": "spatial", "take": "`compiled=True` (2 of 2 mechanisms)"}
     ranked = {
         "`compiled=True` (2 of 3 mechanisms), `heyoka` (1 of 3 mechanisms)": ([WON, WON, LOST], [WON], [LOST] * 9),
-        "no clear choice (`compiled=True` 1 of 2 mechanisms)": ([WON], [LOST, WON]),
-        "no clear choice (`compiled=True` 1 of 3 mechanisms)": ([WON], [NEAR] * 3, [NEAR, WON]),
-        "no clear choice (`compiled=True` 1, `heyoka` 1 of 2 mechanisms)": ([WON], [LOST]),
+        "no clear choice (of 2 mechanisms: `compiled=True` 1)": ([WON], [LOST, WON]),
+        "no clear choice (of 3 mechanisms: `compiled=True` 1)": ([WON], [NEAR] * 3, [NEAR, WON]),
+        "no clear choice (of 2 mechanisms: `compiled=True` 1, `heyoka` 1)": ([WON], [LOST]),
         "no clear choice": ([NEAR, NEAR],),
     }
     for said, mechanisms in ranked.items():
