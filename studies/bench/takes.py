@@ -53,7 +53,8 @@ def _of_class(name: str, entries: Sequence[dict[str, Any]], with_code: set[str])
         won.update({pick["solver"]: len(pick["accuracies"]) - len(pick["undecided"]), "": len(pick["undecided"])})
     times = listed(dict.fromkeys(number(entry["t_end"]) for entry in entries))
     names = list(dict.fromkeys(entry["name"] for entry in entries))
-    what = f"{name} ({names[0] if len(names) == 1 else f'{len(names)} geometries'}, {times} s)"
+    alike = len(names) > 1 and len({each.partition(",")[0] for each in names}) == 1
+    what = f"{name} ({f'{len(names)} geometries' if alike else listed(names)}, {times} s)"
     return {"what": what, "take": _shares(won, "errors", coded) or "no solver compared reaches these errors"}
 
 
