@@ -135,7 +135,7 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     grown, exudyn = (lined[lined["family"] == family]["growth"] for family in ("two-loop", "Exudyn"))
     others = lined[lined["tol"].notna() & (lined["family"] != "two-loop")].groupby("keeps_constraints")["growth"]
     made: dict[str, Any] = {"t_end": float(rows["t_end"].iloc[0]), "problem": rows["problem"].iloc[0]}
-    made |= {"visible": VISIBLE, "passes": PASSES, "fine": FINE, "procedures": procedures}
+    made |= {"visible": VISIBLE, "passes": PASSES, "fine": FINE, "procedures": procedures, "drawn_from": SMALLEST}
     made |= {"procedures_hold": all(one["holds"] for one in procedures)}
     made |= {"agree": all(one["error_y3_short"] <= VISIBLE for one in procedures)}
     made |= {"agree_long": all(one["error_y3"] <= VISIBLE for one in procedures), "gear": _stand_in(rows)}

@@ -116,7 +116,6 @@ def _limits(rows: pd.DataFrame) -> dict[str, Any]:
     theory = _of(rows, "limit").set_index("solver")["theory"].astype(float)
     tests = _of(rows, "growth test").set_index("tol")["measured"].astype(float).sort_index(ascending=False)
     found: dict[str, Any] = {"jacobi": theory[JACOBI], "gauss_seidel": theory[GAUSS_SEIDEL]}
-    found["gauss_seidel_shorter"] = bool(theory[GAUSS_SEIDEL] < theory[JACOBI])
     found |= {"test_tols": tests.index.tolist(), "test_limits": tests.tolist()}
     found["test_no_limit"] = bool(tests.min() < 0.5 * tests.max())
     found["along"] = []

@@ -52,15 +52,19 @@ def _of_class(name: str, entries: Sequence[dict[str, Any]], with_code: set[str])
     for pick in (pick for entry in entries for pick in entry["picks"]):
         won.update({pick["solver"]: len(pick["accuracies"]) - len(pick["undecided"]), "": len(pick["undecided"])})
     times = listed(dict.fromkeys(number(entry["t_end"]) for entry in entries))
-    what = f"{name} ({listed(dict.fromkeys(entry['name'] for entry in entries))}, {times} s)"
+    names = list(dict.fromkeys(entry["name"] for entry in entries))
+    alike = len(names) > 1 and len({each.partition(",")[0] for each in names}) == 1
+    what = f"{name} ({f'{len(names)} geometries' if alike else listed(names)}, {times} s)"
     return {"what": what, "take": _shares(won, "errors", coded) or "no solver compared reaches these errors"}
 
 
 def _shares(won: Mapping[str, int], of: str, coded: bool) -> str:
     """Each solver with how often it is the cheapest ("": none is told from the others), the most often first."""
     total, ranked = sum(won.values()), sorted(won.items(), key=lambda item: -item[1])
-    parts = [f"{call(solver, coded)} ({n} of {total} {of})" for solver, n in ranked if solver and n]
-    return ", ".join(parts) or ("no clear choice" if total else "")
+    counts = [(call(solver, coded), n) for solver, n in ranked if solver and n]
+    if counts and 2 * counts[0][1] <= total:
+        return f"no clear choice (of {total} {of}: {', '.join(f'{who} {n}' for who, n in counts)})"
+    return ", ".join(f"{who} ({n} of {total} {of})" for who, n in counts) or ("no clear choice" if total else "")
 
 
 def _by_the_tip(case: Mapping[str, Any]) -> dict[str, str]:
@@ -182,6 +186,7 @@ def _in_angles(minimal: Mapping[str, Any]) -> list[dict[str, str]]:
     told = f"faster than our best in {pairs}, {share}"
     if minimal.get("wrong"):
         told += f"; {minimal['wrong']} of {minimal['asked']} runs, of {whose}, silently wrong"
+        told += f" by over {number(minimal['wrong_from'])}"
     return [{"what": "loops that close in closed form", "take": f"an ODE in angles{who} ({told})"}]
 
 

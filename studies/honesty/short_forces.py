@@ -19,6 +19,7 @@ from studies.honesty.traps import AGREE, GROWN, SHORT, Trap, of_force, pendulum
 WIDTHS = (1e-4, 3e-4, 1e-3, 3e-3, 1e-2)  # s
 N_DRAWS, N_QUICK, QUICK_WIDTHS = 8, 2, (1e-3,)  # of each width on each mechanism
 SEED = 25
+MISSED = {"some": True, "none": False}  # widths of which some runs of the default are off, or none
 
 
 def two_points(sharp: Sharp) -> Mechanism:
@@ -48,18 +49,25 @@ def traps(quick: bool) -> Iterator[Trap]:
 
 
 def findings_of(ran: pd.DataFrame, wrong: Sequence[str]) -> dict[str, Any]:
-    """Of each solver the runs with a `wrong` outcome, off by over EXACT, by width; of the default by length, too.
+    """Of each solver the runs with a `wrong` outcome, off by over EXACT, by width.
 
-    Of a gust longer than the time between two looks, twice its width is.
+    Of the default also the widths of which some runs are that ("some"), and those of which none is ("none").
     """
     gross = ran["outcome"].isin(wrong) & ~(ran["error"].astype(float) <= EXACT)
     widths = [width for width in WIDTHS if (ran["trap"] == name_of(width)).any()]
-    lines = []
+    lines: list[dict[str, Any]] = []
     for solver, own in ran.groupby("solver", sort=False):
         by = [gross[own.index[own["trap"] == name_of(width)]] for width in widths]
         lines.append({"solver": str(solver), "at": [{"n": len(each), "gross": int(each.sum())} for each in by]})
-    mine = ran["solver"] == DEFAULT
-    seen = ran["trap"].isin([name_of(width) for width in widths if 2.0 * width >= LOOK * T_END])
-    by_length = {"longer": gross[mine & seen], "shorter": gross[mine & ~seen]}
-    found = {"widths": widths, "solvers": lines, "n": len(ran), "look": LOOK * T_END}
-    return found | {"default": {name: {"n": len(own), "gross": int(own.sum())} for name, own in by_length.items()}}
+    found: dict[str, Any] = {"widths": widths, "solvers": lines, "n": len(ran), "look": LOOK * T_END, "default": {}}
+    for line in lines:
+        if line["solver"] == DEFAULT:
+            found["default"] = {name: _of_widths(widths, line["at"], missed) for name, missed in MISSED.items()}
+    return found
+
+
+def _of_widths(widths: Sequence[float], at: Sequence[dict[str, int]], missed: bool) -> dict[str, Any]:
+    """The widths at which some runs are off, or none, and their runs together."""
+    own = [(width, each) for width, each in zip(widths, at, strict=True) if bool(each["gross"]) is missed]
+    counts = {key: sum(each[key] for _, each in own) for key in ("n", "gross")}
+    return counts | {"widths": [width for width, _ in own]}

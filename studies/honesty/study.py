@@ -212,9 +212,6 @@ def findings_of(all_rows: pd.DataFrame) -> dict[str, Any]:
     found["forces_only"] = [name for name in dict.fromkeys(forces["solver"]) if name not in set(rows["solver"])]
     found["input"] = of_mistakes(inputs) | {"trust": trust_in(inputs)}
     found["held_out"] = of_forces(held) | {"trust": trust_in(held), "bad": bad_in(held), "seed": HELD_OUT_SEED}
-    theirs = [line for line in found["held_out"]["solvers"] if not line["solver"].endswith((OURS, LIMITED))]
-    counted = [{key: line[key] for key in ("solver", "n", "wrong", "gross")} for line in theirs]
-    found["held_out"]["by_solver"] = sorted(counted, key=lambda line: -line["wrong"])
     found["held_out"]["ran"] = [kind for kind in KINDS[:-1] if found["held_out"]["trust"][kind]["n"]]
     short = all_rows[(all_rows["group"] == SHORT) & (all_rows["outcome"] != NOT_RUN)]
     found |= {"short": short_forces.findings_of(short, (SILENT, HANG)), "look": LOOK}

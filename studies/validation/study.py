@@ -70,6 +70,7 @@ REACH = {"q": 9, "v": 7, "lam": 5}  # digits aimed at with TIGHT ...
 AIMED = (GIVEN, OWN_EXPLICIT, "Gauss12", "RadauIIA5")  # ... by these
 # their adapters tell states at given instants, between steps by interpolants: not where a step ends
 UNTOLD = (IDA_C, HEYOKA, CVODE_C, CVODE_C_PROJECTED, CVODES)
+CONSTRAINED = "IDA|solve_dae"  # in the names of others that get the constraints; the rest gets accelerations
 APART = (JUDGED, deceived.DECEIVED, MODELLED)  # groups that the table of solvers leaves out
 OUTCOMES = ("right", "inexact", "wrong", "said so", "not run")
 SHORT = {"RANK_LOST": "rank", "TIME_LIMIT": "L", "STEP_TOO_SMALL": "step", "SOLVER_FAILED": "failed"}
@@ -235,11 +236,10 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
         found[f"n_{name}"] = {"ours": int((which & ours).sum()), "others": int((which & ~ours).sum())}
     theirs = rows[(rows["outcome"] == "wrong") & ~ours]
     away, usual = ~theirs["case"].isin(singular), theirs["tol"] <= USUAL
-    found["wrong_others"] = {}
+    given = ~away & ~theirs["solver"].astype(str).str.contains(CONSTRAINED)
+    found |= {"usual": USUAL, "wrong_others": {"singular": int((~away).sum()), "given": int(given.sum())}}
     for name, which in (("tight", usual), ("loose", ~usual)):
-        line = {"n": int(which.sum()), "at": sorted(set(theirs["tol"][which]))}
-        found["wrong_others"][name] = line | {"elsewhere": int((which & away).sum())}
-    found["wrong_others"]["singular"] = int((~away).sum())
+        found["wrong_others"][name] = {"n": int(which.sum()), "elsewhere": int((which & away).sum())}
     at_tight = (rows["tol"] == TIGHT) & (rows["outcome"] == "right")
     found["right_on"] = {
         which: dict(rows[at_tight & of]["solver"].value_counts()) for which, of in (("ours", ours), ("others", ~ours))

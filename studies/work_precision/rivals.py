@@ -184,7 +184,8 @@ def _within(made: Sequence[dict[str, Any]], name: str, errors: Sequence[float]) 
     singular = not errors
     own = [each for each in made if ("singular" in each["tags"]) is singular]
     pairs = [[at["standing"] for at in each["at"] if singular or at["error"] in errors] for each in own]
-    return {"name": name, "n_mechanisms": len(own), "standings": headline.counted(pairs)}
+    variants = sorted({each["case"].partition(",")[0] for each in own}) if singular else []
+    return {"name": name, "n_mechanisms": len(own), "of": variants, "standings": headline.counted(pairs)}
 
 
 def _typical(made: Sequence[dict[str, Any]], error: float) -> dict[str, Any] | None:

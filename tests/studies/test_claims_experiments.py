@@ -24,7 +24,7 @@ def test_line_5_counts_the_criteria_that_were_fixed_afterwards():
     assert 0 < late < len(claimed) < len(load())
     found["claims"] = {key: {"verdict": "not run"} for key in claims}
     text = render("claims", found, {}, lines=[], stamp="a; b", quick=False)
-    assert f"{late} of {len(claimed)} criteria were chosen after the data had been seen" in text.splitlines()[4]
+    assert f"{late} of {len(claimed)} criteria were chosen after seeing the data" in text.splitlines()[4]
 
 
 def test_energy_does_not_bound_y3():

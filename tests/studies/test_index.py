@@ -167,12 +167,12 @@ def test_the_first_screen_and_the_advice_can_be_written_whatever_is_found(change
     """Templates raise on what is not defined."""
     cases = [case(**changed), case(name="hoist")]
     text = screen(tmp_path, cases, energy=energy()) + front(tmp_path, cases, energy=energy())
-    assert text.count("crane") >= 2 and "nan" not in text and "None" not in text
+    assert "crane" in text and "nan" not in text and "None" not in text
 
 
 def test_an_undecided_comparison_counts_as_a_win_for_neither_side(tmp_path):
     near = at_error(standing=standing(verdict="undecided"))
-    assert "(1 of 2 errors) |" in screen(tmp_path, [case(at=[at_error(error=1e-2), near])])
+    assert "no clear choice (of 2 errors: " in screen(tmp_path, [case(at=[at_error(error=1e-2), near])])
     close = energy()
     close["long"]["at"][0]["drift"]["others"] = long_run("LSODA", 1.9, calm=False)  # of one run each, beside 2.0
     told = [entries([], energy=found)[0]["at"][0]["undecided"] for found in (close, energy())]
@@ -225,9 +225,11 @@ def test_what_can_be_trusted_is_counted(tmp_path):
     stopped = VALID | {"only_ours": [{"case": "a", "limit": ["x", "y"]}, {"case": "b", "limit": []}], "time_limit": 1.5}
     said = "only ours on 2 (a and b; we stopped 2 of the rivals after 1.5 s),"
     assert said in screen(tmp_path, validation=stopped)
-    parts = {"tight": {"n": 20, "at": [1e-10, 1e-8], "elsewhere": 0}, "loose": {"n": 37, "at": [1e-4], "elsewhere": 6}}
+    parts = {"singular": 51, "given": 45}
     text = screen(tmp_path, validation=VALID | {"wrong_others": parts})
-    assert "of rivals are wrong, 51 of the latter at singular positions, where the acc" in text
+    assert (
+        "of rivals are wrong, 51 of the latter at singular positions, 45 of these by solvers that are given acc" in text
+    )
     by = {"solve_dae": 20, "known motion": 30, "bounds": 2, "tests": 20}
     planted = {"n": 73, "missed": ["x"], "by": by, "models": {"n": 20, "stopped": 12}}
     text = screen(tmp_path, planted_errors=planted)

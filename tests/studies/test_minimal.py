@@ -66,7 +66,7 @@ def test_a_run_that_ends_with_a_wrong_state_is_told():
     found = minimal.findings_of(wrong, everywhere())
     assert (found["asked"], found["wrong"]) == (4, 2) and found["mechanisms"][0]["at"][0]["rival"]["call_s"] == 1.0
     said = (
-        "Of 4 such runs at tolerances of 1e-3 and tighter, 2 report success with an error above 0.10: "
+        "Of 4 such runs at tolerances of 1e-4 and tighter, 2 report success with an error above 0.10: "
         "1 of `heyoka, minimal coordinates`"
     )
     assert said in stated(1.0, minimal=found) and minimal.findings_of(wrong.assign(tol=0.1), everywhere())["wrong"] == 0

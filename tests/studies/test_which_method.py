@@ -85,7 +85,9 @@ def test_the_table_has_a_row_for_each_class_with_the_cheapest():
     assert row["take"] == '`method="TRBDF2"` (4 of 6 errors), `compiled=True` (2 of 6 errors)'
     entries[1]["picks"] = [loose | {"undecided": ["1e-4"]}, tight]
     (row,) = takes({}, entries)
-    assert row["take"].startswith('`method="TRBDF2"` (3 of 6 errors)')
+    assert row["take"] == 'no clear choice (of 6 errors: `method="TRBDF2"` 3, `compiled=True` 2)'
+    entries[1]["name"] = "a crane, second"
+    assert takes({}, entries)[0]["what"] == "odd (2 geometries, 2.0 s)"
 
 
 @pytest.mark.parametrize(
