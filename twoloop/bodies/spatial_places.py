@@ -89,6 +89,17 @@ def motion(q, v, body, p, at):
 
 
 @exact
+def velocity(q, v, body, p, at):
+    """Return the velocity of that point."""
+    if body < 0:
+        return 0.0, 0.0, 0.0
+    k = 7 * body + 3
+    x, y, z = p[at], p[at + 1], p[at + 2]
+    ux, uy, uz = rotated_rate(q[k], q[k + 1], q[k + 2], q[k + 3], v[k], v[k + 1], v[k + 2], v[k + 3], x, y, z)
+    return v[k - 3] + ux, v[k - 2] + uy, v[k - 1] + uz
+
+
+@exact
 def push_row(q, row, body, p, at, fx, fy, fz):
     """Add to a row the derivative of f . (point of a body), i.e. the generalised force of f there."""
     move_row(row, body, fx, fy, fz)
