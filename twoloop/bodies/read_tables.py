@@ -4,38 +4,37 @@ import math
 
 from twoloop.bodies import parameter_layout as layout
 from twoloop.bodies.program_results import results_within
-from twoloop.kernels.compile.caches import helper
-from twoloop.kernels.data.common import inlined
+from twoloop.kernels.data.common import exact, inlined
 
 
-@helper
+@exact
 def n_bodies(p):
     """Return the number of bodies."""
     return int(p[p.size - layout.HEAD + layout.BODIES])
 
 
-@helper
+@exact
 def joint_places(p):
     """Return the index at which the table of joints begins."""
     first, n = int(p[p.size - layout.HEAD + layout.JOINTS]), int(p[p.size - layout.HEAD + layout.N_JOINTS])
     return range(first, first + layout.JOINT_WIDTH * n, layout.JOINT_WIDTH)
 
 
-@helper
+@exact
 def joint_at(p, k):
     """Return a row of the table: kind, row of C, bodies i and j with their numbers, further numbers, motion."""
     i, at, j, there = int(p[k + 2]), int(p[k + 3]), int(p[k + 4]), int(p[k + 5])
     return int(p[k]), int(p[k + 1]), i, at, j, there, int(p[k + 6]), int(p[k + 7])
 
 
-@helper
+@exact
 def force_places(p):
     """Return the index at which the table of forces begins."""
     first, n = int(p[p.size - layout.HEAD + layout.FORCES]), int(p[p.size - layout.HEAD + layout.N_FORCES])
     return range(first, first + layout.FORCE_WIDTH * n, layout.FORCE_WIDTH)
 
 
-@helper
+@exact
 def force_at(p, k):
     """Return a row of the table: kind, bodies i and j with indices of numbers, further numbers, result, point of i."""
     i, at, j, there = int(p[k + 1]), int(p[k + 2]), int(p[k + 3]), int(p[k + 4])
@@ -48,7 +47,7 @@ def made_by(program, t, q, v, p):
     return results_within(int(p[p.size - layout.HEAD + program]), t, q, v, p)
 
 
-@helper
+@exact
 def value(p, more, made, given, i):
     """Return a number of a force, or its function value if it is a function."""
     if given >= 0:
@@ -56,7 +55,7 @@ def value(p, more, made, given, i):
     return p[more + i]
 
 
-@helper
+@exact
 def push(kind, rate, p, more, made, given):
     """Return the force of friction or of a motor in a joint with the given rate."""
     if kind in (layout.BRAKE, layout.RUB):

@@ -5,7 +5,7 @@ import math
 from twoloop.bodies import parameter_layout as layout
 from twoloop.bodies.read_tables import force_at, force_places, n_bodies, push, value
 from twoloop.bodies.rotation import half_spin
-from twoloop.bodies.spatial_places import centre, motion, move_row, place, push_row, spin, torsion, twist_row, vector
+from twoloop.bodies.spatial_places import centre, move_row, place, push_row, spin, torsion, twist_row, vector, velocity
 from twoloop.kernels.compile.caches import helper
 
 WEIGHT = 3  # components of gravity, which precede the numbers of the bodies
@@ -52,7 +52,7 @@ def put_forces(q, v, p, made, Q):
             bx, by, bz = place(q, j, p, there)
             cx, cy, cz = centre(q, i)
             cx, cy, cz = bx - cx, by - cy, bz - cz
-            wx, wy, wz, _, _, _ = motion(q, v, j, p, there)
+            wx, wy, wz = velocity(q, v, j, p, there)
             ux, uy, uz = centre(v, i)
             ox, oy, oz = spin(q, v, i)
             wx, wy, wz = wx - ux - oy * cz + oz * cy, wy - uy - oz * cx + ox * cz, wz - uz - ox * cy + oy * cx
@@ -75,8 +75,8 @@ def put_forces(q, v, p, made, Q):
         else:
             length = math.sqrt(x * x + y * y + z * z)
             x, y, z = x / length, y / length, z / length
-            ux, uy, uz, _, _, _ = motion(q, v, i, p, at)
-            wx, wy, wz, _, _, _ = motion(q, v, j, p, there)
+            ux, uy, uz = velocity(q, v, i, p, at)
+            wx, wy, wz = velocity(q, v, j, p, there)
             pull = p[more] * (length - p[more + 2])
             pull += p[more + 1] * (x * (wx - ux) + y * (wy - uy) + z * (wz - uz))
             x, y, z = pull * x, pull * y, pull * z

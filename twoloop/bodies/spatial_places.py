@@ -6,13 +6,12 @@ Coordinates of a body: x, y, z of the centre of mass and Euler parameters; see `
 import math
 
 from twoloop.bodies.rotation import half_spin, pulled, rotated, rotated_rate, turned
-from twoloop.kernels.compile.caches import helper
-from twoloop.kernels.data.common import inlined
+from twoloop.kernels.data.common import exact, inlined
 
 FARTHEST = -math.cos(0.95 * math.pi)  # 0.95 of a turn
 
 
-@helper
+@exact
 def vector(q, body, x, y, z):
     """Return a body-fixed vector in space."""
     if body < 0:
@@ -32,7 +31,7 @@ def vector_rate(q, v, body, x, y, z):
     return ux, uy, uz, 2.0 * ax, 2.0 * ay, 2.0 * az
 
 
-@helper
+@exact
 def centre(q, body):
     """Return the centre of mass, or its velocity from v."""
     if body < 0:
@@ -40,7 +39,7 @@ def centre(q, body):
     return q[7 * body], q[7 * body + 1], q[7 * body + 2]
 
 
-@helper
+@exact
 def turn_row(q, row, body, x, y, z, fx, fy, fz):
     """Add to a row (n_q,) the gradient of f . (vector of a body) in its Euler parameters."""
     if body >= 0:
@@ -52,7 +51,7 @@ def turn_row(q, row, body, x, y, z, fx, fy, fz):
         row[k + 3] += d3
 
 
-@helper
+@exact
 def put_point_rows(q, rows, first, body, x, y, z, sign):
     """Store three rows (n_q,), the derivatives of a point of a body, or minus these."""
     if body >= 0:
@@ -64,7 +63,7 @@ def put_point_rows(q, rows, first, body, x, y, z, sign):
         rows[first + 2, k], rows[first + 2, k + 1], rows[first + 2, k + 2], rows[first + 2, k + 3] = wz, wy, -wx, s
 
 
-@helper
+@exact
 def move_row(row, body, fx, fy, fz):
     """Add to a row the gradient of f . (centre of a body)."""
     if body >= 0:
@@ -73,7 +72,7 @@ def move_row(row, body, fx, fy, fz):
         row[7 * body + 2] += fz
 
 
-@helper
+@exact
 def place(q, body, p, at):
     """Return the point of a body stored at index `at` of p."""
     x, y, z = vector(q, body, p[at], p[at + 1], p[at + 2])
@@ -89,14 +88,25 @@ def motion(q, v, body, p, at):
     return cx + ux, cy + uy, cz + uz, ax, ay, az
 
 
-@helper
+@exact
+def velocity(q, v, body, p, at):
+    """Return the velocity of that point."""
+    if body < 0:
+        return 0.0, 0.0, 0.0
+    k = 7 * body + 3
+    x, y, z = p[at], p[at + 1], p[at + 2]
+    ux, uy, uz = rotated_rate(q[k], q[k + 1], q[k + 2], q[k + 3], v[k], v[k + 1], v[k + 2], v[k + 3], x, y, z)
+    return v[k - 3] + ux, v[k - 2] + uy, v[k - 1] + uz
+
+
+@exact
 def push_row(q, row, body, p, at, fx, fy, fz):
     """Add to a row the derivative of f . (point of a body), i.e. the generalised force of f there."""
     move_row(row, body, fx, fy, fz)
     turn_row(q, row, body, p[at], p[at + 1], p[at + 2], fx, fy, fz)
 
 
-@helper
+@exact
 def twist_row(q, row, body, x, y, z):
     """Add to a row the generalised force of a torque in space, 2 G^T R^T torque."""
     if body >= 0:
@@ -109,7 +119,7 @@ def twist_row(q, row, body, x, y, z):
         row[k + 3] += -e2 * x + e1 * y + e0 * z
 
 
-@helper
+@exact
 def spin(q, v, body):
     """Return the angular velocity in space."""
     if body < 0:
@@ -119,7 +129,7 @@ def spin(q, v, body):
     return rotated(q[k], q[k + 1], q[k + 2], q[k + 3], 2.0 * x, 2.0 * y, 2.0 * z)
 
 
-@helper
+@exact
 def parameters_of(q, body):
     """Return the Euler parameters."""
     if body < 0:
@@ -128,7 +138,7 @@ def parameters_of(q, body):
     return q[k], q[k + 1], q[k + 2], q[k + 3]
 
 
-@helper
+@exact
 def product(a0, a1, a2, a3, b0, b1, b2, b3):
     """Return the Euler parameters of the composition of two rotations, the second one applied first."""
     return (
@@ -139,7 +149,7 @@ def product(a0, a1, a2, a3, b0, b1, b2, b3):
     )
 
 
-@helper
+@exact
 def torsion(q, i, j, p, axis, zero, stiffness, angle):
     """Return the torque of a spring on the rotation of body j about an axis (3 numbers in p) of body i, minus an angle.
 
