@@ -9,6 +9,7 @@ from tests.general.dead_points import CUSP_TIME, cusp
 from tests.general.mechanisms import SINGULAR, WINDOWS, error, first_singular_time, mechanism, run
 from tests.problems import event, worst
 from twoloop import DOP853, ConstraintWarning, Status, solve_dae
+from twoloop.bodies import PlanarModel
 
 METHODS = ("SunRadau5", "RadauIIA5", "DOP853")
 FEW = ("A02, N = 1", "A02, N = 2")
@@ -93,3 +94,40 @@ def test_states_stay_as_they_were_stored_when_a_step_goes_across(method):
         crossed += "across" in runs[1].message
         assert (runs[0].t == runs[1].t).all() and (runs[0].q == runs[1].q).all() and (np.diff(runs[1].t) > 0.0).all()
     assert crossed > 0
+
+
+def parallelogram(angle, speed):
+    """Two cranks with a coupler that stays level; it may turn where all lie in line."""
+    model, tip, base = PlanarModel(), np.array([np.cos(angle), np.sin(angle)]), np.array([2.0, 0.0])
+    model.body("crank", mass=1.0, inertia=1.0 / 12.0, position=0.5 * tip, angle=angle, angular_velocity=speed)
+    model.body("coupler", mass=1.5, inertia=0.2, position=tip + np.array([1.0, 0.0]))
+    model.body("rocker", mass=1.0, inertia=1.0 / 12.0, position=0.5 * tip + base, angle=angle)
+    pins = (0.0, 0.0), tip, tip + base, base
+    for one, other, at in zip(
+        ("ground", "crank", "coupler", "rocker"), ("crank", "coupler", "rocker", "ground"), pins, strict=True
+    ):
+        model.revolute(one, other, at=at)
+    return model.problem((0.0, 30.0)), lambda q: q[5]
+
+
+def equal_slider_crank(angle, speed):
+    """A rod as long as the crank: its angle is the opposite one, unless the slider stays on the crank's bearing."""
+    model, tip = PlanarModel(), np.array([np.cos(angle), np.sin(angle)])
+    pin = 2.0 * tip[0], 0.0
+    model.body("crank", mass=1.0, inertia=1.0 / 12.0, position=0.5 * tip, angle=angle, angular_velocity=speed)
+    model.body("rod", mass=1.0, inertia=1.0 / 12.0, position=0.5 * (tip + pin), angle=-angle)
+    model.body("slider", mass=1.0, inertia=1.0, position=pin)
+    for one, other, at in (("ground", "crank", (0.0, 0.0)), ("crank", "rod", tip), ("rod", "slider", pin)):
+        model.revolute(one, other, at=at)
+    model.prismatic("ground", "slider", at=pin, axis=(1.0, 0.0))
+    return model.problem((0.0, 30.0)), lambda q: q[5] + q[2]
+
+
+@pytest.mark.parametrize(("make", "method"), [(parallelogram, "TRBDF2"), (equal_slider_crank, "ESDIRK4")])
+def test_steps_that_test_positions_alone_do_not_creep_onto_another_branch(make, method):
+    """There rounding makes accelerations: they turned the motion, with positions within the tolerance."""
+    numbers = np.random.default_rng(4)
+    for tolerance in (1e-3, 1e-4, 1e-5, 1e-6) * 8:
+        problem, off = make(numbers.uniform(0.3, 1.2), numbers.choice([-7.0, -2.0, -0.5, 0.5, 2.0, 7.0]))
+        result = solve_dae(problem.system, problem.t_span, problem.q0, problem.v0, method, tolerance, tolerance)
+        assert np.abs(off(result.q)).max() < 1e-6, result

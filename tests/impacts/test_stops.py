@@ -353,3 +353,16 @@ def test_rebounds_from_a_wall_towards_which_another_turns_the_load_die_out():
     assert result.success and np.abs(result.q[:, -1]).max() < 1e-9, result.message
     times = [impact.t for impact in result.impacts]
     assert len(times) < 40 and times[-1] == pytest.approx(np.sqrt(0.2) * (1.0 + 0.5) / (1.0 - 0.5), abs=1e-4)
+
+
+def test_a_stop_that_opens_is_hit_when_the_impact_at_another_turns_the_body_back():
+    """The impact at the wall sends the body towards the floor, which it was leaving."""
+    free = ConstrainedSystem.from_python(n_q=2, n_c=0, mass=np.eye(2), force=lambda t, q, v: np.array([0.0, -1e-3]))
+    corner = [
+        Stop(lambda t, q: q[1], restitution=0.8, name="floor"),
+        Stop(lambda t, q: np.sqrt(0.75) * q[0] - 0.5 * q[1], restitution=0.8, name="wall"),
+    ]
+    result = solve_with_stops(free, (0.0, 0.1), [0.0, 0.0], [-0.5, 0.5], corner)
+    assert result.success and [impact.stops for impact in result.impacts] == [("wall",), ("floor",)]
+    jumps = sum(impact.v_after - impact.v_before for impact in result.impacts)
+    np.testing.assert_allclose(result.v[:, -1], jumps + np.array([-0.5, 0.5 - 1e-4]), atol=1e-9)

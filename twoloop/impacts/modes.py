@@ -114,7 +114,13 @@ class Motion:
         near = np.flatnonzero(gap.g <= self.low)
         slow = np.zeros(near.size, dtype=bool)
         if near.size:
-            slow = self._apply_impulses(gap, near) & ~np.isin(near, self.opened)  # an opened stop has no force
+            for _ in range(MAX_STALLED):
+                slow = self._apply_impulses(gap, near)
+                gap = self.gaps.at(self.t, self.q, self.v)
+                # the law lets a stop close that opened before: it is hit next
+                if not (gap.u[near] < -AT_REST * (np.abs(gap.W[near]) @ self.speeds)).any():
+                    break
+            slow &= ~np.isin(near, self.opened)  # an opened stop has no force
         closing = near[slow]
         signs, of = self._sliding(self.v)
         if not closing.size and not of:

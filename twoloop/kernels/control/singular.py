@@ -17,6 +17,7 @@ STATIC_SINGULAR = 0.01  # the same of the static form, whose pivots are sines of
 CARE = 0.05  # ... and where a refused step that begins below this share is tried again with care ...
 LESS = 0.8  # ... and then by steps each of which is this times the one before
 LOST = 0.001  # ... and which is given up there for steps below this share of the longest
+UNDETERMINED = 1e-6  # share of the largest pivot below which rounding makes accelerations: short steps are not to go on
 RARELY = 16  # accepted steps from one look at the partition to the next where steps do without it
 FEW = 32  # degrees of freedom; where they are k times as many, a partition is looked at every k + 1 steps: T is full
 NEARER = 0.25  # of the smallest sine at the start of a step: one that ends nearer to a singular position ends half-way
@@ -99,4 +100,10 @@ def look_at_partition(f, w, control, clock, size, lands, state):
         w.notes[SENSITIVITY] = 1.0  # as of a partition far from there: this one is not to last
         if w.notes[PIVOT] < SINGULAR_PIVOT * clock[at.LARGEST_PIVOT]:
             w.notes[NEARLY_SINGULAR] = 1.0
+    if short and size < LOST * clock[at.H_LONG] and w.notes[NEARLY_SINGULAR] == 1.0:
+        # the partition that serves implicit methods well up to there was chosen far from there
+        if renew_partition(f, w, clock[at.T], state[:n]) != DONE:
+            return at.RANK_LOST
+        if control[at.BRIDGE] == 0.0 and w.notes[PIVOT] < UNDETERMINED * clock[at.LARGEST_PIVOT]:
+            return at.RANK_LOST  # no step led across, and velocities would follow from rounding
     return at.NEAR_SINGULAR if short and near_singular(w, control, clock) else at.GO_ON
