@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 
 from tests.compiled import unit_mass, weight
 from tests.derivative_cases import shaken_pendulum
@@ -166,3 +167,52 @@ def test_rest_and_a_turning_point_need_no_shorter_differences():
     at_rest = solve_dae(system, (0.0, 1.0), [0.0, -1.0], [0.0, 0.0])
     assert at_rest.success and worst(at_rest.q[:, -1], [0.0, -1.0]) < 1e-12
     assert solve_dae(system, (0.0, 5.0), [1.0, 0.0], [0.0, 0.0], rtol=1e-10, atol=1e-10).success
+
+
+def test_differences_of_constraints_that_hardly_bend_are_judged_by_rounding():
+    """Nothing turns and nothing pushes: gamma is zero, and what differences leave of it is rounding."""
+    angle, radius = 0.7, 0.4
+    wheel = ConstrainedSystem.from_python(
+        n_q=4,
+        n_c=1,
+        n_a=2,
+        mass=np.diag([1.0, 1.0, 0.2, 0.1]),
+        force=lambda t, q, v: np.array([0.0, 0.0, 0.1 * np.sin(t), -v[3] if v[3] > 5.0 else 0.0]),
+        constraint=lambda t, q: np.array([q[2] - np.interp(t, [1.0, 2.0], [angle, 1.0])]),
+        jacobian=lambda t, q: np.array([[0.0, 0.0, 1.0, 0.0]]),
+        constraint_rate=lambda t, q: np.array([angle - 1.0 if 1.0 <= t < 2.0 else 0.0]),
+        nonholonomic=lambda t, q: np.array(
+            [[1.0, 0.0, 0.0, -radius * np.cos(q[2])], [0.0, 1.0, 0.0, -radius * np.sin(q[2])]]
+        ),
+    )
+    v0 = [3.0 * radius * np.cos(angle), 3.0 * radius * np.sin(angle), 0.0, 3.0]
+    result = solve_dae(wheel, (0.0, 3.0), [0.0, 0.0, angle, 0.0], v0)
+    assert result.success and abs(result.q[3, -1] - 9.0) < 1e-7
+
+
+@pytest.mark.parametrize("t0", [0.0, 1e5, 1e6])
+def test_a_late_start_leaves_room_for_differences_on_one_side(t0):
+    """A drive of a kilohertz, with lengths of differences that are a few spacings of time at a start as late."""
+    size, rate, end = 1e-3, 6e3, 0.02
+    system = ConstrainedSystem.from_python(
+        n_q=2,
+        n_c=1,
+        mass=np.eye(2),
+        force=lambda t, q, v: np.array([0.0, -9.81]),
+        constraint=lambda t, q: np.array([0.5 * ((q[0] - place(t)) ** 2 + q[1] ** 2 - 1.0)]),
+        jacobian=lambda t, q: np.array([[q[0] - place(t), q[1]]]),
+        constraint_rate=lambda t, q: np.array([-(q[0] - place(t)) * size * rate * np.cos(rate * (t - t0))]),
+    )
+
+    def place(t):
+        return size * np.sin(rate * (t - t0)) if t > -1.0 else 0.0
+
+    start = [np.sin(0.5), -np.cos(0.5)], [size * rate, 0.0]
+    result = solve_dae(system, (t0, t0 + end), *start, "RadauIIA5", rtol=1e-5, atol=1e-5)
+    angle = solve_ivp(
+        lambda t, y: [y[1], -9.81 * np.sin(y[0]) + size * rate * rate * np.sin(rate * t) * np.cos(y[0])],
+        *((0.0, end), [0.5, 0.0], "DOP853"),
+        rtol=1e-12,
+        atol=1e-12,
+    ).y[0, -1]
+    assert result.success and abs(result.q[1, -1] + np.cos(angle)) < 1e-4

@@ -16,7 +16,7 @@ from twoloop.generate import parts_code, stage_code
 from twoloop.generate.choices import Choice
 from twoloop.generate.straight_code import SharedCode, own_code
 from twoloop.generate.straight_line import StraightLine
-from twoloop.kernels.compile import caches
+from twoloop.kernels.compile import kept_files
 from twoloop.kernels.data.codes import DONE
 from twoloop.kernels.data.noted import BY_GENERAL
 from twoloop.kernels.evaluation import tasks
@@ -292,7 +292,7 @@ def test_a_second_process_compiles_nothing(own_disk, monkeypatch):
 
 
 def test_of_code_on_the_disk_the_newest_is_kept(monkeypatch, own_disk):
-    monkeypatch.setattr(caches, "MOST_KEPT", 2)
+    monkeypatch.setattr(kept_files, "MOST_KEPT", 2)
     for stiffness in (1.0, -1.0, 2.0):  # 1 and -1 stand in the code
         system = ConstrainedSystem(
             n_q=1, n_c=0, mass=unit_mass, force=spring, constant_mass=True, parameters=[stiffness]

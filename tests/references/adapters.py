@@ -42,3 +42,7 @@ ANY_CALLBACK = (*(name for name, line in FOUND.items() if not (line.traces or li
 def each(*left_out: str, of: Any = tuple(ADAPTERS), slow: Collection[str] = COMPILES) -> list[Any]:
     """Names of adapters, of which some are slow: those that compile for long, or those given."""
     return [pytest.param(name, marks=[pytest.mark.slow] * (name in slow)) for name in of if name not in left_out]
+
+
+def start(problem, t_end=None):
+    return problem.system, (0.0, problem.reference.t if t_end is None else t_end), problem.q0, problem.v0

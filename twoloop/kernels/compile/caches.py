@@ -1,19 +1,16 @@
 """Machine code on disk: where numba keeps it, when it is out of date, and what happens where it cannot be kept.
 
-Everything that touches numba's private parts is in this file. Numba watches the file in which a function stands, and
-nothing else: not the helpers in other files, and not the values of globals, which it freezes. It raises when no folder
-can be written and when a file is damaged, and runs what others have put into one.
+Everything that touches numba's private parts is in this file and in kept_files.py. Numba watches the file in which a
+function stands, and nothing else: not the helpers in other files, and not the values of globals, which it freezes. It
+raises when no folder can be written and when a file is damaged, and runs what others have put into one.
 """
 
 import enum
 import gc
-import glob
 import hashlib
 import inspect
-import pickle
 import sys
 import types
-import uuid
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from functools import cache
@@ -27,19 +24,17 @@ from numba import njit
 from numba.core import caching
 from numba.core.caching import FunctionCache, NullCache
 from numba.core.dispatcher import Dispatcher
-from numba.core.serialize import dumps
 from numba.core.types import Type
 from numba.misc.appdirs import AppDirs
 
-from twoloop.kernels.compile.ownership import make_own, own_folder, read_own, write_own
+from twoloop.kernels.compile.kept_files import Files
+from twoloop.kernels.compile.ownership import make_own, own_folder
 
 UNWRITABLE = (
     "twoloop: machine code cannot be kept on disk, so every process compiles again. Set NUMBA_CACHE_DIR to a folder "
     "that only you can write"
 )
-MOST_KEPT = 500  # sets of functions made for single mechanisms, of each kind, on disk ...
-MOST_HELD = 50  # ... and in memory
-CHECKSUM = hashlib.sha256().digest_size
+MOST_HELD = 50  # sets of functions made for single mechanisms, of each kind, in memory
 # numba 0.61 has it under a private name
 _LOCATOR: Any = vars(caching).get("UserProvidedCacheLocator") or vars(caching)["_UserProvidedCacheLocator"]
 
@@ -180,67 +175,6 @@ class _Cache(FunctionCache):
             super().save_overload(sig, data)
         except OSError:
             say_once(UNWRITABLE)
-
-
-class Files:
-    """The files of one function, one for each key, each behind its checksum, and in the hands of the user alone.
-
-    A file that is damaged or out of date counts as missing. Numba's own keep an index, through which two processes that
-    write at the same time may lead one function to the machine code of another.
-    """
-
-    def __init__(self, folder: Path, name: str, stamp: Any, limited: bool = False):
-        self.folder, self.name, self.limited = folder, name, limited
-        self.made_of = numba.__version__, stamp
-
-    def save(self, key: Any, data: Any) -> None:
-        """Write what numba made for a key, in the place of what was there."""
-        content = pickle.dumps((repr((*self.made_of, key)), dumps(data)))
-        path = self._path(key)
-        unfinished = path.with_suffix(f".{uuid.uuid4().hex}")
-        make_own(self.folder)
-        try:
-            write_own(unfinished, hashlib.sha256(content).digest() + content)
-            unfinished.replace(path)
-        finally:
-            unfinished.unlink(missing_ok=True)
-        if self.limited:
-            for old in sorted(self._all(), key=_written)[:-MOST_KEPT]:
-                old.unlink(missing_ok=True)
-
-    def has(self, key: Any) -> bool:
-        """Whether there is a file for a key."""
-        return self._path(key).exists()
-
-    def load(self, key: Any) -> Any:
-        """What numba made for a key; None if it is missing."""
-        try:
-            content = read_own(self._path(key))
-        except OSError:
-            return None
-        if hashlib.sha256(content[CHECKSUM:]).digest() != content[:CHECKSUM]:
-            return None
-        made_of, data = pickle.loads(content[CHECKSUM:])
-        return pickle.loads(data) if made_of == repr((*self.made_of, key)) else None
-
-    def flush(self) -> None:
-        """Remove the files of all keys."""
-        for path in self._all():
-            path.unlink(missing_ok=True)
-
-    def _all(self) -> list[Path]:
-        return list(self.folder.glob(f"{glob.escape(self.name)}.*.nbc"))
-
-    def _path(self, key: Any) -> Path:
-        return self.folder / f"{self.name}.{hashlib.sha256(repr(key).encode()).hexdigest()[:16]}.nbc"
-
-
-def _written(path: Path) -> float:
-    """When a file was written; 0 if another process has removed it."""
-    try:
-        return path.stat().st_mtime
-    except OSError:
-        return 0.0
 
 
 def digest_of(text: str, *sources: str | types.ModuleType) -> str:

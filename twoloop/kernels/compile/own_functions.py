@@ -14,7 +14,8 @@ from typing import Any
 from llvmlite import binding
 from numba.core.registry import cpu_target
 
-from twoloop.kernels.compile.caches import UNWRITABLE, Files, Newest, say_once, sources_folder
+from twoloop.kernels.compile.caches import UNWRITABLE, Newest, say_once, sources_folder
+from twoloop.kernels.compile.kept_files import Files
 
 CALLED = "called_"
 _LINKING = Lock()  # names of what is called are those of the process, and other code of the same names may be linked
