@@ -63,7 +63,7 @@ def main(words: Sequence[str] | None = None) -> None:
             with output.kept({"part": name}) as kept:
                 new = known[name].make(kept)
             rows, line = output.load_rows()
-            new = new.assign(processor=cli.processor(), commit=cli.commit())
+            new = study.calibrated(new).assign(processor=cli.processor(), commit=cli.commit())
             output.save_rows(replaced(rows, known[name], new), line)
             print(f"{name}: {len(new)} rows", flush=True)
 

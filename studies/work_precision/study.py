@@ -32,6 +32,7 @@ from studies.bench.solvers import (
 from studies.bench.store import KeptRows, Output
 from studies.compare import GROUP, runs_of
 from studies.work_precision import first_calls, minimal, processors, rivals
+from twoloop.rows.calibration import CALIBRATION, calibration_s
 
 ERRORS = (1e-2, 1e-4, 1e-6)  # the accuracies of the first screen
 FURTHER = ("Gauss6", IRK_LINE, QUARTER, IDA_INDEX_1)
@@ -85,7 +86,12 @@ def make(output: Output) -> pd.DataFrame:
         made = [at_length(known_cases(quick), quick, kept)]
         made += [rivals.collect(rivals.runs(quick), kept)]
         made += [first_calls.collect(kept, quick), minimal.collect(kept, quick)]
-    return pd.concat(made, ignore_index=True)
+    return calibrated(pd.concat(made, ignore_index=True))
+
+
+def calibrated(rows: pd.DataFrame) -> pd.DataFrame:
+    """Rows with the time of the calibration, which lays those of several processors side by side, as it is now."""
+    return rows.assign(calibration=CALIBRATION, calibration_s=calibration_s())
 
 
 def at_length(known: Sequence[Case], quick: bool, kept: KeptRows) -> pd.DataFrame:
