@@ -13,7 +13,7 @@ from references.engines.trees import end_by_pinocchio
 from references.exudyn.pinned import solve_pinned
 from references.sundials.ida_sparse import solve_ida_sparse
 from studies.bench.collector import Case, Run, Solver, called_from, timed
-from studies.bench.large import PLANAR, SPATIAL, Assembly, closed_chain_of_hinges, open_chain
+from studies.bench.large import PLANAR, SPATIAL, Assembly, open_chain
 from studies.bench.solvers import CATALOGUE, CVODE_C, DEFAULT, at_instants
 from studies.bench.store import Row
 from twoloop import Result, solve_dae
@@ -26,7 +26,6 @@ METHOD, TOLERANCE = "DOP853", 1e-6
 FROM, TO = 30, 1000  # bodies, between which the slope is fitted
 SKIPPED, STEPS = 3, 6  # steps that set a run up, and steps timed: few, as motions differ later by size
 MANY, AGAIN = 300, 5  # bodies, below which the steps are timed so many times
-LARGEST_REDUNDANT = 1000  # bodies of a model with redundant rows: it finds their rank by dense matrices
 KEPT = 24  # steps of the run whose memory is asked for
 ROUNDS, REPEATS = 3, 3
 CHAINS = {20: 1.0, 100: 0.3, 400: 0.15}  # bodies, and how long they move, s: later they are chaotic
@@ -54,8 +53,6 @@ def evaluations(quick: bool) -> Keyed:
     for repeat in range(1 if quick else ROUNDS):
         for n in QUICK_SIZES if quick else SIZES:
             for build in (*PLANAR, *SPATIAL):
-                if build is closed_chain_of_hinges and n > LARGEST_REDUNDANT:
-                    continue
                 yield f"{EVALUATION} | {build.__name__} | {n} | {repeat}", partial(evaluation, build, n, repeat)
     for n in QUICK_SIZES if quick else SIZES[3:]:
         yield f"{MEMORY} | {n}", partial(memory, n)

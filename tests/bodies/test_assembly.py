@@ -5,8 +5,9 @@ import pickle
 import numpy as np
 import pytest
 
+from studies.bench.large import closed_chain_of_hinges, grid, in_space, ladder
 from twoloop import DOP853, consistent_states, solve_dae
-from twoloop.bodies import PlanarModel, SpatialModel
+from twoloop.bodies import PlanarModel, SpatialModel, assembly
 
 pytestmark = pytest.mark.filterwarnings("ignore::twoloop.ConstraintWarning")
 BARS = {"crank": 1.0, "rod": 2.0, "rocker": 1.5}
@@ -317,3 +318,24 @@ def test_bodies_that_are_given_at_rest_on_one_that_is_driven(on):
         model.prismatic(name, f"block {k}", at=(0.0, float(k)), axis=(1.0, 0.0))
     v0 = model.problem().v0
     np.testing.assert_allclose(v0, 0.3 * np.eye(len(v0))[0], atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    "made",
+    [
+        lambda: closed_chain_of_hinges(20),
+        lambda: in_space(ladder(30), 0.0),
+        lambda: in_space(ladder(30), 0.3),
+        lambda: in_space(grid(30), 0.3),
+    ],
+    ids=["closed chain", "ladder of parallel hinges", "ladder", "net"],
+)
+def test_the_freedom_of_large_models_is_that_by_full_matrices(made, monkeypatch):
+    def by_full_matrices(system, t, q, rows):
+        raise AssertionError("full matrices")
+
+    with monkeypatch.context() as sparse:
+        sparse.setattr(assembly, "_rank", by_full_matrices)
+        found = made().bodies.freedom
+    monkeypatch.setattr(assembly, "dependence", lambda *_: None)
+    assert made().bodies.freedom == found

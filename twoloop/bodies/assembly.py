@@ -16,6 +16,7 @@ from twoloop.checks.scales import TURNS, column_scales, generic_factors, median,
 from twoloop.checks.sparse_rows import SparseRows, norms
 from twoloop.problem.description import name_and_unit
 from twoloop.problem.system import ConstrainedSystem
+from twoloop.run.large_projection import dependence
 from twoloop.run.projection import consistent_state
 
 SINGULAR = 1e-9  # singular values of the scaled Jacobian below this fraction of the largest count as zero
@@ -230,6 +231,9 @@ def freedom(system: ConstrainedSystem, t: float, q: Array, rows: Mapping[str, tu
         return Freedom(system.n_q, 0, ())
     if _has_full_rank_sparse(system, t, q):
         return Freedom(system.n_q - system.n_c - system.n_a, 0, ())
+    large = _freedom_of_large(system, t, q, rows)
+    if large is not None:
+        return large
     scaled = _scaled(system, t, q)
     if _has_full_rank(scaled):
         return Freedom(system.n_q - len(scaled), 0, ())
@@ -237,8 +241,7 @@ def freedom(system: ConstrainedSystem, t: float, q: Array, rows: Mapping[str, tu
     beside = at_start
     free = null_space(scaled, rcond=SINGULAR)
     if free.shape[1]:
-        direction = free @ np.random.default_rng(3).uniform(0.5, 1.0, free.shape[1])
-        away = q + PERTURBATION * max(1.0, float(np.abs(q).max())) * direction / np.abs(direction).max()
+        away = _away(q, free @ np.random.default_rng(3).uniform(0.5, 1.0, free.shape[1]))
         try:
             there = consistent_state(system, t, away, np.zeros(system.n_q), check_assembly=False)[0]
             beside = max(beside, _rank(system, t, there))
@@ -247,6 +250,40 @@ def freedom(system: ConstrainedSystem, t: float, q: Array, rows: Mapping[str, tu
         q = there if beside > at_start else q
     degrees = system.n_q - beside
     return Freedom(degrees, beside - at_start, _redundant(system, t, q, rows))
+
+
+def _away(q: Array, direction: Array) -> Array:
+    """Return a position near another, in a direction."""
+    return np.asarray(q + PERTURBATION * max(1.0, float(np.abs(q).max())) * direction / np.abs(direction).max())
+
+
+def _freedom_of_large(
+    system: ConstrainedSystem, t: float, q: Array, rows: Mapping[str, tuple[int, ...]]
+) -> Freedom | None:
+    """Return the freedom of a large sparse system by its factors; None if the dense test is needed."""
+    here = dependence(system, t, q)
+    if here is None:
+        return None
+    singular = 0
+    if here.shares and np.abs(here.allowed).max() > 0.0:
+        try:
+            there = consistent_state(system, t, _away(q, here.allowed), np.zeros(system.n_q), check_assembly=False)[0]
+        except ValueError:  # no consistent state nearby: keep the rank at the start
+            there = q
+        beside = dependence(system, t, there)
+        if beside is None:
+            return None
+        if beside.rank > here.rank:
+            singular, here = beside.rank - here.rank, beside
+    of_row = {row: name for name, own in rows.items() for row in own}
+    groups: list[set[str]] = []
+    for row, share in here.shares.items():
+        involved = [row, *np.flatnonzero(np.abs(share) > 1e-6 * np.abs(share).max()).tolist()]
+        joined = {of_row[k] for k in involved if k in of_row}  # rows of Euler parameters belong to no joint
+        joined = joined.union(*(group for group in groups if group & joined))
+        groups = [group for group in groups if not group & joined] + [joined]
+    redundant = tuple(tuple(name for name in rows if name in group) for group in groups)
+    return Freedom(system.n_q - here.rank, singular, redundant)
 
 
 def _scaled(system: ConstrainedSystem, t: float, q: Array) -> Array:

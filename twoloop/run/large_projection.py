@@ -4,12 +4,13 @@ What is not plain sailing is left to it: rows that depend on one another beside 
 a dead centre, other guesses that may lead elsewhere.
 """
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.checks.consistency import is_at_rounding
+from twoloop.checks.sparse_rows import SparseRows
 from twoloop.kernels.compile.linking import direct
 from twoloop.kernels.data import codes, flags, noted
 from twoloop.kernels.evaluation import tasks
@@ -36,11 +37,10 @@ class _Metric:
         diagonal = np.where(rows == columns, 1.0, 0.0)
         self.work.mass_values[:] = diagonal / np.bincount(rows, diagonal, system.n_q)[rows]
 
-    def ask(self, task: int, q: Array, v: Array, a: Array | None = None) -> int:
+    def ask(self, task: int, q: Array, v: Array, a: Array | None = None, lam: Array | None = None) -> int:
         """What the inner loop says to a task; q and v are changed."""
-        a = self.work.x if a is None else a
-        code = direct(self.kit.inner)(self.kit, self.work, task, self.t, q, v, 0.0, a, self.work.lam)
-        return int(code)
+        a, lam = self.work.x if a is None else a, self.work.lam if lam is None else lam
+        return int(direct(self.kit.inner)(self.kit, self.work, task, self.t, q, v, 0.0, a, lam))
 
     def nearest(self, way: Array) -> Array:
         """What the constraints, by the factors there are, leave of a displacement."""
@@ -61,6 +61,36 @@ class _Metric:
                 return None
         self.at = q
         return q, v
+
+
+class Dependence(NamedTuple):
+    """The rank of C_q of a large system at a position, and rows that are made of others."""
+
+    rank: int
+    shares: dict[int, Array]  # of each row that does not count, (n_c,): what of the others it is made of
+    allowed: Array  # a displacement that C_q allows, (n_q,)
+
+
+def dependence(system: ConstrainedSystem, t: float, q: Array) -> Dependence | None:
+    """Which rows of a large sparse system depend on others; None where that is not to be left to sparse factors."""
+    form, all_rows = static_form(system, t, q), system.sparse_rows(t, q)
+    if form is None or not isinstance(all_rows, SparseRows):
+        return None
+    metric, still = _Metric(system, t, q, form), np.zeros_like(q)
+    code = metric.ask(tasks.RENEW, q.copy(), still)
+    if code == codes.RANK_DIFFERS:
+        metric = _Metric(system, t, q, form, int(metric.work.notes[noted.RANK]))
+        code = metric.ask(tasks.RENEW, q.copy(), still)
+    if code != codes.DONE or metric.work.notes[noted.PIVOT] < CLEAR:
+        return None
+    counted, room = set(metric.work.rows_v.tolist()), np.zeros_like(q)
+    shares: dict[int, Array] = {}
+    for row in range(system.n_c):
+        if row not in counted:
+            shares[row] = np.zeros(system.n_c)
+            metric.ask(tasks.SOLVE, all_rows.row(row), np.zeros(system.n_c), room, shares[row])
+    metric.at = q
+    return Dependence(len(counted), shares, metric.nearest(np.random.default_rng(3).uniform(0.5, 1.0, len(q))))
 
 
 def project_sparsely(
