@@ -43,9 +43,15 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     found["growth_w_max"] = w_max[STIFF] / w_max[SOFT]
     found["growth_as_frequency"] = bool(0.5 < found["growth_n_evaluations"] / found["growth_w_max"] < 2.0)
     found["exudyn"] = bool((runs["solver"] == EXUDYN).any())
-    ours = runs[runs["family"] == "two-loop"]
-    found["beside_steps"] = float((ours["call_s"] - ours["inside_s"]).median()) if "inside_s" in ours else None
+    found["beside_steps"] = _beside_steps(runs[runs["family"] == "two-loop"]) if "inside_s" in runs else None
     return found | _limits(rows)
+
+
+def _beside_steps(ours: pd.DataFrame) -> dict[str, Any]:
+    """Median time of a call that is not spent in its steps, of the methods with least and most of it."""
+    median = (ours["call_s"] - ours["inside_s"]).groupby(ours["solver"]).median()
+    ends = {"least": median.idxmin(), "most": median.idxmax()}
+    return {key: {"solver": str(name), "s": float(median[name])} for key, name in ends.items()}
 
 
 def _of(rows: pd.DataFrame, group: str, **equal: Any) -> pd.DataFrame:

@@ -177,17 +177,17 @@ def misses_of(own: pd.DataFrame) -> dict[str, Any]:
 
 
 def short_of_reach(rows: pd.DataFrame) -> list[dict[str, Any]]:
-    """By problem, the methods aimed at that stop with TIGHT, and those that have fewer digits than wanted."""
+    """By problem, the methods aimed at that stop with TIGHT, that we stop, and that have fewer digits than wanted."""
     found: dict[str, dict[str, Any]] = {}
     references = {problem.name: problem.reference for problem in (make() for make in MAKE)}
     for _, row in rows[(rows["tol"] == TIGHT) & rows["solver"].isin(AIMED)].iterrows():
         got, known = {level: row[f"digits_{level}"] for level in REACH}, references[row["case"]]
         assert known is not None
         short = [level for level, wanted in REACH.items() if got[level] < wanted < known.digits.get(level, 0.0)]
-        stopped = [row["solver"]] if pd.isna(got["q"]) else []
-        if short or stopped:
-            of = found.setdefault(row["case"], {"case": row["case"], "stopped": [], "short": []})
-            of["stopped"] += stopped
+        unfinished = bool(pd.isna(got["q"]))
+        if short or unfinished:
+            of = found.setdefault(row["case"], {"case": row["case"], "stopped": [], "limit": [], "short": []})
+            of["limit" if row["status"] == "TIME_LIMIT" else "stopped"] += [row["solver"]] * unfinished
             about = {"case": row["case"], "solver": row["solver"]}
             of["short"] += [about | {"level": level, "digits": float(got[level])} for level in short]
     return list(found.values())

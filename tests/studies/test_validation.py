@@ -112,6 +112,9 @@ def test_findings_turn_with_the_rows():
     found = said(validation, made_up(where=[("double pendulum", "LSODA, index 1")], what=stopped))[0]
     assert alone_of(found) == {"double pendulum": {"limit": ["LSODA, index 1"]}}  # our limit is no miss of theirs
     assert found["n_ended"] == {"ours": 16, "others": 4}
+    found, text = said(validation, made_up(where=[("double pendulum", "Gauss12")], what=stopped))
+    assert [(line["stopped"], line["limit"]) for line in found["ours_short"]] == [([], ["Gauss12"])]
+    assert "- double pendulum: we stopped `Gauss12` after" in text
 
 
 def test_a_solver_that_was_run_and_was_inexact_is_not_called_one_that_was_not_run():
