@@ -316,7 +316,7 @@ def _law(name: str, f: Any, stiffness: Any, more: Any) -> Law | None:
     return None if f is None else law_function(name, f)
 
 
-def _spring_numbers(name: str, given: dict[str, tuple[float, str]]) -> Numbers:
+def _spring_numbers(name: str, given: dict[str, tuple[Any, str]]) -> Numbers:
     """Return stiffness, damping and unstressed length or angle of a spring in a joint, with their units."""
     checks = check_not_negative, check_not_negative, check_finite
     values = tuple(check(what, value) for check, (what, (value, _)) in zip(checks, given.items(), strict=True))

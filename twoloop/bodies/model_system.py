@@ -134,7 +134,7 @@ def check_forces(tables: Tables, t: float, q: Array, v: Array) -> None:
         assert force.on_first is not None and force.on_second is not None
         one = placed(q, force.first, tables.of(force.on_first))
         two = placed(q, force.second, tables.of(force.on_second))
-        length = () if force.function else tables.of(force.more)[2:]
+        length = () if force.more is None else tables.of(force.more)[2:]
         if np.abs(np.subtract(one, two)).max() <= COINCIDE * np.abs((*one, *two, *length)).max():
             raise ValueError(
                 f"the points of the spring {force.name!r} coincide at the start, where it has no direction; give it "
