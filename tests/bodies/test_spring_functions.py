@@ -6,6 +6,7 @@ from scipy.integrate import solve_ivp
 
 from references.engines.rigid import rigid_of
 from tests.bodies.runs import moved
+from twoloop import ensemble
 from twoloop.bodies import PlanarModel, SpatialModel
 from twoloop.bodies.mjcf_geometry import IgnoredWarning
 
@@ -27,6 +28,7 @@ def hinge_and_slide(dimension, law):
         hinge = model.revolute("ground", bar, at=at[0], axis=AXIS)
         slide = model.prismatic(bar, block, at=at[2], axis=(1.0, 0.5, -0.3))
     high = np.eye(dimension)[1]
+    model.force(block, at[2], lambda t, q, v: np.cos(t) * q[0] * v[1] * high)
     if law:
         model.torsion_spring(hinge, torque=lambda angle, rate: 7.0 * angle + 0.3 * rate)
         model.axial_spring(slide, force=lambda x, rate: 40.0 * x + 0.5 * rate)
@@ -84,7 +86,7 @@ def known_pendulum(x0):
     return solve_ivp(rates, (0.0, 2.0), [0.9, -0.3, 0.0, 0.0], method="DOP853", rtol=1e-12, atol=1e-13).y[:2, -1]
 
 
-@pytest.mark.parametrize("options", [{}, {"compiled": True}, {"method": "RadauIIA9"}], ids=str)
+@pytest.mark.parametrize("options", [{}, {"compiled": True}, {"method": "RadauIIA9"}, {"method": "Taylor"}], ids=str)
 def test_a_pendulum_on_a_duffing_spring(options):
     problem = spring_pendulum()
     result = moved(problem, **options)
@@ -96,6 +98,15 @@ def test_a_place_is_a_parameter():
     problem = spring_pendulum().with_parameters({"x of string on ground": -0.1})
     result = moved(problem)
     np.testing.assert_allclose(result.q[:2, -1], known_pendulum((-0.1, 0.1)), atol=1e-8)
+
+
+def test_places_of_many_runs():
+    problem = spring_pendulum()
+    P = np.tile(problem.system.parameters, (3, 1))
+    P[:, problem.place("x of string on ground")] = (0.2, 0.1, -0.1)
+    runs = ensemble(problem.system, problem.t_span, problem.q0, problem.v0, parameters=P, rtol=1e-10, atol=1e-10)
+    for k, x in enumerate((0.2, 0.1, -0.1)):
+        np.testing.assert_allclose(runs.q[k, :2, -1], known_pendulum((x, 0.1)), atol=1e-7)
 
 
 def test_functions_with_branches_are_called_in_python():
