@@ -185,7 +185,7 @@ def hinge_springs(model: Any) -> dict[str, tuple[float, float, float]]:
     """Return by name of a hinge its spring: stiffness, damping, and the unstressed angle from the start."""
     found = {}
     for each in model.forces:
-        if each.kind == TORSION:
+        if each.kind == TORSION and not each.function:
             stiffness, damping, angle = each.more.values
             if model.dimension == 2:  # the unstressed angle is between the body axes
                 angle -= each.second.rotation - each.first.rotation

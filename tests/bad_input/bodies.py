@@ -165,6 +165,16 @@ BODIES: list[Case] = [
     of_planar("a negative stiffness", lambda: planar().spring("bar", (0, 0), "block", (1, 0), stiffness=-1.0)).says(
         "stiffness must not be negative; given -1.0", "give N/m; for a force that pushes away, force(...)"
     ),
+    of_planar(
+        "a spring with neither a stiffness nor a function", lambda: planar().spring("bar", (0, 0), "block", (1, 0))
+    ).says(
+        "give either stiffness, with damping and what is unstressed, or a function",
+        "give N/m, or force=f with f(length, rate)",
+        TypeError,
+    ),
+    of_planar("a spring as a function of t, q and v")
+    .when(lambda: planar().spring("bar", (0, 0), "block", (1, 0), force=lambda t, q, v: 1.0))
+    .says(r"is called as \(length, rate\)", "take length and rate, or use force(...)", TypeError),
     of_planar("a damper without a length")
     .when(lambda: planar().spring("bar", (0, 0), "block", (1, 0), stiffness=1.0, damping=1.0, length=0.0))
     .says("has no direction where its points meet", "give a length, or the damper as a force"),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -16,7 +16,7 @@ from twoloop.generate.derivative import Derivative
 from twoloop.generate.programs import Program, numbers_of, program_of
 from twoloop.generate.tracing import Form, Graph, Untraceable, symbols
 
-ARGUMENTS = {1: "(t)", 3: "(t, q, v)"}
+ARGUMENTS = {1: "(t)", 2: "(length, rate) or (angle, rate)", 3: "(t, q, v)"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,7 +29,7 @@ class Function:
         Names the argument and its owner in messages.
     function : callable
     n_arguments : int
-        1: t; 3: t, q and v.
+        1: t; 2: length and rate, see `Law`; 3: t, q and v.
     size : int
         Number of values returned.
     derivatives : tuple of callable
@@ -52,7 +52,7 @@ class Function:
 
     def at(self, t: float, q: Array, v: Array) -> Array:
         """Evaluate the function and check the shape; for a motion, with its derivatives."""
-        arguments = (t, q.copy(), v.copy())[: self.n_arguments]
+        arguments = self._arguments(t, q.copy(), v.copy())
         try:
             made = [self._checked(each(*arguments)) for each in (self.function, *self.derivatives)]
         except Exception as error:
@@ -64,6 +64,9 @@ class Function:
             made.append(results(0, t, np.zeros(0), np.zeros(0), self.traced)[1:3])
         return np.concatenate(made)
 
+    def _arguments(self, t: Any, q: Any, v: Any) -> tuple[Any, ...]:
+        return (t, q, v)[: self.n_arguments]
+
     def _checked(self, value: Any) -> Array:
         array = check_real(f"what {self.name} returns", value)
         if array.shape != (self.size,) and not (self.size == 1 and array.shape == ()):
@@ -73,7 +76,7 @@ class Function:
 
     def forms(self, graph: Graph, t: Form, q: Sequence[Form], v: Sequence[Form]) -> list[Form]:
         """Return the results for symbolic arguments; raise Untraceable if that fails."""
-        arguments = (t, symbols(q), symbols(v))[: self.n_arguments]
+        arguments = self._arguments(t, symbols(q), symbols(v))
         made: list[Form] = []
         for each in (self.function, *self.derivatives):
             array = np.array(trace(each, *arguments), dtype=object)
@@ -81,6 +84,40 @@ class Function:
                 raise Untraceable(f"on symbols it returns shape {array.shape}")
             made += as_forms(graph, array.reshape(self.size)).tolist()
         return made
+
+
+class Law(Function):
+    """The force of a spring as a function of its length and rate, which are all that it is given as q and v."""
+
+    def _arguments(self, t: Any, q: Any, v: Any) -> tuple[Any, ...]:
+        return q[0], v[0]
+
+
+def law_function(name: str, given: Any) -> Law:
+    """Return the force of a spring as a function of its length, or angle, and rate.
+
+    Raises
+    ------
+    TypeError
+        If the argument is not such a function.
+    """
+    if not callable(given):
+        raise TypeError(
+            f"{name} must be a function of (length, rate) or (angle, rate), such as lambda x, rate: 40.0 * x**3; "
+            f"given {shown(given)}"
+        )
+    return Law(name, given, _n_arguments(name, given, (2,)), 1)
+
+
+def with_arguments(functions: Sequence[Any], n_q: int, q: Any, v: Any) -> Iterator[tuple[Any, Any, Any]]:
+    """Yield functions with their parts of q and v, where lengths and rates of laws follow the first n_q, in order."""
+    law = n_q
+    for each in functions:
+        if isinstance(each, Law):
+            yield each, q[law : law + 1], v[law : law + 1]
+            law += 1
+        else:
+            yield each, q[:n_q], v[:n_q]
 
 
 def force_function(name: str, given: Any, size: int) -> Function | Array:
@@ -147,17 +184,18 @@ def program_for(functions: Sequence[Function | RowFunction], n_q: int, motions: 
     """Return one program for all functions, in order; raise Untraceable if one cannot be traced."""
     graph = Graph()
     (t,) = graph.inputs(1, False)
-    q, v = graph.inputs(n_q, False), graph.inputs(n_q, True)
+    n = n_q + sum(isinstance(each, Law) for each in functions)
+    q, v = graph.inputs(n, False), graph.inputs(n, True)
     made: list[Form] = []
-    for each in functions:
+    for each, one, other in with_arguments(functions, n_q, q, v):
         try:
             if motions and isinstance(each, Function):
                 made += motion_forms(each, graph, t)
             else:
-                made += each.forms(graph, t, q, v)
+                made += each.forms(graph, t, one, other)
         except Untraceable as error:
             raise Untraceable(f"{each.name}: {error}") from None
-    return program_of(graph, 1 + 2 * n_q, dict(enumerate(made)))
+    return program_of(graph, 1 + 2 * n, dict(enumerate(made)))
 
 
 def is_constant(function: Function | RowFunction) -> bool:

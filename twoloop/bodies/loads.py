@@ -7,10 +7,10 @@ from typing import Any
 
 from twoloop.bodies.collection import Collection
 from twoloop.bodies.documented import documented
-from twoloop.bodies.functions import Function, motion_function
+from twoloop.bodies.functions import Function, Law, law_function, motion_function
 from twoloop.bodies.parameter_layout import BRAKE, FORCE, PULL, RAIL, RUB, SPRING, TORQUE
 from twoloop.bodies.parts import Body, DryFriction, Force, JointRow, ModelJoint, Numbers
-from twoloop.checks.arguments import check_finite, check_not_negative, check_positive
+from twoloop.checks.arguments import check_finite, check_not_negative, check_positive, shown
 
 
 @documented
@@ -26,7 +26,7 @@ class Loads(Collection):
     def _motor(self, name: str, joint: ModelJoint, unit: str, f: Any) -> Force:
         raise NotImplementedError
 
-    def _along(self, name: str, kind: int, joint: ModelJoint, numbers: Numbers) -> Force:
+    def _along(self, name: str, kind: int, joint: ModelJoint, numbers: Numbers | None) -> Force:
         """Return a force along the axis of a prismatic joint; for friction also the torque of a revolute joint."""
         raise NotImplementedError
 
@@ -37,9 +37,10 @@ class Loads(Collection):
         b: Body | str,
         at_b: Any,
         *,
-        stiffness: float,
+        stiffness: float | None = None,
         damping: float = 0.0,
         length: float | None = None,
+        force: Any = None,
         name: str | None = None,
     ) -> Force:
         """Add a spring and damper between a point of one body and a point of another.
@@ -54,8 +55,14 @@ class Loads(Collection):
             N/m and N s/m.
         length : float, optional
             Unstressed length, m. None: the distance of the points in the position given.
+        force : callable, optional
+            In the place of stiffness, damping and length: force(length, rate), N, positive where it pulls the points
+            together. A linear spring has stiffness * (length - unstressed length) + damping * rate.
         """
         first, second, name, points, distance = self._apart("spring", a, at_a, b, at_b, name)
+        law = _law(f"force of {name!r}", force, stiffness, damping or length is not None)
+        if law is not None:
+            return self._add_force(Force(name, SPRING, first, second, *points, None, law))
         stiffness, damping = check_not_negative("stiffness", stiffness), check_not_negative("damping", damping)
         length = distance if length is None else check_not_negative("length", length)
         if length == 0.0:
@@ -74,9 +81,10 @@ class Loads(Collection):
         self,
         joint: ModelJoint | str,
         *,
-        stiffness: float,
+        stiffness: float | None = None,
         damping: float = 0.0,
         angle: float = 0.0,
+        torque: Any = None,
         name: str | None = None,
     ) -> Force:
         """Add a torsional spring and damper in a revolute joint.
@@ -90,9 +98,16 @@ class Loads(Collection):
         angle : float
             Rotation of b relative to a, from the position given, at which the spring has no torque, rad. In space the
             torque is defined up to 0.95 of a turn to either side of that position.
+        torque : callable, optional
+            In the place of stiffness, damping and angle: torque(angle, rate), N m, which acts on a, and against the
+            angle on b. A linear spring has stiffness * angle + damping * rate.
         """
         hinge = self._joint(joint, ("revolute",), "torsion_spring")
         name = self._new_name(f"torsion spring of {hinge.name}", name)
+        law = _law(f"torque of {name!r}", torque, stiffness, damping or angle)
+        if law is not None:
+            zero = Numbers((0.0,), (f"angle of {name} (rad)",))
+            return self._add_force(replace(self._torsion(name, hinge, zero), function=law))
         given = {"stiffness": (stiffness, "N m/rad"), "damping": (damping, "N m s/rad"), "angle": (angle, "rad")}
         return self._add_force(self._torsion(name, hinge, _spring_numbers(name, given)))
 
@@ -100,9 +115,10 @@ class Loads(Collection):
         self,
         joint: ModelJoint | str,
         *,
-        stiffness: float,
+        stiffness: float | None = None,
         damping: float = 0.0,
         length: float = 0.0,
+        force: Any = None,
         name: str | None = None,
     ) -> Force:
         """Add a spring and damper along a prismatic joint.
@@ -115,9 +131,15 @@ class Loads(Collection):
             N/m and N s/m.
         length : float
             Displacement of b along the axis of a, from the point on a, at which the spring has no force, m.
+        force : callable, optional
+            In the place of stiffness, damping and length: force(displacement, rate), N, which acts on a, and against
+            the displacement on b. A linear spring has stiffness * displacement + damping * rate.
         """
         slide = self._joint(joint, ("prismatic",), "axial_spring")
         name = self._new_name(f"spring of {slide.name}", name)
+        law = _law(f"force of {name!r}", force, stiffness, damping or length)
+        if law is not None:
+            return self._add_force(replace(self._along(name, RAIL, slide, None), function=law))
         given = {"stiffness": (stiffness, "N/m"), "damping": (damping, "N s/m"), "length": (length, "m")}
         return self._add_force(self._along(name, RAIL, slide, _spring_numbers(name, given)))
 
@@ -284,7 +306,17 @@ class Loads(Collection):
         return self._add_joint(ModelJoint(name, "drive", moved.a, moved.b, (row,), moved.point_a, moved.point_b))
 
 
-def _spring_numbers(name: str, given: dict[str, tuple[float, str]]) -> Numbers:
+def _law(name: str, f: Any, stiffness: Any, more: Any) -> Law | None:
+    """Return the force or torque of a spring as a function, or None if the spring has a stiffness."""
+    if (f is None) == (stiffness is None) or (f is not None and more):
+        raise TypeError(
+            f"give either stiffness, with damping and what is unstressed, or a function in the place of all of them: "
+            f"given {name} = {shown(f)}, stiffness={shown(stiffness)}"
+        )
+    return None if f is None else law_function(name, f)
+
+
+def _spring_numbers(name: str, given: dict[str, tuple[Any, str]]) -> Numbers:
     """Return stiffness, damping and unstressed length or angle of a spring in a joint, with their units."""
     checks = check_not_negative, check_not_negative, check_finite
     values = tuple(check(what, value) for check, (what, (value, _)) in zip(checks, given.items(), strict=True))

@@ -38,7 +38,9 @@ class _Writer:
         self.springs: dict[str, Force] = {}
         self.tendons: list[Force] = []
         for force in model.forces:
-            if force.kind in (TORSION, RAIL):
+            if force.function is not None:
+                self.left_out.append(force.name)
+            elif force.kind in (TORSION, RAIL):
                 assert force.joint is not None
                 if force.joint.name in self.springs:
                     raise ValueError(

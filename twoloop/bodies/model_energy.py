@@ -48,7 +48,9 @@ class ModelEnergy:
             J = bodies[:, [1, 4, 5, 4, 2, 6, 5, 6, 3]].reshape(-1, 3, 3)
             spins = _spins(q[:, 3:], v[:, 3:])
             total += 0.5 * np.einsum("ijk,ij...,ik...->...", J, spins, spins)
-        for kind, i, at, j, there, more, _, on_first in self._forces:
+        for kind, i, at, j, there, more, given, on_first in self._forces:
+            if given >= 0:  # no potential is known
+                continue
             if kind in (layout.SPRING, layout.PULL):
                 length = np.sqrt((between(i, at, j, there) ** 2).sum(axis=0))
                 total += 0.5 * self.p[more] * (length - (self.p[more + 2] if kind == layout.SPRING else 0.0)) ** 2

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.bodies import parameter_layout as layout
-from twoloop.bodies.functions import Function
+from twoloop.bodies.functions import Function, Law, with_arguments
 from twoloop.bodies.loaded_friction import LoadedFriction
 from twoloop.bodies.parts import COINCIDE
 from twoloop.bodies.places import placed
@@ -77,9 +77,25 @@ def system_of(
 
 def _callback(dimension: int, kind: str, tables: Tables) -> Any:
     """Return the callback of a kind, from the module of those that evaluate programs if it needs one."""
+    if kind == "force" and any(isinstance(each, Law) for each in tables.functions):
+        return _laws(dimension).force_of_laws
     programmed = tables.functions if kind == "force" else tables.motions
     name = "programs" if programmed and kind not in ("mass", "mass_values") else "callbacks"
     return getattr(import_module(f"twoloop.bodies.{'planar' if dimension == 2 else 'spatial'}_{name}"), kind)
+
+
+def _laws(dimension: int) -> Any:
+    return import_module(f"twoloop.bodies.{'planar' if dimension == 2 else 'spatial'}_laws")
+
+
+def _with_stretches(tables: Tables, q: Array, v: Array, p: Array) -> tuple[Array, Array]:
+    """Return q and v, followed by the lengths and rates of springs if the forces of some are functions of these."""
+    n_laws = sum(isinstance(each, Law) for each in tables.functions)
+    if not n_laws:
+        return q, v
+    one, other = np.zeros((2, len(q) + n_laws))
+    _laws(len(tables.gravity)).fill_stretches(q, v, p, one, other)
+    return one, other
 
 
 def entries_of(dimension: int, tables: Tables) -> dict[str, NDArray[np.int64]]:
@@ -102,8 +118,9 @@ def entries_of(dimension: int, tables: Tables) -> dict[str, NDArray[np.int64]]:
 
 @QUIET
 def _check_functions(tables: Tables, t: float, q: Array, v: Array) -> None:
-    for each in (*tables.motions, *tables.functions):
-        value = each.at(t, q, v)  # raises if the result has a wrong shape or type
+    stretched = _with_stretches(tables, q, v, tables.p)
+    for each, one, other in with_arguments([*tables.motions, *tables.functions], len(q), *stretched):
+        value = each.at(t, one, other)  # raises if the result has a wrong shape or type
         if each in tables.motions or not np.isfinite(tables.p).all():
             _check_finite(each, value, t)
 
@@ -111,19 +128,20 @@ def _check_functions(tables: Tables, t: float, q: Array, v: Array) -> None:
 @QUIET
 def check_forces(tables: Tables, t: float, q: Array, v: Array) -> None:
     """Raise if a force is undefined at the start."""
-    for each in tables.functions:
-        _check_finite(each, each.at(t, q, v), t)
     for force in tables.forces:
         if force.kind != layout.SPRING:
             continue
-        assert force.on_first is not None and force.on_second is not None and force.more is not None
+        assert force.on_first is not None and force.on_second is not None
         one = placed(q, force.first, tables.of(force.on_first))
         two = placed(q, force.second, tables.of(force.on_second))
-        if np.abs(np.subtract(one, two)).max() <= COINCIDE * np.abs((*one, *two, tables.of(force.more)[2])).max():
+        length = () if force.more is None else tables.of(force.more)[2:]
+        if np.abs(np.subtract(one, two)).max() <= COINCIDE * np.abs((*one, *two, *length)).max():
             raise ValueError(
                 f"the points of the spring {force.name!r} coincide at the start, where it has no direction; give it "
                 "other points, or length=0 for a pull in proportion to their distance"
             )
+    for each, some, rates in with_arguments(tables.functions, len(q), *_with_stretches(tables, q, v, tables.p)):
+        _check_finite(each, each.at(t, some, rates), t)
 
 
 def check_loads(tables: Tables, redundant: tuple[tuple[str, ...], ...], Q: Array) -> None:
@@ -165,10 +183,11 @@ def _disagreement(tables: Tables, t: float, q: Array, v: Array) -> str:
             away = generic.uniform(-1.0, 1.0, (2, len(q))) * (number > 0)
             then = t + 0.37 * number
             one, other = q + 0.3 * away[0], v + away[1]
-            made, first = results(int(place), then, one, other, p), 0
-            for each in functions:
+            stretched = _with_stretches(tables, one, other, p) if functions is tables.functions else (one, other)
+            made, first = results(int(place), then, *stretched, p), 0
+            for each, some, rates in with_arguments(functions, len(q), *stretched):
                 try:
-                    known = each.at(then, one, other)
+                    known = each.at(then, some, rates)
                 except (ArithmeticError, TypeError):  # outside the domain of the function
                     known = np.full(each.n_results, np.nan)
                 size = each.n_results
@@ -191,7 +210,7 @@ class InPython:
 
     def __init__(self, callbacks: Any, tables: Tables, n_q: int):
         self._callbacks, self.p = callbacks, tables.p
-        self._motions, self._functions = tuple(tables.motions), tuple(tables.functions)
+        self._motions, self._tables = tuple(tables.motions), tables
         self._n_q, self._n_rows, self._n_rates = n_q, tables.n_rows, tables.n_rates
         self._untraced = tables.untraced
         self.loaded: LoadedFriction | None = None
@@ -211,7 +230,7 @@ class InPython:
 
     def force(self, t: float, q: Array, v: Array, p: Array) -> Array:
         """Evaluate Q."""
-        made = self._filled("fill_force", (self._n_q,), q, lambda: (q, v, p, _called(self._functions, t, q, v)))
+        made = self._filled("fill_force", (self._n_q,), q, lambda: (q, v, p, self._forces(t, q, v, p)))
         if self.loaded is not None:
             rates = self.nonholonomic_gamma(t, q, v, p) if self._n_rates else np.zeros(0)
             gamma = np.append(self.gamma(t, q, v, p), rates)
@@ -250,8 +269,9 @@ class InPython:
         return made
 
     def _moved(self, t: float, q: Array, v: Array) -> Array:
-        return _called(self._motions, t, q, v)
+        return np.concatenate([np.zeros(0), *(each.at(t, q, v) for each in self._motions)])
 
-
-def _called(functions: tuple[Function | RowFunction, ...], t: float, q: Array, v: Array) -> Array:
-    return np.concatenate([np.zeros(0), *(each.at(t, q, v) for each in functions)])
+    def _forces(self, t: float, q: Array, v: Array, p: Array) -> Array:
+        functions = self._tables.functions
+        called = with_arguments(functions, len(q), *_with_stretches(self._tables, q, v, p))
+        return np.concatenate([np.zeros(0), *(each.at(t, one, other) for each, one, other in called)])

@@ -186,7 +186,9 @@ def fill_force(q, v, p, made, Q):
         kind, i, at, j, there, more, given, on_first = tables.force_at(p, k)
         if kind in (layout.TORQUE, layout.TORSION, layout.BRAKE):
             rate = angle_of(v, j) - angle_of(v, i)
-            if kind == layout.TORSION:
+            if kind == layout.TORSION and given >= 0:
+                torque = -made[given]
+            elif kind == layout.TORSION:
                 torque = -p[more] * (angle_of(q, j) - angle_of(q, i) - p[more + 2]) - p[more + 1] * rate
             elif kind == layout.BRAKE:
                 torque = -p[more] * math.tanh(rate / p[more + 1])
@@ -208,7 +210,9 @@ def fill_force(q, v, p, made, Q):
             if i >= 0:
                 rate = v[3 * i + 2]
                 u, w = u - v[3 * i] + rate * (by - q[3 * i + 1]), w - v[3 * i + 1] - rate * (bx - q[3 * i])
-            if kind == layout.RAIL:
+            if kind == layout.RAIL and given >= 0:
+                f = -made[given]
+            elif kind == layout.RAIL:
                 ax, ay, _, _ = place(q, i, p, on_first)
                 f = -p[more] * (fx * (bx - ax) + fy * (by - ay) - p[more + 2]) - p[more + 1] * (fx * u + fy * w)
             elif kind == layout.RUB:
@@ -223,6 +227,9 @@ def fill_force(q, v, p, made, Q):
         x, y = bx - ax, by - ay
         if kind == layout.PULL:
             x, y = p[more] * x, p[more] * y
+        elif given >= 0:
+            pull = made[given] / math.sqrt(x * x + y * y)
+            x, y = pull * x, pull * y
         else:
             length = math.sqrt(x * x + y * y)
             x, y = x / length, y / length

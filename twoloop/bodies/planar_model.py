@@ -200,10 +200,11 @@ class PlanarModel(Couplings):
         return JointRow(ALONG, 1, joint.a, joint.b, across.on_first, across.on_second, across.more, motion)
 
     def _torsion(self, name: str, joint: ModelJoint, numbers: Numbers) -> Force:
-        stiffness, damping, angle = numbers.values
+        *law, angle = numbers.values
         total = angle + joint.b.rotation - joint.a.rotation
-        names = (*numbers.names[:2], f"angle of {joint.b.name} against {joint.a.name} without torque of {name} (rad)")
-        values = Numbers((stiffness, damping, total), names)
+        zero = "without torque" if law else "at the zero"
+        names = (*numbers.names[:-1], f"angle of {joint.b.name} against {joint.a.name} {zero} of {name} (rad)")
+        values = Numbers((*law, total), names)
         return Force(name, TORSION, joint.a, joint.b, None, None, values, joint=joint)
 
     def _motor(self, name: str, joint: ModelJoint, unit: str, f: Any) -> Force:
@@ -212,7 +213,7 @@ class PlanarModel(Couplings):
             return Force(name, TORQUE, joint.a, joint.b, None, None, more, function, joint=joint)
         return Force(name, SLIDE, joint.a, joint.b, joint.rows[0].more, joint.point_b, more, function, joint=joint)
 
-    def _along(self, name: str, kind: int, joint: ModelJoint, numbers: Numbers) -> Force:
+    def _along(self, name: str, kind: int, joint: ModelJoint, numbers: Numbers | None) -> Force:
         axis = joint.rows[0].more  # None for a revolute joint
         return Force(name, kind, joint.a, joint.b, axis, joint.point_b, numbers, point_on_first=joint.point_a)
 

@@ -41,6 +41,22 @@ def force_at(p, k):
     return int(p[k]), i, at, j, there, int(p[k + 5]), int(p[k + 6]), int(p[k + 7])
 
 
+@exact
+def is_law(p, k):
+    """Return True for a spring whose force is a function of its length and rate."""
+    return int(p[k + layout.F_RESULT]) >= 0 and int(p[k]) in (layout.SPRING, layout.TORSION, layout.RAIL)
+
+
+@exact
+def n_laws(p):
+    """Return the number of such springs."""
+    n = 0
+    for k in force_places(p):
+        if is_law(p, k):
+            n += 1
+    return n
+
+
 @inlined
 def made_by(program, t, q, v, p):
     """Return the results of a program of the model."""

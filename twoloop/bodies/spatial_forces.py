@@ -39,7 +39,9 @@ def put_forces(q, v, p, made, Q):
             ux, uy, uz = spin(q, v, i)
             wx, wy, wz = spin(q, v, j)
             rate = x * (wx - ux) + y * (wy - uy) + z * (wz - uz)
-            if kind == layout.TORSION:
+            if kind == layout.TORSION and given >= 0:
+                f = -made[given]
+            elif kind == layout.TORSION:
                 f = -torsion(q, i, j, p, at, there, p[more], p[more + 2]) - p[more + 1] * rate
             else:
                 f = push(kind, rate, p, more, made, given)
@@ -57,7 +59,9 @@ def put_forces(q, v, p, made, Q):
             ox, oy, oz = spin(q, v, i)
             wx, wy, wz = wx - ux - oy * cz + oz * cy, wy - uy - oz * cx + ox * cz, wz - uz - ox * cy + oy * cx
             rate = x * wx + y * wy + z * wz
-            if kind == layout.RAIL:
+            if kind == layout.RAIL and given >= 0:
+                f = -made[given]
+            elif kind == layout.RAIL:
                 ax, ay, az = place(q, i, p, on_first)
                 f = -p[more] * (x * (bx - ax) + y * (by - ay) + z * (bz - az) - p[more + 2]) - p[more + 1] * rate
             else:
@@ -72,6 +76,9 @@ def put_forces(q, v, p, made, Q):
         x, y, z = bx - ax, by - ay, bz - az
         if kind == layout.PULL:
             x, y, z = p[more] * x, p[more] * y, p[more] * z
+        elif given >= 0:
+            pull = made[given] / math.sqrt(x * x + y * y + z * z)
+            x, y, z = pull * x, pull * y, pull * z
         else:
             length = math.sqrt(x * x + y * y + z * z)
             x, y, z = x / length, y / length, z / length

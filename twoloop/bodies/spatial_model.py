@@ -227,7 +227,7 @@ class SpatialModel(Wheels):
             return Force(name, AXIAL, joint.a, joint.b, axis, None, more, function, joint=joint)
         return Force(name, SLIDE, joint.a, joint.b, axis, joint.point_b, more, function, joint=joint)
 
-    def _along(self, name: str, kind: int, joint: ModelJoint, numbers: Numbers) -> Force:
+    def _along(self, name: str, kind: int, joint: ModelJoint, numbers: Numbers | None) -> Force:
         axis = Numbers(tuple(joint.axes[0]))
         places = axis, joint.point_b, numbers
         return Force(name, kind, joint.a, joint.b, *places, point_on_first=joint.point_a, joint=joint)

@@ -1,0 +1,176 @@
+"""Springs whose force is a function of their length, angle or displacement and its rate."""
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from references.engines.rigid import rigid_of
+from tests.bodies.runs import moved
+from twoloop import ensemble
+from twoloop.bodies import PlanarModel, SpatialModel
+from twoloop.bodies.mjcf_geometry import IgnoredWarning
+
+AXIS = np.array([1.0, 2.0, 2.0]) / 3.0
+
+
+def hinge_and_slide(dimension, law):
+    """A bar on a hinge, a block on a slide, both turned, and a spring in each and between them."""
+    if dimension == 2:
+        model, at = PlanarModel(), [np.array(x) for x in ((0.3, 0.1), (0.8, 0.5), (1.4, 0.2))]
+        bar = model.body("bar", mass=2.0, inertia=0.3, position=at[1], angle=0.2, angular_velocity=0.7)
+        block = model.body("block", mass=1.5, inertia=0.2, position=at[2], angle=-0.4)
+        hinge = model.revolute("ground", bar, at=at[0])
+        slide = model.prismatic(bar, block, at=at[2], axis=(1.0, 0.5))
+    else:
+        model, at = SpatialModel(), [np.array(x) for x in ((0.3, 0.1, 0.2), (0.8, 0.5, 0.1), (1.4, 0.2, 0.6))]
+        bar = model.body("bar", mass=2.0, inertia=(0.3, 0.4, 0.5), position=at[1])
+        block = model.body("block", mass=1.5, inertia=(0.2, 0.3, 0.2), position=at[2])
+        hinge = model.revolute("ground", bar, at=at[0], axis=AXIS)
+        slide = model.prismatic(bar, block, at=at[2], axis=(1.0, 0.5, -0.3))
+    high = np.eye(dimension)[1]
+    model.force(block, at[2], lambda t, q, v: np.cos(t) * q[0] * v[1] * high)
+    if law:
+        model.torsion_spring(hinge, torque=lambda angle, rate: 7.0 * angle + 0.3 * rate)
+        model.axial_spring(slide, force=lambda x, rate: 40.0 * x + 0.5 * rate)
+        model.spring("ground", high, block, at[2] + 0.1, force=lambda x, rate: 30.0 * (x - 0.4) + 0.2 * rate)
+    else:
+        model.torsion_spring(hinge, stiffness=7.0, damping=0.3)
+        model.axial_spring(slide, stiffness=40.0, damping=0.5)
+        model.spring("ground", high, block, at[2] + 0.1, stiffness=30.0, damping=0.2, length=0.4)
+    return model.problem((0.0, 1.0))
+
+
+@pytest.mark.parametrize("dimension", [2, 3])
+def test_a_linear_function_is_a_stiffness_and_a_damping(dimension):
+    law, linear = (hinge_and_slide(dimension, law) for law in (True, False))
+    generic = np.random.default_rng(3)
+    for _ in range(10):
+        q, v = law.q0 + 0.2 * generic.uniform(-1.0, 1.0, len(law.q0)), generic.uniform(-1.0, 1.0, len(law.q0))
+        one, other = (each.system.force(0.0, q, v) for each in (law, linear))
+        np.testing.assert_allclose(one, other, rtol=1e-12, atol=1e-12)
+
+
+def bumper(x, rate):
+    return np.exp(20.0 * (x - 0.4)) - np.exp(-20.0 * (x + 0.4)) + 0.1 * rate
+
+
+def test_a_bumper_on_a_slide():
+    model = PlanarModel(gravity=(0.0, 0.0))
+    block = model.body("block", mass=2.0, inertia=1.0, position=(0.5, 0.0), velocity=(1.0, 0.0))
+    slide = model.prismatic("ground", block, at=(0.5, 0.0), axis=(1.0, 0.0))
+    model.axial_spring(slide, force=bumper)
+    problem = model.problem((0.0, 3.0))
+    known = solve_ivp(lambda t, y: [y[1], -bumper(*y) / 2.0], (0.0, 3.0), [0.0, 1.0], "DOP853", rtol=1e-12, atol=1e-13)
+    result = moved(problem)
+    assert result.q[0, -1] - 0.5 == pytest.approx(known.y[0, -1], abs=1e-8)
+
+
+def duffing(length, rate):
+    return 30.0 * (length - 1.0) + 200.0 * (length - 1.0) ** 3 + 0.4 * rate
+
+
+def spring_pendulum(force=duffing):
+    model = PlanarModel()
+    bob = model.body("bob", mass=1.5, inertia=0.1, position=(0.9, -0.3))
+    model.spring("ground", (0.2, 0.1), bob, bob.point(0.0, 0.0), force=force, name="string")
+    return model.problem((0.0, 2.0))
+
+
+def known_pendulum(x0):
+    def rates(t, y):
+        away = y[:2] - x0
+        length = np.sqrt(away @ away)
+        pull = duffing(length, away @ y[2:] / length) / length
+        return [*y[2:], *(np.array([0.0, -9.81]) - pull * away / 1.5)]
+
+    return solve_ivp(rates, (0.0, 2.0), [0.9, -0.3, 0.0, 0.0], method="DOP853", rtol=1e-12, atol=1e-13).y[:2, -1]
+
+
+@pytest.mark.parametrize("options", [{}, {"compiled": True}, {"method": "RadauIIA9"}, {"method": "Taylor"}], ids=str)
+def test_a_pendulum_on_a_duffing_spring(options):
+    problem = spring_pendulum()
+    result = moved(problem, **options)
+    assert not problem.conserved
+    np.testing.assert_allclose(result.q[:2, -1], known_pendulum((0.2, 0.1)), atol=1e-8)
+
+
+def test_a_place_is_a_parameter():
+    problem = spring_pendulum().with_parameters({"x of string on ground": -0.1})
+    result = moved(problem)
+    np.testing.assert_allclose(result.q[:2, -1], known_pendulum((-0.1, 0.1)), atol=1e-8)
+
+
+def test_places_of_many_runs():
+    problem = spring_pendulum()
+    P = np.tile(problem.system.parameters, (3, 1))
+    P[:, problem.place("x of string on ground")] = (0.2, 0.1, -0.1)
+    runs = ensemble(problem.system, problem.t_span, problem.q0, problem.v0, parameters=P, rtol=1e-10, atol=1e-10)
+    for k, x in enumerate((0.2, 0.1, -0.1)):
+        np.testing.assert_allclose(runs.q[k, :2, -1], known_pendulum((x, 0.1)), atol=1e-7)
+
+
+def test_functions_with_branches_are_called_in_python():
+    branched = spring_pendulum(lambda x, rate: duffing(x, rate) if x > 0.0 else 0.0)
+    result = moved(branched, tolerance=1e-9)
+    np.testing.assert_allclose(result.q[:2, -1], known_pendulum((0.2, 0.1)), atol=1e-6)
+
+
+@pytest.mark.parametrize("options", [{}, {"compiled": True}, {"method": "RadauIIA9"}], ids=str)
+def test_a_cubic_torque_in_a_hinge_in_space(options):
+    model = SpatialModel(gravity=(0.0, 0.0, 0.0))
+    bar = model.body("bar", mass=2.0, inertia=(0.4, 0.4, 0.4), position=(0.0, 0.0, 0.0), angular_velocity=AXIS)
+    hinge = model.revolute("ground", bar, at=(0.0, 0.0, 0.0), axis=AXIS)
+    model.torsion_spring(hinge, torque=lambda angle, rate: 2.0 * angle + 5.0 * angle**3 + 0.1 * rate)
+    problem = model.problem((0.0, 2.0))
+    known = solve_ivp(
+        lambda t, y: [y[1], -(2.0 * y[0] + 5.0 * y[0] ** 3 + 0.1 * y[1]) / 0.4],
+        *((0.0, 2.0), [0.0, 1.0]),
+        **{"method": "DOP853", "rtol": 1e-12, "atol": 1e-13},
+    )
+    result = moved(problem, **options)
+    angle = 2.0 * np.arctan2(AXIS @ result.q[4:7, -1], result.q[3, -1])
+    assert angle == pytest.approx(known.y[0, -1], abs=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({}, "give either stiffness"),
+        ({"stiffness": 1.0, "force": duffing}, "give either stiffness"),
+        ({"length": 1.0, "force": duffing}, "give either stiffness"),
+        ({"damping": 1.0, "force": duffing}, "give either stiffness"),
+        ({"force": 3.0}, "must be a function of"),
+        ({"force": lambda t, q, v: 0.0}, "is called as"),
+    ],
+)
+def test_wrong_arguments(options, message):
+    model = PlanarModel()
+    bob = model.body("bob", mass=1.5, inertia=0.1, position=(0.9, -0.3))
+    with pytest.raises(TypeError, match=message):
+        model.spring("ground", (0.2, 0.1), bob, (0.9, -0.3), **options)
+
+
+def test_wrong_results():
+    with pytest.raises(ValueError, match="must return a number"):
+        spring_pendulum(lambda x, rate: (x, rate))
+    with pytest.raises(ValueError, match="must be finite at the start"):
+        spring_pendulum(lambda x, rate: x / rate)
+
+
+def test_points_that_coincide():
+    model = PlanarModel()
+    bob = model.body("bob", mass=1.5, inertia=0.1, position=(0.9, -0.3))
+    model.spring("ground", (0.9, -0.3), bob, (0.9, -0.3), force=duffing)
+    with pytest.raises(ValueError, match="coincide at the start"):
+        model.problem()
+
+
+def test_exports_do_not_drop_it(tmp_path):
+    model = SpatialModel()
+    bar = model.body("bar", mass=2.0, inertia=(0.4, 0.4, 0.4), position=(0.0, 0.0, 0.0))
+    hinge = model.revolute("ground", bar, at=(0.0, 0.0, 0.0), axis=AXIS)
+    model.torsion_spring(hinge, torque=lambda angle, rate: angle**3, name="hardening")
+    with pytest.warns(IgnoredWarning, match="without hardening"):
+        model.to_mjcf(tmp_path / "model.xml")
+    with pytest.raises(ValueError, match="not 'hardening'"):
+        rigid_of(model.problem())
