@@ -58,6 +58,18 @@ def n_laws(p):
 
 
 @inlined
+def put_stretches(stretch, q, v, p, one, other):
+    """Write q and v, and the lengths and rates of the springs whose forces are functions of these."""
+    for k in range(q.size):
+        one[k], other[k] = q[k], v[k]
+    made = q.size
+    for k in force_places(p):
+        if is_law(p, k):
+            one[made], other[made] = stretch(q, v, p, k)
+            made += 1
+
+
+@inlined
 def made_by(program, t, q, v, p):
     """Return the results of a program of the model."""
     return results_within(int(p[p.size - layout.HEAD + program]), t, q, v, p)

@@ -5,12 +5,11 @@ import math
 import numpy as np
 
 from twoloop.bodies.parameter_layout import FORCE_PROGRAM, RAIL, TORSION
-from twoloop.bodies.read_tables import force_at, force_places, is_law, made_by, n_laws
+from twoloop.bodies.read_tables import force_at, made_by, n_laws, put_stretches
 from twoloop.bodies.spatial_forces import fill_force
 from twoloop.bodies.spatial_places import centre, place, spin, torsion, vector, velocity
 from twoloop.kernels.compile.caches import helper
 from twoloop.kernels.compile.callbacks import callback
-from twoloop.kernels.data.common import inlined
 
 
 @helper
@@ -41,26 +40,13 @@ def stretch(q, v, p, k):
 
 @helper
 def fill_stretches(q, v, p, one, other):
-    """Write q and v, and the lengths and rates of the springs whose forces are functions of these."""
-    for k in range(q.size):
-        one[k], other[k] = q[k], v[k]
-    made = q.size
-    for k in force_places(p):
-        if is_law(p, k):
-            one[made], other[made] = stretch(q, v, p, k)
-            made += 1
-
-
-@inlined
-def with_stretches(q, v, p):
-    """Return q and v, followed by these lengths and rates."""
-    n = q.size + n_laws(p)
-    one, other = np.zeros(n), np.zeros(n)
-    fill_stretches(q, v, p, one, other)
-    return one, other
+    """Write q and v, and what `stretch` returns for each spring whose force is a function."""
+    put_stretches(stretch, q, v, p, one, other)
 
 
 @callback("force")
 def force_of_laws(t, q, v, p, Q):
-    one, other = with_stretches(q, v, p)
+    n = q.size + n_laws(p)
+    one, other = np.zeros(n), np.zeros(n)
+    fill_stretches(q, v, p, one, other)
     fill_force(q, v, p, made_by(FORCE_PROGRAM, t, one, other, p), Q)
