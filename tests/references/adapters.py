@@ -26,12 +26,17 @@ class Adapter:
         return self._line.solve(*start, **self._line.options, **tolerances, **options)
 
 
+def _by_collocation(*start: Any, tol: float | None = None, **options: Any) -> Any:
+    pytest.importorskip("casadi")
+    return solve_collocation(*start, 300, **options)
+
+
 # one setting of each solver: `fixed` tells those that differ in a number
 FOUND = {line.name: line for line in lines() if line.setting == "tol" and not line.of_problem and not line.fixed}
 ADAPTERS: dict[str, Any] = {
     **{name: Adapter(line) for name, line in FOUND.items()},
     # which take steps, here of a fixed length or number
-    "collocation, CasADi": lambda *start, tol=None, **options: solve_collocation(*start, 300, **options),
+    "collocation, CasADi": _by_collocation,
     "GSTIFF": lambda *start, tol=None, **options: solve_gear(*start, 1e-3, 2, **options),
 }
 COMPILES = {"Dopri8, diffrax"}  # for ten seconds

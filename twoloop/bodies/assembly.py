@@ -16,7 +16,7 @@ from twoloop.checks.scales import TURNS, column_scales, generic_factors, median,
 from twoloop.checks.sparse_rows import SparseRows, norms
 from twoloop.problem.description import name_and_unit
 from twoloop.problem.system import ConstrainedSystem
-from twoloop.run.large_projection import dependence
+from twoloop.run.large_projection import dependence, project_sparsely
 from twoloop.run.projection import consistent_state
 
 SINGULAR = 1e-9  # singular values of the scaled Jacobian below this fraction of the largest count as zero
@@ -241,7 +241,8 @@ def freedom(system: ConstrainedSystem, t: float, q: Array, rows: Mapping[str, tu
     beside = at_start
     free = null_space(scaled, rcond=SINGULAR)
     if free.shape[1]:
-        away = _away(q, free @ np.random.default_rng(3).uniform(0.5, 1.0, free.shape[1]))
+        direction = free @ np.random.default_rng(3).uniform(0.5, 1.0, free.shape[1])
+        away = q + PERTURBATION * max(1.0, float(np.abs(q).max())) * direction / np.abs(direction).max()
         try:
             there = consistent_state(system, t, away, np.zeros(system.n_q), check_assembly=False)[0]
             beside = max(beside, _rank(system, t, there))
@@ -250,11 +251,6 @@ def freedom(system: ConstrainedSystem, t: float, q: Array, rows: Mapping[str, tu
         q = there if beside > at_start else q
     degrees = system.n_q - beside
     return Freedom(degrees, beside - at_start, _redundant(system, t, q, rows))
-
-
-def _away(q: Array, direction: Array) -> Array:
-    """Return a position near another, in a direction."""
-    return np.asarray(q + PERTURBATION * max(1.0, float(np.abs(q).max())) * direction / np.abs(direction).max())
 
 
 def _freedom_of_large(
@@ -266,11 +262,10 @@ def _freedom_of_large(
         return None
     singular = 0
     if here.shares and np.abs(here.allowed).max() > 0.0:
-        try:
-            there = consistent_state(system, t, _away(q, here.allowed), np.zeros(system.n_q), check_assembly=False)[0]
-        except ValueError:  # no consistent state nearby: keep the rank at the start
-            there = q
-        beside = dependence(system, t, there)
+        away = q + PERTURBATION * here.allowed
+        moved = project_sparsely(system, t, away, np.zeros(system.n_q), check_assembly=False)
+        there = here.onto_constraints(away) if moved is None else moved[0]
+        beside = None if there is None else dependence(system, t, there)
         if beside is None:
             return None
         if beside.rank > here.rank:

@@ -4,12 +4,14 @@ What is not plain sailing is left to it: rows that depend on one another beside 
 a dead centre, other guesses that may lead elsewhere.
 """
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.checks.consistency import is_at_rounding
+from twoloop.checks.scales import column_scales, median
 from twoloop.checks.sparse_rows import SparseRows
 from twoloop.kernels.compile.linking import direct
 from twoloop.kernels.data import codes, flags, noted
@@ -21,6 +23,7 @@ from twoloop.run.workspace import kit_of, workspace
 Array = NDArray[np.float64]
 
 CLEAR = 1e-5  # sine of a row to others, below which a position may be near a dead centre
+MOST_CORRECTIONS, ROUNDING = 25, 1e-14  # by Newton's method, and what of the largest coordinate is rounding
 STRAIGHT = 0.5  # of a displacement: how far its projection may end from where C_q sends it, on the same assembly
 
 
@@ -50,6 +53,22 @@ class _Metric:
         self.ask(tasks.SOLVE, zero, residual, change)
         return way - change
 
+    def onto_constraints(self, q: Array) -> Array | None:
+        """q on the constraints by the rows that count; None where that fails, or where others are violated then.
+
+        Rows that depend on others on the constraints do so only nearly beside them, where a choice would fail.
+        """
+        zero, change = np.zeros(len(q)), np.zeros(len(q))
+        for _ in range(MOST_CORRECTIONS):
+            if self.ask(tasks.TANGENTS, q, zero) != codes.DONE:
+                return None
+            self.ask(tasks.SOLVE, zero, self.system.constraint(self.t, q), change)
+            q = q - change
+            if not np.abs(change).max() > ROUNDING * np.abs(q).max():  # also true for NaN
+                break
+        held = self.system.constraint(self.t, q)
+        return q if is_at_rounding(held, self.system.sparse_rows(self.t, q), q) else None
+
     def project(self, q: Array, v: Array) -> tuple[Array, Array] | None:
         """q and v on the constraints."""
         q, on_the_way = q.copy(), v.copy()
@@ -68,7 +87,8 @@ class Dependence(NamedTuple):
 
     rank: int
     shares: dict[int, Array]  # of each row that does not count, (n_c,): what of the others it is made of
-    allowed: Array  # a displacement that C_q allows, (n_q,)
+    allowed: Array  # a displacement that C_q allows, at most 1 in the units of the coordinates, (n_q,)
+    onto_constraints: Callable[[Array], Array | None]  # a position near it moved to them, by the rows that count here
 
 
 def dependence(system: ConstrainedSystem, t: float, q: Array) -> Dependence | None:
@@ -90,7 +110,11 @@ def dependence(system: ConstrainedSystem, t: float, q: Array) -> Dependence | No
             shares[row] = np.zeros(system.n_c)
             metric.ask(tasks.SOLVE, all_rows.row(row), np.zeros(system.n_c), room, shares[row])
     metric.at = q
-    return Dependence(len(counted), shares, metric.nearest(np.random.default_rng(3).uniform(0.5, 1.0, len(q))))
+    size = np.abs(q)
+    units = column_scales(all_rows, np.maximum(size, median(size[size > 0.0]) if size.any() else 1.0))
+    allowed = metric.nearest(units * np.random.default_rng(3).uniform(0.5, 1.0, len(q)))
+    most = float((np.abs(allowed) / units).max())
+    return Dependence(len(counted), shares, allowed / most if most > 0.0 else allowed, metric.onto_constraints)
 
 
 def project_sparsely(
