@@ -64,7 +64,8 @@ def _shares(won: Mapping[str, int], of: str, coded: bool) -> str:
     counts = [(call(solver, coded), n) for solver, n in ranked if solver and n]
     if counts and 2 * counts[0][1] <= total:
         return f"no clear choice (of {total} {of}: {', '.join(f'{who} {n}' for who, n in counts)})"
-    return ", ".join(f"{who} ({n} of {total} {of})" for who, n in counts) or ("no clear choice" if total else "")
+    said = [f"{who} ({n}{'' if k else f' of {total} {of}'})" for k, (who, n) in enumerate(counts)]
+    return ", ".join(said) or ("no clear choice" if total else "")
 
 
 def _by_the_tip(case: Mapping[str, Any]) -> dict[str, str]:
@@ -120,9 +121,9 @@ def _crossed(rivals: Mapping[str, Any], own: Sequence[Mapping[str, Any]]) -> str
     verdicts = [at["verdict"] for each in own for at in each["at"]]
     ahead, behind = verdicts.count("ahead"), verdicts.count("behind")
     ranges = {each["name"].partition(" ")[0]: each["standings"][0] for each in rivals.get("ranges", [])}
-    default = ", the default in {ahead} and {behind}".format(**ranges[SINGULAR]) if SINGULAR in ranges else ""
+    default = "; the default in {ahead} and {behind}".format(**ranges[SINGULAR]) if SINGULAR in ranges else ""
     whose = "one of our methods" if ahead > behind else "another project's solver"
-    return f"{whose} (our best is ahead in {ahead} and behind in {behind} comparisons{default})"
+    return f"{whose} (our best is ahead in {ahead}, behind in {behind} comparisons{default})"
 
 
 def _by_error(at: Sequence[Mapping[str, Any]]) -> str:

@@ -171,7 +171,7 @@ def test_every_number_of_the_screen_is_made_again_from_the_rows(tmp_path):
         f"| first call | {first} | – | – | – |\n",
         f"the cheapest rival takes, in the median, {typical} of the default's time for an error of 1e-4, {typical} "
         "for 1e-10.",
-        "This is one of 1 mechanisms (of 2) on which the default is nowhere behind.",
+        "The default is nowhere behind on 1 of 2 mechanisms, of which this is one.",
         "by over 1e-3 at a tolerance of 1e-8, under 17 kinds of sharp forces of our choice: the default 1 of 61, our "
         "other methods 2 of 125, heyoka 1 of 66, IDA and CVODE 0 of 64. ",
         "at least every 5e-4 of a run, and can miss shorter ones unless `max_step` is their duration: the "
@@ -266,7 +266,7 @@ def test_of_a_kind_of_mechanism_it_is_counted_who_is_the_cheapest():
     (row,) = told([WON, WON, LOST], [WON])
     assert row == {"what": "spatial", "take": "`compiled=True` (2 of 2 mechanisms)"}
     ranked = {
-        "`compiled=True` (2 of 3 mechanisms), `heyoka` (1 of 3 mechanisms)": ([WON, WON, LOST], [WON], [LOST] * 9),
+        "`compiled=True` (2 of 3 mechanisms), `heyoka` (1)": ([WON, WON, LOST], [WON], [LOST] * 9),
         "no clear choice (of 2 mechanisms: `compiled=True` 1)": ([WON], [LOST, WON]),
         "no clear choice (of 3 mechanisms: `compiled=True` 1)": ([WON], [NEAR] * 3, [NEAR, WON]),
         "no clear choice (of 2 mechanisms: `compiled=True` 1, `heyoka` 1)": ([WON], [LOST]),
@@ -289,7 +289,7 @@ def test_kinds_on_which_one_solver_is_the_cheapest_share_a_row():
 def test_where_motions_cross_singular_positions_sides_are_compared():
     tight = {**LOST, "error": 1e-6}
     (row,) = told([WON | {"verdict": "ahead", "others": THEIRS}, tight], [{**NEAR}, LOST], tags=("singular",))
-    said = "another project's solver (our best is ahead in 1 and behind in 2 comparisons)"
+    said = "another project's solver (our best is ahead in 1, behind in 2 comparisons)"
     assert row == {"what": "singular positions on the way", "take": said}
 
 
