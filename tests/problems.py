@@ -16,7 +16,7 @@ from twoloop.kernels.data.flags import FORCE_BY_Q_GIVEN
 from twoloop.kernels.data.kit import Kit
 from twoloop.kernels.evaluation.calls import inner_loop
 from twoloop.kernels.steps.explicit_step import EXPLICIT
-from twoloop.mechanisms import four_bar
+from twoloop.mechanisms import Problem, four_bar
 
 G = 9.81
 TIGHT = {"rtol": 1e-13, "atol": 1e-14, "max_step": 0.01, "dense_output": True}
@@ -145,6 +145,11 @@ def pendulum_state(t, angle=-0.5 * np.pi):
 
 def pendulum_energy(q, v):
     return 0.5 * (v * v).sum(axis=0) + G * q[1]
+
+
+def pendulum_problem(t_end, **options):
+    q, v, _ = pendulum_state(0.0)
+    return Problem("pendulum", pendulum(**options), q, v, (0.0, t_end), lambda t, q, v: pendulum_energy(q, v))
 
 
 # --- rheonomic: the same pendulum under a pivot that moves both ways, so that C_t and C_tt are not zero

@@ -9,8 +9,8 @@ from tests.compiled import heavy
 from tests.problems import pendulum
 from tests.test_bounds import FAR
 from twoloop import ConstrainedSystem, callback, consistent_state, mechanisms, solve_dae
-from twoloop.checks.consistency import Violation, _surely_consistent
 from twoloop.checks.scales import scales_of
+from twoloop.checks.violation import Violation, surely_consistent
 from twoloop.generate.families import family_of
 
 
@@ -24,7 +24,7 @@ def test_what_is_accepted_without_singular_values_is_accepted_by_them(name):
     for _ in range(120):
         q, v = (x * (1.0 + 10.0 ** random.uniform(-15, -6) * random.standard_normal(len(x))) for x in state)
         rows, C, rates = system.rows(0.0, q), system.constraint(0.0, q), system.rates(0.0, q)
-        if not _surely_consistent(system, 0.0, q, v, system.mass(0.0, q), system.force(0.0, q, v), rows, C, rates):
+        if not surely_consistent(system, 0.0, q, v, system.mass(0.0, q), system.force(0.0, q, v), rows, C, rates):
             continue
         n_sure += 1
         jacobian = system.jacobian(0.0, q)

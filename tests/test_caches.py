@@ -8,7 +8,8 @@ from numba import njit
 
 from tests.own_cache import RUN, Folder, with_kernels
 from tests.processes import run_python
-from twoloop.kernels.compile.caches import UNWRITABLE, kept_when_called, stands_for, watch
+from twoloop.kernels.compile.caches import UNWRITABLE, kept_when_called, watch
+from twoloop.kernels.compile.dependencies import stands_for
 from twoloop.kernels.compile.kept_files import Files
 
 

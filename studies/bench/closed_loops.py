@@ -20,12 +20,12 @@ from twoloop.problem.problem import Array
 numbers = sys.modules[ready_andrews.__module__]  # those of the squeezer
 
 
-def _closing(one: Array, r: float, other: Array, s: float, side: float = 1.0) -> Array:
+def _closing(one: Array, r: float, other: Array, s: float) -> Array:
     """The point at distances r and s from two points, to the left of the way from one to the other."""
     along = other - one
     d = float(np.linalg.norm(along))
     x = (r * r - s * s + d * d) / (2.0 * d)
-    y = side * math.sqrt(r * r - x * x)
+    y = math.sqrt(r * r - x * x)
     return one + (x * along + y * np.array([-along[1], along[0]])) / d
 
 
@@ -232,7 +232,7 @@ def governor(Q: Array = UPRIGHT) -> ModelProblem:
     return model.problem((0.0, 5.0))
 
 
-def stewart(Q: Array = UPRIGHT, stiffness: float = 600.0, damping: float = 0.0) -> ModelProblem:
+def stewart(Q: Array = UPRIGHT) -> ModelProblem:
     """A platform on six legs, each two bodies that slide on one another, with a spring from base to platform."""
     model = SpatialModel(gravity=Q @ [0.0, 0.0, -9.81], name="Stewart platform")
     moving = {"velocity": Q @ [0.3, 0.1, 0.0], "rotation": Q}
@@ -250,7 +250,7 @@ def stewart(Q: Array = UPRIGHT, stiffness: float = 600.0, damping: float = 0.0) 
         model.prismatic(f"cylinder {k}", f"piston {k}", at=0.5 * (foot + top), axis=along)
         model.spherical(f"piston {k}", "platform", at=top)
         long = 1.05 * float(np.linalg.norm(top - foot))
-        model.spring("ground", foot, "platform", top, stiffness=stiffness, damping=damping, length=long)
+        model.spring("ground", foot, "platform", top, stiffness=600.0, length=long)
     return model.problem((0.0, 3.0))
 
 

@@ -25,13 +25,19 @@ def step(dt=1e-3, **options):
     return call
 
 
-def wheels(call):
-    """Of a model of two wheels on pins."""
-    model = PlanarModel()
+def both_wheels(*ratios):
+    """A model of two wheels on pins, with gears between them."""
+    model = PlanarModel(name="gears")
     for k in range(2):
         model.disc(f"wheel {k}", 0.1, mass=1.0, position=(0.2 * k, 0.0))
         model.revolute("ground", f"wheel {k}", at=(0.2 * k, 0.0), name=f"pin {k}")
-    return lambda: call(model)
+    for ratio in ratios:
+        model.gear("pin 0", "pin 1", ratio=ratio)
+    return model
+
+
+def wheels(call):
+    return lambda: call(both_wheels())
 
 
 def geared(ratio):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from tests.bad_input.bodies import BODIES, GROUP, planar
-from tests.bad_input.impacts import IMPACTS
+from tests.bad_input.impacts import IMPACTS, both_wheels
 from twoloop.bodies import PlanarModel, SpatialModel
 
 
@@ -17,16 +17,6 @@ def hinged(axis, *points):
     model.body("door", mass=1.0, inertia=(0.1, 0.1, 0.1), position=(0.5, 0.0, 0.0))
     for k, (at, along) in enumerate(zip(points, axis, strict=True)):
         model.revolute("ground", "door", at=at, axis=along, name=f"hinge {k}")
-    return model
-
-
-def both_wheels(*ratios):
-    model = PlanarModel(name="gears")
-    for k in range(2):
-        model.disc(f"wheel {k}", 0.1, mass=1.0, position=(0.2 * k, 0.0))
-        model.revolute("ground", f"wheel {k}", at=(0.2 * k, 0.0), name=f"pin {k}")
-    for ratio in ratios:
-        model.gear("pin 0", "pin 1", ratio=ratio)
     return model
 
 

@@ -16,17 +16,15 @@ from studies.bench.collector import CALLS, Case, NotApplicable, Run, Solver, col
 from studies.bench.reference_motion import Quintic, ReferenceMotion, check_published, make_reference
 from studies.bench.solvers import CATALOGUE
 from studies.bench.store import KeptRows
-from tests.problems import pendulum, pendulum_energy, pendulum_state, worst
+from tests.problems import pendulum_problem, pendulum_state, worst
 from twoloop import Status, solve_dae
-from twoloop.mechanisms import Problem
 from twoloop.problem.problem import Reference
 
 T_END = 1.0
 
 
 def problem(**options):
-    q, v, _ = pendulum_state(0.0)
-    return Problem("pendulum", pendulum(**options), q, v, (0.0, T_END), lambda t, q, v: pendulum_energy(q, v))
+    return pendulum_problem(T_END, **options)
 
 
 def case(**changed):

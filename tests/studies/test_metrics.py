@@ -8,9 +8,8 @@ import pytest
 from studies.bench import metrics
 from studies.bench.collector import Case
 from studies.bench.reference_motion import ReferenceMotion
-from tests.problems import held_twice, pendulum, pendulum_energy, pendulum_state
+from tests.problems import held_twice, pendulum, pendulum_problem, pendulum_state
 from twoloop import solve_dae
-from twoloop.mechanisms import Problem
 
 T_END = 1.0
 INSTANTS = np.linspace(0.0, T_END, 41)[1:]
@@ -19,8 +18,7 @@ MOTION = ReferenceMotion(lambda t: pendulum_state(t)[:2], 1e-13, "elliptic funct
 
 @pytest.fixture(scope="module")
 def problem():
-    q, v, _ = pendulum_state(0.0)
-    return Problem("pendulum", pendulum(), q, v, (0.0, T_END), lambda t, q, v: pendulum_energy(q, v))
+    return pendulum_problem(T_END)
 
 
 @pytest.fixture(scope="module")

@@ -15,8 +15,8 @@ from numba import njit
 
 from twoloop.checks.arguments import Array
 from twoloop.checks.values import MOST
-from twoloop.kernels.compile.caches import names_in, of_library
 from twoloop.kernels.compile.callbacks import KINDS
+from twoloop.kernels.compile.dependencies import names_in, of_library
 from twoloop.kernels.compile.private import Dispatcher
 
 if TYPE_CHECKING:

@@ -203,7 +203,7 @@ def _wrong_jacobian(system: ConstrainedSystem, t: float, q: Array, sides: tuple[
     """Which entry of C_q or C_t is wrong."""
     jacobian, rate = system.sparse_rows(t, q)[: system.n_c], system.constraint_rate(t, q)
     if not (is_finite(jacobian) and np.isfinite(rate).all()):
-        return None  # outside what they are made for; at a state of the run consistency.py names it
+        return None  # outside what they are made for; at a state of the run at_position.py names it
     if isinstance(jacobian, SparseRows):
         wrong = _wrong_group(system, t, q, jacobian)
     else:

@@ -16,7 +16,7 @@ import numpy as np
 from twoloop.checks.bounds import Rewritten, place_of
 from twoloop.generate.known_numbers import OPERATORS, Known, Refusal, Untraceable, applied, elementwise, number
 from twoloop.generate.tracing import FUNCTIONS, Form, Graph
-from twoloop.kernels.compile.caches import of_library
+from twoloop.kernels.compile.dependencies import of_library
 from twoloop.kernels.compile.private import Dispatcher
 
 # functions of NumPy that do with arrays of forms what they do with numbers

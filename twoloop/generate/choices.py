@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from twoloop.checks.consistency import mass_and_rows
+from twoloop.checks.at_position import mass_and_rows
 from twoloop.generate.tracing import Untraceable
 from twoloop.kernels.compile.linking import direct
 from twoloop.problem.system import ConstrainedSystem

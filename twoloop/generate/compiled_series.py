@@ -11,7 +11,7 @@ from twoloop.generate.llvm_text import Module
 from twoloop.generate.series import series_program
 from twoloop.generate.series_code import SeriesCode
 from twoloop.generate.straight_code import OwnCode, SharedCode, write_own
-from twoloop.kernels.compile.caches import digest_of
+from twoloop.kernels.compile.dependencies import digest_of
 from twoloop.kernels.compile.own_functions import OwnFunctions, own_functions
 
 LARGEST = 3000  # operations: the time to compile them grows faster than their number

@@ -24,7 +24,7 @@ from twoloop.generate.lane_code import LaneCode
 from twoloop.generate.lane_emitter import LaneEmitter
 from twoloop.generate.llvm_text import Module
 from twoloop.generate.tracing import Untraceable
-from twoloop.kernels.compile.caches import digest_of
+from twoloop.kernels.compile.dependencies import digest_of
 from twoloop.kernels.compile.own_functions import OwnFunctions, are_kept, own_functions
 from twoloop.kernels.lanes.lane_room import CODE
 from twoloop.problem.system import ConstrainedSystem

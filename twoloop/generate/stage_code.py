@@ -17,7 +17,7 @@ from twoloop.generate.llvm_text import BIT, Module, Value, integer
 from twoloop.generate.series_groups import WIDTH
 from twoloop.generate.straight_code import OwnCode, SharedCode
 from twoloop.generate.written import conditions_hold, results_of
-from twoloop.kernels.compile.caches import digest_of
+from twoloop.kernels.compile.dependencies import digest_of
 from twoloop.kernels.compile.own_functions import CALLED, OwnFunctions, own_functions
 
 AT_ONCE = 16  # vectors that are summed in one loop, in registers

@@ -23,7 +23,7 @@ from twoloop.generate.straight_line import Outputs, Solution, StraightLine
 from twoloop.generate.traced_values import Check, Traced, unchecked
 from twoloop.generate.tracing import Graph, Untraceable
 from twoloop.generate.written import conditions_hold, inputs_of, results_of
-from twoloop.kernels.compile.caches import digest_of
+from twoloop.kernels.compile.dependencies import digest_of
 from twoloop.kernels.compile.own_functions import own_functions
 from twoloop.kernels.compile.private import Dispatcher
 from twoloop.problem.system import ConstrainedSystem

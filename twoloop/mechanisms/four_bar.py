@@ -172,7 +172,7 @@ def four_bar(
         **callbacks_in(globals()),
         parameters=[L1, L2, L3, ground],
         constant_mass=True,
-        joints=_joints(L1, L2, L3, ground),
+        joints=_joints(L2, L3, ground),
         name="four-bar",
     )
     return Problem(
@@ -183,7 +183,7 @@ def four_bar(
         t_span=(0.0, 100.0),
         energy=PlanarEnergy(masses, masses * lengths_array**2 / 12.0, GRAVITY),
         conserved=True,
-        drawing=_drawing(L1, L2, L3, ground),
+        drawing=_drawing(L1, L3, ground),
         parameters={
             "L1": L1,
             "L2": L2,
@@ -203,7 +203,7 @@ def four_bar(
     )
 
 
-def _joints(L1: float, L2: float, L3: float, ground: float) -> list[Joint]:
+def _joints(L2: float, L3: float, ground: float) -> list[Joint]:
     """Return the four pins, each acting on the bar that starts there; A acts on bar 3.
 
     A row of C locates a bar, or A, through the whole chain from O, so a pin corresponds to a difference of rows.
@@ -221,7 +221,7 @@ def _joints(L1: float, L2: float, L3: float, ground: float) -> list[Joint]:
     ]
 
 
-def _drawing(L1: float, L2: float, L3: float, ground: float) -> Drawing:
+def _drawing(L1: float, L3: float, ground: float) -> Drawing:
     points = np.array([[0.0, 0.0], [0.5 * L1, 0.0], [-0.5 * L3, 0.0], [ground, 0.0]])
     return Drawing(BodyPoints((GROUND, 0, 2, GROUND), points), ((0, 1), (1, 2), (2, 3)), (1, 2))
 

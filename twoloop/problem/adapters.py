@@ -13,8 +13,9 @@ import numpy as np
 from numba import njit, objmode
 
 from twoloop.checks.arguments import Array
-from twoloop.kernels.compile.caches import digest_of, named_apart, stands_for, watch
+from twoloop.kernels.compile.caches import named_apart, watch
 from twoloop.kernels.compile.callbacks import KINDS, compile_callback
+from twoloop.kernels.compile.dependencies import digest_of, stands_for
 from twoloop.kernels.compile.private import Dispatcher
 
 KIND_NAMES = tuple(KINDS)

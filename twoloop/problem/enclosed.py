@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from twoloop.checks.arguments import shown
-from twoloop.kernels.compile.caches import of_library
+from twoloop.kernels.compile.dependencies import of_library
 from twoloop.kernels.compile.private import Dispatcher
 
 NUMBERS = (bool, int, float, complex, tuple, np.generic)

@@ -8,7 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from twoloop.checks.consistency import ConstraintWarning, pattern_of
+from twoloop.checks.at_position import pattern_of
+from twoloop.checks.consistency import ConstraintWarning
 from twoloop.kernels.compile.linking import direct
 from twoloop.kernels.data import codes, noted
 from twoloop.kernels.data import intervals as names

@@ -10,9 +10,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from twoloop.checks.consistency import is_at_rounding
 from twoloop.checks.scales import column_scales, median
 from twoloop.checks.sparse_rows import SparseRows
+from twoloop.checks.violation import is_at_rounding
 from twoloop.kernels.compile.linking import direct
 from twoloop.kernels.data import codes, flags, noted
 from twoloop.kernels.evaluation import tasks

@@ -6,7 +6,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from twoloop.checks.consistency import check_start, has_definite_mass
+from twoloop.checks.at_position import has_definite_mass
+from twoloop.checks.consistency import check_start
 from twoloop.generate.derived import standing_for
 from twoloop.generate.exact_derivatives import exact_near
 from twoloop.generate.families import Family, family_of, give_bounds, take_bounds

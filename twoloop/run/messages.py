@@ -3,7 +3,8 @@
 import warnings
 from typing import TYPE_CHECKING, Any
 
-from twoloop.checks.consistency import ConstraintWarning, dependent_rows, least_inertia, not_finite
+from twoloop.checks.at_position import dependent_rows, least_inertia, not_finite
+from twoloop.checks.consistency import ConstraintWarning
 from twoloop.checks.rank import in_words, surely_above
 from twoloop.kernels.data import codes, noted
 from twoloop.run.crossings import said_of_crossings, singular_ratio

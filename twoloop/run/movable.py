@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from twoloop.checks.consistency import has_definite_mass, is_definite
+from twoloop.checks.at_position import has_definite_mass, is_definite
 from twoloop.checks.derivatives import check_derivatives
 from twoloop.generate.exact_derivatives import Territory, exact_derivatives, exact_near
 from twoloop.generate.families import family_of, give_bounds

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from twoloop.checks.consistency import NEARBY
+from twoloop.checks.at_position import NEARBY
 from twoloop.kernels.algebra.static_lu import groups_of, in_groups, newton_program
 from twoloop.kernels.algebra.static_program import N_UPDATES, Entries
 from twoloop.problem.system import ConstrainedSystem

@@ -11,9 +11,10 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import qr
 
 from twoloop.checks.arguments import check_finite, check_flag, check_indices, check_vector
+from twoloop.checks.at_position import not_finite
 from twoloop.checks.bounds import check_bounds
-from twoloop.checks.consistency import Violation, not_finite
 from twoloop.checks.scales import Scales, scales_of
+from twoloop.checks.violation import Violation
 from twoloop.problem.system import ConstrainedSystem, check_system
 from twoloop.run.large_projection import project_sparsely
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from twoloop.checks.consistency import dependent_rows, least_inertia, mass_and_rows, pattern_of
+from twoloop.checks.at_position import dependent_rows, least_inertia, mass_and_rows, pattern_of
 from twoloop.checks.rank import SHOWN, equations_in_words, in_words
 from twoloop.checks.sparse_rows import Rows, SparseRows, norms
 from twoloop.generate.time_dependence import Sudden, may_be_sudden

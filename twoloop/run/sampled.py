@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.checks.arguments import check_finite, check_real, shown
+from twoloop.checks.at_position import parts_of
 from twoloop.checks.consistency import check_start
 from twoloop.generate.derived import standing_for
 from twoloop.generate.exact_derivatives import exact_near
@@ -263,7 +264,7 @@ class SampledRun:
             made = []
             for each in (before, value, 0.5 * before + 1.37):
                 self.p[place] = each
-                made.append(np.concatenate([np.ravel(x) for x in _listed(self._of(kind, t, known))]))
+                made.append(np.concatenate([np.ravel(x) for x in parts_of(self._of(kind, t, known))]))
             self.p[place] = before
             if any((each != made[0]).any() for each in made[1:]):
                 raise ValueError(
@@ -274,7 +275,3 @@ class SampledRun:
 
     def _of(self, kind: str, t: float, known: dict[str, Array]) -> Any:
         return self.system.evaluate(kind, t, *(known[name] for name in KINDS[kind].state))
-
-
-def _listed(made: Any) -> tuple[Any, ...]:
-    return made if isinstance(made, tuple) else (made,)

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from twoloop.checks.consistency import NEARBY, pattern_of
+from twoloop.checks.at_position import NEARBY, pattern_of
 from twoloop.kernels.algebra.static_order import bodies_of
 from twoloop.kernels.algebra.static_program import N_OFF, N_PIVOTS, N_UPDATES, Entries, static_program
 from twoloop.kernels.layout import Static

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from twoloop.checks.consistency import has_definite_mass, least_inertia
+from twoloop.checks.at_position import has_definite_mass, least_inertia
 from twoloop.kernels.algebra.banded import banded_pays
 from twoloop.kernels.algebra.lapack import addresses
 from twoloop.kernels.algebra.sparse import sparse_pays

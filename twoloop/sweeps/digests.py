@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from twoloop.kernels.compile.caches import LIBRARIES, CannotBeWatched, Digest
+from twoloop.kernels.compile.dependencies import LIBRARIES, CannotBeWatched, Digest
 from twoloop.kernels.compile.private import Dispatcher
 from twoloop.problem.system import ConstrainedSystem
 

@@ -22,6 +22,15 @@ def copy_matrix(source, target):
 
 
 @merged
+def largest_of(x):
+    """max|x_i| of a vector; 0 of an empty one."""
+    found = 0.0
+    for j in range(x.size):
+        found = max(found, abs(x[j]))
+    return found
+
+
+@merged
 def _size(x):
     """|x|, or of a complex number the sum of its parts' as LAPACK has it: no square root."""
     return abs(x.real) + abs(x.imag)

@@ -5,7 +5,6 @@ function stands, and nothing else: not the helpers in other files, and not the v
 raises when no folder can be written and when a file is damaged, and runs what others have put into one.
 """
 
-import enum
 import gc
 import hashlib
 import inspect
@@ -16,17 +15,15 @@ from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
 from typing import Any
-from weakref import WeakKeyDictionary
 
 import numba
-import numpy as np
 from numba import njit
 from numba.core import caching
 from numba.core.caching import FunctionCache, NullCache
 from numba.core.dispatcher import Dispatcher
-from numba.core.types import Type
 from numba.misc.appdirs import AppDirs
 
+from twoloop.kernels.compile.dependencies import CannotBeWatched, Digest, enclosed_by
 from twoloop.kernels.compile.kept_files import Files
 from twoloop.kernels.compile.ownership import make_own, own_folder
 
@@ -37,9 +34,6 @@ UNWRITABLE = (
 MOST_HELD = 50  # sets of functions made for single mechanisms, of each kind, in memory
 # numba 0.61 has it under a private name
 _LOCATOR: Any = vars(caching).get("UserProvidedCacheLocator") or vars(caching)["_UserProvidedCacheLocator"]
-
-# libraries whose functions are told apart by name; the versions of numba and numpy are compared, too
-LIBRARIES = {*sys.stdlib_module_names, "numpy", "numba", "scipy"}
 
 
 def compile_kept(
@@ -177,14 +171,6 @@ class _Cache(FunctionCache):
             say_once(UNWRITABLE)
 
 
-def digest_of(text: str, *sources: str | types.ModuleType) -> str:
-    """A digest of a text and of the files of modules."""
-    digest = hashlib.sha256(text.encode())
-    for source in sources:
-        digest.update(Path(source if isinstance(source, str) else str(source.__file__)).read_bytes())
-    return digest.hexdigest()
-
-
 def sources_folder() -> Path:
     """Where generated source is kept: in NUMBA_CACHE_DIR if there is one, else where the user's caches are.
 
@@ -215,14 +201,6 @@ def kept_when_called(**options: Any) -> Callable[[Callable[..., Any]], Dispatche
     return decorate
 
 
-_STANDS_FOR: WeakKeyDictionary[Dispatcher, str] = WeakKeyDictionary()
-
-
-def stands_for(callback: Dispatcher, what: str) -> None:
-    """Let a callback, which cannot be watched as it goes to Python, be known by this to functions that enclose it."""
-    _STANDS_FOR[callback] = what
-
-
 def watch(function: Callable[..., Any]) -> tuple[str, str] | None:
     """Digests of all that the machine code of a function depends on, and of what it encloses.
 
@@ -232,9 +210,12 @@ def watch(function: Callable[..., Any]) -> tuple[str, str] | None:
     code, enclosed = Digest(), Digest()
     try:
         code.add_function(function, enclosed=False)
-        enclosed.add(_enclosed(function))
+        enclosed.add(enclosed_by(function))
     except CannotBeWatched:
         return None
+    finally:
+        for each in (*code.helpers, *enclosed.helpers):
+            _take_over(each)
     return code.hash.hexdigest(), enclosed.hash.hexdigest()
 
 
@@ -262,102 +243,3 @@ def _take_over(helper: Any) -> None:
         helper._cache = NullCache()
     if helper.stats.cache_hits:  # what numba has read already may be out of date
         helper.recompile()
-
-
-def _enclosed(function: Any) -> list[Any]:
-    return [cell.cell_contents for cell in function.__closure__ or ()]
-
-
-class CannotBeWatched(Exception):
-    """A value that may change unseen."""
-
-
-class Digest:
-    """A hash that takes values of many types, and follows functions to whatever they name."""
-
-    def __init__(self) -> None:
-        self.hash = hashlib.sha256(np.__version__.encode())
-        self.names: set[str] = set()  # of globals and attributes in the code that is being looked at
-        self.seen: set[tuple[int, str]] = set()
-
-    def add(self, value: Any) -> None:
-        """Add a value."""
-        self.hash.update(f"<{type(value).__qualname__}>".encode())
-        if value is None or isinstance(value, (bool, int, float, complex, str, bytes, np.generic, Type)):
-            self.hash.update(repr(value).encode())
-        elif isinstance(value, np.ndarray) and not value.dtype.hasobject:
-            self.hash.update(f"{value.dtype.descr}{value.shape}".encode() + value.tobytes())
-        elif isinstance(value, (tuple, list)):
-            self.hash.update(f"{len(value)}{getattr(value, '_fields', '')}".encode())
-            for each in value:
-                self.add(each)
-        elif isinstance(value, (set, frozenset)):
-            self.hash.update(repr(sorted(map(repr, value))).encode())
-        elif isinstance(value, dict):
-            self.add(list(value.items()))
-        elif isinstance(value, enum.Enum):
-            self.add((value.name, value.value))
-        elif isinstance(value, types.CodeType):
-            self.hash.update(value.co_code + value.co_exceptiontable)
-            self.add([value.co_consts, value.co_names, value.co_freevars])
-        elif isinstance(value, types.ModuleType):
-            self._add_module(value)
-        elif isinstance(value, Dispatcher):
-            self._add_helper(value)
-        else:
-            self._add_name(value)
-
-    def add_function(self, function: Any, enclosed: bool = True) -> None:
-        """Add the code of a function, its defaults, and the values of the globals that it names."""
-        outer, self.names = self.names, names_in(function.__code__)
-        self.add([function.__code__, function.__defaults__, function.__kwdefaults__])
-        if enclosed:
-            self.add(_enclosed(function))
-        for name in sorted(self.names & set(function.__globals__)):
-            self.add([name, function.__globals__[name]])
-        self.names = outer
-
-    def _add_helper(self, helper: Dispatcher) -> None:
-        if helper in _STANDS_FOR:
-            self.add(_STANDS_FOR[helper])
-        elif self._is_new(helper):
-            _take_over(helper)
-            self.add(sorted(helper.targetoptions.items()))
-            self.add_function(helper.py_func)
-
-    def _add_module(self, module: types.ModuleType) -> None:
-        self.hash.update(module.__name__.encode())
-        if not of_library(module.__name__):
-            for name in sorted(self.names & set(vars(module))):
-                if self._is_new(module, name):
-                    self.add([name, vars(module)[name]])
-
-    def _add_name(self, value: Any) -> None:
-        """Functions and types of the libraries stand for themselves by their names; nothing else does."""
-        if isinstance(value, type) and hasattr(value, "_fields"):
-            self.hash.update(f"{value.__qualname__}{value._fields}".encode())
-            return
-        module, name = getattr(value, "__module__", None), getattr(value, "__qualname__", None)
-        if type(value) is np.ufunc:
-            module, name = "numpy", value.__name__
-        if module is None or name is None or not of_library(module):
-            raise CannotBeWatched
-        self.hash.update(f"{module}.{name}".encode())
-
-    def _is_new(self, value: Any, name: str = "") -> bool:
-        key = (id(value), name)
-        if key in self.seen:
-            return False
-        self.seen.add(key)
-        return True
-
-
-def names_in(code: types.CodeType) -> set[str]:
-    """Names of globals and attributes in a code and the functions within it."""
-    inner = [constant for constant in code.co_consts if isinstance(constant, types.CodeType)]
-    return set(code.co_names).union(*map(names_in, inner))
-
-
-def of_library(module: str) -> bool:
-    """Whether a module is of Python, or of a package that is told by its version."""
-    return module.partition(".")[0] in LIBRARIES

@@ -214,7 +214,7 @@ def _price(w, options, memory, t):
 
 
 @compiled
-def _enter(w, options, memory, n, phase, t):
+def _enter(w, options, memory, phase, t):
     """Begin another phase; its method knows nothing of the steps before."""
     memory[PHASE] = phase
     memory[STEPS] = 0.0
@@ -224,7 +224,7 @@ def _enter(w, options, memory, n, phase, t):
 
 
 @compiled
-def _settle_trial(w, options, memory, n, t):
+def _settle_trial(w, options, memory, t):
     """Whether the method on trial is kept; returns the phase to begin, or -1."""
     if memory[STEPS] == SETTLED:
         memory[T_BEGIN], memory[COST_BEGIN] = t, _cost(w, options)
@@ -308,12 +308,12 @@ def switching_step(f, w, options, memory, t, h, tolerances, state, new_state):
     if memory[MAY_LOOK] == 1.0 and tolerances[ESTIMATE] == 1.0:
         phase = -1
         if memory[PHASE] == ON_TRIAL or memory[PHASE] == BACK_ON_TRIAL:
-            phase = _settle_trial(w, options, memory, n, t)
+            phase = _settle_trial(w, options, memory, t)
         elif w.counters[N_EVALUATIONS] >= memory[LOOK_AT]:
             phase = _look(f, w, options, memory, t, state, new_state)
         if phase >= 0:
             was_explicit = _is_explicit(memory)
-            _enter(w, options, memory, n, phase, t)
+            _enter(w, options, memory, phase, t)
             if was_explicit != _is_explicit(memory):
                 _restart(second if was_explicit else first)
     explicit = _is_explicit(memory)
@@ -326,7 +326,7 @@ def switching_step(f, w, options, memory, t, h, tolerances, state, new_state):
         if (
             code == OUTER_DIVERGED and tolerances[ESTIMATE] == 0.0 and f.flags[FORM] != STATIC
         ):  # a constant step cannot become shorter
-            _enter(w, options, memory, n, IMPLICIT, t)
+            _enter(w, options, memory, IMPLICIT, t)
             _restart(second)
             w.notes[EXPLICIT_STEP] = 0.0
             code, error, factor = f.attempt_second(f, w, options[begin:], second, t, h, tolerances, state, new_state)

@@ -8,6 +8,7 @@ accelerations to the correction itself: one that is not near rounding is followe
 
 import numpy as np
 
+from twoloop.kernels.algebra.linalg import largest_of
 from twoloop.kernels.algebra.saddle_point import solve
 from twoloop.kernels.data.codes import DONE, INNER_DIVERGED
 from twoloop.kernels.data.common import merged
@@ -71,14 +72,6 @@ def _move_both(f, w, q, v):
 
 
 @merged
-def _largest(x):
-    largest = 0.0
-    for j in range(x.size):
-        largest = max(largest, abs(x[j]))
-    return largest
-
-
-@merged
 def to_constraints(f, w, t, q, v, theta, a, lam):
     """(q, v) put on the constraints, then accelerations and multipliers there; without rows of A only.
 
@@ -102,13 +95,13 @@ def to_constraints(f, w, t, q, v, theta, a, lam):
         moved, faster = _move_both(f, w, q, v)
         if not np.isfinite(moved):
             return not_finite(w.notes, CONSTRAINT, t, q)
-        if moved <= theta and faster <= theta * max(1.0, _largest(v)):
+        if moved <= theta and faster <= theta * max(1.0, largest_of(v)):
             break
         if moved <= w.notes[PIVOT] * theta:
             w.notes[KNOWN] = 0.0  # the tangents are those of the end, but Gamma belongs to the velocities before
             break
         if moved > CONTRACTION * before:
-            if not moved <= ROUNDING * _largest(q):
+            if not moved <= ROUNDING * largest_of(q):
                 return INNER_DIVERGED
             break
         before = max(moved, theta)

@@ -8,7 +8,7 @@ partition.
 
 import numpy as np
 
-from twoloop.kernels.algebra.linalg import copy
+from twoloop.kernels.algebra.linalg import copy, largest_of
 from twoloop.kernels.algebra.patterns import has_new_entries
 from twoloop.kernels.algebra.static_program import jacobian_of
 from twoloop.kernels.data.codes import DONE, INNER_DIVERGED, NEEDS_DENSE, ROWS_CONTRADICT
@@ -107,14 +107,6 @@ def _move(f, w, x):
 
 
 @compiled
-def _largest(x):
-    largest = 0.0
-    for j in range(x.size):
-        largest = max(largest, abs(x[j]))
-    return largest
-
-
-@compiled
 def _to_constraints(f, w, t, q, v, theta):
     """(q, v) put on the constraints, as onto_constraints.py says; the factors are those before the last correction."""
     before = np.inf
@@ -139,12 +131,12 @@ def _to_constraints(f, w, t, q, v, theta):
         faster = _move(f, w, v)
         if not np.isfinite(faster):
             return not_finite(w.notes, RATE, t, q)
-        if moved <= theta and faster <= theta * max(1.0, _largest(v)):
+        if moved <= theta and faster <= theta * max(1.0, largest_of(v)):
             return DONE
         if moved <= w.notes[PIVOT] * theta:
             return DONE
         if moved > CONTRACTION * before:
-            return DONE if moved <= ROUNDING * _largest(q) else INNER_DIVERGED
+            return DONE if moved <= ROUNDING * largest_of(q) else INNER_DIVERGED
         before = max(moved, theta)
     return INNER_DIVERGED
 
@@ -160,7 +152,7 @@ def _redundant_rows_hold(f, w, t, q, v):
     """Whether the rows that were left out hold at an accepted state, whose entries stand in w."""
     w.C[:] = 0.0
     f.constraint(t, q, f.p, w.C)
-    size, speed = max(1.0, _largest(q)), max(1.0, _largest(v))
+    size, speed = max(1.0, largest_of(q)), max(1.0, largest_of(v))
     copy(w.Rate, w.g)
     _rows_times(f, w, v, w.g)
     rows, _, _ = jacobian_of(f.static_program)

@@ -63,7 +63,7 @@ def _allowed(control, room, state, new, j, place, k):
 def _embedded(settings, own, A, room, memory):
     """The embedded estimate of the error, not filtered, into E_Q and E_V."""
     n, s = settings[N], A.shape[0]
-    place = eigen_place(own, s)
+    place = eigen_place(s)
     gamma0, e = own[place + GAMMA0], own[place + N_EIGEN_SCALARS : place + N_EIGEN_SCALARS + s]
     known, begin = table(room, block_at(memory, n, s, STAGES), s, n), vector_at(memory, n, BEGIN_V)
     e_q, e_v, sums = vector_at(memory, n, E_Q), vector_at(memory, n, E_V), vector_at(memory, n, SUMS)
@@ -87,7 +87,7 @@ def _embedded(settings, own, A, room, memory):
 def _filter(settings, own, s, room, memory):
     """(I - z J)^-1 (E_Q, E_V), z = gamma0 H, J being the Jacobian of (v, F)."""
     n = settings[N]
-    gamma0 = own[eigen_place(own, s) + GAMMA0]
+    gamma0 = own[eigen_place(s) + GAMMA0]
     e_q, e_v, one = vector_at(memory, n, E_Q), vector_at(memory, n, E_V), vector_at(memory, n, ONE)
     by_q = matrix_at(memory, n, s, BY_Q)
     for i in range(n):
@@ -133,7 +133,7 @@ def _estimate(settings, control, own, A, room):
     """ERROR of the steps: the embedded estimate, filtered for stiff components, over the tolerances."""
     n, s = settings[N], A.shape[0]
     state, new, _, _, _, _, _, memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])
-    place = eigen_place(own, s)
+    place = eigen_place(s)
     e_q, e_v = vector_at(memory, n, E_Q), vector_at(memory, n, E_V)
     _embedded(settings, own, A, room, memory)
     copy_vectors(room, e_v, vector_at(memory, n, RAW), n)

@@ -161,7 +161,7 @@ def factor_systems_of_lanes(settings, own, s, room):
     """Factors of I - (X l)^2 J_q - X l J_v for each eigenvalue l."""
     n = settings[N]
     memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])[7]
-    n_systems, place = count_eigenvalues(own, s), eigen_place(own, s)
+    n_systems, place = count_eigenvalues(own, s), eigen_place(s)
     n_real = int(own[place + N_REAL])
     place += N_EIGEN_SCALARS + s
     by_q, by_v = matrix_at(memory, n, s, BY_Q), matrix_at(memory, n, s, BY_V)
@@ -249,7 +249,7 @@ def _correct(settings, own, s, room):
     """The corrections of the stages, into CHANGES, and to the stages of lanes in which the iteration goes on."""
     n = settings[N]
     memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])[7]
-    n_systems, place = count_eigenvalues(own, s), eigen_place(own, s)
+    n_systems, place = count_eigenvalues(own, s), eigen_place(s)
     n_real = int(own[place + N_REAL])
     place += N_EIGEN_SCALARS + s
     one, changes = vector_at(memory, n, ONE), block_at(memory, n, s, CHANGES)

@@ -49,7 +49,7 @@ def _correct(f, w, options, memory, tolerances, t, c, prediction, rate, new_stat
         memory[at.HAS_JACOBIAN] = 0.0
     while True:
         copy(rate[n:], a1)
-        code = solve_stage(f, w, options[bdf.N_SCALARS :], memory, t, c, tolerances, a1.reshape((1, n)))
+        code = solve_stage(f, w, options[bdf.N_SCALARS :], memory, t, c, a1.reshape((1, n)))
         if code == DONE:
             break
         stale = memory[at.FRESH] == 0.0

@@ -77,7 +77,7 @@ def gamma_of(options):
 
 
 @merged
-def _place(w, z, q_bar, v_bar, a, Q, V):
+def _place(z, q_bar, v_bar, a, Q, V):
     """Independents of Q and V as the stage's acceleration a puts them; dependents, where Newton starts."""
     for m in range(Q.size):
         V[m] = v_bar[m] + z * a[m]
@@ -120,7 +120,7 @@ def _prepare(f, w, options, memory, t, h, Q, V, F):
 
 
 @compiled
-def solve_stage(f, w, options, memory, t, h, tolerances, A_stage):
+def solve_stage(f, w, options, memory, t, h, A_stage):
     """Newton's method for one stage, predicted in A_stage (1, n_q): DONE, or why not; (Q, V) in Q_MID, V_MID."""
     n = w.Q.size
     z = h * gamma_of(options)
@@ -132,7 +132,7 @@ def solve_stage(f, w, options, memory, t, h, tolerances, A_stage):
     before = 0.0
     for iteration in range(MAX_ITERATIONS):
         w.counters[N_OUTER] += 1
-        _place(w, z, q_bar, v_bar, a, Q, V)
+        _place(z, q_bar, v_bar, a, Q, V)
         code = evaluate(f, w, t, Q, V, options[INNER_TOL], F)
         if code != DONE:
             return code

@@ -137,11 +137,11 @@ def diagonal_step(f, w, options, memory, t, h, tolerances, state, new_state):
             q_bar[m] = q[m] + h * in_q
             v_bar[m] = v[m] + h * in_v
         copy(A_stage[j - 1], A_stage[j])
-        code = solve_stage(f, w, options, memory, t + c[j] * h, h, tolerances, A_stage[j : j + 1])
+        code = solve_stage(f, w, options, memory, t + c[j] * h, h, A_stage[j : j + 1])
         if code != DONE and memory[at.FRESH] == 0.0:
             memory[at.HAS_JACOBIAN] = 0.0
             copy(A_stage[j - 1], A_stage[j])
-            code = solve_stage(f, w, options, memory, t + c[j] * h, h, tolerances, A_stage[j : j + 1])
+            code = solve_stage(f, w, options, memory, t + c[j] * h, h, A_stage[j : j + 1])
         if code != DONE:
             memory[at.HAS_JACOBIAN] = 0.0
             return Attempt(code, np.inf, 0.0)

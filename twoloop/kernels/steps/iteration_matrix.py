@@ -11,21 +11,16 @@ same: how T and M change with the position, in which there is no stiffness.
 
 from twoloop.kernels.algebra.linalg import copy, ldl_factor, ldl_solve, lu_factor, lu_solve
 from twoloop.kernels.data.codes import DONE, SINGULAR
-from twoloop.kernels.data.common import compiled, inlined
+from twoloop.kernels.data.common import compiled
 from twoloop.kernels.data.counters import N_FACTORIZATIONS, N_JACOBIANS
 from twoloop.kernels.data.flags import FORCE_BY_V_GIVEN
 from twoloop.kernels.evaluation.calls import find_tangents
 from twoloop.kernels.steps import newton_memory as at
 from twoloop.kernels.steps.newton_dense import reduce
-from twoloop.kernels.steps.newton_memory import pivots_of, space, vector
+from twoloop.kernels.steps.newton_memory import pivots_of, space, square, vector
 from twoloop.kernels.steps.newton_tangents import tangent_by_q, tangent_by_v
 
 ASYMMETRY = 1e-12  # of the largest entry: what counts as rounding
-
-
-@inlined
-def _square(numbers, m):
-    return numbers[: m * m].reshape((m, m))
 
 
 @compiled
@@ -65,17 +60,17 @@ def factor_iteration(f, w, memory, t, q, v, z):
         code = find_tangents(f, w, t, q)
     if code != DONE:
         return code
-    reduce(w, K, AT, _square(space(w, n, at.BY_Q), m))
+    reduce(w, K, AT, square(space(w, n, at.BY_Q), m))
     memory[at.DAMPED] = f.flags[FORCE_BY_V_GIVEN]
     code = tangent_by_v(f, t, q, v, n - 1, K)
     if code != DONE:
         return code
     if memory[at.DAMPED] == 1.0:
-        reduce(w, K, AT, _square(space(w, n, at.BY_V), m))
-    reduce(w, w.M, AT, _square(space(w, n, at.SYSTEMS), m))
+        reduce(w, K, AT, square(space(w, n, at.BY_V), m))
+    reduce(w, w.M, AT, square(space(w, n, at.SYSTEMS), m))
     w.counters[N_FACTORIZATIONS] += 1
     _fill(w, memory, n, m, z, numbers)
-    H = _square(numbers, m)
+    H = square(numbers, m)
     memory[at.SYMMETRIC] = 0.0
     if _symmetric(H):
         if ldl_factor(H):
@@ -88,7 +83,7 @@ def factor_iteration(f, w, memory, t, q, v, z):
 @compiled
 def _solve(w, memory, x):
     m = x.size
-    H = _square(space(w, w.Q.size, at.FILTER), m)
+    H = square(space(w, w.Q.size, at.FILTER), m)
     if memory[at.SYMMETRIC] == 1.0:
         ldl_solve(H, x)
     else:
@@ -100,7 +95,7 @@ def solve_iteration(w, memory, residual, a):
     """The correction of the independents of a, added; it replaces the residual (n_q)."""
     n = w.Q.size
     m = w.independent.size
-    N, x = _square(space(w, n, at.SYSTEMS), m), vector(memory, 1, n, at.V_MOVED)[:m]
+    N, x = square(space(w, n, at.SYSTEMS), m), vector(memory, 1, n, at.V_MOVED)[:m]
     for i in range(m):
         total = 0.0
         for j in range(m):
@@ -117,7 +112,7 @@ def filter_by_iteration(w, memory, z, e_q, e_v):
     """e_v (n_dof) becomes (I - z^2 J_q - z J_v)^-1 (e_v + z J_q e_q)."""
     n = w.Q.size
     m = e_q.size
-    N, Kr = _square(space(w, n, at.SYSTEMS), m), _square(space(w, n, at.BY_Q), m)
+    N, Kr = square(space(w, n, at.SYSTEMS), m), square(space(w, n, at.BY_Q), m)
     x = vector(memory, 1, n, at.V_MOVED)[:m]
     for i in range(m):
         total = 0.0

@@ -153,7 +153,7 @@ def derivatives(f, w, memory, s, t, q, v):
 
 
 @compiled
-def _fill(w, memory, s, b, z, numbers):
+def _fill(w, memory, b, z, numbers):
     """M - z^2 K - z D to where it is factored."""
     n = w.Q.size
     K, D = _band(space(w, n, at.BY_Q), n, b), _band(space(w, n, at.BY_V), n, b)
@@ -172,12 +172,12 @@ def factor(f, w, options, memory, s, h):
     """Factors of the bordered systems of gamma0, real, and of the eigenvalues, complex."""
     n = w.Q.size
     b = f.flags[BANDWIDTH]
-    place = eigen_place(options, s)
+    place = eigen_place(s)
     n_eigen = count_eigenvalues(options, s)
     n_real = int(options[place + at.N_REAL])
     Cq, _, _ = _constraints(w, n, w.rows.size, b)
     numbers = space(w, n, at.FILTER)
-    _fill(w, memory, s, b, h * options[place + at.GAMMA0], numbers)
+    _fill(w, memory, b, h * options[place + at.GAMMA0], numbers)
     w.counters[N_FACTORIZATIONS] += 1
     code = factor_bordered(w, b, Cq, numbers, pivots_of(memory, s, n, 0), DGBTRF, DGBTRS)
     place += at.N_EIGEN_SCALARS + s
@@ -186,7 +186,7 @@ def factor(f, w, options, memory, s, h):
             return code
         if k > 0 or n_real == 0:  # else the eigenvalue is gamma0
             system = system_space(w, n, k)
-            _fill(w, memory, s, b, h * complex(options[place], options[place + 1]), system)
+            _fill(w, memory, b, h * complex(options[place], options[place + 1]), system)
             w.counters[N_FACTORIZATIONS] += 1
             code = factor_bordered(w, b, Cq, system, pivots_of(memory, s, n, 1 + k), ZGBTRF, ZGBTRS)
         place += 2 + 4 * s
@@ -194,7 +194,7 @@ def factor(f, w, options, memory, s, h):
 
 
 @compiled
-def _all_coordinates(w, memory, s, b, x, X):
+def _all_coordinates(w, b, x, X):
     """X = T x; of x (n_q) the first n_dof numbers count, the others are scratch."""
     n_dof = w.independent.size
     _, D, columns = _constraints(w, w.Q.size, w.rows.size, b)
@@ -207,7 +207,7 @@ def _all_coordinates(w, memory, s, b, x, X):
 
 
 @compiled
-def _solve_for_independents(w, memory, s, b, numbers, pivots, substitute, x):
+def _solve_for_independents(w, b, numbers, pivots, substitute, x):
     """Solve with the full right-hand side x (n_q); its first n_dof numbers become the independents of the solution."""
     Cq, _, _ = _constraints(w, x.size, w.rows.size, b)
     solve_bordered(w, b, Cq, numbers, pivots, substitute, x)
@@ -222,23 +222,23 @@ def solve(f, w, options, memory, s, k, x):
     b = f.flags[BANDWIDTH]
     n_eigen = count_eigenvalues(options, s)
     pivots = pivots_of(memory, s, n, 1 + k)
-    if k == 0 and options[eigen_place(options, s) + at.N_REAL] > 0.0:  # the eigenvalue is gamma0
+    if k == 0 and options[eigen_place(s) + at.N_REAL] > 0.0:  # the eigenvalue is gamma0
         real, X = vector(memory, s, n, at.V_MOVED), vector(memory, s, n, at.Q_MOVED)
         for i in range(n):
             real[i] = x[i].real
-        _all_coordinates(w, memory, s, b, real, X)
+        _all_coordinates(w, b, real, X)
         real[:] = 0.0
         add_banded_mass_times(f, w, X, real)
         pivots = pivots_of(memory, s, n, 0)
-        _solve_for_independents(w, memory, s, b, space(w, n, at.FILTER), pivots, DGBTRS, real)
+        _solve_for_independents(w, b, space(w, n, at.FILTER), pivots, DGBTRS, real)
         for i in range(n):
             x[i] = real[i]
     else:
         X = complex_vector(memory, s, n, n_eigen, 1)
-        _all_coordinates(w, memory, s, b, x, X)
+        _all_coordinates(w, b, x, X)
         x[:] = 0.0
         add_banded_mass_times(f, w, X, x)
-        _solve_for_independents(w, memory, s, b, system_space(w, n, k), pivots, ZGBTRS, x)
+        _solve_for_independents(w, b, system_space(w, n, k), pivots, ZGBTRS, x)
 
 
 @compiled
@@ -246,14 +246,14 @@ def filter_error(f, w, options, memory, s, h, e_q, e_v):
     """e_v becomes (I - z^2 J_q - z J_v)^-1 (e_v + z J_q e_q), z = h gamma0: the first n_dof numbers of each (n_q)."""
     n = w.Q.size
     b = f.flags[BANDWIDTH]
-    z = h * options[eigen_place(options, s) + at.GAMMA0]
+    z = h * options[eigen_place(s) + at.GAMMA0]
     K, X = _band(space(w, n, at.BY_Q), n, b), vector(memory, s, n, at.Q_MOVED)
-    _all_coordinates(w, memory, s, b, e_v, X)
+    _all_coordinates(w, b, e_v, X)
     e_v[:] = 0.0
     add_banded_mass_times(f, w, X, e_v)
-    _all_coordinates(w, memory, s, b, e_q, X)
+    _all_coordinates(w, b, e_q, X)
     for i in range(n):
         for j in range(max(0, i - b), min(n, i + b + 1)):
             e_v[i] += z * K[i, b + j - i] * X[j]
     pivots = pivots_of(memory, s, n, 0)
-    _solve_for_independents(w, memory, s, b, space(w, n, at.FILTER), pivots, DGBTRS, e_v)
+    _solve_for_independents(w, b, space(w, n, at.FILTER), pivots, DGBTRS, e_v)

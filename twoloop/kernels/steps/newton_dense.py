@@ -10,19 +10,22 @@ converge.
 from twoloop.kernels.algebra.factors import columns_of
 from twoloop.kernels.algebra.linalg import copy, ldl_factor, ldl_solve_rows, lu_factor, lu_solve
 from twoloop.kernels.data.codes import DONE, SINGULAR
-from twoloop.kernels.data.common import compiled, inlined
+from twoloop.kernels.data.common import compiled
 from twoloop.kernels.data.counters import N_FACTORIZATIONS, N_JACOBIANS
 from twoloop.kernels.data.flags import FORCE_BY_Q_GIVEN, FORCE_BY_V_GIVEN
 from twoloop.kernels.evaluation.calls import evaluate, find_tangents
 from twoloop.kernels.steps import newton_memory as at
-from twoloop.kernels.steps.newton_memory import count_eigenvalues, eigen_place, pivots_of, space, system_space, vector
+from twoloop.kernels.steps.newton_memory import (
+    count_eigenvalues,
+    eigen_place,
+    pivots_of,
+    space,
+    square,
+    system_space,
+    vector,
+)
 from twoloop.kernels.steps.newton_tangents import DIFFERENCE, displaced_with_all, tangent_by_q, tangent_by_v
 from twoloop.kernels.steps.stages import INNER_TOL
-
-
-@inlined
-def _square(numbers, m):
-    return numbers[: m * m].reshape((m, m))
 
 
 @compiled
@@ -55,7 +58,7 @@ def _from_tangents(f, w, memory, s, t, q, v):
     m = w.independent.size
     w.counters[N_JACOBIANS] += 1
     # factors are not needed any more: their spaces hold K or D, then T^T M T and T^T A
-    K, R = _square(space(w, n, at.FILTER), n), _square(space(w, n, at.SYSTEMS), n)
+    K, R = square(space(w, n, at.FILTER), n), square(space(w, n, at.SYSTEMS), n)
     code = tangent_by_q(f, w, t, q, v, n - 1, vector(memory, s, n, at.Q_MOVED), K, R)
     if code != DONE:
         return code
@@ -63,8 +66,8 @@ def _from_tangents(f, w, memory, s, t, q, v):
     code = find_tangents(f, w, t, q)
     if code != DONE:
         return code
-    Jq, Jv = _square(space(w, n, at.BY_Q), m), _square(space(w, n, at.BY_V), m)
-    N = _square(space(w, n, at.SYSTEMS), m)
+    Jq, Jv = square(space(w, n, at.BY_Q), m), square(space(w, n, at.BY_V), m)
+    N = square(space(w, n, at.SYSTEMS), m)
     reduce(w, w.M, AT, N)
     if not ldl_factor(N):
         return SINGULAR
@@ -85,7 +88,7 @@ def derivatives(f, w, options, memory, s, t, q, v, a):
         return _from_tangents(f, w, memory, s, t, q, v)
     n = q.size
     m = w.independent.size
-    Jq, Jv = _square(space(w, n, at.BY_Q), m), _square(space(w, n, at.BY_V), m)
+    Jq, Jv = square(space(w, n, at.BY_Q), m), square(space(w, n, at.BY_V), m)
     q_moved, v_moved = vector(memory, s, n, at.Q_MOVED), vector(memory, s, n, at.V_MOVED)
     a_new = vector(memory, s, n, at.A_NEW)
     w.counters[N_JACOBIANS] += 1
@@ -135,12 +138,12 @@ def factor(w, options, memory, s, h):
     """Factors of I - (h l)^2 J_q - h l J_v for gamma0, real, and for the other eigenvalues l, complex."""
     n = w.Q.size
     m = w.independent.size
-    Jq, Jv = _square(space(w, n, at.BY_Q), m), _square(space(w, n, at.BY_V), m)
-    place = eigen_place(options, s)
+    Jq, Jv = square(space(w, n, at.BY_Q), m), square(space(w, n, at.BY_V), m)
+    place = eigen_place(s)
     n_eigen = count_eigenvalues(options, s)
     n_real = int(options[place + at.N_REAL])
     damped = memory[at.DAMPED] == 1.0
-    filter_matrix = _square(space(w, n, at.FILTER), m)
+    filter_matrix = square(space(w, n, at.FILTER), m)
     hl = h * options[place + at.GAMMA0]
     for i in range(m):
         for j in range(m):
@@ -157,7 +160,7 @@ def factor(w, options, memory, s, h):
         place += 2 + 4 * s
         if k == 0 and n_real > 0:  # the eigenvalue is gamma0
             continue
-        matrix = _square(system_space(w, n, k), m)
+        matrix = square(system_space(w, n, k), m)
         for i in range(m):
             for j in range(m):
                 matrix[i, j] = -z * z * Jq[i, j]
@@ -175,15 +178,15 @@ def solve(w, options, memory, s, k, x):
     """Solve the k-th eigenvalue's system; x (n_dof) is overwritten."""
     n = w.Q.size
     m = x.size
-    if k == 0 and options[eigen_place(options, s) + at.N_REAL] > 0.0:  # the eigenvalue is gamma0
+    if k == 0 and options[eigen_place(s) + at.N_REAL] > 0.0:  # the eigenvalue is gamma0
         real = vector(memory, s, n, at.V_MOVED)[:m]
         for i in range(m):
             real[i] = x[i].real
-        lu_solve(_square(space(w, n, at.FILTER), m), pivots_of(memory, s, n, 0), real)
+        lu_solve(square(space(w, n, at.FILTER), m), pivots_of(memory, s, n, 0), real)
         for i in range(m):
             x[i] = real[i]
     else:
-        lu_solve(_square(system_space(w, n, k), m), pivots_of(memory, s, n, 1 + k), x)
+        lu_solve(square(system_space(w, n, k), m), pivots_of(memory, s, n, 1 + k), x)
 
 
 @compiled
@@ -191,11 +194,11 @@ def filter_error(w, options, memory, s, h, e_q, e_v):
     """e_v becomes (I - (h gamma0)^2 J_q - h gamma0 J_v)^-1 (e_v + h gamma0 J_q e_q), all (n_dof)."""
     n = w.Q.size
     m = e_q.size
-    gamma0 = options[eigen_place(options, s) + at.GAMMA0]
-    Jq = _square(space(w, n, at.BY_Q), m)
+    gamma0 = options[eigen_place(s) + at.GAMMA0]
+    Jq = square(space(w, n, at.BY_Q), m)
     for i in range(m):
         total = 0.0
         for j in range(m):
             total += Jq[i, j] * e_q[j]
         e_v[i] += h * gamma0 * total
-    lu_solve(_square(space(w, n, at.FILTER), m), pivots_of(memory, s, n, 0), e_v)
+    lu_solve(square(space(w, n, at.FILTER), m), pivots_of(memory, s, n, 0), e_v)

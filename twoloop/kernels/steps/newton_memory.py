@@ -43,7 +43,7 @@ def n_matrices(n_eigenvalues: int) -> int:
 
 
 @merged
-def eigen_place(options, s):
+def eigen_place(s):
     """First place of the eigenvalue scalars."""
     return N_SCALARS + 2 * s * s + 5 * s
 
@@ -51,7 +51,7 @@ def eigen_place(options, s):
 @merged
 def count_eigenvalues(options, s):
     """Number of systems: one for each real eigenvalue and one for each pair."""
-    place = eigen_place(options, s)
+    place = eigen_place(s)
     return int(options[place + N_REAL] + options[place + N_PAIRS])
 
 
@@ -73,6 +73,12 @@ def vector(memory, s, n, which):
 def space(w, n, which):
     """The space of one matrix, (n^2)."""
     return w.matrices[which * n * n : (which + 1) * n * n]
+
+
+@inlined
+def square(numbers, m):
+    """The first m^2 numbers of a space as a matrix."""
+    return numbers[: m * m].reshape((m, m))
 
 
 @inlined

@@ -67,7 +67,7 @@ def correct(f, w, options, memory, s, residual, A_stage):
     """Solve for the corrections of the stage accelerations and add them; `residual` becomes the corrections."""
     n = w.Q.size
     m = w.independent.size
-    place = eigen_place(options, s)
+    place = eigen_place(s)
     n_real = int(options[place + at.N_REAL])
     n_eigen = count_eigenvalues(options, s)
     x = complex_vector(memory, s, n, n_eigen, 0)

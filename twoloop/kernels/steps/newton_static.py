@@ -195,7 +195,7 @@ def _factor(f, w, z, values):
 @compiled
 def factor(f, w, options, s, h):
     """Factors for gamma0, real, and for the eigenvalues, complex."""
-    place = eigen_place(options, s)
+    place = eigen_place(s)
     n_eigen, n_real = count_eigenvalues(options, s), int(options[place + at.N_REAL])
     code = _factor(f, w, h * options[place + at.GAMMA0], _factors(f, w, 0))
     place += at.N_EIGEN_SCALARS + s
@@ -225,7 +225,7 @@ def solve(f, w, options, s, k, x):
     """Solve the k-th eigenvalue's system; x (n_q) is overwritten."""
     _, _, real, _, right, y = _vectors(f, w)
     n, n_q = y.size, x.size
-    if k == 0 and options[eigen_place(options, s) + at.N_REAL] > 0.0:  # the eigenvalue is gamma0
+    if k == 0 and options[eigen_place(s) + at.N_REAL] > 0.0:  # the eigenvalue is gamma0
         for i in range(n_q):
             real[i] = x[i].real
         _right(f, w, real, right.view(np.float64)[:n])
@@ -243,7 +243,7 @@ def filter_error(f, w, options, s, h, e_q, e_v):
     """e_v becomes (I - z^2 J_q - z J_v)^-1 (e_v + z J_q e_q), z = h gamma0."""
     _, _, K, _, _, _ = _state(f, w)
     _, _, _, _, right, y = _vectors(f, w)
-    z, n = h * options[eigen_place(options, s) + at.GAMMA0], y.size
+    z, n = h * options[eigen_place(s) + at.GAMMA0], y.size
     x = right.view(np.float64)[:n]
     _right(f, w, e_v, x)
     rows, columns, _ = tangents_of(f.newton_program)

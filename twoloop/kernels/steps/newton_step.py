@@ -164,7 +164,7 @@ def _filter(f, w, options, memory, h, e_q, e_v):
     m = w.independent.size
     filter_error(f, w, options, memory, s, h, e_q, e_v)
     for i in range(m):
-        e_q[i] += h * options[eigen_place(options, s) + at.GAMMA0] * e_v[i]
+        e_q[i] += h * options[eigen_place(s) + at.GAMMA0] * e_v[i]
 
 
 @compiled
@@ -173,7 +173,7 @@ def _estimate(f, w, options, memory, h, tolerances, state, new_state, A_stage):
     s, A, _, _, _, _ = tableau_of(options)
     n = w.Q.size
     q, v, a, q1, v1 = state[:n], state[n : 2 * n], state[2 * n : 3 * n], new_state[:n], new_state[n : 2 * n]
-    place = eigen_place(options, s)
+    place = eigen_place(s)
     gamma0 = options[place + at.GAMMA0]
     e = options[place + at.N_EIGEN_SCALARS : place + at.N_EIGEN_SCALARS + s]
     e_q, e_v = vector(memory, s, n, at.E_Q), vector(memory, s, n, at.E_V)

@@ -247,7 +247,7 @@ def begin_series(options, t, unit, state, N, series, first, x, y, r, c):
 
 
 @merged
-def take_order(w, K, unit, N, series, a):
+def take_order(K, unit, N, series, a):
     """Velocities of order K and positions of order K + 1, from accelerations of order K - 1."""
     n = a.size
     per_v, per_q = unit / K, unit / (K + 1)
@@ -303,7 +303,7 @@ def expand(f, w, options, memory, t, state, unit):
             f.inner(f, w, SOLVE, t, r, c, 0.0, a, lam)
         else:
             solve_both(f, w, r, c, a, lam)
-        take_order(w, K, unit, N, series, a)
+        take_order(K, unit, N, series, a)
         _complete(options, EARLY, N[K], Y1[K])
         _complete(options, LATE, N[k], Y2[k])
     return end_series(w, order, series)

@@ -1,0 +1,163 @@
+"""Whether a state is consistent: what it violates, as the correction that would put it right."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.linalg import lapack
+
+from twoloop.checks.arguments import Array
+from twoloop.checks.rank import least_solution
+from twoloop.checks.scales import EPS, Scales, scales_of
+from twoloop.checks.sparse_rows import Rows, SparseRows
+
+if TYPE_CHECKING:
+    from twoloop.problem.system import ConstrainedSystem
+
+
+CONSISTENT = 1e-8  # correction that an initial state may need, relative to the size of the mechanism
+SURELY = 0.1  # of that: where no more is needed, there is no doubt
+TIED = 1e-6  # relative: corrections that exceed what is allowed by as much, of which the first is named
+ROUNDING = 64.0  # times the spacing of floating-point numbers: what rounding of the state may add to it
+
+
+def surely_consistent(
+    system: ConstrainedSystem,
+    t: float,
+    q: Array,
+    v: Array,
+    mass: Array,
+    force: Array,
+    rows: Array,
+    C: Array,
+    rates: Array,
+) -> bool:
+    """Whether `Violation` would accept a state beyond doubt, without singular values.
+
+    Corrections are the same; they must be less than a share of what is accepted, without what rounding explains, and
+    with the least that accelerations M^-1 Q can be.
+    """
+    scales = scales_of(system, t, q, rows)
+    fastest = np.where(rows != 0.0, np.abs(v) / scales.columns, 0.0).max(axis=1)
+    speeds = np.maximum(fastest, np.abs(rates) / scales.rows)
+    if lapack.dpotrf(mass)[1] == 0:
+        pull = float((np.abs(force) / (np.abs(mass) @ scales.columns)).max())
+        speeds = np.maximum(speeds, np.sqrt(scales.reach * pull))
+    if not _surely_small(rows, rows @ v + rates, scales, speeds):
+        return False
+    if system.n_a > 0:
+        if system.n_c == 0:
+            return True
+        rows = rows[: system.n_c]
+        scales = scales_of(system, t, q, rows)
+    consistent = _surely_small(rows, C, scales, scales.reach)
+    if consistent:  # how far coordinates move until they matter, at the next start as well, beside what rounding is
+        system.made["sizes"] = scales.by_coordinate(scales.reach, rows)
+    return consistent
+
+
+def _surely_small(rows: Array, values: Array, scales: Scales, per_row: Array) -> bool:
+    """Whether the correction that values ask for, and what it leaves, are far below what is accepted."""
+    found = least_solution(scales.scaled(rows), values / scales.rows)
+    if found is None:
+        return False
+    x, left = found
+    allowed = SURELY * CONSISTENT * scales.by_coordinate(per_row, rows)
+    small = np.abs(scales.columns * x) <= allowed
+    return bool(small.all() and (np.abs(left) <= SURELY * CONSISTENT * per_row).all())
+
+
+def is_at_rounding(values: Array, rows: Rows, state: Array, rate: Array | float = 0.0) -> bool:
+    """Whether values are no more than rounding of their terms, which needs no scales to be accepted.
+
+    For rows by their entries, whose scales take full matrices, of entries as well, as large as the largest of a row.
+    """
+    if isinstance(rows, SparseRows):
+        terms = rows.largest() * (rows.pattern() @ np.abs(state)) + np.abs(rate)
+        return bool((np.abs(values) <= ROUNDING * EPS * terms).all())
+    return bool((np.abs(values) <= ROUNDING * EPS * (abs(rows) @ np.abs(state) + np.abs(rate))).all())
+
+
+class Violation:
+    """What a state violates, as the change of coordinates (or velocities) that would put it right.
+
+    Attributes
+    ----------
+    correction : ndarray (n_q,)
+        The Newton correction, by least squares with C_q, coordinates weighted by their scales.
+    allowed : ndarray (n_q,)
+        How much of it is accepted: 1e-8 of the mechanism's size, and rounding.
+    left : ndarray (n_c,)
+        What the correction leaves, where rows of C_q depend on one another or are zero; `allowed_left` with it.
+    """
+
+    def __init__(
+        self,
+        system: ConstrainedSystem,
+        t: float,
+        equation: str,
+        values: Array,
+        terms: Array,
+        jacobian: Array,
+        scales: Scales,
+        per_row: Array,
+        spacing: Array,
+    ):
+        self.system, self.t, self.equation, self.values = system, t, equation, values
+        scaled = scales.scaled(jacobian)
+        inverse = np.linalg.pinv(scaled, rcond=1e-10)
+        self.correction = -scales.columns * (inverse @ (values / scales.rows))
+        by_rounding = scales.columns * (np.abs(inverse) @ (terms / scales.rows)) + spacing
+        self.allowed = CONSISTENT * scales.by_coordinate(per_row, jacobian) + ROUNDING * EPS * by_rounding
+        self.left = np.abs(values + jacobian @ self.correction) / scales.rows
+        self.allowed_left = CONSISTENT * per_row + ROUNDING * EPS * terms / scales.rows
+
+    @classmethod
+    def of_position(cls, system: ConstrainedSystem, t: float, q: Array, jacobian: Array, scales: Scales) -> Violation:
+        """C(t, q) at a position."""
+        terms = np.abs(jacobian) @ np.abs(q)
+        values = system.constraint(t, q)
+        return cls(system, t, "C(t, q)", values, terms, jacobian, scales, scales.reach, np.abs(q))
+
+    @classmethod
+    def of_velocity(
+        cls, system: ConstrainedSystem, t: float, q: Array, v: Array, jacobian: Array, scales: Scales
+    ) -> Violation:
+        """C_q v + C_t and A v + b, beside what is fast there: velocities, drives, what forces can bring about."""
+        rate = system.rates(t, q)
+        fastest = np.where(jacobian != 0.0, np.abs(v) / scales.columns, 0.0).max(axis=1)
+        mass, force = system.mass(t, q), system.force(t, q, v)
+        try:
+            np.linalg.cholesky(mass)
+            pull = np.linalg.solve(mass, force)
+        except np.linalg.LinAlgError:  # no inertia in some directions, which the constraints exclude
+            pull = np.linalg.lstsq(mass, force, rcond=1e-12)[0]
+        falling = np.sqrt(scales.reach * float(np.abs(pull / scales.columns).max()))
+        speeds = np.maximum(np.maximum(fastest, np.abs(rate) / scales.rows), falling)
+        terms = np.abs(jacobian) @ np.abs(v) + np.abs(rate)
+        equation, values = "C_q v + C_t" if system.n_a == 0 else "(C_q v + C_t, A v + b)", jacobian @ v + rate
+        return cls(system, t, equation, values, terms, jacobian, scales, speeds, np.abs(v))
+
+    @property
+    def excess(self) -> float:
+        """The largest correction over what is accepted; at most 1 where the state is consistent."""
+        parts = [(np.abs(self.correction), self.allowed), (self.left, self.allowed_left)]
+        return max(float((part[part > 0.0] / allowed[part > 0.0]).max(initial=0.0)) for part, allowed in parts)
+
+    def refuse(self, name: str) -> None:
+        """Raise unless the state is consistent."""
+        with np.errstate(divide="ignore"):
+            excess = self.excess
+        if excess <= 1.0:
+            return
+        row = int(np.abs(self.values).argmax())
+        excesses = np.abs(self.correction) / np.maximum(self.allowed, 1e-300)
+        j = int(np.flatnonzero(excesses >= (1.0 - TIED) * excesses.max())[0])
+        of = "coordinate" if name == "q0" else "the velocity of coordinate"
+        raise ValueError(
+            f"{name} is not consistent with the constraints of {self.system.name!r}: max|{self.equation}| is "
+            f"{abs(self.values[row]):.3g} (row {row}) at t = {self.t:g}; to put it right {of} {j} has to change by "
+            f"{abs(self.correction[j]):.3g}, and at most {self.allowed[j]:.1g} is accepted. Project it with "
+            "twoloop.consistent_state(system, t, q, v)"
+        )
