@@ -16,12 +16,14 @@ from twoloop.impacts.grip import AT_REST, Grip, Mode
 from twoloop.impacts.joined import Impact, joined
 from twoloop.impacts.laws import NEGLIGIBLE, Undetermined, coulomb, held, impulses, responses
 from twoloop.impacts.rubbing import IDLE, INDEPENDENT, STICKS, Modes, Signs
+from twoloop.methods.presets import PRESETS
+from twoloop.methods.taylor import Taylor
 from twoloop.problem.stops import Stop
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.result.result import Result
 from twoloop.run.impulse import corrected
 from twoloop.run.record import Status
-from twoloop.solve import solve_dae
+from twoloop.solve import check_method, solve_dae
 
 LOW = 0.01  # relative to the absolute tolerance: a rebound below this height ends in contact
 SAMPLES = 2000  # smallest number of evaluations of gaps, forces and rates of sliding over a motion
@@ -281,6 +283,8 @@ class Motion:
         if self.arcs and self.options.get("first_step") is None and self.arcs[-1].h.size:
             least = LEAST_STEP * max(1.0, abs(self.t))  # coordinates near zero have no scale for an initial step
             options["first_step"] = min(max(0.1 * float(self.arcs[-1].h.max()), least), t1 - self.t)
+        if resting:
+            options |= untraced(options)
         arc = solve_dae(system, (self.t, t1), self.q, self.v, events=events, dense_output=True, **options)
         self.arcs.append(arc)
         over = {k for k in range(len(events)) if arc.t_events is not None and arc.t_events[k].size}
@@ -376,6 +380,12 @@ class Motion:
             return float(room * most - abs(needed))
 
         return left
+
+
+def untraced(options: dict[str, Any]) -> dict[str, Any]:
+    """Return the options that change for arcs with closed stops, whose callbacks cannot be traced."""
+    known = PRESETS["auto"] if isinstance(check_method(options["method"]), Taylor) else options["method"]
+    return {"method": known, "compiled": False}
 
 
 def terminal(event: Any) -> Any:

@@ -49,7 +49,8 @@ def solve_with_stops(
     Parameters
     ----------
     system, t_span, q0, v0, method, rtol, atol
-        As for `solve_dae`. The gaps must not be negative at the start.
+        As for `solve_dae`. The gaps must not be negative at the start. While stops are closed, "auto" takes the place
+        of "Taylor", which cannot trace their forces, and `compiled=True` has no effect.
     stops : Stop or sequence of Stop
         E.g. `Stop(lambda t, q: q[1], restitution=0.5)`, or `problem.stops` of a model.
     t_eval : array_like, optional

@@ -42,7 +42,7 @@ def solve_with_friction(
     t_span : (float, float), optional
         None: the time span of the problem.
     method, rtol, atol
-        As for `solve_dae`.
+        As for `solve_dae`. While stops are closed, "auto" takes the place of "Taylor", which cannot trace their forces.
     t_eval : array_like, optional
         Output times. None: the ends of steps.
     **options

@@ -15,7 +15,7 @@ from twoloop.run.comparison import compared
 from twoloop.run.fields import BEFORE, kinds_of, of_run, of_steps, statistics
 from twoloop.run.interrupts import Interrupts, said_of_interrupt
 from twoloop.run.kept import OF_STEPS
-from twoloop.run.messages import message_of, outcome
+from twoloop.run.messages import may_end_singular, message_of, outcome, unless_turned
 from twoloop.run.pace import INTERRUPTED, OUT_OF_TIME, STAGNATED, Pace
 from twoloop.run.passage import beyond, bridge, bridging_kit, give_way, leap
 from twoloop.run.record import Record, Status, explained
@@ -232,6 +232,11 @@ class Course:
         try:
             if recorder.ended is None:
                 status, message = outcome(run, code, self.t1, self.pace)
+            if status >= 0 and may_end_singular(run):
+                steps = self.wanted.times is None and recorder.ended is None and len(t) > 1
+                last_step = [[(float(t[-2]), table[-2])]] if steps else []
+                end = reached if recorder.ended is None else recorder.ended[1]
+                status, message = unless_turned(run, last_step, end, status, message)
             if code != INTERRUPTED:
                 end = reached
                 if recorder.last is not None:
