@@ -11,14 +11,16 @@ from twoloop.methods.presets import PRESETS
 DECIDED = ("ahead", "behind", "alone", "missed")  # verdicts by which one solver is the cheapest
 SUFFIX = " (twoloop)"  # of our solvers, in the findings of honesty
 SMOOTH, STIFF, SINGULAR, LONG = "short smooth motion", "stiff", "singular", "long and conservative"
+FOUR_BARS = "four-bar linkages, over 10 s"  # which have no tags
 KINDS = {  # tags of mechanisms, and what a user calls them; a mechanism of several counts for the first
     STIFF: "stiff springs and dampers",
     SINGULAR: "singular positions on the way",
     "driven": "driven by a given motion",
     "non-holonomic": "rolling, or sliding on an edge",
     "redundant": "redundant constraints",
-    "spatial": "spatial",
+    "spatial": "other spatial mechanisms",
 }
+IN_ANGLES = {"loops": "loops that close in closed form", "pendulums": "pendulums"}  # what a user calls these
 BEAMS = {  # of the study of the beam, and their classes
     "moderately stiff": "stiff beam, vibrations irrelevant",
     "very flexible": "flexible beam, vibrations wanted",
@@ -42,7 +44,8 @@ def takes(found: Mapping[str, Any], entries: Sequence[dict[str, Any]]) -> list[d
     coded = (f"{DEFAULT}, compiled", HEYOKA)
     paid = [_paid(line) for line in made.get("first_calls", []) if line["pays"] and line["solver"] in coded]
     singly = {"what": "many single calls", "take": f"{' and '.join(paid)}, against `compiled=False`"}
-    return rows + [singly] * bool(paid) + _in_angles(made.get("minimal", {}))
+    in_angles = [row for each in made.get("minimal", []) for row in _in_angles(each)]
+    return rows + [singly] * bool(paid) + in_angles
 
 
 def _of_class(name: str, entries: Sequence[dict[str, Any]], with_code: set[str]) -> dict[str, str]:
@@ -92,10 +95,9 @@ def _of_energy(entry: Mapping[str, Any], coded: bool) -> dict[str, str]:
 
 def _of_kinds(rivals: Mapping[str, Any], with_code: set[str]) -> list[dict[str, str]]:
     """Of each kind of mechanism who is the cheapest; kinds on most of whose mechanisms one solver is, in one row."""
-    kinds: dict[str, list[Mapping[str, Any]]] = {kind: [] for kind in ("", *KINDS)}
+    kinds: dict[str, list[Mapping[str, Any]]] = {kind: [] for kind in ("", *KINDS, FOUR_BARS)}
     for each in rivals.get("mechanisms", []):
-        if each.get("tags"):  # the four-bars are a class of their own
-            kinds[next((kind for kind in KINDS if kind in each["tags"]), "")].append(each)
+        kinds[next((kind for kind in KINDS if kind in each["tags"]), "") if each["tags"] else FOUR_BARS].append(each)
     groups: dict[str, list[str]] = defaultdict(list)
     rows = []
     for kind, own in kinds.items():
@@ -103,6 +105,9 @@ def _of_kinds(rivals: Mapping[str, Any], with_code: set[str]) -> list[dict[str, 
             rows.append({"what": KINDS[kind], "take": _crossed(rivals, own)})
         elif kind == STIFF and own:
             rows += [{"what": f"{KINDS[kind]} ({each['case']})", "take": _by_error(each["at"])} for each in own]
+        elif kind == FOUR_BARS and own:
+            won, coded = Counter(_cheapest(each["at"]) for each in own), with_code.issuperset(e["case"] for e in own)
+            rows.append({"what": kind, "take": _shares(won, "geometries", coded)})
         elif own:
             most = Counter(_cheapest(each["at"]) for each in own).most_common(1)[0]
             groups[most[0] if 2 * most[1] > len(own) else ""].append(kind)
@@ -122,7 +127,7 @@ def _crossed(rivals: Mapping[str, Any], own: Sequence[Mapping[str, Any]]) -> str
     ahead, behind = verdicts.count("ahead"), verdicts.count("behind")
     ranges = {each["name"].partition(" ")[0]: each["standings"][0] for each in rivals.get("ranges", [])}
     default = "; the default in {ahead} and {behind}".format(**ranges[SINGULAR]) if SINGULAR in ranges else ""
-    whose = "one of our methods" if ahead > behind else "another project's solver"
+    whose = "one of ours" if ahead > behind else "another project's solver"
     return f"{whose} (our best is ahead in {ahead}, behind in {behind} comparisons{default})"
 
 
@@ -158,12 +163,14 @@ def _cheapest(at: Sequence[Mapping[str, Any]]) -> str:
 
 
 def _at_once(cases: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
-    """Who is the cheapest where many runs are one call, at more than half of the errors of a mechanism."""
-    won: Counter[str] = Counter()
-    for each in cases:
-        best = Counter(min(at["run_s"], key=at["run_s"].get) if at["verdict"] in DECIDED else "" for at in each["at"])
-        won.update([solver if 2 * n > best.total() else "" for solver, n in best.most_common(1)])
-    return [{"what": "many runs in one call", "take": _shares(won, "mechanisms", False)}] if won.total() else []
+    """Whether an ensemble is ahead of others' batches where many runs are one call."""
+    verdicts = Counter(at["verdict"] for each in cases for at in each["at"])
+    ahead, behind = verdicts["ahead"], verdicts["behind"]
+    if not ahead + behind:
+        return []
+    who, other = ("`ensemble`", "heyoka's batches") if ahead > behind else ("`heyoka`, batches", "`ensemble`")
+    told = f"ahead of {other} in {max(ahead, behind)}, behind in {min(ahead, behind)} of {verdicts.total()} comparisons"
+    return [{"what": "many runs in one call", "take": f"{who} ({told})"}]
 
 
 def _paid(line: Mapping[str, Any]) -> str:
@@ -175,20 +182,20 @@ def _paid(line: Mapping[str, Any]) -> str:
 
 
 def _in_angles(minimal: Mapping[str, Any]) -> list[dict[str, str]]:
-    """An ODE in minimal coordinates beside our best with constraints."""
-    if not minimal.get("n") or minimal["n_behind"] <= minimal["n_ahead"]:
+    """An ODE in minimal coordinates beside our best with constraints, on the mechanisms of a kind."""
+    if not minimal["n"] or minimal["n_behind"] <= minimal["n_ahead"]:
         return []
-    pairs = f"{minimal['n_behind']} of {minimal['n']} comparisons"
-    faster = (at for each in minimal.get("mechanisms", []) for at in each["at"] if at["verdict"] == "behind")
+    faster = (at for each in minimal["mechanisms"] for at in each["at"] if at["verdict"] == "behind")
     by = Counter(at["rival"]["solver"].partition(",")[0] for at in faster)
-    who = f" by {' or '.join(f'`{name}`' for name, _ in by.most_common())}" if by else ""
-    share = f"{number(minimal['median'])} of its time in the median"
-    whose = listed(f"`{each['solver'].partition(',')[0]}`" for each in minimal.get("wrong_by", []))
-    told = f"faster than our best in {pairs}, {share}"
-    if minimal.get("wrong"):
-        told += f"; {minimal['wrong']} of {minimal['asked']} runs, of {whose}, silently wrong"
+    slower = f", slower in {minimal['n_ahead']}" if minimal["n_ahead"] else ""
+    told = f"faster in {minimal['n_behind']}{slower} of {minimal['n']} comparisons"
+    for each in minimal["wrong_by"]:
+        told += f"; {each['n']} of {each['asked']} runs silently wrong"
         told += f" by over {number(minimal['wrong_from'])}"
-    return [{"what": "loops that close in closed form", "take": f"an ODE in angles{who} ({told})"}]
+    who = f"an ODE in angles by {' or '.join(f'`{name}`' for name, _ in by.most_common())}"
+    clear = 2 * minimal["n_behind"] > minimal["n"]
+    take = f"{who} ({told})" if clear else f"no clear choice ({who} is {told})"
+    return [{"what": IN_ANGLES[minimal["kind"]], "take": take}]
 
 
 def call(solver: str, coded: bool = False) -> str:

@@ -23,7 +23,7 @@ ERRORS = (1e-3, 1e-6, 1e-9, 1e-12)
 TOLERANCES = (1e-3, 1e-5, 1e-7, 1e-9, 1e-11, 1e-13)
 WRONG, ASKED = 0.1, 1e-4  # a run that ends with this error, though it was asked for a thousandth of it, is wrong
 TIME_LIMIT = 10.0  # s of CPU; heyoka's loosest runs may be its slowest, and what passes it twice is not asked on
-LEVEL = {"A01 pendulum", "projection pendulum", "double pendulum"}  # released from rest in a horizontal position
+PENDULUMS = {"A01 pendulum", "projection pendulum", "double pendulum"}  # no loops; from rest in a horizontal position
 
 
 def runs(quick: bool) -> list[Run]:
@@ -50,6 +50,15 @@ def at_errors(rows: pd.DataFrame, others: pd.DataFrame) -> list[dict[str, Any]]:
     return [at[headline.BEST] | {"error": error} for error, at in zip(ERRORS, found, strict=True)]
 
 
+def findings_by_kind(rows: pd.DataFrame, everywhere: pd.DataFrame) -> list[dict[str, Any]]:
+    """The findings of mechanisms with loops and of pendulums, as far as there are rows of them."""
+    if not len(rows):
+        return []
+    of_pendulums = rows["case"].isin(PENDULUMS)
+    kinds = (("loops", rows[~of_pendulums]), ("pendulums", rows[of_pendulums]))
+    return [{"kind": kind, **findings_of(own, everywhere)} for kind, own in kinds if len(own)]
+
+
 def findings_of(rows: pd.DataFrame, everywhere: pd.DataFrame) -> dict[str, Any]:
     """By mechanism and error, minimal coordinates beside constraints; `rows` and `everywhere` (`rivals`): medians."""
     rows = rows if len(rows) else pd.DataFrame(columns=["case", "solver", "tol", "error_q"])
@@ -64,9 +73,9 @@ def findings_of(rows: pd.DataFrame, everywhere: pd.DataFrame) -> dict[str, Any]:
     wrong = asked[asked["error_q"].astype(float) > WRONG]
     found |= {"asked": len(asked), "asked_at": ASKED, "wrong": len(wrong)}
     released = set(wrong["case"][wrong["solver"].astype(str).str.startswith(HEYOKA)])
-    found["level"] = sorted(released) if released <= LEVEL else []
-    counts = wrong["solver"].value_counts(sort=False)
-    found["wrong_by"] = [{"solver": str(name), "n": int(n)} for name, n in counts.items()]
+    found["level"] = sorted(released) if released <= PENDULUMS else []
+    counts, of = wrong["solver"].value_counts(sort=False), asked["solver"].value_counts()
+    found["wrong_by"] = [{"solver": str(name), "n": int(n), "asked": int(of[name])} for name, n in counts.items()]
     found |= {f"n_{verdict}": verdicts.count(verdict) for verdict in ("ahead", "behind", "undecided")}
     sizes = (min(ratios), float(np.median(ratios)), max(ratios)) if ratios else (None, None, None)
     return found | dict(zip(("least", "median", "most"), sizes, strict=True))

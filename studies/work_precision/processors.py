@@ -6,6 +6,7 @@ added by `python -m studies.work_precision.processors FOLDER`, the folder of rep
 
 import re
 import sys
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from itertools import combinations
 from pathlib import Path
@@ -99,6 +100,8 @@ def findings_of(table: pd.DataFrame) -> list[dict[str, Any]]:
             line: dict[str, Any] = {"processors": [one, other], "time": time, "n": len(both)}
             line["ahead"] = [int((both[f"verdict_{side}"] == "ahead").sum()) for side in ("one", "other")]
             line["turned"] = turned[PLACE].assign(ahead_on=ahead).to_dict("records")
+            favours = Counter(each["ahead_on"] for each in line["turned"]).most_common(1)
+            line["in_favour"] = {"processor": favours[0][0], "n": favours[0][1]} if favours else None
             line["over"] = float((both["ratio_other"] / both["ratio_one"]).median())
             line["same_code"] = bool((both["commit_one"] == both["commit_other"]).all())
             found.append(line | {"apart": float(apart.median()), "most": float(apart.max())})

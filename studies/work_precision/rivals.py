@@ -33,6 +33,7 @@ from twoloop.methods.code_for import is_small
 
 GROUP = "every mechanism"
 DECADES = tuple(10.0**-k for k in range(3, 14))
+CLOSE = 1.2  # ratio of two times that may be otherwise in another session
 RANGES = {  # of errors; none: all of them on the mechanisms that cross singular positions
     "1e-3 to 1e-6": DECADES[:4],
     "1e-7 to 1e-9": DECADES[4:7],
@@ -167,7 +168,7 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     found["alone"] = [each["case"] for each in made if not any(at["others"] for at in each["at"])]
     asked = {each["case"] for each in made if any(at["verdict"] == "alone" for at in each["at"])}
     found["not_put"] = [name for name in found["alone"] if name not in asked]
-    found["put"], found["fewest"] = put(rows), fewest(rows)
+    found["put"], found["fewest"], found["close"] = put(rows), fewest(rows), close(every)
     found["with_code"] = [each["case"] for each in made if given_on(each["case"]) == headline.OWN_CODE]
     found["ranges"] = [_within(made, name, errors) for name, errors in RANGES.items()]
     found["typical"] = [each for error in TYPICAL if (each := _typical(made, error)) is not None]
@@ -198,6 +199,13 @@ def _typical(made: Sequence[dict[str, Any]], error: float) -> dict[str, Any] | N
     known = [ratio for ratio in ratios if ratio is not None]
     quartiles = np.percentile(known, (25, 50, 75)).tolist() if known else []
     return {"error": error, "n": len(known), "quartiles": quartiles} if known else None
+
+
+def close(every: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """In how many pairs in which the default is ahead or behind that may be otherwise in another session."""
+    decided = [at["standing"][headline.GIVEN] for at in every]
+    ratios = [each["ratio"] for each in decided if each["verdict"] in ("ahead", "behind") and each["ratio"] is not None]
+    return {"factor": CLOSE, "of": len(ratios), "n": sum(1.0 / CLOSE < ratio < CLOSE for ratio in ratios)}
 
 
 def fewest(rows: pd.DataFrame) -> dict[str, Any]:

@@ -136,7 +136,8 @@ def report(output: Output, rows: pd.DataFrame, line: str) -> dict[str, Any]:
     findings["repetition"] |= {"once": made_once(everywhere), "outclassed": adaptive.OUTCLASSED}
     findings["repetition"] |= means_over_medians(part(rows, rivals.GROUP))
     findings["price"] = headline.price(everywhere, part(rows, first_calls.GROUP), rivals.HEADLINE)
-    findings["minimal"] = minimal.findings_of(in_angles if in_angles.empty else tables.medians(in_angles), everywhere)
+    in_angles = in_angles if in_angles.empty else tables.medians(in_angles)
+    findings["minimal"] = minimal.findings_by_kind(in_angles, everywhere)
     findings |= {} if output.call.quick else processors.kept(output, rows, line, found)
     output.save_findings(findings)
     draw(output, findings, everywhere, medians)

@@ -163,7 +163,7 @@ def test_violations_are_those_of_ours_on_the_four_bars():
 def stated(own, heyoka=2.0, python=9.0, **changed):
     """The text of the report, of rows of the four-bar."""
     table = compared(own, heyoka, python=python)
-    found = {"cases": [], "first_calls": [], "minimal": {"mechanisms": []}, "default": "auto", "violation": 1e-15}
+    found = {"cases": [], "first_calls": [], "minimal": [], "default": "auto", "violation": 1e-15}
     found |= {"rivals": rivals.findings_of(table), "measured": {"commits": 1, "processors": ["this"]}}
     found["default_over"] = [work_precision.default_over(table, compiled) for compiled in (True, False)]
     found["asked"] = {"n": 4, "refused": 1, "fewer": 0, "far": 20.0, "running": 2, "limit": 1.0}
