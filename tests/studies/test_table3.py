@@ -210,5 +210,5 @@ def test_times_that_scatter_with_the_same_counts_give_no_ratio(tmp_path):
     found = found_of(table3, tmp_path, made)
     text = (tmp_path / "table3.md").read_text()
     assert found["times_unequal"] and "fall into two groups with the same counts (5.1 to 6.6 s; Runge" in text
-    assert "by repetition" not in text and "we give no ratio of times" in text
+    assert "by repetition" not in text and "we give no ratio." in text
     assert "| 6.6 (5.1–6.6)/50.93 |" in text
