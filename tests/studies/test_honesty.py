@@ -192,9 +192,7 @@ def test_a_force_that_was_never_evaluated_stays_among_the_wrong_ones():
     assert (found["trust"]["others"]["wrong"], found["trust"]["others"]["unasked"]) == (2, 1)
     assert found["traps"][0]["silent"] == [OURS, THEIRS]
     assert "| a | 1/0/2 | 1/0/0 | the default; LSODA, index 1 |" in text
-    assert (
-        "- Of ours 1 run is silently wrong or hangs: a." in text and "None of ours is silently wrong or" not in text
-    )
+    assert "- Of ours 1 run is silently wrong or hangs: a." in text and "None of ours is silently wrong or" not in text
     assert "In 2 silently wrong runs under a 1 ms pulse, the force was never evaluated" in text
 
 
@@ -268,10 +266,7 @@ def test_forces_held_out_are_others_and_counted_apart():
         "`max_step`, here 1.5 ms. " in said(honesty, fine)[1] or "`max_step`, here 1.5 ms.\n" in said(honesty, fine)[1]
     )
     assert found["trust"]["default"]["wrong"] == 0 and found["held_out"]["trust"]["default"]["wrong"] == 1
-    assert (
-        "Ours (error): `the default`, gust, pendulum (1e-9)." in text
-        and "drawn by a new seed" in text
-    )
+    assert "Ours (error): `the default`, gust, pendulum (1e-9)." in text and "drawn by a new seed" in text
 
 
 def test_checks_of_the_input_are_counted_apart():
