@@ -14,8 +14,6 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from references.heyoka.taylor import LARGEST_UNROLLED
-from references.sundials.loop import SMALLEST_STEP
 from studies.bench import figures
 from studies.bench.apart import apart, heard
 from studies.bench.cli import StudyError
@@ -34,7 +32,6 @@ from studies.honesty.solvers import (
     LOOK,
     OURS,
     PROJECTED,
-    SCIPY,
     Call,
     kind_of,
     largest_step,
@@ -217,8 +214,7 @@ def findings_of(all_rows: pd.DataFrame) -> dict[str, Any]:
     found |= {"short": short_forces.findings_of(short, (SILENT, HANG)), "look": LOOK}
     # rows without the column are older, of the longest step that ours take
     found["max_step"] = float(held["max_step"].max()) if "max_step" in held else LONGEST_UNSEEN * T_END
-    found |= {"unrolled_to": LARGEST_UNROLLED, "smallest_step": SMALLEST_STEP}
-    found |= {"exact": EXACT, "off": LOOSENESS * USUAL, "usual": USUAL, "scipy": list(SCIPY)}
+    found |= {"exact": EXACT, "off": LOOSENESS * USUAL, "usual": USUAL}
     return found | {"forces_end": T_END, "forces_agree": TRUE_TO, "grown": GROWN}
 
 
@@ -289,8 +285,7 @@ def of_mistakes(rows: pd.DataFrame) -> dict[str, Any]:
     ran = rows[rows["outcome"] != NOT_RUN]
     found: dict[str, Any] = {"n_traps": rows["trap"].nunique(), "n_cells": len(ran), "traps": of_traps(ran)}
     alike = {str(trap): set(own["outcome"]) for trap, own in ran.groupby("trap", sort=False)}
-    for key, outcomes in (("all_say_so", {SAID}), ("all_right", {RIGHT}), ("missed_by_all", {SILENT, HANG})):
-        found[key] = [trap for trap, seen in alike.items() if seen <= outcomes]
+    found["missed_by_all"] = [trap for trap, seen in alike.items() if seen <= {SILENT, HANG}]
     found["counts"] = {str(name): counts_of(own) for name, own in rows.groupby("solver", sort=False)}
     found |= {"looseness": LOOSENESS, "grace": GRACE, "agree": AGREE}
     return found | {f"{whose}_bad": lines for whose, lines in bad_in(rows).items()}

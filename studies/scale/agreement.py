@@ -28,7 +28,7 @@ def agreements(quick: bool) -> Keyed:
 
 
 def agreement(case: str, kind: Callable[..., RandomAssembly], seed: int) -> Row:
-    """An assembly at random velocities that its constraints allow, by whatever form a run takes for it."""
+    """An assembly at random velocities that its constraints allow, by the form of the equations that a run would take."""
     made = drawn(kind, seed)
     system = made.system("random")
     v = made.v(system)
@@ -42,7 +42,7 @@ def agreement(case: str, kind: Callable[..., RandomAssembly], seed: int) -> Row:
             return row | {"status": "FAILED", "message": str(error)}
     row |= {"redundant": system.n_c - exact.rank, "status": "REACHED_END", "message": ""}
     if result.rank != exact.rank:
-        return row | {"status": "FAILED", "message": f"rank {result.rank} in the place of {exact.rank}"}
+        return row | {"status": "FAILED", "message": f"rank {result.rank} instead of {exact.rank}"}
     return row | {"error_q": exact.error(result.a[:, 0], result.lam[:, 0])}
 
 

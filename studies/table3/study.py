@@ -119,8 +119,8 @@ def make(output: Output) -> pd.DataFrame:
     return pd.concat([rows, more], ignore_index=True)
 
 
-def cell_of(rows: pd.DataFrame, group: str, e_in: float, e_out: float) -> str:
-    """Our time of a cell and, of a run as long as the paper's, the printed one and its ratio to our least."""
+def cell_of(rows: pd.DataFrame, group: str, e_in: float, e_out: float, ratio: bool) -> str:
+    """Our time of a cell and, of a run as long as the paper's, the printed one; `ratio`: and its ratio to our least."""
     paper = printed(group)[TOLERANCES.index(e_in)][TOLERANCES.index(e_out)]
     cell = machine(rows, group, e_in, e_out)
     if cell is None:
@@ -129,12 +129,14 @@ def cell_of(rows: pd.DataFrame, group: str, e_in: float, e_out: float) -> str:
     spread = tables.with_quartiles(cell["call_s"], cell["call_q1"], cell["call_q3"]) + mark
     if cell["t_end"] != PAPER_END:  # a quick run: nothing printed is for so short a motion
         return spread
-    return f"{spread} / " + ("★" if paper is None else f"{paper:.2f} ×{number(paper / least(cell))}")
+    if paper is None:
+        return f"{spread}/★"
+    return f"{spread}/{paper:.2f}" + (f" ×{number(paper / least(cell))}" if ratio else "")
 
 
-def grid(rows: pd.DataFrame, group: str) -> str:
+def grid(rows: pd.DataFrame, group: str, ratio: bool = False) -> str:
     """A table of times, err_in by err_out, beside the printed ones."""
-    lines = [[power(e_in), *(cell_of(rows, group, e_in, e_out) for e_out in TOLERANCES)] for e_in in TOLERANCES]
+    lines = [[power(e_in), *(cell_of(rows, group, e_in, e_out, ratio) for e_out in TOLERANCES)] for e_in in TOLERANCES]
     return table(["err_in \\ err_out", *map(power, TOLERANCES)], lines)
 
 
@@ -296,8 +298,8 @@ def tables_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, str]:
     ready = {"work": table(["solver", *map(power, TARGETS)], costs), "counts": counts(first)}
     for name, group in zip(("irk", "newmark"), FAMILIES, strict=True):
         ready[name] = grid(first, group)
-        about = f"{group}, CPU time in s over {number(found['t_end'])} s / the paper's, × its ratio to our least"
-        print(f"\n{about}\n{ready[name]}")
+        about = f"{group}, CPU time in s over {number(found['t_end'])} s/the paper's, × its ratio to our least"
+        print(f"\n{about}\n{grid(first, group, ratio=True)}")
     return ready
 
 

@@ -126,7 +126,7 @@ def test_newtons_method_takes_the_steps_of_the_fixed_point_where_nothing_is_stif
 
 
 def test_newtons_method_takes_long_steps_in_a_viscous_fluid():
-    """A pendulum whose drag lets it creep: rates of 1e4 per second, which last a thousandth of the motion."""
+    """An overdamped pendulum: transients decay within a thousandth of the motion, at rates of 1e4 per second."""
 
     def viscous(t, q, v):
         return np.array([0.0, -9.81]) - 1e4 * v

@@ -85,7 +85,7 @@ def test_the_advice_turns_with_the_rows(tmp_path):
 
 def test_of_a_solver_with_runs_it_is_not_said_that_it_was_not_asked():
     runs = pd.DataFrame({"error_tip": [1e-5, 1e-6, np.nan]})
-    assert study._cell(runs, UNASKED) == "least error 1e-6"
+    assert study._cell(runs, UNASKED) == "> 1e-6 m"
     assert study._cell(runs, "≤ 1.1") == "≤ 1.1" and study._cell(runs[2:], UNASKED) == UNASKED
 
 

@@ -98,14 +98,16 @@ def test_findings_turn_with_the_rows():
     assert found["ours_always"] == [] and found["only_others"] == ["A02, N = 1"]
     assert [(line["case"], line["stopped"]) for line in found["ours_short"]] == [("A02, N = 1", ["Gauss12"])]
     wrong = {"outcome": "wrong", "error_q": 1e-3, "digits_q": 3.0}
-    found = said(validation, made_up(where=[("double pendulum", "BDF")], what=wrong))[0]
+    found, text = said(validation, made_up(where=[("double pendulum", "BDF")], what=wrong))
+    assert "| all | 16 | 8 |\n| inexact | 0 | 0 |\n| wrong | 4 | 0 |\n" in text and "\nOf the" not in text
     (tight,) = found["ours_wrong_tight"]
     assert (tight["solver"], tight["case"], tight["error_q"]) == ("BDF", "double pendulum", 1e-3)
     assert found["n_wrong"] == {"ours": 4, "others": 0}
     refused = {"outcome": "not run", "status": "RAISED", "error_q": np.nan, "digits_q": np.nan}
     found = said(validation, made_up(where=[("double pendulum", "LSODA, index 1")], what=refused))[0]
     assert alone_of(found) == {"double pendulum": {"not run": ["LSODA, index 1"]}}
-    found = said(validation, made_up(where=[("double pendulum", "LSODA, index 1")], what=wrong))[0]
+    found, text = said(validation, made_up(where=[("double pendulum", "LSODA, index 1")], what=wrong))
+    assert "| wrong | 0 | 4 |\n\nOf the 4, 2 are at 1e-8 or tighter and 2 at looser tolerances." in text
     assert alone_of(found) == {"double pendulum": {"wrong": ["LSODA, index 1"]}}
     assert found["n_ended"] == {"ours": 16, "others": 8}
     stopped = stopped | {"status": "TIME_LIMIT"}
@@ -178,9 +180,9 @@ def test_findings_of_steps_and_of_models_follow_their_rows():
     found, text = said(validation, pd.concat([made_up(), pd.DataFrame([first, *runs])]))
     assert found["models"]["n_steps"] == 400 and found["models"]["errors"] == pytest.approx([6.25e-4] * 2)
     cells = [
-        line.strip("| ").split(" | ") for line in text.split("| deceived |\n")[1].split("\n\n")[0].splitlines()[1:]
+        line.strip("| ").split(" | ") for line in text.split("| deceived (%) |\n")[1].split("\n\n")[0].splitlines()[1:]
     ]
-    assert {line[0]: line[-1] for line in cells} == {"Gauss12": "–", "BDF": "0 %", "LSODA, index 1": "–"}
+    assert {line[0]: line[-1] for line in cells} == {"Gauss12": "–", "BDF": "0", "LSODA, index 1": "–"}
     assert found["models"]["orders"] == pytest.approx([2.0, 2.0]) and "converging at orders of 2.0 (theirs" in text
     found = said(validation, pd.concat([made_up(), pd.DataFrame([first | {"first_step": 0.5}])]))[0]
     assert found["models"] is None
