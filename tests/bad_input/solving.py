@@ -31,6 +31,7 @@ SOLVE = [
         "t_span",
         ((1.0, 0.0), ValueError, r"must be \(start, end\) with end > start; given \(1.0, 0.0\)", "swap them"),
         ((1.0, 1.0), ValueError, "must be .* with end > start", "give an end after the start"),
+        ((1e6, 1e6 + 1e-10), ValueError, "must be .* further apart than floating-point", "count t from the start"),
         ((0.0, np.nan), ValueError, "must be finite", "give two finite times"),
         ((0.0, np.inf), ValueError, "must be finite", "give two finite times"),
         ((0.0, 1.0, 2.0), ValueError, r"must have shape \(2,\)", "output times go into t_eval"),

@@ -10,6 +10,7 @@ from tests.general.mechanisms import SINGULAR, WINDOWS, error, first_singular_ti
 from tests.problems import event, worst
 from twoloop import DOP853, ConstraintWarning, Status, solve_dae
 from twoloop.bodies import PlanarModel
+from twoloop.run.crossings import said_of_turn
 
 METHODS = ("SunRadau5", "RadauIIA5", "DOP853")
 FEW = ("A02, N = 1", "A02, N = 2")
@@ -65,7 +66,8 @@ def test_the_end_on_a_singular_position_is_right_or_the_run_says_so(n, method, t
         assert worst(result.q[:, -1], q) < 1e3 * tol and (worst(result.v[:, -1], v) < 1e3 * tol or len(said) == 1)
         assert ("The run ends where the constraints lose rank" in result.message) is bool(said)
     else:
-        assert "s ahead: end a little before that position, or beyond." in result.message
+        said = "s ahead: end a little before that position, or beyond.", "Not to be trusted beyond t = "
+        assert any(words in result.message for words in said)
 
 
 @pytest.mark.parametrize("method", ["SunRadau5", "Gauss12", "DOP853"])
@@ -131,3 +133,35 @@ def test_steps_that_test_positions_alone_do_not_creep_onto_another_branch(make, 
         problem, off = make(numbers.uniform(0.3, 1.2), numbers.choice([-7.0, -2.0, -0.5, 0.5, 2.0, 7.0]))
         result = solve_dae(problem.system, problem.t_span, problem.q0, problem.v0, method, tolerance, tolerance)
         assert np.abs(off(result.q)).max() < 1e-6, result
+
+
+@pytest.mark.filterwarnings("ignore:the run ends where:twoloop.ConstraintWarning")
+@pytest.mark.parametrize(
+    ("method", "tolerance"),
+    [
+        *((method, 1e-3) for method in ("auto", "ESDIRK4", "TRBDF2", "BDF", "RadauIIA5")),
+        *((method, 1e-6) for method in ("TRBDF2", "Adams", "Taylor")),
+    ],
+)
+def test_no_run_that_begins_beside_a_singular_position_succeeds_on_another_branch(method, tolerance):
+    """Both branches are within the tolerance there, and the pivots of the start are small themselves."""
+    for angle, speed in ((4.3e-6, -5.0), (3.5e-5, -0.134), (1.3e-6, -0.0715), (1e-6, -5.0), (1e-5, -1.0), (4e-6, 3.0)):
+        problem, _ = parallelogram(angle, speed)
+        for end in (2.0 * angle / abs(speed), 0.5):
+            result = solve_dae(problem.system, (0.0, end), problem.q0, problem.v0, method, tolerance, tolerance)
+            turned = np.abs(result.v[5]).max() > max(0.1 * abs(speed), 30.0 * tolerance)
+            assert not (result.success and turned), result
+
+
+def test_a_turn_on_the_way_across_is_told_from_a_motion_that_goes_on():
+    problem, _ = parallelogram(0.0, 0.0)
+    system, q = problem.system, problem.q0
+    across = np.array([0.0, 0.5, 1.0, 0.0, 1.0, 0.0, 0.0, 0.5, 1.0])  # velocities of the parallelogram
+    turning = across + np.array([0.0, 0.0, 0.0, 0.0, -1.0, -1.0, 0.0, -1.0, -2.0])  # and of the other branch
+    assert np.abs(system.jacobian(0.0, q) @ np.stack([across, turning], axis=1)).max() < 1e-15
+    went_on, turned = (np.concatenate([q, each, np.zeros(17)]) for each in (across, turning))
+    atol = np.full(9, 1e-3)
+    assert said_of_turn(system, [[(0.0, went_on), (1e-4, went_on)]], (1.0, went_on), 8, 1e-3, atol) == ""
+    for crossings in ([[(0.0, went_on), (1e-4, turned)]], [[(0.0, went_on)], [(5e-5, turned), (1e-4, turned)]]):
+        said = said_of_turn(system, crossings, (1.0, turned), 8, 1e-3, atol)
+        assert said.startswith("Not to be trusted beyond t = 0:") and "up to 2 within 0.0001 s" in said

@@ -366,3 +366,16 @@ def test_a_stop_that_opens_is_hit_when_the_impact_at_another_turns_the_body_back
     assert result.success and [impact.stops for impact in result.impacts] == [("wall",), ("floor",)]
     jumps = sum(impact.v_after - impact.v_before for impact in result.impacts)
     np.testing.assert_allclose(result.v[:, -1], jumps + np.array([-0.5, 0.5 - 1e-4]), atol=1e-9)
+
+
+@pytest.mark.parametrize("options", [{"method": "Taylor"}, {"compiled": True}], ids=str)
+def test_what_needs_traced_callbacks_takes_others_while_a_stop_is_closed(options):
+    model = PlanarModel()
+    rod = model.rod("rod", (0.0, 0.0), (1.0, 0.0), mass=2.0)
+    model.revolute("ground", rod, at=(0.0, 0.0))
+    model.stop(rod, (1.0, 0.0), "ground", (0.0, -0.3), normal=(0.0, 1.0))
+    _, known = moved(model, 1.0)
+    _, result = moved(model, 1.0, **options)
+    assert len(result.arcs) == 2 and result.arcs[1].method == "auto" and result.method == options.get("method", "auto")
+    assert result.impacts[0].t == pytest.approx(known.impacts[0].t, abs=1e-9)
+    np.testing.assert_allclose(result.q[:, -1], known.q[:, -1], atol=1e-9)

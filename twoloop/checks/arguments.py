@@ -125,7 +125,8 @@ def check_span(t_span: tuple[float, float]) -> tuple[float, float]:
     else:
         t0, t1 = check_vector("t_span", t_span, 2).tolist()
     if not t1 - t0 > NEAR * math.ulp(max(abs(t0), abs(t1))):
-        raise ValueError(f"t_span must be (start, end) with end > start; given ({t0!r}, {t1!r})")
+        wanted = "with end > start" if t1 <= t0 else "further apart than floating-point numbers resolve"
+        raise ValueError(f"t_span must be (start, end) {wanted}; given ({t0!r}, {t1!r})")
     return t0, t1
 
 

@@ -20,6 +20,7 @@ from twoloop.run.asked import Asked
 from twoloop.run.beginning import Beginning
 from twoloop.run.between import Between, interpolator_of
 from twoloop.run.comparison import compared_at, territory_of
+from twoloop.run.crossings import turned_last
 from twoloop.run.dense import Table
 from twoloop.run.dense_solution import DenseSolution
 from twoloop.run.fields import kinds_of, of_run, told_later
@@ -135,7 +136,10 @@ class Again:
             self.between.find(between, *parts, self.look.pattern)
         spent = time.process_time() - began
         singular = run.plan.watchful and run.work.notes[noted.NEARLY_SINGULAR] == 1.0
-        if code != a.ALL_OUTPUT_DONE or singular:
+        turned = False
+        if output.times is None and not run.plan.watchful:
+            turned = turned_last(self.t[: n_rows + 1], self.rows[: n_rows + 1], system.n_q)
+        if code != a.ALL_OUTPUT_DONE or singular or turned:
             self.rest = IN_VAIN
             return None
         status, message = outcome(run, code, t1, NO_PACE)

@@ -9,13 +9,14 @@ from numpy.typing import NDArray
 
 from twoloop.generate.traced_values import Sample
 from twoloop.kernels.compile.linking import direct
-from twoloop.kernels.data import intervals
+from twoloop.kernels.data import intervals, noted
 from twoloop.run.between import interpolator_of
 from twoloop.run.comparison import compared
+from twoloop.run.crossings import Place, turned_last
 from twoloop.run.fields import BEFORE, kinds_of, of_run, of_steps, statistics
 from twoloop.run.interrupts import Interrupts, said_of_interrupt
 from twoloop.run.kept import OF_STEPS
-from twoloop.run.messages import may_end_singular, message_of, outcome, unless_turned
+from twoloop.run.messages import message_of, outcome, unless_turned
 from twoloop.run.pace import INTERRUPTED, OUT_OF_TIME, STAGNATED, Pace
 from twoloop.run.passage import beyond, bridge, bridging_kit, give_way, leap
 from twoloop.run.record import Record, Status, explained
@@ -232,11 +233,9 @@ class Course:
         try:
             if recorder.ended is None:
                 status, message = outcome(run, code, self.t1, self.pace)
-            if status >= 0 and may_end_singular(run):
-                steps = self.wanted.times is None and recorder.ended is None and len(t) > 1
-                last_step = [[(float(t[-2]), table[-2])]] if steps else []
+            if status >= 0:
                 end = reached if recorder.ended is None else recorder.ended[1]
-                status, message = unless_turned(run, last_step, end, status, message)
+                status, message = unless_turned(run, self._last_step(t, table), end, status, message)
             if code != INTERRUPTED:
                 end = reached
                 if recorder.last is not None:
@@ -262,6 +261,15 @@ class Course:
             v_events=v_events,
             system=run.system,
         )
+
+    def _last_step(self, t: Array, table: Array) -> list[Place]:
+        """The beginning of the last step where velocities turned in it, as near a singular position: else nothing."""
+        run = self.run
+        if self.wanted.times is not None or self.recorder.ended is not None:
+            return []
+        if run.plan.watchful and run.work.notes[noted.NEARLY_SINGULAR] != 1.0:
+            return []
+        return [(float(t[-2]), table[-2])] if turned_last(t, table, run.system.n_q) else []
 
     def _buffers(self) -> Buffers:
         """Room for the states and steps of a chunk, each attempt of which fills one row at most."""

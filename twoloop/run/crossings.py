@@ -1,5 +1,7 @@
 """What a run says of places where explicit steps went across in the place of its own, which became short there."""
 
+from collections.abc import Callable, Iterator
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -7,10 +9,12 @@ from twoloop.problem.system import ConstrainedSystem
 
 Array = NDArray[np.float64]
 Place = tuple[float, Array]  # time and state [q, v, ...]
+Ratio = Callable[[ConstrainedSystem, float, Array, int], float]
 
 LOST = 1e-2  # smallest over largest singular value, below which constraints are said to lose rank
 SAMPLES = 33  # of the motion across
 SHOWN = 3  # places of which a message speaks
+DIFFERENCE = 1e-6  # relative: length of the way on which gamma is found by differences
 TURNED = 3.0  # of what the accelerations before and behind give: velocities that changed by more turned in between ...
 APPARENT = 10.0  # ... which counts where it exceeds the tolerances so many times
 
@@ -38,15 +42,17 @@ def singular_ratio(system: ConstrainedSystem, t: float, q: Array, rank: int) -> 
     return float(values[-1] / values[0]) if len(values) and values[0] > 0.0 else float(len(values) == 0)
 
 
-def _least_ratio(system: ConstrainedSystem, before: Place, behind: Place, rank: int) -> float:
+def _least_ratio(
+    system: ConstrainedSystem, before: Place, behind: Place, rank: int, ratio: Ratio = singular_ratio
+) -> float:
     """The least ratio on the way between two states."""
     n, (t0, first), (t1, last) = system.n_q, before, behind
     if t1 == t0:
-        return singular_ratio(system, t0, first[:n], rank)
+        return ratio(system, t0, first[:n], rank)
     from scipy.interpolate import CubicHermiteSpline  # takes a tenth of a second to import, and few runs need it
 
     way = CubicHermiteSpline([t0, t1], [first[:n], last[:n]], [first[n : 2 * n], last[n : 2 * n]])
-    return min(singular_ratio(system, float(t), way(t), rank) for t in np.linspace(t0, t1, SAMPLES))
+    return min(ratio(system, float(t), way(t), rank) for t in np.linspace(t0, t1, SAMPLES))
 
 
 def said_of_turn(
@@ -57,33 +63,91 @@ def said_of_turn(
     Positions within the tolerance are near other branches of the motion there, onto which steps may have come.
     """
     n = system.n_q
-    for before, *behind in crossings:
-        across = len(behind) == 1 and behind[0][0] > before[0]
-        (t0, first), (t1, last) = before, behind[0] if across else now
-        if not _turned(n, before, (t1, last), rtol, atol):
+    for (t0, first), (t1, last), across in _passages(crossings, now):
+        size, speeds = (max(np.abs(first[part]).max(), np.abs(last[part]).max()) for part in (_q(n), _v(n)))
+        turn = np.abs(last[_v(n)] - first[_v(n)])
+        least = min(np.abs(state[2 * n : 3 * n]).max() for state in (first, last))
+        if not (turn > np.maximum(APPARENT * (atol + rtol * speeds), TURNED * (t1 - t0) * least)).any():
             continue
-        near = min(LOST, np.sqrt(rtol + float((atol / max(np.abs(first[:n]).max(), np.abs(last[:n]).max())).max())))
+        near = min(LOST, np.sqrt(rtol + float(atol.max()) / size)) if size > 0.0 else LOST
         # where no step led across, the run's own steps may have gone on to anywhere
-        ratio = _least_ratio(system, before, (t1, last), rank) if across else singular_ratio(system, t1, last[:n], rank)
-        if ratio < near:
-            jump = float(np.abs(last[n : 2 * n] - first[n : 2 * n]).max())
+        here, there = (t0, first), (t1, last)
+        ratio = _least_ratio(system, here if across else there, there, rank, _ratio_in_any_units)
+        if ratio >= near:
+            continue
+        known = max(_known_acceleration(system, t, state[_q(n)], state[_v(n)], near) for t, state in (here, there))
+        turn[turn <= np.maximum(APPARENT * (atol + rtol * speeds), TURNED * (t1 - t0) * known)] = 0.0
+        if turn.any():
             return (
                 f"Not to be trusted beyond t = {t0:.10g}: near it the constraints lose rank "
-                f"({_measured({t0: ratio})}), and velocities changed there by up to {jump:.1g} within {t1 - t0:.1g} s, "
-                "more than the accelerations before and behind explain: within the tolerances lies another branch of "
-                "the motion, onto which the steps may have come. Tighten rtol and atol, take another method, or end "
-                "t_span before."
+                f"({_measured({t0: ratio})}), and velocities changed there by up to {turn.max():.1g} within "
+                f"{t1 - t0:.1g} s, more than forces and constraints explain: within the tolerances lies another "
+                "branch of the motion, onto which the steps may have come. Tighten rtol and atol, take another method, "
+                "or end t_span before."
             )
     return ""
 
 
-def _turned(n: int, before: Place, behind: Place, rtol: float, atol: Array) -> bool:
-    """Whether the velocities of two states differ by more than the accelerations there explain."""
-    (t0, first), (t1, last) = before, behind
-    v0, v1 = first[n : 2 * n], last[n : 2 * n]
-    most = max(np.abs(first[2 * n : 3 * n]).max(), np.abs(last[2 * n : 3 * n]).max())
-    seen = APPARENT * (atol + rtol * max(np.abs(v0).max(), np.abs(v1).max()))
-    return bool((np.abs(v1 - v0) > np.maximum(seen, TURNED * (t1 - t0) * most)).any())
+def turned_last(times: Array, rows: Array, n: int) -> bool:
+    """Whether the velocities of the last two states [q, v, a] differ by more than one of their accelerations gives."""
+    most = np.maximum.reduce  # a method max of arrays takes three calls, and repeated runs few more
+    if times.size < 2:
+        return False
+    turn = most(np.abs(rows[-1, n : 2 * n] - rows[-2, n : 2 * n]))
+    least = np.minimum.reduce(most(np.abs(rows[-2:, 2 * n : 3 * n]), axis=1))
+    return bool(turn > TURNED * (times[-1] - times[-2]) * least)
+
+
+def _passages(crossings: list[list[Place]], now: Place) -> Iterator[tuple[Place, Place, bool]]:
+    """The states before and behind each passage, and whether steps led across; one may take several crossings."""
+    before: Place | None = None
+    for first, *behind in crossings:
+        before = first if before is None else before
+        if behind and behind[0][0] > first[0]:
+            yield before, behind[0], True
+            before = None
+    if before is not None and now[0] > before[0]:
+        yield before, now, False
+
+
+def _q(n: int) -> slice:
+    return slice(n)
+
+
+def _v(n: int) -> slice:
+    return slice(n, 2 * n)
+
+
+def _known_acceleration(system: ConstrainedSystem, t: float, q: Array, v: Array, near: float) -> float:
+    """The largest acceleration without what rows give whose singular values are below this share of the largest."""
+    mass, rows, lengths, units = _in_any_units(system, t, q)
+    left, values, right = np.linalg.svd(rows, full_matrices=False)
+    kept = values > near * values[0]
+    short = DIFFERENCE * max(np.abs(q).max(), DIFFERENCE) / max(np.abs(v).max(), DIFFERENCE)
+    rates = [system.velocity_constraint(t + dt, q + dt * v, v) / lengths for dt in (-short, short)]
+    gamma = (left.T @ (rates[0] - rates[1]))[kept] / (2.0 * short * values[kept])
+    equations = np.block([[mass, right[kept].T], [right[kept], np.zeros((int(kept.sum()),) * 2)]])
+    found = np.linalg.lstsq(equations, np.append(units * system.force(t, q, v), gamma), rcond=None)[0]
+    return float(np.abs(units * found[: len(q)]).max())
+
+
+def _ratio_in_any_units(system: ConstrainedSystem, t: float, q: Array, rank: int) -> float:
+    """As `singular_ratio`, but independent of the units of coordinates and rows."""
+    values = np.linalg.svd(_in_any_units(system, t, q)[1], compute_uv=False)[:rank]
+    return float(values[-1] / values[0]) if len(values) and values[0] > 0.0 else float(len(values) == 0)
+
+
+def _in_any_units(system: ConstrainedSystem, t: float, q: Array) -> tuple[Array, Array, Array, Array]:
+    """Mass and rows with coordinates in which each has a mass of one, lengths of these rows, and units of the former.
+
+    The rows are divided by their lengths.
+    """
+    mass, rows = system.mass(t, q), system.rows(t, q)
+    inertia = np.abs(np.diagonal(mass))
+    units = 1.0 / np.sqrt(np.where(inertia > 0.0, inertia, inertia.max()))
+    lengths = np.linalg.norm(rows * units, axis=1)
+    lengths[lengths == 0.0] = 1.0
+    return mass * units * units[:, None], rows * units / lengths[:, None], lengths, units
 
 
 def _times(found: dict[float, float]) -> str:

@@ -17,7 +17,6 @@ if TYPE_CHECKING:
 NEARLY_SINGULAR = 1e-3  # smallest over largest singular value of C_q, below which a message says so
 LOST_AT_END = 1e-6  # the same, below which the state at the end of a run is said not to be determined
 CROSSINGS = "\0"  # stands for what is said of singular positions that were crossed
-LARGEST_LOOKED_AT = 100  # coordinates up to which singular values are found without a reason
 NEXT_TO_END = 1e-3  # of the run: where it stops so close to its end, that is said
 
 _REASONS = {
@@ -54,12 +53,13 @@ def message_of(run: "Run", words: str) -> Any:
     return Later(made)
 
 
-def unless_turned(
-    run: "Run", last_step: list[list[Place]], end: float, status: Status, message: str
-) -> tuple[Status, str]:
+def unless_turned(run: "Run", last_step: list[Place], end: float, status: Status, message: str) -> tuple[Status, str]:
     """Status and message, unless velocities turned at a singular position that was crossed, or in the last step."""
     now, crossings = (float(run.clock[run.a.T]), run.state), [each for each in run.crossings if each[0][0] < end]
-    crossings += last_step
+    if last_step:
+        crossings.append(last_step)
+    if not crossings:
+        return status, message
     rtol, atol = float(run.tolerances[tolerances.RTOL]), run.tolerances[tolerances.ATOL :]
     turned = said_of_turn(run.system, crossings, now, run.rank, rtol, atol)
     return (Status.RANK_LOST, turned) if turned else (status, message)
@@ -146,18 +146,9 @@ def _contradiction(run: "Run") -> str:
     )
 
 
-def may_end_singular(run: "Run") -> bool:
-    """Whether the last state may be near a singular position, as far as the run knows: some methods do not look."""
-    if run.crossings:
-        return True
-    if run.plan.watchful:
-        return bool(run.work.notes[noted.NEARLY_SINGULAR] == 1.0)
-    return run.system.n_q <= LARGEST_LOOKED_AT
-
-
 def _said_of_end(run: "Run") -> str:
     """A warning, and the sentence, where the run ends with constraints that have lost rank."""
-    if not may_end_singular(run):
+    if not run.crossings and not (run.plan.watchful and run.work.notes[noted.NEARLY_SINGULAR] == 1.0):
         return ""
     t, q, rank = float(run.clock[run.a.T]), run.state[: run.system.n_q], run.rank
     if surely_above(LOST_AT_END, run.system.rows(t, q), rank):
