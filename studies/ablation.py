@@ -19,6 +19,7 @@ from studies.bench.metrics import violations
 from studies.bench.store import Array
 from studies.bench.study import Study, rows_of
 from studies.bench.tables import LEAST, where
+from studies.violation import KEPT
 from twoloop import Result
 from twoloop.methods.tableaux import Tableau, gauss, radau_iia, sun_radau_iib
 
@@ -44,7 +45,6 @@ TARGETS = {LINKAGE: (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6), FLEXIBLE: (1e-4, 1e-5,
 TOLD = {LINKAGE: (1e-3, 1e-6), FLEXIBLE: (1e-5, 1e-7)}  # those of the table
 ONE = 1.5  # below this an order counts as 1
 MARGIN = 1.2  # times the cost: dearer; less is no difference
-KEPT = 1e-12  # m; what is violated no more is kept
 GROWS = 2.0  # times the violation of the first tenth of a run in its last
 SAME_TOLERANCE = HALVES[8]  # 1e-5, the paper's, at which step lengths are compared
 

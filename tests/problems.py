@@ -43,11 +43,11 @@ def slope(f, e=1e-3):
     return (45.0 * (f(e) - f(-e)) - 9.0 * (f(2 * e) - f(-2 * e)) + f(3 * e) - f(-3 * e)) / (60.0 * e)
 
 
-def row_errors(system, t, q, v, e=1e-3):
+def row_errors(system, t, q, v):
     """Largest errors of C_q v, of C_t, and of Q_d and Q_a, against differences along q + s v."""
-    by_q = slope(lambda s: system.constraint(t, q + s * v), e)
-    by_t = slope(lambda s: system.constraint(t + s, q), e)
-    bend = slope(lambda s: system.velocity_constraint(t + s, q + s * v, v), e)
+    by_q = slope(lambda s: system.constraint(t, q + s * v))
+    by_t = slope(lambda s: system.constraint(t + s, q))
+    bend = slope(lambda s: system.velocity_constraint(t + s, q + s * v, v))
     kinds = [kind for kind, n in (("gamma", system.n_c), ("nonholonomic_gamma", system.n_a)) if n]
     right = np.concatenate([np.zeros(0), *(system.evaluate(kind, t, q, v) for kind in kinds)])
     return worst(system.jacobian(t, q) @ v, by_q), worst(system.constraint_rate(t, q), by_t), worst(right, -bend)
@@ -366,6 +366,11 @@ def event(function, terminal=None, direction=None):
     if direction is not None:
         function.direction = direction
     return function
+
+
+def at_one(terminal=None):
+    """theta_3 = 1 of the four-bar linkage."""
+    return event(lambda t, q, v: q[8] - 1.0, terminal)
 
 
 # --- runs that end: one that crawls is to fail, not to hang

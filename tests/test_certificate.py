@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from tests.compiled import PENDULUM
-from tests.problems import run
+from tests.problems import at_one, run
 from twoloop import CertificateWarning, ConstrainedSystem, Statistics, callback, mechanisms, solve_dae
 from twoloop.run.dense_solution import DenseSolution
 
@@ -37,8 +37,8 @@ def swung(method="auto", tolerance=1e-6, system=None, **options):
 
 
 @cache
-def calm(method="auto"):
-    return swung(method)
+def calm():
+    return swung("auto")
 
 
 def silently(result, **tolerances):
@@ -161,12 +161,8 @@ def test_the_tolerances_of_newmark_are_its_own(default_four_bar):
 
 
 def test_a_run_that_an_event_ended(default_four_bar):
-    def end(t, q, v):
-        return q[8] - 1.0
-
-    end.terminal = True
     for options in ({}, {"dense_output": True}, {"t_eval": np.linspace(0.0, 5.0, 51)}):
-        assert silently(run(default_four_bar, 5.0, events=end, **options))
+        assert silently(run(default_four_bar, 5.0, events=at_one(True), **options))
 
 
 def test_a_result_of_another_solver(default_four_bar):

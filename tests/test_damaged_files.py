@@ -6,19 +6,15 @@ import numpy as np
 import pytest
 
 import twoloop
-from tests.problems import run
+from tests.problems import at_one, run
 from tests.processes import run_python
 from twoloop.mechanisms import four_bar
-
-
-def crossing(t, q, v):
-    return q[8] - 1.0
 
 
 @pytest.fixture(scope="module")
 def saved(tmp_path_factory):
     path = tmp_path_factory.mktemp("saved") / "run.npz"
-    run(four_bar(), 0.5, method="Gauss12", dense_output=True, events=crossing).save(path)
+    run(four_bar(), 0.5, method="Gauss12", dense_output=True, events=at_one()).save(path)
     return path
 
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from numba import njit
 
+from tests.compiled import unit_mass
 from twoloop import ConstrainedSystem, Integrator, callback, consistent_state, consistent_states, ensemble, solve_dae
 
 GRAVITY = 9.81
@@ -116,15 +117,11 @@ def test_every_call_that_starts_looks():
 
 
 def test_callbacks_are_looked_at_too():
-    @callback("mass")
-    def mass(t, q, p, M):
-        M[0, 0] = 1.0
-
     @callback("force")
     def force(t, q, v, p, Q):
         Q[0] = -of_global(t)
 
-    falling = ConstrainedSystem(n_q=1, n_c=0, mass=mass, force=force)
+    falling = ConstrainedSystem(n_q=1, n_c=0, mass=unit_mass, force=force)
     assert abs(solve_dae(falling, (0.0, 1.0), [0.0], [0.0]).q[0, -1] + 0.5 * 9.81) < 1e-8
     globals()["GRAVITY"] = 4.0
     with pytest.raises(ValueError, match=r"force of 'system' was compiled with GRAVITY = 9\.81, which is 4\.0 now"):

@@ -8,18 +8,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
-from tests.problems import event, pendulum, run, swing, unconstrained, violations, worst
+from tests.problems import at_one, event, pendulum, run, swing, unconstrained, violations, worst
 from twoloop import Status, solve_dae
 
 
-def at_one(terminal=None, direction=None):
-    """theta_3 = 1 of the four-bar linkage."""
-    return event(lambda t, q, v: q[8] - 1.0, terminal, direction)
-
-
-def clock(*times, terminal=None, direction=None):
+def clock(*times, terminal=None):
     """Zero at these times, whatever moves; the sign changes at each."""
-    return event(lambda t, q, v: float(np.prod([t - each for each in times])), terminal, direction)
+    return event(lambda t, q, v: float(np.prod([t - each for each in times])), terminal)
 
 
 @pytest.fixture(scope="module")

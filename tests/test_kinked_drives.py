@@ -19,7 +19,7 @@ LOW_ORDER = ("TRBDF2", "ESDIRK4", "Newmark", "PaperNewmark", "PaperIRK")
 METHODS = [name for name in PRESETS if name not in ("Taylor", "Gauss6", "Gauss10", "Gauss12", "Gauss14")]
 
 
-def driven(place, speed, acceleration, gamma=True, mass=MASS):
+def driven(place, speed, acceleration, gamma=True):
     def constraint(t, q):
         return np.array(
             [
@@ -41,7 +41,7 @@ def driven(place, speed, acceleration, gamma=True, mass=MASS):
     return ConstrainedSystem.from_python(
         n_q=5,
         n_c=3,
-        mass=mass,
+        mass=MASS,
         force=lambda t, q, v: np.array([0.0, 0.0, -19.62, 0.0, -9.81]) - 0.1 * v,
         constraint=constraint,
         jacobian=jacobian,

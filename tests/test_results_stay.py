@@ -8,6 +8,7 @@ import numba
 import numpy as np
 import pytest
 
+from tests.compiled import unit_mass
 from tests.problems import event, pendulum, run, worst
 from tests.processes import run_python
 from twoloop import ConstrainedSystem, Status, callback, consistent_state, solve_dae
@@ -97,16 +98,12 @@ def test_a_helper_that_writes_to_parameters_is_refused():
     def halve(p):
         p[0] *= 0.5
 
-    @callback("mass")
-    def mass(t, q, p, M):
-        M[0, 0] = 1.0
-
     @callback("force")
     def force(t, q, v, p, Q):
         halve(p)
         Q[0] = -p[0] * q[0]
 
-    system = ConstrainedSystem(n_q=1, n_c=0, mass=mass, force=force, parameters=[1.0], name="changing")
+    system = ConstrainedSystem(n_q=1, n_c=0, mass=unit_mass, force=force, parameters=[1.0], name="changing")
     with pytest.raises(
         ValueError, match=r"force of 'changing' must not change the arrays .*: it changes p. Copy first"
     ):

@@ -59,14 +59,14 @@ def start_of(state):
 
 
 @cache
-def reference(force, state, t_end=T_END):
+def reference(force, state):
     """The end position from the equation of the angle alone, by SciPy with steps too short to pass over anything."""
 
     def rates(t, y):
         q, along = position(y[0]), np.array([np.cos(y[0]), np.sin(y[0])])
         return [y[1], along @ force(t, q, y[1] * along)]
 
-    run = solve_ivp(rates, (0.0, t_end), state, method="DOP853", rtol=1e-12, atol=1e-12, max_step=t_end / 600.0)
+    run = solve_ivp(rates, (0.0, T_END), state, method="DOP853", rtol=1e-12, atol=1e-12, max_step=T_END / 600.0)
     return position(run.y[0, -1])
 
 

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import twoloop
-from tests.problems import event, pendulum, run, swing, worst
+from tests.problems import at_one, pendulum, run, swing, worst
 from tests.processes import ROOT
 from twoloop import Result, Statistics, Status
 from twoloop.mechanisms import closed_chain, redundant_slider_crank
@@ -21,13 +21,6 @@ from twoloop.run import course
 
 EVERY = [field.name for field in fields(Result) if field.name != "sol"]
 TELLS = [name for name in EVERY if name not in ("stats", "system", "redundant")]
-
-
-def raised(t, q, v):
-    return q[8] - 1.0
-
-
-ENDING = event(lambda t, q, v: q[8] - 1.0, terminal=True)
 
 
 def same(one, other, names=EVERY):
@@ -44,7 +37,7 @@ def same(one, other, names=EVERY):
 
 @pytest.mark.parametrize("method", ["SunRadau5", "Gauss12", "BDF", "RadauIIA5", "RadauIIA13", "Taylor"])
 def test_there_and_back(default_four_bar, tmp_path, method):
-    result = run(default_four_bar, 1.0, method=method, dense_output=True, events=raised)
+    result = run(default_four_bar, 1.0, method=method, dense_output=True, events=at_one())
     result.save(tmp_path / "run.npz")
     again = twoloop.load(tmp_path / "run.npz", default_four_bar.system)
     same(result, again)
@@ -79,7 +72,7 @@ def test_a_result_from_a_file_says_what_it_said(default_four_bar, tmp_path, says
 
 
 def test_a_run_that_an_event_ended(default_four_bar, tmp_path):
-    result = run(default_four_bar, 1.0, dense_output=True, events=[ENDING, raised])
+    result = run(default_four_bar, 1.0, dense_output=True, events=[at_one(True), at_one()])
     result.save(tmp_path / "run.npz")
     again = twoloop.load(str(tmp_path / "run.npz"), default_four_bar.system)
     same(result, again)
@@ -121,12 +114,12 @@ def test_a_file_that_is_not_there(tmp_path):
     [
         {},
         {"t_eval": np.linspace(0.0, 1.0, 30)},
-        {"t_eval": np.linspace(0.1, 0.9, 30), "dense_output": True, "events": raised},
+        {"t_eval": np.linspace(0.1, 0.9, 30), "dense_output": True, "events": at_one()},
         {"method": "RadauIIA13", "dense_output": True},
         {"step_size": 0.01, "t_eval": [0.5, 0.8], "method": "Gauss12"},
         {"method": "Newmark", "rtol": 1e-4, "atol": 1e-4},
-        {"dense_output": True, "events": [ENDING]},
-        {"t_eval": [0.0, 0.1, 0.2, 0.9], "events": ENDING},
+        {"dense_output": True, "events": [at_one(True)]},
+        {"t_eval": [0.0, 0.1, 0.2, 0.9], "events": at_one(True)},
         {"max_steps": 5},
         {"max_steps": 5, "t_eval": [0.3], "dense_output": True},
     ],

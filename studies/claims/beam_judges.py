@@ -22,7 +22,7 @@ from studies.claims.rows import BEAM_END, BEAMS, Rows, cheapest
 from studies.claims.verdicts import Judgement, decide, span, span_known
 from studies.table3.causes import FLAT
 
-FACTOR = 2.0  # within which a limit counts as the same
+FACTOR = 2.0  # within which an estimate, or a limit, counts as the same
 GIVEN_UP = 0.1  # share of steps given up that counts as little
 STIFFER = 10.0  # times w_max of the very flexible beam, whose modulus is a hundredth
 SECONDS = (56.27, 6278.54)  # s of the beams, printed

@@ -13,6 +13,7 @@ from studies.beam.runs import without_tangent
 from studies.bench import end_states
 from studies.bench.solvers import IMPLICIT
 from studies.bench.store import Array
+from studies.motion import PASSES
 from studies.validation import study as validation
 from twoloop import ConstrainedSystem, ConstraintWarning, Result, RungeKutta, paper_irk, solve_dae
 from twoloop.mechanisms import Problem, four_bar, knife_edge, moderately_stiff_beam, rolling_disc, very_flexible_beam
@@ -37,7 +38,6 @@ GEOMETRIES = (  # lengths of the bars and of the ground, m: the assumed one, tha
     *((1.0, 2.0, 1.5, 3.0), (0.8, 1.2, 1.0, 2.0), (1.0, 1.2, 0.5, 1.0)),
     *((2.0, 2.0, 1.0, 1.5), (2.0, 2.5, 1.0, 2.0), (1.0, 1.0, 0.5, 0.75)),
 )
-PASSES = 1e-3  # m above 0 from which y3 passes the line
 BETAS = (0.0, 0.25, 0.5)
 SWING, SWING_STEP, SWING_STEPS = (2.0, 0.0), 0.2, 100  # a pendulum's start (rad, rad/s), step (s) and steps
 

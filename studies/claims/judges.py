@@ -9,12 +9,12 @@ from studies import ablation
 from studies.bench import tables
 from studies.bench.metrics import ASTRAY, LOST
 from studies.bench.solvers import GEAR_ORDERS, IDA_C, IRK, IRK_LINE, NEWMARK, OWN_BDF, QUARTER, gear
-from studies.claims.beam_judges import FOLLOWS, TIPS
-from studies.claims.experiments import PASSES
+from studies.claims.beam_judges import FACTOR, FOLLOWS, TIPS
 from studies.claims.rows import BEAMS, DEFAULT, LONG, NotRun, Rows, cheapest, common_costs
 from studies.claims.verdicts import Judgement, decide, span, span_known
 from studies.energy.drift import NO_DRIFT, verdict
 from studies.energy.runs import ONE
+from studies.motion import PASSES, VISIBLE
 from studies.table3.causes import FLAT, PAPER_IRK, PAPER_NEWMARK, TOLERANCES, cells, least
 from studies.violation import grows
 
@@ -25,10 +25,8 @@ GROWTH = 10.0  # of the violation from the first tenth of a run to its last: it 
 SATISFIED = 1e-12  # violation that counts as rounding
 LOOSE = 1e-8  # tolerance, from which on what is not solved is off by more
 DEARER = 1.2  # times the cost: beyond the noise of times
-FACTOR = 2.0  # within which an estimate, or a limit, counts as the same
 NEEDLESS = 0.1  # share of steps given up, or of work, that counts as little
 AGREE = 1e-10  # m or rad
-VISIBLE = 0.01  # m, about the width of a line in a figure of the motion
 STEP = 0.02  # s
 MAIN = 2.0  # times a logarithm must exceed another for its tolerance to be the one that governs
 CHANGE = 1.1  # times the steps: a tolerance affects them

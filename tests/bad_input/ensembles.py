@@ -10,8 +10,8 @@ LINKAGE = four_bar()
 THREE = np.tile(LINKAGE.q0, (3, 1))
 
 
-def many(q0=THREE, v0=LINKAGE.v0, t_span=(0.0, 0.1), system=LINKAGE.system, **options):
-    return ensemble(system, t_span, q0, v0, **options)
+def many(q0=THREE, system=LINKAGE.system, **options):
+    return ensemble(system, (0.0, 0.1), q0, LINKAGE.v0, **options)
 
 
 def states(q=THREE, v=LINKAGE.v0, t=0.0, **options):

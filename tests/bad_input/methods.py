@@ -9,8 +9,8 @@ from twoloop import BDF, DOP853, Newmark, RungeKutta, Taylor, paper_irk, paper_n
 from twoloop.methods.tableaux import Tableau, gauss, lobatto_iiie, radau_iia, sun_radau_iib
 
 
-def runge_kutta(tableau=None, **options):
-    return RungeKutta(gauss(2) if tableau is None else tableau, **options)
+def runge_kutta(**options):
+    return RungeKutta(gauss(2), **options)
 
 
 EXPLICIT = Tableau("Heun", [[0.0, 0.0], [1.0, 0.0]], [0.5, 0.5], [0.0, 1.0], 2)

@@ -18,8 +18,8 @@ def problem(**options):
     return Problem("swing", given.system, given.q0, given.v0, (0.0, 1.0), given.energy, **options)
 
 
-def swept(problem_of=four_bar, parameters=({"theta3": 0.1},), **options):
-    return sweep(problem_of, parameters, **{"t_span": (0.0, 1e-3), "parallel": "threads", **options})
+def swept(parameters=({"theta3": 0.1},), **options):
+    return sweep(four_bar, parameters, **{"t_span": (0.0, 1e-3), "parallel": "threads", **options})
 
 
 of_result, of_certify = cases_of("result.to_dataframe, .energy, .plot, .animate"), cases_of("result.certify")

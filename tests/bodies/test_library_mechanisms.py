@@ -46,9 +46,9 @@ def accelerations(system, t, q, v):
     return np.linalg.lstsq(matrix, np.concatenate(right), rcond=1e-13)[0][: system.n_q]
 
 
-def planar_as_given(known, masses, inertias, gravity=(0.0, -9.81)):
+def planar_as_given(known, masses, inertias):
     """A model with bodies as a problem of planar bodies starts."""
-    model = PlanarModel(gravity)
+    model = PlanarModel()
     names = [each.split(" of ")[1] for each in known.coordinates[::3]]
     q, v = known.q0.reshape(-1, 3), known.v0.reshape(-1, 3)
     for name, mass, J, state, rate in zip(names, masses, inertias, q, v, strict=True):

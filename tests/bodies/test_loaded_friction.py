@@ -10,10 +10,11 @@ from twoloop import ensemble, solve_dae
 from twoloop.bodies import PlanarModel, SpatialModel
 
 G = 9.81
+RADIUS = 0.15  # of the pin, m
 TIMES = np.linspace(0.0, 0.8, 5)
 
 
-def cart(spatial, guide=0.2, pin=0.3, push=0.0, radius=0.15):
+def cart(spatial, guide=0.2, pin=0.3, push=0.0):
     """A cart on a guide, and a rod that hangs from it; friction in both joints."""
     if spatial:
         model, z = SpatialModel((0.0, -G, 0.0)), (0.0, 0.0, 1.0)
@@ -28,12 +29,12 @@ def cart(spatial, guide=0.2, pin=0.3, push=0.0, radius=0.15):
         rail = model.prismatic("ground", "cart", at=(0.0, 0.0), axis=(1.0, 0.0))
         hinge = model.revolute("cart", "rod", at=(0.0, 0.0))
     model.friction(rail, push, speed=0.3, coefficient=guide)
-    model.friction(hinge, speed=0.5, coefficient=pin, radius=radius)
+    model.friction(hinge, speed=0.5, coefficient=pin, radius=RADIUS)
     return model, rail, hinge
 
 
 @cache
-def by_hand(guide=0.2, pin=0.3, push=0.0, radius=0.15):
+def by_hand(guide=0.2, pin=0.3, push=0.0):
     """x of the cart, the angle from below, and their rates; forces in the joints by iteration."""
     M, m, J, l = 2.0, 1.0, 0.08, 0.5
 
@@ -46,7 +47,7 @@ def by_hand(guide=0.2, pin=0.3, push=0.0, radius=0.15):
             A = np.array([[m, m * l * c, -1, 0], [0, m * l * s, 0, -1], [M, 0, 1, 0], [0, J, l * c, l * s]])
             _, _, X, Y = found = np.linalg.solve(A, [m * l * w**2 * s, -m * l * w**2 * c - m * G, rub, turn])
             rub = -(push + guide * abs(Y + M * G)) * np.tanh(u / 0.3)
-            turn = -pin * radius * np.hypot(X, Y) * np.tanh(w / 0.5)
+            turn = -pin * RADIUS * np.hypot(X, Y) * np.tanh(w / 0.5)
         return found[:2]
 
     def slope(t, y):

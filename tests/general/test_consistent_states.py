@@ -8,9 +8,9 @@ from tests.problems import pendulum
 from twoloop import ConstrainedSystem, callback, consistent_state, consistent_states, mechanisms
 
 
-def guesses(problem, n, far=0.02):
+def guesses(problem, n):
     random = np.random.default_rng(2)
-    q = problem.q0 + far * random.uniform(-1.0, 1.0, (n, problem.system.n_q))
+    q = problem.q0 + 0.02 * random.uniform(-1.0, 1.0, (n, problem.system.n_q))
     return q, random.uniform(-1.0, 1.0, q.shape)
 
 

@@ -16,10 +16,10 @@ def moved(problem, t1, method="auto", **options):
     return solve_with_stops(problem.system, (0.0, t1), problem.q0, problem.v0, problem.stops, method, **options)
 
 
-def block(friction, speed, slope, restitution=0.0, height=0.0):
+def block(friction, speed, slope, restitution=0.0):
     """A block on two corners on a slope, whose axes are those of space."""
     model = PlanarModel(GRAVITY * np.array([-np.sin(slope), -np.cos(slope)]))
-    box = model.box("block", (0.4, 0.2), mass=2.0, position=(0.0, 0.1 + height), velocity=(speed, 0.0))
+    box = model.box("block", (0.4, 0.2), mass=2.0, position=(0.0, 0.1), velocity=(speed, 0.0))
     for x in (-0.2, 0.2):
         given = {"normal": (0.0, 1.0), "restitution": restitution, "friction": friction}
         model.stop(box, box.point(x, -0.1), "ground", (0.0, 0.0), **given)

@@ -15,9 +15,9 @@ def changes(result):
     return np.array([arc.t[0] for arc in result.arcs[1:]])
 
 
-def incline(f, speed, slope=0.5, angle=0.0, spatial=False):
+def incline(f, speed, angle=0.0, spatial=False):
     """A block of 2 kg that is pushed up a slope; all is turned by an angle."""
-    total = slope + angle
+    total = 0.5 + angle
     along, g = np.array([np.cos(total), np.sin(total)]), 9.81 * np.array([np.sin(angle), -np.cos(angle)])
     if spatial:
         model = SpatialModel((*g, 0.0))

@@ -15,9 +15,9 @@ sizes = st.integers(1, 12)
 seeds = st.integers(0, 2**32 - 1)
 
 
-def sparse(rng, n, share=0.4):
+def sparse(rng, n):
     """A random matrix with zeros, not near singular."""
-    A = rng.normal(size=(n, n)) * (rng.uniform(size=(n, n)) > share)
+    A = rng.normal(size=(n, n)) * (rng.uniform(size=(n, n)) > 0.4)
     return np.ascontiguousarray((A + 3.0 * np.eye(n))[rng.permutation(n)])
 
 

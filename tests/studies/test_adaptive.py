@@ -132,10 +132,10 @@ def test_a_limit_at_a_loose_setting_moves_to_the_next_and_two_running_end_it():
     assert first(made(("a", limited(VALUES[1:3]))), "a") == 3
 
 
-def asked_steps(make, errors=(1e-3, 1e-5, 1e-7), start=(300, 1000), **others):
+def asked_steps(make, **others):
     """Numbers of steps that a solver of fixed steps was asked for, given make(n) -> status, error, seconds."""
     makers = {name: lambda h, make=make: make(10.0 / h) for name, make in {**others, "a": make}.items()}
-    rows = collected(makers, [10.0 / n for n in start], setting="h", errors=errors)
+    rows = collected(makers, [10.0 / n for n in (300, 1000)], setting="h", errors=(1e-3, 1e-5, 1e-7))
     numbers = sorted({10.0 / h for h in rows[rows["solver"] == "a"]["h"]})
     assert [round(n) for n in numbers] == pytest.approx(numbers)  # the motion takes a whole number of each
     return [round(n) for n in numbers]

@@ -22,9 +22,9 @@ def repeated(*lines, family="two-loop"):
     return made.assign(inside_s=0.25 * made["call_s"], times=[(time,) * 5 for time in made["call_s"]])
 
 
-def everywhere(default=4.0, compiled=1.0, rival=2.0):
-    own = repeated(("auto", 1e-3, default), ("auto, compiled", 1e-3, compiled), ("Taylor", 1e-3, 9.0))
-    return pd.concat([own, repeated(("heyoka", 1e-3, rival), family="heyoka")], ignore_index=True)
+def everywhere():
+    own = repeated(("auto", 1e-3, 4.0), ("auto, compiled", 1e-3, 1.0), ("Taylor", 1e-3, 9.0))
+    return pd.concat([own, repeated(("heyoka", 1e-3, 2.0), family="heyoka")], ignore_index=True)
 
 
 def in_angles(time, error=1e-3):

@@ -160,9 +160,9 @@ def test_violations_are_those_of_ours_on_the_four_bars():
     assert work_precision.violation(table) == 3e-15
 
 
-def stated(own, heyoka=2.0, python=9.0, **changed):
+def stated(own, **changed):
     """The text of the report, of rows of the four-bar."""
-    table = compared(own, heyoka, python=python)
+    table = compared(own, 2.0, python=9.0)
     found = {"cases": [], "first_calls": [], "minimal": [], "default": "auto", "violation": 1e-15}
     found |= {"rivals": rivals.findings_of(table), "measured": {"commits": 1, "processors": ["this"]}}
     found["default_over"] = [work_precision.default_over(table, compiled) for compiled in (True, False)]

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.bodies import parameter_layout as layout
-from twoloop.bodies.functions import Function, Law, with_arguments
+from twoloop.bodies.functions import AGREES, BETWEEN, STATES, Function, Law, with_arguments
 from twoloop.bodies.loaded_friction import LoadedFriction
 from twoloop.bodies.parts import COINCIDE
 from twoloop.bodies.places import placed
@@ -24,8 +24,6 @@ from twoloop.problem.system import ConstrainedSystem
 
 KINDS = ("mass", "force", "constraint", "jacobian", "constraint_rate", "gamma")
 OF_JOINTS = ("constraint", "jacobian", "gamma")
-STATES = 5  # at which the traced programs are compared with the original functions
-AGREES = 1e-10  # relative difference between a function and its program
 QUIET = np.errstate(divide="ignore", invalid="ignore")  # reported by name later
 
 
@@ -181,7 +179,7 @@ def _disagreement(tables: Tables, t: float, q: Array, v: Array) -> str:
     ):
         for number in range(STATES if functions else 0):
             away = generic.uniform(-1.0, 1.0, (2, len(q))) * (number > 0)
-            then = t + 0.37 * number
+            then = t + BETWEEN * number
             one, other = q + 0.3 * away[0], v + away[1]
             stretched = _with_stretches(tables, one, other, p) if functions is tables.functions else (one, other)
             made, first = results(int(place), then, *stretched, p), 0

@@ -11,12 +11,11 @@ from twoloop.generate.families import Evaluator, Family, of_family
 from twoloop.generate.programs import Program, program_of
 from twoloop.generate.traced_equations import Equations
 from twoloop.generate.traced_values import Check, Traced
-from twoloop.generate.tracing import Form, Untraceable
+from twoloop.generate.tracing import MOST_OPERATIONS, Form, Untraceable
 from twoloop.kernels.evaluation.operations import KIND, MADE, RESULT
 from twoloop.problem.system import ConstrainedSystem
 
 ROWS = {"jacobian": "n_c", "gamma": "n_c", "nonholonomic_gamma": "n_a"}  # what may be derived, and of how many rows
-MOST = 20_000  # operations of a program
 
 
 class Derived:
@@ -77,7 +76,7 @@ def _made(system: ConstrainedSystem, absent: Sequence[str], family: Family) -> D
     programs = {}
     for name, forms in _results(equations, absent).items():
         program = program_of(equations.graph, 1 + 2 * system.n_q, dict(enumerate(forms.values())))
-        if len(program.rows) > MOST:
+        if len(program.rows) > MOST_OPERATIONS:
             raise Untraceable(f"{name} takes {len(program.rows)} operations")
         programs[name] = program, list(forms)
     return Derived(programs, Traced(system, equations.graph))

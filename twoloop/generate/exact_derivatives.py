@@ -6,6 +6,7 @@ from functools import cache, partial
 import numpy as np
 from numpy.typing import NDArray
 
+from twoloop.checks.derivatives import TIME
 from twoloop.checks.scales import generic_factors, sizes
 from twoloop.generate.families import Family, of_family
 from twoloop.generate.traced_equations import OF_ROWS, Equations
@@ -19,7 +20,6 @@ Array = NDArray[np.float64]
 
 MOST = 50_000  # entries of C_q
 NEAR = (0.0, 1e-3, 0.03)  # of the coordinates, and of TIME
-TIME = 0.1  # s
 BESIDE = 0.01  # of the box of a Territory, less than states of a run that are compared lie apart: no new place
 ROUNDED = 1e-9  # of its longest side but that of the time: the same for coordinates that move by rounding alone
 

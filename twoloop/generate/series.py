@@ -17,7 +17,7 @@ from twoloop.generate.families import Evaluator, Family, of_family
 from twoloop.generate.known_numbers import array_of, elementwise
 from twoloop.generate.traced_equations import Equations
 from twoloop.generate.traced_values import Check, Traced, unchecked
-from twoloop.generate.tracing import Form, Graph, Untraceable
+from twoloop.generate.tracing import MOST_OPERATIONS, Form, Graph, Untraceable
 from twoloop.kernels.evaluation.operations import COSINE, PENDING, SINE, SUM
 from twoloop.problem.system import ConstrainedSystem
 
@@ -27,7 +27,6 @@ Array = NDArray[np.float64]
 MOST_ENTRIES = 200_000  # of M and C_q, above which no series is looked for unless asked for
 
 READ = ("mass", "force", "jacobian", "nonholonomic", "constraint_rate", "nonholonomic_rate")
-MOST = 20_000  # operations; with more the program would take longer to make than a run
 
 
 class Sums(NamedTuple):
@@ -237,8 +236,8 @@ def _assembled(
             kind, first, second = operation
             made = (_without_sums(sums, first), None if second is None else _without_sums(sums, second))
             (late if graph.late[i] else early).append((i, kind, *made))
-    if len(early) + len(late) + len(row_products) + len(reaction_products) > MOST:
-        raise Untraceable(f"its equations are more than {MOST} operations")
+    if len(early) + len(late) + len(row_products) + len(reaction_products) > MOST_OPERATIONS:
+        raise Untraceable(f"its equations are more than {MOST_OPERATIONS} operations")
     tables = [
         [*_ordered(operations), (PENDING, [(next(iter(form.terms)), *factors) for form, *factors in products.values()])]
         for operations, products in ((early, row_products), (late, reaction_products))

@@ -15,9 +15,9 @@ from twoloop.generate.llvm_code import ONE, SLACK, ZERO, Emitter, Quantities
 from twoloop.generate.llvm_text import Value, integer
 from twoloop.generate.series import SeriesProgram
 from twoloop.generate.series_groups import WIDTH, Group, Groups, rounded
+from twoloop.generate.written import FUNCTIONS
 from twoloop.kernels.evaluation.operations import (
     ARCTANGENT,
-    EXPONENTIAL,
     LOGARITHM,
     PENDING,
     PRODUCT,
@@ -27,7 +27,6 @@ from twoloop.kernels.evaluation.operations import (
 )
 
 AT_ONCE = 8  # vectors that are summed in one loop, in registers
-FUNCTIONS = {EXPONENTIAL: "exp", LOGARITHM: "log", ARCTANGENT: "atan", SQUARE_ROOT: "sqrt"}
 
 
 class SeriesCode:

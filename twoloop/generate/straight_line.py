@@ -24,11 +24,9 @@ from twoloop.generate.known_numbers import elementwise
 from twoloop.generate.symbolic_factors import Block, Factors, solve
 from twoloop.generate.traced_equations import Equations, only
 from twoloop.generate.traced_values import Traced
-from twoloop.generate.tracing import Form, Graph, Untraceable
+from twoloop.generate.tracing import MOST_OPERATIONS, Form, Graph, Untraceable
 from twoloop.kernels.evaluation.inner import CONTRADICTS
 from twoloop.problem.system import ConstrainedSystem
-
-MOST = 20_000  # operations
 
 
 @dataclass(frozen=True)
@@ -122,8 +120,8 @@ class StraightLine:
         self.traced = Traced(system, self.graph)
 
     def _bound(self) -> None:
-        if len(self.graph.operations) > MOST:
-            raise Untraceable(f"its equations are more than {MOST} operations")
+        if len(self.graph.operations) > MOST_OPERATIONS:
+            raise Untraceable(f"its equations are more than {MOST_OPERATIONS} operations")
 
     def _made(self, kind: str, v: Sequence[Form] | None = None) -> Any:
         return elementwise(Form.value, [self.equations.of(kind, v)])

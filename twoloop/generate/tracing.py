@@ -25,6 +25,7 @@ from twoloop.generate.known_numbers import (
 from twoloop.kernels.evaluation import operations as op
 
 # the second form of a logarithm or an arctangent is what the derivative of the first is divided by
+MOST_OPERATIONS = 20_000  # of a program; with more it would take longer to make than a run
 BRANCHES = "it branches on, or converts to a number, what depends on t, q or v"
 
 # of numbers

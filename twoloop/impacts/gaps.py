@@ -7,15 +7,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from twoloop.bodies.functions import AGREES, BETWEEN, STATES
 from twoloop.checks.arguments import Array, shown
 from twoloop.generate.calls_on_symbols import as_forms, trace
 from twoloop.generate.derivative import Derivative
 from twoloop.generate.programs import numbers_of, program_of
 from twoloop.generate.tracing import Form, Graph, Untraceable, symbols
 from twoloop.problem.stops import Stop
-
-STATES = 5  # at which the traced program is compared with the function
-AGREES = 1e-10  # relative difference between the function and its program
 
 
 class Gap(NamedTuple):
@@ -75,7 +73,7 @@ class Gaps:
         away = np.random.default_rng(4).uniform(-0.3, 0.3, (STATES, len(q0)))
         away[0] = 0.0
         for k, each in enumerate(away):
-            t, q = t0 + 0.37 * k, q0 + each
+            t, q = t0 + BETWEEN * k, q0 + each
             found = self.at(t, q, np.zeros_like(q)).g
             for stop, own in zip(stops, found, strict=True):
                 value: Any = getattr(stop, self._what)(t, q.copy())

@@ -16,7 +16,7 @@ from twoloop.checks.bounds import check_bounds
 from twoloop.checks.scales import Scales, scales_of
 from twoloop.checks.violation import Violation
 from twoloop.problem.system import ConstrainedSystem, check_system
-from twoloop.run.large_projection import project_sparsely
+from twoloop.run.large_projection import STRAIGHT, project_sparsely
 
 Array = NDArray[np.float64]
 
@@ -27,7 +27,6 @@ NEGLIGIBLE, WEAK = 1e-13, 1e-2  # singular values of rows of length 1 that count
 DEAD_CENTRE = 0.01  # smallest over largest singular value, below which a position is called near a dead centre
 SAME = 0.1  # of what the projection moves: positions that are nearer to each other are one
 LOST = 1e8  # largest change of a position over its scale: farther away rounding hides where the mechanism is
-STRAIGHT = 0.5  # of a displacement: how far its projection may end from where C_q sends it, on the same assembly
 
 
 class Move(NamedTuple):

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from twoloop.kernels.control.directions import DISPLACEMENT, INNER_TOL, first_direction
 from twoloop.kernels.data import codes
 from twoloop.methods.plan import Plan
 
@@ -18,8 +19,6 @@ MOST = 8  # states that are kept; they lie about as far from one another
 LAST_STEPS = 8  # whose median is the step at a state
 ITERATIONS = 6
 START = 0.1  # share of all coordinates in the direction of each look
-DISPLACEMENT = 1e-6  # of the largest coordinate or velocity, for derivatives along a direction
-INNER_TOL = 1e-8  # of the positions; their error is squared
 ALIGNED = 0.9  # cosine from which on two directions are one
 MANY = 200  # accepted steps before the last look, from which on it is worth a sentence
 NEXT_TO = 0.45  # of the limit of stability, which half of the states have to reach; smooth motion stays below 0.4
@@ -70,7 +69,7 @@ def said_of_stiffness(looks: Looks, kit: Any, work: Any) -> str:
     """A sentence where stability limited the steps, else nothing. What stands in the workspace is lost."""
     if not looks.kept or looks.n_steps < MANY:
         return ""
-    start = 0.3 + 0.1 * (np.arange(work.Q.size) % 7)
+    start = first_direction(work.Q.size)
     directions = [np.zeros_like(start), np.zeros_like(start)]
     found = []
     for look in looks.kept:

@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from twoloop.kernels.algebra.linalg import copy
 from twoloop.kernels.control.controller import ERROR_BEFORE, H_BEFORE, LEAST_ERROR, N_PAST, N_RULE, factor_of
+from twoloop.kernels.control.directions import DISPLACEMENT, INNER_TOL, first_direction
 from twoloop.kernels.data.codes import DONE, OUTER_DIVERGED
 from twoloop.kernels.data.common import ATTEMPT, SETTLE, Attempt, Step, compiled, inlined, kernel, merged
 from twoloop.kernels.data.counters import N_EVALUATIONS, N_JACOBIANS
@@ -30,8 +31,6 @@ from twoloop.kernels.evaluation.tasks import PROJECT
 EARLY = 100.0  # evaluations before the first look at the rate
 INTERVAL = 600.0  # evaluations between two looks: a look takes some eight
 ITERATIONS = 4
-DISPLACEMENT = 1e-6  # of the largest coordinate, for derivatives along a direction
-INNER_TOL = 1e-8  # of the positions; their error is squared
 NEGLIGIBLE = 1e-3  # of 1 / h: a rate of decay that needs no second iteration
 SEED = 1e-3  # what a component of a direction begins with, of the largest
 SURELY = 3.0  # times LIMIT: where the step is next to the limit of stability
@@ -98,7 +97,7 @@ def switching_memory(n_q: int, first: ArrayLike, second: ArrayLike) -> NDArray[n
     first, second = np.asarray(first), np.asarray(second)
     scalars = np.zeros(N_SCALARS)
     scalars[T_BEGIN], scalars[WAIT], scalars[FIRST_MEMORY] = np.nan, PATIENCE, first.size
-    directions = np.concatenate([0.3 + 0.1 * (np.arange(n_q) % 7)] * 2)
+    directions = np.tile(first_direction(n_q), 2)
     return np.concatenate([scalars, directions, first, second])
 
 

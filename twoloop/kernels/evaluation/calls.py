@@ -9,11 +9,17 @@ from twoloop.kernels.data.common import INNER, compiled, kernel, merged
 from twoloop.kernels.data.noted import KNOWN, REUSE, ROUNDED
 from twoloop.kernels.evaluation import tasks
 from twoloop.kernels.evaluation.accelerations import accelerate, acceleration_constraint, equilibrate, mass_there
-from twoloop.kernels.evaluation.inner import factor_dependent, positions, redundant_rows_hold, tangents, velocities
+from twoloop.kernels.evaluation.inner import (
+    ROUNDING,
+    factor_dependent,
+    positions,
+    redundant_rows_hold,
+    tangents,
+    velocities,
+)
 from twoloop.kernels.evaluation.onto_constraints import accelerate_there, to_constraints
 from twoloop.kernels.evaluation.partition import note_entries, partition_of_midpoint, renew, write_programs
 
-ROUNDING = 1e-12  # relative to the largest value: changes of this size no longer shrink
 ROUNDING_OF_Q = 2e-14  # a hundred roundings, see rounding_floor
 
 

@@ -19,6 +19,8 @@ from twoloop.kernels.data.flags import GAMMA_GIVEN
 from twoloop.kernels.data.noted import CONTRADICTION, NEARLY_SINGULAR, PIVOT, ROUNDED
 from twoloop.kernels.evaluation import tasks
 from twoloop.kernels.evaluation.constraints import constraint_rates
+from twoloop.kernels.evaluation.inner import CONTRACTION, CONTRADICTS, MAX_INNER, ROUNDING
+from twoloop.kernels.evaluation.onto_constraints import ABOVE_ROUNDING
 from twoloop.kernels.evaluation.program import gamma_by_program
 from twoloop.kernels.evaluation.static_factors_at import (
     CAREFUL,
@@ -29,12 +31,6 @@ from twoloop.kernels.evaluation.static_factors_at import (
     solve_values,
 )
 from twoloop.kernels.evaluation.static_least_norm import least_norm
-
-MAX_INNER = 25  # Newton iterations
-CONTRACTION = 0.5  # each correction must be at most this times the one before
-ROUNDING = 1e-12  # relative to the largest value: changes of this size no longer shrink
-ABOVE_ROUNDING = 10.0  # of positions: no correction is asked to be smaller
-CONTRADICTS = 1e-7  # relative to the mechanism's size: what a redundant row may be violated by
 
 
 @compiled
