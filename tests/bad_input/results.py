@@ -68,6 +68,12 @@ RESULTS = [
     of_problem(
         "`energy=9.81`", lambda: remade(energy=9.81), "energy must be a function", "give energy(t, q, v)", TypeError
     ),
+    of_problem("an energy of the state alone", lambda: remade(energy=lambda q, v: 0.0)).says(
+        r"energy is called as energy\(t, q, v\); the function given takes \(q, v\)", "take t, q and v", TypeError
+    ),
+    of_problem("points of t and q", lambda: Drawing(lambda t, q: q[None], [])).says(
+        r"points is called as points\(q\)", "take q", TypeError
+    ),
     of_problem("bars as `drawing`", lambda: remade(drawing=[(0, 1)])).says(
         "drawing must be a twoloop.Drawing", "write twoloop.Drawing(points, bars)", TypeError
     ),

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from twoloop.checks.arguments import Array, check_span, check_text, check_vector, shown
+from twoloop.checks.arguments import Array, check_call, check_span, check_text, check_vector, shown
 from twoloop.problem.description import Description, name_and_unit
 from twoloop.problem.drawing import Drawing
 from twoloop.problem.joints import Joint
@@ -168,6 +168,7 @@ class Problem:
         check_span(self.t_span)
         if not callable(self.energy):
             raise TypeError(f"energy must be a function of t, q and v; given {shown(self.energy)}")
+        check_call("energy", "energy", self.energy, ("t", "q", "v"))
         if self.drawing is not None and not isinstance(self.drawing, Drawing):
             raise TypeError(f"drawing must be a twoloop.Drawing; given {shown(self.drawing)}")
         unknown = [tag for tag in self.tags if tag not in TAGS]
