@@ -288,6 +288,9 @@ BODIES: list[Case] = [
     of_problem("a drive that begins far away", half_a_turn).says(
         "assembled half a turn from it", "give the bodies near to where the motion begins"
     ),
+    of_problem("`energy` of rows", lambda: rough(1.9).energy(0.0, np.zeros((9, 6)), np.zeros((9, 6)))).says(
+        r"q must have shape \(6,\) or \(6, n_t\); given shape \(9, 6\)", "give states as columns: q.T"
+    ),
     of_problem("an unknown parameter", lambda: rough(1.9).with_parameters({"mass of three": 1.0})).says(
         "'arms' has no parameter 'mass of three'", "names are in problem.parameters"
     ),

@@ -114,6 +114,12 @@ SYSTEMS = [
     *of_compiled_argument(
         "bandwidth", (2, ValueError, "needs a constant mass matrix", "give constant_mass=True where that is so")
     ),
+    of_compiled("`evaluate('friction', ...)`", lambda: linkage().system.evaluate("friction", 0.0)).says(
+        "kind must be one of mass, .*given 'friction'", "take one of the kinds named"
+    ),
+    of_compiled("`system.force(t, q)`, without v", lambda: linkage().system.evaluate("force", 0.0, np.zeros(9))).says(
+        r"force is evaluated at \(t, q, v\); given 1 arrays", "give t, q and v", TypeError
+    ),
     of_compiled("a plain function as `force`", lambda: compiled(force=lambda t, q, v, p, Q: None)).says(
         r"force must be compiled by @twoloop.callback\('force'\).*from_python",
         "decorate it with @callback, or use from_python",

@@ -124,6 +124,12 @@ def check_vector(name: str, value: ArrayLike, n: int) -> Array:
     return array
 
 
+def check_columns(name: str, value: Array, n: int) -> None:
+    """Raise unless an array holds a state of n numbers, or one in each column."""
+    if value.ndim not in (1, 2) or len(value) != n:
+        raise ValueError(f"{name} must have shape ({n},) or ({n}, n_t); given shape {value.shape}")
+
+
 def check_indices(name: str, value: Any, n: int) -> list[int]:
     """Return `value` as a list of different indices below n, or say what is wrong with it."""
     if isinstance(value, (str, bytes)) or not isinstance(value, (Sequence, set, frozenset, range, np.ndarray)):
