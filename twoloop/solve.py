@@ -164,7 +164,7 @@ def solve_dae(
     )
     known = system.shared.get("options")
     if known is None or not all(map(is_, given, known[0])):
-        known = given, _checked(system, *given)
+        known = given, check_options(system, *given)
         if type(atol) is float:  # an array may be changed by who gives it
             system.shared["options"] = known
     asked: Asked = known[1]
@@ -205,7 +205,7 @@ def solve_dae(
     return result_of(vars(not_begun(system, t0, event_functions, asked.method.name)))
 
 
-def _checked(
+def check_options(
     system: ConstrainedSystem,
     method: Any,
     rtol: Any,

@@ -3,12 +3,13 @@
 import numpy as np
 
 from tests.bad_input.case import Case, cases_of
-from twoloop.bodies import PlanarModel, SpatialModel
+from twoloop.bodies import PlanarModel, SpatialModel, from_mjcf, from_urdf
 
 GROUP = "bodies.PlanarModel"
 of_planar = cases_of(GROUP)
 of_spatial = cases_of("bodies.SpatialModel")
 of_problem = cases_of("bodies: problem")
+of_files = cases_of("bodies: files")
 NAMES = "give the body that body(...) returned, or its name"
 
 
@@ -138,6 +139,9 @@ BODIES: list[Case] = [
     of_planar("a joint of a body with itself", lambda: planar().revolute("bar", "bar", at=(0, 0))).says(
         "a and b of a revolute joint must be two bodies; given 'bar' twice", "give two bodies"
     ),
+    of_planar("a joint without a point", lambda: planar().revolute("bar", "block", at=None)).says(
+        "at must be an array of real numbers; given None", "give a point in space, or one of each body", TypeError
+    ),
     of_planar("an axis of length zero", lambda: planar().prismatic("bar", "block", at=(0, 0), axis=(0, 0))).says(
         "axis must have a direction", "give a vector other than zero"
     ),
@@ -261,6 +265,15 @@ BODIES: list[Case] = [
     of_spatial("axes of a universal joint that are not perpendicular")
     .when(lambda: spatial().universal("ground", "bar", at=(0, 0, 0), axes=((1, 0, 0), (1, 1, 0))))
     .says("axes of 'universal bar-ground' must be perpendicular", "give the two axes of the cross"),
+    of_spatial("`to_mjcf(3)`", lambda: spatial().to_mjcf(3)).says(
+        "path must be a file name or a path; given 3", "give the name of a file", TypeError
+    ),
+    of_files("`from_mjcf(3)`", lambda: from_mjcf(3)).says(
+        "path must be a file name or a path; given 3", "give the name of a file", TypeError
+    ),
+    of_files("`from_urdf(None)`", lambda: from_urdf(None)).says(
+        "path must be a file name or a path; given None", "give the name of a file", TypeError
+    ),
     of_problem("a model without bodies", lambda: PlanarModel().problem(), "has no bodies", "add bodies first"),
     of_problem("a loop that cannot close", lambda: rough(2.3)).says(
         r"cannot be assembled: the joint '.*' does not close", "look at the lengths around the loop"
@@ -274,6 +287,9 @@ BODIES: list[Case] = [
     of_problem("two drives that contradict", two_drives, "the motion is over-constrained", "leave one of them out"),
     of_problem("a drive that begins far away", half_a_turn).says(
         "assembled half a turn from it", "give the bodies near to where the motion begins"
+    ),
+    of_problem("`energy` of rows", lambda: rough(1.9).energy(0.0, np.zeros((9, 6)), np.zeros((9, 6)))).says(
+        r"q must have shape \(6,\) or \(6, n_t\); given shape \(9, 6\)", "give states as columns: q.T"
     ),
     of_problem("an unknown parameter", lambda: rough(1.9).with_parameters({"mass of three": 1.0})).says(
         "'arms' has no parameter 'mass of three'", "names are in problem.parameters"

@@ -51,6 +51,15 @@ ENSEMBLES = [
     of_integrator("`tol=1e-6`", lambda: Integrator(LINKAGE.system, tol=1e-6)).says(
         "Integrator has no option 'tol'", "give `rtol` and `atol`", TypeError
     ),
+    of_integrator("`max_step=-1.0`", lambda: Integrator(LINKAGE.system, max_step=-1.0)).says(
+        "max_step must be positive; given -1.0", "give s"
+    ),
+    of_integrator("`compiled='yes'`", lambda: Integrator(LINKAGE.system, compiled="yes")).says(
+        "compiled must be True, False or 'auto'", "take one of these"
+    ),
+    of_integrator("`events=3`", lambda: Integrator(LINKAGE.system, events=3)).says(
+        "events must be a function event", "give event(t, q, v)", TypeError
+    ),
     of_integrator("other parameters than there are")
     .when(lambda: Integrator(LINKAGE.system).run((0.0, 1.0), LINKAGE.q0, LINKAGE.v0, [1.0]))
     .says("parameters of 'four-bar' must be 4 numbers", "give as many as `system.parameters` has"),

@@ -75,6 +75,12 @@ def branching(x, y):
 
 
 IMPACTS = [
+    of_stops("a gap of q alone", lambda: Stop(lambda q: q[0])).says(
+        r"gap of 'stop' is called as gap\(t, q\); the function given takes \(q\)", "take t and q", TypeError
+    ),
+    of_stops("`slide=1.0`", lambda: Stop(lambda t, q: q[0], slide=1.0)).says(
+        "slide of 'stop' must be a function of t and q; given 1.0", "give slide(t, q), or leave it out", TypeError
+    ),
     of_stops("no stops", against(), "stops must be a Stop or a list of them", "give some, or `solve_dae`", TypeError),
     of_stops(
         "a function in place of a stop", against(lambda t, q: q[0]), "stops must be a Stop", "Stop(gap)", TypeError

@@ -18,8 +18,12 @@ def problem(**options):
     return Problem("swing", given.system, given.q0, given.v0, (0.0, 1.0), given.energy, **options)
 
 
-def swept(parameters=({"theta3": 0.1},), **options):
-    return sweep(four_bar, parameters, **{"t_span": (0.0, 1e-3), "parallel": "threads", **options})
+def remade(**changed):
+    return replace(pendulum(), **changed)
+
+
+def swept(problem_of=four_bar, parameters=({"theta3": 0.1},), **options):
+    return sweep(problem_of, parameters, **{"t_span": (0.0, 1e-3), "parallel": "threads", **options})
 
 
 of_result, of_certify = cases_of("result.to_dataframe, .energy, .plot, .animate"), cases_of("result.certify")
@@ -32,6 +36,11 @@ RESULTS = [
     of_result('`animate("swing.avi")`', lambda: solve().animate("swing.avi")).says(
         r"path must end in .html, .gif, .mp4", "choose one of these endings"
     ),
+    of_result("`plot(3)`", lambda: solve().plot(3), "path must be a file name", "give a file name", TypeError),
+    of_result(
+        "`plot('swing.avi')`", lambda: solve().plot("swing.avi"), r"path must end in .*\.png", "choose one of these"
+    ),
+    of_result("`animate(None)`", lambda: solve().animate(None), "path must be a file name", "give a name", TypeError),
     of_certify("a result of another solver, or of an older file")
     .when(lambda: replace(solve(), rtol=None, atol=None).certify())
     .says("certify needs tolerances", "give `rtol` and `atol`"),
@@ -43,6 +52,30 @@ RESULTS = [
     ),
     Case(
         "citation", "another object", lambda: citation(linkage()), "citation needs a result", "give it one", TypeError
+    ),
+    of_problem("`name=3`", lambda: remade(name=3), "name must be a string; given 3", "give text", TypeError),
+    of_problem("a mechanism as `system`", lambda: remade(system=pendulum())).says(
+        "system must be a ConstrainedSystem; given a Problem", "give problem.system", TypeError
+    ),
+    of_problem("`system=3`", lambda: remade(system=3), "system must be a ConstrainedSystem", "give one", TypeError),
+    of_problem("`q0` of one number", lambda: remade(q0=[1.0]), r"q0 must have shape \(2,\)", "give one a coordinate"),
+    of_problem(
+        "`v0` as text", lambda: remade(v0="fast"), "v0 must be an array of real numbers", "give numbers", TypeError
+    ),
+    of_problem(
+        "`t_span=(1.0, 0.0)`", lambda: remade(t_span=(1.0, 0.0)), "t_span must be .* end > start", "exchange them"
+    ),
+    of_problem(
+        "`energy=9.81`", lambda: remade(energy=9.81), "energy must be a function", "give energy(t, q, v)", TypeError
+    ),
+    of_problem("an energy of the state alone", lambda: remade(energy=lambda q, v: 0.0)).says(
+        r"energy is called as energy\(t, q, v\); the function given takes \(q, v\)", "take t, q and v", TypeError
+    ),
+    of_problem("points of t and q", lambda: Drawing(lambda t, q: q[None], [])).says(
+        r"points is called as points\(q\)", "take q", TypeError
+    ),
+    of_problem("bars as `drawing`", lambda: remade(drawing=[(0, 1)])).says(
+        "drawing must be a twoloop.Drawing", "write twoloop.Drawing(points, bars)", TypeError
     ),
     of_problem("two coordinates of one name", lambda: problem(coordinates=("x (m)", "x (m)"))).says(
         "coordinates must be n_q = 2 different names", "name each coordinate"
@@ -64,5 +97,10 @@ RESULTS = [
         r"problem_of does not take parameters\[0\]", "name them as `problem_of` does", TypeError
     ),
     of_sweep("`tol=1e-6`", lambda: swept(tol=1e-6), "sweep has no argument 'tol'", "give `rtol` and `atol`", TypeError),
+    of_sweep("`t_span=(1.0, 0.0)`", lambda: swept(t_span=(1.0, 0.0)), "t_span must be .* end > start", "exchange them"),
+    of_sweep("`out=3`", lambda: swept(out=3), "out must be a file name or a path; given 3", "give a name", TypeError),
+    of_sweep("a `problem_of` that returns a number", lambda: swept(lambda theta3: theta3)).says(
+        "problem_of must return a Problem; it returned 0.1", "return the problem", TypeError
+    ),
     of_sweep("`workers=0`", lambda: swept(workers=0), "workers must be at least 1", "leave it out: all cores"),
 ]

@@ -37,6 +37,9 @@ START = [
     of_start("positions 0.1 m off the constraint", lambda: solve(q0=[-1.1, 0.0])).says(
         r"q0 is not consistent.*'pendulum'.*max\|C.*0.105.*consistent_state", PROJECT
     ),
+    of_start("a position where C_q is zero", lambda: solve(q0=[0.0, 0.0])).says(
+        "q0 is not consistent.*no small change puts it right", "take another guess, and project it"
+    ),
     of_start("a joint of a linkage that does not close", linkage_moved).says(
         r"q0 is not consistent.*0\.01 \(row 3\).*coordinate \d", PROJECT
     ),

@@ -190,6 +190,9 @@ SYMBOLIC += [
     of_mechanism("`with_parameters({'mass': 2.0})`", lambda: lagrangian().with_parameters({"mass": 2.0})).says(
         "parameters must be of m, g, L; given mass", "use the symbols, or their names"
     ),
+    of_mechanism("`with_parameters([2.0])`", lambda: lagrangian().with_parameters([2.0])).says(
+        r"parameters must map symbols to numbers; given \[2.0\]", "write {m: 2.0}", TypeError
+    ),
     of_mechanism("`problem(..., t_span=2.0)`", lambda: lagrangian().problem([1.0, 0.0], [0.0, 0.0], 2.0)).says(
         r"t_span must have shape \(2,\)", "give (start, end)"
     ),

@@ -79,6 +79,19 @@ SYSTEMS = [
         "put them in the order named",
         TypeError,
     ),
+    *of_argument("name", (3, TypeError, "must be a string; given 3", "give text")),
+    of_from_python("`force(t, q)`: an argument too few", lambda: make(force=lambda t, q: np.zeros(2))).says(
+        r"force is called as force\(t, q, v\); the function given takes \(t, q\)", "take the arguments named", TypeError
+    ),
+    of_from_python("`mass(t, q, v)`: an argument too many", lambda: make(mass=lambda t, q, v: np.eye(2))).says(
+        r"mass is called as mass\(t, q\); the function given takes \(t, q, v\)", "take the arguments named", TypeError
+    ),
+    of_from_python("`force(t, q, v, p)` without `parameters`")
+    .when(lambda: make(force=lambda t, q, v, p: p))
+    .says(r"force is called as force\(t, q, v\).*parameters=\[...\]", "give parameters=[...]", TypeError),
+    of_from_python("`force(t, q, v, p, w)` with `parameters`")
+    .when(lambda: make(force=lambda t, q, v, p, w: p, parameters=[1.0]))
+    .says(r"force is called as force\(t, q, v, p\)", "put all numbers into p", TypeError),
     of_from_python("`force_by_v` without `force_by_q`", lambda: make(force_by_v=lambda t, q, v: np.zeros((2, 2)))).says(
         "force_by_v.* go with force_by_q", "give force_by_q too"
     ),
@@ -100,6 +113,12 @@ SYSTEMS = [
     ),
     *of_compiled_argument(
         "bandwidth", (2, ValueError, "needs a constant mass matrix", "give constant_mass=True where that is so")
+    ),
+    of_compiled("`evaluate('friction', ...)`", lambda: linkage().system.evaluate("friction", 0.0)).says(
+        "kind must be one of mass, .*given 'friction'", "take one of the kinds named"
+    ),
+    of_compiled("`system.force(t, q)`, without v", lambda: linkage().system.evaluate("force", 0.0, np.zeros(9))).says(
+        r"force is evaluated at \(t, q, v\); given 1 arrays", "give t, q and v", TypeError
     ),
     of_compiled("a plain function as `force`", lambda: compiled(force=lambda t, q, v, p, Q: None)).says(
         r"force must be compiled by @twoloop.callback\('force'\).*from_python",

@@ -27,6 +27,7 @@ from twoloop.problem.stops import Stop
 Points = tuple[Numbers, Numbers]
 
 AXES = ("x", "y", "z")
+WITHOUT_POINT = ("fixed", "rolling")  # joints whose point may be left out
 
 
 @documented
@@ -189,7 +190,7 @@ class Collection:
         first, second = self._body("a", a), self._body("b", b)
         self._different(f"{kind} joint", first, second)
         name = self._new_name(kind, name, first, second)
-        if at is None:
+        if at is None and kind in WITHOUT_POINT:
             at = first.position if second is self.ground else second.position
         here, there = self._points(at, first, second)
         return first, second, name, (self._numbers(name, first, here), self._numbers(name, second, there))

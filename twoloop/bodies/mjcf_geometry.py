@@ -16,7 +16,7 @@ from xml.etree.ElementTree import Element
 import numpy as np
 
 from twoloop.bodies.rotation import rotation_matrix
-from twoloop.checks.arguments import Array
+from twoloop.checks.arguments import Array, check_path
 
 DENSITY = 1000.0  # kg/m^3, default of MuJoCo for geoms with neither mass nor density
 
@@ -70,7 +70,7 @@ def combined(lumps: list[Lump]) -> Lump:
 def root_of(path: str | os.PathLike[str], tag: str) -> Element:
     """Return the root element of an XML file, which must have this tag."""
     try:
-        root = ElementTree.parse(path).getroot()
+        root = ElementTree.parse(check_path(path)).getroot()
     except ElementTree.ParseError as error:
         raise ValueError(f"{os.fspath(path)!r} is not XML: {error}") from None
     if root.tag != tag:

@@ -16,12 +16,14 @@ from twoloop.bodies.parameter_layout import PULL, RAIL, SPRING, TORSION
 from twoloop.bodies.parts import Body, Force, ModelJoint
 from twoloop.bodies.rotation import euler_parameters
 from twoloop.bodies.spanning_tree import spanning_tree
+from twoloop.checks.arguments import check_path
 
 HALF = 0.5  # m: distance of the two connect points that represent a hinge closing a loop
 
 
 def write(model: Any, path: str | os.PathLike[str]) -> None:
     """Write a SpatialModel; see its `to_mjcf`."""
+    path = check_path(path)
     writer = _Writer(model)
     root = writer.root()
     ElementTree.indent(root)

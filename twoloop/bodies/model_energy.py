@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from twoloop.bodies import parameter_layout as layout
-from twoloop.checks.arguments import Array
+from twoloop.checks.arguments import Array, check_columns
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,6 +31,9 @@ class ModelEnergy:
         from twoloop.bodies.points import direction_of, place_of  # compiled on import
 
         flat = np.asarray(q)
+        n_q = self._n * (3 if self.dimension == 2 else 7)
+        check_columns("q", flat, n_q)
+        check_columns("v", np.asarray(v), n_q)
 
         def between(i: int, at: int, j: int, there: int) -> Any:
             here, end = (self.p[k : k + self.dimension] for k in (at, there))

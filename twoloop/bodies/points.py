@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from twoloop.bodies.rotation import rotated
+from twoloop.checks.arguments import Array, check_columns
 from twoloop.problem.drawing import Drawing
-from twoloop.problem.problem import Array
 
 GROUND = -1
 
@@ -79,6 +79,8 @@ class PlanarEnergy:
     def __call__(self, t: Any, q: Array, v: Array) -> Any:
         """Evaluate for one state, or for many given as columns."""
         q, v = np.asarray(q), np.asarray(v)
+        check_columns("q", q, 3 * len(self.masses))
+        check_columns("v", v, 3 * len(self.masses))
         kinetic = 0.5 * (self.masses @ (v[0::3] ** 2 + v[1::3] ** 2) + self.inertias @ v[2::3] ** 2)
         return kinetic + self.gravity * (self.masses @ q[1::3])
 

@@ -1,7 +1,10 @@
 """Checks of what a user gives: each says which argument is wrong, what was given, what was expected, what to do."""
 
+import inspect
 import math
-from collections.abc import Sequence
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -50,6 +53,26 @@ def check_text(name: str, value: Any) -> str:
     if not isinstance(value, str):
         raise TypeError(f"{name} must be a string; given {shown(value)} of type {type(value).__name__}")
     return value
+
+
+def check_path(path: Any, name: str = "path") -> Path:
+    """Return `path` as a Path; raise TypeError if it is not a path."""
+    if not isinstance(path, (str, os.PathLike)) or "\0" in str(path):
+        raise TypeError(f"{name} must be a file name or a path; given {shown(path)} of type {type(path).__name__}")
+    return Path(path)
+
+
+def check_call(name: str, call: str, function: Callable[..., Any], arguments: Sequence[str], remedy: str = "") -> None:
+    """Raise TypeError if a function cannot be called with these arguments in their places."""
+    try:
+        signature = inspect.signature(function)
+    except (TypeError, ValueError):  # built-in functions have none to look at
+        return
+    try:
+        signature.bind(*arguments)
+    except TypeError:
+        expected = f"{name} is called as {call}({', '.join(arguments)})"
+        raise TypeError(f"{expected}; the function given takes {signature}{remedy}") from None
 
 
 def check_choice(name: str, value: Any, choices: Sequence[str]) -> str:
@@ -101,6 +124,12 @@ def check_vector(name: str, value: ArrayLike, n: int) -> Array:
     return array
 
 
+def check_columns(name: str, value: Array, n: int) -> None:
+    """Raise unless an array holds a state of n numbers, or one in each column."""
+    if value.ndim not in (1, 2) or len(value) != n:
+        raise ValueError(f"{name} must have shape ({n},) or ({n}, n_t); given shape {value.shape}")
+
+
 def check_indices(name: str, value: Any, n: int) -> list[int]:
     """Return `value` as a list of different indices below n, or say what is wrong with it."""
     if isinstance(value, (str, bytes)) or not isinstance(value, (Sequence, set, frozenset, range, np.ndarray)):
@@ -123,7 +152,10 @@ def check_span(t_span: tuple[float, float]) -> tuple[float, float]:
     if type(t0) in NUMBERS and type(t1) in NUMBERS and -FAR < t0 < t1 < FAR:
         t0, t1 = float(t0), float(t1)
     else:
-        t0, t1 = check_vector("t_span", t_span, 2).tolist()
+        times = check_real("t_span", t_span)
+        if times.shape != (2,):
+            raise ValueError(f"t_span must have shape (2,), (start, end); given shape {times.shape}")
+        t0, t1 = check_vector("t_span", times, 2).tolist()
     if not t1 - t0 > NEAR * math.ulp(max(abs(t0), abs(t1))):
         wanted = "with end > start" if t1 <= t0 else "further apart than floating-point numbers resolve"
         raise ValueError(f"t_span must be (start, end) {wanted}; given ({t0!r}, {t1!r})")

@@ -152,12 +152,21 @@ class Violation:
         if excess <= 1.0:
             return
         row = int(np.abs(self.values).argmax())
-        excesses = np.abs(self.correction) / np.maximum(self.allowed, 1e-300)
-        j = int(np.flatnonzero(excesses >= (1.0 - TIED) * excesses.max())[0])
-        of = "coordinate" if name == "q0" else "the velocity of coordinate"
         raise ValueError(
             f"{name} is not consistent with the constraints of {self.system.name!r}: max|{self.equation}| is "
-            f"{abs(self.values[row]):.3g} (row {row}) at t = {self.t:g}; to put it right {of} {j} has to change by "
-            f"{abs(self.correction[j]):.3g}, and at most {self.allowed[j]:.1g} is accepted. Project it with "
-            "twoloop.consistent_state(system, t, q, v)"
+            f"{abs(self.values[row]):.3g} (row {row}) at t = {self.t:g}; {self._remedy(name)}"
+        )
+
+    def _remedy(self, name: str) -> str:
+        excesses = np.abs(self.correction) / np.maximum(self.allowed, 1e-300)
+        if excesses.max(initial=0.0) <= 1.0:
+            return (
+                "no small change puts it right, as rows of C_q are zero there or depend on one another. Take another "
+                "guess, and project it with twoloop.consistent_state(system, t, q, v)"
+            )
+        j = int(np.flatnonzero(excesses >= (1.0 - TIED) * excesses.max())[0])
+        of = "coordinate" if name == "q0" else "the velocity of coordinate"
+        return (
+            f"to put it right {of} {j} has to change by {abs(self.correction[j]):.3g}, and at most "
+            f"{self.allowed[j]:.1g} is accepted. Project it with twoloop.consistent_state(system, t, q, v)"
         )

@@ -15,10 +15,11 @@ from numpy.typing import ArrayLike
 from twoloop.checks.arguments import check_finite, check_positive, check_tolerance, check_vector
 from twoloop.checks.consistency import ConstraintWarning
 from twoloop.methods.plan import Method
+from twoloop.problem.events import check_events
 from twoloop.problem.system import ConstrainedSystem, check_system
 from twoloop.result.result import Result, result_of
 from twoloop.run.sampled import SampledRun, SampledState
-from twoloop.solve import check_method, solve_dae
+from twoloop.solve import check_method, check_options, solve_dae
 
 MOST = 64  # systems of other parameters that are kept
 FOR_SAMPLES = {"method", "rtol", "atol", "max_step", "check_derivatives"}
@@ -54,12 +55,14 @@ class Integrator:
         **options: Any,
     ):
         check_system(system)
-        known = inspect.signature(solve_dae).parameters.keys() - OF_A_RUN
+        parameters = inspect.signature(solve_dae).parameters
+        known = parameters.keys() - OF_A_RUN
         unknown = [name for name in options if name not in known]
         if unknown:
             raise TypeError(f"Integrator has no option {unknown[0]!r}; its options are {', '.join(sorted(known))}")
-        check_positive("rtol", rtol)
-        check_tolerance("atol", atol, system.n_q)
+        given = {name: options.get(name, parameters[name].default) for name in known - {"events"}}
+        check_options(system, method, rtol, atol, **given)
+        check_events(options.get("events"))
         self.system = system
         self._options = {"method": check_method(method), "rtol": rtol, "atol": copy.copy(atol), **options}
         self._systems: dict[bytes, ConstrainedSystem] = {}

@@ -12,7 +12,7 @@ from weakref import WeakValueDictionary
 import numpy as np
 from numba import njit, objmode
 
-from twoloop.checks.arguments import Array
+from twoloop.checks.arguments import Array, check_call
 from twoloop.kernels.compile.caches import named_apart, watch
 from twoloop.kernels.compile.callbacks import KINDS, compile_callback
 from twoloop.kernels.compile.dependencies import digest_of, stands_for
@@ -179,7 +179,7 @@ def check_arguments(kind: str, function: Callable[..., Any], parameters: bool) -
     Raises
     ------
     TypeError
-        If it names its arguments t, q, v, but in another order.
+        If it names its arguments t, q, v, but in another order, or takes another number of them.
     """
     wanted = ("t", *KINDS[kind].state)
     try:
@@ -192,9 +192,19 @@ def check_arguments(kind: str, function: Callable[..., Any], parameters: bool) -
             raise TypeError(
                 f"{kind} is called as {kind}({', '.join(known)}); the function given takes ({', '.join(names)})"
             )
-    if any(each.kind == each.VAR_POSITIONAL for each in given.values()):
-        return parameters
-    if not parameters or len(names) <= len(wanted):
+    takes_p = parameters and _takes_p(list(given.values()), len(wanted))
+    takes_p_alone = not parameters and names == (*wanted, "p")
+    remedy = ". Give the numbers that it takes as p: parameters=[...]" if takes_p_alone else ""
+    check_call(kind, kind, function, (*wanted, "p") if takes_p else wanted, remedy)
+    return takes_p
+
+
+def _takes_p(given: list[inspect.Parameter], n: int) -> bool:
+    """Whether a function takes `p` after n other arguments."""
+    if any(each.kind == each.VAR_POSITIONAL for each in given):
+        return True
+    if len(given) <= n:
         return False
-    place = given[names[len(wanted)]]
-    return place.kind != place.KEYWORD_ONLY and (place.default is place.empty or place.name == "p")
+    return given[n].kind != inspect.Parameter.KEYWORD_ONLY and (
+        given[n].default is inspect.Parameter.empty or given[n].name == "p"
+    )

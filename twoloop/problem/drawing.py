@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from twoloop.checks.arguments import Array
+from twoloop.checks.arguments import Array, check_call
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,6 +39,7 @@ class Drawing:
     def __post_init__(self) -> None:
         if not callable(self.points):
             raise TypeError(f"points must be a function of q that gives (n_points, 2 or 3); given {self.points!r}")
+        check_call("points", "points", self.points, ("q",))
         try:
             bars = tuple((int(first), int(second)) for first, second in self.bars)
             traces = tuple(int(each) for each in self.traces)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 from numpy.typing import ArrayLike
 
-from twoloop.checks.arguments import Array, check_number, check_real
+from twoloop.checks.arguments import Array, check_number, check_real, shown
 from twoloop.checks.bounds import check_callback
 from twoloop.checks.sparse_rows import Rows, SparseRows
 from twoloop.kernels.compile.callbacks import KINDS, STATE
@@ -58,12 +58,17 @@ class EvaluatedEquations:
             If an argument is wrong, if the callback goes out of the bounds of its arrays, or if there is none and
             nothing can stand for it, as for gamma: the integrator then finds it by differences.
         """
+        if kind not in KINDS:
+            raise ValueError(f"kind must be one of {', '.join(KINDS)}; given {shown(kind)}")
         entry = KINDS[kind]
         if entry.absent == "kernels" and kind not in self.given:
             raise ValueError(f"{self.name!r} was given no {kind}")
         t = check_number("t", t)
         if not math.isfinite(t):
             raise ValueError(f"t must be finite; given {t!r}")
+        if len(state) != len(entry.state):
+            wanted = ", ".join(("t", *entry.state))
+            raise TypeError(f"{kind} is evaluated at ({wanted}); given {len(state)} arrays after t")
         arrays = []
         for name, value in zip(entry.state, state, strict=True):
             array = check_real(name, value)

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from twoloop.checks.arguments import Array, shown
+from twoloop.checks.arguments import Array, check_call, shown
 
 SAMPLES = 4  # parts of a step, at whose ends the sign is looked at
 PRECISION = 4.0 * float(np.finfo(float).eps)  # of the time of an event, as in SciPy
@@ -64,6 +64,7 @@ def _checked(number: int, function: Any) -> Event:
             f"events[{number}] must be a function event(t, q, v); given {shown(function)} of type "
             f"{type(function).__name__}"
         )
+    check_call(f"events[{number}]", "event", function, ("t", "q", "v"))
     terminal, direction = getattr(function, "terminal", None), getattr(function, "direction", 0)
     expected = f"events[{number}].terminal must be True, False or a positive number of occurrences"
     if terminal is not None and not isinstance(terminal, (bool, int, np.bool_, np.integer)):

@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from twoloop.checks.arguments import Array
+from twoloop.checks.arguments import Array, check_call, check_span, check_text, check_vector, shown
 from twoloop.problem.description import Description, name_and_unit
 from twoloop.problem.drawing import Drawing
 from twoloop.problem.joints import Joint
-from twoloop.problem.system import ConstrainedSystem
+from twoloop.problem.system import ConstrainedSystem, check_system
 
 TAGS = (
     *("open chain", "closed chain", "rigid", "flexible", "planar", "spatial", "driven", "redundant"),
@@ -134,8 +134,9 @@ class Problem:
 
     Raises
     ------
-    ValueError
-        If a tag is unknown, `coordinates` are not n_q different names, or the drawing does not fit the start.
+    TypeError, ValueError
+        If an attribute is wrong, a tag is unknown, `coordinates` are not n_q different names, or the drawing does not
+        fit the start.
     """
 
     name: str
@@ -159,10 +160,21 @@ class Problem:
     drawing: Drawing | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
+        check_text("name", self.name)
+        check_system(self.system)
+        n_q = self.system.n_q
+        for name, start in (("q0", self.q0), ("v0", self.v0)):
+            check_vector(name, start, n_q)
+        check_span(self.t_span)
+        if not callable(self.energy):
+            raise TypeError(f"energy must be a function of t, q and v; given {shown(self.energy)}")
+        check_call("energy", "energy", self.energy, ("t", "q", "v"))
+        if self.drawing is not None and not isinstance(self.drawing, Drawing):
+            raise TypeError(f"drawing must be a twoloop.Drawing; given {shown(self.drawing)}")
         unknown = [tag for tag in self.tags if tag not in TAGS]
         if unknown:
             raise ValueError(f"tags must be of {', '.join(TAGS)}; given {unknown[0]!r}")
-        n_q, given = self.system.n_q, self.coordinates
+        given = self.coordinates
         if given and not len(given) == len(set(given)) == n_q:
             raise ValueError(f"coordinates must be n_q = {n_q} different names, or none; given {given!r}")
         if self.drawing is not None:

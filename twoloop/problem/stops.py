@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from twoloop.checks.arguments import check_finite, check_not_negative, check_text
+from twoloop.checks.arguments import check_call, check_finite, check_not_negative, check_text
 
 
 @dataclass(frozen=True)
@@ -42,8 +42,13 @@ class Stop:
         check_text("name", self.name)
         if not callable(self.gap):
             raise TypeError(f"gap of {self.name!r} must be a function of t and q; given {self.gap!r}")
+        check_call(f"gap of {self.name!r}", "gap", self.gap, ("t", "q"))
         value = check_finite(f"restitution of {self.name!r}", self.restitution)
         if not 0.0 <= value <= 1.0:
             raise ValueError(f"restitution of {self.name!r} must be from 0 to 1; given {value!r}")
         if check_not_negative(f"friction of {self.name!r}", self.friction) and not callable(self.slide):
             raise TypeError(f"slide of {self.name!r} must be a function of t and q, as it rubs; given {self.slide!r}")
+        if self.slide is not None:
+            if not callable(self.slide):
+                raise TypeError(f"slide of {self.name!r} must be a function of t and q; given {self.slide!r}")
+            check_call(f"slide of {self.name!r}", "slide", self.slide, ("t", "q"))

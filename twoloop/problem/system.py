@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from twoloop.checks.arguments import Array, check_flag, check_size
+from twoloop.checks.arguments import Array, check_flag, check_size, check_text
 from twoloop.kernels.compile.callbacks import KINDS
 from twoloop.kernels.compile.private import Dispatcher
 from twoloop.kernels.data.common import PROGRAMS, Functions
@@ -93,7 +93,7 @@ class ConstrainedSystem(EvaluatedEquations):
         self.n_q = check_size("n_q", n_q, 1)
         self.n_c, self.n_a = check_size("n_c", n_c, 0), check_size("n_a", n_a, 0)
         self.entries = checked_entries(callbacks, self.n_q, self.n_c, mass_entries, jacobian_entries)
-        self.name = name
+        self.name = check_text("name", name)
         self.joints = check_joints(joints, self.n_q, self.n_c + self.n_a)
         self.description = Description()  # a Problem puts its own in its place
         p = checked_parameters(parameters)

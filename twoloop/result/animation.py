@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from twoloop.checks.arguments import Array, check_positive
+from twoloop.checks.arguments import Array, check_path, check_positive
 from twoloop.checks.optional import needed
 from twoloop.run.record import Record
 
@@ -58,7 +58,7 @@ class Scene:
 
 def animate(result: Record, path: str | os.PathLike[str], seconds: float | None) -> Path:
     """Write an animation, see `Result.animate`."""
-    path = Path(path)
+    path = check_path(path)
     if path.suffix.lower() not in SUFFIXES:
         raise ValueError(f"path must end in {', '.join(SUFFIXES)}; given {str(path)!r}")
     if seconds is not None:

@@ -7,8 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from twoloop.checks.arguments import check_path
 from twoloop.result.saved_fields import STATES
-from twoloop.result.storage import FORMAT, check_path, parts_of
+from twoloop.result.storage import FORMAT, parts_of
 from twoloop.run.kept import OF_STEPS, OnDisk, read
 from twoloop.run.record import Record, Status
 

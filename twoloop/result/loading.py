@@ -9,11 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from twoloop.checks.arguments import check_path
 from twoloop.problem.system import ConstrainedSystem, check_system
 from twoloop.result.folder import read_folder
 from twoloop.result.result import Result
 from twoloop.result.saved_fields import OF_EVENTS, Fields
-from twoloop.result.storage import ALWAYS, FORMAT, SOMETIMES, check_path
+from twoloop.result.storage import ALWAYS, FORMAT, SOMETIMES
 from twoloop.run.dense import Interpolator, Table, ranks_at
 from twoloop.run.dense_solution import DenseSolution
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from twoloop.checks.arguments import Array
+from twoloop.checks.arguments import Array, check_path
 from twoloop.checks.optional import needed
 from twoloop.problem.description import name_and_unit
 from twoloop.run.record import Record
@@ -18,6 +18,7 @@ LEGEND_MOST = 12  # largest number of coordinates in a legend
 
 def plot(result: Record, path: str | os.PathLike[str] | None) -> Any:
     """Return a figure of a result, see `Result.plot`."""
+    file = None if path is None else check_path(path)
     if result.t.size == 0:
         raise ValueError(f"plot needs a result with output; this one has none: {result.message}")
     # without pyplot: needs no display and leaves the user's backend alone
@@ -28,6 +29,8 @@ def plot(result: Record, path: str | os.PathLike[str] | None) -> Any:
     known = result.description
     n_panels = len(units) + (known.energy is not None) + (result.system is not None)
     figure = figure_class(figsize=(WIDTH, HEIGHT * n_panels + 0.5), layout="constrained")
+    if file is not None and file.suffix and file.suffix[1:].lower() not in figure.canvas.get_supported_filetypes():
+        raise ValueError(f"path must end in .png, .svg, .pdf or another format of matplotlib; given {str(path)!r}")
     panels = list(np.atleast_1d(figure.subplots(n_panels, 1, sharex=True)))
     rest = iter(panels)
     for unit, chosen in units.items():
@@ -41,8 +44,8 @@ def plot(result: Record, path: str | os.PathLike[str] | None) -> Any:
     panels[-1].set_xlabel("t (s)")
     name = "" if result.system is None else result.system.name
     figure.suptitle(name if result.success else f"{name}: {result.status.name}", fontsize="medium")
-    if path is not None:
-        figure.savefig(path, dpi=150)
+    if file is not None:
+        figure.savefig(file, dpi=150)
     return figure
 
 

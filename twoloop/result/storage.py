@@ -3,25 +3,17 @@
 import json
 import os
 from dataclasses import asdict
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from twoloop.checks.arguments import shown
+from twoloop.checks.arguments import check_path
 from twoloop.result.saved_fields import COUNTS, NUMBERS, OF_EVENTS, STATES, check_sum
 from twoloop.run.record import Record
 
 FORMAT = "twoloop result 1"
 ALWAYS = ("t", *STATES, "h")
 SOMETIMES = (*COUNTS, "redundant", "atol", "untested")
-
-
-def check_path(path: Any) -> Path:
-    """Return `path` as a Path; raise TypeError if it is not a path."""
-    if not isinstance(path, (str, os.PathLike)) or "\0" in str(path):
-        raise TypeError(f"path must be a file name or a path; given {shown(path)} of type {type(path).__name__}")
-    return Path(path)
 
 
 def parts_of(result: Record, inside: bool = True) -> tuple[dict[str, np.ndarray[Any, Any]], dict[str, Any]]:

@@ -11,12 +11,11 @@ from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, ThreadPoolExecutor, wait
 from contextlib import closing, contextmanager
 from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from twoloop.checks.arguments import check_choice, check_flag, check_positive, check_size, shown
+from twoloop.checks.arguments import check_choice, check_flag, check_path, check_positive, check_size, check_span, shown
 from twoloop.checks.optional import needed
 from twoloop.result.result import Result
 from twoloop.run.record import Status
@@ -128,12 +127,15 @@ def sweep(
     check_flag("progress", progress)
     n_workers = (os.cpu_count() or 1) if workers is None else check_size("workers", workers, 1)
     given = _check_parameters(problem_of, parameters)
-    options = _check_options(options) | ({} if t_span is None else {"t_span": t_span})
+    options = _check_options(options)
+    if t_span is not None:
+        check_span(t_span)
+        options["t_span"] = t_span
     work: Work = (problem_of, measure, options)
     if client is not None or parallel == "processes":
         _check_pickles(work)
     pandas = needed("pandas", "pandas", "sweep")
-    path = None if out is None else Path(out)
+    path = None if out is None else check_path(out, "out")
     rows: dict[int, Row] = {}
     if path is not None:
         settings = saved_sweep.settings(work)
@@ -218,6 +220,8 @@ def one_run(work: Work, given: Row, first: bool = False) -> Row:
     began = time.perf_counter()
     try:
         problem = problem_of(**given)
+        if not hasattr(problem, "system"):
+            raise TypeError(f"problem_of must return a Problem; it returned {shown(problem)}")
         call = {"t_span": problem.t_span, "q0": problem.q0, "v0": problem.v0, **options}
         result = solve_dae(problem.system, **call)
         if result.status is Status.INTERRUPTED:

@@ -12,7 +12,7 @@ import sympy
 from numpy.typing import ArrayLike
 from sympy import Basic
 
-from twoloop.checks.arguments import check_flag, check_text, check_vector
+from twoloop.checks.arguments import check_flag, check_text, check_vector, shown
 from twoloop.problem.generated import GeneratedCode, GeneratedEnergy
 from twoloop.problem.problem import Problem
 from twoloop.problem.system import ConstrainedSystem
@@ -89,6 +89,8 @@ class SymbolicMechanism:
         TypeError, ValueError
             If a parameter is unknown or its value is not a finite number.
         """
+        if not isinstance(parameters, Mapping):
+            raise TypeError(f"parameters must map symbols to numbers; given {shown(parameters)}")
         values = {str(symbol): number(f"parameters[{symbol}]", value) for symbol, value in parameters.items()}
         unknown = [name for name in values if name not in self.parameters]
         if unknown:
