@@ -28,7 +28,7 @@ def agreements(quick: bool) -> Keyed:
 
 
 def agreement(case: str, kind: Callable[..., RandomAssembly], seed: int) -> Row:
-    """An assembly at random consistent velocities, by the form of the equations that a run would take."""
+    """An assembly at random velocities that its constraints allow, by the form that a run would take."""
     made = drawn(kind, seed)
     system = made.system("random")
     v = made.v(system)

@@ -155,7 +155,7 @@ class Loads(Collection):
     ) -> Force:
         """Add friction in a revolute or prismatic joint with a smooth law: -(f + coefficient load) tanh(rate / speed).
 
-        Unlike dry friction, this law has no jump at reversal and no sticking: a joint moves slowly under any force. A
+        Unlike dry friction, this law has no jump at reversal and no sticking: a joint slips under any small force. A
         small `speed` makes the equations stiff. With a coefficient, the friction also grows with the load of the joint:
         its force across the axis, times the radius for a hinge; torques and thrust carried by the joint do not count.
         The joint forces are then computed at every evaluation, in Python, and the friction is NaN where the

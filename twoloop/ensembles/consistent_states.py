@@ -55,7 +55,7 @@ def consistent_states(
     q, v : array_like (n_q,) or (n_runs, n_q)
         Guesses: one for all, or one for each.
     parameters : array_like (n_runs, n_p), optional
-        Of each, in the place of `system.parameters`.
+        Of each, instead of `system.parameters`.
     keep : sequence of int, optional
         Coordinates that stay as given, position and velocity. None: all may move.
 

@@ -55,7 +55,7 @@ def ensemble(
     q0, v0 : array_like (n_q,) or (n_runs, n_q)
         Consistent starts (see `consistent_states`): one for all runs, or one for each.
     parameters : array_like (n_runs, n_p), optional
-        Of each run, in the place of `system.parameters`. None: these.
+        Of each run, instead of `system.parameters`. None: these.
     rtol, atol, t_eval, events
         As for `solve_dae`; t_eval None: states are stored at the start and the end.
     method : str or method object
