@@ -30,17 +30,18 @@ def read_by(graph, outputs):
     return numbers
 
 
-def compute(graph, outputs, inputs):
+def compute(graph, outputs, inputs, divided=False):
     """What code for some outputs gives: whether its conditions hold, and the arrays."""
     numbers = read_by(graph, outputs)
     filled = tuple(np.full(len(forms), np.nan) for forms in outputs.arrays.values())
-    return machine_code_of(graph, outputs, numbers)(*inputs, numbers.values, *filled), filled
+    return machine_code_of(graph, outputs, numbers, divided)(*inputs, numbers.values, *filled), filled
 
 
-def machine_code_of(graph, outputs, numbers):
+def machine_code_of(graph, outputs, numbers, divided=False):
     """What Python calls, on arrays, for a function of LLVM."""
-    module, n = Module(), len(graph.sizes) + 1 + len(outputs.arrays)
+    module, n = Module(divided), len(graph.sizes) + 1 + len(outputs.arrays)
     write_function(module, "function", ("i1", ["double*"] * n), graph, outputs, numbers)
+    assert ("blockaddress" in str(module)) is divided
     made = OwnFunctions(["function"], object_code(str(module)))
     function = ctypes.CFUNCTYPE(ctypes.c_bool, *[ctypes.c_void_p] * n)(made.addresses["function"])
 
@@ -49,6 +50,21 @@ def machine_code_of(graph, outputs, numbers):
         return function(*(each.ctypes.data for each in arrays))
 
     return call
+
+
+@pytest.mark.parametrize("make", [four_bar, andrews, heavy_top, spatial_four_bar])
+def test_code_in_divided_blocks_gives_the_same_numbers(make):
+    problem = make()
+    system = problem.system
+    equations = StraightLine(system, Choice.at(system, 0.0, problem.q0))
+    state = (0.0, problem.q0, problem.v0)
+    for outputs in (equations.there, equations.nearer, Solution(equations).kept):
+        (holds, whole), (holds_too, divided) = (
+            compute(equations.graph, outputs, state, each) for each in (False, True)
+        )
+        assert holds and holds_too
+        for one, other in zip(whole, divided, strict=True):
+            np.testing.assert_allclose(other, one, rtol=1e-9, atol=1e-9 * np.abs(one).max(initial=1.0))
 
 
 @pytest.mark.parametrize("make", [four_bar, andrews, heavy_top, spatial_four_bar, rolling_disc])

@@ -14,6 +14,7 @@ from twoloop.generate.straight_code import OwnCode, SharedCode, write_own
 from twoloop.kernels.compile.dependencies import digest_of
 from twoloop.kernels.compile.own_functions import OwnFunctions, own_functions
 
+DIVIDED = 250  # operations of a series from which on its blocks are divided
 LARGEST = 3000  # operations: the time to compile them grows faster than their number
 
 
@@ -63,7 +64,7 @@ def _compiled(own: SharedCode) -> CompiledSeries:
     key = hashlib.sha256(repr(structure).encode()).hexdigest()
 
     def write() -> tuple[list[str], str]:
-        module, names = Module(), ["own_solution"]
+        module, names = Module(divided=program.n_operations > DIVIDED), ["own_solution"]
         write_own(module, "own_solution", own.solution.graph, own.solution.solved, own.numbers)
         if own.parts is None:
             names.append("own_factors")

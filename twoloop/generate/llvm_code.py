@@ -154,17 +154,19 @@ class Emitter:
         its new values. After the loop that list has the last ones.
         """
         builder = self.builder
+        goes = builder.compare("icmp slt", first, end)
         before, body, after = builder.block, builder.append_block(), builder.append_block()
-        builder.branch(builder.compare("icmp slt", first, end), body, after)
+        builder.branch(goes, body, after)
         builder.position_at_end(body)
         index = builder.phi(INTEGER)
         index.add_incoming(first, before)
         carried = [builder.phi(value.type) for value in initial]
         new: list[Any] = []
         yield index, carried, new
-        following, last = builder.add(index, integer(1)), builder.block
+        following = builder.add(index, integer(1))
+        goes, last = builder.compare("icmp slt", following, end), builder.block
         index.add_incoming(following, last)
-        builder.branch(builder.compare("icmp slt", following, end), body, after)
+        builder.branch(goes, body, after)
         builder.position_at_end(after)
         for k, value in enumerate(initial):
             result = builder.phi(value.type)
@@ -177,6 +179,9 @@ class Emitter:
 class Quantities:
     """Values of numbered quantities, and sums of multiples of them; each is loaded, or summed, once.
 
+    In each part of a divided function it is loaded again, as a number that waits in a register is stored and loaded,
+    too. So memory from which quantities are loaded must stay as it is.
+
     Parameters
     ----------
     emit : Emitter
@@ -187,6 +192,8 @@ class Quantities:
     def __init__(self, emit: Emitter, load: Callable[[int], Value]):
         self._emit, self._load = emit, load
         self._values: dict[int, Value] = {}
+        self._loaded: dict[int, Value] = {}  # in the part of a divided function that is being written
+        self._part = emit.builder.part
         self._sums: dict[tuple[Terms, float], Value] = {}
 
     def define(self, quantity: int, value: Value) -> None:
@@ -195,13 +202,29 @@ class Quantities:
 
     def value(self, quantity: int) -> Value:
         """What was defined, or loaded."""
-        if quantity not in self._values:
-            self._values[quantity] = self._load(quantity)
-        return self._values[quantity]
+        if quantity in self._values:
+            return self._values[quantity]
+        loaded = self._here()
+        if quantity not in loaded:
+            loaded[quantity] = self._load(quantity)
+        return loaded[quantity]
+
+    def stored(self, quantity: int) -> None:
+        """Say that it can be loaded from now on."""
+        self._here()[quantity] = self._values.pop(quantity)
+
+    def _here(self) -> dict[int, Value]:
+        """What was loaded in this part."""
+        if self._part != self._emit.builder.part:
+            self._part, self._loaded = self._emit.builder.part, {}
+        return self._loaded
 
     def sum(self, terms: Terms, constant: float = 0.0) -> Value:
         """constant + the sum of coefficient * quantity."""
         key = terms, constant
+        if self._emit.builder.module.divided and len(terms) == 1 and constant == 0.0:
+            ((quantity, coefficient),) = terms  # to multiply again takes no longer than to keep a multiple
+            return self._emit.times(coefficient, self.value(quantity))
         if key not in self._sums:
             total: Any = None if constant == 0.0 and terms else self._emit.known(constant)
             for quantity, coefficient in terms:

@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from typing import Any
 
 DOUBLE, INTEGER, WORD, BIT, NOTHING = "double", "i64", "i32", "i1", "void"
+LONGEST = 80  # operations of a block of a divided function
 
 
 class Value:
@@ -91,9 +92,14 @@ def undefined(kind: str) -> Value:
 
 
 class Module:
-    """Functions, and those of others that they call."""
+    """Functions, and those of others that they call.
 
-    def __init__(self) -> None:
+    `divided`: long blocks are divided, as LLVM's time to select, order and place operations grows faster than a block.
+    """
+
+    def __init__(self, divided: bool = False) -> None:
+        self.divided = divided
+        self.kept_apart: list[str] = []  # addresses of blocks
         self._declared: dict[str, str] = {}
         self._functions: list[Builder] = []
 
@@ -111,6 +117,9 @@ class Module:
         defined = {function.name for function in self._functions}
         declared = [text for name, text in self._declared.items() if name not in defined]
         parts = [*declared, *(function.text() for function in self._functions), "!0 = !{}"]
+        if self.kept_apart:
+            kind = f"[{len(self.kept_apart)} x i8*]"
+            parts.append(f"@kept_apart = internal constant {kind} [{', '.join(self.kept_apart)}]")
         return "\n".join(parts)
 
 
@@ -121,6 +130,7 @@ class Builder:
         self.module, self.name, self.result, self.internal = module, name, result, internal
         self.arguments = [Value(kind, f"%a{k}") for k, kind in enumerate(arguments)]
         self._n = 0
+        self.part = 0  # of a divided function, in which operations are put now
         self._blocks: list[Block] = []
         self.block = self.append_block()
 
@@ -145,10 +155,19 @@ class Builder:
         self.block.lines.append(text)
 
     def _value(self, kind: str, text: str) -> Value:
+        if self.module.divided and len(self.block.lines) >= LONGEST:
+            self._divide()
         self._n += 1
         made = Value(kind, f"%v{self._n}")
         self.block.lines.append(f"{made.text} = {text}")
         return made
+
+    def _divide(self) -> None:
+        """Go on in another block, whose address is taken: so LLVM leaves it apart."""
+        block = self.append_block()
+        self.go_to(block)
+        self.module.kept_apart.append(f"i8* blockaddress(@{self.name}, %{block.name})")
+        self.block, self.part = block, self.part + 1
 
     def operation(self, name: str, a: Value, b: Value) -> Value:
         """An operation on two values of a type, such as "add" or "fmul fast"."""

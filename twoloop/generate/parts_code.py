@@ -14,17 +14,23 @@ from twoloop.generate.coefficients import Coefficients
 from twoloop.generate.llvm_code import Emitter
 from twoloop.generate.llvm_text import BIT, DOUBLE, Builder, Module, Value, integer
 from twoloop.generate.straight_line import Outputs, Solution, StraightLine
-from twoloop.generate.written import NOWHERE, Place, Written, conditions_hold, inputs_of, results_of
+from twoloop.generate.written import NOWHERE, Place, Written, conditions_hold
 
 TRUE = Value(BIT, "true")
 ARRAY = f"{DOUBLE}*"
 POSITION = [DOUBLE, ARRAY, ARRAY, ARRAY, ARRAY]  # t, q, v, numbers, kept
-LONG = 500  # quantities of the accelerations from which on equations are written in parts
+LONG = 500  # quantities of the accelerations from which on equations are written in parts ...
+DIVIDED = 1700  # ... whose blocks are divided; with fewer the divided code runs up to a quarter slower
 
 
 def is_long(equations: StraightLine) -> bool:
     """Whether equations are worth their calls."""
     return len(equations.there.quantities(equations.graph)) > LONG
+
+
+def has_long_blocks(equations: StraightLine) -> bool:
+    """Whether blocks take so long to compile that they are divided."""
+    return len(equations.there.quantities(equations.graph)) > DIVIDED
 
 
 class PartsCode:
@@ -76,8 +82,7 @@ class PartsCode:
     def _written(self, emit: Emitter, arguments: Sequence[Value], places: Mapping[int, Place] = NOWHERE) -> Written:
         """For code at t, q, v, of which numbers are the next argument."""
         written, emit.numbers = Written(emit, self.numbers, places), arguments[3]
-        for i, value in enumerate(inputs_of(emit, self.equations.graph, arguments[:3])):
-            written.define(i, value)
+        written.take(self.equations.graph, arguments[:3])
         return written
 
     def _factors(self, emit: Emitter, *arguments: Value) -> Value:
@@ -88,15 +93,14 @@ class PartsCode:
         for i, place in places.items():
             if graph.operations[i] is None:  # an entry is t or a coordinate
                 emit.store(written.value(i), *place)
-        written.write(graph, solution.kept.quantities(graph), places)
+        written.write(graph, graph.in_order_of_use(solution.kept.forms), places)
         return conditions_hold(emit, written, solution.kept, [])
 
     def _at_position(self, outputs: Outputs) -> Callable[..., Value]:
         def emit_part(emit: Emitter, *arguments: Value) -> Value:
-            graph, known, kept = self.equations.graph, self.solution.known, arguments[4]
+            known, kept = self.solution.known, arguments[4]
             written = self._written(emit, arguments, {i: (kept, place) for i, place in known.items()})
-            written.write(graph, outputs.quantities(graph, known))
-            results = [[written.form(form) for form in forms] for forms in outputs.arrays.values()]
+            results = written.results(self.equations.graph, outputs)
             _store(emit, results, arguments[5:])
             return conditions_hold(emit, written, outputs, results[0])
 
@@ -105,8 +109,9 @@ class PartsCode:
     def _with_factors(self, outputs: Outputs) -> Callable[..., Value]:
         def emit_part(emit: Emitter, r: Value, c: Value, kept: Value, numbers: Value, *out: Value) -> Value:
             emit.numbers = numbers
-            inputs = inputs_of(emit, self.solution.graph, [r, c, kept])
-            written, results = results_of(emit, self.solution.graph, outputs, inputs, self.numbers)
+            written = Written(emit, self.numbers)
+            written.take(self.solution.graph, [r, c, kept])
+            results = written.results(self.solution.graph, outputs)
             _store(emit, results, out)
             return conditions_hold(emit, written, outputs, results[0])
 

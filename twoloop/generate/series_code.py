@@ -97,7 +97,6 @@ class SeriesCode:
         """Late operations of the order before and early ones of this order, as far as they are known; r and c."""
         base, before, emit.numbers = emit.aligned(scratch), emit.builder.sub(order, integer(1)), numbers
         q = emit.pointer(series, emit.builder.mul(order, integer(self.n)))
-        sums = self._sums_of_products(emit, base, order)
         is_first = emit.builder.compare("icmp eq", order, integer(1))
         with emit.builder.if_else(is_first) as (then, otherwise):
             with then:
@@ -108,12 +107,12 @@ class SeriesCode:
                     emit.store(known.sum(terms, constant), r, place)
             with otherwise:
                 known = self._quantities_before(emit, base, q, self._time(emit, unit, before))
-                self._operate(emit, base, known, self.groups.late, sums, before)
+                self._operate(emit, base, known, self.groups.late, order, late=True)
                 for place, terms, _ in self.groups.balance:
                     emit.store(known.sum(terms), r, place)
         time = self._time(emit, unit, order)
         known = Quantities(emit, lambda i: emit.load(q, i - 1) if i else time)
-        self._operate(emit, base, known, self.groups.early, sums, order)
+        self._operate(emit, base, known, self.groups.early, order)
         scale = emit.negative(emit.divide(emit.number(order), unit))
         for place, terms, _ in self.groups.rows:
             emit.store(emit.multiply(scale, known.sum(terms)), c, place)
@@ -180,42 +179,43 @@ class SeriesCode:
         y = emit.vector([known.sum(each.terms) for each in group.second])
         emit.store_vector(y, row, self.width + group.place)
 
-    def _sums_of_products(self, emit: Emitter, base: Value, order: Value) -> dict[int, Value]:
-        """For groups, by place, the sum of X[j] Y[m - j] over 0 < j < m; m is the order, of late ones one less."""
-        builder = emit.builder
-        groups = [(group, 0) for group in self.groups.early] + [(group, 1) for group in self.groups.late]
-        nothing = emit.pointer(base, self.zeros)
-        one, two, before, before_it = integer(1), integer(2), *(builder.sub(order, integer(i)) for i in (1, 2))
+    def _ends(self, emit: Emitter, base: Value, order: Value, late: bool) -> list[tuple[Value, Value]]:
+        """Rows of X[j] and Y[m - j], zeros where there are none, for those j < m that come last in sums of products.
 
-        def rows(j: Value, m: Value, least: int) -> tuple[Value, Value]:
-            """Rows of X[j] and Y[m - j], or zeros where m is less than `least`."""
+        m is the order, of late operations one less.
+        """
+        builder = emit.builder
+        nothing = emit.pointer(base, self.zeros)
+        one, before, before_it = integer(1), *(builder.sub(order, integer(i)) for i in (1, 2))
+        m = before if late else order
+        ends = [(before_it, 3), (one, 2)] if late else [(before_it, 4), (before, 3), (one, 2)]  # j, and the least m
+        made = []
+        for j, least in ends:
             there = builder.compare("icmp sge", m, integer(least))
             x, y = self._row(emit, base, j), self._row(emit, base, builder.sub(m, j))
-            return builder.select(there, x, nothing), builder.select(there, y, nothing)
+            made.append((builder.select(there, x, nothing), builder.select(there, y, nothing)))
+        return made
 
-        def with_product(total: Value, x: Value, y: Value, group: Group) -> Value:
-            x, y = (
-                emit.load_vector(x, group.place, group.width),
-                emit.load_vector(y, self.width + group.place, group.width),
-            )
-            return emit.add(total, emit.multiply(x, y))
+    def _sums_of_products(
+        self, emit: Emitter, base: Value, order: Value, groups: list[Group], ends: list[tuple[Value, Value]], late: bool
+    ) -> list[Value]:
+        """For groups, the sum of X[j] Y[m - j] over 0 < j < m; m is the order, of late ones one less."""
 
-        sums: dict[int, Value] = {}
-        for begin in range(0, len(groups), AT_ONCE):
-            some = groups[begin : begin + AT_ONCE]
-            zeros = [emit.vector([ZERO] * group.width) for group, _ in some]
-            with emit.loop(two, before_it, zeros) as (j, totals, new):
-                x, y = self._row(emit, base, j), self._row(emit, base, builder.sub(order, j))
-                for (group, late), total in zip(some, totals, strict=True):
-                    new.append(with_product(total, x, emit.pointer(y, -2 * self.width * late), group))
-            sums |= {group.place: total for (group, _), total in zip(some, new, strict=True)}
-        last = [
-            [rows(before_it, order, 4), rows(before, order, 3), rows(one, order, 2)],
-            [rows(before_it, before, 3), rows(one, before, 2)],
-        ]
-        for group, late in groups:
-            for pair in last[late]:
-                sums[group.place] = with_product(sums[group.place], *pair, group)
+        def with_products(totals: list[Value], x: Value, y: Value) -> list[Value]:
+            made = []
+            for group, total in zip(groups, totals, strict=True):
+                factor = emit.load_vector(x, group.place, group.width)
+                other = emit.load_vector(y, self.width + group.place, group.width)
+                made.append(emit.add(total, emit.multiply(factor, other)))
+            return made
+
+        zeros = [emit.vector([ZERO] * group.width) for group in groups]
+        before_it = emit.builder.sub(order, integer(2))
+        with emit.loop(integer(2), before_it, zeros) as (j, totals, sums):
+            x, y = self._row(emit, base, j), self._row(emit, base, emit.builder.sub(order, j))
+            sums += with_products(totals, x, emit.pointer(y, -2 * self.width) if late else y)
+        for pair in ends:
+            sums = with_products(sums, *pair)
         return sums
 
     def _begin_group(self, emit: Emitter, base: Value, known: Quantities, group: Group) -> None:
@@ -252,28 +252,40 @@ class SeriesCode:
             emit.store_vector(y, table, self.width + group.place)
 
     def _operate(
+        self, emit: Emitter, base: Value, known: Quantities, groups: list[Group], last: Value, late: bool = False
+    ) -> None:
+        """The order `last`, of late operations one less, that is not 0; of what waits, what is known before."""
+        order = emit.builder.sub(last, integer(1)) if late else last
+        row, number = self._row(emit, base, order), emit.number(order)
+        inverse, ends = emit.divide(ONE, number), self._ends(emit, base, last, late)
+        for begin in range(0, len(groups), AT_ONCE):
+            some = groups[begin : begin + AT_ONCE]
+            sums = self._sums_of_products(emit, base, last, some, ends, late)
+            for group, total in zip(some, sums, strict=True):
+                self._operate_on(emit, base, known, group, total, row, number, inverse)
+
+    def _operate_on(
         self,
         emit: Emitter,
         base: Value,
         known: Quantities,
-        groups: list[Group],
-        sums: dict[int, Value],
-        order: Value,
+        group: Group,
+        total: Value,
+        row: Value,
+        number: Value,
+        inverse: Value,
     ) -> None:
-        """An order that is not 0; of what waits, what is known before."""
-        row, number = self._row(emit, base, order), emit.number(order)
-        inverse = emit.divide(ONE, number)
-        for group in groups:
-            known_factors = [emit.vector([known.sum(each.terms) for each in group.first])]
-            if group.kind in (PRODUCT, LOGARITHM, ARCTANGENT):
-                known_factors.append(emit.vector([known.sum(each.terms) for each in group.second]))
-            scales = (emit.vector([each] * group.width) for each in (number, inverse))
-            results, x, y = self._recurrence(emit, base, group, sums[group.place], *scales, *known_factors)
-            for quantity, value in zip(group.quantities, emit.elements(results), strict=True):
-                known.define(quantity, value)
-            emit.store_vector(x, row, group.place)
-            if not group.pending:
-                emit.store_vector(y, row, self.width + group.place)
+        """One group, with the sum of its products and the row of the order."""
+        known_factors = [emit.vector([known.sum(each.terms) for each in group.first])]
+        if group.kind in (PRODUCT, LOGARITHM, ARCTANGENT):
+            known_factors.append(emit.vector([known.sum(each.terms) for each in group.second]))
+        scales = (emit.vector([each] * group.width) for each in (number, inverse))
+        results, x, y = self._recurrence(emit, base, group, total, *scales, *known_factors)
+        for quantity, value in zip(group.quantities, emit.elements(results), strict=True):
+            known.define(quantity, value)
+        emit.store_vector(x, row, group.place)
+        if not group.pending:
+            emit.store_vector(y, row, self.width + group.place)
 
     def _recurrence(
         self,

@@ -22,8 +22,13 @@ from twoloop.generate.parts_code import PartsCode
 from twoloop.generate.straight_line import Outputs, Solution, StraightLine
 from twoloop.generate.traced_values import Check, Traced, unchecked
 from twoloop.generate.tracing import Graph, Untraceable
+<<<<<<< HEAD
 from twoloop.generate.written import conditions_hold, inputs_of, results_of
 from twoloop.kernels.compile.dependencies import digest_of
+=======
+from twoloop.generate.written import Written, conditions_hold
+from twoloop.kernels.compile.caches import digest_of
+>>>>>>> 6ec3d62dbbe4f470064e39a0858cd043f11a2d8c
 from twoloop.kernels.compile.own_functions import own_functions
 from twoloop.kernels.compile.private import Dispatcher
 from twoloop.problem.system import ConstrainedSystem
@@ -47,8 +52,9 @@ def write_function(
     def emit_all(emit: Emitter, *arguments: Value) -> Value:
         n_given = len(graph.sizes)
         given, emit.numbers, filled = arguments[:n_given], arguments[n_given], arguments[n_given + 1 :]
-        inputs = inputs_of(emit, graph, given)
-        written, results = results_of(emit, graph, outputs, inputs, numbers)
+        written = Written(emit, numbers)
+        written.take(graph, given)
+        results = written.results(graph, outputs)
         holds = conditions_hold(emit, written, outputs, results[0])
         with emit.builder.if_then(holds):
             for place, array in zip(filled, results, strict=True):
@@ -127,7 +133,8 @@ class SharedCode:
     def _write(self) -> tuple[list[str], str]:
         from twoloop.kernels.data.common import KIT
 
-        module, equations = Module(), self.equations
+        equations = self.equations
+        module = Module(divided=parts_code.has_long_blocks(equations))
         for name, outputs in self.outputs.items():
             write_own(module, name, equations.graph, outputs, self.numbers)
         parts = [] if self.parts is None else self.parts.write(module, KIT.own_type)

@@ -85,6 +85,22 @@ class Graph(Symbolic):
                 ahead += [j for form in operation[1:] if isinstance(form, Form) for j in form.terms]
         return sorted(found)
 
+    def in_order_of_use(self, forms: Iterable["Form"], known: Container[int] = ()) -> list[int]:
+        """The same, each as late as it can be: just before what is made of it first."""
+        order: list[int] = []
+        found: set[int] = set()
+        ahead = [i for form in forms for i in form.terms][::-1]
+        while ahead:
+            i = ahead.pop()
+            operation = None if i < 0 else self.operations[i]
+            if i < 0:  # all that it is made of is in the list
+                order.append(~i)
+            elif i not in found and operation is not None and i not in known:
+                found.add(i)
+                ahead.append(~i)
+                ahead += [j for form in operation[1:] if isinstance(form, Form) for j in form.terms][::-1]
+        return order
+
     def product(self, one: "Form", other: "Form") -> "Form":
         """One form times another, factors taken out so that multiples of a product are one quantity."""
         for a, b in ((one, other), (other, one)):

@@ -39,10 +39,11 @@ class Written:
     """
 
     def __init__(self, emit: Emitter, numbers: Coefficients, places: Mapping[int, Place] = NOWHERE):
-        self.emit, self.numbers, self._places = emit, numbers, places
+        self.emit, self.numbers, self._places = emit, numbers, dict(places)
         self.angles: list[Value] = []  # of sines and cosines
         self._known = Quantities(emit, self._missing)
         self._pairs: dict[Any, tuple[Value, Value]] = {}
+        self._made = set(places)
 
     def _missing(self, quantity: int) -> Value:
         return self.emit.load(*self._places[quantity])  # others are defined before they are used
@@ -50,6 +51,19 @@ class Written:
     def define(self, quantity: int, value: Value) -> None:
         """Say what an input is."""
         self._known.define(quantity, value)
+
+    def take(self, graph: Graph, given: Sequence[Value]) -> None:
+        """Take the inputs of a graph, which are given as numbers or in memory, and loaded there first."""
+        first = 0
+        for argument, size in zip(given, graph.sizes, strict=True):
+            if argument.type == DOUBLE:
+                self.define(first, argument)
+            else:
+                self._places |= {first + j: (argument, j) for j in range(size)}
+                if not self.emit.builder.module.divided:
+                    for quantity in range(first, first + size):
+                        self.value(quantity)
+            first += size
 
     def value(self, quantity: int) -> Value:
         """The value of a quantity."""
@@ -86,14 +100,27 @@ class Written:
             self.operation(i, *operation)
             if i in places:
                 self.emit.store(self._known.value(i), *places[i])
+                self._places[i] = places[i]
+                self._known.stored(i)
 
+    def results(self, graph: Graph, outputs: Outputs) -> list[list[Value]]:
+        """Compute arrays, and what conditions are made of.
 
-def inputs_of(emit: Emitter, graph: Graph, given: Sequence[Value]) -> list[Value]:
-    """The inputs of a graph, which are given as numbers or in memory."""
-    inputs: list[Value] = []
-    for argument, size in zip(given, graph.sizes, strict=True):
-        inputs += [argument] if argument.type == DOUBLE else [emit.load(argument, j) for j in range(size)]
-    return inputs
+        In a divided function each number is made just before it is used, as few numbers stay in registers from one part
+        to the next; LLVM finds an order within a part only.
+        """
+        if not self.emit.builder.module.divided:
+            self.write(graph, outputs.quantities(graph, self._made))
+            return [[self.form(form) for form in forms] for forms in outputs.arrays.values()]
+        results = [[self._result(graph, form) for form in forms] for forms in outputs.arrays.values()]
+        self.write(graph, graph.in_order_of_use(outputs.forms, self._made))
+        return results
+
+    def _result(self, graph: Graph, form: Form) -> Value:
+        quantities = graph.in_order_of_use([form], self._made)
+        self.write(graph, quantities)
+        self._made.update(quantities)
+        return self.form(form)
 
 
 def results_of(
@@ -103,8 +130,7 @@ def results_of(
     written = Written(emit, numbers)
     for quantity, value in enumerate(inputs):
         written.define(quantity, value)
-    written.write(graph, outputs.quantities(graph))
-    return written, [[written.form(form) for form in forms] for forms in outputs.arrays.values()]
+    return written, written.results(graph, outputs)
 
 
 def conditions_hold(emit: Emitter, written: Written, outputs: Outputs, values: Sequence[Value]) -> Value:
