@@ -22,13 +22,8 @@ from twoloop.generate.parts_code import PartsCode
 from twoloop.generate.straight_line import Outputs, Solution, StraightLine
 from twoloop.generate.traced_values import Check, Traced, unchecked
 from twoloop.generate.tracing import Graph, Untraceable
-<<<<<<< HEAD
-from twoloop.generate.written import conditions_hold, inputs_of, results_of
-from twoloop.kernels.compile.dependencies import digest_of
-=======
 from twoloop.generate.written import Written, conditions_hold
-from twoloop.kernels.compile.caches import digest_of
->>>>>>> 6ec3d62dbbe4f470064e39a0858cd043f11a2d8c
+from twoloop.kernels.compile.dependencies import digest_of
 from twoloop.kernels.compile.own_functions import own_functions
 from twoloop.kernels.compile.private import Dispatcher
 from twoloop.problem.system import ConstrainedSystem
