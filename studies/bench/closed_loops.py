@@ -232,7 +232,7 @@ def governor(Q: Array = UPRIGHT) -> ModelProblem:
     return model.problem((0.0, 5.0))
 
 
-def stewart(Q: Array = UPRIGHT) -> ModelProblem:
+def stewart(Q: Array = UPRIGHT, stiffness: float = 600.0, damping: float = 0.0) -> ModelProblem:
     """A platform on six legs, each two bodies that slide on one another, with a spring from base to platform."""
     model = SpatialModel(gravity=Q @ [0.0, 0.0, -9.81], name="Stewart platform")
     moving = {"velocity": Q @ [0.3, 0.1, 0.0], "rotation": Q}
@@ -250,7 +250,7 @@ def stewart(Q: Array = UPRIGHT) -> ModelProblem:
         model.prismatic(f"cylinder {k}", f"piston {k}", at=0.5 * (foot + top), axis=along)
         model.spherical(f"piston {k}", "platform", at=top)
         long = 1.05 * float(np.linalg.norm(top - foot))
-        model.spring("ground", foot, "platform", top, stiffness=600.0, length=long)
+        model.spring("ground", foot, "platform", top, stiffness=stiffness, damping=damping, length=long)
     return model.problem((0.0, 3.0))
 
 

@@ -1,6 +1,7 @@
 """All ready mechanisms: what they say of themselves, derivatives, references by a second route, nine digits."""
 
 import warnings
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -66,7 +67,7 @@ def test_it_says_what_it_is(name):
 
 def test_a_tag_must_be_known():
     with pytest.raises(ValueError, match=r"tags must be of open chain.*given 'curly'"):
-        mechanisms.Problem("x", None, np.zeros(1), np.zeros(1), (0.0, 1.0), None, tags=("curly",))
+        replace(mechanisms.pendulum(), tags=("curly",))
 
 
 # --- references by a second route

@@ -16,9 +16,6 @@ from twoloop.generate.derivative import Derivative
 from twoloop.generate.programs import Program, numbers_of, program_of
 from twoloop.generate.tracing import Form, Graph, Untraceable, symbols
 
-STATES = 5  # at which a traced program is compared with the function ...
-BETWEEN = 0.37  # ... and s from one to the next: of no usual period
-AGREES = 1e-10  # relative difference between the two
 ARGUMENTS = {1: "(t)", 2: "(length, rate) or (angle, rate)", 3: "(t, q, v)"}
 
 

@@ -10,13 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.bodies import parameter_layout as layout
-from twoloop.bodies.functions import AGREES, BETWEEN, STATES, Function, Law, with_arguments
+from twoloop.bodies.functions import Function, Law, with_arguments
 from twoloop.bodies.loaded_friction import LoadedFriction
 from twoloop.bodies.parts import COINCIDE
 from twoloop.bodies.places import placed
 from twoloop.bodies.row_function import RowFunction
 from twoloop.bodies.tables import Tables
 from twoloop.checks.arguments import Array, shown
+from twoloop.generate.programs import AGREES, BETWEEN, STATES
 from twoloop.generate.tracing import Untraceable
 from twoloop.problem.entries import LARGE
 from twoloop.problem.joints import Joint

@@ -9,6 +9,10 @@ from twoloop.generate.known_numbers import array_of
 from twoloop.generate.tracing import Form, Graph
 from twoloop.kernels.evaluation.operations import N_COLUMNS, RESULT
 
+STATES = 5  # at which a program is compared with the function that it was traced from ...
+BETWEEN = 0.37  # ... and s from one to the next: of no usual period
+AGREES = 1e-10  # relative difference between the two
+
 
 class Program(NamedTuple):
     """Operations, see kernels/evaluation/operations.py; `columns` and `coefficients` are those of all terms."""

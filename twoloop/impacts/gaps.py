@@ -7,11 +7,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from twoloop.bodies.functions import AGREES, BETWEEN, STATES
 from twoloop.checks.arguments import Array, shown
 from twoloop.generate.calls_on_symbols import as_forms, trace
 from twoloop.generate.derivative import Derivative
-from twoloop.generate.programs import numbers_of, program_of
+from twoloop.generate.programs import AGREES, BETWEEN, STATES, numbers_of, program_of
 from twoloop.generate.tracing import Form, Graph, Untraceable, symbols
 from twoloop.problem.stops import Stop
 
