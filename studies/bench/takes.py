@@ -190,8 +190,11 @@ def _in_angles(minimal: Mapping[str, Any]) -> list[dict[str, str]]:
     slower = f", slower in {minimal['n_ahead']}" if minimal["n_ahead"] else ""
     told = f"faster in {minimal['n_behind']}{slower} of {minimal['n']} comparisons"
     for each in minimal["wrong_by"]:
-        told += f"; {each['n']} of {each['asked']} runs silently wrong"
-        told += f" by over {number(minimal['wrong_from'])}"
+        told += f"; `{each['solver'].partition(',')[0]}` silently wrong by over {number(minimal['wrong_from'])}"
+        told += f" in {each['n']} of {each['asked']} runs"
+    others = minimal["asked"] - sum(each["asked"] for each in minimal["wrong_by"])
+    if minimal["wrong_by"] and others:
+        told += f", others in 0 of {others}"
     who = f"an ODE in angles by {' or '.join(f'`{name}`' for name, _ in by.most_common())}"
     clear = 2 * minimal["n_behind"] > minimal["n"]
     take = f"{who} ({told})" if clear else f"no clear choice ({who} is {told})"
