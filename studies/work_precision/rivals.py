@@ -33,9 +33,7 @@ from twoloop.methods.code_for import is_small
 
 GROUP = "every mechanism"
 DECADES = tuple(10.0**-k for k in range(3, 14))
-CLOSE = (
-    1.33  # by which heyoka's times of the same run on the four-bar differ between the sessions of Table 3 and of this
-)
+CLOSE = 1.33  # by which heyoka's times of one run on the four-bar differ in Table 3 and here
 RANGES = {  # of errors; none: all of them on the mechanisms that cross singular positions
     "1e-3 to 1e-6": DECADES[:4],
     "1e-7 to 1e-9": DECADES[4:7],
