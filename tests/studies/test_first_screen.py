@@ -170,7 +170,7 @@ def test_every_number_of_the_screen_is_made_again_from_the_rows(tmp_path):
         "call on the four-bar over 10 s, in ms (AMD EPYC):",
         f"\n| 1e-4 | {cells} |\n| 1e-6 | {cells} |\n",
         f"| first call | {first} | – | – | – |\n",
-        f"the cheapest rival's median time is {typical} of the default's for an error of 1e-4, {typical} for 1e-10.",
+        f"the cheapest rival takes, in the median, {typical} of the default's time at 1e-4, {typical} at 1e-10.",
         "The default is nowhere behind on 1 of 2 mechanisms, this among them.",
         "by over 1e-3 at a tolerance of 1e-8, under 17 kinds of sharp forces of our choice: the default 1 of 61, our "
         "other methods 2 of 125, heyoka 1 of 66, IDA and CVODE 0 of 64. ",
