@@ -86,7 +86,7 @@ def environment() -> jinja2.Environment:
     how |= {"undefined": jinja2.StrictUndefined, "autoescape": False}  # markdown, from our own data
     made = jinja2.Environment(loader=jinja2.FileSystemLoader(TEMPLATES), **how)
     made.filters |= {"code": code, "num": number, "power": power, "pct": percent, "listed": listed}
-    made.filters |= {"brief": brief, "digit": one_digit}
+    made.filters |= {"brief": brief}
     made.globals["table"] = table
     return made
 

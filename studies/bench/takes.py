@@ -104,7 +104,11 @@ def _of_kinds(rivals: Mapping[str, Any], with_code: set[str]) -> list[dict[str, 
         if kind == SINGULAR and own:
             rows.append({"what": KINDS[kind], "take": _crossed(rivals, own)})
         elif kind == STIFF and own:
-            rows += [{"what": f"{KINDS[kind]} ({each['case']})", "take": _by_error(each["at"])} for each in own]
+            names = [each["case"].removeprefix("A05 ") for each in own]  # its number among IFToMM's benchmarks
+            rows += [
+                {"what": f"{KINDS[kind]} ({name})", "take": _by_error(each["at"])}
+                for name, each in zip(names, own, strict=True)
+            ]
         elif kind == FOUR_BARS and own:
             won, coded = Counter(_cheapest(each["at"]) for each in own), with_code.issuperset(e["case"] for e in own)
             rows.append({"what": kind, "take": _shares(won, "geometries", coded)})
