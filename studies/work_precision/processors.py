@@ -68,7 +68,7 @@ def added(path: Path, made: pd.DataFrame) -> pd.DataFrame:
 
 
 def kept(output: Output, rows: pd.DataFrame, stamp: str, found: Mapping[str, Any]) -> dict[str, list[dict[str, Any]]]:
-    """Keep the verdicts of these rows beside those of other processors; the findings of all, and of the time inside.
+    """Keep the verdicts of these rows beside those of other processors; the findings of all.
 
     `found`: of `rivals.findings_of`, in which those by the time of the call are.
     """
@@ -76,13 +76,7 @@ def kept(output: Output, rows: pd.DataFrame, stamp: str, found: Mapping[str, Any
     made = verdicts(rows, stamp, known)
     table = added(output.file(FILE), made)
     output.write(FILE, table.to_csv(index=False))
-    return {"processors": findings_of(table), "inside": inside(made)}
-
-
-def inside(made: pd.DataFrame) -> list[dict[str, Any]]:
-    """How each of ours stands by the time inside the integrators alone, of the pairs that it and a rival reach."""
-    own = made[made["time"] == "inside"].groupby("who", sort=False)["verdict"]
-    return [{"name": str(who), "n": len(each), **each.value_counts()} for who, each in own]
+    return {"processors": findings_of(table)}
 
 
 def findings_of(table: pd.DataFrame) -> list[dict[str, Any]]:

@@ -33,7 +33,7 @@ from twoloop.methods.code_for import is_small
 
 GROUP = "every mechanism"
 DECADES = tuple(10.0**-k for k in range(3, 14))
-CLOSE = 1.33  # by which heyoka's times of one run on the four-bar differ in Table 3 and here
+CLOSE = 1.3  # ratio of our choice, below which another session may rank two times otherwise
 RANGES = {  # of errors; none: all of them on the mechanisms that cross singular positions
     "1e-3 to 1e-6": DECADES[:4],
     "1e-7 to 1e-9": DECADES[4:7],
@@ -202,7 +202,7 @@ def _typical(made: Sequence[dict[str, Any]], error: float) -> dict[str, Any] | N
 
 
 def close(every: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """In how many pairs in which the default is ahead or behind that may be otherwise in another session."""
+    """In how many of the pairs in which the default is ahead or behind the two times are close."""
     decided = [at["standing"][headline.GIVEN] for at in every]
     ratios = [each["ratio"] for each in decided if each["verdict"] in ("ahead", "behind") and each["ratio"] is not None]
     return {"factor": CLOSE, "of": len(ratios), "n": sum(1.0 / CLOSE < ratio < CLOSE for ratio in ratios)}

@@ -50,7 +50,7 @@ def test_runs_that_differ_by_their_starts_have_ends_that_two_methods_agree_on(mo
 
 
 def rows(error=lambda way, tol: tol, **seconds):
-    """Five equal repetitions at each tolerance; a run takes `seconds` at the loosest, twice that at the next one."""
+    """Five equal repetitions at each tolerance. `seconds`: of a loosest run; each tighter tolerance doubles them."""
     head = {"group": ensembles.GROUP, "case": "linkages", "n_runs": 4, "t_end": 6.0, "first_s": 1.0, "n_failed": 0}
     made = [
         head

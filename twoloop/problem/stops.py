@@ -46,9 +46,9 @@ class Stop:
         value = check_finite(f"restitution of {self.name!r}", self.restitution)
         if not 0.0 <= value <= 1.0:
             raise ValueError(f"restitution of {self.name!r} must be from 0 to 1; given {value!r}")
-        if check_not_negative(f"friction of {self.name!r}", self.friction) and not callable(self.slide):
-            raise TypeError(f"slide of {self.name!r} must be a function of t and q, as it rubs; given {self.slide!r}")
-        if self.slide is not None:
+        rubs = check_not_negative(f"friction of {self.name!r}", self.friction) > 0.0
+        if rubs or self.slide is not None:
             if not callable(self.slide):
-                raise TypeError(f"slide of {self.name!r} must be a function of t and q; given {self.slide!r}")
+                why = ", as it rubs" if rubs else ""
+                raise TypeError(f"slide of {self.name!r} must be a function of t and q{why}; given {self.slide!r}")
             check_call(f"slide of {self.name!r}", "slide", self.slide, ("t", "q"))
