@@ -251,7 +251,7 @@ def test_callbacks_along_runs_are_compared_by_the_doubling_rule(monkeypatch):
 CALLS = {  # in a call with other parameters: beyond those before, and among them
     "four_bar": (830, 560),
     "heavy_top": (720, 470),
-    "spatial_four_bar": (760, 520),
+    "spatial_four_bar": (1390, 1120),
     "bricard": (640, 450),
     "redundant_slider_crank": (1330, 1090),
 }

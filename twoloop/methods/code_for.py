@@ -16,7 +16,7 @@ from twoloop.problem.system import ConstrainedSystem
 Array = NDArray[np.float64]
 Compiled = bool | Literal["auto"]
 
-SMALL = 100  # operations of the series of its motion: the code takes a few tenths of a second to build
+SMALL = 300  # operations of the series of its motion: the code takes at most 0.6 s to build
 
 
 def check_compiled(value: Compiled) -> Compiled:
