@@ -31,7 +31,7 @@ from studies.bench.solvers import (
 )
 from studies.bench.store import KeptRows, Output
 from studies.compare import GROUP, runs_of
-from studies.work_precision import first_calls, minimal, processors, rivals
+from studies.work_precision import behind, first_calls, minimal, processors, rivals
 from twoloop.rows.calibration import CALIBRATION, calibration_s
 
 ERRORS = (1e-2, 1e-4, 1e-6)  # the accuracies of the first screen
@@ -125,6 +125,7 @@ def report(output: Output, rows: pd.DataFrame, line: str) -> dict[str, Any]:
     known, medians = known_cases(output.call.quick), tables.medians(part(rows).reindex(columns=rows.columns))
     found = rivals.findings_of(everywhere)
     findings = findings_of(medians, known) | {"rivals": found}
+    findings["behind"] = behind.findings_of(found["mechanisms"], everywhere)
     findings["default_over"] = [default_over(everywhere, compiled) for compiled in (True, False)]
     findings |= {"violation": violation(medians), "asked": asked(part(rows, rivals.GROUP))}
     findings["versions"], findings["unlike"] = versions(), unlike(pd.concat([medians, everywhere], ignore_index=True))

@@ -1,0 +1,38 @@
+"""Where the default's time goes in the pairs in which it is behind, from rows made by hand."""
+
+import pandas as pd
+import pytest
+
+from studies.bench.render import number
+from studies.work_precision import behind, rivals
+from tests.studies.test_minimal import repeated
+from tests.studies.test_rivals import stated
+
+
+def pairs(inside):
+    """The default takes 4 s for an error of 1e-6, `inside` of them in its steps; heyoka takes 2 s."""
+    own = repeated(("auto, compiled", 1e-6, 4.0)).assign(inside_s=inside, n_steps=8.0)
+    return pd.concat([own, repeated(("heyoka", 1e-6, 2.0), family="heyoka").assign(n_steps=60.0)], ignore_index=True)
+
+
+@pytest.mark.parametrize(("inside", "part"), [(0.5, "outside"), (3.0, "steps")])
+def test_what_takes_longer_than_the_rival_is_told(inside, part):
+    rows = pairs(inside)
+    found = behind.findings_of(rivals.findings_of(rows)["mechanisms"], rows)
+    assert found["n"] > 0 and found["parts"][part] == found["n"] == sum(found["parts"].values())
+    (at,) = found["at"]
+    assert (at["steps_s"], at["n_steps"], at["rival_s"], at["rival_steps"]) == (inside, 8, 2.0, 60)
+
+
+def test_two_parts_that_are_each_shorter_than_the_rival_are_told_apart():
+    rows = pairs(2.5).assign(call_s=lambda made: made["call_s"].where(made["call_s"] != 2.0, 3.0))
+    rows["times"] = [(time,) * 5 for time in rows["call_s"]]
+    assert behind.findings_of(rivals.findings_of(rows)["mechanisms"], rows)["parts"]["both"] > 0
+
+
+def test_the_report_has_the_row_of_the_mechanism():
+    rows = pairs(0.5)
+    found = behind.findings_of(rivals.findings_of(rows)["mechanisms"], rows)
+    said = f"| four-bar | {number(3.5e6)} | {number(0.5e6)} | 8 | heyoka | {number(2e6)} | 60 |"
+    assert said in stated(1.0, behind=found)
+    assert "## Where the rest goes" not in stated(1.0)
