@@ -208,7 +208,7 @@ class Again:
         if not self.beginning.at(t0, q0, v0):
             return False
         run.t0, run.compared_to[0] = t0, -np.inf
-        if run.said_of_rows:  # of this time, with factors of this position; rounding may decide which row is left out
+        if run.said_of_rows:  # rounding may decide which row is left out
             run.redundant, run.said_of_rows = run.redundant_rows(self.look.rows)
         if self.movable is not None and not self.movable.agrees(t1, self.look.mass, self.check_derivatives):
             return False

@@ -105,6 +105,7 @@ class Run:
         self.compared_to = [-np.inf]  # how far callbacks were compared along the motion, in this run or the same before
         self._begin()
         self.rank = len(self.work.rows_v)
+        self.said: dict[tuple[int, ...], str] = {}  # of redundant rows, at the first start of this run where they are
         self.redundant, self.said_of_rows = self.redundant_rows()
 
     def again(self) -> "Run":
@@ -274,11 +275,13 @@ class Run:
                 f"the constraints of {self.system.name!r} contradict one another at t = {self.t0:g}: "
                 f"{self._in_words(rows, wrong)}, but not so their accelerations. Correct or leave out one of these rows"
             )
-        return np.array(redundant), (
-            f"the constraints of {self.system.name!r} have rank {self.rank} of {n_rows} at t = {self.t0:g}: "
-            f"{self._in_words(rows, redundant)}. They are left out of the solution and checked at every "
-            "step; multipliers are those of least norm. See docs/constraints.md#redundant-rows"
-        )
+        if (found := tuple(redundant)) not in self.said:
+            self.said[found] = (
+                f"the constraints of {self.system.name!r} have rank {self.rank} of {n_rows}, first at t = {self.t0:g}: "
+                f"{self._in_words(rows, redundant)}. They are left out of the solution and checked at every "
+                "step; multipliers are those of least norm. See docs/constraints.md#redundant-rows"
+            )
+        return np.array(redundant), self.said[found]
 
     def contradicting(self, rows: Rows) -> NDArray[np.int64]:
         """Of C_q and A at the start, rows that depend on others with which the accelerations disagree."""

@@ -7,6 +7,8 @@ from numba import types
 from twoloop.kernels.algebra.linalg import ldl_factor, ldl_solve
 from twoloop.kernels.data.common import INTEGERS, MATRIX, VECTOR, compiled, f8, i8, kernel, merged
 
+MOST_OF_IT = 0.5  # of the square of a row's length: with more left, what is left is orthogonal to rounding
+
 
 @compiled
 def _dot(x, y):
@@ -16,13 +18,26 @@ def _dot(x, y):
     return total
 
 
+@compiled
+def _without_parts(basis, n, rest, parts):
+    """Take the parts that n orthonormal rows have in a row out of it; the square of the length that is left."""
+    for i in range(n):
+        part = _dot(basis[i], rest)
+        if part != 0.0:
+            parts[i] += part
+            for j in range(rest.size):
+                rest[j] -= part * basis[i, j]
+    return _dot(rest, rest)
+
+
 @merged
 def first_rows(G, least, basis, factors, kept):
     """Put down the first rows that no rows before add up to, and return how many they are.
 
     Such a row keeps more than the share `least` of its length without its part in those before, by Gram and Schmidt's
-    orthogonalisation, made twice. It is the combination of the rows of `basis`, of length 1, that a row of the lower
-    triangle `factors` says; these two have as many rows as can be independent, and one more for scratch.
+    orthogonalisation, repeated where most of the row is lost. It is the combination of the rows of `basis`, of length
+    1, that a row of the lower triangle `factors` says; these two have as many rows as can be independent, and one more
+    for scratch.
     """
     n_kept = 0
     for k in range(len(G)):
@@ -33,15 +48,11 @@ def first_rows(G, least, basis, factors, kept):
             rest[j] = G[k, j]
         for i in range(n_kept):
             parts[i] = 0.0
-        for _ in range(2):
-            for i in range(n_kept):
-                part = _dot(basis[i], rest)
-                if part != 0.0:
-                    parts[i] += part
-                    for j in range(rest.size):
-                        rest[j] -= part * basis[i, j]
-        square = _dot(rest, rest)
-        if square > least**2 * _dot(G[k], G[k]):
+        length = _dot(G[k], G[k])
+        square = _without_parts(basis, n_kept, rest, parts)
+        if square < MOST_OF_IT * length:
+            square = _without_parts(basis, n_kept, rest, parts)
+        if square > least**2 * length:
             parts[n_kept] = math.sqrt(square)
             for j in range(rest.size):
                 rest[j] /= parts[n_kept]
