@@ -45,6 +45,18 @@ def test_stiffness_is_found_where_steps_are_shorter_than_stability_asks_for():
     assert worst(one.q[:, -1], other.q[:, -1]) < 1e-7
 
 
+@pytest.mark.parametrize(("tol", "most"), [(1e-3, 1000), (1e-6, 2000)])
+def test_a_trial_comes_at_once_where_it_costs_little_beside_the_run_to_come(tol, most):
+    """Of the governor, whose explicit steps would be limited by stability for 30,000 evaluations."""
+    problem = governor()
+    result = solve_dae(problem.system, (0.0, problem.reference.t), problem.q0, problem.v0, "auto", tol, tol)
+    assert (
+        result.success and result.stats.n_evaluations < most
+    )  # 670 and 1530; with 100 explicit steps before: 1300, 2700
+    short = solve_dae(problem.system, (0.0, 0.01), problem.q0, problem.v0, "auto", tol, tol)
+    assert short.success and short.stats.n_jacobians == 0  # there it would cost more than the run
+
+
 def test_what_is_chosen_does_not_depend_on_where_time_begins():
     """A trial that is due at the first look is priced from the start of the run."""
     system, options = sprung_pair(1e6, 2e-3), {"check_derivatives": False, "compiled": False}
@@ -59,7 +71,7 @@ def test_what_is_chosen_does_not_depend_on_where_time_begins():
 def test_steps_that_are_explicit_again_are_not_divided_by_newtons_method():
     """As the solution between steps would take longer than the run."""
     problem = moderately_stiff_beam()
-    result = solve_dae(problem.system, (0.0, 0.1), problem.q0, problem.v0, "auto", 1e-7, 1e-7, dense_output=True)
+    result = solve_dae(problem.system, (0.0, 0.1), problem.q0, problem.v0, "auto", 1e-8, 1e-8, dense_output=True)
     assert result.stats.n_jacobians > 0
     n_divided = sum(len(t) for t, _ in result.sol.interpolator.interiors(result.sol.table))
     assert 0 < n_divided < 0.1 * result.h.size

@@ -1,14 +1,15 @@
 """Two methods in one run: an explicit one, and Newton's where stiffness would make its steps tiny.
 
 Now and then the largest rate of the motion, rho, the root of the largest eigenvalue of dF/dq or that of dF/dv, F being
-the accelerations, is found by a few power iterations, one evaluation each. While the explicit method takes steps of
-h rho well below its limit of stability, nothing is stiff. Where h rho has come near it, stiffness or accuracy may be
-the reason: then the implicit method is tried for a window of steps, in which its errors count tenfold, and is kept if a
-second of motion costs it less. So it is where h rho is smaller, but rho far above the rates that the motion shows:
-what decays so fast may keep the estimate of the error from longer steps. A trial that may be in vain waits until the
-run has cost a few times as much. Costs are counted in evaluations of the explicit method; with code made for the
-mechanism one of the implicit method counts several times. This is left in the same way, after a trial of the explicit
-method, where its own steps have come below that limit. What is not kept is next tried after twice as many looks.
+the accelerations, is found by a few power iterations, one evaluation each. While the explicit method takes steps of h
+rho well below its limit of stability, nothing is stiff. Where h rho has come near it, stiffness or accuracy may be the
+reason: then the implicit method is tried for a window of steps, in which its errors count tenfold, and is kept if a
+second of motion costs it less. So it is where h rho is smaller, but rho far above the rates that the motion shows: what
+decays so fast may keep the estimate of the error from longer steps. A trial that may be in vain waits until the run has
+cost a few times as much, unless the run as a whole is to cost ten times as much at its present price. Costs are counted
+in evaluations of the explicit method; with code made for the mechanism one of the implicit method counts several times.
+This is left in the same way, after a trial of the explicit method, where its own steps have come below that limit. What
+is not kept is next tried after twice as many looks.
 
 Both methods are called by their addresses, and are compiled once, where they are.
 """
@@ -36,7 +37,9 @@ SEED = 1e-3  # what a component of a direction begins with, of the largest
 SURELY = 3.0  # times LIMIT: where the step is next to the limit of stability
 EARN = 64.0  # evaluations for each independent coordinate before a trial that differences, some eight of each
 TRIAL = 300.0  # evaluations that a trial of the implicit method takes, about
-AFFORDED = 3.0  # trials that the run has cost so far, before one that may be in vain
+AFFORDED = 3.0  # trials that the run has cost so far, before one that may be in vain ...
+OF_RUN = 0.3  # ... or this share of what the run will cost as a whole, if it goes on as it does
+HUNDREDTHS = 100.0  # of the run, GAP is one of them
 APART = 30.0  # rates that the motion does not show are as many times as fast as those that it shows ...
 WORTH = 0.05  # ... and h rho this share of LIMIT: steps may be short for the sake of what an implicit method damps
 INSTANT = 1e-4  # over the largest rate: the time over which the motion's own is differenced
@@ -239,7 +242,7 @@ def _settle_trial(w, options, memory, t):
 
 
 @compiled
-def _look(f, w, options, memory, t, state, new_state):
+def _look(f, w, options, memory, tolerances, t, state, new_state):
     """Whether the other method is due for a trial; returns the phase to begin, or -1."""
     n = w.Q.size
     memory[RATE] = _largest_rate(f, w, memory, t, state, new_state)
@@ -253,8 +256,10 @@ def _look(f, w, options, memory, t, state, new_state):
     if memory[LOOKS_TO_WAIT] > 0.0:
         return -1
     # a trial that may be in vain, in which derivatives are differenced, has to cost little beside the run so far
-    trial = TRIAL * options[DEARER]
-    cheap = cost > AFFORDED * trial and (f.flags[FORCE_BY_Q_GIVEN] == 1 or cost > EARN * w.independent.size)
+    paid, afforded = cost, AFFORDED * TRIAL * options[DEARER]
+    if np.isfinite(tolerances[GAP]):
+        paid = max(paid, OF_RUN * HUNDREDTHS * tolerances[GAP] * price)
+    cheap = paid > afforded and (f.flags[FORCE_BY_Q_GIVEN] == 1 or paid > EARN * w.independent.size)
     hidden = False
     if memory[PHASE] == EXPLICIT and cheap and share > WORTH:
         Q, V, A = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n]
@@ -309,7 +314,7 @@ def switching_step(f, w, options, memory, t, h, tolerances, state, new_state):
         if memory[PHASE] == ON_TRIAL or memory[PHASE] == BACK_ON_TRIAL:
             phase = _settle_trial(w, options, memory, t)
         elif w.counters[N_EVALUATIONS] >= memory[LOOK_AT]:
-            phase = _look(f, w, options, memory, t, state, new_state)
+            phase = _look(f, w, options, memory, tolerances, t, state, new_state)
         if phase >= 0:
             was_explicit = _is_explicit(memory)
             _enter(w, options, memory, phase, t)
