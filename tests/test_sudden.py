@@ -8,7 +8,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from tests import problems
-from twoloop import ensemble, solve_dae
+from twoloop import Status, ensemble, solve_dae
 from twoloop.generate.time_dependence import may_be_sudden
 from twoloop.mechanisms import driven_slider_crank, four_bar
 
@@ -23,6 +23,18 @@ def gust(t, q, v, p):
 
 def switched(t, q, v, p):
     return np.array([SIZE if abs(t - p[0]) < p[1] else 0.0, -9.81])
+
+
+def not_a_number(t, q, v, p):
+    return np.array([np.nan if abs(t - p[0]) < p[1] else 0.0, -9.81])
+
+
+def infinite(t, q, v, p):
+    return np.array([np.inf if abs(t - p[0]) < p[1] else 0.0, -9.81])
+
+
+def outside_not_a_number(t, q, v, p):
+    return np.array([0.0 if q[0] < 1.0 + 1e-6 else np.nan, -9.81])
 
 
 def vibrating(t, q, v, p):
@@ -144,6 +156,27 @@ def test_nor_is_a_smooth_force_at_such_a_place(options, tolerance):
         run = (0.0, T_END), START[0], [3.0, 0.0]
         result = solve_dae(system, *run, rtol=tolerance, atol=tolerance, **options)
         assert result.success and np.abs(result.q[:, -1] - expected).max() < 1e3 * tolerance
+
+
+@pytest.mark.parametrize("method", ["Adams", "BDF", "SunRadau5"])
+def test_nor_is_a_force_that_is_not_finite(method):
+    """For a 300th and a thousandth of the run; it hid later changes, too."""
+    for at, share in zip(PLACES, (300, 1000) * 6, strict=True):
+        for wrong in (not_a_number, infinite):
+            system = pendulum(wrong, at, 0.5 * T_END / share)
+            result = solve_dae(system, (0.0, T_END), *START, method=method, rtol=1e-6, atol=1e-6)
+            assert result.status is Status.NOT_FINITE and abs(result.t[-1] - at) < T_END / share, result
+
+
+@pytest.mark.parametrize("method", ["auto", "Adams"])
+def test_what_is_not_finite_where_no_step_comes_ends_no_run(method):
+    """x is at most 1, and its parabola goes beyond."""
+    counts = []
+    for force in (outside_not_a_number, lambda t, q, v, p: np.array([0.0 * t**0.5, -9.81])):
+        result = solve_dae(pendulum(force, compile=False), (0.0, T_END), START[0], [6.2, 0.0], method)
+        assert result.success and result.q[0].max() > 0.99
+        counts.append(len(result.h))
+    assert counts[0] < 2 * counts[1]
 
 
 def test_a_force_that_raises_where_no_step_comes_is_looked_at_where_steps_begin():

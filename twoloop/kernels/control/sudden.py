@@ -2,10 +2,10 @@
 
 They are called at times ahead: a call of one callback where a look at the equations is an evaluation. Of what is smooth
 over some of these times second differences are small against the range of the values, less the line from the first to
-the last; of what happens within one or two of them they are as large. A step is to end there. Where something may be
-sharp by place or speed, steps longer than the spacing of these times are looked at along the parabola on which the
-motion sets out: each long one, and at once all short ones that end within LONG spacings. Ahead of others the state
-stays that where the step begins.
+the last; of what happens within one or two of them they are as large. A step is to end there, and where a value is
+not finite, so that the run meets it. Where something may be sharp by place or speed, steps longer than the spacing of
+these times are looked at along the parabola on which the motion sets out: each long one, and at once all short ones
+that end within LONG spacings. Ahead of others the state stays that where the step begins.
 """
 
 import numpy as np
@@ -64,20 +64,24 @@ def sudden_time(f, w, tolerances, t, begin, spacing, last, along, q, v, a):
     """The first of the times ahead at which something changes suddenly, or infinity; and up to where it was looked.
 
     The state is that at t, the times go from `begin`, none is after `last`; `along` tells whether the state goes with
-    them. A value that is not finite is left to the step.
+    them.
     """
-    changes, n = w.changes, 0
+    changes, n, first = w.changes, 0, np.inf
     for k in range(PLACES + 1):
         time = begin + k * spacing
         if time > last:
             break
-        n = k
         _call(f, w, time, along * (time - t), q, v, a, changes[k])
         for j in range(changes.shape[1]):
-            changes[LARGEST, j] = max(changes[LARGEST, j], abs(changes[k, j]))
+            if np.isfinite(changes[k, j]):
+                changes[LARGEST, j] = max(changes[LARGEST, j], abs(changes[k, j]))
+            elif k > 0:
+                first = time
+        if first < np.inf:
+            break
+        n = k
     least = LEAST * tolerances[RTOL]
     of_forces, of_rates = least * _largest(changes[LARGEST, : q.size]), least * _largest(changes[LARGEST, q.size :])
-    first = np.inf
     for j in range(changes.shape[1]):
         values = changes[:, j]
         slope = along * (values[n] - values[0]) / max(n, 1)
