@@ -177,13 +177,14 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     found: dict[str, Any] = {"cases": [{"name": name, "t_end": t_end[name]} for name in cases], "tableaux": tableaux}
     found |= {"against": against, "margin": MARGIN, "n_compared": len(ratios(rows, PROJECTED, "n_evaluations"))}
     found |= {"frozen": {"at_least": _span(frozen_ratios(rows)), "best": frozen.to_dict()}, "orders": orders}
-    found |= {"frozen_order_one": all(value < ONE for value in orders[FROZEN].values()), "kept": kept}
+    found |= {"frozen_order_one": all(value < ONE for value in orders[FROZEN].values())}
     # a step that does not end in a stage is projected in the stabilised form
     found["projected_at_end"] = [name for name in at_end if name in tableaux]
     found["stabilised_alone"] = {name: float(x) for name, x in stabilised.items() if name not in at_end}
     found["kept_as_well"] = kept[PROJECTED] <= max(KEPT, kept[PAPER])
     # in the first and in the last tenth of the run that the figure shows
     found["drift"] = None if drift is None else [float(drift[f"violation_{part}"]) for part in ("early", "late")]
+    found["controlled_drift"] = _controlled_drift(controlled)
     found["grows"] = GROWS
     found |= {what: {name: each[what] for name, each in cases.items()} for what in ("longest", "median_h", "costs")}
     found |= {"tolerance": float(SAME_TOLERANCE), "told": {name: list(TOLD[name]) for name in cases}}
@@ -214,6 +215,13 @@ def of_case(name: str, rows: pd.DataFrame) -> dict[str, Any]:
         "median_h": median_h.astype(float).reindex(VARIANTS).replace(np.nan, None).to_dict(),
         "costs": {variant: costs(variant) for variant in VARIANTS},
     }
+
+
+def _controlled_drift(controlled: pd.DataFrame) -> list[float] | None:
+    """The violation of the unprojected form in the first and last tenth of the run at the tolerance of the table."""
+    own = where(controlled, case=LINKAGE, tableau=SUN.name, solver=UNPROJECTED)
+    own = own[np.isclose(own["tol"].astype(float), SAME_TOLERANCE)]
+    return None if own.empty else [float(own[f"violation_{part}"].iloc[0]) for part in ("early", "late")]
 
 
 def _drawn(fixed: pd.DataFrame) -> float:

@@ -23,7 +23,7 @@ as they were raised; do not edit it by hand.
 # what stands above the table of a group
 MEANT = {
     "result.certify": """\
-A certificate that passes means: made again by an unlike method, which looked at the equations at places no further
+A certificate that passes means: recomputed by a different method, which evaluated the equations at places no further
 apart than `certificate.gap`, no step of the run ends more than 200 tolerances from where they lead. What lasts less
 than the gap may be missed, and so may what moves every step by less than that. How errors of steps grow over the run
 is not bounded, and whether the model is right is not known. One that does not pass gives a `CertificateWarning` that

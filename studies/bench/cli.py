@@ -6,7 +6,7 @@ import platform
 import subprocess
 import sys
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import date
 from functools import cache
@@ -77,7 +77,7 @@ def stamp(command: str) -> str:
     """One line: command, date, commit, machine, versions."""
     versions = [f"{package} {version_of(package, '(not installed)')}" for package in PACKAGES]
     machine = f"{processor()}, {os.cpu_count()} cores"
-    system = f"{platform.system()}, Python {platform.python_version()}"
+    system = ", ".join([platform.system(), *generation(_cpuinfo()), f"Python {platform.python_version()}"])
     return "; ".join([f"`{command}`", date.today().isoformat(), f"commit {commit()}", machine, system, *versions])
 
 
@@ -107,8 +107,20 @@ def commit() -> str:
 @cache
 def processor() -> str:
     """The model of this machine's processor, as the system names it."""
+    return _cpuinfo().get("model name") or platform.processor() or platform.machine()
+
+
+def generation(known: Mapping[str, str]) -> list[str]:
+    """Family and model, where the name of the processor does not tell its generation ("AMD EPYC")."""
+    keys = ("cpu family", "model")
+    return [" ".join(f"{key} {known[key]}" for key in keys)] if all(key in known for key in keys) else []
+
+
+def _cpuinfo() -> dict[str, str]:
+    """What Linux says of its first processor."""
     try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-        return next(line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
-    except (OSError, StopIteration):
-        return platform.processor() or platform.machine()
+        first = Path("/proc/cpuinfo").read_text().split("\n\n")[0]
+    except OSError:
+        return {}
+    lines = (line.partition(":") for line in first.splitlines())
+    return {key.strip(): value.strip() for key, _, value in lines}

@@ -14,16 +14,16 @@ SMOOTH, STIFF, SINGULAR, LONG = "short smooth motion", "stiff", "singular", "lon
 FOUR_BARS = "four-bar linkages, over 10 s"  # which have no tags
 KINDS = {  # tags of mechanisms, and what a user calls them; a mechanism of several counts for the first
     STIFF: "stiff springs and dampers",
-    SINGULAR: "singular positions on the way",
+    SINGULAR: "motion through singular positions",
     "driven": "driven by a given motion",
-    "non-holonomic": "rolling, or sliding on an edge",
+    "non-holonomic": "rolling or a knife edge",
     "redundant": "redundant constraints",
     "spatial": "other spatial mechanisms",
 }
-IN_ANGLES = {"loops": "loops that close in closed form", "pendulums": "pendulums"}  # what a user calls these
+IN_ANGLES = {"loops": "loops solvable in closed form", "pendulums": "pendulums"}  # what a user calls these
 BEAMS = {  # of the study of the beam, and their classes
-    "moderately stiff": "stiff beam, vibrations irrelevant",
-    "very flexible": "flexible beam, vibrations wanted",
+    "moderately stiff": "stiff beam (tip), vibrations irrelevant",
+    "very flexible": "flexible beam (tip), vibrations wanted",
 }
 BEAM_CLASSES = ("stiff, vibrations irrelevant", "stiff, vibrations wanted")  # which the beam's report judges by the tip
 
@@ -73,15 +73,18 @@ def _shares(won: Mapping[str, int], of: str, coded: bool) -> str:
 
 def _by_the_tip(case: Mapping[str, Any]) -> dict[str, str]:
     """The cheapest on a beam by the error of its tip; several where none is clearly cheaper."""
-    by: dict[str, list[str]] = defaultdict(list)
+    by: dict[frozenset[str], list[str]] = defaultdict(list)
+    words: dict[frozenset[str], str] = {}
     for at in case["at"]:
         if at["best"] is not None:
             undecided = at.get("verdict") == "undecided"
             names = [at[which]["solver"] for which in (("ours", "others") if undecided else ("best",))]
             either = dict.fromkeys((*names, *at.get("ties", ())))
-            by[" or ".join(call(name) for name in either)].append(power(at["error"]))
-    take = ", ".join(f"{who} ({listed(errors)} m)" for who, errors in by.items())
-    return {"what": f"{BEAMS[case['name']]}, by its tip", "take": take or "no solver compared reaches these errors"}
+            who = frozenset(either)
+            words.setdefault(who, " or ".join(call(name) for name in either))
+            by[who].append(power(at["error"]))
+    take = ", ".join(f"{words[who]} ({listed(errors)} m)" for who, errors in by.items())
+    return {"what": BEAMS[case["name"]], "take": take or "no solver compared reaches these errors"}
 
 
 def _of_energy(entry: Mapping[str, Any], coded: bool) -> dict[str, str]:
@@ -89,7 +92,7 @@ def _of_energy(entry: Mapping[str, Any], coded: bool) -> dict[str, str]:
     sides = (entry["picks"], entry.get("without_drift", []))
     told = [listed(dict.fromkeys(call(pick["solver"], coded) for pick in picks)) for picks in sides]
     without = f"; without drift {told[1]}" if told[1] else ""
-    what = f"energy over {power(entry['t_end'])} s (four-bar, timed once each)"
+    what = f"energy over {power(entry['t_end'])} s (four-bar, timed once)"
     return {"what": what, "take": (told[0] or "no solver compared reaches these errors") + without}
 
 

@@ -83,8 +83,8 @@ def _paper_on(rows: Rows, case: str) -> pd.Series:
 
 def step_order(rows: Rows, case: str, order: float) -> Judgement:
     run = _paper_on(rows, case)
-    met = order / HALF_A_DECADE <= run["h_median"] <= order * HALF_A_DECADE
-    return decide([met], median=float(run["h_median"]))
+    median, limits = float(run["h_median"]), [1.0 / HALF_A_DECADE, HALF_A_DECADE]
+    return decide([limits[0] <= median / order <= limits[1]], median=median, ratio=median / order, limits=limits)
 
 
 def beams_work(rows: Rows) -> Judgement:

@@ -111,8 +111,6 @@ def long_of(rows: pd.DataFrame) -> dict[str, Any]:
         over = np.inf if other is None else 0.0 if free is None else other["call_s"] / free["call_s"]
         level["pays"] = free is not None and over * (1.0 - EQUAL) > 1.0
         at.append(level | {"equal": free is not None and 1.0 - EQUAL <= over <= 1.0 / (1.0 - EQUAL)})
-    bounds = [level["energy"] for level in at[1:]]
-    lucky = [cheapest(reached[(reached["energy"].abs() <= bound) & (reached["worst"] > bound)]) for bound in bounds]
     kept = [level["no_drift"]["ours"] for level in at[1:] if level["no_drift"]["ours"]]
     sides = [(level["no_drift"]["ours"], level["drift"]["ours"]) for level in at[1:]]
     both = [side for side in sides if all(side)]
@@ -125,7 +123,6 @@ def long_of(rows: pd.DataFrame) -> dict[str, Any]:
     calm_ours["drifting_explicit"] = bool(both) and all(other["explicit"] for _, other in both)
     found = {"case": SWITCHING, "problem": rows["problem"].iloc[0], "t_end": float(rows["t_end"].iloc[0])}
     found |= {"kinetic": kinetic, "no_drift": at[0]["no_drift"], "at": at[1:]}
-    found["lucky"] = [run | {"within": bound} for run, bound in zip(lucky, bounds, strict=True) if run]
     found |= {"calm_ours": calm_ours, "n_pays": sum(level["pays"] for level in at[1:])}
     found |= {"n_equal": sum(level["equal"] for level in at[1:]), "equal": EQUAL}
     return found | {"alternatives": [told(rows.loc[place]) for place in places]}  # of each the run of least error

@@ -1,4 +1,4 @@
-"""Which solver says so when it is wrong: every solver on every trap, right, said so, wrong and silent, or hung."""
+"""Which solvers report when they are wrong: every solver on every trap, right, with a report, silent, or hung."""
 
 import time
 import warnings

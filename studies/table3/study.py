@@ -192,7 +192,7 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     irk, newmark = (machine(first, group, ERR_IN, ERR_IN) for group in FAMILIES)
     if irk is None or newmark is None:
         raise StudyError("the rows lack cells of Table 3; make them again by python -m studies.table3")
-    found: dict[str, Any] = {"t_end": float(first["t_end"].iloc[0]), "floor": float(first["floor"].iloc[0])}
+    found: dict[str, Any] = {"t_end": float(first["t_end"].iloc[0])}
     found |= {"lost_limit": LOST, "astray_limit": ASTRAY}
     found["paper_ratio"] = float(PAPER_NEWMARK[3][3] or 0.0) / PAPER_IRK[3][3]
     for name, cell in (("irk", irk), ("newmark", newmark)):

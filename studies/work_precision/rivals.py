@@ -25,7 +25,6 @@ from studies.bench.end_states import case_of, row_of
 from studies.bench.render import number, power
 from studies.bench.solvers import CATALOGUE, HEYOKA, OWN, RIVALS, TAYLOR
 from studies.bench.store import KeptRows, Row
-from studies.bench.tables import by_solver
 from studies.validation.study import MAKE
 from twoloop import mechanisms, solve_dae
 from twoloop.mechanisms import Problem, Reference
@@ -175,7 +174,6 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     python = rows[rows["called_from"] == "Python"]["solver"].unique()
     ahead = [at["standing"][headline.BEST] for at in every if at["standing"][headline.BEST]["verdict"] == "ahead"]
     found["ahead_of_python"] = sum(best["rival"]["solver"] in python for best in ahead)
-    found["shortest"] = shortest(rows)
     found["processors"] = sorted(rows["processor"].dropna().unique()) if "processor" in rows else []
     return found
 
@@ -215,20 +213,6 @@ def fewest(rows: pd.DataFrame) -> dict[str, Any]:
     ended = others[others["error_q"].notna()].groupby("case")["solver"].nunique()
     ended = ended.reindex(rows["case"].unique(), fill_value=0)
     return {"case": str(ended.idxmin()), "ended": int(ended.min()), "n": n}
-
-
-def shortest(rows: pd.DataFrame) -> dict[str, Any]:
-    """The shortest call of ours; in how many pairs of mechanism and error a rival takes less than ours on it at any.
-
-    On the same mechanism: rows of different days may differ by the speed of the machine.
-    """
-    ours, below = rows[rows["family"] == "two-loop"].astype({"call_s": float}).groupby("case")["call_s"].min(), []
-    for case, own in rows[rows["family"] != "two-loop"].groupby("case", sort=False):
-        grouped = by_solver(own, "call_s")
-        for costs in (tables.costs_at(grouped, error) for error in DECADES):
-            best = min(costs, key=lambda name: costs[name][0], default=None)
-            below += [best] if best is not None and costs[best][0] < ours.get(case, 0.0) else []
-    return {"call_s": float(ours.min()), "n": len(below), "heyoka": below.count(HEYOKA)}
 
 
 def put(rows: pd.DataFrame) -> dict[str, Any]:

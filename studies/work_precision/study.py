@@ -5,7 +5,6 @@ Four cases are run at length, over their whole motion; all others, with more riv
 
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import chain
 from typing import Any
 
 import pandas as pd
@@ -19,7 +18,6 @@ from studies.bench.row_files import versions
 from studies.bench.solvers import (
     COMPARED,
     COMPARED_OWN,
-    COMPILED,
     DEFAULT,
     IDA_C_ORDER_2,
     IDA_INDEX_1,
@@ -40,7 +38,6 @@ STIFF = ("TRBDF2", *RADAU[1:], IDA_C_ORDER_2)  # in their place on stiff cases; 
 BETWEEN = (7e-4, 5e-4, 3e-4, 2e-4)  # tolerances of the first of these, whose loose runs lie on no line
 QUICK = (*COMPARED[:4], "RadauIIA5", "IDA, stabilised")  # others take seconds to compile or to run
 QUICK_CASES = ("four-bar",)  # the beams' references take seconds
-NEAR_BEST = 1.3  # times the time of the best of ours
 SHOWN = (GROUP, rivals.GROUP, first_calls.GROUP, minimal.GROUP)  # groups of the rows that the report is of
 TIME_LIMIT = 3.0  # s of CPU of a run: slower ones are of no use beside others
 
@@ -126,7 +123,6 @@ def report(output: Output, rows: pd.DataFrame, line: str) -> dict[str, Any]:
     found = rivals.findings_of(everywhere)
     findings = findings_of(medians, known) | {"rivals": found}
     findings["behind"] = behind.findings_of(found["mechanisms"], everywhere)
-    findings["default_over"] = [default_over(everywhere, compiled) for compiled in (True, False)]
     findings |= {"violation": violation(medians), "asked": asked(part(rows, rivals.GROUP))}
     findings["versions"], findings["unlike"] = versions(), unlike(pd.concat([medians, everywhere], ignore_index=True))
     findings["first_calls"] = first_calls.findings_of(first_calls.at_error(part(rows, first_calls.GROUP), everywhere))
@@ -134,8 +130,7 @@ def report(output: Output, rows: pd.DataFrame, line: str) -> dict[str, Any]:
     in_angles = on_the_same_processor(part(rows, minimal.GROUP), part(rows, rivals.GROUP))
     findings["measured"] = measured_on(rows[rows["group"].isin(SHOWN)])
     findings["repetition"] = {"calls": int(part(rows, rivals.GROUP)["calls"].max()), "below": rivals.TIMED}
-    findings["repetition"] |= {"once": made_once(everywhere), "outclassed": adaptive.OUTCLASSED}
-    findings["repetition"] |= means_over_medians(part(rows, rivals.GROUP))
+    findings["repetition"]["outclassed"] = adaptive.OUTCLASSED
     findings["price"] = headline.price(everywhere, part(rows, first_calls.GROUP), rivals.HEADLINE)
     in_angles = in_angles if in_angles.empty else tables.medians(in_angles)
     findings["minimal"] = minimal.findings_by_kind(in_angles, everywhere)
@@ -147,20 +142,6 @@ def report(output: Output, rows: pd.DataFrame, line: str) -> dict[str, Any]:
     return findings
 
 
-def means_over_medians(rows: pd.DataFrame) -> dict[str, Any]:
-    """How many times its median call the mean call of a repetition takes, of ours and of others, in the median.
-
-    `before`: mechanisms whose rows are older, and hold the mean of a few calls in the place of the median of more.
-    """
-    several = rows[rows["calls"] > 1]
-    if "call_mean_s" not in rows or several["call_mean_s"].isna().all():
-        return {}
-    old = several[several["call_mean_s"].isna()]
-    over = (several["call_mean_s"] / several["call_s"]).groupby(several["family"] == "two-loop").median()
-    before = {"cases": sorted(old["case"].unique()), "calls": int(old["calls"].max())} if len(old) else None
-    return {"mean": {"ours": over.get(True), "others": over.get(False)}, "before": before}
-
-
 def unlike(medians: pd.DataFrame) -> dict[str, Any]:
     """How many repetitions were not of the run alone, and of which runs."""
     own = medians[medians["unlike"] > 0]
@@ -168,33 +149,10 @@ def unlike(medians: pd.DataFrame) -> dict[str, Any]:
     return {"n": int(own["unlike"].sum()), "runs": named, "times": tables.UNLIKE}
 
 
-def default_over(rows: pd.DataFrame, compiled: bool) -> dict[str, Any]:
-    """The default's time over that of the best of ours, both with code made for the mechanism or both without.
-
-    Over all mechanisms and decades that any of these reaches. `rows`: medians.
-    """
-    default = headline.OWN_CODE if compiled else DEFAULT
-    own, over = rows[(rows["family"] == "two-loop") & (rows["solver"].isin(list(COMPILED)) == compiled)], []
-    by_case = (tables.rankings(runs, rivals.DECADES) for _, runs in own.groupby("case", sort=False))
-    for ranked in chain.from_iterable(by_case):
-        mine = ranked[ranked["solver"] == default]["call_s"]
-        over += [float(mine.iloc[0] / ranked["call_s"].iloc[0]) if len(mine) else None] if len(ranked) else []
-    reached = [each for each in over if each is not None]
-    found = {"solver": default, "n": len(over), "n_unreached": len(over) - len(reached), "near": NEAR_BEST}
-    return found | {"worst": max(reached, default=None), "n_within": sum(each <= NEAR_BEST for each in reached)}
-
-
 def violation(rows: pd.DataFrame) -> float | None:
     """The largest violation of the positions by ours at any stored state of the four-bars."""
     own = rows[(rows["family"] == "two-loop") & rows["case"].isin(rivals.GEOMETRIES)]["violation_q"].dropna()
     return float(own.astype(float).max()) if len(own) else None
-
-
-def made_once(medians: pd.DataFrame) -> dict[str, float]:
-    """Shares of the settings that ended and were timed once, of ours and of others."""
-    ended = medians[medians["error_q"].notna()]
-    ours = ended["family"] == "two-loop"
-    return {who: float((own["repeats"] == 1).mean()) for who, own in (("ours", ended[ours]), ("others", ended[~ours]))}
 
 
 def asked(rows: pd.DataFrame) -> dict[str, Any]:

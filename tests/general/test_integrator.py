@@ -1,5 +1,7 @@
 """An integrator that is kept: its runs are those of solve_dae, and motions made sample by sample are right."""
 
+from importlib.util import find_spec
+
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
@@ -106,7 +108,8 @@ def test_a_sampled_controller_of_a_pendulum(method, error, tmp_path):
         result.certify()
     result.save(tmp_path / "run.npz")
     result.animate(tmp_path / "run.html")
-    assert result.plot() is not None
+    if find_spec("matplotlib"):  # an extra
+        assert result.plot() is not None
     with pytest.raises(ValueError, match="parameters changed at samples"):
         load(tmp_path / "run.npz", problem.system).certify()
     assert (problem.system.parameters[servo] == 0.0).all()  # the system stays as it was

@@ -34,6 +34,11 @@ def test_errors_and_ctrl_c_end_with_one_line(capsys):
     assert end.value.code == 130 and said.count("\n") == 1 and "the same command continues" in said
 
 
+def test_a_processor_is_known_by_its_family_where_its_name_is_short():
+    assert cli.generation({"model name": "AMD EPYC", "cpu family": "26", "model": "2"}) == ["cpu family 26 model 2"]
+    assert cli.generation({"model name": "a machine without families"}) == []
+
+
 def test_the_stamp_is_one_line():
     line = cli.stamp("python -m studies.x")
     assert line.startswith("`python -m studies.x`; ") and "\n" not in line and "numba" in line and "commit" in line

@@ -227,7 +227,7 @@ def test_what_can_be_trusted_is_counted(tmp_path):
     assert said in screen(tmp_path, validation=stopped)
     parts = {"singular": 51, "given": 45}
     text = screen(tmp_path, validation=VALID | {"wrong_others": parts})
-    assert "of rivals are wrong, 51 of the latter at singular positions, where the accelerations given" in text
+    assert "of rivals are wrong, 51 of the latter at singular positions, where accelerations, given" in text
     by = {"solve_dae": 20, "known motion": 30, "bounds": 2, "tests": 20}
     planted = {"n": 73, "missed": ["x"], "by": by, "models": {"n": 20, "stopped": 12}}
     text = screen(tmp_path, planted_errors=planted)

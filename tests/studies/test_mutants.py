@@ -95,5 +95,5 @@ def text_of(seen_by, why=""):
 
 def test_sentences_turn_with_the_rows():
     assert "Not seen" not in text_of("test_x.py::test_it")
-    assert "| bdf.py:3 | 1 → 2 | **no test sees it** |" in text_of(mutants.NONE)
+    assert "| bdf.py:3 | 1 → 2 | **no test detects it** |" in text_of(mutants.NONE)
     assert "because" in text_of(mutants.NONE, "because")

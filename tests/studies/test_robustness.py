@@ -120,21 +120,21 @@ def test_sentences_turn_with_the_rows():
     _, good = said(robustness, rows_of("right"))
     assert "None on the linkages, at any size or mass, is silently wrong." in good
     assert "with all methods together, none of 1 runs is silently wrong. At a tolerance of" in good
-    text = "On 1 random mechanisms under sharp forces, each run at one tolerance from 1e-4 to 1e-4, the default ends "
-    text += "200 tolerances off in the median and 200 at most (0 report failure)"
+    text = "On 1 random mechanisms under sharp forces, each run at one tolerance from 1e-4 to 1e-4, the error of the "
+    text += "default is 200 tolerances in the median and 200 at most (0 report failure)"
     assert text + "; no other project's solver was run." in good
     assert "so up to 1e-5 m or rad are allowed." in good
     assert "| error allowed, largest | 0.50 |" in good and "| BDF | 1e-6 … 1e3 | 1e-6 … 1e3 | 1e-6 … 1e3 |" in good
-    assert "1 runs that count as right there are off by more than 1e-2." in good
+    assert "1 runs that count as right have errors above 1e-2." in good
     assert "All methods are right from 1e-6 to 1e3 m" in good and "The violation does not grow" in good
     _, bad = said(robustness, rows_of(robustness.SILENT, last=1e-12))
     assert "On the linkages, of all sizes and masses, 2 runs are silently wrong:" in bad
     assert "with all methods together, 1 of 1 runs is silently wrong (`auto`, drag)." in bad
-    assert "; 1 is silently wrong by the sensitivity of the motion, at worst with drag: off by 0.020 at 1e-4." in bad
+    assert "; 1 is silently wrong by the sensitivity of the motion, at worst with drag: error 0.020 at 1e-4." in bad
     more = pd.concat([rows_of(robustness.SILENT), rows_of(robustness.SILENT).tail(1).assign(error=0.3, value=1.0)])
     _, text = said(robustness, more.reset_index(drop=True))
-    assert "at most (0 report failure, 1 ends more than 1000 off without" in text
-    assert "; 2 are silently wrong by the sensitivity of the motion, at worst with drag: off by 0.30 at 1e-4." in text
+    assert "at most (0 report failure, 1 silently exceeds 1000" in text
+    assert "; 2 are silently wrong by the sensitivity of the motion, at worst with drag: error 0.30 at 1e-4." in text
     assert "(`auto`, drag in 2 runs)" in text and "All methods are right from" in bad and "from 1e0 to 1e3 m" in bad
     assert "The violation grows in runs of 10 steps and more with BDF" in bad
 

@@ -53,7 +53,7 @@ def test_findings_turn_with_the_rows(tmp_path):
     assert found["others_growing"] == ["LSODA, index 1", "DOP853, index 1"] and found["growing_to"] == [1e-7, 1e-7]
     assert found["growing_unprojected"] and len(set(violation.LISTED)) == len(violation.LISTED)
     text = (tmp_path / "violation.md").read_text()
-    assert "All 2 methods and settings of ours in the line-up keep" in text
+    assert "All 2 methods and settings of ours keep" in text
     assert "Of solvers given the accelerations of the paper's eq. (6) and not projected, it grows with" in text
     assert (found["baumgarte_n"], found["baumgarte_kept"]) == (4, 0) and found["n_kept_first"] == found["n_ranked"]
     assert found["inner_alone_kept"] and not found["both_kept"]

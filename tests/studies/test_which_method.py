@@ -50,8 +50,8 @@ def test_the_default_has_its_own_traps(text_of):
     [
         ({}, "Never wrong at the end of a run: `Gauss12`.", "None of the methods"),
         ({"wrong": 1}, "None of the methods is right on every run", "Never wrong"),
-        ({"ratio": 0.5}, "The median error stays below the tolerance", "ask it"),
-        ({"ratio": 5.0}, "The error exceeds the tolerance in the median of `Gauss12`: ask it", "stays below"),
+        ({"ratio": 0.5}, "The median error stays below the tolerance", "set a smaller"),
+        ({"ratio": 5.0}, "The error exceeds the tolerance in the median of `Gauss12`: set a smaller", "stays below"),
     ],
 )
 def test_sentences_follow_the_findings(text_of, changed, said, unsaid):
