@@ -148,7 +148,7 @@ def test_sentences_turn_with_the_rows():
     _, text = said(honesty, rows)
     assert "- Of ours 1 run is silently wrong or hangs: b." in text
     assert "On 1 of the 2 traps, every run" in text and "\n| b | 1/0/0 | 1/0/0 |" in text and "\n| a |" not in text
-    assert "No solver notices: b" in text
+    assert "No solver detects: b" in text
 
 
 def test_trust_is_counted_over_mistakes_and_forces():
@@ -266,7 +266,7 @@ def test_forces_held_out_are_others_and_counted_apart():
         "`max_step`, here 1.5 ms. " in said(honesty, fine)[1] or "`max_step`, here 1.5 ms.\n" in said(honesty, fine)[1]
     )
     assert found["trust"]["default"]["wrong"] == 0 and found["held_out"]["trust"]["default"]["wrong"] == 1
-    assert "Ours (error): `the default`, gust, pendulum (1e-9)." in text and "drawn by a new seed" in text
+    assert "Ours (error): `the default`, gust, pendulum (1e-9)." in text and "drawn with a new seed" in text
 
 
 def test_checks_of_the_input_are_counted_apart():
