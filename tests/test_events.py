@@ -1,5 +1,9 @@
 """Events: where functions of the motion are zero, by the rules of SciPy."""
 
+import gc
+import weakref
+from unittest.mock import patch
+
 import numba
 import numpy as np
 import pytest
@@ -10,6 +14,7 @@ from scipy.integrate import solve_ivp
 
 from tests.problems import at_one, event, pendulum, run, swing, unconstrained, violations, worst
 from twoloop import Status, solve_dae
+from twoloop.problem.events import check_events
 
 
 def clock(*times, terminal=None):
@@ -199,3 +204,20 @@ def test_a_value_that_is_wrong_later_is_named_with_its_time():
 def test_a_zero_of_high_order_is_found(oscillator):
     result = solve_dae(oscillator, (0.0, 10.0), [0.0], [1.0], events=lambda t, q, v: (t - 4.0) ** 3)
     assert result.t_events[0] == pytest.approx([4.0], abs=1e-4)
+
+
+def test_functions_are_checked_once_and_not_held():
+    def crossing(t, q, v):
+        return q[0]
+
+    check_events(crossing)
+    kept = weakref.ref(crossing)
+    with patch("twoloop.problem.events.check_call") as check:
+        assert len(check_events([crossing, crossing])) == 2
+    assert check.call_count == 0
+    crossing.terminal = -1
+    with pytest.raises(ValueError, match="terminal"):  # attributes may change
+        check_events(crossing)
+    del crossing, check
+    gc.collect()
+    assert kept() is None

@@ -2,7 +2,9 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from types import FunctionType
 from typing import Any
+from weakref import WeakSet
 
 import numpy as np
 
@@ -11,6 +13,8 @@ from twoloop.checks.arguments import Array, check_call, shown
 SAMPLES = 4  # parts of a step, at whose ends the sign is looked at
 PRECISION = 4.0 * float(np.finfo(float).eps)  # of the time of an event, as in SciPy
 MOST = 3000  # iterations of Brent's method, which halves the interval at least every 53rd time: for zeros of high order
+
+_callable: WeakSet[FunctionType] = WeakSet()  # functions whose arguments were checked, which takes 9 µs
 
 States = Callable[[Array], Array]  # rows [q, v] at sorted times
 
@@ -64,7 +68,10 @@ def _checked(number: int, function: Any) -> Event:
             f"events[{number}] must be a function event(t, q, v); given {shown(function)} of type "
             f"{type(function).__name__}"
         )
-    check_call(f"events[{number}]", "event", function, ("t", "q", "v"))
+    if type(function) is not FunctionType or function not in _callable:
+        check_call(f"events[{number}]", "event", function, ("t", "q", "v"))
+        if type(function) is FunctionType:
+            _callable.add(function)
     terminal, direction = getattr(function, "terminal", None), getattr(function, "direction", 0)
     expected = f"events[{number}].terminal must be True, False or a positive number of occurrences"
     if terminal is not None and not isinstance(terminal, (bool, int, np.bool_, np.integer)):
