@@ -6,6 +6,7 @@ from collections import defaultdict
 import numpy as np
 import pytest
 
+from studies.bench.large import open_chain_of_hinges
 from tests.problems import pendulum, unconstrained
 from twoloop import Taylor, mechanisms, solve_dae
 from twoloop.generate import compiled_series
@@ -98,6 +99,15 @@ def test_steps_by_compiled_code_are_the_same_to_rounding(name):
     assert runs[0].stats.n_accepted == runs[1].stats.n_accepted == 2
     for ends in zip(*((run.q[:, -1], run.v[:, -1], run.a[:, -1]) for run in runs), strict=True):
         assert np.abs(ends[1] - ends[0]).max() < 1e-11 * max(1.0, np.abs(ends[0]).max())
+
+
+def test_twenty_bodies_in_space_have_compiled_code():
+    chain = open_chain_of_hinges(20)
+    start = chain.system, (0.0, 0.1), chain.q, 0.0 * chain.q
+    runs = [solve_dae(*start, Taylor(13), 1e-10, 1e-10, compiled=compiled) for compiled in (False, True)]
+    assert all(run.success for run in runs)
+    for ends in zip(*((run.q[:, -1], run.v[:, -1]) for run in runs), strict=True):
+        assert np.abs(ends[1] - ends[0]).max() < 1e-9 * max(1.0, np.abs(ends[0]).max())
 
 
 def test_compiled_operations_give_the_same_run():

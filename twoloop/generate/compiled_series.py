@@ -15,7 +15,8 @@ from twoloop.kernels.compile.dependencies import digest_of
 from twoloop.kernels.compile.own_functions import OwnFunctions, own_functions
 
 DIVIDED = 250  # operations of a series from which on its blocks are divided
-LARGEST = 3000  # operations: the time to compile them grows faster than their number
+LONGEST = 350  # operations from which on LLVM does not simplify it first: it finds nothing there that makes it faster
+LARGEST = 5000  # operations, which take about as many milliseconds to trace and to compile
 
 
 class CompiledSeries(NamedTuple):
@@ -78,7 +79,7 @@ def _compiled(own: SharedCode) -> CompiledSeries:
             llvm_code.write(module, name, KIT.own_type(name), emit)
         return [*names, *recurrences], str(module)
 
-    functions = own_functions("series", _stamp(), key, write)
+    functions = own_functions("series", _stamp(), key, write, passes=program.n_operations <= LONGEST)
     return CompiledSeries(functions, code, own.solution.n_kept, numbers.formulas)
 
 

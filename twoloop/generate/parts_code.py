@@ -20,7 +20,8 @@ TRUE = Value(BIT, "true")
 ARRAY = f"{DOUBLE}*"
 POSITION = [DOUBLE, ARRAY, ARRAY, ARRAY, ARRAY]  # t, q, v, numbers, kept
 LONG = 500  # quantities of the accelerations from which on equations are written in parts ...
-DIVIDED = 1700  # ... whose blocks are divided; with fewer the divided code runs up to a quarter slower
+DIVIDED = 1700  # ... whose blocks are divided; with fewer the divided code runs up to a quarter slower ...
+LONGEST = 2500  # ... and which LLVM does not simplify first: it finds nothing there that makes them faster
 
 
 def is_long(equations: StraightLine) -> bool:
@@ -31,6 +32,11 @@ def is_long(equations: StraightLine) -> bool:
 def has_long_blocks(equations: StraightLine) -> bool:
     """Whether blocks take so long to compile that they are divided."""
     return len(equations.there.quantities(equations.graph)) > DIVIDED
+
+
+def is_longest(equations: StraightLine) -> bool:
+    """Whether to simplify equations first only takes time."""
+    return len(equations.there.quantities(equations.graph)) > LONGEST
 
 
 class PartsCode:

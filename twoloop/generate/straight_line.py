@@ -24,9 +24,11 @@ from twoloop.generate.known_numbers import elementwise
 from twoloop.generate.symbolic_factors import Block, Factors, solve
 from twoloop.generate.traced_equations import Equations, only
 from twoloop.generate.traced_values import Traced
-from twoloop.generate.tracing import MOST_OPERATIONS, Form, Graph, Untraceable
+from twoloop.generate.tracing import Form, Graph, Untraceable
 from twoloop.kernels.evaluation.inner import CONTRADICTS
 from twoloop.problem.system import ConstrainedSystem
+
+MOST_OPERATIONS = 40_000  # with their elimination: those of 28 bodies on hinges in space
 
 
 @dataclass(frozen=True)

@@ -128,15 +128,18 @@ class Form:
     While a callback runs on it, whatever could tell it from a number is refused.
     """
 
-    __slots__ = ("constant", "graph", "terms")
+    __slots__ = ("constant", "graph", "kept_key", "terms")
 
     def __init__(self, graph: Graph, constant: float, terms: dict[int, float]):
         self.graph, self.constant, self.terms = graph, constant, terms
+        self.kept_key: tuple[Any, ...] | None = None
 
     @property
     def key(self) -> tuple[Any, ...]:
         """What equal forms have in common, rounding of their coefficients apart."""
-        return (rounded(self.constant), *((i, rounded(self.terms[i])) for i in sorted(self.terms)))
+        if self.kept_key is None:
+            self.kept_key = rounded(self.constant), *[(i, rounded(self.terms[i])) for i in sorted(self.terms)]
+        return self.kept_key
 
     @property
     def late(self) -> bool:
@@ -145,6 +148,8 @@ class Form:
 
     def times(self, factor: float) -> "Form":
         """A multiple."""
+        if type(factor) is float and factor == 1.0:
+            return self
         if float.__eq__(factor, 0.0):
             return Form(self.graph, 0.0, {})
         return Form(self.graph, self.constant * factor, {i: c * factor for i, c in self.terms.items()})
@@ -152,6 +157,8 @@ class Form:
     def normalised(self) -> tuple[float, "Form"]:
         """A factor, and the form over it, whose first coefficient is 1."""
         factor = self.terms[min(self.terms)]
+        if type(factor) is float and factor == 1.0:
+            return factor, self
         return factor, Form(self.graph, self.constant / factor, {i: c / factor for i, c in self.terms.items()})
 
     def _other(self, other: Any) -> "Form":

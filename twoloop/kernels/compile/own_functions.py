@@ -60,6 +60,7 @@ def own_functions(
     key: str,
     write: Callable[[], tuple[list[str], str]],
     called: OwnFunctions | None = None,
+    passes: bool = True,
 ) -> OwnFunctions:
     """Functions that `write` writes: their names, and the text of a module; from memory or the disk where kept.
 
@@ -72,6 +73,8 @@ def own_functions(
     write : callable
     called : OwnFunctions or None
         See `OwnFunctions`.
+    passes : bool
+        See `object_code`.
     """
     if (made := _MADE[kind].get(key)) is not None:
         return made  # type: ignore[no-any-return]
@@ -82,7 +85,7 @@ def own_functions(
         kept = None
     if kept is None:
         names, text = write()
-        kept = names, object_code(text)
+        kept = names, object_code(text, passes)
         try:
             files.save(place, kept)
         except OSError:
@@ -105,13 +108,14 @@ def _place(key: str) -> Any:
     return (*cpu_target.target_context.codegen().magic_tuple(), key)
 
 
-def object_code(text: str) -> bytes:
-    """Machine code for this processor."""
+def object_code(text: str, passes: bool = True) -> bytes:
+    """Machine code for this processor; `passes`: the operations are simplified first."""
     machine = _compiler()
     target = f'target triple = "{_triple()}"\ntarget datalayout = "{machine.target_data}"\n'
     module = binding.parse_assembly(target + text)
-    passes, builder = _two_passes() if SINGLE_PASSES else _all_passes()
-    passes.run(module, builder)
+    if passes:
+        manager, builder = _two_passes() if SINGLE_PASSES else _all_passes()
+        manager.run(module, builder)
     content: bytes = machine.emit_object(module)
     return content
 
