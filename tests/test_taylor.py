@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from studies.bench.large import open_chain_of_hinges
+from tests.large_systems import spatial_chain
 from tests.problems import pendulum, unconstrained
 from twoloop import Taylor, mechanisms, solve_dae
 from twoloop.generate import compiled_series
@@ -101,6 +102,7 @@ def test_steps_by_compiled_code_are_the_same_to_rounding(name):
         assert np.abs(ends[1] - ends[0]).max() < 1e-11 * max(1.0, np.abs(ends[0]).max())
 
 
+@pytest.mark.slow  # a build of 7 s
 def test_twenty_bodies_in_space_have_compiled_code():
     chain = open_chain_of_hinges(20)
     start = chain.system, (0.0, 0.1), chain.q, 0.0 * chain.q
@@ -108,6 +110,14 @@ def test_twenty_bodies_in_space_have_compiled_code():
     assert all(run.success for run in runs)
     for ends in zip(*((run.q[:, -1], run.v[:, -1]) for run in runs), strict=True):
         assert np.abs(ends[1] - ends[0]).max() < 1e-9 * max(1.0, np.abs(ends[0]).max())
+
+
+@pytest.mark.parametrize("compiled", [False, True])
+def test_a_sum_of_parameters_that_is_zero_in_one_system_alone_is_divided_by_in_no_formula(compiled):
+    """Formulas in the parameters of all chains divide by a sum of components of axes, which is zero here."""
+    system, q, v = spatial_chain(1)
+    runs = [solve_dae(system, (0.0, 0.3), q, v, m, 1e-9, 1e-9, compiled=compiled) for m in ("Taylor", "DOP853")]
+    assert all(run.success for run in runs) and np.abs(runs[0].q[:, -1] - runs[1].q[:, -1]).max() < 1e-7
 
 
 def test_compiled_operations_give_the_same_run():

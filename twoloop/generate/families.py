@@ -81,6 +81,8 @@ class Family:
             scales, places, products = self._gathered(array)
             with np.errstate(all="ignore"):
                 made: Array = scales * np.array(list(map(product, products)))[places]
+            if not np.isfinite(made).all():  # as a sum of parameters by which a formula divides is zero
+                raise Untraceable("a number of them is not finite for these parameters")
             return made
 
         return evaluate
