@@ -25,9 +25,10 @@ from twoloop.methods.plans_for import MOST, plans_for
 from twoloop.methods.presets import PRESETS
 from twoloop.run import comparison
 
-# calls of functions in a second run, which compares callbacks again at four states, in a third, which makes arrays for
-# the next, in a fifth, which uses them, and in a sixth, which begins as that one did
-MANY, FEW, FEWER, FEWEST = 780, 380, 125, 80
+# calls of functions in a second run, which compares callbacks again at four states, in one that makes arrays for the
+# next, in a third, which does so and may compare callbacks at turning points, in a fifth, which uses these arrays, and
+# in a sixth, which begins as that one did
+MANY, FEW, THIRD, FEWER, FEWEST = 780, 380, 620, 125, 80
 # in a run from another start, which names the redundant rows there, and in one with other parameters, of which hundreds
 # of numbers in the code of spatial mechanisms are formulas
 ANOTHER = {
@@ -59,7 +60,7 @@ def test_a_repeated_call_takes_few_calls_of_functions(options):
         run(problem, **options)
         profile.disable()
         calls.append(pstats.Stats(profile).total_calls)
-    assert calls[1] < MANY and calls[2] < FEW  # the first compiles, or checks derivatives
+    assert calls[1] < MANY and calls[2] < THIRD  # the first compiles, or checks derivatives
     assert calls[4] < FEWER and calls[5] < FEWEST
 
 
@@ -256,6 +257,19 @@ def test_a_run_that_goes_where_none_was_is_compared_there():
     assert end(4.0) == "WRONG_DERIVATIVE"  # what was wrong is not taken in
 
 
+@pytest.mark.parametrize("make", [mechanisms.pendulum, mechanisms.double_pendulum])
+def test_runs_along_one_motion_are_soon_compared_no_more(make, monkeypatch):
+    """Turning points may lie between the states of a sample, and beyond all that were compared."""
+    problem, looked, many = make(), [], 200
+    solution = solve_dae(problem.system, (0.0, 0.1), problem.q0, problem.v0, dense_output=True).sol
+    known = Territory.without_known
+    monkeypatch.setattr(Territory, "without_known", lambda self, states: looked.append(1) or known(self, states))
+    for t in np.linspace(0.0, 1e-4, many):
+        state = solution(t)
+        solve_dae(problem.system, (t, t + problem.reference.t), state.q, state.v, rtol=1e-6, atol=1e-6)
+    assert 0 < len(looked) < many // 4  # without the turning points it is nearly every run
+
+
 def test_the_box_of_a_session():
     near, far = np.array([[0.0, 1.0], [1.0, 2.0]]), np.array([[0.5, 3.0], [0.5, 1.5]])
     territory = Territory()
@@ -310,9 +324,10 @@ def test_a_plan_is_that_of_the_choice_of_its_code():
 
 
 def test_what_a_method_was_traced_to_is_compared_in_its_first_run(monkeypatch):
-    compared, look = [], comparison._traces
+    compared, counts, look = [], [], comparison._traces
     monkeypatch.setattr(comparison, "_traces", lambda *given: compared.append(1) or look(*given))
     problem = mechanisms.four_bar()
     for method in ("DOP853", "DOP853", "DOP853", "auto", "auto", "auto"):
         run(problem, method=method)
-    assert len(compared) == 4
+        counts.append(len(compared))
+    assert counts[:2] == [1, 2] and counts[4] == counts[2] + 2 and counts[5] <= 6  # a third run may find turning points

@@ -79,6 +79,12 @@ def _factors(n_states: int, n_q: int) -> Array:
     return random.uniform(0.5, 1.5, (n_states, n_q)) * random.choice((-1.0, 1.0), (n_states, n_q))
 
 
+def farthest(t: Array, rows: Array) -> Array:
+    """Of the states of a run, rows [q, v], those [t, q, v] at which a number is the least or the largest."""
+    states = np.column_stack([t, rows])
+    return states[np.unique([states.argmin(axis=0), states.argmax(axis=0)])]
+
+
 class Territory:
     """Where the states of runs were, at which callbacks were compared: a box of [t, q, v], and one of parameters."""
 

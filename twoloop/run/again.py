@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from twoloop.generate.exact_derivatives import farthest
 from twoloop.generate.straight_code import OwnCode
 from twoloop.generate.traced_values import Sample
 from twoloop.kernels.compile.linking import direct
@@ -228,6 +229,8 @@ class Again:
         sample = Sample(float(t[0]), rows[0], n)
         sample.add(t[1:], rows[1:], float(t[-1]), rows[-1])
         states = sample.states()
+        if not everywhere:  # a sample may lie in known places, and all runs that follow would be sampled in vain
+            states = np.concatenate([farthest(t, rows[:, :n]), states])
         compared = compared_at(self.run, territory, states, self.check_derivatives, status, message, everywhere)
         if self.movable is not None and compared[0] == status:
             territory.add_parameters(self.movable.parameters)
