@@ -153,6 +153,18 @@ def test_numbers_that_cancel_leave_no_rounding():
     assert (1e-12 * x + (0.1 + 0.2) * y - 0.3 * y).terms == {0: 1e-12}
 
 
+@pytest.mark.parametrize("factor", [0.5, 1e-3, 1e3])
+@pytest.mark.parametrize("in_one", [True, False])
+def test_a_high_power_is_right_where_that_of_its_factor_is_beyond_what_numbers_hold(factor, in_one):
+    graph = Graph()
+    (x,) = graph.inputs(1, False)
+    base = factor * (x + 1.0)
+    power = base**2000 if in_one else math.prod([base] * 2000)
+    values = (0.5, 1.0, 1.001)
+    found = [evaluated(power, {0: value / factor - 1.0}) for value in values]
+    np.testing.assert_allclose(found, [value**2000 for value in values], rtol=1e-9)
+
+
 def test_the_derivative_of_every_operation():
     graph = Graph()
     (x,) = graph.inputs(1, False)

@@ -10,6 +10,7 @@ from studies.bench.large import open_chain_of_hinges
 from tests.large_systems import spatial_chain
 from tests.problems import pendulum, unconstrained
 from twoloop import Taylor, mechanisms, solve_dae
+from twoloop.bodies import PlanarModel
 from twoloop.generate import compiled_series
 from twoloop.generate.series import series_program
 from twoloop.generate.straight_code import own_code
@@ -230,3 +231,25 @@ def test_a_first_step_that_is_given_is_taken():
     for method in ("Taylor", "auto"):
         result = solve_dae(problem.system, (0.0, 0.1), problem.q0, problem.v0, method, first_step=1e-5)
         assert result.h[0] == 1e-5
+
+
+@pytest.mark.parametrize("compiled", [False, True])
+def test_a_kink_is_seen_after_the_run_came_near_a_singular_position(compiled):
+    """A slider-crank with a rod a little longer than its crank, and a drag that is rough where the crank turns back."""
+    rod = 1.001
+    foot = (0.6 + np.sqrt(rod**2 - 0.64), 0.0)
+    model = PlanarModel()
+    model.rod("crank", (0.0, 0.0), (0.6, 0.8), mass=1.0)
+    model.rod("rod", (0.6, 0.8), foot, mass=1.0)
+    model.body("slider", mass=1.0, inertia=1.0, position=foot)
+    for a, b, at in (("ground", "crank", (0.0, 0.0)), ("crank", "rod", (0.6, 0.8)), ("rod", "slider", foot)):
+        model.revolute(a, b, at=at)
+    model.prismatic("ground", "slider", at=foot, axis=(1.0, 0.0))
+    model.force("crank", (0.3, 0.4), lambda t, q, v: np.array([-0.5 * np.sqrt(v[0] ** 2 + 1e-12) * v[0], 0.0]))
+    model.spring("ground", (0.0, 2.0), "crank", (0.6, 0.8), stiffness=60.0, length=0.3)
+    problem = model.problem((0.0, 4.0))
+    start = problem.system, problem.t_span, problem.q0, problem.v0
+    known = solve_dae(*start, method="DOP853", rtol=1e-12, atol=1e-12, max_step=0.004)
+    result = solve_dae(*start, method="Taylor", rtol=1e-10, atol=1e-10, compiled=compiled)
+    assert known.success and result.success
+    assert np.abs(result.q[:, -1] - known.q[:, -1]).max() < 1e-8  # 1e-5 where steps after it were not checked

@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
+from scipy.integrate import quad, solve_ivp
 
 from references.engines.rigid import rigid_of
 from tests.bodies.runs import moved
-from twoloop import ensemble
+from twoloop import ensemble, solve_dae
 from twoloop.bodies import PlanarModel, SpatialModel
 from twoloop.bodies.mjcf_geometry import IgnoredWarning
 
@@ -174,3 +174,15 @@ def test_exports_do_not_drop_it(tmp_path):
         model.to_mjcf(tmp_path / "model.xml")
     with pytest.raises(ValueError, match="not 'hardening'"):
         rigid_of(model.problem())
+
+
+@pytest.mark.parametrize("compiled", ["auto", False])
+def test_a_force_that_is_a_high_power_of_a_cosine_acts(compiled):
+    model = PlanarModel(gravity=(0.0, 0.0))
+    body = model.body("body", mass=2.0, inertia=1.0, position=(0.0, 0.0))
+    model.force(body, (0.0, 0.0), lambda t: np.array([8.0 * (0.5 + 0.5 * np.cos(np.pi * (t - 0.5))) ** 2000, 0.0]))
+    problem = model.problem((0.0, 1.0))
+    result = solve_dae(problem.system, problem.t_span, problem.q0, problem.v0, compiled=compiled)
+    impulse, _ = quad(lambda t: 8.0 * np.cos(0.5 * np.pi * (t - 0.5)) ** 4000, 0.0, 1.0, points=[0.5], epsabs=1e-13)
+    assert result.success
+    np.testing.assert_allclose(result.v[0, -1], impulse / 2.0, rtol=1e-6)

@@ -26,6 +26,8 @@ from twoloop.kernels.evaluation import operations as op
 
 # the second form of a logarithm or an arctangent is what the derivative of the first is divided by
 MOST_OPERATIONS = 20_000  # of a program; with more it would take longer to make than a run
+LEAST_FACTOR = 1e-100  # that is taken out of a product: factors of high powers would underflow, or overflow ...
+HIGH_POWER = 8  # ... so from above this none are taken out, whatever values parameters have
 BRANCHES = "it branches on, or converts to a number, what depends on t, q or v"
 
 # of numbers
@@ -106,11 +108,21 @@ class Graph(Symbolic):
         for a, b in ((one, other), (other, one)):
             if not a.terms:
                 return b.times(a.constant)
-        (scale, one), (scale_too, other) = one.normalised(), other.normalised()
+        (scale, first), (scale_too, second) = one.normalised(), other.normalised()
+        factor = scale * scale_too
+        if not LEAST_FACTOR < _size(factor) < 1.0 / LEAST_FACTOR:
+            first, second, factor = one, other, 1.0
+        return self._product(first, second).times(factor)
+
+    def _product(self, one: "Form", other: "Form") -> "Form":
         first, second = (self._seen.setdefault(each.key, len(self._seen)) for each in (one, other))
         if second < first:
             one, other = other, one
-        return self.operation(op.PRODUCT, one, other).times(scale * scale_too)
+        return self.operation(op.PRODUCT, one, other)
+
+    def square(self, form: "Form", high: bool) -> "Form":
+        """A form times itself; `high`: on the way to a high power, of which no factors are taken out."""
+        return self._product(form, form) if high and form.terms else self.product(form, form)
 
 
 def rounded(value: float) -> Any:
@@ -230,12 +242,12 @@ class Form:
                 return self ** math.floor(exponent) * self.square_root()
             return (self.logarithm() * exponent).exponential()
         n = abs(int(exponent))
-        result, square = Form(self.graph, 1.0, {}), self
+        result, square, high = Form(self.graph, 1.0, {}), self, n > HIGH_POWER
         while n:
             if n % 2:
                 result = result * square
             n //= 2
-            square = square * square if n else square
+            square = self.graph.square(square, high) if n else square
         return result.reciprocal() if exponent < 0.0 else result
 
     def _function(self, kind: int, known: Callable[[float], float]) -> "Form":
