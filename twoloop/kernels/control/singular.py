@@ -5,7 +5,7 @@ from twoloop.kernels.data.codes import DONE
 from twoloop.kernels.data.common import merged
 from twoloop.kernels.data.counters import N_ACCEPTED
 from twoloop.kernels.data.flags import AUGMENTED, FORM, NULL_SPACE, STATIC, STRAIGHT
-from twoloop.kernels.data.noted import BY_GENERAL, NEARLY_SINGULAR, PIVOT, SENSITIVITY
+from twoloop.kernels.data.noted import BY_GENERAL, NEAR_NOW, NEARLY_SINGULAR, PIVOT, SENSITIVITY
 from twoloop.kernels.evaluation.calls import find_tangents, renew_partition
 from twoloop.kernels.evaluation.partition import partition_is_poor
 from twoloop.kernels.evaluation.static_factors_at import CAREFUL
@@ -90,16 +90,20 @@ def look_at_partition(f, w, control, clock, size, lands, state):
         find_tangents(f, w, clock[at.T], state[:n])
     if looked and partition_is_poor(w) and renew_partition(f, w, clock[at.T], state[:n]) != DONE:
         return at.RANK_LOST
+    # where steps have no use for the partition, it shows when the position is left behind
+    if f.flags[STRAIGHT] == 1 and w.notes[NEAR_NOW] == 1.0 and renew_partition(f, w, clock[at.T], state[:n]) != DONE:
+        return at.RANK_LOST
     clock[at.LARGEST_PIVOT] = max(clock[at.LARGEST_PIVOT], w.notes[PIVOT])
+    w.notes[NEAR_NOW] = 0.0
     if w.notes[PIVOT] < SINGULAR_PIVOT * clock[at.LARGEST_PIVOT]:
-        w.notes[NEARLY_SINGULAR] = 1.0
+        w.notes[NEARLY_SINGULAR] = w.notes[NEAR_NOW] = 1.0
     if size < COLLAPSED * clock[at.H_LONG] and w.notes[NEARLY_SINGULAR] == 0.0 and control[at.BRIDGE] == 1.0:
         # a motion may go straight towards a singular position, and its partition show nothing of it
         if renew_partition(f, w, clock[at.T], state[:n]) != DONE:
             return at.RANK_LOST
         w.notes[SENSITIVITY] = 1.0  # as of a partition far from there: this one is not to last
         if w.notes[PIVOT] < SINGULAR_PIVOT * clock[at.LARGEST_PIVOT]:
-            w.notes[NEARLY_SINGULAR] = 1.0
+            w.notes[NEARLY_SINGULAR] = w.notes[NEAR_NOW] = 1.0
     if short and size < LOST * clock[at.H_LONG] and w.notes[NEARLY_SINGULAR] == 1.0:
         # the partition that serves implicit methods well up to there was chosen far from there
         if renew_partition(f, w, clock[at.T], state[:n]) != DONE:

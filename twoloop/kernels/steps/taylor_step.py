@@ -24,7 +24,7 @@ from twoloop.kernels.control.predictor import departure, keep_predicted
 from twoloop.kernels.data.codes import DONE
 from twoloop.kernels.data.common import ATTEMPT, SETTLE, Attempt, Step, compiled, kernel, merged
 from twoloop.kernels.data.counters import N_OUTER
-from twoloop.kernels.data.noted import DEFECT, NEARLY_SINGULAR
+from twoloop.kernels.data.noted import DEFECT, NEAR_NOW, NEARLY_SINGULAR
 from twoloop.kernels.data.tolerances import ATOL, ESTIMATE, GAP, LOOK, RTOL
 from twoloop.kernels.evaluation.calls import evaluate_there, project
 from twoloop.kernels.evaluation.tasks import EVALUATE_THERE
@@ -37,7 +37,6 @@ LOUDEST, LOUDER = 1e4, 10.0  # a defect up to LOUDEST is rounding, where one nea
 NEAR_BEGIN = 1e-5  # of the step: no force changes within it
 GOLDEN = 0.6180339887498949  # multiples of it, less their integers, lie evenly between 0 and 1
 BEYOND = 1e300  # in place of an infinite defect, where a function has no value within the step
-SHORTEST_CHECKED = 1e-3  # of GAP: where a run came near a singular position, rounding may make defects of shorter steps
 MOST_SHORTENED = 0.1  # a step that is refused for its defect
 GROWTH = 5.0  # of the step from one to the next, at most: coefficients belong to the unit of the step before
 FARTHEST = 1e6  # of the guess for the first step: no power of it overflows
@@ -229,7 +228,7 @@ def _step(f, w, options, memory, t, h, tolerances, state, new_state, by_code):
             return Attempt(DONE, error, 1.0 / error)
         error = min(error, 1.0)
         singular = w.notes[NEARLY_SINGULAR] != 0.0  # it stays so to the end of the run
-        checked = not singular or h > SHORTEST_CHECKED * tolerances[GAP]
+        checked = w.notes[NEAR_NOW] == 0.0  # near such a position accelerations off the constraints say nothing
         if singular and h > tolerances[GAP] * (1.0 + ROUNDING):
             return Attempt(DONE, h / tolerances[GAP], tolerances[GAP] / h)
         if checked:
