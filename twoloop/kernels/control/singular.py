@@ -90,8 +90,8 @@ def look_at_partition(f, w, control, clock, size, lands, state):
         find_tangents(f, w, clock[at.T], state[:n])
     if looked and partition_is_poor(w) and renew_partition(f, w, clock[at.T], state[:n]) != DONE:
         return at.RANK_LOST
-    # where steps have no use for the partition, it shows when the position is left behind
-    if f.flags[STRAIGHT] == 1 and w.notes[NEAR_NOW] == 1.0 and renew_partition(f, w, clock[at.T], state[:n]) != DONE:
+    # a new partition shows when the position is left behind; here steps have no use for it, and an old one may last
+    if f.flags[STRAIGHT] == 1 and w.notes[NEAR_NOW] == 2.0 and renew_partition(f, w, clock[at.T], state[:n]) != DONE:
         return at.RANK_LOST
     clock[at.LARGEST_PIVOT] = max(clock[at.LARGEST_PIVOT], w.notes[PIVOT])
     w.notes[NEAR_NOW] = 0.0

@@ -18,7 +18,7 @@
     CONTRADICTION,  # row that was taken for redundant and is violated
     PIVOT,  # smallest of the last full pivoting, rows scaled to 1: small near a singular position
     NEARLY_SINGULAR,  # 1: the run has come near a singular position, or is not to look for one
-    NEAR_NOW,  # 1: a singular position was near at the last look
+    NEAR_NOW,  # 1: a singular position was near at the last look; 2: a step that could look within did not for it
     MASS_SCALE,  # s of the augmented matrix, see algebra/sparse.py
     FACTORED,  # 1: the factors of the linear problem belong to w.M and w.G
     KNOWN,  # 1: w.Rate and w.Gamma[:n_c] belong to the state, from the fused callback

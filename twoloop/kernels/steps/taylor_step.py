@@ -229,6 +229,7 @@ def _step(f, w, options, memory, t, h, tolerances, state, new_state, by_code):
         error = min(error, 1.0)
         singular = w.notes[NEARLY_SINGULAR] != 0.0  # it stays so to the end of the run
         checked = w.notes[NEAR_NOW] == 0.0  # near such a position accelerations off the constraints say nothing
+        w.notes[NEAR_NOW] = 0.0 if checked else 2.0
         if singular and h > tolerances[GAP] * (1.0 + ROUNDING):
             return Attempt(DONE, h / tolerances[GAP], tolerances[GAP] / h)
         if checked:
