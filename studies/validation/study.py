@@ -221,7 +221,8 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     }
     found["ours_always"] = [name for name in OWN if all(name in line["ours_right"] for line in problems)]
     found["judged"] = [of_condition(str(name), own) for name, own in judged.groupby("case", sort=False)]
-    decided, of_us = judged[judged["outcome"].isin(("right", "wrong"))], judged["family"] == "two-loop"
+    decided = judged[judged["outcome"].isin(("right", "wrong"))]
+    of_us = decided["family"] == "two-loop"
     found["judged_wrong"] = {
         which: {"n": len(own), "wrong": int((own["outcome"] == "wrong").sum())}
         for which, own in (("ours", decided[of_us]), ("others", decided[~of_us]))
