@@ -174,10 +174,10 @@ def test_stiff_runs_are_those_made_singly(make, method, tolerance):
 
 def test_stiff_motion_takes_the_implicit_method_that_auto_takes_singly():
     system, q, p = dampers(4)
-    runs = ensemble(system, (0.0, 0.3), q, 0 * q, parameters=p, rtol=1e-6, atol=1e-6)
+    runs = ensemble(system, (0.0, 0.3), q, 0 * q, parameters=p, rtol=1e-7, atol=1e-7)
     assert "3 in lanes by RadauIIA9" in runs.message and (runs.n_steps[1:] < 300).all()
-    names = {tolerance: lane_methods("auto", True, 2, tolerance, 1.0)[0].name for tolerance in (1e-3, 1e-12, 1e-13)}
-    assert list(names.values()) == ["RadauIIA5", "RadauIIA9", "RadauIIA13"]
+    names = {tolerance: lane_methods("auto", True, 2, tolerance, 1.0)[0].name for tolerance in (1e-3, 1e-6, 1e-7)}
+    assert list(names.values()) == ["RadauIIA5", "RadauIIA5", "RadauIIA9"]
 
 
 def test_an_iteration_that_has_ended_in_one_lane_goes_on_in_others_alone():
@@ -200,7 +200,7 @@ def test_vibrations_that_do_not_matter_are_passed_over_as_singly_and_no_others(t
     lanes = LaneRuns(system, Starts(0.0, q, v, p), lane_methods("auto", True, 1, tolerance, tolerance)[0])
     out = np.empty((2, 9, 1, 1))
     made, n_steps, _ = lanes.make(np.arange(9), 4.0, np.array([4.0]), tolerance, atol, 1, *out)
-    options = {"method": PRESETS["auto"].tight, "rtol": tolerance, "atol": tolerance}
+    options = {"method": PRESETS["auto"].tightest, "rtol": tolerance, "atol": tolerance}
     for run in (1, 5, 8):
         alone = solve_dae(system.with_parameters(p[run]), (0.0, 4.0), q[run], v[run], **options)
         assert made[run] == 1 and 130 < 0.9 * alone.stats.n_accepted <= n_steps[run] <= 1.3 * alone.stats.n_accepted

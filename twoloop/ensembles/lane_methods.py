@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from twoloop.checks.arguments import Array
-from twoloop.methods.auto import LOOSE, TIGHTEST
+from twoloop.methods.auto import TIGHTEST
 from twoloop.methods.dop853_tableau import B
 from twoloop.methods.plan import Method, least_tolerance
 from twoloop.methods.presets import PRESETS
@@ -64,7 +64,7 @@ def lane_methods(name: str, stiff: bool, n: int, rtol: float, atol: float) -> li
     if not stiff:
         return [_taylor(rtol, atol), _dop853(n, rtol, atol)]
     tolerance = least_tolerance(rtol, atol)
-    radau = "RadauIIA5" if tolerance >= LOOSE else "RadauIIA9" if tolerance >= TIGHTEST else "RadauIIA13"
+    radau = "RadauIIA5" if tolerance >= TIGHTEST else "RadauIIA9"
     return [_newton(radau, "positions", n, rtol, atol)]
 
 

@@ -25,7 +25,7 @@ SHORT = 8  # operations up to which a series costs less than DOP853 at any toler
 SHORT_FROM = 1e-3
 SERIES_COMPILED, SERIES_COMPILED_MANY = 1e-6, 1e-8  # tolerance, for fewer than MANY coordinates and for others
 LOOSE = 3e-5  # tolerance from which on stiff motion is integrated to few digits ...
-TIGHTEST = 1e-12  # ... and from which down to many
+TIGHTEST = 9e-7  # ... and from which down to many
 LIMIT_FEW, LIMIT_MANY = 4.0, 0.25  # h rho from which on stiffness may limit DOP853 (stable to 5.9) and Adams
 LIMIT_FEW_OF_MANY = 2.0  # the same of DOP853 for MANY coordinates
 LOOKS_FEW = 2  # in a row, as accuracy may allow long steps for a while; those of Adams are too short for that
@@ -93,7 +93,7 @@ class Auto:
     far beyond that limit, this waits until the run has cost three trials, and 64 evaluations for each independent
     coordinate if tangents have to be differenced, or three tenths of what the run will cost as a whole at its
     present price are as much. The implicit method is kept if a second of motion costs it less, counted in
-    evaluations and Newton matrices: `loose` at tolerances from 3e-5 on, `tightest` below 1e-12, else `tight`. It is
+    evaluations and Newton matrices: `loose` at tolerances from 3e-5 on, `tightest` below 9e-7, else `tight`. It is
     left the same way. Counts decide, not times: a run can be repeated.
 
     Above 1000 coordinates no implicit method is tried, as its matrices are full; nor is a series where M and C_q have
