@@ -2,6 +2,8 @@
 
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
+from itertools import groupby
+from operator import itemgetter
 from typing import Any
 
 from studies.bench.render import listed, number, one_digit, power
@@ -139,14 +141,13 @@ def _crossed(rivals: Mapping[str, Any], own: Sequence[Mapping[str, Any]]) -> str
 
 
 def _by_error(at: Sequence[Mapping[str, Any]]) -> str:
-    """The cheapest from one error to another."""
-    by: dict[str, list[float]] = defaultdict(list)
-    for line in at:
-        run = _first(line)
-        if run:
-            by[call(run["solver"]) if line["verdict"] in DECIDED else ""].append(line["error"])
-    spans = {who: (power(max(errors)), power(min(errors))) for who, errors in by.items() if who}
-    said = [f"{who} ({high}{f' to {low}' if low != high else ''})" for who, (high, low) in spans.items()]
+    """The cheapest from one error to another, in the order of the errors; where none is, nothing is told."""
+    reached = [(line, run) for line in at if (run := _first(line))]
+    told = [(call(run["solver"]) if line["verdict"] in DECIDED else "", line["error"]) for line, run in reached]
+    spans: dict[str, list[str]] = defaultdict(list)
+    for who, errors in ((who, [error for _, error in own]) for who, own in groupby(told, key=itemgetter(0))):
+        spans[who] += [power(errors[0]) + (f" to {power(errors[-1])}" if len(errors) > 1 else "")]
+    said = [f"{who} ({', '.join(own)})" for who, own in spans.items() if who]
     return ", ".join(said) or "no solver compared reaches these errors"
 
 
@@ -196,9 +197,10 @@ def _in_angles(minimal: Mapping[str, Any]) -> list[dict[str, str]]:
     by = Counter(at["rival"]["solver"].partition(",")[0] for at in faster)
     slower = f", slower in {minimal['n_ahead']}" if minimal["n_ahead"] else ""
     told = f"faster in {minimal['n_behind']}{slower} of {minimal['n']} comparisons"
+    start = " from horizontal rest" if minimal.get("level") else ""  # where terms of heyoka's series vanish
     for each in minimal["wrong_by"]:
         told += f"; `{each['solver'].partition(',')[0]}` silently wrong by over {number(minimal['wrong_from'])}"
-        told += f" in {each['n']} of {each['asked']} runs"
+        told += f" in {each['n']} of {each['asked']} runs{start}"
     others = minimal["asked"] - sum(each["asked"] for each in minimal["wrong_by"])
     if minimal["wrong_by"] and others:
         told += f", others in 0 of {others}"

@@ -11,7 +11,7 @@ AT = 1e-6  # the error at which mechanisms are listed
 
 
 def findings_of(mechanisms: Sequence[dict[str, Any]], rows: pd.DataFrame) -> dict[str, Any]:
-    """The pairs in which the default is behind, by what would have to be shorter, and the mechanisms at one error.
+    """The pairs in which the default is behind, by what takes longer than the rival, and the mechanisms at one error.
 
     `mechanisms`: as `rivals.findings_of` lists them; `rows`: the medians of which it does.
     """
@@ -22,9 +22,11 @@ def findings_of(mechanisms: Sequence[dict[str, Any]], rows: pd.DataFrame) -> dic
         if at["standing"][headline.GIVEN]["verdict"] == "behind"
         and (pair := _pair(rows[rows["case"] == each["case"]], at)) is not None
     ]
-    parts = {"outside": 0, "both": 0, "steps": 0}
-    for pair in pairs:
-        parts[_longer(pair)] += 1
+    steps = [pair["steps_s"] >= pair["rival_s"] for pair in pairs]
+    outside = [pair["call_s"] - pair["steps_s"] >= pair["rival_s"] for pair in pairs]
+    either = list(zip(steps, outside, strict=True))
+    parts = {"steps": sum(steps), "each": either.count((True, True)), "outside": either.count((False, True))}
+    parts["together"] = either.count((False, False))
     return {"n": len(pairs), "parts": parts, "error": AT, "at": [pair for pair in pairs if pair["error"] == AT]}
 
 
@@ -40,10 +42,3 @@ def _pair(rows: pd.DataFrame, at: dict[str, Any]) -> dict[str, Any] | None:
     found |= {"steps_s": float(own["inside_s"]), "n_steps": int(own["n_steps"])}
     steps = None if pd.isna(rival["n_steps"]) else int(rival["n_steps"])
     return found | {"rival": str(rival["solver"]), "rival_s": float(rival["call_s"]), "rival_steps": steps}
-
-
-def _longer(pair: dict[str, Any]) -> str:
-    """Which part of the default's call takes longer than the whole call of its rival: outside the steps, in them."""
-    if pair["call_s"] - pair["steps_s"] >= pair["rival_s"]:
-        return "outside"
-    return "steps" if pair["steps_s"] >= pair["rival_s"] else "both"

@@ -23,6 +23,7 @@ from studies.work_precision import rivals
 FILE = "processors.csv"
 TIMES = {WHOLE_CALL: "call_s", "inside": "inside_s"}  # the measure of record first
 PLACE = ["case", "error", "who"]
+WORDS = ("ahead", "behind")
 
 # mechanism, error, and how each of ours stands
 Standings = Sequence[tuple[str, float, Mapping[str, Mapping[str, Any]]]]
@@ -93,6 +94,7 @@ def findings_of(table: pd.DataFrame) -> list[dict[str, Any]]:
             ahead = np.where(turned["verdict_one"] == "ahead", one, other)
             line: dict[str, Any] = {"processors": [one, other], "time": time, "n": len(both)}
             line["ahead"] = [int((both[f"verdict_{side}"] == "ahead").sum()) for side in ("one", "other")]
+            line["by"] = {str(who): _counts(own) for who, own in both.groupby("who", sort=False)}
             line["turned"] = turned[PLACE].assign(ahead_on=ahead).to_dict("records")
             favours = Counter(each["ahead_on"] for each in line["turned"]).most_common(1)
             line["in_favour"] = {"processor": favours[0][0], "n": favours[0][1]} if favours else None
@@ -101,6 +103,12 @@ def findings_of(table: pd.DataFrame) -> list[dict[str, Any]]:
             found.append(line | {"apart": float(apart.median()), "most": float(apart.max())})
             break
     return found
+
+
+def _counts(both: pd.DataFrame) -> dict[str, Any]:
+    """How many pairs there are, and in how many of them ours is ahead and behind on each processor."""
+    verdicts = {word: [int((both[f"verdict_{side}"] == word).sum()) for side in ("one", "other")] for word in WORDS}
+    return {"n": len(both), **verdicts}
 
 
 def rows_of(folder: Path) -> tuple[pd.DataFrame, str]:

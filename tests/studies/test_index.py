@@ -76,7 +76,7 @@ NOTHING = {"ours": None, "others": None, "standing": None}
 
 def standing(call_s=0.1, verdict="ahead"):
     found = {"solver": "ours", "call_s": call_s, "ratio": 2.0, "interval": [1.5, 2.5], "verdict": verdict}
-    return {name: dict(found) for name in ("auto", "auto, compiled", "best of ours")}
+    return {name: dict(found) for name in ("the default", "auto", "auto, compiled", "best of ours")}
 
 
 def at_error(error=1e-4, **changed):
@@ -257,10 +257,10 @@ def test_the_readme_changes_between_its_marks_only(tmp_path):
         index.put_in_readme(tmp_path / "nowhere", readme)
 
 
-def test_each_of_compiled_default_and_best_stands_in_the_table_by_its_verdict(tmp_path):
+def test_each_of_default_and_best_stands_in_the_table_by_its_verdict(tmp_path):
     at = at_error()
     at["standing"] = standing(0.25, "behind") | {"best of ours": standing(0.1, "undecided")["best of ours"]}
-    at["standing"]["auto, compiled"] |= {"verdict": "missed", "call_s": None, "ratio": None}
+    at["standing"]["the default"] |= {"verdict": "missed", "call_s": None, "ratio": None}
     line = next(line for line in screen(tmp_path, [case(at=[at])]).splitlines() if ": crane, 1.0 s" in line)
     assert [cell.strip() for cell in line.split("|")[3:6]] == [
         "–",

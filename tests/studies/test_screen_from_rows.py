@@ -31,6 +31,7 @@ def test_every_sentence_of_the_screen_follows_from_the_committed_rows(tmp_path, 
     monkeypatch.setattr(study, "write_index", lambda output: None)
     whole = {processors.WHOLE_CALL: processors.TIMES[processors.WHOLE_CALL]}
     monkeypatch.setattr(processors, "TIMES", whole)  # the first screen quotes no other
+    shutil.copy(REPORTS / processors.FILE, tmp_path)
     for name, told in TOLD.items():
         for path in (REPORTS / f"{name}.csv", REPORTS / f"{name}_series.npz"):
             if path.exists():
