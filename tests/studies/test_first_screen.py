@@ -174,7 +174,7 @@ def test_every_number_of_the_screen_is_made_again_from_the_rows(tmp_path):
         "The default is nowhere behind on 1 of 2 mechanisms, this one included.",
         "by over 1e-3 at a tolerance of 1e-8, under 17 kinds of sharp forces of our choice: the default 1 of 61, our "
         "other methods 2 of 125, heyoka 1 of 66 (1 of 67 with `max_step`), IDA and CVODE 0 of 64. ",
-        "at least every 5e-4 of a run (here 1.5e-3 s) and can miss shorter ones unless `max_step` is their duration: "
+        "at least every 5e-4 of a run and can miss shorter ones unless `max_step` is their duration: "
         "the default is wrong under 3 of 40 gusts exp(−(t/b)²) with b near 1e-4 s and none of 60 "
         "with b from 3e-4 to 0.010 s",
     ]
