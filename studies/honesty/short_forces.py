@@ -13,7 +13,7 @@ from studies.bench.sharp_forces import T_END, Sharp, gust
 from studies.bench.sharp_mechanisms import Mechanism, bars
 from studies.bench.sharp_mechanisms import chain as chain_of
 from studies.bench.sharp_motion import motion
-from studies.honesty.solvers import DEFAULT, LOOK
+from studies.honesty.solvers import DEFAULT
 from studies.honesty.traps import AGREE, GROWN, SHORT, Trap, of_force, pendulum
 
 WIDTHS = (1e-4, 3e-4, 1e-3, 3e-3, 1e-2)  # s
@@ -59,7 +59,7 @@ def findings_of(ran: pd.DataFrame, wrong: Sequence[str]) -> dict[str, Any]:
     for solver, own in ran.groupby("solver", sort=False):
         by = [gross[own.index[own["trap"] == name_of(width)]] for width in widths]
         lines.append({"solver": str(solver), "at": [{"n": len(each), "gross": int(each.sum())} for each in by]})
-    found: dict[str, Any] = {"widths": widths, "solvers": lines, "n": len(ran), "look": LOOK * T_END, "default": {}}
+    found: dict[str, Any] = {"widths": widths, "solvers": lines, "n": len(ran), "default": {}}
     for line in lines:
         if line["solver"] == DEFAULT:
             found["default"] = {name: _of_widths(widths, line["at"], missed) for name, missed in MISSED.items()}

@@ -91,7 +91,7 @@ def of_honesty():
     made = {"n_traps": 23, "looseness": 1e3, "exact": 1e-3, "off": 1e-5, "usual": 1e-8}
     made |= {"forces": forces, "forces_only": ["auto, compiled (twoloop)"] * 14}
     forces["trust"] = honesty.trust_in(rows)
-    short = {"n": 120, "widths": [1e-4, 1e-2], "look": 1.5e-3, "solvers": []}
+    short = {"n": 120, "widths": [1e-4, 1e-2], "solvers": []}
     short["default"] = {
         "none": {"n": 60, "gross": 0, "widths": [3e-4, 1e-2]},
         "some": {"n": 40, "gross": 3, "widths": [1e-4]},
