@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 
 from studies.bench.end_states import EXACT
-from studies.bench.sharp_forces import T_END, Sharp, gust
+from studies.bench.sharp_forces import Sharp, gust
 from studies.bench.sharp_mechanisms import Mechanism, bars
 from studies.bench.sharp_mechanisms import chain as chain_of
 from studies.bench.sharp_motion import motion
