@@ -14,7 +14,7 @@ from studies.bench.solvers import GIVEN
 from studies.honesty.traps import FORCE, HELD_OUT, INPUT, MISTAKE, SHORT, Trap
 from twoloop import Result, solve_dae
 from twoloop.kernels.control.sudden import PLACES
-from twoloop.run.run import LONGEST_UNSEEN
+from twoloop.kernels.data.tolerances import LONGEST_UNSEEN
 
 OWN = (GIVEN, "Taylor", "Adams", "DOP853", "Gauss12", "RadauIIA5", "BDF")
 IDA, IDA_C, CVODE_C, HEYOKA = "IDA, stabilised", "IDA from C", "CVODE from C, Adams", "heyoka, Taylor"

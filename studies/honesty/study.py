@@ -42,7 +42,7 @@ from studies.honesty.traps import AGREE as TRUE_TO
 from studies.honesty.traps import FORCE, GROWN, HELD_OUT, HELD_OUT_SEED, INPUT, MISTAKE, SHORT, Trap, held_out, traps
 from twoloop import ConstrainedSystem, solve_dae
 from twoloop.kernels.compile import callbacks
-from twoloop.run.run import LONGEST_UNSEEN
+from twoloop.kernels.data.tolerances import LONGEST_UNSEEN
 
 LOOSENESS = 1e3  # an answer is right within so many times the tolerance ...
 LEAST = 1e-10  # ... of which no more is asked than this

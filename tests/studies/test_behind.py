@@ -35,6 +35,6 @@ def test_what_takes_longer_than_the_rival_is_told(inside, rival, parts):
 def test_the_report_has_the_row_of_the_mechanism():
     rows = pairs(0.5)
     found = behind.findings_of(rivals.findings_of(rows)["mechanisms"], rows)
-    said = f"| four-bar | {number(3.5e6)} | {number(0.5e6)} | 8 | heyoka | {number(2e6)} | 60 |"
+    said = f"| four-bar | {number(3.5e6)} | {number(0.5e6)} (8) | heyoka {number(2e6)} (60) |"
     assert said in stated(1.0, behind=found)
     assert "## Where the rest goes" not in stated(1.0)

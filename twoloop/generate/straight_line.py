@@ -28,7 +28,7 @@ from twoloop.generate.tracing import Form, Graph, Untraceable
 from twoloop.kernels.evaluation.inner import CONTRADICTS
 from twoloop.problem.system import ConstrainedSystem
 
-MOST_OPERATIONS = 40_000  # with their elimination: those of 28 bodies on hinges in space
+MOST_ELIMINATED = 40_000  # operations with their elimination: those of 28 bodies on hinges in space
 
 
 @dataclass(frozen=True)
@@ -122,8 +122,8 @@ class StraightLine:
         self.traced = Traced(system, self.graph)
 
     def _bound(self) -> None:
-        if len(self.graph.operations) > MOST_OPERATIONS:
-            raise Untraceable(f"its equations are more than {MOST_OPERATIONS} operations")
+        if len(self.graph.operations) > MOST_ELIMINATED:
+            raise Untraceable(f"its equations are more than {MOST_ELIMINATED} operations")
 
     def _made(self, kind: str, v: Sequence[Form] | None = None) -> Any:
         return elementwise(Form.value, [self.equations.of(kind, v)])

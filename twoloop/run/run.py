@@ -28,8 +28,7 @@ Array = NDArray[np.float64]
 FIRST_CHUNK = 1024  # attempts of a small compiled system before Python looks at the run: a look costs 0.2 ms
 FIRST_CHUNK_IN_PYTHON = 64  # ... of one whose callbacks are plain Python functions, which may be slow
 SMALL = 32  # coordinates; chunks of larger systems are shorter in proportion
-LONGEST_UNSEEN = 0.01  # of the run: within this time the equations are looked at once at least ...
-SHARPER = 10  # ... and within this part of it by steps that look within, of what may be sharp in q or v
+SHARPER = 10  # times as often steps that look within look at the equations, of what may be sharp in q or v
 PROVISIONAL = 10  # steps after which a method that pays for long steps only gives way if they are short
 FIRST_STEP = 0.01  # of the shortest time scale that the initial state shows
 SHORTEST_STEP = 1e-16  # of the first step
@@ -322,7 +321,7 @@ class Run:
 
     def look_within(self, span: float) -> None:
         """Set how long a run is of which no hundredth is to pass unseen, s."""
-        self.gap = LONGEST_UNSEEN * span
+        self.gap = tolerances.LONGEST_UNSEEN * span
         self.tolerances[tolerances.GAP] = self.gap
         self.tolerances[tolerances.LOOK] = self.gap / (SHARPER if self.sudden.by_state else 1)
         self.limit_steps()

@@ -25,7 +25,7 @@ from twoloop.kernels.data.common import ATTEMPT, SETTLE, Attempt, Step, compiled
 from twoloop.kernels.data.counters import N_EVALUATIONS, N_JACOBIANS
 from twoloop.kernels.data.flags import FORCE_BY_Q_GIVEN, FORM, STATIC, STRAIGHT
 from twoloop.kernels.data.noted import EXPLICIT_STEP, REUSE, ROUNDED
-from twoloop.kernels.data.tolerances import ESTIMATE, GAP
+from twoloop.kernels.data.tolerances import ESTIMATE, GAP, LONGEST_UNSEEN
 from twoloop.kernels.evaluation.calls import evaluate, renew_partition
 from twoloop.kernels.evaluation.tasks import PROJECT
 
@@ -39,7 +39,6 @@ EARN = 64.0  # evaluations for each independent coordinate before a trial that d
 TRIAL = 300.0  # evaluations that a trial of the implicit method takes, about
 AFFORDED = 3.0  # trials that the run has cost so far, before one that may be in vain ...
 OF_RUN = 0.3  # ... or this share of what the run will cost as a whole, if it goes on as it does
-HUNDREDTHS = 100.0  # of the run, GAP is one of them
 APART = 30.0  # rates that the motion does not show are as many times as fast as those that it shows ...
 WORTH = 0.05  # ... and h rho this share of LIMIT: steps may be short for the sake of what an implicit method damps
 INSTANT = 1e-4  # over the largest rate: the time over which the motion's own is differenced
@@ -258,7 +257,7 @@ def _look(f, w, options, memory, tolerances, t, state, new_state):
     # a trial that may be in vain, in which derivatives are differenced, has to cost little beside the run so far
     paid, afforded = cost, AFFORDED * TRIAL * options[DEARER]
     if np.isfinite(tolerances[GAP]):
-        paid = max(paid, OF_RUN * HUNDREDTHS * tolerances[GAP] * price)
+        paid = max(paid, OF_RUN * tolerances[GAP] / LONGEST_UNSEEN * price)
     cheap = paid > afforded and (f.flags[FORCE_BY_Q_GIVEN] == 1 or paid > EARN * w.independent.size)
     hidden = False
     if memory[PHASE] == EXPLICIT and cheap and share > WORTH:

@@ -7,6 +7,8 @@ from twoloop.kernels.data.common import merged
 # ATOL on stands the absolute tolerance of each coordinate and its velocity
 RTOL, ESTIMATE, LEAST, GAP, LOOK, ATOL = range(6)
 
+LONGEST_UNSEEN = 0.01  # of the run: GAP
+
 
 @merged
 def allowed(tolerances, m, x, x1):
