@@ -18,7 +18,7 @@ from twoloop.problem.system import ConstrainedSystem
 from twoloop.result.result import Result
 
 LARGEST_UNROLLED = 21  # coordinates; for larger systems an unrolled integrator may take minutes to build per tolerance
-STEPS_A_CALL = 100  # between two checks of the clock
+STEPS = 20_000  # between two checks of the clock, over the number of coordinates: each costs as much as some steps
 
 
 @adapter(derivatives=False)
@@ -28,7 +28,7 @@ def solve_heyoka(task: Task, tol: float = 1e-8, *, max_step: float | None = None
     Settings: accelerations eliminated symbolically, exploiting structural zeros, in a minimum-degree order;
     `fast_math`; the default, unrolled form (`compact_mode=False`, faster than the compact one) up to
     `LARGEST_UNROLLED` coordinates. The timed call is a second use of the integrator, as in its tutorials: time and
-    state are set, and `propagate_until` is called without output. The clock is checked every `STEPS_A_CALL` steps.
+    state are set, and `propagate_until` is called without output. The clock is checked every `STEPS` / n_q steps.
 
     Parameters, errors and result as in `references.driver`; statistics: n_accepted. The integrator is cached for the
     next run of the same system, start and tolerance, and its machine code in heyoka's own cache on disk.
@@ -41,10 +41,11 @@ def solve_heyoka(task: Task, tol: float = 1e-8, *, max_step: float | None = None
 def integrate(integrator: Any, start: Array, task: Task, longest: float) -> tuple[str, Array, Array, str, int]:
     """Return the integrator's name, times reached, rows y there, error message or "", and number of steps."""
     outcomes, limit, steps = imported("heyoka").taylor_outcome, TimeLimit(task.time_limit), 0
+    at_once = STEPS // task.system.n_q
     with user_call:
         integrator.time, integrator.state[:] = task.t0, start
         while True:
-            outcome, _, _, taken, *_ = integrator.propagate_until(task.t1, max_steps=STEPS_A_CALL, max_delta_t=longest)
+            outcome, _, _, taken, *_ = integrator.propagate_until(task.t1, max_steps=at_once, max_delta_t=longest)
             steps += taken
             if outcome != outcomes.step_limit or limit.passed():
                 break

@@ -14,7 +14,7 @@ from twoloop.problem.problem import Array
 
 SMALLEST_STEP = 1e-12  # relative to the length of t_span; without a limit the step is reduced forever at a NaN
 MOST_STEPS = 10**9  # the time limit takes effect earlier
-STEPS_A_CALL = 100  # between two checks of the clock
+STEPS_A_CALL = 1000  # between two checks of the clock: each costs as much as a step of a small system
 NORMAL, ONE_STEP, TSTOP_RETURN, TOO_MUCH_WORK = 1, 2, 1, -1
 RAISED = -1  # return value of a callback for an unrecoverable error
 COUNTERS = {"n_accepted": ("Steps",), "n_rejected_error": ("ErrTestFails",)}
