@@ -76,7 +76,7 @@ def counted(found: Iterable[Iterable[Mapping[str, Mapping[str, Any]]]]) -> list[
     """Of many pairs of mechanism and error, in how many each of WHOSE is ahead, behind, undecided, alone, missing.
 
     `found`: of each mechanism how they stand at each error. n are the pairs that any of ours or of others reaches;
-    unbeaten the mechanisms, of n_mechanisms, at no error of which it is behind or missing where others get to.
+    unbeaten the mechanisms, of n_mechanisms, for which `is_unbeaten`.
     """
     mechanisms = [list(own) for own in found]
     pairs = [each for own in mechanisms for each in own if any(it["verdict"] != "none" for it in each.values())]
@@ -84,14 +84,19 @@ def counted(found: Iterable[Iterable[Mapping[str, Mapping[str, Any]]]]) -> list[
     for name in WHOSE:
         verdicts = [each[name]["verdict"] for each in pairs]
         line = {verdict: verdicts.count(verdict) for verdict in STANDINGS}
-        by_mechanism = [{each[name]["verdict"] for each in own} for own in mechanisms]
-        line["unbeaten"] = sum(not each & {"behind", "missed"} and each != {"none"} for each in by_mechanism)
+        line["unbeaten"] = sum(is_unbeaten(own, name) for own in mechanisms)
         line["n_mechanisms"] = len(mechanisms)
         # "none" counts, too: the one in question does not get there, another of ours does
         made.append(
             {"name": name, "n": len(pairs), **line, "missed": len(pairs) - sum(line[verdict] for verdict in STANDINGS)}
         )
     return made
+
+
+def is_unbeaten(found: Iterable[Mapping[str, Mapping[str, Any]]], name: str) -> bool:
+    """Whether one of WHOSE is at no error behind on a mechanism, or missing where others get to."""
+    verdicts = {each[name]["verdict"] for each in found}
+    return not verdicts & {"behind", "missed"} and verdicts != {"none"}
 
 
 def price(rows: pd.DataFrame, firsts: pd.DataFrame, case: str) -> dict[str, Any] | None:

@@ -11,6 +11,7 @@ from studies.bench.solvers import COMPILED, DEFAULT, HEYOKA
 from twoloop.methods.presets import PRESETS
 
 DECIDED = ("ahead", "behind", "alone", "missed")  # verdicts by which one solver is the cheapest
+TIGHTEST = 1e-9  # error down to which advice by error goes; the report has all
 SUFFIX = " (twoloop)"  # of our solvers, in the findings of honesty
 SMOOTH, STIFF, SINGULAR, LONG = "short smooth motion", "stiff", "singular", "long and conservative"
 FOUR_BARS = "four-bar linkages, over 10 s"  # which have no tags
@@ -141,8 +142,8 @@ def _crossed(rivals: Mapping[str, Any], own: Sequence[Mapping[str, Any]]) -> str
 
 
 def _by_error(at: Sequence[Mapping[str, Any]]) -> str:
-    """The cheapest from one error to another, in the order of the errors; where none is, nothing is told."""
-    reached = [(line, run) for line in at if (run := _first(line))]
+    """The cheapest from one error to another down to TIGHTEST, in order; where none is, nothing is told."""
+    reached = [(line, run) for line in at if line["error"] > 0.9 * TIGHTEST and (run := _first(line))]
     told = [(call(run["solver"]) if line["verdict"] in DECIDED else "", line["error"]) for line, run in reached]
     spans: dict[str, list[str]] = defaultdict(list)
     for who, errors in ((who, [error for _, error in own]) for who, own in groupby(told, key=itemgetter(0))):

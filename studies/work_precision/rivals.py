@@ -161,7 +161,9 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     ]
     every = [at for each in made for at in each["at"] if at["ratio"] is not None]
     found: dict[str, Any] = {"mechanisms": made, "n": len(every)}
-    found["standings"] = headline.counted([at["standing"] for at in each["at"]] for each in made)
+    standing = {each["case"]: [at["standing"] for at in each["at"]] for each in made}
+    found["standings"] = headline.counted(standing.values())
+    found["unbeaten"] = [case for case, own in standing.items() if headline.is_unbeaten(own, headline.GIVEN)]
     behind = Counter(at["standing"][headline.BEST]["rival"]["solver"] for at in every if at["verdict"] == "behind")
     found["behind"] = dict(behind.most_common())
     found["alone"] = [each["case"] for each in made if not any(at["others"] for at in each["at"])]

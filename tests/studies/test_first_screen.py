@@ -171,9 +171,10 @@ def test_every_number_of_the_screen_is_made_again_from_the_rows(tmp_path):
         f"\n| 1e-4 | {cells} |\n| 1e-6 | {cells} |\n",
         f"| first call | {first} | – | – | – |\n",
         f"the cheapest rival takes, in the median, {typical} of the default's time at 1e-4, {typical} at 1e-10.",
-        "The default is nowhere behind on 1 of 2 mechanisms, this one included.",
-        "by over 1e-3 at a tolerance of 1e-8, under 17 kinds of sharp forces of our choice: the default 1 of 61, our "
-        "other methods 2 of 125, heyoka 1 of 66 (1 of 67 with `max_step`), IDA and CVODE 0 of 64. ",
+        f"The default is nowhere behind on 1 of 2 mechanisms ({FOUR_BAR}).",
+        "by over 1e-3 at a tolerance of 1e-8, under 17 kinds of sharp forces of our choice (the same 61 for each solver, "
+        "unless its adapter refuses): the default 1 of 61, our 2 other methods 2 of 125, heyoka 1 of 66 (1 of 67 "
+        "with `max_step`; its own default tolerance is 2.2e-16), IDA and CVODE 0 of 64. ",
         "at least every 5e-4 of a run and can miss shorter ones unless `max_step` is their duration: "
         "the default is wrong under 3 of 40 gusts exp(−(t/b)²) with b near 1e-4 s and none of 60 "
         "with b from 3e-4 to 0.010 s",
@@ -367,7 +368,7 @@ def test_the_screen_has_few_words_and_sixty_lines_at_most(tmp_path):
     block = front.split(BEGIN)[1].split(END)[0]
     fixed = len(front.splitlines()) - len(block.splitlines())
     words = [word for word in block.replace("|", " ").split() if set(word) - set("-:")]
-    assert len(words) <= 570
+    assert len(words) <= 590
     assert fixed + max(len(each.splitlines()) for each in (block, block_of(tmp_path, findings()))) <= 60
     assert "index-3" not in front and "two-loop" not in front.split(BEGIN)[0]
 
