@@ -154,7 +154,7 @@ def test_sentences_turn_with_the_rows():
 def test_trust_is_counted_over_mistakes_and_forces():
     found, text = said(honesty, rows_of_forces())
     none = dict.fromkeys(("wrong", "unasked", "gross", "slight", "refused"), 0)
-    assert found["trust"]["default"] == none | {"n": 2}
+    assert found["trust"]["default"] == none | {"n": 2, "solvers": 1}
     found, text = said(honesty, rows_of_forces([(COMPILED, FORCE), (OTHER, FORCE), (THEIRS, MISTAKE)]))
     wrong = dict.fromkeys(KINDS, 0) | {"ours": 2, "scipy": 1, "others": 1}
     assert {name: each["wrong"] for name, each in found["trust"].items()} == wrong
