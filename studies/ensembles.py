@@ -41,7 +41,7 @@ OWN, WAYS, LEAPING = (ENSEMBLE, SINGLE), tuple(LOOKS), (ENSEMBLE, HEYOKA)
 LINKAGES = "random four-bar linkages"
 # mechanisms whose runs differ by their velocities at the start, and how long they run
 STARTS = {"andrews": 0.03, "spatial_slider_crank": 2.0, "redundant_slider_crank": 2.0}
-N_RUNS, N_QUICK, N_SINGLE = 256, 16, 32  # N_SINGLE: of those that are made one by one
+N_RUNS, N_QUICK, N_SINGLE = 1000, 16, 32  # N_SINGLE: of those that are made one by one
 SPAN = 6.0  # s, of the linkages
 N_GEOMETRY, N_GEOMETRY_QUICK = (10_000, 1_000_000), (200,)
 BLOCK = 100_000  # linkages at a time

@@ -61,8 +61,8 @@ def ensemble(
     method : str or method object
         "auto", "Taylor", "DOP853", "RadauIIA5", "RadauIIA9" and "RadauIIA13" go in lanes. "auto" takes Taylor series
         there, and DOP853 for runs that these cannot do and for systems that have none. If the first run came to
-        Newton's method, it takes the Radau method for the tolerance, for all runs: of order 5 from 3e-5 on, 13 below
-        1e-9, else 9, with errors of velocities tested as `Auto` does.
+        Newton's method, it takes a Radau method for all runs, of order 5 at tolerances from 9e-7 on and of order 9
+        below, with errors tested as by `Auto`.
     threads : int, optional
         None: one for each core that this process may use. Results do not depend on it.
 
