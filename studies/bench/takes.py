@@ -11,6 +11,7 @@ from studies.bench.solvers import COMPILED, DEFAULT, HEYOKA
 from twoloop.methods.presets import PRESETS
 
 DECIDED = ("ahead", "behind", "alone", "missed")  # verdicts by which one solver is the cheapest
+NAMED = 3  # of ours, the most often cheapest, at singular positions
 TIGHTEST = 1e-9  # error down to which advice by error goes; the report has all
 SUFFIX = " (twoloop)"  # of our solvers, in the findings of honesty
 SMOOTH, STIFF, SINGULAR, LONG = "short smooth motion", "stiff", "singular", "long and conservative"
@@ -75,7 +76,7 @@ def _shares(won: Mapping[str, int], of: str, coded: bool) -> str:
 
 
 def _by_the_tip(case: Mapping[str, Any]) -> dict[str, str]:
-    """The cheapest on a beam by the error of its tip; several where none is clearly cheaper."""
+    """The cheapest on a beam by the error of its tip, and at what setting; several where none is clearly cheaper."""
     by: dict[frozenset[str], list[str]] = defaultdict(list)
     words: dict[frozenset[str], str] = {}
     for at in case["at"]:
@@ -85,8 +86,8 @@ def _by_the_tip(case: Mapping[str, Any]) -> dict[str, str]:
             either = dict.fromkeys((*names, *at.get("ties", ())))
             who = frozenset(either)
             words.setdefault(who, " or ".join(call(name) for name in either))
-            by[who].append(power(at["error"]))
-    take = ", ".join(f"{words[who]} ({listed(errors)} m)" for who, errors in by.items())
+            by[who].append(f"{power(at['error'])} m at {at['best']['setting']}")
+    take = ", ".join(f"{words[who]} ({', '.join(errors)})" for who, errors in by.items())
     return {"what": BEAMS[case["name"]], "take": take or "no solver compared reaches these errors"}
 
 
@@ -136,8 +137,13 @@ def _crossed(rivals: Mapping[str, Any], own: Sequence[Mapping[str, Any]]) -> str
     verdicts = [at["verdict"] for each in own for at in each["at"]]
     ahead, behind = verdicts.count("ahead"), verdicts.count("behind")
     ranges = {each["name"].partition(" ")[0]: each["standings"][0] for each in rivals.get("ranges", [])}
-    default = "; the default in {ahead} and {behind}".format(**ranges[SINGULAR]) if SINGULAR in ranges else ""
-    whose = "one of ours" if ahead > behind else "another project's solver"
+    default = ""
+    if SINGULAR in ranges:
+        default = "; the default in {ahead} and {behind}, and {missed} it does not reach".format(**ranges[SINGULAR])
+    won = Counter(at["ours"]["solver"] for each in own for at in each["at"] if at["verdict"] in ("ahead", "alone"))
+    coded = set(rivals.get("with_code", [])).issuperset(each["case"] for each in own)
+    named = " or ".join(call(name, coded) for name, _ in won.most_common(NAMED))
+    whose = (named or "one of ours") if ahead > behind else "another project's solver"
     return f"{whose} (our best is ahead in {ahead}, behind in {behind} comparisons{default})"
 
 
@@ -199,8 +205,11 @@ def _in_angles(minimal: Mapping[str, Any]) -> list[dict[str, str]]:
     slower = f", slower in {minimal['n_ahead']}" if minimal["n_ahead"] else ""
     told = f"faster in {minimal['n_behind']}{slower} of {minimal['n']} comparisons"
     start = " from horizontal rest" if minimal.get("level") else ""  # where terms of heyoka's series vanish
+    start += ", its default tolerance included" if minimal.get("by_default") else ""
     for each in minimal["wrong_by"]:
-        told += f"; `{each['solver'].partition(',')[0]}` silently wrong by over {number(minimal['wrong_from'])}"
+        told += (
+            f"; `{each['solver'].partition(',')[0]}` silently wrong by over {number(minimal['wrong_from'])} m or rad"
+        )
         told += f" in {each['n']} of {each['asked']} runs{start}"
     others = minimal["asked"] - sum(each["asked"] for each in minimal["wrong_by"])
     if minimal["wrong_by"] and others:

@@ -21,6 +21,7 @@ from studies.work_precision import rivals
 GROUP = "minimal coordinates"
 ERRORS = (1e-3, 1e-6, 1e-9, 1e-12)
 TOLERANCES = (1e-3, 1e-5, 1e-7, 1e-9, 1e-11, 1e-13)
+HEYOKAS_OWN = float(np.finfo(float).eps)  # the tolerance that heyoka takes where none is given
 WRONG, ASKED = 0.1, 1e-4  # a run that ends with this error, though it was asked for a thousandth of it, is wrong
 TIME_LIMIT = 10.0  # s of CPU; heyoka's loosest runs may be its slowest, and what passes it twice is not asked on
 PENDULUMS = {"A01 pendulum", "projection pendulum", "double pendulum"}  # no loops; from rest in a horizontal position
@@ -34,7 +35,9 @@ def runs(quick: bool) -> list[Run]:
             case = replace(case_of(problem), name=name, time_limit=TIME_LIMIT, timed=rivals.TIMED)
             values = rivals.QUICK_TOLERANCES if quick else TOLERANCES
             repeats = 1 if quick else REPEATS
-            found += [Run(case, CATALOGUE[solver], value, GROUP, repeats) for solver in MINIMAL for value in values]
+            for solver in MINIMAL:
+                own = (HEYOKAS_OWN,) if solver.startswith(HEYOKA) and not quick else ()
+                found += [Run(case, CATALOGUE[solver], value, GROUP, repeats) for value in (*values, *own)]
     return found
 
 
@@ -74,6 +77,7 @@ def findings_of(rows: pd.DataFrame, everywhere: pd.DataFrame) -> dict[str, Any]:
     found |= {"asked": len(asked), "asked_at": ASKED, "wrong": len(wrong)}
     released = set(wrong["case"][wrong["solver"].astype(str).str.startswith(HEYOKA)])
     found["level"] = sorted(released) if released <= PENDULUMS else []
+    found["by_default"] = bool((wrong["tol"] == HEYOKAS_OWN).any())
     counts, of = wrong["solver"].value_counts(sort=False), asked["solver"].value_counts()
     found["wrong_by"] = [{"solver": str(name), "n": int(n), "asked": int(of[name])} for name, n in counts.items()]
     found |= {f"n_{verdict}": verdicts.count(verdict) for verdict in ("ahead", "behind", "undecided")}

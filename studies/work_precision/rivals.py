@@ -170,6 +170,7 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     asked = {each["case"] for each in made if any(at["verdict"] == "alone" for at in each["at"])}
     found["not_put"] = [name for name in found["alone"] if name not in asked]
     found["put"], found["fewest"], found["close"] = put(rows), fewest(rows), close(every)
+    found["put"]["ours"] = int(rows.loc[rows["family"] == "two-loop", "solver"].nunique())
     found["with_code"] = [each["case"] for each in made if given_on(each["case"]) == headline.OWN_CODE]
     found["ranges"] = [_within(made, name, errors) for name, errors in RANGES.items()]
     found["typical"] = [each for error in TYPICAL if (each := _typical(made, error)) is not None]

@@ -159,9 +159,10 @@ def test_every_number_of_the_screen_is_made_again_from_the_rows(tmp_path):
         np.median([ms["heyoka"][0] / ms["auto, compiled"][0], ms["IDA from C, stabilised"][1] / ms["auto"][1]])
     )
     expected = [
-        f"the default is ahead in {ahead} and behind in {behind} of {2 * N} comparisons with the best of up to "
-        f"{n_others} rival configurations (2 mechanisms; 0 of the {ahead} at singular positions); the best of our "
-        f"methods, chosen afterwards, is ahead in {best} and behind in {beaten}.",
+        f"against the best of up to {n_others} rival configurations on 2 mechanisms:",
+        f"| ahead / behind, by error | {' | '.join(rivals.RANGES)} |",
+        f"| the default | {own} | 0 / 0 |",
+        f"| the best of our {len(ours)} configurations, chosen afterwards | {ours_best} | 0 / 0 |",
         "| four-bar linkages, over long times (crane, 10 s) | `compiled=True` (3 of 3 errors) |",
         "| energy over 1e4 s (four-bar, timed once) | `LSODA`; without drift `Gauss(3)` |",
         "| redundant constraints | `IDA from C, stabilised` (1 of 1 mechanisms) |",
