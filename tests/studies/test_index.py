@@ -281,10 +281,7 @@ def test_the_counts_of_the_headline_stand_first(tmp_path):
         "n_mechanisms": 23,
     }
     standings = [counts | {"name": name} for name in ("the default", "auto, compiled", "auto", "best of ours")]
-    standings[3] |= {"ahead": 158, "behind": 1, "missed": 0}
     text = front(tmp_path, [case()], standings=standings)
-    said = "the default is ahead in 51 and behind in 123 of 200 comparisons with the best of up to"
-    assert said in text and "chosen afterwards, is ahead in 158 and behind in 1." in text
     assert "In most comparisons another solver is faster" in text
     standings[0] |= {"behind": 60}
     assert "Another solver is often faster" in front(tmp_path, [case()], standings=standings)
