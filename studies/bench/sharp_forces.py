@@ -195,6 +195,12 @@ def gust(width: float) -> Callable[..., Sharp]:
     return family(3, about(), c=between(0.3, 2.3), b=log(0.7, 1.4, width), a=size)
 
 
+def pulse(duration: float) -> Callable[..., Sharp]:
+    """draw(name, generator) of a force that is constant for about this time (s), from a random time on."""
+    size = log(5.0, 50.0, (0.03 / duration) ** 0.5)
+    return family(13, lambda b, c: {"breaks": (c, c + b)}, c=between(0.3, 2.3), b=log(0.7, 1.4, duration), a=size)
+
+
 def families() -> dict[str, Draw]:
     """Name to draw(generator), which returns a force of that family with random numbers."""
     when, size = between(0.3, 2.3), log(5.0, 50.0)

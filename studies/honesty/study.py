@@ -244,6 +244,7 @@ def of_forces(rows: pd.DataFrame) -> dict[str, Any]:
     """Outcomes under sharp forces: of every solver, and of ours and others under each force."""
     ran = rows[rows["outcome"] != NOT_RUN]
     found: dict[str, Any] = {"n": len(ran), "n_families": ran["trap"].nunique(), "families": of_traps(ran)}
+    found["n_gusts"] = sum(name.startswith("gust") for name in map(str, ran["trap"].unique()))
     return found | {"solvers": totals(rows), "mechanisms": [str(name) for name in ran["mechanism"].unique()]}
 
 

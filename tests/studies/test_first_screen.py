@@ -87,16 +87,22 @@ def of_honesty():
     fewer = rows[rows["outcome"] != honesty.SILENT]
     held_out = {"trust": honesty.trust_in(fewer), "solvers": honesty.totals(fewer)}
     held_out["ran"] = [kind for kind in honesty.KINDS[:-1] if held_out["trust"][kind]["n"]]
-    forces = {"n_families": 17, "mechanisms": ["a", "b", "c"]}
+    forces = {"n_families": 17, "n_gusts": 4, "mechanisms": ["a", "b", "c"]}
     made = {"n_traps": 23, "looseness": 1e3, "exact": 1e-3, "off": 1e-5, "usual": 1e-8}
     made |= {"forces": forces, "forces_only": ["auto, compiled (twoloop)"] * 14}
     forces["trust"] = honesty.trust_in(rows)
-    short = {"n": 120, "widths": [1e-4, 1e-2], "solvers": []}
-    short["default"] = {
-        "none": {"n": 60, "gross": 0, "widths": [3e-4, 1e-2]},
-        "some": {"n": 40, "gross": 3, "widths": [1e-4]},
+    short = {}
+    for k, shape in enumerate(("gust", "pulse")):
+        short[shape] = {"n": 120, "widths": [1e-4, 1e-2], "solvers": []}
+        none = {"n": 60 + k, "gross": 0, "widths": [3e-4, 1e-2]}
+        short[shape]["default"] = {"none": none, "some": {"n": 40, "gross": 3 + k, "widths": [1e-4]}}
+    return made | {
+        "trust": honesty.trust_in(rows),
+        "held_out": held_out,
+        "look": 5e-4,
+        "short": short,
+        "forces_end": 3.0,
     }
-    return made | {"trust": honesty.trust_in(rows), "held_out": held_out, "look": 5e-4, "short": short}
 
 
 def of_sharp(error):
@@ -180,12 +186,12 @@ def test_every_number_of_the_screen_is_made_again_from_the_rows(tmp_path):
         f"| first call | {first} | {number(1e3 * FIRST['CVODE from C, Adams'])} | – | – |\n",
         "First calls, at 1e-8 and timed once",
         f"the cheapest rival takes, in the median, {typical} of the default's time at 1e-4, {typical} at 1e-10.",
-        "by over 1e-3 at a tolerance of 1e-8, under 17 kinds of sharp forces of our choice (the same 61 for each solver, "
-        "unless its adapter refuses): the default 1 of 61, our 2 other methods 2 of 125, heyoka 1 of 66 (1 of 67 "
+        "by over 1e-3 at a tolerance of 1e-8, under 17 kinds of sharp forces of our choice, 4 of them gusts (the "
+        "same 61 for each solver, unless its adapter refuses): the default 1 of 61, our 2 other methods 2 of 125, heyoka 1 of 66 (1 of 67 "
         "with `max_step`; its own default tolerance is 2.2e-16), IDA and CVODE 0 of 64. ",
         "at least every 5e-4 of a run and can miss shorter ones unless `max_step` is their duration: "
-        "the default is wrong under 3 of 40 gusts exp(−(t/b)²) with b near 1e-4 s and none of 60 "
-        "with b from 3e-4 to 0.010 s",
+        "the default is wrong under 4 of 40 constant forces that last 1e-4 s and none of 61 that last 3e-4 to 0.010 s; "
+        "under 3 of 40 gusts exp(−(t/b)²) with b of 1e-4 s and none of 60 with b of 3e-4 to 0.010 s, in runs of 3.0 s",
     ]
     for said in expected:
         assert said in text, said

@@ -294,8 +294,12 @@ def test_forces_are_on_three_mechanisms():
 
 def test_a_gust_shorter_than_a_look_is_a_rate_over_random_times():
     made = list(short_forces.traps(quick=True))
-    assert {trap.group for trap in made} == {SHORT} and len({trap.mechanism for trap in made}) == len(made) == 2
-    assert len({tuple(trap.system.parameters) for trap in made}) == 2
+    assert {trap.group for trap in made} == {SHORT} and {trap.name for trap in made} == {
+        "gust of 1 ms",
+        "pulse of 1 ms",
+    }
+    assert len({(trap.name, trap.mechanism) for trap in made}) == len(made) == 4
+    assert len({tuple(trap.system.parameters) for trap in made}) == 4
     assert {"CVODE from C, Adams", "heyoka, Taylor", "IDA from C", "DOP853, index 1"} < set(solvers(False, SHORT))
     assert not any(name.endswith(LIMITED) for name in solvers(False, SHORT))
     lines = [("gust of 1 ms", OURS, honesty.SILENT, 0.1), ("gust of 1 ms", OURS, honesty.SILENT, 1e-4)]
@@ -305,8 +309,9 @@ def test_a_gust_shorter_than_a_look_is_a_rate_over_random_times():
     short = rows.iloc[[0] * len(lines)].reset_index(drop=True).assign(group=SHORT, mechanism="pendulum, draw 0")
     short[["trap", "solver", "outcome", "error"]] = lines
     found, text = said(honesty, pd.concat([rows, short], ignore_index=True))
-    assert found["short"]["widths"] == [1e-3, 1e-2]
+    gusts = found["short"]["gust"]
+    assert gusts["widths"] == [1e-3, 1e-2] and found["short"]["pulse"]["n"] == 0
     some, none = {"n": 2, "gross": 1, "widths": [1e-3]}, {"n": 1, "gross": 0, "widths": [1e-2]}
-    assert found["short"]["default"] == {"some": some, "none": none}
-    assert "| the default | 1/2 | 0/1 |" in text and "| LSODA, index 1 | 1/1 | 0/0 |" in text
-    assert "## Short gusts" not in said(honesty, rows)[1]
+    assert gusts["default"] == {"some": some, "none": none}
+    assert "| the default | 1/2 | 0/1 |" in text and "| LSODA, index 1 | 1/1 | – |" in text
+    assert "## Short forces" not in said(honesty, rows)[1]
