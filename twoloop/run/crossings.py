@@ -120,7 +120,7 @@ def _v(n: int) -> slice:
 
 def _known_acceleration(system: ConstrainedSystem, t: float, q: Array, v: Array, near: float) -> float:
     """The largest acceleration without what rows give whose singular values are below this share of the largest."""
-    mass, rows, lengths, units = _in_any_units(system, t, q)
+    mass, rows, lengths, units = in_any_units(system, t, q)
     left, values, right = np.linalg.svd(rows, full_matrices=False)
     kept = values > near * values[0]
     short = DIFFERENCE * max(np.abs(q).max(), DIFFERENCE) / max(np.abs(v).max(), DIFFERENCE)
@@ -133,11 +133,11 @@ def _known_acceleration(system: ConstrainedSystem, t: float, q: Array, v: Array,
 
 def _ratio_in_any_units(system: ConstrainedSystem, t: float, q: Array, rank: int) -> float:
     """As `singular_ratio`, but independent of the units of coordinates and rows."""
-    values = np.linalg.svd(_in_any_units(system, t, q)[1], compute_uv=False)[:rank]
+    values = np.linalg.svd(in_any_units(system, t, q)[1], compute_uv=False)[:rank]
     return float(values[-1] / values[0]) if len(values) and values[0] > 0.0 else float(len(values) == 0)
 
 
-def _in_any_units(system: ConstrainedSystem, t: float, q: Array) -> tuple[Array, Array, Array, Array]:
+def in_any_units(system: ConstrainedSystem, t: float, q: Array) -> tuple[Array, Array, Array, Array]:
     """Mass and rows with coordinates in which each has a mass of one, lengths of these rows, and units of the former.
 
     The rows are divided by their lengths.

@@ -3,6 +3,9 @@
 import warnings
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from twoloop.checks.at_position import dependent_rows, least_inertia, not_finite
 from twoloop.checks.consistency import ConstraintWarning
 from twoloop.checks.rank import in_words, surely_above
@@ -10,11 +13,15 @@ from twoloop.kernels.data import codes, noted, tolerances
 from twoloop.run.crossings import Place, said_of_crossings, said_of_turn, singular_ratio
 from twoloop.run.pace import INTERRUPTED, OUT_OF_TIME, STAGNATED, STAGNATION_STEPS, Pace
 from twoloop.run.record import Later, Status
+from twoloop.run.undetermined import UNTRUE, WEAK, turned_by_rounding
 
 if TYPE_CHECKING:
     from twoloop.run.run import Run
 
+Array = NDArray[np.float64]
+
 NEARLY_SINGULAR = 1e-3  # smallest over largest singular value of C_q, below which a message says so
+LASTING = 100.0  # times what the tolerances allow: errors of velocities on the way that end the trust in a run
 LOST_AT_END = 1e-6  # the same, below which the state at the end of a run is said not to be determined
 CROSSINGS = "\0"  # stands for what is said of singular positions that were crossed
 NEXT_TO_END = 1e-3  # of the run: where it stops so close to its end, that is said
@@ -61,8 +68,25 @@ def unless_turned(run: "Run", last_step: list[Place], end: float, status: Status
     if not crossings:
         return status, message
     rtol, atol = float(run.tolerances[tolerances.RTOL]), run.tolerances[tolerances.ATOL :]
-    turned = said_of_turn(run.system, crossings, now, run.rank, rtol, atol)
+    turned = said_of_rounding(run, crossings, end) or said_of_turn(run.system, crossings, now, run.rank, rtol, atol)
     return (Status.RANK_LOST, turned) if turned else (status, message)
+
+
+def said_of_rounding(run: "Run", crossings: list[list[Place]], end: float) -> str:
+    """Where steps went on from velocities that rounding had made; nothing if they did so nowhere."""
+    system, n = run.system, run.system.n_q
+    for t, state in {place[0]: place for crossing in crossings for place in crossing}.values():
+        q, v = state[:n], state[n : 2 * n]
+        if t >= end or surely_above(run.near, system.rows(t, q), run.rank):
+            continue
+        over = _over_allowed(run, t, q, v)
+        if over > LASTING:
+            return (
+                f"Not to be trusted beyond t = {t:.10g}: steps went on from there, where the constraints nearly lose "
+                f"rank ({_measured(run, t, q)}), and rounding of positions had changed velocities by about {over:.1g} "
+                "times what rtol and atol allow. Take another method, or end t_span before."
+            )
+    return ""
 
 
 def outcome(run: "Run", code: int, t1: float, pace: Pace) -> tuple[Status, str]:
@@ -147,22 +171,40 @@ def _contradiction(run: "Run") -> str:
 
 
 def _said_of_end(run: "Run") -> str:
-    """A warning, and the sentence, where the run ends with constraints that have lost rank."""
-    if not run.crossings and not (run.plan.watchful and run.work.notes[noted.NEARLY_SINGULAR] == 1.0):
+    """A warning, and the sentence, where the run ends with constraints that have lost rank, or nearly so."""
+    if run.clock[run.a.PIVOT_AT_OUTPUT] >= run.near:
         return ""
-    t, q, rank = float(run.clock[run.a.T]), run.state[: run.system.n_q], run.rank
-    if surely_above(LOST_AT_END, run.system.rows(t, q), rank):
+    system, n, t = run.system, run.system.n_q, float(run.clock[run.a.T])
+    q, v = run.state[:n], run.state[n : 2 * n]
+    if surely_above(WEAK, system.rows(t, q), run.rank):
         return ""
-    ratio = singular_ratio(run.system, t, q, rank)
-    if ratio > LOST_AT_END:
-        return ""
-    said = (
-        f"the run ends where the constraints lose rank (the smallest singular value of the constraint Jacobian is "
-        f"{ratio:.1g} of the largest): they do not determine velocities and accelerations there. End t_span a "
-        "little before, or beyond"
-    )
+    if singular_ratio(system, t, q, run.rank) <= LOST_AT_END:
+        said = (
+            f"the run ends where the constraints lose rank ({_measured(run, t, q)}): they do not determine velocities "
+            "and accelerations there. End t_span a little before, or beyond"
+        )
+    else:
+        over = _over_allowed(run, t, q, v)
+        if over <= UNTRUE:
+            return ""
+        said = (
+            f"the run ends where the constraints nearly lose rank ({_measured(run, t, q)}): rounding of positions "
+            f"changes velocities there by about {over:.1g} times what rtol and atol allow, and accelerations by more. "
+            "End t_span a little before, or beyond, or loosen rtol and atol"
+        )
     warnings.warn(said, ConstraintWarning, stacklevel=4)
     return f" {said[0].upper()}{said[1:]}."
+
+
+def _over_allowed(run: "Run", t: float, q: Array, v: Array) -> float:
+    """Errors of velocities that rounding of positions makes, over the tolerances."""
+    allowed = run.tolerances[tolerances.ATOL :] + run.rtol * np.abs(v).max()
+    return float((turned_by_rounding(run.system, t, q, v, run.rank) / allowed).max())
+
+
+def _measured(run: "Run", t: float, q: Array) -> str:
+    ratio = singular_ratio(run.system, t, q, run.rank)
+    return f"the smallest singular value of the constraint Jacobian is {ratio:.1g} of the largest"
 
 
 def _end_is_near(run: "Run", t1: float) -> str:

@@ -82,6 +82,43 @@ def full_pivoting(A, order, row_order, largest, first, last, most):
 
 
 @compiled
+def scale_columns(A):
+    """The same of each column."""
+    for j in range(A.shape[1]):
+        top = 0.0
+        for i in range(A.shape[0]):
+            top = max(top, abs(A[i, j]))
+        if top > 0.0 and top < np.inf:
+            scale = 2.0 ** -np.round(np.log2(top))
+            for i in range(A.shape[0]):
+                A[i, j] *= scale
+
+
+@compiled
+def least_pivot(f, w, t, q):
+    """The smallest of the pivots at a position, over the largest, whatever the units; the partition stays."""
+    if w.rows_v.size == 0:
+        return 1.0
+    G, order, row_order = w.Gx, w.order, w.row_order
+    G[:, :] = 0.0
+    constraint_rows(f, w, t, q, G)
+    for _ in range(2):
+        scale_rows(G)
+        scale_columns(G)
+    for j in range(order.size):
+        order[j] = j
+    for i in range(row_order.size):
+        row_order[i] = i
+    rank = full_pivoting(G, order, row_order, w.g, 0, row_order.size, w.rows_v.size)
+    if rank < w.rows_v.size:
+        return 0.0
+    smallest, largest = np.inf, 0.0
+    for k in range(rank):
+        smallest, largest = min(smallest, abs(G[k, k])), max(largest, abs(G[k, k]))
+    return smallest / largest
+
+
+@compiled
 def _eliminate(w, most, most_v):
     """Order rows and columns of w.Gx: first what the constraints C need, then what the rows A add to it.
 
