@@ -12,10 +12,10 @@ from twoloop.kernels.data import intervals as kinds
 from twoloop.kernels.data.codes import DONE, GAMMA_INACCURATE, SINGULAR
 from twoloop.kernels.data.common import INTEGERS, KIT, MATRIX, VECTOR, WORK, compiled, f8, i8, kernel, merged
 from twoloop.kernels.data.flags import FORM, NULL_SPACE
-from twoloop.kernels.data.noted import GAMMA_REQUIRED, PIVOT
+from twoloop.kernels.data.noted import GAMMA_REQUIRED
 from twoloop.kernels.data.tolerances import ATOL, RTOL
 from twoloop.kernels.evaluation.calls import accelerations, find_tangents, renew_partition, restore
-from twoloop.kernels.evaluation.partition import partition_is_poor
+from twoloop.kernels.evaluation.partition import least_pivot, partition_is_poor
 
 TABLE = types.int64[:, ::1]
 PLACES = (0.3, 0.7)  # within an interval, of its length, where polynomials are looked at
@@ -110,9 +110,9 @@ def _is_singular(f, w, t, states, i, last, time, q):
     n, largest = w.Q.size, 0.0
     for r in (i, last):
         if renew_partition(f, w, t[r], states[r, :n]) == DONE:
-            largest = max(largest, w.notes[PIVOT])
+            largest = max(largest, least_pivot(f, w, t[r], states[r, :n]))
     code = renew_partition(f, w, time, q)
-    return code != DONE or w.notes[PIVOT] < max(SINGULAR_SHARE * largest, SINGULAR_PIVOT)
+    return code != DONE or least_pivot(f, w, time, q) < max(SINGULAR_SHARE * largest, SINGULAR_PIVOT)
 
 
 @kernel(i8(KIT, WORK, f8, VECTOR, VECTOR, MATRIX, TABLE, VECTOR, VECTOR, MATRIX, MATRIX))

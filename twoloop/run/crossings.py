@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 from numpy.typing import NDArray
 
+from twoloop.checks.scales import signs
 from twoloop.problem.system import ConstrainedSystem
 
 Array = NDArray[np.float64]
@@ -15,6 +16,7 @@ LOST = 1e-2  # smallest over largest singular value, below which constraints are
 SAMPLES = 33  # of the motion across
 SHOWN = 3  # places of which a message speaks
 DIFFERENCE = 1e-6  # relative: length of the way on which gamma is found by differences
+SHORT = 0.1  # of what rows become where they turn as others do: those that are shorter are so by their position
 TURNED = 3.0  # of what the accelerations before and behind give: velocities that changed by more turned in between ...
 APPARENT = 10.0  # ... which counts where it exceeds the tolerances so many times
 
@@ -120,7 +122,7 @@ def _v(n: int) -> slice:
 
 def _known_acceleration(system: ConstrainedSystem, t: float, q: Array, v: Array, near: float) -> float:
     """The largest acceleration without what rows give whose singular values are below this share of the largest."""
-    mass, rows, lengths, units = in_any_units(system, t, q)
+    mass, rows, lengths, units = _in_any_units(system, t, q)
     left, values, right = np.linalg.svd(rows, full_matrices=False)
     kept = values > near * values[0]
     short = DIFFERENCE * max(np.abs(q).max(), DIFFERENCE) / max(np.abs(v).max(), DIFFERENCE)
@@ -133,21 +135,29 @@ def _known_acceleration(system: ConstrainedSystem, t: float, q: Array, v: Array,
 
 def _ratio_in_any_units(system: ConstrainedSystem, t: float, q: Array, rank: int) -> float:
     """As `singular_ratio`, but independent of the units of coordinates and rows."""
-    values = np.linalg.svd(in_any_units(system, t, q)[1], compute_uv=False)[:rank]
+    values = np.linalg.svd(_in_any_units(system, t, q)[1], compute_uv=False)[:rank]
     return float(values[-1] / values[0]) if len(values) and values[0] > 0.0 else float(len(values) == 0)
 
 
-def in_any_units(system: ConstrainedSystem, t: float, q: Array) -> tuple[Array, Array, Array, Array]:
+def _in_any_units(system: ConstrainedSystem, t: float, q: Array) -> tuple[Array, Array, Array, Array]:
     """Mass and rows with coordinates in which each has a mass of one, lengths of these rows, and units of the former.
 
-    The rows are divided by their lengths.
+    The rows are divided by their lengths, or by what these are some way off where they are short by the position.
     """
-    mass, rows = system.mass(t, q), system.rows(t, q)
-    inertia = np.abs(np.diagonal(mass))
-    units = 1.0 / np.sqrt(np.where(inertia > 0.0, inertia, inertia.max()))
+    mass, rows, units = system.mass(t, q), system.rows(t, q), units_of(system, t, q)
     lengths = np.linalg.norm(rows * units, axis=1)
+    way = DIFFERENCE * max(np.abs(q).max(), DIFFERENCE) * units / units.max() * signs(len(q))
+    bends = np.linalg.norm((system.rows(t, q + way) - system.rows(t, q - way)) * units, axis=1)
+    if bends.max(initial=0.0) > 0.0:
+        lengths = np.maximum(lengths, SHORT * lengths.max() * bends / bends.max())
     lengths[lengths == 0.0] = 1.0
     return mass * units * units[:, None], rows * units / lengths[:, None], lengths, units
+
+
+def units_of(system: ConstrainedSystem, t: float, q: Array) -> Array:
+    """Units in which each coordinate has a mass of one."""
+    inertia = np.abs(np.diagonal(system.mass(t, q)))
+    return np.asarray(1.0 / np.sqrt(np.where(inertia > 0.0, inertia, inertia.max())))
 
 
 def _times(found: dict[float, float]) -> str:

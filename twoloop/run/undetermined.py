@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.problem.system import ConstrainedSystem
-from twoloop.run.crossings import DIFFERENCE, in_any_units
+from twoloop.run.crossings import DIFFERENCE, units_of
 
 Array = NDArray[np.float64]
 
@@ -25,9 +25,9 @@ def nearness(rtol: float) -> float:
 
 def turned_by_rounding(system: ConstrainedSystem, t: float, q: Array, v: Array, rank: int) -> Array:
     """The errors of the velocities that rounding of positions makes, about, (n_q,)."""
-    _, rows, lengths, units = in_any_units(system, t, q)
+    units = units_of(system, t, q)
+    rows = system.rows(t, q) * units
     left, values, right = np.linalg.svd(rows, full_matrices=False)
-    rounding = ROUNDING * np.sqrt((rows * rows) @ (q / units) ** 2)
     errors = np.zeros(len(q))
     for u, value, way in zip(left.T[:rank], values[:rank], right[:rank] * units, strict=True):
         if value > WEAK * values[0]:
@@ -35,7 +35,11 @@ def turned_by_rounding(system: ConstrainedSystem, t: float, q: Array, v: Array, 
         if value == 0.0:
             return np.full(len(q), np.inf)
         step = DIFFERENCE * max(np.abs(q).max(), DIFFERENCE) / np.abs(way).max()
-        ahead, behind = (system.velocity_constraint(t, q + side * step * way, v) for side in (1.0, -1.0))
-        turn = (ahead - behind) / (2.0 * step * lengths)
+        beside = [q + side * step * way for side in (1.0, -1.0)]
+        turn = np.subtract(*(system.velocity_constraint(t, each, v) for each in beside)) / (2.0 * step)
+        bend = np.abs(np.subtract(*(system.rows(t, each) for each in beside))) * units
+        # rows that are short here are so by their position: a constraint is rounded as it would be some way off
+        away = np.abs(rows) + bend * (np.abs(rows).max() / max(bend.max(), np.finfo(float).tiny))
+        rounding = ROUNDING * np.sqrt((away * away) @ (q / units) ** 2)
         errors = np.maximum(errors, np.abs(way * (u @ turn)) * np.sqrt((u * u) @ (rounding * rounding)) / value**2)
     return errors

@@ -67,14 +67,10 @@ def with_care(f, w, control, clock, size):
 
 @merged
 def note_output(f, w, clock, state):
-    """Note how near a singular position is at an output time, where the step ends on it.
-
-    Many rows, and those with static factors, are not eliminated for this: the pivots that were last found are compared.
-    """
-    if f.flags[FORM] == STATIC or f.flags[FORM] == AUGMENTED:
-        pivot = w.notes[PIVOT] / max(w.notes[PIVOT], clock[at.LARGEST_PIVOT]) if w.notes[PIVOT] > 0.0 else 0.0
-    else:
-        pivot = least_pivot(f, w, clock[at.T], state[: w.Q.size])
+    """Note how near a singular position is at an output time, where the step ends on it."""
+    pivot = least_pivot(f, w, clock[at.T], state[: w.Q.size])
+    if f.flags[FORM] == STATIC and pivot > 0.0:
+        pivot /= max(pivot, clock[at.LARGEST_PIVOT])  # sines, which are small in large mechanisms
     clock[at.PIVOT_AT_OUTPUT] = min(clock[at.PIVOT_AT_OUTPUT], pivot)
 
 
