@@ -9,7 +9,7 @@ import pytest
 from tests.general.dead_points import CUSP_TIME, cusp
 from tests.general.mechanisms import SINGULAR, WINDOWS, error, first_singular_time, mechanism, run
 from tests.problems import event, worst
-from twoloop import DOP853, ConstrainedSystem, ConstraintWarning, Status, solve_dae
+from twoloop import DOP853, ConstrainedSystem, ConstraintWarning, Integrator, Status, solve_dae
 from twoloop.bodies import PlanarModel
 from twoloop.kernels.data import tolerances
 from twoloop.run.crossings import said_of_turn
@@ -237,6 +237,32 @@ def test_events_beside_a_singular_position_have_velocities_that_are_not_made_by_
         assert len(t) == 1 and errors_of_velocities(t, v.T, 1e-6).max() < 1e3
 
 
+def test_steps_of_constant_size_that_end_beside_a_singular_position_do_not_succeed_with_what_rounding_makes():
+    """With steps that have to end there."""
+    for angle in (2e-8, -1e-7, 2e-7, -5e-7):
+        h = beside_singular(angle) / 50
+        for options in ({}, {"t_eval": h * np.arange(61)}):
+            result, errors, _ = turning("DOP853", 1e-6, 60 * h, step_size=h, **options)
+            assert errors.max() < 1e3 or not result.success, result
+        result, errors, said = turning("DOP853", 1e-6, 49 * h, step_size=h)
+        assert result.success and errors.max() < 100.0 and not said
+
+
+@pytest.mark.parametrize("method", ["DOP853", "Adams", "auto"])
+def test_a_sample_beside_a_singular_position_is_right_or_the_step_says_so(method):
+    problem, _ = parallelogram(ANGLE, SPEED, gravity=0.0)
+    for angle in (2e-8, -5e-8, -1e-7, 2e-7, -3e-7, 5e-7, 1e-6):
+        integrator = Integrator(problem.system, method, 1e-8, 1e-8)
+        integrator.start(0.0, problem.q0, problem.v0)
+        with warnings.catch_warnings(record=True) as said:
+            warnings.simplefilter("always", ConstraintWarning)
+            try:
+                state = integrator.step(beside_singular(angle))
+            except RuntimeError:
+                continue
+        assert said or errors_of_velocities(np.array([state.t]), state.v[:, None], 1e-8)[0] < 1e3
+
+
 def in_units(angle, size=1.0):
     """A state of the parallelogram, in units of which so many make a metre."""
     problem, _ = parallelogram(np.pi + angle, 1.0)
@@ -271,9 +297,9 @@ def test_steps_that_went_on_from_velocities_made_by_rounding_are_not_to_be_trust
         state = np.concatenate([problem.q0, problem.v0, np.zeros(17)])
         tolerance = np.full(tolerances.ATOL + 9, 1e-6)
         run = SimpleNamespace(system=problem.system, rank=8, rtol=1e-6, near=nearness(1e-6), tolerances=tolerance)
-        said = said_of_rounding(run, [[(0.3, state), (0.4, state)]], 1.0)
+        said = said_of_rounding(run, [(0.3, state), (0.4, state)], 1.0)
         assert (said == "") is trusted and said.startswith("" if trusted else "Not to be trusted beyond t = 0.3:")
-        assert said_of_rounding(run, [[(0.3, state), (0.4, state)]], 0.2) == ""  # an event ended the run before
+        assert said_of_rounding(run, [(0.3, state), (0.4, state)], 0.2) == ""  # an event ended the run before
 
 
 def test_a_turn_on_the_way_across_is_told_from_a_motion_that_goes_on():

@@ -310,8 +310,9 @@ def advance(
         if clock[at.LIMIT_AGE] > control[at.LIMIT_MEMORY]:
             clock[at.H_LIMIT] = control[at.LIMIT_START]
             clock[at.FAILURE_CODE] = DONE  # until then it is why steps are short
-        if lands:
+        if lands or fixed:
             note_output(f, w, clock, state)
+        if lands:
             clock[at.NEXT_OUTPUT] += 1.0
             if int(clock[at.NEXT_OUTPUT]) == outputs.size:
                 return at.ALL_OUTPUT_DONE

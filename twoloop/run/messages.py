@@ -1,6 +1,7 @@
 """What is said of how a run ended: status and message, and what to try."""
 
 import warnings
+from operator import itemgetter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -60,22 +61,27 @@ def message_of(run: "Run", words: str) -> Any:
     return Later(made)
 
 
-def unless_turned(run: "Run", last_step: list[Place], end: float, status: Status, message: str) -> tuple[Status, str]:
-    """Status and message, unless velocities turned at a singular position that was crossed, or in the last step."""
+def unless_turned(
+    run: "Run", last_step: list[Place], landed: list[Place], end: float, status: Status, message: str
+) -> tuple[Status, str]:
+    """Status and message, unless velocities turned at a singular position that was crossed, or in the last step.
+
+    `landed`: states before the end on which steps had to end.
+    """
     now, crossings = (float(run.clock[run.a.T]), run.state), [each for each in run.crossings if each[0][0] < end]
+    turned = said_of_rounding(run, [*(place for each in crossings for place in each), *landed], end)
     if last_step:
         crossings.append(last_step)
-    if not crossings:
-        return status, message
-    rtol, atol = float(run.tolerances[tolerances.RTOL]), run.tolerances[tolerances.ATOL :]
-    turned = said_of_rounding(run, crossings, end) or said_of_turn(run.system, crossings, now, run.rank, rtol, atol)
+    if crossings and not turned:
+        rtol, atol = float(run.tolerances[tolerances.RTOL]), run.tolerances[tolerances.ATOL :]
+        turned = said_of_turn(run.system, crossings, now, run.rank, rtol, atol)
     return (Status.RANK_LOST, turned) if turned else (status, message)
 
 
-def said_of_rounding(run: "Run", crossings: list[list[Place]], end: float) -> str:
+def said_of_rounding(run: "Run", places: list[Place], end: float) -> str:
     """Where steps went on from velocities that rounding had made; nothing if they did so nowhere."""
     system, n = run.system, run.system.n_q
-    for t, state in {place[0]: place for crossing in crossings for place in crossing}.values():
+    for t, state in sorted({place[0]: place for place in places}.values(), key=itemgetter(0)):
         q, v = state[:n], state[n : 2 * n]
         if t >= end or surely_above(run.near, system.rows(t, q), run.rank):
             continue
@@ -94,7 +100,7 @@ def outcome(run: "Run", code: int, t1: float, pace: Pace) -> tuple[Status, str]:
     a, t = run.a, float(run.clock[run.a.T])
     if code == a.ALL_OUTPUT_DONE:
         fixed = ", with a constant step: no error was estimated" if run.control[a.FIXED_STEP] > 0.0 else ""
-        said = _said_of_passages(run) + _said_of_end(run)
+        said = _said_of_passages(run) + said_of_end(run)
         return Status.REACHED_END, f"Reached the end, t = {t:g}{fixed}.{said}"
     stopped = f"Stopped at t = {t:.10g}"
     failure = int(run.clock[a.FAILURE_CODE])
@@ -170,7 +176,7 @@ def _contradiction(run: "Run") -> str:
     )
 
 
-def _said_of_end(run: "Run") -> str:
+def said_of_end(run: "Run") -> str:
     """A warning, and the sentence, where the run ends with constraints that have lost rank, or nearly so."""
     if run.clock[run.a.PIVOT_AT_OUTPUT] >= run.near:
         return ""

@@ -67,7 +67,7 @@ def with_care(f, w, control, clock, size):
 
 @merged
 def note_output(f, w, clock, state):
-    """Note how near a singular position is at an output time, where the step ends on it."""
+    """Note how near a singular position is where a step ends on an output time, or wherever its size says."""
     pivot = least_pivot(f, w, clock[at.T], state[: w.Q.size])
     if f.flags[FORM] == STATIC and pivot > 0.0:
         pivot /= max(pivot, clock[at.LARGEST_PIVOT])  # sines, which are small in large mechanisms
