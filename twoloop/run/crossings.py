@@ -74,7 +74,7 @@ def said_of_turn(
         near = min(LOST, np.sqrt(rtol + float(atol.max()) / size)) if size > 0.0 else LOST
         # where no step led across, the run's own steps may have gone on to anywhere
         here, there = (t0, first), (t1, last)
-        ratio = _least_ratio(system, here if across else there, there, rank, _ratio_in_any_units)
+        ratio = _least_ratio(system, here if across else there, there, rank, ratio_in_any_units)
         if ratio >= near:
             continue
         known = max(_known_acceleration(system, t, state[_q(n)], state[_v(n)], near) for t, state in (here, there))
@@ -133,7 +133,7 @@ def _known_acceleration(system: ConstrainedSystem, t: float, q: Array, v: Array,
     return float(np.abs(units * found[: len(q)]).max())
 
 
-def _ratio_in_any_units(system: ConstrainedSystem, t: float, q: Array, rank: int) -> float:
+def ratio_in_any_units(system: ConstrainedSystem, t: float, q: Array, rank: int) -> float:
     """As `singular_ratio`, but independent of the units of coordinates and rows."""
     values = np.linalg.svd(_in_any_units(system, t, q)[1], compute_uv=False)[:rank]
     return float(values[-1] / values[0]) if len(values) and values[0] > 0.0 else float(len(values) == 0)
@@ -144,7 +144,9 @@ def _in_any_units(system: ConstrainedSystem, t: float, q: Array) -> tuple[Array,
 
     The rows are divided by their lengths, or by what these are some way off where they are short by the position.
     """
-    mass, rows, units = system.mass(t, q), system.rows(t, q), units_of(system, t, q)
+    mass, rows = system.mass(t, q), system.rows(t, q)
+    inertia = np.abs(np.diagonal(mass))
+    units = 1.0 / np.sqrt(np.where(inertia > 0.0, inertia, inertia.max()))
     lengths = np.linalg.norm(rows * units, axis=1)
     way = DIFFERENCE * max(np.abs(q).max(), DIFFERENCE) * units / units.max() * signs(len(q))
     bends = np.linalg.norm((system.rows(t, q + way) - system.rows(t, q - way)) * units, axis=1)
@@ -152,12 +154,6 @@ def _in_any_units(system: ConstrainedSystem, t: float, q: Array) -> tuple[Array,
         lengths = np.maximum(lengths, SHORT * lengths.max() * bends / bends.max())
     lengths[lengths == 0.0] = 1.0
     return mass * units * units[:, None], rows * units / lengths[:, None], lengths, units
-
-
-def units_of(system: ConstrainedSystem, t: float, q: Array) -> Array:
-    """Units in which each coordinate has a mass of one."""
-    inertia = np.abs(np.diagonal(system.mass(t, q)))
-    return np.asarray(1.0 / np.sqrt(np.where(inertia > 0.0, inertia, inertia.max())))
 
 
 def _times(found: dict[float, float]) -> str:

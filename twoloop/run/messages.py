@@ -11,7 +11,13 @@ from twoloop.checks.at_position import dependent_rows, least_inertia, not_finite
 from twoloop.checks.consistency import ConstraintWarning
 from twoloop.checks.rank import in_words, surely_above
 from twoloop.kernels.data import codes, noted, tolerances
-from twoloop.run.crossings import Place, said_of_crossings, said_of_turn, singular_ratio
+from twoloop.run.crossings import (
+    Place,
+    ratio_in_any_units,
+    said_of_crossings,
+    said_of_turn,
+    singular_ratio,
+)
 from twoloop.run.pace import INTERRUPTED, OUT_OF_TIME, STAGNATED, STAGNATION_STEPS, Pace
 from twoloop.run.record import Later, Status
 from twoloop.run.undetermined import UNTRUE, WEAK, turned_by_rounding
@@ -23,7 +29,9 @@ Array = NDArray[np.float64]
 
 NEARLY_SINGULAR = 1e-3  # smallest over largest singular value of C_q, below which a message says so
 LASTING = 100.0  # times what the tolerances allow: errors of velocities on the way that end the trust in a run
-LOST_AT_END = 1e-6  # the same, below which the state at the end of a run is said not to be determined
+LOST_AT_END = (
+    1e-6  # the same, in any units, too, below which the state at the end of a run is said not to be determined
+)
 CROSSINGS = "\0"  # stands for what is said of singular positions that were crossed
 NEXT_TO_END = 1e-3  # of the run: where it stops so close to its end, that is said
 
@@ -184,7 +192,8 @@ def said_of_end(run: "Run") -> str:
     q, v = run.state[:n], run.state[n : 2 * n]
     if surely_above(WEAK, system.rows(t, q), run.rank):
         return ""
-    if singular_ratio(system, t, q, run.rank) <= LOST_AT_END:
+    ratios = [ratio(system, t, q, run.rank) for ratio in (singular_ratio, ratio_in_any_units)]
+    if max(ratios) <= LOST_AT_END:
         said = (
             f"the run ends where the constraints lose rank ({_measured(run, t, q)}): they do not determine velocities "
             "and accelerations there. End t_span a little before, or beyond"

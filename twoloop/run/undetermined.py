@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.problem.system import ConstrainedSystem
-from twoloop.run.crossings import DIFFERENCE, units_of
+from twoloop.run.crossings import DIFFERENCE
 
 Array = NDArray[np.float64]
 
@@ -25,11 +25,10 @@ def nearness(rtol: float) -> float:
 
 def turned_by_rounding(system: ConstrainedSystem, t: float, q: Array, v: Array, rank: int) -> Array:
     """The errors of the velocities that rounding of positions makes, about, (n_q,)."""
-    units = units_of(system, t, q)
-    rows = system.rows(t, q) * units
+    rows = system.rows(t, q)
     left, values, right = np.linalg.svd(rows, full_matrices=False)
     errors = np.zeros(len(q))
-    for u, value, way in zip(left.T[:rank], values[:rank], right[:rank] * units, strict=True):
+    for u, value, way in zip(left.T[:rank], values[:rank], right[:rank], strict=True):
         if value > WEAK * values[0]:
             continue
         if value == 0.0:
@@ -37,9 +36,9 @@ def turned_by_rounding(system: ConstrainedSystem, t: float, q: Array, v: Array, 
         step = DIFFERENCE * max(np.abs(q).max(), DIFFERENCE) / np.abs(way).max()
         beside = [q + side * step * way for side in (1.0, -1.0)]
         turn = np.subtract(*(system.velocity_constraint(t, each, v) for each in beside)) / (2.0 * step)
-        bend = np.abs(np.subtract(*(system.rows(t, each) for each in beside))) * units
+        bend = np.abs(np.subtract(*(system.rows(t, each) for each in beside)))
         # rows that are short here are so by their position: a constraint is rounded as it would be some way off
-        away = np.abs(rows) + bend * (np.abs(rows).max() / max(bend.max(), np.finfo(float).tiny))
-        rounding = ROUNDING * np.sqrt((away * away) @ (q / units) ** 2)
+        away = np.abs(rows) + (bend * (np.abs(rows).max() / bend.max()) if bend.any() else 0.0)
+        rounding = ROUNDING * np.sqrt((away * away) @ (q * q))
         errors = np.maximum(errors, np.abs(way * (u @ turn)) * np.sqrt((u * u) @ (rounding * rounding)) / value**2)
     return errors
