@@ -276,7 +276,7 @@ class Course:
         """The states on which steps had to end, where one of them is near a singular position: else nothing."""
         run, wanted = self.run, self.wanted
         grid = run.control[run.a.FIXED_STEP] > 0.0 and wanted.times is None
-        if run.clock[run.a.PIVOT_AT_OUTPUT] >= run.near or not (grid or (wanted.times is not None and wanted.lands)):
+        if not run.came_near() or not (grid or (wanted.times is not None and wanted.lands)):
             return []
         return list(zip(t.tolist(), table, strict=True))
 

@@ -186,7 +186,7 @@ def _contradiction(run: "Run") -> str:
 
 def said_of_end(run: "Run") -> str:
     """A warning, and the sentence, where the run ends with constraints that have lost rank, or nearly so."""
-    if run.clock[run.a.PIVOT_AT_OUTPUT] >= run.near:
+    if not run.came_near():
         return ""
     system, n, t = run.system, run.system.n_q, float(run.clock[run.a.T])
     q, v = run.state[:n], run.state[n : 2 * n]
