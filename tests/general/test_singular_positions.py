@@ -291,6 +291,19 @@ def test_what_rounding_makes_of_velocities_grows_with_the_nearness_and_not_with_
     assert 1e-9 < errors[1e-4, 1.0] < 1e-7  # as measured
 
 
+def test_an_end_where_callbacks_end_too_is_still_reported():
+    """A root that ends beside the position; nothing can be told of the velocities there."""
+
+    def fails_beyond(t, q):
+        if abs(q[2] - problem.q0[2]) > 1e-9:
+            raise ValueError("beyond the dead centre")
+        return problem.system.jacobian(t, q)
+
+    problem, _ = parallelogram(np.pi + 1e-5, 1.0)
+    system = SimpleNamespace(rows=fails_beyond, velocity_constraint=problem.system.velocity_constraint)
+    assert np.isnan(turned_by_rounding(system, 0.0, problem.q0, problem.v0, 8)).all()
+
+
 def test_steps_that_went_on_from_velocities_made_by_rounding_are_not_to_be_trusted():
     for angle, trusted in ((1e-3, True), (1e-7, False)):
         problem, _ = parallelogram(np.pi + angle, 1.0)

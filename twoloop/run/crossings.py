@@ -149,8 +149,11 @@ def _in_any_units(system: ConstrainedSystem, t: float, q: Array) -> tuple[Array,
     units = 1.0 / np.sqrt(np.where(inertia > 0.0, inertia, inertia.max()))
     lengths = np.linalg.norm(rows * units, axis=1)
     way = DIFFERENCE * max(np.abs(q).max(), DIFFERENCE) * units / units.max() * signs(len(q))
-    bends = np.linalg.norm((system.rows(t, q + way) - system.rows(t, q - way)) * units, axis=1)
-    if bends.max(initial=0.0) > 0.0:
+    try:
+        bends = np.linalg.norm((system.rows(t, q + way) - system.rows(t, q - way)) * units, axis=1)
+    except (ArithmeticError, ValueError):  # as a root does beyond a dead centre
+        bends = np.zeros(len(rows))
+    if bends.max(initial=0.0) > 0.0:  # not NaN
         lengths = np.maximum(lengths, SHORT * lengths.max() * bends / bends.max())
     lengths[lengths == 0.0] = 1.0
     return mass * units * units[:, None], rows * units / lengths[:, None], lengths, units

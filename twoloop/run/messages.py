@@ -204,7 +204,7 @@ def said_of_end(run: "Run") -> str:
             return ""
         said = (
             f"the run ends where the constraints nearly lose rank ({_measured(run, t, q)}): rounding of positions "
-            f"changes velocities there by about {over:.1g} times what rtol and atol allow, and accelerations by more. "
+            f"changes velocities there {_times_allowed(over)}, and accelerations by more. "
             "End t_span a little before, or beyond, or loosen rtol and atol"
         )
     warnings.warn(said, ConstraintWarning, stacklevel=4)
@@ -215,6 +215,10 @@ def _over_allowed(run: "Run", t: float, q: Array, v: Array) -> float:
     """Errors of velocities that rounding of positions makes, over the tolerances."""
     allowed = run.tolerances[tolerances.ATOL :] + run.rtol * np.abs(v).max()
     return float((turned_by_rounding(run.system, t, q, v, run.rank) / allowed).max())
+
+
+def _times_allowed(over: float) -> str:
+    return f"by about {over:.1g} times what rtol and atol allow" if np.isfinite(over) else "by more than can be told"
 
 
 def _measured(run: "Run", t: float, q: Array) -> str:

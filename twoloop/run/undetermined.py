@@ -24,7 +24,7 @@ def nearness(rtol: float) -> float:
 
 
 def turned_by_rounding(system: ConstrainedSystem, t: float, q: Array, v: Array, rank: int) -> Array:
-    """The errors of the velocities that rounding of positions makes, about, (n_q,)."""
+    """The errors of the velocities that rounding of positions makes, about, (n_q,); NaN where callbacks fail near q."""
     rows = system.rows(t, q)
     left, values, right = np.linalg.svd(rows, full_matrices=False)
     errors = np.zeros(len(q))
@@ -35,8 +35,11 @@ def turned_by_rounding(system: ConstrainedSystem, t: float, q: Array, v: Array, 
             return np.full(len(q), np.inf)
         step = DIFFERENCE * max(np.abs(q).max(), DIFFERENCE) / np.abs(way).max()
         beside = [q + side * step * way for side in (1.0, -1.0)]
-        turn = np.subtract(*(system.velocity_constraint(t, each, v) for each in beside)) / (2.0 * step)
-        bend = np.abs(np.subtract(*(system.rows(t, each) for each in beside)))
+        try:
+            turn = np.subtract(*(system.velocity_constraint(t, each, v) for each in beside)) / (2.0 * step)
+            bend = np.abs(np.subtract(*(system.rows(t, each) for each in beside)))
+        except (ArithmeticError, ValueError):  # as a root does beyond a dead centre
+            return np.full(len(q), np.nan)
         # rows that are short here are so by their position: a constraint is rounded as it would be some way off
         away = np.abs(rows) + (bend * (np.abs(rows).max() / bend.max()) if bend.any() else 0.0)
         rounding = ROUNDING * np.sqrt((away * away) @ (q * q))
