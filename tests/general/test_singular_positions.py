@@ -1,6 +1,7 @@
 """Where C_q loses rank on the way: the motion goes on where it is smooth, on the same branch, by every method."""
 
 import warnings
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -8,9 +9,12 @@ import pytest
 from tests.general.dead_points import CUSP_TIME, cusp
 from tests.general.mechanisms import SINGULAR, WINDOWS, error, first_singular_time, mechanism, run
 from tests.problems import event, worst
-from twoloop import DOP853, ConstraintWarning, Status, solve_dae
+from twoloop import DOP853, ConstrainedSystem, ConstraintWarning, Integrator, Status, solve_dae
 from twoloop.bodies import PlanarModel
+from twoloop.kernels.data import tolerances
 from twoloop.run.crossings import said_of_turn
+from twoloop.run.messages import said_of_rounding
+from twoloop.run.undetermined import nearness, turned_by_rounding
 
 METHODS = ("SunRadau5", "RadauIIA5", "DOP853")
 FEW = ("A02, N = 1", "A02, N = 2")
@@ -98,9 +102,13 @@ def test_states_stay_as_they_were_stored_when_a_step_goes_across(method):
     assert crossed > 0
 
 
-def parallelogram(angle, speed):
+def parallelogram(angle, speed, gravity=-9.81):
     """Two cranks with a coupler that stays level; it may turn where all lie in line."""
-    model, tip, base = PlanarModel(), np.array([np.cos(angle), np.sin(angle)]), np.array([2.0, 0.0])
+    model, tip, base = (
+        PlanarModel(gravity=(0.0, gravity)),
+        np.array([np.cos(angle), np.sin(angle)]),
+        np.array([2.0, 0.0]),
+    )
     model.body("crank", mass=1.0, inertia=1.0 / 12.0, position=0.5 * tip, angle=angle, angular_velocity=speed)
     model.body("coupler", mass=1.5, inertia=0.2, position=tip + np.array([1.0, 0.0]))
     model.body("rocker", mass=1.0, inertia=1.0 / 12.0, position=0.5 * tip + base, angle=angle)
@@ -151,6 +159,160 @@ def test_no_run_that_begins_beside_a_singular_position_succeeds_on_another_branc
             result = solve_dae(problem.system, (0.0, end), problem.q0, problem.v0, method, tolerance, tolerance)
             turned = np.abs(result.v[5]).max() > max(0.1 * abs(speed), 30.0 * tolerance)
             assert not (result.success and turned), result
+
+
+ANGLE, SPEED = 2.3, 1.7  # of a parallelogram that turns uniformly, at first
+
+
+def turning(method, tolerance, end, **options):
+    """The run until `end`, the largest errors of its velocities over the tolerances, and what was said."""
+    problem, _ = parallelogram(ANGLE, SPEED, gravity=0.0)
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always", ConstraintWarning)
+        result = solve_dae(problem.system, (0.0, end), problem.q0, problem.v0, method, tolerance, tolerance, **options)
+    return result, errors_of_velocities(result.t, result.v, tolerance), [str(each.message) for each in said]
+
+
+def errors_of_velocities(t, v, tolerance):
+    angle = ANGLE + SPEED * t
+    over, up, turn, none = -SPEED * np.sin(angle), SPEED * np.cos(angle), np.full(len(t), SPEED), np.zeros(len(t))
+    exact = np.array([0.5 * over, 0.5 * up, turn, over, up, none, 0.5 * over, 0.5 * up, turn])
+    return np.abs(v - exact).max(axis=0) / (tolerance * (1.0 + SPEED))
+
+
+def beside_singular(angle):
+    """When the parallelogram is so many radians beyond its singular position."""
+    return (np.pi + angle - ANGLE) / SPEED
+
+
+@pytest.mark.parametrize(
+    ("method", "tolerance"),
+    [("DOP853", 1e-4), ("DOP853", 1e-6), ("Adams", 1e-8), ("auto", 1e-9), ("Taylor", 1e-9), ("RadauIIA5", 1e-6)],
+)
+def test_an_end_beside_a_singular_position_is_right_or_the_run_says_so(method, tolerance):
+    """There rounding of positions makes velocities, and no step need be short."""
+    for beside in (-3e-8, -1e-7, 2e-7, -5e-7, 1e-6, -3e-6, 1e-5):
+        result, errors, said = turning(method, tolerance, beside_singular(beside))
+        assert errors[-1] < 1e3 or said or not result.success, (beside, result)
+        assert all("The run ends where the constraints" in result.message for _ in said if result.success)
+
+
+@pytest.mark.parametrize(("method", "tolerance"), [("DOP853", 1e-6), ("Adams", 1e-8), ("auto", 1e-10)])
+def test_nothing_is_said_of_an_end_farther_away(method, tolerance):
+    for beside in (-1e-3, -1e-2, -1e-1):
+        result, errors, said = turning(method, tolerance, beside_singular(beside))
+        assert result.success and not said and errors[-1] < 100.0, (beside, result)
+
+
+SIDES = 10.0 ** np.arange(-9.0, -2.0, 0.5)
+ROUNDED = "interpolated and off the constraints"
+CLOSE_TIMES = beside_singular(np.concatenate([-SIDES[::-1], SIDES]))
+
+
+def off_the_constraints(t, q, v):
+    """At how many of these states velocities are off by more than rounding."""
+    system = parallelogram(ANGLE, SPEED)[0].system
+    return sum(np.abs(system.velocity_constraint(*each)).max() > 1e-13 for each in zip(t, q.T, v.T, strict=True))
+
+
+@pytest.mark.parametrize("method", ["DOP853", "Taylor", "BDF", "RadauIIA5"])
+def test_beside_a_singular_position_no_state_between_steps_is_made_by_rounding(method):
+    """Where it would be, it is that of the polynomials, and the warning counts it."""
+    result, errors, said = turning(method, 1e-6, beside_singular(0.1), t_eval=CLOSE_TIMES)
+    off = off_the_constraints(result.t, result.q, result.v)
+    assert result.success and errors.max() < 1e3
+    counted = [words for words in said if ROUNDED in words]
+    assert off <= (int(counted[0].split("at ")[1].split(" of")[0]) if counted else 0) < len(CLOSE_TIMES)
+    dense, _, _ = turning(method, 1e-6, beside_singular(0.1), dense_output=True)
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always", ConstraintWarning)
+        assert (dense.sol(CLOSE_TIMES).v == result.v).all()
+    assert [str(each.message) for each in said] == counted
+
+
+def test_events_beside_a_singular_position_have_velocities_that_are_not_made_by_rounding():
+    events = [event(lambda t, q, v, at=at: t - at) for at in CLOSE_TIMES]
+    result, _, _ = turning("DOP853", 1e-6, beside_singular(0.1), events=events)
+    for t, v in zip(result.t_events, result.v_events, strict=True):
+        assert len(t) == 1 and errors_of_velocities(t, v.T, 1e-6).max() < 1e3
+
+
+def test_steps_of_constant_size_that_end_beside_a_singular_position_do_not_succeed_with_what_rounding_makes():
+    """With steps that have to end there."""
+    for angle in (2e-8, -1e-7, 2e-7, -5e-7):
+        h = beside_singular(angle) / 50
+        for options in ({}, {"t_eval": h * np.arange(61)}):
+            result, errors, _ = turning("DOP853", 1e-6, 60 * h, step_size=h, **options)
+            assert errors.max() < 1e3 or not result.success, result
+        result, errors, said = turning("DOP853", 1e-6, 49 * h, step_size=h)
+        assert result.success and errors.max() < 100.0 and not said
+
+
+@pytest.mark.parametrize("method", ["DOP853", "Adams", "auto"])
+def test_a_sample_beside_a_singular_position_is_right_or_the_step_says_so(method):
+    problem, _ = parallelogram(ANGLE, SPEED, gravity=0.0)
+    for angle in (2e-8, -5e-8, -1e-7, 2e-7, -3e-7, 5e-7, 1e-6):
+        integrator = Integrator(problem.system, method, 1e-8, 1e-8)
+        integrator.start(0.0, problem.q0, problem.v0)
+        with warnings.catch_warnings(record=True) as said:
+            warnings.simplefilter("always", ConstraintWarning)
+            try:
+                state = integrator.step(beside_singular(angle))
+            except RuntimeError:
+                continue
+        assert said or errors_of_velocities(np.array([state.t]), state.v[:, None], 1e-8)[0] < 1e3
+
+
+def in_units(angle, size=1.0):
+    """A state of the parallelogram, in units of which so many make a metre."""
+    problem, _ = parallelogram(np.pi + angle, 1.0)
+    units = np.array([size, size, 1.0] * 3)
+    system = problem.system
+    scaled = ConstrainedSystem.from_python(
+        n_q=9,
+        n_c=8,
+        mass=system.mass(0.0, problem.q0) / units / units[:, None],
+        force=lambda t, q, v: np.zeros(9),
+        constraint=lambda t, q: system.constraint(t, q / units),
+        jacobian=lambda t, q: system.jacobian(t, q / units) / units,
+    )
+    return scaled, problem.q0 * units, problem.v0 * units, units
+
+
+def test_what_rounding_makes_of_velocities_grows_with_the_nearness_and_not_with_the_units():
+    errors = {}
+    for size in (1.0, 1e3):
+        for angle in (1e-3, 1e-4, 1e-5):
+            system, q, v, units = in_units(angle, size)
+            errors[angle, size] = (turned_by_rounding(system, 0.0, q, v, 8) / units).max()
+        assert errors[1e-4, size] / errors[1e-3, size] == pytest.approx(100.0, rel=0.3)
+        assert errors[1e-5, size] / errors[1e-4, size] == pytest.approx(100.0, rel=0.3)
+    assert errors[1e-4, 1e3] == pytest.approx(errors[1e-4, 1.0], rel=0.3)
+    assert 1e-9 < errors[1e-4, 1.0] < 1e-7  # as measured
+
+
+def test_an_end_where_callbacks_end_too_is_still_reported():
+    """A root that ends beside the position; nothing can be told of the velocities there."""
+
+    def fails_beyond(t, q):
+        if abs(q[2] - problem.q0[2]) > 1e-9:
+            raise ValueError("beyond the dead centre")
+        return problem.system.jacobian(t, q)
+
+    problem, _ = parallelogram(np.pi + 1e-5, 1.0)
+    system = SimpleNamespace(rows=fails_beyond, velocity_constraint=problem.system.velocity_constraint)
+    assert np.isnan(turned_by_rounding(system, 0.0, problem.q0, problem.v0, 8)).all()
+
+
+def test_steps_that_went_on_from_velocities_made_by_rounding_are_not_to_be_trusted():
+    for angle, trusted in ((1e-3, True), (1e-7, False)):
+        problem, _ = parallelogram(np.pi + angle, 1.0)
+        state = np.concatenate([problem.q0, problem.v0, np.zeros(17)])
+        tolerance = np.full(tolerances.ATOL + 9, 1e-6)
+        run = SimpleNamespace(system=problem.system, rank=8, rtol=1e-6, near=nearness(1e-6), tolerances=tolerance)
+        said = said_of_rounding(run, [(0.3, state), (0.4, state)], 1.0)
+        assert (said == "") is trusted and said.startswith("" if trusted else "Not to be trusted beyond t = 0.3:")
+        assert said_of_rounding(run, [(0.3, state), (0.4, state)], 0.2) == ""  # an event ended the run before
 
 
 def test_a_turn_on_the_way_across_is_told_from_a_motion_that_goes_on():

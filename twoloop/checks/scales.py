@@ -145,14 +145,14 @@ def rows_at(system: ConstrainedSystem, t: float, places: Array) -> tuple[Array, 
 
 
 @cache
-def _signs(n_q: int) -> Array:
+def signs(n_q: int) -> Array:
     """Of the displacements of the coordinates, (n_q,): always the same."""
     return np.random.default_rng(3).choice((-1.0, 1.0), n_q)
 
 
 def _curvature(system: ConstrainedSystem, t: float, q: Array, columns: Array, n_rows: int) -> Array:
     """How fast each row of C_q turns, per unit of the coordinates: one digit is enough."""
-    way = columns * _signs(len(q))
+    way = columns * signs(len(q))
     largest = np.zeros(n_rows)
     shifts = np.array([side * part for part in DISPLACEMENTS for side in (1.0, -1.0)])
     rows, defined = rows_at(system, t, q + shifts[:, None] * way)

@@ -15,6 +15,7 @@ from twoloop.kernels.control.singular import (
     look_at_partition,
     lost_at_singular,
     near_singular,
+    note_output,
     with_care,
 )
 from twoloop.kernels.control.sudden import up_to_sudden
@@ -309,6 +310,8 @@ def advance(
         if clock[at.LIMIT_AGE] > control[at.LIMIT_MEMORY]:
             clock[at.H_LIMIT] = control[at.LIMIT_START]
             clock[at.FAILURE_CODE] = DONE  # until then it is why steps are short
+        if lands or fixed:
+            note_output(f, w, clock, state)
         if lands:
             clock[at.NEXT_OUTPUT] += 1.0
             if int(clock[at.NEXT_OUTPUT]) == outputs.size:

@@ -7,7 +7,7 @@ computed first, by steps of the method, and a polynomial goes through those of o
 import numpy as np
 from numba import types
 
-from twoloop.kernels.algebra.linalg import copy
+from twoloop.kernels.algebra.linalg import copy, largest_of
 from twoloop.kernels.data import intervals as kinds
 from twoloop.kernels.data.codes import DONE, GAMMA_INACCURATE, SINGULAR
 from twoloop.kernels.data.common import INTEGERS, KIT, MATRIX, VECTOR, WORK, compiled, f8, i8, kernel, merged
@@ -15,7 +15,7 @@ from twoloop.kernels.data.flags import FORM, NULL_SPACE
 from twoloop.kernels.data.noted import GAMMA_REQUIRED
 from twoloop.kernels.data.tolerances import ATOL, RTOL
 from twoloop.kernels.evaluation.calls import accelerations, find_tangents, renew_partition, restore
-from twoloop.kernels.evaluation.partition import partition_is_poor
+from twoloop.kernels.evaluation.partition import least_pivot, partition_is_poor
 
 TABLE = types.int64[:, ::1]
 PLACES = (0.3, 0.7)  # within an interval, of its length, where polynomials are looked at
@@ -23,6 +23,9 @@ LOOKS = len(PLACES)
 EPS = 2.0**-52
 EVEN = 8.0  # longest over shortest
 NOISY = 10.0  # of the tolerances of velocities
+UNTRUE = 30.0  # of these: what restored velocities may differ by from polynomials beside a singular position ...
+SINGULAR_SHARE = 0.01  # ... where the smallest pivot is below this share of that at the ends of the interval ...
+SINGULAR_PIVOT = 1e-5  # ... or below this
 
 
 @merged
@@ -91,15 +94,37 @@ def _kind(kind, tolerances, h, states, i):
     return kind
 
 
+@merged
+def _turned(tolerances, v_0, v):
+    """Whether restored velocities are farther from those of the polynomials than errors of these explain."""
+    speed = largest_of(v_0)
+    for m in range(v.size):
+        if not abs(v[m] - v_0[m]) <= UNTRUE * (tolerances[ATOL + m] + tolerances[RTOL] * speed):
+            return True
+    return False
+
+
+@compiled
+def _is_singular(f, w, t, states, i, last, time, q):
+    """Whether the rows are so much nearer to losing rank at a place of an interval than at its ends."""
+    n, largest = w.Q.size, 0.0
+    for r in (i, last):
+        if renew_partition(f, w, t[r], states[r, :n]) == DONE:
+            largest = max(largest, least_pivot(f, w, t[r], states[r, :n]))
+    code = renew_partition(f, w, time, q)
+    return code != DONE or least_pivot(f, w, time, q) < max(SINGULAR_SHARE * largest, SINGULAR_PIVOT)
+
+
 @kernel(i8(KIT, WORK, f8, VECTOR, VECTOR, MATRIX, TABLE, VECTOR, VECTOR, MATRIX, MATRIX))
 def between(f, w, tolerance, tolerances, t, states, groups, times, z, room, out):
-    """Rows [q, v] of `out` at `times`; the number of times at which no dependents were found.
+    """Rows [q, v] of `out` at `times`; the number of times at which no dependents were found, or rounding made them.
 
     There q and v are those of the polynomials. `z` and `room` hold nodes and coefficients of two polynomials.
     """
     n = w.Q.size
     half = z.size // 2
     z_q, z_v, c_q, c_v = z[:half], z[half:], room[:half], room[half:]
+    q_0, v_0 = room[2 * half - 2], room[2 * half - 1]  # c_v has no use for them
     reduced = f.flags[FORM] == NULL_SPACE  # then w.D is known
     failures = 0
     for g in range(groups.shape[0]):
@@ -122,18 +147,24 @@ def between(f, w, tolerance, tolerances, t, states, groups, times, z, room, out)
                 continue
             s = (times[p] - t[i]) / h
             _interpolate(states, i, kind, h, s, z_q, c_q, size, z_v, c_v, size_v, q, v)
+            copy(q, q_0)
+            copy(v, v_0)
             code = DONE if chosen else renew_partition(f, w, t[i], states[i, :n])
             if code == DONE:
                 code = restore(f, w, times[p], q, v, tolerance)
-            chosen = code == DONE and not (reduced and partition_is_poor(w))
+            chosen = code == DONE and not (reduced and partition_is_poor(w)) and not _turned(tolerances, v_0, v)
             if not chosen:
-                _interpolate(states, i, kind, h, s, z_q, c_q, size, z_v, c_v, size_v, q, v)
+                copy(q_0, q)
+                copy(v_0, v)
                 code = renew_partition(f, w, times[p], q)
                 if code == DONE:
                     code = restore(f, w, times[p], q, v, tolerance)
+                if code == DONE and _turned(tolerances, v_0, v) and _is_singular(f, w, t, states, i, last, times[p], q):
+                    code = SINGULAR
             if code != DONE:
                 failures += 1
-                _interpolate(states, i, kind, h, s, z_q, c_q, size, z_v, c_v, size_v, q, v)
+                copy(q_0, q)
+                copy(v_0, v)
     return failures
 
 

@@ -235,7 +235,8 @@ class Course:
                 status, message = outcome(run, code, self.t1, self.pace)
             if status >= 0:
                 end = reached if recorder.ended is None else recorder.ended[1]
-                status, message = unless_turned(run, self._last_step(t, table), end, status, message)
+                places = self._last_step(t, table), self._landed(t, table)
+                status, message = unless_turned(run, *places, end, status, message)
             if code != INTERRUPTED:
                 end = reached
                 if recorder.last is not None:
@@ -270,6 +271,14 @@ class Course:
         if run.plan.watchful and run.work.notes[noted.NEARLY_SINGULAR] != 1.0:
             return []
         return [(float(t[-2]), table[-2])] if turned_last(t, table, run.system.n_q) else []
+
+    def _landed(self, t: Array, table: Array) -> list[Place]:
+        """The states on which steps had to end, where one of them is near a singular position: else nothing."""
+        run, wanted = self.run, self.wanted
+        grid = run.control[run.a.FIXED_STEP] > 0.0 and wanted.times is None
+        if not run.came_near() or not (grid or (wanted.times is not None and wanted.lands)):
+            return []
+        return list(zip(t.tolist(), table, strict=True))
 
     def _buffers(self) -> Buffers:
         """Room for the states and steps of a chunk, each attempt of which fills one row at most."""

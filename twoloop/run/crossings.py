@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 from numpy.typing import NDArray
 
+from twoloop.checks.scales import signs
 from twoloop.problem.system import ConstrainedSystem
 
 Array = NDArray[np.float64]
@@ -15,6 +16,7 @@ LOST = 1e-2  # smallest over largest singular value, below which constraints are
 SAMPLES = 33  # of the motion across
 SHOWN = 3  # places of which a message speaks
 DIFFERENCE = 1e-6  # relative: length of the way on which gamma is found by differences
+SHORT = 0.1  # of what rows become where they turn as others do: those that are shorter are so by their position
 TURNED = 3.0  # of what the accelerations before and behind give: velocities that changed by more turned in between ...
 APPARENT = 10.0  # ... which counts where it exceeds the tolerances so many times
 
@@ -72,7 +74,7 @@ def said_of_turn(
         near = min(LOST, np.sqrt(rtol + float(atol.max()) / size)) if size > 0.0 else LOST
         # where no step led across, the run's own steps may have gone on to anywhere
         here, there = (t0, first), (t1, last)
-        ratio = _least_ratio(system, here if across else there, there, rank, _ratio_in_any_units)
+        ratio = _least_ratio(system, here if across else there, there, rank, ratio_in_any_units)
         if ratio >= near:
             continue
         known = max(_known_acceleration(system, t, state[_q(n)], state[_v(n)], near) for t, state in (here, there))
@@ -131,7 +133,7 @@ def _known_acceleration(system: ConstrainedSystem, t: float, q: Array, v: Array,
     return float(np.abs(units * found[: len(q)]).max())
 
 
-def _ratio_in_any_units(system: ConstrainedSystem, t: float, q: Array, rank: int) -> float:
+def ratio_in_any_units(system: ConstrainedSystem, t: float, q: Array, rank: int) -> float:
     """As `singular_ratio`, but independent of the units of coordinates and rows."""
     values = np.linalg.svd(_in_any_units(system, t, q)[1], compute_uv=False)[:rank]
     return float(values[-1] / values[0]) if len(values) and values[0] > 0.0 else float(len(values) == 0)
@@ -140,12 +142,19 @@ def _ratio_in_any_units(system: ConstrainedSystem, t: float, q: Array, rank: int
 def _in_any_units(system: ConstrainedSystem, t: float, q: Array) -> tuple[Array, Array, Array, Array]:
     """Mass and rows with coordinates in which each has a mass of one, lengths of these rows, and units of the former.
 
-    The rows are divided by their lengths.
+    The rows are divided by their lengths, or by what these are some way off where they are short by the position.
     """
     mass, rows = system.mass(t, q), system.rows(t, q)
     inertia = np.abs(np.diagonal(mass))
     units = 1.0 / np.sqrt(np.where(inertia > 0.0, inertia, inertia.max()))
     lengths = np.linalg.norm(rows * units, axis=1)
+    way = DIFFERENCE * max(np.abs(q).max(), DIFFERENCE) * units / units.max() * signs(len(q))
+    try:
+        bends = np.linalg.norm((system.rows(t, q + way) - system.rows(t, q - way)) * units, axis=1)
+    except (ArithmeticError, ValueError):  # as a root does beyond a dead centre
+        bends = np.zeros(len(rows))
+    if bends.max(initial=0.0) > 0.0:  # not NaN
+        lengths = np.maximum(lengths, SHORT * lengths.max() * bends / bends.max())
     lengths[lengths == 0.0] = 1.0
     return mass * units * units[:, None], rows * units / lengths[:, None], lengths, units
 

@@ -20,7 +20,8 @@ class DenseState:
     t : float or ndarray (n,)
         Times, s.
     q, v : ndarray (n_q,) or (n_q, n)
-        Coordinates and velocities, on the constraints to rounding.
+        Coordinates and velocities, on the constraints to rounding; not so close to a singular position, where rounding
+        would make the velocities: a warning says so.
     a : ndarray (n_q,) or (n_q, n)
         Accelerations there, evaluated when they are first asked for.
     lam : ndarray (n_c + n_a,) or (n_c + n_a, n)

@@ -1,21 +1,37 @@
 """What is said of how a run ended: status and message, and what to try."""
 
 import warnings
+from operator import itemgetter
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from twoloop.checks.at_position import dependent_rows, least_inertia, not_finite
 from twoloop.checks.consistency import ConstraintWarning
 from twoloop.checks.rank import in_words, surely_above
 from twoloop.kernels.data import codes, noted, tolerances
-from twoloop.run.crossings import Place, said_of_crossings, said_of_turn, singular_ratio
+from twoloop.run.crossings import (
+    Place,
+    ratio_in_any_units,
+    said_of_crossings,
+    said_of_turn,
+    singular_ratio,
+)
 from twoloop.run.pace import INTERRUPTED, OUT_OF_TIME, STAGNATED, STAGNATION_STEPS, Pace
 from twoloop.run.record import Later, Status
+from twoloop.run.undetermined import UNTRUE, WEAK, turned_by_rounding
 
 if TYPE_CHECKING:
     from twoloop.run.run import Run
 
+Array = NDArray[np.float64]
+
 NEARLY_SINGULAR = 1e-3  # smallest over largest singular value of C_q, below which a message says so
-LOST_AT_END = 1e-6  # the same, below which the state at the end of a run is said not to be determined
+LASTING = 100.0  # times what the tolerances allow: errors of velocities on the way that end the trust in a run
+LOST_AT_END = (
+    1e-6  # the same, in any units, too, below which the state at the end of a run is said not to be determined
+)
 CROSSINGS = "\0"  # stands for what is said of singular positions that were crossed
 NEXT_TO_END = 1e-3  # of the run: where it stops so close to its end, that is said
 
@@ -53,16 +69,38 @@ def message_of(run: "Run", words: str) -> Any:
     return Later(made)
 
 
-def unless_turned(run: "Run", last_step: list[Place], end: float, status: Status, message: str) -> tuple[Status, str]:
-    """Status and message, unless velocities turned at a singular position that was crossed, or in the last step."""
+def unless_turned(
+    run: "Run", last_step: list[Place], landed: list[Place], end: float, status: Status, message: str
+) -> tuple[Status, str]:
+    """Status and message, unless velocities turned at a singular position that was crossed, or in the last step.
+
+    `landed`: states before the end on which steps had to end.
+    """
     now, crossings = (float(run.clock[run.a.T]), run.state), [each for each in run.crossings if each[0][0] < end]
+    turned = said_of_rounding(run, [*(place for each in crossings for place in each), *landed], end)
     if last_step:
         crossings.append(last_step)
-    if not crossings:
-        return status, message
-    rtol, atol = float(run.tolerances[tolerances.RTOL]), run.tolerances[tolerances.ATOL :]
-    turned = said_of_turn(run.system, crossings, now, run.rank, rtol, atol)
+    if crossings and not turned:
+        rtol, atol = float(run.tolerances[tolerances.RTOL]), run.tolerances[tolerances.ATOL :]
+        turned = said_of_turn(run.system, crossings, now, run.rank, rtol, atol)
     return (Status.RANK_LOST, turned) if turned else (status, message)
+
+
+def said_of_rounding(run: "Run", places: list[Place], end: float) -> str:
+    """Where steps went on from velocities that rounding had made; nothing if they did so nowhere."""
+    system, n = run.system, run.system.n_q
+    for t, state in sorted({place[0]: place for place in places}.values(), key=itemgetter(0)):
+        q, v = state[:n], state[n : 2 * n]
+        if t >= end or surely_above(run.near, system.rows(t, q), run.rank):
+            continue
+        over = _over_allowed(run, t, q, v)
+        if over > LASTING:
+            return (
+                f"Not to be trusted beyond t = {t:.10g}: steps went on from there, where the constraints nearly lose "
+                f"rank ({_measured(run, t, q)}), and rounding of positions had changed velocities by about {over:.1g} "
+                "times what rtol and atol allow. Take another method, or end t_span before."
+            )
+    return ""
 
 
 def outcome(run: "Run", code: int, t1: float, pace: Pace) -> tuple[Status, str]:
@@ -70,7 +108,7 @@ def outcome(run: "Run", code: int, t1: float, pace: Pace) -> tuple[Status, str]:
     a, t = run.a, float(run.clock[run.a.T])
     if code == a.ALL_OUTPUT_DONE:
         fixed = ", with a constant step: no error was estimated" if run.control[a.FIXED_STEP] > 0.0 else ""
-        said = _said_of_passages(run) + _said_of_end(run)
+        said = _said_of_passages(run) + said_of_end(run)
         return Status.REACHED_END, f"Reached the end, t = {t:g}{fixed}.{said}"
     stopped = f"Stopped at t = {t:.10g}"
     failure = int(run.clock[a.FAILURE_CODE])
@@ -146,23 +184,46 @@ def _contradiction(run: "Run") -> str:
     )
 
 
-def _said_of_end(run: "Run") -> str:
-    """A warning, and the sentence, where the run ends with constraints that have lost rank."""
-    if not run.crossings and not (run.plan.watchful and run.work.notes[noted.NEARLY_SINGULAR] == 1.0):
+def said_of_end(run: "Run") -> str:
+    """A warning, and the sentence, where the run ends with constraints that have lost rank, or nearly so."""
+    if not run.came_near():
         return ""
-    t, q, rank = float(run.clock[run.a.T]), run.state[: run.system.n_q], run.rank
-    if surely_above(LOST_AT_END, run.system.rows(t, q), rank):
+    system, n, t = run.system, run.system.n_q, float(run.clock[run.a.T])
+    q, v = run.state[:n], run.state[n : 2 * n]
+    if surely_above(WEAK, system.rows(t, q), run.rank):
         return ""
-    ratio = singular_ratio(run.system, t, q, rank)
-    if ratio > LOST_AT_END:
-        return ""
-    said = (
-        f"the run ends where the constraints lose rank (the smallest singular value of the constraint Jacobian is "
-        f"{ratio:.1g} of the largest): they do not determine velocities and accelerations there. End t_span a "
-        "little before, or beyond"
-    )
+    ratios = [ratio(system, t, q, run.rank) for ratio in (singular_ratio, ratio_in_any_units)]
+    if max(ratios) <= LOST_AT_END:
+        said = (
+            f"the run ends where the constraints lose rank ({_measured(run, t, q)}): they do not determine velocities "
+            "and accelerations there. End t_span a little before, or beyond"
+        )
+    else:
+        over = _over_allowed(run, t, q, v)
+        if over <= UNTRUE:
+            return ""
+        said = (
+            f"the run ends where the constraints nearly lose rank ({_measured(run, t, q)}): rounding of positions "
+            f"changes velocities there {_times_allowed(over)}, and accelerations by more. "
+            "End t_span a little before, or beyond, or loosen rtol and atol"
+        )
     warnings.warn(said, ConstraintWarning, stacklevel=4)
     return f" {said[0].upper()}{said[1:]}."
+
+
+def _over_allowed(run: "Run", t: float, q: Array, v: Array) -> float:
+    """Errors of velocities that rounding of positions makes, over the tolerances."""
+    allowed = run.tolerances[tolerances.ATOL :] + run.rtol * np.abs(v).max()
+    return float((turned_by_rounding(run.system, t, q, v, run.rank) / allowed).max())
+
+
+def _times_allowed(over: float) -> str:
+    return f"by about {over:.1g} times what rtol and atol allow" if np.isfinite(over) else "by more than can be told"
+
+
+def _measured(run: "Run", t: float, q: Array) -> str:
+    ratio = singular_ratio(run.system, t, q, run.rank)
+    return f"the smallest singular value of the constraint Jacobian is {ratio:.1g} of the largest"
 
 
 def _end_is_near(run: "Run", t1: float) -> str:

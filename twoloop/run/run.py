@@ -21,6 +21,7 @@ from twoloop.methods.plan import Plan, least_tolerance
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.messages import said_of_not_finite
 from twoloop.run.static_form import static_form, with_newton
+from twoloop.run.undetermined import LEAST, nearness
 from twoloop.run.workspace import kit_of, kit_with, made_ready, workspace
 
 Array = NDArray[np.float64]
@@ -93,7 +94,8 @@ class Run:
         self.clock[clock.T] = self.clock[clock.T_START] = t0
         self.control_by(plan)
         self.substituted = False  # whether another plan has taken over, for good
-        self.clock[clock.JUMP_FROM] = self.clock[clock.JUMP_TO] = np.inf
+        self.clock[[clock.JUMP_FROM, clock.JUMP_TO, clock.PIVOT_AT_OUTPUT]] = np.inf
+        self.near = nearness(rtol)  # pivots at output times below which velocities are looked at
         self.clock[[clock.ROUGH_TO, clock.LOOKED_TO, clock.ALONG_TO, clock.SUDDEN]] = -np.inf
         ran_on_symbols = any("force" in each.kinds for each in plan.traced)
         self.sudden = Sudden(False, False) if step_size is not None else may_be_sudden(system, ran_on_symbols)
@@ -341,6 +343,11 @@ class Run:
         notes = self.work.notes
         checked = self.work.counters[counters.N_ACCEPTED] > 0 and notes[noted.UNCHECKED] == 0.0
         return float(notes[noted.LARGEST_DEFECT]) if checked else None
+
+    def came_near(self) -> bool:
+        """Whether a singular position was so near where a step had to end that rounding may have made velocities."""
+        near = self.near if self.static is None else LEAST  # pivots of static factors vary more, and a look takes long
+        return bool(self.clock[self.a.PIVOT_AT_OUTPUT] < near)
 
     def attempts(self) -> int:
         """How many steps were tried so far."""

@@ -27,6 +27,7 @@ from twoloop.run.course import Course
 from twoloop.run.fields import statistics
 from twoloop.run.interrupts import Interrupts
 from twoloop.run.kept import InMemory
+from twoloop.run.messages import said_of_end
 from twoloop.run.record import Record, Status
 from twoloop.run.recorder import Wanted
 from twoloop.run.run import Run
@@ -154,7 +155,7 @@ class SampledRun:
             code = self._begin_anew(t)
         run.look_within(end - self.t0)
         self._outputs[0], clock[a.NEXT_OUTPUT], clock[a.T_START], clock[a.N_FIXED] = end, 0.0, t, 0.0
-        run.control[a.MAX_ATTEMPTS] = STEPS
+        run.control[a.MAX_ATTEMPTS], clock[a.PIVOT_AT_OUTPUT] = STEPS, np.inf
         steps = self._buffers[2]
         while code == a.PAUSED:
             code = direct(run.kernels.advance)(
@@ -165,6 +166,8 @@ class SampledRun:
                 self.steps.append(steps[: self._filled[1]].copy())
         if code != a.ALL_OUTPUT_DONE:
             self._by_course(end)
+        else:
+            said_of_end(run)
         self.cpu += time.process_time() - began
         self._note(end)
         return self.state

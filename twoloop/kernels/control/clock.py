@@ -69,5 +69,6 @@ H, ERRORS, FAILURES, PARTITIONS, JACOBIANS, N_STEP_COLUMNS = range(6)
     SUDDEN,  # where the next one is that is sudden
     ALONG_TO,  # up to where they were looked for along the way
     LOOKING,  # 1: while callbacks are called along the way, at states to which the motion may not come
+    PIVOT_AT_OUTPUT,  # the smallest pivot where steps had to end: output times, a grid; see least_pivot in partition.py
     N_CLOCK,
-) = range(N_PAST, N_PAST + 21)
+) = range(N_PAST, N_PAST + 22)

@@ -7,7 +7,7 @@ from twoloop.kernels.data.counters import N_ACCEPTED
 from twoloop.kernels.data.flags import AUGMENTED, FORM, NULL_SPACE, STATIC, STRAIGHT
 from twoloop.kernels.data.noted import BY_GENERAL, NEAR_NOW, NEARLY_SINGULAR, PIVOT, SENSITIVITY
 from twoloop.kernels.evaluation.calls import find_tangents, renew_partition
-from twoloop.kernels.evaluation.partition import partition_is_poor
+from twoloop.kernels.evaluation.partition import least_pivot, partition_is_poor
 from twoloop.kernels.evaluation.static_factors_at import CAREFUL
 
 SHORT = 0.5  # of the longest of the last steps: a step below it may be near a singular position ...
@@ -63,6 +63,15 @@ def with_care(f, w, control, clock, size):
         clock[at.H_NEXT] = max(size, clock[at.H_LONG])
     clock[at.H_LIMIT] = max(clock[at.H_LIMIT], clock[at.H_NEXT])
     return True
+
+
+@merged
+def note_output(f, w, clock, state):
+    """Note how near a singular position is where a step ends on an output time, or wherever its size says."""
+    pivot = least_pivot(f, w, clock[at.T], state[: w.Q.size])
+    if f.flags[FORM] == STATIC and pivot > 0.0:
+        pivot /= max(pivot, clock[at.LARGEST_PIVOT])  # sines, which are small in large mechanisms
+    clock[at.PIVOT_AT_OUTPUT] = min(clock[at.PIVOT_AT_OUTPUT], pivot)
 
 
 @merged

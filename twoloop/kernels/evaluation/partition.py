@@ -9,11 +9,13 @@ from twoloop.kernels.algebra.patterns import note_pattern
 from twoloop.kernels.data.codes import DONE, RANK_DIFFERS, SINGULAR
 from twoloop.kernels.data.common import compiled, merged
 from twoloop.kernels.data.counters import N_FACTORIZATIONS, N_PARTITIONS
+from twoloop.kernels.data.flags import FORM, STATIC
 from twoloop.kernels.data.noted import FACTORED, GENERATION, LEANING, ORIENTATION, PIVOT, RANK, RANK_V, SENSITIVITY
 from twoloop.kernels.evaluation.constraints import constraint_rows
 
 RANK_TOLERANCE = 1e-11  # a pivot below this counts as zero; rows are scaled to 1
 CHANGED = -1  # returned beside DONE: there is another partition now
+MANY = 200  # rows, which are not eliminated only to see how near a singular position is
 WORSE = 3.0  # a partition is renewed when max|C_qd^-1 C_qi| exceeds this multiple of what it was at first
 
 
@@ -79,6 +81,33 @@ def full_pivoting(A, order, row_order, largest, first, last, most):
                     largest[i] = _largest_from(A[i], k + 1)
         k += 1
     return k
+
+
+@compiled
+def least_pivot(f, w, t, q):
+    """The smallest of the pivots at a position, over the largest, of the rows as they are; the partition stays.
+
+    Nothing is scaled: a row, or a column, may be short as the position is singular. That of factors, or of too many
+    rows, is the smallest of the last partition.
+    """
+    if f.flags[FORM] == STATIC or w.rows_v.size > MANY:
+        return w.notes[PIVOT]
+    if w.rows_v.size == 0:
+        return 1.0
+    G, order, row_order = w.Gx, w.order, w.row_order
+    G[:, :] = 0.0
+    constraint_rows(f, w, t, q, G)
+    for j in range(order.size):
+        order[j] = j
+    for i in range(row_order.size):
+        row_order[i] = i
+    rank = full_pivoting(G, order, row_order, w.g, 0, row_order.size, w.rows_v.size)
+    if rank < w.rows_v.size:
+        return 0.0
+    smallest, largest = np.inf, 0.0
+    for k in range(rank):
+        smallest, largest = min(smallest, abs(G[k, k])), max(largest, abs(G[k, k]))
+    return smallest / largest
 
 
 @compiled
