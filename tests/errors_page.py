@@ -13,12 +13,13 @@ PAGE = Path(__file__).parents[1] / "docs" / "errors.md"
 LONGEST = 400  # characters of a message
 BEGINNING = """# Error messages
 
-Wrong input raises an exception before any work. The message names the argument, what was given and what is expected. What goes
-wrong later ends the run with a status: see `result.status` and `result.message`. The result holds what was computed before.
+Wrong input raises an exception before any work. The message names the argument, what was given and what is expected.
+What goes wrong later ends the run with a status: see `result.status` and `result.message`. The result holds what was
+computed before.
 
 Each table below belongs to one function or class. Search this page for a word of the message.
 
-<!-- Written by `python -m tests.errors_page` from `tests/bad_input`, which raises every message; do not edit it by hand. -->
+<!-- Written by `python -m tests.errors_page` from `tests/bad_input`, which raises every message: do not edit it. -->
 """
 # what stands above the table of a group
 MEANT = {

@@ -115,7 +115,10 @@ BODIES: list[Case] = [
     of_planar("`name=3`", body(name=3), "name must be a string; given 3", "give text", TypeError),
     of_planar("`mass=-1`", body(mass=-1), "mass of 'arm' must be positive", "give a positive mass"),
     of_planar(
-        "`mass=0`", body(mass=0), "mass of 'arm' must be positive", "give a positive mass; for a massless rod use distance(...)"
+        "`mass=0`",
+        body(mass=0),
+        "mass of 'arm' must be positive",
+        "give a positive mass; for a massless rod use distance(...)",
     ),
     of_planar("`mass='1'`", body(mass="1"), "mass of 'arm' must be a number", "give a number", TypeError),
     of_planar("`mass=nan`", body(mass=np.nan), "mass of 'arm' must be positive", "find out where the NaN comes from"),

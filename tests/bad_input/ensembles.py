@@ -38,7 +38,12 @@ ENSEMBLES = [
     of_ensemble("a start off the constraints", lambda: many(moved(2, 0.1))).says(
         "run 2: q0 is not consistent", "put all starts on the constraints by `consistent_states`"
     ),
-    of_ensemble("a start with a NaN", lambda: many(moved(1, np.nan)), "q0 must be finite; row 1 is not", "find out where the NaN comes from"),
+    of_ensemble(
+        "a start with a NaN",
+        lambda: many(moved(1, np.nan)),
+        "q0 must be finite; row 1 is not",
+        "find out where the NaN comes from",
+    ),
     of_ensemble("`threads=0`", lambda: many(threads=0), "threads must be at least 1", "leave it out: all cores"),
     of_ensemble("a problem in place of its system", lambda: many(system=LINKAGE)).says(
         "give its system, problem.system", "give `problem.system`", TypeError

@@ -82,9 +82,19 @@ IMPACTS = [
     of_stops("`slide=1.0`", lambda: Stop(lambda t, q: q[0], slide=1.0)).says(
         "slide of 'stop' must be a function of t and q; given 1.0", "give slide(t, q), or leave it out", TypeError
     ),
-    of_stops("no stops", against(), "stops must be a Stop or a list of them", "give at least one, or use `solve_dae`", TypeError),
     of_stops(
-        "a function in place of a stop", against(lambda t, q: q[0]), "stops must be a Stop", "write Stop(gap)", TypeError
+        "no stops",
+        against(),
+        "stops must be a Stop or a list of them",
+        "give at least one, or use `solve_dae`",
+        TypeError,
+    ),
+    of_stops(
+        "a function in place of a stop",
+        against(lambda t, q: q[0]),
+        "stops must be a Stop",
+        "write Stop(gap)",
+        TypeError,
     ),
     of_stops("a start beyond a stop", against(Stop(lambda t, q: q[8] - 9.0, name="wall"))).says(
         "gaps must not be negative at q0; that of 'wall' is", "change the sign of the gap, or start elsewhere"
@@ -93,7 +103,10 @@ IMPACTS = [
         "gap of 'stop' must be a number computed from t and q by numpy functions", "give one stop for each branch"
     ),
     of_stops(
-        "`restitution=1.1`", lambda: Stop(lambda t, q: q[0], 1.1), "restitution of 'stop' must be from 0 to 1", "give a number from 0 to 1"
+        "`restitution=1.1`",
+        lambda: Stop(lambda t, q: q[0], 1.1),
+        "restitution of 'stop' must be from 0 to 1",
+        "give a number from 0 to 1",
     ),
     of_stops(
         "`events=`", against(Stop(lambda t, q: 9.0 - q[8]), events=[]), "no option 'events'", "leave it out", TypeError

@@ -42,13 +42,20 @@ METHODS = [
     ),
     *of_option(
         "outer",
-        ("n", ValueError, "must be 'auto', 'fixed-point', 'newton' or 'paper'; given 'n'", "take one of the values named"),
+        (
+            "n",
+            ValueError,
+            "must be 'auto', 'fixed-point', 'newton' or 'paper'; given 'n'",
+            "take one of the values named",
+        ),
         (None, TypeError, "must be .*given None", "leave it out"),
     ),
     *of_option("error", ("none", ValueError, "must be 'richardson'", "take one of the values named")),
     *of_option("variables", ("q", ValueError, "must be 'velocities'", "take one of the values named")),
     *of_option("partition", (1, TypeError, "must be 'lasting'", "take one of the values named")),
-    *of_option("partition", ("no", ValueError, "must be 'lasting'.*'symmetric'; given 'no'", "take one of the values named")),
+    *of_option(
+        "partition", ("no", ValueError, "must be 'lasting'.*'symmetric'; given 'no'", "take one of the values named")
+    ),
     *of_option("outer_test", (1, TypeError, "must be 'all'", "take one of the values named")),
     *of_option("inner_tol", *FEW_POSITIVES),
     *of_option("outer_tol", *FEW_POSITIVES, INFINITE, (np.nan, ValueError, "must be positive", POSITIVE)),
@@ -88,7 +95,9 @@ METHODS = [
     ),
     *argument("BDF", BDF, "outer_tol", *FEW_POSITIVES[:2]),
     *argument("BDF", BDF, "inner_tol", *FEW_POSITIVES[:1]),
-    *argument("BDF", BDF, "outer", ("paper", ValueError, "must be 'fixed-point' or 'newton'", "take one of the values named")),
+    *argument(
+        "BDF", BDF, "outer", ("paper", ValueError, "must be 'fixed-point' or 'newton'", "take one of the values named")
+    ),
     *argument(
         "Taylor",
         Taylor,

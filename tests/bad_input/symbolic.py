@@ -58,9 +58,19 @@ SYMBOLIC = [
         "name it in coordinates, or give the formula of its motion",
         T=T + dynamicsymbols("z").diff(t) ** 2,
     ),
-    case("T=m * x'**4", r"dT/dv\[0\] must be linear in the velocities", "give a T that is at most quadratic in the velocities", T=m * xd**4),
+    case(
+        "T=m * x'**4",
+        r"dT/dv\[0\] must be linear in the velocities",
+        "give a T that is at most quadratic in the velocities",
+        T=m * xd**4,
+    ),
     case("V=m * x' * y", r"V may depend on coordinates and time only", "give it as forces=", V=m * xd * y),
-    case("T=m * x''", "T may not depend on accelerations", "leave accelerations out: they are the unknowns", T=m * xd.diff(t)),
+    case(
+        "T=m * x''",
+        "T may not depend on accelerations",
+        "leave accelerations out: they are the unknowns",
+        T=m * xd.diff(t),
+    ),
     case("T='m*v**2/2'", "T must be a SymPy expression", "give a SymPy expression", TypeError, T="m*v**2/2"),
     case(
         "constraints=[x' - y']",
@@ -97,7 +107,12 @@ SYMBOLIC = [
     case("V=oo", "V must be made of real numbers, powers and", REAL, V=sp.oo),
     case("V=nan", "V must be made of real numbers, powers and", REAL, V=sp.nan),
     case("forces={x: -sign(x')}", r"forces\[x\(t\)\] must be smooth; given sign", SMOOTH, forces={x: -sp.sign(xd)}),
-    case("forces=[0]", "forces must have 2 entries, one for each coordinate; given 1", "give one for each coordinate", forces=[0]),
+    case(
+        "forces=[0]",
+        "forces must have 2 entries, one for each coordinate; given 1",
+        "give one for each coordinate",
+        forces=[0],
+    ),
     case(
         "forces={z: 1}",
         "forces must be for coordinates, x, y; given one for z",
