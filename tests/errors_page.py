@@ -2,32 +2,31 @@
 
 import re
 from functools import cache
-from itertools import groupby
 from pathlib import Path
 
 from tests.bad_input.case import Case
 from tests.bad_input.cases import CASES
 from twoloop import Status
-from twoloop.result import result
+from twoloop.run.record import MEANINGS
 
 PAGE = Path(__file__).parents[1] / "docs" / "errors.md"
 LONGEST = 400  # characters of a message
-BEGINNING = """# What happens at what mistake
+BEGINNING = """# Error messages
 
-Wrong input raises before any work, and the message names the argument, what was given and what to do. What goes wrong
-later ends the run with a status: `result.status`, `result.message`, and what was computed so far.
+Wrong input raises an exception before any work. The message names the argument, what was given and what is expected.
+What goes wrong later ends the run with a status: see `result.status` and `result.message`. The result holds what was
+computed before.
 
-Every line below is a test. Written by `python -m tests.errors_page` from `tests/bad_input`, with the messages
-as they were raised; do not edit it by hand.
+Each table below belongs to one function or class. Search this page for a word of the message.
+
+<!-- Written by `python -m tests.errors_page` from `tests/bad_input`, which raises every message: do not edit it. -->
 """
 # what stands above the table of a group
 MEANT = {
     "result.certify": """\
-A certificate that passes means: recomputed by a different method, which evaluated the equations at places no further
-apart than `certificate.gap`, no step of the run ends more than 200 tolerances from where they lead. What lasts less
-than the gap may be missed, and so may what moves every step by less than that. How errors of steps grow over the run
-is not bounded, and whether the model is right is not known. One that does not pass gives a `CertificateWarning` that
-says where. [The certificate](certificate.md) has the details.
+If a certificate passes, a different method has recomputed the run, and no step ends more than 200 tolerances from the
+recomputed state. If it does not pass, a `CertificateWarning` says where. [The certificate](certificate.md) explains
+what it proves and what it can miss.
 """
 }
 
@@ -61,19 +60,28 @@ def cell(text: str) -> str:
 
 
 def statuses() -> list[str]:
-    """The ways in which a run ends, with their meanings where result.py gives them."""
-    meanings = getattr(result, "MEANINGS", {})
+    """The ways in which a run ends, with their meanings."""
     rows = ["| `result.status` | What it means |", "|---|---|"]
     for status in Status:
-        meaning = meanings.get(status, status.name.replace("_", " ").lower())
-        rows.append(f"| `{status.name}` = {int(status)} | {cell(meaning)} |")
+        name = f"`{status.name}` = {int(status)}"
+        if status < 0:
+            name = f"[{name}](when_it_fails.md#{status.name.lower()})"
+        rows.append(f"| {name} | {cell(MEANINGS[status])} |")
     return rows
+
+
+def groups() -> dict[str, list[Case]]:
+    """The cases by their groups, each group once, in the order in which they first appear."""
+    found: dict[str, list[Case]] = {}
+    for case in CASES:
+        found.setdefault(case.group, []).append(case)
+    return found
 
 
 def page() -> str:
     """The whole page."""
     parts = [BEGINNING, "## How a run ends\n", *statuses(), ""]
-    for group, cases in groupby(CASES, key=lambda case: case.group):
+    for group, cases in groups().items():
         parts += [f"## {group}\n", *([MEANT[group]] if group in MEANT else [])]
         parts += ["| What you did | What you get | What to do |", "|---|---|---|"]
         parts += [f"| {cell(case.what)} | {cell(message(case))} | {cell(case.advice)} |" for case in cases]

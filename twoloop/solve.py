@@ -70,92 +70,98 @@ def solve_dae(
 ) -> Result:
     """Integrate a constrained mechanical system; its constraints hold at every step.
 
-    Constraints that depend on others at the start are left out, named by a `ConstraintWarning`, checked at every step.
-    Near a position where the constraints lose rank, steps of any method may give way to explicit ones across it.
+    Constraints that depend on others at the start are left out and checked at every step; a `ConstraintWarning` names
+    them. Near a position where the constraints lose rank, any method may take explicit steps across it.
 
     Parameters
     ----------
     system : ConstrainedSystem
-        The problem.
+        The system to integrate.
     t_span : (float, float)
         Start and end, s; the end after the start.
     q0, v0 : array_like (n_q,)
         Consistent initial coordinates and velocities (see `consistent_state`).
     method : str or method object
-        "auto" (default: explicit where nothing is stiff, Newton's method where stiffness is measured, see `Auto`),
+        "auto" (default: explicit, with Newton's method while the problem is found to be stiff, see `Auto`),
         "Taylor", "DOP853", "Adams", "Gauss4" ... "Gauss16", "SunRadau5", "RadauIIA5", "RadauIIA9", "RadauIIA13",
         "TRBDF2", "ESDIRK4", "BDF", "Newmark", "PaperIRK", "PaperNewmark", or an object: `RungeKutta(...)`,
         `ESDIRK(...)`, `Newmark(...)`, ...
     rtol : float
+        Relative tolerance of the error of a step.
     atol : float or array_like (n_q,)
-        A step is accepted when the largest component of its estimated error over atol + rtol |value| is at most 1:
-        that of positions and velocities, for `Newmark` that of the positions per unit step over the tolerances of the
-        velocities (with error="richardson-paper" of `RungeKutta` the root mean square counts; with `error_tol` Newmark
-        has its own test). An array holds for each coordinate and its velocity. But for the paper's two procedures the
-        distance between the dependent positions that the formula predicts and those that the constraints give counts
-        as an error, too, and must not exceed about a tenth of the motion in the step: so a step cannot end on another
-        assembly of the mechanism.
+        Absolute tolerance. An array has one number for each coordinate, which also holds for its velocity.
+
+        A step is accepted if the largest component of its estimated error, divided by atol + rtol |value|, is at most
+        1. Positions and velocities count. For `Newmark`, the error of the positions per unit step counts, with the
+        tolerances of the velocities; with `error_tol`, Newmark has a test of its own. With error="richardson-paper" of
+        `RungeKutta`, the root mean square counts instead of the largest component.
+
+        The dependent positions are tested, too, except in the paper's two procedures. The distance between those that
+        the formula predicts and those that the constraints give counts as an error, and must not exceed about a tenth
+        of the motion in the step. A step therefore cannot end on another assembly of the mechanism.
     t_eval : array_like, optional
-        Increasing times in t_span at which to store the solution, interpolated between the steps as by `sol`: these are
-        the same with and without. None: every accepted step is stored. With `step_size`, and the two methods of the
-        paper, nothing is interpolated: steps are shortened to land on the times.
+        Increasing times in t_span at which to store the solution. It is interpolated between the steps as by `sol`, and
+        the steps do not change. None: every accepted step is stored. With `step_size`, and with the two methods of the
+        paper, nothing is interpolated, and steps are shortened to end at these times.
     first_step : float, optional
         First step to try, s. None: chosen from the velocities and accelerations at the start, or from the Taylor series
         there.
     max_step : float
-        Largest step, s. Methods that do not look at the equations between the ends and stages of their steps, all but
-        "Taylor", take none that is longer than a hundredth of the run in any case. Forces and drives are looked at with
-        time every two-thousandth of the run, and steps end where they change suddenly; what acts for a shorter time, or
-        on a shorter way, may be passed over unseen: give its duration.
+        Largest step, s. "Taylor" evaluates the equations within its steps. All other methods evaluate them only at the
+        ends and stages of steps, and take no step longer than a hundredth of the run. Forces and drives that depend on
+        time are also evaluated every two-thousandth of the run, and steps end where they change suddenly. What acts for
+        a shorter time, or over a shorter distance, may be missed; then give its duration.
     max_steps : int, optional
-        Largest number of accepted steps. None: no limit, but a run whose steps have become a thousand times shorter
-        than before, so that the rest would take more than ten million of them, ends with the status STAGNATED.
+        Largest number of accepted steps. None: no limit, but a run ends with the status STAGNATED if its steps have
+        become a thousand times shorter than before and the rest would take more than ten million of them.
     step_size : float, optional
-        Constant step, s: no error control; only the last step is shortened, to end at t_span[1]. Times in `t_eval`
+        Constant step, s, without error control. Only the last step is shortened, to end at t_span[1]. Times in `t_eval`
         must then be multiples of it. A step that does not converge ends the run.
     dense_output : bool
         Whether to keep what `result.sol(t)` needs, the state at any time t of the run (see `DenseSolution`).
     events : callable or list of callables, optional
-        Functions event(t, q, v) -> float, plain or compiled by numba, whose zeros are looked for, by the rules of
-        SciPy's `solve_ivp`: an attribute `terminal`, True or a number of occurrences, ends the run there; an
-        attribute `direction`, 1 or -1, lets only zeros count at which the value rises or falls. The sign is looked at
-        four times a step: two zeros closer than a quarter of a step, and one without a change of sign, are missed;
-        `max_step` helps. A zero at the start counts. The time of an event is found to rounding of the dense solution.
-        Other than terminal events leave the steps as they are.
+        Functions event(t, q, v) -> float, plain or compiled by numba, whose zeros are found by the rules of SciPy's
+        `solve_ivp`. An attribute `terminal`, True or a number of occurrences, ends the run there. With an attribute
+        `direction`, 1 or -1, only zeros count at which the value rises or falls. A zero at the start counts. The sign
+        is checked four times per step. Two zeros within a quarter of a step can be missed, and so can one without a
+        change of sign; a smaller `max_step` helps. The time of an event is that of the dense solution, to rounding.
+        Events that are not terminal do not change the steps.
     progress : bool, optional
         True: show a bar (needs the package rich).
     time_limit : float, optional
-        Wall-clock time, s, after which the run ends with the status TIME_LIMIT. It is looked at about every 0.1 s, but
+        Wall-clock time, s, after which the run ends with the status TIME_LIMIT. It is checked about every 0.1 s, but
         not within a step, and for a small compiled system not before a thousand steps.
     check_derivatives : bool
-        Whether C_q, C_t, gamma and tangents are compared with differences at the first start of a system, and all but
-        the tangents again at a few states of runs: with exact derivatives where the callbacks run on symbols, else with
-        differences. Of compiled callbacks only states beyond those of earlier runs are compared, and the 2nd, 4th, 8th,
-        ... run as a whole. With other parameters (`with_parameters`) they are compared at the start as those of a new
-        system; along runs, where they do not branch on parameters, as if these were coordinates.
+        Whether to check C_q, C_t, gamma and the tangents at the first start of a system, and all but the tangents again
+        at a few states of the run. They are compared with exact derivatives if the callbacks run on symbols, otherwise
+        with differences. For compiled callbacks, only states outside the region of earlier runs are compared, and the
+        2nd, 4th, 8th, ... run as a whole. A system with other parameters (`with_parameters`) is checked at the start
+        like a new one. Along runs, parameters count as if they were coordinates, unless callbacks branch on them.
     compiled : bool or "auto"
-        Whether the equations of the mechanism become machine code of their own, for the methods "auto", "Taylor",
-        "DOP853" and "Adams": as a rule two to four times as fast inside the integrator, less over a short call, and not
-        always on stiff motion; after 0.1 to 6 s, which grow with the mechanism, once for equations of the same
-        structure, as the code is kept on disk and reads its numbers. The callbacks must not
-        branch on t, q or v. What near a singular position cannot be trusted to this code is computed without.
-        "auto" (default): for small mechanisms with compiled callbacks, whose code takes some tenths of a second. This
-        depends on the arguments of the call alone: the same call gives the same numbers whatever ran before.
+        Whether to make machine code of the equations of the mechanism, for the methods "auto", "Taylor", "DOP853" and
+        "Adams". It usually makes the integrator two to four times as fast, but gains less in a short call and not
+        always on stiff motion. Making it takes 0.1 to 7 s, growing with the mechanism. This happens once for equations
+        of the same structure, because the code is kept on disk and reads its numbers. The callbacks must not branch on
+        t, q or v. Near a singular position, steps that cannot be trusted to this code are computed without it.
+        "auto" (default): for small mechanisms with compiled callbacks, whose code takes some tenths of a second. The
+        choice depends only on the arguments of the call, so the same call gives the same numbers whatever ran before.
     store : str or path, optional
-        A folder to make, for runs of which the memory does not hold all: what the run keeps goes there as it comes,
-        and arrays of the result, the dense solution's too, are read from there as they are used. Events stay in memory.
-        `twoloop.load` reads the folder again, also that of a run that failed or whose process died.
+        A new folder, for runs that do not fit into memory. What the run keeps is written there as it is computed.
+        Arrays of the result, and of the dense solution, are read from there when they are used. Events stay in memory.
+        `twoloop.load` reads the folder again, even if the run failed or its process died.
 
     Returns
     -------
     Result
-        After a failure, or Ctrl-C, with what was computed so far, `success=False` and a message that says what to try.
+        After a failure, or Ctrl-C, it holds what was computed so far, with `success=False` and a message that says what
+        to try.
 
     Raises
     ------
     TypeError, ValueError
-        If an argument is wrong: before any work, naming it. An exception of a Python callback or an event comes
-        through unchanged, with a note that says which and at what time; so does what is wrong with an event's value.
+        If an argument is wrong: before any work, naming the argument. An exception from a Python callback or an event
+        is passed on unchanged, with a note that says which one was called and at what time. If an event returns
+        something other than a real number, the error has this note, too.
     """
     check_system(system)
     given = (

@@ -79,10 +79,18 @@ BETWEEN_STEPS = [
     event_case("`hit.terminal = 'yes'`", having(terminal="yes"), TypeError, "terminal must be True", COUNT),
     event_case("`hit.terminal = -1`", having(terminal=-1), ValueError, "terminal must be True", COUNT),
     event_case("`hit.terminal = 1.5`", having(terminal=1.5), TypeError, "terminal must be True", COUNT),
-    event_case("`hit.direction = 'up'`", having(direction="up"), TypeError, "direction must be -1, 0 or 1", "give 1"),
-    event_case("`hit.direction = nan`", having(direction=np.nan), ValueError, "direction must be -1, 0 or 1", "give 1"),
-    event_case("`hit.direction = 2`", having(direction=2), ValueError, "direction must be -1, 0 or 1", "give 1"),
-    event_case("`hit.direction = True`", having(direction=True), TypeError, "direction must be -1, 0 or 1", "give 1"),
+    event_case(
+        "`hit.direction = 'up'`", having(direction="up"), TypeError, "direction must be -1, 0 or 1", "give 1, -1 or 0"
+    ),
+    event_case(
+        "`hit.direction = nan`", having(direction=np.nan), ValueError, "direction must be -1, 0 or 1", "give 1, -1 or 0"
+    ),
+    event_case(
+        "`hit.direction = 2`", having(direction=2), ValueError, "direction must be -1, 0 or 1", "give 1, -1 or 0"
+    ),
+    event_case(
+        "`hit.direction = True`", having(direction=True), TypeError, "direction must be -1, 0 or 1", "give 1, -1 or 0"
+    ),
     *argument(
         "result.sol",
         evaluated,

@@ -115,7 +115,10 @@ BODIES: list[Case] = [
     of_planar("`name=3`", body(name=3), "name must be a string; given 3", "give text", TypeError),
     of_planar("`mass=-1`", body(mass=-1), "mass of 'arm' must be positive", "give a positive mass"),
     of_planar(
-        "`mass=0`", body(mass=0), "mass of 'arm' must be positive", "give a positive mass; for a rod without, distance"
+        "`mass=0`",
+        body(mass=0),
+        "mass of 'arm' must be positive",
+        "give a positive mass; for a massless rod use distance(...)",
     ),
     of_planar("`mass='1'`", body(mass="1"), "mass of 'arm' must be a number", "give a number", TypeError),
     of_planar("`mass=nan`", body(mass=np.nan), "mass of 'arm' must be positive", "find out where the NaN comes from"),
@@ -161,7 +164,7 @@ BODIES: list[Case] = [
     ),
     of_planar("friction so large that a joint may jam", lambda: loaded(coefficient=50.0)).says(
         "cannot be computed at the start: the coefficients are so large that a joint may jam",
-        "give less; locks that hold themselves have no smooth law",
+        "give a smaller coefficient: self-locking has no smooth law",
     ),
     of_planar("a distance of points that coincide", lambda: planar().distance("bar", (1, 0), "block", (1, 0))).says(
         "coincide in the position given", "give a length, or take a revolute joint"
@@ -228,7 +231,7 @@ BODIES: list[Case] = [
     .when(lambda: (m := planar(), m.spring("bar", (0, 0), "ground", (0, 0), stiffness=1.0, length=0.1), m.problem()))
     .says("the points of the spring 'spring bar-ground' coincide at the start", "move a point, or give `length=0`"),
     of_planar("a negative damping", lambda: planar().torsion_spring("pin", stiffness=1.0, damping=-0.1)).says(
-        "damping must not be negative; given -0.1", "for a torque that drives, motor(...)"
+        "damping must not be negative; given -0.1", "for a driving torque use motor(...)"
     ),
     of_planar("a drive of a drive", lambda: (m := planar()).drive(m.drive("pin", lambda t: t), lambda t: t)).says(
         "drive needs a revolute or prismatic joint; given 'drive of pin', which is drive", "drive the joint once"
@@ -292,7 +295,7 @@ BODIES: list[Case] = [
         r"q must have shape \(6,\) or \(6, n_t\); given shape \(9, 6\)", "give states as columns: q.T"
     ),
     of_problem("an unknown parameter", lambda: rough(1.9).with_parameters({"mass of three": 1.0})).says(
-        "'arms' has no parameter 'mass of three'", "names are in problem.parameters"
+        "'arms' has no parameter 'mass of three'", "take a name from problem.parameters"
     ),
     of_problem("a mass that becomes negative", lambda: rough(1.9).with_parameters({"mass of two": -1.0})).says(
         "mass of two must be positive", "give a positive mass"

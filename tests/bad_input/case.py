@@ -122,7 +122,7 @@ POSITIVES = [
     (True, TypeError, "must be a number; given True of type bool", POSITIVE),
     (1e-3j, TypeError, "must be a number; given 0.001j", POSITIVE),
     (HUGE, ValueError, "must fit into a float", POSITIVE),
-    (DAY, TypeError, "must be a number; given datetime", "give seconds"),
+    (DAY, TypeError, "must be a number; given datetime", POSITIVE),
 ]
 FEW_POSITIVES = [POSITIVES[k] for k in (0, 3, 4, 6)]
 INFINITE = (np.inf, ValueError, "must be positive and finite; given inf", POSITIVE)

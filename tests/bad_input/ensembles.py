@@ -38,7 +38,12 @@ ENSEMBLES = [
     of_ensemble("a start off the constraints", lambda: many(moved(2, 0.1))).says(
         "run 2: q0 is not consistent", "put all starts on the constraints by `consistent_states`"
     ),
-    of_ensemble("a start with a NaN", lambda: many(moved(1, np.nan)), "q0 must be finite; row 1 is not", "look at it"),
+    of_ensemble(
+        "a start with a NaN",
+        lambda: many(moved(1, np.nan)),
+        "q0 must be finite; row 1 is not",
+        "find out where the NaN comes from",
+    ),
     of_ensemble("`threads=0`", lambda: many(threads=0), "threads must be at least 1", "leave it out: all cores"),
     of_ensemble("a problem in place of its system", lambda: many(system=LINKAGE)).says(
         "give its system, problem.system", "give `problem.system`", TypeError
@@ -52,10 +57,10 @@ ENSEMBLES = [
         "Integrator has no option 'tol'", "give `rtol` and `atol`", TypeError
     ),
     of_integrator("`max_step=-1.0`", lambda: Integrator(LINKAGE.system, max_step=-1.0)).says(
-        "max_step must be positive; given -1.0", "give s"
+        "max_step must be positive; given -1.0", "give a positive number of seconds"
     ),
     of_integrator("`compiled='yes'`", lambda: Integrator(LINKAGE.system, compiled="yes")).says(
-        "compiled must be True, False or 'auto'", "take one of these"
+        "compiled must be True, False or 'auto'", "take one of the values named"
     ),
     of_integrator("`events=3`", lambda: Integrator(LINKAGE.system, events=3)).says(
         "events must be a function event", "give event(t, q, v)", TypeError

@@ -49,7 +49,9 @@ MECHANISMS = [
         (0, ValueError, "must be at least 1; given 0", "give an int of at least 1"),
         (2.5, TypeError, "must be an int; given 2.5", "give an int of at least 1"),
     ),
-    *of_beam("start", *[(start, ValueError, "must be 'node'", "take one of these") for start in ("tip", ["node"])]),
+    *of_beam(
+        "start", *[(start, ValueError, "must be 'node'", "take one of the values named") for start in ("tip", ["node"])]
+    ),
     *of_beam("youngs_modulus", *FEW_POSITIVES, INFINITE),
     *of_beam("length", *FEW_POSITIVES[:2]),
     *of_beam("amplitude", (np.inf, ValueError, "must be finite; given inf", "give metres")),
@@ -78,7 +80,10 @@ MECHANISMS = [
     ),
     *argument("n_four_bar", n_four_bar, "n", (0, ValueError, "must be at least 1", "give a number of windows")),
     *argument(
-        "n_four_bar", n_four_bar, "coordinates", ("angles", ValueError, "must be one of tips, bodies", "take one")
+        "n_four_bar",
+        n_four_bar,
+        "coordinates",
+        ("angles", ValueError, "must be one of tips, bodies", "take one of the values named"),
     ),
     *argument("pendulum", pendulum, "start", (0.5, ValueError, "must be -1 or 1", "give the side it starts from")),
 ]

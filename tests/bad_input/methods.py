@@ -42,14 +42,21 @@ METHODS = [
     ),
     *of_option(
         "outer",
-        ("n", ValueError, "must be 'auto', 'fixed-point', 'newton' or 'paper'; given 'n'", "take one of these"),
+        (
+            "n",
+            ValueError,
+            "must be 'auto', 'fixed-point', 'newton' or 'paper'; given 'n'",
+            "take one of the values named",
+        ),
         (None, TypeError, "must be .*given None", "leave it out"),
     ),
-    *of_option("error", ("none", ValueError, "must be 'richardson'", "take one of these")),
-    *of_option("variables", ("q", ValueError, "must be 'velocities'", "take one of these")),
-    *of_option("partition", (1, TypeError, "must be 'lasting'", "take one of these")),
-    *of_option("partition", ("no", ValueError, "must be 'lasting'.*'symmetric'; given 'no'", "take one of these")),
-    *of_option("outer_test", (1, TypeError, "must be 'all'", "take one of these")),
+    *of_option("error", ("none", ValueError, "must be 'richardson'", "take one of the values named")),
+    *of_option("variables", ("q", ValueError, "must be 'velocities'", "take one of the values named")),
+    *of_option("partition", (1, TypeError, "must be 'lasting'", "take one of the values named")),
+    *of_option(
+        "partition", ("no", ValueError, "must be 'lasting'.*'symmetric'; given 'no'", "take one of the values named")
+    ),
+    *of_option("outer_test", (1, TypeError, "must be 'all'", "take one of the values named")),
     *of_option("inner_tol", *FEW_POSITIVES),
     *of_option("outer_tol", *FEW_POSITIVES, INFINITE, (np.nan, ValueError, "must be positive", POSITIVE)),
     *(
@@ -80,15 +87,17 @@ METHODS = [
         "BDF",
         BDF,
         "max_order",
-        (0, ValueError, "must be at least 1; given 0", "give 1 to 5"),
-        (6, ValueError, "must be at most 5; given 6", "give 1 to 5"),
-        (2.0, TypeError, "must be an int; given 2.0", "give 1 to 5"),
-        (True, TypeError, "must be an int; given True", "give 1 to 5"),
-        ("5", TypeError, "must be an int; given '5'", "give 1 to 5"),
+        (0, ValueError, "must be at least 1; given 0", "give an int from 1 to 5"),
+        (6, ValueError, "must be at most 5; given 6", "give an int from 1 to 5"),
+        (2.0, TypeError, "must be an int; given 2.0", "give an int from 1 to 5"),
+        (True, TypeError, "must be an int; given True", "give an int from 1 to 5"),
+        ("5", TypeError, "must be an int; given '5'", "give an int from 1 to 5"),
     ),
     *argument("BDF", BDF, "outer_tol", *FEW_POSITIVES[:2]),
     *argument("BDF", BDF, "inner_tol", *FEW_POSITIVES[:1]),
-    *argument("BDF", BDF, "outer", ("paper", ValueError, "must be 'fixed-point' or 'newton'", "give one of the two")),
+    *argument(
+        "BDF", BDF, "outer", ("paper", ValueError, "must be 'fixed-point' or 'newton'", "take one of the values named")
+    ),
     *argument(
         "Taylor",
         Taylor,
@@ -133,7 +142,7 @@ METHODS = [
     *of_tableau(
         "c",
         ([0.5, 1.0], ValueError, r"must have shape \(1,\)", "give s nodes"),
-        ([0.25], ValueError, r"must be the row sums of A.*row 0 of A sums to 0.5, and c\[0\] is 0.25", "give A 1"),
+        ([0.25], ValueError, r"must be the row sums of A.*row 0 of A sums to 0.5, and c\[0\] is 0.25", "give A @ ones"),
     ),
     *of_tableau(
         "order",

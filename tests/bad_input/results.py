@@ -34,13 +34,18 @@ RESULTS = [
     of_result("`energy` of a system without a problem", lambda: solve().energy, "knows no energy", A_PROBLEM),
     of_result("`animate` without a drawing", lambda: solve().animate("swing.gif"), "knows no drawing", A_PROBLEM),
     of_result('`animate("swing.avi")`', lambda: solve().animate("swing.avi")).says(
-        r"path must end in .html, .gif, .mp4", "choose one of these endings"
+        r"path must end in .html, .gif, .mp4", "take one of the endings named"
     ),
     of_result("`plot(3)`", lambda: solve().plot(3), "path must be a file name", "give a file name", TypeError),
     of_result(
-        "`plot('swing.avi')`", lambda: solve().plot("swing.avi"), r"path must end in .*\.png", "choose one of these"
+        "`plot('swing.avi')`",
+        lambda: solve().plot("swing.avi"),
+        r"path must end in .*\.png",
+        "take one of the endings named",
     ),
-    of_result("`animate(None)`", lambda: solve().animate(None), "path must be a file name", "give a name", TypeError),
+    of_result(
+        "`animate(None)`", lambda: solve().animate(None), "path must be a file name", "give a file name", TypeError
+    ),
     of_certify("a result of another solver, or of an older file")
     .when(lambda: replace(solve(), rtol=None, atol=None).certify())
     .says("certify needs tolerances", "give `rtol` and `atol`"),
@@ -51,14 +56,26 @@ RESULTS = [
         "certify needs a result with two times or more", "store more: `dense_output=True`, or a longer `t_eval`"
     ),
     Case(
-        "citation", "another object", lambda: citation(linkage()), "citation needs a result", "give it one", TypeError
+        "citation",
+        "another object",
+        lambda: citation(linkage()),
+        "citation needs a result",
+        "give it a result",
+        TypeError,
     ),
     of_problem("`name=3`", lambda: remade(name=3), "name must be a string; given 3", "give text", TypeError),
     of_problem("a mechanism as `system`", lambda: remade(system=pendulum())).says(
         "system must be a ConstrainedSystem; given a Problem", "give problem.system", TypeError
     ),
-    of_problem("`system=3`", lambda: remade(system=3), "system must be a ConstrainedSystem", "give one", TypeError),
-    of_problem("`q0` of one number", lambda: remade(q0=[1.0]), r"q0 must have shape \(2,\)", "give one a coordinate"),
+    of_problem(
+        "`system=3`", lambda: remade(system=3), "system must be a ConstrainedSystem", "give problem.system", TypeError
+    ),
+    of_problem(
+        "`q0` of one number",
+        lambda: remade(q0=[1.0]),
+        r"q0 must have shape \(2,\)",
+        "give one number for each coordinate",
+    ),
     of_problem(
         "`v0` as text", lambda: remade(v0="fast"), "v0 must be an array of real numbers", "give numbers", TypeError
     ),
@@ -98,7 +115,9 @@ RESULTS = [
     ),
     of_sweep("`tol=1e-6`", lambda: swept(tol=1e-6), "sweep has no argument 'tol'", "give `rtol` and `atol`", TypeError),
     of_sweep("`t_span=(1.0, 0.0)`", lambda: swept(t_span=(1.0, 0.0)), "t_span must be .* end > start", "exchange them"),
-    of_sweep("`out=3`", lambda: swept(out=3), "out must be a file name or a path; given 3", "give a name", TypeError),
+    of_sweep(
+        "`out=3`", lambda: swept(out=3), "out must be a file name or a path; given 3", "give a file name", TypeError
+    ),
     of_sweep("a `problem_of` that returns a number", lambda: swept(lambda theta3: theta3)).says(
         "problem_of must return a Problem; it returned 0.1", "return the problem", TypeError
     ),

@@ -113,8 +113,8 @@ SOLVE = [
     ),
     *of_argument(
         "compiled",
-        ("yes", ValueError, "must be True, False or 'auto'; given 'yes'", "give True or leave it out"),
-        (1, TypeError, "must be True, False or 'auto'; given 1", "give True or leave it out"),
+        ("yes", ValueError, "must be True, False or 'auto'; given 'yes'", "take one of the values named"),
+        (1, TypeError, "must be True, False or 'auto'; given 1", "take one of the values named"),
     ),
     *(
         of_solve(f"`compiled=True` with `method='{method}'`")

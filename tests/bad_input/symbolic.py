@@ -58,10 +58,20 @@ SYMBOLIC = [
         "name it in coordinates, or give the formula of its motion",
         T=T + dynamicsymbols("z").diff(t) ** 2,
     ),
-    case("T=m * x'**4", r"dT/dv\[0\] must be linear in the velocities", "T is at most quadratic in them", T=m * xd**4),
-    case("V=m * x' * y", r"V may depend on coordinates and time only", "forces= takes the rest", V=m * xd * y),
-    case("T=m * x''", "T may not depend on accelerations", "they are what is solved for", T=m * xd.diff(t)),
-    case("T='m*v**2/2'", "T must be a SymPy expression", "give SymPy's own", TypeError, T="m*v**2/2"),
+    case(
+        "T=m * x'**4",
+        r"dT/dv\[0\] must be linear in the velocities",
+        "give a T that is at most quadratic in the velocities",
+        T=m * xd**4,
+    ),
+    case("V=m * x' * y", r"V may depend on coordinates and time only", "give it as forces=", V=m * xd * y),
+    case(
+        "T=m * x''",
+        "T may not depend on accelerations",
+        "leave accelerations out: they are the unknowns",
+        T=m * xd.diff(t),
+    ),
+    case("T='m*v**2/2'", "T must be a SymPy expression", "give a SymPy expression", TypeError, T="m*v**2/2"),
     case(
         "constraints=[x' - y']",
         r"constraints\[0\] may depend on coordinates and time only; given the velocity",
@@ -97,7 +107,12 @@ SYMBOLIC = [
     case("V=oo", "V must be made of real numbers, powers and", REAL, V=sp.oo),
     case("V=nan", "V must be made of real numbers, powers and", REAL, V=sp.nan),
     case("forces={x: -sign(x')}", r"forces\[x\(t\)\] must be smooth; given sign", SMOOTH, forces={x: -sp.sign(xd)}),
-    case("forces=[0]", "forces must have 2 entries, one for each coordinate; given 1", "give one each", forces=[0]),
+    case(
+        "forces=[0]",
+        "forces must have 2 entries, one for each coordinate; given 1",
+        "give one for each coordinate",
+        forces=[0],
+    ),
     case(
         "forces={z: 1}",
         "forces must be for coordinates, x, y; given one for z",
@@ -107,7 +122,7 @@ SYMBOLIC = [
     case(
         "nonholonomic=[x'**2 - y']",
         r"nonholonomic\[0\] must be linear in the velocities",
-        "give rows that are",
+        "give rows that are linear in the velocities",
         nonholonomic=[xd**2 - yd],
     ),
     case(
@@ -124,7 +139,7 @@ SYMBOLIC = [
         coordinates=sp.symbols("x y"),
     ),
     case("coordinates=[x, x]", "coordinates must differ in their names", "name each once", coordinates=[x, x]),
-    case("coordinates=[]", "coordinates must name at least one", "name them", coordinates=[]),
+    case("coordinates=[]", "coordinates must name at least one", "name the coordinates", coordinates=[]),
     case(
         "parameters={'m': 1.0}",
         "parameters must have SymPy symbols",
@@ -165,7 +180,7 @@ SYMBOLIC += [
         "what depends on velocities goes into Q",
         M=sp.diag(xd, 1),
     ),
-    of_matrices("Q=[0]", "Q must have 2 entries, one for each row of M; given 1", "give one each", Q=[0]),
+    of_matrices("Q=[0]", "Q must have 2 entries, one for each row of M; given 1", "give one for each row", Q=[0]),
     of_matrices(
         "speeds=[u1, u2]",
         "speeds must map generalised speeds",

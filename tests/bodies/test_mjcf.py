@@ -170,7 +170,8 @@ def test_what_is_not_read_is_listed(tmp_path):
     model = four_bar()
     model.motor(model.joints[0], 1.0)
     model.drive(model.joints[3], lambda t: t)
-    with pytest.warns(IgnoredWarning, match="without drive of .*; motor of "):
+    model.stop(model.bodies[0], (0.0, 0.0, 0.0), "ground", (0.0, 0.0, -9.0), normal=(0.0, 0.0, 1.0), name="floor")
+    with pytest.warns(IgnoredWarning, match="without drive of .*; floor; motor of "):
         model.to_mjcf(tmp_path / "out.xml")
 
 

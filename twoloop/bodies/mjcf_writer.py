@@ -37,6 +37,7 @@ class _Writer:
         self.model = model
         self.left_out = [f"the start velocity of {each.name!r}" for each in model.bodies if _moves(each)]
         self.left_out += [each.name for each in model.joints if each.kind == "drive"]
+        self.left_out += [each.name for each in model.stops]
         self.springs: dict[str, Force] = {}
         self.tendons: list[Force] = []
         for force in model.forces:

@@ -179,7 +179,7 @@ class SpatialModel(Wheels):
         Warns
         -----
         IgnoredWarning
-            If the model has velocities, forces, motors, drives or friction, which the file does not contain.
+            If the model has velocities, forces, motors, drives, friction or stops, which the file does not contain.
 
         Raises
         ------

@@ -40,12 +40,14 @@ def ensemble(
 ) -> Runs:
     """Integrate many runs of one system, each with parameters and a start of its own.
 
-    Runs go through machine code made for the system, one in each lane of the processor's vectors, with steps of their
-    own, which are checked as those of a single run; a lane whose run has ended takes the next one. All parameters go
-    through the same code, which is kept on disk. What lanes cannot do is made by `solve_dae`, run by run: a run that
-    comes near a singular position, a system whose callbacks branch or has nonholonomic rows, events, other methods. The
-    first run is made by `solve_dae` as well, with all of its checks, and what callbacks say of the end of each other
-    run is compared with what was found there.
+    Runs use machine code made for the system, one run in each lane of the processor's vectors. Each run has its own
+    steps, which are checked as those of a single run. A lane whose run has ended takes the next one. All parameters use
+    the same code, which is kept on disk.
+
+    What lanes cannot do is made by `solve_dae`, run by run: runs that come near a singular position, systems whose
+    callbacks branch or that have nonholonomic rows, events, and other methods. The first run is also made by
+    `solve_dae`, with all of its checks. At the end of every other run, the callbacks are compared with what was found
+    there.
 
     Parameters
     ----------
@@ -69,7 +71,7 @@ def ensemble(
     Returns
     -------
     Runs
-        A run that fails is told by its status, and its states are NaN from where it stopped.
+        A run that fails has a negative status, and its states are NaN from where it stopped.
 
     Raises
     ------
@@ -78,12 +80,12 @@ def ensemble(
 
     Notes
     -----
-    In lanes as singly, no step of DOP853 or of a Radau method is longer than a hundredth of the run; where a force may
-    act for a short time, lanes look at the equations every two-thousandth, which singly is done to forces alone. Stages
-    are off the constraints by the error of the formula, those of Radau methods, too, whose unknowns are here the
-    accelerations of all coordinates; the end of each step is put on the constraints. States at `t_eval` within a step
-    are the ends of shorter steps from its beginning. A run that would take more than 100,000 of these steps is made
-    singly.
+    In lanes, as in a single run, no step of DOP853 or of a Radau method is longer than a hundredth of the run. Where a
+    force may act for a short time, lanes evaluate the equations every two-thousandth of the run; a single run evaluates
+    only the forces there. Stages are off the constraints by the error of the formula. This includes the Radau methods,
+    whose unknowns are here the accelerations of all coordinates. The end of each step is put on the constraints. States
+    at `t_eval` within a step are the ends of shorter steps from its beginning. A run that would take more than 100,000
+    of these steps is made by `solve_dae`.
     """
     check_system(system)
     t0, t1 = check_span(t_span)

@@ -99,7 +99,7 @@ class Integrator:
         return solve_dae(system, t_span, q0, v0, t_eval=t_eval, **self._options)
 
     def start(self, t0: float, q0: ArrayLike, v0: ArrayLike, parameters: ArrayLike | None = None) -> SampledState:
-        """Begin a motion that `step` goes on with, sample by sample.
+        """Begin a motion that `step` continues, sample by sample.
 
         Parameters
         ----------
@@ -144,19 +144,19 @@ class Integrator:
         return self._sampled.state
 
     def step(self, dt: float, inputs: Mapping[int, float] | ArrayLike | None = None) -> SampledState:
-        """Go on by a sample, with inputs that stay as they are until its end.
+        """Integrate to the next sample, with inputs that are constant until then.
 
-        Nothing is checked anew. Accelerations jump with the inputs, and the method begins anew there; error control is
-        that of `run`. As in a run, no step is longer than a hundredth of the time since the start, so that the first
-        samples are divided into many.
+        No checks are repeated. Accelerations jump with the inputs, and the method restarts there. Error control is that
+        of `run`. As in a run, no step is longer than a hundredth of the time since the start, so the first samples are
+        divided into many steps.
 
         Parameters
         ----------
         dt : float
             s.
         inputs : mapping from int to float, or array_like (n_p,), optional
-            Parameters of the system that change, by their places, or all parameters. They may enter forces alone. None:
-            all stay. The place of a parameter of a model is `problem.place("value of motor of shoulder")`.
+            Parameters of the system that change, by their indices, or all parameters. They may enter only forces. None:
+            no parameter changes. `problem.place("value of motor of shoulder")` is the index of a parameter of a model.
 
         Returns
         -------

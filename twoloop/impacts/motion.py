@@ -72,9 +72,10 @@ def solve_with_stops(
 
     Notes
     -----
-    Impacts and releases are located like events, with evaluations of the gaps and of the forces of closed stops four
-    times per step and at least at every two-thousandth of the motion: a gap that closes and opens again between two
-    evaluations is missed; reduce `max_step` if needed. The time of an impact is as accurate as the motion before it.
+    Impacts and releases are located like events. The gaps, their rates and the forces of closed stops are evaluated
+    four times per step, and at least at every two-thousandth of the motion. A gap that closes and opens again between
+    two evaluations is found, unless its rate changes sign more than once there; then reduce `max_step`. The time of an
+    impact is as accurate as the motion before it.
     """
     check_system(system)
     t0, t1 = check_span(t_span)

@@ -25,11 +25,11 @@ class Adams:
     coordinates are integrated alike from their accelerations, by the second-order form: positions by the double
     integral of the polynomial through the last accelerations, velocities by the single one. The end of every step is
     moved to the nearest state on the constraints, in the metric of M; with nonholonomic rows, to that with the same
-    independent coordinates. So the method departs from the paper, whose outer loop knows independent coordinates only,
+    independent coordinates. The method thus departs from the paper, whose outer loop has only independent coordinates,
     and a new partition does not interrupt it.
 
-    Starts by itself, with order 1 and a short step. Where stability rather than accuracy limited the steps, which is
-    measured at a few states when a run of many steps is over, `result.message` says so, and what to take.
+    It starts by itself, with order 1 and a short step. After a run of many steps, it is measured at a few states
+    whether stability rather than accuracy limited the steps. If so, `result.message` says so and names other methods.
 
     Notes
     -----

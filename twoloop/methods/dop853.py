@@ -23,14 +23,16 @@ SAFETY = 0.8  # with 0.9 twice as many steps are rejected, and at equal error it
 class DOP853:
     """An explicit Runge-Kutta method, Dormand and Prince's, of order 8, with 12 stages.
 
-    No outer loop: every stage is one evaluation, so that a step costs 12 (one that is refused 11). Accepted states are
-    on the constraints. For smooth motion that is not stiff. Stability, not accuracy,
-    limits h where the motion is slower than what could vibrate or decay: h w_max to 5.96 for undamped vibrations, and
-    h times the largest rate of decay to 6.39. What little of a vibration such steps do not resolve they damp: of the
-    amplitude 0.15 % a step at h w_max = 3. Where that limited many steps, `result.message` says so, and what to take.
+    It is for smooth motion that is not stiff. There is no outer loop. Every stage is one evaluation, so a step costs 12
+    evaluations, and a rejected one 11. Accepted states are on the constraints.
 
-    A step is accepted when the largest component of the estimated local error of q and v, dependents too, is within
-    the tolerance. Fixed steps estimate nothing.
+    If the motion is slower than what could vibrate or decay, stability, not accuracy, limits the step h: h w_max to
+    5.96 for undamped vibrations, and h times the largest rate of decay to 6.39. Vibrations that such steps hardly
+    resolve are damped, by 0.15 % of the amplitude per step at h w_max = 3. If stability limited many steps,
+    `result.message` says so and names other methods.
+
+    A step is accepted when the largest component of the estimated local error of q and v, including the dependent
+    ones, is within the tolerance. Fixed steps have no error estimate.
 
     Parameters
     ----------

@@ -55,9 +55,9 @@ class ESDIRK:
     Both formulas are L-stable and end with their last stage. With step-size control "TRBDF2" goes on from its embedded
     formula, of order 3: the difference, filtered for stiff components three times, is L-stable, too. A step is accepted
     when the estimated error of the positions, from the embedded formula and filtered, is within the tolerance, and so
-    is what the error of the velocities will make of them before it turns back or decays; ten times that where it does
-    so no faster than the motion changes. Vibrations that the steps pass over are damped; velocities themselves are
-    tested where asked for.
+    is the error that the velocities will add to them before it turns back or decays (ten times that if it does so no
+    faster than the motion changes). Vibrations that the steps pass over are damped. Velocities themselves are tested
+    with `tested="all"`.
 
     Parameters
     ----------

@@ -24,8 +24,9 @@ class Newmark:
         err_out of the paper: a step is accepted when e = |beta - 1/6| h^2 ||a_{n+1} - a_n||_2 is at most this, and the
         error of a run goes with error_tol^(2/3); steps are shortened to end at output times. None: when the largest
         component of e / h, the error per unit step, is at most r atol + rtol |v|, so that the error of a run is
-        proportional to the tolerance. 1 / r is the time in which the largest velocity, or acceleration, so far changes
-        the largest coordinate so far: not in the paper, and for no origin of the coordinates does it become zero.
+        proportional to the tolerance. 1 / r is the time in which the largest velocity, or acceleration, so far would
+        change a coordinate by the largest value so far. r is not in the paper; it does not become zero, whatever the
+        origin of the coordinates.
     inner_tol : float, optional
         Newton on the positions stops when its largest correction, just made, is at most this. None: 1e-8.
     outer_tol : float, optional

@@ -46,11 +46,11 @@ class Taylor:
     """The Taylor series of the motion, its order set by the tolerance, for smooth motion that is not stiff.
 
     The cheapest method here at tight tolerances. The callbacks run once in Python on symbols; this takes milliseconds
-    and compiles nothing. From the operations that they are made of follow the coefficients of q, v, a and lam, order by
-    order: one linear solution with the matrix of the accelerations each, and no derivative of the constraints beyond
-    C_q. gamma and kinematics are not used. A step is as long as the series allows; its end is moved to the nearest
-    state on the constraints, in the metric of M. So the method departs from the paper, whose outer loop knows
-    independent coordinates only.
+    and compiles nothing. The coefficients of q, v, a and lam follow from their operations, order by order. Each order
+    takes one linear solution with the matrix of the accelerations, and no derivative of the constraints beyond C_q.
+    gamma and kinematics are not used. A step is as long as the series allows. Its end is moved to the nearest state on
+    the constraints, in the metric of M. The method thus departs from the paper, whose outer loop has only independent
+    coordinates.
 
     It takes callbacks that give C_q and do not branch on t, q or v, made of + - * /, powers, sin, cos, tan, sqrt,
     hypot, exp, log, atan, sinh, cosh and tanh. `solve_dae` raises ValueError where they are not, and names the

@@ -85,7 +85,7 @@ class Result(Record):
         For `solve_with_stops`: the runs between impacts. They and their `sol` are neither saved to files nor sent to
         other processes.
     impacts : tuple of Impact
-        For `solve_with_stops`: times, stops, velocities before and after, and impulses.
+        For `solve_with_stops`: times, stops, velocities before and after, and impulses. They are not saved to files.
     """
 
     def to_dataframe(self) -> Any:

@@ -68,7 +68,7 @@ def consistent_state(
     keep: Sequence[int] | None = None,
     check_assembly: bool = True,
 ) -> ConsistentState:
-    """Project a guess onto the constraints: positions by Gauss-Newton, then velocities, each by the least change.
+    """Project a guess onto the constraints: positions by Gauss-Newton, then velocities, each by the smallest change.
 
     Parameters
     ----------
@@ -76,12 +76,12 @@ def consistent_state(
     t : float
         Time, s.
     q, v : array_like (n_q,)
-        Guess. Its distance to the constraints should be small against the mechanism.
+        Guess. Its distance from the constraints should be small compared with the mechanism.
     keep : sequence of int, optional
         Coordinates that stay as given, position and velocity: a crank and its speed, say. None: all may move.
     check_assembly : bool
-        Whether three other guesses, as far off as this one, must lead to the same assembly. False: what the projection
-        finds is taken.
+        Whether three other guesses, as far off as this one, must lead to the same assembly. False: the position that
+        the projection finds is taken.
 
     Returns
     -------

@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 
 
 class Status(IntEnum):
-    """How a run ended: 0 reached the end, 1 an event, negative a failure; in words in `MEANINGS`."""
+    """How a run ended: 0 reached the end, 1 an event, negative a failure. See docs/when_it_fails.md for each."""
 
     REACHED_END = 0
     EVENT = 1
