@@ -263,11 +263,12 @@ def newton_step(f, w, options, memory, t, h, tolerances, state, new_state):
         memory[at.PARTITION_NUMBER] = w.notes[GENERATION]
     if memory[at.FRESH] == 0.0 and memory[at.CONTRACTION] > SLOW:
         memory[at.HAS_JACOBIAN] = 0.0
+    node = middle_node(c)
     while True:
         if memory[at.HAS_JACOBIAN] == 0.0:
             # stiff directions turn as the body moves: halfway they are at most half a step's turn from any stage's; at
             # the time of a stage, so that this sees nothing of a force that the stages do not see
-            x = middle_node(c) * h
+            x = node * h
             for m in range(n):
                 q_mid[m] = q[m] + x * (v[m] + 0.5 * x * a[m])
                 v_mid[m] = v[m] + x * a[m]
@@ -295,8 +296,10 @@ def newton_step(f, w, options, memory, t, h, tolerances, state, new_state):
         code = _iterate(f, w, options, memory, t, h, tolerances, q, v, trial)
         if code == DONE:
             break
-        if memory[at.FRESH] == 1.0:
+        if memory[at.FRESH] == 1.0 and (node == 0.0 or code != OUTER_DIVERGED):
             return Attempt(code, np.inf, 0.0)
+        if memory[at.FRESH] == 1.0:  # halfway by the accelerations may be far off, where friction is no longer stiff
+            node = 0.0
         memory[at.HAS_JACOBIAN] = 0.0
     for m in range(n):
         in_q = 0.0
