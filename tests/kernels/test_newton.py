@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from tests.compiled import SPRUNG_START, sprung_pair
+from tests.compiled import SPRUNG_START, sprung_pair, unit_mass
 from tests.problems import G, moving_pivot, moving_pivot_state, oblique_pendulum, oblique_start, violations, worst
-from twoloop import RungeKutta, solve_dae
+from twoloop import ConstrainedSystem, RungeKutta, callback, solve_dae
+from twoloop.bodies import PlanarModel
 from twoloop.mechanisms import four_bar, moderately_stiff_beam
 from twoloop.methods.presets import PRESETS
 from twoloop.methods.tableaux import gauss, lobatto_iiie, radau_iia, sun_radau_iib
@@ -123,3 +124,59 @@ def test_auto_takes_newton_where_a_fixed_step_does_not_converge_by_sweeps():
     run = {o: solve_dae(sprung_pair(1e8), (0.0, 0.1), *SPRUNG_START, m, step_size=1e-3) for o, m in method.items()}
     assert not run["fixed-point"].success
     assert run["auto"].success, run["auto"].message
+
+
+@pytest.mark.parametrize("speed", [1e-5, 1e-4])
+def test_newton_goes_on_from_where_friction_is_stiff(speed):
+    """In the middle of the first step, by the accelerations at its beginning, the block would slide."""
+    model = PlanarModel(gravity=(0.0, 0.0))
+    block = model.box("block", (0.1, 0.1), mass=1.0, position=(0.0, 0.0))
+    model.friction(model.prismatic("ground", block, at=(0.0, 0.0), axis=(1.0, 0.0)), 10.0, speed=speed)
+    model.force(block, (0.0, 0.0), np.array([3.0, 0.0]))
+    problem = model.problem((0.0, 0.5))
+    start = problem.q0, [0.3 * speed, 0.0, 0.0]
+    result = solve_dae(problem.system, problem.t_span, *start, "RadauIIA5", 1e-5, 1e-5, first_step=1e-3)
+    assert result.success and result.stats.n_rejected_convergence < 2  # 3 to 5 with derivatives in the middle alone
+
+
+@callback("force")
+def dragged_and_bouncing(t, q, v, p, Q):
+    Q[0] = p[0] * (np.cos(3.0 * t) - v[0])
+    Q[1] = -9.81 + 0.5 * p[1] * (abs(q[1]) - q[1])
+
+
+@callback("constraint")
+def third_at_zero(t, q, p, C):
+    C[0] = q[2]
+
+
+@callback("jacobian")
+def third_at_zero_by_q(t, q, p, Cq):
+    Cq[0, 2] = 1.0
+
+
+def bounced(stiffness, t):
+    """Height of a mass that begins at 1 with velocity 0.3, after one contact with a spring below 0."""
+    speed, rate = np.sqrt(0.09 + 2.0 * G), np.sqrt(stiffness)
+    contact = 2.0 * (np.pi - np.arctan(speed * rate / G)) / rate
+    flight = t - (0.3 + speed) / G - contact
+    return speed * flight - 0.5 * G * flight**2
+
+
+def test_a_stiff_damper_does_not_hide_what_a_contact_leaves_in_the_velocities():
+    """Steps into and out of the contact are so short that the damper decides how long their error seems to last."""
+    method, tol, errors = RungeKutta(radau_iia(3), outer="newton", tested="positions"), 1e-10, []
+    for stiffness in (1e4, 1e5, 1e6):
+        for damping in (1e4, 1e5, 1e6):
+            system = ConstrainedSystem(
+                n_q=3,
+                n_c=1,
+                mass=unit_mass,
+                force=dragged_and_bouncing,
+                constraint=third_at_zero,
+                jacobian=third_at_zero_by_q,
+                parameters=[damping, stiffness],
+            )
+            result = solve_dae(system, (0.0, 0.8), [0.0, 1.0, 0.0], [1.0, 0.3, 0.0], method, tol, tol)
+            errors.append(abs(result.q[1, -1] - bounced(stiffness, 0.8)) if result.success else np.inf)
+    assert max(errors) < 150.0 * tol  # 12; 990 where all of an error is taken to last as long as its fastest part

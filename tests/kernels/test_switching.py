@@ -6,6 +6,7 @@ import pytest
 from tests.compiled import SPRUNG_START, pull, sprung_pair
 from tests.problems import worst
 from twoloop import callback, solve_dae
+from twoloop.bodies import PlanarModel
 from twoloop.mechanisms import closed_chain, four_bar, governor, moderately_stiff_beam
 from twoloop.mechanisms.ancf_beam import tip_height
 
@@ -114,3 +115,30 @@ def test_constant_steps_are_those_of_the_symplectic_method():
         for method in ("auto", "SunRadau5")
     )
     assert np.array_equal(one.q, other.q)
+
+
+def creeping(speed, push):
+    """A block of 1 kg that is pushed against dry friction of 10 N, regularised by a speed."""
+    model = PlanarModel(gravity=(0.0, 0.0))
+    block = model.box("block", (0.1, 0.1), mass=1.0, position=(0.0, 0.0))
+    model.friction(model.prismatic("ground", block, at=(0.0, 0.0), axis=(1.0, 0.0)), 10.0, speed=speed)
+    model.force(block, (0.0, 0.0), np.array([push, 0.0]))
+    return model.problem((0.0, 0.5))
+
+
+@pytest.mark.parametrize(("tol", "compiled"), [(1e-7, True), (1e-8, "auto")])
+def test_stiffness_is_found_where_a_decay_limits_a_series(tol, compiled):
+    """Series of 14 to 22 terms are stable up to h rho of 0.44 to 0.47 times these."""
+    problem = creeping(1e-4, 3.0)
+    result = solve_dae(problem.system, problem.t_span, problem.q0, problem.v0, "auto", tol, tol, compiled=compiled)
+    assert result.success and result.stats.n_evaluations < 10_000  # 2000; 117,000 with series alone
+    assert abs(result.q[0, -1] - 0.5 * 1e-4 * np.arctanh(0.3)) < 1e-8  # by the speed of the creep
+
+
+@pytest.mark.parametrize("tol", [1e-5, 1e-7])
+def test_a_trial_comes_in_long_runs_whatever_the_rates(tol):
+    """Explicit steps go to and fro about the speed of the creep, mostly where the friction does not change."""
+    problem = creeping(1e-5, 1.0)
+    result = solve_dae(problem.system, problem.t_span, problem.q0, problem.v0, "auto", tol, tol)
+    assert result.success and result.stats.n_evaluations < 100_000  # 1000; 2 million without such a trial
+    assert abs(result.q[0, -1] - 0.5 * 1e-5 * np.arctanh(0.1)) < tol

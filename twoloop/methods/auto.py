@@ -29,7 +29,7 @@ TIGHTEST = 9e-7  # ... and from which down to many
 LIMIT_FEW, LIMIT_MANY = 4.0, 0.25  # h rho from which on stiffness may limit DOP853 (stable to 5.9) and Adams
 LIMIT_FEW_OF_MANY = 2.0  # the same of DOP853 for MANY coordinates
 LOOKS_FEW = 2  # in a row, as accuracy may allow long steps for a while; those of Adams are too short for that
-LIMIT_SERIES = 0.4  # times the order: the same of a series, whose steps grow with its order
+LIMIT_SERIES = 0.3  # times the order: the same of a series, stable to 0.42 (a decay) to 0.6 times its order
 DEARER = 4.0  # evaluations by code made for the mechanism that one without costs, about ...
 DEARER_HEAVY, HEAVY = 2.0, 17  # ... or, from so many operations of the callbacks a coordinate on, as these cost both
 MATRIX_COST = 3.0  # of a Newton matrix for few coordinates, in evaluations; and one more for every eight of them
@@ -92,9 +92,10 @@ class Auto:
     on), or are above 5 % of it and the rate is more than thirty times that of the motion itself. Unless they are
     far beyond that limit, this waits until the run has cost three trials, and 64 evaluations for each independent
     coordinate if tangents have to be differenced, or three tenths of what the run will cost as a whole at its
-    present price are as much. The implicit method is kept if a second of motion costs it less, counted in
-    evaluations and Newton matrices: `loose` at tolerances from 3e-5 on, `tightest` below 9e-7, else `tight`. It is
-    left the same way. Counts decide, not times: a run can be repeated.
+    present price are as much. If it is to cost a thousand trials, one is made whatever the rates. The implicit
+    method is kept if a second of motion costs it less, counted in evaluations and Newton matrices: `loose` at
+    tolerances from 3e-5 on, `tightest` below 9e-7, else `tight`. It is left the same way. Counts decide, not times:
+    a run can be repeated.
 
     Above 1000 coordinates no implicit method is tried, as its matrices are full; nor is a series where M and C_q have
     more than 200,000 entries together, zeros among them, as it takes seconds to find (method="Taylor" does).

@@ -6,10 +6,11 @@ rho well below its limit of stability, nothing is stiff. Where h rho has come ne
 reason: then the implicit method is tried for a window of steps, in which its errors count tenfold, and is kept if a
 second of motion costs it less. So it is where h rho is smaller, but rho far above the rates that the motion shows: what
 decays so fast may keep the estimate of the error from longer steps. A trial that may be in vain waits until the run has
-cost a few times as much, unless the run as a whole is to cost ten times as much at its present price. Costs are counted
-in evaluations of the explicit method; with code made for the mechanism one of the implicit method counts several times.
-This is left in the same way, after a trial of the explicit method, where its own steps have come below that limit. What
-is not kept is next tried after twice as many looks.
+cost a few times as much, unless the run as a whole is to cost ten times as much at its present price. Where a run is to
+cost a thousand trials, one comes whatever the rates. Costs are counted in evaluations of the explicit method; with code
+made for the mechanism one of the implicit method counts several times. This is left in the same way, after a trial of
+the explicit method, where its own steps have come below that limit. What is not kept is next tried after twice as many
+looks.
 
 Both methods are called by their addresses, and are compiled once, where they are.
 """
@@ -39,6 +40,7 @@ EARN = 64.0  # evaluations for each independent coordinate before a trial that d
 TRIAL = 300.0  # evaluations that a trial of the implicit method takes, about
 AFFORDED = 3.0  # trials that the run has cost so far, before one that may be in vain ...
 OF_RUN = 0.3  # ... or this share of what the run will cost as a whole, if it goes on as it does
+ANYWAY = 100.0  # ... beside so many times as much, and once more for each trial, it comes whatever the rates
 APART = 30.0  # rates that the motion does not show are as many times as fast as those that it shows ...
 WORTH = 0.05  # ... and h rho this share of LIMIT: steps may be short for the sake of what an implicit method damps
 INSTANT = 1e-4  # over the largest rate: the time over which the motion's own is differenced
@@ -263,7 +265,9 @@ def _look(f, w, options, memory, tolerances, t, state, new_state):
     if memory[PHASE] == EXPLICIT and cheap and share > WORTH:
         Q, V, A = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n]
         hidden = memory[RATE] > APART * _shown_rate(f, w, t, state, memory[RATE], Q, V, A)
-    due = share > SURELY or hidden or (memory[NEAR] >= options[LOOKS] and cheap)
+    # explicit steps about a speed at which friction turns show its rate at few states
+    anyway = cheap and paid > ANYWAY * afforded * (1.0 + memory[N_TRIALS])
+    due = share > SURELY or hidden or anyway or (memory[NEAR] >= options[LOOKS] and cheap)
     if cheap and share <= 1.0:  # before a trial is affordable it is kept in mind that one will be due
         memory[NEAR] = 0.0
     if (memory[PHASE] == EXPLICIT and due) or (memory[PHASE] == IMPLICIT and share < BELOW):

@@ -3,15 +3,25 @@
 import numpy as np
 
 from twoloop.kernels.data.common import compiled, kernel, merged
-from twoloop.kernels.lanes.lane_algebra import copy_vectors, enlarge, solve_lanes, sum_rows, table, vectors
+from twoloop.kernels.lanes.lane_algebra import (
+    copy_vectors,
+    enlarge,
+    factor_lanes,
+    solve_lanes,
+    sum_rows,
+    table,
+    vectors,
+)
 from twoloop.kernels.lanes.lane_control import N_HEAD, begin_control, choose_steps, end_steps, judge_steps, set_end
 from twoloop.kernels.lanes.lane_newton import (
     BEGIN_Q,
     BEGIN_V,
     BY_Q,
+    BY_V,
     E_Q,
     E_V,
     H_PREVIOUS,
+    LARGEST_V,
     LASTING,
     ONCE,
     ONE,
@@ -21,6 +31,7 @@ from twoloop.kernels.lanes.lane_newton import (
     START,
     SUMS,
     SYSTEMS,
+    TO_GO,
     block_at,
     end_of_stages,
     factor_systems_of_lanes,
@@ -35,7 +46,9 @@ from twoloop.kernels.lanes.lane_room import (
     ACCEPTED,
     ATOL,
     ERROR,
+    FINE,
     FRESH,
+    GAP,
     LANES,
     N_NUMBERS,
     N_ROWS,
@@ -47,7 +60,7 @@ from twoloop.kernels.lanes.lane_room import (
     fill_field,
     places_of,
 )
-from twoloop.kernels.steps.lasting import TURNS
+from twoloop.kernels.steps.lasting import OF_RUN, STEPS, TURNS
 from twoloop.kernels.steps.newton_memory import GAMMA0, N_EIGEN_SCALARS, VELOCITIES, count_eigenvalues, eigen_place
 from twoloop.kernels.steps.stages import tableau_of
 
@@ -120,12 +133,66 @@ def _lasting_error(control, room, n, memory, z, state, new, k):
     lasting = room[(memory + LASTING) * LANES + k]
     if lasting * change * TURNS > fastest:
         lasting *= min(TURNS, lasting * change * TURNS / fastest) if fastest > 0.0 else TURNS
+    return _over_velocities(control, room, n, twice, lasting, state, new, k)
+
+
+@compiled
+def _over_velocities(control, room, n, error_v, lasting, state, new, k):
+    """Largest component of an error of the velocities that lasts so long, over the tolerances."""
     error = 0.0
     for j in range(n):
         share_q = lasting / _allowed(control, room, state, new, j, j, k)
         share_v = 1.0 / _allowed(control, room, state, new, j, n + j, k)
-        error = max(error, abs(room[(twice + j) * LANES + k]) * min(share_q, share_v))
+        error = max(error, abs(room[(error_v + j) * LANES + k]) * min(share_q, share_v))
     return error
+
+
+@merged
+def _own_time(control, room, n, memory, k):
+    """The time in which the motion changes its velocities, s, see lasting.py."""
+    begin = vector_at(memory, n, BEGIN_V)
+    fastest = change = 0.0
+    for j in range(n):
+        fastest = max(fastest, abs(room[(begin + j) * LANES + k]))
+        change = max(change, abs(room[(begin + n + j) * LANES + k]))
+    longest = OF_RUN * control[GAP]
+    return fastest / change if fastest < longest * change else longest
+
+
+@compiled
+def _slow_error(settings, control, own, s, room):
+    """What an error of the velocities, in E_V, leaves in directions that are slow beside the step, as newton_step."""
+    n = settings[N]
+    state, new, _, _, _, _, _, memory = places_of(n, settings[N_ROWS], settings[N_NUMBERS])
+    e_v, most, fine = vector_at(memory, n, E_V), memory + LARGEST_V, memory + TO_GO
+    anywhere = False
+    for k in range(LANES):
+        error = 0.0
+        if room[ERROR * LANES + k] <= 1.0:
+            long = _own_time(control, room, n, memory, k)
+            error = _over_velocities(control, room, n, e_v, long, state, new, k)
+        room[most * LANES + k], room[fine * LANES + k] = error, room[FINE * LANES + k]
+        anywhere = anywhere or error > 1.0
+    if not anywhere:
+        return
+    by_q, by_v = matrix_at(memory, n, s, BY_Q), matrix_at(memory, n, s, BY_V)
+    matrix = matrix_at(memory, n, s, SYSTEMS)
+    for i in range(n * n):
+        for k in range(LANES):
+            z = STEPS * room[H * LANES + k]
+            entry = -z * z * room[(by_q + i) * LANES + k] - z * room[(by_v + i) * LANES + k]
+            room[(matrix + i) * LANES + k] = entry + (1.0 if i % (n + 1) == 0 else 0.0)
+    pivots = pivots_at(memory, n, s, count_eigenvalues(own, s), 0)
+    factor_lanes(room, matrix, pivots, n, 0)
+    solve_lanes(room, matrix, pivots, n, 0, e_v)
+    for k in range(LANES):
+        error = room[most * LANES + k]
+        if room[FINE * LANES + k] == 1.0:  # where the motion is unstable the solution may be large
+            long = _own_time(control, room, n, memory, k)
+            error = min(error, _over_velocities(control, room, n, e_v, long, state, new, k))
+        room[FINE * LANES + k] = room[fine * LANES + k]
+        if room[most * LANES + k] > 1.0:
+            room[ERROR * LANES + k] = max(room[ERROR * LANES + k], error)
 
 
 @compiled
@@ -153,6 +220,7 @@ def _estimate(settings, control, own, A, room):
         z = own[place + GAMMA0] * room[H * LANES + k]
         error = _lasting_error(control, room, n, memory, z, state, new, k)
         room[ERROR * LANES + k] = max(room[ERROR * LANES + k], error)
+    _slow_error(settings, control, own, s, room)
 
 
 @compiled

@@ -168,6 +168,18 @@ def _fill(w, memory, b, z, numbers):
 
 
 @compiled
+def factor_filter(f, w, options, memory, s, h):
+    """Factors of the bordered system of gamma0, real."""
+    n = w.Q.size
+    b = f.flags[BANDWIDTH]
+    Cq, _, _ = _constraints(w, n, w.rows.size, b)
+    numbers = space(w, n, at.FILTER)
+    _fill(w, memory, b, h * options[eigen_place(s) + at.GAMMA0], numbers)
+    w.counters[N_FACTORIZATIONS] += 1
+    return factor_bordered(w, b, Cq, numbers, pivots_of(memory, s, n, 0), DGBTRF, DGBTRS)
+
+
+@compiled
 def factor(f, w, options, memory, s, h):
     """Factors of the bordered systems of gamma0, real, and of the eigenvalues, complex."""
     n = w.Q.size
@@ -176,10 +188,7 @@ def factor(f, w, options, memory, s, h):
     n_eigen = count_eigenvalues(options, s)
     n_real = int(options[place + at.N_REAL])
     Cq, _, _ = _constraints(w, n, w.rows.size, b)
-    numbers = space(w, n, at.FILTER)
-    _fill(w, memory, b, h * options[place + at.GAMMA0], numbers)
-    w.counters[N_FACTORIZATIONS] += 1
-    code = factor_bordered(w, b, Cq, numbers, pivots_of(memory, s, n, 0), DGBTRF, DGBTRS)
+    code = factor_filter(f, w, options, memory, s, h)
     place += at.N_EIGEN_SCALARS + s
     for k in range(n_eigen):
         if code != DONE:

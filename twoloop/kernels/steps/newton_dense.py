@@ -134,6 +134,24 @@ def derivatives(f, w, options, memory, s, t, q, v, a):
 
 
 @compiled
+def factor_filter(w, options, memory, s, h):
+    """Factors of I - z^2 J_q - z J_v, z = h gamma0."""
+    n = w.Q.size
+    m = w.independent.size
+    Jq, Jv = square(space(w, n, at.BY_Q), m), square(space(w, n, at.BY_V), m)
+    matrix = square(space(w, n, at.FILTER), m)
+    z = h * options[eigen_place(s) + at.GAMMA0]
+    for i in range(m):
+        for j in range(m):
+            matrix[i, j] = -z * z * Jq[i, j]
+            if memory[at.DAMPED] == 1.0:
+                matrix[i, j] -= z * Jv[i, j]
+        matrix[i, i] += 1.0
+    w.counters[N_FACTORIZATIONS] += 1
+    return DONE if lu_factor(matrix, pivots_of(memory, s, n, 0)) > 0.0 else SINGULAR
+
+
+@compiled
 def factor(w, options, memory, s, h):
     """Factors of I - (h l)^2 J_q - h l J_v for gamma0, real, and for the other eigenvalues l, complex."""
     n = w.Q.size
@@ -143,17 +161,9 @@ def factor(w, options, memory, s, h):
     n_eigen = count_eigenvalues(options, s)
     n_real = int(options[place + at.N_REAL])
     damped = memory[at.DAMPED] == 1.0
-    filter_matrix = square(space(w, n, at.FILTER), m)
-    hl = h * options[place + at.GAMMA0]
-    for i in range(m):
-        for j in range(m):
-            filter_matrix[i, j] = -hl * hl * Jq[i, j]
-            if damped:
-                filter_matrix[i, j] -= hl * Jv[i, j]
-        filter_matrix[i, i] += 1.0
-    w.counters[N_FACTORIZATIONS] += 1
-    if not lu_factor(filter_matrix, pivots_of(memory, s, n, 0)) > 0.0:
-        return SINGULAR
+    code = factor_filter(w, options, memory, s, h)
+    if code != DONE:
+        return code
     place += at.N_EIGEN_SCALARS + s
     for k in range(n_eigen):
         z = h * complex(options[place], options[place + 1])

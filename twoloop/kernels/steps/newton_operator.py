@@ -40,6 +40,16 @@ def factor_systems(f, w, options, memory, s, h):
 
 
 @compiled
+def factor_filter(f, w, options, memory, s, h):
+    """Factors for h gamma0 alone, as for a step of h."""
+    if f.flags[FORM] == STATIC:
+        return newton_static.factor_filter(f, w, options, s, h)
+    if f.flags[BANDWIDTH] >= 0:
+        return newton_banded.factor_filter(f, w, options, memory, s, h)
+    return newton_dense.factor_filter(w, options, memory, s, h)
+
+
+@compiled
 def solve_system(f, w, options, memory, s, k, x):
     """Solve the k-th eigenvalue's system; the first n_dof numbers of x (n_q) are overwritten."""
     if f.flags[FORM] == STATIC:

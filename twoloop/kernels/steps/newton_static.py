@@ -193,11 +193,17 @@ def _factor(f, w, z, values):
 
 
 @compiled
+def factor_filter(f, w, options, s, h):
+    """Factors for gamma0, real."""
+    return _factor(f, w, h * options[eigen_place(s) + at.GAMMA0], _factors(f, w, 0))
+
+
+@compiled
 def factor(f, w, options, s, h):
     """Factors for gamma0, real, and for the eigenvalues, complex."""
     place = eigen_place(s)
     n_eigen, n_real = count_eigenvalues(options, s), int(options[place + at.N_REAL])
-    code = _factor(f, w, h * options[place + at.GAMMA0], _factors(f, w, 0))
+    code = factor_filter(f, w, options, s, h)
     place += at.N_EIGEN_SCALARS + s
     for k in range(n_eigen):
         if code == DONE and (k > 0 or n_real == 0):  # else the eigenvalue is gamma0

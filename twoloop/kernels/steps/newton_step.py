@@ -26,7 +26,7 @@ from twoloop.kernels.data.noted import GENERATION
 from twoloop.kernels.data.tolerances import ESTIMATE, LEAST, allowed
 from twoloop.kernels.evaluation.calls import accelerations, evaluate, multipliers
 from twoloop.kernels.steps import newton_memory as at
-from twoloop.kernels.steps.lasting import lasting_error
+from twoloop.kernels.steps.lasting import STEPS, lasting_error, over_velocities, own_time
 from twoloop.kernels.steps.newton_memory import block, eigen_place, vector
 from twoloop.kernels.steps.newton_operator import (
     MAX_ITERATIONS,
@@ -34,6 +34,7 @@ from twoloop.kernels.steps.newton_operator import (
     STAGNATION,
     correct,
     derivatives_at,
+    factor_filter,
     factor_systems,
     filter_error,
 )
@@ -202,7 +203,35 @@ def _estimate(f, w, options, memory, h, tolerances, state, new_state, A_stage):
         return error
     copy(e_v, once)
     _filter(f, w, options, memory, h, e_q, e_v)
-    return max(error, lasting_error(w, memory, tolerances, h * gamma0, raw, once, e_v, state, new_state))
+    error = max(error, lasting_error(w, memory, tolerances, h * gamma0, raw, once, e_v, state, new_state))
+    if error <= 1.0:
+        error = max(error, _slow_error(f, w, options, memory, h, tolerances, state, new_state))
+    return error
+
+
+@compiled
+def _slow_error(f, w, options, memory, h, tolerances, state, new_state):
+    """What an error of the velocities, in E_V, leaves in directions that are slow beside the step, over the tolerances.
+
+    How long all of it lasts is known from its fastest part. What is left of it a few steps later lasts as long as
+    the motion itself.
+    """
+    s, n = int(options[STAGES]), w.Q.size
+    z = STEPS * h / options[eigen_place(s) + at.GAMMA0]
+    e_q, e_v = vector(memory, s, n, at.E_Q), vector(memory, s, n, at.E_V)
+    longest = own_time(w, tolerances, state)
+    error = over_velocities(w, tolerances, e_v, longest, state, new_state)
+    if error <= 1.0:
+        return 0.0
+    for i in range(w.independent.size):
+        e_q[i] = 0.0
+    if factor_filter(f, w, options, memory, s, z) == DONE:
+        filter_error(f, w, options, memory, s, z, e_q, e_v)
+        # where the motion is unstable the system may be nearly singular, and the solution large
+        error = min(error, over_velocities(w, tolerances, e_v, longest, state, new_state))
+    if factor_filter(f, w, options, memory, s, h) != DONE:
+        memory[at.H_FACTORED] = 0.0
+    return error
 
 
 @kernel(SETTLE)
@@ -234,11 +263,12 @@ def newton_step(f, w, options, memory, t, h, tolerances, state, new_state):
         memory[at.PARTITION_NUMBER] = w.notes[GENERATION]
     if memory[at.FRESH] == 0.0 and memory[at.CONTRACTION] > SLOW:
         memory[at.HAS_JACOBIAN] = 0.0
+    node = middle_node(c)
     while True:
         if memory[at.HAS_JACOBIAN] == 0.0:
             # stiff directions turn as the body moves: halfway they are at most half a step's turn from any stage's; at
             # the time of a stage, so that this sees nothing of a force that the stages do not see
-            x = middle_node(c) * h
+            x = node * h
             for m in range(n):
                 q_mid[m] = q[m] + x * (v[m] + 0.5 * x * a[m])
                 v_mid[m] = v[m] + x * a[m]
@@ -266,8 +296,10 @@ def newton_step(f, w, options, memory, t, h, tolerances, state, new_state):
         code = _iterate(f, w, options, memory, t, h, tolerances, q, v, trial)
         if code == DONE:
             break
-        if memory[at.FRESH] == 1.0:
+        if memory[at.FRESH] == 1.0 and (node == 0.0 or code != OUTER_DIVERGED):
             return Attempt(code, np.inf, 0.0)
+        if memory[at.FRESH] == 1.0:  # halfway by the accelerations may be far off, where friction is no longer stiff
+            node = 0.0
         memory[at.HAS_JACOBIAN] = 0.0
     for m in range(n):
         in_q = 0.0
