@@ -112,10 +112,10 @@ KINDS = {
         "Cq",
         ("n_c", "n_q"),
         "C_q, the derivative of constraint with respect to q",
-        "None: by differences of C, of order 8. That costs 8 n_q calls of constraint for each Jacobian (more where the "
-        "constraint bends on a scale far below max(1, |q_j|)), and constraint must be defined within 1/16 of "
-        "max(1, |q_j|) about q. Entries are good to about 1e-13 of the largest term in the constraint; differences of "
-        "differences, that is, gamma left out too, to about 1e-9.",
+        "None: the exact derivative of constraint if it runs on symbols, otherwise differences of order 8. Differences "
+        "cost 8 n_q calls of constraint for each Jacobian (more where the constraint bends on a scale far below "
+        "max(1, |q_j|)), and constraint must be defined within 1/16 of max(1, |q_j|) about q. Entries are then good to "
+        "about 1e-13 of the largest term in the constraint; if gamma is left out, too, it is good to about 1e-9.",
         absent="differences",
     ),
     "constraint_rate": Kind(
@@ -131,7 +131,7 @@ KINDS = {
         "Qd",
         ("n_c",),
         "Q_d = -((C_q v)_q v + 2 C_qt v + C_tt), the right-hand side of C_q a = Q_d",
-        "None: by differences of C_q and C_t along the motion.",
+        "None: exact if C_q and C_t run on symbols, otherwise by differences of them along the motion.",
         absent="kernels",
     ),
     "force_by_q": Kind(
@@ -178,7 +178,7 @@ KINDS = {
         "Qa",
         ("n_a",),
         "-((A v)_q v + A_t v + b_q v + b_t), the right-hand side of A a = Q_a",
-        "None: by differences of A and b along the motion.",
+        "None: exact if A and b run on symbols, otherwise by differences of them along the motion.",
         absent="kernels",
     ),
     "kinematics": Kind(
