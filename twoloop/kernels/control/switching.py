@@ -266,7 +266,8 @@ def _look(f, w, options, memory, tolerances, t, state, new_state):
         Q, V, A = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n]
         hidden = memory[RATE] > APART * _shown_rate(f, w, t, state, memory[RATE], Q, V, A)
     # explicit steps about a speed at which friction turns show its rate at few states
-    anyway = cheap and paid > ANYWAY * afforded * (1.0 + memory[N_TRIALS])
+    # and what a run will cost is known once it has left the short steps of its start
+    anyway = cheap and cost > afforded and paid > ANYWAY * afforded * (1.0 + memory[N_TRIALS])
     due = share > SURELY or hidden or anyway or (memory[NEAR] >= options[LOOKS] and cheap)
     if cheap and share <= 1.0:  # before a trial is affordable it is kept in mind that one will be due
         memory[NEAR] = 0.0
