@@ -26,7 +26,7 @@ Solve = Callable[[float], Array]  # tolerance -> q at the end (n_runs, n_q), NaN
 
 GROUP, GEOMETRY = "many", "random linkages"
 TOLERANCES, QUICK_TOLERANCES = tuple(float(f"1e-{k}") for k in range(4, 12)), (1e-6, 1e-9)
-BETWEEN = tuple(float(f"3e-{k}") for k in range(5, 12))  # of ways whose error leaps from one of these to the next
+BETWEEN = (1e-3, *(float(f"3e-{k}") for k in range(4, 12)))  # of ways whose error leaps from one of these to the next
 ERRORS = (1e-4, 1e-6, 1e-8)  # of the worst of the runs, at which ways are compared
 TIGHT, AGREE = 1e-12, 1e-8  # tolerance of references, and how far two unlike methods may end apart with it
 ENSEMBLE, SINGLE, HEYOKA, DIFFRAX = "ensemble", "solve_dae, compiled, one by one", "heyoka, batches", "diffrax, vmap"

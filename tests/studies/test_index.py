@@ -225,9 +225,10 @@ def test_what_can_be_trusted_is_counted(tmp_path):
     stopped = VALID | {"only_ours": [{"case": "a", "limit": ["x", "y"]}, {"case": "b", "limit": []}], "time_limit": 1.5}
     said = "only ours on 2 (where we stopped 2 of the rivals),"
     assert said in screen(tmp_path, validation=stopped)
-    parts = {"singular": 51, "given": 45}
-    text = screen(tmp_path, validation=VALID | {"wrong_others": parts})
+    parts = {"singular": 51, "given": 45, "tight": {"elsewhere": 0}}
+    text = screen(tmp_path, validation=VALID | {"wrong_others": parts, "usual": 1e-8})
     assert "of rivals are wrong, 51 of the latter at singular positions, where accelerations, given" in text
+    assert "undefined, and none of the others at 1e-8 or tighter." in text
     by = {"solve_dae": 20, "known motion": 30, "bounds": 2, "tests": 20}
     planted = {"n": 73, "missed": ["x"], "by": by, "models": {"n": 20, "stopped": 12}}
     text = screen(tmp_path, planted_errors=planted)
