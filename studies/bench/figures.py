@@ -30,7 +30,7 @@ FIRST = (DEFAULT, *(name for name, method in COMPILED.items() if method == DEFAU
 # family, how names begin
 MAIN_RIVALS = (("heyoka", HEYOKA), ("SUNDIALS", "CVODE"), ("SUNDIALS", "IDA from C"), ("SciPy", ""))
 ERROR = "largest position error over the run (m, rad)"
-LEGEND = "solid: twoloop\nfilled: keeps constraints\nno line: a run failed, or\nerrors over a decade apart"
+LEGEND = "solid: twoloop\nfilled: keeps constraints\ngap: failed run, or more\nthan a decade of error"
 
 plt.style.use(Path(__file__).with_name("bench.mplstyle"))
 

@@ -42,6 +42,10 @@ RANGES = {  # of errors; none: all of them on the mechanisms that cross singular
 TYPICAL = (1e-4, 1e-6, 1e-8, 1e-10)  # errors at which the default is compared with the cheapest rival in the median
 SHOWN = DECADES[::2]  # by which the lines of the picture are chosen
 HEADLINE = "four-bar"
+MARKS = (  # of the cells of the heat map
+    "(ratio): undecided, also where a cheaper run just misses the error; ours, others: only they reach it;\n"
+    "ours?: not all rivals were run so tightly; –: nobody reaches it"
+)
 SAID = {headline.OWN_CODE: "the default", headline.DEFAULT: "compiled=False"}  # on it
 GEOMETRIES: dict[str, Callable[[], Problem]] = {
     HEADLINE: mechanisms.four_bar,
@@ -157,7 +161,7 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     """Ratios of the fastest rival to the fastest of ours by mechanism and decade."""
     made: list[dict[str, Any]] = [
         {"case": name, "tags": list(tags().get(str(name), ())), "at": at_decades(own)}
-        for name, own in rows.groupby("case", sort=False)
+        for name, own in sorted(rows.groupby("case"), key=lambda each: _place(str(each[0])))
     ]
     every = [at for each in made for at in each["at"] if at["ratio"] is not None]
     found: dict[str, Any] = {"mechanisms": made, "n": len(every)}
@@ -179,6 +183,12 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     found["ahead_of_python"] = sum(best["rival"]["solver"] in python for best in ahead)
     found["processors"] = sorted(rows["processor"].dropna().unique()) if "processor" in rows else []
     return found
+
+
+def _place(case: str) -> int:
+    """Where a mechanism stands among all; those of elsewhere are last."""
+    names = list(problems(False))
+    return names.index(case) if case in names else len(names)
 
 
 def _within(made: Sequence[dict[str, Any]], name: str, errors: Sequence[float]) -> dict[str, Any]:
@@ -230,7 +240,7 @@ def put(rows: pd.DataFrame) -> dict[str, Any]:
 def cell(found: dict[str, Any]) -> str:
     """A ratio, in brackets where it is undecided; or who gets there."""
     if found["ratio"] is None:
-        return {"alone": "ours", "unasked": "ours?", "missed": "others", "none": ""}[found["verdict"]]
+        return {"alone": "ours", "unasked": "ours?", "missed": "others", "none": "–"}[found["verdict"]]
     text = number(found["ratio"])
     return f"({text})" if found["verdict"] == "undecided" else text
 
@@ -248,7 +258,7 @@ def picture(rows: pd.DataFrame) -> Figure:
         axes.plot(line["error_q"].astype(float), 1e3 * line["call_s"].astype(float), **look)
         once += [line[line["repeats"] == 1]] if "repeats" in line else []
     single = pd.concat(once) if once else rows[:0]
-    alone: dict[str, Any] = {"linestyle": "", "marker": "+", "color": "black", "markersize": 6, "markeredgewidth": 0.6}
+    alone: dict[str, Any] = {"linestyle": "", "marker": "+", "color": "black", "markersize": 10, "markeredgewidth": 0.8}
     alone |= {"zorder": 4}
     if len(single):
         errors, times = single["error_q"].astype(float), 1e3 * single["call_s"].astype(float)
@@ -278,6 +288,6 @@ def heat_map(found: dict[str, Any]) -> Figure:
         axes.set_yticks(range(len(names)), names)
         axes.grid(False)
         axes.set(title=name, xlabel="error at the end")
-    figure.suptitle("Time of the fastest rival over ours (blue: ours faster)", fontsize=12)
+    figure.suptitle(f"Time of the fastest rival over ours (blue: ours faster)\n{MARKS}", fontsize=10)
     figure.colorbar(image, ax=panels, label="ratio", extend="both")
     return figure
