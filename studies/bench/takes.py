@@ -95,7 +95,7 @@ def _of_energy(entry: Mapping[str, Any], coded: bool) -> dict[str, str]:
     """The cheapest for an error of the energy over a long time, and the cheapest whose energy does not drift."""
     sides = (entry["picks"], entry.get("without_drift", []))
     told = [listed(dict.fromkeys(call(pick["solver"], coded) for pick in picks)) for picks in sides]
-    without = f"; without drift {told[1]}" if told[1] else ""
+    without = f" (drifts); without drift {told[1]}" if told[1] else ""
     what = f"energy over {power(entry['t_end'])} s (four-bar, timed once)"
     return {"what": what, "take": (told[0] or "no solver compared reaches these errors") + without}
 

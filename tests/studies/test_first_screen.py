@@ -177,7 +177,7 @@ def test_every_number_of_the_screen_is_made_again_from_the_rows(tmp_path):
         f"| the default | {standings[0]}",
         f"| the best of our {len(ours)} configurations, chosen afterwards | {standings[1]}",
         "| four-bar linkages, over long times (crane, 10 s) | `compiled=True` (3 of 3 errors) |",
-        "| energy over 1e4 s (four-bar, timed once) | `LSODA`; without drift `Gauss(3)` |",
+        "| energy over 1e4 s (four-bar, timed once) | `LSODA` (drifts); without drift `Gauss(3)` |",
         "| redundant constraints | `IDA from C, stabilised` (1 of 1 mechanisms) |",
         f"| four-bar linkages, over 10 s | {call(min(ms, key=lambda name: ms[name][0]), True)} (1 of 1 geometries) |",
         "| flexible beam (tip), vibrations wanted | `CVODE` (1e-2 m at tol 1e-4) |",
