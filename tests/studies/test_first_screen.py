@@ -187,10 +187,10 @@ def test_every_number_of_the_screen_is_made_again_from_the_rows(tmp_path):
         "First calls, at 1e-8 and timed once",
         f"the cheapest rival takes, in the median, {typical} of the default's time at 1e-4, {typical} at 1e-10.",
         "by over 1e-3 at a tolerance of 1e-8, under 17 kinds of sharp forces of our choice, 4 of them gusts (the "
-        "same 61 for each solver, unless its adapter refuses): the default 1 of 61, our 2 other methods 2 of 125, "
+        "same 61 each, unless an adapter refuses): the default 1 of 61, our 2 other methods 2 of 125, "
         "heyoka 1 of 66 (1 of 67 with `max_step`; its own default tolerance is 2.2e-16), IDA and CVODE 0 of 64. ",
-        "at least every 5e-4 of a run and can miss shorter ones unless `max_step` is their duration: "
-        "the default is wrong under 4 of 40 constant forces that last 1e-4 s and none of 61 that last 3e-4 to 0.010 s; "
+        "every 5e-4 of a run and can miss shorter ones unless `max_step` is their duration: "
+        "the default is wrong under 4 of 40 constant forces of 1e-4 s and none of 61 of 3e-4 to 0.010 s; "
         "under 3 of 40 gusts exp(−(t/b)²) with b of 1e-4 s and none of 60 with b of 3e-4 to 0.010 s, in runs of 3.0 s",
     ]
     for said in expected:
