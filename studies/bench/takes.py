@@ -179,7 +179,7 @@ def _cheapest(at: Sequence[Mapping[str, Any]]) -> str:
 
 def _at_once(cases: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
     """Whether an ensemble is ahead of others' batches where many runs are one call."""
-    verdicts = Counter(at["verdict"] for each in cases for at in each["at"])
+    verdicts = Counter(at["verdict"] for each in cases for at in each["at"] if at["verdict"] != "none")
     ahead, behind = verdicts["ahead"], verdicts["behind"]
     if not ahead + behind:
         return []
