@@ -269,9 +269,8 @@ def trust_in(rows: pd.DataFrame) -> dict[str, dict[str, int]]:
     for name, which in parts.items():
         own = rows[which]
         ran = own[own["outcome"] != NOT_RUN]
-        line = {"n": len(ran), "solvers": int(ran["solver"].nunique()), "unasked": int(unasked(ran).sum())} | graded(
-            ran
-        )
+        line = {"n": len(ran), "solvers": int(ran["solver"].nunique())} | graded(ran)
+        line["unasked"] = int(unasked(ran).sum())
         found[name] = line | {"refused": int((own["outcome"].eq(NOT_RUN) & own["status"].eq("RAISED")).sum())}
     return found
 

@@ -44,7 +44,7 @@ SHOWN = DECADES[::2]  # by which the lines of the picture are chosen
 HEADLINE = "four-bar"
 MARKS = (  # of the cells of the heat map
     "(ratio): undecided, also where a cheaper run just misses the error; ours, others: only they reach it;\n"
-    "ours?: not all rivals were run so tightly; –: nobody reaches it"
+    "ours?: not all rivals were run at such tolerances; –: nobody reaches it"
 )
 SAID = {headline.OWN_CODE: "the default", headline.DEFAULT: "compiled=False"}  # on it
 GEOMETRIES: dict[str, Callable[[], Problem]] = {

@@ -132,12 +132,12 @@ def test_stiffness_is_found_where_a_decay_limits_a_series(tol, compiled):
     problem = creeping(1e-4, 3.0)
     result = solve_dae(problem.system, problem.t_span, problem.q0, problem.v0, "auto", tol, tol, compiled=compiled)
     assert result.success and result.stats.n_evaluations < 10_000  # 2000; 117,000 with series alone
-    assert abs(result.q[0, -1] - 0.5 * 1e-4 * np.arctanh(0.3)) < 1e-8  # by the speed of the creep
+    assert abs(result.q[0, -1] - 0.5 * 1e-4 * np.arctanh(0.3)) < 1e-8  # of the creeping motion in closed form
 
 
 @pytest.mark.parametrize("tol", [1e-5, 1e-7])
 def test_a_trial_comes_in_long_runs_whatever_the_rates(tol):
-    """Explicit steps go to and fro about the speed of the creep, mostly where the friction does not change."""
+    """Explicit steps oscillate about the creeping speed, mostly where the friction is constant."""
     problem = creeping(1e-5, 1.0)
     result = solve_dae(problem.system, problem.t_span, problem.q0, problem.v0, "auto", tol, tol)
     assert result.success and result.stats.n_evaluations < 100_000  # 4500; 2 million without such a trial

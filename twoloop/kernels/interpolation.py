@@ -13,7 +13,7 @@ from twoloop.kernels.data.codes import DONE, GAMMA_INACCURATE, SINGULAR
 from twoloop.kernels.data.common import INTEGERS, KIT, MATRIX, VECTOR, WORK, compiled, f8, i8, kernel, merged
 from twoloop.kernels.data.flags import FORM, NULL_SPACE
 from twoloop.kernels.data.noted import GAMMA_REQUIRED
-from twoloop.kernels.data.tolerances import ATOL, RTOL
+from twoloop.kernels.data.tolerances import ATOL, RTOL, UNTRUE
 from twoloop.kernels.evaluation.calls import accelerations, find_tangents, renew_partition, restore
 from twoloop.kernels.evaluation.partition import least_pivot, partition_is_poor
 
@@ -23,9 +23,10 @@ LOOKS = len(PLACES)
 EPS = 2.0**-52
 EVEN = 8.0  # longest over shortest
 NOISY = 10.0  # of the tolerances of velocities
-UNTRUE = 30.0  # of these: what restored velocities may differ by from polynomials beside a singular position ...
-SINGULAR_SHARE = 0.01  # ... where the smallest pivot is below this share of that at the ends of the interval ...
-SINGULAR_PIVOT = 1e-5  # ... or below this
+SINGULAR_SHARE = (
+    0.01  # of the smallest pivot at the ends of an interval: below it a place is beside a singular position
+)
+SINGULAR_PIVOT = 1e-5  # of the largest: below it, too
 
 
 @merged

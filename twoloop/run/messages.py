@@ -20,7 +20,7 @@ from twoloop.run.crossings import (
 )
 from twoloop.run.pace import INTERRUPTED, OUT_OF_TIME, STAGNATED, STAGNATION_STEPS, Pace
 from twoloop.run.record import Later, Status
-from twoloop.run.undetermined import UNTRUE, WEAK, turned_by_rounding
+from twoloop.run.undetermined import WEAK, turned_by_rounding
 
 if TYPE_CHECKING:
     from twoloop.run.run import Run
@@ -29,9 +29,7 @@ Array = NDArray[np.float64]
 
 NEARLY_SINGULAR = 1e-3  # smallest over largest singular value of C_q, below which a message says so
 LASTING = 100.0  # times what the tolerances allow: errors of velocities on the way that end the trust in a run
-LOST_AT_END = (
-    1e-6  # the same, in any units, too, below which the state at the end of a run is said not to be determined
-)
+LOST_AT_END = 1e-6  # the same, in any units, too, below which the state at the end is said not to be determined
 CROSSINGS = "\0"  # stands for what is said of singular positions that were crossed
 NEXT_TO_END = 1e-3  # of the run: where it stops so close to its end, that is said
 
@@ -200,7 +198,7 @@ def said_of_end(run: "Run") -> str:
         )
     else:
         over = _over_allowed(run, t, q, v)
-        if over <= UNTRUE:
+        if over <= tolerances.UNTRUE:
             return ""
         said = (
             f"the run ends where the constraints nearly lose rank ({_measured(run, t, q)}): rounding of positions "

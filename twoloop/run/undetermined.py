@@ -7,13 +7,13 @@ they hold least. Over such a way they change, and with them the velocities, whic
 import numpy as np
 from numpy.typing import NDArray
 
+from twoloop.kernels.data.tolerances import UNTRUE
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.crossings import DIFFERENCE
 
 Array = NDArray[np.float64]
 
 ROUNDING = 0.5 * float(np.finfo(np.float64).eps)
-UNTRUE = 30.0  # times what the tolerances allow: errors of velocities that are said
 WEAK = 1e-2  # of the largest singular value: directions that are looked at
 LEAST, MARGIN = 1e-5, 30.0  # of pivots that are looked at more closely, and how many times the singular values they are
 

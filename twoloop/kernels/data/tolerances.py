@@ -8,6 +8,7 @@ from twoloop.kernels.data.common import merged
 RTOL, ESTIMATE, LEAST, GAP, LOOK, ATOL = range(6)
 
 LONGEST_UNSEEN = 0.01  # of the run: GAP
+UNTRUE = 30.0  # times what the tolerances allow: errors of velocities beside a singular position that are told
 
 
 @merged
