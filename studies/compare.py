@@ -14,6 +14,7 @@ import pandas as pd
 from studies.bench import cli, figures, tables
 from studies.bench.cli import StudyError
 from studies.bench.collector import FILE, REPEATS, Case, Run, Solver, collect
+from studies.bench.names import label
 from studies.bench.outsider import N_TIMES, Outsider
 from studies.bench.reference_motion import ReferenceMotion, check_published, make_reference
 from studies.bench.render import number, power, render, table
@@ -23,6 +24,7 @@ from studies.bench.store import Output, Row
 from twoloop import Result
 from twoloop.mechanisms import Problem
 from twoloop.mechanisms.user_file import problem_from
+from twoloop.methods.code_for import is_small
 from twoloop.rows.calibration import CALIBRATION, calibration_s
 from twoloop.rows.leaderboard import boards
 from twoloop.rows.row_format import text_of
@@ -102,6 +104,7 @@ def rows_from(files: Iterable[str], mechanism: str, t_end: float) -> list[Row]:
 def findings_of(rows: pd.DataFrame, case: Case, errors: Sequence[float]) -> dict[str, Any]:
     floor = float(rows["floor"].iloc[0])
     found: dict[str, Any] = {"name": case.name, "t_end": case.t_end, "floor": floor, "n_instants": case.n_instants}
+    found["coded"] = is_small(case.problem.system)
     found |= {"python": case.problem.system.called_in_python, "unresolved": [e for e in errors if e < floor]}
     found["any_compiled"] = bool((rows["called_from"] != "Python").any())
     found["cheapest"] = []
@@ -127,16 +130,21 @@ def report(
         published = check_published(case.problem, case.reference, case.t_end)
         findings |= {"source": case.reference.source, "published": published}
     output.save_findings(findings)
-    lines = figures.lines_of(rows, errors)
+    lines, coded = figures.lines_of(rows, errors), findings["coded"]
     if lines:
-        plot = figures.work_precision(rows, lines, f"{case.name}, {number(case.t_end)} s")
+        plot = figures.work_precision(rows, lines, f"{case.name}, {number(case.t_end)} s", coded=coded)
         figures.save(plot, output, "compare")
     middle = errors[len(errors) // 2]
     header = ["solver", "called from", *(power(error) for error in errors)]
     kept = {"solver": "solver", "call_s": "CPU (s)", "n_evaluations": "evaluations", "violation_q": "max abs C"}
     kept |= {"violation_v": "max abs C_q v + C_t", "energy": "energy error (J)"}
-    quality = [[run[key] for key in kept] for _, run in tables.ranking(rows, middle).iterrows()]
-    ready = {"work": table(header, tables.work_precision(rows, errors)), "kept": table([*kept.values()], quality)}
+    best = tables.ranking(rows, middle)
+    best["solver"] = [label(name, coded) for name in best["solver"]]
+    quality = [[run[key] for key in kept] for _, run in best.iterrows()]
+    ready = {
+        "work": table(header, tables.work_precision(rows, errors, coded=coded)),
+        "kept": table([*kept.values()], quality),
+    }
     ready["failed"] = _failed(rows)
     all_rows = [*own, *given["rows"]]
     found = [board for error in errors for board in boards(all_rows, error)] if given["rows"] else []

@@ -3,7 +3,7 @@
 import html
 import json
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Mapping, Sequence
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -13,8 +13,10 @@ import pandas as pd
 from studies.bench import cli, figures, tables
 from studies.bench.cli import StudyError
 from studies.bench.index import write_index
+from studies.bench.names import label, looks_like
 from studies.bench.render import TEMPLATES
 from studies.bench.row_files import as_runs, rows_of_file
+from studies.bench.solvers import GIVEN
 from studies.bench.store import Output, plain, read_rows
 from studies.bench.tables import SETTINGS
 
@@ -26,7 +28,7 @@ MEASURES |= {"violation_q": "largest violation of positions, |C|", "violation_v"
 COSTS = {"call_s": "CPU time of the call (s)", "n_evaluations": "evaluations"}
 DIGITS = 4  # significant, of what the page holds; the CSV files have all
 OPENS = "four-bar, 10 s (work_precision)"
-ALWAYS = ("the default", "auto", "auto, compiled")  # shown at first beside the best
+ALWAYS = (GIVEN, "compiled=True", "compiled=False")  # shown at first beside the best
 POINTS = {  # marker of the figures: shape and rotation (degrees) of the nearest one of the plotting library
     **{"o": ("circle", 0), "s": ("rect", 0), "D": ("rectRot", 0), "p": ("rectRounded", 0), "d": ("rectRounded", 45)},
     **{"^": ("triangle", 0), ">": ("triangle", 90), "v": ("triangle", 180), "<": ("triangle", 270)},
@@ -61,16 +63,27 @@ def read(folder: Path, files: Sequence[str] = ()) -> tuple[pd.DataFrame, dict[st
             f"there are no rows in {folder}: run python -m studies.work_precision first, or give --with archive, "
             "the rows that are shipped"
         )
-    rows = pd.concat(parts, ignore_index=True)
+    rows = named(pd.concat(parts, ignore_index=True), folder)
     # rows of cost against size have no setting, and no error to compare
     settings = [name for name in SETTINGS if name in rows]
     return rows[rows[settings].notna().any(axis=1)].reset_index(drop=True), stamps
 
 
+def named(rows: pd.DataFrame, folder: Path) -> pd.DataFrame:
+    """The rows with the names of solvers that figures have, and in "look" the rows whose looks these have."""
+    path = folder / "work_precision.json"
+    told = json.loads(path.read_text()) if path.is_file() else {}
+    rivals = told.get("rivals", {})
+    coded = {case["name"]: False for case in told.get("cases", [])}  # but for those of `rivals`
+    coded |= {each["case"]: each["case"] in rivals["with_code"] for each in rivals.get("mechanisms", [])}
+    pairs = [(solver, coded.get(case)) for solver, case in zip(rows["solver"], rows["case"], strict=True)]
+    return rows.assign(solver=[label(*pair) for pair in pairs], look=[looks_like(*pair) for pair in pairs])
+
+
 def page_data(rows: pd.DataFrame, stamps: dict[str, str]) -> dict[str, Any]:
     """What the page is given: mechanisms, solvers with their looks, and the runs as lists."""
     families = rows.groupby("solver", sort=False)["family"].first()
-    seen = looks(families.index)
+    seen = looks(dict(zip(rows["solver"], rows["look"], strict=True)))
     solvers = [{"name": name, "ours": family == "two-loop", **seen[name]} for name, family in families.items()]
     numbers = {name: k for k, name in enumerate(families.index)}
     mechanisms = [
@@ -93,13 +106,16 @@ def page_data(rows: pd.DataFrame, stamps: dict[str, str]) -> dict[str, Any]:
     return found | {"costs": COSTS, "runs": runs, "stamps": stamps}
 
 
-def looks(solvers: Iterable[str]) -> dict[str, dict[str, Any]]:
-    """Colour and point of each solver: those of the figures, another pair where one is taken or has no such point."""
-    known = sorted(solvers, key=lambda name: name not in figures.STYLES)  # others take what is left
+def looks(solvers: Mapping[str, str]) -> dict[str, dict[str, Any]]:
+    """Colour and point of each solver: those that figures give to a row, another pair where one is taken or not there.
+
+    `solvers`: the name of the row of each.
+    """
+    known = sorted(solvers, key=lambda name: solvers[name] not in figures.STYLES)  # others take what is left
     free = list(product(dict.fromkeys(color for color, _ in figures.STYLES.values()), POINTS))
     made = {}
     for name in known:
-        style = figures.style(name)
+        style = figures.style(solvers[name])
         pair = (str(style["color"]), str(style["marker"]))
         if pair not in free:
             pair = next((each for each in free if each[0] == pair[0]), free[0])

@@ -16,6 +16,7 @@ from references.paper.four_bar_minimal import MinimalFourBar
 from studies.bench import figures, tables
 from studies.bench.cli import StudyError
 from studies.bench.collector import REPEATS
+from studies.bench.names import label
 from studies.bench.store import Array, Output
 from studies.bench.study import Study
 from studies.sweep_linkages.study import drawn, linkage
@@ -236,7 +237,7 @@ def figures_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Figure]:
     for axes, case in zip(panels[0], cases, strict=True):
         for way, own in made[made["case"] == case].groupby("way", sort=False):
             line = own.groupby("tol")[["error_worst", "run_s"]].median()
-            look = figures.style(*LOOKS[way]) | {"label": way}
+            look = figures.style(*LOOKS[way]) | {"label": label(way)}
             axes.plot(line["error_worst"], 1e6 * line["run_s"], **look)
         axes.set(xscale="log", yscale="log", xlabel="largest error of q at the end (m, rad)", title=case)
         axes.grid(alpha=0.3)

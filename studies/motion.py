@@ -151,7 +151,7 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
 
 def _draw(panel: Axes, rows: Iterable[pd.Series | None], curve: str, t: Array, **more: Any) -> None:
     for k, row in enumerate(row for row in rows if row is not None and curve in row["series"]):
-        panel.plot(t, row["series"][curve], **({"markevery": (3 * k % 10, 10)} | figures.look(row) | more))
+        panel.plot(t, row["series"][curve], **({"markevery": (3 * k % 10, 10)} | figures.look(row, coded=True) | more))
 
 
 def _motion(panel: Axes, rows: pd.DataFrame, curve: str, step: float) -> None:

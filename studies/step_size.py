@@ -106,7 +106,7 @@ def figures_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Figure]:
     paper = rows[rows["group"] == "paper"].set_index("solver", drop=False).loc[list(PAPER)]
     for panel, name in ((whole, "whole"), (zoom, "zoom")):
         for _, row in paper.iterrows():
-            look = figures.look(row) | {"marker": "", "linewidth": 0.9}
+            look = figures.look(row, coded=True) | {"marker": "", "linewidth": 0.9}
             panel.plot(*row["series"][name], drawstyle="steps-post", **look)
         panel.axhline(LONG, color=figures.RED, lw=1.0, ls=":", label=f"{LONG:g} s: mostly exceeded in the paper")
         panel.set(ylabel="step size (s)", yscale="log")

@@ -165,7 +165,7 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
         {**row[columns], "setting": tables.setting(row), "kinds": [kind(row, level) for level in "qv"]} for row in lines
     ]
     told["targets"] = TARGETS
-    told |= {"cost": tables.work_precision(along, TARGETS, (*DRAWN, OWN_EXPLICIT, *STABILISED[1::3]))}
+    told |= {"cost": tables.work_precision(along, TARGETS, (*DRAWN, OWN_EXPLICIT, *STABILISED[1::3]), coded=True)}
     told |= {"n_failed": int(failed.sum()), "n_failed_ours": int((failed & (rows["family"] == "two-loop")).sum())}
     return told | {"pairs": [found for names in PAIRS if (found := pair(along, *names))]}
 
@@ -182,13 +182,13 @@ def figures_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Figure]:
         panel.fill_between(t, low, high, color=figures.VIOLET, alpha=0.25, lw=0, label="all methods of ours")
         for row, sizes in drawn:
             if row["solver"] in OVER_TIME:
-                panel.plot(t, sizes, markevery=7, **figures.look(row))
+                panel.plot(t, sizes, markevery=7, **figures.look(row, coded=True))
         panel.set(xlabel="t (s)", yscale="log", ylabel=LEVELS[level])
         panel.tick_params(labelleft=True)
     figures.legend(over_time, axes)
     over_time.suptitle("Largest violation in each fiftieth of the run", fontsize=10)
     title = f"{rows['problem'].iloc[0]}, {number(rows['t_end'].iloc[0])} s"
-    return {"violation": over_time, "violation_cost": figures.work_precision(along, DRAWN, title)}
+    return {"violation": over_time, "violation_cost": figures.work_precision(along, DRAWN, title, coded=True)}
 
 
 STUDY = Study("violation", __doc__, rows_of(runs, measure), findings_of, figures_of, medians=True, curves=True)

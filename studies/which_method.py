@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Any
 
 from studies.bench import index
-from studies.bench.takes import SUFFIX
+from studies.bench.names import SUFFIX
 
 OURS = "two-loop"  # family of our solvers, in the findings of validation
 

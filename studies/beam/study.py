@@ -12,6 +12,7 @@ from studies.beam.runs import DIFFERENCES, EXUDYN, NEWTON, PAPER, TARGETS, by_ti
 from studies.bench import figures, tables
 from studies.bench.cases.beam import SOFT, STIFF
 from studies.bench.cli import StudyError
+from studies.bench.names import label
 from studies.bench.render import number, table
 from studies.bench.solvers import IDA_C, IDA_C_ORDER_2, NEWMARK, OWN_EXPLICIT, PAPER_TOL
 from studies.bench.store import Output
@@ -139,10 +140,12 @@ def drawn(runs_: pd.DataFrame) -> list[str]:
 def tables_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, str]:
     """CPU time of each solver for each target, the beams side by side."""
     runs_, names = by_tip(rows), [case["name"] for case in found["cases"]]
-    costs = [
-        {line[0]: line[1:] for line in tables.work_precision(runs_[runs_["case"] == name], TARGETS, LISTED)}
-        for name in names
-    ]
+    costs = []
+    for name in names:
+        own = runs_[runs_["case"] == name]
+        there = [solver for solver in LISTED if (own["solver"] == solver).any()]
+        made = tables.work_precision(own, TARGETS, there) if there else []
+        costs.append({solver: line[1:] for solver, line in zip(there, made, strict=True)})
     shown = [solver for solver in LISTED if any(solver in cost for cost in costs)]
     for name, cost in zip(names, costs, strict=True):
         for solver, cells in cost.items():
@@ -150,6 +153,7 @@ def tables_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, str]:
             cells[1:] = [_cell(own, cell) for cell in cells[1:]]
     nothing = ["", *["–"] * len(TARGETS)]
     lines = [[solver, *(cell for cost in costs for cell in cost.get(solver, nothing)[1:])] for solver in shown]
+    lines = [[label(solver, coded=False), *cells] for solver, *cells in lines]
     errors = [f"{beam}, {1e3 * target:g} mm" for beam in ("flexible", "stiff") for target in TARGETS]
     return {"cost": table(["solver", *errors], lines)}
 
@@ -166,7 +170,7 @@ def figures_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Figure]:
     for case in found["cases"]:
         own = runs_[runs_["case"] == case["name"]]
         title = f"{case['name']} beam, {number(case['t_end'])} s"
-        plot = figures.work_precision(own, drawn(own), title, ERROR)
+        plot = figures.work_precision(own, drawn(own), title, ERROR, coded=False)
         for axes, target in itertools.product(plot.axes, TARGETS):
             axes.axvline(target, color="0.6", linestyle=":", linewidth=1.0, zorder=0)
         made[case["figure"].removesuffix(".png")] = plot

@@ -20,6 +20,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
+from studies.bench.names import label, looks_like
 from studies.bench.solvers import CATALOGUE, COMPILED, DEFAULT, GEAR_ORDERS, HEYOKA, IRK, IRK_LINE, gear
 from studies.bench.store import Output
 from studies.bench.tables import astray, setting_of, time_for, used
@@ -81,9 +82,10 @@ def style(solver: str, family: str = "two-loop", keeps_constraints: bool = True)
     return made if keeps_constraints else made | {"markerfacecolor": "white"}
 
 
-def look(row: pd.Series) -> dict[str, Any]:
-    """Colour, marker and line of the row's solver, labelled with its name."""
-    return style(row["solver"], row["family"], bool(row["keeps_constraints"])) | {"label": row["solver"]}
+def look(row: pd.Series, coded: bool | None = None) -> dict[str, Any]:
+    """Colour, marker and line of the row's solver, labelled with its name; `coded`: as `names.label` has it."""
+    made = style(looks_like(row["solver"], coded), row["family"], bool(row["keeps_constraints"]))
+    return made | {"label": label(row["solver"], coded)}
 
 
 def shades(n: int) -> list[Any]:
@@ -95,8 +97,8 @@ def legend(figure: Figure, axes: Iterable[Axes], title: str | None = None, below
     """One legend for all panels, each label once; right of them, or in so many columns below."""
     entries: dict[str, Any] = {}
     for panel in axes:
-        for handle, label in zip(*panel.get_legend_handles_labels(), strict=True):
-            entries.setdefault(label, handle)
+        for handle, words in zip(*panel.get_legend_handles_labels(), strict=True):
+            entries.setdefault(words, handle)
     place: dict[str, Any] = {"loc": "outside lower center", "ncols": below, "fontsize": 8} if below else {}
     figure.legend(entries.values(), entries.keys(), **{"loc": "outside right upper", "title": title} | place)
 
@@ -190,11 +192,13 @@ def with_gaps(runs: pd.DataFrame) -> pd.DataFrame:
     return runs.reindex(sorted([*runs.index, *(runs.index[apart] - 0.5)]))
 
 
-def work_precision(rows: pd.DataFrame, solvers: Sequence[str], title: str, error: str = ERROR) -> Figure:
+def work_precision(
+    rows: pd.DataFrame, solvers: Sequence[str], title: str, error: str = ERROR, coded: bool | None = None
+) -> Figure:
     """CPU time and evaluations over the largest error of a position, a line a solver; `rows` of one case, medians.
 
-    `error` says what the column error_q is. Lines have the gaps of `with_gaps`. Raises ValueError if there are more
-    than nine lines.
+    `error` says what the column error_q is; `coded`: as `names.label` has it. Lines have the gaps of `with_gaps`.
+    Raises ValueError if there are more than nine lines.
     """
     if len(solvers) > MOST_LINES:
         raise ValueError(f"a work-precision figure has at most {MOST_LINES} lines; given {len(solvers)}")
@@ -205,7 +209,8 @@ def work_precision(rows: pd.DataFrame, solvers: Sequence[str], title: str, error
         if known.empty:
             continue
         called = " [P]" if known["called_from"].iloc[0] == "Python" else ""
-        one = look(known.iloc[0]) | {"label": f"{solver}{called}"}
+        one = look(known.iloc[0], coded)
+        one["label"] += called
         errors, times = runs["error_q"].astype(float), runs["call_s"].astype(float)
         spread = [times - runs["call_q1"].astype(float), runs["call_q3"].astype(float) - times]
         left.errorbar(errors, times, yerr=spread, elinewidth=0.8, **one)
@@ -214,7 +219,7 @@ def work_precision(rows: pd.DataFrame, solvers: Sequence[str], title: str, error
     for axes, what in ((left, "CPU time of the call (s)"), (right, "evaluations")):
         axes.set(xscale="log", yscale="log", xlabel=error, ylabel=what)
     bars = bool((rows["call_q3"] > rows["call_q1"]).any())
-    from_python = any(label.endswith(" [P]") for label in left.get_legend_handles_labels()[1])
+    from_python = any(words.endswith(" [P]") for words in left.get_legend_handles_labels()[1])
     told = bars * "\nvertical bars: quartiles" + from_python * "\n[P]: called from Python"
     legend(figure, [left], f"{LEGEND}\nleft out: motion lost{told}")
     figure.suptitle(title, fontsize=10)

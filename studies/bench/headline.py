@@ -43,15 +43,15 @@ def of_errors(rows: pd.DataFrame, errors: Iterable[float], given: str = DEFAULT)
         near, at = tables.near_misses(rivals, error), {}
         for name, solver in solvers.items():
             side = {each: cost for each, cost in own.items() if name == BEST or each == solver}
-            compared = _compared(side, others, tables.near_misses(parts[name], error), near)
-            if compared["verdict"] == "alone" and not asked(rivals, error):
-                compared["verdict"] = "unasked"
-            at[name] = _told(side) | {"rival": _told(others)} | compared
+            found_at = compared(side, others, tables.near_misses(parts[name], error), near)
+            if found_at["verdict"] == "alone" and not asked(rivals, error):
+                found_at["verdict"] = "unasked"
+            at[name] = _told(side) | {"rival": _told(others)} | found_at
         found.append(at)
     return found
 
 
-def _compared(own: tables.Costs, others: tables.Costs, *near: tables.Costs) -> dict[str, Any]:
+def compared(own: tables.Costs, others: tables.Costs, *near: tables.Costs) -> dict[str, Any]:
     """`tables.compared`, undecided where near misses of the slower side, of ours or of others, would not be slower."""
     found, (near_own, near_others) = tables.compared(own, others), near
     sides = {"ahead": (own, others | near_others), "behind": (own | near_own, others)}.get(found["verdict"])

@@ -79,8 +79,8 @@ def classes(found: dict[str, dict[str, Any]]) -> list[dict[str, Any]]:
         long = found["energy"]["long"]
         name = f"four-bar, {long['case']}, largest kinetic energy {number(long['kinetic'])} J"
         case = {"name": name, "t_end": long["t_end"]}
-        made.append(_entry(LONG, case, [_at_energy(at, long["equal"], "no_drift", "drift") for at in long["at"]]))
-        made[-1]["without_drift"] = picks([_at_energy(at, long["equal"], "no_drift") for at in long["at"]])
+        made.append(_entry(LONG, case, [_at_energy(at, at["verdict"], "no_drift", "drift") for at in long["at"]]))
+        made[-1]["without_drift"] = picks([_at_energy(at, at["no_drift"]["verdict"], "no_drift") for at in long["at"]])
     return made
 
 
@@ -108,11 +108,10 @@ def _at_error(at: dict[str, Any]) -> dict[str, Any]:
     return line | {"neighbour": rival if cheaper else None}
 
 
-def _at_energy(at: dict[str, Any], equal: float, *kinds: str) -> dict[str, Any]:
-    """The line of a largest energy error, from runs with a drift, without, or both.
+def _at_energy(at: dict[str, Any], verdict: str, *kinds: str) -> dict[str, Any]:
+    """The line of a largest energy error, from runs with a drift, without, or both; `verdict`: on ours among these.
 
-    What wanders is marked as what drifts. These are made once: times that differ by less than a share `equal` are not
-    told apart.
+    What wanders is marked as what drifts.
     """
     line: dict[str, Any] = {"accuracy": f"{number(at['energy'])} J", "standing": None, **dict.fromkeys(WHOSE)}
     line |= {"times": at["times"], "neighbour": None}
@@ -121,8 +120,7 @@ def _at_energy(at: dict[str, Any], equal: float, *kinds: str) -> dict[str, Any]:
         if runs:
             best = min(runs, key=lambda run: float(run["call_s"]))
             line[which] = {key: best[key] for key in COSTS} | {"solver": best["name"], "drifts": not best["calm"]}
-    costs = sorted(line[which]["call_s"] for which in WHOSE if line[which])
-    return line | {"undecided": len(costs) > 1 and costs[0] > (1.0 - equal) * costs[1]}
+    return line | {"undecided": verdict == "undecided"}
 
 
 def picks(at: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -157,7 +155,6 @@ def first_screen(folder: Path, quick: bool) -> str:
     entries = classes(found)
     more: dict[str, Any] = {"studies": studies}
     told = [at[which] for entry in entries for at in entry["at"] for which in WHOSE if at[which]]
-    more["drifting"] = any(best["drifts"] for best in told)
     more["from_python"] = any(best["called_from"] == "Python" for best in told)
     return rendered("index", found, quick=quick, docs="../docs/", reports=".", every=True, **more)
 

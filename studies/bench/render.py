@@ -7,7 +7,7 @@ from typing import Any
 
 import jinja2
 
-from studies.bench.solvers import GIVEN
+from studies.bench import names
 
 TEMPLATES = Path(__file__).parents[1] / "templates"
 
@@ -53,11 +53,6 @@ def brief(stamp: str) -> str:
     return "; ".join(stamp.split("; ")[:4])
 
 
-def code(name: str) -> str:
-    """A name as code, but that of the default, which is words."""
-    return name if name == GIVEN else f"`{name}`"
-
-
 def percent(share: float) -> str:
     """A share as a percentage of two significant digits."""
     return f"{number(100.0 * share)} %"
@@ -85,7 +80,14 @@ def environment() -> jinja2.Environment:
     how: dict[str, Any] = dict.fromkeys(("trim_blocks", "lstrip_blocks", "keep_trailing_newline"), True)
     how |= {"undefined": jinja2.StrictUndefined, "autoescape": False}  # markdown, from our own data
     made = jinja2.Environment(loader=jinja2.FileSystemLoader(TEMPLATES), **how)
-    made.filters |= {"code": code, "num": number, "power": power, "pct": percent, "listed": listed}
+    made.filters |= {
+        "code": names.call,
+        "label": names.label,
+        "num": number,
+        "power": power,
+        "pct": percent,
+        "listed": listed,
+    }
     made.filters |= {"brief": brief}
     made.globals["table"] = table
     return made

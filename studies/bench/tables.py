@@ -8,6 +8,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from studies.bench.collector import NOTHING_RUN
+from studies.bench.names import label
 from studies.bench.render import number, power
 from studies.bench.store import Array
 from twoloop.rows.equal_error import DECADE, FEWEST, INTERVAL, LEAST, Runs, cheapest, cost_at, place_of, resampled
@@ -172,10 +173,14 @@ def nearly_there(rows: pd.DataFrame, target: float) -> pd.DataFrame:
 
 def near_misses(rows: pd.DataFrame, target: float) -> Costs:
     """What the runs take that miss an error by little, each run by itself."""
-    runs = nearly_there(rows, target)
+    return each_run(nearly_there(rows, target))
+
+
+def each_run(runs: pd.DataFrame) -> Costs:
+    """What runs take, each by itself: no solver's name, but that of the row."""
     times = runs["times"] if "times" in runs else len(runs) * [()]
     costs = zip(runs["call_s"].astype(float), resampled(times), strict=True)
-    return {f"near miss {k}": cost for k, cost in enumerate(costs)}
+    return {f"row {k}": cost for k, cost in zip(runs.index, costs, strict=True)}
 
 
 def _least(side: Costs) -> tuple[float, Array]:
@@ -286,9 +291,12 @@ def why_not(rows: pd.DataFrame, target: float) -> str:
     return f"least error {number(float(reached['error_q'].min()))}" + (", then our limit" if stopped else "")
 
 
-def work_precision(rows: pd.DataFrame, targets: Iterable[float], solvers: Sequence[str] = ()) -> list[list[str]]:
+def work_precision(
+    rows: pd.DataFrame, targets: Iterable[float], solvers: Sequence[str] = (), coded: bool | None = None
+) -> list[list[str]]:
     """Lines of a table: solver, called from, CPU time with quartiles in seconds for each target.
 
+    `coded`: as `names.label` has it.
     Instead of a dash the cell of a target that is not reached says how far the solver came.
     """
     lines = []
@@ -296,7 +304,7 @@ def work_precision(rows: pd.DataFrame, targets: Iterable[float], solvers: Sequen
         runs = rows[rows["solver"] == solver]
         if runs.empty:
             continue
-        line = [solver, str(runs["called_from"].iloc[0])]
+        line = [label(solver, coded), str(runs["called_from"].iloc[0])]
         for target in targets:
             middle, low, high = (time_for(runs, target, what) for what in ("call_s", "call_q1", "call_q3"))
             line.append(why_not(runs, target) if np.isnan(middle) else with_quartiles(middle, low, high))

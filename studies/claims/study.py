@@ -51,7 +51,7 @@ def findings_of(pairs: Judged) -> dict[str, Any]:
 
 
 def report(output: Output, rows: Rows, line: str) -> dict[str, Any]:
-    """Write findings, rows and both reports; the findings."""
+    """Write findings, rows and reports; the findings."""
     pairs, lines = judged(rows), []
     for key, (claim, found) in pairs.items():
         told = {"claim": key, "verdict": found.verdict.value, "number": claim.text(found), "why_not_run": found.why}
@@ -61,7 +61,8 @@ def report(output: Output, rows: Rows, line: str) -> dict[str, Any]:
     output.save_findings(findings)
     output.save_rows(table, line)
     more = {"stamp": line, "quick": output.call.quick}
-    output.write("claims.md", render("claims", findings, {}, lines=table.to_dict("records"), **more))
+    for name in ("claims", "claims_that_hold"):
+        output.write(f"{name}.md", render(name, findings, {}, lines=table.to_dict("records"), **more))
     output.write("errata.md", render("errata", ERRATA, {}, **more))
     return findings
 
@@ -82,7 +83,7 @@ def _work(words: Sequence[str] | None) -> None:
         findings = report(output, Rows(read(output.path), made), line)
         write_index(output)
     print(", ".join(f"{n} {verdict}" for verdict, n in findings["counts"].items() if n))
-    print(f"wrote claims.md, .csv, .json and errata.md to {output.path}")
+    print(f"wrote claims.md, claims_that_hold.md, claims.csv, .json and errata.md to {output.path}")
 
 
 def main(words: Sequence[str] | None = None) -> None:

@@ -11,6 +11,7 @@ import pandas as pd
 
 from studies.bench.apart import apart
 from studies.bench.cli import version_of
+from studies.bench.names import label
 from studies.bench.render import table
 from studies.bench.store import Output, Row
 from studies.bench.study import Study
@@ -115,9 +116,12 @@ def tables_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, str]:
         for line in (each for each in told["lines"] if each["simulator"] not in told["passed"]):
             own = rows[(rows["group"] == group) & (rows["simulator"] == line["simulator"])]
             cells = [_cell(own[own["problem"] == name]) for name in names]
-            lines.append([line["simulator"], line["of"], *cells])
+            lines.append([label(line["simulator"], coded=False), line["of"], *cells])
     ended = rows[(rows["outcome"] == FAILED) & rows["property"].isin(("runs", SAYS_SO))]
-    said = [[row["simulator"], row["problem"], _short(str(row["measured"]))] for _, row in ended.iterrows()]
+    said = [
+        [label(row["simulator"], coded=False), row["problem"], _short(str(row["measured"]))]
+        for _, row in ended.iterrows()
+    ]
     return {
         "failed": table(["simulator", "version", *names], lines) if lines else "",
         "ended": table(["simulator", "problem", "what happened"], said) if said else "",

@@ -8,9 +8,10 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from studies.bench import figures
+from studies.bench import figures, headline, tables
 from studies.bench.cli import StudyError
 from studies.bench.headline import OWN_CODE
+from studies.bench.names import label
 from studies.bench.render import number
 from studies.bench.solvers import CVODE_C, DEFAULT, HEYOKA, IDA_C, IRK, OWN_EXPLICIT
 from studies.bench.study import Study, rows_of
@@ -34,7 +35,6 @@ from studies.energy.runs import (
 )
 
 SHARES = (1e-3, 1e-5, 1e-7)  # of the largest kinetic energy: energy errors at which costs are compared
-EQUAL = 0.1  # costs that differ by less count as equal: runs share the machine and are made once
 KEEPING = f"{GAUSS}, symmetric partition"
 FATES = dict.fromkeys(DRIFTING, "drift") | {each: each for each in (NO_DRIFT, IS_LOST, IRREGULAR)}  # in one word
 DRAWN = (DEFAULT, OWN_CODE, OWN_EXPLICIT, IDA_C, HEYOKA, CVODE_C, TRAPEZOIDAL, KEEPING, IRK)  # over cost
@@ -69,7 +69,7 @@ def told(row: pd.Series) -> dict[str, Any]:
     found = {name: row[name] for name in ("solver", "name", "called_from", "call_s", "n_evaluations", "violation_q")}
     found |= {name: row[name] for name in ("verdict", "status")}
     found["setting"] = setting(row)
-    found["label"] = f"{row['name']}, {found['setting']}"
+    found["label"] = f"{label(row['name'], coded=True)}, {found['setting']}"
     found |= {"kinetic": float(row["kinetic"]), "fixed_steps": bool(pd.notna(row["h"]))}
     found["explicit"] = row.get("used") == "explicit" or row["solver"] == OWN_EXPLICIT
     found |= {"drift": row["slope"] * row["t_end"], "bound": bound(row), "energy": abs(row["energy"])}
@@ -94,6 +94,15 @@ def cheapest(rows: pd.DataFrame) -> dict[str, Any] | None:
     return None if rows.empty else told(rows.loc[rows["call_s"].idxmin()])
 
 
+def ranked(reached: pd.DataFrame, good: pd.Series, near: pd.Series, one: pd.Series, other: pd.Series) -> str:
+    """The verdict on one side of runs against another, by the rule of `work_precision`."""
+    return str(
+        headline.compared(*(tables.each_run(reached[of & side]) for of in (good, near) for side in (one, other)))[
+            "verdict"
+        ]
+    )
+
+
 def long_of(rows: pd.DataFrame) -> dict[str, Any]:
     """The class "long and conservative": what small energy errors cost with a drift and without, alternatives."""
     reached = rows.assign(worst=settled(rows))[ended(rows)]
@@ -102,20 +111,21 @@ def long_of(rows: pd.DataFrame) -> dict[str, Any]:
     at = []
     for share in (np.inf, *SHARES):
         good = reached["worst"] <= share * kinetic
+        near = ~good & (reached["worst"] <= tables.NEARLY * share * kinetic)
         level: dict[str, Any] = {"share": share, "energy": share * kinetic}
-        for name, which in (("no_drift", good & calm), ("drift", good & ~calm)):
-            level[name] = {"ours": cheapest(reached[which & own]), "others": cheapest(reached[which & ~own])}
+        for name, which in (("no_drift", calm), ("drift", ~calm)):
+            sides = (which & own, which & ~own)
+            level[name] = dict(zip(("ours", "others"), (cheapest(reached[good & side]) for side in sides), strict=True))
+            level[name]["verdict"] = ranked(reached, good, near, *sides)
         times = {name: reached[good & (reached["solver"] == name)]["call_s"] for name in (DEFAULT, OWN_CODE)}
         level["times"] = {name: float(each.min()) for name, each in times.items() if len(each)}
-        free, other = cheapest(reached[good & calm]), cheapest(reached[good & ~calm])
-        over = np.inf if other is None else 0.0 if free is None else other["call_s"] / free["call_s"]
-        level["pays"] = free is not None and over * (1.0 - EQUAL) > 1.0
-        at.append(level | {"equal": free is not None and 1.0 - EQUAL <= over <= 1.0 / (1.0 - EQUAL)})
+        level["verdict"], free = ranked(reached, good, near, own, ~own), ranked(reached, good, near, calm, ~calm)
+        at.append(level | {"pays": free in ("ahead", "alone"), "undecided": free == "undecided"})
     kept = [level["no_drift"]["ours"] for level in at[1:] if level["no_drift"]["ours"]]
     sides = [(level["no_drift"]["ours"], level["drift"]["ours"]) for level in at[1:]]
     both = [side for side in sides if all(side)]
     over_drifting = [one["call_s"] / other["call_s"] for one, other in both]
-    listed = rows[rows["group"].isin(("other", "controlled"))]
+    listed = where(rows, group="other")
     places = [run["energy"].abs().fillna(np.inf).idxmin() for _, run in listed.groupby("name", sort=False)]
     calm_ours: dict[str, Any] = {"labels": list(dict.fromkeys(run["label"] for run in kept))}
     calm_ours["fixed"] = bool(kept) and all(run["fixed_steps"] for run in kept)
@@ -124,7 +134,9 @@ def long_of(rows: pd.DataFrame) -> dict[str, Any]:
     found = {"case": SWITCHING, "problem": rows["problem"].iloc[0], "t_end": float(rows["t_end"].iloc[0])}
     found |= {"kinetic": kinetic, "no_drift": at[0]["no_drift"], "at": at[1:]}
     found |= {"calm_ours": calm_ours, "n_pays": sum(level["pays"] for level in at[1:])}
-    found |= {"n_equal": sum(level["equal"] for level in at[1:]), "equal": EQUAL}
+    found["n_undecided"] = sum(level["undecided"] for level in at[1:])
+    found["n_verdicts"] = dict(Counter(level["verdict"] for level in at[1:]))
+    found["repeats"] = int(rows["repeats"].max()) if "repeats" in rows else 1
     return found | {"alternatives": [told(rows.loc[place]) for place in places]}  # of each the run of least error
 
 
@@ -179,8 +191,8 @@ def cost_figure(rows: pd.DataFrame) -> Figure:
     errors = long["energy"].abs().where(ended(long))
     long = long.assign(error_q=errors, floor=0.0, solver=long["name"], astray=False)
     long = long[long["solver"].isin(DRAWN) & ((long["solver"] != KEEPING) | long["h"].notna())]
-    title = f"{number(long['t_end'].iloc[0])} s, each run timed once; ringed: no drift"
-    figure = figures.work_precision(long, DRAWN, title, "largest energy error over the run (J)")
+    title = f"{number(long['t_end'].iloc[0])} s; ringed: no drift"
+    figure = figures.work_precision(long, DRAWN, title, "largest energy error over the run (J)", coded=True)
     calm = long[long["verdict"] == NO_DRIFT]
     for axes, what in zip(figure.axes, ("call_s", "n_evaluations"), strict=True):
         ring: dict[str, Any] = {"markerfacecolor": "none", "markersize": 11, "markeredgewidth": 0.8}
@@ -197,7 +209,7 @@ def time_figure(rows: pd.DataFrame) -> Figure:
         for solver, variant in chosen:
             for _, row in of(where(rows, group="fixed", case=motion), solver, variant).iterrows():
                 if curves := row["series"]:
-                    look = figures.look(row) | {"linestyle": dashes[variant], "marker": ""}
+                    look = figures.look(row, coded=True) | {"linestyle": dashes[variant], "marker": ""}
                     look["label"] = f"{row['name']}, h = {row['h']:g} s"
                     axes.plot(curves["t"], np.abs(curves["mean"]), **look)
         axes.set(xscale="log", yscale="log", xlabel="time (s)")

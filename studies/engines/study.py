@@ -17,6 +17,9 @@ from studies.bench import figures
 from studies.bench.changed_loops import IN_A_FRAME, LIGHTENED, MOTORISED
 from studies.bench.closed_loops import MECHANISMS, four_bar, rssr
 from studies.bench.engine_runs import INSTANTS, LIMIT, Loop, errors, gate, timed
+from studies.bench.headline import OWN_CODE
+from studies.bench.names import label
+from studies.bench.solvers import GIVEN
 from studies.bench.store import Output, Row
 from studies.bench.study import Study
 from studies.engines.configurations import CONFIGURATIONS, NAMES, OURS, Configuration
@@ -172,17 +175,9 @@ def energy_row(build: Callable[[], Any], each: Configuration) -> Row:
     return row | {"energy": float(np.abs(energies - energies[0]).max() / loop.kinetic)}
 
 
-COLORS = (
-    figures.GREEN,
-    figures.PINK,
-    figures.BLUE,
-    figures.ORANGE,
-    figures.SKY,
-    figures.RED,
-    figures.BROWN,
-    figures.YELLOW,
-)
-LOOKS = dict(zip(NAMES.values(), COLORS, strict=False)) | {NAMES[OURS]: figures.BLACK}  # engine: colour
+# colours that no solver of other figures has; Exudyn has its own, and ours what they have there
+COLORS = {"Drake": "#00838F", "MuJoCo": "#283593", "Pinocchio": "#EF6C00", "Exudyn": figures.TAN}
+OURS_LIKE = (GIVEN, OWN_CODE)  # of the configurations of ours, in their order
 
 
 def figures_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Figure]:
@@ -194,15 +189,18 @@ def figures_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Figure]:
     size = 3.3 * columns + 1.0, 2.9 * lines + 1.2
     figure, panels = plt.subplots(lines, columns, sharey=True, figsize=size, layout="constrained", squeeze=False)
     for panel, case in zip(panels.flat, shown, strict=False):
-        own, markers = runs[runs["case"] == case], dict.fromkeys(LOOKS, 0)
+        own, markers = runs[runs["case"] == case], dict.fromkeys(NAMES.values(), 0)
         for each in CONFIGURATIONS:
             line = own[own["solver"] == each.name].assign(value=lambda row: row["h"].fillna(row["tol"]))
             family = NAMES[each.engine]
-            look = {"color": LOOKS[family], "marker": "osD^v"[markers[family]], "markersize": 3.5}
+            look = {"color": COLORS.get(family), "marker": "osD^v"[markers[family]], "linestyle": "--"}
+            look = figures.style(OURS_LIKE[markers[family]]) if each.engine == OURS else look
             markers[family] += 1
             if len(line):
                 line = line.sort_values("value")
-                panel.plot(line["error_q"].astype(float), 1e3 * line["call_s"], label=each.name, **look)
+                panel.plot(
+                    line["error_q"].astype(float), 1e3 * line["call_s"], label=label(each.name), markersize=3.5, **look
+                )
         panel.axvspan(LOST, 10.0, color=figures.GREY, alpha=0.15, lw=0)
         panel.set(xscale="log", yscale="log", title=case, xlim=(1e-11, 10.0))
     for panel in panels[-1]:

@@ -39,15 +39,19 @@ LOOK = LONGEST_UNSEEN / PLACES  # of a run: so often ours look at least at force
 LIMITED = ", max_step"  # of others that take no step longer than the time between two looks of ours
 
 # whose a solver is, in the words of the findings
-KINDS = ("default", "ours", "heyoka", "sundials", "scipy", "limited")
+KINDS = ("default", "ours", "set", "heyoka", "sundials", "scipy", "limited")
 
 Call = Callable[[Trap], Result]
 
 
 def kind_of(name: str) -> str:
-    """Which of KINDS a solver is; others with a largest step are limited, whosever they are."""
+    """Which of KINDS a solver is; others with a largest step are limited, whosever they are.
+
+    Each method of ours is one of "default" and "ours"; what is "set" is such a method with another `compiled`.
+    """
     if name.endswith(OURS):
-        return "default" if name == DEFAULT else "ours"
+        code = name.removesuffix(OURS).partition(", ")[2]
+        return "default" if name == DEFAULT else "set" if code else "ours"
     if name.endswith(LIMITED):
         return "limited"
     return "heyoka" if name == HEYOKA else "sundials" if name in (IDA, IDA_C, CVODE_C, PROJECTED) else "scipy"

@@ -18,6 +18,7 @@ from studies.bench import figures
 from studies.bench.apart import apart, heard
 from studies.bench.cli import StudyError
 from studies.bench.end_states import EXACT
+from studies.bench.names import label
 from studies.bench.render import power
 from studies.bench.sharp_forces import T_END
 from studies.bench.store import Array, Output, Row
@@ -244,7 +245,8 @@ def of_forces(rows: pd.DataFrame) -> dict[str, Any]:
     """Outcomes under sharp forces: of every solver, and of ours and others under each force."""
     ran = rows[rows["outcome"] != NOT_RUN]
     found: dict[str, Any] = {"n": len(ran), "n_families": ran["trap"].nunique(), "families": of_traps(ran)}
-    found["n_gusts"] = sum(name.startswith("gust") for name in map(str, ran["trap"].unique()))
+    names = [str(name) for name in ran["trap"].unique()]
+    found |= {f"n_{what}s": sum(what in name for name in names) for what in ("gust", "friction")}
     return found | {"solvers": totals(rows), "mechanisms": [str(name) for name in ran["mechanism"].unique()]}
 
 
@@ -313,9 +315,8 @@ def picture(totals: Sequence[dict[str, Any]]) -> Figure:
         bad = [line for line in own if line[RIGHT] < line["n"] or line["solver"] == DEFAULT]  # which has its own bar
         bad = own if len(own) - len(bad) == 1 else bad
         for line in bad:
-            name = line["solver"].removesuffix(OURS).removesuffix(LIMITED)
+            name = label(line["solver"].removesuffix(LIMITED), coded=False)
             counts = [line[part] for part in PARTS]
-            name = "the default" if line["solver"] == DEFAULT else name
             bars.append((f"{name} ({line['n']})", [100.0 * count / line["n"] for count in counts], counts))
         if len(own) > len(bad):
             n = sum(line["n"] for line in own) - sum(line["n"] for line in bad)

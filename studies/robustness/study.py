@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 
 from studies.bench.apart import apart
+from studies.bench.names import label
 from studies.bench.random_linkages import KINDS, PLACES, draw, end_of_scaled, scaled
 from studies.bench.render import power
 from studies.bench.sharp_motion import RIGHT, SAID, SILENT, graded
@@ -151,7 +152,10 @@ def alike(limits: dict[str, dict[str, dict[str, Any]]]) -> list[dict[str, Any]]:
     methods: dict[tuple[str, ...], list[str]] = {}
     for name in next(iter(limits.values())):
         methods.setdefault(tuple(_said(own[name]) for own in limits.values()), []).append(name)
-    return [{"methods": ", ".join(names), "limits": list(line)} for line, names in methods.items()]
+    return [
+        {"methods": ", ".join(label(name, coded=False) for name in names), "limits": list(line)}
+        for line, names in methods.items()
+    ]
 
 
 def _said(line: dict[str, Any]) -> str:

@@ -174,10 +174,9 @@ def figures_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Figure]:
     width: dict[str, Any] = {"figsize": (3.4 * len(sizes) + 1.2, 4.2), "layout": "constrained", "squeeze": False}
     second, panels = plt.subplots(1, len(sizes), sharey=True, **width)
     for panel, n in zip(panels[0], sizes, strict=True):
-        for solver, own in chains[chains["n"] == n].groupby("solver", sort=False):
+        for _, own in chains[chains["n"] == n].groupby("solver", sort=False):
             line = own.assign(setting=own["tol"].fillna(own["h"])).groupby("setting")[["error_q", "call_s"]].median()
-            look = figures.style(str(solver), str(own["family"].iloc[0]), bool(own["keeps_constraints"].iloc[0]))
-            panel.plot(line["error_q"], line["call_s"], **look | {"label": str(solver)})
+            panel.plot(line["error_q"], line["call_s"], **figures.look(own.iloc[0]))
         panel.set(xscale="log", yscale="log", xlabel="error of q at the end, over max(1, max |q|)", title=f"{n} bars")
         panel.grid(alpha=0.3)
     panels[0][0].set_ylabel("CPU time of the call (s)")

@@ -287,14 +287,15 @@ def figures_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Figure]:
     """Cost over error and, where runs are as long as the paper's, the ratios of the times."""
     first = rows[rows["problem"] == rows["problem"].iloc[0]]
     title = f"{first['problem'].iloc[0]}, {number(found['t_end'])} s"
-    made = {"table3": figures.work_precision(_compared(first), DRAWN, title)}
+    made = {"table3": figures.work_precision(_compared(first), DRAWN, title, coded=True)}
     return made | ({"table3_ratios": picture(first)} if found["t_end"] == PAPER_END else {})
 
 
 def tables_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, str]:
     """The tables of the report, of which the times are printed, too."""
     first = rows[rows["problem"] == rows["problem"].iloc[0]]
-    costs = [[solver, *cells] for solver, _, *cells in tables.work_precision(_compared(first), TARGETS, DRAWN)]
+    made = tables.work_precision(_compared(first), TARGETS, DRAWN, coded=True)
+    costs = [[solver, *cells] for solver, _, *cells in made]
     ready = {"work": table(["solver", *map(power, TARGETS)], costs), "counts": counts(first)}
     for name, group in zip(("irk", "newmark"), FAMILIES, strict=True):
         ready[name] = grid(first, group)

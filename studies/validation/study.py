@@ -14,6 +14,7 @@ from matplotlib.patches import Rectangle
 
 from studies.bench.collector import Run, warm_up
 from studies.bench.end_states import DECADES, EXACT, JUDGED, TIME_LIMIT, case_of, row_of
+from studies.bench.names import label
 from studies.bench.render import number, power
 from studies.bench.solvers import (
     ADAMS,
@@ -270,7 +271,7 @@ def figures_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Figure]:
             axes.add_patch(Rectangle(corner, 1.0, 1.0, facecolor="white", edgecolor="#b0b0b0", hatch="////"))
         size = 7 if len(text) < 5 else 6  # of a word, which is to stay within its cell
         axes.text(*place, text, ha="center", va="center", fontsize=size, color="white" if digits < 8.0 else "black")
-    axes.set_xticks(range(len(solvers)), solvers, rotation=35, ha="right", rotation_mode="anchor")
+    axes.set_xticks(range(len(solvers)), map(label, solvers), rotation=35, ha="right", rotation_mode="anchor")
     axes.set_yticks(range(len(cases)), cases)
     axes.grid(False)
     n_own = sum(CATALOGUE[name].family == "two-loop" for name in solvers)

@@ -35,18 +35,18 @@ DECADES = tuple(10.0**-k for k in range(3, 14))
 CLOSE = 1.3  # ratio of our choice, below which another session may rank two times otherwise
 RANGES = {  # of errors; none: all of them on the mechanisms that cross singular positions
     "1e-3 to 1e-6": DECADES[:4],
-    "1e-7 to 1e-9": DECADES[4:7],
-    "1e-10 to 1e-13": DECADES[7:],
+    "1e-7 to 1e-10": DECADES[4:8],
+    "1e-11 to 1e-13": DECADES[8:],
     "singular positions": (),
 }
+ROUNDING = "1e-11 to 1e-13"  # where ratios compare rounding errors: told in words, beside the table
 TYPICAL = (1e-4, 1e-6, 1e-8, 1e-10)  # errors at which the default is compared with the cheapest rival in the median
 SHOWN = DECADES[::2]  # by which the lines of the picture are chosen
 HEADLINE = "four-bar"
 MARKS = (  # of the cells of the heat map
     "(ratio): undecided, also where a cheaper run just misses the error; ours, others: only they reach it;\n"
-    "ours?: not all rivals were run at such tolerances; –: nobody reaches it"
+    "ours?: not all rivals were run at such tolerances; –: nobody reaches it; from 1e-11 on, rounding errors count"
 )
-SAID = {headline.OWN_CODE: "the default", headline.DEFAULT: "compiled=False"}  # on it
 GEOMETRIES: dict[str, Callable[[], Problem]] = {
     HEADLINE: mechanisms.four_bar,
     "four-bar, second": lambda: mechanisms.four_bar(**SECOND),  # type: ignore[arg-type]
@@ -176,7 +176,8 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     found["put"], found["fewest"], found["close"] = put(rows), fewest(rows), close(every)
     found["put"]["ours"] = int(rows.loc[rows["family"] == "two-loop", "solver"].nunique())
     found["with_code"] = [each["case"] for each in made if given_on(each["case"]) == headline.OWN_CODE]
-    found["ranges"] = [_within(made, name, errors) for name, errors in RANGES.items()]
+    ranges = {name: _within(made, name, errors) for name, errors in RANGES.items()}
+    found |= {"rounding": ranges.pop(ROUNDING), "ranges": list(ranges.values())}
     found["typical"] = [each for error in TYPICAL if (each := _typical(made, error)) is not None]
     python = rows[rows["called_from"] == "Python"]["solver"].unique()
     ahead = [at["standing"][headline.BEST] for at in every if at["standing"][headline.BEST]["verdict"] == "ahead"]
@@ -253,8 +254,7 @@ def picture(rows: pd.DataFrame) -> Figure:
     named, once = [at["solver"] for line in priced for at in line["at"] if at["solver"]], []
     for solver in dict.fromkeys([*figures.lines_of(rows, SHOWN), *named]):
         line = figures.with_gaps(rows[rows["solver"] == solver])
-        look = figures.look(line[line["error_q"].notna()].iloc[0])
-        look["label"] = SAID.get(solver, solver)
+        look = figures.look(line[line["error_q"].notna()].iloc[0], coded=True)
         axes.plot(line["error_q"].astype(float), 1e3 * line["call_s"].astype(float), **look)
         once += [line[line["repeats"] == 1]] if "repeats" in line else []
     single = pd.concat(once) if once else rows[:0]

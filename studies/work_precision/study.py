@@ -169,7 +169,8 @@ def draw(output: Output, findings: dict[str, Any], everywhere: pd.DataFrame, med
     for case in findings["cases"]:
         own = medians[medians["case"] == case["name"]]
         lines = figures.lines_of(own, ERRORS)
-        plot = figures.work_precision(own, lines, f"{case['name']}, {number(case['t_end'])} s")
+        coded = case["name"] in findings["rivals"]["with_code"]
+        plot = figures.work_precision(own, lines, f"{case['name']}, {number(case['t_end'])} s", coded=coded)
         figures.save(plot, output, case["figure"].removesuffix(".png"))
     figures.save(rivals.picture(everywhere), output, "work_precision")
     figures.save(rivals.heat_map(findings["rivals"]), output, "work_precision_ratios")

@@ -40,6 +40,6 @@ def made(request, out):
 def unsaved(monkeypatch):
     """Make and save no figures, which takes longer than all else of a report."""
     monkeypatch.setattr(figures, "save", lambda *arguments: None)
-    monkeypatch.setattr(figures, "work_precision", lambda *arguments: SimpleNamespace(axes=[]))
+    monkeypatch.setattr(figures, "work_precision", lambda *arguments, **more: SimpleNamespace(axes=[]))
     for study in (ablation, energy, motion, step_size, violation):
         monkeypatch.setattr(study, "STUDY", replace(study.STUDY, figures=lambda rows, found: {}))

@@ -24,17 +24,17 @@ from twoloop.rows.row_format import text_of
 
 STAMP = "# full work_precision; `made up`"
 RUNS = [  # case, end, solver, family, called from, tolerance, repetition, CPU, status, message, evaluations, errors
-    ("crane", 9.0, "Adams", "two-loop", "compiled", 1e-4, 0, 0.01, "REACHED_END", "", 100, 1e-4, -1e-5),
-    ("crane", 9.0, "Adams", "two-loop", "compiled", 1e-4, 1, 0.03, "REACHED_END", "", 100, 1e-4, -1e-5),
-    ("crane", 9.0, "Adams", "two-loop", "compiled", 1e-4, 2, 0.02, "REACHED_END", "", 100, 1e-4, -1e-5),
-    ("crane", 9.0, "Adams", "two-loop", "compiled", 1e-8, 0, 0.2, "REACHED_END", "", 900, 1e-8, 1e-9),
+    ("crane", 9.0, "RadauIIA5", "two-loop", "compiled", 1e-4, 0, 0.01, "REACHED_END", "", 100, 1e-4, -1e-5),
+    ("crane", 9.0, "RadauIIA5", "two-loop", "compiled", 1e-4, 1, 0.03, "REACHED_END", "", 100, 1e-4, -1e-5),
+    ("crane", 9.0, "RadauIIA5", "two-loop", "compiled", 1e-4, 2, 0.02, "REACHED_END", "", 100, 1e-4, -1e-5),
+    ("crane", 9.0, "RadauIIA5", "two-loop", "compiled", 1e-8, 0, 0.2, "REACHED_END", "", 900, 1e-8, 1e-9),
     ("crane", 9.0, "IDA <C>", "SUNDIALS", "Python", 1e-4, 0, 0.5, "REACHED_END", "", 400, 2e-4, None),
     ("crane", 9.0, "IDA <C>", "SUNDIALS", "Python", 1e-8, 0, 9.0, "TIME_LIMIT", "Stopped. Try.", None, None, None),
     ("crane", 9.0, "BDF", "two-loop", "compiled", 1e-9, 0, 1.0, "REACHED_END", "", 5000, 1e-13, 1e-12),
     ("crane", 9.0, "Newmark", "two-loop", "compiled", 1e-4, 0, 4.0, "REACHED_END", "", 70, 1e-3, 1e-3),
     ("crane", 9.0, "LSODA", "SciPy", "Python", 1e-4, 0, 0.001, "REACHED_END", "", 50, 2.5, 1e-6),
-    ("crane", 0.5, "Adams", "two-loop", "compiled", 1e-4, 0, 0.001, "REACHED_END", "", 50, 3e-5, 1e-6),
-    ("swing", 1.0, "Adams", "two-loop", "compiled", 1e-4, 0, 0.001, "REACHED_END", "", 50, 3e-5, 1e-6),
+    ("crane", 0.5, "RadauIIA5", "two-loop", "compiled", 1e-4, 0, 0.001, "REACHED_END", "", 50, 3e-5, 1e-6),
+    ("swing", 1.0, "RadauIIA5", "two-loop", "compiled", 1e-4, 0, 0.001, "REACHED_END", "", 50, 3e-5, 1e-6),
 ]
 COLUMNS = ["case", "t_end", "solver", "family", "called_from", "tol", "repeat", "call_s", "status", "message"]
 COLUMNS += ["n_evaluations", "error_q", "energy"]
@@ -150,7 +150,7 @@ def made(folder):
 def test_the_data_are_the_rows(folder):
     data = compare_page.page_data(*compare_page.read(folder))
     assert [each["name"] for each in data["mechanisms"]] == [CRANE, SHORT, SWING]
-    assert [each["name"] for each in data["solvers"]] == ["Adams", "IDA <C>", "BDF", "Newmark", "LSODA"]
+    assert [each["name"] for each in data["solvers"]] == ["RadauIIA5", "IDA <C>", "BDF", "Newmark", "LSODA"]
     place = {name: k for k, name in enumerate(data["columns"])}
     assert len(data["runs"]) == 9  # of the three repetitions the median
     first = data["runs"][0]
@@ -163,11 +163,26 @@ def test_the_data_are_the_rows(folder):
 
 def test_each_solver_has_a_look_of_its_own_that_of_the_figures_where_there_is_one():
     names = [*figures.STYLES, "a solver without a style", "a second one", "a third one"]
-    looks = compare_page.looks(reversed(names))
+    looks = compare_page.looks({name: name for name in reversed(names)})
     assert len({tuple(look.values()) for look in looks.values()}) == len(names)
     for name in ("auto", "DOP853 (twoloop)", "IDA from C, stabilised"):
         assert looks[name]["color"] == figures.style(name)["color"]
     assert looks["BDF"] == {"color": figures.style("BDF")["color"], "point": "cross", "rotation": 0}
+
+
+def test_solvers_have_the_names_of_the_figures(folder):
+    """By what the default does on each mechanism; where that is not known, with the option."""
+    path = folder / "work_precision.csv"
+    path.write_text(path.read_text().replace("RadauIIA5", "auto").replace("BDF", "auto, compiled"))
+    rows = compare_page.read(folder)[0]
+    assert set(rows["solver"]) >= {"compiled=True", "compiled=False"}
+    rivals = {"mechanisms": [{"case": "crane"}, {"case": "hoist"}], "with_code": ["crane"]}
+    told = {"cases": [{"name": "swing"}], "rivals": rivals}
+    (folder / "work_precision.json").write_text(json.dumps(told))
+    rows = compare_page.read(folder)[0]
+    names = {case: set(own["solver"]) for case, own in rows.groupby("case")}
+    assert names["swing"] == {"the default"} and {"the default", "compiled=False"} < names["crane"]
+    assert set(rows.loc[rows["solver"] == "the default", "look"]) == {"auto"}
 
 
 def test_it_opens_on_the_four_bar(folder):
@@ -179,10 +194,10 @@ def test_it_opens_on_the_four_bar(folder):
 def test_the_first_view_has_the_best_of_ours_and_of_others(folder, played):
     (first,) = played(made(folder), "")
     # not the runs that failed, lost the motion or are below the floor; Newmark is beaten in both, error and cost
-    assert points(first) == {"Adams": [[1e-8, 0.2], [1e-4, 0.02]], "IDA <C>": [[2e-4, 0.5]]}
+    assert points(first) == {"RadauIIA5": [[1e-8, 0.2], [1e-4, 0.02]], "IDA <C>": [[2e-4, 0.5]]}
     assert [line["dashed"] for line in first["lines"]] == [False, True]
     assert first["lines"][0]["told"][1] == [
-        "Adams, tol 1e-4",
+        "RadauIIA5, tol 1e-4",
         "error 1e-4",
         "0.02 s, 100 evaluations",
         "called from compiled",
@@ -196,7 +211,7 @@ def test_the_first_view_has_the_best_of_ours_and_of_others(folder, played):
 
 def test_choices(folder, played):
     acts = f"""
-change("solvers", "Adams", false); change("solvers", "BDF", true); press("none"); press("all"); press("best");
+change("solvers", "RadauIIA5", false); change("solvers", "BDF", true); press("none"); press("all"); press("best");
 change("error", "energy"); change("cost", "n_evaluations");
 change("mechanism", "{SWING}"); change("mechanism", "{SHORT}");
 """
@@ -204,14 +219,14 @@ change("mechanism", "{SWING}"); change("mechanism", "{SHORT}");
     assert list(points(hidden)) == list(points(with_bdf)) == ["IDA <C>"]  # the run of BDF is below the floor
     assert "show=IDA" in hidden["address"] and "show=BDF" in with_bdf["address"] and "show" not in best["address"]
     assert not none["lines"] and "No run of the solvers chosen" in none["title"][1] and none["runs"].count("<tr>") == 1
-    assert list(points(everything)) == ["Adams", "IDA <C>", "Newmark"]
+    assert list(points(everything)) == ["RadauIIA5", "IDA <C>", "Newmark"]
     assert everything["runs"].count("<tr>") == 1 + 7 and "but lost the motion" in everything["runs"]
-    assert list(points(best)) == ["Adams", "IDA <C>"]
-    assert list(points(energy)) == ["Adams", "BDF"]  # no floor for energies
+    assert list(points(best)) == ["RadauIIA5", "IDA <C>"]
+    assert list(points(energy)) == ["RadauIIA5", "BDF"]  # no floor for energies
     assert energy["axes"] == [compare_page.MEASURES["energy"], compare_page.COSTS["call_s"]]
     assert counts["axes"] == [compare_page.MEASURES["energy"], compare_page.COSTS["n_evaluations"]]
     assert (
-        points(swing) == points(short) == {"Adams": [[1e-6, 50]]}
+        points(swing) == points(short) == {"RadauIIA5": [[1e-6, 50]]}
     )  # runs of another length are not among those of 9 s
     assert swing["mechanism"] == SWING and swing["solvers"].count("<input") == 1
 
@@ -222,15 +237,15 @@ def test_a_view_can_be_linked_to(folder, played):
         path, f'change("error", "energy"); change("mechanism", "{CRANE}"); change("solvers", "BDF", false);'
     )
     (again,) = played(path, "", address=last["address"])
-    assert again == last and list(points(again)) == ["Adams"]
+    assert again == last and list(points(again)) == ["RadauIIA5"]
     (unknown,) = played(path, "", address="#mechanism=x&error=constructor&show=y")
-    assert list(points(unknown)) == ["Adams", "IDA <C>"]
+    assert list(points(unknown)) == ["RadauIIA5", "IDA <C>"]
 
 
 def test_what_the_library_does_in_a_browser(folder):
     """The run under the pointer is told, a drag zooms, the button goes back, and a picture is saved."""
     *_, found = in_chromium(made(folder), POINTER)
-    assert found["drawn"] == [*bytes.fromhex(figures.style("Adams")["color"][1:]), 255]
+    assert found["drawn"] == [*bytes.fromhex(figures.style("RadauIIA5")["color"][1:]), 255]
     assert found["pointed"] == ["tol 1e-4"]
     x0, x1, y0, y1 = found["whole"]
     assert x0 < found["zoomed"][0] < 1e-4 < found["zoomed"][1] < x1

@@ -9,9 +9,9 @@ import pandas as pd
 import pytest
 
 from studies.bench.cli import Call
-from studies.bench.collector import attempt
+from studies.bench.collector import REPEATS, attempt
 from studies.bench.render import render
-from studies.bench.solvers import CVODE_C, CVODES, DEFAULT, DIFFRAX, HEYOKA, IDA_C, IRK, OWN_BDF, OWN_EXPLICIT
+from studies.bench.solvers import CVODE_C, CVODES, DEFAULT, DIFFRAX, HEYOKA, IDA_C, IRK, OWN_EXPLICIT
 from studies.bench.store import Output
 from studies.energy import study as energy
 from studies.energy.drift import DRIFTS, IRREGULAR, IS_LOST, NO_DRIFT, ROUNDS, SLOWLY, drift, verdict, windows
@@ -27,6 +27,7 @@ from studies.energy.runs import (
     ONE,
     QUICK,
     RADAU,
+    REPEATED,
     SUN,
     SWITCHING,
     H,
@@ -171,17 +172,52 @@ def test_all_controlled_runs_drift_or_not(rows, found_of):
     assert found["paper"]["one"]["calm"] and found["paper"]["switching"]["calm"]
 
 
-def test_freedom_from_drift_pays_where_it_is_cheaper(rows, found_of):
+def repeated(rows, seconds=None):
+    """The rows with five repetitions each, of times that scatter by half a percent."""
+    rows = rows if seconds is None else rows.assign(call_s=seconds)
+    times = [tuple(call_s * (1.0 + 1e-3 * k) for k in range(5)) for call_s in rows["call_s"]]
+    return rows.assign(times=pd.Series(times, rows.index, dtype=object), repeats=5)
+
+
+def long_found(rows):
+    return energy.findings_of(rows)["long"]
+
+
+def test_freedom_from_drift_pays_where_it_is_cheaper(rows):
     where = f"case == '{SWITCHING}'"
     rows = changed(rows, where, slope=1.0, slope_error=0.0, call_s=1.0, energy=1e-9)
     even = f"{FIXED}'{SWITCHING}' and solver == '{GAUSS}' and partition == 'symmetric'"
     pays = changed(rows.copy(), even, slope=0.0, call_s=0.1)
-    found = found_of(pays)["long"]
+    found = long_found(repeated(pays))
     assert found["n_pays"] == len(found["at"]) == 3 and found["no_drift"]["others"] is None
-    for cpu, equal in ((0.95, 3), (1.05, 3), (10.0, 0)):
-        found = found_of(changed(pays, even, call_s=cpu))["long"]
-        assert (found["n_pays"], found["n_equal"]) == (0, equal)
-    assert found_of(changed(pays, where, slope=1.0))["long"]["no_drift"]["ours"] is None
+    for cpu, undecided in ((0.98, 3), (1.02, 3), (10.0, 0)):
+        found = long_found(repeated(changed(pays, even, call_s=cpu)))
+        assert (found["n_pays"], found["n_undecided"]) == (0, undecided)
+    assert long_found(repeated(changed(pays, where, slope=1.0)))["no_drift"]["ours"] is None
+
+
+def test_times_of_energy_are_ranked_by_the_rule_of_the_other_comparisons(rows):
+    """Five repetitions, beyond 5 %, also against runs whose error is a little too large; a single run ranks nothing."""
+    here = rows["case"] == SWITCHING
+    rows = changed(rows, f"case == '{SWITCHING}'", energy=1e-9, slope=1.0, slope_error=0.0)
+    ours = rows["family"] == "two-loop"
+    for seconds, ranked in ((1.0, "ahead"), (3.0, "behind"), (2.0, "undecided")):
+        made = rows.assign(call_s=np.where(ours, seconds, 2.0))
+        assert {at["verdict"] for at in long_found(repeated(made))["at"]} == {ranked}
+        assert {at["verdict"] for at in long_found(made.assign(repeats=1))["at"]} == {"undecided"}
+    level = 1e-5 * float(rows.loc[here, "kinetic"].iloc[0])
+    near = rows.index[here & ~ours & (rows["solver"] == IDA_C)][:1]
+    made = repeated(made.assign(call_s=np.where(ours, 1.0, 2.0)))
+    made.loc[near, "energy"], made.loc[near, "call_s"] = 1.1 * level, 1.0
+    made.at[near[0], "times"] = (1.0,) * 5
+    assert [at["verdict"] for at in long_found(made)["at"]] == ["ahead", "undecided", "ahead"]
+
+
+def test_what_sets_the_price_is_repeated():
+    listed = list(runs(False))
+    assert {run.repeats for run in listed if run.case.name == ONE} == {1}
+    assert {run.solver.name for run in listed if run.repeats == REPEATS} == set(REPEATED)
+    assert all(run.repeats == 1 for run in runs(True))
 
 
 def test_failed_and_lost_runs_are_found(rows, found_of):
@@ -195,9 +231,9 @@ def test_failed_and_lost_runs_are_found(rows, found_of):
 
 
 def test_the_run_of_least_error_stands_for_a_solver(rows):
-    more = rows[rows["solver"] == OWN_BDF].assign(tol=1e-7, energy=1e-12)
+    more = rows[rows["solver"] == OWN_EXPLICIT].assign(tol=1e-7, energy=1e-12)
     found = energy.findings_of(pd.concat([rows, more], ignore_index=True))["long"]["alternatives"]
-    assert [run["label"] for run in found if run["solver"] == OWN_BDF] == ["BDF, tol 1e-7"]
+    assert [run["label"] for run in found if run["solver"] == OWN_EXPLICIT] == ["DOP853, compiled=False, tol 1e-7"]
 
 
 def test_a_run_that_does_not_converge_is_a_row():

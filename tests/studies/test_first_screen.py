@@ -11,8 +11,8 @@ import pytest
 
 from studies.bench import headline, index, tables
 from studies.bench.collector import Case
+from studies.bench.names import call
 from studies.bench.render import number, render
-from studies.bench.takes import call
 from studies.honesty import study as honesty
 from studies.honesty.traps import FORCE
 from studies.table3 import study as table3
@@ -87,7 +87,7 @@ def of_honesty():
     fewer = rows[rows["outcome"] != honesty.SILENT]
     held_out = {"trust": honesty.trust_in(fewer), "solvers": honesty.totals(fewer)}
     held_out["ran"] = [kind for kind in honesty.KINDS[:-1] if held_out["trust"][kind]["n"]]
-    forces = {"n_families": 17, "n_gusts": 4, "mechanisms": ["a", "b", "c"]}
+    forces = {"n_families": 17, "n_gusts": 4, "n_frictions": 2, "mechanisms": ["a", "b", "c"]}
     made = {"n_traps": 23, "looseness": 1e3, "exact": 1e-3, "off": 1e-5, "usual": 1e-8}
     made |= {"forces": forces, "forces_only": ["auto, compiled (twoloop)"] * 14}
     forces["trust"] = honesty.trust_in(rows)

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from studies.bench import render
-from studies.bench.render import code, listed, number, percent, power, table
+from studies.bench.render import listed, number, percent, power, table
 
 
 @pytest.mark.parametrize(
@@ -37,7 +37,6 @@ def test_numbers_have_two_digits_and_one_exponent_style(value, text):
 
 def test_other_styles():
     assert number(3.4449, 3) == "3.44" and power(1e-9) == "1e-9" and power(0.01) == "1e-2" and percent(0.123) == "12 %"
-    assert (code("TRBDF2"), code("the default")) == ("`TRBDF2`", "the default")
     assert [listed(words) for words in ([], ["a"], ["a", "b"], ["a", "b", "c"])] == [
         "none",
         "a",

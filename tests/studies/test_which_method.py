@@ -5,7 +5,7 @@ import json
 import pytest
 
 from studies.bench.store import WHOLE_CALL
-from studies.bench.takes import call, takes
+from studies.bench.takes import takes
 from studies.which_method import page, table
 from tests.studies.test_index import energy
 
@@ -37,7 +37,10 @@ def test_a_line_for_each_method_of_ours_best_first(text_of):
     good = SOLVER | {"solver": "DOP853 (twoloop)"}
     text = text_of([bad, good, SOLVER | {"solver": "IDA", "family": "SUNDIALS"}], {"DOP853 (twoloop)": COUNTS})
     lines = [line for line in text.splitlines() if line.startswith("| `")][:2]
-    assert lines == ["| `DOP853` | 9 | 1 | 0 | 0.10 | 3 |", "| `BDF` | 9 | 1 | 3 | 0.10 | – |"] and "`IDA`" not in text
+    assert (
+        lines == ['| `method="DOP853"` | 9 | 1 | 0 | 0.10 | 3 |', '| `method="BDF"` | 9 | 1 | 3 | 0.10 | – |']
+        and "`IDA`" not in text
+    )
 
 
 def test_the_default_has_its_own_traps(text_of):
@@ -48,32 +51,19 @@ def test_the_default_has_its_own_traps(text_of):
 @pytest.mark.parametrize(
     ("changed", "said", "unsaid"),
     [
-        ({}, "Never wrong at the end of a run: `Gauss12`.", "None of the methods"),
+        ({}, 'Never wrong at the end of a run: `method="Gauss12"`.', "None of the methods"),
         ({"wrong": 1}, "None of the methods is right on every run", "Never wrong"),
         ({"ratio": 0.5}, "The median error stays below the tolerance", "set a smaller"),
-        ({"ratio": 5.0}, "The error exceeds the tolerance in the median of `Gauss12`: set a smaller", "stays below"),
+        (
+            {"ratio": 5.0},
+            'The error exceeds the tolerance in the median of `method="Gauss12"`: set a smaller',
+            "stays below",
+        ),
     ],
 )
 def test_sentences_follow_the_findings(text_of, changed, said, unsaid):
     text = text_of([SOLVER | {"solver": "Gauss12"} | changed])
     assert said in text and unsaid not in text and "traps" not in text
-
-
-@pytest.mark.parametrize(
-    ("solver", "without", "with_code"),
-    [
-        ("auto", "the default", "`compiled=False`"),
-        ("auto, compiled", "`compiled=True`", "the default"),
-        ("DOP853 (twoloop)", '`method="DOP853"`', '`method="DOP853", compiled=False`'),
-        ("Taylor, compiled", '`method="Taylor", compiled=True`', '`method="Taylor"`'),
-        ("TRBDF2", '`method="TRBDF2"`', '`method="TRBDF2"`'),
-        ("DOP853, projected", "`DOP853, projected`", "`DOP853, projected`"),  # SciPy's
-        ("heyoka", "`heyoka`", "`heyoka`"),
-    ],
-)
-def test_a_solver_is_asked_for_as_a_user_does(solver, without, with_code):
-    """On mechanisms for which the default makes no code, and on those for which it does."""
-    assert (call(solver), call(solver, coded=True)) == (without, with_code)
 
 
 def test_the_table_has_a_row_for_each_class_with_the_cheapest():

@@ -1,0 +1,56 @@
+"""How figures, tables and sentences call a solver: the one mapping from the names of rows, which CSV files keep.
+
+Of `method="auto"` there are three ways, "the default", "compiled=True" and "compiled=False"; other methods of ours have
+the value of `method`, with `compiled` where it is not what `solve_dae` does by itself. Rivals have their names.
+"""
+
+from studies.bench.solvers import COMPILED, DEFAULT, GIVEN, OWN_EXPLICIT
+from twoloop.methods.presets import PRESETS
+
+SUFFIX = " (twoloop)"  # of ours, where a rival has such a name, too
+WITH, WITHOUT = "compiled", "not compiled"  # after a comma, of rows; without either: as a study runs its methods
+PLAIN = {OWN_EXPLICIT if method == "DOP853" else method: made for made, method in COMPILED.items()}
+OTHERS = {  # of studies that run few of ours
+    "solve_dae, compiled, one by one": "compiled=True, one by one",
+    "twoloop, default": f"twoloop, {GIVEN}",
+}
+
+
+def _parts(solver: str) -> tuple[str, str] | None:
+    """Method and word on code of a row of ours."""
+    method, _, word = solver.removesuffix(SUFFIX).partition(", ")
+    return (method, word) if method in PRESETS and word in ("", WITH, WITHOUT) else None
+
+
+def label(solver: str, coded: bool | None = None) -> str:
+    """A solver in figures and tables.
+
+    `coded`: whether `solve_dae` by itself makes code for the mechanism; None: for some of those that are meant.
+    """
+    parts = _parts(solver)
+    if parts is None:
+        return OTHERS.get(solver, solver.removesuffix(SUFFIX))
+    method, word = parts
+    words = [] if method == DEFAULT else [method]
+    if word == WITHOUT or (method in COMPILED.values() and (word == WITH) is not coded):
+        words.append(f"compiled={word == WITH}")
+    return ", ".join(words) or GIVEN
+
+
+def call(solver: str, coded: bool | None = None) -> str:
+    """The same in sentences, as code: what a user writes where it is one of ours."""
+    text, parts = label(solver, coded), _parts(solver)
+    if text == GIVEN:
+        return text
+    if parts is None or parts[0] == DEFAULT:
+        return f"`{text}`"
+    method, _, option = text.partition(", ")
+    return f'`method="{method}"{", " * bool(option)}{option}`'
+
+
+def looks_like(solver: str, coded: bool | None = None) -> str:
+    """The row whose colour and marker a solver has: what is called without `compiled` looks the same everywhere."""
+    if not coded:
+        return solver
+    swapped = PLAIN | {made: plain for plain, made in PLAIN.items()}
+    return swapped.get(solver, solver)
