@@ -21,7 +21,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
 from studies.bench.names import label, looks_like
-from studies.bench.solvers import CATALOGUE, COMPILED, DEFAULT, GEAR_ORDERS, HEYOKA, IRK, IRK_LINE, gear
+from studies.bench.solvers import CATALOGUE, COMPILED, DEFAULT, GEAR_ORDERS, GIVEN, HEYOKA, IRK, IRK_LINE, gear
 from studies.bench.store import Output
 from studies.bench.tables import astray, setting_of, time_for, used
 from twoloop.rows.equal_error import DECADE
@@ -167,6 +167,11 @@ def lines_of(rows: pd.DataFrame, targets: Sequence[float]) -> list[str]:
     return [*first, *(name for name in dict.fromkeys(ours["solver"]) if name in chosen), *rivals]
 
 
+def default_first(solvers: Iterable[str], coded: bool | None) -> list[str]:
+    """The solvers in the order of a legend, each once; `coded`: as `names.label` has it."""
+    return sorted(dict.fromkeys(solvers), key=lambda name: label(name, coded) != GIVEN)
+
+
 def _winners(rows: pd.DataFrame, targets: Sequence[float]) -> list[str]:
     """The cheapest solver at each of the targets that any reaches."""
     best = (cheapest_lines(rows, (target,), 1) for target in targets)
@@ -203,7 +208,7 @@ def work_precision(
     if len(solvers) > MOST_LINES:
         raise ValueError(f"a work-precision figure has at most {MOST_LINES} lines; given {len(solvers)}")
     figure, (left, right) = plt.subplots(1, 2, figsize=(9.2, 3.8), sharex=True, layout="constrained")
-    for solver in solvers:
+    for solver in default_first(solvers, coded):
         runs = with_gaps(rows[rows["solver"] == solver])
         known = runs[runs["error_q"].notna()]
         if known.empty:

@@ -252,12 +252,12 @@ def picture(rows: pd.DataFrame) -> Figure:
     figure, axes = plt.subplots(figsize=(7.6, 4.4), layout="constrained")
     priced = (headline.price(rows.assign(t_end=0.0), rows[:0], HEADLINE) or {"lines": []})["lines"]
     named, once = [at["solver"] for line in priced for at in line["at"] if at["solver"]], []
-    for solver in dict.fromkeys([*figures.lines_of(rows, SHOWN), *named]):
+    for solver in figures.default_first([*figures.lines_of(rows, SHOWN), *named], coded=True):
         line = figures.with_gaps(rows[rows["solver"] == solver])
         look = figures.look(line[line["error_q"].notna()].iloc[0], coded=True)
         axes.plot(line["error_q"].astype(float), 1e3 * line["call_s"].astype(float), **look)
         once += [line[line["repeats"] == 1]] if "repeats" in line else []
-    single = pd.concat(once) if once else rows[:0]
+    single = pd.concat(once).dropna(subset=["error_q"]) if once else rows[:0]
     alone: dict[str, Any] = {"linestyle": "", "marker": "+", "color": "black", "markersize": 10, "markeredgewidth": 0.8}
     alone |= {"zorder": 4}
     if len(single):

@@ -210,7 +210,8 @@ def test_times_of_energy_are_ranked_by_the_rule_of_the_other_comparisons(rows):
     made = repeated(made.assign(call_s=np.where(ours, 1.0, 2.0)))
     made.loc[near, "energy"], made.loc[near, "call_s"] = 1.1 * level, 1.0
     made.at[near[0], "times"] = (1.0,) * 5
-    assert [at["verdict"] for at in long_found(made)["at"]] == ["ahead", "undecided", "ahead"]
+    verdicts = [at["verdict"] for at in long_found(made)["at"]]
+    assert verdicts == ["undecided", "undecided", "ahead"]  # it is good enough, nearly good enough, and not
 
 
 def test_what_sets_the_price_is_repeated():

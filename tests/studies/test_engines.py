@@ -68,10 +68,10 @@ def test_where_our_calls_cost_more_is_said():
     over = found["call_over_engines"]
     assert over["twoloop, default"] == {"four-bar": pytest.approx(0.1), "RSSR": pytest.approx(10.0)}
     assert over["twoloop, compiled=True"] == {"four-bar": pytest.approx(0.01), "RSSR": None}
-    assert "- `twoloop, default`: no slower on 1, slower on RSSR (10 times)." in text
+    assert "- `twoloop, the default`: no slower on 1, slower on RSSR (10 times)." in text
     assert "- `twoloop, compiled=True`: no slower on 1, not compared on RSSR." in text
     assert found["wins_engines"][1] == {"MuJoCo": 2}  # of engines alone
-    assert "| twoloop, default |" in text and "| twoloop, compiled=True |" not in text
+    assert "| twoloop, the default |" in text and "| twoloop, compiled=True |" not in text
 
 
 def test_a_mechanism_without_code_is_a_row(monkeypatch):

@@ -160,9 +160,8 @@ def test_trust_is_counted_over_mistakes_and_forces():
     assert {name: each["wrong"] for name, each in found["trust"].items()} == wrong
     assert "| our 1 other methods | 0 | 0 | 0 | 2 | 0 | 1 |" in text
     assert "| some of these with `compiled` set | 0 | 0 | 0 | 2 | 0 | 1 |" in text
-    for who in ("SciPy", "other projects' solvers together"):
-        assert f"| {who} | 0 | 0 | 0 | 2 | 0 | 1 |" in text
-    assert "| the same with `max_step` | 0 | 0 | 0 | 2 | 0 | 0 |" in text and "| heyoka |" not in text
+    assert "| SciPy | 0 | 0 | 0 | 2 | 0 | 1 |" in text and "| heyoka |" not in text
+    assert "| other projects' solvers with `max_step` | 0 | 0 | 0 | 2 | 0 | 0 |" in text
     line = found["forces"]["families"][0]
     assert line["ours"][honesty.SILENT] == 2 and line["others"][honesty.RIGHT] == line["limited"][honesty.RIGHT] == 1
 
@@ -192,7 +191,7 @@ def test_a_force_that_was_never_evaluated_stays_among_the_wrong_ones():
     assert (found["trust"]["default"]["wrong"], found["trust"]["default"]["unasked"]) == (1, 1)
     assert (found["trust"]["others"]["wrong"], found["trust"]["others"]["unasked"]) == (2, 1)
     assert found["traps"][0]["silent"] == [OURS, THEIRS]
-    assert "| a | 1/0/2 | 1/0/0 | the default; LSODA, index 1 |" in text
+    assert "| a | 1/0/2 | 1/0/0 |" in text
     assert "- Of ours 1 run is silently wrong or hangs: a." in text and "None of ours is silently wrong or" not in text
     assert "In 2 silently wrong runs under a 1 ms pulse, the force was never evaluated" in text
 
@@ -216,7 +215,7 @@ def test_a_refusal_is_no_run(message):
     found, text = said(honesty, rows)
     assert found["trust"]["set"]["n"] == found["trust"]["set"]["refused"] == 1
     words = "some of these with `compiled` set"
-    assert f"| {words} | 0 | 0 | 0 | 1 | 0 | 0 |" in text and f"1 of {words}." in text
+    assert f"| {words} | 0 | 0 | 0 | 1 | 0 | 0 |" in text and "1 of ours with `compiled` set." in text
 
 
 def test_what_a_refusal_says_is_what_is_said():

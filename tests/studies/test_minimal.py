@@ -52,7 +52,7 @@ def test_without_rows_nothing_is_said():
 @pytest.mark.parametrize(("time", "faster", "slower"), [(0.5, 1, 0), (3.0, 0, 1)])
 def test_the_report_says_what_the_rows_say(time, faster, slower):
     text = stated(1.0, minimal=minimal.findings_by_kind(in_angles(time), everywhere()))
-    said = f"(four-bar) | 1 | {faster} | {slower} | {number(time)} to {number(time)} ({number(time)}) | 0 of 0 |"
+    said = f"closed form | 1 | {faster} | {slower} | {number(time)} to {number(time)} ({number(time)}) | 0 of 0 |"
     assert "## Should I use a DAE at all?" in text and said in text
     assert "Should I use a DAE" not in stated(1.0)
 

@@ -59,9 +59,9 @@ def test_of_beams_two_are_named_where_neither_is_cheaper():
     at = {"error": 1e-3, "verdict": "undecided", "best": best, "ours": {"solver": "TRBDF2"}, "others": THEIRS}
     found = {"cases": [{"name": "moderately stiff", "at": [at, at | {"error": 1e-4, "verdict": "behind"}]}]}
     (row,) = takes({"beam": found}, [])
-    assert row["take"] == '`method="TRBDF2"` or `heyoka` (1e-3 m at tol 0.10), `heyoka` (1e-4 m at tol 0.10)'
+    assert row["take"] == '`method="TRBDF2"` or `heyoka` (1e-3 m), `heyoka` (1e-4 m)'
     found["cases"][0]["at"] = [at | {"verdict": "behind", "ties": ["Adams"]}]
-    assert takes({"beam": found}, [])[0]["take"] == '`heyoka` or `method="Adams"` (1e-3 m at tol 0.10)'
+    assert takes({"beam": found}, [])[0]["take"] == '`heyoka` or `method="Adams"` (1e-3 m)'
 
 
 def test_an_ode_is_advised_only_where_it_is_faster_more_often():
@@ -73,7 +73,7 @@ def test_an_ode_is_advised_only_where_it_is_faster_more_often():
     def told(**counts):
         return takes({"work_precision": {"minimal": [minimal | counts]}}, [])
 
-    wrong = "`CVODE` silently wrong by over 0.10 m or rad in 3 of 50 runs, others in 0 of 20"
+    wrong = "`CVODE` silently wrong by over 0.10 in 3 of 50 runs, others in 0 of 20"
     said = f"faster in 23, slower in 1 of 24 comparisons; {wrong}"
     assert told() == [{"what": "pendulums", "take": f"an ODE in angles by `CVODE` ({said})"}]
     assert told(n_behind=1, n_ahead=23) == []
