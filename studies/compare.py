@@ -145,7 +145,7 @@ def report(
         "work": table(header, tables.work_precision(rows, errors, coded=coded)),
         "kept": table([*kept.values()], quality),
     }
-    ready["failed"] = _failed(rows)
+    ready["failed"] = _failed(rows, coded)
     all_rows = [*own, *given["rows"]]
     found = [board for error in errors for board in boards(all_rows, error)] if given["rows"] else []
     ready["beside"] = "\n\n".join(map(str, found)).replace("`", "'")
@@ -155,8 +155,8 @@ def report(
     output.write("compare.md", render("compare", findings, ready, **more))
 
 
-def _failed(rows: pd.DataFrame) -> str:
-    return table(["solver", "setting", "status", "message"], tables.failures(rows))
+def _failed(rows: pd.DataFrame, coded: bool) -> str:
+    return table(["solver", "setting", "status", "message"], tables.failures(rows, coded))
 
 
 def _work(words: Sequence[str] | None) -> None:
@@ -210,7 +210,7 @@ def _work(words: Sequence[str] | None) -> None:
                     rows = collect(runs, kept, partial(beside, outsiders))  # raises without a reference
                 output.save_rows(rows, line)
                 if not (rows["status"] == "REACHED_END").any():
-                    failed = _failed(rows)
+                    failed = _failed(rows, is_small(case.problem.system))
                     raise StudyError(f"no solver reached the end; the first said: {rows['message'].iloc[0]}")
             except StudyError as error:
                 found = {"name": case.name, "why": str(error)}

@@ -329,13 +329,16 @@ def setting(row: Mapping[str, Any]) -> str:
     return next(f"{name} {number(row[name])}" for name in ("h", "err_out", "tol") if pd.notna(row.get(name)))
 
 
-def failures(rows: pd.DataFrame) -> list[list[str]]:
-    """Lines of a table of runs that did not reach the end: solver, setting, status, first sentence of the message."""
+def failures(rows: pd.DataFrame, coded: bool | None = None) -> list[list[str]]:
+    """Lines of a table of runs that did not reach the end: solver, setting, status, first sentence of the message.
+
+    `coded`: as `names.label` has it.
+    """
     lines = []
     for _, row in rows[rows["status"] != "REACHED_END"].iterrows():
         what = [f"{key} {power(row[key])}" for key in ("err_in", "err_out", "tol", "h") if pd.notna(row.get(key))]
         setting = "all" if row["status"] in NOTHING_RUN else ", ".join(what)
         status, message = str(row["status"]).lower().replace("_", " "), str(row["message"]).split(". ")[0]
-        if [row["solver"], setting, status, message] not in lines:
-            lines.append([row["solver"], setting, status, message])
+        if (line := [label(row["solver"], coded), setting, status, message]) not in lines:
+            lines.append(line)
     return lines

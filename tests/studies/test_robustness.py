@@ -129,13 +129,15 @@ def test_sentences_turn_with_the_rows():
     assert "All methods are right from 1e-6 to 1e3 m" in good and "The violation does not grow" in good
     _, bad = said(robustness, rows_of(robustness.SILENT, last=1e-12))
     assert "On the linkages, of all sizes and masses, 2 runs are silently wrong:" in bad
-    assert "with all methods together, 1 of 1 runs is silently wrong (`auto`, drag)." in bad
+    assert "with all methods together, 1 of 1 runs is silently wrong (the default, drag)." in bad
     assert "; 1 is silently wrong by the sensitivity of the motion, at worst with drag: error 0.020 at 1e-4." in bad
     more = pd.concat([rows_of(robustness.SILENT), rows_of(robustness.SILENT).tail(1).assign(error=0.3, value=1.0)])
     _, text = said(robustness, more.reset_index(drop=True))
     assert "at most (0 report failure, 1 silently exceeds 1000" in text
     assert "; 2 are silently wrong by the sensitivity of the motion, at worst with drag: error 0.30 at 1e-4." in text
-    assert "(`auto`, drag in 2 runs)" in text and "All methods are right from" in bad and "from 1e0 to 1e3 m" in bad
+    assert (
+        "(the default, drag in 2 runs)" in text and "All methods are right from" in bad and "from 1e0 to 1e3 m" in bad
+    )
     assert "The violation grows in runs of 10 steps and more with BDF" in bad
 
 
