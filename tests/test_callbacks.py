@@ -99,6 +99,14 @@ def test_what_numba_cannot_compile_takes_two_lines():
     assert caught.value.__suppress_context__  # nor are numba's own hundred lines shown below
 
 
+AT_THE_MARGIN = {"force": lambda t, q, v: np.array([0.0, undefined_name])}  # noqa: F821
+
+
+def test_lines_of_the_source_are_not_taken_for_what_numba_says():
+    with pytest.raises(TypeError, match=r"Numba says: TypingError: NameError: name 'undefined_name' is not defined$"):
+        pendulum(compile=True, **AT_THE_MARGIN)
+
+
 @pytest.mark.parametrize("kind", ["mass", "force", "constraint", "jacobian", "constraint_rate", "gamma"])
 def test_plain_functions_are_sent_to_from_python(kind):
     with pytest.raises(TypeError, match=rf"{kind} must be compiled by @twoloop.callback.*from_python"):

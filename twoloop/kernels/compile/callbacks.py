@@ -343,10 +343,11 @@ def _named(function: Callable[..., Any]) -> str:
     return f"{name!r} ({code.co_filename}, line {code.co_firstlineno})" if code else repr(name)
 
 
-# lines of numba's messages that only lead to another, or show source
+_SOURCE = re.compile(r"^File \".*?^[ ]*\^$", re.MULTILINE | re.DOTALL)  # what numba shows of a file, down to its mark
+# lines of numba's messages that only lead to another
 _LEADING = re.compile(
     r"Failed in |- Resolution failure|During: |File \"|>>> |There (is|are) \d+ candidate|- Of which|Overload (in|of) |"
-    r"With argument|Rejected as|raised from|None$|Tried |This (is usually|error)|<source elided>|\^|Enable logging"
+    r"With argument|Rejected as|raised from|None$|Tried |This (is usually|error)|<source elided>|Enable logging"
 )
 
 
@@ -356,7 +357,7 @@ def _plain(error: Exception) -> str:
 
 def _telling_line(error: Exception) -> str:
     plain = _plain(error)
-    plain = re.sub(r":\s*>>> ", ": ", plain)  # a signature that was not found
+    plain = re.sub(r":\s*>>> ", ": ", _SOURCE.sub("", plain))  # a signature that was not found
     lines = [line.strip() for line in plain.splitlines() if line and not line.startswith("    ")]
     telling = [line for line in lines if line and not _LEADING.match(line) and not line.startswith("def ")]
     return f"{type(error).__name__}: {telling[-1] if telling else plain.strip()[:200]}"
