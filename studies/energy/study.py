@@ -114,9 +114,9 @@ def long_of(rows: pd.DataFrame) -> dict[str, Any]:
         near = ~good & (reached["worst"] <= tables.NEARLY * share * kinetic)
         level: dict[str, Any] = {"share": share, "energy": share * kinetic}
         for name, which in (("no_drift", calm), ("drift", ~calm)):
-            sides = (which & own, which & ~own)
-            level[name] = dict(zip(("ours", "others"), (cheapest(reached[good & side]) for side in sides), strict=True))
-            level[name]["verdict"] = ranked(reached, good, near, *sides)
+            of_us, of_others = which & own, which & ~own
+            level[name] = {"ours": cheapest(reached[good & of_us]), "others": cheapest(reached[good & of_others])}
+            level[name]["verdict"] = ranked(reached, good, near, of_us, of_others)
         times = {name: reached[good & (reached["solver"] == name)]["call_s"] for name in (DEFAULT, OWN_CODE)}
         level["times"] = {name: float(each.min()) for name, each in times.items() if len(each)}
         level["verdict"], free = ranked(reached, good, near, own, ~own), ranked(reached, good, near, calm, ~calm)

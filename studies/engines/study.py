@@ -193,7 +193,7 @@ def figures_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Figure]:
         for each in CONFIGURATIONS:
             line = own[own["solver"] == each.name].assign(value=lambda row: row["h"].fillna(row["tol"]))
             family = NAMES[each.engine]
-            look = {"color": COLORS.get(family), "marker": "osD^v"[markers[family]], "linestyle": "--"}
+            look: dict[str, Any] = {"color": COLORS.get(family), "marker": "osD^v"[markers[family]], "linestyle": "--"}
             look = figures.style(OURS_LIKE[markers[family]]) if each.engine == OURS else look
             markers[family] += 1
             if len(line):
