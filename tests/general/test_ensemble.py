@@ -1,5 +1,7 @@
 """Ensembles: what lanes make of many runs is what single runs make of them, and what they cannot do is made singly."""
 
+import signal
+
 import numpy as np
 import pytest
 
@@ -122,3 +124,19 @@ def test_a_lane_that_fails_says_what_a_single_run_says():
     runs = ensemble(system, (0.0, 1.0), np.tile(q, (3, 1)), v)
     assert (runs.status < 0).all() and not runs.success.any() and np.isnan(runs.q[:, :, -1]).all()
     assert set(runs.messages) == {0, 1, 2} and "0 of 3 runs" in runs.message
+
+
+def test_ctrl_c_ends_all_runs_and_not_one(interruptible):
+    q, v, parameters = drawn(6)
+    begun = []
+
+    def force(t, q, v, p):
+        if t > 0.1:
+            begun.append(p[2])
+            if p[2] == parameters[2, 2]:
+                signal.raise_signal(signal.SIGINT)
+        return np.array([0.0, -9.81])
+
+    with pytest.raises(KeyboardInterrupt):
+        ensemble(system_of(parameters, force=force), SPAN, q, v, parameters=parameters)
+    assert set(begun) == set(parameters[:3, 2])

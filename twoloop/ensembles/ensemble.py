@@ -15,6 +15,7 @@ from twoloop.ensembles.starts import Starts, all_starts, far_off, system_of
 from twoloop.generate.tracing import Untraceable
 from twoloop.problem.system import ConstrainedSystem, check_system
 from twoloop.result.result import Result
+from twoloop.run.record import Status
 from twoloop.solve import check_method, solve_dae
 
 Integers = NDArray[np.int64]
@@ -77,6 +78,8 @@ def ensemble(
     ------
     TypeError, ValueError
         If an argument is wrong, naming it, or a start is not consistent, naming the run.
+    KeyboardInterrupt
+        At Ctrl-C. Nothing is kept.
 
     Notes
     -----
@@ -103,6 +106,8 @@ def ensemble(
 
     def single(run: int) -> Result:
         result = _alone(system, starts, run, (t0, t1), options)
+        if result.status is Status.INTERRUPTED:  # as in lanes, and not of this run alone
+            raise KeyboardInterrupt
         q[run, :, : len(result.t)], v[run, :, : len(result.t)] = result.q, result.v
         q[run, :, len(result.t) :], v[run, :, len(result.t) :] = np.nan, np.nan
         status[run], n_steps[run] = int(result.status), result.stats.n_accepted or 0
