@@ -10,6 +10,7 @@ from typing import Any
 from studies.bench import tables
 from studies.bench.cli import StudyError
 from studies.bench.headline import BEST
+from studies.bench.kinds import by_kind
 from studies.bench.render import number, power, render
 from studies.bench.store import TIMED, WHOLE_CALL, Output
 from studies.bench.takes import takes
@@ -140,6 +141,7 @@ def rendered(template: str, found: dict[str, dict[str, Any]], **more: Any) -> st
     """A template of what all studies found, with the classes of problems, what to take, and further names."""
     entries = classes(found)
     more |= {"classes": entries, "cases": cases_of(found), "takes": takes(found, entries)}
+    more["by_kind"] = by_kind(found.get("work_precision", {}))
     return render(template, found, {}, default=found.get("work_precision", {}).get("default", ""), **more)
 
 

@@ -178,6 +178,7 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     found["with_code"] = [each["case"] for each in made if given_on(each["case"]) == headline.OWN_CODE]
     ranges = {name: _within(made, name, errors) for name, errors in RANGES.items()}
     found |= {"rounding": ranges.pop(ROUNDING), "ranges": list(ranges.values())}
+    found["reached"] = reached(rows)
     found["typical"] = [each for error in TYPICAL if (each := _typical(made, error)) is not None]
     python = rows[rows["called_from"] == "Python"]["solver"].unique()
     ahead = [at["standing"][headline.BEST] for at in every if at["standing"][headline.BEST]["verdict"] == "ahead"]
@@ -198,7 +199,19 @@ def _within(made: Sequence[dict[str, Any]], name: str, errors: Sequence[float]) 
     own = [each for each in made if ("singular" in each["tags"]) is singular]
     pairs = [[at["standing"] for at in each["at"] if singular or at["error"] in errors] for each in own]
     variants = sorted({each["case"].partition(",")[0] for each in own}) if singular else []
-    return {"name": name, "n_mechanisms": len(own), "of": variants, "standings": headline.counted(pairs)}
+    told = {"name": name, "errors": list(errors), "n_mechanisms": len(own), "of": variants}
+    return told | {"standings": headline.counted(pairs)}
+
+
+def reached(rows: pd.DataFrame) -> dict[str, Any]:
+    """At how many of the errors that any solver reaches at singular positions ours do, the default first."""
+    crossed = rows[rows["case"].map(lambda case: "singular" in tags().get(str(case), ())) & rows["error_q"].notna()]
+    least = crossed.groupby(["case", "solver"])["error_q"].min()
+    errors = [(case, error) for case, own in least.groupby("case") for error in DECADES if own.min() <= error]
+    solvers = crossed.loc[crossed["family"] == "two-loop", "solver"].unique()
+    count = {str(who): sum(least.get((case, who), np.inf) <= error for case, error in errors) for who in solvers}
+    default = sum(least.get((case, given_on(str(case))), np.inf) <= error for case, error in errors)
+    return {"n": len(errors), "default": default, "by": dict(sorted(count.items(), key=lambda item: -item[1]))}
 
 
 def _typical(made: Sequence[dict[str, Any]], error: float) -> dict[str, Any] | None:
