@@ -45,7 +45,7 @@ SHOWN = DECADES[::2]  # by which the lines of the picture are chosen
 HEADLINE = "four-bar"
 MARKS = (  # of the cells of the heat map
     "(ratio): undecided, also where a cheaper run just misses the error; ours, others: only they reach it;\n"
-    "ours?: not all rivals were run at such tolerances; –: nobody reaches it; from 1e-11 on, rounding errors count"
+    "ours?: not all rivals were run at such tolerances; –: reached by neither; from 1e-11 on, rounding errors count"
 )
 GEOMETRIES: dict[str, Callable[[], Problem]] = {
     HEADLINE: mechanisms.four_bar,
