@@ -16,7 +16,7 @@ from studies.bench.index import write_index
 from studies.bench.names import label, looks_like
 from studies.bench.render import TEMPLATES
 from studies.bench.row_files import as_runs, rows_of_file
-from studies.bench.solvers import GIVEN
+from studies.bench.solvers import CVODE_C, GIVEN, HEYOKA, IDA_C
 from studies.bench.store import Output, plain, read_rows
 from studies.bench.tables import SETTINGS
 
@@ -28,7 +28,7 @@ MEASURES |= {"violation_q": "largest violation of positions, |C|", "violation_v"
 COSTS = {"call_s": "CPU time of the call (s)", "n_evaluations": "evaluations"}
 DIGITS = 4  # significant, of what the page holds; the CSV files have all
 OPENS = "four-bar, 10 s (work_precision)"
-ALWAYS = (GIVEN, "compiled=True", "compiled=False")  # shown at first beside the best
+ALWAYS = (GIVEN, "compiled=True", "compiled=False", HEYOKA, CVODE_C, IDA_C)  # shown at first beside the best
 POINTS = {  # marker of the figures: shape and rotation (degrees) of the nearest one of the plotting library
     **{"o": ("circle", 0), "s": ("rect", 0), "D": ("rectRot", 0), "p": ("rectRounded", 0), "d": ("rectRounded", 45)},
     **{"^": ("triangle", 0), ">": ("triangle", 90), "v": ("triangle", 180), "<": ("triangle", 270)},
