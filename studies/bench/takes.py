@@ -1,10 +1,9 @@
 """The table "more, take": what is the fastest for long motions, beams, energies and many runs, by its call."""
 
 from collections import Counter, defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from studies.bench.kinds import coded
 from studies.bench.names import call
 from studies.bench.render import listed, number, one_digit, power
 from studies.bench.solvers import DEFAULT, HEYOKA
@@ -12,8 +11,8 @@ from studies.bench.solvers import DEFAULT, HEYOKA
 LONG = "long and conservative"
 ORDERED, SCATTER = ("ahead", "behind"), 1.5  # ratio of ensembles below which other tolerances may turn the order
 BEAMS = {  # of the study of the beam, and their classes
-    "moderately stiff": "stiff beam (tip), vibrations irrelevant",
-    "very flexible": "flexible beam (tip), vibrations wanted",
+    "moderately stiff": "stiff, vibrations irrelevant",
+    "very flexible": "flexible, vibrations wanted",
 }
 NONE, UNCLEAR = "no solver compared reaches these errors", "no clear choice"
 BEAM_CLASSES = ("stiff, vibrations irrelevant", "stiff, vibrations wanted")  # which the beam's report judges by the tip
@@ -22,19 +21,27 @@ BEAM_CLASSES = ("stiff, vibrations irrelevant", "stiff, vibrations wanted")  # w
 def takes(found: Mapping[str, Any], entries: Sequence[dict[str, Any]]) -> list[dict[str, str]]:
     """For each class of problem (`entries`, those of `index.classes`) what is the fastest."""
     made = found.get("work_precision", {})
-    with_code = set(made.get("rivals", {}).get("with_code", []))
+    rivals = made.get("rivals", {})
+    with_code = set(rivals.get("with_code", []))
     classes: dict[str, list[dict[str, Any]]] = defaultdict(list)
     for entry in entries:
         classes[entry["class"]].append(entry)
     rows = [_of_class(name, own, with_code) for name, own in classes.items() if name not in (*BEAM_CLASSES, LONG)]
-    rows += [_by_the_tip(case) for case in found.get("beam", {}).get("cases", []) if case["name"] in BEAMS]
+    tips = [_by_the_tip(case) for case in found.get("beam", {}).get("cases", []) if case["name"] in BEAMS]
+    rows += [{"what": "beams, by the error of the tip", "take": "; ".join(tips)}] * bool(tips)
     over = found.get("energy", {}).get("long", {}).get("calm_ours", {}).get("over_drifting") or ()
     rows += [_of_energy(entry, coded(("four-bar",), with_code), over) for entry in classes[LONG]]
     rows += _at_once(found.get("ensembles", {}).get("cases", []))
     paying = (f"{DEFAULT}, compiled", HEYOKA)
     paid = [_paid(line) for line in made.get("first_calls", []) if line["pays"] and line["solver"] in paying]
     singly = {"what": "many single calls", "take": f"{' and '.join(paid)}, against `compiled=False`"}
-    return rows + [singly] * bool(paid)
+    return rows + _in_angles(made.get("minimal", []), rivals.get("ranges", [])) + [singly] * bool(paid)
+
+
+def coded(cases: Iterable[str], with_code: set[str]) -> bool | None:
+    """Whether the default makes code for mechanisms; None: for some of them."""
+    made = {case in with_code for case in cases}
+    return made.pop() if len(made) == 1 else None
 
 
 def _of_class(name: str, entries: Sequence[dict[str, Any]], with_code: set[str]) -> dict[str, str]:
@@ -60,7 +67,7 @@ def _shares(won: Mapping[str, int], of: str, made: bool | None) -> str:
     return ", ".join(said) or ("no clear choice" if total else "")
 
 
-def _by_the_tip(case: Mapping[str, Any]) -> dict[str, str]:
+def _by_the_tip(case: Mapping[str, Any]) -> str:
     """The cheapest on a beam by the error of its tip; several where none is clearly cheaper."""
     by: dict[frozenset[str], list[str]] = defaultdict(list)
     words: dict[frozenset[str], str] = {}
@@ -73,7 +80,7 @@ def _by_the_tip(case: Mapping[str, Any]) -> dict[str, str]:
             words.setdefault(who, " or ".join(call(name, False) for name in either))
             by[who].append(f"{power(at['error'])} m")
     take = ", ".join(f"{words[who]} ({', '.join(errors)})" for who, errors in by.items())
-    return {"what": BEAMS[case["name"]], "take": take or NONE}
+    return f"{BEAMS[case['name']]}: {take or NONE}"
 
 
 def _of_energy(entry: Mapping[str, Any], made: bool | None, over: Sequence[float]) -> dict[str, str]:
@@ -113,3 +120,44 @@ def _paid(line: Mapping[str, Any]) -> str:
     after = first if first == last else f"{first} to {last}"
     on = f" on {line['n'] - line['never']} of {line['n']} mechanisms" if line["never"] else ""
     return f"{call(line['solver'])} after some {after} calls{on}"
+
+
+def _in_angles(minimal: Sequence[Mapping[str, Any]], ranges: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
+    """An ODE in minimal coordinates beside our best with constraints: loops one by one, pendulums together."""
+    told, by = [], Counter[str]()
+    for kind in minimal:
+        groups: dict[str, list[dict[str, Any]]] = defaultdict(list)
+        for each in kind["mechanisms"]:
+            name = each["case"].partition(",")[0] if kind["kind"] == "loops" else kind["kind"]
+            groups[name] += [at for at in each["at"] if at["ratio"] is not None]
+        told += [f"{name}: {_beside(pairs, ranges)}{_wrong(kind)}" for name, pairs in groups.items() if pairs]
+        by.update(at["rival"]["solver"].partition(",")[0] for pairs in groups.values() for at in pairs)
+    who = f" by `{by.most_common(1)[0][0]}`" if by else ""
+    take = f"an ODE in angles{who}, against our best: {'; '.join(told)}"
+    return [{"what": "mechanisms solvable in closed form", "take": take}] * bool(told)
+
+
+def _beside(pairs: Sequence[Mapping[str, Any]], ranges: Sequence[Mapping[str, Any]]) -> str:
+    """In how many pairs an ODE in minimal coordinates is faster, or slower; by errors where that differs."""
+    words = {"behind": "faster", "ahead": "slower", "undecided": "undecided"}
+    if len({at["verdict"] for at in pairs}) == 1:
+        return f"{words[pairs[0]['verdict']]} in {len(pairs)} of {len(pairs)}"
+    parts = []
+    for each in ranges:
+        verdicts = Counter(at["verdict"] for at in pairs if at["error"] in each["errors"])
+        counts = ", ".join(f"{word} in {verdicts[name]}" for name, word in words.items() if verdicts[name])
+        parts += [f"{counts} of {verdicts.total()} at {each['name']}"] if counts else []
+    return ", ".join(parts)
+
+
+def _wrong(kind: Mapping[str, Any]) -> str:
+    """How often solvers are silently wrong in minimal coordinates, and the others."""
+    start = " from horizontal rest" if kind.get("level") else ""  # where terms of heyoka's series vanish
+    others = kind["asked"] - sum(each["asked"] for each in kind["wrong_by"])
+    told = [
+        f"`{each['solver'].partition(',')[0]}` silently wrong in {each['n']} of {each['asked']} runs{start} at "
+        f"{power(kind['asked_at'])} or tighter"
+        for each in kind["wrong_by"]
+    ]
+    told += [f"others in 0 of {others}"] * bool(told and others)
+    return f" ({', '.join(told)})" if told else ""
