@@ -339,6 +339,6 @@ def failures(rows: pd.DataFrame, coded: bool | None = None) -> list[list[str]]:
         what = [f"{key} {power(row[key])}" for key in ("err_in", "err_out", "tol", "h") if pd.notna(row.get(key))]
         setting = "all" if row["status"] in NOTHING_RUN else ", ".join(what)
         status, message = str(row["status"]).lower().replace("_", " "), str(row["message"]).split(". ")[0]
-        if (line := [label(row["solver"], coded), setting, status, message]) not in lines:
+        if (line := [label(str(row["solver"]), coded), setting, status, message]) not in lines:
             lines.append(line)
     return lines

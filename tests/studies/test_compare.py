@@ -40,7 +40,7 @@ def test_the_page_of_the_docs_runs_outside_the_repository(file, code, monkeypatc
     assert findings["floor"] < 1e-9 and [at["error"] for at in findings["cheapest"]] == [1e-3, 1e-5]
     assert {"compare.png", "compare.svg"} <= {path.name for path in out.iterdir()}
     monkeypatch.setattr(compare.figures, "save", lambda *arguments: None)  # longer than all else of a report
-    monkeypatch.setattr(compare.figures, "work_precision", lambda *arguments: None)
+    monkeypatch.setattr(compare.figures, "work_precision", lambda *arguments, **more: None)
     (out / "compare.md").unlink()
     monkeypatch.chdir(file.parent.parent)
     again = [
