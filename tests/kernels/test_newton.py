@@ -163,9 +163,12 @@ def bounced(stiffness, t):
     return speed * flight - 0.5 * G * flight**2
 
 
-def test_a_stiff_damper_does_not_hide_what_a_contact_leaves_in_the_velocities():
+@pytest.mark.parametrize(
+    ("method", "tol"), [(RungeKutta(radau_iia(3), outer="newton", tested="positions"), 1e-10), ("TRBDF2", 1e-9)]
+)
+def test_a_stiff_damper_does_not_hide_what_a_contact_leaves_in_the_velocities(method, tol):
     """Steps into and out of the contact are so short that the damper decides how long their error seems to last."""
-    method, tol, errors = RungeKutta(radau_iia(3), outer="newton", tested="positions"), 1e-10, []
+    errors = []
     for stiffness in (1e4, 1e5, 1e6):
         for damping in (1e4, 1e5, 1e6):
             system = ConstrainedSystem(
@@ -179,4 +182,5 @@ def test_a_stiff_damper_does_not_hide_what_a_contact_leaves_in_the_velocities():
             )
             result = solve_dae(system, (0.0, 0.8), [0.0, 1.0, 0.0], [1.0, 0.3, 0.0], method, tol, tol)
             errors.append(abs(result.q[1, -1] - bounced(stiffness, 0.8)) if result.success else np.inf)
-    assert max(errors) < 150.0 * tol  # 12; 990 where all of an error is taken to last as long as its fastest part
+    # 12 and 73; 990 and 303 where all of an error is taken to last as long as its fastest part
+    assert max(errors) < 150.0 * tol

@@ -142,3 +142,12 @@ def test_a_trial_comes_in_long_runs_whatever_the_rates(tol):
     result = solve_dae(problem.system, problem.t_span, problem.q0, problem.v0, "auto", tol, tol)
     assert result.success and result.stats.n_evaluations < 100_000  # 4500; 2 million without such a trial
     assert abs(result.q[0, -1] - 0.5 * 1e-5 * np.arctanh(0.1)) < tol
+
+
+@pytest.mark.parametrize(("speed", "tol"), [(1e-4, 1e-5), (1e-3, 1e-4)])
+def test_what_creeps_to_within_the_tolerances_is_found_stiff(speed, tol):
+    """At the limit of stability accelerations change as fast as they decay, but what they move is too little to see."""
+    problem = creeping(speed, 1.0)
+    result = solve_dae(problem.system, problem.t_span, problem.q0, problem.v0, "auto", tol, tol)
+    assert result.success and result.stats.n_evaluations < 5_000  # 600; 200,000 and 18,000 without a trial
+    assert abs(result.q[0, -1] - 0.5 * speed * np.arctanh(0.1)) < 10.0 * tol

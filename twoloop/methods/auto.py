@@ -86,16 +86,16 @@ class Auto:
     hundredth of the run: after 10 steps it goes on without, if the next would be no longer than that. It also goes on
     without where the series is not finite and the functions are.
 
-    After 100 evaluations, and then every 600, the largest rate of the motion is estimated, from the derivatives of
-    the accelerations. The implicit method is tried for 15 steps where the steps have come near the limit of
-    stability that this rate sets (at two looks in a row; at one with `many`, and with `few` from 16 coordinates
-    on), or are above 5 % of it and the rate is more than thirty times that of the motion itself. Unless they are
-    far beyond that limit, this waits until the run has cost three trials, and 64 evaluations for each independent
-    coordinate if tangents have to be differenced, or three tenths of what the run will cost as a whole at its
-    present price are as much. If it is to cost a thousand trials, one is made whatever the rates. The implicit
-    method is kept if a second of motion costs it less, counted in evaluations and Newton matrices: `loose` at
-    tolerances from 3e-5 on, `tightest` below 9e-7, else `tight`. It is left the same way. Counts decide, not times:
-    a run can be repeated.
+    After 100 evaluations, and then every 600, the largest rate of the motion is estimated, from the derivatives of the
+    accelerations. The implicit method is tried for 15 steps where the steps have come near the limit of stability that
+    this rate sets (at two looks in a row; at one with `many`, and with `few` from 16 coordinates on), or are above 5 %
+    of it and the rate is more than thirty times that of the motion itself, or all that could move at this rate is
+    within ten tolerances of velocities. Unless they are far beyond that limit, this waits until the run has cost three
+    trials, and 64 evaluations for each independent coordinate if tangents have to be differenced, or three tenths of
+    what the run will cost as a whole at its present price are as much. If it is to cost a thousand trials, one is made
+    whatever the rates. The implicit method is kept if a second of motion costs it less, counted in evaluations and
+    Newton matrices: `loose` at tolerances from 3e-5 on, `tightest` below 9e-7, else `tight`. It is left the same way.
+    Counts decide, not times: a run can be repeated.
 
     Above 1000 coordinates no implicit method is tried, as its matrices are full; nor is a series where M and C_q have
     more than 200,000 entries together, zeros among them, as it takes seconds to find (method="Taylor" does).

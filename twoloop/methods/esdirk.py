@@ -56,8 +56,8 @@ class ESDIRK:
     formula, of order 3: the difference, filtered for stiff components three times, is L-stable, too. A step is accepted
     when the estimated error of the positions, from the embedded formula and filtered, is within the tolerance, and so
     is the error that the velocities will add to them before it turns back or decays (ten times that if it does so no
-    faster than the motion changes). Vibrations that the steps pass over are damped. Velocities themselves are tested
-    with `tested="all"`.
+    faster than the motion changes), and what is left of it some steps later, over the time in which the motion changes.
+    Vibrations that the steps pass over are damped. Velocities themselves are tested with `tested="all"`.
 
     Parameters
     ----------

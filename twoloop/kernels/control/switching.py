@@ -5,12 +5,13 @@ the accelerations, is found by a few power iterations, one evaluation each. Whil
 rho well below its limit of stability, nothing is stiff. Where h rho has come near it, stiffness or accuracy may be the
 reason: then the implicit method is tried for a window of steps, in which its errors count tenfold, and is kept if a
 second of motion costs it less. So it is where h rho is smaller, but rho far above the rates that the motion shows: what
-decays so fast may keep the estimate of the error from longer steps. A trial that may be in vain waits until the run has
-cost a few times as much, unless the run as a whole is to cost ten times as much at its present price. Where a run is to
-cost a thousand trials, one comes whatever the rates. Costs are counted in evaluations of the explicit method; with code
-made for the mechanism one of the implicit method counts several times. This is left in the same way, after a trial of
-the explicit method, where its own steps have come below that limit. What is not kept is next tried after twice as many
-looks.
+decays so fast may keep the estimate of the error from longer steps; or where all that could move at that rate is about
+the tolerances, as steps at the limit of stability keep it from dying away. A trial that may be in vain waits until the
+run has cost a few times as much, unless the run as a whole is to cost ten times as much at its present price. Where a
+run is to cost a thousand trials, one comes whatever the rates. Costs are counted in evaluations of the explicit method;
+with code made for the mechanism one of the implicit method counts several times. This is left in the same way, after a
+trial of the explicit method, where its own steps have come below that limit. What is not kept is next tried after twice
+as many looks.
 
 Both methods are called by their addresses, and are compiled once, where they are.
 """
@@ -26,7 +27,7 @@ from twoloop.kernels.data.common import ATTEMPT, SETTLE, Attempt, Step, compiled
 from twoloop.kernels.data.counters import N_EVALUATIONS, N_JACOBIANS
 from twoloop.kernels.data.flags import FORCE_BY_Q_GIVEN, FORM, STATIC, STRAIGHT
 from twoloop.kernels.data.noted import EXPLICIT_STEP, REUSE, ROUNDED
-from twoloop.kernels.data.tolerances import ESTIMATE, GAP, LONGEST_UNSEEN
+from twoloop.kernels.data.tolerances import ESTIMATE, GAP, LONGEST_UNSEEN, allowed
 from twoloop.kernels.evaluation.calls import evaluate, renew_partition
 from twoloop.kernels.evaluation.tasks import PROJECT
 
@@ -42,6 +43,7 @@ AFFORDED = 3.0  # trials that the run has cost so far, before one that may be in
 OF_RUN = 0.3  # ... or this share of what the run will cost as a whole, if it goes on as it does
 ANYWAY = 100.0  # ... beside so many times as much, and once more for each trial, it comes whatever the rates
 APART = 30.0  # rates that the motion does not show are as many times as fast as those that it shows ...
+QUIET = 10.0  # tolerances of velocities: what steps at the limit of stability leave of a decay to and fro
 WORTH = 0.05  # ... and h rho this share of LIMIT: steps may be short for the sake of what an implicit method damps
 INSTANT = 1e-4  # over the largest rate: the time over which the motion's own is differenced
 BELOW = 0.4  # of LIMIT: h rho from which down the explicit method is tried again
@@ -204,6 +206,17 @@ def _shown_rate(f, w, t, state, rate, Q, V, A):
 
 
 @compiled
+def _is_quiet(w, tolerances, state, rate):
+    """Whether all that the independents would change by at this rate is about the tolerances."""
+    n = w.Q.size
+    for i in w.independent_v:
+        v = state[n + i]
+        if abs(state[2 * n + i]) > QUIET * rate * allowed(tolerances, i, v, v):
+            return False
+    return True
+
+
+@compiled
 def _cost(w, options):
     """What the run has cost so far, in evaluations."""
     return w.counters[N_EVALUATIONS] + options[MATRIX_COST] * w.counters[N_JACOBIANS]
@@ -264,7 +277,9 @@ def _look(f, w, options, memory, tolerances, t, state, new_state):
     hidden = False
     if memory[PHASE] == EXPLICIT and cheap and share > WORTH:
         Q, V, A = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n]
-        hidden = memory[RATE] > APART * _shown_rate(f, w, t, state, memory[RATE], Q, V, A)
+        hidden = _is_quiet(w, tolerances, state, memory[RATE])
+        if not hidden:
+            hidden = memory[RATE] > APART * _shown_rate(f, w, t, state, memory[RATE], Q, V, A)
     # explicit steps about a speed at which friction turns show its rate at few states
     # and what a run will cost is known once it has left the short steps of its start
     anyway = cheap and cost > afforded and paid > ANYWAY * afforded * (1.0 + memory[N_TRIALS])

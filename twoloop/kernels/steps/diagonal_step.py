@@ -28,10 +28,10 @@ from twoloop.kernels.steps.diagonal_stage import (
     solve_stage,
     stages_of,
 )
-from twoloop.kernels.steps.iteration_matrix import filter_by_iteration
-from twoloop.kernels.steps.lasting import lasting_error
+from twoloop.kernels.steps.iteration_matrix import factor_again, filter_by_iteration
+from twoloop.kernels.steps.lasting import STEPS, lasting_error, over_velocities, own_time
 from twoloop.kernels.steps.newton_memory import block, vector
-from twoloop.kernels.steps.newton_operator import filter_error
+from twoloop.kernels.steps.newton_operator import factor_filter, filter_error
 from twoloop.kernels.steps.stages import INNER_TOL
 
 FILTERED = 3  # times: with fewer the extrapolated method is unstable for vibrations, see tests/kernels/test_diagonal.py
@@ -48,6 +48,14 @@ def _filter(f, w, options, memory, h, e_q, e_v):
         filter_error(f, w, options, memory, one_stage_of(options), h, e_q, e_v)
     for i in range(count):
         e_q[i] += z * e_v[i]
+
+
+@compiled
+def _factor_filter(f, w, options, memory, h):
+    """Factors with which `_filter` is that of steps of h."""
+    if has_dense_tangents(f, w):
+        return factor_again(w, memory, h * gamma_of(options))
+    return factor_filter(f, w, options, memory, one_stage_of(options), h)
 
 
 @compiled
@@ -94,6 +102,25 @@ def _extrapolate(f, w, options, memory, h, q1, v1):
     for i in range(w.independent.size):
         q1[w.independent[i]] -= e_q[i]
         v1[w.independent[i]] -= e_v[i]
+
+
+@compiled
+def _slow_error(f, w, options, memory, h, tolerances, state, new_state):
+    """What an error of the velocities, in E_V, leaves in directions that are slow beside the step, as newton_step."""
+    e_q, e_v = vector(memory, 1, w.Q.size, at.E_Q), vector(memory, 1, w.Q.size, at.E_V)
+    longest = own_time(w, tolerances, state)
+    error = over_velocities(w, tolerances, e_v, longest, state, new_state)
+    if error <= 1.0:
+        return 0.0
+    for i in range(w.independent.size):
+        e_q[i] = 0.0
+    longer = STEPS * h / gamma_of(options)
+    if _factor_filter(f, w, options, memory, longer) == DONE:
+        _filter(f, w, options, memory, longer, e_q, e_v)
+        # where the motion is unstable the system may be nearly singular, and the solution large
+        error = min(error, over_velocities(w, tolerances, e_v, longest, state, new_state))
+    memory[at.H_FACTORED] = 0.0
+    return error
 
 
 @kernel(SETTLE)
@@ -158,6 +185,9 @@ def diagonal_step(f, w, options, memory, t, h, tolerances, state, new_state):
             return Attempt(DONE, error, 0.0)
         if options[options.size - 1] == 1.0:
             _extrapolate(f, w, options, memory, h, q1, v1)
+        error = max(error, _slow_error(f, w, options, memory, h, tolerances, state, new_state))
+        if not error <= 1.0:
+            return Attempt(DONE, error, 0.0)
     keep_predicted(w, q1)
     code = evaluate_state(f, w, t + h, q1, v1, options[INNER_TOL], a1, lam1)
     if code == DONE:

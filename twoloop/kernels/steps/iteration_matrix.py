@@ -47,6 +47,23 @@ def _fill(w, memory, n, m, z, H):
 
 
 @compiled
+def factor_again(w, memory, z):
+    """Factors of the matrix at the last state for another z."""
+    n, m = w.Q.size, w.independent.size
+    numbers = space(w, n, at.FILTER)
+    H = square(numbers, m)
+    w.counters[N_FACTORIZATIONS] += 1
+    _fill(w, memory, n, m, z, numbers)
+    memory[at.SYMMETRIC] = 0.0
+    if _symmetric(H):
+        if ldl_factor(H):
+            memory[at.SYMMETRIC] = 1.0
+            return DONE
+        _fill(w, memory, n, m, z, numbers)  # not definite, as of a compressed beam
+    return DONE if lu_factor(H, pivots_of(memory, 1, n, 0)) > 0.0 else SINGULAR
+
+
+@compiled
 def factor_iteration(f, w, memory, t, q, v, z):
     """Factors of the matrix at a state that was evaluated just before, with its multipliers in w.lam."""
     n = q.size
@@ -68,16 +85,7 @@ def factor_iteration(f, w, memory, t, q, v, z):
     if memory[at.DAMPED] == 1.0:
         reduce(w, K, AT, square(space(w, n, at.BY_V), m))
     reduce(w, w.M, AT, square(space(w, n, at.SYSTEMS), m))
-    w.counters[N_FACTORIZATIONS] += 1
-    _fill(w, memory, n, m, z, numbers)
-    H = square(numbers, m)
-    memory[at.SYMMETRIC] = 0.0
-    if _symmetric(H):
-        if ldl_factor(H):
-            memory[at.SYMMETRIC] = 1.0
-            return DONE
-        _fill(w, memory, n, m, z, numbers)  # not definite, as of a compressed beam
-    return DONE if lu_factor(H, pivots_of(memory, 1, n, 0)) > 0.0 else SINGULAR
+    return factor_again(w, memory, z)
 
 
 @compiled
