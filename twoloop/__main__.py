@@ -27,10 +27,11 @@ THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 TABLES, PICTURES, ANIMATIONS = (".csv", ".parquet"), (".png", ".svg", ".pdf"), (".html", ".gif", ".mp4")
 ENDINGS = (*TABLES, *PICTURES, *ANIMATIONS, ".npz")
 PACKAGES = {  # modules without which such files cannot be written, and the packages that have them
-    ".csv": {"pandas": "pandas"},
-    ".parquet": {"pandas": "pandas", "pyarrow": "pyarrow"},
-    **dict.fromkeys(PICTURES, {"matplotlib": "matplotlib"}),
-    **dict.fromkeys((".gif", ".mp4"), {"PIL": "pillow"}),
+    ".csv": (("pandas", "pandas"),),
+    ".parquet": (("pandas", "pandas"), ("pyarrow", "pyarrow")),
+    ".gif": (("PIL", "pillow"),),
+    ".mp4": (("PIL", "pillow"),),
+    **dict.fromkeys(PICTURES, (("matplotlib", "matplotlib"),)),
 }
 
 
@@ -88,7 +89,7 @@ def solve(given: argparse.Namespace) -> None:
             raise ValueError(f"--out takes files that end in {', '.join(ENDINGS)}; given {str(file)!r}")
         if not file.parent.is_dir():
             raise ValueError(f"--out: there is no folder {file.parent.resolve()}")
-        for module, package in PACKAGES.get(file.suffix.lower(), {}).items():
+        for module, package in PACKAGES.get(file.suffix.lower(), ()):
             needed(module, package, f"--out {file}")
     problem = problem_from(given.where)
     if problem.drawing is None and any(file.suffix.lower() in ANIMATIONS for file in files):
