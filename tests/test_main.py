@@ -155,6 +155,24 @@ def test_mistakes_are_one_line(where, words, says):
     assert end.startswith("error: ") and says in end and "\n" not in end
 
 
+@pytest.mark.parametrize(
+    ("name", "module", "package"),
+    [
+        ("run.csv", "pandas", "pandas"),
+        ("run.parquet", "pyarrow", "pyarrow"),
+        ("run.SVG", "matplotlib", "matplotlib"),
+        ("run.gif", "PIL", "pillow"),
+    ],
+)
+def test_packages_for_the_files_are_looked_for_before_the_run(where, monkeypatch, tmp_path, name, module, package):
+    monkeypatch.setitem(sys.modules, module, None)
+    monkeypatch.setattr("twoloop.__main__.solve_dae", lambda *words, **options: pytest.fail("it ran"))
+    path = tmp_path / name
+    assert ended(["solve", where, "--out", str(path)]) == (
+        f"error: --out {path} needs the package {package}: pip install {package}"
+    )
+
+
 def test_unknown_commands_and_methods_are_usage_errors(where, capsys):
     assert ended([]) == 2 and ended(["solve", where, "--method", "Guass8"]) == 2
     assert "invalid choice: 'Guass8'" in capsys.readouterr().err

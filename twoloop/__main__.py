@@ -14,6 +14,7 @@ from pathlib import Path
 
 from twoloop import Result, __version__, kernels, mechanisms, solve_dae
 from twoloop.audit.mjcf_audit import audit_mjcf, check_ending
+from twoloop.checks.optional import needed
 from twoloop.kernels.compile.caches import folder_of
 from twoloop.mechanisms.user_file import problem_from
 from twoloop.methods.presets import PRESETS
@@ -25,6 +26,13 @@ OPTIONAL = ("pandas", "pyarrow", "matplotlib", "pillow", "rich", "sympy", "dask"
 THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 TABLES, PICTURES, ANIMATIONS = (".csv", ".parquet"), (".png", ".svg", ".pdf"), (".html", ".gif", ".mp4")
 ENDINGS = (*TABLES, *PICTURES, *ANIMATIONS, ".npz")
+PACKAGES = {  # modules without which such files cannot be written, and the packages that have them
+    ".csv": (("pandas", "pandas"),),
+    ".parquet": (("pandas", "pandas"), ("pyarrow", "pyarrow")),
+    ".gif": (("PIL", "pillow"),),
+    ".mp4": (("PIL", "pillow"),),
+    **dict.fromkeys(PICTURES, (("matplotlib", "matplotlib"),)),
+}
 
 
 def info() -> None:
@@ -70,6 +78,8 @@ def solve(given: argparse.Namespace) -> None:
 
     Raises
     ------
+    ImportError
+        If a file needs a package that is not installed.
     ValueError
         If an argument is wrong, or a file cannot be written as asked.
     """
@@ -79,6 +89,8 @@ def solve(given: argparse.Namespace) -> None:
             raise ValueError(f"--out takes files that end in {', '.join(ENDINGS)}; given {str(file)!r}")
         if not file.parent.is_dir():
             raise ValueError(f"--out: there is no folder {file.parent.resolve()}")
+        for module, package in PACKAGES.get(file.suffix.lower(), ()):
+            needed(module, package, f"--out {file}")
     problem = problem_from(given.where)
     if problem.drawing is None and any(file.suffix.lower() in ANIMATIONS for file in files):
         raise ValueError(f"{given.where} makes a problem without a drawing: give it drawing=twoloop.Drawing(...)")
