@@ -75,6 +75,12 @@ class Coefficients:
             self._known[key] = tuple((i, self._number(c)) for i, c in terms), self._number(constant)
         return self._known[key]
 
+    def in_memory(self, values: Iterable[float]) -> int:
+        """Put numbers side by side, also those that may stand in the code; the place of the first."""
+        first = len(self._values)
+        self._values += values
+        return first
+
     def of_form(self, form: Form) -> tuple[Terms, float]:
         """The same of a form."""
         return self.of(tuple(form.terms.items()), form.constant)
@@ -112,9 +118,15 @@ class Coefficients:
                 made_of = value.scale, value.powers
                 self._varying.setdefault(made_of, value)
                 return Coefficient(value, list(self._varying).index(made_of), varies=True)
-        else:
-            near = float(round(value)) if math.isfinite(value) else value
-            if near in IN_THE_CODE and abs(value - near) <= ROUNDING * abs(near):
-                return near
+        elif (near := in_the_code(value)) is not None:
+            return near
         self._values.append(value)
         return Coefficient(value, len(self._values) - 1)
+
+
+def in_the_code(value: float) -> float | None:
+    """A number as it may stand in the code, if it may."""
+    if type(value) is Known or not math.isfinite(value):
+        return None
+    near = float(round(value))
+    return near if near in IN_THE_CODE and abs(value - near) <= ROUNDING * abs(near) else None

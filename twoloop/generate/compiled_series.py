@@ -5,15 +5,17 @@ from collections.abc import Callable
 from functools import cache
 from typing import Any, NamedTuple
 
-from twoloop.generate import llvm_code, series_code, series_groups
+from twoloop.generate import llvm_code, series_code, series_groups, series_loops
 from twoloop.generate.coefficients import Coefficients
 from twoloop.generate.llvm_text import Module
 from twoloop.generate.series import series_program
 from twoloop.generate.series_code import SeriesCode
+from twoloop.generate.series_loops import SeriesLoops
 from twoloop.generate.straight_code import OwnCode, SharedCode, write_own
 from twoloop.kernels.compile.dependencies import digest_of
 from twoloop.kernels.compile.own_functions import OwnFunctions, own_functions
 
+LONG = int(__import__("os").environ.get("LONG", "200"))  # operations from which on they are loops over tables, which read and write memory
 DIVIDED = 250  # operations of a series from which on its blocks are divided
 LONGEST = 350  # operations from which on LLVM does not simplify it first: it finds nothing there that makes it faster
 LARGEST = 5000  # operations, which take about as many milliseconds to trace and to compile
@@ -23,7 +25,7 @@ class CompiledSeries(NamedTuple):
     """Functions of a program and of the solution of an order."""
 
     functions: OwnFunctions
-    code: SeriesCode
+    code: SeriesCode | SeriesLoops
     n_factors: int  # numbers that are kept
     numbers: Any  # what they read, or formulas for it
 
@@ -60,8 +62,8 @@ def _compiled(own: SharedCode) -> CompiledSeries:
             f"it out"
         )
     numbers = Coefficients()
-    code = SeriesCode(program, numbers)
-    structure = [own.digest, program.n_q, program.n_rows, code.groups.structure]
+    code = (SeriesLoops if program.n_operations > LONG else SeriesCode)(program, numbers)
+    structure = [own.digest, code.structure]
     key = hashlib.sha256(repr(structure).encode()).hexdigest()
 
     def write() -> tuple[list[str], str]:
@@ -75,6 +77,7 @@ def _compiled(own: SharedCode) -> CompiledSeries:
             "find_order": code.find_order,
             "take_order": code.take_order,
         }
+        code.write_parts(module)
         for name, emit in recurrences.items():
             llvm_code.write(module, name, KIT.own_type(name), emit)
         return [*names, *recurrences], str(module)
@@ -86,4 +89,4 @@ def _compiled(own: SharedCode) -> CompiledSeries:
 @cache
 def _stamp() -> str:
     """A digest of what writes the functions; what they share with those of the equations is in the key."""
-    return digest_of("", __file__, series_code, series_groups)
+    return digest_of("", __file__, series_code, series_groups, series_loops)

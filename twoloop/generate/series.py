@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from twoloop.generate.families import Evaluator, Family, of_family
 from twoloop.generate.known_numbers import array_of, elementwise
-from twoloop.generate.traced_equations import Equations
+from twoloop.generate.traced_equations import Equations, only
 from twoloop.generate.traced_values import Check, Traced, unchecked
 from twoloop.generate.tracing import MOST_OPERATIONS, Form, Graph, Untraceable
 from twoloop.kernels.evaluation.operations import COSINE, PENDING, SINE, SUM
@@ -239,7 +239,7 @@ def _assembled(
     if len(early) + len(late) + len(row_products) + len(reaction_products) > MOST_OPERATIONS:
         raise Untraceable(f"its equations are more than {MOST_OPERATIONS} operations")
     tables = [
-        [*_ordered(operations), (PENDING, [(next(iter(form.terms)), *factors) for form, *factors in products.values()])]
+        [*_ordered(operations), (PENDING, sorted([(only(form), *factors) for form, *factors in products.values()], key=_n_terms))]
         for operations, products in ((early, row_products), (late, reaction_products))
     ]
     n_inputs = 1 + 3 * n + n_rows
@@ -287,11 +287,17 @@ def _ordered(operations: list[Any]) -> list[tuple[int, list[Any]]]:
     for (number, kind), members in sorted(groups.items()):
         if kind == COSINE:
             continue
+        members.sort(key=_n_terms)  # side by side is done what takes as long
         if kind == SINE:
             cosines = {first.key: node for node, first, _ in groups[number, COSINE]}
             members += [(cosines[first.key], first, second) for _, first, second in members]
         ordered.append((kind, members))
     return ordered
+
+
+def _n_terms(operation: tuple[int, Form, Form]) -> tuple[int, int]:
+    _, first, second = operation
+    return len(first.terms), len(second.terms)
 
 
 def _table(groups: list[tuple[int, list[Any]]], place: dict[int, int]) -> Table:
