@@ -67,10 +67,10 @@ def _compiled(own: SharedCode) -> CompiledSeries:
     key = hashlib.sha256(repr(structure).encode()).hexdigest()
 
     def write() -> tuple[list[str], str]:
-        module, names = Module(divided=program.n_operations > DIVIDED), ["own_solution"]
-        write_own(module, "own_solution", own.solution.graph, own.solution.solved, own.numbers)
+        module, names = Module(divided=program.n_operations > DIVIDED), []
         if own.parts is None:
-            names.append("own_factors")
+            names += ["own_solution", "own_factors"]
+            write_own(module, "own_solution", own.solution.graph, own.solution.solved, own.numbers)
             write_own(module, "own_factors", own.equations.graph, own.solution.kept, own.numbers)
         recurrences: dict[str, Callable[..., Any]] = {
             "begin_series": code.begin,

@@ -122,8 +122,7 @@ class SharedCode:
         if self.parts is not None:
             for outputs in self.parts.at_position.values():
                 yield outputs.sizes, list(numbers.structure(equations.graph, outputs.forms, solution.known))
-        others = [] if self.parts is None else self.parts.with_factors.values()
-        for outputs in (solution.solved, *others):
+        for outputs in [solution.solved] if self.parts is None else self.parts.with_factors.values():
             yield outputs.sizes, list(numbers.structure(solution.graph, outputs.forms))
 
     def _write(self) -> tuple[list[str], str]:

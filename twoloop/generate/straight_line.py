@@ -79,8 +79,8 @@ class StraightLine:
         Its first quantities are t, q and v.
     there : Outputs
         "a" (n_q,), the accelerations at (q, v) as they stand.
-    solved : Outputs
-        The same, and "lam" (n_c + n_a,), 0 for rows that do not count; without conditions.
+    right : Outputs
+        "r" (n_q,) and "c" (n_c + n_a,), Q and the right-hand sides of those rows of G that are used; without conditions.
     projects : bool
         Whether there are `closer` and `nearer`. Rows of A leave positions free.
     closer : Outputs
@@ -91,6 +91,8 @@ class StraightLine:
         "c" (n_c,) of the moves to positions and to velocities on the rows.
     redundant : Outputs
         No arrays; its conditions are that the rows of C_q that do not count hold, too.
+    n_operations : int
+        Of callbacks and elimination, without solutions.
     traced : Traced
         What the callbacks gave.
 
@@ -114,11 +116,11 @@ class StraightLine:
         self.factors = Factors(self._matrix(), n + len(self.rows), n)
         self.conditions = [(pivot, alone.times(choice.least)) for pivot, alone in self.factors.conditions]
         self.conditions += [(pivot, self.nothing) for pivot in self.factors.positive if pivot.terms]
-        solution = self._accelerations(self.v)
-        self.there = Outputs({"a": solution[:n]}, self.conditions)
-        self.solved = Outputs({"a": solution[:n], "lam": self._spread(solution[n:])}, [])
         self.redundant = self._redundant(np.concatenate(rates))
         self._bound()
+        for kind in ("gamma", "nonholonomic_gamma", "force"):
+            self.equations.of(kind)
+        self.n_operations = len(self.graph.operations)
         self.traced = Traced(system, self.graph)
 
     def _bound(self) -> None:
@@ -162,10 +164,27 @@ class StraightLine:
                     matrix[n + k, i] = matrix[i, n + k] = row[i]
         return matrix
 
+    def _given(self, v: Sequence[Form]) -> tuple[list[Form], list[Form]]:
+        """Q, and the right-hand sides of all rows of G, at velocities v."""
+        return list(self._made("force", v)), [*self._made("gamma", v), *self._made("nonholonomic_gamma", v)]
+
+    @cached_property
+    def there(self) -> Outputs:
+        """See the class."""
+        solution = self._accelerations(self.v)
+        self._bound()
+        return Outputs({"a": solution[: self.system.n_q]}, self.conditions)
+
+    @cached_property
+    def right(self) -> Outputs:
+        """See the class."""
+        force, gamma = self._given(self.v)
+        used = {*self.choice.rows, *self.choice.added}
+        return Outputs({"r": force, "c": [each if k in used else self.nothing for k, each in enumerate(gamma)]}, [])
+
     def _accelerations(self, v: Sequence[Form]) -> list[Form]:
         """a and the multipliers of the rows that count, at velocities v."""
-        gamma = [*self._made("gamma", v), *self._made("nonholonomic_gamma", v)]
-        right = list(self._made("force", v))
+        right, gamma = self._given(v)
         for k in self.choice.added:
             for i, entry in enumerate(self.all_rows[k]):
                 right[i] = right[i] + (entry * gamma[k]).times(self.choice.scale)
