@@ -55,6 +55,7 @@ class Coefficients:
         self._formulas: Any = np.zeros(0)
         self._varying: dict[tuple[float, Powers], Known] = {}
         self._known: dict[tuple[Terms, float], tuple[Terms, float]] = {}
+        self._of_forms: dict[Any, tuple[Terms, float]] = {}
 
     @property
     def values(self) -> NDArray[np.float64]:
@@ -83,7 +84,10 @@ class Coefficients:
 
     def of_form(self, form: Form) -> tuple[Terms, float]:
         """The same of a form."""
-        return self.of(tuple(form.terms.items()), form.constant)
+        key = form.key
+        if key not in self._of_forms:
+            self._of_forms[key] = self.of(tuple(form.terms.items()), form.constant)
+        return self._of_forms[key]
 
     def structure(
         self, graph: Graph, forms: Iterable[Form], kept: Mapping[int, int] = MappingProxyType({})
