@@ -15,9 +15,8 @@ from twoloop.generate.straight_code import OwnCode, SharedCode, write_own
 from twoloop.kernels.compile.dependencies import digest_of
 from twoloop.kernels.compile.own_functions import OwnFunctions, own_functions
 
-LONG = int(__import__("os").environ.get("LONG", "200"))  # operations from which on they are loops over tables, which read and write memory
-DIVIDED = 250  # operations of a series from which on its blocks are divided
-LONGEST = 350  # operations from which on LLVM does not simplify it first: it finds nothing there that makes it faster
+LONG = 300  # operations of a series from which on they are loops over tables: of fewer the loops take a tenth more time
+DIVIDED = 250  # operations from which on blocks of straight code are divided
 LARGEST = 5000  # operations, which take about as many milliseconds to trace and to compile
 
 
@@ -55,7 +54,7 @@ def _compiled(own: SharedCode) -> CompiledSeries:
     from twoloop.kernels.data.common import KIT
 
     system, family = own.equations.system, own.family
-    program = family.remembered("series", lambda: series_program(system, family.parameters))
+    program = family.remembered("series", lambda: series_program(system, family.equations(system)))
     if program.n_operations > LARGEST:
         raise ValueError(
             f"compiled=True is for equations of at most {LARGEST} operations; these are {program.n_operations}. Leave "
@@ -67,7 +66,7 @@ def _compiled(own: SharedCode) -> CompiledSeries:
     key = hashlib.sha256(repr(structure).encode()).hexdigest()
 
     def write() -> tuple[list[str], str]:
-        module, names = Module(divided=program.n_operations > DIVIDED), []
+        module, names = Module(divided=DIVIDED < program.n_operations <= LONG), []
         if own.parts is None:
             names += ["own_solution", "own_factors"]
             write_own(module, "own_solution", own.solution.graph, own.solution.solved, own.numbers)
@@ -82,7 +81,7 @@ def _compiled(own: SharedCode) -> CompiledSeries:
             llvm_code.write(module, name, KIT.own_type(name), emit)
         return [*names, *recurrences], str(module)
 
-    functions = own_functions("series", _stamp(), key, write, passes=program.n_operations <= LONGEST)
+    functions = own_functions("series", _stamp(), key, write)
     return CompiledSeries(functions, code, own.solution.n_kept, numbers.formulas)
 
 

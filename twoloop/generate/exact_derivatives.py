@@ -39,7 +39,7 @@ def exact_derivatives(system: ConstrainedSystem, check: Check = unchecked) -> Tr
 
 
 def _traced(system: ConstrainedSystem, family: Family) -> Traced:
-    equations = Equations(system, family.parameters)
+    equations = family.equations(system)
     given = [kind for kind in ("jacobian", *OF_ROWS) if kind in system.given]
     forms = {kind: equations.derived(kind) for kind in (*given, *(["constraint_rate"] if system.n_c else []))}
     # of which the others are derivatives, if they are what they were traced to

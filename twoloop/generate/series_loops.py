@@ -421,9 +421,9 @@ class SeriesLoops:
         """Multiples of forms to where they belong."""
         scales = emit.vector([scale] * WIDTH)
         for each in scattered:
-            with _turns(emit, each.n_groups, 1) as (first, _):
-                (total,) = self._gathered(emit, base, each.forms, first, 1, constant)
-                self._store_at(emit, emit.elements(emit.multiply(scales, total)), out, each.places, first, 0)
+            with _turns(emit, each.n_groups, SIDE_BY_SIDE) as (first, few):
+                for k, total in enumerate(self._gathered(emit, base, each.forms, first, few, constant)):
+                    self._store_at(emit, emit.elements(emit.multiply(scales, total)), out, each.places, first, k)
 
     def _take_waiting(self, emit: Emitter, base: Value, side: Side, order: Value) -> None:
         """The second factors that waited, into the row of an order."""

@@ -176,7 +176,7 @@ def own_code(system: ConstrainedSystem, t0: float, q0: Array, check: Check = unc
         choice = system.remembered_at("choice", (t0, q0.tobytes()), lambda: Choice.at(system, t0, q0))
 
         def make(family: Family) -> SharedCode:
-            return SharedCode(StraightLine(system, choice, family.parameters), family)
+            return SharedCode(StraightLine(system, choice, family.equations(system)), family)
 
         made: OwnCode = of_family(system, ("code", choice), make, lambda code: check(code.traced))
     except Untraceable as error:

@@ -70,8 +70,8 @@ class StraightLine:
     system : ConstrainedSystem
     choice : Choice
         What numbers decide.
-    parameters : array of float or Known, optional
-        In the place of its own.
+    equations : Equations, optional
+        Of the system, which are continued.
 
     Attributes
     ----------
@@ -102,8 +102,8 @@ class StraightLine:
         Saying why the equations cannot be had.
     """
 
-    def __init__(self, system: ConstrainedSystem, choice: Choice, parameters: Any = None):
-        self.equations = Equations(system, parameters)
+    def __init__(self, system: ConstrainedSystem, choice: Choice, equations: Equations | None = None):
+        self.equations = Equations(system) if equations is None else equations
         self.system, self.choice, self.graph = system, choice, self.equations.graph
         self.nothing = Form(self.graph, 0.0, {})
         n, (self.q, self.v) = system.n_q, (self.equations.q, self.equations.v)

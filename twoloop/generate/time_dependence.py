@@ -54,7 +54,7 @@ def may_be_sudden(system: ConstrainedSystem, ran_on_symbols: bool) -> Sudden:
 
 def _traced(system: ConstrainedSystem) -> Any:
     def make(family: Family) -> Dependence:
-        equations = Equations(system, family.parameters)
+        equations = family.equations(system)
 
         def needed(kinds: tuple[str, ...]) -> list[int]:
             forms = [form for kind in kinds if kind in system.given for form in equations.of(kind).ravel()]

@@ -54,6 +54,17 @@ class Graph(Symbolic):
         self._known: dict[Any, int] = {}
         self._seen: dict[Any, int] = {}  # factors, in the order in which they came: values have no part in it
 
+    def copy(self) -> "Graph":
+        """A graph of the same quantities, which may be continued otherwise; what callbacks gave is not in it."""
+        other = Graph()
+        other.sizes, other.late, other.inputs_of = self.sizes.copy(), self.late.copy(), self.inputs_of.copy()
+        other._known, other._seen = self._known.copy(), self._seen.copy()
+        other.operations = [
+            None if each is None else (each[0], each[1].on(other), None if each[2] is None else each[2].on(other))
+            for each in self.operations
+        ]
+        return other
+
     def inputs(self, n: int, late: bool) -> list["Form"]:
         """New quantities that are given, as forms."""
         first = len(self.operations)
@@ -146,6 +157,12 @@ class Form:
     def __init__(self, graph: Graph, constant: float, terms: dict[int, float]):
         self.graph, self.constant, self.terms = graph, constant, terms
         self.kept_key: tuple[Any, ...] | None = None
+
+    def on(self, graph: Graph) -> "Form":
+        """The same of a graph that has these quantities, too."""
+        made = Form(graph, self.constant, self.terms)
+        made.kept_key = self.kept_key
+        return made
 
     @property
     def key(self) -> tuple[Any, ...]:
