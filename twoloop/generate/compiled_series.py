@@ -17,7 +17,6 @@ from twoloop.kernels.compile.own_functions import OwnFunctions, own_functions
 
 LONG = 300  # operations of a series from which on they are loops over tables: of fewer the loops take a tenth more time
 DIVIDED = 250  # operations from which on blocks of straight code are divided
-LARGEST = 5000  # operations, which take about as many milliseconds to trace and to compile
 
 
 class CompiledSeries(NamedTuple):
@@ -55,11 +54,6 @@ def _compiled(own: SharedCode) -> CompiledSeries:
 
     system, family = own.equations.system, own.family
     program = family.remembered("series", lambda: series_program(system, family.equations(system)))
-    if program.n_operations > LARGEST:
-        raise ValueError(
-            f"compiled=True is for equations of at most {LARGEST} operations; these are {program.n_operations}. Leave "
-            f"it out"
-        )
     numbers = Coefficients()
     code = (SeriesLoops if program.n_operations > LONG else SeriesCode)(program, numbers)
     structure = [own.digest, code.structure]
@@ -81,7 +75,7 @@ def _compiled(own: SharedCode) -> CompiledSeries:
             llvm_code.write(module, name, KIT.own_type(name), emit)
         return [*names, *recurrences], str(module)
 
-    functions = own_functions("series", _stamp(), key, write)
+    functions = own_functions("series", _stamp(), key, write, passes=program.n_operations <= LONG)
     return CompiledSeries(functions, code, own.solution.n_kept, numbers.formulas)
 
 
