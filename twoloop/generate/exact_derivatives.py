@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from twoloop.checks.derivatives import TIME
 from twoloop.checks.scales import generic_factors, sizes
 from twoloop.generate.families import Family, of_family
-from twoloop.generate.traced_equations import OF_ROWS, Equations
+from twoloop.generate.traced_equations import OF_ROWS
 from twoloop.generate.traced_values import Check, Traced, unchecked
 from twoloop.generate.tracing import Untraceable
 from twoloop.kernels.compile.linking import direct

@@ -169,9 +169,7 @@ class PartsCode:
         _sum(emit, n, v, change, new_v)
         return TRUE
 
-    def _correct(
-        self, emit: Emitter, what: str, at: list[Value], r: Value, c: Value, out: Value, lam: Value
-    ) -> None:
+    def _correct(self, emit: Emitter, what: str, at: list[Value], r: Value, c: Value, out: Value, lam: Value) -> None:
         """The solution where r is zero, in the metric of M; the multipliers do not matter."""
         _leave_unless(emit, what, [*at, c])
         _leave_unless(emit, "own_solution", [r, c, at[-1], at[-2], out, lam])

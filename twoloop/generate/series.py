@@ -243,7 +243,10 @@ def _assembled(
     if len(early) + len(late) + len(row_products) + len(reaction_products) > MOST_OPERATIONS:
         raise Untraceable(f"its equations are more than {MOST_OPERATIONS} operations")
     tables = [
-        [*_ordered(operations), (PENDING, sorted([(only(form), *factors) for form, *factors in products.values()], key=_n_terms))]
+        [
+            *_ordered(operations),
+            (PENDING, sorted([(only(form), *factors) for form, *factors in products.values()], key=_n_terms)),
+        ]
         for operations, products in ((early, row_products), (late, reaction_products))
     ]
     place = {i: k for k, i in enumerate(inputs)}

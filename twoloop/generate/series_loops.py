@@ -103,26 +103,25 @@ class SeriesLoops:
     def _side(self, table: Table, place: int, quantity: int) -> Side:
         first, second = (terms_of(sums, range(len(sums.column))) for sums in (table.first, table.second))
         runs: list[Run] = []
+        waiting: list[Run] = []
         begins_at = place
         for kind, begin, end in table.groups[:, :3].tolist():
             operations, used = range(begin, end), [first, second] if kind in OF_TWO else [first]
             runs += self._sums([each[o] for each in used for o in operations])
             for members in _in_runs(kind, begin, end, lambda _: 1):
-                forms = [self._forms([self._plain(each[o]) for o in members]) for each in used]
+                forms = [self._summed([each[o] for o in members]) for each in used]
                 results = [quantity + o for o in members] if kind == SINE else []
                 runs.append(Run(kind, place, len(members) // WIDTH, quantity + members[0], results, forms))
+                if kind == PENDING:
+                    own = [second[o] for o in members]
+                    waiting += [*self._sums(own), runs[-1]._replace(forms=[self._summed(own)])]
                 place += len(members)
-        begin, end = table.groups[-1, 1:3].tolist()
-        waiting = self._sums(second[begin:end])
-        for run in runs:
-            if run.kind == PENDING:
-                forms = [self._plain(second[o]) for members in _in_runs(PENDING, begin, end, lambda _: 1) for o in members]
-                waiting.append(run._replace(forms=[self._forms(forms)]))
         return Side(runs, waiting, begins_at, place)
 
-    def _plain(self, form: Form) -> Form:
-        """A form as the quantity that it is, or that it was summed up to."""
-        return ((form[0][0][0] if _is_quantity(form) else self._places[_key(form)], 1.0),), 0.0
+    def _summed(self, forms: Sequence[Form]) -> Forms:
+        """Forms as the quantities that they are, or that they were summed up to."""
+        columns = [form[0][0][0] if _is_quantity(form) else self._places[_key(form)] for form in forms]
+        return self._forms([(((column, 1.0),), 0.0) for column in columns])
 
     def _sums(self, forms: Sequence[Form]) -> list[Run]:
         """Runs that sum up those forms that are no quantities and were not summed up before."""
@@ -212,7 +211,12 @@ class SeriesLoops:
         numbers: Value,
     ) -> None:
         """Late operations of the order before and early ones of this order, as far as they are known; r and c."""
-        builder, base, before, emit.numbers = emit.builder, emit.aligned(scratch), emit.builder.sub(order, integer(1)), numbers
+        builder, base, before, emit.numbers = (
+            emit.builder,
+            emit.aligned(scratch),
+            emit.builder.sub(order, integer(1)),
+            numbers,
+        )
         is_first = builder.compare("icmp eq", order, integer(1))
         builder.call("late", BIT, [base, before, numbers])
         self._scatter(emit, base, self.balance, r, ONE, builder.select(is_first, ONE, ZERO))
@@ -330,8 +334,8 @@ class SeriesLoops:
                     emit.store_vector(found.x, row, place)
                     emit.store_vector(found.y, row, self.width + place)
             with otherwise:
-                number = emit.number(order)
-                scales = [emit.vector([each] * WIDTH) for each in (number, emit.divide(ONE, number))]
+                order_of = emit.number(order)
+                number, inverse = (emit.vector([each] * WIDTH) for each in (order_of, emit.divide(ONE, order_of)))
                 for k, place in enumerate(at):
 
                     def there(begin: int, place: int = place) -> Value:
@@ -339,12 +343,14 @@ class SeriesLoops:
 
                     places = self.table, self.table + self.width, self.inverses
                     total = there(self.totals)
-                    results, x, y = recurrence(emit, run.kind, there, places, total, *scales, u[k], z[k])
+                    results, x, y = recurrence(emit, run.kind, there, places, total, number, inverse, u[k], z[k])
                     self._put(emit, run, base, out, first, k, emit.elements(results))
                     emit.store_vector(x, row, place)
                     emit.store_vector(y, row, self.width + place)
 
-    def _put(self, emit: Emitter, run: Run, base: Value, out: Value, first: Value, k: int, results: list[Value]) -> None:
+    def _put(
+        self, emit: Emitter, run: Run, base: Value, out: Value, first: Value, k: int, results: list[Value]
+    ) -> None:
         """Results of a group into their places."""
         if run.results:
             self._store_at(emit, results, base, run.results, first, k)
@@ -383,8 +389,8 @@ class SeriesLoops:
                 for t in range(n_terms):
                     totals = self._with_term(emit, base, forms, table, numbers, totals, t)
             else:
-                with emit.loop(integer(0), integer(n_terms), totals) as (t, before, sums):
-                    place = builder.mul(t, integer(WIDTH))
+                with emit.loop(integer(0), integer(n_terms), totals) as (term, before, sums):
+                    place = builder.mul(term, integer(WIDTH))
                     there = builder.gep(table, place)
                     own = numbers if forms.factors else emit.pointer(numbers, place)
                     sums += self._with_term(emit, base, forms, there, own, before, 0)
@@ -403,7 +409,9 @@ class SeriesLoops:
         made = []
         for k, total in enumerate(totals):
             place = WIDTH * (k * forms.n_terms + t)
-            x = emit.vector([emit.builder.load(self._by_table(emit, base, table, place + lane)) for lane in range(WIDTH)])
+            x = emit.vector(
+                [emit.builder.load(self._by_table(emit, base, table, place + lane)) for lane in range(WIDTH)]
+            )
             if forms.factors is None:
                 made.append(emit.add(total, emit.multiply(self._load(emit, numbers, place), x)))
             else:

@@ -80,7 +80,7 @@ class StraightLine:
     there : Outputs
         "a" (n_q,), the accelerations at (q, v) as they stand.
     right : Outputs
-        "r" (n_q,) and "c" (n_c + n_a,), Q and the right-hand sides of those rows of G that are used; without conditions.
+        "r" (n_q,) and "c" (n_c + n_a,), Q and the right-hand sides of the rows of G that are used; without conditions.
     projects : bool
         Whether there are `closer` and `nearer`. Rows of A leave positions free.
     closer : Outputs

@@ -3,7 +3,6 @@
 from typing import Any, NamedTuple
 
 from twoloop.generate.families import Evaluator, Family, of_family
-from twoloop.generate.traced_equations import Equations
 from twoloop.generate.traced_values import unchecked
 from twoloop.generate.tracing import Form, Graph, Untraceable
 from twoloop.kernels.evaluation.operations import COSINE, EXPONENTIAL, PRODUCT, SINE, SUM

@@ -63,7 +63,10 @@ class Equations:
         """Equations with a graph of their own, in which what was traced here is not traced again."""
         other = copy.copy(self)
         other.graph = self.graph.copy()
-        other.t, other.q, other.v = self.t.on(other.graph), *([x.on(other.graph) for x in each] for each in (self.q, self.v))
+        other.t, other.q, other.v = (
+            self.t.on(other.graph),
+            *([x.on(other.graph) for x in each] for each in (self.q, self.v)),
+        )
         other._made, other._before = {}, self.graph.traced
         return other
 
