@@ -3,8 +3,8 @@
 Accelerations and both projections take the same factors and solve with them. What LLVM takes for machine code grows
 faster than the length of a block, and the values of long equations pass through memory in any case, as there are more
 of them than registers. So each part is a function of its own, and the functions that kernels know call them: the
-factors of a position, what is solved for accelerations, the correction that moves q or v onto the constraints, what is
-off for either, and, with redundant rows, multipliers of least norm.
+factors of a position, the solution with them, which gives accelerations, the corrections that move q and v onto the
+constraints, and every order of a series, right-hand sides of these, and, with redundant rows, multipliers of least norm.
 """
 
 from collections.abc import Callable, Mapping, Sequence

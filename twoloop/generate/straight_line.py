@@ -285,8 +285,6 @@ class Solution:
         Its inputs are r (n_q,), c (n_c + n_a,) and the factors, which are kept first.
     solved : Outputs
         "a" (n_q,) and "lam" (n_c + n_a,); 0 for rows that do not count.
-    correction : Outputs
-        "x" (n_q,), the solution where r is 0, in the metric of M.
     least : Outputs
         "lam" (n_c,) of least norm, where c is "lam" of `solved`.
     """
@@ -341,11 +339,6 @@ class Solution:
         for k, value in zip(self._choice.rows, solution[self._n :], strict=True):
             lam[k] = value
         return Outputs({"a": solution[: self._n], "lam": lam}, [])
-
-    @cached_property
-    def correction(self) -> Outputs:
-        """See the class."""
-        return Outputs({"x": self._solve([*([self._nothing] * self._n), *self._counting()])[: self._n]}, [])
 
     @cached_property
     def least(self) -> Outputs:
