@@ -4,7 +4,7 @@ Accelerations and both projections take the same factors and solve with them. Wh
 faster than the length of a block, and the values of long equations pass through memory in any case, as there are more
 of them than registers. So each part is a function of its own, and the functions that kernels know call them: the
 factors of a position, the solution with them, which gives accelerations, the corrections that move q and v onto the
-constraints, and every order of a series, right-hand sides of these, and, with redundant rows, multipliers of least norm.
+constraints, and every order of a series, right-hand sides, and, with redundant rows, multipliers of least norm.
 """
 
 from collections.abc import Callable, Mapping, Sequence
