@@ -130,9 +130,7 @@ def test_symbols_that_a_callback_keeps_are_found():
         kept.append(v)
         return WEIGHT - kept[-2]
 
-    with pytest.raises(
-        ValueError, match=r"force of 'pendulum'.*(does not give what its operations give|of another call)"
-    ):
+    with pytest.raises(ValueError, match="force of 'pendulum' does not give what its operations give"):
         run(pendulum(force=previous))
     with pytest.raises(Untraceable, match="of another call, which it has kept"):
         series_program(pendulum(force=lambda t, q, v: v + kept[-2]))

@@ -66,6 +66,8 @@ class Family:
 
     def equations(self, system: ConstrainedSystem) -> Equations:
         """What its callbacks were traced to, as a beginning of a graph."""
+        if system.called_in_python:  # may keep what it gets, and so is traced no earlier than it must be
+            return Equations(system, self.parameters)
         traced: Equations = self.remembered("equations", lambda: Equations(system, self.parameters).trace_all())
         return traced.copy()
 
