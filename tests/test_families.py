@@ -144,7 +144,7 @@ def test_numbers_of_other_parameters_are_those_that_are_traced_for_them(make):
     other = system.with_parameters(np.where(varies, p * random.uniform(0.98, 1.02), p))
     code = own_code(other, 0.0, problem.q0)
     assert (code.shared.family is own_code(system, 0.0, problem.q0).shared.family) or not varies.any()
-    expected = StraightLine(other, code.shared.equations.choice, _alone(other).parameters)
+    expected = StraightLine(other, code.shared.equations.choice, _alone(other).equations(other))
     near = np.array([problem.q0, problem.v0]) + random.uniform(-0.1, 0.1, (5, 2, system.n_q))
     states = np.column_stack([np.linspace(0.0, 0.1, 5), near.reshape(5, -1)])
     assert code.traced.wrong(other, states) is None and expected.traced.wrong(other, states) is None

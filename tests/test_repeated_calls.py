@@ -315,7 +315,7 @@ def test_a_plan_is_that_of_the_choice_of_its_code():
     numbers = []
     for each in (choice, replace(choice, least=10.0 * choice.least), choice):
         family = family_of(problem.system)
-        shared = SharedCode(StraightLine(problem.system, each, family.parameters), family)
+        shared = SharedCode(StraightLine(problem.system, each, family.equations(problem.system)), family)
         code = shared.of(problem.system, family.evaluator(problem.system.parameters))
         code.traced.trusted = True
         plan, _ = plans_for(problem.system, PRESETS["DOP853"], 1e-6, 1e-6, False, code, unchecked)

@@ -103,7 +103,7 @@ def test_steps_by_compiled_code_are_the_same_to_rounding(name):
         assert np.abs(ends[1] - ends[0]).max() < 1e-11 * max(1.0, np.abs(ends[0]).max())
 
 
-@pytest.mark.slow  # a build of 7 s
+@pytest.mark.slow  # a build of 3 s
 def test_twenty_bodies_in_space_have_compiled_code():
     chain = open_chain_of_hinges(20)
     start = chain.system, (0.0, 0.1), chain.q, 0.0 * chain.q
@@ -139,7 +139,10 @@ def test_compiled_code_is_read_from_the_disk(monkeypatch):
     assert "find_order" in compiled_series.compiled_series(code).functions.addresses
 
 
-def test_compiled_code_uses_nothing_that_was_left_in_memory(monkeypatch):
+@pytest.mark.parametrize("long", [0, 10**9], ids=["loops", "straight"])
+def test_compiled_code_uses_nothing_that_was_left_in_memory(long, monkeypatch):
+    monkeypatch.setattr(compiled_series, "LONG", long)
+    monkeypatch.setattr("twoloop.generate.families._FAMILIES", {})
     problem, plan = mechanisms.four_bar(), Taylor.plan
     runs = []
     for left in (0.0, np.nan):
@@ -156,9 +159,9 @@ def test_compiled_code_uses_nothing_that_was_left_in_memory(monkeypatch):
 
 def test_equations_too_long_to_compile_are_refused(monkeypatch):
     problem = mechanisms.spatial_four_bar()
-    monkeypatch.setattr(compiled_series, "LARGEST", 100)
+    monkeypatch.setattr("twoloop.generate.straight_line.MOST_ELIMINATED", 100)
     monkeypatch.setattr("twoloop.generate.families._FAMILIES", {})  # without what another test has made
-    words = r"of at most 100 operations; these are [1-9]\d\d\. Leave it out"
+    words = r"its equations are more than 100 operations\. Leave it out"
     with pytest.raises(ValueError, match=words):
         solve_dae(problem.system, (0.0, 0.1), problem.q0, problem.v0, "Taylor", compiled=True)
 

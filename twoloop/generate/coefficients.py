@@ -55,6 +55,7 @@ class Coefficients:
         self._formulas: Any = np.zeros(0)
         self._varying: dict[tuple[float, Powers], Known] = {}
         self._known: dict[tuple[Terms, float], tuple[Terms, float]] = {}
+        self._of_forms: dict[Any, tuple[Terms, float]] = {}
 
     @property
     def values(self) -> NDArray[np.float64]:
@@ -75,9 +76,18 @@ class Coefficients:
             self._known[key] = tuple((i, self._number(c)) for i, c in terms), self._number(constant)
         return self._known[key]
 
+    def in_memory(self, values: Iterable[float]) -> int:
+        """Put numbers side by side, also those that may stand in the code; the place of the first."""
+        first = len(self._values)
+        self._values += values
+        return first
+
     def of_form(self, form: Form) -> tuple[Terms, float]:
         """The same of a form."""
-        return self.of(tuple(form.terms.items()), form.constant)
+        key = form.key
+        if key not in self._of_forms:
+            self._of_forms[key] = self.of(tuple(form.terms.items()), form.constant)
+        return self._of_forms[key]
 
     def structure(
         self, graph: Graph, forms: Iterable[Form], kept: Mapping[int, int] = MappingProxyType({})
@@ -112,9 +122,15 @@ class Coefficients:
                 made_of = value.scale, value.powers
                 self._varying.setdefault(made_of, value)
                 return Coefficient(value, list(self._varying).index(made_of), varies=True)
-        else:
-            near = float(round(value)) if math.isfinite(value) else value
-            if near in IN_THE_CODE and abs(value - near) <= ROUNDING * abs(near):
-                return near
+        elif (near := in_the_code(value)) is not None:
+            return near
         self._values.append(value)
         return Coefficient(value, len(self._values) - 1)
+
+
+def in_the_code(value: float) -> float | None:
+    """A number as it may stand in the code, if it may."""
+    if type(value) is Known or not math.isfinite(value):
+        return None
+    near = float(round(value))
+    return near if near in IN_THE_CODE and abs(value - near) <= ROUNDING * abs(near) else None

@@ -5,25 +5,25 @@ from collections.abc import Callable
 from functools import cache
 from typing import Any, NamedTuple
 
-from twoloop.generate import llvm_code, series_code, series_groups
+from twoloop.generate import llvm_code, series_code, series_groups, series_loops
 from twoloop.generate.coefficients import Coefficients
 from twoloop.generate.llvm_text import Module
 from twoloop.generate.series import series_program
 from twoloop.generate.series_code import SeriesCode
+from twoloop.generate.series_loops import SeriesLoops
 from twoloop.generate.straight_code import OwnCode, SharedCode, write_own
 from twoloop.kernels.compile.dependencies import digest_of
 from twoloop.kernels.compile.own_functions import OwnFunctions, own_functions
 
-DIVIDED = 250  # operations of a series from which on its blocks are divided
-LONGEST = 350  # operations from which on LLVM does not simplify it first: it finds nothing there that makes it faster
-LARGEST = 5000  # operations, which take about as many milliseconds to trace and to compile
+LONG = 300  # operations of a series from which on they are loops over tables: of fewer the loops take a tenth more time
+DIVIDED = 250  # operations from which on blocks of straight code are divided
 
 
 class CompiledSeries(NamedTuple):
     """Functions of a program and of the solution of an order."""
 
     functions: OwnFunctions
-    code: SeriesCode
+    code: SeriesCode | SeriesLoops
     n_factors: int  # numbers that are kept
     numbers: Any  # what they read, or formulas for it
 
@@ -53,37 +53,33 @@ def _compiled(own: SharedCode) -> CompiledSeries:
     from twoloop.kernels.data.common import KIT
 
     system, family = own.equations.system, own.family
-    program = family.remembered("series", lambda: series_program(system, family.parameters))
-    if program.n_operations > LARGEST:
-        raise ValueError(
-            f"compiled=True is for equations of at most {LARGEST} operations; these are {program.n_operations}. Leave "
-            f"it out"
-        )
+    program = family.remembered("series", lambda: series_program(system, family.equations(system)))
     numbers = Coefficients()
-    code = SeriesCode(program, numbers)
-    structure = [own.digest, program.n_q, program.n_rows, code.groups.structure]
+    code = (SeriesLoops if program.n_operations > LONG else SeriesCode)(program, numbers)
+    structure = [own.digest, code.structure]
     key = hashlib.sha256(repr(structure).encode()).hexdigest()
 
     def write() -> tuple[list[str], str]:
-        module, names = Module(divided=program.n_operations > DIVIDED), ["own_solution"]
-        write_own(module, "own_solution", own.solution.graph, own.solution.solved, own.numbers)
+        module, names = Module(divided=DIVIDED < program.n_operations <= LONG), []
         if own.parts is None:
-            names.append("own_factors")
+            names += ["own_solution", "own_factors"]
+            write_own(module, "own_solution", own.solution.graph, own.solution.solved, own.numbers)
             write_own(module, "own_factors", own.equations.graph, own.solution.kept, own.numbers)
         recurrences: dict[str, Callable[..., Any]] = {
             "begin_series": code.begin,
             "find_order": code.find_order,
             "take_order": code.take_order,
         }
+        code.write_parts(module)
         for name, emit in recurrences.items():
             llvm_code.write(module, name, KIT.own_type(name), emit)
         return [*names, *recurrences], str(module)
 
-    functions = own_functions("series", _stamp(), key, write, passes=program.n_operations <= LONGEST)
+    functions = own_functions("series", _stamp(), key, write, passes=program.n_operations <= LONG)
     return CompiledSeries(functions, code, own.solution.n_kept, numbers.formulas)
 
 
 @cache
 def _stamp() -> str:
     """A digest of what writes the functions; what they share with those of the equations is in the key."""
-    return digest_of("", __file__, series_code, series_groups)
+    return digest_of("", __file__, series_code, series_groups, series_loops)

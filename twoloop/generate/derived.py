@@ -72,7 +72,7 @@ def standing_for(system: ConstrainedSystem, check: Check) -> tuple[ConstrainedSy
 
 
 def _made(system: ConstrainedSystem, absent: Sequence[str], family: Family) -> Derived:
-    equations = Equations(system, family.parameters)
+    equations = family.equations(system)
     programs = {}
     for name, forms in _results(equations, absent).items():
         program = program_of(equations.graph, 1 + 2 * system.n_q, dict(enumerate(forms.values())))

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from twoloop.checks.derivatives import TIME
 from twoloop.checks.scales import generic_factors, sizes
 from twoloop.generate.families import Family, of_family
-from twoloop.generate.traced_equations import OF_ROWS, Equations
+from twoloop.generate.traced_equations import OF_ROWS
 from twoloop.generate.traced_values import Check, Traced, unchecked
 from twoloop.generate.tracing import Untraceable
 from twoloop.kernels.compile.linking import direct
@@ -39,7 +39,7 @@ def exact_derivatives(system: ConstrainedSystem, check: Check = unchecked) -> Tr
 
 
 def _traced(system: ConstrainedSystem, family: Family) -> Traced:
-    equations = Equations(system, family.parameters)
+    equations = family.equations(system)
     given = [kind for kind in ("jacobian", *OF_ROWS) if kind in system.given]
     forms = {kind: equations.derived(kind) for kind in (*given, *(["constraint_rate"] if system.n_c else []))}
     # of which the others are derivatives, if they are what they were traced to

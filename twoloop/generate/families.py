@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.generate.known_numbers import Known, Powers, Record
+from twoloop.generate.traced_equations import Equations
 from twoloop.generate.tracing import Untraceable
 from twoloop.kernels.compile.caches import Newest, uncollected
 from twoloop.problem.system import ConstrainedSystem
@@ -62,6 +63,13 @@ class Family:
         self._made: dict[Any, Any] = {}
         self._arrays: dict[int, tuple[Any, Gathered]] = {}  # of formulas, by their ids
         self._tracing = RLock()  # what is traced is put down in one record
+
+    def equations(self, system: ConstrainedSystem) -> Equations:
+        """What its callbacks were traced to, as a beginning of a graph."""
+        if system.called_in_python:  # may keep what it gets, and so is traced no earlier than it must be
+            return Equations(system, self.parameters)
+        traced: Equations = self.remembered("equations", lambda: Equations(system, self.parameters).trace_all())
+        return traced.copy()
 
     def numbers(self, parameters: Array) -> Array:
         """The numbers, one for each class, of a system's parameters."""

@@ -19,6 +19,7 @@ Array = NDArray[np.float64]
 Powers = tuple[tuple[int, float], ...]  # atoms and their exponents: a product; empty for 1
 
 MOST_TERMS = 200  # of a sum: each is told apart by all of its terms
+_plain = float.__pos__  # a number as a float, which is not asked for as by a callback
 CANCELLED = 8.0 * 2.0**-52  # of a term: what rounding leaves of two that cancel
 NUMBERS = (int, float, np.number)
 _OF_ONE = ("sin", "cos", "tan", "sqrt", "exp", "log", "arctan", "sinh", "cosh", "tanh", "absolute")
@@ -96,6 +97,7 @@ class Record(Symbolic):
 
     def __init__(self, values: Sequence[float], varying: Iterable[int]):
         self.atoms: list[Any] = [None] * len(values)
+        self.merged: dict[tuple[Powers, Powers], Powers] = {}  # products of two
         self._places: dict[Any, int] = {}
         self.parameters = np.empty(len(values), dtype=object)
         self.parameters[:] = [float(value) for value in values]
@@ -177,7 +179,7 @@ class Known(float):
 
     def __new__(cls, value: float, record: Record, scale: float, powers: Powers) -> "Known":
         """A number of a record."""
-        made = super().__new__(cls, value)
+        made = float.__new__(cls, value)
         made.record, made.scale, made.powers = record, scale, powers
         return made
 
@@ -198,10 +200,10 @@ class Known(float):
     def to(self, exponent: float) -> "Known":
         """The power with a whole exponent that is not 0."""
         powers = tuple([(place, exponent * own) for place, own in self.powers])
-        return Known(float(self) ** exponent, self.record, self.scale**exponent, powers)
+        return Known(_plain(self) ** exponent, self.record, self.scale**exponent, powers)
 
     def __neg__(self) -> "Known":
-        return Known(-float(self), self.record, -self.scale, self.powers)
+        return Known(-_plain(self), self.record, -self.scale, self.powers)
 
     def __pos__(self) -> "Known":
         return self
@@ -221,7 +223,7 @@ class Known(float):
 
 def _sum(one: float, other: float) -> float:
     record = _record(one, other)
-    terms, value = record.terms(one), float(one) + float(other)
+    terms, value = record.terms(one), _plain(one) + _plain(other)
     for powers, c in record.terms(other).items():
         total = terms.get(powers, 0.0) + c
         if abs(total) <= CANCELLED * abs(c):
@@ -241,13 +243,19 @@ def _product(one: float, other: float) -> float:
     if type(one) is not Known:
         one, other = other, one
     assert isinstance(one, Known)
+    record = one.record
     if type(other) is not Known:
-        return Known(float(one) * other, one.record, one.scale * other, one.powers) if other else 0.0
-    powers = dict(one.powers)
-    for place, exponent in other.powers:
-        powers[place] = powers.get(place, 0.0) + exponent
-    scale, left = one.scale * other.scale, tuple(sorted(each for each in powers.items() if each[1]))
-    return Known(float(one) * float(other), one.record, scale, left) if left else scale
+        if other == 1.0:
+            return one
+        return Known(_plain(one) * other, record, one.scale * other, one.powers) if other else 0.0
+    scale, both = one.scale * other.scale, (one.powers, other.powers)
+    left = record.merged.get(both)
+    if left is None:
+        powers = dict(one.powers)
+        for place, exponent in other.powers:
+            powers[place] = powers.get(place, 0.0) + exponent
+        left = record.merged[both] = tuple(sorted(each for each in powers.items() if each[1]))
+    return Known(_plain(one) * _plain(other), record, scale, left) if left else scale
 
 
 def _power(one: float, exponent: float) -> float:

@@ -16,6 +16,7 @@ from twoloop.generate.lane_series import LaneSeries
 from twoloop.generate.llvm_text import Value, integer
 from twoloop.generate.series import series_program
 from twoloop.generate.straight_line import Outputs, Solution, StraightLine
+from twoloop.generate.traced_equations import Equations
 from twoloop.generate.tracing import Untraceable
 from twoloop.generate.written import conditions_hold, results_of
 from twoloop.kernels.control.defect import ROUNDING
@@ -48,12 +49,12 @@ class LaneCode:
 
     def __init__(self, system: ConstrainedSystem, choice: Choice, parameters: Any, series: bool):
         self.numbers = Coefficients(apart=True)
-        self.equations = equations = StraightLine(system, choice, parameters)
+        self.equations = equations = StraightLine(system, choice, Equations(system, parameters))
         self.solution = Solution(self.equations)
         self.n, self.n_rows = system.n_q, system.n_c + system.n_a
         self.recurrences: LaneSeries | None = None
         if series:
-            program = series_program(system, parameters)
+            program = series_program(system, Equations(system, parameters))
             if program.n_operations > LARGEST:
                 raise Untraceable(f"its series takes more than {LARGEST} operations")
             self.recurrences = LaneSeries(program, self.solution, self.numbers, self.n, self.n_rows)

@@ -100,6 +100,7 @@ class Module:
     def __init__(self, divided: bool = False) -> None:
         self.divided = divided
         self.kept_apart: list[str] = []  # addresses of blocks
+        self._tables: list[str] = []
         self._declared: dict[str, str] = {}
         self._functions: list[Builder] = []
 
@@ -109,6 +110,13 @@ class Module:
         self._functions.append(made)
         return made
 
+    def table(self, places: Sequence[int]) -> Value:
+        """A pointer to integers that never change."""
+        kind, name = f"[{len(places)} x {WORD}]", f"@table{len(self._tables)}"
+        entries = ", ".join([f"{WORD} {place}" for place in places])
+        self._tables.append(f"{name} = internal constant {kind} [{entries}]")
+        return Value(f"{WORD}*", f"getelementptr inbounds ({kind}, {kind}* {name}, {INTEGER} 0, {INTEGER} 0)")
+
     def declare(self, name: str, result: str, arguments: Iterable[str]) -> None:
         """Say of which type a function of LLVM, or of libm, is."""
         self._declared[name] = f"declare {result} @{name}({', '.join(arguments)})"
@@ -116,7 +124,7 @@ class Module:
     def __str__(self) -> str:
         defined = {function.name for function in self._functions}
         declared = [text for name, text in self._declared.items() if name not in defined]
-        parts = [*declared, *(function.text() for function in self._functions), "!0 = !{}"]
+        parts = [*declared, *self._tables, *(function.text() for function in self._functions), "!0 = !{}"]
         if self.kept_apart:
             kind = f"[{len(self.kept_apart)} x i8*]"
             parts.append(f"@kept_apart = internal constant {kind} [{', '.join(self.kept_apart)}]")

@@ -3,15 +3,15 @@
 Accelerations and both projections take the same factors and solve with them. What LLVM takes for machine code grows
 faster than the length of a block, and the values of long equations pass through memory in any case, as there are more
 of them than registers. So each part is a function of its own, and the functions that kernels know call them: the
-factors of a position, what is solved for accelerations, the correction that moves q or v onto the constraints, what is
-off for either, and, with redundant rows, multipliers of least norm.
+factors of a position, the solution with them, which gives accelerations, the corrections that move q and v onto the
+constraints, and every order of a series, right-hand sides, and, with redundant rows, multipliers of least norm.
 """
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from twoloop.generate.coefficients import Coefficients
-from twoloop.generate.llvm_code import Emitter
+from twoloop.generate.llvm_code import ZERO, Emitter
 from twoloop.generate.llvm_text import BIT, DOUBLE, Builder, Module, Value, integer
 from twoloop.generate.straight_line import Outputs, Solution, StraightLine
 from twoloop.generate.written import NOWHERE, Place, Written, conditions_hold
@@ -19,24 +19,24 @@ from twoloop.generate.written import NOWHERE, Place, Written, conditions_hold
 TRUE = Value(BIT, "true")
 ARRAY = f"{DOUBLE}*"
 POSITION = [DOUBLE, ARRAY, ARRAY, ARRAY, ARRAY]  # t, q, v, numbers, kept
-LONG = 500  # quantities of the accelerations from which on equations are written in parts ...
-DIVIDED = 1700  # ... whose blocks are divided; with fewer the divided code runs up to a quarter slower ...
+LONG = 500  # operations from which on equations are written in parts ...
+DIVIDED = 1500  # ... whose blocks are divided; with fewer the divided code runs up to a quarter slower ...
 LONGEST = 2500  # ... and which LLVM does not simplify first: it finds nothing there that makes them faster
 
 
 def is_long(equations: StraightLine) -> bool:
     """Whether equations are worth their calls."""
-    return len(equations.there.quantities(equations.graph)) > LONG
+    return equations.n_operations > LONG
 
 
 def has_long_blocks(equations: StraightLine) -> bool:
     """Whether blocks take so long to compile that they are divided."""
-    return len(equations.there.quantities(equations.graph)) > DIVIDED
+    return equations.n_operations > DIVIDED
 
 
 def is_longest(equations: StraightLine) -> bool:
     """Whether to simplify equations first only takes time."""
-    return len(equations.there.quantities(equations.graph)) > LONGEST
+    return equations.n_operations > LONGEST
 
 
 class PartsCode:
@@ -59,15 +59,13 @@ class PartsCode:
         self.equations, self.numbers = equations, numbers
         self.n, self.n_rows = equations.system.n_q, len(equations.all_rows)
         self.redundant = len(equations.choice.rows) < self.n_rows
-        self.at_position = {"solved": equations.solved}
+        self.at_position = {"right": equations.right}
         if equations.projects:
             self.at_position |= {"off": equations.off, "faster": equations.faster}
         self.solution = Solution(equations, list(self.at_position.values()))
-        self.with_factors: dict[str, Outputs] = {}
-        if equations.projects:
-            self.with_factors["correction"] = self.solution.correction
-            if self.redundant:
-                self.with_factors["least"] = self.solution.least
+        self.with_factors = {"own_solution": self.solution.solved}
+        if equations.projects and self.redundant:
+            self.with_factors["least"] = self.solution.least
 
     def write(self, module: Module, kinds: Callable[[str], tuple[str, list[str]]]) -> list[str]:
         """Put all of them into a module; the names of those that kernels know, whose types `kinds` has."""
@@ -77,8 +75,10 @@ class PartsCode:
         for name, outputs in self.at_position.items():
             kind = [*POSITION, *[ARRAY] * len(outputs.arrays)]
             _write(module.function(name, BIT, kind, internal=True), self._at_position(outputs))
-        for name, outputs in self.with_factors.items():
-            _write(module.function(name, BIT, [ARRAY] * 5, internal=True), self._with_factors(outputs))
+        known["own_solution"] = self._with_factors(self.with_factors["own_solution"])
+        if "least" in self.with_factors:
+            kind = [ARRAY] * 5
+            _write(module.function("least", BIT, kind, internal=True), self._with_factors(self.with_factors["least"]))
         for name, emit in known.items():
             _write(module.function(name, *kinds(name)), emit)
         return list(known)
@@ -126,14 +126,17 @@ class PartsCode:
     # what kernels call
 
     def _there(self, emit: Emitter, t: Value, q: Value, v: Value, numbers: Value, a: Value) -> Value:
-        kept, lam = _rooms(emit, self.solution.n_kept, self.n_rows)
-        _leave_unless(emit, "own_factors", [t, q, v, numbers, kept])
-        return emit.builder.call("solved", BIT, [t, q, v, numbers, kept, a, lam])
+        kept, r, c, lam = _rooms(emit, self.solution.n_kept, self.n, self.n_rows, self.n_rows)
+        at = [t, q, v, numbers, kept]
+        _leave_unless(emit, "own_factors", at)
+        _leave_unless(emit, "right", [*at, r, c])
+        return emit.builder.call("own_solution", BIT, [r, c, kept, numbers, a, lam])
 
     def _closer(self, emit: Emitter, t: Value, q: Value, v: Value, numbers: Value, moved: Value, out: Value) -> Value:
-        kept, c = _rooms(emit, self.solution.n_kept, self.n_rows)
+        kept, r, c, lam = _rooms(emit, self.solution.n_kept, self.n, self.n_rows, self.n_rows)
         _leave_unless(emit, "own_factors", [t, q, v, numbers, kept])
-        self._correct(emit, "off", [t, q, v, numbers, kept], c, moved)
+        _clear(emit, self.n, r)
+        self._correct(emit, "off", [t, q, v, numbers, kept], r, c, moved, lam)
         _sum(emit, self.n, q, moved, out)
         return TRUE
 
@@ -151,22 +154,25 @@ class PartsCode:
         lam: Value,
     ) -> Value:
         n, n_rows = self.n, self.n_rows
-        kept, c, change, u = _rooms(emit, self.solution.n_kept, n_rows, n, n)
+        kept, r, c, change, u = _rooms(emit, self.solution.n_kept, n, n_rows, n, n)
         at = [t, q, v, numbers, kept]
         _leave_unless(emit, "own_factors", at)
-        self._correct(emit, "off", at, c, moved)
-        self._correct(emit, "faster", at, c, change)
+        _clear(emit, n, r)
+        self._correct(emit, "off", at, r, c, moved, lam)
+        self._correct(emit, "faster", at, r, c, change, lam)
         _sum(emit, n, v, change, u)
-        _leave_unless(emit, "solved", [t, q, u, numbers, kept, a, c if self.redundant else lam])
+        _leave_unless(emit, "right", [t, q, u, numbers, kept, r, c])
+        _leave_unless(emit, "own_solution", [r, c, kept, numbers, a, c if self.redundant else lam])
         if self.redundant:
             _leave_unless(emit, "least", [c, c, kept, numbers, lam])
         _sum(emit, n, q, moved, new_q)
         _sum(emit, n, v, change, new_v)
         return TRUE
 
-    def _correct(self, emit: Emitter, what: str, at: list[Value], c: Value, out: Value) -> None:
+    def _correct(self, emit: Emitter, what: str, at: list[Value], r: Value, c: Value, out: Value, lam: Value) -> None:
+        """The solution where r is zero, in the metric of M; the multipliers do not matter."""
         _leave_unless(emit, what, [*at, c])
-        _leave_unless(emit, "correction", [c, c, at[-1], at[-2], out])
+        _leave_unless(emit, "own_solution", [r, c, at[-1], at[-2], out, lam])
 
 
 def _rooms(emit: Emitter, *sizes: int) -> list[Value]:
@@ -185,6 +191,11 @@ def _store(emit: Emitter, arrays: Sequence[Sequence[Value]], out: Sequence[Value
     for place, values in zip(out, arrays, strict=True):
         for j, value in enumerate(values):
             emit.store(value, place, j)
+
+
+def _clear(emit: Emitter, n: int, out: Value) -> None:
+    with emit.loop(integer(0), integer(n), []) as (j, _, _):
+        emit.store(ZERO, emit.pointer(out, j))
 
 
 def _sum(emit: Emitter, n: int, one: Value, other: Value, out: Value) -> None:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from twoloop.generate.families import Evaluator, Family, of_family
 from twoloop.generate.known_numbers import array_of, elementwise
-from twoloop.generate.traced_equations import Equations
+from twoloop.generate.traced_equations import Equations, only
 from twoloop.generate.traced_values import Check, Traced, unchecked
 from twoloop.generate.tracing import MOST_OPERATIONS, Form, Graph, Untraceable
 from twoloop.kernels.evaluation.operations import COSINE, PENDING, SINE, SUM
@@ -133,13 +133,13 @@ def series_for(system: ConstrainedSystem, check: Check = unchecked) -> SeriesPro
     """
 
     def make(family: Family) -> SeriesProgram:
-        return series_program(system, family.parameters)
+        return series_program(system, family.equations(system))
 
     made: SeriesProgram = of_family(system, "series", make, lambda program: check(program.traced))
     return made
 
 
-def series_program(system: ConstrainedSystem, parameters: Any = None) -> SeriesProgram:
+def series_program(system: ConstrainedSystem, equations: Equations | None = None) -> SeriesProgram:
     """The program of a system, of callbacks that do not branch on t, q or v.
 
     Raises
@@ -147,7 +147,8 @@ def series_program(system: ConstrainedSystem, parameters: Any = None) -> SeriesP
     Untraceable
         Naming the callback, and why its equations cannot be had.
     """
-    equations, n, n_rows = Equations(system, parameters), system.n_q, system.n_c + system.n_a
+    equations = Equations(system) if equations is None else equations
+    n, n_rows = system.n_q, system.n_c + system.n_a
     graph, v = equations.graph, equations.v
     a, lam = graph.inputs(n, True), graph.inputs(n_rows, True)
     mass, force, jacobian, nonholonomic, rate, nonholonomic_rate = map(equations.of, READ)
@@ -162,7 +163,8 @@ def series_program(system: ConstrainedSystem, parameters: Any = None) -> SeriesP
         factors, others = [-each for each in G[:, i]], list(lam)
         factors += [-each for each in mass[i]]
         balance.append(_sum_of_products(graph, factors, [*others, *a], force[i], reaction_products))
-    program = _assembled(graph, sums, n, n_rows, rows, balance, row_products, reaction_products)
+    inputs = [*range(1 + 2 * n), *map(only, a), *map(only, lam)]
+    program = _assembled(graph, sums, inputs, n, n_rows, rows, balance, row_products, reaction_products)
     return replace(program, traced=Traced(system, graph))
 
 
@@ -222,6 +224,7 @@ def _collect(groups: dict[Any, tuple[Form, Form]], factor: Form, other: Form) ->
 def _assembled(
     graph: Graph,
     sums: dict[int, Form],
+    inputs: list[int],
     n: int,
     n_rows: int,
     rows: list[Form],
@@ -231,32 +234,47 @@ def _assembled(
 ) -> SeriesProgram:
     early: list[Any] = []
     late: list[Any] = []
-    for i, operation in enumerate(graph.operations):
-        if operation is not None and i not in sums:
+    factors = [form for each in (row_products, reaction_products) for _, *forms in each.values() for form in forms]
+    for i, operation in _used(graph, [*rows, *balance, *factors]):
+        if i not in sums:
             kind, first, second = operation
             made = (_without_sums(sums, first), None if second is None else _without_sums(sums, second))
             (late if graph.late[i] else early).append((i, kind, *made))
     if len(early) + len(late) + len(row_products) + len(reaction_products) > MOST_OPERATIONS:
         raise Untraceable(f"its equations are more than {MOST_OPERATIONS} operations")
     tables = [
-        [*_ordered(operations), (PENDING, [(next(iter(form.terms)), *factors) for form, *factors in products.values()])]
+        [
+            *_ordered(operations),
+            (PENDING, sorted([(only(form), *factors) for form, *factors in products.values()], key=_n_terms)),
+        ]
         for operations, products in ((early, row_products), (late, reaction_products))
     ]
-    n_inputs = 1 + 3 * n + n_rows
-    place = {i: i for i in range(n_inputs)}
+    place = {i: k for k, i in enumerate(inputs)}
     for groups in tables:
         for _, members in groups:
             for node, *_ in members:
                 place[node] = len(place)
-    v_and_a = range(1 + n, 1 + 3 * n)
+    v_and_a, lam_and_a = set(inputs[1 + n : 1 + 3 * n]), set(inputs[1 + 2 * n :])
     return SeriesProgram(
         n,
         n_rows,
         _table(tables[0], place),
         _table(tables[1], place),
         *_scattered([_without(form, v_and_a) for form in rows], place),
-        *_scattered([_without(form, range(1 + 2 * n, n_inputs)) for form in balance], place),
+        *_scattered([_without(form, lam_and_a) for form in balance], place),
     )
+
+
+def _used(graph: Graph, forms: list[Form]) -> list[tuple[int, Any]]:
+    """The operations that forms are made of, and those that are made with them: sines and cosines of an angle."""
+    needed = set(graph.needed_by(forms))
+    pairs = (SINE, COSINE)
+    angles = {each[1].key for i in needed if (each := graph.operations[i]) is not None and each[0] in pairs}
+    return [
+        (i, each)
+        for i, each in enumerate(graph.operations)
+        if each is not None and (i in needed or (each[0] in pairs and each[1].key in angles))
+    ]
 
 
 def _scattered(forms: list[Form], place: dict[int, int]) -> tuple[Sums, Integers]:
@@ -287,11 +305,17 @@ def _ordered(operations: list[Any]) -> list[tuple[int, list[Any]]]:
     for (number, kind), members in sorted(groups.items()):
         if kind == COSINE:
             continue
+        members.sort(key=_n_terms)  # side by side is done what takes as long
         if kind == SINE:
             cosines = {first.key: node for node, first, _ in groups[number, COSINE]}
             members += [(cosines[first.key], first, second) for _, first, second in members]
         ordered.append((kind, members))
     return ordered
+
+
+def _n_terms(operation: tuple[int, Form, Form]) -> tuple[int, int]:
+    _, first, second = operation
+    return len(first.terms), len(second.terms)
 
 
 def _table(groups: list[tuple[int, list[Any]]], place: dict[int, int]) -> Table:

@@ -8,11 +8,12 @@ are vector operations. What a processor has stored number by number it cannot re
 put together in registers, and the newest coefficients come last in the sums.
 """
 
-from typing import Any
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 from twoloop.generate.coefficients import Coefficients
 from twoloop.generate.llvm_code import ONE, SLACK, ZERO, Emitter, Quantities
-from twoloop.generate.llvm_text import Value, integer
+from twoloop.generate.llvm_text import Module, Value, integer, width_of
 from twoloop.generate.series import SeriesProgram
 from twoloop.generate.series_groups import WIDTH, Group, Groups, rounded
 from twoloop.generate.written import FUNCTIONS
@@ -44,6 +45,14 @@ class SeriesCode:
         self.inverses = self.velocities + rounded(self.n)
         self.zeros = self.inverses + self.width
         self.table = self.zeros + 2 * self.width
+
+    @property
+    def structure(self) -> tuple[object, ...]:
+        """All that the code depends on, the values of its numbers apart."""
+        return self.n, self.n_rows, self.groups.structure
+
+    def write_parts(self, module: Module) -> None:
+        """Put functions into a module that the others call: there are none."""
 
     def scratch_size(self, order: int) -> int:
         """Length of `scratch` for a series of this order."""
@@ -220,31 +229,12 @@ class SeriesCode:
 
     def _begin_group(self, emit: Emitter, base: Value, known: Quantities, group: Group) -> None:
         """Order 0: the functions themselves; what waits stays zero."""
-        kind, table, half = group.kind, emit.pointer(base, self.table), group.width // 2
+        table = emit.pointer(base, self.table)
         first = [known.sum(*each) for each in group.first]
         second = [ZERO if group.pending else known.sum(*each) for each in group.second]
-        x, y = emit.vector(first), emit.vector(second)
-        ones, divisor = emit.vector([ONE] * group.width), None
-        if kind == PENDING:
-            results = second
-        elif kind == PRODUCT:
-            results = emit.elements(emit.multiply(x, y))
-        elif kind == SINE:
-            sines, cosines = ([emit.function(name, each) for each in first[:half]] for name in ("sin", "cos"))
-            results, y = [*sines, *cosines], emit.vector([*cosines, *map(emit.negative, sines)])
-        elif kind == RECIPROCAL:
-            y = emit.divide(ones, x)
-            results = emit.elements(y)
-        else:
-            results = [emit.function(FUNCTIONS[kind], each) for each in first]
-            if kind in (LOGARITHM, ARCTANGENT):
-                divisor = y
-            else:
-                y = emit.vector(results)
-            if kind == SQUARE_ROOT:
-                divisor = emit.add(y, y)
-        if divisor is not None:
-            emit.store_vector(emit.divide(ones, divisor), base, self.inverses + group.place)
+        results, x, y, inverse = begun(emit, group.kind, first, second)
+        if inverse is not None:
+            emit.store_vector(inverse, base, self.inverses + group.place)
         for quantity, result in zip(group.quantities, results, strict=True):
             known.define(quantity, result)
         emit.store_vector(x, table, group.place)
@@ -280,50 +270,90 @@ class SeriesCode:
         if group.kind in (PRODUCT, LOGARITHM, ARCTANGENT):
             known_factors.append(emit.vector([known.sum(each.terms) for each in group.second]))
         scales = (emit.vector([each] * group.width) for each in (number, inverse))
-        results, x, y = self._recurrence(emit, base, group, total, *scales, *known_factors)
+
+        def at(place: int) -> Value:
+            return emit.load_vector(base, place + group.place, group.width)
+
+        places = self.table, self.table + self.width, self.inverses
+        results, x, y = recurrence(emit, group.kind, at, places, total, *scales, *known_factors)
         for quantity, value in zip(group.quantities, emit.elements(results), strict=True):
             known.define(quantity, value)
         emit.store_vector(x, row, group.place)
         if not group.pending:
             emit.store_vector(y, row, self.width + group.place)
 
-    def _recurrence(
-        self,
-        emit: Emitter,
-        base: Value,
-        group: Group,
-        total: Value,
-        number: Value,
-        inverse: Value,
-        u: Value,
-        z: Any = None,
-    ) -> tuple[Value, Value, Any]:
-        """Results and factors X and Y of order `number`, from arguments u and z and the sum of products."""
 
-        def at(place: int) -> Value:
-            return emit.load_vector(base, place + group.place, group.width)
+class Begun(NamedTuple):
+    """Operations of order 0."""
 
-        def with_last(x: Value) -> Value:
-            """The sum of products with that of X of this order."""
-            return emit.add(total, emit.multiply(x, at(self.table + self.width)))
+    results: list[Value]
+    x: Value
+    y: Value
+    inverse: Value | None  # of what the recurrence divides by
 
-        kind = group.kind
-        if kind == PENDING:
-            return with_last(u), u, None
-        if kind == PRODUCT:
-            return emit.add(with_last(u), emit.multiply(at(self.table), z)), u, z
-        if kind == RECIPROCAL:
-            y = emit.negative(emit.multiply(with_last(u), at(self.table + self.width)))
-            return y, u, y
-        if kind == SQUARE_ROOT:
-            x = emit.multiply(emit.subtract(u, total), at(self.inverses))
-            return x, x, x
+
+def begun(emit: Emitter, kind: int, first: list[Value], second: list[Value]) -> Begun:
+    """The functions themselves of their arguments, side by side; what waits stays zero."""
+    x, y, half = emit.vector(first), emit.vector(second), len(first) // 2
+    ones, divisor = emit.vector([ONE] * len(first)), None
+    if kind == PENDING:
+        results = second
+    elif kind == PRODUCT:
+        results = emit.elements(emit.multiply(x, y))
+    elif kind == SINE:
+        sines, cosines = ([emit.function(name, each) for each in first[:half]] for name in ("sin", "cos"))
+        results, y = [*sines, *cosines], emit.vector([*cosines, *map(emit.negative, sines)])
+    elif kind == RECIPROCAL:
+        y = emit.divide(ones, x)
+        results = emit.elements(y)
+    else:
+        results = [emit.function(FUNCTIONS[kind], each) for each in first]
         if kind in (LOGARITHM, ARCTANGENT):
-            result = emit.multiply(emit.subtract(u, emit.multiply(total, inverse)), at(self.inverses))
-            return result, emit.multiply(number, result), z
-        x = emit.multiply(number, u)
-        result = y = emit.multiply(with_last(x), inverse)
-        if kind == SINE:
-            each, half = emit.elements(result), group.width // 2
-            y = emit.vector([*each[half:], *map(emit.negative, each[:half])])
-        return result, x, y
+            divisor = y
+        else:
+            y = emit.vector(results)
+        if kind == SQUARE_ROOT:
+            divisor = emit.add(y, y)
+    return Begun(results, x, y, None if divisor is None else emit.divide(ones, divisor))
+
+
+def recurrence(
+    emit: Emitter,
+    kind: int,
+    at: Callable[[int], Value],
+    places: tuple[int, int, int],
+    total: Value,
+    number: Value,
+    inverse: Value,
+    u: Value,
+    z: Any = None,
+) -> tuple[Value, Value, Any]:
+    """Results and factors X and Y of order `number`, from arguments u and z and the sum of products.
+
+    `at` loads what stands at one of the places: X and Y of order 0, and the inverse of what is divided by.
+    """
+    x0, y0, inverses = places
+
+    def with_last(x: Value) -> Value:
+        """The sum of products with that of X of this order."""
+        return emit.add(total, emit.multiply(x, at(y0)))
+
+    if kind == PENDING:
+        return with_last(u), u, None
+    if kind == PRODUCT:
+        return emit.add(with_last(u), emit.multiply(at(x0), z)), u, z
+    if kind == RECIPROCAL:
+        y = emit.negative(emit.multiply(with_last(u), at(y0)))
+        return y, u, y
+    if kind == SQUARE_ROOT:
+        x = emit.multiply(emit.subtract(u, total), at(inverses))
+        return x, x, x
+    if kind in (LOGARITHM, ARCTANGENT):
+        result = emit.multiply(emit.subtract(u, emit.multiply(total, inverse)), at(inverses))
+        return result, emit.multiply(number, result), z
+    x = emit.multiply(number, u)
+    result = y = emit.multiply(with_last(x), inverse)
+    if kind == SINE:
+        each, half = emit.elements(result), width_of(result.type) // 2
+        y = emit.vector([*each[half:], *map(emit.negative, each[:half])])
+    return result, x, y

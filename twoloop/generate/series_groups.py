@@ -104,18 +104,19 @@ def _terms(sums: Sums, rows: Sequence[int]) -> list[Terms]:
     return [tuple(term for term in ((i, c), *more[row]) if term[1] != 0.0) for row, i, c in firsts]
 
 
+def terms_of(sums: Sums, rows: Sequence[int]) -> list[tuple[Terms, float]]:
+    """Forms, which belong to these rows, as terms and constants."""
+    return list(zip(_terms(sums, rows), sums.constant.tolist(), strict=True))
+
+
 def _rows(sums: Sums, places: Sequence[int], numbers: Coefficients) -> list[Row]:
-    forms = zip(places, _terms(sums, places), sums.constant.tolist(), strict=True)
-    return [Row(place, *numbers.of(terms, constant)) for place, terms, constant in forms]
+    return [Row(place, *numbers.of(*form)) for place, form in zip(places, terms_of(sums, places), strict=True)]
 
 
 def _groups(table: Table, quantity: int, numbers: Coefficients) -> list[Group]:
     """Those of a table, whose first operation makes this quantity; they have no places yet."""
     first, second = (
-        [
-            Argument(*numbers.of(*each))
-            for each in zip(_terms(sums, range(len(sums.column))), sums.constant.tolist(), strict=True)
-        ]
+        [Argument(*numbers.of(*each)) for each in terms_of(sums, range(len(sums.column)))]
         for sums in (table.first, table.second)
     )
     groups = []

@@ -122,8 +122,7 @@ class SharedCode:
         if self.parts is not None:
             for outputs in self.parts.at_position.values():
                 yield outputs.sizes, list(numbers.structure(equations.graph, outputs.forms, solution.known))
-        others = [] if self.parts is None else self.parts.with_factors.values()
-        for outputs in (solution.solved, *others):
+        for outputs in [solution.solved] if self.parts is None else self.parts.with_factors.values():
             yield outputs.sizes, list(numbers.structure(solution.graph, outputs.forms))
 
     def _write(self) -> tuple[list[str], str]:
@@ -177,7 +176,7 @@ def own_code(system: ConstrainedSystem, t0: float, q0: Array, check: Check = unc
         choice = system.remembered_at("choice", (t0, q0.tobytes()), lambda: Choice.at(system, t0, q0))
 
         def make(family: Family) -> SharedCode:
-            return SharedCode(StraightLine(system, choice, family.parameters), family)
+            return SharedCode(StraightLine(system, choice, family.equations(system)), family)
 
         made: OwnCode = of_family(system, ("code", choice), make, lambda code: check(code.traced))
     except Untraceable as error:

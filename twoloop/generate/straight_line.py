@@ -28,7 +28,7 @@ from twoloop.generate.tracing import Form, Graph, Untraceable
 from twoloop.kernels.evaluation.inner import CONTRADICTS
 from twoloop.problem.system import ConstrainedSystem
 
-MOST_ELIMINATED = 40_000  # operations with their elimination: those of 28 bodies on hinges in space
+MOST_ELIMINATED = 60_000  # operations with their elimination: those of 57 bodies on hinges in space
 
 
 @dataclass(frozen=True)
@@ -70,8 +70,8 @@ class StraightLine:
     system : ConstrainedSystem
     choice : Choice
         What numbers decide.
-    parameters : array of float or Known, optional
-        In the place of its own.
+    equations : Equations, optional
+        Of the system, which are continued.
 
     Attributes
     ----------
@@ -79,8 +79,8 @@ class StraightLine:
         Its first quantities are t, q and v.
     there : Outputs
         "a" (n_q,), the accelerations at (q, v) as they stand.
-    solved : Outputs
-        The same, and "lam" (n_c + n_a,), 0 for rows that do not count; without conditions.
+    right : Outputs
+        "r" (n_q,) and "c" (n_c + n_a,), Q and the right-hand sides of the rows of G that are used; without conditions.
     projects : bool
         Whether there are `closer` and `nearer`. Rows of A leave positions free.
     closer : Outputs
@@ -91,6 +91,8 @@ class StraightLine:
         "c" (n_c,) of the moves to positions and to velocities on the rows.
     redundant : Outputs
         No arrays; its conditions are that the rows of C_q that do not count hold, too.
+    n_operations : int
+        Of callbacks and elimination, without solutions.
     traced : Traced
         What the callbacks gave.
 
@@ -100,8 +102,8 @@ class StraightLine:
         Saying why the equations cannot be had.
     """
 
-    def __init__(self, system: ConstrainedSystem, choice: Choice, parameters: Any = None):
-        self.equations = Equations(system, parameters)
+    def __init__(self, system: ConstrainedSystem, choice: Choice, equations: Equations | None = None):
+        self.equations = Equations(system) if equations is None else equations
         self.system, self.choice, self.graph = system, choice, self.equations.graph
         self.nothing = Form(self.graph, 0.0, {})
         n, (self.q, self.v) = system.n_q, (self.equations.q, self.equations.v)
@@ -114,11 +116,11 @@ class StraightLine:
         self.factors = Factors(self._matrix(), n + len(self.rows), n)
         self.conditions = [(pivot, alone.times(choice.least)) for pivot, alone in self.factors.conditions]
         self.conditions += [(pivot, self.nothing) for pivot in self.factors.positive if pivot.terms]
-        solution = self._accelerations(self.v)
-        self.there = Outputs({"a": solution[:n]}, self.conditions)
-        self.solved = Outputs({"a": solution[:n], "lam": self._spread(solution[n:])}, [])
         self.redundant = self._redundant(np.concatenate(rates))
         self._bound()
+        for kind in ("gamma", "nonholonomic_gamma", "force"):
+            self.equations.of(kind)
+        self.n_operations = len(self.graph.operations)
         self.traced = Traced(system, self.graph)
 
     def _bound(self) -> None:
@@ -162,10 +164,27 @@ class StraightLine:
                     matrix[n + k, i] = matrix[i, n + k] = row[i]
         return matrix
 
+    def _given(self, v: Sequence[Form]) -> tuple[list[Form], list[Form]]:
+        """Q, and the right-hand sides of all rows of G, at velocities v."""
+        return list(self._made("force", v)), [*self._made("gamma", v), *self._made("nonholonomic_gamma", v)]
+
+    @cached_property
+    def there(self) -> Outputs:
+        """See the class."""
+        solution = self._accelerations(self.v)
+        self._bound()
+        return Outputs({"a": solution[: self.system.n_q]}, self.conditions)
+
+    @cached_property
+    def right(self) -> Outputs:
+        """See the class."""
+        force, gamma = self._given(self.v)
+        used = {*self.choice.rows, *self.choice.added}
+        return Outputs({"r": force, "c": [each if k in used else self.nothing for k, each in enumerate(gamma)]}, [])
+
     def _accelerations(self, v: Sequence[Form]) -> list[Form]:
         """a and the multipliers of the rows that count, at velocities v."""
-        gamma = [*self._made("gamma", v), *self._made("nonholonomic_gamma", v)]
-        right = list(self._made("force", v))
+        right, gamma = self._given(v)
         for k in self.choice.added:
             for i, entry in enumerate(self.all_rows[k]):
                 right[i] = right[i] + (entry * gamma[k]).times(self.choice.scale)
@@ -266,8 +285,6 @@ class Solution:
         Its inputs are r (n_q,), c (n_c + n_a,) and the factors, which are kept first.
     solved : Outputs
         "a" (n_q,) and "lam" (n_c + n_a,); 0 for rows that do not count.
-    correction : Outputs
-        "x" (n_q,), the solution where r is 0, in the metric of M.
     least : Outputs
         "lam" (n_c,) of least norm, where c is "lam" of `solved`.
     """
@@ -322,11 +339,6 @@ class Solution:
         for k, value in zip(self._choice.rows, solution[self._n :], strict=True):
             lam[k] = value
         return Outputs({"a": solution[: self._n], "lam": lam}, [])
-
-    @cached_property
-    def correction(self) -> Outputs:
-        """See the class."""
-        return Outputs({"x": self._solve([*([self._nothing] * self._n), *self._counting()])[: self._n]}, [])
 
     @cached_property
     def least(self) -> Outputs:

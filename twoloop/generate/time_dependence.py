@@ -3,7 +3,6 @@
 from typing import Any, NamedTuple
 
 from twoloop.generate.families import Evaluator, Family, of_family
-from twoloop.generate.traced_equations import Equations
 from twoloop.generate.traced_values import unchecked
 from twoloop.generate.tracing import Form, Graph, Untraceable
 from twoloop.kernels.evaluation.operations import COSINE, EXPONENTIAL, PRODUCT, SINE, SUM
@@ -54,7 +53,7 @@ def may_be_sudden(system: ConstrainedSystem, ran_on_symbols: bool) -> Sudden:
 
 def _traced(system: ConstrainedSystem) -> Any:
     def make(family: Family) -> Dependence:
-        equations = Equations(system, family.parameters)
+        equations = family.equations(system)
 
         def needed(kinds: tuple[str, ...]) -> list[int]:
             forms = [form for kind in kinds if kind in system.given for form in equations.of(kind).ravel()]

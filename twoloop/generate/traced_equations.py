@@ -3,19 +3,25 @@
 Series, straight-line code, references and the programs that stand for callbacks that are not given read them from here.
 """
 
+import copy
 from collections.abc import Sequence
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from typing import Any
 
 import numpy as np
 
 from twoloop.generate.calls_on_symbols import as_forms, trace
 from twoloop.generate.derivative import Derivative
-from twoloop.generate.known_numbers import Known
+from twoloop.generate.known_numbers import Known, elementwise
 from twoloop.generate.tracing import Form, Graph, Untraceable, symbols
 from twoloop.kernels.compile.callbacks import KINDS
 from twoloop.problem.system import ConstrainedSystem
 
+# in the order in which they are traced
+CALLBACKS = (
+    *("constraint", "constraint_rate", "jacobian", "nonholonomic", "nonholonomic_rate", "mass", "force"),
+    *("gamma", "nonholonomic_gamma"),
+)
 OF_ROWS = {"gamma": ("jacobian", "constraint_rate"), "nonholonomic_gamma": ("nonholonomic", "nonholonomic_rate")}
 
 
@@ -43,6 +49,26 @@ class Equations:
         (self.t,) = self.graph.inputs(1, False)
         self.q, self.v = self.graph.inputs(system.n_q, False), self.graph.inputs(system.n_q, True)
         self._made: dict[str, Any] = {}
+        self._before: dict[str, Any] = {}  # what was traced in the graph of which this one is a copy
+
+    def trace_all(self) -> "Equations":
+        """Trace all callbacks that can be traced, for copies."""
+        for kind in CALLBACKS:
+            if not self._is_derived(kind):
+                with suppress(Untraceable):  # which who needs it is told
+                    self.of(kind)
+        return self
+
+    def copy(self) -> "Equations":
+        """Equations with a graph of their own, in which what was traced here is not traced again."""
+        other = copy.copy(self)
+        other.graph = self.graph.copy()
+        other.t, other.q, other.v = (
+            self.t.on(other.graph),
+            *([x.on(other.graph) for x in each] for each in (self.q, self.v)),
+        )
+        other._made, other._before = {}, self.graph.traced
+        return other
 
     def of(self, kind: str, v: Sequence[Form] | None = None) -> Any:
         """What a kind of callback gives, as an array of forms: zeros, or derivatives, where there is none.
@@ -67,8 +93,16 @@ class Equations:
         return self._rate() if kind == "constraint_rate" else self._gamma(*OF_ROWS[kind], self.v if v is None else v)
 
     def _make(self, kind: str, v: Sequence[Form]) -> Any:
-        absent = kind not in self.system.given
-        return self.derived(kind, v) if absent and kind in ("jacobian", *OF_ROWS) else self._traced(kind, v)
+        if self._is_derived(kind):
+            return self.derived(kind, v)
+        if kind in self._before and v is self.v:
+            made = elementwise(lambda form: form.on(self.graph), [self._before[kind]])
+            self.graph.traced.setdefault(kind, made.copy())
+            return made
+        return self._traced(kind, v)
+
+    def _is_derived(self, kind: str) -> bool:
+        return kind not in self.system.given and kind in ("jacobian", *OF_ROWS)
 
     def _traced(self, kind: str, v: Sequence[Form]) -> Any:
         system, graph, (out,) = self.system, self.graph, self.system.arrays_of(kind)

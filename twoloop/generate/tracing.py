@@ -33,6 +33,7 @@ BRANCHES = "it branches on, or converts to a number, what depends on t, q or v"
 # of numbers
 SIN, COS, EXP, LOG, ATAN, ROOT = map(function_of_number, ("sin", "cos", "exp", "log", "atan", "sqrt"))
 
+_equal = float.__eq__  # of numbers, whether or not they know their parameters
 _size = float.__abs__  # a plain number, also of one that knows its parameters
 
 CONVERTS = "it converts what depends on t, q or v to a number, as functions of math do within methods (numpy's do not)"
@@ -52,6 +53,17 @@ class Graph(Symbolic):
         self.traced: dict[str, Any] = {}
         self._known: dict[Any, int] = {}
         self._seen: dict[Any, int] = {}  # factors, in the order in which they came: values have no part in it
+
+    def copy(self) -> "Graph":
+        """A graph of the same quantities, which may be continued otherwise; what callbacks gave is not in it."""
+        other = Graph()
+        other.sizes, other.late, other.inputs_of = self.sizes.copy(), self.late.copy(), self.inputs_of.copy()
+        other._known, other._seen = self._known.copy(), self._seen.copy()
+        other.operations = [
+            None if each is None else (each[0], each[1].on(other), None if each[2] is None else each[2].on(other))
+            for each in self.operations
+        ]
+        return other
 
     def inputs(self, n: int, late: bool) -> list["Form"]:
         """New quantities that are given, as forms."""
@@ -146,6 +158,12 @@ class Form:
         self.graph, self.constant, self.terms = graph, constant, terms
         self.kept_key: tuple[Any, ...] | None = None
 
+    def on(self, graph: Graph) -> "Form":
+        """The same of a graph that has these quantities, too."""
+        made = Form(graph, self.constant, self.terms)
+        made.kept_key = self.kept_key
+        return made
+
     @property
     def key(self) -> tuple[Any, ...]:
         """What equal forms have in common, rounding of their coefficients apart."""
@@ -162,7 +180,7 @@ class Form:
         """A multiple."""
         if type(factor) is float and factor == 1.0:
             return self
-        if float.__eq__(factor, 0.0):
+        if _equal(factor, 0.0):
             return Form(self.graph, 0.0, {})
         return Form(self.graph, self.constant * factor, {i: c * factor for i, c in self.terms.items()})
 
@@ -171,6 +189,11 @@ class Form:
         factor = self.terms[min(self.terms)]
         if type(factor) is float and factor == 1.0:
             return factor, self
+        if len(self.terms) == 1 and _equal(self.constant, 0.0):
+            return factor, Form(self.graph, 0.0, dict.fromkeys(self.terms, 1.0))
+        if type(factor) is Known:
+            inverse = factor.to(-1.0)
+            return factor, Form(self.graph, self.constant * inverse, {i: c * inverse for i, c in self.terms.items()})
         return factor, Form(self.graph, self.constant / factor, {i: c / factor for i, c in self.terms.items()})
 
     def _other(self, other: Any) -> "Form":
@@ -187,11 +210,13 @@ class Form:
         other = self._other(other)
         terms = dict(self.terms)
         for i, c in other.terms.items():
-            total = terms.get(i, 0.0) + c
+            total = terms[i] + c if i in terms else c
             if _size(total) <= CANCELLED * _size(c):
                 terms.pop(i, None)  # a coefficient that underflowed is not there
             else:
                 terms[i] = total
+        if _equal(other.constant, 0.0):
+            return Form(self.graph, self.constant, terms)
         constant = self.constant + other.constant
         return Form(self.graph, 0.0 if _size(constant) <= CANCELLED * _size(other.constant) else constant, terms)
 
@@ -282,7 +307,7 @@ class Form:
 
     def value(self) -> "Form":
         """The same as a multiple of one quantity, or as a number."""
-        if len(self.terms) + (self.constant != 0.0) < 2:
+        if len(self.terms) + (not _equal(self.constant, 0.0)) < 2:
             return self
         scale, form = self.normalised()
         return self.graph.operation(op.SUM, form).times(scale)
