@@ -53,7 +53,7 @@ class LaneCode:
         self.n, self.n_rows = system.n_q, system.n_c + system.n_a
         self.recurrences: LaneSeries | None = None
         if series:
-            program = series_program(system, parameters)
+            program = series_program(system, parameters, {*choice.rows, *choice.added})
             if program.n_operations > LARGEST:
                 raise Untraceable(f"its series takes more than {LARGEST} operations")
             self.recurrences = LaneSeries(program, self.solution, self.numbers, self.n, self.n_rows)
