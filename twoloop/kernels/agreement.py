@@ -76,11 +76,11 @@ def disagreement(f, sizes, t, share, atol, parameters, q, v, a, lam, room, worst
         worst[k] = largest
 
 
-@kernel(types.void(KIT, INTEGERS, f8, TABLE, TABLE, TABLE, VECTOR, VECTOR))
-def violation(f, sizes, t, parameters, q, v, room, worst):
+@kernel(types.void(KIT, INTEGERS, f8, f8, TABLE, TABLE, TABLE, VECTOR, VECTOR))
+def violation(f, sizes, t, slow, parameters, q, v, room, worst):
     """Of each state the largest |C| and |C_q v + C_t| over the sum of a row of |C_q| times the largest entry of q or v.
 
-    room : (n_c (n + 2),).
+    slow : speed below which velocities count as if one of them were as large; room : (n_c (n + 2),).
     """
     n, n_c, first = sizes[0], sizes[1], sizes[2]
     C, rate, G = room[:n_c], room[n_c : 2 * n_c], room[2 * n_c :].reshape((n_c, n))
@@ -91,7 +91,7 @@ def violation(f, sizes, t, parameters, q, v, room, worst):
         f.constraint(t, q[k], f.p, C)
         f.jacobian(t, q[k], f.p, G)
         f.constraint_rate(t, q[k], f.p, rate)
-        far, fast, worst[k] = 0.0, 0.0, 0.0
+        far, fast, worst[k] = 0.0, slow, 0.0
         for j in range(n):
             far, fast = max(far, abs(q[k, j])), max(fast, abs(v[k, j]))
         for i in range(n_c):
