@@ -87,6 +87,8 @@ def far_off(kit: tuple[Any, NDArray[np.int64]], starts: Starts) -> NDArray[np.bo
 def generic_parameters(parameters: Array) -> tuple[Array, list[int]]:
     """Parameters between those of some runs, bound by no rule but a linear one of all, and which of them vary."""
     varies = (parameters != parameters[:1]).any(axis=0)
+    if not varies.any():
+        return parameters[0], []
     ends = (parameters[:, varies].argmin(axis=0), parameters[:, varies].argmax(axis=0))  # what one run alone has counts
     rows = parameters[np.concatenate([np.arange(0, len(parameters), max(1, len(parameters) // GENERIC)), *ends])]
     weights = np.random.default_rng(3).uniform(0.5, 1.5, len(rows))

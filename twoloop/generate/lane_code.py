@@ -60,7 +60,7 @@ class LaneCode:
             self.recurrences = LaneSeries(program, self.solution, self.numbers, self.n, self.n_rows)
         self.structure = self._structure()
         self.n_numbers = self.numbers.n_varying
-        parts = [equations.there, equations.closer, equations.nearer, equations.redundant]
+        parts = [equations.there, equations.closer, equations.nearest, equations.redundant]
         parts += [self.solution.kept] if series else []
         counts = [len(each.quantities(equations.graph)) for each in parts]
         counts += [len(self.solution.solved.quantities(self.solution.graph))] if series else []
@@ -79,7 +79,7 @@ class LaneCode:
     def _structure(self) -> str:
         equations, numbers = self.equations, self.numbers
         told: list[Any] = []
-        parts = [equations.there, equations.closer, equations.nearer, equations.redundant]
+        parts = [equations.there, equations.closer, equations.nearest, equations.redundant]
         if self.recurrences is not None:
             told += list(self.recurrences.structure)
             parts.append(self.solution.kept)
@@ -341,7 +341,7 @@ class LaneCode:
         """The same and velocities, and accelerations and multipliers there, until a move is no more than rounding."""
         builder, at = emit.builder, self._at(emit, order, control, room)
         fine, left = (_is_set(emit, room, field) for field in (lanes.FINE, lanes.LEFT_TO_MOVE))
-        act, moved = self._project(emit, self.equations.nearer, lanes.LEFT_TO_MOVE, at)
+        act, moved = self._project(emit, self.equations.nearest, lanes.LEFT_TO_MOVE, at)
         largest = emit.constant(0.0)
         for j in range(self.n):
             largest = emit.larger(emit.function("fabs", emit.load(at.new, j)), largest)

@@ -59,20 +59,18 @@ def disagreement(f, sizes, t, share, atol, parameters, q, v, a, lam, room, worst
             largest = max(largest, _off(faster, row * (share * fast + atol) + share * abs(rate[i])))
             if gamma_given:
                 largest = max(largest, _off(off, share * terms + row * atol))
-        size = 0.0
+        size, apart = 0.0, 0.0
         for j in range(n):
-            size = max(size, abs(Q[j]))
+            total, most = -Q[j], abs(Q[j])
             for m in range(n):
-                size = max(size, abs(M[j, m] * a[k, m]))
+                term = M[j, m] * a[k, m]
+                total, most = total + term, max(most, abs(term))
             for i in range(n_c):
-                size = max(size, abs(G[i, j] * lam[k, i]))
-        for j in range(n):
-            total = -Q[j]
-            for m in range(n):
-                total += M[j, m] * a[k, m]
-            for i in range(n_c):
-                total += G[i, j] * lam[k, i]
-            largest = max(largest, _off(total, share * size))
+                term = G[i, j] * lam[k, i]
+                total, most = total + term, max(most, abs(term))
+            size = max(size, most)
+            apart = max(apart, abs(total)) if np.isfinite(total) else np.inf
+        largest = max(largest, _off(apart, share * size))
         worst[k] = largest
 
 
