@@ -14,7 +14,8 @@ from twoloop.generate.choices import Choice
 from twoloop.generate.time_dependence import may_be_sudden
 from twoloop.problem.system import ConstrainedSystem
 
-Integers, Flags = NDArray[np.int64], NDArray[np.bool_]
+Integers = NDArray[np.int64]
+Flags = NDArray[np.bool_]
 
 PLACES = 100  # of a run, at least as many at which the equations are looked at ...
 OF_SUDDEN = 20  # ... times as many where a force may act for a short time: lanes do not look ahead
