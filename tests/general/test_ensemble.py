@@ -118,6 +118,17 @@ def test_velocities_off_the_constraints_are_named():
         ensemble(system, SPAN, q, v, parameters=parameters)
 
 
+def test_runs_nearly_at_rest_among_fast_ones_need_no_closer_look(monkeypatch):
+    """What rounding leaves of velocities is a share of those of other runs, from which they were projected."""
+    looked = []
+    monkeypatch.setattr("twoloop.ensembles.ensemble._check_start", lambda *arguments: looked.append(arguments[-1]))
+    system, q, _, parameters = pendulums(9)
+    v = np.column_stack([-q[:, 1], q[:, 0]])
+    v[4] = 1e-9 * v[4] + 5e-16 * q[4]
+    runs = ensemble(system, (0.0, 0.1), q, v, parameters=parameters)
+    assert looked == [] and runs.success.all()
+
+
 def test_a_lane_that_fails_says_what_a_single_run_says():
     q, v, _ = pendulum_state(0.0)
     system = pendulum(force=lambda t, q, v: np.array([0.0, -9.81 - 1e3 * np.sqrt(0.5 - t)]), compile=True)

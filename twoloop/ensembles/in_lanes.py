@@ -15,6 +15,7 @@ from twoloop.generate.time_dependence import may_be_sudden
 from twoloop.problem.system import ConstrainedSystem
 
 Integers = NDArray[np.int64]
+Flags = NDArray[np.bool_]
 
 PLACES = 100  # of a run, at least as many at which the equations are looked at ...
 OF_SUDDEN = 20  # ... times as many where a force may act for a short time: lanes do not look ahead
@@ -106,16 +107,19 @@ class LaneRuns:
         arrays = times, numbers, *given, *out, status, n_steps, room
         lane_runs.advance_lanes(kit, settings, control, method.options, *arrays)
 
-    def disagree(self, which: Integers, t1: float, atol: float, q: Array, v: Array, ends: Array) -> NDArray[np.bool_]:
-        """Of which of these runs callbacks say that the equations of motion do not hold at their end."""
+    def agree(self, which: Integers, made: Flags, t1: float, atol: float, q: Array, v: Array, ends: Array) -> Flags:
+        """Of which of these runs, of those that were made, callbacks say that the equations hold at their end.
+
+        q, v : (n_runs, n, n_t), the last at the end; ends : a and lam there.
+        """
         from twoloop.kernels.agreement import disagreement
 
-        system, n = self.system, self.system.n_q
-        room, worst = np.zeros(n * (n + 1) + system.n_c * (n + 3)), np.zeros(len(which))
-        arrays = self.starts.parameters[which], q, v, ends[:, :n], ends[:, n:]
-        chosen = (np.ascontiguousarray(each) for each in arrays)
-        disagreement(*self.kit, t1, AGREES, atol, *chosen, room, worst)
-        return ~(worst <= 1.0)
+        n, n_c = self.system.n_q, self.system.n_c
+        room, worst = np.zeros(n * (n + 3) + n_c * (n + 3)), np.full(len(which), np.inf)
+        rows = np.where(made, which, -1)
+        disagreement(*self.kit, t1, AGREES, atol, rows, self.starts.parameters, q, v, ends, room, worst)
+        agreed: Flags = worst <= 1.0
+        return agreed
 
 
 def _aligned(vectors: int, lanes: int) -> Array:

@@ -11,6 +11,7 @@ from twoloop.problem.system import ConstrainedSystem
 
 AT_ROUNDING = 64.0  # times rounding of its terms: an equation of a start that holds
 NEAR = 1e4  # the same of one that needs no closer look
+SLOW = 1e-3  # of the largest speed of all runs: what rounding leaves in velocities is not less in a run at rest
 GENERIC = 16  # runs of which generic parameters are a mean
 
 
@@ -78,13 +79,16 @@ def far_off(kit: tuple[Any, NDArray[np.int64]], starts: Starts) -> NDArray[np.bo
 
     functions, sizes = kit
     room, worst = np.zeros(int(sizes[1] * (sizes[0] + 2))), np.zeros(len(starts.q))
-    violation(functions, sizes, starts.t0, starts.parameters, starts.q, starts.v, room, worst)
+    slow = SLOW * float(np.abs(starts.v).max(initial=0.0))
+    violation(functions, sizes, starts.t0, slow, starts.parameters, starts.q, starts.v, room, worst)
     return ~(worst <= NEAR * np.finfo(float).eps)
 
 
 def generic_parameters(parameters: Array) -> tuple[Array, list[int]]:
     """Parameters between those of some runs, bound by no rule but a linear one of all, and which of them vary."""
     varies = (parameters != parameters[:1]).any(axis=0)
+    if not varies.any():
+        return parameters[0], []
     ends = (parameters[:, varies].argmin(axis=0), parameters[:, varies].argmax(axis=0))  # what one run alone has counts
     rows = parameters[np.concatenate([np.arange(0, len(parameters), max(1, len(parameters) // GENERIC)), *ends])]
     weights = np.random.default_rng(3).uniform(0.5, 1.5, len(rows))

@@ -21,6 +21,7 @@ from twoloop.generate.tracing import Untraceable
 from twoloop.generate.written import conditions_hold, results_of
 from twoloop.kernels.control.defect import ROUNDING
 from twoloop.kernels.control.predictor import FLOOR, LEAST, SHARE_OF_MOTION
+from twoloop.kernels.lanes import lane_projection, lane_taylor
 from twoloop.kernels.lanes import lane_room as lanes
 from twoloop.problem.system import ConstrainedSystem
 
@@ -54,13 +55,13 @@ class LaneCode:
         self.n, self.n_rows = system.n_q, system.n_c + system.n_a
         self.recurrences: LaneSeries | None = None
         if series:
-            program = series_program(system, Equations(system, parameters))
+            program = series_program(system, Equations(system, parameters), {*choice.rows, *choice.added})
             if program.n_operations > LARGEST:
                 raise Untraceable(f"its series takes more than {LARGEST} operations")
             self.recurrences = LaneSeries(program, self.solution, self.numbers, self.n, self.n_rows)
         self.structure = self._structure()
         self.n_numbers = self.numbers.n_varying
-        parts = [equations.there, equations.closer, equations.nearer, equations.redundant]
+        parts = [equations.there, equations.closer, equations.nearest, equations.redundant]
         parts += [self.solution.kept] if series else []
         counts = [len(each.quantities(equations.graph)) for each in parts]
         counts += [len(self.solution.solved.quantities(self.solution.graph))] if series else []
@@ -79,7 +80,7 @@ class LaneCode:
     def _structure(self) -> str:
         equations, numbers = self.equations, self.numbers
         told: list[Any] = []
-        parts = [equations.there, equations.closer, equations.nearer, equations.redundant]
+        parts = [equations.there, equations.closer, equations.nearest, equations.redundant]
         if self.recurrences is not None:
             told += list(self.recurrences.structure)
             parts.append(self.solution.kept)
@@ -94,7 +95,7 @@ class LaneCode:
     def series(self, emit: LaneEmitter, order: Value, control: Value, room: Value) -> None:
         """Coefficients of q up to an order, in units of time, about the state of each lane."""
         builder, n, at = emit.builder, self.n, self._at(emit, order, control, room)
-        unit, out, scratch = emit.load(room, lanes.UNIT), at.series, at.scratch
+        unit, out, scratch = self._unit(emit, control, room), at.series, at.scratch
         inputs = [emit.load(room, lanes.T), *(emit.load(at.state, i) for i in range(2 * n))]
         written, (kept,) = results_of(emit, self.equations.graph, self.solution.kept, inputs, self.numbers)
         holds = conditions_hold(emit, written, self.solution.kept, kept)
@@ -111,10 +112,26 @@ class LaneCode:
         for j in range(n):
             total = emit.add(total, emit.multiply(emit.constant(0.0), emit.load(last, j)))
         holds = builder.both(holds, builder.compare("fcmp oeq", total, emit.constant(0.0)))
-        _keep_fine(emit, room, holds)
+        _store_mask(emit, room, lanes.FINE, holds)
+
+    def _unit(self, emit: LaneEmitter, control: Value, room: Value) -> Value:
+        """UNIT of new runs, and that after accepted steps."""
+        select, unit = emit.builder.select, emit.load(room, lanes.UNIT)
+        fresh, accepted = (_is_set(emit, room, field) for field in (lanes.FRESH, lanes.ACCEPTED))
+        span = emit.subtract(_common(emit, control, lanes.T1), _common(emit, control, lanes.T0))
+        following = emit.smaller(
+            emit.multiply(emit.load(room, lanes.LENGTH), unit),
+            emit.multiply(emit.constant(lane_taylor.GROWTH), emit.load(room, lanes.H)),
+        )
+        first = emit.multiply(emit.constant(lane_taylor.FIRST_UNIT), span)
+        unit = select(fresh, first, select(accepted, following, unit))
+        emit.store(unit, room, lanes.UNIT)
+        for field, value in ((lanes.LONGEST, math.inf), (lanes.SHIFT, 0.0)):
+            emit.store(select(fresh, emit.constant(value), emit.load(room, field)), room, field)
+        return unit
 
     def lengths(self, emit: LaneEmitter, order: Value, control: Value, room: Value) -> None:
-        """The last two terms of positions and velocities over the tolerances."""
+        """Steps by the last two terms of positions and velocities over the tolerances."""
         builder, n, at = emit.builder, self.n, self._at(emit, order, control, room)
         unit, (rtol, atol) = emit.load(room, lanes.UNIT), self._tolerances(emit, control)
         one, found = emit.constant(1.0), []
@@ -136,14 +153,31 @@ class LaneCode:
             emit.divide(emit.logarithm(value), emit.number(power))
             for value, power in zip(found, (order, builder.sub(order, integer(1))), strict=True)
         ]
-        emit.store(emit.exponential(emit.negative(emit.larger(*logarithms))), room, lanes.LENGTH)
+        length = emit.exponential(emit.negative(emit.larger(*logarithms)))
+        emit.store(length, room, lanes.LENGTH)
+        t, t1 = emit.load(room, lanes.T), _common(emit, control, lanes.T1)
+        left, zero = emit.subtract(t1, t), emit.constant(0.0)
+        h = emit.smallest_of(emit.multiply(length, unit), emit.load(room, lanes.LONGEST))
+        h = builder.select(builder.compare("fcmp oge", h, left), left, h)
+        largest = emit.larger(emit.function("fabs", t), emit.function("fabs", t1))
+        goes = builder.compare("fcmp ogt", h, emit.multiply(emit.constant(lanes.SHORTEST), largest))
+        for field in (lanes.RUNNING, lanes.FINE):
+            goes = builder.both(goes, _is_set(emit, room, field))
+        h = builder.select(goes, h, zero)
+        emit.store(h, room, lanes.H)
+        emit.store(emit.divide(h, unit), room, lanes.X)
+        for field in (lanes.RUNNING, lanes.FINE):
+            _store_mask(emit, room, field, goes)
 
     def evaluate(self, emit: LaneEmitter, order: Value, control: Value, room: Value) -> None:
         """The state and its accelerations by the series, X units of time on."""
-        self._evaluate(emit, self._at(emit, order, control, room), emit.load(room, lanes.X))
+        at = self._at(emit, order, control, room)
+        for j, q in enumerate(self._evaluate(emit, at, emit.load(room, lanes.X))):
+            emit.store(q, at.predicted, j)
 
-    def _evaluate(self, emit: LaneEmitter, at: "_Places", x: Value) -> None:
-        """The same by Horner's scheme."""
+    def _evaluate(self, emit: LaneEmitter, at: "_Places", x: Value) -> list[Value]:
+        """The same by Horner's scheme; the positions."""
+        positions: list[Value] = []
         builder, n, order = emit.builder, self.n, at.order
         unit, zero = emit.load(at.room, lanes.UNIT), emit.constant(0.0)
         per_unit = emit.divide(emit.constant(1.0), unit)
@@ -160,17 +194,20 @@ class LaneCode:
                     v = emit.add(emit.multiply(v, x), q)
                     new += [emit.add(emit.multiply(q, x), emit.load(row, j)), v, a]
             for j, (q, v, a) in zip(some, _threes(new), strict=True):
+                positions.append(q)
                 emit.store(q, at.new, j)
                 emit.store(emit.multiply(v, per_unit), at.new, n + j)
                 emit.store(emit.multiply(a, twice), at.found, j)
+        return positions
 
     def look(self, emit: LaneEmitter, order: Value, control: Value, room: Value) -> None:
         """WORST, the largest defect at places within the step, none further than the gap from the next, or an end.
 
+        AHEAD is the time of the place, and then of the end.
         SHIFT, multiples of the golden section less their integers, moves the places as far as the gap allows.
         """
         builder, at = emit.builder, self._at(emit, order, control, room)
-        h, gap = emit.load(room, lanes.H), emit.splat(builder.load(builder.gep(control, integer(lanes.GAP))))
+        h, gap = emit.load(room, lanes.H), _common(emit, control, lanes.GAP)
         zero, one, two = (emit.constant(x) for x in (0.0, 1.0, 2.0))
         parts = emit.function("ceil", emit.divide(h, gap))
         parts = emit.larger(emit.smaller(parts, emit.constant(MOST_PARTS)), one)
@@ -191,6 +228,9 @@ class LaneCode:
             defect = builder.select(holds, self._defect(emit, control, at, a), emit.constant(math.inf))
             new.append(emit.largest_of(builder.select(looks, defect, zero), worst))
         emit.store(new[0], room, lanes.WORST)
+        t, t1 = emit.load(room, lanes.T), _common(emit, control, lanes.T1)
+        last = builder.compare("fcmp oeq", h, emit.subtract(t1, t))
+        emit.store(builder.select(last, t1, emit.add(t, h)), room, lanes.AHEAD)
 
     def defect(self, emit: LaneEmitter, order: Value, control: Value, room: Value) -> None:
         """The defect of a step at its end."""
@@ -240,18 +280,46 @@ class LaneCode:
             off = emit.largest_of(emit.divide(apart(at.predicted, at.new, j), allowed), off)
         emit.store(off, room, lanes.OFF)
 
+    def judge(self, emit: LaneEmitter, order: Value, control: Value, room: Value) -> None:
+        """Accept steps, or shorten them by as much as they are off; runs of too many refusals end in lanes."""
+        builder, one = emit.builder, emit.constant(1.0)
+        select, per_order = builder.select, emit.divide(one, emit.number(order))
+        off, *defects = (emit.load(room, field) for field in (lanes.OFF, lanes.WORST, lanes.DEFECT))
+        fine = _is_set(emit, room, lanes.FINE)
+        for value in (off, *defects):
+            size = emit.function("fabs", value)
+            fine = builder.both(fine, builder.compare("fcmp olt", size, emit.constant(math.inf)))
+        defect, shortest = emit.larger(*defects), emit.constant(lane_taylor.MOST_SHORTENED)
+
+        def root(x: Value) -> Value:
+            return emit.exponential(emit.multiply(emit.logarithm(x), per_order))
+
+        nearer = root(emit.divide(emit.constant(lane_taylor.ALLOWED), off))
+        factor = select(builder.compare("fcmp ogt", off, one), nearer, one)
+        truer = emit.multiply(emit.constant(lane_taylor.SHORTENED), root(emit.divide(one, defect)))
+        truer = emit.smaller(factor, emit.larger(shortest, truer))
+        factor = select(builder.compare("fcmp ogt", defect, one), truer, factor)
+        factor = select(fine, factor, shortest)
+        running, refused = _is_set(emit, room, lanes.RUNNING), builder.compare("fcmp olt", factor, one)
+        accepted = builder.both(running, builder.compare("fcmp oge", factor, one))
+        _store_mask(emit, room, lanes.ACCEPTED, accepted)
+        times = emit.load(room, lanes.REFUSED)
+        times = select(builder.both(running, refused), emit.add(times, one), times)
+        emit.store(times, room, lanes.REFUSED)
+        grown = emit.multiply(emit.load(room, lanes.H), select(refused, factor, emit.constant(lane_taylor.GROWTH)))
+        emit.store(select(running, grown, emit.load(room, lanes.LONGEST)), room, lanes.LONGEST)
+        few = builder.compare("fcmp ole", times, emit.constant(float(lane_taylor.MOST_REFUSED)))
+        _store_mask(emit, room, lanes.RUNNING, builder.both(running, few))
+
     def take(self, emit: LaneEmitter, order: Value, control: Value, room: Value) -> None:
         """The end of an accepted step becomes the state."""
         at = self._at(emit, order, control, room)
-        accepted = emit.builder.compare("fcmp one", emit.load(room, lanes.ACCEPTED), emit.constant(0.0))
+        accepted = _is_set(emit, room, lanes.ACCEPTED)
         for k in range(2 * self.n):
             emit.store(emit.builder.select(accepted, emit.load(at.new, k), emit.load(at.state, k)), at.state, k)
 
     def _tolerances(self, emit: LaneEmitter, control: Value) -> tuple[Value, list[Value]]:
-        def at(place: int) -> Value:
-            return emit.splat(emit.builder.load(emit.builder.gep(control, integer(place))))
-
-        return at(lanes.RTOL), [at(lanes.ATOL + j) for j in range(self.n)]
+        return _common(emit, control, lanes.RTOL), [_common(emit, control, lanes.ATOL + j) for j in range(self.n)]
 
     def _at(self, emit: LaneEmitter, order: Value, control: Value, room: Value) -> "_Places":
         *fixed, series = lanes.places(self.n, self.n_rows, self.n_numbers)
@@ -265,28 +333,46 @@ class LaneCode:
 
     def closer(self, emit: LaneEmitter, order: Value, control: Value, room: Value) -> None:
         """Move positions of lanes that FINE names towards the constraints."""
-        self._project(emit, self.equations.closer, order, control, room)
+        act, _ = self._project(emit, self.equations.closer, lanes.FINE, self._at(emit, order, control, room))
+        for field in (lanes.FINE, lanes.LEFT_TO_MOVE):
+            _store_mask(emit, room, field, act)
+        emit.store(emit.constant(math.inf), room, lanes.MOVED_BEFORE)
 
     def nearer(self, emit: LaneEmitter, order: Value, control: Value, room: Value) -> None:
-        """The same and velocities, and accelerations and multipliers there."""
-        self._project(emit, self.equations.nearer, order, control, room)
+        """The same and velocities, and accelerations and multipliers there, until a move is no more than rounding."""
+        builder, at = emit.builder, self._at(emit, order, control, room)
+        fine, left = (_is_set(emit, room, field) for field in (lanes.FINE, lanes.LEFT_TO_MOVE))
+        act, moved = self._project(emit, self.equations.nearest, lanes.LEFT_TO_MOVE, at)
+        largest = emit.constant(0.0)
+        for j in range(self.n):
+            largest = emit.larger(emit.function("fabs", emit.load(at.new, j)), largest)
+        least = emit.multiply(emit.constant(lane_projection.OF_POSITIONS), largest)
+        least = emit.larger(least, emit.constant(lane_projection.LARGEST_MOVE))
+        there = builder.both(act, builder.compare("fcmp ole", moved, least))
+        before = emit.multiply(emit.constant(lane_projection.CONTRACTION), emit.load(room, lanes.MOVED_BEFORE))
+        goes_on = builder.both(act, builder.compare("fcmp ole", moved, before))
+        goes_on = builder.both(goes_on, builder.compare("fcmp ogt", moved, least))
+        emit.store(emit.larger(moved, least), room, lanes.MOVED_BEFORE)
+        _store_mask(emit, room, lanes.LEFT_TO_MOVE, goes_on)
+        waited = builder.operation("xor", fine, builder.both(fine, left))
+        _store_mask(emit, room, lanes.FINE, builder.operation("or", waited, there))
 
-    def _project(self, emit: LaneEmitter, outputs: Outputs, order: Value, control: Value, room: Value) -> None:
-        select, at = emit.builder.select, self._at(emit, order, control, room)
+    def _project(self, emit: LaneEmitter, outputs: Outputs, which: int, at: "_Places") -> tuple[Value, Value]:
+        """Which of some lanes could be moved, and how far they were."""
+        select, room = emit.builder.select, at.room
         inputs = self._new(emit, room, at)
         written, arrays = results_of(emit, self.equations.graph, outputs, inputs, self.numbers)
         made = dict(zip(outputs.arrays, arrays, strict=True))
-        act = emit.builder.both(_chosen(emit, room), conditions_hold(emit, written, outputs, arrays[0]))
+        act = emit.builder.both(_is_set(emit, room, which), conditions_hold(emit, written, outputs, arrays[0]))
         largest = emit.constant(0.0)
         for value in made["moved"]:
             largest = emit.larger(emit.function("fabs", value), largest)
-        emit.store(select(act, largest, emit.constant(0.0)), room, lanes.MOVED)
         for k, value in enumerate([*made["q"], *made.get("v", [])]):
             emit.store(select(act, value, inputs[1 + k]), at.new, k)
         for base, name in ((at.a, "a"), (at.lam, "lam")):
             for k, value in enumerate(made.get(name, [])):
                 emit.store(select(act, value, emit.load(base, k)), base, k)
-        _store_mask(emit, room, act)
+        return act, largest
 
     def there(self, emit: LaneEmitter, order: Value, control: Value, room: Value) -> None:
         """Accelerations at a state as it stands."""
@@ -330,13 +416,19 @@ def _threes(values: list[Value]) -> Iterator[tuple[Value, Value, Value]]:
     return zip(values[::3], values[1::3], values[2::3], strict=True)
 
 
-def _chosen(emit: LaneEmitter, room: Value) -> Value:
-    return emit.builder.compare("fcmp one", emit.load(room, lanes.FINE), emit.constant(0.0))
+def _common(emit: LaneEmitter, control: Value, place: int) -> Value:
+    """A number of `control`, for all lanes."""
+    return emit.splat(emit.builder.load(emit.builder.gep(control, integer(place))))
 
 
-def _store_mask(emit: LaneEmitter, room: Value, mask: Value) -> None:
-    emit.store(emit.builder.select(mask, emit.constant(1.0), emit.constant(0.0)), room, lanes.FINE)
+def _is_set(emit: LaneEmitter, room: Value, field: int) -> Value:
+    """In which lanes a field is not 0."""
+    return emit.builder.compare("fcmp one", emit.load(room, field), emit.constant(0.0))
+
+
+def _store_mask(emit: LaneEmitter, room: Value, field: int, mask: Value) -> None:
+    emit.store(emit.builder.select(mask, emit.constant(1.0), emit.constant(0.0)), room, field)
 
 
 def _keep_fine(emit: LaneEmitter, room: Value, holds: Value) -> None:
-    _store_mask(emit, room, emit.builder.both(_chosen(emit, room), holds))
+    _store_mask(emit, room, lanes.FINE, emit.builder.both(_is_set(emit, room, lanes.FINE), holds))

@@ -90,5 +90,5 @@ def _stamp() -> str:
     """A digest of what writes the code, and of the kernels that it goes with."""
     from twoloop.kernels.data import common
 
-    kernels = ("lanes.lane_room", "control.defect", "control.predictor")
+    kernels = ("lanes.lane_room", "lanes.lane_projection", "lanes.lane_taylor", "control.defect", "control.predictor")
     return digest_of("".join(map(common.stamp, kernels)), __file__, *WRITERS)

@@ -139,8 +139,12 @@ def series_for(system: ConstrainedSystem, check: Check = unchecked) -> SeriesPro
     return made
 
 
-def series_program(system: ConstrainedSystem, equations: Equations | None = None) -> SeriesProgram:
+def series_program(
+    system: ConstrainedSystem, equations: Equations | None = None, counting: Container[int] | None = None
+) -> SeriesProgram:
     """The program of a system, of callbacks that do not branch on t, q or v.
+
+    `counting`: the rows of G that have multipliers, None: all; there are no others in the program.
 
     Raises
     ------
@@ -156,13 +160,18 @@ def series_program(system: ConstrainedSystem, equations: Equations | None = None
     arrays = np.vstack([jacobian, nonholonomic]), mass, np.append(rate, nonholonomic_rate), force
     G, mass, rates, force = (elementwise(partial(_without_sums, sums), [each]) for each in arrays)
     row_products: dict[Any, Any] = {}
-    rows = [_sum_of_products(graph, G[i], v, rates[i], row_products) for i in range(n_rows)]
+    nothing = Form(graph, 0.0, {})
+    kept = [i for i in range(n_rows) if counting is None or i in counting]
+    rows = [nothing] * n_rows
+    for i in kept:
+        rows[i] = _sum_of_products(graph, G[i], v, rates[i], row_products, of_rates=True)
     reaction_products: dict[Any, Any] = {}
     balance = []
     for i in range(n):
-        factors, others = [-each for each in G[:, i]], list(lam)
+        factors, others = [-G[k, i] for k in kept], [lam[k] for k in kept]
         factors += [-each for each in mass[i]]
-        balance.append(_sum_of_products(graph, factors, [*others, *a], force[i], reaction_products))
+        total = _sum_of_products(graph, factors, [*others, *a], force[i], reaction_products, of_rates=False)
+        balance.append(total)
     inputs = [*range(1 + 2 * n), *map(only, a), *map(only, lam)]
     program = _assembled(graph, sums, inputs, n, n_rows, rows, balance, row_products, reaction_products)
     return replace(program, traced=Traced(system, graph))
@@ -189,9 +198,13 @@ def _without_sums(sums: dict[int, Form], form: Form) -> Form:
 
 
 def _sum_of_products(
-    graph: Graph, factors: Sequence[Form], others: Sequence[Form], rest: Form, known: dict[Any, Any]
+    graph: Graph, factors: Sequence[Form], others: Sequence[Form], rest: Form, known: dict[Any, Any], of_rates: bool
 ) -> Form:
-    """rest + sum_i factors[i] others[i] with few products, which go into `known`: by factor, or by what is in these."""
+    """rest + sum_i factors[i] others[i] with few products, which go into `known`: by factor, or by what is in these.
+
+    Where both take as few, those of rates go by what is in the factors: a sine's with the rate of its angle is a
+    derivative.
+    """
     total = rest
     by_factor: dict[Any, tuple[Form, Form]] = {}
     by_quantity: dict[Any, tuple[Form, Form]] = {}
@@ -205,15 +218,19 @@ def _sum_of_products(
         _collect(by_factor, form, other.times(scale))
         for i, c in factor.terms.items():
             _collect(by_quantity, Form(graph, 0.0, {i: 1.0}), other.times(c))
-    groups = by_factor if len(by_factor) <= len(by_quantity) else by_quantity
-    for factor, other in groups.values():
-        if other.terms:
-            scale, other = other.normalised()
-            key = (factor.key, other.key)
-            if key not in known:
-                known[key] = (*graph.inputs(1, True), factor, other)
-            total = total + known[key][0].times(scale)
+    groups = (by_quantity, by_factor) if of_rates else (by_factor, by_quantity)
+    ways = [[_normalised(*each) for each in way.values() if each[1].terms] for way in groups]
+    for key, scale, factor, other in min(ways, key=lambda way: len({key for key, *_ in way} - known.keys())):
+        if key not in known:
+            known[key] = (*graph.inputs(1, True), factor, other)
+        total = total + known[key][0].times(scale)
     return total
+
+
+def _normalised(factor: Form, other: Form) -> tuple[Any, float, Form, Form]:
+    """A product with a scale of 1: its key, the scale, and both factors."""
+    scale, other = other.normalised()
+    return (factor.key, other.key), scale, factor, other
 
 
 def _collect(groups: dict[Any, tuple[Form, Form]], factor: Form, other: Form) -> None:

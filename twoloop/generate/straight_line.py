@@ -223,12 +223,20 @@ class StraightLine:
     @cached_property
     def nearer(self) -> Outputs:
         """See the class."""
-        n, rows, position = self.system.n_q, self.choice.rows, self.closer.arrays
+        arrays = self.nearest.arrays
+        known = [arrays["lam"][k] for k in self.choice.rows]
+        lam = of_least_norm(self.graph, known, self.all_rows, self.choice.rows, self.factors.solve)
+        self._bound()
+        return Outputs({**arrays, "lam": lam}, self.conditions)
+
+    @cached_property
+    def nearest(self) -> Outputs:
+        """The same, "lam" 0 for rows that do not count."""
+        n, position = self.system.n_q, self.closer.arrays
         v = [(one + other).value() for one, other in zip(self.v, self._correction(self.faster), strict=True)]
         solution = self._accelerations(v)
-        lam = of_least_norm(self.graph, solution[n:], self.all_rows, rows, self.factors.solve)
         self._bound()
-        return Outputs({"a": solution[:n], **position, "v": v, "lam": lam}, self.conditions)
+        return Outputs({"a": solution[:n], **position, "v": v, "lam": self._spread(solution[n:])}, self.conditions)
 
     def _correction(self, c: Outputs) -> list[Form]:
         n = self.system.n_q

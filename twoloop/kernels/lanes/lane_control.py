@@ -131,7 +131,7 @@ def end_steps(code, settings, control, room, predicted_v):
     for i in range(n * LANES):
         room[predicted * LANES + i] = room[new * LANES + i]
         room[predicted_v * LANES + i] = room[(new + n) * LANES + i]
-    project_lanes(code, order, control, room, n, new)
+    project_lanes(code, order, control, room)
     if settings[CHECKS_REDUNDANT] == 1:
         code.redundant(order, control, room)
     code.departure(order, control, room)

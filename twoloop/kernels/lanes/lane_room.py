@@ -20,7 +20,6 @@ LANES = 8 if has_wide_vectors() else 4  # runs side by side: of two vectors each
     H,
     X,
     FINE,  # 1: of the lanes that a task is for; what it leaves 1 could be done
-    MOVED,
     DEFECT,
     OFF,
     LENGTH,
@@ -33,7 +32,6 @@ LANES = 8 if has_wide_vectors() else 4  # runs side by side: of two vectors each
     REACHED,  # of the times at which states are wanted
     LEFT_TO_MOVE,
     MOVED_BEFORE,
-    ON_CONSTRAINTS,
     ACCEPTED,
     FRESH,  # 1: lanes whose run has not taken a step yet
     ERROR,  # of a step, over the tolerances
@@ -46,11 +44,11 @@ LANES = 8 if has_wide_vectors() else 4  # runs side by side: of two vectors each
     PAST,  # of controller.py, of one lane after the other
     _MORE_PAST,
     N_FIELDS,
-) = range(32)
+) = range(30)
 # functions made for a mechanism, (order, control, room), on what lies in `room`
 TASKS = (
-    "closer",  # positions of NEW, at AHEAD, moved towards the constraints, by MOVED
-    "nearer",  # the same and velocities, and A and LAM there
+    "closer",  # positions of NEW, at AHEAD, moved towards the constraints, of the lanes that are FINE
+    "nearer",  # the same of those that are LEFT_TO_MOVE, and velocities, and A and LAM there; FINE: there by now
     "redundant",  # whether rows that do not count hold at NEW
     "departure",  # OFF: of a step H from STATE by PREDICTED to NEW
     "take",  # NEW becomes STATE where ACCEPTED
@@ -58,10 +56,11 @@ TASKS = (
 TASKS_OF_STAGES = ("there",)  # A at NEW as it stands
 TASKS_OF_SERIES = (
     "series",  # coefficients about STATE at T, in units of time UNIT
-    "lengths",  # LENGTH of the step at which the last two terms are within the tolerances, in units
-    "look",  # WORST: the largest defect within a step H
-    "evaluate",  # NEW and FOUND: the state and its accelerations by the series, X units of time on
+    "lengths",  # LENGTH in units, H and X of the steps of the lanes that can go on, which are FINE
+    "look",  # WORST: the largest defect within a step H; AHEAD: its end
+    "evaluate",  # NEW, PREDICTED and FOUND: the state and its accelerations by the series, X units of time on
     "defect",  # DEFECT: of A at NEW, the end of a step H
+    "judge",  # ACCEPTED: the steps that are, and how long the next one may be
 )
 CODE = Reference("LaneKit", {})
 ALL_TASKS = (*TASKS, *TASKS_OF_STAGES, *TASKS_OF_SERIES)

@@ -62,7 +62,7 @@ def _refill(code, order, control, room, n, n_rows, numbers, q0, v0, next_run, st
     if n_fresh > 0:
         for k in range(LANES):
             room[ASKED * LANES + k] = room[FINE * LANES + k]
-        project_lanes(code, order, control, room, n, new)
+        project_lanes(code, order, control, room)
         for k in range(LANES):
             if room[ASKED * LANES + k] == 1.0:
                 for j in range(2 * n):
@@ -91,7 +91,7 @@ def _between(code, settings, control, options, room, n, new, times, out_q, out_v
         if n_wanted == 0:
             return
         code.step(code, settings, control, options, room, status, n_steps, True)
-        project_lanes(code, settings[ORDER], control, room, n, new)
+        project_lanes(code, settings[ORDER], control, room)
         for k in range(LANES):
             if room[ASKED * LANES + k] == 1.0:
                 run, wanted = int(room[WHICH * LANES + k]), int(room[REACHED * LANES + k])
@@ -139,16 +139,22 @@ def advance_lanes(code, settings, control, options, times, numbers, q0, v0, out_
     """
     n, n_rows, order = settings[N], settings[N_ROWS], settings[ORDER]
     _, new, _, _, a, _, _, _ = places_of(n, n_rows, numbers.shape[1])
-    next_run = 0
+    next_run, are_fresh = 0, False
     for field in (T, AHEAD, H, X, RUNNING, WHICH, ACCEPTED):
         fill_field(room, field, 0.0)
     fill_field(room, UNIT, 1.0)
     while True:
-        next_run, n_running = _refill(code, order, control, room, n, n_rows, numbers, q0, v0, next_run, status)
-        if n_running == 0:
-            if next_run == numbers.shape[0]:
-                return
-            continue
+        n_running = 0.0
+        for k in range(LANES):
+            n_running += room[RUNNING * LANES + k]
+        if n_running < LANES or are_fresh:
+            before = next_run
+            next_run, left = _refill(code, order, control, room, n, n_rows, numbers, q0, v0, next_run, status)
+            are_fresh = next_run > before
+            if left == 0:
+                if next_run == numbers.shape[0]:
+                    return
+                continue
         code.step(code, settings, control, options, room, status, n_steps, False)
         code.take(order, control, room)
         _write_ends(room, control, n, n_rows, new, a, times.size - 1, out_q, out_v, out_a, status)
