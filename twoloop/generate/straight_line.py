@@ -28,7 +28,7 @@ from twoloop.generate.tracing import Form, Graph, Untraceable
 from twoloop.kernels.evaluation.inner import CONTRADICTS
 from twoloop.problem.system import ConstrainedSystem
 
-MOST_ELIMINATED = 60_000  # operations with their elimination: those of 57 bodies on hinges in space
+MOST_ELIMINATED = 60_000  # operations with their elimination: those of more than 40 bodies on hinges in space
 
 
 @dataclass(frozen=True)
