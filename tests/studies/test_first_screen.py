@@ -202,8 +202,7 @@ def test_every_number_of_the_screen_is_made_again_from_the_rows(tmp_path):
         "our 1 other methods "
         "1 of 63, some of these with `compiled` set 1 of 62, heyoka 1 of 66 (1 of 67 with `max_step`; "
         "not run at its own default tolerance, 2.2e-16), IDA and CVODE 0 of 64. ",
-        "every 5e-4 of a run. They can miss shorter ones unless `max_step` is their duration or their "
-        "ends are [events](docs/between_steps.md#events): the default is wrong "
+        "every 5e-4 of a run. They can miss shorter ones unless `max_step` is their duration: the default is wrong "
         "under 4 of 40 constant forces of 1e-4 s and none of 61 of 3e-4 to 0.010 s, in runs of 3.0 s",
     ]
     for said in expected:
