@@ -18,7 +18,8 @@ from twoloop.kernels.steps import newton_memory as at
 from twoloop.kernels.steps.diagonal_stage import KEPT_WHILE, diagonal_options, solve_stage
 from twoloop.kernels.steps.newton_memory import block, vector
 
-ONE_STAGE = ([[0.0, 0.0], [0.0, 1.0]], [0.0, 1.0], [0.0, 0.0])  # of gamma = 1: its step is c
+# of gamma = 1: its step is c
+ONE_STAGE = ([[0.0, 0.0], [0.0, 1.0]], [0.0, 1.0], [0.0, 0.0], [0.0, 0.0])
 
 
 def newton_options(max_order: int, inner_tol: float, outer_tol: float) -> NDArray[np.float64]:

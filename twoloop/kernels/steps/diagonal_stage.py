@@ -37,17 +37,25 @@ TAIL = PLACE + at.N_EIGEN_SCALARS + 1 + 2 + 4
 
 
 def diagonal_options(
-    A: ArrayLike, c: ArrayLike, weights: ArrayLike, inner_tol: float, outer_tol: float, velocities: bool, embedded: bool
+    A: ArrayLike,
+    c: ArrayLike,
+    weights: ArrayLike,
+    lower: ArrayLike,
+    inner_tol: float,
+    outer_tol: float,
+    velocities: bool,
+    embedded: bool,
 ) -> NDArray[np.float64]:
     """The parameter block: A (s, s) with zeros in its first row and gamma on the diagonal below, b its last row.
 
+    `lower`: weights of the estimate where accelerations jump.
     `embedded`: the embedded formula is the one of higher order, from which steps go on.
     """
-    A, c, weights = (np.asarray(x, dtype=np.float64) for x in (A, c, weights))
+    A, c, weights, lower = (np.asarray(x, dtype=np.float64) for x in (A, c, weights, lower))
     gamma = A[-1, -1]
     one_stage = options_array([[gamma]], [1.0], [1.0], inner_tol, outer_tol, 0.0)
     newton = np.array([1.0, 0.0, gamma, float(velocities), 0.0, gamma, 0.0, 1.0, 0.0, 1.0, 0.0])
-    return np.concatenate([one_stage, newton, [float(c.size)], A.ravel(), c, weights, [float(embedded)]])
+    return np.concatenate([one_stage, newton, [float(c.size)], A.ravel(), c, weights, lower, [float(embedded)]])
 
 
 def diagonal_memory(s: int, n_q: int) -> NDArray[np.float64]:

@@ -36,6 +36,8 @@ from twoloop.kernels.steps.stages import INNER_TOL
 
 FILTERED = 3  # times: with fewer the extrapolated method is unstable for vibrations, see tests/kernels/test_diagonal.py
 
+AT_JUMP = 0.174  # of the width of accelerations that jump: when `lower` misses as much, its difference counts in full
+
 
 @compiled
 def _filter(f, w, options, memory, h, e_q, e_v):
@@ -59,8 +61,8 @@ def _factor_filter(f, w, options, memory, h):
 
 
 @compiled
-def _error(f, w, options, memory, h, tolerances, state, new_state, V_stage, A_stage, weights):
-    """Largest component, over atol + rtol |value|, of the difference to the embedded formula.
+def _error(f, w, options, memory, h, tolerances, state, new_state, V_stage, A_stage, weights, share):
+    """Largest component, over atol + rtol |value|, of the stages' difference by such weights, times `share`.
 
     It is filtered by the last factors (Hosea and Shampine 1996): what is stiff has no part in it.
     """
@@ -75,8 +77,8 @@ def _error(f, w, options, memory, h, tolerances, state, new_state, V_stage, A_st
         for k in range(weights.size):
             in_q += weights[k] * V_stage[k, j]
             in_v += weights[k] * A_stage[k, j]
-        e_q[i] = h * in_q
-        e_v[i] = h * in_v
+        e_q[i] = share * h * in_q
+        e_v[i] = share * h * in_v
     copy(e_v, raw)
     _filter(f, w, options, memory, h, e_q, e_v)
     error = 0.0
@@ -90,7 +92,7 @@ def _error(f, w, options, memory, h, tolerances, state, new_state, V_stage, A_st
     copy(e_v, once)
     _filter(f, w, options, memory, h, e_q, e_v)
     z = h * gamma_of(options)
-    return max(error, lasting_error(w, memory, tolerances, z, raw, once, e_v, state, new_state))
+    return max(error, lasting_error(w, memory, tolerances, z, raw, once, e_v, state, new_state, A_stage[-1]))
 
 
 @compiled
@@ -123,6 +125,34 @@ def _slow_error(f, w, options, memory, h, tolerances, state, new_state):
     return error
 
 
+@compiled
+def _error_at_jumps(f, w, options, memory, h, tolerances, state, new_state, V_stage, A_stage, lower):
+    """The error by `lower`, the weights of another embedded formula, for accelerations that jump within the step.
+
+    Those of the first one are so small at the stages of the first half that a jump there hardly shows. `lower` is exact
+    for accelerations quadratic in time; where these are smooth, what it misses of their width is small, and its
+    difference counts less by that factor, so that it is of a higher order than the first estimate.
+    """
+    n = w.Q.size
+    missed, widest = 0.0, 0.0
+    for j in w.independent:
+        low, high, total = A_stage[0, j], A_stage[0, j], 0.0
+        for k in range(lower.size):
+            low, high = min(low, A_stage[k, j]), max(high, A_stage[k, j])
+            total += lower[k] * A_stage[k, j]
+        scale = allowed(tolerances, j, state[n + j], new_state[n + j])
+        missed, widest = max(missed, abs(total) / scale), max(widest, (high - low) / scale)
+    if missed == 0.0:
+        return 0.0
+    if memory[at.H_FACTORED] == 0.0 and _factor_filter(f, w, options, memory, h) != DONE:
+        return np.inf
+    share = min(1.0, missed / (AT_JUMP * widest))
+    error = _error(f, w, options, memory, h, tolerances, state, new_state, V_stage, A_stage, lower, share)
+    if error <= 1.0:
+        error = max(error, _slow_error(f, w, options, memory, h, tolerances, state, new_state))
+    return error
+
+
 @kernel(SETTLE)
 def settle_diagonal(f, w, options, memory, tolerances, accepted):
     """The last stage of an accepted step is the first of the next one."""
@@ -140,6 +170,7 @@ def diagonal_step(f, w, options, memory, t, h, tolerances, state, new_state):
     o = TAIL + 1
     A = options[o : o + s * s].reshape((s, s))
     c, weights = options[o + s * s : o + s * s + s], options[o + s * s + s : o + s * s + 2 * s]
+    lower = options[o + s * s + 2 * s : o + s * s + 3 * s]
     n = w.Q.size
     q, v, a = state[:n], state[n : 2 * n], state[2 * n : 3 * n]
     q1, v1, a1, lam1 = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n], new_state[3 * n :]
@@ -180,12 +211,15 @@ def diagonal_step(f, w, options, memory, t, h, tolerances, state, new_state):
         q1[m] = Q[m]
     error = 0.0
     if tolerances[ESTIMATE] == 1.0:
-        error = _error(f, w, options, memory, h, tolerances, state, new_state, V_stage, A_stage, weights)
+        error = _error(f, w, options, memory, h, tolerances, state, new_state, V_stage, A_stage, weights, 1.0)
         if not error <= 1.0:
             return Attempt(DONE, error, 0.0)
         if options[options.size - 1] == 1.0:
             _extrapolate(f, w, options, memory, h, q1, v1)
         error = max(error, _slow_error(f, w, options, memory, h, tolerances, state, new_state))
+        if error <= 1.0 and options[options.size - 1] == 0.0:
+            jumps = _error_at_jumps(f, w, options, memory, h, tolerances, state, new_state, V_stage, A_stage, lower)
+            error = max(error, jumps)
         if not error <= 1.0:
             return Attempt(DONE, error, 0.0)
     keep_predicted(w, q1)

@@ -22,10 +22,11 @@ STEPS = 10.0  # after which nothing is left of an error that is fast beside the 
 
 
 @compiled
-def lasting_error(w, memory, tolerances, z, raw, once, twice, state, new_state):
+def lasting_error(w, memory, tolerances, z, raw, once, twice, state, new_state, a_end):
     """Largest component of the error that was filtered by (I - z J)^-1 `once` and `twice`, over the tolerances.
 
     Over that of a position where it has turned back or decayed before it is off by more, else over that of a velocity.
+    `a_end`: accelerations at the end, where a contact that begins in the step shows how fast the motion changes.
     """
     n = w.Q.size
     v, a = state[n : 2 * n], state[2 * n : 3 * n]
@@ -33,7 +34,7 @@ def lasting_error(w, memory, tolerances, z, raw, once, twice, state, new_state):
     largest, turn, fastest, change = 0.0, 0.0, 0.0, 0.0
     for i in range(count):
         fastest = max(fastest, abs(v[w.independent[i]]))
-        change = max(change, abs(a[w.independent[i]]))
+        change = max(change, abs(a[w.independent[i]]), abs(a_end[w.independent[i]]))
         largest = max(largest, abs(twice[i]))
         turn = max(turn, abs(twice[i] - 2.0 * once[i] + raw[i]))  # (z J)^2 e
     if largest > 0.0:

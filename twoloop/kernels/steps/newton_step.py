@@ -203,7 +203,7 @@ def _estimate(f, w, options, memory, h, tolerances, state, new_state, A_stage):
         return error
     copy(e_v, once)
     _filter(f, w, options, memory, h, e_q, e_v)
-    error = max(error, lasting_error(w, memory, tolerances, h * gamma0, raw, once, e_v, state, new_state))
+    error = max(error, lasting_error(w, memory, tolerances, h * gamma0, raw, once, e_v, state, new_state, a))
     if error <= 1.0:
         error = max(error, _slow_error(f, w, options, memory, h, tolerances, state, new_state))
     return error
