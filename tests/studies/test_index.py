@@ -172,7 +172,7 @@ def test_the_first_screen_and_the_advice_can_be_written_whatever_is_found(change
 
 def test_an_undecided_comparison_counts_as_a_win_for_neither_side(tmp_path):
     near = at_error(standing=standing(verdict="undecided"))
-    assert "no clear choice (of 2 errors: " in screen(tmp_path, [case(at=[at_error(error=1e-2), near])])
+    assert "no clear choice (of 2 errors: " in front(tmp_path, [case(at=[at_error(error=1e-2), near])])
     close = energy()
     close["long"]["at"][0]["verdict"] = "undecided"
     told = [entries([], energy=found)[0]["at"][0]["undecided"] for found in (close, energy())]

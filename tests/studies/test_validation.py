@@ -116,13 +116,13 @@ def test_findings_turn_with_the_rows():
     assert found["n_ended"] == {"ours": 16, "others": 4}
     found, text = said(validation, made_up(where=[("double pendulum", "Gauss12")], what=stopped))
     assert [(line["stopped"], line["limit"]) for line in found["ours_short"]] == [([], ["Gauss12"])]
-    assert "- double pendulum: we stopped `Gauss12` after" in text
+    assert '- double pendulum: we stopped `method="Gauss12"` after' in text
 
 
 def test_a_solver_that_was_run_and_was_inexact_is_not_called_one_that_was_not_run():
     inexact = {"outcome": "inexact", "error_q": 2e-5, "digits_q": 4.7}
     _, text = said(validation, made_up(where=[("double pendulum", "LSODA, index 1")], what=inexact))
-    ours = "- On double pendulum only ours are right: `Gauss12` and `BDF`. The others are inexact: "
+    ours = '- On double pendulum only ours are right: `method="Gauss12"` and `method="BDF"`. The others are inexact: '
     assert ours + "`LSODA, index 1` (2e-5).\n" in text and "not run" not in text
 
 
