@@ -42,6 +42,7 @@ from studies.honesty.solvers import (
 from studies.honesty.traps import AGREE as TRUE_TO
 from studies.honesty.traps import FORCE, GROWN, HELD_OUT, HELD_OUT_SEED, INPUT, MISTAKE, SHORT, Trap, held_out, traps
 from twoloop import ConstrainedSystem, solve_dae
+from twoloop.__main__ import compile_all
 from twoloop.kernels.compile import callbacks
 from twoloop.kernels.data.tolerances import LONGEST_UNSEEN
 
@@ -151,6 +152,7 @@ def make(output: Output) -> pd.DataFrame:
     """Make all cells. The checks of a start in our adapters of foreign solvers are off: those are to answer alone."""
     rows: list[Row] = []
     compiled: set[tuple[Any, ...]] = set()
+    compile_all()  # what a child of a slow machine compiles may exceed its time limit, and is lost with it
 
     def made(name: str, call: Call, trap: Trap, truth: Array | None) -> Row:
         if why := why_not(name, trap):

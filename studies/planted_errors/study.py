@@ -25,6 +25,7 @@ from studies.bench.store import Output, Row
 from studies.planted_errors.faults import SCIPY, TRACING, Fault, all_faults
 from studies.validation import study as validation
 from twoloop import mechanisms
+from twoloop.__main__ import compile_all
 from twoloop.mechanisms import Problem
 
 TOLERANCE = 1e-10  # of the runs
@@ -156,6 +157,7 @@ def make(output: Output) -> pd.DataFrame:
     faults = all_faults()
     if output.call.quick:
         faults = [fault for k, fault in enumerate(faults) if fault.place == "trace" or k % QUICK == 0]
+    compile_all()  # what a child of a slow machine compiles may exceed TIME_LIMIT, and is lost with it
     check_sound(faults)
     with output.kept() as kept:
         return pd.DataFrame([kept.made(fault.name, partial(row_of, fault)) for fault in faults])
