@@ -29,6 +29,7 @@ GROUP, GEOMETRY = "many", "random linkages"
 TOLERANCES, QUICK_TOLERANCES = tuple(float(f"1e-{k}") for k in range(4, 12)), (1e-6, 1e-9)
 BETWEEN = (1e-3, *(float(f"3e-{k}") for k in range(4, 12)))  # of ways whose error leaps from one of these to the next
 ERRORS = (1e-4, 1e-6, 1e-8)  # of the worst of the runs, at which ways are compared
+USUAL = 1e-8  # tolerances of an ensemble that is given none
 TIGHT, AGREE = 1e-12, 1e-8  # tolerance of references, and how far two unlike methods may end apart with it
 ENSEMBLE, SINGLE, HEYOKA, DIFFRAX = "ensemble", "solve_dae, compiled, one by one", "heyoka, batches", "diffrax, vmap"
 # whose colour and marker each has: solver, family, whether it keeps the constraints
@@ -218,6 +219,11 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     for line in (line for line in lines if line["verdict"] == "behind"):
         best = min(set(line["run_s"]) - set(OWN), key=line["run_s"].__getitem__)
         found["rivals_ahead"].append({key: line[key] for key in ("case", "error", "ratio")} | {"way": best})
+    usual = made[(made["case"] == LINKAGES) & (made["way"] == ENSEMBLE) & (made["tol"] == USUAL)]
+    found["usual"] = None
+    if len(usual):  # the errors of runs at the default tolerances, which are not measured where geometry is varied
+        errors = usual[["error_median", "error_worst"]].iloc[0].astype(float)
+        found["usual"] = {"n": int(usual["n_runs"].iloc[0]), "median": errors.iloc[0], "worst": errors.iloc[1]}
     found["n_single"] = N_SINGLE
     names = ("ahead", "behind", "undecided", "alone", "missed", "none")
     found["verdicts"] = {name: sum(line["verdict"] == name for line in lines) for name in names}

@@ -27,8 +27,7 @@ def takes(found: Mapping[str, Any], entries: Sequence[dict[str, Any]]) -> list[d
     for entry in entries:
         classes[entry["class"]].append(entry)
     rows = [_of_class(name, own, with_code) for name, own in classes.items() if name not in (*BEAM_CLASSES, LONG)]
-    tips = [_by_the_tip(case) for case in found.get("beam", {}).get("cases", []) if case["name"] in BEAMS]
-    rows += [{"what": "beams, by the error of the tip", "take": "; ".join(tips)}] * bool(tips)
+    rows += _of_beams([case for case in found.get("beam", {}).get("cases", []) if case["name"] in BEAMS])
     over = found.get("energy", {}).get("long", {}).get("calm_ours", {}).get("over_drifting") or ()
     rows += [_of_energy(entry, coded(("four-bar",), with_code), over) for entry in classes[LONG]]
     rows += _at_once(found.get("ensembles", {}).get("cases", []))
@@ -67,6 +66,15 @@ def _shares(won: Mapping[str, int], of: str, made: bool | None) -> str:
     return ", ".join(said) or ("no clear choice" if total else "")
 
 
+def _of_beams(cases: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
+    """The cheapest by the error of the tip, and how loose the tolerances are with which they are that."""
+    settings = [at["best"]["setting"].split() for case in cases for at in case["at"] if at["best"] is not None]
+    loosest = max((float(value) for name, value in settings if name == "tol"), default=None)
+    chosen = f" (tolerances chosen afterwards, up to {number(loosest)})" if loosest else ""
+    told = "; ".join(_by_the_tip(case) for case in cases)
+    return [{"what": f"beams, by the error of the tip{chosen}", "take": told}] * bool(cases)
+
+
 def _by_the_tip(case: Mapping[str, Any]) -> str:
     """The cheapest on a beam by the error of its tip; several where none is clearly cheaper."""
     by: dict[frozenset[str], list[str]] = defaultdict(list)
@@ -90,7 +98,7 @@ def _of_energy(entry: Mapping[str, Any], made: bool | None, over: Sequence[float
     """
     told = [_decided(entry[which], made) for which in ("picks", "without_drift")]
     drifts = " (drifts)" if told[0] != UNCLEAR else ""
-    times = f", at {number(over[0])} to {number(over[1])} times the time" if over else ""
+    times = f", at {number(over[0])} to {number(over[1])} times the time of those that drift" if over else ""
     without = f"{drifts}; without a visible drift {told[1]}{times}" if told[1] not in (UNCLEAR, NONE) else ""
     return {"what": f"energy over {power(entry['t_end'])} s (four-bar)", "take": told[0] + without}
 
@@ -110,7 +118,7 @@ def _at_once(cases: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
     who, other = ("`ensemble`", "heyoka's batches") if ahead > behind else ("`heyoka`, batches", "`ensemble`")
     told = f"ahead of {other} in {max(ahead, behind)}, behind in {min(ahead, behind)} of {verdicts.total()} comparisons"
     close = sum(1 / SCATTER < at["ratio"] < SCATTER for each in cases for at in each["at"] if at["verdict"] in ORDERED)
-    told += f"; {close} of these by less than {SCATTER:g} times" if close else ""
+    told += f"; {close} of these {ahead + behind} by less than {SCATTER:g} times" if close else ""
     return [{"what": "many runs in one call", "take": f"{who} ({told})"}]
 
 

@@ -12,6 +12,7 @@ def test_of_beams_two_are_named_where_neither_is_cheaper():
     at = {"error": 1e-3, "verdict": "undecided", "best": best, "ours": {"solver": "TRBDF2"}, "others": THEIRS}
     found = {"cases": [{"name": "moderately stiff", "at": [at, at | {"error": 1e-4, "verdict": "behind"}]}]}
     (row,), stiff = takes({"beam": found}, []), "stiff, vibrations irrelevant"
+    assert row["what"] == "beams, by the error of the tip (tolerances chosen afterwards, up to 0.10)"
     assert row["take"] == f'{stiff}: `method="TRBDF2"` or `heyoka` (1e-3 m), `heyoka` (1e-4 m)'
     found["cases"][0]["at"] = [at | {"verdict": "behind", "ties": ["Adams"]}]
     assert takes({"beam": found}, [])[0]["take"] == f'{stiff}: `heyoka` or `method="Adams"` (1e-3 m)'
@@ -45,7 +46,7 @@ def test_an_ode_in_angles_is_told_by_errors_only_where_these_differ():
 
 
 @pytest.mark.parametrize(
-    ("ratios", "close"), [((2.0, 1.6, 0.5), ""), ((1.2, 1.6, 0.9), "; 2 of these by less than 1.5 times")]
+    ("ratios", "close"), [((2.0, 1.6, 0.5), ""), ((1.2, 1.6, 0.9), "; 2 of these 3 by less than 1.5 times")]
 )
 def test_of_ensembles_it_is_said_how_many_are_close(ratios, close):
     at = [{"verdict": "ahead" if ratio > 1.0 else "behind", "ratio": ratio} for ratio in ratios]
@@ -53,7 +54,9 @@ def test_of_ensembles_it_is_said_how_many_are_close(ratios, close):
     assert row["take"] == f"`ensemble` (ahead of heyoka's batches in 2, behind in 1 of 3 comparisons{close})"
 
 
-@pytest.mark.parametrize(("over", "times"), [([7.0, 10.0], ", at 7.0 to 10 times the time"), (None, "")])
+@pytest.mark.parametrize(
+    ("over", "times"), [([7.0, 10.0], ", at 7.0 to 10 times the time of those that drift"), (None, "")]
+)
 def test_of_the_energy_it_is_said_what_a_run_without_a_drift_takes(over, times):
     pick = {"solver": "Taylor, compiled", "accuracies": ["1 J"], "undecided": []}
     level = {**pick, "solver": "Gauss(3), symmetric partition"}
