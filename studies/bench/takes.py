@@ -98,7 +98,7 @@ def _of_energy(entry: Mapping[str, Any], made: bool | None, over: Sequence[float
     """
     told = [_decided(entry[which], made) for which in ("picks", "without_drift")]
     drifts = " (drifts)" if told[0] != UNCLEAR else ""
-    times = f", at {number(over[0])} to {number(over[1])} times the time of those that drift" if over else ""
+    times = f", at {number(over[0])} to {number(over[1])} times the time of ours that drift" if over else ""
     without = f"{drifts}; without a visible drift {told[1]}{times}" if told[1] not in (UNCLEAR, NONE) else ""
     return {"what": f"energy over {power(entry['t_end'])} s (four-bar)", "take": told[0] + without}
 
@@ -163,8 +163,8 @@ def _wrong(kind: Mapping[str, Any]) -> str:
     start = " from horizontal rest" if kind.get("level") else ""  # where terms of heyoka's series vanish
     others = kind["asked"] - sum(each["asked"] for each in kind["wrong_by"])
     told = [
-        f"`{each['solver'].partition(',')[0]}` silently wrong in {each['n']} of {each['asked']} runs{start} at "
-        f"{power(kind['asked_at'])} or tighter"
+        f"`{each['solver'].partition(',')[0]}` wrong by over {number(kind['wrong_from'])} without a message in "
+        f"{each['n']} of {each['asked']} runs{start} at {power(kind['asked_at'])} or tighter"
         for each in kind["wrong_by"]
     ]
     told += [f"others in 0 of {others}"] * bool(told and others)

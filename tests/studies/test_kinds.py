@@ -27,6 +27,8 @@ def test_each_comparison_counts_once_within_its_range_of_errors():
     ]
     assert cells([NEAR, NONE], [WON]) == ["other spatial mechanisms (2)", "`Taylor` 1, undecided 1 of 2", "not reached"]
     assert cells([NONE])[1:] == ["not reached", "not reached"]
+    alone = WON | {"verdict": "unasked"}
+    assert cells([WON, alone])[1] == "`Taylor` 1, ours alone, not all rivals run, 1 of 2"
 
 
 def test_the_default_has_its_name_and_only_three_are_named():
