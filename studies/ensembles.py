@@ -19,6 +19,7 @@ from studies.bench.collector import REPEATS
 from studies.bench.names import label
 from studies.bench.store import Array, Output
 from studies.bench.study import Study
+from studies.bench.takes import SCATTER
 from studies.sweep_linkages.study import drawn, linkage
 from twoloop import consistent_states, ensemble, mechanisms, solve_dae
 from twoloop.mechanisms import Problem
@@ -224,7 +225,7 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     if len(usual):  # the errors of runs at the default tolerances, which are not measured where geometry is varied
         errors = usual[["error_median", "error_worst"]].iloc[0].astype(float)
         found["usual"] = {"n": int(usual["n_runs"].iloc[0]), "median": errors.iloc[0], "worst": errors.iloc[1]}
-    found["n_single"] = N_SINGLE
+    found["n_single"], found["scatter"] = N_SINGLE, SCATTER
     names = ("ahead", "behind", "undecided", "alone", "missed", "none")
     found["verdicts"] = {name: sum(line["verdict"] == name for line in lines) for name in names}
     geometry = rows[rows["group"] == GEOMETRY]

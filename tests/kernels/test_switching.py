@@ -149,5 +149,5 @@ def test_what_creeps_to_within_the_tolerances_is_found_stiff(speed, tol):
     """At the limit of stability accelerations change as fast as they decay, but what they move is too little to see."""
     problem = creeping(speed, 1.0)
     result = solve_dae(problem.system, problem.t_span, problem.q0, problem.v0, "auto", tol, tol)
-    assert result.success and result.stats.n_evaluations < 5_000  # 600; 200,000 and 18,000 without a trial
+    assert result.success and result.stats.n_evaluations < 5_000  # over 2 s 360,304 and 73,960 without a trial
     assert abs(result.q[0, -1] - 0.5 * speed * np.arctanh(0.1)) < 10.0 * tol
