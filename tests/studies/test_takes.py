@@ -72,3 +72,26 @@ def test_of_the_energy_it_is_said_what_a_run_without_a_drift_takes(over, times):
     found = {"energy": {"long": {"calm_ours": {"over_drifting": over}}}}
     told = takes(found, [entry])[0]["take"]
     assert told.endswith(f"(drifts); without a visible drift `Gauss(3), symmetric partition`{times}")
+
+
+def test_a_smaller_energy_error_of_a_run_that_drifts_is_said():
+    pick = {"solver": "Gauss(3), symmetric partition", "accuracies": ["1 J"], "undecided": []}
+    entry = {"class": "long and conservative", "t_end": 1e4, "picks": [pick], "without_drift": [pick]}
+    for least, more in (({"calm": 2e-6, "drifting": 3e-9}, True), ({"calm": 3e-9, "drifting": 2e-6}, False)):
+        told = takes({"energy": {"long": {"calm_ours": {"least": least}}}}, [entry])[0]["take"]
+        assert told.endswith(" and with a larger energy error (2e-6 J, against 3e-9 J)") is more
+
+
+def test_runs_timed_once_are_not_ranked_but_their_times_are_told():
+    pick = {"solver": "auto, compiled", "accuracies": ["1 J"], "undecided": ["1 J"]}
+    entry = {"class": "long and conservative", "t_end": 1e4, "picks": [pick], "without_drift": []}
+    sides = [
+        {"ours": {"solver": "auto, compiled", "call_s": own}, "others": {"solver": "heyoka", "call_s": other}}
+        for own, other in ((0.3, 1.4), (0.4, 2.0))
+    ]
+    long = {"at": [{"drift": each} for each in sides], "repeats": 1}
+    told = takes({"energy": {"long": long}, "work_precision": {"rivals": {"with_code": ["four-bar"]}}}, [entry])
+    assert (
+        told[0]["take"] == "not ranked, as timed once: the default 0.30 to 0.40 s, `heyoka` 1.4 to 2.0 s (both drift)"
+    )
+    assert takes({"energy": {"long": long | {"repeats": 5}}}, [entry])[0]["take"] == "no clear choice"
