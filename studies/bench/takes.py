@@ -174,7 +174,7 @@ def _beside(pairs: Sequence[Mapping[str, Any]], ranges: Sequence[Mapping[str, An
     """In how many pairs an ODE in minimal coordinates is faster, or slower; by errors where that differs."""
     words = {"behind": "faster", "ahead": "slower", "undecided": "undecided"}
     if len({at["verdict"] for at in pairs}) == 1:
-        return f"{words[pairs[0]['verdict']]} in {len(pairs)} of {len(pairs)}"
+        return f"{words[pairs[0]['verdict']]} in {len(pairs)} of {len(pairs)} at all errors"
     parts = []
     for each in ranges:
         verdicts = Counter(at["verdict"] for at in pairs if at["error"] in each["errors"])

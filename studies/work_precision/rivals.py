@@ -208,8 +208,8 @@ def reached(rows: pd.DataFrame) -> dict[str, Any]:
     crossed = rows[rows["case"].map(lambda case: "singular" in tags().get(str(case), ())) & rows["error_q"].notna()]
     least = crossed.groupby(["case", "solver"])["error_q"].min()
     errors = [(case, error) for case, own in least.groupby("case") for error in DECADES if own.min() <= error]
-    count = {"ours": {}, "rivals": {}}
-    for (own, solver), runs in crossed.groupby([crossed["family"] == "two-loop", "solver"]):
+    count: dict[str, dict[str, int]] = {"ours": {}, "rivals": {}}
+    for (own, solver), _ in crossed.groupby([crossed["family"] == "two-loop", "solver"]):
         there = sum(least.get((case, solver), np.inf) <= error for case, error in errors)
         count["ours" if own else "rivals"][str(solver)] = there
     default = [pair for pair in errors if least.get((pair[0], given_on(str(pair[0]))), np.inf) <= pair[1]]
