@@ -66,7 +66,8 @@ class ESDIRK:
     """Two-loop procedure with diagonally implicit stages, each by Newton's method: few digits of stiff problems.
 
     The stages are solved one after another, each with derivatives at its own iterates where the system gives tangents
-    (without them they are differenced, and kept while Newton's method contracts fast). A matrix of an earlier state
+    (without them they are differenced, and kept while Newton's method contracts fast and the error estimate finds them
+    right). A matrix of an earlier state
     stops contracting once stiff directions have turned; `RungeKutta(..., outer="newton")`, whose stages share one
     matrix, is held to short steps by that at loose tolerances, and is the better one at tight tolerances.
 
