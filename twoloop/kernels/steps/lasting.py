@@ -116,6 +116,8 @@ def derivatives_fit(f, w, options, memory, s, t, z, tolerances, raw, e_q, e_v, s
     for i in range(w.independent.size):
         largest = max(largest, abs(e_v[i]))
         size = max(size, abs(V[w.independent[i]]))
+    if largest == 0.0:
+        return True
     factor = max(1.0, DIFFERENCE * size / largest)
     copy(q1, Q)
     copy(v1, V)
