@@ -164,7 +164,6 @@ def test_every_number_of_the_screen_is_made_again_from_the_rows(tmp_path):
     cells = " | ".join(number(price) for price in prices)
     first = " | ".join(number(1e3 * FIRST[name]) for name in ("auto, compiled", "auto", "heyoka"))
     n_in = [len(errors) for name, errors in rivals.RANGES.items() if errors and name != rivals.ROUNDING]
-    n_rounding = len(rivals.RANGES[rivals.ROUNDING])
     standings = []
     default = count(("auto, compiled", "auto"))
     for ahead, behind in (default, count(None)):
@@ -180,8 +179,6 @@ def test_every_number_of_the_screen_is_made_again_from_the_rows(tmp_path):
     expected = [
         f"the fastest of up to {n_others} rival configurations; *behind*: more. 2 mechanisms were run on an AMD EPYC.",
         f"| ahead / behind | {' | '.join(name for name in rivals.RANGES if name != rivals.ROUNDING)} (all errors) |",
-        f"At {rivals.ROUNDING}, where rounding errors are compared, the default is ahead in "
-        f"{default[0] * n_rounding // N} and behind in {default[1] * n_rounding // N}.",
         "in m or rad, relative to the largest coordinate if that exceeds 1.",
         f"| the default | {standings[0]}",
         f"| the best of our {len(ours)} configurations, chosen afterwards | {standings[1]}",
