@@ -32,7 +32,7 @@ LONG = "long and conservative"
 NEWEST = "CyRK"  # a rival that the rows of some of these lack, as they were made before
 ASKED_OF = {"beam": "beams by the error of the tip", "energy": "energy", "honesty": "sharp forces", "table3": "Table 3"}
 ASKED_OF |= {"validation": "published mechanisms", "ensembles": "many runs in one call"}
-AT_LENGTH = "compare,"  # how rows of work_precision begin that are of long motions
+AT_LENGTH = '"compare",'  # how rows of work_precision begin that are of long motions
 
 
 def module_of(name: str) -> ModuleType:
