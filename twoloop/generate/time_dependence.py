@@ -5,14 +5,24 @@ from typing import Any, NamedTuple
 from twoloop.generate.families import Evaluator, Family, of_family
 from twoloop.generate.traced_values import unchecked
 from twoloop.generate.tracing import Form, Graph, Untraceable
-from twoloop.kernels.evaluation.operations import COSINE, EXPONENTIAL, PRODUCT, SINE, SUM
+from twoloop.kernels.evaluation.operations import (
+    ARCTANGENT,
+    COSINE,
+    EXPONENTIAL,
+    PRODUCT,
+    RECIPROCAL,
+    SINE,
+    SQUARE_ROOT,
+    SUM,
+)
 from twoloop.problem.system import ConstrainedSystem
 
 BY_TIME = ("force", "constraint_rate", "nonholonomic_rate")  # callbacks that a change with time is looked for in ...
 BY_STATE = ("force", "mass", "jacobian")  # ... and one with the state
 SMOOTH = (PRODUCT, SUM, SINE, COSINE)  # polynomials and vibrations: nothing happens in a short time alone ...
 HIGHEST = 8  # ... up to this degree: a high power of a cosine is a pulse
-HIGHEST_OF_STATE = 32  # degree in q and v up to which it is seen from afar; so are roots and quotients, not exp
+HIGHEST_OF_STATE = 32  # degree in q and v up to which it is seen from afar; so are roots, not exp ...
+HIGHEST_INVERSE = 4  # ... and quotients up to this one: 1 / (1 + (x / w)**2) squared, not to a higher power
 LARGEST = 300  # coordinates: to trace the forces of more takes up to seconds, the looks of a run a tenth of it
 TIME = 1  # the bit of t, the first input of a graph
 
@@ -67,7 +77,7 @@ def _traced(system: ConstrainedSystem) -> Any:
 
 
 def _by_time(graph: Graph, needed: list[int]) -> bool:
-    degrees = {0: 1}  # in time, or in vibrations with it; 0 of what is not here
+    degrees = {0: 1.0}  # in time, or in vibrations with it; 0 of what is not here
     for i in needed:
         operation = graph.operations[i]
         if operation is not None and graph.inputs_of[i] & TIME:
@@ -78,17 +88,24 @@ def _by_time(graph: Graph, needed: list[int]) -> bool:
 
 
 def _by_state(graph: Graph, needed: list[int], n_q: int) -> bool:
-    degrees = dict.fromkeys(range(1, 2 * n_q + 1), 1)
+    degrees: dict[int, float] = dict.fromkeys(range(1, 2 * n_q + 1), 1.0)
+    inverse: dict[int, float] = {}  # the highest degree of what is divided by; the slope of an arctangent is a quotient
     for i in needed:
         operation = graph.operations[i]
         if operation is not None and graph.inputs_of[i] & ~TIME:
+            kind, argument, *_ = operation
             degrees[i] = _degree(degrees, *operation)
-            if operation[0] == EXPONENTIAL or degrees[i] > HIGHEST_OF_STATE:
+            inverse[i] = _degree(inverse, *operation)
+            if kind in (RECIPROCAL, ARCTANGENT):
+                inverse[i] += _degree(degrees, kind, argument)
+            if kind == EXPONENTIAL or degrees[i] > HIGHEST_OF_STATE or inverse[i] > HIGHEST_INVERSE:
                 return True
     return False
 
 
-def _degree(degrees: dict[int, int], kind: int, *factors: Form | None) -> int:
-    """The degree of a product is the sum of those of its factors; of others that of their argument."""
-    first, *others = (max((degrees.get(i, 0) for i in form.terms), default=0) for form in factors if form is not None)
-    return first + sum(others) if kind == PRODUCT else first
+def _degree(degrees: dict[int, float], kind: int, *factors: Form | None) -> float:
+    """The degree of a product is the sum of those of its factors, of a root half that of its argument, else that."""
+    first, *others = (
+        max((degrees.get(i, 0.0) for i in form.terms), default=0.0) for form in factors if form is not None
+    )
+    return first + sum(others) if kind == PRODUCT else 0.5 * first if kind == SQUARE_ROOT else first
