@@ -53,6 +53,21 @@ def smooth_magnet(t, q, v, p):
     return np.array([SIZE * np.exp(-(((q[0] - p[0]) / p[1]) ** 2)), -9.81])
 
 
+def quotient(t, q, v, p):
+    return np.array([SIZE * (1.0 / (1.0 + ((q[0] - p[0]) / p[1]) ** 2)) ** 8, -9.81])
+
+
+def broad_quotient(t, q, v, p):
+    return np.array([SIZE * (1.0 / (1.0 + ((q[0] - p[0]) / p[1]) ** 2)) ** 2, -9.81])
+
+
+def damper(t, q, v, p):
+    """Between the bob and a point, which keep their distance or not."""
+    x, y = q[0] - p[0], q[1] - p[1]
+    along = 1.0 / np.sqrt(x * x + y * y)
+    return -(x * v[0] + y * v[1]) * along * along * np.array([x, y])
+
+
 def teeth(t, q, v, p):
     return np.array([SIZE * np.cos((q[0] - p[0]) / p[1]) ** 4096, -9.81])
 
@@ -65,7 +80,8 @@ def pendulum(force, at=1.5, width=WIDTH, compile=True):
     return problems.pendulum(compile=compile, force=force, parameters=[at, width])
 
 
-SYSTEMS = {"gust": pendulum(gust), "switched": pendulum(switched), "smooth magnet": pendulum(smooth_magnet)}
+FORCES = {"gust": gust, "switched": switched, "smooth magnet": smooth_magnet, "quotient": quotient}
+SYSTEMS = {name: pendulum(force) for name, force in FORCES.items()}
 
 
 @cache
@@ -136,23 +152,26 @@ def test_nor_is_it_by_steps_shorter_than_a_170th_of_the_run(method):
 
 
 @cache
-def end_behind_a_place(at, width):
-    """(x, y) at T_END by the angle, in steps that cannot pass over the smooth magnet."""
+def end_behind_a_place(name, at, width):
+    """(x, y) at T_END by the angle, in steps that cannot pass over a force at a place."""
+    force = FORCES[name]
 
     def rate(t, state):
-        along = math.cos(state[0]) * SIZE * math.exp(-(((math.sin(state[0]) - at) / width) ** 2))
+        along = math.cos(state[0]) * force(t, (math.sin(state[0]),), None, (at, width))[0]
         return state[1], along - 9.81 * math.sin(state[0])
 
     made = solve_ivp(rate, (0.0, T_END), (0.0, 3.0), method="DOP853", rtol=1e-11, atol=1e-11, max_step=5e-4)
     return np.array([np.sin(made.y[0, -1]), -np.cos(made.y[0, -1])])
 
 
-@pytest.mark.parametrize("options", [{}, {"compiled": False}, {"method": "Taylor"}], ids=str)
+@pytest.mark.parametrize("options", [{}, {"compiled": False}, {"method": "Taylor"}, {"method": "DOP853"}], ids=str)
 @pytest.mark.parametrize("tolerance", [1e-6, 1e-8])
-def test_nor_is_a_smooth_force_at_such_a_place(options, tolerance):
+@pytest.mark.parametrize(("name", "factor"), [("smooth magnet", 1.0), ("quotient", 2.0)])
+def test_nor_is_a_smooth_force_at_such_a_place(name, factor, options, tolerance):
     """It is passed at 3/s, a width in a two-thousandth of the run or more."""
     for at, width in ((0.1, 5e-3), (0.3, 5e-3), (-0.2, 1e-2), (0.4, 1e-2)):
-        system, expected = SYSTEMS["smooth magnet"].with_parameters([at, width]), end_behind_a_place(at, width)
+        width *= factor
+        system, expected = SYSTEMS[name].with_parameters([at, width]), end_behind_a_place(name, at, width)
         run = (0.0, T_END), START[0], [3.0, 0.0]
         result = solve_dae(system, *run, rtol=tolerance, atol=tolerance, **options)
         assert result.success and np.abs(result.q[:, -1] - expected).max() < 1e3 * tolerance
@@ -200,9 +219,13 @@ def test_nor_in_lanes():
 
 def test_what_may_act_for_a_short_time():
     assert all(may_be_sudden(each, False).by_time for each in (SYSTEMS["gust"], SYSTEMS["switched"], pendulum(ticking)))
-    smooth = pendulum(vibrating), pendulum(steady), four_bar().system, driven_slider_crank().system
+    smooth = (
+        *map(pendulum, (vibrating, steady, broad_quotient, damper)),
+        four_bar().system,
+        driven_slider_crank().system,
+    )
     assert not any(any(may_be_sudden(system, False)) for system in smooth)
-    for system in (SYSTEMS["smooth magnet"], pendulum(teeth)):
+    for system in (SYSTEMS["smooth magnet"], SYSTEMS["quotient"], pendulum(teeth)):
         assert may_be_sudden(system, False) == (False, True)
 
 
