@@ -122,11 +122,9 @@ def _beside_drifting(long: Mapping[str, Any]) -> str:
     """What a run without drift costs of time and of energy error, against ours that drift."""
     calm = long.get("calm_ours", {})
     over, least = calm.get("over_drifting"), calm.get("least")
-    said = f", at {_between(over)} times the time of ours that drift" if over else ""
+    said = f", at {_between(over)} times the time" if over else ""
     if least and least["drifting"] < least["calm"]:
-        said += (
-            f" and with a larger energy error ({number(least['calm'])} J, the default {number(least['drifting'])} J)"
-        )
+        said += f" and a larger energy error ({number(least['calm'])} J, the default {number(least['drifting'])} J)"
     return said
 
 

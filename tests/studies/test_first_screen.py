@@ -202,8 +202,7 @@ def test_every_number_of_the_screen_is_made_again_from_the_rows(tmp_path):
         "We chose 17 kinds of sharp forces (4 gusts, 2 frictions, 11 others); only",
         "Of the same 61 runs, unless our interface to a solver refuses, silently wrong are: the default 1 of 61, "
         "our 1 other methods "
-        "1 of 63, heyoka 1 of 66 (1 of 67 with `max_step`; "
-        "not run at its own default tolerance, 2.2e-16), IDA and CVODE 0 of 64. ",
+        "1 of 63, heyoka 1 of 66 (1 of 67 with `max_step`), IDA and CVODE 0 of 64. ",
         "every 5e-4 of a run. They can miss shorter ones unless `max_step` is their duration: the default is wrong "
         "under 4 of 40 constant forces of 1e-4 s and none of 61 of 3e-4 to 0.010 s, in runs of 3.0 s",
     ]
