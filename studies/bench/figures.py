@@ -29,7 +29,7 @@ from twoloop.rows.equal_error import DECADE
 MOST_LINES = 9
 FIRST = (DEFAULT, *(name for name, method in COMPILED.items() if method == DEFAULT), IRK_LINE, IRK)  # always drawn
 # family, how names begin
-MAIN_RIVALS = (("heyoka", HEYOKA), ("SUNDIALS", "CVODE"), ("SUNDIALS", "IDA from C"), ("SciPy", ""))
+MAIN_RIVALS = (("heyoka", HEYOKA), ("CyRK", ""), ("SUNDIALS", "CVODE"), ("SUNDIALS", "IDA from C"), ("SciPy", ""))
 ERROR = "largest position error over the run (m, rad)"
 LEGEND = "solid: twoloop\nfilled: keeps constraints\ngap: failed run, or more\nthan a decade of error"
 
@@ -40,6 +40,7 @@ BLACK, ORANGE, SKY, GREEN = "#000000", "#E69F00", "#56B4E9", "#009E73"
 YELLOW, BLUE, RED, PINK, GREY, BROWN = "#B39B00", "#0072B2", "#D55E00", "#CC79A7", "#7F7F7F", "#7A4A12"
 VIOLET, MAGENTA, SLATE = "#6A3D9A", "#D4006A", "#2F4F6F"  # more, as ours and others' share none
 OLIVE, CRIMSON, LIME, TAN, ROSE, LAVENDER = "#556B2F", "#8B0000", "#8CC63E", "#C49C6B", "#FF9D9A", "#A99BD8"
+TEAL = "#00A6A6"
 
 LOOKS = tomllib.loads(Path(__file__).with_name("looks.toml").read_text(encoding="utf-8"))
 OURS, THEIRS = ({globals()[color]: own for color, own in LOOKS[whose].items()} for whose in ("ours", "theirs"))

@@ -20,7 +20,7 @@ WHOSE = (GIVEN, OWN_CODE, DEFAULT, BEST)
 STANDINGS = ("ahead", "behind", "undecided", "alone", "unasked")
 PRICED = (1e-4, 1e-6)  # errors of the price on the first screen
 CHEAPER = 1.2  # by which a run that nearly gets there takes less time, where that is to be said
-FROM_C = ("CVODE from C", "IDA from C")  # each in several settings, the best of which counts
+SEVERAL = {"CyRK": "CyRK", "CVODE from C": "SUNDIALS", "IDA from C": "SUNDIALS"}  # the best of whose settings counts
 SCIPY = "SciPy's best"
 LOOKED_AT = (  # columns by which solvers are compared
     *("solver", "family", "status", "message", "error_q", "floor", "astray", "used", "times", "call_s"),
@@ -114,9 +114,9 @@ def price(rows: pd.DataFrame, firsts: pd.DataFrame, case: str) -> dict[str, Any]
         return None
     first = firsts[(firsts["case"] == case) & firsts["first_call_s"].notna()] if "first_call_s" in firsts else firsts
     own = {name: rows["solver"] == name for name in (OWN_CODE, DEFAULT, HEYOKA)}
-    sundials = {name: (rows["family"] == "SUNDIALS") & rows["solver"].str.startswith(name) for name in FROM_C}
+    best = {name: (rows["family"] == of) & rows["solver"].str.startswith(name) for name, of in SEVERAL.items()}
     lines = []
-    for name, which in (own | sundials | {SCIPY: rows["family"] == "SciPy"}).items():
+    for name, which in (own | best | {SCIPY: rows["family"] == "SciPy"}).items():
         runs, rival = rows[which], name not in (DEFAULT, OWN_CODE)
         built = first[first["solver"].isin(runs["solver"])] if len(first) else first
         first_s = float(built["first_call_s"].min()) if len(built) else None

@@ -35,7 +35,7 @@ def mechanism_of(name: str) -> str:
     return READY.get(name) or re.sub(r"\W+", "_", name).strip("_").lower()
 
 
-RIVALS = ("heyoka", "scikit-sundae", "scipy", "extensisq", "diffrax", "casadi", "solve-dae", "exudyn")
+RIVALS = ("heyoka", "scikit-sundae", "scipy", "extensisq", "diffrax", "casadi", "cyrk", "solve-dae", "exudyn")
 PACKAGES = {"SUNDIALS": "scikit-sundae", "solve_dae": "solve-dae"}  # of families that are called otherwise
 QUALITY = ("violation_q", "violation_v", "error_lam", "energy")
 SAME = ("t_end", "solver", "family", "status", "astray", "error_v", *QUALITY)  # by these names in tables of runs, too

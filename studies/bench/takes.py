@@ -28,8 +28,8 @@ def takes(found: Mapping[str, Any], entries: Sequence[dict[str, Any]]) -> list[d
         classes[entry["class"]].append(entry)
     rows = [_of_class(name, own, with_code) for name, own in classes.items() if name not in (*BEAM_CLASSES, LONG)]
     rows += _of_beams([case for case in found.get("beam", {}).get("cases", []) if case["name"] in BEAMS])
-    over = found.get("energy", {}).get("long", {}).get("calm_ours", {}).get("over_drifting") or ()
-    rows += [_of_energy(entry, coded(("four-bar",), with_code), over) for entry in classes[LONG]]
+    long = found.get("energy", {}).get("long", {})
+    rows += [_of_energy(entry, coded(("four-bar",), with_code), long) for entry in classes[LONG]]
     rows += _at_once(found.get("ensembles", {}).get("cases", []))
     paying = (f"{DEFAULT}, compiled", HEYOKA)
     paid = [_paid(line) for line in made.get("first_calls", []) if line["pays"] and line["solver"] in paying]
@@ -91,16 +91,41 @@ def _by_the_tip(case: Mapping[str, Any]) -> str:
     return f"{BEAMS[case['name']]}: {take or NONE}"
 
 
-def _of_energy(entry: Mapping[str, Any], made: bool | None, over: Sequence[float]) -> dict[str, str]:
-    """The cheapest for an error of the energy over a long time, and the cheapest whose energy shows no drift.
-
-    `over`: how many times as long, at least and at most, that takes as methods whose energy drifts.
-    """
+def _of_energy(entry: Mapping[str, Any], made: bool | None, long: Mapping[str, Any]) -> dict[str, str]:
+    """The cheapest for an error of the energy over a long time, and the cheapest whose energy shows no drift."""
     told = [_decided(entry[which], made) for which in ("picks", "without_drift")]
-    drifts = " (drifts)" if told[0] != UNCLEAR else ""
-    times = f", at {number(over[0])} to {number(over[1])} times the time of ours that drift" if over else ""
-    without = f"{drifts}; without a visible drift {told[1]}{times}" if told[1] not in (UNCLEAR, NONE) else ""
-    return {"what": f"energy over {power(entry['t_end'])} s (four-bar)", "take": told[0] + without}
+    first = told[0] if told[0] != UNCLEAR else _timed_once(long, made) or UNCLEAR
+    drifts = " (drifts)" if first == told[0] != UNCLEAR else ""
+    without = f"{drifts}; without a visible drift {told[1]}{_beside_drifting(long)}"
+    without = without if told[1] not in (UNCLEAR, NONE) else ""
+    return {"what": f"energy over {power(entry['t_end'])} s (four-bar)", "take": first + without}
+
+
+def _timed_once(long: Mapping[str, Any], made: bool | None) -> str:
+    """The times of both sides for the energy errors, which are not ranked where each run was timed once."""
+    told = []
+    for side in ("ours", "others"):
+        runs = [run for at in long.get("at", ()) if (run := at["drift"][side]) is not None]
+        if not runs or long.get("repeats", 1) > 1:
+            return ""
+        names = listed(dict.fromkeys(call(run["solver"], made) for run in runs))
+        told.append(f"{names} {_between(run['call_s'] for run in runs)} s")
+    return f"not ranked, as timed once: {', '.join(told)} (both drift)"
+
+
+def _between(values: Iterable[float]) -> str:
+    least, most = min(known := list(values)), max(known)
+    return f"{number(least)} to {number(most)}"
+
+
+def _beside_drifting(long: Mapping[str, Any]) -> str:
+    """What a run without drift costs of time and of energy error, against ours that drift."""
+    calm = long.get("calm_ours", {})
+    over, least = calm.get("over_drifting"), calm.get("least")
+    said = f", at {_between(over)} times the time of ours that drift" if over else ""
+    if least and least["drifting"] < least["calm"]:
+        said += f" and with a larger energy error ({number(least['calm'])} J, against {number(least['drifting'])} J)"
+    return said
 
 
 def _decided(picks: Sequence[Mapping[str, Any]], made: bool | None) -> str:
@@ -149,7 +174,7 @@ def _beside(pairs: Sequence[Mapping[str, Any]], ranges: Sequence[Mapping[str, An
     """In how many pairs an ODE in minimal coordinates is faster, or slower; by errors where that differs."""
     words = {"behind": "faster", "ahead": "slower", "undecided": "undecided"}
     if len({at["verdict"] for at in pairs}) == 1:
-        return f"{words[pairs[0]['verdict']]} in {len(pairs)} of {len(pairs)}"
+        return f"{words[pairs[0]['verdict']]} in {len(pairs)} of {len(pairs)} at all errors"
     parts = []
     for each in ranges:
         verdicts = Counter(at["verdict"] for at in pairs if at["error"] in each["errors"])

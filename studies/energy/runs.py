@@ -20,6 +20,7 @@ from studies.bench.solvers import (
     CVODE_C,
     CVODE_C_PROJECTED,
     CVODES,
+    CYRK,
     DEFAULT,
     DIFFRAX,
     HEYOKA,
@@ -70,7 +71,10 @@ CONTROLLED: dict[str, dict[str, Variant]] = {
 }
 TOL = 1e-5  # Rtol = Atol
 # of those on SWITCHING which may set a price: all others take three times as long for no smaller an energy error
-REPEATED = (DEFAULT, OWN_CODE, OWN_EXPLICIT, "Gauss12", GAUSS, MIDPOINT, CVODE_C, HEYOKA, "Exudyn, TrapezoidalIndex2")
+REPEATED = (
+    *(DEFAULT, OWN_CODE, OWN_EXPLICIT, "Gauss12", GAUSS, MIDPOINT, CVODE_C, CYRK, HEYOKA),
+    "Exudyn, TrapezoidalIndex2",
+)
 LSODA, PROJECTED = "LSODA, index 1", "DOP853, projected"
 ALPHA, TRAPEZOIDAL = "Exudyn, GeneralizedAlpha", "Exudyn, TrapezoidalIndex2"
 
@@ -144,6 +148,7 @@ OTHERS: dict[str, tuple[tuple[float, ...], Callable[[Case, float, int], Result]]
     "Gauss12": ((1e-5, 1e-7), partial(_controlled, "Gauss12")),
     IDA_C: (FINE, CATALOGUE[IDA_C].run),
     CVODE_C: (FINER, CATALOGUE[CVODE_C].run),
+    CYRK: (FINER, CATALOGUE[CYRK].run),
     CVODE_C_PROJECTED: (FINE, CATALOGUE[CVODE_C_PROJECTED].run),
     DIFFRAX: (FINE, partial(_long, solve_diffrax)),
     CVODES: (FINE, partial(_long, solve_cvodes)),

@@ -13,7 +13,7 @@ from studies.bench.cli import StudyError
 from studies.bench.headline import OWN_CODE
 from studies.bench.names import label
 from studies.bench.render import number
-from studies.bench.solvers import CVODE_C, DEFAULT, HEYOKA, IDA_C, IRK, OWN_EXPLICIT
+from studies.bench.solvers import CVODE_C, CYRK, DEFAULT, HEYOKA, IDA_C, IRK, OWN_EXPLICIT
 from studies.bench.study import Study, rows_of
 from studies.bench.tables import setting, setting_of, where
 from studies.energy.drift import DRIFTING, IRREGULAR, IS_LOST, NO_DRIFT, bound, verdict
@@ -37,7 +37,7 @@ from studies.energy.runs import (
 SHARES = (1e-3, 1e-5, 1e-7)  # of the largest kinetic energy: energy errors at which costs are compared
 KEEPING = f"{GAUSS}, symmetric partition"
 FATES = dict.fromkeys(DRIFTING, "drift") | {each: each for each in (NO_DRIFT, IS_LOST, IRREGULAR)}  # in one word
-DRAWN = (DEFAULT, OWN_CODE, OWN_EXPLICIT, IDA_C, HEYOKA, CVODE_C, TRAPEZOIDAL, KEEPING, IRK)  # over cost
+DRAWN = (DEFAULT, OWN_CODE, IDA_C, HEYOKA, CYRK, CVODE_C, TRAPEZOIDAL, KEEPING, IRK)  # over cost
 
 
 def judged(rows: pd.DataFrame) -> pd.DataFrame:
@@ -130,6 +130,8 @@ def long_of(rows: pd.DataFrame) -> dict[str, Any]:
     calm_ours: dict[str, Any] = {"labels": list(dict.fromkeys(run["label"] for run in kept))}
     calm_ours["fixed"] = bool(kept) and all(run["fixed_steps"] for run in kept)
     calm_ours["over_drifting"] = [min(over_drifting), max(over_drifting)] if over_drifting else None
+    least = [reached[own & side]["worst"].min() for side in (calm, ~calm)]  # energy errors without drift and with it
+    calm_ours["least"] = dict(zip(("calm", "drifting"), map(float, least), strict=True))
     calm_ours["drifting_explicit"] = bool(both) and all(other["explicit"] for _, other in both)
     found = {"case": SWITCHING, "problem": rows["problem"].iloc[0], "t_end": float(rows["t_end"].iloc[0])}
     found |= {"kinetic": kinetic, "no_drift": at[0]["no_drift"], "at": at[1:]}

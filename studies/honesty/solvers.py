@@ -5,6 +5,7 @@ from functools import partial
 from importlib.util import find_spec
 from typing import Any
 
+from references.cyrk.ode import solve_cyrk
 from references.heyoka.taylor import solve_heyoka
 from references.scipy.index1 import solve_index1
 from references.sundials.cvode_c import solve_cvode_c
@@ -19,11 +20,14 @@ from twoloop.kernels.data.tolerances import LONGEST_UNSEEN
 OWN = (GIVEN, "Taylor", "Adams", "DOP853", "Gauss12", "RadauIIA5", "BDF")
 IDA, IDA_C, CVODE_C, HEYOKA = "IDA, stabilised", "IDA from C", "CVODE from C, Adams", "heyoka, Taylor"
 PROJECTED = "CVODE from C, BDF, projected"
+CYRK, CYRK_RADAU = "CyRK, DOP853", "CyRK, Radau"
 OTHERS: dict[str, Callable[..., Result]] = {  # but for SciPy's
     **{IDA: partial(solve_ida, form="stabilised"), IDA_C: solve_ida_c, CVODE_C: partial(solve_cvode_c, method="Adams")},
     **{HEYOKA: solve_heyoka, PROJECTED: partial(solve_cvode_c, method="BDF", projected=True)},
+    **{CYRK: solve_cyrk, CYRK_RADAU: partial(solve_cyrk, method="Radau")},
 }
-COMPILED_ONLY = (IDA_C, CVODE_C, PROJECTED, HEYOKA)
+SUNDIALS = (IDA, IDA_C, CVODE_C, PROJECTED)
+COMPILED_ONLY = (IDA_C, CVODE_C, PROJECTED, HEYOKA, CYRK, CYRK_RADAU)
 SCIPY = ("LSODA", "DOP853", "Radau", "BDF")
 OF_FORCES = (  # further ones of ours under sharp forces: all presets but the paper's, which follow it to the letter
     *("auto, compiled", "auto, not compiled", "Taylor, compiled", "Gauss4", "Gauss6", "Gauss8", "Gauss10", "Gauss14"),
@@ -33,13 +37,13 @@ OURS = " (twoloop)"
 DEFAULT = f"{GIVEN}{OURS}"
 WITH_CODE: dict[str, dict[str, Any]] = {"": {}, "compiled": {"compiled": True}, "not compiled": {"compiled": False}}
 QUICK_OWN, QUICK_SCIPY = (GIVEN, "DOP853", "BDF"), ("DOP853",)
-OF_SHORT = (GIVEN, "DOP853", "RadauIIA5")  # under gusts that a solver may step over, with IDA_C, CVODE_C, HEYOKA ...
+OF_SHORT = (GIVEN, "DOP853", "RadauIIA5")  # under gusts that a solver may step over, with IDA_C, CVODE_C, HEYOKA, CYRK
 SCIPY_OF_SHORT = ("DOP853",)
 LOOK = LONGEST_UNSEEN / PLACES  # of a run: so often ours look at least at forces that change with time
 LIMITED = ", max_step"  # of others that take no step longer than the time between two looks of ours
 
 # whose a solver is, in the words of the findings
-KINDS = ("default", "ours", "set", "heyoka", "sundials", "scipy", "limited")
+KINDS = ("default", "ours", "set", "heyoka", "cyrk", "sundials", "scipy", "limited")
 
 Call = Callable[[Trap], Result]
 
@@ -54,7 +58,8 @@ def kind_of(name: str) -> str:
         return "default" if name == DEFAULT else "set" if code else "ours"
     if name.endswith(LIMITED):
         return "limited"
-    return "heyoka" if name == HEYOKA else "sundials" if name in (IDA, IDA_C, CVODE_C, PROJECTED) else "scipy"
+    named = {HEYOKA: "heyoka", CYRK: "cyrk", CYRK_RADAU: "cyrk"} | dict.fromkeys(SUNDIALS, "sundials")
+    return named.get(name, "scipy")
 
 
 def own(method: str, trap: Trap) -> Result:
@@ -81,7 +86,7 @@ def solvers(quick: bool, group: str = MISTAKE) -> dict[str, Call]:
     """Name to call, of those that are run on a group of traps; ours first, then others without `max_step` and with."""
     ours = OF_SHORT if group == SHORT else (*OWN, *(OF_FORCES if group in (FORCE, HELD_OUT) else ()))
     theirs = QUICK_SCIPY if quick else SCIPY_OF_SHORT if group == SHORT else SCIPY
-    left_out = OTHERS if quick else (IDA, PROJECTED) if group == SHORT else ()
+    left_out = OTHERS if quick else (IDA, PROJECTED, CYRK_RADAU) if group == SHORT else ()
     made: dict[str, Call] = {f"{name}{OURS}": partial(own, name) for name in (QUICK_OWN if quick else ours)}
     others = {name: solve for name, solve in OTHERS.items() if name not in left_out}
     others |= {f"{name}, index 1": partial(solve_index1, method=name) for name in theirs}
@@ -103,6 +108,7 @@ def why_not(name: str, trap: Trap) -> str:
             return "it is given accelerations: it has no constraints to check"
         if trap.impulse or trap.singular:
             return "the accelerations are not defined throughout: of an impulse, or where C_q loses rank"
-    if solver == HEYOKA and find_spec("heyoka") is None:
-        return "heyoka is not installed"
+    package = {HEYOKA: "heyoka", CYRK: "CyRK", CYRK_RADAU: "CyRK"}.get(solver)
+    if package is not None and find_spec(package) is None:
+        return f"{package} is not installed"
     return "it takes compiled functions only" if solver in COMPILED_ONLY and trap.system.called_in_python else ""

@@ -26,6 +26,8 @@ from studies.bench.study import Study
 from studies.honesty import short_forces
 from studies.honesty.solvers import (
     CVODE_C,
+    CYRK,
+    CYRK_RADAU,
     DEFAULT,
     HEYOKA,
     KINDS,
@@ -60,7 +62,7 @@ REFUSALS = (  # of an adapter or of ours to put the equations, or the setting, t
     *("NotSymbolic", "compiled=True needs equations", "needs callbacks whose operations it can see"),
     *("must be positive definite", "cannot keep a constant one", "LinAlgError"),
 )
-BUILT = (HEYOKA, CVODE_C, PROJECTED)  # solvers that are built for each system, which takes longer than they run
+BUILT = (HEYOKA, CVODE_C, PROJECTED, CYRK, CYRK_RADAU)  # made for each system, which takes longer than a run
 
 PARTS = {  # of the bars of the figure, in counts of `totals`
     "gross": (f"silently wrong, off by over {power(EXACT)}", figures.RED),

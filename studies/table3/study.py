@@ -22,6 +22,7 @@ from studies.bench.solvers import (
     ADAMS,
     CATALOGUE,
     CVODE_C,
+    CYRK,
     DEFAULT,
     ERR_IN,
     HEYOKA,
@@ -61,12 +62,21 @@ PAPER = (NEWMARK, QUARTER, IRK_LINE)
 EXPLICIT = (OWN_EXPLICIT, TAYLOR, ADAMS)  # all coordinates, projected: not the paper's procedure
 OTHERS = (
     *(DEFAULT, OWN_CODE, "SunRadau5", "Gauss6", "Gauss12", "BDF", OWN_EXPLICIT, ADAMS, TAYLOR),
-    *(HEYOKA, CVODE_C, IDA_C, "IDA, stabilised", "LSODA, index 1", "DOP853, index 1", "DOP853, projected"),
+    *(HEYOKA, CYRK, CVODE_C, IDA_C, "IDA, stabilised", "LSODA, index 1", "DOP853, index 1", "DOP853, projected"),
     *("Exudyn, GeneralizedAlpha", "Exudyn, TrapezoidalIndex2"),
 )
 # for seconds: no quick runs
-COMPILED = (OWN_CODE, HEYOKA, CVODE_C, "IDA, stabilised", "LSODA, index 1", "DOP853, index 1", "DOP853, projected")
-DRAWN = (DEFAULT, OWN_CODE, NEWMARK, IRK_LINE, OWN_EXPLICIT, TAYLOR, HEYOKA, CVODE_C, IDA_C)
+COMPILED = (
+    OWN_CODE,
+    HEYOKA,
+    CYRK,
+    CVODE_C,
+    "IDA, stabilised",
+    "LSODA, index 1",
+    "DOP853, index 1",
+    "DOP853, projected",
+)
+DRAWN = (DEFAULT, OWN_CODE, NEWMARK, IRK_LINE, OWN_EXPLICIT, HEYOKA, CYRK, CVODE_C, IDA_C)
 PAPER_END = 100.0  # s, of the paper's runs
 STEP = 0.01  # s, of the runs that tell what a partition costs
 

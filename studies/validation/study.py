@@ -22,6 +22,7 @@ from studies.bench.solvers import (
     CVODE_C,
     CVODE_C_PROJECTED,
     CVODES,
+    CYRK,
     EXUDYN,
     GIVEN,
     HEYOKA,
@@ -49,7 +50,7 @@ MAKE: tuple[Callable[[], Problem], ...] = (
 QUICK = (0, 2, 4, 10, 14)  # places in MAKE
 OWN = (GIVEN, TAYLOR, ADAMS, OWN_EXPLICIT, "Gauss12", "RadauIIA5", OWN_BDF)
 OTHERS = (
-    *(IDA_C, IDA_C_STATES, HEYOKA, CVODE_C, CVODE_C_PROJECTED, CVODES, "Radau, solve_dae"),
+    *(IDA_C, IDA_C_STATES, HEYOKA, CYRK, "CyRK, Radau", CVODE_C, CVODE_C_PROJECTED, CVODES, "Radau, solve_dae"),
     *("LSODA, index 1", "DOP853, index 1", "DOP853, projected", "Radau, index 1", "BDF, index 1"),
 )
 QUICK_OTHERS = ("DOP853, index 1",)
@@ -70,7 +71,7 @@ COMPILING = 120.0  # s of CPU of what a solver builds before it runs on a proble
 REACH = {"q": 9, "v": 7, "lam": 5}  # digits aimed at with TIGHT ...
 AIMED = (GIVEN, OWN_EXPLICIT, "Gauss12", "RadauIIA5")  # ... by these
 # their adapters tell states at given instants, between steps by interpolants: not where a step ends
-UNTOLD = (IDA_C, HEYOKA, CVODE_C, CVODE_C_PROJECTED, CVODES)
+UNTOLD = (IDA_C, HEYOKA, CYRK, "CyRK, Radau", CVODE_C, CVODE_C_PROJECTED, CVODES)
 CONSTRAINED = "IDA|solve_dae"  # in the names of others that get the constraints; the rest gets accelerations
 APART = (JUDGED, deceived.DECEIVED, MODELLED)  # groups that the table of solvers leaves out
 OUTCOMES = ("right", "inexact", "wrong", "said so", "not run")

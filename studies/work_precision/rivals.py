@@ -204,14 +204,20 @@ def _within(made: Sequence[dict[str, Any]], name: str, errors: Sequence[float]) 
 
 
 def reached(rows: pd.DataFrame) -> dict[str, Any]:
-    """At how many of the errors that any solver reaches at singular positions ours do, the default first."""
+    """At how many of the errors that any solver reaches at singular positions each does; `missed`: not the default."""
     crossed = rows[rows["case"].map(lambda case: "singular" in tags().get(str(case), ())) & rows["error_q"].notna()]
     least = crossed.groupby(["case", "solver"])["error_q"].min()
     errors = [(case, error) for case, own in least.groupby("case") for error in DECADES if own.min() <= error]
-    solvers = crossed.loc[crossed["family"] == "two-loop", "solver"].unique()
-    count = {str(who): sum(least.get((case, who), np.inf) <= error for case, error in errors) for who in solvers}
-    default = sum(least.get((case, given_on(str(case))), np.inf) <= error for case, error in errors)
-    return {"n": len(errors), "default": default, "by": dict(sorted(count.items(), key=lambda item: -item[1]))}
+    count: dict[str, dict[str, int]] = {"ours": {}, "rivals": {}}
+    for (own, solver), _ in crossed.groupby([crossed["family"] == "two-loop", "solver"]):
+        there = sum(least.get((case, solver), np.inf) <= error for case, error in errors)
+        count["ours" if own else "rivals"][str(solver)] = there
+    default = [pair for pair in errors if least.get((pair[0], given_on(str(pair[0]))), np.inf) <= pair[1]]
+    others = crossed[crossed["family"] != "two-loop"].groupby("case")["error_q"].min()
+    missed = [pair for pair in errors if pair not in default and others.get(pair[0], np.inf) <= pair[1]]
+    told = {"n": len(errors), "default": len(default), "missed": len(missed)}
+    ordered = {which: dict(sorted(by.items(), key=lambda item: -item[1])) for which, by in count.items()}
+    return told | {"by": ordered["ours"], "rivals": ordered["rivals"]}
 
 
 def _typical(made: Sequence[dict[str, Any]], error: float) -> dict[str, Any] | None:

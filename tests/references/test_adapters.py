@@ -37,6 +37,9 @@ RIGHT = {
         "CVODE from C, BDF": 1e-5,
         "CVODE, Adams": 2e-6,
         "Pr9, index 1": 1e-9,
+        "CyRK, DOP853": 5e-8,
+        "CyRK, Vern8": 1e-6,
+        "CyRK, Radau": 1e-6,
     },
     **{
         "IDAS, CasADi": 5e-6,
@@ -56,6 +59,9 @@ RIGHT_ON_SMALL = {
         "CVODE from C, BDF": 4e-6,
         "CVODE, Adams": 2e-6,
         "Pr9, index 1": 2e-11,
+        "CyRK, DOP853": 4e-9,
+        "CyRK, Vern8": 2e-7,
+        "CyRK, Radau": 1e-8,
     },
     **{
         "IDAS, CasADi": 1.5e-6,

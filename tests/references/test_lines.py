@@ -44,7 +44,7 @@ def test_a_package_that_is_not_installed_leaves_the_others():
     told = run_python(
         """
         import sys
-        for name in ("exudyn", "sksundae", "heyoka", "casadi", "diffrax", "solve_dae", "extensisq"):
+        for name in ("exudyn", "sksundae", "heyoka", "casadi", "diffrax", "solve_dae", "extensisq", "CyRK"):
             sys.modules[name] = None
         from references.lines import lines
         from references.sundials.ida import solve_ida

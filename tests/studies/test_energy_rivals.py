@@ -5,10 +5,10 @@ import pytest
 from references.casadi.integrators import solve_cvodes
 from studies.bench.collector import attempt
 from studies.bench.figures import STYLES
-from studies.bench.solvers import CVODE_C, CVODES, DIFFRAX, HEYOKA
+from studies.bench.solvers import CVODE_C, CVODES, CYRK, DIFFRAX, HEYOKA
 from studies.energy.runs import NOT_QUICK, OTHERS, QUICK, SWITCHING, case_of, measure, runs
 
-PACKAGES = {HEYOKA: "heyoka", CVODE_C: "sksundae", CVODES: "casadi", DIFFRAX: "diffrax"}
+PACKAGES = {HEYOKA: "heyoka", CYRK: "CyRK", CVODE_C: "sksundae", CVODES: "casadi", DIFFRAX: "diffrax"}
 
 
 def test_the_rivals_are_among_the_runs():

@@ -42,6 +42,22 @@ def test_ahead_and_behind_follow_the_rows(own, behind):
     assert given["missed"] == own_code["missed"] == plain["missed"] == best["n"] == len(rivals.DECADES)  # none was run
 
 
+def test_who_gets_how_far_at_singular_positions_counts_rivals_too():
+    lines = [("auto", 1e-5), ("auto, compiled", 1e-4), ("DOP853, projected", 1e-8), ("heyoka", 1.0)]
+    ours = {"auto", "auto, compiled"}
+    table = rows(
+        *((name, "two-loop" if name in ours else "others", "compiled", error, 1.0) for name, error in lines),
+        case="A02, N = 1",
+    )
+    given = rivals.given_on("A02, N = 1")
+    told, decades = rivals.reached(table), rivals.DECADES
+    reach = {name: sum(error <= at for at in decades) for name, error in lines}
+    assert told["n"] == reach["DOP853, projected"] and told["default"] == reach[given]
+    assert told["by"] == {name: reach[name] for name in ours}
+    assert told["rivals"] == {"DOP853, projected": told["n"], "heyoka": 0}
+    assert told["missed"] == told["n"] - reach[given] > 0
+
+
 def test_the_headline_names_the_default_with_code_without_and_the_best_in_this_order():
     """Every sentence is made again from the rows."""
     lines = [("auto", 3.0), ("auto, compiled", 2.0), ("Adams", 0.5), ("heyoka", 1.0)]

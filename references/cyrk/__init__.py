@@ -1,0 +1,1 @@
+"""CyRK: Runge-Kutta methods in C++, driven from compiled code."""

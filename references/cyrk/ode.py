@@ -1,0 +1,175 @@
+"""CyRK's methods on the ODE y' = f(t, y), y = [q, v], from compiled code; the constraints drift."""
+
+import ctypes
+import math
+import time
+from contextlib import ExitStack
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numba import carray, cfunc, types
+
+from references.cyrk.library import FINISHED, MEMORY, NUMBERS, POINTER, TOO_MANY_STEPS, Solution, Vector, library
+from references.driver import ADVICE, Task, TimeLimit, adapter, user_call
+from references.equations.straight_line import straight_line, straight_line_jacobian
+from references.lines import Line
+from twoloop.checks.arguments import check_choice
+from twoloop.problem.problem import Array
+from twoloop.problem.system import ConstrainedSystem
+from twoloop.result.result import Result
+
+IMPLICIT = ("BDF", "LSODA", "Radau")
+NO_TIMES = np.empty(0)
+TRIED = 2000  # steps by which the time of a step is known, where there is a time limit
+REALS, COUNTER = types.CPointer(types.float64), types.CPointer(types.int64)
+FUNCTION = types.void(REALS, types.float64, REALS, COUNTER, types.voidptr)
+
+
+@adapter(derivatives=False)
+def solve_cyrk(
+    task: Task, method: str = "DOP853", rtol: float = 1e-8, atol: float = 1e-8, *, max_step: float | None = None
+) -> Result:
+    """Integrate a constrained mechanical system, as the ODE q' = v, v' = a(t, q, v), with a method of CyRK.
+
+    Settings: accelerations as straight-line code of the mechanism (`equations.straight_line`); for implicit methods the
+    analytic Jacobian likewise, up to `straight_line.MOST_OPERATIONS` operations, otherwise differences. A second use of
+    the solver is timed, with its steps stored, as CyRK does unless it is given output times. A time limit is a limit of
+    the number of steps, by the time of the first `TRIED`.
+
+    Parameters
+    ----------
+    method : {"DOP853", "BDF", "LSODA", "Radau", "Tsit5", "Vern7", "Vern8"}
+    others : see `references.driver`
+
+    Returns
+    -------
+    Result
+        The statistics are CyRK's number of steps, and the evaluations counted by the right-hand side itself.
+
+    Raises RuntimeError if the version of CyRK is not supported.
+    """
+    check_choice("method", method, tuple(NUMBERS))
+    jacobian = _jacobian(*task.key) if method in IMPLICIT else None
+    with ExitStack() as stack:
+        solver = Solver(stack, task, method, _rate(*task.key), jacobian, (rtol, atol), task.longest(max_step))
+        limit = TimeLimit(task.time_limit)
+        most = solver.most_steps(limit)
+        with user_call:
+            solver.run(most)
+        failure, reached, end, counts = solver.failure(limit), solver.reached, solver.end, solver.counts
+        times = task.instants[task.instants <= reached]
+        solver.run(most, times)
+        rows = solver.found.states.values.reshape(-1, end.size)
+    if times.size and times[-1] == reached:
+        rows[-1] = end  # without the error of the interpolation
+    return task.result(f"CyRK, {method},", times[: len(rows)], rows.T, failure, **counts)
+
+
+class Solver:
+    """CyRK's solver of one task, with the vectors that it reads."""
+
+    def __init__(
+        self, stack: ExitStack, task: Task, method: str, rate: Any, jacobian: Any, tolerances: Any, longest: float
+    ):
+        self.task, self.start, self.longest = task, task.y0, longest
+        self.rate, self.jacobian = rate.address, None if jacobian is None else jacobian.address
+        self.tolerances, self.given = [np.array([each]) for each in tolerances], np.zeros(1, dtype=np.int64)
+        made, self._solve = library()
+        self.pointer = POINTER()
+        soon = task.t0 + 1e-9 * (task.t1 - task.t0)  # is made, and initialised, by a run
+        made(ctypes.byref(self.pointer), *self._arguments(1, NO_TIMES, soon, NUMBERS[method]))
+        stack.callback(self._delete)
+        self.found = ctypes.cast(self.pointer, ctypes.POINTER(Solution)).contents
+
+    def _arguments(self, most_steps: int, times: Array, end: float, *method: int) -> tuple[Any, ...]:
+        y0, args, t_eval, events, *tolerances = map(
+            Vector.of, (self.start, self.given, times, NO_TIMES, *self.tolerances)
+        )
+        return (
+            *(self.rate, self.task.t0, end, ctypes.byref(y0), *method),
+            *(0, 0, ctypes.byref(args), most_steps, MEMORY, False),
+            *(ctypes.byref(t_eval), None, ctypes.byref(events), *map(ctypes.byref, tolerances)),
+            *(self.longest, 0.0, True, self.jacobian),
+        )
+
+    def run(self, most_steps: int = 0, times: Array = NO_TIMES) -> None:
+        """Run from the start to the end, or for some steps; 0: as many as it takes."""
+        self._solve(self.pointer, *self._arguments(most_steps, times, self.task.t1))
+
+    def most_steps(self, limit: TimeLimit) -> int:
+        """Return the number of steps that the time limit allows, 0: no limit, by a run of at most `TRIED` steps."""
+        began = time.monotonic()
+        self.run(TRIED)
+        if limit.passed():
+            return 1
+        if limit.seconds is None or self.found.status != TOO_MANY_STEPS:
+            return 0
+        return TRIED * math.ceil(limit.seconds / (time.monotonic() - began))
+
+    @property
+    def reached(self) -> float:
+        """Return the time that the last run without output times reached."""
+        times = self.found.times.values
+        return float(times[-1]) if times.size else self.task.t0
+
+    @property
+    def end(self) -> Array:
+        """Return the state there."""
+        states = self.found.states.values
+        return states[-self.start.size :] if states.size else self.start.copy()
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Return the counters of the last run."""
+        counted = ctypes.c_int64.from_address(self.found.configuration.contents.given.begin).value
+        return {"n_accepted": int(self.found.n_steps), "n_evaluations": counted}
+
+    def failure(self, limit: TimeLimit) -> str:
+        """Return the message of a run that did not reach the end, or ""."""
+        if self.found.status == FINISHED:
+            return ""
+        if self.found.status == TOO_MANY_STEPS:
+            return limit.message("CyRK", self.reached, "take looser tolerances")
+        return f"CyRK failed after t = {self.reached:.10g}: {self.found.message.decode()} {ADVICE}"
+
+    def _delete(self) -> None:
+        """Call the destructor that frees the memory, the second of its virtual functions."""
+        functions = ctypes.cast(self.found.methods, ctypes.POINTER(POINTER))
+        ctypes.CFUNCTYPE(None, POINTER)(functions[1])(self.pointer)
+
+
+@lru_cache(maxsize=256)
+def _rate(system: ConstrainedSystem, t0: float, q0: bytes, v0: bytes) -> Any:
+    derivative, size = straight_line(system, t0, q0, v0), 2 * system.n_q
+
+    @cfunc(FUNCTION, error_model="numpy")
+    def rate(found, t, y, count, before):  # type: ignore[no-untyped-def]
+        carray(count, (1,))[0] += 1
+        derivative(t, carray(y, (size,)), carray(found, (size,)))
+
+    return rate
+
+
+@lru_cache(maxsize=256)
+def _jacobian(system: ConstrainedSystem, t0: float, q0: bytes, v0: bytes) -> Any:
+    """Return CyRK's Jacobian function, whose matrix is stored by columns; None if it is too long to compile."""
+    derivatives, size = straight_line_jacobian(system, t0, q0, v0), 2 * system.n_q
+    if derivatives is None:
+        return None
+
+    @cfunc(FUNCTION, error_model="numpy")
+    def jacobian(J, t, y, count, before):  # type: ignore[no-untyped-def]
+        columns = carray(J, (size, size))
+        columns[:] = 0.0
+        derivatives(t, carray(y, (size,)), columns)
+
+    return jacobian
+
+
+def _line(method: str, **more: Any) -> Line:
+    options = {"method": method}
+    return Line(f"CyRK, {method}", "cyrk", "CyRK", solve_cyrk, options, keeps=False, traces=True, **more)
+
+
+LINES = (_line("DOP853", checked=True), _line("Vern8"), _line("Radau"))
