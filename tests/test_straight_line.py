@@ -291,6 +291,15 @@ def test_a_second_process_compiles_nothing(own_disk, monkeypatch):
     run_python(program, own_disk)
 
 
+@pytest.mark.parametrize(("make", "n_stages"), [(mechanisms.four_bar, 0), (mechanisms.very_flexible_beam, 1)])
+def test_stages_are_compiled_where_a_run_leaves_its_series(make, n_stages, own_disk, monkeypatch):
+    monkeypatch.setattr("twoloop.generate.families._FAMILIES", {})
+    problem = make()
+    assert solve_dae(problem.system, (0.0, 0.2), problem.q0, problem.v0, compiled=True).success
+    assert len(list(own_disk.glob("series.*.nbc"))) == 1
+    assert len(list(own_disk.glob("stages.*.nbc"))) == n_stages
+
+
 def test_of_code_on_the_disk_the_newest_is_kept(monkeypatch, own_disk):
     monkeypatch.setattr(kept_files, "MOST_KEPT", 2)
     for stiffness in (1.0, -1.0, 2.0):  # 1 and -1 stand in the code

@@ -63,7 +63,7 @@ MINIMAL = tuple(line.name for line in lines() if line.family == MINIMAL_FAMILY)
 # of ours what `compare` and the cases at length run, and with rivals enough for a mechanism of a user's own
 COMPARED_OWN = ("auto, compiled", DEFAULT, TAYLOR, ADAMS, OWN_EXPLICIT, "Gauss12", "SunRadau5", "RadauIIA5", "BDF")
 COMPARED = (
-    *(*COMPARED_OWN, HEYOKA, CVODE_C, "CVODE from C, BDF"),
+    *(*COMPARED_OWN, HEYOKA, CYRK, "CyRK, Radau", CVODE_C, "CVODE from C, BDF"),
     *(IDA_C, "IDA, stabilised", "LSODA, index 1", "DOP853, index 1", "DOP853, projected", "Radau, index 1"),
 )
 

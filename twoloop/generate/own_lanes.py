@@ -11,6 +11,7 @@ from twoloop.generate import (
     lane_code,
     lane_emitter,
     lane_series,
+    lane_steps,
     llvm_code,
     llvm_text,
     llvm_trigonometry,
@@ -32,7 +33,7 @@ from twoloop.problem.system import ConstrainedSystem
 Array = NDArray[np.float64]
 
 BUILD_SECONDS = 3e-4  # for a quantity, about
-LANE_WRITERS = (lane_code, lane_series, lane_emitter)
+LANE_WRITERS = (lane_code, lane_steps, lane_series, lane_emitter)
 WRITERS = (series, straight_line, written, coefficients, *LANE_WRITERS, llvm_code, llvm_text, llvm_trigonometry)
 
 KIND = "lanes"  # of files on the disk

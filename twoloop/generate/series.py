@@ -217,7 +217,7 @@ def _sum_of_products(
         scale, form = varying.normalised()
         _collect(by_factor, form, other.times(scale))
         for i, c in factor.terms.items():
-            _collect(by_quantity, Form(graph, 0.0, {i: 1.0}), other.times(c))
+            _collect(by_quantity, graph.quantity(i), other.times(c))
     groups = (by_quantity, by_factor) if of_rates else (by_factor, by_quantity)
     ways = [[_normalised(*each) for each in way.values() if each[1].terms] for way in groups]
     for key, scale, factor, other in min(ways, key=lambda way: len({key for key, *_ in way} - known.keys())):

@@ -18,7 +18,7 @@ from twoloop.generate.series_groups import WIDTH
 from twoloop.generate.straight_code import OwnCode, SharedCode
 from twoloop.generate.written import conditions_hold, results_of
 from twoloop.kernels.compile.dependencies import digest_of
-from twoloop.kernels.compile.own_functions import CALLED, OwnFunctions, own_functions
+from twoloop.kernels.compile.own_functions import CALLED, LaterFunctions, own_functions
 
 AT_ONCE = 16  # vectors that are summed in one loop, in registers
 
@@ -137,7 +137,7 @@ class StageCode:
 class CompiledStages(NamedTuple):
     """Functions for the stages of a method."""
 
-    functions: OwnFunctions
+    functions: LaterFunctions
     code: StageCode
 
     @property
@@ -147,10 +147,19 @@ class CompiledStages(NamedTuple):
 
 
 def compiled_stages(of_one: OwnCode, n_stages: int) -> CompiledStages:
-    """The code for a mechanism and a method of so many stages, compiled; its machine code is kept on disk."""
+    """The code for a mechanism and a method of so many stages; its machine code is kept on disk.
+
+    It is compiled when steps are to call it: most runs that begin with a series do not come to that.
+    """
+    own = of_one.shared
+    what = "stages", own.equations.choice, n_stages
+    made: CompiledStages = own.family.remembered(what, lambda: _compiled(own, n_stages))
+    return made
+
+
+def _compiled(own: SharedCode, n_stages: int) -> CompiledStages:
     from twoloop.kernels.data.common import KIT
 
-    own = of_one.shared
     key, code = f"{own.digest} {n_stages}", StageCode(own, n_stages)
     parts: dict[str, Callable[..., Any]] = {
         "begin_stages": code.begin,
@@ -166,7 +175,7 @@ def compiled_stages(of_one: OwnCode, n_stages: int) -> CompiledStages:
         return list(parts), str(module)
 
     called = own.functions if code.calls else None
-    return CompiledStages(own_functions("stages", _stamp(), key, write, called), code)
+    return CompiledStages(LaterFunctions(lambda: own_functions("stages", _stamp(), key, write, called)), code)
 
 
 @cache

@@ -307,7 +307,7 @@ class Solution:
         factors_kept = sorted({i for form in forms for i in form.terms})
         shared = _shared(equations.graph, factors_kept, more)
         self.known = {i: k for k, i in enumerate([*factors_kept, *shared])}
-        kept = [Form(equations.graph, 0.0, {i: 1.0}) for i in self.known]
+        kept = [equations.graph.quantity(i) for i in self.known]
         self.kept = Outputs({"kept": kept}, equations.conditions)
         self.graph = Graph()
         self._r, self._c = self.graph.inputs(self._n, False), self.graph.inputs(n_rows, False)
@@ -357,7 +357,7 @@ class Solution:
 
 def _shared(graph: Graph, kept: Sequence[int], more: Sequence[Outputs]) -> list[int]:
     """What more outputs take of the quantities that what is kept is made of."""
-    made = set(graph.needed_by(Form(graph, 0.0, {i: 1.0}) for i in kept))
+    made = set(graph.needed_by(map(graph.quantity, kept)))
     found = {i for outputs in more for form in outputs.forms for i in form.terms}
     for outputs in more:
         for j in outputs.quantities(graph, made):

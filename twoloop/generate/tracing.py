@@ -51,14 +51,16 @@ class Graph(Symbolic):
         self.late: list[bool] = []  # whether a quantity depends on more than time and coordinates
         self.inputs_of: list[int] = []  # the inputs that a quantity depends on, a bit each
         self.traced: dict[str, Any] = {}
-        self._known: dict[Any, int] = {}
-        self._seen: dict[Any, int] = {}  # factors, in the order in which they came: values have no part in it
+        self._known: dict[tuple[int, int, int], int] = {}
+        self._seen: dict[int, int] = {}  # factors, in the order in which they came: values have no part in it
+        self._numbers: dict[Any, int] = {}  # of forms, by their keys, which take long to compare
+        self._quantities: dict[int, Form] = {}
 
     def copy(self) -> "Graph":
         """A graph of the same quantities, which may be continued otherwise; what callbacks gave is not in it."""
         other = Graph()
         other.sizes, other.late, other.inputs_of = self.sizes.copy(), self.late.copy(), self.inputs_of.copy()
-        other._known, other._seen = self._known.copy(), self._seen.copy()
+        other._known, other._seen, other._numbers = self._known.copy(), self._seen.copy(), self._numbers.copy()
         other.operations = [
             None if each is None else (each[0], each[1].on(other), None if each[2] is None else each[2].on(other))
             for each in self.operations
@@ -72,20 +74,34 @@ class Graph(Symbolic):
         self.operations += [None] * n
         self.late += [late] * n
         self.inputs_of += [1 << first + i for i in range(n)]
-        return [Form(self, 0.0, {first + i: 1.0}) for i in range(n)]
+        return [self.quantity(first + i) for i in range(n)]
+
+    def quantity(self, i: int) -> "Form":
+        """A quantity as a form."""
+        known = self._quantities.get(i)
+        if known is None:
+            self._quantities[i] = known = Form(self, 0.0, {i: 1.0})
+        return known
+
+    def number(self, form: "Form") -> int:
+        """The same of equal forms, rounding of their coefficients apart."""
+        if form.kept_number is None:
+            form.kept_number = self._numbers.setdefault(form.key, len(self._numbers))
+        return form.kept_number
 
     def operation(self, kind: int, first: "Form", second: "Form | None" = None) -> "Form":
         """The result of an operation, the one known before if there is one."""
-        key = (kind, first.key, None if second is None else second.key)
-        if key not in self._known:
-            self._known[key] = len(self.operations)
+        key = kind, self.number(first), -1 if second is None else self.number(second)
+        known = self._known.get(key)
+        if known is None:
+            known = self._known[key] = len(self.operations)
             self.operations.append((kind, first, second))
             self.late.append(first.late or (second is not None and second.late))
             bits = 0
             for i in (*first.terms, *(() if second is None else second.terms)):
                 bits |= self.inputs_of[i]
             self.inputs_of.append(bits)
-        return Form(self, 0.0, {self._known[key]: 1.0})
+        return self.quantity(known)
 
     def needed_by(self, forms: Iterable["Form"], known: Container[int] = ()) -> list[int]:
         """What forms are made of, inputs and what is known apart, in an order in which it can be computed."""
@@ -117,9 +133,10 @@ class Graph(Symbolic):
 
     def product(self, one: "Form", other: "Form") -> "Form":
         """One form times another, factors taken out so that multiples of a product are one quantity."""
-        for a, b in ((one, other), (other, one)):
-            if not a.terms:
-                return b.times(a.constant)
+        if not one.terms:
+            return other.times(one.constant)
+        if not other.terms:
+            return one.times(other.constant)
         (scale, first), (scale_too, second) = one.normalised(), other.normalised()
         factor = scale * scale_too
         if not LEAST_FACTOR < _size(factor) < 1.0 / LEAST_FACTOR:
@@ -127,8 +144,9 @@ class Graph(Symbolic):
         return self._product(first, second).times(factor)
 
     def _product(self, one: "Form", other: "Form") -> "Form":
-        first, second = (self._seen.setdefault(each.key, len(self._seen)) for each in (one, other))
-        if second < first:
+        seen = self._seen
+        first = seen.setdefault(self.number(one), len(seen))
+        if seen.setdefault(self.number(other), len(seen)) < first:
             one, other = other, one
         return self.operation(op.PRODUCT, one, other)
 
@@ -152,11 +170,12 @@ class Form:
     While a callback runs on it, whatever could tell it from a number is refused.
     """
 
-    __slots__ = ("constant", "graph", "kept_key", "terms")
+    __slots__ = ("constant", "graph", "kept_key", "kept_number", "terms")
 
     def __init__(self, graph: Graph, constant: float, terms: dict[int, float]):
         self.graph, self.constant, self.terms = graph, constant, terms
         self.kept_key: tuple[Any, ...] | None = None
+        self.kept_number: int | None = None  # see Graph.number
 
     def on(self, graph: Graph) -> "Form":
         """The same of a graph that has these quantities, too."""
@@ -186,11 +205,12 @@ class Form:
 
     def normalised(self) -> tuple[float, "Form"]:
         """A factor, and the form over it, whose first coefficient is 1."""
-        factor = self.terms[min(self.terms)]
+        first = min(self.terms)
+        factor = self.terms[first]
         if type(factor) is float and factor == 1.0:
             return factor, self
         if len(self.terms) == 1 and _equal(self.constant, 0.0):
-            return factor, Form(self.graph, 0.0, dict.fromkeys(self.terms, 1.0))
+            return factor, self.graph.quantity(first)
         if type(factor) is Known:
             inverse = factor.to(-1.0)
             return factor, Form(self.graph, self.constant * inverse, {i: c * inverse for i, c in self.terms.items()})

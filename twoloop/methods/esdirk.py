@@ -65,10 +65,11 @@ ROUGH = {"TRBDF2": 1.0, "ESDIRK4": 300.0}
 class ESDIRK:
     """Two-loop procedure with diagonally implicit stages, each by Newton's method: few digits of stiff problems.
 
-    The stages are solved one after another, each with derivatives at its own iterates where the system gives tangents
-    (without them they are differenced, and kept while Newton's method contracts fast). A matrix of an earlier state
-    stops contracting once stiff directions have turned; `RungeKutta(..., outer="newton")`, whose stages share one
-    matrix, is held to short steps by that at loose tolerances, and is the better one at tight tolerances.
+    The stages are solved one after another, each with derivatives at its own iterates where the system gives tangents.
+    Without them they are differenced, and kept while Newton's method contracts fast and the error estimate finds them
+    right. A matrix of an earlier state stops contracting once stiff directions have turned;
+    `RungeKutta(..., outer="newton")`, whose stages share one matrix, is held to short steps by that at loose
+    tolerances, and is the better one at tight tolerances.
 
     Both formulas are L-stable and end with their last stage. With step-size control "TRBDF2" goes on from its embedded
     formula, of order 3: the difference, filtered for stiff components three times, is L-stable, too. A step is accepted

@@ -7,7 +7,7 @@ done, so that LLVM has little to do before it makes machine code of it.
 
 from collections import defaultdict
 from collections.abc import Callable
-from functools import cache
+from functools import cache, cached_property
 from threading import Lock
 from typing import Any
 
@@ -49,6 +49,23 @@ class OwnFunctions:
                 binding.add_symbol(CALLED + name, address)
             self._engine.finalize_object()
         self.addresses: dict[str, int] = {name: int(self._engine.get_function_address(name)) for name in names}
+
+
+class LaterFunctions:
+    """Functions that `make` makes when their addresses are first asked for: of what a run may not come to."""
+
+    def __init__(self, make: Callable[[], OwnFunctions]):
+        self._make = make
+
+    @cached_property
+    def functions(self) -> OwnFunctions:
+        """Themselves, which stay in memory with this object."""
+        return self._make()
+
+    @property
+    def addresses(self) -> dict[str, int]:
+        """By their names."""
+        return self.functions.addresses
 
 
 _MADE: dict[str, Newest] = defaultdict(Newest)  # by kind

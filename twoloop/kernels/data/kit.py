@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from numba.extending import typeof_impl
 
-from twoloop.kernels.compile.own_functions import OwnFunctions
+from twoloop.kernels.compile.own_functions import LaterFunctions, OwnFunctions
 from twoloop.kernels.data.common import KIT, OWN_FUNCTIONS, Step
 
 NONE = np.zeros(0)
@@ -30,7 +30,7 @@ class Kit:
         second: Step | None = None,
         general: Any = None,
         instead: Any = None,
-        own: tuple[OwnFunctions, ...] = (),
+        own: tuple[OwnFunctions | LaterFunctions, ...] = (),
         numbers: Any = None,
         own_numbers: Any = None,
     ):

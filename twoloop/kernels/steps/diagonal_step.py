@@ -14,9 +14,10 @@ from twoloop.kernels.algebra.linalg import copy
 from twoloop.kernels.control.predictor import departure, keep_predicted
 from twoloop.kernels.data.codes import DONE
 from twoloop.kernels.data.common import ATTEMPT, SETTLE, Attempt, Step, compiled, kernel
+from twoloop.kernels.data.flags import FORCE_BY_Q_GIVEN
 from twoloop.kernels.data.noted import GENERATION
 from twoloop.kernels.data.tolerances import ESTIMATE, allowed
-from twoloop.kernels.evaluation.calls import evaluate_state
+from twoloop.kernels.evaluation.calls import evaluate, evaluate_state, multipliers
 from twoloop.kernels.steps import newton_memory as at
 from twoloop.kernels.steps.diagonal_stage import (
     KEPT_WHILE,
@@ -29,9 +30,9 @@ from twoloop.kernels.steps.diagonal_stage import (
     stages_of,
 )
 from twoloop.kernels.steps.iteration_matrix import factor_again, filter_by_iteration
-from twoloop.kernels.steps.lasting import STEPS, lasting_error, over_velocities, own_time
+from twoloop.kernels.steps.lasting import STEPS, derivatives_fit, lasting_error, over_velocities, own_time
 from twoloop.kernels.steps.newton_memory import block, vector
-from twoloop.kernels.steps.newton_operator import factor_filter, filter_error
+from twoloop.kernels.steps.newton_operator import derivatives_at, factor_filter, factor_systems, filter_error
 from twoloop.kernels.steps.stages import INNER_TOL
 
 FILTERED = 3  # times: with fewer the extrapolated method is unstable for vibrations, see tests/kernels/test_diagonal.py
@@ -61,7 +62,41 @@ def _factor_filter(f, w, options, memory, h):
 
 
 @compiled
-def _error(f, w, options, memory, h, tolerances, state, new_state, V_stage, A_stage, weights, share):
+def _difference(w, h, V_stage, A_stage, weights, share, e_q, e_v):
+    """The stages' difference by such weights, times `share`, of the independents; all n_dof numbers in (n_q)."""
+    for i in range(w.independent.size):
+        j = w.independent[i]
+        in_q, in_v = 0.0, 0.0
+        for k in range(weights.size):
+            in_q += weights[k] * V_stage[k, j]
+            in_v += weights[k] * A_stage[k, j]
+        e_q[i] = share * h * in_q
+        e_v[i] = share * h * in_v
+
+
+@compiled
+def _renew(f, w, options, memory, t, h, new_state):
+    """Derivatives at the end of the step, and their factors."""
+    n = w.Q.size
+    Q, V, F = vector(memory, 1, n, at.Q_MID), vector(memory, 1, n, at.V_MID), vector(memory, 1, n, at.A_MID)
+    copy(new_state[:n], Q)
+    copy(new_state[n : 2 * n], V)
+    memory[at.HAS_JACOBIAN] = 0.0
+    code = evaluate(f, w, t, Q, V, options[INNER_TOL], F)
+    if code != DONE:
+        return code
+    multipliers(f, w, t, Q, V, F, w.lam)
+    code = derivatives_at(f, w, options, memory, one_stage_of(options), t, Q, V, F)
+    if code == DONE:
+        code = factor_systems(f, w, options, memory, one_stage_of(options), h)
+    if code == DONE:
+        memory[at.HAS_JACOBIAN] = 1.0
+        memory[at.FRESH] = 0.0
+    return code
+
+
+@compiled
+def _error(f, w, options, memory, t, h, tolerances, state, new_state, V_stage, A_stage, weights, share):
     """Largest component, over atol + rtol |value|, of the stages' difference by such weights, times `share`.
 
     It is filtered by the last factors (Hosea and Shampine 1996): what is stiff has no part in it.
@@ -71,16 +106,19 @@ def _error(f, w, options, memory, h, tolerances, state, new_state, V_stage, A_st
     e_q, e_v = vector(memory, 1, n, at.E_Q), vector(memory, 1, n, at.E_V)
     raw, once = vector(memory, 1, n, at.A_NEW), vector(memory, 1, n, at.A_MID)
     count = w.independent.size
-    for i in range(count):
-        j = w.independent[i]
-        in_q, in_v = 0.0, 0.0
-        for k in range(weights.size):
-            in_q += weights[k] * V_stage[k, j]
-            in_v += weights[k] * A_stage[k, j]
-        e_q[i] = share * h * in_q
-        e_v[i] = share * h * in_v
+    z = h * gamma_of(options)
+    _difference(w, h, V_stage, A_stage, weights, share, e_q, e_v)
     copy(e_v, raw)
     _filter(f, w, options, memory, h, e_q, e_v)
+    if f.flags[FORCE_BY_Q_GIVEN] == 0 and not derivatives_fit(
+        f, w, options, memory, 1, t + h, z, tolerances, raw, e_q, e_v, state, new_state, A_stage[-1]
+    ):
+        memory[at.CHANGED] = 1.0
+        if _renew(f, w, options, memory, t + h, h, new_state) != DONE:
+            return np.inf
+        _difference(w, h, V_stage, A_stage, weights, share, e_q, e_v)
+        copy(e_v, raw)
+        _filter(f, w, options, memory, h, e_q, e_v)
     error = 0.0
     for i in range(count):
         j = w.independent[i]
@@ -91,7 +129,6 @@ def _error(f, w, options, memory, h, tolerances, state, new_state, V_stage, A_st
             error = max(error, abs(e_v[i]) / scale)
     copy(e_v, once)
     _filter(f, w, options, memory, h, e_q, e_v)
-    z = h * gamma_of(options)
     return max(error, lasting_error(w, memory, tolerances, z, raw, once, e_v, state, new_state, A_stage[-1]))
 
 
@@ -107,10 +144,13 @@ def _extrapolate(f, w, options, memory, h, q1, v1):
 
 
 @compiled
-def _slow_error(f, w, options, memory, h, tolerances, state, new_state):
+def _slow_error(f, w, options, memory, h, tolerances, state, new_state, A_stage):
     """What an error of the velocities, in E_V, leaves in directions that are slow beside the step, as newton_step."""
-    e_q, e_v = vector(memory, 1, w.Q.size, at.E_Q), vector(memory, 1, w.Q.size, at.E_V)
-    longest = own_time(w, tolerances, state)
+    n = w.Q.size
+    e_q, e_v = vector(memory, 1, n, at.E_Q), vector(memory, 1, n, at.E_V)
+    longest = own_time(w, tolerances, state, state[2 * n :])
+    if memory[at.CHANGED] == 1.0:
+        longest = max(longest, own_time(w, tolerances, state, A_stage[-1]))
     error = over_velocities(w, tolerances, e_v, longest, state, new_state)
     if error <= 1.0:
         return 0.0
@@ -126,7 +166,7 @@ def _slow_error(f, w, options, memory, h, tolerances, state, new_state):
 
 
 @compiled
-def _error_at_jumps(f, w, options, memory, h, tolerances, state, new_state, V_stage, A_stage, lower):
+def _error_at_jumps(f, w, options, memory, t, h, tolerances, state, new_state, V_stage, A_stage, lower):
     """The error by `lower`, the weights of another embedded formula, for accelerations that jump within the step.
 
     Those of the first one are so small at the stages of the first half that a jump there hardly shows. `lower` is exact
@@ -147,9 +187,9 @@ def _error_at_jumps(f, w, options, memory, h, tolerances, state, new_state, V_st
     if memory[at.H_FACTORED] == 0.0 and _factor_filter(f, w, options, memory, h) != DONE:
         return np.inf
     share = min(1.0, missed / (AT_JUMP * widest))
-    error = _error(f, w, options, memory, h, tolerances, state, new_state, V_stage, A_stage, lower, share)
+    error = _error(f, w, options, memory, t, h, tolerances, state, new_state, V_stage, A_stage, lower, share)
     if error <= 1.0:
-        error = max(error, _slow_error(f, w, options, memory, h, tolerances, state, new_state))
+        error = max(error, _slow_error(f, w, options, memory, h, tolerances, state, new_state, A_stage))
     return error
 
 
@@ -210,15 +250,16 @@ def diagonal_step(f, w, options, memory, t, h, tolerances, state, new_state):
     for m in w.independent:
         q1[m] = Q[m]
     error = 0.0
+    memory[at.CHANGED] = 0.0
     if tolerances[ESTIMATE] == 1.0:
-        error = _error(f, w, options, memory, h, tolerances, state, new_state, V_stage, A_stage, weights, 1.0)
+        error = _error(f, w, options, memory, t, h, tolerances, state, new_state, V_stage, A_stage, weights, 1.0)
         if not error <= 1.0:
             return Attempt(DONE, error, 0.0)
         if options[options.size - 1] == 1.0:
             _extrapolate(f, w, options, memory, h, q1, v1)
-        error = max(error, _slow_error(f, w, options, memory, h, tolerances, state, new_state))
+        error = max(error, _slow_error(f, w, options, memory, h, tolerances, state, new_state, A_stage))
         if error <= 1.0 and options[options.size - 1] == 0.0:
-            jumps = _error_at_jumps(f, w, options, memory, h, tolerances, state, new_state, V_stage, A_stage, lower)
+            jumps = _error_at_jumps(f, w, options, memory, t, h, tolerances, state, new_state, V_stage, A_stage, lower)
             error = max(error, jumps)
         if not error <= 1.0:
             return Attempt(DONE, error, 0.0)

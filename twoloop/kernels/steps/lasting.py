@@ -6,19 +6,29 @@ matter are passed over.
 
 That is the rate of its fastest part. Where a stiff damper acts beside a contact, what the step leaves in the slow
 directions lasts much longer: it is what the system solved for some steps at once leaves of the error.
+
+J that was differenced before a contact began or ended says another rate, while Newton's method still contracts with it.
 """
 
 import numpy as np
 
+from twoloop.kernels.algebra.linalg import copy
+from twoloop.kernels.data.codes import DONE
 from twoloop.kernels.data.common import compiled
 from twoloop.kernels.data.tolerances import GAP, allowed
+from twoloop.kernels.evaluation.calls import evaluate
 from twoloop.kernels.steps import newton_memory as at
+from twoloop.kernels.steps.newton_memory import block, vector
+from twoloop.kernels.steps.newton_tangents import DIFFERENCE
+from twoloop.kernels.steps.stages import INNER_TOL
 
 # An error that turns back as slowly as the motion itself does is none of a vibration, and those of the next steps go
 # the same way: it counts as if it lasted so many times as long
 TURNS = 10.0
 OF_RUN = 10.0  # times GAP: longer than that nothing is taken to last
 STEPS = 10.0  # after which nothing is left of an error that is fast beside the step
+FAST = 20.0  # steps: an error of the velocities that lasts shorter is fast
+UNLIKE = 0.3  # relative difference of accelerations, from which derivatives are not those of a state
 
 
 @compiled
@@ -59,12 +69,69 @@ def over_velocities(w, tolerances, e_v, lasting, state, new_state):
 
 
 @compiled
-def own_time(w, tolerances, state):
-    """The time in which the motion changes its velocities, s."""
+def own_time(w, tolerances, state, a):
+    """The time in which accelerations like these change the velocities of the motion, s."""
     n = w.Q.size
     fastest = change = 0.0
     for j in w.independent:
         fastest = max(fastest, abs(state[n + j]))
-        change = max(change, abs(state[2 * n + j]))
+        change = max(change, abs(a[j]))
     longest = OF_RUN * tolerances[GAP]
     return fastest / change if fastest < longest * change else longest
+
+
+@compiled
+def _may_mislead(w, memory, tolerances, z, raw, longest, state, new_state):
+    """Whether it matters if J is not that of the end of the step.
+
+    It does where an error of the velocities, `raw`, would count if it lasted longer than J says, and where J has
+    directions that are fast beside the step while Newton's method, which it serves, contracts no better than if they
+    were slow.
+    """
+    lasting = memory[at.LASTING]
+    if lasting < min(longest, FAST * z) and memory[at.CONTRACTION] * lasting * lasting > UNLIKE * z * z:
+        return True
+    return over_velocities(w, tolerances, raw, longest, state, new_state) > 1.0
+
+
+@compiled
+def derivatives_fit(f, w, options, memory, s, t, z, tolerances, raw, e_q, e_v, state, new_state, a_end):
+    """Whether J is that of the end of the step, at time t, as far as it matters.
+
+    (e_q, e_v) is (I - z J)^-1 of the error, and `raw` its velocities; J times it is compared with a difference of
+    accelerations.
+    """
+    n = w.Q.size
+    longest = max(own_time(w, tolerances, state, state[2 * n :]), own_time(w, tolerances, state, a_end))
+    if not _may_mislead(w, memory, tolerances, z, raw, longest, state, new_state):
+        return True
+    q1, v1 = new_state[:n], new_state[n : 2 * n]
+    Q, V = vector(memory, s, n, at.Q_MOVED), vector(memory, s, n, at.V_MOVED)
+    there, moved = block(memory, s, n, at.RESIDUAL)[0], block(memory, s, n, at.Q_STAGE)[0]
+    copy(q1, Q)
+    copy(v1, V)
+    if evaluate(f, w, t, Q, V, options[INNER_TOL], there) != DONE:
+        return False
+    largest, size = 0.0, 1.0
+    for i in range(w.independent.size):
+        largest = max(largest, abs(e_v[i]))
+        size = max(size, abs(V[w.independent[i]]))
+    if largest == 0.0:
+        return True
+    factor = max(1.0, DIFFERENCE * size / largest)
+    copy(q1, Q)
+    copy(v1, V)
+    for i in range(w.independent.size):
+        Q[w.independent[i]] += factor * e_q[i]
+        V[w.independent[i]] += factor * e_v[i]
+    if evaluate(f, w, t, Q, V, options[INNER_TOL], moved) != DONE:
+        return False
+    apart, widest, fastest = 0.0, 0.0, 0.0
+    for i in range(w.independent.size):
+        j = w.independent[i]
+        scale = allowed(tolerances, j, state[n + j], new_state[n + j])
+        by_j, found = (e_v[i] - raw[i]) / z, (moved[j] - there[j]) / factor
+        apart = max(apart, abs(by_j - found) / scale)
+        widest = max(widest, abs(by_j) / scale, abs(found) / scale)
+        fastest = max(fastest, abs(e_v[i]) / scale)
+    return apart <= UNLIKE * widest or widest * longest <= fastest

@@ -24,8 +24,9 @@ N_REAL, N_PAIRS, GAMMA0, VELOCITIES, N_EIGEN_SCALARS = range(5)
     DAMPED,  # 0: no derivative by v
     SYMMETRIC,  # 1: the matrix of diagonal_step.py was factored as a symmetric one
     LASTING,  # s, of diagonal_step.py: how long an error of velocity lasts; 0: not known
+    CHANGED,  # 1: in diagonal_step.py: derivatives were renewed at the end of the step
     N_MEMORY_SCALARS,
-) = range(13)
+) = range(14)
 PREVIOUS, TRIAL, RESIDUAL, Q_STAGE, V_STAGE, N_BLOCKS = range(6)
 A_NEW, Q_MOVED, V_MOVED, E_Q, E_V, Q_MID, V_MID, A_MID, N_VECTORS = range(9)
 # spaces in w.matrices, of n_q^2 numbers each; those from SYSTEMS on go in pairs, complex, one for each eigenvalue

@@ -219,7 +219,7 @@ def _slow_error(f, w, options, memory, h, tolerances, state, new_state):
     s, n = int(options[STAGES]), w.Q.size
     z = STEPS * h / options[eigen_place(s) + at.GAMMA0]
     e_q, e_v = vector(memory, s, n, at.E_Q), vector(memory, s, n, at.E_V)
-    longest = own_time(w, tolerances, state)
+    longest = own_time(w, tolerances, state, state[2 * n :])
     error = over_velocities(w, tolerances, e_v, longest, state, new_state)
     if error <= 1.0:
         return 0.0
