@@ -3,8 +3,9 @@
 import ctypes
 import math
 import time
+from collections.abc import Callable
 from contextlib import ExitStack
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
@@ -51,29 +52,55 @@ def solve_cyrk(
     """
     check_choice("method", method, tuple(NUMBERS))
     jacobian = _jacobian(*task.key) if method in IMPLICIT else None
+    functions = _rate(*task.key), jacobian
+    times, rows, failure, counts = integrate(functions, task.y0, task, method, rtol, atol, max_step)
+    return task.result(f"CyRK, {method},", times, rows.T, failure, **counts)
+
+
+def integrate(
+    functions: tuple[Any, Any],
+    start: Array,
+    task: Task,
+    method: str,
+    rtol: float,
+    atol: float,
+    max_step: float | None = None,
+) -> tuple[Array, Array, str, dict[str, int]]:
+    """Return the times reached, rows y there, error message or "", and counters.
+
+    `functions`: right-hand side and Jacobian, or None, in machine code.
+    """
     with ExitStack() as stack:
-        solver = Solver(stack, task, method, _rate(*task.key), jacobian, (rtol, atol), task.longest(max_step))
+        solver = Solver(stack, task, start, method, functions, (rtol, atol), task.longest(max_step))
         limit = TimeLimit(task.time_limit)
         most = solver.most_steps(limit)
+        run = solver.prepared(most)
         with user_call:
-            solver.run(most)
+            run()
         failure, reached, end, counts = solver.failure(limit), solver.reached, solver.end, solver.counts
         times = task.instants[task.instants <= reached]
-        solver.run(most, times)
+        solver.prepared(most, times)()
         rows = solver.found.states.values.reshape(-1, end.size)
     if times.size and times[-1] == reached:
         rows[-1] = end  # without the error of the interpolation
-    return task.result(f"CyRK, {method},", times[: len(rows)], rows.T, failure, **counts)
+    return times[: len(rows)], rows, failure, counts
 
 
 class Solver:
     """CyRK's solver of one task, with the vectors that it reads."""
 
     def __init__(
-        self, stack: ExitStack, task: Task, method: str, rate: Any, jacobian: Any, tolerances: Any, longest: float
+        self,
+        stack: ExitStack,
+        task: Task,
+        start: Array,
+        method: str,
+        functions: tuple[Any, Any],
+        tolerances: tuple[float, float],
+        longest: float,
     ):
-        self.task, self.start, self.longest = task, task.y0, longest
-        self.rate, self.jacobian = rate.address, None if jacobian is None else jacobian.address
+        self.task, self.start, self.longest = task, np.array(start, dtype=float), longest
+        self.rate, self.jacobian = (None if each is None else each.address for each in functions)
         self.tolerances, self.given = [np.array([each]) for each in tolerances], np.zeros(1, dtype=np.int64)
         made, self._solve = library()
         self.pointer = POINTER()
@@ -93,14 +120,17 @@ class Solver:
             *(self.longest, 0.0, True, self.jacobian),
         )
 
-    def run(self, most_steps: int = 0, times: Array = NO_TIMES) -> None:
-        """Run from the start to the end, or for some steps; 0: as many as it takes."""
-        self._solve(self.pointer, *self._arguments(most_steps, times, self.task.t1))
+    def prepared(self, most_steps: int, times: Array = NO_TIMES) -> Callable[[], None]:
+        """Return a function that runs from the start to the end, or for some steps; 0: as many as it takes.
+
+        The arguments are C++ objects, which a user of CyRK has: they are made before.
+        """
+        return partial(self._solve, self.pointer, *self._arguments(most_steps, times, self.task.t1))
 
     def most_steps(self, limit: TimeLimit) -> int:
         """Return the number of steps that the time limit allows, 0: no limit, by a run of at most `TRIED` steps."""
         began = time.monotonic()
-        self.run(TRIED)
+        self.prepared(TRIED)()
         if limit.passed():
             return 1
         if limit.seconds is None or self.found.status != TOO_MANY_STEPS:
@@ -139,9 +169,8 @@ class Solver:
         ctypes.CFUNCTYPE(None, POINTER)(functions[1])(self.pointer)
 
 
-@lru_cache(maxsize=256)
-def _rate(system: ConstrainedSystem, t0: float, q0: bytes, v0: bytes) -> Any:
-    derivative, size = straight_line(system, t0, q0, v0), 2 * system.n_q
+def right_hand_side(derivative: Callable[..., Any], size: int) -> Any:
+    """Return CyRK's right-hand side function, which counts its calls, for a compiled (t, y, rate) -> None."""
 
     @cfunc(FUNCTION, error_model="numpy")
     def rate(found, t, y, count, before):  # type: ignore[no-untyped-def]
@@ -149,6 +178,11 @@ def _rate(system: ConstrainedSystem, t0: float, q0: bytes, v0: bytes) -> Any:
         derivative(t, carray(y, (size,)), carray(found, (size,)))
 
     return rate
+
+
+@lru_cache(maxsize=256)
+def _rate(system: ConstrainedSystem, t0: float, q0: bytes, v0: bytes) -> Any:
+    return right_hand_side(straight_line(system, t0, q0, v0), 2 * system.n_q)
 
 
 @lru_cache(maxsize=256)
@@ -172,4 +206,4 @@ def _line(method: str, **more: Any) -> Line:
     return Line(f"CyRK, {method}", "cyrk", "CyRK", solve_cyrk, options, keeps=False, traces=True, **more)
 
 
-LINES = (_line("DOP853", checked=True), _line("Vern8"), _line("Radau"))
+LINES = (_line("DOP853", checked=True), *map(_line, ("Vern8", "Radau", "BDF", "LSODA")))

@@ -1,10 +1,11 @@
-"""heyoka and CVODE on a mechanism in minimal coordinates (`minimal.equations`), where no constraints can drift.
+"""heyoka, CyRK and CVODE on a mechanism in minimal coordinates (`minimal.equations`), where no constraints can drift.
 
-Each is used as for redundant coordinates (`heyoka.taylor`, `sundials.cvode_c`), with the options that are best there,
-and the same timing of a second use of the integrator.
+Each is used as for redundant coordinates (`heyoka.taylor`, `cyrk.ode`, `sundials.cvode_c`), with the options that are
+best there, and the same timing of a second use of the integrator.
 """
 
 import math
+from collections.abc import Callable
 from functools import lru_cache
 from typing import Any
 
@@ -12,6 +13,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike
 
+from references.cyrk import ode
 from references.driver import Task, check_task, imported
 from references.heyoka import taylor
 from references.lines import Line
@@ -82,9 +84,30 @@ def solve_cvode_minimal(
     check_positive("rtol", rtol)
     check_positive("atol", atol)
     own, task = _checked(problem, t_end, t_eval, time_limit)
-    functions, start = cvode_c.Functions(_right_hand_side(own)), np.array(own.start)
+    functions, start = cvode_c.Functions(_right_hand_side(own, cvode_c.right_hand_side)), np.array(own.start)
     times, rows, failure, counts = cvode_c.integrate(functions, start, task, "Adams", rtol, atol)
     return task.result("CVODE, Adams,", times, _states(own, task, rows), failure, **counts)
+
+
+def solve_cyrk_minimal(
+    problem: Problem,
+    t_end: float,
+    rtol: float = 1e-8,
+    atol: float = 1e-8,
+    *,
+    t_eval: ArrayLike | None = None,
+    time_limit: float | None = None,
+) -> Result:
+    """Integrate a mechanism in minimal coordinates by CyRK's DOP853.
+
+    Parameters, errors and result as for `solve_cvode_minimal`.
+    """
+    check_positive("rtol", rtol)
+    check_positive("atol", atol)
+    own, task = _checked(problem, t_end, t_eval, time_limit)
+    rate = _right_hand_side(own, ode.right_hand_side)
+    times, rows, failure, counts = ode.integrate((rate, None), np.array(own.start), task, "DOP853", rtol, atol)
+    return task.result("CyRK, DOP853,", times, _states(own, task, rows), failure, **counts)
 
 
 def _checked(
@@ -109,8 +132,8 @@ def _integrator(own: Minimal, tol: float) -> Any:
 
 
 @lru_cache(maxsize=64)
-def _right_hand_side(own: Minimal) -> Any:
-    """Return CVODE's right-hand side function."""
+def _right_hand_side(own: Minimal, made: Callable[[Any, int], Any]) -> Any:
+    """Return the right-hand side as `made` makes it for a solver of a compiled (t, y, rate) -> None."""
     rates, size = njit(error_model="numpy")(own.equations(math)), len(own.start)
 
     @njit(error_model="numpy")
@@ -119,7 +142,7 @@ def _right_hand_side(own: Minimal) -> Any:
         for i in range(size):
             rate[i] = found[i]
 
-    return cvode_c.right_hand_side(derivative, size)
+    return made(derivative, size)
 
 
 def _states(own: Minimal, task: Task, rows: Array) -> Array:
@@ -137,5 +160,6 @@ LINES = (
         builds_each=True,
         **OWN,
     ),
+    Line(f"CyRK, DOP853, {FAMILY}", "cyrk", FAMILY, solve_cyrk_minimal, **OWN),
     Line(f"CVODE from C, {FAMILY}", "scikit-sundae", FAMILY, solve_cvode_minimal, **OWN),
 )

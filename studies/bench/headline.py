@@ -11,7 +11,7 @@ from typing import Any
 import pandas as pd
 
 from studies.bench import tables
-from studies.bench.solvers import COMPILED, DEFAULT, GIVEN, HEYOKA
+from studies.bench.solvers import CATALOGUE, COMPILED, DEFAULT, GIVEN, HEYOKA
 from studies.bench.tables import SETTINGS, by_solver
 
 OWN_CODE = next(name for name, method in COMPILED.items() if method == DEFAULT)
@@ -67,9 +67,17 @@ def asked(rivals: pd.DataFrame, error: float) -> bool:
 
 
 def _told(costs: tables.Costs) -> dict[str, Any]:
-    """The cheapest."""
+    """The cheapest, and those of other projects that take as long within LEAST."""
     best = min(costs, key=lambda name: costs[name][0], default=None)
-    return {"solver": best, "call_s": None if best is None else costs[best][0]}
+    if best is None:
+        return {"solver": None, "call_s": None, "close": []}
+    most = tables.LEAST * costs[best][0]
+    close = [name for name, cost in costs.items() if cost[0] < most and _project(name) != _project(best)]
+    return {"solver": best, "call_s": costs[best][0], "close": close}
+
+
+def _project(solver: str) -> str:
+    return CATALOGUE[solver].family if solver in CATALOGUE else solver
 
 
 def counted(found: Iterable[Iterable[Mapping[str, Mapping[str, Any]]]]) -> list[dict[str, Any]]:

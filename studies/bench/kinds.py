@@ -56,13 +56,18 @@ def _which(kind: str, own: Sequence[Mapping[str, Any]]) -> str:
 
 
 def _fastest(own: Sequence[Mapping[str, Any]], errors: Sequence[float]) -> str:
-    """Who is the fastest in how many of the pairs of mechanism and error that any solver reaches."""
+    """Who is the fastest in how many of the pairs of mechanism and error that any solver reaches.
+
+    Where a rival of another project takes as long as the fastest rival, it is not decided.
+    """
     won: Counter[str] = Counter()
     for line in (line for each in own for line in each["at"] if line["error"] in errors):
         runs = [run for run in (line["ours"], line["others"]) if run]
         if runs:
             best = min(runs, key=lambda run: float(run["call_s"]))
-            won.update([label(best["solver"], True) if line["verdict"] in DECIDED else line["verdict"]])
+            open_to_rivals = best is line["others"] and line.get("close")
+            verdict = "undecided" if open_to_rivals else line["verdict"]
+            won.update([label(best["solver"], True) if verdict in DECIDED else verdict])
     named = [(who, n) for who, n in won.most_common() if who not in OPEN]
     told = [f"{who if who == GIVEN else f'`{who}`'} {n}" for who, n in named[:NAMED]]
     rest = sum(n for _, n in named[NAMED:])

@@ -124,7 +124,9 @@ def _beside_drifting(long: Mapping[str, Any]) -> str:
     over, least = calm.get("over_drifting"), calm.get("least")
     said = f", at {_between(over)} times the time of ours that drift" if over else ""
     if least and least["drifting"] < least["calm"]:
-        said += f" and with a larger energy error ({number(least['calm'])} J, against {number(least['drifting'])} J)"
+        said += (
+            f" and with a larger energy error ({number(least['calm'])} J, the default {number(least['drifting'])} J)"
+        )
     return said
 
 

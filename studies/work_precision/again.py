@@ -1,8 +1,8 @@
 """Measure single mechanisms, or other parts, again: `python -m studies.work_precision.again NAME ...`.
 
-The whole study takes hours. Each part that this has measured takes the place of its rows in work_precision.csv at once,
-with the commit and the processor that it was made on; `python -m studies.work_precision --redraw` then writes the
-report anew. Without names: what there is.
+The whole study takes hours. A part is a mechanism, or a rival's project on all mechanisms. Each part that this has
+measured takes the place of its rows in work_precision.csv at once, with the commit and the processor that it was made
+on; `python -m studies.work_precision --redraw` then writes the report anew. Without names: what there is.
 """
 
 import sys
@@ -23,11 +23,12 @@ AT_LENGTH = ", at length"  # after the name of a case: the runs over its whole m
 
 @dataclass(frozen=True)
 class Part:
-    """Rows that are measured together: all of a group, or those of one case of it."""
+    """Rows that are measured together: all of a group, or those of one case of it, or of one project's solvers."""
 
     group: str
     case: str | None
     make: Callable[[KeptRows], pd.DataFrame]
+    family: str | None = None
 
 
 def parts() -> dict[str, Part]:
@@ -37,6 +38,9 @@ def parts() -> dict[str, Part]:
         name: Part(rivals.GROUP, name, partial(rivals.collect, [run for run in runs if run.case.name == name]))
         for name in rivals.problems(False)
     }
+    for family in dict.fromkeys(run.solver.family for run in runs if run.solver.family != "two-loop"):
+        own = [run for run in runs if run.solver.family == family]
+        found[family] = Part(rivals.GROUP, None, partial(rivals.collect, own), family)
     for case in study.known_cases(False):
         found[case.name + AT_LENGTH] = Part(LENGTH, case.name, partial(study.at_length, [case], False))
     found["first calls"] = Part(first_calls.GROUP, None, partial(first_calls.collect, quick=False))
@@ -49,6 +53,8 @@ def replaced(rows: pd.DataFrame, part: Part, new: pd.DataFrame) -> pd.DataFrame:
     old = rows["group"] == part.group
     if part.case is not None:
         old &= rows["case"] == part.case
+    if part.family is not None:
+        old &= rows["family"] == part.family
     columns = list(dict.fromkeys([*rows.columns, *new.columns]))
     return pd.concat([rows[~old], new], ignore_index=True).reindex(columns=columns)
 

@@ -1,4 +1,4 @@
-"""Should I use a DAE at all? heyoka and CVODE in minimal coordinates, beside ours and rivals with constraints.
+"""Should I use a DAE at all? heyoka, CyRK and CVODE in minimal coordinates, beside ours and rivals with constraints.
 
 On the mechanisms whose loops close in closed form (`minimal.equations`). The rows are a group of their own, which no
 ranking of solvers of a DAE sees. A part of `studies.work_precision`.
@@ -19,7 +19,6 @@ from studies.bench.store import KeptRows
 from studies.work_precision import rivals
 
 GROUP = "minimal coordinates"
-ERRORS = (1e-3, 1e-6, 1e-9, 1e-12)
 TOLERANCES = (1e-3, 1e-5, 1e-7, 1e-9, 1e-11, 1e-13)
 HEYOKAS_OWN = float(np.finfo(float).eps)  # the tolerance that heyoka takes where none is given
 WRONG, ASKED = 0.1, 1e-4  # a run that ends with this error, though it was asked for a thousandth of it, is wrong
@@ -43,14 +42,14 @@ def runs(quick: bool) -> list[Run]:
 
 def collect(kept: KeptRows, quick: bool) -> pd.DataFrame:
     """Rows of all runs, the repetitions interleaved."""
-    return adaptive.collect(runs(quick), kept, rivals.row_at_end, lambda run: True, () if quick else ERRORS)
+    return adaptive.collect(runs(quick), kept, rivals.row_at_end, lambda run: True, () if quick else rivals.DECADES)
 
 
 def at_errors(rows: pd.DataFrame, others: pd.DataFrame) -> list[dict[str, Any]]:
     """How the best of ours with constraints stands at each error beside the cheapest without (`rows`)."""
     both = pd.concat([others[others["family"] == "two-loop"], rows], ignore_index=True)
-    found = headline.of_errors(both, ERRORS)
-    return [at[headline.BEST] | {"error": error} for error, at in zip(ERRORS, found, strict=True)]
+    found = headline.of_errors(both, rivals.DECADES)
+    return [at[headline.BEST] | {"error": error} for error, at in zip(rivals.DECADES, found, strict=True)]
 
 
 def findings_by_kind(rows: pd.DataFrame, everywhere: pd.DataFrame) -> list[dict[str, Any]]:

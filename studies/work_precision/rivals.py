@@ -152,7 +152,8 @@ def at_decades(rows: pd.DataFrame) -> list[dict[str, Any]]:
             found[which] = cheapest and {key: cheapest[key] for key in ("solver", "call_s")}
         best = standing[headline.BEST]
         if found["others"] is None and best["rival"]["solver"]:  # not asked for about so much
-            found["others"] = best["rival"]
+            found["others"] = {key: best["rival"][key] for key in ("solver", "call_s")}
+        found["close"] = best["rival"]["close"]
         made.append(found | {key: best[key] for key in ("ratio", "verdict")})
     return made
 

@@ -33,6 +33,12 @@ def test_a_mechanism_measured_again_takes_the_place_of_its_rows():
     assert length["call_s"].tolist() == [1.0, 2.0, 3.0, 7.0]
 
 
+def test_a_project_measured_again_takes_the_place_of_its_solvers_on_all_mechanisms():
+    kept = KEPT.assign(family=["heyoka", "two-loop", "heyoka", "heyoka"])
+    new = rows((rivals.GROUP, "knife edge", 9.0, "new")).assign(family="heyoka")
+    assert again.replaced(kept, again.parts()["heyoka"], new)["call_s"].tolist() == [2.0, 3.0, 4.0, 9.0]
+
+
 def test_it_writes_each_part_at_once(tmp_path, monkeypatch):
     (tmp_path / "work_precision.csv").write_text(f"# full work_precision; stamp\n{KEPT.to_csv(index=False)}")
     call = cli.parse("work_precision", None, ["--out", str(tmp_path)])

@@ -31,6 +31,12 @@ def test_each_comparison_counts_once_within_its_range_of_errors():
     assert cells([WON, alone])[1] == "`Taylor` 1, ours alone, not all rivals run, 1 of 2"
 
 
+def test_rivals_of_two_projects_that_take_as_long_are_undecided():
+    tie = LOST | {"close": ["CyRK, DOP853"]}
+    assert cells([tie, LOST])[1] == "`heyoka` 1, undecided 1 of 2"
+    assert cells([WON | {"others": None, "close": ["CyRK, DOP853"]}])[1] == "`Taylor` 1 of 1"
+
+
 def test_the_default_has_its_name_and_only_three_are_named():
     names = ("auto, compiled", "auto", "DOP853 (twoloop)", "DOP853, compiled", "Adams, compiled")
     at = [WON | {"ours": {"solver": name, "call_s": 0.1}} for name in names]

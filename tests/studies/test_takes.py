@@ -79,7 +79,7 @@ def test_a_smaller_energy_error_of_a_run_that_drifts_is_said():
     entry = {"class": "long and conservative", "t_end": 1e4, "picks": [pick], "without_drift": [pick]}
     for least, more in (({"calm": 2e-6, "drifting": 3e-9}, True), ({"calm": 3e-9, "drifting": 2e-6}, False)):
         told = takes({"energy": {"long": {"calm_ours": {"least": least}}}}, [entry])[0]["take"]
-        assert told.endswith(" and with a larger energy error (2e-6 J, against 3e-9 J)") is more
+        assert told.endswith(" and with a larger energy error (2e-6 J, the default 3e-9 J)") is more
 
 
 def test_runs_timed_once_are_not_ranked_but_their_times_are_told():
