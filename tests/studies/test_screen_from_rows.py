@@ -32,6 +32,7 @@ def test_every_sentence_of_the_screen_follows_from_the_committed_rows(tmp_path, 
     whole = {processors.WHOLE_CALL: processors.TIMES[processors.WHOLE_CALL]}
     monkeypatch.setattr(processors, "TIMES", whole)  # the first screen quotes no other
     shutil.copy(REPORTS / processors.FILE, tmp_path)
+    shutil.copy(REPORTS / "validation.csv", tmp_path)  # which rivals it has
     for name, told in TOLD.items():
         for path in (REPORTS / f"{name}.csv", REPORTS / f"{name}_series.npz"):
             if path.exists():
