@@ -1,5 +1,6 @@
 """The first screen, reports/README.md: which method to take, from the findings of all studies in the folder."""
 
+import csv
 import importlib
 import json
 from collections.abc import Sequence
@@ -73,8 +74,14 @@ def lacking(folder: Path) -> list[str]:
     """What the rows of a folder do not compare `NEWEST` on."""
     rows = {name: _lines(folder / f"{name}.csv") for name in (*ASKED_OF, "work_precision")}
     long = [line for line in rows.pop("work_precision") if line.startswith(AT_LENGTH)]
-    told = {"long motions": long} | {what: rows[name] for name, what in ASKED_OF.items()}
-    return [what for what, lines in told.items() if lines and not any(NEWEST in line for line in lines)]
+    cases = {line[1] for line in csv.reader(long)} - {line[1] for line in csv.reader(filter(_has_newest, long))}
+    told = {what: rows[name] for name, what in ASKED_OF.items()}
+    without = [what for what, lines in told.items() if lines and not any(map(_has_newest, lines))]
+    return ["some long motions"] * bool(cases) + without
+
+
+def _has_newest(line: str) -> bool:
+    return NEWEST in line
 
 
 def _lines(file: Path) -> list[str]:
