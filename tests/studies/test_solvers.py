@@ -23,7 +23,7 @@ COMPILING = (
     "Radau,",
     "Radau9,",
     "BDF,",
-    *("heyoka", "CVODE", "Dopri8", "Pr9", "collocation"),
+    *("heyoka", "CyRK", "CVODE", "Dopri8", "Pr9", "collocation"),
 )  # seconds each, and tested by the studies that show them
 
 
