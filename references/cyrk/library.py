@@ -19,7 +19,7 @@ from twoloop.problem.problem import Array
 
 WRITTEN_FOR = "0.20.0"
 MADE_BY, SOLVED_BY = r"_Z\d+baseline_cysolve_ivpP\w+", r"_Z\d+baseline_cysolve_ivp_noreturnP\w+"
-NUMBERS = {"DOP853": 5, "BDF": 6, "LSODA": 7, "Radau": 8, "Tsit5": 9, "Vern7": 10, "Vern8": 11}  # ODEMethod
+NUMBERS = {"DOP853": 5, "BDF": 6, "LSODA": 7, "Radau": 8, "Vern8": 11}  # ODEMethod
 FINISHED, TOO_MANY_STEPS = 1, -52  # CyrkErrorCodes
 MEMORY = 8192  # MB that stored steps may take, the only limit of their number
 POINTER, REAL, SIZE = ctypes.c_void_p, ctypes.c_double, ctypes.c_size_t

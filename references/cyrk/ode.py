@@ -40,7 +40,7 @@ def solve_cyrk(
 
     Parameters
     ----------
-    method : {"DOP853", "BDF", "LSODA", "Radau", "Tsit5", "Vern7", "Vern8"}
+    method : {"DOP853", "BDF", "LSODA", "Radau", "Vern8"}
     others : see `references.driver`
 
     Returns

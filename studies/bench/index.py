@@ -55,6 +55,8 @@ COSTS = ("call_s", "called_from", "keeps")
 def findings(folder: Path) -> dict[str, dict[str, Any]]:
     """What NAME.json of each study holds, for those that have been run into the folder and time what all time.
 
+    In that of work_precision, "lacking" is what was not run with the newest rival.
+
     Raises StudyError if a file is damaged.
     """
     found = {}

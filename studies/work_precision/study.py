@@ -107,7 +107,14 @@ def part(rows: pd.DataFrame, group: str = GROUP) -> pd.DataFrame:
 def measured_on(rows: pd.DataFrame) -> dict[str, Any]:
     """At how many commits, and on which processors, the rows were measured."""
     made = rows.reindex(columns=["processor", "commit"]).dropna().astype(str)
-    return {"commits": made["commit"].nunique(), "processors": sorted(made["processor"].unique())}
+    return {"apart": apart(rows), "commits": made["commit"].nunique(), "processors": sorted(made["processor"].unique())}
+
+
+def apart(rows: pd.DataFrame) -> list[str]:
+    """Projects whose solvers were measured at another commit than most rows of a mechanism: in a pass of their own."""
+    known = rows[rows["group"] == rivals.GROUP].reindex(columns=["case", "family", "commit"]).dropna()
+    usual = known["case"].map(known.groupby("case")["commit"].agg(lambda each: each.mode().iloc[0]))
+    return sorted(known.loc[known["commit"] != usual, "family"].unique())
 
 
 def on_the_same_processor(rows: pd.DataFrame, others: pd.DataFrame) -> pd.DataFrame:

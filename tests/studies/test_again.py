@@ -26,7 +26,7 @@ def test_a_mechanism_measured_again_takes_the_place_of_its_rows():
     parts = again.parts()
     made = again.replaced(KEPT, parts["four-bar"], new)
     assert made["call_s"].tolist() == [2.0, 3.0, 4.0, 9.0]
-    assert study.measured_on(made.fillna({"commit": "ab"})) == {"commits": 2, "processors": ["new", "old"]}
+    assert study.measured_on(made.fillna({"commit": "ab"})) == {"apart": [], "commits": 2, "processors": ["new", "old"]}
     calls = again.replaced(KEPT, parts["first calls"], rows((first_calls.GROUP, "four-bar", 8.0, "new")))
     assert calls["call_s"].tolist() == [1.0, 2.0, 4.0, 8.0]
     length = again.replaced(KEPT, parts["four-bar" + again.AT_LENGTH], rows(("compare", "four-bar", 7.0, "new")))
@@ -62,3 +62,9 @@ def test_only_what_ran_on_one_processor_is_compared():
     own = rows(("m", "four-bar", 1.0, "old"), ("m", "double pendulum", 2.0, "new"))
     others = rows((rivals.GROUP, "four-bar", 1.0, "new"), (rivals.GROUP, "double pendulum", 2.0, "new"))
     assert study.on_the_same_processor(own, others)["call_s"].tolist() == [2.0]
+
+
+def test_a_project_measured_in_a_pass_of_its_own_is_told():
+    made = KEPT.assign(family="two-loop", commit="abc")
+    later = rows((rivals.GROUP, "four-bar", 9.0, "old")).assign(family="heyoka", commit="def")
+    assert study.apart(made) == [] and study.apart(pd.concat([made, made, later])) == ["heyoka"]
