@@ -13,7 +13,7 @@ import pytest
 
 from tests.problems import pendulum
 from twoloop import mechanisms, solve_dae
-from twoloop.checks.consistency import check_start
+from twoloop.checks.consistency import Look, check_start
 from twoloop.generate.choices import Choice
 from twoloop.generate.exact_derivatives import Territory, exact_derivatives, generic_states
 from twoloop.generate.families import family_of
@@ -126,6 +126,17 @@ def test_what_starts_have_shown_lets_no_other_start_pass(make):
             assert said[0] == said[1]
             refused.append(bool(said[0]))
     assert 0 < sum(refused) < len(refused)
+
+
+@pytest.mark.parametrize("make", [mechanisms.spatial_four_bar, mechanisms.spatial_slider_crank, mechanisms.heavy_top])
+def test_coordinates_that_are_zero_but_for_rounding_need_no_closer_look(make):
+    """Another processor leaves 1e-50 in the place of 0: constraints of such coordinates are no rounding of their terms."""
+    problem, generic = make(), np.random.default_rng(6)
+    look = Look(problem.system)
+    off = generic.standard_normal(problem.system.n_q)
+    for size, seen in ((0.0, True), (1e-50, True), (1e-35, True), (1e-12, False)):
+        found = look.at(0.0, problem.q0 + size * off, problem.v0)
+        assert bool(found & look.flags.CONSISTENT) is seen
 
 
 def test_a_call_that_crosses_singular_positions_takes_few_calls_and_measures_them_when_its_message_is_read():

@@ -18,6 +18,7 @@ from twoloop.kernels.data.flags import (
 # flags of what is found: all is finite, M symmetric, no row empty; the state on the rows but for rounding; an M that
 # varies definite, or not
 IN_ORDER, CONSISTENT, DEFINITE, INDEFINITE = 1, 2, 4, 8
+LEFT = 2.0**-52  # of the largest coordinate: one as small is rounding of zero
 SURELY = 2.0  # times what counts as no eigenvalue: what rounding does not reach
 
 
@@ -56,32 +57,37 @@ def _symmetric(mass, allowed):
 
 
 @exact
-def _rounding(value, row, state, least, rate, allowed):
-    """Whether a value is no more than this share of the terms that it is the sum of, no state being below its least."""
+def _largest(state):
+    largest = 0.0
+    for x in state:
+        largest = max(largest, abs(x))
+    return largest
+
+
+@exact
+def _rounding(value, row, state, sizes, least, rate, allowed):
+    """Whether a value is no more than this share of the terms that it is the sum of, no state being below its size."""
     size = abs(rate)
     for j in range(state.size):
-        size += abs(row[j]) * max(abs(state[j]), least[j])
+        size += abs(row[j]) * max(abs(state[j]), sizes[j], least)
     return abs(value) <= allowed * size
 
 
 @exact
-def _consistent(C, rate, rows, q, v, sizes, fastest, allowed):
+def _consistent(C, rate, rows, q, v, sizes, allowed):
     """Whether positions and velocities are on the rows but for rounding, of velocities of the fastest coordinate.
 
-    No coordinate counts as less than its size; `fastest` is scratch.
+    No coordinate counts as less than its size, or than what rounding leaves of the largest: of coordinates that are
+    zero but for rounding, as in a plane, a constraint is not zero to rounding of its terms.
     """
-    largest = 0.0
-    for j in range(q.size):
-        largest = max(largest, abs(v[j]))
-    for j in range(q.size):
-        fastest[j] = largest
+    fastest, nothing = _largest(v), LEFT * _largest(q)
     for i in range(len(rows)):
         speed = 0.0
         for j in range(q.size):
             speed += rows[i, j] * v[j]
-        if not _rounding(speed + rate[i], rows[i], v, fastest, rate[i], allowed):
+        if not _rounding(speed + rate[i], rows[i], v, v, fastest, rate[i], allowed):
             return False
-        if i < C.size and not _rounding(C[i], rows[i], q, sizes, 0.0, allowed):
+        if i < C.size and not _rounding(C[i], rows[i], q, sizes, nothing, 0.0, allowed):
             return False
     return True
 
@@ -169,7 +175,7 @@ def look(f, t, q, v, sizes, lam, room, mass, rows, ways, pattern, least):
     found = 0
     if _symmetric(mass, least[1]) and not _empty(rows):
         found = IN_ORDER
-        if _consistent(room[force:C], room[C:rate], rows, q, v, sizes, scratch[0], least[0]):
+        if _consistent(room[force:C], room[C:rate], rows, q, v, sizes, least[0]):
             found |= CONSISTENT
     if flags[CONSTANT_MASS] == 0:  # beyond doubt
         if _definite(mass, SURELY * least[2], scratch):
