@@ -84,7 +84,7 @@ def counted(found: Iterable[Iterable[Mapping[str, Mapping[str, Any]]]]) -> list[
     """Of many pairs of mechanism and error, in how many each of WHOSE is ahead, behind, undecided, alone, missing.
 
     `found`: of each mechanism how they stand at each error. n are the pairs that any of ours or of others reaches;
-    unbeaten the mechanisms, of n_mechanisms, for which `is_unbeaten`.
+    `lost` those of the missing that others reach; unbeaten the mechanisms, of n_mechanisms, for which `is_unbeaten`.
     """
     mechanisms = [list(own) for own in found]
     pairs = [each for own in mechanisms for each in own if any(it["verdict"] != "none" for it in each.values())]
@@ -92,6 +92,7 @@ def counted(found: Iterable[Iterable[Mapping[str, Mapping[str, Any]]]]) -> list[
     for name in WHOSE:
         verdicts = [each[name]["verdict"] for each in pairs]
         line = {verdict: verdicts.count(verdict) for verdict in STANDINGS}
+        line["lost"] = verdicts.count("missed")
         line["unbeaten"] = sum(is_unbeaten(own, name) for own in mechanisms)
         line["n_mechanisms"] = len(mechanisms)
         # "none" counts, too: the one in question does not get there, another of ours does

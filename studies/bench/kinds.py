@@ -8,7 +8,7 @@ from studies.bench.names import label
 from studies.bench.solvers import GIVEN
 
 DECIDED = ("ahead", "behind", "alone", "missed")  # verdicts by which one solver is the fastest
-OPEN = {"undecided": "undecided", "unasked": "ours alone, not all rivals run,"}  # others, in words
+OPEN = {"undecided": "undecided", "unasked": "only ours, with some rivals not run,"}  # others, in words
 NAMED = 3  # solvers, the most often fastest
 FOUR_BARS, PLANAR = "four-bar linkages, over 10 s", "other planar pendulums, chains and loops"
 STIFF, CROSSED = "stiff springs and dampers", "motion through singular positions"
@@ -71,7 +71,7 @@ def _fastest(own: Sequence[Mapping[str, Any]], errors: Sequence[float]) -> str:
     named = [(who, n) for who, n in won.most_common() if who not in OPEN]
     told = [f"{who if who == GIVEN else f'`{who}`'} {n}" for who, n in named[:NAMED]]
     rest = sum(n for _, n in named[NAMED:])
-    told += [f"others {rest}"] * bool(rest) + [
+    told += [f"other solvers {rest}"] * bool(rest) + [
         f"{words} {won[verdict]}" for verdict, words in OPEN.items() if won[verdict]
     ]
     return f"{', '.join(told)} of {won.total()}" if won else "not reached"

@@ -48,6 +48,11 @@ def call(solver: str, coded: bool | None = None) -> str:
     return f'`method="{method}"{", " * bool(option)}{option}`'
 
 
+def project(solver: str) -> str:
+    """Whose solver a row is, for rivals: what stands before its method."""
+    return solver.partition(", ")[0]
+
+
 def looks_like(solver: str, coded: bool | None = None) -> str:
     """The row whose colour and marker a solver has: what is called without `compiled` looks the same everywhere."""
     if not coded:

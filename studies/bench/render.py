@@ -83,6 +83,7 @@ def environment() -> jinja2.Environment:
     made.filters |= {
         "code": names.call,
         "label": names.label,
+        "project": names.project,
         "num": number,
         "power": power,
         "pct": percent,

@@ -222,15 +222,18 @@ def reached(rows: pd.DataFrame) -> dict[str, Any]:
 
 
 def _typical(made: Sequence[dict[str, Any]], error: float) -> dict[str, Any] | None:
-    """Time of the cheapest rival over that of the default at an error: quartiles over mechanisms.
+    """Time of the cheapest rival over that of the default at an error: quartiles over mechanisms; and its median.
 
     Those with singular positions, at which accelerations are not defined, do not count. None: it is not known on any.
     """
     smooth = [each for each in made if "singular" not in each["tags"]]
-    ratios = [at["standing"][headline.GIVEN]["ratio"] for each in smooth for at in each["at"] if at["error"] == error]
-    known = [ratio for ratio in ratios if ratio is not None]
-    quartiles = np.percentile(known, (25, 50, 75)).tolist() if known else []
-    return {"error": error, "n": len(known), "quartiles": quartiles} if known else None
+    at = [at["standing"][headline.GIVEN] for each in smooth for at in each["at"] if at["error"] == error]
+    known = [(own["ratio"], own["call_s"]) for own in at if own["ratio"] is not None]
+    if not known:
+        return None
+    ratios, calls = zip(*known, strict=True)
+    quartiles = np.percentile(ratios, (25, 50, 75)).tolist()
+    return {"error": error, "n": len(known), "quartiles": quartiles, "call_s": float(np.median(calls))}
 
 
 def close(every: Sequence[dict[str, Any]]) -> dict[str, Any]:

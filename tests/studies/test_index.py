@@ -172,7 +172,7 @@ def test_the_first_screen_and_the_advice_can_be_written_whatever_is_found(change
 
 def test_an_undecided_comparison_counts_as_a_win_for_neither_side(tmp_path):
     near = at_error(standing=standing(verdict="undecided"))
-    assert "no clear choice (of 2 errors: " in front(tmp_path, [case(at=[at_error(error=1e-2), near])])
+    assert "no clear choice (of 2 errors: " in screen(tmp_path, [case(at=[at_error(error=1e-2), near])])
     close = energy()
     close["long"]["at"][0]["verdict"] = "undecided"
     told = [entries([], energy=found)[0]["at"][0]["undecided"] for found in (close, energy())]
@@ -255,7 +255,7 @@ def test_the_readme_changes_between_its_marks_only(tmp_path):
     index.put_in_readme(tmp_path, readme)
     text = readme.read_text()
     assert text.startswith("above\n") and text.endswith("\nbelow\n") and "earlier" not in text
-    assert "`ours` (" in text and "`SunRadau5`" not in text
+    assert "#more-to-take" in text and "`SunRadau5`" not in text
     with pytest.raises(StudyError, match="there is no work_precision"):
         index.put_in_readme(tmp_path / "nowhere", readme)
 

@@ -28,7 +28,7 @@ def test_each_comparison_counts_once_within_its_range_of_errors():
     assert cells([NEAR, NONE], [WON]) == ["other spatial mechanisms (2)", "`Taylor` 1, undecided 1 of 2", "not reached"]
     assert cells([NONE])[1:] == ["not reached", "not reached"]
     alone = WON | {"verdict": "unasked"}
-    assert cells([WON, alone])[1] == "`Taylor` 1, ours alone, not all rivals run, 1 of 2"
+    assert cells([WON, alone])[1] == "`Taylor` 1, only ours, with some rivals not run, 1 of 2"
 
 
 def test_rivals_of_two_projects_that_take_as_long_are_undecided():
@@ -41,7 +41,7 @@ def test_the_default_has_its_name_and_only_three_are_named():
     names = ("auto, compiled", "auto", "DOP853 (twoloop)", "DOP853, compiled", "Adams, compiled")
     at = [WON | {"ours": {"solver": name, "call_s": 0.1}} for name in names]
     _, loose, _ = cells([*at, at[0], at[1], at[2]])
-    assert loose == "the default 2, `compiled=False` 2, `DOP853, compiled=False` 2, others 2 of 8"
+    assert loose == "the default 2, `compiled=False` 2, `DOP853, compiled=False` 2, other solvers 2 of 8"
 
 
 def test_kinds_are_told_by_the_first_of_their_tags():
