@@ -48,6 +48,20 @@ def call(solver: str, coded: bool | None = None) -> str:
     return f'`method="{method}"{", " * bool(option)}{option}`'
 
 
+def whose(n_ours: int) -> dict[str, str]:
+    """Kinds of solvers in sentences on silent errors, in their order; `n_ours`: of ours beside the default."""
+    return {
+        "default": "the default",
+        "ours": f"our {n_ours} other methods",
+        "set": "some of these with `compiled` set",
+        "heyoka": "heyoka",
+        "cyrk": "CyRK",
+        "sundials": "IDA and CVODE",
+        "scipy": "SciPy",
+        "limited": "other projects' solvers with `max_step`",
+    }
+
+
 def project(solver: str) -> str:
     """Whose solver a row is, for rivals: what stands before its method."""
     return solver.partition(", ")[0]

@@ -90,7 +90,7 @@ def environment() -> jinja2.Environment:
         "listed": listed,
     }
     made.filters |= {"brief": brief}
-    made.globals["table"] = table
+    made.globals |= {"table": table, "whose": names.whose}
     return made
 
 

@@ -66,8 +66,8 @@ def pick(rows: pd.DataFrame, motion: str, solver: str, variant: Variant = BASIC,
 
 def told(row: pd.Series) -> dict[str, Any]:
     """A run as a finding."""
-    found = {name: row[name] for name in ("solver", "name", "called_from", "call_s", "n_evaluations", "violation_q", "error_q")}
-    found |= {name: row[name] for name in ("verdict", "status")}
+    names = ("solver", "name", "called_from", "call_s", "n_evaluations", "violation_q", "error_q", "verdict", "status")
+    found = {name: row[name] for name in names}
     found["setting"] = setting(row)
     found["label"] = f"{label(row['name'], coded=True)}, {found['setting']}"
     found |= {"kinetic": float(row["kinetic"]), "fixed_steps": bool(pd.notna(row["h"]))}

@@ -199,8 +199,8 @@ def test_every_number_of_the_screen_is_made_again_from_the_rows(tmp_path):
         f"{number(np.median([ms['auto, compiled'][0], ms['auto'][1]]))} ms), {typical} at 1e-10.",
         "an error over 1e-3 at a tolerance of 1e-8.",
         "We chose 17 kinds of sharp forces (4 gusts, 2 frictions, 11 others); only",
-        "Of the same 61 runs of 3.0 s, unless our interface to a solver refuses, silently wrong are: the default 1 of 61, "
-        "our 1 other methods "
+        "Of the same 61 runs of 3.0 s, unless our interface to a solver refuses, silently wrong are: "
+        "the default 1 of 61, our 1 other methods "
         "1 of 63, heyoka 1 of 66 (1 of 67 with `max_step`), IDA and CVODE 0 of 64. ",
         "every 5e-4 of a run (1.5e-3 s here, 0.050 s in 100 s), other forces",
         "Under constant forces of 1e-4 s, wrong are: the default 4 of 40, `IDA from C` 7. ",

@@ -45,7 +45,8 @@ def test_an_ode_in_angles_is_told_by_errors_only_where_these_differ():
     pendulums = minimal("pendulums", [wrong], one=["behind"] * 3, two=["behind"] * 3)
     (row,) = takes({"work_precision": {"minimal": [loops, pendulums], "rivals": {"ranges": ranges}}}, [])
     assert row["take"] == (
-        "an ODE in angles by the fastest of a few solvers, `heyoka` (12), against our best: crank: faster in 3 of 3 at all errors; "
+        "an ODE in angles by the fastest of a few solvers, `heyoka` (12), against our best: "
+        "crank: faster in 3 of 3 at all errors; "
         "slider: faster in 1, undecided in 1 of 2 at loose, slower in 1 of 1 at tight; "
         "pendulums: faster in 6 of 6 at all errors (`heyoka` silently wrong by over 0.10 in 3 of 14 runs from "
         "horizontal rest, others in 0 of 6)"
