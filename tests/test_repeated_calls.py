@@ -130,7 +130,7 @@ def test_what_starts_have_shown_lets_no_other_start_pass(make):
 
 @pytest.mark.parametrize("make", [mechanisms.spatial_four_bar, mechanisms.spatial_slider_crank, mechanisms.heavy_top])
 def test_coordinates_that_are_zero_but_for_rounding_need_no_closer_look(make):
-    """Another processor leaves 1e-50 in place of 0, and constraints of such coordinates above the rounding of their terms."""
+    """Another processor leaves 1e-50 in place of 0, and rows of such coordinates above the rounding of their terms."""
     problem, generic = make(), np.random.default_rng(6)
     look = Look(problem.system)
     off = generic.standard_normal(problem.system.n_q)
