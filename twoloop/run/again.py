@@ -15,20 +15,20 @@ from twoloop.generate.exact_derivatives import farthest
 from twoloop.generate.straight_code import OwnCode
 from twoloop.generate.traced_values import Sample
 from twoloop.kernels.compile.linking import direct
-from twoloop.kernels.data import flags, noted
+from twoloop.kernels.data import flags, intervals, noted
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.asked import Asked
 from twoloop.run.beginning import Beginning
 from twoloop.run.between import Between, interpolator_of
 from twoloop.run.comparison import compared_at, territory_of
-from twoloop.run.crossings import turned_last
+from twoloop.run.crossings import Place, turned_last
 from twoloop.run.dense import Table
 from twoloop.run.dense_solution import DenseSolution
 from twoloop.run.fields import kinds_of, of_run, told_later
-from twoloop.run.messages import outcome
+from twoloop.run.messages import message_of, outcome, unless_turned
 from twoloop.run.movable import Kin, Movable
 from twoloop.run.pace import INTERRUPTED, Pace
-from twoloop.run.passage import give_way
+from twoloop.run.passage import beyond, bridge, bridging_kit, give_way
 from twoloop.run.record import Record, Status
 from twoloop.run.run import Run
 
@@ -86,7 +86,7 @@ class Again:
         self.territory = territory_of(run, check_derivatives) if kin is None else kin.territory(check_derivatives)
         self.beginning = Beginning(run, system if self.movable is None else self.movable.system, code, definite)
         self.look, self.rest, self._advance = self.beginning.look, 0, direct(run.kernels.advance)
-        self.plan, self.kit, self.flags = run.plan, run.kit, run.kit.flags.copy()
+        self.plan, self.kit, self.flags, self.memory = run.plan, run.kit, run.kit.flags.copy(), run.memory
         self.t, self.rows = np.empty(run.chunk + 1), np.empty((run.chunk + 1, len(run.state)))
         self.steps = np.empty((run.chunk, run.a.N_STEP_COLUMNS))
         self.kinds, self.between = np.empty(run.chunk, dtype=np.int64), Between(run)
@@ -136,20 +136,15 @@ class Again:
             parts = self.t[: n_rows + 1], self.rows[: n_rows + 1], self.kinds[:n_rows]
             self.between.find(between, *parts, self.look.pattern)
         spent = time.process_time() - began
-        singular = run.plan.watchful and run.work.notes[noted.NEARLY_SINGULAR] == 1.0
-        turned = False
-        if output.times is None and not run.plan.watchful:
-            turned = turned_last(self.t[: n_rows + 1], self.rows[: n_rows + 1], system.n_q)
-        if code != a.ALL_OUTPUT_DONE or singular or turned:
+        t, rows = self.t[: n_rows + 1].copy(), self.rows[: n_rows + 1].copy()
+        if code != a.ALL_OUTPUT_DONE or not self._is_to_be_trusted(t, rows, t1, output):
             self.rest = IN_VAIN
             return None
-        status, message = outcome(run, code, t1, NO_PACE)
-        t, rows = self.t[: n_rows + 1].copy(), self.rows[: n_rows + 1].copy()
         if run.compared_to[0] < t1 or territory.is_due():
-            status, message = self._compared(t, rows, status, message)
-            if status != Status.REACHED_END:
+            if not self._compared(t, rows):
                 return None
             run.compared_to[0] = t1
+        status, message = outcome(run, code, t1, NO_PACE)  # last: it may warn, which the long way would do again
         sol = None
         if output.dense:
             table = Table(t, rows[:, : 3 * system.n_q].copy(), self.kinds[:n_steps].copy())
@@ -168,36 +163,56 @@ class Again:
             **of_run(run, t, rows),
             **told_later(self.steps[:n_steps], run.work.counters, spent),
             "status": status,
-            "message": message,
+            "message": message_of(run, message, run.system if movable is None else system),
             "compiled": bool(self.plan.own),
             "sol": sol,
         }
 
     def _steps_to(self, t1: float, with_kinds: bool) -> tuple[int, int, int]:
         """How the steps of one chunk end, with how many states, beside the first, and steps in the arrays."""
-        run, a, n_rows, n_steps = self.run, self.run.a, 0, 0
-        run.control[a.STORE_ALL], run.control[a.MAX_ATTEMPTS], self.end[0] = 1.0, run.chunk, t1
+        run, a, n_rows, n_steps, attempts = self.run, self.run.a, 0, 0, 0
+        plan, control, kit = run.plan, run.control, run.kit  # at the moment: not always the run's own
+        control[a.STORE_ALL], self.end[0] = 1.0, t1
         self.t[0], self.rows[0] = run.t0, run.state
         while True:
-            arrays = run.plan.options, run.plan.memory, run.tolerances, run.control, run.clock, run.state, run.new_state
+            run.control[a.MAX_ATTEMPTS] = run.chunk - attempts
+            arrays = plan.options, plan.memory, run.tolerances, control, run.clock, run.state, run.new_state
             room = self.t[n_rows + 1 :], self.rows[n_rows + 1 :], self.steps[n_steps:]
             try:
-                code = self._advance(run.kit, run.work, *arrays, self.end, *room, self.filled)
+                code = self._advance(kit, run.work, *arrays, self.end, *room, self.filled)
             except Exception:  # of a callback; the long way knows what to do
                 return INTERRUPTED, n_rows, n_steps
-            taken = slice(n_steps, n_steps + int(self.filled[1]))
+            n_taken, taken = int(self.filled[1]), slice(n_steps, n_steps + int(self.filled[1]))
+            across = plan is not run.plan
             if with_kinds:
-                self.kinds[taken] = kinds_of(run, self.steps[taken])
+                self.kinds[taken] = intervals.ACROSS if across else kinds_of(run, self.steps[taken])
             n_rows, n_steps = n_rows + int(self.filled[0]), taken.stop
-            if code != a.HAS_TO_GIVE_WAY:
+            if code == a.ALL_OUTPUT_DONE:
                 return code, n_rows, n_steps
-            give_way(run)
+            attempts = run.attempts()
+            if code == a.PAUSED and attempts >= run.chunk:
+                return code, n_rows, n_steps
+            if code == a.HAS_TO_GIVE_WAY:
+                give_way(run)
+                plan, control, kit = run.plan, run.control, run.kit
+            elif code == a.NEAR_SINGULAR:
+                plan, control = bridge(run)
+                kit = bridging_kit(run.kit)
+            elif across:
+                plan, control, code = beyond(run, plan, control, code, n_taken)
+                kit = kit if plan is not run.plan else run.kit
+                if code != a.PAUSED:
+                    return code, n_rows, n_steps
+            else:
+                return code, n_rows, n_steps
 
     def _is_ready(self, system: ConstrainedSystem, t0: float, t1: float, q0: Array, v0: Array, asked: Asked) -> bool:
         """Whether the run is at its start: one that is asked for again needs no second look."""
         run, call = self.run, (id(system), t0, t1, q0.tobytes(), v0.tobytes())  # of the last call the system is kept
         if run.substituted:
             run.plan, run.kit, run.functions, run.substituted = self.plan, self.kit, self.kit.functions, False
+            run.memory = self.memory
+        run.crossings = []
         if run.kit.flags[flags.FORM] != self.flags[flags.FORM]:
             run.kit.flags[:] = self.flags
         equal = call == self.call
@@ -219,19 +234,33 @@ class Again:
             self.saved = [(each, each.copy()) for each in (*self.beginning.lasting, run.state)]
         return True
 
-    def _compared(self, t: Array, rows: Array, status: Status, message: str) -> tuple[Status, str]:
-        """Status and message after callbacks were compared at states that lie where none was compared."""
+    def _is_to_be_trusted(self, t: Array, rows: Array, t1: float, output: Output) -> bool:
+        """Whether nothing speaks against a run that came to its end, by singular positions or not: see `Course`."""
+        run, places = self.run, list[Place]()
+        nearly = not run.plan.watchful or run.work.notes[noted.NEARLY_SINGULAR] == 1.0
+        if nearly and output.times is None and turned_last(t, rows, run.system.n_q):
+            places = [(float(t[-2]), rows[-2])]
+        landed = list[Place]()
+        if (output.at_ends or run.control[run.a.FIXED_STEP] > 0.0) and run.came_near():
+            landed = list(zip(t.tolist(), rows, strict=True))
+        if not (places or landed or run.crossings):
+            return True
+        return unless_turned(run, places, landed, t1, Status.REACHED_END, "")[0] == Status.REACHED_END
+
+    def _compared(self, t: Array, rows: Array) -> bool:
+        """Whether callbacks were right at states that lie where none was compared."""
         n, territory, everywhere = 2 * self.run.system.n_q, self.territory, False
         if self.movable is not None:
             everywhere = territory.is_due() or not territory.knows(self.movable.parameters)
         if not everywhere and territory.holds(t, rows):
-            return status, message
+            return True
         sample = Sample(float(t[0]), rows[0], n)
         sample.add(t[1:], rows[1:], float(t[-1]), rows[-1])
         states = sample.states()
         if not everywhere:  # a sample may lie in known places, and all runs that follow would be sampled in vain
             states = np.concatenate([farthest(t, rows[:, :n]), states])
-        compared = compared_at(self.run, territory, states, self.check_derivatives, status, message, everywhere)
-        if self.movable is not None and compared[0] == status:
+        run, status = self.run, Status.REACHED_END
+        right = compared_at(run, territory, states, self.check_derivatives, status, "", everywhere)[0] == status
+        if right and self.movable is not None:
             territory.add_parameters(self.movable.parameters)
-        return compared
+        return right

@@ -23,6 +23,7 @@ from twoloop.run.record import Later, Status
 from twoloop.run.undetermined import WEAK, turned_by_rounding
 
 if TYPE_CHECKING:
+    from twoloop.problem.system import ConstrainedSystem
     from twoloop.run.run import Run
 
 Array = NDArray[np.float64]
@@ -53,11 +54,14 @@ def _said_of_passages(run: "Run") -> str:
     return said + (CROSSINGS if run.crossings else "")
 
 
-def message_of(run: "Run", words: str) -> Any:
-    """The message of these words, or what makes it: to measure what was crossed takes longer than many a run."""
+def message_of(run: "Run", words: str, system: "ConstrainedSystem") -> Any:
+    """The message of these words, or what makes it: to measure what was crossed takes longer than many a run.
+
+    `system`: one that stays what it is, as the arrays of the run may not.
+    """
     if CROSSINGS not in words:
         return words
-    system, crossings, now, rank = run.system, run.crossings, (float(run.clock[run.a.T]), run.state), run.rank
+    crossings, now, rank = run.crossings, (float(run.clock[run.a.T]), run.state.copy()), run.rank
 
     def made() -> dict[str, str]:
         return {"message": words.replace(CROSSINGS, said_of_crossings(system, crossings, now, rank))}
