@@ -103,13 +103,16 @@ def test_a_call_for_the_end_or_for_a_dense_solution_takes_few_calls_of_functions
     assert calls(True) < few + AT_ENDS and calls(False, dense_output=True) < few + DENSE
 
 
-@pytest.mark.parametrize("make", [mechanisms.bricard, mechanisms.redundant_slider_crank, mechanisms.closed_chain])
+OFF_ROUNDING = ("bricard", "redundant_slider_crank", "closed_chain", "spatial_slider_crank", "spatial_four_bar")
+
+
+@pytest.mark.parametrize("name", OFF_ROUNDING)
 @pytest.mark.filterwarnings("ignore::twoloop.ConstraintWarning")
-def test_what_starts_have_shown_lets_no_other_start_pass(make):
+def test_what_starts_have_shown_lets_no_other_start_pass(name):
     """The size of coordinates that a start has shown spares the next a closer look, which would say the same."""
-    problem = make(4) if make is mechanisms.closed_chain else make()
-    known = problem.system
-    motion = solve_dae(known, (0.0, 0.2), problem.q0, problem.v0, t_eval=np.linspace(0.0, 0.2, 4))
+    problem = mechanisms.closed_chain(4) if name == "closed_chain" else getattr(mechanisms, name)()
+    known, times = problem.system, [0.0, 1e-6, 0.1, 0.2]  # near some starts rows are short by their position
+    motion = solve_dae(known, (0.0, 0.2), problem.q0, problem.v0, t_eval=times)
     for k in range(4):
         check_start(known, motion.t[k], motion.q[:, k], motion.v[:, k])
     generic, refused = np.random.default_rng(5), []
