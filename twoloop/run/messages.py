@@ -105,13 +105,17 @@ def said_of_rounding(run: "Run", places: list[Place], end: float) -> str:
     return ""
 
 
+def said_of_reached(run: "Run") -> str:
+    """The first sentence of a run that came to its end."""
+    fixed = ", with a constant step: no error was estimated" if run.control[run.a.FIXED_STEP] > 0.0 else ""
+    return f"Reached the end, t = {run.clock[run.a.T]:g}{fixed}."
+
+
 def outcome(run: "Run", code: int, t1: float, pace: Pace) -> tuple[Status, str]:
     """Status and message for how the run ended."""
     a, t = run.a, float(run.clock[run.a.T])
     if code == a.ALL_OUTPUT_DONE:
-        fixed = ", with a constant step: no error was estimated" if run.control[a.FIXED_STEP] > 0.0 else ""
-        said = _said_of_passages(run) + said_of_end(run)
-        return Status.REACHED_END, f"Reached the end, t = {t:g}{fixed}.{said}"
+        return Status.REACHED_END, said_of_reached(run) + _said_of_passages(run) + said_of_end(run)
     stopped = f"Stopped at t = {t:.10g}"
     failure = int(run.clock[a.FAILURE_CODE])
     if code == INTERRUPTED:
