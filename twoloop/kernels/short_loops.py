@@ -88,14 +88,15 @@ def tell_steps(steps, counts, h, changes, untested):
 
 REFUSED, IN_DOUBT, READY = range(3)  # another way has to be gone; a closer look has to be taken; at the start
 
-# arrays of looks at starts, of choices and of a run; each `begin_...` is what the one after it is full of at a start
+# arrays of looks at starts, of choices and of a run; `begin_numbers` is what `numbers` is full of at a start, and
+# `begin_memory` what stands in `memory` at `places`: of the rest, nearly all, to clear it takes less than to copy it
 BEGINNING = Reference(
     "Beginning",
     {
         **dict.fromkeys(("looked", "lam", "room", "least", "bounds", "scratch", "constants"), VECTOR),
         **dict.fromkeys(("begin_numbers", "numbers", "begin_memory", "memory", "clock", "state", "lasting"), VECTOR),
         **dict.fromkeys(("mass", "rows", "ways", "pattern"), MATRIX),
-        **dict.fromkeys(("chosen", "expected", "lapack", "lasting_integers"), INTEGERS),
+        **dict.fromkeys(("chosen", "expected", "lapack", "lasting_integers", "places"), INTEGERS),
     },
 )
 BEGINNING.add_function("look", i8(KIT, f8, *(VECTOR,) * 5, *(MATRIX,) * 4, VECTOR))
@@ -164,7 +165,10 @@ def begin(f, given, w, b, t, q, v, sizes, weak, definite, sure):
     if b.expected.size > 0 and not _is_expected(b, weak):
         return REFUSED
     _copy(b.begin_numbers, b.numbers)
-    _copy(b.begin_memory, b.memory)
+    for k in range(b.memory.size):
+        b.memory[k] = 0.0
+    for k in range(b.places.size):
+        b.memory[b.places[k]] = b.begin_memory[k]
     for j in range(b.state.size):
         b.state[j] = q[j] if j < n else v[j - n] if j < 2 * n else 0.0
     b.clock[at.T] = b.clock[at.T_START] = t

@@ -55,11 +55,13 @@ class Beginning:
         memory, (of_work, integers) = run.plan.memory, lasting(run.work)
         self.lasting = numbers, memory, of_work, integers
         expected, scale = _expected(None if code is None else code.shared.equations.choice)
+        places = np.flatnonzero(memory.view(np.int64))  # -0 is not what is cleared
         nearly = 0.0 if run.plan.watchful else 1.0
         banded = run.kit.flags[BANDWIDTH] >= 0
         self._known = known = SimpleNamespace(
             **self.look.arrays,
-            **{"numbers": numbers, "begin_numbers": numbers.copy(), "memory": memory, "begin_memory": memory.copy()},
+            **{"numbers": numbers, "begin_numbers": numbers.copy()},
+            **{"memory": memory, "places": places, "begin_memory": memory[places]},
             **{"clock": run.clock, "state": run.state, "lasting": of_work, "lasting_integers": integers},
             constants=np.array([max(run.rtol, GAMMA_ACCURACY), run.reuse, nearly, RANK, scale, CONTRADICTS]),
             lapack=np.array(addresses() if banded else [], dtype=np.int64),
