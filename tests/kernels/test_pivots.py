@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from twoloop.checks.rank import least_solution, orthogonalised
+from twoloop.checks.rank import least_solution, orthogonalised, surely_above
 from twoloop.checks.scales import column_scales
 from twoloop.generate.choices import BOUNDS, LEAST, RANK, SINGULAR_MASS
 from twoloop.kernels.algebra.pivots import STAYS_SINGULAR, choose, room_size
@@ -29,6 +29,18 @@ def test_the_least_solution_is_that_of_the_pseudo_inverse(rows):
     expected = np.linalg.pinv(rows, rcond=1e-10) @ values
     size = np.abs(expected).max(initial=1.0)
     assert np.allclose(x, expected, atol=1e-9 * size) and np.allclose(left, values - rows @ expected, atol=1e-9 * size)
+
+
+@pytest.mark.parametrize("size", [1e-6, 1.0, 1e8])
+@pytest.mark.parametrize("rows", [ROWS, DEPENDENT, ROWS * 10.0 ** np.arange(-4, 1)[:, None], 0.0 * ROWS], ids=str)
+def test_what_is_surely_above_a_share_of_the_largest_singular_value_is(rows, size):
+    values, rank = np.linalg.svd(rows, compute_uv=False), np.linalg.matrix_rank(rows)
+    ratio = values[rank - 1] / np.linalg.norm(rows) if rank else 0.0
+    for share in np.geomspace(1e-6, 1.0, 40):
+        surely = surely_above(share, size * rows, rank)
+        assert not (surely and share > ratio * (1.0 + 1e-9))
+        assert surely or rank < len(rows) or share > ratio * (1.0 - 1e-3)
+    assert not surely_above(1e-6, np.full((2, 3), np.nan), 2)
 
 
 @pytest.mark.parametrize(("near", "known"), [(1e-14, True), (1e-11, False), (1e-9, False), (1e-7, True)])

@@ -65,6 +65,7 @@ def check_start(
         full = system.jacobian(t0, q0)
         scales = scales_of(system, t0, q0, full)
         Violation.of_position(system, t0, q0, full, scales).refuse("q0")
+        scales.keep(system, full)
     if derivatives:
         check_derivatives(system, t0, q0, exact)
     empty = np.flatnonzero(largest_in_rows(rows) == 0.0).tolist()

@@ -53,8 +53,10 @@ def least_solution(rows: Array, values: Array) -> tuple[Array, Array] | None:
 
 def surely_above(ratio: float, rows: Array, rank: int) -> bool:
     """Whether so many singular values are above this share of the largest, by bounds that cost less than these."""
-    from twoloop.kernels.algebra.independent import size_of_inverse
+    from twoloop.kernels.algebra.independent import above, size_of_inverse
 
+    if rank == len(rows) > 0 and direct(above)(np.ascontiguousarray(rows), ratio, np.empty((rank, rank))):
+        return True
     _, factors, kept = orthogonalised(rows, NO_DIRECTION)
     if len(kept) != rank or rank == 0:
         return False

@@ -46,6 +46,13 @@ class Scales:
         values = np.where(jacobian != 0.0, per_row[:, None], np.inf).min(axis=0, initial=np.inf)
         return self.columns * np.where(np.isfinite(values), values, per_row.min(initial=np.inf))
 
+    def keep(self, system: ConstrainedSystem, jacobian: Array) -> None:
+        """Note, of a consistent position, how far coordinates move until they matter: beside it, rounding is nothing.
+
+        The look at the next start goes by it, and need not find these scales once more.
+        """
+        system.made["sizes"] = self.by_coordinate(self.reach, jacobian)
+
 
 def sizes(q: Array) -> Array:
     """A first guess at how far each coordinate must move to matter."""

@@ -52,8 +52,8 @@ def surely_consistent(
         rows = rows[: system.n_c]
         scales = scales_of(system, t, q, rows)
     consistent = _surely_small(rows, C, scales, scales.reach)
-    if consistent:  # how far coordinates move until they matter, at the next start as well, beside what rounding is
-        system.made["sizes"] = scales.by_coordinate(scales.reach, rows)
+    if consistent:
+        scales.keep(system, rows)
     return consistent
 
 

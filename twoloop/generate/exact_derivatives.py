@@ -12,8 +12,6 @@ from twoloop.generate.families import Family, of_family
 from twoloop.generate.traced_equations import OF_ROWS
 from twoloop.generate.traced_values import Check, Traced, unchecked
 from twoloop.generate.tracing import Untraceable
-from twoloop.kernels.compile.linking import direct
-from twoloop.kernels.layout import short_loops
 from twoloop.problem.system import ConstrainedSystem
 
 Array = NDArray[np.float64]
@@ -86,13 +84,19 @@ def farthest(t: Array, rows: Array) -> Array:
 
 
 class Territory:
-    """Where the states of runs were, at which callbacks were compared: a box of [t, q, v], and one of parameters."""
+    """Where the states of runs were, at which callbacks were compared: a box of [t, q, v], and one of parameters.
+
+    Attributes
+    ----------
+    known : ndarray (2, 1 + 2 n_q) or (2, 0)
+        The least and the largest of each number of states that are in no new place.
+    """
 
     def __init__(self) -> None:
         self._runs = 0
         self._parameters: tuple[Array, Array] | None = None  # the least and the largest, of runs of many systems
-        self._box = np.zeros((2, 0))  # the least and the largest of each number, and the same of what is no new place
-        self._known = self._box
+        self._box = np.zeros((2, 0))  # the least and the largest of each number
+        self.known = self._box
 
     def is_due(self) -> bool:
         """Whether callbacks are to be compared wherever the next run goes: the 1st, 2nd, 4th, 8th, ..."""
@@ -102,15 +106,11 @@ class Territory:
         """One more run was made."""
         self._runs += 1
 
-    def holds(self, t: Array, rows: Array) -> bool:
-        """Whether all states of a run, rows that begin with [q, v], lie where others were compared."""
-        return self._box.size > 0 and direct(short_loops().lies_within)(t, rows, self._known)
-
     def without_known(self, states: Array) -> Array:
         """Those of the states, rows, of a run that lie in no place, or next to none, where one was compared."""
         if not self._box.size:
             return states
-        least, largest = self._known
+        least, largest = self.known
         new = (states < least) | (states > largest)
         return states[new.any(axis=1)] if new.any() else states[:0]
 
@@ -134,4 +134,4 @@ class Territory:
         known = np.concatenate([states, self._box]) if self._box.size else states
         least, largest = self._box = np.array([known.min(axis=0), known.max(axis=0)])
         beside = BESIDE * (largest - least) + ROUNDED * float((largest - least)[1:].max())
-        self._known = np.array([least - beside, largest + beside])
+        self.known = np.array([least - beside, largest + beside])

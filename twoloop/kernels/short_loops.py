@@ -8,6 +8,7 @@ from twoloop.kernels.compile.reference import Reference
 from twoloop.kernels.control import clock as at
 from twoloop.kernels.data import codes, noted
 from twoloop.kernels.data.common import INTEGERS, KIT, MATRIX, VECTOR, WORK, f8, i8, kernel, merged
+from twoloop.kernels.data.counters import N_ACCEPTED
 from twoloop.kernels.evaluation.first_look import CONSISTENT, DEFINITE, IN_ORDER, INDEFINITE
 
 ROUNDING = 1e-15  # of the largest coordinate: corrections of this size are rounding
@@ -60,8 +61,8 @@ def first_step(state, n, least, span, share):
     return share * scale
 
 
-@kernel(types.boolean(VECTOR, MATRIX, MATRIX))
-def lies_within(t, rows, box):
+@merged
+def _lie_within(t, rows, box):
     """Whether all times, and rows as far as the box has numbers, lie between its rows [t, q, v]."""
     for k in range(t.size):
         if not box[0, 0] <= t[k] <= box[1, 0]:
@@ -87,20 +88,21 @@ def tell_steps(steps, counts, h, changes, untested):
 
 REFUSED, IN_DOUBT, READY = range(3)  # another way has to be gone; a closer look has to be taken; at the start
 
-# arrays of looks at starts, of choices and of a run; each `begin_...` is what the one after it is full of at a start
+# arrays of looks at starts, of choices and of a run; `begin_numbers` is what `numbers` is full of at a start, and
+# `begin_memory` what stands in `memory` at `places`: of the rest, nearly all, to clear it takes less than to copy it
 BEGINNING = Reference(
     "Beginning",
     {
         **dict.fromkeys(("looked", "lam", "room", "least", "bounds", "scratch", "constants"), VECTOR),
         **dict.fromkeys(("begin_numbers", "numbers", "begin_memory", "memory", "clock", "state", "lasting"), VECTOR),
         **dict.fromkeys(("mass", "rows", "ways", "pattern"), MATRIX),
-        **dict.fromkeys(("chosen", "expected", "lapack", "lasting_integers"), INTEGERS),
+        **dict.fromkeys(("chosen", "expected", "lapack", "lasting_integers", "places"), INTEGERS),
     },
 )
 BEGINNING.add_function("look", i8(KIT, f8, *(VECTOR,) * 5, *(MATRIX,) * 4, VECTOR))
 BEGINNING.add_function("choose", i8(MATRIX, MATRIX, f8, f8, VECTOR, VECTOR, INTEGERS))
 BEGINNING.add_function("start", i8(KIT, WORK, f8, VECTOR))
-ACCURACY, REUSE, NEARLY_SINGULAR, RANK, SCALE = range(5)  # in `constants`
+ACCURACY, REUSE, NEARLY_SINGULAR, RANK, SCALE, CONTRADICTS = range(6)  # in `constants`
 PLACE, N_KEPT, N_ADDED, KEPT = range(4)  # in `expected`, which is empty without code; those that help follow those kept
 
 
@@ -130,6 +132,21 @@ def _copy(one, other):
         other[k] = one[k]
 
 
+@merged
+def _agree(w, b, n):
+    """Whether the accelerations agree with all rows where some, which depend on others, were left out."""
+    if w.rows_v.size == len(b.rows):
+        return True
+    for i in range(len(b.rows)):
+        off, size = -w.Gamma[i], abs(w.Gamma[i])
+        for j in range(n):
+            off += b.rows[i, j] * b.state[2 * n + j]
+            size += abs(b.rows[i, j] * b.state[2 * n + j])
+        if not abs(off) <= b.constants[CONTRADICTS] * max(size, 1.0):
+            return False
+    return True
+
+
 @kernel(i8(KIT, KIT, WORK, BEGINNING, f8, VECTOR, VECTOR, VECTOR, f8, i8, types.boolean))
 def begin(f, given, w, b, t, q, v, sizes, weak, definite, sure):
     """Whether a run begins at a state, with the same choices as the run before it; then it is at its start there.
@@ -148,11 +165,72 @@ def begin(f, given, w, b, t, q, v, sizes, weak, definite, sure):
     if b.expected.size > 0 and not _is_expected(b, weak):
         return REFUSED
     _copy(b.begin_numbers, b.numbers)
-    _copy(b.begin_memory, b.memory)
+    for k in range(b.memory.size):
+        b.memory[k] = 0.0
+    for k in range(b.places.size):
+        b.memory[b.places[k]] = b.begin_memory[k]
     for j in range(b.state.size):
         b.state[j] = q[j] if j < n else v[j - n] if j < 2 * n else 0.0
     b.clock[at.T] = b.clock[at.T_START] = t
     put_ready(w, b.lasting, b.lasting_integers, b.pattern, q, b.constants[ACCURACY], b.constants[REUSE])
     _copy(b.lapack, w.lapack[: b.lapack.size])
     w.notes[noted.NEARLY_SINGULAR] = b.constants[NEARLY_SINGULAR]
-    return READY if b.start(f, w, t, b.state) == codes.DONE else REFUSED
+    return READY if b.start(f, w, t, b.state) == codes.DONE and _agree(w, b, n) else REFUSED
+
+
+# of a run that is made again and again: what `advance` takes, room for its states and steps, and what is told of it
+GOING = Reference(
+    "Going",
+    {
+        **dict.fromkeys(("options", "memory", "tolerances", "control", "clock", "state", "new_state"), VECTOR),
+        **dict.fromkeys(("end", "t", "told"), VECTOR),
+        **dict.fromkeys(("rows", "steps"), MATRIX),
+        "filled": INTEGERS,
+    },
+)
+GOING.add_function("advance", i8(KIT, WORK, *(VECTOR,) * 9, MATRIX, MATRIX, INTEGERS))
+# in `told`: numbers of states, the first included, and of steps; as numbers, whether velocities turned in the last step
+# and all states lie in a box; and what stands in the workspace and the clock
+N_STATES, N_STEPS, TURNED, WITHIN, NEARLY, PIVOT, CHECKED, DEFECT, GAP, N_TOLD = range(10)
+
+
+@merged
+def _turned(b, k, n, turned):
+    """Whether the velocities of the last two states differ by more than one of their accelerations gives."""
+    change, first, last = 0.0, 0.0, 0.0
+    for j in range(n):
+        change = max(change, abs(b.rows[k, n + j] - b.rows[k - 1, n + j]))
+        first, last = max(first, abs(b.rows[k - 1, 2 * n + j])), max(last, abs(b.rows[k, 2 * n + j]))
+    return change > turned * (b.t[k] - b.t[k - 1]) * min(first, last)
+
+
+@merged
+def _tell(w, b, n_rows, n_steps, turned, box):
+    """Put down what `told` has, after so many rows behind the first, and steps."""
+    b.told[N_STATES], b.told[N_STEPS] = 1 + n_rows, n_steps
+    b.told[TURNED] = n_rows > 0 and _turned(b, n_rows, w.Q.size, turned)
+    b.told[WITHIN] = box.shape[1] > 0 and _lie_within(b.t[: 1 + n_rows], b.rows, box)
+    b.told[NEARLY], b.told[PIVOT] = w.notes[noted.NEARLY_SINGULAR], b.clock[at.PIVOT_AT_OUTPUT]
+    b.told[CHECKED] = w.counters[N_ACCEPTED] > 0 and w.notes[noted.UNCHECKED] == 0.0
+    b.told[DEFECT], b.told[GAP] = w.notes[noted.LARGEST_DEFECT], w.notes[noted.WIDEST_GAP]
+
+
+@kernel(types.void(WORK, GOING, i8, i8, f8, MATRIX))
+def tell(w, b, n_rows, n_steps, turned, box):
+    """The same, for Python."""
+    _tell(w, b, n_rows, n_steps, turned, box)
+
+
+@kernel(i8(KIT, WORK, GOING, f8, f8, MATRIX))
+def go(f, w, b, t1, turned, box):
+    """The steps of a run from its start to t1, as many as there is room for; how `advance` ended, and `told`.
+
+    `turned` is how many times what accelerations give is too much; `box` has rows [t, q, v], or nothing.
+    """
+    b.end[0], b.t[0] = t1, b.clock[at.T]
+    b.control[at.STORE_ALL], b.control[at.MAX_ATTEMPTS] = 1.0, len(b.steps)
+    _copy(b.state, b.rows[0])
+    arrays = b.tolerances, b.control, b.clock, b.state, b.new_state
+    code = b.advance(f, w, b.options, b.memory, *arrays, b.end, b.t[1:], b.rows[1:], b.steps, b.filled)
+    _tell(w, b, b.filled[0], b.filled[1], turned, box)
+    return code

@@ -6,6 +6,7 @@ does, or a start is not beyond doubt, nothing comes of it, and the call goes the
 
 import time
 from dataclasses import MISSING, fields
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,20 +16,21 @@ from twoloop.generate.exact_derivatives import farthest
 from twoloop.generate.straight_code import OwnCode
 from twoloop.generate.traced_values import Sample
 from twoloop.kernels.compile.linking import direct
-from twoloop.kernels.data import flags, noted
+from twoloop.kernels.data import flags, intervals
+from twoloop.kernels.layout import short_loops
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.asked import Asked
 from twoloop.run.beginning import Beginning
 from twoloop.run.between import Between, interpolator_of
 from twoloop.run.comparison import compared_at, territory_of
-from twoloop.run.crossings import turned_last
+from twoloop.run.crossings import TURNED, Place
 from twoloop.run.dense import Table
 from twoloop.run.dense_solution import DenseSolution
-from twoloop.run.fields import kinds_of, of_run, told_later
-from twoloop.run.messages import outcome
+from twoloop.run.fields import kinds_of, of_states, told_later
+from twoloop.run.messages import message_of, outcome, said_of_reached, unless_turned
 from twoloop.run.movable import Kin, Movable
 from twoloop.run.pace import INTERRUPTED, Pace
-from twoloop.run.passage import give_way
+from twoloop.run.passage import beyond, bridge, bridging_kit, give_way
 from twoloop.run.record import Record, Status
 from twoloop.run.run import Run
 
@@ -86,14 +88,29 @@ class Again:
         self.territory = territory_of(run, check_derivatives) if kin is None else kin.territory(check_derivatives)
         self.beginning = Beginning(run, system if self.movable is None else self.movable.system, code, definite)
         self.look, self.rest, self._advance = self.beginning.look, 0, direct(run.kernels.advance)
-        self.plan, self.kit, self.flags = run.plan, run.kit, run.kit.flags.copy()
+        self.plan, self.kit, self.flags, self.memory = run.plan, run.kit, run.kit.flags.copy(), run.memory
         self.t, self.rows = np.empty(run.chunk + 1), np.empty((run.chunk + 1, len(run.state)))
         self.steps = np.empty((run.chunk, run.a.N_STEP_COLUMNS))
         self.kinds, self.between = np.empty(run.chunk, dtype=np.int64), Between(run)
-        self.end, self.filled = np.zeros(1), np.zeros(2, dtype=np.int64)
+        loops = short_loops()
+        self._go, self._tell, self.going = direct(loops.go), direct(loops.tell), self._going(loops)
+        self.dependent: dict[bytes, tuple[NDArray[np.int64], str]] = {}  # by the rows that count
         self.call: tuple[int, float, float, bytes, bytes] | None = None  # the last one
         # arrays with copies made at its start, where the one before was equal
         self.saved: list[tuple[NDArray[Any], NDArray[Any]]] = []
+
+    def _going(self, loops: Any) -> SimpleNamespace:
+        """The arrays that `go` of kernels/short_loops.py reads and writes."""
+        run = self.run
+        going = SimpleNamespace(
+            **{"options": run.plan.options, "memory": run.plan.memory, "tolerances": run.tolerances},
+            **{"control": run.control, "clock": run.clock, "state": run.state, "new_state": run.new_state},
+            **{"end": np.zeros(1), "t": self.t, "told": np.zeros(loops.N_TOLD), "rows": self.rows, "steps": self.steps},
+            **{"filled": np.zeros(2, dtype=np.int64), "advance": run.kernels.advance},
+        )
+        going.table = loops.GOING.table(going)
+        going.address = going.table.ctypes.data
+        return going
 
     @staticmethod
     def suits(run: Run) -> bool:
@@ -131,25 +148,27 @@ class Again:
         if not self._is_ready(system, t0, t1, q0, v0, asked):
             return None
         began = time.process_time()
-        code, n_rows, n_steps = self._steps_to(t1, between is not None or output.dense)
+        code = self._steps_to(t1, between is not None or output.dense)
+        n_states, n_steps, turned, within, nearly, pivot, checked, defect, gap = self.going.told.tolist()
+        n_states, n_steps = int(n_states), int(n_steps)
         if between is not None and code == a.ALL_OUTPUT_DONE:
-            parts = self.t[: n_rows + 1], self.rows[: n_rows + 1], self.kinds[:n_rows]
+            parts = self.t[:n_states], self.rows[:n_states], self.kinds[:n_steps]
             self.between.find(between, *parts, self.look.pattern)
         spent = time.process_time() - began
-        singular = run.plan.watchful and run.work.notes[noted.NEARLY_SINGULAR] == 1.0
-        turned = False
-        if output.times is None and not run.plan.watchful:
-            turned = turned_last(self.t[: n_rows + 1], self.rows[: n_rows + 1], system.n_q)
-        if code != a.ALL_OUTPUT_DONE or singular or turned:
+        t, rows = self.t[:n_states].copy(), self.rows[:n_states].copy()
+        turns = turned and output.times is None and (nearly == 1.0 or not run.plan.watchful)
+        special = turns or run.crossings or pivot < run.near
+        if code != a.ALL_OUTPUT_DONE or (special and not self._is_to_be_trusted(t, rows, t1, output, turns)):
             self.rest = IN_VAIN
             return None
-        status, message = outcome(run, code, t1, NO_PACE)
-        t, rows = self.t[: n_rows + 1].copy(), self.rows[: n_rows + 1].copy()
         if run.compared_to[0] < t1 or territory.is_due():
-            status, message = self._compared(t, rows, status, message)
-            if status != Status.REACHED_END:
+            if not (within and movable is None) and not self._compared(t, rows, bool(within)):
                 return None
             run.compared_to[0] = t1
+        if special:  # after all that may send it the long way: it may warn
+            message = message_of(run, outcome(run, code, t1, NO_PACE)[1], run.system if movable is None else system)
+        else:
+            message = said_of_reached(run)
         sol = None
         if output.dense:
             table = Table(t, rows[:, : 3 * system.n_q].copy(), self.kinds[:n_steps].copy())
@@ -165,39 +184,70 @@ class Again:
         territory.count()  # a run that goes the long way is counted there
         return {
             **DEFAULTS,
-            **of_run(run, t, rows),
+            **of_states(system.n_q, t, rows),
             **told_later(self.steps[:n_steps], run.work.counters, spent),
-            "status": status,
+            "rank": run.rank,
+            "redundant": run.redundant.copy(),
+            "defect": defect if checked else None,
+            "widest_gap": gap,
+            "status": Status.REACHED_END,
             "message": message,
             "compiled": bool(self.plan.own),
             "sol": sol,
         }
 
-    def _steps_to(self, t1: float, with_kinds: bool) -> tuple[int, int, int]:
-        """How the steps of one chunk end, with how many states, beside the first, and steps in the arrays."""
-        run, a, n_rows, n_steps = self.run, self.run.a, 0, 0
-        run.control[a.STORE_ALL], run.control[a.MAX_ATTEMPTS], self.end[0] = 1.0, run.chunk, t1
-        self.t[0], self.rows[0] = run.t0, run.state
-        while True:
-            arrays = run.plan.options, run.plan.memory, run.tolerances, run.control, run.clock, run.state, run.new_state
-            room = self.t[n_rows + 1 :], self.rows[n_rows + 1 :], self.steps[n_steps:]
-            try:
-                code = self._advance(run.kit, run.work, *arrays, self.end, *room, self.filled)
-            except Exception:  # of a callback; the long way knows what to do
-                return INTERRUPTED, n_rows, n_steps
-            taken = slice(n_steps, n_steps + int(self.filled[1]))
+    def _steps_to(self, t1: float, with_kinds: bool) -> int:
+        """How the steps of one chunk end; what is told of them stands in `going`."""
+        run, going, a = self.run, self.going, self.run.a
+        try:
+            code: int = self._go(run.kit, run.work, going, t1, TURNED, self.territory.known)
+            n_rows, n_steps = going.filled.tolist()
             if with_kinds:
-                self.kinds[taken] = kinds_of(run, self.steps[taken])
-            n_rows, n_steps = n_rows + int(self.filled[0]), taken.stop
-            if code != a.HAS_TO_GIVE_WAY:
+                self.kinds[:n_steps] = kinds_of(run, self.steps[:n_steps])
+            if code in (a.HAS_TO_GIVE_WAY, a.NEAR_SINGULAR):
+                code, n_rows, n_steps = self._steps_beyond(code, n_rows, n_steps)
+                self._tell(run.work, going, n_rows, n_steps, TURNED, self.territory.known)
+        except Exception:  # of a callback; the long way knows what to do
+            return INTERRUPTED
+        return code
+
+    def _steps_beyond(self, code: int, n_rows: int, n_steps: int) -> tuple[int, int, int]:
+        """How they end, with how many states, beside the first, and steps, where the run's own could not go on."""
+        run, going, a = self.run, self.going, self.run.a
+        plan, control, kit = run.plan, run.control, run.kit  # at the moment: not always the run's own
+        while True:
+            across, taken = plan is not run.plan, int(going.filled[1])
+            if code == a.HAS_TO_GIVE_WAY:
+                give_way(run)
+                plan, control, kit = run.plan, run.control, run.kit
+            elif code == a.NEAR_SINGULAR:
+                plan, control = bridge(run)
+                kit = bridging_kit(run.kit)
+            elif across:
+                plan, control, code = beyond(run, plan, control, code, taken)
+                kit = kit if plan is not run.plan else run.kit
+                if code != a.PAUSED:
+                    return code, n_rows, n_steps
+            else:
                 return code, n_rows, n_steps
-            give_way(run)
+            run.control[a.MAX_ATTEMPTS] = run.chunk - run.attempts()
+            arrays = plan.options, plan.memory, run.tolerances, control, run.clock, run.state, run.new_state
+            room = self.t[n_rows + 1 :], self.rows[n_rows + 1 :], self.steps[n_steps:]
+            code = self._advance(kit, run.work, *arrays, going.end, *room, going.filled)
+            before, (more, steps) = n_steps, going.filled.tolist()
+            n_rows, n_steps = n_rows + more, n_steps + steps
+            across = plan is not run.plan
+            self.kinds[before:n_steps] = intervals.ACROSS if across else kinds_of(run, self.steps[before:n_steps])
+            if code == a.ALL_OUTPUT_DONE or (code == a.PAUSED and run.attempts() >= run.chunk):
+                return code, n_rows, n_steps
 
     def _is_ready(self, system: ConstrainedSystem, t0: float, t1: float, q0: Array, v0: Array, asked: Asked) -> bool:
         """Whether the run is at its start: one that is asked for again needs no second look."""
         run, call = self.run, (id(system), t0, t1, q0.tobytes(), v0.tobytes())  # of the last call the system is kept
         if run.substituted:
             run.plan, run.kit, run.functions, run.substituted = self.plan, self.kit, self.kit.functions, False
+            run.memory = self.memory
+        run.crossings = []
         if run.kit.flags[flags.FORM] != self.flags[flags.FORM]:
             run.kit.flags[:] = self.flags
         equal = call == self.call
@@ -210,7 +260,10 @@ class Again:
             return False
         run.t0, run.compared_to[0] = t0, -np.inf
         if run.said_of_rows:  # rounding may decide which row is left out
-            run.redundant, run.said_of_rows = run.redundant_rows(self.look.rows)
+            counted = run.work.rows_v.tobytes()
+            if counted not in self.dependent:
+                self.dependent[counted] = run.redundant_rows(self.look.rows)
+            run.redundant, run.said_of_rows = self.dependent[counted]
         if self.movable is not None and not self.movable.agrees(t1, self.look.mass, self.check_derivatives):
             return False
         asked.set_sizes(run, t1)
@@ -219,19 +272,28 @@ class Again:
             self.saved = [(each, each.copy()) for each in (*self.beginning.lasting, run.state)]
         return True
 
-    def _compared(self, t: Array, rows: Array, status: Status, message: str) -> tuple[Status, str]:
-        """Status and message after callbacks were compared at states that lie where none was compared."""
+    def _is_to_be_trusted(self, t: Array, rows: Array, t1: float, output: Output, turns: bool) -> bool:
+        """Whether nothing speaks against a run that ended near singular positions or crossed some, as in `Course`."""
+        run, landed = self.run, list[Place]()
+        if (output.at_ends or run.control[run.a.FIXED_STEP] > 0.0) and run.came_near():
+            landed = list(zip(t.tolist(), rows, strict=True))
+        last = [(float(t[-2]), rows[-2])] if turns else []
+        return unless_turned(run, last, landed, t1, Status.REACHED_END, "")[0] == Status.REACHED_END
+
+    def _compared(self, t: Array, rows: Array, within: bool) -> bool:
+        """Whether callbacks were right at states that lie where none was compared; `within`: these lie elsewhere."""
         n, territory, everywhere = 2 * self.run.system.n_q, self.territory, False
         if self.movable is not None:
             everywhere = territory.is_due() or not territory.knows(self.movable.parameters)
-        if not everywhere and territory.holds(t, rows):
-            return status, message
+        if not everywhere and within:
+            return True
         sample = Sample(float(t[0]), rows[0], n)
         sample.add(t[1:], rows[1:], float(t[-1]), rows[-1])
         states = sample.states()
         if not everywhere:  # a sample may lie in known places, and all runs that follow would be sampled in vain
             states = np.concatenate([farthest(t, rows[:, :n]), states])
-        compared = compared_at(self.run, territory, states, self.check_derivatives, status, message, everywhere)
-        if self.movable is not None and compared[0] == status:
+        run, status = self.run, Status.REACHED_END
+        right = compared_at(run, territory, states, self.check_derivatives, status, "", everywhere)[0] == status
+        if right and self.movable is not None:
             territory.add_parameters(self.movable.parameters)
-        return compared
+        return right

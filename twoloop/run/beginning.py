@@ -13,7 +13,7 @@ from twoloop.kernels.compile.linking import direct
 from twoloop.kernels.data.flags import BANDWIDTH
 from twoloop.kernels.layout import lasting, short_loops
 from twoloop.problem.system import ConstrainedSystem
-from twoloop.run.run import Run
+from twoloop.run.run import CONTRADICTS, Run
 from twoloop.run.workspace import GAMMA_ACCURACY
 
 Array = NDArray[np.float64]
@@ -55,13 +55,15 @@ class Beginning:
         memory, (of_work, integers) = run.plan.memory, lasting(run.work)
         self.lasting = numbers, memory, of_work, integers
         expected, scale = _expected(None if code is None else code.shared.equations.choice)
+        places = np.flatnonzero(memory.view(np.int64))  # -0 is not what is cleared
         nearly = 0.0 if run.plan.watchful else 1.0
         banded = run.kit.flags[BANDWIDTH] >= 0
         self._known = known = SimpleNamespace(
             **self.look.arrays,
-            **{"numbers": numbers, "begin_numbers": numbers.copy(), "memory": memory, "begin_memory": memory.copy()},
+            **{"numbers": numbers, "begin_numbers": numbers.copy()},
+            **{"memory": memory, "places": places, "begin_memory": memory[places]},
             **{"clock": run.clock, "state": run.state, "lasting": of_work, "lasting_integers": integers},
-            constants=np.array([max(run.rtol, GAMMA_ACCURACY), run.reuse, nearly, RANK, scale]),
+            constants=np.array([max(run.rtol, GAMMA_ACCURACY), run.reuse, nearly, RANK, scale, CONTRADICTS]),
             lapack=np.array(addresses() if banded else [], dtype=np.int64),
             **{"bounds": BOUNDS, "scratch": np.zeros(pivots.room_size(n_rows, system.n_q)), "expected": expected},
             chosen=np.zeros(2 + 3 * n_rows, dtype=np.int64),

@@ -254,7 +254,7 @@ class Course:
         return Record(
             **fields,
             status=status,
-            message=message_of(run, message + explained(status)),
+            message=message_of(run, message + explained(status), run.system),
             stats=stats,
             sol=recorder.solution(),
             t_events=t_events,

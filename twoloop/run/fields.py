@@ -45,17 +45,24 @@ def statistics(counted: Integers, cpu: float) -> Statistics:
 
 def of_run(run: Run, t: Array, table: Array) -> dict[str, Any]:
     """The trajectory, of rows [q, v, a, lam], and what is known of the run as a whole."""
-    n, columns = run.system.n_q, table.T
+    return {
+        **of_states(run.system.n_q, t, table),
+        "rank": run.rank,
+        "redundant": run.redundant.copy(),  # runs of one start share it
+        "defect": run.defect(),
+        "widest_gap": float(run.work.notes[noted.WIDEST_GAP]),
+    }
+
+
+def of_states(n: int, t: Array, table: Array) -> dict[str, Array]:
+    """The trajectory alone, of n coordinates."""
+    columns = table.T
     return {
         "t": t,
         "q": columns[:n],
         "v": columns[n : 2 * n],
         "a": columns[2 * n : 3 * n],
         "lam": columns[3 * n :],
-        "rank": run.rank,
-        "redundant": run.redundant.copy(),  # runs of one start share it
-        "defect": run.defect(),
-        "widest_gap": float(run.work.notes[noted.WIDEST_GAP]),
     }
 
 

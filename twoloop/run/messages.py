@@ -23,6 +23,7 @@ from twoloop.run.record import Later, Status
 from twoloop.run.undetermined import WEAK, turned_by_rounding
 
 if TYPE_CHECKING:
+    from twoloop.problem.system import ConstrainedSystem
     from twoloop.run.run import Run
 
 Array = NDArray[np.float64]
@@ -53,11 +54,14 @@ def _said_of_passages(run: "Run") -> str:
     return said + (CROSSINGS if run.crossings else "")
 
 
-def message_of(run: "Run", words: str) -> Any:
-    """The message of these words, or what makes it: to measure what was crossed takes longer than many a run."""
+def message_of(run: "Run", words: str, system: "ConstrainedSystem") -> Any:
+    """The message of these words, or what makes it: to measure what was crossed takes longer than many a run.
+
+    `system`: one that stays what it is, as the arrays of the run may not.
+    """
     if CROSSINGS not in words:
         return words
-    system, crossings, now, rank = run.system, run.crossings, (float(run.clock[run.a.T]), run.state), run.rank
+    crossings, now, rank = run.crossings, (float(run.clock[run.a.T]), run.state.copy()), run.rank
 
     def made() -> dict[str, str]:
         return {"message": words.replace(CROSSINGS, said_of_crossings(system, crossings, now, rank))}
@@ -101,13 +105,17 @@ def said_of_rounding(run: "Run", places: list[Place], end: float) -> str:
     return ""
 
 
+def said_of_reached(run: "Run") -> str:
+    """The first sentence of a run that came to its end."""
+    fixed = ", with a constant step: no error was estimated" if run.control[run.a.FIXED_STEP] > 0.0 else ""
+    return f"Reached the end, t = {run.clock[run.a.T]:g}{fixed}."
+
+
 def outcome(run: "Run", code: int, t1: float, pace: Pace) -> tuple[Status, str]:
     """Status and message for how the run ended."""
     a, t = run.a, float(run.clock[run.a.T])
     if code == a.ALL_OUTPUT_DONE:
-        fixed = ", with a constant step: no error was estimated" if run.control[a.FIXED_STEP] > 0.0 else ""
-        said = _said_of_passages(run) + said_of_end(run)
-        return Status.REACHED_END, f"Reached the end, t = {t:g}{fixed}.{said}"
+        return Status.REACHED_END, said_of_reached(run) + _said_of_passages(run) + said_of_end(run)
     stopped = f"Stopped at t = {t:.10g}"
     failure = int(run.clock[a.FAILURE_CODE])
     if code == INTERRUPTED:

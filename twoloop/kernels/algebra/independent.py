@@ -7,6 +7,7 @@ from numba import types
 from twoloop.kernels.algebra.linalg import ldl_factor, ldl_solve
 from twoloop.kernels.data.common import INTEGERS, MATRIX, VECTOR, compiled, f8, i8, kernel, merged
 
+ROUNDED = 4.0 * 2.0**-52  # of the sum of squares of all entries, a row: what rounding may add to a product of rows
 MOST_OF_IT = 0.5  # of the square of a row's length: with more left, what is left is orthogonal to rounding
 
 
@@ -150,3 +151,19 @@ def least_solution(rows, values, least, basis, factors, kept, shares, gram, part
     for i in range(len(rows)):
         values[i] -= _dot(rows[i], x)
     return n
+
+
+@kernel(types.boolean(MATRIX, f8, MATRIX), vectorized=True)
+def above(rows, ratio, gram):
+    """Whether all singular values are above this share of the largest, by G G^T less its square.
+
+    The root of the sum of squares of the entries stands for the largest; `gram` is scratch.
+    """
+    n, total = len(rows), 0.0
+    for i in range(n):
+        for j in range(i + 1):
+            gram[j, i] = _dot(rows[i], rows[j])  # its upper triangle is what counts
+        total += gram[i, i]
+    for i in range(n):
+        gram[i, i] -= (ratio * ratio + ROUNDED * n) * total
+    return math.isfinite(total) and ldl_factor(gram)

@@ -96,8 +96,7 @@ def _consistent(C, rate, rows, q, v, sizes, allowed):
 def _note_entries(rows, pattern):
     for i in range(len(rows)):
         for j in range(rows.shape[1]):
-            if rows[i, j] != 0.0:
-                pattern[i, j] = 1.0
+            pattern[i, j] = 1.0 if rows[i, j] != 0.0 else pattern[i, j]  # written in any case: so it is vectorised
 
 
 @exact
@@ -128,7 +127,7 @@ def _definite(mass, least, factors):
     return ldl_factor(factors)
 
 
-@kernel(i8(KIT, f8, VECTOR, VECTOR, VECTOR, VECTOR, VECTOR, MATRIX, MATRIX, MATRIX, MATRIX, VECTOR))
+@kernel(i8(KIT, f8, VECTOR, VECTOR, VECTOR, VECTOR, VECTOR, MATRIX, MATRIX, MATRIX, MATRIX, VECTOR), vectorized=True)
 def look(f, t, q, v, sizes, lam, room, mass, rows, ways, pattern, least):
     """Flags of what is found at (t, q, v); arrays are full of zeros, but for `lam`, and these.
 
