@@ -14,7 +14,7 @@ from studies.bench.headline import BEST
 from studies.bench.kinds import by_kind
 from studies.bench.render import number, power, render
 from studies.bench.store import TIMED, WHOLE_CALL, Output
-from studies.bench.takes import takes
+from studies.bench.takes import NEWEST, takes
 
 # claims and compare_page read the others' rows
 STUDIES = (
@@ -30,7 +30,6 @@ CLASSES = {  # tags of a case and the class of problem that they stand for, in t
     ("stiff", "vibrations wanted"): "stiff, vibrations wanted",
 }
 LONG = "long and conservative"
-NEWEST = "CyRK"  # a rival that the rows of some of these lack, as they were made before
 ASKED_OF = {"beam": "beams by the error of the tip", "energy": "energy", "honesty": "sharp forces", "table3": "Table 3"}
 ASKED_OF |= {"validation": "published mechanisms", "ensembles": "many runs in one call"}
 AT_LENGTH = '"compare",'  # how rows of work_precision begin that are of long motions

@@ -18,6 +18,19 @@ def test_of_beams_two_are_named_where_neither_is_cheaper():
     assert takes({"beam": found}, [])[0]["take"] == f'{stiff}: `heyoka` or `method="Adams"` (1e-3 m)'
 
 
+def test_rows_that_lack_the_newest_rival_say_so():
+    at = {"error": 1e-3, "verdict": "ahead", "best": THEIRS | {"setting": "tol 0.10"}}
+    found = {"beam": {"cases": [{"name": "very flexible", "at": [at]}]}}
+    found["work_precision"] = {"lacking": ["beams by the error of the tip"]}
+    assert takes(found, [])[0]["take"].endswith("`heyoka` (1e-3 m); without `CyRK`")
+    pick = {"solver": "CyRK, DOP853", "accuracies": ["1e-2"], "undecided": []}
+    entry = {"class": "stiff, vibrations wanted", "name": "very flexible beam", "t_end": 2.0, "picks": [pick]}
+    told = takes(found, [entry])[0]["take"]
+    assert told.endswith(
+        "without `CyRK`, which is the fastest on the very flexible beam by the error of all coordinates"
+    )
+
+
 def minimal(kind, wrong=(), asked=20, **mechanisms):
     """Findings in minimal coordinates, from verdicts at 1e-3, 1e-6 and 1e-9."""
     told = {
