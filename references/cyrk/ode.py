@@ -129,11 +129,13 @@ class Solver:
 
     def most_steps(self, limit: TimeLimit) -> int:
         """Return the number of steps that the time limit allows, 0: no limit, by a run of at most `TRIED` steps."""
+        if limit.seconds is None:
+            return 0
         began = time.monotonic()
         self.prepared(TRIED)()
         if limit.passed():
             return 1
-        if limit.seconds is None or self.found.status != TOO_MANY_STEPS:
+        if self.found.status != TOO_MANY_STEPS:
             return 0
         return TRIED * math.ceil(limit.seconds / (time.monotonic() - began))
 
