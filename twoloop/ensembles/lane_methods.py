@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from twoloop.checks.arguments import Array
+from twoloop.methods import dop853_tableau as tableau
 from twoloop.methods.auto import TIGHTEST
-from twoloop.methods.dop853_tableau import B
+from twoloop.methods.dop853 import COARSE_SHARE
 from twoloop.methods.plan import Method, least_tolerance
 from twoloop.methods.presets import PRESETS
 from twoloop.methods.runge_kutta import RungeKutta
@@ -37,6 +38,10 @@ class LaneMethod:
         What code made for a mechanism gets as the order.
     options : ndarray
         What its step reads.
+    tableau : tuple of ndarray or None
+        Of an explicit method, for which code is made: A, b, c and the weights of two estimates of its error.
+    unseen : float
+        Of a step, the longest part within which the equations are not looked at.
     step, memory : callable
         Its kernel, compiled when it is first asked for, and the length of its memory, in vectors, for such code.
     """
@@ -47,6 +52,8 @@ class LaneMethod:
     options: Array
     step: Callable[[], Any]
     memory: Callable[["LaneCode"], int]
+    tableau: tuple[Array, Array, Array, Array, Array] | None = None
+    unseen: float = 1.0
 
 
 def lane_methods(name: str, stiff: bool, n: int, rtol: float, atol: float) -> list[LaneMethod]:
@@ -87,9 +94,19 @@ def _dop853(n: int, rtol: float, atol: float) -> LaneMethod:
     def memory(code: "LaneCode") -> int:
         from twoloop.kernels.lanes.lane_dop853 import memory_size
 
-        return memory_size(len(B), n)
+        return memory_size(len(tableau.B), n)
 
-    return LaneMethod("DOP853", False, 8, _options(PRESETS["DOP853"], n, rtol, atol), step, memory)
+    weights = tableau.A, tableau.B, tableau.C, tableau.E5, COARSE_SHARE * tableau.E3
+    return LaneMethod(
+        "DOP853", False, 8, _options(PRESETS["DOP853"], n, rtol, atol), step, memory, weights, _unseen(weights)
+    )
+
+
+def _unseen(weights: tuple[Array, Array, Array, Array, Array]) -> float:
+    """The widest gap between stages with weight in the result or in an estimate, and the end."""
+    _, b, c, fine, coarse = weights
+    seen = c[(b != 0.0) | (fine != 0.0) | (coarse != 0.0)]
+    return float(np.diff(np.sort([*seen, 1.0])).max())
 
 
 def _newton(name: str, tested: Literal["all", "positions"], n: int, rtol: float, atol: float) -> LaneMethod:
@@ -101,11 +118,11 @@ def _newton(name: str, tested: Literal["all", "positions"], n: int, rtol: float,
     def memory(code: "LaneCode") -> int:
         from twoloop.kernels.lanes.lane_newton import memory_size
 
-        return memory_size(tableau.stages, n)
+        return memory_size(radau.stages, n)
 
-    tableau = radau_iia(STAGES[name])
-    method = RungeKutta(tableau, outer="newton", tested=tested)
-    return LaneMethod(name, False, tableau.order, _options(method, n, rtol, atol), step, memory)
+    radau = radau_iia(STAGES[name])
+    method = RungeKutta(radau, outer="newton", tested=tested)
+    return LaneMethod(name, False, radau.order, _options(method, n, rtol, atol), step, memory)
 
 
 def _options(method: Method, n: int, rtol: float, atol: float) -> Array:
