@@ -357,3 +357,15 @@ def test_long_steps_stay_on_their_assembly():
     assert runs.success.all() and (~runs.singly).sum() > 90
     off = np.abs(ends["DOP853"] - ends["Taylor"]).max(axis=1)
     assert (off < 0.1).all() and np.median(off) < 1e-3
+
+
+@pytest.mark.parametrize("name", ["andrews", "four_bar", "redundant_slider_crank"])
+@pytest.mark.parametrize("method", ["Taylor", "DOP853", "RadauIIA5"])
+def test_numbers_of_code_are_known_before_it_is_written(name, method):
+    """Code that comes from the disk is not written again: it would read numbers that are not there."""
+    problem = getattr(mechanisms, name)()
+    starts = Starts(0.0, problem.q0[None], problem.v0[None], problem.system.parameters[None])
+    code = LaneRuns(problem.system, starts, lane_methods(method, False, problem.system.n_q, 1e-6, 1e-6)[0]).own
+    known = len(code.code.numbers.values), code.code.n_numbers
+    code._write()
+    assert (len(code.code.numbers.values), code.code.numbers.n_varying) == known

@@ -63,6 +63,9 @@ class LaneCode(LaneSteps):
             if program.n_operations > LARGEST:
                 raise Untraceable(f"its series takes more than {LARGEST} operations")
             self.recurrences = LaneSeries(program, self.solution, self.numbers, self.n, self.n_rows)
+        rows = self.equations.rows
+        self._entries = [(k, j) for k, row in enumerate(rows) for j in range(self.n) if not is_zero(row[j])]
+        self._rows_at = Outputs({"G": [rows[k, j] for k, j in self._entries]}, [])
         self.structure = self._structure()
         self.n_numbers = self.numbers.n_varying
         parts = [equations.there, equations.closer, equations.nearest, equations.redundant]
@@ -91,6 +94,8 @@ class LaneCode(LaneSteps):
         if self.recurrences is not None:
             told += list(self.recurrences.structure)
             parts.append(self.solution.kept)
+        else:
+            parts.append(self._rows_at)  # whose numbers have to be known where the code comes from the disk
         for outputs in parts:
             told += [outputs.sizes, *numbers.structure(equations.graph, outputs.forms)]
         if self.recurrences is not None:
@@ -220,12 +225,10 @@ class LaneCode(LaneSteps):
 
     def _rows(self, emit: LaneEmitter, at: Places, time: int, base: Value) -> list[dict[int, Value]]:
         """The entries of G that are not zero, row by row, at a state."""
-        places = [(k, j) for k, row in enumerate(self.equations.rows) for j in range(self.n) if not is_zero(row[j])]
-        outputs = Outputs({"G": [self.equations.rows[k, j] for k, j in places]}, [])
         inputs = [emit.load(at.room, time), *(emit.load(base, i) for i in range(2 * self.n))]
-        _, (entries,) = results_of(emit, self.equations.graph, outputs, inputs, self.numbers)
+        _, (entries,) = results_of(emit, self.equations.graph, self._rows_at, inputs, self.numbers)
         rows: list[dict[int, Value]] = [{} for _ in self.equations.rows]
-        for (k, j), value in zip(places, entries, strict=True):
+        for (k, j), value in zip(self._entries, entries, strict=True):
             rows[k][j] = value
         return rows
 
