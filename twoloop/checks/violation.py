@@ -9,7 +9,7 @@ from scipy.linalg import lapack
 
 from twoloop.checks.arguments import Array
 from twoloop.checks.rank import least_solution
-from twoloop.checks.scales import EPS, Scales, scales_of
+from twoloop.checks.scales import EPS, Scales, scales_of, signs
 from twoloop.checks.sparse_rows import Rows, SparseRows
 
 if TYPE_CHECKING:
@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 CONSISTENT = 1e-8  # correction that an initial state may need, relative to the size of the mechanism
 SURELY = 0.1  # of that: where no more is needed, there is no doubt
 TIED = 1e-6  # relative: corrections that exceed what is allowed by as much, of which the first is named
+NEIGHBOURS = 4  # of a position, at which constraints are looked at for rounding
+MOST_NOISE = 1e-11  # of the largest coordinate: what counts as rounding of a constraint
 ROUNDING = 64.0  # times the spacing of floating-point numbers: what rounding of the state may add to it
 
 
@@ -79,6 +81,19 @@ def is_at_rounding(values: Array, rows: Rows, state: Array, rate: Array | float 
     return bool((np.abs(values) <= ROUNDING * EPS * (abs(rows) @ np.abs(state) + np.abs(rate))).all())
 
 
+def _noise(system: ConstrainedSystem, t: float, q: Array, values: Array, jacobian: Array) -> Array:
+    """What rounding makes of C, which may be a difference of terms that its derivatives do not show, (n_c,).
+
+    It is what C differs by between neighbouring numbers, less what C_q explains.
+    """
+    noise = np.zeros(len(values))
+    for k in range(NEIGHBOURS):
+        beside = q * (1.0 + EPS * np.roll(signs(len(q)), k))
+        noise = np.maximum(noise, np.abs(system.constraint(t, beside) - values - jacobian @ (beside - q)))
+    most = MOST_NOISE * float(np.abs(q).max(initial=0.0)) * np.abs(jacobian).max(axis=1, initial=0.0)
+    return np.where(np.isfinite(noise), np.minimum(noise, most), 0.0)
+
+
 class Violation:
     """What a state violates, as the change of coordinates (or velocities) that would put it right.
 
@@ -116,8 +131,8 @@ class Violation:
     @classmethod
     def of_position(cls, system: ConstrainedSystem, t: float, q: Array, jacobian: Array, scales: Scales) -> Violation:
         """C(t, q) at a position."""
-        terms = np.abs(jacobian) @ np.abs(q)
         values = system.constraint(t, q)
+        terms = np.maximum(np.abs(jacobian) @ np.abs(q), _noise(system, t, q, values, jacobian) / EPS)
         return cls(system, t, "C(t, q)", values, terms, jacobian, scales, scales.reach, np.abs(q))
 
     @classmethod

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from twoloop.checks.arguments import Array, check_positive, check_size, check_span, check_times, check_tolerance
 from twoloop.ensembles.in_lanes import LaneRuns, threads_of
-from twoloop.ensembles.lane_methods import IN_LANES, LaneMethod, lane_methods
+from twoloop.ensembles.lane_methods import IN_LANES, LaneMethod, is_involved, lane_methods
 from twoloop.ensembles.runs import Runs
 from twoloop.ensembles.starts import Starts, all_starts, far_off, system_of
 from twoloop.generate.tracing import Untraceable
@@ -63,7 +63,8 @@ def ensemble(
         As for `solve_dae`; t_eval None: states are stored at the start and the end.
     method : str or method object
         "auto", "Taylor", "DOP853", "RadauIIA5", "RadauIIA9" and "RadauIIA13" go in lanes. "auto" takes Taylor series
-        there, and DOP853 for runs that these cannot do and for systems that have none. If the first run came to
+        there, and DOP853 for runs that these cannot do and for systems that have none; at tolerances from 1e-9 on it
+        takes DOP853 first where series take more than six operations a coordinate. If the first run came to
         Newton's method, it takes a Radau method for all runs, of order 5 at tolerances from 9e-7 on and of order 9
         below, with errors tested as by `Auto`.
     threads : int, optional
@@ -83,12 +84,13 @@ def ensemble(
 
     Notes
     -----
-    In lanes, as in a single run, no step of DOP853 or of a Radau method is longer than a hundredth of the run. Where a
-    force may act for a short time, lanes evaluate the equations every two-thousandth of the run; a single run evaluates
-    only the forces there. Stages are off the constraints by the error of the formula. This includes the Radau methods,
-    whose unknowns are here the accelerations of all coordinates. The end of each step is put on the constraints. States
-    at `t_eval` within a step are the ends of shorter steps from its beginning. A run that would take more than 100,000
-    of these steps is made by `solve_dae`.
+    In lanes, as in a single run, the equations are evaluated at least every hundredth of the run. So no step of a Radau
+    method is longer, and no step of DOP853 longer than 3.75 hundredths, as the widest gap between its stages is 4/15 of
+    a step. Where a force may act for a short time, steps are no longer than a two-thousandth of the run; a single run
+    evaluates only the forces there. Stages are off the constraints by the error of the formula. This includes the Radau
+    methods, whose unknowns are here the accelerations of all coordinates. The end of each step is put on the
+    constraints. States at `t_eval` within a step are the ends of shorter steps from its beginning. A run that would
+    take more than 100,000 of these steps is made by `solve_dae`.
     """
     check_system(system)
     t0, t1 = check_span(t_span)
@@ -125,7 +127,8 @@ def ensemble(
         why = f"{chosen.name} does not go in lanes"
     elif n_runs > 1:
         stiff = (first.stats.n_jacobians or 0) > 0
-        methods = lane_methods(str(method), stiff, system.n_q, float(rtol), float(tolerance.min()))
+        involved = method == "auto" and not stiff and is_involved(system)
+        methods = lane_methods(str(method), stiff, system.n_q, float(rtol), float(tolerance.min()), involved)
     for each in methods:
         left = np.flatnonzero(~in_lanes)
         if len(left) == 1:

@@ -44,10 +44,11 @@ class LaneRuns:
 
         self.system, self.starts, self.method, self.kit = system, starts, method, kit_to_write(system)
         generic, varying = generic_parameters(starts.parameters)
-        self.places = PLACES * (OF_SUDDEN if any(may_be_sudden(system, ran_on_symbols=True)) else 1)
+        sudden = any(may_be_sudden(system, ran_on_symbols=True))
+        self.places = PLACES * OF_SUDDEN if sudden else PLACES * method.unseen
         choice = Choice.at(system_of(system, starts, 0), starts.t0, starts.q[0])
-        kind = ("lanes", method.series, choice, tuple(varying))  # of which the latest is kept
-        make = partial(OwnLanes, system, choice, generic, varying, method.series)
+        kind = ("lanes", method.series, method.tableau is None, choice, tuple(varying))  # of which the latest is kept
+        make = partial(OwnLanes, system, choice, generic, varying, method.series, method.tableau)
         self.own: OwnLanes = system.remembered_at(kind, generic.tobytes(), make)
 
     def make(

@@ -7,19 +7,26 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from twoloop.checks.arguments import Array
+from twoloop.generate.series import series_for
+from twoloop.generate.time_dependence import may_be_sudden
+from twoloop.generate.tracing import Untraceable
+from twoloop.methods import dop853_tableau as tableau
 from twoloop.methods.auto import TIGHTEST
-from twoloop.methods.dop853_tableau import B
+from twoloop.methods.dop853 import COARSE_SHARE
 from twoloop.methods.plan import Method, least_tolerance
 from twoloop.methods.presets import PRESETS
 from twoloop.methods.runge_kutta import RungeKutta
 from twoloop.methods.tableaux import radau_iia
 from twoloop.methods.taylor import order_in_lanes
+from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.run import FIRST_STEP
 
 if TYPE_CHECKING:  # it loads kernels
     from twoloop.generate.lane_code import LaneCode
 
 
+INVOLVED = 6.0  # operations of a series a coordinate, from which on "auto" takes DOP853 (measured at 2, 11 and 13) ...
+STAGES_TO = 1e-9  # ... down to this tolerance
 STAGES = {"RadauIIA5": 3, "RadauIIA9": 5, "RadauIIA13": 7}  # of the implicit methods
 IN_LANES = ("auto", "Taylor", "DOP853", *STAGES)  # presets that go in lanes
 
@@ -37,6 +44,10 @@ class LaneMethod:
         What code made for a mechanism gets as the order.
     options : ndarray
         What its step reads.
+    tableau : tuple of ndarray or None
+        Of an explicit method, for which code is made: A, b, c and the weights of two estimates of its error.
+    unseen : float
+        Of a step, the longest part within which the equations are not looked at.
     step, memory : callable
         Its kernel, compiled when it is first asked for, and the length of its memory, in vectors, for such code.
     """
@@ -47,13 +58,28 @@ class LaneMethod:
     options: Array
     step: Callable[[], Any]
     memory: Callable[["LaneCode"], int]
+    tableau: tuple[Array, Array, Array, Array, Array] | None = None
+    unseen: float = 1.0
 
 
-def lane_methods(name: str, stiff: bool, n: int, rtol: float, atol: float) -> list[LaneMethod]:
+def is_involved(system: ConstrainedSystem) -> bool:
+    """Whether a Taylor series takes so many operations that a dozen evaluations cost less; not where forces are sudden.
+
+    There DOP853 has to evaluate forces at short distances, and a series is only looked at there.
+    """
+    if any(may_be_sudden(system, ran_on_symbols=True)):
+        return False
+    try:
+        return series_for(system).n_operations > INVOLVED * system.n_q
+    except Untraceable:
+        return False
+
+
+def lane_methods(name: str, stiff: bool, n: int, rtol: float, atol: float, involved: bool = False) -> list[LaneMethod]:
     """Methods for runs of n coordinates by a preset; the next one where no code can be had for one.
 
-    "auto" takes Taylor series, or DOP853 where there are none; for stiff motion the Radau method that it takes singly,
-    at loose tolerances that of order 5.
+    "auto" takes Taylor series, or DOP853 where there are none or, down to STAGES_TO, these are `involved`; for stiff
+    motion the Radau method that it takes singly, at loose tolerances that of order 5.
     """
     if name == "DOP853":
         return [_dop853(n, rtol, atol)]
@@ -61,9 +87,10 @@ def lane_methods(name: str, stiff: bool, n: int, rtol: float, atol: float) -> li
         return [_taylor(rtol, atol)]
     if name != "auto":
         return [_newton(name, "all", n, rtol, atol)]
-    if not stiff:
-        return [_taylor(rtol, atol), _dop853(n, rtol, atol)]
     tolerance = least_tolerance(rtol, atol)
+    if not stiff:
+        made = [_taylor(rtol, atol), _dop853(n, rtol, atol)]
+        return made[::-1] if involved and tolerance >= STAGES_TO else made
     radau = "RadauIIA5" if tolerance >= TIGHTEST else "RadauIIA9"
     return [_newton(radau, "positions", n, rtol, atol)]
 
@@ -87,9 +114,19 @@ def _dop853(n: int, rtol: float, atol: float) -> LaneMethod:
     def memory(code: "LaneCode") -> int:
         from twoloop.kernels.lanes.lane_dop853 import memory_size
 
-        return memory_size(len(B), n)
+        return memory_size(len(tableau.B), n)
 
-    return LaneMethod("DOP853", False, 8, _options(PRESETS["DOP853"], n, rtol, atol), step, memory)
+    weights = tableau.A, tableau.B, tableau.C, tableau.E5, COARSE_SHARE * tableau.E3
+    return LaneMethod(
+        "DOP853", False, 8, _options(PRESETS["DOP853"], n, rtol, atol), step, memory, weights, _unseen(weights)
+    )
+
+
+def _unseen(weights: tuple[Array, Array, Array, Array, Array]) -> float:
+    """The widest gap between stages with weight in the result or in an estimate, and the end."""
+    _, b, c, fine, coarse = weights
+    seen = c[(b != 0.0) | (fine != 0.0) | (coarse != 0.0)]
+    return float(np.diff(np.sort([*seen, 1.0])).max())
 
 
 def _newton(name: str, tested: Literal["all", "positions"], n: int, rtol: float, atol: float) -> LaneMethod:
@@ -101,11 +138,11 @@ def _newton(name: str, tested: Literal["all", "positions"], n: int, rtol: float,
     def memory(code: "LaneCode") -> int:
         from twoloop.kernels.lanes.lane_newton import memory_size
 
-        return memory_size(tableau.stages, n)
+        return memory_size(radau.stages, n)
 
-    tableau = radau_iia(STAGES[name])
-    method = RungeKutta(tableau, outer="newton", tested=tested)
-    return LaneMethod(name, False, tableau.order, _options(method, n, rtol, atol), step, memory)
+    radau = radau_iia(STAGES[name])
+    method = RungeKutta(radau, outer="newton", tested=tested)
+    return LaneMethod(name, False, radau.order, _options(method, n, rtol, atol), step, memory)
 
 
 def _options(method: Method, n: int, rtol: float, atol: float) -> Array:

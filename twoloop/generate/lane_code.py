@@ -12,10 +12,12 @@ from twoloop.generate.choices import Choice
 from twoloop.generate.coefficients import Coefficients
 from twoloop.generate.lane_emitter import LaneEmitter
 from twoloop.generate.lane_series import LaneSeries
+from twoloop.generate.lane_stages import LaneStages, Tableau
 from twoloop.generate.lane_steps import LaneSteps, Places, common, is_set, keep_fine, store_mask
+from twoloop.generate.lane_turns import turned
 from twoloop.generate.llvm_text import Value, integer
 from twoloop.generate.series import series_program
-from twoloop.generate.straight_line import Outputs, Solution, StraightLine
+from twoloop.generate.straight_line import Outputs, Solution, StraightLine, is_zero
 from twoloop.generate.traced_equations import Equations
 from twoloop.generate.tracing import Untraceable
 from twoloop.generate.written import conditions_hold, results_of
@@ -38,6 +40,8 @@ class LaneCode(LaneSteps):
     parameters : array of Known
     series : bool
         Whether there is to be code for its Taylor series, too.
+    tableau : Tableau, optional
+        Of an explicit method, whose stages there is to be code for.
 
     Raises
     ------
@@ -45,17 +49,23 @@ class LaneCode(LaneSteps):
         Saying why the equations, or their series, cannot be had.
     """
 
-    def __init__(self, system: ConstrainedSystem, choice: Choice, parameters: Any, series: bool):
+    def __init__(
+        self, system: ConstrainedSystem, choice: Choice, parameters: Any, series: bool, tableau: Tableau | None = None
+    ):
         self.numbers = Coefficients(apart=True)
         self.equations = equations = StraightLine(system, choice, Equations(system, parameters))
         self.solution = Solution(self.equations)
         super().__init__(system.n_q, system.n_c + system.n_a)
         self.recurrences: LaneSeries | None = None
+        self.explicit = None if tableau is None else LaneStages(tableau, self.n)
         if series:
             program = series_program(system, Equations(system, parameters), {*choice.rows, *choice.added})
             if program.n_operations > LARGEST:
                 raise Untraceable(f"its series takes more than {LARGEST} operations")
             self.recurrences = LaneSeries(program, self.solution, self.numbers, self.n, self.n_rows)
+        rows = self.equations.rows
+        self._entries = [(k, j) for k, row in enumerate(rows) for j in range(self.n) if not is_zero(row[j])]
+        self._rows_at = Outputs({"G": [rows[k, j] for k, j in self._entries]}, [])
         self.structure = self._structure()
         self.n_numbers = self.numbers.n_varying
         parts = [equations.there, equations.closer, equations.nearest, equations.redundant]
@@ -67,7 +77,10 @@ class LaneCode(LaneSteps):
     @property
     def tasks(self) -> tuple[str, ...]:
         """What there is code for."""
-        return *lanes.TASKS, *(lanes.TASKS_OF_STAGES if self.recurrences is None else lanes.TASKS_OF_SERIES)
+        if self.recurrences is not None:
+            return *lanes.TASKS, *lanes.TASKS_OF_SERIES
+        explicit = () if self.explicit is None else lanes.TASKS_OF_EXPLICIT
+        return *lanes.TASKS, *lanes.TASKS_OF_STAGES, *explicit
 
     def series_size(self, order: int) -> int:
         """Length of the memory that a series of an order takes and works in, in vectors."""
@@ -76,11 +89,13 @@ class LaneCode(LaneSteps):
 
     def _structure(self) -> str:
         equations, numbers = self.equations, self.numbers
-        told: list[Any] = []
+        told: list[Any] = [] if self.explicit is None else [*self.explicit.structure]
         parts = [equations.there, equations.closer, equations.nearest, equations.redundant]
         if self.recurrences is not None:
             told += list(self.recurrences.structure)
             parts.append(self.solution.kept)
+        else:
+            parts.append(self._rows_at)  # whose numbers have to be known where the code comes from the disk
         for outputs in parts:
             told += [outputs.sizes, *numbers.structure(equations.graph, outputs.forms)]
         if self.recurrences is not None:
@@ -198,6 +213,29 @@ class LaneCode(LaneSteps):
         outputs = self.equations.there
         written, (a,) = results_of(emit, self.equations.graph, outputs, self._new(emit, room, at), self.numbers)
         return conditions_hold(emit, written, outputs, a), a
+
+    def turned(self, emit: LaneEmitter, at: Places) -> Value | None:
+        """Where det G1 G0^T is not positive, see lane_turns.py; series have their defects for that."""
+        if self.recurrences is not None or len(self.equations.rows) == 0:
+            return None
+        return turned(emit, *(self._rows(emit, at, time, base) for time, base in self._ends(at)))
+
+    def _ends(self, at: Places) -> list[tuple[int, Value]]:
+        return [(lanes.T, at.state), (lanes.AHEAD, at.new)]
+
+    def _rows(self, emit: LaneEmitter, at: Places, time: int, base: Value) -> list[dict[int, Value]]:
+        """The entries of G that are not zero, row by row, at a state."""
+        inputs = [emit.load(at.room, time), *(emit.load(base, i) for i in range(2 * self.n))]
+        _, (entries,) = results_of(emit, self.equations.graph, self._rows_at, inputs, self.numbers)
+        rows: list[dict[int, Value]] = [{} for _ in self.equations.rows]
+        for (k, j), value in zip(self._entries, entries, strict=True):
+            rows[k][j] = value
+        return rows
+
+    def stages(self, emit: LaneEmitter, order: Value, control: Value, room: Value) -> None:
+        """NEW and ERROR by the stages of a step."""
+        assert self.explicit is not None
+        self.explicit.write(emit, (order, control, room), self.places(emit, order, control, room))
 
     def redundant(self, emit: LaneEmitter, order: Value, control: Value, room: Value) -> None:
         """Whether the rows that do not count hold, too."""

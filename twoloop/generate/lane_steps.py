@@ -10,7 +10,7 @@ from typing import NamedTuple
 from twoloop.generate.lane_emitter import LaneEmitter
 from twoloop.generate.llvm_text import Value, integer
 from twoloop.kernels.control.defect import ROUNDING
-from twoloop.kernels.control.predictor import FLOOR, LEAST, SHARE_OF_MOTION
+from twoloop.kernels.control.predictor import FLOOR, LEAST, SHARE_OF_MOTION, SHARE_THROUGH_ZERO
 from twoloop.kernels.lanes import lane_room as lanes
 from twoloop.kernels.lanes import lane_taylor
 
@@ -166,13 +166,21 @@ class LaneSteps:
         for j in range(n):
             way = emit.larger(emit.multiply(h, size(at.state, n + j)), apart(at.new, at.state, j))
             motion = emit.larger(way, motion)
+        turned, least = self.turned(emit, at), emit.multiply(emit.constant(SHARE_THROUGH_ZERO), motion)
         motion = emit.multiply(emit.constant(SHARE_OF_MOTION), motion)
         for j in range(n):
             scale = emit.add(atol[j], emit.multiply(rtol, emit.larger(size(at.new, j), size(at.state, j))))
             allowed = emit.add(motion, emit.multiply(emit.constant(FLOOR), scale))
-            allowed = emit.larger(emit.smaller(scale, allowed), emit.constant(LEAST))
+            allowed = emit.smaller(scale, allowed)
+            if turned is not None:
+                allowed = emit.builder.select(turned, emit.smaller(scale, least), allowed)
+            allowed = emit.larger(allowed, emit.constant(LEAST))
             off = emit.largest_of(emit.divide(apart(at.predicted, at.new, j), allowed), off)
         emit.store(off, room, lanes.OFF)
+
+    def turned(self, emit: LaneEmitter, at: Places) -> Value | None:
+        """Where a step from STATE to NEW may have passed a singular position; None: others look for that."""
+        return None
 
     def judge(self, emit: LaneEmitter, order: Value, control: Value, room: Value) -> None:
         """Accept steps, or shorten them by as much as they are off; runs of too many refusals end in lanes."""

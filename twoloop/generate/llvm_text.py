@@ -221,6 +221,10 @@ class Builder:
         self.module.declare(name, kind, [value.type for value in arguments])
         return self._value(kind, f"call {kind} @{name}({', '.join(map(str, arguments))})")
 
+    def run(self, name: str, arguments: Sequence[Value]) -> None:
+        """Call a function of the module that has no result."""
+        self._line(f"call {NOTHING} @{name}({', '.join(map(str, arguments))})")
+
     def room(self, kind: str, size: int) -> Value:
         """Memory for some values, until the function ends."""
         return self._value(f"{kind}*", f"alloca {kind}, {integer(max(size, 1))}, align 64")

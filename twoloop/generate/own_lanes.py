@@ -11,7 +11,9 @@ from twoloop.generate import (
     lane_code,
     lane_emitter,
     lane_series,
+    lane_stages,
     lane_steps,
+    lane_turns,
     llvm_code,
     llvm_text,
     llvm_trigonometry,
@@ -23,6 +25,7 @@ from twoloop.generate.choices import Choice
 from twoloop.generate.known_numbers import Record
 from twoloop.generate.lane_code import LaneCode
 from twoloop.generate.lane_emitter import LaneEmitter
+from twoloop.generate.lane_stages import Tableau
 from twoloop.generate.llvm_text import Module
 from twoloop.generate.tracing import Untraceable
 from twoloop.kernels.compile.dependencies import digest_of
@@ -33,7 +36,7 @@ from twoloop.problem.system import ConstrainedSystem
 Array = NDArray[np.float64]
 
 BUILD_SECONDS = 3e-4  # for a quantity, about
-LANE_WRITERS = (lane_code, lane_steps, lane_series, lane_emitter)
+LANE_WRITERS = (lane_code, lane_steps, lane_series, lane_stages, lane_turns, lane_emitter)
 WRITERS = (series, straight_line, written, coefficients, *LANE_WRITERS, llvm_code, llvm_text, llvm_trigonometry)
 
 KIND = "lanes"  # of files on the disk
@@ -50,6 +53,8 @@ class OwnLanes:
         Of a `Record`: generic parameters, and which of them differ from run to run.
     series : bool
         Whether there is to be code for its Taylor series, too.
+    tableau : Tableau, optional
+        Of an explicit method, whose stages there is to be code for.
 
     Raises
     ------
@@ -57,11 +62,19 @@ class OwnLanes:
         Saying why the equations cannot be had.
     """
 
-    def __init__(self, system: ConstrainedSystem, choice: Choice, values: Array, varying: Sequence[int], series: bool):
+    def __init__(
+        self,
+        system: ConstrainedSystem,
+        choice: Choice,
+        values: Array,
+        varying: Sequence[int],
+        series: bool,
+        tableau: Tableau | None = None,
+    ):
         if system.n_a > 0:
             raise Untraceable("it has nonholonomic rows")
         self.record = Record(values.tolist(), varying)
-        self.code = LaneCode(system, choice, self.record.parameters, series)
+        self.code = LaneCode(system, choice, self.record.parameters, series, tableau)
 
     @cached_property
     def functions(self) -> OwnFunctions:

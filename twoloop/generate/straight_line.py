@@ -145,7 +145,7 @@ class StraightLine:
 
     def _matrix(self) -> dict[tuple[int, int], Form]:
         n = self.system.n_q
-        matrix = {(i, j): self.mass[i, j] for i in range(n) for j in range(n) if not _is_zero(self.mass[i, j])}
+        matrix = {(i, j): self.mass[i, j] for i in range(n) for j in range(n) if not is_zero(self.mass[i, j])}
         for i, j in matrix:
             if (j, i) not in matrix:
                 name = self.system.name
@@ -153,14 +153,14 @@ class StraightLine:
                     f"mass of {name!r} is not symmetric: its entry {(j, i)} is zero, and its entry {(i, j)} is not"
                 )
         for k in self.choice.added:
-            places = [i for i in range(n) if not _is_zero(self.all_rows[k, i])]
+            places = [i for i in range(n) if not is_zero(self.all_rows[k, i])]
             for i in places:
                 for j in places:
                     term = (self.all_rows[k, i] * self.all_rows[k, j]).times(self.choice.scale)
                     matrix[i, j] = matrix[i, j] + term if (i, j) in matrix else term
         for k, row in enumerate(self.rows):
             for i in range(n):
-                if not _is_zero(row[i]):
+                if not is_zero(row[i]):
                     matrix[n + k, i] = matrix[i, n + k] = row[i]
         return matrix
 
@@ -367,5 +367,6 @@ def _shared(graph: Graph, kept: Sequence[int], more: Sequence[Outputs]) -> list[
     return sorted(found & made - set(kept))
 
 
-def _is_zero(form: Form) -> bool:
+def is_zero(form: Form) -> bool:
+    """Whether a form is zero by its structure."""
     return not form.terms and form.constant == 0.0

@@ -54,6 +54,8 @@ TASKS = (
     "take",  # NEW becomes STATE where ACCEPTED
 )
 TASKS_OF_STAGES = ("there",)  # A at NEW as it stands
+# NEW, X after the BEGIN of the step, and ERROR, if that is the whole step; FINE stays where it could be done
+TASKS_OF_EXPLICIT = ("stages",)
 TASKS_OF_SERIES = (
     "series",  # coefficients about STATE at T, in units of time UNIT
     "lengths",  # LENGTH in units, H and X of the steps of the lanes that can go on, which are FINE
@@ -63,13 +65,17 @@ TASKS_OF_SERIES = (
     "judge",  # ACCEPTED: the steps that are, and how long the next one may be
 )
 CODE = Reference("LaneKit", {})
-ALL_TASKS = (*TASKS, *TASKS_OF_STAGES, *TASKS_OF_SERIES)
+ALL_TASKS = (*TASKS, *TASKS_OF_STAGES, *TASKS_OF_EXPLICIT, *TASKS_OF_SERIES)
 CODE.add_own_functions(dict.fromkeys(ALL_TASKS, types.none(types.int64, VECTOR, VECTOR)))
 # of a method, (code, settings, control, options, room, status, n_steps, within): a step H of each lane that runs, and
 # whether it is ACCEPTED, with its end in NEW, A and LAM; or, `within` the step that was just accepted, NEW, X seconds
 # after its beginning, of the lanes that FINE names, off the constraints as yet
 STEP = types.void(CODE, INTEGERS, *[VECTOR] * 3, *[INTEGERS] * 2, types.boolean)
 CODE.add_function("step", STEP)
+
+# of the memory of an explicit method, in n vectors: accelerations at STATE, the state at which the step begins (twice
+# n), velocities before they are put on the constraints, and accelerations of the stages
+START, BEGIN, _BEGIN_V, PREDICTED_V, SLOPES = range(5)
 
 LEFT, ENDED = 0, 1  # what becomes of a run: left to a run of its own, or made
 N, N_ROWS, ORDER, CHECKS_REDUNDANT, N_NUMBERS = range(5)  # in `settings`
