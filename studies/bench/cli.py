@@ -107,7 +107,13 @@ def commit() -> str:
 @cache
 def processor() -> str:
     """The model of this machine's processor, as the system names it."""
-    return _cpuinfo().get("model name") or platform.processor() or platform.machine()
+    return named(_cpuinfo()) or platform.processor() or platform.machine()
+
+
+def named(known: Mapping[str, str]) -> str:
+    """The name of a processor, with its family where it has no number ("AMD EPYC"): times of generations differ."""
+    name, family = known.get("model name", ""), known.get("cpu family")
+    return f"{name} (family {family})" if name and family and not any(map(str.isdigit, name)) else name
 
 
 def generation(known: Mapping[str, str]) -> list[str]:

@@ -37,6 +37,8 @@ def test_errors_and_ctrl_c_end_with_one_line(capsys):
 def test_a_processor_is_known_by_its_family_where_its_name_is_short():
     assert cli.generation({"model name": "AMD EPYC", "cpu family": "26", "model": "2"}) == ["cpu family 26 model 2"]
     assert cli.generation({"model name": "a machine without families"}) == []
+    assert cli.named({"model name": "AMD EPYC", "cpu family": "26", "model": "2"}) == "AMD EPYC (family 26)"
+    assert cli.named({"model name": "Xeon 8481C", "cpu family": "6"}) == "Xeon 8481C" and cli.named({}) == ""
 
 
 def test_the_stamp_is_one_line():

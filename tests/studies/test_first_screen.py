@@ -181,7 +181,7 @@ def test_every_number_of_the_screen_is_made_again_from_the_rows(tmp_path):
     here = number(ms["heyoka"][0] / ms["auto, compiled"][0])
     expected = [
         f"the fastest of up to {n_others} rival configurations; *behind*: more, or only rivals reach the error. "
-        "2 mechanisms were run on an AMD EPYC.",
+        "2 mechanisms were run, on an AMD EPYC.",
         f"| ahead / behind | {' | '.join(name for name in rivals.RANGES if name != rivals.ROUNDING)} (all errors) |",
         "in m or rad, relative to the largest coordinate if that exceeds 1.",
         f"| the default | {standings[0]}",
