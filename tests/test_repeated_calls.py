@@ -190,6 +190,35 @@ def test_what_a_start_of_a_large_mechanism_has_shown_lets_no_start_of_a_small_on
             )
 
 
+@callback("constraint")
+def of_a_small_crank(t, q, p, C):
+    C[0], C[1] = q[0] - 1e-6 * np.cos(q[2] - 1e4), q[1] - np.sin(q[2] - 1e4)
+
+
+@callback("jacobian")
+def turned(t, q, p, Cq):
+    Cq[0, 0], Cq[0, 2] = 1.0, 1e-6 * np.sin(q[2] - 1e4)
+    Cq[1, 1], Cq[1, 2] = 1.0, -np.cos(q[2] - 1e4)
+
+
+def test_what_is_shown_where_an_entry_vanishes_lets_no_start_pass_where_it_does_not():
+    """At a dead centre nothing tells the micrometres of the first coordinate from the 1e4 rad of the last."""
+    callbacks = {"constraint": of_a_small_crank, "jacobian": turned, "force": no_force, "mass": three_equal_masses}
+
+    def refused(system, angle, off):
+        start = np.array([1e-6 * np.cos(angle) * (1.0 + off), np.sin(angle), 1e4 + angle])
+        try:
+            check_start(system, 0.0, start, np.zeros(3))
+        except ValueError:
+            return True
+        return False
+
+    known = ConstrainedSystem(n_q=3, n_c=2, constant_mass=True, **callbacks)
+    assert not refused(known, 1e-9, 1e-6)
+    places = [(angle, off) for angle in (1e-3, 0.3, 1.0) for off in (1e-7, 1e-6, 1e-5, 1e-4)]
+    assert all(refused(known, *place) for place in places)
+
+
 @pytest.mark.parametrize("make", [mechanisms.spatial_four_bar, mechanisms.spatial_slider_crank, mechanisms.heavy_top])
 def test_coordinates_that_are_zero_but_for_rounding_need_no_closer_look(make):
     """Another processor leaves 1e-50 in place of 0, and rows of such coordinates above the rounding of their terms."""

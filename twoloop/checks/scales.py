@@ -51,14 +51,19 @@ class Scales:
     def keep(self, system: ConstrainedSystem, q: Array, jacobian: Array) -> None:
         """Note, of a consistent position, how far coordinates move until they matter: beside it, rounding is nothing.
 
-        Looks at starts near it go by that, and need not find these scales once more. Elsewhere the mechanism may be
-        smaller by far. The latest of such positions are kept, each behind its sizes.
+        Looks at starts near it go by that where C_q has the same entries, and need not find these scales once more.
+        Elsewhere the mechanism may be smaller by far. The latest of such positions are kept: the sizes of each, where
+        it is, and which entries count there.
         """
+        from twoloop.kernels.algebra.scaling import NO_ENTRY
         from twoloop.kernels.evaluation.first_look import NEAR
 
-        known, of_this = system.made.get("sizes", NONE).reshape(-1, 2, len(q)), self.by_coordinate(self.reach, jacobian)
-        others = known[(np.abs(known[:, 1] - q) > NEAR * known[:, 0]).any(axis=1)][: MOST_PLACES - 1]
-        system.made["sizes"] = np.concatenate([of_this, q, others.ravel()])
+        n, size = len(q), np.abs(jacobian)
+        entries = (size > NO_ENTRY * size.max(axis=1, initial=0.0)[:, None]).ravel()
+        known = system.made.get("sizes", NONE).reshape(-1, 2 * n + entries.size)
+        away = (np.abs(known[:, n : 2 * n] - q) > NEAR * known[:, :n]).any(axis=1)
+        others = known[away | (known[:, 2 * n :] != entries).any(axis=1)][: MOST_PLACES - 1]
+        system.made["sizes"] = np.concatenate([self.by_coordinate(self.reach, jacobian), q, entries, others.ravel()])
 
 
 def sizes(q: Array) -> Array:

@@ -3,6 +3,7 @@
 from numba import types
 
 from twoloop.kernels.algebra.linalg import ldl_factor
+from twoloop.kernels.algebra.scaling import NO_ENTRY
 from twoloop.kernels.data.common import KIT, MATRIX, VECTOR, exact, f8, i8, kernel
 from twoloop.kernels.data.finite import finite, finite_vector
 from twoloop.kernels.data.flags import (
@@ -84,11 +85,25 @@ def _is_near(q, sizes, place):
 
 
 @exact
-def _known(q, sizes):
+def _has(rows, entries):
+    """Whether these entries of rows count, and no others: where one vanishes by its position, sizes say little."""
+    same, n = True, rows.shape[1]
+    for i in range(entries.size // n):
+        largest = 0.0
+        for j in range(n):
+            largest = max(largest, abs(rows[i, j]))
+        for j in range(n):
+            same = same and (abs(rows[i, j]) > NO_ENTRY * largest) == (entries[i * n + j] != 0.0)
+    return same
+
+
+@exact
+def _known(q, rows, n_c, sizes):
     """Where the sizes begin that are known of a position near this one; -1 where there are none."""
     n = q.size
-    for k in range(0, sizes.size, 2 * n):
-        if _is_near(q, sizes[k : k + n], sizes[k + n : k + 2 * n]):
+    width = 2 * n + n_c * n
+    for k in range(0, sizes.size, width):
+        if _is_near(q, sizes[k : k + n], sizes[k + n : k + 2 * n]) and _has(rows, sizes[k + 2 * n : k + width]):
             return k
     return -1
 
@@ -101,7 +116,7 @@ def _consistent(C, rate, rows, q, v, sizes, allowed):
     coordinates that are zero but for rounding, as in a plane, a constraint is not zero to rounding of its terms.
     """
     fastest, nothing = _largest(v), LEFT * _largest(q)
-    begin = _known(q, sizes)
+    begin = _known(q, rows, C.size, sizes)
     known = q if begin < 0 else sizes[begin : begin + q.size]
     for i in range(len(rows)):
         speed = 0.0
@@ -154,7 +169,7 @@ def look(f, t, q, v, sizes, lam, room, mass, rows, ways, pattern, least):
     """Flags of what is found at (t, q, v); arrays are full of zeros, but for `lam`, and these.
 
     `least` are relative: what counts as rounding of a state, as the asymmetry of M, and as an eigenvalue of M. In what
-    counts as rounding, no coordinate is less than its size near one of some positions: in `sizes` each follows its own.
+    counts as rounding, no coordinate is less than its size near one of some positions (`keep` of checks/scales.py).
     `ways` say how far from q, over its size, rows are looked at, too. `mass` and `rows` become M, and C_q with A,
     `pattern` 1 where rows have entries; `room`, of `room_size` numbers, begins with the force, C, and C_t with b.
     """
