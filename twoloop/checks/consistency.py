@@ -12,7 +12,7 @@ from twoloop.checks.arguments import Array
 from twoloop.checks.at_position import SINGULAR_MASS, not_finite, place_of_mass, ways
 from twoloop.checks.bounds import check_bounds
 from twoloop.checks.derivatives import check_derivatives
-from twoloop.checks.scales import EPS, scales_of
+from twoloop.checks.scales import EPS, NONE, scales_of
 from twoloop.checks.sparse_rows import largest_in_rows
 from twoloop.checks.values import UNSYMMETRIC, unsymmetric_mass
 from twoloop.checks.violation import ROUNDING, Violation, is_at_rounding, surely_consistent
@@ -65,7 +65,7 @@ def check_start(
         full = system.jacobian(t0, q0)
         scales = scales_of(system, t0, q0, full)
         Violation.of_position(system, t0, q0, full, scales).refuse("q0")
-        scales.keep(system, full)
+        scales.keep(system, q0, full)
     if derivatives:
         check_derivatives(system, t0, q0, exact)
     empty = np.flatnonzero(largest_in_rows(rows) == 0.0).tolist()
@@ -105,7 +105,6 @@ class Look:
             **{"looked": looked, "lam": _ones(system.n_c), "room": self._room, "mass": self.mass, "rows": self.rows},
             **{"ways": ways(n), "pattern": self.pattern, "least": LEAST},
         }
-        self._nothing = _zeros(n)
         self.definite: bool | None = None
 
     def at(self, t: float, q: Array, v: Array) -> int:
@@ -121,8 +120,8 @@ class Look:
         return found
 
     def sizes(self) -> Array:
-        """What no coordinate is less than in what counts as rounding: what a start before has shown, or nothing."""
-        sizes: Array = self.system.made.get("sizes", self._nothing)
+        """What no coordinate is less than in what counts as rounding, as starts before have shown of theirs."""
+        sizes: Array = self.system.made.get("sizes", NONE)
         return sizes
 
     def is_surely(self, found: int, t: float, q: Array, v: Array) -> bool:
@@ -153,8 +152,3 @@ def _in_order(system: ConstrainedSystem, t: float, q: Array, v: Array) -> bool:
 @cache
 def _ones(n: int) -> Array:
     return np.ones(n)
-
-
-@cache
-def _zeros(n: int) -> Array:
-    return np.zeros(n)

@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 FASTEST = 1e9  # times the motion by one's own size in a second: beyond, C_q is nearly zero and the drive is not so fast
 EPS = float(np.finfo(np.float64).eps)
 DISPLACEMENTS = (1e-2, 1e-4, 1e-6)  # of a coordinate, for the curvature of the constraints
+MOST_PLACES = 16  # positions whose sizes are kept
+NONE = np.zeros(0)
 TURNS = 0.1  # units: a row that is short beside what it becomes over this way is short by its position
 
 
@@ -46,12 +48,22 @@ class Scales:
         values = np.where(jacobian != 0.0, per_row[:, None], np.inf).min(axis=0, initial=np.inf)
         return self.columns * np.where(np.isfinite(values), values, per_row.min(initial=np.inf))
 
-    def keep(self, system: ConstrainedSystem, jacobian: Array) -> None:
+    def keep(self, system: ConstrainedSystem, q: Array, jacobian: Array) -> None:
         """Note, of a consistent position, how far coordinates move until they matter: beside it, rounding is nothing.
 
-        The look at the next start goes by it, and need not find these scales once more.
+        Looks at starts near it go by that where C_q has the same entries, and need not find these scales once more.
+        Elsewhere the mechanism may be smaller by far. The latest of such positions are kept: the sizes of each, where
+        it is, and which entries count there.
         """
-        system.made["sizes"] = self.by_coordinate(self.reach, jacobian)
+        from twoloop.kernels.algebra.scaling import NO_ENTRY
+        from twoloop.kernels.evaluation.first_look import NEAR
+
+        n, size = len(q), np.abs(jacobian)
+        entries = (size > NO_ENTRY * size.max(axis=1, initial=0.0)[:, None]).ravel()
+        known = system.made.get("sizes", NONE).reshape(-1, 2 * n + entries.size)
+        away = (np.abs(known[:, n : 2 * n] - q) > NEAR * known[:, :n]).any(axis=1)
+        others = known[away | (known[:, 2 * n :] != entries).any(axis=1)][: MOST_PLACES - 1]
+        system.made["sizes"] = np.concatenate([self.by_coordinate(self.reach, jacobian), q, entries, others.ravel()])
 
 
 def sizes(q: Array) -> Array:

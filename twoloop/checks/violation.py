@@ -55,7 +55,7 @@ def surely_consistent(
         scales = scales_of(system, t, q, rows)
     consistent = _surely_small(rows, C, scales, scales.reach)
     if consistent:
-        scales.keep(system, rows)
+        scales.keep(system, q, rows)
     return consistent
 
 

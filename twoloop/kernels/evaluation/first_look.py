@@ -3,6 +3,7 @@
 from numba import types
 
 from twoloop.kernels.algebra.linalg import ldl_factor
+from twoloop.kernels.algebra.scaling import NO_ENTRY
 from twoloop.kernels.data.common import KIT, MATRIX, VECTOR, exact, f8, i8, kernel
 from twoloop.kernels.data.finite import finite, finite_vector
 from twoloop.kernels.data.flags import (
@@ -18,6 +19,7 @@ from twoloop.kernels.data.flags import (
 # flags of what is found: all is finite, M symmetric, no row empty; the state on the rows but for rounding; an M that
 # varies definite, or not
 IN_ORDER, CONSISTENT, DEFINITE, INDEFINITE = 1, 2, 4, 8
+NEAR = 0.5  # of how far the coordinates move until they matter: where these are still of that size
 LEFT = 2.0**-52  # of the largest coordinate: one as small is rounding of zero
 SURELY = 2.0  # times what counts as no eigenvalue: what rounding does not reach
 
@@ -74,20 +76,55 @@ def _rounding(value, row, state, sizes, least, rate, allowed):
 
 
 @exact
+def _is_near(q, sizes, place):
+    """Whether a position is near another, of which these are the sizes, so that they are its own, too."""
+    near = True
+    for j in range(q.size):
+        near = near and abs(q[j] - place[j]) <= NEAR * sizes[j]
+    return near
+
+
+@exact
+def _has(rows, entries):
+    """Whether these entries of rows count, and no others: where one vanishes by its position, sizes say little."""
+    same, n = True, rows.shape[1]
+    for i in range(entries.size // n):
+        largest = 0.0
+        for j in range(n):
+            largest = max(largest, abs(rows[i, j]))
+        for j in range(n):
+            same = same and (abs(rows[i, j]) > NO_ENTRY * largest) == (entries[i * n + j] != 0.0)
+    return same
+
+
+@exact
+def _known(q, rows, n_c, sizes):
+    """Where the sizes begin that are known of a position near this one; -1 where there are none."""
+    n = q.size
+    width = 2 * n + n_c * n
+    for k in range(0, sizes.size, width):
+        if _is_near(q, sizes[k : k + n], sizes[k + n : k + 2 * n]) and _has(rows, sizes[k + 2 * n : k + width]):
+            return k
+    return -1
+
+
+@exact
 def _consistent(C, rate, rows, q, v, sizes, allowed):
     """Whether positions and velocities are on the rows but for rounding, of velocities of the fastest coordinate.
 
-    No coordinate counts as less than its size, or than what rounding leaves of the largest: of coordinates that are
-    zero but for rounding, as in a plane, a constraint is not zero to rounding of its terms.
+    No coordinate counts as less than its size, where that is known, or than what rounding leaves of the largest: of
+    coordinates that are zero but for rounding, as in a plane, a constraint is not zero to rounding of its terms.
     """
     fastest, nothing = _largest(v), LEFT * _largest(q)
+    begin = _known(q, rows, C.size, sizes)
+    known = q if begin < 0 else sizes[begin : begin + q.size]
     for i in range(len(rows)):
         speed = 0.0
         for j in range(q.size):
             speed += rows[i, j] * v[j]
         if not _rounding(speed + rate[i], rows[i], v, v, fastest, rate[i], allowed):
             return False
-        if i < C.size and not _rounding(C[i], rows[i], q, sizes, nothing, 0.0, allowed):
+        if i < C.size and not _rounding(C[i], rows[i], q, known, nothing, 0.0, allowed):
             return False
     return True
 
@@ -132,9 +169,9 @@ def look(f, t, q, v, sizes, lam, room, mass, rows, ways, pattern, least):
     """Flags of what is found at (t, q, v); arrays are full of zeros, but for `lam`, and these.
 
     `least` are relative: what counts as rounding of a state, as the asymmetry of M, and as an eigenvalue of M. In what
-    counts as rounding, no coordinate is less than its size. `ways` say how far from q, over its size, rows are looked
-    at, too. `mass` and `rows` become M, and C_q with A, `pattern` 1 where rows have entries; `room`, of `room_size`
-    numbers, begins with the force, C, and C_t with b.
+    counts as rounding, no coordinate is less than its size near one of some positions (`keep` of checks/scales.py).
+    `ways` say how far from q, over its size, rows are looked at, too. `mass` and `rows` become M, and C_q with A,
+    `pattern` 1 where rows have entries; `room`, of `room_size` numbers, begins with the force, C, and C_t with b.
     """
     n, n_c, n_rows, flags = q.size, lam.size, rows.shape[0], f.flags
     force, C, rate, gamma = n, n + n_c, n + n_c + n_rows, n + n_c + 2 * n_rows  # where they end
