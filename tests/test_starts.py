@@ -329,3 +329,16 @@ def test_runs_say_what_was_measured_where_steps_went_across():
             said.append((float(re.search(r"comes down to (\S+) of the largest", part)[1]), "lose rank" in part))
     assert said
     assert all(ratio <= 0.01 if lost else ratio >= 0.01 for ratio, lost in said), said
+
+
+def test_a_state_of_a_solution_starts_a_run_where_constraints_are_differences_of_large_terms():
+    """Their rounding is beyond that of what their derivatives multiply; a start that is off is refused all the same."""
+    problem = n_four_bar(40)
+    system, options = problem.system, {"rtol": 1e-12, "atol": 1e-12, "dense_output": True}
+    solution = solve_dae(system, (0.0, 1e-3), problem.q0, problem.v0, **options).sol
+    off = 1e-10 * np.random.default_rng(7).standard_normal(system.n_q)
+    for t in np.geomspace(1e-7, 9e-4, 8).tolist():
+        state = solution(t)
+        check_start(system, t, state.q, state.v, derivatives=False)
+        with pytest.raises(ValueError, match="not consistent"):
+            check_start(system, t, state.q + off, state.v, derivatives=False)
