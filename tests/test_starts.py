@@ -342,3 +342,20 @@ def test_a_state_of_a_solution_starts_a_run_where_constraints_are_differences_of
         check_start(system, t, state.q, state.v, derivatives=False)
         with pytest.raises(ValueError, match="not consistent"):
             check_start(system, t, state.q + off, state.v, derivatives=False)
+
+
+def test_velocities_are_judged_beside_what_rounding_of_the_positions_makes_of_them():
+    """Forty parallel bars a little away from where an entry of C_q of each vanishes."""
+    system, refused = n_four_bar(40).system, []
+    along = np.arange(41.0)
+    for angle in np.geomspace(1e-8, 1e-4, 200).tolist():
+        q = np.column_stack([along + np.sin(angle), np.full(41, np.cos(angle))]).ravel()
+        v = np.tile([np.cos(angle), -np.sin(angle)], 41)
+        try:
+            check_start(system, 0.0, q, v, derivatives=False)
+        except ValueError as error:
+            refused.append(str(error))
+        v[1::2] += 1e-7 * np.cos(along)  # along the bars
+        with pytest.raises(ValueError, match="v0 is not consistent"):
+            check_start(system, 0.0, q, v, derivatives=False)
+    assert not refused

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -81,16 +82,15 @@ def is_at_rounding(values: Array, rows: Rows, state: Array, rate: Array | float 
     return bool((np.abs(values) <= ROUNDING * EPS * (abs(rows) @ np.abs(state) + np.abs(rate))).all())
 
 
-def _noise(system: ConstrainedSystem, t: float, q: Array, values: Array, jacobian: Array) -> Array:
-    """What rounding makes of C, which may be a difference of terms that its derivatives do not show, (n_c,).
+def _noise(q: Array, change: Callable[[Array], Array], rows: Array, largest: float) -> Array:
+    """What rounding of a position q changes in values of constraints, by what they change to its neighbours, (n_rows,).
 
-    It is what C differs by between neighbouring numbers, less what C_q explains.
+    `largest`: of the coordinates or velocities that the rows are multiplied by.
     """
-    noise = np.zeros(len(values))
+    noise = np.zeros(len(rows))
     for k in range(NEIGHBOURS):
-        beside = q * (1.0 + EPS * np.roll(signs(len(q)), k))
-        noise = np.maximum(noise, np.abs(system.constraint(t, beside) - values - jacobian @ (beside - q)))
-    most = MOST_NOISE * float(np.abs(q).max(initial=0.0)) * np.abs(jacobian).max(axis=1, initial=0.0)
+        noise = np.maximum(noise, np.abs(change(q * (1.0 + EPS * np.roll(signs(len(q)), k)))))
+    most = MOST_NOISE * largest * np.abs(rows).max(axis=1, initial=0.0)
     return np.where(np.isfinite(noise), np.minimum(noise, most), 0.0)
 
 
@@ -131,8 +131,13 @@ class Violation:
     @classmethod
     def of_position(cls, system: ConstrainedSystem, t: float, q: Array, jacobian: Array, scales: Scales) -> Violation:
         """C(t, q) at a position."""
-        values = system.constraint(t, q)
-        terms = np.maximum(np.abs(jacobian) @ np.abs(q), _noise(system, t, q, values, jacobian) / EPS)
+        values, size = system.constraint(t, q), np.abs(q)
+
+        def change(beside: Array) -> Array:  # C may be a difference of terms that its derivatives do not show
+            return system.constraint(t, beside) - values - jacobian @ (beside - q)
+
+        noise = _noise(q, change, jacobian, float(size.max(initial=0.0)))
+        terms = np.maximum(np.abs(jacobian) @ size, noise / EPS)
         return cls(system, t, "C(t, q)", values, terms, jacobian, scales, scales.reach, np.abs(q))
 
     @classmethod
@@ -150,8 +155,13 @@ class Violation:
             pull = np.linalg.lstsq(mass, force, rcond=1e-12)[0]
         falling = np.sqrt(scales.reach * float(np.abs(pull / scales.columns).max()))
         speeds = np.maximum(np.maximum(fastest, np.abs(rate) / scales.rows), falling)
-        terms = np.abs(jacobian) @ np.abs(v) + np.abs(rate)
         equation, values = "C_q v + C_t" if system.n_a == 0 else "(C_q v + C_t, A v + b)", jacobian @ v + rate
+
+        def change(beside: Array) -> Array:  # rows turn
+            return system.rows(t, beside) @ v + system.rates(t, beside) - values
+
+        noise = _noise(q, change, jacobian, float(np.abs(v).max(initial=0.0)))
+        terms = np.maximum(np.abs(jacobian) @ np.abs(v) + np.abs(rate), noise / EPS)
         return cls(system, t, equation, values, terms, jacobian, scales, speeds, np.abs(v))
 
     @property
