@@ -202,7 +202,7 @@ def turned(t, q, p, Cq):
 
 
 def test_what_is_shown_where_an_entry_vanishes_lets_no_start_pass_where_it_does_not():
-    """At a dead centre nothing tells the micrometres of the first coordinate from the 1e4 rad of the last."""
+    """At a dead centre C_q does not tell the micrometres of the first coordinate from the 1e4 rad of the last."""
     callbacks = {"constraint": of_a_small_crank, "jacobian": turned, "force": no_force, "mass": three_equal_masses}
 
     def refused(system, angle, off):
@@ -214,8 +214,9 @@ def test_what_is_shown_where_an_entry_vanishes_lets_no_start_pass_where_it_does_
         return False
 
     known = ConstrainedSystem(n_q=3, n_c=2, constant_mass=True, **callbacks)
-    assert not refused(known, 1e-9, 1e-6)
-    places = [(angle, off) for angle in (1e-3, 0.3, 1.0) for off in (1e-7, 1e-6, 1e-5, 1e-4)]
+    assert not refused(known, 1e-9, 1e-9)
+    assert "sizes" in known.made
+    places = [(angle, off) for angle in (1e-9, 1e-3, 0.3, 1.0) for off in (1e-7, 1e-6, 1e-5, 1e-4)]
     assert all(refused(known, *place) for place in places)
 
 

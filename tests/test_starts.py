@@ -93,7 +93,7 @@ def test_every_coordinate_counts_in_its_own_unit(case):
     rest = np.zeros(case.n_q)
     assert accepted(system, q, rest)
     for j in range(case.n_q):
-        size = min(abs(q[j]), 10.0)
+        size = min(abs(q[j]), 100.0)
         for part, fine in ((1e-13, True), (1e-6, False), (1e-3, False)):
             moved = q.copy()
             moved[j] += part * size
@@ -215,7 +215,7 @@ def test_velocities_off_by_rounding_of_the_fastest_are_no_violation_and_larger_o
         state = solution(t)
         check_start(problem.system, t, state.q, state.v)
         with pytest.raises(ValueError, match="v0 is not consistent"):
-            check_start(problem.system, t, state.q, state.v + 1e-9 * problem.system.jacobian(t, state.q)[0])
+            check_start(problem.system, t, state.q, state.v + 1e-7 * problem.system.jacobian(t, state.q)[0])
 
 
 # --- guesses that are a little off
@@ -336,7 +336,7 @@ def test_a_state_of_a_solution_starts_a_run_where_constraints_are_differences_of
     problem = n_four_bar(40)
     system, options = problem.system, {"rtol": 1e-12, "atol": 1e-12, "dense_output": True}
     solution = solve_dae(system, (0.0, 1e-3), problem.q0, problem.v0, **options).sol
-    off = 1e-10 * np.random.default_rng(7).standard_normal(system.n_q)
+    off = 1e-7 * np.random.default_rng(7).standard_normal(system.n_q)
     for t in np.geomspace(1e-7, 9e-4, 8).tolist():
         state = solution(t)
         check_start(system, t, state.q, state.v, derivatives=False)
@@ -359,3 +359,42 @@ def test_velocities_are_judged_beside_what_rounding_of_the_positions_makes_of_th
         with pytest.raises(ValueError, match="v0 is not consistent"):
             check_start(system, 0.0, q, v, derivatives=False)
     assert not refused
+
+
+# --- next to where entries of C_q vanish by the position alone
+def hanging(angle, wrong=1.0):
+    """Three points one below the other on rods of 1 m, next to upright; gamma may be wrong in its vertical terms."""
+
+    def parts(x):
+        return np.diff(np.vstack([np.zeros(2), x.reshape(3, 2)]), axis=0)
+
+    def jacobian(t, q):
+        rows, d = np.zeros((3, 3, 2)), parts(q)
+        for i in range(3):
+            rows[i, i] = d[i]
+            rows[i, i - 1] -= d[i] if i > 0 else 0.0
+        return rows.reshape(3, 6)
+
+    system = unconstrained(
+        lambda t, q, v: np.tile([0.0, -9.81], 3),
+        6,
+        n_c=3,
+        constraint=lambda t, q: 0.5 * (parts(q) ** 2).sum(axis=1) - 0.5,
+        jacobian=jacobian,
+        gamma=lambda t, q, v: -(parts(v) ** 2) @ np.array([1.0, wrong]),
+    )
+    down = np.array([math.sin(angle), -math.cos(angle)])
+    below = np.arange(1.0, 4.0)[:, None]
+    return system, (below * down).ravel(), (below * [-down[1], down[0]]).ravel()
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-11, 1e-9, 1e-8, 1e-6, 1e-4, 1e-2, 0.3])
+def test_what_vanishes_by_the_position_alone_hides_no_error(angle):
+    system, q, v = hanging(angle)
+    assert accepted(system, q, v)
+    for off in (1e-6, 1e-3, 1.0):
+        assert not accepted(system, q, v + off * q)  # along the rods
+        assert not accepted(system, (1.0 + off) * q, v)
+    for wrong in (1.01, 2.0):
+        with pytest.raises(ValueError, match="gamma of"):
+            check_start(hanging(angle, wrong)[0], 0.0, q, v)

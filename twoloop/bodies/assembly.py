@@ -12,7 +12,7 @@ from scipy.linalg import lapack, null_space
 from scipy.optimize import least_squares
 
 from twoloop.checks.arguments import Array
-from twoloop.checks.scales import TURNS, column_scales, generic_factors, median, scales_of
+from twoloop.checks.scales import TURNS, generic_factors, median, scales_of, units
 from twoloop.checks.sparse_rows import SparseRows, norms
 from twoloop.problem.description import name_and_unit
 from twoloop.problem.system import ConstrainedSystem
@@ -295,17 +295,17 @@ def _has_full_rank_sparse(system: ConstrainedSystem, t: float, q: Array) -> bool
     from scipy.sparse.linalg import LinearOperator, onenormest, splu
 
     size = np.abs(q)
-    columns = column_scales(rows, np.maximum(size, median(size[size > 0.0]) if size.any() else 1.0))
-    way, units = DIFFERENCE_STEP * columns * generic_factors(len(q)), columns[rows.columns]
+    columns = units(system, t, q, rows, np.maximum(size, median(size[size > 0.0]) if size.any() else 1.0))
+    way, unit = DIFFERENCE_STEP * columns * generic_factors(len(q)), columns[rows.columns]
     try:
         sides = [rows.added(system.jacobian_values(t, q + part)) for part in (way, -way)]
     except Exception:  # outside the domain of the callbacks
         return False
-    turned = norms(rows.with_values((sides[0] - sides[1]) * units)) / (2.0 * DIFFERENCE_STEP)
-    lengths = np.maximum(norms(rows.with_values(rows.values * units)), TURNS * turned)
+    turned = norms(rows.with_values((sides[0] - sides[1]) * unit)) / (2.0 * DIFFERENCE_STEP)
+    lengths = np.maximum(norms(rows.with_values(rows.values * unit)), TURNS * turned)
     if not (lengths > 0.0).all():
         return False
-    scaled = csc_array((rows.values * units / lengths[rows.rows], (rows.rows, rows.columns)), shape=rows.shape)
+    scaled = csc_array((rows.values * unit / lengths[rows.rows], (rows.rows, rows.columns)), shape=rows.shape)
     square = (scaled @ scaled.T).tocsc()
     try:
         factors = splu(square, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})

@@ -91,7 +91,7 @@ def wrong_derivative(system: ConstrainedSystem, t: float, q: Array, v: Array) ->
     if jacobian.size == 0 or not (is_finite(jacobian) and np.isfinite(rate).all()):
         return None
     n_c = system.n_c
-    generic = generic_velocities(jacobian, rate, q)[-1]
+    generic = generic_velocities(system, t, q, jacobian, rate)[-1]
     generic = generic * max(1.0, float(np.abs(v).max()) / float(np.abs(generic).max()))
     scale = min(TIME, _time_scale(q, generic))
     noise = EPS * (abs(jacobian) @ np.abs(q))[:n_c]
@@ -167,7 +167,7 @@ def _wrong_constraint(system: ConstrainedSystem, t: float, q: Array, sides: tupl
     if not (is_finite(jacobian) and np.isfinite(rate).all()):
         return None
     for kind, rows in _gammas(system):
-        for v in generic_velocities(jacobian, rate, q):
+        for v in generic_velocities(system, t, q, jacobian, rate):
             given = defined(lambda kind=kind, v=v: system.evaluate(kind, t, q, v))  # type: ignore[misc]
             if given is None:
                 continue

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from twoloop.checks.arguments import Array
 from twoloop.checks.bounds import check_callback
-from twoloop.checks.sparse_rows import Rows, SparseRows
+from twoloop.checks.sparse_rows import Rows, SparseRows, is_finite
 from twoloop.kernels.compile.linking import direct
 
 if TYPE_CHECKING:
@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 FASTEST = 1e9  # times the motion by one's own size in a second: beyond, C_q is nearly zero and the drive is not so fast
 EPS = float(np.finfo(np.float64).eps)
 DISPLACEMENTS = (1e-2, 1e-4, 1e-6)  # of a coordinate, for the curvature of the constraints
+MOST_UNITS, SETTLED = 10, 1.5  # times that units are looked for; by what factor they may change then
 MOST_PLACES = 16  # positions whose sizes are kept
 NONE = np.zeros(0)
 TURNS = 0.1  # units: a row that is short beside what it becomes over this way is short by its position
@@ -130,7 +131,7 @@ def scales_of(system: ConstrainedSystem, t: float, q: Array, jacobian: Array) ->
 
     size = np.abs(q)
     typical = median(size[size > NEGLIGIBLE * size.max()]) if size.any() else 1.0
-    columns = column_scales(jacobian, np.maximum(size, typical))
+    columns = units(system, t, q, jacobian, np.maximum(size, typical))
     in_units = np.abs(jacobian) * columns
     norms, curvature = np.sqrt((in_units * in_units).sum(axis=1)), _curvature(system, t, q, columns, len(jacobian))
     rows = np.maximum(norms, TURNS * curvature)
@@ -141,6 +142,39 @@ def scales_of(system: ConstrainedSystem, t: float, q: Array, jacobian: Array) ->
     reach, negligible = np.ones(len(rows)), NEGLIGIBLE * float(in_units.max(initial=0.0))
     direct(reaches)(in_units, radius, negligible, np.zeros(len(q)), reach)
     return Scales(columns, rows, reach)
+
+
+def units(system: ConstrainedSystem, t: float, q: Array, jacobian: Rows, typical: Array) -> Array:
+    """Units of the coordinates in which entries of C_q, with A or without, are of like size, here or a unit away.
+
+    An entry that is small by the position alone, as of a bar next to upright, says nothing about units.
+    """
+    columns, way = column_scales(jacobian, typical), generic_factors(len(q))
+    for _ in range(MOST_UNITS):
+        largest = jacobian
+        for side in (way, -way):
+            largest = _larger(largest, _beside(system, t, q + side * columns, jacobian))
+        found = column_scales(largest, typical)
+        if (np.maximum(columns / found, found / columns) < SETTLED).all():
+            break
+        columns = np.cbrt(columns * found * found)  # twice the unit makes half the unit of an entry that grows with it
+    return columns
+
+
+def _beside(system: ConstrainedSystem, t: float, q: Array, like: Rows) -> Rows | None:
+    """Rows at a position beside another, which may be outside what the callbacks are made for."""
+    try:
+        rows = system.sparse_rows(t, q) if isinstance(like, SparseRows) else system.rows(t, q)[: len(like)]
+    except Exception:  # of a callback
+        return None
+    return rows if is_finite(rows) else None
+
+
+def _larger(one: Rows, other: Rows | None) -> Rows:
+    """Entries of the larger magnitude, which is what they become."""
+    if isinstance(one, SparseRows):
+        return one.with_values(np.maximum(abs(one.values), abs(other.values))) if isinstance(other, SparseRows) else one
+    return np.maximum(abs(one), abs(other)) if isinstance(other, np.ndarray) else one
 
 
 def rows_at(system: ConstrainedSystem, t: float, places: Array) -> tuple[Array, NDArray[np.bool_]]:
@@ -185,10 +219,10 @@ def _curvature(system: ConstrainedSystem, t: float, q: Array, columns: Array, n_
     return largest
 
 
-def generic_velocities(jacobian: Rows, rate: Array, q: Array) -> list[Array]:
+def generic_velocities(system: ConstrainedSystem, t: float, q: Array, jacobian: Rows, rate: Array) -> list[Array]:
     """Velocities in which each coordinate matters; where C_t is not zero, the last are as fast as the drive."""
     size = sizes(q)
-    v = column_scales(jacobian, size) * generic_factors(len(q))
+    v = units(system, t, q, jacobian, size) * generic_factors(len(q))
     v = v / median(np.abs(v) / size)
     driven, moved = rate != 0.0, abs(jacobian) @ np.abs(v)
     if not (driven & (moved > 0.0)).any():

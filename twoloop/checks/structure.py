@@ -53,7 +53,7 @@ def wrong_kinematics(system: ConstrainedSystem, t: float, q: Array) -> str | Non
     if "kinematics" not in system.given:
         return None
     _, rate, rows = _compared(system, t, q, 0.0 * q)
-    v = generic_velocities(rows, rate, q)[-1]
+    v = generic_velocities(system, t, q, rows, rate)[-1]
     for place in (q, q + NEAR * v):
         if _compared(system, t, place, v)[0]:
             continue

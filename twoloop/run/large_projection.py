@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from twoloop.checks.scales import column_scales, median
+from twoloop.checks.scales import median, units
 from twoloop.checks.sparse_rows import SparseRows
 from twoloop.checks.violation import is_at_rounding
 from twoloop.kernels.compile.linking import direct
@@ -111,9 +111,9 @@ def dependence(system: ConstrainedSystem, t: float, q: Array) -> Dependence | No
             metric.ask(tasks.SOLVE, all_rows.row(row), np.zeros(system.n_c), room, shares[row])
     metric.at = q
     size = np.abs(q)
-    units = column_scales(all_rows, np.maximum(size, median(size[size > 0.0]) if size.any() else 1.0))
-    allowed = metric.nearest(units * np.random.default_rng(3).uniform(0.5, 1.0, len(q)))
-    most = float((np.abs(allowed) / units).max())
+    columns = units(system, t, q, all_rows, np.maximum(size, median(size[size > 0.0]) if size.any() else 1.0))
+    allowed = metric.nearest(columns * np.random.default_rng(3).uniform(0.5, 1.0, len(q)))
+    most = float((np.abs(allowed) / columns).max())
     return Dependence(len(counted), shares, allowed / most if most > 0.0 else allowed, metric.onto_constraints)
 
 

@@ -14,7 +14,7 @@ from twoloop.checks.arguments import check_finite, check_flag, check_indices, ch
 from twoloop.checks.at_position import not_finite
 from twoloop.checks.bounds import check_bounds
 from twoloop.checks.scales import Scales, scales_of
-from twoloop.checks.violation import Violation
+from twoloop.checks.violation import CONSISTENT, Violation
 from twoloop.problem.system import ConstrainedSystem, check_system
 from twoloop.run.large_projection import STRAIGHT, project_sparsely
 
@@ -175,7 +175,8 @@ def _position(
             f"q cannot be projected onto the constraints of {system.name!r} at t = {t!r}: {reached}. Give a guess that "
             f"is nearer to an assembled position{_smallest(scales, jacobian, free, kept)}"
         )
-    if start.excess > 1.0 and check_assembly:
+    far = float((np.abs(found - guess) / scales.columns).max())
+    if check_assembly and (start.excess > 1.0 or far > CONSISTENT):  # next to a dead centre a small error moves far
         other = _another_assembly(system, t, found, guess, free, scales, cut)
         if other is not None:
             there = system.jacobian(t, found)
