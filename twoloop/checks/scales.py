@@ -149,32 +149,29 @@ def units(system: ConstrainedSystem, t: float, q: Array, jacobian: Rows, typical
 
     An entry that is small by the position alone, as of a bar next to upright, says nothing about units.
     """
-    columns, way = column_scales(jacobian, typical), generic_factors(len(q))
+    columns, ways = column_scales(jacobian, typical), np.outer([1.0, -1.0], generic_factors(len(q)))
     for _ in range(MOST_UNITS):
-        largest = jacobian
-        for side in (way, -way):
-            largest = _larger(largest, _beside(system, t, q + side * columns, jacobian))
-        found = column_scales(largest, typical)
+        found = column_scales(_largest(system, t, q + columns * ways, jacobian), typical)
         if (np.maximum(columns / found, found / columns) < SETTLED).all():
             break
         columns = np.cbrt(columns * found * found)  # twice the unit makes half the unit of an entry that grows with it
     return columns
 
 
-def _beside(system: ConstrainedSystem, t: float, q: Array, like: Rows) -> Rows | None:
-    """Rows at a position beside another, which may be outside what the callbacks are made for."""
-    try:
-        rows = system.sparse_rows(t, q) if isinstance(like, SparseRows) else system.rows(t, q)[: len(like)]
-    except Exception:  # of a callback
-        return None
-    return rows if is_finite(rows) else None
-
-
-def _larger(one: Rows, other: Rows | None) -> Rows:
-    """Entries of the larger magnitude, which is what they become."""
-    if isinstance(one, SparseRows):
-        return one.with_values(np.maximum(abs(one.values), abs(other.values))) if isinstance(other, SparseRows) else one
-    return np.maximum(abs(one), abs(other)) if isinstance(other, np.ndarray) else one
+def _largest(system: ConstrainedSystem, t: float, places: Array, here: Rows) -> Rows:
+    """Entries of rows of the largest magnitude, here and at other places, where the callbacks may not be defined."""
+    if not isinstance(here, SparseRows):
+        beside = rows_at(system, t, places)[0][:, : len(here)]
+        return np.maximum(abs(here), abs(np.where(np.isfinite(beside), beside, 0.0)).max(axis=0))
+    largest = abs(here.values)
+    for place in places:
+        try:
+            rows = system.sparse_rows(t, place)
+        except Exception:  # outside what the callbacks are made for
+            continue
+        if isinstance(rows, SparseRows) and is_finite(rows):
+            largest = np.maximum(largest, abs(rows.values))
+    return here.with_values(largest)
 
 
 def rows_at(system: ConstrainedSystem, t: float, places: Array) -> tuple[Array, NDArray[np.bool_]]:
