@@ -12,6 +12,7 @@ import pytest
 from tests.derivative_cases import UNITS, lever, linkage, slider_crank
 from tests.problems import pendulum, unconstrained, worst
 from twoloop import ConstraintWarning, consistent_state, solve_dae
+from twoloop.bodies import SpatialModel
 from twoloop.checks.consistency import check_start
 from twoloop.mechanisms import (
     andrews,
@@ -398,3 +399,17 @@ def test_what_vanishes_by_the_position_alone_hides_no_error(angle):
     for wrong in (1.01, 2.0):
         with pytest.raises(ValueError, match="gamma of"):
             check_start(hanging(angle, wrong)[0], 0.0, q, v)
+
+
+@pytest.mark.parametrize("turned", [1e-9, 1e-7, 1e-5, 1e-3])
+def test_an_inertia_that_is_rounding_of_zero_makes_no_velocity_consistent(turned):
+    """Euler parameters have one in the direction of their norm, and rounding may leave M an inverse of 1e16."""
+    random = np.random.default_rng(8)
+    for _ in range(12):  # which M has an inverse then hangs on the processor
+        model, end = SpatialModel(name="rod"), (0.5, 0.0, 0.0) + turned * random.standard_normal(3)
+        model.rod("rod", (0.0, 0.0, 0.0), tuple(end), mass=1.0, radius=0.05)
+        model.spherical("ground", "rod", at=(0.0, 0.0, 0.0))
+        problem = model.problem(t_span=(0.0, 1.0))
+        assert accepted(problem.system, problem.q0, problem.v0)
+        for row in problem.system.jacobian(0.0, problem.q0):
+            assert not accepted(problem.system, problem.q0, problem.v0 + 1e-3 * row)

@@ -9,8 +9,9 @@ import numpy as np
 from scipy.linalg import lapack
 
 from twoloop.checks.arguments import Array
+from twoloop.checks.differences import defined
 from twoloop.checks.rank import least_solution
-from twoloop.checks.scales import EPS, Scales, scales_of, signs
+from twoloop.checks.scales import EPS, Scales, generic_factors, scales_of, signs
 from twoloop.checks.sparse_rows import Rows, SparseRows
 
 if TYPE_CHECKING:
@@ -22,6 +23,7 @@ SURELY = 0.1  # of that: where no more is needed, there is no doubt
 TIED = 1e-6  # relative: corrections that exceed what is allowed by as much, of which the first is named
 NEIGHBOURS = 4  # of a position, at which constraints are looked at for rounding
 MOST_NOISE = 1e-11  # of the largest coordinate: what counts as rounding of a constraint
+NO_INERTIA = 1e-12  # of the largest: singular values of M in such units that are rounding of zero
 ROUNDING = 64.0  # times the spacing of floating-point numbers: what rounding of the state may add to it
 
 
@@ -94,6 +96,22 @@ def _noise(q: Array, change: Callable[[Array], Array], rows: Array, largest: flo
     return np.where(np.isfinite(noise), np.minimum(noise, most), 0.0)
 
 
+def _without_constraints(system: ConstrainedSystem, t: float, q: Array, v: Array, columns: Array) -> Array:
+    """Accelerations M^-1 Q; none in directions without inertia, which the constraints exclude, as of Euler parameters.
+
+    Rounding may leave such an M an inverse of 1e16, so it is cut off, in units in which the largest inertia of each
+    coordinate, here or a unit away, is 1.
+    """
+    mass, inertia = system.mass(t, q), np.zeros(len(q))
+    for each in (mass, defined(lambda: system.mass(t, q + columns * generic_factors(len(q))))):
+        if each is not None:
+            inertia = np.maximum(inertia, np.abs(np.diag(each)))
+    units = np.divide(1.0, np.sqrt(inertia), out=np.zeros(len(q)), where=inertia > 0.0)
+    force = system.force(t, q, v)
+    found: Array = units * np.linalg.lstsq(units[:, None] * mass * units, units * force, rcond=NO_INERTIA)[0]
+    return found
+
+
 class Violation:
     """What a state violates, as the change of coordinates (or velocities) that would put it right.
 
@@ -147,12 +165,7 @@ class Violation:
         """C_q v + C_t and A v + b, beside what is fast there: velocities, drives, what forces can bring about."""
         rate = system.rates(t, q)
         fastest = np.where(jacobian != 0.0, np.abs(v) / scales.columns, 0.0).max(axis=1)
-        mass, force = system.mass(t, q), system.force(t, q, v)
-        try:
-            np.linalg.cholesky(mass)
-            pull = np.linalg.solve(mass, force)
-        except np.linalg.LinAlgError:  # no inertia in some directions, which the constraints exclude
-            pull = np.linalg.lstsq(mass, force, rcond=1e-12)[0]
+        pull = _without_constraints(system, t, q, v, scales.columns)
         falling = np.sqrt(scales.reach * float(np.abs(pull / scales.columns).max()))
         speeds = np.maximum(np.maximum(fastest, np.abs(rate) / scales.rows), falling)
         equation, values = "C_q v + C_t" if system.n_a == 0 else "(C_q v + C_t, A v + b)", jacobian @ v + rate
