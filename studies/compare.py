@@ -30,6 +30,7 @@ from twoloop.rows.leaderboard import boards
 from twoloop.rows.row_format import text_of
 
 GROUP = "compare"
+FOLDER = "compare"  # of the report, unless --out is given
 ERRORS = (1e-2, 1e-4, 1e-6, 1e-8)
 QUICK = (1e-3, 1e-6, 1e-9)  # values of tolerances in a quick comparison
 REFERENCE_LIMIT = 300.0  # s of wall-clock time for each run of the reference
@@ -160,7 +161,7 @@ def _failed(rows: pd.DataFrame, coded: bool) -> str:
 
 
 def _work(words: Sequence[str] | None) -> None:
-    parser = cli.parser("compare", __doc__)
+    parser = cli.parser("compare", __doc__, quick="one repetition and few settings", folder=FOLDER)
     what = "FILE.py:FUNCTION, which returns a twoloop.mechanisms.Problem, or a ready mechanism"
     parser.add_argument("where", metavar="MECHANISM", help=what)
     what = "FILE.py:FUNCTION, simulate(problem, times, tolerance) as check_simulator takes it, or sundae_ida, "
@@ -178,7 +179,7 @@ def _work(words: Sequence[str] | None) -> None:
     unknown = [name for name in given.solvers or () if name not in CATALOGUE]
     if unknown:
         raise StudyError(f"no solver is called {unknown[0]!r}; there are: {'; '.join(CATALOGUE)}")
-    given.out = given.out or Path("compare")
+    given.out = given.out or Path(FOLDER)
     problem = load_problem(given.where)
     t_end = problem.t_span[1] if given.t_end is None else given.t_end
     positive = {"errors": given.errors, "reference-limit": [given.reference_limit], "time-limit": [given.time_limit]}

@@ -120,6 +120,12 @@ def test_an_exception_at_the_start_has_its_time_too():
     refuses(OwnError, r"(?s)never.*force of system 'pendulum' at t = 0", pendulum(force=fails))
 
 
+def test_a_message_on_many_entries_is_short():
+    with pytest.raises(ValueError, match=r"t_eval must be finite; entries \[0, 1, .*: given \[nan, nan") as error:
+        solve(pendulum(), t_eval=np.full(100_000, np.nan))
+    assert len(str(error.value)) < 400
+
+
 def test_a_fixed_step_into_values_that_are_not_finite():
     system = pendulum(force=lambda t, q, v: np.array([0.0, -9.81 if t < 0.5 else np.nan]))
     result = solve(system, step_size=0.01)

@@ -36,11 +36,16 @@ class Call:
     command: str  # for the stamp
 
 
-def parser(name: str, description: str | None) -> argparse.ArgumentParser:
+def parser(
+    name: str,
+    description: str | None,
+    quick: str = "a small version in seconds, into reports/quick",
+    folder: str = "reports",
+) -> argparse.ArgumentParser:
     """The options that all studies have; `name` is what follows `python -m studies.`."""
     made = argparse.ArgumentParser(prog=f"python -m studies.{name}", description=description)
-    made.add_argument("--quick", action="store_true", help="a small version in seconds, into reports/quick")
-    made.add_argument("--out", type=Path, help="folder for the report (default: reports)")
+    made.add_argument("--quick", action="store_true", help=quick)
+    made.add_argument("--out", type=Path, help=f"folder for the report (default: {folder})")
     made.add_argument("--redraw", action="store_true", help="write report and figures again from the saved rows")
     return made
 

@@ -41,7 +41,13 @@ ENSEMBLES = [
     of_ensemble(
         "a start with a NaN",
         lambda: many(moved(1, np.nan)),
-        "q0 must be finite; row 1 is not",
+        r"q0 must be finite; row 1 is not: given \[nan",
+        "find out where the NaN comes from",
+    ),
+    of_ensemble(
+        "one start for all runs, with a NaN",
+        lambda: many(np.r_[0.0, np.nan, LINKAGE.q0[2:]]),
+        r"q0 must be finite; entries \[1\] are not: given \[nan\]",
         "find out where the NaN comes from",
     ),
     of_ensemble("`threads=0`", lambda: many(threads=0), "threads must be at least 1", "leave it out: all cores"),

@@ -129,7 +129,7 @@ METHODS = [
         "A",
         ([[0.5, 0.0]], ValueError, r"must have shape \(1, 1\).*given shape \(1, 2\)", "give s rows and columns"),
         (0.5, ValueError, r"must have shape \(1, 1\)", "give s rows and columns"),
-        ([[np.nan]], ValueError, "must be finite", "give finite coefficients"),
+        ([[np.nan]], ValueError, r"must be finite; entries \[\[0, 0\]\] are not", "give finite coefficients"),
         ([["1/2"]], TypeError, "must be an array of real numbers", "give numbers"),
         ([[True]], TypeError, "must be an array of real numbers", "give numbers"),
     ),

@@ -26,7 +26,7 @@ MULTIPLES = "give numbers of steps such as (100, 200, 400)"
 NAMES = "give 'smoke', 'all', or names of `problems()`"
 SIMULATORS = [
     of_check("the path of a file", lambda: check("solver.py")).says(
-        "simulate must be a function of .*given str", "import the function", TypeError
+        "simulate must be a function of .*given 'solver.py' of type str", "import the function", TypeError
     ),
     of_check("a simulator of the problem alone", lambda: check(lambda problem: None)).says(
         r"simulate is called as simulate\(problem, times, tolerance\); the function given takes \(problem\)",

@@ -51,7 +51,12 @@ SOLVE = [
         ([], ValueError, "must be a non-empty", "leave it out to get every step"),
         ([[0.1, 0.2]], ValueError, "must be a non-empty one-dimensional array; given shape", "ravel() it"),
         (0.5, ValueError, "must be a non-empty one-dimensional array", "give a list: [0.5]"),
-        ([0.1, np.nan], ValueError, r"must be finite; entries \[1\]", "find out where the NaN comes from"),
+        (
+            [0.1, np.nan],
+            ValueError,
+            r"must be finite; entries \[1\] .*given \[nan\]",
+            "find out where the NaN comes from",
+        ),
         (["soon"], TypeError, "must be an array of real numbers", "give seconds"),
         ([0.5 + 1.0j], TypeError, "must be an array of real numbers", "give seconds"),
         ([False, True], TypeError, "must be an array of real numbers", "give seconds"),

@@ -87,6 +87,14 @@ def test_wrong_mechanisms_are_named(file, where, says):
         compare.load_problem(where.format(file=file))
 
 
+def test_help_names_the_folder_of_its_own_report(capsys):
+    with pytest.raises(SystemExit):
+        compare.main(["--help"])
+    text = " ".join(capsys.readouterr().out.split())
+    assert "folder for the report (default: compare)" in text and "one repetition and few settings" in text
+    assert "reports/quick" not in text  # a report on a mechanism of one's own goes elsewhere
+
+
 def test_errors_are_one_line(file, capsys):
     for words, says in (
         ([f"{file}:swing", "--solvers", "Guass12"], "no solver is called 'Guass12'"),

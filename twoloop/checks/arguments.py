@@ -114,13 +114,21 @@ def _holds_bool(value: Any) -> bool:
     return isinstance(value, (bool, np.bool_)) or (isinstance(value, np.ndarray) and value.dtype.kind == "b")
 
 
+def wrong_entries(name: str, wanted: str, array: Array, wrong: NDArray[np.bool_]) -> ValueError:
+    """The error that says which entries of an array are not as they must be, and what they are."""
+    places = np.argwhere(wrong)
+    listed = places.ravel() if array.ndim == 1 else places
+    given = f"given {shown(array[wrong].tolist())}"
+    return ValueError(f"{name} must be {wanted}; entries {shown(listed.tolist())} are not: {given}")
+
+
 def check_vector(name: str, value: ArrayLike, n: int) -> Array:
     """Return `value` as a new float vector of length n, or say what is wrong with it."""
     array = check_real(name, value)
     if array.shape != (n,):
         raise ValueError(f"{name} must have shape ({n},); given shape {array.shape}")
     if not math.isfinite(sum(array.tolist())) and not np.isfinite(array).all():  # sums may be too large
-        raise ValueError(f"{name} must be finite; entries {np.flatnonzero(~np.isfinite(array)).tolist()} are not")
+        raise wrong_entries(name, "finite", array, ~np.isfinite(array))
     return array
 
 
@@ -207,9 +215,9 @@ def check_tolerance(name: str, value: ArrayLike, n_q: int) -> Array:
         raise ValueError(
             f"{name} must be a number or have one for each coordinate, shape ({n_q},); given shape {array.shape}"
         )
-    wrong = np.flatnonzero(~((array > 0.0) & np.isfinite(array)))
-    if wrong.size:
-        raise ValueError(f"{name} must be positive and finite; entries {wrong.tolist()} are not")
+    fine = (array > 0.0) & np.isfinite(array)
+    if not fine.all():
+        raise wrong_entries(name, "positive and finite", array, ~fine)
     return array
 
 
@@ -219,7 +227,7 @@ def check_times(t_eval: ArrayLike, t0: float, t1: float, step_size: float | None
     if times.ndim != 1 or times.size == 0:
         raise ValueError(f"t_eval must be a non-empty one-dimensional array; given shape {times.shape}")
     if not np.isfinite(times).all():
-        raise ValueError(f"t_eval must be finite; entries {np.flatnonzero(~np.isfinite(times)).tolist()} are not")
+        raise wrong_entries("t_eval", "finite", times, ~np.isfinite(times))
     if times.min() < t0 or times.max() > t1:
         raise ValueError(
             f"t_eval must lie within t_span = ({t0!r}, {t1!r}); given times from {float(times.min())!r} to "

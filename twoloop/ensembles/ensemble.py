@@ -46,9 +46,9 @@ def ensemble(
     the same code, which is kept on disk.
 
     What lanes cannot do is made by `solve_dae`, run by run: runs that come near a singular position, systems whose
-    callbacks branch or that have nonholonomic rows, events, and other methods. The first run is also made by
-    `solve_dae`, with all of its checks. At the end of every other run, the callbacks are compared with what was found
-    there.
+    callbacks branch or that have nonholonomic rows, events, and other methods. So are runs that take less than a
+    twentieth of the estimated time to make their code. The first run is also made by `solve_dae`, with all of its
+    checks. At the end of every other run, the callbacks are compared with what was found there.
 
     Parameters
     ----------
@@ -64,9 +64,9 @@ def ensemble(
     method : str or method object
         "auto", "Taylor", "DOP853", "RadauIIA5", "RadauIIA9" and "RadauIIA13" go in lanes. "auto" takes Taylor series
         there, and DOP853 for runs that these cannot do and for systems that have none; at tolerances from 1e-9 on it
-        takes DOP853 first where series take more than six operations a coordinate. If the first run came to
-        Newton's method, it takes a Radau method for all runs, of order 5 at tolerances from 9e-7 on and of order 9
-        below, with errors tested as by `Auto`.
+        takes DOP853 first where series take more than six operations a coordinate and no force may act for a short
+        time. If the first run came to Newton's method, it takes a Radau method for all runs, of order 5 at tolerances
+        from 9e-7 on and of order 9 below, with errors tested as by `Auto`.
     threads : int, optional
         None: one for each core that this process may use. Results do not depend on it.
 

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from twoloop.checks.arguments import Array, check_real
+from twoloop.checks.arguments import Array, check_real, shown, wrong_entries
 from twoloop.problem.system import ConstrainedSystem
 
 AT_ROUNDING = 64.0  # times rounding of its terms: an equation of a start that holds
@@ -47,7 +47,10 @@ def all_starts(
             alone = "" if name == "parameters" else f"({n},) or "
             raise ValueError(f"{name} must have shape {alone}(n_runs, {n}); given shape {array.shape}")
         if not np.isfinite(array).all():
-            raise ValueError(f"{name} must be finite; row {int(np.argwhere(~np.isfinite(array))[0][0])} is not")
+            if array.ndim == 1:
+                raise wrong_entries(name, "finite", array, ~np.isfinite(array))
+            run = int(np.argwhere(~np.isfinite(array))[0][0])
+            raise ValueError(f"{name} must be finite; row {run} is not: given {shown(array[run].tolist())}")
         if array.ndim == 2:
             several[name] = len(array)
     if len(set(several.values())) > 1:

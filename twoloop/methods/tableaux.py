@@ -11,7 +11,7 @@ import numpy as np
 from numpy.polynomial import Legendre
 from numpy.typing import NDArray
 
-from twoloop.checks.arguments import check_real, check_size, check_text, check_vector, shown
+from twoloop.checks.arguments import check_real, check_size, check_text, check_vector, shown, wrong_entries
 
 Array = NDArray[np.float64]
 
@@ -55,7 +55,7 @@ class Tableau:
         if A.shape != (s, s):
             raise ValueError(f"A must have shape ({s}, {s}), as b has {s} entries; given shape {A.shape}")
         if not np.isfinite(A).all():
-            raise ValueError("A must be finite")
+            raise wrong_entries("A", "finite", A, ~np.isfinite(A))
         check_vector("b", b, s)
         c = check_vector("c", self.c, s)
         check_size("order", self.order, 1)

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from twoloop.checks.arguments import check_call
+from twoloop.checks.arguments import check_call, shown
 from twoloop.testing.changes import in_a_frame, in_millimetres_and_grams
 from twoloop.testing.evidence import Evidence
 from twoloop.testing.findings import Finding, Report
@@ -103,7 +103,8 @@ def check_simulator(
     >>> assert report.passed, str(report)  # doctest: +SKIP
     """
     if not callable(simulate):
-        raise TypeError(f"simulate must be a function of (problem, times, tolerance); given {type(simulate).__name__}")
+        given = f"{shown(simulate)} of type {type(simulate).__name__}"
+        raise TypeError(f"simulate must be a function of (problem, times, tolerance); given {given}")
     check_call("simulate", "simulate", simulate, ("problem", "times", "tolerance" if steps is None else "step"))
     settings = settings_of(tolerances, steps, order, time_limit)
     findings: list[Finding] = []
