@@ -1,4 +1,4 @@
-"""Thousands of runs of one mechanism in one call: ours in lanes, heyoka in batches, diffrax by vmap, one by one."""
+"""Thousands of runs of one mechanism in one call: ours in lanes, heyoka in batches, diffrax by vmap, others singly."""
 
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -11,7 +11,8 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from references.equations.many_at_once import by_diffrax, by_heyoka
+from references.driver import user_call
+from references.equations.many_at_once import by_cyrk, by_diffrax, by_heyoka
 from references.paper.four_bar_minimal import MinimalFourBar
 from studies.bench import figures, tables
 from studies.bench.cli import StudyError
@@ -33,14 +34,17 @@ ERRORS = (1e-4, 1e-6, 1e-8)  # of the worst of the runs, at which ways are compa
 USUAL = 1e-8  # tolerances of an ensemble that is given none
 TIGHT, AGREE = 1e-12, 1e-8  # tolerance of references, and how far two unlike methods may end apart with it
 ENSEMBLE, SINGLE, HEYOKA, DIFFRAX = "ensemble", "solve_dae, compiled, one by one", "heyoka, batches", "diffrax, vmap"
+CYRK = "CyRK, DOP853, one by one"
 # whose colour and marker each has: solver, family, whether it keeps the constraints
 LOOKS: dict[str, tuple[str, str, bool]] = {
     ENSEMBLE: ("Taylor, compiled", "two-loop", True),
     SINGLE: ("auto, compiled", "two-loop", True),
     HEYOKA: ("heyoka", "heyoka", False),
+    CYRK: ("CyRK, DOP853", "CyRK", False),
     DIFFRAX: ("Dopri8, diffrax", "diffrax", False),
 }
 OWN, WAYS, LEAPING = (ENSEMBLE, SINGLE), tuple(LOOKS), (ENSEMBLE, HEYOKA)
+RIVALS = {HEYOKA: "heyoka's batches", CYRK: "CyRK, one run after another", DIFFRAX: "diffrax (on linkages only)"}
 LINKAGES = "random four-bar linkages"
 # mechanisms whose runs differ by their velocities at the start, and how long they run
 STARTS = {"andrews": 0.03, "spatial_slider_crank": 2.0, "redundant_slider_crank": 2.0}
@@ -129,12 +133,13 @@ def ways(of: Ensemble) -> dict[str, Callable[[], Solve]]:
         ENSEMBLE: lambda: in_lanes(of.problems, of.t_end),
         SINGLE: lambda: one_by_one(of.problems[:N_SINGLE], of.t_end),
         HEYOKA: lambda: by_heyoka(of.problems, of.t_end),
+        CYRK: lambda: by_cyrk(of.problems[:N_SINGLE], of.t_end),
         DIFFRAX: lambda: by_diffrax(of.problems, of.t_end),
     }
 
 
 def rows_of(of: Ensemble, names: Sequence[str], quick: bool) -> Iterator[dict[str, Any]]:
-    """A row for each way, tolerance and repetition: CPU time by a run, that of the first call, errors at the end.
+    """A row for each way, tolerance and repetition: CPU time by a run, errors at the end.
 
     The calls after the first are repeated in turn, so that a slow minute of the machine falls on all alike.
     """
@@ -148,11 +153,12 @@ def rows_of(of: Ensemble, names: Sequence[str], quick: bool) -> Iterator[dict[st
             yield head | {"way": name, "message": f"{said}: {why}"}
     for tol in QUICK_TOLERANCES if quick else sorted((*TOLERANCES, *BETWEEN), reverse=True):
         asked = {name: solve for name, solve in solves.items() if tol not in BETWEEN or name in LEAPING}
-        first = {name: _timed(solve, tol)[0] for name, solve in asked.items()}
+        for solve in asked.values():  # which may build
+            solve(tol)
         for repeat, (name, solve) in product(range(1 if quick else REPEATS), asked.items()):
             spent, ends = _timed(solve, tol)
             errors = np.abs(ends - of.true[: len(ends)]).max(axis=1)
-            row = head | {"way": name, "tol": tol, "repeat": repeat, "first_s": first[name]}
+            row = head | {"way": name, "tol": tol, "repeat": repeat}
             row |= {"run_s": spent / len(ends), "n_failed": int(np.isnan(errors).sum())}
             good = errors[~np.isnan(errors)]
             yield row | (
@@ -161,9 +167,12 @@ def rows_of(of: Ensemble, names: Sequence[str], quick: bool) -> Iterator[dict[st
 
 
 def _timed(solve: Solve, tol: float) -> tuple[float, Array]:
+    """CPU time of the call that a user writes, s, and the ends."""
+    user_call.forget()
     began = time.process_time()
     ends = solve(tol)
-    return time.process_time() - began, ends
+    spent = time.process_time() - began
+    return spent if user_call.seconds is None else user_call.seconds, ends
 
 
 def with_geometry(n: int) -> dict[str, Any]:
@@ -187,7 +196,7 @@ def make(output: Output) -> pd.DataFrame:
     for each in sets[: 1 if quick else None]:
         made = each()
         # diffrax takes ten seconds to compile, and minutes for larger mechanisms
-        names = (ENSEMBLE, SINGLE, HEYOKA, *((DIFFRAX,) if made.name == LINKAGES and not quick else ()))
+        names = (ENSEMBLE, SINGLE, HEYOKA, CYRK, *((DIFFRAX,) if made.name == LINKAGES and not quick else ()))
         rows += list(rows_of(made, names, quick))
     with_geometry(N_QUICK)  # compiles what is not on disk
     rows += [with_geometry(n) for n in (N_GEOMETRY_QUICK if quick else N_GEOMETRY)]
@@ -209,6 +218,7 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
         for error in ERRORS:
             ours, others = tables.costs_at(medians[own], error), tables.costs_at(medians[~own], error)
             line = {"error": error, **tables.compared({k: c for k, c in ours.items() if k == ENSEMBLE}, others)}
+            line["rival"] = min(others, key=lambda name: others[name][0], default=None)
             at.append(line | {"run_s": {name: cost for name, (cost, _) in (ours | others).items()}})
         n_runs, t_end = (own_rows[name].iloc[0] for name in ("n_runs", "t_end"))
         found["cases"].append({"case": case, "n_runs": int(n_runs), "t_end": float(t_end), "at": at})
@@ -216,10 +226,9 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     lines = [line | {"case": each["case"]} for each in found["cases"] for line in each["at"]]
     every = [line["ratio"] for line in lines if line["ratio"] is not None]
     found["ratios"] = [min(every), max(every)] if every else None
-    found["rivals_ahead"] = []
-    for line in (line for line in lines if line["verdict"] == "behind"):
-        best = min(set(line["run_s"]) - set(OWN), key=line["run_s"].__getitem__)
-        found["rivals_ahead"].append({key: line[key] for key in ("case", "error", "ratio")} | {"way": best})
+    behind = [line for line in lines if line["verdict"] == "behind"]
+    found["rivals_ahead"] = [{key: line[key] for key in ("case", "error", "ratio", "rival")} for line in behind]
+    found["rivals"] = [said for way, said in RIVALS.items() if (made["way"] == way).any()]
     usual = made[(made["case"] == LINKAGES) & (made["way"] == ENSEMBLE) & (made["tol"] == USUAL)]
     found["usual"] = None
     if len(usual):  # the errors of runs at the default tolerances, which are not measured where geometry is varied

@@ -52,7 +52,7 @@ def solve_cyrk(
     """
     check_choice("method", method, tuple(NUMBERS))
     jacobian = _jacobian(*task.key) if method in IMPLICIT else None
-    functions = _rate(*task.key), jacobian
+    functions = rate_of(*task.key), jacobian
     times, rows, failure, counts = integrate(functions, task.y0, task, method, rtol, atol, max_step)
     return task.result(f"CyRK, {method},", times, rows.T, failure, **counts)
 
@@ -183,7 +183,8 @@ def right_hand_side(derivative: Callable[..., Any], size: int) -> Any:
 
 
 @lru_cache(maxsize=256)
-def _rate(system: ConstrainedSystem, t0: float, q0: bytes, v0: bytes) -> Any:
+def rate_of(system: ConstrainedSystem, t0: float, q0: bytes, v0: bytes) -> Any:
+    """Return the right-hand side of a system, whose equations are ordered by a start."""
     return right_hand_side(straight_line(system, t0, q0, v0), 2 * system.n_q)
 
 

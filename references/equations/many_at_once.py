@@ -1,16 +1,21 @@
-"""Many motions of one mechanism with different parameters and starts: diffrax by vmap, heyoka in batches.
+"""Many motions of one mechanism with different parameters and starts: diffrax by vmap, heyoka in batches, CyRK singly.
 
-Each is built once and takes parameters as arguments; both packages are optional: `make peers`, or the extra `peers`.
+diffrax and heyoka are built once and take parameters as arguments. All packages are optional: `make peers`, or the
+extra `peers`.
 """
 
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from typing import Any
 
 import numpy as np
 
+from references.cyrk.library import FINISHED
+from references.cyrk.ode import Solver, rate_of
 from references.diffrax.dopri8 import derivative_of, packages, solved
-from references.driver import imported
+from references.driver import Task, imported, user_call
 from references.equations.expressions import Expressions
+from references.equations.rows import with_all_rows
 from references.heyoka.taylor import rates_of
 from twoloop.problem.problem import Array, Problem
 
@@ -55,6 +60,34 @@ def by_heyoka(problems: Sequence[Problem], t_end: float) -> Solve:
             good = [result[0] == package.taylor_outcome.time_limit for result in integrator.propagate_res]
             ends[group[good]] = integrator.state[:n, good].T
         return ends
+
+    return solve
+
+
+def by_cyrk(problems: Sequence[Problem], t_end: float) -> Solve:
+    """Return CyRK's DOP853, one run after another, with solvers that are made before the runs that are timed.
+
+    The accelerations are those of the first problem, unless parameters differ, which are constants in its code.
+    """
+    tasks = [Task(with_all_rows(each.system), each.system.n_c, 0.0, t_end, each.q0, each.v0) for each in problems]
+    alike = all((each.system.parameters == problems[0].system.parameters).all() for each in problems)
+    rates = [rate_of(*tasks[0].key)] * len(tasks) if alike else [rate_of(*task.key) for task in tasks]
+    made: dict[float, list[Solver]] = {}
+    stack, n = ExitStack(), problems[0].system.n_q  # the solvers last as long as the process
+
+    def solve(tol: float) -> Array:
+        if tol not in made:
+            made[tol] = [
+                Solver(stack, task, task.y0, "DOP853", (rate, None), (tol, tol), t_end)
+                for task, rate in zip(tasks, rates, strict=True)
+            ]
+        runs = [solver.prepared(0) for solver in made[tol]]
+        with user_call:
+            for run in runs:
+                run()
+        return np.array(
+            [solver.end[:n] if solver.found.status == FINISHED else np.full(n, np.nan) for solver in made[tol]]
+        )
 
     return solve
 

@@ -147,12 +147,13 @@ def _decided(picks: Sequence[Mapping[str, Any]], made: bool | None) -> str:
 
 
 def _at_once(cases: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
-    """Whether an ensemble is ahead of others' batches where many runs are one call."""
+    """Whether an ensemble is ahead of the fastest of the others, where many runs are one call."""
     verdicts = Counter(at["verdict"] for each in cases for at in each["at"] if at["verdict"] != "none")
     ahead, behind = verdicts["ahead"], verdicts["behind"]
     if not ahead + behind:
         return []
-    who, other = ("`ensemble`", "heyoka's batches") if ahead > behind else ("`heyoka`, batches", "`ensemble`")
+    fastest = Counter(at["rival"] for each in cases for at in each["at"] if at["verdict"] == "behind")
+    who, other = ("`ensemble`", "all others") if ahead > behind else (call(fastest.most_common(1)[0][0]), "`ensemble`")
     told = f"ahead of {other} in {max(ahead, behind)}, behind in {min(ahead, behind)} of {verdicts.total()} comparisons"
     close = sum(1 / SCATTER < at["ratio"] < SCATTER for each in cases for at in each["at"] if at["verdict"] in ORDERED)
     told += f"; {close} of these {ahead + behind} by less than {SCATTER:g} times" if close else ""

@@ -71,9 +71,9 @@ def test_an_ode_in_angles_is_told_by_errors_only_where_these_differ():
     ("ratios", "close"), [((2.0, 1.6, 0.5), ""), ((1.2, 1.6, 0.9), "; 2 of these 3 by less than 1.5 times")]
 )
 def test_of_ensembles_it_is_said_how_many_are_close(ratios, close):
-    at = [{"verdict": "ahead" if ratio > 1.0 else "behind", "ratio": ratio} for ratio in ratios]
+    at = [{"verdict": "ahead" if ratio > 1.0 else "behind", "ratio": ratio, "rival": "heyoka"} for ratio in ratios]
     (row,) = takes({"ensembles": {"cases": [{"at": [*at, {"verdict": "none", "ratio": None}]}]}}, [])
-    assert row["take"] == f"`ensemble` (ahead of heyoka's batches in 2, behind in 1 of 3 comparisons{close})"
+    assert row["take"] == f"`ensemble` (ahead of all others in 2, behind in 1 of 3 comparisons{close})"
 
 
 @pytest.mark.parametrize(("over", "times"), [([7.0, 10.0], ", at 7.0 to 10 times the time"), (None, "")])
