@@ -7,11 +7,13 @@ import pytest
 from numba import njit
 
 from tests.problems import pendulum
+from tests.processes import run_python
 from tests.test_callbacks import PENDULUM
 from twoloop import ConstrainedSystem, callback, consistent_state, solve_dae
 from twoloop.checks import bounds, values
 from twoloop.generate import exact_derivatives
 from twoloop.kernels.compile.callbacks import KINDS
+from twoloop.kernels.compile.indices import computes_indices
 
 FAR = 10**7  # a write so far out would end the process
 Q, V = [-1.0, 0.0], [0.0, 0.0]
@@ -217,3 +219,104 @@ def test_arguments_of_single_callbacks_are_checked(make, kind, arguments, error,
 def test_arguments_of_single_callbacks_may_be_named():
     assert pendulum().force(t=0.0, q=Q, v=V).tolist() == [0.0, -9.81]
     assert pendulum().force(0.0, v=V, q=np.array([Q, Q]).T[:, 0]).tolist() == [0.0, -9.81]
+
+
+# --- indices that are computed: their bounds are watched in every call
+TABLE = np.sin(np.linspace(0.0, 2.0, 401))
+SPACING = 2.0 / 400.0
+
+
+@njit
+def looked_up(x):
+    i = int(x / SPACING)
+    s = x / SPACING - i
+    return (1.0 - s) * TABLE[i] + s * TABLE[i + 1]
+
+
+@callback("mass")
+def of_one(t, q, p, M):
+    M[0, 0] = 1.0
+
+
+@callback("force")
+def in_a_table(t, q, v, p, Q):
+    i = int(t / SPACING)
+    Q[0] = TABLE[i + 1] - q[0]
+
+
+@callback("force")
+def in_a_table_by_a_helper(t, q, v, p, Q):
+    Q[0] = looked_up(t) - q[0]
+
+
+@pytest.mark.parametrize("force", [in_a_table, in_a_table_by_a_helper])
+@pytest.mark.parametrize("method", ["auto", "RadauIIA5"])
+def test_a_run_beyond_the_end_of_a_table_is_no_success(force, method):
+    system = ConstrainedSystem(n_q=1, n_c=0, mass=of_one, force=force, name="table")
+    assert solve_dae(system, (0.0, 1.9), [0.0], [0.0], method).success
+    for end in (2.5, 300.0):
+        with pytest.raises(IndexError) as caught:
+            solve_dae(system, (0.0, end), [0.0], [0.0], method)
+        (note,) = caught.value.__notes__
+        assert "compiled callback of system 'table'" in note and "beyond the end of a table" in note
+
+
+CAM = """
+import numpy as np
+from twoloop import ConstrainedSystem, callback, solve_dae
+TABLE, SPACING = np.sin(np.linspace(0.0, 2.0, 401)), 2.0 / 400.0
+@callback("mass")
+def mass(t, q, p, M):
+    M[0, 0] = M[1, 1] = 1.0
+@callback("force")
+def force(t, q, v, p, Q):
+    Q[1] = -1.0
+@callback("constraint")
+def constraint(t, q, p, C):
+    i = int(q[0] / SPACING)
+    s = q[0] / SPACING - i
+    C[0] = q[1] - (1.0 - s) * TABLE[i] - s * TABLE[i + 1]
+@callback("jacobian")
+def jacobian(t, q, p, Cq):
+    i = int(q[0] / SPACING)
+    Cq[0, 0], Cq[0, 1] = (TABLE[i] - TABLE[i + 1]) / SPACING, 1.0
+@callback("gamma")
+def gamma(t, q, v, p, Qd):
+    Qd[0] = 0.0
+given = {"mass": mass, "force": force, "constraint": constraint, "jacobian": jacobian, "gamma": gamma}
+system = ConstrainedSystem(n_q=2, n_c=1, **given)
+start = np.array([1.5025, 0.5 * (TABLE[300] + TABLE[301])])
+print(solve_dae(system, (0.0, 1e-3), start, np.zeros(2), rtol=1e-5, atol=1e-5).success)
+"""
+
+
+def test_checks_of_a_start_that_look_beyond_a_table_do_not_end_the_process():
+    assert run_python(CAM).stdout.split() == ["True"]
+
+
+def plain(q, p, out):
+    for i in range(3):
+        for j, k in ((0, 1), (1, 0)):
+            out[3 * i + j] = q[i] * p[len(p) - 1] + out[-k]
+
+
+def by_search(q, p, out):
+    i = 0
+    while q[0] > p[i]:
+        i += 1
+    out[0] = p[i]
+
+
+def by_counting(q, p, out):
+    for i in range(int(q[0])):
+        out[0] += p[i]
+
+
+def by_values(q, p, out):
+    for i in (0, int(p[0])):
+        out[i] = q[0]
+
+
+def test_which_functions_compute_indices():
+    assert not computes_indices(plain)
+    assert all(map(computes_indices, (by_search, by_counting, by_values, looked_up.py_func, in_a_table.py_func)))

@@ -13,11 +13,12 @@ from typing import Any
 
 import numpy as np
 
-from twoloop.checks.bounds import Rewritten, place_of
+from twoloop.checks.bounds import place_of
 from twoloop.generate.known_numbers import OPERATORS, Known, Refusal, Untraceable, applied, elementwise, number
 from twoloop.generate.tracing import FUNCTIONS, Form, Graph
 from twoloop.kernels.compile.dependencies import of_library
 from twoloop.kernels.compile.private import Dispatcher
+from twoloop.kernels.compile.rewritten import Rewritten
 
 # functions of NumPy that do with arrays of forms what they do with numbers
 AS_WITH_NUMBERS = {
@@ -42,7 +43,7 @@ def trace(function: Callable[..., Any], t: Form, *arguments: Any) -> Any:
     graph, value = t.graph, None
     with graph.watched():
         try:
-            value = _Traced(lambda python_function: python_function).callback(function)(t, *arguments)
+            value = _Traced(lambda copy, _: copy).callback(function)(t, *arguments)
         except (Refusal, Untraceable) as refusal:
             raise Untraceable(f"{graph.refused or refusal}{place_of(refusal)}") from None
         except Exception as error:  # what a callback makes of symbols is its own

@@ -156,6 +156,8 @@ class Course:
                 run.clock[a.LOOKING] = self.control[a.AHEAD] = 0.0
             else:
                 self.code, self.raised = INTERRUPTED, None if self.interrupts.asked else error
+                if not run.system.called_in_python:
+                    error.add_note(_where(run.system.name, float(run.clock[a.T]), error))
 
     def _take(self, t: Array, rows: Array, steps: Array, kinds: NDArray[np.int64]) -> None:
         """Take over what a chunk has stored."""
@@ -305,3 +307,9 @@ class Course:
         if across:
             return np.full(len(steps), intervals.ACROSS)
         return kinds_of(run, steps)
+
+
+def _where(name: str, t: float, error: Exception) -> str:
+    """What of a compiled callback's error the error does not say."""
+    beyond = ": it asks an array for more than it has, as beyond the end of a table" * isinstance(error, IndexError)
+    return f"raised by a compiled callback of system {name!r} in a step from t = {t:.10g}{beyond}"

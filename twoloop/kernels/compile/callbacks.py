@@ -16,6 +16,7 @@ import numba
 from numba.core.dispatcher import Dispatcher
 
 from twoloop.kernels.compile.caches import compile_kept, watch
+from twoloop.kernels.compile.indices import with_bounds_watched
 from twoloop.kernels.compile.private import also_for
 
 f8 = numba.types.float64
@@ -277,13 +278,14 @@ def compile_callback(
 
     `watched` is that of `compile_kept`; `named` is the function to name in the message, if it is another.
     """
-    options = _OPTIONS if allocates else {**_OPTIONS, "_nrt": False}
+    function, more = with_bounds_watched(function)
+    options = {**_OPTIONS, **more} if allocates else {**_OPTIONS, **more, "_nrt": False}
     if watched is not None:
         watched = f"{watched[0]} {options}", watched[1]
     try:
         made = compile_kept(function, KINDS[kind].reading, watched, **options)
     except Exception as error:  # numba lets some of its own assertions through
-        return _compiled_to_write(kind, function, watched, named or function, error)
+        return _compiled_to_write(kind, function, watched, named or function, error, options)
     also_for(made, KINDS[kind].signature)
     return made
 
@@ -294,10 +296,11 @@ def _compiled_to_write(
     watched: tuple[str, str] | None,
     named: Callable[..., Any],
     error: Exception,
+    options: dict[str, Any],
 ) -> Dispatcher:
     """The same of a function whose helpers are compiled for arrays that may be written; one that does so is refused."""
     try:
-        made = compile_kept(function, KINDS[kind].signature, watched, **_OPTIONS)
+        made = compile_kept(function, KINDS[kind].signature, watched, **options)
     except Exception as its_own:
         raise TypeError(_why_not(kind, named, its_own)) from None
     if _ONLY_A_HELPER.search(plain := _plain(error)) and "setitem" not in plain:
