@@ -263,6 +263,25 @@ def test_a_force_that_ends_is_left_to_single_runs_and_others_are_not(method):
     assert np.isnan(runs.q[[3, 7], :, -1]).all() and runs.success.sum() == 7
 
 
+@pytest.mark.filterwarnings("ignore:invalid value")
+def test_steps_do_not_pass_over_places_without_a_force():
+    """A step that meets such a place is refused, and the next ones could pass over it."""
+    system = pendulum(force=lambda t, q, v: 0.02 * np.sqrt(0.95 + q[0]) * np.array([-q[1], q[0]]))
+    v = np.outer(np.append(0.1, np.geomspace(20.0, 200.0, 8)), [0.0, 1.0])
+    runs = ensemble(system, (0.0, 3.0), np.tile([1.0, 0.0], (9, 1)), v, rtol=1e-3, atol=1e-3)
+    assert runs.success.tolist() == [True] + 8 * [False]
+
+
+def test_a_stiff_run_among_others_does_not_go_on_for_ever():
+    """By series: its steps are as many as its time scales, and nothing interrupts them."""
+    parameters = np.array([[0.1], [1.0], [1e7], [10.0]])
+    force = lambda t, q, v, p: np.array([-p[0] * (v[0] - np.cos(2.0 * t))])  # noqa: E731
+    system = unconstrained(force, parameters=parameters[0])
+    runs = ensemble(system, (0.0, 1.0), np.zeros(1), np.ones(1), parameters=parameters)
+    assert runs.singly.tolist() == [True, False, True, False] and "2 in lanes by Taylor" in runs.message
+    assert runs.n_steps[2] < 1000 and abs(runs.q[2, 0, 1] - 0.5 * np.sin(2.0)) < 1e-6
+
+
 @pytest.mark.parametrize("method", ["DOP853", "RadauIIA5"])
 @pytest.mark.filterwarnings("ignore:invalid value")
 def test_drives_whose_speed_jumps_are_left_to_single_runs(method):

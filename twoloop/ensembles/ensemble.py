@@ -90,7 +90,8 @@ def ensemble(
     evaluates only the forces there. Stages are off the constraints by the error of the formula. This includes the Radau
     methods, whose unknowns are here the accelerations of all coordinates. The end of each step is put on the
     constraints. States at `t_eval` within a step are the ends of shorter steps from its beginning. A run that would
-    take more than 100,000 of these steps is made by `solve_dae`.
+    take more than 100,000 steps is made by `solve_dae`. So is one that by series meets a place at which the equations
+    have no values.
     """
     check_system(system)
     t0, t1 = check_span(t_span)

@@ -183,7 +183,7 @@ class LaneSteps:
         return None
 
     def judge(self, emit: LaneEmitter, order: Value, control: Value, room: Value) -> None:
-        """Accept steps, or shorten them by as much as they are off; runs of too many refusals end in lanes."""
+        """Accept steps, or shorten them by as much as they are off; too many refusals, or no values, end a run here."""
         builder, one = emit.builder, emit.constant(1.0)
         select, per_order = builder.select, emit.divide(one, emit.number(order))
         off, *defects = (emit.load(room, field) for field in (lanes.OFF, lanes.WORST, lanes.DEFECT))
@@ -207,6 +207,8 @@ class LaneSteps:
         store_mask(emit, room, lanes.ACCEPTED, accepted)
         times = emit.load(room, lanes.REFUSED)
         times = select(builder.both(running, refused), emit.add(times, one), times)
+        # shorter steps could pass over a place at which the equations have no values
+        times = select(fine, times, emit.constant(math.inf))
         emit.store(times, room, lanes.REFUSED)
         grown = emit.multiply(emit.load(room, lanes.H), select(refused, factor, emit.constant(lane_taylor.GROWTH)))
         emit.store(select(running, grown, emit.load(room, lanes.LONGEST)), room, lanes.LONGEST)

@@ -1,8 +1,9 @@
 """Steps by Taylor series in lanes, as `taylor_step` has them."""
 
 from twoloop.kernels.data.common import kernel
+from twoloop.kernels.lanes.lane_control import MOST_STEPS
 from twoloop.kernels.lanes.lane_projection import project_lanes
-from twoloop.kernels.lanes.lane_room import CHECKS_REDUNDANT, LANES, ORDER, STEP, UNIT, X
+from twoloop.kernels.lanes.lane_room import CHECKS_REDUNDANT, LANES, ORDER, RUNNING, STEP, UNIT, WHICH, X, leave
 
 ALLOWED = 0.3  # as in taylor_step.py
 MOST_SHORTENED, SHORTENED, GROWTH = 0.1, 0.9, 5.0
@@ -19,6 +20,9 @@ def step_by_series(code, settings, control, options, room, status, n_steps, with
             room[X * LANES + k] = room[X * LANES + k] / room[UNIT * LANES + k]
         code.evaluate(order, control, room)
         return
+    for k in range(LANES):  # of stiff motion, steps are as many as its time scales
+        if room[RUNNING * LANES + k] == 1.0 and n_steps[int(room[WHICH * LANES + k])] >= MOST_STEPS:
+            leave(room, status, k)
     code.series(order, control, room)
     code.lengths(order, control, room)
     code.look(order, control, room)
