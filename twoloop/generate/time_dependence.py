@@ -22,7 +22,8 @@ BY_STATE = ("force", "mass", "jacobian")  # ... and one with the state
 SMOOTH = (PRODUCT, SUM, SINE, COSINE)  # polynomials and vibrations: nothing happens in a short time alone ...
 HIGHEST = 8  # ... up to this degree: a high power of a cosine is a pulse
 HIGHEST_OF_STATE = 32  # degree in q and v up to which it is seen from afar; so are roots, not exp ...
-HIGHEST_INVERSE = 4  # ... and quotients up to this one: 1 / (1 + (x / w)**2) squared, not to a higher power
+HIGHEST_INVERSE = 4  # ... and quotients up to this one ...
+SLOWEST = -2.0  # ... that fall off no faster than this power: 1 / (1 + (x / w)**2), not its square
 LARGEST = 300  # coordinates: to trace the forces of more takes up to seconds, the looks of a run a tenth of it
 TIME = 1  # the bit of t, the first input of a graph
 
@@ -90,6 +91,7 @@ def _by_time(graph: Graph, needed: list[int]) -> bool:
 def _by_state(graph: Graph, needed: list[int], n_q: int) -> bool:
     degrees: dict[int, float] = dict.fromkeys(range(1, 2 * n_q + 1), 1.0)
     inverse: dict[int, float] = {}  # the highest degree of what is divided by; the slope of an arctangent is a quotient
+    growth = degrees.copy()  # power by which something grows far away
     for i in needed:
         operation = graph.operations[i]
         if operation is not None and graph.inputs_of[i] & ~TIME:
@@ -98,7 +100,10 @@ def _by_state(graph: Graph, needed: list[int], n_q: int) -> bool:
             inverse[i] = _degree(inverse, *operation)
             if kind in (RECIPROCAL, ARCTANGENT):
                 inverse[i] += _degree(degrees, kind, argument)
+            growth[i] = _growth(growth, *operation)
             if kind == EXPONENTIAL or degrees[i] > HIGHEST_OF_STATE or inverse[i] > HIGHEST_INVERSE:
+                return True
+            if growth[i] < SLOWEST:
                 return True
     return False
 
@@ -109,3 +114,9 @@ def _degree(degrees: dict[int, float], kind: int, *factors: Form | None) -> floa
         max((degrees.get(i, 0.0) for i in form.terms), default=0.0) for form in factors if form is not None
     )
     return first + sum(others) if kind == PRODUCT else 0.5 * first if kind == SQUARE_ROOT else first
+
+
+def _growth(powers: dict[int, float], kind: int, *factors: Form | None) -> float:
+    """By which power it grows far away; it falls off with its reciprocal, and vibrations do neither."""
+    power = _degree(powers, kind, *factors)
+    return 0.0 if kind in (SINE, COSINE) else -power if kind == RECIPROCAL else power
