@@ -12,7 +12,7 @@ from twoloop import ConstrainedSystem, Result
 from twoloop.mechanisms import Problem, Reference
 
 JUDGED = "judged by the problem's own condition"  # group of runs
-TIME_LIMIT = 1.5  # s of CPU of a run
+TIME_LIMIT = 3.0  # s of a run
 INSTANTS = 101  # of solvers that store none of their steps; not a multiple of a half period of any
 DECADES = 2  # a run is right within so many decades of its tolerance, where the problem has no condition of its own
 EXACT = 1e-3  # what misses its tolerance by more, but is right to this, is inexact and not wrong

@@ -5,19 +5,11 @@ import pandas as pd
 
 from studies.beam.limits import PARAMETERS
 from studies.bench.solvers import (
-    ADAMS,
-    COMPILED,
-    CVODE_C,
-    DEFAULT,
-    DIFFRAX,
-    HEYOKA,
     IRK,
-    NEWMARK,
-    OWN_EXPLICIT,
     PAPER_TOL,
-    QUARTER,
 )
 from studies.bench.tables import as_good
+from studies.claims.explicit import kind_of
 from studies.claims.rows import BEAM_END, BEAMS, Rows, cheapest
 from studies.claims.verdicts import Judgement, decide, span, span_known
 from studies.table3.causes import FLAT
@@ -31,9 +23,6 @@ FOLLOWS = 1e-3  # m, of the tip over the run
 A_LOT = 5.0  # times; the frequencies grow by 10
 TIPS = (1e-2, 1e-3, 1e-4)  # m or rad, errors over the run at which costs are compared: tip, or the linkage
 TIP = TIPS[-1]  # m
-EXPLICIT = (OWN_EXPLICIT, ADAMS, HEYOKA, DIFFRAX, "DOP853, projected", "DOP853, index 1", "Pr9, index 1")
-FIXED_POINT = (IRK, NEWMARK, QUARTER, CVODE_C, "CVODE, Adams", "CVODES, CasADi, Adams")
-CHOOSING = (DEFAULT, *COMPILED, "LSODA, index 1")  # between explicit and implicit
 WIDTH = 0.02  # m, about the width of a line in a figure of the tip
 KEYS = ("soft", "stiff")
 PARTED = 10.0  # times the change until 1.2 s
@@ -69,10 +58,10 @@ def implicit_needed(rows: Rows) -> Judgement:
     ratios = {}
     for key, case in zip(KEYS, BEAMS, strict=True):
         runs = rows.beam(case, "")
-        explicit = runs["solver"].isin(EXPLICIT)
-        implicit = ~explicit & ~runs["solver"].isin((*CHOOSING, *FIXED_POINT))
+        kinds = runs["solver"].map(kind_of)
+        sides = [runs[kinds == kind] for kind in ("explicit", "Newton")]
         for name, what in ((key, "call_s"), (f"{key}_evaluations", "n_evaluations")):
-            costs = [[cheapest(runs[place], tip, what) for tip in TIPS] for place in (explicit, implicit)]
+            costs = [[cheapest(side, tip, what) for tip in TIPS] for side in sides]
             ratios[name] = span_known((np.array(costs[0]) / costs[1]).tolist())
     return decide((ratio > 1.0 for each in ratios.values() for ratio in each), **ratios)
 

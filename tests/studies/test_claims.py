@@ -6,9 +6,12 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from studies.beam import runs
+from studies.bench.cli import StudyError
 from studies.bench.solvers import IRK, NEWMARK, QUARTER
 from studies.claims import beam_judges, experiments, judges
 from studies.claims import study as claims
+from studies.claims.explicit import kind_of
 from studies.claims.rows import STUDIES, Rows, processors, read
 from studies.claims.study import JUDGES, judged
 from studies.claims.verdicts import Claim, Judgement, Verdict, load
@@ -297,3 +300,11 @@ def test_the_processors_are_those_of_the_rows_and_not_of_who_draws_them(tmp_path
         first = f"# full {name}; `python -m studies.{name}`; 2026-01-01; commit abc; {machine}, 2 cores; Linux"
         (tmp_path / f"{name}.csv").write_text(f"{first}\nsolver\na\n")
     assert processors(tmp_path) == {"Z80": ["table3", "energy"], "6502": ["beam"]}
+
+
+def test_every_solver_of_the_beams_is_explicit_or_not():
+    """CyRK's DOP853 was once compared as an implicit method, as it stood in no list."""
+    kinds = {name: kind_of(name) for name in runs.solvers()}
+    assert kinds["CyRK, DOP853"] == kinds["heyoka"] == "explicit" and kinds["CyRK, Radau"] == "Newton"
+    with pytest.raises(StudyError, match="whether 'another' is explicit is not known"):
+        kind_of("another")

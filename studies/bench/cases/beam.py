@@ -19,7 +19,7 @@ T_END, T_END_QUICK = 2.0, 0.1  # s; the paper does not say how long its runs are
 TIGHT = 1e-10  # tolerance of the reference
 CHECK = 1e-9  # of the two runs that it is compared with
 TOLERANCES = tuple(float(f"1e-{k}") for k in range(1, 9))  # from looser ones on: these step over vibrations
-TIME_LIMIT = 10.0  # s of a run: no run of use takes so long
+TIME_LIMIT = 30.0  # s, of a call; the paper's procedure takes a third of it on the processors seen so far
 NOTE = (
     "The start is assumed, the paper's text does not tell it: straight along x, gravity across it, only the base node "
     "moving. Its figures are lost."
