@@ -250,7 +250,7 @@ def test_callbacks_along_runs_are_compared_by_the_doubling_rule(monkeypatch):
 
 
 CALLS = {  # in a call with other parameters: beyond those before, and among them
-    "four_bar": (830, 560),
+    "four_bar": (960, 600),
     "heavy_top": (720, 470),
     "spatial_four_bar": (1390, 1120),
     "bricard": (640, 450),

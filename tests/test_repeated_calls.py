@@ -20,7 +20,7 @@ MANY, FEW, THIRD, FEWER, FEWEST = 780, 450, 690, 115, 77
 # in a run from another start, which names the redundant rows there, and in one with other parameters, of which hundreds
 # of numbers in the code of spatial mechanisms are formulas
 ANOTHER = {
-    "four_bar": (88, 890),
+    "four_bar": (88, 920),
     "andrews": (88, 710),
     "redundant_slider_crank": (92, 1330),
     "heavy_top": (108, 720),  # whose starts ask for two codes in turn

@@ -83,7 +83,7 @@ def wrong_derivative(system: ConstrainedSystem, t: float, q: Array, v: Array) ->
     """Say which of C_q, C_t and gamma is wrong at a state of a run, or None: formulas may hold near the start only.
 
     One direction through all coordinates and time stands for all entries, so that this costs as a rule nine calls of
-    `constraint`, twelve of `jacobian`, ten of `constraint_rate` and one of `gamma`, whatever n_q. Only where the
+    `constraint`, sixteen of `jacobian`, ten of `constraint_rate` and one of `gamma`, whatever n_q. Only where the
     direction shows a difference are the entries compared one by one, as at the start. Tangents are not looked at: they
     decide whether Newton's method converges, not what it converges to.
     """

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 FASTEST = 1e9  # times the motion by one's own size in a second: beyond, C_q is nearly zero and the drive is not so fast
 EPS = float(np.finfo(np.float64).eps)
 DISPLACEMENTS = (1e-2, 1e-4, 1e-6)  # of a coordinate, for the curvature of the constraints
-MOST_UNITS, SETTLED = 10, 1.5  # times that units are looked for; by what factor they may change then
+ROUNDS = 3  # in which units are found: the first ones may be off by 1e5
 MOST_PLACES = 16  # positions whose sizes are kept
 NONE = np.zeros(0)
 TURNS = 0.1  # units: a row that is short beside what it becomes over this way is short by its position
@@ -150,10 +150,8 @@ def units(system: ConstrainedSystem, t: float, q: Array, jacobian: Rows, typical
     An entry that is small by the position alone, as of a bar next to upright, says nothing about units.
     """
     columns, ways = column_scales(jacobian, typical), np.outer([1.0, -1.0], generic_factors(len(q)))
-    for _ in range(MOST_UNITS):
+    for _ in range(ROUNDS):  # always as many: rounding is not to decide
         found = column_scales(_largest(system, t, q + columns * ways, jacobian), typical)
-        if (np.maximum(columns / found, found / columns) < SETTLED).all():
-            break
         columns = np.cbrt(columns * found * found)  # twice the unit makes half the unit of an entry that grows with it
     return columns
 

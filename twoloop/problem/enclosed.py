@@ -77,6 +77,7 @@ def _differ(one: Any, other: Any) -> bool:
 def _enclosed(function: Any, seen: set[int]) -> Iterator[tuple[Any, str, Any]]:
     """Where a function finds a number or an array, a cell or a namespace (None: a default), its name, and its value."""
     function = function.py_func if isinstance(function, Dispatcher) else function
+    function = getattr(function, "__wrapped__", function)  # of a copy whose bounds are watched
     if id(function) in seen:
         return
     seen.add(id(function))

@@ -31,7 +31,8 @@ def with_bounds_watched(function: Callable[..., Any]) -> tuple[Callable[..., Any
 
 
 def _watched(copy: Any, original: Any) -> Any:
-    """What stands in the place of a compiled helper, with the options that it had."""
+    """What stands in the place of a compiled helper, with the options that it had, or of the function itself."""
+    copy.__wrapped__ = getattr(original, "py_func", original)  # whose surroundings may change
     if not isinstance(original, Dispatcher):
         return copy
     copy.__qualname__ = f"{original.py_func.__qualname__}.watched"  # numba's symbols are made of it
