@@ -54,7 +54,7 @@ COSTS = ("call_s", "called_from", "keeps")
 def findings(folder: Path) -> dict[str, dict[str, Any]]:
     """What NAME.json of each study holds, for those that have been run into the folder and time what all time.
 
-    In that of work_precision, "lacking" is what was not run with the newest rival.
+    In that of work_precision, "lacking" is what was not run with the newest rival, "long_without" the cases at length.
 
     Raises StudyError if a file is damaged.
     """
@@ -67,18 +67,23 @@ def findings(folder: Path) -> dict[str, dict[str, Any]]:
         if path.stem not in TIMED or told.get("timed") == WHOLE_CALL:  # others are to be run again
             found[path.stem] = told
     if "work_precision" in found:
-        found["work_precision"]["lacking"] = lacking(folder)
+        found["work_precision"] |= {"lacking": lacking(folder), "long_without": long_without(folder)}
     return found
 
 
 def lacking(folder: Path) -> list[str]:
     """What the rows of a folder do not compare `NEWEST` on."""
-    rows = {name: _lines(folder / f"{name}.csv") for name in (*ASKED_OF, "work_precision")}
-    long = [line for line in rows.pop("work_precision") if line.startswith(AT_LENGTH)]
-    cases = {line[1] for line in csv.reader(long)} - {line[1] for line in csv.reader(filter(_has_newest, long))}
+    rows = {name: _lines(folder / f"{name}.csv") for name in ASKED_OF}
     told = {what: rows[name] for name, what in ASKED_OF.items()}
     without = [what for what, lines in told.items() if lines and not any(map(_has_newest, lines))]
-    return ["some long motions"] * bool(cases) + without
+    return ["some long motions"] * bool(long_without(folder)) + without
+
+
+def long_without(folder: Path) -> list[str]:
+    """The cases at length that the rows of a folder do not compare `NEWEST` on."""
+    long = [line for line in _lines(folder / "work_precision.csv") if line.startswith(AT_LENGTH)]
+    asked, there = ({line[1] for line in csv.reader(lines)} for lines in (long, filter(_has_newest, long)))
+    return sorted(asked - there)
 
 
 def _has_newest(line: str) -> bool:

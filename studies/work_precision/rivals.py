@@ -222,7 +222,7 @@ def reached(rows: pd.DataFrame) -> dict[str, Any]:
 
 
 def _typical(made: Sequence[dict[str, Any]], error: float) -> dict[str, Any] | None:
-    """Time of the cheapest rival over that of the default at an error: quartiles over mechanisms; and its median.
+    """Time of the cheapest rival over that of the default at an error, over mechanisms; and the median of the latter.
 
     Those with singular positions, at which accelerations are not defined, do not count. None: it is not known on any.
     """
@@ -233,7 +233,8 @@ def _typical(made: Sequence[dict[str, Any]], error: float) -> dict[str, Any] | N
         return None
     ratios, calls = zip(*known, strict=True)
     quartiles = np.percentile(ratios, (25, 50, 75)).tolist()
-    return {"error": error, "n": len(known), "quartiles": quartiles, "call_s": float(np.median(calls))}
+    spread = {"quartiles": quartiles, "range": [min(ratios), max(ratios)]}
+    return {"error": error, "n": len(known), **spread, "call_s": float(np.median(calls))}
 
 
 def close(every: Sequence[dict[str, Any]]) -> dict[str, Any]:
