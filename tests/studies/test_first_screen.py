@@ -197,14 +197,14 @@ def test_every_number_of_the_screen_is_made_again_from_the_rows(tmp_path):
         f"In the median, the fastest rival takes {typical} of the default's time at an error of 1e-4 ({spread} by "
         "mechanism; the default "
         f"{number(np.median([ms['auto, compiled'][0], ms['auto'][1]]))} ms), {typical} at 1e-10.",
-        f"would change within {100.0 * (tables.LEAST - 1.0):.0f} %, their scatter, or a quarter of the error.",
+        f"differ by less than {100.0 * (tables.LEAST - 1.0):.0f} % or their scatter, or would swap if errors a quarter",
         "an error over 1e-3 at a tolerance of 1e-8.",
         "We chose 17 kinds of sharp forces (4 gusts, 2 frictions, 11 others); only",
         "Of the same 61 runs of 3.0 s, unless our interface to a solver refuses, silently wrong are: "
         "the default 1 of 61, our 1 other methods "
         "1 of 63, heyoka 1 of 66 (1 of 67 with `max_step`), IDA and CVODE 0 of 64. ",
         "every 5e-4 of a run (1.5e-3 s here, 0.050 s in 100 s), other forces",
-        "short forces at random times, without `max_step`:",
+        "short forces at random times in runs of 3.0 s, at which only ours look every 1.5e-3 s (",
         "| | IDA from C | the default |",
         *(f"| {shape} of 1e-4 s | 7 of 20 | 7 of 20 |" for shape in ("gusts", "pulses")),
         *(f"| {shape} of 3e-4 to 0.010 s | 11 of 40 | 11 of 40 |" for shape in ("gusts", "pulses")),
@@ -323,7 +323,7 @@ def test_the_screen_has_few_words_and_sixty_lines_at_most(tmp_path):
     block = front.split(BEGIN)[1].split(END)[0]
     fixed = len(front.splitlines()) - len(block.splitlines())
     words = [word for word in block.replace("|", " ").split() if set(word) - set("-:")]
-    assert len(words) <= 950
+    assert len(words) <= 960
     assert fixed + max(len(each.splitlines()) for each in (block, block_of(tmp_path, findings()))) <= 60
     assert "index-3" not in front and "two-loop" not in front.split(BEGIN)[0]
 
