@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pandas as pd
 
 from references.heyoka.taylor import LARGEST_UNROLLED
@@ -107,7 +108,10 @@ def part(rows: pd.DataFrame, group: str = GROUP) -> pd.DataFrame:
 def measured_on(rows: pd.DataFrame) -> dict[str, Any]:
     """At how many commits, and on which processors, the rows were measured."""
     made = rows.reindex(columns=["processor", "commit"]).dropna().astype(str)
-    return {"apart": apart(rows), "commits": made["commit"].nunique(), "processors": sorted(made["processor"].unique())}
+    names = apart(rows)
+    told = {"apart": names, "commits": made["commit"].nunique(), "processors": sorted(made["processor"].unique())}
+    speeds = speeds_apart(rows, names)
+    return told | ({"speeds": speeds} if speeds else {})
 
 
 def apart(rows: pd.DataFrame) -> list[str]:
@@ -115,6 +119,15 @@ def apart(rows: pd.DataFrame) -> list[str]:
     known = rows[rows["group"] == rivals.GROUP].reindex(columns=["case", "family", "commit"]).dropna()
     usual = known["case"].map(known.groupby("case")["commit"].agg(lambda each: each.mode().iloc[0]))
     return sorted(known.loc[known["commit"] != usual, "family"].unique())
+
+
+def speeds_apart(rows: pd.DataFrame, names: Sequence[str]) -> list[float]:
+    """Time of the calibration in the pass of such projects over that with the others: least, median, largest."""
+    known = rows[rows["group"] == rivals.GROUP].reindex(columns=["case", "family", "calibration_s"]).dropna()
+    own = known["family"].isin(names)
+    apart, others = (known[which].groupby("case")["calibration_s"].median() for which in (own, ~own))
+    ratios = (apart / others).dropna()
+    return [float(each) for each in np.percentile(ratios, (0, 50, 100))] if len(ratios) else []
 
 
 def on_the_same_processor(rows: pd.DataFrame, others: pd.DataFrame) -> pd.DataFrame:

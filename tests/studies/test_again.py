@@ -68,3 +68,14 @@ def test_a_project_measured_in_a_pass_of_its_own_is_told():
     made = KEPT.assign(family="two-loop", commit="abc")
     later = rows((rivals.GROUP, "four-bar", 9.0, "old")).assign(family="heyoka", commit="def")
     assert study.apart(made) == [] and study.apart(pd.concat([made, made, later])) == ["heyoka"]
+
+
+def test_the_speed_of_a_pass_of_its_own_is_that_of_its_calibrations():
+    head = {"group": rivals.GROUP, "processor": "one"}
+    made = [
+        head | {"case": case, "family": family, "commit": commit, "calibration_s": calibration}
+        for case, others in (("a", 4.0), ("b", 2.0), ("c", 1.0))
+        for family, commit, calibration in (("SciPy", "1", others), ("SUNDIALS", "1", others), ("CyRK", "2", 2.0))
+    ]
+    told = study.measured_on(pd.DataFrame(made))
+    assert told["apart"] == ["CyRK"] and told["speeds"] == [0.5, 1.0, 2.0]
