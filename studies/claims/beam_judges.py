@@ -4,10 +4,7 @@ import numpy as np
 import pandas as pd
 
 from studies.beam.limits import PARAMETERS
-from studies.bench.solvers import (
-    IRK,
-    PAPER_TOL,
-)
+from studies.bench.solvers import IRK, PAPER_TOL
 from studies.bench.tables import as_good
 from studies.claims.explicit import kind_of
 from studies.claims.rows import BEAM_END, BEAMS, Rows, cheapest

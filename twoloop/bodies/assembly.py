@@ -12,7 +12,7 @@ from scipy.linalg import lapack, null_space
 from scipy.optimize import least_squares
 
 from twoloop.checks.arguments import Array
-from twoloop.checks.scales import TURNS, generic_factors, median, scales_of, units
+from twoloop.checks.scales import TURNS, generic_factors, scales_of, typical_sizes, units
 from twoloop.checks.sparse_rows import SparseRows, norms
 from twoloop.problem.description import name_and_unit
 from twoloop.problem.system import ConstrainedSystem
@@ -294,8 +294,7 @@ def _has_full_rank_sparse(system: ConstrainedSystem, t: float, q: Array) -> bool
     from scipy.sparse import csc_array  # slow to import
     from scipy.sparse.linalg import LinearOperator, onenormest, splu
 
-    size = np.abs(q)
-    columns = units(system, t, q, rows, np.maximum(size, median(size[size > 0.0]) if size.any() else 1.0))
+    columns = units(system, t, q, rows, typical_sizes(q))
     way, unit = DIFFERENCE_STEP * columns * generic_factors(len(q)), columns[rows.columns]
     try:
         sides = [rows.added(system.jacobian_values(t, q + part)) for part in (way, -way)]

@@ -77,6 +77,14 @@ def sizes(q: Array) -> Array:
     return np.maximum(size, 1e-3 * middle)
 
 
+def typical_sizes(q: Array) -> Array:
+    """Sizes of the coordinates, (n_q,): none below the median of those that are no zeros by chance, 1 if all are."""
+    from twoloop.kernels.algebra.scaling import NEGLIGIBLE
+
+    size = np.abs(q)
+    return np.maximum(size, median(size[size > NEGLIGIBLE * size.max()]) if size.any() else 1.0)
+
+
 @cache
 def generic_factors(n_q: int) -> Array:
     """Between 0.5 and 1.5, of either sign, (n_q,): always the same."""
@@ -129,9 +137,7 @@ def scales_of(system: ConstrainedSystem, t: float, q: Array, jacobian: Array) ->
     """Scales at a position, from C_q there and nearby; or from C_q and A, if `jacobian` has the rows of both."""
     from twoloop.kernels.algebra.scaling import NEGLIGIBLE, reaches
 
-    size = np.abs(q)
-    typical = median(size[size > NEGLIGIBLE * size.max()]) if size.any() else 1.0
-    columns = units(system, t, q, jacobian, np.maximum(size, typical))
+    size, columns = np.abs(q), units(system, t, q, jacobian, typical_sizes(q))
     in_units = np.abs(jacobian) * columns
     norms, curvature = np.sqrt((in_units * in_units).sum(axis=1)), _curvature(system, t, q, columns, len(jacobian))
     rows = np.maximum(norms, TURNS * curvature)

@@ -12,6 +12,7 @@ import numpy as np
 
 from twoloop.checks.arguments import shown
 from twoloop.kernels.compile.dependencies import of_library
+from twoloop.kernels.compile.indices import UNWATCHED
 from twoloop.kernels.compile.private import Dispatcher
 
 NUMBERS = (bool, int, float, complex, tuple, np.generic)
@@ -77,7 +78,7 @@ def _differ(one: Any, other: Any) -> bool:
 def _enclosed(function: Any, seen: set[int]) -> Iterator[tuple[Any, str, Any]]:
     """Where a function finds a number or an array, a cell or a namespace (None: a default), its name, and its value."""
     function = function.py_func if isinstance(function, Dispatcher) else function
-    function = getattr(function, "__wrapped__", function)  # of a copy whose bounds are watched
+    function = getattr(function, UNWATCHED, function)  # of a copy whose surroundings stay as they were
     if id(function) in seen:
         return
     seen.add(id(function))

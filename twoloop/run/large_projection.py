@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from twoloop.checks.scales import median, units
+from twoloop.checks.scales import typical_sizes, units
 from twoloop.checks.sparse_rows import SparseRows
 from twoloop.checks.violation import is_at_rounding
 from twoloop.kernels.compile.linking import direct
@@ -110,8 +110,7 @@ def dependence(system: ConstrainedSystem, t: float, q: Array) -> Dependence | No
             shares[row] = np.zeros(system.n_c)
             metric.ask(tasks.SOLVE, all_rows.row(row), np.zeros(system.n_c), room, shares[row])
     metric.at = q
-    size = np.abs(q)
-    columns = units(system, t, q, all_rows, np.maximum(size, median(size[size > 0.0]) if size.any() else 1.0))
+    columns = units(system, t, q, all_rows, typical_sizes(q))
     allowed = metric.nearest(columns * np.random.default_rng(3).uniform(0.5, 1.0, len(q)))
     most = float((np.abs(allowed) / columns).max())
     return Dependence(len(counted), shares, allowed / most if most > 0.0 else allowed, metric.onto_constraints)

@@ -132,7 +132,6 @@ def named_apart(function: Callable[..., Any], watched: tuple[str, str] | None) -
         code, function.__globals__, function.__name__, function.__defaults__, function.__closure__
     )
     copy.__kwdefaults__, copy.__module__ = function.__kwdefaults__, function.__module__
-    vars(copy).update(vars(function))
     apart = hashlib.sha256(repr((watched, code.co_filename, code.co_firstlineno)).encode()).hexdigest()
     copy.__qualname__ = f"{function.__qualname__}.{apart[:16]}"
     return copy

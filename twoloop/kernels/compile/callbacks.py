@@ -16,7 +16,7 @@ import numba
 from numba.core.dispatcher import Dispatcher
 
 from twoloop.kernels.compile.caches import compile_kept, watch
-from twoloop.kernels.compile.indices import with_bounds_watched
+from twoloop.kernels.compile.indices import UNWATCHED, with_bounds_watched
 from twoloop.kernels.compile.private import also_for
 
 f8 = numba.types.float64
@@ -278,15 +278,18 @@ def compile_callback(
 
     `watched` is that of `compile_kept`; `named` is the function to name in the message, if it is another.
     """
-    function, more = with_bounds_watched(function)
+    compiled, more = with_bounds_watched(function)
     options = {**_OPTIONS, **more} if allocates else {**_OPTIONS, **more, "_nrt": False}
     if watched is not None:
         watched = f"{watched[0]} {options}", watched[1]
     try:
-        made = compile_kept(function, KINDS[kind].reading, watched, **options)
+        made = compile_kept(compiled, KINDS[kind].reading, watched, **options)
     except Exception as error:  # numba lets some of its own assertions through
-        return _compiled_to_write(kind, function, watched, named or function, error, options)
-    also_for(made, KINDS[kind].signature)
+        made = _compiled_to_write(kind, compiled, watched, named or function, error, options)
+    else:
+        also_for(made, KINDS[kind].signature)
+    if compiled is not function:
+        setattr(made.py_func, UNWATCHED, function)
     return made
 
 

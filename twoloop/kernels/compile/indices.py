@@ -19,7 +19,8 @@ from twoloop.kernels.compile.private import Dispatcher
 from twoloop.kernels.compile.rewritten import Rewritten
 
 WATCHED = {"boundscheck": True}  # for numba
-OURS = ("twoloop", "twoloop_equations")  # packages and generated modules, whose own functions stay within bounds
+UNWATCHED = "__unwatched__"  # the attribute of a copy with watched helpers that holds the function itself
+OURS, GENERATED = "twoloop", "twoloop_equations_"  # package and generated modules: their functions stay within bounds
 SAFE_CALLS = ("len", "min", "max", "abs", "range", "enumerate", "zip", "reversed")  # with arguments that are safe
 
 
@@ -31,8 +32,7 @@ def with_bounds_watched(function: Callable[..., Any]) -> tuple[Callable[..., Any
 
 
 def _watched(copy: Any, original: Any) -> Any:
-    """What stands in the place of a compiled helper, with the options that it had, or of the function itself."""
-    copy.__wrapped__ = getattr(original, "py_func", original)  # whose surroundings may change
+    """What stands in the place of a compiled helper, with the options that it had; the function itself is no helper."""
     if not isinstance(original, Dispatcher):
         return copy
     copy.__qualname__ = f"{original.py_func.__qualname__}.watched"  # numba's symbols are made of it
@@ -55,7 +55,7 @@ def _helpers(function: Callable[..., Any], seen: set[int]) -> Iterator[Dispatche
 def computes_indices(function: Callable[..., Any]) -> bool:
     """Whether an index in the source of a function may depend on more than constants and counters of loops."""
     module = function.__module__ or ""
-    if module.partition(".")[0] in OURS or module.startswith(OURS[1]) or of_library(module):
+    if module.partition(".")[0] == OURS or module.startswith(GENERATED) or of_library(module):
         return False
     try:
         tree = ast.parse(textwrap.dedent(inspect.getsource(function)))
