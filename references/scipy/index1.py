@@ -38,6 +38,7 @@ STABILISATIONS = {
 }
 ALPHA = 10.0  # 1/s, see solve_index1
 
+INCREMENT = 1e-8  # m, rad, m/s or rad/s, of differences: about the root of the rounding
 PROJECTED = 1e-10  # correction of q at convergence, relative to max(1, |q|); the remaining error is its square
 MAX_PROJECTIONS = 10  # Newton iterations of a projection
 
@@ -60,8 +61,9 @@ def solve_index1(
     method : {"DOP853", "RK45", "LSODA", "Radau", "BDF", "Pr9"}
         The solver of `scipy.integrate`, or of extensisq (`PAIR`: on the four-bar the best of its pairs at tight
         tolerances). The implicit ones get the analytic Jacobian as straight-line code, if the equations have at most
-        `straight_line.MOST_OPERATIONS` operations as expressions, without Baumgarte's terms; otherwise they use finite
-        differences.
+        `straight_line.MOST_OPERATIONS` operations as expressions, without Baumgarte's terms; otherwise forward
+        differences with constant increments, compiled. SciPy's own adapts its increments: of a coordinate without
+        influence it multiplies them by ten at each Jacobian, without a bound.
     stabilisation : {"none", "baumgarte", "projection"}
         `STABILISATIONS` has a description of each for tables.
 
@@ -110,8 +112,8 @@ def solve_index1(
     equations.warm(t0, y0, projected)
     options: dict[str, Any] = {"rtol": rtol, "atol": atol}
     options |= {} if max_step is None else {"max_step": task.longest(max_step)}
-    if method in IMPLICIT and (jacobian := equations.jacobian(t0, y0)):
-        options["jac"] = jacobian
+    if method in IMPLICIT:
+        options["jac"] = equations.jacobian(t0, y0) or equations.differences(t0, y0)
 
     def made(limit: TimeLimit) -> OdeSolver:
         return solver_type(equations.function(limit), t0, y0, task.t1, **options)
@@ -176,6 +178,22 @@ class RightHandSide(Equations):
         jac(t, y)  # compiles
         return jac
 
+    def differences(self, t: float, y: Array) -> Callable[[float, Array], Array]:
+        """Return df/dy in SciPy's signature, by forward differences, compiled; their evaluations are counted."""
+        columns, n_c, alpha = _differences(self.accelerate), self.system.n_c, self.alpha
+        p, factors, known, counters = self.system.functions.p, self.factors, self.known, self.counters
+
+        def jac(t: float, y: Array) -> Array:
+            try:
+                return columns(t, y, n_c, alpha, p, factors, known, counters).T  # type: ignore[no-any-return]
+            except BaseException:
+                self.raised = True
+                raise
+
+        jac(t, y)  # compiles
+        self.counters[:] = 0
+        return jac
+
     def project(self, t: float, y: Array) -> bool:
         """Project y onto the constraints; return False if that does not converge."""
         return bool(self.projection(t, y, self.system.n_c, self.system.functions.p, self.factors, self.known))
@@ -205,6 +223,25 @@ def _derivative(accelerate: Callable[..., Any]) -> Callable[..., Any]:
         return rate
 
     return derivative  # type: ignore[no-any-return]
+
+
+@lru_cache(maxsize=64)
+def _differences(accelerate: Callable[..., Any]) -> Callable[..., Any]:
+    """Return (t, y, n_c, alpha, p, factors, known, counters) -> (dy'/dy)^T."""
+    derivative = _derivative(accelerate)
+
+    @kept
+    def differences(t, y, m, alpha, p, factors, known, counters):  # type: ignore[no-untyped-def]
+        columns = np.empty((y.size, y.size))
+        here, moved = derivative(t, y, m, alpha, p, factors, known, counters), y.copy()
+        for j in range(y.size):
+            moved[j] += INCREMENT * max(1.0, abs(y[j]))
+            there = derivative(t, moved, m, alpha, p, factors, known, counters)
+            columns[j] = (there - here) / (moved[j] - y[j])
+            moved[j] = y[j]
+        return columns
+
+    return differences  # type: ignore[no-any-return]
 
 
 @lru_cache(maxsize=64)
