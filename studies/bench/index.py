@@ -3,6 +3,7 @@
 import csv
 import importlib
 import json
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from types import ModuleType
@@ -32,6 +33,8 @@ CLASSES = {  # tags of a case and the class of problem that they stand for, in t
 LONG = "long and conservative"
 ASKED_OF = {"beam": "beams by the error of the tip", "energy": "energy", "honesty": "sharp forces", "table3": "Table 3"}
 ASKED_OF |= {"validation": "published mechanisms", "ensembles": "many runs in one call"}
+WITH_RIVALS = (*ASKED_OF, "violation", "motion", "step_size", "scale", "conformance")
+SOLVERS_OF_NEWEST = re.compile(rf'"{NEWEST}, [^",]*')
 AT_LENGTH = '"compare",'  # how rows of work_precision begin that are of long motions
 
 
@@ -54,7 +57,8 @@ COSTS = ("call_s", "called_from", "keeps")
 def findings(folder: Path) -> dict[str, dict[str, Any]]:
     """What NAME.json of each study holds, for those that have been run into the folder and time what all time.
 
-    In that of work_precision, "lacking" is what was not run with the newest rival, "long_without" the cases at length.
+    In that of work_precision, "lacking" is what was not run with the newest rival, "long_without" the cases at length, "partly_asked" the
+    other studies without it, or with one solver of it.
 
     Raises StudyError if a file is damaged.
     """
@@ -68,6 +72,7 @@ def findings(folder: Path) -> dict[str, dict[str, Any]]:
             found[path.stem] = told
     if "work_precision" in found:
         found["work_precision"] |= {"lacking": lacking(folder), "long_without": long_without(folder)}
+        found["work_precision"]["partly_asked"] = partly_asked(folder)
     return found
 
 
@@ -77,6 +82,16 @@ def lacking(folder: Path) -> list[str]:
     told = {what: rows[name] for name, what in ASKED_OF.items()}
     without = [what for what, lines in told.items() if lines and not any(map(_has_newest, lines))]
     return ["some long motions"] * bool(long_without(folder)) + without
+
+
+def partly_asked(folder: Path) -> dict[str, list[str]]:
+    """Studies with rivals whose rows lack `NEWEST`, and those that have one solver of it only."""
+    named = {name: set(SOLVERS_OF_NEWEST.findall("\n".join(_lines(folder / f"{name}.csv")))) for name in WITH_RIVALS}
+    there = {name: own for name, own in named.items() if (folder / f"{name}.csv").is_file()}
+    return {
+        "none": [name for name, own in there.items() if not own],
+        "one": [name for name, own in there.items() if len(own) == 1],
+    }
 
 
 def long_without(folder: Path) -> list[str]:

@@ -125,11 +125,17 @@ def long_of(rows: pd.DataFrame) -> dict[str, Any]:
     sides = [(level["no_drift"]["ours"], level["drift"]["ours"]) for level in at[1:]]
     both = [side for side in sides if all(side)]
     over_drifting = [one["call_s"] / other["call_s"] for one, other in both]
+    plain = [
+        level["no_drift"]["ours"]["call_s"] / level["times"][DEFAULT]
+        for level in at[1:]
+        if level["no_drift"]["ours"] and DEFAULT in level["times"]
+    ]
     listed = where(rows, group="other")
     places = [run["energy"].abs().fillna(np.inf).idxmin() for _, run in listed.groupby("name", sort=False)]
     calm_ours: dict[str, Any] = {"labels": list(dict.fromkeys(run["label"] for run in kept))}
     calm_ours["fixed"] = bool(kept) and all(run["fixed_steps"] for run in kept)
     calm_ours["over_drifting"] = [min(over_drifting), max(over_drifting)] if over_drifting else None
+    calm_ours["over_plain"] = [min(plain), max(plain)] if plain else None
     default = reached[own & ~calm & reached["solver"].isin((DEFAULT, OWN_CODE))]
     calm_ours["least"] = {"calm": float(reached[own & calm]["worst"].min()), "drifting": float(default["worst"].min())}
     calm_ours["drifting_explicit"] = bool(both) and all(other["explicit"] for _, other in both)

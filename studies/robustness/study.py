@@ -172,6 +172,9 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     found["n_linkages"] = len(drawn.groupby(["what", "value"]))
     found["n_redrawn"] = int(drawn.drop_duplicates(["what", "value"])["n_redrawn"].sum())
     found["sensitivity"], found["allowed"] = float(drawn["sensitivity"].max()), float(drawn["allowed"].max())
+    beyond = drawn[drawn["outcome"].eq(RIGHT) & (drawn["error"] > LOOSENESS * TOLERANCE)]
+    found["beyond"] = {"n": len(beyond), "of": int(drawn["outcome"].eq(RIGHT).sum())}
+    found["beyond"] |= {"default": int(beyond["method"].eq("auto").sum())}
     found["sharp"] = sharp_runs.counts(rows[rows["group"] == sharp_runs.SHARP])
     stopped = drawn[drawn["outcome"] == SAID]
     found["n_stopped"], found["n_stopped_rank"] = len(stopped), int(stopped["message"].str.contains("rank").sum())

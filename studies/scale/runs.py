@@ -14,7 +14,7 @@ from references.exudyn.pinned import solve_pinned
 from references.sundials.ida_sparse import solve_ida_sparse
 from studies.bench.collector import Case, Run, Solver, called_from, timed
 from studies.bench.large import PLANAR, SPATIAL, Assembly, open_chain
-from studies.bench.solvers import CATALOGUE, CVODE_C, DEFAULT, at_instants
+from studies.bench.solvers import CATALOGUE, CVODE_C, CYRK, DEFAULT, HEYOKA, at_instants
 from studies.bench.store import Row
 from twoloop import Result, solve_dae
 from twoloop.mechanisms import Problem
@@ -35,7 +35,7 @@ EXUDYN = {f"Exudyn, {name}": name for name in ("GeneralizedAlpha", "TrapezoidalI
 N_STEPS = (100, 300, 1000, 3000, 10_000, 30_000)  # of Exudyn; the last two once
 ONCE = 2
 SPARSE_IDA, IDA_TOLERANCES = "IDA, sparse", (1e-4, 1e-5, 1e-6, 1e-7, 1e-8)  # where entries are given by values: once
-OTHERS = (CVODE_C,)  # on the smallest chain: its expressions grow faster than the chain
+OTHERS = {20: (CVODE_C, CYRK, HEYOKA), 100: (CVODE_C, CYRK)}  # by size: their expressions grow faster than the chain
 STAGES = 12  # evaluations of a step of DOP853
 LIMIT, TIGHT = 60.0, 1e-10  # s of CPU of a run; tolerance of the reference
 AGREE = 1e-7  # how far two unlike methods may end apart with it
@@ -120,9 +120,9 @@ def solvers(n: int) -> dict[str, tuple[float, ...]]:
     """What runs a chain of n bodies, and tolerances, or steps in s."""
     steps = tuple(CHAINS[n] / n_steps for n_steps in N_STEPS)
     ours = dict.fromkeys((DEFAULT, "DOP853 (twoloop)"), TOLERANCES)
-    others: dict[str, tuple[float, ...]] = dict.fromkeys(OTHERS, TOLERANCES)
+    others: dict[str, tuple[float, ...]] = dict.fromkeys(OTHERS.get(n, ()), TOLERANCES)
     if n != min(CHAINS):
-        others = {SPARSE_IDA: IDA_TOLERANCES}
+        others[SPARSE_IDA] = IDA_TOLERANCES
     return {**ours, **dict.fromkeys(EXUDYN, steps), **others}
 
 

@@ -26,6 +26,7 @@ AT_REST = 1e-4  # of the largest velocity of a run: below it the linkage has tur
 SAME = 1e-6  # s: zeros of several bars closer than this are one rest
 BARS = (2, 5, 8)  # angles of the three bars
 WAYS = (("processes", 1), ("processes", 2), ("threads", 1), ("threads", 2))
+ONE = {"processes": "process", "threads": "thread"}
 SCALES = 1.8  # on two cores, as the project asks for
 
 
@@ -118,13 +119,20 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     returned = np.abs(periodic["period"] - 2.0 * periodic["half"]) / periodic["period"]
     found: dict[str, Any] = {"n": len(linkages), "n_done": len(done), "n_unassembled": int(causes.sum())}
     found |= {"others": failed[~causes]["status"].value_counts().to_dict()}
-    found |= {"runs_per_second": int(scaling["n_runs"].iloc[0]) / min(wall.values()), "t_end": SPAN[1]}
+    found |= {"speeds": [_speed(row) for _, row in scaling.sort_values("wall").iterrows()], "t_end": SPAN[1]}
     found |= {"energy": _quantiles(done["energy_error"])}
     found |= {"worst": {name: float(worst[name]) for name in (*RANGES, "branch", "energy_error")}}
     found |= {"n_periodic": len(periodic), "period": _quantiles(periodic["period"]) if len(periodic) else None}
     found |= {"return": _quantiles(returned) if len(periodic) else None, "n_scaling": int(scaling["n_runs"].iloc[0])}
     found |= {"ratios": ratios, "asked": SCALES}
     return found | {"scales": ratios["processes"] >= SCALES if "processes" in ratios else None}
+
+
+def _speed(row: pd.Series) -> dict[str, Any]:
+    """How many runs a second a way of sweeping makes."""
+    n = int(row["workers"])
+    words = f"Two {row['parallel']}" if n > 1 else f"One {ONE[row['parallel']]}"
+    return {"words": words, "workers": n, "per_second": int(row["n_runs"]) / row["wall"]}
 
 
 def _quantiles(values: pd.Series) -> dict[str, float]:

@@ -108,7 +108,7 @@ def test_the_order_is_named_where_steps_cost_about_the_same():
 
 
 def test_cvode_is_asked_for_all_that_the_default_is_asked_for():
-    assert runs.solvers(20)[runs.OTHERS[0]] == runs.solvers(20)[scale.DEFAULT]
+    assert runs.solvers(20)[runs.OTHERS[20][0]] == runs.solvers(20)[scale.DEFAULT]
 
 
 def test_a_failed_size_is_named_and_in_no_fit():

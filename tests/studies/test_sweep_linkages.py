@@ -74,7 +74,8 @@ def test_findings_are_of_the_rows():
     assert (found["n"], found["n_done"], found["n_unassembled"], found["others"]) == (3, 2, 1, {})
     assert found["worst"]["L1"] == study.drawn(3)[1]["L1"] and found["return"]["worst"] == pytest.approx(0.001 / 1.001)
     assert found["ratios"] == {"processes": 2.0, "threads": 1.45} and found["scales"] is True
-    assert found["runs_per_second"] == pytest.approx(500 / 15.0)
+    assert [each["words"] for each in found["speeds"]][:2] == ["Two processes", "Two threads"]
+    assert found["speeds"][0]["per_second"] == pytest.approx(500 / 15.0)
     with pytest.raises(StudyError, match="no linkage reached the end"):
         study.findings_of(made_up(status="RANK_LOST"))
 
