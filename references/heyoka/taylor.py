@@ -59,13 +59,8 @@ def integrate(integrator: Any, start: Array, task: Task, longest: float) -> tupl
     integrator.time, integrator.state[:] = task.t0, start
     grid = kept if kept.size and kept[0] == task.t0 else np.append(task.t0, kept)  # must start at the current time
     rows = integrator.propagate_grid(grid, max_delta_t=longest)[-1][grid.size - kept.size :]
-    return (
-        f"heyoka, order {integrator.order},",
-        kept[: len(rows)],
-        rows,
-        failure,
-        steps,
-    )  # a failure may come earlier now
+    kept = kept[: len(rows)]  # a failure may come earlier this time
+    return f"heyoka, order {integrator.order},", kept, rows, failure, steps
 
 
 def rates_of(equations: Expressions, parameters: list[Any] | None = None) -> list[tuple[Any, Any]]:

@@ -57,8 +57,8 @@ COSTS = ("call_s", "called_from", "keeps")
 def findings(folder: Path) -> dict[str, dict[str, Any]]:
     """What NAME.json of each study holds, for those that have been run into the folder and time what all time.
 
-    In that of work_precision, "lacking" is what was not run with the newest rival, "long_without" the cases at length, "partly_asked" the
-    other studies without it, or with one solver of it.
+    In that of work_precision, "lacking" is what was not run with the newest rival, "long_without" the cases at length,
+    "partly_asked" the other studies without it, or with one solver of it.
 
     Raises StudyError if a file is damaged.
     """
