@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike
 from scipy.integrate import solve_ivp
 
 from twoloop.checks.arguments import check_finite, check_positive, check_real, check_vector
+from twoloop.kernels.compile.caches import kept_when_called
 from twoloop.problem.problem import Array
 
 RTOL, ATOL = 1e-13, 1e-14
@@ -91,7 +92,7 @@ class MinimalFourBar:
     def from_parameters(cls, parameters: Mapping[str, Any]) -> "MinimalFourBar":
         """Return the linkage of `four_bar(...).parameters`: L1, L2, L3, L, theta3, branch, density, gravity."""
         p = parameters
-        return cls((p["L1"], p["L2"], p["L3"]), p["L"], p["theta3"], p["branch"], p["density"], p["gravity"])
+        return _linkage((p["L1"], p["L2"], p["L3"]), p["L"], p["theta3"], p["branch"], p["density"], p["gravity"])
 
     def states(self, times: ArrayLike) -> tuple[Array, Array]:
         """Return absolute coordinates and velocities at any times.
@@ -154,28 +155,44 @@ class MinimalFourBar:
 
         x and y are the displacements of the centres along the tangent.
         """
-        L, masses = self._lengths, self._masses
-        angles, u = state[:3], state[3]
-        n = tangent_of(L, angles)
-        n_s = _tangent_rate(L, angles, n)
-        c, s = np.cos(angles), np.sin(angles)
-        x, x_s = _centres(L, -s * n), _centres(L, -s * n_s - c * n**2)
-        y, y_s = _centres(L, c * n), _centres(L, c * n_s - s * n**2)
-        inertias = masses * L**2 / 12.0
-        inertia = masses @ (x * x + y * y) + inertias @ (n * n)
-        coupling = masses @ (x * x_s + y * y_s) + inertias @ (n * n_s)
-        return np.append(n * u, (torque * n[0] - coupling * u**2 - self._gravity * (masses @ y)) / inertia)
+        return _rate(self._lengths, self._masses, self._gravity, state, torque)  # type: ignore[no-any-return]
 
 
 def trajectory(parameters: Mapping[str, Any], times: ArrayLike) -> tuple[Array, Array]:
     """Return states of the linkage of `four_bar(...).parameters` at `times`; see `MinimalFourBar.states`."""
-    return _linkage(tuple(sorted(parameters.items()))).states(times)
+    return MinimalFourBar.from_parameters(parameters).states(times)
 
 
 @lru_cache(maxsize=64)
-def _linkage(parameters: tuple[tuple[str, Any], ...]) -> MinimalFourBar:
+def _linkage(*arguments: Any) -> MinimalFourBar:
     """Return the linkage, integrated once."""
-    return MinimalFourBar.from_parameters(dict(parameters))
+    return MinimalFourBar(*arguments)
+
+
+@kept_when_called(error_model="numpy")
+def _rate(L, masses, gravity, state, torque):  # type: ignore[no-untyped-def]
+    rate, n, n_s = np.zeros(4), np.zeros(3), np.zeros(3)
+    for i in range(3):  # the tangent, and its derivative along itself
+        j, k = (i + 1) % 3, (i + 2) % 3
+        n[i] = L[j] * L[k] * math.sin(state[k] - state[j])
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        n_s[i] = L[j] * L[k] * math.cos(state[k] - state[j]) * (n[k] - n[j])
+    inertia = coupling = lifted = 0.0
+    x = y = x_s = y_s = 0.0  # of the end of the bar before, per unit of the tangent; _s: the derivatives along it
+    for i in range(3):
+        c, s = math.cos(state[i]), math.sin(state[i])
+        dx, dy = -L[i] * s * n[i], L[i] * c * n[i]
+        dx_s, dy_s = -L[i] * (s * n_s[i] + c * n[i] ** 2), L[i] * (c * n_s[i] - s * n[i] ** 2)
+        mid_x, mid_y = x + 0.5 * dx, y + 0.5 * dy
+        about = L[i] ** 2 / 12.0
+        inertia += masses[i] * (mid_x**2 + mid_y**2 + about * n[i] ** 2)
+        coupling += masses[i] * (mid_x * (x_s + 0.5 * dx_s) + mid_y * (y_s + 0.5 * dy_s) + about * n[i] * n_s[i])
+        lifted += masses[i] * mid_y
+        x, y, x_s, y_s = x + dx, y + dy, x_s + dx_s, y_s + dy_s
+        rate[i] = n[i] * state[3]
+    rate[3] = (torque * n[0] - coupling * state[3] ** 2 - gravity * lifted) / inertia
+    return rate
 
 
 def _counted(rate: Callable[[float, Array], Array]) -> Callable[[float, Array], Array]:
@@ -219,14 +236,6 @@ def tangent_of(lengths: Array, angles: Array) -> Array:
     L1, L2, L3 = lengths
     th1, th2, th3 = angles
     return np.array([L2 * L3 * np.sin(th3 - th2), L3 * L1 * np.sin(th1 - th3), L1 * L2 * np.sin(th2 - th1)])
-
-
-def _tangent_rate(lengths: Array, angles: Array, n: Array) -> Array:
-    """Return the derivative of the tangent along itself, (3,)."""
-    L1, L2, L3 = lengths
-    th1, th2, th3 = angles
-    areas = np.array([L2 * L3 * np.cos(th3 - th2), L3 * L1 * np.cos(th1 - th3), L1 * L2 * np.cos(th2 - th1)])
-    return areas * np.array([n[2] - n[1], n[0] - n[2], n[1] - n[0]])
 
 
 def _assemble(lengths: Array, ground: float, theta3: float, branch: int) -> Array:

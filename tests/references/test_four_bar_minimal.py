@@ -98,13 +98,14 @@ def test_wrong_arguments_are_named(changed, error, words):
 def test_the_search_for_the_period_and_the_integration_end(monkeypatch):
     for most in (100, 2000):  # the search takes fewer than 2000, the integration more
         monkeypatch.setattr(four_bar_minimal, "MOST_EVALUATIONS", most)
+        four_bar_minimal._linkage.cache_clear()
         with pytest.raises(ValueError, match=f"not come to rest after {most} evaluations"):
             MinimalFourBar.from_parameters(PROBLEMS[0].parameters)
 
 
 def test_an_equation_of_motion_that_is_not_finite_is_an_error(monkeypatch):
     form = minimal_form(0)
-    monkeypatch.setattr(four_bar_minimal, "_tangent_rate", lambda *_: np.full(3, np.nan))
+    monkeypatch.setattr(four_bar_minimal, "_rate", lambda *_: np.full(4, np.nan))
     rate = four_bar_minimal._counted(form.rate)
     with pytest.raises(ValueError, match=r"gives values that are not finite at t = 0\.5 s"):
         rate(0.5, np.array([0.1, 0.2, 0.3, 1.0]))

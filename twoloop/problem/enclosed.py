@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import dis
 from collections.abc import Iterator
-from itertools import pairwise
+from functools import lru_cache
+from itertools import chain, pairwise
 from types import CellType, CodeType, ModuleType
 from typing import Any, NamedTuple
 
@@ -101,11 +102,13 @@ def _enclosed(function: Any, seen: set[int]) -> Iterator[tuple[Any, str, Any]]:
             yield place, name, value
 
 
-def _names_in(code: CodeType) -> Iterator[tuple[str, str]]:
+@lru_cache(maxsize=1024)  # functions are made again and again from one code, and every `solve_dae` looks
+def _names_in(code: CodeType) -> tuple[tuple[str, str], ...]:
     """The globals that a code and the functions within it load, each with the attribute that is taken of it, or ""."""
-    for one, following in pairwise(dis.get_instructions(code)):
-        if one.opname == "LOAD_GLOBAL":
-            yield one.argval, following.argval if following.opname in ("LOAD_ATTR", "LOAD_METHOD") else ""
-    for inner in code.co_consts:
-        if isinstance(inner, CodeType):
-            yield from _names_in(inner)
+    found = [
+        (one.argval, following.argval if following.opname in ("LOAD_ATTR", "LOAD_METHOD") else "")
+        for one, following in pairwise(dis.get_instructions(code))
+        if one.opname == "LOAD_GLOBAL"
+    ]
+    inner = [_names_in(constant) for constant in code.co_consts if isinstance(constant, CodeType)]
+    return tuple(chain(found, *inner))
