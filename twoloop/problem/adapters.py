@@ -1,6 +1,8 @@
 """Plain functions that return their array, made into callbacks: called as they are, or compiled."""
 
+import ctypes
 import inspect
+import math
 import secrets
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -18,7 +20,11 @@ from twoloop.kernels.compile.callbacks import KINDS, compile_callback
 from twoloop.kernels.compile.dependencies import digest_of, stands_for
 from twoloop.kernels.compile.private import Dispatcher
 
+Address = tuple[int, tuple[int, ...]]  # of a contiguous float64 array, and its shape: numba boxes an array in 0.5 us
+
 KIND_NAMES = tuple(KINDS)
+_ARRAYS: dict[Address, Array] = {}  # by where they are: arrays of a run stay where they are
+MOST_ARRAYS = 1000
 REAL = "fiu"  # kinds of arrays; durations are whole numbers to NumPy, and no forces
 HANDLE_BITS = 52  # so that a handle is a float64 exactly; a foreign one, of another process, matches none of ours
 
@@ -30,18 +36,18 @@ class PythonFunctions:
     unpickled elsewhere, the functions are registered again. Those in `taking` get the parameters.
     """
 
-    registry: ClassVar[WeakValueDictionary[int, "PythonFunctions"]] = WeakValueDictionary()
+    registry: ClassVar[WeakValueDictionary[float, "PythonFunctions"]] = WeakValueDictionary()
 
     def __init__(self, name: str, functions: dict[str, Callable[..., Any]], taking: frozenset[str]):
         self.name, self.functions, self.taking = name, functions, taking
         self.handle = secrets.randbits(HANDLE_BITS)
         self.registry[self.handle] = self
 
-    def call(self, kind: str, arguments: tuple[Any, ...], p: Array, out: Array) -> None:
+    def call(self, kind: str, arguments: tuple[Any, ...], p: Address, out: Array) -> None:
         """Call one function with copies of the arrays, check what comes back and write it to `out`."""
         t = arguments[0]
         if kind in self.taking:
-            arguments = (*arguments, p.copy())
+            arguments = (*arguments, array_at(*p)[1:].copy())
         try:
             value = self.functions[kind](*arguments)
         except Exception as error:
@@ -70,14 +76,25 @@ def store(kind: str, name: str, t: float, value: Any, out: Array) -> None:
     out[...] = array
 
 
-def _call(number: int, arguments: tuple[Any, ...], p: Array, out: Array) -> None:
-    functions = PythonFunctions.registry.get(int(p[0])) if p.size and np.isfinite(p[0]) else None
+def array_at(address: int, shape: tuple[int, ...]) -> Array:
+    """The float64 array of a shape at an address, which holds as long as the call of the callback that names it."""
+    found = _ARRAYS.get((address, shape))
+    if found is None:
+        if len(_ARRAYS) >= MOST_ARRAYS:
+            _ARRAYS.clear()
+        numbers = (ctypes.c_double * math.prod(shape)).from_address(address)
+        found = _ARRAYS[address, shape] = np.ctypeslib.as_array(numbers).reshape(shape)
+    return found
+
+
+def _call(number: int, handle: float, t: float, state: tuple[Address, ...], p: Address, out: Address) -> None:
+    functions = PythonFunctions.registry.get(handle)
     if functions is None:
         raise RuntimeError(
             "these callbacks lead to Python functions of a system that is not in this process, or no longer: their "
             "`parameters` are not numbers to keep. Pass the system itself on, by pickle if need be"
         )
-    functions.call(KIND_NAMES[number], arguments, p[1:], out)
+    functions.call(KIND_NAMES[number], (t, *[array_at(*each).copy() for each in state]), p, array_at(*out))
 
 
 @cache
@@ -86,14 +103,17 @@ def through_python(kind: str) -> Dispatcher:
     place = KIND_NAMES.index(kind)
 
     def with_two(t, q, p, out):  # type: ignore[no-untyped-def]
-        number = place
+        number, handle = place, p[0] if p.size > 0 else np.nan
+        at_q, at_p, at_out = (q.ctypes.data, q.shape), (p.ctypes.data, p.shape), (out.ctypes.data, out.shape)
         with objmode():
-            _call(number, (t, q.copy()), p, out)
+            _call(number, handle, t, (at_q,), at_p, at_out)
 
     def with_three(t, q, x, p, out):  # type: ignore[no-untyped-def]
-        number = place
+        number, handle = place, p[0] if p.size > 0 else np.nan
+        at_q, at_x = (q.ctypes.data, q.shape), (x.ctypes.data, x.shape)
+        at_p, at_out = (p.ctypes.data, p.shape), (out.ctypes.data, out.shape)
         with objmode():
-            _call(number, (t, q.copy(), x.copy()), p, out)
+            _call(number, handle, t, (at_q, at_x), at_p, at_out)
 
     through = with_two if len(KINDS[kind].state) == 1 else with_three
     made = compile_callback(kind, through, ("through Python", str(place)))
