@@ -112,8 +112,8 @@ def solve_dae(
         time are also evaluated every two-thousandth of the run, and steps end where they change suddenly. What acts for
         a shorter time, or over a shorter distance, may be missed; then give its duration.
     max_steps : int, optional
-        Largest number of accepted steps. None: no limit, but a run ends with the status STAGNATED if its steps have
-        become a thousand times shorter than before and the rest would take more than ten million of them.
+        Largest number of accepted steps. None: no limit, but a run ends with the status STAGNATED if the rest would
+        take more than 1e10 of its last steps, or more than 1e7 if these are a thousand times shorter than those before.
     step_size : float, optional
         Constant step, s, without error control. Only the last step is shortened, to end at t_span[1]. Times in `t_eval`
         must then be multiples of it. A step that does not converge ends the run.
