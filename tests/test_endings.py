@@ -6,7 +6,7 @@ import time
 import numpy as np
 import pytest
 
-from tests.problems import pendulum, violations
+from tests.problems import event, pendulum, violations
 from twoloop import Integrator, Status, solve_dae
 from twoloop.mechanisms import four_bar
 from twoloop.run.record import MEANINGS
@@ -100,6 +100,14 @@ def test_a_sample_that_is_too_long_for_the_motion_ends():
     integrator.start(0.0, *TOO_FAST)
     with pytest.raises(RuntimeError, match="the rest needs"):
         integrator.step(10.0)
+
+
+def test_what_ends_before_the_end_may_be_far_from_it():
+    far, start = (0.0, 1e11), ([-1.0, 0.0], [0.0, 0.0])
+    ended = solve_dae(pendulum(compile=True), far, *start, "DOP853", time_limit=0.5, compiled=False)
+    assert ended.status is Status.TIME_LIMIT
+    late = event(lambda t, q, v: t - 1e3, terminal=True)
+    assert solve_dae(pendulum(compile=True), far, *start, "DOP853", max_step=0.02, events=late).status is Status.EVENT
 
 
 def test_many_steps_within_reach_are_made():

@@ -113,7 +113,8 @@ def solve_dae(
         a shorter time, or over a shorter distance, may be missed; then give its duration.
     max_steps : int, optional
         Largest number of accepted steps. None: no limit, but a run ends with the status STAGNATED if the rest would
-        take more than 1e10 of its last steps, or more than 1e7 if these are a thousand times shorter than those before.
+        take more than 1e7 steps as short as the last and these are a thousand times shorter than before, or more than
+        1e11 and there is neither a time_limit nor a terminal event.
     step_size : float, optional
         Constant step, s, without error control. Only the last step is shortened, to end at t_span[1]. Times in `t_eval`
         must then be multiples of it. A step that does not converge ends the run.
