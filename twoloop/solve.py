@@ -247,7 +247,10 @@ def check_options(
     if step_size is not None:
         check_positive("step_size", step_size)
         if first_step is not None or max_step != np.inf:
-            raise ValueError("step_size is a constant step: give neither first_step nor max_step with it")
+            raise ValueError(
+                "step_size is a constant step: give neither first_step nor max_step with it; given step_size = "
+                f"{step_size!r}, first_step = {first_step!r}, max_step = {max_step!r}"
+            )
     if max_steps is not None:
         check_size("max_steps", max_steps, 1)
     if time_limit is not None:
