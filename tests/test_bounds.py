@@ -200,7 +200,7 @@ def test_negative_indices_count_from_the_end_as_in_python():
     [
         ("jacobian", (0.0, [0.0]), ValueError, r"q must have shape \(2,\), as n_q = 2 in '\w+'; given shape \(1,\)"),
         ("jacobian", (0.0, [[0.0, 1.0]]), ValueError, r"q must have shape \(2,\).*given shape \(1, 2\)"),
-        ("constraint", (0.0, 1.0), ValueError, r"q must have shape \(2,\).*given shape \(\)"),
+        ("constraint", (0.0, 1.0), ValueError, r"q must have shape \(2,\).*given the number 1\.0"),
         ("force", (0.0, Q, [0.0] * 3), ValueError, r"v must have shape \(2,\).*given shape \(3,\)"),
         ("reaction_by_q", (0.0, Q, V), ValueError, r"lam must have shape \(1,\), as n_c = 1.*given shape \(2,\)"),
         ("mass", (np.nan, Q), ValueError, "t must be finite; given nan"),

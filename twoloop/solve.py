@@ -112,8 +112,9 @@ def solve_dae(
         time are also evaluated every two-thousandth of the run, and steps end where they change suddenly. What acts for
         a shorter time, or over a shorter distance, may be missed; then give its duration.
     max_steps : int, optional
-        Largest number of accepted steps. None: no limit, but a run ends with the status STAGNATED if its steps have
-        become a thousand times shorter than before and the rest would take more than ten million of them.
+        Largest number of accepted steps. None: no limit, but a run ends with the status STAGNATED if the rest would
+        take more than 1e7 steps as short as the last and these are a thousand times shorter than before, or more than
+        1e11 and there is neither a time_limit nor a terminal event.
     step_size : float, optional
         Constant step, s, without error control. Only the last step is shortened, to end at t_span[1]. Times in `t_eval`
         must then be multiples of it. A step that does not converge ends the run.
@@ -246,7 +247,10 @@ def check_options(
     if step_size is not None:
         check_positive("step_size", step_size)
         if first_step is not None or max_step != np.inf:
-            raise ValueError("step_size is a constant step: give neither first_step nor max_step with it")
+            raise ValueError(
+                "step_size is a constant step: give neither first_step nor max_step with it; given step_size = "
+                f"{step_size!r}, first_step = {first_step!r}, max_step = {max_step!r}"
+            )
     if max_steps is not None:
         check_size("max_steps", max_steps, 1)
     if time_limit is not None:

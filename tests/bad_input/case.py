@@ -91,9 +91,9 @@ def argument(group, call, name, *values):
 
 NUMBERS = "give a list or array of n_q real numbers"
 VECTORS = [
-    ([1.0], ValueError, r"must have shape \(2,\); given shape \(1,\)", NUMBERS),
+    ([1.0], ValueError, r"must have shape \(2,\); given shape \(1,\), \[1.0\]", NUMBERS),
     (np.zeros((2, 1)), ValueError, r"must have shape \(2,\); given shape \(2, 1\)", "give one dimension: ravel() it"),
-    (0.0, ValueError, r"must have shape \(2,\); given shape \(\)", NUMBERS),
+    (0.0, ValueError, r"must have shape \(2,\); given the number 0.0", NUMBERS),
     ([np.nan, 0.0], ValueError, r"must be finite; entries \[0\] .*given \[nan\]", "find out where the NaN comes from"),
     (
         [0.0, np.inf],

@@ -86,7 +86,7 @@ JOINTS = [
         "equations of another size",
         [Joint("a", (0,), (0, 1), equations=np.eye(2))],
         ValueError,
-        r"must be an invertible matrix of shape \(1, 1\); given one of shape \(2, 2\)",
+        r"must be an invertible matrix of shape \(1, 1\); given shape \(2, 2\)",
         "give a matrix (n_c + n_a, n_c + n_a)",
     ),
     joints(

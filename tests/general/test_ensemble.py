@@ -51,6 +51,7 @@ def test_what_lanes_cannot_see_is_found_and_made_singly(case, compiled):
     system = system_of(parameters, mass=np.eye(2), force=BRANCHING[case], compile=compiled)
     runs = ensemble(system, (0.0, 1.0), q, v, parameters=parameters)
     assert runs.success.all() and far_from_single_runs(runs, range(12), system, (0.0, 1.0), q, v, parameters) < 1e-6
+    assert runs.reasons.keys() == set(np.flatnonzero(runs.singly)) and all(runs.reasons.values())
 
 
 @pytest.mark.parametrize("compiled", [False, True])
@@ -74,7 +75,7 @@ def test_what_cannot_go_in_lanes_says_why():
     system, q, v, parameters = pendulums(3)
     knife = mechanisms.knife_edge()
     runs = ensemble(knife.system, (0.0, 0.1), np.tile(knife.q0, (2, 1)), knife.v0)
-    assert runs.singly.all() and "nonholonomic" in runs.message
+    assert runs.singly.all() and "nonholonomic" in runs.message and "nonholonomic" in runs.reasons[1]
     runs = ensemble(system, (0.0, 0.1), q, v, parameters=parameters, method="Adams")
     assert runs.singly.all() and "Adams does not go in lanes" in runs.message
     runs = ensemble(system, SPAN, q, v, parameters=parameters, events=event(lambda t, q, v: q[1] + 0.2, terminal=True))

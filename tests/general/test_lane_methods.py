@@ -261,6 +261,9 @@ def test_a_force_that_ends_is_left_to_single_runs_and_others_are_not(method):
     runs = ensemble(system, SPAN, q, v, parameters=parameters, method=method, t_eval=TIMES)
     assert np.flatnonzero(runs.singly).tolist() == [0, 3, 7] == [0, *sorted(runs.messages)]
     assert np.isnan(runs.q[[3, 7], :, -1]).all() and runs.success.sum() == 7
+    assert runs.reasons.keys() == {0, 3, 7} and "first" in runs.reasons[0]
+    assert all("no values" in runs.reasons[run] or "refused" in runs.reasons[run] for run in (3, 7))
+    assert all(runs.reasons[run] in runs.message for run in runs.reasons)
 
 
 @pytest.mark.filterwarnings("ignore:invalid value")
@@ -279,6 +282,7 @@ def test_a_stiff_run_among_others_does_not_go_on_for_ever():
     system = unconstrained(force, parameters=parameters[0])
     runs = ensemble(system, (0.0, 1.0), np.zeros(1), np.ones(1), parameters=parameters)
     assert runs.singly.tolist() == [True, False, True, False] and "2 in lanes by Taylor" in runs.message
+    assert "100,000 steps" in runs.reasons[2] and "run 2: it takes more than 100,000" in runs.message
     assert runs.n_steps[2] < 1000 and abs(runs.q[2, 0, 1] - 0.5 * np.sin(2.0)) < 1e-6
 
 
@@ -337,6 +341,8 @@ def test_runs_through_a_singular_position_are_made_singly(method):
     runs = ensemble(problem.system, span, np.tile(problem.q0, (3, 1)), problem.v0, method=method)
     known = solve_dae(problem.system, span, problem.q0, problem.v0)
     assert runs.singly.all() and np.abs(runs.q[:, :, -1] - known.q[:, -1]).max() < 1e-6
+    assert runs.reasons[1] == runs.reasons[2] and f"2 runs (1, 2): {runs.reasons[1]}" in runs.message
+    assert "lose rank" in runs.reasons[1] or "singular position" in runs.reasons[1]
 
 
 # long steps

@@ -30,6 +30,13 @@ def shown(value: Any) -> str:
     return text if len(text) <= SHOWN else f"{text[:SHOWN]}..."
 
 
+def shaped(array: NDArray[Any]) -> str:
+    """An array of another shape than was expected, as a message shows it."""
+    if array.ndim == 0:
+        return f"the number {shown(array.tolist())}"
+    return f"shape {array.shape}, {shown(array.tolist())}"
+
+
 def check_size(name: str, value: Any, least: int) -> int:
     """Return `value` as an int of at least `least`, or say what is wrong with it."""
     if isinstance(value, bool) or not isinstance(value, (int, np.integer)):
@@ -126,7 +133,7 @@ def check_vector(name: str, value: ArrayLike, n: int) -> Array:
     """Return `value` as a new float vector of length n, or say what is wrong with it."""
     array = check_real(name, value)
     if array.shape != (n,):
-        raise ValueError(f"{name} must have shape ({n},); given shape {array.shape}")
+        raise ValueError(f"{name} must have shape ({n},); given {shaped(array)}")
     if not math.isfinite(sum(array.tolist())) and not np.isfinite(array).all():  # sums may be too large
         raise wrong_entries(name, "finite", array, ~np.isfinite(array))
     return array
@@ -135,7 +142,7 @@ def check_vector(name: str, value: ArrayLike, n: int) -> Array:
 def check_columns(name: str, value: Array, n: int) -> None:
     """Raise unless an array holds a state of n numbers, or one in each column."""
     if value.ndim not in (1, 2) or len(value) != n:
-        raise ValueError(f"{name} must have shape ({n},) or ({n}, n_t); given shape {value.shape}")
+        raise ValueError(f"{name} must have shape ({n},) or ({n}, n_t); given {shaped(value)}")
 
 
 def check_indices(name: str, value: Any, n: int) -> list[int]:
@@ -162,7 +169,8 @@ def check_span(t_span: tuple[float, float]) -> tuple[float, float]:
     else:
         times = check_real("t_span", t_span)
         if times.shape != (2,):
-            raise ValueError(f"t_span must have shape (2,), (start, end); given shape {times.shape}")
+            advice = "give both, as in (0.0, 10.0)" if times.ndim == 0 else "give both, and further times as t_eval"
+            raise ValueError(f"t_span must have shape (2,), (start, end); given {shaped(times)}: {advice}")
         t0, t1 = check_vector("t_span", times, 2).tolist()
     if not t1 - t0 > NEAR * math.ulp(max(abs(t0), abs(t1))):
         wanted = "with end > start" if t1 <= t0 else "further apart than floating-point numbers resolve"
@@ -213,7 +221,7 @@ def check_tolerance(name: str, value: ArrayLike, n_q: int) -> Array:
     array = check_real(name, value)
     if array.shape != (n_q,):
         raise ValueError(
-            f"{name} must be a number or have one for each coordinate, shape ({n_q},); given shape {array.shape}"
+            f"{name} must be a number or have one for each coordinate, shape ({n_q},); given {shaped(array)}"
         )
     fine = (array > 0.0) & np.isfinite(array)
     if not fine.all():
@@ -225,7 +233,8 @@ def check_times(t_eval: ArrayLike, t0: float, t1: float, step_size: float | None
     """Return the output times as an array, or say what is wrong with them."""
     times = check_real("t_eval", t_eval)
     if times.ndim != 1 or times.size == 0:
-        raise ValueError(f"t_eval must be a non-empty one-dimensional array; given shape {times.shape}")
+        advice = "leave it out for every step" if times.size == 0 else f"write {shown(times.ravel().tolist())}"
+        raise ValueError(f"t_eval must be a non-empty one-dimensional array; given {shaped(times)}: {advice}")
     if not np.isfinite(times).all():
         raise wrong_entries("t_eval", "finite", times, ~np.isfinite(times))
     if times.min() < t0 or times.max() > t1:
@@ -244,7 +253,10 @@ def check_times(t_eval: ArrayLike, t0: float, t1: float, step_size: float | None
     for end in (t0, t1):
         beside = (times != end) & (np.abs(times - end) <= spacing)
         if beside.any():
-            raise ValueError(f"t_eval must not come within rounding of the end {end!r} of t_span; give that end itself")
+            raise ValueError(
+                f"t_eval must not come within rounding of the end {end!r} of t_span; given "
+                f"{float(times[beside][0])!r}: give that end itself"
+            )
     if step_size is not None:
         ratio = (times - t0) / step_size
         off = np.abs(ratio - np.round(ratio)) > max(1e-6, spacing / step_size)

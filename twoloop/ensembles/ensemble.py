@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from twoloop.checks.arguments import Array, check_positive, check_size, check_span, check_times, check_tolerance
-from twoloop.ensembles.in_lanes import LaneRuns, threads_of
+from twoloop.ensembles.in_lanes import WHY, LaneRuns, threads_of
 from twoloop.ensembles.lane_methods import IN_LANES, LaneMethod, is_involved, lane_methods
 from twoloop.ensembles.runs import Runs
 from twoloop.ensembles.starts import Starts, all_starts, far_off, system_of
@@ -22,6 +22,8 @@ Integers = NDArray[np.int64]
 
 FAR = 1e5  # tolerances, by which a motion that is not chaotic does not end elsewhere
 CALL = 1e-3  # s of a call of solve_dae beside its steps
+SHOWN = 5  # numbers of runs in a message
+FIRST = "the first, which checks the system"  # why it is made singly
 WORTH = 20.0  # times what the runs of a call take singly: what their code may take to compile, as it is kept
 
 
@@ -121,6 +123,7 @@ def ensemble(
     first = single(0)  # which checks the system, derivatives and all
     in_lanes, why = np.zeros(n_runs, dtype=bool), ""
     made_by: dict[str, int] = {}
+    reasons: dict[int, str] = {}
     methods: list[LaneMethod] = []
     if events is not None:
         why = "events are looked for in single runs only"
@@ -139,15 +142,19 @@ def ensemble(
             singly = len(left) * (first.stats.cpu_time + CALL)
             if lanes.own.seconds_to_build > WORTH * singly:
                 raise Untraceable(f"to compile them does not pay for these runs, which take about {singly:.2g} s")
-            made = left[_in_lanes(lanes, left, t1, times, options, n_threads, (q, v, n_steps))]
+            fine, refused = _in_lanes(lanes, left, t1, times, options, n_threads, (q, v, n_steps))
         except Untraceable as reason:
             why = why or str(reason)
         else:
-            in_lanes[made], made_by[each.name] = True, len(made)
+            in_lanes[left[fine]], made_by[each.name] = True, int(fine.sum())
+            reasons |= refused
     for run in np.flatnonzero(~in_lanes).tolist():
         if run > 0:
             single(run)
-    return Runs(times, q, v, status, n_steps, ~in_lanes, _message(status, made_by, why), messages)
+    reasons = {run: reasons.get(run, why) for run in np.flatnonzero(~in_lanes).tolist()}
+    if made_by or not why:
+        reasons[0] = FIRST
+    return Runs(times, q, v, status, n_steps, ~in_lanes, _message(status, made_by, reasons), messages, reasons)
 
 
 def _in_lanes(
@@ -158,8 +165,10 @@ def _in_lanes(
     options: dict[str, Any],
     threads: int,
     out: tuple[Array, Array, Integers],
-) -> NDArray[np.bool_]:
-    """Which of these runs were made; the first is there already, made singly, and has to end where lanes have it.
+) -> tuple[NDArray[np.bool_], dict[int, str]]:
+    """Which of these runs were made, and why others were not.
+
+    The first is there already, made singly, and has to end where lanes have it.
 
     Raises
     ------
@@ -175,8 +184,7 @@ def _in_lanes(
     new_q, new_v = np.full((2, len(which), system.n_q, len(ends)), np.nan)
     rtol, atol = options["rtol"], options["atol"]
     status, steps, at_end = lanes.make(which, t1, ends, rtol, atol, threads, new_q, new_v)
-    fine = (status == 1) & np.isfinite(new_q).all(axis=(1, 2))
-    fine &= lanes.agree(which, fine, t1, float(atol.min()), new_q, new_v, at_end)
+    fine = lanes.judge(which, status, t1, float(atol.min()), new_q, new_v, at_end)
     allowed = FAR * (atol + rtol * np.abs(q[0, :, -1]))
     if fine[0] and times[-1] == t1 and (np.abs(new_q[0, :, -1] - q[0, :, -1]) > allowed).any():
         raise Untraceable(f"the first run ends elsewhere by itself, {FAR:g} tolerances and more away")
@@ -190,7 +198,7 @@ def _in_lanes(
         if n < len(times):
             states[runs, :, 0] = start[runs]
     n_steps[runs] = steps[fine]
-    return fine
+    return fine, {int(which[i]): WHY[int(status[i])] for i in np.flatnonzero(~fine).tolist() if which[i] > 0}
 
 
 def _alone(
@@ -218,13 +226,20 @@ def _of_run(run: int, error: ValueError) -> ValueError:
     return ValueError(f"run {run}: {error}".replace("twoloop.consistent_state(", "twoloop.consistent_states("))
 
 
-def _message(status: Integers, made_by: dict[str, int], why: str) -> str:
+def _message(status: Integers, made_by: dict[str, int], reasons: dict[int, str]) -> str:
     failed, n_runs = int((status < 0).sum()), len(status)
     said = f"{n_runs - failed} of {n_runs} runs reached the end or an event"
-    if not made_by and why:
-        return f"{said}; none went in lanes: {why}."
+    alike: dict[str, list[int]] = {}
+    for run, reason in reasons.items():
+        alike.setdefault(reason, []).append(run)
+    if not made_by and FIRST not in alike:
+        return f"{said}; none went in lanes: {reasons[0]}."
     in_lanes = "".join(f"{count} in lanes by {name}, " for name, count in made_by.items() if count > 0)
-    singly = n_runs - sum(made_by.values())
-    return (
-        f"{said}; {in_lanes}{singly} made singly: the first, which checks the system, and those that lanes cannot do."
-    )
+    others = "".join(f"; {_numbered(runs)}: {reason}" for reason, runs in alike.items() if reason != FIRST)
+    return f"{said}; {in_lanes}{len(reasons)} made singly: {FIRST}{others}."
+
+
+def _numbered(runs: list[int]) -> str:
+    """How many runs, and which."""
+    told = ", ".join(map(str, runs[:SHOWN])) + (", ..." if len(runs) > SHOWN else "")
+    return f"run {told}" if len(runs) == 1 else f"{len(runs)} runs ({told})"

@@ -12,6 +12,7 @@ from twoloop.ensembles.lane_methods import LaneMethod
 from twoloop.ensembles.starts import Starts, generic_parameters, kit_to_write, system_of
 from twoloop.generate.choices import Choice
 from twoloop.generate.time_dependence import may_be_sudden
+from twoloop.kernels.lanes import lane_ends
 from twoloop.problem.system import ConstrainedSystem
 
 Integers = NDArray[np.int64]
@@ -22,6 +23,15 @@ OF_SUDDEN = 20  # ... times as many where a force may act for a short time: lane
 SMALLEST, LARGEST = 128, 4096  # runs of a block; numbers of all of a block's runs are made at once
 FOR_EACH = 3  # blocks for each of several threads, so that all end at about the same time
 AGREES = 1e-7  # of the terms of an equation: what rounding may leave of it at the end of a run
+
+WHY = {  # a run is left to a run of its own, by what lane_ends.py says of it
+    lane_ends.NO_START: "the code made for the first run does not hold at the start",
+    lane_ends.NO_STATE: "a state at t_eval could not be put on the constraints",
+    lane_ends.NO_VALUES: "the equations have no values in a step (constraints lose rank, a root of a negative number)",
+    lane_ends.OFTEN_REFUSED: "steps are refused again and again (a sudden force, stiff motion, a singular position)",
+    lane_ends.MANY_STEPS: "it takes more than 100,000 steps in lanes (stiff, or very fast motion)",
+    lane_ends.UNLIKE: "the callbacks do not agree with the code at the end (they branch)",
+}
 
 
 class LaneRuns:
@@ -62,7 +72,7 @@ class LaneRuns:
         out_q: Array,
         out_v: Array,
     ) -> tuple[Integers, Integers, Array]:
-        """Make these runs: 1 for each that was made and 0 for each that is left, steps, and a and lam at the end."""
+        """Make these runs: what became of each, as lane_ends.py has it, steps, and a and lam at the end."""
         n_runs = len(which)
         status, n_steps = np.zeros((2, n_runs), dtype=np.int64)
         ends = np.full((n_runs, self.system.n_q + self.system.n_c), np.nan)
@@ -121,6 +131,18 @@ class LaneRuns:
         disagreement(*self.kit, t1, AGREES, atol, rows, self.starts.parameters, q, v, ends, room, worst)
         agreed: Flags = worst <= 1.0
         return agreed
+
+    def judge(
+        self, which: Integers, status: Integers, t1: float, atol: float, q: Array, v: Array, ends: Array
+    ) -> Flags:
+        """Of which of these runs all states were found and agree; the status of others says why not."""
+        made = status == lane_ends.ENDED
+        found = np.isfinite(q).all(axis=(1, 2))
+        fine = made & found
+        status[made & ~found] = lane_ends.NO_STATE
+        agreed = self.agree(which, fine, t1, atol, q, v, ends)
+        status[fine & ~agreed] = lane_ends.UNLIKE
+        return fine & agreed
 
 
 def _aligned(vectors: int, lanes: int) -> Array:

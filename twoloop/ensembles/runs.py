@@ -31,6 +31,8 @@ class Runs:
         How many runs reached the end, how many were made in lanes, by which method, how many singly, and why.
     messages : dict of int to str
         What `solve_dae` said of those runs that failed.
+    reasons : dict of int to str
+        Why each of the runs that were made singly was.
     """
 
     t: Array
@@ -41,6 +43,7 @@ class Runs:
     singly: NDArray[np.bool_]
     message: str
     messages: dict[int, str]
+    reasons: dict[int, str]
 
     @property
     def success(self) -> NDArray[np.bool_]:

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from twoloop.checks.arguments import Array, check_real, shown, wrong_entries
+from twoloop.checks.arguments import Array, check_real, shaped, shown, wrong_entries
 from twoloop.problem.system import ConstrainedSystem
 
 AT_ROUNDING = 64.0  # times rounding of its terms: an equation of a start that holds
@@ -45,7 +45,7 @@ def all_starts(
         least = 2 if name == "parameters" else 1
         if array.ndim not in (least, 2) or array.shape[-1] != n or array.shape[0] == 0:
             alone = "" if name == "parameters" else f"({n},) or "
-            raise ValueError(f"{name} must have shape {alone}(n_runs, {n}); given shape {array.shape}")
+            raise ValueError(f"{name} must have shape {alone}(n_runs, {n}); given {shaped(array)}")
         if not np.isfinite(array).all():
             if array.ndim == 1:
                 raise wrong_entries(name, "finite", array, ~np.isfinite(array))

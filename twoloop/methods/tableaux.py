@@ -11,7 +11,7 @@ import numpy as np
 from numpy.polynomial import Legendre
 from numpy.typing import NDArray
 
-from twoloop.checks.arguments import check_real, check_size, check_text, check_vector, shown, wrong_entries
+from twoloop.checks.arguments import check_real, check_size, check_text, check_vector, shaped, shown, wrong_entries
 
 Array = NDArray[np.float64]
 
@@ -49,11 +49,11 @@ class Tableau:
         check_text("name", self.name)
         b = check_real("b", self.b)
         if b.ndim != 1 or b.size == 0:
-            raise ValueError(f"b must be a vector with one weight for each stage; given shape {b.shape}")
+            raise ValueError(f"b must be a vector with one weight for each stage; given {shaped(b)}")
         s = b.size
         A = check_real("A", self.A)
         if A.shape != (s, s):
-            raise ValueError(f"A must have shape ({s}, {s}), as b has {s} entries; given shape {A.shape}")
+            raise ValueError(f"A must have shape ({s}, {s}), as b has {s} entries; given {shaped(A)}")
         if not np.isfinite(A).all():
             raise wrong_entries("A", "finite", A, ~np.isfinite(A))
         check_vector("b", b, s)

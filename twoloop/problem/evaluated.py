@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 from numpy.typing import ArrayLike
 
-from twoloop.checks.arguments import Array, check_number, check_real, shown
+from twoloop.checks.arguments import Array, check_number, check_real, shaped, shown
 from twoloop.checks.bounds import check_callback
 from twoloop.checks.sparse_rows import Rows, SparseRows
 from twoloop.kernels.compile.callbacks import KINDS, STATE
@@ -74,7 +74,7 @@ class EvaluatedEquations:
             array = check_real(name, value)
             if array.shape != (n := getattr(self, STATE[name]),):
                 raise ValueError(
-                    f"{name} must have shape ({n},), as {STATE[name]} = {n} in {self.name!r}; given shape {array.shape}"
+                    f"{name} must have shape ({n},), as {STATE[name]} = {n} in {self.name!r}; given {shaped(array)}"
                 )
             arrays.append(np.ascontiguousarray(array))
         check_callback(cast(Any, self), kind, t, arrays)

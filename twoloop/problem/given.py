@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from twoloop.checks.arguments import Array, check_real, shown
+from twoloop.checks.arguments import Array, check_real, shaped, shown
 from twoloop.kernels.compile.callbacks import KINDS, stand_in
 from twoloop.kernels.compile.private import Dispatcher
 from twoloop.problem.adapters import ConstantMatrix, check_arguments
@@ -98,7 +98,7 @@ def plain_functions(
     for kind in masses if constant_mass else ():
         matrix = check_real(kind, functions[kind])
         if matrix.shape != shapes[kind]:
-            raise ValueError(f"{kind} must have shape {shapes[kind]}; given an array of shape {matrix.shape}")
+            raise ValueError(f"{kind} must have shape {shapes[kind]}; given {shaped(matrix)}")
         functions[kind] = ConstantMatrix(matrix)
     for kind, function in functions.items():
         if not callable(function):

@@ -6,7 +6,7 @@ from itertools import count
 
 import numpy as np
 
-from twoloop.checks.arguments import Array, check_flag, check_real, check_size, check_text, check_vector
+from twoloop.checks.arguments import Array, check_flag, check_real, check_size, check_text, check_vector, shaped
 
 # numbers of coordinates of a rotation, by those of the translation
 ROTATIONS = {2: (0, 1), 3: (0, 4, 9)}
@@ -112,6 +112,6 @@ def check_joints(joints: object, n_q: int, n_rows: int) -> tuple[Joint, ...]:
         if matrix is not None and (matrix.shape != (n_rows, n_rows) or np.linalg.matrix_rank(matrix) < n_rows):
             raise ValueError(
                 f"equations of the joint {joint.name!r} must be an invertible matrix of shape {(n_rows, n_rows)}; "
-                f"given one of shape {matrix.shape}"
+                f"given {shaped(matrix)}"
             )
     return tuple(joints)

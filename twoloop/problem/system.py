@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from twoloop.checks.arguments import Array, check_flag, check_size, check_text
+from twoloop.checks.arguments import Array, check_flag, check_size, check_text, shaped
 from twoloop.kernels.compile.callbacks import KINDS
 from twoloop.kernels.compile.private import Dispatcher
 from twoloop.kernels.data.common import PROGRAMS, Functions
@@ -201,7 +201,7 @@ class ConstrainedSystem(EvaluatedEquations):
                 "numbers"
             )
         if p.size != size:
-            raise ValueError(f"parameters of {self.name!r} must be {size} numbers, as they are; given {p.size}")
+            raise ValueError(f"parameters of {self.name!r} must be {size} numbers, as they are; given {shaped(p)}")
         other = copy.copy(self)
         if self.called_in_python:
             p = np.append(self.functions.p[:1], p)  # the handle of Python functions

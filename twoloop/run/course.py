@@ -17,7 +17,7 @@ from twoloop.run.fields import BEFORE, kinds_of, of_run, of_steps, statistics
 from twoloop.run.interrupts import Interrupts, said_of_interrupt
 from twoloop.run.kept import OF_STEPS
 from twoloop.run.messages import message_of, outcome, unless_turned
-from twoloop.run.pace import INTERRUPTED, OUT_OF_TIME, STAGNATED, Pace
+from twoloop.run.pace import INTERRUPTED, OUT_OF_REACH, OUT_OF_TIME, STAGNATED, Pace
 from twoloop.run.passage import beyond, bridge, bridging_kit, give_way, leap
 from twoloop.run.record import Record, Status, explained
 from twoloop.run.recorder import Recorder, Wanted
@@ -72,7 +72,8 @@ class Course:
             self.outputs = np.append(wanted.times[(wanted.times > run.t0) & (wanted.times < t1)], t1)
         run.control[run.a.STORE_ALL] = wanted.every_step
         self.largest_chunk = BUFFER_STEPS
-        if wanted.events is not None and any(event.terminal < np.inf for event in wanted.events):
+        to_event = wanted.events is not None and any(event.terminal < np.inf for event in wanted.events)
+        if to_event:
             self.largest_chunk = run.chunk = CHUNK_TO_EVENT
         # the run is looked at after so many attempts, however long the chunks are that the clock allows
         self.between_looks = self.next_look = run.chunk
@@ -82,7 +83,9 @@ class Course:
         if self.wanted.kept.finished:
             self._tell()
         self.filled = np.zeros(2, dtype=np.int64)
-        self.pace, self.looks = Pace(run.t0), Looks(run.plan)
+        ends_before = to_event or time_limit is not None  # then t1 may only stand for any time
+        self.pace = Pace(run.t0, np.inf if ends_before else OUT_OF_REACH)
+        self.looks = Looks(run.plan)
         self.sample = Sample(run.t0, run.state, 2 * run.system.n_q)
         self.cpu = 0.0
         self.raised: Exception | None = None

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from twoloop.checks.arguments import check_real
+from twoloop.checks.arguments import check_real, shaped
 from twoloop.run.dense import Array, Groups, Interpolator, Table
 
 
@@ -96,7 +96,7 @@ class DenseSolution:
         """
         times = check_real("t", t)
         if times.ndim > 1:
-            raise ValueError(f"t must be a number or have shape (n,); given shape {times.shape}")
+            raise ValueError(f"t must be a number or have shape (n,); given {shaped(times)}")
         outside = ~((times >= self.t_min) & (times <= self.t_max))  # NaN, too
         if outside.any():
             raise ValueError(

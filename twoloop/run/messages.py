@@ -132,13 +132,7 @@ def outcome(run: "Run", code: int, t1: float, pace: Pace) -> tuple[Status, str]:
             f"{stopped} by time_limit. Raise time_limit, loosen rtol and atol, or shorten t_span.",
         )
     if code == STAGNATED:
-        return (
-            Status.STAGNATED,
-            f"{stopped}: the last {STAGNATION_STEPS} steps were {pace.mean:.2g} s long on average, after steps of "
-            f"up to {pace.longest:.2g} s, and the rest needs {(t1 - t) / pace.mean:.1g} of them. Look for a "
-            "singular position or a stiff force near this time, or take another method; with max_steps the run "
-            "goes on up to that number of steps.",
-        )
+        return Status.STAGNATED, f"{stopped}: {_standstill(run, (t1 - t) / pace.mean, pace)}"
     if code == a.AT_JUMP:
         return (
             Status.RATE_JUMPS,
@@ -176,6 +170,20 @@ def outcome(run: "Run", code: int, t1: float, pace: Pace) -> tuple[Status, str]:
         f"{stopped}: the step size fell below the spacing of floating-point numbers; at the last attempt {reason}. "
         f"{_near_singular(run, t1)}{_near_massless(run)}Look for a discontinuity near this time, loosen rtol and "
         "atol, or use coordinates of similar scale.",
+    )
+
+
+def _standstill(run: "Run", left: float, pace: Pace) -> str:
+    """How short the steps are, and how many the rest takes."""
+    before, advice = "", "Shorten t_span, or look at the units of velocities, masses and forces"
+    if pace.slows:
+        before = f", after steps of up to {pace.longest:.2g} s"
+        advice = "Look for a singular position or a stiff force near this time, or take another method"
+    elif run.control[run.a.FIXED_STEP] > 0.0:
+        advice = "Take a larger step_size, or shorten t_span"
+    return (
+        f"the last {STAGNATION_STEPS} steps were {pace.mean:.2g} s long on average{before}, and the rest needs "
+        f"{left:.1g} of them. {advice}; with max_steps the run goes on up to that number of steps."
     )
 
 

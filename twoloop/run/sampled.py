@@ -28,6 +28,7 @@ from twoloop.run.fields import statistics
 from twoloop.run.interrupts import Interrupts
 from twoloop.run.kept import InMemory
 from twoloop.run.messages import said_of_end
+from twoloop.run.pace import STAGNATION_STEPS
 from twoloop.run.record import Record, Status
 from twoloop.run.recorder import Wanted
 from twoloop.run.run import Run
@@ -157,7 +158,8 @@ class SampledRun:
         self._outputs[0], clock[a.NEXT_OUTPUT], clock[a.T_START], clock[a.N_FIXED] = end, 0.0, t, 0.0
         run.control[a.MAX_ATTEMPTS], clock[a.PIVOT_AT_OUTPUT] = STEPS, np.inf
         steps = self._buffers[2]
-        while code == a.PAUSED:
+        before = run.attempts()
+        while code == a.PAUSED and run.attempts() - before < STAGNATION_STEPS:  # then it is seen whether it gets there
             code = direct(run.kernels.advance)(
                 *(run.kit, run.work, run.plan.options, run.plan.memory, run.tolerances, run.control, clock),
                 *(run.state, run.new_state, self._outputs, *self._buffers, self._filled),

@@ -5,6 +5,7 @@ import numpy as np
 from twoloop.kernels.control.controller import N_PAST, N_RULE, factor_of, remember
 from twoloop.kernels.data.common import compiled, inlined, merged
 from twoloop.kernels.lanes.lane_algebra import enlarge
+from twoloop.kernels.lanes.lane_ends import MANY_STEPS, NO_VALUES, OFTEN_REFUSED
 from twoloop.kernels.lanes.lane_projection import project_lanes
 from twoloop.kernels.lanes.lane_room import (
     ACCEPTED,
@@ -103,10 +104,13 @@ def choose_steps(room, control, status, n_steps):
                 h = left
             elif h > 0.5 * left:
                 h = 0.5 * left  # two equal steps rather than a long and a tiny one
-            if h > SHORTEST * max(abs(t), abs(t1)) and n_steps[int(room[WHICH * LANES + k])] < MOST_STEPS:
+            if n_steps[int(room[WHICH * LANES + k])] >= MOST_STEPS:
+                leave(room, status, k, MANY_STEPS)
+            elif h > SHORTEST * max(abs(t), abs(t1)):
                 room[H * LANES + k], room[WANTED * LANES + k] = h, wanted
             else:
-                leave(room, status, k)
+                failed = room[H_LIMIT * LANES + k] < np.inf and room[LIMIT_AGE * LANES + k] == 0.0
+                leave(room, status, k, NO_VALUES if failed else OFTEN_REFUSED)
         room[X * LANES + k] = room[H * LANES + k]
         room[FINE * LANES + k] = room[RUNNING * LANES + k]
 
@@ -185,4 +189,4 @@ def judge_steps(options, room, n, a, start, status):
         else:
             room[REFUSED * LANES + k] += 1.0
             if room[REFUSED * LANES + k] > MOST_REFUSED:
-                leave(room, status, k)
+                leave(room, status, k, OFTEN_REFUSED if room[FINE * LANES + k] == 1.0 else NO_VALUES)

@@ -77,7 +77,6 @@ CODE.add_function("step", STEP)
 # n), velocities before they are put on the constraints, and accelerations of the stages
 START, BEGIN, _BEGIN_V, PREDICTED_V, SLOPES = range(5)
 
-LEFT, ENDED = 0, 1  # what becomes of a run: left to a run of its own, or made
 N, N_ROWS, ORDER, CHECKS_REDUNDANT, N_NUMBERS = range(5)  # in `settings`
 T0, T1, GAP, RTOL, ATOL = range(5)  # in `control`; from ATOL on a tolerance for each coordinate
 
@@ -126,7 +125,7 @@ def fill_field(room, field, value):
 
 
 @merged
-def leave(room, status, k):
+def leave(room, status, k, reason):
     """Leave the run of a lane to a run of its own."""
     room[RUNNING * LANES + k] = 0.0
-    status[int(room[WHICH * LANES + k])] = LEFT
+    status[int(room[WHICH * LANES + k])] = reason

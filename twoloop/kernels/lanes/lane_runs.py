@@ -9,13 +9,13 @@ from numba import types
 
 from twoloop.kernels.compile.callbacks import VECTOR
 from twoloop.kernels.data.common import INTEGERS, compiled, kernel
+from twoloop.kernels.lanes.lane_ends import ENDED, NO_START, NO_VALUES, OFTEN_REFUSED, UNDECIDED
 from twoloop.kernels.lanes.lane_projection import project_lanes
 from twoloop.kernels.lanes.lane_room import (
     ACCEPTED,
     AHEAD,
     ASKED,
     CODE,
-    ENDED,
     FINE,
     FRESH,
     LANES,
@@ -46,6 +46,9 @@ def _refill(code, order, control, room, n, n_rows, numbers, q0, v0, next_run, st
     state, new, _, _, _, _, own, _ = places_of(n, n_rows, numbers.shape[1])
     n_fresh, n_running = 0, 0
     for k in range(LANES):
+        last = int(room[WHICH * LANES + k])
+        if room[RUNNING * LANES + k] == 0.0 and last >= 0 and status[last] == UNDECIDED:  # as a series leaves it
+            status[last] = OFTEN_REFUSED if room[REFUSED * LANES + k] < np.inf else NO_VALUES
         room[FINE * LANES + k] = room[FRESH * LANES + k] = 0.0
         if room[RUNNING * LANES + k] == 0.0 and next_run < numbers.shape[0]:
             room[FINE * LANES + k] = room[FRESH * LANES + k] = room[RUNNING * LANES + k] = 1.0
@@ -68,7 +71,7 @@ def _refill(code, order, control, room, n, n_rows, numbers, q0, v0, next_run, st
                 for j in range(2 * n):
                     room[(state + j) * LANES + k] = room[(new + j) * LANES + k]
                 if room[FINE * LANES + k] == 0.0:
-                    leave(room, status, k)
+                    leave(room, status, k, NO_START)
                     n_running -= 1
     return next_run, n_running
 
@@ -140,9 +143,10 @@ def advance_lanes(code, settings, control, options, times, numbers, q0, v0, out_
     n, n_rows, order = settings[N], settings[N_ROWS], settings[ORDER]
     _, new, _, _, a, _, _, _ = places_of(n, n_rows, numbers.shape[1])
     next_run, are_fresh = 0, False
-    for field in (T, AHEAD, H, X, RUNNING, WHICH, ACCEPTED):
+    for field in (T, AHEAD, H, X, RUNNING, ACCEPTED):
         fill_field(room, field, 0.0)
     fill_field(room, UNIT, 1.0)
+    fill_field(room, WHICH, -1.0)
     while True:
         n_running = 0.0
         for k in range(LANES):

@@ -2,8 +2,19 @@
 
 from twoloop.kernels.data.common import kernel
 from twoloop.kernels.lanes.lane_control import MOST_STEPS
+from twoloop.kernels.lanes.lane_ends import MANY_STEPS
 from twoloop.kernels.lanes.lane_projection import project_lanes
-from twoloop.kernels.lanes.lane_room import CHECKS_REDUNDANT, LANES, ORDER, RUNNING, STEP, UNIT, WHICH, X, leave
+from twoloop.kernels.lanes.lane_room import (
+    CHECKS_REDUNDANT,
+    LANES,
+    ORDER,
+    RUNNING,
+    STEP,
+    UNIT,
+    WHICH,
+    X,
+    leave,
+)
 
 ALLOWED = 0.3  # as in taylor_step.py
 MOST_SHORTENED, SHORTENED, GROWTH = 0.1, 0.9, 5.0
@@ -22,7 +33,7 @@ def step_by_series(code, settings, control, options, room, status, n_steps, with
         return
     for k in range(LANES):  # of stiff motion, steps are as many as its time scales
         if room[RUNNING * LANES + k] == 1.0 and n_steps[int(room[WHICH * LANES + k])] >= MOST_STEPS:
-            leave(room, status, k)
+            leave(room, status, k, MANY_STEPS)
     code.series(order, control, room)
     code.lengths(order, control, room)
     code.look(order, control, room)
