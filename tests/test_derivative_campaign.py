@@ -8,7 +8,7 @@ import pytest
 from tests import problems
 from tests.derivative_cases import UNITS, Case, lever, linkage, shaken_pendulum, slider_crank, sprung_rod
 from tests.test_callbacks import PENDULUM
-from twoloop import ConstrainedSystem, callback, solve_dae
+from twoloop import ConstrainedSystem, Status, callback, solve_dae
 from twoloop.checks.derivatives import check_derivatives, wrong_derivative
 from twoloop.mechanisms import four_bar, moderately_stiff_beam, very_flexible_beam
 
@@ -107,6 +107,27 @@ def test_terms_that_vanish_at_the_start_are_found_later(unit, kind):
     later, v = np.array(slider_crank(unit, crank=0.4, offset_of_guide=0.0).q), np.array([3.0, -1.0, -unit])
     assert wrong_derivative(right.system(), 1.0, later, v) is None
     assert wrong_derivative(wrong, 1.0, later, v).startswith(f"{kind} of '{right.name}' is not")
+
+
+@pytest.mark.parametrize("method", ["auto", "DOP853", "RadauIIA5", "Gauss8"])
+@pytest.mark.parametrize("compile", [False, True])
+def test_terms_that_are_wrong_at_high_speeds_only_end_the_run(method, compile):
+    """They look right at every velocity that is tried at the start."""
+    wrong = problems.pendulum(gamma=lambda t, q, v: np.array([-min(v[0] ** 2 + v[1] ** 2, 4.0)]), compile=compile)
+    result = solve_dae(wrong, (0.0, 1.0), [1.0, 0.0], [0.0, 0.0], method, rtol=1e-8, atol=1e-8)
+    assert result.status is Status.WRONG_DERIVATIVE and "gamma of" in result.message
+
+
+def test_so_do_terms_of_constraints_on_velocities():
+    def gamma(t, q, v):
+        return np.array([np.clip(v[2], -3.0, 3.0) * (math.cos(q[2]) * v[0] + math.sin(q[2]) * v[1])])
+
+    q, along = np.array([0.3, -0.2, 0.7]), lambda t, q: np.array([[-math.sin(q[2]), math.cos(q[2]), 0.0]])
+    edge = {"n_a": 1, "nonholonomic": along, "nonholonomic_gamma": gamma}
+    system = problems.unconstrained(lambda t, q, v: np.zeros(3), 3, **edge)
+    check_derivatives(system, 0.0, q)
+    assert wrong_derivative(system, 0.0, q, np.ones(3)) is None
+    assert "nonholonomic_gamma of" in wrong_derivative(system, 0.0, q, 20.0 * np.ones(3))
 
 
 def test_a_check_along_a_run_is_cheap():

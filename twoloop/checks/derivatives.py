@@ -110,7 +110,7 @@ def wrong_derivative(system: ConstrainedSystem, t: float, q: Array, v: Array) ->
         noise = EPS * (abs(jacobian) @ np.abs(generic) + np.abs(rate))[rows]
         found = _along_a_run(_slowing(system, t, q, generic, rows), scale, noise, right, spacing)
         suspicious = found.disagrees(right, 0.0 * right).max() > 1.0
-    return _wrong_constraint(system, t, q, ANYWHERE) if suspicious else None
+    return _wrong_constraint(system, t, q, ANYWHERE, generic) if suspicious else None
 
 
 def _along_a_run(function: Function, scale: float, noise: Array, given: Array, spacing: float) -> Estimate:
@@ -158,8 +158,13 @@ class _Comparison:
         )
 
 
-def _wrong_constraint(system: ConstrainedSystem, t: float, q: Array, sides: tuple[int, ...]) -> str | None:
-    """Which entry of C_q, C_t or gamma is wrong: the first of them that is, because each relies on those before."""
+def _wrong_constraint(
+    system: ConstrainedSystem, t: float, q: Array, sides: tuple[int, ...], *faster: Array
+) -> str | None:
+    """Which entry of C_q, C_t or gamma is wrong: the first of them that is, because each relies on those before.
+
+    `gamma` is compared at generic velocities and at the `faster` ones of a run, as it may be wrong at such only.
+    """
     wrong = _wrong_jacobian(system, t, q, sides) if system.n_c > 0 else None
     if wrong is not None:
         return wrong
@@ -167,7 +172,7 @@ def _wrong_constraint(system: ConstrainedSystem, t: float, q: Array, sides: tupl
     if not (is_finite(jacobian) and np.isfinite(rate).all()):
         return None
     for kind, rows in _gammas(system):
-        for v in generic_velocities(system, t, q, jacobian, rate):
+        for v in (*generic_velocities(system, t, q, jacobian, rate), *faster):
             given = defined(lambda kind=kind, v=v: system.evaluate(kind, t, q, v))  # type: ignore[misc]
             if given is None:
                 continue
