@@ -286,7 +286,8 @@ def _look(f, w, options, memory, tolerances, t, state, new_state):
     due = share > SURELY or hidden or anyway or (memory[NEAR] >= options[LOOKS] and cheap)
     if cheap and share <= 1.0:  # before a trial is affordable it is kept in mind that one will be due
         memory[NEAR] = 0.0
-    if (memory[PHASE] == EXPLICIT and due) or (memory[PHASE] == IMPLICIT and share < BELOW):
+    dear = price > GAIN * memory[PRICE]  # than the explicit method was when it was left
+    if (memory[PHASE] == EXPLICIT and due) or (memory[PHASE] == IMPLICIT and (share < BELOW or dear)):
         memory[PRICE] = price
         memory[N_TRIALS] += 1.0
         return ON_TRIAL if memory[PHASE] == EXPLICIT else BACK_ON_TRIAL
