@@ -10,7 +10,8 @@ the tolerances, as steps at the limit of stability keep it from dying away. A tr
 run has cost a few times as much, unless the run as a whole is to cost ten times as much at its present price. Where a
 run is to cost a thousand trials, one comes whatever the rates. Costs are counted in evaluations of the explicit method;
 with code made for the mechanism one of the implicit method counts several times. This is left in the same way, after a
-trial of the explicit method, where its own steps have come below that limit. What is not kept is next tried after twice
+trial of the explicit method, where its own steps have come below that limit, or a second of motion costs more than the
+explicit one took when it was left. What is not kept is next tried after twice
 as many looks.
 
 Both methods are called by their addresses, and are compiled once, where they are.
