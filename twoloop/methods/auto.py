@@ -94,8 +94,9 @@ class Auto:
     trials, and 64 evaluations for each independent coordinate if tangents have to be differenced, or three tenths of
     what the run will cost as a whole at its present price are as much. If it is to cost a thousand trials, one is made
     whatever the rates. The implicit method is kept if a second of motion costs it less, counted in evaluations and
-    Newton matrices: `loose` at tolerances from 3e-5 on, `tightest` below 9e-7, else `tight`. It is left the same way.
-    Counts decide, not times: a run can be repeated.
+    Newton matrices: `loose` at tolerances from 3e-5 on, `tightest` below 9e-7, else `tight`. It is left the same way,
+    where its steps come below that limit or a second of motion costs more than the explicit method took. Counts decide,
+    not times: a run can be repeated.
 
     Above 1000 coordinates no implicit method is tried, as its matrices are full; nor is a series where M and C_q have
     more than 200,000 entries together, zeros among them, as it takes seconds to find (method="Taylor" does).

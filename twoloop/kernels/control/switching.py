@@ -10,7 +10,8 @@ the tolerances, as steps at the limit of stability keep it from dying away. A tr
 run has cost a few times as much, unless the run as a whole is to cost ten times as much at its present price. Where a
 run is to cost a thousand trials, one comes whatever the rates. Costs are counted in evaluations of the explicit method;
 with code made for the mechanism one of the implicit method counts several times. This is left in the same way, after a
-trial of the explicit method, where its own steps have come below that limit. What is not kept is next tried after twice
+trial of the explicit method, where its own steps have come below that limit, or a second of motion costs more than the
+explicit one took when it was left. What is not kept is next tried after twice
 as many looks.
 
 Both methods are called by their addresses, and are compiled once, where they are.
@@ -286,7 +287,8 @@ def _look(f, w, options, memory, tolerances, t, state, new_state):
     due = share > SURELY or hidden or anyway or (memory[NEAR] >= options[LOOKS] and cheap)
     if cheap and share <= 1.0:  # before a trial is affordable it is kept in mind that one will be due
         memory[NEAR] = 0.0
-    if (memory[PHASE] == EXPLICIT and due) or (memory[PHASE] == IMPLICIT and share < BELOW):
+    dear = price > GAIN * memory[PRICE]  # than the explicit method was when it was left
+    if (memory[PHASE] == EXPLICIT and due) or (memory[PHASE] == IMPLICIT and (share < BELOW or dear)):
         memory[PRICE] = price
         memory[N_TRIALS] += 1.0
         return ON_TRIAL if memory[PHASE] == EXPLICIT else BACK_ON_TRIAL
