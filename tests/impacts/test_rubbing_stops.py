@@ -9,6 +9,7 @@ from twoloop.bodies import PlanarModel
 from twoloop.impacts.laws import Rubs, Undetermined, impulses
 
 GRAVITY = 9.81
+MORE_SLOPES = [(1.0, 0.0), (-1.0, 0.2), (0.0, 0.4)]  # and speeds
 
 
 def moved(problem, t1, method="auto", **options):
@@ -26,7 +27,10 @@ def block(friction, speed, slope, restitution=0.0):
     return model.problem()
 
 
-@pytest.mark.parametrize(("speed", "slope"), [(1.0, 0.0), (1.0, 0.2), (1.0, 0.4), (0.0, 0.2), (-1.0, 0.2), (0.0, 0.4)])
+@pytest.mark.parametrize(
+    ("speed", "slope"),
+    [(1.0, 0.2), (1.0, 0.4), (0.0, 0.2), *(pytest.param(*each, marks=pytest.mark.slow) for each in MORE_SLOPES)],
+)
 def test_a_block_slides_sticks_and_slides_back(speed, slope):
     friction, t1 = 0.3, 1.0
     result = moved(block(friction, speed, slope), t1)
@@ -101,7 +105,7 @@ def test_a_rod_falls_over_sticks_and_slips(friction, t1, slips, method):
 
 
 @pytest.mark.parametrize("restitution", [0.0, 0.5])
-@pytest.mark.parametrize("friction", [0.05, 0.2, 2.0])
+@pytest.mark.parametrize("friction", [0.05, pytest.param(0.2, marks=pytest.mark.slow), 2.0])
 @pytest.mark.parametrize("speed", [2.0, -0.1, -3.0])
 def test_the_impact_of_a_rod(restitution, friction, speed):
     """Two impulses by hand: the end stops along the floor, or slides on and has all of its friction."""

@@ -17,8 +17,10 @@ from twoloop.testing.changes import in_a_frame, in_millimetres_and_grams
 from twoloop.testing.known_problems import MAKERS
 
 LONG = ("andrews", "heavy_top")  # the dearest to evaluate
+LONGEST = "a misprint in the tableau"  # takes ten seconds
 NAMED = [fault.words for fault in FAULTS]
-QUICK = [fault for k, fault in enumerate(FAULTS) if fault.problem not in LONG and fault.words not in NAMED[:k]]
+NEW = [fault for k, fault in enumerate(FAULTS) if fault.words not in NAMED[:k]]  # in what is said of them
+QUICK = [fault for fault in NEW if fault.problem not in LONG and fault.name != LONGEST]
 
 
 def known(edit=lambda problem, q, v, lam: (q, v, lam)):
