@@ -86,7 +86,7 @@ class Run:
         self.control[clock.FIXED_STEP] = 0.0 if step_size is None else step_size
         self.control[clock.MAX_STEPS] = np.inf
         self.control[clock.BRIDGE], self.control[clock.AHEAD] = self.static is None, 1.0
-        rates = system.given.keys() & {"constraint_rate", "nonholonomic_rate", "kinematics"}
+        rates = system.given.keys() & {"constraint_rate", "nonholonomic_rate"}  # C_t of kinematics alone is zero
         self.control[clock.DRIVEN] = bool(rates)
         first_chunk = FIRST_CHUNK_IN_PYTHON if system.called_in_python else FIRST_CHUNK
         self.chunk = max(1, first_chunk // max(1, system.n_q // SMALL))  # attempts in one call of advance, at most
