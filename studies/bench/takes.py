@@ -136,8 +136,8 @@ def _between(values: Iterable[float]) -> str:
 
 def _beside_drifting(long: Mapping[str, Any]) -> str:
     """What a run without drift costs of time, against ours that drift with energy errors as large."""
-    over = long.get("calm_ours", {}).get("over_drifting")
-    plain = long["calm_ours"].get("over_plain")
+    calm = long.get("calm_ours", {})
+    over, plain = calm.get("over_drifting"), calm.get("over_plain")
     without = f" ({_between(plain)} times that of `compiled=False`)" if plain else ""
     return f", at {_between(over)} times the time{without}" if over else ""
 
