@@ -120,10 +120,45 @@ def test_every_crossing_that_is_sampled_is_found(times):
     assert result.t_events[0] == pytest.approx(times, abs=1e-14)
 
 
-@pytest.mark.parametrize("at", [0.5, 1 / 128, 1.0, 63 / 128])
+@pytest.mark.parametrize("compiled", [True, False])
+@pytest.mark.parametrize("method", ["auto", "Taylor", "DOP853", "RadauIIA9"])
+@pytest.mark.parametrize("level", [0.97, 0.999])
+def test_what_lasts_longer_than_the_widest_gap_is_found(oscillator, method, level, compiled):
+    """x = -cos(t) above a level for 0.49 s or 0.09 s, of 20 s; a series takes steps of seconds."""
+    if compiled and method == "RadauIIA9":
+        pytest.skip("there is no machine code for it")
+    end, half = 20.0, np.arccos(level)
+    high = [np.pi * each + side for each in (1, 3, 5) for side in (-half, half)]
+    events = [event(lambda t, q, v: q[0] - level), event(lambda t, q, v: q[0] - level, 2, 1)]
+    result = solve_dae(oscillator, (0.0, end), [-1.0], [0.0], method, compiled=compiled, events=events[0])
+    assert result.t_events[0] == pytest.approx(high, abs=1e-5)
+    if level == 0.97:
+        assert result.widest_gap < 2.0 * half and (method in ("DOP853", "RadauIIA9") or result.h.max() > 1.0)
+    result = solve_dae(oscillator, (0.0, end), [-1.0], [0.0], method, compiled=compiled, events=events[1])
+    assert result.status is Status.EVENT and result.t[-1] == pytest.approx(high[2], abs=1e-5)
+
+
+@pytest.mark.parametrize("method", ["Taylor", "RadauIIA9", "BDF"])
+def test_samples_are_no_further_apart_than_a_400th_of_the_run(oscillator, method):
+    seen = []
+    watch = event(lambda t, q, v: seen.append(t) or 1.0)
+    result = solve_dae(oscillator, (5.0, 25.0), [-1.0], [0.0], method, 1e-6, 1e-6, events=watch)
+    assert np.diff(seen).max() <= 20.0 / 400.0 * (1.0 + 1e-8) and (np.isin(result.t, seen)).all()
+    assert method == "Taylor" or len(seen) == 4 * len(result.h) + 1  # steps of a hundredth of the run at most
+
+
+def test_samples_are_as_close_as_the_widest_gap_where_forces_may_be_sharp():
+    seen = []
+    sharp = unconstrained(lambda t, q, v: -q * (1.0 + 1e-3 * np.exp(-((q / 0.5) ** 2))), compile=True)
+    watch = event(lambda t, q, v: seen.append(t) or 1.0)
+    result = solve_dae(sharp, (0.0, 20.0), [-1.0], [0.0], "Taylor", 1e-6, 1e-6, events=watch)
+    assert np.diff(seen).max() <= result.widest_gap * (1.0 + 1e-8) and result.widest_gap < 20.0 / 400.0
+
+
+@pytest.mark.parametrize("at", [0.5, 1 / 512, 1.0, 255 / 512])
 def test_a_zero_on_a_sample_counts_once(at):
-    """Fixed steps of 1/32 with samples at 1/128: the zero is exactly on the end of a step, or within."""
-    result = swing(1.0, method="Gauss8", step_size=1 / 32, events=[clock(at), clock(at, terminal=True)])
+    """Fixed steps of 1/128 with samples at 1/512: the zero is exactly on the end of a step, or within."""
+    result = swing(1.0, method="Gauss8", step_size=1 / 128, events=[clock(at), clock(at, terminal=True)])
     assert [times.tolist() for times in result.t_events] == [[at], [at]] and result.t[-1] == at and result.h.sum() == at
 
 

@@ -5,7 +5,7 @@ import pytest
 
 from tests.compiled import pendulum_under
 from tests.problems import START, SWING, G, pendulum_state, swing, worst
-from twoloop import Status, solve_dae
+from twoloop import ConstrainedSystem, Status, solve_dae
 
 METHODS = ["SunRadau5", "Gauss12", "RadauIIA5", "Newmark", "BDF", "DOP853", "Adams"]
 
@@ -42,6 +42,28 @@ def test_the_first_step_follows_the_time_scale_of_the_motion(method, scale):
     assert worst(result.q, pendulum_state(result.t / scale)[0]) < 2e-2
     # the steps of the same motion at a scale of one
     assert result.stats.n_rejected_error + result.stats.n_rejected_convergence < 20 and 1e-6 < result.h[0] / scale < 0.1
+
+
+@pytest.mark.parametrize("t0", [1e5, -1e7, 1e9])
+@pytest.mark.parametrize("method", ["auto", "Taylor", *METHODS])
+def test_a_drive_starts_at_zero_far_from_the_time_zero(method, t0):
+    """Coordinates that are zero have no scale for a first step, which was shorter than the spacing of times."""
+    tolerance = {1e5: 1e-8, -1e7: 1e-6, 1e9: 1e-4}[t0] if method not in ("Newmark", "BDF") else 1e-4
+    system = ConstrainedSystem.from_python(
+        n_q=2,
+        n_c=1,
+        mass=np.eye(2),
+        force=lambda t, q, v: np.array([0.0, -4.0 * (q[1] - q[0])]),
+        constraint=lambda t, q: np.array([q[0] - np.sin(3.0 * (t - t0))]),
+        jacobian=lambda t, q: np.array([[1.0, 0.0]]),
+        constraint_rate=lambda t, q: np.array([-3.0 * np.cos(3.0 * (t - t0))]),
+        compile=True,
+    )
+    options = {"method": method, "rtol": tolerance, "atol": tolerance}
+    result = solve_dae(system, (t0, t0 + 5.0), [0.0, 0.0], [3.0, 0.0], **options)
+    x = result.t - t0
+    assert result.success, result.message
+    assert worst(result.q, [np.sin(3.0 * x), 1.2 * np.sin(2.0 * x) - 0.8 * np.sin(3.0 * x)]) < 100.0 * tolerance
 
 
 @pytest.mark.parametrize("beside", [5e-9, 9e-9])

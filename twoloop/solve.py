@@ -124,9 +124,9 @@ def solve_dae(
         Functions event(t, q, v) -> float, plain or compiled by numba, whose zeros are found by the rules of SciPy's
         `solve_ivp`. An attribute `terminal`, True or a number of occurrences, ends the run there. With an attribute
         `direction`, 1 or -1, only zeros count at which the value rises or falls. A zero at the start counts. The sign
-        is checked four times per step. Two zeros within a quarter of a step can be missed, and so can one without a
-        change of sign; a smaller `max_step` helps. The time of an event is that of the dense solution, to rounding.
-        Events that are not terminal do not change the steps.
+        is checked four times per step, and at least every 400th of t_span. Two zeros between two checks can be missed,
+        and so can one without a change of sign; a smaller `max_step` helps. The time of an event is that of the dense
+        solution, to rounding. Events that are not terminal do not change the steps.
     progress : bool, optional
         True: show a bar (needs the package rich).
     time_limit : float, optional

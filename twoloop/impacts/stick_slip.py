@@ -61,8 +61,8 @@ def solve_with_friction(
 
     Notes
     -----
-    Mode changes are located like events: a joint that reverses within a quarter of a step is missed; reduce `max_step`
-    if needed.
+    Mode changes are located like events, by checks four times per step and at least every two-thousandth of the motion:
+    a joint that reverses twice between two of these is missed; reduce `max_step` if needed.
     """
     from twoloop.bodies.model_problem import ModelProblem  # slow to import
 

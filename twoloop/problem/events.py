@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from math import isfinite
 from types import FunctionType
 from typing import Any
 from weakref import WeakSet
@@ -10,7 +11,8 @@ import numpy as np
 
 from twoloop.checks.arguments import Array, check_call, shown
 
-SAMPLES = 4  # parts of a step, at whose ends the sign is looked at
+SAMPLES = 4  # parts of a step at least, at whose ends the sign is looked at
+WHOLE = 1.0 - 1e-9  # of a step: one of SAMPLES times the time between samples, but for rounding, has SAMPLES parts
 PRECISION = 4.0 * float(np.finfo(float).eps)  # of the time of an event, as in SciPy
 MOST = 3000  # iterations of Brent's method, which halves the interval at least every 53rd time: for zeros of high order
 
@@ -41,6 +43,8 @@ class Event:
         except Exception as error:
             error.add_note(f"raised by {self.name} at t = {t!r}")
             raise
+        if isinstance(value, float) and isfinite(value):
+            return float(value)
         array = np.asarray(value)
         if array.ndim > 0 or array.dtype.kind not in "iuf":
             raise TypeError(f"{self.name} must return a number; at t = {t!r} it returned {shown(value)}")
@@ -89,6 +93,14 @@ def _checked(number: int, function: Any) -> Event:
 class EventSearch:
     """Looks for the events of a run, step by step.
 
+    Parameters
+    ----------
+    events : list of Event
+    t0, row : float, ndarray
+        The start, and [q, v] there.
+    every : float
+        The longest time between two samples, s; an event function may have an attribute `every` of its own.
+
     Attributes
     ----------
     found : list of list of (float, ndarray)
@@ -99,12 +111,12 @@ class EventSearch:
         The end of the last step that was looked at.
     """
 
-    def __init__(self, events: list[Event], t0: float, row: Array):
+    def __init__(self, events: list[Event], t0: float, row: Array, every: float):
         self.events, self.reached = events, t0
         self.found: list[list[tuple[float, Array]]] = [[] for _ in events]
         self.ended: tuple[Event, float] | None = None
         self._n_q = len(row) // 2
-        self._every = min((getattr(event.function, "every", np.inf) for event in events), default=np.inf)
+        self._every = min((getattr(event.function, "every", every) for event in events), default=every)
         self._rates = [each for event in events if (each := getattr(event.function, "gap_rate", None)) is not None]
         self._values = self._evaluate(t0, row)
         self._at_start = True
@@ -117,7 +129,7 @@ class EventSearch:
         if len(ends) < 2 or self.ended is not None:
             return
         steps = np.diff(ends)
-        counts = np.maximum(SAMPLES, np.ceil(steps / self._every)).astype(int)
+        counts = np.maximum(SAMPLES, np.ceil(WHOLE * steps / self._every)).astype(int)
         inner = [end + np.arange(n) / n * h for end, n, h in zip(ends[:-1], counts, steps, strict=True)]
         times = np.append(np.concatenate(inner), ends[-1])
         rows, first = states(times), np.append(0, np.cumsum(counts))
@@ -151,15 +163,18 @@ class EventSearch:
 
     def _in_step(self, states: States, times: Array, rows: Array) -> None:
         """Events between samples of one step."""
-        for k in range(1, len(times)):
-            before, self._values = self._values, self._evaluate(float(times[k]), rows[k])
+        at = times.tolist()
+        for k in range(1, len(at)):
+            before, self._values = self._values, self._evaluate(at[k], rows[k])
             active = [
                 event
                 for event, g, g_new in zip(self.events, before, self._values, strict=True)
                 if (g != 0.0 or self._at_start) and crosses(event.direction, g, g_new)
             ]
             self._at_start = False
-            ends = (float(times[k - 1]), float(times[k]))
+            if not active:
+                continue
+            ends = (at[k - 1], at[k])
             roots = [
                 (_root(event, states, ends, (before[event.number], self._values[event.number])), event)
                 for event in active

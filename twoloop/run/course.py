@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 from twoloop.generate.traced_values import Sample
 from twoloop.kernels.compile.linking import direct
 from twoloop.kernels.data import intervals, noted
+from twoloop.kernels.data.tolerances import LONGEST_UNSEEN
+from twoloop.problem.events import SAMPLES
 from twoloop.run.between import interpolator_of
 from twoloop.run.comparison import compared
 from twoloop.run.crossings import Place, turned_last
@@ -21,7 +23,7 @@ from twoloop.run.pace import INTERRUPTED, OUT_OF_REACH, OUT_OF_TIME, STAGNATED, 
 from twoloop.run.passage import beyond, bridge, bridging_kit, give_way, leap
 from twoloop.run.record import Record, Status, explained
 from twoloop.run.recorder import Recorder, Wanted
-from twoloop.run.run import Run
+from twoloop.run.run import SHARPER, Run
 from twoloop.run.stability import Looks, said_of_stiffness
 
 Array = NDArray[np.float64]
@@ -298,7 +300,8 @@ class Course:
         """What takes the states; where some are to lie between steps, with what finds them."""
         run, n = self.run, self.run.system.n_q
         interpolator = interpolator_of(run, run.state[: 3 * n]) if self.wanted.between_steps else None
-        return Recorder(self.wanted, interpolator, n, run.t0, run.state)
+        every = LONGEST_UNSEEN * (self.t1 - run.t0) / (SHARPER if run.sudden.by_state else SAMPLES)
+        return Recorder(self.wanted, interpolator, n, run.t0, run.state, every)
 
     def _kinds(self, steps: Array, across: bool, leaps: bool) -> NDArray[np.int64]:
         """What kind of interval each of these accepted steps is, for the solution between them."""

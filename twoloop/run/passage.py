@@ -101,5 +101,5 @@ def leap(run: Run, t1: float) -> bool:
     clock[a.LEAPS] = 1.0
     clock[a.H_LIMIT], clock[a.LIMIT_AGE] = run.plan.limit_start, 0.0
     if end < t1:
-        clock[a.H_NEXT] = min(clock[a.H_NEXT], run.first_step(t1 - end, run.new_state))
+        clock[a.H_NEXT] = min(clock[a.H_NEXT], run.first_step(end, t1 - end, run.new_state))
     return True

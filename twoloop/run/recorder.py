@@ -56,6 +56,7 @@ class Recorder:
 
     An interval is looked at when all states are known that its polynomials go through, so that what comes out does not
     depend on the chunks. Of the states before it as many are kept as the polynomials need, and all if they are wanted.
+    Events are looked for at least once every so many seconds (`every`).
 
     Attributes
     ----------
@@ -67,7 +68,9 @@ class Recorder:
         Whether Ctrl-C broke off the search for events, or what is computed between the steps.
     """
 
-    def __init__(self, wanted: Wanted, interpolator: Interpolator | None, n_q: int, t0: float, state: Array):
+    def __init__(
+        self, wanted: Wanted, interpolator: Interpolator | None, n_q: int, t0: float, state: Array, every: float
+    ):
         self.wanted, self.interpolator, self._n_q, self._width = wanted, interpolator, n_q, len(state)
         self.n_steps, self.last_step = 0, 0.0
         self.interrupted = False
@@ -77,7 +80,7 @@ class Recorder:
         self._n_outputs = 0
         ends = wanted.events is not None and any(event.terminal < np.inf for event in wanted.events)
         self._waits_for = 0 if ends or wanted.kept.finished else PENDING
-        self.search = None if wanted.events is None else EventSearch(wanted.events, t0, state[: 2 * self._n_q])
+        self.search = None if wanted.events is None else EventSearch(wanted.events, t0, state[: 2 * n_q], every)
         self._add(self._t, self._rows, self._kinds)
         if wanted.times is not None and not wanted.lands:
             self._store(self._t[:0], self._rows[:0, : 2 * self._n_q])

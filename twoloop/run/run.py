@@ -1,5 +1,6 @@
 """One run: its arrays, at its start, with what the kernels keep in them."""
 
+import math
 from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any
@@ -32,6 +33,7 @@ SMALL = 32  # coordinates; chunks of larger systems are shorter in proportion
 SHARPER = 10  # times as often steps that look within look at the equations, of what may be sharp in q or v
 PROVISIONAL = 10  # steps after which a method that pays for long steps only gives way if they are short
 FIRST_STEP = 0.01  # of the shortest time scale that the initial state shows
+RESOLVED = 1e4  # spacings of floating-point numbers at the start: the first step is no shorter
 SHORTEST_STEP = 1e-16  # of the first step
 NONE = np.zeros((0, 0))
 CONTRADICTS = 1e-6  # relative: what the accelerations of redundant rows may differ by
@@ -315,7 +317,7 @@ class Run:
     def set_sizes(self, first_step: float | None, max_step: float, t1: float) -> None:
         """Set the first and the largest step, s."""
         span = t1 - self.t0
-        first = min(self.first_step(span, self.state) if first_step is None else first_step, span)
+        first = min(self.first_step(self.t0, span, self.state) if first_step is None else first_step, span)
         self.clock[self.a.H_NEXT], self.control[self.a.FIRST_GIVEN] = first, float(first_step is not None)
         self.control[self.a.SHORTEST] = SHORTEST_STEP * first
         self.max_step = max_step
@@ -333,10 +335,13 @@ class Run:
         self.control[self.a.MAX_STEP] = self.max_step if self.plan.looks_within else min(self.max_step, self.gap)
         self.control[self.a.SPACING] = self.gap / PLACES if any(self.sudden) else 0.0
 
-    def first_step(self, span: float, state: Array) -> float:
-        """A share of the time in which velocities and accelerations of a state change the coordinates as a whole."""
-        n = self.system.n_q
-        return direct(short_loops().first_step)(state, n, self.least_atol, span, FIRST_STEP)  # type: ignore[no-any-return]
+    def first_step(self, t: float, span: float, state: Array) -> float:
+        """A share of the time in which velocities and accelerations of a state change the coordinates as a whole.
+
+        Of coordinates next to zero that may be less than numbers near t can tell apart.
+        """
+        share: float = direct(short_loops().first_step)(state, self.system.n_q, self.least_atol, span, FIRST_STEP)
+        return max(share, RESOLVED * math.ulp(t))
 
     def defect(self) -> float | None:
         """The largest defect of the steps, if all looked for it."""

@@ -49,6 +49,7 @@ ROUGH, FIRST, LEAST, N_HEAD = range(N_RULE, N_RULE + 4)
 
 SUDDEN, SHORTENED, WHOLE = 10.0, 0.95, 1e-10  # as in advance.py
 LIMIT_FACTOR, LIMIT_MEMORY = 0.7, 10.0  # as of a Plan
+RESOLVED = 20.0 * SHORTEST  # of the time at the start: the first step is no shorter
 MOST_REFUSED = 30  # one after another, by estimates that may say little of how much shorter a stiff step has to be
 MOST_STEPS = 100_000  # of a run in lanes, which nothing interrupts
 
@@ -74,7 +75,7 @@ def _first_step(options, control, room, n, state, a, k):
         scale = min(scale, np.sqrt(far / sharp))
     if fast > 0.0 and sharp > 0.0 and fast / sharp > options[FIRST] * scale:
         scale = min(scale, fast / sharp)
-    return options[FIRST] * scale
+    return max(options[FIRST] * scale, RESOLVED * abs(control[T0]))
 
 
 @compiled
