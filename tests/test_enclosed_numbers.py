@@ -1,7 +1,10 @@
 """Compiled functions keep the numbers that they enclose: a change of these is refused, not ignored."""
 
 import math
+import subprocess
+import sys
 import types
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -9,12 +12,41 @@ from numba import njit
 
 from tests.compiled import unit_mass
 from twoloop import ConstrainedSystem, Integrator, callback, consistent_state, consistent_states, ensemble, solve_dae
+from twoloop.kernels.compile.places import places
 
 GRAVITY = 9.81
 size = 4.0
 START = [1.0, 0.0], [0.0, 0.0]
-shop = types.ModuleType("shop")
-shop.pull = 9.81
+shop, mall = types.ModuleType("shop"), types.ModuleType("mall")
+mall.shop, shop.pull, shop.table = shop, 9.81, np.array([9.81])
+tables = (np.array([9.81]), np.array([1.0]))
+
+
+class Pair(NamedTuple):
+    table: np.ndarray
+    count: int
+
+
+pair = Pair(np.array([9.81]), 1)
+
+
+@njit
+def of_shop(t):
+    return shop.pull + 0.0 * t
+
+
+@njit
+def heavy(t):
+    return 9.81 + 0.0 * t
+
+
+@njit
+def light(t):
+    return 4.0 + 0.0 * t
+
+
+shop.helper, mall.helper = of_shop, heavy
+of_law = heavy
 
 
 @njit
@@ -62,7 +94,7 @@ def enclosing(how):
         "array": (lambda t: table[0] + 0.0 * t, refill, "table"),
         "other array": (lambda t: table[0] + 0.0 * t, rebind_table, "table"),
         "global": (of_global, rebind_global, "GRAVITY"),
-        "module": (lambda t: shop.pull + 0.0 * t, lambda value: setattr(shop, "pull", value), "pull"),
+        "module": (lambda t: shop.pull + 0.0 * t, lambda value: setattr(shop, "pull", value), r"shop\.pull"),
         "default": (of_default, refill, "share"),
     }
     pull, change, name = pulls[how]
@@ -73,6 +105,8 @@ def enclosing(how):
 def restored():
     yield
     globals()["GRAVITY"] = shop.pull = 9.81
+    shop.table[0] = tables[0][0] = pair.table[0] = 9.81
+    globals()["of_law"] = mall.helper = heavy
 
 
 @pytest.mark.parametrize("how", ["cell", "array", "other array", "global", "module", "default"])
@@ -130,9 +164,14 @@ def test_callbacks_are_looked_at_too():
 
 def test_nothing_is_looked_at_where_nothing_is_enclosed():
     """Nor is a global that an attribute shares its name with."""
-    plain = system(njit(lambda t: np.ones(4).size + 5.81 + 0.0 * t))
+
+    @callback("force")
+    def force(t, q, v, p, Q):
+        Q[0] = -np.ones(4).size
+
+    plain = ConstrainedSystem(n_q=1, n_c=0, mass=unit_mass, force=force)
     assert plain.enclosed is None
-    assert solve_dae(plain, (0.0, 1.0), *START).success
+    assert solve_dae(plain, (0.0, 1.0), [0.0], [0.0]).success
 
 
 def test_an_equal_number_is_no_change():
@@ -140,3 +179,199 @@ def test_an_equal_number_is_no_change():
     pendulum = system(pull)
     change(np.float64(9.81))
     assert solve_dae(pendulum, (0.0, 1.0), *START).success and not math.isnan(GRAVITY)
+
+
+def in_tuples_and_modules(how):
+    """A function that numba has not compiled yet, what changes the pull of 9.81 that it finds, and the name."""
+    law, nested, record = heavy, ((np.array([9.81]), 1.0), 2.0), np.array([(9.81, 1.0)], [("g", "f8"), ("c", "f8")])[0]
+    table, store, center = np.array([9.81]), shop, mall
+    helpers = (light, njit(lambda t: table[0] + 0.0 * t))
+
+    def of_default(t, pulls=tables):
+        return pulls[0][0] + 0.0 * t
+
+    def of_local(t):
+        place = mall.shop
+        return place.pull + 0.0 * t
+
+    def within(t):
+        def inner(x):
+            return store.pull + x
+
+        return inner(0.0 * t)
+
+    def rebind(value):
+        nonlocal law
+        law = heavy if value == 9.81 else light
+
+    def fill(array):
+        return lambda value: array.__setitem__(0, value)
+
+    def set_pull(value):
+        shop.pull = value
+
+    def set_global_law(value):
+        globals()["of_law"] = heavy if value == 9.81 else light
+
+    def set_law_of_module(value):
+        mall.helper = heavy if value == 9.81 else light
+
+    return {
+        "tuple": (lambda t: tables[0][0] + 0.0 * t, fill(tables[0]), r"tables\[0\]"),
+        "nested tuple": (lambda t: nested[0][0][0] + 0.0 * t, fill(nested[0][0]), r"nested\[0\]\[0\]"),
+        "named tuple": (lambda t: pair.table[0] + 0.0 * t, fill(pair.table), r"pair\.table"),
+        "tuple as default": (of_default, fill(tables[0]), r"pulls\[0\]"),
+        "record": (lambda t: record.g + 0.0 * t, lambda value: record.__setitem__("g", value), "record"),
+        "helper in a tuple": (lambda t: helpers[1](t), fill(table), "table"),
+        "module in a module": (lambda t: mall.shop.pull + 0.0 * t, set_pull, r"mall\.shop\.pull"),
+        "its table": (lambda t: mall.shop.table[0] + 0.0 * t, fill(shop.table), r"mall\.shop\.table"),
+        "its helper": (lambda t: mall.shop.helper(t), set_pull, r"shop\.pull"),
+        "module by another name": (of_local, set_pull, r"mall\.shop\.pull"),
+        "module in a cell": (lambda t: store.pull + 0.0 * t, set_pull, r"store\.pull"),
+        "its array": (lambda t: store.table[0] + 0.0 * t, fill(shop.table), r"store\.table"),
+        "its helper in a cell": (lambda t: center.shop.helper(t), set_pull, r"shop\.pull"),
+        "inner function": (within, set_pull, r"store\.pull"),
+        "other helper": (lambda t: of_law(t), set_global_law, "of_law"),
+        "other helper in a cell": (lambda t: law(t), rebind, "law"),
+        "other helper in a module": (lambda t: mall.helper(t), set_law_of_module, r"mall\.helper"),
+    }[how]
+
+
+PLACES = [
+    *("tuple", "nested tuple", "named tuple", "tuple as default", "record", "helper in a tuple"),
+    *("module in a module", "its table", "its helper", "module by another name"),
+    *("module in a cell", "its array", "its helper in a cell", "inner function"),
+    *("other helper", "other helper in a cell", "other helper in a module"),
+]
+
+
+@pytest.mark.filterwarnings("ignore:First-class function type feature is experimental")
+@pytest.mark.parametrize("made", ["compile=True", "callback"])
+@pytest.mark.parametrize("how", PLACES)
+def test_what_is_in_tuples_modules_and_helpers_is_looked_at(how, made):
+    function, change, name = in_tuples_and_modules(how)
+    pull = njit(function)
+
+    def again():
+        if made == "compile=True":
+            return system(pull)
+
+        @callback("force")
+        def force(t, q, v, p, Q):
+            Q[1] = -pull(t)
+
+        return ConstrainedSystem(n_q=2, n_c=0, mass=callback("mass")(both), force=force, name="pendulum")
+
+    pendulum = again()
+    before = solve_dae(pendulum, (0.0, 1.0), *START)
+    change(4.0)
+    with pytest.raises(ValueError, match=rf"force of 'pendulum' was compiled with {name} = .*, which is .* now"):
+        solve_dae(pendulum, (0.0, 1.0), *START)
+    other = solve_dae(again(), (0.0, 1.0), *START)
+    assert abs(other.q[:, -1] - before.q[:, -1]).max() > 0.1
+    change(9.81)
+    assert (solve_dae(pendulum, (0.0, 1.0), *START).q == before.q).all()
+
+
+def both(t, q, p, M):
+    M[0, 0] = M[1, 1] = 1.0
+
+
+def test_a_callback_that_was_compiled_before_the_change_is_refused_in_a_new_system_too():
+    @callback("force")
+    def force(t, q, v, p, Q):
+        Q[0] = -GRAVITY
+
+    globals()["GRAVITY"] = 4.0
+    falling = ConstrainedSystem(n_q=1, n_c=0, mass=unit_mass, force=force)
+    with pytest.raises(ValueError, match=r"was compiled with GRAVITY = 9\.81, which is 4\.0 now"):
+        solve_dae(falling, (0.0, 1.0), [0.0], [0.0])
+
+
+def test_an_equal_helper_and_an_equal_tuple_are_no_change():
+    def made():
+        @njit
+        def law(t):
+            return 9.81 + 0.0 * t
+
+        return law
+
+    law, pulls = made(), (np.array([9.81]), 1.0)
+    pendulum = system(njit(lambda t: 0.5 * (law(t) + pulls[0][0])))
+    law, pulls = made(), (np.array([9.81]), 1.0)
+    assert solve_dae(pendulum, (0.0, 1.0), *START).success
+    pulls[0][0] = 4.0
+    with pytest.raises(ValueError, match="was compiled with pulls"):
+        solve_dae(pendulum, (0.0, 1.0), *START)
+
+
+def test_names_that_lead_back_to_themselves_and_long_tuples_end():
+    many, modules = tuple(map(float, range(100_000))), [types.ModuleType("round") for _ in range(2)]
+    modules[0].other, modules[1].other = modules[1], modules[0]
+    for k in range(500):
+        setattr(modules[0], f"number_{k}", float(k))
+
+    def cyclic(t):
+        return cyclic(t - 1.0) + loop[1] + many[5] + modules[0].other.other.number_3 if t > 0.0 else back.other
+
+    back, cyclic = modules[0], njit(cyclic)
+    loop = (cyclic, 1.0, many)
+    names = [place.name for place in places(cyclic.py_func)]
+    assert {"loop", "loop[0]", "loop[2]", "many", "back", "back.other"} <= set(names) and len(names) < 20
+
+
+PROCESS = """
+import sys, types
+import numpy as np
+from numba import njit
+from twoloop import callback
+
+g = float(sys.argv[1])
+
+@njit
+def heavy(t):
+    return 9.81 + 0.0 * t
+
+@njit
+def light(t):
+    return 4.0 + 0.0 * t
+
+@njit
+def of_g(t):
+    return g + 0.0 * t
+
+def made(how):
+    shop = types.ModuleType("shop")
+    shop.pull, tables = g, ((np.array([g]),), 1.0)
+    laws = (heavy, light, heavy if g == 9.81 else light)
+    def in_module(t, q, v, p, Q):
+        Q[0] = -shop.pull
+    def in_tuple(t, q, v, p, Q):
+        Q[0] = -tables[0][0][0]
+    def again(t, q, v, p, Q):
+        Q[0] = -laws[2](t) + 0.0 * heavy(t) + 0.0 * light(t)
+    def of_helper(t, q, v, p, Q):
+        Q[0] = -of_g(t)
+    return callback("force")(locals()[how])
+
+def values(how):
+    Q, function = np.zeros(1), made(how)
+    function(0.0, np.zeros(1), np.zeros(1), np.zeros(0), Q)
+    return -Q[0]
+
+hows = "in_module", "in_tuple", "again", "of_helper"
+print(*map(values, hows))
+if g == 9.81:
+    g = 5.0  # a helper that numba has compiled by now
+    print(values("of_helper"))
+"""
+
+
+def test_machine_code_on_disk_is_that_of_the_same_values(tmp_path):
+    script, found = tmp_path / "script.py", []
+    script.write_text(PROCESS)
+    for g in ("9.81", "4.0", "5.0"):
+        command = [sys.executable, "-W", "ignore", str(script), g]
+        done = subprocess.run(command, capture_output=True, text=True, check=True)
+        found.append([float(each) for each in done.stdout.split()])
+    assert found == [[9.81] * 4 + [5.0], [4.0] * 4, [5.0, 5.0, 4.0, 5.0]]

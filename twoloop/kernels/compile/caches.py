@@ -15,6 +15,7 @@ from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import numba
 from numba import njit
@@ -23,7 +24,7 @@ from numba.core.caching import FunctionCache, NullCache
 from numba.core.dispatcher import Dispatcher
 from numba.misc.appdirs import AppDirs
 
-from twoloop.kernels.compile.dependencies import CannotBeWatched, Digest, enclosed_by
+from twoloop.kernels.compile.dependencies import CannotBeWatched, Digest, enclosed_by, names_in
 from twoloop.kernels.compile.kept_files import Files
 from twoloop.kernels.compile.ownership import make_own, own_folder
 
@@ -207,16 +208,23 @@ def watch(function: Callable[..., Any]) -> tuple[str, str] | None:
     The first is of its code, its defaults, and the values of the globals and of the attributes of modules that it
     names; of compiled helpers among them the same, and so on. None: something among it cannot be watched.
     """
+    watched, helpers = _followed(function)
+    for each in helpers:
+        _take_over(each)
+    return watched
+
+
+def _followed(function: Callable[..., Any]) -> tuple[tuple[str, str] | None, list[Any]]:
+    """The digests of `watch`, and the helpers that were met, each after those that it names."""
     code, enclosed = Digest(), Digest()
+    enclosed.names = names_in(function.__code__)  # of modules among what it encloses
     try:
         code.add_function(function, enclosed=False)
         enclosed.add(enclosed_by(function))
+        watched = code.hash.hexdigest(), enclosed.hash.hexdigest()
     except CannotBeWatched:
-        return None
-    finally:
-        for each in (*code.helpers, *enclosed.helpers):
-            _take_over(each)
-    return code.hash.hexdigest(), enclosed.hash.hexdigest()
+        watched = None
+    return watched, [*code.helpers, *enclosed.helpers]
 
 
 def helper(function: Callable[..., Any]) -> Any:
@@ -232,14 +240,23 @@ def helper(function: Callable[..., Any]) -> Any:
     return dispatcher
 
 
+_AS_COMPILED: WeakKeyDictionary[Dispatcher, tuple[str, str]] = WeakKeyDictionary()  # what helpers depended on
+
+
 def _take_over(helper: Any) -> None:
-    """Put our cache in the place of one of numba, which does not see what a helper calls in other files."""
-    if not isinstance(helper._cache, FunctionCache) or isinstance(helper._cache, _Cache):
-        return
-    watched = watch(helper.py_func)
-    try:
-        helper._cache = NullCache() if watched is None else _Cache(helper.py_func, *watched, "")
-    except RuntimeError:
-        helper._cache = NullCache()
-    if helper.stats.cache_hits:  # what numba has read already may be out of date
+    """Put our cache in the place of numba's, and have numba compile a helper again that names other values now.
+
+    Numba's cache does not see what a helper calls in other files. What numba has compiled, or read, it keeps for all
+    functions that call it later; it may have done so before the helper came here, unless the signatures were given.
+    """
+    watched, known = _followed(helper.py_func)[0], _AS_COMPILED.get(helper)
+    changed = known is not None and known != watched
+    if isinstance(helper._cache, FunctionCache) and (changed or not isinstance(helper._cache, _Cache)):
+        try:
+            helper._cache = NullCache() if watched is None else _Cache(helper.py_func, *watched, "")
+        except RuntimeError:
+            helper._cache = NullCache()
+    if helper.overloads and (changed or (known is None and (helper._can_compile or helper.stats.cache_hits))):
         helper.recompile()
+    if watched is not None:
+        _AS_COMPILED[helper] = watched

@@ -16,7 +16,9 @@ import numba
 from numba.core.dispatcher import Dispatcher
 
 from twoloop.kernels.compile.caches import compile_kept, watch
-from twoloop.kernels.compile.indices import UNWATCHED, with_bounds_watched
+from twoloop.kernels.compile.dependencies import stands_for
+from twoloop.kernels.compile.indices import with_bounds_watched
+from twoloop.kernels.compile.places import found_by
 from twoloop.kernels.compile.private import also_for
 
 f8 = numba.types.float64
@@ -288,8 +290,9 @@ def compile_callback(
         made = _compiled_to_write(kind, compiled, watched, named or function, error, options)
     else:
         also_for(made, KINDS[kind].signature)
-    if compiled is not function:
-        setattr(made.py_func, UNWATCHED, function)
+    if watched is not None:
+        stands_for(made, f"{kind} {watched}")  # as it was compiled, whatever becomes of what it names
+    found_by(made, function)
     return made
 
 

@@ -15,6 +15,8 @@ from numba.core.types import Type
 # libraries whose functions are told apart by name; the versions of numba and numpy are compared, too
 LIBRARIES = {*sys.stdlib_module_names, "numpy", "numba", "scipy"}
 
+FORM = 2  # another one for machine code that files of earlier versions may have wrong
+
 
 def digest_of(text: str, *sources: str | types.ModuleType) -> str:
     """A digest of a text and of the files of modules."""
@@ -45,10 +47,10 @@ class Digest:
     """A hash that takes values of many types, and follows functions to whatever they name."""
 
     def __init__(self) -> None:
-        self.hash = hashlib.sha256(np.__version__.encode())
+        self.hash = hashlib.sha256(f"{FORM} {np.__version__}".encode())
         self.names: set[str] = set()  # of globals and attributes in the code that is being looked at
-        self.seen: set[tuple[int, str]] = set()
-        self.helpers: list[Dispatcher] = []  # that were followed
+        self.seen: dict[tuple[int, str], int] = {}  # and in which order
+        self.helpers: list[Dispatcher] = []  # that were followed, each after those that it names
 
     def add(self, value: Any) -> None:
         """Add a value."""
@@ -91,9 +93,11 @@ class Digest:
         if helper in _STANDS_FOR:
             self.add(_STANDS_FOR[helper])
         elif self._is_new(helper):
-            self.helpers.append(helper)
-            self.add(sorted(helper.targetoptions.items()))
-            self.add_function(helper.py_func)
+            try:
+                self.add(sorted(helper.targetoptions.items()))
+                self.add_function(helper.py_func)
+            finally:
+                self.helpers.append(helper)
 
     def _add_module(self, module: types.ModuleType) -> None:
         self.hash.update(module.__name__.encode())
@@ -116,9 +120,10 @@ class Digest:
 
     def _is_new(self, value: Any, name: str = "") -> bool:
         key = (id(value), name)
-        if key in self.seen:
+        if key in self.seen:  # one of several, and which one counts
+            self.hash.update(f"<again {self.seen[key]}>".encode())
             return False
-        self.seen.add(key)
+        self.seen[key] = len(self.seen)
         return True
 
 

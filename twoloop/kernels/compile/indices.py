@@ -19,7 +19,6 @@ from twoloop.kernels.compile.private import Dispatcher
 from twoloop.kernels.compile.rewritten import Rewritten
 
 WATCHED = {"boundscheck": True}  # for numba
-UNWATCHED = "__unwatched__"  # the attribute of a copy with watched helpers that holds the function itself
 OURS, GENERATED = "twoloop", "twoloop_equations_"  # package and generated modules: their functions stay within bounds
 SAFE_CALLS = ("len", "min", "max", "abs", "range", "enumerate", "zip", "reversed")  # with arguments that are safe
 
