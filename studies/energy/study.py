@@ -35,6 +35,7 @@ from studies.energy.runs import (
 )
 
 SHARES = (1e-3, 1e-5, 1e-7)  # of the largest kinetic energy: energy errors at which costs are compared
+PARTED = 3.0  # times the error of a run: what is less is no other phase
 KEEPING = f"{GAUSS}, symmetric partition"
 FATES = dict.fromkeys(DRIFTING, "drift") | {each: each for each in (NO_DRIFT, IS_LOST, IRREGULAR)}  # in one word
 DRAWN = (DEFAULT, OWN_CODE, IDA_C, HEYOKA, CYRK, CVODE_C, TRAPEZOIDAL, KEEPING, IRK)  # over cost
@@ -103,6 +104,16 @@ def ranked(reached: pd.DataFrame, good: pd.Series, near: pd.Series, one: pd.Seri
     )
 
 
+def _phase_later(reached: pd.DataFrame, run: dict[str, Any] | None) -> float | None:
+    """The largest error of positions with tighter tolerances of a solver, where it is far larger than with this one."""
+    if run is None or not run.get("error_q"):
+        return None
+    own = reached[reached["solver"] == run["solver"]]
+    tol = own.loc[(own["call_s"] - run["call_s"]).abs().idxmin(), "tol"]
+    largest = float(own[own["tol"] < tol]["error_q"].max())
+    return largest if largest > PARTED * run["error_q"] else None
+
+
 def long_of(rows: pd.DataFrame) -> dict[str, Any]:
     """The class "long and conservative": what small energy errors cost with a drift and without, alternatives."""
     reached = rows.assign(worst=settled(rows))[ended(rows)]
@@ -119,6 +130,7 @@ def long_of(rows: pd.DataFrame) -> dict[str, Any]:
             level[name]["verdict"] = ranked(reached, good, near, of_us, of_others)
         times = {name: reached[good & (reached["solver"] == name)]["call_s"] for name in (DEFAULT, OWN_CODE)}
         level["times"] = {name: float(each.min()) for name, each in times.items() if len(each)}
+        level["phase_later"] = _phase_later(reached, level["drift"]["ours"])
         level["verdict"], free = ranked(reached, good, near, own, ~own), ranked(reached, good, near, calm, ~calm)
         at.append(level | {"pays": free in ("ahead", "alone"), "undecided": free == "undecided"})
     kept = [level["no_drift"]["ours"] for level in at[1:] if level["no_drift"]["ours"]]

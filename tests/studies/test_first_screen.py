@@ -205,7 +205,7 @@ def test_every_number_of_the_screen_is_made_again_from_the_rows(tmp_path):
         "1 of 63, heyoka 1 of 66 (1 of 67 with `max_step`), IDA and CVODE 0 of 64. ",
         "every 5e-4 of a run (1.5e-3 s here, 0.050 s in 100 s), other forces",
         "short forces at random times in runs of 3.0 s, whose forces only ours evaluate every 1.5e-3 s "
-        "(in longer runs, more rarely); rivals have no `max_step` (",
+        "(in longer runs, more rarely); rivals ran without `max_step` (",
         "| | IDA from C | the default |",
         *(f"| {shape} of 1e-4 s | 7 of 20 | 7 of 20 |" for shape in ("gusts", "pulses")),
         *(f"| {shape} of 3e-4 to 0.010 s | 11 of 40 | 11 of 40 |" for shape in ("gusts", "pulses")),
