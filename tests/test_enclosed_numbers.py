@@ -12,7 +12,7 @@ from numba import njit
 
 from tests.compiled import unit_mass
 from twoloop import ConstrainedSystem, Integrator, callback, consistent_state, consistent_states, ensemble, solve_dae
-from twoloop.kernels.compile.places import places
+from twoloop.kernels.compile.frozen import places
 
 GRAVITY = 9.81
 size = 4.0

@@ -225,10 +225,9 @@ def another_constant(monkeypatch):
 
 @pytest.mark.usefixtures("another_constant")
 def test_a_global_that_numba_froze_is_not_read_anew():
-    for method, compiled in (("Taylor", False), ("DOP853", True), ("Adams", True), ("auto", True)):
-        with pytest.raises(ValueError, match=r"force of 'free' does not give what .* changed after numba compiled it"):
+    for method, compiled in (("Taylor", False), ("DOP853", True), ("Adams", True), ("auto", True), ("auto", "auto")):
+        with pytest.raises(ValueError, match=r"force of 'free' was compiled with K = 5.0, which is 0.5 now"):
             run(free(damped), method, compiled=compiled)
-    assert worst(run(free(damped), "auto").v[:, -1], [0.0, -9.81 / 5.0 * (1.0 - math.exp(-1.5))]) < 1e-7
 
 
 def test_a_counter_ends_the_run():

@@ -9,7 +9,7 @@ import numpy as np
 
 from twoloop.checks.arguments import shown
 from twoloop.kernels.compile.dependencies import CannotBeWatched, Digest
-from twoloop.kernels.compile.places import found_by
+from twoloop.kernels.compile.frozen import found_by
 from twoloop.kernels.compile.private import Dispatcher
 
 

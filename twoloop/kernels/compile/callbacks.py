@@ -17,8 +17,8 @@ from numba.core.dispatcher import Dispatcher
 
 from twoloop.kernels.compile.caches import compile_kept, watch
 from twoloop.kernels.compile.dependencies import stands_for
+from twoloop.kernels.compile.frozen import found_by
 from twoloop.kernels.compile.indices import with_bounds_watched
-from twoloop.kernels.compile.places import found_by
 from twoloop.kernels.compile.private import also_for
 
 f8 = numba.types.float64

@@ -1,4 +1,4 @@
-"""Where compiled functions find what they name: globals, free variables, defaults, modules, tuples, helpers."""
+"""What numba freezes in the functions it compiles: globals, free variables, defaults, modules, tuples, helpers."""
 
 from __future__ import annotations
 
