@@ -23,11 +23,11 @@ class Change(NamedTuple):
 
     def message(self, system: str) -> str:
         """What is wrong, and what to do."""
-        way = "M" if callable(self.compiled) else f"Pass {self.name} through parameters, m"
+        number = "" if callable(self.compiled) else f"pass {self.name} through parameters, "
         return (
             f"{self.kind} of {system!r} was compiled with {self.name} = {shown(self.compiled)}, which is "
-            f"{shown(self.now)} now; the compiled function keeps the first. {way}ake the function and the system "
-            "again after the change, or leave compile=True out"
+            f"{shown(self.now)} now; the compiled function keeps the first. To have the second, {number}make the "
+            "function and the system again after the change, or leave compile=True out"
         )
 
 

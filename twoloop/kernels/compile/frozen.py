@@ -15,6 +15,7 @@ from twoloop.kernels.compile.dependencies import names_in, of_library
 
 OURS = ("twoloop.", "twoloop_equations_")  # our modules, and generated ones: what they name stays as it is
 LOADS_ATTRIBUTE = ("LOAD_ATTR", "LOAD_METHOD")
+AS_COMPILED = "__as_compiled__"  # the attribute of a compiled callback that holds what it named then
 BETWEEN = ("EXTENDED_ARG", "CACHE", "NOP", "PUSH_NULL")  # these do nothing to what was loaded
 
 
@@ -45,9 +46,6 @@ class _Loaded(NamedTuple):
     free: bool
     name: str
     attributes: tuple[str, ...]
-
-
-AS_COMPILED = "__as_compiled__"  # the attribute of a compiled callback that holds what it named then
 
 
 def found_by(compiled: Any, function: Any = None) -> list[tuple[Place, bytes | None]]:

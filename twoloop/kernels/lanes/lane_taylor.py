@@ -4,17 +4,7 @@ from twoloop.kernels.data.common import kernel
 from twoloop.kernels.lanes.lane_control import MOST_STEPS
 from twoloop.kernels.lanes.lane_ends import MANY_STEPS
 from twoloop.kernels.lanes.lane_projection import project_lanes
-from twoloop.kernels.lanes.lane_room import (
-    CHECKS_REDUNDANT,
-    LANES,
-    ORDER,
-    RUNNING,
-    STEP,
-    UNIT,
-    WHICH,
-    X,
-    leave,
-)
+from twoloop.kernels.lanes.lane_room import CHECKS_REDUNDANT, LANES, ORDER, RUNNING, STEP, UNIT, WHICH, X, leave
 
 ALLOWED = 0.3  # as in taylor_step.py
 MOST_SHORTENED, SHORTENED, GROWTH = 0.1, 0.9, 5.0
