@@ -28,7 +28,8 @@ ORDER = (FOUR_BARS, PLANAR, DRIVEN, REDUNDANT, SPATIAL, STIFF, CROSSED)
 def by_kind(made: Mapping[str, Any]) -> dict[str, Any]:
     """For each kind of mechanism the fastest solvers within each range of errors (`made`: of `work_precision`).
 
-    errors: names of the ranges; rows: what, and a cell for each range. Nothing is told without mechanisms.
+    errors: names of the ranges; rows: what, a cell for each range, and `brief` ones, of the most often fastest.
+    Nothing is told without mechanisms.
     """
     rivals = made.get("rivals", {})
     ranges = [each for each in rivals.get("ranges", []) if each.get("errors")]
@@ -38,8 +39,8 @@ def by_kind(made: Mapping[str, Any]) -> dict[str, Any]:
     rows = []
     for kind, own in kinds.items():
         if own and ranges:
-            cells = [_fastest(own, each["errors"]) for each in ranges]
-            rows.append({"what": f"{kind} ({_which(kind, own)})", "cells": cells})
+            cells, brief = ([_fastest(own, each["errors"], how) for each in ranges] for how in (False, True))
+            rows.append({"what": f"{kind} ({_which(kind, own)})", "cells": cells, "brief": brief})
     return {"errors": [each["name"] for each in ranges], "rows": rows}
 
 
@@ -55,10 +56,11 @@ def _which(kind: str, own: Sequence[Mapping[str, Any]]) -> str:
     return f"{len(own)} variants of one, {names[0]}" if len(names) == 1 and kind != FOUR_BARS else str(len(own))
 
 
-def _fastest(own: Sequence[Mapping[str, Any]], errors: Sequence[float]) -> str:
+def _fastest(own: Sequence[Mapping[str, Any]], errors: Sequence[float], brief: bool) -> str:
     """Who is the fastest in how many of the pairs of mechanism and error that any solver reaches.
 
-    Where a rival of another project takes as long as the fastest rival, it is not decided.
+    Where a rival of another project takes as long as the fastest rival, it is not decided. `brief`: only what is true
+    of the most pairs.
     """
     won: Counter[str] = Counter()
     for line in (line for each in own for line in each["at"] if line["error"] in errors):
@@ -68,10 +70,14 @@ def _fastest(own: Sequence[Mapping[str, Any]], errors: Sequence[float]) -> str:
             open_to_rivals = best is line["others"] and line.get("close")
             verdict = "undecided" if open_to_rivals else line["verdict"]
             won.update([label(best["solver"], True) if verdict in DECIDED else verdict])
+    if not won:
+        return "not reached"
     named = [(who, n) for who, n in won.most_common() if who not in OPEN]
+    most = named[0][1] if named else 0
+    if brief:
+        named = [(who, n) for who, n in named if n == most]
     told = [f"{who if who == GIVEN else f'`{who}`'} {n}" for who, n in named[:NAMED]]
     rest = sum(n for _, n in named[NAMED:])
-    told += [f"other solvers {rest}"] * bool(rest) + [
-        f"{words} {won[verdict]}" for verdict, words in OPEN.items() if won[verdict]
-    ]
-    return f"{', '.join(told)} of {won.total()}" if won else "not reached"
+    told += [f"other solvers {rest}"] * bool(rest)
+    told += [f"{words} {won[verdict]}" for verdict, words in OPEN.items() if won[verdict] >= max(most * brief, 1)]
+    return f"{', '.join(told)} of {won.total()}"

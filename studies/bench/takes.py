@@ -37,7 +37,7 @@ def takes(found: Mapping[str, Any], entries: Sequence[dict[str, Any]]) -> list[d
     paying = (f"{DEFAULT}, compiled", HEYOKA)
     paid = [_paid(line) for line in made.get("first_calls", []) if line["pays"] and line["solver"] in paying]
     singly = {"what": "many single calls", "take": f"{' and '.join(paid)}, against `compiled=False`"}
-    return rows + _in_angles(made.get("minimal", []), rivals.get("ranges", [])) + [singly] * bool(paid)
+    return rows + _in_angles(made.get("minimal", [])) + [singly] * bool(paid)
 
 
 def _without(what: str, lacking: Sequence[str], entries: Sequence[dict[str, Any]]) -> str:
@@ -170,43 +170,17 @@ def _paid(line: Mapping[str, Any]) -> str:
     return f"{call(line['solver'])} after some {after} calls{on}"
 
 
-def _in_angles(minimal: Sequence[Mapping[str, Any]], ranges: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
-    """The fastest ODE in minimal coordinates beside our best with constraints: loops one by one, pendulums together."""
+def _in_angles(minimal: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
+    """In how many comparisons an ODE in minimal coordinates is faster than our best with constraints."""
     told, by = [], Counter[str]()
     for kind in minimal:
-        groups: dict[str, list[dict[str, Any]]] = defaultdict(list)
-        for each in kind["mechanisms"]:
-            name = each["case"].partition(",")[0] if kind["kind"] == "loops" else kind["kind"]
-            groups[name] += [at for at in each["at"] if at["ratio"] is not None]
-        told += [f"{name}: {_beside(pairs, ranges)}{_wrong(kind)}" for name, pairs in groups.items() if pairs]
-        by.update(at["rival"]["solver"].partition(",")[0] for pairs in groups.values() for at in pairs)
-    fastest = " or ".join(f"`{who}` ({n})" for who, n in by.most_common())
-    who = f" by the fastest of a few solvers, {fastest}," if by else ""
-    take = f"an ODE in angles{who} against our best: {'; '.join(told)}"
+        pairs = [at for each in kind["mechanisms"] for at in each["at"] if at["ratio"] is not None]
+        faster = sum(at["verdict"] == "behind" for at in pairs)
+        told += [f"{kind['kind']}: faster than our best in {faster} of {len(pairs)} comparisons"] * bool(pairs)
+        by.update(at["rival"]["solver"].partition(",")[0] for at in pairs)
+        for each in kind["wrong_by"]:
+            who, n = each["solver"].partition(",")[0], f"{each['n']} of {each['asked']} runs of {kind['kind']}"
+            told.append(f"`{who}` is silently wrong by over {number(kind['wrong_from'])} in {n}")
+    names = " or ".join(f"`{who}`" for who, _ in by.most_common(2))
+    take = f"an ODE in angles{f' by {names}' if by else ''} ({'; '.join(told)})"
     return [{"what": "loops that close by a formula, and pendulums", "take": take}] * bool(told)
-
-
-def _beside(pairs: Sequence[Mapping[str, Any]], ranges: Sequence[Mapping[str, Any]]) -> str:
-    """In how many pairs an ODE in minimal coordinates is faster, or slower; by errors where that differs."""
-    words = {"behind": "faster", "ahead": "slower", "undecided": "undecided"}
-    if len({at["verdict"] for at in pairs}) == 1:
-        return f"{words[pairs[0]['verdict']]} in {len(pairs)} of {len(pairs)} at all errors"
-    parts = []
-    for each in ranges:
-        verdicts = Counter(at["verdict"] for at in pairs if at["error"] in each["errors"])
-        counts = ", ".join(f"{word} in {verdicts[name]}" for name, word in words.items() if verdicts[name])
-        parts += [f"{counts} of {verdicts.total()} at {each['name']}"] if counts else []
-    return ", ".join(parts)
-
-
-def _wrong(kind: Mapping[str, Any]) -> str:
-    """How often solvers are silently wrong in minimal coordinates, and the others."""
-    start = " from horizontal rest" if kind.get("level") else ""  # where terms of heyoka's series vanish
-    others = kind["asked"] - sum(each["asked"] for each in kind["wrong_by"])
-    told = [
-        f"`{each['solver'].partition(',')[0]}` silently wrong by over {number(kind['wrong_from'])} in {each['n']} of "
-        f"{each['asked']} runs{start}"
-        for each in kind["wrong_by"]
-    ]
-    told += [f"others in 0 of {others}"] * bool(told and others)
-    return f" ({', '.join(told)})" if told else ""

@@ -44,6 +44,17 @@ def test_the_default_has_its_name_and_only_three_are_named():
     assert loose == "the default 2, `compiled=False` 2, `DOP853, compiled=False` 2, other solvers 2 of 8"
 
 
+def test_briefly_only_the_most_often_fastest_are_named():
+    other = WON | {"ours": {"solver": "Adams, compiled", "call_s": 0.1}}
+
+    def brief(*at):
+        made = [{"case": "m", "tags": ["spatial"], "at": list(at)}]
+        return by_kind({"rivals": {"mechanisms": made, "ranges": RANGES}})["rows"][0]["brief"][0]
+
+    assert brief(WON, WON, other, NEAR, NONE) == "`Taylor` 2 of 4"
+    assert brief(WON, other, NEAR) == "`Taylor` 1, `Adams` 1, undecided 1 of 3" and brief(NEAR) == "undecided 1 of 1"
+
+
 def test_kinds_are_told_by_the_first_of_their_tags():
     assert cells([WON], tags=("spatial", "redundant"))[0] == "redundant constraints (m0)"
     assert cells([WON], tags=("planar",))[0] == "other planar pendulums, chains and loops (m0)"
