@@ -8,7 +8,7 @@ from studies.bench.names import label
 from studies.bench.solvers import GIVEN
 
 DECIDED = ("ahead", "behind", "alone", "missed")  # verdicts by which one solver is the fastest
-OPEN = {"undecided": "undecided", "unasked": "reached by ours only (some rivals not run)"}  # others, in words
+OPEN = {"undecided": "undecided", "unasked": "reached by ours only (not all rivals run)"}  # others, in words
 NAMED = 3  # solvers, the most often fastest
 FOUR_BARS, PLANAR = "four-bar linkages, over 10 s", "other planar pendulums, chains and loops"
 STIFF, CROSSED = "stiff springs and dampers", "motion through singular positions"

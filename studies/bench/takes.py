@@ -87,7 +87,7 @@ def _of_beams(cases: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
     settings = [at["best"]["setting"].split() for case in cases for at in case["at"] if at["best"] is not None]
     loosest = max((float(value) for name, value in settings if name == "tol"), default=None)
     chosen = f" (tolerances chosen afterwards, up to {number(loosest)})" if loosest else ""
-    told = "; ".join(_by_the_tip(case) for case in cases)
+    told = "; ".join([*map(_by_the_tip, cases), "SUNDIALS had dense matrices, ours are banded"])
     return [{"what": f"beams, by the error of the tip{chosen}", "take": told}] * bool(cases)
 
 
@@ -157,6 +157,10 @@ def _at_once(cases: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
     fastest = Counter(at["rival"] for each in cases for at in each["at"] if at["verdict"] == "behind")
     who, other = ("`ensemble`", "all others") if ahead > behind else (call(fastest.most_common(1)[0][0]), "`ensemble`")
     told = f"ahead of {other} in {max(ahead, behind)}, behind in {min(ahead, behind)} of {verdicts.total()} comparisons"
+    if verdicts["undecided"]:
+        told += f", undecided in {verdicts['undecided']}"
+    if verdicts["missed"]:
+        told += f", {verdicts['missed']} reached by others only"
     close = sum(1 / SCATTER < at["ratio"] < SCATTER for each in cases for at in each["at"] if at["verdict"] in ORDERED)
     told += f"; {close} of these {ahead + behind} by less than {SCATTER:g} times" if close else ""
     return [{"what": "many runs in one call", "take": f"{who} ({told})"}]
@@ -180,7 +184,8 @@ def _in_angles(minimal: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
         by.update(at["rival"]["solver"].partition(",")[0] for at in pairs)
         for each in kind["wrong_by"]:
             who, n = each["solver"].partition(",")[0], f"{each['n']} of {each['asked']} runs of {kind['kind']}"
-            told.append(f"`{who}` is silently wrong by over {number(kind['wrong_from'])} in {n}")
+            start = ", which start horizontally from rest" if kind.get("level") else ""
+            told.append(f"`{who}` is silently wrong by over {number(kind['wrong_from'])} in {n}{start}")
     names = " or ".join(f"`{who}`" for who, _ in by.most_common(2))
     take = f"an ODE in angles{f' by {names}' if by else ''} ({'; '.join(told)})"
     return [{"what": "loops that close by a formula, and pendulums", "take": take}] * bool(told)

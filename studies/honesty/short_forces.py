@@ -18,12 +18,12 @@ from studies.bench.sharp_mechanisms import Mechanism, bars
 from studies.bench.sharp_mechanisms import chain as chain_of
 from studies.bench.sharp_motion import motion
 from studies.honesty.solvers import DEFAULT
-from studies.honesty.traps import AGREE, GROWN, SHORT, Trap, of_force, pendulum
+from studies.honesty.traps import AGREE, GROWN, HELD_OUT_SEED, SHORT, Trap, of_force, pendulum
 
 SHAPES = {"gust": gust, "pulse": pulse}
 WIDTHS = (1e-4, 3e-4, 1e-3, 3e-3, 1e-2)  # s: b of a gust, duration of a pulse
 N_DRAWS, N_QUICK, QUICK_WIDTHS = 8, 2, (1e-3,)  # of each width on each mechanism
-SEED, PULSES = 25, 1  # what begins the seeds of the draws; of pulses, behind the others
+SEED, PULSES = HELD_OUT_SEED, 1  # what begins the seeds of the draws; of pulses, behind the others
 MISSED = {"some": True, "none": False}  # widths of which some runs of the default are off, or none
 
 

@@ -91,7 +91,7 @@ def solvers(quick: bool, group: str = MISTAKE) -> dict[str, Call]:
     others = {name: solve for name, solve in OTHERS.items() if name not in left_out}
     others |= {f"{name}, index 1": partial(solve_index1, method=name) for name in theirs}
     made |= {name: partial(other, solve, False) for name, solve in others.items()}
-    if group not in (INPUT, SHORT):  # to whose checks steps do not matter; of which max_step is the remedy
+    if group != INPUT:  # to whose checks steps do not matter
         made |= {name + LIMITED: partial(other, solve, True) for name, solve in others.items()}
     return made
 

@@ -138,6 +138,7 @@ def about(name: str, trap: Trap) -> dict[str, str]:
 def run(name: str, call: Call, trap: Trap, truth: Array | None) -> Row:
     """One cell, in a process of its own that is ended when it does not come back."""
     row: Row = {**about(name, trap), "tol": trap.tolerance, "n_drawn": trap.n_drawn}
+    row["seed"] = HELD_OUT_SEED if trap.group in (HELD_OUT, SHORT) else None
     row["max_step"] = None if name.endswith(OURS) else largest_step(name.endswith(LIMITED), trap)
     began, no_answer = time.monotonic(), {"message": "", "error": None, "warned": ""}
     try:
@@ -213,7 +214,9 @@ def findings_of(all_rows: pd.DataFrame) -> dict[str, Any]:
     found = of_mistakes(rows) | {"forces": of_forces(forces) | {"trust": trust_in(forces)}, "trust": trust_in(both)}
     found["forces_only"] = [name for name in dict.fromkeys(forces["solver"]) if name not in set(rows["solver"])]
     found["input"] = of_mistakes(inputs) | {"trust": trust_in(inputs)}
-    found["held_out"] = of_forces(held) | {"trust": trust_in(held), "bad": bad_in(held), "seed": HELD_OUT_SEED}
+    found["held_out"] = of_forces(held) | {"trust": trust_in(held), "bad": bad_in(held)}
+    seeds = held["seed"].dropna().unique() if "seed" in held else []  # of older rows: used during development
+    found["held_out"]["seed"] = int(seeds[0]) if len(seeds) else None
     found["held_out"]["ran"] = [kind for kind in KINDS[:-1] if found["held_out"]["trust"][kind]["n"]]
     short = all_rows[(all_rows["group"] == SHORT) & (all_rows["outcome"] != NOT_RUN)]
     found |= {"short": short_forces.findings_of(short, (SILENT, HANG)), "look": LOOK}

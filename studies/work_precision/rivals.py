@@ -200,7 +200,9 @@ def _within(made: Sequence[dict[str, Any]], name: str, errors: Sequence[float]) 
     own = [each for each in made if ("singular" in each["tags"]) is singular]
     pairs = [[at["standing"] for at in each["at"] if singular or at["error"] in errors] for each in own]
     variants = sorted({each["case"].partition(",")[0] for each in own}) if singular else []
-    told = {"name": name, "errors": list(errors), "n_mechanisms": len(own), "of": variants}
+    told: dict[str, Any] = {"name": name, "errors": list(errors), "n_mechanisms": len(own), "of": variants}
+    ahead = [any(at[headline.GIVEN]["verdict"] == "ahead" for at in each) for each in pairs]
+    told["faster_on"] = [each["case"] for each, faster in zip(own, ahead, strict=True) if faster]
     return told | {"standings": headline.counted(pairs)}
 
 

@@ -184,10 +184,11 @@ def test_every_number_of_the_screen_is_made_again_from_the_rows(tmp_path):
         f"fastest of up to {n_others} rival configurations, on an AMD EPYC:",
         "| faster / slower | errors of 1e-3 to 1e-6 | errors of 1e-7 to 1e-10 | singular positions (all errors) |",
         f"| the default | {standings[0]}",
-        f"| the default, `compiled=True` | {standings[1]}",
+        f"| `compiled=True` everywhere | {standings[1]}",
         f"| the best of our {len(ours)} configurations, chosen afterwards | {standings[2]}",
         f"median (range) | {typical} at 1e-4 | {typical} at 1e-8 | – |",
-        f"below {100.0 * (tables.LEAST - 1.0):.0f} % or the scatter",
+        f"below {100.0 * (tables.LEAST - 1.0):.0f} % or within the scatter",
+        f"neither count. At 1e-3 to 1e-6 the default is faster on {FOUR_BAR} only. At 1e-7 to 1e-10 the default is",
         "most often the fastest at 1e-3 to 1e-6 | most often the fastest at 1e-7 to 1e-10 |",
         f"| redundant constraints ({BRICARD}) | {both('IDA from C, stabilised')} |",
         f"| four-bar linkages, over 10 s ({FOUR_BAR}) | {both('the default')} |",
@@ -200,7 +201,8 @@ def test_every_number_of_the_screen_is_made_again_from_the_rows(tmp_path):
         f"| 17 kinds of sharp forces (4 gusts, 2 frictions, 11 others) | {' | '.join(held_out)} |",
         "| gusts at random times, of 1e-4 to 3e-4 s / 0.010 s | 15 of 40 / 3 of 20 | 15 of 40 / 3 of 20 |",
         "| pulses at random times, of 1e-4 to 3e-4 s / 0.010 s | 15 of 40 / 3 of 20 | 15 of 40 / 3 of 20 |",
-        "every 5e-4 of a run (here 1.5e-3 s), others",
+        "every 5e-4 of a run (here 1.5e-3 s), other forces",
+        "rivals are silently wrong in 2 of 132 runs of the first row; in the table they run without.",
     ]
     for said in expected:
         assert said in text, said

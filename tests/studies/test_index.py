@@ -287,7 +287,7 @@ def test_the_counts_of_the_headline_stand_first(tmp_path):
     text = front(tmp_path, [case()], standings=standings)
     assert "another solver is usually faster." in text and "the constraints drift" not in text
     named = front(tmp_path, [case()], standings=standings, behind={"CyRK, DOP853": 9, "heyoka": 2})
-    assert "usually faster, most often `CyRK` or `heyoka`. They integrate accelerations" in named
+    assert "usually faster, most often `CyRK` or `heyoka`. Here they integrate accelerations, which" in named
     standings[0] |= {"behind": 60}
     assert "usually faster" not in front(tmp_path, [case()], standings=standings)
 

@@ -28,7 +28,7 @@ def test_each_comparison_counts_once_within_its_range_of_errors():
     assert cells([NEAR, NONE], [WON]) == ["other spatial mechanisms (2)", "`Taylor` 1, undecided 1 of 2", "not reached"]
     assert cells([NONE])[1:] == ["not reached", "not reached"]
     alone = WON | {"verdict": "unasked"}
-    assert cells([WON, alone])[1] == "`Taylor` 1, reached by ours only (some rivals not run) 1 of 2"
+    assert cells([WON, alone])[1] == "`Taylor` 1, reached by ours only (not all rivals run) 1 of 2"
 
 
 def test_rivals_of_two_projects_that_take_as_long_are_undecided():

@@ -5,6 +5,7 @@ import pytest
 from studies.bench.takes import takes
 
 THEIRS = {"solver": "heyoka", "call_s": 0.05}
+MATRICES = "SUNDIALS had dense matrices, ours are banded"
 
 
 def test_of_beams_two_are_named_where_neither_is_cheaper():
@@ -13,16 +14,16 @@ def test_of_beams_two_are_named_where_neither_is_cheaper():
     found = {"cases": [{"name": "moderately stiff", "at": [at, at | {"error": 1e-4, "verdict": "behind"}]}]}
     (row,), stiff = takes({"beam": found}, []), "stiff, vibrations irrelevant"
     assert row["what"] == "beams, by the error of the tip (tolerances chosen afterwards, up to 0.10)"
-    assert row["take"] == f'{stiff}: `method="TRBDF2"` or `heyoka` (1e-3 m), `heyoka` (1e-4 m)'
+    assert row["take"] == f'{stiff}: `method="TRBDF2"` or `heyoka` (1e-3 m), `heyoka` (1e-4 m); {MATRICES}'
     found["cases"][0]["at"] = [at | {"verdict": "behind", "ties": ["Adams"]}]
-    assert takes({"beam": found}, [])[0]["take"] == f'{stiff}: `heyoka` or `method="Adams"` (1e-3 m)'
+    assert takes({"beam": found}, [])[0]["take"] == f'{stiff}: `heyoka` or `method="Adams"` (1e-3 m); {MATRICES}'
 
 
 def test_rows_that_lack_the_newest_rival_say_so():
     at = {"error": 1e-3, "verdict": "ahead", "best": THEIRS | {"setting": "tol 0.10"}}
     found = {"beam": {"cases": [{"name": "very flexible", "at": [at]}]}}
     found["work_precision"] = {"lacking": ["beams by the error of the tip"]}
-    assert takes(found, [])[0]["take"].endswith("`heyoka` (1e-3 m); without `CyRK`")
+    assert takes(found, [])[0]["take"].endswith(f"`heyoka` (1e-3 m); {MATRICES}; without `CyRK`")
     pick = {"solver": "CyRK, DOP853", "accuracies": ["1e-2"], "undecided": []}
     entry = {"class": "stiff, vibrations wanted", "name": "very flexible beam", "t_end": 2.0, "picks": [pick]}
     told = takes(found, [entry])[0]["take"]
