@@ -151,8 +151,11 @@ def run(name: str, call: Call, trap: Trap, truth: Array | None) -> Row:
     return row | {"outcome": outcome(row, trap, truth is not None)}
 
 
-def make(output: Output) -> pd.DataFrame:
-    """Make all cells. The checks of a start in our adapters of foreign solvers are off: those are to answer alone."""
+def make(output: Output, groups: Sequence[str] | None = None) -> pd.DataFrame:
+    """Make all cells, or those of some groups of traps.
+
+    The checks of a start in our adapters of foreign solvers are off: those are to answer alone.
+    """
     rows: list[Row] = []
     compiled: set[tuple[Any, ...]] = set()
     compile_all()  # what a child of a slow machine compiles may exceed its time limit, and is lost with it
@@ -163,8 +166,9 @@ def make(output: Output) -> pd.DataFrame:
         warm_up(name, call, trap, compiled)
         return run(name, call, trap, truth)
 
-    with output.kept() as kept, unchecked():
-        for trap in chain(*(each(output.call.quick) for each in (traps, held_out, short_forces.traps))):
+    with output.kept({"groups": groups}) as kept, unchecked():
+        every = chain(*(each(output.call.quick) for each in (traps, held_out, short_forces.traps)))
+        for trap in (trap for trap in every if groups is None or trap.group in groups):
             known = solvers(output.call.quick, trap.group)
             keys = {name: " | ".join(about(name, trap).values()) for name in known}
             truth = None if all(key in kept for key in keys.values()) else right_answer(trap)

@@ -8,9 +8,11 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from studies.honesty import short_forces
+from studies.bench.cli import StudyError
+from studies.honesty import again, short_forces
 from studies.honesty import solvers as honesty_solvers
 from studies.honesty import study as honesty
+from studies.honesty.again import told
 from studies.honesty.solvers import DEFAULT, IDA_C, KINDS, LIMITED, LOOK, kind_of, own, solvers, why_not
 from studies.honesty.traps import (
     FORCE,
@@ -318,3 +320,14 @@ def test_a_gust_shorter_than_a_look_is_a_rate_over_random_times():
     assert gusts["default"] == {"some": some, "none": none}
     assert "| the default | 1/2 | 0/1 |" in text and "| LSODA, index 1 | 1/1 | – |" in text
     assert "## Short forces" not in said(honesty, rows)[1]
+
+
+def test_groups_that_were_run_again_stand_beside_the_commit_of_the_others():
+    line = "`python -m studies.honesty`; 2026-11-26; commit abc; AMD EPYC, 2 cores"
+    once = told(line, "short: commit def, Xeon")
+    assert once == "`python -m studies.honesty`; 2026-11-26; commit abc (short: commit def, Xeon); AMD EPYC, 2 cores"
+    assert "; commit abc (short: commit def, Xeon; held out: commit g, Xeon); " in told(
+        once, "held out: commit g, Xeon"
+    )
+    with pytest.raises(StudyError, match="give groups of traps"):
+        again.main(["long"])
