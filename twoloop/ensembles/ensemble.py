@@ -24,6 +24,7 @@ FAR = 1e5  # tolerances, by which a motion that is not chaotic does not end else
 CALL = 1e-3  # s of a call of solve_dae beside its steps
 SHOWN = 5  # numbers of runs in a message
 FIRST = "the first, which checks the system"  # why it is made singly
+CLOSER, TIGHT = 0.1, 1e-9  # of the tolerances: those of the first run, unless they are as tight as this
 WORTH = 20.0  # times what the runs of a call take singly: what their code may take to compile, as it is kept
 
 
@@ -120,7 +121,11 @@ def ensemble(
             messages[run] = result.message
         return result
 
+    may_go = events is None and method in IN_LANES and n_runs > 1
+    if may_go and float(rtol) > TIGHT and tolerance.min() > TIGHT:  # lanes are compared with it
+        options |= {"rtol": CLOSER * float(rtol), "atol": CLOSER * tolerance}
     first = single(0)  # which checks the system, derivatives and all
+    options |= {"rtol": float(rtol), "atol": tolerance}
     in_lanes, why = np.zeros(n_runs, dtype=bool), ""
     made_by: dict[str, int] = {}
     reasons: dict[int, str] = {}
