@@ -96,7 +96,8 @@ class Again:
         self.plan, self.kit, self.flags, self.memory = run.plan, run.kit, run.kit.flags.copy(), run.memory
         room = LARGEST // len(run.state)
         self.t, self.rows = np.empty(room + 1), np.empty((room + 1, len(run.state)))
-        self.steps, self.looks = np.empty((room, run.a.N_STEP_COLUMNS)), Looks(run.plan)
+        self.steps = np.empty((room, run.a.N_STEP_COLUMNS))
+        self.looks: Looks | None = None  # of a run of several chunks
         self.kinds, self.between = np.empty(room, dtype=np.int64), Between(run)
         loops = short_loops()
         self._go, self._tell, self.going = direct(loops.go), direct(loops.tell), self._going(loops)
@@ -154,7 +155,7 @@ class Again:
         if not self._is_ready(system, t0, t1, q0, v0, asked):
             return None
         began = time.process_time()
-        code = self._steps_to(t1, between is not None or output.dense)
+        code = self._steps_to(t1, between is not None or output.dense, began + LONGEST)
         n_states, n_steps, turned, within, nearly, pivot, checked, defect, gap = self.going.told.tolist()
         n_states, n_steps = int(n_states), int(n_steps)
         if between is not None and code == a.ALL_OUTPUT_DONE:
@@ -186,7 +187,7 @@ class Again:
             t, rows = output.times.copy(), at_times
         # after all that may send it the long way: it may warn, and takes the workspace
         words = outcome(run, code, t1, NO_PACE)[1] if special else said_of_reached(run)
-        if self.looks.kept:
+        if self.looks is not None:
             words += said_of_stiffness(self.looks, run.kit, run.work)
         message = message_of(run, words, run.system if movable is None else system)
         territory.count()  # a run that goes the long way is counted there
@@ -204,11 +205,10 @@ class Again:
             "sol": sol,
         }
 
-    def _steps_to(self, t1: float, with_kinds: bool) -> int:
+    def _steps_to(self, t1: float, with_kinds: bool, until: float) -> int:
         """How the steps end; what is told of them stands in `going`."""
         run, going, a = self.run, self.going, self.run.a
-        self.looks.forget(run.plan)
-        until = time.process_time() + LONGEST
+        self.looks = None
         try:
             code: int = self._go(run.kit, run.work, going, t1, TURNED, self.territory.known)
             n_rows, n_steps = going.filled.tolist()
@@ -223,7 +223,8 @@ class Again:
 
     def _steps_beyond(self, code: int, n_rows: int, n_steps: int, t1: float, until: float) -> tuple[int, int, int]:
         """How they end, with how many states, beside the first, and steps, where the first chunk did not reach it."""
-        run, going, a, looks = self.run, self.going, self.run.a, self.looks
+        run, going, a = self.run, self.going, self.run.a
+        self.looks = looks = Looks(run.plan)
         plan, control, kit = run.plan, run.control, run.kit  # at the moment: not always the run's own
         pace, taken, across = Pace(run.t0), n_steps, False
         between_looks = next_look = run.chunk  # the states that are looked at are those of `Course`

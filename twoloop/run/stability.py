@@ -40,10 +40,6 @@ class Looks:
     """States of a run, kept as it goes on."""
 
     def __init__(self, plan: Plan):
-        self.forget(plan)
-
-    def forget(self, plan: Plan) -> None:
-        """Begin with a run of this plan."""
         self.plan, self.every, self.n_seen, self.n_steps = plan, 1, 0, 0
         self.last = np.zeros(0)  # lengths of the last steps
         self.kept: list[Look] = []
