@@ -51,7 +51,8 @@ def ensemble(
     What lanes cannot do is made by `solve_dae`, run by run: runs that come near a singular position, systems whose
     callbacks branch or that have nonholonomic rows, events, and other methods. So are runs that take less than a
     twentieth of the estimated time to make their code. The first run is also made by `solve_dae`, with all of its
-    checks. At the end of every other run, the callbacks are compared with what was found there.
+    checks, and with a tenth of the tolerances where these are above 1e-9, as lanes are compared with it. At the end of
+    every other run, the callbacks are compared with what was found there.
 
     Parameters
     ----------
