@@ -12,6 +12,7 @@ from tests.problems import some_of
 from twoloop import ConstrainedSystem, ConstraintWarning, callback, mechanisms, solve, solve_dae
 from twoloop.generate.exact_derivatives import Territory
 from twoloop.result.result import Result
+from twoloop.run import again
 
 METHODS = ["auto", "DOP853", "Adams", "Gauss8", "RadauIIA5", "TRBDF2", "BDF"]
 NAMES = [
@@ -172,10 +173,28 @@ def test_threads_have_arrays_of_their_own(taken):
         assert (one.q == other.q).all() and (one.lam == other.lam).all()
 
 
-def test_a_run_of_more_than_one_chunk_goes_the_long_way(taken):
+@pytest.mark.parametrize("options", [{"method": "DOP853"}, {"method": "Adams"}, {}], ids=str)
+def test_a_run_of_several_chunks_is_that_of_the_long_way(options, taken, monkeypatch):
+    """It is looked at after as many attempts, so that the message is the same, too."""
+    problem, other = mechanisms.four_bar(), mechanisms.four_bar()
+    options = {"max_step": 0.01, "t_eval": [0.5, 7.3, 25.0]} | options
+    states = starts(problem, 1.0, 8)
+    monkeypatch.setattr(again, "LONGEST", np.inf)
+    by_arrays = runs(problem, states, 30.0, **options)
+    assert min(each.h.size for each in by_arrays) >= 3000 and sum(taken) >= 3, taken
+    monkeypatch.setattr(solve, "record_again", lambda *asked: None)
+    for one, long in zip(by_arrays, runs(other, states, 30.0, **options), strict=True):
+        assert_same(one, long)
+
+
+def test_a_run_that_takes_too_long_or_has_no_room_goes_the_long_way(taken, monkeypatch):
     problem = mechanisms.four_bar()
-    lengths = [each.h.size for each in runs(problem, starts(problem, 1.0, 6), 30.0, method="DOP853", max_step=0.01)]
-    assert min(lengths) >= 3000 and not any(taken)
+    states, options = starts(problem, 1.0, 6), {"method": "DOP853", "max_step": 0.01}
+    monkeypatch.setattr(again, "LONGEST", -1.0)
+    assert all(each.success for each in runs(problem, states, 30.0, **options)) and not any(taken)
+    monkeypatch.setattr(again, "LONGEST", np.inf)
+    monkeypatch.setattr(again, "LARGEST", 2000 * len(states[0].q) * 4)
+    assert all(each.success for each in runs(mechanisms.four_bar(), states, 30.0, **options)) and not any(taken)
 
 
 def test_what_is_wrong_at_a_start_is_said_as_ever(taken):

@@ -76,6 +76,14 @@ def teeth(t, q, v, p):
     return np.array([SIZE * np.cos((q[0] - p[0]) / p[1]) ** 4096, -9.81])
 
 
+def cogs(t, q, v, p):
+    return np.array([20.0 * np.cos((q[0] - p[0]) / p[1]) ** 32, -9.81])
+
+
+def wave(t, q, v, p):
+    return np.array([20.0 * np.cos((q[0] - p[0]) / p[1]) ** 6, -9.81])
+
+
 def steady(t, q, v, p):
     return np.array([-p[1] * v[0], -9.81])
 
@@ -84,7 +92,7 @@ def pendulum(force, at=1.5, width=WIDTH, compile=True):
     return problems.pendulum(compile=compile, force=force, parameters=[at, width])
 
 
-FORCES = {"gust": gust, "switched": switched, "smooth magnet": smooth_magnet, "quotient": quotient}
+FORCES = {"gust": gust, "switched": switched, "smooth magnet": smooth_magnet, "quotient": quotient, "cogs": cogs}
 SYSTEMS = {name: pendulum(force) for name, force in FORCES.items()}
 
 
@@ -221,15 +229,26 @@ def test_nor_in_lanes():
         assert np.abs(q - end(gust, at)).max() < 1e-5
 
 
+@pytest.mark.parametrize("tolerance", [1e-4, 1e-6])
+def test_nor_are_pulses_of_a_high_power_of_a_cosine(tolerance):
+    """Between these the force and its series are zero to rounding; each acts for a hundredth of the run."""
+    widths = np.linspace(0.04, 0.09, 24)
+    given = {"parameters": [[0.1, width] for width in widths], "rtol": tolerance, "atol": tolerance}
+    runs = ensemble(SYSTEMS["cogs"], (0.0, T_END), START[0], [3.0, 0.0], method="Taylor", t_eval=[T_END], **given)
+    assert runs.success.all() and (~runs.singly).sum() > 12
+    for q, width in zip(runs.q[:, :, -1], widths.tolist(), strict=True):
+        assert np.abs(q - end_behind_a_place("cogs", 0.1, width)).max() < 1e3 * tolerance
+
+
 def test_what_may_act_for_a_short_time():
     assert all(may_be_sudden(each, False).by_time for each in (SYSTEMS["gust"], SYSTEMS["switched"], pendulum(ticking)))
     smooth = (
-        *map(pendulum, (vibrating, steady, broad_quotient, damper)),
+        *map(pendulum, (vibrating, steady, broad_quotient, damper, wave)),
         four_bar().system,
         driven_slider_crank().system,
     )
     assert not any(any(may_be_sudden(system, False)) for system in smooth)
-    for system in (SYSTEMS["smooth magnet"], SYSTEMS["quotient"], pendulum(teeth), pendulum(narrow_quotient)):
+    for system in (*map(SYSTEMS.get, ("smooth magnet", "quotient", "cogs")), *map(pendulum, (teeth, narrow_quotient))):
         assert may_be_sudden(system, False) == (False, True)
 
 

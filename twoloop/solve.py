@@ -31,7 +31,7 @@ from twoloop.problem.events import check_events
 from twoloop.problem.system import ConstrainedSystem, check_system
 from twoloop.result.folder import begin_folder, check_folder, end_folder
 from twoloop.result.result import Result, result_of
-from twoloop.run.again import Output
+from twoloop.run.again import LONGEST, Output
 from twoloop.run.asked import Asked
 from twoloop.run.course import Course
 from twoloop.run.interrupts import Interrupts, not_begun
@@ -186,7 +186,8 @@ def solve_dae(
     with Interrupts() as interrupts:
         own, told = asked.own_tolerance, asked.told | {"system": system, "atol": asked.atol.copy()}
         at_ends = times is not None and set(times.tolist()) <= {t0, t1}
-        if folder is event_functions is own is None and not progress:
+        in_time = time_limit is None or time_limit >= LONGEST
+        if folder is event_functions is own is None and in_time and not progress:
             made = record_again(system, t0, t1, q0, v0, asked, Output(times, at_ends, bool(dense_output)))
             if made is not None and not interrupts.asked:
                 fields, said_of_rows = made

@@ -24,6 +24,7 @@ FAR = 1e5  # tolerances, by which a motion that is not chaotic does not end else
 CALL = 1e-3  # s of a call of solve_dae beside its steps
 SHOWN = 5  # numbers of runs in a message
 FIRST = "the first, which checks the system"  # why it is made singly
+CLOSER, TIGHT = 0.1, 1e-9  # of the tolerances: those of the first run, unless they are as tight as this
 WORTH = 20.0  # times what the runs of a call take singly: what their code may take to compile, as it is kept
 
 
@@ -50,7 +51,8 @@ def ensemble(
     What lanes cannot do is made by `solve_dae`, run by run: runs that come near a singular position, systems whose
     callbacks branch or that have nonholonomic rows, events, and other methods. So are runs that take less than a
     twentieth of the estimated time to make their code. The first run is also made by `solve_dae`, with all of its
-    checks. At the end of every other run, the callbacks are compared with what was found there.
+    checks, and with a tenth of the tolerances where these are above 1e-9, as lanes are compared with it. At the end of
+    every other run, the callbacks are compared with what was found there.
 
     Parameters
     ----------
@@ -120,7 +122,11 @@ def ensemble(
             messages[run] = result.message
         return result
 
+    may_go = events is None and method in IN_LANES and n_runs > 1
+    if may_go and float(rtol) > TIGHT and tolerance.min() > TIGHT:  # lanes are compared with it
+        options |= {"rtol": CLOSER * float(rtol), "atol": CLOSER * tolerance}
     first = single(0)  # which checks the system, derivatives and all
+    options |= {"rtol": float(rtol), "atol": tolerance}
     in_lanes, why = np.zeros(n_runs, dtype=bool), ""
     made_by: dict[str, int] = {}
     reasons: dict[int, str] = {}

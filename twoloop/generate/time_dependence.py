@@ -90,6 +90,7 @@ def _by_time(graph: Graph, needed: list[int]) -> bool:
 
 def _by_state(graph: Graph, needed: list[int], n_q: int) -> bool:
     degrees: dict[int, float] = dict.fromkeys(range(1, 2 * n_q + 1), 1.0)
+    vibrations: dict[int, float] = {}  # the degree in sines and cosines, whose high powers are flat between pulses
     inverse: dict[int, float] = {}  # the highest degree of what is divided by; the slope of an arctangent is a quotient
     growth = degrees.copy()  # power by which something grows far away
     for i in needed:
@@ -97,13 +98,14 @@ def _by_state(graph: Graph, needed: list[int], n_q: int) -> bool:
         if operation is not None and graph.inputs_of[i] & ~TIME:
             kind, argument, *_ = operation
             degrees[i] = _degree(degrees, *operation)
+            vibrations[i] = max(_degree(vibrations, *operation), float(kind in (SINE, COSINE)))
             inverse[i] = _degree(inverse, *operation)
             if kind in (RECIPROCAL, ARCTANGENT):
                 inverse[i] += _degree(degrees, kind, argument)
             growth[i] = _growth(growth, *operation)
             if kind == EXPONENTIAL or degrees[i] > HIGHEST_OF_STATE or inverse[i] > HIGHEST_INVERSE:
                 return True
-            if growth[i] < SLOWEST:
+            if growth[i] < SLOWEST or vibrations[i] > HIGHEST:
                 return True
     return False
 

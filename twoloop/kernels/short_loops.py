@@ -223,12 +223,11 @@ def tell(w, b, n_rows, n_steps, turned, box):
 
 @kernel(i8(KIT, WORK, GOING, f8, f8, MATRIX))
 def go(f, w, b, t1, turned, box):
-    """The steps of a run from its start to t1, as many as there is room for; how `advance` ended, and `told`.
+    """The first chunk of the steps of a run from its start to t1; how `advance` ended, and `told`.
 
     `turned` is how many times what accelerations give is too much; `box` has rows [t, q, v], or nothing.
     """
     b.end[0], b.t[0] = t1, b.clock[at.T]
-    b.control[at.STORE_ALL], b.control[at.MAX_ATTEMPTS] = 1.0, len(b.steps)
     _copy(b.state, b.rows[0])
     arrays = b.tolerances, b.control, b.clock, b.state, b.new_state
     code = b.advance(f, w, b.options, b.memory, *arrays, b.end, b.t[1:], b.rows[1:], b.steps, b.filled)

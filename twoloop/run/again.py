@@ -23,21 +23,25 @@ from twoloop.run.asked import Asked
 from twoloop.run.beginning import Beginning
 from twoloop.run.between import Between, interpolator_of
 from twoloop.run.comparison import compared_at, territory_of
+from twoloop.run.course import BUFFER_STEPS
 from twoloop.run.crossings import TURNED, Place
 from twoloop.run.dense import Table
 from twoloop.run.dense_solution import DenseSolution
 from twoloop.run.fields import kinds_of, of_states, told_later
 from twoloop.run.messages import message_of, outcome, said_of_reached, unless_turned
 from twoloop.run.movable import Kin, Movable
-from twoloop.run.pace import INTERRUPTED, Pace
+from twoloop.run.pace import INTERRUPTED, STAGNATED, Pace
 from twoloop.run.passage import beyond, bridge, bridging_kit, give_way
 from twoloop.run.record import Record, Status
 from twoloop.run.run import Run
+from twoloop.run.stability import Looks, said_of_stiffness
 
 Array = NDArray[np.float64]
 
 MOST_WAITING, LARGEST = 4, 500_000  # those of a kind that wait for a call, one a thread; numbers of the states of each
-IN_VAIN = 16  # runs that are not tried after one that did not come to its end
+IN_VAIN = 16  # runs that are not tried after one that did not come to its end ...
+TOO_LONG = 1024  # ... and after one for which there was no room, or which took longer than that:
+LONGEST = 0.1  # s of CPU time, in which Ctrl-C is not heard, nor is the time looked at
 DEFAULTS = {each.name: each.default for each in fields(Record) if each.default is not MISSING}
 NO_PACE = Pace(0.0)  # of a run that came to its end at once
 
@@ -86,12 +90,15 @@ class Again:
         self.movable = None if kin is None else Movable(kin, run)
         self.run, self.check_derivatives = run, check_derivatives
         self.territory = territory_of(run, check_derivatives) if kin is None else kin.territory(check_derivatives)
+        run.control[run.a.STORE_ALL], run.control[run.a.MAX_ATTEMPTS] = 1.0, run.chunk
         self.beginning = Beginning(run, system if self.movable is None else self.movable.system, code, definite)
         self.look, self.rest, self._advance = self.beginning.look, 0, direct(run.kernels.advance)
         self.plan, self.kit, self.flags, self.memory = run.plan, run.kit, run.kit.flags.copy(), run.memory
-        self.t, self.rows = np.empty(run.chunk + 1), np.empty((run.chunk + 1, len(run.state)))
-        self.steps = np.empty((run.chunk, run.a.N_STEP_COLUMNS))
-        self.kinds, self.between = np.empty(run.chunk, dtype=np.int64), Between(run)
+        room = LARGEST // len(run.state)
+        self.t, self.rows = np.empty(room + 1), np.empty((room + 1, len(run.state)))
+        self.steps = np.empty((room, run.a.N_STEP_COLUMNS))
+        self.looks: Looks | None = None  # of a run of several chunks
+        self.kinds, self.between = np.empty(room, dtype=np.int64), Between(run)
         loops = short_loops()
         self._go, self._tell, self.going = direct(loops.go), direct(loops.tell), self._going(loops)
         self.dependent: dict[bytes, tuple[NDArray[np.int64], str]] = {}  # by the rows that count
@@ -114,7 +121,7 @@ class Again:
 
     @staticmethod
     def suits(run: Run) -> bool:
-        """Whether a run may be made in this way: in one chunk, in the dense form."""
+        """Whether a run may be made in this way: its first chunk at least, in the dense form."""
         return run.static is None and run.chunk * len(run.state) <= LARGEST and not run.system.called_in_python
 
     @staticmethod
@@ -148,7 +155,7 @@ class Again:
         if not self._is_ready(system, t0, t1, q0, v0, asked):
             return None
         began = time.process_time()
-        code = self._steps_to(t1, between is not None or output.dense)
+        code = self._steps_to(t1, between is not None or output.dense, began + LONGEST)
         n_states, n_steps, turned, within, nearly, pivot, checked, defect, gap = self.going.told.tolist()
         n_states, n_steps = int(n_states), int(n_steps)
         if between is not None and code == a.ALL_OUTPUT_DONE:
@@ -159,16 +166,13 @@ class Again:
         turns = turned and output.times is None and (nearly == 1.0 or not run.plan.watchful)
         special = turns or run.crossings or pivot < run.near
         if code != a.ALL_OUTPUT_DONE or (special and not self._is_to_be_trusted(t, rows, t1, output, turns)):
-            self.rest = IN_VAIN
+            self.rest = max(self.rest, IN_VAIN)
             return None
         if run.compared_to[0] < t1 or territory.is_due():
             if not (within and movable is None) and not self._compared(t, rows, bool(within)):
                 return None
             run.compared_to[0] = t1
-        if special:  # after all that may send it the long way: it may warn
-            message = message_of(run, outcome(run, code, t1, NO_PACE)[1], run.system if movable is None else system)
-        else:
-            message = said_of_reached(run)
+        told = told_later(self.steps[:n_steps], run.work.counters, spent)
         sol = None
         if output.dense:
             table = Table(t, rows[:, : 3 * system.n_q].copy(), self.kinds[:n_steps].copy())
@@ -181,11 +185,16 @@ class Again:
             if at_times is None:
                 return None
             t, rows = output.times.copy(), at_times
+        # after all that may send it the long way: it may warn, and takes the workspace
+        words = outcome(run, code, t1, NO_PACE)[1] if special else said_of_reached(run)
+        if self.looks is not None:
+            words += said_of_stiffness(self.looks, run.kit, run.work)
+        message = message_of(run, words, run.system if movable is None else system)
         territory.count()  # a run that goes the long way is counted there
         return {
             **DEFAULTS,
             **of_states(system.n_q, t, rows),
-            **told_later(self.steps[:n_steps], run.work.counters, spent),
+            **told,
             "rank": run.rank,
             "redundant": run.redundant.copy(),
             "defect": defect if checked else None,
@@ -196,27 +205,45 @@ class Again:
             "sol": sol,
         }
 
-    def _steps_to(self, t1: float, with_kinds: bool) -> int:
-        """How the steps of one chunk end; what is told of them stands in `going`."""
+    def _steps_to(self, t1: float, with_kinds: bool, until: float) -> int:
+        """How the steps end; what is told of them stands in `going`."""
         run, going, a = self.run, self.going, self.run.a
+        self.looks = None
         try:
             code: int = self._go(run.kit, run.work, going, t1, TURNED, self.territory.known)
             n_rows, n_steps = going.filled.tolist()
             if with_kinds:
                 self.kinds[:n_steps] = kinds_of(run, self.steps[:n_steps])
-            if code in (a.HAS_TO_GIVE_WAY, a.NEAR_SINGULAR):
-                code, n_rows, n_steps = self._steps_beyond(code, n_rows, n_steps)
+            if code in (a.HAS_TO_GIVE_WAY, a.NEAR_SINGULAR, a.PAUSED):
+                code, n_rows, n_steps = self._steps_beyond(code, n_rows, n_steps, t1, until)
                 self._tell(run.work, going, n_rows, n_steps, TURNED, self.territory.known)
         except Exception:  # of a callback; the long way knows what to do
             return INTERRUPTED
         return code
 
-    def _steps_beyond(self, code: int, n_rows: int, n_steps: int) -> tuple[int, int, int]:
-        """How they end, with how many states, beside the first, and steps, where the run's own could not go on."""
+    def _steps_beyond(self, code: int, n_rows: int, n_steps: int, t1: float, until: float) -> tuple[int, int, int]:
+        """How they end, with how many states, beside the first, and steps, where the first chunk did not reach it."""
         run, going, a = self.run, self.going, self.run.a
+        self.looks = looks = Looks(run.plan)
         plan, control, kit = run.plan, run.control, run.kit  # at the moment: not always the run's own
+        pace, taken, across = Pace(run.t0), n_steps, False
+        between_looks = next_look = run.chunk  # the states that are looked at are those of `Course`
         while True:
-            across, taken = plan is not run.plan, int(going.filled[1])
+            h = self.steps[n_steps - taken : n_steps, a.H]
+            looks.pass_by(h)
+            pace.pass_by(h)
+            if code == a.ALL_OUTPUT_DONE:
+                return code, n_rows, n_steps
+            if code == a.PAUSED and run.attempts() >= next_look:
+                between_looks = min(2 * between_looks, BUFFER_STEPS)
+                next_look = run.attempts() + between_looks
+                if not across:
+                    looks.take(float(run.clock[a.T]), run.state, run.system.n_q)
+                if time.process_time() > until:
+                    self.rest = TOO_LONG
+                    return code, n_rows, n_steps
+                if pace.stagnates(run.clock[a.T], t1):
+                    return STAGNATED, n_rows, n_steps
             if code == a.HAS_TO_GIVE_WAY:
                 give_way(run)
                 plan, control, kit = run.plan, run.control, run.kit
@@ -228,18 +255,19 @@ class Again:
                 kit = kit if plan is not run.plan else run.kit
                 if code != a.PAUSED:
                     return code, n_rows, n_steps
-            else:
+            elif code != a.PAUSED:
                 return code, n_rows, n_steps
-            run.control[a.MAX_ATTEMPTS] = run.chunk - run.attempts()
+            if n_steps == len(self.steps):
+                self.rest = TOO_LONG
+                return a.PAUSED, n_rows, n_steps
+            run.control[a.MAX_ATTEMPTS] = max(0, next_look - run.attempts())
             arrays = plan.options, plan.memory, run.tolerances, control, run.clock, run.state, run.new_state
             room = self.t[n_rows + 1 :], self.rows[n_rows + 1 :], self.steps[n_steps:]
             code = self._advance(kit, run.work, *arrays, going.end, *room, going.filled)
-            before, (more, steps) = n_steps, going.filled.tolist()
-            n_rows, n_steps = n_rows + more, n_steps + steps
-            across = plan is not run.plan
-            self.kinds[before:n_steps] = intervals.ACROSS if across else kinds_of(run, self.steps[before:n_steps])
-            if code == a.ALL_OUTPUT_DONE or (code == a.PAUSED and run.attempts() >= run.chunk):
-                return code, n_rows, n_steps
+            more, taken = going.filled.tolist()
+            n_rows, n_steps, across = n_rows + more, n_steps + taken, plan is not run.plan
+            made = slice(n_steps - taken, n_steps)
+            self.kinds[made] = intervals.ACROSS if across else kinds_of(run, self.steps[made])
 
     def _is_ready(self, system: ConstrainedSystem, t0: float, t1: float, q0: Array, v0: Array, asked: Asked) -> bool:
         """Whether the run is at its start: one that is asked for again needs no second look."""

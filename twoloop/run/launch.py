@@ -26,7 +26,7 @@ from twoloop.run.workspace import sparse_factors_pay
 
 Array = NDArray[np.float64]
 
-MOST, LARGEST = 16, 100_000  # what is kept of with a system, for calls that ask for the same; numbers of each run
+MOST, LARGEST = 16, 150_000  # what is kept of with a system, for calls that ask for the same; numbers of each run
 MOST_ALIKE = 3  # runs that are kept for such calls, as starts may ask for other code
 
 

@@ -20,14 +20,14 @@ CLEAR = 0.3  # of the largest pivot that C_q had: where the run's own steps go o
 
 def give_way(run: Run) -> None:
     """Go on with the plan that takes over where values of this one are not finite."""
-    assert run.plan.substitute is not None
-    run.plan = run.plan.substitute.fresh()
+    substitute = run.plan.substitute
+    assert substitute is not None
+    run.plan, run.memory = substitute.fresh(), substitute.memory  # in which no run writes
     if run.static is None:
         run.kit = kit_with(run.system, run.functions.flags, run.plan)
     else:
         run.kit = kit_of(run.system, run.t0, run.state[: run.system.n_q], run.plan, run.static)
     run.functions = run.kit.functions
-    run.memory = run.plan.memory.copy()
     run.substituted = True
     run.control_by(run.plan)
     run.limit_steps()

@@ -132,11 +132,14 @@ def _first_bound_kept(mass, G, kept, n_rows, bounds, factors, solved, S, sizes):
                 for k in range(n_rows):
                     S[i, k] += G[kept[i], j] * solved[j, k]
         sizes[i] = math.sqrt(S[i, i])
+    for i in range(n_rows):
+        for k in range(i, n_rows):
+            S[i, k] /= sizes[i] * sizes[k]
     less = S[n_rows:]
     for place in range(bounds.size):
         for i in range(n_rows):
-            for k in range(n_rows):
-                less[i, k] = S[i, k] / (sizes[i] * sizes[k])
+            for k in range(i, n_rows):  # its upper triangle is what counts
+                less[i, k] = S[i, k]
             less[i, i] -= bounds[place] * (1.0 - ROUNDING)
         if ldl_factor(less):
             return place
