@@ -50,7 +50,7 @@ class Digest:
 
     def __init__(self) -> None:
         self.hash = hashlib.sha256(f"{FORM} {np.__version__}".encode())
-        self.names: set[str] = set()  # of globals and attributes in the code that is being looked at
+        self.names: set[str] = set()  # of attributes that the code being looked at, or its helpers, may take of modules
         self.seen: dict[tuple[int, str], int] = {}  # and in which order
         self.helpers: list[Any] = []  # that were followed, each after those that it names
 
@@ -87,7 +87,7 @@ class Digest:
         self.add([function.__code__, function.__defaults__, function.__kwdefaults__])
         if enclosed:
             self.add(enclosed_by(function))
-        for name in sorted(self.names & set(function.__globals__)):
+        for name in sorted(names_in(function.__code__) & set(function.__globals__)):
             self.add([name, function.__globals__[name]])
         self.names = outer
 
@@ -144,7 +144,7 @@ def names_reached(function: Any, seen: set[int] | None = None) -> set[str]:
     modules = [value for value in values if isinstance(value, types.ModuleType) and not of_library(value.__name__)]
     values += [vars(module)[name] for module in modules for name in names & set(vars(module))]
     helpers = [value for value in values if isinstance(value, Dispatcher) or registered(value)]
-    functions = [getattr(helper, "py_func", helper) for helper in helpers]
+    functions = [getattr(helper, "py_func", helper) for helper in helpers if helper not in _STANDS_FOR]
     return names.union(*(names_reached(each, seen) for each in functions if id(each) not in seen))
 
 
