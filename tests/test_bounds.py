@@ -5,6 +5,7 @@ import types
 import numpy as np
 import pytest
 from numba import njit
+from numba.extending import register_jitable
 
 from tests.problems import pendulum
 from tests.processes import run_python
@@ -249,7 +250,35 @@ def in_a_table_by_a_helper(t, q, v, p, Q):
     Q[0] = looked_up(t) - q[0]
 
 
-@pytest.mark.parametrize("force", [in_a_table, in_a_table_by_a_helper])
+looked_up_there = register_jitable(looked_up.py_func)
+LAWS, LOOKING = (looked_up,), types.ModuleType("looking")
+LOOKING.law = looked_up
+
+
+@njit
+def by_law_of(module, x):
+    return module.law(x)
+
+
+@callback("force")
+def in_a_table_by_what_is_registered(t, q, v, p, Q):
+    Q[0] = looked_up_there(t) - q[0]
+
+
+@callback("force")
+def in_a_table_by_a_tuple(t, q, v, p, Q):
+    Q[0] = LAWS[0](t) - q[0]
+
+
+@callback("force")
+def in_a_table_by_a_module(t, q, v, p, Q):
+    Q[0] = by_law_of(LOOKING, t) - q[0]
+
+
+BY_OTHERS = [in_a_table_by_what_is_registered, in_a_table_by_a_tuple, in_a_table_by_a_module]
+
+
+@pytest.mark.parametrize("force", [in_a_table, in_a_table_by_a_helper, *BY_OTHERS])
 @pytest.mark.parametrize("method", ["auto", "RadauIIA5"])
 def test_a_run_beyond_the_end_of_a_table_is_no_success(force, method):
     system = ConstrainedSystem(n_q=1, n_c=0, mass=of_one, force=force, name="table")

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 from numba import njit
+from numba.extending import register_jitable
 
 from tests.compiled import unit_mass
 from twoloop import ConstrainedSystem, Integrator, callback, consistent_state, consistent_states, ensemble, solve_dae
@@ -52,6 +53,16 @@ of_law = heavy
 @njit
 def of_global(t):
     return GRAVITY + 0.0 * t
+
+
+@register_jitable
+def registered(t):
+    return GRAVITY + 0.0 * t
+
+
+@njit
+def pull_of(place, t):
+    return place.pull + 0.0 * t
 
 
 def system(pull, compile=True, **more):
@@ -213,6 +224,9 @@ def in_tuples_and_modules(how):
     def set_global_law(value):
         globals()["of_law"] = heavy if value == 9.81 else light
 
+    def set_gravity(value):
+        globals()["GRAVITY"] = value
+
     def set_law_of_module(value):
         mall.helper = heavy if value == 9.81 else light
 
@@ -231,6 +245,8 @@ def in_tuples_and_modules(how):
         "its array": (lambda t: store.table[0] + 0.0 * t, fill(shop.table), r"store\.table"),
         "its helper in a cell": (lambda t: center.shop.helper(t), set_pull, r"shop\.pull"),
         "inner function": (within, set_pull, r"store\.pull"),
+        "module as an argument": (lambda t: pull_of(shop, t), set_pull, r"shop\.pull"),
+        "register_jitable": (lambda t: registered(t), set_gravity, "GRAVITY"),
         "other helper": (lambda t: of_law(t), set_global_law, "of_law"),
         "other helper in a cell": (lambda t: law(t), rebind, "law"),
         "other helper in a module": (lambda t: mall.helper(t), set_law_of_module, r"mall\.helper"),
@@ -241,6 +257,7 @@ PLACES = [
     *("tuple", "nested tuple", "named tuple", "tuple as default", "record", "helper in a tuple"),
     *("module in a module", "its table", "its helper", "module by another name"),
     *("module in a cell", "its array", "its helper in a cell", "inner function"),
+    *("module as an argument", "register_jitable"),
     *("other helper", "other helper in a cell", "other helper in a module"),
 ]
 
@@ -324,6 +341,7 @@ PROCESS = """
 import sys, types
 import numpy as np
 from numba import njit
+from numba.extending import register_jitable
 from twoloop import callback
 
 g = float(sys.argv[1])
@@ -340,6 +358,14 @@ def light(t):
 def of_g(t):
     return g + 0.0 * t
 
+@register_jitable
+def registered(t):
+    return g + 0.0 * t
+
+@njit
+def pull_of(place, t):
+    return place.pull + 0.0 * t
+
 def made(how):
     shop = types.ModuleType("shop")
     shop.pull, tables = g, ((np.array([g]),), 1.0)
@@ -352,6 +378,10 @@ def made(how):
         Q[0] = -laws[2](t) + 0.0 * heavy(t) + 0.0 * light(t)
     def of_helper(t, q, v, p, Q):
         Q[0] = -of_g(t)
+    def of_registered(t, q, v, p, Q):
+        Q[0] = -registered(t)
+    def module_as_argument(t, q, v, p, Q):
+        Q[0] = -pull_of(shop, t)
     return callback("force")(locals()[how])
 
 def values(how):
@@ -359,11 +389,11 @@ def values(how):
     function(0.0, np.zeros(1), np.zeros(1), np.zeros(0), Q)
     return -Q[0]
 
-hows = "in_module", "in_tuple", "again", "of_helper"
+hows = "in_module", "in_tuple", "again", "of_helper", "of_registered", "module_as_argument"
 print(*map(values, hows))
 if g == 9.81:
     g = 5.0  # a helper that numba has compiled by now
-    print(values("of_helper"))
+    print(values("of_helper"), values("of_registered"))
 """
 
 
@@ -374,4 +404,4 @@ def test_machine_code_on_disk_is_that_of_the_same_values(tmp_path):
         command = [sys.executable, "-W", "ignore", str(script), g]
         done = subprocess.run(command, capture_output=True, text=True, check=True)
         found.append([float(each) for each in done.stdout.split()])
-    assert found == [[9.81] * 4 + [5.0], [4.0] * 4, [5.0, 5.0, 4.0, 5.0]]
+    assert found == [[9.81] * 6 + [5.0] * 2, [4.0] * 6, [5.0, 5.0, 4.0, 5.0, 5.0, 5.0]]

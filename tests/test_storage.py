@@ -81,6 +81,23 @@ def test_a_run_that_an_event_ended(default_four_bar, tmp_path):
         again.sol(result.t[-1] + 1e-6)
 
 
+def test_what_ends_alone_serve_best_is_read_back(tmp_path):
+    """No steps divide an interval before a force that has no value from there on."""
+    falling = twoloop.ConstrainedSystem.from_python(
+        n_q=2,
+        n_c=1,
+        mass=np.eye(2),
+        force=lambda t, q, v: np.array([np.nan if t > 1.0 else 0.0, -9.81]),
+        constraint=lambda t, q: np.array([0.5 * (q @ q - 1.0)]),
+    )
+    result = twoloop.solve_dae(falling, (0.0, 3.0), [1.0, 0.0], [0.0, 0.0], dense_output=True)
+    assert result.status is Status.NOT_FINITE
+    result.save(tmp_path / "run.npz")
+    again = twoloop.load(tmp_path / "run.npz", falling)
+    t = np.linspace(0.9, result.t[-1], 20)
+    assert (again.sol(t).q == result.sol(t).q).all()
+
+
 def test_failures_and_what_foreign_solvers_do_not_tell(tmp_path):
     swing(max_steps=3).save(tmp_path / "failed.npz")
     assert twoloop.load(tmp_path / "failed.npz").status is Status.MAX_STEPS

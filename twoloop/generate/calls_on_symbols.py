@@ -71,7 +71,8 @@ def as_forms(graph: Graph, made: Any) -> Any:
 class _Traced(Rewritten):
     """Copies of callbacks with the mathematics of forms in the place of `math` and `numpy`."""
 
-    functions = (Dispatcher, types.FunctionType)
+    def copies(self, value: Any) -> bool:
+        return isinstance(value, Dispatcher | types.FunctionType)
 
     def callback(self, function: Any) -> Any:
         """A callback that may be an object with a method to call it."""

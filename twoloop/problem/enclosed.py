@@ -9,7 +9,7 @@ import numpy as np
 
 from twoloop.checks.arguments import shown
 from twoloop.kernels.compile.dependencies import CannotBeWatched, Digest
-from twoloop.kernels.compile.frozen import found_by
+from twoloop.kernels.compile.frozen import found_by, python_function
 from twoloop.kernels.compile.private import Dispatcher
 
 
@@ -74,12 +74,12 @@ def _differ(one: Any, other: Any) -> bool:
     if isinstance(one, tuple) and isinstance(other, tuple):
         fields = getattr(one, "_fields", None) != getattr(other, "_fields", None)
         return fields or len(one) != len(other) or any(map(_differ, one, other))
-    if isinstance(one, Dispatcher) and isinstance(other, Dispatcher):
+    if python_function(one) and python_function(other):
         return _code_of(one) != _code_of(other)
     return not np.array_equal(one, other)
 
 
-def _code_of(helper: Dispatcher) -> str:
+def _code_of(helper: Any) -> str:
     """A digest of a helper, and of all that it names; of one with unknown parts, something that no other has."""
     digest = Digest()
     try:

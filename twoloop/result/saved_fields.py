@@ -19,7 +19,7 @@ OF_EVENTS = ("t_events", "q_events", "v_events")
 KINDS = (intervals.APART, intervals.VELOCITIES, intervals.ACCELERATIONS, intervals.ACROSS)
 LARGEST = 2**63
 ROWS = 1024  # rows of an array checked at a time
-FEWEST = 3  # smallest number of states of an interval with interior states, including its ends
+FEWEST = 2  # smallest number of states that serve an interval in the place of its neighbours: its two ends alone
 
 
 def check_sum(array: NDArray[Any]) -> int:

@@ -24,9 +24,10 @@ from numba.core.caching import FunctionCache, NullCache
 from numba.core.dispatcher import Dispatcher
 from numba.misc.appdirs import AppDirs
 
-from twoloop.kernels.compile.dependencies import CannotBeWatched, Digest, enclosed_by, names_in
+from twoloop.kernels.compile.dependencies import CannotBeWatched, Digest, enclosed_by, names_reached
 from twoloop.kernels.compile.kept_files import Files
 from twoloop.kernels.compile.ownership import make_own, own_folder
+from twoloop.kernels.compile.private import forget_compiled, registered
 
 UNWRITABLE = (
     "twoloop: machine code cannot be kept on disk, so every process compiles again. Set NUMBA_CACHE_DIR to a folder "
@@ -217,7 +218,7 @@ def watch(function: Callable[..., Any]) -> tuple[str, str] | None:
 def _followed(function: Callable[..., Any]) -> tuple[tuple[str, str] | None, list[Any]]:
     """The digests of `watch`, and the helpers that were met, each after those that it names."""
     code, enclosed = Digest(), Digest()
-    enclosed.names = names_in(function.__code__)  # of modules among what it encloses
+    enclosed.names = names_reached(function)  # of modules among what it encloses
     try:
         code.add_function(function, enclosed=False)
         enclosed.add(enclosed_by(function))
@@ -240,7 +241,7 @@ def helper(function: Callable[..., Any]) -> Any:
     return dispatcher
 
 
-_AS_COMPILED: WeakKeyDictionary[Dispatcher, tuple[str, str]] = WeakKeyDictionary()  # what helpers depended on
+_AS_COMPILED: WeakKeyDictionary[Any, tuple[str, str]] = WeakKeyDictionary()  # what helpers depended on
 
 
 def _take_over(helper: Any) -> None:
@@ -249,8 +250,14 @@ def _take_over(helper: Any) -> None:
     Numba's cache does not see what a helper calls in other files. What numba has compiled, or read, it keeps for all
     functions that call it later; it may have done so before the helper came here, unless the signatures were given.
     """
-    watched, known = _followed(helper.py_func)[0], _AS_COMPILED.get(helper)
+    watched, known = _followed(getattr(helper, "py_func", helper))[0], _AS_COMPILED.get(helper)
     changed = known is not None and known != watched
+    if watched is not None:
+        _AS_COMPILED[helper] = watched
+    if registered(helper):
+        if changed or known is None:
+            forget_compiled(helper)
+        return
     if isinstance(helper._cache, FunctionCache) and (changed or not isinstance(helper._cache, _Cache)):
         try:
             helper._cache = NullCache() if watched is None else _Cache(helper.py_func, *watched, "")
@@ -258,5 +265,3 @@ def _take_over(helper: Any) -> None:
             helper._cache = NullCache()
     if helper.overloads and (changed or (known is None and (helper._can_compile or helper.stats.cache_hits))):
         helper.recompile()
-    if watched is not None:
-        _AS_COMPILED[helper] = watched

@@ -12,6 +12,8 @@ import numpy as np
 from numba.core.dispatcher import Dispatcher
 from numba.core.types import Type
 
+from twoloop.kernels.compile.private import options_of, registered
+
 # libraries whose functions are told apart by name; the versions of numba and numpy are compared, too
 LIBRARIES = {*sys.stdlib_module_names, "numpy", "numba", "scipy"}
 
@@ -48,9 +50,9 @@ class Digest:
 
     def __init__(self) -> None:
         self.hash = hashlib.sha256(f"{FORM} {np.__version__}".encode())
-        self.names: set[str] = set()  # of globals and attributes in the code that is being looked at
+        self.names: set[str] = set()  # of attributes that the code being looked at, or its helpers, may take of modules
         self.seen: dict[tuple[int, str], int] = {}  # and in which order
-        self.helpers: list[Dispatcher] = []  # that were followed, each after those that it names
+        self.helpers: list[Any] = []  # that were followed, each after those that it names
 
     def add(self, value: Any) -> None:
         """Add a value."""
@@ -74,28 +76,28 @@ class Digest:
             self.add([value.co_consts, value.co_names, value.co_freevars])
         elif isinstance(value, types.ModuleType):
             self._add_module(value)
-        elif isinstance(value, Dispatcher):
+        elif isinstance(value, Dispatcher) or registered(value):
             self._add_helper(value)
         else:
             self._add_name(value)
 
     def add_function(self, function: Any, enclosed: bool = True) -> None:
         """Add the code of a function, its defaults, and the values of the globals that it names."""
-        outer, self.names = self.names, names_in(function.__code__)
+        outer, self.names = self.names, names_reached(function)
         self.add([function.__code__, function.__defaults__, function.__kwdefaults__])
         if enclosed:
             self.add(enclosed_by(function))
-        for name in sorted(self.names & set(function.__globals__)):
+        for name in sorted(names_in(function.__code__) & set(function.__globals__)):
             self.add([name, function.__globals__[name]])
         self.names = outer
 
-    def _add_helper(self, helper: Dispatcher) -> None:
+    def _add_helper(self, helper: Any) -> None:
         if helper in _STANDS_FOR:
             self.add(_STANDS_FOR[helper])
         elif self._is_new(helper):
             try:
-                self.add(sorted(helper.targetoptions.items()))
-                self.add_function(helper.py_func)
+                self.add(sorted(options_of(helper).items()))
+                self.add_function(getattr(helper, "py_func", helper))
             finally:
                 self.helpers.append(helper)
 
@@ -131,6 +133,19 @@ def names_in(code: types.CodeType) -> set[str]:
     """Names of globals and attributes in a code and the functions within it."""
     inner = [constant for constant in code.co_consts if isinstance(constant, types.CodeType)]
     return set(code.co_names).union(*map(names_in, inner))
+
+
+def names_reached(function: Any, seen: set[int] | None = None) -> set[str]:
+    """Names in a function and in compiled helpers that it names, to which it may pass a module."""
+    seen = set() if seen is None else seen
+    seen.add(id(function))
+    names = names_in(function.__code__)
+    values = [*(function.__globals__[name] for name in names & set(function.__globals__)), *enclosed_by(function)]
+    modules = [value for value in values if isinstance(value, types.ModuleType) and not of_library(value.__name__)]
+    values += [vars(module)[name] for module in modules for name in names & set(vars(module))]
+    helpers = [value for value in values if isinstance(value, Dispatcher) or registered(value)]
+    functions = [getattr(helper, "py_func", helper) for helper in helpers if helper not in _STANDS_FOR]
+    return names.union(*(names_reached(each, seen) for each in functions if id(each) not in seen))
 
 
 def of_library(module: str) -> bool:

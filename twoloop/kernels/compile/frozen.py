@@ -9,9 +9,9 @@ from types import CellType, CodeType, FunctionType, ModuleType
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba.core.dispatcher import Dispatcher
 
-from twoloop.kernels.compile.dependencies import names_in, of_library
+from twoloop.kernels.compile.dependencies import names_reached, of_library
+from twoloop.kernels.compile.private import Dispatcher, registered
 
 OURS = ("twoloop.", "twoloop_equations_")  # our modules, and generated ones: what they name stays as it is
 LOADS_ATTRIBUTE = ("LOAD_ATTR", "LOAD_METHOD")
@@ -84,9 +84,11 @@ def places(function: Any, seen: set[int] | None = None) -> Iterator[Place]:
 
 
 def python_function(value: Any) -> FunctionType | None:
-    """What numba compiled to a helper (by `njit`, `vectorize` or `cfunc`); None of anything else."""
+    """What numba compiles to a helper (by `njit`, `register_jitable`, `vectorize` or `cfunc`); else None."""
     if isinstance(value, Dispatcher):
         return value.py_func  # type: ignore[no-any-return]
+    if isinstance(value, FunctionType):
+        return value if registered(value) else None
     if type(value).__module__.startswith("numba."):
         inner = getattr(value, "__wrapped__", None)
         return inner if isinstance(inner, FunctionType) else None
@@ -117,7 +119,7 @@ def _with_items(place: Place, seen: set[int]) -> Iterator[Place]:
 
 def _named(function: FunctionType) -> Iterator[Place]:
     """Defaults, and the globals and free variables that are loaded, with the attributes that are taken of modules."""
-    code, space, names = function.__code__, function.__globals__, names_in(function.__code__)
+    code, space = function.__code__, function.__globals__
     last = code.co_varnames[: code.co_argcount][::-1]
     for name, value in zip(last, (function.__defaults__ or ())[::-1], strict=False):
         yield Place(None, "", name, value)
@@ -128,13 +130,14 @@ def _named(function: FunctionType) -> Iterator[Place]:
         holder, value = (cells[name], cells[name].cell_contents) if free else (space, space[name])
         place = Place(holder, name, name, value)
         yield place
-        yield from _of_module(place, attributes, names)
+        if isinstance(value, ModuleType) and not of_library(value.__name__):
+            yield from _of_module(place, attributes, names_reached(function))
 
 
 def _of_module(place: Place, attributes: tuple[str, ...], names: set[str]) -> Iterator[Place]:
     """Attributes that are taken of a module of the user, and of modules within it.
 
-    Where the module itself goes elsewhere, as to a local variable, these are all that bear `names`.
+    Where the module itself goes elsewhere, as to a local variable or to a helper, these are all that bear `names`.
     """
     if not isinstance(place.value, ModuleType) or of_library(place.value.__name__):
         return

@@ -7,15 +7,15 @@ constant indices and counters of loops do, the first call shows, and they are le
 import ast
 import inspect
 import textwrap
-import types
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 from numba import jit
 
 from twoloop.kernels.compile.caches import named_apart, watch
-from twoloop.kernels.compile.dependencies import enclosed_by, names_in, of_library
-from twoloop.kernels.compile.private import Dispatcher
+from twoloop.kernels.compile.dependencies import of_library
+from twoloop.kernels.compile.frozen import places, python_function
+from twoloop.kernels.compile.private import options_of
 from twoloop.kernels.compile.rewritten import Rewritten
 
 WATCHED = {"boundscheck": True}  # for numba
@@ -25,30 +25,19 @@ SAFE_CALLS = ("len", "min", "max", "abs", "range", "enumerate", "zip", "reversed
 
 def with_bounds_watched(function: Callable[..., Any]) -> tuple[Callable[..., Any], dict[str, Any]]:
     """A function, or its copy with helpers whose bounds are watched, and options that numba needs for it."""
-    if any(computes_indices(helper.py_func) for helper in _helpers(function, set())):
+    helpers = [helper for place in places(function) if (helper := python_function(place.value)) is not None]
+    if any(map(computes_indices, helpers)):
         return Rewritten(_watched).copy_of(function), WATCHED
     return function, WATCHED if computes_indices(function) else {}
 
 
 def _watched(copy: Any, original: Any) -> Any:
     """What stands in the place of a compiled helper, with the options that it had; the function itself is no helper."""
-    if not isinstance(original, Dispatcher):
+    helper = python_function(original)
+    if helper is None:
         return copy
-    copy.__qualname__ = f"{original.py_func.__qualname__}.watched"  # numba's symbols are made of it
-    return jit(**{**original.targetoptions, **WATCHED})(named_apart(copy, watch(original.py_func)))
-
-
-def _helpers(function: Callable[..., Any], seen: set[int]) -> Iterator[Dispatcher]:
-    """Compiled helpers that a function names or encloses, and theirs."""
-    names = names_in(function.__code__)
-    named = [value for name, value in function.__globals__.items() if name in names]
-    modules = [value for value in named if isinstance(value, types.ModuleType) and not of_library(value.__name__)]
-    within = [value for module in modules for name, value in vars(module).items() if name in names]
-    for value in (*named, *within, *enclosed_by(function)):
-        if isinstance(value, Dispatcher) and id(value) not in seen:
-            seen.add(id(value))
-            yield value
-            yield from _helpers(value.py_func, seen)
+    copy.__qualname__ = f"{helper.__qualname__}.watched"  # numba's symbols are made of it
+    return jit(**{**options_of(original), **WATCHED})(named_apart(copy, watch(helper)))
 
 
 def computes_indices(function: Callable[..., Any]) -> bool:

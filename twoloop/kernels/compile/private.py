@@ -1,12 +1,32 @@
 """What of numba's private parts is used where code is generated; other modules take it from here."""
 
 from copy import copy
+from types import FunctionType
 from typing import Any
 
 from numba.core import cgutils
 from numba.core.dispatcher import Dispatcher
+from numba.core.registry import cpu_target
 
-__all__ = ["Dispatcher", "also_for", "cgutils"]
+__all__ = ["Dispatcher", "also_for", "cgutils", "forget_compiled", "options_of", "registered"]
+
+
+def registered(function: Any) -> list[Any]:
+    """What numba keeps of a function made by `register_jitable`, which it compiles anew in functions that call it.
+
+    Nothing of any other function.
+    """
+    context: Any = cpu_target.typing_context
+    if not isinstance(function, FunctionType):
+        return []
+    context.refresh()  # what was registered since numba last compiled
+    try:
+        templates = list(getattr(context.resolve_value_type(function), "templates", ()))
+    except ValueError:  # numba does not know it
+        return []
+    sources = [getattr(getattr(each, "_overload_func", None), "__closure__", None) for each in templates]
+    own = [any(cell.cell_contents is function for cell in source or ()) for source in sources]
+    return templates if all(own) else []  # another implementation may stand in its place
 
 
 def also_for(function: Dispatcher, signature: Any) -> None:
@@ -18,3 +38,14 @@ def also_for(function: Dispatcher, signature: Any) -> None:
     described = copy(compiled.fndesc)  # for compiled functions that call it
     described.argtypes = signature.args
     own.targetctx.insert_user_function(compiled.entry_point, described, [compiled.library])
+
+
+def options_of(helper: Any) -> dict[str, Any]:
+    """Numba's options of a compiled helper, or of a function made by `register_jitable`."""
+    return helper.targetoptions if isinstance(helper, Dispatcher) else registered(helper)[0]._jit_options
+
+
+def forget_compiled(function: Any) -> None:
+    """Have numba compile a function made by `register_jitable` again where it is called next."""
+    for template in registered(function):
+        template._impl_cache.clear()

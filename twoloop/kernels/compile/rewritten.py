@@ -4,14 +4,12 @@ import types
 from collections.abc import Callable
 from typing import Any
 
-from twoloop.kernels.compile.dependencies import names_in, of_library
-from twoloop.kernels.compile.private import Dispatcher
+from twoloop.kernels.compile.dependencies import names_in, names_reached, of_library
+from twoloop.kernels.compile.private import Dispatcher, registered
 
 
 class Rewritten:
     """Copies of functions with other ones in the place of the compiled helpers that they name or enclose."""
-
-    functions: tuple[type, ...] = (Dispatcher,)  # what is copied
 
     # wrap(copy, original) -> what stands in the place of the original
     def __init__(self, wrap: Callable[[types.FunctionType, Any], Any]):
@@ -19,8 +17,8 @@ class Rewritten:
         self.known: dict[Any, Any] = {}
 
     def value(self, value: Any, names: frozenset[str] = frozenset()) -> Any:
-        """What stands in the place of a value; `names` are those in the code that names it."""
-        if isinstance(value, self.functions):
+        """What stands in the place of a value; `names` are those that may be taken of a module."""
+        if self.copies(value):
             if id(value) not in self.known:
                 self._rewrite(value)
             return self.known[id(value)]
@@ -29,6 +27,10 @@ class Rewritten:
         if isinstance(value, types.ModuleType) and not of_library(value.__name__):
             return self._module(value, names)
         return value
+
+    def copies(self, value: Any) -> bool:
+        """Whether a value is a function that is copied."""
+        return isinstance(value, Dispatcher) or bool(registered(value))
 
     def _module(self, module: types.ModuleType, names: frozenset[str]) -> types.ModuleType:
         """A copy of a module with other functions in the place of those of these names."""
@@ -46,13 +48,13 @@ class Rewritten:
 
     def _rewrite(self, helper: Any) -> None:
         function = getattr(helper, "py_func", helper)
-        names = frozenset(names_in(function.__code__))
+        own, names = names_in(function.__code__), frozenset(names_reached(function))
         cells = tuple(types.CellType() for _ in function.__closure__ or ())
         own_globals = dict(function.__globals__)
         copy = types.FunctionType(function.__code__, own_globals, function.__name__, function.__defaults__, cells)
         copy.__kwdefaults__, copy.__qualname__ = function.__kwdefaults__, function.__qualname__
         self.known[id(helper)] = self.wrap(copy, helper)  # before what it names, which may be itself
-        for name in names & set(own_globals):
+        for name in own & set(own_globals):
             own_globals[name] = self.value(own_globals[name], names)
         if function.__defaults__ is not None:
             copy.__defaults__ = self.value(function.__defaults__, names)
