@@ -1,7 +1,7 @@
 """Compiled functions keep the numbers that they enclose: a change of these is refused, not ignored."""
 
 import math
-import subprocess
+import runpy
 import sys
 import types
 from typing import NamedTuple
@@ -243,11 +243,12 @@ PLACES = [
     *("module in a cell", "its array", "its helper in a cell", "inner function"),
     *("other helper", "other helper in a cell", "other helper in a module"),
 ]
+# the same walk looks at what from_python compiles, of which every system has four functions: of each kind of place one
+BY_PYTHON = [(how, "compile=True") for how in ("tuple as default", "its table", "other helper in a cell")]
 
 
 @pytest.mark.filterwarnings("ignore:First-class function type feature is experimental")
-@pytest.mark.parametrize("made", ["compile=True", "callback"])
-@pytest.mark.parametrize("how", PLACES)
+@pytest.mark.parametrize(("how", "made"), [*((how, "callback") for how in PLACES), *BY_PYTHON])
 def test_what_is_in_tuples_modules_and_helpers_is_looked_at(how, made):
     function, change, name = in_tuples_and_modules(how)
     pull = njit(function)
@@ -320,7 +321,7 @@ def test_names_that_lead_back_to_themselves_and_long_tuples_end():
     assert {"loop", "loop[0]", "loop[2]", "many", "back", "back.other"} <= set(names) and len(names) < 20
 
 
-PROCESS = """
+SCRIPT = """
 import sys, types
 import numpy as np
 from numba import njit
@@ -367,11 +368,12 @@ if g == 9.81:
 """
 
 
-def test_machine_code_on_disk_is_that_of_the_same_values(tmp_path):
-    script, found = tmp_path / "script.py", []
-    script.write_text(PROCESS)
-    for g in ("9.81", "4.0", "5.0"):
-        command = [sys.executable, "-W", "ignore", str(script), g]
-        done = subprocess.run(command, capture_output=True, text=True, check=True)
-        found.append([float(each) for each in done.stdout.split()])
-    assert found == [[9.81] * 4 + [5.0], [4.0] * 4, [5.0, 5.0, 4.0, 5.0]]
+@pytest.mark.filterwarnings("ignore:First-class function type feature is experimental")
+def test_machine_code_on_disk_is_that_of_the_same_values(tmp_path, monkeypatch, capsys):
+    """Each run of the script makes all functions anew, as a process does: only the disk knows of those before."""
+    script = tmp_path / "script.py"
+    script.write_text(SCRIPT)
+    for g, values in (("9.81", [9.81] * 4 + [5.0]), ("4.0", [4.0] * 4), ("5.0", [5.0, 5.0, 4.0, 5.0])):
+        monkeypatch.setattr(sys, "argv", [str(script), g])
+        runpy.run_path(str(script), run_name="script")
+        assert [float(each) for each in capsys.readouterr().out.split()] == values

@@ -67,7 +67,8 @@ def test_a_cart_with_a_pendulum(spatial):
     else:
         problem.v0[:3], problem.v0[7:10] = (1.0, 0.0, 0.0), (1.0 + 0.4 * 2.0, 0.3 * 2.0, 0.0)
     run = problem.system, problem.t_span, problem.q0, problem.v0, "DOP853"
-    result = solve_dae(*run, rtol=1e-10, atol=1e-10, t_eval=TIMES)
+    # machine code of the plane's law is made as that of space would be, which is four times as long
+    result = solve_dae(*run, rtol=1e-10, atol=1e-10, t_eval=TIMES, compiled=False if spatial else "auto")
     assert result.success, result.message
     x, a, *_ = by_hand(push=0.4)
     np.testing.assert_allclose(result.q[0], x, atol=1e-9)
