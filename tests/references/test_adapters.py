@@ -14,7 +14,7 @@ from references.exudyn.run import SOLVERS
 from references.paper.gear import solve_gear
 from references.scipy.index1 import solve_index1
 from tests.problems import pendulum
-from tests.references.adapters import ADAPTERS, ANY_CALLBACK, COMPILES, each, start
+from tests.references.adapters import ADAPTERS, ALIKE, ANY_CALLBACK, COMPILES, each, start
 from twoloop import ConstrainedSystem
 from twoloop.mechanisms import double_pendulum, four_bar, knife_edge, rolling_disc, very_flexible_beam
 from twoloop.run.record import Status
@@ -25,12 +25,6 @@ KNOWN = MAKERS["double_pendulum"]().reference  # its motion
 LONG = 1e6  # s of motion: none of the solvers is there within the limits below
 MOST = 20.0  # s: far above what a run with a limit needs, far below what the run would take
 TIMES = np.linspace(0.0, 2.0, 201)
-# solvers that others of the same adapter stand for: another formula, told by an option
-ALIKE = {
-    *("RK45, index 1", "RK45, projected", "LSODA, index 1", "BDF, index 1", "BDF, solve_dae", "Radau9, solve_dae"),
-    *("CyRK, Vern8", "CyRK, BDF", "CyRK, LSODA", "CVODES, CasADi, Adams", "IDA from C, q and v tested"),
-    *("IDA from C, order 2, positions tested", "CVODE from C, BDF", "IDA, index1"),
-}
 
 
 # --- right, and measured
