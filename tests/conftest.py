@@ -55,6 +55,12 @@ def collinear_four_bar():
 
 
 @pytest.fixture
+def collected_alone():
+    """A collection of cycles looks at what the test makes: of all else a worker has, it takes seconds."""
+    gc.freeze()
+
+
+@pytest.fixture
 def interruptible():
     """Python's own handler of Ctrl-C, without which shells start jobs in the background."""
     before = signal.signal(signal.SIGINT, signal.default_int_handler)

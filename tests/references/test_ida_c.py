@@ -240,6 +240,7 @@ def allocated():
 
 
 @pytest.mark.skipif(not hasattr(ctypes.CDLL(None), "mallinfo2"), reason="needs glibc")
+@pytest.mark.usefixtures("collected_alone")
 def test_runs_leave_nothing_behind():
     failing, q0, v0 = pendulum(NAN)
 
