@@ -68,22 +68,24 @@ reports: install ## all studies into reports/
 bench: compile ## two commits side by side: make bench BASE=main [HEAD=branch] [ARGS=--short]
 	@$(RUN) -m studies.bench_commits $(BASE) $(if $(HEAD),--head $(HEAD)) $(ARGS)
 
-# the inner loop first, which all others need; then two processes of about equal work, neither of which imports, and so
-# compiles, what the other does: what Newton's matrices and large systems have in common is in one of them. Callbacks are
-# last: each worker of the tests would begin by compiling them
+# the inner loop first, which all kernels need, and beside it the callbacks of bodies, which need no kernel; then two
+# processes of about equal work, neither of which imports, and so compiles, what the other does: what Newton's matrices and
+# large systems have in common, and BDF, are in one of them. What imports callbacks of bodies is last, and the traps, which
+# import all, last of these
 compile: install ## compile the kernels, and the callbacks of bodies, mechanisms and studies, on two cores
-	@$(RUN) -c "from twoloop.kernels.evaluation import calls, own_inner; from twoloop.kernels.control import controller"
-	@$(RUN) -c "from twoloop.kernels.steps import bdf_newton_step, diagonal_step, newton_step; \
+	@$(RUN) -c "from twoloop.bodies import planar_callbacks, planar_programs, spatial_callbacks, spatial_programs" & \
+	$(RUN) -c "from twoloop.kernels.evaluation import calls, own_inner; from twoloop.kernels.control import controller" \
+	&& wait $$!
+	@$(RUN) -c "from twoloop.kernels.steps import bdf_newton_step, bdf_step, diagonal_step, newton_step; \
 	from twoloop.kernels.evaluation import static_inner; from twoloop.kernels.lanes import lane_implicit" & \
 	$(RUN) -c "from twoloop.kernels import advance, agreement, interpolation, short_loops; \
 	from twoloop.kernels.algebra import independent, pivots, scaling; from twoloop.kernels.control import switching; \
 	from twoloop.kernels.evaluation import first_look, traced; \
 	from twoloop.kernels.lanes import lane_dop853, lane_runs, lane_taylor; \
-	from twoloop.kernels.steps import adams_step, bdf_step, bridge, canonical_step, explicit_step, \
+	from twoloop.kernels.steps import adams_step, bridge, canonical_step, explicit_step, \
 	fixed_point_step, newmark_step, taylor_step" && wait $$!
-	@$(RUN) -c "from twoloop.bodies import planar_callbacks, planar_programs, spatial_callbacks, spatial_programs" & \
-	$(RUN) -c "from twoloop.mechanisms import *; from studies.bench import sharp_callbacks; from studies.honesty import traps" \
-	&& wait $$!
+	@$(RUN) -c "from studies.bench import sharp_callbacks" & \
+	$(RUN) -c "from twoloop.mechanisms import *; from studies.honesty import traps" && wait $$!
 
 # files in the order of their names: sorted by how many tests they have, long ones with few tests would come last
 SHARED := -n 2 --dist loadfile --no-loadscope-reorder

@@ -1,6 +1,7 @@
 """The folders of twoloop and the imports between them: for the picture in how_it_is_built.md, and for its test."""
 
 import ast
+from collections.abc import Iterator
 from pathlib import Path
 
 import matplotlib.pyplot as plt
@@ -22,18 +23,22 @@ def _name(path: Path) -> str:
 MODULES = {_name(path): path for path in FOLDER.rglob("*.py")}
 
 
+def _statements(node: ast.AST) -> Iterator[ast.stmt]:
+    """Statements that run, at any depth: expressions have no imports, and are most of a tree."""
+    for kind in ("body", "handlers", "orelse", "finalbody", "cases"):
+        if kind == "body" and isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test):
+            continue
+        for inner in getattr(node, kind, ()):
+            if isinstance(inner, ast.stmt):
+                yield inner
+            yield from _statements(inner)
+
+
 def imports_of(path: Path) -> set[str]:
     """Modules of twoloop that a file imports when it runs, wherever it says so; not those of annotations alone."""
-    tree = ast.parse(path.read_text(encoding="utf-8"))
-    for_types = {
-        id(node)
-        for branch in ast.walk(tree)
-        if isinstance(branch, ast.If) and "TYPE_CHECKING" in ast.unparse(branch.test)
-        for node in ast.walk(branch)
-    }
     found = set()
-    for node in ast.walk(tree):
-        if isinstance(node, ast.ImportFrom) and id(node) not in for_types and f"{node.module}.".startswith("twoloop."):
+    for node in _statements(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.ImportFrom) and f"{node.module}.".startswith("twoloop."):
             package = f"{node.module}.".removeprefix("twoloop.")
             names = (f"{package}{alias.name}" for alias in node.names)
             found |= {name if name in MODULES else package[:-1] for name in names}

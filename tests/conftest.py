@@ -16,9 +16,25 @@ NEED_STUDIES = (
     *("symbolic/test_from_lagrangian.py", "symbolic/test_matrices.py", "test_differential.py"),
     *("test_docs.py", "test_rooms.py"),
 )
+LONG_AND_LATE = {"test_docs.py", "test_results_stay.py", "test_check.py", "test_examples.py"}
 collect_ignore = [] if find_spec("pandas") and find_spec("matplotlib") else list(NEED_STUDIES)
 settings.register_profile("twoloop", deadline=None, derandomize=True, max_examples=25)
 settings.load_profile("twoloop")
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection():
+    """Nothing of what is imported is garbage."""
+    gc.disable()
+    try:
+        return (yield)
+    finally:
+        gc.enable()
+
+
+def pytest_collection_modifyitems(items):
+    """The longest of the files that would come last come first, so that neither of two workers waits for one."""
+    items.sort(key=lambda item: item.path.name not in LONG_AND_LATE)
 
 
 def pytest_collection_finish():
@@ -36,6 +52,12 @@ def default_four_bar():
 @pytest.fixture(scope="session")
 def collinear_four_bar():
     return LINKAGES["collinear"]
+
+
+@pytest.fixture
+def collected_alone():
+    """A collection of cycles looks at what the test makes: of all else a worker has, it takes seconds."""
+    gc.freeze()
 
 
 @pytest.fixture

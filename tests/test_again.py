@@ -93,7 +93,7 @@ def test_states_at_the_ends_are_those_of_the_long_way_to_the_bit(method, at, tak
         assert_same(one, long)
 
 
-@pytest.mark.parametrize(("name", "method"), some_of(NAMES, METHODS))
+@pytest.mark.parametrize(("name", "method"), some_of(NAMES, METHODS, 2))
 @pytest.mark.filterwarnings("ignore::twoloop.ConstraintWarning")
 def test_the_solution_between_the_steps_is_that_of_the_long_way_to_the_bit(name, method, taken, monkeypatch):
     problem, other = getattr(mechanisms, name)(), getattr(mechanisms, name)()

@@ -241,6 +241,7 @@ def test_a_zero_of_high_order_is_found(oscillator):
     assert result.t_events[0] == pytest.approx([4.0], abs=1e-4)
 
 
+@pytest.mark.usefixtures("collected_alone")
 def test_functions_are_checked_once_and_not_held():
     def crossing(t, q, v):
         return q[0]

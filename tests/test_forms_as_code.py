@@ -185,6 +185,7 @@ def test_the_derivative_of_every_operation():
         assert abs(value[0] - (known(0.7 + e) - known(0.7 - e)) / (2.0 * e)) < 1e-9
 
 
+@pytest.mark.usefixtures("collected_alone")
 def test_functions_that_others_call_are_those_they_were_linked_with_and_stay_in_memory():
     def constant(value):
         return OwnFunctions(["number"], object_code(f"define i64 @number() {{ ret i64 {value} }}"))

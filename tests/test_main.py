@@ -1,6 +1,6 @@
 """python -m twoloop: info, compile, solve."""
 
-import subprocess
+import runpy
 import sys
 from pathlib import Path
 
@@ -15,7 +15,6 @@ from twoloop.mechanisms import four_bar
 
 pd = pytest.importorskip("pandas")  # not among the oldest versions
 pytest.importorskip("matplotlib")
-ROOT = Path(__file__).parents[1]
 FILE = """
 from twoloop.mechanisms import four_bar, heavy_top
 import dataclasses
@@ -178,6 +177,7 @@ def test_unknown_commands_and_methods_are_usage_errors(where, capsys):
     assert "invalid choice: 'Guass8'" in capsys.readouterr().err
 
 
-def test_as_a_module():
-    done = subprocess.run([sys.executable, "-m", "twoloop", "info"], cwd=ROOT, capture_output=True, text=True)
-    assert done.returncode == 0 and done.stdout.startswith(f"twoloop {twoloop.__version__}")
+def test_as_a_module(monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["twoloop", "info"])
+    runpy.run_path(str(Path(twoloop.__file__).with_name("__main__.py")), run_name="__main__")
+    assert capsys.readouterr().out.startswith(f"twoloop {twoloop.__version__}")

@@ -2,6 +2,7 @@
 
 import importlib.util
 import sys
+from functools import cache
 from graphlib import TopologicalSorter
 from pathlib import Path
 
@@ -17,14 +18,18 @@ def documentation(name):
 
 
 rooms = documentation("rooms")
-IMPORTS = {module: rooms.imports_of(path) for module, path in rooms.MODULES.items()}
+
+
+@cache
+def imports():
+    return {module: rooms.imports_of(path) for module, path in rooms.MODULES.items()}
 
 
 def test_no_import_goes_upwards():
     level = {room: k for k, room in enumerate((*rooms.ROOMS, ""))}
     upwards = [
         (module, other)
-        for module, others in IMPORTS.items()
+        for module, others in imports().items()
         for other in others
         if level[rooms.room_of(other)] > level[rooms.room_of(module)]
     ]
@@ -32,7 +37,7 @@ def test_no_import_goes_upwards():
 
 
 def test_no_module_imports_itself_by_others():
-    TopologicalSorter(IMPORTS).prepare()
+    TopologicalSorter(imports()).prepare()
 
 
 def test_no_name_stands_twice():

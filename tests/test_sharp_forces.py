@@ -79,13 +79,17 @@ FORCES = {
     "stop": (stop, START),
     "switching": (switching, AT_REST),
 }
-SYSTEMS = {name: pendulum(force) for name, (force, _) in FORCES.items()}
 MISSED = 3e3  # tolerances that an end may be off after 3 s
+
+
+@cache
+def system_of(name):
+    return pendulum(FORCES[name][0])
 
 
 def off(name, **options):
     force, state = FORCES[name]
-    result = solve_dae(SYSTEMS[name], (0.0, T_END), *start_of(state), **options)
+    result = solve_dae(system_of(name), (0.0, T_END), *start_of(state), **options)
     assert result.success, result.message
     return result, np.abs(result.q[:, -1] - reference(force, state)).max()
 

@@ -93,7 +93,11 @@ def pendulum(force, at=1.5, width=WIDTH, compile=True):
 
 
 FORCES = {"gust": gust, "switched": switched, "smooth magnet": smooth_magnet, "quotient": quotient, "cogs": cogs}
-SYSTEMS = {name: pendulum(force) for name, force in FORCES.items()}
+
+
+@cache
+def system_of(name):
+    return pendulum(FORCES[name])
 
 
 @cache
@@ -114,7 +118,7 @@ def end(force, at):
 @pytest.mark.parametrize("options", [{}, {"compiled": False}, {"method": "Adams"}, {"method": "RadauIIA5"}], ids=str)
 def test_no_gust_of_a_thousandth_of_the_run_is_passed_over(options):
     for at in PLACES:
-        system = SYSTEMS["gust"].with_parameters([at, WIDTH])
+        system = system_of("gust").with_parameters([at, WIDTH])
         result = solve_dae(system, (0.0, T_END), *START, rtol=1e-8, atol=1e-8, **options)
         assert result.success and np.abs(result.q[:, -1] - end(gust, at)).max() < 1e-5
 
@@ -122,7 +126,7 @@ def test_no_gust_of_a_thousandth_of_the_run_is_passed_over(options):
 @pytest.mark.parametrize("method", ["auto", "TRBDF2"])
 def test_nor_is_a_force_that_is_switched_on_for_that_time(method):
     for at in PLACES[:4]:
-        system = SYSTEMS["switched"].with_parameters([at, WIDTH])
+        system = system_of("switched").with_parameters([at, WIDTH])
         result = solve_dae(system, (0.0, T_END), *START, method=method, rtol=1e-6, atol=1e-6)
         assert result.success and np.abs(result.q[:, -1] - end(switched, at)).max() < 1e-3
 
@@ -183,7 +187,7 @@ def test_nor_is_a_smooth_force_at_such_a_place(name, factor, options, tolerance)
     """It is passed at 3/s, a width in a two-thousandth of the run or more."""
     for at, width in ((0.1, 5e-3), (0.3, 5e-3), (-0.2, 1e-2), (0.4, 1e-2)):
         width *= factor
-        system, expected = SYSTEMS[name].with_parameters([at, width]), end_behind_a_place(name, at, width)
+        system, expected = system_of(name).with_parameters([at, width]), end_behind_a_place(name, at, width)
         run = (0.0, T_END), START[0], [3.0, 0.0]
         result = solve_dae(system, *run, rtol=tolerance, atol=tolerance, **options)
         assert result.success and np.abs(result.q[:, -1] - expected).max() < 1e3 * tolerance
@@ -222,7 +226,7 @@ def test_a_force_that_raises_where_no_step_comes_is_looked_at_where_steps_begin(
 
 def test_nor_in_lanes():
     runs = ensemble(
-        SYSTEMS["gust"], (0.0, T_END), *START, parameters=[[at, WIDTH] for at in PLACES], rtol=1e-8, atol=1e-8
+        system_of("gust"), (0.0, T_END), *START, parameters=[[at, WIDTH] for at in PLACES], rtol=1e-8, atol=1e-8
     )
     assert runs.success.all()
     for q, at in zip(runs.q[:, :, -1], PLACES, strict=True):
@@ -234,21 +238,23 @@ def test_nor_are_pulses_of_a_high_power_of_a_cosine(tolerance):
     """Between these the force and its series are zero to rounding; each acts for a hundredth of the run."""
     widths = np.linspace(0.04, 0.09, 24)
     given = {"parameters": [[0.1, width] for width in widths], "rtol": tolerance, "atol": tolerance}
-    runs = ensemble(SYSTEMS["cogs"], (0.0, T_END), START[0], [3.0, 0.0], method="Taylor", t_eval=[T_END], **given)
+    runs = ensemble(system_of("cogs"), (0.0, T_END), START[0], [3.0, 0.0], method="Taylor", t_eval=[T_END], **given)
     assert runs.success.all() and (~runs.singly).sum() > 12
     for q, width in zip(runs.q[:, :, -1], widths.tolist(), strict=True):
         assert np.abs(q - end_behind_a_place("cogs", 0.1, width)).max() < 1e3 * tolerance
 
 
 def test_what_may_act_for_a_short_time():
-    assert all(may_be_sudden(each, False).by_time for each in (SYSTEMS["gust"], SYSTEMS["switched"], pendulum(ticking)))
+    assert all(
+        may_be_sudden(each, False).by_time for each in (system_of("gust"), system_of("switched"), pendulum(ticking))
+    )
     smooth = (
         *map(pendulum, (vibrating, steady, broad_quotient, damper, wave)),
         four_bar().system,
         driven_slider_crank().system,
     )
     assert not any(any(may_be_sudden(system, False)) for system in smooth)
-    for system in (*map(SYSTEMS.get, ("smooth magnet", "quotient", "cogs")), *map(pendulum, (teeth, narrow_quotient))):
+    for system in (*map(system_of, ("smooth magnet", "quotient", "cogs")), *map(pendulum, (teeth, narrow_quotient))):
         assert may_be_sudden(system, False) == (False, True)
 
 

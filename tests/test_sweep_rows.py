@@ -301,6 +301,7 @@ def swinging_under(gravity):
     return Problem("swing", pendulum_under(gravity), np.array([-1.0, 0.0]), np.zeros(2), (0.0, 0.01), energy)
 
 
+@pytest.mark.usefixtures("collected_alone")
 def test_what_is_compiled_for_a_run_is_let_go(monkeypatch):
     monkeypatch.setattr("twoloop.kernels.compile.caches.MOST_HELD", 1)
     held, made = [], straight_code.SharedCode

@@ -28,7 +28,7 @@ TINY = 1e-3  # m/s, velocity of the base of the linearised beam: nothing else mo
 STOPPED_AT = (1e-1, 1e-2, 1e-8)  # of TINY: changes at which (32) ends the iteration
 LINEARISED_STEPS = 10  # that must converge
 TRIED = np.geomspace(0.01, 5.0, 80)  # h w_max of single steps
-STATES, STATES_QUICK = 40, 4  # along the motion, from which these are tried
+STATES, STATES_QUICK = 40, 2  # along the motion, from which these are tried
 
 
 def frequencies(problem: Problem) -> Array:

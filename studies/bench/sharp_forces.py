@@ -156,7 +156,7 @@ def between(low: float, high: float) -> Number:
     return lambda g: float(g.uniform(low, high))
 
 
-def log(low: float, high: float, factor: float = 1.0) -> Number:
+def log_uniform(low: float, high: float, factor: float = 1.0) -> Number:
     """A number whose logarithm is even, times a factor."""
     return lambda g: factor * float(np.exp(g.uniform(np.log(low), np.log(high))))
 
@@ -184,26 +184,28 @@ def at_zeros(b: float, c: float) -> dict[str, Any]:
 def noise(name: str, g: np.random.Generator) -> Sharp:
     """Random values, and lines between them."""
     b = 0.05
-    force = made(name, 8, (log(3.0, 20.0)(g), b), breaks=tuple(b * np.arange(1, N_TABLE - 4)))
+    force = made(name, 8, (log_uniform(3.0, 20.0)(g), b), breaks=tuple(b * np.arange(1, N_TABLE - 4)))
     force.parameters[TABLE:] = g.standard_normal(N_TABLE)
     return force
 
 
 def gust(width: float) -> Callable[..., Sharp]:
     """draw(name, generator) of a gust of about this width (s) at a random time."""
-    size = log(5.0, 50.0, (0.03 / width) ** 0.5)
-    return family(3, about(), c=between(0.3, 2.3), b=log(0.7, 1.4, width), a=size)
+    size = log_uniform(5.0, 50.0, (0.03 / width) ** 0.5)
+    return family(3, about(), c=between(0.3, 2.3), b=log_uniform(0.7, 1.4, width), a=size)
 
 
 def pulse(duration: float) -> Callable[..., Sharp]:
     """draw(name, generator) of a force that is constant for about this time (s), from a random time on."""
-    size = log(5.0, 50.0, (0.03 / duration) ** 0.5)
-    return family(13, lambda b, c: {"breaks": (c, c + b)}, c=between(0.3, 2.3), b=log(0.7, 1.4, duration), a=size)
+    size = log_uniform(5.0, 50.0, (0.03 / duration) ** 0.5)
+    return family(
+        13, lambda b, c: {"breaks": (c, c + b)}, c=between(0.3, 2.3), b=log_uniform(0.7, 1.4, duration), a=size
+    )
 
 
 def families() -> dict[str, Draw]:
     """Name to draw(generator), which returns a force of that family with random numbers."""
-    when, size = between(0.3, 2.3), log(5.0, 50.0)
+    when, size = between(0.3, 2.3), log_uniform(5.0, 50.0)
 
     def jumps(b: float, c: float) -> dict[str, Any]:
         return {"breaks": (c,)}
@@ -215,33 +217,48 @@ def families() -> dict[str, Draw]:
         return {"follows_x": True}
 
     found = {
-        "drag": family(1, a=log(0.05, 1.0)),
-        **{f"tanh friction, width {b:g}": family(2, a=log(0.5, 5.0), b=log(0.7, 1.4, b)) for b in FRICTIONS},
+        "drag": family(1, a=log_uniform(0.05, 1.0)),
+        **{
+            f"tanh friction, width {b:g}": family(2, a=log_uniform(0.5, 5.0), b=log_uniform(0.7, 1.4, b))
+            for b in FRICTIONS
+        },
         **{f"gust of {1e3 * b:g} ms": gust(b) for b in GUSTS},
-        "softplus stop": family(4, in_x, a=log(200.0, 5000.0), b=log(0.002, 0.05), c=between(-0.3, 0.4)),
-        "chirp": family(5, whole, a=log(3.0, 30.0), b=log(3.0, 60.0)),
-        "switching drive": family(6, whole, a=log(2.0, 20.0), b=log(5.0, 40.0), c=log(10.0, 200.0)),
-        "square wave": family(7, at_zeros, b=log(2.0, 30.0), a=log(2.0, 20.0)),
+        "softplus stop": family(
+            4, in_x, a=log_uniform(200.0, 5000.0), b=log_uniform(0.002, 0.05), c=between(-0.3, 0.4)
+        ),
+        "chirp": family(5, whole, a=log_uniform(3.0, 30.0), b=log_uniform(3.0, 60.0)),
+        "switching drive": family(
+            6, whole, a=log_uniform(2.0, 20.0), b=log_uniform(5.0, 40.0), c=log_uniform(10.0, 200.0)
+        ),
+        "square wave": family(7, at_zeros, b=log_uniform(2.0, 30.0), a=log_uniform(2.0, 20.0)),
         "noise by interpolation": noise,
-        "brake": family(10, about(9.0, 0.6), b=log(0.003, 0.1), c=when, a=log(1.0, 10.0), d=lambda g: 0.02),
-        "Stribeck friction": family(19, a=log(0.5, 3.0), b=log(0.002, 0.05), c=log(0.02, 0.3), d=log(0.5, 3.0)),
-        "stop of power 3/2": family(9, in_x, a=log(500.0, 2e4), b=log(1.0, 2.0), c=between(-0.2, 0.4)),
-        "jump of the force": family(11, jumps, c=when, a=log(3.0, 30.0)),
-        "kinked force": family(12, jumps, c=when, a=log(3.0, 30.0)),
-        "square pulse": family(13, lambda b, c: {"breaks": (c, c + b)}, b=log(0.02, 0.5), c=when, a=size),
-        "fast decay": family(15, lambda b, c: {"windows": ((0.0, 30.0 * b),)}, b=log(3e-4, 0.03), a=log(10.0, 500.0)),
-        "square root of t": family(17, lambda b, c: {"windows": ((0.0, 1e-4), (1e-4, 1e-2))}, a=log(3.0, 30.0)),
-        "wave packet": family(22, about(), c=when, b=log(0.01, 0.1), a=log(10.0, 100.0), d=log(30.0, 300.0)),
-        "Lorentz pulse": family(14, about(20.0), c=when, b=log(0.005, 0.1), a=size),
-        "tanh step": family(16, about(12.0), c=when, b=log(5e-4, 0.1), a=size),
-        "high power of x": family(18, in_x, a=log(10.0, 100.0), b=lambda g: 2.0 * g.integers(5, 33) + 1.0),
-        "magnet": family(20, in_x, a=log(10.0, 100.0), b=log(0.03, 0.2), c=between(-0.4, 0.5)),
-        "backlash": family(24, in_x, a=log(50.0, 2000.0), b=log(0.03, 0.3)),
-        "resonance in v": family(21, a=log(3.0, 60.0), b=log(0.1, 0.5), c=between(-1.5, 1.5)),
-        "spikes": family(23, whole, a=log(5.0, 60.0), b=log(3.0, 10.0), c=log(20.0, 200.0)),
-        "rectified sine": family(25, at_zeros, b=log(2.0, 30.0), a=log(2.0, 20.0)),
-        "drive with a kink": family(1, jumps, True, a=between(0.05, 0.5), b=log(1.0, 2.0), c=when),
-        "drive with a gust": family(2, about(12.0), True, a=between(0.05, 0.5), b=log(0.01, 0.3), c=when),
-        "drive with a step": family(3, about(12.0), True, a=between(0.05, 0.5), b=log(0.01, 0.2), c=when),
+        "brake": family(
+            10, about(9.0, 0.6), b=log_uniform(0.003, 0.1), c=when, a=log_uniform(1.0, 10.0), d=lambda g: 0.02
+        ),
+        "Stribeck friction": family(
+            19, a=log_uniform(0.5, 3.0), b=log_uniform(0.002, 0.05), c=log_uniform(0.02, 0.3), d=log_uniform(0.5, 3.0)
+        ),
+        "stop of power 3/2": family(9, in_x, a=log_uniform(500.0, 2e4), b=log_uniform(1.0, 2.0), c=between(-0.2, 0.4)),
+        "jump of the force": family(11, jumps, c=when, a=log_uniform(3.0, 30.0)),
+        "kinked force": family(12, jumps, c=when, a=log_uniform(3.0, 30.0)),
+        "square pulse": family(13, lambda b, c: {"breaks": (c, c + b)}, b=log_uniform(0.02, 0.5), c=when, a=size),
+        "fast decay": family(
+            15, lambda b, c: {"windows": ((0.0, 30.0 * b),)}, b=log_uniform(3e-4, 0.03), a=log_uniform(10.0, 500.0)
+        ),
+        "square root of t": family(17, lambda b, c: {"windows": ((0.0, 1e-4), (1e-4, 1e-2))}, a=log_uniform(3.0, 30.0)),
+        "wave packet": family(
+            22, about(), c=when, b=log_uniform(0.01, 0.1), a=log_uniform(10.0, 100.0), d=log_uniform(30.0, 300.0)
+        ),
+        "Lorentz pulse": family(14, about(20.0), c=when, b=log_uniform(0.005, 0.1), a=size),
+        "tanh step": family(16, about(12.0), c=when, b=log_uniform(5e-4, 0.1), a=size),
+        "high power of x": family(18, in_x, a=log_uniform(10.0, 100.0), b=lambda g: 2.0 * g.integers(5, 33) + 1.0),
+        "magnet": family(20, in_x, a=log_uniform(10.0, 100.0), b=log_uniform(0.03, 0.2), c=between(-0.4, 0.5)),
+        "backlash": family(24, in_x, a=log_uniform(50.0, 2000.0), b=log_uniform(0.03, 0.3)),
+        "resonance in v": family(21, a=log_uniform(3.0, 60.0), b=log_uniform(0.1, 0.5), c=between(-1.5, 1.5)),
+        "spikes": family(23, whole, a=log_uniform(5.0, 60.0), b=log_uniform(3.0, 10.0), c=log_uniform(20.0, 200.0)),
+        "rectified sine": family(25, at_zeros, b=log_uniform(2.0, 30.0), a=log_uniform(2.0, 20.0)),
+        "drive with a kink": family(1, jumps, True, a=between(0.05, 0.5), b=log_uniform(1.0, 2.0), c=when),
+        "drive with a gust": family(2, about(12.0), True, a=between(0.05, 0.5), b=log_uniform(0.01, 0.3), c=when),
+        "drive with a step": family(3, about(12.0), True, a=between(0.05, 0.5), b=log_uniform(0.01, 0.2), c=when),
     }
     return {name: partial(draw, name) for name, draw in found.items()}

@@ -48,7 +48,7 @@ LONG, QUICK = 10_000.0, 75.0  # s
 FLOOR = 1e-9  # m, rad; the one-coordinate solution after 10,000 s, some thousand periods
 TIME_LIMIT = 300.0  # CPU s
 MOST_STEPS = 30_000_000  # of solvers that count them and do not look at the clock
-NOT_QUICK = (DIFFRAX, CVODES, CVODE_C_PROJECTED)  # compile for seconds
+NOT_QUICK = (DIFFRAX, CVODES, CVODE_C_PROJECTED, CYRK)  # compile for seconds
 GOLDEN = (3.0 - math.sqrt(5.0)) / 2.0  # of a period: far from every fraction of few parts, so no phase is left out
 
 SUN, GAUSS, RADAU, MIDPOINT = "Sun Radau IIB(3)", "Gauss(3)", "Radau IIA(3)", "implicit midpoint"

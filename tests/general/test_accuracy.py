@@ -9,11 +9,21 @@ from tests.mechanisms.make_references import solution
 METHODS = ("Gauss12", "DOP853", "Adams")
 DIGITS = {"Adams": 1e-8}  # its errors are up to a hundred times the tolerance
 CONSERVATIVE = [name for name in REGULAR if mechanism(name).energy is not None]
-both = pytest.mark.parametrize("method", METHODS)
+# by Gauss12 these take seconds each; others in space, of redundant rows and of rows of velocities do not
+LONG = ("spatial slider-crank", "A05 governor", "A04 Bricard", "wobbling disc, redundant")
 
 
-@both
-@pytest.mark.parametrize("name", REGULAR)
+def of_each(names):
+    """Every method with every mechanism."""
+    pairs = [
+        pytest.param(name, method, marks=[pytest.mark.slow] * (method == "Gauss12" and name in LONG))
+        for name in names
+        for method in METHODS
+    ]
+    return pytest.mark.parametrize(("name", "method"), pairs)
+
+
+@of_each(REGULAR)
 def test_nine_digits(name, method):
     m, (result, _) = mechanism(name), run(name, method)
     assert result.success, result.message
@@ -23,8 +33,7 @@ def test_nine_digits(name, method):
     assert relative_error(result.v, v) < 2.0 * DIGITS.get(method, 1e-9)
 
 
-@both
-@pytest.mark.parametrize("name", REGULAR)
+@of_each(REGULAR)
 def test_every_state_is_on_all_rows(name, method):
     """Redundant rows too, though they are left out of the solution."""
     system, (result, _) = mechanism(name).system(), run(name, method)
@@ -33,8 +42,7 @@ def test_every_state_is_on_all_rows(name, method):
         assert np.abs(system.velocity_constraint(t, q, v)).max(initial=0.0) < 1e-9 * max(1.0, np.abs(v).max())
 
 
-@both
-@pytest.mark.parametrize("name", CONSERVATIVE)
+@of_each(CONSERVATIVE)
 def test_energy(name, method):
     m, (result, _) = mechanism(name), run(name, method)
     energies = np.array([m.energy(q, v) for q, v in zip(result.q.T, result.v.T, strict=True)])
@@ -42,8 +50,7 @@ def test_energy(name, method):
     assert np.ptp(energies) < 4e-9 * max(1.0, kinetic)
 
 
-@both
-@pytest.mark.parametrize("name", REGULAR)
+@of_each(REGULAR)
 def test_accelerations_and_multipliers_of_minimum_norm(name, method):
     """Against the pseudoinverse of the whole matrix at the known state; lam is [lam; mu]."""
     m, (result, _) = mechanism(name), run(name, method)
@@ -54,8 +61,7 @@ def test_accelerations_and_multipliers_of_minimum_norm(name, method):
         assert relative_error(result.lam, np.array([lam for _, lam in known]).T) < 1e-7
 
 
-@both
-@pytest.mark.parametrize("name", REGULAR)
+@of_each(REGULAR)
 def test_rank_and_redundant_rows(name, method):
     """What remains without the rows named must be independent, and as many as the rank."""
     m, (result, warned) = mechanism(name), run(name, method)

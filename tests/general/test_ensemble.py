@@ -47,17 +47,17 @@ BRANCHING = {
     ("case", "compiled"), [*((case, False) for case in BRANCHING), ("a branch", True), ("a parameter rounded", True)]
 )
 def test_what_lanes_cannot_see_is_found_and_made_singly(case, compiled):
-    q, v, parameters = drawn(12)
+    q, v, parameters = drawn(8)
     system = system_of(parameters, mass=np.eye(2), force=BRANCHING[case], compile=compiled)
     runs = ensemble(system, (0.0, 1.0), q, v, parameters=parameters)
-    assert runs.success.all() and far_from_single_runs(runs, range(12), system, (0.0, 1.0), q, v, parameters) < 1e-6
+    assert runs.success.all() and far_from_single_runs(runs, range(8), system, (0.0, 1.0), q, v, parameters) < 1e-6
     assert runs.reasons.keys() == set(np.flatnonzero(runs.singly)) and all(runs.reasons.values())
 
 
 @pytest.mark.parametrize("compiled", [False, True])
 def test_one_run_of_many_that_is_unlike_the_others_is_found(compiled):
     """A branch on a parameter, for which there are no formulas, and a parameter that only one run has otherwise."""
-    n_runs, one = 60, 37
+    n_runs, one = 20, 17
     q, v, parameters = drawn(n_runs)
     parameters[:, 0], parameters[:, 2] = 1.0, 9.0
     parameters[one] = 2.0, parameters[one, 1], 20.0

@@ -90,9 +90,7 @@ def falling(angle, friction, t1):
     return t, second.y[:, -1], sign
 
 
-@pytest.mark.parametrize(
-    ("friction", "t1", "slips", "method"), [(0.3, 0.45, -1.0, "RadauIIA9"), (0.5, 0.75, 1.0, "auto")]
-)
+@pytest.mark.parametrize(("friction", "t1", "slips", "method"), [(0.3, 0.45, -1.0, "DOP853"), (0.5, 0.75, 1.0, "auto")])
 def test_a_rod_falls_over_sticks_and_slips(friction, t1, slips, method):
     """Its foot slips backwards on a smooth floor, and forwards on a rough one."""
     known, end, sign = falling(0.3, friction, t1)
@@ -104,9 +102,21 @@ def test_a_rod_falls_over_sticks_and_slips(friction, t1, slips, method):
     np.testing.assert_allclose(result.q[:, -1], q, atol=1e-9)
 
 
-@pytest.mark.parametrize("restitution", [0.0, 0.5])
-@pytest.mark.parametrize("friction", [0.05, pytest.param(0.2, marks=pytest.mark.slow), 2.0])
-@pytest.mark.parametrize("speed", [2.0, -0.1, -3.0])
+# without restitution a motion in contact follows, which takes twenty times as long as the impact
+IMPACTS = [(0.5, friction, speed) for friction in (0.05, 2.0) for speed in (2.0, -0.1, -3.0)]
+IMPACTS += [(0.0, 0.05, 2.0), (0.0, 2.0, -0.1)]
+MORE_IMPACTS = [
+    (e, friction, speed) for e in (0.0, 0.5) for friction in (0.05, 0.2, 2.0) for speed in (2.0, -0.1, -3.0)
+]
+
+
+@pytest.mark.parametrize(
+    ("restitution", "friction", "speed"),
+    [
+        *IMPACTS,
+        *(pytest.param(*each, marks=pytest.mark.slow) for each in MORE_IMPACTS if each not in IMPACTS),
+    ],
+)
 def test_the_impact_of_a_rod(restitution, friction, speed):
     """Two impulses by hand: the end stops along the floor, or slides on and has all of its friction."""
     angle, m, J = 0.6, 2.0, 1.0 / 6.0

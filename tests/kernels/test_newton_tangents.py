@@ -95,8 +95,9 @@ def test_tangents_of_a_system_whose_mass_varies():
     assert runs[1].stats.n_outer < 2 * runs[0].stats.n_outer
 
 
-@pytest.mark.parametrize("banded", [False, True])
-@pytest.mark.parametrize("reaction", [{}, {"reaction_by_q": rod_by_q}], ids=["rod differenced", "rod given"])
+@pytest.mark.parametrize(
+    ("banded", "reaction"), [(False, {}), (True, {"reaction_by_q": rod_by_q})], ids=["rod differenced", "rod given"]
+)
 def test_tangents_replace_differences(monkeypatch, banded, reaction):
     monkeypatch.setattr(workspace_module, "banded_pays", lambda *sizes: banded)
     calls = {"differences": {}, "tangents": {}}

@@ -125,9 +125,12 @@ def check_tip_heights(name, problem, end=2.0):
     return q
 
 
-def test_tip_of_the_very_flexible_beam(flexible):
-    deflection = midpoint_deflection(check_tip_heights("flexible, node", flexible))
-    assert worst(deflection[[0, 2, 4, 6, 9]], [-0.123, -0.042, 0.247, -0.175, -0.155]) < 1e-3
+@pytest.mark.parametrize("end", [1.0, pytest.param(2.0, marks=pytest.mark.slow)])
+def test_tip_of_the_very_flexible_beam(flexible, end):
+    deflection = midpoint_deflection(check_tip_heights("flexible, node", flexible, end))
+    known = np.array([-0.123, -0.042, 0.247, -0.175, -0.155])
+    n = np.count_nonzero(TIMES[[0, 2, 4, 6, 9]] < end + 1e-9)
+    assert worst(deflection[[0, 2, 4, 6, 9][:n]], known[:n]) < 1e-3
 
 
 def test_tip_of_the_moderately_stiff_beam_at_first(stiff):
@@ -170,7 +173,7 @@ def test_two_loop_procedures_reach_the_tip_heights(flexible, method):
 
 
 def test_fine_meshes_start():
-    problem = very_flexible_beam(64)
+    problem = very_flexible_beam(32)
     result = solve_dae(problem.system, (0.0, 1e-5), problem.q0, problem.v0)
     assert result.success and abs(result.q[0, -1] - problem.v0[0] * 1e-5) < 1e-12
     assert violations(problem.system, result)[0] < 1e-14

@@ -40,6 +40,12 @@ ADAPTERS: dict[str, Any] = {
     "GSTIFF": lambda *start, tol=None, **options: solve_gear(*start, 1e-3, 2, **options),
 }
 COMPILES = {"Dopri8, diffrax"}  # for ten seconds
+# solvers that others of the same adapter stand for: another formula, told by an option
+ALIKE = {
+    *("RK45, index 1", "RK45, projected", "LSODA, index 1", "BDF, index 1", "BDF, solve_dae", "Radau9, solve_dae"),
+    *("CyRK, Vern8", "CyRK, BDF", "CyRK, LSODA", "CVODES, CasADi, Adams", "IDA from C, q and v tested"),
+    *("IDA from C, order 2, positions tested", "CVODE from C, BDF", "IDA, index1"),
+}
 # callbacks in Python, too
 ANY_CALLBACK = (*(name for name, line in FOUND.items() if not (line.traces or line.compiled_callbacks)), "GSTIFF")
 

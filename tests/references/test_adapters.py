@@ -14,7 +14,7 @@ from references.exudyn.run import SOLVERS
 from references.paper.gear import solve_gear
 from references.scipy.index1 import solve_index1
 from tests.problems import pendulum
-from tests.references.adapters import ADAPTERS, ANY_CALLBACK, each, start
+from tests.references.adapters import ADAPTERS, ALIKE, ANY_CALLBACK, COMPILES, each, start
 from twoloop import ConstrainedSystem
 from twoloop.mechanisms import double_pendulum, four_bar, knife_edge, rolling_disc, very_flexible_beam
 from twoloop.run.record import Status
@@ -76,7 +76,7 @@ RIGHT_ON_SMALL = {
 
 
 @pytest.mark.parametrize("problem", [SMALL, pytest.param(PROBLEM, marks=pytest.mark.slow)], ids=lambda each: each.name)
-@pytest.mark.parametrize("name", each(of=RIGHT))
+@pytest.mark.parametrize("name", each(of=RIGHT, slow=(ALIKE - {"Radau9, solve_dae"}) | COMPILES))
 def test_a_rival_is_right_and_measured(name, problem):
     result = ADAPTERS[name](*start(problem), tol=1e-6 if name == "heyoka" else 1e-9)
     system, n, end = problem.system, problem.system.n_q, result.q[:, -1].copy()
@@ -96,7 +96,7 @@ def test_a_rival_is_right_and_measured(name, problem):
 AT = [[1.0], [0.0, 0.26, 1.0], [0.5], [0.0, 1.0]]
 
 
-@pytest.mark.parametrize("name", each("collocation, CasADi"))
+@pytest.mark.parametrize("name", each("collocation, CasADi", slow=ALIKE | COMPILES))
 def test_output_is_at_the_times_asked_for(name):
     at, far = start(SMALL, 1.0), 2e-2 if name == "RK45, index 1" else 1e-3
     for times in AT:
@@ -114,7 +114,7 @@ OWN_OUTPUT = ("collocation, CasADi", "Dopri8, diffrax", "GSTIFF", "heyoka")
 OWN_OUTPUT += ("IDAS, CasADi", "CVODES, CasADi", "CVODES, CasADi, Adams")
 
 
-@pytest.mark.parametrize("name", each(*OWN_OUTPUT))
+@pytest.mark.parametrize("name", each(*OWN_OUTPUT, slow=ALIKE | COMPILES))
 def test_output_takes_no_step_and_no_evaluation_of_the_run_that_is_timed(name):
     solve, at = ADAPTERS[name], start(SMALL, 2.0)
     end, many = (solve(*at, tol=1e-7, t_eval=times) for times in ([2.0], TIMES))
@@ -144,7 +144,7 @@ STOPPED = {
 }
 
 
-@pytest.mark.parametrize("name", STOPPED)
+@pytest.mark.parametrize("name", each(of=STOPPED, slow=ALIKE))
 def test_a_run_past_its_time_limit_is_a_row(name):
     STOPPED[name](time_limit=0.02)  # compiles, and imports what SciPy imports late
     for limit in (1e-9, 0.1):
@@ -172,7 +172,7 @@ def test_a_run_past_its_limit_is_not_run_again_to_its_end(name):
     assert result.status is Status.SOLVER_FAILED and "time_limit" in result.message and result.t.size == 0
 
 
-@pytest.mark.parametrize("name", [*ANY_CALLBACK, "IDA from C, stabilised"])
+@pytest.mark.parametrize("name", each(of=[*ANY_CALLBACK, "IDA from C, stabilised"], slow=ALIKE))
 def test_a_limit_that_is_not_reached_changes_nothing(name):
     # more steps than between two looks at the clock, where those are counted
     times = [0.0, 0.25, 1.0]
@@ -238,7 +238,9 @@ NANS += [(name, "gamma") for name in ("DOP853, index 1", "IDA, index1")]
 
 
 @pytest.mark.parametrize("every_step", [True, False])
-@pytest.mark.parametrize(("name", "kind"), NANS)
+@pytest.mark.parametrize(
+    ("name", "kind"), [pytest.param(*pair, marks=[pytest.mark.slow] * (pair[0] in ALIKE)) for pair in NANS]
+)
 def test_a_function_that_becomes_nan_is_a_row(name, kind, every_step, capfd):
     began, more = time.monotonic(), {} if every_step else {"t_eval": np.linspace(0.0, 2.0, 101)}
     result = ADAPTERS[name](late(kind, lambda: np.nan), (0.0, 2.0), [1.0, 0.0], [0.0, 0.0], **more)
@@ -251,7 +253,7 @@ def test_a_function_that_becomes_nan_is_a_row(name, kind, every_step, capfd):
     assert capfd.readouterr().out == ""
 
 
-@pytest.mark.parametrize("name", ANY_CALLBACK)
+@pytest.mark.parametrize("name", each(of=ANY_CALLBACK, slow=ALIKE))
 def test_an_exception_of_a_callback_comes_through(name):
     with pytest.raises(ValueError, match="no force today"):
         ADAPTERS[name](late("force", raising), (0.0, 2.0), [1.0, 0.0], [0.0, 0.0])
@@ -277,7 +279,7 @@ ROLLING = (
     "IDA, stabilised",
 )
 ON_AN_EDGE = ("IDAS, CasADi", "CVODE from C, BDF, projected", "IDA, index1", "Dopri8, diffrax")
-SLOW = (*ROLLING[3:], *ON_AN_EDGE[1:])
+SLOW = (*ROLLING[2:], *ON_AN_EDGE[1:])
 
 
 @pytest.mark.parametrize("name", each(of=(*ROLLING, *ON_AN_EDGE), slow=SLOW))

@@ -81,10 +81,17 @@ def test_diffrax_looks_at_the_clock_before_the_second_run_and_takes_many_steps()
 
 
 # --- mass matrices that are singular without the constraints, as with Euler parameters
-QUICK = ("DOP853, index 1", "DOP853, projected", "Pr9, index 1")
-COMPILING = ("LSODA, index 1", "Radau, index 1", "CVODE, Adams", "IDA from C, stabilised")
+QUICK = ("DOP853, projected",)
+OTHERS = (
+    "DOP853, index 1",
+    "Pr9, index 1",
+    "LSODA, index 1",
+    "Radau, index 1",
+    "CVODE, Adams",
+    "IDA from C, stabilised",
+)
 EULER = ("heavy top", "spatial slider-crank", "spatial four-bar", "A05 governor")
-SLOW = [pytest.param(name, (*QUICK, *COMPILING), marks=pytest.mark.slow) for name in EULER]
+SLOW = [pytest.param(name, (*QUICK, *OTHERS), marks=pytest.mark.slow) for name in EULER]
 
 
 @pytest.mark.parametrize(("name", "solvers"), [("heavy top", QUICK), *SLOW])
@@ -120,10 +127,9 @@ def test_a_step_of_scipy_that_is_timed_makes_no_interpolant(monkeypatch):
 # --- Jacobians
 def test_implicit_solvers_get_the_analytic_jacobian(monkeypatch):
     """Without it as many evaluations more as there are unknowns, for every Jacobian; the motion is the same."""
-    at = start(PENDULUM, 5.0)
+    at = start(PENDULUM, 2.0)
     solvers = {
         "Radau": lambda: solve_index1(*at, "Radau", 1e-7, 1e-7),
-        "BDF": lambda: solve_index1(*at, "BDF", 1e-7, 1e-7),
         "CVODE": lambda: solve_cvode(*at, 1e-7, 1e-7),
     }
     exact = {name: solve() for name, solve in solvers.items()}

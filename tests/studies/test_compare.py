@@ -16,7 +16,7 @@ from twoloop.rows import row_format
 
 CODE, SOLVER = (part.split("```")[0] for part in (ROOT / "docs" / "compare.md").read_text().split("```python\n")[1:])
 PLAIN = CODE.replace("compile=True", "compile=False")  # machine code takes longer to make than all else here
-SOLVERS = ("DOP853 (twoloop)", "DOP853, projected", "Exudyn, GeneralizedAlpha")
+SOLVERS = ("DOP853 (twoloop)", "Exudyn, GeneralizedAlpha")
 
 
 @pytest.fixture

@@ -22,8 +22,8 @@ def few():
 
 
 @pytest.mark.parametrize(
-    "name", [ENSEMBLE, SINGLE, HEYOKA, CYRK, pytest.param(DIFFRAX, marks=pytest.mark.slow)]
-)  # the last compiles for ten seconds
+    "name", [ENSEMBLE, SINGLE, HEYOKA, *(pytest.param(each, marks=pytest.mark.slow) for each in (CYRK, DIFFRAX))]
+)  # CyRK compiles for each linkage, diffrax for ten seconds
 def test_every_way_ends_where_each_linkage_does(name, few, monkeypatch):
     if name in PACKAGES:
         pytest.importorskip(PACKAGES[name])

@@ -24,6 +24,7 @@ WITHOUT_FIGURES = {
 TOLD = {"work_precision": work_precision, **WITHOUT_FIGURES}  # which it quotes
 
 
+@pytest.mark.slow  # reads all rows; test_first_screen.py holds the screen to the committed findings
 def test_every_sentence_of_the_screen_follows_from_the_committed_rows(tmp_path, monkeypatch):
     if not set(TOLD) <= set(index.findings(REPORTS)):
         pytest.skip("reports/ has findings with times of before the whole call: python -m studies all")

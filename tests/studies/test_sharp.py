@@ -4,6 +4,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from studies.bench import sharp_callbacks
 from studies.bench.sharp_forces import DRIVE_A, SIZE, T_END, families, force_along, made
 from studies.bench.sharp_mechanisms import bars, chain, row, slider_crank, slider_in_space
 from studies.bench.sharp_motion import LOOSENESS, RIGHT, SAID, SILENT, Motion, allowed, judged, march, off, positions
@@ -24,6 +25,13 @@ MECHANISMS = {
 
 def known(mechanism):
     return Motion(positions(mechanism, march(mechanism, "DOP853", 1e-10, mechanism.y0)), 0.0, 10.0)
+
+
+def test_their_machine_code_is_kept_on_disk():
+    """What cannot be watched is compiled in every process that imports it, for seconds."""
+    forces = (sharp_callbacks.chain_force, sharp_callbacks.crank_force, sharp_callbacks.row_force)
+    for force in (*forces, sharp_callbacks.slider_force):
+        assert force.stats.cache_path is not None
 
 
 @pytest.mark.parametrize("name", MECHANISMS)
