@@ -398,23 +398,13 @@ if g == 9.81:
 """
 
 
-<<<<<<< HEAD
-def test_machine_code_on_disk_is_that_of_the_same_values(tmp_path):
-    script, found = tmp_path / "script.py", []
-    script.write_text(PROCESS)
-    for g in ("9.81", "4.0", "5.0"):
-        command = [sys.executable, "-W", "ignore", str(script), g]
-        done = subprocess.run(command, capture_output=True, text=True, check=True)
-        found.append([float(each) for each in done.stdout.split()])
-    assert found == [[9.81] * 6 + [5.0] * 2, [4.0] * 6, [5.0, 5.0, 4.0, 5.0, 5.0, 5.0]]
-=======
 @pytest.mark.filterwarnings("ignore:First-class function type feature is experimental")
 def test_machine_code_on_disk_is_that_of_the_same_values(tmp_path, monkeypatch, capsys):
     """Each run of the script makes all functions anew, as a process does: only the disk knows of those before."""
+    numbers = {"9.81": [9.81] * 6 + [5.0] * 2, "4.0": [4.0] * 6, "5.0": [5.0, 5.0, 4.0, 5.0, 5.0, 5.0]}
     script = tmp_path / "script.py"
     script.write_text(SCRIPT)
-    for g, values in (("9.81", [9.81] * 4 + [5.0]), ("4.0", [4.0] * 4), ("5.0", [5.0, 5.0, 4.0, 5.0])):
+    for g, values in numbers.items():
         monkeypatch.setattr(sys, "argv", [str(script), g])
         runpy.run_path(str(script), run_name="script")
         assert [float(each) for each in capsys.readouterr().out.split()] == values
->>>>>>> 5dbaa480fc1daae4efe0fd85013f27884d39fcc7
