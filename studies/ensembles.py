@@ -219,6 +219,8 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
             ours, others = tables.costs_at(medians[own], error), tables.costs_at(medians[~own], error)
             line = {"error": error, **tables.compared({k: c for k, c in ours.items() if k == ENSEMBLE}, others)}
             line["rival"] = min(others, key=lambda name: others[name][0], default=None)
+            if line["verdict"] == "missed" and set(others) == {CYRK}:  # whose fewer runs have a smaller largest error
+                line["verdict"] = "none"
             at.append(line | {"run_s": {name: cost for name, (cost, _) in (ours | others).items()}})
         n_runs, t_end = (own_rows[name].iloc[0] for name in ("n_runs", "t_end"))
         found["cases"].append({"case": case, "n_runs": int(n_runs), "t_end": float(t_end), "at": at})

@@ -1,7 +1,6 @@
 """Why the paper's time over ours is not one factor in Table 3: causes and readings of the text, tested on the rows."""
 
 import math
-from collections.abc import Sequence
 from functools import partial
 from itertools import product
 from typing import Any, Literal
@@ -19,7 +18,6 @@ from twoloop.methods.tableaux import sun_radau_iib
 TOLERANCES = ERR_OUT
 FAMILIES = {"Table 3: IRK": IRK, "Table 3: Newmark": NEWMARK}
 UNEQUAL = 1.2  # times of the same run, largest over least, beyond which they are no result
-GAP = 0.1  # of the median: between groups of times
 FLAT = 1.5  # a cause explains the pattern if the largest ratio over the smallest is at most this
 Reading = Literal["all", "independent"]
 READINGS: dict[Reading, str] = {"all": "all of z", "independent": "y_i only"}  # what criterion (32) is taken over
@@ -55,16 +53,6 @@ def least(run: pd.Series) -> float:
     """Least time of the repetitions of a run, which other processes and the places of arrays have prolonged least."""
     times = run.get("times")
     return float(min(times) if isinstance(times, tuple) and times else run["call_s"])
-
-
-def in_two_groups(times: Sequence[float]) -> bool:
-    """Whether times fall into two groups, of two or more each: farther apart than all within them, and not by noise."""
-    t = np.sort(np.asarray(times, dtype=float))
-    if t.size < 4:
-        return False
-    cut = 2 + int(np.diff(t)[1:-1].argmax())  # the first place of the upper group
-    gap = t[cut] - t[cut - 1]
-    return bool(gap > GAP * np.median(t) and gap > np.ptp(t[:cut]) + np.ptp(t[cut:]))
 
 
 def cells(rows: pd.DataFrame, exchanged: bool = False) -> pd.DataFrame:

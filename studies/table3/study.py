@@ -48,7 +48,6 @@ from studies.table3.causes import (
     UNEQUAL,
     by_repetition,
     causes,
-    in_two_groups,
     least,
     machine,
     printed,
@@ -217,7 +216,6 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     times = [time for own in same["times"] for time in own]  # of all its repetitions, in whatever group
     found["newmark_times"] = [float(min(times)), float(max(times))]
     found["times_unequal"] = found["newmark_times"][1] > UNEQUAL * found["newmark_times"][0]
-    found["newmark_in_two_groups"] = in_two_groups(newmark["times"])
     found["ratio_evaluations"] = newmark["n_evaluations"] / irk["n_evaluations"]
     ratios = _newmark_over_irk(first)
     over = list(chain(*ratios.values()))

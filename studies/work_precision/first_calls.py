@@ -168,6 +168,7 @@ def findings_of(rows: pd.DataFrame) -> list[dict[str, Any]]:
         tol = float(own["tol"].iloc[0])
         line: dict[str, Any] = {"solver": solver, "tol": tol, "error": ERROR, "n": len(own), "pays": [], "never": 0}
         line["first_call_s"] = float(own["first_call_s"].median())
+        line["first_calls"] = [float(own["first_call_s"].min()), float(own["first_call_s"].max())]
         line["call_s"] = float(own["call_s"].median()) if own["call_s"].notna().any() else None
         known = own["elsewhere_s"].astype(float).dropna().tolist() if "elsewhere_s" in own else []
         line["elsewhere_s"] = [min(known), max(known)] if known else None

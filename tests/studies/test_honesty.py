@@ -269,7 +269,7 @@ def test_forces_held_out_are_others_and_counted_apart():
         "`max_step`, here 1.5 ms. " in said(honesty, fine)[1] or "`max_step`, here 1.5 ms.\n" in said(honesty, fine)[1]
     )
     assert found["trust"]["default"]["wrong"] == 0 and found["held_out"]["trust"]["default"]["wrong"] == 1
-    assert "Ours (error): the default, gust, pendulum (1e-9)." in text and "drawn until these two agree" in text
+    assert "Ours (error): the default, gust, pendulum (1e-9)." in text and "until these two agree" in text
 
 
 def test_checks_of_the_input_are_counted_apart():

@@ -19,7 +19,6 @@ from studies.table3.causes import (
     causes,
     cells,
     fit,
-    in_two_groups,
     printed,
 )
 from tests.studies.of_study import GOOD, QuickRun, found_of
@@ -101,9 +100,7 @@ def test_a_partition_too_cheap_to_be_measured_explains_nothing(tmp_path):
 
 def test_ratios_of_times_show_their_scatter():
     slow, fast = (pd.Series({"times": times}) for times in ((1.0, 0.7, 0.9, 0.71), (0.1, 0.1, 0.1, 0.1)))
-    assert by_repetition(slow, fast) == pytest.approx([7.0, 10.0]) and in_two_groups((1.00, 0.72, 0.94, 0.72, 0.93))
-    assert not in_two_groups((1.0, 0.9, 0.8, 0.7, 0.6)) and not in_two_groups((1.0, 1.01, 1.02, 1.01, 1.5))
-    assert not in_two_groups((1.0, 2.0))
+    assert by_repetition(slow, fast) == pytest.approx([7.0, 10.0])
 
 
 @pytest.mark.usefixtures("unsaved")
@@ -201,7 +198,7 @@ def test_the_default_is_called_a_series_where_it_takes_the_steps_of_one():
 
 
 @pytest.mark.usefixtures("unsaved")
-def test_times_that_scatter_with_the_same_counts_give_no_ratio(tmp_path):
+def test_times_that_scatter_with_the_same_counts_give_a_range_of_ratios(tmp_path):
     found = found_of(table3, tmp_path, rows())
     assert not found["times_unequal"] and "times as long, by repetition: " in (tmp_path / "table3.md").read_text()
     made = pd.concat([rows().assign(repeat=k) for k in range(5)]).sort_index(kind="stable").reset_index(drop=True)
@@ -209,6 +206,5 @@ def test_times_that_scatter_with_the_same_counts_give_no_ratio(tmp_path):
     made.loc[slow & made["repeat"].isin((1, 2, 4)), "call_s"] *= 1.3
     found = found_of(table3, tmp_path, made)
     text = (tmp_path / "table3.md").read_text()
-    assert found["times_unequal"] and "fall into two groups with the same counts (5.1 to 6.6 s; Runge" in text
-    assert "by repetition" not in text and "we give no ratio." in text
+    assert found["times_unequal"] and " times as long, by repetition: 6.6 and " in text
     assert "| 6.6 (5.1–6.6)/50.93 |" in text
