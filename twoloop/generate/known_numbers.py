@@ -167,10 +167,7 @@ class Record(Symbolic):
             own = dict(other.powers) if type(other) is Known else {}
             powers |= {place: min(powers[place], own.get(place, 0.0)) for place in sums}
         left = tuple(each for each in powers.items() if each[1])
-        if not left:
-            return number.scale
-        with np.errstate(all="ignore"):
-            return Known(number.scale * self._generic(left), self, number.scale, left)
+        return Known(number.scale * self._generic(left), self, number.scale, left) if left else number.scale
 
     def evaluate(self, numbers: Sequence["Known"], parameters: Array) -> Array:
         """What numbers are for other parameters (n_runs, n_p): (n_runs, len(numbers))."""

@@ -214,7 +214,8 @@ class Form:
         if type(factor) is Known:
             coefficients = self.terms.values() if _equal(self.constant, 0.0) else (*self.terms.values(), self.constant)
             factor = factor.record.divisor(factor, coefficients)
-            inverse = factor**-1.0
+        if type(factor) is Known:
+            inverse = factor.to(-1.0)
             return factor, Form(self.graph, self.constant * inverse, {i: c * inverse for i, c in self.terms.items()})
         return factor, Form(self.graph, self.constant / factor, {i: c / factor for i, c in self.terms.items()})
 
