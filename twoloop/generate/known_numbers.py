@@ -99,7 +99,6 @@ class Record(Symbolic):
         self.atoms: list[Any] = [None] * len(values)
         self.merged: dict[tuple[Powers, Powers], Powers] = {}  # products of two
         self._places: dict[Any, int] = {}
-        self._generic = self.products(np.array(values, dtype=np.float64))
         self.parameters = np.empty(len(values), dtype=object)
         self.parameters[:] = [float(value) for value in values]
         for place in varying:
@@ -156,18 +155,6 @@ class Record(Symbolic):
             return atoms[place]
 
         return product
-
-    def divisor(self, number: "Known", others: Iterable[float]) -> float:
-        """What a number may be divided by with others: of sums, which are zero for some parameters, what all have."""
-        powers = dict(number.powers)
-        sums = [place for place in powers if (made := self.atoms[place]) is not None and made[0] == "sum"]
-        if not sums:
-            return number
-        for other in others:
-            own = dict(other.powers) if type(other) is Known else {}
-            powers |= {place: min(powers[place], own.get(place, 0.0)) for place in sums}
-        left = tuple(each for each in powers.items() if each[1])
-        return Known(number.scale * self._generic(left), self, number.scale, left) if left else number.scale
 
     def evaluate(self, numbers: Sequence["Known"], parameters: Array) -> Array:
         """What numbers are for other parameters (n_runs, n_p): (n_runs, len(numbers))."""

@@ -204,16 +204,13 @@ class Form:
         return Form(self.graph, self.constant * factor, {i: c * factor for i, c in self.terms.items()})
 
     def normalised(self) -> tuple[float, "Form"]:
-        """A factor, and the form over it, whose first coefficient is 1, or a sum of parameters, which may be zero."""
+        """A factor, and the form over it, whose first coefficient is 1."""
         first = min(self.terms)
         factor = self.terms[first]
         if type(factor) is float and factor == 1.0:
             return factor, self
         if len(self.terms) == 1 and _equal(self.constant, 0.0):
             return factor, self.graph.quantity(first)
-        if type(factor) is Known:
-            coefficients = self.terms.values() if _equal(self.constant, 0.0) else (*self.terms.values(), self.constant)
-            factor = factor.record.divisor(factor, coefficients)
         if type(factor) is Known:
             inverse = factor.to(-1.0)
             return factor, Form(self.graph, self.constant * inverse, {i: c * inverse for i, c in self.terms.items()})
