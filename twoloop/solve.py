@@ -3,9 +3,11 @@
 from __future__ import annotations  # ArrayLike stays a word in help()
 
 import os
+import time
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
+from dataclasses import replace
 from operator import is_
 from typing import Any
 
@@ -38,6 +40,7 @@ from twoloop.run.interrupts import Interrupts, not_begun
 from twoloop.run.kept import InMemory, OnDisk
 from twoloop.run.launch import record_again, run_from
 from twoloop.run.recorder import Wanted
+from twoloop.run.short_changes import MOST, closer, may_be_missed
 
 Array = NDArray[np.float64]
 
@@ -108,9 +111,12 @@ def solve_dae(
         there.
     max_step : float
         Largest step, s. "Taylor" evaluates the equations within its steps. All other methods evaluate them only at the
-        ends and stages of steps, and take no step longer than a hundredth of the run. Forces and drives that depend on
-        time are also evaluated every two-thousandth of the run, and steps end where they change suddenly. What acts for
-        a shorter time, or over a shorter distance, may be missed; then give its duration.
+        ends and stages of steps, and take no step longer than a hundredth of the run. Forces and drives that may change
+        suddenly with time are also evaluated every two-thousandth of the run, and at least eight times per step; steps
+        end where they change. A run that meets a change too short for this is made again, up to twice, with more such
+        evaluations. If these are still too few, a `ConstraintWarning` and the message say how long it lasts. What acts
+        for a shorter time, or over a shorter distance, may be missed, if the run meets none of it; then give its
+        duration.
     max_steps : int, optional
         Largest number of accepted steps. None: no limit, but a run ends with the status STAGNATED if the rest would
         take more than 1e7 steps as short as the last and these are a thousand times shorter than before, or more than
@@ -198,11 +204,23 @@ def solve_dae(
         if run.said_of_rows:
             warnings.warn(run.said_of_rows, ConstraintWarning, stacklevel=2)
         with_code = bool(run.plan.own)
-        with _progress_bar(asked.method.name, t0, t1) if progress else NO_BAR as report:
-            lands = run.plan.lands or step_size is not None or at_ends
-            kept = InMemory() if folder is None else begin_folder(folder, system.n_q)
-            wanted = Wanted(times, lands, bool(dense_output), event_functions, kept)
-            record = Course(run, t1, wanted, report, time_limit, interrupts).to_end(check_derivatives)
+        lands = run.plan.lands or step_size is not None or at_ends
+        deadline, spent = None if time_limit is None else time.monotonic() + time_limit, 0.0
+        for left in range(MOST, -1, -1):
+            with _progress_bar(asked.method.name, t0, t1) if progress else NO_BAR as report:
+                kept = InMemory() if folder is None else begin_folder(folder, system.n_q)
+                wanted = Wanted(times, lands, bool(dense_output), event_functions, kept)
+                limit = None if deadline is None else max(0.0, deadline - time.monotonic())
+                last = left == 0 or folder is not None
+                record = Course(run, t1, wanted, report, limit, interrupts, last).to_end(check_derivatives)
+            if last or record.status < 0 or not may_be_missed(run):
+                break
+            spent += record.stats.cpu_time
+            give_back(run.work)
+            every, run = closer(run), run_from(system, t0, t1, q0, v0, asked)
+            run.look_every(every)
+        if spent > 0.0:
+            record = replace(record, stats=replace(record.stats, cpu_time=spent + record.stats.cpu_time))
         give_back(run.work)
         if own is not None:  # Newmark's own test, of positions, has its place
             told |= {"rtol": own, "atol": np.full(system.n_q, own), "untested": np.ones(len(record.h), dtype=bool)}

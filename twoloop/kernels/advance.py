@@ -235,7 +235,8 @@ def advance(
         lands = reaches and goal == target
         if reaches:
             size = goal - t
-        if size > control[at.SPACING] > 0.0 or t < clock[at.SUDDEN] < t + size:
+        may_look = control[at.SPACING] > 0.0 and (control[at.BY_TIME] == 1.0 or size > control[at.SPACING])
+        if (may_look or t < clock[at.SUDDEN] < t + size) and not leaps:
             whole, last = size, outputs[outputs.size - 1]
             size = up_to_sudden(f, w, tolerances, control, clock, t, whole, last, state)
             if size < whole:

@@ -61,8 +61,8 @@ class Result(Record):
     widest_gap : float or None
         Longest time without an evaluation of the equations, s: shorter features may have been missed. It is the
         longest distance between the evaluation points of "Taylor", or the longest step of other methods; at most a
-        hundredth of the run unless the step size is constant. Forces and drives were also sampled as functions of time
-        at every two-thousandth of the run. None for a foreign solver.
+        hundredth of the run unless the step size is constant. Forces and drives that may change suddenly with time
+        were also sampled at every two-thousandth of the run, and eight times per step. None for a foreign solver.
     system : ConstrainedSystem or None
         The system: `reactions` and `plot` evaluate its rows; names, energy and drawing come from its `Problem`. None
         for a foreign solver, for a file read without the system, or for a result from another process if the

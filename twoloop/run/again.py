@@ -34,6 +34,7 @@ from twoloop.run.pace import INTERRUPTED, STAGNATED, Pace
 from twoloop.run.passage import beyond, bridge, bridging_kit, give_way
 from twoloop.run.record import Record, Status
 from twoloop.run.run import Run
+from twoloop.run.short_changes import may_be_missed
 from twoloop.run.stability import Looks, said_of_stiffness
 
 Array = NDArray[np.float64]
@@ -165,7 +166,8 @@ class Again:
         t, rows = self.t[:n_states].copy(), self.rows[:n_states].copy()
         turns = turned and output.times is None and (nearly == 1.0 or not run.plan.watchful)
         special = turns or run.crossings or pivot < run.near
-        if code != a.ALL_OUTPUT_DONE or (special and not self._is_to_be_trusted(t, rows, t1, output, turns)):
+        missed = may_be_missed(run)
+        if code != a.ALL_OUTPUT_DONE or missed or (special and not self._is_to_be_trusted(t, rows, t1, output, turns)):
             self.rest = max(self.rest, IN_VAIN)
             return None
         if run.compared_to[0] < t1 or territory.is_due():

@@ -24,6 +24,7 @@ from twoloop.run.passage import beyond, bridge, bridging_kit, give_way, leap
 from twoloop.run.record import Record, Status, explained
 from twoloop.run.recorder import Recorder, Wanted
 from twoloop.run.run import SHARPER, Run
+from twoloop.run.short_changes import said_of_missed
 from twoloop.run.stability import Looks, said_of_stiffness
 
 Array = NDArray[np.float64]
@@ -54,6 +55,8 @@ class Course:
     time_limit : float or None
         s.
     interrupts : Interrupts
+    last : bool
+        Whether it is not made again, if it may have missed something.
     """
 
     def __init__(
@@ -64,8 +67,9 @@ class Course:
         report: Callable[[float], object],
         time_limit: float | None,
         interrupts: Interrupts,
+        last: bool = True,
     ):
-        self.run, self.t1, self.wanted = run, t1, wanted
+        self.run, self.t1, self.wanted, self.last = run, t1, wanted, last
         self.report, self.interrupts = report, interrupts
         self.deadline = np.inf if time_limit is None else time.monotonic() + time_limit
         self.recorder = self._recorder()
@@ -250,6 +254,8 @@ class Course:
                     self.sample.end(*recorder.last)
                     end = recorder.last[0]
                 status, message = compared(run, self.sample, end, check_derivatives, status, message)
+            if self.last and status >= 0:
+                message += said_of_missed(run)
             if status in EXPLAINED_BY_STIFFNESS:
                 message += said_of_stiffness(self.looks, run.kit, run.work)
         except KeyboardInterrupt:

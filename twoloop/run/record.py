@@ -86,7 +86,8 @@ class Statistics:
     cpu_time : float
         Process time of the integration, s: of the steps, of storing what they give, of events, and of q and v at output
         times between them. Compilation, checks of the input, the workspace, the first accelerations, and a and lam at
-        output times between steps are not included.
+        output times between steps are not included. A run that was made again counts as a whole; counts are those of
+        the last time.
     """
 
     n_accepted: int | None = None

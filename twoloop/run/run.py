@@ -98,7 +98,8 @@ class Run:
         self.substituted = False  # whether another plan has taken over, for good
         self.clock[[clock.JUMP_FROM, clock.JUMP_TO, clock.PIVOT_AT_OUTPUT]] = np.inf
         self.near = nearness(rtol)  # pivots at output times below which velocities are looked at
-        self.clock[[clock.ROUGH_TO, clock.LOOKED_TO, clock.ALONG_TO, clock.SUDDEN]] = -np.inf
+        self.clock[[clock.ROUGH_TO, clock.LOOKED_TO, clock.ALONG_TO, clock.SUDDEN, clock.FLANK]] = -np.inf
+        self.clock[clock.BRIEFEST] = np.inf
         ran_on_symbols = any("force" in each.kinds for each in plan.traced)
         self.sudden = Sudden(False, False) if step_size is not None else may_be_sudden(system, ran_on_symbols)
         self.control[[clock.BY_TIME, clock.BY_STATE]] = self.sudden
@@ -326,14 +327,21 @@ class Run:
     def look_within(self, span: float) -> None:
         """Set how long a run is of which no hundredth is to pass unseen, s."""
         self.gap = tolerances.LONGEST_UNSEEN * span
+        self.apart = self.gap / PLACES
         self.tolerances[tolerances.GAP] = self.gap
         self.tolerances[tolerances.LOOK] = self.gap / (SHARPER if self.sudden.by_state else 1)
+        self.limit_steps()
+
+    def look_every(self, apart: float) -> None:
+        """Look for sudden changes with time at least so often, s."""
+        self.apart = apart
         self.limit_steps()
 
     def limit_steps(self) -> None:
         """Let no step that does not look at the equations between its ends pass over a hundredth of the run."""
         self.control[self.a.MAX_STEP] = self.max_step if self.plan.looks_within else min(self.max_step, self.gap)
         self.control[self.a.SPACING] = self.gap / PLACES if any(self.sudden) else 0.0
+        self.control[self.a.APART] = self.apart
 
     def first_step(self, t: float, span: float, state: Array) -> float:
         """A share of the time in which velocities and accelerations of a state change the coordinates as a whole.

@@ -36,12 +36,13 @@ GO_ON = -1  # nothing of these yet
     DRIVEN,  # 1: C_t or b may jump
     ROUGH,  # by how much an error may be larger than its estimate where a force jumps, see UNFORESEEN
     SPACING,  # s, of times at which to look ahead for sudden changes; 0: there are none
+    APART,  # s, the same of changes with time, which are also looked for ahead of shorter steps
     AHEAD,  # 1: these looks go along the way; 0: they stay at the state, as a callback raised on the way
     BY_TIME,  # 1: they stay there ahead of other steps, too, for what may change suddenly with time
     BY_STATE,  # 1: they go along the way of short steps, too, for what may be sharp by place or speed
     FIRST_GIVEN,  # 1: the first step is the user's, and not a guess that may become longer
     N_CONTROL,
-) = range(N_RULE, N_RULE + 21)
+) = range(N_RULE, N_RULE + 22)
 
 # places in a row of `out_steps`: the size of an accepted step, and the counters so far; JACOBIANS is 0 after an
 # explicit step of a method that switches
@@ -66,9 +67,13 @@ H, ERRORS, FAILURES, PARTITIONS, JACOBIANS, N_STEP_COLUMNS = range(6)
     ROUGH_TO,  # where the last step ended that was refused for a sudden error
     PIVOT_HERE,  # the smallest pivot at the end of the last step, of the static form
     LOOKED_TO,  # up to where changes with time were looked for
+    LOOKED_EVERY,  # s, of the times of the last such look
+    WIDEST_LOOK,  # the widest of these
     SUDDEN,  # where the next one is that is sudden
+    FLANK,  # when a value changed suddenly
+    BRIEFEST,  # s, the shortest time between two such changes
     ALONG_TO,  # up to where they were looked for along the way
     LOOKING,  # 1: while callbacks are called along the way, at states to which the motion may not come
     PIVOT_AT_OUTPUT,  # the smallest pivot where steps had to end: output times, a grid; see least_pivot in partition.py
     N_CLOCK,
-) = range(N_PAST, N_PAST + 22)
+) = range(N_PAST, N_PAST + 26)

@@ -6,6 +6,9 @@ the last; of what happens within one or two of them they are as large. A step is
 not finite, so that the run meets it. Where something may be sharp by place or speed, steps longer than the spacing of
 these times are looked at along the parabola on which the motion sets out: each long one, and at once all short ones
 that end within LONG spacings. Ahead of others the state stays that where the step begins.
+
+Of what may change suddenly with time, these times are also no further apart than a share of the step. The shortest time
+between two changes is kept: what is as short may have been missed where these times were further apart.
 """
 
 import numpy as np
@@ -20,9 +23,16 @@ PLACES = 20  # times ahead that are compared
 LONG = 12.0  # spacings of these times: the shortest way along which it is looked
 SHARE = 0.1  # of the range: a second difference that is sudden; that of a bell as wide as four of these times
 LEAST = 0.1  # of rtol, times the largest value so far: a range that may matter
+IN_A_STEP = 8.0  # looks within a step: stages lie up to a quarter of it apart, and may all miss what is shorter
+SHRUNK = 0.25  # of the distance of the last looks: looks that are to be closer than that are taken again
+LEAST_APART = 16.0  # spacings of floating-point numbers between two looks
+HALVINGS = 20  # to find when a value changes between two looks ...
+SAME = 1e-5  # ... of the widest ones: changes that are closer are one
+STEEPER = 2.0  # times the changes before and after: the flank of a pulse, and not a slope
 NEARLY = 0.01  # of the spacing of these times: before a sudden change by that is at it
 LARGEST = PLACES + 1  # row of w.changes behind those of the values
-N_CHANGES = PLACES + 2
+MIDDLE = PLACES + 2  # row of w.changes for values between two looks
+N_CHANGES = PLACES + 3
 
 
 @compiled
@@ -47,20 +57,64 @@ def _largest(values):
 
 @compiled
 def _first_bend(values, n, slope, least):
-    """The first place where the second difference of n + 1 values, less a line, is sudden; else 0."""
+    """The first place where the second difference of n + 1 values, less a line, is sudden, else 0; and what is so."""
     low = high = 0.0
     for k in range(1, n + 1):
         off = values[k] - values[0] - k * slope
         low, high = min(low, off), max(high, off)
+    sudden = SHARE * (high - low)
     if high - low > least:
         for k in range(1, n):
-            if abs(values[k + 1] - 2.0 * values[k] + values[k - 1]) > SHARE * (high - low):
-                return k
-    return 0
+            if abs(values[k + 1] - 2.0 * values[k] + values[k - 1]) > sudden:
+                return k, sudden
+    return 0, sudden
 
 
 @compiled
-def sudden_time(f, w, tolerances, t, begin, spacing, last, along, q, v, a):
+def _is_flank(previous, one, other, following, sudden):
+    """Whether values change suddenly between one and other, and neither before nor after as if on a slope."""
+    change = other - one
+    sign = 1.0 if change > 0.0 else -1.0
+    beside = max(sign * (one - previous), sign * (following - other))
+    return abs(change) > sudden and STEEPER * beside < abs(change)
+
+
+@compiled
+def _flank(f, w, t, low, high, k, j, q, v, a):
+    """When value j changes, between times low and high at places k and k + 1: just behind it."""
+    changes = w.changes
+    before, after = changes[k, j], changes[k + 1, j]
+    for _ in range(HALVINGS):
+        time = 0.5 * (low + high)
+        _call(f, w, time, 0.0, q, v, a, changes[MIDDLE])
+        now = changes[MIDDLE, j]
+        if abs(now - before) >= abs(after - now):
+            high, after = time, now
+        else:
+            low, before = time, now
+    return high
+
+
+@compiled
+def _keep_flanks(f, w, clock, t, begin, spacing, n, place, column, sudden, q, v, a):
+    """Keep when a value changes next to a place where it bends, and the time since the change before."""
+    values, apart = w.changes[:, column], max(NEARLY * spacing, SAME * clock[at.WIDEST_LOOK])
+    for k in range(place - 1, place + 1):
+        low, high = begin + k * spacing, begin + (k + 1) * spacing
+        known = low - apart <= clock[at.FLANK] <= high + apart
+        if known or k + 2 > n or low - spacing < clock[at.T_START]:  # what is on both sides is to be seen, too
+            continue
+        if k == 0:
+            _call(f, w, low - spacing, 0.0, q, v, a, w.changes[MIDDLE])
+        if _is_flank(values[MIDDLE if k == 0 else k - 1], values[k], values[k + 1], values[k + 2], sudden):
+            time = _flank(f, w, t, low, high, k, column, q, v, a)
+            if clock[at.FLANK] > -np.inf:
+                clock[at.BRIEFEST] = min(clock[at.BRIEFEST], abs(time - clock[at.FLANK]))
+            clock[at.FLANK] = time
+
+
+@compiled
+def sudden_time(f, w, tolerances, clock, t, begin, spacing, last, along, q, v, a):
     """The first of the times ahead at which something changes suddenly, or infinity; and up to where it was looked.
 
     The state is that at t, the times go from `begin`, none is after `last`; `along` tells whether the state goes with
@@ -82,28 +136,54 @@ def sudden_time(f, w, tolerances, t, begin, spacing, last, along, q, v, a):
         n = k
     least = LEAST * tolerances[RTOL]
     of_forces, of_rates = least * _largest(changes[LARGEST, : q.size]), least * _largest(changes[LARGEST, q.size :])
+    bend, column, sudden = n, -1, 0.0
     for j in range(changes.shape[1]):
         values = changes[:, j]
         slope = along * (values[n] - values[0]) / max(n, 1)
-        place = _first_bend(values, n, slope, of_forces if j < q.size else of_rates)
-        if place > 0:
-            first = min(first, begin + place * spacing)
+        place, least = _first_bend(values, n, slope, of_forces if j < q.size else of_rates)
+        if 0 < place < bend:
+            bend, column, sudden = place, j, least
+    if column >= 0:
+        first = min(first, begin + bend * spacing)
+        if along == 0.0:
+            _keep_flanks(f, w, clock, t, begin, spacing, n, bend, column, sudden, q, v, a)
     return first, min(first, begin + PLACES * spacing if n == PLACES else last)
 
 
 @compiled
-def _look_along(f, w, tolerances, clock, spacing, t, size, last, q, v, a):
+def _look_along(f, w, tolerances, control, clock, spacing, t, size, last, q, v, a):
     """Look along the way of a step, and of those behind it that end within LONG spacings, once."""
     if clock[at.ALONG_TO] >= t + (1.0 - NEARLY) * size:
         return
     way = min(max(size, LONG * spacing), last - t)
     clock[at.LOOKING] = 1.0
-    first, clock[at.ALONG_TO] = sudden_time(f, w, tolerances, t, t, way / PLACES, last, 1.0, q, v, a)
+    first, clock[at.ALONG_TO] = sudden_time(f, w, tolerances, clock, t, t, way / PLACES, last, 1.0, q, v, a)
     clock[at.LOOKING] = 0.0
-    if first == np.inf:
-        clock[at.LOOKED_TO] = max(clock[at.LOOKED_TO], t + way)
-    elif first < clock[at.SUDDEN] or clock[at.SUDDEN] <= t + NEARLY * spacing:
-        clock[at.SUDDEN] = clock[at.LOOKED_TO] = first
+    if way <= PLACES * min(control[at.APART], size / IN_A_STEP):  # as close as looks in time alone
+        clock[at.LOOKED_TO], clock[at.LOOKED_EVERY] = max(clock[at.LOOKED_TO], min(first, t + way)), way / PLACES
+        clock[at.WIDEST_LOOK] = max(clock[at.WIDEST_LOOK], way / PLACES)
+    if first < clock[at.SUDDEN] or clock[at.SUDDEN] <= t + NEARLY * spacing:
+        clock[at.SUDDEN] = first
+
+
+@compiled
+def _ahead(f, w, tolerances, control, clock, known, t, size, last, q, v, a):
+    """The next sudden change with time ahead of a step, or infinity, where no other is known before that."""
+    every = max(min(control[at.APART], size / IN_A_STEP), LEAST_APART * np.spacing(abs(t)))
+    # a multistep method, whose formula no jump fools, drops its past only where it is refused; and steps find jumps of
+    # C_t and b, if they do not end next to them
+    closer = control[at.ROUGH] > 1.0 and control[at.DRIVEN] == 0.0
+    if closer and every < SHRUNK * clock[at.LOOKED_EVERY]:
+        clock[at.LOOKED_TO] = t
+    begin = max(t, clock[at.LOOKED_TO])
+    at_change = clock[at.SUDDEN] == clock[at.LOOKED_TO]  # which is to be found again
+    while begin < min(t + size, last, known):
+        apart, at_change = min(every, clock[at.LOOKED_EVERY]) if at_change else every, False
+        clock[at.WIDEST_LOOK] = max(clock[at.WIDEST_LOOK], apart)
+        first, begin = sudden_time(f, w, tolerances, clock, t, begin, apart, last, 0.0, q, v, a)
+        known = min(known, first)
+        clock[at.LOOKED_TO], clock[at.LOOKED_EVERY] = begin, apart
+    return known
 
 
 @compiled
@@ -113,10 +193,12 @@ def up_to_sudden(f, w, tolerances, control, clock, t, size, last, state):
     q, v, a = state[:n], state[n : 2 * n], state[2 * n : 3 * n]
     shortest = (1.0 if control[at.BY_STATE] == 1.0 else LONG) * spacing
     if control[at.AHEAD] == 1.0 and shortest < size < (PLACES + NEARLY) * spacing:
-        _look_along(f, w, tolerances, clock, spacing, t, size, last, q, v, a)
-    while clock[at.SUDDEN] <= t + NEARLY * spacing or clock[at.SUDDEN] == np.inf:
-        begin = max(t, clock[at.LOOKED_TO])
-        if control[at.BY_TIME] == 0.0 or begin >= min(t + size, last):
-            return size
-        clock[at.SUDDEN], clock[at.LOOKED_TO] = sudden_time(f, w, tolerances, t, begin, spacing, last, 0.0, q, v, a)
-    return min(size, representable(t, clock[at.SUDDEN] - t))
+        _look_along(f, w, tolerances, control, clock, spacing, t, size, last, q, v, a)
+    known = clock[at.SUDDEN] if clock[at.SUDDEN] > t + NEARLY * min(spacing, size / IN_A_STEP) else np.inf
+    at_change = known == np.inf and clock[at.SUDDEN] == clock[at.LOOKED_TO] > -np.inf
+    if at_change and size <= (1.0 + NEARLY) * clock[at.LOOKED_EVERY]:
+        return size  # up to the end of a run, where looks within shorter and shorter rests would find the change anew
+    if control[at.BY_TIME] == 1.0:
+        known = _ahead(f, w, tolerances, control, clock, known, t, size, last, q, v, a)
+    clock[at.SUDDEN] = known
+    return min(size, representable(t, known - t))

@@ -1,0 +1,114 @@
+"""Pulses of a force, again and again in a long run: none is passed over, or the run says so."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from scipy.linalg import expm
+
+import twoloop.solve
+from tests import problems
+from twoloop import ConstrainedSystem, ConstraintWarning, Status, solve_dae
+
+MASS, STIFFNESS, DAMPING = 1.04, 4.0, 0.3
+TABLE_AT = np.linspace(0.0, 60.0, 121)
+TABLE = np.sin(0.7 * TABLE_AT) + 0.3 * np.sin(2.1 * TABLE_AT)
+
+
+def pulsed(t, q, v, p):
+    push = 5.0 if (t - p[2]) % p[0] < p[1] else 0.0
+    return np.array([push - STIFFNESS * q[0] - DAMPING * v[0]])
+
+
+def slide(period, width, begin=0.0, compile=True):
+    given = {"n_q": 1, "n_c": 0, "mass": np.array([[MASS]]), "parameters": [period, width, begin]}
+    return ConstrainedSystem.from_python(force=pulsed, compile=compile, **given)
+
+
+def end(period, width, begin, t_end):
+    """Position and velocity at the end, from rest, from one edge of a pulse to the next."""
+    edges = np.add.outer(begin + period * np.arange(-1, t_end // period + 1), [0.0, width]).ravel()
+    edges = np.concatenate([[0.0], edges[(edges > 0.0) & (edges < t_end)], [t_end]])
+    state = np.zeros(2)
+    for t0, t1 in pairwise(edges.tolist()):
+        push = 5.0 if (0.5 * (t0 + t1) - begin) % period < width else 0.0
+        rest = np.array([push / STIFFNESS, 0.0])
+        matrix = np.array([[0.0, 1.0], [-STIFFNESS / MASS, -DAMPING / MASS]])
+        state = rest + expm(matrix * (t1 - t0)) @ (state - rest)
+    return state
+
+
+def off(result, *pulses):
+    """Errors at the end over the tolerance."""
+    state = np.array([result.q[0, -1], result.v[0, -1]])
+    return np.abs(state - end(*pulses, result.t[-1])).max() / result.rtol
+
+
+@pytest.mark.parametrize("method", ["auto", "DOP853", "Adams", "RadauIIA5", "TRBDF2"])
+@pytest.mark.parametrize(("width", "t_end", "tolerance"), [(0.1, 200.0, 1e-5), (0.02, 50.0, 1e-5)])
+def test_pulses_shorter_than_steps_are_not_passed_over(method, width, t_end, tolerance):
+    result = solve_dae(slide(1.0, width), (0.0, t_end), [0.0], [0.0], method, tolerance, tolerance)
+    assert result.success and off(result, 1.0, width, 0.0) < 100.0
+
+
+def test_nor_by_functions_in_python():
+    result = solve_dae(slide(1.0, 0.02, 0.3, compile=False), (0.0, 30.0), [0.0], [0.0], rtol=1e-5, atol=1e-5)
+    assert result.success and off(result, 1.0, 0.02, 0.3) < 100.0
+
+
+def test_a_run_that_may_have_missed_some_says_so():
+    """The first pulse falls into the short steps at the start, and no other is met."""
+    run = slide(100.0, 2e-3, 3e-3), (0.0, 3000.0), [0.1], [0.0], "DOP853", 1e-6, 1e-6
+    for _ in range(4):  # also by the arrays of the call before
+        with pytest.warns(ConstraintWarning, match=r"change suddenly for 0\.002 s.*max_step, at most 0\.002"):
+            result = solve_dae(*run)
+        assert result.success and "Give max_step" in result.message
+
+
+def test_repeated_calls_see_what_the_first_has_seen():
+    system = slide(1.0, 0.02)
+    results = [solve_dae(system, (0.0, 50.0), [0.0], [0.0], rtol=1e-5, atol=1e-5, t_eval=[50.0]) for _ in range(4)]
+    assert off(results[0], 1.0, 0.02, 0.0) < 100.0
+    for result in results[1:]:
+        assert (result.q == results[0].q).all() and result.stats.n_accepted == results[0].stats.n_accepted
+
+
+def test_a_run_is_made_again_up_to_an_event():
+    at_end = problems.njit(lambda t, q, v: t - 40.5)
+    at_end.terminal = True
+    pulses = 1.0, 0.02, 0.0
+    result = solve_dae(slide(*pulses), (0.0, 80.0), [0.0], [0.0], rtol=1e-5, atol=1e-5, events=at_end)
+    assert result.status is Status.EVENT and result.t_events[0].size == 1 and off(result, *pulses) < 100.0
+
+
+SMOOTH = {
+    "steep": lambda t, q, v: np.array([np.tanh(5.0 * np.sin(3.0 * t)), -9.81]),
+    "bent": lambda t, q, v: np.array([abs(np.sin(3.0 * t)), -9.81]),
+    "table": lambda t, q, v: np.array([np.interp(t, TABLE_AT, TABLE), -9.81]),
+    "gust": lambda t, q, v: np.array([20.0 * np.exp(-(((t - 5.0) / 0.3) ** 2)), -9.81]),
+    "switch": lambda t, q, v: np.array([2.0 if t > 3.3 else 0.0, -9.81]),
+    "square": lambda t, q, v: np.array([1.0 if np.sin(3.0 * t) > 0.0 else -1.0, -9.81]),
+}
+
+
+@pytest.mark.parametrize("method", ["auto", "Adams", "RadauIIA5"])
+@pytest.mark.parametrize("name", SMOOTH)
+def test_no_run_is_made_again_without_need(name, method, monkeypatch):
+    made = []
+    monkeypatch.setattr(twoloop.solve, "closer", made.append)
+    system = problems.pendulum(force=SMOOTH[name], compile=True)
+    for tolerance in (1e-4, 1e-8):
+        assert solve_dae(system, (0.0, 60.0), [0.8, -0.6], [0.0, 0.0], method, tolerance, tolerance).success
+    assert not made
+
+
+def test_looks_are_eight_calls_of_the_force_a_step():
+    calls = []
+
+    def force(t, q, v):
+        calls.append(t)
+        return np.array([np.exp(-t), -9.81])
+
+    result = solve_dae(problems.pendulum(force=force), (0.0, 10.0), [0.8, -0.6], [0.0, 0.0], "Adams")
+    looks = len(calls) - result.stats.n_evaluations
+    assert result.success and looks < 9 * len(result.h) + 2300  # and along the way
