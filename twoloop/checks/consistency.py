@@ -26,7 +26,10 @@ LEAST = np.array([ROUNDING * EPS, UNSYMMETRIC, SINGULAR_MASS])  # as the kernel 
 
 
 class ConstraintWarning(UserWarning):
-    """Constraints of a system depend on one another: those left out are checked, and multipliers are not unique."""
+    """Constraints depend on one another, or something changes for so short a time that a run may have missed it.
+
+    Rows that are left out are checked, and their multipliers are not unique.
+    """
 
 
 def check_start(
