@@ -15,7 +15,7 @@ import numpy as np
 
 from twoloop.kernels.control import clock as at
 from twoloop.kernels.data.common import compiled
-from twoloop.kernels.data.tolerances import RTOL
+from twoloop.kernels.data.tolerances import GAP, RTOL
 from twoloop.kernels.evaluation.constraints import constraint_rates
 from twoloop.kernels.evaluation.gamma import representable
 
@@ -28,6 +28,7 @@ SHRUNK = 0.25  # of the distance of the last looks: looks that are to be closer 
 LEAST_APART = 16.0  # spacings of floating-point numbers between two looks
 HALVINGS = 20  # to find when a value changes between two looks ...
 SAME = 1e-5  # ... of the widest ones: changes that are closer are one
+SOON = 5e-5  # of a hundredth of the run: before, a force that begins at zero, as 1 - cos(t), changes by rounding
 STEEPER = 2.0  # times the changes before and after: the flank of a pulse, and not a slope
 NEARLY = 0.01  # of the spacing of these times: before a sudden change by that is at it
 LARGEST = PLACES + 1  # row of w.changes behind those of the values
@@ -96,13 +97,14 @@ def _flank(f, w, t, low, high, k, j, q, v, a):
 
 
 @compiled
-def _keep_flanks(f, w, clock, t, begin, spacing, n, place, column, sudden, q, v, a):
+def _keep_flanks(f, w, tolerances, clock, t, begin, spacing, n, place, column, sudden, q, v, a):
     """Keep when a value changes next to a place where it bends, and the time since the change before."""
     values, apart = w.changes[:, column], max(NEARLY * spacing, SAME * clock[at.WIDEST_LOOK])
+    soonest = clock[at.T_START] + SOON * tolerances[GAP]
     for k in range(place - 1, place + 1):
         low, high = begin + k * spacing, begin + (k + 1) * spacing
         known = low - apart <= clock[at.FLANK] <= high + apart
-        if known or k + 2 > n or low - spacing < clock[at.T_START]:  # what is on both sides is to be seen, too
+        if known or k + 2 > n or low - spacing < soonest:  # what is on both sides is to be seen, too
             continue
         if k == 0:
             _call(f, w, low - spacing, 0.0, q, v, a, w.changes[MIDDLE])
@@ -146,7 +148,7 @@ def sudden_time(f, w, tolerances, clock, t, begin, spacing, last, along, q, v, a
     if column >= 0:
         first = min(first, begin + bend * spacing)
         if along == 0.0:
-            _keep_flanks(f, w, clock, t, begin, spacing, n, bend, column, sudden, q, v, a)
+            _keep_flanks(f, w, tolerances, clock, t, begin, spacing, n, bend, column, sudden, q, v, a)
     return first, min(first, begin + PLACES * spacing if n == PLACES else last)
 
 
