@@ -8,7 +8,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from tests import problems
-from twoloop import Status, ensemble, solve_dae
+from twoloop import ConstrainedSystem, Status, ensemble, solve_dae
 from twoloop.generate.time_dependence import may_be_sudden
 from twoloop.mechanisms import driven_slider_crank, four_bar
 
@@ -201,6 +201,20 @@ def test_nor_is_a_force_that_is_not_finite(method):
             system = pendulum(wrong, at, 0.5 * T_END / share)
             result = solve_dae(system, (0.0, T_END), *START, method=method, rtol=1e-6, atol=1e-6)
             assert result.status is Status.NOT_FINITE and abs(result.t[-1] - at) < T_END / share, result
+
+
+@pytest.mark.parametrize("method", ["DOP853", "RadauIIA5"])
+def test_a_gust_far_ahead_does_not_stop_a_body_at_rest(method):
+    """Its least values change by steps, and so do the accelerations and velocities that they give."""
+
+    def far(t, q, v):
+        return np.array([SIZE * np.exp(-(((t - 4.0) / 0.1) ** 2)) - q[0]])
+
+    body = ConstrainedSystem.from_python(n_q=1, n_c=0, mass=np.eye(1), force=far)
+    result = solve_dae(body, (0.0, 10.0), [0.0], [0.0], method, rtol=1e-8, atol=1e-8)
+    exact = SIZE * 0.1 * np.sqrt(np.pi) * np.exp(-(0.1**2) / 4.0) * np.sin(6.0)
+    assert result.success and abs(result.q[0, -1] - exact) < 1e-5
+    assert len(result.h) < 1000  # Newton's method takes 330
 
 
 @pytest.mark.parametrize("method", ["auto", "Adams"])

@@ -23,6 +23,7 @@ PLACES = 20  # times ahead that are compared
 LONG = 12.0  # spacings of these times: the shortest way along which it is looked
 SHARE = 0.1  # of the range: a second difference that is sudden; that of a bell as wide as four of these times
 LEAST = 0.1  # of rtol, times the largest value so far: a range that may matter
+FLOOR = 1e-150  # ... in any units: squares of less underflow, and the least numbers of all change by steps
 IN_A_STEP = 8.0  # looks within a step: stages lie up to a quarter of it apart, and may all miss what is shorter
 SHRUNK = 0.25  # of the distance of the last looks: looks that are to be closer than that are taken again
 LEAST_APART = 16.0  # spacings of floating-point numbers between two looks
@@ -137,7 +138,8 @@ def sudden_time(f, w, tolerances, clock, t, begin, spacing, last, along, q, v, a
             break
         n = k
     least = LEAST * tolerances[RTOL]
-    of_forces, of_rates = least * _largest(changes[LARGEST, : q.size]), least * _largest(changes[LARGEST, q.size :])
+    of_forces = max(FLOOR, least * _largest(changes[LARGEST, : q.size]))
+    of_rates = max(FLOOR, least * _largest(changes[LARGEST, q.size :]))
     bend, column, sudden = n, -1, 0.0
     for j in range(changes.shape[1]):
         values = changes[:, j]

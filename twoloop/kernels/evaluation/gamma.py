@@ -39,8 +39,9 @@ def longest_difference(q, v):
     for j in range(v.size):
         size = max(size, abs(q[j]))
         speed = max(speed, abs(v[j]))
-    size = max(size, SHORTEST * speed)  # where all coordinates pass through zero
-    return LENGTH * size / speed if speed > size else LENGTH
+    if speed <= size:
+        return LENGTH
+    return LENGTH * max(size / speed, SHORTEST)  # where all coordinates pass through zero
 
 
 @merged
