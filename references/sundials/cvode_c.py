@@ -140,7 +140,7 @@ def integrate(
             iteration = made(solver.stack, "SUNNonlinSol_FixedPoint", free, *solver.vectors, 0, solver.own)
             solver.call("SetNonlinearSolver", iteration)
         else:
-            solver.solve_dense(functions.jacobian)
+            solver.solve_directly(functions.jacobian)
         if functions.projection is not None:
             solver.call("SetUserData", functions.data.ctypes.data)
             solver.call("SetProjFn", functions.projection.address)

@@ -15,6 +15,7 @@ from numba import carray, cfunc, njit, types
 from references.driver import Task, adapter
 from references.equations.linear import OPTIONS
 from references.lines import Line
+from references.sundials.band import band_of
 from references.sundials.library import library
 from references.sundials.loop import RAISED, Memory, run
 from references.sundials.residual import NOT_TESTED, Implicit, Parts, iteration_matrix_at, residual_at
@@ -38,6 +39,7 @@ def solve_ida_c(
     *,
     max_order: int = HIGHEST_ORDER,
     error_test: str = "all",
+    banded: bool = False,
     max_step: float | None = None,
 ) -> Result:
     """Integrate a constrained mechanical system with IDA, in the form "stabilised", without Python in the integration.
@@ -61,6 +63,8 @@ def solve_ida_c(
         Unknowns in the error test and the convergence test: all, q and v, or q alone. IDA's norm is a mean over all
         unknowns, so the same tolerance is looser with fewer tested: the error of q may be sqrt((2 n_q + 2 n_c)/n_q)
         times as large, that of q and v sqrt(1 + n_c/n_q) times.
+    banded : bool
+        Whether IDA's matrix is banded, in the order of `sundials.band`; the system must declare its bandwidth.
     others : see `references.driver` and, for rtol and atol, `sundials.ida.solve_ida`
         The system must have compiled callbacks. The clock is checked every `STEPS_A_CALL` steps.
 
@@ -87,28 +91,45 @@ def solve_ida_c(
     absolute = np.full(form.start.shape[1], atol)
     if error_test != "all":
         absolute[system.n_q * (2 if error_test == "states" else 1) :] = NOT_TESTED
-    residual, jacobian = _compiled(form.parts, system.n_q, system.n_c, system.functions.p.size)
-    data = np.concatenate([each.ravel() for each in form.space])
+    if banded and system.bandwidth is None:
+        raise ValueError(f"banded=True needs a system with a bandwidth; {system.name!r} declares none")
+    band, size = band_of(form) if banded else None, absolute.size
+    order = np.arange(size) if band is None else band.order
+    widths = None if band is None else (band.lower, band.upper)
+    residual, jacobian = _compiled(form.parts, system.n_q, system.n_c, system.functions.p.size, widths)
+    room = () if band is None else (order.astype(float), np.zeros(3 * size + size * size))
+    data = np.concatenate([each.ravel() for each in (*form.space, *room)])
 
     def set_up(solver: Memory) -> None:
         solver.call("Init", residual.address, task.t0, *solver.vectors)
-        solver.call("SVtolerances", rtol, solver.vector(absolute))
+        solver.call("SVtolerances", rtol, solver.vector(absolute[order]))
         solver.call("SetMaxOrd", max_order)
         solver.call("SetUserData", data.ctypes.data)
-        solver.solve_dense(jacobian)
+        solver.solve_directly(jacobian, widths)
 
-    times, rows, failure, counts = run("IDA", form.start, task, (), set_up, max_step, COUNTERS, ADVICE)
-    return task.result("IDA", times, form.columns(*np.split(rows.T, 2)), failure, **counts)
+    times, rows, failure, counts = run("IDA", form.start[:, order], task, (), set_up, max_step, COUNTERS, ADVICE)
+    y, yp = (each[np.argsort(order)] for each in np.split(rows.T, 2))
+    return task.result("IDA", times, form.columns(y, yp), failure, **counts)
 
 
 @lru_cache(maxsize=64)
-def _compiled(parts: Parts, n: int, m: int, n_p: int) -> tuple[Any, Any]:
-    """Return IDA's residual and Jacobian functions; their user data are the arrays of `Implicit.space` in sequence."""
+def _compiled(parts: Parts, n: int, m: int, n_p: int, widths: tuple[int, int] | None) -> tuple[Any, Any]:
+    """Return IDA's residual and Jacobian functions; their user data are the arrays of `Implicit.space` in sequence.
+
+    With `widths`, the matrix is banded and the unknowns are in another order, which follows there as numbers, and then
+    room for y, y', the residual and the matrix in the order of `Implicit`.
+    """
     size = 2 * (n + m)  # constant of the machine code
     ends = np.cumsum([n_p, n * n, m * n, n * n, size, size, size]).tolist()
     after_p, after_M, after_Cq, after_K, after_y, after_here, n_memory = ends
-    array_of, matrix_of, pointer = library().N_VGetArrayPointer, library().SUNDenseMatrix_Data, types.voidptr
+    array_of, pointer = library().N_VGetArrayPointer, types.voidptr
     residual, iteration_matrix = residual_at(parts), iteration_matrix_at(parts)
+    banded = widths is not None
+    lower, upper = widths or (size - 1, size - 1)
+    above = min(size - 1, lower + upper)  # rows of SUNDIALS' band above the diagonal, which pivoting fills
+    depth = above + lower + 1 if banded else size
+    matrix_of = library().SUNBandMatrix_Data if banded else library().SUNDenseMatrix_Data
+    n_room = size * (4 + size) if banded else 0
 
     @njit(**OPTIONS)
     def vector(pointer):  # type: ignore[no-untyped-def]
@@ -121,11 +142,29 @@ def _compiled(parts: Parts, n: int, m: int, n_p: int) -> tuple[Any, Any]:
         K = memory[after_Cq:after_K].reshape((n, n))
         return memory[:n_p], M, Cq, K, memory[after_K:after_y], memory[after_y:after_here], memory[after_here:]
 
+    @njit(**OPTIONS)
+    def in_order(pointer, y, yp):  # type: ignore[no-untyped-def]
+        """y, y' and the places of their entries in IDA's vectors; room for the residual and the matrix."""
+        room = carray(pointer, (n_memory + n_room,), np.float64)[n_memory:]
+        own = room[size:].reshape((3 + size, size))
+        for k in range(size):
+            place = int(room[k])
+            own[0, place] = y[k]
+            own[1, place] = yp[k]
+        return room[:size], own[0], own[1], own[2], own[3:]
+
     @cfunc(types.int32(types.float64, pointer, pointer, pointer, pointer), **OPTIONS)
     def residual_of_ida(t, y, yp, res, memory):  # type: ignore[no-untyped-def]
         p, M, Cq, _, _, _, _ = space(memory)
         try:
-            residual(t, vector(y), vector(yp), p, M, Cq, vector(res))
+            if banded:
+                order, own_y, own_yp, own_res, _ = in_order(memory, vector(y), vector(yp))
+                residual(t, own_y, own_yp, p, M, Cq, own_res)
+                out = vector(res)
+                for k in range(size):
+                    out[k] = own_res[int(order[k])]
+            else:
+                residual(t, vector(y), vector(yp), p, M, Cq, vector(res))
         except Exception:
             return RAISED
         return 0
@@ -133,9 +172,18 @@ def _compiled(parts: Parts, n: int, m: int, n_p: int) -> tuple[Any, Any]:
     @cfunc(types.int32(types.float64, types.float64, *[pointer] * 8), **OPTIONS)
     def jacobian_of_ida(t, cj, y, yp, res, J, memory, work1, work2, work3):  # type: ignore[no-untyped-def]
         p, M, Cq, K, moved, here, there = space(memory)
-        columns = carray(matrix_of(J), (size, size))  # initialised to zero by IDA
+        columns = carray(matrix_of(J), (size, depth))  # initialised to zero by IDA
         try:
-            iteration_matrix(t, cj, vector(y), vector(yp), p, M, Cq, K, moved, here, there, columns)
+            if banded:
+                order, own_y, own_yp, _, dense = in_order(memory, vector(y), vector(yp))
+                dense[:, :] = 0.0
+                iteration_matrix(t, cj, own_y, own_yp, p, M, Cq, K, moved, here, there, dense)
+                for j in range(size):  # an entry outside the band, were there one, would only slow Newton's method
+                    own, column = dense[int(order[j])], columns[j]
+                    for i in range(max(0, j - upper), min(size, j + lower + 1)):
+                        column[above + i - j] = own[int(order[i])]
+            else:
+                iteration_matrix(t, cj, vector(y), vector(yp), p, M, Cq, K, moved, here, there, columns)
         except Exception:
             return RAISED
         return 0
@@ -149,4 +197,10 @@ LINES = (
     Line("IDA from C, stabilised", "scikit-sundae", "SUNDIALS", solve_ida_c, checked=True, **HOW),
     Line("IDA from C, q and v tested", "scikit-sundae", "SUNDIALS", solve_ida_c, {"error_test": "states"}, **HOW),
     Line("IDA from C, order 2, positions tested", "scikit-sundae", "SUNDIALS", solve_ida_c, OF_ORDER_2, **HOW),
+    Line(
+        *("IDA from C, order 2, banded", "scikit-sundae", "SUNDIALS", solve_ida_c),
+        OF_ORDER_2 | {"banded": True},
+        rival=False,
+        **HOW,
+    ),
 )

@@ -28,6 +28,8 @@ FUNCTIONS = {  # by library
     "nvecserial": "N_VMake_Serial:pxpp",
     "sunmatrixdense": "SUNDenseMatrix:pxxp SUNDenseMatrix_Data:Rp",
     "sunlinsoldense": "SUNLinSol_Dense:pppp",
+    "sunmatrixband": "SUNBandMatrix:pxxxp SUNBandMatrix_Data:Rp",
+    "sunlinsolband": "SUNLinSol_Band:pppp",
     "ida": " ".join(f"IDA{each}" for each in _OF_EACH.split()) + " IDACreate:pp IDAInit:ipprpp IDAReInit:iprpp "
     "IDASVtolerances:iprp IDASetMaxOrd:ipi IDASolve:iprpppi IDAGetNumResEvals:ipp",
     "cvode": " ".join(f"CVode{each}" for each in _OF_EACH.split()) + " CVodeCreate:pip CVodeInit:ipprp "

@@ -41,12 +41,15 @@ class Memory:
         """Call a function, which must return 0."""
         check(f"{self.kind}{name}", getattr(self.sundials, f"{self.kind}{name}")(self.memory, *arguments))
 
-    def solve_dense(self, jacobian: Any) -> None:
-        """Use Newton's method with a dense matrix; None: a Jacobian by differences."""
-        # not banded: ordered by nodes, the beam of 4 elements has bandwidths 23 and 21 of 64, too large for a gain
-        size, destroy = self.state.shape[1], self.sundials.SUNMatDestroy
-        matrix = made(self.stack, "SUNDenseMatrix", destroy, size, size, self.own)
-        linear = made(self.stack, "SUNLinSol_Dense", self.sundials.SUNLinSolFree, self.vectors[0], matrix, self.own)
+    def solve_directly(self, jacobian: Any, band: tuple[int, int] | None = None) -> None:
+        """Use Newton's method with a dense matrix, or one of so many lower and upper diagonals.
+
+        `jacobian` None: by differences.
+        """
+        kind, size, destroy = "Dense" if band is None else "Band", self.state.shape[1], self.sundials.SUNMatDestroy
+        widths = (size,) if band is None else band[::-1]
+        matrix = made(self.stack, f"SUN{kind}Matrix", destroy, size, *widths, self.own)
+        linear = made(self.stack, f"SUNLinSol_{kind}", self.sundials.SUNLinSolFree, self.vectors[0], matrix, self.own)
         self.call("SetLinearSolver", linear, matrix)
         if jacobian is not None:
             self.call("SetJacFn", jacobian.address)

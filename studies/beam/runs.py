@@ -13,7 +13,18 @@ from studies.bench.cases import beam
 from studies.bench.cases.beam import SOFT, STIFF
 from studies.bench.collector import REPEATS, Array, Case, Run, Solver, Warm, row_of
 from studies.bench.metrics import ASTRAY, deviation
-from studies.bench.solvers import CATALOGUE, IRK, IRK_LINE, NEWMARK, OWN_EXPLICIT, PAPER_TOL, QUARTER, RADAU, RIVALS
+from studies.bench.solvers import (
+    CATALOGUE,
+    IDA_C_BANDED,
+    IRK,
+    IRK_LINE,
+    NEWMARK,
+    OWN_EXPLICIT,
+    PAPER_TOL,
+    QUARTER,
+    RADAU,
+    RIVALS,
+)
 from studies.bench.store import KeptRows, Row
 from twoloop import ConstrainedSystem, Result, solve_dae
 from twoloop.mechanisms import Problem
@@ -23,7 +34,7 @@ PAPER = IRK
 NEWTON, DIFFERENCES = "RadauIIA5", "RadauIIA5, by differences"
 EXUDYN = "Exudyn, GeneralizedAlpha, its own cable"
 OURS = ("auto", "auto, compiled", "TRBDF2", "ESDIRK4", "SunRadau5", "Gauss6", "BDF", "Adams", OWN_EXPLICIT)
-OTHERS = tuple(name for name in RIVALS if not name.startswith("Exudyn"))  # whose cable is another
+OTHERS = (*(name for name in RIVALS if not name.startswith("Exudyn")), IDA_C_BANDED)  # Exudyn's cable is another
 
 TARGETS = (1e-2, 1e-3, 1e-4)  # m, of the tip's height
 LOOSE = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5)  # tolerances, between and beyond which `adaptive` asks

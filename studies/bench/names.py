@@ -10,6 +10,7 @@ from twoloop.methods.presets import PRESETS
 SUFFIX = " (twoloop)"  # of ours, where a rival has such a name, too
 WITH, WITHOUT = "compiled", "not compiled"  # after a comma, of rows; without either: as a study runs its methods
 PLAIN = {OWN_EXPLICIT if method == "DOP853" else method: made for made, method in COMPILED.items()}
+SCIPY = ("LSODA, ", "DOP853, ", "Radau, ", "BDF, ", "RK45, ")  # how rows of SciPy's begin, which ours may, too
 OTHERS = {  # of studies that run few of ours
     "solve_dae, compiled, one by one": "compiled=True, one by one",
     "twoloop, default": f"twoloop, {GIVEN}",
@@ -29,7 +30,8 @@ def label(solver: str, coded: bool | None = None) -> str:
     """
     parts = _parts(solver)
     if parts is None:
-        return OTHERS.get(solver, solver.removesuffix(SUFFIX))
+        name = solver.removesuffix(SUFFIX)
+        return OTHERS.get(solver, f"SciPy, {name}" if name.startswith(SCIPY) else name)
     method, word = parts
     words = [] if method == DEFAULT else [method]
     if word == WITHOUT or (method in COMPILED.values() and (word == WITH) is not coded):

@@ -34,6 +34,7 @@ NUDGE = 1e-5  # IDA's error scatters with rounding: repeats differ by this in rt
 IRK, NEWMARK, QUARTER = "PaperIRK", "PaperNewmark (beta = 1/2)", "PaperNewmark, beta = 1/4"
 IRK_LINE = "PaperIRK, Atol = Rtol varied"
 IDA_C, IDA_C_ORDER_2 = "IDA from C, stabilised", "IDA from C, order 2, positions tested"
+IDA_C_BANDED = "IDA from C, order 2, banded"  # of systems with a bandwidth, with positions tested
 IDA_C_STATES = "IDA from C, q and v tested"
 CANONICAL = "Gauss6, momenta, symmetric"
 ADAMS, TAYLOR = "Adams", "Taylor"

@@ -15,6 +15,7 @@ BEAMS = {  # of the study of the beam, and their classes
     "very flexible": "flexible, vibrations wanted",
 }
 NEWEST = "CyRK"  # a rival that rows of some studies lack, as they were made before
+NO_ANGLES = "ODEs in angles were not run"
 NONE, UNCLEAR = "no solver compared reaches these errors", "no clear choice"
 BEAM_CLASSES = ("stiff, vibrations irrelevant", "stiff, vibrations wanted")  # which the beam's report judges by the tip
 
@@ -69,7 +70,8 @@ def _of_class(name: str, entries: Sequence[dict[str, Any]], with_code: set[str])
     names = list(dict.fromkeys(entry["name"] for entry in entries))
     alike = len(names) > 1 and len({each.partition(",")[0] for each in names}) == 1
     what = f"{name} ({f'{len(names)} geometries' if alike else listed(names)}, {times} s)"
-    return {"what": what, "take": _shares(won, "errors", made) or NONE}
+    taken = _shares(won, "errors", made)
+    return {"what": what, "take": f"{taken}, among solvers with constraints: {NO_ANGLES}" if taken else NONE}
 
 
 def _shares(won: Mapping[str, int], of: str, made: bool | None) -> str:
@@ -114,7 +116,10 @@ def _of_energy(entry: Mapping[str, Any], made: bool | None, long: Mapping[str, A
     drifts = " (drifts)" if first == told[0] != UNCLEAR else ""
     without = f"{drifts}; without a visible drift {told[1]}{_beside_drifting(long)}"
     without = without if told[1] not in (UNCLEAR, NONE) else ""
-    return {"what": f"energy over {power(entry['t_end'])} s (four-bar)", "take": first + without}
+    taken = first + without
+    if first != NONE:
+        taken += f"; {NO_ANGLES}"
+    return {"what": f"energy over {power(entry['t_end'])} s (four-bar)", "take": taken}
 
 
 def _timed_once(long: Mapping[str, Any], made: bool | None) -> str:
@@ -163,7 +168,7 @@ def _at_once(cases: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
         told += f", {verdicts['missed']} reached by others only"
     close = sum(1 / SCATTER < at["ratio"] < SCATTER for each in cases for at in each["at"] if at["verdict"] in ORDERED)
     told += f"; {close} of these {ahead + behind} by less than {SCATTER:g} times" if close else ""
-    return [{"what": "many runs in one call", "take": f"{who} ({told})"}]
+    return [{"what": "many runs in one call", "take": f"{who} ({told}); {NO_ANGLES}"}]
 
 
 def _paid(line: Mapping[str, Any]) -> str:

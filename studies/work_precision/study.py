@@ -20,6 +20,7 @@ from studies.bench.solvers import (
     COMPARED,
     COMPARED_OWN,
     DEFAULT,
+    IDA_C_BANDED,
     IDA_C_ORDER_2,
     IDA_INDEX_1,
     IRK_LINE,
@@ -35,7 +36,12 @@ from twoloop.rows.calibration import CALIBRATION, calibration_s
 
 ERRORS = (1e-2, 1e-4, 1e-6)  # the accuracies of the first screen
 FURTHER = ("Gauss6", IRK_LINE, QUARTER, IDA_INDEX_1)
-STIFF = ("TRBDF2", *RADAU[1:], IDA_C_ORDER_2)  # in their place on stiff cases; the paper's: `studies.beam`
+STIFF = (
+    "TRBDF2",
+    *RADAU[1:],
+    IDA_C_ORDER_2,
+    IDA_C_BANDED,
+)  # in their place on stiff cases
 BETWEEN = (7e-4, 5e-4, 3e-4, 2e-4)  # tolerances of the first of these, whose loose runs lie on no line
 QUICK = (*COMPARED[:4], "RadauIIA5", "IDA, stabilised")  # others take seconds to compile or to run
 QUICK_CASES = ("four-bar",)  # the beams' references take seconds

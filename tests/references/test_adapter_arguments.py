@@ -83,6 +83,7 @@ def test_wrong_tolerances_are_named(name, tol):
         (solve_ida, {"form": None}, "form must be 'index1' or 'stabilised'; given None"),
         (solve_ida_c, {"max_order": 6}, "max_order must be at most 5"),
         (solve_ida_c, {"max_order": 0}, "max_order must be at least 1"),
+        (solve_ida_c, {"banded": True}, "banded=True needs a system with a bandwidth; 'four-bar' declares none"),
         (solve_ida_c, {"error_test": []}, r"error_test must be 'all', 'states' or 'positions'; given \[\]"),
         (solve_cvode_c, {"method": "adams"}, "method must be 'Adams' or 'BDF'; given 'adams'"),
         (solve_cvode_c, {"projected": True}, r"projected needs method 'BDF'.*; given 'Adams'"),

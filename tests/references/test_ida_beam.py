@@ -3,9 +3,12 @@
 import numpy as np
 import pytest
 
+from references.driver import check_task
 from references.scipy.index1 import solve_index1
+from references.sundials.band import band_of
 from references.sundials.ida import solve_ida
 from references.sundials.ida_c import solve_ida_c
+from references.sundials.residual import Implicit
 from tests.problems import without_tangent
 from twoloop.mechanisms import four_bar, moderately_stiff_beam, very_flexible_beam
 from twoloop.mechanisms.ancf_beam import tip_height
@@ -89,6 +92,19 @@ def test_order_2_and_positions_step_over_them():
     assert errors("stiff", run("stiff", 1e-8, **ORDER_2))[1] < 2e-4
     # they do not matter only where the beam is stiff
     assert errors("flexible", run("flexible", 1e-6, **ORDER_2))[1] > 0.1
+
+
+def test_a_banded_matrix_gives_the_same_steps():
+    banded, dense = (run("stiff", 1e-2, **ORDER_2, banded=each) for each in (True, False))
+    assert banded.stats.n_accepted == pytest.approx(dense.stats.n_accepted, rel=0.05)
+    assert np.abs(banded.q - dense.q).max() < 1e-6
+
+
+def test_bandwidths_in_the_order_of_the_nodes():
+    problem = CASES["stiff"]
+    task = check_task(problem.system, (0.0, 1.0), problem.q0, problem.v0, None, None)
+    order, lower, upper = band_of(Implicit(task, "stabilised"))
+    assert sorted(order) == list(range(64)) and (lower, upper) == (25, 23)
 
 
 @pytest.mark.slow

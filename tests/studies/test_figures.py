@@ -246,7 +246,7 @@ def test_the_bars_of_honesty_are_the_shares_of_the_outcomes():
     assert np.allclose(shares, [[0.0, 0.0, third], [0.0, 0.0, third], [25.0, 0.0, third]])
     assert {text.get_text() for text in axes.texts} == {"", "1", "ours", "rivals"} and axes.get_title()
     names = [label.get_text() for label in axes.get_yticklabels()]
-    assert names == ["the default (4)", "2 solvers, all right (10)", "LSODA, index 1 (3)"]
+    assert names == ["the default (4)", "2 solvers, all right (10)", "SciPy, LSODA, index 1 (3)"]
 
 
 def test_the_cells_of_table_3_are_drawn_as_ratios():

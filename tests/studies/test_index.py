@@ -220,7 +220,7 @@ def test_what_is_said_of_the_paper_turns_with_the_findings(tmp_path):
 
 def test_what_can_be_trusted_is_counted(tmp_path):
     text = screen(tmp_path, validation=VALID)
-    assert "some rival on 17, only ours on 2, only rivals on 0, none on 2." in text
+    assert "one rival are right on 17, only ours on 2, only rivals on 0, none on 2." in text
     assert (
         "Of the runs of all solvers on these that report success, 1 of 500 of ours and 57 of 300 of rivals are wrong."
         in text
