@@ -1,5 +1,6 @@
 """Machine code on disk: read again when nothing changed, rebuilt when anything did, never a reason to fail."""
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -179,6 +180,18 @@ def test_a_digest_follows_the_values_of_any_type(monkeypatch):
     assert len(seen) == 16 and None not in seen
     monkeypatch.setitem(globals(), "NAMED", object())
     assert watch(names_a_dictionary.py_func) is None
+
+
+@njit
+def takes_an_attribute(x):
+    return math.log(x)
+
+
+def test_an_attribute_is_not_the_global_of_the_same_name(monkeypatch):
+    """A callback that calls `math.log` was not kept where its file had something else that is called `log`."""
+    stamp = watch(takes_an_attribute.py_func)
+    monkeypatch.setitem(globals(), "log", object())
+    assert watch(takes_an_attribute.py_func) == stamp is not None
 
 
 def test_digests_of_functions_that_name_themselves_end():

@@ -91,7 +91,10 @@ def test_the_first_screen_says_who_is_the_cheapest():
     ahead, behind = "`ensemble` (ahead of all others", "`heyoka, batches` (ahead of `ensemble`"
     for times, way in (({ENSEMBLE: 0.01, HEYOKA: 0.05}, ahead), ({ENSEMBLE: 0.05, HEYOKA: 0.01}, behind)):
         (line,) = takes.takes({"ensembles": ensembles.findings_of(rows(**times))}, [])
-        assert line == {"what": "many runs in one call", "take": f"{way} in 3, behind in 0 of 3 comparisons); {takes.NO_ANGLES}"}
+        assert line == {
+            "what": "many runs in one call",
+            "take": f"{way} in 3, behind in 0 of 3 comparisons); {takes.NO_ANGLES}",
+        }
 
 
 def test_a_way_with_failed_runs_is_not_the_cheapest():

@@ -1,5 +1,6 @@
 """What machine code depends on: digests of functions, with all that they name and enclose, and of files."""
 
+import dis
 import enum
 import hashlib
 import sys
@@ -87,8 +88,8 @@ class Digest:
         self.add([function.__code__, function.__defaults__, function.__kwdefaults__])
         if enclosed:
             self.add(enclosed_by(function))
-        for name in sorted(names_in(function.__code__) & set(function.__globals__)):
-            self.add([name, function.__globals__[name]])
+        for name, value in globals_of(function).items():
+            self.add([name, value])
         self.names = outer
 
     def _add_helper(self, helper: Any) -> None:
@@ -135,12 +136,24 @@ def names_in(code: types.CodeType) -> set[str]:
     return set(code.co_names).union(*map(names_in, inner))
 
 
+def globals_of(function: Any) -> dict[str, Any]:
+    """The globals that a function, or one within it, loads; an attribute of the same name, as in `math.log`, is none."""
+    names = _loaded(function.__code__) & set(function.__globals__)
+    return {name: function.__globals__[name] for name in sorted(names)}
+
+
+def _loaded(code: types.CodeType) -> set[str]:
+    inner = [constant for constant in code.co_consts if isinstance(constant, types.CodeType)]
+    own = {each.argval for each in dis.get_instructions(code) if each.opname in ("LOAD_GLOBAL", "LOAD_NAME")}
+    return own.union(*map(_loaded, inner))
+
+
 def names_reached(function: Any, seen: set[int] | None = None) -> set[str]:
     """Names in a function and in compiled helpers that it names, to which it may pass a module."""
     seen = set() if seen is None else seen
     seen.add(id(function))
     names = names_in(function.__code__)
-    values = [*(function.__globals__[name] for name in names & set(function.__globals__)), *enclosed_by(function)]
+    values = [*globals_of(function).values(), *enclosed_by(function)]
     modules = [value for value in values if isinstance(value, types.ModuleType) and not of_library(value.__name__)]
     values += [vars(module)[name] for module in modules for name in names & set(vars(module))]
     helpers = [value for value in values if isinstance(value, Dispatcher) or registered(value)]
