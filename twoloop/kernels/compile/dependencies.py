@@ -137,7 +137,7 @@ def names_in(code: types.CodeType) -> set[str]:
 
 
 def globals_of(function: Any) -> dict[str, Any]:
-    """The globals that a function, or one within it, loads; an attribute of the same name, as in `math.log`, is none."""
+    """The globals that a function, or one within it, loads; an attribute of that name, as in `math.log`, is none."""
     names = _loaded(function.__code__) & set(function.__globals__)
     return {name: function.__globals__[name] for name in sorted(names)}
 
