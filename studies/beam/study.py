@@ -14,7 +14,7 @@ from studies.bench.cases.beam import SOFT, STIFF
 from studies.bench.cli import StudyError
 from studies.bench.names import label
 from studies.bench.render import number, table
-from studies.bench.solvers import CYRK, IDA_C, IDA_C_ORDER_2, NEWMARK, OWN_EXPLICIT, PAPER_TOL
+from studies.bench.solvers import CYRK, IDA_C, IDA_C_BANDED, IDA_C_ORDER_2, NEWMARK, OWN_EXPLICIT, PAPER_TOL
 from studies.bench.store import Output
 from studies.bench.study import Study
 
@@ -44,6 +44,7 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     found |= {f"growth_{key}": stiff[key] / soft[key] for key in ("n_evaluations", "call_s", "printed_s")}
     found["growth_w_max"] = w_max[STIFF] / w_max[SOFT]
     found["growth_as_frequency"] = bool(0.5 < found["growth_n_evaluations"] / found["growth_w_max"] < 2.0)
+    found["banded"] = bool((runs["solver"] == IDA_C_BANDED).any())
     found["exudyn"] = bool((runs["solver"] == EXUDYN).any())
     return found | _limits(rows)
 

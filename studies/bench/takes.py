@@ -29,7 +29,8 @@ def takes(found: Mapping[str, Any], entries: Sequence[dict[str, Any]]) -> list[d
     for entry in entries:
         classes[entry["class"]].append(entry)
     rows = [_of_class(name, own, with_code) for name, own in classes.items() if name not in (*BEAM_CLASSES, LONG)]
-    rows += _of_beams([case for case in found.get("beam", {}).get("cases", []) if case["name"] in BEAMS])
+    beam = found.get("beam", {})
+    rows += _of_beams([case for case in beam.get("cases", []) if case["name"] in BEAMS], beam.get("banded", False))
     long = found.get("energy", {}).get("long", {})
     rows += [_of_energy(entry, coded(("four-bar",), with_code), long) for entry in classes[LONG]]
     for row in rows:
@@ -84,12 +85,13 @@ def _shares(won: Mapping[str, int], of: str, made: bool | None) -> str:
     return ", ".join(said) or ("no clear choice" if total else "")
 
 
-def _of_beams(cases: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
+def _of_beams(cases: Sequence[Mapping[str, Any]], banded: bool) -> list[dict[str, str]]:
     """The cheapest by the error of the tip, and how loose the tolerances are with which they are that."""
     settings = [at["best"]["setting"].split() for case in cases for at in case["at"] if at["best"] is not None]
     loosest = max((float(value) for name, value in settings if name == "tol"), default=None)
     chosen = f" (tolerances chosen afterwards, up to {number(loosest)})" if loosest else ""
-    told = "; ".join([*map(_by_the_tip, cases), "SUNDIALS had dense matrices, ours are banded"])
+    apart = [] if banded else ["SUNDIALS had dense matrices, ours are banded"]
+    told = "; ".join([*map(_by_the_tip, cases), *apart])
     return [{"what": f"beams, by the error of the tip{chosen}", "take": told}] * bool(cases)
 
 
@@ -117,7 +119,7 @@ def _of_energy(entry: Mapping[str, Any], made: bool | None, long: Mapping[str, A
     without = f"{drifts}; without a visible drift {told[1]}{_beside_drifting(long)}"
     without = without if told[1] not in (UNCLEAR, NONE) else ""
     taken = first + without
-    if first != NONE:
+    if first not in (NONE, UNCLEAR):
         taken += f"; {NO_ANGLES}"
     return {"what": f"energy over {power(entry['t_end'])} s (four-bar)", "take": taken}
 

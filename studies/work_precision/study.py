@@ -36,12 +36,7 @@ from twoloop.rows.calibration import CALIBRATION, calibration_s
 
 ERRORS = (1e-2, 1e-4, 1e-6)  # the accuracies of the first screen
 FURTHER = ("Gauss6", IRK_LINE, QUARTER, IDA_INDEX_1)
-STIFF = (
-    "TRBDF2",
-    *RADAU[1:],
-    IDA_C_ORDER_2,
-    IDA_C_BANDED,
-)  # in their place on stiff cases
+STIFF = ("TRBDF2", *RADAU[1:], IDA_C_ORDER_2, IDA_C_BANDED)  # in their place on stiff cases
 BETWEEN = (7e-4, 5e-4, 3e-4, 2e-4)  # tolerances of the first of these, whose loose runs lie on no line
 QUICK = (*COMPARED[:4], "RadauIIA5", "IDA, stabilised")  # others take seconds to compile or to run
 QUICK_CASES = ("four-bar",)  # the beams' references take seconds
@@ -79,6 +74,19 @@ def findings_of(rows: pd.DataFrame, known: Sequence[Case]) -> dict[str, Any]:
         found |= {"at": classes_of(runs), "figure": f"work_precision_{slug}.png"}
         listed.append(found | {"processor": str(runs["processor"].iloc[0]) if "processor" in runs else ""})
     return {"cases": listed, "default": DEFAULT}
+
+
+def banded_over_dense(rows: pd.DataFrame) -> dict[str, Any] | None:
+    """Times of IDA with banded matrices over those with dense ones, otherwise alike; None: there are no such runs."""
+    one, other = (
+        rows[rows["solver"] == name].set_index(["case", "tol"])["call_s"].astype(float)
+        for name in (IDA_C_BANDED, IDA_C_ORDER_2)
+    )
+    ratios = (one / other).dropna()
+    if ratios.empty:
+        return None
+    least, median, most = np.percentile(ratios, (0, 50, 100)).tolist()
+    return {"n": len(ratios), "least": least, "median": median, "most": most}
 
 
 def known_cases(quick: bool) -> list[Case]:
@@ -150,6 +158,7 @@ def report(output: Output, rows: pd.DataFrame, line: str) -> dict[str, Any]:
     findings = findings_of(medians, known) | {"rivals": found}
     findings["behind"] = behind.findings_of(found["mechanisms"], everywhere)
     findings |= {"violation": violation(medians), "asked": asked(part(rows, rivals.GROUP))}
+    findings["banded"] = banded_over_dense(medians)
     findings["versions"], findings["unlike"] = versions(), unlike(pd.concat([medians, everywhere], ignore_index=True))
     findings["first_calls"] = first_calls.findings_of(first_calls.at_error(part(rows, first_calls.GROUP), everywhere))
     findings["unrolled"] = LARGEST_UNROLLED

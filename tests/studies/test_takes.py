@@ -2,7 +2,7 @@
 
 import pytest
 
-from studies.bench.takes import takes
+from studies.bench.takes import NO_ANGLES, takes
 
 THEIRS = {"solver": "heyoka", "call_s": 0.05}
 MATRICES = "SUNDIALS had dense matrices, ours are banded"
@@ -15,6 +15,7 @@ def test_of_beams_two_are_named_where_neither_is_cheaper():
     (row,), stiff = takes({"beam": found}, []), "stiff, vibrations irrelevant"
     assert row["what"] == "beams, by the error of the tip (tolerances chosen afterwards, up to 0.10)"
     assert row["take"] == f'{stiff}: `method="TRBDF2"` or `heyoka` (1e-3 m), `heyoka` (1e-4 m); {MATRICES}'
+    assert takes({"beam": found | {"banded": True}}, [])[0]["take"] == row["take"].removesuffix(f"; {MATRICES}")
     found["cases"][0]["at"] = [at | {"verdict": "behind", "ties": ["Adams"]}]
     assert takes({"beam": found}, [])[0]["take"] == f'{stiff}: `heyoka` or `method="Adams"` (1e-3 m); {MATRICES}'
 
@@ -60,7 +61,7 @@ def test_an_ode_in_angles_is_told_by_counts():
 def test_of_ensembles_it_is_said_how_many_are_close(ratios, close):
     at = [{"verdict": "ahead" if ratio > 1.0 else "behind", "ratio": ratio, "rival": "heyoka"} for ratio in ratios]
     (row,) = takes({"ensembles": {"cases": [{"at": [*at, {"verdict": "none", "ratio": None}]}]}}, [])
-    assert row["take"] == f"`ensemble` (ahead of all others in 2, behind in 1 of 3 comparisons{close})"
+    assert row["take"] == f"`ensemble` (ahead of all others in 2, behind in 1 of 3 comparisons{close}); {NO_ANGLES}"
 
 
 @pytest.mark.parametrize(("over", "times"), [([7.0, 10.0], ", at 7.0 to 10 times the time"), (None, "")])
@@ -70,7 +71,7 @@ def test_of_the_energy_it_is_said_what_a_run_without_a_drift_takes(over, times):
     entry = {"class": "long and conservative", "t_end": 1e4, "picks": [pick], "without_drift": [level]}
     found = {"energy": {"long": {"calm_ours": {"over_drifting": over}}}}
     told = takes(found, [entry])[0]["take"]
-    assert told.endswith(f"(drifts); without a visible drift `Gauss(3), symmetric partition`{times}")
+    assert told.endswith(f"(drifts); without a visible drift `Gauss(3), symmetric partition`{times}; {NO_ANGLES}")
 
 
 def test_runs_timed_once_are_not_ranked_but_their_times_are_told():
@@ -86,6 +87,6 @@ def test_runs_timed_once_are_not_ranked_but_their_times_are_told():
     }
     told = takes({"energy": {"long": long}, "work_precision": {"rivals": {"with_code": ["four-bar"]}}}, [entry])
     assert told[0]["take"] == (
-        "not ranked, as timed once: the default 0.40 s and `heyoka` 2.0 s for at most 2e-6 J (both drift)"
+        f"not ranked, as timed once: the default 0.40 s and `heyoka` 2.0 s for at most 2e-6 J (both drift); {NO_ANGLES}"
     )
     assert takes({"energy": {"long": long | {"repeats": 5}}}, [entry])[0]["take"] == "no clear choice"

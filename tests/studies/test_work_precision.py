@@ -1,8 +1,11 @@
 """The comparison of all mechanisms: what the default costs, a quick run."""
 
+import pandas as pd
 import pytest
 
 from studies.bench import cases
+from studies.bench.solvers import IDA_C_BANDED as BANDED
+from studies.bench.solvers import IDA_C_ORDER_2 as DENSE
 from studies.bench.solvers import RIVALS
 from studies.work_precision import study as work_precision
 
@@ -32,3 +35,10 @@ def test_the_quick_study_runs_and_is_drawn_again(tmp_path):
     assert "four-bar" in (tmp_path / "README.md").read_text()
     work_precision.main([*words, "--redraw"])
     assert (tmp_path / "work_precision.md").read_text() == text
+
+
+def test_banded_matrices_are_compared_at_the_same_tolerances():
+    times = {(BANDED, 1e-2): 3.0, (DENSE, 1e-2): 2.0, (BANDED, 1e-4): 1.0, (DENSE, 1e-4): 2.0, (DENSE, 1e-6): 9.0}
+    rows = pd.DataFrame([{"case": "b", "solver": s, "tol": tol, "call_s": t} for (s, tol), t in times.items()])
+    assert work_precision.banded_over_dense(rows) == {"n": 2, "least": 0.5, "median": 1.0, "most": 1.5}
+    assert work_precision.banded_over_dense(rows[rows["solver"] == DENSE]) is None
