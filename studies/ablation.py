@@ -1,4 +1,4 @@
-"""Does the paper's idea pay: positions solved in every stage, against four other ways in the same Runge-Kutta code."""
+"""Does the paper's idea pay off: positions solved in every stage, against four other ways in one Runge-Kutta code."""
 
 from collections.abc import Sequence
 from dataclasses import replace

@@ -209,16 +209,18 @@ def compared(own: Costs, others: Costs) -> dict[str, Any]:
     return {"ratio": least[1] / least[0], "interval": None if np.isnan(low) else [low, high], "verdict": verdict}
 
 
-def ranking(rows: pd.DataFrame, target: float) -> pd.DataFrame:
+def ranking(rows: pd.DataFrame, target: float, unasked: bool = False) -> pd.DataFrame:
     """The solvers of one case that reach an error, cheapest first; others' only where asked for about so much.
+
+    `unasked`: others', too, wherever they reach it.
 
     Returns solver, family, called_from, keeps_constraints, call_s, call_q1, call_q3, n_evaluations for this error (on
     the log-log line between two runs), and violation_q, violation_v, energy, setting of the cheapest run near it.
     """
-    return rankings(rows, (target,))[0]
+    return rankings(rows, (target,), unasked)[0]
 
 
-def rankings(rows: pd.DataFrame, targets: Sequence[float]) -> list[pd.DataFrame]:
+def rankings(rows: pd.DataFrame, targets: Sequence[float], unasked: bool = False) -> list[pd.DataFrame]:
     """The `ranking` at each of some errors."""
     grouped, ranked = by_solver(rows, *COSTS), []
     told = {name: rows[name].to_numpy() for name in (*RANKED, *SETTINGS) if name in rows and name not in COSTS}
@@ -226,7 +228,7 @@ def rankings(rows: pd.DataFrame, targets: Sequence[float]) -> list[pd.DataFrame]
         lines = []
         for solver, runs in grouped.items():
             ours = len(runs.rows) > 0 and told["family"][runs.rows[0]] == "two-loop"
-            if (place := place_of(runs, target, unasked=ours)) is None:
+            if (place := place_of(runs, target, unasked=ours or unasked)) is None:
                 continue
             run = {name: column[cheapest(runs, place)] for name, column in told.items()}
             line = run | {what: float(cost_at(runs.of(what), place)) for what in COSTS}

@@ -17,7 +17,7 @@ from studies.bench.sharp_forces import Sharp, gust, pulse
 from studies.bench.sharp_mechanisms import Mechanism, bars
 from studies.bench.sharp_mechanisms import chain as chain_of
 from studies.bench.sharp_motion import motion
-from studies.honesty.solvers import DEFAULT
+from studies.honesty.solvers import DEFAULT, LIMITED
 from studies.honesty.traps import AGREE, GROWN, HELD_OUT_SEED, SHORT, Trap, of_force, pendulum
 
 SHAPES = {"gust": gust, "pulse": pulse}
@@ -58,7 +58,8 @@ def traps(quick: bool) -> Iterator[Trap]:
 def findings_of(ran: pd.DataFrame, wrong: Sequence[str]) -> dict[str, Any]:
     """Of each of SHAPES and each solver the runs with a `wrong` outcome, off by over EXACT, by width.
 
-    Of the default also the widths of which some runs are that ("some"), and those of which none is ("none").
+    Of the default also the widths of which some runs are that ("some"), and those of which none is ("none"), and its
+    counts over all widths beside those of the best of the others with a largest step.
     """
     return {shape: _of_shape(shape, ran[ran["trap"].str.startswith(shape)], wrong) for shape in SHAPES}
 
@@ -70,7 +71,11 @@ def _of_shape(shape: str, ran: pd.DataFrame, wrong: Sequence[str]) -> dict[str, 
     for solver, own in ran.groupby("solver", sort=False):
         by = [gross[own.index[own["trap"] == name_of(shape, width)]] for width in widths]
         lines.append({"solver": str(solver), "at": [{"n": len(each), "gross": int(each.sum())} for each in by]})
+    totals = {line["solver"]: {key: sum(at[key] for at in line["at"]) for key in ("n", "gross")} for line in lines}
+    limited = [{"solver": name, **total} for name, total in totals.items() if name.endswith(LIMITED)]
     found: dict[str, Any] = {"widths": widths, "solvers": lines, "n": len(ran), "default": {}}
+    found["best_limited"] = min(limited, key=lambda each: each["gross"] / each["n"], default=None)
+    found["of_default"] = totals.get(DEFAULT)
     for line in lines:
         if line["solver"] == DEFAULT:
             found["default"] = {name: _of_widths(widths, line["at"], missed) for name, missed in MISSED.items()}

@@ -1,4 +1,4 @@
-"""Mechanisms that others published: which solver is right, to how many digits, on which of them."""
+"""Mechanisms published by others: which solver is right, to how many digits, on which of them."""
 
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -225,10 +225,10 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     found["judged"] = [of_condition(str(name), own) for name, own in judged.groupby("case", sort=False)]
     decided = judged[judged["outcome"].isin(("right", "wrong"))]
     of_us = decided["family"] == "two-loop"
-    found["judged_wrong"] = {
-        which: {"n": len(own), "wrong": int((own["outcome"] == "wrong").sum())}
-        for which, own in (("ours", decided[of_us]), ("others", decided[~of_us]))
-    }
+    found["judged_wrong"] = _wrong(decided, of_us)
+    found["judged_wrong"]["by_tol"] = [
+        {"tol": float(tol), **_wrong(own, of_us[own.index])} for tol, own in decided.groupby("tol", sort=False)
+    ]
     found["judged_at"] = sorted(map(float, judged["tol"].unique()), reverse=True)
     found["ours_wrong_tight"] = [line for line in wrong if line["family"] == "two-loop" and line["tol"] == TIGHT]
     found["exact"] = EXACT
@@ -246,6 +246,12 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
         which: dict(rows[at_tight & of]["solver"].value_counts()) for which, of in (("ours", ours), ("others", ~ours))
     }
     return found | {"time_limit": TIME_LIMIT}
+
+
+def _wrong(decided: pd.DataFrame, of_us: pd.Series) -> dict[str, Any]:
+    """How many of the runs that were judged are wrong, of ours and of others."""
+    sides = (("ours", decided[of_us]), ("others", decided[~of_us]))
+    return {which: {"n": len(own), "wrong": int((own["outcome"] == "wrong").sum())} for which, own in sides}
 
 
 def of_condition(name: str, own: pd.DataFrame) -> dict[str, Any]:

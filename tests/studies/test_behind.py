@@ -36,4 +36,4 @@ def test_the_report_has_the_counts():
     found = behind.findings_of(rivals.findings_of(rows)["mechanisms"], rows)
     said = f"In 0 of the {found['n']} pairs in which the default is behind, its steps alone"
     assert said in stated(1.0, behind=found)
-    assert "## Where the rest goes" not in stated(1.0)
+    assert "## Where the default's time goes" not in stated(1.0)
