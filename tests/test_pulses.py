@@ -8,7 +8,7 @@ from scipy.linalg import expm
 
 import twoloop.solve
 from tests import problems
-from twoloop import ConstrainedSystem, ConstraintWarning, Status, solve_dae
+from twoloop import ConstrainedSystem, ConstraintWarning, Status, ensemble, solve_dae
 
 MASS, STIFFNESS, DAMPING = 1.04, 4.0, 0.3
 TABLE_AT = np.linspace(0.0, 60.0, 121)
@@ -148,6 +148,40 @@ def test_gusts_that_short_steps_met_are_not_passed_over_later(period, width, beg
     result = solve_dae(gusty(period, width, begin), (0.0, 49.0), [0.0], [0.0], method, tolerance, tolerance)
     known = after_gusts(period, width, begin, 49.0)
     assert result.success and np.abs([result.q[0, -1], result.v[0, -1]] - known).max() < 1e3 * tolerance
+
+
+N_GUSTS = 5
+
+
+def some_gusts(t, q, v, p):
+    push = 0.0
+    for k in range(N_GUSTS):
+        push = push + 5.0 * np.exp(-(((t - p[2] - k * p[0]) / p[1]) ** 2))
+    return np.array([push - STIFFNESS * q[0] - DAMPING * v[0]])
+
+
+def many_runs(P, method, compile=True):
+    """Of runs over 60 s, their errors over the tolerances, too."""
+    given = {"n_q": 1, "n_c": 0, "mass": np.array([[MASS]]), "parameters": P[0]}
+    system = ConstrainedSystem.from_python(force=some_gusts, compile=compile, **given)
+    runs = ensemble(system, (0.0, 60.0), [0.0], [0.0], parameters=P, rtol=1e-7, atol=1e-7, method=method)
+    assert runs.success.all()
+    known = np.array([after_gusts(*p, 60.0, N_GUSTS) for p in P])
+    return runs, np.abs(np.column_stack([runs.q[:, 0, -1], runs.v[:, 0, -1]]) - known).max() / 1e-7
+
+
+@pytest.mark.parametrize("method", ["auto", "Taylor", "DOP853"])
+@pytest.mark.parametrize("compile", [True, False])
+def test_runs_in_lanes_that_meet_short_gusts_are_made_singly(method, compile):
+    P = np.array([[9.0, 0.1, 2.0], [9.0, 0.02, 2.01], [10.0, 0.01, 3.01], [9.0, 0.1, 2.1], [11.0, 0.003, 3.0]])
+    runs, off = many_runs(P, method, compile)
+    assert off < 1e3 and runs.singly.tolist() == [True, True, True, False, True]
+    assert all("so short a time" in runs.reasons[k] for k in (1, 2, 4))
+
+
+def test_lanes_keep_gusts_that_last_longer_than_two_looks():
+    runs, off = many_runs(np.array([[9.0, width, 5.0] for width in (0.2, 0.3, 0.1, 0.07, 0.15)]), "auto")
+    assert off < 1e2 and runs.singly.tolist() == [True, False, False, False, False]
 
 
 def two_pulses(t, q, v, p):
