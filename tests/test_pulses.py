@@ -8,7 +8,7 @@ from scipy.linalg import expm
 
 import twoloop.solve
 from tests import problems
-from twoloop import ConstrainedSystem, ConstraintWarning, Status, ensemble, solve_dae
+from twoloop import ConstrainedSystem, ConstraintWarning, Integrator, Status, ensemble, solve_dae
 
 MASS, STIFFNESS, DAMPING = 1.04, 4.0, 0.3
 TABLE_AT = np.linspace(0.0, 60.0, 121)
@@ -182,6 +182,27 @@ def test_runs_in_lanes_that_meet_short_gusts_are_made_singly(method, compile):
 def test_lanes_keep_gusts_that_last_longer_than_two_looks():
     runs, off = many_runs(np.array([[9.0, width, 5.0] for width in (0.2, 0.3, 0.1, 0.07, 0.15)]), "auto")
     assert off < 1e2 and runs.singly.tolist() == [True, False, False, False, False]
+
+
+@pytest.mark.parametrize("method", ["auto", "DOP853", "Adams"])
+def test_samples_that_meet_pulses_are_made_again(method):
+    integrator = Integrator(slide(1.0, 0.02, 0.3), method, 1e-6, 1e-6)
+    integrator.start(0.0, [0.0], [0.0])
+    for _ in range(150):
+        state = integrator.step(1.0)
+    known = end(1.0, 0.02, 0.3, state.t)
+    assert np.abs([state.q[0], state.v[0]] - known).max() < 1e-4
+    assert (np.diff(integrator.result().t) == 1.0).all()
+
+
+def test_samples_that_may_have_missed_pulses_say_so():
+    """What is short is met in the second sample; the first had looks that are as far apart."""
+    integrator = Integrator(slide(100.0, 3e-3, 19.99), "DOP853", 1e-6, 1e-6)
+    integrator.start(0.0, [0.1], [0.0])
+    integrator.step(10.0)
+    with pytest.warns(ConstraintWarning, match=r"change suddenly for 0\.003 s") as said:
+        integrator.step(10.0)
+    assert said[0].filename == __file__
 
 
 def two_pulses(t, q, v, p):
