@@ -22,7 +22,7 @@ SHARE = 0.1  # of this range: a change that is sudden
 LEAST = 0.1  # of rtol, times the largest value: a range that may matter ...
 FLOOR = 1e-150  # ... in any units
 STEEPER = 2.0  # times the changes before and after: the flank of a pulse, and not a slope
-AT_ONCE = 1_000_000  # numbers that are compared together
+AT_ONCE = 30_000  # numbers that are compared together
 
 
 class ShortLooks:
