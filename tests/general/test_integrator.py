@@ -1,5 +1,7 @@
 """An integrator that is kept: its runs are those of solve_dae, and motions made sample by sample are right."""
 
+import copy
+import pickle
 from importlib.util import find_spec
 
 import numpy as np
@@ -263,3 +265,16 @@ def test_a_sample_that_time_cannot_resolve_is_refused():
     integrator.start(1e9, [1.0, 0.0], [0.0, 0.0])
     with pytest.raises(ValueError, match=r"dt must reach the next floating-point number after t = 1000000000\.0"):
         integrator.step(1e-9)
+
+
+@pytest.mark.parametrize("copied", [copy.copy, copy.deepcopy, lambda each: pickle.loads(pickle.dumps(each))])
+def test_a_copy_has_no_motion(problem, copied):
+    """Both stepped on in the same arrays, and the samples of one were in the result of the other."""
+    integrator = Integrator(problem.system, "DOP853", rtol=1e-7, atol=1e-7, max_step=0.01)
+    integrator.start(0.0, problem.q0, problem.v0)
+    integrator.step(0.1)
+    other = copied(integrator)
+    with pytest.raises(ValueError, match=r"call integrator\.start"):
+        other.step(0.1)
+    runs = [each.run((0.0, 0.2), problem.q0, problem.v0) for each in (integrator, other)]
+    assert (runs[0].q == runs[1].q).all() and integrator.step(0.1).t == 0.2

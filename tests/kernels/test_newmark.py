@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from tests.problems import run, swing, worst
-from twoloop import Newmark, solve_dae
+from twoloop import ConstrainedSystem, Newmark, solve_dae
 from twoloop.mechanisms import four_bar, knife_edge, rolling_disc
 from twoloop.mechanisms.knife_edge import motion
 
@@ -38,6 +38,17 @@ def test_a_start_at_the_origin(tolerance):
     q, v = motion(1.0)
     assert result.success and np.abs(result.q[:, -1] - q).max() < 40.0 * tolerance
     assert np.abs(result.v[:, -1] - v).max() < 100.0 * tolerance
+
+
+@pytest.mark.parametrize("tolerance", [1e-6, 1e-7])
+def test_a_body_at_rest_at_the_origin_that_is_pushed_later(tolerance):
+    """The first step under the force was the only size there was, and any error was allowed in it."""
+    system = ConstrainedSystem.from_python(
+        **{"n_q": 1, "n_c": 0, "mass": np.array([[2.0]]), "compile": True},
+        force=lambda t, q, v: np.array([5.0 if t >= 0.3 else 0.0]),
+    )
+    result = solve_dae(system, (0.0, 3.0), [0.0], [0.0], "Newmark", tolerance, tolerance)
+    assert result.success and abs(result.v[0, -1] - 2.5 * 2.7) < 400.0 * tolerance
 
 
 def test_the_same_steps_from_a_start_far_away():

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from twoloop.checks.arguments import Array, check_positive, check_size, check_span, check_times, check_tolerance
-from twoloop.ensembles.in_lanes import WHY, LaneRuns, threads_of
+from twoloop.ensembles.in_lanes import LOOKS, SHORT, WHY, LaneRuns, threads_of
 from twoloop.ensembles.lane_methods import IN_LANES, LaneMethod, is_involved, lane_methods
 from twoloop.ensembles.runs import Runs
 from twoloop.ensembles.starts import Starts, all_starts, far_off, system_of
@@ -49,7 +49,8 @@ def ensemble(
     the same code, which is kept on disk.
 
     What lanes cannot do is made by `solve_dae`, run by run: runs that come near a singular position, systems whose
-    callbacks branch or that have nonholonomic rows, events, and other methods. So are runs that take less than a
+    callbacks branch or that have nonholonomic rows, events, and other methods. So are runs whose forces or drives were
+    seen to act for less than a thousandth of the run, with a `max_step` of half of that, and runs that take less than a
     twentieth of the estimated time to make their code. The first run is also made by `solve_dae`, with all of its
     checks, and with a tenth of the tolerances where these are above 1e-9, as lanes are compared with it. At the end of
     every other run, the callbacks are compared with what was found there.
@@ -111,8 +112,8 @@ def ensemble(
     options = {"rtol": float(rtol), "atol": tolerance, "t_eval": times, "method": chosen, "events": events}
     messages: dict[int, str] = {}
 
-    def single(run: int) -> Result:
-        result = _alone(system, starts, run, (t0, t1), options)
+    def single(run: int, max_step: float = np.inf) -> Result:
+        result = _alone(system, starts, run, (t0, t1), options | {"max_step": max_step})
         if result.status is Status.INTERRUPTED:  # as in lanes, and not of this run alone
             raise KeyboardInterrupt
         q[run, :, : len(result.t)], v[run, :, : len(result.t)] = result.q, result.v
@@ -155,8 +156,8 @@ def ensemble(
             in_lanes[left[fine]], made_by[each.name] = True, int(fine.sum())
             reasons |= refused
     for run in np.flatnonzero(~in_lanes).tolist():
-        if run > 0:
-            single(run)
+        if run > 0:  # what was met in short looks is to be met again
+            single(run, (t1 - t0) / LOOKS if reasons.get(run) == WHY[SHORT] else np.inf)
     reasons = {run: reasons.get(run, why) for run in np.flatnonzero(~in_lanes).tolist()}
     if made_by or not why:
         reasons[0] = FIRST
@@ -190,7 +191,7 @@ def _in_lanes(
     new_q, new_v = np.full((2, len(which), system.n_q, len(ends)), np.nan)
     rtol, atol = options["rtol"], options["atol"]
     status, steps, at_end = lanes.make(which, t1, ends, rtol, atol, threads, new_q, new_v)
-    fine = lanes.judge(which, status, t1, float(atol.min()), new_q, new_v, at_end)
+    fine = lanes.judge(which, status, t1, rtol, float(atol.min()), new_q, new_v, at_end)
     allowed = FAR * (atol + rtol * np.abs(q[0, :, -1]))
     if fine[0] and times[-1] == t1 and (np.abs(new_q[0, :, -1] - q[0, :, -1]) > allowed).any():
         raise Untraceable(f"the first run ends elsewhere by itself, {FAR:g} tolerances and more away")

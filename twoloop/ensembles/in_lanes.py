@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from twoloop.checks.arguments import Array
 from twoloop.ensembles.lane_methods import LaneMethod
+from twoloop.ensembles.short_looks import ShortLooks
 from twoloop.ensembles.starts import Starts, generic_parameters, kit_to_write, system_of
 from twoloop.generate.choices import Choice
 from twoloop.generate.time_dependence import may_be_sudden
@@ -22,6 +23,8 @@ PLACES = 100  # of a run, at least as many at which the equations are looked at 
 OF_SUDDEN = 20  # ... times as many where a force may act for a short time: lanes do not look ahead
 SMALLEST, LARGEST = 128, 4096  # runs of a block; numbers of all of a block's runs are made at once
 FOR_EACH = 3  # blocks for each of several threads, so that all end at about the same time
+LOOKS = PLACES * OF_SUDDEN
+SHORT = min(lane_ends.NO_START, lane_ends.UNLIKE) - 1  # beside what lane_ends.py says
 AGREES = 1e-7  # of the terms of an equation: what rounding may leave of it at the end of a run
 
 WHY = {  # a run is left to a run of its own, by what lane_ends.py says of it
@@ -31,6 +34,7 @@ WHY = {  # a run is left to a run of its own, by what lane_ends.py says of it
     lane_ends.OFTEN_REFUSED: "steps are refused again and again (a sudden force, stiff motion, a singular position)",
     lane_ends.MANY_STEPS: "it takes more than 100,000 steps in lanes (stiff, or very fast motion)",
     lane_ends.UNLIKE: "the callbacks do not agree with the code at the end (they branch)",
+    SHORT: "forces or drives change for so short a time that lanes may miss others",
 }
 
 
@@ -54,8 +58,9 @@ class LaneRuns:
 
         self.system, self.starts, self.method, self.kit = system, starts, method, kit_to_write(system)
         generic, varying = generic_parameters(starts.parameters)
-        sudden = any(may_be_sudden(system, ran_on_symbols=True))
-        self.places = PLACES * OF_SUDDEN if sudden else PLACES * method.unseen
+        sudden = may_be_sudden(system, ran_on_symbols=True)
+        self.places = LOOKS if any(sudden) else PLACES * method.unseen
+        self.looks = ShortLooks(system, generic, varying) if sudden.by_time else None
         choice = Choice.at(system_of(system, starts, 0), starts.t0, starts.q[0])
         kind = ("lanes", method.series, method.tableau is None, choice, tuple(varying))  # of which the latest is kept
         make = partial(OwnLanes, system, choice, generic, varying, method.series, method.tableau)
@@ -133,7 +138,15 @@ class LaneRuns:
         return agreed
 
     def judge(
-        self, which: Integers, status: Integers, t1: float, atol: float, q: Array, v: Array, ends: Array
+        self,
+        which: Integers,
+        status: Integers,
+        t1: float,
+        rtol: float,
+        atol: float,
+        q: Array,
+        v: Array,
+        ends: Array,
     ) -> Flags:
         """Of which of these runs all states were found and agree; the status of others says why not."""
         made = status == lane_ends.ENDED
@@ -142,7 +155,13 @@ class LaneRuns:
         status[made & ~found] = lane_ends.NO_STATE
         agreed = self.agree(which, fine, t1, atol, q, v, ends)
         status[fine & ~agreed] = lane_ends.UNLIKE
-        return fine & agreed
+        fine &= agreed
+        if self.looks is not None:
+            times, runs = np.linspace(self.starts.t0, t1, LOOKS + 1), np.flatnonzero(fine)
+            given = self.starts.parameters[which[runs]], q[runs, :, -1], v[runs, :, -1]
+            short = runs[self.looks.meet(times, rtol, *given)]
+            status[short], fine[short] = SHORT, False
+        return fine
 
 
 def _aligned(vectors: int, lanes: int) -> Array:

@@ -30,7 +30,8 @@ class Integrator:
     """A system with a method and tolerances, for many runs one after another, or for one from sample to sample.
 
     What does not change from run to run is made once and kept: plans, machine code, checks of the same start, and for
-    the latest parameters the systems that they make. For thousands of runs at once see `ensemble`.
+    the latest parameters the systems that they make. A copy begins without a motion: give it a `start`. For thousands
+    of runs at once see `ensemble`.
 
     Parameters
     ----------
@@ -148,7 +149,8 @@ class Integrator:
 
         No checks are repeated. Accelerations jump with the inputs, and the method restarts there. Error control is that
         of `run`. As in a run, no step is longer than a hundredth of the time since the start, so the first samples are
-        divided into many steps.
+        divided into many steps. A sample that meets a force too short for its looks is made again, and a
+        `ConstraintWarning` says where earlier samples may have missed one.
 
         Parameters
         ----------
@@ -210,8 +212,16 @@ class Integrator:
             del self._systems[next(iter(self._systems))]
         return kept
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Make copies, also in other processes, that have no motion: two cannot step on in the same arrays."""
+        return _made, (self.system, self._options)
+
     def __repr__(self) -> str:
         told = (self._options[name] for name in ("method", "rtol", "atol"))
         return "<Integrator of {!r}: {}, rtol {}, atol {}>".format(
             self.system.name, *(getattr(x, "name", x) for x in told)
         )
+
+
+def _made(system: ConstrainedSystem, options: dict[str, Any]) -> Integrator:
+    return Integrator(system, **options)

@@ -37,8 +37,11 @@ class OnArrays:
     def __init__(self, graph: Graph, record: Record, parameters: Array):
         self.graph, self.parameters, self._number = graph, parameters, record.on(parameters)
 
-    def evaluate(self, arrays: Iterable[Any], t: float, *states: Array) -> list[Array]:
-        """Arrays of forms as (n_runs, ...), at a time and states (n_runs, n) whose numbers are the graph's inputs."""
+    def evaluate(self, arrays: Iterable[Any], t: float | Array, *states: Array) -> list[Array]:
+        """Arrays of forms as (n_runs, ...), at a time and states (n_runs, n) whose numbers are the graph's inputs.
+
+        t : of shape (n_times, 1) for arrays of shape (n_times, n_runs, ...).
+        """
         arrays = list(arrays)
         values: dict[int, Any] = {0: t}
         for state in states:
@@ -59,10 +62,10 @@ class OnArrays:
                     assert second is not None
                     x = x * value(second)
                 values[i] = FUNCTIONS[kind](x) if kind in FUNCTIONS else x
-            made = []
+            made, shape = [], np.broadcast_shapes(np.shape(t), (len(self.parameters),))
             for array in arrays:
-                out = np.empty((len(self.parameters), *array.shape))
+                out = np.empty((*shape, *array.shape))
                 for place in np.ndindex(array.shape):
-                    out[(slice(None), *place)] = value(array[place])
+                    out[(..., *place)] = value(array[place])
                 made.append(out)
         return made

@@ -236,7 +236,7 @@ def advance(
         if reaches:
             size = goal - t
         may_look = control[at.SPACING] > 0.0 and (control[at.BY_TIME] == 1.0 or size > control[at.SPACING])
-        if (may_look or t < clock[at.SUDDEN] < t + size) and not leaps:
+        if (may_look or t < clock[at.ALONG] < t + size) and not leaps:
             whole, last = size, outputs[outputs.size - 1]
             size = up_to_sudden(f, w, tolerances, control, clock, t, whole, last, state)
             if size < whole:

@@ -98,7 +98,8 @@ class Run:
         self.substituted = False  # whether another plan has taken over, for good
         self.clock[[clock.JUMP_FROM, clock.JUMP_TO, clock.PIVOT_AT_OUTPUT]] = np.inf
         self.near = nearness(rtol)  # pivots at output times below which velocities are looked at
-        self.clock[[clock.ROUGH_TO, clock.LOOKED_TO, clock.ALONG_TO, clock.SUDDEN, clock.FLANK]] = -np.inf
+        looked = clock.LOOKED_TO, clock.ALONG_TO, clock.SUDDEN, clock.ALONG, clock.COMPARED, clock.FLANK
+        self.clock[[clock.ROUGH_TO, *looked]] = -np.inf
         self.clock[clock.BRIEFEST] = np.inf
         ran_on_symbols = any("force" in each.kinds for each in plan.traced)
         self.sudden = Sudden(False, False) if step_size is not None else may_be_sudden(system, ran_on_symbols)

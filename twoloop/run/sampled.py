@@ -32,9 +32,11 @@ from twoloop.run.pace import STAGNATION_STEPS
 from twoloop.run.record import Record, Status
 from twoloop.run.recorder import Wanted
 from twoloop.run.run import Run
+from twoloop.run.short_changes import MOST, closer, may_be_missed, said_of_missed
 
 Array = NDArray[np.float64]
 
+CALLS = 4  # from a warning to who calls step of an integrator
 STEPS = 1024  # in one call of the compiled loop
 FORCES = {"force", "force_by_q", "force_by_v"}
 CHANGED = "the parameters changed at samples"
@@ -104,7 +106,7 @@ class SampledRun:
         self._outputs, self._filled = np.zeros(1), np.zeros(2, dtype=np.int64)
         self._buffers = np.empty(1), np.empty((1, len(self.run.state))), np.empty((STEPS, self.run.a.N_STEP_COLUMNS))
         self.rows, self.times, self.steps = list[Array](), list[float](), list[Array]()
-        self.cpu = 0.0
+        self.cpu, self._every = 0.0, np.inf  # s between two looks, where a sample has met what is short
         self._note(t0)
 
     def _run_from(self, t: float, q: Array, v: Array) -> Run:
@@ -147,16 +149,34 @@ class SampledRun:
         """Go on by dt, and note the state there; after a failure, from the last sample."""
         if self._failed:
             self._return()
+        end, began = self.times[-1] + dt, time.process_time()
+        self._failed = True  # until it is at its end: a callback may raise, too
+        for left in range(MOST, -1, -1):
+            self._go_to(end)
+            run = self.run
+            if left == 0 or not may_be_missed(run):
+                break
+            if len(self.times) > 1:  # samples before may have missed something, and are not made again
+                said_of_missed(run, CALLS)
+            self._every = closer(run)
+            self._return()
+        else:
+            said_of_missed(run, CALLS)
+        self.cpu += time.process_time() - began
+        self._note(end)
+        return self.state
+
+    def _go_to(self, end: float) -> None:
+        """Steps from the last sample to the end of the next one."""
         run, a, clock = self.run, self.run.a, self.run.clock
-        t = self.times[-1]
-        end = t + dt
-        began = time.process_time()
-        code, self._failed = a.PAUSED, True  # until it is at its end: a callback may raise, too
+        t, code = self.times[-1], self.run.a.PAUSED
         if self._changed or self.system.called_in_python:  # what such functions find in their surroundings may change
             code = self._begin_anew(t)
         run.look_within(end - self.t0)
+        if self._every < run.apart:
+            run.look_every(self._every)
         self._outputs[0], clock[a.NEXT_OUTPUT], clock[a.T_START], clock[a.N_FIXED] = end, 0.0, t, 0.0
-        run.control[a.MAX_ATTEMPTS], clock[a.PIVOT_AT_OUTPUT] = STEPS, np.inf
+        run.control[run.a.MAX_ATTEMPTS], clock[a.PIVOT_AT_OUTPUT] = STEPS, np.inf
         steps = self._buffers[2]
         before = run.attempts()
         while code == a.PAUSED and run.attempts() - before < STAGNATION_STEPS:  # then it is seen whether it gets there
@@ -170,9 +190,6 @@ class SampledRun:
             self._by_course(end)
         else:
             said_of_end(run)
-        self.cpu += time.process_time() - began
-        self._note(end)
-        return self.state
 
     @property
     def state(self) -> SampledState:

@@ -31,8 +31,11 @@ def closer(run: "Run") -> float:
     return float(max(clock[a.BRIEFEST] / CLOSER, clock[a.WIDEST_LOOK] / MOST_CLOSER))
 
 
-def said_of_missed(run: "Run") -> str:
-    """A warning, and the sentence, of a run that succeeded, and is not made again, but may have missed something."""
+def said_of_missed(run: "Run", calls: int = 5) -> str:
+    """A warning, and the sentence, of a run that succeeded, and is not made again, but may have missed something.
+
+    calls : from here to who has called.
+    """
     if not may_be_missed(run, SEEN):
         return ""
     a, clock = run.a, run.clock
@@ -41,5 +44,5 @@ def said_of_missed(run: "Run") -> str:
         f"at every {clock[a.WIDEST_LOOK]:.2g} s only, where steps are long: other changes as short may have been "
         f"missed. Give max_step, at most {clock[a.BRIEFEST]:.2g}"
     )
-    warnings.warn(said, ConstraintWarning, stacklevel=5)
+    warnings.warn(said, ConstraintWarning, stacklevel=calls)
     return f" {said[0].upper()}{said[1:]}."

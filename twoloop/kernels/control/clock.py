@@ -70,10 +70,12 @@ H, ERRORS, FAILURES, PARTITIONS, JACOBIANS, N_STEP_COLUMNS = range(6)
     LOOKED_EVERY,  # s, of the times of the last such look
     WIDEST_LOOK,  # the widest of these
     SUDDEN,  # where the next one is that is sudden
+    ALONG,  # the same along the way
+    COMPARED,  # where it was last compared with what is before and behind
     FLANK,  # when a value changed suddenly
     BRIEFEST,  # s, the shortest time between two such changes
     ALONG_TO,  # up to where they were looked for along the way
     LOOKING,  # 1: while callbacks are called along the way, at states to which the motion may not come
     PIVOT_AT_OUTPUT,  # the smallest pivot where steps had to end: output times, a grid; see least_pivot in partition.py
     N_CLOCK,
-) = range(N_PAST, N_PAST + 26)
+) = range(N_PAST, N_PAST + 28)

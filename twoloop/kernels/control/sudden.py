@@ -8,7 +8,8 @@ these times are looked at along the parabola on which the motion sets out: each 
 that end within LONG spacings. Ahead of others the state stays that where the step begins.
 
 Of what may change suddenly with time, these times are also no further apart than a share of the step. The shortest time
-between two changes is kept: what is as short may have been missed where these times were further apart.
+between two changes is kept, and the shortest for which a value differs from those before and behind: what is as short
+may have been missed where these times were further apart.
 """
 
 import numpy as np
@@ -31,6 +32,8 @@ HALVINGS = 20  # to find when a value changes between two looks ...
 SAME = 1e-5  # ... of the widest ones: changes that are closer are one
 SOON = 5e-5  # of a hundredth of the run: before, a force that begins at zero, as 1 - cos(t), changes by rounding
 STEEPER = 2.0  # times the changes before and after: the flank of a pulse, and not a slope
+SHORT = 0.5  # of the longest of the last steps: below, something has happened that made steps shorter
+IN_SHORT = 4  # looks within such a step
 NEARLY = 0.01  # of the spacing of these times: before a sudden change by that is at it
 LARGEST = PLACES + 1  # row of w.changes behind those of the values
 MIDDLE = PLACES + 2  # row of w.changes for values between two looks
@@ -58,7 +61,18 @@ def _largest(values):
 
 
 @compiled
-def _first_bend(values, n, slope, least):
+def _is_smooth(values, k, n):
+    """Whether the second difference at place k of n + 1 values is about that at the next place, or the one before."""
+    other = k + 1 if k + 2 <= n else k - 1
+    if other < 1:
+        return False
+    here = values[k + 1] - 2.0 * values[k] + values[k - 1]
+    there = values[other + 1] - 2.0 * values[other] + values[other - 1]
+    return here * there > 0.0 and abs(there) > 0.5 * abs(here)
+
+
+@compiled
+def _bend(values, n, slope, least, within):
     """The first place where the second difference of n + 1 values, less a line, is sudden, else 0; and what is so."""
     low = high = 0.0
     for k in range(1, n + 1):
@@ -67,9 +81,22 @@ def _first_bend(values, n, slope, least):
     sudden = SHARE * (high - low)
     if high - low > least:
         for k in range(1, n):
-            if abs(values[k + 1] - 2.0 * values[k] + values[k - 1]) > sudden:
+            second = values[k + 1] - 2.0 * values[k] + values[k - 1]
+            if abs(second) > sudden and not (within and _is_smooth(values, k, n)):
                 return k, sudden
     return 0, sudden
+
+
+@compiled
+def _first_bend(values, n, along, least):
+    """The same of the whole, less the line to its end if `along`, and then of what is before: that may be smaller."""
+    place, sudden = _bend(values, n, along * (values[n] - values[0]) / max(n, 1), least, False)
+    while place > 1:  # few values may bend as much as that, and smoothly
+        before, share = _bend(values, place, along * (values[place] - values[0]) / place, least, True)
+        if before == 0:
+            break
+        place, sudden = before, share
+    return place, sudden
 
 
 @compiled
@@ -143,8 +170,7 @@ def sudden_time(f, w, tolerances, clock, t, begin, spacing, last, along, q, v, a
     bend, column, sudden = n, -1, 0.0
     for j in range(changes.shape[1]):
         values = changes[:, j]
-        slope = along * (values[n] - values[0]) / max(n, 1)
-        place, least = _first_bend(values, n, slope, of_forces if j < q.size else of_rates)
+        place, least = _first_bend(values, n, along, of_forces if j < q.size else of_rates)
         if 0 < place < bend:
             bend, column, sudden = place, j, least
     if column >= 0:
@@ -152,6 +178,32 @@ def sudden_time(f, w, tolerances, clock, t, begin, spacing, last, along, q, v, a
         if along == 0.0:
             _keep_flanks(f, w, tolerances, clock, t, begin, spacing, n, bend, column, sudden, q, v, a)
     return first, min(first, begin + PLACES * spacing if n == PLACES else last)
+
+
+@compiled
+def _keep_brief(f, w, tolerances, control, clock, t, size, last, q, v, a):
+    """Keep how long a value in a step differs from those before and behind: short steps have met it, and not looks."""
+    changes, wide, begin, end = w.changes, control[at.APART], clock[at.T_START], t + size
+    clock[at.COMPARED] = t
+    if end + wide > last or (t - 2.0 * wide < begin and end + 2.0 * wide > last):
+        return
+    for k, time in enumerate((t - 2.0 * wide, t - wide, end + wide, end + 2.0 * wide)):
+        _call(f, w, min(max(time, begin), last), 0.0, q, v, a, changes[k + (k > 1)])
+    least = LEAST * tolerances[RTOL]
+    of_forces = max(FLOOR, least * _largest(changes[LARGEST, : q.size]))
+    of_rates = max(FLOOR, least * _largest(changes[LARGEST, q.size :]))
+    for k in range(IN_SHORT):
+        time = t + k * size / IN_SHORT
+        _call(f, w, time, 0.0, q, v, a, changes[2])
+        for j in range(changes.shape[1]):
+            values = changes[:, j]
+            low = min(min(values[0], values[1]), min(values[3], values[4]))
+            high = max(max(values[0], values[1]), max(values[3], values[4]))
+            beyond = max(values[2] - high, low - values[2])
+            if beyond > max(STEEPER * (high - low), of_forces if j < q.size else of_rates):
+                first = _flank(f, w, t, max(t - wide, begin), time, 1, j, q, v, a)
+                second = _flank(f, w, t, time, end + wide, 2, j, q, v, a)
+                clock[at.BRIEFEST] = min(clock[at.BRIEFEST], second - first)
 
 
 @compiled
@@ -163,11 +215,14 @@ def _look_along(f, w, tolerances, control, clock, spacing, t, size, last, q, v, 
     clock[at.LOOKING] = 1.0
     first, clock[at.ALONG_TO] = sudden_time(f, w, tolerances, clock, t, t, way / PLACES, last, 1.0, q, v, a)
     clock[at.LOOKING] = 0.0
-    if way <= PLACES * min(control[at.APART], size / IN_A_STEP):  # as close as looks in time alone
-        clock[at.LOOKED_TO], clock[at.LOOKED_EVERY] = max(clock[at.LOOKED_TO], min(first, t + way)), way / PLACES
+    known = clock[at.LOOKED_TO] == clock[at.SUDDEN] > t  # by closer looks, which are to go on there
+    if not known and way <= PLACES * min(control[at.APART], size / IN_A_STEP):  # as close as looks in time alone
         clock[at.WIDEST_LOOK] = max(clock[at.WIDEST_LOOK], way / PLACES)
-    if first < clock[at.SUDDEN] or clock[at.SUDDEN] <= t + NEARLY * spacing:
-        clock[at.SUDDEN] = first
+        if clock[at.ALONG_TO] > clock[at.LOOKED_TO]:
+            clock[at.LOOKED_TO], clock[at.LOOKED_EVERY] = clock[at.ALONG_TO], way / PLACES
+            clock[at.SUDDEN] = first
+    if first < clock[at.ALONG] or clock[at.ALONG] <= t + NEARLY * spacing:
+        clock[at.ALONG] = first
 
 
 @compiled
@@ -198,11 +253,16 @@ def up_to_sudden(f, w, tolerances, control, clock, t, size, last, state):
     shortest = (1.0 if control[at.BY_STATE] == 1.0 else LONG) * spacing
     if control[at.AHEAD] == 1.0 and shortest < size < (PLACES + NEARLY) * spacing:
         _look_along(f, w, tolerances, control, clock, spacing, t, size, last, q, v, a)
-    known = clock[at.SUDDEN] if clock[at.SUDDEN] > t + NEARLY * min(spacing, size / IN_A_STEP) else np.inf
+    near = t + NEARLY * min(spacing, size / IN_A_STEP)
+    known = clock[at.SUDDEN] if clock[at.SUDDEN] > near else np.inf
+    along = clock[at.ALONG] if clock[at.ALONG] > near else np.inf
     at_change = known == np.inf and clock[at.SUDDEN] == clock[at.LOOKED_TO] > -np.inf
-    if at_change and size <= (1.0 + NEARLY) * clock[at.LOOKED_EVERY]:
-        return size  # up to the end of a run, where looks within shorter and shorter rests would find the change anew
-    if control[at.BY_TIME] == 1.0:
+    # not up to the end of a run, where looks within shorter and shorter rests would find the change anew
+    if control[at.BY_TIME] == 1.0 and not (at_change and size <= (1.0 + NEARLY) * clock[at.LOOKED_EVERY]):
         known = _ahead(f, w, tolerances, control, clock, known, t, size, last, q, v, a)
-    clock[at.SUDDEN] = known
-    return min(size, representable(t, known - t))
+        clock[at.SUDDEN] = known
+    size = min(size, representable(t, min(known, along) - t))
+    is_short = size < SHORT * clock[at.H_LONG] or t < clock[at.T_START] + 2.0 * control[at.APART]
+    if control[at.BY_TIME] == 1.0 and is_short and size < control[at.APART] and clock[at.COMPARED] < t:
+        _keep_brief(f, w, tolerances, control, clock, t, size, last, q, v, a)
+    return size

@@ -8,10 +8,11 @@ from twoloop.kernels.control.predictor import departure
 from twoloop.kernels.data.codes import DONE, OUTER_DIVERGED
 from twoloop.kernels.data.common import ATTEMPT, Attempt, Step, compiled, kernel, merged
 from twoloop.kernels.data.counters import N_OUTER
-from twoloop.kernels.data.tolerances import ATOL, ESTIMATE, RTOL
+from twoloop.kernels.data.tolerances import ATOL, ESTIMATE, GAP, RTOL
 from twoloop.kernels.evaluation.calls import evaluate_state, rounding_floor
 
 MAX_ITERATIONS = 60
+GROWN = 2.0  # times the size before a step
 TINY = 1e-300  # a mechanism at rest at the origin has neither size nor rate
 
 # places in `memory` before the new accelerations
@@ -29,10 +30,11 @@ def _largest(x, least):
 
 
 @compiled
-def _rate(memory, q, v, a, q1, v1, a1):
+def _rate(memory, gap, q, v, a, q1, v1, a1):
     """Reciprocal of the time in which velocities and accelerations change the coordinates as a whole.
 
-    Of the largest of each so far: at one time alone, coordinates are near zero wherever the origin is.
+    Of the largest of each so far: at one time alone, coordinates are near zero wherever the origin is. Where most of
+    their size comes of this step, as from rest at the origin, it says nothing of that time, which is `gap` then.
     """
     memory[SIZE] = _largest(q, memory[SIZE])
     memory[SPEED] = _largest(v, memory[SPEED])
@@ -40,7 +42,8 @@ def _rate(memory, q, v, a, q1, v1, a1):
     size = _largest(q1, memory[SIZE])
     if size == 0.0:
         return 0.0
-    return max(_largest(v1, memory[SPEED]) / size, np.sqrt(_largest(a1, memory[ACCELERATION]) / size))
+    rate = max(_largest(v1, memory[SPEED]) / size, np.sqrt(_largest(a1, memory[ACCELERATION]) / size))
+    return min(rate, 1.0 / gap) if size > GROWN * memory[SIZE] else rate
 
 
 @compiled
@@ -89,7 +92,7 @@ def newmark_step(f, w, options, memory, t, h, tolerances, state, new_state):
         if change <= options[OUTER_TOL] or (change >= before and change <= rounding_floor(q)):
             error = 0.0
             if tolerances[ESTIMATE] == 1.0:
-                rate = _rate(memory, q, v, a, q1, v1, a1)
+                rate = _rate(memory, tolerances[GAP], q, v, a, q1, v1, a1)
                 error = _error(options, tolerances, rate, h, q, v, a, a1)
                 if options[ERROR_TOL] == 0.0:  # not in the paper
                     for k in range(w.dependent.size):
