@@ -318,7 +318,7 @@ def test_a_gust_shorter_than_a_look_is_a_rate_over_random_times():
     assert gusts["widths"] == [1e-3, 1e-2] and found["short"]["pulse"]["n"] == 0
     some, none = {"n": 2, "gross": 1, "widths": [1e-3]}, {"n": 1, "gross": 0, "widths": [1e-2]}
     assert gusts["default"] == {"some": some, "none": none}
-    assert "| the default | 1/2 | 0/1 |" in text and "| LSODA, index 1 | 1/1 | – |" in text
+    assert "| the default | 1/2 | 0/1 |" in text and "| SciPy, LSODA, index 1 | 1/1 | – |" in text
     assert "## Short forces" not in said(honesty, rows)[1]
 
 

@@ -107,7 +107,7 @@ def test_findings_turn_with_the_rows():
     found = said(validation, made_up(where=[("double pendulum", "LSODA, index 1")], what=refused))[0]
     assert alone_of(found) == {"double pendulum": {"not run": ["LSODA, index 1"]}}
     found, text = said(validation, made_up(where=[("double pendulum", "LSODA, index 1")], what=wrong))
-    assert "| wrong | 0 | 4 |\n\nOf the 4, 2 are at 1e-8 or tighter and 2 at looser tolerances." in text
+    assert "| wrong | 0 | 4 |\n\nOf the 4, 2 are at 1e-8 or tighter and 2 at looser tolerances, which bound" in text
     assert alone_of(found) == {"double pendulum": {"wrong": ["LSODA, index 1"]}}
     assert found["n_ended"] == {"ours": 16, "others": 8}
     stopped = stopped | {"status": "TIME_LIMIT"}
@@ -123,7 +123,7 @@ def test_a_solver_that_was_run_and_was_inexact_is_not_called_one_that_was_not_ru
     inexact = {"outcome": "inexact", "error_q": 2e-5, "digits_q": 4.7}
     _, text = said(validation, made_up(where=[("double pendulum", "LSODA, index 1")], what=inexact))
     ours = '- On double pendulum only ours are right: `method="Gauss12"` and `method="BDF"`. The others are inexact: '
-    assert ours + "`LSODA, index 1` (2e-5).\n" in text and "not run" not in text
+    assert ours + "`SciPy, LSODA, index 1` (2e-5).\n" in text and "not run" not in text
 
 
 def test_cells_that_are_no_failures_are_hatched():
@@ -182,7 +182,7 @@ def test_findings_of_steps_and_of_models_follow_their_rows():
     cells = [
         line.strip("| ").split(" | ") for line in text.split("| deceived (%) |\n")[1].split("\n\n")[0].splitlines()[1:]
     ]
-    assert {line[0]: line[-1] for line in cells} == {"Gauss12": "–", "BDF": "0", "LSODA, index 1": "–"}
+    assert {line[0]: line[-1] for line in cells} == {"Gauss12": "–", "BDF": "0", "SciPy, LSODA, index 1": "–"}
     assert found["models"]["orders"] == pytest.approx([2.0, 2.0]) and "converging at orders of 2.0 (theirs" in text
     found = said(validation, pd.concat([made_up(), pd.DataFrame([first | {"first_step": 0.5}])]))[0]
     assert found["models"] is None
