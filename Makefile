@@ -87,10 +87,12 @@ compile: install ## compile the kernels, and the callbacks of bodies, mechanisms
 	@$(RUN) -c "from studies.bench import sharp_callbacks" & \
 	$(RUN) -c "from twoloop.mechanisms import *; from studies.honesty import traps" && wait $$!
 
-# files in the order of their names: sorted by how many tests they have, long ones with few tests would come last
+# the callbacks of tests are compiled before: both workers would do that. Files
+# in the order of their names: sorted by how many tests they have, long ones with few tests would come last
 SHARED := -n 2 --dist loadfile --no-loadscope-reorder
 
 test: compile ## the tests, on two cores; ARGS="-m ''" takes the slow ones too
+	@$(RUN) -c "import tests.compiled, tests.problems, tests.test_families, tests.test_bounds, tests.test_what_is_kept"
 	$(RUN) -m pytest $(SHARED) $(ARGS)
 
 # other rounding: no fused operations, and kernels of OpenBLAS for an old processor; a numba cache of its own, as below

@@ -9,7 +9,7 @@ from scipy.special import ellipj
 
 from tests.compiled import PENDULUM
 from twoloop import ConstrainedSystem, solve_dae
-from twoloop.kernels.compile.caches import compile_kept
+from twoloop.kernels.compile.caches import compile_kept, kept_when_called
 from twoloop.kernels.compile.linking import KernelCompiler
 from twoloop.kernels.data.common import OPTIONS, stamp
 from twoloop.kernels.data.flags import FORCE_BY_Q_GIVEN
@@ -113,9 +113,9 @@ def kit_of(system):
 
 @cache
 def entry(helper):
-    """A helper of the kernels, which has no entry from Python, as a function of Python's."""
+    """A helper of the kernels, which has no entry from Python, as a function of Python's; its machine code is kept."""
 
-    @njit
+    @kept_when_called()
     def call(arguments):
         return helper(*arguments)
 

@@ -222,6 +222,14 @@ def test_closures_are_kept_by_what_they_enclose():
     assert scaled(1.0, named)._cache.cache_path is not None
 
 
+def test_a_closure_that_another_encloses_is_not_compiled_again():
+    inner = scaled(2.0, njit(lambda x: x))
+    assert inner(1.0) == 2.0
+    before = list(inner.overloads.values())
+    assert scaled(3.0, inner)(1.0) == 6.0 and list(inner.overloads.values()) == before
+    assert len(list(inner._cache._cache_file._all())) == 1  # nor is its machine code removed from the disk
+
+
 OPEN_FILES = (object(),)
 SYMBOL = """
 import sys

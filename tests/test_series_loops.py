@@ -32,7 +32,7 @@ MECHANISMS = [
     mechanisms.heavy_top,
     mechanisms.spatial_slider_crank,
     mechanisms.rolling_disc,
-    mechanisms.governor,
+    pytest.param(mechanisms.governor, marks=pytest.mark.slow),  # in space, too, as are three of the others
     mechanisms.moderately_stiff_beam,
 ]
 

@@ -1,6 +1,6 @@
 """Two-loop state-space integration of constrained mechanical systems, M q'' + C_q^T lam = Q, C(q, t) = 0.
 
-The names are imported when the first of them is asked for, so that `twoloop.testing` does without numba and SciPy.
+A name is imported when it is asked for: `twoloop.testing` does without numba and SciPy, and `callback` without solvers.
 """
 
 from importlib import import_module
@@ -47,12 +47,42 @@ __all__ = [
     "sweep",
 ]
 
+_NAMES_OF = {
+    "checks.consistency": ("ConstraintWarning",),
+    "ensembles.consistent_states": ("consistent_states",),
+    "ensembles.ensemble": ("ensemble",),
+    "ensembles.integrator": ("Integrator",),
+    "ensembles.runs": ("Runs",),
+    "impacts.motion": ("solve_with_stops",),
+    "impacts.stick_slip": ("solve_with_friction",),
+    "kernels.compile.callbacks": ("callback",),
+    "methods.bdf": ("BDF",),
+    "methods.dop853": ("DOP853",),
+    "methods.esdirk": ("ESDIRK",),
+    "methods.newmark": ("Newmark",),
+    "methods.presets": ("paper_irk", "paper_newmark"),
+    "methods.runge_kutta": ("RungeKutta",),
+    "methods.taylor": ("Taylor",),
+    "problem.drawing": ("Drawing",),
+    "problem.joints": ("Joint",),
+    "problem.stops": ("Stop",),
+    "problem.system": ("ConstrainedSystem",),
+    "result.certificate": ("Certificate", "CertificateWarning"),
+    "result.citations": ("citation",),
+    "result.loading": ("load",),
+    "result.result": ("Result",),
+    "run.projection": ("ConsistentState", "consistent_state"),
+    "run.record": ("Statistics", "Status"),
+    "solve": ("solve_dae",),
+    "sweeps.sweep": ("sweep",),
+}
+_PLACES = {name: f"twoloop.{module}" for module, names in _NAMES_OF.items() for name in names}
+
 
 def __getattr__(name: str) -> Any:
-    if name in __all__:
-        exported = import_module("twoloop.exported")
-        globals().update({each: getattr(exported, each) for each in __all__})
-        return globals()[name]
+    if name in _PLACES:
+        globals()[name] = found = getattr(import_module(_PLACES[name]), name)
+        return found
     if not name.startswith("_") and find_spec(f"twoloop.{name}") is not None:
         return import_module(f"twoloop.{name}")
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -148,7 +148,7 @@ def matrix_of(mass: Dispatcher) -> Callable[..., Any]:
     return mass_at  # type: ignore[no-any-return]
 
 
-@njit(**OPTIONS)
+@kept  # called from Python, too
 def saddle_solve(M, Cq, a, lam):  # type: ignore[no-untyped-def]
     """Solve eq. (6) as a whole; Q in a is overwritten by the accelerations, Q_d in lam by the multipliers.
 

@@ -23,7 +23,7 @@ def compiled_now(signature: Any) -> Callable[[Callable[..., Any]], Any]:
 kept = kept_when_called(**OPTIONS)
 
 
-@njit(**OPTIONS)
+@kept  # called from Python, too
 def cholesky(A, lost=0.0):  # type: ignore[no-untyped-def]
     """Overwrite the lower half of A with its Cholesky factor, with reciprocal pivots; return whether A is definite.
 

@@ -5,13 +5,16 @@ partitions, and the integrator is a different one.
 """
 
 import math
+from collections.abc import Callable
+from functools import lru_cache
 
 import numpy as np
-from numba import njit
+from numba.core.dispatcher import Dispatcher
 from numpy.typing import ArrayLike
 from scipy.integrate import solve_ivp
 
 from references.driver import check_problem
+from references.equations.linear import kept
 from twoloop.checks.arguments import check_positive, check_times
 from twoloop.mechanisms import Problem
 from twoloop.problem.problem import Array
@@ -40,11 +43,11 @@ def reduced_motion(problem: Problem, t_eval: ArrayLike, tol: float) -> tuple[Arr
     times = check_times(t_eval, 0.0, float(np.max(t_eval, initial=0.0)), None)
     amplitude, frequency = (float(problem.parameters[name]) for name in ("amplitude", "angular_frequency"))
     system, n = problem.system, problem.system.n_q
-    force, p, M = system.functions.force, system.functions.p, system.mass(0.0, problem.q0)
+    own, p, M = _rate_of(system.functions.force), system.functions.p, system.mass(0.0, problem.q0)
     fixed = np.linalg.inv(M[2:, 2:]), M[2:, 0].copy(), amplitude, frequency
 
     def rate(t: float, y: Array) -> Array:
-        return _rate(t, y, force, p, fixed)  # type: ignore[no-any-return]
+        return own(t, y, p, fixed)
 
     y0, run = np.concatenate([problem.q0[2:], problem.v0[2:]]), f"DOP853 with rtol = atol = {tol:g} on {problem.name}"
     if not np.isfinite(rate(0.0, y0)).all():  # SciPy would try a first step of NaN forever
@@ -57,15 +60,20 @@ def reduced_motion(problem: Problem, t_eval: ArrayLike, tol: float) -> tuple[Arr
     return q, np.vstack([amplitude * frequency * np.cos(phase), zero, solution.y[n - 2 :]])
 
 
-@njit
-def _rate(t, y, force, p, fixed):  # type: ignore[no-untyped-def]
-    """Return y' of y = [q, v] without the coordinates of the base."""
-    inverse, coupling, amplitude, frequency = fixed
-    n = coupling.size + 2
-    q, v, Q = np.zeros(n), np.zeros(n), np.zeros(n)
-    q[0], q[2:] = amplitude * math.sin(frequency * t), y[: n - 2]
-    force(t, q, v, p, Q)
-    out = np.empty_like(y)
-    out[: n - 2] = y[n - 2 :]
-    out[n - 2 :] = inverse @ (Q[2:] + coupling * amplitude * frequency**2 * math.sin(frequency * t))
-    return out
+@lru_cache(maxsize=8)
+def _rate_of(force: Dispatcher) -> Callable[..., Array]:
+    """Return (t, y, p, fixed) -> y' of y = [q, v] without the coordinates of the base."""
+
+    @kept
+    def rate(t, y, p, fixed):  # type: ignore[no-untyped-def]
+        inverse, coupling, amplitude, frequency = fixed
+        n = coupling.size + 2
+        q, v, Q = np.zeros(n), np.zeros(n), np.zeros(n)
+        q[0], q[2:] = amplitude * math.sin(frequency * t), y[: n - 2]
+        force(t, q, v, p, Q)
+        out = np.empty_like(y)
+        out[: n - 2] = y[n - 2 :]
+        out[n - 2 :] = inverse @ (Q[2:] + coupling * amplitude * frequency**2 * math.sin(frequency * t))
+        return out
+
+    return rate  # type: ignore[no-any-return]

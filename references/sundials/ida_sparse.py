@@ -11,14 +11,13 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numba.core.dispatcher import Dispatcher
 from numpy.typing import NDArray
 from scipy.sparse import bmat, coo_array, csc_array, eye_array
 
 from references.driver import CAUSES, Deferred, Task, TimeLimit, adapter, user_call
 from references.equations.least_norm import accelerations
-from references.equations.linear import OPTIONS
+from references.equations.linear import kept
 from references.sundials.loop import SMALLEST_STEP
 from references.sundials.residual import DIFFERENCE
 from twoloop.problem.system import ConstrainedSystem
@@ -111,7 +110,7 @@ def _residual_of(
 ) -> Callable[..., None]:
     """Return (n_q, t, y, y', p, rows and columns of M and C_q, workspaces for their values, res) -> None."""
 
-    @njit(**OPTIONS)
+    @kept
     def residual(n, t, y, yp, p, rows, columns, row_of, column_of, M, G, res):  # type: ignore[no-untyped-def]
         m = y.size // 2 - n
         q, v, Lam, Mu = y[:n], y[n : 2 * n], yp[2 * n : 2 * n + m], yp[2 * n + m :]
@@ -138,7 +137,7 @@ def _residual_of(
 def _matrix_of(residual: Callable[..., None]) -> Callable[..., None]:
     """Return the same with cj after t, and groups, pointers, rows and values of the columns: dF/dy + cj dF/dy'."""
 
-    @njit(**OPTIONS)
+    @kept
     def matrix(n, t, cj, y, yp, p, r, c, r_of, c_of, M, G, groups, begin, rows, values):  # type: ignore[no-untyped-def]
         there, moved = np.zeros_like(y), np.zeros_like(y)
         residual(n, t, y, yp, p, r, c, r_of, c_of, M, G, there)

@@ -9,14 +9,18 @@ from tests.mechanisms.make_references import solution
 METHODS = ("Gauss12", "DOP853", "Adams")
 DIGITS = {"Adams": 1e-8}  # its errors are up to a hundred times the tolerance
 CONSERVATIVE = [name for name in REGULAR if mechanism(name).energy is not None]
-# by Gauss12 these take seconds each; others in space, of redundant rows and of rows of velocities do not
-LONG = ("spatial slider-crank", "A05 governor", "A04 Bricard", "wobbling disc, redundant")
+# these take seconds each, and Adams' method runs them all; others in space, with redundant rows or with rows of
+# velocities do not
+LONG = {
+    "Gauss12": ("spatial slider-crank", "A05 governor", "A04 Bricard", "wobbling disc, redundant"),
+    "DOP853": ("spatial slider-crank", "A05 governor"),
+}
 
 
 def of_each(names):
     """Every method with every mechanism."""
     pairs = [
-        pytest.param(name, method, marks=[pytest.mark.slow] * (method == "Gauss12" and name in LONG))
+        pytest.param(name, method, marks=[pytest.mark.slow] * (name in LONG.get(method, ())))
         for name in names
         for method in METHODS
     ]

@@ -174,7 +174,8 @@ class KnownProblem:
 def solved(M: Array, Q: Array, J: Array, right: Array) -> tuple[Array, Array]:
     """Return the solution a, lam of M a + J^T lam = Q, J a = right, with minimum norm of lam."""
     n, m = J.shape[1], J.shape[0]
-    matrix = np.block([[M, J.T], [J, np.zeros((m, m))]])
+    matrix = np.zeros((n + m, n + m))
+    matrix[:n, :n], matrix[:n, n:], matrix[n:, :n] = M, J.T, J
     scale = np.ones(n + m)
     for _ in range(5):  # equilibration (Ruiz 2001), so that ranks do not depend on units
         size = np.abs(scale[:, None] * matrix * scale).max(axis=1)

@@ -101,8 +101,11 @@ class PlanarEquations:
         for body, point, sign in ((i, a, 1.0), (j, b, -1.0)):
             if body != GROUND:
                 x, y = self._arm(q, body, point)
-                J[:, 3 * body : 3 * body + 2] += sign * np.eye(2)
-                J[:, 3 * body + 2] += sign * np.array([-y, x])
+                k = 3 * body
+                J[0, k] += sign
+                J[1, k + 1] += sign
+                J[0, k + 2] -= sign * y
+                J[1, k + 2] += sign * x
         return J
 
     def mass(self, t: float, q: Array) -> Array:

@@ -196,6 +196,7 @@ def kept_when_called(**options: Any) -> Callable[[Callable[..., Any]], Dispatche
         watched = watch(function)
         dispatcher = njit(**options)(named_apart(function, watched))
         if watched is not None:
+            _AS_COMPILED[dispatcher] = watched  # so that a closure around it does not compile it again
             with suppress(RuntimeError):  # there is no folder that can be written
                 dispatcher._cache = _Cache(dispatcher.py_func, *watched, "")
         return dispatcher
