@@ -23,19 +23,21 @@ def main(words: Sequence[str] | None = None) -> None:
     if not names or set(names) - set(GROUPS):
         raise StudyError(f"give groups of traps, of {', '.join(map(repr, GROUPS))}; given {names}")
     with Output(cli.parse("honesty", __doc__, [])) as output:
-        rows, line = output.load_rows()
-        new = make(output, names).assign(processor=cli.processor())
-        said = f"{', '.join(names)}: commit {cli.commit()}, {cli.processor()}"
-        output.save_rows(pd.concat([rows[~rows["group"].isin(names)], new], ignore_index=True), told(line, said))
+        rows, _ = output.load_rows()
+        new = make(output, names).assign(processor=cli.processor(), commit=cli.commit())
+        rows = pd.concat([rows[~rows["group"].isin(names)], new], ignore_index=True)
+        output.save_rows(rows, told(cli.stamp("python -m studies.honesty"), rows, cli.commit()))
 
 
-def told(line: str, said: str) -> str:
-    """A stamp with what is said of parts of the rows beside their commit."""
-    parts = line.split("; ")
-    place = next(k for k, part in enumerate(parts) if part.startswith("commit "))
-    before, _, others = parts[place].partition(" (")
-    parts[place] = f"{before} ({'; '.join([*filter(None, [others.removesuffix(')')]), said])})"
-    return "; ".join(parts)
+def told(stamp: str, rows: pd.DataFrame, commit: str) -> str:
+    """A stamp that names the groups of rows of other commits beside its own."""
+    apart: dict[str, list[str]] = {}
+    for group, own in rows.groupby("group", sort=False):
+        made = own.reindex(columns=["commit", "processor"]).fillna("not kept").iloc[0]
+        if made["commit"] != commit:
+            apart.setdefault(f"commit {made['commit']}, {made['processor']}", []).append(str(group))
+    others = "; ".join(f"{', '.join(groups)}: {which}" for which, groups in apart.items())
+    return stamp.replace(f"commit {commit}", f"commit {commit} ({others})", 1) if others else stamp
 
 
 if __name__ == "__main__":

@@ -322,12 +322,13 @@ def test_a_gust_shorter_than_a_look_is_a_rate_over_random_times():
     assert "## Short forces" not in said(honesty, rows)[1]
 
 
-def test_groups_that_were_run_again_stand_beside_the_commit_of_the_others():
-    line = "`python -m studies.honesty`; 2026-11-26; commit abc; AMD EPYC, 2 cores"
-    once = told(line, "short: commit def, Xeon")
-    assert once == "`python -m studies.honesty`; 2026-11-26; commit abc (short: commit def, Xeon); AMD EPYC, 2 cores"
-    assert "; commit abc (short: commit def, Xeon; held out: commit g, Xeon); " in told(
-        once, "held out: commit g, Xeon"
+def test_groups_of_other_commits_stand_beside_that_of_the_newest_rows():
+    stamp = "`python -m studies.honesty`; 2026-11-26; commit abc; AMD EPYC, 2 cores"
+    rows = pd.DataFrame(
+        {"group": ["input", "short", "force"], "commit": ["abc", "def", "def"], "processor": "Xeon (6)"}
     )
+    assert told(stamp, rows[:1], "abc") == stamp
+    assert told(stamp, rows, "abc") == stamp.replace("abc", "abc (short, force: commit def, Xeon (6))")
+    assert "commit abc (input: commit not kept, not kept)" in told(stamp, rows[["group"]][:1], "abc")
     with pytest.raises(StudyError, match="give groups of traps"):
         again.main(["long"])
