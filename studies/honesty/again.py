@@ -33,7 +33,7 @@ def told(stamp: str, rows: pd.DataFrame, commit: str) -> str:
     """A stamp that names the groups of rows of other commits beside its own."""
     apart: dict[str, list[str]] = {}
     for group, own in rows.groupby("group", sort=False):
-        made = own.reindex(columns=["commit", "processor"]).fillna("not kept").iloc[0]
+        made = own.reindex(columns=["commit", "processor"]).astype(object).fillna("not kept").iloc[0]
         if made["commit"] != commit:
             apart.setdefault(f"commit {made['commit']}, {made['processor']}", []).append(str(group))
     others = "; ".join(f"{', '.join(groups)}: {which}" for which, groups in apart.items())
