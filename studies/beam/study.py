@@ -85,6 +85,8 @@ def at(runs: pd.DataFrame, error: float) -> dict[str, Any]:
     own = runs["family"] == "two-loop"
     sides = tables.costs_at(runs[own], error), tables.costs_at(runs[~own], error, doubt=True)
     found["verdict"] = tables.compared(*sides)["verdict"]
+    if found["verdict"] in ("ahead", "behind"):  # of the two sides: ties are within one of them then
+        runs = runs[own if found["best"]["ours"] else ~own]
     found["ties"] = _ties(tables.costs_at(runs, error), found["best"]["solver"]) if found["best"] else []
     found |= dict.fromkeys(("others_over_ours", "paper_over_best"))
     if found["others"] is not None and found["ours"] is not None:
