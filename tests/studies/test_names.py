@@ -22,8 +22,8 @@ RAW = re.compile(r"`auto\b|\bauto, (not )?compiled|\b(Taylor|Adams|DOP853), comp
         ("DOP853 (twoloop)", *(f'`method="DOP853"{word}`' for word in (", compiled=False", "", ", compiled=False"))),
         ("Taylor, compiled", *(f'`method="Taylor"{word}`' for word in (", compiled=True", ", compiled=True", ""))),
         ("TRBDF2", *['`method="TRBDF2"`'] * 3),
-        ("DOP853, projected", *["`DOP853, projected`"] * 3),  # SciPy's
-        ("BDF, index 1", *["`BDF, index 1`"] * 3),
+        ("DOP853, projected", *["`SciPy, DOP853, projected`"] * 3),
+        ("BDF, index 1", *["`SciPy, BDF, index 1`"] * 3),
         ("heyoka", *["`heyoka`"] * 3),
     ],
 )

@@ -5,13 +5,15 @@ import json
 import pytest
 
 from studies.bench.store import WHOLE_CALL
-from studies.bench.takes import takes
+from studies.bench.takes import NO_ANGLES, takes
 from studies.which_method import page, table
 from tests.studies.test_index import energy
 
 SOLVER = {"family": "two-loop", "right": 9, "wrong": 0, "said so": 1, "ratio": 0.1}
 VALIDATION = {"n": 4, "tight": 1e-10, "decades": 2}
 COUNTS = {"WRONG AND SILENT": 2, "HANG": 1}
+
+AMONG = f", among solvers with constraints: {NO_ANGLES}"
 
 
 @pytest.fixture
@@ -72,10 +74,10 @@ def test_the_table_has_a_row_for_each_class_with_the_cheapest():
     entries = [{"class": "odd", "name": name, "t_end": 2.0, "picks": [loose, tight]} for name in ("a crane", "another")]
     (row,) = takes({}, entries)
     assert row["what"] == "odd (a crane and another, 2.0 s)"
-    assert row["take"] == '`method="TRBDF2"` (4 of 6 errors), `compiled=True` (2)'
+    assert row["take"] == '`method="TRBDF2"` (4 of 6 errors), `compiled=True` (2)' + AMONG
     entries[1]["picks"] = [loose | {"undecided": ["1e-4"]}, tight]
     (row,) = takes({}, entries)
-    assert row["take"] == 'no clear choice (of 6 errors: `method="TRBDF2"` 3, `compiled=True` 2)'
+    assert row["take"] == 'no clear choice (of 6 errors: `method="TRBDF2"` 3, `compiled=True` 2)' + AMONG
     entries[1]["name"] = "a crane, second"
     assert takes({}, entries)[0]["what"] == "odd (2 geometries, 2.0 s)"
 
