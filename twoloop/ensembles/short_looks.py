@@ -14,14 +14,9 @@ from twoloop.generate.known_numbers import Record
 from twoloop.generate.on_arrays import OnArrays
 from twoloop.generate.time_dependence import BY_TIME, TIME
 from twoloop.generate.traced_equations import Equations
+from twoloop.kernels.control.sudden import FLOOR, LEAST, PLACES, SHARE, STEEPER  # what counts as sudden in single runs
 from twoloop.problem.system import ConstrainedSystem
 
-# as in kernels/control/sudden.py
-PLACES = 20  # looks whose range counts
-SHARE = 0.1  # of this range: a change that is sudden
-LEAST = 0.1  # of rtol, times the largest value: a range that may matter ...
-FLOOR = 1e-150  # ... in any units
-STEEPER = 2.0  # times the changes before and after: the flank of a pulse, and not a slope
 AT_ONCE = 30_000  # numbers that are compared together
 
 
