@@ -13,7 +13,7 @@ from numba import carray, cfunc, types
 
 from references.cyrk.library import FINISHED, MEMORY, NUMBERS, POINTER, TOO_MANY_STEPS, Solution, Vector, library
 from references.driver import ADVICE, Task, TimeLimit, adapter, user_call
-from references.equations.straight_line import straight_line, straight_line_jacobian
+from references.equations.straight_line import exact_jacobian, straight_line
 from references.lines import Line
 from twoloop.checks.arguments import check_choice
 from twoloop.problem.problem import Array
@@ -34,9 +34,8 @@ def solve_cyrk(
     """Integrate a constrained mechanical system, as the ODE q' = v, v' = a(t, q, v), with a method of CyRK.
 
     Settings: accelerations as straight-line code of the mechanism (`equations.straight_line`); for implicit methods the
-    analytic Jacobian likewise, up to `straight_line.MOST_OPERATIONS` operations, otherwise differences. A second use of
-    the solver is timed, with its steps stored, as CyRK does unless it is given output times. A time limit is a limit of
-    the number of steps, by the time of the first `TRIED`.
+    analytic Jacobian from there, too. A second use of the solver is timed, with its steps stored, as CyRK does unless
+    it is given output times. A time limit is a limit of the number of steps, by the time of the first `TRIED`.
 
     Parameters
     ----------
@@ -190,10 +189,8 @@ def rate_of(system: ConstrainedSystem, t0: float, q0: bytes, v0: bytes) -> Any:
 
 @lru_cache(maxsize=256)
 def _jacobian(system: ConstrainedSystem, t0: float, q0: bytes, v0: bytes) -> Any:
-    """Return CyRK's Jacobian function, whose matrix is stored by columns; None if it is too long to compile."""
-    derivatives, size = straight_line_jacobian(system, t0, q0, v0), 2 * system.n_q
-    if derivatives is None:
-        return None
+    """Return CyRK's Jacobian function, whose matrix is stored by columns."""
+    derivatives, size = exact_jacobian(system, t0, q0, v0), 2 * system.n_q
 
     @cfunc(FUNCTION, error_model="numpy")
     def jacobian(J, t, y, count, before):  # type: ignore[no-untyped-def]

@@ -89,37 +89,41 @@ class Expressions:
             matrix[n + k, i] = matrix[i, n + k] = self.jacobian[k, i]
         return _factored(matrix, _order(matrix, n, n + len(self.rows)))
 
-    def _solved(self, force: Any, gamma: Any) -> list[Form]:
-        """Return accelerations and multipliers of eq. (6) for a right-hand side."""
+    def _right_hand_side(self, force: Any, gamma: Any) -> list[Form]:
+        """Return that of eq. (6), with the rows that were added to the mass."""
         right = [*force]
         for k in self.added:
             for i, entry in enumerate(self.jacobian[k]):
                 right[i] = right[i] + entry * gamma[k]
-        return _substituted(self.factors, [*right, *gamma])
+        return [*right, *gamma]
 
     @cached_property
     def solution(self) -> list[Form]:
         """Return accelerations and multipliers of eq. (6)."""
-        return self._solved(self.force, self.gamma)
+        return _substituted(self.factors, self._right_hand_side(self.force, self.gamma))
 
     def derivatives(self) -> Iterator[list[Form]]:
-        """Yield the derivatives of the accelerations with respect to each of [q, v], as 2 n_q lists (n_q,) of forms.
+        """Yield the derivatives of the accelerations with respect to each of [q, v], as 2 n_q lists (n_q,) of forms."""
+        for right in self.right_hand_sides():
+            yield _substituted(self.factors, right)[: self.system.n_q]
 
-        The matrix of eq. (6) is factorised once; its derivatives times the solution go to the right-hand side.
+    def right_hand_sides(self) -> Iterator[list[Form]]:
+        """Yield the right-hand sides for these derivatives, whose matrix is that of eq. (6), factorised once.
+
+        Its derivatives times the solution are in them.
         """
         n, graph = self.system.n_q, self.traced.graph
+        masses, jacobians = _nonzero(self.mass), _nonzero(self.jacobian)
         for unknown in (*self.traced.q, *self.traced.v):
             by = Derivative(graph, {only(unknown): Form(graph, 1.0, {})})
-            M, Cq, Q, gamma = (
-                symbols(map(by.of, of.ravel())).reshape(of.shape)
-                for of in (self.mass, self.jacobian, self.force, self.gamma)
-            )
-            for i, j in _nonzero(M):
-                Q[i] = Q[i] - M[i, j] * self.solution[j]
-            for k, j in _nonzero(Cq):
-                Q[j] = Q[j] - Cq[k, j] * self.solution[n + k]
-                gamma[k] = gamma[k] - Cq[k, j] * self.solution[j]
-            yield self._solved(Q, gamma)[:n]
+            Q, gamma = (list(map(by.of, of)) for of in (self.force, self.gamma))
+            for i, j in masses:
+                Q[i] = Q[i] - by.of(self.mass[i, j]) * self.solution[j]
+            for k, j in jacobians:
+                Cq = by.of(self.jacobian[k, j])
+                Q[j] = Q[j] - Cq * self.solution[n + k]
+                gamma[k] = gamma[k] - Cq * self.solution[j]
+            yield self._right_hand_side(Q, gamma)
 
     def accelerations(
         self, functions: Functions, t: Any, q: Sequence[Any], v: Sequence[Any], parameters: Sequence[Any] = ()

@@ -4,19 +4,20 @@ The equations come from `equations.expressions`: loops are unrolled, structural 
 computed once. This is the fastest right-hand side available here for a foreign solver driven from compiled code.
 """
 
-import math
 from collections.abc import Callable
 from functools import lru_cache
 from typing import Any
 
+import numpy as np
 from numba import njit
 
-from references.equations.expressions import FUNCTIONS, Expressions, Printed, expressions_at, functions_of
+from references.equations.expressions import FUNCTIONS, Expressions, Printed, expressions_at
 from references.equations.linear import OPTIONS
+from references.equations.machine_code import machine_code
 from twoloop.problem.system import ConstrainedSystem
 
 COMMUTES = "+*"
-MOST_OPERATIONS = 3000  # limit for a Jacobian: numba takes two or three milliseconds per operation
+MOST_OPERATIONS = 3000  # of a Jacobian in straight-line code, which takes more of them than loops
 
 
 class Program:
@@ -28,12 +29,6 @@ class Program:
     def value(self, *what: str) -> "Value":
         """Return the value of (left, operator, right) or of (function, argument)."""
         return Value(self, self.names.setdefault(what, f"x{len(self.names)}"))
-
-    @property
-    def lines(self) -> list[str]:
-        """Return the lines of its code."""
-        texts = (" ".join(what) if len(what) == 3 else "{}({})".format(*what) for what in self.names)
-        return [f"{name} = {text}" for name, text in zip(self.names.values(), texts, strict=True)]
 
 
 class Value:
@@ -87,38 +82,72 @@ def straight_line(system: ConstrainedSystem, t0: float, q0: bytes, v0: bytes) ->
     """Return compiled (t, y, rate) -> None: y' of y = [q, v]; q0, v0: the bytes of the start."""
     n = system.n_q
     program, names = program_of(expressions_at(system, t0, q0, v0))
-    results = [f"rate[{i}] = v{i}" for i in range(n)] + [f"rate[{n + i}] = {name}" for i, name in enumerate(names)]
-    return _machine_code(system, "rate", program, results)
+    return machine_code(n, program.names, enumerate([*(f"v{i}" for i in range(n)), *names]))
 
 
 @lru_cache(maxsize=256)
-def straight_line_jacobian(system: ConstrainedSystem, t0: float, q0: bytes, v0: bytes) -> Callable[..., Any] | None:
-    """Return compiled (t, y, columns) -> None: the nonzeros of d y'[i]/d y[k] in columns[k, i].
+def exact_jacobian(system: ConstrainedSystem, t0: float, q0: bytes, v0: bytes) -> Callable[..., Any]:
+    """Return compiled (t, y, columns) -> None: the nonzeros of d y'[i]/d y[k] in columns[k, i]; q0, v0 as above.
 
-    None if it takes more than `MOST_OPERATIONS`, as for mechanisms with a dozen coordinates or more.
+    Straight-line code of up to `MOST_OPERATIONS`, otherwise with loops for the solution of the linear systems.
     """
-    n, program = system.n_q, Program()
     equations = expressions_at(system, t0, q0, v0)
+    return _straight_line_jacobian(equations) or _jacobian_in_loops(equations)
+
+
+def _straight_line_jacobian(equations: Expressions) -> Callable[..., Any] | None:
+    """Return the function, or None if it takes too many operations."""
+    n, program = equations.system.n_q, Program()
     written = _printed(equations, program)
-    results = [f"columns[{n + i}, {i}] = 1.0" for i in range(n)]
+    results = [(2 * n * (n + i) + i, "1.0") for i in range(n)]
     for k, column in enumerate(equations.derivatives()):
-        made = written.each(column)
+        results += [(2 * n * k + n + i, name) for i, name in _nonzero(written.each(column))]
         if len(program.names) > MOST_OPERATIONS:
             return None
-        places = [(i, _name(each)) for i, each in enumerate(made) if isinstance(each, Value) or each != 0.0]
-        results += [f"columns[{k}, {n + i}] = {name}" for i, name in places]
-    return _machine_code(system, "columns", program, results)
+    return machine_code(n, program.names, results)
+
+
+def _jacobian_in_loops(equations: Expressions) -> Callable[..., Any]:
+    """Return the function, with straight-line code for the factors of eq. (6) and the right-hand sides only."""
+    n, program, factors = equations.system.n_q, Program(), equations.factors
+    written = _printed(equations, program)
+    pivots = np.array([i for i, *_ in factors])
+    rows = np.array([j for *_, column in factors for j, _ in column], dtype=np.int64)
+    begins = np.cumsum([0, *(len(column) for *_, column in factors)])
+    made = [inverse for _, inverse, _ in factors] + [entry for *_, column in factors for _, entry in column]
+    results = list(enumerate(map(_name, written.each(made))))
+    for k, right in enumerate(equations.right_hand_sides()):
+        results += [(len(made) + 2 * n * i + k, name) for i, name in _nonzero(written.each(right))]
+    fill = machine_code(n, program.names, results)
+
+    @njit(**OPTIONS)
+    def derivatives(t, y, columns):  # type: ignore[no-untyped-def]
+        values = np.zeros(pivots.size + rows.size + pivots.size * 2 * n)
+        fill(t, y, values)
+        inverse, multiple = values[: pivots.size], values[pivots.size : pivots.size + rows.size]
+        right = values[pivots.size + rows.size :].reshape(pivots.size, 2 * n)
+        for k in range(pivots.size):
+            for place in range(begins[k], begins[k + 1]):
+                for c in range(2 * n):
+                    right[rows[place], c] -= multiple[place] * right[pivots[k], c]
+        for k in range(pivots.size - 1, -1, -1):
+            for c in range(2 * n):
+                right[pivots[k], c] *= inverse[k]
+            for place in range(begins[k], begins[k + 1]):
+                for c in range(2 * n):
+                    right[pivots[k], c] -= multiple[place] * right[rows[place], c]
+        for i in range(n):
+            columns[n + i, i] = 1.0
+            for c in range(2 * n):
+                columns[c, n + i] = right[i, c]
+
+    return derivatives  # type: ignore[no-any-return]
+
+
+def _nonzero(made: list[Any]) -> list[tuple[int, str]]:
+    """Return the indices and names of values that are not known to be zero."""
+    return [(i, _name(each)) for i, each in enumerate(made) if isinstance(each, Value) or each != 0.0]
 
 
 def _name(made: Any) -> str:
     return made.name if isinstance(made, Value) else repr(float(made))
-
-
-def _machine_code(system: ConstrainedSystem, into: str, program: Program, results: list[str]) -> Callable[..., Any]:
-    """Return compiled (t, y, into) -> None: the program at y = [q, v], and the assignment of its results."""
-    n = system.n_q
-    lines = [f"q{i} = y[{i}]" for i in range(n)] + [f"v{i} = y[{n + i}]" for i in range(n)] + program.lines + results
-    scope: dict[str, Any] = functions_of(math)
-    text = "\n    ".join([f"def derivative(t, y, {into}):", *lines])
-    exec(compile(text, f"<straight-line code of {system.name}>", "exec"), scope)
-    return njit(**OPTIONS)(scope["derivative"])  # type: ignore[no-any-return]

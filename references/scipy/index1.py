@@ -18,7 +18,7 @@ from references.driver import ADVICE, Task, TimeLimit, adapter, imported, user_c
 from references.equations.accelerations import Equations, matrix_of, solve_for
 from references.equations.expressions import NotSymbolic
 from references.equations.linear import OPTIONS, kept
-from references.equations.straight_line import straight_line_jacobian
+from references.equations.straight_line import exact_jacobian
 from references.lines import Line
 from references.scipy.steps import Steps
 from twoloop.checks.arguments import check_choice, check_positive
@@ -60,10 +60,10 @@ def solve_index1(
     ----------
     method : {"DOP853", "RK45", "LSODA", "Radau", "BDF", "Pr9"}
         The solver of `scipy.integrate`, or of extensisq (`PAIR`: on the four-bar the best of its pairs at tight
-        tolerances). The implicit ones get the analytic Jacobian as straight-line code, if the equations have at most
-        `straight_line.MOST_OPERATIONS` operations as expressions, without Baumgarte's terms; otherwise forward
-        differences with constant increments, compiled. SciPy's own adapts its increments: of a coordinate without
-        influence it multiplies them by ten at each Jacobian, without a bound.
+        tolerances). The implicit ones get the analytic Jacobian of `equations.straight_line`, if the equations can be
+        had as expressions, without Baumgarte's terms; otherwise forward differences with constant increments, compiled.
+        SciPy's own adapts its increments: of a coordinate without influence it multiplies them by ten at each Jacobian,
+        without a bound.
     stabilisation : {"none", "baumgarte", "projection"}
         `STABILISATIONS` has a description of each for tables.
 
@@ -160,14 +160,12 @@ class RightHandSide(Equations):
         return fun  # type: ignore[no-any-return]
 
     def jacobian(self, t: float, y: Array) -> Callable[[float, Array], Array] | None:
-        """Return df/dy in SciPy's signature, compiled; None if it is not available, or too long to compile."""
-        try:
-            derivatives = (
-                None if self.alpha > 0.0 else straight_line_jacobian(self.system, t, *map(bytes, np.split(y, 2)))
-            )
-        except NotSymbolic:
+        """Return df/dy in SciPy's signature, compiled; None if it is not available."""
+        if self.alpha > 0.0:
             return None
-        if derivatives is None:
+        try:
+            derivatives = exact_jacobian(self.system, t, *map(bytes, np.split(y, 2)))
+        except NotSymbolic:
             return None
 
         def jac(t: float, y: Array) -> Array:

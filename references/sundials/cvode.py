@@ -23,9 +23,8 @@ MOST_STEPS = 10**7  # between two output times; the default of 500 is too small
 def solve_cvode(task: Task, rtol: float = 1e-8, atol: float = 1e-8) -> Result:
     """Integrate a constrained mechanical system, as the ODE q' = v, v' = a(t, q, v), with Adams' methods in CVODE.
 
-    Settings: a compiled right-hand side, and its analytic Jacobian as straight-line code, up to
-    `straight_line.MOST_OPERATIONS`, otherwise differences; orders up to 12; Newton's iteration, the only one available
-    in scikit-sundae. The integration to the end without output is timed.
+    Settings: a compiled right-hand side, and its analytic Jacobian where `equations.straight_line` has it; orders up to
+    12; Newton's iteration, the only one available in scikit-sundae. The integration to the end without output is timed.
 
     Parameters, errors and result as in `references.driver`; statistics: n_evaluations, all calls of the right-hand
     side.

@@ -12,7 +12,7 @@ import numpy as np
 from numba import carray, cfunc, types
 
 from references.driver import ADVICE, Task, adapter
-from references.equations.straight_line import straight_line, straight_line_jacobian
+from references.equations.straight_line import exact_jacobian, straight_line
 from references.lines import Line
 from references.sundials.cvode_projection import projection_for_cvode
 from references.sundials.library import library, made
@@ -54,8 +54,7 @@ def solve_cvode_c(
 
     Settings: accelerations as straight-line code of the mechanism (`equations.straight_line`); Adams with fixed-point
     iteration, as SUNDIALS recommends for non-stiff problems; BDF with Newton's iteration, dense with the analytic
-    Jacobian as straight-line code, up to `straight_line.MOST_OPERATIONS` (compiled in a few seconds), otherwise by
-    differences. A second use of CVODE's memory is timed. The clock is checked every `STEPS_A_CALL` steps.
+    Jacobian from there, too. A second use of CVODE's memory is timed. The clock is checked every `STEPS_A_CALL` steps.
 
     Parameters
     ----------
@@ -102,10 +101,8 @@ def _rate(system: ConstrainedSystem, t0: float, q0: bytes, v0: bytes) -> Any:
 
 @lru_cache(maxsize=256)
 def _jacobian(system: ConstrainedSystem, t0: float, q0: bytes, v0: bytes) -> Any:
-    """Return CVODE's Jacobian function; None if it is too long to compile."""
-    derivatives = straight_line_jacobian(system, t0, q0, v0)
-    if derivatives is None:
-        return None
+    """Return CVODE's Jacobian function."""
+    derivatives = exact_jacobian(system, t0, q0, v0)
     array_of, matrix_of, size = library().N_VGetArrayPointer, library().SUNDenseMatrix_Data, 2 * system.n_q
 
     @cfunc(types.int32(types.float64, *[POINTER] * 7), error_model="numpy")

@@ -49,7 +49,7 @@ def test_elimination_fills_little():
     operations = []
     for n in (5, 10, 20):
         problem = n_four_bar(n)
-        operations.append(len(program_of(Expressions(problem.system, 0.0, problem.q0, problem.v0))[0].lines))
+        operations.append(len(program_of(Expressions(problem.system, 0.0, problem.q0, problem.v0))[0].names))
     assert operations[2] - operations[1] == pytest.approx(2 * (operations[1] - operations[0]), rel=0.02)  # linear in n
 
 
@@ -61,7 +61,7 @@ def test_a_mass_that_no_rows_make_definite_is_refused():
 def test_a_program_writes_each_operation_once():
     program = Program()
     x, y = Value(program, "x"), Value(program, "y")
-    assert (x * y).name == (y * x).name and len(program.lines) == 1 and (x - y).name != (y - x).name
+    assert (x * y).name == (y * x).name and len(program.names) == 1 and (x - y).name != (y - x).name
 
 
 @pytest.mark.parametrize("make", [four_bar, heavy_top, partial(n_four_bar, 2)])
