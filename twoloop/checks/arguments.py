@@ -235,6 +235,25 @@ def check_times(t_eval: ArrayLike, t0: float, t1: float, step_size: float | None
     if times.ndim != 1 or times.size == 0:
         advice = "leave it out for every step" if times.size == 0 else f"write {shown(times.ravel().tolist())}"
         raise ValueError(f"t_eval must be a non-empty one-dimensional array; given {shaped(times)}: {advice}")
+    spacing = NEAR * float(np.spacing(max(abs(t0), abs(t1))))
+    first, last = float(times[0]), float(times[-1])
+    within = (first == t0 or first - t0 > spacing) and (last == t1 or t1 - last > spacing)
+    if not (within and bool((times[1:] - times[:-1] > spacing).all())):  # False for NaN, too
+        _check_each(times, t0, t1, spacing)
+    if step_size is not None:
+        ratio = (times - t0) / step_size
+        off = np.abs(ratio - np.round(ratio)) > max(1e-6, spacing / step_size)
+        off &= times != t1
+        if off.any():
+            raise ValueError(
+                f"t_eval must hold multiples of step_size = {step_size!r} from t = {t0!r} when the step is fixed; "
+                f"{float(times[off][0])!r} is not one"
+            )
+    return times
+
+
+def _check_each(times: Array, t0: float, t1: float, spacing: float) -> None:
+    """Say which of the output times is wrong, one of which is."""
     if not np.isfinite(times).all():
         raise wrong_entries("t_eval", "finite", times, ~np.isfinite(times))
     if times.min() < t0 or times.max() > t1:
@@ -242,7 +261,6 @@ def check_times(t_eval: ArrayLike, t0: float, t1: float, step_size: float | None
             f"t_eval must lie within t_span = ({t0!r}, {t1!r}); given times from {float(times.min())!r} to "
             f"{float(times.max())!r}"
         )
-    spacing = NEAR * np.spacing(max(abs(t0), abs(t1)))
     close = np.diff(times) <= spacing
     if close.any():
         where = int(np.flatnonzero(close)[0])
@@ -257,13 +275,3 @@ def check_times(t_eval: ArrayLike, t0: float, t1: float, step_size: float | None
                 f"t_eval must not come within rounding of the end {end!r} of t_span; given "
                 f"{float(times[beside][0])!r}: give that end itself"
             )
-    if step_size is not None:
-        ratio = (times - t0) / step_size
-        off = np.abs(ratio - np.round(ratio)) > max(1e-6, spacing / step_size)
-        off &= times != t1
-        if off.any():
-            raise ValueError(
-                f"t_eval must hold multiples of step_size = {step_size!r} from t = {t0!r} when the step is fixed; "
-                f"{float(times[off][0])!r} is not one"
-            )
-    return times
