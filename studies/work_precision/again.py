@@ -1,19 +1,21 @@
 """Measure single mechanisms, or other parts, again: `python -m studies.work_precision.again NAME ...`.
 
-The whole study takes hours. A part is a mechanism, or a rival's project on all mechanisms. Each part that this has
-measured takes the place of its rows in work_precision.csv at once, with the commit and the processor that it was made
-on; `python -m studies.work_precision --redraw` then writes the report anew. Without names: what there is.
+The whole study takes hours. A part is a mechanism, or a rival's project on all mechanisms; "MECHANISM | SOLVER | ..."
+are single solvers on a mechanism, by their names in work_precision.csv. Each part that this has measured takes the
+place of its rows in work_precision.csv at once, with the commit and the processor that it was made on;
+`python -m studies.work_precision --redraw` then writes the report anew. Without names: what there is.
 """
 
 import sys
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 
 import pandas as pd
 
 from studies.bench import cli
 from studies.bench.cli import StudyError
+from studies.bench.solvers import CATALOGUE
 from studies.bench.store import KeptRows, Output
 from studies.compare import GROUP as LENGTH
 from studies.work_precision import first_calls, minimal, rivals, study
@@ -23,12 +25,13 @@ AT_LENGTH = ", at length"  # after the name of a case: the runs over its whole m
 
 @dataclass(frozen=True)
 class Part:
-    """Rows that are measured together: all of a group, or those of one case of it, or of one project's solvers."""
+    """Rows that are measured together: all of a group, or those of one case of it, or of one project, or of solvers."""
 
     group: str
     case: str | None
     make: Callable[[KeptRows], pd.DataFrame]
     family: str | None = None
+    solvers: Sequence[str] = ()
 
 
 def parts() -> dict[str, Part]:
@@ -48,6 +51,24 @@ def parts() -> dict[str, Part]:
     return found
 
 
+def part_of(name: str, known: Mapping[str, Part]) -> Part:
+    """The part of a name.
+
+    Raises StudyError if there is none.
+    """
+    case, *solvers = name.split(" | ")
+    whole = known.get(case)
+    if whole is None or (solvers and (whole.case is None or set(solvers) - CATALOGUE.keys())):
+        raise StudyError(f"there is no {name!r}; parts are {'; '.join(known)}; and solvers of a mechanism after ' | '")
+    if not solvers:
+        return whole
+    if whole.group == LENGTH:
+        cases = [case for case in study.known_cases(False) if case.name == whole.case]
+        return replace(whole, make=partial(study.at_length, cases, False, solvers=solvers), solvers=solvers)
+    runs = [run for run in rivals.runs(False) if run.case.name == case and run.solver.name in solvers]
+    return replace(whole, make=partial(rivals.collect, runs), solvers=solvers)
+
+
 def replaced(rows: pd.DataFrame, part: Part, new: pd.DataFrame) -> pd.DataFrame:
     """All rows with those of one part in the place of what stood there."""
     old = rows["group"] == part.group
@@ -55,22 +76,24 @@ def replaced(rows: pd.DataFrame, part: Part, new: pd.DataFrame) -> pd.DataFrame:
         old &= rows["case"] == part.case
     if part.family is not None:
         old &= rows["family"] == part.family
+    if part.solvers:
+        old &= rows["solver"].isin(part.solvers)
     columns = list(dict.fromkeys([*rows.columns, *new.columns]))
     return pd.concat([rows[~old], new], ignore_index=True).reindex(columns=columns)
 
 
 def main(words: Sequence[str] | None = None) -> None:
     names, known = list(sys.argv[1:] if words is None else words), parts()
-    unknown = [name for name in names if name not in known]
-    if unknown or not names:
-        raise StudyError(f"{f'there is no {unknown[0]!r}; ' if unknown else ''}parts are {'; '.join(known)}")
+    if not names:
+        raise StudyError(f"parts are {'; '.join(known)}")
+    chosen = {name: part_of(name, known) for name in names}
     with Output(cli.parse("work_precision", __doc__, [])) as output:
-        for name in names:
+        for name, part in chosen.items():
             with output.kept({"part": name}) as kept:
-                new = known[name].make(kept)
+                new = part.make(kept)
             rows, line = output.load_rows()
             new = study.calibrated(new).assign(processor=cli.processor(), commit=cli.commit())
-            output.save_rows(replaced(rows, known[name], new), line)
+            output.save_rows(replaced(rows, part, new), line)
             print(f"{name}: {len(new)} rows", flush=True)
 
 

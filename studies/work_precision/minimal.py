@@ -20,6 +20,7 @@ from studies.work_precision import rivals
 
 GROUP = "minimal coordinates"
 TOLERANCES = (1e-3, 1e-5, 1e-7, 1e-9, 1e-11, 1e-13)
+ERRORS = tuple(error for errors in list(rivals.RANGES.values())[:2] for error in errors)  # not those of rounding
 HEYOKAS_OWN = float(np.finfo(float).eps)  # the tolerance that heyoka takes where none is given
 WRONG, ASKED = 0.1, 1e-4  # a run that ends with this error, though it was asked for a thousandth of it, is wrong
 TIME_LIMIT = 10.0  # s of CPU; heyoka's loosest runs may be its slowest, and what passes it twice is not asked on
@@ -42,14 +43,14 @@ def runs(quick: bool) -> list[Run]:
 
 def collect(kept: KeptRows, quick: bool) -> pd.DataFrame:
     """Rows of all runs, the repetitions interleaved."""
-    return adaptive.collect(runs(quick), kept, rivals.row_at_end, lambda run: True, () if quick else rivals.DECADES)
+    return adaptive.collect(runs(quick), kept, rivals.row_at_end, lambda run: True, () if quick else ERRORS)
 
 
 def at_errors(rows: pd.DataFrame, others: pd.DataFrame) -> list[dict[str, Any]]:
     """How the best of ours with constraints stands at each error beside the cheapest without (`rows`)."""
     both = pd.concat([others[others["family"] == "two-loop"], rows], ignore_index=True)
-    found = headline.of_errors(both, rivals.DECADES)
-    return [at[headline.BEST] | {"error": error} for error, at in zip(rivals.DECADES, found, strict=True)]
+    found = headline.of_errors(both, ERRORS)
+    return [at[headline.BEST] | {"error": error} for error, at in zip(ERRORS, found, strict=True)]
 
 
 def findings_by_kind(rows: pd.DataFrame, everywhere: pd.DataFrame) -> list[dict[str, Any]]:
