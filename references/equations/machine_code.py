@@ -60,7 +60,7 @@ def _write(
     """Write the body of the function."""
     t, y, into = arguments
     at = lambda array, place: build.gep(array, [PLACE(place)])  # noqa: E731
-    values = {"t": t} | {f"{'qv'[i // n]}{i % n}": build.load(at(y, i), typ=DOUBLE) for i in range(2 * n)}
+    values = {"t": t} | {f"{'qv'[i // n]}{i % n}": build.load(at(y, i)) for i in range(2 * n)}
     functions: dict[str, Any] = {}
 
     def value(of: str) -> Any:
