@@ -61,7 +61,6 @@ def _write(
     t, y, into = arguments
     at = lambda array, place: build.gep(array, [PLACE(place)])  # noqa: E731
     values = {"t": t} | {f"{'qv'[i // n]}{i % n}": build.load(at(y, i)) for i in range(2 * n)}
-    functions: dict[str, Any] = {}
 
     def value(of: str) -> Any:
         return values[of] if of in values else values.setdefault(of, DOUBLE(float(of)))
@@ -70,15 +69,14 @@ def _write(
         if len(what) == 3:
             values[name] = INSTRUCTIONS[what[1]](build, value(what[0]), value(what[2]), flags=FLAGS)
         else:
-            functions.setdefault(what[0], _declared(build.module, what[0]))
-            values[name] = build.call(functions[what[0]], [value(what[1])])
+            values[name] = build.call(_declared(build.module, what[0]), [value(what[1])])
     for place, result in results:
         build.store(value(result), at(into, place))
     build.ret_void()
 
 
 def _declared(module: Any, name: str) -> Any:
-    """Return an elementary function, declared in a module."""
+    """Return an elementary function, declared in a module once."""
     if name in OF_THE_LIBRARY:
         return module.globals.get(name) or ir.Function(module, ir.FunctionType(DOUBLE, [DOUBLE]), name)
     return module.declare_intrinsic(f"llvm.{name}", [DOUBLE])
