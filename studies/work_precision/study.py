@@ -122,26 +122,53 @@ def part(rows: pd.DataFrame, group: str = GROUP) -> pd.DataFrame:
 def measured_on(rows: pd.DataFrame) -> dict[str, Any]:
     """At how many commits, and on which processors, the rows were measured."""
     made = rows.reindex(columns=["processor", "commit"]).dropna().astype(str)
-    names = apart(rows)
-    told = {"apart": names, "commits": made["commit"].nunique(), "processors": sorted(made["processor"].unique())}
-    speeds = speeds_apart(rows, names)
+    names, some = apart(rows), some_apart(rows)
+    told = {"apart": names, "some": some, "commits": made["commit"].nunique()}
+    told["processors"] = sorted(made["processor"].unique())
+    speeds = speeds_apart(rows)
     return told | ({"speeds": speeds} if speeds else {})
 
 
-def apart(rows: pd.DataFrame) -> list[str]:
-    """Projects whose solvers were measured at another commit than most rows of a mechanism: in a pass of their own."""
-    known = rows[rows["group"] == rivals.GROUP].reindex(columns=["case", "family", "commit"]).dropna()
+def rows_apart(rows: pd.DataFrame) -> pd.DataFrame:
+    """Those at another commit than most rows of a mechanism: of a pass of their own."""
+    known = rows[rows["group"] == rivals.GROUP].reindex(columns=["case", "family", "solver", "commit"])
+    known = known.dropna(subset=["commit"])
     usual = known["case"].map(known.groupby("case")["commit"].agg(lambda each: each.mode().iloc[0]))
-    return sorted(known.loc[known["commit"] != usual, "family"].unique())
+    return known[known["commit"] != usual]
 
 
-def speeds_apart(rows: pd.DataFrame, names: Sequence[str]) -> list[float]:
-    """Time of the calibration in the pass of such projects over that with the others: least, median, largest."""
-    known = rows[rows["group"] == rivals.GROUP].reindex(columns=["case", "family", "calibration_s"]).dropna()
-    own = known["family"].isin(names)
+def apart(rows: pd.DataFrame) -> list[str]:
+    """Projects whose solvers were measured in a pass of their own on most mechanisms."""
+    cases, n = (
+        rows_apart(rows).groupby("family")["case"].nunique(),
+        rows.loc[rows["group"] == rivals.GROUP, "case"].nunique(),
+    )
+    return sorted(family for family, own in cases.items() if 2 * own >= n)
+
+
+def some_apart(rows: pd.DataFrame) -> list[dict[str, Any]]:
+    """Of other projects, how many solvers were measured in such a pass, and on how many mechanisms."""
+    found, others = rows_apart(rows), apart(rows)
+    found = found[~found["family"].isin(others)]
+    return [
+        {"family": str(family), "solvers": own["solver"].nunique(), "cases": own["case"].nunique()}
+        for family, own in found.groupby("family")
+    ]
+
+
+def speeds_apart(rows: pd.DataFrame) -> list[float]:
+    """Time of the calibration in passes of their own over that with the others: least, median, largest."""
+    known = rows[rows["group"] == rivals.GROUP].reindex(columns=["case", "calibration_s"])
+    own = known.index.isin(rows_apart(rows).index)
     apart, others = (known[which].groupby("case")["calibration_s"].median() for which in (own, ~own))
     ratios = (apart / others).dropna()
     return [float(each) for each in np.percentile(ratios, (0, 50, 100))] if len(ratios) else []
+
+
+def with_one_name(rows: pd.DataFrame) -> pd.DataFrame:
+    """Rows whose processors are named without their family, where rows from before that was kept lack it."""
+    bare = rows["processor"].str.partition(" (family ")[0]
+    return rows.assign(processor=bare.where(bare.isin(rows["processor"]), rows["processor"]))
 
 
 def on_the_same_processor(rows: pd.DataFrame, others: pd.DataFrame) -> pd.DataFrame:
@@ -152,6 +179,7 @@ def on_the_same_processor(rows: pd.DataFrame, others: pd.DataFrame) -> pd.DataFr
 
 
 def report(output: Output, rows: pd.DataFrame, line: str) -> dict[str, Any]:
+    rows = with_one_name(rows) if "processor" in rows else rows
     everywhere = tables.medians(part(rows, rivals.GROUP))
     known, medians = known_cases(output.call.quick), tables.medians(part(rows).reindex(columns=rows.columns))
     found = rivals.findings_of(everywhere)

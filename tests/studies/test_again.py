@@ -26,7 +26,10 @@ def test_a_mechanism_measured_again_takes_the_place_of_its_rows():
     parts = again.parts()
     made = again.replaced(KEPT, parts["four-bar"], new)
     assert made["call_s"].tolist() == [2.0, 3.0, 4.0, 9.0]
-    assert study.measured_on(made.fillna({"commit": "ab"})) == {"apart": [], "commits": 2, "processors": ["new", "old"]}
+    assert study.measured_on(made.fillna({"commit": "ab"})) == {
+        **{"apart": [], "some": [], "commits": 2},
+        "processors": ["new", "old"],
+    }
     calls = again.replaced(KEPT, parts["first calls"], rows((first_calls.GROUP, "four-bar", 8.0, "new")))
     assert calls["call_s"].tolist() == [1.0, 2.0, 4.0, 8.0]
     length = again.replaced(KEPT, parts["four-bar" + again.AT_LENGTH], rows(("compare", "four-bar", 7.0, "new")))
@@ -83,9 +86,22 @@ def test_only_what_ran_on_one_processor_is_compared():
 
 
 def test_a_project_measured_in_a_pass_of_its_own_is_told():
-    made = KEPT.assign(family="two-loop", commit="abc")
-    later = rows((rivals.GROUP, "four-bar", 9.0, "old")).assign(family="heyoka", commit="def")
-    assert study.apart(made) == [] and study.apart(pd.concat([made, made, later])) == ["heyoka"]
+    made = KEPT.assign(family="two-loop", solver="Taylor", commit="abc")
+    later = rows((rivals.GROUP, "four-bar", 9.0, "old")).assign(family="heyoka", solver="heyoka", commit="def")
+    assert study.apart(made) == study.some_apart(made) == []
+    both = pd.concat([made, made, later], ignore_index=True)
+    assert study.apart(both) == ["heyoka"] and study.some_apart(both) == []
+    further = made.assign(case="chain")
+    third = pd.concat([both, further, further.assign(case="top")], ignore_index=True)
+    assert study.apart(third) == []
+    assert study.some_apart(third) == [{"family": "heyoka", "solvers": 1, "cases": 1}]
+
+
+def test_processors_have_one_name_where_older_rows_lack_the_family():
+    named = ["AMD EPYC", "AMD EPYC (family 25)", "Xeon (family 6)"]
+    made = study.with_one_name(pd.DataFrame({"processor": named}))["processor"].tolist()
+    assert made == ["AMD EPYC", "AMD EPYC", "Xeon (family 6)"]
+    assert study.with_one_name(pd.DataFrame({"processor": named[1:]}))["processor"].tolist() == named[1:]
 
 
 def test_the_speed_of_a_pass_of_its_own_is_that_of_its_calibrations():
