@@ -7,7 +7,8 @@ with little fill-in; then the graph is translated to expressions of a package, o
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import cached_property, lru_cache
-from typing import Any
+from itertools import product
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -23,10 +24,20 @@ from twoloop.problem.problem import Array
 from twoloop.problem.system import ConstrainedSystem, check_system
 
 Functions = Mapping[str, Callable[[Any], Any]]  # elementary functions of the package, by name
-Factors = list[tuple[int, Form, list[tuple[int, Form]]]]
 
 FUNCTIONS = {operations.SINE: "sin", operations.COSINE: "cos", operations.SQUARE_ROOT: "sqrt"}
 FUNCTIONS |= {operations.EXPONENTIAL: "exp", operations.LOGARITHM: "log", operations.ARCTANGENT: "atan"}
+
+
+DIVISION = 10.0  # products that take as long, about
+
+
+class Block(NamedTuple):
+    """One or two unknowns that are eliminated together, by one division."""
+
+    places: tuple[int, ...]
+    inverse: list[list[Form]]  # of their part of D
+    below: list[tuple[int, list[Form]]]  # rows of L
 
 
 class NotSymbolic(CannotRun, ValueError):
@@ -76,7 +87,7 @@ class Expressions:
         return mass, jacobian[self.rows], force, gamma[self.rows]
 
     @cached_property
-    def factors(self) -> Factors:
+    def factors(self) -> list[Block]:
         """Factors of the matrix of eq. (6)."""
         matrix, n = {(i, j): self.mass[i, j] for i, j in _nonzero(self.mass)}, self.system.n_q
         for k in self.added:  # M + C_q^T C_q gives the same accelerations
@@ -87,7 +98,17 @@ class Expressions:
                     matrix[i, j] = matrix[i, j] + term if (i, j) in matrix else term
         for k, i in _nonzero(self.jacobian):
             matrix[n + k, i] = matrix[i, n + k] = self.jacobian[k, i]
-        return _factored(matrix, _order(matrix, n, n + len(self.rows)))
+        size = n + len(self.rows)
+        orders = [_order(matrix, n, size, *how) for how in product((True, False), repeat=2)]
+        return min((_factored(matrix, order) for order in orders), key=self._price)
+
+    def _price(self, factors: Sequence[Block]) -> float:
+        """Return about how many operations the accelerations take by these factors; a division counts for several."""
+        graph = self.traced.graph
+        made = _substituted(factors, self._right_hand_side(self.force, self.gamma))[: self.system.n_q]
+        kinds = [graph.operations[i] for i in graph.needed_by(made)]
+        terms = sum(len(form.terms) for _, *forms in kinds for form in forms if form is not None)  # type: ignore[misc]
+        return terms + DIVISION * sum(kind == operations.RECIPROCAL for kind, *_ in kinds)  # type: ignore[misc]
 
     def _right_hand_side(self, force: Any, gamma: Any) -> list[Form]:
         """Return that of eq. (6), with the rows that were added to the mass."""
@@ -218,57 +239,120 @@ def _rows_for_mass(mass: Array, jacobian: Array) -> list[int]:
     return chosen
 
 
-def _order(matrix: Iterable[tuple[int, int]], n: int, size: int) -> list[int]:
+def _order(
+    matrix: Mapping[tuple[int, int], Form], n: int, size: int, together: bool, early: bool
+) -> list[tuple[int, ...]]:
     """Return an elimination order by minimum degree, with each row of C_q after all its coordinates.
 
-    The pivots are then those of the definite matrices M and -C_q M^-1 C_q^T.
+    The pivots are then those of the definite matrices M and -C_q M^-1 C_q^T. If `together`, unknowns with the same
+    neighbours, such as the two rows of a joint, are eliminated at once. If `early`, of equal degrees those come first
+    that wait for the fewest divisions. A coordinate that stands in one row of C_q alone, by a number, goes before all
+    others, with this row: without any division.
     """
     neighbours: list[set[int]] = [set() for _ in range(size)]
     for i, j in matrix:
         neighbours[i] |= {j} - {i}
-    waits = [sum(j < n for j in neighbours[i]) if i >= n else 0 for i in range(size)]
-    own = [[k for k in neighbours[i] if k >= n] if i < n else [] for i in range(size)]
-    left, order = set(range(size)), []
+    waits = [{j for j in neighbours[i] if j < n} if i >= n else set() for i in range(size)]
+    left, depth = set(range(size)), [0] * size
+    order: list[tuple[int, ...]] = []
+    given = _given_by_rows(matrix, neighbours, n)
     while left:
-        i = min((j for j in left if waits[j] == 0), key=lambda j: (len(neighbours[j]), j))
-        left.remove(i)
-        order.append(i)
-        for k in own[i]:
-            waits[k] -= 1
-        for j in neighbours[i]:
-            neighbours[j] |= neighbours[i]
-            neighbours[j] -= {i, j}
+        if given:
+            i, row = places = given.pop()
+            around = neighbours[i] | neighbours[row]
+        else:
+            i = min((j for j in left if not waits[j]), key=lambda j: (len(neighbours[j]), early * depth[j], j))
+            around = neighbours[i] | {i}
+            alike = [j for j in around - {i} if not waits[j] and (j < n) == (i < n) and neighbours[j] | {j} == around]
+            places = (i, *(sorted(alike)[:1] if together else ()))
+        order.append(places)
+        left -= set(places)
+        around -= set(places)
+        for j in around:
+            neighbours[j] = (neighbours[j] | around) - {*places, j}
+            depth[j] = max(depth[j], depth[i] + 1)
+        for j in left:
+            waits[j] -= set(places)
     return order
 
 
-def _factored(matrix: dict[tuple[int, int], Form], order: list[int]) -> Factors:
-    """Return the LDL^T factors, in this order, of a symmetric matrix; entries not in `matrix` are zero."""
-    rows: list[dict[int, Form]] = [{} for _ in order]
+def _given_by_rows(
+    matrix: Mapping[tuple[int, int], Form], neighbours: Sequence[set[int]], n: int
+) -> list[tuple[int, ...]]:
+    """Return coordinates that stand in one row of C_q alone, by a number, and whose mass is one; each with its row."""
+    rows: dict[int, int] = {}
+    for i in range(n):
+        k = max(neighbours[i], default=0)
+        if len(neighbours[i]) == 1 and k >= n and not any(matrix[i, j].terms for j in (i, k) if (i, j) in matrix):
+            rows.setdefault(k, i)
+    return [(i, k) for k, i in rows.items()]
+
+
+def _factored(matrix: dict[tuple[int, int], Form], order: list[tuple[int, ...]]) -> list[Block]:
+    """Return the factors L D L^T, in this order, of a symmetric matrix; entries not in `matrix` are zero."""
+    rows: dict[int, dict[int, Form]] = {i: {} for places in order for i in places}
     for (i, j), entry in matrix.items():
         rows[i][j] = entry
-    factors: Factors = []
-    for i in order:
-        inverse = 1.0 / rows[i].pop(i)
-        row = [(j, entry.value()) for j, entry in rows[i].items()]
-        column = [(j, (entry * inverse).value()) for j, entry in row]
-        for j, multiple in column:
-            for k, entry in row:
-                rows[j][k] = rows[j][k] - multiple * entry if k in rows[j] else -(multiple * entry)
-            del rows[j][i]
-        factors.append((i, inverse, column))
-    return factors
+    blocks: list[Block] = []
+    for places in order:
+        zero = Form(next(iter(matrix.values())).graph, 0.0, {})
+        inverse = _inverse([[rows[i].pop(j, zero).value() for j in places] for i in places])
+        others = dict.fromkeys(j for i in places for j in rows[i])
+        entries = [(j, [rows[i].get(j, zero).value() for i in places]) for j in others]
+        below = [(j, [_dot(row, values).value() for row in inverse]) for j, values in entries]
+        for j, multiples in below:
+            for k, values in entries:
+                change = _dot(multiples, values)
+                rows[j][k] = rows[j][k] - change if k in rows[j] else -change
+            for i in places:
+                rows[j].pop(i, None)
+        blocks.append(Block(places, inverse, below))
+    return blocks
 
 
-def _substituted(factors: Factors, right: list[Form]) -> list[Form]:
+def _inverse(pivots: list[list[Form]]) -> list[list[Form]]:
+    """Return the inverse of a symmetric matrix of one or two rows."""
+    a = pivots[0][0]
+    if len(pivots) == 1:
+        return [[1.0 / a]]
+    b, c = pivots[1]
+    inverse = 1.0 / (a * c - b * b).value()
+    return [[(c * inverse).value(), (-b * inverse).value()], [(-b * inverse).value(), (a * inverse).value()]]
+
+
+def _dot(one: Sequence[Form], other: Sequence[Form]) -> Form:
+    total = one[0] * other[0]
+    for x, y in zip(one[1:], other[1:], strict=True):
+        total = total + x * y
+    return total
+
+
+def _substituted(factors: Sequence[Block], right: list[Form]) -> list[Form]:
     """Return the solution of the factorised system."""
     solution = list(right)
-    for i, _, column in factors:
-        solution[i] = solution[i].value()
-        for j, multiple in column:
-            solution[j] = solution[j] - multiple * solution[i]
-    for i, inverse, column in reversed(factors):
-        total = solution[i] * inverse
-        for j, multiple in column:
-            total = total - multiple * solution[j]
-        solution[i] = total.value()
+    owed: list[list[tuple[Form, Form]]] = [[] for _ in right]
+    for places, _, below in factors:
+        for i in places:
+            solution[i] = (solution[i] - _total(owed[i])).value()
+        for j, multiples in below:
+            owed[j] += zip(multiples, [solution[i] for i in places], strict=True)
+    for places, inverse, below in reversed(factors):
+        known = [solution[i] for i in places]
+        for k, (i, row) in enumerate(zip(places, inverse, strict=True)):
+            solution[i] = (_dot(row, known) - _total([(each[k], solution[j]) for j, each in below])).value()
     return solution
+
+
+def _total(products: Sequence[tuple[Form, Form]]) -> Any:
+    """Return the sum of products, in which multiples of one factor are summed up before they are multiplied by it."""
+    total: Any = 0.0
+    by_factor: dict[Any, list[Any]] = {}
+    for one, other in products:
+        if not one.terms:
+            total = total + one.constant * other
+            continue
+        scale, factor = one.normalised()
+        by_factor.setdefault(factor.key, [factor, 0.0])[1] += scale * other
+    for factor, other in by_factor.values():
+        total = total + factor * other.value()
+    return total

@@ -110,11 +110,16 @@ def _straight_line_jacobian(equations: Expressions) -> Callable[..., Any] | None
 def _jacobian_in_loops(equations: Expressions) -> Callable[..., Any]:
     """Return the function, with straight-line code for the factors of eq. (6) and the right-hand sides only."""
     n, program, factors = equations.system.n_q, Program(), equations.factors
-    written = _printed(equations, program)
-    pivots = np.array([i for i, *_ in factors])
-    rows = np.array([j for *_, column in factors for j, _ in column], dtype=np.int64)
-    begins = np.cumsum([0, *(len(column) for *_, column in factors)])
-    made = [inverse for _, inverse, _ in factors] + [entry for *_, column in factors for _, entry in column]
+    written, size = _printed(equations, program), sum(len(block.places) for block in factors)
+    pivots = np.array([i for block in factors for i in block.places])
+    partners = np.array([i for block in factors for i in reversed(block.places)])  # a pivot without one is its own
+    entries = [(j, each[k]) for block in factors for k in range(len(block.places)) for j, each in block.below]
+    lengths = [len(block.below) for block in factors for _ in block.places]
+    begins, rows = np.cumsum([0, *lengths]), np.array([j for j, _ in entries], dtype=np.int64)
+    made = [block.inverse[k][k] for block in factors for k in range(len(block.places))]
+    made += [block.inverse[k][1 - k] for block in factors for k in range(len(block.places)) if len(block.places) == 2]
+    both = np.flatnonzero(pivots != partners)
+    made += [entry for _, entry in entries]
     results = list(enumerate(map(_name, written.each(made))))
     for k, right in enumerate(equations.right_hand_sides()):
         results += [(len(made) + 2 * n * i + k, name) for i, name in _nonzero(written.each(right))]
@@ -122,24 +127,31 @@ def _jacobian_in_loops(equations: Expressions) -> Callable[..., Any]:
 
     @njit(**OPTIONS)
     def derivatives(t, y, columns):  # type: ignore[no-untyped-def]
-        values = np.zeros(pivots.size + rows.size + pivots.size * 2 * n)
+        values = np.zeros(size + both.size + rows.size + size * 2 * n)
         fill(t, y, values)
-        inverse, multiple = values[: pivots.size], values[pivots.size : pivots.size + rows.size]
-        right = values[pivots.size + rows.size :].reshape(pivots.size, 2 * n)
-        for k in range(pivots.size):
+        inverse, beside, after = values[:size], values[size : size + both.size], size + both.size
+        multiple = values[after : after + rows.size]
+        right = values[after + rows.size :].reshape(size, 2 * n)
+        for k in range(size):
             for place in range(begins[k], begins[k + 1]):
                 for c in range(2 * n):
                     right[rows[place], c] -= multiple[place] * right[pivots[k], c]
-        for k in range(pivots.size - 1, -1, -1):
+        scaled = right.copy()
+        for k in range(size):
             for c in range(2 * n):
-                right[pivots[k], c] *= inverse[k]
+                scaled[pivots[k], c] *= inverse[k]
+        for k in range(both.size):
+            i, j = pivots[both[k]], partners[both[k]]
+            for c in range(2 * n):
+                scaled[i, c] += beside[k] * right[j, c]
+        for k in range(size - 1, -1, -1):
             for place in range(begins[k], begins[k + 1]):
                 for c in range(2 * n):
-                    right[pivots[k], c] -= multiple[place] * right[rows[place], c]
+                    scaled[pivots[k], c] -= multiple[place] * scaled[rows[place], c]
         for i in range(n):
             columns[n + i, i] = 1.0
             for c in range(2 * n):
-                columns[c, n + i] = right[i, c]
+                columns[c, n + i] = scaled[i, c]
 
     return derivatives  # type: ignore[no-any-return]
 
