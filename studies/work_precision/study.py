@@ -122,47 +122,21 @@ def part(rows: pd.DataFrame, group: str = GROUP) -> pd.DataFrame:
 def measured_on(rows: pd.DataFrame) -> dict[str, Any]:
     """At how many commits, and on which processors, the rows were measured."""
     made = rows.reindex(columns=["processor", "commit"]).dropna().astype(str)
-    names, some = apart(rows), some_apart(rows)
-    told = {"apart": names, "some": some, "commits": made["commit"].nunique()}
-    told["processors"] = sorted(made["processor"].unique())
-    speeds = speeds_apart(rows)
-    return told | ({"speeds": speeds} if speeds else {})
+    told: dict[str, Any] = {"commits": made["commit"].nunique(), "processors": sorted(made["processor"].unique())}
+    return told | sessions(rows)
 
 
-def rows_apart(rows: pd.DataFrame) -> pd.DataFrame:
-    """Those at another commit than most rows of a mechanism: of a pass of their own."""
-    known = rows[rows["group"] == rivals.GROUP].reindex(columns=["case", "family", "solver", "commit"])
-    known = known.dropna(subset=["commit"])
-    usual = known["case"].map(known.groupby("case")["commit"].agg(lambda each: each.mode().iloc[0]))
-    return known[known["commit"] != usual]
+def sessions(rows: pd.DataFrame) -> dict[str, Any]:
+    """In how many sessions each mechanism was measured, at most, and how unlike the calibrations of these are.
 
-
-def apart(rows: pd.DataFrame) -> list[str]:
-    """Projects whose solvers were measured in a pass of their own on most mechanisms."""
-    cases, n = (
-        rows_apart(rows).groupby("family")["case"].nunique(),
-        rows.loc[rows["group"] == rivals.GROUP, "case"].nunique(),
-    )
-    return sorted(family for family, own in cases.items() if 2 * own >= n)
-
-
-def some_apart(rows: pd.DataFrame) -> list[dict[str, Any]]:
-    """Of other projects, how many solvers were measured in such a pass, and on how many mechanisms."""
-    found, others = rows_apart(rows), apart(rows)
-    found = found[~found["family"].isin(others)]
-    return [
-        {"family": str(family), "solvers": own["solver"].nunique(), "cases": own["case"].nunique()}
-        for family, own in found.groupby("family")
-    ]
-
-
-def speeds_apart(rows: pd.DataFrame) -> list[float]:
-    """Time of the calibration in passes of their own over that with the others: least, median, largest."""
-    known = rows[rows["group"] == rivals.GROUP].reindex(columns=["case", "calibration_s"])
-    own = known.index.isin(rows_apart(rows).index)
-    apart, others = (known[which].groupby("case")["calibration_s"].median() for which in (own, ~own))
-    ratios = (apart / others).dropna()
-    return [float(each) for each in np.percentile(ratios, (0, 50, 100))] if len(ratios) else []
+    `speeds`: the largest time of the calibration over the least of a mechanism, in the median and at most.
+    """
+    known = rows[rows["group"] == rivals.GROUP].reindex(columns=["case", "commit", "calibration_s"])
+    by_case = known.dropna(subset=["commit"]).groupby("case")
+    most = int(by_case["commit"].nunique().max()) if len(by_case) else 0
+    times = known.groupby(["case", "commit"])["calibration_s"].median().groupby("case")
+    unlike = (times.max() / times.min()).dropna()
+    return {"sessions": most} | ({"speeds": [float(unlike.median()), float(unlike.max())]} if len(unlike) else {})
 
 
 def with_one_name(rows: pd.DataFrame) -> pd.DataFrame:

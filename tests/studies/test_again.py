@@ -27,8 +27,8 @@ def test_a_mechanism_measured_again_takes_the_place_of_its_rows():
     made = again.replaced(KEPT, parts["four-bar"], new)
     assert made["call_s"].tolist() == [2.0, 3.0, 4.0, 9.0]
     assert study.measured_on(made.fillna({"commit": "ab"})) == {
-        **{"apart": [], "some": [], "commits": 2},
-        "processors": ["new", "old"],
+        **{"commits": 2, "processors": ["new", "old"]},
+        "sessions": 1,
     }
     calls = again.replaced(KEPT, parts["first calls"], rows((first_calls.GROUP, "four-bar", 8.0, "new")))
     assert calls["call_s"].tolist() == [1.0, 2.0, 4.0, 8.0]
@@ -85,18 +85,6 @@ def test_only_what_ran_on_one_processor_is_compared():
     assert study.on_the_same_processor(own, others)["call_s"].tolist() == [2.0]
 
 
-def test_a_project_measured_in_a_pass_of_its_own_is_told():
-    made = KEPT.assign(family="two-loop", solver="Taylor", commit="abc")
-    later = rows((rivals.GROUP, "four-bar", 9.0, "old")).assign(family="heyoka", solver="heyoka", commit="def")
-    assert study.apart(made) == study.some_apart(made) == []
-    both = pd.concat([made, made, later], ignore_index=True)
-    assert study.apart(both) == ["heyoka"] and study.some_apart(both) == []
-    further = made.assign(case="chain")
-    third = pd.concat([both, further, further.assign(case="top")], ignore_index=True)
-    assert study.apart(third) == []
-    assert study.some_apart(third) == [{"family": "heyoka", "solvers": 1, "cases": 1}]
-
-
 def test_processors_have_one_name_where_older_rows_lack_the_family():
     named = ["AMD EPYC", "AMD EPYC (family 25)", "Xeon (family 6)"]
     made = study.with_one_name(pd.DataFrame({"processor": named}))["processor"].tolist()
@@ -104,12 +92,14 @@ def test_processors_have_one_name_where_older_rows_lack_the_family():
     assert study.with_one_name(pd.DataFrame({"processor": named[1:]}))["processor"].tolist() == named[1:]
 
 
-def test_the_speed_of_a_pass_of_its_own_is_that_of_its_calibrations():
+def test_sessions_and_their_calibrations_are_told():
     head = {"group": rivals.GROUP, "processor": "one"}
     made = [
-        head | {"case": case, "family": family, "commit": commit, "calibration_s": calibration}
+        head | {"case": case, "commit": commit, "calibration_s": calibration}
         for case, others in (("a", 4.0), ("b", 2.0), ("c", 1.0))
-        for family, commit, calibration in (("SciPy", "1", others), ("SUNDIALS", "1", others), ("CyRK", "2", 2.0))
+        for commit, calibration in (("1", others), ("2", 2.0))
     ]
     told = study.measured_on(pd.DataFrame(made))
-    assert told["apart"] == ["CyRK"] and told["speeds"] == [0.5, 1.0, 2.0]
+    assert told["sessions"] == 2 and told["speeds"] == [2.0, 2.0] and told["commits"] == 2
+    alone = study.measured_on(pd.DataFrame(made[::2]))
+    assert alone["sessions"] == 1 and alone["speeds"] == [1.0, 1.0]
