@@ -16,6 +16,7 @@ from studies.bench.row_files import in_format
 from studies.bench.store import read_rows
 from studies.compare import GROUP as LENGTH
 from studies.work_precision.rivals import GROUP
+from studies.work_precision.study import with_one_name
 from twoloop.rows.leaderboard import ARCHIVE
 from twoloop.rows.row_format import Row, text_of
 
@@ -37,7 +38,7 @@ def archived(rows: pd.DataFrame, versions: dict[str, str]) -> list[Row]:
 def made_of(folder: Path) -> str:
     """The archive of the rows in a folder of reports."""
     rows, _ = read_rows(folder / "work_precision.csv", "group", "case", "solver", "t_end")
-    return text_of(archived(rows, json.loads((folder / "work_precision.json").read_text())["versions"]))
+    return text_of(archived(with_one_name(rows), json.loads((folder / "work_precision.json").read_text())["versions"]))
 
 
 def main(words: Sequence[str] | None = None) -> None:

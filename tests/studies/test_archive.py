@@ -8,6 +8,7 @@ from studies.bench.cli import REPORTS
 from studies.bench.row_files import READY, mechanism_of, package_of, rounded
 from studies.bench.store import read_rows
 from studies.work_precision import archive
+from studies.work_precision.study import with_one_name
 from twoloop import mechanisms
 from twoloop.rows.leaderboard import ARCHIVE
 from twoloop.rows.row_format import mistakes, read_lines, text_of
@@ -16,7 +17,7 @@ AGAIN = "make it again by python -m studies.work_precision.archive"
 
 
 def test_the_archive_is_of_the_rows_of_the_report():
-    rows, _ = read_rows(REPORTS / "work_precision.csv")
+    rows = with_one_name(read_rows(REPORTS / "work_precision.csv")[0])
     kept = [line for line in read_lines(ARCHIVE) if '"mechanism":"four_bar_second"' in line]
     versions = {row["family"]: row["version"] for row in mistakes(kept)[0] if row["family"] != "two-loop"}
     versions |= {package_of(family): version for family, version in versions.items()}
