@@ -238,7 +238,9 @@ def check_times(t_eval: ArrayLike, t0: float, t1: float, step_size: float | None
     spacing = NEAR * float(np.spacing(max(abs(t0), abs(t1))))
     first, last = float(times[0]), float(times[-1])
     within = (first == t0 or first - t0 > spacing) and (last == t1 or t1 - last > spacing)
-    if not (within and bool((times[1:] - times[:-1] > spacing).all())):  # False for NaN, too
+    with np.errstate(invalid="ignore"):  # of infinite times
+        apart = times[1:] - times[:-1] > spacing
+    if not (within and bool(apart.all())):  # False for NaN, too
         _check_each(times, t0, t1, spacing)
     if step_size is not None:
         ratio = (times - t0) / step_size
