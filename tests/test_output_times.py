@@ -1,10 +1,13 @@
 """t_eval: interpolated where steps adapt, landed on where they are fixed or the paper's."""
 
+import warnings
+
 import numpy as np
 import pytest
 
 from tests.problems import event, pendulum_state, run, swing, worst
 from twoloop import Status
+from twoloop.checks.arguments import check_times
 from twoloop.methods.presets import PRESETS
 from twoloop.run.dense import Interpolator
 
@@ -96,3 +99,9 @@ def test_a_failed_run_has_the_times_that_it_reached(default_four_bar, method):
     result = run(default_four_bar, 1.0, method=method, t_eval=TIMES, max_steps=10)
     assert result.status == Status.MAX_STEPS and 1 < result.t.size < TIMES.size
     assert (result.t == TIMES[: np.searchsorted(TIMES, result.h.sum(), side="right")]).all()
+
+
+def test_infinite_times_are_refused_without_a_warning_of_numpy():
+    with warnings.catch_warnings(), pytest.raises(ValueError, match=r"t_eval must be finite; entries \[1, 2\] are not"):
+        warnings.simplefilter("error")
+        check_times([0.0, np.inf, np.inf, 1.0], 0.0, 1.0, None)
