@@ -28,7 +28,6 @@ Functions = Mapping[str, Callable[[Any], Any]]  # elementary functions of the pa
 FUNCTIONS = {operations.SINE: "sin", operations.COSINE: "cos", operations.SQUARE_ROOT: "sqrt"}
 FUNCTIONS |= {operations.EXPONENTIAL: "exp", operations.LOGARITHM: "log", operations.ARCTANGENT: "atan"}
 
-
 DIVISION = 10.0  # products that take as long, about
 
 

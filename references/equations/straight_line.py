@@ -1,7 +1,7 @@
 """Accelerations of one mechanism, and their Jacobian, as straight-line machine code, for compiled solvers.
 
 The equations come from `equations.expressions`: loops are unrolled, structural zeros removed, common subexpressions
-computed once. This is the fastest right-hand side available here for a foreign solver driven from compiled code.
+computed once.
 """
 
 from collections.abc import Callable

@@ -198,7 +198,7 @@ def asked(rows: pd.DataFrame) -> dict[str, Any]:
     pairs = others.groupby(["solver", "case"]).ngroups
     put = [own for _, own in tables.put(others).groupby(["solver", "case"])]
     found: dict[str, Any] = {"n": pairs, "refused": pairs - len(put)}
-    found |= {"fewer": sum(not tables.missed(own, 0.0) for own in put), "far": adaptive.FAR}
+    found |= {"fewer": sum(not tables.missed(own, 0.0) for own in put), "far": adaptive.FAR, "close": adaptive.CLOSE}
     return found | {"running": adaptive.RUNNING, "limit": rivals.TIME_LIMIT}
 
 

@@ -53,6 +53,12 @@ def test_elimination_fills_little():
     assert operations[2] - operations[1] == pytest.approx(2 * (operations[1] - operations[0]), rel=0.02)  # linear in n
 
 
+@pytest.mark.parametrize(("make", "most"), [(four_bar, 239), (heavy_top, 329)])
+def test_rivals_get_accelerations_of_few_operations(make, most):
+    problem = make()
+    assert len(program_of(Expressions(problem.system, 0.0, problem.q0, problem.v0))[0].names) <= most
+
+
 def test_a_mass_that_no_rows_make_definite_is_refused():
     with pytest.raises(NotSymbolic, match="stays singular"):
         expressions._rows_for_mass(np.diag([1.0, 0.0]), np.array([[1.0, 0.0]]))

@@ -174,7 +174,7 @@ def stated(own, **changed):
     table = compared(own, 2.0, python=9.0)
     found = {"cases": [], "first_calls": [], "minimal": [], "default": "auto", "violation": 1e-15}
     found |= {"rivals": rivals.findings_of(table), "measured": {"commits": 1, "processors": ["this"]}}
-    found["asked"] = {"n": 4, "refused": 1, "fewer": 0, "far": 20.0, "running": 2, "limit": 1.0}
+    found["asked"] = {"n": 4, "refused": 1, "fewer": 0, "far": 20.0, "close": 5.0, "running": 2, "limit": 1.0}
     return render("work_precision", found | changed, {}, stamp="", quick=False)
 
 
