@@ -44,10 +44,20 @@ def minimal(problem: Problem) -> Minimal:
 
     Raises NoMinimalCoordinates if there are none, or a four-bar has no angle that stays away from its dead centres.
     """
-    name = problem.system.name
-    if name not in MAKE:
-        raise NoMinimalCoordinates(f"equations in minimal coordinates exist for {', '.join(MAKE)}; given {name!r}")
-    return MAKE[name](problem)
+    if not has_minimal(problem):
+        given = problem.system.name
+        raise NoMinimalCoordinates(f"equations in minimal coordinates exist for {', '.join(MAKE)}; given {given!r}")
+    return MAKE[_kind(problem)](problem)
+
+
+def has_minimal(problem: Problem) -> bool:
+    """Return whether there are equations for the mechanism; a four-bar may still be refused by `minimal`."""
+    return _kind(problem) in MAKE
+
+
+def _kind(problem: Problem) -> str:
+    """Return the name of the mechanism without its size, which follows a comma."""
+    return problem.system.name.partition(",")[0]
 
 
 def _pendulum(problem: Problem) -> Minimal:
@@ -224,7 +234,43 @@ def _four_bar(problem: Problem) -> Minimal:
     return Minimal(equations, (float(problem.q0[3 * own + 2]), float(problem.v0[3 * own + 2])), states)
 
 
+def _n_four_bar(problem: Problem) -> Minimal:
+    """One angle, that of all cranks from the ground line: th'' = -w^2 cos th, on the branch with level couplers.
+
+    n + 1 uniform bars turn about their ends and n do not turn; at positions where C_q loses rank nothing happens here.
+    """
+    n, length, gravity = (problem.parameters[name] for name in ("n", "length", "gravity"))
+    inertia, weight = (n + 1) / 3.0 + n, 0.5 * (n + 1) + n  # of bars of equal mass, over mass times length (squared)
+    pull = weight * gravity / (inertia * length)
+    by_tips = len(problem.q0) == 2 * (n + 1)
+    crank = 1.0 if by_tips else 0.5  # of its length, to the point whose coordinates are q
+
+    def equations(functions: Any) -> Equations:
+        cos = functions.cos
+
+        def rates(y):  # type: ignore[no-untyped-def]
+            return y[1], -pull * cos(y[0])
+
+        return rates
+
+    def states(y: Array) -> tuple[Array, Array]:
+        arm, turned = length * np.exp(1j * y[0]), y[1] * 1j * length * np.exp(1j * y[0])
+        cranks = [(crank * arm + length * i, crank * turned, y[0], y[1]) for i in range(n + 1)]
+        level = np.zeros_like(y[0])
+        couplers = [(arm + length * (i + 0.5), turned, level, level) for i in range(n)]
+        q = [part for x, _, angle, _ in cranks + couplers for part in (x.real, x.imag, angle)]
+        v = [part for _, u, _, rate in cranks + couplers for part in (u.real, u.imag, rate)]
+        if by_tips:
+            q, v = ([part for i, part in enumerate(made[: 3 * (n + 1)]) if i % 3 < 2] for made in (q, v))
+        return np.array(q), np.array(v)
+
+    tip, speed = problem.q0[:2] / (crank * length), problem.v0[:2] / (crank * length)
+    angle = math.atan2(tip[1], tip[0]) if by_tips else float(problem.q0[2])  # with whole turns
+    return Minimal(equations, (angle, float(tip[0] * speed[1] - tip[1] * speed[0])), states)
+
+
 OTHERS = ((0, 1, 2), (1, 0, 2), (2, 0, 1))  # a bar and the two others
 HALVES = ((0.5, 0.0, 0.0), (1.0, 0.5, 0.0), (1.0, 1.0, 0.5))  # path to the centre of a bar, in lengths of the bars
 MAKE: dict[str, Callable[[Problem], Minimal]] = {"four-bar": _four_bar, "A01 pendulum": _pendulum}
 MAKE |= {"projection pendulum": _pendulum, "double pendulum": _double_pendulum, "SUNDIALS slider-crank": _slider_crank}
+MAKE |= {"A02": _n_four_bar}

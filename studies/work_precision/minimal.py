@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from references.minimal.equations import MAKE
+from references.minimal.equations import has_minimal
 from studies.bench import adaptive, headline
 from studies.bench.collector import REPEATS, Run
 from studies.bench.end_states import case_of
@@ -26,12 +26,14 @@ WRONG, ASKED = 0.1, 1e-4  # a run that ends with this error, though it was asked
 TIME_LIMIT = 10.0  # s of CPU; heyoka's loosest runs may be its slowest, and what passes it twice is not asked on
 PENDULUMS = {"A01 pendulum", "projection pendulum", "double pendulum"}  # no loops; from rest in a horizontal position
 
+SINGULAR = "A02"  # whose variants lose rank; the one angle knows no such positions
+
 
 def runs(quick: bool) -> list[Run]:
     """Both solvers on every mechanism that has minimal coordinates."""
     found = []
     for name, problem in rivals.problems(quick).items():
-        if problem.system.name in MAKE:
+        if has_minimal(problem):
             case = replace(case_of(problem), name=name, time_limit=TIME_LIMIT, timed=rivals.TIMED)
             values = rivals.QUICK_TOLERANCES if quick else TOLERANCES
             repeats = 1 if quick else REPEATS
@@ -57,8 +59,9 @@ def findings_by_kind(rows: pd.DataFrame, everywhere: pd.DataFrame) -> list[dict[
     """The findings of mechanisms with loops and of pendulums, as far as there are rows of them."""
     if not len(rows):
         return []
-    of_pendulums = rows["case"].isin(PENDULUMS)
-    kinds = (("loops", rows[~of_pendulums]), ("pendulums", rows[of_pendulums]))
+    of_pendulums, singular = rows["case"].isin(PENDULUMS), rows["case"].astype(str).str.startswith(SINGULAR)
+    loops = rows[~of_pendulums & ~singular]
+    kinds = (("loops", loops), ("pendulums", rows[of_pendulums]), ("singular", rows[singular]))
     return [{"kind": kind, **findings_of(own, everywhere)} for kind, own in kinds if len(own)]
 
 

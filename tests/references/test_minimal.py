@@ -20,6 +20,8 @@ MAKE = {
     "projection pendulum": mechanisms.projection_pendulum,
     "double pendulum": mechanisms.double_pendulum,
     "slider-crank": mechanisms.sundials_slider_crank,
+    "A02 by tips": mechanisms.n_four_bar,
+    "A02 by bodies": lambda: mechanisms.n_four_bar(3, "bodies"),
 }
 SOLVERS = {
     "heyoka": ("heyoka", lambda *given, **more: minimal_solvers.solve_heyoka_minimal(*given, 1e-11, **more), 1e-12),
@@ -72,7 +74,7 @@ def test_any_four_bar_with_an_angle_clear_of_its_dead_centres(given, far):
     assert np.abs(q - known[0]).max() < far and np.abs(v - known[1]).max() < 10.0 * far
 
 
-@pytest.mark.parametrize("name", ["pendulum, right", "double pendulum", "slider-crank", "four-bar"])
+@pytest.mark.parametrize("name", ["pendulum, right", "double pendulum", "slider-crank", "four-bar", "A02 by bodies"])
 def test_a_start_in_motion(name):
     """From a state in the middle of the motion, the same motion goes on."""
     problem = MAKE[name]()
