@@ -21,6 +21,7 @@ from studies.compare import GROUP as LENGTH
 from studies.work_precision import first_calls, minimal, rivals, study
 
 AT_LENGTH = ", at length"  # after the name of a case: the runs over its whole motion
+IN_ANGLES = ", in angles"  # after that of a mechanism: the runs of its equations in minimal coordinates
 
 
 @dataclass(frozen=True)
@@ -47,7 +48,8 @@ def parts() -> dict[str, Part]:
     for case in study.known_cases(False):
         found[case.name + AT_LENGTH] = Part(LENGTH, case.name, partial(study.at_length, [case], False))
     found["first calls"] = Part(first_calls.GROUP, None, partial(first_calls.collect, quick=False))
-    found[minimal.GROUP] = Part(minimal.GROUP, None, partial(minimal.collect, quick=False))
+    for name in minimal.problems(False):
+        found[name + IN_ANGLES] = Part(minimal.GROUP, name, partial(minimal.collect, quick=False, names=[name]))
     return found
 
 
@@ -58,7 +60,8 @@ def part_of(name: str, known: Mapping[str, Part]) -> Part:
     """
     case, *solvers = name.split(" | ")
     whole = known.get(case)
-    if whole is None or (solvers and (whole.case is None or set(solvers) - CATALOGUE.keys())):
+    only_whole = whole is None or whole.case is None or whole.group == minimal.GROUP
+    if whole is None or (solvers and (only_whole or set(solvers) - CATALOGUE.keys())):
         raise StudyError(f"there is no {name!r}; parts are {'; '.join(known)}; and solvers of a mechanism after ' | '")
     if not solvers:
         return whole

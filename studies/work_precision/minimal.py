@@ -4,6 +4,7 @@ On the mechanisms whose loops close in closed form (`minimal.equations`). The ro
 ranking of solvers of a DAE sees. A part of `studies.work_precision`.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -17,6 +18,7 @@ from studies.bench.end_states import case_of
 from studies.bench.solvers import CATALOGUE, HEYOKA, MINIMAL
 from studies.bench.store import KeptRows
 from studies.work_precision import rivals
+from twoloop.mechanisms import Problem
 
 GROUP = "minimal coordinates"
 TOLERANCES = (1e-3, 1e-5, 1e-7, 1e-9, 1e-11, 1e-13)
@@ -29,23 +31,28 @@ PENDULUMS = {"A01 pendulum", "projection pendulum", "double pendulum"}  # no loo
 SINGULAR = "A02"  # whose variants lose rank; the one angle knows no such positions
 
 
-def runs(quick: bool) -> list[Run]:
-    """Both solvers on every mechanism that has minimal coordinates."""
-    found = []
-    for name, problem in rivals.problems(quick).items():
-        if has_minimal(problem):
-            case = replace(case_of(problem), name=name, time_limit=TIME_LIMIT, timed=rivals.TIMED)
-            values = rivals.QUICK_TOLERANCES if quick else TOLERANCES
-            repeats = 1 if quick else REPEATS
-            for solver in MINIMAL:
-                own = (HEYOKAS_OWN,) if solver.startswith(HEYOKA) and not quick else ()
-                found += [Run(case, CATALOGUE[solver], value, GROUP, repeats) for value in (*values, *own)]
+def problems(quick: bool) -> dict[str, Problem]:
+    """Every mechanism that has minimal coordinates."""
+    return {name: problem for name, problem in rivals.problems(quick).items() if has_minimal(problem)}
+
+
+def runs(quick: bool, names: Sequence[str]) -> list[Run]:
+    """All solvers on the mechanisms of these names."""
+    found, known = [], problems(quick)
+    for name in names:
+        case = replace(case_of(known[name]), name=name, time_limit=TIME_LIMIT, timed=rivals.TIMED)
+        values = rivals.QUICK_TOLERANCES if quick else TOLERANCES
+        repeats = 1 if quick else REPEATS
+        for solver in MINIMAL:
+            own = (HEYOKAS_OWN,) if solver.startswith(HEYOKA) and not quick else ()
+            found += [Run(case, CATALOGUE[solver], value, GROUP, repeats) for value in (*values, *own)]
     return found
 
 
-def collect(kept: KeptRows, quick: bool) -> pd.DataFrame:
-    """Rows of all runs, the repetitions interleaved."""
-    return adaptive.collect(runs(quick), kept, rivals.row_at_end, lambda run: True, () if quick else ERRORS)
+def collect(kept: KeptRows, quick: bool, names: Sequence[str] = ()) -> pd.DataFrame:
+    """Rows of all runs, the repetitions interleaved; on all mechanisms where none is named."""
+    chosen = runs(quick, names or list(problems(quick)))
+    return adaptive.collect(chosen, kept, rivals.row_at_end, lambda run: True, () if quick else ERRORS)
 
 
 def at_errors(rows: pd.DataFrame, others: pd.DataFrame) -> list[dict[str, Any]]:
