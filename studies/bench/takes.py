@@ -187,10 +187,11 @@ def _in_angles(minimal: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
     for kind in minimal:
         pairs = [at for each in kind["mechanisms"] for at in each["at"] if at["ratio"] is not None]
         faster = sum(at["verdict"] == "behind" for at in pairs)
-        told += [f"{kind['kind']}: faster than our best in {faster} of {len(pairs)} comparisons"] * bool(pairs)
+        name = "singular positions" if kind["kind"] == "singular" else kind["kind"]
+        told += [f"{name}: faster than our best in {faster} of {len(pairs)} comparisons"] * bool(pairs)
         by.update(at["rival"]["solver"].partition(",")[0] for at in pairs)
         for each in kind["wrong_by"]:
-            who, n = each["solver"].partition(",")[0], f"{each['n']} of {each['asked']} runs of {kind['kind']}"
+            who, n = each["solver"].partition(",")[0], f"{each['n']} of {each['asked']} runs of {name}"
             start = ", which start horizontally from rest" if kind.get("level") else ""
             told.append(f"`{who}` is silently wrong by over {number(kind['wrong_from'])} in {n}{start}")
     names = " or ".join(f"`{who}`" for who, _ in by.most_common(2))

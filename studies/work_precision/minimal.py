@@ -36,10 +36,10 @@ def problems(quick: bool) -> dict[str, Problem]:
     return {name: problem for name, problem in rivals.problems(quick).items() if has_minimal(problem)}
 
 
-def runs(quick: bool, names: Sequence[str]) -> list[Run]:
-    """All solvers on the mechanisms of these names."""
+def runs(quick: bool, names: Sequence[str] = ()) -> list[Run]:
+    """All solvers on the mechanisms of these names, or on all."""
     found, known = [], problems(quick)
-    for name in names:
+    for name in names or known:
         case = replace(case_of(known[name]), name=name, time_limit=TIME_LIMIT, timed=rivals.TIMED)
         values = rivals.QUICK_TOLERANCES if quick else TOLERANCES
         repeats = 1 if quick else REPEATS
@@ -50,9 +50,8 @@ def runs(quick: bool, names: Sequence[str]) -> list[Run]:
 
 
 def collect(kept: KeptRows, quick: bool, names: Sequence[str] = ()) -> pd.DataFrame:
-    """Rows of all runs, the repetitions interleaved; on all mechanisms where none is named."""
-    chosen = runs(quick, names or list(problems(quick)))
-    return adaptive.collect(chosen, kept, rivals.row_at_end, lambda run: True, () if quick else ERRORS)
+    """Rows of all runs, the repetitions interleaved."""
+    return adaptive.collect(runs(quick, names), kept, rivals.row_at_end, lambda run: True, () if quick else ERRORS)
 
 
 def at_errors(rows: pd.DataFrame, others: pd.DataFrame) -> list[dict[str, Any]]:

@@ -6,7 +6,7 @@ import pytest
 from studies.bench import cli
 from studies.bench.cli import StudyError
 from studies.bench.store import Output
-from studies.work_precision import again, first_calls, rivals, study
+from studies.work_precision import again, first_calls, minimal, rivals, study
 
 
 def rows(*lines):
@@ -34,6 +34,11 @@ def test_a_mechanism_measured_again_takes_the_place_of_its_rows():
     assert calls["call_s"].tolist() == [1.0, 2.0, 4.0, 8.0]
     length = again.replaced(KEPT, parts["four-bar" + again.AT_LENGTH], rows(("compare", "four-bar", 7.0, "new")))
     assert length["call_s"].tolist() == [1.0, 2.0, 3.0, 7.0]
+    angles = again.replaced(
+        pd.concat([KEPT, rows((minimal.GROUP, "four-bar", 5.0, "old"), (minimal.GROUP, "A02, N = 1", 6.0, "old"))]),
+        *(again.parts()["four-bar" + again.IN_ANGLES], rows((minimal.GROUP, "four-bar", 0.5, "new"))),
+    )
+    assert angles["call_s"].tolist() == [1.0, 2.0, 3.0, 4.0, 6.0, 0.5]
 
 
 def test_a_project_measured_again_takes_the_place_of_its_solvers_on_all_mechanisms():
@@ -72,10 +77,16 @@ def test_it_writes_each_part_at_once(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    "words", [[], ["five-bar"], ["five-bar | heyoka"], ["four-bar | hey"], ["first calls | heyoka"]]
+    "words",
+    [
+        *([], ["five-bar"], ["five-bar | heyoka"], ["four-bar | hey"], ["first calls | heyoka"]),
+        ["four-bar, in angles | heyoka"],
+    ],
 )
 def test_parts_are_named(words):
-    with pytest.raises(StudyError, match=r"parts are four-bar; four-bar, second; .*first calls; minimal coordinates"):
+    with pytest.raises(
+        StudyError, match=r"parts are four-bar; four-bar, second; .*first calls; four-bar, in angles"
+    ):
         again.main(words)
 
 

@@ -66,14 +66,15 @@ def test_a_run_that_ends_with_a_wrong_state_is_told():
     assert minimal.findings_of(wrong.assign(tol=0.1), everywhere())["wrong"] == 0
 
 
-def test_pendulums_which_have_no_loop_are_counted_apart():
-    pendulums = in_angles(0.5).assign(case="double pendulum")
-    both = pd.concat([in_angles(3.0), pendulums], ignore_index=True)
-    made = pd.concat([everywhere(), everywhere().assign(case="double pendulum")], ignore_index=True)
+def test_pendulums_and_singular_positions_are_counted_apart():
+    others = ("double pendulum", "A02, N = 1")
+    both = pd.concat([in_angles(3.0), *(in_angles(0.5).assign(case=name) for name in others)], ignore_index=True)
+    made = pd.concat([everywhere(), *(everywhere().assign(case=name) for name in others)], ignore_index=True)
     found = minimal.findings_by_kind(both, made)
     assert [(each["kind"], each["n_behind"], each["n_ahead"]) for each in found] == [
         ("loops", 0, 1),
         ("pendulums", 1, 0),
+        ("singular", 1, 0),
     ]
 
 
