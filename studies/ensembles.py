@@ -238,6 +238,7 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
         found["usual"] = {"n": int(usual["n_runs"].iloc[0]), "median": errors.iloc[0], "worst": errors.iloc[1]}
     found["n_single"], found["scatter"] = N_SINGLE, SCATTER
     names = ("ahead", "behind", "undecided", "alone", "missed", "none")
+    found["n_few"] = sum(line["verdict"] == "none" and CYRK in line["run_s"] for line in lines)
     found["verdicts"] = {name: sum(line["verdict"] == name for line in lines) for name in names}
     geometry = rows[rows["group"] == GEOMETRY]
     found["refused"] = rows.reindex(columns=["way", "case", "message"]).dropna().to_dict("records")

@@ -185,6 +185,7 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     ahead = [at["standing"][headline.BEST] for at in every if at["standing"][headline.BEST]["verdict"] == "ahead"]
     found["ahead_of_python"] = sum(best["rival"]["solver"] in python for best in ahead)
     found["processors"] = sorted(rows["processor"].dropna().unique()) if "processor" in rows else []
+    found["drift"] = drift(rows, made)
     return found
 
 
@@ -237,6 +238,23 @@ def _typical(made: Sequence[dict[str, Any]], error: float) -> dict[str, Any] | N
     quartiles = np.percentile(ratios, (25, 50, 75)).tolist()
     spread = {"quartiles": quartiles, "range": [min(ratios), max(ratios)]}
     return {"error": error, "n": len(known), **spread, "call_s": float(np.median(calls))}
+
+
+def drift(rows: pd.DataFrame, made: Sequence[dict[str, Any]]) -> float | None:
+    """How far the fastest rivals leave the constraints where they are faster than the default, in the median.
+
+    |C| of the cheapest run that is accurate enough over the error compared; None: all of them keep the constraints.
+    """
+    known = rows.reindex(columns=[*rows.columns, *{"violation_q", "keeps_constraints"} - set(rows.columns)])
+    leaves = known[known[["error_q", "violation_q"]].notna().all(axis=1) & known["keeps_constraints"].eq(False)]
+    ratios = []
+    for case, at in ((each["case"], at) for each in made for at in each["at"]):
+        standing = at["standing"][headline.GIVEN]
+        own = leaves[(leaves["case"] == case) & (leaves["solver"] == standing["rival"]["solver"])]
+        own = own[own["error_q"].astype(float) <= at["error"]]
+        if standing["verdict"] == "behind" and len(own):
+            ratios.append(float(own.loc[own["call_s"].astype(float).idxmin(), "violation_q"]) / at["error"])
+    return float(np.median(ratios)) if ratios else None
 
 
 def close(every: Sequence[dict[str, Any]]) -> dict[str, Any]:

@@ -42,6 +42,18 @@ def test_ahead_and_behind_follow_the_rows(own, behind):
     assert given["missed"] == own_code["missed"] == plain["missed"] == best["n"] == len(rivals.DECADES)  # none was run
 
 
+def test_drift_is_that_of_the_fastest_rivals_at_the_errors_where_the_default_is_slower():
+    table = rows(
+        (rivals.given_on("four-bar"), "two-loop", "compiled", 1e-14, 3.0),
+        ("CyRK, DOP853", "CyRK", "compiled", 1e-8, 1.0),
+        ("CyRK, DOP853", "CyRK", "compiled", 1e-14, 2.0),
+    )
+    leaving = table.assign(keeps_constraints=[True, False, False], violation_q=[9.0, 2e-8, 3e-14])
+    over = sorted((2e-8 if error >= 1e-8 else 3e-14) / error for error in rivals.DECADES)
+    assert rivals.findings_of(leaving)["drift"] == pytest.approx(float(np.median(over)))
+    assert rivals.findings_of(leaving.assign(keeps_constraints=True))["drift"] is None
+
+
 def test_who_gets_how_far_at_singular_positions_counts_rivals_too():
     lines = [("auto", 1e-5), ("auto, compiled", 1e-4), ("DOP853, projected", 1e-8), ("heyoka", 1.0)]
     ours = {"auto", "auto, compiled"}
