@@ -197,7 +197,7 @@ def test_every_number_of_the_screen_is_made_again_from_the_rows(tmp_path):
         f"| first call | {first} | – | {number(1e3 * FIRST['CVODE from C, Adams'])} | – | – |\n",
         "First calls, at 1e-8, were timed once",
         "were drawn on 22 and 23 November 2026; our methods",
-        "a gust lasts about 4 b.",
+        "The table splits b and durations at this interval.",
         "runs of 3.0 s that report success at a tolerance of 1e-8 with an error over 1e-3:",
         "| | IDA from C | the default |",
         f"| 17 kinds of sharp forces (4 gusts, 2 frictions, 11 others) | {' | '.join(held_out)} |",
