@@ -56,6 +56,9 @@ class Value:
 
     __radd__, __rmul__ = __add__, __mul__
 
+    def __truediv__(self, other: Any) -> "Value":
+        return self._with("/", other)
+
     def __rtruediv__(self, other: Any) -> "Value":
         return self._with("/", other, True)
 

@@ -4,17 +4,18 @@ Each is used as for redundant coordinates (`heyoka.taylor`, `cyrk.ode`, `sundial
 best there, and the same timing of a second use of the integrator.
 """
 
-import math
 from collections.abc import Callable
-from functools import lru_cache
+from functools import lru_cache, partial
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike
 
 from references.cyrk import ode
 from references.driver import Task, check_task, imported
+from references.equations.machine_code import machine_code
+from references.equations.straight_line import Program, Value
 from references.heyoka import taylor
 from references.lines import Line
 from references.minimal.equations import Minimal, minimal
@@ -24,6 +25,7 @@ from twoloop.mechanisms import Problem
 from twoloop.problem.problem import Array
 from twoloop.result.result import Result
 
+FUNCTIONS = ("sin", "cos", "sqrt")  # that equations in minimal coordinates have
 _KNOWN: dict[int, tuple[Problem, Minimal]] = {}
 
 
@@ -134,15 +136,15 @@ def _integrator(own: Minimal, tol: float) -> Any:
 @lru_cache(maxsize=64)
 def _right_hand_side(own: Minimal, made: Callable[[Any, int], Any]) -> Any:
     """Return the right-hand side as `made` makes it for a solver of a compiled (t, y, rate) -> None."""
-    rates, size = njit(error_model="numpy")(own.equations(math)), len(own.start)
+    program, n = Program(), len(own.start) // 2
+    names = [f"{letter}{i}" for letter in "qv" for i in range(n)]
+    functions = {name: partial(_of, program, name) for name in FUNCTIONS}
+    rates = own.equations(SimpleNamespace(**functions))([Value(program, name) for name in names])
+    return made(machine_code(n, program.names, enumerate(each.name for each in rates)), 2 * n)
 
-    @njit(error_model="numpy")
-    def derivative(t, y, rate):  # type: ignore[no-untyped-def]
-        found = rates(y)
-        for i in range(size):
-            rate[i] = found[i]
 
-    return made(derivative, size)
+def _of(program: Program, name: str, x: Value) -> Value:
+    return program.value(name, x.name)
 
 
 def _states(own: Minimal, task: Task, rows: Array) -> Array:
