@@ -5,6 +5,7 @@ import enum
 import hashlib
 import sys
 import types
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 from weakref import WeakKeyDictionary
@@ -18,6 +19,7 @@ from twoloop.kernels.compile.private import options_of, registered
 # libraries whose functions are told apart by name; the versions of numba and numpy are compared, too
 LIBRARIES = {*sys.stdlib_module_names, "numpy", "numba", "scipy"}
 
+MOST_CODES = 2000  # whose names are kept: to read the operations of helpers again takes most of the time of tracing
 FORM = 2  # another one for machine code that files of earlier versions may have wrong
 
 
@@ -142,10 +144,11 @@ def globals_of(function: Any) -> dict[str, Any]:
     return {name: function.__globals__[name] for name in sorted(names)}
 
 
-def _loaded(code: types.CodeType) -> set[str]:
+@lru_cache(MOST_CODES)
+def _loaded(code: types.CodeType) -> frozenset[str]:
     inner = [constant for constant in code.co_consts if isinstance(constant, types.CodeType)]
     own = {each.argval for each in dis.get_instructions(code) if each.opname in ("LOAD_GLOBAL", "LOAD_NAME")}
-    return own.union(*map(_loaded, inner))
+    return frozenset(own).union(*map(_loaded, inner))
 
 
 def names_reached(function: Any, seen: set[int] | None = None) -> set[str]:
