@@ -185,8 +185,8 @@ def _in_angles(minimal: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
     """In how many comparisons an ODE in minimal coordinates is faster than our best with constraints."""
     told, by = [], Counter[str]()
     for kind in minimal:
-        pairs = [at for each in kind["mechanisms"] for at in each["at"] if at["ratio"] is not None]
-        faster = sum(at["verdict"] == "behind" for at in pairs)
+        pairs = [at for each in kind["mechanisms"] for at in each["at"] if at["ratio"] or at["verdict"] == "missed"]
+        faster = sum(at["verdict"] in ("behind", "missed") for at in pairs)
         name = "singular positions" if kind["kind"] == "singular" else kind["kind"]
         told += [f"{name}: faster than our best in {faster} of {len(pairs)} comparisons"] * bool(pairs)
         by.update(at["rival"]["solver"].partition(",")[0] for at in pairs)

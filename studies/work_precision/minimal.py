@@ -4,7 +4,7 @@ On the mechanisms whose loops close in closed form (`minimal.equations`). The ro
 ranking of solvers of a DAE sees. A part of `studies.work_precision`.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -61,6 +61,11 @@ def at_errors(rows: pd.DataFrame, others: pd.DataFrame) -> list[dict[str, Any]]:
     return [at[headline.BEST] | {"error": error} for error, at in zip(ERRORS, found, strict=True)]
 
 
+def is_compared(at: Mapping[str, Any]) -> bool:
+    """Whether both sides reach an error, or only the ODEs in angles do."""
+    return at["ratio"] is not None or at["verdict"] == "missed"
+
+
 def findings_by_kind(rows: pd.DataFrame, everywhere: pd.DataFrame) -> list[dict[str, Any]]:
     """The findings of mechanisms with loops and of pendulums, as far as there are rows of them."""
     if not len(rows):
@@ -78,8 +83,11 @@ def findings_of(rows: pd.DataFrame, everywhere: pd.DataFrame) -> dict[str, Any]:
         {"case": str(name), "at": at_errors(own, everywhere[everywhere["case"] == name])}
         for name, own in rows.groupby("case", sort=False)
     ]
-    pairs = [at for each in made for at in each["at"] if at["ratio"] is not None]
-    verdicts, ratios = [each["verdict"] for each in pairs], [each["ratio"] for each in pairs]
+    pairs = [at for each in made for at in each["at"] if is_compared(at)]
+    verdicts, ratios = (
+        [each["verdict"] for each in pairs],
+        [each["ratio"] for each in pairs if each["ratio"] is not None],
+    )
     found: dict[str, Any] = {"mechanisms": made, "n": len(pairs), "wrong_from": WRONG}
     asked = rows[rows["error_q"].notna() & (rows["tol"] <= ASKED)]
     wrong = asked[asked["error_q"].astype(float) > WRONG]
@@ -89,6 +97,7 @@ def findings_of(rows: pd.DataFrame, everywhere: pd.DataFrame) -> dict[str, Any]:
     found["by_default"] = bool((wrong["tol"] == HEYOKAS_OWN).any())
     counts, of = wrong["solver"].value_counts(sort=False), asked["solver"].value_counts()
     found["wrong_by"] = [{"solver": str(name), "n": int(n), "asked": int(of[name])} for name, n in counts.items()]
-    found |= {f"n_{verdict}": verdicts.count(verdict) for verdict in ("ahead", "behind", "undecided")}
+    found |= {f"n_{verdict}": verdicts.count(verdict) for verdict in ("ahead", "behind", "undecided", "missed")}
+    found["n_behind"] += found["n_missed"]  # as on the first screen: what only others reach
     sizes = (min(ratios), float(np.median(ratios)), max(ratios)) if ratios else (None, None, None)
     return found | dict(zip(("least", "median", "most"), sizes, strict=True))

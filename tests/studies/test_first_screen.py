@@ -320,12 +320,16 @@ def test_odes_in_angles_are_counted_from_the_rows():
     """From the committed rows, by another way than the findings: the sentence is of all kinds together."""
     made = json.loads((ROOT / "reports" / "work_precision.json").read_text(encoding="utf-8"))["minimal"]
     standings = [at["verdict"] for kind in made for mechanism in kind["mechanisms"] for at in mechanism["at"]]
+    standings = ["behind" if verdict == "missed" else verdict for verdict in standings]  # what only the ODE reaches
     decided = [verdict for verdict in standings if verdict in ("ahead", "behind", "undecided")]
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
     told = f"faster than our best in {decided.count('behind')} of {len(decided)} comparisons"
     assert told in " ".join(readme.split()) and told in (ROOT / "reports" / "README.md").read_text(encoding="utf-8")
     (singular,) = [kind for kind in made if kind["kind"] == "singular"]
-    own = [at["verdict"] for mechanism in singular["mechanisms"] for at in mechanism["at"] if at["ratio"] is not None]
+    own = [at["verdict"] for mechanism in singular["mechanisms"] for at in mechanism["at"]]
+    own = [
+        "behind" if verdict == "missed" else verdict for verdict in own if verdict not in ("none", "alone", "unasked")
+    ]
     assert (
         f"in its one angle, not counted, an ODE is faster than our best in {own.count('behind')} of {len(own)}."
         in " ".join(readme.split())
@@ -337,7 +341,7 @@ def test_the_screen_has_few_words_and_sixty_lines_at_most(tmp_path):
     block = front.split(BEGIN)[1].split(END)[0]
     fixed = len(front.splitlines()) - len(block.splitlines())
     words = [word for word in block.replace("|", " ").split() if set(word) - set("-:")]
-    assert len(words) <= 935
+    assert len(words) <= 945
     assert fixed + max(len(each.splitlines()) for each in (block, block_of(tmp_path, findings()))) <= 60
     assert "index-3" not in front and "two-loop" not in front.split(BEGIN)[0]
 

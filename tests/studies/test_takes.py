@@ -43,7 +43,7 @@ def minimal(kind, wrong=(), **mechanisms):
 
 
 def test_an_ode_in_angles_is_told_by_counts():
-    loops = minimal("loops", crank=["behind"] * 3, slider=["behind", "undecided", "ahead"])
+    loops = minimal("loops", crank=["behind"] * 3, slider=["missed", "undecided", "ahead"])
     wrong = {"solver": "heyoka, minimal", "n": 3, "asked": 14}
     pendulums = minimal("pendulums", [wrong], one=["behind"] * 3, two=["behind"] * 3)
     (row,) = takes({"work_precision": {"minimal": [loops, pendulums]}}, [])
