@@ -82,6 +82,7 @@ def findings_of(rows: pd.DataFrame, everywhere: pd.DataFrame) -> dict[str, Any]:
     made: list[dict[str, Any]] = [
         {"case": str(name), "at": at_errors(own, everywhere[everywhere["case"] == name])}
         for name, own in rows.groupby("case", sort=False)
+        if (everywhere["case"] == name).any()
     ]
     pairs = [at for each in made for at in each["at"] if is_compared(at)]
     verdicts, ratios = (
