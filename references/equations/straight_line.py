@@ -4,7 +4,7 @@ The equations come from `equations.expressions`: loops are unrolled, structural 
 computed once.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import lru_cache
 from typing import Any
 
@@ -29,6 +29,10 @@ class Program:
     def value(self, *what: str) -> "Value":
         """Return the value of (left, operator, right) or of (function, argument)."""
         return Value(self, self.names.setdefault(what, f"x{len(self.names)}"))
+
+    def functions(self, names: Iterable[str]) -> dict[str, Callable[["Value"], "Value"]]:
+        """Return the functions of these names, of values."""
+        return {name: lambda x, name=name: self.value(name, x.name) for name in names}  # type: ignore[misc]
 
 
 class Value:
@@ -76,7 +80,7 @@ def program_of(equations: Expressions) -> tuple[Program, list[str]]:
 def _printed(equations: Expressions, program: Program) -> Printed:
     """Return the translator of forms to a program in the values t, q0, q1, ..., v0, v1, ..."""
     names = ["t", *(f"{letter}{i}" for letter in "qv" for i in range(equations.system.n_q))]
-    functions = {name: lambda x, name=name: program.value(name, x.name) for name in FUNCTIONS.values()}  # type: ignore[misc]
+    functions = program.functions(FUNCTIONS.values())
     return Printed(equations.traced.graph, functions, [Value(program, name) for name in names])
 
 

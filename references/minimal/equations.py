@@ -255,13 +255,13 @@ def _n_four_bar(problem: Problem) -> Minimal:
 
     def states(y: Array) -> tuple[Array, Array]:
         arm, turned = length * np.exp(1j * y[0]), y[1] * 1j * length * np.exp(1j * y[0])
-        cranks = [(crank * arm + length * i, crank * turned, y[0], y[1]) for i in range(n + 1)]
-        level = np.zeros_like(y[0])
-        couplers = [(arm + length * (i + 0.5), turned, level, level) for i in range(n)]
-        q = [part for x, _, angle, _ in cranks + couplers for part in (x.real, x.imag, angle)]
-        v = [part for _, u, _, rate in cranks + couplers for part in (u.real, u.imag, rate)]
-        if by_tips:
-            q, v = ([part for i, part in enumerate(made[: 3 * (n + 1)]) if i % 3 < 2] for made in (q, v))
+        bars = [(crank * arm + length * i, crank * turned, y[0], y[1]) for i in range(n + 1)]
+        if not by_tips:
+            level = np.zeros_like(y[0])
+            bars += [(arm + length * (i + 0.5), turned, level, level) for i in range(n)]
+        size = 2 if by_tips else 3  # coordinates of each
+        q = [part for x, _, angle, _ in bars for part in (x.real, x.imag, angle)[:size]]
+        v = [part for _, u, _, rate in bars for part in (u.real, u.imag, rate)[:size]]
         return np.array(q), np.array(v)
 
     tip, speed = problem.q0[:2] / (crank * length), problem.v0[:2] / (crank * length)

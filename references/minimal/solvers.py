@@ -5,7 +5,7 @@ best there, and the same timing of a second use of the integrator.
 """
 
 from collections.abc import Callable
-from functools import lru_cache, partial
+from functools import lru_cache
 from types import SimpleNamespace
 from typing import Any
 
@@ -138,13 +138,9 @@ def _right_hand_side(own: Minimal, made: Callable[[Any, int], Any]) -> Any:
     """Return the right-hand side as `made` makes it for a solver of a compiled (t, y, rate) -> None."""
     program, n = Program(), len(own.start) // 2
     names = [f"{letter}{i}" for letter in "qv" for i in range(n)]
-    functions = {name: partial(_of, program, name) for name in FUNCTIONS}
-    rates = own.equations(SimpleNamespace(**functions))([Value(program, name) for name in names])
+    functions = SimpleNamespace(**program.functions(FUNCTIONS))
+    rates = own.equations(functions)([Value(program, name) for name in names])
     return made(machine_code(n, program.names, enumerate(each.name for each in rates)), 2 * n)
-
-
-def _of(program: Program, name: str, x: Value) -> Value:
-    return program.value(name, x.name)
 
 
 def _states(own: Minimal, task: Task, rows: Array) -> Array:

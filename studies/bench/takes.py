@@ -185,11 +185,10 @@ def _in_angles(minimal: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
     """In how many comparisons an ODE in minimal coordinates is faster than our best with constraints."""
     told, by = [], Counter[str]()
     for kind in minimal:
-        pairs = [at for each in kind["mechanisms"] for at in each["at"] if at["ratio"] or at["verdict"] == "missed"]
-        faster = sum(at["verdict"] in ("behind", "missed") for at in pairs)
         name = "singular positions" if kind["kind"] == "singular" else kind["kind"]
-        told += [f"{name}: faster than our best in {faster} of {len(pairs)} comparisons"] * bool(pairs)
-        by.update(at["rival"]["solver"].partition(",")[0] for at in pairs)
+        told += [f"{name}: faster than our best in {kind['n_behind']} of {kind['n']} comparisons"] * bool(kind["n"])
+        every = (at for each in kind["mechanisms"] for at in each["at"])
+        by.update(at["rival"]["solver"].partition(",")[0] for at in every if at["ratio"] is not None)
         for each in kind["wrong_by"]:
             who, n = each["solver"].partition(",")[0], f"{each['n']} of {each['asked']} runs of {name}"
             start = ", which start horizontally from rest" if kind.get("level") else ""

@@ -4,7 +4,7 @@ On the mechanisms whose loops close in closed form (`minimal.equations`). The ro
 ranking of solvers of a DAE sees. A part of `studies.work_precision`.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -61,11 +61,6 @@ def at_errors(rows: pd.DataFrame, others: pd.DataFrame) -> list[dict[str, Any]]:
     return [at[headline.BEST] | {"error": error} for error, at in zip(ERRORS, found, strict=True)]
 
 
-def is_compared(at: Mapping[str, Any]) -> bool:
-    """Whether both sides reach an error, or only the ODEs in angles do."""
-    return at["ratio"] is not None or at["verdict"] == "missed"
-
-
 def findings_by_kind(rows: pd.DataFrame, everywhere: pd.DataFrame) -> list[dict[str, Any]]:
     """The findings of mechanisms with loops and of pendulums, as far as there are rows of them."""
     if not len(rows):
@@ -84,11 +79,9 @@ def findings_of(rows: pd.DataFrame, everywhere: pd.DataFrame) -> dict[str, Any]:
         for name, own in rows.groupby("case", sort=False)
         if (everywhere["case"] == name).any()
     ]
-    pairs = [at for each in made for at in each["at"] if is_compared(at)]
-    verdicts, ratios = (
-        [each["verdict"] for each in pairs],
-        [each["ratio"] for each in pairs if each["ratio"] is not None],
-    )
+    every = [at for each in made for at in each["at"]]
+    pairs = [at for at in every if at["ratio"] is not None or at["verdict"] == "missed"]
+    verdicts, ratios = [at["verdict"] for at in pairs], [at["ratio"] for at in pairs if at["ratio"] is not None]
     found: dict[str, Any] = {"mechanisms": made, "n": len(pairs), "wrong_from": WRONG}
     asked = rows[rows["error_q"].notna() & (rows["tol"] <= ASKED)]
     wrong = asked[asked["error_q"].astype(float) > WRONG]

@@ -240,8 +240,8 @@ def _typical(made: Sequence[dict[str, Any]], error: float) -> dict[str, Any] | N
     return {"error": error, "n": len(known), **spread, "call_s": float(np.median(calls))}
 
 
-def drift(rows: pd.DataFrame, made: Sequence[dict[str, Any]]) -> list[float] | None:
-    """How far the fastest rivals leave the constraints where they are faster than the default: least, median, most.
+def drift(rows: pd.DataFrame, made: Sequence[dict[str, Any]]) -> dict[str, float] | None:
+    """How far the fastest rivals leave the constraints where they are faster than the default.
 
     |C| of the cheapest run that is accurate enough over the error compared; None: all of them keep the constraints.
     """
@@ -254,7 +254,7 @@ def drift(rows: pd.DataFrame, made: Sequence[dict[str, Any]]) -> list[float] | N
         own = own[own["error_q"].astype(float) <= at["error"]]
         if standing["verdict"] == "behind" and len(own):
             ratios.append(float(own.loc[own["call_s"].astype(float).idxmin(), "violation_q"]) / at["error"])
-    return np.percentile(ratios, (0, 50, 100)).tolist() if ratios else None
+    return {"median": float(np.median(ratios)), "most": max(ratios)} if ratios else None
 
 
 def close(every: Sequence[dict[str, Any]]) -> dict[str, Any]:

@@ -35,7 +35,9 @@ def test_rows_that_lack_the_newest_rival_say_so():
 
 def minimal(kind, wrong=(), **mechanisms):
     """Findings in minimal coordinates, from verdicts at three errors."""
-    told = {"kind": kind, "wrong_by": list(wrong), "wrong_from": 0.1, "mechanisms": []}
+    n = sum(map(len, mechanisms.values()))
+    n_behind = sum(verdict == "behind" for verdicts in mechanisms.values() for verdict in verdicts)
+    told = {"n": n, "n_behind": n_behind, "kind": kind, "wrong_by": list(wrong), "wrong_from": 0.1, "mechanisms": []}
     for name, verdicts in mechanisms.items():
         at = [{"verdict": verdict, "ratio": 1.0, "rival": {"solver": "heyoka, minimal"}} for verdict in verdicts]
         told["mechanisms"].append({"case": name, "at": at})
@@ -43,7 +45,7 @@ def minimal(kind, wrong=(), **mechanisms):
 
 
 def test_an_ode_in_angles_is_told_by_counts():
-    loops = minimal("loops", crank=["behind"] * 3, slider=["missed", "undecided", "ahead"])
+    loops = minimal("loops", crank=["behind"] * 3, slider=["behind", "undecided", "ahead"])
     wrong = {"solver": "heyoka, minimal", "n": 3, "asked": 14}
     pendulums = minimal("pendulums", [wrong], one=["behind"] * 3, two=["behind"] * 3)
     (row,) = takes({"work_precision": {"minimal": [loops, pendulums]}}, [])
