@@ -5,7 +5,7 @@ best there, and the same timing of a second use of the integrator.
 """
 
 from collections.abc import Callable
-from functools import lru_cache
+from functools import lru_cache, partial
 from types import SimpleNamespace
 from typing import Any
 
@@ -97,19 +97,20 @@ def solve_cyrk_minimal(
     rtol: float = 1e-8,
     atol: float = 1e-8,
     *,
+    method: str = "DOP853",
     t_eval: ArrayLike | None = None,
     time_limit: float | None = None,
 ) -> Result:
-    """Integrate a mechanism in minimal coordinates by CyRK's DOP853.
+    """Integrate a mechanism in minimal coordinates by one of CyRK's explicit methods, "DOP853" or "Vern8".
 
-    Parameters, errors and result as for `solve_cvode_minimal`.
+    Other parameters, errors and result as for `solve_cvode_minimal`.
     """
     check_positive("rtol", rtol)
     check_positive("atol", atol)
     own, task = _checked(problem, t_end, t_eval, time_limit)
     rate = _right_hand_side(own, ode.right_hand_side)
-    times, rows, failure, counts = ode.integrate((rate, None), np.array(own.start), task, "DOP853", rtol, atol)
-    return task.result("CyRK, DOP853,", times, _states(own, task, rows), failure, **counts)
+    times, rows, failure, counts = ode.integrate((rate, None), np.array(own.start), task, method, rtol, atol)
+    return task.result(f"CyRK, {method},", times, _states(own, task, rows), failure, **counts)
 
 
 def _checked(
@@ -158,6 +159,9 @@ LINES = (
         builds_each=True,
         **OWN,
     ),
-    Line(f"CyRK, DOP853, {FAMILY}", "cyrk", FAMILY, solve_cyrk_minimal, **OWN),
+    *(
+        Line(f"CyRK, {method}, {FAMILY}", "cyrk", FAMILY, partial(solve_cyrk_minimal, method=method), **OWN)
+        for method in ("DOP853", "Vern8")
+    ),
     Line(f"CVODE from C, {FAMILY}", "scikit-sundae", FAMILY, solve_cvode_minimal, **OWN),
 )

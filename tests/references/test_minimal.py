@@ -25,6 +25,11 @@ MAKE = {
 }
 SOLVERS = {
     "heyoka": ("heyoka", lambda *given, **more: minimal_solvers.solve_heyoka_minimal(*given, 1e-11, **more), 1e-12),
+    "CyRK, Vern8": (
+        "CyRK",
+        lambda *given, **more: minimal_solvers.solve_cyrk_minimal(*given, 1e-11, 1e-11, method="Vern8", **more),
+        1e-8,
+    ),
     "CVODE": (
         "sksundae",
         lambda *given, **more: minimal_solvers.solve_cvode_minimal(*given, 1e-10, 1e-10, **more),

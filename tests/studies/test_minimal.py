@@ -13,7 +13,7 @@ from tests.studies.test_rivals import stated
 from tests.studies.test_tables import rows
 from twoloop import mechanisms
 
-ANGLES, _, CVODE = MINIMAL
+ANGLES, *_, CVODE = MINIMAL
 
 
 def repeated(*lines, family="two-loop"):
