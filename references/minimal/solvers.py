@@ -5,7 +5,7 @@ best there, and the same timing of a second use of the integrator.
 """
 
 from collections.abc import Callable
-from functools import lru_cache, partial
+from functools import lru_cache
 from types import SimpleNamespace
 from typing import Any
 
@@ -160,7 +160,7 @@ LINES = (
         **OWN,
     ),
     *(
-        Line(f"CyRK, {method}, {FAMILY}", "cyrk", FAMILY, partial(solve_cyrk_minimal, method=method), **OWN)
+        Line(f"CyRK, {method}, {FAMILY}", "cyrk", FAMILY, solve_cyrk_minimal, {"method": method}, **OWN)
         for method in ("DOP853", "Vern8")
     ),
     Line(f"CVODE from C, {FAMILY}", "scikit-sundae", FAMILY, solve_cvode_minimal, **OWN),
