@@ -170,9 +170,16 @@ def many_runs(P, method, compile=True):
     return runs, np.abs(np.column_stack([runs.q[:, 0, -1], runs.v[:, 0, -1]]) - known).max() / 1e-7
 
 
-@pytest.mark.parametrize("method", ["auto", "Taylor", "DOP853"])
-@pytest.mark.parametrize("compile", [True, False])
-def test_runs_in_lanes_that_meet_short_gusts_are_made_singly(method, compile):
+# functions in Python are called as those that are compiled, by whichever method
+@pytest.mark.parametrize(
+    ("compile", "method"),
+    [
+        *((True, method) for method in ("auto", "Taylor", "DOP853")),
+        (False, "auto"),
+        *(pytest.param(False, method, marks=pytest.mark.slow) for method in ("Taylor", "DOP853")),
+    ],
+)
+def test_runs_in_lanes_that_meet_short_gusts_are_made_singly(compile, method):
     P = np.array([[9.0, 0.1, 2.0], [9.0, 0.02, 2.01], [10.0, 0.01, 3.01], [9.0, 0.1, 2.1], [11.0, 0.003, 3.0]])
     runs, off = many_runs(P, method, compile)
     assert off < 1e3 and runs.singly.tolist() == [True, True, True, False, True]

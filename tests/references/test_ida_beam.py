@@ -61,6 +61,7 @@ def test_heights_are_those_of_dop853():
     assert np.abs(tip_height(result.q) - TIPS["flexible"][:10]).max() < 1e-9
 
 
+@pytest.mark.slow  # the stiff beam takes the same way
 def test_six_digits_of_the_flexible_beam_at_1_s():
     assert errors("flexible", run("flexible", 1e-8, t_eval=TIMES[:10]))[0] < 2e-9
 

@@ -1,11 +1,14 @@
 """Motions of the ready mechanisms by equations that share nothing with their callbacks, in any floating-point type."""
 
+from functools import cache
+
 from tests.mechanisms.motions import planar, spatial
 from twoloop import mechanisms
 
 CLOSED_CHAINS = (2, 4, 5, 10, 20)
 
 
+@cache
 def known_motions():
     """Name to problem, motion and the end of the motion, for all without a closed form."""
     cases = [
@@ -25,6 +28,7 @@ def known_motions():
     return {problem.name: (problem, motion, end) for problem, motion, end in cases}
 
 
+@cache
 def closed_forms():
     """Name to problem and motion, for those with a closed form and an equation to integrate."""
     cases = [
