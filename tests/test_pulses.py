@@ -91,8 +91,7 @@ SMOOTH = {
 }
 
 
-@pytest.mark.parametrize("method", ["auto", "Adams", "RadauIIA5"])
-@pytest.mark.parametrize("name", SMOOTH)
+@pytest.mark.parametrize(("name", "method"), problems.some_of(SMOOTH, ("auto", "Adams", "RadauIIA5"), 2))
 def test_no_run_is_made_again_without_need(name, method, monkeypatch):
     made = []
     monkeypatch.setattr(twoloop.solve, "closer", made.append)

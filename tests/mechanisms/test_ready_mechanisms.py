@@ -19,6 +19,8 @@ COMPUTED, CLOSED = known_motions(), closed_forms()
 PROBLEMS = {name: problem for name, (problem, *_) in {**COMPUTED, **CLOSED}.items()}
 PROBLEMS["driven slider-crank"] = mechanisms.driven_slider_crank()
 EVERY = {**PROBLEMS, "four-bar": mechanisms.four_bar(), "beam": mechanisms.very_flexible_beam()}
+# of these tests/general/test_accuracy.py has the whole motions by the same equations, for seconds
+LONG = ("spatial slider-crank", "A05 governor", "A04 Bricard")
 DAMPED = ("SUNDIALS slider-crank", "A05 governor")
 every = pytest.mark.parametrize("problem", EVERY.values(), ids=EVERY)
 SINGULAR = [name for name, problem in PROBLEMS.items() if "singular" in problem.tags]
@@ -71,7 +73,7 @@ def test_a_tag_must_be_known():
 
 
 # --- references by a second route
-@pytest.mark.parametrize("name", COMPUTED)
+@pytest.mark.parametrize("name", [pytest.param(each, marks=[pytest.mark.slow] * (each in LONG)) for each in COMPUTED])
 def test_references_by_equations_in_few_coordinates(name):
     """In double precision by SciPy; the numbers themselves are from extended precision, by extrapolation."""
     problem, (rate, start, known), end = COMPUTED[name]

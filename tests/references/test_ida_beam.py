@@ -115,6 +115,7 @@ def test_tangent_gives_the_same_motion():
     assert given.stats.n_factorizations == pytest.approx(differenced.stats.n_factorizations, rel=0.4)
 
 
+@pytest.mark.slow  # as in the test of order 2 above
 def test_orders_and_error_test_reach_ida():
     def steps(**options):
         result = solve_ida_c(FOUR_BAR.system, (0.0, 2.0), FOUR_BAR.q0, FOUR_BAR.v0, rtol=1e-7, atol=1e-7, **options)

@@ -116,7 +116,9 @@ def test_cvode_takes_the_analytic_jacobian(monkeypatch):
     assert more[0] < exact.stats.n_jacobians and more[1] >= 4 * differenced.stats.n_jacobians  # one for each unknown
 
 
-@pytest.mark.parametrize("name", ["singular mass", "double pendulum", "pendulum"])
+@pytest.mark.parametrize(
+    "name", ["singular mass", *(pytest.param(each, marks=pytest.mark.slow) for each in ("double pendulum", "pendulum"))]
+)
 def test_a_jacobian_in_loops_is_that_of_straight_line_code(name):
     system, q, v = STATES[name]
     equations = expressions_at(system, 0.0, q.tobytes(), v.tobytes())
