@@ -91,7 +91,18 @@ SMOOTH = {
 }
 
 
-@pytest.mark.parametrize(("name", "method"), problems.some_of(SMOOTH, ("auto", "Adams", "RadauIIA5"), 2))
+EACH = ("auto", "Adams", "RadauIIA5")
+FAST = problems.some_of(SMOOTH, EACH, 2)
+
+
+@pytest.mark.parametrize(
+    ("name", "method"),
+    [
+        pytest.param(name, method, marks=[pytest.mark.slow] * ((name, method) not in FAST))
+        for name in SMOOTH
+        for method in EACH
+    ],
+)
 def test_no_run_is_made_again_without_need(name, method, monkeypatch):
     made = []
     monkeypatch.setattr(twoloop.solve, "closer", made.append)
