@@ -232,16 +232,19 @@ def test_frequencies_are_those_of_the_published_case():
     assert abs(frequencies(MAKE[SOFT]())[-1] - 3358.5) < 0.05
 
 
+@pytest.mark.slow  # as those of motion and step_size
 class TestQuickRun(QuickRun):
     pictures = ("beam_very_flexible", "beam_moderately_stiff")
 
 
+@pytest.mark.slow  # the quick study
 def test_a_quick_report_does_not_compare_with_the_paper(out):
     text = (out / "beam.md").read_text()
     assert "6278" not in text and "56.2" not in text  # the paper's seconds are not for so short a motion
     assert study.__doc__.split(":")[0] in index.first_screen(out, True)
 
 
+@pytest.mark.slow  # the quick study
 def test_quick_runs_follow_the_reference_and_newton_needs_far_fewer_evaluations(made):
     made = made[made["group"] == "run"]
     assert (made["status"] == "REACHED_END").all() and made["error_tip"].max() < 0.02
@@ -251,6 +254,7 @@ def test_quick_runs_follow_the_reference_and_newton_needs_far_fewer_evaluations(
     assert 1e-4 < steps[SOFT] < 3e-3 and 1e-5 < steps[STIFF] < 1e-4
 
 
+@pytest.mark.slow  # the quick study
 def test_the_papers_growth_test_is_no_limit_of_the_iteration(made):
     limits = made[made["group"] == "limit"].set_index("solver")["theory"]
     tests = made[made["group"] == "growth test"].set_index("tol")["measured"]

@@ -3,6 +3,7 @@
 import json
 import math
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -41,18 +42,25 @@ from studies.energy.study import pick
 from tests.studies import of_study
 
 STUDIED = energy
+REPORTS = Path(__file__).parents[2] / "reports"
 RIVALS = (HEYOKA, CVODE_C, CVODES, DIFFRAX)
 PERIOD = 2.2489859198
 
 
 @pytest.fixture(scope="module")
-def loaded(out):
-    return Output(Call("energy", True, out, False, "")).load_rows(curves=True)[0]
+def loaded():
+    """The committed rows."""
+    return Output(Call("energy", False, REPORTS, False, "")).load_rows(curves=True)[0]
 
 
 @pytest.fixture
 def rows(loaded):
     return energy.judged(loaded)
+
+
+@pytest.fixture
+def quick(out):
+    return energy.judged(Output(Call("energy", True, out, False, "")).load_rows(curves=True)[0])
 
 
 @pytest.fixture
@@ -68,18 +76,20 @@ def changed(rows, where, **values):
     return rows
 
 
+@pytest.mark.slow  # the quick study
 def test_only_the_report_is_left(out):
     names = {"README.md", "energy.md", "energy.csv", "energy.json", "energy_series.npz", ".lock"}
     names |= {f"energy_{what}.{suffix}" for what in ("long", "cost") for suffix in ("png", "svg")}
     assert {path.name for path in out.iterdir()} == names
 
 
+@pytest.mark.slow  # as those of motion and step_size
 class TestQuickRun(of_study.QuickRun):
     pictures = ("energy_long", "energy_cost")
 
 
-def test_findings_answer_the_first_screen(out):
-    found = json.loads((out / "energy.json").read_text())["long"]
+def test_findings_answer_the_first_screen():
+    found = json.loads((REPORTS / "energy.json").read_text())["long"]
     ours = found["no_drift"]["ours"]
     assert ours["calm"] and ours["keeps"] and ours["call_s"] > 0.0
     assert [at["share"] for at in found["at"]] == [1e-3, 1e-5, 1e-7]
@@ -98,8 +108,9 @@ def test_the_full_report_is_short_with_all_rivals(rows):
     assert len(" ".join(prose).split()) < 700
 
 
-def test_other_solvers_have_rows_near_the_true_motion(rows):
-    others = rows[rows["group"] == "other"]
+@pytest.mark.slow  # the quick study
+def test_other_solvers_have_rows_near_the_true_motion(quick):
+    others = quick[quick["group"] == "other"]
     assert set(others["solver"]) >= {DEFAULT, OWN_EXPLICIT, IDA_C, "LSODA, index 1", "DOP853, projected"}
     assert others[others["tol"] < 1e-6]["error_q"].max() < 0.1
 
@@ -117,13 +128,14 @@ def test_what_is_neither_symmetric_nor_symplectic_drifts(rows):
     assert pick(rows, ONE, RADAU)["verdict"] == DRIFTS
 
 
-def test_across_changes_of_partition_only_symmetry_helps(rows):
+@pytest.mark.slow  # the quick study
+def test_across_changes_of_partition_only_symmetry_helps(quick):
     for solver in (GAUSS, SUN):
-        assert pick(rows, SWITCHING, solver)["verdict"] == DRIFTS
+        assert pick(quick, SWITCHING, solver)["verdict"] == DRIFTS
     for variant in (EVEN, MOMENTA_EVEN):
-        assert pick(rows, SWITCHING, SUN, variant)["verdict"] == SLOWLY
-        assert pick(rows, SWITCHING, GAUSS, variant)["verdict"] == NO_DRIFT
-    assert pick(rows, SWITCHING, MIDPOINT, EVEN)["verdict"] == NO_DRIFT
+        assert pick(quick, SWITCHING, SUN, variant)["verdict"] == SLOWLY
+        assert pick(quick, SWITCHING, GAUSS, variant)["verdict"] == NO_DRIFT
+    assert pick(quick, SWITCHING, MIDPOINT, EVEN)["verdict"] == NO_DRIFT
 
 
 def test_newmark_does_not_drift_on_one_partition_and_does_across_changes(rows):
@@ -159,8 +171,8 @@ TURNING = {  # finding: rows, what is changed in them; the finding is there befo
 
 
 @pytest.mark.parametrize(("finding", "where", "slope"), TURNING.values(), ids=TURNING)
-def test_findings_turn_with_the_rows(finding, where, slope, rows, found_of, out):
-    assert finding(json.loads((out / "energy.json").read_text()))
+def test_findings_turn_with_the_rows(finding, where, slope, rows, found_of):
+    assert finding(energy.findings_of(rows))
     assert not finding(found_of(changed(rows, where, slope_error=0.0, slope=slope)))
 
 
@@ -223,10 +235,11 @@ def test_what_sets_the_price_is_repeated():
 
 def test_failed_and_lost_runs_are_found(rows, found_of):
     rows = rows[~rows["solver"].isin((HEYOKA, CYRK))]  # which are not installed everywhere
+    before = found_of(rows)["failed"]
     gone = {"status": "NOT_CONVERGED", "t_reached": 0.1, "slope": math.nan, "slope_error": math.nan}
     rows = changed(rows, f"{ON_ONE}'{RADAU}'", energy=math.nan, swing=math.nan, **gone)
     found = found_of(changed(rows, "solver == 'LSODA, index 1'", lost=True))
-    assert found["failed"] == 1 and found["radau"]["status"] == "NOT_CONVERGED"
+    assert found["failed"] == before + 1 and found["radau"]["status"] == "NOT_CONVERGED"
     lost = next(run for run in found["long"]["alternatives"] if run["solver"] == "LSODA, index 1")
     assert lost["verdict"] == IS_LOST and not lost["calm"]
 

@@ -168,10 +168,12 @@ def test_the_study_lists_all_cells_once():
     assert sum(run.repeats for run in table3.runs(*four_bar.cases(True), True)) < 100
 
 
+@pytest.mark.slow  # as those of motion and step_size
 class TestQuickRun(QuickRun):
     pictures = ("table3",)
 
 
+@pytest.mark.slow  # the quick study
 def test_the_quick_study_has_all_cells(made):
     found = made[made["group"].isin(FAMILIES) & (made["case"] == "four-bar")]
     assert len(found) == 32 and (found["status"] == "REACHED_END").all()
