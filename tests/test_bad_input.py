@@ -26,6 +26,8 @@ def refuses(error, words, *arguments, **options):
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.id)
 def test_each_mistake_has_its_error(case):
     error = errors_page.error_of(case)
+    if isinstance(error, ImportError) and not issubclass(case.error, ImportError):
+        pytest.skip(str(error))  # of a package that is optional: `make test-oldest`
     assert isinstance(error, case.error) and not isinstance(error, (OverflowError, UnicodeError)), repr(error)
     assert re.search(case.words, str(error), re.DOTALL), str(error)
 
@@ -39,6 +41,8 @@ def test_there_are_many_and_each_once():
 
 
 def test_the_page_of_errors_is_what_the_cases_give():
+    for package in ("pandas", "matplotlib"):
+        pytest.importorskip(package)
     page = Path(errors_page.__file__).parents[1] / "docs" / "errors.md"
     assert page.read_text(encoding="utf-8") == errors_page.page(), "renew it: python -m tests.errors_page"
 

@@ -250,11 +250,11 @@ def test_callbacks_along_runs_are_compared_by_the_doubling_rule(monkeypatch):
 
 
 CALLS = {  # in a call with other parameters: beyond those before, and among them
-    "four_bar": (960, 680),
-    "heavy_top": (720, 470),
+    "four_bar": (1010, 710),
+    "heavy_top": (770, 500),
     "spatial_four_bar": (1390, 1120),
     "bricard": (640, 450),
-    "redundant_slider_crank": (1390, 1150),
+    "redundant_slider_crank": (1460, 1210),
 }
 AT_TIMES = 210  # more where the solution is wanted at times
 

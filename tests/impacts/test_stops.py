@@ -49,12 +49,19 @@ def test_a_ball_bounces_to_rest(tmp_path):
     result.save(tmp_path / "run.npz")
     again = load(tmp_path / "run.npz", problem.system)
     assert (again.q == result.q).all() and again.changes == result.changes
-    again.animate(tmp_path / "run.html")
-    result.plot(tmp_path / "run.png")
     for each in (result, again, pickle.loads(pickle.dumps(result))):
         with pytest.raises(ValueError, match="impacts"):
             each.certify()
     assert result.arcs[0].certify().passed
+
+
+def test_a_run_with_impacts_is_drawn(tmp_path):
+    pytest.importorskip("matplotlib")
+    model = ball(velocity=(0.3, 0.0))
+    model.stop("ball", (0.0, 1.0), "ground", (5.0, 0.0), normal=(0.0, 3.0), restitution=0.7, name="floor")
+    _, result = moved(model, 2.0)
+    result.animate(tmp_path / "run.html")
+    result.plot(tmp_path / "run.png")
 
 
 def test_output_times():

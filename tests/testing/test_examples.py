@@ -46,6 +46,7 @@ def outside(python, folder, *words):
 # the dearest suite has one of its problems here, that on which no other runs; the whole is slow
 @pytest.mark.parametrize("smoke", ["redundant_slider_crank", pytest.param("smoke", marks=pytest.mark.slow)])
 def test_the_template_runs_on_the_installed_wheel(python, tmp_path, smoke):
+    pytest.importorskip("xdist")
     for path in EXAMPLES.glob("*.py"):
         text = path.read_text(encoding="utf-8")
         (tmp_path / path.name).write_text(text.replace('simulate, "smoke"', f'simulate, "{smoke}"'), encoding="utf-8")
