@@ -88,7 +88,7 @@ def test_ways_are_compared_at_equal_error_and_not_at_equal_tolerance():
 
 
 def test_the_first_screen_says_who_is_the_cheapest():
-    ahead, behind = "`ensemble` (ahead of all that were run", "`heyoka, batches` (ahead of `ensemble`"
+    ahead, behind = "`ensemble` (ahead of all that ran", "`heyoka, batches` (ahead of `ensemble`"
     for times, way in (({ENSEMBLE: 0.01, HEYOKA: 0.05}, ahead), ({ENSEMBLE: 0.05, HEYOKA: 0.01}, behind)):
         (line,) = takes.takes({"ensembles": ensembles.findings_of(rows(**times))}, [])
         assert line == {

@@ -63,7 +63,7 @@ def test_an_ode_in_angles_is_told_by_counts():
 def test_of_ensembles_it_is_said_how_many_are_close(ratios, close):
     at = [{"verdict": "ahead" if ratio > 1.0 else "behind", "ratio": ratio, "rival": "heyoka"} for ratio in ratios]
     (row,) = takes({"ensembles": {"cases": [{"at": [*at, {"verdict": "none", "ratio": None}]}]}}, [])
-    assert row["take"] == f"`ensemble` (ahead of all that were run in 2, behind in 1 of 3 comparisons{close}); {NO_ANGLES}"
+    assert row["take"] == f"`ensemble` (ahead of all that ran in 2, behind in 1 of 3 comparisons{close}); {NO_ANGLES}"
 
 
 @pytest.mark.parametrize(("over", "times"), [([7.0, 10.0], ", at 7.0 to 10 times the time"), (None, "")])
