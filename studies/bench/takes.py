@@ -162,7 +162,8 @@ def _at_once(cases: Sequence[Mapping[str, Any]]) -> list[dict[str, str]]:
     if not ahead + behind:
         return []
     fastest = Counter(at["rival"] for each in cases for at in each["at"] if at["verdict"] == "behind")
-    who, other = ("`ensemble`", "all that ran") if ahead > behind else (call(fastest.most_common(1)[0][0]), "`ensemble`")
+    ours = ahead > behind
+    who, other = ("`ensemble`", "all that ran") if ours else (call(fastest.most_common(1)[0][0]), "`ensemble`")
     told = f"ahead of {other} in {max(ahead, behind)}, behind in {min(ahead, behind)} of {verdicts.total()} comparisons"
     if verdicts["undecided"]:
         told += f", undecided in {verdicts['undecided']}"
