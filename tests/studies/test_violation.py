@@ -109,7 +109,6 @@ class TestQuickRun(QuickRun):
     pictures = ("violation", "violation_cost")
 
 
-@pytest.mark.slow  # the quick study
 def test_two_loop_procedures_keep_the_constraints_and_do_not_drift(line_up):
     ours = line_up[line_up["family"] == "two-loop"]
     assert len(ours) >= 8 and (ours["violation_q"] < 1e-13).all() and (ours["violation_v"] < 1e-13).all()
@@ -117,28 +116,24 @@ def test_two_loop_procedures_keep_the_constraints_and_do_not_drift(line_up):
     assert [name for name, row in ours.iterrows() for level in ("q", "v") if kind(row, level) == "grows"] == []
 
 
-@pytest.mark.slow  # the quick study
 def test_index_1_drifts_baumgarte_bounds_and_projection_keeps(line_up):
     plain, projected, bounded = (line_up.loc[s] for s in ("DOP853, index 1", "DOP853, projected", BAUMGARTE))
     assert plain["violation_q"] > 10.0 * bounded["violation_q"] > 1e3 * projected["violation_q"]
     assert grows(plain, "q") and grows(plain, "v") and not grows(bounded, "q") and not grows(projected, "q")
 
 
-@pytest.mark.slow  # the quick study
 def test_accelerations_by_eq_6_satisfy_their_constraints_and_others_do_not(line_up):
     own = pd.Series({name: CATALOGUE[name].own_accelerations for name in line_up.index})
     assert (line_up[~own]["violation_a"] < 1e-11).all() and (line_up[own]["violation_a"] > 1e-8).all()
     assert own[gear(2)] and not own[IRK]
 
 
-@pytest.mark.slow  # the quick study
 def test_index_3_and_index_2_forms_keep_only_their_own_level(line_up):
     third, second = line_up.loc["Exudyn, GeneralizedAlpha"], line_up.loc["Exudyn, TrapezoidalIndex2"]
     assert third["violation_q"] < 1e-12 < 1e-6 < third["violation_v"]
     assert second["violation_v"] < 1e-6 < second["violation_q"]
 
 
-@pytest.mark.slow  # the quick study
 def test_loose_loops_leave_a_trace_only_together(made):
     loops = made[made["group"] == "loops"].set_index(["err_in", "err_out"])["violation_q"]
     assert loops[1e-3, 1e-3] > 1e-10 > 1e-13 > loops[1e-3, 1e-9]
