@@ -143,7 +143,7 @@ def test_steps_that_test_positions_alone_do_not_creep_onto_another_branch(make, 
         assert np.abs(off(result.q)).max() < 1e-6, result
 
 
-@pytest.mark.filterwarnings("ignore:the run ends where:twoloop.ConstraintWarning")
+@pytest.mark.filterwarnings("ignore:the run (begins|ends) where:twoloop.ConstraintWarning")
 @pytest.mark.parametrize(
     ("method", "tolerance"),
     [
@@ -154,7 +154,7 @@ def test_steps_that_test_positions_alone_do_not_creep_onto_another_branch(make, 
 def test_no_run_that_begins_beside_a_singular_position_succeeds_on_another_branch_without_a_word(method, tolerance):
     """Both branches are within the tolerance there, and the pivots of the start are small themselves.
 
-    Rounding decides which of a hundred such runs turn; those say that rank was lost, in their message and by a warning.
+    Rounding decides which of a hundred such runs turn; all say so in their message and by a warning.
     """
     for angle, speed in ((4.3e-6, -5.0), (3.5e-5, -0.134), (1.3e-6, -0.0715), (1e-6, -5.0), (1e-5, -1.0), (4e-6, 3.0)):
         problem, _ = parallelogram(angle, speed)
@@ -162,6 +162,32 @@ def test_no_run_that_begins_beside_a_singular_position_succeeds_on_another_branc
             result = solve_dae(problem.system, (0.0, end), problem.q0, problem.v0, method, tolerance, tolerance)
             turned = np.abs(result.v[5]).max() > max(0.1 * abs(speed), 30.0 * tolerance)
             assert not (result.success and turned) or "lose rank" in result.message, result
+
+
+NEAR_START = "the run begins where the constraints nearly lose rank"
+
+
+@pytest.mark.parametrize(("angle", "tolerance", "near"), [(1e-4, 1e-3, True), (1e-4, 1e-6, False), (0.1, 1e-3, False)])
+def test_a_start_that_the_tolerances_do_not_tell_from_a_singular_position_is_told(angle, tolerance, near):
+    """At every call, and by whatever makes the run."""
+
+    def single(*start):
+        return solve_dae(problem.system, (0.0, 0.1), *start, rtol=tolerance, atol=tolerance)
+
+    problem, far = parallelogram(angle, 1.0)[0], parallelogram(0.5, 1.0)[0]
+    starts = (problem.q0, problem.v0), (far.q0, far.v0), (problem.q0, problem.v0), (problem.q0, problem.v0)
+    for start, beside in zip(starts, (near, False, near, near), strict=True):
+        with warnings.catch_warnings(record=True) as said:
+            warnings.simplefilter("always", ConstraintWarning)
+            result = single(*start)
+        assert result.success, result.message
+        assert [NEAR_START in str(each.message) for each in said] == [True] * beside
+        assert (NEAR_START[1:] in result.message) is beside
+    integrator = Integrator(problem.system, method="RadauIIA5", rtol=tolerance, atol=tolerance)
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always", ConstraintWarning)
+        integrator.start(0.0, problem.q0, problem.v0)
+    assert [NEAR_START in str(each.message) for each in said] == [True] * near
 
 
 ANGLE, SPEED = 2.3, 1.7  # of a parallelogram that turns uniformly, at first

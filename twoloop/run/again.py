@@ -16,7 +16,7 @@ from twoloop.generate.exact_derivatives import farthest
 from twoloop.generate.straight_code import OwnCode
 from twoloop.generate.traced_values import Sample
 from twoloop.kernels.compile.linking import direct
-from twoloop.kernels.data import flags, intervals
+from twoloop.kernels.data import flags, intervals, noted
 from twoloop.kernels.layout import short_loops
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.asked import Asked
@@ -43,6 +43,7 @@ MOST_WAITING, LARGEST = 4, 500_000  # those of a kind that wait for a call, one 
 IN_VAIN = 16  # runs that are not tried after one that did not come to its end ...
 TOO_LONG = 1024  # ... and after one for which there was no room, or which took longer than that:
 LONGEST = 0.1  # s of CPU time, in which Ctrl-C is not heard, nor is the time looked at
+NEARER = 0.1  # of the smallest pivot at the start of the first run: below it, a start is looked at anew
 DEFAULTS = {each.name: each.default for each in fields(Record) if each.default is not MISSING}
 NO_PACE = Pace(0.0)  # of a run that came to its end at once
 
@@ -90,6 +91,7 @@ class Again:
     ):
         self.movable = None if kin is None else Movable(kin, run)
         self.run, self.check_derivatives = run, check_derivatives
+        self.least_pivot = NEARER * run.work.notes[noted.PIVOT]
         self.territory = territory_of(run, check_derivatives) if kin is None else kin.territory(check_derivatives)
         run.control[run.a.STORE_ALL], run.control[run.a.MAX_ATTEMPTS] = 1.0, run.chunk
         self.beginning = Beginning(run, system if self.movable is None else self.movable.system, code, definite)
@@ -123,7 +125,8 @@ class Again:
     @staticmethod
     def suits(run: Run) -> bool:
         """Whether a run may be made in this way: its first chunk at least, in the dense form."""
-        return run.static is None and run.chunk * len(run.state) <= LARGEST and not run.system.called_in_python
+        fits = run.chunk * len(run.state) <= LARGEST
+        return run.static is None and fits and not run.said_of_start and not run.system.called_in_python
 
     @staticmethod
     def interpolates(run: Run) -> bool:
@@ -286,7 +289,7 @@ class Again:
                 array[:] = copy
             return True
         self.call, self.saved = None, []
-        if not self.beginning.at(t0, q0, v0):
+        if not self.beginning.at(t0, q0, v0) or run.work.notes[noted.PIVOT] < self.least_pivot:
             return False
         run.t0, run.compared_to[0] = t0, -np.inf
         if run.said_of_rows:  # rounding may decide which row is left out

@@ -18,7 +18,7 @@ from twoloop.run.crossings import Place, turned_last
 from twoloop.run.fields import BEFORE, kinds_of, of_run, of_steps, statistics
 from twoloop.run.interrupts import Interrupts, said_of_interrupt
 from twoloop.run.kept import OF_STEPS
-from twoloop.run.messages import message_of, outcome, unless_turned
+from twoloop.run.messages import message_of, outcome, unless_turned, warned
 from twoloop.run.pace import INTERRUPTED, OUT_OF_REACH, OUT_OF_TIME, STAGNATED, Pace
 from twoloop.run.passage import beyond, bridge, bridging_kit, give_way, leap
 from twoloop.run.record import Record, Status, explained
@@ -256,6 +256,8 @@ class Course:
                 status, message = compared(run, self.sample, end, check_derivatives, status, message)
             if self.last and status >= 0:
                 message += said_of_missed(run)
+            if status >= 0 and run.said_of_start:
+                message += warned(run.said_of_start)
             if status in EXPLAINED_BY_STIFFNESS:
                 message += said_of_stiffness(self.looks, run.kit, run.work)
         except KeyboardInterrupt:

@@ -221,7 +221,12 @@ def said_of_end(run: "Run") -> str:
             f"changes velocities there {_times_allowed(over)}, and accelerations by more. "
             "End t_span a little before, or beyond, or loosen rtol and atol"
         )
-    warnings.warn(said, ConstraintWarning, stacklevel=4)
+    return warned(said)
+
+
+def warned(said: str, calls: int = 4) -> str:
+    """A sentence for the message of what is warned of, to who called the solver."""
+    warnings.warn(said, ConstraintWarning, stacklevel=calls + 1)
     return f" {said[0].upper()}{said[1:]}."
 
 

@@ -22,7 +22,7 @@ from twoloop.methods.plan import Plan, least_tolerance
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.messages import said_of_not_finite
 from twoloop.run.static_form import static_form, with_newton
-from twoloop.run.undetermined import LEAST, nearness
+from twoloop.run.undetermined import LEAST, MARGIN, WEAK, nearness, said_of_start
 from twoloop.run.workspace import kit_of, kit_with, made_ready, workspace
 
 Array = NDArray[np.float64]
@@ -112,6 +112,7 @@ class Run:
         self.rank = len(self.work.rows_v)
         self.said: dict[tuple[int, ...], str] = {}  # of redundant rows, at the first start of this run where they are
         self.redundant, self.said_of_rows = self.redundant_rows()
+        self.said_of_start = self._said_of_start()
 
     def again(self) -> "Run":
         """A copy of this run at its start; this one must not have taken a step."""
@@ -135,6 +136,7 @@ class Run:
         if direct(self.kernels.start)(other.kit, work, t0, other.state) != codes.DONE:
             return None
         other.redundant, other.said_of_rows = other.redundant_rows()
+        other.said_of_start = other._said_of_start()
         return other
 
     def _copy(self) -> "Run":
@@ -287,6 +289,13 @@ class Run:
                 "step; multipliers are those of least norm. See docs/constraints.md#redundant-rows"
             )
         return np.array(redundant), self.said[found]
+
+    def _said_of_start(self) -> str:
+        """What is said of a start beside a singular position, where pivots are small: those of static factors vary."""
+        if self.work.notes[noted.PIVOT] > (MARGIN * WEAK if self.static is None else LEAST):
+            return ""
+        atol, q = self.tolerances[tolerances.ATOL :], self.state[: self.system.n_q]
+        return said_of_start(self.system, self.t0, q, self.rank, self.rtol, atol)
 
     def contradicting(self, rows: Rows) -> NDArray[np.int64]:
         """Of C_q and A at the start, rows that depend on others with which the accelerations disagree."""

@@ -27,7 +27,7 @@ from twoloop.run.course import Course
 from twoloop.run.fields import statistics
 from twoloop.run.interrupts import Interrupts
 from twoloop.run.kept import InMemory
-from twoloop.run.messages import said_of_end
+from twoloop.run.messages import said_of_end, warned
 from twoloop.run.pace import STAGNATION_STEPS
 from twoloop.run.record import Record, Status
 from twoloop.run.recorder import Wanted
@@ -100,6 +100,8 @@ class SampledRun:
         self.system, self.method, self.max_step, self.t0 = system, method, max_step, t0
         self._tolerances = rtol, atol
         self.run = self._run_from(t0, q0, v0)
+        if self.run.said_of_start:
+            warned(self.run.said_of_start, CALLS)
         self.p = system.functions.p[system.called_in_python :]
         self._free: set[int] = set()  # places of parameters that are known to enter forces alone
         self._changed = self._failed = False
@@ -257,7 +259,7 @@ class SampledRun:
     def _by_course(self, end: float) -> None:
         """What the compiled loop cannot do by itself: a singular position, a jump, another algebra; or a failure."""
         run = self.run
-        run.t0 = float(run.clock[run.a.T])
+        run.t0, run.said_of_start = float(run.clock[run.a.T]), ""
         wanted = Wanted(np.array([end]), True, False, None, InMemory())
         with Interrupts() as interrupts:
             course = Course(run, end, wanted, lambda t: None, None, interrupts)
