@@ -44,7 +44,8 @@ def verdicts(rows: pd.DataFrame, stamp: str, known: Standings = ()) -> pd.DataFr
     """Who is ahead by the time of the call and by that inside; `rows`: of all runs; `known`: the first, if it is."""
     commit = re.search(r"commit (\w+)", stamp)
     rows = rows[rows["group"] == rivals.GROUP]
-    made = rows.reindex(columns=["case", "processor", "commit"]).groupby("case").first()  # on one, at one commit
+    own = rows[rows["family"] == "two-loop"]  # which stand in every verdict; of others, some may be older
+    made = own.reindex(columns=["case", "processor", "commit"]).groupby("case").first()
     lines = []
     for time, column in TIMES.items():
         if column not in rows:

@@ -95,6 +95,7 @@ def test_order_2_and_positions_step_over_them():
     assert errors("flexible", run("flexible", 1e-6, **ORDER_2))[1] > 0.1
 
 
+@pytest.mark.slow
 def test_a_banded_matrix_gives_the_same_steps():
     banded, dense = (run("stiff", 1e-2, **ORDER_2, banded=each) for each in (True, False))
     assert banded.stats.n_accepted == pytest.approx(dense.stats.n_accepted, rel=0.05)

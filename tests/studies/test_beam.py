@@ -232,7 +232,7 @@ def test_frequencies_are_those_of_the_published_case():
     assert abs(frequencies(MAKE[SOFT]())[-1] - 3358.5) < 0.05
 
 
-@pytest.mark.slow  # as those of motion and step_size
+@pytest.mark.slow  # as that of step_size
 class TestQuickRun(QuickRun):
     pictures = ("beam_very_flexible", "beam_moderately_stiff")
 

@@ -16,6 +16,7 @@ def measured(cpu, instructions=None, **counts):
     return {"step": [{"cpu": each, "instructions": instructions, "counts": counts} for each in cpu]}
 
 
+@pytest.mark.slow
 def test_the_same_folder_twice_does_the_same_work():
     found = measure({"a": ROOT, "b": ROOT}, ("compile", "step of Adams", "step of Unknown"), 2)
     a, b = found["a"]["step of Adams"], found["b"]["step of Adams"]

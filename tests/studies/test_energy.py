@@ -83,7 +83,7 @@ def test_only_the_report_is_left(out):
     assert {path.name for path in out.iterdir()} == names
 
 
-@pytest.mark.slow  # as those of motion and step_size
+@pytest.mark.slow  # as that of step_size
 class TestQuickRun(of_study.QuickRun):
     pictures = ("energy_long", "energy_cost")
 

@@ -68,6 +68,7 @@ def at(made, order, step):
     return find(made, gear(order), step)
 
 
+@pytest.mark.slow  # as that of step_size
 class TestQuickRun(QuickRun):
     pictures = ("motion_short", "motion_long", "motion_error")
 

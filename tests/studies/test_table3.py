@@ -168,7 +168,7 @@ def test_the_study_lists_all_cells_once():
     assert sum(run.repeats for run in table3.runs(*four_bar.cases(True), True)) < 100
 
 
-@pytest.mark.slow  # as those of motion and step_size
+@pytest.mark.slow  # as that of step_size
 class TestQuickRun(QuickRun):
     pictures = ("table3",)
 

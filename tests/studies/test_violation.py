@@ -104,7 +104,7 @@ def line_up(made):
     return made[made["group"] == "line-up"].set_index("solver")
 
 
-@pytest.mark.slow  # as those of motion and step_size
+@pytest.mark.slow  # as that of step_size
 class TestQuickRun(QuickRun):
     pictures = ("violation", "violation_cost")
 
