@@ -35,6 +35,17 @@ ASKED_OF = {"beam": "beams by the error of the tip", "energy": "energy", "honest
 ASKED_OF |= {"validation": "published mechanisms", "ensembles": "many runs in one call"}
 WITH_RIVALS = (*ASKED_OF, "violation", "motion", "step_size", "scale", "conformance")
 SOLVERS_OF_NEWEST = re.compile(rf'"{NEWEST}, [^",]*')
+PROJECTS = {  # of the rivals of work_precision, and how their solvers are called in the rows of all studies
+    "heyoka": re.compile("heyoka"),
+    "CyRK": re.compile("CyRK"),
+    "SUNDIALS": re.compile(r"(CVODE|IDA)\b"),
+    "CasADi": re.compile("CasADi"),
+    "diffrax": re.compile("diffrax"),
+    "SciPy": re.compile("^(LSODA|DOP853|Radau|BDF), (index 1|projected)"),
+    "extensisq": re.compile("Pr9"),
+    "solve_dae": re.compile(", solve_dae"),
+    "Exudyn": re.compile("Exudyn"),
+}
 AT_LENGTH = '"compare",'  # how rows of work_precision begin that are of long motions
 
 
@@ -58,7 +69,7 @@ def findings(folder: Path) -> dict[str, dict[str, Any]]:
     """What NAME.json of each study holds, for those that have been run into the folder and time what all time.
 
     In that of work_precision, "lacking" is what was not run with the newest rival, "long_without" the cases at length,
-    "partly_asked" the other studies without it, or with one solver of it.
+    "unasked" the projects that other studies lack, "one_asked" those of the latter with one solver of that rival.
 
     Raises StudyError if a file is damaged.
     """
@@ -72,7 +83,7 @@ def findings(folder: Path) -> dict[str, dict[str, Any]]:
             found[path.stem] = told
     if "work_precision" in found:
         found["work_precision"] |= {"lacking": lacking(folder), "long_without": long_without(folder)}
-        found["work_precision"]["partly_asked"] = partly_asked(folder)
+        found["work_precision"] |= {"unasked": unasked(folder), "one_asked": one_asked(folder)}
     return found
 
 
@@ -84,14 +95,27 @@ def lacking(folder: Path) -> list[str]:
     return ["some long motions"] * bool(long_without(folder)) + without
 
 
-def partly_asked(folder: Path) -> dict[str, list[str]]:
-    """Studies with rivals whose rows lack `NEWEST`, and those that have one solver of it only."""
-    named = {name: set(SOLVERS_OF_NEWEST.findall("\n".join(_lines(folder / f"{name}.csv")))) for name in WITH_RIVALS}
-    there = {name: own for name, own in named.items() if (folder / f"{name}.csv").is_file()}
-    return {
-        "none": [name for name, own in there.items() if not own],
-        "one": [name for name, own in there.items() if len(own) == 1],
-    }
+def unasked(folder: Path) -> dict[str, list[str]]:
+    """Of the other studies with rivals, those of whose rows lack all solvers of a project, with the projects."""
+    found: dict[str, list[str]] = {}
+    for name in WITH_RIVALS:
+        solvers = _solvers(_lines(folder / f"{name}.csv"))
+        without = [project for project, named in PROJECTS.items() if not any(map(named.search, solvers))]
+        found |= {name: without} if solvers and without else {}
+    return found
+
+
+def one_asked(folder: Path) -> list[str]:
+    """The other studies with rivals that have one solver of `NEWEST` only."""
+    named = {name: SOLVERS_OF_NEWEST.findall("\n".join(_lines(folder / f"{name}.csv"))) for name in WITH_RIVALS}
+    return [name for name, own in named.items() if len(set(own)) == 1]
+
+
+def _solvers(lines: Sequence[str]) -> set[str]:
+    """Who made the rows of a file."""
+    read = csv.DictReader(line for line in lines if not line.startswith("#"))
+    column = next((each for each in ("solver", "simulator", "way") if each in (read.fieldnames or ())), None)
+    return {row[column] for row in read} if column else set()
 
 
 def long_without(folder: Path) -> list[str]:

@@ -7,7 +7,8 @@ import pytest
 
 from studies import __main__ as command
 from studies.bench import index
-from studies.bench.cli import StudyError
+from studies.bench.cli import ROOT, StudyError
+from studies.bench.solvers import CATALOGUE, RIVALS
 
 
 def test_the_list_names_every_study_with_its_first_line(monkeypatch, capsys):
@@ -309,3 +310,24 @@ def test_a_rival_that_older_rows_lack_is_told(tmp_path):
     for name, solver in (("beam", "heyoka"), ("energy", "CyRK, DOP853")):
         (tmp_path / f"{name}.csv").write_text(f"# line\nsolver\n{solver}\n")
     assert index.lacking(tmp_path) == ["beams by the error of the tip"]
+
+
+def test_projects_of_rivals_that_a_study_leaves_out_are_told(tmp_path):
+    for name in RIVALS:
+        assert [each for each, named in index.PROJECTS.items() if named.search(name)] == [CATALOGUE[name].family]
+    assert set(index.PROJECTS) == {CATALOGUE[name].family for name in RIVALS}
+    (tmp_path / "motion.csv").write_text('# heyoka\n"solver","message"\n"IDA, stabilised","not CyRK"\n"BDF",""\n')
+    (tmp_path / "conformance.csv").write_text('"simulator"\n' + "".join(f'"{name}"\n' for name in RIVALS))
+    others = [project for project in index.PROJECTS if project != "SUNDIALS"]
+    assert index.unasked(tmp_path) == {"motion": others}
+    text = screen(tmp_path, [case()])
+    assert f"| motion | {', '.join(others)} |" in text and "| conformance |" not in text
+    assert "The solvers of motion were chosen" in text and "`max_step`, too" not in text
+    (tmp_path / "motion.csv").unlink()
+    assert "Rivals that studies leave out" not in screen(tmp_path, [case()])
+
+
+def test_the_index_has_the_price_of_the_readme():
+    block, text = ((ROOT / name).read_text(encoding="utf-8") for name in ("README.md", "reports/README.md"))
+    price = block.split("**Price**")[1].split("**Silently wrong**")[0]
+    assert f"**Price**{price}## Can it be trusted?" in text
