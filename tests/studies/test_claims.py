@@ -283,6 +283,23 @@ def test_report_rows_and_findings(folder):
     assert "nan" not in text and (folder / "errata.md").exists() and max(len(each.split()) for each in texts) < 1000
 
 
+def test_every_report_begins_with_question_run_and_answer(folder):
+    for name in ("claims", "claims_that_hold", "errata"):
+        begin = (folder / f"{name}.md").read_text().split("\n## ")[0].split("**Holds**")[0]
+        places = [begin.index(f"**{word}**") for word in ("Question", "Run", "Answer")]
+        assert places == sorted(places)
+    rows = pd.read_csv(folder / "claims.csv", comment="#")
+    n = rows["verdict"].value_counts()
+    claimed, held = len(rows) - n["choice of the paper"], (folder / "claims_that_hold.md").read_text()
+    assert f"of {claimed} claims {n['holds']} hold, {n['consistent']} are consistent with our runs, " in held
+    assert f"; {n['choice of the paper']} of its statements are choices." in held
+    assert f"each of {claimed} claims is judged" in (folder / "claims.md").read_text()
+    places = [line for line in (folder / "errata.md").read_text().splitlines() if line.startswith("| ")]
+    n_places = len(places) - 3  # but the headings of three tables
+    n_read = sum(line.endswith("| – |") for line in places)
+    assert f"of {n_places} places, {n_places - n_read} are checked by a test each" in (folder / "errata.md").read_text()
+
+
 def test_report_is_written_again_from_rows(folder):
     text = (folder / "claims.md").read_text()
     claims.main(["--redraw", "--out", str(folder)])
