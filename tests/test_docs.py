@@ -212,6 +212,16 @@ def test_all_three_are_one_mechanism(names):
     assert np.ptp(page["energy"]) < 1e-5
 
 
+def test_the_drawing_of_the_page_is_its_mechanism(names):
+    page, drawing = names("your_mechanism"), names("your_mechanism")["drawing"]
+    run = solve_dae(page["compiled"], (0.0, 2.0), page["q0"], page["v0"], rtol=1e-8, atol=1e-8)
+    lengths = [np.linalg.norm(b - a, axis=0) for a, b in drawing.at(run.q)[np.array(drawing.bars)]]
+    assert lengths[0] == pytest.approx(page["r"], abs=1e-12) and lengths[1] == pytest.approx(page["l"], abs=1e-12)
+    by_hand = page["total_energy"](run.t, run.q, run.v)
+    assert by_hand == pytest.approx(page["problem"].energy(run.t, run.q, run.v), abs=1e-12)  # SymPy's
+    assert "slider-crank" in (page["_folder"] / "slider_crank.html").read_text(encoding="utf-8")
+
+
 def test_what_the_page_says_of_the_others(names):
     page = names("your_mechanism")
     assert page["problem"].conserved and not page["start"].conserved
