@@ -1,7 +1,7 @@
 """Table 3 of the paper: computation time of both two-loop procedures over their tolerances, and of other solvers."""
 
 from functools import partial
-from itertools import chain
+from itertools import chain, pairwise
 from typing import Any
 
 import matplotlib.pyplot as plt
@@ -227,7 +227,28 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     found |= _of_default(first)
     failed = rows[rows["status"] != "REACHED_END"]
     found |= {"failed": len(failed), "failed_two_loop": int((failed["family"] == "two-loop").sum())}
-    return found | causes(first)
+    return found | {"newmark_growth": growth(first)} | causes(first)
+
+
+def growth(first: pd.DataFrame) -> list[dict[str, Any]]:
+    """Growth of Newmark's cost between neighbouring err_out, least and most over err_in: printed, our time and counts.
+
+    A star of the paper, or a run of ours that lost its energy, has no cost that could grow.
+    """
+    found = []
+    group = "Table 3: Newmark"
+    for j, (loose, tight) in enumerate(pairwise(TOLERANCES)):
+        factors: dict[str, list[float]] = {"printed": [], "time": [], "evaluations": []}
+        for e_in, (before, after) in zip(TOLERANCES, (row[j : j + 2] for row in PAPER_NEWMARK), strict=True):
+            ours, finer = (machine(first, group, e_in, e_out) for e_out in (loose, tight))
+            if before and after and ours is not None and finer is not None and not (ours["lost"] or finer["lost"]):
+                factors["printed"].append(after / before)
+                factors["time"].append(finer["call_s"] / ours["call_s"])
+                factors["evaluations"].append(finer["n_evaluations"] / ours["n_evaluations"])
+        if factors["printed"]:
+            spans = {what: [float(min(each)), float(max(each))] for what, each in factors.items()}
+            found.append({"from": power(loose), "to": power(tight)} | spans)
+    return found
 
 
 def _of_default(first: pd.DataFrame) -> dict[str, Any]:

@@ -122,6 +122,25 @@ def test_findings_turn_with_the_rows(tmp_path):
 
 
 @pytest.mark.usefixtures("unsaved")
+def test_the_growth_of_newmarks_cost_stands_beside_the_printed_one(tmp_path):
+    made = rows()
+    cells_ = (made["group"] == "Table 3: Newmark") & ~made["lost"]
+    made.loc[cells_, "n_evaluations"] = made.loc[cells_, "err_out"] ** -0.25  # 10 ** 0.5 in two decades
+    first, second = found_of(table3, tmp_path, made)["newmark_growth"]
+    assert (first["from"], first["to"], second["to"]) == ("1e-5", "1e-7", "1e-9")  # the paper has a star at 1e-3
+    assert first["printed"] == pytest.approx([12.68 / 3.10, 12.62 / 2.71])
+    assert second["printed"] == pytest.approx([50.93 / 13.40, 49.68 / 12.36])
+    assert first["time"] == pytest.approx(first["printed"]) and second["time"] == pytest.approx(second["printed"])
+    assert first["evaluations"] == pytest.approx([10.0**0.5] * 2) == second["evaluations"]
+    text = (tmp_path / "table3.md").read_text()
+    assert "printed time by 4.1–4.7 and 3.8–4.0 (over all err_in), our time by 4.1–4.7 and 3.8–4.0 and our" in text
+    assert "evaluations by 3.2 and 3.2; a local error of order h³ predicts 4.6." in text
+    made.loc[cells_ & (made["err_out"] == 1e-7), "lost"] = True
+    assert found_of(table3, tmp_path, made)["newmark_growth"] == []
+    assert "Newmark's printed time" not in (tmp_path / "table3.md").read_text()
+
+
+@pytest.mark.usefixtures("unsaved")
 def test_both_readings_of_the_stopping_test_are_compared_with_the_printed_row(tmp_path):
     found = found_of(table3, tmp_path, rows())["readings"]
     assert {line["over"]: line["astray"] for line in found} == {"all of z": False, "y_i only": True}
