@@ -13,7 +13,7 @@ from studies.bench import figures, tables
 from studies.bench.cases.beam import SOFT, STIFF
 from studies.bench.cli import StudyError
 from studies.bench.names import label
-from studies.bench.render import number, table
+from studies.bench.render import number, power, table
 from studies.bench.solvers import CYRK, IDA_C, IDA_C_BANDED, IDA_C_ORDER_2, NEWMARK, OWN_EXPLICIT, PAPER_TOL
 from studies.bench.store import Output
 from studies.bench.study import Study
@@ -67,6 +67,7 @@ def _case(rows: pd.DataFrame, runs: pd.DataFrame, name: str, w_max: float) -> di
     found["figure"] = f"beam_{name.replace(' ', '_')}.png"
     found["failed"] = runs[runs["status"] != "REACHED_END"]["solver"].nunique()
     ranked = runs[runs["solver"] != EXUDYN]
+    found["asked_to"] = _asked_to(ranked)
     found["at"] = [at(ranked, error) for error in (*TARGETS, FINER)]
     largest = runs[runs["error_tip"].notna()].groupby("solver")[["error_tip", "floor"]].max()
     found["unresolved"] = sorted(str(solver) for solver in largest.index[largest["error_tip"] <= largest["floor"]])
@@ -74,6 +75,20 @@ def _case(rows: pd.DataFrame, runs: pd.DataFrame, name: str, w_max: float) -> di
     changes = _of(rows, "sensitivity", case=name).set_index("solver")["largest"].astype(float)
     below_mesh = [error for error in TARGETS if error < changes[MESH]]
     return found | {"changes": changes.to_dict(), "below_mesh": below_mesh}
+
+
+def _asked_to(runs: pd.DataFrame) -> dict[str, list[str]]:
+    """Solvers without a run within the smallest target whose tightest run ended, by the tolerance of that run."""
+    found: dict[str, list[str]] = {}
+    for solver, own in runs.groupby("solver"):
+        tightest = own[tables.setting_of(own) == np.nanmin(tables.setting_of(own))]
+        if own["error_tip"].min() > TARGETS[-1] and tightest["error_tip"].notna().all():
+            found.setdefault(_tightest(own), []).append(str(solver))
+    return found
+
+
+def _tightest(runs: pd.DataFrame) -> str:
+    return power(float(np.nanmin(tables.setting_of(runs))))
 
 
 def at(runs: pd.DataFrame, error: float) -> dict[str, Any]:
@@ -162,9 +177,11 @@ def tables_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, str]:
 
 
 def _cell(runs: pd.DataFrame, cell: str) -> str:
-    """A cell of the table; of a solver of which no run is so good, its least error in m."""
+    """A cell of the table; of a solver of which no run is so good, its least error in m and how far it was asked."""
     least = runs["error_tip"].dropna().min()
-    return f"> {number(float(least))} m" if cell == tables.UNASKED and least == least else cell
+    if cell != tables.UNASKED or np.isnan(least):
+        return cell
+    return f"> {number(float(least))} m ({_tightest(runs)})"
 
 
 def figures_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Figure]:

@@ -84,9 +84,29 @@ def test_the_advice_turns_with_the_rows(tmp_path):
 
 
 def test_of_a_solver_with_runs_it_is_not_said_that_it_was_not_asked():
-    runs = pd.DataFrame({"error_tip": [1e-5, 1e-6, np.nan]})
-    assert study._cell(runs, UNASKED) == "> 1e-6 m"
+    runs = pd.DataFrame({"error_tip": [1e-5, 1e-6, np.nan], "tol": [1e-1, 1e-3, 1e-2]})
+    assert study._cell(runs, UNASKED) == "> 1e-6 m (1e-3)"
     assert study._cell(runs, "≤ 1.1") == "≤ 1.1" and study._cell(runs[2:], UNASKED) == UNASKED
+
+
+@pytest.mark.usefixtures("unsaved")
+def test_how_far_solvers_were_asked_that_come_within_no_target(tmp_path):
+    assert [case["asked_to"] for case in found_of(study, tmp_path, rows())["cases"]] == [{}, {}]
+    assert "tightest tolerance asked is" not in (tmp_path / "beam.md").read_text()
+    made = rows()
+    coarse = (made["case"] == SOFT) & made["solver"].isin((IDA_C, "BDF", OWN_EXPLICIT)) & (made["error_tip"] < 5e-4)
+    made = made[~coarse]
+    made.loc[(made["case"] == SOFT) & (made["solver"] == "BDF") & (made["tol"] == 1e-2), "tol"] = 1e-5
+    stopped = (made["case"] == SOFT) & (made["solver"] == OWN_EXPLICIT) & (made["tol"] == 1e-2)
+    made.loc[stopped, ["status", "error_q", "error_tip"]] = [
+        "TIME_LIMIT",
+        np.nan,
+        np.nan,
+    ]
+    found = found_of(study, tmp_path, made)["cases"]
+    assert [case["asked_to"] for case in found] == [{"1e-2": [IDA_C], "1e-5": ["BDF"]}, {}]
+    text = (tmp_path / "beam.md").read_text()
+    assert f'the tightest tolerance asked is 1e-2 of `{IDA_C}`, 1e-5 of `method="BDF"`.' in text
 
 
 @pytest.mark.usefixtures("unsaved")
