@@ -51,7 +51,7 @@ def turning(angle: int, t: float, q: Array, v: Array) -> float:
 
 
 # of all three bars: one whose acceleration at rest is nearly zero turns back three times within milliseconds, of which
-# signs taken four times a step see one
+# signs taken four times a step, and at least every 400th of the run, see one
 TURNING = tuple(partial(turning, angle) for angle in BARS)
 
 
