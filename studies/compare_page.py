@@ -18,7 +18,6 @@ from studies.bench.render import TEMPLATES
 from studies.bench.row_files import as_runs, rows_of_file
 from studies.bench.solvers import CVODE_C, GIVEN, HEYOKA, IDA_C
 from studies.bench.store import Output, plain, read_rows
-from studies.bench.tables import SETTINGS
 
 FILE = "compare.html"
 SOURCES = ("work_precision", "validation")
@@ -50,7 +49,7 @@ def read(folder: Path, files: Sequence[str] = ()) -> tuple[pd.DataFrame, dict[st
             continue
         rows, first = read_rows(path, "case", "solver", "t_end")
         rows = tables.medians(rows) if "repeat" in rows else rows
-        rows = rows[rows["t_end"].notna()]  # not those of a first call, which are times alone
+        rows = rows[rows["t_end"].notna()]  # not those that are times alone, of first calls and sizes
         # a study may run one mechanism for several lengths of time, whose costs cannot be compared
         parts.append(rows.assign(mechanism=rows["case"] + rows["t_end"].map(", {:g} s".format), study=name))
         stamps[name] = first.removeprefix("# ")
@@ -63,10 +62,7 @@ def read(folder: Path, files: Sequence[str] = ()) -> tuple[pd.DataFrame, dict[st
             f"there are no rows in {folder}: run python -m studies.work_precision first, or give --with archive, "
             "the rows that are shipped"
         )
-    rows = named(pd.concat(parts, ignore_index=True), folder)
-    # rows of cost against size have no setting, and no error to compare
-    settings = [name for name in SETTINGS if name in rows]
-    return rows[rows[settings].notna().any(axis=1)].reset_index(drop=True), stamps
+    return named(pd.concat(parts, ignore_index=True), folder), stamps
 
 
 def named(rows: pd.DataFrame, folder: Path) -> pd.DataFrame:

@@ -15,7 +15,7 @@ from references.driver import user_call
 from references.equations.many_at_once import by_cyrk, by_diffrax, by_heyoka
 from references.paper.four_bar_minimal import MinimalFourBar
 from studies.bench import figures, tables
-from studies.bench.cli import StudyError
+from studies.bench.cli import StudyError, processor
 from studies.bench.collector import REPEATS
 from studies.bench.names import label
 from studies.bench.store import Array, Output
@@ -200,7 +200,7 @@ def make(output: Output) -> pd.DataFrame:
         rows += list(rows_of(made, names, quick))
     with_geometry(N_QUICK)  # compiles what is not on disk
     rows += [with_geometry(n) for n in (N_GEOMETRY_QUICK if quick else N_GEOMETRY)]
-    return pd.DataFrame(rows)
+    return pd.DataFrame(rows).assign(processor=processor())
 
 
 def findings_of(rows: pd.DataFrame) -> dict[str, Any]:

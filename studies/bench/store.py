@@ -32,7 +32,7 @@ NUMERICS = ("numpy", "scipy", "numba")
 # studies whose times are compared, so that no two run at once
 TIMED = (
     *("work_precision", "compare", "table3", "beam", "energy", "violation", "symbolic_size", "sweep_linkages"),
-    *("ensembles", "ablation", "engines"),
+    *("ensembles", "ablation", "engines", "scale"),
 )
 WHOLE_CALL = "whole call"  # what their times are of, in their findings
 LOCK = "twoloop-timed.lock"  # in the machine's folder of temporary files

@@ -10,7 +10,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from studies.bench import figures
-from studies.bench.cli import StudyError
+from studies.bench.cli import StudyError, processor
 from studies.bench.store import Array, Output, sources
 from studies.bench.study import Study
 from twoloop import Result, sweep
@@ -101,7 +101,7 @@ def make(output: Output) -> pd.DataFrame:
         row = {"group": "scaling", "parallel": parallel, "workers": workers, "n_runs": len(timed)}
         parts.append(pd.DataFrame([row | {"wall": time.perf_counter() - began}]))
     kept.unlink()
-    return pd.concat(parts, ignore_index=True)
+    return pd.concat(parts, ignore_index=True).assign(processor=processor())
 
 
 def findings_of(rows: pd.DataFrame) -> dict[str, Any]:

@@ -1,5 +1,7 @@
 """Many runs in one call: every way ends where the equation in one coordinate does; sentences follow the rows."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -7,7 +9,7 @@ import pytest
 from references.equations.many_at_once import by_diffrax, by_heyoka
 from studies import ensembles
 from studies.bench import takes
-from studies.bench.cli import StudyError
+from studies.bench.cli import StudyError, processor
 from studies.ensembles import CYRK, DIFFRAX, ENSEMBLE, ERRORS, HEYOKA, SINGLE, TOLERANCES
 from tests.studies.of_study import said
 from twoloop.mechanisms import double_pendulum
@@ -120,6 +122,15 @@ def test_a_package_that_is_not_there_is_a_row(monkeypatch, few):
     monkeypatch.setattr(ensembles, "by_heyoka", missing)
     (row,) = ensembles.rows_of(few, (HEYOKA,), True)
     assert row["way"] == HEYOKA and "not installed" in row["message"]
+
+
+def test_rows_have_their_processor(monkeypatch):
+    made = rows(**{ENSEMBLE: 0.01, HEYOKA: 0.05}).to_dict("records")
+    monkeypatch.setattr(ensembles, "rows_of", lambda of, names, quick: made[:-1])
+    monkeypatch.setattr(ensembles, "with_geometry", lambda n: made[-1])
+    table = ensembles.make(SimpleNamespace(call=SimpleNamespace(quick=True)))
+    assert (table["processor"] == processor()).all()
+    assert ensembles.findings_of(table) == ensembles.findings_of(table.drop(columns="processor"))  # as rows of old
 
 
 def test_linkages_are_put_together_and_run():

@@ -6,8 +6,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from studies.bench.cli import StudyError
+from studies.bench.cli import StudyError, processor
 from studies.bench.render import render
+from studies.bench.store import read_rows
 from studies.sweep_linkages import study
 from twoloop import sweep
 from twoloop.mechanisms import four_bar
@@ -96,6 +97,8 @@ def test_findings_follow_the_rows():
 def test_the_quick_study(tmp_path):
     study.STUDY.main(["--quick", "--out", str(tmp_path)])
     report = (tmp_path / "sweep_linkages.md").read_text()
+    rows, _ = read_rows(tmp_path / "sweep_linkages.csv")
+    assert (rows["processor"] == processor()).all()
     assert not list(tmp_path.glob("*.parquet"))  # of unfinished runs only
     assert "Quick run" in report and "Processes are compared in the full run only" in report
     study.STUDY.main(["--quick", "--redraw", "--out", str(tmp_path)])
