@@ -148,14 +148,14 @@ def test_how_far_the_fastest_rivals_drift_is_taken_from_the_rows(screen, compare
 
 
 def test_the_intervals_of_looking_are_those_of_the_package(screen):
-    (every,) = numbers(screen, "Ours evaluate forces that depend on time at least every * of a run (here")
+    (every,) = numbers(screen, "Ours evaluate forces that may change suddenly with time at least every * of a run (here")
     assert every == pytest.approx(LONGEST_UNSEEN / PLACES)
     assert "other forces every hundredth, and" in screen and pytest.approx(0.01) == LONGEST_UNSEEN
 
 
 @pytest.mark.parametrize("method", ["auto", "DOP853", "RadauIIA5", "BDF"])
 def test_forces_are_evaluated_as_often_as_the_screen_says(screen, method):
-    (every,) = numbers(screen, "Ours evaluate forces that depend on time at least every * of a run (here")
+    (every,) = numbers(screen, "Ours evaluate forces that may change suddenly with time at least every * of a run (here")
     t_end, seen = 3.0, []
 
     def force(t, q, v):
