@@ -208,9 +208,7 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
 
     The error of a way is the largest of its runs, at a tolerance at which none failed.
     """
-    made = rows[(rows["group"] == GROUP) & rows["tol"].notna()]  # of packages that are there
-    made = made.assign(error_q=made["error_worst"].where(made["n_failed"] == 0), call_s=made["run_s"], floor=AGREE / 10)
-    made = made.assign(solver=made["way"], status="REACHED_END").sort_values(["case", "way", "tol", "repeat"])
+    made = _runs(rows)
     found: dict[str, Any] = {"cases": []}
     for case, own_rows in made.groupby("case", sort=False):
         medians = tables.medians(own_rows)
@@ -246,22 +244,29 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     return found
 
 
+def _runs(rows: pd.DataFrame) -> pd.DataFrame:
+    """The rows of ways, of packages that are there, with columns as `tables` has them."""
+    made = rows[(rows["group"] == GROUP) & rows["tol"].notna()]
+    made = made.assign(error_q=made["error_worst"].where(made["n_failed"] == 0), call_s=made["run_s"], floor=AGREE / 10)
+    return made.assign(solver=made["way"], status="REACHED_END").sort_values(["case", "way", "tol", "repeat"])
+
+
 def figures_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Figure]:
     """CPU time of a run over the largest error, a panel a mechanism."""
-    made = rows[(rows["group"] == GROUP) & rows["tol"].notna() & (rows["n_failed"] == 0)]
-    cases = list(dict.fromkeys(made["case"]))
+    made, cases = _runs(rows), [each["case"] for each in found["cases"]]
     width = 3.4 * len(cases) + 1.2
     of_panels: dict[str, Any] = {"figsize": (width, 4.2), "layout": "constrained", "squeeze": False, "sharey": True}
     figure, panels = plt.subplots(1, len(cases), **of_panels)
     for axes, case in zip(panels[0], cases, strict=True):
-        for way, own in made[made["case"] == case].groupby("way", sort=False):
-            line = own.groupby("tol")[["error_worst", "run_s"]].median()
-            look = figures.style(*LOOKS[way]) | {"label": label(way)}
-            axes.plot(line["error_worst"], 1e6 * line["run_s"], **look)
+        medians = tables.medians(made[made["case"] == case])
+        for way, look in LOOKS.items():
+            line = figures.with_gaps(medians[medians["way"] == way])
+            if line["error_q"].notna().any():
+                axes.plot(line["error_q"], 1e6 * line["call_s"], label=label(way), **figures.style(*look))
         axes.set(xscale="log", yscale="log", xlabel="largest error of q at the end (m, rad)", title=case)
         axes.grid(alpha=0.3)
     panels[0][0].set_ylabel("CPU time of a run (µs)")
-    figures.legend(figure, panels[0], below=len(WAYS))
+    figures.legend(figure, panels[0], figures.GAPS, below=len(WAYS))
     return {"ensembles": figure}
 
 

@@ -31,6 +31,7 @@ FIRST = (DEFAULT, *(name for name, method in COMPILED.items() if method == DEFAU
 # family, how names begin
 MAIN_RIVALS = (("heyoka", HEYOKA), ("CyRK", ""), ("SUNDIALS", "CVODE"), ("SUNDIALS", "IDA from C"), ("SciPy", ""))
 ERROR = "largest position error over the run (m, rad)"
+GAPS = "gap: failed run, or more than a decade of error; left out: error below that of the reference"
 LEGEND = "solid: twoloop\nfilled: keeps constraints\ngap: failed run, or more\nthan a decade of error"
 
 plt.style.use(Path(__file__).with_name("bench.mplstyle"))

@@ -9,7 +9,6 @@ from twoloop.methods.presets import PRESETS
 
 SUFFIX = " (twoloop)"  # of ours, where a rival has such a name, too
 WITH, WITHOUT = "compiled", "not compiled"  # after a comma, of rows; without either: as a study runs its methods
-PLAIN = {OWN_EXPLICIT if method == "DOP853" else method: made for made, method in COMPILED.items()}
 SCIPY = ("LSODA, ", "DOP853, ", "Radau, ", "BDF, ", "RK45, ")  # how rows of SciPy's begin, which ours may, too
 OTHERS = {  # of studies that run few of ours
     "solve_dae, compiled, one by one": "compiled=True, one by one",
@@ -23,6 +22,12 @@ def _parts(solver: str) -> tuple[str, str] | None:
     return (method, word) if method in PRESETS and word in ("", WITH, WITHOUT) else None
 
 
+def _option(method: str, word: str, coded: bool | None) -> bool | None:
+    """The value of `compiled` that a user gives; None: none, as `solve_dae` does so by itself."""
+    given = word == WITHOUT or (method in COMPILED.values() and (word == WITH) is not coded)
+    return word == WITH if given else None
+
+
 def label(solver: str, coded: bool | None = None) -> str:
     """A solver in figures and tables.
 
@@ -32,10 +37,9 @@ def label(solver: str, coded: bool | None = None) -> str:
     if parts is None:
         name = solver.removesuffix(SUFFIX)
         return OTHERS.get(solver, f"SciPy, {name}" if name.startswith(SCIPY) else name)
-    method, word = parts
+    method, option = parts[0], _option(*parts, coded)
     words = [] if method == DEFAULT else [method]
-    if word == WITHOUT or (method in COMPILED.values() and (word == WITH) is not coded):
-        words.append(f"compiled={word == WITH}")
+    words += [] if option is None else [f"compiled={option}"]
     return ", ".join(words) or GIVEN
 
 
@@ -70,8 +74,11 @@ def project(solver: str) -> str:
 
 
 def looks_like(solver: str, coded: bool | None = None) -> str:
-    """The row whose colour and marker a solver has: what is called without `compiled` looks the same everywhere."""
-    if not coded:
+    """The name in `looks.toml` of a solver: with `compiled` left out, True or False it looks the same everywhere."""
+    parts = _parts(solver)
+    if parts is None or parts[0] not in COMPILED.values():
         return solver
-    swapped = PLAIN | {made: plain for plain, made in PLAIN.items()}
-    return swapped.get(solver, solver)
+    method, option = parts[0], _option(*parts, coded)
+    if option is None:
+        return OWN_EXPLICIT if method == "DOP853" else method
+    return f"{method}, {WITH if option else WITHOUT}"

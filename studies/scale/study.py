@@ -74,11 +74,8 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
         apart = [abs(each["power"] - fitted[0]) for each in between] if fitted else []
         found["kinds"].append(line | {"slope": fitted, "powers": between, "bends": max(apart, default=0.0) > BEND})
     found["failed"] = rows[rows["group"].eq(EVALUATION) & rows["status"].eq("FAILED")][["case", "n"]].to_dict("records")
-    order = {"n": True, "solver": True, "h": False, "tol": False, "repeat": True}
-    chains = rows[rows["group"] == CHAIN].sort_values([*order], ascending=[*order.values()])
-    for n, own in chains.groupby("n"):
-        medians = tables.medians(own.reset_index(drop=True))
-        of_chain: dict[str, Any] = {"n": int(n), "t_end": CHAINS[int(n)]}
+    for n, medians in _chains(rows).items():
+        of_chain: dict[str, Any] = {"n": n, "t_end": CHAINS[n]}
         of_chain["lines"] = tables.work_precision(medians, ERRORS)
         of_chain["over_exudyn"] = {error: ratio for error in ERRORS if (ratio := over_exudyn(medians, error))}
         of_chain["step"] = steps_of(medians)
@@ -97,6 +94,13 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     of_reference = rows["reference"].dropna() if "reference" in rows else rows["group"][:0]
     found["references"] = sorted(set(of_reference))
     return found
+
+
+def _chains(rows: pd.DataFrame) -> dict[int, pd.DataFrame]:
+    """Medians of the runs of chains, by the number of bars."""
+    order = {"n": True, "solver": True, "h": False, "tol": False, "repeat": True}
+    chains = rows[rows["group"] == CHAIN].sort_values([*order], ascending=[*order.values()])
+    return {int(n): tables.medians(own.reset_index(drop=True)) for n, own in chains.groupby("n")}
 
 
 def _beside_engines(line: dict[str, Any], rows: pd.DataFrame) -> dict[str, Any]:
@@ -169,18 +173,19 @@ def figures_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Figure]:
     axes.set(xscale="log", yscale="log", xlabel="bodies", ylabel="time of an evaluation, projections included (µs)")
     axes.legend(fontsize=8, title="mechanism")
     axes.grid(alpha=0.3)
-    chains = rows[(rows["group"] == CHAIN) & rows["error_q"].notna()]
-    sizes = sorted(set(chains["n"]))
-    width: dict[str, Any] = {"figsize": (3.4 * len(sizes) + 1.2, 4.2), "layout": "constrained", "squeeze": False}
-    second, panels = plt.subplots(1, len(sizes), sharey=True, **width)
-    for panel, n in zip(panels[0], sizes, strict=True):
-        for _, own in chains[chains["n"] == n].groupby("solver", sort=False):
-            line = own.assign(setting=own["tol"].fillna(own["h"])).groupby("setting")[["error_q", "call_s"]].median()
-            panel.plot(line["error_q"], line["call_s"], **figures.look(own.iloc[0]))
+    chains, names = _chains(rows), rows[rows["group"] == CHAIN]["solver"].unique()
+    width: dict[str, Any] = {"figsize": (3.4 * len(chains) + 1.2, 4.2), "layout": "constrained", "squeeze": False}
+    second, panels = plt.subplots(1, len(chains), sharey=True, **width)
+    for panel, (n, medians) in zip(panels[0], chains.items(), strict=True):
+        for solver in names:
+            own = medians[medians["solver"] == solver]
+            line = figures.with_gaps(own)
+            if line["error_q"].notna().any():
+                panel.plot(line["error_q"], line["call_s"], **figures.look(own.iloc[0]))
         panel.set(xscale="log", yscale="log", xlabel="error of q at the end, over max(1, max |q|)", title=f"{n} bars")
         panel.grid(alpha=0.3)
     panels[0][0].set_ylabel("CPU time of the call (s)")
-    figures.legend(second, panels[0], below=3)
+    figures.legend(second, panels[0], figures.GAPS, below=3)
     return {"scale": figure, "scale_chains": second}
 
 

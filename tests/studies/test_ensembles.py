@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pandas as pd
 import pytest
+from matplotlib import pyplot as plt
 
 from references.equations.many_at_once import by_diffrax, by_heyoka
 from studies import ensembles
@@ -131,6 +132,20 @@ def test_rows_have_their_processor(monkeypatch):
     table = ensembles.make(SimpleNamespace(call=SimpleNamespace(quick=True)))
     assert (table["processor"] == processor()).all()
     assert ensembles.findings_of(table) == ensembles.findings_of(table.drop(columns="processor"))  # as rows of old
+
+
+def test_lines_have_a_gap_where_nothing_was_run():
+    made = rows(**{ENSEMBLE: 0.01, HEYOKA: 0.05})
+    between = (made["way"] == HEYOKA) & made["tol"].isin((1e-6, 1e-7))
+    made = made[~between].assign(error_worst=made["error_worst"] * 0.99)
+    figure = ensembles.figures_of(made, ensembles.findings_of(made))["ensembles"]
+    lines = {line.get_label(): np.asarray(line.get_xdata(), dtype=float) for line in figure.axes[0].lines}
+    plt.close(figure)
+    tight = [tol for tol in TOLERANCES if 0.99 * tol > 0.1 * ensembles.AGREE]  # the others are below the reference
+    assert len(lines["ensemble"]) == len(TOLERANCES) and np.isfinite(lines["ensemble"]).sum() == len(tight)
+    x = lines[HEYOKA]
+    gap = int(np.flatnonzero(np.isnan(x))[0])
+    assert x[gap - 1] == pytest.approx(0.99e-5) and x[gap + 1] == pytest.approx(0.99e-8)
 
 
 def test_linkages_are_put_together_and_run():

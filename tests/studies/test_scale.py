@@ -3,6 +3,7 @@
 import numpy as np
 import pandas as pd
 import pytest
+from matplotlib import pyplot as plt
 
 from studies.bench.large import PLANAR, SPATIAL, open_chain
 from studies.bench.render import render
@@ -54,6 +55,17 @@ def test_slopes_and_ratios_follow_the_rows():
     found, text = said(pd.concat([evaluations(2.0), chains(ours=1.0, exudyn=0.5)], ignore_index=True))
     assert found["kinds"][0]["slope"][0] == pytest.approx(2.0)
     assert f"| 20 | 1.0 | 0.50 (1e-3), 0.50 (1e-4), 0.50 (1e-5) | `{EXUDYN}`: 0.50 |" in text
+
+
+def test_lines_of_chains_have_a_gap_where_nothing_was_run():
+    rows = pd.concat([evaluations(), chains()], ignore_index=True)
+    rows = rows[(rows["solver"] != EXUDYN) | ~rows["error_q"].isin((1e-3, 1e-4))]
+    made = scale.figures_of(rows, scale.findings_of(rows))
+    lines = {line.get_label(): np.asarray(line.get_xdata(), dtype=float) for line in made["scale_chains"].axes[0].lines}
+    for figure in made.values():
+        plt.close(figure)
+    assert np.isfinite(lines["compiled=False"]).all()
+    assert lines[EXUDYN] == pytest.approx([1e-2, np.nan, 1e-5, 1e-6], nan_ok=True)
 
 
 def test_a_power_that_changes_with_the_size_is_said_to_change():
