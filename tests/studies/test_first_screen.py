@@ -211,7 +211,7 @@ def test_every_number_of_the_screen_is_made_again_from_the_rows(tmp_path):
         assert said in text, said
         text = text.replace(said, "", 1)
     assert numbers(text) == [] and tables.NEARLY == 1.25
-    assert "Of these rivals, only IDA from C keeps the constraints." in text
+    assert "Of these, only IDA from C keeps the constraints." in text
     assert "`CVODE from C, BDF`" not in text and "`DOP853, index 1`" not in text
 
 

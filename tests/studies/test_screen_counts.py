@@ -15,6 +15,7 @@ from twoloop.kernels.data.tolerances import LONGEST_UNSEEN
 ROOT = Path(__file__).parents[2]
 DEFAULT, LIMITED = "the default (twoloop)", ", max_step"  # in the rows of honesty
 SINGULAR = "A02"  # how the mechanisms that pass singular positions are called in the rows
+EVERY = "Ours evaluate forces that may change suddenly with time at least every * of a run (here"
 PRICED = ("case", "solver", "family", "keeps_constraints", "tol", "h", "call_s", "error_q", "violation_q")
 
 
@@ -104,7 +105,8 @@ def test_the_table_of_silent_errors_is_counted_from_the_rows(screen, runs):
 def test_what_is_reached_at_singular_positions_is_counted_from_the_rows(screen, compared):
     told = numbers(
         screen,
-        "Of * pairs of variant and error the default reaches *, `compiled=False` *, the best of the rivals *.",
+        "Of * errors on these variants that any solver with constraints reaches, the default reaches *, "
+        "`compiled=False` *, the best single rival *.",
     )
     crossing = compared[compared["case"].str.startswith(SINGULAR)]
     ours = crossing["family"] == "two-loop"
@@ -123,7 +125,8 @@ def test_what_is_reached_at_singular_positions_is_counted_from_the_rows(screen, 
 def test_first_calls_are_taken_from_the_rows(screen, priced):
     n, *told = numbers(
         screen,
-        "On * mechanisms they take * to * s with `compiled=True`, * to * s with `CyRK`, * to * s with `heyoka`.",
+        "On * mechanisms they take * to * s with `compiled=True`, * to * s with `CyRK`, "
+        "* to * s with `heyoka` (unrolled).",
     )
     known = priced[(priced["group"] == "first call") & priced["first_call_s"].notna()]
     times = [
@@ -135,7 +138,10 @@ def test_first_calls_are_taken_from_the_rows(screen, priced):
 
 def test_how_far_the_fastest_rivals_drift_is_taken_from_the_rows(screen, compared):
     """Which rival is the fastest where the default is slower is taken from the findings."""
-    told = numbers(screen, "by * times the error at which times are compared in the median, at most * times.")
+    told = numbers(
+        screen,
+        "drift: at the end by * times the error at which times are compared in the median, at most * times.",
+    )
     mechanisms = json.loads((ROOT / "reports" / "work_precision.json").read_text())["rivals"]["mechanisms"]
     drifts = []
     for case, at in ((each["case"], at) for each in mechanisms for at in each["at"]):
@@ -148,14 +154,14 @@ def test_how_far_the_fastest_rivals_drift_is_taken_from_the_rows(screen, compare
 
 
 def test_the_intervals_of_looking_are_those_of_the_package(screen):
-    (every,) = numbers(screen, "Ours evaluate forces that may change suddenly with time at least every * of a run (here")
+    (every,) = numbers(screen, EVERY)
     assert every == pytest.approx(LONGEST_UNSEEN / PLACES)
     assert "other forces every hundredth, and" in screen and pytest.approx(0.01) == LONGEST_UNSEEN
 
 
 @pytest.mark.parametrize("method", ["auto", "DOP853", "RadauIIA5", "BDF"])
 def test_forces_are_evaluated_as_often_as_the_screen_says(screen, method):
-    (every,) = numbers(screen, "Ours evaluate forces that may change suddenly with time at least every * of a run (here")
+    (every,) = numbers(screen, EVERY)
     t_end, seen = 3.0, []
 
     def force(t, q, v):
