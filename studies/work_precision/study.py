@@ -136,7 +136,16 @@ def sessions(rows: pd.DataFrame) -> dict[str, Any]:
     most = int(by_case["commit"].nunique().max()) if len(by_case) else 0
     times = known.groupby(["case", "commit"])["calibration_s"].median().groupby("case")
     unlike = (times.max() / times.min()).dropna()
-    return {"sessions": most} | ({"speeds": [float(unlike.median()), float(unlike.max())]} if len(unlike) else {})
+    told = {"sessions": most, "in_angles_apart": _in_angles_apart(rows)}
+    return told | ({"speeds": [float(unlike.median()), float(unlike.max())]} if len(unlike) else {})
+
+
+def _in_angles_apart(rows: pd.DataFrame) -> int:
+    """How many mechanisms have ODEs in angles of another commit than ours."""
+    made = rows.reindex(columns=["group", "family", "case", "commit"]).drop_duplicates()
+    ours = made[(made["group"] == rivals.GROUP) & (made["family"] == "two-loop")].set_index(["case", "commit"])
+    in_angles = made[made["group"] == minimal.GROUP].drop_duplicates(["case", "commit"]).set_index(["case", "commit"])
+    return int((~in_angles.index.isin(ours.index)).sum())
 
 
 def with_one_name(rows: pd.DataFrame) -> pd.DataFrame:

@@ -28,7 +28,7 @@ def test_a_mechanism_measured_again_takes_the_place_of_its_rows():
     assert made["call_s"].tolist() == [2.0, 3.0, 4.0, 9.0]
     assert study.measured_on(made.fillna({"commit": "ab"})) == {
         **{"commits": 2, "processors": ["new", "old"]},
-        "sessions": 1,
+        **{"sessions": 1, "in_angles_apart": 0},
     }
     calls = again.replaced(KEPT, parts["first calls"], rows((first_calls.GROUP, "four-bar", 8.0, "new")))
     assert calls["call_s"].tolist() == [1.0, 2.0, 4.0, 8.0]
@@ -110,5 +110,9 @@ def test_sessions_and_their_calibrations_are_told():
     ]
     told = study.measured_on(pd.DataFrame(made))
     assert told["sessions"] == 2 and told["speeds"] == [2.0, 2.0] and told["commits"] == 2
+    angles = [head | {"group": minimal.GROUP, "case": "a", "commit": commit, "family": "SciPy"} for commit in "13"]
+    ours = [each | {"family": "two-loop"} for each in made]
+    assert study.measured_on(pd.DataFrame([*ours, angles[0]]))["in_angles_apart"] == 0
+    assert study.measured_on(pd.DataFrame([*ours, *angles]))["in_angles_apart"] == 1
     alone = study.measured_on(pd.DataFrame(made[::2]))
     assert alone["sessions"] == 1 and alone["speeds"] == [1.0, 1.0]
