@@ -9,6 +9,7 @@ from twoloop.methods.presets import PRESETS
 
 SUFFIX = " (twoloop)"  # of ours, where a rival has such a name, too
 WITH, WITHOUT = "compiled", "not compiled"  # after a comma, of rows; without either: as a study runs its methods
+ON_SCIPY = "solve_dae"  # another project, whose methods have names of SciPy's
 SCIPY = ("LSODA, ", "DOP853, ", "Radau, ", "BDF, ", "RK45, ")  # how rows of SciPy's begin, which ours may, too
 OTHERS = {  # of studies that run few of ours
     "solve_dae, compiled, one by one": "compiled=True, one by one",
@@ -36,7 +37,7 @@ def label(solver: str, coded: bool | None = None) -> str:
     parts = _parts(solver)
     if parts is None:
         name = solver.removesuffix(SUFFIX)
-        return OTHERS.get(solver, f"SciPy, {name}" if name.startswith(SCIPY) else name)
+        return OTHERS.get(solver, f"SciPy, {name}" if name.startswith(SCIPY) and ON_SCIPY not in name else name)
     method, option = parts[0], _option(*parts, coded)
     words = [] if method == DEFAULT else [method]
     words += [] if option is None else [f"compiled={option}"]

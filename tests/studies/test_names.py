@@ -24,6 +24,7 @@ RAW = re.compile(r"`auto\b|\bauto, (not )?compiled|\b(Taylor|Adams|DOP853), comp
         ("TRBDF2", *['`method="TRBDF2"`'] * 3),
         ("DOP853, projected", *["`SciPy, DOP853, projected`"] * 3),
         ("BDF, index 1", *["`SciPy, BDF, index 1`"] * 3),
+        ("Radau, solve_dae, stabilised", *["`Radau, solve_dae, stabilised`"] * 3),
         ("heyoka", *["`heyoka`"] * 3),
     ],
 )
