@@ -6,10 +6,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from references.engines.engine import engines
 from studies.bench import tables
 from studies.bench.changed_loops import DRIVEN, RATIOS, SERVO
-from studies.bench.cli import version_of
 from studies.bench.closed_loops import SPATIAL
 from studies.bench.end_states import EXACT
 from studies.bench.engine_runs import LIMIT
@@ -38,7 +36,7 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     cases = list(dict.fromkeys(runs["case"]))
     found: dict[str, Any] = {"cases": cases, "errors": list(ERRORS), "lost": LOST, "limit": LIMIT}
     found["absent"] = sorted(set(gates[gates["status"] == "NOT_AVAILABLE"]["family"]))
-    found["versions"] = {each.name: version_of(each.package) for each in engines().values()}
+    found["versions"] = rows.dropna(subset="version").groupby("family")["version"].first().astype(str).to_dict()
     found["gates"] = gates[gates["status"] != "PASSED"][["case", "solver", "message"]].to_dict("records")
     found["n_gates"] = int((gates["status"] == "PASSED").sum())
     found["apart"] = float(runs["floor"].astype(float).max())

@@ -15,6 +15,7 @@ from references.engines.engine import engines
 from references.engines.rigid import Motion, Prepared, coordinates
 from studies.bench import figures
 from studies.bench.changed_loops import IN_A_FRAME, LIGHTENED, MOTORISED
+from studies.bench.cli import version_of
 from studies.bench.closed_loops import MECHANISMS, four_bar, rssr
 from studies.bench.engine_runs import INSTANTS, LIMIT, Loop, errors, gate, timed
 from studies.bench.headline import OWN_CODE
@@ -84,7 +85,9 @@ def make(output: Output) -> pd.DataFrame:
                     kept.made(f"{ENERGY} {build.__name__} {each.name}", partial(energy_row, build, each))
                     for each in ASKED_MORE
                 ]
-    return pd.DataFrame(rows)
+    versions = {engine.name: version_of(engine.package) for engine in engines().values()}
+    made = pd.DataFrame(rows)
+    return made.assign(version=made["family"].map(versions))
 
 
 def _row(group: str, build: Callable[[], Any], **more: Any) -> Row:

@@ -32,6 +32,7 @@ def made(solver, errors, cost=1.0, case="four-bar", **more):
 def said(*parts):
     gates = [{"group": "gate", "case": "four-bar", "solver": name, "family": name} for name in ("MuJoCo", "Drake")]
     head = pd.DataFrame(gates).assign(status=["PASSED", "NOT_AVAILABLE"], message=["", "drake is not installed"])
+    head["version"] = ["4.0.0", "not installed"]
     rows = pd.concat([head, *parts], ignore_index=True)
     found = engines.findings_of(rows)
     return found, render("engines", found, {}, stamp="stamp", quick=False, rows=rows)
@@ -56,6 +57,7 @@ def test_what_to_set_and_what_is_wrong_follow_the_rows():
     best = by_name["MuJoCo, RK4, solref 2h"]
     assert best["gross"] == 0 and best["silent"] == 0 and best["order"][1] == pytest.approx(2.0)
     assert found["wins_engines"][1] == {"MuJoCo": 1}
+    assert "MuJoCo 4.0.0" in text  # as the rows have it, whatever is installed
     first = found["engines"][0]
     assert first["solver"] == "MuJoCo, RK4, solref 2h" and first["steps"] == {"four-bar": [1e-2, 1e-2, 3e-3]}
     assert "| four-bar | 10/10/3.0 |" in text and "Not installed, and so without rows: Drake." in text
