@@ -256,12 +256,6 @@ def test_what_the_library_does_in_a_browser(folder):
     assert found["asked"] == 0  # the page needs no other file
 
 
-@pytest.mark.skipif(
-    any(
-        "call_s" not in (REPORTS / f"{name}.csv").read_text().split("\n")[1].split(",") for name in compare_page.SOURCES
-    ),
-    reason="the reports are not made again since the whole call is timed",
-)
 def test_the_saved_rows_of_the_reports_can_be_shown(tmp_path):
     kept: dict[str, float] = {}
     for name in compare_page.SOURCES:
