@@ -57,6 +57,7 @@ from twoloop.kernels.evaluation.partition import CHANGED
 FADING = 0.98  # of the longest step, with each accepted one
 UNFORESEEN = 10.0  # an error that is so large was not foreseen: the force jumps, or bends, within the step
 REFUSED = 0.95  # of a refused step is what the next one is at most
+FIRST_JUDGED = 2  # accepted step after which a provisional method may give way: the first one may be a guess
 
 
 @kernel(i8(KIT, WORK, f8, VECTOR))
@@ -317,7 +318,7 @@ def advance(
             clock[at.NEXT_OUTPUT] += 1.0
             if int(clock[at.NEXT_OUTPUT]) == outputs.size:
                 return at.ALL_OUTPUT_DONE
-        if w.counters[N_ACCEPTED] == control[at.PROVISIONAL] and clock[at.H_NEXT] <= tolerances[GAP]:
+        if FIRST_JUDGED <= w.counters[N_ACCEPTED] <= control[at.PROVISIONAL] and clock[at.H_NEXT] <= tolerances[GAP]:
             clock[at.H_FAILED] = clock[at.H_NEXT]
             return at.HAS_TO_GIVE_WAY
         if leaps:

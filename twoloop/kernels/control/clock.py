@@ -32,7 +32,7 @@ GO_ON = -1  # nothing of these yet
     BRIDGE,  # 1: stop with NEAR_SINGULAR where steps become short near a singular position
     SHORTEST,  # s; a shorter step is too small, and so is one of a few spacings of t
     GIVES_WAY,  # 1: stop with HAS_TO_GIVE_WAY at a value that is not finite, as another method goes on ...
-    PROVISIONAL,  # ... and after this number of steps, if the next is no longer than steps of others may be
+    PROVISIONAL,  # ... and within this number of steps, if the next is no longer than steps of others may be
     DRIVEN,  # 1: C_t or b may jump
     ROUGH,  # by how much an error may be larger than its estimate where a force jumps, see UNFORESEEN
     SPACING,  # s, of times at which to look ahead for sudden changes; 0: there are none

@@ -32,8 +32,8 @@ from twoloop.kernels.data.tolerances import ESTIMATE, GAP, LONGEST_UNSEEN, allow
 from twoloop.kernels.evaluation.calls import evaluate, renew_partition
 from twoloop.kernels.evaluation.tasks import PROJECT
 
-EARLY = 100.0  # evaluations before the first look at the rate
-INTERVAL = 600.0  # evaluations between two looks: a look takes some eight
+EARLY = 100.0  # evaluations before the first look at the rate ...
+INTERVAL = 600.0  # ... and between two looks: a look takes some eight. Of code made for the mechanism DEARER times as many
 ITERATIONS = 4
 NEGLIGIBLE = 1e-3  # of 1 / h: a rate of decay that needs no second iteration
 SEED = 1e-3  # what a component of a direction begins with, of the largest
@@ -231,13 +231,19 @@ def _price(w, options, memory, t):
 
 
 @compiled
+def _interval(options, memory):
+    """Evaluations until the next look, which itself takes general code."""
+    return INTERVAL * options[DEARER] if _is_explicit(memory) else INTERVAL
+
+
+@compiled
 def _enter(w, options, memory, phase, t):
     """Begin another phase; its method knows nothing of the steps before."""
     memory[PHASE] = phase
     memory[STEPS] = 0.0
     memory[PAST + ERROR_BEFORE] = 0.0
     memory[T_BEGIN], memory[COST_BEGIN] = t, _cost(w, options)
-    memory[LOOK_AT] = w.counters[N_EVALUATIONS] + INTERVAL
+    memory[LOOK_AT] = w.counters[N_EVALUATIONS] + _interval(options, memory)
 
 
 @compiled
@@ -263,7 +269,7 @@ def _look(f, w, options, memory, tolerances, t, state, new_state):
     memory[RATE] = _largest_rate(f, w, memory, t, state, new_state)
     price, cost = _price(w, options, memory, t), _cost(w, options)
     memory[T_BEGIN], memory[COST_BEGIN] = t, cost
-    memory[LOOK_AT] = w.counters[N_EVALUATIONS] + INTERVAL
+    memory[LOOK_AT] = w.counters[N_EVALUATIONS] + _interval(options, memory)
     memory[LOOKS_TO_WAIT] -= 1.0
     share = memory[H_MEAN] * memory[RATE] / options[LIMIT]
     if share > 1.0:
@@ -329,7 +335,7 @@ def switching_step(f, w, options, memory, t, h, tolerances, state, new_state):
     first, second = _memories(memory, n)
     if np.isnan(memory[T_BEGIN]):  # of a run, or of what is left of it beyond a singular position
         memory[T_BEGIN], memory[COST_BEGIN] = t, _cost(w, options)
-        memory[LOOK_AT] = w.counters[N_EVALUATIONS] + EARLY
+        memory[LOOK_AT] = w.counters[N_EVALUATIONS] + EARLY * options[DEARER]
     if memory[MAY_LOOK] == 1.0 and tolerances[ESTIMATE] == 1.0:
         phase = -1
         if memory[PHASE] == ON_TRIAL or memory[PHASE] == BACK_ON_TRIAL:
