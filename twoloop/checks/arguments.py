@@ -94,6 +94,8 @@ def check_real(name: str, value: ArrayLike) -> Array:
     """Return `value` as a new float array, or say that it is not one."""
     if type(value) is np.ndarray and value.dtype == np.float64:
         return value.astype(np.float64)
+    if type(value) is list and all(type(each) is float for each in value):
+        return np.array(value, dtype=np.float64)
     expected = f"{name} must be an array of real numbers"
     if isinstance(value, np.ma.MaskedArray):
         raise TypeError(f"{expected}; given a masked array: fill its gaps first, with filled()")
@@ -235,12 +237,10 @@ def check_times(t_eval: ArrayLike, t0: float, t1: float, step_size: float | None
     if times.ndim != 1 or times.size == 0:
         advice = "leave it out for every step" if times.size == 0 else f"write {shown(times.ravel().tolist())}"
         raise ValueError(f"t_eval must be a non-empty one-dimensional array; given {shaped(times)}: {advice}")
-    spacing = NEAR * float(np.spacing(max(abs(t0), abs(t1))))
+    spacing = NEAR * math.ulp(max(abs(t0), abs(t1)))
     first, last = float(times[0]), float(times[-1])
     within = (first == t0 or first - t0 > spacing) and (last == t1 or t1 - last > spacing)
-    with np.errstate(invalid="ignore"):  # of infinite times
-        apart = times[1:] - times[:-1] > spacing
-    if not (within and bool(apart.all())):  # False for NaN, too
+    if not (within and _are_apart(times, spacing)):  # False for NaN, too
         _check_each(times, t0, t1, spacing)
     if step_size is not None:
         ratio = (times - t0) / step_size
@@ -252,6 +252,14 @@ def check_times(t_eval: ArrayLike, t0: float, t1: float, step_size: float | None
                 f"{float(times[off][0])!r} is not one"
             )
     return times
+
+
+def _are_apart(times: Array, spacing: float) -> bool:
+    """Whether each of the times comes later than the one before by more than a spacing."""
+    if len(times) == 1:
+        return True
+    with np.errstate(invalid="ignore"):  # of infinite times
+        return bool((times[1:] - times[:-1] > spacing).all())
 
 
 def _check_each(times: Array, t0: float, t1: float, spacing: float) -> None:
