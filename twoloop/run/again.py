@@ -184,7 +184,7 @@ class Again:
             sol = DenseSolution(interpolator_of(run, table.states[0]), table, t1)
         if output.times is not None:
             if between is None:
-                at_times: Array | None = rows[[0 if time == t0 else -1 for time in output.times]]
+                at_times: Array | None = rows[[0 if time == t0 else -1 for time in output.times.tolist()]]
             else:
                 at_times = self.between.completed(between)
             if at_times is None:
