@@ -291,7 +291,7 @@ def test_a_second_process_compiles_nothing(own_disk, monkeypatch):
     run_python(program, own_disk)
 
 
-@pytest.mark.parametrize(("make", "n_stages"), [(mechanisms.four_bar, 0), (mechanisms.very_flexible_beam, 1)])
+@pytest.mark.parametrize(("make", "n_stages"), [(mechanisms.four_bar, 0), (mechanisms.governor, 1)])
 def test_stages_are_compiled_where_a_run_leaves_its_series(make, n_stages, own_disk, monkeypatch):
     monkeypatch.setattr("twoloop.generate.families._FAMILIES", {})
     problem = make()

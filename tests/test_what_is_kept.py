@@ -162,7 +162,7 @@ def test_a_call_is_that_of_a_new_system_whatever_was_called_before(name):
 @pytest.mark.filterwarnings("ignore::twoloop.ConstraintWarning")
 def test_a_call_that_crosses_singular_positions_is_that_of_a_new_system(given, options):
     def call(system, state):
-        return solve_dae(system, (float(state.t), 10.0), state.q, state.v, rtol=1e-6, atol=1e-6, **options)
+        return solve_dae(system, (float(state.t), 10.0), state.q, state.v, rtol=1e-7, atol=1e-7, **options)
 
     problem = mechanisms.n_four_bar(*given)
     solution = solve_dae(problem.system, (0.0, 1e-3), problem.q0, problem.v0, dense_output=True).sol
@@ -293,6 +293,6 @@ def test_what_a_method_was_traced_to_is_compared_in_its_first_run(monkeypatch):
     monkeypatch.setattr(comparison, "_traces", lambda *given: compared.append(1) or look(*given))
     problem = mechanisms.four_bar()
     for method in ("DOP853", "DOP853", "DOP853", "auto", "auto", "auto"):
-        solve_dae(problem.system, (0.0, 1.0), problem.q0, problem.v0, method, 1e-6, 1e-6)
+        solve_dae(problem.system, (0.0, 1.0), problem.q0, problem.v0, method, 1e-7, 1e-7)
         counts.append(len(compared))
     assert counts[:2] == [1, 2] and counts[4] == counts[2] + 2 and counts[5] <= 6  # a third run may find turning points

@@ -148,9 +148,9 @@ class Integrator:
         """Integrate to the next sample, with inputs that are constant until then.
 
         No checks are repeated. Accelerations jump with the inputs, and the method restarts there. Error control is that
-        of `run`. As in a run, no step is longer than a hundredth of the time since the start, so the first samples are
-        divided into many steps. A sample that meets a force too short for its looks is made again, and a
-        `ConstraintWarning` says where earlier samples may have missed one.
+        of `run`. As in a run, the equations are evaluated at least every hundredth of the time since the start, so the
+        first samples are divided into many steps. A sample that meets a force too short for its looks is made again,
+        and a `ConstraintWarning` says where earlier samples may have missed one.
 
         Parameters
         ----------

@@ -12,7 +12,7 @@ from twoloop.generate.time_dependence import may_be_sudden
 from twoloop.generate.tracing import Untraceable
 from twoloop.methods import dop853_tableau as tableau
 from twoloop.methods.auto import TIGHTEST
-from twoloop.methods.dop853 import COARSE_SHARE
+from twoloop.methods.dop853 import COARSE_SHARE, UNSEEN
 from twoloop.methods.plan import Method, least_tolerance
 from twoloop.methods.presets import PRESETS
 from twoloop.methods.runge_kutta import RungeKutta
@@ -117,16 +117,7 @@ def _dop853(n: int, rtol: float, atol: float) -> LaneMethod:
         return memory_size(len(tableau.B), n)
 
     weights = tableau.A, tableau.B, tableau.C, tableau.E5, COARSE_SHARE * tableau.E3
-    return LaneMethod(
-        "DOP853", False, 8, _options(PRESETS["DOP853"], n, rtol, atol), step, memory, weights, _unseen(weights)
-    )
-
-
-def _unseen(weights: tuple[Array, Array, Array, Array, Array]) -> float:
-    """The widest gap between stages with weight in the result or in an estimate, and the end."""
-    _, b, c, fine, coarse = weights
-    seen = c[(b != 0.0) | (fine != 0.0) | (coarse != 0.0)]
-    return float(np.diff(np.sort([*seen, 1.0])).max())
+    return LaneMethod("DOP853", False, 8, _options(PRESETS["DOP853"], n, rtol, atol), step, memory, weights, UNSEEN)
 
 
 def _newton(name: str, tested: Literal["all", "positions"], n: int, rtol: float, atol: float) -> LaneMethod:

@@ -39,6 +39,7 @@ class Dependence(NamedTuple):
     """What is known of a family of systems."""
 
     sudden: Sudden
+    narrow: bool  # whether something may be narrow, see `may_be_narrow`
     kinds: frozenset[str]  # of callbacks that ran on symbols
 
     def of(self, system: ConstrainedSystem, evaluate: Evaluator) -> "Dependence":
@@ -53,13 +54,29 @@ def may_be_sudden(system: ConstrainedSystem, ran_on_symbols: bool) -> Sudden:
     """
     if system.n_q > LARGEST:
         return Sudden(True, False)
+    known = _known(system, ran_on_symbols)
+    return Sudden(True, True) if known is None else known.sudden
+
+
+def may_be_narrow(system: ConstrainedSystem, ran_on_symbols: bool) -> bool:
+    """Whether forces, M or C_q may change much over a short way, though not suddenly: quotients and roots of the state.
+
+    What is far from there tells of it, but over long steps less than a step needs to know, as of 1 / (1 + (x / w)**2).
+    """
+    if any(may_be_sudden(system, ran_on_symbols)):
+        return True
+    known = _known(system, ran_on_symbols)
+    return known is None or known.narrow
+
+
+def _known(system: ConstrainedSystem, ran_on_symbols: bool) -> Dependence | None:
     if system.called_in_python and not ran_on_symbols:
-        return Sudden(True, True)
+        return None
     try:
         known: Dependence = of_family(system, "dependence", _traced(system), unchecked)
     except Untraceable:
-        return Sudden(True, True)
-    return known.sudden
+        return None
+    return known
 
 
 def _traced(system: ConstrainedSystem) -> Any:
@@ -71,8 +88,9 @@ def _traced(system: ConstrainedSystem) -> Any:
             return equations.graph.needed_by(forms)
 
         graph = equations.graph
-        sudden = Sudden(_by_time(graph, needed(BY_TIME)), _by_state(graph, needed(BY_STATE), system.n_q))
-        return Dependence(sudden, frozenset(graph.traced))
+        by_state = needed(BY_STATE)
+        sudden = Sudden(_by_time(graph, needed(BY_TIME)), _by_state(graph, by_state, system.n_q))
+        return Dependence(sudden, _has_poles(graph, by_state), frozenset(graph.traced))
 
     return make
 
@@ -108,6 +126,12 @@ def _by_state(graph: Graph, needed: list[int], n_q: int) -> bool:
             if growth[i] < SLOWEST or vibrations[i] > HIGHEST:
                 return True
     return False
+
+
+def _has_poles(graph: Graph, needed: list[int]) -> bool:
+    """Whether more than products, sines and cosines are made of the state."""
+    operations = ((graph.operations[i], graph.inputs_of[i]) for i in needed)
+    return any(operation[0] not in SMOOTH for operation, inputs in operations if operation and inputs & ~TIME)
 
 
 def _degree(degrees: dict[int, float], kind: int, *factors: Form | None) -> float:

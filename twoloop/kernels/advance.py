@@ -42,7 +42,7 @@ from twoloop.kernels.data.noted import (
     UNCHECKED,
     WIDEST_GAP,
 )
-from twoloop.kernels.data.tolerances import GAP, LOOK
+from twoloop.kernels.data.tolerances import ESTIMATE, GAP, LOOK
 from twoloop.kernels.evaluation.calls import (
     accelerations,
     check_redundant,
@@ -184,7 +184,9 @@ def _count(w, tolerances, size, out_step):
         w.notes[LARGEST_DEFECT] = max(w.notes[LARGEST_DEFECT], w.notes[DEFECT])
     else:
         w.notes[UNCHECKED] += 1.0
-    gap = min(size, tolerances[LOOK]) if w.notes[DEFECT] >= 0.0 else size
+    gap = size
+    if tolerances[ESTIMATE] == 1.0:  # longer steps have looks, or stages, no further from one another than that
+        gap = min(size, tolerances[LOOK] if w.notes[DEFECT] >= 0.0 else tolerances[GAP])
     w.notes[WIDEST_GAP] = max(w.notes[WIDEST_GAP], gap)
     w.notes[ORIENTATION] = w.notes[ORIENTATION_NEW]
     out_step[at.H] = size

@@ -4,6 +4,7 @@ from dataclasses import dataclass, replace
 
 from twoloop.generate.series import is_quick
 from twoloop.generate.straight_code import OwnCode
+from twoloop.generate.time_dependence import may_be_narrow
 from twoloop.generate.traced_values import Check, unchecked
 from twoloop.methods.dop853 import DOP853
 from twoloop.methods.plan import Method, Plan, kept_plan, least_tolerance
@@ -82,21 +83,22 @@ class Auto:
     Systems that give the values of entries have `few` from 64 coordinates on, too, unless tolerances are below 1e-10 or
     there are at most a quarter as many constraints: their projections, one a step, cost as much as evaluations.
 
-    At looser tolerances than these a run begins with `series` as well, as others may take no steps longer than a
-    hundredth of the run: after 10 steps it goes on without, if the next would be no longer than that. It also goes on
-    without where the series is not finite and the functions are.
+    At looser tolerances than these a run begins with `series` as well where others may take no steps longer than a
+    hundredth of the run: within 10 steps it goes on without, if the next would be no longer than that. Steps of `few`
+    may be longer where forces, M and C_q are sums of products, sines and cosines. A run also goes on without the series
+    where this is not finite and the functions are.
 
-    After 100 evaluations, and then every 600, the largest rate of the motion is estimated, from the derivatives of the
-    accelerations. The implicit method is tried for 15 steps where the steps have come near the limit of stability that
-    this rate sets (at two looks in a row; at one with `many`, and with `few` from 16 coordinates on), or are above 5 %
-    of it and the rate is more than thirty times that of the motion itself, or all that could move at this rate is
-    within ten tolerances of velocities. Unless they are far beyond that limit, this waits until the run has cost three
-    trials, and 64 evaluations for each independent coordinate if tangents have to be differenced, or three tenths of
-    what the run will cost as a whole at its present price are as much. If it is to cost a thousand trials, one is made
-    whatever the rates. The implicit method is kept if a second of motion costs it less, counted in evaluations and
-    Newton matrices: `loose` at tolerances from 3e-5 on, `tightest` below 9e-7, else `tight`. It is left the same way,
-    where its steps come below that limit or a second of motion costs more than the explicit method took. Counts decide,
-    not times: a run can be repeated.
+    After 100 evaluations, and then every 600, of code made for the mechanism two to four times as many, the largest
+    rate of the motion is estimated, from the derivatives of the accelerations. The implicit method is tried for 15
+    steps where the steps have come near the limit of stability that this rate sets (at two looks in a row; at one with
+    `many`, and with `few` from 16 coordinates on), or are above 5 % of it and the rate is more than thirty times that
+    of the motion itself, or all that could move at this rate is within ten tolerances of velocities. Unless they are
+    far beyond that limit, this waits until the run has cost three trials, and 64 evaluations for each independent
+    coordinate if tangents have to be differenced, or three tenths of what the run will cost as a whole at its present
+    price are as much. If it is to cost a thousand trials, one is made whatever the rates. The implicit method is kept
+    if a second of motion costs it less, counted in evaluations and Newton matrices: `loose` at tolerances from 3e-5 on,
+    `tightest` below 9e-7, else `tight`. It is left the same way, where its steps come below that limit or a second of
+    motion costs more than the explicit method took. Counts decide, not times: a run can be repeated.
 
     Above 1000 coordinates no implicit method is tried, as its matrices are full; nor is a series where M and C_q have
     more than 200,000 entries together, zeros among them, as it takes seconds to find (method="Taylor" does).
@@ -127,6 +129,7 @@ class Auto:
     n_rows: int = 0  # constraints of the system, and whether there is code made for it; solve_dae says so
     compiled: bool = False
     sparse: bool = False  # whether it gives the values of entries: an evaluation then costs no more than a projection
+    narrow: bool = True  # whether forces may change much over a short way, so that no method may take longer steps
 
     @property
     def name(self) -> str:
@@ -148,9 +151,10 @@ class Auto:
         if self.series is None or plain:
             return replace(chosen, series=None)
         try:
-            return replace(chosen, series=self.series.for_system(system, code, check))
+            series = self.series.for_system(system, code, check)
         except ValueError:
             return replace(chosen, series=None)
+        return replace(chosen, series=series, narrow=may_be_narrow(system, ran_on_symbols=True))
 
     def _series_pays(self, n_q: int, tolerance: float) -> bool:
         """Whether a step of the series costs less than the steps of the others that it replaces."""
@@ -186,8 +190,9 @@ class Auto:
         # where the series lasts, what takes over if its values are not finite is not worth a compilation
         few = replace(self.few, code=None) if pays and isinstance(self.few, DOP853) else self.few
         explicit = self._explicit(few, n_q, rtol, atol, second, dearer)
-        # at looser tolerances as well where steps are long: others may not be longer than a hundredth of the run
-        if not pays and not self._series_pays(n_q, LONG_STEPS):
+        # at looser tolerances as well where steps are long: most others may not be longer than a hundredth of the run
+        stages_suffice = explicit.unseen < 1.0 and not self.narrow
+        if not pays and (stages_suffice or not self._series_pays(n_q, LONG_STEPS)):
             return explicit
         series = self.series.plan(n_q, rtol, atol, False)
         chosen = switching(series, second, LIMIT_SERIES / series.exponent, n_q, LOOKS_FEW, dearer)

@@ -15,6 +15,8 @@ from twoloop.problem.system import ConstrainedSystem
 COARSE_SHARE = 0.1  # of the estimate of order 3 beside that of order 5
 REUSE = 1e-4  # of the tolerance: how far off a stage may be from the position of the Jacobian that its velocities use
 LEAST_ERROR = 1e-6  # of the tolerance, in the trend: an error of order 8 falls a hundredfold with steps half as long
+SEEN = tableau.C[(tableau.B != 0.0) | (tableau.E5 != 0.0) | (tableau.E3 != 0.0)]  # stages that count
+UNSEEN = float(np.diff([*np.sort(SEEN), 1.0]).max())  # of a step, between two of them: 4/15
 STABLE_TO = (5.96, 6.39)  # h times the frequency of a vibration, and times a rate of decay
 SAFETY = 0.8  # with 0.9 twice as many steps are rejected, and at equal error it costs about a tenth more
 
@@ -106,6 +108,7 @@ class DOP853:
             rough=ROUGH,
             stable_to=lambda memory: STABLE_TO,
             reuse=0.0 if fixed else REUSE * least_tolerance(rtol, atol),
+            unseen=UNSEEN if free else 1.0,
         )
         if self.code is None or not free:
             return plan

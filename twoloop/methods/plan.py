@@ -55,6 +55,7 @@ class Plan:
     parts: int = 1  # equal steps that a step is divided into for the solution between its ends ...
     interior: "Plan | None" = None  # ... and how they are made; None: by the method itself
     looks_within: bool = False  # whether its steps look at the equations between their ends; if not, they are limited
+    unseen: float = 1.0  # of such a step, the longest part within which nothing is evaluated
     substitute: "Plan | None" = None  # what goes on where this one's values are not finite
     provisional: bool = False  # whether that takes over, too, where steps turn out to be no longer than its own may be
     traced: tuple[Any, ...] = ()  # what the callbacks were traced to, where a step goes by that: see traced_values.py

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from twoloop.checks.at_position import dependent_rows, least_inertia, mass_and_rows, pattern_of
 from twoloop.checks.rank import SHOWN, equations_in_words, in_words
 from twoloop.checks.sparse_rows import Rows, SparseRows, norms
-from twoloop.generate.time_dependence import Sudden, may_be_sudden
+from twoloop.generate.time_dependence import Sudden, may_be_narrow, may_be_sudden
 from twoloop.kernels.compile.linking import direct
 from twoloop.kernels.control.sudden import PLACES
 from twoloop.kernels.data import codes, counters, flags, noted, tolerances
@@ -104,6 +104,7 @@ class Run:
         ran_on_symbols = any("force" in each.kinds for each in plan.traced)
         self.sudden = Sudden(False, False) if step_size is not None else may_be_sudden(system, ran_on_symbols)
         self.control[[clock.BY_TIME, clock.BY_STATE]] = self.sudden
+        self.narrow = plan.unseen == 1.0 or may_be_narrow(system, ran_on_symbols)
         self.crossings: list[list[tuple[float, Array]]] = []  # states before and behind steps across singular positions
         self.lengths: list[float] = []  # of steps across such a position that are still to be tried
         self.jumps: list[float] = []  # times at which velocities changed as by an impulse
@@ -348,8 +349,12 @@ class Run:
         self.limit_steps()
 
     def limit_steps(self) -> None:
-        """Let no step that does not look at the equations between its ends pass over a hundredth of the run."""
-        self.control[self.a.MAX_STEP] = self.max_step if self.plan.looks_within else min(self.max_step, self.gap)
+        """Let no step pass over a hundredth of the run without an evaluation.
+
+        Where something may be narrow, one stage that meets it may say too little: no step is longer then.
+        """
+        longest = np.inf if self.plan.looks_within else self.gap / (1.0 if self.narrow else self.plan.unseen)
+        self.control[self.a.MAX_STEP] = min(self.max_step, longest)
         self.control[self.a.SPACING] = self.gap / PLACES if any(self.sudden) else 0.0
         self.control[self.a.APART] = self.apart
 

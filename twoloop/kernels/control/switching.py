@@ -32,8 +32,8 @@ from twoloop.kernels.data.tolerances import ESTIMATE, GAP, LONGEST_UNSEEN, allow
 from twoloop.kernels.evaluation.calls import evaluate, renew_partition
 from twoloop.kernels.evaluation.tasks import PROJECT
 
-EARLY = 100.0  # evaluations before the first look at the rate ...
-INTERVAL = 600.0  # ... and between two looks: a look takes some eight. Of code made for the mechanism DEARER times as many
+# evaluations before the first look at the rate, and between two; of code made for the mechanism DEARER times as many
+EARLY, INTERVAL = 100.0, 600.0  # a look takes some eight, by the general code
 ITERATIONS = 4
 NEGLIGIBLE = 1e-3  # of 1 / h: a rate of decay that needs no second iteration
 SEED = 1e-3  # what a component of a direction begins with, of the largest
