@@ -8,7 +8,7 @@ from scipy.integrate import solve_ivp
 
 from tests import problems
 from tests.problems import unconstrained, worst
-from twoloop import mechanisms, solve_dae
+from twoloop import DOP853, mechanisms, solve_dae
 from twoloop.mechanisms import four_bar
 
 T_END = 3.0
@@ -122,6 +122,45 @@ def test_few_digits_and_many_are_what_was_asked_for(name, method, tolerances):
 def test_other_methods_do_not_say_a_defect():
     result, _ = off("brake", method="DOP853")
     assert result.defect is None and result.widest_gap == pytest.approx(result.h.max())
+
+
+@pytest.mark.parametrize(
+    ("force", "narrow"),
+    [
+        (lambda t, q, v: -0.1 * q, False),
+        (lambda t, q, v: -0.1 * np.sin(q) * np.cos(t) - 1e-3 * v**3, False),
+        (lambda t, q, v: -0.1 * q / (1.0 + q**2), True),
+        (lambda t, q, v: -0.1 * q / np.sqrt(1.0 + q**2), True),
+        (lambda t, q, v: -0.1 * np.arctan(q), True),
+        (lambda t, q, v: -0.1 * np.tanh(q), True),
+        (lambda t, q, v: -0.1 * q if t < 1e9 else q, True),
+    ],
+)
+def test_steps_are_longer_than_a_hundredth_where_nothing_is_narrow(force, narrow):
+    """4/15 of a step is the longest part without a stage: the equations are still evaluated in each hundredth."""
+    system = unconstrained(force, compile=True)
+    result = solve_dae(system, (0.0, 1.0), [1.0], [0.0], "DOP853", 1e-3, 1e-3)
+    assert result.h.max() == pytest.approx(0.01 if narrow else 0.0375, rel=1e-9)
+    assert result.widest_gap == pytest.approx(0.01, rel=1e-9)
+
+
+@pytest.mark.parametrize("method", ["RadauIIA9", "Adams", "Newmark", DOP853("restored")], ids=str)
+def test_steps_of_other_methods_are_not(method):
+    system = unconstrained(lambda t, q, v: -0.1 * q, compile=True)
+    result = solve_dae(system, (0.0, 1.0), [1.0], [0.0], method, 1e-3, 1e-3)
+    assert result.h.max() <= 0.01 * (1.0 + 1e-9) and result.widest_gap <= 0.01 * (1.0 + 1e-9)
+
+
+def test_the_default_takes_them_from_the_start_at_loose_tolerances():
+    problem = mechanisms.double_pendulum()
+    for compiled in (True, False):
+        given = {"rtol": 1e-3, "atol": 1e-3, "compiled": compiled}
+        default, alone = (
+            solve_dae(problem.system, (0.0, 5.0), problem.q0, problem.v0, method, **given)
+            for method in ("auto", "DOP853")
+        )
+        assert default.h.max() > 0.05 * (1.0 + 1e-9)
+        assert default.stats.n_evaluations < 1.2 * alone.stats.n_evaluations
 
 
 def test_constant_steps_say_how_wide_they_are():
