@@ -3,6 +3,7 @@
 from typing import Any, NamedTuple
 
 from twoloop.generate.families import Evaluator, Family, of_family
+from twoloop.generate.known_numbers import Known
 from twoloop.generate.traced_values import unchecked
 from twoloop.generate.tracing import Form, Graph, Untraceable
 from twoloop.kernels.evaluation.operations import (
@@ -23,6 +24,7 @@ SMOOTH = (PRODUCT, SUM, SINE, COSINE)  # polynomials and vibrations: nothing hap
 HIGHEST = 8  # ... up to this degree: a high power of a cosine is a pulse
 HIGHEST_OF_STATE = 32  # degree in q and v up to which it is seen from afar; so are roots, not exp ...
 HIGHEST_INVERSE = 4  # ... and quotients up to this one ...
+FASTEST = 4.0  # times a coordinate or a speed: of vibrations with these that long steps resolve
 SLOWEST = -2.0  # ... that fall off no faster than this power: 1 / (1 + (x / w)**2), not its square
 LARGEST = 300  # coordinates: to trace the forces of more takes up to seconds, the looks of a run a tenth of it
 TIME = 1  # the bit of t, the first input of a graph
@@ -59,9 +61,10 @@ def may_be_sudden(system: ConstrainedSystem, ran_on_symbols: bool) -> Sudden:
 
 
 def may_be_narrow(system: ConstrainedSystem, ran_on_symbols: bool) -> bool:
-    """Whether forces, M or C_q may change much over a short way, though not suddenly: quotients and roots of the state.
+    """Whether forces, M, C_q or C_t may change much over a short way, though not suddenly.
 
-    What is far from there tells of it, but over long steps less than a step needs to know, as of 1 / (1 + (x / w)**2).
+    So may quotients and roots of the state. Of 1 / (1 + (x / w)**2) what is far away tells, but over long steps less
+    than a step needs to know. Stages of long steps may meet a fast vibration at like phases.
     """
     if any(may_be_sudden(system, ran_on_symbols)):
         return True
@@ -90,7 +93,8 @@ def _traced(system: ConstrainedSystem) -> Any:
         graph = equations.graph
         by_state = needed(BY_STATE)
         sudden = Sudden(_by_time(graph, needed(BY_TIME)), _by_state(graph, by_state, system.n_q))
-        return Dependence(sudden, _has_poles(graph, by_state), frozenset(graph.traced))
+        narrow = any(_is_narrow(graph, i) for i in {*by_state, *needed(BY_TIME)})
+        return Dependence(sudden, narrow, frozenset(graph.traced))
 
     return make
 
@@ -128,10 +132,16 @@ def _by_state(graph: Graph, needed: list[int], n_q: int) -> bool:
     return False
 
 
-def _has_poles(graph: Graph, needed: list[int]) -> bool:
-    """Whether more than products, sines and cosines are made of the state."""
-    operations = ((graph.operations[i], graph.inputs_of[i]) for i in needed)
-    return any(operation[0] not in SMOOTH for operation, inputs in operations if operation and inputs & ~TIME)
+def _is_narrow(graph: Graph, i: int) -> bool:
+    """Whether a quantity is a quotient or a root, a vibration with time, or a fast one with the state.
+
+    How fast one of a coordinate is that a parameter multiplies is not known.
+    """
+    kind, argument, *_ = graph.operations[i] or (SUM, None)
+    if kind not in (SINE, COSINE) or argument is None:
+        return kind not in SMOOTH and graph.inputs_of[i] != TIME
+    fast = any(type(c) is Known or abs(c) > FASTEST for c in argument.terms.values())
+    return fast or bool(graph.inputs_of[i] & TIME)
 
 
 def _degree(degrees: dict[int, float], kind: int, *factors: Form | None) -> float:

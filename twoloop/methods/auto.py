@@ -85,8 +85,8 @@ class Auto:
 
     At looser tolerances than these a run begins with `series` as well where others may take no steps longer than a
     hundredth of the run: within 10 steps it goes on without, if the next would be no longer than that. Steps of `few`
-    may be longer where forces, M and C_q are sums of products, sines and cosines. A run also goes on without the series
-    where this is not finite and the functions are.
+    may be longer where forces and constraints have no quotients, roots or fast vibrations. A run also goes on without
+    the series where this is not finite and the functions are.
 
     After 100 evaluations, and then every 600, of code made for the mechanism two to four times as many, the largest
     rate of the motion is estimated, from the derivatives of the accelerations. The implicit method is tried for 15
