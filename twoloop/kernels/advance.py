@@ -42,7 +42,7 @@ from twoloop.kernels.data.noted import (
     UNCHECKED,
     WIDEST_GAP,
 )
-from twoloop.kernels.data.tolerances import ESTIMATE, GAP, LOOK
+from twoloop.kernels.data.tolerances import GAP, LOOK
 from twoloop.kernels.evaluation.calls import (
     accelerations,
     check_redundant,
@@ -177,7 +177,7 @@ def _refused(f, w, control, clock, t, size, proposal):
 
 
 @merged
-def _count(w, tolerances, size, out_step):
+def _count(w, tolerances, control, size, out_step):
     """Count an accepted step, and what it saw of the equations."""
     w.counters[N_ACCEPTED] += 1
     if w.notes[DEFECT] >= 0.0:
@@ -185,8 +185,10 @@ def _count(w, tolerances, size, out_step):
     else:
         w.notes[UNCHECKED] += 1.0
     gap = size
-    if tolerances[ESTIMATE] == 1.0:  # longer steps have looks, or stages, no further from one another than that
-        gap = min(size, tolerances[LOOK] if w.notes[DEFECT] >= 0.0 else tolerances[GAP])
+    if w.notes[DEFECT] >= 0.0:
+        gap = min(size, tolerances[LOOK])
+    elif size > tolerances[GAP]:  # as only steps may be whose stages are nearer to one another
+        gap = control[at.UNSEEN] * size
     w.notes[WIDEST_GAP] = max(w.notes[WIDEST_GAP], gap)
     w.notes[ORIENTATION] = w.notes[ORIENTATION_NEW]
     out_step[at.H] = size
@@ -292,7 +294,7 @@ def advance(
         if w.rows_v.size < w.Rate.size and check_redundant(f, w, t + size, new_state[:n], new_state[n : 2 * n]) != DONE:
             clock[at.H_FAILED] = size
             return at.ROWS_VIOLATED
-        _count(w, tolerances, size, out_steps[filled[1]])
+        _count(w, tolerances, control, size, out_steps[filled[1]])
         filled[1] += 1
         clock[at.H_LONG] = max(size, FADING * clock[at.H_LONG])
         remember(control, clock, size, error)

@@ -84,7 +84,7 @@ class Run:
         self.tolerances[tolerances.LEAST] = least_tolerance(rtol, self.least_atol)
         self.tolerances[tolerances.ATOL :] = atol
         self.control = np.zeros(clock.N_CONTROL)
-        self.control[clock.MAX_STEP] = np.inf
+        self.control[clock.MAX_STEP], self.control[clock.UNSEEN] = np.inf, 1.0
         self.control[clock.FIXED_STEP] = 0.0 if step_size is None else step_size
         self.control[clock.MAX_STEPS] = np.inf
         self.control[clock.BRIDGE], self.control[clock.AHEAD] = self.static is None, 1.0
@@ -104,7 +104,7 @@ class Run:
         ran_on_symbols = any("force" in each.kinds for each in plan.traced)
         self.sudden = Sudden(False, False) if step_size is not None else may_be_sudden(system, ran_on_symbols)
         self.control[[clock.BY_TIME, clock.BY_STATE]] = self.sudden
-        self.narrow = plan.unseen == 1.0 or may_be_narrow(system, ran_on_symbols)
+        self.narrow = step_size is not None or plan.unseen == 1.0 or may_be_narrow(system, ran_on_symbols)
         self.crossings: list[list[tuple[float, Array]]] = []  # states before and behind steps across singular positions
         self.lengths: list[float] = []  # of steps across such a position that are still to be tried
         self.jumps: list[float] = []  # times at which velocities changed as by an impulse
@@ -353,8 +353,9 @@ class Run:
 
         Where something may be narrow, one stage that meets it may say too little: no step is longer then.
         """
-        longest = np.inf if self.plan.looks_within else self.gap / (1.0 if self.narrow else self.plan.unseen)
-        self.control[self.a.MAX_STEP] = min(self.max_step, longest)
+        unseen = 1.0 if self.narrow else self.plan.unseen
+        longest = np.inf if self.plan.looks_within else self.gap / unseen
+        self.control[self.a.MAX_STEP], self.control[self.a.UNSEEN] = min(self.max_step, longest), unseen
         self.control[self.a.SPACING] = self.gap / PLACES if any(self.sudden) else 0.0
         self.control[self.a.APART] = self.apart
 
