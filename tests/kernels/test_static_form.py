@@ -229,7 +229,7 @@ def test_small_mechanisms_have_the_forms_that_they_had():
 
 
 def test_a_position_that_is_nearly_singular_is_left_to_the_dense_forms(any_size, both):
-    """A parallelogram that comes to its flat position: the static form says what the others say, or crosses it."""
+    """A parallelogram that comes to its flat position: every form stops there, or crosses it on the same branch."""
     bodies = PlanarBodies([f"bar {k}" for k in range(3)], np.ones(3), np.full(3, 0.1))
     bodies.pin(GROUND, (0.0, 0.0), 0, (-0.5, 0.0))
     bodies.pin(GROUND, (1.0, 0.0), 1, (-0.5, 0.0))
@@ -240,13 +240,13 @@ def test_a_position_that_is_nearly_singular_is_left_to_the_dense_forms(any_size,
     q = np.array([0.5 * c, 0.5 * s, angle, 1.0 + 0.5 * c, 0.5 * s, angle, 0.5 + c, s, 0.0])
     v = -speed * np.array([-0.5 * s, 0.5 * c, 1.0, -0.5 * s, 0.5 * c, 1.0, -s, c, 0.0])
     options = {"method": "DOP853", "rtol": 1e-8, "atol": 1e-8, "compiled": False}
-    dense, result = both(lambda: solve_dae(bodies.system("parallelogram"), (0.0, 0.2), q, v, **options))
-    assert dense.status is Status.STEP_TOO_SMALL
-    if result.success:  # a step that ends beyond the position, by rounding: in the motion of the parallelogram
-        energy = bodies.energy(result.t, result.q, result.v)
-        assert worst(result.q[8], 0.0) < 1e-5 and np.ptp(energy) < 1e-6 * np.abs(energy).max()
-    else:
-        assert result.status is Status.STEP_TOO_SMALL and abs(dense.t[-1] - result.t[-1]) < 1e-4
+    runs = both(lambda: solve_dae(bodies.system("parallelogram"), (0.0, 0.2), q, v, **options))
+    for result in runs:  # rounding decides whether a step ends beyond the position, in the motion of the parallelogram
+        if result.success:
+            energy = bodies.energy(result.t, result.q, result.v)
+            assert worst(result.q[8], 0.0) < 1e-5 and np.ptp(energy) < 1e-6 * np.abs(energy).max()
+        else:
+            assert result.status is Status.STEP_TOO_SMALL and worst(result.q[2, -1], 0.0) < 1e-3
 
 
 def test_starts_of_large_systems(both):
