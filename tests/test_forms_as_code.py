@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.problems import worst
+from twoloop.generate import llvm_text
 from twoloop.generate.choices import Choice
 from twoloop.generate.coefficients import Coefficients
 from twoloop.generate.derivative import Derivative
@@ -53,7 +54,8 @@ def machine_code_of(graph, outputs, numbers, divided=False):
 
 
 @pytest.mark.parametrize("make", [four_bar, andrews, heavy_top, spatial_four_bar])
-def test_code_in_divided_blocks_gives_the_same_numbers(make):
+def test_code_in_divided_blocks_gives_the_same_numbers(make, monkeypatch):
+    monkeypatch.setattr(llvm_text, "LONGEST", 50)
     problem = make()
     system = problem.system
     equations = StraightLine(system, Choice.at(system, 0.0, problem.q0))

@@ -16,7 +16,6 @@ from twoloop.kernels.compile.dependencies import digest_of
 from twoloop.kernels.compile.own_functions import OwnFunctions, own_functions
 
 LONG = 300  # operations of a series from which on they are loops over tables: of fewer the loops take a tenth more time
-DIVIDED = 250  # operations from which on blocks of straight code are divided
 
 
 class CompiledSeries(NamedTuple):
@@ -55,12 +54,13 @@ def _compiled(own: SharedCode) -> CompiledSeries:
     system, family = own.equations.system, own.family
     program = family.remembered("series", lambda: series_program(system, family.equations(system)))
     numbers = Coefficients()
-    code = (SeriesLoops if program.n_operations > LONG else SeriesCode)(program, numbers)
+    in_loops = program.n_operations > LONG
+    code = (SeriesLoops if in_loops else SeriesCode)(program, numbers)
     structure = [own.digest, code.structure]
     key = hashlib.sha256(repr(structure).encode()).hexdigest()
 
     def write() -> tuple[list[str], str]:
-        module, names = Module(divided=DIVIDED < program.n_operations <= LONG), []
+        module, names = Module(divided=not in_loops), []
         if own.parts is None:
             names += ["own_solution", "own_factors"]
             write_own(module, "own_solution", own.solution.graph, own.solution.solved, own.numbers)
@@ -75,7 +75,7 @@ def _compiled(own: SharedCode) -> CompiledSeries:
             llvm_code.write(module, name, KIT.own_type(name), emit)
         return [*names, *recurrences], str(module)
 
-    functions = own_functions("series", _stamp(), key, write, passes=program.n_operations <= LONG)
+    functions = own_functions("series", _stamp(), key, write, passes=not in_loops)
     return CompiledSeries(functions, code, own.solution.n_kept, numbers.formulas)
 
 

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from typing import Any
 
 DOUBLE, INTEGER, WORD, BIT, NOTHING = "double", "i64", "i32", "i1", "void"
-LONGEST = 80  # operations of a block of a divided function
+LONGEST = 400  # lines of a block of a divided function; code of much shorter blocks is up to two thirds slower
 
 
 class Value:

@@ -20,18 +20,12 @@ TRUE = Value(BIT, "true")
 ARRAY = f"{DOUBLE}*"
 POSITION = [DOUBLE, ARRAY, ARRAY, ARRAY, ARRAY]  # t, q, v, numbers, kept
 LONG = 500  # operations from which on equations are written in parts ...
-DIVIDED = 1500  # ... whose blocks are divided; with fewer the divided code runs up to a quarter slower ...
 LONGEST = 2500  # ... and which LLVM does not simplify first: it finds nothing there that makes them faster
 
 
 def is_long(equations: StraightLine) -> bool:
     """Whether equations are worth their calls."""
     return equations.n_operations > LONG
-
-
-def has_long_blocks(equations: StraightLine) -> bool:
-    """Whether blocks take so long to compile that they are divided."""
-    return equations.n_operations > DIVIDED
 
 
 def is_longest(equations: StraightLine) -> bool:

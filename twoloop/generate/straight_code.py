@@ -129,7 +129,7 @@ class SharedCode:
         from twoloop.kernels.data.common import KIT
 
         equations = self.equations
-        module = Module(divided=parts_code.has_long_blocks(equations))
+        module = Module(divided=True)
         for name, outputs in self.outputs.items():
             write_own(module, name, equations.graph, outputs, self.numbers)
         parts = [] if self.parts is None else self.parts.write(module, KIT.own_type)
