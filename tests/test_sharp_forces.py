@@ -131,6 +131,8 @@ def test_other_methods_do_not_say_a_defect():
         (lambda t, q, v: -0.1 * np.sin(q) * t - 1e-3 * v**3, False),
         (lambda t, q, v: -0.1 * np.sin(q) * np.cos(t), True),
         (lambda t, q, v: -0.1 * np.sin(8.0 * q), True),
+        (lambda t, q, v: -0.1 * np.sin((q + v) * (q - 8.0 * v)), True),
+        (lambda t, q, v: -0.1 * np.sin(q * v), False),
         (lambda t, q, v: -0.1 * q / (1.0 + q**2), True),
         (lambda t, q, v: -0.1 * q / np.sqrt(1.0 + q**2), True),
         (lambda t, q, v: -0.1 * np.arctan(q), True),

@@ -1,5 +1,6 @@
 """Whether forces, C_t or b may change suddenly, with time or with the state, by what their callbacks are traced to."""
 
+import math
 from typing import Any, NamedTuple
 
 from twoloop.generate.families import Evaluator, Family, of_family
@@ -93,7 +94,7 @@ def _traced(system: ConstrainedSystem) -> Any:
         graph = equations.graph
         by_state = needed(BY_STATE)
         sudden = Sudden(_by_time(graph, needed(BY_TIME)), _by_state(graph, by_state, system.n_q))
-        narrow = any(_is_narrow(graph, i) for i in {*by_state, *needed(BY_TIME)})
+        narrow = _is_narrow(graph, sorted({*by_state, *needed(BY_TIME)}))
         return Dependence(sudden, narrow, frozenset(graph.traced))
 
     return make
@@ -132,16 +133,20 @@ def _by_state(graph: Graph, needed: list[int], n_q: int) -> bool:
     return False
 
 
-def _is_narrow(graph: Graph, i: int) -> bool:
+def _is_narrow(graph: Graph, needed: list[int]) -> bool:
     """Whether a quantity is a quotient or a root, a vibration with time, or a fast one with the state.
 
     How fast one of a coordinate is that a parameter multiplies is not known.
     """
-    kind, argument, *_ = graph.operations[i] or (SUM, None)
-    if kind not in (SINE, COSINE) or argument is None:
-        return kind not in SMOOTH and graph.inputs_of[i] != TIME
-    fast = any(type(c) is Known or abs(c) > FASTEST for c in argument.terms.values())
-    return fast or bool(graph.inputs_of[i] & TIME)
+    rates: dict[int, float] = {}  # how many times faster than a coordinate or a speed something changes at most
+    for i in needed:
+        kind, *factors = graph.operations[i] or (SUM, None)
+        if kind not in SMOOTH and graph.inputs_of[i] != TIME:
+            return True
+        rates[i] = _rate(rates, *factors)
+        if kind in (SINE, COSINE) and (rates[i] > FASTEST or graph.inputs_of[i] & TIME):
+            return True
+    return False
 
 
 def _degree(degrees: dict[int, float], kind: int, *factors: Form | None) -> float:
@@ -156,3 +161,12 @@ def _growth(powers: dict[int, float], kind: int, *factors: Form | None) -> float
     """By which power it grows far away; it falls off with its reciprocal, and vibrations do neither."""
     power = _degree(powers, kind, *factors)
     return 0.0 if kind in (SINE, COSINE) else -power if kind == RECIPROCAL else power
+
+
+def _rate(rates: dict[int, float], *factors: Form | None) -> float:
+    """The rate of a product is the sum of those of its factors, of a sum the largest of those of its terms."""
+    return sum(
+        max((math.inf if type(c) is Known else abs(c) * rates.get(i, 1.0) for i, c in form.terms.items()), default=0.0)
+        for form in factors
+        if form is not None
+    )

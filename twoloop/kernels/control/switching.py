@@ -28,7 +28,7 @@ from twoloop.kernels.data.common import ATTEMPT, SETTLE, Attempt, Step, compiled
 from twoloop.kernels.data.counters import N_EVALUATIONS, N_JACOBIANS
 from twoloop.kernels.data.flags import FORCE_BY_Q_GIVEN, FORM, STATIC, STRAIGHT
 from twoloop.kernels.data.noted import EXPLICIT_STEP, REUSE, ROUNDED
-from twoloop.kernels.data.tolerances import ESTIMATE, GAP, LONGEST_UNSEEN, allowed
+from twoloop.kernels.data.tolerances import ESTIMATE, GAP, LONGEST_UNSEEN, allowed, times_gap
 from twoloop.kernels.evaluation.calls import evaluate, renew_partition
 from twoloop.kernels.evaluation.tasks import PROJECT
 
@@ -52,7 +52,6 @@ STRICT = 10.0  # what an error counts as during a trial of the implicit method, 
 MEAN = 0.8  # weight of the steps before in the mean step
 SETTLED = 5.0  # accepted steps of a trial before its price is taken
 WINDOW = 10.0  # accepted steps over which it is
-SAME = 1e-9  # relative: steps that are of one length but for rounding
 GAIN = 1.2  # what a method on trial must be cheaper by
 PATIENCE = 4.0  # looks before the next trial
 
@@ -363,8 +362,9 @@ def switching_step(f, w, options, memory, t, h, tolerances, state, new_state):
             code, error, factor = f.attempt_second(f, w, options[begin:], second, t, h, tolerances, state, new_state)
     else:
         # only steps of the first method may look at the equations within them; others have to be short
-        if tolerances[ESTIMATE] == 1.0 and h > tolerances[GAP] * (1.0 + SAME):
-            return Attempt(DONE, h / tolerances[GAP], tolerances[GAP] / h)
+        longer = times_gap(tolerances, h)
+        if longer > 0.0:
+            return Attempt(DONE, longer, 1.0 / longer)
         code, error, factor = f.attempt_second(f, w, options[begin:], second, t, h, tolerances, state, new_state)
     memory[H_MEAN] = MEAN * memory[H_MEAN] + (1.0 - MEAN) * h
     if code != DONE or not np.isfinite(error):

@@ -8,6 +8,7 @@ from twoloop.kernels.data.common import merged
 RTOL, ESTIMATE, LEAST, GAP, LOOK, ATOL = range(6)
 
 LONGEST_UNSEEN = 0.01  # of the run: GAP
+ROUNDING = 1e-9  # relative, by which a step may be longer than it should be
 UNTRUE = 30.0  # times what the tolerances allow: errors of velocities beside a singular position that are told
 
 
@@ -15,3 +16,11 @@ UNTRUE = 30.0  # times what the tolerances allow: errors of velocities beside a 
 def allowed(tolerances, m, x, x1):
     """Of an error of coordinate m, or of its velocity, in a step from x to x1."""
     return tolerances[ATOL + m] + tolerances[RTOL] * max(abs(x), abs(x1))
+
+
+@merged
+def times_gap(tolerances, h):
+    """How many times GAP a step is long whose length is chosen by its error; 0 where it is no longer than that."""
+    if tolerances[ESTIMATE] == 1.0 and h > tolerances[GAP] * (1.0 + ROUNDING):
+        return h / tolerances[GAP]
+    return 0.0

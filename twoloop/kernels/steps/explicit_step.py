@@ -16,7 +16,7 @@ from twoloop.kernels.data.codes import DONE
 from twoloop.kernels.data.common import ATTEMPT, Attempt, Step, compiled, inlined, kernel, merged
 from twoloop.kernels.data.counters import N_EVALUATIONS, N_FACTORIZATIONS, N_OUTER
 from twoloop.kernels.data.noted import NEARLY_SINGULAR
-from twoloop.kernels.data.tolerances import ATOL, ESTIMATE, GAP, RTOL
+from twoloop.kernels.data.tolerances import ATOL, ESTIMATE, RTOL, times_gap
 from twoloop.kernels.evaluation.calls import evaluate, evaluate_state, evaluate_there, project
 from twoloop.kernels.evaluation.tasks import EVALUATE_THERE
 
@@ -25,7 +25,6 @@ STAGES, INNER_TOL, FREE, THETA, N_SCALARS = range(5)  # FREE: stages are left wh
 # vectors in `memory`, then the slopes of the stages. Each has 2 n_q numbers, and zeros up to a multiple of BLOCK
 STAGE, FINE, COARSE, N_VECTORS = range(4)
 BLOCK = 8
-ROUNDING = 1e-9  # relative, by which a step may be longer than GAP
 
 
 def options_array(
@@ -156,8 +155,9 @@ def explicit_step(f, w, options, memory, t, h, tolerances, state, new_state):
     slopes = _slopes(memory, s, n)
     # near a singular position it matters on which side of it a stage is, and how well velocities keep to the rows
     free = options[FREE] == 1.0 and w.notes[NEARLY_SINGULAR] == 0.0
-    if not free and tolerances[ESTIMATE] == 1.0 and h > tolerances[GAP] * (1.0 + ROUNDING):
-        return Attempt(DONE, h / tolerances[GAP], tolerances[GAP] / h)
+    longer = times_gap(tolerances, h)
+    if longer > 0.0 and not free:
+        return Attempt(DONE, longer, 1.0 / longer)
     w.counters[N_OUTER] += 1
     copy(state[n : 3 * n], slopes[0])
     for j in range(1, s):

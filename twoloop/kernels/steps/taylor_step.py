@@ -25,13 +25,12 @@ from twoloop.kernels.data.codes import DONE
 from twoloop.kernels.data.common import ATTEMPT, SETTLE, Attempt, Step, compiled, kernel, merged
 from twoloop.kernels.data.counters import N_OUTER
 from twoloop.kernels.data.noted import DEFECT, NEAR_NOW, NEARLY_SINGULAR
-from twoloop.kernels.data.tolerances import ATOL, ESTIMATE, GAP, LOOK, RTOL
+from twoloop.kernels.data.tolerances import ATOL, ESTIMATE, LOOK, ROUNDING, RTOL, times_gap
 from twoloop.kernels.evaluation.calls import evaluate_there, project
 from twoloop.kernels.evaluation.tasks import EVALUATE_THERE
 from twoloop.kernels.steps import recurrences as at
 from twoloop.kernels.steps.recurrences import accelerations_found, end_series, expand, series_of
 
-ROUNDING = 1e-9  # relative, by which a step may be longer than the series allows
 ALLOWED = 0.3  # of the tolerances: how far from the constraints the end of a step is to be before it is moved there
 LOUDEST, LOUDER = 1e4, 10.0  # a defect up to LOUDEST is rounding, where one near the beginning is a LOUDER-th of it
 NEAR_BEGIN = 1e-5  # of the step: no force changes within it
@@ -230,8 +229,9 @@ def _step(f, w, options, memory, t, h, tolerances, state, new_state, by_code):
         singular = w.notes[NEARLY_SINGULAR] != 0.0  # it stays so to the end of the run
         checked = w.notes[NEAR_NOW] == 0.0  # near such a position accelerations off the constraints say nothing
         w.notes[NEAR_NOW] = 0.0 if checked else 2.0
-        if singular and h > tolerances[GAP] * (1.0 + ROUNDING):
-            return Attempt(DONE, h / tolerances[GAP], tolerances[GAP] / h)
+        longer = times_gap(tolerances, h)
+        if longer > 0.0 and singular:
+            return Attempt(DONE, longer, 1.0 / longer)
         if checked:
             memory[at.ATTEMPTS] += 1.0
             if memory[at.SUSPECTED] == 1.0 and memory[at.SUSPECT] <= t:
