@@ -18,7 +18,7 @@ from studies.bench.cli import StudyError
 from studies.bench.solvers import CATALOGUE
 from studies.bench.store import KeptRows, Output
 from studies.compare import GROUP as LENGTH
-from studies.work_precision import first_calls, minimal, rivals, study
+from studies.work_precision import builds, first_calls, minimal, rivals, study
 
 AT_LENGTH = ", at length"  # after the name of a case: the runs over its whole motion
 IN_ANGLES = ", in angles"  # after that of a mechanism: the runs of its equations in minimal coordinates
@@ -48,6 +48,7 @@ def parts() -> dict[str, Part]:
     for case in study.known_cases(False):
         found[case.name + AT_LENGTH] = Part(LENGTH, case.name, partial(study.at_length, [case], False))
     found["first calls"] = Part(first_calls.GROUP, None, partial(first_calls.collect, quick=False))
+    found["builds"] = Part(builds.GROUP, None, partial(builds.collect, quick=False))
     for name in minimal.problems(False):
         found[name + IN_ANGLES] = Part(minimal.GROUP, name, partial(minimal.collect, quick=False, names=[name]))
     return found

@@ -56,7 +56,7 @@ def collect(kept: KeptRows, quick: bool) -> pd.DataFrame:
 
     def made(name: str, solver: str) -> Row:
         row: Row = {"group": GROUP, "case": name, "solver": solver, "tol": TOLERANCE, "repeat": 0}
-        return row | {"family": CATALOGUE[solver].family, **dict.fromkeys(TIMES), **in_process(name, solver)}
+        return row | {"family": CATALOGUE[solver].family, **dict.fromkeys(TIMES), **in_process(__name__, name, solver)}
 
     pairs = product(list(MECHANISMS)[: 1 if quick else None], QUICK if quick else (DEFAULT, *BUILDING))
     return pd.DataFrame(
@@ -64,14 +64,14 @@ def collect(kept: KeptRows, quick: bool) -> pd.DataFrame:
     )
 
 
-def in_process(name: str, solver: str) -> Row:
-    """Times, status and message of a solver on a mechanism in a new process with cold caches."""
+def in_process(module: str, *words: str) -> Row:
+    """What a module prints of a mechanism, in a new process in which no code of mechanisms is kept."""
     with tempfile.TemporaryDirectory(prefix="twoloop-first-") as folder:
         environment = {**os.environ, "HOME": folder, "XDG_CACHE_HOME": folder, "PYTHONUSERBASE": site.getuserbase()}
         if shared := os.environ.get("NUMBA_CACHE_DIR"):  # with the kernels, and the code of mechanisms
             own = shutil.copytree(shared, Path(folder, "numba"), ignore=shutil.ignore_patterns(EQUATIONS))
             environment["NUMBA_CACHE_DIR"] = str(own)
-        command = [sys.executable, "-m", "studies.work_precision.first_calls", name, solver]
+        command = [sys.executable, "-m", module, *words]
         done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
     if done.returncode:
         return {"status": "RAISED", "message": (done.stderr.strip().splitlines() or ["no word of why"])[-1]}
@@ -80,13 +80,13 @@ def in_process(name: str, solver: str) -> Row:
 
 def times_of(name: str, solver: str) -> Row:
     """The same in this process."""
-    attempt(_run(mechanisms.double_pendulum(), solver), 0)
+    attempt(run_of(mechanisms.double_pendulum(), solver), 0)
     make = getattr(mechanisms, MECHANISMS[name])
     callbacks = [function.py_func.__module__ for function in make().system.given.values()]
     modules = [importlib.import_module(each) for each in dict.fromkeys([*callbacks, make.__module__])]
     user_call.ended = None
     began = cpu_time()
-    run = _run(getattr(_compiled_anew(modules), MECHANISMS[name])(), solver)
+    run = run_of(getattr(_compiled_anew(modules), MECHANISMS[name])(), solver)
     if run.solver.traces and run.solver.family != "two-loop":
         start = run.case.problem
         check_start(start.system, 0.0, start.q0, start.v0)
@@ -122,7 +122,8 @@ def _above_steps(run: Run) -> float:
     return spent - result.stats.cpu_time
 
 
-def _run(problem: mechanisms.Problem, solver: str) -> Run:
+def run_of(problem: mechanisms.Problem, solver: str) -> Run:
+    """The run of a solver on a mechanism that is timed."""
     return Run(replace(case_of(problem), time_limit=LIMIT, timed=rivals.TIMED), CATALOGUE[solver], TOLERANCE)
 
 

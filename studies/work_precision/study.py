@@ -31,7 +31,7 @@ from studies.bench.solvers import (
 )
 from studies.bench.store import KeptRows, Output
 from studies.compare import GROUP, runs_of
-from studies.work_precision import behind, first_calls, minimal, processors, rivals
+from studies.work_precision import behind, builds, first_calls, minimal, processors, rivals
 from twoloop.rows.calibration import CALIBRATION, calibration_s
 
 ERRORS = (1e-2, 1e-4, 1e-6)  # the accuracies of the first screen
@@ -40,7 +40,13 @@ STIFF = ("TRBDF2", *RADAU[1:], IDA_C_ORDER_2, IDA_C_BANDED)  # in their place on
 BETWEEN = (7e-4, 5e-4, 3e-4, 2e-4)  # tolerances of the first of these, whose loose runs lie on no line
 QUICK = (*COMPARED[:4], "RadauIIA5", "IDA, stabilised")  # others take seconds to compile or to run
 QUICK_CASES = ("four-bar",)  # the beams' references take seconds
-SHOWN = (GROUP, rivals.GROUP, first_calls.GROUP, minimal.GROUP)  # groups of the rows that the report is of
+SHOWN = (
+    GROUP,
+    rivals.GROUP,
+    first_calls.GROUP,
+    builds.GROUP,
+    minimal.GROUP,
+)  # groups of rows of the report
 TIME_LIMIT = 3.0  # s of CPU of a run: slower ones are of no use beside others
 
 
@@ -98,7 +104,7 @@ def make(output: Output) -> pd.DataFrame:
     with output.kept() as kept:
         made = [at_length(known_cases(quick), quick, kept)]
         made += [rivals.collect(rivals.runs(quick), kept)]
-        made += [first_calls.collect(kept, quick), minimal.collect(kept, quick)]
+        made += [first_calls.collect(kept, quick), builds.collect(kept, quick), minimal.collect(kept, quick)]
     return calibrated(pd.concat(made, ignore_index=True))
 
 
@@ -172,6 +178,8 @@ def report(output: Output, rows: pd.DataFrame, line: str) -> dict[str, Any]:
     findings["banded"] = banded_over_dense(medians)
     findings["versions"], findings["unlike"] = versions(), unlike(pd.concat([medians, everywhere], ignore_index=True))
     findings["first_calls"] = first_calls.findings_of(first_calls.at_error(part(rows, first_calls.GROUP), everywhere))
+    findings["builds"] = builds.findings_of(part(rows, builds.GROUP), found["with_code"])
+    findings |= {"build_asked": builds.ASKED, "build_processes": builds.PROCESSES}
     findings["unrolled"] = LARGEST_UNROLLED
     in_angles = on_the_same_processor(part(rows, minimal.GROUP), part(rows, rivals.GROUP))
     findings["measured"] = measured_on(rows[rows["group"].isin(SHOWN)])
