@@ -84,7 +84,7 @@ def test_it_writes_each_part_at_once(tmp_path, monkeypatch):
     ],
 )
 def test_parts_are_named(words):
-    with pytest.raises(StudyError, match="parts are four-bar; .*first calls; builds; four-bar, in angles"):
+    with pytest.raises(StudyError, match=r"parts are four-bar; .*first calls; builds; four-bar, in angles"):
         again.main(words)
 
 

@@ -166,7 +166,7 @@ class Again:
             parts = self.t[:n_states], self.rows[:n_states], self.kinds[:n_steps]
             self.between.find(between, *parts, self.look.pattern)
         spent = time.process_time() - began
-        t, rows = self.t[:n_states].copy(), self.rows[:n_states].copy()
+        t, rows = self.t[:n_states], self.rows[:n_states]
         turns = turned and output.times is None and (nearly == 1.0 or not run.plan.watchful)
         special = turns or run.crossings or pivot < run.near
         missed = may_be_missed(run)
@@ -180,7 +180,7 @@ class Again:
         told = told_later(self.steps[:n_steps], run.work.counters, spent)
         sol = None
         if output.dense:
-            table = Table(t, rows[:, : 3 * system.n_q].copy(), self.kinds[:n_steps].copy())
+            table = Table(t.copy(), rows[:, : 3 * system.n_q].copy(), self.kinds[:n_steps].copy())
             sol = DenseSolution(interpolator_of(run, table.states[0]), table, t1)
         if output.times is not None:
             if between is None:
@@ -190,6 +190,8 @@ class Again:
             if at_times is None:
                 return None
             t, rows = output.times.copy(), at_times
+        else:
+            t, rows = t.copy(), rows.copy()
         # after all that may send it the long way: it may warn, and takes the workspace
         words = outcome(run, code, t1, NO_PACE)[1] if special else said_of_reached(run)
         if self.looks is not None:
