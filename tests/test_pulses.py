@@ -201,6 +201,7 @@ def test_lanes_keep_gusts_that_last_longer_than_two_looks():
     assert off < 1e2 and runs.singly.tolist() == [True, False, False, False, False]
 
 
+@pytest.mark.filterwarnings("ignore:.*change suddenly for 0.02 s:twoloop.ConstraintWarning")  # by the steps of Adams
 @pytest.mark.parametrize("method", ["auto", "DOP853", "Adams"])
 def test_samples_that_meet_pulses_are_made_again(method):
     integrator = Integrator(slide(1.0, 0.02, 0.3), method, 1e-6, 1e-6)

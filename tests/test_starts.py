@@ -322,9 +322,10 @@ def test_loss_of_rank_is_said_where_it_is_so(beside):
 
 def test_runs_say_what_was_measured_where_steps_went_across():
     said = []
-    for n, method, tolerance in itertools.product((1, 2, 3), ("auto", "DOP853"), (1e-6, 1e-8)):
+    for n, method, tolerance in itertools.product((1, 2), ("auto", "DOP853", "Taylor"), (1e-5, 1e-7, 1e-8)):
         problem = n_four_bar(n)  # which runs go across hangs on rounding
-        message = solve_dae(problem.system, (0.0, 2.0), problem.q0, problem.v0, method, tolerance, tolerance).message
+        run = problem.system, (0.0, 2.0), problem.q0, problem.v0, method, tolerance, tolerance
+        message = solve_dae(*run, compiled=False).message
         for part in re.findall(r"Near t = [^(]*\([^)]*\)", message):
             said.append((float(re.search(r"comes down to (\S+) of the largest", part)[1]), "lose rank" in part))
     assert said

@@ -210,9 +210,10 @@ def velocities(
     if off.max(initial=0.0) > max(VELOCITY_CHANGE * size, SINGULAR * speed):
         j = int(off.argmax())
         name, unit = name_and_unit(coordinates[j])
+        nearest = v[j] * scales.columns[j] if abs(v[j]) > ROUNDING * size else 0.0
         raise ValueError(
             f"the joints and drives of {system.name!r} do not allow the velocities given: the rate of {name} is given "
-            f"as {given[j]:.6g}, and the nearest admissible value is {v[j] * scales.columns[j]:.6g}"
+            f"as {given[j]:.6g}, and the nearest admissible value is {nearest:.6g}"
             f"{f' ({unit}/s)' if unit else ''}. Give fewer velocities (the others are computed), or fewer joints"
         )
     v = v - np.linalg.lstsq(scaled, scaled @ v + system.rates(t, q) / scales.rows, rcond=SINGULAR)[0]
