@@ -1,12 +1,14 @@
 """The first call with code made for a mechanism whose callbacks are compiled: what building it adds to a later call.
 
 A part of `studies.work_precision`. Each is made in a process of its own that finds the kernels and the callbacks, and
-no code of a mechanism; a run on another mechanism has loaded the packages.
+no code of a mechanism; a run on another mechanism has loaded the packages. Runs last for a small part of the motion:
+they are of the same code, and some of whole motions through singular positions end early.
 """
 
 import json
 import sys
 from collections.abc import Collection
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -26,6 +28,7 @@ from twoloop.mechanisms import Problem
 GROUP = "build"
 PROCESSES = 3  # of each mechanism, of which the median counts
 ASKED = 0.3  # s of CPU time: a build that takes less is not noticed
+PART = 0.05  # of the motion, for which runs last
 
 
 def collect(kept: KeptRows, quick: bool) -> pd.DataFrame:
@@ -39,16 +42,24 @@ def collect(kept: KeptRows, quick: bool) -> pd.DataFrame:
     return pd.DataFrame(
         [
             kept.made(f"{GROUP} | {name} | {repeat}", partial(made, name, repeat))
-            for name in rivals.problems(quick)
+            for name in names(quick)
             for repeat in range(1 if quick else PROCESSES)
         ]
     )
 
 
+def names(quick: bool) -> list[str]:
+    """The mechanisms, each once: four-bars have one code."""
+    made = [problem.name for problem in (make() for make in MAKE)]
+    return [rivals.HEADLINE, *made] if not quick else [rivals.HEADLINE]
+
+
 def times_of(name: str) -> Row:
     """CPU times of the first call and of later ones in this process, s, status and message."""
-    attempt(first_calls.run_of(mechanisms.double_pendulum(), OWN_CODE), 0)
-    run = first_calls.run_of(problem_of(name), OWN_CODE)
+    problem, loads = problem_of(name), mechanisms.double_pendulum()
+    attempt(first_calls.run_of(loads if name != loads.name else mechanisms.heavy_top(), OWN_CODE), 0)
+    run = first_calls.run_of(problem, OWN_CODE)
+    run = replace(run, case=replace(run.case, t_end=PART * run.case.t_end))
     began = cpu_time()
     result, status, message, _ = attempt(run, 0)
     spent = cpu_time() - began
@@ -61,8 +72,8 @@ def times_of(name: str) -> Row:
 
 def problem_of(name: str) -> Problem:
     """The mechanism of a name; nothing is run, which might build code that it shares."""
-    if name in rivals.GEOMETRIES:
-        return rivals.GEOMETRIES[name]()
+    if name == rivals.HEADLINE:
+        return mechanisms.four_bar()
     return next(problem for problem in (make() for make in MAKE) if problem.name == name)
 
 
