@@ -136,6 +136,21 @@ def test_first_calls_are_taken_from_the_rows(screen, priced):
     assert told == printed([value for own in times for value in (own.min(), own.max())])
 
 
+def test_builds_are_taken_from_the_rows(priced):
+    report = (ROOT / "reports" / "work_precision.md").read_text(encoding="utf-8")
+    least, most, n, quick, asked, _, _, others, _ = numbers(
+        report,
+        "by * to * s on * mechanisms on which the default makes code (* of them at most * s), and by * to * s on * "
+        "mechanisms on which it does not, in the median of * processes.",
+    )
+    own = priced[(priced["group"] == "build") & priced["first_call_s"].notna()]
+    longer = (own["first_call_s"] - own["call_s"]).groupby(own["case"]).median()
+    with_code = json.loads((ROOT / "reports" / "work_precision.json").read_text())["rivals"]["with_code"]
+    known = longer[longer.index.isin(with_code)]
+    assert [n, others, quick] == [len(known), len(longer) - len(known), (known <= asked).sum()]
+    assert [least, most] == printed([known.min(), known.max()])
+
+
 def test_how_far_the_fastest_rivals_drift_is_taken_from_the_rows(screen, compared):
     """Which rival is the fastest where the default is slower is taken from the findings."""
     told = numbers(
