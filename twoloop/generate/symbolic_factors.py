@@ -43,12 +43,12 @@ class Factors:
             others = dict.fromkeys(j for i in places for j in rows[i])
             entries = [(j, [rows[i].get(j, nothing).value() for i in places]) for j in others]
             below = [(j, [_dot(row, values).value() for row in inverse]) for j, values in entries]
-            for j, multiples in below:
-                for k, values in entries:
+            for first, (j, multiples) in enumerate(below):
+                for k, values in entries[first:]:
                     change = _dot(multiples, values)
                     if j == k >= n > places[0]:
                         alone[j] = alone.get(j, 0.0) - change
-                    rows[j][k] = rows[j][k] - change if k in rows[j] else -change
+                    rows[j][k] = rows[k][j] = rows[j][k] - change if k in rows[j] else -change
                 for i in places:
                     rows[j].pop(i, None)
             self.blocks.append(Block(places, inverse, below))
