@@ -8,7 +8,7 @@ from scipy.integrate import solve_ivp
 
 from tests import problems
 from tests.problems import unconstrained, worst
-from twoloop import DOP853, mechanisms, solve_dae
+from twoloop import DOP853, ConstrainedSystem, ensemble, mechanisms, solve_dae
 from twoloop.mechanisms import four_bar
 
 T_END = 3.0
@@ -124,6 +124,10 @@ def test_other_methods_do_not_say_a_defect():
     assert result.defect is None and result.widest_gap == pytest.approx(result.h.max())
 
 
+def falling_off(t, q, v):
+    return -0.1 * q / (1.0 + q**2)
+
+
 @pytest.mark.parametrize(
     ("force", "narrow"),
     [
@@ -133,7 +137,7 @@ def test_other_methods_do_not_say_a_defect():
         (lambda t, q, v: -0.1 * np.sin(8.0 * q), True),
         (lambda t, q, v: -0.1 * np.sin((q + v) * (q - 8.0 * v)), True),
         (lambda t, q, v: -0.1 * np.sin(q * v), False),
-        (lambda t, q, v: -0.1 * q / (1.0 + q**2), True),
+        (falling_off, True),
         (lambda t, q, v: -0.1 * q / np.sqrt(1.0 + q**2), True),
         (lambda t, q, v: -0.1 * np.arctan(q), True),
         (lambda t, q, v: -0.1 * np.tanh(q), True),
@@ -146,6 +150,49 @@ def test_steps_are_longer_than_a_hundredth_where_nothing_is_narrow(force, narrow
     result = solve_dae(system, (0.0, 1.0), [1.0], [0.0], "DOP853", 1e-3, 1e-3)
     assert result.h.max() == pytest.approx(0.01 if narrow else 0.0375, rel=1e-9)
     assert result.widest_gap == pytest.approx(0.01, rel=1e-9)
+
+
+HILL = {"n_q": 2, "n_c": 1, "mass": np.eye(2), "force": lambda t, q, v: np.array([0.1, -1.0])}
+NARROW = {
+    "mass": {
+        "mass": lambda t, q: np.diag(np.array([1.0 - 0.999 * np.exp(-(((t - 0.5) / 0.002) ** 2)), 1.0])),
+        "n_c": 0,
+    },
+    "constraint": {"constraint": lambda t, q: np.array([q[1] - 0.1 / (1.0 + q[0] ** 2)])},
+    "jacobian": {
+        "constraint": lambda t, q: np.array([q[1] - 0.1 / (1.0 + q[0] ** 2)]),
+        "jacobian": lambda t, q: np.array([[0.2 * q[0] / (1.0 + q[0] ** 2) ** 2, 1.0]]),
+    },
+    "nonholonomic": {"n_c": 0, "n_a": 1, "nonholonomic": lambda t, q: np.array([[1.0 / (1.0 + q[0] ** 2), -1.0]])},
+}
+
+
+@pytest.mark.parametrize("callback", NARROW)
+def test_what_is_narrow_is_seen_in_every_callback(callback):
+    """A jacobian that is not given, rows of A and a mass that varies with time were not looked at."""
+    system = ConstrainedSystem.from_python(**{**HILL, **NARROW[callback], "compile": True})
+    q, v = ([0.0, 0.1], [0.0, 0.0]) if system.n_c else ([0.0, 0.0], [0.0, 0.0])
+    result = solve_dae(system, (0.0, 1.0), q, v, "DOP853", 1e-3, 1e-3)
+    assert result.success and result.h.max() <= 0.01 * (1.0 + 1e-9)
+
+
+def test_implicit_steps_of_a_hundredth_are_their_own_widest_gap():
+    """Those beyond it by rounding, too, are not told as 4/15 of a step, as steps of DOP853 are."""
+    stiff = lambda t, q, v: np.array([-1e6 * (q[0] - 0.1 * q[1]) - 2e3 * v[0], -0.1 * q[1]])  # noqa: E731
+    system = unconstrained(stiff, 2, compile=True)
+    result = solve_dae(system, (1.3, 4.3), [0.1, 1.0], [0.0, 0.0], rtol=1e-5, atol=1e-5)
+    assert (result.h > 0.0299).sum() > 20 and result.widest_gap == pytest.approx(0.03, rel=1e-6)
+
+
+@pytest.mark.parametrize(("force", "narrow"), [(lambda t, q, v: -0.1 * q, False), (falling_off, True)])
+def test_steps_in_lanes_are_as_long_as_in_single_runs(force, narrow):
+    system = unconstrained(force, compile=True)
+    starts = np.linspace(0.5, 1.5, 8)[:, None]
+    runs = ensemble(system, (0.0, 1.0), starts, 0.0 * starts, method="DOP853", rtol=1e-3, atol=1e-3)
+    assert not runs.singly[1:].any()  # the first one checks the system
+    single = solve_dae(system, (0.0, 1.0), starts[3], [0.0], "DOP853", 1e-3, 1e-3)
+    assert (runs.n_steps >= 100).all() if narrow else (runs.n_steps < 50).all()
+    assert abs(runs.n_steps[3] - single.h.size) <= 5
 
 
 @pytest.mark.parametrize("method", ["RadauIIA9", "Adams", "Newmark", DOP853("restored")], ids=str)

@@ -111,13 +111,13 @@ def solve_dae(
         there.
     max_step : float
         Largest step, s. "Taylor" evaluates the equations within its steps. All other methods evaluate them only at the
-        ends and stages of steps, and take no step longer than a hundredth of the run; of "DOP853" 3.75 hundredths, as
-        its stages are no more than 4/15 of a step apart, where forces and constraints have no quotients, roots or fast
-        vibrations. Forces and drives that may change suddenly with time are also evaluated every two-thousandth of the
-        run, and at least eight times per step; steps end where they change. A run that meets a change too short for
-        this is made again, up to twice, with more such evaluations. If these are still too few, a `ConstraintWarning`
-        and the message say how long it lasts. What acts for a shorter time, or over a shorter distance, may be missed,
-        if the run meets none of it; then give its duration.
+        ends and stages of steps, and take no step longer than a hundredth of the run. Steps of "DOP853", whose stages
+        are no more than 4/15 of a step apart, may last 3.75 hundredths where no callback has quotients, roots or fast
+        vibrations and no position was nearly singular. Forces and drives that may change suddenly with time are also
+        evaluated every two-thousandth of the run, and at least eight times per step; steps end where they change. A run
+        that meets a change too short for this is made again, up to twice, with more such evaluations. If these are
+        still too few, a `ConstraintWarning` and the message say how long it lasts. What acts for a shorter time, or
+        over a shorter distance, may be missed, if the run meets none of it; then give its duration.
     max_steps : int, optional
         Largest number of accepted steps. None: no limit, but a run ends with the status STAGNATED if the rest would
         take more than 1e7 steps as short as the last and these are a thousand times shorter than before, or more than

@@ -34,7 +34,7 @@ def test_the_motion_across_the_singular_positions(name, method, tolerance):
     m, runs = mechanism(name), (run(name, method, factor * tolerance)[0] for factor in (1.0, 0.7, 1.5, 2.0))
     result = next(each for each in runs if each.status is not Status.STEP_TOO_SMALL)
     assert result.success, result.message
-    assert error(m, result) < (1e-5 if tolerance < 1e-8 else 1e-4)
+    assert error(m, result) < 1e-4
 
 
 @pytest.mark.parametrize("name", SINGULAR)

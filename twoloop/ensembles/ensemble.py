@@ -91,12 +91,12 @@ def ensemble(
     -----
     In lanes, as in a single run, the equations are evaluated at least every hundredth of the run. So no step of a Radau
     method is longer, and no step of DOP853 longer than 3.75 hundredths, as the widest gap between its stages is 4/15 of
-    a step. Where a force may act for a short time, steps are no longer than a two-thousandth of the run; a single run
-    evaluates only the forces there. Stages are off the constraints by the error of the formula. This includes the Radau
-    methods, whose unknowns are here the accelerations of all coordinates. The end of each step is put on the
-    constraints. States at `t_eval` within a step are the ends of shorter steps from its beginning. A run that would
-    take more than 100,000 steps is made by `solve_dae`. So is one that by series meets a place at which the equations
-    have no values.
+    a step, or than a hundredth where a callback has quotients, roots or fast vibrations. Where a force may act for a
+    short time, steps are no longer than a two-thousandth of the run; a single run evaluates only the forces there.
+    Stages are off the constraints by the error of the formula. This includes the Radau methods, whose unknowns are here
+    the accelerations of all coordinates. The end of each step is put on the constraints. States at `t_eval` within a
+    step are the ends of shorter steps from its beginning. A run that would take more than 100,000 steps is made by
+    `solve_dae`. So is one that by series meets a place at which the equations have no values.
     """
     check_system(system)
     t0, t1 = check_span(t_span)

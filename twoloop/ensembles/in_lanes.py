@@ -12,7 +12,7 @@ from twoloop.ensembles.lane_methods import LaneMethod
 from twoloop.ensembles.short_looks import ShortLooks
 from twoloop.ensembles.starts import Starts, generic_parameters, kit_to_write, system_of
 from twoloop.generate.choices import Choice
-from twoloop.generate.time_dependence import may_be_sudden
+from twoloop.generate.time_dependence import may_be_narrow, may_be_sudden
 from twoloop.kernels.lanes import lane_ends
 from twoloop.problem.system import ConstrainedSystem
 
@@ -59,7 +59,8 @@ class LaneRuns:
         self.system, self.starts, self.method, self.kit = system, starts, method, kit_to_write(system)
         generic, varying = generic_parameters(starts.parameters)
         sudden = may_be_sudden(system, ran_on_symbols=True)
-        self.places = LOOKS if any(sudden) else PLACES * method.unseen
+        unseen = 1.0 if may_be_narrow(system, ran_on_symbols=True) else method.unseen
+        self.places = LOOKS if any(sudden) else PLACES * unseen
         self.looks = ShortLooks(system, generic, varying) if sudden.by_time else None
         choice = Choice.at(system_of(system, starts, 0), starts.t0, starts.q[0])
         kind = ("lanes", method.series, method.tableau is None, choice, tuple(varying))  # of which the latest is kept

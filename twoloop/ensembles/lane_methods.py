@@ -8,7 +8,7 @@ import numpy as np
 
 from twoloop.checks.arguments import Array
 from twoloop.generate.series import series_for
-from twoloop.generate.time_dependence import may_be_sudden
+from twoloop.generate.time_dependence import may_be_narrow
 from twoloop.generate.tracing import Untraceable
 from twoloop.methods import dop853_tableau as tableau
 from twoloop.methods.auto import TIGHTEST
@@ -63,11 +63,11 @@ class LaneMethod:
 
 
 def is_involved(system: ConstrainedSystem) -> bool:
-    """Whether a Taylor series takes so many operations that a dozen evaluations cost less; not where forces are sudden.
+    """Whether a Taylor series takes so many operations that a dozen evaluations cost less.
 
-    There DOP853 has to evaluate forces at short distances, and a series is only looked at there.
+    Not where something is narrow: there steps of DOP853 have to be short, and a series is only looked at within them.
     """
-    if any(may_be_sudden(system, ran_on_symbols=True)):
+    if may_be_narrow(system, ran_on_symbols=True):
         return False
     try:
         return series_for(system).n_operations > INVOLVED * system.n_q

@@ -20,7 +20,7 @@ TRUE = Value(BIT, "true")
 ARRAY = f"{DOUBLE}*"
 POSITION = [DOUBLE, ARRAY, ARRAY, ARRAY, ARRAY]  # t, q, v, numbers, kept
 LONG = 500  # operations from which on equations are written in parts ...
-LONGEST = 2000  # ... and which LLVM does not simplify first: it finds nothing there that makes them faster
+LONGEST = 2000  # ... and from which on LLVM does not simplify them first, as it finds nothing that makes them faster
 
 
 def is_long(equations: StraightLine) -> bool:

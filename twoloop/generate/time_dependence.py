@@ -1,4 +1,4 @@
-"""Whether forces, C_t or b may change suddenly, with time or with the state, by what their callbacks are traced to."""
+"""Whether what callbacks give may change suddenly, or much over a short way, by what they are traced to."""
 
 import math
 from typing import Any, NamedTuple
@@ -20,12 +20,12 @@ from twoloop.kernels.evaluation.operations import (
 from twoloop.problem.system import ConstrainedSystem
 
 BY_TIME = ("force", "constraint_rate", "nonholonomic_rate")  # callbacks that a change with time is looked for in ...
-BY_STATE = ("force", "mass", "jacobian")  # ... and one with the state
+BY_STATE = ("force", "mass", "constraint", "jacobian", "nonholonomic")  # ... and one with the state
 SMOOTH = (PRODUCT, SUM, SINE, COSINE)  # polynomials and vibrations: nothing happens in a short time alone ...
 HIGHEST = 8  # ... up to this degree: a high power of a cosine is a pulse
 HIGHEST_OF_STATE = 32  # degree in q and v up to which it is seen from afar; so are roots, not exp ...
 HIGHEST_INVERSE = 4  # ... and quotients up to this one ...
-FASTEST = 4.0  # times a coordinate or a speed: of vibrations with these that long steps resolve
+FASTEST = 4.0  # times a coordinate or a speed: the fastest vibration with these that long steps resolve
 SLOWEST = -2.0  # ... that fall off no faster than this power: 1 / (1 + (x / w)**2), not its square
 LARGEST = 300  # coordinates: to trace the forces of more takes up to seconds, the looks of a run a tenth of it
 TIME = 1  # the bit of t, the first input of a graph
@@ -140,8 +140,11 @@ def _is_narrow(graph: Graph, needed: list[int]) -> bool:
     """
     rates: dict[int, float] = {}  # how many times faster than a coordinate or a speed something changes at most
     for i in needed:
-        kind, *factors = graph.operations[i] or (SUM, None)
-        if kind not in SMOOTH and graph.inputs_of[i] != TIME:
+        operation = graph.operations[i]
+        if operation is None:
+            continue
+        kind, *factors = operation
+        if kind not in SMOOTH:
             return True
         rates[i] = _rate(rates, *factors)
         if kind in (SINE, COSINE) and (rates[i] > FASTEST or graph.inputs_of[i] & TIME):

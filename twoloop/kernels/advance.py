@@ -42,7 +42,7 @@ from twoloop.kernels.data.noted import (
     UNCHECKED,
     WIDEST_GAP,
 )
-from twoloop.kernels.data.tolerances import GAP, LOOK
+from twoloop.kernels.data.tolerances import GAP, LOOK, is_beyond_gap
 from twoloop.kernels.evaluation.calls import (
     accelerations,
     check_redundant,
@@ -187,7 +187,7 @@ def _count(w, tolerances, control, size, out_step):
     gap = size
     if w.notes[DEFECT] >= 0.0:
         gap = min(size, tolerances[LOOK])
-    elif size > tolerances[GAP]:  # as only steps may be whose stages are nearer to one another
+    elif is_beyond_gap(tolerances, size):  # as only steps may be whose stages are nearer to one another
         gap = control[at.UNSEEN] * size
     w.notes[WIDEST_GAP] = max(w.notes[WIDEST_GAP], gap)
     w.notes[ORIENTATION] = w.notes[ORIENTATION_NEW]

@@ -60,9 +60,9 @@ class Result(Record):
         for methods other than "Taylor", and for "auto" where it used others; `certify` verifies a run afterwards.
     widest_gap : float or None
         Longest time without an evaluation of the equations, s: shorter features may have been missed. It is the
-        longest distance between the evaluation points of "Taylor", or the longest step of other methods, but for steps
-        of "DOP853" above a hundredth of the run, whose stages are no further apart than that; at most a hundredth of
-        the run unless the step size is constant. Forces and drives that may change suddenly with time
+        longest distance between the evaluation points of "Taylor", or the longest step of other methods; of a step of
+        "DOP853" above a hundredth of the run, 4/15, as its stages are no further apart. At most a hundredth of the
+        run unless the step size is constant. Forces and drives that may change suddenly with time
         were also sampled at every two-thousandth of the run, and eight times per step. None for a foreign solver.
     system : ConstrainedSystem or None
         The system: `reactions` and `plot` evaluate its rows; names, energy and drawing come from its `Problem`. None

@@ -361,7 +361,7 @@ def switching_step(f, w, options, memory, t, h, tolerances, state, new_state):
             w.notes[EXPLICIT_STEP] = 0.0
             code, error, factor = f.attempt_second(f, w, options[begin:], second, t, h, tolerances, state, new_state)
     else:
-        # only steps of the first method may look at the equations within them; others have to be short
+        # only steps of the first method may be longer, as it looks within them or has stages near one another
         longer = times_gap(tolerances, h)
         if longer > 0.0:
             return Attempt(DONE, longer, 1.0 / longer)

@@ -19,8 +19,14 @@ def allowed(tolerances, m, x, x1):
 
 
 @merged
+def is_beyond_gap(tolerances, h):
+    """Whether a step is longer than GAP."""
+    return h > tolerances[GAP] * (1.0 + ROUNDING)
+
+
+@merged
 def times_gap(tolerances, h):
     """How many times GAP a step is long whose length is chosen by its error; 0 where it is no longer than that."""
-    if tolerances[ESTIMATE] == 1.0 and h > tolerances[GAP] * (1.0 + ROUNDING):
+    if tolerances[ESTIMATE] == 1.0 and is_beyond_gap(tolerances, h):
         return h / tolerances[GAP]
     return 0.0
