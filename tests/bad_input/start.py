@@ -20,6 +20,18 @@ def forgotten_rate():
     return solve(system, (0.0, 0.1), *moving_pivot_state(0.0))
 
 
+def pushed_later(t, q):
+    return np.array([q[1] - 0.01 * np.exp(-(((t - 1.03) / 0.003) ** 2))])
+
+
+def rate_forgotten_of_a_push():
+    system = ConstrainedSystem.from_python(
+        **{"n_q": 2, "n_c": 1, "mass": np.eye(2), "force": lambda t, q, v: np.array([0.1, -1.0])},
+        **{"constraint": pushed_later, "jacobian": lambda t, q: np.array([[0.0, 1.0]]), "name": "push"},
+    )
+    return solve(system, (0.0, 2.0), [0.0, 0.0], [0.0, 0.0])
+
+
 def with_tangents(**changed):
     """A pendulum on a spring and a damper, with its tangents."""
     tangents = {
@@ -109,6 +121,10 @@ START = [
     .says(r"jacobian of 'pendulum' is not the derivative of constraint.*entry \(0, 1\) is -1e-05", FORMULA),
     of_start("constraints that depend on time, without `constraint_rate`", forgotten_rate).says(
         "constraint_rate of 'moving pivot' is not.*or give constraint_rate: the constraints depend on time",
+        "give constraint_rate",
+    ),
+    of_start("the same of constraints that rest at the start", rate_forgotten_of_a_push).says(
+        "constraint_rate of 'push' is not given, but constraint depends on t, though not near t = 0",
         "give constraint_rate",
     ),
     of_start("`gamma` with the wrong sign", lambda: solve(pendulum(gamma=lambda t, q, v: np.array([v @ v])))).says(

@@ -46,7 +46,13 @@ def _traced(system: ConstrainedSystem, family: Family) -> Traced:
 
 
 def exact_near(system: ConstrainedSystem, t: float, q: Array, v: Array) -> bool:
-    """Whether C_q, C_t and Gamma are, near a start, the derivatives of what callbacks were traced to."""
+    """Whether C_q, C_t and Gamma are, near a start, the derivatives of what callbacks were traced to.
+
+    Raises
+    ------
+    ValueError
+        If there is no C_t, and C was traced to depend on time, though not near the start.
+    """
     away = generic_factors(len(q)) * sizes(q)
     places = [(t + share * TIME, q + share * away) for share in NEAR]
 
@@ -59,7 +65,13 @@ def exact_near(system: ConstrainedSystem, t: float, q: Array, v: Array) -> bool:
         if wrong is not None:
             raise Untraceable(wrong)
 
-    return exact_derivatives(system, check) is not None
+    found = exact_derivatives(system, check)
+    if found is not None and "constraint_rate" in found.not_zero and "constraint_rate" not in system.given:
+        raise ValueError(
+            f"constraint_rate of {system.name!r} is not given, but constraint depends on t, though not near t = {t:g}: "
+            "give constraint_rate, the derivative of constraint with respect to t"
+        )
+    return found is not None
 
 
 def generic_states(states: Sequence[tuple[float, Array, Array]]) -> Array:

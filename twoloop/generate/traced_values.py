@@ -65,6 +65,7 @@ class Traced:
         self.trusted = False
         entries = (forms[kind][place] for kind, place in self.places)
         made = {k: form for k, form in enumerate(entries) if form.terms or form.constant}  # others stay zero
+        self.not_zero = frozenset(self.places[k][0] for k in made)  # kinds of callbacks that have such entries
         self.program = program_of(graph, 1 + 2 * system.n_q, made)
 
     def of(self, system: ConstrainedSystem, evaluate: Evaluator) -> "Traced":
