@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from typing import Any
 
 DOUBLE, INTEGER, WORD, BIT, NOTHING = "double", "i64", "i32", "i1", "void"
-LONGEST = 400  # lines of a block of a divided function; of longer ones code takes up to twice as long to compile
+LONGEST = 400  # lines of a block of a divided function; longer ones take more than twice as long to compile
 
 
 class Value:

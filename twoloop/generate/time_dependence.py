@@ -62,7 +62,7 @@ def may_be_sudden(system: ConstrainedSystem, ran_on_symbols: bool) -> Sudden:
 
 
 def may_be_narrow(system: ConstrainedSystem, ran_on_symbols: bool) -> bool:
-    """Whether forces, M, C_q or C_t may change much over a short way, though not suddenly.
+    """Whether what callbacks give may change much over a short way, though not suddenly.
 
     So may quotients and roots of the state. Of 1 / (1 + (x / w)**2) what is far away tells, but over long steps less
     than a step needs to know. Stages of long steps may meet a fast vibration at like phases.
