@@ -9,9 +9,11 @@ from dataclasses import FrozenInstanceError, replace
 import numpy as np
 import pytest
 
-from twoloop import mechanisms, solve_dae
+from twoloop import BDF, DOP853, Newmark, RungeKutta, Taylor, mechanisms, solve_dae
 from twoloop.checks.consistency import Look
 from twoloop.kernels.layout import MOST_FREE, _free, give_back, make_work
+from twoloop.methods.presets import paper_irk
+from twoloop.methods.tableaux import gauss, radau_iia
 
 # calls of functions in a second run, which compares callbacks again at four states, in one that makes arrays for the
 # next, in a third, which does so and may compare callbacks at turning points, in a fifth, which uses these arrays, and
@@ -50,6 +52,62 @@ def test_a_repeated_call_takes_few_calls_of_functions(options):
         calls.append(pstats.Stats(profile).total_calls)
     assert calls[1] < MANY and calls[2] < THIRD  # the first compiles, or checks derivatives
     assert calls[4] < FEWER and calls[5] < FEWEST
+
+
+OF_OBJECTS = 110  # calls more where the method is an object, which is compared with those before by its options
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: Taylor(order=12),
+        lambda: RungeKutta(gauss(3)),
+        lambda: RungeKutta(radau_iia(3), outer="newton"),
+        lambda: Newmark(beta=0.3),
+        lambda: BDF(max_order=3),
+        lambda: paper_irk(inner_tol=1e-8),
+    ],
+)
+def test_a_repeated_call_with_an_equal_method_object_takes_few_calls_of_functions(make):
+    problem, calls = mechanisms.four_bar(), []
+    for _ in range(6):
+        method = make()
+        calls.append(calls_of(lambda method=method: run(problem, method=method)))
+    assert calls[4] < FEWER + OF_OBJECTS and calls[5] < FEWEST + OF_OBJECTS, calls
+
+
+def test_a_method_of_other_options_makes_a_run_of_its_own():
+    problem = mechanisms.four_bar()
+    orders = [8, 12, 8, 12, 8, 12, 8, 12]
+    ends = [run(problem, method=Taylor(order=order)).q[:, -1].tolist() for order in orders]
+    assert ends[0] != ends[1] and all(end == ends[k % 2] for k, end in enumerate(ends))
+
+
+class Changing:
+    """A method whose steps change."""
+
+    name = "changing"
+
+    def __init__(self):
+        self.now = DOP853()
+
+    def plan(self, *given):
+        return self.now.plan(*given)
+
+
+def test_nothing_is_kept_for_a_method_that_may_change():
+    problem, method = mechanisms.four_bar(), Changing()
+    before = [run(problem, method=method).h.size for _ in range(4)]
+    method.now = RungeKutta(gauss(3))
+    after = [run(problem, method=method).h.size for _ in range(4)]
+    assert len({*before}) == len({*after}) == 1 and before[0] != after[0]
+
+
+def test_tableaux_are_equal_by_their_coefficients_which_stay():
+    assert gauss(3) == gauss(3) and hash(gauss(3)) == hash(gauss(3)) and gauss(3) != gauss(4)
+    assert RungeKutta(gauss(3)) == RungeKutta(gauss(3)) != RungeKutta(radau_iia(3))
+    with pytest.raises(ValueError, match="read-only"):
+        gauss(3).A[0, 0] = 1.0
 
 
 def calls_of(function):

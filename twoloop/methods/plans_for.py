@@ -1,10 +1,10 @@
-"""The plans by which a method runs a system; those of presets are made once for a system and a tolerance."""
+"""The plans by which a method runs a system; those of our own methods are made once for a system and a tolerance."""
 
 from twoloop.generate.straight_code import OwnCode
 from twoloop.generate.traced_values import Check
 from twoloop.kernels.data.intervals import ACCELERATIONS, VELOCITIES
 from twoloop.methods.plan import Method, Plan
-from twoloop.methods.presets import is_preset
+from twoloop.methods.presets import identity
 from twoloop.problem.system import ConstrainedSystem
 
 MOST = 16  # that are kept with a system
@@ -20,13 +20,14 @@ def plans_for(
 
     Raises ValueError if the method cannot run the system.
     """
-    key = (id(method), rtol, atol, fixed, None if code is None else code.shared.equations.choice)
+    known = identity(method)
+    key = (known, rtol, atol, fixed, None if code is None else code.shared.equations.choice)
     kept: dict[tuple[object, ...], Plans] = system.remembered("plans", dict)
-    made = kept.get(key)
+    made = None if known is None else kept.get(key)
     if made is None:
         ready = method.for_system(system, code, check) if hasattr(method, "for_system") else method
         made = _made(system, ready, rtol, atol, fixed, code)
-        if is_preset(method) and _series(ready) == _series(method) and all(each.trusted for each in made[0].traced):
+        if known is not None and _series(ready) == _series(method) and all(each.trusted for each in made[0].traced):
             if len(kept) == MOST:
                 del kept[next(iter(kept))]
             kept[key] = made

@@ -1,5 +1,8 @@
 """What a user chooses by name, and the paper's two procedures."""
 
+from contextlib import suppress
+from typing import Any
+
 from twoloop.checks.arguments import check_positive
 from twoloop.methods.adams import Adams
 from twoloop.methods.auto import Auto
@@ -105,6 +108,16 @@ PRESETS: dict[str, Method] = {
 }
 
 
-def is_preset(method: Method) -> bool:
-    """Whether it is one of these objects: another may change between runs, or go, and a third one have its id."""
-    return any(each is method for each in PRESETS.values())
+OWN = (Adams, BDF, DOP853, ESDIRK, Newmark, RungeKutta, Taylor)  # whose objects do not change
+_OF_PRESETS = frozenset(map(id, PRESETS.values()))
+
+
+def identity(method: Method) -> Any:
+    """What equal methods have in common, by which runs are kept for later calls; None of a method that may change."""
+    if id(method) in _OF_PRESETS:
+        return id(method)  # hashing takes longer
+    if type(method) in OWN:
+        with suppress(TypeError):  # one that was made ready for a system holds arrays
+            hash(method)
+            return method
+    return None

@@ -69,7 +69,18 @@ class Tableau:
                 f"{float(A[i].sum())!r}, and c[{i}] is {float(c[i])!r}"
             )
         for name, array in (("A", A), ("b", b), ("c", c)):
+            array.flags.writeable = False  # runs of one tableau are kept
             object.__setattr__(self, name, array)
+
+    @property
+    def _content(self) -> tuple[object, ...]:
+        return self.name, self.order, self.A.tobytes(), self.b.tobytes(), self.c.tobytes()
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Tableau) and self._content == other._content
+
+    def __hash__(self) -> int:
+        return hash(self._content)
 
     @property
     def stages(self) -> int:

@@ -20,8 +20,8 @@ Array = NDArray[np.float64]
 
 LOWEST, HIGHEST = 4, 40  # orders that may be asked for
 PER_DIGIT, LEAST = 1.15, 5.0  # order = LEAST + PER_DIGIT digits: about the cheapest on the mechanisms of the bench
-PER_DIGIT_COMPILED, LEAST_COMPILED = 1.25, 7.5  # the same of code made for the mechanism
-LEAST_IN_LANES = 5.5
+PER_DIGIT_COMPILED, LEAST_COMPILED = 1.25, 5.5  # the same of code made for the mechanism
+LEAST_IN_LANES = 3.5
 FIXED = 19  # order of constant steps
 FEWEST, MOST = 3, 6  # parts of a step for the solution between its ends: states of its own series, on the constraints
 PADDED = 8  # operations of a table are a multiple of this
@@ -60,7 +60,7 @@ class Taylor:
     ----------
     order : int, optional
         Of the method, 4 to 40: velocities are a series of this order, positions of one more. None: 5 and 1.15 for each
-        digit of the smaller tolerance (with `compiled=True` of solve_dae 7.5 and 1.25), or 19 with constant steps.
+        digit of the smaller tolerance (with `compiled=True` of solve_dae 5.5 and 1.25), or 19 with constant steps.
 
     Raises
     ------

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from twoloop.kernels.data import noted
 from twoloop.methods.code_for import Compiled
 from twoloop.methods.plan import Method
+from twoloop.methods.presets import identity
 from twoloop.run.run import Run
 
 
@@ -31,7 +32,7 @@ class Asked:
     def key(self) -> Any:
         """What calls have in common that ask for the same."""
         sizes = self.first_step, self.max_step, self.max_steps, self.step_size
-        return id(self.method), self.rtol, self.atol.tobytes(), *sizes, self.compiled, self.check_derivatives
+        return identity(self.method), self.rtol, self.atol.tobytes(), *sizes, self.compiled, self.check_derivatives
 
     @cached_property
     def own_tolerance(self) -> float | None:

@@ -15,7 +15,7 @@ from twoloop.generate.straight_code import OwnCode
 from twoloop.generate.traced_values import Traced, states_around
 from twoloop.methods.code_for import code_for, may_have_code
 from twoloop.methods.plans_for import plans_for
-from twoloop.methods.presets import is_preset
+from twoloop.methods.presets import identity
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.again import MOST_WAITING, Again, Output
 from twoloop.run.asked import Asked
@@ -90,7 +90,7 @@ def _by_arrays_of(
 def run_from(system: ConstrainedSystem, t0: float, t1: float, q0: Array, v0: Array, asked: Asked) -> Run:
     """The run of a call: a copy of one that is kept, where the same was asked for, from there or from another start.
 
-    Kept are those of presets, compiled callbacks and trusted traces, from the second call of a system on.
+    Kept are those of our own methods, compiled callbacks and trusted traces, from the second call of a system on.
 
     Raises
     ------
@@ -134,7 +134,7 @@ def _runs_of(system: ConstrainedSystem) -> tuple[Any, dict[Any, tuple[Kept, ...]
 def _kept_of(run: Run, code: OwnCode | None, t1: float, asked: Asked) -> Kept | None:
     """What is kept of a run at its start, if it may be."""
     system, n = run.system, run.system.n_q
-    trusted = is_preset(asked.method) and all(traced.trusted for traced in run.traced)
+    trusted = identity(asked.method) is not None and all(traced.trusted for traced in run.traced)
     if not trusted or run.work.notes.base.size > LARGEST:
         return None
     t0, q0, v0 = run.t0, run.state[:n], run.state[n : 2 * n]
