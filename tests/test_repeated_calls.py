@@ -76,6 +76,24 @@ def test_a_repeated_call_with_an_equal_method_object_takes_few_calls_of_function
     assert calls[4] < FEWER + OF_OBJECTS and calls[5] < FEWEST + OF_OBJECTS, calls
 
 
+EVENTS, A_LOOK, A_ROOT = 800, 6, 220  # calls of a run with an event, and for each value and each root of it
+
+
+def test_a_repeated_call_with_an_event_takes_few_calls_of_functions():
+    problem, values = mechanisms.four_bar(), []
+
+    def event(t, q, v):
+        values.append(t)
+        return v[0]
+
+    for _ in range(6):
+        results, before = [], len(values)
+        calls = calls_of(lambda results=results: results.append(run(problem, events=event)))
+    n_roots = results[0].t_events[0].size
+    assert n_roots > 0 and calls < EVENTS + A_LOOK * (len(values) - before) + A_ROOT * n_roots
+    assert values[0] == 0.0 and len(values) - before < 450 + 15 * n_roots
+
+
 def test_a_method_of_other_options_makes_a_run_of_its_own():
     problem = mechanisms.four_bar()
     orders = [8, 12, 8, 12, 8, 12, 8, 12]

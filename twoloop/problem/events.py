@@ -4,7 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from math import isfinite
 from types import FunctionType
-from typing import Any
+from typing import Any, Protocol
 from weakref import WeakSet
 
 import numpy as np
@@ -13,12 +13,23 @@ from twoloop.checks.arguments import Array, check_call, shown
 
 SAMPLES = 4  # parts of a step at least, at whose ends the sign is looked at
 WHOLE = 1.0 - 1e-9  # of a step: one of SAMPLES times the time between samples, but for rounding, has SAMPLES parts
+TOGETHER = 32  # steps that are looked at together where no event ends the run
 PRECISION = 4.0 * float(np.finfo(float).eps)  # of the time of an event, as in SciPy
 MOST = 3000  # iterations of Brent's method, which halves the interval at least every 53rd time: for zeros of high order
 
 _callable: WeakSet[FunctionType] = WeakSet()  # functions whose arguments were checked, which takes 9 µs
 
-States = Callable[[Array], Array]  # rows [q, v] at sorted times
+
+class States(Protocol):
+    """Rows [q, v] of a run between its steps."""
+
+    def at(self, times: Array) -> Array:
+        """Those at sorted times."""
+        ...
+
+    def within(self, t: float) -> Callable[[float], Array]:
+        """What gives the one at a time, for one after another in the step of t."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -37,9 +48,9 @@ class Event:
         return f"events[{self.number}]" + (f" ({own})" if own and own != "<lambda>" else "")
 
     def __call__(self, t: float, q: Array, v: Array) -> float:
-        """Its value, or what is wrong with it."""
+        """Its value, or what is wrong with it; it may write to q and v."""
         try:
-            value = self.function(t, q.copy(), v.copy())
+            value = self.function(t, q, v)
         except Exception as error:
             error.add_note(f"raised by {self.name} at t = {t!r}")
             raise
@@ -118,11 +129,9 @@ class EventSearch:
         self._n_q = len(row) // 2
         self._every = min((getattr(event.function, "every", every) for event in events), default=every)
         self._rates = [each for event in events if (each := getattr(event.function, "gap_rate", None)) is not None]
-        self._values = self._evaluate(t0, row)
+        self._ends = any(event.terminal < np.inf for event in events)
+        self._values = [values[0] for values in self._evaluate([t0], row[None, :])]
         self._at_start = True
-
-    def _evaluate(self, t: float, row: Array) -> list[float]:
-        return [event(t, row[: self._n_q], row[self._n_q :]) for event in self.events]
 
     def search(self, states: States, ends: Array) -> None:
         """Look at the steps that end at ends[1:], the first of which begins at ends[0]; stop at a terminal event."""
@@ -130,15 +139,17 @@ class EventSearch:
             return
         steps = np.diff(ends)
         counts = np.maximum(SAMPLES, np.ceil(WHOLE * steps / self._every)).astype(int)
-        inner = [end + np.arange(n) / n * h for end, n, h in zip(ends[:-1], counts, steps, strict=True)]
-        times = np.append(np.concatenate(inner), ends[-1])
-        rows, first = states(times), np.append(0, np.cumsum(counts))
-        for k in range(len(steps)):
-            within = slice(first[k], first[k + 1] + 1)
-            self._in_step(states, *self._with_turns(states, times[within], rows[within]))
+        first = np.append(0, np.cumsum(counts))
+        begins, parts, lengths, before = (np.repeat(each, counts) for each in (ends[:-1], counts, steps, first[:-1]))
+        times = np.append(begins + (np.arange(first[-1]) - before) / parts * lengths, ends[-1])
+        rows, together = states.at(times), 1 if self._ends else TOGETHER
+        for begin in range(0, len(steps), together):
+            end = min(begin + together, len(steps))
+            within = slice(first[begin], first[end] + 1)
+            self._in_steps(states, *self._with_turns(states, times[within], rows[within]))
             if self.ended is not None:
                 return
-            self.reached = float(ends[k + 1])
+            self.reached = float(ends[end])
 
     def break_off(self) -> None:
         """Forget what was found in a step whose search was interrupted."""
@@ -152,64 +163,79 @@ class EventSearch:
         states_at = zip(times.tolist(), *np.split(rows, 2, axis=1), strict=True)
         values = np.array([[rate(*state) for rate in self._rates] for state in states_at])
         turns = [
-            _root(self._rates[j], states, (float(times[k]), float(times[k + 1])), (values[k, j], values[k + 1, j]))
+            _root(self._rates[j], states, (float(times[k]), float(times[k + 1])), (values[k, j], values[k + 1, j]))[0]
             for k, j in np.argwhere((values[:-1] < 0.0) & (values[1:] > 0.0))
         ]
         if not turns:
             return times, rows
         new = np.unique(turns)
         places = np.searchsorted(times, new)
-        return np.insert(times, places, new), np.insert(rows, places, states(new), axis=0)
+        return np.insert(times, places, new), np.insert(rows, places, states.at(new), axis=0)
 
-    def _in_step(self, states: States, times: Array, rows: Array) -> None:
-        """Events between samples of one step."""
+    def _evaluate(self, times: list[float], rows: Array) -> list[list[float]]:
+        """Values of each event at some times; each has states of its own to write to."""
+        n = self._n_q
+        return [[*map(event, times, rows[:, :n].copy(), rows[:, n:].copy())] for event in self.events]
+
+    def _in_steps(self, states: States, times: Array, rows: Array) -> None:
+        """Events between samples of some steps; behind a terminal one no function is called."""
         at = times.tolist()
-        for k in range(1, len(at)):
-            before, self._values = self._values, self._evaluate(at[k], rows[k])
-            active = [
-                event
-                for event, g, g_new in zip(self.events, before, self._values, strict=True)
-                if (g != 0.0 or self._at_start) and crosses(event.direction, g, g_new)
-            ]
-            self._at_start = False
-            if not active:
-                continue
-            ends = (at[k - 1], at[k])
-            roots = [
-                (_root(event, states, ends, (before[event.number], self._values[event.number])), event)
-                for event in active
-            ]
-            self._record(sorted(roots, key=lambda root: root[0]), states)
-            if self.ended is not None:
-                return
+        size = 1 if self._ends else len(at)
+        for begin in range(1, len(at), size):
+            after = slice(begin, begin + size)
+            values = self._evaluate(at[after], rows[after])
+            crossings = self._crossings(values)
+            for k in sorted({k for k, *_ in crossings}):
+                ends = (at[begin + k - 1], at[begin + k])
+                roots = [(*_root(event, states, ends, own), event) for place, event, own in crossings if place == k]
+                self._record(sorted(roots, key=lambda root: root[0]))
+                if self.ended is not None:
+                    return
 
-    def _record(self, roots: list[tuple[float, Event]], states: States) -> None:
+    def _crossings(self, values: list[list[float]]) -> list[tuple[int, Event, tuple[float, float]]]:
+        """Between which of these values and the one before events are zero: the place, the event, and both values."""
+        found = []
+        for event, g, own in zip(self.events, self._values, values, strict=True):
+            for k, g_new in enumerate(own):
+                if (g > 0.0) is not (g_new > 0.0) or g == 0.0 or g_new == 0.0:
+                    counts = g != 0.0 or (self._at_start and k == 0)
+                    if counts and crosses(event.direction, g, g_new):
+                        found.append((k, event, (g, g_new)))
+                g = g_new
+        self._values, self._at_start = [own[-1] for own in values], False
+        return found
+
+    def _record(self, roots: list[tuple[float, Array, Event]]) -> None:
         """Note events up to the first terminal one, and those at the same time."""
-        for t, event in roots:
+        for t, row, event in roots:
             if self.ended is not None and t > self.ended[1]:
                 return
             found = self.found[event.number]
-            found.append((t, states(np.array([t]))[0]))
+            found.append((t, row))
             if len(found) >= event.terminal and self.ended is None:
                 self.ended = (event, t)
 
 
-def _root(event: Callable[..., float], states: States, ends: tuple[float, float], values: tuple[float, float]) -> float:
-    """When an event is zero between two times at which its values are known, to rounding."""
+def _root(
+    event: Callable[..., float], states: States, ends: tuple[float, float], values: tuple[float, float]
+) -> tuple[float, Array]:
+    """When an event is zero between two times at which its values are known, to rounding; the row [q, v] there."""
     from scipy.optimize import brentq  # takes a tenth of a second to import, and few runs need it
 
     known = dict(zip(ends, values, strict=True))
     for t, value in known.items():
         if value == 0.0:
-            return t
+            return t, states.at(np.array([t]))[0]
+    row = states.within(0.5 * sum(ends))
 
     def at(t: float) -> float:
         if t in known:
             return known[t]
-        q, v = np.split(states(np.array([t]))[0], 2)
-        return event(t, q, v)
+        found = row(t)
+        return event(t, found[: len(found) // 2], found[len(found) // 2 :])
 
-    return float(brentq(at, *ends, xtol=PRECISION, rtol=PRECISION, maxiter=MOST))
+    t = float(brentq(at, *ends, xtol=PRECISION, rtol=PRECISION, maxiter=MOST))
+    return t, row(t)
 
 
 def crosses(direction: float, g: float, g_new: float) -> bool:

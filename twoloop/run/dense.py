@@ -1,7 +1,7 @@
 """Polynomials through the stored states of a run, put back on the constraints: what dense_solution.py evaluates."""
 
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -160,10 +160,29 @@ class Interpolator:
             failures += self._between(divided, own, times, out)
             others.append(rest)
         failures += self._between(table, np.concatenate(others), times, out)
+        self._count(failures, len(times))
+        return out
+
+    def within(self, table: Table, t: float) -> Callable[[float], Array]:
+        """What gives the same at one time after another, all of them in the interval of t."""
+        groups = _groups(table, np.searchsorted(table.t[1:-1], [t], side="right"))
+        groups[:, names.END_TIME] = 1
+        self._settle(table, groups)
+        divided, own, rest = self._divided(table, groups)
+        known, group = (divided, own) if len(own) else (table, rest)
+        time, out = np.empty(1), np.empty((1, 2 * self.system.n_q))
+
+        def row(t: float) -> Array:
+            time[0] = t
+            self._count(self._between(known, group, time, out), 1)
+            return out[0].copy()
+
+        return row
+
+    def _count(self, failures: int, n_times: int) -> None:
         self.failures = failures
         if failures > 0 and self.tells:
-            _warn(f"at {failures} of {len(times)} times the state is interpolated and off the constraints")
-        return out
+            _warn(f"at {failures} of {n_times} times the state is interpolated and off the constraints", 5)
 
     def _between(self, table: Table, groups: Groups, times: Array, out: Array) -> int:
         known = (self.tolerances, table.t, table.states, np.ascontiguousarray(groups))
@@ -340,5 +359,5 @@ def _groups(table: Table, which: Groups) -> Groups:
     return groups
 
 
-def _warn(what: str) -> None:
-    warnings.warn(f"the constraint Jacobian has lost rank: {what}", ConstraintWarning, stacklevel=4)
+def _warn(what: str, stacklevel: int = 4) -> None:
+    warnings.warn(f"the constraint Jacobian has lost rank: {what}", ConstraintWarning, stacklevel)

@@ -1,6 +1,8 @@
 """What a run keeps of its accepted steps as they come: all states, or those at output times; and its events."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,6 +51,19 @@ class Wanted:
     def between_steps(self) -> bool:
         """Whether states between steps are wanted."""
         return (self.times is not None and not self.lands) or self.dense or self.events is not None
+
+
+class _Between(NamedTuple):
+    """States between steps, as a search for events asks for them."""
+
+    interpolator: Interpolator
+    table: Table
+
+    def at(self, times: Array) -> Array:
+        return self.interpolator.states(self.table, times)
+
+    def within(self, t: float) -> Callable[[float], Array]:
+        return self.interpolator.within(self.table, t)
 
 
 class Recorder:
@@ -146,7 +161,7 @@ class Recorder:
         ends = self._t[self._next : end + 1]
         if self.search is not None:
             try:
-                self.search.search(lambda times: interpolator.states(table, times), ends)
+                self.search.search(_Between(interpolator, table), ends)
             except KeyboardInterrupt:
                 self.interrupted = True
                 self.search.break_off()
