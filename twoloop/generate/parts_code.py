@@ -19,18 +19,12 @@ from twoloop.generate.written import NOWHERE, Place, Written, conditions_hold
 TRUE = Value(BIT, "true")
 ARRAY = f"{DOUBLE}*"
 POSITION = [DOUBLE, ARRAY, ARRAY, ARRAY, ARRAY]  # t, q, v, numbers, kept
-LONG = 500  # operations from which on equations are written in parts ...
-LONGEST = 2000  # ... and from which on LLVM does not simplify them first, as it finds nothing that makes them faster
+LONG = 500  # operations from which on equations are written in parts
 
 
 def is_long(equations: StraightLine) -> bool:
     """Whether equations are worth their calls."""
     return equations.n_operations > LONG
-
-
-def is_longest(equations: StraightLine) -> bool:
-    """Whether to simplify equations first only takes time."""
-    return equations.n_operations > LONGEST
 
 
 class PartsCode:

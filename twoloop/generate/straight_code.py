@@ -89,9 +89,9 @@ class SharedCode:
         self.solution = Solution(equations) if self.parts is None else self.parts.solution
         self.outputs = self._outputs()
         structure = repr(list(self._described()))
-        passes = not parts_code.is_longest(equations)
         self.digest = hashlib.sha256((structure + _stamp()).encode()).hexdigest()
-        self.functions = own_functions("equations", _stamp(), self.digest, self._write, passes=passes)
+        # LLVM finds nothing that makes equations faster, and takes up to a quarter of a build to look for it
+        self.functions = own_functions("equations", _stamp(), self.digest, self._write, passes=False)
 
     def of(self, system: ConstrainedSystem, evaluate: Evaluator) -> "OwnCode":
         """The code, and what it reads for one of the systems."""
