@@ -69,7 +69,6 @@ class Tableau:
                 f"{float(A[i].sum())!r}, and c[{i}] is {float(c[i])!r}"
             )
         for name, array in (("A", A), ("b", b), ("c", c)):
-            array.flags.writeable = False  # runs of one tableau are kept
             object.__setattr__(self, name, array)
 
     @property
