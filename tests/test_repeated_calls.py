@@ -121,11 +121,6 @@ def test_nothing_is_kept_for_a_method_that_may_change():
     assert len({*before}) == len({*after}) == 1 and before[0] != after[0]
 
 
-def test_tableaux_are_equal_by_their_coefficients():
-    assert gauss(3) == gauss(3) and hash(gauss(3)) == hash(gauss(3)) and gauss(3) != gauss(4)
-    assert RungeKutta(gauss(3)) == RungeKutta(gauss(3)) != RungeKutta(radau_iia(3))
-
-
 def test_a_tableau_that_was_written_to_makes_a_run_of_its_own():
     problem, tableau, other = mechanisms.four_bar(), gauss(3), radau_iia(3)
     before = [run(problem, method=RungeKutta(tableau)).q[:, -1].tolist() for _ in range(4)]

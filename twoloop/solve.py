@@ -179,7 +179,7 @@ def solve_dae(
     known = system.shared.get("options")
     if known is None or not all(map(is_, given, known[0])):
         known = given, check_options(system, *given)
-        if type(atol) is float:  # an array may be changed by who gives it
+        if type(atol) is float and isinstance(method, str):  # an array, or an object, may be changed by who gives it
             system.shared["options"] = known
     asked: Asked = known[1]
     event_functions = None if events is None else check_events(events)
