@@ -114,9 +114,14 @@ PLAIN = (str, int, float, np.generic, type(None))  # such values, beside tableau
 _OF_PRESETS = frozenset(map(id, PRESETS.values()))
 
 
+def is_preset(method: Any) -> bool:
+    """Whether it is one of these objects, or the name of one, which do not change."""
+    return isinstance(method, str) or id(method) in _OF_PRESETS
+
+
 def identity(method: Method) -> Any:
     """What methods of the same options have in common now, by which runs are kept; None: it is not known."""
-    if id(method) in _OF_PRESETS:
+    if is_preset(method):
         return id(method)
     if type(method) not in OWN:
         return None
