@@ -127,7 +127,8 @@ def test_a_parallelogram_is_left_or_ends_with_a_status_soon():
     problem = four_bar((1.5423, 1.7303, 1.5423), 1.7303, 0.39914, 1)
     for method in ("DOP853", "SunRadau5", "Gauss12", "BDF"):
         result = solve_dae(problem.system, (0.0, 2.0), problem.q0, problem.v0, method, 1e-10, 1e-10)
-        assert result.stats.n_accepted < 30_000
+        # a standstill is seen after 20,000 such steps, or nearly twice as many
+        assert result.stats.n_accepted < 65_000
         if not result.success:
             assert "close to losing rank" in result.message and "singular" in result.message
 

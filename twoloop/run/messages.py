@@ -132,7 +132,7 @@ def outcome(run: "Run", code: int, t1: float, pace: Pace) -> tuple[Status, str]:
             f"{stopped} by time_limit. Raise time_limit, loosen rtol and atol, or shorten t_span.",
         )
     if code == STAGNATED:
-        return Status.STAGNATED, f"{stopped}: {_standstill(run, (t1 - t) / pace.mean, pace)}"
+        return Status.STAGNATED, f"{stopped}: {_standstill(run, t1, pace)}"
     if code == a.AT_JUMP:
         return (
             Status.RATE_JUMPS,
@@ -173,17 +173,19 @@ def outcome(run: "Run", code: int, t1: float, pace: Pace) -> tuple[Status, str]:
     )
 
 
-def _standstill(run: "Run", left: float, pace: Pace) -> str:
-    """How short the steps are, and how many the rest takes."""
-    before, advice = "", "Shorten t_span, or look at the units of velocities, masses and forces"
+def _standstill(run: "Run", t1: float, pace: Pace) -> str:
+    """How short the steps are, how many the rest takes, and what may be why."""
+    left = (t1 - float(run.clock[run.a.T])) / pace.mean
+    before, advice = "", "Shorten t_span, or look at the units of velocities, masses and forces. "
     if pace.slows:
         before = f", after steps of up to {pace.longest:.2g} s"
-        advice = "Look for a singular position or a stiff force near this time, or take another method"
+        advice = "Look for a singular position or a stiff force near this time, or take another method. "
+        advice = _near_singular(run, t1) or advice
     elif run.control[run.a.FIXED_STEP] > 0.0:
-        advice = "Take a larger step_size, or shorten t_span"
+        advice = "Take a larger step_size, or shorten t_span. "
     return (
         f"the last {STAGNATION_STEPS} steps were {pace.mean:.2g} s long on average{before}, and the rest needs "
-        f"{left:.1g} of them. {advice}; with max_steps the run goes on up to that number of steps."
+        f"{left:.1g} of them. {advice}With max_steps the run goes on up to that number of steps."
     )
 
 
