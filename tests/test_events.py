@@ -14,7 +14,7 @@ from scipy.integrate import solve_ivp
 
 from tests.problems import at_one, event, pendulum, run, swing, unconstrained, violations, worst
 from twoloop import Status, solve_dae
-from twoloop.problem.events import check_events
+from twoloop.problem.events import EventSearch, check_events
 
 
 def clock(*times, terminal=None):
@@ -242,6 +242,32 @@ def test_a_zero_of_high_order_is_found(oscillator):
 
 
 @pytest.mark.usefixtures("collected_alone")
+class OneStep:
+    """A step from its beginning on, as a search for events asks for its states."""
+
+    def __init__(self):
+        self.asked = []
+
+    def at(self, times):
+        return np.stack([times, np.ones_like(times)], axis=1)
+
+    def within(self, t):
+        self.asked.append(t)
+        return lambda t: np.array([t, 1.0])
+
+
+def test_a_zero_in_a_step_of_one_spacing_is_looked_for_in_that_step():
+    """As across a jump of velocities: the middle of such a step may be its end, where the next one begins."""
+    begin = 1.0
+    for _ in range(4):
+        end, states = float(np.nextafter(begin, 2.0)), OneStep()
+        jump = event(lambda t, q, v, end=end: -1.0 if t < end else 1.0)
+        search = EventSearch(check_events(jump), begin, np.array([begin, 1.0]), 1.0)
+        search.search(states, np.array([begin, end]))
+        assert len(search.found[0]) == 1 and states.asked == [begin]
+        begin = end
+
+
 def test_functions_are_checked_once_and_not_held():
     def crossing(t, q, v):
         return q[0]

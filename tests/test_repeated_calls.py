@@ -9,7 +9,7 @@ from dataclasses import FrozenInstanceError, replace
 import numpy as np
 import pytest
 
-from twoloop import BDF, DOP853, Newmark, RungeKutta, Taylor, mechanisms, solve_dae
+from twoloop import BDF, DOP853, Integrator, Newmark, RungeKutta, Taylor, mechanisms, solve_dae
 from twoloop.checks.consistency import Look
 from twoloop.kernels.layout import MOST_FREE, _free, give_back, make_work
 from twoloop.methods.presets import paper_irk
@@ -76,6 +76,16 @@ def test_a_repeated_call_with_an_equal_method_object_takes_few_calls_of_function
     assert calls[4] < FEWER + OF_OBJECTS and calls[5] < FEWEST + OF_OBJECTS, calls
 
 
+@pytest.mark.parametrize(
+    ("method", "most"), [("auto", FEWEST), ("DOP853", FEWEST), (Taylor(order=12), FEWEST + OF_OBJECTS)]
+)
+def test_a_repeated_run_of_an_integrator_takes_few_calls_of_functions(method, most):
+    problem = mechanisms.four_bar()
+    integrator = Integrator(problem.system, method, 1e-6, 1e-6)
+    calls = [calls_of(lambda: integrator.run((0.0, 1.0), problem.q0, problem.v0)) for _ in range(6)]
+    assert calls[5] < most, calls
+
+
 EVENTS, A_LOOK, A_ROOT = 800, 6, 220  # calls of a run with an event, and for each value and each root of it
 
 
@@ -119,11 +129,6 @@ def test_nothing_is_kept_for_a_method_that_may_change():
     method.now = RungeKutta(gauss(3))
     after = [run(problem, method=method).h.size for _ in range(4)]
     assert len({*before}) == len({*after}) == 1 and before[0] != after[0]
-
-
-def test_tableaux_are_equal_by_their_coefficients():
-    assert gauss(3) == gauss(3) and hash(gauss(3)) == hash(gauss(3)) and gauss(3) != gauss(4)
-    assert RungeKutta(gauss(3)) == RungeKutta(gauss(3)) != RungeKutta(radau_iia(3))
 
 
 def test_a_tableau_that_was_written_to_makes_a_run_of_its_own():

@@ -28,7 +28,7 @@ from twoloop.checks.consistency import ConstraintWarning
 from twoloop.kernels.layout import give_back
 from twoloop.methods.code_for import Compiled, check_compiled
 from twoloop.methods.plan import Method
-from twoloop.methods.presets import PRESETS
+from twoloop.methods.presets import PRESETS, is_preset
 from twoloop.problem.events import check_events
 from twoloop.problem.system import ConstrainedSystem, check_system
 from twoloop.result.folder import begin_folder, check_folder, end_folder
@@ -179,7 +179,7 @@ def solve_dae(
     known = system.shared.get("options")
     if known is None or not all(map(is_, given, known[0])):
         known = given, check_options(system, *given)
-        if type(atol) is float:  # an array may be changed by who gives it
+        if type(atol) is float and is_preset(method):  # an array, or another object, may be changed by who gives it
             system.shared["options"] = known
     asked: Asked = known[1]
     event_functions = None if events is None else check_events(events)

@@ -1,7 +1,8 @@
 """What a user chooses by name, and the paper's two procedures."""
 
-from contextlib import suppress
 from typing import Any
+
+import numpy as np
 
 from twoloop.checks.arguments import check_positive
 from twoloop.methods.adams import Adams
@@ -12,7 +13,7 @@ from twoloop.methods.esdirk import ESDIRK
 from twoloop.methods.newmark import Newmark
 from twoloop.methods.plan import Method
 from twoloop.methods.runge_kutta import RungeKutta
-from twoloop.methods.tableaux import gauss, radau_iia, sun_radau_iib
+from twoloop.methods.tableaux import Tableau, gauss, radau_iia, sun_radau_iib
 from twoloop.methods.taylor import Taylor
 
 
@@ -108,16 +109,21 @@ PRESETS: dict[str, Method] = {
 }
 
 
-OWN = (Adams, BDF, DOP853, ESDIRK, Newmark, RungeKutta, Taylor)  # whose objects do not change
+OWN = (Adams, BDF, DOP853, ESDIRK, Newmark, RungeKutta, Taylor)  # whose objects are the values of their options
+PLAIN = (str, int, float, np.generic, type(None))  # such values, beside tableaux
 _OF_PRESETS = frozenset(map(id, PRESETS.values()))
 
 
+def is_preset(method: Any) -> bool:
+    """Whether it is one of these objects, or the name of one, which do not change."""
+    return isinstance(method, str) or id(method) in _OF_PRESETS
+
+
 def identity(method: Method) -> Any:
-    """What equal methods have in common, by which runs are kept for later calls; None of a method that may change."""
-    if id(method) in _OF_PRESETS:
-        return id(method)  # hashing takes longer
-    if type(method) in OWN:
-        with suppress(TypeError):  # one that was made ready for a system holds arrays
-            hash(method)
-            return method
-    return None
+    """What methods of the same options have in common now, by which runs are kept; None: it is not known."""
+    if is_preset(method):
+        return id(method)
+    if type(method) not in OWN:
+        return None
+    values = [value.content if type(value) is Tableau else value for value in vars(method).values()]
+    return (type(method), *values) if all(isinstance(value, (*PLAIN, tuple)) for value in values) else None

@@ -13,7 +13,6 @@ from twoloop.checks.arguments import Array, check_call, shown
 
 SAMPLES = 4  # parts of a step at least, at whose ends the sign is looked at
 WHOLE = 1.0 - 1e-9  # of a step: one of SAMPLES times the time between samples, but for rounding, has SAMPLES parts
-TOGETHER = 32  # steps that are looked at together where no event ends the run
 PRECISION = 4.0 * float(np.finfo(float).eps)  # of the time of an event, as in SciPy
 MOST = 3000  # iterations of Brent's method, which halves the interval at least every 53rd time: for zeros of high order
 
@@ -129,8 +128,8 @@ class EventSearch:
         self._n_q = len(row) // 2
         self._every = min((getattr(event.function, "every", every) for event in events), default=every)
         self._rates = [each for event in events if (each := getattr(event.function, "gap_rate", None)) is not None]
-        self._ends = any(event.terminal < np.inf for event in events)
-        self._values = [values[0] for values in self._evaluate([t0], row[None, :])]
+        own = zip(events, self._own(row[None, :]), strict=True)
+        self._values = [event(t0, q[0], v[0]) for event, (q, v) in own]
         self._at_start = True
 
     def search(self, states: States, ends: Array) -> None:
@@ -142,14 +141,15 @@ class EventSearch:
         first = np.append(0, np.cumsum(counts))
         begins, parts, lengths, before = (np.repeat(each, counts) for each in (ends[:-1], counts, steps, first[:-1]))
         times = np.append(begins + (np.arange(first[-1]) - before) / parts * lengths, ends[-1])
-        rows, together = states.at(times), 1 if self._ends else TOGETHER
-        for begin in range(0, len(steps), together):
-            end = min(begin + together, len(steps))
-            within = slice(first[begin], first[end] + 1)
-            self._in_steps(states, *self._with_turns(states, times[within], rows[within]))
+        rows = states.at(times)
+        if not self._rates:
+            self._in_steps(states, times, rows, ends[1:].tolist())
+            return
+        for k, end in enumerate(ends[1:].tolist()):
+            within = slice(first[k], first[k + 1] + 1)
+            self._in_steps(states, *self._with_turns(states, times[within], rows[within]), [end])
             if self.ended is not None:
                 return
-            self.reached = float(ends[end])
 
     def break_off(self) -> None:
         """Forget what was found in a step whose search was interrupted."""
@@ -172,38 +172,28 @@ class EventSearch:
         places = np.searchsorted(times, new)
         return np.insert(times, places, new), np.insert(rows, places, states.at(new), axis=0)
 
-    def _evaluate(self, times: list[float], rows: Array) -> list[list[float]]:
-        """Values of each event at some times; each has states of its own to write to."""
-        n = self._n_q
-        return [[*map(event, times, rows[:, :n].copy(), rows[:, n:].copy())] for event in self.events]
+    def _own(self, rows: Array) -> list[tuple[list[Array], list[Array]]]:
+        """Coordinates and velocities for each event, which it may write to."""
+        return [(list(rows[:, : self._n_q].copy()), list(rows[:, self._n_q :].copy())) for _ in self.events]
 
-    def _in_steps(self, states: States, times: Array, rows: Array) -> None:
-        """Events between samples of some steps; behind a terminal one no function is called."""
-        at = times.tolist()
-        size = 1 if self._ends else len(at)
-        for begin in range(1, len(at), size):
-            after = slice(begin, begin + size)
-            values = self._evaluate(at[after], rows[after])
-            crossings = self._crossings(values)
-            for k in sorted({k for k, *_ in crossings}):
-                ends = (at[begin + k - 1], at[begin + k])
-                roots = [(*_root(event, states, ends, own), event) for place, event, own in crossings if place == k]
+    def _in_steps(self, states: States, times: Array, rows: Array, ends: list[float]) -> None:
+        """Events between samples of the steps that end at `ends`."""
+        at, own, steps = times.tolist(), self._own(rows), iter(ends)
+        end = next(steps)
+        for k in range(1, len(at)):
+            values, active = [], []
+            for event, (q, v), g in zip(self.events, own, self._values, strict=True):
+                values.append(g_new := event(at[k], q[k], v[k]))
+                if g * g_new <= 0.0 and (g != 0.0 or self._at_start) and crosses(event.direction, g, g_new):
+                    active.append((event, (g, g_new)))
+            self._values, self._at_start = values, False
+            if active:
+                roots = [(*_root(event, states, (at[k - 1], at[k]), both), event) for event, both in active]
                 self._record(sorted(roots, key=lambda root: root[0]))
                 if self.ended is not None:
                     return
-
-    def _crossings(self, values: list[list[float]]) -> list[tuple[int, Event, tuple[float, float]]]:
-        """Between which of these values and the one before events are zero: the place, the event, and both values."""
-        found = []
-        for event, g, own in zip(self.events, self._values, values, strict=True):
-            for k, g_new in enumerate(own):
-                if (g > 0.0) is not (g_new > 0.0) or g == 0.0 or g_new == 0.0:
-                    counts = g != 0.0 or (self._at_start and k == 0)
-                    if counts and crosses(event.direction, g, g_new):
-                        found.append((k, event, (g, g_new)))
-                g = g_new
-        self._values, self._at_start = [own[-1] for own in values], False
-        return found
+            if at[k] == end:
+                self.reached, end = end, next(steps, np.inf)
 
     def _record(self, roots: list[tuple[float, Array, Event]]) -> None:
         """Note events up to the first terminal one, and those at the same time."""
@@ -226,7 +216,7 @@ def _root(
     for t, value in known.items():
         if value == 0.0:
             return t, states.at(np.array([t]))[0]
-    row = states.within(0.5 * sum(ends))
+    row = states.within(ends[0])
 
     def at(t: float) -> float:
         if t in known:
