@@ -2,6 +2,7 @@
 
 import gc
 import signal
+import sys
 from importlib.util import find_spec
 
 import pytest
@@ -20,6 +21,14 @@ LONG_AND_LATE = {"test_docs.py", "test_results_stay.py", "test_check.py", "test_
 collect_ignore = [] if find_spec("pandas") and find_spec("matplotlib") else list(NEED_STUDIES)
 settings.register_profile("twoloop", deadline=None, derandomize=True, max_examples=25)
 settings.load_profile("twoloop")
+
+
+@pytest.fixture(autouse=True)
+def no_figures_stay():
+    """Matplotlib warns of many that are open, of whichever tests a worker has run."""
+    yield
+    if "matplotlib.pyplot" in sys.modules:
+        sys.modules["matplotlib.pyplot"].close("all")
 
 
 @pytest.hookimpl(wrapper=True)

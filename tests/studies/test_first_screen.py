@@ -180,7 +180,7 @@ def test_every_number_of_the_screen_is_made_again_from_the_rows(tmp_path):
         return " | ".join(f"{who if who == 'the default' else f'`{who}`'} {n} of {n}" for n in n_in[:2])
 
     expected = [
-        "The table counts comparisons, each on one of 2 mechanisms at one error at the end of the motion, against the "
+        "The table counts comparisons, each on one of 2 mechanisms at one error at the end, against the "
         f"fastest of up to {n_others} rival configurations, on an AMD EPYC:",
         "| faster / slower | errors of 1e-3 to 1e-6 | errors of 1e-7 to 1e-10 | singular positions (all errors) |",
         f"| the default | {standings[0]}",

@@ -155,7 +155,7 @@ def test_how_far_the_fastest_rivals_drift_is_taken_from_the_rows(screen, compare
     """Which rival is the fastest where the default is slower is taken from the findings."""
     told = numbers(
         screen,
-        "drift: at the end by * times the error at which times are compared in the median, at most * times.",
+        "drift: at the end by * times the error at which times are compared in the median, at most *",
     )
     mechanisms = json.loads((ROOT / "reports" / "work_precision.json").read_text())["rivals"]["mechanisms"]
     drifts = []
