@@ -241,7 +241,6 @@ def test_a_zero_of_high_order_is_found(oscillator):
     assert result.t_events[0] == pytest.approx([4.0], abs=1e-4)
 
 
-@pytest.mark.usefixtures("collected_alone")
 class OneStep:
     """A step from its beginning on, as a search for events asks for its states."""
 
@@ -268,6 +267,7 @@ def test_a_zero_in_a_step_of_one_spacing_is_looked_for_in_that_step():
         begin = end
 
 
+@pytest.mark.usefixtures("collected_alone")
 def test_functions_are_checked_once_and_not_held():
     def crossing(t, q, v):
         return q[0]
