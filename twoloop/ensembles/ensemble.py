@@ -69,9 +69,10 @@ def ensemble(
     method : str or method object
         "auto", "Taylor", "DOP853", "RadauIIA5", "RadauIIA9" and "RadauIIA13" go in lanes. "auto" takes Taylor series
         there, and DOP853 for runs that these cannot do and for systems that have none; at tolerances from 1e-9 on it
-        takes DOP853 first where series take more than six operations a coordinate, no force may act for a short
-        time, and no callback has quotients, roots or fast vibrations. If the first run came to Newton's method, it takes a Radau method for all runs, of order 5 at tolerances
-        from 9e-7 on and of order 9 below, with errors tested as by `Auto`.
+        takes DOP853 first where series take more than six operations a coordinate, no force may act for a short time,
+        and no callback has quotients, roots or fast vibrations. If the first run came to Newton's method, it takes a
+        Radau method for all runs, of order 5 at tolerances from 9e-7 on and of order 9 below, with errors tested as by
+        `Auto`.
     threads : int, optional
         None: one for each core that this process may use. Results do not depend on it.
 
