@@ -1,9 +1,36 @@
-"""Mechanisms built from bodies, joints and forces; a model becomes a `Problem` with its equations of motion."""
+"""Mechanisms built from bodies, joints and forces; a model becomes a `Problem` with its equations of motion.
 
-from twoloop.bodies.mjcf_geometry import IgnoredWarning
-from twoloop.bodies.mjcf_reader import from_mjcf
-from twoloop.bodies.planar_model import PlanarModel
-from twoloop.bodies.spatial_model import SpatialModel
-from twoloop.bodies.urdf_reader import Loop, from_urdf
+A name is imported when it is asked for: what ready mechanisms need of this package imports next to nothing.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from twoloop.bodies.mjcf_geometry import IgnoredWarning
+    from twoloop.bodies.mjcf_reader import from_mjcf
+    from twoloop.bodies.planar_model import PlanarModel
+    from twoloop.bodies.spatial_model import SpatialModel
+    from twoloop.bodies.urdf_reader import Loop, from_urdf
+
+_MODULES = {
+    "IgnoredWarning": "mjcf_geometry",
+    "Loop": "urdf_reader",
+    "PlanarModel": "planar_model",
+    "SpatialModel": "spatial_model",
+    "from_mjcf": "mjcf_reader",
+    "from_urdf": "urdf_reader",
+}
 
 __all__ = ["IgnoredWarning", "Loop", "PlanarModel", "SpatialModel", "from_mjcf", "from_urdf"]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _MODULES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    globals()[name] = found = getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)
+    return found
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

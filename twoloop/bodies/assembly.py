@@ -9,7 +9,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import lapack, null_space
-from scipy.optimize import least_squares
 
 from twoloop.checks.arguments import Array
 from twoloop.checks.scales import TURNS, generic_factors, scales_of, typical_sizes, units
@@ -142,6 +141,8 @@ def _open_joints_message(system: ConstrainedSystem, left: Array, rows: Mapping[s
 
 def _least_squares_positions(system: ConstrainedSystem, t: float, guess: Array, keep: Sequence[int]) -> Array:
     """Return the positions near the guess that minimise the norm of the constraints."""
+    from scipy.optimize import least_squares  # takes a quarter of a second to import, and most models assemble without
+
     free = np.setdiff1d(np.arange(system.n_q), keep)
     q = guess.copy()
     if len(free) == 0:

@@ -58,7 +58,7 @@ def bridging_step(f, w, options, memory, t, h, tolerances, state, new_state):
     _move(y, h, b, slopes, stage, y1)
     error = 0.0
     if tolerances[ESTIMATE] == 1.0:
-        error = _error(tolerances, h, fine, coarse, y, y1, slopes, one, other)
+        error = _error(tolerances, h, fine, coarse, y, y1, slopes, one, other, True)
         if not error <= 1.0:
             return Attempt(DONE, error, 0.0)
     code = renew_partition(f, w, t + h, q1)
