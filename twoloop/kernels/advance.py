@@ -19,7 +19,7 @@ from twoloop.kernels.control.singular import (
     with_care,
 )
 from twoloop.kernels.control.sudden import up_to_sudden
-from twoloop.kernels.data.codes import DONE, INNER_DIVERGED, NEEDS_DENSE, NOT_FINITE, SINGULAR
+from twoloop.kernels.data.codes import DONE, INNER_DIVERGED, NEEDS_DENSE, NOT_FINITE, NOT_LOADED, SINGULAR
 from twoloop.kernels.data.common import INTEGERS, KIT, MATRIX, VECTOR, WORK, f8, i8, kernel, merged
 from twoloop.kernels.data.counters import (
     N_ACCEPTED,
@@ -251,6 +251,8 @@ def advance(
         code, error, factor = _attempt(
             f, w, options, memory, tolerances, control, clock, t, size, leaps, state, new_state
         )
+        if code == NOT_LOADED:
+            return at.HAS_TO_LOAD
         # at a jump the embedded formula may agree by chance: until the place is passed, the estimate has to be smaller
         strict = control[at.ROUGH] if t < clock[at.ROUGH_TO] else 1.0
         accepted = code == DONE and error * strict <= 1.0

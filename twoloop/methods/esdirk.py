@@ -122,8 +122,8 @@ class ESDIRK:
 
     def plan(self, n_q: int, rtol: float, atol: float, fixed: bool) -> Plan:
         """Make the method ready for a run of n_q coordinates."""
-        from twoloop.kernels.steps import diagonal_step as kernels
         from twoloop.kernels.steps.diagonal_stage import diagonal_memory, diagonal_options
+        from twoloop.kernels.steps.named_step import NamedStep
         from twoloop.kernels.steps.newton_memory import n_matrices
 
         make, order = FORMULAS[self.formula]
@@ -135,7 +135,7 @@ class ESDIRK:
             outer_tol = min(OUTER_SHARE * tolerance, LOOSEST_OUTER) * min(1.0, (tolerance / FEW_STEPS) ** exponent)
         inner_tol = INNER_TOL if self.inner_tol is None else self.inner_tol
         return Plan(
-            kernels.DIAGONAL,
+            NamedStep("diagonal_step", "DIAGONAL"),
             diagonal_options(
                 A,
                 A.sum(axis=1),

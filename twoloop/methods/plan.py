@@ -25,7 +25,7 @@ LEAST_TOLERANCE = 1e-14  # what smaller tolerances count as where a loop has to 
 class Plan:
     """A method made ready for one run: the compiled step, its parameter block, its memory, its controller."""
 
-    step: Any  # a Step of kernels/data/common.py
+    step: Any  # a Step of kernels/data/common.py, or the name of one
     options: Array
     memory: Array
     exponent: float

@@ -12,7 +12,7 @@ from twoloop.methods.tableaux import Tableau
 
 NEWTON_TOL_FIXED = 1e-12  # the outer tolerance of fixed steps where stiff forces magnify rounding
 LIMIT_OF_FIXED_POINT = 1.5  # h rho from which on the fixed-point iteration converges slowly: Newton's method is tried
-# eigenvectors of A, as in kernels/steps/newton_step.py; one over it: an eigenvalue that counts as zero
+# eigenvectors of A, as in kernels/steps/newton_memory.py; one over it: an eigenvalue that counts as zero
 ILL_CONDITIONED = 1e8
 # highest order for which a step is divided into so many parts: with fewer the error between steps is more than a few
 # times that at the steps (four-bar linkage, tolerances of 1e-4 to 1e-12)
@@ -123,7 +123,8 @@ class RungeKutta:
 
     def plan(self, n_q: int, rtol: float, atol: float, fixed: bool) -> Plan:
         """Make the method ready for a run of n_q coordinates."""
-        from twoloop.kernels.steps import fixed_point_step as kernels
+        from twoloop.kernels.steps import fixed_point_memory
+        from twoloop.kernels.steps.named_step import NamedStep
         from twoloop.kernels.steps.stages import options_array
 
         tableau = self.tableau
@@ -141,11 +142,12 @@ class RungeKutta:
             float(self.outer_test == "all"),
             tableau.order - 1.0,
         )
-        memory = np.zeros(kernels.memory_size(tableau.stages, n_q))
-        plan = Plan(kernels.RUNGE_KUTTA, options, memory, 1.0 / (tableau.order + 1), rough=ROUGH)
+        memory = np.zeros(fixed_point_memory.memory_size(tableau.stages, n_q))
+        step = NamedStep("fixed_point_step", "RUNGE_KUTTA")
+        plan = Plan(step, options, memory, 1.0 / (tableau.order + 1), rough=ROUGH)
         if self.outer == "paper":
             return plan.changed(
-                step=kernels.PAPER,
+                step=NamedStep("paper_step", "PAPER"),
                 factor_min=0.5,
                 limit_start=1.0,
                 limit_factor=1.0,
@@ -166,13 +168,13 @@ class RungeKutta:
     def _newton_plan(self, plan: Plan, n_q: int) -> Plan:
         """The same with Newton's method as the outer loop."""
         from twoloop.kernels.steps import newton_memory
-        from twoloop.kernels.steps import newton_step as newton
+        from twoloop.kernels.steps.named_step import NamedStep
 
         tableau = self.tableau
-        extra = newton.newton_options(tableau.A, tableau.b, tableau.c, self.tested == "all")
+        extra = newton_memory.newton_options(tableau.A, tableau.b, tableau.c, self.tested == "all")
         n_eigen = int(extra[newton_memory.N_REAL] + extra[newton_memory.N_PAIRS])
         made = plan.changed(
-            step=newton.NEWTON,
+            step=NamedStep("newton_step", "NEWTON"),
             options=np.concatenate([plan.options, extra]),
             memory=np.zeros(newton_memory.memory_size(n_eigen, tableau.stages, n_q)),
             matrices=newton_memory.n_matrices(n_eigen),

@@ -31,7 +31,7 @@ from twoloop.run.fields import kinds_of, of_states, told_later
 from twoloop.run.messages import message_of, outcome, said_of_reached, unless_turned
 from twoloop.run.movable import Kin, Movable
 from twoloop.run.pace import INTERRUPTED, STAGNATED, Pace
-from twoloop.run.passage import beyond, bridge, bridging_kit, give_way
+from twoloop.run.passage import beyond, bridge, bridging_kit, give_way, load
 from twoloop.run.record import Record, Status
 from twoloop.run.run import Run
 from twoloop.run.short_changes import may_be_missed
@@ -221,7 +221,7 @@ class Again:
             n_rows, n_steps = going.filled.tolist()
             if with_kinds:
                 self.kinds[:n_steps] = kinds_of(run, self.steps[:n_steps])
-            if code in (a.HAS_TO_GIVE_WAY, a.NEAR_SINGULAR, a.PAUSED):
+            if code in (a.HAS_TO_GIVE_WAY, a.HAS_TO_LOAD, a.NEAR_SINGULAR, a.PAUSED):
                 code, n_rows, n_steps = self._steps_beyond(code, n_rows, n_steps, t1, until)
                 self._tell(run.work, going, n_rows, n_steps, TURNED, self.territory.known)
         except Exception:  # of a callback; the long way knows what to do
@@ -254,6 +254,11 @@ class Again:
             if code == a.HAS_TO_GIVE_WAY:
                 give_way(run)
                 plan, control, kit = run.plan, run.control, run.kit
+            elif code == a.HAS_TO_LOAD:
+                load(run)
+                kit = run.kit
+                if not run.substituted:
+                    self.kit = kit
             elif code == a.NEAR_SINGULAR:
                 plan, control = bridge(run)
                 kit = bridging_kit(run.kit)

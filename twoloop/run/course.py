@@ -20,7 +20,7 @@ from twoloop.run.interrupts import Interrupts, said_of_interrupt
 from twoloop.run.kept import OF_STEPS
 from twoloop.run.messages import message_of, outcome, unless_turned, warned
 from twoloop.run.pace import INTERRUPTED, OUT_OF_REACH, OUT_OF_TIME, STAGNATED, Pace
-from twoloop.run.passage import beyond, bridge, bridging_kit, give_way, leap
+from twoloop.run.passage import beyond, bridge, bridging_kit, give_way, leap, load
 from twoloop.run.record import Record, Status, explained
 from twoloop.run.recorder import Recorder, Wanted
 from twoloop.run.run import SHARPER, Run
@@ -212,6 +212,9 @@ class Course:
         elif self.code == a.HAS_TO_GIVE_WAY:
             give_way(run)
             self.plan, self.control, self.kit, self.code = run.plan, run.control, run.kit, a.PAUSED
+        elif self.code == a.HAS_TO_LOAD:
+            load(run)
+            self.kit, self.code = run.kit, a.PAUSED
         elif self.code == a.AT_JUMP and not across and leap(run, self.t1):
             self.code = a.PAUSED
         elif self.code == a.NEAR_SINGULAR:

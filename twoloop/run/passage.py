@@ -6,6 +6,7 @@ from numpy.typing import NDArray
 from twoloop.kernels.compile.linking import direct
 from twoloop.kernels.data import codes, noted
 from twoloop.kernels.data.kit import Kit
+from twoloop.kernels.steps.named_step import loaded
 from twoloop.methods.plan import Plan, kept_plan
 from twoloop.run.impulse import beyond_jump
 from twoloop.run.run import Run
@@ -23,17 +24,28 @@ def give_way(run: Run) -> None:
     substitute = run.plan.substitute
     assert substitute is not None
     run.plan, run.memory = substitute.fresh(), substitute.memory  # in which no run writes
-    if run.static is None:
-        run.kit = kit_with(run.system, run.functions.flags, run.plan)
-    else:
-        run.kit = kit_of(run.system, run.t0, run.state[: run.system.n_q], run.plan, run.static)
-    run.functions = run.kit.functions
+    _call_anew(run)
     run.substituted = True
     run.control_by(run.plan)
     run.limit_steps()
     run.clock[run.a.FAILURE_CODE] = codes.DONE
     run.clock[run.a.H_NEXT] = run.clock[run.a.H_FAILED]
     run.clock[: run.a.N_PAST] = 0.0
+
+
+def load(run: Run) -> None:
+    """Load the step that a run has come to."""
+    loaded(run.plan.second)
+    _call_anew(run)
+
+
+def _call_anew(run: Run) -> None:
+    """Have kernels call what the run's plan names now."""
+    if run.static is None:
+        run.kit = kit_with(run.system, run.functions.flags, run.plan)
+    else:
+        run.kit = kit_of(run.system, run.t0, run.state[: run.system.n_q], run.plan, run.static)
+    run.functions = run.kit.functions
 
 
 def bridge(run: Run) -> tuple[Plan, Array]:

@@ -25,6 +25,7 @@ from twoloop.kernels.data.flags import (
 from twoloop.kernels.data.kit import Kit
 from twoloop.kernels.evaluation.operations import N_NODES
 from twoloop.kernels.layout import lasting, make_work, short_loops
+from twoloop.kernels.steps.named_step import at_hand, loaded
 from twoloop.methods.plan import Plan
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.static_form import StaticForm
@@ -68,8 +69,7 @@ def _static_kit(system: ConstrainedSystem, plan: Plan | None, form: StaticForm) 
         functions = functions._replace(newton_program=form.newton)
     if plan is None:
         return Kit(functions, static_inner_loop)
-    called = (plan.step, plan.first, plan.second)
-    return Kit(functions, static_inner_loop, *called, static_inner_loop, plan.instead)
+    return Kit(functions, static_inner_loop, *_steps_of(plan), static_inner_loop, plan.instead)
 
 
 def _flags_at(system: ConstrainedSystem, t0: float, q0: Array) -> Array:
@@ -114,7 +114,7 @@ def kit_with(system: ConstrainedSystem, flags: Array, plan: Plan) -> Kit:
     """The callbacks with these flags, and what a plan calls; kept with the system for the next run."""
     from twoloop.kernels.evaluation.calls import inner_loop
 
-    called = (plan.inner or inner_loop, plan.step, plan.first, plan.second)
+    called = (plan.inner or inner_loop, *_steps_of(plan))
     read = (plan.numbers, plan.own_numbers)
     kept: dict[Any, tuple[Kit, Any]] = system.remembered("kits", dict)
     # what it names by numbers is held by what is kept
@@ -130,6 +130,11 @@ def kit_with(system: ConstrainedSystem, flags: Array, plan: Plan) -> Kit:
         del kept[next(iter(kept))]
     kept[key] = made, system.functions
     return _with_own_flags(made) if changes else made
+
+
+def _steps_of(plan: Plan) -> tuple[Any, Any, Any]:
+    """The step that is called, and the two between which it chooses: the second one may stay unused."""
+    return loaded(plan.step), loaded(plan.first), at_hand(plan.second)
 
 
 def _with_own_flags(kit: Kit) -> Kit:

@@ -11,4 +11,5 @@
     RANK_DIFFERS,
     ROWS_CONTRADICT,
     NEEDS_DENSE,  # the static form cannot decide it
-) = range(10)
+    NOT_LOADED,  # the machine code of the step: the caller is to load it
+) = range(11)

@@ -1,6 +1,9 @@
 """Where the parts of newton_step's `options` and `memory` are; both keep to these places."""
 
+from typing import Any
+
 import numpy as np
+from numpy.typing import NDArray
 
 from twoloop.kernels.data.common import inlined, merged
 from twoloop.kernels.steps.stages import N_SCALARS
@@ -31,6 +34,49 @@ PREVIOUS, TRIAL, RESIDUAL, Q_STAGE, V_STAGE, N_BLOCKS = range(6)
 A_NEW, Q_MOVED, V_MOVED, E_Q, E_V, Q_MID, V_MID, A_MID, N_VECTORS = range(9)
 # spaces in w.matrices, of n_q^2 numbers each; those from SYSTEMS on go in pairs, complex, one for each eigenvalue
 BY_Q, BY_V, FILTER, SYSTEMS = range(4)
+
+
+def newton_options(
+    A: NDArray[np.float64], b: NDArray[np.float64], c: NDArray[np.float64], velocities: bool
+) -> NDArray[np.float64]:
+    """The part of `options` that Newton's method needs besides stages.options_array; `velocities`: those are tested.
+
+    Raises
+    ------
+    ValueError
+        If A has too few eigenvectors.
+    """
+    values, T = np.linalg.eig(A)
+    if np.linalg.cond(T) > 1e8:
+        raise ValueError(
+            "A of the tableau must have a basis of eigenvectors for Newton's method. Take outer='fixed-point'"
+        )
+    inverse = np.linalg.inv(T)
+    real = [k for k in range(len(b)) if values[k].imag == 0.0]
+    pairs = [k for k in range(len(b)) if values[k].imag > 0.0]
+    gamma0 = float(values[real[0]].real) if real else float(np.abs(values).min())
+    parts: list[Any] = [[len(real), len(pairs), gamma0, float(velocities)], _estimate_weights(b, c, gamma0)]
+    for k in real + pairs:
+        row, column = inverse[k], T[:, k]
+        parts += [[values[k].real, values[k].imag], row.real, row.imag, column.real, column.imag]
+    return np.concatenate([np.asarray(part, dtype=np.float64) for part in parts])
+
+
+def _estimate_weights(b: NDArray[np.float64], c: NDArray[np.float64], gamma0: float) -> NDArray[np.float64]:
+    """Weights e: gamma0 f(y_n) + sum_j e_j f(Y_j) is a quadrature of order s less the method's own.
+
+    Hairer & Wanner II, (IV.8.16). With c_1 = 0 the stages hold f(y_n) already: then the last stage is left out.
+    """
+    s = len(b)
+    moments = 1.0 / np.arange(1.0, s + 1.0)
+    if c[0] > 1e-10:
+        moments[0] -= gamma0
+        embedded = np.linalg.solve(np.vander(c, increasing=True).T, moments)
+    else:
+        embedded = np.zeros(s)
+        embedded[:-1] = np.linalg.solve(np.vander(c[:-1], increasing=True).T, moments[:-1])
+        embedded[0] -= gamma0
+    return np.asarray(embedded - b)
 
 
 def memory_size(n_eigenvalues: int, s: int, n_q: int) -> int:

@@ -11,10 +11,7 @@ of those of a first-order form (Hairer & Wanner, Solving ODEs II, IV.8, for Rada
 need tiny steps there.
 """
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import NDArray
 
 from twoloop.kernels.algebra.linalg import copy
 from twoloop.kernels.control.predictor import restore_predicted
@@ -42,49 +39,6 @@ from twoloop.kernels.steps.stages import FARTHEST, INNER_TOL, OUTER_TOL, STAGES,
 
 SLOW = 0.05  # contraction above which the derivatives are renewed before the next step
 STAGNATION_FIXED = 1e-9  # as STAGNATION, for fixed steps, relative to max(1, |value|)
-
-
-def newton_options(
-    A: NDArray[np.float64], b: NDArray[np.float64], c: NDArray[np.float64], velocities: bool
-) -> NDArray[np.float64]:
-    """The part of `options` that Newton's method needs besides stages.options_array; `velocities`: those are tested.
-
-    Raises
-    ------
-    ValueError
-        If A has too few eigenvectors.
-    """
-    values, T = np.linalg.eig(A)
-    if np.linalg.cond(T) > 1e8:
-        raise ValueError(
-            "A of the tableau must have a basis of eigenvectors for Newton's method. Take outer='fixed-point'"
-        )
-    inverse = np.linalg.inv(T)
-    real = [k for k in range(len(b)) if values[k].imag == 0.0]
-    pairs = [k for k in range(len(b)) if values[k].imag > 0.0]
-    gamma0 = float(values[real[0]].real) if real else float(np.abs(values).min())
-    parts: list[Any] = [[len(real), len(pairs), gamma0, float(velocities)], _estimate_weights(b, c, gamma0)]
-    for k in real + pairs:
-        row, column = inverse[k], T[:, k]
-        parts += [[values[k].real, values[k].imag], row.real, row.imag, column.real, column.imag]
-    return np.concatenate([np.asarray(part, dtype=np.float64) for part in parts])
-
-
-def _estimate_weights(b: NDArray[np.float64], c: NDArray[np.float64], gamma0: float) -> NDArray[np.float64]:
-    """Weights e: gamma0 f(y_n) + sum_j e_j f(Y_j) is a quadrature of order s less the method's own.
-
-    Hairer & Wanner II, (IV.8.16). With c_1 = 0 the stages hold f(y_n) already: then the last stage is left out.
-    """
-    s = len(b)
-    moments = 1.0 / np.arange(1.0, s + 1.0)
-    if c[0] > 1e-10:
-        moments[0] -= gamma0
-        embedded = np.linalg.solve(np.vander(c, increasing=True).T, moments)
-    else:
-        embedded = np.zeros(s)
-        embedded[:-1] = np.linalg.solve(np.vander(c[:-1], increasing=True).T, moments[:-1])
-        embedded[0] -= gamma0
-    return np.asarray(embedded - b)
 
 
 @compiled

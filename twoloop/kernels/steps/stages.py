@@ -7,6 +7,7 @@ from twoloop.kernels.data.common import compiled, inlined, merged
 from twoloop.kernels.data.tolerances import allowed
 
 FARTHEST = 3.0  # largest step ratio over which the old stage polynomial is extrapolated
+SHARE_BESIDE = 0.01  # of end_error, beside Richardson's estimate: it is there for jumps between ends and stages
 
 # places in `options`: scalars, then A (s, s), A A (s, s), b (s), b A (s), c (s) and two rows (s) for `end_error`
 # EXTRAPOLATION: 1 / (2^order - 1), or 0 without; POWER: order - 1

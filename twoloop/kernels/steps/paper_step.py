@@ -1,0 +1,67 @@
+"""The paper's steps: implicit Runge-Kutta, its outer loop a fixed point of the first-order form."""
+
+import numpy as np
+
+from twoloop.kernels.algebra.linalg import copy
+from twoloop.kernels.control.controller import nothing_to_settle
+from twoloop.kernels.control.richardson import conclude
+from twoloop.kernels.data.codes import DONE
+from twoloop.kernels.data.common import ATTEMPT, Attempt, Step, kernel
+from twoloop.kernels.data.tolerances import ESTIMATE
+from twoloop.kernels.evaluation.calls import accelerations
+from twoloop.kernels.steps import fixed_point_memory as at
+from twoloop.kernels.steps.fixed_point_loops import iterate_first_order
+from twoloop.kernels.steps.fixed_point_memory import block, vector
+from twoloop.kernels.steps.stages import EXTRAPOLATION, INNER_TOL, SHARE_BESIDE, end_error, tableau_of
+
+SUDDEN = 10.0  # what `end_error` has to be before it counts: the procedure has no such estimate
+
+
+@kernel(ATTEMPT)
+def paper_step(f, w, options, memory, t, h, tolerances, state, new_state):
+    """One attempt in the manner of the paper (Sects. 3.1-3.3): a step of h, two of h/2, their difference the error."""
+    s, _, _, _, _, _ = tableau_of(options)
+    n = w.Q.size
+    q, v, a = state[:n], state[n : 2 * n], state[2 * n : 3 * n]
+    q1, v1, a1, lam1 = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n], new_state[3 * n :]
+    A_stage = block(memory, s, n, at.TRIAL)
+    A_full = block(memory, s, n, at.HALF)
+    Q_stage = block(memory, s, n, at.Q_STAGE)
+    V_stage = block(memory, s, n, at.V_STAGE)
+    q_full, v_full = vector(memory, s, n, at.Q_FULL), vector(memory, s, n, at.V_FULL)
+    q_mid, v_mid, a_mid = vector(memory, s, n, at.Q_MID), vector(memory, s, n, at.V_MID), vector(memory, s, n, at.A_MID)
+    q_old, v_old = vector(memory, s, n, at.Q_OLD), vector(memory, s, n, at.V_OLD)
+    code = iterate_first_order(f, w, options, t, h, q, v, a, A_stage, Q_stage, V_stage, q_old, v_old, q1, v1)
+    if code != DONE:
+        return Attempt(code, np.inf, 0.0)
+    error = 0.0
+    if tolerances[ESTIMATE] == 1.0:
+        copy(q1, q_full)
+        copy(v1, v_full)
+        for j in range(s):
+            copy(A_stage[j], A_full[j])
+        g = 0.5 * h
+        code = iterate_first_order(f, w, options, t, g, q, v, a, A_stage, Q_stage, V_stage, q_old, v_old, q_mid, v_mid)
+        if code == DONE:
+            code = accelerations(f, w, t + g, q_mid, v_mid, a_mid, w.lam)
+        if code != DONE:
+            return Attempt(code, np.inf, 0.0)
+        code = iterate_first_order(
+            f, w, options, t + g, g, q_mid, v_mid, a_mid, A_stage, Q_stage, V_stage, q_old, v_old, q1, v1
+        )
+        if code != DONE:
+            return Attempt(code, np.inf, 0.0)
+        code, error = conclude(
+            f, w, options[EXTRAPOLATION], options[INNER_TOL], t + h, tolerances, q, v, q_full, v_full, q1, v1
+        )
+        if code != DONE:
+            return Attempt(code, np.inf, 0.0)
+    code = accelerations(f, w, t + h, q1, v1, a1, lam1)
+    if code == DONE and tolerances[ESTIMATE] == 1.0:
+        beside = SHARE_BESIDE * end_error(tolerances, options, h, state, new_state, A_full)
+        if error <= 1.0 and beside > SUDDEN:
+            error = beside
+    return Attempt(code, error, 0.0)
+
+
+PAPER = Step(paper_step, nothing_to_settle)
