@@ -6,8 +6,9 @@ import pytest
 from tests.kernels.adaptive import AdaptiveMethod, four_bar_run, shared_run
 from tests.problems import LINKAGES, pendulum, violations, worst
 from twoloop import DOP853, solve_dae
+from twoloop.kernels.data import tolerances
 from twoloop.kernels.steps import explicit_step as explicit
-from twoloop.mechanisms import very_flexible_beam
+from twoloop.mechanisms import n_four_bar, very_flexible_beam
 
 STAGES = 12
 FOUR_BAR = LINKAGES["default"]
@@ -52,6 +53,31 @@ def test_a_step_is_twelve_evaluations_and_a_refused_one_eleven():
 def test_fewer_steps_are_refused_than_taken(tol):
     stats = shared_run("DOP853", tol)[0].stats
     assert stats.n_rejected_error + stats.n_rejected_convergence < 0.4 * stats.n_accepted
+
+
+def test_near_singular_positions_the_estimate_follows_its_lower_orders():
+    """Of the step on A02 that was off by 47 tolerances: of orders 5 and 3 they are 245 and 40,000 tolerances."""
+    allowed = np.concatenate([np.zeros(tolerances.ATOL), [1.0, 1.0]])
+    ends = np.zeros(2), np.ones(2)
+    found = [
+        explicit.largest_error.py_func(allowed, *ends, np.array([-245.0, 1.0]), np.array([3.0, -4e4]), strict)
+        for strict in (False, True)
+    ]
+    assert found == pytest.approx([1.5, 19.2], rel=0.01)
+    assert explicit.largest_error.py_func(allowed, *ends, np.zeros(2), np.ones(2), True) == 0.0
+
+
+def test_runs_through_singular_positions_err_by_what_an_ode_in_the_angle_does():
+    """A02, N = 1, from a place of which errors grow 180-fold: with SciPy's DOP853 the angle errs by up to 14,000 tolerances."""
+    problem = n_four_bar(1)
+    q0, v0 = problem.motion(0.37)
+    q, v = problem.motion(10.37)
+    errors = []
+    for tol in np.logspace(-4.0, -6.0, 17):
+        result = solve_dae(problem.system, (0.37, 10.37), q0, v0, "DOP853", tol, tol)
+        if result.success:
+            errors.append(max(np.abs(result.q[:, -1] - q).max(), np.abs(result.v[:, -1] - v).max()) / tol)
+    assert len(errors) > 8 and sorted(errors)[-2] < 8e3
 
 
 # --- constraints

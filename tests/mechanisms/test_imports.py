@@ -33,6 +33,22 @@ def test_a_mechanism_imports_no_other_and_its_name_is_a_function_also_after_an_i
     assert {"four_bar", "heavy_top"} <= other and "andrews" not in other
 
 
+def test_a_first_run_imports_no_models_and_no_step_that_it_does_not_come_to():
+    """Of an implicit method, whose machine code takes a third of a cold first run, and of SciPy's optimisation."""
+    source = """
+import sys
+from twoloop import solve_dae
+from twoloop.mechanisms import four_bar
+problem = four_bar()
+print(solve_dae(problem.system, (0.0, 0.5), problem.q0, problem.v0).success, *sys.modules)
+"""
+    success, *modules = run_python(source).stdout.split()
+    assert success == "True" and "twoloop.kernels.steps.explicit_step" in modules
+    unused = ("newton_step", "diagonal_step", "fixed_point_step", "paper_step")
+    assert not {*modules} & {f"twoloop.kernels.steps.{name}" for name in unused}
+    assert not {*modules} & {"twoloop.bodies.model", "twoloop.bodies.assembly", "scipy.optimize"}
+
+
 def test_names_are_functions():
     assert not [name for name in mechanisms.__all__ if isinstance(getattr(mechanisms, name), ModuleType)]
     assert set(mechanisms.__all__) <= set(dir(mechanisms))
