@@ -68,7 +68,7 @@ def test_near_singular_positions_the_estimate_follows_its_lower_orders():
 
 
 def test_runs_through_singular_positions_err_by_what_an_ode_in_the_angle_does():
-    """A02, N = 1, from a place of which errors grow 180-fold: with SciPy's DOP853 the angle errs by up to 14,000 tolerances."""
+    """A02, where errors grow 180-fold: SciPy's DOP853 errs by up to 14,000 tolerances in the angle."""
     problem = n_four_bar(1)
     q0, v0 = problem.motion(0.37)
     q, v = problem.motion(10.37)
