@@ -24,7 +24,10 @@ for kind in {kinds}:
         print(sha256(b"".join(each.tobytes() for each in numbers)).hexdigest())
 print(*[name for name in ("newton_step", "diagonal_step") if f"twoloop.kernels.steps.{{name}}" in sys.modules])
 """
-BEFORE = "from twoloop.kernels.steps import diagonal_step, newton_step\n"
+BEFORE = """
+from twoloop.kernels.steps.named_step import NamedStep, loaded
+loaded(NamedStep("diagonal_step", "DIAGONAL")), loaded(NamedStep("newton_step", "NEWTON"))
+"""
 KINDS = ("ends", "t_eval", "dense", "Integrator")
 
 

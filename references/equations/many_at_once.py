@@ -1,6 +1,7 @@
-"""Many motions of one mechanism with different parameters and starts: diffrax by vmap, heyoka in batches, CyRK singly.
+"""Many motions of one mechanism with different parameters and starts, by other packages.
 
-diffrax and heyoka are built once and take parameters as arguments. All packages are optional: `make peers`, or the
+diffrax, by vmap, and heyoka, in batches, are built once and take parameters as arguments; CyRK and CVODE make one run
+after another. All packages are optional: `make peers`, or the
 extra `peers`.
 """
 
@@ -13,10 +14,12 @@ import numpy as np
 from references.cyrk.library import FINISHED
 from references.cyrk.ode import Solver, rate_of
 from references.diffrax.dopri8 import derivative_of, packages, solved
-from references.driver import Task, imported, user_call
+from references.driver import Task, TimeLimit, imported, user_call
 from references.equations.expressions import Expressions
 from references.equations.rows import with_all_rows
 from references.heyoka.taylor import rates_of
+from references.sundials.cvode_c import adams_memory
+from references.sundials.loop import Memory
 from twoloop.problem.problem import Array, Problem
 
 Solve = Callable[[float], Array]  # tolerance -> final q (n_runs, n_q), NaN for failed runs
@@ -39,26 +42,61 @@ def by_diffrax(problems: Sequence[Problem], t_end: float) -> Solve:
     return lambda tol: np.array(run(states, parameters, tol))
 
 
+class Batches:
+    """heyoka's Taylor integrators in batches as wide as it recommends for the processor, built once per tolerance."""
+
+    def __init__(self, problems: Sequence[Problem]):
+        self.package = imported("heyoka")
+        equations, self.states, self.parameters = _gathered(problems)
+        self.n, self._made = equations.system.n_q, dict[float, Any]()
+        self.motion = rates_of(equations, [self.package.par[i] for i in range(self.parameters.shape[1])])
+        n_runs, width = len(self.states), self.package.recommended_simd_size()
+        self.groups = np.minimum(np.arange(-(-n_runs // width) * width), n_runs - 1).reshape(-1, width)
+
+    def integrator(self, tol: float) -> Any:
+        """The integrator of a tolerance."""
+        if tol not in self._made:
+            start = self.states[self.groups[0]].T.copy()
+            self._made[tol] = self.package.taylor_adaptive_batch(self.motion, start, tol=tol, fast_math=True)
+        return self._made[tol]
+
+    def put(self, integrator: Any, k: int) -> Any:
+        """Put a batch at its start."""
+        group = self.groups[k]
+        integrator.set_time(0.0)
+        integrator.state[:] = self.states[group].T
+        integrator.pars[:] = self.parameters[group, : len(integrator.pars)].T  # only those that are used
+        return integrator
+
+    def take(self, integrator: Any, k: int, ends: Array) -> None:
+        """Take the ends of the runs of a batch that got there."""
+        good = [result[0] == self.package.taylor_outcome.time_limit for result in integrator.propagate_res]
+        ends[self.groups[k][good]] = integrator.state[: self.n, good].T
+
+
 def by_heyoka(problems: Sequence[Problem], t_end: float) -> Solve:
-    """Return heyoka's Taylor integrator in batches as wide as the vector registers, built once per tolerance."""
-    package = imported("heyoka")
-    equations, states, parameters = _gathered(problems)
-    n, width, made = equations.system.n_q, package.recommended_simd_size(), {}
-    motion = rates_of(equations, [package.par[i] for i in range(parameters.shape[1])])
-    groups = np.minimum(np.arange(-(-len(states) // width) * width), len(states) - 1).reshape(-1, width)
+    """Return heyoka's batches, one after another in one integrator."""
+    batches = Batches(problems)
 
     def solve(tol: float) -> Array:
-        if tol not in made:
-            start = states[groups[0]].T.copy()
-            made[tol] = package.taylor_adaptive_batch(motion, start, tol=tol, fast_math=True)
-        integrator, ends = made[tol], np.full((len(states), n), np.nan)
-        for group in groups:
-            integrator.set_time(0.0)
-            integrator.state[:] = states[group].T
-            integrator.pars[:] = parameters[group, : len(integrator.pars)].T  # only those that are used
-            integrator.propagate_until(t_end)
-            good = [result[0] == package.taylor_outcome.time_limit for result in integrator.propagate_res]
-            ends[group[good]] = integrator.state[:n, good].T
+        integrator, ends = batches.integrator(tol), np.full((len(problems), batches.n), np.nan)
+        for k in range(len(batches.groups)):
+            batches.put(integrator, k).propagate_until(t_end)
+            batches.take(integrator, k, ends)
+        return ends
+
+    return solve
+
+
+def by_heyoka_ensemble(problems: Sequence[Problem], t_end: float) -> Solve:
+    """Return heyoka's ensemble_propagate_until_batch, which copies the integrator for each batch, on one thread."""
+    batches = Batches(problems)
+
+    def solve(tol: float) -> Array:
+        ends, n = np.full((len(problems), batches.n), np.nan), len(batches.groups)
+        propagate = batches.package.ensemble_propagate_until_batch
+        for k, made in enumerate(propagate(batches.integrator(tol), t_end, n, batches.put, max_workers=1)):
+            batches.take(made[0], k, ends)
         return ends
 
     return solve
@@ -69,9 +107,8 @@ def by_cyrk(problems: Sequence[Problem], t_end: float) -> Solve:
 
     The accelerations are those of the first problem, unless parameters differ, which are constants in its code.
     """
-    tasks = [Task(with_all_rows(each.system), each.system.n_c, 0.0, t_end, each.q0, each.v0) for each in problems]
-    alike = all((each.system.parameters == problems[0].system.parameters).all() for each in problems)
-    rates = [rate_of(*tasks[0].key)] * len(tasks) if alike else [rate_of(*task.key) for task in tasks]
+    tasks, keys = _tasks(problems, t_end)
+    rates = [rate_of(*key) for key in keys]
     made: dict[float, list[Solver]] = {}
     stack, n = ExitStack(), problems[0].system.n_q  # the solvers last as long as the process
 
@@ -90,6 +127,32 @@ def by_cyrk(problems: Sequence[Problem], t_end: float) -> Solve:
         )
 
     return solve
+
+
+def by_cvode(problems: Sequence[Problem], t_end: float) -> Solve:
+    """Return CVODE's Adams methods driven from C, one run after another, with equations as `by_cyrk` has them."""
+    (tasks, keys), made = _tasks(problems, t_end), dict[float, list[Memory]]()
+    stack, n = ExitStack(), problems[0].system.n_q
+
+    def solve(tol: float) -> Array:
+        if tol not in made:
+            made[tol] = [adams_memory(stack, task, key, tol) for task, key in zip(tasks, keys, strict=True)]
+        flags, limit = [], TimeLimit(None)
+        with user_call:
+            for solver in made[tol]:
+                solver.restart()
+                flags.append(solver.go_to_the_end(limit))
+        ends = [solver.state[0, :n].copy() for solver in made[tol]]
+        return np.array([end if flag >= 0 else np.full(n, np.nan) for end, flag in zip(ends, flags, strict=True)])
+
+    return solve
+
+
+def _tasks(problems: Sequence[Problem], t_end: float) -> tuple[list[Task], list[tuple[Any, ...]]]:
+    """Return the tasks of runs that are made singly, and the key of the equations of each: one, if parameters agree."""
+    tasks = [Task(with_all_rows(each.system), each.system.n_c, 0.0, t_end, each.q0, each.v0) for each in problems]
+    alike = all((each.system.parameters == problems[0].system.parameters).all() for each in problems)
+    return tasks, [tasks[0].key if alike else task.key for task in tasks]
 
 
 def _gathered(problems: Sequence[Problem]) -> tuple[Expressions, Array, Array]:

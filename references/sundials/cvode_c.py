@@ -5,7 +5,8 @@ unless CVODE projects. See `references.sundials.ida_c` for the library.
 """
 
 from collections.abc import Callable
-from functools import lru_cache
+from contextlib import ExitStack
+from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -128,21 +129,30 @@ def integrate(
     functions: Functions, start: Array, task: Task, method: str, rtol: float, atol: float, max_step: float | None = None
 ) -> tuple[Array, Array, str, dict[str, int]]:
     """Return the times reached, rows y there, error message or "", and CVODE's counters."""
-
-    def set_up(solver: Memory) -> None:
-        solver.call("Init", functions.rate.address, task.t0, *solver.vectors)
-        solver.call("SStolerances", float(rtol), float(atol))
-        if method == "Adams":
-            free = solver.sundials.SUNNonlinSolFree_FixedPoint
-            iteration = made(solver.stack, "SUNNonlinSol_FixedPoint", free, *solver.vectors, 0, solver.own)
-            solver.call("SetNonlinearSolver", iteration)
-        else:
-            solver.solve_directly(functions.jacobian)
-        if functions.projection is not None:
-            solver.call("SetUserData", functions.data.ctypes.data)
-            solver.call("SetProjFn", functions.projection.address)
-
+    set_up = partial(_set_up, functions, task, method, rtol, atol)
     return run("CVode", start[None], task, (METHODS[method],), set_up, max_step, COUNTERS[method], ADVICE)
+
+
+def adams_memory(stack: ExitStack, task: Task, key: tuple[Any, ...], tolerance: float) -> Memory:
+    """Return the memory of a run by the Adams methods; it lasts as long as the stack. `key`: of the equations."""
+    solver = Memory(stack, "CVode", task.y0[None], task, METHODS["Adams"])
+    _set_up(Functions(_rate(*key)), task, "Adams", tolerance, tolerance, solver)
+    solver.bound_steps(task.longest(None))
+    return solver
+
+
+def _set_up(functions: Functions, task: Task, method: str, rtol: float, atol: float, solver: Memory) -> None:
+    solver.call("Init", functions.rate.address, task.t0, *solver.vectors)
+    solver.call("SStolerances", float(rtol), float(atol))
+    if method == "Adams":
+        free = solver.sundials.SUNNonlinSolFree_FixedPoint
+        iteration = made(solver.stack, "SUNNonlinSol_FixedPoint", free, *solver.vectors, 0, solver.own)
+        solver.call("SetNonlinearSolver", iteration)
+    else:
+        solver.solve_directly(functions.jacobian)
+    if functions.projection is not None:
+        solver.call("SetUserData", functions.data.ctypes.data)
+        solver.call("SetProjFn", functions.projection.address)
 
 
 LINES = (

@@ -1,5 +1,6 @@
 """Many runs in one call: every way ends where the equation in one coordinate does; sentences follow the rows."""
 
+import ctypes
 from types import SimpleNamespace
 
 import numpy as np
@@ -8,15 +9,16 @@ import pytest
 from matplotlib import pyplot as plt
 
 from references.equations.many_at_once import by_diffrax, by_heyoka
-from studies import ensembles
 from studies.bench import takes
 from studies.bench.cli import StudyError, processor
-from studies.ensembles import CYRK, DIFFRAX, ENSEMBLE, ERRORS, HEYOKA, SINGLE, TOLERANCES
+from studies.ensembles import operations
+from studies.ensembles import study as ensembles
+from studies.ensembles.study import CVODE, CYRK, DIFFRAX, ENSEMBLE, ERRORS, HEYOKA, PROPAGATE, SINGLE, TOLERANCES
 from tests.studies.of_study import said
 from twoloop.mechanisms import double_pendulum
 
 T_END = 1.0
-PACKAGES = {HEYOKA: "heyoka", CYRK: "CyRK", DIFFRAX: "diffrax"}
+PACKAGES = {HEYOKA: "heyoka", PROPAGATE: "heyoka", CYRK: "CyRK", CVODE: "sksundae", DIFFRAX: "diffrax"}
 
 
 @pytest.fixture(scope="module")
@@ -25,15 +27,19 @@ def few():
 
 
 @pytest.mark.parametrize(
-    "name", [ENSEMBLE, SINGLE, HEYOKA, *(pytest.param(each, marks=pytest.mark.slow) for each in (CYRK, DIFFRAX))]
-)  # CyRK compiles for each linkage, diffrax for ten seconds
+    "name",
+    [
+        *(ENSEMBLE, SINGLE, HEYOKA, PROPAGATE),
+        *(pytest.param(each, marks=pytest.mark.slow) for each in (CYRK, CVODE, DIFFRAX)),
+    ],
+)  # CyRK and CVODE compile for each linkage, diffrax for ten seconds
 def test_every_way_ends_where_each_linkage_does(name, few, monkeypatch):
     if name in PACKAGES:
         pytest.importorskip(PACKAGES[name])
     monkeypatch.setattr(ensembles, "N_SINGLE", 99)
     solve = ensembles.ways(few)[name]()
     for _ in range(2):  # nothing is left of the call before
-        np.testing.assert_allclose(solve(1e-9), few.true, rtol=0.0, atol=1e-6)
+        np.testing.assert_allclose(solve(1e-9), few.true, rtol=0.0, atol=1e-6 if name != CVODE else 1e-4)
 
 
 def test_other_mechanisms_are_refused(few):
@@ -128,6 +134,8 @@ def test_a_package_that_is_not_there_is_a_row(monkeypatch, few):
 def test_rows_have_their_processor(monkeypatch):
     made = rows(**{ENSEMBLE: 0.01, HEYOKA: 0.05}).to_dict("records")
     monkeypatch.setattr(ensembles, "rows_of", lambda of, names, quick: made[:-1])
+    monkeypatch.setattr(ensembles, "on_threads", lambda of, quick: [])
+    monkeypatch.setattr(ensembles.lanes, "rows", lambda n, quick: [])
     monkeypatch.setattr(ensembles, "with_geometry", lambda n: made[-1])
     table = ensembles.make(SimpleNamespace(call=SimpleNamespace(quick=True)))
     assert (table["processor"] == processor()).all()
@@ -146,6 +154,64 @@ def test_lines_have_a_gap_where_nothing_was_run():
     x = lines[HEYOKA]
     gap = int(np.flatnonzero(np.isnan(x))[0])
     assert x[gap - 1] == pytest.approx(0.99e-5) and x[gap + 1] == pytest.approx(0.99e-8)
+
+
+def test_scaling_follows_the_rows():
+    table = rows(**{ENSEMBLE: 0.01, HEYOKA: 0.05})
+    threads = [
+        {"group": ensembles.THREADS, "n_runs": 10, "n_threads": n, "repeat": k, "wall": wall * (1.0 + 0.1 * k)}
+        for n, wall in ((1, 0.9), (2, 0.5))
+        for k in range(3)
+    ]
+    of_lanes = [
+        {"group": "lanes", "n_runs": 10, "n_lanes": 4, "message": "no compiler"},
+        {"group": "lanes", "n_runs": 10, "n_lanes": 8, "run_s": 1e-4, "operations": 1e6, "most": 4e10},
+    ]
+    found, text = said(ensembles, pd.concat([table, pd.DataFrame([*threads, *of_lanes])], ignore_index=True))
+    assert [round(each["gain"], 6) for each in found["threads"]] == [1.0, 1.8]
+    assert found["lanes"][0] == {"n": 4, "message": "no compiler"}
+    assert found["lanes"][1]["share"] == pytest.approx(0.25)
+    assert "25 %" in text and "no compiler" in text and "1.8" in text
+
+
+def test_threads_and_lanes_are_measured():
+    made = list(ensembles.on_threads(ensembles.linkages(9, T_END), True))
+    assert [row["n_threads"] for row in made] == list(range(1, len(made) + 1)) and all(row["wall"] > 0 for row in made)
+    (row,) = ensembles.lanes.rows(9, True)
+    assert row["run_s"] > 0.0 and 1e5 < row["operations"] < 1e8 and row["operations"] < row["most"] * row["run_s"]
+
+
+def test_operations_are_counted_block_by_block():
+    """A loop of three operations on two numbers, of which one is fused: four on each, and one before it."""
+    fma = "@llvm.fma.v2f64"
+    text = f"""declare <2 x double> {fma}(<2 x double>, <2 x double>, <2 x double>)
+define void @looped(i64 %n, double* %x) noinline {{
+b0:
+ %0 = bitcast double* %x to <2 x double>*
+ %1 = load <2 x double>, <2 x double>* %0, align 8
+ %2 = fmul contract <2 x double> %1, %1
+ br label %b1
+b1:
+ %3 = phi i64 [0, %b0], [%5, %b1]
+ %4 = phi <2 x double> [%2, %b0], [%8, %b1]
+ %5 = add i64 %3, 1
+ %6 = fsub <2 x double> %4, %1
+ %7 = fdiv <2 x double> %6, %1
+ %8 = call <2 x double> {fma}(<2 x double> %7, <2 x double> %1, <2 x double> %1)
+ %9 = icmp slt i64 %5, %n
+ br i1 %9, label %b1, label %b2
+b2:
+ store <2 x double> %8, <2 x double>* %0, align 8
+ ret void
+}}
+"""
+    made = operations.compiled(["looped", operations.COUNT], operations.counting(text))
+    count, x = operations.count_of(made), np.array([1.0, 2.0])
+    call = ctypes.CFUNCTYPE(None, ctypes.c_int64, ctypes.c_void_p)(made.addresses["looped"])
+    for n in (1, 5):
+        before = count()
+        call(n, x.ctypes.data)
+        assert count() - before == 2 + 8 * n
 
 
 def test_linkages_are_put_together_and_run():

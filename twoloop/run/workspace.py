@@ -25,7 +25,7 @@ from twoloop.kernels.data.flags import (
 from twoloop.kernels.data.kit import Kit
 from twoloop.kernels.evaluation.operations import N_NODES
 from twoloop.kernels.layout import lasting, make_work, short_loops
-from twoloop.kernels.steps.named_step import at_hand, loaded
+from twoloop.kernels.steps.named_step import LOADED, at_hand, loaded
 from twoloop.methods.plan import Plan
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.static_form import StaticForm
@@ -114,18 +114,18 @@ def kit_with(system: ConstrainedSystem, flags: Array, plan: Plan) -> Kit:
     """The callbacks with these flags, and what a plan calls; kept with the system for the next run."""
     from twoloop.kernels.evaluation.calls import inner_loop
 
-    called = (plan.inner or inner_loop, *_steps_of(plan))
     read = (plan.numbers, plan.own_numbers)
     kept: dict[Any, tuple[Kit, Any]] = system.remembered("kits", dict)
     # what it names by numbers is held by what is kept
-    key = (id(system.functions), flags.tobytes(), *called, plan.instead, *map(id, (*plan.own, *read)))
+    called = (plan.inner, plan.step, plan.first, plan.second, plan.instead)
+    key = (id(system.functions), flags.tobytes(), *called, len(LOADED), *map(id, (*plan.own, *read)))
     changes = flags[FORM] == AUGMENTED  # which a run may
     if key in kept:
         return _with_own_flags(kept[key][0]) if changes else kept[key][0]
     flags = flags.copy()
     flags[STRAIGHT] = plan.inner is not None
     functions = system.functions._replace(flags=flags)
-    made = Kit(functions, *called, inner_loop, plan.instead, plan.own, *read)
+    made = Kit(functions, plan.inner or inner_loop, *_steps_of(plan), inner_loop, plan.instead, plan.own, *read)
     if len(kept) == MOST_KITS:
         del kept[next(iter(kept))]
     kept[key] = made, system.functions

@@ -1,6 +1,5 @@
 """Steps by their names: the module of one is imported, and with that compiled or loaded, when a run needs it."""
 
-import sys
 from importlib import import_module
 from typing import Any, NamedTuple
 
@@ -13,28 +12,21 @@ class NamedStep(NamedTuple):
     module: str
     name: str
 
-    @property
-    def _path(self) -> str:
-        return f"{__package__}.{self.module}"
 
-    def loaded(self) -> Step:
-        """The step itself."""
-        step: Step = getattr(import_module(self._path), self.name)
-        return step
-
-    def at_hand(self) -> Step:
-        """The step itself if it is loaded, else one that asks for it."""
-        from twoloop.kernels.steps.asking_step import ASKING
-
-        step: Step = getattr(sys.modules.get(self._path), self.name, ASKING)
-        return step
+LOADED: dict[NamedStep, Step] = {}
 
 
 def loaded(step: Any) -> Any:
     """A step that may be given by its name."""
-    return step.loaded() if isinstance(step, NamedStep) else step
+    if isinstance(step, NamedStep) and step not in LOADED:
+        LOADED[step] = getattr(import_module(f"{__package__}.{step.module}"), step.name)
+    return at_hand(step)
 
 
 def at_hand(step: Any) -> Any:
-    """The same of a step that a run may not come to."""
-    return step.at_hand() if isinstance(step, NamedStep) else step
+    """The same without loading it: in its place one that asks for it."""
+    if not isinstance(step, NamedStep):
+        return step
+    from twoloop.kernels.steps.asking_step import ASKING
+
+    return LOADED.get(step, ASKING)

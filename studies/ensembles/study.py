@@ -12,7 +12,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from references.driver import user_call
-from references.equations.many_at_once import by_cyrk, by_diffrax, by_heyoka
+from references.equations.many_at_once import by_cvode, by_cyrk, by_diffrax, by_heyoka, by_heyoka_ensemble
 from references.paper.four_bar_minimal import MinimalFourBar
 from studies.bench import figures, tables
 from studies.bench.cli import StudyError, processor
@@ -21,30 +21,37 @@ from studies.bench.names import label
 from studies.bench.store import Array, Output
 from studies.bench.study import Study
 from studies.bench.takes import SCATTER
+from studies.ensembles import lanes
 from studies.sweep_linkages.study import drawn, linkage
 from twoloop import consistent_states, ensemble, mechanisms, solve_dae
+from twoloop.ensembles.in_lanes import threads_of
 from twoloop.mechanisms import Problem
 
 Solve = Callable[[float], Array]  # tolerance -> q at the end (n_runs, n_q), NaN of what failed
 
-GROUP, GEOMETRY = "many", "random linkages"
+GROUP, GEOMETRY, THREADS = "many", "random linkages", "threads"
 TOLERANCES, QUICK_TOLERANCES = tuple(float(f"1e-{k}") for k in range(4, 12)), (1e-6, 1e-9)
 BETWEEN = (1e-3, *(float(f"3e-{k}") for k in range(4, 12)))  # of ways whose error leaps from one of these to the next
 ERRORS = (1e-4, 1e-6, 1e-8)  # of the worst of the runs, at which ways are compared
 USUAL = 1e-8  # tolerances of an ensemble that is given none
 TIGHT, AGREE = 1e-12, 1e-8  # tolerance of references, and how far two unlike methods may end apart with it
 ENSEMBLE, SINGLE, HEYOKA, DIFFRAX = "ensemble", "solve_dae, compiled, one by one", "heyoka, batches", "diffrax, vmap"
-CYRK = "CyRK, DOP853, one by one"
+CYRK, CVODE = "CyRK, DOP853, one by one", "CVODE from C, Adams, one by one"
+PROPAGATE = "heyoka, ensemble_propagate"
 # whose colour and marker each has: solver, family, whether it keeps the constraints
 LOOKS: dict[str, tuple[str, str, bool]] = {
     ENSEMBLE: ("Taylor, compiled", "two-loop", True),
     SINGLE: ("auto, compiled", "two-loop", True),
     HEYOKA: ("heyoka", "heyoka", False),
+    PROPAGATE: ("heyoka, minimal coordinates", "heyoka", False),
     CYRK: ("CyRK, DOP853", "CyRK", False),
+    CVODE: ("CVODE from C, Adams", "SUNDIALS", False),
     DIFFRAX: ("Dopri8, diffrax", "diffrax", False),
 }
 OWN, WAYS, LEAPING = (ENSEMBLE, SINGLE), tuple(LOOKS), (ENSEMBLE, HEYOKA)
-RIVALS = {HEYOKA: "heyoka's batches", CYRK: "CyRK, one run after another", DIFFRAX: "diffrax (on linkages only)"}
+RIVALS = {HEYOKA: "heyoka's batches", PROPAGATE: "heyoka's ensemble_propagate"}
+RIVALS |= {way: f"{package}, one run after another" for way, package in ((CYRK, "CyRK"), (CVODE, "CVODE"))}
+RIVALS |= {DIFFRAX: "diffrax (on linkages only)"}
 LINKAGES = "random four-bar linkages"
 # mechanisms whose runs differ by their velocities at the start, and how long they run
 STARTS = {"andrews": 0.03, "spatial_slider_crank": 2.0, "redundant_slider_crank": 2.0}
@@ -115,13 +122,13 @@ def one_by_one(problems: Sequence[Problem], t_end: float, method: str = "auto") 
     return solve
 
 
-def in_lanes(problems: Sequence[Problem], t_end: float, method: str = "auto") -> Solve:
-    """Runs by one call of `ensemble` on one thread, by the default or another method."""
+def in_lanes(problems: Sequence[Problem], t_end: float, method: str = "auto", threads: int = 1) -> Solve:
+    """Runs by one call of `ensemble`, by the default or another method."""
     system, p = problems[0].system, np.array([each.system.parameters for each in problems])
     q, v = (np.array([getattr(each, name) for each in problems]) for name in ("q0", "v0"))
 
     def solve(tol: float) -> Array:
-        given: dict[str, Any] = {"rtol": tol, "atol": tol, "t_eval": [t_end], "threads": 1, "method": method}
+        given: dict[str, Any] = {"rtol": tol, "atol": tol, "t_eval": [t_end], "threads": threads, "method": method}
         return ensemble(system, (0.0, t_end), q, v, parameters=p if p.size else None, **given).q[:, :, -1]
 
     return solve
@@ -133,7 +140,9 @@ def ways(of: Ensemble) -> dict[str, Callable[[], Solve]]:
         ENSEMBLE: lambda: in_lanes(of.problems, of.t_end),
         SINGLE: lambda: one_by_one(of.problems[:N_SINGLE], of.t_end),
         HEYOKA: lambda: by_heyoka(of.problems, of.t_end),
+        PROPAGATE: lambda: by_heyoka_ensemble(of.problems, of.t_end),
         CYRK: lambda: by_cyrk(of.problems[:N_SINGLE], of.t_end),
+        CVODE: lambda: by_cvode(of.problems[:N_SINGLE], of.t_end),
         DIFFRAX: lambda: by_diffrax(of.problems, of.t_end),
     }
 
@@ -186,7 +195,20 @@ def with_geometry(n: int) -> dict[str, Any]:
         failed, singly = failed + int((~runs.success).sum()), singly + int(runs.singly.sum())
     spent = time.process_time() - spent
     wall = time.perf_counter() - began
-    return {"group": GEOMETRY, "n_runs": n, "wall": wall, "cpu": spent, "n_failed": failed, "n_singly": singly}
+    row = {"group": GEOMETRY, "n_runs": n, "n_threads": threads_of(None), "wall": wall, "cpu": spent}
+    return row | {"n_failed": failed, "n_singly": singly}
+
+
+def on_threads(of: Ensemble, quick: bool) -> Iterator[dict[str, Any]]:
+    """Wall-clock time of a run of linkages at the usual tolerances, on one thread and on more, in turn."""
+    solves = {n: in_lanes(of.problems, of.t_end, threads=n) for n in range(1, threads_of(None) + 1)}
+    for solve in solves.values():
+        solve(USUAL)
+    for repeat, (n, solve) in product(range(1 if quick else REPEATS), solves.items()):
+        began = time.perf_counter()
+        solve(USUAL)
+        wall = time.perf_counter() - began
+        yield {"group": THREADS, "n_runs": len(of.problems), "n_threads": n, "repeat": repeat, "wall": wall}
 
 
 def make(output: Output) -> pd.DataFrame:
@@ -196,8 +218,11 @@ def make(output: Output) -> pd.DataFrame:
     for each in sets[: 1 if quick else None]:
         made = each()
         # diffrax takes ten seconds to compile, and minutes for larger mechanisms
-        names = (ENSEMBLE, SINGLE, HEYOKA, CYRK, *((DIFFRAX,) if made.name == LINKAGES and not quick else ()))
-        rows += list(rows_of(made, names, quick))
+        rest = (DIFFRAX,) if made.name == LINKAGES and not quick else ()
+        rows += list(rows_of(made, (ENSEMBLE, SINGLE, HEYOKA, PROPAGATE, CYRK, CVODE, *rest), quick))
+        if made.name == LINKAGES:
+            rows += list(on_threads(made, quick))
+    rows += lanes.rows(n, quick)
     with_geometry(N_QUICK)  # compiles what is not on disk
     rows += [with_geometry(n) for n in (N_GEOMETRY_QUICK if quick else N_GEOMETRY)]
     return pd.DataFrame(rows).assign(processor=processor())
@@ -240,7 +265,32 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     found["verdicts"] = {name: sum(line["verdict"] == name for line in lines) for name in names}
     geometry = rows[rows["group"] == GEOMETRY]
     found["refused"] = rows.reindex(columns=["way", "case", "message"]).dropna().to_dict("records")
-    found["geometry"] = geometry[["n_runs", "wall", "cpu", "n_failed", "n_singly"]].to_dict("records")
+    known = ["n_runs", "n_threads", "wall", "cpu", "n_failed", "n_singly"]
+    found["geometry"] = geometry.reindex(columns=known).fillna({"n_threads": 1}).to_dict("records")
+    found |= {"threads": _scaling(rows), "lanes": _of_lanes(rows)}
+    return found
+
+
+def _scaling(rows: pd.DataFrame) -> list[dict[str, float]]:
+    """Wall-clock time of a run on so many threads, s, and how many times as fast that is as one."""
+    made = rows[rows["group"] == THREADS]
+    if made.empty:
+        return []
+    times = (made["wall"] / made["n_runs"]).groupby(made["n_threads"]).median()
+    return [{"n": int(n), "run_s": time, "gain": times.iloc[0] / time} for n, time in times.items()]
+
+
+def _of_lanes(rows: pd.DataFrame) -> list[dict[str, Any]]:
+    """CPU time of a run in so many lanes, s, the operations of that, a second and as a share of the core's peak."""
+    made = rows[rows["group"] == lanes.GROUP].reindex(columns=["n_lanes", "run_s", "operations", "most", "message"])
+    found = []
+    for line in made.to_dict("records"):
+        if pd.isna(line["run_s"]):
+            found.append({"n": int(line["n_lanes"]), "message": line["message"]})
+            continue
+        rate = line["operations"] / line["run_s"]
+        of_line = {"n": int(line["n_lanes"]), "run_s": line["run_s"], "operations": line["operations"]}
+        found.append(of_line | {"rate": rate, "most": line["most"], "share": rate / line["most"]})
     return found
 
 

@@ -1,0 +1,3 @@
+from studies.ensembles.study import STUDY
+
+STUDY.main()
