@@ -101,6 +101,7 @@ class Again:
         self.t, self.rows = np.empty(room + 1), np.empty((room + 1, len(run.state)))
         self.steps = np.empty((room, run.a.N_STEP_COLUMNS))
         self.looks: Looks | None = None  # of a run of several chunks
+        self.loading = 0.0  # CPU time of a step that a run came to, s
         self.kinds, self.between = np.empty(room, dtype=np.int64), Between(run)
         loops = short_loops()
         self._go, self._tell, self.going = direct(loops.go), direct(loops.tell), self._going(loops)
@@ -165,7 +166,7 @@ class Again:
         if between is not None and code == a.ALL_OUTPUT_DONE:
             parts = self.t[:n_states], self.rows[:n_states], self.kinds[:n_steps]
             self.between.find(between, *parts, self.look.pattern)
-        spent = time.process_time() - began
+        spent = time.process_time() - began - self.loading
         t, rows = self.t[:n_states], self.rows[:n_states]
         turns = turned and output.times is None and (nearly == 1.0 or not run.plan.watchful)
         special = turns or run.crossings or pivot < run.near
@@ -215,7 +216,7 @@ class Again:
     def _steps_to(self, t1: float, with_kinds: bool, until: float) -> int:
         """How the steps end; what is told of them stands in `going`."""
         run, going, a = self.run, self.going, self.run.a
-        self.looks = None
+        self.looks, self.loading = None, 0.0
         try:
             code: int = self._go(run.kit, run.work, going, t1, TURNED, self.territory.known)
             n_rows, n_steps = going.filled.tolist()
@@ -255,9 +256,14 @@ class Again:
                 give_way(run)
                 plan, control, kit = run.plan, run.control, run.kit
             elif code == a.HAS_TO_LOAD:
+                began = time.process_time()
                 load(run)
+                self.loading = time.process_time() - began
+                until += self.loading
                 kit = run.kit
-                if not run.substituted:
+                if run.substituted or kit.flags[flags.FORM] != self.flags[flags.FORM]:
+                    run.substituted = True  # this kit is not for a start
+                else:
                     self.kit = kit
             elif code == a.NEAR_SINGULAR:
                 plan, control = bridge(run)

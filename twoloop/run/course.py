@@ -198,9 +198,9 @@ class Course:
                 self.code = STAGNATED
         if spent < CHUNK_TIME:
             run.chunk = min(2 * run.chunk, self.largest_chunk)
-        if self.code == a.PAUSED and time.monotonic() > self.deadline:
+        if self.code in (a.PAUSED, a.HAS_TO_LOAD) and time.monotonic() > self.deadline:
             self.code = OUT_OF_TIME
-        if self.code == a.PAUSED and (self.interrupts.asked or self.recorder.interrupted):
+        if self.code in (a.PAUSED, a.HAS_TO_LOAD) and (self.interrupts.asked or self.recorder.interrupted):
             self.code = INTERRUPTED
 
     def _go_on(self, across: bool, n_steps: int) -> None:
@@ -213,7 +213,9 @@ class Course:
             give_way(run)
             self.plan, self.control, self.kit, self.code = run.plan, run.control, run.kit, a.PAUSED
         elif self.code == a.HAS_TO_LOAD:
+            began = time.monotonic()
             load(run)
+            self.deadline += time.monotonic() - began  # compilation does not count
             self.kit, self.code = run.kit, a.PAUSED
         elif self.code == a.AT_JUMP and not across and leap(run, self.t1):
             self.code = a.PAUSED

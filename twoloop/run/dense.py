@@ -14,6 +14,7 @@ from twoloop.kernels.compile.linking import direct
 from twoloop.kernels.data import codes, noted
 from twoloop.kernels.data import intervals as names
 from twoloop.kernels.data.tolerances import ATOL, RTOL
+from twoloop.kernels.steps.named_step import loaded
 from twoloop.methods.plan import INNER_TOL, Plan
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.run.static_form import static_form
@@ -100,6 +101,8 @@ class Interpolator:
         """The workspace, and what is called with it."""
         system, t0, row = self.made_of[:3]
         q0, static = row[: system.n_q], self.static
+        for plan in self.plans.values():
+            loaded(plan.second)  # a kit is to serve as long as the solution
         self.kits = {kind: kit_of(system, t0, q0, plan, static) for kind, plan in self.plans.items()}
         self.kit = kit_of(system, t0, q0, None, static)
         pattern = pattern_of(system, t0, q0) if static is None else np.zeros((0, 0))

@@ -1,4 +1,4 @@
-"""What goes on where a run's own steps cannot: another plan, steps across a singular position or over a jump."""
+"""What goes on where a run's own steps cannot: another plan, a step to load, one across what is singular, a jump."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +24,7 @@ def give_way(run: Run) -> None:
     substitute = run.plan.substitute
     assert substitute is not None
     run.plan, run.memory = substitute.fresh(), substitute.memory  # in which no run writes
-    _call_anew(run)
+    _renew_kit(run)
     run.substituted = True
     run.control_by(run.plan)
     run.limit_steps()
@@ -36,10 +36,10 @@ def give_way(run: Run) -> None:
 def load(run: Run) -> None:
     """Load the step that a run has come to."""
     loaded(run.plan.second)
-    _call_anew(run)
+    _renew_kit(run)
 
 
-def _call_anew(run: Run) -> None:
+def _renew_kit(run: Run) -> None:
     """Have kernels call what the run's plan names now."""
     if run.static is None:
         run.kit = kit_with(run.system, run.functions.flags, run.plan)

@@ -15,7 +15,7 @@ from twoloop.kernels.control.controller import N_PAST, N_RULE
     HAS_TO_GIVE_WAY,
     AT_JUMP,  # of C_t or b; the caller is to put the state beyond it into new_state
     HAS_TO_BE_DENSE,  # the static form cannot decide what it was asked
-    HAS_TO_LOAD,  # the step that is due; nothing has changed
+    HAS_TO_LOAD,  # the step that is due, which is then tried again
 ) = range(12)
 GO_ON = -1  # nothing of these yet
 

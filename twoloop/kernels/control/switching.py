@@ -23,7 +23,7 @@ from numpy.typing import ArrayLike, NDArray
 from twoloop.kernels.algebra.linalg import copy
 from twoloop.kernels.control.controller import ERROR_BEFORE, H_BEFORE, LEAST_ERROR, N_PAST, N_RULE, factor_of
 from twoloop.kernels.control.directions import DISPLACEMENT, INNER_TOL, first_direction
-from twoloop.kernels.data.codes import DONE, OUTER_DIVERGED
+from twoloop.kernels.data.codes import DONE, NOT_LOADED, OUTER_DIVERGED
 from twoloop.kernels.data.common import ATTEMPT, SETTLE, Attempt, Step, compiled, inlined, kernel, merged
 from twoloop.kernels.data.counters import N_EVALUATIONS, N_JACOBIANS
 from twoloop.kernels.data.flags import FORCE_BY_Q_GIVEN, FORM, STATIC, STRAIGHT
@@ -366,6 +366,8 @@ def switching_step(f, w, options, memory, t, h, tolerances, state, new_state):
         if longer > 0.0:
             return Attempt(DONE, longer, 1.0 / longer)
         code, error, factor = f.attempt_second(f, w, options[begin:], second, t, h, tolerances, state, new_state)
+    if code == NOT_LOADED:
+        return Attempt(code, error, 0.0)
     memory[H_MEAN] = MEAN * memory[H_MEAN] + (1.0 - MEAN) * h
     if code != DONE or not np.isfinite(error):
         return Attempt(code, error, 0.0)

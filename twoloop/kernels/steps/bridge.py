@@ -29,6 +29,7 @@ from twoloop.kernels.steps.explicit_step import (
     tableau_of,
 )
 
+STRICT = True  # of the estimate
 NEARER = 0.5  # of the smallest pivot at the start of a step, which there must be at its end
 
 
@@ -58,7 +59,7 @@ def bridging_step(f, w, options, memory, t, h, tolerances, state, new_state):
     _move(y, h, b, slopes, stage, y1)
     error = 0.0
     if tolerances[ESTIMATE] == 1.0:
-        error = _error(tolerances, h, fine, coarse, y, y1, slopes, one, other, True)
+        error = _error(tolerances, h, fine, coarse, y, y1, slopes, one, other, STRICT)
         if not error <= 1.0:
             return Attempt(DONE, error, 0.0)
     code = renew_partition(f, w, t + h, q1)

@@ -119,7 +119,7 @@ def largest_error(tolerances, y, y1, one, other, strict):
 
     Each is an estimate over atol + rtol |y|. Taken component by component e^2 / sqrt(e^2 + d^2) would be e, of low
     order, where d passes through zero: up to 30 % more evaluations. If `strict`, e^(3/2) / (e^2 + d^2)^(1/4): near a
-    singular position orders fall off slowly, and 1.4 tolerances were estimated where 47 were lost.
+    singular position terms of high order are not small, and 1.4 tolerances were estimated where 47 were lost.
     """
     n = one.size // 2
     rtol = tolerances[RTOL]
