@@ -3,11 +3,15 @@
 from __future__ import annotations  # ArrayLike stays a word in help()
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from copy import copy
+from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from twoloop.checks.arguments import Array, check_finite, check_indices
+from twoloop.ensembles.in_lanes import threads_of
 from twoloop.ensembles.starts import (
     AT_ROUNDING,
     Starts,
@@ -29,7 +33,7 @@ MOST_ITERATIONS = 12
 STRAIGHT = 0.25  # of a displacement: how far its projection may end from where C_q sends it
 SINGULAR = 1e-12  # smallest eigenvalue of G G^T, rows of length 1, that counts ...
 LEAST = 1e-15  # ... and what is added to it, so that it has an inverse
-AT_ONCE = 2000  # guesses whose matrices are in memory together
+LEAST_AT_ONCE, AT_ONCE = 250, 2000  # guesses whose matrices are in memory together, in each thread
 
 
 def consistent_states(
@@ -74,13 +78,20 @@ def consistent_states(
     kept = [] if keep is None else check_indices("keep", keep, system.n_q)
     fine = np.zeros(len(starts.q), dtype=bool)
     made_q, made_v = starts.q.copy(), starts.v.copy()
-    for begin in range(0, len(fine), AT_ONCE):
-        rows = slice(begin, begin + AT_ONCE)
-        part = Starts(t, starts.q[rows], starts.v[rows], starts.parameters[rows])
-        try:
-            made_q[rows], made_v[rows], fine[rows] = _together(system, part, kept)
-        except Untraceable:
-            break
+    try:
+        rows = _Rows(system, starts, [j for j in range(system.n_q) if j not in kept])
+    except Untraceable:
+        rows = None
+
+    def block(which: slice) -> None:
+        assert rows is not None
+        made_q[which], made_v[which], fine[which] = _together(rows.part(which))
+
+    threads = threads_of(None)
+    size = int(np.clip(-(-len(fine) // threads), LEAST_AT_ONCE, AT_ONCE))
+    blocks = [] if rows is None else [slice(begin, begin + size) for begin in range(0, len(fine), size)]
+    with ThreadPoolExecutor(threads) as pool:  # NumPy does not hold the GIL where it computes
+        list(pool.map(block, blocks))
     # of others compiled callbacks may go out of the bounds of their arrays, which single calls look at
     traced = np.flatnonzero(fine)
     made = Starts(t, made_q[traced], made_v[traced], starts.parameters[traced])
@@ -94,12 +105,12 @@ def consistent_states(
     return made_q, made_v
 
 
-def _together(system: ConstrainedSystem, starts: Starts, kept: list[int]) -> tuple[Array, Array, NDArray[np.bool_]]:
+def _together(equations: _Rows) -> tuple[Array, Array, NDArray[np.bool_]]:
     """Positions and velocities, and which of them may be taken."""
-    equations = _Rows(system, starts, [j for j in range(system.n_q) if j not in kept])
-    q, fine = equations.gauss_newton(starts.q)
-    fine &= equations.on_one_assembly(q, q - starts.q)
-    v = starts.v.copy()
+    guesses = equations.starts
+    q, fine = equations.gauss_newton(guesses.q)
+    fine &= equations.on_one_assembly(q, q - guesses.q)
+    v = guesses.v.copy()
     G, rate = equations.of("jacobian", q), equations.of("constraint_rate", q)
     for _ in range(2):  # once more for what rounding of a large change leaves
         v[:, equations.free] += _least_change(G[:, :, equations.free], -(np.einsum("rij,rj->ri", G, v) + rate))
@@ -120,12 +131,22 @@ class _Rows:
             "jacobian": equations.of("jacobian"),
             "constraint_rate": equations.of("constraint_rate"),
         }
-        self._arrays = OnArrays(equations.graph, record, starts.parameters)
-        self.t, self.v, self.free = starts.t0, starts.v, free
+        self._make = partial(OnArrays, equations.graph, record)
+        self.free = free
+        self._take(starts)
+
+    def _take(self, starts: Starts) -> None:
+        self.starts, self._arrays = starts, self._make(starts.parameters)
+
+    def part(self, which: slice) -> _Rows:
+        """The same of some of the guesses."""
+        other, all_of = copy(self), self.starts
+        other._take(Starts(all_of.t0, all_of.q[which], all_of.v[which], all_of.parameters[which]))
+        return other
 
     def of(self, kind: str, q: Array) -> Array:
         """Values at positions (n_runs, n_q)."""
-        return self._arrays.evaluate([self._forms[kind]], self.t, q, self.v)[0]
+        return self._arrays.evaluate([self._forms[kind]], self.starts.t0, q, self.starts.v)[0]
 
     def gauss_newton(self, q: Array) -> tuple[Array, NDArray[np.bool_]]:
         """Positions on the constraints, each by steps of least change, and which of them are there."""
