@@ -122,13 +122,13 @@ def one_by_one(problems: Sequence[Problem], t_end: float, method: str = "auto") 
     return solve
 
 
-def in_lanes(problems: Sequence[Problem], t_end: float, method: str = "auto", threads: int = 1) -> Solve:
-    """Runs by one call of `ensemble`, by the default or another method."""
+def in_lanes(problems: Sequence[Problem], t_end: float, method: str = "auto") -> Solve:
+    """Runs by one call of `ensemble` on one thread, by the default or another method."""
     system, p = problems[0].system, np.array([each.system.parameters for each in problems])
     q, v = (np.array([getattr(each, name) for each in problems]) for name in ("q0", "v0"))
 
     def solve(tol: float) -> Array:
-        given: dict[str, Any] = {"rtol": tol, "atol": tol, "t_eval": [t_end], "threads": threads, "method": method}
+        given: dict[str, Any] = {"rtol": tol, "atol": tol, "t_eval": [t_end], "threads": 1, "method": method}
         return ensemble(system, (0.0, t_end), q, v, parameters=p if p.size else None, **given).q[:, :, -1]
 
     return solve
@@ -184,13 +184,19 @@ def _timed(solve: Solve, tol: float) -> tuple[float, Array]:
     return spent if user_call.seconds is None else user_call.seconds, ends
 
 
+def varied(n: int, random: np.random.Generator) -> tuple[Array, Array, Array]:
+    """Lengths of n linkages about those of the four-bar, and where each starts."""
+    problem = mechanisms.four_bar()
+    p = problem.system.parameters * (1.0 + SPREAD * random.uniform(-1.0, 1.0, (n, 4)))
+    return p, *consistent_states(problem.system, 0.0, problem.q0, problem.v0, parameters=p, keep=[8])
+
+
 def with_geometry(n: int) -> dict[str, Any]:
     """Linkages with slightly different lengths: assembled and run, in blocks, on all cores; the total time."""
-    problem, random = mechanisms.four_bar(), np.random.default_rng(11)
-    system, began, failed, singly, spent = problem.system, time.perf_counter(), 0, 0, time.process_time()
+    system, random = mechanisms.four_bar().system, np.random.default_rng(11)
+    began, failed, singly, spent = time.perf_counter(), 0, 0, time.process_time()
     for first in range(0, n, BLOCK):
-        p = system.parameters * (1.0 + SPREAD * random.uniform(-1.0, 1.0, (min(BLOCK, n - first), 4)))
-        q, v = consistent_states(system, 0.0, problem.q0, problem.v0, parameters=p, keep=[8])
+        p, q, v = varied(min(BLOCK, n - first), random)
         runs = ensemble(system, (0.0, SPAN), q, v, parameters=p)
         failed, singly = failed + int((~runs.success).sum()), singly + int(runs.singly.sum())
     spent = time.process_time() - spent
@@ -199,16 +205,18 @@ def with_geometry(n: int) -> dict[str, Any]:
     return row | {"n_failed": failed, "n_singly": singly}
 
 
-def on_threads(of: Ensemble, quick: bool) -> Iterator[dict[str, Any]]:
-    """Wall-clock time of a run of linkages at the usual tolerances, on one thread and on more, in turn."""
-    solves = {n: in_lanes(of.problems, of.t_end, threads=n) for n in range(1, threads_of(None) + 1)}
-    for solve in solves.values():
-        solve(USUAL)
-    for repeat, (n, solve) in product(range(1 if quick else REPEATS), solves.items()):
+def on_threads(n: int, quick: bool) -> Iterator[dict[str, Any]]:
+    """Wall-clock time of such linkages at the usual tolerances, without their starts, on one thread and on more."""
+    system, (p, q, v) = mechanisms.four_bar().system, varied(n, np.random.default_rng(11))
+    numbers = range(1, threads_of(None) + 1)
+    for repeat, threads in product(
+        range(-1, 1 if quick else REPEATS), numbers
+    ):  # in turn; the first calls do not count
         began = time.perf_counter()
-        solve(USUAL)
+        ensemble(system, (0.0, SPAN), q, v, parameters=p, threads=threads)
         wall = time.perf_counter() - began
-        yield {"group": THREADS, "n_runs": len(of.problems), "n_threads": n, "repeat": repeat, "wall": wall}
+        if repeat >= 0:
+            yield {"group": THREADS, "n_runs": n, "n_threads": threads, "repeat": repeat, "wall": wall}
 
 
 def make(output: Output) -> pd.DataFrame:
@@ -220,9 +228,8 @@ def make(output: Output) -> pd.DataFrame:
         # diffrax takes ten seconds to compile, and minutes for larger mechanisms
         rest = (DIFFRAX,) if made.name == LINKAGES and not quick else ()
         rows += list(rows_of(made, (ENSEMBLE, SINGLE, HEYOKA, PROPAGATE, CYRK, CVODE, *rest), quick))
-        if made.name == LINKAGES:
-            rows += list(on_threads(made, quick))
     rows += lanes.rows(n, quick)
+    rows += list(on_threads(N_GEOMETRY_QUICK[0] if quick else N_GEOMETRY[0], quick))
     with_geometry(N_QUICK)  # compiles what is not on disk
     rows += [with_geometry(n) for n in (N_GEOMETRY_QUICK if quick else N_GEOMETRY)]
     return pd.DataFrame(rows).assign(processor=processor())
@@ -277,7 +284,8 @@ def _scaling(rows: pd.DataFrame) -> list[dict[str, float]]:
     if made.empty:
         return []
     times = (made["wall"] / made["n_runs"]).groupby(made["n_threads"]).median()
-    return [{"n": int(n), "run_s": time, "gain": times.iloc[0] / time} for n, time in times.items()]
+    n_runs = int(made["n_runs"].iloc[0])
+    return [{"n": int(n), "n_runs": n_runs, "run_s": each, "gain": times.iloc[0] / each} for n, each in times.items()]
 
 
 def _of_lanes(rows: pd.DataFrame) -> list[dict[str, Any]]:

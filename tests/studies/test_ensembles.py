@@ -134,7 +134,7 @@ def test_a_package_that_is_not_there_is_a_row(monkeypatch, few):
 def test_rows_have_their_processor(monkeypatch):
     made = rows(**{ENSEMBLE: 0.01, HEYOKA: 0.05}).to_dict("records")
     monkeypatch.setattr(ensembles, "rows_of", lambda of, names, quick: made[:-1])
-    monkeypatch.setattr(ensembles, "on_threads", lambda of, quick: [])
+    monkeypatch.setattr(ensembles, "on_threads", lambda n, quick: [])
     monkeypatch.setattr(ensembles.lanes, "rows", lambda n, quick: [])
     monkeypatch.setattr(ensembles, "with_geometry", lambda n: made[-1])
     table = ensembles.make(SimpleNamespace(call=SimpleNamespace(quick=True)))
@@ -175,7 +175,7 @@ def test_scaling_follows_the_rows():
 
 
 def test_threads_and_lanes_are_measured():
-    made = list(ensembles.on_threads(ensembles.linkages(9, T_END), True))
+    made = list(ensembles.on_threads(300, True))
     assert [row["n_threads"] for row in made] == list(range(1, len(made) + 1)) and all(row["wall"] > 0 for row in made)
     (row,) = ensembles.lanes.rows(9, True)
     assert row["run_s"] > 0.0 and 1e5 < row["operations"] < 1e8 and row["operations"] < row["most"] * row["run_s"]
