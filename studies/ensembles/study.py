@@ -50,7 +50,7 @@ LOOKS: dict[str, tuple[str, str, bool]] = {
 }
 OWN, WAYS, LEAPING = (ENSEMBLE, SINGLE), tuple(LOOKS), (ENSEMBLE, HEYOKA)
 RIVALS = {HEYOKA: "heyoka's batches", PROPAGATE: "heyoka's ensemble_propagate"}
-RIVALS |= {way: f"{package}, one run after another" for way, package in ((CYRK, "CyRK"), (CVODE, "CVODE"))}
+RIVALS |= {way: f"{package} one run at a time" for way, package in ((CYRK, "CyRK"), (CVODE, "CVODE"))}
 RIVALS |= {DIFFRAX: "diffrax (on linkages only)"}
 LINKAGES = "random four-bar linkages"
 # mechanisms whose runs differ by their velocities at the start, and how long they run

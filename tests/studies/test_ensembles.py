@@ -82,7 +82,7 @@ def test_sentences_follow_the_rows():
     )
     assert "ahead on" not in text
     _, text = said(ensembles, rows(**{ENSEMBLE: 0.1, SINGLE: 0.01, HEYOKA: 0.05, CYRK: 0.07}))
-    assert f"heyoka's batches and CyRK, one run after another in 0, behind in {n} and undecided in 0 of {n}" in text
+    assert f"heyoka's batches and CyRK one run at a time in 0, behind in {n} and undecided in 0 of {n}" in text
     assert "`heyoka, batches` is ahead on" in text and "1 of the 1 mechanisms, at errors of 1e-4, 1e-6 and 1e-8" in text
     assert "with 0.50 of the time." in text and "10,000 four-bar linkages" in text and "none failed" in text
 
