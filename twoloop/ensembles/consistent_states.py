@@ -48,8 +48,8 @@ def consistent_states(
     """Project many guesses onto the constraints, each by the least change, as `consistent_state` does with one.
 
     Guesses that are near the constraints are moved together, by Gauss-Newton on the equations that the callbacks were
-    traced to; each result is compared with what the callbacks themselves say. The others, and systems with nonholonomic
-    rows or whose callbacks cannot be traced, go through `consistent_state` one by one.
+    traced to, on all cores; each result is compared with what the callbacks themselves say. The others, and systems
+    with nonholonomic rows or whose callbacks cannot be traced, go through `consistent_state` one by one.
 
     Parameters
     ----------
