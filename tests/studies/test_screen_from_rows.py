@@ -5,11 +5,11 @@ from dataclasses import replace
 
 import pytest
 
-from studies import ensembles
 from studies.beam import study as beam
 from studies.bench import index, study
 from studies.bench.cli import REPORTS, ROOT
 from studies.energy import study as energy
+from studies.ensembles import study as ensembles
 from studies.honesty import study as honesty
 from studies.robustness import study as robustness
 from studies.table3 import study as table3
