@@ -60,3 +60,55 @@ for thread in threads: thread.join()
 print(len(ends), len(set(ends)), ends[0][:2])
 """
     assert run_python(source).stdout.split("\n")[0] == "4 1 (True, True)"
+
+
+def test_a_solution_between_steps_is_the_same_before_and_after_the_method_is_loaded():
+    """Its pieces may come to the implicit method, too, as long as the solution lasts: a rod of 1e9 N/m."""
+    source = """
+import numpy as np
+from twoloop import ConstrainedSystem, RungeKutta, solve_dae
+from twoloop.methods.tableaux import gauss
+
+def force(t, q, v):
+    d = q[2:] - q[:2]
+    pull = 1e9 * (np.hypot(*d) - 1.0) / np.hypot(*d) * d
+    return np.concatenate([[0.0, -9.81] + pull, [0.0, -9.81] - pull])
+
+system = ConstrainedSystem.from_python(
+    n_q=4, n_c=1, mass=np.eye(4), force=force, constraint=lambda t, q: np.array([q[0] ** 2 + q[1] ** 2 - 1.0]),
+    jacobian=lambda t, q: np.array([[2.0 * q[0], 2.0 * q[1], 0.0, 0.0]]),
+)
+length = 2.0 + 0.8 * 9.81 / 1e9
+start = [0.6, -0.8, 0.6 * length, -0.8 * length], np.zeros(4)
+for _ in range(2):
+    method = RungeKutta(gauss(3), outer="auto")
+    result = solve_dae(system, (0.0, 0.02), *start, method, rtol=0.1, atol=0.1, dense_output=True)
+    print(result.status.name, result.sol(np.linspace(0.0, 0.02, 3001)).v.tobytes().hex()[-4000:])
+"""
+    first, second = run_python(source).stdout.splitlines()
+    assert first == second and first.startswith("REACHED_END")
+
+
+def test_loading_counts_neither_as_time_of_steps_nor_against_the_limit():
+    """As compilation may take a minute: here three seconds, the limit being two; steps take some milliseconds."""
+    source = """
+import time
+from twoloop import solve_dae
+from twoloop.kernels.steps import named_step
+from twoloop.mechanisms import governor
+
+problem, original = governor(), named_step.import_module
+
+def slow(name):
+    began = time.process_time()
+    while time.process_time() - began < 3.0:
+        pass
+    return original(name)
+
+named_step.import_module = slow
+for t1 in (1e-4, 1e-4, 0.3):  # the arrays of the first runs serve the last one
+    result = solve_dae(problem.system, (0.0, t1), problem.q0, problem.v0, rtol=1e-5, atol=1e-5, **{more})
+print(result.success, result.stats.n_jacobians > 0, result.stats.cpu_time < 1.5)
+"""
+    for more in ({}, {"time_limit": 2.0}):
+        assert run_python(source.replace("{more}", str(more))).stdout.split() == ["True", "True", "True"]
