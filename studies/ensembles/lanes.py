@@ -26,7 +26,7 @@ FEWER = (2, 4)  # than the processor's vectors hold: these are the number that i
 
 
 def row_of(n_lanes: int, n_runs: int) -> dict[str, Any]:
-    """The row of a number of lanes, from a process of its own; of the usual one, which has its kernels, with counts."""
+    """The row of a number of lanes, from a process of its own; the kernels of the usual number are there already."""
     environment = dict(os.environ)
     with tempfile.TemporaryDirectory(prefix="twoloop-lanes-") as folder:
         if n_lanes != lane_room.LANES:
