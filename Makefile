@@ -81,7 +81,7 @@ compile: install ## compile the kernels, and the callbacks of bodies, mechanisms
 	$(RUN) -c "from twoloop.kernels import advance, agreement, interpolation, short_loops; \
 	from twoloop.kernels.algebra import independent, pivots, scaling; from twoloop.kernels.control import switching; \
 	from twoloop.kernels.evaluation import first_look, traced; \
-	from twoloop.kernels.lanes import lane_dop853, lane_runs, lane_taylor; \
+	from twoloop.kernels.lanes import lane_dop853, lane_runs, lane_starts, lane_taylor; \
 	from twoloop.kernels.steps import adams_step, asking_step, bridge, canonical_step, explicit_step, \
 	fixed_point_step, newmark_step, paper_step, taylor_step" && wait $$!
 	@$(RUN) -c "from studies.bench import sharp_callbacks" & \

@@ -20,9 +20,9 @@ NAMES = ("four_bar", "spatial_slider_crank", "driven_slider_crank", "redundant_s
 @pytest.mark.parametrize("name", NAMES)
 def test_each_is_what_one_by_one_gives(name):
     problem = getattr(mechanisms, name)()
-    q, v = guesses(problem, 5)
+    q, v = guesses(problem, 19)
     made_q, made_v = consistent_states(problem.system, 0.1, q, v)
-    for run in range(5):
+    for run in (0, 7, 8, 18):
         own_q, own_v = consistent_state(problem.system, 0.1, q[run], v[run])
         assert np.abs(made_q[run] - own_q).max() < 1e-12 and np.abs(made_v[run] - own_v).max() < 1e-11
 
@@ -40,6 +40,33 @@ def test_parameters_of_their_own_and_coordinates_that_are_kept():
         known = consistent_state(own, 0.0, problem.q0, speeds, keep=[8])
         assert np.abs(q[run] - known[0]).max() < 1e-12 and np.abs(v[run] - known[1]).max() < 1e-11
         assert np.abs(own.constraint(0.0, q[run])).max() < 1e-14
+
+
+def test_lanes_take_those_that_are_near_and_none_depends_on_others(monkeypatch):
+    problem = mechanisms.spatial_four_bar()
+    q, v = guesses(problem, 300)
+
+    def singly(*arguments, **options):
+        raise AssertionError("a guess went by itself")
+
+    monkeypatch.setattr("twoloop.ensembles.consistent_states.consistent_state", singly)
+    monkeypatch.setattr("twoloop.ensembles.consistent_states.threads_of", lambda wanted: 2)
+    all_q, all_v = consistent_states(problem.system, 0.1, q, v)
+    monkeypatch.setattr("twoloop.ensembles.consistent_states.threads_of", lambda wanted: 1)
+    for some in (slice(0, 13), slice(5, 300)):
+        made_q, made_v = consistent_states(problem.system, 0.1, q[some], v[some])
+        assert (made_q == all_q[some]).all() and (made_v == all_v[some]).all()
+
+
+def test_few_guesses_are_not_worth_code(monkeypatch):
+    problem = mechanisms.four_bar()
+    q, v = guesses(problem, 2)
+    made = consistent_states(problem.system, 0.1, q, v)
+    monkeypatch.setattr("twoloop.ensembles.consistent_states.SINGLY", 0.0)
+    monkeypatch.setattr("twoloop.generate.own_lanes.are_kept", lambda *arguments: False)
+    singly = consistent_states(problem.system, 0.1, q, v)
+    for one, other in zip(made, singly, strict=True):
+        assert np.abs(one - other).max() < 1e-12
 
 
 def test_callbacks_that_cannot_be_traced_go_one_by_one():

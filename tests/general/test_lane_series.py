@@ -5,14 +5,14 @@ import pytest
 
 from twoloop import ConstrainedSystem, ensemble, mechanisms, solve_dae
 from twoloop.generate.choices import Choice
-from twoloop.generate.own_lanes import OwnLanes
+from twoloop.generate.lane_code import LaneCode
 from twoloop.generate.series import series_program
 
 
 def recurrences_of(problem):
     system = problem.system
     choice = Choice.at(system, 0.0, problem.q0)
-    return choice, OwnLanes(system, choice, system.parameters, (), True).code.recurrences
+    return choice, LaneCode(system, choice, system.parameters, True).recurrences
 
 
 def test_rows_that_do_not_count_take_no_operations():

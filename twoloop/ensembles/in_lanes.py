@@ -1,8 +1,11 @@
 """Runs of one system in lanes: blocks of runs, taken by threads; what is left to single runs, and why."""
 
+from __future__ import annotations
+
 import os
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from functools import partial
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,9 +15,14 @@ from twoloop.ensembles.lane_methods import LaneMethod
 from twoloop.ensembles.short_looks import ShortLooks
 from twoloop.ensembles.starts import Starts, generic_parameters, kit_to_write, system_of
 from twoloop.generate.choices import Choice
+from twoloop.generate.known_numbers import Record
 from twoloop.generate.time_dependence import may_be_narrow, may_be_sudden
 from twoloop.kernels.lanes import lane_ends
 from twoloop.problem.system import ConstrainedSystem
+
+if TYPE_CHECKING:
+    from twoloop.generate.lane_code import LaneCode
+    from twoloop.generate.own_lanes import OwnLanes
 
 Integers = NDArray[np.int64]
 Flags = NDArray[np.bool_]
@@ -54,8 +62,6 @@ class LaneRuns:
     """
 
     def __init__(self, system: ConstrainedSystem, starts: Starts, method: LaneMethod):
-        from twoloop.generate.own_lanes import OwnLanes  # compiled, or read from the cache, at the first ensemble
-
         self.system, self.starts, self.method, self.kit = system, starts, method, kit_to_write(system)
         generic, varying = generic_parameters(starts.parameters)
         sudden = may_be_sudden(system, ran_on_symbols=True)
@@ -64,8 +70,15 @@ class LaneRuns:
         self.looks = ShortLooks(system, generic, varying) if sudden.by_time else None
         choice = Choice.at(system_of(system, starts, 0), starts.t0, starts.q[0])
         kind = ("lanes", method.series, method.tableau is None, choice, tuple(varying))  # of which the latest is kept
-        make = partial(OwnLanes, system, choice, generic, varying, method.series, method.tableau)
-        self.own: OwnLanes = system.remembered_at(kind, generic.tobytes(), make)
+
+        def make() -> OwnLanes[LaneCode]:
+            from twoloop.generate.lane_code import LaneCode  # compiled, or read from the cache, at the first ensemble
+            from twoloop.generate.own_lanes import OwnLanes
+
+            record = Record(generic.tolist(), varying)
+            return OwnLanes(record, LaneCode(system, choice, record.parameters, method.series, method.tableau))
+
+        self.own = system.remembered_at(kind, generic.tobytes(), make)
 
     def make(
         self,
@@ -82,20 +95,12 @@ class LaneRuns:
         n_runs = len(which)
         status, n_steps = np.zeros((2, n_runs), dtype=np.int64)
         ends = np.full((n_runs, self.system.n_q + self.system.n_c), np.nan)
-        n_blocks = 1 if threads == 1 else FOR_EACH * threads
-        size = int(np.clip(-(-n_runs // n_blocks), SMALLEST, LARGEST))
-        blocks = [slice(begin, min(begin + size, n_runs)) for begin in range(0, n_runs, size)]
 
         def block(rows: slice) -> None:
             out = out_q[rows], out_v[rows], ends[rows]
             self._make(which[rows], t1, times, rtol, atol, out, status[rows], n_steps[rows])
 
-        if threads == 1 or len(blocks) == 1:
-            for rows in blocks:
-                block(rows)
-        else:
-            with ThreadPoolExecutor(threads) as pool:
-                list(pool.map(block, blocks))
+        in_blocks(block, n_runs, threads)
         return status, n_steps, ends
 
     def _make(
@@ -115,7 +120,7 @@ class LaneRuns:
         n, n_rows = code.n, code.n_rows
         numbers = self.own.numbers(starts.parameters[which])
         begin = lane_room.places(n, n_rows, code.n_numbers)[-1]
-        room = _aligned(begin + method.memory(code), lane_room.LANES)
+        room = aligned(begin + method.memory(code), lane_room.LANES)
         kit = lane_room.LaneKit(self.own.functions, method.step())
         redundant = bool(code.equations.redundant.conditions)
         settings = np.array([n, n_rows, method.order, redundant, code.n_numbers], dtype=np.int64)
@@ -165,7 +170,20 @@ class LaneRuns:
         return fine
 
 
-def _aligned(vectors: int, lanes: int) -> Array:
+def in_blocks(make: Callable[[slice], None], n_runs: int, threads: int) -> None:
+    """Have blocks of runs made, by so many threads."""
+    n_blocks = 1 if threads == 1 else FOR_EACH * threads
+    size = int(np.clip(-(-n_runs // n_blocks), SMALLEST, LARGEST))
+    blocks = [slice(begin, min(begin + size, n_runs)) for begin in range(0, n_runs, size)]
+    if threads == 1 or len(blocks) == 1:
+        for rows in blocks:
+            make(rows)
+    else:
+        with ThreadPoolExecutor(threads) as pool:
+            list(pool.map(make, blocks))
+
+
+def aligned(vectors: int, lanes: int) -> Array:
     """Zeros whose address a vector of all lanes may have."""
     size = 8 * lanes
     room = np.zeros(vectors * lanes + lanes)

@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 from twoloop.checks.arguments import Array, check_real, shaped, shown, wrong_entries
 from twoloop.problem.system import ConstrainedSystem
 
-AT_ROUNDING = 64.0  # times rounding of its terms: an equation of a start that holds
-NEAR = 1e4  # the same of one that needs no closer look
+NEAR = 1e4  # times rounding of its terms: an equation of a start that needs no closer look
 SLOW = 1e-3  # of the largest speed of all runs: what rounding leaves in velocities is not less in a run at rest
 GENERIC = 16  # runs of which generic parameters are a mean
 
@@ -96,11 +95,3 @@ def generic_parameters(parameters: Array) -> tuple[Array, list[int]]:
     rows = parameters[np.concatenate([np.arange(0, len(parameters), max(1, len(parameters) // GENERIC)), *ends])]
     weights = np.random.default_rng(3).uniform(0.5, 1.5, len(rows))
     return np.where(varies, weights @ rows / weights.sum(), parameters[0]), np.flatnonzero(varies).tolist()
-
-
-def over_rounding(values: Array, rows: Array, state: Array) -> Array:
-    """The largest of some constraints, with rows C_q, over what rounding of the largest coordinate may leave of it."""
-    terms = np.abs(rows).sum(axis=-1) * np.abs(state).max(axis=-1, keepdims=True, initial=0.0)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        off: Array = np.where(values == 0.0, 0.0, np.abs(values) / (np.finfo(float).eps * terms))
-    return off.max(axis=-1, initial=0.0)

@@ -52,6 +52,8 @@ class LaneCode(LaneSteps):
     def __init__(
         self, system: ConstrainedSystem, choice: Choice, parameters: Any, series: bool, tableau: Tableau | None = None
     ):
+        if system.n_a > 0:
+            raise Untraceable("it has nonholonomic rows")
         self.numbers = Coefficients(apart=True)
         self.equations = equations = StraightLine(system, choice, Equations(system, parameters))
         self.solution = Solution(self.equations)

@@ -1,7 +1,7 @@
 """Machine code of one mechanism for lanes, kept on disk by the structure of its equations, and the numbers it reads."""
 
-from collections.abc import Sequence
 from functools import cache, cached_property
+from typing import Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +12,7 @@ from twoloop.generate import (
     lane_emitter,
     lane_series,
     lane_stages,
+    lane_starts,
     lane_steps,
     lane_turns,
     llvm_code,
@@ -21,60 +22,38 @@ from twoloop.generate import (
     straight_line,
     written,
 )
-from twoloop.generate.choices import Choice
 from twoloop.generate.known_numbers import Record
 from twoloop.generate.lane_code import LaneCode
 from twoloop.generate.lane_emitter import LaneEmitter
-from twoloop.generate.lane_stages import Tableau
+from twoloop.generate.lane_starts import LaneStarts
 from twoloop.generate.llvm_text import Module
-from twoloop.generate.tracing import Untraceable
 from twoloop.kernels.compile.dependencies import digest_of
 from twoloop.kernels.compile.own_functions import OwnFunctions, are_kept, own_functions
 from twoloop.kernels.lanes.lane_room import CODE
-from twoloop.problem.system import ConstrainedSystem
 
 Array = NDArray[np.float64]
 
 BUILD_SECONDS = 3e-4  # for a quantity, about
-LANE_WRITERS = (lane_code, lane_steps, lane_series, lane_stages, lane_turns, lane_emitter)
+LANE_WRITERS = (lane_code, lane_starts, lane_steps, lane_series, lane_stages, lane_turns, lane_emitter)
 WRITERS = (series, straight_line, written, coefficients, *LANE_WRITERS, llvm_code, llvm_text, llvm_trigonometry)
 
+Code = TypeVar("Code", LaneCode, LaneStarts)
 KIND = "lanes"  # of files on the disk
 
 
-class OwnLanes:
+class OwnLanes(Generic[Code]):
     """Machine code of a mechanism for lanes, and the numbers that it reads for any parameters.
 
     Parameters
     ----------
-    system : ConstrainedSystem
-    choice : Choice
-    values, varying
-        Of a `Record`: generic parameters, and which of them differ from run to run.
-    series : bool
-        Whether there is to be code for its Taylor series, too.
-    tableau : Tableau, optional
-        Of an explicit method, whose stages there is to be code for.
-
-    Raises
-    ------
-    Untraceable
-        Saying why the equations cannot be had.
+    record : Record
+        Of the parameters that `code` was made for.
+    code : LaneCode or LaneStarts
     """
 
-    def __init__(
-        self,
-        system: ConstrainedSystem,
-        choice: Choice,
-        values: Array,
-        varying: Sequence[int],
-        series: bool,
-        tableau: Tableau | None = None,
-    ):
-        if system.n_a > 0:
-            raise Untraceable("it has nonholonomic rows")
-        self.record = Record(values.tolist(), varying)
-        self.code = LaneCode(system, choice, self.record.parameters, series, tableau)
+    def __init__(self, record: Record, code: Code):
+        self.record = record
+        self.code: Code = code
 
     @cached_property
     def functions(self) -> OwnFunctions:

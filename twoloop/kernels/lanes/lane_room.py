@@ -53,6 +53,9 @@ TASKS = (
     "departure",  # OFF: of a step H from STATE by PREDICTED to NEW
     "take",  # NEW becomes STATE where ACCEPTED
 )
+TASKS_OF_STARTS = (
+    "rows",
+)  # C, C_t and C_q at NEW and AHEAD, in the memory of the method; FINE: where they have values
 TASKS_OF_STAGES = ("there",)  # A at NEW as it stands
 # NEW, X after the BEGIN of the step, and ERROR, if that is the whole step; FINE stays where it could be done
 TASKS_OF_EXPLICIT = ("stages",)
@@ -65,7 +68,7 @@ TASKS_OF_SERIES = (
     "judge",  # ACCEPTED: the steps that are, and how long the next one may be
 )
 CODE = Reference("LaneKit", {})
-ALL_TASKS = (*TASKS, *TASKS_OF_STAGES, *TASKS_OF_EXPLICIT, *TASKS_OF_SERIES)
+ALL_TASKS = (*TASKS, *TASKS_OF_STARTS, *TASKS_OF_STAGES, *TASKS_OF_EXPLICIT, *TASKS_OF_SERIES)
 CODE.add_own_functions(dict.fromkeys(ALL_TASKS, types.none(types.int64, VECTOR, VECTOR)))
 # of a method, (code, settings, control, options, room, status, n_steps, within): a step H of each lane that runs, and
 # whether it is ACCEPTED, with its end in NEW, A and LAM; or, `within` the step that was just accepted, NEW, X seconds
@@ -86,7 +89,7 @@ SHORTEST = 1e-13  # step, of the time
 class LaneKit:
     """The functions made for a mechanism and the step of a method, as kernels get them."""
 
-    def __init__(self, own: OwnFunctions, step: Any):
+    def __init__(self, own: OwnFunctions, step: Any = None):
         self.__dict__.update(dict.fromkeys(ALL_TASKS, 0))
         self.__dict__.update(own.addresses)
         self.own, self.step = own, step
