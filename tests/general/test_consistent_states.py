@@ -42,17 +42,21 @@ def test_parameters_of_their_own_and_coordinates_that_are_kept():
         assert np.abs(own.constraint(0.0, q[run])).max() < 1e-14
 
 
-def test_lanes_take_those_that_are_near_and_none_depends_on_others(monkeypatch):
-    problem = mechanisms.spatial_four_bar()
-    q, v = guesses(problem, 300)
+@pytest.mark.parametrize(("name", "n_singly"), [("spatial_four_bar", 0), ("redundant_slider_crank", 1), ("bricard", 1)])
+def test_lanes_take_those_that_are_near_and_none_depends_on_others(monkeypatch, name, n_singly):
+    module, calls = "twoloop.ensembles.consistent_states", []
 
-    def singly(*arguments, **options):
-        raise AssertionError("a guess went by itself")
+    def singly(*arguments, **options):  # of redundant rows the first guess says how many they are
+        calls.append(arguments)
+        return consistent_state(*arguments, **options)
 
-    monkeypatch.setattr("twoloop.ensembles.consistent_states.consistent_state", singly)
-    monkeypatch.setattr("twoloop.ensembles.consistent_states.threads_of", lambda wanted: 2)
+    problem = getattr(mechanisms, name)()
+    q, v = problem.q0 + 0.5 * (guesses(problem, 300)[0] - problem.q0), guesses(problem, 300)[1]
+    monkeypatch.setattr(f"{module}.consistent_state", singly)
+    monkeypatch.setattr(f"{module}.threads_of", lambda wanted: 2)
     all_q, all_v = consistent_states(problem.system, 0.1, q, v)
-    monkeypatch.setattr("twoloop.ensembles.consistent_states.threads_of", lambda wanted: 1)
+    assert len(calls) == n_singly
+    monkeypatch.setattr(f"{module}.threads_of", lambda wanted: 1)
     for some in (slice(0, 13), slice(5, 300)):
         made_q, made_v = consistent_states(problem.system, 0.1, q[some], v[some])
         assert (made_q == all_q[some]).all() and (made_v == all_v[some]).all()

@@ -15,7 +15,7 @@ from twoloop.ensembles.starts import Starts, all_starts, far_off, generic_parame
 from twoloop.generate.known_numbers import Record
 from twoloop.generate.tracing import Untraceable
 from twoloop.problem.system import ConstrainedSystem, check_system
-from twoloop.run.projection import consistent_state
+from twoloop.run.projection import ConsistentState, consistent_state
 
 if TYPE_CHECKING:
     from twoloop.generate.lane_starts import LaneStarts
@@ -37,8 +37,8 @@ def consistent_states(
 
     Guesses that are near the constraints are moved together, by Gauss-Newton on the equations that the callbacks were
     traced to, in SIMD lanes on all cores; each result is compared with what the callbacks themselves say. The others go
-    through `consistent_state` one by one, as do those of systems with redundant or nonholonomic rows or whose callbacks
-    cannot be traced, and a few guesses of a large system, for which the code is not worth its time.
+    through `consistent_state` one by one, as do those of systems with nonholonomic rows or whose callbacks cannot be
+    traced, and a few guesses of a large system, for which the code is not worth its time.
 
     Parameters
     ----------
@@ -65,21 +65,27 @@ def consistent_states(
     t = check_finite("t", t)
     starts = all_starts(system, t, q, v, parameters, ("q", "v"))
     kept = [] if keep is None else check_indices("keep", keep, system.n_q)
-    free = np.array([j for j in range(system.n_q) if j not in kept], dtype=np.int64)
+    moves = np.array([j not in kept for j in range(system.n_q)], dtype=np.int64)
+
+    def singly(run: int) -> ConsistentState:
+        try:
+            return consistent_state(system_of(system, starts, run), t, starts.q[run], starts.v[run], keep=keep)
+        except ValueError as error:
+            raise ValueError(f"guess {run}: {error}") from error
+
     fine = np.zeros(len(starts.q), dtype=bool)
     made_q, made_v = starts.q.copy(), starts.v.copy()
     with suppress(Untraceable):
-        fine = _InLanes(system, starts).put(starts, free, made_q, made_v)
+        lanes = _InLanes(system, starts)
+        made_q, made_v, fine = lanes.put(starts, moves, 0)
+        if not fine[0] and (n_redundant := system.n_c - len(singly(0).dependent)) > 0:
+            made_q, made_v, fine = lanes.put(starts, moves, n_redundant)
     # of others compiled callbacks may go out of the bounds of their arrays, which single calls look at
     traced = np.flatnonzero(fine)
     made = Starts(t, made_q[traced], made_v[traced], starts.parameters[traced])
     fine[traced] = ~far_off(kit_to_write(system), made)
     for run in np.flatnonzero(~fine).tolist():
-        try:
-            found = consistent_state(system_of(system, starts, run), t, starts.q[run], starts.v[run], keep=keep)
-        except ValueError as error:
-            raise ValueError(f"guess {run}: {error}") from error
-        made_q[run], made_v[run] = found
+        made_q[run], made_v[run] = singly(run)
     return made_q, made_v
 
 
@@ -108,22 +114,25 @@ class _InLanes:
         if self._own.seconds_to_build > SINGLY * len(starts.q):
             raise Untraceable("it is not worth the code for so few")
 
-    def put(self, starts: Starts, free: Integers, q: Array, v: Array) -> NDArray[np.bool_]:
-        """Put positions and velocities on the constraints, in place; which of them may be taken."""
+    def put(self, starts: Starts, moves: Integers, n_redundant: int) -> tuple[Array, Array, NDArray[np.bool_]]:
+        """Positions and velocities put on the constraints, so many of which are redundant; which may be taken."""
         from twoloop.kernels.lanes import lane_room, lane_starts
 
-        own, code, fine = self._own, self._own.code, np.zeros(len(q), dtype=np.int64)
+        own, code, q, v = self._own, self._own.code, starts.q.copy(), starts.v.copy()
+        fine = np.zeros(len(q), dtype=np.int64)
         n, n_rows = code.n, code.n_rows
         kit = lane_room.LaneKit(own.functions)
-        settings = np.array([n, n_rows, 0, 0, code.n_numbers], dtype=np.int64)
+        settings = np.array([n, n_rows, 0, 0, code.n_numbers, n_redundant], dtype=np.int64)
         control = np.concatenate([[starts.t0], np.zeros(lane_room.ATOL - 1 + n), code.numbers.values])
         places = (
-            lane_room.places(n, n_rows, code.n_numbers)[-1] + lane_starts.places_of_starts(n, n_rows, len(free))[-1]
+            lane_room.places(n, n_rows, code.n_numbers)[-1]
+            + lane_starts.places_of_starts(n, n_rows, len(code.pattern) - n_rows - 1, n_redundant)[-1]
         )
 
         def block(rows: slice) -> None:
             room, numbers = aligned(places, lane_room.LANES), own.numbers(starts.parameters[rows])
-            lane_starts.start_lanes(kit, settings, control, free, numbers, q[rows], v[rows], fine[rows], room)
+            given = code.pattern, moves, numbers, q[rows], v[rows]
+            lane_starts.start_lanes(kit, settings, control, *given, fine[rows], room)
 
         in_blocks(block, len(q), threads_of(None))
-        return fine == 1
+        return q, v, fine == 1

@@ -55,7 +55,7 @@ TASKS = (
 )
 TASKS_OF_STARTS = (
     "rows",
-)  # C, C_t and C_q at NEW and AHEAD, in the memory of the method; FINE: where they have values
+)  # C, C_t, entries of C_q at NEW and AHEAD, in the memory of the method; FINE: where they have values
 TASKS_OF_STAGES = ("there",)  # A at NEW as it stands
 # NEW, X after the BEGIN of the step, and ERROR, if that is the whole step; FINE stays where it could be done
 TASKS_OF_EXPLICIT = ("stages",)

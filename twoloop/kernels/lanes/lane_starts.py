@@ -1,6 +1,8 @@
 """Guesses in lanes put on the constraints by the least change, and whether there is another assembly about as near.
 
-Gauss-Newton with rows of length 1, and Cholesky's factors of G G^T. Lanes are independent of one another.
+Gauss-Newton with rows of length 1, and Cholesky's factors of G G^T. Redundant rows depend on one another on the
+constraints, and beside them only nearly: combinations of rows that vanish there, Z, are left out, as Z^T Z is added to
+G G^T. Lanes are independent of one another.
 """
 
 import numpy as np
@@ -28,28 +30,34 @@ MOST_ITERATIONS = 12
 AT_ROUNDING = 64.0  # times rounding of its terms: an equation of a start that holds
 STRAIGHT = 0.25  # of a displacement: how far its projection may end from where C_q sends it
 SINGULAR = 1e-12  # smallest eigenvalue of G G^T, rows of length 1, that counts ...
-LEAST = 1e-15  # ... and what is added to it, so that it has an inverse
-INVERSE_ITERATIONS = 10  # for the eigenvector of the smallest eigenvalue
+LEAST = 1e-15  # ... and what is added to it, so that it has an inverse ...
+SHIFT = 1e-8  # ... where some eigenvalues vanish
+WEAK = 1e-4  # eigenvalue, of the largest, from which on redundant rows count
+INVERSE_ITERATIONS = 10  # for the eigenvector of the smallest eigenvalue that counts ...
+OF_REDUNDANT = 5  # ... and for those of eigenvalues that do not, which are far smaller
 GOLDEN = 0.6180339887498949
+N_REDUNDANT = 5  # in `settings`, behind those of lane_room.py: rows that depend on others
 WAYS = ((-2.0, 0.0), (0.0, 1.0), (0.0, -1.0))  # off a state that was found: parts of the guess's way, of the weakest
 
 
-def places_of_starts(n, n_rows, n_free):
+def places_of_starts(n, n_rows, n_entries, n_redundant):
     """Where in `room` stand, from the memory of the method on, and how long all of it is.
 
-    C, C_t and G, as the code writes them; numbers of rows; changes of the coordinates that may move; positions found
-    (n); the way there; the direction in which rows say least; a way off; factors, see `_factor`, there and at NEW.
+    C, C_t and the entries of G, as the code writes them; numbers of rows; changes of positions or velocities; positions
+    found; the way there; the direction in which rows say least; a way off; a row; factors, see `_factor`, there and at
+    NEW.
     """
     G = 2 * n_rows
-    x = G + n_rows * n
+    x = G + n_entries
     change = x + n_rows
-    found = change + n_free
+    found = change + n
     moved = found + n
-    weakest = moved + n_free
-    way = weakest + n_free
-    there = way + n_free
-    here = there + n_rows * (n_free + 1 + n_rows)
-    return G, x, change, found, moved, weakest, way, there, here, here + n_rows * (n_free + 1 + n_rows)
+    weakest = moved + n
+    way = weakest + n
+    row = way + n
+    there = row + n
+    size = n_entries + n_rows * (1 + n_rows + n_redundant)
+    return G, x, change, found, moved, weakest, way, row, there, there + size, there + 2 * size
 
 
 _places = merged(places_of_starts)
@@ -75,6 +83,13 @@ def _subtract_products(room, target, x, dx, y, dy, count):
         _subtract_four(room, target * LANES + k, x * LANES + k, dx * LANES, y * LANES + k, dy * LANES, count)
 
 
+@merged
+def _subtract_row(room, target, entries, pattern, i, y):
+    """target -= row i of G y, whose entries stand behind one another."""
+    for e in range(pattern[i], pattern[i + 1]):
+        _subtract_products(room, target, entries + e - pattern[0], 1, y + pattern[e], 1, 1)
+
+
 @compiled
 def _scale(room, target, factor):
     for k in range(LANES):
@@ -82,26 +97,19 @@ def _scale(room, target, factor):
 
 
 @compiled
-def _factor(room, free, n, n_rows, G, factors):
-    """Rows of length 1 of what may move, 1 over their lengths, and Cholesky's factors, whose diagonal is inverted."""
-    n_free = free.size
-    lengths, gram = factors + n_rows * n_free, factors + n_rows * (n_free + 1)
+def _invert_gram(room, pattern, n_rows, n_redundant, row, factors, shift):
+    """Cholesky's factors of G G^T + shift + Z Z^T, with 1 over their diagonal."""
+    n_entries = pattern[n_rows] - pattern[0]
+    gram = factors + n_entries + n_rows
+    Z = gram + n_rows * n_rows
     for i in range(n_rows):
-        fill_field(room, lengths + i, 0.0)
-        for j in range(n_free):
-            entry = G + i * n + free[j]
-            copy_vectors(room, entry, factors + i * n_free + j, 1)
-            _subtract_products(room, lengths + i, entry, 1, entry, 1, 1)
-        for k in range(LANES):
-            square = -room[(lengths + i) * LANES + k]
-            room[(lengths + i) * LANES + k] = 1.0 / np.sqrt(square) if square != 0.0 else 1.0
-        for j in range(n_free):
-            _scale(room, factors + i * n_free + j, lengths + i)
-    for i in range(n_rows):
+        for e in range(pattern[i], pattern[i + 1]):
+            copy_vectors(room, factors + e - pattern[0], row + pattern[e], 1)
         for j in range(i + 1):
             entry = gram + i * n_rows + j
-            fill_field(room, entry, -LEAST if i == j else 0.0)
-            _subtract_products(room, entry, factors + i * n_free, 1, factors + j * n_free, 1, n_free)
+            fill_field(room, entry, -shift if i == j else 0.0)
+            _subtract_row(room, entry, factors, pattern, j, row)
+            _subtract_products(room, entry, Z + i, n_rows, Z + j, n_rows, n_redundant)
             for k in range(LANES):
                 room[entry * LANES + k] *= -1.0
             _subtract_products(room, entry, gram + i * n_rows, 1, gram + j * n_rows, 1, j)
@@ -110,11 +118,77 @@ def _factor(room, free, n, n_rows, G, factors):
         for k in range(LANES):
             pivot = room[(gram + i * n_rows + i) * LANES + k]
             room[(gram + i * n_rows + i) * LANES + k] = 1.0 / np.sqrt(pivot) if pivot > 0.0 else np.nan
+        for e in range(pattern[i], pattern[i + 1]):
+            fill_field(room, row + pattern[e], 0.0)
+
+
+@compiled
+def _factor(room, pattern, moves, n_rows, n_redundant, G, row, factors):
+    """Rows of length 1 of what may move, 1 over their lengths, factors of `_invert_gram`, and Z, a vector a row."""
+    n_entries = pattern[n_rows] - pattern[0]
+    for i in range(n_rows):
+        length = factors + n_entries + i
+        fill_field(room, length, 0.0)
+        for e in range(pattern[i], pattern[i + 1]):
+            entry = e - pattern[0]
+            if moves[pattern[e]] == 1:
+                copy_vectors(room, G + entry, factors + entry, 1)
+                _subtract_products(room, length, G + entry, 1, G + entry, 1, 1)
+            else:
+                fill_field(room, factors + entry, 0.0)
+        for k in range(LANES):
+            square = -room[length * LANES + k]
+            room[length * LANES + k] = 1.0 / np.sqrt(square) if square != 0.0 else 1.0
+        for e in range(pattern[i], pattern[i + 1]):
+            _scale(room, factors + e - pattern[0], length)
+    if n_redundant > 0:
+        _find_redundant(room, pattern, n_rows, n_redundant, row, factors)
+    _invert_gram(room, pattern, n_rows, n_redundant, row, factors, LEAST)
+
+
+@compiled
+def _find_redundant(room, pattern, n_rows, n_redundant, row, factors):
+    """Z, eigenvectors of the smallest eigenvalues of G G^T; NaN where these are not small."""
+    gram = factors + pattern[n_rows] - pattern[0] + n_rows
+    Z = gram + n_rows * n_rows
+    _invert_gram(room, pattern, n_rows, 0, row, factors, SHIFT)
+    for w in range(n_redundant):
+        z = Z + w * n_rows
+        for i in range(n_rows):
+            fill_field(room, z + i, 0.5 + (GOLDEN * (i + 1) * (w + 1)) % 1.0)
+        for _ in range(OF_REDUNDANT):
+            _normalise(room, z, n_rows)
+            _solve(room, n_rows, gram, z)
+            _leave_out(room, n_rows, w, Z, z)
+        for k in range(LANES):
+            if not _length(room, z, n_rows, k) * (WEAK - SHIFT) > 1.0:  # 1 over the eigenvalue and SHIFT
+                room[z * LANES + k] = np.nan
+        _normalise(room, z, n_rows)
+
+
+@compiled
+def _normalise(room, x, n_rows):
+    for k in range(LANES):
+        length = _length(room, x, n_rows, k)
+        for i in range(n_rows):
+            room[(x + i) * LANES + k] /= length
+
+
+@compiled
+def _leave_out(room, n_rows, n_redundant, Z, x):
+    """x less its parts in Z."""
+    for w in range(n_redundant):
+        for k in range(LANES):
+            part = 0.0
+            for i in range(n_rows):
+                part += room[(Z + w * n_rows + i) * LANES + k] * room[(x + i) * LANES + k]
+            for i in range(n_rows):
+                room[(x + i) * LANES + k] -= part * room[(Z + w * n_rows + i) * LANES + k]
 
 
 @compiled
 def _solve(room, n_rows, gram, x):
-    """x becomes the solution of G G^T y = x, of rows of length 1."""
+    """x becomes the solution y of the factors' matrix y = x."""
     for i in range(n_rows):
         _subtract_products(room, x + i, gram + i * n_rows, 1, x, 1, i)
         _scale(room, x + i, gram + i * n_rows + i)
@@ -124,20 +198,24 @@ def _solve(room, n_rows, gram, x):
 
 
 @compiled
-def _along_rows(room, n_rows, n_free, factors, x, out):
-    """out = -G^T x, of rows of length 1."""
-    for j in range(n_free):
+def _along_rows(room, pattern, n, n_rows, n_redundant, factors, x, out):
+    """x becomes the solution y of G G^T y = x, of rows of length 1, without what is redundant, and out = -G^T y."""
+    gram = factors + pattern[n_rows] - pattern[0] + n_rows
+    _leave_out(room, n_rows, n_redundant, gram + n_rows * n_rows, x)
+    _solve(room, n_rows, gram, x)
+    for j in range(n):
         fill_field(room, out + j, 0.0)
-        _subtract_products(room, out + j, x, 1, factors + j, n_free, n_rows)
+    for i in range(n_rows):
+        for e in range(pattern[i], pattern[i + 1]):
+            _subtract_products(room, out + pattern[e], x + i, 1, factors + e - pattern[0], 1, 1)
 
 
 @compiled
-def _least_change(room, n_rows, n_free, factors, x, change):
+def _least_change(room, pattern, n, n_rows, n_redundant, factors, x, change):
     """The smallest change with G change = -x; not finite where rows depend on one another. x is lost."""
     for i in range(n_rows):
-        _scale(room, x + i, factors + n_rows * n_free + i)
-    _solve(room, n_rows, factors + n_rows * (n_free + 1), x)
-    _along_rows(room, n_rows, n_free, factors, x, change)
+        _scale(room, x + i, factors + pattern[n_rows] - pattern[0] + i)
+    _along_rows(room, pattern, n, n_rows, n_redundant, factors, x, change)
 
 
 @merged
@@ -158,44 +236,44 @@ def _length(room, place, count, k):
 
 
 @merged
-def _holds(room, n, n_rows, C, G, new, k):
+def _holds(room, pattern, n, n_rows, C, G, new, k):
     """Whether each constraint is what rounding of its terms may leave."""
     allowed = AT_ROUNDING * np.finfo(np.float64).eps * _largest(room, new, n, k)
     for i in range(n_rows):
         off, terms = abs(room[(C + i) * LANES + k]), 0.0
-        for j in range(n):
-            terms += abs(room[(G + i * n + j) * LANES + k])
+        for e in range(pattern[i], pattern[i + 1]):
+            terms += abs(room[(G + e - pattern[0]) * LANES + k])
         if off != 0.0 and not off <= allowed * terms:
             return False
     return True
 
 
 @compiled
-def _gauss_newton(code, settings, control, free, room):
+def _gauss_newton(code, settings, control, pattern, moves, room):
     """NEW onto the constraints by steps of least change; RUNNING stays where that could be done."""
-    n, n_rows, n_free = settings[N], settings[N_ROWS], free.size
+    n, n_rows, n_redundant = settings[N], settings[N_ROWS], settings[N_REDUNDANT]
     _, new, _, _, _, _, _, memory = places_of(n, n_rows, settings[N_NUMBERS])
-    G, x, change, _, _, _, _, _, here, _ = _places(n, n_rows, n_free)
-    G, x, change, factors = memory + G, memory + x, memory + change, memory + here
+    G, x, change, _, _, _, _, row, _, here, _ = _places(n, n_rows, pattern[n_rows] - pattern[0], n_redundant)
+    G, x, change, row, factors = memory + G, memory + x, memory + change, memory + row, memory + here
     for k in range(LANES):
         room[LEFT_TO_MOVE * LANES + k] = room[RUNNING * LANES + k]
     for _ in range(MOST_ITERATIONS):
         fill_field(room, FINE, 1.0)
         code.rows(0, control, room)
-        _factor(room, free, n, n_rows, G, factors)
+        _factor(room, pattern, moves, n_rows, n_redundant, G, row, factors)
         copy_vectors(room, memory, x, n_rows)
-        _least_change(room, n_rows, n_free, factors, x, change)
+        _least_change(room, pattern, n, n_rows, n_redundant, factors, x, change)
         left = 0.0
         for k in range(LANES):
             if room[LEFT_TO_MOVE * LANES + k] == 0.0:
                 continue
-            if room[FINE * LANES + k] == 0.0 or not _largest(room, change, n_free, k) < np.inf:
+            if room[FINE * LANES + k] == 0.0 or not _largest(room, change, n, k) < np.inf:
                 room[LEFT_TO_MOVE * LANES + k] = room[RUNNING * LANES + k] = 0.0
                 continue
-            for j in range(n_free):
-                room[(new + free[j]) * LANES + k] += room[(change + j) * LANES + k]
+            for j in range(n):
+                room[(new + j) * LANES + k] += room[(change + j) * LANES + k]
             # after the change, which is applied to the last bit
-            if _holds(room, n, n_rows, memory, G, new, k):
+            if _holds(room, pattern, n, n_rows, memory, G, new, k):
                 room[LEFT_TO_MOVE * LANES + k] = 0.0
             else:
                 left += 1.0
@@ -207,95 +285,94 @@ def _gauss_newton(code, settings, control, free, room):
 
 
 @compiled
-def _change_velocities(code, settings, control, free, room):
+def _change_velocities(code, settings, control, pattern, moves, room):
     """Velocities of NEW onto the rows at its positions, whose factors are then there."""
-    n, n_rows, n_free = settings[N], settings[N_ROWS], free.size
+    n, n_rows, n_redundant = settings[N], settings[N_ROWS], settings[N_REDUNDANT]
     _, new, _, _, _, _, _, memory = places_of(n, n_rows, settings[N_NUMBERS])
-    G, x, change, _, _, _, _, there, _, _ = _places(n, n_rows, n_free)
-    G, x, change, factors = memory + G, memory + x, memory + change, memory + there
+    G, x, change, _, _, _, _, row, there, _, _ = _places(n, n_rows, pattern[n_rows] - pattern[0], n_redundant)
+    G, x, change, row, factors = memory + G, memory + x, memory + change, memory + row, memory + there
     fill_field(room, FINE, 1.0)
     code.rows(0, control, room)
-    _factor(room, free, n, n_rows, G, factors)
+    _factor(room, pattern, moves, n_rows, n_redundant, G, row, factors)
     for _ in range(2):  # once more for what rounding of a large change leaves
         for i in range(n_rows):
             fill_field(room, x + i, 0.0)
-            _subtract_products(room, x + i, G + i * n, 1, new + n, 1, n)
+            _subtract_row(room, x + i, G, pattern, i, new + n)
             for k in range(LANES):
                 room[(x + i) * LANES + k] = room[(memory + n_rows + i) * LANES + k] - room[(x + i) * LANES + k]
-        _least_change(room, n_rows, n_free, factors, x, change)
-        for j in range(n_free):
-            for k in range(LANES):
-                room[(new + n + free[j]) * LANES + k] += room[(change + j) * LANES + k]
+        _least_change(room, pattern, n, n_rows, n_redundant, factors, x, change)
+        for j in range(n * LANES):
+            room[(new + n) * LANES + j] += room[change * LANES + j]
     for k in range(LANES):
         if room[FINE * LANES + k] == 0.0 or not _largest(room, new, 2 * n, k) < np.inf:
             room[RUNNING * LANES + k] = 0.0
 
 
 @compiled
-def _look_for_weakest(room, n_rows, n_free, factors, x, moved, weakest):
+def _look_for_weakest(room, pattern, n, n_rows, n_redundant, factors, x, moved, weakest):
     """The direction in which rows say least, as far as the guess was moved; RUNNING stays where there is none."""
     for i in range(n_rows):
         fill_field(room, x + i, 0.5 + (GOLDEN * (i + 1)) % 1.0)
     for _ in range(INVERSE_ITERATIONS):
-        for k in range(LANES):
-            length = _length(room, x, n_rows, k)
-            for i in range(n_rows):
-                room[(x + i) * LANES + k] /= length
-        _solve(room, n_rows, factors + n_rows * (n_free + 1), x)
-    _along_rows(room, n_rows, n_free, factors, x, weakest)
+        _normalise(room, x, n_rows)
+        _along_rows(room, pattern, n, n_rows, n_redundant, factors, x, weakest)
+    least = SINGULAR if n_redundant == 0 else WEAK * n_rows
     for k in range(LANES):
-        if not SINGULAR * _length(room, x, n_rows, k) < 1.0:  # it is as long as 1 over the smallest eigenvalue
+        if not least * _length(room, x, n_rows, k) < 1.0:  # it is as long as 1 over the smallest eigenvalue
             room[RUNNING * LANES + k] = 0.0
-        share = _largest(room, moved, n_free, k) / max(_largest(room, weakest, n_free, k), LEAST)
-        for j in range(n_free):
+        share = _largest(room, moved, n, k) / max(_largest(room, weakest, n, k), LEAST)
+        for j in range(n):
             room[(weakest + j) * LANES + k] *= share
 
 
 @compiled
-def _look_for_others(code, settings, control, free, room):
+def _look_for_others(code, settings, control, pattern, moves, room):
     """RUNNING stays where guesses as far off as this one lead where C_q at FOUND sends them."""
-    n, n_rows, n_free = settings[N], settings[N_ROWS], free.size
+    n, n_rows, n_redundant = settings[N], settings[N_ROWS], settings[N_REDUNDANT]
     _, new, _, _, _, _, _, memory = places_of(n, n_rows, settings[N_NUMBERS])
-    _, x, change, found, moved, weakest, way, there, _, _ = _places(n, n_rows, n_free)
+    _, x, change, found, moved, weakest, way, _, there, _, _ = _places(
+        n, n_rows, pattern[n_rows] - pattern[0], n_redundant
+    )
     x, change, found, moved = memory + x, memory + change, memory + found, memory + moved
     weakest, way, factors = memory + weakest, memory + way, memory + there
-    _look_for_weakest(room, n_rows, n_free, factors, x, moved, weakest)
+    _look_for_weakest(room, pattern, n, n_rows, n_redundant, factors, x, moved, weakest)
     for own, other in WAYS:
-        copy_vectors(room, found, new, n)
-        for j in range(n_free):
-            for k in range(LANES):
-                off = own * room[(moved + j) * LANES + k] + other * room[(weakest + j) * LANES + k]
-                room[(way + j) * LANES + k] = off
-                room[(new + free[j]) * LANES + k] += off
-        _gauss_newton(code, settings, control, free, room)
+        for j in range(n * LANES):
+            off = own * room[moved * LANES + j] + other * room[weakest * LANES + j]
+            room[way * LANES + j], room[new * LANES + j] = off, room[found * LANES + j] + off
+        _gauss_newton(code, settings, control, pattern, moves, room)
         for i in range(n_rows):
             fill_field(room, x + i, 0.0)
-            _subtract_products(room, x + i, factors + i * n_free, 1, way, 1, n_free)
-        _solve(room, n_rows, factors + n_rows * (n_free + 1), x)
-        _along_rows(room, n_rows, n_free, factors, x, change)  # which is what the rows leave nothing of
+            _subtract_row(room, x + i, factors, pattern, i, way)
+        _along_rows(
+            room, pattern, n, n_rows, n_redundant, factors, x, change
+        )  # the part of the way that rows leave nothing of
         for k in range(LANES):
             apart = 0.0
-            for j in range(n_free):
-                m = free[j] * LANES + k
-                expected = room[found * LANES + m] + room[(way + j) * LANES + k] - room[(change + j) * LANES + k]
+            for j in range(n):
+                m = j * LANES + k
+                expected = room[found * LANES + m] + room[way * LANES + m] - room[change * LANES + m]
                 apart = max(apart, abs(room[new * LANES + m] - expected))
-            if not apart <= STRAIGHT * _largest(room, way, n_free, k):
+            if not apart <= STRAIGHT * _largest(room, way, n, k):
                 room[RUNNING * LANES + k] = 0.0
 
 
-_START = types.void(CODE, INTEGERS, VECTOR, INTEGERS, *[types.float64[:, ::1]] * 3, INTEGERS, VECTOR)
+_START = types.void(CODE, INTEGERS, VECTOR, *[INTEGERS] * 2, *[types.float64[:, ::1]] * 3, INTEGERS, VECTOR)
 
 
 @kernel(_START, vectorized=True)
-def start_lanes(code, settings, control, free, numbers, q, v, fine, room):
+def start_lanes(code, settings, control, pattern, moves, numbers, q, v, fine, room):
     """Put states, one for each row of `numbers`, on the constraints at t0, in place; `fine`: 1 where that was done.
 
-    free : coordinates that may move.
+    pattern : where in it the columns of the entries of each row of G begin, and end, and these columns. moves : (n,)
+    1 for coordinates that may.
     """
-    n, n_rows, n_runs, n_free = settings[N], settings[N_ROWS], numbers.shape[0], free.size
+    n, n_rows, n_redundant, n_runs = settings[N], settings[N_ROWS], settings[N_REDUNDANT], numbers.shape[0]
     _, new, _, _, _, _, own, memory = places_of(n, n_rows, numbers.shape[1])
-    _, _, _, found, moved, _, _, _, _, _ = _places(n, n_rows, n_free)
+    _, _, _, found, moved, _, _, row, _, _, _ = _places(n, n_rows, pattern[n_rows] - pattern[0], n_redundant)
     fill_field(room, AHEAD, control[T0])
+    for j in range(n):
+        fill_field(room, memory + row + j, 0.0)
     for first in range(0, n_runs, LANES):
         for k in range(LANES):
             run = min(first + k, n_runs - 1)
@@ -304,14 +381,14 @@ def start_lanes(code, settings, control, free, numbers, q, v, fine, room):
                 room[(new + j) * LANES + k], room[(new + n + j) * LANES + k] = q[run, j], v[run, j]
             for i in range(numbers.shape[1]):
                 room[(own + i) * LANES + k] = numbers[run, i]
-        _gauss_newton(code, settings, control, free, room)
-        _change_velocities(code, settings, control, free, room)
+        _gauss_newton(code, settings, control, pattern, moves, room)
+        _change_velocities(code, settings, control, pattern, moves, room)
         copy_vectors(room, new, memory + found, n)
         for k in range(LANES):
             run = min(first + k, n_runs - 1)
-            for j in range(n_free):
-                room[(memory + moved + j) * LANES + k] = room[(new + free[j]) * LANES + k] - q[run, free[j]]
-        _look_for_others(code, settings, control, free, room)
+            for j in range(n):
+                room[(memory + moved + j) * LANES + k] = room[(new + j) * LANES + k] - q[run, j]
+        _look_for_others(code, settings, control, pattern, moves, room)
         for k in range(min(LANES, n_runs - first)):
             fine[first + k] = int(room[RUNNING * LANES + k])
             for j in range(n):
