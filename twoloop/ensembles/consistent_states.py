@@ -18,7 +18,7 @@ from twoloop.problem.system import ConstrainedSystem, check_system
 from twoloop.run.projection import ConsistentState, consistent_state
 
 if TYPE_CHECKING:
-    from twoloop.generate.lane_starts import LaneStarts
+    from twoloop.generate.lane_constraints import LaneConstraints
     from twoloop.generate.own_lanes import OwnLanes
 
 SINGLY = 0.01  # about what `consistent_state` takes, s
@@ -103,12 +103,12 @@ class _InLanes:
             raise Untraceable("it has nonholonomic rows")
         generic, varying = generic_parameters(starts.parameters)
 
-        def make() -> OwnLanes[LaneStarts]:
-            from twoloop.generate.lane_starts import LaneStarts
+        def make() -> OwnLanes[LaneConstraints]:
+            from twoloop.generate.lane_constraints import LaneConstraints
             from twoloop.generate.own_lanes import OwnLanes
 
             record = Record(generic.tolist(), varying)
-            return OwnLanes(record, LaneStarts(system, record.parameters))
+            return OwnLanes(record, LaneConstraints(system, record.parameters))
 
         self._own = system.remembered_at(("starts", tuple(varying)), generic.tobytes(), make)
         if self._own.seconds_to_build > SINGLY * len(starts.q):

@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 from twoloop.generate import (
     coefficients,
     lane_code,
+    lane_constraints,
     lane_emitter,
     lane_series,
     lane_stages,
-    lane_starts,
     lane_steps,
     lane_turns,
     llvm_code,
@@ -24,8 +24,8 @@ from twoloop.generate import (
 )
 from twoloop.generate.known_numbers import Record
 from twoloop.generate.lane_code import LaneCode
+from twoloop.generate.lane_constraints import LaneConstraints
 from twoloop.generate.lane_emitter import LaneEmitter
-from twoloop.generate.lane_starts import LaneStarts
 from twoloop.generate.llvm_text import Module
 from twoloop.kernels.compile.dependencies import digest_of
 from twoloop.kernels.compile.own_functions import OwnFunctions, are_kept, own_functions
@@ -34,10 +34,10 @@ from twoloop.kernels.lanes.lane_room import CODE
 Array = NDArray[np.float64]
 
 BUILD_SECONDS = 3e-4  # for a quantity, about
-LANE_WRITERS = (lane_code, lane_starts, lane_steps, lane_series, lane_stages, lane_turns, lane_emitter)
+LANE_WRITERS = (lane_code, lane_constraints, lane_steps, lane_series, lane_stages, lane_turns, lane_emitter)
 WRITERS = (series, straight_line, written, coefficients, *LANE_WRITERS, llvm_code, llvm_text, llvm_trigonometry)
 
-Code = TypeVar("Code", LaneCode, LaneStarts)
+Code = TypeVar("Code", LaneCode, LaneConstraints)
 KIND = "lanes"  # of files on the disk
 
 
@@ -48,7 +48,7 @@ class OwnLanes(Generic[Code]):
     ----------
     record : Record
         Of the parameters that `code` was made for.
-    code : LaneCode or LaneStarts
+    code : LaneCode or LaneConstraints
     """
 
     def __init__(self, record: Record, code: Code):

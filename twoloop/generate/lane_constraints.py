@@ -1,4 +1,4 @@
-"""Code for starts of many runs: constraints and their derivatives in lanes."""
+"""Constraints and their derivatives in lanes, as code: for starts of many runs."""
 
 import hashlib
 from itertools import chain
@@ -17,7 +17,7 @@ from twoloop.kernels.lanes import lane_room as lanes
 from twoloop.problem.system import ConstrainedSystem
 
 
-class LaneStarts(LaneSteps):
+class LaneConstraints(LaneSteps):
     """Writes C, C_t and the entries of C_q of a system, whose numbers depend on parameters.
 
     Parameters
