@@ -42,31 +42,84 @@ def test_parameters_of_their_own_and_coordinates_that_are_kept():
         assert np.abs(own.constraint(0.0, q[run])).max() < 1e-14
 
 
-@pytest.mark.parametrize(("name", "n_singly"), [("spatial_four_bar", 0), ("redundant_slider_crank", 1), ("bricard", 1)])
-def test_lanes_take_those_that_are_near_and_none_depends_on_others(monkeypatch, name, n_singly):
-    module, calls = "twoloop.ensembles.consistent_states", []
+MODULE = "twoloop.ensembles.consistent_states"
 
-    def singly(*arguments, **options):  # of redundant rows the first guess says how many they are
+
+@pytest.fixture
+def singly(monkeypatch):
+    """Calls for one guess."""
+    calls = []
+
+    def one(*arguments, **options):
         calls.append(arguments)
         return consistent_state(*arguments, **options)
 
+    monkeypatch.setattr(f"{MODULE}.consistent_state", one)
+    return calls
+
+
+@pytest.mark.parametrize(("name", "n_singly"), [("spatial_four_bar", 0), ("redundant_slider_crank", 1), ("bricard", 1)])
+def test_lanes_take_those_that_are_near_and_none_depends_on_others(monkeypatch, singly, name, n_singly):
+    """Of redundant rows the first guess says how many they are."""
     problem = getattr(mechanisms, name)()
     q, v = problem.q0 + 0.5 * (guesses(problem, 300)[0] - problem.q0), guesses(problem, 300)[1]
-    monkeypatch.setattr(f"{module}.consistent_state", singly)
-    monkeypatch.setattr(f"{module}.threads_of", lambda wanted: 2)
+    monkeypatch.setattr(f"{MODULE}.threads_of", lambda wanted: 2)
     all_q, all_v = consistent_states(problem.system, 0.1, q, v)
-    assert len(calls) == n_singly
-    monkeypatch.setattr(f"{module}.threads_of", lambda wanted: 1)
+    assert len(singly) == n_singly
+    consistent_states(problem.system, 0.1, all_q, all_v)  # which are on the constraints
+    assert len(singly) == 2 * n_singly
+    monkeypatch.setattr(f"{MODULE}.threads_of", lambda wanted: 1)
     for some in (slice(0, 13), slice(5, 300)):
         made_q, made_v = consistent_states(problem.system, 0.1, q[some], v[some])
         assert (made_q == all_q[some]).all() and (made_v == all_v[some]).all()
+
+
+@pytest.mark.parametrize("n", [3, 2, 40])
+def test_coordinates_without_constraints_have_code_of_their_own(singly, n):
+    system = ConstrainedSystem.from_python(
+        n_q=n,
+        n_c=1,
+        mass=np.eye(n),
+        force=lambda t, q, v: -q,
+        constraint=lambda t, q: np.array([q[0] ** 2 + 1.7 * q[1] ** 3 - 1.2345]),
+        jacobian=lambda t, q: np.concatenate([[2.0 * q[0], 5.1 * q[1] ** 2], np.zeros(n - 2)])[None],
+    )
+    q = 0.7 + np.random.default_rng(1).uniform(0.0, 0.02, (20, n))
+    q[:, 1] += 0.05
+    made, _ = consistent_states(system, 0.0, q, q)
+    assert np.abs(made[:, 0] ** 2 + 1.7 * made[:, 1] ** 3 - 1.2345).max() < 1e-14 and len(singly) == 0
+
+
+def test_rows_that_are_redundant_for_some_parameters():
+    def constraint(t, q, p):
+        return np.array([q[0] ** 2 + q[1] ** 2 - 1.0, p[0] * (q[2] - q[0])])
+
+    def jacobian(t, q, p):
+        return np.array([[2.0 * q[0], 2.0 * q[1], 0.0], [-p[0], 0.0, p[0]]])
+
+    system = ConstrainedSystem.from_python(
+        n_q=3,
+        n_c=2,
+        mass=np.eye(3),
+        force=lambda t, q, v: -q,
+        constraint=constraint,
+        jacobian=jacobian,
+        parameters=[1.0],
+    )
+    q, parameters = np.tile([0.65, 0.78, 0.66], (30, 1)), np.ones((30, 1))
+    for rank_lost in ([0], [7, 8], range(1, 30)):
+        parameters[:], parameters[list(rank_lost)] = 1.0, 0.0
+        made = consistent_states(system, 0.0, q, q, parameters=parameters)
+        for run in (0, 1, 8, 29):
+            known = consistent_state(system.with_parameters(parameters[run]), 0.0, q[run], q[run])
+            assert all(np.abs(one[run] - other).max() < 1e-14 for one, other in zip(made, known, strict=True))
 
 
 def test_few_guesses_are_not_worth_code(monkeypatch):
     problem = mechanisms.four_bar()
     q, v = guesses(problem, 2)
     made = consistent_states(problem.system, 0.1, q, v)
-    monkeypatch.setattr("twoloop.ensembles.consistent_states.SINGLY", 0.0)
+    monkeypatch.setattr(f"{MODULE}.SINGLY", 0.0)
     monkeypatch.setattr("twoloop.generate.own_lanes.are_kept", lambda *arguments: False)
     singly = consistent_states(problem.system, 0.1, q, v)
     for one, other in zip(made, singly, strict=True):

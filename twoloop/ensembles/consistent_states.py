@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from twoloop.generate.lane_constraints import LaneConstraints
     from twoloop.generate.own_lanes import OwnLanes
 
+MOST_ROWS = 200  # whose factors in lanes have no zeros
 SINGLY = 0.01  # about what `consistent_state` takes, s
 
 
@@ -38,7 +39,7 @@ def consistent_states(
     Guesses that are near the constraints are moved together, by Gauss-Newton on the equations that the callbacks were
     traced to, in SIMD lanes on all cores; each result is compared with what the callbacks themselves say. The others go
     through `consistent_state` one by one, as do those of systems with nonholonomic rows or whose callbacks cannot be
-    traced, and a few guesses of a large system, for which the code is not worth its time.
+    traced, of large systems, and a few guesses for which the code is not worth its time.
 
     Parameters
     ----------
@@ -78,8 +79,14 @@ def consistent_states(
     with suppress(Untraceable):
         lanes = _InLanes(system, starts)
         made_q, made_v, fine = lanes.put(starts, moves, 0)
-        if not fine[0] and (n_redundant := system.n_c - len(singly(0).dependent)) > 0:
-            made_q, made_v, fine = lanes.put(starts, moves, n_redundant)
+        left = np.flatnonzero(~fine)
+        for run in left[:1].tolist():  # it says how many rows are redundant, if that is why
+            found = singly(run)
+            n_redundant = system.n_c - len(found.dependent)
+            if n_redundant > 0:
+                made_q[left], made_v[left], fine[left] = lanes.put(starts.some(left), moves, n_redundant)
+            if not fine[run]:
+                made_q[run], made_v[run], fine[run] = *found, True
     # of others compiled callbacks may go out of the bounds of their arrays, which single calls look at
     traced = np.flatnonzero(fine)
     made = Starts(t, made_q[traced], made_v[traced], starts.parameters[traced])
@@ -101,6 +108,8 @@ class _InLanes:
     def __init__(self, system: ConstrainedSystem, starts: Starts):
         if system.n_a > 0:
             raise Untraceable("it has nonholonomic rows")
+        if system.n_c > MOST_ROWS:
+            raise Untraceable("single calls have sparse matrices")
         generic, varying = generic_parameters(starts.parameters)
 
         def make() -> OwnLanes[LaneConstraints]:

@@ -23,6 +23,10 @@ class Starts:
     v: Array
     parameters: Array
 
+    def some(self, which: NDArray[np.intp]) -> "Starts":
+        """Those of some runs."""
+        return Starts(self.t0, self.q[which], self.v[which], self.parameters[which])
+
 
 def all_starts(
     system: ConstrainedSystem, t0: float, q0: Any, v0: Any, parameters: Any, names: tuple[str, str] = ("q0", "v0")

@@ -49,7 +49,7 @@ class LaneConstraints(LaneSteps):
         entries = [G[i, j] for i, row in enumerate(columns) for j in row]
         values = {kind: list(equations.of(kind)) for kind in ("constraint", "constraint_rate")}
         self._rows = Outputs({**values, "entries": entries}, [])
-        told = self.pattern.tolist(), *self.numbers.structure(self._graph, self._rows.forms)
+        told = self.n, self.pattern.tolist(), *self.numbers.structure(self._graph, self._rows.forms)
         self.structure = hashlib.sha256(repr(told).encode()).hexdigest()
         self.n_numbers, self.n_quantities = self.numbers.n_varying, len(self._rows.quantities(self._graph))
 

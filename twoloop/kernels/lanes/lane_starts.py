@@ -1,8 +1,6 @@
 """Guesses in lanes put on the constraints by the least change, and whether there is another assembly about as near.
 
-Gauss-Newton with rows of length 1, and Cholesky's factors of G G^T. Redundant rows depend on one another on the
-constraints, and beside them only nearly: combinations of rows that vanish there, Z, are left out, as Z^T Z is added to
-G G^T. Lanes are independent of one another.
+Lanes are independent of one another.
 """
 
 import numpy as np
@@ -11,6 +9,17 @@ from numba import types
 from twoloop.kernels.compile.callbacks import VECTOR
 from twoloop.kernels.data.common import INTEGERS, compiled, kernel, merged
 from twoloop.kernels.lanes.lane_algebra import copy_vectors
+from twoloop.kernels.lanes.lane_gram import (
+    GOLDEN,
+    LEAST,
+    WEAK,
+    along_rows,
+    factor_gram,
+    least_change,
+    length_of,
+    normalise,
+    subtract_row,
+)
 from twoloop.kernels.lanes.lane_room import (
     AHEAD,
     CODE,
@@ -29,13 +38,8 @@ from twoloop.kernels.lanes.lane_room import (
 MOST_ITERATIONS = 12
 AT_ROUNDING = 64.0  # times rounding of its terms: an equation of a start that holds
 STRAIGHT = 0.25  # of a displacement: how far its projection may end from where C_q sends it
-SINGULAR = 1e-12  # smallest eigenvalue of G G^T, rows of length 1, that counts ...
-LEAST = 1e-15  # ... and what is added to it, so that it has an inverse ...
-SHIFT = 1e-8  # ... where some eigenvalues vanish
-WEAK = 1e-4  # eigenvalue, of the largest, from which on redundant rows count
-INVERSE_ITERATIONS = 10  # for the eigenvector of the smallest eigenvalue that counts ...
-OF_REDUNDANT = 5  # ... and for those of eigenvalues that do not, which are far smaller
-GOLDEN = 0.6180339887498949
+SINGULAR = 1e-12  # smallest eigenvalue of G G^T, rows of length 1, that counts
+ITERATIONS = 10  # of inverse iteration for the eigenvector of the smallest eigenvalue that counts
 N_REDUNDANT = 5  # in `settings`, behind those of lane_room.py: rows that depend on others
 WAYS = ((-2.0, 0.0), (0.0, 1.0), (0.0, -1.0))  # off a state that was found: parts of the guess's way, of the weakest
 
@@ -44,8 +48,8 @@ def places_of_starts(n, n_rows, n_entries, n_redundant):
     """Where in `room` stand, from the memory of the method on, and how long all of it is.
 
     C, C_t and the entries of G, as the code writes them; numbers of rows; changes of positions or velocities; positions
-    found; the way there; the direction in which rows say least; a way off; a row; factors, see `_factor`, there and at
-    NEW.
+    found; the way there; the direction in which rows say least; a way off; a row; what `factor_gram` makes, there and
+    at NEW.
     """
     G = 2 * n_rows
     x = G + n_entries
@@ -64,175 +68,12 @@ _places = merged(places_of_starts)
 
 
 @merged
-def _subtract_four(room, target, x, dx, y, dy, count):
-    t0, t1, t2, t3 = room[target], room[target + 1], room[target + 2], room[target + 3]
-    for _ in range(count):
-        t0 -= room[x] * room[y]
-        t1 -= room[x + 1] * room[y + 1]
-        t2 -= room[x + 2] * room[y + 2]
-        t3 -= room[x + 3] * room[y + 3]
-        x += dx
-        y += dy
-    room[target], room[target + 1], room[target + 2], room[target + 3] = t0, t1, t2, t3
-
-
-@compiled
-def _subtract_products(room, target, x, dx, y, dy, count):
-    """target -= the sum of products of vectors that are dx and dy apart, in each lane."""
-    for k in range(0, LANES, 4):
-        _subtract_four(room, target * LANES + k, x * LANES + k, dx * LANES, y * LANES + k, dy * LANES, count)
-
-
-@merged
-def _subtract_row(room, target, entries, pattern, i, y):
-    """target -= row i of G y, whose entries stand behind one another."""
-    for e in range(pattern[i], pattern[i + 1]):
-        _subtract_products(room, target, entries + e - pattern[0], 1, y + pattern[e], 1, 1)
-
-
-@compiled
-def _scale(room, target, factor):
-    for k in range(LANES):
-        room[target * LANES + k] *= room[factor * LANES + k]
-
-
-@compiled
-def _invert_gram(room, pattern, n_rows, n_redundant, row, factors, shift):
-    """Cholesky's factors of G G^T + shift + Z Z^T, with 1 over their diagonal."""
-    n_entries = pattern[n_rows] - pattern[0]
-    gram = factors + n_entries + n_rows
-    Z = gram + n_rows * n_rows
-    for i in range(n_rows):
-        for e in range(pattern[i], pattern[i + 1]):
-            copy_vectors(room, factors + e - pattern[0], row + pattern[e], 1)
-        for j in range(i + 1):
-            entry = gram + i * n_rows + j
-            fill_field(room, entry, -shift if i == j else 0.0)
-            _subtract_row(room, entry, factors, pattern, j, row)
-            _subtract_products(room, entry, Z + i, n_rows, Z + j, n_rows, n_redundant)
-            for k in range(LANES):
-                room[entry * LANES + k] *= -1.0
-            _subtract_products(room, entry, gram + i * n_rows, 1, gram + j * n_rows, 1, j)
-            if i > j:
-                _scale(room, entry, gram + j * n_rows + j)
-        for k in range(LANES):
-            pivot = room[(gram + i * n_rows + i) * LANES + k]
-            room[(gram + i * n_rows + i) * LANES + k] = 1.0 / np.sqrt(pivot) if pivot > 0.0 else np.nan
-        for e in range(pattern[i], pattern[i + 1]):
-            fill_field(room, row + pattern[e], 0.0)
-
-
-@compiled
-def _factor(room, pattern, moves, n_rows, n_redundant, G, row, factors):
-    """Rows of length 1 of what may move, 1 over their lengths, factors of `_invert_gram`, and Z, a vector a row."""
-    n_entries = pattern[n_rows] - pattern[0]
-    for i in range(n_rows):
-        length = factors + n_entries + i
-        fill_field(room, length, 0.0)
-        for e in range(pattern[i], pattern[i + 1]):
-            entry = e - pattern[0]
-            if moves[pattern[e]] == 1:
-                copy_vectors(room, G + entry, factors + entry, 1)
-                _subtract_products(room, length, G + entry, 1, G + entry, 1, 1)
-            else:
-                fill_field(room, factors + entry, 0.0)
-        for k in range(LANES):
-            square = -room[length * LANES + k]
-            room[length * LANES + k] = 1.0 / np.sqrt(square) if square != 0.0 else 1.0
-        for e in range(pattern[i], pattern[i + 1]):
-            _scale(room, factors + e - pattern[0], length)
-    if n_redundant > 0:
-        _find_redundant(room, pattern, n_rows, n_redundant, row, factors)
-    _invert_gram(room, pattern, n_rows, n_redundant, row, factors, LEAST)
-
-
-@compiled
-def _find_redundant(room, pattern, n_rows, n_redundant, row, factors):
-    """Z, eigenvectors of the smallest eigenvalues of G G^T; NaN where these are not small."""
-    gram = factors + pattern[n_rows] - pattern[0] + n_rows
-    Z = gram + n_rows * n_rows
-    _invert_gram(room, pattern, n_rows, 0, row, factors, SHIFT)
-    for w in range(n_redundant):
-        z = Z + w * n_rows
-        for i in range(n_rows):
-            fill_field(room, z + i, 0.5 + (GOLDEN * (i + 1) * (w + 1)) % 1.0)
-        for _ in range(OF_REDUNDANT):
-            _normalise(room, z, n_rows)
-            _solve(room, n_rows, gram, z)
-            _leave_out(room, n_rows, w, Z, z)
-        for k in range(LANES):
-            if not _length(room, z, n_rows, k) * (WEAK - SHIFT) > 1.0:  # 1 over the eigenvalue and SHIFT
-                room[z * LANES + k] = np.nan
-        _normalise(room, z, n_rows)
-
-
-@compiled
-def _normalise(room, x, n_rows):
-    for k in range(LANES):
-        length = _length(room, x, n_rows, k)
-        for i in range(n_rows):
-            room[(x + i) * LANES + k] /= length
-
-
-@compiled
-def _leave_out(room, n_rows, n_redundant, Z, x):
-    """x less its parts in Z."""
-    for w in range(n_redundant):
-        for k in range(LANES):
-            part = 0.0
-            for i in range(n_rows):
-                part += room[(Z + w * n_rows + i) * LANES + k] * room[(x + i) * LANES + k]
-            for i in range(n_rows):
-                room[(x + i) * LANES + k] -= part * room[(Z + w * n_rows + i) * LANES + k]
-
-
-@compiled
-def _solve(room, n_rows, gram, x):
-    """x becomes the solution y of the factors' matrix y = x."""
-    for i in range(n_rows):
-        _subtract_products(room, x + i, gram + i * n_rows, 1, x, 1, i)
-        _scale(room, x + i, gram + i * n_rows + i)
-    for i in range(n_rows - 1, -1, -1):
-        _subtract_products(room, x + i, gram + (i + 1) * n_rows + i, n_rows, x + i + 1, 1, n_rows - 1 - i)
-        _scale(room, x + i, gram + i * n_rows + i)
-
-
-@compiled
-def _along_rows(room, pattern, n, n_rows, n_redundant, factors, x, out):
-    """x becomes the solution y of G G^T y = x, of rows of length 1, without what is redundant, and out = -G^T y."""
-    gram = factors + pattern[n_rows] - pattern[0] + n_rows
-    _leave_out(room, n_rows, n_redundant, gram + n_rows * n_rows, x)
-    _solve(room, n_rows, gram, x)
-    for j in range(n):
-        fill_field(room, out + j, 0.0)
-    for i in range(n_rows):
-        for e in range(pattern[i], pattern[i + 1]):
-            _subtract_products(room, out + pattern[e], x + i, 1, factors + e - pattern[0], 1, 1)
-
-
-@compiled
-def _least_change(room, pattern, n, n_rows, n_redundant, factors, x, change):
-    """The smallest change with G change = -x; not finite where rows depend on one another. x is lost."""
-    for i in range(n_rows):
-        _scale(room, x + i, factors + pattern[n_rows] - pattern[0] + i)
-    _along_rows(room, pattern, n, n_rows, n_redundant, factors, x, change)
-
-
-@merged
 def _largest(room, place, count, k):
     largest = 0.0
     for j in range(count):
         size = abs(room[(place + j) * LANES + k])
         largest = largest if size <= largest else size  # NaN stays
     return largest
-
-
-@merged
-def _length(room, place, count, k):
-    total = 0.0
-    for j in range(count):
-        total += room[(place + j) * LANES + k] ** 2
-    return np.sqrt(total)
 
 
 @merged
@@ -260,9 +101,9 @@ def _gauss_newton(code, settings, control, pattern, moves, room):
     for _ in range(MOST_ITERATIONS):
         fill_field(room, FINE, 1.0)
         code.rows(0, control, room)
-        _factor(room, pattern, moves, n_rows, n_redundant, G, row, factors)
+        factor_gram(room, pattern, moves, n_rows, n_redundant, G, row, factors)
         copy_vectors(room, memory, x, n_rows)
-        _least_change(room, pattern, n, n_rows, n_redundant, factors, x, change)
+        least_change(room, pattern, n, n_rows, n_redundant, factors, x, change)
         left = 0.0
         for k in range(LANES):
             if room[LEFT_TO_MOVE * LANES + k] == 0.0:
@@ -293,14 +134,14 @@ def _change_velocities(code, settings, control, pattern, moves, room):
     G, x, change, row, factors = memory + G, memory + x, memory + change, memory + row, memory + there
     fill_field(room, FINE, 1.0)
     code.rows(0, control, room)
-    _factor(room, pattern, moves, n_rows, n_redundant, G, row, factors)
+    factor_gram(room, pattern, moves, n_rows, n_redundant, G, row, factors)
     for _ in range(2):  # once more for what rounding of a large change leaves
         for i in range(n_rows):
             fill_field(room, x + i, 0.0)
-            _subtract_row(room, x + i, G, pattern, i, new + n)
+            subtract_row(room, x + i, G, pattern, i, new + n)
             for k in range(LANES):
                 room[(x + i) * LANES + k] = room[(memory + n_rows + i) * LANES + k] - room[(x + i) * LANES + k]
-        _least_change(room, pattern, n, n_rows, n_redundant, factors, x, change)
+        least_change(room, pattern, n, n_rows, n_redundant, factors, x, change)
         for j in range(n * LANES):
             room[(new + n) * LANES + j] += room[change * LANES + j]
     for k in range(LANES):
@@ -313,12 +154,12 @@ def _look_for_weakest(room, pattern, n, n_rows, n_redundant, factors, x, moved, 
     """The direction in which rows say least, as far as the guess was moved; RUNNING stays where there is none."""
     for i in range(n_rows):
         fill_field(room, x + i, 0.5 + (GOLDEN * (i + 1)) % 1.0)
-    for _ in range(INVERSE_ITERATIONS):
-        _normalise(room, x, n_rows)
-        _along_rows(room, pattern, n, n_rows, n_redundant, factors, x, weakest)
+    for _ in range(ITERATIONS):
+        normalise(room, x, n_rows)
+        along_rows(room, pattern, n, n_rows, n_redundant, factors, x, weakest)
     least = SINGULAR if n_redundant == 0 else WEAK * n_rows
     for k in range(LANES):
-        if not least * _length(room, x, n_rows, k) < 1.0:  # it is as long as 1 over the smallest eigenvalue
+        if not least * length_of(room, x, n_rows, k) < 1.0:  # it is as long as 1 over the smallest eigenvalue
             room[RUNNING * LANES + k] = 0.0
         share = _largest(room, moved, n, k) / max(_largest(room, weakest, n, k), LEAST)
         for j in range(n):
@@ -343,17 +184,16 @@ def _look_for_others(code, settings, control, pattern, moves, room):
         _gauss_newton(code, settings, control, pattern, moves, room)
         for i in range(n_rows):
             fill_field(room, x + i, 0.0)
-            _subtract_row(room, x + i, factors, pattern, i, way)
-        _along_rows(
-            room, pattern, n, n_rows, n_redundant, factors, x, change
-        )  # the part of the way that rows leave nothing of
+            subtract_row(room, x + i, factors, pattern, i, way)
+        # the part of the way that rows leave nothing of
+        along_rows(room, pattern, n, n_rows, n_redundant, factors, x, change)
         for k in range(LANES):
-            apart = 0.0
+            apart, rounding = 0.0, AT_ROUNDING * np.finfo(np.float64).eps * _largest(room, found, n, k)
             for j in range(n):
                 m = j * LANES + k
                 expected = room[found * LANES + m] + room[way * LANES + m] - room[change * LANES + m]
                 apart = max(apart, abs(room[new * LANES + m] - expected))
-            if not apart <= STRAIGHT * _largest(room, way, n, k):
+            if not apart <= STRAIGHT * _largest(room, way, n, k) + rounding:
                 room[RUNNING * LANES + k] = 0.0
 
 
