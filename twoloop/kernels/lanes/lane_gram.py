@@ -20,15 +20,6 @@ GOLDEN = 0.6180339887498949
 
 
 @merged
-def length_of(room, place, count, k):
-    """Of a vector of so many numbers, in one lane."""
-    total = 0.0
-    for j in range(count):
-        total += room[(place + j) * LANES + k] ** 2
-    return np.sqrt(total)
-
-
-@merged
 def _subtract_four(room, target, x, dx, y, dy, count):
     t0, t1, t2, t3 = room[target], room[target + 1], room[target + 2], room[target + 3]
     for _ in range(count):
@@ -42,7 +33,7 @@ def _subtract_four(room, target, x, dx, y, dy, count):
 
 
 @compiled
-def _subtract_products(room, target, x, dx, y, dy, count):
+def subtract_products(room, target, x, dx, y, dy, count):
     """target -= the sum of products of vectors that are dx and dy apart, in each lane."""
     for k in range(0, LANES, 4):
         _subtract_four(room, target * LANES + k, x * LANES + k, dx * LANES, y * LANES + k, dy * LANES, count)
@@ -52,7 +43,7 @@ def _subtract_products(room, target, x, dx, y, dy, count):
 def subtract_row(room, target, entries, pattern, i, y):
     """target -= row i of G y, whose entries stand behind one another."""
     for e in range(pattern[i], pattern[i + 1]):
-        _subtract_products(room, target, entries + e - pattern[0], 1, y + pattern[e], 1, 1)
+        subtract_products(room, target, entries + e - pattern[0], 1, y + pattern[e], 1, 1)
 
 
 @compiled
@@ -74,10 +65,10 @@ def _invert_gram(room, pattern, n_rows, n_redundant, row, factors, shift):
             entry = gram + i * n_rows + j
             fill_field(room, entry, -shift if i == j else 0.0)
             subtract_row(room, entry, factors, pattern, j, row)
-            _subtract_products(room, entry, Z + i, n_rows, Z + j, n_rows, n_redundant)
+            subtract_products(room, entry, Z + i, n_rows, Z + j, n_rows, n_redundant)
             for k in range(LANES):
                 room[entry * LANES + k] *= -1.0
-            _subtract_products(room, entry, gram + i * n_rows, 1, gram + j * n_rows, 1, j)
+            subtract_products(room, entry, gram + i * n_rows, 1, gram + j * n_rows, 1, j)
             if i > j:
                 _scale(room, entry, gram + j * n_rows + j)
         for k in range(LANES):
@@ -89,7 +80,7 @@ def _invert_gram(room, pattern, n_rows, n_redundant, row, factors, shift):
 
 @compiled
 def factor_gram(room, pattern, moves, n_rows, n_redundant, G, row, factors):
-    """Rows of length 1 of what may move, 1 over their lengths, factors of `_invert_gram`, and Z, one after another."""
+    """Rows of length 1 of what may move, 1 over their lengths, factors of `_invert_gram`, Z, and a spare vector."""
     n_entries = pattern[n_rows] - pattern[0]
     for i in range(n_rows):
         length = factors + n_entries + i
@@ -98,7 +89,7 @@ def factor_gram(room, pattern, moves, n_rows, n_redundant, G, row, factors):
             entry = e - pattern[0]
             if moves[pattern[e]] == 1:
                 copy_vectors(room, G + entry, factors + entry, 1)
-                _subtract_products(room, length, G + entry, 1, G + entry, 1, 1)
+                subtract_products(room, length, G + entry, 1, G + entry, 1, 1)
             else:
                 fill_field(room, factors + entry, 0.0)
         for k in range(LANES):
@@ -116,50 +107,54 @@ def _find_redundant(room, pattern, n_rows, n_redundant, row, factors):
     """Z, eigenvectors of the smallest eigenvalues of G G^T; NaN where these are not small."""
     gram = factors + pattern[n_rows] - pattern[0] + n_rows
     Z = gram + n_rows * n_rows
+    spare = Z + n_redundant * n_rows
     _invert_gram(room, pattern, n_rows, 0, row, factors, MORE)
     for w in range(n_redundant):
         z = Z + w * n_rows
         for i in range(n_rows):
             fill_field(room, z + i, 0.5 + (GOLDEN * (i + 1) * (w + 1)) % 1.0)
         for _ in range(ITERATIONS):
-            normalise(room, z, n_rows)
+            normalise(room, z, n_rows, spare)
             _solve(room, n_rows, gram, z)
-            _leave_out(room, n_rows, w, Z, z)
+            _leave_out(room, n_rows, w, Z, z, spare)
+        normalise(room, z, n_rows, spare)
         for k in range(LANES):
-            if not length_of(room, z, n_rows, k) * (WEAK - MORE) > 1.0:  # 1 over the eigenvalue and MORE
+            if not room[spare * LANES + k] < WEAK - MORE:  # the eigenvalue, less MORE
                 room[z * LANES + k] = np.nan
-        normalise(room, z, n_rows)
 
 
 @compiled
-def normalise(room, x, n_rows):
-    """x becomes of length 1."""
+def normalise(room, x, n_rows, spare):
+    """x becomes of length 1, and `spare` 1 over what it was."""
+    fill_field(room, spare, 0.0)
+    subtract_products(room, spare, x, 1, x, 1, n_rows)
     for k in range(LANES):
-        length = length_of(room, x, n_rows, k)
-        for i in range(n_rows):
-            room[(x + i) * LANES + k] /= length
+        room[spare * LANES + k] = 1.0 / np.sqrt(abs(room[spare * LANES + k]))
+    for i in range(n_rows):
+        _scale(room, x + i, spare)
 
 
 @compiled
-def _leave_out(room, n_rows, n_redundant, Z, x):
+def _leave_out(room, n_rows, n_redundant, Z, x, spare):
     """x less its parts in Z."""
     for w in range(n_redundant):
+        z = Z + w * n_rows
+        fill_field(room, spare, 0.0)
+        subtract_products(room, spare, z, 1, x, 1, n_rows)
         for k in range(LANES):
-            part = 0.0
-            for i in range(n_rows):
-                part += room[(Z + w * n_rows + i) * LANES + k] * room[(x + i) * LANES + k]
-            for i in range(n_rows):
-                room[(x + i) * LANES + k] -= part * room[(Z + w * n_rows + i) * LANES + k]
+            room[spare * LANES + k] *= -1.0
+        for i in range(n_rows):
+            subtract_products(room, x + i, z + i, 1, spare, 1, 1)
 
 
 @compiled
 def _solve(room, n_rows, gram, x):
     """x becomes the solution y of the factors' matrix y = x."""
     for i in range(n_rows):
-        _subtract_products(room, x + i, gram + i * n_rows, 1, x, 1, i)
+        subtract_products(room, x + i, gram + i * n_rows, 1, x, 1, i)
         _scale(room, x + i, gram + i * n_rows + i)
     for i in range(n_rows - 1, -1, -1):
-        _subtract_products(room, x + i, gram + (i + 1) * n_rows + i, n_rows, x + i + 1, 1, n_rows - 1 - i)
+        subtract_products(room, x + i, gram + (i + 1) * n_rows + i, n_rows, x + i + 1, 1, n_rows - 1 - i)
         _scale(room, x + i, gram + i * n_rows + i)
 
 
@@ -167,13 +162,14 @@ def _solve(room, n_rows, gram, x):
 def along_rows(room, pattern, n, n_rows, n_redundant, factors, x, out):
     """x becomes the solution y of G G^T y = x, of rows of length 1, without what is redundant, and out = -G^T y."""
     gram = factors + pattern[n_rows] - pattern[0] + n_rows
-    _leave_out(room, n_rows, n_redundant, gram + n_rows * n_rows, x)
+    Z = gram + n_rows * n_rows
+    _leave_out(room, n_rows, n_redundant, Z, x, Z + n_redundant * n_rows)
     _solve(room, n_rows, gram, x)
     for j in range(n):
         fill_field(room, out + j, 0.0)
     for i in range(n_rows):
         for e in range(pattern[i], pattern[i + 1]):
-            _subtract_products(room, out + pattern[e], x + i, 1, factors + e - pattern[0], 1, 1)
+            subtract_products(room, out + pattern[e], x + i, 1, factors + e - pattern[0], 1, 1)
 
 
 @compiled

@@ -16,7 +16,6 @@ from twoloop.kernels.lanes.lane_gram import (
     along_rows,
     factor_gram,
     least_change,
-    length_of,
     normalise,
     subtract_row,
 )
@@ -60,7 +59,7 @@ def places_of_starts(n, n_rows, n_entries, n_redundant):
     way = weakest + n
     row = way + n
     there = row + n
-    size = n_entries + n_rows * (1 + n_rows + n_redundant)
+    size = n_entries + n_rows * (1 + n_rows + n_redundant) + 1
     return G, x, change, found, moved, weakest, way, row, there, there + size, there + 2 * size
 
 
@@ -152,14 +151,16 @@ def _change_velocities(code, settings, control, pattern, moves, room):
 @compiled
 def _look_for_weakest(room, pattern, n, n_rows, n_redundant, factors, x, moved, weakest):
     """The direction in which rows say least, as far as the guess was moved; RUNNING stays where there is none."""
+    spare = factors + pattern[n_rows] - pattern[0] + n_rows * (1 + n_rows + n_redundant)
     for i in range(n_rows):
         fill_field(room, x + i, 0.5 + (GOLDEN * (i + 1)) % 1.0)
     for _ in range(ITERATIONS):
-        normalise(room, x, n_rows)
+        normalise(room, x, n_rows, spare)
         along_rows(room, pattern, n, n_rows, n_redundant, factors, x, weakest)
+    normalise(room, x, n_rows, spare)
     least = SINGULAR if n_redundant == 0 else WEAK * n_rows
     for k in range(LANES):
-        if not least * length_of(room, x, n_rows, k) < 1.0:  # it is as long as 1 over the smallest eigenvalue
+        if not room[spare * LANES + k] > least:  # the smallest eigenvalue
             room[RUNNING * LANES + k] = 0.0
         share = _largest(room, moved, n, k) / max(_largest(room, weakest, n, k), LEAST)
         for j in range(n):
