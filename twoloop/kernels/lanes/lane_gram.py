@@ -119,7 +119,7 @@ def _find_redundant(room, pattern, n_rows, n_redundant, row, factors):
             _leave_out(room, n_rows, w, Z, z, spare)
         normalise(room, z, n_rows, spare)
         for k in range(LANES):
-            if not room[spare * LANES + k] < WEAK - MORE:  # the eigenvalue, less MORE
+            if not room[spare * LANES + k] < WEAK:  # the eigenvalue and MORE
                 room[z * LANES + k] = np.nan
 
 
