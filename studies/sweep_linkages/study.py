@@ -1,4 +1,4 @@
-"""Ten thousand random linkages: energy error and period of each, and how a sweep scales on two cores."""
+"""Ten thousand random linkages: energy error and period of each, how a sweep scales, and a million in one call."""
 
 import time
 from functools import partial
@@ -13,6 +13,8 @@ from studies.bench import figures
 from studies.bench.cli import StudyError, processor
 from studies.bench.store import Array, Output, sources
 from studies.bench.study import Study
+from studies.sweep_linkages import in_one_call
+from studies.sweep_linkages.in_one_call import RANGES
 from twoloop import Result, sweep
 from twoloop.ensembles.in_lanes import threads_of
 from twoloop.mechanisms import Problem, four_bar
@@ -21,7 +23,7 @@ SEED = 2016
 N_RUNS, N_QUICK = 10_000, 20
 N_SCALING, N_SCALING_QUICK = 1_000, 10
 SPAN = (0.0, 6.0)
-RANGES = {"L1": (0.8, 1.5), "L2": (1.0, 2.0), "L3": (0.8, 1.6), "ground": (2.0, 3.0), "theta3": (-1.0, 1.0)}
+N_IN_ONE_CALL, N_IN_ONE_CALL_QUICK = (10_000, 1_000_000), (100,)
 AT_REST = 1e-4  # of the largest velocity of a run: below it the linkage has turned back
 SAME = 1e-6  # s: zeros of several bars closer than this are one rest
 BARS = (2, 5, 8)  # angles of the three bars
@@ -101,6 +103,9 @@ def make(output: Output) -> pd.DataFrame:
         row = {"group": "scaling", "parallel": parallel, "workers": workers, "n_runs": len(timed)}
         parts.append(pd.DataFrame([row | {"wall": time.perf_counter() - began}]))
     kept.unlink()
+    next(in_one_call.blocks(N_IN_ONE_CALL_QUICK[0], SPAN[1]))  # which loads the code
+    one_call = [in_one_call.row_of(n, SPAN[1]) for n in (N_IN_ONE_CALL_QUICK if quick else N_IN_ONE_CALL)]
+    parts.append(pd.DataFrame(one_call))
     return pd.concat(parts, ignore_index=True).assign(processor=processor())
 
 
@@ -125,6 +130,9 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     found |= {"n_periodic": len(periodic), "period": _quantiles(periodic["period"]) if len(periodic) else None}
     found |= {"return": _quantiles(returned) if len(periodic) else None, "n_scaling": int(scaling["n_runs"].iloc[0])}
     found |= {"ratios": ratios, "asked": SCALES}
+    found |= {"block": in_one_call.BLOCK, "n_times": in_one_call.N_TIMES}
+    found |= {"n_worst": in_one_call.N_WORST, "n_any": in_one_call.N_ANY}
+    found |= {"in_one_call": rows[rows["group"] == in_one_call.GROUP].to_dict("records")}
     return found | {"scales": ratios["processes"] >= SCALES if "processes" in ratios else None}
 
 

@@ -9,7 +9,7 @@ import pytest
 from studies.bench.cli import StudyError, processor
 from studies.bench.render import render
 from studies.bench.store import read_rows
-from studies.sweep_linkages import study
+from studies.sweep_linkages import in_one_call, study
 from twoloop import sweep
 from twoloop.mechanisms import four_bar
 
@@ -38,7 +38,22 @@ def made_up(**changes):
         for way, times in walls.items()
         for k, wall in enumerate(times)
     ]
-    return pd.concat([linkages.assign(**changes), pd.DataFrame(scaling)], ignore_index=True)
+    one_call = [
+        {
+            "group": in_one_call.GROUP,
+            "n_runs": n,
+            "n_assembled": n - 1,
+            "wall": 1.0,
+            "n_failed": failed,
+            "n_left": failed,
+        }
+        | {"energy_median": 1e-9, "energy_high": 2e-9, "energy_error": 1e-8, "n_hard": 40, "n_any": 100}
+        | {"end_error_hard": 1e-7, "end_error_any": 1e-7, "n_unknown_hard": failed, "n_unknown_any": 0}
+        | study.drawn(1)[0]
+        for n, failed in ((100, 0), (10_000, changes.pop("n_failed", 0)))
+    ]
+    parts = [linkages.assign(**changes), pd.DataFrame(scaling), pd.DataFrame(one_call)]
+    return pd.concat(parts, ignore_index=True)
 
 
 def said(rows):
@@ -70,6 +85,40 @@ def test_draws_are_always_the_same_and_within_their_ranges():
     assert {each["branch"] for each in more} == {-1, 1}
 
 
+def test_linkages_by_the_hundred_are_assembled_as_one_is():
+    given = in_one_call.drawn(60)
+    assert (given[:20] == in_one_call.drawn(20)).all()
+    linkages, made = in_one_call.assembled(given), []
+    for each in given:
+        try:
+            made.append(study.linkage(*each[:5], int(each[5])))
+        except ValueError:
+            continue
+    assert len(made) == len(linkages.q0) < 60
+    assert max(np.abs(one.q0 - q0).max() for one, q0 in zip(made, linkages.q0, strict=True)) < 1e-14
+
+
+@pytest.fixture
+def few_compared(monkeypatch):
+    monkeypatch.setattr(in_one_call, "N_WORST", 2)
+    monkeypatch.setattr(in_one_call, "N_ANY", 3)
+
+
+def test_energies_and_ends_of_many_are_those_of_one(few_compared):
+    (linkages, runs), row = next(in_one_call.blocks(30, 1.0)), in_one_call.row_of(30, 1.0)
+    lengths = linkages.given[:, :3]
+    for k in (0, 11):
+        problem = study.linkage(*linkages.given[k, :5], int(linkages.given[k, 5]))
+        scale = 9.81 * (lengths[k] ** 2).sum()
+        known = problem.energy(0.0, runs.q[k], runs.v[k]) / scale
+        assert np.abs(in_one_call.energies(lengths, runs.q, runs.v)[k] - known).max() < 1e-14
+    errors = in_one_call.energy_errors(linkages, runs)
+    assert row["energy_error"] == errors.max() < 1e-7 and row["n_failed"] == row["n_left"] == 0
+    assert 0.0 < row["end_error_any"] < 1e-6 and (row["n_hard"], row["n_any"], row["n_assembled"]) == (4, 3, len(runs))
+    off = runs.q[0, :, -1] + 1e-3
+    assert in_one_call.end_error(linkages.given[0], off, 1.0) == pytest.approx(1e-3, rel=1e-3)
+
+
 def test_findings_are_of_the_rows():
     found = study.findings_of(made_up())
     assert (found["n"], found["n_done"], found["n_unassembled"], found["others"]) == (3, 2, 1, {})
@@ -89,12 +138,13 @@ def test_findings_follow_the_rows():
     other = made_up(status=["REACHED_END", "STAGNATED", "ERROR"])
     said(other)
     assert study.findings_of(other)["others"]["STAGNATED"] == 1
+    assert "; 3 failed" in said(made_up(n_failed=3)) and ", and none failed" in said(made_up())
     none = made_up(period=np.nan, half=np.nan)
     said(none)
     assert study.findings_of(none)["n_periodic"] == 0
 
 
-def test_the_quick_study(tmp_path):
+def test_the_quick_study(tmp_path, few_compared):
     study.STUDY.main(["--quick", "--out", str(tmp_path)])
     report = (tmp_path / "sweep_linkages.md").read_text()
     rows, _ = read_rows(tmp_path / "sweep_linkages.csv")
