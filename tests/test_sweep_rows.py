@@ -18,7 +18,7 @@ from twoloop import sweep
 from twoloop.generate import straight_code
 from twoloop.kernels.compile.caches import Newest
 from twoloop.mechanisms import Problem
-from twoloop.sweeps import sweep as sweeps
+from twoloop.sweeps import tasks
 from twoloop.sweeps import workers
 from twoloop.sweeps.digests import digest_of
 
@@ -279,7 +279,7 @@ class Lost(ThreadPoolExecutor):
 
 
 def test_a_cluster_that_loses_a_worker_loses_one_run(monkeypatch):
-    monkeypatch.setattr(sweeps, "BATCHES", 1)
+    monkeypatch.setattr(tasks, "BATCHES", 1)
     rows = sweep(swinging, RUNS, measure=plain, client=Lost(1), workers=1, **QUICK)
     assert [k for k, status in enumerate(rows["status"]) if status != "REACHED_END"] == [2]
     assert rows.loc[2, "message"] == "RuntimeError: the worker was killed"

@@ -15,7 +15,7 @@ SPAN = (0.0, 2.0)
 @pytest.fixture(autouse=True)
 def builds(monkeypatch):
     """Lanes are compiled however few runs there are."""
-    monkeypatch.setattr("twoloop.ensembles.ensemble.CALL", 1e9)
+    monkeypatch.setattr("twoloop.ensembles.in_turn.CALL", 1e9)
 
 
 def test_one_start_serves_all_parameters_and_one_set_of_parameters_all_starts():
@@ -86,14 +86,14 @@ def test_what_cannot_go_in_lanes_says_why():
 def test_lanes_that_do_not_end_where_the_first_run_does_are_not_believed(monkeypatch):
     system, q, v, parameters = pendulums(9)
     runs = ensemble(system, SPAN, q, v, parameters=parameters, rtol=1e-8, atol=1e-8)
-    monkeypatch.setattr("twoloop.ensembles.ensemble.FAR", 1e-6)
+    monkeypatch.setattr("twoloop.ensembles.in_turn.FAR", 1e-6)
     other = ensemble(system, SPAN, q, v, parameters=parameters)
     assert other.singly.all() and "the first run ends elsewhere by itself" in other.message
     assert np.abs(other.q - runs.q).max() < 1e-6
 
 
 def test_a_few_runs_do_not_wait_for_a_compiler(monkeypatch):
-    monkeypatch.setattr("twoloop.ensembles.ensemble.CALL", 0.0)
+    monkeypatch.setattr("twoloop.ensembles.in_turn.CALL", 0.0)
     monkeypatch.setattr("twoloop.generate.own_lanes.OwnLanes.seconds_to_build", 10.0)
     system, q, v, parameters = pendulums(3)
     runs = ensemble(system, (0.0, 0.1), q, v, parameters=parameters)
@@ -122,7 +122,7 @@ def test_velocities_off_the_constraints_are_named():
 def test_runs_nearly_at_rest_among_fast_ones_need_no_closer_look(monkeypatch):
     """What rounding leaves of velocities is a share of those of other runs, from which they were projected."""
     looked = []
-    monkeypatch.setattr("twoloop.ensembles.ensemble._check_start", lambda *arguments: looked.append(arguments[-1]))
+    monkeypatch.setattr("twoloop.ensembles.in_turn._check_start", lambda *arguments: looked.append(arguments[-1]))
     system, q, _, parameters = pendulums(9)
     v = np.column_stack([-q[:, 1], q[:, 0]])
     v[4] = 1e-9 * v[4] + 5e-16 * q[4]

@@ -20,7 +20,7 @@ TIMES = np.sort(np.concatenate([np.linspace(*SPAN, 9), [1e-4, 0.501, 0.5011, 1.9
 @pytest.fixture(autouse=True)
 def builds(monkeypatch):
     """Lanes are compiled however few runs there are."""
-    monkeypatch.setattr("twoloop.ensembles.ensemble.CALL", 1e9)
+    monkeypatch.setattr("twoloop.ensembles.in_turn.CALL", 1e9)
 
 
 @pytest.fixture(scope="module", params=["auto", "DOP853", "RadauIIA5", "RadauIIA9", "RadauIIA13"])
@@ -28,7 +28,7 @@ def made(request):
     system, q, v, parameters = pendulums(140)
     options = {"method": request.param, "rtol": TOLERANCE, "atol": TOLERANCE, "t_eval": TIMES}
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("twoloop.ensembles.ensemble.CALL", 1e9)
+        patch.setattr("twoloop.ensembles.in_turn.CALL", 1e9)
         runs = ensemble(system, SPAN, q, v, parameters=parameters, threads=1, **options)
     return system, q, v, parameters, options, runs
 
@@ -202,7 +202,7 @@ def test_vibrations_that_do_not_matter_are_passed_over_as_singly_and_no_others(t
     q, v, atol = np.zeros((9, 1)), np.full((9, 1), 40.0), np.full(1, tolerance)
     lanes = LaneRuns(system, Starts(0.0, q, v, p), lane_methods("auto", True, 1, tolerance, tolerance)[0])
     out = np.empty((2, 9, 1, 1))
-    made, n_steps, _ = lanes.make(np.arange(9), 4.0, np.array([4.0]), tolerance, atol, 1, *out)
+    made, n_steps, _, _ = lanes.make(np.arange(9), 4.0, np.array([4.0]), tolerance, atol, 1, *out)
     options = {"method": PRESETS["auto"].tightest, "rtol": tolerance, "atol": tolerance}
     for run in (1, 5, 8):
         alone = solve_dae(system.with_parameters(p[run]), (0.0, 4.0), q[run], v[run], **options)

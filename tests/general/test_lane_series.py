@@ -31,7 +31,7 @@ def test_rates_of_sines_share_the_sums_of_these():
 @pytest.mark.filterwarnings("ignore::twoloop.ConstraintWarning")
 def test_massless_coordinates_and_rows_that_depend_on_others(n_redundant, monkeypatch):
     """Rows that M is made definite with are in the series, whether they count or not."""
-    monkeypatch.setattr("twoloop.ensembles.ensemble.CALL", 1e9)
+    monkeypatch.setattr("twoloop.ensembles.in_turn.CALL", 1e9)
     parameters = np.column_stack([np.linspace(0.7, 1.3, 9), np.linspace(12.0, 5.0, 9)])
     angle = np.linspace(0.3, 1.2, 9)
     q = np.column_stack([parameters[:, 0] * np.sin(angle), -parameters[:, 0] * np.cos(angle), angle])

@@ -90,18 +90,20 @@ class LaneRuns:
         threads: int,
         out_q: Array,
         out_v: Array,
-    ) -> tuple[Integers, Integers, Array]:
-        """Make these runs: what became of each, as lane_ends.py has it, steps, and a and lam at the end."""
+    ) -> tuple[Integers, Integers, Integers, Array]:
+        """Make these runs: what became of each, as lane_ends.py has it, steps, evaluations, a and lam at the end."""
         n_runs = len(which)
-        status, n_steps = np.zeros((2, n_runs), dtype=np.int64)
+        status, n_steps, n_evaluations = np.zeros((3, n_runs), dtype=np.int64)
+        n_evaluations += 1  # at the start
         ends = np.full((n_runs, self.system.n_q + self.system.n_c), np.nan)
 
         def block(rows: slice) -> None:
             out = out_q[rows], out_v[rows], ends[rows]
-            self._make(which[rows], t1, times, rtol, atol, out, status[rows], n_steps[rows])
+            told = status[rows], n_steps[rows], n_evaluations[rows]
+            self._make(which[rows], t1, times, rtol, atol, out, told)
 
         in_blocks(block, n_runs, threads)
-        return status, n_steps, ends
+        return status, n_steps, n_evaluations, ends
 
     def _make(
         self,
@@ -111,8 +113,7 @@ class LaneRuns:
         rtol: float,
         atol: Array,
         out: tuple[Array, Array, Array],
-        status: Integers,
-        n_steps: Integers,
+        told: tuple[Integers, Integers, Integers],
     ) -> None:
         from twoloop.kernels.lanes import lane_room, lane_runs
 
@@ -123,10 +124,10 @@ class LaneRuns:
         room = aligned(begin + method.memory(code), lane_room.LANES)
         kit = lane_room.LaneKit(self.own.functions, method.step())
         redundant = bool(code.equations.redundant.conditions)
-        settings = np.array([n, n_rows, method.order, redundant, code.n_numbers], dtype=np.int64)
+        settings = np.array([n, n_rows, method.order, redundant, code.n_numbers, method.evaluations], dtype=np.int64)
         control = np.concatenate([[starts.t0, t1, (t1 - starts.t0) / self.places, rtol], atol, code.numbers.values])
         given = np.ascontiguousarray(starts.q[which]), np.ascontiguousarray(starts.v[which])
-        arrays = times, numbers, *given, *out, status, n_steps, room
+        arrays = times, numbers, *given, *out, *told, room
         lane_runs.advance_lanes(kit, settings, control, method.options, *arrays)
 
     def agree(self, which: Integers, made: Flags, t1: float, atol: float, q: Array, v: Array, ends: Array) -> Flags:

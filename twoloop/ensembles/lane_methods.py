@@ -42,6 +42,8 @@ class LaneMethod:
         Whether it needs code for Taylor series.
     order : int
         What code made for a mechanism gets as the order.
+    evaluations : int
+        Of an attempt, besides those that its kernel counts and the one at its end.
     options : ndarray
         What its step reads.
     tableau : tuple of ndarray or None
@@ -55,6 +57,7 @@ class LaneMethod:
     name: str
     series: bool
     order: int
+    evaluations: int
     options: Array
     step: Callable[[], Any]
     memory: Callable[["LaneCode"], int]
@@ -102,7 +105,7 @@ def _taylor(rtol: float, atol: float) -> LaneMethod:
         return step_by_series
 
     order = order_in_lanes(rtol, atol) + 1
-    return LaneMethod("Taylor", True, order, np.zeros(0), step, lambda code: code.series_size(order))
+    return LaneMethod("Taylor", True, order, order - 1, np.zeros(0), step, lambda code: code.series_size(order))
 
 
 def _dop853(n: int, rtol: float, atol: float) -> LaneMethod:
@@ -117,7 +120,8 @@ def _dop853(n: int, rtol: float, atol: float) -> LaneMethod:
         return memory_size(len(tableau.B), n)
 
     weights = tableau.A, tableau.B, tableau.C, tableau.E5, COARSE_SHARE * tableau.E3
-    return LaneMethod("DOP853", False, 8, _options(PRESETS["DOP853"], n, rtol, atol), step, memory, weights, UNSEEN)
+    stages, options = len(tableau.B), _options(PRESETS["DOP853"], n, rtol, atol)
+    return LaneMethod("DOP853", False, 8, stages - 1, options, step, memory, weights, UNSEEN)
 
 
 def _newton(name: str, tested: Literal["all", "positions"], n: int, rtol: float, atol: float) -> LaneMethod:
@@ -133,7 +137,8 @@ def _newton(name: str, tested: Literal["all", "positions"], n: int, rtol: float,
 
     radau = radau_iia(STAGES[name])
     method = RungeKutta(radau, outer="newton", tested=tested)
-    return LaneMethod(name, False, radau.order, _options(method, n, rtol, atol), step, memory)
+    for_derivatives = 2 * n + 1
+    return LaneMethod(name, False, radau.order, for_derivatives, _options(method, n, rtol, atol), step, memory)
 
 
 def _options(method: Method, n: int, rtol: float, atol: float) -> Array:

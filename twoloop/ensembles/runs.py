@@ -25,6 +25,8 @@ class Runs:
     success : ndarray (n_runs,) of bool
     n_steps : ndarray (n_runs,)
         Accepted steps.
+    n_evaluations : ndarray (n_runs,)
+        Solutions for accelerations, as `Statistics` counts them.
     singly : ndarray (n_runs,) of bool
         Runs that were not made in lanes, but one by one, as by `solve_dae`.
     message : str
@@ -40,6 +42,7 @@ class Runs:
     v: Array
     status: Integers
     n_steps: Integers
+    n_evaluations: Integers
     singly: NDArray[np.bool_]
     message: str
     messages: dict[int, str]

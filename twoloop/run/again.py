@@ -5,7 +5,6 @@ does, or a start is not beyond doubt, nothing comes of it, and the call goes the
 """
 
 import time
-from dataclasses import MISSING, fields
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
@@ -32,7 +31,7 @@ from twoloop.run.messages import message_of, outcome, said_of_reached, unless_tu
 from twoloop.run.movable import Kin, Movable
 from twoloop.run.pace import INTERRUPTED, STAGNATED, Pace
 from twoloop.run.passage import beyond, bridge, bridging_kit, give_way, load
-from twoloop.run.record import Record, Status
+from twoloop.run.record import DEFAULTS, Status
 from twoloop.run.run import Run
 from twoloop.run.short_changes import may_be_missed
 from twoloop.run.stability import Looks, said_of_stiffness
@@ -44,7 +43,6 @@ IN_VAIN = 16  # runs that are not tried after one that did not come to its end .
 TOO_LONG = 1024  # ... and after one for which there was no room, or which took longer than that:
 LONGEST = 0.1  # s of CPU time, in which Ctrl-C is not heard, nor is the time looked at
 NEARER = 0.1  # of the smallest pivot at the start of the first run: below it, a start is looked at anew
-DEFAULTS = {each.name: each.default for each in fields(Record) if each.default is not MISSING}
 NO_PACE = Pace(0.0)  # of a run that came to its end at once
 
 

@@ -2,7 +2,7 @@
 
 import pickle
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import MISSING, dataclass, fields
 from enum import IntEnum
 from typing import Any
 
@@ -223,5 +223,7 @@ class _MayComeLater:
         vars(record)[self.name] = value
 
 
-for _name in ("message", "stats", *OF_STEPS):  # behind the decorator, which would take it for a default
+DEFAULTS = {each.name: each.default for each in fields(Record) if each.default is not MISSING}
+
+for _name in ("a", "lam", "message", "stats", *OF_STEPS):  # behind the decorator, which would take it for a default
     setattr(Record, _name, _MayComeLater(_name))

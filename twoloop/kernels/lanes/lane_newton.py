@@ -23,6 +23,7 @@ from twoloop.kernels.lanes.lane_algebra import (
 from twoloop.kernels.lanes.lane_control import LEAST, N_HEAD
 from twoloop.kernels.lanes.lane_room import (
     AHEAD,
+    EVALUATED,
     FINE,
     LANES,
     N_NUMBERS,
@@ -342,6 +343,7 @@ def solve_stages(code, settings, control, options, own, A, A2, c, room):
         for k in range(LANES):
             room[FINE * LANES + k] = room[to_go * LANES + k]
             left += room[to_go * LANES + k]
+            room[EVALUATED * LANES + k] += c.size * room[to_go * LANES + k]
         if left == 0.0:
             break
         _residuals(code, settings, control, A, A2, c, room)

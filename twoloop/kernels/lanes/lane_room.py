@@ -41,10 +41,11 @@ LANES = 8 if has_wide_vectors() else 4  # runs side by side: of two vectors each
     LIMIT_AGE,  # ... so many steps ago
     ROUGH_TO,  # where the last step ended that was refused for a sudden error
     SHIFT,  # by which places within a step are moved
+    EVALUATED,  # how often the equations were in the step, besides what `settings` tell
     PAST,  # of controller.py, of one lane after the other
     _MORE_PAST,
     N_FIELDS,
-) = range(30)
+) = range(31)
 # functions made for a mechanism, (order, control, room), on what lies in `room`
 TASKS = (
     "closer",  # positions of NEW, at AHEAD, moved towards the constraints, of the lanes that are FINE
@@ -80,7 +81,7 @@ CODE.add_function("step", STEP)
 # n), velocities before they are put on the constraints, and accelerations of the stages
 START, BEGIN, _BEGIN_V, PREDICTED_V, SLOPES = range(5)
 
-N, N_ROWS, ORDER, CHECKS_REDUNDANT, N_NUMBERS = range(5)  # in `settings`
+N, N_ROWS, ORDER, CHECKS_REDUNDANT, N_NUMBERS, N_EVALUATIONS = range(6)  # in `settings`
 T0, T1, GAP, RTOL, ATOL = range(5)  # in `control`; from ATOL on a tolerance for each coordinate
 
 SHORTEST = 1e-13  # step, of the time

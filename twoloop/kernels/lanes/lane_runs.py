@@ -16,9 +16,11 @@ from twoloop.kernels.lanes.lane_room import (
     AHEAD,
     ASKED,
     CODE,
+    EVALUATED,
     FINE,
     FRESH,
     LANES,
+    N_EVALUATIONS,
     N_ROWS,
     ORDER,
     REACHED,
@@ -120,6 +122,15 @@ def _write_ends(room, control, n, n_rows, new, a, last, out_q, out_v, out_a, sta
 
 
 @compiled
+def _count(settings, room, n_evaluations):
+    """What steps evaluated, accepted or not, and once more at their ends; of runs that are left nothing counts."""
+    for k in range(LANES):
+        if room[RUNNING * LANES + k] == 1.0:
+            made = settings[N_EVALUATIONS] + int(room[EVALUATED * LANES + k])
+            n_evaluations[int(room[WHICH * LANES + k])] += made + 1
+
+
+@compiled
 def _go_on(room, control, n_steps):
     """Time goes on in the lanes whose steps were accepted."""
     for k in range(LANES):
@@ -130,15 +141,18 @@ def _go_on(room, control, n_steps):
             room[REFUSED * LANES + k] = 0.0
 
 
-_ADVANCE = types.void(CODE, INTEGERS, *[VECTOR] * 3, *[TABLE] * 3, *[STATES] * 2, TABLE, *[INTEGERS] * 2, VECTOR)
+_ADVANCE = types.void(CODE, INTEGERS, *[VECTOR] * 3, *[TABLE] * 3, *[STATES] * 2, TABLE, *[INTEGERS] * 3, VECTOR)
 
 
 @kernel(_ADVANCE)
-def advance_lanes(code, settings, control, options, times, numbers, q0, v0, out_q, out_v, out_a, status, n_steps, room):
+def advance_lanes(
+    code, settings, control, options, times, numbers, q0, v0, out_q, out_v, out_a, status, n_steps, n_evaluations, room
+):
     """Make runs, one for each row of `numbers`, from t0 to t1.
 
     times : (n_t,) at which states are wanted, the last of them t1; out_q, out_v : (n_runs, n, n_t); out_a : (n_runs,
-    n + n_rows), accelerations and multipliers at t1. options : of the method.
+    n + n_rows), accelerations and multipliers at t1. n_evaluations : counts go on from what is there. options : of the
+    method.
     """
     n, n_rows, order = settings[N], settings[N_ROWS], settings[ORDER]
     _, new, _, _, a, _, _, _ = places_of(n, n_rows, numbers.shape[1])
@@ -159,7 +173,9 @@ def advance_lanes(code, settings, control, options, times, numbers, q0, v0, out_
                 if next_run == numbers.shape[0]:
                     return
                 continue
+        fill_field(room, EVALUATED, 0.0)
         code.step(code, settings, control, options, room, status, n_steps, False)
+        _count(settings, room, n_evaluations)
         code.take(order, control, room)
         _write_ends(room, control, n, n_rows, new, a, times.size - 1, out_q, out_v, out_a, status)
         if times.size > 1:
