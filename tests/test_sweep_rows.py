@@ -18,8 +18,7 @@ from twoloop import sweep
 from twoloop.generate import straight_code
 from twoloop.kernels.compile.caches import Newest
 from twoloop.mechanisms import Problem
-from twoloop.sweeps import tasks
-from twoloop.sweeps import workers
+from twoloop.sweeps import tasks, workers
 from twoloop.sweeps.digests import digest_of
 
 pd = pytest.importorskip("pandas")  # not among the oldest versions

@@ -7,7 +7,7 @@ import pytest
 
 from tests.test_sweep_rows import energy, force
 from twoloop import ConstrainedSystem, solve_dae, sweep
-from twoloop.mechanisms import Problem, four_bar, pendulum
+from twoloop.mechanisms import Problem, four_bar
 from twoloop.sweeps import shared_runs, tasks
 
 pd = pytest.importorskip("pandas")  # not among the oldest versions
@@ -98,11 +98,11 @@ def test_every_step_is_only_there_in_single_runs():
 
 
 def either(kind, angle):
-    return four_bar(theta3=angle) if kind == "four-bar" else pendulum(start=-1.0 + angle)
+    return four_bar(theta3=angle) if kind == "four-bar" else swinging(9.81, 1.0 + angle)
 
 
 def test_several_systems_in_one_table():
-    given = [{"kind": kind, "angle": 0.1 + 0.01 * k} for k in range(6) for kind in ("four-bar", "pendulum")]
+    given = [{"kind": kind, "angle": 0.1 + 0.01 * k} for k in range(6) for kind in ("four-bar", "swing")]
     given.append({"kind": "four-bar", "angle": 2.0})  # cannot be assembled
     rows = sweep(either, given, measure=ends_of, t_span=(0.0, 1.0), t_eval=TIMES, **TOGETHER)
     assert rows["status"].tolist() == ["REACHED_END"] * 12 + ["ERROR"]
@@ -244,3 +244,38 @@ def test_long_runs_are_not_kept_in_one_task(monkeypatch):
     monkeypatch.setattr(tasks, "LONGEST", 5.5e-3)  # s, and a call takes at least 1e-3
     sweep(linkage, LINKAGES, t_span=(0.0, 0.1), **TOGETHER)
     assert max(sizes) <= 5
+
+
+def test_what_a_result_in_lanes_can_do_is_that_of_single_runs():
+    def reaction(problem, result):
+        at = result.reactions("1-2")
+        table = result.to_dataframe()
+        return {"force": at.force[0, -1], "angle": table["angle (rad) of bar 3"].iloc[-1]}
+
+    rows = sweep(linkage, LINKAGES[:6], measure=reaction, t_span=(0.0, 1.0), t_eval=TIMES, **TOGETHER)
+    assert sum(in_lanes(rows)) == 4
+    compare(rows, linkage, reaction, (0.0, 1.0), t_eval=TIMES)
+
+
+def test_starts_that_change_one_another_are_seen():
+    start = np.array([-1.0, 0.0])
+
+    def released(height):
+        system = swinging(9.81, 1.0).system
+        start[:] = -np.sqrt(1.0 - height**2), height
+        return Problem("swing", system, start, np.zeros(2), (0.0, 1.0), energy)
+
+    def from_there(problem, result):
+        return {"y": result.q[1, 0], "x": result.q[0, -1]}
+
+    heights = [{"height": 0.1 * k} for k in range(4)]
+    rows = sweep(released, heights, measure=from_there, t_eval=TIMES, **TOGETHER)
+    assert rows["y"].tolist() == pytest.approx([0.0, 0.1, 0.2, 0.3])
+    compare(rows, released, from_there, (0.0, 1.0), t_eval=TIMES)
+
+
+def test_room_is_bounded(monkeypatch):
+    monkeypatch.setattr(shared_runs, "ROOM", 5 * 2 * 9 * len(TIMES))  # numbers: five runs
+    rows = sweep(linkage, LINKAGES, measure=ends_of, t_span=(0.0, 1.0), t_eval=TIMES, **TOGETHER)
+    assert sum(in_lanes(rows)) == N - 1 - 4
+    compare(rows, linkage, ends_of, (0.0, 1.0), t_eval=TIMES)

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 OPTIONS = {"t_span", "method", "rtol", "atol", "t_eval", "check_derivatives"}  # with which runs may go together
 TIMES = 101  # of a run at which its energy is looked at, where nothing else is measured
 TOLERANCE = 1e-8  # of a run that was given none
+ROOM = 5_000_000  # numbers of the states of runs that are made together
 
 
 def may_be_shared(work: Work) -> bool:
@@ -50,14 +51,15 @@ def batch(work: Work, given: list[Row]) -> list[Row]:
 class _Batch:
     """Runs of which some may share their callbacks.
 
-    All problems are made before the first is solved. So they must not leave anything in globals that `problem_of`,
-    `measure` or callbacks read: where they do, runs are made one by one.
+    All problems are made before the first is solved. Where that matters, as they leave something in globals that
+    `problem_of`, `measure` or callbacks read, or change arrays of one another, runs are made one by one.
     """
 
     def __init__(self, work: Work, given: list[Row]):
         self.work, self.given = work, given
         self.made: dict[int, Row] = {}
         self.problems: dict[int, Problem] = {}
+        self.starts: dict[int, tuple[bytes, bytes]] = {}
         self.began: dict[int, float] = {}  # so that what `problem_of` took counts
 
     def rows(self) -> list[Row]:
@@ -69,8 +71,12 @@ class _Batch:
         for number, problem in self.problems.items():
             span = call_of(self.work, problem)["t_span"]
             groups.setdefault((tuple(span), *_callbacks_of(problem.system)), []).append(number)
+        wanted = self.work[2].get("t_eval")
         for numbers in groups.values():
-            self._solve(numbers)
+            n_states = 2 * self.problems[numbers[0]].system.n_q * (TIMES if wanted is None else np.size(wanted))
+            most = max(1, ROOM // n_states)
+            for k in range(0, len(numbers), most):
+                self._solve(numbers[k : k + most])
         return [self.made[k] for k in range(len(self.given))]
 
     def _reached(self) -> str | None:
@@ -86,6 +92,7 @@ class _Batch:
             began = time.perf_counter()
             try:
                 self.problems[number] = problem_for(self.work, each)
+                self.starts[number] = _start_of(self.problems[number])
             except (Exception, SystemExit) as error:
                 self.made[number] = failed_by(error, began)
             self.began[number] = time.perf_counter() - began
@@ -93,7 +100,7 @@ class _Batch:
                 if number in self.problems:
                     self._solve_singly(number)
                 return False
-        if self._reached() == before:
+        if self._reached() == before and all(_start_of(each) == self.starts[k] for k, each in self.problems.items()):
             return True
         self.made = {}
         return False
@@ -188,6 +195,10 @@ class _Runs:
             **{"method": method, "rtol": self.rtol, "atol": self.atol.copy(), "compiled": True},
         }
         return result_of(DEFAULTS | told)
+
+
+def _start_of(problem: Problem) -> tuple[bytes, bytes]:
+    return np.asarray(problem.q0, dtype=float).tobytes(), np.asarray(problem.v0, dtype=float).tobytes()
 
 
 def _accelerations(system: ConstrainedSystem, runs: ManyRuns, k: int) -> dict[str, Array]:
