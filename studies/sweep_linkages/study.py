@@ -13,7 +13,7 @@ from studies.bench import figures
 from studies.bench.cli import StudyError, processor
 from studies.bench.store import Array, Output, sources
 from studies.bench.study import Study
-from studies.sweep_linkages import in_one_call
+from studies.sweep_linkages import as_a_table, in_one_call
 from studies.sweep_linkages.in_one_call import RANGES
 from twoloop import Result, sweep
 from twoloop.ensembles.in_lanes import threads_of
@@ -103,6 +103,8 @@ def make(output: Output) -> pd.DataFrame:
         row = {"group": "scaling", "parallel": parallel, "workers": workers, "n_runs": len(timed)}
         parts.append(pd.DataFrame([row | {"wall": time.perf_counter() - began}]))
     kept.unlink()
+    parallel, workers = ways[1]  # two processes
+    parts.append(pd.DataFrame(as_a_table.rows_of(linkage, given, SPAN, parallel, workers)))
     next(in_one_call.blocks(N_IN_ONE_CALL_QUICK[0], SPAN[1]))  # which loads the code
     one_call = [in_one_call.row_of(n, SPAN[1]) for n in (N_IN_ONE_CALL_QUICK if quick else N_IN_ONE_CALL)]
     parts.append(pd.DataFrame(one_call))
@@ -132,6 +134,7 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     found |= {"ratios": ratios, "asked": SCALES}
     found |= {"block": in_one_call.BLOCK, "n_times": in_one_call.N_TIMES}
     found |= {"n_worst": in_one_call.N_WORST, "n_any": in_one_call.N_ANY}
+    found |= {"table": rows[rows["group"] == as_a_table.GROUP].to_dict("records")}
     found |= {"in_one_call": rows[rows["group"] == in_one_call.GROUP].to_dict("records")}
     return found | {"scales": ratios["processes"] >= SCALES if "processes" in ratios else None}
 

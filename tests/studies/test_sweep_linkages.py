@@ -9,7 +9,7 @@ import pytest
 from studies.bench.cli import StudyError, processor
 from studies.bench.render import render
 from studies.bench.store import read_rows
-from studies.sweep_linkages import in_one_call, study
+from studies.sweep_linkages import as_a_table, in_one_call, study
 from twoloop import sweep
 from twoloop.mechanisms import four_bar
 
@@ -52,7 +52,12 @@ def made_up(**changes):
         | study.drawn(1)[0]
         for n, failed in ((100, 0), (10_000, changes.pop("n_failed", 0)))
     ]
-    parts = [linkages.assign(**changes), pd.DataFrame(scaling), pd.DataFrame(one_call)]
+    table = [
+        {"group": "table", "way": way, "parallel": "processes", "workers": 2, "n_runs": 3, "wall": wall, "n_done": 2}
+        | {"n_in_lanes": n, "energy_median": 1e-9, "energy_error": 1e-8}
+        for way, wall, n in (("in lanes", changes.pop("wall_of_lanes", 1.0), 2), ("one by one", 4.0, 0))
+    ]
+    parts = [linkages.assign(**changes), *map(pd.DataFrame, (scaling, one_call, table))]
     return pd.concat(parts, ignore_index=True)
 
 
@@ -153,3 +158,15 @@ def test_the_quick_study(tmp_path, few_compared):
     assert "Quick run" in report and "Processes are compared in the full run only" in report
     study.STUDY.main(["--quick", "--redraw", "--out", str(tmp_path)])
     assert (tmp_path / "sweep_linkages.md").read_text().split("\n", 4)[4] == report.split("\n", 4)[4]
+
+
+def test_a_table_says_whether_lanes_are_faster():
+    assert "In lanes the table takes 0.25 times the time" in said(made_up())
+    assert "Lanes are no faster here" in said(made_up(wall_of_lanes=5.0))
+
+
+def test_a_table_has_the_same_runs_in_both_ways(monkeypatch):
+    monkeypatch.setattr("twoloop.ensembles.in_turn.CALL", 1e9)  # code is worth its time
+    lanes, singly = as_a_table.rows_of(study.linkage, study.drawn(12), (0.0, 1.0), "threads", 1)
+    assert lanes["n_done"] == singly["n_done"] > 6 and singly["n_in_lanes"] == 0 < lanes["n_in_lanes"]
+    assert 0.0 < lanes["energy_error"] < 1e-6 and 0.0 < singly["energy_error"] < 1e-6

@@ -98,6 +98,7 @@ def check_joints(joints: object, n_q: int, n_rows: int) -> tuple[Joint, ...]:
     if len(set(names)) < len(names):
         twice = next(name for name in names if names.count(name) > 1)
         raise ValueError(f"joints must have names of their own; given {twice!r} twice")
+    known: Array | None = None  # equations of the joint before, which most joints share
     for joint in joints:
         if max(joint.rows) >= n_rows:
             raise ValueError(
@@ -109,9 +110,12 @@ def check_joints(joints: object, n_q: int, n_rows: int) -> tuple[Joint, ...]:
                 f"{joint.translation!r} and rotation {joint.rotation!r}"
             )
         matrix = joint.equations
-        if matrix is not None and (matrix.shape != (n_rows, n_rows) or np.linalg.matrix_rank(matrix) < n_rows):
+        if matrix is None or (known is not None and np.array_equal(matrix, known)):
+            continue
+        if matrix.shape != (n_rows, n_rows) or np.linalg.matrix_rank(matrix) < n_rows:
             raise ValueError(
                 f"equations of the joint {joint.name!r} must be an invertible matrix of shape {(n_rows, n_rows)}; "
                 f"given {shaped(matrix)}"
             )
+        known = matrix
     return tuple(joints)

@@ -63,7 +63,7 @@ def explained(status: Status) -> str:
 
 @dataclass(frozen=True)
 class Statistics:
-    """Counts and CPU time of a run; None where a foreign solver does not tell.
+    """Counts and CPU time of a run; None where a foreign solver, or a run in lanes of a `sweep`, does not tell.
 
     Attributes
     ----------

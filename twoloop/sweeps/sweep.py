@@ -74,15 +74,14 @@ def sweep(
     t_span : (float, float), optional
         Time span of all runs, s. None: that of each problem.
     **options
-        Keyword arguments of `solve_dae`: method, rtol, t_eval, events, time_limit, ... Once the derivatives are known
-        to be right, check_derivatives=False makes short runs slightly faster.
+        Keyword arguments of `solve_dae`: method, rtol, t_eval, events, time_limit, ...
 
     Returns
     -------
     pandas.DataFrame
         One row per run in the order of `parameters`, indexed by "run". Columns: the parameters, "status" (that of
-        `Result.status`, or "ERROR" if the run raised an exception), "message", "seconds" of wall-clock time, and the
-        measures.
+        `Result.status`, or "ERROR" if the run raised an exception), "message", "seconds" of wall-clock time (of runs
+        made together an equal share), and the measures.
 
     Raises
     ------
@@ -93,9 +92,20 @@ def sweep(
 
     Notes
     -----
-    Every run is a separate call of `solve_dae`: `measure` has access to the whole `Result`, a crash affects a single
-    run, and rows do not depend on how the runs are distributed or interrupted. If runs differ in parameters and starts
-    only, and states at given times suffice, `ensemble` is much faster.
+    Runs that differ in parameters and starts only are made together in SIMD lanes, as by `ensemble`, if states at
+    given times are all that is asked for: with `t_eval`, or with the default measures, and no options but these and
+    method, rtol, atol, t_span and check_derivatives. The first run in each process and task is made by `solve_dae`.
+    Then
+
+    - their messages say "in lanes", and numbers agree with those of single runs within the tolerances;
+    - their `Result` has t, q, v, a, lam, energy, reactions, and of the statistics n_accepted and n_evaluations. Other
+      fields are None. Where `measure` returns None or raises an exception, the run is made singly and measured again;
+    - the default measures look at the energy at 101 evenly spaced times, instead of at every step;
+    - the problems of a task (up to 1024) are made before the first is solved. Where they change something that
+      `problem_of` or `measure` refer to, such as a global, all are made singly.
+
+    All other runs, and those that lanes cannot do, are separate calls of `solve_dae`, whose rows do not depend on how
+    they are distributed. A crash affects a single run: the others of its task are repeated one by one.
     """
     check_choice("parallel", parallel, PARALLEL)
     check_flag("progress", progress)

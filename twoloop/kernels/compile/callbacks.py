@@ -9,7 +9,7 @@ import inspect
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 from typing import Any
 
 import numba
@@ -70,7 +70,7 @@ class Kind:
         """Whether it may be left out."""
         return self.absent != ""
 
-    @property
+    @cached_property
     def outputs(self) -> tuple[tuple[str, tuple[str, ...]], ...]:
         """Names and sizes of all arrays that it fills."""
         return ((self.output, self.shape), *self.more)
@@ -80,7 +80,7 @@ class Kind:
         """Names of the arguments of a callback that works in place."""
         return ("t", *self.state, "p", *(name for name, _ in self.outputs))
 
-    @property
+    @cached_property
     def signature(self) -> Any:
         """With what kernels call a callback."""
         return self._signature(VECTOR)
