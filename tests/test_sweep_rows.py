@@ -18,7 +18,7 @@ from twoloop import sweep
 from twoloop.generate import straight_code
 from twoloop.kernels.compile.caches import Newest
 from twoloop.mechanisms import Problem
-from twoloop.sweeps import tasks, workers
+from twoloop.sweeps import shared_out, workers
 from twoloop.sweeps.digests import digest_of
 
 pd = pytest.importorskip("pandas")  # not among the oldest versions
@@ -278,7 +278,7 @@ class Lost(ThreadPoolExecutor):
 
 
 def test_a_cluster_that_loses_a_worker_loses_one_run(monkeypatch):
-    monkeypatch.setattr(tasks, "BATCHES", 1)
+    monkeypatch.setattr(shared_out, "BATCHES", 1)
     rows = sweep(swinging, RUNS, measure=plain, client=Lost(1), workers=1, **QUICK)
     assert [k for k, status in enumerate(rows["status"]) if status != "REACHED_END"] == [2]
     assert rows.loc[2, "message"] == "RuntimeError: the worker was killed"

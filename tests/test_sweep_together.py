@@ -8,7 +8,7 @@ import pytest
 from tests.test_sweep_rows import energy, force
 from twoloop import ConstrainedSystem, solve_dae, sweep
 from twoloop.mechanisms import Problem, four_bar
-from twoloop.sweeps import shared_runs, tasks
+from twoloop.sweeps import shared_out, shared_runs
 
 pd = pytest.importorskip("pandas")  # not among the oldest versions
 N = 20
@@ -20,7 +20,7 @@ LENGTH = 1.0
 @pytest.fixture(autouse=True)
 def _in_one_task(monkeypatch):
     monkeypatch.setattr("twoloop.ensembles.in_turn.CALL", 1e9)
-    monkeypatch.setattr(tasks, "OF_SHARED", 1)  # task per worker
+    monkeypatch.setattr(shared_out, "OF_SHARED", 1)  # task per worker
 
 
 def linkage(third, theta3=0.1):
@@ -195,9 +195,9 @@ def test_what_problems_leave_in_globals_is_seen(lengths):
 # --- tasks
 def test_rows_are_the_same_however_they_are_shared_out(monkeypatch):
     options = {"measure": ends_of, "t_span": (0.0, 1.0), "t_eval": TIMES, "parallel": "threads"}
-    monkeypatch.setattr(tasks, "SHARED", 7)
+    monkeypatch.setattr(shared_out, "SHARED", 7)
     some = sweep(linkage, LINKAGES, workers=2, **options)
-    monkeypatch.setattr(tasks, "SHARED", 1)
+    monkeypatch.setattr(shared_out, "SHARED", 1)
     alone = sweep(linkage, LINKAGES, workers=1, **options)
     assert sum(in_lanes(some)) == N - 1 - 3 and not any(in_lanes(alone))
     told = ["seconds", "message"]
@@ -240,10 +240,15 @@ def test_what_cannot_be_read_leaves_runs_single(tmp_path):
 
 def test_long_runs_are_not_kept_in_one_task(monkeypatch):
     sizes = []
-    monkeypatch.setattr(tasks, "batch", lambda work, given: sizes.append(len(given)) or shared_runs.batch(work, given))
-    monkeypatch.setattr(tasks, "LONGEST", 5.5e-3)  # s, and a call takes at least 1e-3
+
+    def watched(work, given):
+        sizes.append(len(given))
+        return shared_runs.batch(work, given)
+
+    monkeypatch.setattr(shared_out, "batch", watched)
+    monkeypatch.setattr(shared_out, "LONGEST", 5.5e-3)  # s, and a call takes at least 1e-3
     sweep(linkage, LINKAGES, t_span=(0.0, 0.1), **TOGETHER)
-    assert max(sizes) <= 5
+    assert sum(sizes) == N - 1 and max(sizes) <= 5
 
 
 def test_what_a_result_in_lanes_can_do_is_that_of_single_runs():

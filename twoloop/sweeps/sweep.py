@@ -17,7 +17,7 @@ from twoloop.solve import check_method, solve_dae
 from twoloop.sweeps import saved_sweep
 from twoloop.sweeps.cells import OWN, Row, check_parameters, fitting, kind_of
 from twoloop.sweeps.one_run import Work, ends
-from twoloop.sweeps.tasks import all_rows
+from twoloop.sweeps.shared_out import all_rows
 
 if TYPE_CHECKING:
     from twoloop.problem.problem import Problem
