@@ -123,16 +123,16 @@ def test_spans_of_their_own():
 
 def off(third):
     problem = linkage(third)
-    if third == 1.45:
+    if third in (1.41, 1.45):
         problem.q0[0] += 1e-3
     return problem
 
 
 def test_a_start_off_the_constraints_is_a_row():
     rows = sweep(off, LINKAGES[:10], t_span=(0.0, 0.3), **TOGETHER)
-    assert [k for k, status in enumerate(rows["status"]) if status == "ERROR"] == [5]
+    assert [k for k, status in enumerate(rows["status"]) if status == "ERROR"] == [1, 5]  # 1 is the first of its task
     assert "ValueError: q0 is not consistent with the constraints" in rows.loc[5, "message"]
-    assert sum(in_lanes(rows)) == 7
+    assert sum(in_lanes(rows)) == 6
 
 
 # --- functions of one's own

@@ -60,7 +60,7 @@ class _Batch:
         self.made: dict[int, Row] = {}
         self.problems: dict[int, Problem] = {}
         self.starts: dict[int, tuple[bytes, bytes]] = {}
-        self.began: dict[int, float] = {}  # so that what `problem_of` took counts
+        self.seconds: dict[int, float] = {}  # that `problem_of` took
 
     def rows(self) -> list[Row]:
         """One for each run."""
@@ -95,7 +95,7 @@ class _Batch:
                 self.starts[number] = _start_of(self.problems[number])
             except (Exception, SystemExit) as error:
                 self.made[number] = failed_by(error, began)
-            self.began[number] = time.perf_counter() - began
+            self.seconds[number] = time.perf_counter() - began
             if number == 0 and self._reached() != before:
                 if number in self.problems:
                     self._solve_singly(number)
@@ -107,7 +107,7 @@ class _Batch:
 
     def _solve_singly(self, number: int, **closer: float) -> Result | None:
         """Make the row of a run as if there were no others; its result, if there is one."""
-        began, problem, result = time.perf_counter() - self.began[number], self.problems[number], None
+        began, problem, result = time.perf_counter() - self.seconds[number], self.problems[number], None
         try:
             result = solved(self.work, problem, **closer)
             seconds = time.perf_counter() - began
@@ -117,24 +117,24 @@ class _Batch:
         return result
 
     def _solve(self, numbers: list[int]) -> None:
-        """Make the rows of runs that share their callbacks."""
-        first = self._solve_singly(numbers[0])
-        left = numbers[1:]
-        if first is not None and left:
-            runs = _Runs(self.work, [self.problems[number] for number in numbers])
-            runs.make(first)
-            left = [number for k, number in enumerate(numbers) if k > 0 and not self._take(number, runs, k)]
-            for number in left:
-                self._solve_singly(number, **runs.closer(numbers.index(number)))
+        """Make the rows of runs that share their callbacks; the first that raises nothing is that of `ensemble`."""
+        first = None
+        while numbers and first is None:
+            beginning, first = numbers[0], self._solve_singly(numbers[0])
+            numbers = numbers[1:]
+        if first is None or not numbers:
             return
-        for number in left:
-            self._solve_singly(number)
+        runs = _Runs(self.work, [self.problems[number] for number in (beginning, *numbers)])
+        runs.make(first)
+        for k, number in enumerate(numbers, start=1):
+            if not self._take(number, runs, k):
+                self._solve_singly(number, **runs.closer(k))
 
     def _take(self, number: int, runs: _Runs, k: int) -> bool:
         """Make the row of a run by what lanes left of it; False if there is nothing, or measures ask for more."""
         if not runs.has(k):
             return False
-        problem, seconds = self.problems[number], self.began[number] + runs.seconds
+        problem, seconds = self.problems[number], self.seconds[number] + runs.seconds
         try:
             row = row_of(self.work, self.given[number], problem, runs.result(k, problem.system), seconds)
         except (Exception, SystemExit):  # it may be for what is None there
