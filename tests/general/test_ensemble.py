@@ -112,6 +112,22 @@ def test_forces_that_are_short_or_sudden_are_seen():
     assert far_from_single_runs(runs, range(17), system, SPAN, q, v, parameters, max_step=0.005) < 1e-5
 
 
+@pytest.mark.parametrize("method", ["auto", "DOP853"])
+@pytest.mark.parametrize("by_state", [False, True])
+def test_what_is_narrow_and_acts_in_later_runs_alone_is_seen(method, by_state):
+    """Of the first run, whose factor is zero, nothing tells that there is something."""
+
+    def force(t, q, v, p):
+        x = (q[0] - 0.1234) / 3e-3 if by_state else (t - 0.4321) / 3e-4
+        return np.array([0.0, p[0] - 9.81 + p[2] * np.exp(-x * x)])
+
+    q, v, parameters = drawn(9)
+    parameters[:, 2] = np.linspace(0.0, 300.0 if by_state else 500.0, 9)
+    system = system_of(parameters, mass=np.eye(2), force=force, compile=True)
+    runs = ensemble(system, SPAN, q, v, parameters=parameters, method=method)
+    assert far_from_single_runs(runs, range(9), system, SPAN, q, v, parameters, max_step=5e-4) < 1e-5
+
+
 def test_velocities_off_the_constraints_are_named():
     system, q, v, parameters = pendulums(9)
     v[7] += 0.1 * q[7]

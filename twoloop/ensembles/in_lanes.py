@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from twoloop.checks.arguments import Array
 from twoloop.ensembles.lane_methods import LaneMethod
 from twoloop.ensembles.short_looks import ShortLooks
-from twoloop.ensembles.starts import Starts, generic_parameters, kit_to_write, system_of
+from twoloop.ensembles.starts import Starts, generic_parameters, generic_system, kit_to_write, system_of
 from twoloop.generate.choices import Choice
 from twoloop.generate.known_numbers import Record
 from twoloop.generate.time_dependence import may_be_narrow, may_be_sudden
@@ -64,8 +64,9 @@ class LaneRuns:
     def __init__(self, system: ConstrainedSystem, starts: Starts, method: LaneMethod):
         self.system, self.starts, self.method, self.kit = system, starts, method, kit_to_write(system)
         generic, varying = generic_parameters(starts.parameters)
-        sudden = may_be_sudden(system, ran_on_symbols=True)
-        unseen = 1.0 if may_be_narrow(system, ran_on_symbols=True) else method.unseen
+        of_all = generic_system(system, starts)
+        sudden = may_be_sudden(of_all, ran_on_symbols=True)
+        unseen = 1.0 if may_be_narrow(of_all, ran_on_symbols=True) else method.unseen
         self.places = LOOKS if any(sudden) else PLACES * unseen
         self.looks = ShortLooks(system, generic, varying) if sudden.by_time else None
         choice = Choice.at(system_of(system, starts, 0), starts.t0, starts.q[0])

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from twoloop.checks.arguments import Array
 from twoloop.ensembles.in_lanes import LOOKS, SHORT, WHY, LaneRuns
 from twoloop.ensembles.lane_methods import is_involved, lane_methods
-from twoloop.ensembles.starts import Starts, far_off, system_of
+from twoloop.ensembles.starts import Starts, far_off, generic_system, system_of
 from twoloop.generate.tracing import Untraceable
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.result.result import Result
@@ -87,7 +87,7 @@ class ManyRuns:
             If a start is not consistent, naming the run.
         """
         stiff = (first.stats.n_jacobians or 0) > 0
-        involved = method == "auto" and not stiff and is_involved(self.system)
+        involved = method == "auto" and not stiff and is_involved(generic_system(self.system, self.starts))
         tolerances = self.rtol, float(self.atol.min())
         for each in lane_methods(method, stiff, self.system.n_q, *tolerances, involved):
             left = np.flatnonzero(~self.in_lanes)

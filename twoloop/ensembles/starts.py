@@ -71,6 +71,12 @@ def system_of(system: ConstrainedSystem, starts: Starts, run: int) -> Constraine
     return system if same else system.with_parameters(starts.parameters[run])
 
 
+def generic_system(system: ConstrainedSystem, starts: Starts) -> ConstrainedSystem:
+    """One in which all acts that does in any of the runs: a factor that is zero in the first may not be in others."""
+    generic, _ = generic_parameters(starts.parameters)
+    return system if np.array_equal(generic, system.parameters) else system.with_parameters(generic)
+
+
 def kit_to_write(system: ConstrainedSystem) -> tuple[Any, NDArray[np.int64]]:
     """The callbacks with parameters of their own that a kernel may write, and n_q, n_c and the place of the first."""
     from twoloop.kernels.data.kit import Kit
