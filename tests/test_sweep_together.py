@@ -1,11 +1,13 @@
 """Runs of a sweep that share their callbacks are made together, and their rows are those of single runs."""
 
 import os
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from tests.test_sweep_rows import energy, force
+from tests.problems import pendulum as bare_pendulum
+from tests.test_sweep_rows import energy
 from twoloop import ConstrainedSystem, solve_dae, sweep
 from twoloop.mechanisms import Problem, four_bar
 from twoloop.sweeps import shared_out, shared_runs
@@ -14,7 +16,6 @@ pd = pytest.importorskip("pandas")  # not among the oldest versions
 N = 20
 TIMES = [0.0, 0.5, 1.0]
 TOGETHER = {"parallel": "threads", "workers": 1}
-LENGTH = 1.0
 
 
 @pytest.fixture(autouse=True)
@@ -32,7 +33,7 @@ LINKAGES = [{"third": 1.4 + 0.01 * k} for k in range(N)]
 
 def ends_of(problem, result):
     loads = {"a": result.a[0, -1], "lam": np.abs(result.lam[:, -1]).max(), "energy": result.energy[-1]}
-    return {"x": result.q[0, -1], "y": result.v[1, 1], "n_t": result.t.size, **loads}
+    return {"x": result.q[0, -1], "y": result.v[1, -1], "n_t": result.t.size, **loads}
 
 
 def in_lanes(rows):
@@ -77,17 +78,20 @@ def test_evaluations_of_other_methods_are_counted(method):
     assert (rows["n_evaluations"] <= 40 * rows["n_accepted"]).all()
 
 
-def test_a_run_is_made_singly_where_measures_ask_for_more():
-    def longest(problem, result):
-        return {"h": result.h.max()}
+MORE = {
+    "steps": lambda problem, result: {"h": result.h.max(), "x": int(np.size(result.h))},
+    "counts": lambda problem, result: {"n": result.stats.n_partitions or 0, "m": result.stats.n_accepted},
+    "of steps": lambda problem, result: {"n": int(np.size(result.rejected_error)), "none": result.untested is None},
+    "of the run": lambda problem, result: {"rank": result.rank or 0, "n": len(result.redundant), "d": result.defect},
+    "names": lambda problem, result: {"auto": result.method == "auto", "compiled": result.compiled},
+}
 
-    def rank(problem, result):
-        return {"rank": result.rank}
 
-    for measure in (longest, rank):
-        rows = sweep(linkage, LINKAGES[:5], measure=measure, t_span=(0.0, 0.3), t_eval=[0.3], **TOGETHER)
-        assert not any(in_lanes(rows)) and set(rows["status"]) == {"REACHED_END"}
-        compare(rows, linkage, measure, (0.0, 0.3), rel=1e-12, t_eval=[0.3])
+@pytest.mark.parametrize("name", MORE)
+def test_what_lanes_do_not_know_is_that_of_a_single_run(name):
+    rows = sweep(linkage, LINKAGES[:6], measure=MORE[name], t_span=(0.0, 0.3), t_eval=[0.3], **TOGETHER)
+    assert sum(in_lanes(rows)) == 4
+    compare(rows, linkage, MORE[name], (0.0, 0.3), rel=1e-12, t_eval=[0.3])
 
 
 def test_every_step_is_only_there_in_single_runs():
@@ -144,60 +148,118 @@ def rod(t, q, p):
     return np.array([q[0] ** 2 + q[1] ** 2 - p[1] ** 2])
 
 
+SWING = ConstrainedSystem.from_python(
+    n_q=2, n_c=1, mass=np.eye(2), force=pull, constraint=rod, parameters=[9.81, 1.0], compile=True
+)
+
+
 def swinging(gravity, length):
-    system = ConstrainedSystem.from_python(
-        n_q=2, n_c=1, mass=np.eye(2), force=pull, constraint=rod, parameters=[gravity, length]
-    )
+    system = SWING.with_parameters([gravity, length])
     return Problem("swing", system, np.array([-length, 0.0]), np.zeros(2), (0.0, 1.0), energy)
 
 
-def test_plain_functions_with_parameters_go_together():
-    given = [{"gravity": 9.0 + 0.1 * k, "length": 1.0 + 0.02 * k} for k in range(10)]
-    rows = sweep(swinging, given, measure=ends_of, t_eval=TIMES, **TOGETHER)
+SWINGS = [{"gravity": 9.0 + 0.1 * k, "length": 1.0 + 0.02 * k} for k in range(10)]
+
+
+def test_compiled_functions_with_parameters_go_together():
+    rows = sweep(swinging, SWINGS, measure=ends_of, t_eval=TIMES, **TOGETHER)
     assert sum(in_lanes(rows)) == 8
     compare(rows, swinging, ends_of, (0.0, 1.0), t_eval=TIMES)
 
 
-def test_functions_that_enclose_numbers_do_not():
-    def enclosing(gravity):
-        system = ConstrainedSystem.from_python(
-            n_q=2,
-            n_c=1,
-            mass=np.eye(2),
-            force=lambda t, q, v: np.array([0.0, -gravity]),
-            constraint=lambda t, q: np.array([q @ q - 1.0]),
-        )
+def test_functions_in_python_do_not():
+    """They may read whatever `problem_of` leaves somewhere."""
+
+    def pulled(t, q, v):
+        return np.array([0.0, -pulled.gravity])
+
+    def keeping(gravity):
+        pulled.gravity = gravity
+        system = bare_pendulum(force=pulled)
         return Problem("swing", system, np.array([-1.0, 0.0]), np.zeros(2), (0.0, 1.0), energy)
 
-    given = [{"gravity": 9.0 + 0.1 * k} for k in range(5)]
-    rows = sweep(enclosing, given, measure=ends_of, t_eval=TIMES, **TOGETHER)
+    given = [{"gravity": 9.0 + 0.1 * k} for k in range(12)]
+    rows = sweep(keeping, given, measure=ends_of, t_eval=TIMES, **TOGETHER)
     assert not any(in_lanes(rows))
-    compare(rows, enclosing, ends_of, (0.0, 1.0), t_eval=TIMES)
+    compare(rows, keeping, ends_of, (0.0, 1.0), t_eval=TIMES)
 
 
-def rod_of_a_global(t, q):
-    return np.array([q[0] ** 2 + q[1] ** 2 - LENGTH**2])
+KEPT = SimpleNamespace(gravity=0.0, n=0)
 
 
-def by_a_global(length):
-    globals()["LENGTH"] = length
-    system = ConstrainedSystem.from_python(n_q=2, n_c=1, mass=np.eye(2), force=force, constraint=rod_of_a_global)
-    return Problem("swing", system, np.array([-length, 0.0]), np.zeros(2), (0.0, 1.0), energy)
+def looking(problem, result):
+    import tests.test_sweep_together as module  # which no digest looks into
+
+    return {"left": module.KEPT.gravity, "x": result.q[0, -1]}
 
 
-@pytest.mark.parametrize("lengths", [(1.0, 1.1, 1.2, 1.3), (1.0, 1.0, 1.0, 1.3, 1.4)])  # the second run changes nothing
-def test_what_problems_leave_in_globals_is_seen(lengths):
-    rows = sweep(by_a_global, [{"length": x} for x in lengths], measure=ends_of, t_eval=TIMES, **TOGETHER)
-    assert not any(in_lanes(rows)) and set(rows["status"]) == {"REACHED_END"}
-    compare(rows, by_a_global, ends_of, (0.0, 1.0), t_eval=TIMES)
+def test_measures_see_what_the_problem_of_their_run_left():
+    def leaving(gravity, length):
+        import tests.test_sweep_together as module
+
+        module.KEPT.gravity = gravity
+        return swinging(gravity, length)
+
+    rows = sweep(leaving, SWINGS, measure=looking, t_eval=TIMES, **TOGETHER)
+    assert rows["left"].tolist() == [each["gravity"] for each in SWINGS] and sum(in_lanes(rows)) == 8
+
+
+def test_problems_that_depend_on_the_runs_before_them_are_those_of_single_runs():
+    def counting(gravity, length):
+        import tests.test_sweep_together as module
+
+        return swinging(gravity + module.KEPT.n, length)
+
+    def count(problem, result):
+        import tests.test_sweep_together as module
+
+        module.KEPT.n += 1
+        return {"g": problem.system.parameters[0], "x": result.q[0, -1]}
+
+    rows = sweep(counting, SWINGS, measure=count, t_eval=TIMES, **TOGETHER)
+    assert rows["g"].tolist() == pytest.approx([each["gravity"] + k for k, each in enumerate(SWINGS)])
+    for number, each in enumerate(SWINGS):
+        known = singly(swinging, each | {"gravity": rows.loc[number, "g"]}, last_place, (0.0, 1.0))
+        assert rows.loc[number, "x"] == pytest.approx(known["x"], rel=1e-5)
+
+
+def test_problems_that_are_one_object_are_told_apart():
+    start = np.array([-1.0, 0.0])
+
+    def released(height):
+        start[:] = -np.sqrt(1.0 - height**2), height
+        return Problem("swing", SWING, start, np.zeros(2), (0.0, 1.0), energy)
+
+    def from_there(problem, result):
+        return {"y": result.q[1, 0], "y0": problem.q0[1], "x": result.q[0, -1]}
+
+    heights = [{"height": 0.05 * k} for k in range(12)]
+    rows = sweep(released, heights, measure=from_there, t_eval=TIMES, **TOGETHER)
+    assert rows["y"].tolist() == pytest.approx([each["height"] for each in heights])
+    compare(rows, released, from_there, (0.0, 1.0), t_eval=TIMES)
+
+
+def test_a_start_that_is_no_vector_is_a_row():
+    def odd(k):
+        problem = swinging(9.81, 1.0)
+        q0 = {4: np.array([-1.0 + 0.0j, 0.0]), 5: ["-1", "0"], 6: np.array([True, False])}.get(k, problem.q0)
+        return SimpleNamespace(**vars(problem) | {"q0": q0})
+
+    rows = sweep(odd, [{"k": k} for k in range(12)], measure=last_place, t_eval=TIMES, **TOGETHER)
+    assert [k for k, status in enumerate(rows["status"]) if status == "ERROR"] == [4, 5, 6]
+    assert sum(in_lanes(rows)) == 7
+
+
+def last_place(problem, result):
+    return {"x": result.q[0, -1]}
 
 
 # --- tasks
 def test_rows_are_the_same_however_they_are_shared_out(monkeypatch):
     options = {"measure": ends_of, "t_span": (0.0, 1.0), "t_eval": TIMES, "parallel": "threads"}
-    monkeypatch.setattr(shared_out, "SHARED", 7)
+    monkeypatch.setattr(shared_out, "LARGEST_SHARED", 7)
     some = sweep(linkage, LINKAGES, workers=2, **options)
-    monkeypatch.setattr(shared_out, "SHARED", 1)
+    monkeypatch.setattr(shared_out, "LARGEST_SHARED", 1)
     alone = sweep(linkage, LINKAGES, workers=1, **options)
     assert sum(in_lanes(some)) == N - 1 - 3 and not any(in_lanes(alone))
     told = ["seconds", "message"]
@@ -227,28 +289,12 @@ def test_a_worker_that_dies_in_a_task_costs_one_run():
     assert rows.loc[3, "message"] == "the worker process ended with exit code 3 in this run"
 
 
-def test_what_cannot_be_read_leaves_runs_single(tmp_path):
-    with (tmp_path / "log").open("w") as log:
-
-        def logged(third):
-            log.write(f"{third}\n")
-            return linkage(third)
-
-        rows = sweep(logged, LINKAGES[:4], t_span=(0.0, 0.1), **TOGETHER)
-    assert set(rows["status"]) == {"REACHED_END"} and not any(in_lanes(rows))
-
-
-def test_long_runs_are_not_kept_in_one_task(monkeypatch):
-    sizes = []
-
-    def watched(work, given):
-        sizes.append(len(given))
-        return shared_runs.batch(work, given)
-
-    monkeypatch.setattr(shared_out, "batch", watched)
-    monkeypatch.setattr(shared_out, "LONGEST", 5.5e-3)  # s, and a call takes at least 1e-3
-    sweep(linkage, LINKAGES, t_span=(0.0, 0.1), **TOGETHER)
-    assert sum(sizes) == N - 1 and max(sizes) <= 5
+@pytest.mark.parametrize("parallel", ["threads", "processes"])
+def test_long_tasks_hand_back_what_they_have(monkeypatch, parallel):
+    monkeypatch.setattr(shared_runs, "LONGEST", 0.0)  # s; of processes those of their own do
+    rows = sweep(linkage, LINKAGES, measure=ends_of, t_span=(0.0, 0.1), t_eval=[0.1], parallel=parallel, workers=2)
+    assert rows.index.tolist() == list(range(N)) and set(rows["status"]) == {"REACHED_END"}
+    compare(rows, linkage, ends_of, (0.0, 0.1), t_eval=[0.1])
 
 
 def test_what_a_result_in_lanes_can_do_is_that_of_single_runs():
@@ -262,25 +308,16 @@ def test_what_a_result_in_lanes_can_do_is_that_of_single_runs():
     compare(rows, linkage, reaction, (0.0, 1.0), t_eval=TIMES)
 
 
-def test_starts_that_change_one_another_are_seen():
-    start = np.array([-1.0, 0.0])
-
-    def released(height):
-        system = swinging(9.81, 1.0).system
-        start[:] = -np.sqrt(1.0 - height**2), height
-        return Problem("swing", system, start, np.zeros(2), (0.0, 1.0), energy)
-
-    def from_there(problem, result):
-        return {"y": result.q[1, 0], "x": result.q[0, -1]}
-
-    heights = [{"height": 0.1 * k} for k in range(4)]
-    rows = sweep(released, heights, measure=from_there, t_eval=TIMES, **TOGETHER)
-    assert rows["y"].tolist() == pytest.approx([0.0, 0.1, 0.2, 0.3])
-    compare(rows, released, from_there, (0.0, 1.0), t_eval=TIMES)
-
-
 def test_room_is_bounded(monkeypatch):
     monkeypatch.setattr(shared_runs, "ROOM", 5 * 2 * 9 * len(TIMES))  # numbers: five runs
+    sizes = []
+
+    class Watched(shared_runs._Runs):
+        def __init__(self, *given):
+            super().__init__(*given)
+            sizes.append(len(self.places))
+
+    monkeypatch.setattr(shared_runs, "_Runs", Watched)
     rows = sweep(linkage, LINKAGES, measure=ends_of, t_span=(0.0, 1.0), t_eval=TIMES, **TOGETHER)
-    assert sum(in_lanes(rows)) == N - 1 - 4
+    assert sum(in_lanes(rows)) == N - 2 and sizes == [5, 5, 5, 3]
     compare(rows, linkage, ends_of, (0.0, 1.0), t_eval=TIMES)

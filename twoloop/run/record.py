@@ -63,7 +63,7 @@ def explained(status: Status) -> str:
 
 @dataclass(frozen=True)
 class Statistics:
-    """Counts and CPU time of a run; None where a foreign solver, or a run in lanes of a `sweep`, does not tell.
+    """Counts and CPU time of a run; None where a foreign solver does not tell.
 
     Attributes
     ----------
@@ -225,5 +225,6 @@ class _MayComeLater:
 
 DEFAULTS = {each.name: each.default for each in fields(Record) if each.default is not MISSING}
 
-for _name in ("a", "lam", "message", "stats", *OF_STEPS):  # behind the decorator, which would take it for a default
+NOT_OF_STATES = ("stats", *OF_STEPS, "rank", "redundant", "defect", "widest_gap", "compiled")  # but of the run
+for _name in ("a", "lam", "message", *NOT_OF_STATES):  # behind the decorator, which would take it for a default
     setattr(Record, _name, _MayComeLater(_name))

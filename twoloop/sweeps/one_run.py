@@ -47,31 +47,23 @@ def call_of(work: Work, problem: Problem) -> dict[str, Any]:
     return {"t_span": problem.t_span, "q0": problem.q0, "v0": problem.v0, **work[2]}
 
 
-def solved(work: Work, problem: Problem, **closer: float) -> Result:
+def solved(work: Work, problem: Problem, **more: float) -> Result:
     """The result of a run; raises KeyboardInterrupt where that ended it."""
-    result = solve_dae(problem.system, **call_of(work, problem) | closer)
+    result = solve_dae(problem.system, **call_of(work, problem) | more)
     if result.status is Status.INTERRUPTED:
         raise KeyboardInterrupt
     return result
 
 
-def row_of(work: Work, given: Row, problem: Problem, result: Result, seconds: float) -> Row:
-    """The columns of a run other than its parameters; raises what `measure` raises."""
-    row = {"status": result.status.name, "message": result.message, "seconds": seconds}
-    return row | check_measured(work[1](problem, result), {*given, *OWN, "run"})
-
-
-def one_run(work: Work, given: Row) -> Row:
-    """The same, of a run that may raise: that is then its row."""
+def one_run(work: Work, given: Row, solve: Callable[[Work, Problem], Result] = solved, first: bool = False) -> Row:
+    """The columns of a run other than its parameters; errors are rows, but that of the `first` is raised."""
     began = time.perf_counter()
     try:
         problem = problem_for(work, given)
-        result = solved(work, problem)
-        return row_of(work, given, problem, result, time.perf_counter() - began)
+        result = solve(work, problem)
+        row = {"status": result.status.name, "message": result.message, "seconds": time.perf_counter() - began}
+        return row | check_measured(work[1](problem, result), {*given, *OWN, "run"})
     except (Exception, SystemExit) as error:
-        return failed_by(error, began)
-
-
-def failed_by(error: BaseException, began: float) -> Row:
-    """The row of a run that raised this."""
-    return failed(f"{type(error).__name__}: {error}", time.perf_counter() - began)
+        if first and not isinstance(error, ValueError):
+            raise
+        return failed(f"{type(error).__name__}: {error}", time.perf_counter() - began)

@@ -3,26 +3,25 @@
 from __future__ import annotations
 
 import time
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from twoloop.checks.arguments import Array, check_span, check_times, check_tolerance
-from twoloop.ensembles.in_turn import ManyRuns
+from twoloop.checks.arguments import Array, check_span, check_times, check_tolerance, check_vector
+from twoloop.ensembles.in_turn import CALL, ManyRuns
 from twoloop.ensembles.lane_methods import IN_LANES
 from twoloop.ensembles.starts import Starts, far_off, kit_to_write
 from twoloop.kernels.data.common import PROGRAMS
 from twoloop.kernels.layout import give_back
-from twoloop.problem.adapters import ConstantMatrix
 from twoloop.problem.system import ConstrainedSystem
 from twoloop.result.result import Result, result_of
 from twoloop.run.between import interpolator_of
 from twoloop.run.launch import run_from
-from twoloop.run.record import DEFAULTS, Later, Statistics, Status
-from twoloop.solve import check_options
+from twoloop.run.record import DEFAULTS, NOT_OF_STATES, Later, Statistics, Status
+from twoloop.solve import check_method, check_options
 from twoloop.sweeps.cells import Row
 from twoloop.sweeps.digests import digest_of
-from twoloop.sweeps.one_run import Work, call_of, ends, failed_by, one_run, problem_for, row_of, solved
+from twoloop.sweeps.one_run import Work, call_of, ends, one_run, problem_for, solved
 
 if TYPE_CHECKING:
     from twoloop.problem.problem import Problem
@@ -31,6 +30,10 @@ OPTIONS = {"t_span", "method", "rtol", "atol", "t_eval", "check_derivatives"}  #
 TIMES = 101  # of a run at which its energy is looked at, where nothing else is measured
 TOLERANCE = 1e-8  # of a run that was given none
 ROOM = 5_000_000  # numbers of the states of runs that are made together
+LONGEST = 10.0  # s, after which a task hands back what it has, so that it is saved
+AHEAD = 0.2  # of this time, in which problems are made before their turn
+FEW = 8  # problems after which it is clear whether any share their callbacks, and what it costs to make them: ...
+DEAR = 2.0  # ... no more than so many times what their runs take singly
 
 
 def may_be_shared(work: Work) -> bool:
@@ -42,186 +45,215 @@ def may_be_shared(work: Work) -> bool:
 
 
 def batch(work: Work, given: list[Row]) -> list[Row]:
-    """The rows of some runs; executed by a worker."""
-    if len(given) == 1 or not may_be_shared(work):
-        return [one_run(work, each) for each in given]
-    return _Batch(work, given).rows()
+    """The rows of the first of these runs, as many as there is time for; executed by a worker."""
+    began, rows = time.monotonic(), []
+    runs = _Batch(work, given) if len(given) > 2 and may_be_shared(work) else None
+    for number, each in enumerate(given):
+        if number > 0 and time.monotonic() - began > LONGEST:
+            break
+        rows.append(one_run(work, each) if runs is None else runs.row(number))
+    return rows
+
+
+class _Start(NamedTuple):
+    """What a run is, for lanes."""
+
+    group: Any  # equal for runs that differ in what follows alone
+    parameters: Array
+    q0: Array
+    v0: Array
+
+    def same(self, other: _Start | None) -> bool:
+        """Whether it is the same run."""
+        return other is not None and self.group == other.group and all(map(np.array_equal, self[1:], other[1:]))
 
 
 class _Batch:
-    """Runs of which some may share their callbacks.
+    """Runs one after another, each with a problem of its own; where lanes have made an equal run, that is taken.
 
-    All problems are made before the first is solved. Where that matters, as they leave something in globals that
-    `problem_of`, `measure` or callbacks read, or change arrays of one another, runs are made one by one.
+    So that lanes can make many at once, problems are made before their turn, and then anew: what `problem_of` leaves
+    anywhere is there for `measure` as if there were no lanes. Where the second problem is another, its run is single.
     """
 
     def __init__(self, work: Work, given: list[Row]):
         self.work, self.given = work, given
-        self.made: dict[int, Row] = {}
-        self.problems: dict[int, Problem] = {}
-        self.starts: dict[int, tuple[bytes, bytes]] = {}
-        self.seconds: dict[int, float] = {}  # that `problem_of` took
+        self.starts: dict[int, _Start] = {}
+        self.systems: dict[Any, ConstrainedSystem] = {}  # one of each group, which also keeps its callbacks alive
+        self.firsts: dict[Any, tuple[_Start, Result]] = {}  # a single run of each group
+        self.made: dict[Any, _Runs] = {}  # by groups, what lanes made last
+        self.number, self.seconds = 0, 0.0  # of the run that has its turn: its share of the time of lanes
 
-    def rows(self) -> list[Row]:
-        """One for each run."""
+    def row(self, number: int) -> Row:
+        """That of a run; those before it have theirs."""
+        self.number, self.seconds = number, 0.0
+        if number > 0:
+            self._make()
+            row = one_run(self.work, self.given[number], self._result)
+            return row | {"seconds": row["seconds"] + self.seconds}
         before = self._reached()
-        if before is None or not self._build(before):
-            return [self.made.get(k) or one_run(self.work, each) for k, each in enumerate(self.given)]
-        groups: dict[Any, list[int]] = {}
-        for number, problem in self.problems.items():
-            span = call_of(self.work, problem)["t_span"]
-            groups.setdefault((tuple(span), *_callbacks_of(problem.system)), []).append(number)
-        wanted = self.work[2].get("t_eval")
-        for numbers in groups.values():
-            n_states = 2 * self.problems[numbers[0]].system.n_q * (TIMES if wanted is None else np.size(wanted))
-            most = max(1, ROOM // n_states)
-            for k in range(0, len(numbers), most):
-                self._solve(numbers[k : k + most])
-        return [self.made[k] for k in range(len(self.given))]
+        row = one_run(self.work, self.given[0], self._result)
+        if before is not None and before == self._reached():
+            self._look_ahead()
+        return row
 
     def _reached(self) -> str | None:
-        """A digest of all that the functions reach; None where that cannot be read."""
+        """A digest of what the functions reach: most of those that keep something are known by it at once."""
         try:
             return digest_of("work", self.work[:2])
-        except ValueError:
+        except (ValueError, RecursionError):
             return None
 
-    def _build(self, before: str) -> bool:
-        """Make the problems; whether these left what the functions reach as it was."""
-        for number, each in enumerate(self.given):
-            began = time.perf_counter()
+    def _look_ahead(self) -> None:
+        """Note what the runs are, unless that costs more than to solve them, or no two share their callbacks."""
+        began = time.monotonic()
+        single = [result.stats.cpu_time + CALL for _, result in self.firsts.values()]
+        for number, each in enumerate(self.given[1:], start=1):
             try:
-                self.problems[number] = problem_for(self.work, each)
-                self.starts[number] = _start_of(self.problems[number])
-            except (Exception, SystemExit) as error:
-                self.made[number] = failed_by(error, began)
-            self.seconds[number] = time.perf_counter() - began
-            if number == 0 and self._reached() != before:
-                if number in self.problems:
-                    self._solve_singly(number)
-                return False
-        if self._reached() == before and all(_start_of(each) == self.starts[k] for k, each in self.problems.items()):
-            return True
-        self.made = {}
-        return False
+                problem = problem_for(self.work, each)
+            except (Exception, SystemExit):  # it is said when its turn comes
+                continue
+            start = _start_of(self.work, problem)
+            if start is not None:
+                self.starts[number] = start
+                self.systems.setdefault(start.group, problem.system)
+            spent = time.monotonic() - began
+            if number >= FEW and (spent > DEAR * number * max(single, default=spent) or self._none_share()):
+                self.starts.clear()
+                return
+            if spent > AHEAD * LONGEST:
+                return
 
-    def _solve_singly(self, number: int, **closer: float) -> Result | None:
-        """Make the row of a run as if there were no others; its result, if there is one."""
-        began, problem, result = time.perf_counter() - self.seconds[number], self.problems[number], None
-        try:
-            result = solved(self.work, problem, **closer)
-            seconds = time.perf_counter() - began
-            self.made[number] = row_of(self.work, self.given[number], problem, result, seconds)
-        except (Exception, SystemExit) as error:
-            self.made[number] = failed_by(error, began)
-        return result
+    def _none_share(self) -> bool:
+        return len(self.starts) < 2 or len(self.systems) >= len(self.starts)
 
-    def _solve(self, numbers: list[int]) -> None:
-        """Make the rows of runs that share their callbacks; the first that raises nothing is that of `ensemble`."""
-        first = None
-        while numbers and first is None:
-            beginning, first = numbers[0], self._solve_singly(numbers[0])
-            numbers = numbers[1:]
-        if first is None or not numbers:
+    def _make(self) -> None:
+        """Have lanes make those that share callbacks with the run that has its turn, if they have not yet."""
+        start = self.starts.get(self.number)
+        if start is None or start.group not in self.firsts:
             return
-        runs = _Runs(self.work, [self.problems[number] for number in (beginning, *numbers)])
-        runs.make(first)
-        for k, number in enumerate(numbers, start=1):
-            if not self._take(number, runs, k):
-                self._solve_singly(number, **runs.closer(k))
+        known = self.made.get(start.group)
+        if known is None or self.number not in known.places:
+            most = max(1, ROOM // (2 * start.q0.size * _n_times(self.work)))
+            numbers = [n for n, each in self.starts.items() if n >= self.number and each.group == start.group][:most]
+            starts = {number: self.starts[number] for number in numbers}
+            self.made[start.group] = _Runs(self.work, self.systems[start.group], *self.firsts[start.group], starts)
 
-    def _take(self, number: int, runs: _Runs, k: int) -> bool:
-        """Make the row of a run by what lanes left of it; False if there is nothing, or measures ask for more."""
-        if not runs.has(k):
-            return False
-        problem, seconds = self.problems[number], self.seconds[number] + runs.seconds
-        try:
-            row = row_of(self.work, self.given[number], problem, runs.result(k, problem.system), seconds)
-        except (Exception, SystemExit):  # it may be for what is None there
-            return False
-        if any(value is None for value in row.values()):
-            return False
-        self.made[number] = row
-        return True
+    def _result(self, work: Work, problem: Problem) -> Result:
+        """What lanes made of a run, else its own."""
+        start, more = _start_of(work, problem), {}
+        if start is not None and start.same(self.starts.get(self.number)) and start.group in self.made:
+            runs = self.made[start.group]
+            if runs.has(self.number):
+                self.seconds = runs.seconds
+                return runs.result(self.number, problem)
+            more = runs.more(self.number)
+        result = solved(work, problem, **more)
+        if start is not None and start.group not in self.firsts:
+            self.firsts[start.group] = start, result
+            self.systems.setdefault(start.group, problem.system)
+        return result
 
 
 class _Runs:
-    """Runs that share their callbacks, in lanes as far as they go."""
+    """Runs that share their callbacks, in lanes as far as they go.
 
-    def __init__(self, work: Work, problems: list[Problem]):
-        options, system = work[2], problems[0].system
-        self.method = options.get("method", "auto")
-        self.rtol = float(options.get("rtol", TOLERANCE))
-        self.atol = check_tolerance("atol", options.get("atol", TOLERANCE), system.n_q)
-        t0, t1 = check_span(call_of(work, problems[0])["t_span"])
+    Parameters
+    ----------
+    work
+    system : ConstrainedSystem
+        One of the group.
+    first, result
+        A run of the group that was made singly, and its result.
+    starts : dict of int to _Start
+        Of the runs, by their numbers.
+    """
+
+    def __init__(self, work: Work, system: ConstrainedSystem, first: _Start, result: Result, starts: dict[int, _Start]):
+        self.work, options = work, work[2]
+        (t0, t1), *_ = first.group
+        rtol, atol = (options.get(name, TOLERANCE) for name in ("rtol", "atol"))
         wanted = options.get("t_eval")
         times = np.linspace(t0, t1, TIMES) if wanted is None else check_times(wanted, t0, t1, None)
-        rows = ([each.q0 for each in problems], [each.v0 for each in problems])
-        q0, v0 = (np.array(each, dtype=float, order="C") for each in rows)
-        starts = Starts(t0, q0, v0, np.array([each.system.parameters for each in problems]))
-        refused = far_off(kit_to_write(system), starts)
-        refused[0] = False  # it was made by itself already
-        self.which = np.flatnonzero(~refused)
-        self.places = {int(run): place for place, run in enumerate(self.which)}
-        self.runs = ManyRuns(system, starts.some(self.which), t1, times, self.rtol, self.atol)
-        self.seconds = 0.0
-
-    def make(self, first: Result) -> None:
-        """Have lanes make what they can; the first of the runs is there."""
+        runs = (first, *starts.values())
+        q0, v0, parameters = (np.array([getattr(each, name) for each in runs]) for name in ("q0", "v0", "parameters"))
+        given = Starts(t0, q0, v0, parameters)
+        fine = ~far_off(kit_to_write(system), given)
+        fine[0] = True  # it was made
+        taken = np.array(list(starts))[fine[1:]].tolist()
+        self.places = dict.fromkeys(starts, -1) | {number: place for place, number in enumerate(taken, start=1)}
+        self.runs = ManyRuns(
+            system, given.some(np.flatnonzero(fine)), t1, times, float(rtol), check_tolerance("atol", atol, system.n_q)
+        )
         began = time.perf_counter()
-        self.runs.make_in_lanes(self.method, first, threads=1)
+        self.runs.make_in_lanes(options.get("method", "auto"), result, threads=1)
         self.seconds = (time.perf_counter() - began) / max(1, int(self.runs.in_lanes.sum()))
 
-    def has(self, run: int) -> bool:
+    def has(self, number: int) -> bool:
         """Whether lanes made a run."""
-        return run in self.places and bool(self.runs.in_lanes[self.places[run]])
+        return self.places[number] > 0 and bool(self.runs.in_lanes[self.places[number]])
 
-    def closer(self, run: int) -> dict[str, float]:
-        """What a run that is left is to be made with."""
-        step = self.runs.max_step(self.places[run]) if run in self.places else np.inf
+    def more(self, number: int) -> dict[str, float]:
+        """Options for a run that is left."""
+        step = self.runs.max_step(self.places[number])
         return {} if step == np.inf else {"max_step": step}
 
-    def result(self, run: int, system: ConstrainedSystem) -> Result:
-        """What lanes left of a run, and of other fields None, as of a foreign solver."""
-        runs, place = self.runs, self.places[run]
-        q, v, times = runs.q[place].copy(), runs.v[place].copy(), runs.times.copy()
-        later = Later(lambda: _accelerations(system, runs, place))
+    def result(self, number: int, problem: Problem) -> Result:
+        """What lanes left of a run; for what they do not know it is made singly, when that is asked for."""
+        work, runs, place, system = self.work, self.runs, self.places[number], problem.system
+        of_steps: Any = Later(lambda: _not_of_states(work, problem))
+        of_states: Any = Later(lambda: _accelerations(system, runs, place))
         counts = int(runs.n_steps[place]), int(runs.n_evaluations[place])
-        method = runs.methods[runs.turn[place]]
-        told = {
-            **{"t": times, "q": q, "v": v, "a": later, "lam": later, "h": None, "system": system},
-            **{"status": Status.REACHED_END, "message": f"Reached the end, t = {runs.t1:g}, in lanes by {method}."},
-            "stats": Statistics(n_accepted=counts[0], n_evaluations=counts[1], cpu_time=self.seconds),
-            **{"method": method, "rtol": self.rtol, "atol": self.atol.copy(), "compiled": True},
+        stats = Statistics(n_accepted=counts[0], n_evaluations=counts[1], cpu_time=self.seconds)
+        message = f"Reached the end, t = {runs.t1:g}, in lanes by {runs.methods[runs.turn[place]]}."
+        told = dict.fromkeys(NOT_OF_STATES, of_steps) | {
+            **{"t": runs.times.copy(), "q": runs.q[place].copy(), "v": runs.v[place].copy()},
+            **{"a": of_states, "lam": of_states, "status": Status.REACHED_END, "message": message, "system": system},
+            **{"method": check_method(work[2].get("method", "auto")).name, "rtol": runs.rtol, "atol": runs.atol.copy()},
         }
-        return result_of(DEFAULTS | told)
+        return result_of(DEFAULTS | told | ({"stats": stats} if work[1] is ends else {}))
 
 
-def _start_of(problem: Problem) -> tuple[bytes, bytes]:
-    return np.asarray(problem.q0, dtype=float).tobytes(), np.asarray(problem.v0, dtype=float).tobytes()
+def _not_of_states(work: Work, problem: Problem) -> dict[str, Any]:
+    """Counts, steps and what else only a single run tells."""
+    result = solved(work, problem)
+    return {name: getattr(result, name) for name in NOT_OF_STATES}
 
 
-def _accelerations(system: ConstrainedSystem, runs: ManyRuns, k: int) -> dict[str, Array]:
+def _accelerations(system: ConstrainedSystem, runs: ManyRuns, place: int) -> dict[str, Array]:
     """Accelerations and multipliers at the states of a run, found as those between the steps of single runs."""
     none = (None, np.inf, None, None, False, None, None, False, False)
     asked = check_options(system, "auto", runs.rtol, runs.atol, *none)
     starts = runs.starts
-    run = run_from(system, starts.t0, runs.t1, starts.q[k], starts.v[k], asked)
-    n, states = system.n_q, np.concatenate([runs.q[k], runs.v[k]]).T
+    run = run_from(system, starts.t0, runs.t1, starts.q[place], starts.v[place], asked)
+    n, states = system.n_q, np.concatenate([runs.q[place], runs.v[place]]).T
     found = np.full((len(states), len(run.state) - 2 * n), np.nan)
     interpolator_of(run, run.state[: 3 * n]).complete(runs.times, states, found)
     give_back(run.work)
     return {"a": found[:, :n].T, "lam": found[:, n:].T}
 
 
+def _n_times(work: Work) -> int:
+    wanted = work[2].get("t_eval")
+    return TIMES if wanted is None else int(np.size(wanted))
+
+
+def _start_of(work: Work, problem: Problem) -> _Start | None:
+    """What a run is; None where callbacks are in Python, as these may read anything, or the start is not in order."""
+    system = problem.system
+    if not isinstance(system, ConstrainedSystem) or system.called_in_python:
+        return None
+    call = call_of(work, problem)
+    try:
+        span = check_span(call["t_span"])
+        q0, v0 = (check_vector(name, call[name], system.n_q) for name in ("q0", "v0"))
+    except (TypeError, ValueError):  # as `solve_dae` says
+        return None
+    return _Start((span, *_callbacks_of(system)), system.parameters, q0, v0)
+
+
 def _callbacks_of(system: ConstrainedSystem) -> tuple[Any, ...]:
-    """Equal for systems that differ in nothing but their parameters, as long as these live."""
+    """Equal for systems that differ in nothing but their parameters, as long as one of them lives."""
     sizes = system.n_q, system.n_c, system.n_a, system.bandwidth, system.constant_mass, system.parameters.size
     entries = [(kind, *(each.tobytes() for each in pair)) for kind, pair in sorted(system.entries.items())]
     programs = [getattr(system.functions, name).tobytes() for name in PROGRAMS]
-    functions = system.python_functions or system.given
-    return *sizes, *entries, *programs, *((kind, _identity(each)) for kind, each in sorted(functions.items()))
-
-
-def _identity(function: Any) -> Any:
-    return function.matrix.tobytes() if isinstance(function, ConstantMatrix) else id(function)
+    return *sizes, *entries, *programs, *((kind, id(function)) for kind, function in sorted(system.given.items()))

@@ -92,20 +92,20 @@ def sweep(
 
     Notes
     -----
-    Runs that differ in parameters and starts only are made together in SIMD lanes, as by `ensemble`, if states at
-    given times are all that is asked for: with `t_eval`, or with the default measures, and no options but these and
-    method, rtol, atol, t_span and check_derivatives. The first run in each process and task is made by `solve_dae`.
-    Then
+    Runs of compiled callbacks that differ in parameters and starts only are made together in SIMD lanes, as by
+    `ensemble`, if states at given times are all that is asked for: with `t_eval`, or with the default measures, and no
+    options but these and method, rtol, atol, t_span and check_derivatives. Some runs of each task are still made by
+    `solve_dae`. Of those made in lanes,
 
-    - their messages say "in lanes", and numbers agree with those of single runs within the tolerances;
-    - their `Result` has t, q, v, a, lam, energy, reactions, and of the statistics n_accepted and n_evaluations. Other
-      fields are None. Where `measure` returns None or raises an exception, the run is made singly and measured again;
+    - messages say "in lanes", and numbers agree with those of single runs within the tolerances;
+    - t, q, v, a, lam, energy and reactions of the `Result` are of the lanes. Where `measure` asks for anything else,
+      such as `stats` or `h`, the run is made singly, too. The default measures have the counts of the lanes;
     - the default measures look at the energy at 101 evenly spaced times, instead of at every step;
-    - the problems of a task (up to 1024) are made before the first is solved. Where they change something that
-      `problem_of` or `measure` refer to, such as a global, all are made singly.
+    - `problem_of` is called twice: for lanes, and again just before `measure`. If the second problem is another, the
+      run is a single one. So `problem_of` should be cheap.
 
-    All other runs, and those that lanes cannot do, are separate calls of `solve_dae`, whose rows do not depend on how
-    they are distributed. A crash affects a single run: the others of its task are repeated one by one.
+    All other runs are separate calls of `solve_dae`, whose rows do not depend on how they are distributed. A process
+    that dies affects a single run: the others of its task are repeated one by one.
     """
     check_choice("parallel", parallel, PARALLEL)
     check_flag("progress", progress)

@@ -16,15 +16,15 @@ LOOK_EVERY = 1.0  # s between checks that workers are alive: a child of a dead w
 Task = Callable[[Any], Any]
 
 
-def in_processes(task: Task, inputs: dict[int, Any], n_workers: int) -> Iterator[tuple[int, Any, str]]:
+def in_processes(task: Task, inputs: list[tuple[int, Any]], n_workers: int) -> Iterator[tuple[int, Any, str]]:
     """Yield the outcome of a task for each input, as they finish.
 
     Parameters
     ----------
     task : callable
         task(input) -> picklable object; it raises no exception but KeyboardInterrupt.
-    inputs : dict
-        Inputs by number.
+    inputs : list of (int, object)
+        Inputs with their numbers. They are taken from it, the last one first; others may be added on the way.
     n_workers : int
 
     Yields
@@ -34,20 +34,19 @@ def in_processes(task: Task, inputs: dict[int, Any], n_workers: int) -> Iterator
 
     Raises KeyboardInterrupt if the task raised one. Raises RuntimeError if a worker dies before it can begin.
     """
-    left = list(reversed(inputs.items()))
     workers: list[_Worker] = []
     try:
-        while left or workers:
-            while left and len(workers) < n_workers:
-                workers.append(_Worker(task, left.pop()))
+        while inputs or workers:
+            while inputs and len(workers) < n_workers:
+                workers.append(_Worker(task, inputs.pop()))
             wait([each.connection for each in workers], LOOK_EVERY)
             for worker in list(workers):
                 for number, made in worker.answers():
                     yield number, made, ""
                 if worker.number is not None and worker.dead:
                     yield worker.number, None, worker.how_it_died()
-                if worker.number is None and left and not worker.worn and not worker.dead:
-                    worker.begin(left.pop())
+                if worker.number is None and inputs and not worker.worn and not worker.dead:
+                    worker.begin(inputs.pop())
                 elif worker.number is None or worker.dead:
                     worker.end()
                     workers.remove(worker)
