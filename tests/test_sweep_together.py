@@ -184,6 +184,21 @@ def test_functions_in_python_do_not():
     compare(rows, keeping, ends_of, (0.0, 1.0), t_eval=TIMES)
 
 
+def test_nothing_is_kept_of_systems_that_share_nothing():
+    def compiled_anew(gravity):
+        system = ConstrainedSystem.from_python(
+            n_q=1, n_c=0, mass=np.eye(1), force=lambda t, q, v: np.array([-gravity]), compile=True
+        )
+        return Problem("fall", system, np.zeros(1), np.zeros(1), (0.0, 0.1), lambda t, q, v: 0.0 * t)
+
+    given = [{"gravity": float(k)} for k in range(12)]
+    made = shared_runs._Batch((compiled_anew, last_place, {"t_eval": [0.1]}), given)
+    rows = [made.row(k) for k in range(12)]
+    assert {row["status"] for row in rows} == {"REACHED_END"} and not any("in lanes" in row["message"] for row in rows)
+    assert [row["x"] for row in rows] == pytest.approx([-0.005 * k for k in range(12)])
+    assert len(made.firsts) <= 1 and not made.systems and not made.starts
+
+
 KEPT = SimpleNamespace(gravity=0.0, n=0)
 
 

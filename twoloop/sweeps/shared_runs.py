@@ -119,6 +119,7 @@ class _Batch:
             spent = time.monotonic() - began
             if number >= FEW and (spent > DEAR * number * max(single, default=spent) or self._none_share()):
                 self.starts.clear()
+                self.systems.clear()
                 return
             if spent > AHEAD * LONGEST:
                 return
@@ -148,9 +149,10 @@ class _Batch:
                 return runs.result(self.number, problem)
             more = runs.more(self.number)
         result = solved(work, problem, **more)
-        if start is not None and start.group not in self.firsts:
-            self.firsts[start.group] = start, result
-            self.systems.setdefault(start.group, problem.system)
+        if start is not None and self.number == 0:
+            self.systems[start.group] = problem.system
+        if start is not None and start.group in self.systems:
+            self.firsts.setdefault(start.group, (start, result))
         return result
 
 
