@@ -5,6 +5,7 @@ import math
 import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from types import FunctionType
 from typing import Any
 
 import numpy as np
@@ -71,6 +72,8 @@ def check_path(path: Any, name: str = "path") -> Path:
 
 def check_call(name: str, call: str, function: Callable[..., Any], arguments: Sequence[str], remedy: str = "") -> None:
     """Raise TypeError if a function cannot be called with these arguments in their places."""
+    if _takes(function, len(arguments)):
+        return
     try:
         signature = inspect.signature(function)
     except (TypeError, ValueError):  # built-in functions have none to look at
@@ -80,6 +83,15 @@ def check_call(name: str, call: str, function: Callable[..., Any], arguments: Se
     except TypeError:
         expected = f"{name} is called as {call}({', '.join(arguments)})"
         raise TypeError(f"{expected}; the function given takes {signature}{remedy}") from None
+
+
+def _takes(function: Callable[..., Any], n: int) -> bool:
+    """Whether a plain function, or the method that calls an object, takes just so many arguments: quick to see."""
+    of_object = not isinstance(function, FunctionType)
+    own = getattr(type(function), "__call__", None) if of_object else function
+    if not isinstance(own, FunctionType) or own.__code__.co_kwonlyargcount > 0:
+        return False
+    return own.__code__.co_argcount == n + of_object
 
 
 def check_choice(name: str, value: Any, choices: Sequence[str]) -> str:
