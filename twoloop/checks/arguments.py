@@ -72,7 +72,7 @@ def check_path(path: Any, name: str = "path") -> Path:
 
 def check_call(name: str, call: str, function: Callable[..., Any], arguments: Sequence[str], remedy: str = "") -> None:
     """Raise TypeError if a function cannot be called with these arguments in their places."""
-    if _takes(function, len(arguments)):
+    if callable(function) and _takes(function, len(arguments)):
         return
     try:
         signature = inspect.signature(function)
@@ -88,7 +88,7 @@ def check_call(name: str, call: str, function: Callable[..., Any], arguments: Se
 def _takes(function: Callable[..., Any], n: int) -> bool:
     """Whether a plain function, or the method that calls an object, takes just so many arguments: quick to see."""
     of_object = not isinstance(function, FunctionType)
-    own = getattr(type(function), "__call__", None) if of_object else function
+    own = type(function).__call__ if of_object else function
     if not isinstance(own, FunctionType) or own.__code__.co_kwonlyargcount > 0:
         return False
     return own.__code__.co_argcount == n + of_object
