@@ -1,6 +1,7 @@
 """Runs of a sweep that share their callbacks are made together, and their rows are those of single runs."""
 
 import os
+import time
 from types import SimpleNamespace
 
 import numpy as np
@@ -184,6 +185,19 @@ def test_functions_in_python_do_not():
     compare(rows, keeping, ends_of, (0.0, 1.0), t_eval=TIMES)
 
 
+def test_problems_that_cost_more_than_their_runs_are_made_once():
+    def slow(third):
+        time.sleep(0.15)
+        import tests.test_sweep_together as module  # which no digest looks into
+
+        module.KEPT.n += 1
+        return linkage(third)
+
+    KEPT.n = 0
+    rows = sweep(slow, LINKAGES[:6], measure=last_place, t_span=(0.0, 0.1), t_eval=[0.1], **TOGETHER)
+    assert not any(in_lanes(rows)) and KEPT.n == 6 + 1
+
+
 def test_nothing_is_kept_of_systems_that_share_nothing():
     def compiled_anew(gravity):
         system = ConstrainedSystem.from_python(
@@ -231,6 +245,7 @@ def test_problems_that_depend_on_the_runs_before_them_are_those_of_single_runs()
         module.KEPT.n += 1
         return {"g": problem.system.parameters[0], "x": result.q[0, -1]}
 
+    KEPT.n = 0
     rows = sweep(counting, SWINGS, measure=count, t_eval=TIMES, **TOGETHER)
     assert rows["g"].tolist() == pytest.approx([each["gravity"] + k for k, each in enumerate(SWINGS)])
     for number, each in enumerate(SWINGS):

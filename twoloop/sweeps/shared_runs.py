@@ -34,6 +34,7 @@ LONGEST = 10.0  # s, after which a task hands back what it has, so that it is sa
 AHEAD = 0.2  # of this time, in which problems are made before their turn
 FEW = 8  # problems after which it is clear whether any share their callbacks, and what it costs to make them: ...
 DEAR = 2.0  # ... no more than so many times what their runs take singly
+NOTICED = 0.1  # s of problems that cost more, of which fewer are enough
 
 
 def may_be_shared(work: Work) -> bool:
@@ -117,7 +118,8 @@ class _Batch:
                 self.starts[number] = start
                 self.systems.setdefault(start.group, problem.system)
             spent = time.monotonic() - began
-            if number >= FEW and (spent > DEAR * number * max(single, default=spent) or self._none_share()):
+            dear = spent > DEAR * number * max(single, default=spent)
+            if (number >= FEW and (dear or self._none_share())) or (dear and spent > NOTICED):
                 self.starts.clear()
                 self.systems.clear()
                 return
