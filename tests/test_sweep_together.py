@@ -23,6 +23,7 @@ TOGETHER = {"parallel": "threads", "workers": 1}
 def _in_one_task(monkeypatch):
     monkeypatch.setattr("twoloop.ensembles.in_turn.CALL", 1e9)
     monkeypatch.setattr(shared_out, "OF_SHARED", 1)  # task per worker
+    monkeypatch.setattr(shared_runs, "DEAR", 1e9)  # on a busy machine, too
 
 
 def linkage(third, theta3=0.1):
@@ -185,9 +186,11 @@ def test_functions_in_python_do_not():
     compare(rows, keeping, ends_of, (0.0, 1.0), t_eval=TIMES)
 
 
-def test_problems_that_cost_more_than_their_runs_are_made_once():
+def test_problems_that_cost_more_than_their_runs_are_made_once(monkeypatch):
+    monkeypatch.setattr(shared_runs, "DEAR", 0.0)
+
     def slow(third):
-        time.sleep(0.15)
+        time.sleep(1.1 * shared_runs.NOTICED)
         import tests.test_sweep_together as module  # which no digest looks into
 
         module.KEPT.n += 1
@@ -338,8 +341,35 @@ def test_what_a_result_in_lanes_can_do_is_that_of_single_runs():
     compare(rows, linkage, reaction, (0.0, 1.0), t_eval=TIMES)
 
 
-def test_room_is_bounded(monkeypatch):
+def test_ends_are_compared_at_the_last_time_that_is_wanted(monkeypatch):
+    monkeypatch.setattr("twoloop.ensembles.in_turn.FAR", 1e-9)
+    for times in ([0.0, 0.5, 1.0], [0.0, 0.5]):
+        rows = sweep(linkage, LINKAGES[:6], measure=last_place, t_span=(0.0, 1.0), t_eval=times, **TOGETHER)
+        assert not any(in_lanes(rows)) and set(rows["status"]) == {"REACHED_END"}
+
+
+def test_what_lanes_cannot_make_is_not_tried_again(monkeypatch):
+    tried = []
+
+    class Refused(shared_runs._Runs):
+        def __init__(self, *given):
+            super().__init__(*given)
+            tried.append(len(self.places))
+            self.runs.turn[:] = -1
+
+    monkeypatch.setattr(shared_runs, "_Runs", Refused)
+    monkeypatch.setattr(shared_runs, "CHUNK", 0.0)  # s
+    rows = sweep(linkage, LINKAGES, measure=last_place, t_span=(0.0, 0.1), t_eval=[0.1], **TOGETHER)
+    assert tried == [shared_runs.FEW] and not any(in_lanes(rows)) and set(rows["status"]) == {"REACHED_END"}
+
+
+@pytest.mark.parametrize("by", ["room", "time"])
+def test_what_lanes_make_at_a_time_is_bounded(monkeypatch, by):
     monkeypatch.setattr(shared_runs, "ROOM", 5 * 2 * 9 * len(TIMES))  # numbers: five runs
+    if by == "time":
+        monkeypatch.setattr(shared_runs, "ROOM", 10**6)
+        monkeypatch.setattr(shared_runs, "CHUNK", 0.0)
+        monkeypatch.setattr(shared_runs, "FEW", 5)
     sizes = []
 
     class Watched(shared_runs._Runs):

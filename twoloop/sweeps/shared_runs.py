@@ -34,6 +34,7 @@ LONGEST = 10.0  # s, after which a task hands back what it has, so that it is sa
 AHEAD = 0.2  # of this time, in which problems are made before their turn
 FEW = 8  # problems after which it is clear whether any share their callbacks, and what it costs to make them: ...
 DEAR = 2.0  # ... no more than so many times what their runs take singly
+CHUNK = 2.0  # s that runs may take singly which lanes make at a time, as nothing interrupts these
 NOTICED = 0.1  # s of problems that cost more, of which fewer are enough
 
 
@@ -136,10 +137,15 @@ class _Batch:
             return
         known = self.made.get(start.group)
         if known is None or self.number not in known.places:
-            most = max(1, ROOM // (2 * start.q0.size * _n_times(self.work)))
-            numbers = [n for n, each in self.starts.items() if n >= self.number and each.group == start.group][:most]
-            starts = {number: self.starts[number] for number in numbers}
-            self.made[start.group] = _Runs(self.work, self.systems[start.group], *self.firsts[start.group], starts)
+            first, result = self.firsts[start.group]
+            in_time = int(CHUNK / (result.stats.cpu_time + CALL))
+            most = max(1, min(ROOM // (2 * start.q0.size * _n_times(self.work)), max(in_time, FEW)))
+            alike = [n for n, each in self.starts.items() if n >= self.number and each.group == start.group]
+            starts = {number: self.starts[number] for number in alike[:most]}
+            runs = self.made[start.group] = _Runs(self.work, self.systems[start.group], first, result, starts)
+            if not runs.runs.in_lanes.any():  # nor will others
+                for number in alike[most:]:
+                    del self.starts[number]
 
     def _result(self, work: Work, problem: Problem) -> Result:
         """What lanes made of a run, else its own."""

@@ -102,7 +102,7 @@ def sweep(
       such as `stats` or `h`, the run is made singly, too. The default measures have the counts of the lanes;
     - the default measures look at the energy at 101 evenly spaced times, instead of at every step;
     - `problem_of` is called twice: for lanes, and again just before `measure`. If the second problem is another, the
-      run is a single one. So `problem_of` should be cheap.
+      run is a single one. So `problem_of` should be cheap, and must not depend on earlier calls.
 
     All other runs are separate calls of `solve_dae`, whose rows do not depend on how they are distributed. A process
     that dies affects a single run: the others of its task are repeated one by one.
