@@ -24,6 +24,7 @@ def _in_one_task(monkeypatch):
     monkeypatch.setattr("twoloop.ensembles.in_turn.CALL", 1e9)
     monkeypatch.setattr(shared_out, "OF_SHARED", 1)  # task per worker
     monkeypatch.setattr(shared_runs, "DEAR", 1e9)  # on a busy machine, too
+    monkeypatch.setattr(shared_runs, "LONGEST", 1e9)  # s, also where kernels have to be compiled
 
 
 def linkage(third, theta3=0.1):
