@@ -10,10 +10,8 @@ from twoloop import sweep
 
 GROUP = "table"
 LANES, SINGLY = "in lanes", "one by one"
-OPTIONS: dict[str, dict[str, Any]] = {
-    LANES: {},
-    SINGLY: {"max_step": np.inf},
-}  # one that lanes do not have: its default
+# the default of an option with which runs do not go in lanes
+OPTIONS: dict[str, dict[str, Any]] = {LANES: {}, SINGLY: {"max_step": np.inf}}
 
 
 def rows_of(
