@@ -1,9 +1,12 @@
-"""One style for all figures: a colour and a marker for each solver, and the work-precision figure."""
+"""Draw all figures in one style: a message as title, at most six lines, and labels on the lines.
 
+The default is thick and has the same colour in every figure. Errors grow to the right, so better is to the left.
+"""
+
+import textwrap
 import tomllib
 import zlib
-from collections.abc import Iterable, Mapping, Sequence
-from functools import cache
+from collections.abc import Iterable, Sequence
 from io import BytesIO
 from itertools import product
 from pathlib import Path
@@ -17,86 +20,136 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
+from matplotlib.container import ErrorbarContainer
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
 from studies.bench.names import label, looks_like
-from studies.bench.solvers import CATALOGUE, COMPILED, DEFAULT, GEAR_ORDERS, GIVEN, HEYOKA, IRK, IRK_LINE, gear
+from studies.bench.solvers import COMPILED, DEFAULT, GEAR_ORDERS, GIVEN, HEYOKA, IRK, IRK_LINE, gear
 from studies.bench.store import Output
-from studies.bench.tables import astray, setting_of, time_for, used
-from twoloop.rows.equal_error import DECADE
+from studies.bench.tables import astray, setting_of, time_for
 
-MOST_LINES = 9
-FIRST = (DEFAULT, *(name for name, method in COMPILED.items() if method == DEFAULT), IRK_LINE, IRK)  # always drawn
-# family, how names begin
-MAIN_RIVALS = (("heyoka", HEYOKA), ("CyRK", ""), ("SUNDIALS", "CVODE"), ("SUNDIALS", "IDA from C"), ("SciPy", ""))
+MOST_LINES = 6
+# a solver of each of these is drawn if there is room, in this order: family, how its name begins
+MAIN_SOLVERS = (("SUNDIALS", "IDA from C"), ("heyoka", HEYOKA), ("CyRK", ""), ("SUNDIALS", "CVODE"), ("SciPy", ""))
 ERROR = "largest position error over the run (m, rad)"
-GAPS = "gap: failed run, or more than a decade of error; left out: error below that of the reference"
-LEGEND = "solid: twoloop\nfilled: keeps constraints\ngap: failed run, or more\nthan a decade of error"
+TIME = "CPU time of the call (s)"
+THICK = 3.0  # width of the default's line, in points
+LABEL_HEIGHT = 1.25  # distance between the labels of lines, in heights of their letters
 
 plt.style.use(Path(__file__).with_name("bench.mplstyle"))
 
-# Okabe and Ito's colours, told apart by colour-blind readers; a marker besides, and dashes for other families
+# Okabe and Ito's colours, which colour-blind readers can tell apart, and more
 BLACK, ORANGE, SKY, GREEN = "#000000", "#E69F00", "#56B4E9", "#009E73"
 YELLOW, BLUE, RED, PINK, GREY, BROWN = "#B39B00", "#0072B2", "#D55E00", "#CC79A7", "#7F7F7F", "#7A4A12"
-VIOLET, MAGENTA, SLATE = "#6A3D9A", "#D4006A", "#2F4F6F"  # more, as ours and others' share none
-OLIVE, CRIMSON, LIME, TAN, ROSE, LAVENDER = "#556B2F", "#8B0000", "#8CC63E", "#C49C6B", "#FF9D9A", "#A99BD8"
-TEAL = "#00A6A6"
+VIOLET, MAGENTA, SLATE = "#6A3D9A", "#D4006A", "#2F4F6F"
+OLIVE, CRIMSON, LIME, TAN, ROSE, LAVENDER = "#556B2F", "#8B0000", "#7AB52E", "#A87B3F", "#FF9D9A", "#A99BD8"
+TEAL, NAVY = "#00A6A6", "#283593"
+STEELS = ("#9AD0D2", "#6FB7B9", "#4A9A9D", "#327D81", "#1E6064", "#0B4447")  # of the stand-in, by its order
+MARKERS = "o^sDvP>d<pX*Hh8"
+DEFAULT_COLOR = VIOLET
 
 LOOKS = tomllib.loads(Path(__file__).with_name("looks.toml").read_text(encoding="utf-8"))
 OURS, THEIRS = ({globals()[color]: own for color, own in LOOKS[whose].items()} for whose in ("ours", "theirs"))
-STEELS = ("#9AD0D2", "#6FB7B9", "#4A9A9D", "#327D81", "#1E6064", "#0B4447")  # of the stand-in, by its order
 STYLES = {name: (color, marker) for color, own in (OURS | THEIRS).items() for name, marker in own.items()}
 STYLES |= {gear(order): look for order, look in zip(GEAR_ORDERS, zip(STEELS, "1234+x", strict=True), strict=True)}
 SAME: dict[str, str] = LOOKS["same"]
-MARKERS = "o^sDvP>d<pX*Hh8"  # those that can be open
 
 
-@cache
-def looks() -> dict[str, tuple[str, str]]:
-    """Colour and marker of all solvers that are known: of those without an entry above, the next that are free."""
-    found = dict(STYLES)
-    for colors, ours in ((OURS, True), (THEIRS, False)):
-        unlisted = (name for name in CATALOGUE if name not in STYLES | SAME)
-        names = (name for name in unlisted if (CATALOGUE[name].family == "two-loop") == ours)
-        found |= dict(zip(names, _free(colors, STYLES), strict=False))
-    return found
+def style(solver: str, family: str = "two-loop", keeps_constraints: bool = True) -> dict[str, Any]:
+    """Return colour, marker and line of a solver, the same in all figures; the default's line is thick.
 
-
-def _free(colors: Iterable[str], known: Mapping[str, tuple[str, str]]) -> list[tuple[str, str]]:
-    return [(color, marker) for marker, color in product(MARKERS, colors) if (color, marker) not in known.values()]
-
-
-def _look_of(solver: str) -> tuple[str, str]:
-    """That of a solver; of an unknown one, by its name, one that no other solver has."""
-    known = looks()
-    if (name := SAME.get(solver, solver)) in known:
-        return known[name]
-    free = _free(THEIRS, known)
-    return free[zlib.crc32(name.encode()) % len(free)]
-
-
-def style(solver: str, family: str = "two-loop", keeps_constraints: bool = True) -> dict[str, object]:
-    """Colour, marker and line of a solver, the same in all figures; an open marker where the constraints drift."""
-    color, marker = _look_of(solver)
-    line: dict[str, object] = {"linestyle": "-", "linewidth": 1.7} if family == "two-loop" else {"linestyle": "--"}
-    made = line | {"color": color, "marker": marker}
-    return made if keeps_constraints else made | {"markerfacecolor": "white"}
+    `keeps_constraints` changes nothing.
+    """
+    name = SAME.get(solver, solver)
+    if name not in STYLES:  # the same one every time, and no listed solver's
+        free = [pair for pair in product(THEIRS, MARKERS) if pair not in STYLES.values()]
+        color, marker = free[zlib.crc32(name.encode()) % len(free)]
+    else:
+        color, marker = STYLES[name]
+    thick = {"linewidth": THICK, "zorder": 3} if name == DEFAULT else {}
+    return {"color": color, "marker": marker, "linestyle": "-"} | thick
 
 
 def look(row: pd.Series, coded: bool | None = None) -> dict[str, Any]:
-    """Colour, marker and line of the row's solver, labelled with its name; `coded`: as `names.label` has it."""
-    made = style(looks_like(row["solver"], coded), row["family"], bool(row["keeps_constraints"]))
-    return made | {"label": label(row["solver"], coded)}
+    """Return the style of the row's solver, with its name as label; `coded`: as `names.label` has it."""
+    text = label(row["solver"], coded)
+    if text == GIVEN:
+        return style(DEFAULT) | {"label": f"twoloop, {GIVEN}"}
+    return style(looks_like(row["solver"], coded)) | {"label": text}
 
 
 def shades(n: int) -> list[Any]:
-    """Colours of what is no solver, from dark to light; a legend of them has a title that says what they are."""
+    """Return colours from dark to light, for curves that are not of solvers."""
     return list(plt.get_cmap("viridis")(np.linspace(0.0, 0.85, n)))
 
 
+def message(figure: Figure, text: str) -> None:
+    """Write what the figure shows above it, as one sentence."""
+    width = int(11.0 * figure.get_figwidth())  # letters that fit on a line
+    figure.suptitle(textwrap.fill(text, width), x=0.01, ha="left", fontsize=11, fontweight="bold")
+
+
+def label_lines(panels: Axes | Iterable[Axes]) -> None:
+    """Write each label once, right of the panel where its line ends last; call this last, before `save`.
+
+    `panels`: those that share their labels, from left to right. Lines without a label are left alone.
+    """
+    lines: dict[str, tuple[Axes, Any]] = {}
+    for axes in [panels] if isinstance(panels, Axes) else panels:
+        for handle, text in zip(*axes.get_legend_handles_labels(), strict=True):
+            line: Any = handle[0] if isinstance(handle, ErrorbarContainer) else handle
+            if np.isfinite(np.array(line.get_ydata(), dtype=float)).any():
+                lines[text] = axes, line
+    for axes in dict.fromkeys(axes for axes, _ in lines.values()):
+        figure = axes.get_figure(root=True)
+        assert figure is not None
+        label_decades(figure)
+        figure.draw_without_rendering()  # so that the axes have their size
+        _label_ends(axes, {text: line for text, (own, line) in lines.items() if own is axes})
+
+
+def _label_ends(axes: Axes, lines: dict[str, Any]) -> None:
+    places = []
+    for text, line in lines.items():
+        x, y = (np.asarray(line.get_data()[k], dtype=float) for k in (0, 1))
+        seen = np.flatnonzero(np.isfinite(x) & np.isfinite(y))
+        last = seen[np.argmax(x[seen])]
+        x_low, x_high = sorted(axes.get_xlim())
+        y_low, y_high = sorted(axes.get_ylim())
+        end = np.clip(x[last], x_low, x_high), np.clip(y[last], y_low, y_high)
+        height = axes.transAxes.inverted().transform(axes.transData.transform(end))[1]
+        places.append((height, end, text, line))
+    places.sort(key=lambda place: place[0])
+    size = float(mpl.rcParams["legend.fontsize"])
+    gap = LABEL_HEIGHT * size / 72.0 / (axes.get_window_extent().height / axes.get_figure(root=True).dpi)  # type: ignore[union-attr]
+    heights = np.array([place[0] for place in places])
+    for k in range(1, len(heights)):  # push up what would overlap, then down again what is above the panel
+        heights[k] = max(heights[k], heights[k - 1] + gap)
+    top = max(1.0, gap * (len(heights) - 1))
+    for k in reversed(range(len(heights))):
+        heights[k] = min(heights[k], top - gap * (len(heights) - 1 - k))
+    for height, (_, end, text, line) in zip(heights, places, strict=True):
+        color, bold = line.get_color(), line.get_linewidth() >= THICK
+        axes.annotate(
+            text,
+            xy=end,
+            xytext=(1.04, height),
+            textcoords="axes fraction",
+            color=color,
+            fontsize=size,
+            fontweight="bold" if bold else "normal",
+            va="center",
+            annotation_clip=False,
+            arrowprops={"arrowstyle": "-", "color": color, "linewidth": 0.6, "alpha": 0.6, "shrinkA": 1, "shrinkB": 3},
+        )
+
+
 def legend(figure: Figure, axes: Iterable[Axes], title: str | None = None, below: int = 0) -> None:
-    """One legend for all panels, each label once; right of them, or in so many columns below."""
+    """Explain what has no line to be labelled, such as bars: each label once, right of the panels or below them.
+
+    `below`: the number of columns below. Lines have their labels by `label_lines`.
+    """
     entries: dict[str, Any] = {}
     for panel in axes:
         for handle, words in zip(*panel.get_legend_handles_labels(), strict=True):
@@ -132,102 +185,85 @@ def save(figure: Figure, output: Output, name: str) -> None:
 
 
 def cheapest_lines(rows: pd.DataFrame, targets: Sequence[float], most: int = MOST_LINES) -> list[str]:
-    """At most so many solvers of a case, those with the best places at the targets; in the order of the rows."""
-    places: dict[str, list[int]] = {}
+    """Return at most so many solvers of a case, those with the best places at the targets, in the order of the rows."""
+    solvers = rows["solver"].unique()
+    score = dict.fromkeys(solvers, 0)
     for target in targets:
         times = {solver: time_for(runs, target) for solver, runs in rows.groupby("solver", sort=False)}
-        ranked = sorted((time, str(solver)) for solver, time in times.items() if time == time)
-        for place, (_, solver) in enumerate(ranked):
-            places.setdefault(solver, []).append(place)
-    missing = len(rows["solver"].unique())
-    score = {solver: sum(got) + missing * (len(targets) - len(got)) for solver, got in places.items()}
-    best = sorted(score, key=score.__getitem__)[:most]
-    return [solver for solver in dict.fromkeys(rows["solver"]) if solver in best]
+        ranked = sorted((solver for solver in solvers if times[solver] == times[solver]), key=times.__getitem__)
+        for solver in solvers:
+            score[solver] += ranked.index(solver) if solver in ranked else len(solvers)
+    reached = [solver for solver in solvers if score[solver] < len(targets) * len(solvers)]
+    best = sorted(reached, key=score.__getitem__)[:most]
+    return [str(solver) for solver in solvers if solver in best]
 
 
-def lines_of(rows: pd.DataFrame, targets: Sequence[float]) -> list[str]:
-    """The solvers that a figure of a case shows, of those with errors that can be told.
+def lines_of(rows: pd.DataFrame, targets: Sequence[float], coded: bool | None = None) -> list[str]:
+    """Choose at most six solvers of a case whose errors can be told from that of the reference.
 
-    The default, compiled too, and the paper's procedure; the cheapest of the main rivals that got anywhere, and of all
-    at each target; of ours the cheapest others, those at a target first, as many as there is room for.
+    In this order: the default, the paper's procedure, the fastest of the other solvers at each target, the fastest of
+    each of `MAIN_SOLVERS`, and the fastest further methods of twoloop. Other projects have a line each.
+    `coded`: as `names.label` has it.
     """
     seen = rows[_told(rows)]
-    first = [name for name in FIRST if (seen["solver"] == name).any()]
-    rivals: list[str] = []
-    for family, begins in MAIN_RIVALS:
+    names = list(dict.fromkeys(seen["solver"]))
+    defaults = [name for name in (*COMPILED, GIVEN, DEFAULT) if COMPILED.get(name, DEFAULT) == DEFAULT]
+    ranked = sorted((name for name in defaults if name in names), key=lambda name: label(name, coded) != GIVEN)
+    chosen = [*ranked[:1], *[name for name in (IRK_LINE, IRK) if name in names][:1]]
+    of_us = seen["family"] == "two-loop"
+    others = rows[rows["solver"].isin(seen[~of_us]["solver"])]
+    found = [name for target in targets for name in cheapest_lines(others, (target,), 1)]
+    for family, begins in MAIN_SOLVERS:
         own = seen[(seen["family"] == family) & seen["solver"].str.startswith(begins)]
         if not own.empty:
-            best = own.loc[own["error_q"].astype(float).idxmin(), "solver"]
-            rivals += cheapest_lines(rows[rows["solver"].isin(own["solver"])], targets, 1) or [best]
-    of_us = seen["family"] == "two-loop"
-    rivals += [
-        name for name in _winners(rows[rows["solver"].isin(seen[~of_us]["solver"])], targets) if name not in rivals
-    ]
-    ours = rows[rows["solver"].isin(seen[of_us & ~seen["solver"].isin(first)]["solver"])]
-    room = max(0, MOST_LINES - len(first) - len(rivals))
-    chosen = list(dict.fromkeys([*_winners(ours, targets), *cheapest_lines(ours, targets, room)]))[:room]
-    return [*first, *(name for name in dict.fromkeys(ours["solver"]) if name in chosen), *rivals]
+            best = str(own.loc[own["error_q"].astype(float).idxmin(), "solver"])
+            found += cheapest_lines(rows[rows["solver"].isin(own["solver"])], targets, 1) or [best]
+    firsts: dict[str, str] = {}  # of each project, by the first word of its label
+    for name in found:
+        firsts.setdefault(label(name).split()[0].rstrip(","), name)
+    chosen += firsts.values()
+    further = rows[rows["solver"].isin(seen[of_us]["solver"]) & ~rows["solver"].isin([*ranked, IRK_LINE, IRK])]
+    return list(dict.fromkeys([*chosen, *cheapest_lines(further, targets)]))[:MOST_LINES]
 
 
 def default_first(solvers: Iterable[str], coded: bool | None) -> list[str]:
-    """The solvers in the order of a legend, each once; `coded`: as `names.label` has it."""
+    """Return the solvers with the default first, each once; `coded`: as `names.label` has it."""
     return sorted(dict.fromkeys(solvers), key=lambda name: label(name, coded) != GIVEN)
 
 
-def _winners(rows: pd.DataFrame, targets: Sequence[float]) -> list[str]:
-    """The cheapest solver at each of the targets that any reaches."""
-    best = (cheapest_lines(rows, (target,), 1) for target in targets)
-    return list(dict.fromkeys(name for names in best for name in names))
-
-
 def _told(rows: pd.DataFrame) -> pd.Series:
-    """Whether the reference resolves the error of a run, and the run has not lost the motion."""
+    """Return whether the reference resolves the error of a run, and the run has not lost the motion."""
     return (rows["error_q"].astype(float) > rows["floor"].astype(float)) & ~astray(rows)
 
 
-def with_gaps(runs: pd.DataFrame) -> pd.DataFrame:
-    """The runs of one solver from its loosest setting on, with an empty row wherever no line is to be drawn.
+def line_of(runs: pd.DataFrame) -> pd.DataFrame:
+    """Return the runs of one solver that a line connects, from its loosest setting on.
 
-    As in `tables`, nothing is told between runs of errors more than a decade apart or of different methods, nor across
-    a run that failed. Runs whose errors cannot be told are left out.
+    Runs that failed, lost the motion or have errors below that of the reference are left out.
     """
-    runs = runs.assign(error_q=runs["error_q"].astype(float).where(_told(runs)))
-    runs = runs.iloc[np.lexsort((-runs["error_q"], -setting_of(runs)))].reset_index(drop=True)
-    size = np.log(runs["error_q"])
-    methods = pd.Series([used(run) for _, run in runs.iterrows()])
-    apart = (size.diff().abs() > np.log(DECADE)) | (methods != methods.shift(fill_value=methods.get(0)))
-    return runs.reindex(sorted([*runs.index, *(runs.index[apart] - 0.5)]))
+    runs = runs[_told(runs)]
+    return runs.iloc[np.lexsort((-runs["error_q"].astype(float), -setting_of(runs)))].reset_index(drop=True)
+
+
+with_gaps, LEGEND = line_of, None  # lines have no gaps and no legend any more
 
 
 def work_precision(
     rows: pd.DataFrame, solvers: Sequence[str], title: str, error: str = ERROR, coded: bool | None = None
 ) -> Figure:
-    """CPU time and evaluations over the largest error of a position, a line a solver; `rows` of one case, medians.
+    """Draw CPU time over the largest error of a position, a line a solver; `rows` of one case, medians.
 
-    `error` says what the column error_q is; `coded`: as `names.label` has it. Lines have the gaps of `with_gaps`.
-    Raises ValueError if there are more than nine lines.
+    `title`: the message. `error` says what the column error_q is; `coded`: as `names.label` has it.
+    Raises ValueError if there are more than six lines.
     """
     if len(solvers) > MOST_LINES:
         raise ValueError(f"a work-precision figure has at most {MOST_LINES} lines; given {len(solvers)}")
-    figure, (left, right) = plt.subplots(1, 2, figsize=(9.2, 3.8), sharex=True, layout="constrained")
+    figure, axes = plt.subplots(figsize=(7.6, 4.0), layout="constrained")
     for solver in default_first(solvers, coded):
-        runs = with_gaps(rows[rows["solver"] == solver])
-        known = runs[runs["error_q"].notna()]
-        if known.empty:
-            continue
-        called = " [P]" if known["called_from"].iloc[0] == "Python" else ""
-        one = look(known.iloc[0], coded)
-        one["label"] += called
-        errors, times = runs["error_q"].astype(float), runs["call_s"].astype(float)
-        spread = [times - runs["call_q1"].astype(float), runs["call_q3"].astype(float) - times]
-        left.errorbar(errors, times, yerr=spread, elinewidth=0.8, **one)
-        if known["n_evaluations"].notna().any():
-            right.plot(errors, runs["n_evaluations"].astype(float), **one)
-    for axes, what in ((left, "CPU time of the call (s)"), (right, "evaluations")):
-        axes.set(xscale="log", yscale="log", xlabel=error, ylabel=what)
-    bars = bool((rows["call_q3"] > rows["call_q1"]).any())
-    from_python = any(words.endswith(" [P]") for words in left.get_legend_handles_labels()[1])
-    told = bars * "\nvertical bars: quartiles" + from_python * "\n[P]: called from Python"
-    legend(figure, [left], f"{LEGEND}\nleft out: motion lost{told}")
-    figure.suptitle(title, fontsize=10)
+        runs = line_of(rows[rows["solver"] == solver])
+        if len(runs):
+            axes.plot(runs["error_q"].astype(float), runs["call_s"].astype(float), **look(runs.iloc[0], coded))
+    axes.set(xscale="log", yscale="log", xlabel=error, ylabel=TIME)
+    message(figure, title)
+    label_lines(axes)
     return figure
