@@ -20,6 +20,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
+from matplotlib.collections import PolyCollection
+from matplotlib.colors import to_hex
 from matplotlib.container import ErrorbarContainer
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
@@ -28,6 +30,7 @@ from studies.bench.names import label, looks_like
 from studies.bench.solvers import COMPILED, DEFAULT, GEAR_ORDERS, GIVEN, HEYOKA, IRK, IRK_LINE, gear
 from studies.bench.store import Output
 from studies.bench.tables import astray, setting_of, time_for
+from twoloop.problem.problem import Array
 
 MOST_LINES = 6
 # a solver of each of these is drawn if there is room, in this order: family, how its name begins
@@ -93,55 +96,61 @@ def message(figure: Figure, text: str) -> None:
 def label_lines(panels: Axes | Iterable[Axes]) -> None:
     """Write each label once, right of the panel where its line ends last; call this last, before `save`.
 
-    `panels`: those that share their labels, from left to right. Lines without a label are left alone.
+    `panels`: those that share their labels, from left to right. Lines and bands without a label are left alone.
     """
-    lines: dict[str, tuple[Axes, Any]] = {}
+    last: dict[str, tuple[Axes, Any]] = {}
     for axes in [panels] if isinstance(panels, Axes) else panels:
         for handle, text in zip(*axes.get_legend_handles_labels(), strict=True):
-            line: Any = handle[0] if isinstance(handle, ErrorbarContainer) else handle
-            if np.isfinite(np.array(line.get_ydata(), dtype=float)).any():
-                lines[text] = axes, line
-    for axes in dict.fromkeys(axes for axes, _ in lines.values()):
-        figure = axes.get_figure(root=True)
-        assert figure is not None
-        label_decades(figure)
-        figure.draw_without_rendering()  # so that the axes have their size
-        _label_ends(axes, {text: line for text, (own, line) in lines.items() if own is axes})
+            line = handle[0] if isinstance(handle, ErrorbarContainer) else handle
+            if np.isfinite(_points(line)).all(axis=1).any():
+                last[text] = axes, line
+    for axes in dict.fromkeys(axes for axes, _ in last.values()):
+        _label_ends(axes, {text: line for text, (own, line) in last.items() if own is axes})
+
+
+def _points(line: Any) -> Array:
+    """Return the points of a line or of a filled band, a row each, in its own coordinates."""
+    if isinstance(line, PolyCollection):
+        return np.asarray(line.get_paths()[0].vertices, dtype=float)
+    return np.array(line.get_xydata(), dtype=float)
 
 
 def _label_ends(axes: Axes, lines: dict[str, Any]) -> None:
-    places = []
+    figure = axes.get_figure(root=True)
+    assert figure is not None
+    label_decades(figure)
+    figure.draw_without_rendering()  # so that the axes have their size
+    ends = []
     for text, line in lines.items():
-        x, y = (np.asarray(line.get_data()[k], dtype=float) for k in (0, 1))
-        seen = np.flatnonzero(np.isfinite(x) & np.isfinite(y))
-        last = seen[np.argmax(x[seen])]
-        x_low, x_high = sorted(axes.get_xlim())
-        y_low, y_high = sorted(axes.get_ylim())
-        end = np.clip(x[last], x_low, x_high), np.clip(y[last], y_low, y_high)
-        height = axes.transAxes.inverted().transform(axes.transData.transform(end))[1]
-        places.append((height, end, text, line))
-    places.sort(key=lambda place: place[0])
+        points = _points(line)
+        points = points[np.isfinite(points).all(axis=1)]
+        shown = axes.transAxes.inverted().transform(line.get_transform().transform(points))
+        end = np.clip(shown[shown[:, 0] >= shown[:, 0].max() - 1e-9].mean(axis=0), 0.0, 1.0)
+        ends.append((end, text, line))
+    ends.sort(key=lambda each: each[0][1])
     size = float(mpl.rcParams["legend.fontsize"])
-    gap = LABEL_HEIGHT * size / 72.0 / (axes.get_window_extent().height / axes.get_figure(root=True).dpi)  # type: ignore[union-attr]
-    heights = np.array([place[0] for place in places])
+    gap = LABEL_HEIGHT * size / 72.0 * figure.dpi / axes.get_window_extent().height
+    heights = np.array([end[1] for end, *_ in ends])
     for k in range(1, len(heights)):  # push up what would overlap, then down again what is above the panel
         heights[k] = max(heights[k], heights[k - 1] + gap)
-    top = max(1.0, gap * (len(heights) - 1))
     for k in reversed(range(len(heights))):
-        heights[k] = min(heights[k], top - gap * (len(heights) - 1 - k))
-    for height, (_, end, text, line) in zip(heights, places, strict=True):
-        color, bold = line.get_color(), line.get_linewidth() >= THICK
+        heights[k] = min(heights[k], max(1.0, gap * (len(heights) - 1)) - gap * (len(heights) - 1 - k))
+    for height, (end, text, line) in zip(heights, ends, strict=True):
+        band = isinstance(line, PolyCollection)
+        color = to_hex(line.get_facecolor()[0] if band else line.get_color())
+        thick = not band and line.get_linewidth() >= THICK
+        arrow = {"arrowstyle": "-", "color": color, "linewidth": 0.6, "alpha": 0.6, "shrinkA": 1, "shrinkB": 3}
         axes.annotate(
             text,
             xy=end,
+            xycoords="axes fraction",
             xytext=(1.04, height),
-            textcoords="axes fraction",
             color=color,
             fontsize=size,
-            fontweight="bold" if bold else "normal",
+            fontweight="bold" if thick else "normal",
             va="center",
             annotation_clip=False,
-            arrowprops={"arrowstyle": "-", "color": color, "linewidth": 0.6, "alpha": 0.6, "shrinkA": 1, "shrinkB": 3},
+            arrowprops=arrow,
         )
 
 
