@@ -19,6 +19,7 @@ import pandas as pd
 
 from studies.bench import headline
 from studies.bench.collector import NOTHING_RUN, Run, Warm
+from studies.bench.progress import Progress
 from studies.bench.store import KeptRows, Row
 from studies.bench.tables import TIGHTEST
 from twoloop.rows.equal_error import DECADE, LOOSEST, NEAR
@@ -79,9 +80,11 @@ def collect(
     progress: dict[tuple[str, str], _Progress] = defaultdict(_Progress)
     reached: dict[Side, list[tuple[float, float]]] = defaultdict(list)  # error and time of the runs on a mechanism
     todo = list(todo)
+    lines = Progress(len(todo))  # as if all were made: how many are is known only from their results
 
     def first(run: Run) -> None:
         row, runs = kept.made(run.key(0), lambda: make(run, 0, built)), reached[_side(run)]
+        lines.step(run.label(0), always=False)
         good = [] if row["error_q"] is None else [cpu for error, cpu in runs if error <= row["error_q"]]
         who = progress[run.case.name, run.solver.name]
         who.judge(row, min(good, default=None), all_asked(run), run.solver.setting == "tol")
@@ -89,21 +92,26 @@ def collect(
             runs.append((row["error_q"], row["call_s"]))
 
     for run in todo:
-        if not progress[run.case.name, run.solver.name].ended:
+        if progress[run.case.name, run.solver.name].ended:
+            lines.add(-1)
+        else:
             first(run)
     for _ in range(ROUNDS if errors else 0):
         by_solver: dict[tuple[str, str], list[Run]] = defaultdict(list)
         for run in todo:
             by_solver[run.case.name, run.solver.name].append(run)
         more = [run for own in by_solver.values() for run in between(own, kept, reached, errors, fine(own[0]))]
+        lines.add(len(more))
         for run in more:
             first(run)
         todo += more
     again = _repeated(todo, kept, always_repeated)
+    lines.add(sum(run.repeats - 1 for run in again))
     for repeat in range(1, max((run.repeats for run in todo), default=0)):
         for run in again:
             if repeat < run.repeats:
                 kept.made(run.key(repeat), partial(make, run, repeat, built))
+                lines.step(run.label(repeat), always=False)
     keys = [run.key(k) for run in todo for k in range(run.repeats)]
     return pd.DataFrame([kept[key] for key in keys if key in kept])
 

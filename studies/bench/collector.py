@@ -4,7 +4,6 @@ A study lists `Run`s, `collect` makes the rows, `tables` summarises them. Mechan
 `solvers.py`, what a row says of the quality of a run in `metrics.py`.
 """
 
-import sys
 import time
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
@@ -14,12 +13,12 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from rich.progress import track
 
 from references.driver import user_call
 from references.lines import CannotRun
 from studies.bench import metrics
 from studies.bench.apart import Alarm
+from studies.bench.progress import track
 from studies.bench.reference_motion import ReferenceMotion, make_reference
 from studies.bench.store import Array, KeptRows, Row
 from twoloop import ConstrainedSystem, Result, Statistics, solve_dae
@@ -158,6 +157,13 @@ class Run:
         """Names and values of the settings, for the row."""
         return {**self.solver.fixed, self.solver.setting: self.value}
 
+    def label(self, repeat: int) -> str:
+        """The run in a line of progress."""
+        values = {name: value for name, value in self.settings.items() if isinstance(value, float)}
+        settings = " ".join(f"{name}={value:g}".replace("e-0", "e-") for name, value in values.items())
+        again = f" (repetition {repeat + 1} of {self.repeats})" if repeat else ""
+        return f"{self.case.name}: {self.solver.name} {settings}{again}"
+
     def key(self, repeat: int) -> str:
         """What tells one row from all others of the study."""
         settings = " ".join(f"{name}={value!r}" for name, value in sorted(self.settings.items()))
@@ -192,7 +198,8 @@ def collect(runs: Iterable[Run], kept: KeptRows, measure: Measure | None = None)
     for case in {id(run.case): run.case for run, _ in left}.values():
         _ = case.scale  # makes the reference, which is not to be timed with anything
     warm: Warm = set()
-    for run, k in track(left, "runs", disable=not sys.stdout.isatty()):
+    # a line for each run, and for its repetitions as far as they take their time
+    for run, k in track(left, lambda each: each[0].label(each[1]), lambda each: each[1] == 0):
         if k == 0 or kept[run.key(0)]["status"] not in ONCE:
             kept.add(run.key(k), row_of(run, k, measure, warm))
     return pd.DataFrame([kept[key] for key in order if key in kept])

@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from studies.bench import cli, figures, tables
 from studies.bench.collector import Measure, Run, collect
 from studies.bench.index import write_index
+from studies.bench.progress import track
 from studies.bench.render import render, table
 from studies.bench.store import Output, Row
 
@@ -66,9 +67,9 @@ def kept_rows(*parts: Callable[[bool], Iterable[tuple[str, Callable[[], Any]]]])
         return dict(made) if isinstance(made, dict) else {"rows": made}
 
     def make(output: Output) -> pd.DataFrame:
-        keyed = chain.from_iterable(part(output.call.quick) for part in parts)
+        keyed = list(chain.from_iterable(part(output.call.quick) for part in parts))
         with output.kept() as kept:
-            made = [kept.made(key, partial(kept_row, run)) for key, run in keyed]
+            made = [kept.made(key, partial(kept_row, run)) for key, run in track(keyed, lambda each: each[0])]
         return pd.DataFrame([row for each in made for row in each.get("rows", [each])])
 
     return make
