@@ -23,7 +23,7 @@ class Line:
     called_from: str = "compiled"  # caller of the mechanism's functions; "Python" costs microseconds per call
     # whether the positions stay on the constraints to the solver's tolerance
     keeps: bool = True
-    rival: bool = True  # included in all tables
+    compared: bool = True  # runs in all comparisons of studies
     checked: bool = False  # checked by `conformance`; one setting per solver
     setting: str = "tol"  # the number that varies; "h": a fixed step, which `solve` takes as `step`
     of_problem: bool = False  # solve(problem, t_end, ...), with equations of its own; otherwise of a system

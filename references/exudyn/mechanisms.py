@@ -242,7 +242,7 @@ LINES = (
     *(
         Line(
             *(f"{ALPHA} {radius:g}", "exudyn", "Exudyn", solve_by_step, {"spectral_radius": radius}),
-            rival=radius < 1.0,
+            compared=radius < 1.0,
             fixed={"spectral_radius": radius},
             **MODEL,
         )
@@ -252,7 +252,7 @@ LINES = (
         Line(
             *(f"Exudyn, {solver}", "exudyn", "Exudyn", solve_by_step, {"solver": solver}),
             keeps=solver != "TrapezoidalIndex2",  # its positions are off by its errors
-            rival=solver == "TrapezoidalIndex2",
+            compared=solver == "TrapezoidalIndex2",
             **MODEL,
         )
         for solver in SOLVERS

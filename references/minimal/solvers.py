@@ -149,9 +149,9 @@ def _states(own: Minimal, task: Task, rows: Array) -> Array:
     return np.concatenate(own.states(rows.T)) if len(rows) else np.empty((2 * task.system.n_q, 0))
 
 
-# in minimal coordinates, where these have a closed form: no rivals on a DAE, and in no ranking
+# in minimal coordinates, where these have a closed form: no solvers of a DAE, and in no ranking
 FAMILY = "minimal coordinates"
-OWN: dict[str, Any] = {"rival": False, "of_problem": True, "traces": True}
+OWN: dict[str, Any] = {"compared": False, "of_problem": True, "traces": True}
 LINES = (
     Line(
         *(f"heyoka, {FAMILY}", "heyoka", FAMILY, solve_heyoka_minimal),

@@ -304,7 +304,7 @@ def name_of(order: int, start: str = "accurate") -> str:
 LINES = tuple(
     Line(
         *(name_of(order, start), "twoloop", "stand-in", solve_gear_stored, {"order": order, "start": start}),
-        rival=False,
+        compared=False,
         setting="h",
         stores_steps=True,
         own_accelerations=True,

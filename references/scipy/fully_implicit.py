@@ -111,7 +111,7 @@ LINES = tuple(
         *(f"{method}, solve_dae", "solve-dae", "solve_dae", solve_fully_implicit),
         {"method": method},
         called_from="Python",
-        rival=method != "BDF",
+        compared=method != "BDF",
         checked=method == "Radau",
         own_accelerations=True,
         stores_steps=True,

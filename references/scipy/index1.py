@@ -316,12 +316,12 @@ def _line(name: str, method: str, stabilisation: str = "none", **more: Any) -> L
 LINES = (
     _line("LSODA, index 1", "LSODA", checked=True),
     _line("DOP853, index 1", "DOP853"),
-    _line("RK45, index 1", "RK45", rival=False),
+    _line("RK45, index 1", "RK45", compared=False),
     _line("DOP853, projected", "DOP853", "projection", keeps=True, checked=True),
-    _line("RK45, projected", "RK45", "projection", keeps=True, rival=False),
+    _line("RK45, projected", "RK45", "projection", keeps=True, compared=False),
     *(_line(f"{name}, index 1", name) for name in ("Pr9", "Radau", "BDF")),
     *(
-        _line(baumgarte(name, alpha), name, "baumgarte", rival=False, own_accelerations=True, fixed={"alpha": alpha})
+        _line(baumgarte(name, alpha), name, "baumgarte", compared=False, own_accelerations=True, fixed={"alpha": alpha})
         for name in ("LSODA", "DOP853")
         for alpha in ALPHAS
     ),

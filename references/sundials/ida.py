@@ -123,6 +123,6 @@ def _solver(equations: Implicit, t0: float, options: dict[str, Any], limit: Time
 
 HOW: dict[str, Any] = {"called_from": "Python", "own_accelerations": True, "scatters": True}
 LINES = (
-    Line("IDA, index1", "scikit-sundae", "SUNDIALS", solve_ida, {"form": "index1"}, keeps=False, rival=False, **HOW),
+    Line("IDA, index1", "scikit-sundae", "SUNDIALS", solve_ida, {"form": "index1"}, keeps=False, compared=False, **HOW),
     Line("IDA, stabilised", "scikit-sundae", "SUNDIALS", solve_ida, {"form": "stabilised"}, checked=True, **HOW),
 )

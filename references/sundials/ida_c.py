@@ -200,7 +200,7 @@ LINES = (
     Line(
         *("IDA from C, order 2, banded", "scikit-sundae", "SUNDIALS", solve_ida_c),
         OF_ORDER_2 | {"banded": True},
-        rival=False,
+        compared=False,
         **HOW,
     ),
 )

@@ -23,7 +23,7 @@ from studies.bench.solvers import (
     PAPER_TOL,
     QUARTER,
     RADAU,
-    RIVALS,
+    OTHER_SOLVERS,
 )
 from studies.bench.store import KeptRows, Row
 from twoloop import ConstrainedSystem, Result, solve_dae
@@ -34,7 +34,7 @@ PAPER = IRK
 NEWTON, DIFFERENCES = "RadauIIA5", "RadauIIA5, by differences"
 EXUDYN = "Exudyn, GeneralizedAlpha, its own cable"
 OURS = ("auto", "auto, compiled", "TRBDF2", "ESDIRK4", "SunRadau5", "Gauss6", "BDF", "Adams", OWN_EXPLICIT)
-OTHERS = (*(name for name in RIVALS if not name.startswith("Exudyn")), IDA_C_BANDED)  # Exudyn's cable is another
+OTHERS = (*(name for name in OTHER_SOLVERS if not name.startswith("Exudyn")), IDA_C_BANDED)  # Exudyn's cable is another
 
 TARGETS = (1e-2, 1e-3, 1e-4)  # m, of the tip's height
 LOOSE = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5)  # tolerances, between and beyond which `adaptive` asks

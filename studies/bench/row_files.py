@@ -35,7 +35,9 @@ def mechanism_of(name: str) -> str:
     return READY.get(name) or re.sub(r"\W+", "_", name).strip("_").lower()
 
 
-RIVALS = ("heyoka", "scikit-sundae", "scipy", "extensisq", "diffrax", "casadi", "cyrk", "solve-dae", "exudyn")
+COMPARED_PACKAGES = (
+    *("heyoka", "scikit-sundae", "scipy", "extensisq", "diffrax", "casadi", "cyrk", "solve-dae", "exudyn"),
+)
 PACKAGES = {"SUNDIALS": "scikit-sundae", "solve_dae": "solve-dae"}  # of families that are called otherwise
 QUALITY = ("violation_q", "violation_v", "error_lam", "energy")
 SAME = ("t_end", "solver", "family", "status", "astray", "error_v", *QUALITY)  # by these names in tables of runs, too
@@ -46,14 +48,14 @@ LONGEST = 120  # letters of a message
 
 def versions() -> dict[str, str]:
     """Of the packages compared, those that are installed."""
-    return {package: told for package in RIVALS if (told := version_of(package, ""))}
+    return {package: told for package in COMPARED_PACKAGES if (told := version_of(package, ""))}
 
 
 def in_format(run: Mapping[str, Any], columns: Mapping[str, str], versions: Mapping[str, str]) -> Row:
     """The row of a run.
 
     `run`: a line of `tables.medians`. `columns`: where it has the errors and floors of the format that are known.
-    `versions`: of the rivals' packages, and of solvers from files.
+    `versions`: of the other projects' packages, and of solvers from files.
     """
     family, done = run["family"], run["status"] == REACHED_END
     setting = next(name for name in SETTINGS if run.get(name) == run.get(name, float("nan")))

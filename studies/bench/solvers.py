@@ -46,7 +46,7 @@ COMPILED = {f"{method}, compiled": method for method in (DEFAULT, TAYLOR, ADAMS,
 RADAU = ("RadauIIA5", "RadauIIA9", "RadauIIA13")
 IMPLICIT = ("SunRadau5", "Gauss6", "Gauss12", *RADAU, "TRBDF2", "ESDIRK4", "Newmark", OWN_BDF)
 PRESETS = (*IMPLICIT, OWN_EXPLICIT, ADAMS, TAYLOR)  # of twoloop, with their own options
-# of ours, beside the rivals
+# of ours, beside the other solvers
 OWN = (*(*COMPILED, DEFAULT, TAYLOR, ADAMS, OWN_EXPLICIT), *("Gauss12", "Gauss16", *RADAU, "TRBDF2", OWN_BDF))
 IDA_INDEX_1 = "IDA, index1"
 EXUDYN = tuple(EXUDYN_SOLVERS)
@@ -57,11 +57,11 @@ SAME_IN_LINES = ("own_accelerations", "traces", "builds_each", "builds_span", "f
 GEAR_ORDERS = tuple(range(1, HIGHEST + 1))
 
 # other projects' solvers, the same beside ours in every table: called from compiled code, then from Python
-RIVALS = tuple(line.name for line in lines() if line.rival)
-# in minimal coordinates, where these have a closed form: no rivals on a DAE, and in no ranking
+OTHER_SOLVERS = tuple(line.name for line in lines() if line.compared)
+# in minimal coordinates, where these have a closed form: no solvers of a DAE, and in no ranking
 MINIMAL = tuple(line.name for line in lines() if line.family == MINIMAL_FAMILY)
 
-# of ours what `compare` and the cases at length run, and with rivals enough for a mechanism of a user's own
+# of ours what `compare` and the cases at length run, and with enough other solvers for a mechanism of a user's own
 COMPARED_OWN = ("auto, compiled", DEFAULT, TAYLOR, ADAMS, OWN_EXPLICIT, "Gauss12", "SunRadau5", "RadauIIA5", "BDF")
 COMPARED = (
     *(*COMPARED_OWN, HEYOKA, CYRK, "CyRK, Radau", CVODE_C, "CVODE from C, BDF"),

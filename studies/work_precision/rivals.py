@@ -23,7 +23,7 @@ from studies.bench.cli import StudyError
 from studies.bench.collector import REPEATS, Run, Warm, warm_up
 from studies.bench.end_states import case_of, row_of
 from studies.bench.render import number, power
-from studies.bench.solvers import CATALOGUE, HEYOKA, OWN, RIVALS, TAYLOR
+from studies.bench.solvers import CATALOGUE, HEYOKA, OWN, OTHER_SOLVERS, TAYLOR
 from studies.bench.store import KeptRows, Row
 from studies.validation.study import MAKE
 from twoloop import mechanisms, solve_dae
@@ -109,7 +109,7 @@ def runs(quick: bool) -> list[Run]:
     for name, problem in problems(quick).items():
         case = replace(case_of(problem), name=name, time_limit=TIME_LIMIT, timed=TIMED)
         case = replace(case, step_sizes=tuple(case.t_end / n for n in STEPS))
-        for solver in (CATALOGUE[each] for each in (QUICK_SOLVERS if quick else (*OWN, *RIVALS))):
+        for solver in (CATALOGUE[each] for each in (QUICK_SOLVERS if quick else (*OWN, *OTHER_SOLVERS))):
             grid = BUILT if solver.builds_each else TOLERANCES if solver.setting == "tol" else case.steps()
             grid = (*grid, *BELOW) if grid is TOLERANCES and solver.family == "SUNDIALS" else grid
             values = QUICK_TOLERANCES if quick else grid

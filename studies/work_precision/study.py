@@ -26,7 +26,7 @@ from studies.bench.solvers import (
     IRK_LINE,
     QUARTER,
     RADAU,
-    RIVALS,
+    OTHER_SOLVERS,
     TOLERANCES,
 )
 from studies.bench.store import KeptRows, Output
@@ -55,7 +55,7 @@ def runs(case: Case, quick: bool) -> list[Run]:
     stiff = "stiff" in case.tags
     if quick:
         return runs_of(case, QUICK, quick)
-    made = runs_of(case, dict.fromkeys((*COMPARED_OWN, *RIVALS, *(STIFF if stiff else FURTHER))), quick)
+    made = runs_of(case, dict.fromkeys((*COMPARED_OWN, *OTHER_SOLVERS, *(STIFF if stiff else FURTHER))), quick)
     coarse = (case.tolerances or TOLERANCES)[::2]
     made = [run for run in made if run.solver.setting != "tol" or run.value in coarse]
     rough = {run.solver.name: run for run in made if stiff and run.solver.name == STIFF[0]}.values()

@@ -77,7 +77,7 @@ RIGHT_ON_SMALL = {
 
 @pytest.mark.parametrize("problem", [SMALL, pytest.param(PROBLEM, marks=pytest.mark.slow)], ids=lambda each: each.name)
 @pytest.mark.parametrize("name", each(of=RIGHT, slow=(ALIKE - {"Radau9, solve_dae"}) | COMPILES))
-def test_a_rival_is_right_and_measured(name, problem):
+def test_another_solver_is_right_and_measured(name, problem):
     result = ADAPTERS[name](*start(problem), tol=1e-6 if name == "heyoka" else 1e-9)
     system, n, end = problem.system, problem.system.n_q, result.q[:, -1].copy()
     assert result.success, result.message

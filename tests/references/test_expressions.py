@@ -54,7 +54,7 @@ def test_elimination_fills_little():
 
 
 @pytest.mark.parametrize(("make", "most"), [(four_bar, 239), (heavy_top, 329)])
-def test_rivals_get_accelerations_of_few_operations(make, most):
+def test_other_solvers_get_accelerations_of_few_operations(make, most):
     problem = make()
     assert len(program_of(Expressions(problem.system, 0.0, problem.q0, problem.v0))[0].names) <= most
 

@@ -11,7 +11,7 @@ from references.scipy import fully_implicit, index1
 from references.scipy.index1 import solve_index1
 from references.sundials.cvode import solve_cvode
 from studies.bench.collector import Case, Run, attempt
-from studies.bench.solvers import CATALOGUE, RIVALS
+from studies.bench.solvers import CATALOGUE, OTHER_SOLVERS
 from studies.validation.study import MAKE
 from tests.problems import pendulum
 from twoloop import mechanisms
@@ -47,7 +47,7 @@ def test_adams_of_cvodes_is_another_method_and_right():
     assert adams.stats.n_accepted < 0.8 * bdf.stats.n_accepted
     name = "CVODES, CasADi, Adams"
     made, status, *_ = attempt(Run(Case("pendulum", PENDULUM, 2.0, n_instants=5), CATALOGUE[name], 1e-9), 0)
-    assert status == "REACHED_END" and made.stats.n_accepted == adams.stats.n_accepted and name in RIVALS
+    assert status == "REACHED_END" and made.stats.n_accepted == adams.stats.n_accepted and name in OTHER_SOLVERS
     with pytest.raises(ValueError, match="method must be 'BDF' or 'Adams'; given 'adams'"):
         solve_cvodes(*start(PENDULUM, 2.0), method="adams")
 
@@ -95,7 +95,7 @@ SLOW = [pytest.param(name, (*QUICK, *OTHERS), marks=pytest.mark.slow) for name i
 
 
 @pytest.mark.parametrize(("name", "solvers"), [("heavy top", QUICK), *SLOW])
-def test_every_rival_is_put_to_mechanisms_with_euler_parameters(name, solvers):
+def test_every_solver_is_put_to_mechanisms_with_euler_parameters(name, solvers):
     problem = next(problem for problem in (make() for make in MAKE) if problem.name == name)
     known = problem.reference
     for solver in solvers:

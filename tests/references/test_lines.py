@@ -5,7 +5,7 @@ import sys
 import references
 from references import lines as lines_module
 from references.lines import Line, lines
-from studies.bench.solvers import CATALOGUE, RIVALS
+from studies.bench.solvers import CATALOGUE, OTHER_SOLVERS
 from tests.processes import run_python
 
 FILE = """
@@ -26,7 +26,7 @@ def test_names_are_those_of_the_catalogue():
     found = lines()
     names = [line.name for line in found]
     assert len(set(names)) == len(names) > 25 and set(names) <= set(CATALOGUE)
-    assert [line.name for line in found if line.rival] == list(RIVALS)
+    assert [line.name for line in found if line.compared] == list(OTHER_SOLVERS)
     for line in found:
         assert CATALOGUE[line.name].keeps_constraints == line.keeps and CATALOGUE[line.name].family == line.family
 

@@ -26,7 +26,7 @@ from studies.bench.cases import load
 from studies.bench.cases.beam import MAKE, SOFT, STIFF
 from studies.bench.cli import StudyError
 from studies.bench.collector import Run, attempt
-from studies.bench.solvers import IDA_C, IDA_C_ORDER_2, NEWMARK, OWN_EXPLICIT, PAPER_TOL, QUARTER, RIVALS
+from studies.bench.solvers import IDA_C, IDA_C_ORDER_2, NEWMARK, OWN_EXPLICIT, PAPER_TOL, QUARTER, OTHER_SOLVERS
 from studies.bench.tables import UNASKED
 from tests.studies.of_study import GOOD, QuickRun, found_of
 from twoloop import solve_dae
@@ -182,7 +182,7 @@ def test_the_study_lists_all_cells_once():
     assert len({run.key(0) for run in made}) == len(made)
     names = {run.solver.name for run in made}
     assert {PAPER, NEWTON, DIFFERENCES, "BDF", OWN_EXPLICIT, IDA_C, IDA_C_ORDER_2, EXUDYN} <= names
-    assert {name for name in RIVALS if not name.startswith("Exudyn")} <= names
+    assert {name for name in OTHER_SOLVERS if not name.startswith("Exudyn")} <= names
     own = next(run for run in made if run.solver.name == PAPER and run.value == PAPER_TOL)
     assert own.settings == {"tol": PAPER_TOL} and own.group == "run"
     assert sum(run.repeats for run in runs(cases(True), True)) < 40

@@ -8,7 +8,7 @@ import pytest
 from studies import __main__ as command
 from studies.bench import index
 from studies.bench.cli import ROOT, StudyError
-from studies.bench.solvers import CATALOGUE, RIVALS
+from studies.bench.solvers import CATALOGUE, OTHER_SOLVERS
 
 
 def test_the_list_names_every_study_with_its_first_line(monkeypatch, capsys):
@@ -313,11 +313,11 @@ def test_a_rival_that_older_rows_lack_is_told(tmp_path):
 
 
 def test_projects_of_rivals_that_a_study_leaves_out_are_told(tmp_path):
-    for name in RIVALS:
+    for name in OTHER_SOLVERS:
         assert [each for each, named in index.PROJECTS.items() if named.search(name)] == [CATALOGUE[name].family]
-    assert set(index.PROJECTS) == {CATALOGUE[name].family for name in RIVALS}
+    assert set(index.PROJECTS) == {CATALOGUE[name].family for name in OTHER_SOLVERS}
     (tmp_path / "motion.csv").write_text('# heyoka\n"solver","message"\n"IDA, stabilised","not CyRK"\n"BDF",""\n')
-    (tmp_path / "conformance.csv").write_text('"simulator"\n' + "".join(f'"{name}"\n' for name in RIVALS))
+    (tmp_path / "conformance.csv").write_text('"simulator"\n' + "".join(f'"{name}"\n' for name in OTHER_SOLVERS))
     others = [project for project in index.PROJECTS if project != "SUNDIALS"]
     assert index.unasked(tmp_path) == {"motion": others}
     text = screen(tmp_path, [case()])

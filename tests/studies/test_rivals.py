@@ -8,7 +8,7 @@ import pytest
 
 from studies.bench import headline, tables
 from studies.bench.render import render
-from studies.bench.solvers import CATALOGUE, OWN, RIVALS
+from studies.bench.solvers import CATALOGUE, OWN, OTHER_SOLVERS
 from studies.bench.store import KeptRows
 from studies.work_precision import rivals
 from studies.work_precision import study as work_precision
@@ -118,7 +118,7 @@ def test_figures_are_drawn_of_rows():
 
 def test_every_solver_has_its_settings_and_every_mechanism_is_there():
     todo = rivals.runs(False)
-    assert {run.solver.name for run in todo} == {*OWN, *RIVALS} <= set(CATALOGUE)
+    assert {run.solver.name for run in todo} == {*OWN, *OTHER_SOLVERS} <= set(CATALOGUE)
     assert len({run.key(0) for run in todo}) == len(todo) and len({run.case.name for run in todo}) >= 23
     heyoka = [run.value for run in todo if run.solver.name == "heyoka" and run.case.name == "four-bar"]
     assert heyoka == list(rivals.BUILT) and all(run.repeats == 5 for run in todo)

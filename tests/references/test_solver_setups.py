@@ -15,7 +15,7 @@ from references.sundials.cvode_c import solve_cvode_c
 from references.sundials.cvode_projection import projection_for_cvode
 from references.sundials.ida_c import solve_ida_c
 from studies.bench.figures import STYLES
-from studies.bench.solvers import CATALOGUE, CVODE_C_PROJECTED, IDA_C_STATES, RIVALS
+from studies.bench.solvers import CATALOGUE, CVODE_C_PROJECTED, IDA_C_STATES, OTHER_SOLVERS
 from twoloop import ConstrainedSystem, callback
 from twoloop.mechanisms import double_pendulum, four_bar, projection_pendulum, spatial_slider_crank
 from twoloop.problem.given import callbacks_in
@@ -174,5 +174,5 @@ def test_the_projection_is_the_shortest_one_and_projects_the_error():
 def test_each_set_up_is_run_beside_the_others_and_drawn_as_itself():
     added = {IDA_C_STATES: True, CVODE_C_PROJECTED: True, "CVODES, CasADi": False}
     assert {name: CATALOGUE[name].keeps_constraints for name in added} == added
-    assert set(added) <= set(RIVALS) and len(set(RIVALS)) == len(RIVALS)
+    assert set(added) <= set(OTHER_SOLVERS) and len(set(OTHER_SOLVERS)) == len(OTHER_SOLVERS)
     assert [list(STYLES.values()).count(STYLES[name]) for name in added] == [1, 1, 1]
