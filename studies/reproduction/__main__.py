@@ -1,0 +1,3 @@
+from studies.reproduction.study import main
+
+main()

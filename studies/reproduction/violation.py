@@ -1,0 +1,150 @@
+"""Fig. 7 of the paper: violation of position, velocity and acceleration constraints over 100 s."""
+
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+
+from references.scipy.index1 import ALPHAS, baumgarte
+from studies.bench import figures, tables
+from studies.bench.cases import four_bar
+from studies.bench.cli import StudyError
+from studies.bench.collector import REPEATS, Run
+from studies.bench.metrics import violations
+from studies.bench.solvers import (
+    CATALOGUE,
+    CVODE_C,
+    CVODE_C_PROJECTED,
+    GIVEN,
+    HEYOKA,
+    IDA_C,
+    IRK,
+    LINE_UP,
+    OWN_EXPLICIT,
+    paper_irk_at,
+)
+from studies.bench.store import Array
+from twoloop import Result
+
+LOOSE, TIGHT = 1e-3, 1e-9  # err_in and err_out of Table 3
+CLOSURE = slice(6, 8)  # places of (35) and (36) among the constraints
+# a violation grows when it goes like t^p with p at least that of a random walk, and ends above TIMES its start
+SLOPE, TIMES = 0.5, 2.0
+KEPT = 1e-12  # m, m/s: a constraint violated no more than this is kept
+WINDOWS = 10  # equal parts of the run, to whose largest violations the growth is fitted
+CURVE = 50  # equal parts of the run, whose largest violations are drawn
+ZERO = 1e-17  # what counts as a violation of zero where a logarithm is taken
+
+PAIRS = (  # kept, not kept
+    ("DOP853, projected", "DOP853, index 1"),
+    (CVODE_C_PROJECTED, "CVODE from C, BDF"),
+    ("IDA, stabilised", "IDA, index1"),
+)
+OWN = (GIVEN, "SunRadau5", "Gauss12", OWN_EXPLICIT)
+ALONG = (*(name for pair in PAIRS for name in pair), "LSODA, index 1", IDA_C, HEYOKA, CVODE_C, *OWN)
+MORE = {CVODE_C_PROJECTED: 1e-8}  # tolerance, in the line-up of this part
+BAUMGARTE = baumgarte("DOP853", 10.0)
+STABILISED = tuple(baumgarte(name, alpha) for name in ("DOP853", "LSODA") for alpha in ALPHAS)
+QUICK_ALONG = (*PAIRS[0], BAUMGARTE, *OWN)
+SHOWN = ("Exudyn, GeneralizedAlpha", "IDA, stabilised", BAUMGARTE, CVODE_C, "DOP853, index 1")
+TARGETS = (1e-2, 1e-4, 1e-6)
+
+
+def runs(quick: bool) -> list[Run]:
+    """List every solver at one setting, PaperIRK with loose loops, and solvers along their tolerances."""
+    case = four_bar.cases(quick)[0]
+    settings = LINE_UP | MORE
+    line_up = [CATALOGUE[name] for name in settings]
+    if quick:
+        line_up = [s for s in line_up if s.family == "two-loop" or s.name.startswith(("Exudyn", "GSTIFF", "DOP853"))]
+    listed = [Run(case, solver, settings[solver.name], "line-up", 1) for solver in line_up]
+    listed += [Run(case, paper_irk_at(LOOSE), err_out, "loops", 1) for err_out in (LOOSE, TIGHT)]
+    for name in QUICK_ALONG if quick else (*ALONG, *STABILISED):
+        values = (1e-5, 1e-7) if quick else CATALOGUE[name].grid(case)
+        listed += [Run(case, CATALOGUE[name], value, "tolerances", 1 if quick else REPEATS) for value in values]
+    return listed
+
+
+def windows(t: Array, size: Array, n: int) -> Array:
+    """Largest value in each of n equal parts of the run; NaN where nothing is stored."""
+    places = np.minimum((t / t[-1] * n).astype(int), n - 1)
+    return np.array([size[places == k].max(initial=ZERO) if (places == k).any() else np.nan for k in range(n)])
+
+
+def growth(t: Array, size: Array) -> float:
+    """Exponent p of size ~ t^p: least squares through the largest values of equal parts of the run."""
+    values = windows(t, size, WINDOWS)
+    ends = np.arange(1, WINDOWS + 1)  # where what grows is largest
+    known = ~np.isnan(values)
+    return float(np.polyfit(np.log10(ends[known]), np.log10(values[known]), 1)[0])
+
+
+def measure(run: Run, result: Result) -> dict[str, Any]:
+    """Columns of this part, and the curves of the figure in the entry "series"."""
+    if result.t.size < WINDOWS or run.group == "tolerances":  # of those the common columns are enough
+        return {}
+    row: dict[str, Any] = {}
+    system = run.case.problem.system
+    t, levels = violations(system, result)
+    for level, size in levels.items():
+        parts = windows(t, size, WINDOWS)
+        row[f"growth_{level}"], row[f"early_{level}"], row[f"late_{level}"] = growth(t, size), parts[0], parts[-1]
+    stored = np.searchsorted(result.t, t)
+    closure = np.array([system.constraint(result.t[k], result.q[:, k].copy())[CLOSURE] for k in stored])
+    row["violation_35"], row["violation_36"] = np.abs(closure).max(axis=0)
+    return row | {"series": {level: windows(t, levels[level], CURVE) for level in "qv"}}
+
+
+def grows(row: pd.Series, level: str) -> bool:
+    """Whether the violation of a level grows, by the criterion of the report."""
+    return bool(row[f"growth_{level}"] >= SLOPE and row[f"late_{level}"] > TIMES * row[f"early_{level}"])
+
+
+def time_ratios(rows: pd.DataFrame, kept: str, drifting: str) -> list[float]:
+    """CPU times of the first solver over those of the second at the errors that both reach."""
+    first, second = (rows[rows["solver"] == name] for name in (kept, drifting))
+    # where all runs of a solver are better than a target, its cost at the target is not known
+    targets = [target for target in TARGETS if target <= min(first["error_q"].max(), second["error_q"].max())]
+    ratios = [tables.time_for(first, target) / tables.time_for(second, target) for target in targets]
+    return [float(ratio) for ratio in ratios if not np.isnan(ratio)]
+
+
+def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
+    line_up, loops, along = (rows[rows["group"] == group] for group in ("line-up", "loops", "tolerances"))
+    line_up = line_up[line_up["growth_q"].notna()].set_index("solver")
+    loose = loops.set_index("err_out")["violation_q"]
+    if IRK not in line_up.index or not {LOOSE, TIGHT} <= set(loose.index):
+        raise StudyError("the rows lack runs of PaperIRK; run python -m studies.reproduction violation")
+    irk, ours = line_up.loc[IRK], line_up[line_up["family"] == "two-loop"]
+    every = pd.concat([ours, along[(along["family"] == "two-loop") & along["error_q"].notna()]])
+    of_alpha = along[along["solver"].str.contains("Baumgarte") & along["error_q"].notna()]["violation_q"]
+    found: dict[str, Any] = {"t_end": float(rows["t_end"].iloc[0]), "kept": KEPT}
+    found |= {"irk": [float(irk["violation_35"]), float(irk["violation_36"])], "irk_grows": grows(irk, "q")}
+    found |= {"n_ours": len(ours), "ours_q": float(every["violation_q"].max())}
+    found |= {"ours_v": float(every["violation_v"].max()), "both_loose": float(loose[LOOSE])}
+    found["ours_grow"] = [name for name, row in ours.iterrows() if grows(row, "q")]
+    found |= {"baumgarte": [of_alpha.min(), of_alpha.max()] if len(of_alpha) else None}
+    ratios = [ratio for pair in PAIRS for ratio in time_ratios(along, *pair)]
+    found["cost"] = [min(ratios), max(ratios)] if ratios else None
+    told = [(name, line_up.loc[name]) for name in SHOWN if name in line_up.index]
+    columns = ["violation_q", "violation_v"]
+    return found | {"runs": [{"solver": name, **row[columns], "grows": grows(row, "q")} for name, row in told]}
+
+
+def figure_of(rows: pd.DataFrame, found: dict[str, Any]) -> Figure:
+    """Largest violation of the positions in each fiftieth of the run."""
+    line_up = rows[(rows["group"] == "line-up") & rows["series"].map(lambda curves: "q" in curves)]
+    t = (np.arange(CURVE) + 0.5) * found["t_end"] / CURVE
+    figure, panel = plt.subplots(figsize=(7.6, 3.8), layout="constrained")
+    ours = np.stack(line_up[line_up["family"] == "two-loop"]["series"].map(lambda curves: curves["q"]).tolist())
+    low, high = np.nanmin(ours, axis=0), np.nanmax(ours, axis=0)
+    panel.fill_between(t, low, high, color=figures.VIOLET, alpha=0.3, lw=0, label="all methods of twoloop")
+    for _, row in line_up[line_up["solver"].isin(SHOWN)].iterrows():
+        panel.plot(t, row["series"]["q"], **figures.look(row, coded=True) | {"marker": ""})
+    panel.set(xlabel="t (s)", yscale="log", ylabel="largest violation |C| (m)")
+    kept = "keep the constraints to rounding" if found["ours_q"] <= KEPT else "violate the constraints"
+    figures.message(figure, f"All methods of twoloop {kept}; solvers that do not project drift")
+    figures.label_lines(panel)
+    return figure
