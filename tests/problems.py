@@ -1,14 +1,16 @@
 """Small problems with references that share nothing with the integrator."""
 
+from dataclasses import fields
 from functools import cache
 
 import numpy as np
+import pytest
 from numba import njit
 from scipy.integrate import solve_ivp
 from scipy.special import ellipj
 
 from tests.compiled import PENDULUM
-from twoloop import ConstrainedSystem, solve_dae
+from twoloop import ConstrainedSystem, Result, solve_dae
 from twoloop.kernels.compile.caches import compile_kept, kept_when_called
 from twoloop.kernels.compile.linking import KernelCompiler
 from twoloop.kernels.data.common import OPTIONS, stamp
@@ -30,6 +32,12 @@ def some_of(one, other, each=3):
     """Pairs in which each of `one` is with a few of `other`, evenly spread, and each of these with a few of those."""
     n = len(other)
     return [(a, other[(i + k * n // each) % n]) for i, a in enumerate(one) for k in range(each)]
+
+
+def quick(cases, n=1):
+    """The first n cases are in every run of the tests, the others are slow ones."""
+    rest = [each if isinstance(each, tuple) else (each,) for each in list(cases)[n:]]
+    return [*list(cases)[:n], *(pytest.param(*each, marks=pytest.mark.slow) for each in rest)]
 
 
 def without_tangent(problem):
@@ -357,6 +365,22 @@ def force_residual(system, result):
         residual = system.mass(t, q) @ a + system.rows(t, q).T @ lam - system.force(t, q, v)
         largest = max(largest, np.abs(residual).max())
     return float(largest)
+
+
+def assert_same(one, other):
+    """All that two results hold is equal to the bit, but for the CPU time and the system."""
+    for name in [each.name for each in fields(Result) if each.name not in ("stats", "system", "sol")]:
+        a, b = getattr(one, name), getattr(other, name)
+        assert np.array_equal(a, b) if isinstance(a, np.ndarray) else a == b, name
+        assert type(a) is type(b), name
+    counted = [{k: v for k, v in vars(each.stats).items() if k != "cpu_time"} for each in (one, other)]
+    assert counted[0] == counted[1] and one.stats.cpu_time > 0.0
+    assert vars(one).keys() == vars(other).keys() and (one.sol is None) == (other.sol is None)
+    if one.sol is not None:
+        times = np.random.default_rng(2).uniform(one.sol.t_min, one.sol.t_max, 9)
+        assert (one.sol.t_min, one.sol.t_max) == (other.sol.t_min, other.sol.t_max)
+        for kind in ("q", "v", "a", "lam"):
+            assert np.array_equal(getattr(one.sol(times), kind), getattr(other.sol(times), kind)), kind
 
 
 def event(function, terminal=None, direction=None):
