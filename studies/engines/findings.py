@@ -1,152 +1,169 @@
-"""What the rows of the engines say: what to set, what it costs, where errors end, and who is wrong without a word."""
+"""Which engines are run with which settings, and what their rows say: cost at equal error, orders, silent errors."""
 
-from collections import Counter
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 
+from references.engines.engine import engines
 from studies.bench import tables
-from studies.bench.changed_loops import DRIVEN, RATIOS, SERVO
-from studies.bench.closed_loops import SPATIAL
+from studies.bench.changed_loops import RATIOS, SERVO
 from studies.bench.end_states import EXACT
 from studies.bench.engine_runs import LIMIT
-from studies.engines.configurations import AS_IT_COMES, CONFIGURATIONS, NAMES, OURS, Configuration
+from studies.bench.render import number, power
 from twoloop.audit.step_audit import LOST, order_and_floor
 
 GATE, RUN, MASS, TURN, MOTOR, ENERGY = "gate", "run", "mass", "turn", "motor", "energy"  # groups of rows
 ERRORS = (1e-2, 1e-3, 1e-4, 1e-6)
-SET_FOR = ERRORS[:3]  # for which a step is named
-SPEEDS = (1, 100)  # times real time
-PROBED = 5000  # steps, of the table of motors, masses, frames and forces
-PROBES = {  # what is asked: mechanisms by the end of their names, groups, and measures, of which the median counts
-    "as made; a body 1e2, 1e4 times lighter": (("", RUN, "error_q"), *((name, MASS, "error_q") for name in RATIOS)),
-    "driven; with a PD motor": ((DRIVEN, MOTOR, "error_q"), (SERVO, MOTOR, "error_q")),
-    "in space; turned": (("in space", RUN, "error_q"), ("", TURN, "error_q")),
-    "force in a joint": (("", RUN, "error_f"),),
-    "energy, 100 s": (("", ENERGY, "energy"),),
+PROBED = 5000  # steps of the runs with motors, other masses and turned frames
+TIGHT = 1e-8  # tolerance of twoloop in these
+OURS = "twoloop"  # which is compared with the engines
+PROBES = {  # label: group of rows, end of the names of the mechanisms, measure
+    "positions": (RUN, "", "error_q"),
+    "positions, a light body": (MASS, max(RATIOS, key=RATIOS.__getitem__), "error_q"),
+    "positions, with a PD motor": (MOTOR, SERVO, "error_q"),
+    "positions, turned in space": (TURN, "", "error_q"),
+    "force in a joint": (RUN, "", "error_f"),
+    "energy over 100 s": (ENERGY, "", "energy"),
 }
-OWN = tuple(each.name for each in CONFIGURATIONS if each.engine == OURS)
-IN_SPACE = tuple(build().name for build in SPATIAL)
+
+
+class Configuration(NamedTuple):
+    """An engine with settings; those of twoloop are `compiled` of solve_dae."""
+
+    engine: str
+    name: str
+    settings: Any
+    everywhere: bool
+
+
+NAMES = {**{key: engine.name for key, engine in engines().items()}, OURS: OURS}
+CONFIGURATIONS = (
+    *(
+        Configuration(key, f"{engine.name}, {each.label}", each.settings, each.everywhere)
+        for key, engine in engines().items()
+        for each in engine.configured
+    ),
+    Configuration(OURS, f"{OURS}, default", "auto", True),
+    Configuration(OURS, f"{OURS}, compiled=True", True, False),
+)
+HOW = {f"{engine.name}, {each.label}": each.how for engine in engines().values() for each in engine.configured}
+DEFAULT = f"{OURS}, default"
 
 
 def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
-    """Versions, gates, what each configuration is off by, and what an accuracy costs."""
+    """Compare the default with the fastest engine at each error; then times, orders and silent errors of each."""
     runs, gates = rows[rows["group"] == RUN], rows[rows["group"] == GATE]
-    cases = list(dict.fromkeys(runs["case"]))
-    found: dict[str, Any] = {"cases": cases, "errors": list(ERRORS), "lost": LOST, "limit": LIMIT}
+    found: dict[str, Any] = {
+        "cases": list(dict.fromkeys(runs["case"])),
+        "errors": list(ERRORS),
+        "exact": EXACT,
+        "limit": LIMIT,
+    }
+    found |= {"lost": LOST, "tight": TIGHT, "probed": PROBED, "apart": float(runs["floor"].astype(float).max())}
     found["absent"] = sorted(set(gates[gates["status"] == "NOT_AVAILABLE"]["family"]))
     found["versions"] = rows.dropna(subset="version").groupby("family")["version"].first().astype(str).to_dict()
     found["gates"] = gates[gates["status"] != "PASSED"][["case", "solver", "message"]].to_dict("records")
     found["n_gates"] = int((gates["status"] == "PASSED").sum())
-    found["apart"] = float(runs["floor"].astype(float).max())
-    found["configurations"] = [_configuration(each, runs[runs["solver"] == each.name]) for each in CONFIGURATIONS]
-    cheapest = [_cheapest(runs[runs["case"] == case]) for case in cases]
-    cheapest_of = [line["engines"] for line in cheapest]
-    found["call_over_engines"] = {
-        name: {case: line["ratios"].get(name) for case, line in zip(cases, cheapest, strict=True)} for name in OWN
+    found["against"] = {power(error): _against(runs, error) for error in ERRORS}
+    best: dict[str, str] = {}
+    for engine, name in NAMES.items():
+        if solver := DEFAULT if engine == OURS else _best(runs[runs["family"] == name]):
+            best[name] = solver
+    found["best"] = best
+    found["settings"] = {solver: HOW.get(solver, "nothing") for solver in best.values() if solver != DEFAULT}
+    found["times"] = {name: _times(runs[runs["solver"] == solver]) for name, solver in best.items()}
+    shown = [each.name for each in CONFIGURATIONS if each.name in best.values() or each.name.endswith("default")]
+    found["configurations"] = [_configuration(name, runs[runs["solver"] == name]) for name in shown]
+    found["probes"] = {
+        label: {name: _probe(rows[rows["solver"] == solver], *probe) for name, solver in best.items()}
+        for label, probe in PROBES.items()
     }
-    wins = [Counter(sorted(each.split(", ")[0] for each in names if each)) for names in zip(*cheapest_of, strict=True)]
-    found["wins_engines"] = [dict(each.most_common()) for each in wins]
-    others = [runs[runs["family"] == name] for engine, name in NAMES.items() if engine != OURS]
-    lines = [_engine(each, cases) for each in (*others, *(runs[runs["solver"] == name] for name in OWN))]
-    found["engines"] = [line for line in lines if line is not None]
-    found["set_for"], found["speeds"], found["own"] = list(SET_FOR), list(SPEEDS), list(OWN)
-    found["probed"] = [AS_IT_COMES, *(line["solver"] for line in found["engines"] if line["solver"] not in OWN[1:])]
-    found["probes"] = [
-        {"label": label, "cells": [[_probe(rows, solver, *each) for each in asked] for solver in found["probed"]]}
-        for label, asked in PROBES.items()
-    ]
-    found["exact"] = EXACT
-    return found
+    return found | {"answer": _answer(found)}
 
 
-def _configuration(each: Configuration, runs: pd.DataFrame) -> dict[str, Any]:
-    ended = runs[runs["error_q"].notna()]
-    orders, floors, lost = [], [], 0
-    for _, own in ended.groupby("case", sort=False):
-        lost += bool((own["error_q"].astype(float) > LOST).all())
-        if own["h"].notna().all():
-            order, floor = order_and_floor(own["h"], own["error_q"], float(own["floor"].max()))
-            orders += [order] if order is not None else []
-            floors += [floor] if floor is not None else []
-    found: dict[str, Any] = {"name": each.name, "how": each.how, "runs": len(ended)}
-    found |= {"silent": int((ended["error_q"].astype(float) > EXACT).sum())}
-    found |= {"gross": int((ended["error_q"].astype(float) > LOST).sum())}
-    found |= {"failed": int((runs["status"] == "FAILED").sum())}
-    found |= {"order": [min(orders), float(np.median(orders)), max(orders)] if orders else None}
-    found |= {"floor": [min(floors), max(floors)] if floors else None, "n_floors": len(floors), "lost": lost}
-    return found | {"gap": float(ended["gap"].astype(float).median()) if len(ended) else None}
+def _answer(found: dict[str, Any]) -> str:
+    compared = {error: line for error, line in found["against"].items() if line["compared"]}
+    if not compared:
+        return "No engine and twoloop reach the same error."
+    (loose, first), *_, (tight, last) = [*compared.items()] * 2
+    return (
+        f"For an error of {loose} twoloop is faster than every engine on {first['ahead']} of {first['compared']} "
+        f"mechanisms (median {number(first['ratio'])} times), for {tight} on {last['ahead']} of {last['compared']} "
+        f"({number(last['ratio'])} times)."
+    )
 
 
-def _priced(runs: pd.DataFrame, error: float, what: str = "call_s") -> float | None:
-    """What a configuration takes on a mechanism for an error: that of its cheapest run that is as good."""
-    cost = tables.as_good(runs, error, what) if runs["error_q"].notna().any() else np.nan
+def _cost(runs: pd.DataFrame, error: float, what: str = "call_s") -> float | None:
+    """Return the cost of the cheapest run on a mechanism whose error is at most this; None if there is none."""
+    cost = tables.as_good(runs, error, what) if len(runs) else np.nan
     return cost if cost == cost else None
 
 
-def _cheapest(runs: pd.DataFrame) -> dict[str, Any]:
-    """At each error the cheapest configuration of the engines on a mechanism.
+def _against(runs: pd.DataFrame, error: float) -> dict[str, Any]:
+    """Compare the default with the fastest configuration of any engine on each mechanism.
 
-    `ratios`: our calls at the first error over theirs, where both reach it.
+    `ratio`: the median of the engine's time over the default's. `slower`: where it is below 1, with the engine.
+    `compared`: mechanisms on which an engine and the default reach the error. `fastest`: wins among engines.
     """
-    line: dict[str, Any] = {"engines": [], "ratios": {}}
-    for error in ERRORS:
-        costs = {str(solver): cost for solver, own in runs.groupby("solver") if (cost := _priced(own, error))}
-        ours = {name: costs.pop(name) for name in OWN if name in costs}
-        line["engines"].append(min(costs, key=costs.__getitem__, default=None))
-        if error == ERRORS[0] and costs:
-            line["ratios"] = {name: cost / min(costs.values()) for name, cost in ours.items()}
-    return line
+    ratios, fastest = {}, []
+    for case, own in runs.groupby("case", sort=False):
+        costs = {str(name): cost for name, each in own.groupby("solver") if (cost := _cost(each, error))}
+        default = costs.get(DEFAULT)
+        others = {name: cost for name, cost in costs.items() if not name.startswith(OURS)}
+        if others:
+            name = min(others, key=others.__getitem__)
+            fastest.append(name.split(", ")[0])
+            if default:
+                ratios[str(case)] = others[name] / default, fastest[-1]
+    values = [ratio for ratio, _ in ratios.values()]
+    found: dict[str, Any] = {"compared": len(ratios), "ahead": sum(ratio > 1.0 for ratio in values)}
+    found |= {"ratio": float(np.median(values)) if values else None}
+    found["slower"] = {case: {"engine": name, "ratio": ratio} for case, (ratio, name) in ratios.items() if ratio <= 1.0}
+    return found | {"fastest": {name: fastest.count(name) for name in sorted(set(fastest))}}
 
 
-def _engine(runs: pd.DataFrame, cases: list[str]) -> dict[str, Any] | None:
-    """The configuration of an engine that reaches most errors on most mechanisms, then the fastest; None: none ran."""
-    ranked: list[tuple[int, float, str]] = []
+def _best(runs: pd.DataFrame) -> str | None:
+    """Return the configuration that reaches most errors on most mechanisms, then the fastest; None: none does."""
+    ranked = []
     for solver, own in runs.groupby("solver", sort=False):
-        costs = [cost for _, each in own.groupby("case") for error in ERRORS if (cost := _priced(each, error))]
+        costs = [cost for _, each in own.groupby("case") for error in ERRORS if (cost := _cost(each, error))]
         ranked += [(-len(costs), float(np.median(costs)), str(solver))] if costs else []
-    if not ranked:
-        return None
-    solver = min(ranked)[2]
-    by_case = {str(case): own for case, own in runs[runs["solver"] == solver].groupby("case")}
-    name = solver if solver in OWN else solver.split(", ")[0]
-    line: dict[str, Any] = {"name": name, "solver": solver, "at": [], "speeds": []}
-    line["how"] = next(each.how for each in CONFIGURATIONS if each.name == solver)
-    line["steps"] = {
-        case: [_step_for(by_case[case], error) if case in by_case else None for error in SET_FOR] for case in cases
-    }
+    return min(ranked)[2] if ranked else None
+
+
+def _times(runs: pd.DataFrame) -> dict[str, dict[str, Any]]:
+    """Return the median time of a call at each error over the mechanisms on which it is reached, and their number."""
+    found = {}
     for error in ERRORS:
-        reached = [own for own in by_case.values() if _priced(own, error)]
-        line["at"].append({"reached": len(reached)})
-        for what in ("call_s", "stepping_s") if reached else ():
-            line["at"][-1][what] = float(np.median([_priced(own, error, what) or np.nan for own in reached]))
-    for speed in SPEEDS:  # of the calls so many times faster than real time the least error; infinite: none
-        runs_ = [own.astype({"call_s": float, "span": float, "error_q": float}) for own in by_case.values()]
-        least = [own["error_q"][own["call_s"] <= own["span"] / speed].min() for own in runs_]
-        middle = float(np.median(np.nan_to_num(least, nan=np.inf)))
-        line["speeds"].append(middle if np.isfinite(middle) else None)
-    return line
+        costs = [cost for _, own in runs.groupby("case") if (cost := _cost(own, error))]
+        found[power(error)] = {"call_s": float(np.median(costs)) if costs else None, "reached": len(costs)}
+    return found
 
 
-def _probe(rows: pd.DataFrame, solver: str, of: str, group: str, measure: str) -> float | None:
-    """What a configuration is off by in the median, with `PROBED` steps, ours with a tolerance of 1e-8.
+def _configuration(name: str, runs: pd.DataFrame) -> dict[str, Any]:
+    """Return the median order of convergence, the largest error floor, and how many runs are silently wrong."""
+    ended = runs[runs["error_q"].notna()]
+    orders, floors = [], []
+    for _, own in ended[ended["h"].notna()].groupby("case", sort=False):
+        order, floor = order_and_floor(own["h"], own["error_q"], float(own["floor"].max()))
+        orders += [order] if order is not None else []
+        floors += [floor] if floor is not None else []
+    found: dict[str, Any] = {"name": name, "runs": len(ended), "failed": int((runs["status"] == "FAILED").sum())}
+    found |= {"order": float(np.median(orders)) if orders else None, "floor": max(floors, default=None)}
+    found["wrong"] = int((ended["error_q"].astype(float) > EXACT).sum())
+    return found | {"lost": int((ended["error_q"].astype(float) > LOST).sum())}
 
-    A run that ends early is off by any amount. None: not run, or off by any amount in the median.
+
+def _probe(rows: pd.DataFrame, group: str, ending: str, measure: str) -> float | None:
+    """Return the median error with `PROBED` steps, or with tolerance `TIGHT`; a failed run counts as infinite.
+
+    None: not run, or infinite.
     """
-    own = rows[(rows["group"] == group) & (rows["solver"] == solver) & rows["status"].isin(("REACHED_END", "FAILED"))]
-    own = own[own["case"].isin(IN_SPACE) if of == "in space" else own["case"].str.endswith(of)]
-    own = own[(own["n_steps"] == PROBED) | (own["tol"] == 1e-8) | (group == ENERGY)]
+    own = rows[(rows["group"] == group) & rows["case"].str.endswith(ending)]
+    own = own[own["status"].isin(("REACHED_END", "FAILED"))]
+    own = own[(own["n_steps"] == PROBED) | (own["tol"] == TIGHT) | (group == ENERGY)]
     if own.empty or measure not in own:
         return None
-    ended = own["status"] == "REACHED_END"
-    value = float(own[measure].astype(float).where(ended, np.inf).median())
+    value = float(own[measure].astype(float).where(own["status"] == "REACHED_END", np.inf).median())
     return value if np.isfinite(value) else None
-
-
-def _step_for(runs: pd.DataFrame, error: float) -> float | None:
-    """The longest step, or loosest tolerance, of which neither it nor any shorter one is off by more."""
-    known = runs[runs["error_q"].notna()].assign(value=lambda each: each["h"].fillna(each["tol"]))
-    wrong = known[known["error_q"].astype(float) > error]["value"].min()
-    good = known[~(known["value"] >= wrong)]["value"] if wrong == wrong else known["value"]
-    return float(good.max()) if len(good) else None

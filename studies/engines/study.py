@@ -18,23 +18,35 @@ from studies.bench.changed_loops import IN_A_FRAME, LIGHTENED, MOTORISED
 from studies.bench.cli import version_of
 from studies.bench.closed_loops import MECHANISMS, four_bar, rssr
 from studies.bench.engine_runs import INSTANTS, LIMIT, Loop, errors, gate, timed
-from studies.bench.headline import OWN_CODE
-from studies.bench.names import label
+from studies.bench.render import number
 from studies.bench.solvers import GIVEN
 from studies.bench.store import Output, Row
 from studies.bench.study import Study
-from studies.engines.configurations import CONFIGURATIONS, NAMES, OURS, Configuration
-from studies.engines.findings import ENERGY, GATE, MASS, MOTOR, PROBED, RUN, TURN, findings_of
+from studies.engines.findings import (
+    CONFIGURATIONS,
+    ENERGY,
+    GATE,
+    MASS,
+    MOTOR,
+    NAMES,
+    OURS,
+    PROBED,
+    RUN,
+    TIGHT,
+    TURN,
+    Configuration,
+    findings_of,
+)
 from twoloop.audit.step_audit import LOST
 
 N_STEPS = (100, 200, 500, 1500, 5000, 15_000, 50_000, 150_000)  # multiples of INSTANTS
 TOLERANCES = (1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10, 1e-11)
 # steps, or tolerances
-FEWER: dict[str, Any] = {RUN: (N_STEPS, TOLERANCES), **dict.fromkeys((MASS, MOTOR, TURN), ((PROBED,), (1e-8,)))}
+FEWER: dict[str, Any] = {RUN: (N_STEPS, TOLERANCES), **dict.fromkeys((MASS, MOTOR, TURN), ((PROBED,), (TIGHT,)))}
 CHANGED = {MASS: LIGHTENED, TURN: IN_A_FRAME, MOTOR: MOTORISED}
 SHORT = 0.1  # s: motions that last no longer are too fast for the steps of the long ones
 LONG, LONG_STEPS, LONG_INSTANTS, LONG_LIMIT = 100.0, 50_000, 200, 20.0  # s; how it is run; s of CPU
-SHOWN = ("four-bar", "Watt's six-bar", "Andrews' squeezer", "RSSR", "Bricard", "Stewart platform")  # in the figure
+SHOWN, AS_IT_COMES = ("four-bar", "RSSR", "Stewart platform"), "MuJoCo, default"  # in the figure
 ASKED_MORE = [each for each in CONFIGURATIONS if each.everywhere]
 STOPPED = ("NOT_AVAILABLE", "NOT_APPLICABLE", "GATE_FAILED")
 
@@ -157,8 +169,8 @@ def energy_row(build: Callable[[], Any], each: Configuration) -> Row:
     row = _row(ENERGY, build, solver=each.name, family=NAMES[each.engine], status="REACHED_END")
     if each.engine == OURS:
         longer = Loop(replace(loop.problem, t_span=(0.0, LONG)))
-        made = longer.ours(1e-8, times=np.linspace(0.0, LONG, LONG_INSTANTS + 1))
-        row |= {"tol": 1e-8, "call_s": made.stats.cpu_time}
+        made = longer.ours(TIGHT, times=np.linspace(0.0, LONG, LONG_INSTANTS + 1))
+        row |= {"tol": TIGHT, "call_s": made.stats.cpu_time}
         t, q, v, message = made.t, made.q, made.v, "" if made.success else made.message
     else:
         row |= {"h": LONG / LONG_STEPS, "n_steps": LONG_STEPS}
@@ -178,40 +190,43 @@ def energy_row(build: Callable[[], Any], each: Configuration) -> Row:
     return row | {"energy": float(np.abs(energies - energies[0]).max() / loop.kinetic)}
 
 
-# colours that no solver of other figures has; Exudyn has its own, and ours what they have there
-COLORS = {"Drake": "#00838F", "MuJoCo": "#283593", "Pinocchio": "#EF6C00", "Exudyn": figures.TAN}
-OURS_LIKE = (GIVEN, OWN_CODE)  # of the configurations of ours, in their order
+# one configuration a line, those that come closest, and MuJoCo as it comes
+COLORS = {"Drake": figures.TEAL, "MuJoCo": figures.NAVY, "Pinocchio": figures.ORANGE, "Exudyn": figures.TAN}
 
 
 def figures_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Figure]:
-    """Time of the call over the error, a panel a mechanism."""
+    """Draw the time of the call over the error, a panel a mechanism."""
     runs = rows[(rows["group"] == RUN) & rows["error_q"].notna()]
-    shown = [case for case in SHOWN if case in set(runs["case"])] or found["cases"]
-    columns = min(3, len(shown))
-    lines = -(-len(shown) // columns)
-    size = 3.3 * columns + 1.0, 2.9 * lines + 1.2
-    figure, panels = plt.subplots(lines, columns, sharey=True, figsize=size, layout="constrained", squeeze=False)
-    for panel, case in zip(panels.flat, shown, strict=False):
-        own, markers = runs[runs["case"] == case], dict.fromkeys(NAMES.values(), 0)
-        for each in CONFIGURATIONS:
-            line = own[own["solver"] == each.name].assign(value=lambda row: row["h"].fillna(row["tol"]))
-            family = NAMES[each.engine]
-            look: dict[str, Any] = {"color": COLORS.get(family), "marker": "osD^v"[markers[family]], "linestyle": "--"}
-            look = figures.style(OURS_LIKE[markers[family]]) if each.engine == OURS else look
-            markers[family] += 1
-            if len(line):
-                line = line.sort_values("value")
-                panel.plot(
-                    line["error_q"].astype(float), 1e3 * line["call_s"], label=label(each.name), markersize=3.5, **look
-                )
+    shown = [case for case in SHOWN if case in found["cases"]] or found["cases"][:1]
+    lines = {solver: name for name, solver in found["best"].items()} | {AS_IT_COMES: AS_IT_COMES}
+    figure, panels = plt.subplots(1, len(shown), sharey=True, figsize=(9.6, 3.6), layout="constrained", squeeze=False)
+    for panel, case in zip(panels[0], shown, strict=True):
+        for solver, name in lines.items():
+            line = runs[(runs["case"] == case) & (runs["solver"] == solver)]
+            line = line.assign(value=line["h"].fillna(line["tol"])).sort_values("value")
+            engine = name.split(", ")[0]
+            look = {"color": COLORS.get(engine), "marker": "x" if name == AS_IT_COMES else "o", "label": name}
+            if engine == OURS:
+                look = figures.style(figures.DEFAULT) | {"label": f"{OURS}, {GIVEN}"}
+            panel.plot(line["error_q"].astype(float), 1e3 * line["call_s"].astype(float), **look)
         panel.axvspan(LOST, 10.0, color=figures.GREY, alpha=0.15, lw=0)
-        panel.set(xscale="log", yscale="log", title=case, xlim=(1e-11, 10.0))
-    for panel in panels[-1]:
-        panel.set_xlabel("error of positions (m, or of the axes)")
-    for panel in panels[:, 0]:
-        panel.set_ylabel("CPU time of the call (ms)")
-    figures.legend(figure, panels.flat, below=3)
+        panel.text(1.0, 1.0, "wrong\nmotion", transform=panel.transAxes, ha="right", va="top", fontsize=8)
+        panel.set(xscale="log", yscale="log", title=case, xlim=(1e-12, 10.0))
+    panels[0, len(shown) // 2].set_xlabel("largest error of positions (m, or of the axes of bodies)")
+    panels[0, 0].set_ylabel("CPU time of the call (ms)")
+    figures.message(figure, _message(found))
+    figures.label_lines(panels[0])
     return {"engines": figure}
+
+
+def _message(found: dict[str, Any]) -> str:
+    reached = {error: line for error, line in found["against"].items() if line["compared"]}
+    if not reached:
+        return "No engine and twoloop reach the same error"
+    (loose, first), *_, (tight, last) = [*reached.items()] * 2
+    text = f"For an error of {tight} the fastest engine takes {number(last['ratio'])} times as long as twoloop (median)"
+    n = len(first["slower"])
+    return text + (f"; for {loose} an engine is faster on {n} of {first['compared']} mechanisms" if n else "")
 
 
 STUDY = Study("engines", __doc__, make, findings_of, figures_of)
