@@ -4,11 +4,14 @@ import sys
 from pathlib import Path
 
 HERE = Path(__file__).resolve().parent
-sys.path[:0] = [str(HERE.parent), str(HERE)]  # the packages, and the generators beside this file
+sys.path[:0] = [str(HERE.parent), str(HERE)]  # the packages, and the modules beside this file
 
-import generate  # noqa: E402
+import for_sphinx  # noqa: E402
+import gallery  # noqa: E402
 
 import twoloop  # noqa: E402
+
+GENERATED = HERE / "generated"
 
 project = "twoloop"
 author = "The twoloop contributors"
@@ -17,11 +20,11 @@ version = release = twoloop.__version__
 
 # Sphinx links the word for a type in a docstring to attributes of that name, of which classes may share one
 suppress_warnings = ["ref.python"]
-extensions = ["myst_parser", "sphinx_design", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.mathjax"]
-exclude_patterns = ["_build", "generated/extra", "generated/takes.md"]  # the last is included by the front page
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.mathjax"]
+exclude_patterns = ["_build", "generated/extra"]
 html_extra_path = ["generated/extra"]  # the animations, copied as they are
 default_role = "py:obj"  # a name in single backticks, as numpydoc has them, is a link where there is such an object
-myst_enable_extensions = ["colon_fence", "dollarmath"]
+myst_enable_extensions = ["dollarmath"]
 myst_heading_anchors = 3  # as on GitHub: a link to page.md#heading works in both
 napoleon_google_docstring = False
 napoleon_use_ivar = True
@@ -37,6 +40,17 @@ html_show_sourcelink = False
 html_copy_source = False
 
 
+def prepare(app, config):
+    """Copy linked files and write the animations before Sphinx looks for files."""
+    for_sphinx.copy_linked_files(GENERATED)
+    gallery.animate(GENERATED / "extra" / "animations")
+
+
+def read(app, name, source):
+    """Change a page from plain Markdown to what Sphinx needs."""
+    source[0] = for_sphinx.page_for_sphinx(name, source[0], GENERATED)
+
+
 def escape_bars(app, what, name, obj, options, lines):
     """Let |x| in a docstring be the magnitude that it means, not a substitution of reStructuredText."""
     for k, line in enumerate(lines):
@@ -46,6 +60,7 @@ def escape_bars(app, what, name, obj, options, lines):
 
 
 def setup(app):
-    """Write the generated pages before Sphinx looks for files."""
-    app.connect("config-inited", lambda app, config: generate.write(HERE / "generated"))
+    """Connect the functions above to Sphinx."""
+    app.connect("config-inited", prepare)
+    app.connect("source-read", read)
     app.connect("autodoc-process-docstring", escape_bars)

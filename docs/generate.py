@@ -1,42 +1,27 @@
-"""What is made anew with every build, in docs/generated: reports, methods, gallery, joints, the front page."""
+"""Write the committed pages of docs/reference that follow from the code: python docs/generate.py.
 
-import contextlib
-import io
-import shutil
+The tests compare the pages with what this would write. Pictures are drawn again with --pictures.
+"""
+
+import sys
 from pathlib import Path
 
+import command_line
 import gallery
 import joints
-import rooms
 
-from studies.which_method import page, table
-
-ROOT = Path(__file__).resolve().parents[1]
-SHOWN = (".md", ".png", ".svg", ".csv", ".json", ".html")  # files of a report that its pages show or link
+REFERENCE = Path(__file__).resolve().parent / "reference"
+PAGES = {"gallery": gallery, "joints": joints, "command_line": command_line}
 
 
-def write(folder: Path) -> None:
-    """Write all generated pages into a folder, which is emptied first."""
-    shutil.rmtree(folder, ignore_errors=True)
-    reports = folder / "reports"
-    reports.mkdir(parents=True)
-    for file in (ROOT / "reports").iterdir():
-        if file.suffix in SHOWN:
-            shutil.copy(file, reports)
-    shutil.copytree(ROOT / "reports" / "engines", reports / "engines")  # scripts that a report links
-    for report in reports.glob("*.md"):  # from docs/generated/reports the pages are two folders up
-        report.write_text(report.read_text(encoding="utf-8").replace("](../docs/", "](../../"), encoding="utf-8")
-    (folder / "which_method.md").write_text(page(ROOT / "reports"), encoding="utf-8")
-    (folder / "takes.md").write_text(table(ROOT / "reports"), encoding="utf-8")
-    rooms.draw(folder / "rooms.svg")
-    joints.write(folder / "joints.md")
-    run_the_front_page(folder / "extra" / "front")
-    gallery.write(folder / "gallery.md", folder / "extra" / "animations")
+def main() -> None:
+    """Write all pages, and the pictures if the command line asks for them."""
+    for name, module in PAGES.items():
+        (REFERENCE / f"{name}.md").write_text(module.text(), encoding="utf-8")
+    if "--pictures" in sys.argv:
+        gallery.draw(REFERENCE)
+        joints.draw(REFERENCE)
 
 
-def run_the_front_page(folder: Path) -> None:
-    """Run the code that the front page shows, so that its plot and its animation are what that code writes."""
-    folder.mkdir(parents=True)
-    code = (ROOT / "docs" / "index.md").read_text(encoding="utf-8").split("```python\n")[1].split("```")[0]
-    with contextlib.chdir(folder), contextlib.redirect_stdout(io.StringIO()):
-        exec(code, {})
+if __name__ == "__main__":
+    main()

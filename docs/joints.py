@@ -1,7 +1,7 @@
-"""The page of joints: what each is called with, what it leaves free, and a picture, drawn by moving its bodies.
+"""The page of joints: how each is called, how many freedoms it leaves, and a picture, drawn by moving its bodies.
 
-The code that the page shows is run. The bodies are then moved along motions that are checked to be free, and drawn in
-each position.
+The code on the page is run. The bodies are then moved along motions that are checked to be free, and drawn in each
+position.
 """
 
 import itertools
@@ -26,9 +26,10 @@ STEPS = 12  # from the position given to the farthest
 COLOURS = {"ground": (0.62, 0.62, 0.64), "a": (0.85, 0.52, 0.24), "b": (0.22, 0.47, 0.72)}
 BEGINNING = """# Joints
 
-Grey is the ground, blue is body `b`, orange `a`; pale ones show where the joint lets them go. The code above each
-picture makes the joint in a `model` that has these bodies, and the picture is drawn by moving that model, whenever the
-documentation is built. [Bodies and joints](../bodies.md) has the rest.
+In each picture the ground is grey, body `a` is orange and body `b` is blue. Pale bodies show where the joint lets them
+go. The code makes the joint in a `model` that has these bodies. [Bodies and joints](../bodies.md) explains the models.
+
+<!-- Written by `python docs/generate.py`: do not edit it. -->
 """
 
 
@@ -254,28 +255,42 @@ SPATIAL = (
 )
 
 
-def write(page: Path) -> None:
-    """Write the page, and its pictures beside it."""
+def text() -> str:
+    """Return the page; the code of each joint is run."""
     parts = [BEGINNING]
     for heading, kinds, model_of in (("In a plane", PLANAR, planar), ("In space", SPATIAL, spatial)):
         parts.append(f"## {heading}\n")
+        parts += [section(kind, problem_of(kind, model_of)[1], heading.split()[-1]) for kind in kinds]
+    return "\n".join(parts)
+
+
+def draw(folder: Path) -> None:
+    """Draw the picture of each joint."""
+    for where, kinds, model_of in (("plane", PLANAR, planar), ("space", SPATIAL, spatial)):
         for kind in kinds:
-            parts.append(section(kind, model_of, page.parent, heading.split()[-1]))
-    page.write_text("\n".join(parts), encoding="utf-8")
+            picture(kind, *problem_of(kind, model_of), folder / file_name(kind, where))
 
 
-def section(kind: Kind, model_of: Callable[[Kind], Any], folder: Path, where: str) -> str:
-    """The section of one joint; its picture goes into the folder."""
+def problem_of(kind: Kind, model_of: Callable[[Kind], Any]) -> tuple[Any, Any]:
+    """Return the model with the joint, made by the code that the page shows, and its problem."""
     model = model_of(kind)
     exec(kind.code, {"model": model, "np": np})
-    problem = model.problem()
+    return model, model.problem()
+
+
+def file_name(kind: Kind, where: str) -> str:
+    """Return the name of the picture of a joint."""
+    return f"joint-{kind.title.lower().replace(' ', '-')}-{where}.png"
+
+
+def section(kind: Kind, problem: Any, where: str) -> str:
+    """Return the section of one joint."""
     noun = "degree" if problem.freedom.degrees == 1 else "degrees"
-    bodies = "the body has" if len(model.bodies) == 1 else "both bodies together have"
-    name = f"joint-{kind.title.lower().replace(' ', '-')}-{where}.svg"
-    picture(kind, model, problem, folder / name)
+    bodies = "the body has" if len(kind.shapes.keys() - {"ground"}) == 1 else "both bodies together have"
     return (
         f"### {kind.title}, in {'a ' if where == 'plane' else ''}{where}\n\n{kind.text} With it, {bodies} "
-        f"{problem.freedom.degrees} {noun} of freedom.\n\n```python\n{kind.code}\n```\n\n![{kind.title}]({name})\n"
+        f"{problem.freedom.degrees} {noun} of freedom.\n\n```python\n{kind.code}\n```\n\n"
+        f"![{kind.title}]({file_name(kind, where)})\n"
     )
 
 
@@ -357,7 +372,7 @@ def picture(kind: Kind, model: Any, problem: Any, path: Path) -> None:
     axes.autoscale_view()
     axes.margins(0.04)
     axes.axis("off")
-    figure.savefig(path, bbox_inches="tight", pad_inches=0.03, transparent=True, metadata={"Date": None})
+    figure.savefig(path, dpi=100, bbox_inches="tight", pad_inches=0.03, metadata={"Software": None})
     plt.close(figure)
 
 

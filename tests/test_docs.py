@@ -1,7 +1,13 @@
-"""The documentation and the README: their code as printed, links, what they say of every status, generated pages."""
+"""The documentation and the README: their code as printed, links, statuses, the reference, and generated pages."""
 
+import csv
 import inspect
 import re
+import shutil
+import tomllib
+from collections import Counter
+from dataclasses import replace
+from functools import cache
 from itertools import pairwise
 from pathlib import Path
 
@@ -9,9 +15,9 @@ import numpy as np
 import pytest
 
 from tests.test_rooms import documentation
-from tests.testing.planted import FAULTS
-from twoloop import Result, Status, mechanisms, solve_dae
+from twoloop import Status, mechanisms, solve_dae
 from twoloop.bodies import PlanarModel, SpatialModel
+from twoloop.mechanisms import four_bar, pendulum
 from twoloop.methods.presets import PRESETS
 from twoloop.run.record import explained
 
@@ -19,13 +25,27 @@ mpl = pytest.importorskip("matplotlib")  # not among the oldest versions
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 PAGES = sorted(page.stem for page in DOCS.glob("*.md"))
-ELSEWHERE = {"compare": "studies/test_compare.py"}  # whose code other tests run
-WITHOUT_CODE = {"errors", "how_it_is_built", "method", "reference"}
+IN_EXAMPLES = (  # pages whose code tests/test_examples.py runs
+    *("check_simulator", "coming_from_exudyn", "coming_from_mujoco", "coming_from_scipy", "coming_from_sundials"),
+    *("controller", "fit_parameters", "from_a_file", "spatial_mechanism", "start"),
+)
+ELSEWHERE = {"compare": "studies/test_compare.py"} | dict.fromkeys(IN_EXAMPLES, "test_examples.py")
+WITHOUT_CODE = {"benchmark", "errors", "faq", "glossary", "how_it_is_built", "method", "planted_errors", "reference"}
+LINKED = sorted(
+    path.relative_to(ROOT).as_posix()
+    for pattern in ("*.md", "docs/*.md", "docs/reference/*.md", "reports/*.md", "examples/*.md")
+    for path in ROOT.glob(pattern)
+)
+
+
+def text_of(page):
+    """The text of a file of the repository."""
+    return (ROOT / page).read_text(encoding="utf-8")
 
 
 def blocks(page):
     """The Python code of a page."""
-    return [part.split("```")[0] for part in (ROOT / page).read_text(encoding="utf-8").split("```python\n")[1:]]
+    return [part.split("```")[0] for part in text_of(page).split("```python\n")[1:]]
 
 
 @pytest.fixture(scope="module")
@@ -66,28 +86,14 @@ def test_code_that_is_run_elsewhere_is(names):
 
 def test_the_code_of_the_readme(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    for block in blocks("README.md"):
+    code = blocks("README.md")
+    for block in code:
         exec(block, {})
-    assert {path.name for path in tmp_path.iterdir()} == {"run.png", "run.html"}
+    written = re.findall(r"\.(?:plot|animate)\(\"(\S+)\"", "\n".join(code))
+    assert written and {path.name for path in tmp_path.iterdir()} == set(written)
 
 
 # --- what the pages promise
-def test_start_here_has_the_right_motion(names):
-    page = names("start")
-    assert page["result"].success and page["other"].success and page["error"] < 1e-7 and page["violation"] < 1e-13
-    assert np.ptp(page["energies"]) < 1e-6
-    drawing, corners = page["problem"].drawing, [page[name] for name in "OABD"]
-    ends = drawing.at(page["result"].q)[np.array(drawing.bars)]
-    bars = sorted(np.linalg.norm(b - a, axis=0).mean() for a, b in ends)
-    assert bars == pytest.approx(sorted(np.linalg.norm(np.subtract(b, a)) for a, b in pairwise(corners)))
-    assert page["by_hand"].success and np.abs(page["by_hand"].q[:2, -1] - page["corner"]).max() < 1e-6
-
-
-def test_a_fit_with_the_step_that_the_page_names_finds_the_masses(names):
-    page = names("your_mechanism")
-    assert page["fit"].success and page["fit"].x == pytest.approx([page["m2"], page["m3"]], rel=1e-4)
-
-
 def test_the_models_of_the_page_of_bodies(names):
     page = names("bodies")
     six, result = page["problem"], page["result"]
@@ -103,16 +109,6 @@ def test_the_models_of_the_page_of_bodies(names):
     assert page["linkage"].freedom.degrees == 1 and page["turning"].success
 
 
-@pytest.mark.parametrize(("tol", "step"), [(1e-8, 1e-4), (1e-12, 1.5e-8)])
-def test_so_are_the_derivatives_right_with_each_of_its_two_remedies(names, tol, step):
-    slider, masses = names("your_mechanism")["slider"], np.array([2.0, 1.5])
-    for k in range(2):
-        change = np.where(np.arange(2) == k, masses, 0.0)
-        smooth = (slider(masses + 1e-3 * change, 1e-13) - slider(masses - 1e-3 * change, 1e-13)) / 2e-3
-        by_steps = (slider(masses + step * change, tol) - slider(masses, tol)) / step
-        assert np.linalg.norm(by_steps - smooth) < 0.02 * np.linalg.norm(smooth)
-
-
 def test_every_kind_of_constraint_does_what_its_section_says(names):
     page = names("constraints")
     assert "on which assembly" in str(page["error_text"])
@@ -124,26 +120,12 @@ def test_every_kind_of_constraint_does_what_its_section_says(names):
     assert slope == pytest.approx([scale * np.sin(17.0) ** 2, scale * (17.0 - 0.5 * np.sin(34.0)), 17.0], abs=1e-7)
 
 
-def test_the_adapter_of_the_page_has_the_order_of_its_method(names):
-    page = names("benchmark")
-    errors = page["rows"].query("solver == 'RATTLE'")["error_q"].to_numpy()
-    assert errors[0] / errors[1] == pytest.approx(100.0, rel=0.1) and (page["rows"]["status"] == "REACHED_END").all()
-
-
 def test_many_runs(names):
     page = names("many_runs")
     assert page["runs"].success.all() and page["q0"].shape == (2000, 9)
     assert page["result"].success and page["again"].success and np.ptp(page["high"] - page["low"]) > 1e-3
     sizes = pictures(page)
     assert min(sizes["tolerances.png"], sizes["workspace.png"]) > 5000
-
-
-def test_the_red_example_is_as_printed(names):
-    page, text = names("check_simulator"), (DOCS / "check_simulator.md").read_text(encoding="utf-8")
-    assert not page["report"].passed and page["repaired"].passed
-    assert all(failure.hint in text for failure in page["report"].failures)
-    assert f"Of {len(FAULTS)} faults planted" in text
-    assert all(f"    {failure.property}: " in text for failure in page["report"].failures)
 
 
 def test_dense_output(names):
@@ -247,15 +229,59 @@ def test_success_is_not_explained():
     assert explained(Status.REACHED_END) == explained(Status.EVENT) == ""
 
 
+# --- developer pages
+def test_the_method_of_the_page_has_order_five_and_keeps_tolerance_and_constraints(names):
+    page, problem, errors = names("add_a_method"), pendulum(), []
+    for h in (0.05, 0.025):
+        method = page["DormandPrince5"]()
+        end = solve_dae(problem.system, (0.0, 1.0), problem.q0, problem.v0, method, step_size=h).q[:, -1]
+        errors.append(np.abs(end - problem.motion(1.0)[0]).max())
+    assert 4.5 < np.log2(errors[0] / errors[1]) < 6.5
+    system, result = four_bar().system, page["result"]
+    assert result.success and result.method == "DormandPrince5" and page["error"] < 1e-6
+    assert max(np.abs(system.constraint(t, q)).max() for t, q in zip(result.t, result.q.T, strict=True)) < 1e-13
+
+
+def test_the_solver_of_the_page_has_order_two_and_is_a_line_of_the_benchmark(names):
+    page = names("add_a_solver_or_study")
+    errors = np.array(page["errors"])
+    assert np.abs(errors[:-1] / errors[1:] - 4.0).max() < 0.1
+    (line,) = page["LINES"]
+    problem = four_bar()
+    run = line.solve(problem.system, (0.0, 1.0), problem.q0, problem.v0, step=1e-3)
+    assert run.success and run.stats.n_accepted == 1000
+    assert not line.solve(problem.system, (0.0, 1.0), problem.q0, problem.v0, step=1e-4, time_limit=1e-6).success
+
+
+@pytest.mark.parametrize("page", [page for page in LINKED if page.startswith(("docs/", "CONTRIBUTING"))])
+def test_files_that_a_page_names_exist(page):
+    named = set(re.findall(r"`((?:twoloop|references|studies|tests|docs|kernels|examples)/[\w/.]+)`", text_of(page)))
+    missing = [name for name in named if not (ROOT / name).exists() and not (ROOT / "twoloop" / name).exists()]
+    assert missing == []
+
+
+def test_how_it_is_built_lists_the_layers_in_the_order_of_imports():
+    table = text_of("docs/how_it_is_built.md").split("## Layers")[1].split("\n## ")[0]
+    listed = [
+        name.replace("/", ".").removesuffix(".py").strip(".") for name in re.findall(r"^\| \**`(\S+)`", table, re.M)
+    ]
+    layers = documentation("rooms").ROOMS
+    assert Counter(listed) == Counter(layers)
+    assert [name for name in listed if name not in ("rows", "audit")] == [
+        name for name in layers if name not in ("rows", "audit")
+    ]  # neither of the two imports the other
+
+
+def test_the_glossary_has_at_most_fifty_words_in_order():
+    words = re.findall(r"^\| ([\w][^|]*) \| (?!---)", text_of("docs/glossary.md"), re.MULTILINE)[1:]
+    assert 30 <= len(words) <= 50 and [word.lower() for word in words] == sorted(word.lower() for word in words)
+
+
 # --- the reference has an entry for all that a user can import
-ENTRIES = set(
-    re.findall(
-        r"^\.\. auto(?:class|function|exception):: (\S+)", (DOCS / "reference.md").read_text("utf-8"), re.MULTILINE
-    )
-)
+ENTRIES = set(re.findall(r"^- `([\w.]+)`: ", text_of("docs/reference.md"), re.MULTILINE))
 
 
-@pytest.mark.parametrize("package", [f"twoloop{each}" for each in ("", ".audit", ".bodies", ".symbolic", ".testing")])
+@pytest.mark.parametrize("package", [f"twoloop{name}" for name in ("", ".audit", ".bodies", ".symbolic", ".testing")])
 def test_every_name_of_a_package_has_an_entry(package):
     module = pytest.importorskip(package, exc_type=ImportError)
     assert {f"{package}.{name}" for name in module.__all__} <= ENTRIES
@@ -266,57 +292,154 @@ def test_so_has_every_method_that_a_name_stands_for():
     assert kinds <= {entry.rpartition(".")[2] for entry in ENTRIES}
 
 
-# --- links, and what is generated
-def test_links_lead_to_files_that_are_there():
-    """Also on GitHub, but for the pages that only the build makes; headings are checked by the build."""
-    for page in PAGES:
-        text = (DOCS / f"{page}.md").read_text(encoding="utf-8")
-        for link in re.findall(r"\]\(([^)#]+)", text):
-            if not link.startswith(("http", "generated/")):
-                assert (DOCS / link).is_file(), f"{page}.md: {link}"
+def test_the_build_replaces_every_entry_by_its_docstring():
+    for_sphinx = documentation("for_sphinx")
+    text = for_sphinx.with_docstrings(text_of("docs/reference.md"))
+    directives = dict(re.findall(r"^\.\. auto(\w+):: (\S+)$", text, re.MULTILINE)[::-1])
+    assert set(re.findall(r"^\.\. auto\w+:: (\S+)$", text, re.MULTILINE)) == ENTRIES
+    assert set(directives) == {"module", "exception", "class", "function"} and set(for_sphinx.MEMBERS) <= ENTRIES
 
 
-def test_the_front_page_shows_what_its_code_writes(tmp_path):
-    for name in ("gallery", "shapes", "joints", "rooms"):
-        documentation(name)
-    documentation("generate").run_the_front_page(tmp_path / "front")
-    assert {file.name for file in (tmp_path / "front").iterdir()} == {"run.png", "run.html"}
-    text = (DOCS / "index.md").read_text(encoding="utf-8")
-    assert '<iframe src="front/run.html"' in text and "generated/extra/front/run.png" in text
-    assert "{include} generated/takes.md" in text  # the table "your mechanism, take"
+# --- links
+@cache
+def anchors(path):
+    """The anchors of the headings of a page, as GitHub names them; a repeated one gets a number."""
+    seen, found = Counter(), set()
+    text = re.sub(r"^```.*?^```", "", path.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
+    for heading in re.findall(r"^#+ +(.*?) *#*$", text, re.MULTILINE):
+        plain = re.sub(r"\[([^]]*)\]\([^)]*\)", r"\1", heading)
+        slug = re.sub(r"[^\w\- ]", "", plain.lower()).replace(" ", "-")
+        found.add(f"{slug}-{seen[slug]}" if seen[slug] else slug)
+        seen[slug] += 1
+    return found
 
 
-def test_the_page_of_joints_shows_every_joint(tmp_path, monkeypatch):
+def dead_links(page):
+    """The relative links of a page, pictures among them, whose file or heading does not exist."""
+    text = re.sub(r"^```.*?^```|`[^`\n]*`", "", text_of(page), flags=re.MULTILINE | re.DOTALL)
+    for link in re.findall(r"\]\(([^)\s]+)", text):
+        if not re.match(r"\w+:", link):
+            file, _, anchor = link.partition("#")
+            target = (ROOT / page).parent / file if file else ROOT / page
+            if not target.exists() or (anchor and (target.suffix != ".md" or anchor not in anchors(target.resolve()))):
+                yield link
+
+
+@pytest.mark.parametrize("page", LINKED)
+def test_every_link_leads_to_a_file_and_a_heading(page):
+    assert list(dead_links(page)) == []
+
+
+def test_messages_and_comments_name_pages_that_exist():
+    sources = [path for folder in ("twoloop", "references", "studies") for path in (ROOT / folder).rglob("*.py")]
+    named = {
+        link
+        for path in sources
+        for link in re.findall(r"\b(docs/\w+\.md(?:#[\w-]+)?)", path.read_text(encoding="utf-8"))
+    }
+    assert named
+    for link in named:
+        file, _, anchor = link.partition("#")
+        assert (ROOT / file).is_file() and (not anchor or anchor in anchors(ROOT / file)), link
+
+
+def test_pages_are_plain_markdown_and_use_the_words_of_the_glossary():
+    for page in LINKED:
+        text = text_of(page)
+        assert not re.search(r"^(:::|```\{|---$)", text, re.MULTILINE), page
+        assert not re.search(r"rival|rows not kept", text, re.IGNORECASE), page
+
+
+def test_the_menu_has_every_page_once():
+    for_sphinx = documentation("for_sphinx")
+    pages = Counter(page for _, section in for_sphinx.menu(text_of("docs/index.md")) for page in section)
+    reference = {f"reference/{path.stem}" for path in (DOCS / "reference").glob("*.md")}
+    assert {*PAGES, *reference} - {"index", "errors"} <= set(pages) and set(pages.values()) == {1}
+    assert for_sphinx.with_menu(text_of("docs/index.md")).count("```{toctree}") == 7
+
+
+def test_the_build_copies_what_pages_link_outside_docs(tmp_path):
+    for_sphinx = documentation("for_sphinx")
+    folder = DOCS / "generated-by-a-test"  # links are relative to docs/, in which copies stand
+    try:
+        for_sphinx.copy_linked_files(folder)
+        copies = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
+        assert {"reports/README.md", "CONTRIBUTING.md", "README.md"} <= copies
+        for name in ("index", "reference/gallery", "method"):
+            text = for_sphinx.page_for_sphinx(name, text_of(f"docs/{name}.md"), folder)
+            links = for_sphinx.LINK.findall(text)
+            assert links and all(((DOCS / name).parent / link).resolve().is_relative_to(DOCS) for link in links)
+        contributing = (folder / "CONTRIBUTING.md").read_text(encoding="utf-8")
+        assert contributing.startswith("---\norphan: true") and "](../add_a_method.md)" in contributing
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+# --- pages that follow from the code
+@pytest.mark.parametrize("name", ["gallery", "joints", "command_line"])
+def test_committed_pages_are_what_the_code_gives(name):
     documentation("shapes")
-    page = documentation("joints")
-    monkeypatch.setattr(page, "STEPS", 3)  # smooth ways are for the build
-    page.write(tmp_path / "joints.md")  # runs the code of each, and moves its bodies
-    plane, space = (tmp_path / "joints.md").read_text(encoding="utf-8").split("## In space")
+    assert text_of(f"docs/reference/{name}.md") == documentation(name).text(), "renew it: python docs/generate.py"
+
+
+def test_the_page_of_joints_shows_every_joint():
+    plane, space = text_of("docs/reference/joints.md").split("## In space")
     for text, model in ((plane, PlanarModel), (space, SpatialModel)):
-        joints = {
-            name for name, each in inspect.getmembers(model, inspect.isfunction) if is_joint(each) and name[0] != "_"
-        }
+        methods = inspect.getmembers(model, inspect.isfunction)
+        joints = {name for name, method in methods if is_joint(method) and name[0] != "_"}
         assert joints - {"drive"} == set(re.findall(r"model\.(\w+)\(", text))
-    pictures = re.findall(r"\]\((joint-[\w-]+\.svg)\)", plane + space)
-    assert len(set(pictures)) == len(pictures) == 20
-    assert all((tmp_path / picture).stat().st_size > 1000 for picture in pictures)
-    assert (
-        "With it, the body has 1 degree of freedom" in plane and "With it, the body has 5 degrees of freedom" in space
-    )
+    assert "With it, the body has 1 degree of freedom" in plane
+    assert "With it, the body has 5 degrees of freedom" in space
 
 
 def is_joint(method):
+    """Whether a method of a model adds a joint."""
     return inspect.signature(method).return_annotation == "ModelJoint"
 
 
+def test_a_joint_is_drawn_by_moving_it(tmp_path, monkeypatch):
+    documentation("shapes")
+    joints = documentation("joints")
+    monkeypatch.setattr(joints, "STEPS", 3)
+    revolute, skate = joints.PLANAR[0], next(kind for kind in joints.PLANAR if kind.title == "Skate")
+    for kind in (revolute, skate):
+        model, problem = joints.problem_of(kind, joints.planar)
+        first, *_, last = joints.positions(kind, model, problem)
+        assert (last == problem.q0).all() and np.abs(first - last).max() > 0.1
+        assert np.abs(problem.system.constraint(0.0, first)).max(initial=0.0) < 1e-12
+        joints.picture(kind, model, problem, tmp_path / "joint.png")
+        assert (tmp_path / "joint.png").stat().st_size > 1000
+    forbidden = replace(revolute, motions=({"b": (1.0, 0.0, 0.0)},))
+    with pytest.raises(ValueError, match="is not free"):
+        list(joints.positions(forbidden, *joints.problem_of(forbidden, joints.planar)))
+
+
 def test_the_gallery_shows_every_ready_mechanism(tmp_path, monkeypatch):
+    documentation("shapes")
     gallery = documentation("gallery")
-    monkeypatch.setattr(gallery, "LONGEST", 0.01)  # s: whole motions are for the build
-    gallery.write(tmp_path / "gallery.md", tmp_path / "animations")
-    text = (tmp_path / "gallery.md").read_text(encoding="utf-8")
     makers = {name for name in mechanisms.__all__ if name[0].islower()} - {"ancf_beam"}
-    assert {line[3:] for line in text.splitlines() if line.startswith("## ")} == makers
-    assert text.count("- *Tests*: ") == len(makers)
-    if hasattr(Result, "animate"):
-        assert {file.stem for file in (tmp_path / "animations").iterdir()} == makers
-        assert all(f"../animations/{name}.html" in text for name in makers)
+    text = text_of("docs/reference/gallery.md")
+    assert set(re.findall(r"^## (\w+)$", text, re.MULTILINE)) == makers and text.count("- *Tests*: ") == len(makers)
+    monkeypatch.setattr(gallery, "LONGEST", 0.01)  # s: whole motions are for the build
+    gallery.animate(tmp_path)
+    assert {file.stem for file in tmp_path.iterdir()} == makers
+    shown = documentation("for_sphinx").with_animations(text)
+    assert set(re.findall(r'src="\.\./animations/(\w+)\.html"', shown)) == makers and "![" not in shown
+    problem = four_bar()
+    gallery.picture(problem, gallery.motion(problem), tmp_path / "four_bar.png")
+    assert (tmp_path / "four_bar.png").stat().st_size > 1000
+
+
+def test_columns_that_several_files_share_are_explained():
+    explained_here = set(re.findall(r"`(\w+)`(?=[^|\n]*\|[^|\n]+\|$)", text_of("docs/reference/csv_columns.md"), re.M))
+    files = Counter()
+    for path in (ROOT / "reports").glob("*.csv"):
+        lines = path.read_text(encoding="utf-8").splitlines()
+        files.update(next(csv.reader(line for line in lines if not line.startswith("#"))))
+    assert {column for column, count in files.items() if count >= 4} <= explained_here
+
+
+def test_the_citation_file_has_no_address_that_is_not_there():
+    assert not re.search(r"example\.|TODO|<.*>", text_of("CITATION.cff"))
+    urls = tomllib.loads(text_of("pyproject.toml"))["project"].get("urls", {})
+    assert not any("example" in url or "OWNER" in url for url in urls.values())
