@@ -1,4 +1,4 @@
-"""Run groups of traps again: `python -m studies.honesty.again GROUP ...`, such as 'held out' and short.
+"""Run groups of traps again: `python -m studies.honesty.again GROUP ...`, such as force and short.
 
 The whole study takes over an hour. The new rows take the place of those of their groups in honesty.csv, whose first
 line names their commit and processor; `python -m studies.honesty --redraw` then writes the report anew.
@@ -13,9 +13,9 @@ from studies.bench import cli
 from studies.bench.cli import StudyError
 from studies.bench.store import Output
 from studies.honesty.study import make
-from studies.honesty.traps import FORCE, HELD_OUT, INPUT, MISTAKE, SHORT
+from studies.honesty.traps import FORCE, INPUT, LINKAGE, MISTAKE, SHORT, SINGULAR
 
-GROUPS = (INPUT, MISTAKE, FORCE, HELD_OUT, SHORT)
+GROUPS = (INPUT, MISTAKE, FORCE, SHORT, LINKAGE, SINGULAR)
 
 
 def main(words: Sequence[str] | None = None) -> None:

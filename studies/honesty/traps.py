@@ -1,24 +1,25 @@
-"""Traps: systems and starts on which a solver goes wrong unless it notices, each on two mechanisms.
+"""Traps: systems and starts on which a solver goes wrong unless it notices.
 
-One set of compiled callbacks serves those on chains of point masses, that of `sharp_callbacks` with a force of its own:
-what makes the trap stands in the parameters.
+All traps on chains of point masses share the compiled callbacks of `sharp_callbacks`, with a force of its own: the
+parameters say what the trap is.
 """
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from itertools import chain, product
 from typing import Any
 
 import numpy as np
 
-from studies.bench.cli import StudyError
-from studies.bench.random_linkages import end_of
+from studies.bench.random_linkages import KINDS as LINKAGES
+from studies.bench.random_linkages import draw, end_of
 from studies.bench.sharp_callbacks import CHAIN, chain_force, chain_jacobian
-from studies.bench.sharp_forces import FRICTIONS, GUSTS, T_END, Sharp, families, made
+from studies.bench.sharp_forces import FRICTIONS, GUSTS, T_END, Sharp, families, gust, made, pulse
 from studies.bench.sharp_mechanisms import Mechanism, bars, row, slider_in_space
 from studies.bench.sharp_mechanisms import chain as chain_of
-from studies.bench.sharp_motion import CHECK, RTOL, march, motion, off
+from studies.bench.sharp_motion import Motion, motion
 from studies.bench.store import Array
 from studies.planted_errors.faults import python_copy
 from twoloop import ConstrainedSystem
@@ -26,25 +27,29 @@ from twoloop.kernels.compile.callbacks import callback
 from twoloop.mechanisms import Problem, four_bar, n_four_bar
 
 NEVER = 1e30  # s
-# what a trap is made of: a start or derivative that checks of input find, a model or setting, a force that is sharp,
-# such a one with other numbers, on which no method was repaired, one that a solver may step over
-INPUT, MISTAKE, FORCE, HELD_OUT, SHORT = "input", "mistake", "force", "held out", "short"
+# groups of traps: a start or a derivative that checks of the input find; a mistake in a model or a setting, or a hard
+# motion; a sharp force; a force so short that a solver may step over it; a random linkage; singular positions
+INPUT, MISTAKE, FORCE, SHORT, LINKAGE, SINGULAR = "input", "mistake", "force", "short", "linkage", "singular"
 AGREE = 1e-8  # m or rad: how far two methods may differ in the motion under a force
-SEED = 13  # of the numbers of the forces
-HELD_OUT_SEED = 20261126  # of those held out: the day; a run on code changed since draws by a new one
-GROWN = 100.0  # how much errors may grow in a motion that is held out: as much as in the first set
+SEED = 20261126  # of all draws: the day. Draw by a new seed when the methods have been changed to pass these
+GROWN = 100.0  # how much errors may grow in a motion under a force, up to which two methods can agree on it
 FORCES = (  # families of `sharp_forces`
     "drag",
     *(f"tanh friction, width {width:g}" for width in FRICTIONS),
     *(f"gust of {1e3 * width:g} ms" for width in GUSTS),
     *("softplus stop", "chirp", "switching drive", "square wave", "noise by interpolation"),
 )
-UNKNOWN_IN_SPACE = FORCES[-4:]  # two methods do not agree to AGREE there: the truth is not known
+UNKNOWN_IN_SPACE = FORCES[-4:]  # two methods do not agree to AGREE there
 KINK = "drive with a kink"
 QUICK_FORCES = ("drag", "gust of 30 ms", KINK)
-# places in the parameters behind lengths and masses, of what makes the trap: a spring that holds the last point, and
-# where it is at rest; begin and end of a force along x and its size, when the force becomes NaN, when it raises, a
-# wrong entry of C_q
+SHAPES = {"gust": gust, "pulse": pulse}  # a gust exp(-(t / b)^2) has tails; a pulse is zero before and behind
+WIDTHS = (1e-4, 3e-4, 1e-3, 3e-3, 1e-2)  # s: b of a gust, duration of a pulse
+N_DRAWS, N_QUICK, QUICK_WIDTHS = 8, 2, (1e-3,)  # of each width on each mechanism
+N_LINKAGES, LINKAGE_END = 100, 5.0  # of each kind; s
+SIZES, ENDS = tuple(range(1, 7)), (5.0, 10.0, 20.0)  # of A02 in both sets of coordinates; s
+TOLERANCES = tuple(10.0 ** (-0.5 * k) for k in range(12, 23))  # of A02: 1e-6 to 1e-11
+# places in the parameters behind lengths and masses: a spring that holds the last point, and where it is at rest;
+# begin, end and size of a force along x; when the force becomes NaN, when it raises; a wrong entry of C_q
 SPRING, REST, BEGIN, END, PUSH, NAN, RAISES, WRONG = range(8)
 SANE = (0.0, 0.0, NEVER, NEVER, 0.0, NEVER, NEVER, 0.0)
 
@@ -98,11 +103,12 @@ class Trap:
     steps: Mapping[str, float] = field(default_factory=dict)
     # the system as it is for a solver that never evaluates it where the trap lies
     unnoticed: ConstrainedSystem | None = None
-    group: str = MISTAKE  # INPUT, MISTAKE, FORCE, HELD_OUT or SHORT
+    group: str = MISTAKE  # one of the groups above
     # impulse, singular: whether velocities jump, or C_q loses rank on the way
     impulse: bool = False
     singular: bool = False
-    n_drawn: int = 1  # how many forces were drawn until the motion under one was known
+    sensitivity: float = 1.0  # growth of an error at the start; where it is above 1, so much more error is allowed
+    n_drawn: int = 1  # how many were drawn until the motion of one was known
 
 
 def start(n: int) -> tuple[Array, Array]:
@@ -113,24 +119,49 @@ def start(n: int) -> tuple[Array, Array]:
     return q, np.zeros(2 * n)
 
 
-def traps(quick: bool) -> list[Trap]:
-    """All traps: mistakes on chains of two and of three points, positions on two linkages each, and sharp forces."""
-    made = [trap for n in ((2,) if quick else (2, 3)) for trap in of_chain(n)]
-    return made + ([] if quick else list(of_linkages())) + list(under_forces(quick))
+def traps(quick: bool, groups: Sequence[str] | None = None) -> Iterator[Trap]:
+    """Yield all traps, or those of some groups."""
+    sizes = (2,) if quick else (2, 3)
+    made: dict[str, Callable[[], Iterator[Trap]]] = {
+        MISTAKE: lambda: chain((trap for n in sizes for trap in of_chain(n)), () if quick else of_linkages()),
+        LINKAGE: lambda: random_linkages(0 if quick else N_LINKAGES),
+        SINGULAR: lambda: iter(()) if quick else singular_positions(),
+        FORCE: lambda: under_forces(quick),
+        SHORT: lambda: short_forces(quick),
+    }
+    for group, make in made.items():
+        if groups is None or group in groups or (group == MISTAKE and INPUT in groups):
+            yield from (trap for trap in make() if groups is None or trap.group in groups)
 
 
 def of_linkages() -> Iterator[Trap]:
-    """Singular positions, dead points, and positions where the two assemblies of a linkage nearly meet."""
-    for n in (1, 2):
-        problem = n_four_bar(n)
-        trap = of_motion("singular position crossed", problem, lambda t, known=problem.motion: known(t)[0])  # type: ignore[misc]
-        yield replace(trap, singular=True)
+    """Yield dead points, and positions where the two assemblies of a linkage nearly meet."""
     for ground in (2.0, 1.9):  # bars 1 and 2 come into line: the angle of bar 3 does not determine theirs
         problem = four_bar((0.8, 1.2, 1.0), ground)
         yield of_motion("dead point", problem, partial(end_of, problem))
     for excess in (1e-4, -1e-7):  # longest and shortest less the other two: 0 at a change point
         problem = four_bar((0.5, 1.5, 1.0), 2.0 + excess, theta3=1.0)
         yield of_motion("assemblies nearly meet", problem, partial(end_of, problem))
+
+
+def random_linkages(n: int) -> Iterator[Trap]:
+    """Yield n four-bar linkages of each kind with a known motion, released from rest."""
+    for (place, kind), k in product(enumerate(LINKAGES), range(n)):
+        g, drawn, n_drawn = np.random.default_rng([SEED, place, k]), None, 0
+        while drawn is None:
+            drawn, n_drawn = draw(kind, g, LINKAGE_END), n_drawn + 1
+        trap = of_motion(kind, drawn.problem, lambda t, q=drawn.q: q)  # type: ignore[misc]
+        about: dict[str, Any] = {"mechanism": f"linkage {k}", "n_drawn": n_drawn, "group": LINKAGE}
+        yield replace(trap, t_end=LINKAGE_END, sensitivity=max(1.0, drawn.sensitivity), **about)
+
+
+def singular_positions() -> Iterator[Trap]:
+    """Yield IFToMM's A02, which passes singular positions, in all SIZES, both coordinates, ENDS and TOLERANCES."""
+    for coordinates, n, t_end, tolerance in product(("tips", "bodies"), SIZES, ENDS, TOLERANCES):
+        problem = n_four_bar(n, coordinates)
+        trap = of_motion(SINGULAR, problem, lambda t, known=problem.motion: known(t)[0])  # type: ignore[misc]
+        name = f"{problem.name}, {t_end:g} s, {tolerance:.2g}"
+        yield replace(trap, t_end=t_end, tolerance=tolerance, mechanism=name, singular=True, group=SINGULAR)
 
 
 def of_motion(name: str, problem: Problem, positions: Callable[[float], Array]) -> Trap:
@@ -198,20 +229,6 @@ def masses(sharp: Sharp) -> Mechanism:
     return row(sharp, np.array([3.0, 8.0]), np.array([1.0, 1.5]), 0.2, 0.0)
 
 
-def end_under_force(mechanism: Mechanism) -> Array:
-    """Positions at the end by two methods of SciPy in independent coordinates; NaN where they are not compared.
-
-    Raises StudyError if the two do not agree.
-    """
-    ends = [
-        mechanism.positions(T_END, march(mechanism, method, tolerance, mechanism.y0)[T_END])
-        for method, tolerance in (("DOP853", RTOL), ("LSODA", CHECK))
-    ]
-    if not off(ends[1], ends[0]) <= AGREE:
-        raise StudyError(f"no right answer for {mechanism.sharp.family} on {mechanism.name}: two methods differ")
-    return ends[0]
-
-
 def forces(quick: bool) -> list[tuple[str, Callable[[Sharp], Mechanism]]]:
     """Sharp forces, each on a pendulum and two linkages; a kinked drive on what keeps a freedom under it."""
     if quick:
@@ -222,33 +239,53 @@ def forces(quick: bool) -> list[tuple[str, Callable[[Sharp], Mechanism]]]:
     return [*every, (KINK, pendulum), (KINK, masses)]
 
 
+def known_motion(
+    bodies: Callable[[Sharp], Mechanism], force: Callable[[np.random.Generator], Sharp], seed: list[int]
+) -> tuple[Mechanism, Motion, int]:
+    """Draw forces until the motion under one is known to AGREE and errors grow by GROWN at most; count the draws."""
+    g, n_drawn = np.random.default_rng(seed), 0
+    while True:
+        n_drawn += 1
+        mechanism = bodies(force(g))
+        try:
+            known = motion(mechanism)
+        except (RuntimeError, ValueError):  # SciPy's method fails
+            continue
+        if known.apart <= AGREE and known.growth <= GROWN:
+            return mechanism, known, n_drawn
+
+
 def under_forces(quick: bool) -> Iterator[Trap]:
-    """The traps that are made of these."""
-    for family, bodies in forces(quick):
-        drawn = families()[family](np.random.default_rng([SEED, [*FORCES, KINK].index(family)]))
-        mechanism = bodies(drawn)
-        yield of_force(mechanism, FORCE, partial(end_under_force, mechanism))
-
-
-def held_out(quick: bool) -> Iterator[Trap]:
-    """The same forces and mechanisms with other numbers, each drawn until two methods agree and errors do not grow."""
+    """Yield the sharp forces on their mechanisms, with random parameters."""
     for place, (family, bodies) in enumerate(forces(quick)):
-        g, n_drawn = np.random.default_rng([HELD_OUT_SEED, place]), 0
-        while True:
-            n_drawn += 1
-            mechanism = bodies(families()[family](g))
-            try:
-                known = motion(mechanism)
-            except (RuntimeError, ValueError):  # SciPy's method fails
-                continue
-            if known.apart <= AGREE and known.growth <= GROWN:
-                break
-        yield of_force(mechanism, HELD_OUT, partial(known.q.__getitem__, -1), n_drawn)
+        yield of_force(FORCE, *known_motion(bodies, families()[family], [SEED, place]))
 
 
-def of_force(mechanism: Mechanism, group: str, end: Callable[[], Array], n_drawn: int = 1) -> Trap:
-    """The trap of a mechanism under a force, whose end is known."""
-    sharp = mechanism.sharp
+def two_points(sharp: Sharp) -> Mechanism:
+    """Make a chain of two points of 1 kg on links of 1 m."""
+    two = np.ones(2)
+    return chain_of(sharp, two, two, np.array([1.0, 0.5]), 0.0 * two)
+
+
+def name_of(shape: str, width: float) -> str:
+    """Name the trap of a short force."""
+    return f"{shape} of {1e3 * width:g} ms"
+
+
+def short_forces(quick: bool) -> Iterator[Trap]:
+    """Yield each width of a gust and of a pulse on each mechanism, at random times."""
+    widths = enumerate(QUICK_WIDTHS if quick else WIDTHS)
+    mechanisms = enumerate((pendulum,) if quick else (pendulum, bars, two_points))
+    draws = range(N_QUICK if quick else N_DRAWS)
+    for shape, (place, width), (k, bodies), n in product(SHAPES, widths, mechanisms, draws):
+        seed = [SEED, place, k, n] + [1] * (shape == "pulse")
+        mechanism, known, _ = known_motion(bodies, partial(SHAPES[shape](width), name_of(shape, width)), seed)
+        yield replace(of_force(SHORT, mechanism, known, 1), mechanism=f"{mechanism.name}, draw {n}")
+
+
+def of_force(group: str, mechanism: Mechanism, known: Motion, n_drawn: int) -> Trap:
+    """Make the trap of a mechanism under a force, whose motion is known."""
+    sharp, end = mechanism.sharp, known.q[-1]
     about: dict[str, Any] = {"group": group, "impulse": sharp.driven and bool(sharp.breaks), "n_drawn": n_drawn}
     given = mechanism.system, mechanism.q0, mechanism.v0, T_END, mechanism.system
-    return Trap(sharp.family, mechanism.name, *given, positions=lambda t: end(), **about)
+    return Trap(sharp.family, mechanism.name, *given, positions=lambda t: end, **about)

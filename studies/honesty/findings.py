@@ -1,0 +1,186 @@
+"""What the report of `studies.honesty` says, from its rows and those of `studies.validation`."""
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+
+from studies.bench import figures
+from studies.bench.end_states import EXACT, JUDGED
+from studies.bench.render import number
+from studies.bench.sharp_forces import T_END
+from studies.bench.solvers import GIVEN
+from studies.honesty.solvers import DEFAULT, KINDS, LIMITED, LOOK, OWN_SUFFIX, kind_of
+from studies.honesty.traps import (
+    FORCE,
+    INPUT,
+    LINKAGE,
+    MISTAKE,
+    SEED,
+    SHAPES,
+    SHORT,
+    SINGULAR,
+    TOLERANCES,
+    WIDTHS,
+    name_of,
+)
+
+RIGHT, SAID, SILENT, HANG, NOT_RUN = "right", "reported failure", "silently wrong", "hangs", "not run"
+BAD = (SILENT, HANG)
+LOOSENESS = 1e3  # an answer is right within so many times the tolerance
+USUAL = 1e-8  # tolerance of all traps that are not about tolerances
+PUBLISHED, AUTHORS = "published", "authors"  # groups of the rows of validation
+BRIEF = LOOK * T_END  # s: forces that change with time are evaluated at least so often
+PLAIN = f"auto, not compiled{OWN_SUFFIX}"
+DRAWN = {"gross": figures.RED, "slight": figures.ORANGE}  # parts of the bars
+
+
+def _brief(shape: str, below: bool) -> Callable[[pd.DataFrame], pd.Series]:
+    names = [name_of(shape, width) for width in WIDTHS if (width < BRIEF) is below]
+    return lambda rows: (rows["group"] == SHORT) & rows["trap"].isin(names)
+
+
+def _of(group: str) -> Callable[[pd.DataFrame], pd.Series]:
+    return lambda rows: rows["group"] == group
+
+
+TABLE: dict[str, tuple[str, Callable[[pd.DataFrame], pd.Series]]] = {  # kinds of traps: words, and which rows they are
+    "sharp": ("sharp forces", _of(FORCE)),
+    "gust_long": ("gusts of 3 and 10 ms", _brief("gust", False)),
+    "gust_short": ("gusts of 0.1 to 1 ms", _brief("gust", True)),
+    "pulse_long": ("pulses of 3 and 10 ms", _brief("pulse", False)),
+    "pulse_short": ("pulses of 0.1 to 1 ms", _brief("pulse", True)),
+    "singular": ("singular positions", _of(SINGULAR)),
+    "linkages": ("random four-bar linkages", _of(LINKAGE)),
+    "mistakes": ("mistakes and hard motions", _of(MISTAKE)),
+    "input": ("inconsistent start, wrong derivative", _of(INPUT)),
+    "published": ("published mechanisms", _of(PUBLISHED)),
+    "authors": ("benchmark authors' own conditions", _of(AUTHORS)),
+}
+
+
+def of_validation(rows: pd.DataFrame) -> pd.DataFrame:
+    """Judge the rows of `validation` by the rule of this study, and those on the authors' conditions by these."""
+    rows = rows[rows["group"].isna() | (rows["group"] == JUDGED)]
+    own = rows["family"] == "two-loop"
+    names = rows["solver"].astype(str).str.removesuffix(OWN_SUFFIX) + np.where(own, OWN_SUFFIX, "")
+    by_authors = rows["group"] == JUDGED
+    allowed = LOOSENESS * rows[["tol", "floor"]].max(axis=1)
+    wrong = (rows["outcome"] == "wrong").where(by_authors, rows["error_q"].astype(float) > allowed)
+    ended = rows["outcome"].isin(("right", "inexact", "wrong"))
+    outcome = pd.Series(np.where(wrong, np.where(rows["warnings"] > 0, SAID, SILENT), RIGHT), rows.index)
+    made = {"group": np.where(by_authors, AUTHORS, PUBLISHED), "trap": rows["case"], "mechanism": rows["case"]}
+    made |= {"solver": names, "tol": rows["tol"], "status": rows["status"], "evaluated": True}
+    # by the authors' conditions there is no slight error
+    made["error"] = rows["error_q"].astype(float).where(~(by_authors & wrong), np.inf)
+    failed = rows["outcome"].where(rows["outcome"] == NOT_RUN, SAID)
+    return pd.DataFrame(made | {"outcome": outcome.where(ended, failed)})
+
+
+def graded(ran: pd.DataFrame) -> dict[str, int]:
+    """Count runs, those that end, those silently wrong, and of these those off by over EXACT, or by less."""
+    bad = ran["outcome"].isin(BAD)
+    slight = bad & (ran["error"].astype(float) <= EXACT)
+    failed = int((ran["outcome"] == SAID).sum())
+    counts = {"n": len(ran), "ended": len(ran) - failed, "failed": failed, "wrong": int(bad.sum())}
+    return counts | {"gross": int((bad & ~slight).sum()), "slight": int(slight.sum())}
+
+
+def parts_of(rows: pd.DataFrame) -> dict[str, pd.DataFrame]:
+    """Split rows into those of the default, of twoloop's other methods, and of other solvers without `max_step`."""
+    own, default = rows["solver"].str.endswith(OWN_SUFFIX), rows["solver"] == DEFAULT
+    others = ~own & ~rows["solver"].str.endswith(LIMITED)
+    return {"default": rows[default], "own": rows[own & ~default], "others": rows[others]}
+
+
+def table_of(ran: pd.DataFrame) -> dict[str, dict[str, Any]]:
+    """Count the silent failures of each kind of trap that has rows."""
+    lines: dict[str, dict[str, Any]] = {}
+    for key, (words, which) in TABLE.items():
+        if len(rows := ran[which(ran)]):
+            lines[key] = {"trap": words} | {who: graded(own) for who, own in parts_of(rows).items()}
+    return lines
+
+
+def kinds_of(ran: pd.DataFrame) -> list[dict[str, Any]]:
+    """Count the runs of each kind of solver."""
+    kinds = ran["solver"].map(kind_of)
+    return [{"kind": words} | graded(own) for kind, words in KINDS.items() if len(own := ran[kinds == kind])]
+
+
+def best_limited(ran: pd.DataFrame, shape: str) -> dict[str, Any] | None:
+    """Return the solver with a largest step that misses the fewest short forces of a shape."""
+    own = ran[ran["trap"].str.startswith(shape) & ran["solver"].str.endswith(LIMITED)]
+    lines = [{"solver": str(name).removesuffix(LIMITED)} | graded(of) for name, of in own.groupby("solver", sort=False)]
+    return min(lines, key=lambda line: line["wrong"] / line["n"], default=None)
+
+
+def pulses_of(ran: pd.DataFrame) -> dict[str, Any]:
+    """Count the pulses of each width that the default misses."""
+    own = ran[ran["solver"] == DEFAULT]
+    by_width = {width: graded(own[own["trap"] == name_of("pulse", width)]) for width in WIDTHS}
+    missed = [(width, each["wrong"]) for width, each in by_width.items() if each["wrong"]]
+    return {"n": max(each["n"] for each in by_width.values()), "wrong": missed}
+
+
+def wrong_traps(ran: pd.DataFrame) -> list[dict[str, Any]]:
+    """List the mistakes and hard motions with silent failures, of any solver without `max_step`."""
+    bad = ran[ran["outcome"].isin(BAD) & ~ran["solver"].str.endswith(LIMITED)]
+    return [{"trap": str(trap), "wrong": len(own)} for trap, own in bad.groupby("trap", sort=False)]
+
+
+def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
+    """Count silent failures by kind of trap, and those under sharp forces by kind of solver."""
+    ran = rows[rows["outcome"] != NOT_RUN]
+    forces, short, mistakes, singular = (ran[ran["group"] == group] for group in (FORCE, SHORT, MISTAKE, SINGULAR))
+    found: dict[str, Any] = {"table": table_of(ran), "kinds": kinds_of(forces), "pulses": pulses_of(short)}
+    found["n"] = int((~ran["group"].isin((PUBLISHED, AUTHORS))).sum())
+    found |= {f"best_{shape}": best_limited(short, shape) for shape in SHAPES}
+    found["limited"] = graded(forces[forces["solver"].str.endswith(LIMITED)])
+    found |= {"wrong_traps": wrong_traps(mistakes), "n_forces": int(forces["trap"].nunique())}
+    found["singular"] = {"tolerances": [max(TOLERANCES), min(TOLERANCES)]}
+    found["singular"]["plain"] = graded(singular[singular["solver"] == PLAIN])["failed"]
+    found |= {"look": LOOK, "brief": BRIEF, "t_end": T_END, "exact": EXACT, "usual": USUAL, "looseness": LOOSENESS}
+    # which methods the traps in models and settings deceive
+    found["counts"] = {str(name): graded(own) for name, own in mistakes.groupby("solver", sort=False)}
+    return found | {"n_traps": int(mistakes["trap"].nunique()), "seed": SEED, "answer": answer_of(found["table"])}
+
+
+def answer_of(table: Mapping[str, Any]) -> str:
+    """Say in one sentence where the default is silently wrong."""
+
+    def counts(*keys: str) -> str:
+        own = [table[key]["default"] for key in keys if key in table]
+        return f"{sum(each['wrong'] for each in own)} of {sum(each['n'] for each in own)}"
+
+    brief = f"forces shorter than 1/{number(round(1.0 / LOOK))} of the run"
+    words = {("sharp",): "runs under sharp forces", ("gust_short", "pulse_short"): f"under {brief}"}
+    words |= {("singular",): "at singular positions"}
+    places = [f"{counts(*keys)} {where}" for keys, where in words.items() if keys[0] in table]
+    return f"{GIVEN[0].upper()}{GIVEN[1:]} is silently wrong in {', '.join(places)}."
+
+
+def figures_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Figure]:
+    """Draw the shares of silently wrong runs under sharp forces, a bar for each kind of solver."""
+    lines = [line for line in found["kinds"] if line["kind"] != KINDS["limited"]]
+    figure, axes = plt.subplots(figsize=(7.0, 0.4 * len(lines) + 1.2), layout="constrained")
+    places, left = np.arange(len(lines)), np.zeros(len(lines))
+    for part, color in DRAWN.items():
+        shares = np.array([100.0 * line[part] / line["n"] for line in lines])
+        bars = axes.barh(places, shares, left=left, color=color, height=0.6)
+        axes.bar_label(bars, [str(line[part] or "") for line in lines], label_type="center", fontsize=8)
+        left += shares
+    for place, line, end in zip(places, lines, left, strict=True):
+        axes.text(end, place, f"  {line['wrong']} of {line['n']}", va="center", fontsize=9)
+    axes.set_yticks(places, [line["kind"] for line in lines])
+    axes.invert_yaxis()
+    axes.set_xlabel(f"silently wrong runs (%); red: off by over {EXACT:g} m or rad")
+    axes.set_xlim(0.0, max(5.0, 1.2 * left.max()))
+    axes.grid(False)
+    wrong = {line["kind"] for line in lines if line["wrong"]}
+    only = "Only other solvers are silently" if wrong and not wrong & {KINDS["default"], KINDS["own"]} else "Silently"
+    axes.set_title(f"{only} wrong under sharp forces")
+    return {"honesty": figure}
