@@ -1,3 +1,3 @@
-from studies.table3.study import STUDY
+from studies.table3.study import main
 
-STUDY.main()
+main()

@@ -10,49 +10,22 @@ import pandas as pd
 from scipy.optimize import least_squares
 
 from studies.bench.collector import Case, Run, Solver
-from studies.bench.solvers import ERR_IN, ERR_OUT, IRK, NEWMARK, PAPER_TOL
+from studies.bench.solvers import ERR_IN, IRK, PAPER_TOL
 from studies.bench.tables import where
+from studies.table3.cells import FAMILIES, PAPER_IRK, TOLERANCES, least, machine, printed
 from twoloop import Result, RungeKutta, solve_dae
 from twoloop.methods.tableaux import sun_radau_iib
 
-TOLERANCES = ERR_OUT
-FAMILIES = {"Table 3: IRK": IRK, "Table 3: Newmark": NEWMARK}
 UNEQUAL = 1.2  # times of the same run, largest over least, beyond which they are no result
 FLAT = 1.5  # a cause explains the pattern if the largest ratio over the smallest is at most this
 Reading = Literal["all", "independent"]
 READINGS: dict[Reading, str] = {"all": "all of z", "independent": "y_i only"}  # what criterion (32) is taken over
-
-# Table 3 as printed: [err_in][err_out] in seconds; None is the star, "no reasonable result in long time simulation"
-PAPER_IRK = ((1.95, 1.98, 2.00, 2.08), (2.12, 2.23, 2.31, 2.31), (2.64, 2.85, 2.85, 2.99), (3.37, 3.46, 3.55, 3.60))
-PAPER_NEWMARK = (
-    (None, 2.71, 12.62, 49.73),
-    (None, 2.74, 12.36, 49.68),
-    (None, 3.10, 12.68, 49.66),
-    (None, 3.09, 13.40, 50.93),
-)
-
-
-def printed(group: str) -> tuple[tuple[float | None, ...], ...]:
-    """The paper's times of one procedure."""
-    return PAPER_IRK if group == "Table 3: IRK" else PAPER_NEWMARK
-
-
-def machine(rows: pd.DataFrame, group: str, err_in: float, err_out: float) -> pd.Series | None:
-    """Our run of a cell."""
-    found = where(rows, group=group, err_in=err_in, err_out=err_out)
-    return None if found.empty else found.iloc[0]
 
 
 def by_repetition(slow: pd.Series, fast: pd.Series) -> list[float]:
     """Least and largest time of one run over that of another, of repetitions made in turn."""
     ratios = [a / b for a, b in zip(slow["times"], fast["times"], strict=False)]
     return [float(min(ratios)), float(max(ratios))] if ratios else [math.nan, math.nan]
-
-
-def least(run: pd.Series) -> float:
-    """Least time of the repetitions of a run, which other processes and the places of arrays have prolonged least."""
-    times = run.get("times")
-    return float(min(times) if isinstance(times, tuple) and times else run["call_s"])
 
 
 def cells(rows: pd.DataFrame, exchanged: bool = False) -> pd.DataFrame:

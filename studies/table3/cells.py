@@ -1,0 +1,217 @@
+"""Table 3 of the paper: computation time of both two-loop procedures over their tolerances, beside IDA and Exudyn."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pandas as pd
+from matplotlib.colors import LogNorm
+from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator
+
+from studies.bench import figures, tables
+from studies.bench.cases import four_bar
+from studies.bench.cli import StudyError
+from studies.bench.collector import Case, Run, collect
+from studies.bench.metrics import ASTRAY, LOST
+from studies.bench.render import number, power, table
+from studies.bench.solvers import CATALOGUE, ERR_IN, ERR_OUT, GIVEN, IDA_C, IRK, NEWMARK, paper_irk_at, paper_newmark_at
+from studies.bench.store import Array, Output
+from studies.bench.study import Study
+from studies.bench.tables import where
+
+Geometry = tuple[tuple[float, float, float], float]  # lengths of the bars and distance of the ground joints, m
+
+TOLERANCES = ERR_OUT  # of err_in, too
+FAMILIES = {"Table 3: IRK": IRK, "Table 3: Newmark": NEWMARK}
+# Table 3 as printed: [err_in][err_out] in seconds; None is the star, "no reasonable result in long time simulation"
+PAPER_IRK = ((1.95, 1.98, 2.00, 2.08), (2.12, 2.23, 2.31, 2.31), (2.64, 2.85, 2.85, 2.99), (3.37, 3.46, 3.55, 3.60))
+PAPER_NEWMARK = (
+    (None, 2.71, 12.62, 49.73),
+    (None, 2.74, 12.36, 49.68),
+    (None, 3.10, 12.68, 49.66),
+    (None, 3.09, 13.40, 50.93),
+)
+PAPER_END = 100.0  # s, of the paper's runs
+REPEATS = 3  # the times of a cell differ by a few per cent; an odd number has a middle one
+BESIDE = {  # solver and settings, loose to tight: tolerances, or steps in s of Exudyn, whose run at 1e-4 s takes 10 s
+    GIVEN: (1e-4, 1e-6, 1e-8),
+    IDA_C: (1e-4, 1e-6, 1e-8, 1e-10),
+    "Exudyn, GeneralizedAlpha": (1e-2, 4e-3, 1e-3),
+    "Exudyn, TrapezoidalIndex2": (1e-2, 4e-3, 1e-3),
+}
+
+
+def printed(group: str) -> tuple[tuple[float | None, ...], ...]:
+    """Return the paper's times of one procedure, s."""
+    return PAPER_IRK if group == "Table 3: IRK" else PAPER_NEWMARK
+
+
+def machine(rows: pd.DataFrame, group: str, err_in: float, err_out: float) -> pd.Series | None:
+    """Return the run of a cell."""
+    found = where(rows, group=group, err_in=err_in, err_out=err_out)
+    return None if found.empty else found.iloc[0]
+
+
+def least(run: pd.Series) -> float:
+    """Return the least time of the repetitions of a run, the one that other processes have prolonged least."""
+    times = run.get("times")
+    return float(min(times) if isinstance(times, tuple) and times else run["call_s"])
+
+
+def runs(case: Case, quick: bool) -> list[Run]:
+    """List the 32 cells and the solvers beside them, of which the default, with the shortest times, is repeated."""
+    repeats = 1 if quick else REPEATS
+    made = [
+        Run(case, at(e_in), e_out, group, repeats)
+        for group, at in zip(FAMILIES, (paper_irk_at, paper_newmark_at), strict=True)
+        for e_in in TOLERANCES
+        for e_out in TOLERANCES
+    ]
+    for name, values in BESIDE.items():
+        for value in values[:1] if quick else values:
+            made.append(Run(case, CATALOGUE[name], value, "beside", repeats if name == GIVEN else 1))
+    return made
+
+
+def make(output: Output, geometry: Geometry | None = None) -> pd.DataFrame:
+    """Make all rows, of the assumed geometry or of another."""
+    try:
+        case = four_bar.cases(output.call.quick)[0] if geometry is None else four_bar.case_of(*geometry)
+        _ = case.reference
+    except ValueError as error:
+        raise StudyError(f"no run with these lengths: {error}") from None
+    # the calls of a cell are long enough to be timed one by one
+    with output.kept() as kept:
+        rows = collect(runs(replace(case, timed=0.0), output.call.quick), kept)
+    return rows.assign(assumed=geometry is None)
+
+
+def ratios(rows: pd.DataFrame, group: str) -> Array:
+    """Return the paper's time over our least, err_in by err_out; NaN where either has no result that is of use."""
+    own = rows[(rows["group"] == group) & ~rows["lost"].astype(bool)]
+    own = own.assign(least=[least(row) for _, row in own.iterrows()])
+    ours = own.pivot_table("least", "err_in", "err_out").reindex(index=TOLERANCES, columns=TOLERANCES)
+    return np.array(printed(group), dtype=float) / ours.to_numpy(float)
+
+
+def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
+    """Compute what the report says."""
+    irk, newmark = (machine(rows, group, ERR_IN, ERR_IN) for group in FAMILIES)
+    if irk is None or newmark is None:
+        raise StudyError("the rows lack cells of Table 3; make them again by python -m studies.table3")
+    found: dict[str, Any] = {"t_end": float(rows["t_end"].iloc[0]), "assumed": bool(rows["assumed"].iloc[0])}
+    found |= {"paper_ratio": float(PAPER_NEWMARK[3][3] or 0.0) / PAPER_IRK[3][3]}
+    found |= {"time_ratio": newmark["call_s"] / irk["call_s"]}
+    found |= {"evaluation_ratio": newmark["n_evaluations"] / irk["n_evaluations"]}
+    for name, group in zip(("irk", "newmark"), FAMILIES, strict=True):
+        over, cells = ratios(rows, group), rows[rows["group"] == group]
+        kept = over[np.isfinite(over)]
+        found[f"{name}_over"] = [float(kept.min()), float(kept.max())] if kept.size else []
+        for what in ("lost", "astray"):
+            found[f"{name}_{what}"] = [
+                power(e) for e in sorted(cells[cells[what].astype(bool)]["err_out"].unique())[::-1]
+            ]
+    found["newmark_only_astray"] = [e for e in found["newmark_astray"] if e not in found["newmark_lost"]]
+    found |= {"lost_limit": LOST, "astray_limit": ASTRAY, "failed": int((rows["status"] != "REACHED_END").sum())}
+    return found | {"answer": answer_of(found)}
+
+
+def answer_of(found: dict[str, Any]) -> str:
+    """Say in one sentence whether the table comes out."""
+    dearer = f"Newmark takes {number(found['time_ratio'])} times the time of Runge–Kutta at the tightest tolerances"
+    if found["t_end"] != PAPER_END:
+        return f"{dearer}; the paper's {number(found['paper_ratio'])} is for {number(PAPER_END)} s."
+    return f"The order comes out, the times do not: {dearer}, in the paper {number(found['paper_ratio'])} times."
+
+
+def grid(rows: pd.DataFrame, group: str, paper: bool) -> str:
+    """Make a table of times in s, err_in by err_out: ours, or with `paper` those that are printed."""
+    lines = []
+    for e_in, own in zip(TOLERANCES, printed(group), strict=True):
+        ours = [machine(rows, group, e_in, e_out) for e_out in TOLERANCES]
+        times = own if paper else [None if run is None else run["call_s"] for run in ours]
+        lines.append([power(e_in), *(number(time, 4 if paper else 2) for time in times)])
+    return table(["err_in \\ err_out", *map(power, TOLERANCES)], lines)
+
+
+def counts(rows: pd.DataFrame) -> str:
+    """Make a table of evaluations and errors along err_out, with the finest inner loop; err_in hardly changes them."""
+    lines = []
+    for name, group in zip(("Runge–Kutta", "Newmark"), FAMILIES, strict=True):
+        own = [machine(rows, group, ERR_IN, err_out) for err_out in TOLERANCES]
+        for what, key in (("evaluations", "n_evaluations"), ("largest error (m, rad)", "error_q")):
+            lines.append([f"{name}, {what}", *("–" if run is None else number(float(run[key])) for run in own)])
+    return table(["err_out", *map(power, TOLERANCES)], lines)
+
+
+def beside(rows: pd.DataFrame) -> str:
+    """Make a table of the solvers beside the procedures, with these at their tightest, from the largest error down."""
+    own = rows[rows["group"].isin(FAMILIES) & (rows["err_in"] == ERR_IN) & (rows["err_out"] == ERR_IN)]
+    chosen = pd.concat([own, rows[rows["group"] == "beside"]])
+    lines = []
+    for _, run in chosen.sort_values("error_q", ascending=False).iterrows():
+        numbers = [run["call_s"], run["error_q"], run["violation_q"]]
+        lines.append([run["solver"], tables.setting(run), *map(number, numbers)])
+    return table(["solver", "setting", "CPU time (s)", "largest error (m, rad)", "violation of C (m)"], lines)
+
+
+def picture(rows: pd.DataFrame, found: dict[str, Any]) -> Figure:
+    """Draw the paper's time over ours, of both procedures: one colour, were the machine all the difference."""
+    known = {group: ratios(rows, group) for group in FAMILIES}
+    every = np.concatenate([np.ravel(each) for each in known.values()])
+    norm = LogNorm(np.nanmin(every), max(np.nanmax(every), 1.01 * np.nanmin(every)))
+    figure, panels = plt.subplots(1, 2, figsize=(7.4, 3.4), sharey=True, layout="constrained")
+    colours = plt.get_cmap("viridis").with_extremes(bad="#e6e6e6")
+    for axes, (group, name) in zip(panels, FAMILIES.items(), strict=True):
+        image = axes.imshow(known[group], norm=norm, cmap=colours)
+        for (i, j), value in np.ndenumerate(known[group]):
+            text = "no result" if np.isnan(value) else number(value)
+            size = 7 if np.isnan(value) else None
+            color = "black" if np.isnan(value) or norm(value) >= 0.6 else "white"
+            axes.text(j, i, text, ha="center", va="center", color=color, fontsize=size)
+        axes.set_xticks(range(len(TOLERANCES)), [power(e) for e in TOLERANCES])
+        axes.set_yticks(range(len(TOLERANCES)), [power(e) for e in TOLERANCES])
+        axes.set_xlabel("err_out")
+        axes.set_title(name, fontsize=9)
+        axes.grid(False)
+    panels[0].set_ylabel("err_in")
+    ticks = LogLocator(subs=(1.0, 2.0, 3.0, 4.0, 6.0, 8.0))
+    scale = figure.colorbar(image, ax=panels, shrink=0.8, ticks=ticks, format=lambda value, _: number(value))
+    scale.set_label("paper's time / ours")
+    least_, most = number(np.nanmin(every)), number(np.nanmax(every))
+    figures.message(figure, f"The paper's times are {least_} to {most} times ours: not one factor")
+    return figure
+
+
+def figures_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Figure]:
+    """Draw the ratios of the times where runs are as long as the paper's."""
+    return {"table3_ratios": picture(rows, found)} if found["t_end"] == PAPER_END else {}
+
+
+def tables_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, str]:
+    """Make the tables of the report, and print those of the times."""
+    ready = {"counts": counts(rows), "beside": beside(rows)}
+    for name, group in zip(("irk", "newmark"), FAMILIES, strict=True):
+        ready |= {name: grid(rows, group, paper=False), f"{name}_paper": grid(rows, group, paper=True)}
+        print(f"\n{group}, CPU time in s over {number(found['t_end'])} s\n{ready[name]}")
+        if found["t_end"] == PAPER_END:
+            print(f"as printed in the paper\n{ready[f'{name}_paper']}")
+    print(f"\nbeside them\n{ready['beside']}")
+    return ready
+
+
+def study_of(geometry: Geometry | None = None) -> Study:
+    """Return the study, with the geometry that is assumed or with another."""
+    made = partial(make, geometry=geometry)
+    return Study("table3", __doc__, made, findings_of, figures_of, tables_of, medians=True)
+
+
+def geometry_of(lengths: Sequence[float] | None, ground: float | None) -> Geometry | None:
+    """Return the geometry that --lengths and --ground give; neither: the assumed one."""
+    if (lengths is None) != (ground is None):
+        raise StudyError("--lengths L1 L2 L3 and --ground G go together: the paper's Table 2 has all four")
+    return None if lengths is None or ground is None else ((lengths[0], lengths[1], lengths[2]), ground)

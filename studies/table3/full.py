@@ -1,0 +1,256 @@
+"""Table 3 at length: both two-loop procedures and other solvers at equal error, and why the times differ."""
+
+from functools import partial
+from itertools import chain, pairwise
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+
+from studies.bench import adaptive, figures, tables
+from studies.bench.cases import four_bar
+from studies.bench.cli import StudyError
+from studies.bench.collector import REPEATS, Case, Run, Solver, Warm, collect, row_of
+from studies.bench.headline import OWN_CODE
+from studies.bench.metrics import ASTRAY, LOST
+from studies.bench.render import number, power, table
+from studies.bench.solvers import (
+    ADAMS,
+    CATALOGUE,
+    CVODE_C,
+    CYRK,
+    DEFAULT,
+    ERR_IN,
+    HEYOKA,
+    IDA_C,
+    IDA_INDEX_1,
+    IRK,
+    IRK_LINE,
+    NEWMARK,
+    OWN_EXPLICIT,
+    QUARTER,
+    TAYLOR,
+    paper_irk_at,
+    paper_newmark_at,
+)
+from studies.bench.store import Output, Row
+from studies.bench.study import Study
+from studies.bench.tables import used
+from studies.table3.causes import UNEQUAL, by_repetition, causes, reading_runs
+from studies.table3.cells import FAMILIES, PAPER_IRK, PAPER_NEWMARK, TOLERANCES, machine
+from twoloop import Result, RungeKutta, solve_dae
+from twoloop.methods.tableaux import gauss
+
+TARGETS = (1e-2, 1e-4, 1e-6)
+PAPER = (NEWMARK, QUARTER, IRK_LINE)
+EXPLICIT = (OWN_EXPLICIT, TAYLOR, ADAMS)  # all coordinates, projected: not the paper's procedure
+OTHERS = (
+    *(DEFAULT, OWN_CODE, "SunRadau5", "Gauss6", "Gauss12", "BDF", OWN_EXPLICIT, ADAMS, TAYLOR),
+    *(HEYOKA, CYRK, CVODE_C, IDA_C, "IDA, stabilised", "LSODA, index 1", "DOP853, index 1", "DOP853, projected"),
+    *("Exudyn, GeneralizedAlpha", "Exudyn, TrapezoidalIndex2"),
+)
+# for seconds: no quick runs
+COMPILED = (
+    OWN_CODE,
+    HEYOKA,
+    CYRK,
+    CVODE_C,
+    "IDA, stabilised",
+    "LSODA, index 1",
+    "DOP853, index 1",
+    "DOP853, projected",
+)
+DRAWN = (OWN_CODE, NEWMARK, IRK_LINE, HEYOKA, CYRK, IDA_C)
+STEP = 0.01  # s, of the runs that tell what a partition costs
+
+
+def _fixed(partition: str, case: Case, step: float, repeat: int) -> Result:
+    return solve_dae(*case.start, method=RungeKutta(gauss(1), partition=partition), step_size=step)  # type: ignore[arg-type]
+
+
+def runs(first: Case, second: Case, quick: bool) -> list[Run]:
+    """The cells of the table, what a partition costs, both readings of (32), and the other solvers.
+
+    On the second geometry only the paper's procedures: `studies.work_precision` has the others there.
+    """
+    made = reading_runs(first)
+    for case, once in ((first, quick), (second, True)):
+        for group, at in zip(FAMILIES, (paper_irk_at, paper_newmark_at), strict=True):
+            cells = [(e_in, e_out) for e_in in TOLERANCES for e_out in TOLERANCES if case is first or e_in == e_out]
+            made += [Run(case, at(e_in), e_out, group, 1 if once else REPEATS) for e_in, e_out in cells]
+    for partition in ("lasting", "symmetric"):
+        solver = Solver(f"fixed step, {partition}", "two-loop", "compiled", True, "h", partial(_fixed, partition))
+        made.append(Run(first, solver, STEP, "partition", 3 if quick else 9))  # they differ by little
+    more = [] if quick else [IDA_INDEX_1]
+    names = [name for name in (*PAPER, *OTHERS, *more) if not (quick and name in COMPILED)]
+    for case, names_ in ((first, names),) if quick else ((first, names), (second, PAPER)):
+        for name in names_:
+            solver = CATALOGUE[name]
+            values = solver.grid(case) if name not in (NEWMARK, QUARTER) else (1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10)
+            made += [
+                Run(case, solver, x, "comparison", 1 if quick else REPEATS) for x in (values[1:3] if quick else values)
+            ]
+    return made
+
+
+def make(output: Output) -> pd.DataFrame:
+    """Make all rows, with the height of bar 3's centre, by which the paper judges energy."""
+
+    def highest(run: Run, result: Result) -> dict[str, float]:
+        return {"y3_max": float(result.q[four_bar.Y3].max()) if result.t.size else float("nan")}
+
+    def row(run: Run, repeat: int, built: Warm) -> Row:
+        return row_of(run, repeat, highest, built)
+
+    quick = output.call.quick
+    first, second = four_bar.cases(quick)
+    todo, errors = runs(first, second, quick), () if quick else TARGETS
+    compared = [run for run in todo if run.group == "comparison"]
+    with output.kept() as kept:
+        rows = collect([run for run in todo if run.group != "comparison"], kept, highest)
+        more = adaptive.collect(compared, kept, row, lambda run: True, errors, adaptive.is_ours)
+    return pd.concat([rows, more], ignore_index=True)
+
+
+def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
+    first = rows[rows["problem"] == rows["problem"].iloc[0]]
+    irk, newmark = (machine(first, group, ERR_IN, ERR_IN) for group in FAMILIES)
+    if irk is None or newmark is None:
+        raise StudyError("the rows lack cells of Table 3; make them again by python -m studies.table3")
+    found: dict[str, Any] = {"t_end": float(first["t_end"].iloc[0])}
+    found |= {"lost_limit": LOST, "astray_limit": ASTRAY}
+    found["paper_ratio"] = float(PAPER_NEWMARK[3][3] or 0.0) / PAPER_IRK[3][3]
+    for name, cell in (("irk", irk), ("newmark", newmark)):
+        found[f"{name}_s"] = cell["call_s"]
+        cells = first[first["group"] == cell["group"]]
+        for what in ("lost", "astray"):
+            bad = cells[cells[what].astype(bool)]["err_out"].unique()
+            found[f"{name}_{what}"] = [power(e) for e in sorted(bad, reverse=True)]
+    found["newmark_only_astray"] = [e for e in found["newmark_astray"] if e not in found["newmark_lost"]]
+    found["ratio_s"] = by_repetition(newmark, irk)
+    same = first[(first["solver"] == NEWMARK) & (first["err_in"] == ERR_IN) & (first["err_out"] == ERR_IN)]
+    times = [time for own in same["times"] for time in own]  # of all its repetitions, in whatever group
+    found["newmark_times"] = [float(min(times)), float(max(times))]
+    found["times_unequal"] = found["newmark_times"][1] > UNEQUAL * found["newmark_times"][0]
+    found["ratio_evaluations"] = newmark["n_evaluations"] / irk["n_evaluations"]
+    ratios = _newmark_over_irk(first)
+    over = list(chain(*ratios.values()))
+    found["newmark_over_irk"] = [min(over), max(over)] if over else []
+    found["newmark_errors"] = list(ratios)
+    found["newmark_dearer_everywhere"] = bool(over and min(over) > 1.0)
+    found["cheapest"] = [line for error in TARGETS if (line := _cheapest(_compared(first), error)) is not None]
+    found["explicit"] = _explicit(first)
+    found |= _of_default(first)
+    failed = rows[rows["status"] != "REACHED_END"]
+    found |= {"failed": len(failed), "failed_two_loop": int((failed["family"] == "two-loop").sum())}
+    return found | {"newmark_growth": growth(first)} | causes(first) | {"answer": _answer(found["cheapest"])}
+
+
+def _answer(cheapest: list[dict[str, Any]]) -> str:
+    dearer = [number(irk) for each in cheapest if (irk := each["paper_times"])]
+    if not dearer:
+        return "No error is reached by both the paper's Runge–Kutta procedure and another solver."
+    over = f"{dearer[0]} to {dearer[-1]}" if len(dearer) > 1 else dearer[0]
+    return f"At equal error, the paper's Runge–Kutta procedure takes {over} times as long as the cheapest solver."
+
+
+def growth(first: pd.DataFrame) -> list[dict[str, Any]]:
+    """Growth of Newmark's cost between neighbouring err_out, least and most over err_in: printed, our time and counts.
+
+    A star of the paper, or a run of ours that lost its energy, has no cost that could grow.
+    """
+    found = []
+    group = "Table 3: Newmark"
+    for j, (loose, tight) in enumerate(pairwise(TOLERANCES)):
+        factors: dict[str, list[float]] = {"printed": [], "time": [], "evaluations": []}
+        for e_in, (before, after) in zip(TOLERANCES, (row[j : j + 2] for row in PAPER_NEWMARK), strict=True):
+            ours, finer = (machine(first, group, e_in, e_out) for e_out in (loose, tight))
+            if before and after and ours is not None and finer is not None and not (ours["lost"] or finer["lost"]):
+                factors["printed"].append(after / before)
+                factors["time"].append(finer["call_s"] / ours["call_s"])
+                factors["evaluations"].append(finer["n_evaluations"] / ours["n_evaluations"])
+        if factors["printed"]:
+            spans = {what: [float(min(each)), float(max(each))] for what, each in factors.items()}
+            found.append({"from": power(loose), "to": power(tight)} | spans)
+    return found
+
+
+def _of_default(first: pd.DataFrame) -> dict[str, Any]:
+    """From which tolerance down the default takes the steps of the Taylor series, and whether it is explicit beside."""
+    default, series = (
+        first[(first["solver"] == name) & first["error_q"].notna()].sort_values("tol") for name in (DEFAULT, TAYLOR)
+    )
+    both = default.merge(series, on="tol", suffixes=("", "_series"))
+    alike = (both["n_steps"] == both["n_steps_series"]) & (both["error_q"] == both["error_q_series"])
+    same = both["tol"][alike.cummin().astype(bool)]
+    looser = default[default["tol"] > same.max()] if len(same) else default
+    explicit = len(looser) > 0 and all(used(run) == "explicit" for _, run in looser.iterrows())
+    return {"series_from": float(same.max()) if len(same) else None, "default_explicit": explicit}
+
+
+def _cheapest(first: pd.DataFrame, error: float) -> dict[str, Any] | None:
+    """The cheapest solver at an error, and how many times as long the paper's procedure and IDA from C take."""
+    ranked = tables.ranking(first, error)
+    if ranked.empty:
+        return None
+    times = dict(zip(ranked["solver"], ranked["call_s"] / ranked["call_s"].iloc[0], strict=True))
+    found = {"error": error, "paper_times": times.get(IRK_LINE), "ida_times": times.get(IDA_C)}
+    found["beside"] = None
+    if len(ranked) > 1:
+        best, second = ranked["solver"].iloc[:2]
+        costs = tables.costs_at(first, error)
+        verdict = tables.compared({best: costs[best]}, {second: costs[second]})["verdict"]
+        found["beside"] = None if verdict == "ahead" else str(second)
+    return found | (tables.best(ranked) or {})
+
+
+def _newmark_over_irk(first: pd.DataFrame) -> dict[str, list[float]]:
+    """CPU time of Newmark, with either beta, over that of Runge-Kutta, at errors that both reach or pass."""
+    fine = _compared(first)
+    found: dict[str, list[float]] = {}
+    for target in (0.1, 0.03, 0.01, 0.003):  # a solution worse than these is of no use
+        half, quarter, irk = (
+            tables.time_for(runs_, target) if target <= runs_["error_q"].max() else np.nan
+            for runs_ in (fine[fine["solver"] == solver] for solver in PAPER)
+        )
+        ratios = [float(newmark / irk) for newmark in (half, quarter) if not np.isnan(newmark / irk)]
+        found |= {number(target): ratios} if ratios else {}
+    return found
+
+
+def _explicit(first: pd.DataFrame) -> dict[str, Any]:
+    """Time of the paper's Runge-Kutta procedure over that of the cheapest explicit method on all coordinates."""
+    fine = _compared(first)
+    over = {}
+    for error in TARGETS:
+        paper, *explicit = (tables.time_for(fine[fine["solver"] == name], error) for name in (IRK_LINE, *EXPLICIT))
+        least = np.fmin.reduce(explicit)  # of those that get there
+        if not np.isnan(paper) and not np.isnan(least):
+            over[power(error)] = float(paper / least)
+    return {"solvers": list(EXPLICIT), "paper": IRK, "errors": list(over), "over": list(over.values())}
+
+
+def _compared(first: pd.DataFrame) -> pd.DataFrame:
+    """The runs that are compared at equal error: of the cells of the table those with the finest inner loop."""
+    fine = first["err_in"].isna() | (first["err_in"] == ERR_IN)
+    return first[first["group"].isin(("comparison", *FAMILIES)) & fine]
+
+
+def figures_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Figure]:
+    """Cost over error."""
+    first = rows[rows["problem"] == rows["problem"].iloc[0]]
+    dearer = [irk for each in found["cheapest"] if (irk := each["paper_times"])]
+    most = f"{number(min(dearer))} to {number(max(dearer))} times" if dearer else "more"
+    title = f"The paper's Runge–Kutta procedure takes {most} the least time"
+    return {"table3_full": figures.work_precision(_compared(first), DRAWN, title, coded=True)}
+
+
+def tables_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, str]:
+    """Make the table of the report."""
+    first = rows[rows["problem"] == rows["problem"].iloc[0]]
+    made = tables.work_precision(_compared(first), TARGETS, DRAWN, coded=True)
+    return {"work": table(["solver", *map(power, TARGETS)], [[solver, *costs] for solver, _, *costs in made])}
+
+
+STUDY = Study("table3_full", __doc__, make, findings_of, figures_of, tables_of, medians=True)
