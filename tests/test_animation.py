@@ -1,10 +1,8 @@
 """Animations: pages, GIFs and films of results. No browser is needed: the script of a page runs under node."""
 
-import json
 import re
 import stat
 import sys
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,7 +10,6 @@ import pytest
 from tests.processes import run_node
 from twoloop import solve_dae
 from twoloop.mechanisms import pendulum, spatial_slider_crank
-from twoloop.result.animation import projected
 
 Image = pytest.importorskip("PIL.Image")  # not among the oldest versions
 # a document with what the page asks of it; counts what is drawn, and lets time pass frame by frame
@@ -64,28 +61,9 @@ def crank():
     return solve_dae(problem.system, (0.0, 0.2), problem.q0, problem.v0, dense_output=True)
 
 
-def scene_of(path):
-    return json.loads(re.search(r"const scene = (.*);\n", path.read_text(encoding="utf-8"))[1])
-
-
 def played(path):
     script = re.search(r"<script>(.*)</script>", path.read_text(encoding="utf-8"), re.DOTALL)[1]
     return run_node(f"{DOCUMENT}{script}{PLAYED}")
-
-
-def test_the_page_of_a_planar_mechanism(swung, tmp_path):
-    path = swung.animate(tmp_path / "swing.html")
-    scene = scene_of(path)
-    frames = np.array(scene["frames"])
-    assert frames.shape == (76, 2, 2)  # 3 s of 25 pictures, and the last
-    assert scene["times"][::75] == [0.0, 1.0] and len(scene["fixed"]) == 1
-    assert np.linalg.norm(frames[:, 1] - frames[:, 0], axis=1) == pytest.approx(np.ones(76), abs=1e-3)
-    for frame, t in zip(frames[::15], np.linspace(0.0, 1.0, 76)[::15], strict=True):
-        assert frame[1 - scene["fixed"][0]] == pytest.approx(pendulum().motion(t)[0], abs=1e-3)
-    (bob,) = np.array(scene["paths"])  # four points for each frame
-    assert bob.shape == (301, 2) and np.linalg.norm(bob, axis=1) == pytest.approx(np.ones(301), abs=1e-3)
-    np.testing.assert_array_equal(bob[::4], frames[:, 1 - scene["fixed"][0]])
-    assert "http" not in path.read_text(encoding="utf-8")  # needs no other file
 
 
 def test_the_script_of_a_planar_page(swung, tmp_path):
@@ -140,25 +118,3 @@ def test_a_film_is_what_ffmpeg_gets(crank, tmp_path, monkeypatch):
     program.unlink()
     with pytest.raises(RuntimeError, match=r"needs the program ffmpeg.*or write \.gif, \.html"):
         crank.animate(tmp_path / "crank.mp4", seconds=0.2)
-
-
-def test_seen_from_the_front_and_above():
-    axes = projected(np.eye(3)[:, :, None])[..., 0]
-    assert axes[2, 0] == 0.0 and axes[2, 1] > 0.9  # z points upwards
-    assert axes[0, 0] > 0.0 and axes[1, 0] > 0.0  # x and y to the right
-
-
-def test_between_stored_times_with_and_without_the_dense_solution(crank, tmp_path):
-    with_sol, without = (
-        np.array(scene_of(each.animate(tmp_path / f"{k}.html"))["frames"])
-        for k, each in enumerate((crank, replace(crank, sol=None)))
-    )
-    assert np.abs(with_sol - without).max() < 1e-4
-
-
-def test_what_cannot_be_animated(swung, tmp_path):
-    with pytest.raises(ValueError, match="seconds must be positive"):
-        swung.animate(tmp_path / "swing.gif", seconds=0.0)
-    short = replace(swung, t=swung.t[:1], q=swung.q[:, :1], v=swung.v[:, :1], a=swung.a[:, :1])
-    with pytest.raises(ValueError, match="two times at least; this one has 1"):
-        short.animate(tmp_path / "swing.gif")

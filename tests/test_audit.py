@@ -1,8 +1,6 @@
 """The audit: a simulator's order, floor and step; an MJCF file in MuJoCo, compared before it moves; what is refused."""
 
 import json
-import sys
-from dataclasses import replace
 from importlib.util import find_spec
 
 import numpy as np
@@ -132,31 +130,6 @@ def test_gaps_are_of_points_that_joints_keep_together():
     assert gaps(model, along, R)[0] < 1e-12 and gaps(model, across, R)[0] == pytest.approx(0.2)
     with pytest.raises(ValueError, match="given"):
         coordinates(x[0], R)
-
-
-def test_what_is_left_out_of_many_joints_is_counted():
-    given = ("limits of joint 'a'", "actuator: motor 'm'", "limits of joint 'b'", "armature of joint 'a'")
-    assert mjcf_audit._counted(given) == ["limits of 2 joints", "actuator: motor 'm'", "armature of joint 'a'"]
-
-
-def test_without_mujoco_it_says_so(tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "mujoco", None)
-    with pytest.raises(RuntimeError, match="mujoco is not installed: pip install mujoco"):
-        audit_mjcf(file_with(tmp_path))
-
-
-def test_neither_a_short_step_nor_a_large_model_takes_for_ever(pendulum, monkeypatch):
-    taken = []
-
-    def simulate(problem, times, step):
-        taken.append(round((times[-1] - times[0]) / step))
-        return falling()(problem, times, step)
-
-    audit_simulator(simulate, pendulum, step=1e-9, error=1e-3)
-    assert taken[0] <= 100_000
-    monkeypatch.setattr(step_audit, "KNOWN_WITHIN", 1e-9)
-    with pytest.raises(RuntimeError, match=r"ends at .* s: use a shorter time span"):
-        audit_simulator(simulate, replace(pendulum, t_span=(0.0, 100.0)), step=1e-2)
 
 
 @pytest.mark.skipif(find_spec("mujoco") is None, reason="MuJoCo is not installed")

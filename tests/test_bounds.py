@@ -14,7 +14,6 @@ from twoloop import ConstrainedSystem, callback, consistent_state, solve_dae
 from twoloop.checks import bounds, values
 from twoloop.generate import exact_derivatives
 from twoloop.kernels.compile.callbacks import KINDS
-from twoloop.kernels.compile.indices import computes_indices
 
 FAR = 10**7  # a write so far out would end the process
 Q, V = [-1.0, 0.0], [0.0, 0.0]
@@ -163,14 +162,6 @@ def test_what_runs_only_compiled_is_watched_too():
         system(force=force).force(0.0, Q, V)
 
 
-def test_functions_compiled_by_from_python_are_watched():
-    def force(t, q, v):
-        return np.array([q[FAR], 0.0])
-
-    with pytest.raises(ValueError, match=rf"force of 'pendulum' goes out of bounds: index {FAR}.*q\[FAR\]"):
-        pendulum(compile=True, force=force).force(0.0, Q, V)
-
-
 def test_a_callback_is_looked_at_once_and_changes_nothing():
     @callback("force")
     def force(t, q, v, p, Q):
@@ -184,14 +175,6 @@ def test_a_callback_is_looked_at_once_and_changes_nothing():
     force.py_func = None  # what is looked at again would fail now
     given.force(0.0, q, v)
     assert q.tolist() == Q and v.tolist() == V
-
-
-def test_negative_indices_count_from_the_end_as_in_python():
-    @callback("force")
-    def force(t, q, v, p, Q):
-        Q[-1] = -9.81 * q[-2]
-
-    assert system(force=force).force(0.0, Q, V).tolist() == [0.0, 9.81]
 
 
 # --- what the caller passes
@@ -215,11 +198,6 @@ def test_negative_indices_count_from_the_end_as_in_python():
 def test_arguments_of_single_callbacks_are_checked(make, kind, arguments, error, words):
     with pytest.raises(error, match=words):
         getattr(make(), kind)(*arguments)
-
-
-def test_arguments_of_single_callbacks_may_be_named():
-    assert pendulum().force(t=0.0, q=Q, v=V).tolist() == [0.0, -9.81]
-    assert pendulum().force(0.0, v=V, q=np.array([Q, Q]).T[:, 0]).tolist() == [0.0, -9.81]
 
 
 # --- indices that are computed: their bounds are watched in every call
@@ -327,25 +305,3 @@ def plain(q, p, out):
     for i in range(3):
         for j, k in ((0, 1), (1, 0)):
             out[3 * i + j] = q[i] * p[len(p) - 1] + out[-k]
-
-
-def by_search(q, p, out):
-    i = 0
-    while q[0] > p[i]:
-        i += 1
-    out[0] = p[i]
-
-
-def by_counting(q, p, out):
-    for i in range(int(q[0])):
-        out[0] += p[i]
-
-
-def by_values(q, p, out):
-    for i in (0, int(p[0])):
-        out[i] = q[0]
-
-
-def test_which_functions_compute_indices():
-    assert not computes_indices(plain)
-    assert all(map(computes_indices, (by_search, by_counting, by_values, looked_up.py_func, in_a_table.py_func)))

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from tests.own_cache import RUN, Folder
-from twoloop.kernels.compile import caches, ownership
+from twoloop.kernels.compile import ownership
 from twoloop.kernels.compile.ownership import doubt_of, make_own, own_folder, read_own, write_own
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="rights on other systems are not in the mode")
@@ -124,25 +124,6 @@ def test_whose_folders_are_in_doubt(tmp_path, monkeypatch, changes, why, above):
     assert doubt_of(folder) == (f"{at} {why}" if why else "") and (own_folder(folder) == folder) == (not why)
 
 
-def test_a_sticky_folder_above_is_as_good_as_its_owner(tmp_path, monkeypatch):
-    folder = tmp_path / "shared" / "folder"
-    make_own(folder)
-    folder.parent.chmod(0o1777)  # as /tmp
-    assert doubt_of(folder) == ""
-    folder.chmod(0o1777)
-    assert "can be written by everybody" in doubt_of(folder)
-    folder.chmod(0o755)
-    seen_as(monkeypatch, folder.parent, uid=OTHER, mode=0o041777)
-    assert doubt_of(folder) == f"{folder.parent} belongs to user {OTHER}"
-
-
-def test_a_link_is_followed(tmp_path):
-    make_own(tmp_path / "open")
-    (tmp_path / "open").chmod(0o777)
-    (tmp_path / "link").symlink_to(tmp_path / "open")
-    assert doubt_of(tmp_path / "link") == doubt_of(tmp_path / "open") != ""
-
-
 @pytest.mark.parametrize(
     ("name", "members", "primary", "private"),
     [("ann", [], True, True), ("ann", ["bob"], True, False), ("staff", [], True, False), ("ann", [], False, False)],
@@ -171,7 +152,3 @@ def test_where_the_users_caches_are_in_doubt_too_code_ends_with_the_process(tmp_
     make_own(folder)
     write_own(folder / "file", b"content")
     assert read_own(folder / "file") == b"content"
-
-
-def test_the_advice_names_the_folder_to_take():
-    assert "NUMBA_CACHE_DIR" in caches.UNWRITABLE and "only you can write" in caches.UNWRITABLE

@@ -1,6 +1,5 @@
 """Machine code on disk: read again when nothing changed, rebuilt when anything did, never a reason to fail."""
 
-import math
 from typing import NamedTuple
 
 import numpy as np
@@ -182,26 +181,6 @@ def test_a_digest_follows_the_values_of_any_type(monkeypatch):
     assert watch(names_a_dictionary.py_func) is None
 
 
-@njit
-def takes_an_attribute(x):
-    return math.log(x)
-
-
-def test_an_attribute_is_not_the_global_of_the_same_name(monkeypatch):
-    """A callback that calls `math.log` was not kept where its file had something else that is called `log`."""
-    stamp = watch(takes_an_attribute.py_func)
-    monkeypatch.setitem(globals(), "log", object())
-    assert watch(takes_an_attribute.py_func) == stamp is not None
-
-
-def test_digests_of_functions_that_name_themselves_end():
-    @njit
-    def again(x):
-        return again(x - 1.0) if x > 0.0 else 0.0
-
-    assert watch(again.py_func) == watch(again.py_func) is not None
-
-
 def scaled(scale, helper):
     @kept_when_called()
     def function(x):
@@ -220,14 +199,6 @@ def test_closures_are_kept_by_what_they_enclose():
     assert scaled(1.0, named)._cache.cache_path is None  # it cannot be watched
     stands_for(named, "a name")
     assert scaled(1.0, named)._cache.cache_path is not None
-
-
-def test_a_closure_that_another_encloses_is_not_compiled_again():
-    inner = scaled(2.0, njit(lambda x: x))
-    assert inner(1.0) == 2.0
-    before = list(inner.overloads.values())
-    assert scaled(3.0, inner)(1.0) == 6.0 and list(inner.overloads.values()) == before
-    assert len(list(inner._cache._cache_file._all())) == 1  # nor is its machine code removed from the disk
 
 
 OPEN_FILES = (object(),)

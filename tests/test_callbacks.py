@@ -1,9 +1,6 @@
 """The table of callbacks and what follows from it, the decorator, and what becomes of plain Python functions."""
 
 import inspect
-import subprocess
-import sys
-from pathlib import Path
 
 import numba
 import numpy as np
@@ -16,40 +13,6 @@ from twoloop.kernels.compile.callbacks import KINDS, OPTIONAL
 from twoloop.kernels.data.common import KIT, Functions
 from twoloop.kernels.data.flags import GIVEN
 
-SOURCE = """
-import numpy as np
-from twoloop import ConstrainedSystem, callback, solve_dae
-
-@callback("mass")
-def mass(t, q, p, M):
-    M[0, 0] = M[1, 1] = p[0]
-
-@callback("force")
-def force(t, q, v, p, Q):
-    Q[1] = -9.81 * p[0]
-
-@callback("constraint")
-def constraint(t, q, p, C):
-    C[0] = 0.5 * (q[0] ** 2 + q[1] ** 2 - 1.0)
-
-@callback("jacobian")
-def jacobian(t, q, p, Cq):
-    Cq[0, 0] = q[0]
-    Cq[0, 1] = q[1]
-
-system = ConstrainedSystem(n_q=2, n_c=1, mass=mass, force=force, constraint=constraint, jacobian=jacobian,
-                           parameters=[2.0], constant_mass=True, name="typed")
-print(solve_dae(system, (0.0, 0.1), [-1.0, 0.0], [0.0, 0.0]).success)
-"""
-
-
-@pytest.mark.parametrize("how", [pytest.param("-c", marks=pytest.mark.slow), "stdin"])
-def test_callbacks_may_be_typed_at_a_prompt(how):
-    command, given = ([sys.executable, "-c", SOURCE], None) if how == "-c" else ([sys.executable, "-"], SOURCE)
-    done = subprocess.run(command, input=given, capture_output=True, text=True, timeout=300)
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.strip() == "True"
-
 
 @callback("force")
 def gravity(t, q, v, p, Q):
@@ -57,17 +20,6 @@ def gravity(t, q, v, p, Q):
 
 
 PENDULUM = {"n_q": 2, "n_c": 1, "mass": heavy, "force": gravity, "constraint": circle, "jacobian": radius}  # p = mass
-
-
-def test_a_constant_mass_is_factored_once():
-    def run(constant):
-        system = ConstrainedSystem(**PENDULUM, parameters=[2.0], constant_mass=constant)
-        return solve_dae(system, (0.0, 1.0), [-1.0, 0.0], [0.0, 0.0])
-
-    once, always = run(True), run(False)
-    np.testing.assert_allclose(once.q[:, -1], always.q[:, -1], atol=1e-10)
-    # T^T M T is factored at every state, with M constant not again at the same
-    assert 0.9 * always.stats.n_factorizations < once.stats.n_factorizations <= always.stats.n_factorizations
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -99,14 +51,6 @@ def test_what_numba_cannot_compile_takes_two_lines():
     assert caught.value.__suppress_context__  # nor are numba's own hundred lines shown below
 
 
-AT_THE_MARGIN = {"force": lambda t, q, v: np.array([0.0, undefined_name])}  # noqa: F821
-
-
-def test_lines_of_the_source_are_not_taken_for_what_numba_says():
-    with pytest.raises(TypeError, match=r"Numba says: TypingError: NameError: name 'undefined_name' is not defined$"):
-        pendulum(compile=True, **AT_THE_MARGIN)
-
-
 @pytest.mark.parametrize("kind", ["mass", "force", "constraint", "jacobian", "constraint_rate", "gamma"])
 def test_plain_functions_are_sent_to_from_python(kind):
     with pytest.raises(TypeError, match=rf"{kind} must be compiled by @twoloop.callback.*from_python"):
@@ -126,16 +70,6 @@ def test_a_kind_is_known_everywhere(kind):
         assert f"{kind} : " in maker.__doc__, name
         assert (inspect.signature(maker).parameters[kind].default is None) == (kind in OPTIONAL)
     assert tuple(inspect.signature(getattr(pendulum(), kind)).parameters) == ("t", *entry.state)
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_contributing_has_a_row_for_each_kind(kind):
-    entry = KINDS[kind]
-    rows = [line for line in CONTRIBUTING.splitlines() if f'`"{kind}"`' in line]
-    assert len(rows) == 1 and f"`{', '.join(entry.arguments)}`" in rows[0] and entry.size in rows[0]
-
-
-CONTRIBUTING = (Path(__file__).parents[1] / "CONTRIBUTING.md").read_text()
 
 
 @pytest.mark.parametrize("maker", MAKERS.values(), ids=MAKERS)
@@ -159,11 +93,6 @@ def test_what_is_left_out_leaves_zeros(kind):
     values = getattr(system, kind)(0.0, *state)
     for value, zeros in zip(values if KINDS[kind].more else [values], system.arrays_of(kind), strict=True):
         assert value.shape == zeros.shape and not value.any()
-
-
-def test_gamma_left_out_cannot_be_called():
-    with pytest.raises(ValueError, match="'pendulum' was given no gamma"):
-        pendulum(gamma=False).gamma(0.0, np.ones(2), np.ones(2))
 
 
 @numba.njit

@@ -130,13 +130,6 @@ def test_arrays_in_each_others_place(pair, saved, tmp_path):
         twoloop.load(tmp_path / "mixed.npz")
 
 
-def test_files_of_before_there_were_check_sums_are_read(saved, tmp_path):
-    one, other = (
-        twoloop.load(path, four_bar().system) for path in (saved, changed(saved, tmp_path, lambda a, w: None))
-    )
-    assert (one.sol(0.123).q == other.sol(0.123).q).all()
-
-
 def test_a_field_whose_bytes_changed_is_named(saved, tmp_path):
     content = bytearray(saved.read_bytes())
     content[content.index(b"lam.npy") + 400] ^= 1

@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 from tests.general.mechanisms import mechanism
 from tests.problems import force_residual, pendulum_state, run, swing, violations, worst
 from twoloop import RungeKutta, Status, solve_dae
-from twoloop.mechanisms import moderately_stiff_beam
 from twoloop.methods.presets import PRESETS
 from twoloop.methods.tableaux import gauss, lobatto_iiie
 
@@ -95,20 +94,6 @@ def test_on_the_constraints_at_ten_thousand_times(default_four_bar):
     assert position < 1e-14 and velocity < 1e-13
 
 
-@pytest.mark.parametrize("method", ["SunRadau5", "Gauss12", "BDF", "RadauIIA5"])
-def test_at_a_step_the_state_is_the_one_stored(default_four_bar, method):
-    result = run(default_four_bar, 1.0, method=method, dense_output=True)
-    state = result.sol(result.t)
-    assert (state.q == result.q).all() and (state.v == result.v).all()
-    assert worst(state.a, result.a) < 1e-11 and worst(state.lam, result.lam) < 1e-11
-
-
-def test_a_run_has_the_same_steps_with_and_without(default_four_bar):
-    with_it, without = run(default_four_bar, 2.0, dense_output=True), run(default_four_bar, 2.0)
-    assert (with_it.q == without.q).all() and with_it.stats.n_evaluations == without.stats.n_evaluations
-    assert without.sol is None
-
-
 @given(st.lists(st.floats(0.0, 1.5), min_size=1, max_size=12))
 def test_times_in_any_order_one_by_one_or_together(times):
     sol = swung()
@@ -150,18 +135,6 @@ def test_other_mechanisms(name, method):
         assert force_residual(m.system(), state) < 4.0 * force_residual(m.system(), result) + 1e-11
 
 
-def test_vibrations_that_are_stepped_over_leave_no_noise():
-    """Newton's method on a stiff beam: its accelerations are of no use between the steps."""
-    problem = moderately_stiff_beam()
-    span = (problem.system, (0.0, 0.05), problem.q0, problem.v0)
-    exact = solve_dae(*span, "DOP853", 1e-9, 1e-9, dense_output=True)
-    result = solve_dae(*span, "RadauIIA5", 1e-2, 1e-2, dense_output=True)
-    known, state = exact.sol(between(result)), result.sol(between(result))
-    at_steps = exact.sol(result.t)
-    assert result.stats.n_jacobians > 0 and worst(state.q, known.q) < 3.0 * worst(result.q, at_steps.q)
-    assert worst(state.v, known.v) < 3.0 * worst(result.v, at_steps.v) and violations(problem.system, state)[0] < 1e-13
-
-
 @pytest.mark.parametrize("max_steps", [1, 2, 3, 4])
 @pytest.mark.parametrize("method", ["DOP853", "Gauss8"])
 def test_a_run_of_few_steps_covers_what_was_computed(default_four_bar, method, max_steps):
@@ -177,31 +150,9 @@ def test_a_run_without_a_step():
     assert result.status == Status.NOT_CONVERGED and result.t.size == 1 and (result.sol(0.0).q == result.q[:, 0]).all()
 
 
-def test_where_no_interior_states_are_found_the_neighbours_serve(default_four_bar, exact, monkeypatch):
-    monkeypatch.setattr("twoloop.run.dense.Interpolator._fill", lambda *_: {})
-    result = run(default_four_bar, 1.0, method="Gauss8", rtol=1e-6, atol=1e-6, dense_output=True)
-    t = between(result)
-    assert 0.0 < worst(result.sol(t).q, exact(t).q) < 1e-3
-
-
-def test_more_intervals_than_are_kept(default_four_bar, exact, monkeypatch):
-    result = run(default_four_bar, 1.0, method="Gauss6", rtol=1e-8, atol=1e-8, dense_output=True)
-    t = between(result)
-    at_once = result.sol(t)
-    monkeypatch.setattr("twoloop.run.dense.KEPT", 5)
-    again = run(default_four_bar, 1.0, method="Gauss6", rtol=1e-8, atol=1e-8, dense_output=True)
-    assert worst(again.sol(t).q, at_once.q) < 1e-12 and len(again.sol.interpolator.filled) <= 10
-
-
 @pytest.mark.parametrize("method", ["SunRadau5", "Gauss8"])
 @pytest.mark.parametrize("copied", [copy.copy, copy.deepcopy, lambda result: pickle.loads(pickle.dumps(result))])
 def test_copies(default_four_bar, method, copied):
     result = run(default_four_bar, 0.5, method=method, dense_output=True)
     state, again = result.sol(0.3), copied(result).sol(0.3)
     assert (state.q == again.q).all() and (state.lam == again.lam).all()
-
-
-def test_it_says_what_it_is():
-    with pytest.raises(ValueError, match=r"t must lie within the run, from 0.0 to 1.5; given -1e-09"):
-        swung()(-1e-9)
-    assert repr(swung()).startswith("DenseSolution(from t = 0 to 1.5 s, ")

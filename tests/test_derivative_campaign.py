@@ -117,35 +117,6 @@ def test_terms_that_are_wrong_at_high_speeds_only_end_the_run(method):
     assert result.status is Status.WRONG_DERIVATIVE and "gamma of" in result.message
 
 
-def test_so_do_terms_of_constraints_on_velocities():
-    def gamma(t, q, v):
-        return np.array([np.clip(v[2], -3.0, 3.0) * (math.cos(q[2]) * v[0] + math.sin(q[2]) * v[1])])
-
-    q, along = np.array([0.3, -0.2, 0.7]), lambda t, q: np.array([[-math.sin(q[2]), math.cos(q[2]), 0.0]])
-    edge = {"n_a": 1, "nonholonomic": along, "nonholonomic_gamma": gamma}
-    system = problems.unconstrained(lambda t, q, v: np.zeros(3), 3, **edge)
-    check_derivatives(system, 0.0, q)
-    assert wrong_derivative(system, 0.0, q, np.ones(3)) is None
-    assert "nonholonomic_gamma of" in wrong_derivative(system, 0.0, q, 20.0 * np.ones(3))
-
-
-def test_a_check_along_a_run_is_cheap():
-    calls = dict.fromkeys(("constraint", "jacobian", "constraint_rate", "gamma"), 0)
-    case = shaken_pendulum(1.0)
-
-    def counted(kind):
-        def function(*arguments):
-            calls[kind] += 1
-            return case.functions[kind](*arguments)
-
-        return function
-
-    system = case.system(**{kind: counted(kind) for kind in calls})
-    calls.update(dict.fromkeys(calls, 0))
-    assert wrong_derivative(system, 0.0, np.array(case.q), np.ones(2)) is None
-    assert calls == {"constraint": 9, "jacobian": 16, "constraint_rate": 10, "gamma": 1}
-
-
 def test_a_table_that_ends_with_the_run_is_no_error():
     functions = {
         "constraint": lambda t, q: np.array([q[0] - np.interp(t, TABLE_T, TABLE_X)]),
@@ -298,10 +269,3 @@ def test_a_mass_that_is_not_constant_is_found():
     with pytest.raises(ValueError, match="said to be constant"):
         solve_dae(ConstrainedSystem(**functions, constant_mass=True), *run)
     assert solve_dae(ConstrainedSystem(**functions), *run).success
-
-
-def test_a_bandwidth_is_checked_without_constraints_too():
-    coupled = problems.unconstrained(lambda t, q, v: -q[::-1], 2, bandwidth=0, name="free")
-    with pytest.raises(ValueError, match="bandwidth of 'free' must be at least 1"):
-        solve_dae(coupled, (0.0, 0.1), *problems.START)
-    assert solve_dae(problems.unconstrained(lambda t, q, v: -q, 2, bandwidth=0), (0.0, 0.1), *problems.START).success

@@ -5,11 +5,10 @@ import pytest
 
 from tests import problems
 from tests.problems import kept, worst
-from twoloop import ConstrainedSystem, consistent_state, consistent_states, ensemble, mechanisms, solve_dae
+from twoloop import ConstrainedSystem, consistent_state, mechanisms, solve_dae
 from twoloop.generate import derived
 from twoloop.generate.derived import standing_for
 from twoloop.generate.programs import program_of
-from twoloop.generate.traced_equations import Equations
 from twoloop.generate.traced_values import unchecked
 from twoloop.kernels.data.codes import DONE
 from twoloop.kernels.data.common import KIT, VECTOR, WORK, f8, i8
@@ -57,15 +56,6 @@ def in_kernels(system, t, q, v):
     work = workspace(system, kit, np.ones((system.n_c + system.n_a, system.n_q)), q, 1e-8, 0.0)
     assert rows_and_gamma(kit, work, t, q, v) == DONE
     return work.G[:-1].copy(), work.Gamma.copy(), traced
-
-
-@pytest.mark.parametrize("absent", [("gamma",), ("jacobian", "gamma")], ids=" and ".join)
-def test_they_are_those_of_the_formulas(absent):
-    q, v = np.array([0.6, -0.8, 0.3]), np.array([1.0, 2.0, -3.0])
-    given, less = bar(), bar(**dict.fromkeys(absent))
-    rows, gamma, traced = in_kernels(less, 0.1, q, v)
-    assert traced and np.allclose(rows, given.jacobian(0.1, q), rtol=1e-14, atol=1e-15)
-    assert np.allclose(gamma, given.gamma(0.1, q, v), rtol=1e-14, atol=1e-15)
 
 
 READY = sorted({name for name in mechanisms.__all__ if name[0].islower()} - {"ancf_beam", "n_four_bar"})
@@ -135,24 +125,6 @@ def test_what_branches_is_differenced():
     assert other is system and traced == () and solve_dae(system, (0.0, 1.0), [0.6, -0.8], [0.8, 0.6]).success
 
 
-def test_all_given_is_left_alone():
-    system = pendulum()
-    assert standing_for(system, unchecked) == (system, ())
-
-
-def test_each_callback_is_traced_once():
-    calls = []
-
-    def constraint(t, q):
-        calls.append(1)
-        return np.array([0.5 * (q @ q - 1.0)])
-
-    equations = Equations(pendulum(constraint=constraint, jacobian=None, gamma=None))
-    for kind in ("jacobian", "gamma", "constraint", "gamma"):
-        equations.of(kind)
-    assert len(calls) == 1
-
-
 def driven_along_a_rail(parameters=(9.81, 0.2)):
     """A pendulum on a pivot that moves, with a mass that varies; without derivatives of the constraint."""
     return ConstrainedSystem.from_python(
@@ -175,14 +147,6 @@ def test_a_series_follows_where_a_derivative_is_a_sum(method, compiled):
     implicit = solve_dae(system, (0.0, 2.0), *start, method="RadauIIA9", rtol=1e-11, atol=1e-11)
     result = solve_dae(system, (0.0, 2.0), *start, method=method, compiled=compiled)
     assert result.success and worst(result.q[:, -1], implicit.q[:, -1]) < 1e-6
-
-
-def test_an_ensemble_follows_where_a_derivative_is_a_sum():
-    system, parameters = driven_along_a_rail(), np.column_stack([np.linspace(9.0, 10.0, 9), np.linspace(0.1, 0.3, 9)])
-    q, v = consistent_states(system, 0.0, [0.3, -0.95], [0.4, 0.1], parameters=parameters)[:2]
-    runs = ensemble(system, (0.0, 1.0), q, v, parameters=parameters)
-    alone = solve_dae(driven_along_a_rail(parameters[8]), (0.0, 1.0), q[8], v[8], method="DOP853", compiled=False)
-    assert runs.success.all() and worst(runs.q[8, :, -1], alone.q[:, -1]) < 1e-6
 
 
 def switched_on(rapidity):
@@ -222,11 +186,6 @@ def test_products_may_be_a_thousand_deep():
     system = pendulum(constraint=constraint, jacobian=None, gamma=None)
     rows, gamma, traced = in_kernels(system, 0.0, np.array([1.0, 0.0]), np.array([0.0, 1.0]))
     assert traced and np.allclose(rows, [[1.0, 1.0]], rtol=1e-12) and gamma[0] == pytest.approx(1000.0 * 1e-6, rel=1e-9)
-
-
-def test_a_result_keeps_the_system_that_was_given():
-    system = pendulum(jacobian=None, gamma=None)
-    assert solve_dae(system, (0.0, 0.1), [0.6, -0.8], [0.0, 0.0]).system is system
 
 
 BEAD = {  # on a circle of radius p[1]

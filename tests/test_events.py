@@ -1,10 +1,5 @@
 """Events: where functions of the motion are zero, by the rules of SciPy."""
 
-import gc
-import weakref
-from unittest.mock import patch
-
-import numba
 import numpy as np
 import pytest
 import scipy
@@ -72,25 +67,12 @@ def test_a_terminal_event_ends_the_run_there(default_four_bar, exact, terminal):
     assert worst(state.a, result.a[:, -1]) < 1e-11 and worst(state.lam, result.lam[:, -1]) < 1e-11
 
 
-def test_with_output_times_the_run_ends_with_the_last_before_the_event(default_four_bar, exact):
-    times = np.linspace(0.0, 4.0, 41)
-    result = run(default_four_bar, 4.0, t_eval=times, events=at_one(True))
-    assert (result.t == times[times <= exact[0]]).all() and result.t_events[0] == pytest.approx(exact[:1], abs=1e-6)
-
-
 @pytest.mark.parametrize("t_eval", [None, np.linspace(0.0, 2.0, 21)])
 def test_events_of_fixed_steps(default_four_bar, exact, t_eval):
     result = run(default_four_bar, 2.0, method="Gauss6", step_size=0.01, events=[at_one(), at_one(2)], t_eval=t_eval)
     assert result.status is Status.EVENT and worst(result.t_events[0], exact[:2]) < 1e-8
     assert worst(result.h[:-1], 0.01) < 1e-15 and 0.0 < result.h[-1] <= 0.01
     assert result.t[-1] == (result.t_events[1][-1] if t_eval is None else 0.9)
-
-
-def test_restart_after_an_event_follows_the_same_motion(default_four_bar):
-    first = run(default_four_bar, 4.0, rtol=1e-11, atol=1e-11, events=at_one(True))
-    span = (first.t[-1], 4.0)
-    second = solve_dae(default_four_bar.system, span, first.q[:, -1], first.v[:, -1], rtol=1e-11, atol=1e-11)
-    assert worst(second.q[:, -1], run(default_four_bar, 4.0, rtol=1e-11, atol=1e-11).q[:, -1]) < 1e-8
 
 
 @pytest.mark.parametrize("terminal", [None, 1, 2, 3])
@@ -188,39 +170,6 @@ def test_what_fails_beyond_a_terminal_event_does_not_matter():
         swing(2.0, system=system, events=clock(0.5))
 
 
-def test_events_are_not_evaluated_far_beyond_a_terminal_one():
-    seen = []
-
-    def end(t, q, v):
-        seen.append(t)
-        return t - 0.5
-
-    end.terminal = True
-    result = swing(2.0, events=end)
-    assert max(seen) < 0.5 + 2.0 * result.h.max()
-
-
-def test_compiled_events():
-    @numba.njit
-    def lowest(t, q, v):
-        return q[0]
-
-    result = swing(2.0, events=lowest)
-    assert result.t_events[0].size > 0 and worst(result.q_events[0][:, 0], 0.0) < 1e-15
-
-
-def test_what_an_event_is_given_is_its_own():
-    def greedy(t, q, v):
-        q[:], v[:] = 7.0, 7.0
-        return 1.0
-
-    assert (swing(1.0, events=greedy).q == swing(1.0).q).all()
-
-
-def test_without_a_change_of_sign_there_is_no_event():
-    assert swing(1.0, events=lambda t, q, v: (t - 0.4) ** 2 + 1e-9).t_events[0].size == 0
-
-
 def raising(t, q, v):
     raise KeyError("tip")
 
@@ -234,11 +183,6 @@ def test_an_exception_of_an_event_comes_through_with_a_note():
 def test_a_value_that_is_wrong_later_is_named_with_its_time():
     with pytest.raises(ValueError, match=r"events\[0\] must return a finite number; at t = 0\.\d+ it returned nan"):
         swing(1.0, events=lambda t, q, v: np.nan if t > 0.3 else 1.0)
-
-
-def test_a_zero_of_high_order_is_found(oscillator):
-    result = solve_dae(oscillator, (0.0, 10.0), [0.0], [1.0], events=lambda t, q, v: (t - 4.0) ** 3)
-    assert result.t_events[0] == pytest.approx([4.0], abs=1e-4)
 
 
 class OneStep:
@@ -265,21 +209,3 @@ def test_a_zero_in_a_step_of_one_spacing_is_looked_for_in_that_step():
         search.search(states, np.array([begin, end]))
         assert len(search.found[0]) == 1 and states.asked == [begin]
         begin = end
-
-
-@pytest.mark.usefixtures("collected_alone")
-def test_functions_are_checked_once_and_not_held():
-    def crossing(t, q, v):
-        return q[0]
-
-    check_events(crossing)
-    kept = weakref.ref(crossing)
-    with patch("twoloop.problem.events.check_call") as check:
-        assert len(check_events([crossing, crossing])) == 2
-    assert check.call_count == 0
-    crossing.terminal = -1
-    with pytest.raises(ValueError, match="terminal"):  # attributes may change
-        check_events(crossing)
-    del crossing, check
-    gc.collect()
-    assert kept() is None

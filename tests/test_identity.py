@@ -7,7 +7,6 @@ import pickle
 import numpy as np
 import pytest
 
-from tests.problems import pendulum
 from tests.test_callbacks import PENDULUM
 from twoloop import ConstrainedSystem, callback, solve_dae
 from twoloop.mechanisms import four_bar
@@ -101,27 +100,6 @@ def energy_at_the_end(result):
     return result.energy[-1], result.system.name
 
 
-def test_a_forked_system_that_is_not_pickled_keeps_its_functions():
-    system = pendulum(force=lambda t, q, v: np.array([1.0, 2.0]))
-    context = multiprocessing.get_context("fork")
-    queue = context.Queue()
-    process = context.Process(target=lambda: queue.put(system.force(0.0, Q, V).tolist()))
-    process.start()
-    assert queue.get(timeout=60) == [1.0, 2.0]
-    process.join()
-
-
-def test_changed_parameters_travel():
-    system = SYSTEMS["compiled"]()
-    system = system.with_parameters([5.0, *system.parameters[1:]])
-    for other in (copy.deepcopy(system), pickle.loads(pickle.dumps(system))):
-        assert other.mass(0.0, Q)[0, 0] == 5.0
-
-
-def test_a_compiled_callback_at_the_top_level_travels_by_name():
-    assert pickle.loads(pickle.dumps(SYSTEMS["compiled"]())).functions.force is PENDULUM["force"]
-
-
 def test_a_compiled_callback_within_a_function_travels_with_its_source():
     factor = 3.0
 
@@ -156,8 +134,3 @@ def test_numbers_that_lead_to_no_function_are_refused():
     stale = ConstrainedSystem(n_q=2, n_c=1, **callbacks, parameters=[12345.0])
     with pytest.raises(RuntimeError, match="of a system that is not in this process, or no longer"):
         stale.force(0.0, Q, V)
-
-
-def test_handles_cannot_be_guessed_and_fit_a_float():
-    handles = {int(made().functions.p[0]) for _ in range(50)}
-    assert len(handles) == 50 and max(handles) < 2**52 and max(handles) - min(handles) > 2**40

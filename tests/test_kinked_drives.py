@@ -131,42 +131,6 @@ def test_a_jump_is_an_impulse(case, method):
     assert f"At t = {at:.4g} C_t or b jumps" in result.message and np.abs(result.t - at).min() < 1e-14
 
 
-def test_gamma_may_be_differenced(case):
-    jump, at, expected = case
-    system = shaken(jump, at, gamma=False)
-    for method in ("DOP853", "Gauss6", "RadauIIA9"):
-        result = solve_dae(system, (0.0, END), START, velocities(system), method, 1e-7, 1e-7)
-        assert off(result, expected) < 1e-5
-
-
-@pytest.mark.parametrize("at", [0.5, 0.437])  # on the grid, and between
-def test_constant_steps(at):
-    system = shaken(1.3, at)
-    result = solve_dae(system, (0.0, END), START, velocities(system), "Gauss6", step_size=0.01)
-    assert off(result, end_of(system, "Gauss6", 1e-9)) < 1e-7 and result.t.size - 1 in (81, 82)
-    assert np.abs(result.t[-1] - END) < 1e-15
-
-
-@pytest.fixture(scope="module")
-def before_and_end():
-    """States before a jump at 0.3 s, and at the end of the run."""
-    return through([(0.0, 0.3, shaken())], velocities(shaken())), end_of(shaken(0.9, 0.3))
-
-
-@pytest.mark.parametrize("method", ["DOP853", "Gauss4", "RadauIIA5"])
-@pytest.mark.parametrize("after_too", [True, False])
-def test_at_the_ends_of_a_run(before_and_end, method, after_too):
-    """The value of C_t at the time of the jump says on which side of it a run begins or ends."""
-    system, smooth = shaken(0.9, 0.3, after_too), shaken()
-    before, end = before_and_end
-    beyond = np.append(before[:5], impulse(shaken(0.9, 0.3), 0.3, before[:5], before[5:]))
-    result = solve_dae(system, (0.0, 0.3), START, velocities(smooth), method, 1e-8, 1e-8)
-    assert off(result, beyond if after_too else before) < 1e-6
-    begun = (beyond if after_too else before)[5:]
-    again = solve_dae(system, (0.3, END), before[:5], begun, method, 1e-8, 1e-8, check_derivatives=False)
-    assert off(again, end) < 1e-5 and ("jumps" in again.message) is not after_too
-
-
 def softplus(x):
     return x + np.log1p(np.exp(-x)) if x > 0.0 else np.log1p(np.exp(x))
 
@@ -293,25 +257,6 @@ def test_drives_that_contradict_one_another_end_the_run():
     with pytest.warns(UserWarning, match="rank 1 of 2"):
         result = solve_dae(system, (0.0, 1.0), np.zeros(2), np.zeros(2), "Gauss6", check_derivatives=False)
     assert result.status in (Status.RATE_JUMPS, Status.ROWS_CONTRADICT) and result.t[-1] < 0.51
-
-
-def test_a_smooth_drive_is_left_alone():
-    """The same steps with and without the look at C_t."""
-    from twoloop.run.run import Run
-
-    system = shaken()
-    with pytest.MonkeyPatch.context() as patch:
-        looked = solve_dae(system, (0.0, END), START, velocities(system), "Gauss16", 1e-10, 1e-10)
-        made = Run.__init__
-
-        def unwatched(self, *arguments):
-            made(self, *arguments)
-            self.control[self.a.DRIVEN] = 0.0
-
-        patch.setattr(Run, "__init__", unwatched)
-        without = solve_dae(system, (0.0, END), START, velocities(system), "Gauss16", 1e-10, 1e-10)
-    assert looked.stats.n_rejected_error == without.stats.n_rejected_error and (looked.t == without.t).all()
-    assert (looked.q == without.q).all()
 
 
 @pytest.mark.parametrize("method", ["auto", "RadauIIA9", "TRBDF2", "Gauss12"])

@@ -43,25 +43,6 @@ def test_a_run_that_loads_its_implicit_method_is_the_one_that_had_it(tol, compil
     assert lines == run_python(BEFORE + source).stdout.splitlines()[:-1]
 
 
-def test_threads_may_come_to_it_at_once():
-    source = """
-from threading import Thread
-from twoloop import solve_dae
-from twoloop.mechanisms import governor
-
-problem, ends = governor(), []
-def run():
-    result = solve_dae(problem.system, (0.0, 0.2), problem.q0, problem.v0, rtol=1e-5, atol=1e-5)
-    ends.append((result.success, result.stats.n_jacobians > 0, result.q[:, -1].tobytes()))
-
-threads = [Thread(target=run) for _ in range(4)]
-for thread in threads: thread.start()
-for thread in threads: thread.join()
-print(len(ends), len(set(ends)), ends[0][:2])
-"""
-    assert run_python(source).stdout.split("\n")[0] == "4 1 (True, True)"
-
-
 def test_a_solution_between_steps_is_the_same_before_and_after_the_method_is_loaded():
     """Its pieces may come to the implicit method, too, as long as the solution lasts: a rod of 1e9 N/m."""
     source = """
@@ -87,28 +68,3 @@ for _ in range(2):
 """
     first, second = run_python(source).stdout.splitlines()
     assert first == second and first.startswith("REACHED_END")
-
-
-def test_loading_counts_neither_as_time_of_steps_nor_against_the_limit():
-    """As compilation may take a minute: here three seconds, the limit being two; steps take some milliseconds."""
-    source = """
-import time
-from twoloop import solve_dae
-from twoloop.kernels.steps import named_step
-from twoloop.mechanisms import governor
-
-problem, original = governor(), named_step.import_module
-
-def slow(name):
-    began = time.process_time()
-    while time.process_time() - began < 3.0:
-        pass
-    return original(name)
-
-named_step.import_module = slow
-for t1 in (1e-4, 1e-4, 0.3):  # the arrays of the first runs serve the last one
-    result = solve_dae(problem.system, (0.0, t1), problem.q0, problem.v0, rtol=1e-5, atol=1e-5, **{more})
-print(result.success, result.stats.n_jacobians > 0, result.stats.cpu_time < 1.5)
-"""
-    for more in ({}, {"time_limit": 2.0}):
-        assert run_python(source.replace("{more}", str(more))).stdout.split() == ["True", "True", "True"]

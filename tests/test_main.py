@@ -1,6 +1,5 @@
 """python -m twoloop: info, compile, solve."""
 
-import runpy
 import sys
 from pathlib import Path
 
@@ -65,12 +64,6 @@ def test_info(capsys):
     assert str(folder_of(kernels)) in text and "compiled functions" in text and "cores" in text
 
 
-def test_the_folder_is_the_one_that_numba_writes_to():
-    from twoloop.kernels import advance
-
-    assert folder_of(kernels) == Path(advance.advance._cache.cache_path)
-
-
 def test_compile_names_every_file(capsys):
     main(["compile"])
     lines = capsys.readouterr().out.splitlines()
@@ -106,12 +99,6 @@ def test_solve_compiles_the_equations_when_asked_to(where, capsys, monkeypatch):
     main(["solve", where, "--t-end", "0.1", "--compiled"])
     assert [(more["method"], more["compiled"]) for more in given] == [("auto", "auto"), ("auto", True)]
     assert capsys.readouterr().out.count("auto: REACHED_END.") == 2
-
-
-def test_solve_takes_a_ready_mechanism_by_name(tmp_path, capsys):
-    main(["solve", "double_pendulum", "--t-end", "0.2", "--out", str(tmp_path / "run.csv")])
-    assert "double pendulum, auto: REACHED_END. Reached the end, t = 0.2" in capsys.readouterr().out
-    assert pd.read_csv(tmp_path / "run.csv", index_col=0).index[-1] == 0.2
 
 
 def test_a_failed_run_ends_with_one(where, tmp_path, monkeypatch, capsys):
@@ -170,14 +157,3 @@ def test_packages_for_the_files_are_looked_for_before_the_run(where, monkeypatch
     assert ended(["solve", where, "--out", str(path)]) == (
         f"error: --out {path} needs the package {package}: pip install {package}"
     )
-
-
-def test_unknown_commands_and_methods_are_usage_errors(where, capsys):
-    assert ended([]) == 2 and ended(["solve", where, "--method", "Guass8"]) == 2
-    assert "invalid choice: 'Guass8'" in capsys.readouterr().err
-
-
-def test_as_a_module(monkeypatch, capsys):
-    monkeypatch.setattr(sys, "argv", ["twoloop", "info"])
-    runpy.run_path(str(Path(twoloop.__file__).with_name("__main__.py")), run_name="__main__")
-    assert capsys.readouterr().out.startswith(f"twoloop {twoloop.__version__}")

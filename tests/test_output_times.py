@@ -1,13 +1,10 @@
 """t_eval: interpolated where steps adapt, landed on where they are fixed or the paper's."""
 
-import warnings
-
 import numpy as np
 import pytest
 
-from tests.problems import event, pendulum_state, run, swing, worst
+from tests.problems import pendulum_state, run, swing, worst
 from twoloop import Status
-from twoloop.checks.arguments import check_times
 from twoloop.methods.presets import PRESETS
 from twoloop.run.dense import Interpolator
 
@@ -45,15 +42,6 @@ def test_a_run_goes_to_its_end_whatever_times_are_asked_for(times):
     assert result.h.sum() == pytest.approx(2.0, abs=1e-13)
 
 
-@pytest.mark.parametrize("chunk", [1, 2, 3, 7])
-def test_the_chunks_of_a_run_do_not_show(default_four_bar, chunk, monkeypatch):
-    usual = run(default_four_bar, 1.0, t_eval=TIMES)
-    monkeypatch.setattr("twoloop.run.run.FIRST_CHUNK", chunk)
-    monkeypatch.setattr("twoloop.run.course.CHUNK_TIME", 0.0)  # chunks do not grow
-    other = run(default_four_bar, 1.0, t_eval=TIMES)
-    assert (other.q == usual.q).all() and (other.lam == usual.lam).all()
-
-
 @pytest.mark.parametrize(
     ("method", "times"), [*((name, [0.0, 1.0]) for name in ADAPTIVE), ("auto", [0.0]), ("auto", [1.0])]
 )
@@ -72,11 +60,6 @@ def test_nothing_is_interpolated_at_the_ends_of_a_run(default_four_bar, method, 
     assert made
 
 
-def test_an_event_ends_a_run_with_output_at_the_end_only(default_four_bar):
-    result = run(default_four_bar, 1.0, t_eval=[0.0, 1.0], events=event(lambda t, q, v: t - 0.5, terminal=True))
-    assert result.status == Status.EVENT and result.t.tolist() == [0.0] and result.t_events[0] == pytest.approx(0.5)
-
-
 @pytest.mark.parametrize("method", PAPERS)
 def test_the_procedures_of_the_paper_land(default_four_bar, method):
     options = {"method": method, "rtol": 1e-5, "atol": 1e-5}
@@ -86,22 +69,8 @@ def test_the_procedures_of_the_paper_land(default_four_bar, method):
     assert np.abs(np.cumsum(landed.h) - 0.123).min() < 1e-12
 
 
-def test_fixed_steps_land_and_have_a_dense_solution_all_the_same(default_four_bar):
-    times = np.array([0.1, 0.25, 1.0])
-    result = run(default_four_bar, 1.0, method="Gauss6", step_size=0.01, t_eval=times, dense_output=True)
-    free = run(default_four_bar, 1.0, method="Gauss6", step_size=0.01)
-    assert (result.t == times).all() and worst(result.q, free.q[:, [10, 25, 100]]) < 1e-14
-    assert worst(result.sol(free.t).q, free.q) < 1e-13
-
-
 @pytest.mark.parametrize("method", ["SunRadau5", "Gauss8"])
 def test_a_failed_run_has_the_times_that_it_reached(default_four_bar, method):
     result = run(default_four_bar, 1.0, method=method, t_eval=TIMES, max_steps=10)
     assert result.status == Status.MAX_STEPS and 1 < result.t.size < TIMES.size
     assert (result.t == TIMES[: np.searchsorted(TIMES, result.h.sum(), side="right")]).all()
-
-
-def test_infinite_times_are_refused_without_a_warning_of_numpy():
-    with warnings.catch_warnings(), pytest.raises(ValueError, match=r"t_eval must be finite; entries \[1, 2\] are not"):
-        warnings.simplefilter("error")
-        check_times([0.0, np.inf, np.inf, 1.0], 0.0, 1.0, None)

@@ -10,7 +10,7 @@ from hatchling.build import build_wheel
 from numba.core.types.functions import BaseFunction, Function
 from numba.np import arrayobj
 
-from twoloop.kernels.compile.versions import BELOW, LEAST, check_version
+from twoloop.kernels.compile.versions import check_version
 
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
@@ -67,17 +67,6 @@ def test_other_versions_of_numba_are_refused_with_what_to_install():
     for unknown in ("0.60.0", "0.69.0", "1.0.0"):
         with pytest.raises(ImportError, match=r"numba .* is installed: pip install 'numba>=0\.61,<0\.69'"):
             check_version(unknown)
-
-
-def test_the_versions_of_numba_are_those_of_the_package():
-    least, below = (".".join(map(str, version)) for version in (LEAST, BELOW))
-    assert f"numba>={least},<{below}" in PROJECT["dependencies"]
-
-
-def test_private_parts_of_numba_are_used_in_one_folder():
-    private = re.compile(r"(from|import) numba\.(core|np|misc)")
-    users = {path.parent for path in (ROOT / "twoloop").rglob("*.py") if private.search(path.read_text())}
-    assert users == {ROOT / "twoloop" / "kernels" / "compile"}
 
 
 def test_numba_is_its_own_after_kernels_were_compiled_or_read():

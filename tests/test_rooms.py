@@ -38,19 +38,3 @@ def test_no_import_goes_upwards():
 
 def test_no_module_imports_itself_by_others():
     TopologicalSorter(imports()).prepare()
-
-
-def test_no_name_stands_twice():
-    names = [path.stem for path in rooms.MODULES.values() if path.stem != "__init__"]
-    assert sorted({name for name in names if names.count(name) > 1}) == []
-
-
-def test_nothing_is_flat_but_the_calls():
-    assert {path.stem for path in rooms.FOLDER.glob("*.py")} == rooms.CALLS
-
-
-def test_every_room_says_what_is_in_it_and_stands_on_the_page():
-    page = (ROOT / "docs" / "how_it_is_built.md").read_text(encoding="utf-8")
-    for room in set(rooms.ROOMS) - {"solve"}:
-        about = (rooms.FOLDER / room.replace(".", "/") / "__init__.py").read_text(encoding="utf-8")
-        assert about.startswith('"""') and f"**`{room.replace('.', '/')}/`**" in page

@@ -183,13 +183,6 @@ def test_the_leaderboard(tmp_path, capsys):
             main(["leaderboard", *words])
 
 
-@pytest.mark.usefixtures("small")
-def test_a_board_is_drawn(tmp_path):
-    pytest.importorskip("matplotlib")  # not among the oldest versions
-    leaderboard.leaderboard("four_bar", 1e-6, out=tmp_path / "board.png")
-    assert (tmp_path / "board.png").stat().st_size > 10_000
-
-
 def test_the_page_says_what_the_fields_are():
     page = (Path(__file__).parents[1] / "docs" / "compare.md").read_text(encoding="utf-8")
     for name, field in FIELDS.items():

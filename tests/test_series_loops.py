@@ -1,7 +1,5 @@
 """Series as loops over tables: the same numbers as by straight code, and code that does not grow with a mechanism."""
 
-import math
-
 import numpy as np
 import pytest
 
@@ -106,16 +104,3 @@ def test_callbacks_are_traced_once_for_all_that_is_made_of_them(monkeypatch):
     monkeypatch.setattr(Equations, "_traced", lambda self, kind, v: calls.append(kind) or traced(self, kind, v))
     solve_dae(problem.system, (0.0, 0.01), problem.q0, problem.v0, "Taylor", 1e-6, 1e-6, compiled=True)
     assert len(calls) == len(set(calls)) and {"mass", "force", "jacobian", "constraint"} <= set(calls)
-
-
-def test_a_copy_of_a_graph_goes_its_own_way():
-    system = unconstrained(lambda t, q, v: -np.array([math.pi * q[0] * q[1], q[0]]), 2)
-    first = Equations(system).trace_all()
-    n = len(first.graph.operations)
-    one, other = first.copy(), first.copy()
-    force = one.of("force")
-    assert force[0].graph is one.graph and len(one.graph.operations) == n  # nothing is traced again
-    assert (one.q[0] * one.q[1]).key == (first.q[0] * first.q[1]).key  # what is known stays known
-    (one.q[0] * one.v[1]).sine()
-    assert len(first.graph.operations) == len(other.graph.operations) == n < len(one.graph.operations)
-    assert "force" not in other.graph.traced  # it is compared with the callback only where it is used

@@ -2,17 +2,14 @@
 
 import re
 from math import comb
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from tests.problems import event, pendulum
 from twoloop import DOP853, Status, mechanisms, solve_dae
-from twoloop.kernels.data import codes
 from twoloop.kernels.steps import adams_step as kernels
-from twoloop.methods import adams, dop853
-from twoloop.run.stability import Looks, said_of_stiffness
+from twoloop.methods import adams
 
 STIFF = "The problem looks stiff"
 METHODS = pytest.mark.parametrize("method", ["Adams", "DOP853"])
@@ -64,11 +61,6 @@ def test_smooth_motion_is_not_called_stiff(make, end, tol, method):
     assert result.success and STIFF not in result.message
 
 
-def test_tight_tolerances_limit_the_steps_of_the_beam_by_accuracy():
-    for method, tol in (("Adams", 1e-8), ("DOP853", 1e-6)):
-        assert STIFF not in run(mechanisms.moderately_stiff_beam(), 0.1, method, tol).message
-
-
 def test_methods_for_stiff_motion_and_the_default_say_nothing():
     for method in ("auto", "TRBDF2", "RadauIIA5", "Gauss8"):
         assert STIFF not in run(mechanisms.moderately_stiff_beam(), 0.1, method, 1e-3).message
@@ -100,23 +92,6 @@ def test_a_stiff_spring_in_python_is_seen(method, monkeypatch):
         messages.append(result.message)
     found = re.search(r"vibrations of (\S+) rad/s", result.message)
     assert result.success and found and float(found[1]) == pytest.approx(1e4, rel=0.05) and messages[0] == messages[1]
-
-
-def test_a_rate_that_one_look_does_not_show_is_found_by_the_next():
-    """The derivatives by velocities leave nothing of the direction in which those by positions are largest."""
-
-    class Kit:
-        def inner(self, kit, work, task, t, q, v, tol, a, lam):
-            a[:] = [3.0 * v[0], -1e8 * q[1]]
-            return codes.DONE
-
-    looks = Looks(DOP853().plan(2, 1e-6, 1e-6, False))
-    looks.pass_by(np.full(1000, 6e-4))
-    for _ in range(3):
-        looks.take(0.0, np.zeros(8), 2)
-    places = np.arange(2)
-    work = SimpleNamespace(Q=np.zeros(2), x=np.zeros(2), lam=None, independent=places, independent_v=places)
-    assert "vibrations of 1e+04 rad/s" in said_of_stiffness(looks, Kit(), work)
 
 
 def test_counts_are_those_of_the_run_alone():
@@ -153,29 +128,3 @@ def test_limits_of_adams(order):
         assert radius(order, 0.0, decay - 0.02) < 1.01 < radius(order, 0.0, decay + 0.02)
     else:
         assert decay == adams.STABLE_TO[5][1]
-
-
-def test_limits_of_dop853_are_those_of_its_docstring():
-    for limit in dop853.STABLE_TO:
-        assert str(limit) in DOP853.__doc__
-
-
-def test_a_callback_that_raises_beside_the_run_spoils_nothing():
-    class Kit:
-        def inner(self, *arguments):
-            raise ZeroDivisionError
-
-    looks = Looks(DOP853().plan(2, 1e-6, 1e-6, False))
-    looks.pass_by(np.full(1000, 1e-3))
-    looks.take(0.0, np.zeros(8), 2)
-    assert len(looks.kept) == 1
-    assert said_of_stiffness(looks, Kit(), type("Work", (), {"Q": np.zeros(2), "x": None, "lam": None})) == ""
-
-
-def test_few_states_are_kept_of_many():
-    looks = Looks(DOP853().plan(2, 1e-6, 1e-6, False))
-    for k in range(1000):
-        looks.pass_by(np.full(16, 1e-3))
-        looks.take(float(k), np.zeros(8), 2)
-    times = np.array([look.t for look in looks.kept])
-    assert 4 <= len(times) <= 8 and np.ptp(np.diff(times)) == 0.0 and times[-1] > 800.0

@@ -16,7 +16,7 @@ import twoloop
 from tests.problems import at_one, pendulum, run, swing, worst
 from tests.processes import ROOT
 from twoloop import Result, Statistics, Status
-from twoloop.mechanisms import closed_chain, redundant_slider_crank
+from twoloop.mechanisms import closed_chain
 from twoloop.run import course
 
 EVERY = [field.name for field in fields(Result) if field.name != "sol"]
@@ -47,11 +47,6 @@ def test_there_and_back(default_four_bar, tmp_path, method):
     one, other = result.sol(t), again.sol(t)
     assert np.abs(one.q - other.q).max() < 1e-12 and np.abs(one.v - other.v).max() < 1e-11
     assert np.abs(one.lam - other.lam).max() < 1e-9 and (again.sol.t_min, again.sol.t_max) == (0.0, 1.0)
-
-
-def test_without_the_system_there_is_no_dense_solution(default_four_bar, tmp_path):
-    run(default_four_bar, 0.2, dense_output=True).save(tmp_path / "run")
-    assert twoloop.load(tmp_path / "run").sol is None  # the name is as given, without .npz
 
 
 @pytest.mark.parametrize(
@@ -120,11 +115,6 @@ def test_other_files_are_refused(tmp_path, content):
         twoloop.load(path)
 
 
-def test_a_file_that_is_not_there(tmp_path):
-    with pytest.raises(FileNotFoundError):
-        twoloop.load(tmp_path / "nothing.npz")
-
-
 # --- runs whose states go to the disk as they come
 @pytest.mark.parametrize(
     "options",
@@ -155,16 +145,6 @@ def test_a_stored_run_is_the_same_as_another(default_four_bar, tmp_path, options
         assert all((getattr(one, name) == getattr(other, name)).all() for other in others for name in ("q", "v", "lam"))
 
 
-def test_redundant_rows_and_another_file_of_it(tmp_path):
-    problem = redundant_slider_crank()
-    with pytest.warns(twoloop.ConstraintWarning):
-        found = run(problem, 0.5, store=tmp_path / "run")
-    again = twoloop.load(tmp_path / "run", problem.system)
-    assert (again.redundant == found.redundant).all() and again.rank == found.rank
-    again.save(tmp_path / "run.npz")
-    same(found, twoloop.load(tmp_path / "run.npz", problem.system), TELLS)
-
-
 @pytest.mark.parametrize("options", [{}, {"t_eval": True}, {"dense_output": True}])
 def test_the_memory_holds_a_part_only(tmp_path, options, monkeypatch):
     """Counted is what NumPy asks for: files that are mapped are not among it."""
@@ -182,14 +162,6 @@ def test_the_memory_holds_a_part_only(tmp_path, options, monkeypatch):
     before = result.q[0, 0]
     result.q[0, 0] = 7.0  # as in memory, and not in the file
     assert twoloop.load(tmp_path / "40.0").q[0, 0] == before
-
-
-def test_what_is_refused(default_four_bar, tmp_path):
-    with pytest.raises(ValueError, match="q0"):
-        twoloop.solve_dae(default_four_bar.system, (0.0, 1.0), [np.nan] * 9, [0.0] * 9, store=tmp_path / "run")
-    assert not (tmp_path / "run").exists()  # so that the next call may have the name
-    with pytest.raises(ValueError, match="a folder that solve_dae stored a run in"):
-        twoloop.load(tmp_path)
 
 
 def test_a_callback_that_raises_leaves_what_was_there(tmp_path):

@@ -1,6 +1,5 @@
 """Code made for the equations of one mechanism: against the general inner loop, dense linear algebra and references."""
 
-import math
 from collections import defaultdict
 from dataclasses import replace
 
@@ -8,15 +7,13 @@ import numpy as np
 import pytest
 from numba import njit
 
-from tests.compiled import unit_mass
 from tests.problems import pendulum, unconstrained, worst
 from tests.processes import run_python
-from twoloop import ConstrainedSystem, ConstraintWarning, callback, mechanisms
-from twoloop.generate import parts_code, stage_code
+from twoloop import ConstraintWarning, callback, mechanisms
+from twoloop.generate import parts_code
 from twoloop.generate.choices import Choice
 from twoloop.generate.straight_code import SharedCode, own_code
 from twoloop.generate.straight_line import StraightLine
-from twoloop.kernels.compile import kept_files
 from twoloop.kernels.data.codes import DONE
 from twoloop.kernels.data.noted import BY_GENERAL
 from twoloop.kernels.evaluation import tasks
@@ -191,19 +188,6 @@ def test_stages_that_the_code_leaves_to_the_general_one():
     assert own > 0.9 * general  # where the mechanism's own code is taken, half of them
 
 
-@pytest.mark.parametrize(("make", "calls"), [(mechanisms.four_bar, False), (mechanisms.spatial_four_bar, True)])
-def test_stages_compute_accelerations_or_call_the_code_of_long_equations(make, calls):
-    problem = make()
-    code = stage_code.compiled_stages(own_code(problem.system, 0.0, problem.q0), 12).code
-    runs = [
-        solve_dae(problem.system, (0.0, 0.2), problem.q0, problem.v0, "DOP853", 1e-8, 1e-8, compiled=compiled)
-        for compiled in (False, True)
-    ]
-    assert code.calls == calls
-    assert worst(runs[0].q[:, -1], runs[1].q[:, -1]) < 1e-9
-    assert runs[0].stats.n_accepted == runs[1].stats.n_accepted
-
-
 def test_redundant_rows_that_stop_holding_end_the_run():
     def system(drift):
         return pendulum(
@@ -225,16 +209,6 @@ def test_redundant_rows_that_stop_holding_end_the_run():
 @callback("force")
 def spring(t, q, v, p, Q):
     Q[0] = -p[0] * q[0]
-
-
-@pytest.mark.parametrize("compiled", [False, True])
-@pytest.mark.parametrize("method", ["DOP853", "Taylor"])
-def test_other_parameters_are_followed(method, compiled):
-    system = ConstrainedSystem(n_q=1, n_c=0, mass=unit_mass, force=spring, constant_mass=True, parameters=[1.0])
-    for stiffness in (1.0, 4.0):
-        system = system.with_parameters([stiffness])
-        result = solve_dae(system, (0.0, 1.0), [1.0], [0.0], method, 1e-10, 1e-10, compiled=compiled)
-        assert abs(result.q[0, -1] - math.cos(math.sqrt(stiffness))) < 1e-8
 
 
 def on_a_circle(radius, stiffness):
@@ -289,23 +263,3 @@ def test_a_second_process_compiles_nothing(own_disk, monkeypatch):
         solve_dae(p.system, (0.0, 0.1), p.q0, p.v0, "DOP853", compiled=True)
     """
     run_python(program, own_disk)
-
-
-@pytest.mark.parametrize(("make", "n_stages"), [(mechanisms.four_bar, 0), (mechanisms.governor, 1)])
-def test_stages_are_compiled_where_a_run_leaves_its_series(make, n_stages, own_disk, monkeypatch):
-    monkeypatch.setattr("twoloop.generate.families._FAMILIES", {})
-    problem = make()
-    assert solve_dae(problem.system, (0.0, 0.2), problem.q0, problem.v0, compiled=True).success
-    assert len(list(own_disk.glob("series.*.nbc"))) == 1
-    assert len(list(own_disk.glob("stages.*.nbc"))) == n_stages
-
-
-def test_of_code_on_the_disk_the_newest_is_kept(monkeypatch, own_disk):
-    monkeypatch.setattr(kept_files, "MOST_KEPT", 2)
-    for stiffness in (1.0, -1.0, 2.0):  # 1 and -1 stand in the code
-        system = ConstrainedSystem(
-            n_q=1, n_c=0, mass=unit_mass, force=spring, constant_mass=True, parameters=[stiffness]
-        )
-        assert solve_dae(system, (0.0, 0.1), [1.0], [0.0], "DOP853", compiled=True).success
-    for kind in ("equations", "stages"):
-        assert len(list(own_disk.glob(f"{kind}.*.nbc"))) == 2

@@ -1,25 +1,16 @@
 """Rows of a sweep: kept ones are of the same functions, whatever their names, and none is lost, whatever a run does."""
 
-import gc
-import importlib
 import os
 import sys
-import weakref
-from collections import defaultdict
-from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 
 import numpy as np
 import pytest
 
-from tests.compiled import pendulum_under
 from tests.problems import pendulum as bare_pendulum
 from twoloop import sweep
-from twoloop.generate import straight_code
-from twoloop.kernels.compile.caches import Newest
 from twoloop.mechanisms import Problem
-from twoloop.sweeps import shared_out, workers
-from twoloop.sweeps.digests import digest_of
+from twoloop.sweeps import workers
 
 pd = pytest.importorskip("pandas")  # not among the oldest versions
 GRAVITY = 9.81
@@ -136,41 +127,6 @@ def test_a_global_that_is_reached_counts_and_others_do_not(tmp_path, monkeypatch
         sweep(swinging, RUNS[:2], **options)
 
 
-MODULE = """
-import helpers, twoloop
-class Base:
-    OFFSET = {0}
-class Law(Base):
-    def __init__(self): self.scale = helpers.SCALE
-    def __call__(self): return self.scale + helpers.nested() + self.OFFSET
-LAW = Law()
-def measure(problem, result):
-    return {{"x": LAW()}}
-"""
-HELPERS = "SCALE = {0}\nimport inner\ndef nested(): return inner.deep()\n"
-
-
-def test_code_in_other_files_and_in_classes_counts(tmp_path, monkeypatch):
-    monkeypatch.syspath_prepend(str(tmp_path))
-    monkeypatch.setattr(sys, "dont_write_bytecode", True)
-    names, digests = ("inner", "helpers", "law"), {}
-    for case, values in {
-        "as it was": (1, 1, 1),
-        "again": (1, 1, 1),
-        "class": (2, 1, 1),
-        "global": (1, 2, 1),
-        "deep": (1, 1, 2),
-    }.items():
-        for name, text in zip(names, ("def deep(): return {2}\n", HELPERS.replace("{0}", "{1}"), MODULE), strict=True):
-            (tmp_path / f"{name}.py").write_text(text.format(*values))
-            sys.modules.pop(name, None)
-        importlib.invalidate_caches()
-        digests[case] = digest_of("measure", importlib.import_module("law").measure)
-    for name in names:
-        sys.modules.pop(name)
-    assert digests.pop("again") == digests["as it was"] and len(set(digests.values())) == 4
-
-
 def test_what_cannot_be_compared_is_refused_and_runs_without_a_file(tmp_path):
     with (tmp_path / "log").open("w") as log:
 
@@ -183,16 +139,6 @@ def test_what_cannot_be_compared_is_refused_and_runs_without_a_file(tmp_path):
         ):
             sweep(swinging, RUNS[:1], out=tmp_path / "rows.parquet", **options)
         assert sweep(swinging, RUNS[:1], **options)["closed"].tolist() == [False]
-
-
-def test_a_digest_ends_with_what_holds_itself():
-    ring = [1.0]
-    ring.append(ring)
-
-    def again(n):
-        return again(n - 1) if n else ring
-
-    assert digest_of("it", again) == digest_of("it", again)
 
 
 # --- cells
@@ -262,28 +208,6 @@ def test_a_worker_that_dies_costs_its_own_run_alone(tmp_path, monkeypatch):
     pd.testing.assert_frame_equal(pd.read_parquet(out), rows, check_dtype=False)
 
 
-class Lost(ThreadPoolExecutor):
-    """A cluster that loses every task with run 2 in it."""
-
-    def get_executor(self, pure):
-        return self
-
-    def submit(self, function, work, given):
-        if {"k": 2} in given:
-            return super().submit(self.lose)
-        return super().submit(function, work, given)
-
-    def lose(self):
-        raise RuntimeError("the worker was killed")
-
-
-def test_a_cluster_that_loses_a_worker_loses_one_run(monkeypatch):
-    monkeypatch.setattr(shared_out, "BATCHES", 1)
-    rows = sweep(swinging, RUNS, measure=plain, client=Lost(1), workers=1, **QUICK)
-    assert [k for k, status in enumerate(rows["status"]) if status != "REACHED_END"] == [2]
-    assert rows.loc[2, "message"] == "RuntimeError: the worker was killed"
-
-
 def fails_when_it_is_read(k):
     return swinging(k)
 
@@ -296,28 +220,3 @@ def test_a_worker_that_cannot_begin_is_an_error(monkeypatch):
 
 
 # --- memory
-def swinging_under(gravity):
-    return Problem("swing", pendulum_under(gravity), np.array([-1.0, 0.0]), np.zeros(2), (0.0, 0.01), energy)
-
-
-@pytest.mark.usefixtures("collected_alone")
-def test_what_is_compiled_for_a_run_is_let_go(monkeypatch):
-    monkeypatch.setattr("twoloop.kernels.compile.caches.MOST_HELD", 1)
-    held, made = [], straight_code.SharedCode
-
-    class Watched(made):
-        def __init__(self, *given):
-            super().__init__(*given)
-            held.append(weakref.ref(self.functions))
-            held.append(weakref.ref(self))
-
-    monkeypatch.setattr(straight_code, "SharedCode", Watched)
-    kept = defaultdict(Newest)
-    monkeypatch.setattr("twoloop.kernels.compile.own_functions._MADE", kept)  # what other tests hold has no part in it
-    options = {"measure": plain, "parallel": "threads", "workers": 1, "compiled": True, "method": "DOP853", **QUICK}
-    # 0, 1 and -1 stand in the code
-    rows = sweep(swinging_under, [{"gravity": gravity} for gravity in (9.0, 1.0, -1.0, 0.0)], **options)
-    assert set(rows["status"]) == {"REACHED_END"}, rows["message"].tolist()
-    assert len(held) == 8
-    gc.collect()
-    assert sum(each() is not None for each in held) <= 2 and len(kept["equations"]) == len(kept["stages"]) == 1

@@ -1,13 +1,10 @@
 """Runs of a sweep that share their callbacks are made together, and their rows are those of single runs."""
 
-import os
-import time
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from tests.problems import pendulum as bare_pendulum
 from tests.test_sweep_rows import energy
 from twoloop import ConstrainedSystem, solve_dae, sweep
 from twoloop.mechanisms import Problem, four_bar
@@ -72,15 +69,6 @@ def test_by_default_counts_and_energy_are_of_the_same_size():
     assert (rows["n_evaluations"] > 5 * rows["n_accepted"]).all()
 
 
-@pytest.mark.parametrize("method", ["DOP853", "RadauIIA5"])
-def test_evaluations_of_other_methods_are_counted(method):
-    rows = sweep(linkage, LINKAGES, t_span=(0.0, 0.5), method=method, **TOGETHER)
-    assert sum(in_lanes(rows)) == N - 2
-    attempts = {"DOP853": 12, "RadauIIA5": 3}[method]  # evaluations of one
-    assert (rows["n_evaluations"] >= attempts * rows["n_accepted"]).all()
-    assert (rows["n_evaluations"] <= 40 * rows["n_accepted"]).all()
-
-
 MORE = {
     "steps": lambda problem, result: {"h": result.h.max(), "x": int(np.size(result.h))},
     "counts": lambda problem, result: {"n": result.stats.n_partitions or 0, "m": result.stats.n_accepted},
@@ -97,13 +85,6 @@ def test_what_lanes_do_not_know_is_that_of_a_single_run(name):
     compare(rows, linkage, MORE[name], (0.0, 0.3), rel=1e-12, t_eval=[0.3])
 
 
-def test_every_step_is_only_there_in_single_runs():
-    rows = sweep(linkage, LINKAGES[:5], measure=ends_of, t_span=(0.0, 0.3), **TOGETHER)
-    assert not any(in_lanes(rows)) and (rows["n_t"] > 2).all()
-    rows = sweep(linkage, LINKAGES[:5], t_span=(0.0, 0.3), max_step=0.1, **TOGETHER)
-    assert not any(in_lanes(rows))
-
-
 def either(kind, angle):
     return four_bar(theta3=angle) if kind == "four-bar" else swinging(9.81, 1.0 + angle)
 
@@ -115,17 +96,6 @@ def test_several_systems_in_one_table():
     assert rows["status"].tolist() == ["REACHED_END"] * 12 + ["ERROR"]
     assert sum(in_lanes(rows)) == 9  # not the first of all, nor those of each system in the task
     compare(rows[:12], either, ends_of, (0.0, 1.0), t_eval=TIMES)
-
-
-def test_spans_of_their_own():
-    def released(third):
-        problem = linkage(third)
-        span = (0.0, 1.0) if third < 1.5 else (0.0, 0.5)
-        return Problem("linkage", problem.system, problem.q0, problem.v0, span, problem.energy)
-
-    rows = sweep(released, LINKAGES, **TOGETHER)
-    assert rows["t"].tolist() == [1.0 if each["third"] < 1.5 else 0.5 for each in LINKAGES]
-    assert sum(in_lanes(rows)) == N - 3
 
 
 def off(third):
@@ -168,53 +138,6 @@ def test_compiled_functions_with_parameters_go_together():
     rows = sweep(swinging, SWINGS, measure=ends_of, t_eval=TIMES, **TOGETHER)
     assert sum(in_lanes(rows)) == 8
     compare(rows, swinging, ends_of, (0.0, 1.0), t_eval=TIMES)
-
-
-def test_functions_in_python_do_not():
-    """They may read whatever `problem_of` leaves somewhere."""
-
-    def pulled(t, q, v):
-        return np.array([0.0, -pulled.gravity])
-
-    def keeping(gravity):
-        pulled.gravity = gravity
-        system = bare_pendulum(force=pulled)
-        return Problem("swing", system, np.array([-1.0, 0.0]), np.zeros(2), (0.0, 1.0), energy)
-
-    given = [{"gravity": 9.0 + 0.1 * k} for k in range(12)]
-    rows = sweep(keeping, given, measure=ends_of, t_eval=TIMES, **TOGETHER)
-    assert not any(in_lanes(rows))
-    compare(rows, keeping, ends_of, (0.0, 1.0), t_eval=TIMES)
-
-
-def test_problems_that_cost_more_than_their_runs_are_made_once(monkeypatch):
-    monkeypatch.setattr(shared_runs, "DEAR", 0.0)
-
-    def slow(third):
-        time.sleep(1.1 * shared_runs.NOTICED)
-        import tests.test_sweep_together as module  # which no digest looks into
-
-        module.KEPT.n += 1
-        return linkage(third)
-
-    KEPT.n = 0
-    rows = sweep(slow, LINKAGES[:6], measure=last_place, t_span=(0.0, 0.1), t_eval=[0.1], **TOGETHER)
-    assert not any(in_lanes(rows)) and KEPT.n == 6 + 1
-
-
-def test_nothing_is_kept_of_systems_that_share_nothing():
-    def compiled_anew(gravity):
-        system = ConstrainedSystem.from_python(
-            n_q=1, n_c=0, mass=np.eye(1), force=lambda t, q, v: np.array([-gravity]), compile=True
-        )
-        return Problem("fall", system, np.zeros(1), np.zeros(1), (0.0, 0.1), lambda t, q, v: 0.0 * t)
-
-    given = [{"gravity": float(k)} for k in range(12)]
-    made = shared_runs._Batch((compiled_anew, last_place, {"t_eval": [0.1]}), given)
-    rows = [made.row(k) for k in range(12)]
-    assert {row["status"] for row in rows} == {"REACHED_END"} and not any("in lanes" in row["message"] for row in rows)
-    assert [row["x"] for row in rows] == pytest.approx([-0.005 * k for k in range(12)])
-    assert len(made.firsts) <= 1 and not made.systems and not made.starts
 
 
 KEPT = SimpleNamespace(gravity=0.0, n=0)
@@ -273,17 +196,6 @@ def test_problems_that_are_one_object_are_told_apart():
     compare(rows, released, from_there, (0.0, 1.0), t_eval=TIMES)
 
 
-def test_a_start_that_is_no_vector_is_a_row():
-    def odd(k):
-        problem = swinging(9.81, 1.0)
-        q0 = {4: np.array([-1.0 + 0.0j, 0.0]), 5: ["-1", "0"], 6: np.array([True, False])}.get(k, problem.q0)
-        return SimpleNamespace(**vars(problem) | {"q0": q0})
-
-    rows = sweep(odd, [{"k": k} for k in range(12)], measure=last_place, t_eval=TIMES, **TOGETHER)
-    assert [k for k, status in enumerate(rows["status"]) if status == "ERROR"] == [4, 5, 6]
-    assert sum(in_lanes(rows)) == 7
-
-
 def last_place(problem, result):
     return {"x": result.q[0, -1]}
 
@@ -298,29 +210,6 @@ def test_rows_are_the_same_however_they_are_shared_out(monkeypatch):
     assert sum(in_lanes(some)) == N - 1 - 3 and not any(in_lanes(alone))
     told = ["seconds", "message"]
     pd.testing.assert_frame_equal(some.drop(columns=told), alone.drop(columns=told), rtol=1e-5, atol=1e-7)
-
-
-def test_a_task_of_a_cluster_is_an_ensemble():
-    distributed = pytest.importorskip("dask.distributed")
-    with (
-        distributed.LocalCluster(n_workers=1, threads_per_worker=2, processes=False, dashboard_address=None) as cluster,
-        distributed.Client(cluster) as client,
-    ):
-        rows = sweep(linkage, LINKAGES, measure=ends_of, client=client, workers=1, t_span=(0.0, 1.0), t_eval=TIMES)
-    assert sum(in_lanes(rows)) == N - 2
-    compare(rows, linkage, ends_of, (0.0, 1.0), t_eval=TIMES)
-
-
-def dying(third):
-    if third == LINKAGES[3]["third"]:
-        os._exit(3)
-    return linkage(third)
-
-
-def test_a_worker_that_dies_in_a_task_costs_one_run():
-    rows = sweep(dying, LINKAGES[:6], t_span=(0.0, 0.1), workers=1)
-    assert [k for k, status in enumerate(rows["status"]) if status != "REACHED_END"] == [3]
-    assert rows.loc[3, "message"] == "the worker process ended with exit code 3 in this run"
 
 
 @pytest.mark.parametrize("parallel", ["threads", "processes"])
@@ -340,45 +229,3 @@ def test_what_a_result_in_lanes_can_do_is_that_of_single_runs():
     rows = sweep(linkage, LINKAGES[:6], measure=reaction, t_span=(0.0, 1.0), t_eval=TIMES, **TOGETHER)
     assert sum(in_lanes(rows)) == 4
     compare(rows, linkage, reaction, (0.0, 1.0), t_eval=TIMES)
-
-
-def test_ends_are_compared_at_the_last_time_that_is_wanted(monkeypatch):
-    monkeypatch.setattr("twoloop.ensembles.in_turn.FAR", 1e-9)
-    for times in ([0.0, 0.5, 1.0], [0.0, 0.5]):
-        rows = sweep(linkage, LINKAGES[:6], measure=last_place, t_span=(0.0, 1.0), t_eval=times, **TOGETHER)
-        assert not any(in_lanes(rows)) and set(rows["status"]) == {"REACHED_END"}
-
-
-def test_what_lanes_cannot_make_is_not_tried_again(monkeypatch):
-    tried = []
-
-    class Refused(shared_runs._Runs):
-        def __init__(self, *given):
-            super().__init__(*given)
-            tried.append(len(self.places))
-            self.runs.turn[:] = -1
-
-    monkeypatch.setattr(shared_runs, "_Runs", Refused)
-    monkeypatch.setattr(shared_runs, "CHUNK", 0.0)  # s
-    rows = sweep(linkage, LINKAGES, measure=last_place, t_span=(0.0, 0.1), t_eval=[0.1], **TOGETHER)
-    assert tried == [shared_runs.FEW] and not any(in_lanes(rows)) and set(rows["status"]) == {"REACHED_END"}
-
-
-@pytest.mark.parametrize("by", ["room", "time"])
-def test_what_lanes_make_at_a_time_is_bounded(monkeypatch, by):
-    monkeypatch.setattr(shared_runs, "ROOM", 5 * 2 * 9 * len(TIMES))  # numbers: five runs
-    if by == "time":
-        monkeypatch.setattr(shared_runs, "ROOM", 10**6)
-        monkeypatch.setattr(shared_runs, "CHUNK", 0.0)
-        monkeypatch.setattr(shared_runs, "FEW", 5)
-    sizes = []
-
-    class Watched(shared_runs._Runs):
-        def __init__(self, *given):
-            super().__init__(*given)
-            sizes.append(len(self.places))
-
-    monkeypatch.setattr(shared_runs, "_Runs", Watched)
-    rows = sweep(linkage, LINKAGES, measure=ends_of, t_span=(0.0, 1.0), t_eval=TIMES, **TOGETHER)
-    assert sum(in_lanes(rows)) == N - 2 and sizes == [5, 5, 5, 3]
-    compare(rows, linkage, ends_of, (0.0, 1.0), t_eval=TIMES)

@@ -3,11 +3,9 @@
 import numpy as np
 import pytest
 
-from tests.problems import pendulum as bare_pendulum
 from twoloop import solve_dae, sweep
-from twoloop.mechanisms import Problem, four_bar, pendulum
+from twoloop.mechanisms import four_bar
 from twoloop.sweeps import saved_sweep
-from twoloop.sweeps import sweep as sweeps
 
 pd = pytest.importorskip("pandas")  # not among the oldest versions
 ANGLES = [{"theta3": angle} for angle in (0.0, 0.1, 2.0, -0.2, 0.3, 0.05)]  # 2.0 cannot be assembled
@@ -31,12 +29,6 @@ def interrupted(theta3):
 
 def heights(problem, result):
     return {"lowest": result.q[1::3].min(), "system": problem.system.name}
-
-
-def fussy(problem, result):
-    if result.q[8, 0] > 0.04:
-        raise RuntimeError("too steep")
-    return {"steps": result.stats.n_accepted}
 
 
 @pytest.fixture(scope="module")
@@ -78,30 +70,6 @@ def test_a_dask_cluster_gives_the_same_numbers(rows):
     pd.testing.assert_frame_equal(other.drop(columns="seconds"), rows.drop(columns="seconds"))
 
 
-def test_by_default_ends_and_energy_are_measured():
-    rows = sweep(pendulum, [{"start": -1.0}, {"start": 1.0}], workers=1, parallel="threads", t_span=(0.0, 1.0))
-    assert rows["t"].tolist() == [1.0, 1.0] and rows["energy_error"].between(1e-14, 1e-6).all()
-    assert (rows["n_evaluations"] > rows["n_accepted"]).all()
-
-
-def test_of_a_mechanism_of_ones_own_in_threads():
-    """Lambdas travel to no process; threads take them. Each system has its own functions."""
-
-    def swinging(gravity):
-        system = bare_pendulum(force=lambda t, q, v: np.array([0.0, -gravity]))
-        energy = lambda t, q, v: 0.5 * (v * v).sum(axis=0) + gravity * q[1]  # noqa: E731
-        return Problem("swing", system, np.array([-1.0, 0.0]), np.zeros(2), (0.0, 0.2), energy)
-
-    gravities = [{"gravity": g} for g in (1.0, 2.0, 3.0, 4.0)]
-    rows = sweep(
-        swinging, gravities, parallel="threads", workers=2, measure=lambda problem, result: {"y": result.q[1, -1]}
-    )
-    # y is close to -g t^2 / 2 while the swing is short
-    assert rows["y"].to_numpy() == pytest.approx(-0.02 * np.arange(1.0, 5.0), rel=1e-2)
-    with pytest.raises(TypeError, match=r"problem_of cannot be sent to another process: .*parallel='threads'"):
-        sweep(swinging, gravities)
-
-
 # --- going on
 def test_an_interrupted_sweep_goes_on(tmp_path, monkeypatch):
     out = tmp_path / "rows.parquet"
@@ -121,19 +89,6 @@ def test_an_interrupted_sweep_goes_on(tmp_path, monkeypatch):
     pd.testing.assert_frame_equal(again, rows)
     more = sweep(counted, [*ANGLES, {"theta3": 0.15}], **options)
     assert MADE == [0.15] and len(more) == 7
-
-
-def test_rows_are_saved_while_it_runs(tmp_path, monkeypatch):
-    monkeypatch.setattr(sweeps, "SAVE_EVERY", 0.0)
-    lengths, write = [], saved_sweep.write
-
-    def watched(table, *others):
-        lengths.append(len(table))
-        write(table, *others)
-
-    monkeypatch.setattr(saved_sweep, "write", watched)
-    sweep(linkage, ANGLES[:2], parallel="threads", workers=1, t_span=(0.0, 0.1), out=tmp_path / "rows.parquet")
-    assert lengths == [1, 2, 2]
 
 
 def test_rows_of_another_sweep_are_refused(tmp_path):
@@ -192,13 +147,3 @@ def test_rows_of_another_sweep_are_refused(tmp_path):
 def test_mistakes_come_through_at_once(arguments, options, error, words):
     with pytest.raises(error, match=words):
         sweep(*arguments, **{"t_span": (0.0, 0.01)} | options)
-
-
-def test_a_later_run_that_raises_is_a_row():
-    rows = sweep(linkage, ANGLES[:2], measure=fussy, parallel="threads", t_span=(0.0, 0.01))
-    assert rows["status"].tolist() == ["REACHED_END", "ERROR"] and rows.loc[1, "message"] == "RuntimeError: too steep"
-
-
-def test_a_bar(capsys):
-    sweep(linkage, ANGLES[:2], parallel="threads", t_span=(0.0, 0.01), progress=True)
-    assert "2 runs" in capsys.readouterr().out

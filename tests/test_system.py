@@ -23,20 +23,6 @@ def test_derivatives_of_the_shared_problems(name, t, q, v):
     assert by_q < 1e-8 and by_t < 1e-8 and gamma < 1e-7
 
 
-def test_functions_can_be_called_one_by_one():
-    system = pendulum()
-    q, v = np.array([0.6, -0.8]), np.array([4.0, 3.0])
-    assert (system.mass(0.0, q) == np.eye(2)).all() and (system.force(0.0, q, v) == [0.0, -9.81]).all()
-    assert abs(system.constraint(0.0, q)[0]) < 1e-15 and (system.jacobian(0.0, q) == [q]).all()
-    assert (system.constraint_rate(0.0, q) == 0.0).all() and (system.gamma(0.0, q, v) == -25.0).all()
-    assert abs(system.velocity_constraint(0.0, q, v)[0]) < 1e-15
-    assert worst(system.velocity_constraint(0.0, q, q), 1.0) < 1e-15
-
-
-def test_repr_has_name_and_sizes():
-    assert repr(pendulum()) == "ConstrainedSystem('pendulum', n_q=2, n_c=1)"
-
-
 def test_a_mass_array_is_constant_and_copied():
     matrix = np.eye(2)
     system = pendulum(mass=matrix)
@@ -64,20 +50,6 @@ def test_a_guess_is_projected_and_can_be_started_from(shift, speeds):
     assert np.abs(problem.system.constraint(0.0, q)).max() < 1e-13
     assert np.abs(problem.system.velocity_constraint(0.0, q, v)).max() < 1e-12 and worst(q, problem.q0) < 1.0
     assert solve_dae(problem.system, (0.0, 0.01), q, v).success
-
-
-def test_velocities_change_as_little_as_they_can(default_four_bar):
-    system, q, guess = default_four_bar.system, default_four_bar.q0, np.arange(9.0)
-    _, v = consistent_state(system, 0.0, q, guess)
-    free = np.linalg.svd(system.jacobian(0.0, q))[2][8]  # the one direction that the constraints leave
-    assert abs(free @ (v - guess)) < 1e-12
-
-
-def test_moving_constraints_are_projected_at_their_time():
-    system = moving_pivot()
-    q, v = consistent_state(system, 0.7, [0.9, -0.9], [0.0, 0.0])
-    assert np.abs(system.constraint(0.7, q)).max() < 1e-14 and np.abs(system.constraint(0.0, q)).max() > 1e-2
-    assert np.abs(system.velocity_constraint(0.7, q, v)).max() < 1e-13 and np.abs(v).max() > 0.1
 
 
 def test_what_cannot_be_projected_says_how_far_it_is():

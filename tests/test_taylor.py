@@ -1,19 +1,15 @@
 """The Taylor series of the motion: every operation that it knows, every kind of mechanism, and what it refuses."""
 
 import math
-from collections import defaultdict
 
 import numpy as np
 import pytest
 
-from studies.bench.large import open_chain_of_hinges
 from tests.large_systems import spatial_chain
 from tests.problems import pendulum, unconstrained
 from twoloop import Taylor, mechanisms, solve_dae
 from twoloop.bodies import PlanarModel
 from twoloop.generate import compiled_series
-from twoloop.generate.series import series_program
-from twoloop.generate.straight_code import own_code
 from twoloop.kernels.steps.recurrences import N_MEMORY_SCALARS
 
 FORCES = {
@@ -103,16 +99,6 @@ def test_steps_by_compiled_code_are_the_same_to_rounding(name):
         assert np.abs(ends[1] - ends[0]).max() < 1e-11 * max(1.0, np.abs(ends[0]).max())
 
 
-@pytest.mark.slow  # a build of 3 s
-def test_twenty_bodies_in_space_have_compiled_code():
-    chain = open_chain_of_hinges(20)
-    start = chain.system, (0.0, 0.1), chain.q, 0.0 * chain.q
-    runs = [solve_dae(*start, Taylor(13), 1e-10, 1e-10, compiled=compiled) for compiled in (False, True)]
-    assert all(run.success for run in runs)
-    for ends in zip(*((run.q[:, -1], run.v[:, -1]) for run in runs), strict=True):
-        assert np.abs(ends[1] - ends[0]).max() < 1e-9 * max(1.0, np.abs(ends[0]).max())
-
-
 @pytest.mark.parametrize("compiled", [False, True])
 def test_a_sum_of_parameters_that_is_zero_in_one_system_alone_is_divided_by_in_no_formula(compiled):
     """Formulas in the parameters of all chains divide by a sum of components of axes, which is zero here."""
@@ -127,16 +113,6 @@ def test_compiled_operations_give_the_same_run():
     start = (system, (0.0, 2.0), [0.4], [0.7])
     runs = [solve_dae(*start, Taylor(17), 1e-10, 1e-10, compiled=compiled) for compiled in (False, True)]
     assert abs(runs[1].q[0, -1] - runs[0].q[0, -1]) < 1e-12
-
-
-def test_compiled_code_is_read_from_the_disk(monkeypatch):
-    problem = mechanisms.four_bar()
-    code = own_code(problem.system, 0.0, problem.q0)
-    compiled_series.compiled_series(code)  # now it is there
-    monkeypatch.setattr("twoloop.kernels.compile.own_functions._MADE", defaultdict(dict))
-    code.shared.family._made.clear()
-    monkeypatch.setattr("twoloop.kernels.compile.own_functions.object_code", None)
-    assert "find_order" in compiled_series.compiled_series(code).functions.addresses
 
 
 @pytest.mark.parametrize("long", [0, 10**9], ids=["loops", "straight"])
@@ -157,32 +133,6 @@ def test_compiled_code_uses_nothing_that_was_left_in_memory(long, monkeypatch):
     assert np.array_equal(runs[0].q, runs[1].q)
 
 
-def test_equations_too_long_to_compile_are_refused(monkeypatch):
-    problem = mechanisms.spatial_four_bar()
-    monkeypatch.setattr("twoloop.generate.straight_line.MOST_ELIMINATED", 100)
-    monkeypatch.setattr("twoloop.generate.families._FAMILIES", {})  # without what another test has made
-    words = r"its equations are more than 100 operations\. Leave it out"
-    with pytest.raises(ValueError, match=words):
-        solve_dae(problem.system, (0.0, 0.1), problem.q0, problem.v0, "Taylor", compiled=True)
-
-
-def test_the_default_takes_compiled_code_too():
-    problem = mechanisms.four_bar()
-    start = (problem.system, (0.0, 10.0), problem.q0, problem.v0)
-    for tolerance in (1e-4, 1e-9):
-        runs = [solve_dae(*start, "auto", tolerance, tolerance, compiled=compiled) for compiled in (False, True)]
-        assert all(np.abs(run.q[:, -1] - problem.reference.q).max() < 100.0 * tolerance for run in runs)
-        assert (runs[1].q[:, -1] != runs[0].q[:, -1]).any()
-
-
-@pytest.mark.parametrize("t0", [0.0, -10.0])
-def test_a_step_of_a_few_spacings_of_t_is_not_tried_for_ever(t0):
-    """A tolerance of a metre, which is no tolerance for this linkage, leads to ever shorter steps."""
-    problem = mechanisms.four_bar()
-    result = solve_dae(problem.system, (t0, t0 + 10.0), problem.q0, problem.v0, "Taylor", 1.0, 1.0, compiled=True)
-    assert result.stats.n_rejected_error < 5000
-
-
 @pytest.mark.parametrize(("compiled", "tolerances"), [(False, 5.0), (True, 50.0)])
 def test_the_error_follows_the_tolerance(compiled, tolerances):
     problem = mechanisms.four_bar()
@@ -190,13 +140,6 @@ def test_the_error_follows_the_tolerance(compiled, tolerances):
     for tolerance in (1e-4, 1e-6, 1e-8, 1e-10, 1e-12):
         result = solve_dae(*start, tolerance, tolerance, compiled=compiled)
         assert np.abs(result.q[:, -1] - problem.reference.q).max() < tolerances * tolerance
-
-
-def test_the_program_shares_what_is_computed_twice():
-    program = series_program(mechanisms.four_bar().system)
-    assert len(program.early.first.column) == 12  # sines and cosines of three angles, and their products with rates
-    assert len(program.late.first.column) == 6  # their products with sums of multipliers
-    assert len(program.early.groups) == 2
 
 
 def test_a_callback_that_branches_is_refused_by_name_and_auto_goes_on_without():
@@ -212,11 +155,6 @@ def test_a_function_that_returns_the_wrong_shape_on_symbols_is_refused():
         solve_dae(system, (0.0, 1.0), [1.0, 0.0], [0.0, 0.0], "Taylor")
 
 
-def test_the_method_alone_says_what_it_needs():
-    with pytest.raises(ValueError, match="for_system"):
-        Taylor().plan(2, 1e-8, 1e-8, False)
-
-
 @pytest.mark.parametrize("compiled", [False, True])
 @pytest.mark.parametrize("span", [1e-9, 1e-3, 10.0])
 def test_the_first_step_is_as_long_as_the_series_at_the_start_allows(span, compiled):
@@ -227,13 +165,6 @@ def test_the_first_step_is_as_long_as_the_series_at_the_start_allows(span, compi
         assert result.h.tolist() == [span]
     else:
         assert result.h[0] > 0.5 * result.h[1]
-
-
-def test_a_first_step_that_is_given_is_taken():
-    problem = mechanisms.heavy_top()
-    for method in ("Taylor", "auto"):
-        result = solve_dae(problem.system, (0.0, 0.1), problem.q0, problem.v0, method, first_step=1e-5)
-        assert result.h[0] == 1e-5
 
 
 @pytest.mark.parametrize("compiled", [False, True])

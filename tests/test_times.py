@@ -66,14 +66,6 @@ def test_a_drive_starts_at_zero_far_from_the_time_zero(method, t0):
     assert worst(result.q, [np.sin(3.0 * x), 1.2 * np.sin(2.0 * x) - 0.8 * np.sin(3.0 * x)]) < 100.0 * tolerance
 
 
-@pytest.mark.parametrize("beside", [5e-9, 9e-9])
-def test_two_output_times_beside_one_point_of_the_grid_do_not_shift_it(beside):
-    times = [0.5, 0.5 + beside, 1.0]
-    result = swing(1.0, method="Gauss6", step_size=0.01, t_eval=times)
-    assert (result.t == times).all() and np.delete(result.h, 50) == pytest.approx(0.01, abs=1e-8)
-    assert result.h[50] == pytest.approx(beside)
-
-
 @pytest.mark.parametrize("rtol", [1e-300, 1e-20])
 @pytest.mark.parametrize("method", METHODS)
 def test_an_absolute_tolerance_alone(method, rtol):

@@ -12,7 +12,6 @@ from tests.problems import pendulum, unconstrained, worst
 from twoloop import ConstrainedSystem, Status, callback
 from twoloop.generate.calls_on_symbols import as_forms
 from twoloop.generate.series import series_program
-from twoloop.generate.straight_code import own_code
 from twoloop.generate.traced_values import Traced
 from twoloop.generate.tracing import Graph, Untraceable
 from twoloop.solve import solve_dae
@@ -230,23 +229,6 @@ def test_a_global_that_numba_froze_is_not_read_anew():
             run(free(damped), method, compiled=compiled)
 
 
-def test_a_counter_ends_the_run():
-    calls = []
-
-    def force(t, q, v):
-        calls.append(t)
-        return WEIGHT - (1.0 if len(calls) < 200 else 2.0) * v
-
-    result = run(pendulum(force=force))  # at the start nothing shows: the callback is called a few dozen times
-    assert result.success
-    for method, compiled in (("Taylor", False), ("DOP853", True)):
-        del calls[:100]
-        calls[:] = calls[:60]
-        system = pendulum(force=force)
-        result = run(system, method, compiled=compiled, events=lambda t, q, v: calls.extend(range(200)) or 1.0)
-        assert result.status is Status.WRONG_TRACE and "force of 'pendulum' does not give" in result.message
-
-
 @pytest.mark.parametrize("options", [{"method": "Taylor"}, {"method": "Adams", "compiled": True}], ids=str)
 def test_an_event_that_changes_a_callback_ends_the_run(options):
     state = {"k": 1.0}
@@ -307,17 +289,6 @@ def test_rounding_is_no_difference(function):
     assert traced(pendulum(), force=function).wrong(pendulum(), STATES) is None
 
 
-def test_what_is_cancelled_exactly_may_be_rounded_in_the_callback():
-    system = pendulum(force=lambda t, q, v: np.array([(q[0] + 1e5) - 1e5 - q[0], -9.81]))
-    assert run(system).success
-
-
-@pytest.mark.parametrize("force", [Damper().force, Damper(), functools.partial(Damper.force, Damper())])
-def test_numba_takes_functions_only(force):
-    with pytest.raises(TypeError, match=r"force: compile=True takes functions .* given"):
-        pendulum(force=force, compile=True)
-
-
 # symmetry of M ------------------------------------------------------------------------------------------------------
 
 
@@ -337,16 +308,3 @@ def test_a_mass_that_is_not_symmetric_later_ends_the_run(method):
     system = two_masses(lambda t, q: np.array([[2.0, 0.1 * t**4], [0.2 * t**4, 2.0]]))
     result = run(system, method)
     assert result.status is Status.WRONG_DERIVATIVE and "mass of 'two' must be symmetric" in result.message
-
-
-def test_without_checks_its_operations_are_refused_in_words():
-    system = two_masses(lambda t, q: np.array([[2.0, 0.5 * q[1]], [0.0, 2.0]]))
-    with pytest.raises(ValueError, match=r"mass of 'two' is not symmetric: its entry \(1, 0\) is zero"):
-        run(system, "DOP853", compiled=True, check_derivatives=False)
-
-
-def test_the_reason_is_kept_where_it_is_known():
-    with pytest.raises(Untraceable, match="asks for the type"):
-        series_program(pendulum(force=REFUSED["isinstance"][0]))
-    with pytest.raises(ValueError, match="asks for the type"):
-        own_code(pendulum(force=REFUSED["isinstance"][0]), 0.0, np.array([1.0, 0.0]))

@@ -10,7 +10,6 @@ import twoloop
 from tests.problems import pendulum, run, swing
 from tests.processes import run_python
 from twoloop import solve_dae
-from twoloop.mechanisms import knife_edge, rolling_disc
 from twoloop.result.plotting import violation
 
 pytest.importorskip("pandas")  # not among the oldest versions
@@ -33,11 +32,6 @@ def test_a_table_with_the_names_of_the_mechanism(result, default_four_bar):
     np.testing.assert_array_equal(table["energy (J)"], default_four_bar.energy(result.t, result.q, result.v))
 
 
-def test_a_table_without_names():
-    table = swing().to_dataframe()
-    assert list(table.columns) == ["q0", "q1", *(f"q{k}, {what}" for what in ("velocity (1/s)", "acceleration (1/s^2)") for k in (0, 1)), "lam0"]  # fmt: skip # noqa: E501
-
-
 def test_energy_needs_a_problem(result, default_four_bar):
     assert result.energy.shape == result.t.shape and np.ptp(result.energy) < 1e-6
     with pytest.raises(ValueError, match=r"this result knows no energy: put the system into a problem"):
@@ -54,17 +48,6 @@ def test_a_result_from_a_file_knows_what_its_system_knows(result, default_four_b
     table, other = result.to_dataframe(), twoloop.load(tmp_path / "run.npz", default_four_bar.system).to_dataframe()
     assert list(other.columns) == list(table.columns)
     np.testing.assert_allclose(other, table, rtol=1e-13)  # of another layout in memory, the energy is rounded otherwise
-
-
-def test_problems_do_not_share_what_they_say_of_one_system():
-    system = pendulum()
-    given = twoloop.mechanisms.pendulum()
-    one, other = (
-        twoloop.mechanisms.Problem("x", system, given.q0, given.v0, (0.0, 1.0), given.energy, coordinates=names)
-        for names in (("x", "y"), ("along", "up"))
-    )
-    assert one.system.description.coordinates == ("x", "y") and other.system.description.coordinates == ("along", "up")
-    assert system.description.coordinates == ()
 
 
 # --- figures
@@ -95,14 +78,6 @@ def test_violation_is_that_of_the_rows(result, default_four_bar):
     assert np.delete(positions, 3).max() < 1e-12 and np.delete(velocities, [3, 5]).max() < 1e-12
 
 
-@pytest.mark.parametrize("make", [knife_edge, rolling_disc])
-def test_nonholonomic_rows_are_plotted_too(make):
-    problem = make()
-    done = solve_dae(problem.system, (0.0, 0.1), problem.q0, problem.v0)
-    positions, velocities = violation(done)
-    assert positions.shape == velocities.shape == done.t.shape and len(done.plot().axes) == len(set(problem.units)) + 2
-
-
 # --- packages that may be missing, and other processes (see also tests/test_identity.py)
 def test_missing_packages_say_how_to_install_them(tmp_path):
     source = """
@@ -129,9 +104,3 @@ def test_results_of_lambdas_travel_without_their_system():
     other = pickle.loads(pickle.dumps(done))
     assert other.system is None and done.system is not None
     np.testing.assert_array_equal(other.q, done.q)
-
-
-def test_an_energy_without_a_name_says_so():
-    problem = replace(twoloop.mechanisms.pendulum(), energy=lambda t, q, v: 0.0)
-    with pytest.raises(TypeError, match=r"energy of 'A01 pendulum', .*<lambda>, cannot be pickled"):
-        pickle.dumps(problem.system)
