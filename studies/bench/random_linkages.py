@@ -1,18 +1,15 @@
-"""Four-bar linkages drawn at random, made of any size and mass, with their motion by one equation of one unknown.
+"""Draw four-bar linkages at random, with their motion by one equation of one unknown.
 
 That motion is `references.paper.four_bar_minimal`, SciPy's DOP853 at 1e-13: it shares no line with the integrators.
 """
 
 import sys
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 
 from references.paper.four_bar_minimal import MinimalFourBar
 from studies.bench.store import Array
-from twoloop import ConstrainedSystem
-from twoloop.kernels.compile.callbacks import callback
 from twoloop.mechanisms import Problem, four_bar
 
 equations = sys.modules[four_bar.__module__]  # the module, whose name its function has taken in the package
@@ -70,41 +67,3 @@ def draw(kind: str, generator: np.random.Generator, t_end: float) -> Drawn | Non
     except ValueError:
         return None
     return Drawn(problem, kind, q, float(np.abs(nudged - q).max()) / NUDGE)
-
-
-@callback("mass")
-def mass(t, q, p, M):  # type: ignore[no-untyped-def]
-    for i in range(3):
-        m = p[4 + i] * p[i]
-        M[3 * i, 3 * i] = m
-        M[3 * i + 1, 3 * i + 1] = m
-        M[3 * i + 2, 3 * i + 2] = m * p[i] ** 2 / 12.0
-
-
-@callback("force")
-def force(t, q, v, p, Q):  # type: ignore[no-untyped-def]
-    for i in range(3):
-        Q[3 * i + 1] = -p[4 + i] * p[i] * 9.81
-
-
-def scaled(size: float, densities: tuple[float, float, float]) -> Problem:
-    """The default linkage with all lengths times `size`, and bars of these masses per length (kg/m)."""
-    problem = four_bar()
-    p = np.array([problem.parameters[name] for name in ("L1", "L2", "L3", "L")]) * size
-    rows = {name: getattr(equations, name) for name in ("constraint", "jacobian", "gamma", "kinematics")}
-    about: dict[str, Any] = {"parameters": [*p.tolist(), *densities], "constant_mass": True}
-    name = f"four-bar of size {size:g}, densities {', '.join(f'{d:g}' for d in densities)}"
-    system = ConstrainedSystem(n_q=9, n_c=8, mass=mass, force=force, name=name, **rows, **about)
-    q0 = problem.q0.copy()
-    q0[PLACES] *= size
-    return replace(problem, name=system.name, system=system, q0=q0, reference=None)
-
-
-def end_of_scaled(size: float, densities: tuple[float, float, float], t_end: float) -> Array:
-    """Its positions at t_end: size scales lengths by s and times by sqrt(s), as gravity stays."""
-    p = four_bar().parameters
-    bars = (p["L1"], p["L2"], p["L3"])
-    motion = MinimalFourBar(bars, p["L"], p["theta3"], p["branch"], densities, p["gravity"])
-    q = motion.states(t_end / np.sqrt(size))[0][:, 0]
-    q[PLACES] *= size
-    return q

@@ -28,7 +28,7 @@ LOOSENESS = 1e3  # an answer is right within so many tolerances, times the growt
 JUMPS = 10  # ... and once more for as many jumps ...
 LEAST = 3e-12  # ... a tolerance below which no more is asked
 CHAOTIC = 1e3  # growth beyond which a motion is not used
-RIGHT, SAID, SILENT = "right", "said so", "wrong and silent"
+RIGHT, SAID, SILENT = "right", "reported failure", "silently wrong"
 
 
 @dataclass(frozen=True)

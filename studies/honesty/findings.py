@@ -114,7 +114,9 @@ def kinds_of(ran: pd.DataFrame) -> list[dict[str, Any]]:
 def best_limited(ran: pd.DataFrame, shape: str) -> dict[str, Any] | None:
     """Return the solver with a largest step that misses the fewest short forces of a shape."""
     own = ran[ran["trap"].str.startswith(shape) & ran["solver"].str.endswith(LIMITED)]
-    lines = [{"solver": str(name).removesuffix(LIMITED)} | graded(of) for name, of in own.groupby("solver", sort=False)]
+    lines: list[dict[str, Any]] = [
+        {"solver": str(name).removesuffix(LIMITED)} | graded(of) for name, of in own.groupby("solver", sort=False)
+    ]
     return min(lines, key=lambda line: line["wrong"] / line["n"], default=None)
 
 
@@ -173,7 +175,7 @@ def figures_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Figure]:
         bars = axes.barh(places, shares, left=left, color=color, height=0.6)
         axes.bar_label(bars, [str(line[part] or "") for line in lines], label_type="center", fontsize=8)
         left += shares
-    for place, line, end in zip(places, lines, left, strict=True):
+    for place, (line, end) in enumerate(zip(lines, left, strict=True)):
         axes.text(end, place, f"  {line['wrong']} of {line['n']}", va="center", fontsize=9)
     axes.set_yticks(places, [line["kind"] for line in lines])
     axes.invert_yaxis()

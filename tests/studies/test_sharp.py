@@ -1,14 +1,15 @@
 """Sharp forces: mechanisms under them against their motion in independent coordinates, and the rule of a run."""
 
 import numpy as np
-import pandas as pd
 import pytest
 
+from references.paper.four_bar_minimal import MinimalFourBar
 from studies.bench import sharp_callbacks
+from studies.bench.random_linkages import GRASHOF, KINDS, NEAR, draw, end_of, four_lengths
 from studies.bench.sharp_forces import DRIVE_A, SIZE, T_END, families, force_along, made
 from studies.bench.sharp_mechanisms import bars, chain, row, slider_crank, slider_in_space
 from studies.bench.sharp_motion import LOOSENESS, RIGHT, SAID, SILENT, Motion, allowed, judged, march, off, positions
-from studies.robustness import sharp_runs
+from twoloop import solve_dae
 from twoloop.mechanisms import four_bar, spatial_slider_crank
 
 FORCE = made("gust", 3, (5.0, 0.1, 0.4), windows=((0.0, 1.1),))
@@ -78,8 +79,8 @@ def test_what_is_allowed_grows_with_the_errors():
 
 
 def test_every_family_is_finite_and_can_be_drawn_again():
-    for draw in families().values():
-        one, two = (draw(np.random.default_rng(3)) for _ in range(2))
+    for force in families().values():
+        one, two = (force(np.random.default_rng(3)) for _ in range(2))
         assert np.array_equal(one.parameters, two.parameters) and one.parameters.size == SIZE
         assert all(0.0 < t < T_END for t in one.breaks)
         p = one.on(2.0, 0.1, 1.0, 1.0)
@@ -87,21 +88,30 @@ def test_every_family_is_finite_and_can_be_drawn_again():
         assert np.isfinite(values).all() and (one.driven or np.ptp([*values, 0.0]) > 0.0 or one.windows or one.breaks)
 
 
-def test_the_runs_go_round_methods_and_tolerances():
-    keys = [key for key, _ in sharp_runs.random_mechanisms(quick=False)]
-    assert len(set(keys)) == len(keys) and len(keys) * len(sharp_runs.METHODS) >= 3000
-    assert ({key.split(" ", 2)[2] for key in keys}) == set(families())
+def excess(lengths):
+    s = np.sort(lengths)
+    return s[1] + s[2] - s[0] - s[3]
 
 
-def test_counts_of_runs():
-    about = {"group": "sharp", "what": "drag", "name": "pendulum", "value": 0.0, "method": "auto", "message": "x"}
-    about |= {"tol": 1e-4, "error": 0.02, "allowed": 0.01}
-    found = sharp_runs.counts(pd.DataFrame([about | {"outcome": each} for each in (RIGHT, SILENT, SAID, RIGHT)]))
-    assert (found["n"], found[RIGHT], found[SAID], found[SILENT], found["n_mechanisms"]) == (4, 2, 1, 1, 1)
-    assert found["silent"] == [{"method": "auto", "what": "drag", "n": 1}] and found["loose"] == {
-        "tolerance": 1e-4,
-        "error": 1e-2,
-        "n": 2,
-    }
-    assert found["allowed"] == [{"tol": 1e-4, "median": 0.01, "most": 0.01}]
-    assert found["default"]["n"] == 4 and [line["error"] for line in found["default"]["wrong"]] == [0.02]
+def test_random_linkages_are_of_their_kind_and_the_other_assembly_is_another_motion():
+    generator = np.random.default_rng(1)
+    for kind in KINDS:
+        for _ in range(20):
+            got = excess(four_lengths(kind, generator))
+            assert abs(got) < 0.0101 if kind == NEAR else (got > 0.0) == (kind == GRASHOF)
+    drawn = None
+    while drawn is None:
+        drawn = draw(NEAR, generator, 1.0)
+    problem, p = drawn.problem, drawn.problem.parameters
+    other = four_bar((p["L1"], p["L2"], p["L3"]), p["L"], p["theta3"], -p["branch"])
+    for each, same in ((problem, True), (other, False)):
+        end = solve_dae(each.system, (0.0, 1.0), each.q0, each.v0, "DOP853", 1e-8, 1e-8).q[:, -1]
+        assert (np.abs(end - drawn.q).max() <= 1e-5 * max(1.0, drawn.sensitivity)) == same
+
+
+def test_the_minimal_coordinate_takes_a_density_for_each_bar():
+    given, known = ((1.0, 2.0, 1.5), 3.0, 0.0, -1), end_of(four_bar(), 0.3)
+    same, heavy = (MinimalFourBar(*given, (1.0, rho, 1.0), 9.81).states([0.3])[0][:, 0] for rho in (1.0, 5.0))
+    assert np.abs(same - known).max() < 1e-12 and np.abs(heavy - known).max() > 1e-4
+    with pytest.raises(ValueError, match="density must be positive"):
+        MinimalFourBar(*given, (1.0, -5.0, 1.0), 9.81)

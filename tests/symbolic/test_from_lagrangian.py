@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from studies.symbolic_size.models import MODELS, symbolic_four_bar, symbolic_knife_edge
+from tests.symbolic.models import MODELS, symbolic_four_bar, symbolic_knife_edge
 from twoloop import solve_dae
 
 

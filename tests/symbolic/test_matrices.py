@@ -5,7 +5,7 @@ import pytest
 import sympy as sp
 from sympy.physics import mechanics as me
 
-from studies.symbolic_size.models import body_spin, rates, rotation, symbolic_heavy_top, t
+from tests.symbolic.models import body_spin, rates, rotation, symbolic_heavy_top, t
 from twoloop.symbolic import from_lagrangian, from_matrices, from_method
 
 m, length, g, k, span = sp.symbols("m length g k span")

@@ -1,31 +1,16 @@
-"""Ready mechanisms, written again as energies and constraints for SymPy, with their numbers.
+"""Ready mechanisms, written again as energies and constraints for SymPy, with their numbers."""
 
-`python -m studies.symbolic_size.models COORDINATES N TANGENTS FOLDER` measures one chain in a process of its own.
-"""
-
-import json
-import math
-import sys
-import time
 from collections.abc import Callable, Sequence
-from functools import partial
-from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
-import numpy as np
 import sympy as sp
-from scipy.optimize import brentq
 from sympy.physics.mechanics import dynamicsymbols
 
-from twoloop import mechanisms, solve_dae
-from twoloop.problem import generated
+from twoloop import mechanisms
 from twoloop.problem.problem import Problem
 from twoloop.symbolic import SymbolicMechanism, from_lagrangian
 
 t = dynamicsymbols._t
-SLACK = 0.8  # m between the pins of a chain, whose links are together 1 m long
-REPEATS = 5
 
 
 def rates(coordinates: Sequence[Any]) -> list[Any]:
@@ -160,71 +145,3 @@ def symbolic_heavy_top() -> tuple[Any, ...]:
     values = dict(zip((m, length, g, *J), (known["mass"], known["length"], 9.81, *known["inertia"]), strict=True))
     constraints = [(sum(each**2 for each in e) - 1) / 2, *(-pivot)]
     return problem, T, m * g * x[2], constraints, [*x, *e], values, {}
-
-
-def chain_of_positions(n: int, tangents: bool = False) -> SymbolicMechanism:
-    """`closed_chain(n)`: point masses on massless links, in Cartesian coordinates."""
-    names = " ".join(f"x{i} y{i}" for i in range(n))
-    q = dynamicsymbols(names)
-    m, length, g, span = sp.symbols("m length g span")
-    points = [(0, 0), *((q[2 * i], q[2 * i + 1]) for i in range(n)), (span, 0)]
-    T = m * sum(each**2 for each in rates(q)) / 2
-    V = m * g * sum(q[1::2])
-    links = [((a[0] - b[0]) ** 2 + (a[1] - b[1]) ** 2 - length**2) / 2 for a, b in pairwise(points)]
-    values = {m: 1.0 / n, length: 1.0 / (n + 1), g: 9.81, span: SLACK}
-    return from_lagrangian(T, V, links, q, parameters=values, tangents=tangents, name=f"closed chain of {n}")
-
-
-def chain_of_angles(n: int, tangents: bool = False) -> SymbolicMechanism:
-    """n + 1 uniform links whose ends are pinned, in the angles of the links: a full mass matrix, two constraints."""
-    q = dynamicsymbols(f"a0:{n + 1}")
-    m, length, g, span = sp.symbols("m length g span")
-    T = V = x = y = sp.S.Zero
-    for angle in q:
-        middle = x + length / 2 * sp.cos(angle), y + length / 2 * sp.sin(angle)
-        T += m * (sum(each.diff(t) ** 2 for each in middle) + length**2 / 12 * angle.diff(t) ** 2) / 2
-        V += m * g * middle[1]
-        x, y = x + length * sp.cos(angle), y + length * sp.sin(angle)
-    values = {m: 1.0 / (n + 1), length: 1.0 / (n + 1), g: 9.81, span: SLACK}
-    return from_lagrangian(
-        T, V, [x - span, y], q, parameters=values, tangents=tangents, name=f"closed chain of {n}, angles"
-    )
-
-
-CHAINS = {"angles": chain_of_angles, "positions": chain_of_positions}
-
-
-def started(coordinates: str, n: int, mechanism: SymbolicMechanism) -> Problem:
-    """A chain at rest, not symmetric."""
-    if coordinates == "positions":
-        return mechanism.problem(mechanisms.closed_chain(n).q0, np.zeros(2 * n), (0.0, 0.5))
-    links = n + 1
-    half = brentq(lambda a: math.sin(links * a) / (links * math.sin(a)) - SLACK, 1e-6, math.pi / links)
-    angles = (2.0 * np.arange(links) - n) * half
-    angles[:2] = angles[1::-1]
-    return mechanism.problem(angles, np.zeros(links), (0.0, 0.5))
-
-
-def measured(coordinates: str, n: int, tangents: bool) -> dict[str, Any]:
-    """CPU times of making and running a chain, s: to be called in a process that has done nothing before."""
-    began = time.process_time()
-    mechanism = CHAINS[coordinates](n, tangents)
-    derived = time.process_time()
-    _ = mechanism.system
-    compiled = time.process_time()
-    problem = started(coordinates, n, mechanism)
-    solve = partial(solve_dae, problem.system, problem.t_span, problem.q0, problem.v0, "DOP853", compiled=False)
-    runs = [solve()]
-    since_start = time.process_time()
-    for _ in range(REPEATS):
-        runs.append(solve())
-    costs = [1e6 * (run.stats.cpu_time or 0.0) / (run.stats.n_evaluations or 1) for run in runs]
-    found = {"status": runs[-1].status.name, "lines": mechanism.code.source.count("\n"), "derive_s": derived - began}
-    # the start with the imports, and all that runs before
-    return found | {"compile_s": compiled - derived, "start_s": since_start, "evaluation_us": min(costs)}
-
-
-if __name__ == "__main__":
-    coordinates, n, tangents, folder = sys.argv[1:]
-    generated.sources_folder = lambda: Path(folder)  # type: ignore[assignment]
-    print(json.dumps(measured(coordinates, int(n), tangents == "True")))

@@ -1,3 +1,0 @@
-from studies.conformance.study import STUDY
-
-STUDY.main()

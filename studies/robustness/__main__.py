@@ -1,3 +1,0 @@
-from studies.robustness.study import STUDY
-
-STUDY.main()

@@ -1,3 +1,0 @@
-from studies.symbolic_size.study import STUDY
-
-STUDY.main()
