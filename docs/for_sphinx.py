@@ -127,7 +127,17 @@ def with_animations(text: str) -> str:
     return re.sub(r"^!\[.*\]\((\w+)\.png\)$", lambda p: f"```{{raw}} html\n{frame.format(p[1])}\n```", text, flags=re.M)
 
 
-CHANGES = {"index": with_menu, "reference": with_docstrings, "reference/gallery": with_animations}
+def without_menu(text: str) -> str:
+    """Return a page that is in no menu, so that Sphinx does not warn of it."""
+    return ORPHAN + text
+
+
+CHANGES = {
+    "index": with_menu,
+    "reference": with_docstrings,
+    "reference/gallery": with_animations,
+    "errors": without_menu,
+}
 
 
 def page_for_sphinx(name: str, text: str, folder: Path) -> str:

@@ -1,4 +1,4 @@
-"""Writes docs/errors.md from the cases of `tests/bad_input`, each really run: python -m tests.errors_page."""
+"""Write docs/errors.md from the cases of `tests/bad_input`, each of which is run: python -m tests.errors_page."""
 
 import re
 from functools import cache
@@ -13,11 +13,10 @@ PAGE = Path(__file__).parents[1] / "docs" / "errors.md"
 LONGEST = 400  # characters of a message
 BEGINNING = """# Error messages
 
-Wrong input raises an exception before any work. The message names the argument, what was given and what is expected.
-What goes wrong later ends the run with a status: see `result.status` and `result.message`. The result holds what was
-computed before.
+This list is for searching. [When it fails](when_it_fails.md) explains what can go wrong, and what to do.
 
-Each table below belongs to one function or class. Search this page for a word of the message.
+Wrong input raises an exception before any work. The message names the argument, what was given and what is expected.
+Each table below belongs to one function or class.
 
 <!-- Written by `python -m tests.errors_page` from `tests/bad_input`, which raises every message: do not edit it. -->
 """
@@ -33,7 +32,7 @@ what it proves and what it can miss.
 
 @cache
 def error_of(case: Case) -> Exception | None:
-    """What a mistake raises; each is made once, by the tests of all cases or for the page."""
+    """Return what a mistake raises; the tests of all cases and the page share it."""
     try:
         case.call()
     except Exception as error:
@@ -42,7 +41,7 @@ def error_of(case: Case) -> Exception | None:
 
 
 def message(case: Case) -> str:
-    """What a mistake gets: the type of the error and its message, without what differs between machines."""
+    """Return the type of the error and its message, without what differs between machines."""
     error = error_of(case)
     text = re.sub(r"\s+", " ", str(error))
     text = re.sub(r" at 0x[0-9a-f]+", "", text)
@@ -53,14 +52,14 @@ def message(case: Case) -> str:
 
 
 def cell(text: str) -> str:
-    """Text that a table of Markdown shows as it is: code in backticks needs no escapes but that of the bar."""
+    """Escape text for a table of Markdown; in backticks only the bar needs it."""
     parts = text.replace("|", "\\|").split("`")
     parts[::2] = [part.replace("<", "&lt;").replace("*", "\\*") for part in parts[::2]]
     return "`".join(parts)
 
 
 def statuses() -> list[str]:
-    """The ways in which a run ends, with their meanings."""
+    """Return the rows of the statuses, with their meanings."""
     rows = ["| `result.status` | What it means |", "|---|---|"]
     for status in Status:
         name = f"`{status.name}` = {int(status)}"
@@ -71,7 +70,7 @@ def statuses() -> list[str]:
 
 
 def groups() -> dict[str, list[Case]]:
-    """The cases by their groups, each group once, in the order in which they first appear."""
+    """Return the cases by their groups, in the order in which these first appear."""
     found: dict[str, list[Case]] = {}
     for case in CASES:
         found.setdefault(case.group, []).append(case)
@@ -79,7 +78,7 @@ def groups() -> dict[str, list[Case]]:
 
 
 def page() -> str:
-    """The whole page."""
+    """Return the page."""
     parts = [BEGINNING, "## How a run ends\n", *statuses(), ""]
     for group, cases in groups().items():
         parts += [f"## {group}\n", *([MEANT[group]] if group in MEANT else [])]

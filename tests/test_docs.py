@@ -354,8 +354,9 @@ def test_the_menu_has_every_page_once():
     for_sphinx = documentation("for_sphinx")
     pages = Counter(page for _, section in for_sphinx.menu(text_of("docs/index.md")) for page in section)
     reference = {f"reference/{path.stem}" for path in (DOCS / "reference").glob("*.md")}
-    assert {*PAGES, *reference} - {"index", "errors"} <= set(pages) and set(pages.values()) == {1}
-    assert for_sphinx.with_menu(text_of("docs/index.md")).count("```{toctree}") == 7
+    reports = {f"../reports/{path.stem}" for path in (ROOT / "reports").glob("*.md")}
+    assert {*PAGES, *reference, *reports} - {"index", "errors"} <= set(pages) and set(pages.values()) == {1}
+    assert for_sphinx.with_menu(text_of("docs/index.md")).count("```{toctree}") == 8
 
 
 def test_the_build_copies_what_pages_link_outside_docs(tmp_path):

@@ -61,36 +61,16 @@ BETWEEN_STEPS = [
     event_case("an event that returns an array", returning(np.zeros(2)), TypeError, "must return a number", NUMBER),
     event_case("an event that returns None", returning(None), TypeError, "must return a number", NUMBER),
     event_case("an event that returns True", returning(True), TypeError, "must return a number", NUMBER),
-    event_case(
-        "an event of the time alone",
-        lambda t: 1.0,
-        TypeError,
-        r"called as event\(t, q, v\); the .* takes \(t\)",
-        FUNCTION,
-    ),
+    event_case("an event of the time alone", lambda t: 1.0, TypeError, r"called as event\(t, q, v\); the .* takes \(t\)", FUNCTION),
     event_case("an event that returns text", returning("high"), TypeError, "must return a number", NUMBER),
-    event_case(
-        "an event that returns NaN",
-        returning(np.nan),
-        ValueError,
-        r"events\[0\] must return a finite number; at t = 0.0",
-        "let it be finite wherever the motion may go",
-    ),
+    event_case("an event that returns NaN", returning(np.nan), ValueError, r"events\[0\] must return a finite number; at t = 0.0", "let it be finite wherever the motion may go"),
     event_case("`hit.terminal = 'yes'`", having(terminal="yes"), TypeError, "terminal must be True", COUNT),
     event_case("`hit.terminal = -1`", having(terminal=-1), ValueError, "terminal must be True", COUNT),
     event_case("`hit.terminal = 1.5`", having(terminal=1.5), TypeError, "terminal must be True", COUNT),
-    event_case(
-        "`hit.direction = 'up'`", having(direction="up"), TypeError, "direction must be -1, 0 or 1", "give 1, -1 or 0"
-    ),
-    event_case(
-        "`hit.direction = nan`", having(direction=np.nan), ValueError, "direction must be -1, 0 or 1", "give 1, -1 or 0"
-    ),
-    event_case(
-        "`hit.direction = 2`", having(direction=2), ValueError, "direction must be -1, 0 or 1", "give 1, -1 or 0"
-    ),
-    event_case(
-        "`hit.direction = True`", having(direction=True), TypeError, "direction must be -1, 0 or 1", "give 1, -1 or 0"
-    ),
+    event_case("`hit.direction = 'up'`", having(direction="up"), TypeError, "direction must be -1, 0 or 1", "give 1, -1 or 0"),
+    event_case("`hit.direction = nan`", having(direction=np.nan), ValueError, "direction must be -1, 0 or 1", "give 1, -1 or 0"),
+    event_case("`hit.direction = 2`", having(direction=2), ValueError, "direction must be -1, 0 or 1", "give 1, -1 or 0"),
+    event_case("`hit.direction = True`", having(direction=True), TypeError, "direction must be -1, 0 or 1", "give 1, -1 or 0"),
     *argument(
         "result.sol",
         evaluated,
@@ -103,13 +83,7 @@ BETWEEN_STEPS = [
         (None, TypeError, "must be an array of real numbers", "give seconds"),
         (True, TypeError, "must be an array of real numbers", "write 1.0"),
     ),
-    of_load("a file of something else", lambda: loaded(b"text")).says(
-        "must lead to a file written by Result.save", "give a file that result.save(path) wrote"
-    ),
-    of_load("the result of another system", lambda: loaded(None, linkage().system)).says(
-        r"system must be the one that was solved, with n_q = 2 and n_c \+ n_a = 1", "give the system that was solved"
-    ),
-    of_load("a problem in the place of its system", lambda: loaded(None, linkage())).says(
-        r"give its system, problem\.system", "give problem.system", TypeError
-    ),
+    of_load("a file of something else", lambda: loaded(b"text")).says("must lead to a file written by Result.save", "give a file that result.save(path) wrote"),
+    of_load("the result of another system", lambda: loaded(None, linkage().system)).says(r"system must be the one that was solved, with n_q = 2 and n_c \+ n_a = 1", "give the system that was solved"),
+    of_load("a problem in the place of its system", lambda: loaded(None, linkage())).says(r"give its system, problem\.system", "give problem.system", TypeError),
 ]

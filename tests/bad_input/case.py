@@ -83,10 +83,7 @@ def listed(value):
 
 def argument(group, call, name, *values):
     """A case for each wrong value of one argument: (value, error, words, advice)."""
-    return [
-        Case(group, f"`{name}={shown(value)}`", lambda value=value: call(**{name: value}), f"{name} {words}", do, error)
-        for value, error, words, do in values
-    ]
+    return [Case(group, f"`{name}={shown(value)}`", lambda value=value: call(**{name: value}), f"{name} {words}", do, error) for value, error, words, do in values]
 
 
 NUMBERS = "give a list or array of n_q real numbers"
@@ -95,12 +92,7 @@ VECTORS = [
     (np.zeros((2, 1)), ValueError, r"must have shape \(2,\); given shape \(2, 1\)", "give one dimension: ravel() it"),
     (0.0, ValueError, r"must have shape \(2,\); given the number 0.0", NUMBERS),
     ([np.nan, 0.0], ValueError, r"must be finite; entries \[0\] .*given \[nan\]", "find out where the NaN comes from"),
-    (
-        [0.0, np.inf],
-        ValueError,
-        r"must be finite; entries \[1\] .*given \[inf\]",
-        "find out where the infinity comes from",
-    ),
+    ([0.0, np.inf], ValueError, r"must be finite; entries \[1\] .*given \[inf\]", "find out where the infinity comes from"),
     (["left", "down"], TypeError, "must be an array of real numbers; given .*left", NUMBERS),
     (["1.0", "0.0"], TypeError, "must be an array of real numbers", "convert text to numbers first"),
     (None, TypeError, "must be an array of real numbers; given None", NUMBERS),

@@ -16,11 +16,4 @@ from tests.bad_input.symbolic import SYMBOLIC
 from tests.bad_input.systems import SYSTEMS
 from tests.general.wrong_rows import ROWS
 
-CASES = [
-    *(*SOLVE, *BETWEEN_STEPS, *START, *PROJECTION, *SYSTEMS, *METHODS, *MECHANISMS, *ROWS, *JOINTS, *RESULTS),
-    *BODIES,
-    *IMPACTS,
-    *ENSEMBLES,
-    *SIMULATORS,
-    *SYMBOLIC,
-]
+CASES = [*(*SOLVE, *BETWEEN_STEPS, *START, *PROJECTION, *SYSTEMS, *METHODS, *MECHANISMS, *ROWS, *JOINTS, *RESULTS), *BODIES, *IMPACTS, *ENSEMBLES, *SIMULATORS, *SYMBOLIC]

@@ -37,25 +37,12 @@ METHODS = [
         ("Gauss6", TypeError, "must be a twoloop.methods.tableaux.Tableau.*given 'Gauss6'", "give gauss(3), say"),
         (DOUBLE, ValueError, "must have distinct nodes", "take another tableau"),
     ),
-    of_runge_kutta("an explicit tableau with `outer='newton'`", lambda: RungeKutta(EXPLICIT, outer="newton")).says(
-        "tableau must have an invertible A.*Heun.*fixed-point", "take outer='fixed-point'"
-    ),
-    *of_option(
-        "outer",
-        (
-            "n",
-            ValueError,
-            "must be 'auto', 'fixed-point', 'newton' or 'paper'; given 'n'",
-            "take one of the values named",
-        ),
-        (None, TypeError, "must be .*given None", "leave it out"),
-    ),
+    of_runge_kutta("an explicit tableau with `outer='newton'`", lambda: RungeKutta(EXPLICIT, outer="newton")).says("tableau must have an invertible A.*Heun.*fixed-point", "take outer='fixed-point'"),
+    *of_option("outer", ("n", ValueError, "must be 'auto', 'fixed-point', 'newton' or 'paper'; given 'n'", "take one of the values named"), (None, TypeError, "must be .*given None", "leave it out")),
     *of_option("error", ("none", ValueError, "must be 'richardson'", "take one of the values named")),
     *of_option("variables", ("q", ValueError, "must be 'velocities'", "take one of the values named")),
     *of_option("partition", (1, TypeError, "must be 'lasting'", "take one of the values named")),
-    *of_option(
-        "partition", ("no", ValueError, "must be 'lasting'.*'symmetric'; given 'no'", "take one of the values named")
-    ),
+    *of_option("partition", ("no", ValueError, "must be 'lasting'.*'symmetric'; given 'no'", "take one of the values named")),
     *of_option("outer_test", (1, TypeError, "must be 'all'", "take one of the values named")),
     *of_option("inner_tol", *FEW_POSITIVES),
     *of_option("outer_tol", *FEW_POSITIVES, INFINITE, (np.nan, ValueError, "must be positive", POSITIVE)),
@@ -63,11 +50,7 @@ METHODS = [
         of_runge_kutta(f"`outer='{outer}', variables='momenta'`")
         .when(lambda outer=outer: runge_kutta(outer=outer, variables="momenta"))
         .says(f"outer='{outer}' {words}", "take outer='fixed-point' for momenta")
-        for outer, words in (
-            ("newton", "goes with variables='velocities' only"),
-            ("auto", "goes with variables='velocities' only"),
-            ("paper", ".*'momenta'"),
-        )
+        for outer, words in (("newton", "goes with variables='velocities' only"), ("auto", "goes with variables='velocities' only"), ("paper", ".*'momenta'"))
     ),
     of_runge_kutta("`outer='paper', partition='symmetric'`")
     .when(lambda: runge_kutta(outer="paper", partition="symmetric"))
@@ -95,9 +78,7 @@ METHODS = [
     ),
     *argument("BDF", BDF, "outer_tol", *FEW_POSITIVES[:2]),
     *argument("BDF", BDF, "inner_tol", *FEW_POSITIVES[:1]),
-    *argument(
-        "BDF", BDF, "outer", ("paper", ValueError, "must be 'fixed-point' or 'newton'", "take one of the values named")
-    ),
+    *argument("BDF", BDF, "outer", ("paper", ValueError, "must be 'fixed-point' or 'newton'", "take one of the values named")),
     *argument(
         "Taylor",
         Taylor,
@@ -113,13 +94,7 @@ METHODS = [
     *(
         case
         for family in (gauss, radau_iia, sun_radau_iib, lobatto_iiie)
-        for case in argument(
-            family.__name__,
-            family,
-            "s",
-            (0, ValueError, "must be at least [12]", STAGES),
-            (2.0, TypeError, "must be an int", STAGES),
-        )
+        for case in argument(family.__name__, family, "s", (0, ValueError, "must be at least [12]", STAGES), (2.0, TypeError, "must be an int", STAGES))
     ),
     *argument("lobatto_iiie", lobatto_iiie, "s", (1, ValueError, "must be at least 2", STAGES)),
     *argument("gauss", gauss, "s", (True, TypeError, "must be an int", STAGES), ("3", TypeError, "must be", STAGES)),
@@ -140,13 +115,7 @@ METHODS = [
         ([np.inf], ValueError, "must be finite", "give finite coefficients"),
     ),
     *of_tableau(
-        "c",
-        ([0.5, 1.0], ValueError, r"must have shape \(1,\)", "give s nodes"),
-        ([0.25], ValueError, r"must be the row sums of A.*row 0 of A sums to 0.5, and c\[0\] is 0.25", "give A @ ones"),
+        "c", ([0.5, 1.0], ValueError, r"must have shape \(1,\)", "give s nodes"), ([0.25], ValueError, r"must be the row sums of A.*row 0 of A sums to 0.5, and c\[0\] is 0.25", "give A @ ones")
     ),
-    *of_tableau(
-        "order",
-        (0, ValueError, "must be at least 1; given 0", "give the classical order"),
-        (2.5, TypeError, "must be an int; given 2.5", "give the classical order"),
-    ),
+    *of_tableau("order", (0, ValueError, "must be at least 1; given 0", "give the classical order"), (2.5, TypeError, "must be an int; given 2.5", "give the classical order")),
 ]

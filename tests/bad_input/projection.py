@@ -17,9 +17,7 @@ FINITE = "give a finite time, s"
 of_projection = cases_of("consistent_state")
 of_argument = partial(argument, "consistent_state", project)
 PROJECTION = [
-    of_projection("a `Problem` as `system`", lambda: project(linkage())).says(
-        r"system must be a ConstrainedSystem; given a Problem.*problem\.system", "give problem.system", TypeError
-    ),
+    of_projection("a `Problem` as `system`", lambda: project(linkage())).says(r"system must be a ConstrainedSystem; given a Problem.*problem\.system", "give problem.system", TypeError),
     *of_argument(
         "t",
         (np.nan, ValueError, "must be finite; given nan", FINITE),
@@ -48,19 +46,10 @@ PROJECTION = [
     of_projection("`keep` of a coordinate at a dead centre, with a speed")
     .when(lambda: project(q=[1.0, 0.0], v=[1.0, 0.0], keep=[0]))
     .says("keep leaves too little freedom.*C_q v", "move the guess away from the dead centre"),
-    of_projection("a guess halfway to another assembly", lambda: project(q=[0.1, 0.0])).says(
-        "q does not say on which assembly.*from 0.1 to 1", "give a guess nearer to the assembly that is meant"
-    ),
-    of_projection("a guess where C_q is zero", lambda: project(q=[0.0, 0.0])).says(
-        r"q cannot be projected.*max\|C\| is 0.5.*nearly loses rank", "give a guess nearer to an assembled position"
-    ),
-    of_projection("a kept coordinate out of reach", lambda: project(q=[1.1, 0.1], keep=[0])).says(
-        "q cannot be projected.*nearer to an assembled position", "keep a value that the mechanism can have"
-    ),
+    of_projection("a guess halfway to another assembly", lambda: project(q=[0.1, 0.0])).says("q does not say on which assembly.*from 0.1 to 1", "give a guess nearer to the assembly that is meant"),
+    of_projection("a guess where C_q is zero", lambda: project(q=[0.0, 0.0])).says(r"q cannot be projected.*max\|C\| is 0.5.*nearly loses rank", "give a guess nearer to an assembled position"),
+    of_projection("a kept coordinate out of reach", lambda: project(q=[1.1, 0.1], keep=[0])).says("q cannot be projected.*nearer to an assembled position", "keep a value that the mechanism can have"),
     of_projection("`constraint` returns NaN")
     .when(lambda: project(pendulum(constraint=lambda t, q: np.full(1, np.nan))))
-    .says(
-        "q and v cannot be projected: constraint of 'pendulum' returned values that are not finite",
-        "find out where the NaN comes from",
-    ),
+    .says("q and v cannot be projected: constraint of 'pendulum' returned values that are not finite", "find out where the NaN comes from"),
 ]
