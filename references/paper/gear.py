@@ -16,7 +16,7 @@ from numba import njit, types
 
 from references.driver import STORED as STEPS_STORED
 from references.driver import Task, TimeLimit, adapter, user_call
-from references.equations.linear import compiled_now, lu_factor, lu_solve
+from references.equations.linear import compiled_when_called, lu_factor, lu_solve
 from references.lines import Line
 from references.scipy.index1 import solve_index1
 from twoloop.checks.arguments import check_choice, check_size, check_times
@@ -242,7 +242,7 @@ def _newton(f, w, t, q, forces, q_past, v_past, hb, r, there, J, pivots, counter
     return NOT_CONVERGED
 
 
-@compiled_now(_INTEGRATE)
+@compiled_when_called(_INTEGRATE)
 def _integrate(  # type: ignore[no-untyped-def]
     f, n, given, past, first, last, t0, h, order, formulas, keep, rows, counters
 ):
