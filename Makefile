@@ -2,7 +2,7 @@
 # PYTHON=/path/to/python chooses the interpreter, ARGS="--quick" passes options on.
 
 .DEFAULT_GOAL := help
-.PHONY: help install peers engines compile table3 reports bench test test-portable test-oldest lint docs lock clean
+.PHONY: help install peers engines compile table3 reports bench test test-all test-portable test-oldest lint docs lock clean
 
 # one thread: CPU times can be compared, and no BLAS changes a count
 export OPENBLAS_NUM_THREADS := 1
@@ -41,13 +41,17 @@ $(STAMP): requirements.lock pyproject.toml
 		exit 1; \
 	fi
 	@$(FIND_PYTHON); \
-	echo "Setting up .venv with $$("$$python" --version): about a minute. The first run then compiles for one."; \
+	echo "[1/3] Making .venv with $$("$$python" --version)"; \
 	"$$python" -m venv --clear .venv
-	@$(RUN) $(PIP) install -r requirements.lock
-	@$(RUN) $(PIP) install --no-deps --no-build-isolation --editable .
+	@grep -E '^(llvmlite|numba|numpy|scipy)==' requirements.lock > .venv/first.txt
+	@$(RUN) $(PIP) install --no-compile -r .venv/first.txt
+	@echo "[2/3] Installing packages; beside that, on the second core, compiling the inner loop of the integrator (once)"
+	@{ $(RUN) $(PIP) install --no-compile -r requirements.lock \
+		&& $(RUN) $(PIP) install --no-compile --no-deps --no-build-isolation --editable .; } & \
+	$(RUN) -W ignore -c "import twoloop.kernels.advance" 2>/dev/null; wait $$!
 	@touch $@
 
-peers: .venv/peers ## the rivals that work_precision compares with where they are installed: heyoka, diffrax, CasADi, extensisq
+peers: .venv/peers ## more solvers for work_precision, which does without them: heyoka, CyRK, diffrax, CasADi, extensisq
 
 .venv/peers: requirements-peers.lock $(STAMP)
 	@$(RUN) $(PIP) install -c requirements.lock -r requirements-peers.lock
@@ -59,7 +63,10 @@ engines: .venv/engines ## the physics engines of the study engines, where they a
 	@$(RUN) $(PIP) install -c requirements.lock -r requirements-engines.lock
 	@touch $@
 
-table3: install ## the paper's Table 3 into reports/; ARGS="--quick" takes seconds
+table3: install ## the paper's Table 3 into reports/, about three minutes; ARGS=--full takes twenty
+	@echo "[3/3] Compiling the paper's steps and those of the default (once), then 32 cells, IDA and Exudyn"
+	@$(RUN) -c "from twoloop.kernels.steps import explicit_step, taylor_step; from twoloop.kernels.control import switching" & \
+	$(RUN) -c "from twoloop.kernels.steps import newmark_step, paper_step; from twoloop.kernels import interpolation" && wait $$!
 	$(RUN) -m studies.table3 $(ARGS)
 
 reports: install ## all studies into reports/
@@ -91,9 +98,12 @@ compile: install ## compile the kernels, and the callbacks of bodies, mechanisms
 # in the order of their names: sorted by how many tests they have, long ones with few tests would come last
 SHARED := -n 2 --dist loadfile --no-loadscope-reorder
 
-test: compile ## the tests, on two cores; ARGS="-m ''" takes the slow ones too
-	@$(RUN) -c "import tests.compiled, tests.problems, tests.test_families, tests.test_bounds, tests.test_what_is_kept"
+test: compile ## the tests that a change needs, on two cores
+	@$(RUN) -c "import tests.compiled, tests.problems, tests.test_bounds, tests.test_other_parameters"
 	$(RUN) -m pytest $(SHARED) $(ARGS)
+
+test-all: ## all tests, the slow ones too: about twenty minutes
+	@$(MAKE) --no-print-directory test ARGS="-m ''"
 
 # other rounding: no fused operations, and kernels of OpenBLAS for an old processor; a numba cache of its own, as below
 test-portable: install ## the tests of twoloop and references as on another processor; ARGS=tests/kernels for some
