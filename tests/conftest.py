@@ -17,7 +17,7 @@ NEED_STUDIES = (
     *("symbolic/test_from_lagrangian.py", "symbolic/test_matrices.py", "test_differential.py"),
     *("test_docs.py", "test_rooms.py"),
 )
-LONG_AND_LATE = {"test_docs.py", "test_results_stay.py", "test_check.py", "test_examples.py"}
+LONG_AND_LATE = {"test_docs.py", "test_check.py", "test_examples.py"}
 collect_ignore = [] if find_spec("pandas") and find_spec("matplotlib") else list(NEED_STUDIES)
 settings.register_profile("twoloop", deadline=None, derandomize=True, max_examples=25)
 settings.load_profile("twoloop")

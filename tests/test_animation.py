@@ -4,14 +4,13 @@ import re
 import stat
 import sys
 
-import numpy as np
 import pytest
 
 from tests.processes import run_node
 from twoloop import solve_dae
 from twoloop.mechanisms import pendulum, spatial_slider_crank
 
-Image = pytest.importorskip("PIL.Image")  # not among the oldest versions
+pytest.importorskip("PIL")  # not among the oldest versions
 # a document with what the page asks of it; counts what is drawn, and lets time pass frame by frame
 DOCUMENT = """
 const elements = {};
@@ -87,17 +86,6 @@ def test_a_spatial_page_can_be_turned(crank, tmp_path):
     assert lines and all(0 < x < 1440 and 0 < y < 960 for _, x, y in lines)
     first = [call for call in said["drawn"] if call[0] == "lineTo"]
     assert first[0] != lines[0]
-
-
-def test_a_gif(swung, tmp_path):
-    path = swung.animate(tmp_path / "swing.gif", seconds=1.0)
-    with Image.open(path) as picture:
-        assert picture.n_frames == 26 and picture.info["duration"] == 40
-        first = np.array(picture.convert("RGB"), dtype=int)
-        picture.seek(20)
-        later = np.array(picture.convert("RGB"), dtype=int)
-    assert (np.abs(first - later).sum(axis=2) > 100).sum() > 500  # it moved
-    assert (first.sum(axis=2) < 500).sum() > 500  # and is not a blank page
 
 
 def test_a_film_is_what_ffmpeg_gets(crank, tmp_path, monkeypatch):

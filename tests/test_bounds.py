@@ -1,13 +1,11 @@
 """Indices out of bounds are found before machine code reads or writes outside its arrays, at every entry point."""
 
-import types
-
 import numpy as np
 import pytest
 from numba import njit
 from numba.extending import register_jitable
 
-from tests.problems import pendulum
+from tests.problems import pendulum, quick
 from tests.processes import run_python
 from tests.test_callbacks import PENDULUM
 from twoloop import ConstrainedSystem, callback, consistent_state, solve_dae
@@ -58,7 +56,7 @@ def test_every_callback_is_watched_when_it_is_called_alone(kind):
 
 
 @pytest.mark.parametrize("entry", ENTRIES)
-@pytest.mark.parametrize("kind", ["mass", "force", "constraint", "jacobian", "gamma", "reaction_by_q"])
+@pytest.mark.parametrize("kind", quick(["mass", "force", "constraint", "jacobian", "gamma", "reaction_by_q"], 4))
 def test_every_entry_point_watches_every_callback(entry, kind):
     tangents = NO_TANGENT if kind == "reaction_by_q" else {}
     with pytest.raises(ValueError, match=rf"{kind} of 'far' goes out of bounds: index {FAR}"):
@@ -92,11 +90,6 @@ def test_too_few_parameters_are_reported_as_such(entry):
         ENTRIES[entry](system(parameters=[]))
 
 
-def test_the_message_shows_the_line():
-    with pytest.raises(ValueError, match=r"index 0 is out of bounds.*in `.* = p\[0\]` \(.*compiled.py, line \d+\)"):
-        system(parameters=[]).mass(0.0, Q)
-
-
 @njit
 def fill(out, place):
     out[place] = 1.0
@@ -122,29 +115,10 @@ def enclosing(helper):
     return force
 
 
-def of_module(module):
-    def force(t, q, v, p, Q):
-        module.fill(Q, FAR)
-
-    return force
-
-
-def of_tuple(helpers):
-    def force(t, q, v, p, Q):
-        helpers[0](Q, FAR)
-
-    return force
-
-
-MODULE = types.ModuleType("helpers")
-MODULE.fill = fill
-
-
-@pytest.mark.filterwarnings("ignore:First-class function type feature is experimental")
 @pytest.mark.parametrize(
     "force",
-    [enclosing(fill), enclosing(pass_on), enclosing(countdown), of_module(MODULE), of_tuple((pass_on,))],
-    ids=["helper", "helper of a helper", "recursive", "module", "tuple"],
+    [enclosing(fill), enclosing(pass_on), enclosing(countdown)],
+    ids=["helper", "helper of a helper", "recursive"],
 )
 def test_helpers_are_watched(force):
     with pytest.raises(
@@ -162,37 +136,17 @@ def test_what_runs_only_compiled_is_watched_too():
         system(force=force).force(0.0, Q, V)
 
 
-def test_a_callback_is_looked_at_once_and_changes_nothing():
-    @callback("force")
-    def force(t, q, v, p, Q):
-        Q[1] = -9.81 * q.size
-
-    given = system(force=force)
-    q, v = np.array(Q), np.array(V)
-    for _ in range(3):
-        assert given.force(0.0, q, v).tolist() == [0.0, -19.62]
-    assert given.within_bounds == {"force"}
-    force.py_func = None  # what is looked at again would fail now
-    given.force(0.0, q, v)
-    assert q.tolist() == Q and v.tolist() == V
-
-
 # --- what the caller passes
 @pytest.mark.parametrize("make", [system, pendulum], ids=["compiled", "plain"])
 @pytest.mark.parametrize(
     ("kind", "arguments", "error", "words"),
     [
         ("jacobian", (0.0, [0.0]), ValueError, r"q must have shape \(2,\), as n_q = 2 in '\w+'; given shape \(1,\)"),
-        ("jacobian", (0.0, [[0.0, 1.0]]), ValueError, r"q must have shape \(2,\).*given shape \(1, 2\)"),
-        ("constraint", (0.0, 1.0), ValueError, r"q must have shape \(2,\).*given the number 1\.0"),
         ("force", (0.0, Q, [0.0] * 3), ValueError, r"v must have shape \(2,\).*given shape \(3,\)"),
         ("reaction_by_q", (0.0, Q, V), ValueError, r"lam must have shape \(1,\), as n_c = 1.*given shape \(2,\)"),
         ("mass", (np.nan, Q), ValueError, "t must be finite; given nan"),
-        ("mass", (np.inf, Q), ValueError, "t must be finite; given inf"),
-        ("mass", ("now", Q), TypeError, "t must be a number; given 'now'"),
         ("mass", (0.0, ["left", "down"]), TypeError, "q must be an array of real numbers"),
         ("force", (0.0, Q), TypeError, r"force\(t, q, v\): missing a required argument: 'v'"),
-        ("force", (0.0, Q, V, V), TypeError, r"force\(t, q, v\): too many positional arguments"),
     ],
 )
 def test_arguments_of_single_callbacks_are_checked(make, kind, arguments, error, words):
@@ -229,13 +183,7 @@ def in_a_table_by_a_helper(t, q, v, p, Q):
 
 
 looked_up_there = register_jitable(looked_up.py_func)
-LAWS, LOOKING = (looked_up,), types.ModuleType("looking")
-LOOKING.law = looked_up
-
-
-@njit
-def by_law_of(module, x):
-    return module.law(x)
+LAWS = (looked_up,)
 
 
 @callback("force")
@@ -248,16 +196,11 @@ def in_a_table_by_a_tuple(t, q, v, p, Q):
     Q[0] = LAWS[0](t) - q[0]
 
 
-@callback("force")
-def in_a_table_by_a_module(t, q, v, p, Q):
-    Q[0] = by_law_of(LOOKING, t) - q[0]
+OTHERS = [in_a_table_by_what_is_registered, in_a_table_by_a_tuple]
 
 
-BY_OTHERS = [in_a_table_by_what_is_registered, in_a_table_by_a_tuple, in_a_table_by_a_module]
-
-
-@pytest.mark.parametrize("force", [in_a_table, in_a_table_by_a_helper, *BY_OTHERS])
-@pytest.mark.parametrize("method", ["auto", "RadauIIA5"])
+@pytest.mark.parametrize("force", [in_a_table, in_a_table_by_a_helper, *OTHERS])
+@pytest.mark.parametrize("method", quick(["auto", "RadauIIA5"]))
 def test_a_run_beyond_the_end_of_a_table_is_no_success(force, method):
     system = ConstrainedSystem(n_q=1, n_c=0, mass=of_one, force=force, name="table")
     assert solve_dae(system, (0.0, 1.9), [0.0], [0.0], method).success

@@ -1,17 +1,22 @@
 """The table of callbacks and what follows from it, the decorator, and what becomes of plain Python functions."""
 
+import copy
 import inspect
+import multiprocessing
+import pickle
 
 import numba
 import numpy as np
 import pytest
 
 from tests.compiled import centripetal, circle, heavy, radius, unit_mass, weight
-from tests.problems import pendulum
+from tests.problems import pendulum, quick
 from twoloop import ConstrainedSystem, Status, callback, solve_dae
 from twoloop.kernels.compile.callbacks import KINDS, OPTIONAL
 from twoloop.kernels.data.common import KIT, Functions
 from twoloop.kernels.data.flags import GIVEN
+from twoloop.mechanisms import four_bar
+from twoloop.problem.adapters import PythonFunctions
 
 
 @callback("force")
@@ -83,16 +88,6 @@ def test_a_kind_is_known_everywhere(kind):
 def test_callbacks_that_are_unknown_or_missing_are_named(maker, changed, words):
     with pytest.raises(TypeError, match=words):
         maker(n_q=2, n_c=1, **changed)
-
-
-@pytest.mark.parametrize("kind", ["constraint_rate", "force_by_q", "force_by_v", "reaction_by_q"])
-def test_what_is_left_out_leaves_zeros(kind):
-    system = pendulum()
-    state = [np.ones(1) if name == "lam" else np.ones(2) for name in KINDS[kind].state]
-    assert kind not in system.given
-    values = getattr(system, kind)(0.0, *state)
-    for value, zeros in zip(values if KINDS[kind].more else [values], system.arrays_of(kind), strict=True):
-        assert value.shape == zeros.shape and not value.any()
 
 
 @numba.njit
@@ -168,7 +163,7 @@ def pushed(t, q, v, p, Q):
     Q[0] = 1.0
 
 
-@pytest.mark.parametrize("method", ["auto", "Adams", "RadauIIA9", "TRBDF2", "Gauss8", "Newmark"])
+@pytest.mark.parametrize("method", quick(["auto", "Adams", "RadauIIA9", "TRBDF2", "Gauss8", "Newmark"]))
 def test_a_mass_that_is_constant_at_the_start_only_ends_the_run(method):
     """It was factored once, and the motion that of a lighter body, by every method."""
     system = ConstrainedSystem(
@@ -187,10 +182,208 @@ def agrees_at_first(t, q, v, p, C, Cq, Ct, Qd):
     Qd[0] = -(v[0] * v[0] + v[1] * v[1])
 
 
-@pytest.mark.parametrize("method", ["auto", "Adams", "TRBDF2"])
+@pytest.mark.parametrize("method", quick(["auto", "Adams", "TRBDF2"]))
 def test_kinematics_that_agree_at_the_start_only_end_the_run(method):
     given = dict(mass=unit_mass, force=weight, constraint=circle, jacobian=radius, gamma=centripetal)
     system = ConstrainedSystem(n_q=2, n_c=1, **given, kinematics=agrees_at_first, name="fused")
     result = solve_dae(system, (0.0, 1.0), [1.0, 0.0], [0.0, 0.0], method, rtol=1e-6, atol=1e-6)
     assert result.status is Status.WRONG_DERIVATIVE
     assert "kinematics of 'fused' does not give what jacobian gives: entry (0, 1)" in result.message
+
+
+# --- copied, deep-copied, pickled and sent to another process, a system keeps its own functions, or says why it cannot
+AT, MOVING = [-0.6, -0.8], [0.4, -0.3]
+LOADS = np.diag([2.0, 3.0])
+
+
+def plain_mass(t, q):
+    return np.eye(2)
+
+
+def light_weight(t, q, v):
+    return np.array([0.0, -9.81])
+
+
+def heavy_weight(t, q, v):
+    return np.array([0.0, -98.1])
+
+
+def plain_constraint(t, q):
+    return np.array([0.5 * (q[0] * q[0] + q[1] * q[1] - 1.0)])
+
+
+def plain_jacobian(t, q):
+    return q.reshape((1, 2))
+
+
+def made(force=light_weight, **changed):
+    functions = {"mass": plain_mass, "force": force, "constraint": plain_constraint, "jacobian": plain_jacobian}
+    return ConstrainedSystem.from_python(n_q=2, n_c=1, **{**functions, "name": "own", **changed})
+
+
+SYSTEMS = {
+    "plain": made,
+    "plain, array mass": lambda: made(mass=LOADS),
+    "compile=True": lambda: made(compile=True),
+    "compile=True, array mass": lambda: made(mass=LOADS, compile=True),
+    "compiled": lambda: ConstrainedSystem(**PENDULUM, parameters=[3.0], constant_mass=True, name="own"),
+    "four-bar": lambda: four_bar().system,
+}
+
+
+def observed(system):
+    """What tells one system from another; at the top level, for other processes."""
+    q = np.linspace(0.1, 0.9, system.n_q)
+    arrays = [system.mass(0.0, q), system.force(0.0, q, q), system.constraint(0.0, q), system.jacobian(0.0, q)]
+    flags = system.functions.flags.tolist()
+    return [array.tolist() for array in arrays], flags, system.name, system.constant_mass, system.called_in_python
+
+
+OTHERS = []
+
+
+def observed_beside_others(system):
+    """In a process where more and more systems are, whose numbers a foreign one must not meet."""
+    OTHERS.extend(made(force=heavy_weight) for _ in range(5))
+    return observed(system), [other.force(0.0, AT, MOVING).tolist() for other in OTHERS]
+
+
+@pytest.mark.parametrize("name", SYSTEMS)
+@pytest.mark.parametrize(
+    "copied",
+    [copy.copy, copy.deepcopy, lambda system: pickle.loads(pickle.dumps(system))],
+    ids=["copy", "deepcopy", "pickle"],
+)
+def test_a_copy_works_when_the_original_is_gone(name, copied):
+    system = SYSTEMS[name]()
+    expected = observed(system)
+    other = copied(system)
+    del system
+    assert observed(other) == expected
+    if other.called_in_python:
+        assert int(other.functions.p[0]) in PythonFunctions.registry
+
+
+@pytest.mark.parametrize("method", quick(["fork", "spawn"]))
+def test_systems_keep_their_functions_in_other_processes(method):
+    systems = [make() for make in SYSTEMS.values()]
+    problem = four_bar()
+    result = solve_dae(problem.system, (0.0, 0.1), problem.q0, problem.v0)
+    with multiprocessing.get_context(method).Pool(1) as pool:
+        for k, system in enumerate(systems, 1):  # all but the first arrive where others are already
+            there, others = pool.apply(observed_beside_others, (system,))
+            assert there == observed(system) and others == [[0.0, -98.1]] * 5 * k
+        assert pool.apply(energy_at_the_end, (result,)) == (result.energy[-1], "four-bar")
+
+
+def energy_at_the_end(result):
+    return result.energy[-1], result.system.name
+
+
+def test_a_compiled_callback_within_a_function_travels_with_its_source():
+    factor = 3.0
+
+    @callback("force")
+    def force(t, q, v, p, Q):
+        Q[1] = factor * p[0]
+
+    system = ConstrainedSystem(**{**PENDULUM, "force": force}, parameters=[2.0])
+    assert pickle.loads(pickle.dumps(system)).force(0.0, AT, MOVING).tolist() == [0.0, 6.0]
+
+
+def enclosing():
+    def force(t, q, v):
+        return np.zeros(2)
+
+    return force
+
+
+@pytest.mark.parametrize("compiled", [False, True])
+@pytest.mark.parametrize("force", [lambda t, q, v: np.zeros(2), enclosing()], ids=["lambda", "closure"])
+def test_functions_without_a_name_of_their_own_say_so(force, compiled):
+    system = made(force=force, compile=compiled)
+    words = r"(?s)force of 'own', .*(<lambda>|enclosing.<locals>.force), cannot be pickled.*top level of a module"
+    with pytest.raises(TypeError, match=words):
+        pickle.dumps(system)
+    assert copy.deepcopy(system).force(0.0, AT, MOVING).tolist() == [0.0, 0.0]  # needs no name
+
+
+# --- forces in Python that depend on more than t, q and v: named at the start, or at the end of the run
+BESIDE = np.array([0.6, -0.8]), np.array([0.4, 0.3])
+
+
+def pushed_by(along_x):
+    return pendulum(force=lambda t, q, v: np.array([along_x(t, q, v), -9.81]), gamma=False, constant_mass=True)
+
+
+def noise():
+    random = np.random.default_rng(1)
+    return lambda t, q, v: 1e-3 * random.normal()
+
+
+def sampled_controller():
+    held = {"next": 0.0, "value": 0.0}
+
+    def force(t, q, v):
+        if t >= held["next"]:
+            held["value"], held["next"] = -3.0 * v[0], held["next"] + 0.01
+        return held["value"]
+
+    return force
+
+
+def integral():
+    held = {"t": 0.0, "sum": 0.0}
+
+    def force(t, q, v):
+        held["sum"] += q[0] * (t - held["t"])
+        held["t"] = t
+        return -2.0 * held["sum"]
+
+    return force
+
+
+def delayed():
+    before = []
+
+    def force(t, q, v):
+        while before and before[-1][0] >= t:
+            before.pop()
+        before.append((t, v[0]))
+        return -2.0 * np.interp(t - 0.2, *zip(*before, strict=True))
+
+    return force
+
+
+@pytest.mark.parametrize("method", quick(["auto", "RadauIIA9"]))
+@pytest.mark.parametrize("make", [noise, sampled_controller, integral])
+def test_memory_is_named_at_the_start(make, method):
+    with pytest.raises(ValueError, match="force of 'pendulum' gives something else when it is called again"):
+        solve_dae(pushed_by(make()), (0.0, 1.0), *BESIDE, method)
+
+
+def test_memory_that_shows_along_the_motion_is_named_at_its_end():
+    result = solve_dae(pushed_by(delayed()), (0.0, 1.0), *BESIDE, "DOP853")
+    assert result.status is Status.WRONG_TRACE and "when it is called again" in result.message
+
+
+def test_what_is_kept_for_speed_or_to_be_looked_at_is_no_memory():
+    known, log, guess = {}, [], [0.0]
+
+    def kept(t, q, v):
+        log.append((t, q, v))
+        return known.setdefault((t, *q, *v), -2.0 * v[0])
+
+    def warm_start(t, q, v):
+        x = guess[0]
+        for _ in range(60):
+            x -= (x + 0.5 * np.sin(x) - v[0]) / (1.0 + 0.5 * np.cos(x))
+        guess[0] = x
+        return -2.0 * x
+
+    for force in (kept, warm_start):
+        assert solve_dae(pushed_by(force), (0.0, 1.0), *BESIDE).success
+
+
+def test_noise_goes_with_steps_of_a_constant_size():
+    assert solve_dae(pushed_by(noise()), (0.0, 0.1), *BESIDE, "DOP853", step_size=0.01).success

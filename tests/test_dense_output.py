@@ -11,14 +11,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.general.mechanisms import mechanism
-from tests.problems import force_residual, pendulum_state, run, swing, violations, worst
+from tests.problems import force_residual, pendulum_state, quick, run, swing, violations, worst
 from twoloop import RungeKutta, Status, solve_dae
 from twoloop.methods.presets import PRESETS
 from twoloop.methods.tableaux import gauss, lobatto_iiie
 
 END = 2.0
 LOOSE = ("Newmark", "BDF", "TRBDF2", "ESDIRK4", "PaperIRK", "PaperNewmark")  # steps without number at tight tolerances
-TOLERANCES = (1e-4, 1e-8, 1e-12)
+TOLERANCES = (1e-4, 1e-6, 1e-8, 1e-12)
 INNER = (0.1, 0.3, 0.5, 0.7, 0.9)
 
 
@@ -45,7 +45,8 @@ def errors(result, exact):
 
 
 @pytest.mark.parametrize(
-    ("method", "tol"), [(name, tol) for name in PRESETS for tol in ((1e-4, 1e-6) if name in LOOSE else TOLERANCES)]
+    ("method", "tol"),
+    quick([(name, tol) for tol in TOLERANCES for name in PRESETS if name not in LOOSE or tol > 1e-8], len(PRESETS)),
 )
 def test_between_the_steps_as_good_as_at_them(default_four_bar, exact, method, tol):
     result = run(default_four_bar, END, method=method, rtol=tol, atol=tol, dense_output=True)
@@ -58,23 +59,22 @@ def test_between_the_steps_as_good_as_at_them(default_four_bar, exact, method, t
 
 @pytest.mark.parametrize(
     ("method", "order", "h"),
-    [
-        ("SunRadau5", 5, 0.02),
-        ("Gauss4", 4, 0.02),
-        ("Gauss6", 6, 0.02),
-        ("Gauss8", 8, 0.04),
-        ("Gauss10", 10, 0.0267),
-        ("Gauss12", 12, 0.04),
-        (RungeKutta(lobatto_iiie(3)), 4, 0.02),
-        (RungeKutta(gauss(3), variables="momenta", partition="symmetric"), 6, 0.02),
-        ("RadauIIA5", 5, 0.01),
-        ("RadauIIA9", 9, 0.04),
-        ("Newmark", 2, 0.01),
-        ("BDF", 5, 0.005),
-        ("DOP853", 8, 0.04),
-        ("PaperIRK", 5, 0.02),
-        ("PaperNewmark", 2, 0.01),
-    ],
+    quick(
+        [
+            *(
+                ("DOP853", 8, 0.04),
+                ("Gauss8", 8, 0.04),
+                ("RadauIIA5", 5, 0.01),
+                ("BDF", 5, 0.005),
+                ("Newmark", 2, 0.01),
+            ),
+            *(("SunRadau5", 5, 0.02), ("Gauss4", 4, 0.02), ("Gauss6", 6, 0.02), ("Gauss12", 12, 0.04)),
+            *(("RadauIIA9", 9, 0.04), ("PaperIRK", 5, 0.02), ("PaperNewmark", 2, 0.01)),
+            (RungeKutta(lobatto_iiie(3)), 4, 0.02),
+            (RungeKutta(gauss(3), variables="momenta", partition="symmetric"), 6, 0.02),
+        ],
+        5,
+    ),
 )
 def test_order_between_the_steps(default_four_bar, exact, method, order, h):
     found = []
@@ -117,10 +117,10 @@ ACROSS = "A02, N = 1"  # a singular position
 
 @pytest.mark.parametrize(
     ("name", "method"),
-    [
-        *((name, method) for name in OTHERS for method in ("SunRadau5", "Gauss12", "RadauIIA5")),
-        *((ACROSS, method) for method in ("DOP853", "Gauss12")),
-    ],
+    quick(
+        [(ACROSS, "DOP853"), *((name, method) for method in ("Gauss12", "RadauIIA5", "SunRadau5") for name in OTHERS)],
+        6,
+    ),
 )
 def test_other_mechanisms(name, method):
     """Redundant rows, a singular mass, non-holonomic rows, a drive, no constraints at all; rank lost on the way."""
@@ -135,7 +135,7 @@ def test_other_mechanisms(name, method):
         assert force_residual(m.system(), state) < 4.0 * force_residual(m.system(), result) + 1e-11
 
 
-@pytest.mark.parametrize("max_steps", [1, 2, 3, 4])
+@pytest.mark.parametrize("max_steps", quick([1, 2, 3, 4], 2))
 @pytest.mark.parametrize("method", ["DOP853", "Gauss8"])
 def test_a_run_of_few_steps_covers_what_was_computed(default_four_bar, method, max_steps):
     result = run(default_four_bar, 1.0, method=method, max_steps=max_steps, dense_output=True)
@@ -150,7 +150,7 @@ def test_a_run_without_a_step():
     assert result.status == Status.NOT_CONVERGED and result.t.size == 1 and (result.sol(0.0).q == result.q[:, 0]).all()
 
 
-@pytest.mark.parametrize("method", ["SunRadau5", "Gauss8"])
+@pytest.mark.parametrize("method", quick(["SunRadau5", "Gauss8"]))
 @pytest.mark.parametrize("copied", [copy.copy, copy.deepcopy, lambda result: pickle.loads(pickle.dumps(result))])
 def test_copies(default_four_bar, method, copied):
     result = run(default_four_bar, 0.5, method=method, dense_output=True)

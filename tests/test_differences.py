@@ -7,7 +7,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from tests.derivative_cases import shaken_pendulum
-from tests.problems import pendulum, worst
+from tests.problems import pendulum, quick, worst
 from twoloop import ConstrainedSystem, Status, consistent_state, solve_dae
 from twoloop.mechanisms import four_bar, very_flexible_beam
 
@@ -67,7 +67,7 @@ def start(system, speed):
     return consistent_state(system, 0.0, [-1.0, 0.0], [AMPLITUDE * speed, 0.0])
 
 
-@pytest.mark.parametrize("method", ["Gauss12", "DOP853", "BDF"])
+@pytest.mark.parametrize("method", quick(["DOP853", "Gauss12", "BDF"]))
 @pytest.mark.parametrize("speed", [1.0, 1e3, 2.0 * np.pi * 16e3])
 def test_a_fast_drive(speed, method):
     exact, differenced = shaken(speed), shaken(speed, gamma=False)
@@ -109,17 +109,6 @@ def test_what_cannot_reach_the_tolerance_is_a_status():
     assert "gamma by differences" in run.message and "Give gamma, or loosen rtol" in run.message and run.t[0] == 0.0
 
 
-def test_differences_where_all_coordinates_are_zero():
-    """A bead on y = x^2 that passes the vertex."""
-    system = pendulum(
-        constraint=lambda t, q: np.array([q[1] - q[0] ** 2]),
-        jacobian=lambda t, q: opaque(np.array([[-2.0 * q[0], 1.0]])),
-        gamma=False,
-    )
-    run = solve_dae(system, (0.0, 0.5), [0.0, 0.0], [3.0, 0.0], "Gauss8", 1e-9, 1e-9)
-    assert worst(run.a[:, 0], [0.0, 18.0]) < 1e-6 and worst(0.5 * (run.v**2).sum(axis=0) + 9.81 * run.q[1], 4.5) < 1e-7
-
-
 def test_differences_of_constraints_that_hardly_bend_are_judged_by_rounding():
     """Nothing turns and nothing pushes: gamma is zero, and what differences leave of it is rounding."""
     angle, radius = 0.7, 0.4
@@ -141,7 +130,7 @@ def test_differences_of_constraints_that_hardly_bend_are_judged_by_rounding():
     assert result.success and abs(result.q[3, -1] - 9.0) < 1e-7
 
 
-@pytest.mark.parametrize("t0", [0.0, 1e5, 1e6])
+@pytest.mark.parametrize("t0", quick([1e6, 0.0, 1e5]))
 def test_a_late_start_leaves_room_for_differences_on_one_side(t0):
     """A drive of a kilohertz, with lengths of differences that are a few spacings of time at a start as late."""
     size, rate, end = 1e-3, 6e3, 0.02

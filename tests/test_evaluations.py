@@ -7,6 +7,7 @@ On Andrews' mechanism most methods would take fewer than a hundred steps, which 
 import numpy as np
 import pytest
 
+from tests.problems import quick
 from twoloop import solve_dae
 from twoloop.mechanisms import andrews, four_bar
 from twoloop.methods.presets import PRESETS
@@ -56,7 +57,7 @@ def test_every_preset_has_a_bound():
     assert set(BOUNDS) == set(PRESETS) - ELSEWHERE
 
 
-@pytest.mark.parametrize("method", BOUNDS)
-@pytest.mark.parametrize("make", [four_bar, andrews])
+@pytest.mark.parametrize("method", quick(BOUNDS, 4))
+@pytest.mark.parametrize("make", quick([four_bar, andrews]))
 def test_evaluations_at_an_error_are_bounded(make, method):
     assert evaluations(make(), method, LOOSE.get(method, ERROR)) < BOUNDS[method][make is andrews]

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
-from tests.problems import at_one, event, pendulum, run, swing, unconstrained, violations, worst
+from tests.problems import at_one, event, pendulum, quick, run, swing, unconstrained, violations, worst
 from twoloop import Status, solve_dae
 from twoloop.problem.events import EventSearch, check_events
 
@@ -30,7 +30,7 @@ def exact(default_four_bar):
     return run(default_four_bar, 4.0, events=at_one(), **options).t_events[0]
 
 
-@pytest.mark.parametrize("method", ["SunRadau5", "Gauss12", "DOP853", "RadauIIA5"])
+@pytest.mark.parametrize("method", quick(["DOP853", "SunRadau5", "Gauss12", "RadauIIA5"], 2))
 def test_theta_3_is_one(default_four_bar, exact, method):
     result = run(default_four_bar, 4.0, method=method, rtol=1e-11, atol=1e-11, events=at_one(), dense_output=True)
     (times,), (q,), (v,) = result.t_events, result.q_events, result.v_events
@@ -39,7 +39,7 @@ def test_theta_3_is_one(default_four_bar, exact, method):
     assert (state.q == q.T).all() and (state.v == v.T).all() and max(violations(default_four_bar.system, state)) < 1e-13
 
 
-@pytest.mark.parametrize("method", ["SunRadau5", "Gauss8", "BDF"])
+@pytest.mark.parametrize("method", quick(["BDF", "SunRadau5", "Gauss8"]))
 def test_events_leave_a_run_as_it_is(default_four_bar, method):
     free = run(default_four_bar, 3.0, method=method, rtol=1e-6, atol=1e-6)
     never = clock(10.0, terminal=True)  # short chunks
@@ -102,25 +102,23 @@ def test_every_crossing_that_is_sampled_is_found(times):
     assert result.t_events[0] == pytest.approx(times, abs=1e-14)
 
 
-@pytest.mark.parametrize("compiled", [True, False])
-@pytest.mark.parametrize("method", ["auto", "Taylor", "DOP853", "RadauIIA9"])
+@pytest.mark.parametrize("compiled", quick([True, False]))
+@pytest.mark.parametrize("method", quick(["auto", "Taylor", "DOP853"]))
 @pytest.mark.parametrize("level", [0.97, 0.999])
 def test_what_lasts_longer_than_the_widest_gap_is_found(oscillator, method, level, compiled):
     """x = -cos(t) above a level for 0.49 s or 0.09 s, of 20 s; a series takes steps of seconds."""
-    if compiled and method == "RadauIIA9":
-        pytest.skip("there is no machine code for it")
     end, half = 20.0, np.arccos(level)
     high = [np.pi * each + side for each in (1, 3, 5) for side in (-half, half)]
     events = [event(lambda t, q, v: q[0] - level), event(lambda t, q, v: q[0] - level, 2, 1)]
     result = solve_dae(oscillator, (0.0, end), [-1.0], [0.0], method, compiled=compiled, events=events[0])
     assert result.t_events[0] == pytest.approx(high, abs=1e-5)
     if level == 0.97:
-        assert result.widest_gap < 2.0 * half and (method in ("DOP853", "RadauIIA9") or result.h.max() > 1.0)
+        assert result.widest_gap < 2.0 * half and (method == "DOP853" or result.h.max() > 1.0)
     result = solve_dae(oscillator, (0.0, end), [-1.0], [0.0], method, compiled=compiled, events=events[1])
     assert result.status is Status.EVENT and result.t[-1] == pytest.approx(high[2], abs=1e-5)
 
 
-@pytest.mark.parametrize("method", ["Taylor", "RadauIIA9", "BDF"])
+@pytest.mark.parametrize("method", quick(["Taylor", "RadauIIA9", "BDF"]))
 def test_samples_are_no_further_apart_than_a_400th_of_the_run(oscillator, method):
     seen = []
     watch = event(lambda t, q, v: seen.append(t) or 1.0)

@@ -1,12 +1,10 @@
 """Drives whose C_t jumps: velocities change as by an impulse, by every method, or the run says why not."""
 
-from functools import cache
-
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from tests.problems import driven_cart, pendulum, some_of
+from tests.problems import driven_cart, pendulum, quick
 from twoloop import ConstrainedSystem, Status, solve_dae
 from twoloop.methods.presets import PRESETS
 from twoloop.run.impulse import beyond_jump
@@ -15,8 +13,8 @@ from twoloop.run.impulse import beyond_jump
 MIXED = np.random.default_rng(5).normal(size=(5, 5)) * 0.3
 MASS = np.diag([1.0, 2.0, 2.0, 1.0, 1.0]) + MIXED @ MIXED.T
 LOW_ORDER = ("TRBDF2", "ESDIRK4", "Newmark", "PaperNewmark", "PaperIRK")
-# Taylor refuses callbacks that branch; of Gauss' methods the shortest, the middle one and the longest
-METHODS = [name for name in PRESETS if name not in ("Taylor", "Gauss6", "Gauss10", "Gauss12", "Gauss14")]
+# Taylor refuses callbacks that branch
+METHODS = [name for name in PRESETS if name not in ("auto", "Taylor", "Gauss6", "Gauss10", "Gauss12", "Gauss14")]
 
 
 def driven(place, speed, acceleration, gamma=True):
@@ -107,19 +105,13 @@ def case(request):
     return jump, at, through([(0.0, at, smooth), (at, END, after)], velocities(smooth))
 
 
-def end_of(system, method="DOP853", tolerance=1e-10, **options):
-    """State at the end of a run from the start, by a method that lands on what jumps."""
-    result = solve_dae(system, (0.0, END), START, velocities(system), method, tolerance, tolerance, **options)
-    return np.concatenate([result.q[:, -1], result.v[:, -1]])
-
-
 def off(result, expected):
     return np.abs(np.concatenate([result.q[:, -1], result.v[:, -1]]) - expected).max()
 
 
 @pytest.mark.parametrize(
     ("case", "method"),
-    [(CASES[0], name) for name in METHODS] + [(CASES[1], name) for name in FAMILIES],
+    quick([(CASES[k], name) for name in ("auto", *METHODS) for k in (0, 1) if k == 0 or name in FAMILIES], 4),
     indirect=["case"],
 )
 def test_a_jump_is_an_impulse(case, method):
@@ -129,39 +121,6 @@ def test_a_jump_is_an_impulse(case, method):
     result = solve_dae(system, (0.0, END), START, velocities(system), method, tol, tol)
     assert result.success and off(result, expected) < (3e3 if method in LOW_ORDER else 1e2) * tol
     assert f"At t = {at:.4g} C_t or b jumps" in result.message and np.abs(result.t - at).min() < 1e-14
-
-
-def softplus(x):
-    return x + np.log1p(np.exp(-x)) if x > 0.0 else np.log1p(np.exp(x))
-
-
-def sigmoid(x):
-    return 1.0 / (1.0 + np.exp(-x)) if x > -700.0 else 0.0
-
-
-@cache
-def steep_ramp(width):
-    """A drive that becomes faster within the width, and the state at the end."""
-    at, jump = 0.4371, 0.8
-
-    def steep(t):
-        return sigmoid((t - at) / width)
-
-    system = driven(
-        lambda t: jump * width * softplus((t - at) / width),
-        lambda t: jump * steep(t),
-        lambda t: jump / width * steep(t) * (1.0 - steep(t)),
-    )
-    return system, end_of(system, max_step=0.005)
-
-
-@pytest.mark.parametrize(
-    ("width", "method"), some_of((1e-3, 1e-4, 1e-8), ("auto", "Gauss4", "Gauss16", "RadauIIA9", "SunRadau5", "BDF"), 4)
-)
-def test_a_steep_ramp_is_none(method, width):
-    system, expected = steep_ramp(width)
-    result = solve_dae(system, (0.0, END), START, velocities(system), method, 1e-6, 1e-6)
-    assert off(result, expected) < 1e-4 and "jumps" not in result.message
 
 
 def at_rest_and_then(place, speed, acceleration, at):
@@ -175,14 +134,11 @@ def after_a_sudden_start():
     return at_rest_and_then(lambda t: 0.8 * (t - 0.4371), lambda t: 0.8, lambda t: 0.0, 0.4371)
 
 
-@pytest.mark.parametrize(
-    ("method", "tolerance"), [("Newmark", 1e-4), ("TRBDF2", 1e-4), ("TRBDF2", 1e-6), ("auto", 1e-6)]
-)
-@pytest.mark.parametrize("width", [1e-4, 1e-6, 1e-9])
+@pytest.mark.parametrize(("method", "tolerance"), quick([("TRBDF2", 1e-4), ("auto", 1e-6), ("Newmark", 1e-4)], 2))
+@pytest.mark.parametrize("width", quick([1e-6, 1e-4, 1e-9]))
 def test_a_ramp_between_the_ends_of_a_step(after_a_sudden_start, method, tolerance, width):
     """At both ends of a step as long as the ramp its acceleration is zero: such steps left the impulse of it out."""
     at, jump = 0.4371, 0.8
-
     system = driven(
         lambda t: jump * (0.5 * min(max(0.0, t - at), width) ** 2 / width + max(0.0, t - at - width)),
         lambda t: jump * min(max(0.0, t - at) / width, 1.0),
@@ -197,7 +153,7 @@ def after_a_gentle_start():
     return at_rest_and_then(lambda t: 3.0 * (t - 0.437) ** 2, lambda t: 6.0 * (t - 0.437), lambda t: 6.0, 0.437)
 
 
-@pytest.mark.parametrize("method", ["auto", "Gauss4", "RadauIIA9", "BDF", "Adams", "PaperIRK"])
+@pytest.mark.parametrize("method", quick(["auto", "RadauIIA9", "BDF", "Adams", "PaperIRK"]))
 def test_a_jump_of_the_acceleration_of_a_drive_is_none(after_a_gentle_start, method):
     at = 0.437
     system = driven(
@@ -216,7 +172,7 @@ def beside_a_jump():
     return start, solve_dae(*start, "DOP853", 1e-11, 1e-11, t_eval=t, max_step=0.02)
 
 
-@pytest.mark.parametrize("method", ["DOP853", "Gauss8", "Gauss6", "BDF"])
+@pytest.mark.parametrize("method", quick(["DOP853", "Gauss8", "BDF"]))
 def test_between_the_steps_no_polynomial_goes_through_the_jump(beside_a_jump, method):
     start, exact = beside_a_jump
     state = solve_dae(*start, method, 1e-7, 1e-7, dense_output=True).sol(exact.t)
@@ -259,7 +215,7 @@ def test_drives_that_contradict_one_another_end_the_run():
     assert result.status in (Status.RATE_JUMPS, Status.ROWS_CONTRADICT) and result.t[-1] < 0.51
 
 
-@pytest.mark.parametrize("method", ["auto", "RadauIIA9", "TRBDF2", "Gauss12"])
+@pytest.mark.parametrize("method", quick(["auto", "RadauIIA9", "TRBDF2"]))
 def test_a_rate_that_has_no_value_where_it_jumps_is_an_impulse(method):
     """C_t of 0.5 |t - 0.4|, written as a quotient, is 0 / 0 at the kink."""
 
@@ -298,7 +254,7 @@ def hung(at, jump, after_too):
     )
 
 
-@pytest.mark.parametrize("method", ["auto", "RadauIIA5", "Gauss6", "BDF", "Newmark", "TRBDF2"])
+@pytest.mark.parametrize("method", quick(["auto", "RadauIIA5", "Gauss6", "BDF", "Newmark", "TRBDF2"], 2))
 @pytest.mark.parametrize("at", [0.0, 1.0])
 def test_a_run_may_start_and_end_at_a_kink(method, at):
     speed = 0.6 if at == 0.0 else -0.6

@@ -6,6 +6,7 @@ import pickle
 import pstats
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import FrozenInstanceError, replace
+from functools import cache
 from itertools import chain
 
 import numpy as np

@@ -3,7 +3,6 @@
 import gzip
 import inspect
 import json
-from pathlib import Path
 
 import pytest
 
@@ -11,7 +10,7 @@ from twoloop import mechanisms
 from twoloop.__main__ import main
 from twoloop.rows import leaderboard, row_format
 from twoloop.rows.leaderboard import ARCHIVE, boards, chosen, seconds
-from twoloop.rows.row_format import FIELDS, mistakes, read_rows, text_of
+from twoloop.rows.row_format import mistakes, read_rows, text_of
 
 ROW = {"schema": 1, "mechanism": "four_bar", "t_end": 10, "solver": "mine", "family": "me", "version": "3"}
 ROW |= {"processor": "abacus", "setting": "tol", "value": 1e-6, "status": "REACHED_END", "times_s": [0.1, 0.11, 0.09]}
@@ -26,32 +25,24 @@ def row(**more):
     ("more", "says"),
     [
         ({"schema": 2}, "schema: given 2, expected 1"),
-        ({"schema": ...}, "schema: missing, expected 1"),
         ({"schema": True}, "schema: given true, expected 1"),
         ({"speed": 1.0}, "speed: there is no such field"),
         ({"solver": ...}, "solver: missing, expected printable text"),
-        ({"solver": None}, "solver: missing"),
         ({"solver": "a\nb"}, r'solver: given "a\\nb", expected printable text'),
-        ({"solver": "\x1b[2J"}, "solver: given"),
         ({"t_end": 0}, "t_end: given 0, expected a number > 0"),
         ({"t_end": "10"}, 't_end: given "10", expected a number > 0'),
-        ({"value": -1e-6}, "value: given -1e-06"),
         ({"value": 10**400}, "value: given 1000"),
         ({"value": True}, "value: given true"),
         ({"setting": "rtol"}, 'setting: given "rtol", expected one of tol, h, err_out'),
         ({"times_s": 0.1}, "times_s: given 0.1, expected a list of numbers > 0"),
-        ({"times_s": [0.1, 0.0]}, "times_s: given"),
         ({"times_s": []}, "expected a time at least of a run that is REACHED_END"),
         ({"error_end": ...}, "error: missing, expected it, or error_end"),
         ({"floor_end": ...}, "floor_end: missing, expected a number >= 0 beside error_end"),
-        ({"error": 1e-7}, "floor: missing"),
         ({"astray": 0}, "astray: given 0, expected true or false"),
         ({"called_from": "C"}, 'called_from: given "C", expected compiled or Python'),
         ({"calibration_s": 0.1}, "calibration: expected beside calibration_s"),
-        ({"setting": ["tol"]}, "setting: given"),
         ({"status": "reached end"}, 'status: given "reached end", expected REACHED_END in these letters'),
         ({"solver": "mine "}, 'solver: given "mine ", expected printable text, no blanks around it'),
-        ({"version": "1" * 501}, "at most 500 letters"),
     ],
 )
 def test_a_mistake_is_named_by_line_and_field(more, says):
@@ -64,10 +55,8 @@ def test_a_mistake_is_named_by_line_and_field(more, says):
     ("line", "says"),
     [
         ("{", 'given "{", expected a JSON object on a line of its own: '),
-        ("[1]", "given [1], expected a JSON object"),
         (json.dumps(row(value=float("nan"))), "value: given NaN, expected a number > 0; leave out what is not known"),
         (json.dumps(row(times_s=[0.1, float("nan")])), "times_s: given [0.1, NaN], expected a list of numbers > 0"),
-        (json.dumps(row(value=float("-inf"))), "value: given -Infinity, expected a number > 0"),
         (text_of([row()])[:-2] + ',"t_end":3}', "t_end stands twice"),
         (text_of([row(times_s=[5.0])]), "the run of line 1 again"),
         ("[" * 100_000, "expected a JSON object"),
@@ -181,9 +170,3 @@ def test_the_leaderboard(tmp_path, capsys):
     ):
         with pytest.raises(SystemExit, match=f"error: {says}"):
             main(["leaderboard", *words])
-
-
-def test_the_page_says_what_the_fields_are():
-    page = (Path(__file__).parents[1] / "docs" / "compare.md").read_text(encoding="utf-8")
-    for name, field in FIELDS.items():
-        assert f"| `{name}` | {field.expected} | {field.about}{'' if field.needed else '; may be left out'} |" in page

@@ -1,7 +1,5 @@
 """solve_dae: output times, step sizes, limits, statistics, partial results, plain and compiled Python, prices."""
 
-import tracemalloc
-
 import numpy as np
 import pytest
 
@@ -11,13 +9,14 @@ from tests.problems import (
     force_residual,
     pendulum,
     pendulum_state,
+    quick,
     run,
     swing,
     unconstrained,
     violations,
     worst,
 )
-from twoloop import ConstraintWarning, RungeKutta, Status, paper_irk, paper_newmark, solve_dae
+from twoloop import ConstraintWarning, RungeKutta, Status, paper_irk, solve_dae
 from twoloop.methods.presets import PRESETS
 from twoloop.methods.tableaux import sun_radau_iib
 
@@ -38,7 +37,7 @@ def test_first_step_is_tried_first():
     assert refused.h[0] < 0.5 and refused.stats.n_rejected_error + refused.stats.n_rejected_convergence > 0
 
 
-@pytest.mark.parametrize("method", ["SunRadau5", "PaperIRK", "Newmark", "BDF", "DOP853", "Adams"])
+@pytest.mark.parametrize("method", quick(["Adams", "SunRadau5", "PaperIRK", "Newmark", "BDF", "DOP853"], 3))
 def test_max_step_is_respected(method):
     free = swing(method=method, rtol=1e-5, atol=1e-5)
     bound = 0.5 * free.h.max()
@@ -85,7 +84,7 @@ def test_an_output_time_on_a_singular_position_is_warned_of():
 
 
 # --- statistics
-@pytest.mark.parametrize("method", ["SunRadau5", "Gauss12", "PaperIRK", "Newmark", "BDF", "DOP853", "PaperNewmark"])
+@pytest.mark.parametrize("method", quick(["DOP853", "SunRadau5", "Gauss12", "PaperIRK", "Newmark", "BDF"], 3))
 def test_counts_are_consistent(default_four_bar, method):
     result = run(default_four_bar, 3.0, method=method, rtol=1e-6, atol=1e-6)
     stats = result.stats
@@ -100,7 +99,7 @@ def test_counts_are_consistent(default_four_bar, method):
     assert stats.cpu_time > 0.0
 
 
-@pytest.mark.parametrize("method", ["SunRadau5", "Gauss12", "PaperIRK", "PaperNewmark"])
+@pytest.mark.parametrize("method", quick(["SunRadau5", "Gauss12", "PaperIRK", "PaperNewmark"]))
 def test_what_happened_before_each_step_adds_up_to_the_counts(default_four_bar, method, monkeypatch):
     options = {"method": method, "rtol": 1e-5, "atol": 1e-5}
     t_end = 20.0 if method == "Gauss12" else 3.0  # a hundredth of which is longer than its steps
@@ -156,17 +155,6 @@ def test_the_inner_loop_corrects_before_it_tests(default_four_bar):
     assert run(default_four_bar).stats.n_inner < 2.0 * run(default_four_bar).stats.n_evaluations
 
 
-def test_a_loose_outer_loop_is_cheaper_and_worse_a_tight_one_dearer_and_no_better(default_four_bar):
-    reference = default_four_bar.reference.q
-    cost, error = {}, {}
-    for outer_tol in (1e-5, None, 1e-13):
-        result = run(default_four_bar, method=RungeKutta(sun_radau_iib(3), outer_tol=outer_tol))
-        cost[outer_tol] = result.stats.n_evaluations
-        error[outer_tol] = worst(result.q[:, -1], reference)
-    assert cost[1e-5] < cost[None] < cost[1e-13] and error[1e-5] > 3.0 * error[None]
-    assert error[None] < 2.0 * error[1e-13]
-
-
 def test_price_and_accuracy_of_the_papers_method_over_100_s(default_four_bar):
     result = run(default_four_bar, 100.0, method=paper_irk(1e-9, 1e-9), rtol=1e-5, atol=1e-5)
     assert result.success and result.stats.n_evaluations < 210_000
@@ -175,37 +163,6 @@ def test_price_and_accuracy_of_the_papers_method_over_100_s(default_four_bar):
     energy = default_four_bar.energy(result.t, result.q, result.v)
     assert worst(energy, energy[0]) < 1e-2
     assert worst(result.q[:, -1], trajectory(default_four_bar.parameters, [100.0])[0][:, 0]) < 1e-2
-
-
-@pytest.mark.parametrize("beta", [0.5, 0.25])
-def test_newmark_pays_three_to_five_times_as_much_per_two_decades(default_four_bar, beta):
-    counts, spans = [], []
-    for outer_tol in (1e-3, 1e-5, 1e-7, 1e-9):
-        result = run(default_four_bar, 30.0, method=paper_newmark(1e-9, outer_tol, beta))
-        counts.append(result.stats.n_evaluations)
-        spans.append(np.ptp(default_four_bar.energy(result.t, result.q, result.v)))
-    growth = np.array(counts[1:]) / counts[:-1]
-    if beta == 0.25:
-        growth = growth[1:]  # the run that is lost at 1e-3 is of another motion
-    assert (growth > 3.0).all() and (growth < 5.0).all()
-    assert spans[0] > 1.0  # err_out = 1e-3 loses the solution
-    assert spans[3] < 1e-2
-
-
-def test_memory_of_a_run_grows_only_with_the_stored_output(default_four_bar):
-    problem = default_four_bar
-
-    def peak(t_end):
-        tracemalloc.start()
-        solve_dae(problem.system, (0.0, t_end), problem.q0, problem.v0, "Newmark", 1e-4, 1e-4, t_eval=[t_end])
-        size = tracemalloc.get_traced_memory()[1]
-        tracemalloc.stop()
-        return size
-
-    peak(0.1)  # compiled and cached
-    short, long = peak(1.0), peak(30.0)
-    step_bytes = 4 * 8 * 30000  # result.h and three counts: at most so many steps, and copies on the way
-    assert long - short < step_bytes
 
 
 VARIES = ("Adams", True)  # keeps no constant step

@@ -5,7 +5,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from tests.test_sweep_rows import energy
+from tests.problems import quick
+from tests.test_sweeps import energy
 from twoloop import ConstrainedSystem, solve_dae, sweep
 from twoloop.mechanisms import Problem, four_bar
 from twoloop.sweeps import shared_out, shared_runs
@@ -70,6 +71,7 @@ def test_by_default_counts_and_energy_are_of_the_same_size():
 
 
 MORE = {
+    "joints": lambda problem, result: {"force": result.reactions("1-2").force[0, -1]},
     "steps": lambda problem, result: {"h": result.h.max(), "x": int(np.size(result.h))},
     "counts": lambda problem, result: {"n": result.stats.n_partitions or 0, "m": result.stats.n_accepted},
     "of steps": lambda problem, result: {"n": int(np.size(result.rejected_error)), "none": result.untested is None},
@@ -78,7 +80,7 @@ MORE = {
 }
 
 
-@pytest.mark.parametrize("name", MORE)
+@pytest.mark.parametrize("name", quick(MORE, 2))
 def test_what_lanes_do_not_know_is_that_of_a_single_run(name):
     rows = sweep(linkage, LINKAGES[:6], measure=MORE[name], t_span=(0.0, 0.3), t_eval=[0.3], **TOGETHER)
     assert sum(in_lanes(rows)) == 4
@@ -86,7 +88,7 @@ def test_what_lanes_do_not_know_is_that_of_a_single_run(name):
 
 
 def either(kind, angle):
-    return four_bar(theta3=angle) if kind == "four-bar" else swinging(9.81, 1.0 + angle)
+    return four_bar(theta3=angle) if kind == "four-bar" else swing_of(9.81, 1.0 + angle)
 
 
 def test_several_systems_in_one_table():
@@ -126,7 +128,7 @@ SWING = ConstrainedSystem.from_python(
 )
 
 
-def swinging(gravity, length):
+def swing_of(gravity, length):
     system = SWING.with_parameters([gravity, length])
     return Problem("swing", system, np.array([-length, 0.0]), np.zeros(2), (0.0, 1.0), energy)
 
@@ -135,36 +137,19 @@ SWINGS = [{"gravity": 9.0 + 0.1 * k, "length": 1.0 + 0.02 * k} for k in range(10
 
 
 def test_compiled_functions_with_parameters_go_together():
-    rows = sweep(swinging, SWINGS, measure=ends_of, t_eval=TIMES, **TOGETHER)
+    rows = sweep(swing_of, SWINGS, measure=ends_of, t_eval=TIMES, **TOGETHER)
     assert sum(in_lanes(rows)) == 8
-    compare(rows, swinging, ends_of, (0.0, 1.0), t_eval=TIMES)
+    compare(rows, swing_of, ends_of, (0.0, 1.0), t_eval=TIMES)
 
 
 KEPT = SimpleNamespace(gravity=0.0, n=0)
-
-
-def looking(problem, result):
-    import tests.test_sweep_together as module  # which no digest looks into
-
-    return {"left": module.KEPT.gravity, "x": result.q[0, -1]}
-
-
-def test_measures_see_what_the_problem_of_their_run_left():
-    def leaving(gravity, length):
-        import tests.test_sweep_together as module
-
-        module.KEPT.gravity = gravity
-        return swinging(gravity, length)
-
-    rows = sweep(leaving, SWINGS, measure=looking, t_eval=TIMES, **TOGETHER)
-    assert rows["left"].tolist() == [each["gravity"] for each in SWINGS] and sum(in_lanes(rows)) == 8
 
 
 def test_problems_that_depend_on_the_runs_before_them_are_those_of_single_runs():
     def counting(gravity, length):
         import tests.test_sweep_together as module
 
-        return swinging(gravity + module.KEPT.n, length)
+        return swing_of(gravity + module.KEPT.n, length)
 
     def count(problem, result):
         import tests.test_sweep_together as module
@@ -176,7 +161,7 @@ def test_problems_that_depend_on_the_runs_before_them_are_those_of_single_runs()
     rows = sweep(counting, SWINGS, measure=count, t_eval=TIMES, **TOGETHER)
     assert rows["g"].tolist() == pytest.approx([each["gravity"] + k for k, each in enumerate(SWINGS)])
     for number, each in enumerate(SWINGS):
-        known = singly(swinging, each | {"gravity": rows.loc[number, "g"]}, last_place, (0.0, 1.0))
+        known = singly(swing_of, each | {"gravity": rows.loc[number, "g"]}, last_place, (0.0, 1.0))
         assert rows.loc[number, "x"] == pytest.approx(known["x"], rel=1e-5)
 
 
@@ -210,22 +195,3 @@ def test_rows_are_the_same_however_they_are_shared_out(monkeypatch):
     assert sum(in_lanes(some)) == N - 1 - 3 and not any(in_lanes(alone))
     told = ["seconds", "message"]
     pd.testing.assert_frame_equal(some.drop(columns=told), alone.drop(columns=told), rtol=1e-5, atol=1e-7)
-
-
-@pytest.mark.parametrize("parallel", ["threads", "processes"])
-def test_long_tasks_hand_back_what_they_have(monkeypatch, parallel):
-    monkeypatch.setattr(shared_runs, "LONGEST", 0.0)  # s; of processes those of their own do
-    rows = sweep(linkage, LINKAGES, measure=ends_of, t_span=(0.0, 0.1), t_eval=[0.1], parallel=parallel, workers=2)
-    assert rows.index.tolist() == list(range(N)) and set(rows["status"]) == {"REACHED_END"}
-    compare(rows, linkage, ends_of, (0.0, 0.1), t_eval=[0.1])
-
-
-def test_what_a_result_in_lanes_can_do_is_that_of_single_runs():
-    def reaction(problem, result):
-        at = result.reactions("1-2")
-        table = result.to_dataframe()
-        return {"force": at.force[0, -1], "angle": table["angle (rad) of bar 3"].iloc[-1]}
-
-    rows = sweep(linkage, LINKAGES[:6], measure=reaction, t_span=(0.0, 1.0), t_eval=TIMES, **TOGETHER)
-    assert sum(in_lanes(rows)) == 4
-    compare(rows, linkage, reaction, (0.0, 1.0), t_eval=TIMES)

@@ -1,13 +1,19 @@
 """Many runs at once: the same numbers as one by one, failures as rows, and going on after an interruption."""
 
+import os
+import sys
+from functools import partial
+
 import numpy as np
 import pytest
 
+from tests.problems import pendulum as bare_pendulum
 from twoloop import solve_dae, sweep
-from twoloop.mechanisms import four_bar
-from twoloop.sweeps import saved_sweep
+from twoloop.mechanisms import Problem, four_bar
+from twoloop.sweeps import saved_sweep, workers
 
 pd = pytest.importorskip("pandas")  # not among the oldest versions
+THREADS = {"parallel": "threads"}
 ANGLES = [{"theta3": angle} for angle in (0.0, 0.1, 2.0, -0.2, 0.3, 0.05)]  # 2.0 cannot be assembled
 MADE = []  # by `counted`, of threads
 
@@ -25,6 +31,18 @@ def interrupted(theta3):
     if theta3 == -0.2:
         raise KeyboardInterrupt
     return four_bar(theta3=theta3)
+
+
+def swinging(k):
+    return Problem("swing", bare_pendulum(force=force), np.array([-1.0, 0.0]), np.zeros(2), (0.0, 0.01), energy)
+
+
+def force(t, q, v):
+    return np.array([0.0, -GRAVITY])
+
+
+def energy(t, q, v):
+    return 0.5 * (v * v).sum(axis=0) + GRAVITY * q[1]
 
 
 def heights(problem, result):
@@ -120,30 +138,160 @@ def test_rows_of_another_sweep_are_refused(tmp_path):
         ((linkage, [0.1]), {}, TypeError, r"parameters\[0\] must be a mapping of names to values; given 0.1"),
         ((linkage, [{"theta3": 0.1}, {"x": 1}]), {}, ValueError, r"all have the same names; .*\[1\] \['x'\]"),
         ((lambda status: None, [{"status": 1}]), {}, ValueError, "the name of a standard column; given 'status'"),
-        (
-            (linkage, ANGLES),
-            {"parallel": "fork"},
-            ValueError,
-            "parallel must be 'processes' or 'threads'; given 'fork'",
-        ),
+        ((linkage, ANGLES), {"parallel": "fork"}, ValueError, "must be 'processes' or 'threads'; given 'fork'"),
         ((linkage, ANGLES), {"method": "Guass8"}, ValueError, r"method must be one of .*given 'Guass8'"),
         ((linkage, ANGLES), {"rtol": 0.0}, ValueError, "rtol must be positive"),
         ((linkage, ANGLES), {"measure": lambda p, r: {}}, TypeError, "measure cannot be sent to another process"),
         ((linkage, ANGLES), {"measure": len, "parallel": "threads"}, TypeError, r"len\(\) takes exactly one argument"),
+        ((linkage, ANGLES), THREADS | {"measure": lambda p, r: 1.0}, TypeError, "must return a mapping of columns"),
         (
             (linkage, ANGLES),
-            {"measure": lambda p, r: 1.0, "parallel": "threads"},
+            THREADS | {"measure": lambda p, r: {"theta3": 1}},
             TypeError,
-            "measure must return a mapping of columns; it returned 1.0",
+            "that the row has not already",
         ),
         (
             (linkage, ANGLES),
-            {"measure": lambda p, r: {"theta3": 1}, "parallel": "threads"},
+            THREADS | {"measure": lambda p, r: {"x": [1.0]}},
             TypeError,
-            "columns that the row has not already; it returned 'theta3'",
+            r"'x' is \[1.0\] of type list",
         ),
+        ((swinging, [{"k": 1.0}, {"k": "one"}]), THREADS, TypeError, "'k' has numbers, and 'one'"),
+        ((swinging, [{"k": 2**63}]), THREADS, TypeError, "must be a number"),
     ],
 )
 def test_mistakes_come_through_at_once(arguments, options, error, words):
     with pytest.raises(error, match=words):
         sweep(*arguments, **{"t_span": (0.0, 0.01)} | options)
+
+
+# --- rows of a sweep: kept ones are of the same functions, whatever their names, and none is lost, whatever a run does
+GRAVITY = 9.81
+TABLE = np.linspace(0.0, 1.0, 2000)  # its repr leaves most of it out
+QUICK = {"t_span": (0.0, 0.01), "check_derivatives": False}
+RUNS = [{"k": k} for k in range(6)]
+
+
+def plain(problem, result):
+    return {"process": os.getpid()}
+
+
+def dying(k):
+    """Its process ends at once in run 1, and is asked to end in run 2."""
+    if k == 1:
+        os._exit(3)
+    if k == 2:
+        sys.exit("enough")
+    return swinging(k)
+
+
+# --- other functions under the same names
+@pytest.fixture
+def resumes(tmp_path):
+    """Whether a sweep of a second function goes on from the file of a first."""
+
+    def resumed(first, second, **options):
+        common = {"parallel": "threads", "workers": 1, "out": tmp_path / "rows.parquet", **QUICK}
+        sweep(swinging, RUNS[:1], measure=first, **common)
+        try:
+            sweep(swinging, RUNS[:1], measure=second, **common | options)
+        except ValueError as error:
+            assert "functions or values that have changed: measure (its code" in str(error)
+            return False
+        return True
+
+    return resumed
+
+
+class Scaled:
+    """A measure whose repr says nothing of its factor."""
+
+    def __init__(self, factor):
+        self.factor = factor
+
+    def __call__(self, problem, result):
+        return {"x": self.factor}
+
+    def __repr__(self):
+        return "Scaled"
+
+
+def enclosing(value):
+    return lambda problem, result: {"x": value if np.isscalar(value) else 0.0}
+
+
+def helped(value):
+    helper = lambda: value  # noqa: E731
+    return lambda problem, result: {"x": helper()}
+
+
+OTHER = np.array(TABLE)
+OTHER[1000] += 1e-9
+PAIRS = {
+    "two lambdas of one name": (lambda p, r: {"x": 1.0}, lambda p, r: {"x": 2.0}),
+    "an enclosed array": (enclosing(TABLE), enclosing(OTHER)),
+    "an enclosed function's enclosed number": (helped(1.0), helped(2.0)),
+    "a default": (lambda p, r, x=1.0: {"x": x}, lambda p, r, x=2.0: {"x": x}),
+    "objects of equal repr": (Scaled(1.0), Scaled(2.0)),
+    "a partial": (partial(Scaled.__call__, Scaled(1.0)), partial(Scaled.__call__, Scaled(2.0))),
+}
+
+
+@pytest.mark.parametrize("name", PAIRS)
+def test_rows_of_another_function_of_the_same_name_are_refused(name, resumes, monkeypatch):
+    first, second = PAIRS[name]
+    monkeypatch.setattr("twoloop.sweeps.saved_sweep.described", lambda value: "the same words")
+    assert resumes(first, first) and not resumes(first, second)
+
+
+def test_a_global_that_is_reached_counts_and_others_do_not(tmp_path, monkeypatch):
+    options = {"parallel": "threads", "workers": 1, "measure": plain, "out": tmp_path / "rows.parquet", **QUICK}
+    rows = sweep(swinging, RUNS[:2], **options)
+    monkeypatch.setitem(globals(), "PAIRS", {})
+    pd.testing.assert_frame_equal(sweep(swinging, RUNS[:2], **options), rows)
+    monkeypatch.setitem(globals(), "GRAVITY", 1.62)  # by `force`, which `swinging` names
+    with pytest.raises(ValueError, match=r"have changed: problem_of .*Give another file"):
+        sweep(swinging, RUNS[:2], **options)
+
+
+# --- cells
+ODD = [1.5, object(), "text", np.ones(2), 2**70, None, np.float64(2.5), "\udc80", 1j, True]
+
+
+def odd(k):
+    problem = swinging(k)
+    problem.parameters["k"] = k
+    return problem
+
+
+def measured_odd(problem, result):
+    return {"x": ODD[problem.parameters["k"]]}
+
+
+def test_what_is_no_cell_is_a_row_that_says_so(tmp_path):
+    out = tmp_path / "rows.parquet"
+    options = {"measure": measured_odd, "parallel": "threads", "workers": 2, "out": out, **QUICK}
+    rows = sweep(odd, [{"k": k} for k in range(len(ODD))], **options)
+    good = [0, 5, 6]
+    assert [k for k, status in enumerate(rows["status"]) if status == "REACHED_END"] == good
+    assert rows.loc[good, "x"].tolist()[::2] == [1.5, 2.5]
+    for k, words in {
+        1: "'x' is <object object at .* of type object",
+        2: "must fill a column with one kind; 'x' had numbers, now 'text'",
+        4: "'x' is 1180591620717411303424 of type int",
+        9: "'x' had numbers, now True",
+    }.items():
+        assert pd.Series([rows.loc[k, "message"]]).str.contains(words).all()
+    pd.testing.assert_frame_equal(pd.read_parquet(out), rows, check_dtype=False)
+
+
+# --- workers that die
+def test_a_worker_that_dies_costs_its_own_run_alone(tmp_path, monkeypatch):
+    monkeypatch.setattr(workers, "RENEWED_AFTER", 0)  # processes grow with what they compile: each ends after a run
+    out = tmp_path / "rows.parquet"
+    rows = sweep(dying, RUNS[:4], measure=plain, workers=2, out=out, **QUICK)
+    assert rows["status"].tolist() == ["REACHED_END", "ERROR", "ERROR", "REACHED_END"]
+    assert rows.loc[1, "message"] == "the worker process ended with exit code 3 in this run"
+    assert rows.loc[2, "message"] == "SystemExit: enough"
+    assert rows.loc[0, "process"] == os.getpid() != rows.loc[3, "process"]
+    pd.testing.assert_frame_equal(pd.read_parquet(out), rows, check_dtype=False)

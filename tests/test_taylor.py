@@ -6,11 +6,16 @@ import numpy as np
 import pytest
 
 from tests.large_systems import spatial_chain
-from tests.problems import pendulum, unconstrained
+from tests.problems import quick, unconstrained, worst
 from twoloop import Taylor, mechanisms, solve_dae
 from twoloop.bodies import PlanarModel
-from twoloop.generate import compiled_series
-from twoloop.kernels.steps.recurrences import N_MEMORY_SCALARS
+from twoloop.generate import compiled_series, families
+from twoloop.generate.coefficients import Coefficients
+from twoloop.generate.llvm_code import Emitter
+from twoloop.generate.llvm_text import Module
+from twoloop.generate.series import series_program
+from twoloop.generate.series_code import SeriesCode
+from twoloop.generate.series_loops import SeriesLoops
 
 FORCES = {
     "sine and cosine": lambda t, q, v: math.sin(q) * math.cos(2.0 * q),
@@ -32,7 +37,7 @@ def one_coordinate(law):
     return unconstrained(lambda t, q, v: np.array([law(t, q[0], v[0])]), name="one coordinate")
 
 
-@pytest.mark.parametrize("name", FORCES)
+@pytest.mark.parametrize("name", quick(FORCES, 4))
 def test_every_operation_gives_the_motion_of_another_method(name):
     system = one_coordinate(FORCES[name])
     ends = [
@@ -56,7 +61,7 @@ PROBLEMS = {
 
 
 @pytest.mark.filterwarnings("ignore::twoloop.ConstraintWarning")
-@pytest.mark.parametrize("name", PROBLEMS)
+@pytest.mark.parametrize("name", quick(PROBLEMS, 3))
 def test_every_kind_of_mechanism_ends_at_its_reference(name):
     make, allowed = PROBLEMS[name]
     problem = make()
@@ -85,20 +90,6 @@ def test_constant_steps_have_the_order_asked_for(order):
     assert order - 0.5 < np.log2(errors[0] / errors[1]) < order + 1.0
 
 
-@pytest.mark.filterwarnings("ignore::twoloop.ConstraintWarning")
-@pytest.mark.parametrize("name", PROBLEMS)
-def test_steps_by_compiled_code_are_the_same_to_rounding(name):
-    problem = PROBLEMS[name][0]()
-    h = problem.reference.t * 1e-3
-    runs = [
-        solve_dae(problem.system, (0.0, 2.0 * h), problem.q0, problem.v0, Taylor(9), step_size=h, compiled=compiled)
-        for compiled in (False, True)
-    ]
-    assert runs[0].stats.n_accepted == runs[1].stats.n_accepted == 2
-    for ends in zip(*((run.q[:, -1], run.v[:, -1], run.a[:, -1]) for run in runs), strict=True):
-        assert np.abs(ends[1] - ends[0]).max() < 1e-11 * max(1.0, np.abs(ends[0]).max())
-
-
 @pytest.mark.parametrize("compiled", [False, True])
 def test_a_sum_of_parameters_that_is_zero_in_one_system_alone_is_divided_by_in_no_formula(compiled):
     """Formulas in the parameters of all chains divide by a sum of components of axes, which is zero here."""
@@ -113,24 +104,6 @@ def test_compiled_operations_give_the_same_run():
     start = (system, (0.0, 2.0), [0.4], [0.7])
     runs = [solve_dae(*start, Taylor(17), 1e-10, 1e-10, compiled=compiled) for compiled in (False, True)]
     assert abs(runs[1].q[0, -1] - runs[0].q[0, -1]) < 1e-12
-
-
-@pytest.mark.parametrize("long", [0, 10**9], ids=["loops", "straight"])
-def test_compiled_code_uses_nothing_that_was_left_in_memory(long, monkeypatch):
-    monkeypatch.setattr(compiled_series, "LONG", long)
-    monkeypatch.setattr("twoloop.generate.families._FAMILIES", {})
-    problem, plan = mechanisms.four_bar(), Taylor.plan
-    runs = []
-    for left in (0.0, np.nan):
-
-        def with_memory(*arguments, left=left):
-            made = plan(*arguments)
-            made.memory[N_MEMORY_SCALARS:] = left
-            return made
-
-        monkeypatch.setattr(Taylor, "plan", with_memory)
-        runs.append(solve_dae(problem.system, (0.0, 1.0), problem.q0, problem.v0, "Taylor", compiled=True))
-    assert np.array_equal(runs[0].q, runs[1].q)
 
 
 @pytest.mark.parametrize(("compiled", "tolerances"), [(False, 5.0), (True, 50.0)])
@@ -149,13 +122,7 @@ def test_a_callback_that_branches_is_refused_by_name_and_auto_goes_on_without():
     assert solve_dae(system, (0.0, 1.0), [0.1], [0.0]).success
 
 
-def test_a_function_that_returns_the_wrong_shape_on_symbols_is_refused():
-    system = pendulum(force=lambda t, q, v: np.array([0.0, -9.81]) if q.dtype == float else np.zeros(3))
-    with pytest.raises(ValueError, match=r"force of 'pendulum': on symbols .* shape \(3,\)"):
-        solve_dae(system, (0.0, 1.0), [1.0, 0.0], [0.0, 0.0], "Taylor")
-
-
-@pytest.mark.parametrize("compiled", [False, True])
+@pytest.mark.parametrize("compiled", quick([True, False]))
 @pytest.mark.parametrize("span", [1e-9, 1e-3, 10.0])
 def test_the_first_step_is_as_long_as_the_series_at_the_start_allows(span, compiled):
     problem = mechanisms.heavy_top()
@@ -167,7 +134,7 @@ def test_the_first_step_is_as_long_as_the_series_at_the_start_allows(span, compi
         assert result.h[0] > 0.5 * result.h[1]
 
 
-@pytest.mark.parametrize("compiled", [False, True])
+@pytest.mark.parametrize("compiled", quick([True, False]))
 def test_a_kink_is_seen_after_the_run_came_near_a_singular_position(compiled):
     """A slider-crank with a rod a little longer than its crank, and a drag that is rough where the crank turns back."""
     rod = 1.001
@@ -187,3 +154,85 @@ def test_a_kink_is_seen_after_the_run_came_near_a_singular_position(compiled):
     result = solve_dae(*start, method="Taylor", rtol=1e-10, atol=1e-10, compiled=compiled)
     assert known.success and result.success
     assert np.abs(result.q[:, -1] - known.q[:, -1]).max() < 1e-8  # 1e-5 where steps after it were not checked
+
+
+# --- series as loops over tables: the same numbers as by straight code, and code that does not grow with a mechanism
+FUNCTIONS = {
+    "square root": lambda t, q, v: -np.sqrt(2.0 + q * q),
+    "reciprocal": lambda t, q, v: -1.0 / (2.0 + q) - 0.3 * v,
+    "exponential": lambda t, q, v: -np.exp(0.5 * q),
+    "logarithm": lambda t, q, v: -np.log(3.0 + q),
+    "arctangent": lambda t, q, v: -np.arctan(2.0 * q + 0.1 * v),
+    "sines of some angles": lambda t, q, v: -np.sin(q) + 0.1 * np.cos(3.0 * t),
+}
+KINDS_OF_MECHANISM = [
+    mechanisms.four_bar,
+    mechanisms.driven_slider_crank,
+    mechanisms.andrews,
+    mechanisms.heavy_top,
+    mechanisms.spatial_slider_crank,
+    mechanisms.rolling_disc,
+    mechanisms.moderately_stiff_beam,
+]
+
+
+def both(monkeypatch, make, t_end):
+    """Runs by loops and by straight code; `make` gives a system and its start."""
+    made = []
+    for long in (0, 10**9):
+        monkeypatch.setattr(compiled_series, "LONG", long)
+        monkeypatch.setattr(families, "_FAMILIES", {})
+        system, q0, v0 = make()
+        result = solve_dae(system, (0.0, t_end), q0, v0, "Taylor", 1e-10, 1e-10, compiled=True)
+        assert result.success, result.message
+        made.append(result)
+    return made
+
+
+@pytest.mark.filterwarnings("ignore::twoloop.ConstraintWarning")
+@pytest.mark.parametrize("make", quick(KINDS_OF_MECHANISM, 3))
+def test_mechanisms_move_as_by_straight_code(make, monkeypatch):
+    def start():
+        problem = make()
+        return problem.system, problem.q0, problem.v0
+
+    t_end = 0.002 * make().t_span[1]
+    loops, straight = both(monkeypatch, start, t_end)
+    assert abs(loops.stats.n_accepted - straight.stats.n_accepted) <= 1 + 0.05 * straight.stats.n_accepted
+    assert worst(loops.q[:, -1], straight.q[:, -1]) < 1e-9 * max(1.0, np.abs(straight.q).max())
+    assert worst(loops.lam[:, -1], straight.lam[:, -1]) < 1e-6 * max(1.0, np.abs(straight.lam).max())
+
+
+@pytest.mark.parametrize("n", quick([9, 1, 3]))
+@pytest.mark.parametrize("name", quick(FUNCTIONS, 3))
+def test_functions_of_any_number_of_quantities(name, n, monkeypatch):
+    """One group, groups of which the last is not full, and more than one turn of a loop."""
+
+    def start():
+        return unconstrained(FUNCTIONS[name], n), np.linspace(0.1, 0.9, n), np.linspace(-0.5, 0.4, n)
+
+    loops, straight = both(monkeypatch, start, 1.0)
+    assert worst(loops.q[:, -1], straight.q[:, -1]) < 1e-12
+    q, v = loops.q[:, 0], loops.v[:, 0]
+    assert np.allclose(loops.a[:, 0], FUNCTIONS[name](0.0, q, v), rtol=1e-14, atol=0.0)
+
+
+def n_lines(kind, system):
+    """Of the code of a kind."""
+    module, code = Module(), kind(series_program(system), Coefficients())
+    code.write_parts(module)
+    for name, emit, n_vectors in (("begin", code.begin, 5), ("find", code.find_order, 4), ("take", code.take_order, 4)):
+        more = {"begin": 2, "find": 2, "take": 1}[name]
+        arguments = ["double*"] * n_vectors + ["double"] * more
+        arguments += ["double*"] * (2 if name == "begin" else 0) + ["i64"] * (name != "begin")
+        arguments += ["double*"] * (name != "begin")
+        builder = module.function(name, "void", arguments)
+        emit(Emitter(builder), *builder.arguments)
+        builder.ret(None)
+    return str(module).count("\n")
+
+
+def test_the_code_does_not_grow_with_a_mechanism():
+    short, long = (n_lines(SeriesLoops, spatial_chain(n, hinges=True)[0]) for n in (4, 12))
+    assert long < 1.2 * short
+    assert n_lines(SeriesCode, spatial_chain(12, hinges=True)[0]) > 8 * long

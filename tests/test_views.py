@@ -8,7 +8,6 @@ import pytest
 
 import twoloop
 from tests.problems import pendulum, run, swing
-from tests.processes import run_python
 from twoloop import solve_dae
 from twoloop.result.plotting import violation
 
@@ -60,15 +59,6 @@ def test_panels_for_units_energy_and_violation(result, tmp_path):
     np.testing.assert_array_equal(figure.axes[2].lines[0].get_ydata(), result.energy - result.energy[0])
 
 
-def test_what_is_not_known_is_left_out():
-    assert [panel.get_ylabel() for panel in swing().plot().axes] == ["q", "largest violation"]
-    assert [panel.get_ylabel() for panel in replace(swing(), system=None).plot().axes] == ["q"]
-    failed = swing(max_steps=3)
-    assert failed.plot().get_suptitle() == "pendulum: MAX_STEPS"
-    with pytest.raises(ValueError, match="plot needs a result with output; this one has none"):
-        replace(failed, t=failed.t[:0]).plot()
-
-
 def test_violation_is_that_of_the_rows(result, default_four_bar):
     q, v = result.q.copy(), result.v.copy()
     q[0, 3] += 1e-3
@@ -79,26 +69,6 @@ def test_violation_is_that_of_the_rows(result, default_four_bar):
 
 
 # --- packages that may be missing, and other processes (see also tests/test_identity.py)
-def test_missing_packages_say_how_to_install_them(tmp_path):
-    source = """
-import sys
-sys.modules |= dict.fromkeys(("pandas", "matplotlib", "PIL"))
-from twoloop import solve_dae
-from twoloop.mechanisms import pendulum
-p = pendulum()
-result = solve_dae(p.system, (0.0, 0.1), p.q0, p.v0)
-result.animate(sys.argv[1])  # a page needs none of them
-for call in (result.to_dataframe, result.plot, lambda: result.animate("x.gif")):
-    try:
-        call()
-    except ImportError as error:
-        print(error)
-"""
-    lines = run_python(source, tmp_path / "page.html").stdout.splitlines()
-    for line, package in zip(lines, ("pandas", "matplotlib", "pillow"), strict=True):
-        assert line.endswith(f"needs the package {package}: pip install {package}")
-
-
 def test_results_of_lambdas_travel_without_their_system():
     done = solve_dae(pendulum(force=lambda t, q, v: np.array([0.0, -1.0])), (0.0, 0.1), [-1.0, 0.0], [0.0, 0.0])
     other = pickle.loads(pickle.dumps(done))
