@@ -1,3 +1,0 @@
-from studies.sweep_linkages.study import STUDY
-
-STUDY.main()
