@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
+from tests.marks import slow
 from twoloop import ensemble, solve_dae
 from twoloop.bodies import PlanarModel, SpatialModel
 
@@ -57,7 +58,7 @@ def by_hand(guide=0.2, pin=0.3, push=0.0):
     return solve_ivp(slope, (0.0, TIMES[-1]), start, "DOP853", TIMES, rtol=1e-11, atol=1e-12).y
 
 
-@pytest.mark.parametrize("spatial", [False, True])
+@pytest.mark.parametrize("spatial", [False, slow(True)])
 def test_a_cart_with_a_pendulum(spatial):
     model, *_ = cart(spatial, push=0.4)
     problem = model.problem((0.0, TIMES[-1]))
@@ -77,6 +78,7 @@ def test_a_cart_with_a_pendulum(spatial):
     assert (np.diff(problem.energy(result.t, result.q, result.v)) < 0.0).all()
 
 
+@pytest.mark.slow
 def test_a_stiff_method_and_many_runs_with_other_coefficients():
     model, *_ = cart(False)
     problem = model.problem((0.0, 0.03))
@@ -91,23 +93,6 @@ def test_a_stiff_method_and_many_runs_with_other_coefficients():
     np.testing.assert_allclose(runs.q[0, :, -1], known.q[:, -1], atol=1e-6)
     np.testing.assert_allclose(runs.q[1, :, -1], single.q[:, -1], atol=1e-6)
     assert abs(runs.q[1, 0, -1] - runs.q[0, 0, -1]) > 1e-4
-
-
-def test_the_thrust_of_a_hinge_in_space_is_without_friction():
-    """A wheel on a vertical axle with its weight along it, beside one of which the axle is level."""
-    rates = []
-    for axis in ((0.0, 0.0, 1.0), (1.0, 0.0, 0.0)):
-        model = SpatialModel()
-        wheel = model.body(
-            "wheel", mass=3.0, inertia=(0.5, 0.5, 0.5), position=(0, 0, 0), angular_velocity=np.array(axis)
-        )
-        model.friction(
-            model.revolute("ground", wheel, at=(0, 0, 0), axis=axis), speed=1e-2, coefficient=0.1, radius=0.02
-        )
-        problem = model.problem((0.0, 0.1))
-        result = solve_dae(problem.system, problem.t_span, problem.q0, problem.v0)
-        rates.append(2.0 * np.linalg.norm(result.v[3:, -1]))
-    np.testing.assert_allclose(rates, [1.0, 1.0 - 0.1 * 0.02 * 3.0 * G / 0.5 * 0.1], atol=1e-6)
 
 
 def test_where_the_load_or_the_friction_is_not_determined():

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from tests.bodies.runs import moved
-from twoloop import solve_dae
 from twoloop.bodies import IgnoredWarning, Loop, PlanarModel, SpatialModel, from_urdf
-from twoloop.bodies.rotation import euler_rates, rotation_matrix
+from twoloop.bodies.rotation import rotation_matrix
 
 ARM = """<?xml version="1.0"?>
 <robot name="arm">
@@ -112,46 +111,6 @@ def test_what_is_ignored_is_told(arm):
     assert read(arm, free_base=False).problem().freedom.degrees == 3
 
 
-@pytest.mark.parametrize("free_base", [False, True])
-def test_accelerations_are_those_of_pinocchio(arm, free_base, tmp_path):
-    pin = pytest.importorskip("pinocchio")
-    if free_base:
-        heavy = (
-            '<link name="base"><inertial><mass value="3"/><inertia ixx="1" ixy="0" ixz="0" iyy="2" iyz="0" izz="2"/>'
-        )
-        arm = tmp_path / "free.urdf"
-        arm.write_text(ARM.replace('<link name="base"/>', heavy + "</inertial></link>"))
-    root = (pin.JointModelFreeFlyer(),) if free_base else ()
-    theirs = pin.buildModelFromUrdf(str(arm), *root)
-    data = theirs.createData()
-    model = read(arm, positions=POSITIONS, free_base=free_base)
-    problem, system = model.problem(), model.problem().system
-    q = pin.neutral(theirs)
-    for name, value in POSITIONS.items():
-        joint = theirs.joints[theirs.getJointId(name)]
-        place = q[joint.idx_q : joint.idx_q + joint.nq]
-        place[:] = (np.cos(value), np.sin(value)) if joint.nq == 2 else value
-    rates = np.random.default_rng(1).uniform(-1.0, 1.0, theirs.nv)
-    torque = np.zeros(theirs.nv)
-    damped = theirs.joints[theirs.getJointId("turn")].idx_v
-    torque[damped] = -0.3 * rates[damped]
-    pin.forwardKinematics(theirs, data, q, rates, pin.aba(theirs, data, q, rates, torque))
-    known, v = [], []
-    for k in range(1, 1 + len(model.bodies)):
-        pose, lever, speed, change = data.oMi[k], theirs.inertias[k].lever, data.v[k], data.a[k]
-        np.testing.assert_allclose(problem.q0[7 * (k - 1) :][:3], pose.act(lever), atol=1e-14)
-        w = speed.angular
-        v += [*(pose.rotation @ (speed.linear + np.cross(w, lever)))]
-        v += [*euler_rates(problem.q0[7 * (k - 1) + 3 :][:4], pose.rotation @ w)]
-        moved = change.linear + np.cross(w, speed.linear) + np.cross(change.angular, lever)
-        known.append(pose.rotation @ (moved + np.cross(w, np.cross(w, lever))))
-    found = solve_dae(system, (0.0, 1e-3), problem.q0, np.array(v)).a[:, 0]
-    np.testing.assert_allclose(found.reshape(-1, 7)[:, :3], known, atol=1e-10)
-    energy = pin.computeKineticEnergy(theirs, data, q, rates)
-    at_rest = problem.energy(0.0, problem.q0, 0.0 * problem.v0)
-    assert problem.energy(0.0, problem.q0, v) - at_rest == pytest.approx(energy)
-
-
 LINKAGE = """<robot name="four-bar">{links}
   <joint name="pivot" type="revolute"><parent link="base"/><child link="crank"/><axis xyz="0 -1 0"/>
     <limit effort="1" velocity="1"/></joint>
@@ -223,15 +182,3 @@ def test_the_damping_of_a_floating_joint_is_told(tmp_path):
       <child link="hull"/><dynamics damping="3"/></joint></robot>""")
     with pytest.warns(IgnoredWarning, match="damping of joint 'free'"):
         assert not from_urdf(path).joints
-
-
-def test_wrong_loops_and_positions(arm):
-    for options, message in (
-        ({"positions": {"knee": 1.0}}, "no joint of that name"),
-        ({"positions": {"hold": 1.0}}, "has no angle"),
-        ({"loops": [Loop("revolute", "slide", "ground")]}, "needs an axis"),
-        ({"loops": [Loop("spherical", "slide", "wall")]}, "must be between links"),
-        ({"loops": [Loop("gear", "slide", "ground")]}, "kind of a loop must be"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            read(arm, **options)

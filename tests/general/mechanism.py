@@ -15,32 +15,15 @@ TIGHT = {"method": "DOP853", "rtol": 1e-13, "atol": 1e-14, "dense_output": True}
 
 @dataclass(frozen=True, eq=False)
 class Mechanism:
-    """A mechanism and its motion by a route that shares no equation of motion with it.
-
-    Attributes
-    ----------
-    name : str
-    system : callable
-        system() -> ConstrainedSystem; of plain functions, it takes others in the place of some by their names.
-    end : float
-        End of the run, s; it starts at 0.
-    state : callable
-        state(t) -> q, v (n_q,) at one time.
-    rank : int
-        Rank of all rows [C_q; A] at the start.
-    energy : callable, optional
-        energy(q, v); None where it is not conserved.
-    given : tuple of ndarray, optional
-        Its start q, v (n_q,), where the system comes with one. None: that of `state`.
-    """
+    """A mechanism and its motion by a route that shares no equation of motion with it."""
 
     name: str
-    system: Callable[..., ConstrainedSystem]
-    end: float
-    state: Callable[[float], tuple[np.ndarray, np.ndarray]]
-    rank: int
-    energy: Callable[[np.ndarray, np.ndarray], float] | None = None
-    given: tuple[np.ndarray, np.ndarray] | None = None
+    system: Callable[..., ConstrainedSystem]  # of plain functions: it takes others in the place of some by their names
+    end: float  # of the run, s; it starts at 0
+    state: Callable[[float], tuple[np.ndarray, np.ndarray]]  # q, v (n_q,) at one time
+    rank: int  # of all rows [C_q; A] at the start
+    energy: Callable[[np.ndarray, np.ndarray], float] | None = None  # None where it is not conserved
+    given: tuple[np.ndarray, np.ndarray] | None = None  # its start, where the system comes with one
 
     @property
     def start(self):
@@ -94,25 +77,3 @@ def integrate(rate, start, end):
         return solved.sol
 
     return lambda t: solution()(t)
-
-
-def one_coordinate(kinematics, mass, force, start, end):
-    """The motion of a mechanism with one degree of freedom, by d'Alembert's principle for one coordinate s.
-
-    `kinematics(s)` gives q, u = dq/ds and w = d2q/ds2; `mass` (n_q,) is constant, `force` (n_q,) too or a
-    function of q.
-    """
-
-    def rate(t, y):
-        q, u, w = kinematics(y[0])
-        Q = force(q) if callable(force) else force
-        return [y[1], (u @ (Q - mass * w * y[1] ** 2)) / (u @ (mass * u))]
-
-    solution = integrate(rate, start, end)
-
-    def state(t):
-        s, speed = solution(t)
-        q, u, _ = kinematics(s)
-        return q, u * speed
-
-    return state

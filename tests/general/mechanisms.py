@@ -1,4 +1,4 @@
-"""All mechanisms with a known motion, by name, each made once; runs of them, and their errors."""
+"""All mechanisms with a known motion, by name, each built once; runs of them, and their errors."""
 
 import warnings
 from functools import cache, partial
@@ -6,9 +6,9 @@ from functools import cache, partial
 import numpy as np
 from scipy.optimize import brentq
 
-from tests.general import dead_points, disc, faulty, heavy_top, knife_edge
+from tests.general import systems
 from tests.general.mechanism import Mechanism, known, of_functions, of_problem
-from tests.mechanisms.motions import known_motions, planar
+from tests.mechanisms.motions import known_motions, planar, spatial
 from tests.problems import functions_of, unconstrained
 from twoloop import ConstraintWarning, mechanisms, solve_dae
 from twoloop.mechanisms import n_four_bar
@@ -65,8 +65,6 @@ def driven_slider_crank(redundant):
 
 
 # --- IFToMM A02 beside the equation for the angle of its cranks
-# the tip of the first crank at 10 s for N = 2, as Exudyn prints it at h = 2.5e-4 and at half of that: order 2
-PRINTED_TIP = np.array([[0.3284552113, 0.9445195467], [0.3284573768, 0.9445187937]])
 
 
 def windows(n, coordinates="tips"):
@@ -83,17 +81,14 @@ WINDOWS = (1, 2, 40)
 # name -> how it is made; motion that never comes near a point where C_q loses rank
 REGULAR = {
     "redundant slider-crank": redundant_slider_crank,
-    "top of Euler parameters": heavy_top.top_of_euler_parameters,
-    "top with its centre": heavy_top.top_with_centre,
-    "knife edge": knife_edge.knife_edge,
-    "knife edge in space": knife_edge.knife_edge_in_space,
-    "pushed knife edge": knife_edge.pushed_knife_edge,
-    "steady disc": disc.steady_disc,
-    "wobbling disc": disc.wobbling_disc,
-    "wobbling disc, redundant": partial(disc.wobbling_disc, True),
+    "top with its centre": lambda: of_problem(mechanisms.heavy_top(), known(spatial.heavy_top(), 0.1), 0.1),
+    "knife edge": lambda: of_problem(systems.KNIFE_EDGE, known(spatial.knife_edge(), 2.0), 2.0),
+    "pushed knife edge": systems.pushed_knife_edge,
+    "wobbling disc": systems.wobbling_disc,
+    "wobbling disc, redundant": partial(systems.wobbling_disc, True),
     "driven slider-crank": partial(driven_slider_crank, False),
     "driven slider-crank, redundant": partial(driven_slider_crank, True),
-    "massless coordinate": faulty.massless_coordinate,
+    "massless coordinate": systems.massless_coordinate,
     "planet": planet,
 }
 # the ready mechanisms that have no other place above; of Bricard's 60 rows, one is redundant
@@ -111,8 +106,7 @@ REGULAR |= {name: partial(_ready, name) for name in known_motions() if name not 
 SINGULAR = {
     **{f"A02, N = {n}": partial(windows, n) for n in WINDOWS},
     **{f"A02 of bodies, N = {n}": partial(windows, n, "bodies") for n in (1, 2)},
-    "isosceles slider-crank": dead_points.isosceles_slider_crank,
-    "crossing lines": dead_points.crossing_lines,
+    "crossing lines": systems.crossing_lines,
 }
 ALL = {**REGULAR, **SINGULAR}
 REDUNDANT = [name for name in REGULAR if "redundant" in name or name in RANKS]

@@ -1,10 +1,10 @@
-"""Many guesses put on the constraints at once: each is what consistent_state makes of it."""
+"""Test `consistent_states`: each of many guesses is what `consistent_state` makes of it."""
 
 import numpy as np
 import pytest
 
 from tests.compiled import unit_mass, weight
-from tests.problems import pendulum
+from tests.marks import slow
 from twoloop import ConstrainedSystem, callback, consistent_state, consistent_states, mechanisms
 
 
@@ -14,7 +14,10 @@ def guesses(problem, n):
     return q, random.uniform(-1.0, 1.0, q.shape)
 
 
-NAMES = ("four_bar", "spatial_slider_crank", "driven_slider_crank", "redundant_slider_crank", "knife_edge", "heavy_top")
+NAMES = (
+    *("redundant_slider_crank", "knife_edge"),
+    *(slow(name) for name in ("four_bar", "spatial_slider_crank", "heavy_top")),
+)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -58,7 +61,9 @@ def singly(monkeypatch):
     return calls
 
 
-@pytest.mark.parametrize(("name", "n_singly"), [("spatial_four_bar", 0), ("redundant_slider_crank", 1), ("bricard", 1)])
+@pytest.mark.parametrize(
+    ("name", "n_singly"), [("spatial_four_bar", 0), *(slow(name, 1) for name in ("redundant_slider_crank", "bricard"))]
+)
 def test_lanes_take_those_that_are_near_and_none_depends_on_others(monkeypatch, singly, name, n_singly):
     """Of redundant rows the first guess says how many they are."""
     problem = getattr(mechanisms, name)()
@@ -72,80 +77,6 @@ def test_lanes_take_those_that_are_near_and_none_depends_on_others(monkeypatch, 
     for some in (slice(0, 13), slice(5, 300)):
         made_q, made_v = consistent_states(problem.system, 0.1, q[some], v[some])
         assert (made_q == all_q[some]).all() and (made_v == all_v[some]).all()
-
-
-@pytest.mark.parametrize("n", [3, 2, 40])
-def test_coordinates_without_constraints_have_code_of_their_own(singly, n):
-    system = ConstrainedSystem.from_python(
-        n_q=n,
-        n_c=1,
-        mass=np.eye(n),
-        force=lambda t, q, v: -q,
-        constraint=lambda t, q: np.array([q[0] ** 2 + 1.7 * q[1] ** 3 - 1.2345]),
-        jacobian=lambda t, q: np.concatenate([[2.0 * q[0], 5.1 * q[1] ** 2], np.zeros(n - 2)])[None],
-    )
-    q = 0.7 + np.random.default_rng(1).uniform(0.0, 0.02, (20, n))
-    q[:, 1] += 0.05
-    made, _ = consistent_states(system, 0.0, q, q)
-    assert np.abs(made[:, 0] ** 2 + 1.7 * made[:, 1] ** 3 - 1.2345).max() < 1e-14 and len(singly) == 0
-
-
-def test_rows_that_are_redundant_for_some_parameters():
-    def constraint(t, q, p):
-        return np.array([q[0] ** 2 + q[1] ** 2 - 1.0, p[0] * (q[2] - q[0])])
-
-    def jacobian(t, q, p):
-        return np.array([[2.0 * q[0], 2.0 * q[1], 0.0], [-p[0], 0.0, p[0]]])
-
-    system = ConstrainedSystem.from_python(
-        n_q=3,
-        n_c=2,
-        mass=np.eye(3),
-        force=lambda t, q, v: -q,
-        constraint=constraint,
-        jacobian=jacobian,
-        parameters=[1.0],
-    )
-    q, parameters = np.tile([0.65, 0.78, 0.66], (30, 1)), np.ones((30, 1))
-    for rank_lost in ([0], [7, 8], range(1, 30)):
-        parameters[:], parameters[list(rank_lost)] = 1.0, 0.0
-        made = consistent_states(system, 0.0, q, q, parameters=parameters)
-        for run in (0, 1, 8, 29):
-            known = consistent_state(system.with_parameters(parameters[run]), 0.0, q[run], q[run])
-            assert all(np.abs(one[run] - other).max() < 1e-14 for one, other in zip(made, known, strict=True))
-
-
-def test_few_guesses_are_not_worth_code(monkeypatch):
-    problem = mechanisms.four_bar()
-    q, v = guesses(problem, 2)
-    made = consistent_states(problem.system, 0.1, q, v)
-    monkeypatch.setattr(f"{MODULE}.SINGLY", 0.0)
-    monkeypatch.setattr("twoloop.generate.own_lanes.are_kept", lambda *arguments: False)
-    singly = consistent_states(problem.system, 0.1, q, v)
-    for one, other in zip(made, singly, strict=True):
-        assert np.abs(one - other).max() < 1e-12
-
-
-def test_callbacks_that_cannot_be_traced_go_one_by_one():
-    def circle(t, q, p):
-        return np.array([q @ q - (p[0] if q[0] < 5.0 else 2.0) ** 2])
-
-    system = pendulum(constraint=circle, jacobian=None, gamma=False, parameters=[1.0])
-    parameters, q = np.random.default_rng(0).uniform(0.9, 1.1, (4, 1)), np.array([0.7, 0.8])
-    made, _ = consistent_states(system, 0.0, q, np.zeros(2), parameters=parameters)
-    assert np.abs(np.linalg.norm(made, axis=1) - parameters[:, 0]).max() < 1e-12
-
-
-def test_velocities_that_the_callbacks_deny_are_found_again_one_by_one():
-    system = pendulum(
-        constraint=lambda t, q, p: np.array([q[0] - p[0] * t]),
-        jacobian=lambda t, q: np.array([[1.0, 0.0]]),
-        constraint_rate=lambda t, q, p: np.array([-float(p[0])]),  # which symbols do not see
-        **{"gamma": False, "parameters": [1.0]},
-    )
-    parameters = np.array([[1.0], [2.0], [3.0]])
-    q, v = consistent_states(system, 0.5, [0.4, 0.0], [0.0, 1.0], parameters=parameters)
-    assert np.abs(q[:, 0] - 0.5 * parameters[:, 0]).max() < 1e-14 and np.abs(v[:, 0] - parameters[:, 0]).max() < 1e-14
 
 
 def test_a_guess_that_is_too_far_is_named():

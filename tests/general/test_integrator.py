@@ -1,7 +1,8 @@
-"""An integrator that is kept: its runs are those of solve_dae, and motions made sample by sample are right."""
+"""Test `Integrator`: its runs are those of solve_dae, and motions made sample by sample are right."""
 
 import copy
 import pickle
+import sys
 from importlib.util import find_spec
 
 import numpy as np
@@ -9,9 +10,9 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from tests import problems
+from tests.marks import slow
 from twoloop import Integrator, load, mechanisms, solve_dae
 from twoloop.bodies import PlanarModel
-from twoloop.ensembles import integrator as module
 
 
 @pytest.fixture(scope="module")
@@ -28,29 +29,6 @@ def test_its_runs_are_those_of_solve_dae(problem, options):
         own = integrator.run(span, problem.q0, problem.v0, t_eval=[0.1, 0.2])
         known = solve_dae(problem.system, span, problem.q0, problem.v0, t_eval=[0.1, 0.2], **given)
         assert (own.q == known.q).all() and own.t.tolist() == [0.1, 0.2]
-
-
-def test_parameters_of_a_run(problem, monkeypatch):
-    monkeypatch.setattr(module, "MOST", 2)
-    system, integrator = problem.system, Integrator(problem.system, rtol=1e-7, atol=1e-7)
-    scaled = [system.parameters * factor for factor in (1.0, 1.5, 2.0, 1.5)]
-    for p in scaled:  # everything is longer by as much, and so is the motion slower
-        q0 = problem.q0.copy()
-        factor = p[0] / system.parameters[0]
-        q0[[0, 1, 3, 4, 6, 7]] *= factor
-        own = integrator.run((0.0, 0.5 * factor**0.5), q0, problem.v0, p)
-        known = integrator.run((0.0, 0.5), problem.q0, problem.v0)
-        assert np.abs(own.q[2::3, -1] - known.q[2::3, -1]).max() < 1e-5 and (own.system.parameters == p).all()
-    assert len(integrator._systems) <= 2
-
-
-def test_its_tolerances_stay(problem):
-    tolerances = np.full(9, 1e-9)
-    integrator = Integrator(problem.system, atol=tolerances)
-    runs = [integrator.run((0.0, 0.5), problem.q0, problem.v0)]
-    tolerances[:] = 1e-3
-    runs.append(integrator.run((0.0, 0.5), problem.q0, problem.v0))
-    assert (runs[0].q == runs[1].q).all()
 
 
 def test_wrong_tolerances_and_systems_are_named_when_it_is_made(problem):
@@ -95,7 +73,7 @@ def controller(k, angle, rate):
     return 5.0 * (0.7 - angle) - 0.5 * rate
 
 
-@pytest.mark.parametrize(("method", "error"), [("auto", 1e-10), ("RadauIIA5", 1e-10), ("Adams", 1e-9)])
+@pytest.mark.parametrize(("method", "error"), [("auto", 1e-10), slow("RadauIIA5", 1e-10), slow("Adams", 1e-9)])
 def test_a_sampled_controller_of_a_pendulum(method, error, tmp_path):
     problem, servo = pendulum()
     integrator = Integrator(problem.system, method, rtol=1e-11, atol=1e-11)
@@ -117,26 +95,21 @@ def test_a_sampled_controller_of_a_pendulum(method, error, tmp_path):
     assert (problem.system.parameters[servo] == 0.0).all()  # the system stays as it was
 
 
-def test_samples_are_one_step_each_after_the_first_hundred():
+def test_samples_are_one_step_and_few_calls_of_python_each_after_the_first_hundred():
     problem, servo = pendulum()
-    integrator = Integrator(problem.system)
+    integrator, calls, counts = Integrator(problem.system), [0], []
     integrator.start(0.0, problem.q0, problem.v0)
-    counts = []
+
+    def count(frame, event, argument):
+        calls[0] += event in ("call", "c_call")
+
     for k in range(300):
+        sys.setprofile(count if k >= 200 else None)
         integrator.step(1e-3, inputs={servo: 0.1 * (k % 2)})
+        sys.setprofile(None)
         counts.append(integrator.result().stats.n_accepted if k in (199, 299) else 0)
     assert counts[299] - counts[199] == 100 and counts[199] < 1000
-
-
-def test_without_inputs_it_is_a_run():
-    problem = mechanisms.four_bar()
-    integrator = Integrator(problem.system, rtol=1e-10, atol=1e-10)
-    state = integrator.start(0.0, problem.q0, problem.v0)
-    for _ in range(20):
-        state = integrator.step(0.1)
-    run = solve_dae(problem.system, (0.0, 2.0), problem.q0, problem.v0, rtol=1e-11, atol=1e-11)
-    np.testing.assert_allclose(state.q, run.q[:, -1], atol=1e-8)
-    np.testing.assert_allclose(state.lam, run.lam[:, -1], atol=1e-6)
+    assert calls[0] / 100 <= 50  # 30 when written
 
 
 @pytest.mark.parametrize("given", ["all", "derived", "closure"])
@@ -200,29 +173,7 @@ def test_a_step_that_fails_says_so():
     assert integrator.result().t.tolist() == [0.0, 1e-3]
 
 
-def test_redundant_rows():
-    """A parallelogram with three cranks, pushed by a torque that alternates."""
-    model = PlanarModel(gravity=(0.0, 0.0))
-    model.body("rod", mass=1.0, inertia=0.2, position=(1.0, 1.0))
-    for k, x in enumerate((0.0, 1.0, 2.0)):
-        spin = {"angular_velocity": -0.5} if k == 0 else {}
-        model.rod(f"crank {k}", (x, 0.0), (x, 1.0), mass=0.5, **spin)
-        model.revolute("ground", f"crank {k}", at=(x, 0.0))
-        model.revolute(f"crank {k}", "rod", at=(x, 1.0))
-    model.motor("revolute crank 0-ground", 0.0, name="servo")
-    with pytest.warns(match="have rank"):
-        problem = model.problem()
-        integrator = Integrator(problem.system, rtol=1e-10, atol=1e-10)
-        state = integrator.start(0.0, problem.q0, problem.v0)
-    turned, rate, inertia = 0.0, -0.5, 1.0 + 3 * 0.5 / 3.0
-    for k in range(40):
-        u = 0.3 * (-1.0) ** k
-        state = integrator.step(0.05, inputs={problem.place("value of servo"): u})
-        turned, rate = turned + 0.05 * rate + 0.5 * u / inertia * 0.05**2, rate + u / inertia * 0.05
-    np.testing.assert_allclose(state.q[2::3], [0.0, *[0.5 * np.pi + turned] * 3], atol=1e-7)
-
-
-@pytest.mark.parametrize("method", ["auto", "RadauIIA5", "BDF"])
+@pytest.mark.parametrize("method", ["auto", slow("RadauIIA5"), slow("BDF")])
 def test_after_a_step_that_failed_the_next_goes_on_from_the_last_sample(method):
     def force(t, q, v, p):
         push = p[0] if t < p[1] else np.nan
@@ -258,13 +209,6 @@ def test_what_a_force_raises_leaves_the_last_sample():
     expected = solve_dae(problems.pendulum(), (0.0, 0.5), [1.0, 0.0], [0.0, 0.0]).q[:, -1]
     assert state.t == 0.5
     np.testing.assert_allclose(state.q, expected, atol=1e-7)
-
-
-def test_a_sample_that_time_cannot_resolve_is_refused():
-    integrator = Integrator(problems.pendulum())
-    integrator.start(1e9, [1.0, 0.0], [0.0, 0.0])
-    with pytest.raises(ValueError, match=r"dt must reach the next floating-point number after t = 1000000000\.0"):
-        integrator.step(1e-9)
 
 
 @pytest.mark.parametrize("copied", [copy.copy, copy.deepcopy, lambda each: pickle.loads(pickle.dumps(each))])

@@ -1,17 +1,16 @@
-"""Methods in lanes: each is what it is in single runs, stiff ensembles too, whatever the lanes, threads and order."""
+"""Test ensembles in SIMD lanes: runs are what they are alone, whatever the lanes, threads and order, or run alone."""
 
+import signal
 from contextlib import nullcontext
 
 import numpy as np
 import pytest
 
-from tests.general.pendulums import far_from_single_runs, pendulums, system_of
-from tests.problems import pendulum, unconstrained
+from tests.general.pendulums import drawn, far_from_single_runs, pendulums, system_of
+from tests.marks import slow
+from tests.problems import event, pendulum, pendulum_state, unconstrained
 from twoloop import ConstrainedSystem, ConstraintWarning, Status, ensemble, mechanisms, solve_dae
-from twoloop.ensembles.in_lanes import LaneRuns
-from twoloop.ensembles.lane_methods import STAGES, is_involved, lane_methods
-from twoloop.ensembles.starts import Starts
-from twoloop.methods.presets import PRESETS
+from twoloop.ensembles.lane_methods import lane_methods
 
 SPAN, TOLERANCE = (0.0, 2.0), 1e-8
 TIMES = np.sort(np.concatenate([np.linspace(*SPAN, 9), [1e-4, 0.501, 0.5011, 1.99999]]))
@@ -23,7 +22,7 @@ def builds(monkeypatch):
     monkeypatch.setattr("twoloop.ensembles.in_turn.CALL", 1e9)
 
 
-@pytest.fixture(scope="module", params=["auto", "DOP853", "RadauIIA5", "RadauIIA9", "RadauIIA13"])
+@pytest.fixture(scope="module", params=["auto", *(slow(name) for name in ("DOP853", "RadauIIA9", "RadauIIA13"))])
 def made(request):
     system, q, v, parameters = pendulums(140)
     options = {"method": request.param, "rtol": TOLERANCE, "atol": TOLERANCE, "t_eval": TIMES}
@@ -45,6 +44,8 @@ def test_runs_are_those_of_another_method_one_by_one(made):
         own = system.with_parameters(parameters[run])
         known = solve_dae(own, SPAN, q[run], v[run], method=other, rtol=1e-11, atol=1e-11, t_eval=TIMES)
         assert np.abs(runs.q[run] - known.q).max() < 1e-6 and np.abs(runs.v[run] - known.v).max() < 1e-6
+    C = 0.5 * ((runs.q**2).sum(axis=1) - parameters[:, 1:2] ** 2)  # every state is on its own constraints
+    assert np.abs(C).max() < 1e-13 and np.abs((runs.q * runs.v).sum(axis=1)).max() < 1e-12
 
 
 def test_steps_are_as_many_as_those_of_single_runs(made):
@@ -53,26 +54,6 @@ def test_steps_are_as_many_as_those_of_single_runs(made):
         n_steps = solve_dae(system.with_parameters(parameters[run]), SPAN, q[run], v[run], **options).stats.n_accepted
         longer = 4.0 / 15.0 if options["method"] == "DOP853" else 1.0  # stages look at the equations, too
         assert 0.9 * longer * n_steps <= runs.n_steps[run] <= 1.5 * n_steps
-
-
-@pytest.mark.parametrize(("method", "tolerance"), [("DOP853", 1e-9), ("RadauIIA5", 1e-6), ("RadauIIA9", 1e-9)])
-def test_errors_set_the_steps_of_long_runs(method, tolerance):
-    """Of those above a hundredth of the run does."""
-    system, q, v, parameters = pendulums(9)
-    span, options = (0.0, 60.0), {"method": method, "rtol": tolerance, "atol": tolerance}
-    runs = ensemble(system, span, q, v, parameters=parameters, **options)
-    for run in (2, 5):
-        own = system.with_parameters(parameters[run])
-        n_steps = solve_dae(own, span, q[run], v[run], **options).stats.n_accepted
-        known = solve_dae(own, span, q[run], v[run], method="Taylor", rtol=1e-12, atol=1e-12)
-        assert 150 < 0.9 * n_steps <= runs.n_steps[run] <= 1.6 * n_steps
-        assert np.abs(runs.q[run, :, -1] - known.q[:, -1]).max() < 1e3 * tolerance
-
-
-def test_every_state_is_on_its_own_constraints(made):
-    *_, parameters, _, runs = made
-    C = 0.5 * ((runs.q**2).sum(axis=1) - parameters[:, 1:2] ** 2)
-    assert np.abs(C).max() < 1e-13 and np.abs((runs.q * runs.v).sum(axis=1)).max() < 1e-12
 
 
 def test_runs_depend_neither_on_threads_nor_on_their_order_nor_on_one_another(made):
@@ -129,38 +110,15 @@ def dampers(n_runs):
     return system, np.column_stack([np.sin(angle), -np.cos(angle)]), p
 
 
-def bushings(n_runs):
-    """Two bars, the end of the second held on a line by a stiff bushing: stiffness, damping and a length vary."""
-    random = np.random.default_rng(3)
-    p = np.column_stack([10.0 ** random.uniform(5, 7, n_runs), 10.0 ** random.uniform(2, 4, n_runs)])
-    p = np.column_stack([p, random.uniform(0.9, 1.1, n_runs)])
-
-    def constraint(t, q, p):
-        s, c, s2, c2 = np.sin(q[2]), np.cos(q[2]), np.sin(q[5]), np.cos(q[5])
-        half = 0.5 * p[2]
-        return np.array(
-            [q[0] - 0.5 * c, q[1] - 0.5 * s, q[0] + 0.5 * c - q[3] + half * c2, q[1] + 0.5 * s - q[4] + half * s2]
-        )
-
-    def force(t, q, v, p):
-        lever = 0.5 * p[2] * np.cos(q[5])
-        push = -p[0] * (q[4] + 0.5 * p[2] * np.sin(q[5])) - p[1] * (v[4] + lever * v[5])
-        return np.array([0.0, -9.81, 5.0, 0.0, -9.81 + push, lever * push])
-
-    masses = np.diag([1.0, 1.0, 1.0 / 12.0] * 2)
-    system = ConstrainedSystem.from_python(
-        n_q=6, n_c=4, mass=masses, force=force, constraint=constraint, parameters=p[0], name="bars on a bushing"
-    )
-    first = random.uniform(0.2, 0.6, n_runs)
-    second = -np.arcsin(np.sin(first) / p[:, 2])
-    half = 0.5 * p[:, 2]
-    q = [0.5 * np.cos(first), 0.5 * np.sin(first), first]
-    q += [np.cos(first) + half * np.cos(second), np.sin(first) + half * np.sin(second), second]
-    return system, np.column_stack(q), p
-
-
-@pytest.mark.parametrize("make", [springs, dampers, bushings])
-@pytest.mark.parametrize(("method", "tolerance"), [("auto", 1e-4), ("RadauIIA9", 1e-7), ("RadauIIA5", 1e-5)])
+@pytest.mark.parametrize(
+    ("make", "method", "tolerance"),
+    [
+        (springs, "auto", 1e-4),
+        slow(dampers, "auto", 1e-4),
+        slow(dampers, "RadauIIA9", 1e-7),
+        slow(springs, "RadauIIA5", 1e-5),
+    ],
+)
 def test_stiff_runs_are_those_made_singly(make, method, tolerance):
     system, q, p = make(11)
     span, times = (0.0, 0.3), np.linspace(0.0, 0.3, 5)
@@ -181,53 +139,6 @@ def test_stiff_motion_takes_the_implicit_method_that_auto_takes_singly():
     assert list(names.values()) == ["RadauIIA5", "RadauIIA5", "RadauIIA9"]
 
 
-def test_an_iteration_that_has_ended_in_one_lane_goes_on_in_others_alone():
-    system, q, p = springs(17)
-    order = np.random.default_rng(5).permutation(17)
-    options = {"method": "RadauIIA9", "rtol": 1e-4, "atol": 1e-4, "t_eval": np.linspace(0.0, 3.0, 7)}
-    runs = ensemble(system, (0.0, 3.0), q, 0 * q, parameters=p, **options)
-    other = ensemble(system, (0.0, 3.0), q[order], 0 * q, parameters=p[order], **options)
-    lanes = ~runs.singly[order] & ~other.singly
-    apart = np.abs(other.q[lanes] - runs.q[order][lanes]).max(axis=(1, 2))
-    # with older versions of LLVM rounding depends on the lane, and with it where an iteration ends
-    assert lanes.sum() >= 15 and (apart == 0.0).mean() > 0.5 and apart.max() < 1e-6
-
-
-@pytest.mark.parametrize("tolerance", [1e-7, 1e-8])
-def test_vibrations_that_do_not_matter_are_passed_over_as_singly_and_no_others(tolerance):
-    """By the methods of the default, which look at what errors of velocities make of the positions."""
-    p = np.column_stack([np.geomspace(1e2, 1e8, 9), np.full(9, 2.0)])
-    force = lambda t, q, v, p: np.array([-p[0] * (q[0] - np.sin(40.0 * t)) - p[1] * v[0]])  # noqa: E731
-    system = unconstrained(force, parameters=p[0], name="carried along by a spring")
-    q, v, atol = np.zeros((9, 1)), np.full((9, 1), 40.0), np.full(1, tolerance)
-    lanes = LaneRuns(system, Starts(0.0, q, v, p), lane_methods("auto", True, 1, tolerance, tolerance)[0])
-    out = np.empty((2, 9, 1, 1))
-    made, n_steps, _, _ = lanes.make(np.arange(9), 4.0, np.array([4.0]), tolerance, atol, 1, *out)
-    options = {"method": PRESETS["auto"].tightest, "rtol": tolerance, "atol": tolerance}
-    for run in (1, 5, 8):
-        alone = solve_dae(system.with_parameters(p[run]), (0.0, 4.0), q[run], v[run], **options)
-        assert made[run] == 1 and 130 < 0.9 * alone.stats.n_accepted <= n_steps[run] <= 1.3 * alone.stats.n_accepted
-        # the motion itself: errors of single runs come to a hundred tolerances where steps pass over vibrations
-        assert abs(out[0, run, 0, 0] - _carried_along(*p[run], 40.0, 4.0)) < 100.0 * tolerance
-
-
-def _carried_along(k, c, w, t):
-    """The solution of x'' = k (sin w t - x) - c x' that begins at 0 with velocity w."""
-    size = (k - w * w) ** 2 + (c * w) ** 2
-    sine, cosine = k * (k - w * w) / size, -k * c * w / size
-    decay, frequency = -0.5 * c, np.sqrt(k - 0.25 * c * c)
-    other = (w * (1.0 - sine) + decay * cosine) / frequency
-    vibration = other * np.sin(frequency * t) - cosine * np.cos(frequency * t)
-    return sine * np.sin(w * t) + cosine * np.cos(w * t) + np.exp(decay * t) * vibration
-
-
-@pytest.mark.parametrize("name", STAGES)
-def test_implicit_methods_in_lanes_are_the_presets(name):
-    own, plan = lane_methods(name, False, 5, 1e-6, 1e-7)[0], PRESETS[name].plan(5, 1e-6, 1e-7, False)
-    assert np.array_equal(own.options[-plan.options.size :], plan.options)
-    assert np.array_equal(own.options[: len(plan.rule)], plan.rule) and own.options[len(plan.rule)] == plan.rough
-
-
 # what one method cannot do
 
 
@@ -244,15 +155,7 @@ def test_auto_goes_on_with_dop853_where_series_are_not_finite():
     assert far_from_single_runs(runs, [2, 8], system, SPAN, q, v, parameters) < 1e-6
 
 
-def test_auto_goes_on_with_dop853_where_series_are_too_long(monkeypatch):
-    monkeypatch.setattr("twoloop.generate.lane_code.LARGEST", 3)
-    system, q, v, parameters = pendulums(9)
-    runs = ensemble(system, SPAN, q, v, parameters=parameters)
-    assert "8 in lanes by DOP853" in runs.message
-    assert far_from_single_runs(runs, [2, 8], system, SPAN, q, v, parameters) < 1e-6
-
-
-@pytest.mark.parametrize("method", ["DOP853", "RadauIIA9"])
+@pytest.mark.parametrize("method", ["DOP853", slow("RadauIIA9")])
 @pytest.mark.filterwarnings("ignore:invalid value")
 def test_a_force_that_ends_is_left_to_single_runs_and_others_are_not(method):
     _, q, v, parameters = pendulums(9)
@@ -288,7 +191,7 @@ def test_a_stiff_run_among_others_does_not_go_on_for_ever():
     assert runs.n_steps[2] < 1000 and abs(runs.q[2, 0, 1] - 0.5 * np.sin(2.0)) < 1e-6
 
 
-@pytest.mark.parametrize("method", ["DOP853", "RadauIIA5"])
+@pytest.mark.parametrize("method", ["DOP853", slow("RadauIIA5")])
 @pytest.mark.filterwarnings("ignore:invalid value")
 def test_drives_whose_speed_jumps_are_left_to_single_runs(method):
     """Accelerations see nothing of the impulse, and a projection alone would hide it."""
@@ -317,12 +220,12 @@ def test_drives_whose_speed_jumps_are_left_to_single_runs(method):
 @pytest.mark.parametrize(
     ("name", "method"),
     [
-        ("driven_slider_crank", "auto"),
-        ("redundant_slider_crank", "auto"),
         ("redundant_slider_crank", "DOP853"),
-        ("andrews", "RadauIIA9"),
-        ("heavy_top", "RadauIIA5"),
-        ("n_four_bar", "DOP853"),
+        slow("driven_slider_crank", "auto"),
+        slow("redundant_slider_crank", "auto"),
+        slow("andrews", "RadauIIA9"),
+        slow("heavy_top", "RadauIIA5"),
+        slow("n_four_bar", "DOP853"),
     ],
 )
 def test_mechanisms(name, method):
@@ -337,7 +240,7 @@ def test_mechanisms(name, method):
     assert runs.singly.sum() == 1 and np.abs(runs.q[4, :, -1] - known.q[:, -1]).max() < 1e-6
 
 
-@pytest.mark.parametrize("method", ["auto", "DOP853", "RadauIIA9"])
+@pytest.mark.parametrize("method", ["DOP853", slow("auto"), slow("RadauIIA9")])
 def test_runs_through_a_singular_position_are_made_singly(method):
     problem, span = mechanisms.n_four_bar(), (0.0, 2.0)
     runs = ensemble(problem.system, span, np.tile(problem.q0, (3, 1)), problem.v0, method=method)
@@ -348,20 +251,6 @@ def test_runs_through_a_singular_position_are_made_singly(method):
 
 
 # long steps
-
-
-def test_auto_takes_stages_where_a_series_takes_many_operations():
-    """Of the heavy top, down to a tolerance; not of Andrews' mechanism, the length of whose spring is a root."""
-    involved = {name: is_involved(getattr(mechanisms, name)().system) for name in ("heavy_top", "andrews", "four_bar")}
-    assert involved == {"heavy_top": True, "andrews": False, "four_bar": False}
-    names = {tol: [m.name for m in lane_methods("auto", False, 7, tol, 1.0, True)] for tol in (1e-4, 1e-10)}
-    assert names == {1e-4: ["DOP853", "Taylor"], 1e-10: ["Taylor", "DOP853"]}
-
-
-def test_no_hundredth_of_a_run_is_without_a_stage_of_a_long_step():
-    system, q, v, parameters = pendulums(4)
-    runs = ensemble(system, (0.0, 1e-3), q, v, parameters=parameters, method="DOP853", rtol=1e-3, atol=1e-3)
-    assert runs.singly.sum() == 1 and (runs.n_steps[1:] >= 27).all() and (runs.n_steps[1:] <= 40).all()
 
 
 def test_long_steps_stay_on_their_assembly():
@@ -386,13 +275,103 @@ def test_long_steps_stay_on_their_assembly():
     assert (off < 0.1).all() and np.median(off) < 1e-3
 
 
-@pytest.mark.parametrize("name", ["andrews", "four_bar", "redundant_slider_crank"])
-@pytest.mark.parametrize("method", ["Taylor", "DOP853", "RadauIIA5"])
-def test_numbers_of_code_are_known_before_it_is_written(name, method):
-    """Code that comes from the disk is not written again: it would read numbers that are not there."""
-    problem = getattr(mechanisms, name)()
-    starts = Starts(0.0, problem.q0[None], problem.v0[None], problem.system.parameters[None])
-    code = LaneRuns(problem.system, starts, lane_methods(method, False, problem.system.n_q, 1e-6, 1e-6)[0]).own
-    known = len(code.code.numbers.values), code.code.n_numbers
-    code._write()
-    assert (len(code.code.numbers.values), code.code.numbers.n_varying) == known
+def test_one_start_serves_all_parameters_and_one_set_of_parameters_all_starts():
+    problem = mechanisms.four_bar()
+    system, start = problem.system, (problem.q0, problem.v0)
+    runs = ensemble(system, (0.0, 0.5), np.tile(start[0], (9, 1)), start[1])
+    known = solve_dae(system, (0.0, 0.5), *start, rtol=1e-11, atol=1e-11)
+    assert runs.singly.sum() == 1 and np.abs(runs.q[:, :, -1] - known.q[:, -1]).max() < 1e-7
+    assert len(ensemble(system, (0.0, 0.1), *start, parameters=np.tile(system.parameters, (3, 1)))) == 3
+    assert len(ensemble(system, (0.0, 0.1), *start)) == 1
+
+
+BRANCHING = {
+    "a branch": lambda t, q, v, p: np.array([0.0, -9.81 if q[0] > 0.5 else -p[2]]),
+    "a number made of a parameter": lambda t, q, v, p: np.array([0.0, -float(p[2])]),
+    "a branch on a parameter": lambda t, q, v, p: np.array([0.0, -p[2] if p[2] < 8.0 else -5.0]),
+    "a parameter rounded": lambda t, q, v, p: np.array([0.0, -np.round(p[2])]),
+}
+
+
+@pytest.mark.parametrize(
+    ("case", "compiled"),
+    [
+        ("a branch", True),
+        ("a number made of a parameter", False),
+        *(slow(case, False) for case in ("a branch on a parameter", "a parameter rounded")),
+    ],
+)
+def test_what_lanes_cannot_see_is_found_and_made_singly(case, compiled):
+    q, v, parameters = drawn(8)
+    system = system_of(parameters, mass=np.eye(2), force=BRANCHING[case], compile=compiled)
+    runs = ensemble(system, (0.0, 1.0), q, v, parameters=parameters)
+    assert runs.success.all() and far_from_single_runs(runs, range(8), system, (0.0, 1.0), q, v, parameters) < 1e-6
+    assert runs.reasons.keys() == set(np.flatnonzero(runs.singly)) and all(runs.reasons.values())
+
+
+@pytest.mark.parametrize("compiled", [False, slow(True)])
+def test_one_run_of_many_that_is_unlike_the_others_is_found(compiled):
+    """A branch on a parameter, for which there are no formulas, and a parameter that only one run has otherwise."""
+    n_runs, one = 20, 17
+    q, v, parameters = drawn(n_runs)
+    parameters[:, 0], parameters[:, 2] = 1.0, 9.0
+    parameters[one] = 2.0, parameters[one, 1], 20.0
+
+    def force(t, q, v, p):
+        return np.array([p[0] - 3.0, -p[2] if p[2] < 15.0 else -3.0])
+
+    # and no jacobian: it is derived
+    system = system_of(parameters, mass=np.eye(2), force=force, jacobian=None, compile=compiled)
+    runs = ensemble(system, (0.0, 0.5), q, v, parameters=parameters)
+    assert runs.singly.all() and far_from_single_runs(runs, [5, one], system, (0.0, 0.5), q, v, parameters) < 1e-6
+
+
+def test_what_cannot_go_in_lanes_says_why():
+    system, q, v, parameters = pendulums(3)
+    knife = mechanisms.knife_edge()
+    runs = ensemble(knife.system, (0.0, 0.1), np.tile(knife.q0, (2, 1)), knife.v0)
+    assert runs.singly.all() and "nonholonomic" in runs.message and "nonholonomic" in runs.reasons[1]
+    runs = ensemble(system, (0.0, 0.1), q, v, parameters=parameters, method="Adams")
+    assert runs.singly.all() and "Adams does not go in lanes" in runs.message
+    runs = ensemble(system, SPAN, q, v, parameters=parameters, events=event(lambda t, q, v: q[1] + 0.2, terminal=True))
+    assert runs.singly.all() and "events" in runs.message and (runs.status == Status.EVENT).any()
+    assert np.isnan(runs.q[runs.status == Status.EVENT][:, :, -1]).all()
+
+
+@pytest.mark.parametrize(("method", "by_state"), [("auto", False), slow("DOP853", False), slow("auto", True)])
+def test_what_is_narrow_and_acts_in_later_runs_alone_is_seen(method, by_state):
+    """Of the first run, whose factor is zero, nothing tells that there is something."""
+
+    def force(t, q, v, p):
+        x = (q[0] - 0.1234) / 3e-3 if by_state else (t - 0.4321) / 3e-4
+        return np.array([0.0, p[0] - 9.81 + p[2] * np.exp(-x * x)])
+
+    q, v, parameters = drawn(9)
+    parameters[:, 2] = np.linspace(0.0, 300.0 if by_state else 500.0, 9)
+    system = system_of(parameters, mass=np.eye(2), force=force, compile=True)
+    runs = ensemble(system, SPAN, q, v, parameters=parameters, method=method)
+    assert far_from_single_runs(runs, range(9), system, SPAN, q, v, parameters, max_step=5e-4) < 1e-5
+
+
+def test_a_lane_that_fails_says_what_a_single_run_says():
+    q, v, _ = pendulum_state(0.0)
+    system = pendulum(force=lambda t, q, v: np.array([0.0, -9.81 - 1e3 * np.sqrt(0.5 - t)]), compile=True)
+    runs = ensemble(system, (0.0, 1.0), np.tile(q, (3, 1)), v)
+    assert (runs.status < 0).all() and not runs.success.any() and np.isnan(runs.q[:, :, -1]).all()
+    assert set(runs.messages) == {0, 1, 2} and "0 of 3 runs" in runs.message
+
+
+def test_ctrl_c_ends_all_runs_and_not_one(interruptible):
+    q, v, parameters = drawn(6)
+    begun = []
+
+    def force(t, q, v, p):
+        if t > 0.1:
+            begun.append(p[2])
+            if p[2] == parameters[2, 2]:
+                signal.raise_signal(signal.SIGINT)
+        return np.array([0.0, -9.81])
+
+    with pytest.raises(KeyboardInterrupt):
+        ensemble(system_of(parameters, force=force), SPAN, q, v, parameters=parameters)
+    assert set(begun) == set(parameters[:3, 2])

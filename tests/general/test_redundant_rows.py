@@ -1,19 +1,28 @@
-"""Rows that follow from others: named once, left out, checked, with multipliers of minimum norm."""
+"""Test redundant and non-holonomic rows and singular masses: named once, left out, with multipliers of least norm."""
 
+import re
 import warnings
 
 import numpy as np
 import pytest
+from scipy.integrate import quad
 
-from tests.general.faulty import parted_drives
+from tests.bad_input.rows import edge, slide
+from tests.general.mechanism import G
 from tests.general.mechanisms import mechanism
-from tests.problems import START, held_twice, pendulum_state, some_of
+from tests.general.systems import KNIFE_EDGE, parted_drives, without_inertia
+from tests.marks import slow
+from tests.problems import START, held_twice, pendulum_state
 from twoloop import ConstraintWarning, consistent_state, solve_dae
+from twoloop.methods.presets import PRESETS
 
 
 @pytest.mark.parametrize(
     ("method", "factor"),
-    some_of(["SunRadau5", "Gauss12", "RadauIIA5", "DOP853", "BDF", "Newmark", "PaperIRK"], [1.0, 3.0, -0.5], 2),
+    [
+        *(("DOP853", -0.5), ("RadauIIA5", 3.0), ("Newmark", 1.0)),
+        *(slow(method, 3.0) for method in ("SunRadau5", "Gauss12", "BDF", "PaperIRK")),
+    ],
 )
 def test_a_row_given_twice_shares_the_force(method, factor):
     """Minimum norm: lam (1, factor) / (1 + factor^2) of the one multiplier, which is known in closed form."""
@@ -29,7 +38,7 @@ def test_a_row_given_twice_shares_the_force(method, factor):
     assert result.lam[1] == pytest.approx(factor * result.lam[0], abs=1e-9)
 
 
-@pytest.mark.parametrize("method", ["Gauss12", "DOP853"])
+@pytest.mark.parametrize("method", ["DOP853", slow("Gauss12")])
 def test_rows_that_part_later_end_the_run(method):
     """Both drives agree at the start, and only there: to go on with one of them would be wrong in silence."""
     with pytest.warns(ConstraintWarning):
@@ -52,3 +61,34 @@ def test_a_guess_is_projected_on_all_rows(name, off_q, off_v):
     assert np.abs(system.velocity_constraint(0.0, found_q, found_v)).max() < 1e-11
     if off_v:
         assert found_q == pytest.approx(q, abs=1e-12) and found_v != pytest.approx(v, abs=1e-4)
+
+
+@pytest.mark.parametrize("method", ["auto", "Newmark", "BDF", *(slow(name) for name in PRESETS)])
+def test_every_preset_takes_non_holonomic_rows(method):
+    """Only the canonical variables refuse them."""
+    result = slide(method=method, rtol=1e-5, atol=1e-5)
+    assert result.success, result.message
+    q, _ = KNIFE_EDGE.motion(result.t[-1])
+    assert result.q[:, -1] == pytest.approx(q, abs=1e-3)
+
+
+def test_gamma_left_out_is_differenced():
+    result = slide(edge(nonholonomic_gamma=None), rtol=1e-8, atol=1e-8)
+    assert result.success, result.message
+    assert result.q[:, -1] == pytest.approx(KNIFE_EDGE.motion(result.t[-1])[0], abs=1e-7)
+
+
+@pytest.mark.parametrize("method", ["DOP853", slow("SunRadau5")])
+def test_inertia_that_is_lost_on_the_way_ends_the_run(method):
+    """A pendulum whose mass moves sideways only: where the rod lies flat, nothing with mass can move.
+
+    On the way x'^2 / 2 - G sqrt(1 - x^2) is conserved, so that the time at which x = 1 is a quadrature.
+    """
+    speed = 5.0
+    end, _ = quad(lambda angle: np.cos(angle) / np.sqrt(speed**2 - 2.0 * G * (1.0 - np.cos(angle))), 0.0, 0.5 * np.pi)
+    system = without_inertia((1.0, 0.0, 1.0))
+    result = solve_dae(system, (0.0, 1.0), [0.0, -1.0, 0.0], [speed, 0.0, 0.0], method=method, max_steps=50_000)
+    assert not result.success and end - 0.02 < result.t[-1] <= end + 1e-6
+    x, u = result.q[0, result.t < 0.8 * end], result.v[0, result.t < 0.8 * end]
+    assert 0.5 * u**2 - G * np.sqrt(1.0 - x**2) == pytest.approx(0.5 * speed**2 - G, abs=1e-5)
+    assert "inertia" in result.message and re.search(r"coordinate\(?s?\)? .*1", result.message)

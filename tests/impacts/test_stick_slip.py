@@ -1,12 +1,14 @@
-"""Dry friction that sticks: motions in closed form, and what is asked wrongly."""
+"""Test dry friction that sticks, alone and with stops, in closed form."""
 
 import numpy as np
 import pytest
 
+from tests.marks import slow
 from twoloop import solve_with_friction
 from twoloop.bodies import PlanarModel, SpatialModel
 
 TIGHT = {"rtol": 1e-11, "atol": 1e-11}
+WEIGHT = 9.81
 
 
 def changes(result):
@@ -15,47 +17,43 @@ def changes(result):
     return np.array([arc.t[0] for arc in result.arcs[1:]])
 
 
-def incline(f, speed, angle=0.0, spatial=False):
-    """A block of 2 kg that is pushed up a slope; all is turned by an angle."""
-    total = 0.5 + angle
-    along, g = np.array([np.cos(total), np.sin(total)]), 9.81 * np.array([np.sin(angle), -np.cos(angle)])
+def block(slope, f, speed, spatial=False, **limits):
+    """A block of 2 kg on a slope, with dry friction and limits of its guide."""
+    up = np.array([np.cos(slope), np.sin(slope), 0.0])
     if spatial:
-        model = SpatialModel((*g, 0.0))
-        up = np.array([*along, 0.0])
-        model.body("block", mass=2.0, inertia=(0.1, 0.1, 0.1), position=(0.3, 0.2, 0.0), velocity=speed * up)
+        model = SpatialModel((0.0, -WEIGHT, 0.0), name="block")
+        model.body("block", mass=2.0, inertia=(0.1, 0.1, 0.1), position=(0, 0, 0), velocity=speed * up)
+        guide = model.prismatic("ground", "block", at=(0, 0, 0), axis=up)
     else:
-        model, up = PlanarModel(g), along
-        model.body("block", mass=2.0, inertia=0.1, position=(0.3, 0.2), velocity=speed * up)
-    guide = model.prismatic("ground", "block", at=(0.3, 0.2, 0.0)[: len(up)], axis=up)
+        model = PlanarModel(name="block")
+        model.body("block", mass=2.0, inertia=0.1, position=(0.0, 0.0), velocity=speed * up[:2])
+        guide = model.prismatic("ground", "block", at=(0.0, 0.0), axis=up[:2])
     model.dry_friction(guide, f)
-    return model.problem((0.0, 2.0)), up
+    if limits:
+        model.limit(guide, **limits)
+    return model, up
 
 
-@pytest.mark.parametrize("spatial", [False, True])
-@pytest.mark.parametrize("angle", [0.0, 1.9])
-def test_a_block_on_a_slope_stops_and_sticks(spatial, angle):
-    problem, up = incline(12.0, 3.0, angle=angle, spatial=spatial)
-    result = solve_with_friction(problem, **TIGHT)
-    pull = 9.81 * np.sin(0.5)
-    end = 3.0 / (pull + 6.0)
+def along(result, up):
+    """How far the block is up the slope, and how fast."""
+    n = 3 if len(result.q) == 7 else 2
+    return up[:n] @ result.q[:n], up[:n] @ result.v[:n]
+
+
+@pytest.mark.parametrize(("f", "spatial"), [(12.0, True), (5.0, False)])
+def test_a_block_on_a_slope_stops_and_sticks_or_turns_round(f, spatial):
+    model, up = block(0.5, f, 3.0, spatial)
+    result = solve_with_friction(model.problem((0.0, 2.0)), t_eval=[0.0, 1.0, 2.0], **TIGHT)
+    pull = WEIGHT * np.sin(0.5)
+    end = 3.0 / (pull + 0.5 * f)
     np.testing.assert_allclose(changes(result), [end], atol=1e-9)
-    place = problem.q0[: len(up)] + 4.5 / (pull + 6.0) * up
-    np.testing.assert_allclose(result.q[: len(up), -1], place, atol=1e-9)
-    assert "dry friction of prismatic block-ground sticks" in result.arcs[-1].system.name
+    back = 0.5 * max(pull - 0.5 * f, 0.0) * (2.0 - end) ** 2
+    assert along(result, up)[0][-1] == pytest.approx(4.5 / (pull + 0.5 * f) - back, abs=1e-9)
+    sticks = "dry friction of prismatic block-ground sticks" in result.arcs[-1].system.name
+    assert sticks == (f == 12.0) and result.t.tolist() == [0.0, 1.0, 2.0]
 
 
-def test_a_block_on_a_slope_turns_round():
-    problem, up = incline(5.0, 3.0)
-    result = solve_with_friction(problem, t_eval=[0.0, 1.0, 2.0], **TIGHT)
-    pull = 9.81 * np.sin(0.5)
-    end = 3.0 / (pull + 2.5)
-    np.testing.assert_allclose(changes(result), [end], atol=1e-9)
-    back = 4.5 / (pull + 2.5) - 0.5 * (pull - 2.5) * (2.0 - end) ** 2
-    np.testing.assert_allclose(result.q[:2, -1], problem.q0[:2] + back * up, atol=1e-9)
-    assert result.t.tolist() == [0.0, 1.0, 2.0] and result.lam.shape == (2, 3)
-
-
-@pytest.mark.parametrize("spatial", [False, True])
+@pytest.mark.parametrize("spatial", [True, slow(False)])
 def test_a_rotor_on_a_torsion_spring_loses_as_much_in_every_half_turn(spatial):
     J, k, f, start = 0.4, 3.0, 0.25, 2.5
     pose = {"mass": 1.0, "position": (0.0, 0.0, 0.0)}
@@ -103,22 +101,6 @@ def test_a_block_on_a_belt_sticks_and_slips():
     assert len(found) >= 6
 
 
-def test_two_blocks_of_which_one_holds_the_other():
-    """A pushes B by a spring: A slides until it stops, then both hold, each with friction that depends on the other."""
-    model = PlanarModel()
-    for name, x, v in (("A", 0.0, 1.2), ("B", 1.0, 0.0)):
-        model.body(name, mass=1.0, inertia=0.1, position=(x, 0.0), velocity=(v, 0.0))
-        model.dry_friction(model.prismatic("ground", name, at=(x, 0.0), axis=(1.0, 0.0)), 3.0, static=3.5)
-    model.spring("A", (0.0, 0.0), "B", (1.0, 0.0), stiffness=20.0)
-    result = solve_with_friction(model.problem((0.0, 3.0)), **TIGHT)
-    w = np.sqrt(20.0)  # x_A = -(3/20) (1 - cos wt) + 1.2 / w sin wt, while B sticks
-    slide = np.arctan2(1.2 / w, 3.0 / 20.0) / w
-    most = -0.15 + np.hypot(0.15, 1.2 / w)
-    assert 20.0 * most < 3.5  # B is never overcome
-    np.testing.assert_allclose(changes(result)[0], slide, atol=1e-9)
-    assert result.q[0, -1] == pytest.approx(most, abs=1e-9) and result.q[3, -1] == pytest.approx(1.0, abs=1e-12)
-
-
 def rotor(torque, **friction):
     """A rotor without weight under a torque."""
     model = PlanarModel((0.0, 0.0))
@@ -139,48 +121,6 @@ def test_static_friction_is_overcome_and_one_in_balance_holds():
     assert at_once.v[2, -1] == pytest.approx(16.0, abs=1e-7)
 
 
-def test_a_block_on_a_cart_is_caught_and_both_stop():
-    model = PlanarModel()
-    model.body("cart", mass=2.0, inertia=1.0, position=(0.0, 0.0))
-    model.body("block", mass=1.0, inertia=1.0, position=(0.0, 0.2), velocity=(2.0, 0.0))
-    model.dry_friction(model.prismatic("ground", "cart", at=(0.0, 0.0), axis=(1.0, 0.0)), 2.0)
-    model.dry_friction(model.prismatic("cart", "block", at=(0.0, 0.2), axis=(1.0, 0.0)), 5.0)
-    problem = model.problem((0.0, 5.0))
-    problem.v0[:] = [0.0, 0.0, 0.0, 2.0, 0.0, 0.0]
-    result = solve_with_friction(problem, **TIGHT)
-    caught, speed = 2.0 / 6.5, 3.0 / 6.5  # decelerations -5 and (5 - 2) / 2, then 2 / 3 together
-    np.testing.assert_allclose(changes(result), [caught, caught + 1.5 * speed], atol=1e-9)
-    assert result.q[0, -1] == pytest.approx(0.75 * caught**2 + 0.75 * speed**2, abs=1e-9)
-    lighter = solve_with_friction(problem.with_parameters({"mass of block": 0.5}), **TIGHT)
-    assert lighter.success and lighter.q[0, -1] < result.q[0, -1]
-
-
-def double_pendulum(kind):
-    points = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0]])
-    flat = kind is PlanarModel
-    model = kind((0.0, -9.81) if flat else (0.0, -9.81, 0.0))
-    axis = {} if flat else {"axis": (0.0, 0.0, 1.0)}
-    for k, name in enumerate("ab"):
-        one, other = points[k], points[k + 1]
-        if flat:
-            model.body(name, mass=1.0, inertia=0.1, position=0.5 * (one + other))
-        else:
-            model.body(name, mass=1.0, inertia=(0.1, 0.1, 0.1), position=np.append(0.5 * (one + other), 0.0))
-        joint = model.revolute("ab"[k - 1] if k else "ground", name, at=one if flat else np.append(one, 0.0), **axis)
-        model.dry_friction(joint, (1.0, 0.5)[k], static=(1.6, 0.5)[k])
-    return model.problem((0.0, 1.6))
-
-
-def test_a_double_pendulum_by_unlike_methods_in_a_plane_and_in_space():
-    problem = double_pendulum(PlanarModel)
-    known = solve_with_friction(problem, method="DOP853", **TIGHT)
-    assert len(changes(known)) >= 5
-    assert np.diff(problem.energy(known.t, known.q, known.v)).max() < 1e-12  # friction takes energy only
-    for other, method in ((problem, "RadauIIA9"), (double_pendulum(SpatialModel), "DOP853")):
-        result = solve_with_friction(other, method=method, **TIGHT)
-        np.testing.assert_allclose(changes(result), changes(known), atol=1e-9)
-
-
 def test_wheels_that_mesh_come_to_rest():
     """What rounding leaves of their rates is no motion."""
     model = PlanarModel((0.0, 0.0))
@@ -194,12 +134,6 @@ def test_wheels_that_mesh_come_to_rest():
     assert not result.v[:, -1].any()
 
 
-def test_what_the_problem_says_of_dry_friction():
-    problem = rotor(1.0)
-    assert "solve_with_friction handles its dry friction" in problem.note and not problem.conserved
-    assert not any("friction" in name for name in problem.parameters)
-
-
 def test_a_short_push_releases_a_joint_that_sticks():
     """For a two-hundredth of the run friction is exceeded, by little, while nothing else moves."""
     model = PlanarModel((0.0, 0.0))
@@ -211,3 +145,77 @@ def test_a_short_push_releases_a_joint_that_sticks():
     start = 5.0 - 0.05 * np.sqrt(np.log(1.2))
     assert result.success and changes(result)[0] == pytest.approx(start, abs=1e-8)
     assert result.q[0, -1] == pytest.approx(1.0476e-4, rel=1e-4)
+
+
+@pytest.mark.parametrize("spatial", [False, slow(True)])
+def test_a_block_rebounds_and_sticks(spatial):
+    """On a level guide: it slows down, rebounds from the limit, and stays where it stops."""
+    speed, end, e, slows = 3.0, 0.7, 0.6, 2.5
+    model, up = block(0.0, 5.0, speed, spatial, upper=end, restitution=e)
+    result = solve_with_friction(model.problem((0.0, 3.0)), **TIGHT)
+    assert result.success, result.message
+    hit = np.sqrt(speed**2 - 2.0 * slows * end)
+    first, stop = (speed - hit) / slows, e * hit / slows
+    np.testing.assert_allclose([impact.t for impact in result.impacts], [first], atol=1e-9)
+    np.testing.assert_allclose([arc.t[0] for arc in result.arcs], [0.0, first, first + stop], atol=1e-9)
+    place, rate = along(result, up)
+    assert place[-1] == pytest.approx(end - 0.5 * slows * stop**2, abs=1e-9) and abs(rate[-1]) < 1e-12
+    assert "sticks" in result.arcs[-1].system.name and "1 impacts, 2 changes" in result.message
+
+
+def test_a_block_slides_down_bounces_and_rests_on_the_limit():
+    """Its weight overcomes the friction: each rebound is lower by that, too, until the limit carries it."""
+    slope, e, drop = 0.6, 0.3, 0.4
+    pull, slows = WEIGHT * np.sin(slope), 1.5
+    model, up = block(slope, 2.0 * slows, 0.0, lower=-drop, restitution=e)
+    result = solve_with_friction(model.problem((0.0, 4.0)), **TIGHT)
+    assert result.success, result.message
+    t = np.sqrt(2.0 * drop / (pull - slows))
+    speed, times = (pull - slows) * t, []
+    for _ in range(len(result.impacts)):
+        times.append(t)
+        speed *= e
+        height = speed**2 / (2.0 * (pull + slows))
+        t += speed / (pull + slows) + np.sqrt(2.0 * height / (pull - slows))
+        speed = np.sqrt(2.0 * height * (pull - slows))
+    assert 6 < len(times) < 40
+    np.testing.assert_allclose([impact.t for impact in result.impacts], times, atol=1e-9)
+    place, _ = along(result, up)
+    assert place[-1] == pytest.approx(-drop, abs=1e-10)
+    assert "on lower limit" in result.arcs[-1].system.name and "sticks" not in result.arcs[-1].system.name
+    np.testing.assert_allclose(-result.arcs[-1].lam[result.system.n_c, -1], 2.0 * pull, atol=1e-7)
+
+
+def test_an_impact_releases_a_joint_that_sticks():
+    """A cart that sticks is hit by a mass on it, whose guide has a limit: both slide, and stop one after the other."""
+    M, m, v, f, g = 2.0, 1.0, 3.0, 1.0, 0.4
+    model = PlanarModel(name="cart")
+    model.body("cart", mass=M, inertia=1.0, position=(0.0, 0.0))
+    model.body("mass", mass=m, inertia=1.0, position=(0.0, 0.2), velocity=(v, 0.0))
+    model.dry_friction(model.prismatic("ground", "cart", at=(0.0, 0.0), axis=(1.0, 0.0)), f)
+    slot = model.prismatic("cart", "mass", at=(0.0, 0.2), axis=(1.0, 0.0))
+    model.dry_friction(slot, g)
+    model.limit(slot, upper=0.5, restitution=0.5)
+    problem = model.problem((0.0, 10.0))
+    problem.v0[:] = [0.0, 0.0, 0.0, v, 0.0, 0.0]
+    result = solve_with_friction(problem, **TIGHT)
+    assert result.success, result.message
+    hit = np.sqrt(v**2 - 2.0 * (g / m) * 0.5)
+    first = (v - hit) / (g / m)
+    np.testing.assert_allclose(result.impacts[0].t, first, atol=1e-9)
+    both, apart = m * hit / (M + m), 0.5 * hit
+    cart, mass = both + m * apart / (M + m), both - M * apart / (M + m)
+    np.testing.assert_allclose(result.impacts[0].v_after[[0, 3]], [cart, mass], atol=1e-9)
+    # the cart slows by (f + g) / M, the mass, which is slower, gains g / m until both are as fast, then both slow by f
+    t = first + (cart - mass) / ((f + g) / M + g / m)
+    speed = mass + g / m * (t - first)
+    assert speed > 0.0 and f / (M + m) * m < g
+    np.testing.assert_allclose([arc.t[0] for arc in result.arcs], [0.0, first, t, t + speed * (M + m) / f], atol=1e-9)
+    assert abs(result.v[:, -1]).max() < 1e-12
+
+
+def test_a_joint_at_rest_without_load_stays_at_rest():
+    """The rounding of what acts on it counts for nothing."""
+    model, _ = block(0.0, 2.0, 0.0, upper=0.0)
+    result = solve_with_friction(model.problem((0.0, 1.0)), **TIGHT)
+    assert result.success and len(result.arcs) == 1 and np.abs(result.q[0]).max() < 1e-12

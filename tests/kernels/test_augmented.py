@@ -1,4 +1,4 @@
-"""Accelerations and projection by the sparse augmented matrix, against the dense forms."""
+"""Test M a + G^T lam = r, G a = c in every form: the sparse augmented matrix against the dense forms and NumPy."""
 
 import numpy as np
 import pytest
@@ -6,10 +6,10 @@ import pytest
 import twoloop.run.workspace as workspace_module
 from tests.chains import chain
 from tests.general.mechanisms import error, mechanism
-from tests.problems import force_residual, functions_of, pendulum, some_of, violations, worst
-from twoloop import ConstrainedSystem, ConstraintWarning, Status, solve_dae
+from tests.problems import force_residual, pendulum, some_of, violations, worst
+from twoloop import solve_dae
 from twoloop.kernels.algebra.sparse import MANY, sparse_pays
-from twoloop.kernels.data import codes, flags
+from twoloop.kernels.data import flags
 from twoloop.mechanisms import n_four_bar
 from twoloop.methods.dop853 import DOP853
 from twoloop.run.run import Run
@@ -19,8 +19,7 @@ from twoloop.run.run import Run
 KINDS = (
     "redundant slider-crank",
     "top with its centre",
-    "top of Euler parameters",
-    "knife edge in space",
+    "pushed knife edge",
     "wobbling disc, redundant",
     "driven slider-crank, redundant",
     "massless coordinate",
@@ -60,7 +59,7 @@ def form(run):
 
 
 @pytest.mark.filterwarnings("ignore::twoloop.ConstraintWarning")
-@pytest.mark.parametrize(("name", "method"), some_of(KINDS, ["Gauss12", "DOP853", "Adams"], 2))
+@pytest.mark.parametrize(("name", "method"), some_of(KINDS, ["Gauss12", "DOP853", "Adams"], 1))
 def test_known_motions(both, name, method):
     m = mechanism(name)
     dense, sparse = both(m.system(), (0.0, 0.5 * m.end), *m.start, method, 1e-10, 1e-10)
@@ -70,8 +69,7 @@ def test_known_motions(both, name, method):
     assert sparse.stats.n_evaluations < 1.5 * dense.stats.n_evaluations  # at 1e-10 rounding decides on some iterations
 
 
-@pytest.mark.parametrize("method", ["Adams", "DOP853", "Gauss6", "RadauIIA5"])
-@pytest.mark.parametrize("closed", [False, True])
+@pytest.mark.parametrize(("method", "closed"), [("DOP853", False), ("Gauss6", True)])
 def test_a_chain_of_fourteen(both, closed, method):
     problem = chain(14, closed)
     options = {"method": method, "rtol": 1e-10, "atol": 1e-10, "t_eval": np.linspace(0.0, 0.05, 6)}
@@ -86,27 +84,6 @@ def test_chosen_where_rows_and_degrees_of_freedom_are_many():
     assert form(started(chain(MANY, False))) == flags.AUGMENTED
     assert form(started(chain(MANY - 1, False))) == flags.NULL_SPACE
     assert form(started(n_four_bar(2))) == flags.NULL_SPACE and form(started(n_four_bar(20))) == flags.AUGMENTED
-
-
-def with_mass(system, mass):
-    """A system with another mass."""
-    sizes = {"n_q": system.n_q, "n_c": system.n_c}
-    return ConstrainedSystem.from_python(**sizes, **functions_of(system) | {"mass": mass})
-
-
-def full_mass(n):
-    """The chain of n with a mass matrix without zeros."""
-    problem = chain(n, False)
-    system, weight = problem.system, np.random.default_rng(3).normal(size=(2 * n, 2 * n))
-    return with_mass(system, np.eye(2 * n) + 0.1 * weight @ weight.T / n), problem
-
-
-def test_dense_where_the_factors_are_not_sparse(both):
-    system, problem = full_mass(40)
-    dense, turned = both(system, (0.0, 0.01), problem.q0, problem.v0, "Adams", 1e-8, 1e-8)
-    assert worst(dense.q, turned.q) == 0.0 and worst(dense.lam, turned.lam) == 0.0
-    problem = type(problem)(**{**vars(problem), "system": system})
-    assert form(started(problem)) == flags.NULL_SPACE
 
 
 def test_an_entry_that_comes_later_is_found(both):
@@ -124,43 +101,3 @@ def test_an_entry_that_comes_later_is_found(both):
     )
     one, other = both(system, (0.0, 2.0), [0.0, 0.0], [0.0, 0.0], "Adams", 1e-9, 1e-9)
     assert worst(one.q[:, -1], other.q[:, -1]) < 1e-7 and max(violations(system, other)) < 1e-9
-
-
-@pytest.mark.parametrize("heavy", [False, True])
-def test_a_mass_that_turns_negative_ends_the_run(choose, heavy):
-    """The mass of the last of three links, or that of every one of them."""
-
-    def mass(t, q):
-        diagonal = np.full(6, 1.0 - 4.0 * t if heavy else 1.0)
-        diagonal[-2:] = 1.0 - 4.0 * t
-        return np.diag(diagonal)
-
-    problem = chain(3, False)
-    choose(True)
-    result = solve_dae(with_mass(problem.system, mass), (0.0, 1.0), problem.q0, problem.v0, "DOP853", 1e-6, 1e-6)
-    assert not result.success and result.t[-1] <= 0.26 and result.status is not Status.REACHED_END
-
-
-def test_a_mass_negative_at_the_start_is_refused(choose):
-    problem = chain(4, False)
-    choose(True)
-    with pytest.raises(ValueError, match="positive definite on the velocities"):
-        solve_dae(with_mass(problem.system, -np.eye(8)), (0.0, 1.0), problem.q0, problem.v0)
-
-
-def test_a_program_outlasts_partitions(choose):
-    """Another partition of a chain has the same rows: the program of the augmented matrix stays."""
-    choose(True)
-    run = started(chain(12, False))
-    program = run.work.index_a.copy()
-    for _ in range(2):
-        assert run.kernels.start(run.kit, run.work, 0.0, run.state) == codes.DONE
-    assert (run.work.index_a == program).all()
-
-
-def test_rows_of_rank_less_than_their_number_warn(choose):
-    choose(True)
-    m = mechanism("redundant slider-crank")
-    with pytest.warns(ConstraintWarning, match="rank"):
-        result = solve_dae(m.system(), (0.0, 0.01), *m.start, "Adams", 1e-8, 1e-8)
-    assert force_residual(m.system(), result) < 1e-8

@@ -1,13 +1,12 @@
-"""BDF with variable step and order: orders, prices, conservation, fixed steps, and what holds for each method."""
+"""Test BDF with variable step and order: cost, jumps of the force, Newton's method, and the tests of every method."""
 
 import numpy as np
 import pytest
 
 from tests.kernels.adaptive import AdaptiveMethod, after_the_jump, four_bar_run, jumping, shared_run
-from tests.problems import pendulum, pendulum_energy, pendulum_state, swing, worst
-from twoloop import BDF, solve_dae
-from twoloop.kernels.steps import bdf_step as bdf
-from twoloop.methods.bdf import BDF_HIGHEST
+from tests.marks import slow
+from tests.problems import pendulum, pendulum_state, swing, worst
+from twoloop import BDF
 
 TOLERANCES = (1e-6, 1e-8, 1e-10)
 
@@ -25,14 +24,11 @@ class TestBDF(AdaptiveMethod):
     oblique_tol, oblique_far = 1e-9, (2e-7, 5e-7, 1e-5)
 
 
-def test_the_face_and_the_kernel_agree_on_the_highest_order():
-    assert BDF_HIGHEST == bdf.MAX_ORDER
-
-
 # --- accuracy and price
 @pytest.mark.parametrize(("tol", "per_step", "steps"), [(1e-4, 2.8, 1120), (1e-6, 2.4, 2470), (1e-8, 2.2, 5330)])
 def test_a_sweep_is_an_evaluation_and_a_step_takes_two_or_three(tol, per_step, steps):
     stats = shared_run("BDF", tol)[0].stats
+    assert stats.n_rejected_error + stats.n_rejected_convergence <= 0.01 * stats.n_accepted
     assert stats.n_evaluations < per_step * stats.n_accepted
     assert stats.n_accepted < steps  # a twentieth more than it takes
     assert stats.n_evaluations == stats.n_outer + 1  # one more at the start
@@ -43,19 +39,6 @@ def test_every_order_pays():
     assert counts[0] > 5 * counts[1] > 10 * counts[2] and counts[2] > 1.3 * counts[3] > 1.3 * counts[4]
 
 
-def test_a_run_of_low_order_has_the_steps_of_its_order():
-    # a hundredth of the tolerance: 10 times the steps with order 1, 100^(1/3) with order 2
-    for order, ratio in ((1, 10.0), (2, 4.64)):
-        coarse, fine = (four_bar_run(BDF(order), tol, 1.0)[0] for tol in (1e-4, 1e-6))
-        assert fine.stats.n_accepted / coarse.stats.n_accepted == pytest.approx(ratio, rel=0.2)
-
-
-def test_steps_are_seldom_rejected():
-    for tol in TOLERANCES:
-        stats = shared_run("BDF", tol)[0].stats
-        assert stats.n_rejected_error + stats.n_rejected_convergence <= 0.01 * stats.n_accepted
-
-
 def test_the_first_step_is_small_enough_for_order_one():
     result = swing(method="BDF", rtol=1e-8, atol=1e-8)
     q, v, _ = pendulum_state(result.t[:20])
@@ -63,52 +46,20 @@ def test_the_first_step_is_small_enough_for_order_one():
     assert result.h.max() > 100.0 * result.h[:10].min()
 
 
-def test_a_tight_outer_loop_is_dearer_and_no_better_a_loose_one_still_corrects_once():
-    cost, error = {}, {}
-    for outer_tol in (1e-2, None, 1e-13):
-        result, error[outer_tol] = four_bar_run(BDF(outer_tol=outer_tol), 1e-8)
-        cost[outer_tol] = result.stats.n_evaluations / result.stats.n_accepted
-    assert 2.0 <= cost[1e-2] < cost[None] < cost[1e-13] and max(error.values()) < 5.0 * min(error.values())
-
-
 # --- other problems
-@pytest.mark.parametrize("tol", TOLERANCES)
+@pytest.mark.parametrize("tol", [1e-6, slow(1e-10)])
 def test_after_a_jump_of_the_force_the_order_rises_again(tol):
     result, smooth = swing(3.0, jumping(), method="BDF", rtol=tol, atol=tol), after_the_jump(3.0, "BDF", tol)
     assert result.h[result.t[1:] > 2.0].mean() > 0.8 * smooth.h[smooth.t[1:] > 2.0].mean()
     assert result.h[np.abs(result.t[1:] - 1.0) < 1e-3].min() < 1e-5
 
 
-@pytest.mark.parametrize("tol", [1e-4, 1e-6, 1e-8])
+@pytest.mark.parametrize("tol", [1e-4, slow(1e-6)])
 def test_steps_far_shorter_than_the_tolerance_asks_for_are_no_worse(tol):
     # the prediction alone is within the tolerance then, but a chain of predictions would explode
     _, error = four_bar_run("BDF", tol, 1.0)
     many, many_error = four_bar_run("BDF", tol, 1.0, max_step=1e-4)
     assert many_error < error and many.stats.n_evaluations >= 2 * many.stats.n_accepted
-
-
-@pytest.mark.parametrize(("order", "sign"), [(1, -1), (2, -1), (3, 1), (4, 1), (5, -1)])
-def test_fixed_steps_damp_or_amplify_small_oscillations_as_the_formulas_do(order, sign):
-    h, steps, angle = 0.02, 1000, 1e-2
-    start = np.array([np.sin(angle), -np.cos(angle)])
-    result = solve_dae(pendulum(compile=True), (0.0, h * steps), start, [0.0, 0.0], BDF(order), step_size=h)
-    energy = pendulum_energy(result.q, result.v) + 9.81
-    growth = np.log(energy[-1] / energy[0]) / (2.0 * steps)  # of the amplitude, a step
-    # roots of sum_j (1 - 1/z)^j / j = i h omega
-    polynomial = np.poly1d([0.0]) - 1j * h * np.sqrt(9.81)
-    for j in range(1, order + 1):
-        polynomial = polynomial + np.poly1d([-1.0, 1.0]) ** j / j
-    expected = np.log(np.abs(1.0 / polynomial.roots).max())
-    assert np.sign(expected) == sign and growth == pytest.approx(expected, rel=0.15, abs=1e-7)
-
-
-# --- fixed steps
-def test_fixed_steps_begin_with_as_many_gauss_steps_as_the_order():
-    h = 0.02
-    bdf_run = swing(10 * h, method=BDF(4), step_size=h)
-    gauss_run = swing(10 * h, method="Gauss6", step_size=h)
-    assert worst(bdf_run.q[:, :5], gauss_run.q[:, :5]) < 1e-13 and worst(bdf_run.q[:, 5], gauss_run.q[:, 5]) > 1e-9
-    assert (bdf_run.h[:-1] == h).all()
 
 
 def test_the_last_fixed_step_may_be_short():
@@ -119,10 +70,9 @@ def test_the_last_fixed_step_may_be_short():
 
 # --- Newton's method as the outer loop
 def test_newtons_method_takes_the_steps_of_the_fixed_point_where_nothing_is_stiff():
-    for tol in (1e-5, 1e-8):
-        (one, error), (other, same) = (four_bar_run(BDF(outer=outer), tol, 3.0) for outer in ("fixed-point", "newton"))
-        assert same < 1.2 * error and abs(other.stats.n_accepted - one.stats.n_accepted) < 0.02 * one.stats.n_accepted
-        assert other.stats.n_outer <= 1.1 * one.stats.n_outer and 0 < other.stats.n_jacobians < 30
+    (one, error), (other, same) = (four_bar_run(BDF(outer=outer), 1e-8, 3.0) for outer in ("fixed-point", "newton"))
+    assert same < 1.2 * error and abs(other.stats.n_accepted - one.stats.n_accepted) < 0.02 * one.stats.n_accepted
+    assert other.stats.n_outer <= 1.1 * one.stats.n_outer and 0 < other.stats.n_jacobians < 30
 
 
 def test_newtons_method_takes_long_steps_in_a_viscous_fluid():
@@ -138,11 +88,3 @@ def test_newtons_method_takes_long_steps_in_a_viscous_fluid():
         assert found[outer].success
     one, other = found["fixed-point"], found["newton"]
     assert worst(one.q[:, -1], other.q[:, -1]) < 1e-4 and other.stats.n_accepted < 0.02 * one.stats.n_accepted
-
-
-def test_fixed_steps_by_newtons_method_have_the_order_that_was_asked_for():
-    errors = []
-    for h in (0.002, 0.001):
-        result = swing(1.0, method=BDF(2, outer="newton"), step_size=h)
-        errors.append(worst(result.q[:, -1], pendulum_state(result.t[-1:])[0][:, 0]))
-    assert 3.0 < errors[0] / errors[1] < 5.0

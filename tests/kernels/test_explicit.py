@@ -1,13 +1,10 @@
-"""DOP853 in the two loops: prices, constraints, stability. Its numbers: test_tableaux.py, its order: test_orders.py."""
+"""Test DOP853 in the two loops: cost, constraints, stability (its numbers: test_tableaux.py; order: test_orders.py)."""
 
 import numpy as np
-import pytest
 
 from tests.kernels.adaptive import AdaptiveMethod, four_bar_run, shared_run
 from tests.problems import LINKAGES, pendulum, violations, worst
 from twoloop import DOP853, solve_dae
-from twoloop.kernels.data import tolerances
-from twoloop.kernels.steps import explicit_step as explicit
 from twoloop.mechanisms import n_four_bar, very_flexible_beam
 
 STAGES = 12
@@ -25,46 +22,12 @@ class TestDOP853(AdaptiveMethod):
     swing_end, more_after, far_after = 50.0, 1.2, 1e3
 
 
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        ({"b": np.ones(3)}, r"must be \(s, s\).*given \(2, 2\), \(3,\)"),
-        ({"fine": np.ones(1)}, r"must be \(s, s\).*\(1,\)"),
-        ({"A": np.array([[0.0, 0.0], [0.5, 0.5]])}, "strictly lower triangular"),
-        ({"c": np.array([0.5, 1.0])}, r"c\[0\] = 0"),
-    ],
-)
-def test_a_tableau_that_is_not_explicit_is_refused(change, words):
-    good = {"A": np.array([[0.0, 0.0], [1.0, 0.0]]), "b": np.array([0.5, 0.5]), "c": np.array([0.0, 1.0])}
-    good |= {"fine": np.array([1.0, -1.0]), "coarse": np.array([1.0, -1.0])}
-    with pytest.raises(ValueError, match=words):
-        explicit.options_array(**{**good, **change}, inner_tol=1e-8)
-
-
 def test_a_step_is_twelve_evaluations_and_a_refused_one_eleven():
     for tol in (1e-8, 1e-10):
         stats = shared_run("DOP853", tol)[0].stats
-        assert stats.n_rejected_convergence == 0 < stats.n_rejected_error
+        assert stats.n_rejected_convergence == 0 < stats.n_rejected_error < 0.4 * stats.n_accepted
         least = STAGES * stats.n_accepted + (STAGES - 1) * stats.n_rejected_error + 1
         assert least <= stats.n_evaluations <= least + 2 and stats.n_outer == stats.n_accepted + stats.n_rejected_error
-
-
-@pytest.mark.parametrize("tol", TestDOP853.tolerances)
-def test_fewer_steps_are_refused_than_taken(tol):
-    stats = shared_run("DOP853", tol)[0].stats
-    assert stats.n_rejected_error + stats.n_rejected_convergence < 0.4 * stats.n_accepted
-
-
-def test_near_singular_positions_the_estimate_follows_its_lower_orders():
-    """Of the step on A02 that was off by 47 tolerances: of orders 5 and 3 they are 245 and 40,000 tolerances."""
-    allowed = np.concatenate([np.zeros(tolerances.ATOL), [1.0, 1.0]])
-    ends = np.zeros(2), np.ones(2)
-    found = [
-        explicit.largest_error.py_func(allowed, *ends, np.array([-245.0, 1.0]), np.array([3.0, -4e4]), strict)
-        for strict in (False, True)
-    ]
-    assert found == pytest.approx([1.5, 19.2], rel=0.01)
-    assert explicit.largest_error.py_func(allowed, *ends, np.zeros(2), np.ones(2), True) == 0.0
 
 
 def test_runs_through_singular_positions_err_by_what_an_ode_in_the_angle_does():
@@ -110,15 +73,6 @@ def vibration(w, force=None):
         gamma=lambda t, q, v: np.zeros(1),
         constant_mass=True,
     )
-
-
-def test_fixed_steps_grow_beyond_the_limit_that_the_docstring_names():
-    assert "5.96" in DOP853.__doc__
-    amplitudes = {}
-    for x in (5.9, 6.0):
-        result = solve_dae(vibration(x / 0.01), (0.0, 5.0), [1.0, 2.0], [0.0, 0.0], "DOP853", step_size=0.01)
-        amplitudes[x] = np.abs(result.q[0, -20:]).max()
-    assert amplitudes[5.9] < 1e-6 and amplitudes[6.0] > 1e6
 
 
 def test_step_size_control_stays_below_the_limit_when_nothing_else_asks_for_it():

@@ -1,6 +1,5 @@
 """How helpers get into kernels, and which kernels are compiled together."""
 
-import gc
 import re
 from pathlib import Path
 
@@ -11,7 +10,6 @@ from numba import types
 from numba.core.registry import cpu_target
 
 from twoloop.kernels.compile import own_rules
-from twoloop.kernels.compile.caches import compile_kept
 from twoloop.kernels.compile.linking import KernelCompiler
 from twoloop.kernels.data.common import OPTIONS, compiled, inlined, merged
 
@@ -52,17 +50,6 @@ def test_a_step_compiles_no_other_step():
     found = {(name, other) for name, text in steps.items() for other in re.findall(imported, text) if other in steps}
     # the explicit step belongs to the default method, and is compiled in any case
     assert {pair for pair in found if pair[1] != "explicit_step"} == set()
-
-
-@pytest.mark.parametrize("collecting", [True, False])
-def test_the_collection_of_cycles_goes_on_as_it_was(collecting):
-    before = gc.isenabled()
-    try:
-        (gc.enable if collecting else gc.disable)()
-        assert compile_kept(lambda x: 2.0 * x, types.float64(types.float64), None)(1.0) == 2.0
-        assert gc.isenabled() is collecting
-    finally:
-        (gc.enable if before else gc.disable)()
 
 
 @inlined

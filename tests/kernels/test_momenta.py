@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from tests import problems
+from tests.marks import slow
 from twoloop import RungeKutta, solve_dae
-from twoloop.methods.tableaux import gauss, lobatto_iiie, radau_iia, sun_radau_iib
+from twoloop.methods.tableaux import gauss, lobatto_iiie, sun_radau_iib
 
 SYMPLECTIC = {"Sun": sun_radau_iib(3), "Gauss": gauss(3), "Lobatto": lobatto_iiie(4), "midpoint": gauss(1)}
 START = np.array([0.7, -0.4, 1.1, -0.6])  # angles and momenta of the double pendulum
@@ -46,23 +47,10 @@ def defect(method, gamma=True):
     )
 
 
-@pytest.mark.parametrize("name", SYMPLECTIC)
+@pytest.mark.parametrize("name", ["Sun", *(slow(name) for name in SYMPLECTIC if name != "Sun")])
 def test_a_symplectic_tableau_is_symplectic_in_momenta_and_not_in_velocities(name):
     assert defect(RungeKutta(SYMPLECTIC[name], variables="momenta")) < 1e-8
     assert defect(RungeKutta(SYMPLECTIC[name])) > 1e-6
-
-
-@pytest.mark.parametrize(
-    "method",
-    [RungeKutta(sun_radau_iib(3), outer="paper", outer_tol=1e-14), RungeKutta(radau_iia(3), variables="momenta")],
-    ids=["the paper's own loop", "another tableau in momenta"],
-)
-def test_others_are_not_symplectic(method):
-    assert defect(method) > 1e-6
-
-
-def test_symplectic_with_gamma_by_differences():
-    assert defect(RungeKutta(sun_radau_iib(3), variables="momenta"), gamma=False) < 1e-8
 
 
 def oblique_from_angle(angle, momentum):
@@ -78,7 +66,7 @@ def angle_of_oblique(q, v):
     return np.array([np.arctan2(x[0], -x[1])]), np.array([x[0] * u[1] - x[1] * u[0]])
 
 
-@pytest.mark.parametrize("gamma", [True, False])
+@pytest.mark.parametrize("gamma", [False, slow(True)])
 def test_symplectic_where_the_mass_matrix_depends_on_the_position(gamma):
     system = problems.oblique_pendulum(gamma, conservative=True)
     defects = {
@@ -91,39 +79,13 @@ def test_symplectic_where_the_mass_matrix_depends_on_the_position(gamma):
     assert defects["momenta"] < 1e-8 and defects["velocities"] > 1e-7
 
 
-def test_variable_steps_reach_the_tolerance():
-    start, times = (0.4, 0.0), np.linspace(0.25, 2.0, 8)
-    begin, truth = problems.moving_pivot_state(0.0, start, 2.0), problems.moving_pivot_state(times, start, 2.0)
-    system = problems.moving_pivot(compile=True)
-    for error in ("richardson", "richardson-paper"):
-        for tol, largest in ((1e-6, 1e-5), (1e-9, 1e-8)):
-            method = RungeKutta(gauss(3), error=error, variables="momenta")
-            result = solve_dae(system, (0.0, 2.0), *begin, method, tol, tol, t_eval=times)
-            assert result.success, result.message
-            assert max(problems.worst(result.q, truth[0]), problems.worst(result.v, truth[1])) < largest
-
-
-@pytest.mark.parametrize("variables", ["velocities", "momenta"])
-@pytest.mark.parametrize("gamma", [True, False])
+@pytest.mark.parametrize(("variables", "gamma"), [("velocities", True), ("momenta", False)])
 def test_forces_without_a_potential_and_a_mass_that_depends_on_time_are_right_too(gamma, variables):
-    system, times, method = (
-        problems.oblique_pendulum(gamma),
-        np.linspace(0.0, 2.0, 6),
-        RungeKutta(gauss(3), variables=variables),
-    )
+    system, times = problems.oblique_pendulum(gamma), np.linspace(0.0, 2.0, 6)
+    method = RungeKutta(gauss(3), variables=variables)
     result = solve_dae(system, (0.0, 2.0), *problems.oblique_start(), method, 1e-10, 1e-10, t_eval=times)
     x, u = problems.oblique_to_point(result)
     truth = problems.oblique_point(times)
-    assert (
-        problems.worst(x, truth[0]) < 1e-8
-        and problems.worst(u, truth[1]) < 1e-8
-        and problems.worst(result.lam[0], truth[2]) < 1e-6
-    )
+    assert max(problems.worst(x, truth[0]), problems.worst(u, truth[1])) < 1e-8
+    assert problems.worst(result.lam[0], truth[2]) < 1e-6
     assert max(problems.violations(system, result)) < 1e-12 and problems.force_residual(system, result) < 1e-10
-
-
-def test_steps_that_are_too_long_end_with_a_message():
-    q, v = problems.double_pendulum_state(START[:2], START[2:])
-    method = RungeKutta(gauss(3), variables="momenta")
-    result = solve_dae(pendulums(True), (0.0, 10.0), q, v, method, step_size=1.0)
-    assert not result.success and "step_size" in result.message

@@ -5,16 +5,11 @@ import pytest
 
 from tests.problems import run, swing, worst
 from twoloop import ConstrainedSystem, Newmark, solve_dae
-from twoloop.mechanisms import four_bar, knife_edge, rolling_disc
+from twoloop.mechanisms import four_bar, knife_edge
 from twoloop.mechanisms.knife_edge import motion
 
 # bounds are about 1.1 times what was counted when they were written
-PRICES = {
-    ("default_four_bar", 1e-4): (800, 2400),
-    ("default_four_bar", 1e-6): (7900, 17_500),
-    ("collinear_four_bar", 1e-4): (880, 2700),
-    ("collinear_four_bar", 1e-6): (8700, 21_000),
-}
+PRICES = {("default_four_bar", 1e-4): (800, 2400), ("collinear_four_bar", 1e-6): (8700, 21_000)}
 
 
 @pytest.mark.parametrize(("linkage", "tol"), PRICES)
@@ -31,18 +26,16 @@ def test_price_with_the_error_tolerance_of_the_paper(default_four_bar):
     assert stats.n_inner < 1.85 * stats.n_outer  # Newton starts from where the accelerations lead
 
 
-@pytest.mark.parametrize("tolerance", [1e-5, 1e-7])
-def test_a_start_at_the_origin(tolerance):
-    """As small as coordinates are there, the rate at which velocities change them was huge, and went with atol."""
+def test_a_start_at_the_origin(tolerance=1e-5):
+    """Where coordinates are zero, the contraction rate was measured over atol alone, and was huge."""
     result = run(knife_edge(), 1.0, method="Newmark", rtol=tolerance, atol=tolerance)
     q, v = motion(1.0)
     assert result.success and np.abs(result.q[:, -1] - q).max() < 40.0 * tolerance
     assert np.abs(result.v[:, -1] - v).max() < 100.0 * tolerance
 
 
-@pytest.mark.parametrize("tolerance", [1e-6, 1e-7])
-def test_a_body_at_rest_at_the_origin_that_is_pushed_later(tolerance):
-    """The first step under the force was the only size there was, and any error was allowed in it."""
+def test_a_body_at_rest_at_the_origin_that_is_pushed_later(tolerance=1e-6):
+    """The first step under the force set the scale of its own error, so that any error passed."""
     system = ConstrainedSystem.from_python(
         **{"n_q": 1, "n_c": 0, "mass": np.array([[2.0]]), "compile": True},
         force=lambda t, q, v: np.array([5.0 if t >= 0.3 else 0.0]),
@@ -62,27 +55,8 @@ def test_the_same_steps_from_a_start_far_away():
     assert np.abs(near.q[:, -1] - far.q[:, -1] + shift).max() < 4e-5
 
 
-def test_iterations_far_away_are_as_many():
-    """Changes of positions count over their size, which is a million metres."""
-    problem, counts = knife_edge(), []
-    for x in (0.0, 1e6):
-        q0 = problem.q0 + np.array([x, x, 0.0])
-        counts.append(solve_dae(problem.system, (0.0, 1.0), q0, problem.v0, "Newmark", step_size=1e-3).stats.n_outer)
-    assert counts[1] < 1.1 * counts[0]
-
-
-def test_a_rolling_disc():
-    errors = []
-    exact = run(rolling_disc(), 1.0, method="DOP853", rtol=1e-11, atol=1e-11)
-    for tolerance in (1e-4, 1e-6):
-        result = run(rolling_disc(), 1.0, method="Newmark", rtol=tolerance, atol=tolerance)
-        errors.append(np.abs(np.append(result.q[:, -1] - exact.q[:, -1], result.v[:, -1] - exact.v[:, -1])).max())
-    assert errors[0] < 2e-2 and errors[1] < 2e-4
-
-
-@pytest.mark.parametrize("linkage", [{}, {"lengths": (0.8, 1.2, 1.0), "ground": 2.0}])
-def test_the_error_of_newmark_is_proportional_to_its_tolerance(linkage):
-    problem = four_bar(**linkage)
+def test_the_error_of_newmark_is_proportional_to_its_tolerance():
+    problem = four_bar()
     reference = solve_dae(problem.system, (0.0, 5.0), problem.q0, problem.v0, "Gauss12", 1e-11, 1e-11)
     errors = []
     for tolerance in (1e-4, 1e-5, 1e-6):

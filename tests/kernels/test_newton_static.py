@@ -1,4 +1,4 @@
-"""Newton's method of large systems by sparse factors with a static program, against the dense forms."""
+"""Test Newton's method of large systems, by sparse factors with a static program, against the dense forms."""
 
 import numpy as np
 import pytest
@@ -6,11 +6,11 @@ import pytest
 import twoloop.run.newton_form as newton_form
 import twoloop.run.static_form as static_module
 from studies.bench.large import PLANAR, closed_chain, grid, ladder, open_chain, tree
-from studies.bench.random_assemblies import PlanarAssembly, SpatialAssembly
+from studies.bench.random_assemblies import PlanarAssembly
 from tests.large_systems import spatial_chain
+from tests.marks import slow
 from tests.problems import worst
 from twoloop import BDF, ConstrainedSystem, solve_dae
-from twoloop.bodies import model_system
 from twoloop.kernels.algebra.static_program import N_UPDATES
 from twoloop.mechanisms import planar
 from twoloop.run.run import Run
@@ -106,15 +106,18 @@ def alike(one, other, allowed):
 @pytest.mark.parametrize(
     ("case", "method", "tolerance", "allowed"),
     [
-        ("open chain", "RadauIIA9", 1e-10, 1e-9),
-        ("closed chain", "RadauIIA13", 1e-10, 1e-9),
-        ("ladder", "RadauIIA9", 1e-10, 1e-9),
-        ("tree", "RadauIIA5", 1e-9, 1e-9),
-        ("redundant rows", "RadauIIA9", 1e-10, 1e-9),
         ("closed chain", "TRBDF2", 1e-5, 1e-5),
-        ("closed chain", "BDF", 1e-7, 1e-6),
         ("ladder", BDF(outer="newton"), 1e-7, 1e-6),
-        ("redundant rows", BDF(outer="newton"), 1e-7, 1e-6),
+        *(
+            slow(*case)
+            for case in (
+                ("redundant rows", "RadauIIA9", 1e-10, 1e-9),
+                ("open chain", "RadauIIA9", 1e-10, 1e-9),
+                ("closed chain", "RadauIIA13", 1e-10, 1e-9),
+                ("tree", "RadauIIA5", 1e-9, 1e-9),
+                ("closed chain", "BDF", 1e-7, 1e-6),
+            )
+        ),
     ],
 )
 def test_runs_are_those_of_the_dense_forms(form, case, method, tolerance, allowed):
@@ -161,6 +164,7 @@ def test_bodies_whose_mass_matrix_is_singular(form):
     assert worst(ends[0].q[:, -1], ends[1].q[:, -1]) < 1e-9
 
 
+@pytest.mark.slow
 def test_programs_grow_with_the_bodies_and_no_faster():
     """Multiplications of a factorization."""
     for make in PLANAR:
@@ -174,37 +178,3 @@ def test_programs_grow_with_the_bodies_and_no_faster():
             updates.append(int(form.newton[N_UPDATES]))
             assert form.matrix_cost() < 3.0 + system.n_q / 8.0  # what a dense one is taken to cost
         assert updates[1] <= (5.2 if make is grid else 3.6) * updates[0]  # of a grid like n^1.5, at best
-
-
-@pytest.mark.filterwarnings("ignore::twoloop.ConstraintWarning")
-@pytest.mark.parametrize(
-    ("seed", "n", "loops", "doubles", "method", "stiffness"),
-    [
-        (1, 10, 0, 0, "RadauIIA9", 1e3),
-        pytest.param(2, 11, 2, 0, "RadauIIA5", 1e5, marks=pytest.mark.slow),
-        (3, 10, 1, 2, "RadauIIA9", 1e3),
-        pytest.param(4, 60, 0, 0, "RadauIIA9", 1e4, marks=pytest.mark.slow),
-        pytest.param(5, 40, 4, 2, "RadauIIA9", 1e4, marks=pytest.mark.slow),
-        *[
-            pytest.param(seed, 5 + (7 * seed) % 30, seed % 4, seed % 3, "RadauIIA9", 1e4, marks=pytest.mark.slow)
-            for seed in range(10, 20)
-        ],
-    ],
-)
-def test_spatial_assemblies_with_springs(form, monkeypatch, seed, n, loops, doubles, method, stiffness):
-    monkeypatch.setattr(model_system, "LARGE", 0)
-    ends = []
-    for static in (False, True):
-        left = form(static)
-        made = SpatialAssembly(seed, n, loops, doubles, (stiffness, 1.0))
-        q = made.q
-        ends.append(solve_dae(made.system("sprung"), (0.0, 0.01), q, 0.0 * q, method, 1e-10, 1e-10, compiled=False))
-        assert ends[-1].success and left == []
-    alike(*ends, 1e-9)
-
-
-def test_a_chain_of_hinges_in_space():
-    """Rows of the hinge on the ground are not among those that stiffen M: else no step was accepted."""
-    system, q, v = spatial_chain(15, hinges=True)
-    ends = [solve_dae(system, (0.0, 0.02), q, v, method, 1e-8, 1e-8) for method in ("RadauIIA9", "DOP853")]
-    assert all(end.success for end in ends) and worst(ends[0].q[:, -1], ends[1].q[:, -1]) < 1e-8

@@ -1,24 +1,21 @@
-"""Large systems by sparse factors with a static program, against dense algebra in NumPy and the other forms."""
+"""Test large systems by sparse factors with a static program, against dense algebra in NumPy and the dense forms."""
 
 import tracemalloc
-from dataclasses import replace
 
 import numpy as np
 import pytest
 
 import twoloop.run.static_form as static_module
-from studies.bench.large import LEVEL, PLANAR, closed_chain, grid, in_space, ladder, open_chain
+from studies.bench.large import LEVEL, PLANAR, closed_chain, grid, ladder
 from studies.bench.random_assemblies import PlanarAssembly, SpatialAssembly, dense_solution, drawn
 from tests.large_systems import spatial_chain, started_run
+from tests.marks import slow
 from tests.problems import worst
-from twoloop import ConstraintWarning, Status, consistent_state, mechanisms, solve_dae
+from twoloop import ConstrainedSystem, ConstraintWarning, solve_dae
 from twoloop.checks.values import MOST
 from twoloop.kernels import advance
 from twoloop.kernels.algebra import static_program
 from twoloop.kernels.data import codes, noted
-from twoloop.kernels.evaluation import tasks
-from twoloop.mechanisms.planar import GROUND, PlanarBodies
-from twoloop.methods.presets import PRESETS
 from twoloop.run.static_form import static_form
 from twoloop.run.workspace import kit_of, workspace
 
@@ -29,7 +26,7 @@ class Started:
     def __init__(self, system, q, v):
         form, n = static_form(system, 0.0, q), system.n_q
         assert form is not None
-        self.system, self.kit = system, kit_of(system, 0.0, q, None, form)
+        self.kit = kit_of(system, 0.0, q, None, form)
         ranks = (None, None)
         for _ in range(2):
             self.work = workspace(system, self.kit, np.zeros((0, 0)), q, 1e-8, 0.0, ranks, form)
@@ -39,12 +36,6 @@ class Started:
                 break
             ranks = (int(self.work.notes[noted.RANK]),) * 2
         self.a, self.lam, self.rank = state[2 * n : 3 * n], state[3 * n :], len(self.work.rows_v)
-
-    def project(self, q, v, theta=1e-13):
-        q, v, a, lam = q.copy(), v.copy(), np.zeros_like(q), np.zeros_like(self.lam)
-        code = self.kit.inner(self.kit, self.work, tasks.PROJECT, 0.0, q, v, theta, a, lam)
-        assert code == codes.DONE
-        return q, v
 
 
 def compare(assembly):
@@ -69,8 +60,8 @@ def any_size(large, monkeypatch):
     [
         (PlanarAssembly, 16, 80),
         (SpatialAssembly, 12, 30),
-        pytest.param(PlanarAssembly, 130, 300, marks=pytest.mark.slow),
-        pytest.param(SpatialAssembly, 70, 300, marks=pytest.mark.slow),
+        slow(PlanarAssembly, 130, 300),
+        slow(SpatialAssembly, 70, 300),
     ],
 )
 def test_random_assemblies_agree_with_dense_algebra(any_size, kind, number, most):
@@ -79,49 +70,7 @@ def test_random_assemblies_agree_with_dense_algebra(any_size, kind, number, most
     assert max(error for error in found if error is not None) < 1e-9 and found.count(None) <= number // 12
 
 
-@pytest.mark.parametrize("ratio", [1e6, 1e10])
-def test_mass_ratios(any_size, ratio):
-    decided = 0
-    for seed in range(12):
-        assembly = PlanarAssembly(seed, 30, 2, 0, heaviest=ratio)
-        system = assembly.system("heavy and light")
-        v = np.zeros(system.n_q)
-        started = Started(system, assembly.q, v)
-        if started.code == codes.NEEDS_DENSE:
-            continue
-        decided += 1
-        root, a = np.sqrt(np.diag(system.mass(0.0, assembly.q))), dense_solution(system, assembly.q, v).a
-        assert worst(root * started.a, root * a) < 1e-10 * np.abs(root * a).max()
-    assert decided >= 10
-
-
-def test_projection_is_that_in_the_metric_of_the_masses(any_size):
-    assembly = PlanarAssembly(3, 40, 4, 1)
-    system = assembly.system("projected")
-    started = Started(system, assembly.q, np.zeros(system.n_q))
-    rng = np.random.default_rng(1)
-    q = expected = assembly.q + 1e-4 * rng.normal(size=system.n_q)
-    speeds = rng.normal(size=system.n_q)
-    root = np.sqrt(np.diag(system.mass(0.0, q)))
-
-    def least(values, at):
-        return np.linalg.pinv(system.jacobian(0.0, at) / root, rcond=1e-5) @ values / root
-
-    # beside the constraints redundant rows are so only nearly: the same that count are taken
-    rows = np.sort(started.work.rows_v)
-
-    def least_of(values, at):
-        return np.linalg.pinv(system.jacobian(0.0, at)[rows] / root, rcond=1e-10) @ values[rows] / root
-
-    for _ in range(6):
-        expected = expected - least_of(system.constraint(0.0, expected), expected)
-    found, v = started.project(q, speeds)
-    assert worst(found, expected) < 1e-11
-    found, v = started.project(found, speeds)
-    assert worst(v, speeds - least(system.jacobian(0.0, found) @ speeds, found)) < 1e-9
-
-
-@pytest.mark.parametrize("method", ["DOP853", "Adams", "Taylor", "auto"])
+@pytest.mark.parametrize("method", ["DOP853", *(slow(name) for name in ("Adams", "Taylor", "auto"))])
 def test_runs_are_those_of_the_other_forms(both, method):
     options = {"method": method, "rtol": 1e-10, "atol": 1e-10, "compiled": False, "dense_output": True}
 
@@ -142,16 +91,6 @@ def test_runs_are_those_of_the_other_forms(both, method):
     assert worst(one.reactions(name).force[:, -1], other.reactions(name).force[:, -1]) < 1e-7
 
 
-def test_the_default_of_large_systems_with_values_of_entries_is_explicit_by_dop853(large):
-    """A projection, one a step, costs as much as an evaluation: Adams' many short steps take twice the time."""
-    system, n = closed_chain(30).system, 90
-    large(10**9)
-    dense = closed_chain(30).system
-    for given, name, tolerance in ((system, "DOP853", 1e-6), (system, "Adams", 1e-11), (dense, "Adams", 1e-6)):
-        chosen = replace(PRESETS["auto"].for_system(given), series=None).plan(n, tolerance, tolerance, False)
-        assert chosen.first == PRESETS[name].plan(n, tolerance, tolerance, False).step
-
-
 def test_redundant_rows_are_named_and_held(both):
     assembly = PlanarAssembly(5, 24, 2, 2)
     system, q = assembly.system("redundant"), assembly.q
@@ -167,18 +106,7 @@ def test_redundant_rows_are_named_and_held(both):
     assert worst(system.constraint(0.02, result.q[:, -1]), 0.0) < 1e-12
 
 
-def test_many_redundant_rows(any_size):
-    """More than eighty, with multipliers of least norm."""
-    assembly = PlanarAssembly(3, 60, 0, 90)
-    system = assembly.system("many pins twice")
-    v = assembly.v(system)
-    a, lam, rank, _ = dense_solution(system, assembly.q, v)
-    started = Started(system, assembly.q, v)
-    assert started.rank == rank <= system.n_c - 80 and worst(started.a, a) < 1e-9 * np.abs(a).max()
-    assert worst(started.lam, lam) < 1e-9 * np.abs(lam).max()
-
-
-@pytest.mark.parametrize(("end", "partitions", "drift"), [(0.09, 10, 1e-6), (0.15, 20, 1e-5)])
+@pytest.mark.parametrize(("end", "partitions", "drift"), [(0.09, 10, 1e-6), slow(0.15, 20, 1e-5)])
 def test_a_ladder_whose_parallelograms_pass_their_flat_position(end, partitions, drift):
     """Which is a singular one: steps cross it. Rungs stay parallel, and the rails each other's images.
 
@@ -197,6 +125,7 @@ def test_a_ladder_whose_parallelograms_pass_their_flat_position(end, partitions,
     assert np.ptp(energy) < drift * np.abs(energy).max()
 
 
+@pytest.mark.slow
 def test_programs_grow_with_the_bodies_and_no_faster(large):
     for make in PLANAR:
         updates = {}
@@ -210,54 +139,16 @@ def test_programs_grow_with_the_bodies_and_no_faster(large):
         assert updates[499] <= (800 if make is grid else 150) * 499
 
 
-@pytest.mark.parametrize("build", [pytest.param(open_chain, marks=pytest.mark.slow), ladder])
-def test_starts_make_no_full_matrix_beyond_those_of_four_million_numbers(build):
+@pytest.mark.slow
+def test_starts_make_no_full_matrix_beyond_those_of_four_million_numbers():
     for size in (40, 1000):  # the first one loads the kernels
-        made = build(size)
+        made = ladder(size)
         system = made.system
         tracemalloc.start()
         solve_dae(system, (0.0, 1.0), made.q, 0.0 * made.q, "DOP853", max_steps=2, compiled=False)
         most = tracemalloc.get_traced_memory()[1]
         tracemalloc.stop()
     assert system.n_c * system.n_q > MOST and most < 0.7 * 8 * system.n_c * system.n_q
-
-
-def test_small_mechanisms_have_the_forms_that_they_had():
-    for name in ("bricard", "closed_chain", "n_four_bar", "andrews", "spatial_slider_crank"):
-        problem = getattr(mechanisms, name)()
-        assert static_form(problem.system, 0.0, problem.q0) is None
-
-
-def test_a_position_that_is_nearly_singular_is_left_to_the_dense_forms(any_size, both):
-    """A parallelogram that comes to its flat position: every form stops there, or crosses it on the same branch."""
-    bodies = PlanarBodies([f"bar {k}" for k in range(3)], np.ones(3), np.full(3, 0.1))
-    bodies.pin(GROUND, (0.0, 0.0), 0, (-0.5, 0.0))
-    bodies.pin(GROUND, (1.0, 0.0), 1, (-0.5, 0.0))
-    bodies.pin(0, (0.5, 0.0), 2, (-0.5, 0.0))
-    bodies.pin(1, (0.5, 0.0), 2, (0.5, 0.0))
-    angle, speed = 0.3, 4.0
-    c, s = np.cos(angle), np.sin(angle)
-    q = np.array([0.5 * c, 0.5 * s, angle, 1.0 + 0.5 * c, 0.5 * s, angle, 0.5 + c, s, 0.0])
-    v = -speed * np.array([-0.5 * s, 0.5 * c, 1.0, -0.5 * s, 0.5 * c, 1.0, -s, c, 0.0])
-    options = {"method": "DOP853", "rtol": 1e-8, "atol": 1e-8, "compiled": False}
-    runs = both(lambda: solve_dae(bodies.system("parallelogram"), (0.0, 0.2), q, v, **options))
-    for result in runs:  # rounding decides whether a step ends beyond the position, in the motion of the parallelogram
-        if result.success:
-            energy = bodies.energy(result.t, result.q, result.v)
-            assert worst(result.q[8], 0.0) < 1e-5 and np.ptp(energy) < 1e-6 * np.abs(energy).max()
-        else:
-            assert result.status is Status.STEP_TOO_SMALL and worst(result.q[2, -1], 0.0) < 1e-3
-
-
-def test_starts_of_large_systems(both):
-    for make in (open_chain, closed_chain, ladder):
-        system, q, _ = make(36)
-        rng = np.random.default_rng(2)
-        guess, speeds = q + 1e-5 * rng.normal(size=len(q)), rng.normal(size=len(q))
-        dense, state = both(lambda start=(system, 0.0, guess, speeds): consistent_state(*start))
-        assert type(state) is not type(dense) and worst(state[0], dense[0]) < 1e-11 and worst(state[1], dense[1]) < 1e-9
-        assert (state.moved_q.coordinate, len(state.dependent)) == (dense.moved_q.coordinate, system.n_c)
-        assert abs(state.margin - dense.margin) < 1e-6
 
 
 def test_bodies_whose_mass_matrix_is_singular(any_size, both):
@@ -275,36 +166,81 @@ def test_bodies_whose_mass_matrix_is_singular(any_size, both):
     assert worst(one.lam[:, -1], other.lam[:, -1]) < 1e-9 * np.abs(one.lam[:, -1]).max()
 
 
-@pytest.mark.parametrize(
-    ("build", "n", "loops"),
-    [
-        (closed_chain, 60, 1),
-        (ladder, 30, 10),
-        pytest.param(closed_chain, 1000, 1, marks=pytest.mark.slow),
-        pytest.param(ladder, 300, 100, marks=pytest.mark.slow),
-    ],
-)
-def test_parallel_hinges_have_three_redundant_rows_a_loop(any_size, build, n, loops):
-    made = build(n)
-    hinged = in_space(made, 0.0)
-    system, q = hinged.system, hinged.q
-    v = 0.0 * q
-    planar_one, one = Started(made.system, made.q, 0.0 * made.q), Started(system, q, v)
-    assert (planar_one.code, one.code) == (codes.DONE, codes.DONE)
-    assert (planar_one.rank, one.rank) == (made.system.n_c, system.n_c - 3 * loops)
-    expected = planar_one.a.reshape(-1, 3)[:, :2]
-    assert worst(one.a.reshape(-1, 7)[:, :2], expected) < 1e-8 * np.abs(expected).max()
-    (rows, columns), (i, j) = system.entries["jacobian"], system.entries["mass"]
-    reaction = np.bincount(columns, system.jacobian_values(0.0, q) * one.lam[rows], system.n_q)
-    inertia = np.bincount(i, system.mass_values(0.0, q) * one.a[j], system.n_q)
-    assert worst(inertia + reaction, system.force(0.0, q, v)) < 1e-8 * np.abs(reaction).max()
+def masses_on_rods(n, dense):
+    """A chain of point masses in plain functions, its matrices dense or by values; masses vary by a millionth."""
+    rows = np.repeat(np.arange(n), [2] + [4] * (n - 1))
+    columns = np.concatenate([[0, 1]] + [[2 * k - 2, 2 * k - 1, 2 * k, 2 * k + 1] for k in range(1, n)])
+
+    def differences(q):
+        return np.diff(np.vstack([np.zeros((1, 2)), q.reshape(n, 2)]), axis=0)
+
+    def values(t, q):
+        d = differences(q)
+        return np.concatenate([d[0], np.hstack([-d[1:], d[1:]]).ravel()])
+
+    def matrix(t, q):
+        made = np.zeros((n, 2 * n))
+        made[rows, columns] = values(t, q)
+        return made
+
+    def masses(t, q):
+        return 1.0 + 1e-6 * np.sin(q)
+
+    both = np.arange(2 * n)
+    if dense:
+        options = {"jacobian": matrix, "mass": lambda t, q: np.diag(masses(t, q))}
+    else:
+        options = {"jacobian_values": values, "jacobian_entries": (rows, columns)}
+        options |= {"mass_values": masses, "mass_entries": (both, both)}
+    system = ConstrainedSystem.from_python(
+        n_q=2 * n,
+        n_c=n,
+        force=lambda t, q, v: np.tile([0.0, -9.81], n),
+        constraint=lambda t, q: 0.5 * ((differences(q) ** 2).sum(axis=1) - 1.0 / n**2),
+        gamma=lambda t, q, v: -(differences(v) ** 2).sum(axis=1),
+        name="masses on rods",
+        **options,
+    )
+    angles = np.linspace(0.1, 1.3, n)
+    return system, np.cumsum(np.column_stack([np.cos(angles), np.sin(angles)]) / n, axis=0).ravel()
 
 
-def test_a_large_program_is_made_where_it_is_sparse(monkeypatch):
-    monkeypatch.setattr(static_program, "FEW_UPDATES", 0)
-    none, n = (np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)), 300
-    each = np.arange(n)
-    chain = np.concatenate([each, each[1:]]), np.concatenate([each, each[:-1]])
-    full = np.divmod(np.arange(n * n), n)
-    assert static_program.program_in_order(each, n, chain, none, ()) is not None
-    assert static_program.program_in_order(each, n, full, none, ()) is None
+def test_plain_functions_dense_or_by_values(large):
+    found = []
+    for dense, least in ((True, 10**9), (True, 0), (False, 0)):
+        large(least)
+        system, q = masses_on_rods(30, dense)
+        assert (started_run(system, q).static is not None) == (least == 0)
+        found.append(solve_dae(system, (0.0, 0.02), q, 0.0 * q, "DOP853", 1e-8, 1e-8))
+    assert all(result.success for result in found) and worst(found[0].q[:, -1], found[1].q[:, -1]) < 1e-12
+    assert worst(found[0].q[:, -1], found[2].q[:, -1]) < 1e-12
+
+
+def test_an_entry_that_comes_up_on_the_way_ends_the_static_form(both):
+    """Coordinates that are held, the first of which comes to lean on another where the second is beyond 0.5."""
+    n = 12
+
+    def beyond(x, order=0):
+        return [1.0, 4.0, 12.0][order] * max(0.0, x - 0.5) ** (4 - order)
+
+    def jacobian(t, q):
+        made = np.eye(n, 2 * n)
+        made[0, 1], made[0, n] = beyond(q[1], 1) * q[n], beyond(q[1])
+        return made
+
+    def gamma(t, q, v):
+        return -np.eye(n)[0] * (beyond(q[1], 2) * q[n] * v[1] ** 2 + 2.0 * beyond(q[1], 1) * v[1] * v[n])
+
+    system = ConstrainedSystem.from_python(
+        n_q=2 * n,
+        n_c=n,
+        mass=np.eye(2 * n),
+        force=lambda t, q, v: np.ones(2 * n),
+        constraint=lambda t, q: q[:n] + np.eye(n)[0] * beyond(q[1]) * q[n] - np.eye(n)[1] * t,
+        constraint_rate=lambda t, q: -np.eye(n)[1],
+        jacobian=jacobian,
+        gamma=gamma,
+    )
+    start = (0.0, 1.2), np.zeros(2 * n), np.eye(2 * n)[1]
+    one, other = both(lambda: solve_dae(system, *start, "DOP853", time_limit=20.0))
+    assert one.success and other.success and abs(one.q[0, -1]) > 0.05 and worst(one.q[:, -1], other.q[:, -1]) < 1e-9

@@ -4,23 +4,12 @@ import numpy as np
 import pytest
 
 from tests.compiled import SPRUNG_START, pull, sprung_pair
+from tests.marks import slow
 from tests.problems import worst
 from twoloop import callback, solve_dae
 from twoloop.bodies import PlanarModel
-from twoloop.mechanisms import closed_chain, four_bar, governor, moderately_stiff_beam
+from twoloop.mechanisms import four_bar, governor, moderately_stiff_beam
 from twoloop.mechanisms.ancf_beam import tip_height
-
-
-@pytest.mark.parametrize("tol", [1e-3, 1e-6, 1e-9])
-def test_where_nothing_is_stiff_the_steps_are_those_of_the_explicit_method(tol):
-    for problem, explicit in ((four_bar(), "DOP853" if tol >= 1e-6 else "Taylor"), (closed_chain(20), "Taylor")):
-        one, other = (
-            solve_dae(problem.system, (0.0, 2.0), problem.q0, problem.v0, method, tol, tol)
-            for method in ("auto", explicit)
-        )
-        assert one.stats.n_jacobians < 30  # a trial at most
-        assert one.stats.n_evaluations < 1.2 * other.stats.n_evaluations + 50
-        assert worst(one.q[:, -1], other.q[:, -1]) < 100 * tol
 
 
 def test_stiffness_is_found_and_costs_few_evaluations():
@@ -46,14 +35,11 @@ def test_stiffness_is_found_where_steps_are_shorter_than_stability_asks_for():
     assert worst(one.q[:, -1], other.q[:, -1]) < 1e-7
 
 
-@pytest.mark.parametrize(("tol", "most"), [(1e-3, 1000), (1e-6, 2000)])
-def test_a_trial_comes_at_once_where_it_costs_little_beside_the_run_to_come(tol, most):
+def test_a_trial_comes_at_once_where_it_costs_little_beside_the_run_to_come(tol=1e-6, most=2000):
     """Of the governor, whose explicit steps would be limited by stability for 30,000 evaluations."""
     problem = governor()
     result = solve_dae(problem.system, (0.0, problem.reference.t), problem.q0, problem.v0, "auto", tol, tol)
-    assert (
-        result.success and result.stats.n_evaluations < most
-    )  # 670 and 1530; with 100 explicit steps before: 1300, 2700
+    assert result.success and result.stats.n_evaluations < most  # 1530; with 100 explicit steps before: 2700
     short = solve_dae(problem.system, (0.0, 0.01), problem.q0, problem.v0, "auto", tol, tol)
     assert short.success and short.stats.n_jacobians == 0  # there it would cost more than the run
 
@@ -69,17 +55,7 @@ def test_what_is_chosen_does_not_depend_on_where_time_begins():
     assert min(counts) > 1 and max(counts) - min(counts) < 4
 
 
-def test_steps_that_are_explicit_again_are_not_divided_by_newtons_method():
-    """As the solution between steps would take longer than the run."""
-    problem = moderately_stiff_beam()
-    result = solve_dae(problem.system, (0.0, 0.1), problem.q0, problem.v0, "auto", 1e-8, 1e-8, dense_output=True)
-    assert result.stats.n_jacobians > 0
-    n_divided = sum(len(t) for t, _ in result.sol.interpolator.interiors(result.sol.table))
-    assert 0 < n_divided < 0.1 * result.h.size
-
-
-@pytest.mark.parametrize("compiled", [False, True])
-@pytest.mark.parametrize("tol", [1e-3, 1e-7])
+@pytest.mark.parametrize(("tol", "compiled"), [(1e-7, True), slow(1e-3, False)])
 def test_no_implicit_method_is_tried_where_nothing_is_stiff(tol, compiled):
     problem = four_bar()
     result = solve_dae(problem.system, (0.0, 40.0), problem.q0, problem.v0, "auto", tol, tol, compiled=compiled)
@@ -108,15 +84,6 @@ def test_it_goes_both_ways_during_a_run():
     assert worst(again.q[:, -1], rest.q[:, -1]) < 0.1  # DOP853 alone: 5e-3; 0.005 to 0.03 by rounding
 
 
-def test_constant_steps_are_those_of_the_symplectic_method():
-    problem = four_bar()
-    one, other = (
-        solve_dae(problem.system, (0.0, 1.0), problem.q0, problem.v0, method, step_size=0.01)
-        for method in ("auto", "SunRadau5")
-    )
-    assert np.array_equal(one.q, other.q)
-
-
 def creeping(speed, push):
     """A block of 1 kg that is pushed against dry friction of 10 N, regularised by a speed."""
     model = PlanarModel(gravity=(0.0, 0.0))
@@ -126,28 +93,17 @@ def creeping(speed, push):
     return model.problem((0.0, 0.5))
 
 
-@pytest.mark.parametrize(("tol", "compiled"), [(1e-7, True), (1e-8, "auto")])
-def test_stiffness_is_found_where_a_decay_limits_a_series(tol, compiled):
-    """Series of 14 to 22 terms are stable up to h rho of 0.44 to 0.47 times these."""
-    problem = creeping(1e-4, 3.0)
-    result = solve_dae(problem.system, problem.t_span, problem.q0, problem.v0, "auto", tol, tol, compiled=compiled)
-    assert result.success and result.stats.n_evaluations < 10_000  # 2000; 117,000 with series alone
-    assert abs(result.q[0, -1] - 0.5 * 1e-4 * np.arctanh(0.3)) < 1e-8  # of the creeping motion in closed form
-
-
-@pytest.mark.parametrize("tol", [1e-5, 1e-7])
-def test_a_trial_comes_in_long_runs_whatever_the_rates(tol):
-    """Explicit steps oscillate about the creeping speed, mostly where the friction is constant."""
-    problem = creeping(1e-5, 1.0)
+@pytest.mark.parametrize(
+    ("speed", "push", "tol", "most"),
+    [
+        (1e-4, 3.0, 1e-7, 10_000),  # a decay limits the series: 117,000 evaluations with series alone
+        (1e-5, 1.0, 1e-5, 100_000),  # explicit steps oscillate about the creeping speed: 2 million without a trial
+        (1e-3, 1.0, 1e-4, 5_000),  # what moves is within the tolerances: 74,000 without a trial
+        slow(1e-4, 1.0, 1e-5, 5_000),
+    ],
+)
+def test_stiffness_of_a_creeping_block_is_found(speed, push, tol, most):
+    problem = creeping(speed, push)
     result = solve_dae(problem.system, problem.t_span, problem.q0, problem.v0, "auto", tol, tol)
-    assert result.success and result.stats.n_evaluations < 100_000  # 4500; 2 million without such a trial
-    assert abs(result.q[0, -1] - 0.5 * 1e-5 * np.arctanh(0.1)) < tol
-
-
-@pytest.mark.parametrize(("speed", "tol"), [(1e-4, 1e-5), (1e-3, 1e-4)])
-def test_what_creeps_to_within_the_tolerances_is_found_stiff(speed, tol):
-    """At the limit of stability accelerations change as fast as they decay, but what they move is too little to see."""
-    problem = creeping(speed, 1.0)
-    result = solve_dae(problem.system, problem.t_span, problem.q0, problem.v0, "auto", tol, tol)
-    assert result.success and result.stats.n_evaluations < 5_000  # over 2 s 360,304 and 73,960 without a trial
-    assert abs(result.q[0, -1] - 0.5 * speed * np.arctanh(0.1)) < 10.0 * tol
+    assert result.success and result.stats.n_evaluations < most
+    assert abs(result.q[0, -1] - 0.5 * speed * np.arctanh(0.1 * push)) < 10.0 * tol  # the closed form

@@ -7,7 +7,7 @@ from references.equations.accelerations import Equations, compiled_gamma, saddle
 from references.equations.least_norm import accelerations as least_norm
 from references.equations.linear import SINGULAR, cholesky
 from references.scipy.index1 import solve_index1
-from tests.general.faulty import SPRING, massless_coordinate
+from tests.general.systems import SPRING, massless_coordinate
 from tests.mechanisms.make_references import solution
 from tests.problems import moving_pivot, moving_pivot_state, oblique_pendulum, oblique_start, pendulum, worst
 from twoloop import mechanisms, solve_dae

@@ -77,10 +77,6 @@ def cross(a, b):
     return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
 
 
-def dot(a, b):
-    return sum((x * y for x, y in zip(a, b, strict=True)), Jet(0))
-
-
 def acceleration(kinetic, potential, speed, damping=0):
     """s'' from pairs (weight, jet) whose squared rates make twice the kinetic energy, and the potential as a jet."""
     inertia = sum(m * jet.u**2 for m, jet in kinetic)
