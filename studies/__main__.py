@@ -3,19 +3,15 @@
 import sys
 import traceback
 
-from studies.bench import cli
-from studies.bench.cli import CLONE, REPORTS, ROOT
-from studies.bench.index import STUDIES, module_of, put_in_readme, run_study
+from studies.bench.index import STUDIES, module_of, run_study
 
-USAGE = "usage: python -m studies [NAME | all | readme | compare FILE.py:FUNCTION] [--quick] [--out DIR] [--redraw]"
+USAGE = "usage: python -m studies [NAME | all | compare FILE.py:FUNCTION] [--quick] [--out DIR] [--redraw]"
 
 
 def main() -> None:
     name, *words = sys.argv[1:] or [""]
     if name == "all":
         run_all(words)
-    elif name == "readme":  # its generated block alone, from the findings of all studies
-        cli.main(lambda words: put_in_readme(REPORTS, ROOT / "README.md"), words)
     elif name in (*STUDIES, "compare"):
         run_study(name, words)
     elif name and name not in ("-h", "--help"):
@@ -24,7 +20,7 @@ def main() -> None:
         if name:
             print(USAGE)
         for study in STUDIES:
-            print(f"python -m studies.{study:10s} {(module_of(study).__doc__ or '').splitlines()[0]}")
+            print(f"python -m studies.{study:14s} {(module_of(study).__doc__ or '').splitlines()[0]}")
 
 
 def run_all(words: list[str]) -> None:
@@ -42,9 +38,6 @@ def run_all(words: list[str]) -> None:
         except Exception:  # a bug in one study
             traceback.print_exc()
             failed.append(name)
-    options = {word.split("=")[0] for word in words}
-    if CLONE and not options & {"--quick", "--out"} and "work_precision" not in failed:
-        put_in_readme(REPORTS, ROOT / "README.md")
     if failed:
         sys.exit(f"{len(failed)} of {len(STUDIES)} studies failed, see above: {', '.join(failed)}")
 

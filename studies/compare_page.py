@@ -69,9 +69,8 @@ def named(rows: pd.DataFrame, folder: Path) -> pd.DataFrame:
     """The rows with the names of solvers that figures have, and in "look" the rows whose looks these have."""
     path = folder / "work_precision.json"
     told = json.loads(path.read_text()) if path.is_file() else {}
-    rivals = told.get("rivals", {})
-    coded = {case["name"]: False for case in told.get("cases", [])}  # but for those of `rivals`
-    coded |= {each["case"]: each["case"] in rivals["with_code"] for each in rivals.get("mechanisms", [])}
+    cases = rows.loc[rows["study"] == "work_precision", "case"].unique() if told else ()
+    coded = {case: case in told.get("with_code", ()) for case in cases}
     pairs = [(solver, coded.get(case)) for solver, case in zip(rows["solver"], rows["case"], strict=True)]
     return rows.assign(solver=[label(*pair) for pair in pairs], look=[looks_like(*pair) for pair in pairs])
 

@@ -29,7 +29,6 @@ from studies.bench.solvers import (
 )
 from studies.bench.store import Array
 from studies.bench.study import Study, rows_of
-from studies.bench.takes import NEWEST
 from twoloop import Result
 
 LOOSE, TIGHT = 1e-3, 1e-9  # err_in and err_out of Table 3
@@ -160,7 +159,7 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     told |= {"both_kept": bool(loose[LOOSE] <= KEPT), "baumgarte": [of_alpha.min(), of_alpha.max()]}
     told |= {"baumgarte_n": len(of_alpha), "baumgarte_kept": int((of_alpha <= KEPT).sum()), "n_ranked": len(first)}
     told |= {"n_kept_first": sum(bool(kept[solver]) for solver in first)}
-    told |= {"with_newest": bool(along["family"].eq(NEWEST).any())}
+    told |= {"with_newest": bool(along["family"].eq("CyRK").any())}
     columns = ["solver", "called_from", "error_q", "violation_q", "violation_v"]
     lines = [listed.loc[name] for name in LISTED if name in listed.index]
     told["listed"] = [

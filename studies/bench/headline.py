@@ -1,8 +1,7 @@
-"""The headline of the comparisons: the default, with code, without it, the best of ours afterwards, against all rivals.
+"""How twoloop stands beside the fastest of the other solvers, on one mechanism at each error, by the time of the call.
 
-In this order: a user who changes nothing gets the first, which is the second on small mechanisms and the third on
-others, and the last by choosing among our methods when all have been run. Each is compared with the best of the same
-rivals, on each mechanism at each error, by the time of the whole call.
+Four stand in for twoloop: the default, which a user gets who changes nothing; the same with and without code made for
+the mechanism, of which it is one; and the fastest of its methods, which a user finds by running them all.
 """
 
 from collections.abc import Iterable, Mapping
@@ -11,42 +10,40 @@ from typing import Any
 import pandas as pd
 
 from studies.bench import tables
-from studies.bench.solvers import CATALOGUE, COMPILED, DEFAULT, GIVEN, HEYOKA
+from studies.bench.solvers import COMPILED, DEFAULT, GIVEN, HEYOKA
 from studies.bench.tables import SETTINGS, by_solver
 
 OWN_CODE = next(name for name, method in COMPILED.items() if method == DEFAULT)
 BEST = "best of ours"
 WHOSE = (GIVEN, OWN_CODE, DEFAULT, BEST)
-STANDINGS = ("ahead", "behind", "undecided", "alone", "unasked")
-PRICED = (1e-4, 1e-6)  # errors of the price on the first screen
+VERDICTS = ("ahead", "behind", "undecided", "alone", "missed", "none")
+PRICED = (1e-4, 1e-6)  # errors at which single calls are shown
 CHEAPER = 1.2  # by which a run that nearly gets there takes less time, where that is to be said
 SEVERAL = {"CyRK": "CyRK", "CVODE from C": "SUNDIALS", "IDA from C": "SUNDIALS"}  # the best of whose settings counts
 SCIPY = "SciPy's best"
-LOOKED_AT = (  # columns by which solvers are compared
-    *("solver", "family", "status", "message", "error_q", "floor", "astray", "used", "times", "call_s"),
-    *SETTINGS,
-)
+COMPARED_BY = ("solver", "family", "status", "message", "error_q", "floor", "astray", "used", "times", "call_s")
 
 
 def of_errors(rows: pd.DataFrame, errors: Iterable[float], given: str = DEFAULT) -> list[dict[str, dict[str, Any]]]:
-    """How each of WHOSE stands on one case at each of some errors, by the best of each.
+    """Compare each of WHOSE with the fastest other solver on one case at each of some errors.
 
     `rows`: medians, of all solvers; `given`: the solver that the default is on this case.
+
+    Returns for each error and name solver and call_s, those of the fastest other one ("other"), and what
+    `tables.compared` does.
     """
-    rows, found = rows[[name for name in LOOKED_AT if name in rows]], []
+    rows, found = rows[[name for name in (*COMPARED_BY, *SETTINGS) if name in rows]], []
     ours = rows["family"] == "two-loop"
     solvers = {name: given if name == GIVEN else name for name in WHOSE}
     parts = {name: rows[ours if name == BEST else rows["solver"] == solver] for name, solver in solvers.items()}
-    rivals, sides = rows[~ours], [by_solver(rows[which], "call_s") for which in (ours, ~ours)]
+    sides = [by_solver(rows[which], "call_s") for which in (ours, ~ours)]
     for error in errors:
         own, others = tables.costs_at(sides[0], error), tables.costs_at(sides[1], error, doubt=True)
-        near, at = tables.near_misses(rivals, error), {}
+        near, at = tables.near_misses(rows[~ours], error), {}
         for name, solver in solvers.items():
             side = {each: cost for each, cost in own.items() if name == BEST or each == solver}
-            found_at = compared(side, others, tables.near_misses(parts[name], error), near)
-            if found_at["verdict"] == "alone" and not asked(rivals, error):
-                found_at["verdict"] = "unasked"
-            at[name] = _told(side) | {"rival": _told(others)} | found_at
+            verdict = compared(side, others, tables.near_misses(parts[name], error), near)
+            at[name] = _cheapest(side) | {"other": _cheapest(others)} | verdict
         found.append(at)
     return found
 
@@ -60,101 +57,57 @@ def compared(own: tables.Costs, others: tables.Costs, *near: tables.Costs) -> di
     return found
 
 
-def asked(rivals: pd.DataFrame, error: float) -> bool:
-    """Whether rivals were put to a case (a refusal is our adapter's), and all of these to the end of what they can."""
-    put = tables.put(rivals)
-    return len(put) > 0 and all(tables.missed(own, error) for _, own in put.groupby("solver"))
+def _cheapest(costs: tables.Costs) -> dict[str, Any]:
+    solver = min(costs, key=lambda name: costs[name][0], default=None)
+    return {"solver": solver, "call_s": None if solver is None else costs[solver][0]}
 
 
-def _told(costs: tables.Costs) -> dict[str, Any]:
-    """The cheapest, and those of other projects that take as long within LEAST."""
-    best = min(costs, key=lambda name: costs[name][0], default=None)
-    if best is None:
-        return {"solver": None, "call_s": None, "close": []}
-    most = tables.LEAST * costs[best][0]
-    close = [name for name, cost in costs.items() if cost[0] < most and _project(name) != _project(best)]
-    return {"solver": best, "call_s": costs[best][0], "close": close}
+def counted(pairs: Iterable[Mapping[str, Mapping[str, Any]]], name: str) -> dict[str, Any]:
+    """Count the verdicts on one of WHOSE over pairs of mechanism and error that any solver reaches.
 
-
-def _project(solver: str) -> str:
-    return CATALOGUE[solver].family if solver in CATALOGUE else solver
-
-
-def counted(found: Iterable[Iterable[Mapping[str, Mapping[str, Any]]]]) -> list[dict[str, Any]]:
-    """Of many pairs of mechanism and error, in how many each of WHOSE is ahead, behind, undecided, alone, missing.
-
-    `found`: of each mechanism how they stand at each error. n are the pairs that any of ours or of others reaches;
-    `lost` those of the missing that others reach; unbeaten the mechanisms, of n_mechanisms, for which `is_unbeaten`.
+    `faster` and `slower`, which includes errors that only others reach, are what reports say; the rest are not
+    distinguishable, or only twoloop reaches them.
     """
-    mechanisms = [list(own) for own in found]
-    pairs = [each for own in mechanisms for each in own if any(it["verdict"] != "none" for it in each.values())]
-    made = []
-    for name in WHOSE:
-        verdicts = [each[name]["verdict"] for each in pairs]
-        line = {verdict: verdicts.count(verdict) for verdict in STANDINGS}
-        line["lost"] = verdicts.count("missed")
-        line["unbeaten"] = sum(is_unbeaten(own, name) for own in mechanisms)
-        line["n_mechanisms"] = len(mechanisms)
-        # "none" counts, too: the one in question does not get there, another of ours does
-        made.append(
-            {"name": name, "n": len(pairs), **line, "missed": len(pairs) - sum(line[verdict] for verdict in STANDINGS)}
-        )
-    return made
+    reached = [each for each in pairs if any(it["verdict"] != "none" for it in each.values())]
+    verdicts = [each[name]["verdict"] for each in reached]
+    count = {verdict: verdicts.count(verdict) for verdict in VERDICTS}
+    return {"n": len(reached), "faster": count["ahead"], "slower": count["behind"] + count["missed"], **count}
 
 
-def is_unbeaten(found: Iterable[Mapping[str, Mapping[str, Any]]], name: str) -> bool:
-    """Whether one of WHOSE is at no error behind on a mechanism, or missing where others get to."""
-    verdicts = {each[name]["verdict"] for each in found}
-    return not verdicts & {"behind", "missed"} and verdicts != {"none"}
-
-
-def price(rows: pd.DataFrame, firsts: pd.DataFrame, case: str) -> dict[str, Any] | None:
-    """What a call takes on one mechanism at PRICED, and the first call where code is built; None: it was not run.
+def calls(rows: pd.DataFrame, firsts: pd.DataFrame, case: str) -> dict[str, Any] | None:
+    """What a call takes on one mechanism at PRICED, and the first call; None: the mechanism was not run.
 
     `rows`: medians, of all mechanisms and solvers. `firsts`: rows of `studies.work_precision.first_calls`.
 
-    Returns case, processor ("": not kept), t_end, errors, first_at (tolerance of the first calls, None without them),
-    and lines: name, first_s or None, and at each error solver, call_s, repeats of the cheapest run that is good enough
-    (0: not kept), keeps (the constraints) and near (asked, error and call_s of a run that nearly gets there and takes
-    much less, or None), or in their place why there is none: "not run", "not reached", "not asked".
+    Returns case, t_end, errors, and lines: name, first_s or None, and at each error solver and call_s of the cheapest
+    run that is good enough, or None; keeps (the constraints); near: error and call_s of a run that nearly gets there
+    and takes much less time, or None.
     """
     rows = rows[rows["case"] == case]
     if rows.empty:
         return None
     first = firsts[(firsts["case"] == case) & firsts["first_call_s"].notna()] if "first_call_s" in firsts else firsts
-    own = {name: rows["solver"] == name for name in (OWN_CODE, DEFAULT, HEYOKA)}
-    best = {name: (rows["family"] == of) & rows["solver"].str.startswith(name) for name, of in SEVERAL.items()}
+    which = {name: rows["solver"] == name for name in (OWN_CODE, DEFAULT, HEYOKA)}
+    which |= {name: (rows["family"] == of) & rows["solver"].str.startswith(name) for name, of in SEVERAL.items()}
     lines = []
-    for name, which in (own | best | {SCIPY: rows["family"] == "SciPy"}).items():
-        runs, rival = rows[which], name not in (DEFAULT, OWN_CODE)
+    for name, chosen in (which | {SCIPY: rows["family"] == "SciPy"}).items():
+        runs = rows[chosen]
         built = first[first["solver"].isin(runs["solver"])] if len(first) else first
+        at = [_call(runs, error, doubt=name not in (DEFAULT, OWN_CODE)) for error in PRICED]
         first_s = float(built["first_call_s"].min()) if len(built) else None
-        lines.append({"name": name, "first_s": first_s, "at": [_priced(runs, error, rival) for error in PRICED]})
-    found = {"case": case, "t_end": float(rows["t_end"].iloc[0]), "errors": list(PRICED), "lines": lines}
-    found["processor"] = str(rows["processor"].iloc[0]) if "processor" in rows else ""
-    return found | {"first_at": float(first["tol"].iloc[0]) if len(first) else None}
+        lines.append({"name": name, "first_s": first_s, "at": at})
+    return {"case": case, "t_end": float(rows["t_end"].iloc[0]), "errors": list(PRICED), "lines": lines}
 
 
-def _priced(runs: pd.DataFrame, error: float, rival: bool) -> dict[str, Any]:
-    """The cheapest of some solvers; rivals by the rule of the standings, where they were not run at about the error."""
-    costs = tables.costs_at(runs, error, doubt=rival)
-    solver = min(costs, key=lambda name: costs[name][0], default=None)
-    if solver is not None:
-        own, call_s = runs[runs["solver"] == solver], costs[solver][0]
-        told: dict[str, Any] = {"keeps": bool(own.iloc[0]["keeps_constraints"]), "near": _near(runs, error, call_s)}
-        told["repeats"] = int(tables.run_for(own, error).get("repeats", 0))
-        return {"solver": solver, "call_s": float(call_s), "why": None} | told
-    put = tables.put(runs)
-    missed = all(tables.missed(own, error) for _, own in put.groupby("solver"))
-    why = "not run" if put.empty else "not reached" if missed else "not asked"
-    return {"solver": None, "call_s": None, "why": why, "keeps": True, "near": None}
-
-
-def _near(runs: pd.DataFrame, error: float, call_s: float) -> dict[str, float] | None:
-    """The cheapest run that misses an error by little and takes much less time than one that does not."""
+def _call(runs: pd.DataFrame, error: float, doubt: bool) -> dict[str, Any]:
+    """The cheapest of some solvers; others' by the rule of the verdicts, where they were not run at about the error."""
+    best = _cheapest(tables.costs_at(runs, error, doubt=doubt))
+    if best["solver"] is None:
+        return best | {"keeps": None, "near": None}
+    keeps = bool(runs[runs["solver"] == best["solver"]].iloc[0]["keeps_constraints"])
     near = tables.nearly_there(runs, error)
-    near = near[CHEAPER * near["call_s"] < call_s]
+    near = near[CHEAPER * near["call_s"] < best["call_s"]]
     if near.empty:
-        return None
+        return best | {"keeps": keeps, "near": None}
     run = near.loc[near["call_s"].astype(float).idxmin()]
-    return {"asked": error, "error": float(run["error_q"]), "call_s": float(run["call_s"])}
+    return best | {"keeps": keeps, "near": {"error": float(run["error_q"]), "call_s": float(run["call_s"])}}

@@ -1,8 +1,8 @@
 """Measure single mechanisms, or other parts, again: `python -m studies.work_precision.again NAME ...`.
 
-The whole study takes hours. A part is a mechanism, or a rival's project on all mechanisms; "MECHANISM | SOLVER | ..."
-are single solvers on a mechanism, by their names in work_precision.csv. Each part that this has measured takes the
-place of its rows in work_precision.csv at once, with the commit and the processor that it was made on;
+The whole study takes hours. A part is a mechanism, or another project's solvers on all mechanisms; "MECHANISM | SOLVER
+| ..." are single solvers on a mechanism, by their names in work_precision.csv. The rows of a part take the place of
+those in work_precision.csv at once, with the commit and the processor that they were made on;
 `python -m studies.work_precision --redraw` then writes the report anew. Without names: what there is.
 """
 
@@ -18,7 +18,7 @@ from studies.bench.cli import StudyError
 from studies.bench.solvers import CATALOGUE
 from studies.bench.store import KeptRows, Output
 from studies.compare import GROUP as LENGTH
-from studies.work_precision import builds, first_calls, minimal, rivals, study
+from studies.work_precision import first_calls, mechanisms, minimal, study
 
 AT_LENGTH = ", at length"  # after the name of a case: the runs over its whole motion
 IN_ANGLES = ", in angles"  # after that of a mechanism: the runs of its equations in minimal coordinates
@@ -37,18 +37,17 @@ class Part:
 
 def parts() -> dict[str, Part]:
     """What can be measured again, by name."""
-    runs = rivals.runs(False)
+    runs = mechanisms.runs(False)
     found = {
-        name: Part(rivals.GROUP, name, partial(rivals.collect, [run for run in runs if run.case.name == name]))
-        for name in rivals.problems(False)
+        name: Part(mechanisms.GROUP, name, partial(mechanisms.collect, [run for run in runs if run.case.name == name]))
+        for name in mechanisms.problems(False)
     }
     for family in dict.fromkeys(run.solver.family for run in runs if run.solver.family != "two-loop"):
         own = [run for run in runs if run.solver.family == family]
-        found[family] = Part(rivals.GROUP, None, partial(rivals.collect, own), family)
+        found[family] = Part(mechanisms.GROUP, None, partial(mechanisms.collect, own), family)
     for case in study.known_cases(False):
         found[case.name + AT_LENGTH] = Part(LENGTH, case.name, partial(study.at_length, [case], False))
     found["first calls"] = Part(first_calls.GROUP, None, partial(first_calls.collect, quick=False))
-    found["builds"] = Part(builds.GROUP, None, partial(builds.collect, quick=False))
     for name in minimal.problems(False):
         found[name + IN_ANGLES] = Part(minimal.GROUP, name, partial(minimal.collect, quick=False, names=[name]))
     return found
@@ -69,8 +68,8 @@ def part_of(name: str, known: Mapping[str, Part]) -> Part:
     if whole.group == LENGTH:
         cases = [case for case in study.known_cases(False) if case.name == whole.case]
         return replace(whole, make=partial(study.at_length, cases, False, solvers=solvers), solvers=solvers)
-    runs = [run for run in rivals.runs(False) if run.case.name == case and run.solver.name in solvers]
-    return replace(whole, make=partial(rivals.collect, runs), solvers=solvers)
+    runs = [run for run in mechanisms.runs(False) if run.case.name == case and run.solver.name in solvers]
+    return replace(whole, make=partial(mechanisms.collect, runs), solvers=solvers)
 
 
 def replaced(rows: pd.DataFrame, part: Part, new: pd.DataFrame) -> pd.DataFrame:

@@ -15,7 +15,7 @@ from studies.bench.cli import REPORTS
 from studies.bench.row_files import in_format
 from studies.bench.store import read_rows
 from studies.compare import GROUP as LENGTH
-from studies.work_precision.rivals import GROUP
+from studies.work_precision.mechanisms import GROUP
 from studies.work_precision.study import with_one_name
 from twoloop.rows.leaderboard import ARCHIVE
 from twoloop.rows.row_format import Row, text_of
@@ -27,7 +27,7 @@ MEASURED = {  # what the errors of a group are
 
 
 def archived(rows: pd.DataFrame, versions: dict[str, str]) -> list[Row]:
-    """Rows of the format, of the repetitions of all runs of the comparisons; `versions`: of the rivals' packages."""
+    """Rows of the format, of the repetitions of all runs compared; `versions`: of the other projects' packages."""
     found = []
     for group, columns in MEASURED.items():
         medians = tables.medians(rows[rows["group"] == group])

@@ -1,4 +1,4 @@
-"""The first call on a mechanism: nothing built, caches cold, a process of its own; from which run building pays.
+"""Time the first call on a mechanism: nothing built, caches cold, a process of its own.
 
 A part of `studies.work_precision`. The process has an empty folder of caches, but for the kernels of twoloop, which are
 compiled once an installation; the callbacks of the ready mechanisms are compiled anew. It loads the packages by a run
@@ -9,7 +9,6 @@ is without that: their users write equations instead.
 
 import importlib
 import json
-import math
 import os
 import shutil
 import site
@@ -28,14 +27,13 @@ import numpy as np
 import pandas as pd
 
 from references.driver import cpu_time, user_call
-from studies.bench import tables
 from studies.bench.cli import ROOT
 from studies.bench.collector import REPEATS, Run, attempt, timed
 from studies.bench.end_states import case_of
 from studies.bench.solvers import CATALOGUE, COMPILED, CVODE_C, CYRK, DEFAULT, DIFFRAX, HEYOKA, IDA_C
 from studies.bench.store import KeptRows, Row
-from studies.work_precision import rivals
-from twoloop import Result, mechanisms
+from studies.work_precision.mechanisms import TIMED
+from twoloop import mechanisms
 from twoloop.checks.consistency import check_start
 
 GROUP = "first call"
@@ -44,10 +42,9 @@ MECHANISMS = {"four-bar": "four_bar", "SUNDIALS slider-crank": "sundials_slider_
 MECHANISMS |= {"Andrews' squeezing mechanism": "andrews", "spatial four-bar": "spatial_four_bar"}
 MECHANISMS |= {"heavy top": "heavy_top"}
 QUICK = (DEFAULT, "auto, compiled")
-TOLERANCE = ERROR = 1e-8  # of the calls in processes of their own; of the calls that are laid side by side, m or rad
+TOLERANCE = 1e-8
 TIMES = ("first_call_s", "call_s", "call_q1", "call_q3")
 LIMIT = 120.0  # s of CPU of a call
-STARTS = 20  # from which calls are made whose set-up is compared
 EQUATIONS = "equations"  # folder of twoloop's code for single mechanisms in a folder of caches
 
 
@@ -99,32 +96,12 @@ def times_of(name: str, solver: str) -> Row:
         return found
     later = [timed(run, 0)[3]["call_s"] for _ in range(REPEATS)]
     low, middle, high = map(float, np.percentile(later, (25, 50, 75)))
-    if run.solver.family == "two-loop":
-        found["elsewhere_s"] = elsewhere(run, result)
     return found | {"first_call_s": spent, "call_s": middle, "call_q1": low, "call_q3": high}
-
-
-def elsewhere(run: Run, result: Result) -> float:
-    """What a call from a start that no call has had takes longer, above its steps, than one from a start again, s.
-
-    The starts are states at steps of the run, whose equations do not depend on time.
-    """
-    places = np.linspace(0, result.t.size - 1, STARTS + 1).astype(int)[1:]
-    problems = [replace(run.case.problem, q0=result.q[:, k].copy(), v0=result.v[:, k].copy()) for k in places]
-    others = [_above_steps(replace(run, case=replace(run.case, problem=problem))) for problem in problems]
-    again = [_above_steps(run) for _ in range(STARTS)]
-    return float(np.median(others) - np.median(again[len(again) // 2 :]))
-
-
-def _above_steps(run: Run) -> float:
-    result, _, message, spent = attempt(run, 0)
-    assert result is not None, message
-    return spent - result.stats.cpu_time
 
 
 def run_of(problem: mechanisms.Problem, solver: str) -> Run:
     """The run of a solver on a mechanism that is timed."""
-    return Run(replace(case_of(problem), time_limit=LIMIT, timed=rivals.TIMED), CATALOGUE[solver], TOLERANCE)
+    return Run(replace(case_of(problem), time_limit=LIMIT, timed=TIMED), CATALOGUE[solver], TOLERANCE)
 
 
 def _compiled_anew(modules: list[ModuleType]) -> ModuleType:
@@ -136,49 +113,13 @@ def _compiled_anew(modules: list[ModuleType]) -> ModuleType:
     return modules[-1]
 
 
-def pays_from(line: Any, default: Any) -> float | None:
-    """The run on one mechanism from which building took less in all than the default without it; None: never.
-
-    It pays only where later calls are cheaper: three quarters of their repetitions below three quarters of the
-    default's. A first call is measured once, so that a shorter one alone says nothing.
-    """
-    if not line["call_q3"] < default["call_q1"]:  # NaN: the error was not reached
-        return None
-    saved, built = default["call_s"] - line["call_s"], line["first_call_s"] - default["first_call_s"]
-    return 1.0 if built < 0.0 else 2.0 + math.floor(built / saved)
-
-
-def at_error(rows: pd.DataFrame, everywhere: pd.DataFrame) -> pd.DataFrame:
-    """These rows with the later calls that have an error of ERROR, by the medians of every mechanism; NaN: none has."""
-    costs = ["call_s", "call_q1", "call_q3"]
-    ranked = [tables.ranking(own, ERROR).assign(case=case) for case, own in everywhere.groupby("case", sort=False)]
-    if not ranked:
-        return rows
-    known = pd.concat(ranked)[["case", "solver", *costs]]
-    return rows.drop(columns=costs).merge(known, how="left", on=["case", "solver"])
-
-
 def findings_of(rows: pd.DataFrame) -> list[dict[str, Any]]:
-    """By solver: the first call and a later one, medians over the mechanisms, and when building pays."""
+    """By solver the first call, s: on how many mechanisms, the median, the least and the most."""
     if "first_call_s" not in rows:
         return []
-    told = rows[rows["first_call_s"].notna()]
-    default = told[told["solver"] == DEFAULT].set_index("case")
-    found = []
-    for solver, own in told.groupby("solver", sort=False):
-        tol = float(own["tol"].iloc[0])
-        line: dict[str, Any] = {"solver": solver, "tol": tol, "error": ERROR, "n": len(own), "pays": [], "never": 0}
-        line["first_call_s"] = float(own["first_call_s"].median())
-        line["first_calls"] = [float(own["first_call_s"].min()), float(own["first_call_s"].max())]
-        line["call_s"] = float(own["call_s"].median()) if own["call_s"].notna().any() else None
-        known = own["elsewhere_s"].astype(float).dropna().tolist() if "elsewhere_s" in own else []
-        line["elsewhere_s"] = [min(known), max(known)] if known else None
-        for _, row in own[own["case"].isin(default.index)].iterrows():
-            pays = None if solver == DEFAULT else pays_from(row, default.loc[row["case"]])
-            line["pays"] += [] if pays is None else [pays]
-            line["never"] += pays is None and solver != DEFAULT
-        found.append(line)
-    return found
+    told = rows[rows["first_call_s"].notna()].groupby("solver", sort=False)["first_call_s"]
+    lines = told.agg(["size", "median", "min", "max"]).reset_index()
+    return [dict(zip(("solver", "n", "median", "least", "most"), line, strict=True)) for line in lines.values.tolist()]
 
 
 if __name__ == "__main__":

@@ -1,53 +1,49 @@
-"""Every mechanism with every solver, ours and others': what each accuracy costs, and which solver to take.
+"""Every mechanism with every solver: what an accuracy costs, and whether twoloop or another solver is faster.
 
-Four cases are run at length, over their whole motion; all others, with more rivals, by `rivals`.
+Four cases are also run over their whole motion (`at_length`), for the page in the browser and the archive of rows.
 """
 
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
+import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
+from matplotlib.colors import LogNorm
+from matplotlib.figure import Figure
 
-from references.heyoka.taylor import LARGEST_UNROLLED
 from studies.bench import adaptive, cases, figures, headline, study, tables
-from studies.bench.cli import StudyError
-from studies.bench.collector import Case, Run, row_of
-from studies.bench.render import number, render
+from studies.bench.collector import REPEATS, Case, Run, row_of
+from studies.bench.index import short
+from studies.bench.render import number, power, render
 from studies.bench.row_files import versions
 from studies.bench.solvers import (
     COMPARED,
     COMPARED_OWN,
-    DEFAULT,
     IDA_C_BANDED,
     IDA_C_ORDER_2,
     IDA_INDEX_1,
     IRK_LINE,
+    OTHER_SOLVERS,
     QUARTER,
     RADAU,
-    OTHER_SOLVERS,
     TOLERANCES,
 )
 from studies.bench.store import KeptRows, Output
-from studies.compare import GROUP, runs_of
-from studies.work_precision import behind, builds, first_calls, minimal, processors, rivals
+from studies.compare import runs_of
+from studies.work_precision import first_calls, mechanisms, minimal, processors
+from studies.work_precision.mechanisms import HEADLINE, RESOLVED
 from twoloop.rows.calibration import CALIBRATION, calibration_s
 
-ERRORS = (1e-2, 1e-4, 1e-6)  # the accuracies of the first screen
+ERRORS = (1e-2, 1e-4, 1e-6)  # between which runs over whole motions are made
 FURTHER = ("Gauss6", IRK_LINE, QUARTER, IDA_INDEX_1)
 STIFF = ("TRBDF2", *RADAU[1:], IDA_C_ORDER_2, IDA_C_BANDED)  # in their place on stiff cases
 BETWEEN = (7e-4, 5e-4, 3e-4, 2e-4)  # tolerances of the first of these, whose loose runs lie on no line
 QUICK = (*COMPARED[:4], "RadauIIA5", "IDA, stabilised")  # others take seconds to compile or to run
 QUICK_CASES = ("four-bar",)  # the beams' references take seconds
-SHOWN = (
-    GROUP,
-    rivals.GROUP,
-    first_calls.GROUP,
-    builds.GROUP,
-    minimal.GROUP,
-)  # groups of rows of the report
 TIME_LIMIT = 3.0  # s of CPU of a run: slower ones are of no use beside others
+MARKS = {"alone": "ours", "missed": "others", "none": "–"}  # cells of the picture without a ratio
 
 
 def runs(case: Case, quick: bool) -> list[Run]:
@@ -62,39 +58,6 @@ def runs(case: Case, quick: bool) -> list[Run]:
     return made + [replace(run, value=value) for run in rough for value in BETWEEN]
 
 
-def classes_of(rows: pd.DataFrame) -> list[dict[str, Any]]:
-    """The cheapest of ours and of others on one case at each error, and how the default does."""
-    made = zip(ERRORS, rivals.standings(rows, ERRORS), tables.rankings(rows, ERRORS), strict=True)
-    return [{"error": error, "standing": at} | tables.of_both(ranked) for error, at, ranked in made]
-
-
-def findings_of(rows: pd.DataFrame, known: Sequence[Case]) -> dict[str, Any]:
-    """What the report and the first screen say, from the medians."""
-    listed = []
-    for case in known:
-        runs = rows[rows["case"] == case.name]
-        if runs.empty:
-            raise StudyError(f"the rows have none of {case.name}; make them again by python -m studies.work_precision")
-        slug = "_".join("".join(letter if letter.isalnum() else " " for letter in case.name).split())
-        found: dict[str, Any] = {"name": case.name, "tags": list(case.tags), "t_end": case.t_end}
-        found |= {"at": classes_of(runs), "figure": f"work_precision_{slug}.png"}
-        listed.append(found | {"processor": str(runs["processor"].iloc[0]) if "processor" in runs else ""})
-    return {"cases": listed, "default": DEFAULT}
-
-
-def banded_over_dense(rows: pd.DataFrame) -> dict[str, Any] | None:
-    """Times of IDA with banded matrices over those with dense ones, otherwise alike; None: there are no such runs."""
-    one, other = (
-        rows[rows["solver"] == name].set_index(["case", "tol"])["call_s"].astype(float)
-        for name in (IDA_C_BANDED, IDA_C_ORDER_2)
-    )
-    ratios = (one / other).dropna()
-    if ratios.empty:
-        return None
-    least, median, most = np.percentile(ratios, (0, 50, 100)).tolist()
-    return {"n": len(ratios), "least": least, "median": median, "most": most}
-
-
 def known_cases(quick: bool) -> list[Case]:
     return [replace(case, time_limit=TIME_LIMIT) for case in cases.load(quick) if not quick or case.name in QUICK_CASES]
 
@@ -103,8 +66,8 @@ def make(output: Output) -> pd.DataFrame:
     quick = output.call.quick
     with output.kept() as kept:
         made = [at_length(known_cases(quick), quick, kept)]
-        made += [rivals.collect(rivals.runs(quick), kept)]
-        made += [first_calls.collect(kept, quick), builds.collect(kept, quick), minimal.collect(kept, quick)]
+        made += [mechanisms.collect(mechanisms.runs(quick), kept)]
+        made += [first_calls.collect(kept, quick), minimal.collect(kept, quick)]
     return calibrated(pd.concat(made, ignore_index=True))
 
 
@@ -120,38 +83,9 @@ def at_length(known: Sequence[Case], quick: bool, kept: KeptRows, solvers: Seque
     return adaptive.collect(made, kept, row, lambda run: True, () if quick else ERRORS)
 
 
-def part(rows: pd.DataFrame, group: str = GROUP) -> pd.DataFrame:
-    """The rows of one group, by default of the four cases, without columns that it has not."""
+def part(rows: pd.DataFrame, group: str) -> pd.DataFrame:
+    """The rows of one group, without columns that it has not."""
     return rows[rows["group"] == group].dropna(axis="columns", how="all").reset_index(drop=True)
-
-
-def measured_on(rows: pd.DataFrame) -> dict[str, Any]:
-    """At how many commits, and on which processors, the rows were measured."""
-    made = rows.reindex(columns=["processor", "commit"]).dropna().astype(str)
-    told: dict[str, Any] = {"commits": made["commit"].nunique(), "processors": sorted(made["processor"].unique())}
-    return told | sessions(rows)
-
-
-def sessions(rows: pd.DataFrame) -> dict[str, Any]:
-    """In how many sessions each mechanism was measured, at most, and how unlike the calibrations of these are.
-
-    `speeds`: the largest time of the calibration over the least of a mechanism, in the median and at most.
-    """
-    known = rows[rows["group"] == rivals.GROUP].reindex(columns=["case", "commit", "calibration_s"])
-    by_case = known.dropna(subset=["commit"]).groupby("case")
-    most = int(by_case["commit"].nunique().max()) if len(by_case) else 0
-    times = known.groupby(["case", "commit"])["calibration_s"].median().groupby("case")
-    unlike = (times.max() / times.min()).dropna()
-    told = {"sessions": most, "in_angles_apart": _in_angles_apart(rows)}
-    return told | ({"speeds": [float(unlike.median()), float(unlike.max())]} if len(unlike) else {})
-
-
-def _in_angles_apart(rows: pd.DataFrame) -> int:
-    """How many mechanisms have ODEs in angles of another commit than ours."""
-    made = rows.reindex(columns=["group", "family", "case", "commit"]).drop_duplicates()
-    ours = made[(made["group"] == rivals.GROUP) & (made["family"] == "two-loop")].set_index(["case", "commit"])
-    in_angles = made[made["group"] == minimal.GROUP].drop_duplicates(["case", "commit"]).set_index(["case", "commit"])
-    return int((~in_angles.index.isin(ours.index)).sum())
 
 
 def with_one_name(rows: pd.DataFrame) -> pd.DataFrame:
@@ -160,74 +94,85 @@ def with_one_name(rows: pd.DataFrame) -> pd.DataFrame:
     return rows.assign(processor=bare.where(bare.isin(rows["processor"]), rows["processor"]))
 
 
-def on_the_same_processor(rows: pd.DataFrame, others: pd.DataFrame) -> pd.DataFrame:
-    """The rows of mechanisms that were measured on the processor on which the others were."""
-    if "processor" not in rows or "processor" not in others:
-        return rows
-    return rows[rows["processor"] == rows["case"].map(others.groupby("case")["processor"].first())]
-
-
 def report(output: Output, rows: pd.DataFrame, line: str) -> dict[str, Any]:
+    """Write findings, figures and report."""
     rows = with_one_name(rows) if "processor" in rows else rows
-    everywhere = tables.medians(part(rows, rivals.GROUP))
-    known, medians = known_cases(output.call.quick), tables.medians(part(rows).reindex(columns=rows.columns))
-    found = rivals.findings_of(everywhere)
-    findings = findings_of(medians, known) | {"rivals": found}
-    findings["behind"] = behind.findings_of(found["mechanisms"], everywhere)
-    findings |= {"violation": violation(medians), "asked": asked(part(rows, rivals.GROUP))}
-    findings["banded"] = banded_over_dense(medians)
-    findings["versions"], findings["unlike"] = versions(), unlike(pd.concat([medians, everywhere], ignore_index=True))
-    findings["first_calls"] = first_calls.findings_of(first_calls.at_error(part(rows, first_calls.GROUP), everywhere))
-    findings["builds"] = builds.findings_of(part(rows, builds.GROUP), found["with_code"])
-    findings |= {"build_asked": builds.ASKED, "build_processes": builds.PROCESSES}
-    findings["unrolled"] = LARGEST_UNROLLED
-    in_angles = on_the_same_processor(part(rows, minimal.GROUP), part(rows, rivals.GROUP))
-    findings["measured"] = measured_on(rows[rows["group"].isin(SHOWN)])
-    findings["repetition"] = {"calls": int(part(rows, rivals.GROUP)["calls"].max()), "below": rivals.TIMED}
-    findings["repetition"]["outclassed"] = adaptive.OUTCLASSED
-    findings["price"] = headline.price(everywhere, part(rows, first_calls.GROUP), rivals.HEADLINE)
-    in_angles = in_angles if in_angles.empty else tables.medians(in_angles)
-    findings["minimal"] = minimal.findings_by_kind(in_angles, everywhere)
-    findings |= {} if output.call.quick else processors.kept(output, rows, line, found)
-    output.save_findings(findings)
-    draw(output, findings, everywhere, medians)
-    text = render("work_precision", findings, {}, stamp=line, quick=output.call.quick)
-    output.write("work_precision.md", text)
-    return findings
+    everywhere, in_angles = tables.medians(part(rows, mechanisms.GROUP)), part(rows, minimal.GROUP)
+    standings, firsts = mechanisms.standings_of(everywhere), part(rows, first_calls.GROUP)
+    found = mechanisms.findings_of(standings, everywhere)
+    found["minimal"] = minimal.findings_of(tables.medians(in_angles) if len(in_angles) else in_angles, everywhere)
+    found |= {"calls": headline.calls(everywhere, firsts, HEADLINE), "first_calls": first_calls.findings_of(firsts)}
+    found["favourable"] = favourable(found)
+    found["processors"] = [] if output.call.quick else processors.kept(output, rows, line, standings)
+    found |= {"measured": measured_on(rows), "versions": versions(), "least": tables.LEAST}
+    found |= {"repeats": REPEATS, "answer": answer(found)}
+    output.save_findings(found)
+    figures.save(heat_map(found), output, "work_precision_ratios")
+    figures.save(picture(everywhere, found), output, "work_precision")
+    output.write("work_precision.md", render("work_precision", found, {}, stamp=line, quick=output.call.quick))
+    return found
 
 
-def unlike(medians: pd.DataFrame) -> dict[str, Any]:
-    """How many repetitions were not of the run alone, and of which runs."""
-    own = medians[medians["unlike"] > 0]
-    named = [f"{run['solver']} on {run['case']} at {tables.setting(run)}" for _, run in own.iterrows()]
-    return {"n": int(own["unlike"].sum()), "runs": named, "times": tables.UNLIKE}
+def measured_on(rows: pd.DataFrame) -> dict[str, Any]:
+    """At how many commits, and on which processors, the rows were measured."""
+    made = rows.reindex(columns=["processor", "commit"]).dropna().astype(str)
+    return {"commits": made["commit"].nunique(), "processors": sorted(map(short, made["processor"].unique()))}
 
 
-def violation(rows: pd.DataFrame) -> float | None:
-    """The largest violation of the positions by ours at any stored state of the four-bars."""
-    own = rows[(rows["family"] == "two-loop") & rows["case"].isin(rivals.GEOMETRIES)]["violation_q"].dropna()
-    return float(own.astype(float).max()) if len(own) else None
+def answer(found: dict[str, Any]) -> str:
+    """One sentence: which part of the default's time the fastest other solver takes."""
+    at = found["typical"]
+    if not at:
+        return "No error was reached by both sides."
+    least, most = (f(at, key=lambda line: line["median"]) for f in (min, max))
+    times = f"{number(least['median'])} to {number(most['median'])} times the default's time"
+    without = "" if found["keeping"] else ", without keeping the joints closed"
+    return f"On smooth motion, the fastest other solver takes {times} in the median{without}."
 
 
-def asked(rows: pd.DataFrame) -> dict[str, Any]:
-    """How many pairs of rival and mechanism were refused, or not asked for all accuracies, and the rule."""
-    others = rows[rows["family"] != "two-loop"]
-    pairs = others.groupby(["solver", "case"]).ngroups
-    put = [own for _, own in tables.put(others).groupby(["solver", "case"])]
-    found: dict[str, Any] = {"n": pairs, "refused": pairs - len(put)}
-    found |= {"fewer": sum(not tables.missed(own, 0.0) for own in put), "far": adaptive.FAR, "close": adaptive.CLOSE}
-    return found | {"running": adaptive.RUNNING, "limit": rivals.TIME_LIMIT}
+def favourable(found: dict[str, Any]) -> bool:
+    """Whether on the mechanism of the single calls the default does at least as well at each error as in the median."""
+    cells = [each["ratio"] for each in found["cells"] if each["case"] == HEADLINE]
+    at = [(cells[0][RESOLVED.index(line["error"])], line["median"]) for line in found["typical"]] if cells else []
+    return bool(at) and all(ratio is not None and ratio >= median for ratio, median in at)
 
 
-def draw(output: Output, findings: dict[str, Any], everywhere: pd.DataFrame, medians: pd.DataFrame) -> None:
-    for case in findings["cases"]:
-        own = medians[medians["case"] == case["name"]]
-        lines = figures.lines_of(own, ERRORS)
-        coded = case["name"] in findings["rivals"]["with_code"]
-        plot = figures.work_precision(own, lines, f"{case['name']}, {number(case['t_end'])} s", coded=coded)
-        figures.save(plot, output, case["figure"].removesuffix(".png"))
-    figures.save(rivals.picture(everywhere), output, "work_precision")
-    figures.save(rivals.heat_map(findings["rivals"]), output, "work_precision_ratios")
+def picture(rows: pd.DataFrame, found: dict[str, Any]) -> Figure:
+    """What a call takes over its error on the four-bar: the default, the fastest other solvers, and SUNDIALS'."""
+    own, coded = rows[rows["case"] == HEADLINE], mechanisms.given_on(HEADLINE) == headline.OWN_CODE
+    lines = figures.lines_of(own, RESOLVED[1::3], coded)
+    at = {line["name"]: line["at"][-1]["call_s"] for line in found["calls"]["lines"]} if found["calls"] else {}
+    ours, other = (at.get(name) for name in (headline.OWN_CODE if coded else headline.DEFAULT, "CyRK"))
+    title = "Four-bar linkage, 10 s: what an accuracy costs"
+    if ours and other:
+        error, times = power(found["calls"]["errors"][-1]), [number(1e3 * seconds) for seconds in (ours, other)]
+        title = f"For an error of {error} on the four-bar, the default takes {times[0]} ms and CyRK {times[1]} ms"
+    return figures.work_precision(own, lines, title, "error after 10 s, over max(1, max |q|)", coded)
+
+
+def heat_map(found: dict[str, Any]) -> Figure:
+    """Mechanism by error: the time of the fastest other solver over that of the default."""
+    cells, count = found["cells"], found["default"]
+    names = [f"{each['case']}{' *' if each['singular'] else ''}" for each in cells]
+    figure, axes = plt.subplots(figsize=(7.6, 0.3 * len(names) + 1.5), layout="constrained")
+    shown = np.array([[ratio or np.nan for ratio in each["ratio"][::-1]] for each in cells], dtype=float)
+    colours = plt.get_cmap("RdBu").with_extremes(bad="#e6e6e6")
+    image = axes.imshow(shown, norm=LogNorm(0.04, 25.0), cmap=colours, aspect="auto")
+    for (i, j), ratio in np.ndenumerate(shown):
+        verdict = cells[i]["verdict"][::-1][j]
+        text = MARKS.get(verdict) or number(float(ratio))
+        color = "white" if abs(np.log10(ratio)) > 0.8 else "black"  # black on the grey of those without a ratio
+        shape = f"({text})" if verdict == "undecided" else text
+        axes.text(j, i, shape, ha="center", va="center", fontsize=8, color=color)
+    axes.set_xticks(range(len(RESOLVED)), [power(error) for error in RESOLVED[::-1]])
+    axes.set_yticks(range(len(names)), names)
+    axes.grid(False)
+    marks = "* singular positions   ( ) not distinguishable   ours, others: only they reach the error"
+    axes.set_xlabel(f"error at the end, over max(1, max |q|)\n{marks}")
+    told = f"{count['slower']} of {count['n']} cells"
+    figures.message(figure, f"Another solver is faster than the default in {told} (without *)")
+    figure.colorbar(image, ax=axes, label="time of the fastest other solver over the default's", extend="both")
+    return figure
 
 
 def main(words: Sequence[str] | None = None) -> None:

@@ -1,0 +1,226 @@
+"""Run every mechanism whose end is verified with every solver, and find which is the fastest at which error.
+
+Errors are those at the end of the reference, which is known there to more digits than by any motion between: the
+largest of a coordinate, over the largest coordinate where that exceeds 1. A part of `studies.work_precision`.
+"""
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from references.paper.four_bar_minimal import MinimalFourBar
+from studies.bench import adaptive, headline
+from studies.bench.cases.four_bar import SECOND
+from studies.bench.cli import StudyError
+from studies.bench.collector import REPEATS, Run, Warm, warm_up
+from studies.bench.end_states import case_of, row_of
+from studies.bench.solvers import CATALOGUE, HEYOKA, OTHER_SOLVERS, OWN, TAYLOR
+from studies.bench.store import KeptRows, Row
+from studies.validation.study import MAKE
+from twoloop import mechanisms, solve_dae
+from twoloop.mechanisms import Problem, Reference
+from twoloop.methods.code_for import is_small
+
+GROUP = "every mechanism"
+DECADES = tuple(10.0**-k for k in range(3, 14))
+RESOLVED = DECADES[:8]  # down to 1e-10; below, rounding errors are compared
+TYPICAL = (1e-4, 1e-6, 1e-8, 1e-10)  # errors of the table of ratios
+HEADLINE = "four-bar"
+SINGULAR = "singular"  # tag of mechanisms that pass through singular positions
+GEOMETRIES: dict[str, Callable[[], Problem]] = {
+    HEADLINE: mechanisms.four_bar,
+    "four-bar, second": lambda: mechanisms.four_bar(**SECOND),  # type: ignore[arg-type]
+}
+QUICK = ("four-bar", "knife edge")
+QUICK_SOLVERS = (headline.DEFAULT, headline.OWN_CODE, TAYLOR, "DOP853 (twoloop)", HEYOKA, "CVODE from C, Adams")
+TOLERANCES = (1e-3, 1e-5, 1e-7, 1e-9, 1e-11, 1e-14)
+BELOW = (3e-15, 3e-16)  # of CVODE and IDA, whose errors may fall until there
+BUILT = (1e-3, 1e-7, 1e-11, 1e-15)  # of solvers that are built for each tolerance
+STEPS = (100, 300, 1000, 3000, 10_000)  # of those of fixed steps
+QUICK_TOLERANCES = (1e-3, 1e-5)
+TIMED = 0.1  # s; a shorter run is called several times more
+TIME_LIMIT = 1.0  # s of CPU of a run
+COMPILING = 30.0  # s of what is built before
+TIGHT = 1e-12  # tolerance of the reference of the second geometry, well above rounding, which a third way holds ...
+FAR = 1e-11  # ... to so much
+
+
+@cache
+def problems(quick: bool) -> dict[str, Problem]:
+    """The mechanisms by name, each with a reference."""
+    made = {name: replace(make(), name=name) for name, make in GEOMETRIES.items()}
+    made["four-bar, second"] = replace(made["four-bar, second"], reference=_end_of_second(made["four-bar, second"]))
+    for problem in (make() for make in MAKE):
+        made[problem.name] = problem
+    return {name: problem for name, problem in made.items() if not quick or name in QUICK}
+
+
+@cache
+def singular() -> frozenset[str]:
+    """The mechanisms that pass through singular positions."""
+    return frozenset(problem.name for problem in (make() for make in MAKE) if SINGULAR in problem.tags)
+
+
+def _end_of_second(problem: Problem) -> Reference:
+    """Its state after 10 s by Gauss14, from which DOP853 differs in the last of its digits.
+
+    Raises StudyError if a run fails, or the equation in one coordinate, which shares nothing with them, does not agree
+    to FAR.
+    """
+    t_end, ends = 10.0, []
+    for method in ("Gauss14", "DOP853"):
+        span = (0.0, t_end)
+        result = solve_dae(problem.system, span, problem.q0, problem.v0, method=method, rtol=TIGHT, atol=TIGHT)
+        if not result.success:
+            raise StudyError(f"{method} does not reach the end of {problem.name}: {result.message}")
+        ends.append((result.q[:, -1], result.v[:, -1]))
+    known = MinimalFourBar.from_parameters(problem.parameters).states(np.array([t_end]))[0]
+    apart = float(np.abs(ends[0][0] - known[:, 0]).max())
+    if apart > FAR:
+        raise StudyError(f"the end of {problem.name} is {apart:.1e} from that of the equation in one coordinate")
+    differ = max(float(np.abs(ends[0][0] - ends[1][0]).max()), 1e-15)
+    said = f"DOP853, which differs by {differ:.1e}; the equation in one coordinate, by {apart:.1e}"
+    return Reference(t_end, *ends[0], f"Gauss14 at {TIGHT:g}", digits={"q": float(-np.log10(differ))}, verified=said)
+
+
+def runs(quick: bool) -> list[Run]:
+    """Every mechanism, solver and setting."""
+    found = []
+    for name, problem in problems(quick).items():
+        case = replace(case_of(problem), name=name, time_limit=TIME_LIMIT, timed=TIMED)
+        case = replace(case, step_sizes=tuple(case.t_end / n for n in STEPS))
+        for solver in (CATALOGUE[each] for each in (QUICK_SOLVERS if quick else (*OWN, *OTHER_SOLVERS))):
+            grid = BUILT if solver.builds_each else TOLERANCES if solver.setting == "tol" else case.steps()
+            grid = (*grid, *BELOW) if grid is TOLERANCES and solver.family == "SUNDIALS" else grid
+            values = QUICK_TOLERANCES if quick else grid
+            found += [Run(case, solver, value, GROUP, 1 if quick else REPEATS) for value in values]
+    return found
+
+
+def collect(todo: Sequence[Run], kept: KeptRows) -> pd.DataFrame:
+    """Rows of all runs that are of use; on the four-bars however far behind a solver is, and repeated where priced."""
+    quick = all(run.repeats == 1 for run in todo)
+    errors, priced = () if quick else DECADES, lambda run: run.case.name == HEADLINE
+    return adaptive.collect(todo, kept, row_at_end, lambda run: run.case.name in GEOMETRIES, errors, priced, priced)
+
+
+def row_at_end(run: Run, repeat: int, built: Warm) -> Row:
+    """A repetition of a run, measured by the end of the reference."""
+    warm_up(run, repeat, built, COMPILING)
+    row = row_of(run) | {"repeat": repeat, "keeps_constraints": run.solver.keeps_constraints}
+    return row | {"n_steps": row.pop("n_accepted")}
+
+
+@cache
+def given_on(case: str) -> str:
+    """The solver that the default is on a mechanism: `auto`, with code for the mechanism if it is small."""
+    problem = problems(False).get(case)
+    return headline.OWN_CODE if problem is not None and is_small(problem.system) else headline.DEFAULT
+
+
+def standings(rows: pd.DataFrame, errors: Sequence[float]) -> list[dict[str, dict[str, Any]]]:
+    """How the default and ours stand on one mechanism at each error; `rows`: its medians."""
+    return headline.of_errors(rows, errors, given_on(str(rows["case"].iloc[0])))
+
+
+Standings = dict[str, list[dict[str, dict[str, Any]]]]  # by mechanism how each of `headline.WHOSE` stands, by decade
+
+
+def standings_of(rows: pd.DataFrame) -> Standings:
+    """How the default and ours stand on each mechanism at each decade, in the order of `problems`."""
+    places = {name: k for k, name in enumerate(problems(False))}
+    cases = sorted(rows.groupby("case"), key=lambda each: places.get(str(each[0]), len(places)))
+    return {str(name): standings(own, DECADES) for name, own in cases}
+
+
+def findings_of(made: Standings, rows: pd.DataFrame) -> dict[str, Any]:
+    """What the report says of the mechanisms; `rows`: the medians of which `made` is."""
+    smooth = {case: own for case, own in made.items() if case not in singular()}
+    crossing = {case: own for case, own in made.items() if case in singular()}
+    found: dict[str, Any] = {"mechanisms": len(smooth), "typical": [typical(smooth, error) for error in TYPICAL]}
+    found["typical"] = [line for line in found["typical"] if line["n"]]
+    within = [at for own in smooth.values() for at in own[: len(RESOLVED)]]
+    for word, name in (("default", headline.GIVEN), ("best", headline.BEST)):
+        found[word] = headline.counted(within, name)
+    found["fastest"] = fastest(within)
+    others = rows.loc[rows["family"] != "two-loop", "solver"].unique()
+    found |= {"n_others": len(others), "n_ours": int(rows.loc[rows["family"] == "two-loop", "solver"].nunique())}
+    found["with_code"] = [case for case in made if given_on(case) == headline.OWN_CODE]
+    found["drift"] = drift(made, rows)
+    pairs = [at for own in crossing.values() for at in own]
+    found["keeping"] = [name for name in found["fastest"] if CATALOGUE[name].keeps_constraints]
+    names = sorted({case.partition(",")[0] for case in crossing})
+    found["singular"] = {
+        "variants": len(crossing),
+        "names": names,
+        **headline.counted(pairs, headline.GIVEN),
+        **reached(rows),
+    }
+    return found | {"cells": cells(made)}
+
+
+def typical(made: Standings, error: float) -> dict[str, Any]:
+    """Time of the fastest other solver over the default's at an error: median and range over mechanisms, and counts."""
+    at = [own[DECADES.index(error)][headline.GIVEN] for own in made.values()]
+    ratios = [each["ratio"] for each in at if each["ratio"] is not None]
+    verdicts = [each["verdict"] for each in at]
+    told: dict[str, Any] = {"error": error, "n": len(ratios), "of": len(at)}
+    told |= {"faster": verdicts.count("ahead"), "slower": verdicts.count("behind") + verdicts.count("missed")}
+    if ratios:
+        told |= {"median": float(np.median(ratios)), "least": min(ratios), "most": max(ratios)}
+    return told
+
+
+def fastest(pairs: Iterable[Mapping[str, Mapping[str, Any]]]) -> dict[str, int]:
+    """Which other solvers are the fastest where the default is slower, and in how many pairs of mechanism and error."""
+    at = [each[headline.GIVEN] for each in pairs]
+    return dict(Counter(each["other"]["solver"] for each in at if each["verdict"] == "behind").most_common())
+
+
+def reached(rows: pd.DataFrame) -> dict[str, Any]:
+    """At how many of the errors that any solver reaches at singular positions each does."""
+    crossed = rows[rows["case"].isin(singular()) & rows["error_q"].notna()]
+    least = crossed.groupby(["case", "solver"])["error_q"].min()
+    errors = [(case, error) for case, own in least.groupby("case") for error in DECADES if own.min() <= error]
+    count = {
+        str(solver): sum(least.get((case, solver), np.inf) <= error for case, error in errors)
+        for solver in crossed["solver"].unique()
+    }
+    ours = set(crossed.loc[crossed["family"] == "two-loop", "solver"])
+    others = {name: n for name, n in count.items() if name not in ours}
+    best = max(others, key=others.__getitem__, default=None)
+    given = sum(least.get((case, given_on(str(case))), np.inf) <= error for case, error in errors)
+    told = {"errors": len(errors), "reached": given, "without_code": count.get(headline.DEFAULT, 0)}
+    return told | {"best_other": best, "best_other_reached": 0 if best is None else others[best]}
+
+
+def drift(made: Standings, rows: pd.DataFrame) -> dict[str, float] | None:
+    """How far the fastest other solvers leave the constraints where they are faster than the default.
+
+    |C| of the cheapest run that is accurate enough over the error compared; None: all of them keep the constraints.
+    """
+    known = rows.reindex(columns=list(dict.fromkeys([*rows.columns, "violation_q", "keeps_constraints"])))
+    leaves = known[known[["error_q", "violation_q"]].notna().all(axis=1) & known["keeps_constraints"].eq(False)]
+    ratios = []
+    pairs = [(case, at[headline.GIVEN], error) for case in made for at, error in zip(made[case], DECADES, strict=True)]
+    for case, standing, error in pairs:
+        own = leaves[(leaves["case"] == case) & (leaves["solver"] == standing["other"]["solver"])]
+        own = own[own["error_q"].astype(float) <= error]
+        if standing["verdict"] == "behind" and len(own):
+            ratios.append(float(own.loc[own["call_s"].astype(float).idxmin(), "violation_q"]) / error)
+    return {"median": float(np.median(ratios)), "most": max(ratios)} if ratios else None
+
+
+def cells(made: Standings) -> list[dict[str, Any]]:
+    """By mechanism the ratio of times and the verdict on the default at each of RESOLVED; singular positions last."""
+    found = []
+    for case, own in sorted(made.items(), key=lambda each: each[0] in singular()):
+        at = [each[headline.GIVEN] for each in own[: len(RESOLVED)]]
+        told = {key: [each[key] for each in at] for key in ("ratio", "verdict")}
+        found.append({"case": case, "singular": case in singular(), **told})
+    return found
