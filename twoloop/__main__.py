@@ -207,7 +207,7 @@ def parser() -> argparse.ArgumentParser:
     loops.add_argument("--t-end", type=float, default=2.0, help="s; default: 2")
     loops.add_argument("--key", help="keyframe to start from; default: the pose of the file, at rest")
     loops.add_argument("--out", nargs="+", default=[], type=Path, metavar="FILE", help="files, .json or .csv")
-    rows = commands.add_parser("rows", help="rows of runs of solvers, as docs/compare.md has their format")
+    rows = commands.add_parser("rows", help="rows of runs of solvers, as docs/reference/rows.md has their format")
     checked = rows.add_subparsers(dest="what", required=True).add_parser("check", help="say what is wrong with files")
     checked.add_argument("files", nargs="+", type=Path, metavar="FILE", help=".jsonl, or .jsonl.gz")
     board = commands.add_parser("leaderboard", help="which solver takes how long for an error on a mechanism")

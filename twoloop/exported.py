@@ -18,6 +18,7 @@ from twoloop.methods.runge_kutta import RungeKutta as RungeKutta
 from twoloop.methods.taylor import Taylor as Taylor
 from twoloop.problem.drawing import Drawing as Drawing
 from twoloop.problem.joints import Joint as Joint
+from twoloop.problem.problem import Problem as Problem
 from twoloop.problem.stops import Stop as Stop
 from twoloop.problem.system import ConstrainedSystem as ConstrainedSystem
 from twoloop.result.certificate import Certificate as Certificate

@@ -128,8 +128,8 @@ def four_bar(
 ) -> Problem:
     """A four-bar linkage of uniform rods of 1 kg/m under gravity 9.81 m/s^2, released from rest.
 
-    The default geometry is *assumed*, because Table 2 of the paper with the parameters is lost. It agrees with the
-    motion described in the text: bar 3 starts horizontally, and its centre returns to y = 0 without crossing it.
+    The default geometry is *assumed*: the paper's Table 2 is missing from the text that we worked from. It agrees with
+    the motion described there: bar 3 starts horizontally, and its centre returns to y = 0 without crossing it.
 
     Parameters
     ----------
@@ -194,7 +194,9 @@ def four_bar(
             "density": DENSITY,
             "gravity": GRAVITY,
         },
-        note="geometry assumed: Table 2 of the paper is lost" if is_default else "geometry chosen for this project",
+        note="geometry assumed: the paper's Table 2 is missing from the text that we worked from"
+        if is_default
+        else "geometry chosen for this project",
         reference=_DEFAULT_REFERENCE if is_default else None,
         source="L. Zhang and Zhang, Nonlinear Dynamics (2016), Sect. 4.1",
         tags=("closed chain", "rigid", "planar"),
