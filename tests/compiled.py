@@ -24,6 +24,11 @@ def weight(t, q, v, p, Q):
 
 
 @callback("force")
+def weight_of_mass(t, q, v, p, Q):
+    Q[1] = -9.81 * p[0]
+
+
+@callback("force")
 def attraction(t, q, v, p, Q):
     Q[1] = -p[0]
 
@@ -50,6 +55,7 @@ def centripetal(t, q, v, p, Qd):
 
 PENDULUM = {"mass": unit_mass, "force": weight, "constraint": circle, "jacobian": radius, "gamma": centripetal}
 PENDULUM |= {"n_q": 2, "n_c": 1, "constant_mass": True, "name": "pendulum"}
+HEAVY_PENDULUM = {"n_q": 2, "n_c": 1, "mass": heavy, "force": weight_of_mass, "constraint": circle, "jacobian": radius}
 SPRUNG_START = [1.0, 0.0, 2.0, 0.0], [0.0, 0.0, 0.0, 0.0]
 
 

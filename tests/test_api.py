@@ -1,6 +1,5 @@
 """The public face: what problems, results and statuses have, defaults, names, help."""
 
-import pydoc
 from dataclasses import FrozenInstanceError, replace
 
 import numpy as np
@@ -30,15 +29,6 @@ def test_names_that_come_when_they_are_asked_for():
     assert twoloop.mechanisms is mechanisms  # and so do folders
     with pytest.raises(AttributeError, match="module 'twoloop' has no attribute 'solve_ode'"):
         twoloop.solve_ode  # noqa: B018
-
-
-@pytest.mark.parametrize("name", twoloop.__all__)
-def test_help_leaves_the_names_of_types_as_they_are(name):
-    assert getattr(twoloop, name).__doc__
-    text = pydoc.render_doc(getattr(twoloop, name), renderer=pydoc.plaintext)
-    assert "_array_like" not in text and "Union[" not in text
-    if name == "solve_dae":
-        assert "q0: 'ArrayLike'" in text and "t_eval: 'ArrayLike | None' = None" in text
 
 
 def test_zero_is_the_end_one_an_event_and_what_is_negative_a_failure():

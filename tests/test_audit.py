@@ -82,15 +82,6 @@ def test_order_floor_and_step(pendulum):
     assert "floor 0.00" in str(floored) and "not reached" in str(floored)
 
 
-def test_a_lucky_step_is_no_accuracy(pendulum):
-    def simulate(problem, times, step):
-        good = abs(step - 5e-3) < 1e-9
-        return falling(bias=0.0 if good else 0.1, order=9)(problem, times, step)
-
-    audit = audit_simulator(simulate, pendulum, step=5e-3, error=1e-3)
-    assert min(run.error for run in audit.runs) < 1e-6 and audit.reaching is None
-
-
 def test_a_failure_is_a_row_and_a_wrong_simulator_an_error(pendulum):
     def failing(problem, times, step):
         raise RuntimeError("the loop broke")

@@ -5,12 +5,10 @@ import pytest
 from numba import njit
 from numba.extending import register_jitable
 
+from tests.compiled import HEAVY_PENDULUM
 from tests.problems import pendulum, quick
 from tests.processes import run_python
-from tests.test_callbacks import PENDULUM
 from twoloop import ConstrainedSystem, callback, consistent_state, solve_dae
-from twoloop.checks import bounds, values
-from twoloop.generate import exact_derivatives
 from twoloop.kernels.compile.callbacks import KINDS
 
 FAR = 10**7  # a write so far out would end the process
@@ -34,7 +32,7 @@ def beyond(kind):
 
 
 def system(**changed):
-    return ConstrainedSystem(**{**PENDULUM, "parameters": [2.0], "name": "far", **changed})
+    return ConstrainedSystem(**{**HEAVY_PENDULUM, "parameters": [2.0], "name": "far", **changed})
 
 
 ENTRIES = {
@@ -61,27 +59,6 @@ def test_every_entry_point_watches_every_callback(entry, kind):
     tangents = NO_TANGENT if kind == "reaction_by_q" else {}
     with pytest.raises(ValueError, match=rf"{kind} of 'far' goes out of bounds: index {FAR}"):
         ENTRIES[entry](system(**tangents, **{kind: beyond(kind)}))
-
-
-@callback("mass_values")
-def heavy_values(t, q, p, values):
-    values[0] = values[1] = p[0]
-
-
-@callback("jacobian_values")
-def radius_values(t, q, p, values):
-    values[0], values[1] = q[0], q[1]
-
-
-@pytest.mark.parametrize("kind", ["mass", "jacobian"])
-@pytest.mark.parametrize("method", ["BDF", "DOP853"])
-def test_dense_matrices_of_large_systems_are_watched_where_they_are_asked_for(monkeypatch, kind, method):
-    for module in (bounds, values, exact_derivatives):
-        monkeypatch.setattr(module, "MOST", 0)
-    entries = {"mass_values": heavy_values, "mass_entries": ([0, 1], [0, 1])}
-    entries |= {"jacobian_values": radius_values, "jacobian_entries": ([0, 0], [0, 1])}
-    with pytest.raises(ValueError, match=rf"{kind} of 'far' goes out of bounds: index {FAR}"):
-        solve_dae(system(**entries, **{kind: beyond(kind)}), (0.0, 0.1), Q, V, method)
 
 
 @pytest.mark.parametrize("entry", ENTRIES)
@@ -125,15 +102,6 @@ def test_helpers_are_watched(force):
         ValueError, match=r"force of 'far' goes out of bounds: index 1000000\d is .*`out\[place\] = 1.0`"
     ):
         system(force=callback("force")(force)).force(0.0, Q, V)
-
-
-def test_what_runs_only_compiled_is_watched_too():
-    @callback("force")
-    def force(t, q, v, p, Q):
-        Q[FAR] = 1.0 / (0.0 * t)  # an exception in Python, where t is a float, and an infinity when compiled
-
-    with pytest.raises(ValueError, match=r"force of 'far' goes out of bounds: index is out of bounds"):
-        system(force=force).force(0.0, Q, V)
 
 
 # --- what the caller passes
@@ -240,6 +208,7 @@ print(solve_dae(system, (0.0, 1e-3), start, np.zeros(2), rtol=1e-5, atol=1e-5).s
 """
 
 
+@pytest.mark.slow
 def test_checks_of_a_start_that_look_beyond_a_table_do_not_end_the_process():
     assert run_python(CAM).stdout.split() == ["True"]
 

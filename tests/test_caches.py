@@ -10,12 +10,105 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 from numba import njit
+from numba.core.caching import _CacheLocator
 
-from tests.own_cache import RUN, Folder
-from twoloop.kernels.compile import ownership
-from twoloop.kernels.compile.caches import UNWRITABLE, watch
+from tests.processes import ROOT, run_python
+from twoloop.kernels.compile import callbacks, ownership
+from twoloop.kernels.compile.caches import UNWRITABLE, folder_of, watch
 from twoloop.kernels.compile.kept_files import Files
 from twoloop.kernels.compile.ownership import doubt_of, make_own, own_folder
+from twoloop.kernels.evaluation import calls
+
+
+def with_kernels(cache):
+    """Fill a folder for NUMBA_CACHE_DIR with what every run needs: the inner loop, and what stands for callbacks."""
+    for module, names in ((calls, "calls.inner_loop-*"), (callbacks, "callbacks.stand_in.*")):
+        folder = cache / _CacheLocator.get_suitable_cache_subpath(module.__file__)
+        folder.mkdir(parents=True)
+        for file in folder_of(module).glob(names):
+            shutil.copy(file, folder)
+    return cache
+
+
+# what a mechanism's file looks like: a callback for each value, some of which enclose a global
+MECHANISM = """
+import numpy as np
+import numba
+from typing import NamedTuple
+from twoloop import callback
+import constants, helpers
+from constants import *
+from helpers import *
+from own_caches import *
+
+class Callbacks:
+    pass
+
+{callbacks}
+
+def value(function):
+    Q = np.zeros(1)
+    function(0.0, np.ones(1), np.ones(1), np.ones(1), Q)
+    return float(Q[0])
+"""
+CALLBACK = """
+@callback("force")
+def {name}(t, q, v, p, Q):
+    Q[0] = {value}
+Callbacks.{name} = {name}
+"""
+ENCLOSING = """
+def make_{name}(enclosed):
+    @callback("force")
+    def force(t, q, v, p, Q):
+        Q[0] = {value}
+    return force
+Callbacks.{name} = make_{name}({enclosed})
+"""
+# names, values, and how often the machine code was read from the disk
+RUN = """
+import mechanism as m
+for name, function in vars(m.Callbacks).items():
+    if not name.startswith("_"):
+        print(name, m.value(function), sum(function.stats.cache_hits.values()))
+"""
+
+
+class Folder:
+    """Files of a mechanism, and processes that run it with a cache of their own."""
+
+    def __init__(self, path):
+        self.path = path
+        self.cache = with_kernels(path / "cache")
+        self.write("constants", "")
+        self.write("helpers", "")
+        self.write("own_caches", "")
+
+    def write(self, name, text):
+        (self.path / f"{name}.py").write_text(text)
+
+    def mechanism(self, **values):
+        """A callback for each value; what stands behind a semicolon is enclosed."""
+        texts = []
+        for name, value in values.items():
+            text, _, enclosed = value.partition(";")
+            texts.append((ENCLOSING if enclosed else CALLBACK).format(name=name, value=text, enclosed=enclosed))
+        self.write("mechanism", MECHANISM.format(callbacks="".join(texts)))
+
+    def run(self, source=RUN, **environment):
+        variables = {
+            "NUMBA_CACHE_DIR": str(self.cache),
+            "PYTHONPATH": f"{self.path}{os.pathsep}{ROOT}",
+            "PYTHONDONTWRITEBYTECODE": "1",  # Python's own cache sees whole seconds only
+        }
+        done = run_python(source, folder=self.path, **variables | environment)
+        self.said = done.stderr
+        return done.stdout
+
+    def values(self, source=RUN):
+        """{name: (value, how often its machine code was read)}."""
+        rows = [line.split() for line in self.run(source).splitlines()]
+        return {name: (float(value), int(hits)) for name, value, hits in rows}
 
 
 @pytest.fixture
@@ -107,6 +200,7 @@ DAMAGES = {  # what stands in the file of a callback instead of its machine code
 }
 
 
+@pytest.mark.slow
 def test_what_changes_in_other_files_and_damage_make_machine_code_stale(folder):
     folder.mechanism(**VALUES)
     folder.write("own_caches", OWN_CACHES + KERNELS)  # does not change
@@ -229,6 +323,7 @@ def plant(path, mark):
     path.write_bytes(hashlib.sha256(content).digest() + content)
 
 
+@pytest.mark.slow
 def test_what_others_can_write_is_not_loaded(user, monkeypatch):
     assert user(umask=0)[:2] == (2.0, 0)
     assert user.file().stat().st_mode & 0o022 == user.file().parent.stat().st_mode & 0o022 == 0
@@ -297,22 +392,3 @@ def test_whose_folders_are_in_doubt(tmp_path, monkeypatch, changes, why, above):
     at = folder.parent if above else folder
     seen_as(monkeypatch, at, **changes)
     assert doubt_of(folder) == (f"{at} {why}" if why else "") and (own_folder(folder) == folder) == (not why)
-
-
-@pytest.mark.parametrize(
-    ("name", "members", "primary", "private"),
-    [("ann", [], True, True), ("ann", ["bob"], True, False), ("staff", [], True, False), ("ann", [], False, False)],
-)
-def test_the_group_of_one_user_alone_may_write(tmp_path, monkeypatch, name, members, primary, private):
-    """Distributions with umask 0002 give each user such a group: it is never refused."""
-    import grp
-    import pwd
-
-    gid = 5000
-    entry = pwd.struct_passwd(("ann", "x", os.geteuid(), gid if primary else 100, "", "/", "/bin/sh"))
-    monkeypatch.setattr(pwd, "getpwuid", lambda uid: entry)
-    monkeypatch.setattr(grp, "getgrgid", lambda gid: grp.struct_group((name, "x", gid, members)))
-    ownership._private.cache_clear()
-    seen_as(monkeypatch, tmp_path, mode=0o040775, gid=gid)
-    assert (doubt_of(tmp_path) == "") == private
-    ownership._private.cache_clear()

@@ -9,7 +9,7 @@ import numba
 import numpy as np
 import pytest
 
-from tests.compiled import centripetal, circle, heavy, radius, unit_mass, weight
+from tests.compiled import HEAVY_PENDULUM, centripetal, circle, heavy, radius, unit_mass, weight
 from tests.problems import pendulum, quick
 from twoloop import ConstrainedSystem, Status, callback, solve_dae
 from twoloop.kernels.compile.callbacks import KINDS, OPTIONAL
@@ -17,14 +17,6 @@ from twoloop.kernels.data.common import KIT, Functions
 from twoloop.kernels.data.flags import GIVEN
 from twoloop.mechanisms import four_bar
 from twoloop.problem.adapters import PythonFunctions
-
-
-@callback("force")
-def gravity(t, q, v, p, Q):
-    Q[1] = -9.81 * p[0]
-
-
-PENDULUM = {"n_q": 2, "n_c": 1, "mass": heavy, "force": gravity, "constraint": circle, "jacobian": radius}  # p = mass
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -59,7 +51,7 @@ def test_what_numba_cannot_compile_takes_two_lines():
 @pytest.mark.parametrize("kind", ["mass", "force", "constraint", "jacobian", "constraint_rate", "gamma"])
 def test_plain_functions_are_sent_to_from_python(kind):
     with pytest.raises(TypeError, match=rf"{kind} must be compiled by @twoloop.callback.*from_python"):
-        ConstrainedSystem(**{**PENDULUM, kind: lambda t, q, p, x: None})
+        ConstrainedSystem(**{**HEAVY_PENDULUM, kind: lambda t, q, p, x: None})
 
 
 # --- what follows from an entry of the table
@@ -137,22 +129,6 @@ def test_functions_that_return_arrays_must_not_write_either():
     assert pendulum(force=force).force(0.0, [3.0, 0.0], [1.0, 1.0]).tolist() == [-1.0, 0.0]  # on copies it may
 
 
-def test_helpers_compiled_for_arrays_that_may_be_written_are_taken():
-    @numba.njit("f8(f8[::1])")
-    def first(x):
-        return x[0]
-
-    @callback("force")
-    def force(t, q, v, p, Q):
-        x = q.copy()
-        x[0] += 1.0
-        Q[0] = first(q) + x[0]
-
-    Q, q = np.zeros(1), np.ones(1)
-    force(0.0, q, q, q, Q)
-    assert Q[0] == 3.0 and q[0] == 1.0
-
-
 @callback("mass")
 def heavier_beyond(t, q, p, M):
     M[0, 0] = 1.0 if q[0] < p[0] else 1.0 + q[0]
@@ -224,9 +200,8 @@ def made(force=light_weight, **changed):
 SYSTEMS = {
     "plain": made,
     "plain, array mass": lambda: made(mass=LOADS),
-    "compile=True": lambda: made(compile=True),
     "compile=True, array mass": lambda: made(mass=LOADS, compile=True),
-    "compiled": lambda: ConstrainedSystem(**PENDULUM, parameters=[3.0], constant_mass=True, name="own"),
+    "compiled": lambda: ConstrainedSystem(**HEAVY_PENDULUM, parameters=[3.0], constant_mass=True, name="own"),
     "four-bar": lambda: four_bar().system,
 }
 
@@ -278,17 +253,6 @@ def test_systems_keep_their_functions_in_other_processes(method):
 
 def energy_at_the_end(result):
     return result.energy[-1], result.system.name
-
-
-def test_a_compiled_callback_within_a_function_travels_with_its_source():
-    factor = 3.0
-
-    @callback("force")
-    def force(t, q, v, p, Q):
-        Q[1] = factor * p[0]
-
-    system = ConstrainedSystem(**{**PENDULUM, "force": force}, parameters=[2.0])
-    assert pickle.loads(pickle.dumps(system)).force(0.0, AT, MOVING).tolist() == [0.0, 6.0]
 
 
 def enclosing():
@@ -362,6 +326,7 @@ def test_memory_is_named_at_the_start(make, method):
         solve_dae(pushed_by(make()), (0.0, 1.0), *BESIDE, method)
 
 
+@pytest.mark.slow
 def test_memory_that_shows_along_the_motion_is_named_at_its_end():
     result = solve_dae(pushed_by(delayed()), (0.0, 1.0), *BESIDE, "DOP853")
     assert result.status is Status.WRONG_TRACE and "when it is called again" in result.message

@@ -13,7 +13,6 @@ import pytest
 from tests.compiled import PENDULUM
 from tests.problems import at_one, quick, run
 from twoloop import CertificateWarning, ConstrainedSystem, Statistics, callback, mechanisms, solve_dae
-from twoloop.run.dense_solution import DenseSolution
 
 END = 3.0
 
@@ -106,18 +105,6 @@ def test_a_stored_state_that_was_altered(default_four_bar):
         v = result.v.copy()
         v[2, k] *= 1.0 + 1e-4
         assert result.t[k] - 0.11 <= refused(replace(result, v=v)).t <= result.t[k]
-
-
-@pytest.mark.parametrize("method", quick(["auto", "DOP853", "Gauss8", "RadauIIA9"]))
-def test_a_solution_that_is_wrong_between_its_steps_only(default_four_bar, method):
-    result = run(default_four_bar, 1.0, method=method, dense_output=True)
-    interpolator, table = result.sol.interpolator, result.sol.table
-    a = table.states.copy()
-    a[:, 18:] *= 1.01
-    inner = replace(result, sol=DenseSolution(interpolator, table._replace(states=a), result.sol.t_max))
-    assert silently(result)
-    if interpolator.parts == 1 or method == "DOP853":  # else polynomials go through states of their own
-        refused(inner)
 
 
 def test_constant_steps_are_measured_by_the_tolerance_that_is_asked_for(default_four_bar):

@@ -1,21 +1,19 @@
 """How runs end early: interrupted, at a standstill, out of time, by values that are not finite."""
 
+import re
 import signal
 import sys
 import threading
 import time
 import warnings
 
-import numba
 import numpy as np
 import pytest
 
-from tests.compiled import unit_mass
 from tests.problems import event, pendulum, quick, run, violations, worst
 from tests.processes import run_python
-from twoloop import ConstrainedSystem, Status, callback, solve_dae
+from twoloop import DOP853, Status, mechanisms, solve_dae
 from twoloop.mechanisms import four_bar
-from twoloop.run.interrupts import CALLS_A_USER
 
 HORIZONTAL = ([-1.0, 0.0], [0.0, 0.0])
 
@@ -99,16 +97,6 @@ def test_what_ends_before_the_end_may_be_far_from_it():
     assert solve_dae(pendulum(compile=True), far, *start, "DOP853", max_step=0.02, events=late).status is Status.EVENT
 
 
-def test_a_parallelogram_is_left_or_ends_with_a_status_soon():
-    problem = four_bar((1.5423, 1.7303, 1.5423), 1.7303, 0.39914, 1)
-    for method in ("DOP853", "SunRadau5", "Gauss12", "BDF"):
-        result = solve_dae(problem.system, (0.0, 2.0), problem.q0, problem.v0, method, 1e-10, 1e-10)
-        # a standstill is seen after 20,000 such steps, or nearly twice as many
-        assert result.stats.n_accepted < 65_000
-        if not result.success:
-            assert "close to losing rank" in result.message and "singular" in result.message
-
-
 # --- values that are not finite
 KINDS = ("mass", "force", "constraint", "jacobian", "gamma")
 METHODS = ("Gauss12", "SunRadau5", "PaperIRK", "Newmark", "BDF", "DOP853", "Adams", "RadauIIA5")
@@ -163,23 +151,6 @@ def test_parameters_cannot_be_written_to(default_four_bar):
     system.with_parameters(OTHER)
     after = result.sol(0.31)
     assert (after.q == known[0]).all() and (after.lam == known[1]).all()
-
-
-def test_a_helper_that_writes_to_parameters_is_refused():
-    @numba.njit("void(f8[::1])")  # a type of its own, past which the compiler does not look
-    def halve(p):
-        p[0] *= 0.5
-
-    @callback("force")
-    def force(t, q, v, p, Q):
-        halve(p)
-        Q[0] = -p[0] * q[0]
-
-    system = ConstrainedSystem(n_q=1, n_c=0, mass=unit_mass, force=force, parameters=[1.0], name="changing")
-    with pytest.raises(
-        ValueError, match=r"force of 'changing' must not change the arrays .*: it changes p. Copy first"
-    ):
-        solve_dae(system, (0.0, 1.0), [1.0], [0.0])
 
 
 # --- an event before the first output
@@ -288,45 +259,6 @@ def test_ctrl_c_in_any_function_at_any_call_returns_what_there_is(method, option
             check_part(part, full)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("events", [None, lambda t, q, v: q[0] - 0.1])
-def test_signals_at_any_instruction_end_the_run_with_its_result(events):
-    """A tracing function raises them where no function of a user runs, too: in what boxes arguments, and between."""
-    system = pendulum()
-    solve_dae(system, (0.0, 0.1), *START, events=events)
-    n = last_call = 0  # lines of Python in a run, and at its last call of a user's function
-
-    def every_line(frame, event, argument):
-        nonlocal n, last_call
-        if signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
-            n += 1
-            if frame.f_code in CALLS_A_USER:
-                last_call = n
-            if n == at:
-                signal.raise_signal(signal.SIGINT)
-        return every_line
-
-    def solve():
-        nonlocal n
-        n, before = 0, sys.gettrace()
-        sys.settrace(every_line)
-        try:
-            options = {"step_size": 0.01, "check_derivatives": False}  # few steps: each line of them is slow here
-            return solve_dae(system, (0.0, 0.05), *START, "DOP853", events=events, **options)
-        finally:
-            sys.settrace(before)
-
-    at = 0
-    solve()  # what is done once in a process
-    assert solve().success
-    total, within = n, 0.95 * last_call  # the number of lines is not quite the same each time
-    for at in [*np.linspace(1, within, 5).astype(int), *np.linspace(within, total, 5).astype(int)]:
-        result = solve()
-        assert result.status is Status.INTERRUPTED or (result.success and at > within), (at, result.message)
-        assert worst_or_zero((result.q**2).sum(axis=0), 1.0) < 1e-9
-    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
-
-
 def test_a_handler_of_the_users_own_stays():
     heard = []
     before = signal.signal(signal.SIGINT, lambda number, frame: heard.append(number))
@@ -339,6 +271,7 @@ def test_a_handler_of_the_users_own_stays():
     assert result.success and heard == [signal.SIGINT]
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="signals to oneself")
 def test_real_signals_while_compiled_code_python_callbacks_and_events_run():
     run_python("""
@@ -361,3 +294,72 @@ def test_real_signals_while_compiled_code_python_callbacks_and_events_run():
         for k, events in enumerate((None, lambda t, q, v: q[0], None, lambda t, q, v: q[0])):
             interrupted(system, [0.0, -1.0], [3.0, 0.0], after=0.1 + 0.0137 * k, events=events)
     """)
+
+
+# --- runs whose steps stability limits say so; those whose steps accuracy limits do not
+STIFF = "The problem looks stiff"
+EXPLICIT = pytest.mark.parametrize("method", ["Adams", "DOP853"])
+
+
+def run_of(problem, end, method, tol, **options):
+    return solve_dae(problem.system, (0.0, end), problem.q0, problem.v0, method, tol, tol, **options)
+
+
+@pytest.mark.parametrize(
+    ("make", "end", "tol", "method", "what"),
+    [
+        (mechanisms.moderately_stiff_beam, 0.1, 1e-2, "Adams", "vibrations of 3.*e.04 rad/s"),
+        (mechanisms.moderately_stiff_beam, 0.3, 1e-2, "DOP853", "vibrations of 3.*e.04 rad/s"),
+        (mechanisms.moderately_stiff_beam, 0.3, 1e-2, DOP853("restored"), "vibrations of 3.*e.04 rad/s"),
+        (mechanisms.governor, 2.0, 1e-4, "Adams", "a decay of .*e.03 1/s"),
+        (mechanisms.governor, 2.0, 1e-4, "DOP853", "a decay of .*e.03 1/s"),
+    ],
+)
+def test_steps_at_the_limit_of_stability_are_said_to_be(make, end, tol, method, what):
+    result = run_of(make(), end, method, tol)
+    assert result.success and result.message.count(STIFF) == 1
+    assert re.search(what, result.message), result.message
+    for name in ("'auto'", "'RadauIIA9'", "'TRBDF2'"):
+        assert name in result.message
+
+
+SMOOTH = [(mechanisms.four_bar, 10.0), (mechanisms.double_pendulum, 10.0), (mechanisms.heavy_top, 2.0)]
+SMOOTH += [(lambda: mechanisms.closed_chain(10), 2.0), (mechanisms.bricard, 10.0), (mechanisms.rolling_disc, 5.0)]
+SMOOTH += [(mechanisms.spatial_four_bar, 5.0), (mechanisms.spatial_slider_crank, 5.0)]
+
+
+@EXPLICIT
+@pytest.mark.parametrize("tol", quick([1e-4, 1e-8, 1e-12]))
+@pytest.mark.parametrize(("make", "end"), quick(SMOOTH, 4))
+@pytest.mark.filterwarnings("ignore::twoloop.ConstraintWarning")
+def test_smooth_motion_is_not_called_stiff(make, end, tol, method):
+    never = event(lambda t, q, v: 1.0, terminal=True)  # has Python look at a run every 16 attempts
+    result = run_of(make(), end, method, tol, events=never)
+    assert result.success and STIFF not in result.message
+
+
+def test_methods_for_stiff_motion_and_the_default_say_nothing():
+    for method in ("auto", "TRBDF2", "RadauIIA5", "Gauss8"):
+        assert STIFF not in run_of(mechanisms.moderately_stiff_beam(), 0.1, method, 1e-3).message
+
+
+@EXPLICIT
+def test_a_stiff_spring_in_python_is_seen(method, monkeypatch):
+    """A point on a circle, tied to its lowest position by a spring of 1e4 rad/s in which next to no motion is.
+
+    What is said is the same on a machine that is too busy for long chunks of steps.
+    """
+    stiff = pendulum(
+        n_q=3,
+        mass=np.eye(3),
+        force=lambda t, q, v: np.array([0.0, -9.81, -1e8 * (q[2] - np.sin(t)) - np.sin(t)]),
+        jacobian=lambda t, q: np.array([[q[0], q[1], 0.0]]),
+    )
+    start = ([1.0, 0.0, 0.0], [0.0, 0.0, 1.0])
+    messages = []
+    for allowed in (0.0, np.inf):  # s of a chunk, from which on chunks do not grow
+        monkeypatch.setattr("twoloop.run.course.CHUNK_TIME", allowed)
+        result = solve_dae(stiff, (0.0, 0.3), *start, method=method, rtol=1e-4, atol=1e-4)
+        messages.append(result.message)
+    found = re.search(r"vibrations of (\S+) rad/s", result.message)
+    assert result.success and found and float(found[1]) == pytest.approx(1e4, rel=0.05) and messages[0] == messages[1]

@@ -2,6 +2,7 @@
 
 import pytest
 
+from tests.problems import quick
 from tests.processes import run_python
 
 RUN = """
@@ -33,7 +34,7 @@ KINDS = ("ends", "t_eval", "dense", "Integrator")
 
 @pytest.mark.parametrize(
     ("tol", "compiled", "name"),
-    [(1e-3, False, "diagonal_step"), (1e-5, False, "newton_step"), (1e-5, True, "newton_step")],
+    quick([(1e-3, False, "diagonal_step"), (1e-5, False, "newton_step"), (1e-5, True, "newton_step")]),
 )
 def test_a_run_that_loads_its_implicit_method_is_the_one_that_had_it(tol, compiled, name):
     source = RUN.format(tol=tol, compiled=compiled, kinds=KINDS)
@@ -41,30 +42,3 @@ def test_a_run_that_loads_its_implicit_method_is_the_one_that_had_it(tol, compil
     assert loaded == name  # and no other
     assert all(line.startswith("REACHED_END") and line.split()[1] != "0" for line in lines[::2])
     assert lines == run_python(BEFORE + source).stdout.splitlines()[:-1]
-
-
-def test_a_solution_between_steps_is_the_same_before_and_after_the_method_is_loaded():
-    """Its pieces may come to the implicit method, too, as long as the solution lasts: a rod of 1e9 N/m."""
-    source = """
-import numpy as np
-from twoloop import ConstrainedSystem, RungeKutta, solve_dae
-from twoloop.methods.tableaux import gauss
-
-def force(t, q, v):
-    d = q[2:] - q[:2]
-    pull = 1e9 * (np.hypot(*d) - 1.0) / np.hypot(*d) * d
-    return np.concatenate([[0.0, -9.81] + pull, [0.0, -9.81] - pull])
-
-system = ConstrainedSystem.from_python(
-    n_q=4, n_c=1, mass=np.eye(4), force=force, constraint=lambda t, q: np.array([q[0] ** 2 + q[1] ** 2 - 1.0]),
-    jacobian=lambda t, q: np.array([[2.0 * q[0], 2.0 * q[1], 0.0, 0.0]]),
-)
-length = 2.0 + 0.8 * 9.81 / 1e9
-start = [0.6, -0.8, 0.6 * length, -0.8 * length], np.zeros(4)
-for _ in range(2):
-    method = RungeKutta(gauss(3), outer="auto")
-    result = solve_dae(system, (0.0, 0.02), *start, method, rtol=0.1, atol=0.1, dense_output=True)
-    print(result.status.name, result.sol(np.linspace(0.0, 0.02, 3001)).v.tobytes().hex()[-4000:])
-"""
-    first, second = run_python(source).stdout.splitlines()
-    assert first == second and first.startswith("REACHED_END")

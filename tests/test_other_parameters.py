@@ -14,10 +14,6 @@ from tests.test_bounds import FAR
 from twoloop import ConstrainedSystem, Integrator, callback, consistent_state, mechanisms, solve, solve_dae
 from twoloop.checks.scales import scales_of
 from twoloop.checks.violation import Violation, surely_consistent
-from twoloop.generate.compiled_series import compiled_series
-from twoloop.generate.families import _alone
-from twoloop.generate.straight_code import own_code
-from twoloop.generate.straight_line import StraightLine
 from twoloop.kernels.compile.caches import Newest
 
 METHODS = ["auto", "Taylor", "DOP853", "Adams", "RadauIIA5", "BDF"]
@@ -337,22 +333,6 @@ def test_a_run_is_what_it_is_without_code(parameters, method):
     assert np.abs(made.q[:, -1] - expected.q[:, -1]).max() < 1e-7
 
 
-@pytest.mark.parametrize("make", quick(MECHANISMS, 3))
-def test_numbers_of_other_parameters_are_those_that_are_traced_for_them(make):
-    problem, random = make(), np.random.default_rng(2)
-    system = problem.system
-    own_code(system, 0.0, problem.q0)  # for which the family is traced
-    p = system.parameters
-    varies = p != np.round(p)
-    other = system.with_parameters(np.where(varies, p * random.uniform(0.98, 1.02), p))
-    code = own_code(other, 0.0, problem.q0)
-    assert (code.shared.family is own_code(system, 0.0, problem.q0).shared.family) or not varies.any()
-    expected = StraightLine(other, code.shared.equations.choice, _alone(other).equations(other))
-    near = np.array([problem.q0, problem.v0]) + random.uniform(-0.1, 0.1, (5, 2, system.n_q))
-    states = np.column_stack([np.linspace(0.0, 0.1, 5), near.reshape(5, -1)])
-    assert code.traced.wrong(other, states) is None and expected.traced.wrong(other, states) is None
-
-
 @pytest.mark.parametrize("first", [1e-14, 5e-324, 1e30, 1.3000000001, 0.4])
 def test_what_ran_before_has_no_part_in_it(first):
     """Parameters that are alike, tiny or huge once are told apart all the same."""
@@ -372,14 +352,6 @@ def test_callbacks_that_are_no_formulas_of_their_parameters_run_all_the_same(for
         system = bead([1.3, value, 0.4, 1.9], force)
         made, expected = run_bead(system), run_bead(system, compiled=False, method="DOP853")
         assert made.success and np.abs(made.q[:, -1] - expected.q[:, -1]).max() < 1e-7
-
-
-def test_nothing_is_traced_for_the_next_parameters(monkeypatch):
-    start = np.array([1.9, 0.0])
-    own_code(bead(PARAMETERS[0]), 0.0, start)
-    monkeypatch.setattr("twoloop.generate.straight_code.StraightLine", None)
-    code = own_code(bead(PARAMETERS[0]).with_parameters([1.4, 2.9, 0.5, 1.9]), 0.0, start)
-    compiled_series(code)
 
 
 def test_threads_trace_one_family_one_after_another(monkeypatch):

@@ -53,13 +53,6 @@ def test_least_versions_are_those_that_are_tested(requirement):
     assert oldest < numbers(pins("requirements.lock")[name])
 
 
-def test_the_tools_of_both_test_runs_are_the_same():
-    least = {requirement.split(">=")[0] for requirement in PROJECT["dependencies"]}
-    tools = {name: version for name, version in pins("requirements-oldest.txt").items() if name not in least}
-    locked = pins("requirements.lock")
-    assert tools and all(locked[name] == version for name, version in tools.items())
-
-
 # --- private parts of numba: in one folder, of versions that are known, and put back after each compilation
 def test_other_versions_of_numba_are_refused_with_what_to_install():
     for known in ("0.61.0", "0.68.1", "0.68.0rc1"):

@@ -4,7 +4,6 @@ import copy
 import cProfile
 import pickle
 import pstats
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import FrozenInstanceError, replace
 from functools import cache
 from itertools import chain
@@ -135,17 +134,6 @@ def test_results_do_not_share_arrays(taken):
     assert all((each.q == q).all() for each, q in zip(results, kept, strict=True))
     results[-1].atol[0] = 7.0
     assert runs(problem, starts(problem, 1.0, 1), 1.0)[0].atol[0] == 1e-6
-
-
-def test_threads_have_arrays_of_their_own(taken):
-    problem = mechanisms.four_bar()
-    states = starts(problem, 1.0, 40)
-    alone = runs(problem, states, 1.0)
-    with ThreadPoolExecutor(4) as pool:
-        together = list(pool.map(lambda state: runs(problem, [state], 1.0)[0], states))
-    assert sum(taken) > 60
-    for one, other in zip(alone, together, strict=True):
-        assert (one.q == other.q).all() and (one.lam == other.lam).all()
 
 
 @pytest.mark.parametrize("options", [*({"method": name} for name in ("DOP853", "Adams")), {}], ids=str)

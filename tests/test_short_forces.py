@@ -1,6 +1,5 @@
 """Short and discontinuous forces: no method passes over them, and no estimate of the error is too small there."""
 
-import math
 import warnings
 from functools import cache
 from itertools import pairwise
@@ -10,7 +9,6 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
-import twoloop.solve
 from tests.problems import event, pendulum, quick, unconstrained
 from twoloop import ConstrainedSystem, ConstraintWarning, Integrator, Status, ensemble, mechanisms, solve_dae
 from twoloop.mechanisms import n_four_bar
@@ -58,15 +56,22 @@ def start_of(state):
 
 
 @cache
-def reference(force, state):
-    """The end position from the equation of the angle alone, by SciPy with steps too short to pass over anything."""
+def reference(force, state, p=None, longest=T_END / 600.0, around=None):
+    """Compute the end position from the equation of the angle, by SciPy in steps too short to pass over anything.
+
+    With `around` steps are that much shorter close to the time p[0].
+    """
+    given = () if p is None else (p,)
 
     def rates(t, y):
         q, along = position(y[0]), np.array([np.cos(y[0]), np.sin(y[0])])
-        return [y[1], along @ force(t, q, y[1] * along)]
+        return [y[1], along @ force(t, q, y[1] * along, *given)]
 
-    run = solve_ivp(rates, (0.0, T_END), state, method="DOP853", rtol=1e-12, atol=1e-12, max_step=T_END / 600.0)
-    return position(run.y[0, -1])
+    edges = [0.0, T_END] if around is None else [0.0, p[0] - 8.0 * p[1], p[0] + 8.0 * p[1], T_END]
+    for t0, t1 in pairwise(edges):
+        steps = longest if around is None or t1 - t0 > 0.1 else around
+        state = solve_ivp(rates, (t0, t1), state, method="DOP853", rtol=1e-11, atol=1e-11, max_step=steps).y[:, -1]
+    return position(state[0])
 
 
 # forces as they are given, so that references are made once
@@ -187,13 +192,6 @@ def test_auto_goes_on_where_a_series_is_not_finite(name, compiled):
         assert np.abs(np.sum(result.sol(0.5 * (result.t[1:] + result.t[:-1])).q ** 2, axis=0) - 1.0).max() < 1e-12
 
 
-@pytest.mark.parametrize("compiled", [False, True])
-def test_a_series_that_is_not_finite_says_so(compiled):
-    start = smooth(drag), (0.0, 1.0), *start_of((0.7, 0.0))
-    result = solve_dae(*start, "Taylor", rtol=1e-8, atol=1e-8, compiled=compiled)
-    assert result.status.name == "NOT_FINITE" and "no derivatives" in result.message and "DOP853" in result.message
-
-
 # --- forces that jump within a step, and errors of velocities that last
 TOL = 1e-8
 W, PUSH, END = 3.0, 10.0, 1.0  # rad/s, m/s^2, s
@@ -243,10 +241,10 @@ def test_times_before_zero_are_like_others(at):
     assert result.stats.n_accepted < 130
 
 
-# --- forces that act for a thousandth of the run: steps end where something changes suddenly with time
+# --- forces that act for a thousandth of the run, in time or at a place: steps end where they change suddenly
 SIZE, WIDTH = 200.0, 1e-3
 PLACES = np.random.default_rng(12).uniform(0.4, 2.4, 12)
-DOWN = np.array([0.0, -1.0]), np.array([0.5, 0.0])
+SLOW, FAST = (0.0, 0.5), (0.0, 3.0)  # starts
 
 
 def short_gust(t, q, v, p):
@@ -257,12 +255,8 @@ def switched(t, q, v, p):
     return np.array([SIZE if abs(t - p[0]) < p[1] else 0.0, -9.81])
 
 
-def not_a_number(t, q, v, p):
-    return np.array([np.nan if abs(t - p[0]) < p[1] else 0.0, -9.81])
-
-
-def infinite(t, q, v, p):
-    return np.array([np.inf if abs(t - p[0]) < p[1] else 0.0, -9.81])
+def not_finite(t, q, v, p):
+    return np.array([p[2] if abs(t - p[0]) < p[1] else 0.0, -9.81])
 
 
 def outside_not_a_number(t, q, v, p):
@@ -281,144 +275,70 @@ def cogs(t, q, v, p):
     return np.array([20.0 * np.cos((q[0] - p[0]) / p[1]) ** 32, -9.81])
 
 
-def pendulum_with(force, at=1.5, width=WIDTH, compile=True):
-    return pendulum(compile=compile, force=force, parameters=[at, width])
-
-
-SHORT = {"gust": short_gust, "switched": switched, "smooth magnet": smooth_magnet, "cogs": cogs}
-
-
 @cache
-def short_system(name):
-    return pendulum_with(SHORT[name])
+def pendulum_with(force, compile=True):
+    return pendulum(compile=compile, force=force, parameters=[1.5, WIDTH])
 
 
-@cache
-def end(force, at):
-    """(x, y) at T_END by the angle, in steps that cannot pass over the short_gust."""
+def end_of(force, p, start, compile=True, **options):
+    system = pendulum_with(force, compile).with_parameters(p)
+    result = solve_dae(system, (0.0, T_END), *start_of(start), **options)
+    assert result.success, result.message
+    return result.q[:, -1]
 
-    def rate(t, state):
-        return state[1], np.cos(state[0]) * force(t, None, None, (at, WIDTH))[0] - 9.81 * np.sin(state[0])
 
-    state = np.array([0.0, 0.5])
-    for t0, t1 in ((0.0, at - 8 * WIDTH), (at - 8 * WIDTH, at + 8 * WIDTH), (at + 8 * WIDTH, T_END)):
-        longest = WIDTH / 20.0 if force is switched and t1 - t0 < 0.1 else max(WIDTH / 2.0, (t1 - t0) / 40.0)
-        made = solve_ivp(rate, (t0, t1), state, method="DOP853", rtol=1e-11, atol=1e-11, max_step=longest)
-        state = made.y[:, -1]
-    return np.array([np.sin(state[0]), -np.cos(state[0])])
+def at_a_time(force, at):
+    shortest = WIDTH / (20.0 if force is switched else 2.0)
+    return reference(force, SLOW, (at, WIDTH), T_END / 40.0, shortest)
+
+
+TIGHT = {"rtol": 1e-8, "atol": 1e-8}
+LOOSE = {"rtol": 1e-6, "atol": 1e-6}
 
 
 @pytest.mark.parametrize("options", quick([{}, {"compiled": False}, {"method": "Adams"}, {"method": "RadauIIA5"}]))
 def test_no_gust_of_a_thousandth_of_the_run_is_passed_over(options):
     for at in PLACES:
-        system = short_system("gust").with_parameters([at, WIDTH])
-        result = solve_dae(system, (0.0, T_END), *DOWN, rtol=1e-8, atol=1e-8, **options)
-        assert result.success and np.abs(result.q[:, -1] - end(short_gust, at)).max() < 1e-5
+        found = end_of(short_gust, (at, WIDTH), SLOW, **TIGHT, **options)
+        assert np.abs(found - at_a_time(short_gust, at)).max() < 1e-5
 
 
 @pytest.mark.parametrize("method", ["auto", "TRBDF2"])
 def test_nor_is_a_force_that_is_switched_on_for_that_time(method):
     for at in PLACES[:4]:
-        system = short_system("switched").with_parameters([at, WIDTH])
-        result = solve_dae(system, (0.0, T_END), *DOWN, method=method, rtol=1e-6, atol=1e-6)
-        assert result.success and np.abs(result.q[:, -1] - end(switched, at)).max() < 1e-3
+        found = end_of(switched, (at, WIDTH), SLOW, method=method, **LOOSE)
+        assert np.abs(found - at_a_time(switched, at)).max() < 1e-3
 
 
-def end_behind_edges(at, width):
-    """(x, y) at T_END by the angle under the magnet, begun anew at each of its edges."""
-
-    def rate(t, y):
-        return y[1], np.cos(y[0]) * magnet(t, [np.sin(y[0])], None, (at, width))[0] - 9.81 * np.sin(y[0])
-
-    events = [event(lambda t, y, edge=edge: np.sin(y[0]) - edge, True) for edge in (at - width, at + width)]
-    t, y = 0.0, np.array([0.0, 3.0])
-    while t < T_END:
-        made = solve_ivp(rate, (t, T_END), y, method="DOP853", rtol=1e-10, atol=1e-10, max_step=2e-3, events=events)
-        t, y = made.t[-1], made.y[:, -1]
-        if made.status == 1:  # beyond the edge
-            y, t = y + 1e-10 * np.array(rate(t, y)), t + 1e-10
-    return np.array([np.sin(y[0]), -np.cos(y[0])])
-
-
-def test_nor_is_what_acts_at_a_place_that_is_passed_in_that_time():
-    at, width = 0.3, 3e-3
-    expected = end_behind_edges(at, width)
-    for compile in (True, False):
-        system = pendulum_with(magnet, at, width, compile)
-        for method in ("auto", "DOP853", "RadauIIA9", "Adams", "BDF"):
-            result = solve_dae(system, (0.0, T_END), DOWN[0], [3.0, 0.0], method, rtol=1e-6, atol=1e-6)
-            assert result.success and np.abs(result.q[:, -1] - expected).max() < 1e-4
-
-
-PLACES_AND_WIDTHS = {
-    "smooth magnet": ((0.1, 5e-3), (0.3, 5e-3), (-0.2, 1e-2), (0.4, 1e-2)),
-    "cogs": tuple((0.1, width) for width in np.linspace(0.04, 0.09, 24)[::2].tolist()),
-}
-ANGLES = {  # at T_END, by `angle_behind_a_place`; with half its steps and a hundredth of its tolerance 1e-10 from it
-    "smooth magnet": (0.8940700426, 0.9658623702, -0.0539605515, 1.3315628819),
-    "cogs": (
-        *(0.5489668711, 1.1252816754, 0.6147421969, 1.1688734996, 0.7639210604, 0.7074273204),
-        *(1.2187527686, 0.8991678508, 0.8161683773, 0.5751799883, 0.8080871428, 1.2009418208),
-    ),
-}
-
-
-def behind_a_place(name):
-    """(at, width) and (x, y) at T_END of each."""
-    return [
-        (*given, np.array([np.sin(angle), -np.cos(angle)]))
-        for given, angle in zip(PLACES_AND_WIDTHS[name], ANGLES[name], strict=True)
-    ]
-
-
-def angle_behind_a_place(name, at, width):
-    """At T_END, in steps of a quarter of the time in which a force at a place is passed."""
-    force, longest = SHORT[name], 0.035 * width if name == "cogs" else 5e-4
-
-    def rate(t, state):
-        along = math.cos(state[0]) * force(t, (math.sin(state[0]),), None, (at, width))[0]
-        return state[1], along - 9.81 * math.sin(state[0])
-
-    made = solve_ivp(rate, (0.0, T_END), (0.0, 3.0), method="DOP853", rtol=1e-11, atol=1e-11, max_step=longest)
-    return made.y[0, -1]
-
-
-@pytest.mark.slow  # numbers that do not change
-@pytest.mark.parametrize("name", ANGLES)
-def test_the_ends_behind_a_place_are_those_of_scipy(name):
-    for at, width, end in behind_a_place(name):
-        angle = angle_behind_a_place(name, at, width)
-        assert np.abs(end - [np.sin(angle), -np.cos(angle)]).max() < 1e-9
+@pytest.mark.parametrize("compile", [True, False])
+def test_nor_is_what_acts_at_a_place_that_is_passed_in_that_time(compile, p=(0.3, 3e-3)):
+    expected = reference(magnet, FAST, p, 5e-4)
+    for method in ("auto", "DOP853", "RadauIIA9", "Adams", "BDF"):
+        assert np.abs(end_of(magnet, p, FAST, compile, method=method, **LOOSE) - expected).max() < 1e-4
 
 
 @pytest.mark.parametrize("options", quick([{}, {"compiled": False}, {"method": "Taylor"}, {"method": "DOP853"}], 2))
-def test_nor_is_a_smooth_force_at_such_a_place(options, tolerance=1e-8):
+def test_nor_is_a_smooth_force_at_such_a_place(options):
     """It is passed at 3/s, a width in a two-thousandth of the run or more."""
-    for at, width, expected in behind_a_place("smooth magnet"):
-        system = short_system("smooth magnet").with_parameters([at, width])
-        run = (0.0, T_END), DOWN[0], [3.0, 0.0]
-        result = solve_dae(system, *run, rtol=tolerance, atol=tolerance, **options)
-        assert result.success and np.abs(result.q[:, -1] - expected).max() < 1e3 * tolerance
+    for p in ((0.1, 5e-3), (-0.2, 1e-2)):
+        expected = reference(smooth_magnet, FAST, p, 5e-4)
+        assert np.abs(end_of(smooth_magnet, p, FAST, **TIGHT, **options) - expected).max() < 1e-5
 
 
 @pytest.mark.parametrize("method", quick(["Adams", "BDF", "SunRadau5"]))
 def test_nor_is_a_force_that_is_not_finite(method):
     """For a 300th and a thousandth of the run; it hid later changes, too."""
-    each = zip(PLACES, (300, 1000) * 6, (not_a_number, not_a_number, infinite, infinite) * 3, strict=True)
-    for at, share, wrong in each:
-        system = pendulum_with(wrong, at, 0.5 * T_END / share)
-        result = solve_dae(system, (0.0, T_END), *DOWN, method=method, rtol=1e-6, atol=1e-6)
+    for at, share, wrong in zip(PLACES, (300, 1000) * 6, (np.nan, np.nan, np.inf, np.inf) * 3, strict=True):
+        p = at, 0.5 * T_END / share, wrong
+        system = pendulum(force=lambda t, q, v, p=p: not_finite(t, q, v, p))
+        result = solve_dae(system, (0.0, T_END), *start_of(SLOW), method=method, **LOOSE)
         assert result.status is Status.NOT_FINITE and abs(result.t[-1] - at) < T_END / share, result
 
 
 @pytest.mark.parametrize("method", ["DOP853", "RadauIIA5"])
 def test_a_gust_far_ahead_does_not_stop_a_body_at_rest(method):
     """Its least values change by steps, and so do the accelerations and velocities that they give."""
-
-    def far(t, q, v):
-        return np.array([SIZE * np.exp(-(((t - 4.0) / 0.1) ** 2)) - q[0]])
-
-    body = ConstrainedSystem.from_python(n_q=1, n_c=0, mass=np.eye(1), force=far)
+    body = unconstrained(lambda t, q, v: np.array([SIZE * np.exp(-(((t - 4.0) / 0.1) ** 2)) - q[0]]))
     result = solve_dae(body, (0.0, 10.0), [0.0], [0.0], method, rtol=1e-8, atol=1e-8)
     exact = SIZE * 0.1 * np.sqrt(np.pi) * np.exp(-(0.1**2) / 4.0) * np.sin(6.0)
     assert result.success and abs(result.q[0, -1] - exact) < 1e-5
@@ -430,34 +350,32 @@ def test_what_is_not_finite_where_no_step_comes_ends_no_run(method):
     """x is at most 1, and its parabola goes beyond."""
     counts = []
     for force in (outside_not_a_number, lambda t, q, v, p: np.array([0.0 * t**0.5, -9.81])):
-        result = solve_dae(pendulum_with(force, compile=False), (0.0, T_END), DOWN[0], [6.2, 0.0], method)
+        result = solve_dae(pendulum_with(force, False), (0.0, T_END), *start_of((0.0, 6.2)), method)
         assert result.success and result.q[0].max() > 0.99
         counts.append(len(result.h))
     assert counts[0] < 2 * counts[1]
 
 
-def test_nor_in_lanes():
-    runs = ensemble(
-        short_system("gust"), (0.0, T_END), *DOWN, parameters=[[at, WIDTH] for at in PLACES], rtol=1e-8, atol=1e-8
-    )
+def test_nor_are_gusts_in_lanes():
+    given = {"parameters": [[at, WIDTH] for at in PLACES], **TIGHT}
+    runs = ensemble(pendulum_with(short_gust), (0.0, T_END), *start_of(SLOW), **given)
     assert runs.success.all()
     for q, at in zip(runs.q[:, :, -1], PLACES, strict=True):
-        assert np.abs(q - end(short_gust, at)).max() < 1e-5
+        assert np.abs(q - at_a_time(short_gust, at)).max() < 1e-5
 
 
-def test_nor_are_pulses_of_a_high_power_of_a_cosine(tolerance=1e-6):
+def test_nor_are_pulses_of_a_high_power_of_a_cosine():
     """Between these the force and its series are zero to rounding; each acts for a hundredth of the run."""
-    given = {"parameters": PLACES_AND_WIDTHS["cogs"], "rtol": tolerance, "atol": tolerance}
-    runs = ensemble(short_system("cogs"), (0.0, T_END), DOWN[0], [3.0, 0.0], method="Taylor", t_eval=[T_END], **given)
-    assert runs.success.all() and (~runs.singly).sum() > 6
-    for q, (_, _, end) in zip(runs.q[:, :, -1], behind_a_place("cogs"), strict=True):
-        assert np.abs(q - end).max() < 1e3 * tolerance
+    widths = np.linspace(0.04, 0.09, 24)[::3].tolist()
+    given = {"parameters": [[0.1, width] for width in widths], **LOOSE}
+    runs = ensemble(pendulum_with(cogs), (0.0, T_END), *start_of(FAST), method="Taylor", t_eval=[T_END], **given)
+    assert runs.success.all() and (~runs.singly).sum() > 4
+    for q, width in zip(runs.q[:, :, -1], widths, strict=True):
+        assert np.abs(q - reference(cogs, FAST, (0.1, width), 0.035 * width)).max() < 1e-3
 
 
 # --- pulses of a force, again and again in a long run: none is passed over, or the run says so
 MASS, STIFFNESS, DAMPING = 1.04, 4.0, 0.3
-TABLE_AT = np.linspace(0.0, 60.0, 121)
-TABLE = np.sin(0.7 * TABLE_AT) + 0.3 * np.sin(2.1 * TABLE_AT)
 
 
 def pulsed(t, q, v, p):
@@ -465,22 +383,31 @@ def pulsed(t, q, v, p):
     return np.array([push - STIFFNESS * q[0] - DAMPING * v[0]])
 
 
-def slide(period, width, begin=0.0, compile=True):
-    given = {"n_q": 1, "n_c": 0, "mass": np.array([[MASS]]), "parameters": [period, width, begin]}
-    return ConstrainedSystem.from_python(force=pulsed, compile=compile, **given)
+def on_a_spring(force, *parameters, compile=True):
+    given = {"n_q": 1, "n_c": 0, "mass": np.array([[MASS]]), "parameters": parameters}
+    return ConstrainedSystem.from_python(force=force, compile=compile, **given)
+
+
+def slide(period, width, begin=0.0):
+    return on_a_spring(pulsed, period, width, begin)
+
+
+def state_after(pushes):
+    """Position and velocity from rest after pushes that last for some time each."""
+    state = np.zeros(2)
+    matrix = np.array([[0.0, 1.0], [-STIFFNESS / MASS, -DAMPING / MASS]])
+    for push, span in pushes:
+        rest = np.array([push / STIFFNESS, 0.0])
+        state = rest + expm(matrix * span) @ (state - rest)
+    return state
 
 
 def end_of_pulses(period, width, begin, t_end):
     """Position and velocity at the end, from rest, from one edge of a pulse to the next."""
     edges = np.add.outer(begin + period * np.arange(-1, t_end // period + 1), [0.0, width]).ravel()
     edges = np.concatenate([[0.0], edges[(edges > 0.0) & (edges < t_end)], [t_end]])
-    state = np.zeros(2)
-    for t0, t1 in pairwise(edges.tolist()):
-        push = 5.0 if (0.5 * (t0 + t1) - begin) % period < width else 0.0
-        rest = np.array([push / STIFFNESS, 0.0])
-        matrix = np.array([[0.0, 1.0], [-STIFFNESS / MASS, -DAMPING / MASS]])
-        state = rest + expm(matrix * (t1 - t0)) @ (state - rest)
-    return state
+    pieces = pairwise(edges.tolist())
+    return state_after((5.0 if (0.5 * (a + b) - begin) % period < width else 0.0, b - a) for a, b in pieces)
 
 
 def pulses_off(result, *pulses):
@@ -513,26 +440,6 @@ def test_repeated_calls_see_what_the_first_has_seen():
         assert (result.q == results[0].q).all() and result.stats.n_accepted == results[0].stats.n_accepted
 
 
-SMOOTH = {
-    "table": lambda t, q, v: np.array([np.interp(t, TABLE_AT, TABLE), -9.81]),
-    "square": lambda t, q, v: np.array([1.0 if np.sin(3.0 * t) > 0.0 else -1.0, -9.81]),
-    "steep": lambda t, q, v: np.array([np.tanh(5.0 * np.sin(3.0 * t)), -9.81]),
-    "gust": lambda t, q, v: np.array([20.0 * np.exp(-(((t - 5.0) / 0.3) ** 2)), -9.81]),
-}
-
-
-@pytest.mark.parametrize(
-    ("name", "method"), quick([(name, method) for method in ("auto", "Adams", "RadauIIA5") for name in SMOOTH], 2)
-)
-def test_no_run_is_made_again_without_need(name, method, monkeypatch):
-    made = []
-    monkeypatch.setattr(twoloop.solve, "closer", made.append)
-    system = pendulum(force=SMOOTH[name], compile=True)
-    for tolerance in (1e-4, 1e-8):
-        assert solve_dae(system, (0.0, 60.0), [0.8, -0.6], [0.0, 0.0], method, tolerance, tolerance).success
-    assert not made
-
-
 GUSTY = "period", "width", "begin", "method", "tolerance"  # of gusts 5 exp(-(t / width)^2)
 MET_BY_SHORT_STEPS = [
     (5.0, 2e-3, 0.01, "Adams", 1e-6),
@@ -547,11 +454,6 @@ def gusts(t, q, v, p):
     return np.array([5.0 * np.exp(-((since / p[1]) ** 2)) - STIFFNESS * q[0] - DAMPING * v[0]])
 
 
-def gusty(period, width, begin, compile=True):
-    given = {"n_q": 1, "n_c": 0, "mass": np.array([[MASS]]), "parameters": [period, width, begin]}
-    return ConstrainedSystem.from_python(force=gusts, compile=compile, **given)
-
-
 def after_gusts(period, width, begin, t_end, n=100):
     """Position and velocity at the end: each gust leaves a vibration, as the integral of its force has it."""
     rate = np.roots([MASS, DAMPING, STIFFNESS])[0]
@@ -564,7 +466,9 @@ def after_gusts(period, width, begin, t_end, n=100):
 @pytest.mark.parametrize(GUSTY, MET_BY_SHORT_STEPS)
 def test_gusts_that_short_steps_met_are_not_passed_over_later(period, width, begin, method, tolerance):
     """To closer looks these are smooth, and so none of their flanks was found, nor were the gusts that followed."""
-    result = solve_dae(gusty(period, width, begin), (0.0, 49.0), [0.0], [0.0], method, tolerance, tolerance)
+    result = solve_dae(
+        on_a_spring(gusts, period, width, begin), (0.0, 49.0), [0.0], [0.0], method, tolerance, tolerance
+    )
     known = after_gusts(period, width, begin, 49.0)
     assert result.success and np.abs([result.q[0, -1], result.v[0, -1]] - known).max() < 1e3 * tolerance
 
@@ -581,8 +485,7 @@ def some_gusts(t, q, v, p):
 
 def many_runs(P, method, compile=True):
     """Of runs over 60 s, their errors over the tolerances, too."""
-    given = {"n_q": 1, "n_c": 0, "mass": np.array([[MASS]]), "parameters": P[0]}
-    system = ConstrainedSystem.from_python(force=some_gusts, compile=compile, **given)
+    system = on_a_spring(some_gusts, *P[0], compile=compile)
     runs = ensemble(system, (0.0, 60.0), [0.0], [0.0], parameters=P, rtol=1e-7, atol=1e-7, method=method)
     assert runs.success.all()
     known = np.array([after_gusts(*p, 60.0, N_GUSTS) for p in P])
@@ -620,15 +523,10 @@ def two_pulses(t, q, v, p):
 @pytest.mark.parametrize("method", quick(["auto", "Adams", "BDF", "TRBDF2", "RadauIIA5"]))
 def test_a_pulse_is_found_ahead_of_a_much_larger_one(method):
     """Beside the large one the small one was no sudden change, and steps went from before it to between both."""
-    given = {"n_q": 1, "n_c": 0, "mass": np.array([[MASS]]), "parameters": [1.0, 20.0, -300.0]}
-    system = ConstrainedSystem.from_python(force=two_pulses, compile=True, **given)
-    matrix = np.array([[0.0, 1.0], [-STIFFNESS / MASS, -DAMPING / MASS]])
+    system = on_a_spring(two_pulses, 1.0, 20.0, -300.0)
     for begin in np.linspace(1.0, 1.1, 15):
         result = solve_dae(system.with_parameters([begin, 20.0, -300.0]), (0.0, 3.0), [0.0], [0.0], method, 1e-6, 1e-6)
-        state = np.zeros(2)
-        for push, span in ((20.0, 2e-3), (0.0, 4e-3), (-300.0, 2e-3), (0.0, 3.0 - begin - 8e-3)):
-            rest = np.array([push / STIFFNESS, 0.0])
-            state = rest + expm(matrix * span) @ (state - rest)
+        state = state_after(((20.0, 2e-3), (0.0, 4e-3), (-300.0, 2e-3), (0.0, 3.0 - begin - 8e-3)))
         assert result.success and np.abs([result.q[0, -1], result.v[0, -1]] - state).max() < 1e-3
 
 

@@ -168,6 +168,7 @@ print(result.status.name, result.t[-1], result.t.size)
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name == "nt", reason="signals of POSIX")
 @pytest.mark.parametrize("name", quick(["SIGKILL", "SIGINT"]))
 def test_ctrl_c_and_the_death_of_the_process(default_four_bar, tmp_path, name):
@@ -227,13 +228,6 @@ def gone(name):
     return lambda arrays, words: (arrays if name in arrays else words).pop(name)
 
 
-def in_each_others_place(one, other):
-    def change(arrays, words):
-        arrays[one], arrays[other] = arrays[other], arrays[one]
-
-    return change
-
-
 CASES = {
     "no times": ("t ", gone("t")),
     "a time that is none": ("t ", entry("t", 2, np.nan)),
@@ -271,16 +265,6 @@ def test_what_a_field_may_not_hold(case, saved, tmp_path):
     path = changed(saved, tmp_path, change)
     with pytest.raises(ValueError, match=f"(?s){field}.*(must be|are)"):
         twoloop.load(path, four_bar().system)
-
-
-@pytest.mark.parametrize("pair", [("q", "v"), ("v", "a"), ("q", "lam"), ("t_events_0", "sol_t")])
-def test_arrays_in_each_others_place(pair, saved, tmp_path):
-    with np.load(saved) as file:
-        arrays = {name: file[name] for name in file.files}
-    in_each_others_place(*pair)(arrays, {})
-    np.savez(tmp_path / "mixed.npz", **arrays)
-    with pytest.raises(ValueError, match=f"({pair[0]}|{pair[1]}) in .* must be what was saved under this name"):
-        twoloop.load(tmp_path / "mixed.npz")
 
 
 def test_a_field_whose_bytes_changed_is_named(saved, tmp_path):
@@ -348,6 +332,7 @@ print(refused, read)
 """
 
 
+@pytest.mark.slow
 def test_nothing_in_a_file_ends_the_process(saved, tmp_path):
     refused, read = map(int, run_python(FUZZ, saved, tmp_path, 240, PYTHONWARNINGS="ignore").stdout.split())
     assert refused > 120 and read > 10  # both ways were tried

@@ -3,7 +3,6 @@
 import ctypes
 import gc
 import math
-from collections import defaultdict
 from dataclasses import replace
 
 import numpy as np
@@ -13,23 +12,18 @@ from hypothesis import strategies as st
 from numba import njit
 
 from tests.problems import pendulum, quick, unconstrained, worst
-from tests.processes import run_python
 from twoloop import ConstraintWarning, mechanisms
-from twoloop.generate import llvm_text, parts_code
-from twoloop.generate.choices import Choice
 from twoloop.generate.coefficients import Coefficients
-from twoloop.generate.derivative import Derivative
 from twoloop.generate.llvm_text import Module
 from twoloop.generate.llvm_trigonometry import LARGEST_ANGLE
-from twoloop.generate.straight_code import SharedCode, own_code, write_function
-from twoloop.generate.straight_line import Outputs, Solution, StraightLine
+from twoloop.generate.straight_code import own_code, write_function
+from twoloop.generate.straight_line import Outputs
 from twoloop.generate.symbolic_factors import Factors
-from twoloop.generate.tracing import Form, Graph
+from twoloop.generate.tracing import Graph
 from twoloop.kernels.compile.own_functions import CALLED, OwnFunctions, object_code
 from twoloop.kernels.data.codes import DONE
 from twoloop.kernels.data.noted import BY_GENERAL
 from twoloop.kernels.evaluation import tasks
-from twoloop.mechanisms import andrews, four_bar, heavy_top, spatial_four_bar
 from twoloop.methods.presets import PRESETS
 from twoloop.run.run import Run
 from twoloop.solve import solve_dae
@@ -101,32 +95,6 @@ def test_a_state_is_moved_to_the_nearest_on_the_constraints(make):
         assert np.abs(np.linalg.svd(G.T)[2][run.rank :] @ lam).max() < 1e-8 * np.abs(lam).max()
 
 
-@pytest.mark.parametrize(
-    "make", quick([mechanisms.four_bar, mechanisms.redundant_slider_crank, mechanisms.rolling_disc])
-)
-def test_equations_in_parts_give_the_same(make, monkeypatch):
-    problem, rng = make(), np.random.default_rng(5)
-    n, choice = problem.system.n_q, Choice.at(problem.system, 0.0, problem.q0)
-    q = problem.q0 + 1e-6 * rng.standard_normal(n)
-    v = problem.v0 + 1e-3 * rng.standard_normal(n)
-    made = []
-    for long in (10**6, 0):
-        monkeypatch.setattr(parts_code, "LONG", long)
-        code = SharedCode(StraightLine(problem.system, choice), None)
-        assert (code.parts is not None) == (long == 0)
-        plan = PRESETS["DOP853"].plan(n, 1e-8, 1e-8, False)
-        plan = replace(plan, inner=code.inner, own=(code.functions,), numbers=code.numbers.values)
-        run = Run(problem.system, plan, 0.0, problem.q0, problem.v0, 1e-8, np.full(n, 1e-8), None)
-        for task in (tasks.EVALUATE_THERE, *([tasks.PROJECT] if code.projects else [])):
-            run.work.notes[BY_GENERAL] = 0.0
-            found = inner(run, task, 0.0, q, v)
-            assert found[0] == DONE and run.work.notes[BY_GENERAL] == 0.0  # not by the general inner loop
-            made.append(np.concatenate(found[1:]))
-    half = len(made) // 2
-    for one, other in zip(made[:half], made[half:], strict=True):
-        assert np.abs(one - other).max() < 1e-10 * np.abs(one).max()
-
-
 @ending_at_a_reference
 @pytest.mark.parametrize("make", quick(MECHANISMS, 4))
 def test_a_run_ends_at_its_reference_by_as_many_evaluations(make):
@@ -196,38 +164,6 @@ def test_redundant_rows_that_stop_holding_end_the_run():
     assert held.success and not broken.success and broken.status.name == "ROWS_CONTRADICT"
 
 
-@pytest.fixture
-def own_disk(monkeypatch, tmp_path):
-    """A folder for code of this test alone: from that of the user other processes remove the oldest."""
-    monkeypatch.setattr("twoloop.kernels.compile.own_functions.sources_folder", lambda: tmp_path)
-    monkeypatch.setattr("twoloop.kernels.compile.own_functions._MADE", defaultdict(dict))
-    return tmp_path
-
-
-@pytest.mark.slow
-def test_a_second_process_compiles_nothing(own_disk, monkeypatch):
-    monkeypatch.setattr("twoloop.generate.families._FAMILIES", {})  # without what another test has made
-    problem = mechanisms.four_bar()
-    solve_dae(problem.system, (0.0, 0.1), problem.q0, problem.v0, "DOP853", compiled=True)
-    program = """
-        import sys
-        from pathlib import Path
-        from twoloop import solve_dae
-        from twoloop.generate import written
-        from twoloop.kernels.compile import own_functions
-        from twoloop.mechanisms import four_bar
-
-        def refuse(*given):
-            raise AssertionError("compiled again")
-
-        written.Written.operation = own_functions.object_code = refuse
-        own_functions.sources_folder = lambda: Path(sys.argv[1])
-        p = four_bar()
-        solve_dae(p.system, (0.0, 0.1), p.q0, p.v0, "DOP853", compiled=True)
-    """
-    run_python(program, own_disk)
-
-
 # --- forms of a graph as machine code: elimination, sines and cosines to rounding, derivatives of every operation
 def read_by(graph, outputs):
     """The numbers that code for some outputs reads."""
@@ -256,22 +192,6 @@ def machine_code_of(graph, outputs, numbers, divided=False):
         return function(*(each.ctypes.data for each in arrays))
 
     return call
-
-
-@pytest.mark.parametrize("make", quick([heavy_top, four_bar, andrews, spatial_four_bar]))
-def test_code_in_divided_blocks_gives_the_same_numbers(make, monkeypatch):
-    monkeypatch.setattr(llvm_text, "LONGEST", 50)
-    problem = make()
-    system = problem.system
-    equations = StraightLine(system, Choice.at(system, 0.0, problem.q0))
-    state = (0.0, problem.q0, problem.v0)
-    for outputs in (equations.there, equations.nearer, Solution(equations).kept):
-        (holds, whole), (holds_too, divided) = (
-            compute(equations.graph, outputs, state, each) for each in (False, True)
-        )
-        assert holds and holds_too
-        for one, other in zip(whole, divided, strict=True):
-            np.testing.assert_allclose(other, one, rtol=1e-9, atol=1e-9 * np.abs(one).max(initial=1.0))
 
 
 @settings(max_examples=30, deadline=None)
@@ -338,26 +258,6 @@ def test_beyond_the_angles_that_it_takes_and_where_nothing_is_finite_it_says_so(
         holds, (filled,) = compute(graph, outputs, (np.array(each),))
         assert not holds
         assert np.isnan(filled).all()  # nothing was written
-
-
-def test_the_derivative_of_every_operation():
-    graph = Graph()
-    (x,) = graph.inputs(1, False)
-    laws = {
-        "square root": (lambda x: (x + 2.0).square_root(), lambda x: math.sqrt(x + 2.0)),
-        "exponential": (lambda x: (x * 0.5).exponential(), lambda x: math.exp(0.5 * x)),
-        "sine": (lambda x: x.sine(), math.sin),
-        "cosine": (lambda x: x.cosine(), math.cos),
-        "logarithm": (lambda x: (x + 3.0).logarithm(), lambda x: math.log(x + 3.0)),
-        "arctangent": (lambda x: x.arctangent(), math.atan),
-        "quotient": (lambda x: x / (x * x + 1.0), lambda x: x / (x * x + 1.0)),
-    }
-    one = Form(graph, 1.0, {})
-    for law, known in laws.values():
-        slope = Derivative(graph, {0: one}).of(law(x))
-        _, (value,) = compute(graph, Outputs({"slope": [slope]}, []), (np.array([0.7]),))
-        e = 1e-5
-        assert abs(value[0] - (known(0.7 + e) - known(0.7 - e)) / (2.0 * e)) < 1e-9
 
 
 @pytest.mark.usefixtures("collected_alone")

@@ -254,38 +254,8 @@ def test_a_global_that_is_reached_counts_and_others_do_not(tmp_path, monkeypatch
         sweep(swinging, RUNS[:2], **options)
 
 
-# --- cells
-ODD = [1.5, object(), "text", np.ones(2), 2**70, None, np.float64(2.5), "\udc80", 1j, True]
-
-
-def odd(k):
-    problem = swinging(k)
-    problem.parameters["k"] = k
-    return problem
-
-
-def measured_odd(problem, result):
-    return {"x": ODD[problem.parameters["k"]]}
-
-
-def test_what_is_no_cell_is_a_row_that_says_so(tmp_path):
-    out = tmp_path / "rows.parquet"
-    options = {"measure": measured_odd, "parallel": "threads", "workers": 2, "out": out, **QUICK}
-    rows = sweep(odd, [{"k": k} for k in range(len(ODD))], **options)
-    good = [0, 5, 6]
-    assert [k for k, status in enumerate(rows["status"]) if status == "REACHED_END"] == good
-    assert rows.loc[good, "x"].tolist()[::2] == [1.5, 2.5]
-    for k, words in {
-        1: "'x' is <object object at .* of type object",
-        2: "must fill a column with one kind; 'x' had numbers, now 'text'",
-        4: "'x' is 1180591620717411303424 of type int",
-        9: "'x' had numbers, now True",
-    }.items():
-        assert pd.Series([rows.loc[k, "message"]]).str.contains(words).all()
-    pd.testing.assert_frame_equal(pd.read_parquet(out), rows, check_dtype=False)
-
-
 # --- workers that die
+@pytest.mark.slow
 def test_a_worker_that_dies_costs_its_own_run_alone(tmp_path, monkeypatch):
     monkeypatch.setattr(workers, "RENEWED_AFTER", 0)  # processes grow with what they compile: each ends after a run
     out = tmp_path / "rows.parquet"

@@ -1,6 +1,7 @@
 """The Taylor series of the motion: every operation that it knows, every kind of mechanism, and what it refuses."""
 
 import math
+from collections import defaultdict
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from twoloop.generate.llvm_text import Module
 from twoloop.generate.series import series_program
 from twoloop.generate.series_code import SeriesCode
 from twoloop.generate.series_loops import SeriesLoops
+from twoloop.generate.straight_code import own_code
 
 FORCES = {
     "sine and cosine": lambda t, q, v: math.sin(q) * math.cos(2.0 * q),
@@ -77,19 +79,6 @@ def test_every_kind_of_mechanism_ends_at_its_reference(name):
     assert np.abs(balance - force).max() < 1e-9 * max(1.0, np.abs(force).max())
 
 
-@pytest.mark.parametrize("order", [4, 6, 8])
-def test_constant_steps_have_the_order_asked_for(order):
-    problem = mechanisms.driven_crank()
-    errors = []
-    for steps in (40, 80):
-        h = problem.reference.t / steps
-        result = solve_dae(
-            problem.system, (0.0, problem.reference.t), problem.q0, problem.v0, Taylor(order), step_size=h
-        )
-        errors.append(np.nanmax(np.abs(result.q[:, -1] - problem.reference.q)))
-    assert order - 0.5 < np.log2(errors[0] / errors[1]) < order + 1.0
-
-
 @pytest.mark.parametrize("compiled", [False, True])
 def test_a_sum_of_parameters_that_is_zero_in_one_system_alone_is_divided_by_in_no_formula(compiled):
     """Formulas in the parameters of all chains divide by a sum of components of axes, which is zero here."""
@@ -104,6 +93,16 @@ def test_compiled_operations_give_the_same_run():
     start = (system, (0.0, 2.0), [0.4], [0.7])
     runs = [solve_dae(*start, Taylor(17), 1e-10, 1e-10, compiled=compiled) for compiled in (False, True)]
     assert abs(runs[1].q[0, -1] - runs[0].q[0, -1]) < 1e-12
+
+
+def test_compiled_code_is_read_from_the_disk(monkeypatch):
+    problem = mechanisms.four_bar()
+    code = own_code(problem.system, 0.0, problem.q0)
+    compiled_series.compiled_series(code)  # now it is there
+    monkeypatch.setattr("twoloop.kernels.compile.own_functions._MADE", defaultdict(dict))
+    code.shared.family._made.clear()
+    monkeypatch.setattr("twoloop.kernels.compile.own_functions.object_code", None)
+    assert "find_order" in compiled_series.compiled_series(code).functions.addresses
 
 
 @pytest.mark.parametrize(("compiled", "tolerances"), [(False, 5.0), (True, 50.0)])

@@ -15,7 +15,7 @@ from twoloop.generate.calls_on_symbols import as_forms
 from twoloop.generate.derived import standing_for
 from twoloop.generate.series import series_program
 from twoloop.generate.traced_values import Traced, unchecked
-from twoloop.generate.tracing import Graph, Untraceable
+from twoloop.generate.tracing import Graph
 from twoloop.kernels.data.codes import DONE
 from twoloop.kernels.data.common import KIT, VECTOR, WORK, f8, i8
 from twoloop.kernels.evaluation.accelerations import acceleration_constraint
@@ -114,21 +114,6 @@ def test_what_tells_symbols_from_numbers_is_refused(case):
         run(pendulum(force=force))
     with pytest.raises(ValueError, match="compiled=True needs equations that can be written down; force of 'pendulum'"):
         run(pendulum(force=force), "DOP853", compiled=True)
-
-
-def test_symbols_that_a_callback_keeps_are_found():
-    kept = [np.zeros(2)]
-
-    def previous(t, q, v):
-        kept.append(v)
-        return WEIGHT - kept[-2]
-
-    with pytest.raises(ValueError, match="force of 'pendulum' does not give what its operations give"):
-        run(pendulum(force=previous))
-    with pytest.raises(Untraceable, match="of another call, which it has kept"):
-        series_program(pendulum(force=lambda t, q, v: v + kept[-2]))
-        kept.append(Graph().inputs(2, True))
-        series_program(pendulum(force=lambda t, q, v: v + kept[-1]))
 
 
 # callbacks that are traced ------------------------------------------------------------------------------------------
@@ -378,18 +363,6 @@ def test_a_fast_bar_is_as_right_without_gamma_as_with():
     assert errors[1] <= 1.01 * errors[0] + 1e-12
 
 
-@pytest.mark.parametrize(
-    ("method", "compiled"), quick([("auto", "auto"), ("auto", True), ("RadauIIA5", "auto"), ("PaperIRK", "auto")], 2)
-)
-def test_a_motion_without_them_is_the_motion_with_them(method, compiled):
-    ends = []
-    for absent in ((), ("gamma",), ("jacobian", "gamma")):
-        system = constant_pendulum(**dict.fromkeys(absent))
-        run = solve_dae(system, (0.0, 1.0), [0.6, -0.8], [0.8, 0.6], method, 1e-9, 1e-9, compiled=compiled)
-        ends.append(run.q[:, -1])
-    assert np.ptp(ends, axis=0).max() < 1e-12
-
-
 def test_what_branches_is_differenced():
     system = constant_pendulum(jacobian=lambda t, q: q[None, :] if q[0] > -2.0 else 2.0 * q[None, :], gamma=None)
     other, traced = standing_for(system, unchecked)
@@ -461,32 +434,5 @@ def test_products_may_be_a_thousand_deep():
     assert traced and np.allclose(rows, [[1.0, 1.0]], rtol=1e-12) and gamma[0] == pytest.approx(1000.0 * 1e-6, rel=1e-9)
 
 
-BEAD = {  # on a circle of radius p[1]
-    "n_q": 2,
-    "n_c": 1,
-    "mass": np.eye(2),
-    "force": lambda t, q, v, p: np.array([0.0, -p[0]]),
-    "constraint": lambda t, q, p: np.array([0.5 * (q[0] * q[0] + q[1] * q[1] - p[1] * p[1])]),
-    "parameters": [9.81, 1.1],
-    "compile": True,
-}
-
-
 def branches(t, q, v, p):
     return np.array([0.0, -p[0] if p[0] < 10.0 else 0.0])
-
-
-@pytest.mark.parametrize("force", [BEAD["force"], branches], ids=["formulas", "a branch on a parameter"])
-def test_systems_of_other_parameters_share_what_was_derived(force):
-    system = ConstrainedSystem.from_python(**BEAD | {"force": force})
-    solve_dae(system, (0.0, 1.0), [1.1, 0.0], [0.0, 0.0])
-    for gravity, radius in ((9.7, 1.2), (10.1, 1.3), (9.9, 1.4)):
-        other = system.with_parameters([gravity, radius])
-        whole = {"jacobian": lambda t, q: q[None, :], "gamma": lambda t, q, v: np.array([-(v @ v)])}
-        given = {kind: BEAD[kind] for kind in ("n_q", "n_c", "mass")} | whole
-        fall = -gravity if force is not branches or gravity < 10.0 else 0.0
-        radial = {"constraint": lambda t, q, r=radius: np.array([0.5 * (q @ q - r * r)])}
-        radial |= {"force": lambda t, q, v, fall=fall: np.array([0.0, fall])}
-        expected = solve_dae(ConstrainedSystem.from_python(**given | radial), (0.0, 1.0), [radius, 0.0], [0.0, 0.0])
-        result = solve_dae(other, (0.0, 1.0), [radius, 0.0], [0.0, 0.0])
-        assert worst(result.q[:, -1], expected.q[:, -1]) < 1e-6
