@@ -14,7 +14,7 @@ from scipy.optimize import brentq
 from scipy.special import ellipj, ellipk
 
 from tests.testing.planted import FAULTS
-from twoloop import ConstraintWarning
+from twoloop import ConstraintWarning, solve_dae
 
 mpl = pytest.importorskip("matplotlib")  # not among the oldest versions
 ROOT = Path(__file__).parents[1]
@@ -247,6 +247,41 @@ def test_the_fit_finds_the_masses_that_it_was_given(run):
     assert names["fit"].success
     assert (np.abs(names["fit"].x - names["true_masses"]) < 4.0 * names["deviation"]).all()
     assert (names["deviation"] < 0.01).all()  # so that the line above can fail
+
+
+def test_the_slider_moves_as_that_of_sympys_joints_does(run):
+    """docs/your_mechanism.md says that `from_method` takes a System; this one has the numbers of the fit."""
+    sp = pytest.importorskip("sympy")
+    from sympy.physics import mechanics as me
+
+    from twoloop.symbolic import from_method
+
+    names = run("fit_parameters")
+    r, l, g = (sp.Symbol(name) for name in "rlg")
+    first, second = (np.array(names[name]) for name in "AB")
+    values = {r: np.hypot(*first), l: np.hypot(*(second - first)), g: 9.81}
+    bars = [me.RigidBody(name, mass=m) for name, m in (("crank", 1.0), ("rod", 2.0))]
+    for bar, mass, length in zip(bars, (1.0, 2.0), (r, l), strict=True):
+        bar.central_inertia = me.inertia(bar.frame, 0, 0, mass * length**2 / 12)
+    ground, piston = me.RigidBody("ground"), me.RigidBody("piston", mass=1.5)
+    crank, rod_ = bars
+    linkage = me.System.from_newtonian(ground)
+    linkage.add_joints(
+        me.PinJoint("O", ground, crank, child_point=-r / 2 * crank.x, joint_axis=ground.z),
+        me.PinJoint("A", crank, rod_, parent_point=r / 2 * crank.x, child_point=-l / 2 * rod_.x, joint_axis=crank.z),
+        me.PrismaticJoint("guide", ground, piston, joint_axis=ground.x),
+    )
+    linkage.apply_uniform_gravity(-g * ground.y)
+    gap = rod_.masscenter.locatenew("end", l / 2 * rod_.x).pos_from(piston.masscenter)
+    linkage.add_holonomic_constraints(gap.dot(ground.x), gap.dot(ground.y))
+    angle, elbow, guide = linkage.q
+    turned = np.arctan2(*first[::-1]), np.arctan2(*(second - first)[::-1])
+    start = {angle: turned[0], elbow: turned[1] - turned[0], guide: second[0]}
+    problem = from_method(linkage, parameters=values, name="joints").problem(
+        start, {angle: 8.0}, (0.0, 2.0), keep=[angle]
+    )
+    result = solve_dae(problem.system, (0.0, 2.0), problem.q0, problem.v0, t_eval=names["instants"])
+    assert result.q[2] == pytest.approx(names["slider"](names["true_masses"]), abs=1e-6)
 
 
 @pytest.mark.parametrize(("tol", "step"), [(1e-8, 1e-4), (1e-12, 1.5e-8)])
