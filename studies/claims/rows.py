@@ -13,7 +13,7 @@ from studies.bench.cases.beam import SOFT, STIFF
 from studies.bench.store import read_rows
 from twoloop.mechanisms import four_bar
 
-STUDIES = ("table3", "motion", "step_size", "violation", "energy", "beam", "ablation")
+STUDIES = ("table3_full", "energy", "motion", "step_size", "violation", "beam", "ablation")
 DEFAULT = four_bar().name
 LONG = 100.0  # s, the length of the paper's runs
 BEAM_END = 2.0  # s, of a full run of the beams
@@ -28,17 +28,6 @@ def read(folder: Path) -> dict[str, pd.DataFrame]:
     """One row a run of every study whose rows are in the folder. Raises StudyError if a file of rows is damaged."""
     paths = [path for name in STUDIES if (path := folder / f"{name}.csv").is_file()]
     return {path.stem: _one_a_run(path.stem, read_rows(path)[0]) for path in paths}
-
-
-def processors(folder: Path) -> dict[str, list[str]]:
-    """Processors by which the rows in the folder were measured, and of which studies, by the first lines of these."""
-    found: dict[str, list[str]] = {}
-    for name in STUDIES:
-        path = folder / f"{name}.csv"
-        # behind kind, command, date and commit: processor, cores
-        for machine in read_rows(path)[1].split("; ")[4:5] if path.is_file() else ():
-            found.setdefault(machine.rpartition(", ")[0], []).append(name)
-    return found
 
 
 def _one_a_run(name: str, table: pd.DataFrame) -> pd.DataFrame:
@@ -87,7 +76,7 @@ class Rows:
 
     def cell(self, group: str, err_in: float, err_out: float, problem: str = DEFAULT) -> pd.Series:
         """A cell of Table 3."""
-        return self.long("table3", group=group, problem=problem, err_in=err_in, err_out=err_out).iloc[0]
+        return self.long("table3_full", group=group, problem=problem, err_in=err_in, err_out=err_out).iloc[0]
 
     def beam(self, case: str, named: str, **equal: Any) -> pd.DataFrame:
         """Full runs of a beam."""
@@ -95,16 +84,16 @@ class Rows:
 
 
 def common_costs(
-    one: pd.DataFrame,
-    other: pd.DataFrame,
+    first: pd.DataFrame,
+    second: pd.DataFrame,
     targets: tuple[float, ...],
     cost: Callable[[pd.DataFrame, float], float] = tables.time_for,
 ) -> list[float]:
-    """Times of `one` over those of `other` at the errors that both reach; `cost`: that of the runs of a solver."""
-    costs = [(cost(one, e), cost(other, e)) for e in targets]
-    ratios = [a / b for a, b in costs if np.isfinite(a) and np.isfinite(b)]
+    """Times of the first solver over those of the second at the errors that both reach; `cost`: cost(runs, error)."""
+    ratios = [cost(first, error) / cost(second, error) for error in targets]
+    ratios = [ratio for ratio in ratios if np.isfinite(ratio)]
     if not ratios:
-        raise NotRun(f"{one['solver'].iloc[0]} and {other['solver'].iloc[0]} have no error in common")
+        raise NotRun(f"{first['solver'].iloc[0]} and {second['solver'].iloc[0]} have no error in common")
     return ratios
 
 

@@ -1,8 +1,6 @@
-"""Which of the paper's claims hold: a verdict and a number for each, computed from the rows of all studies."""
+"""Which of the paper's claims hold: a verdict and a number for each, from the rows of the other studies."""
 
-import tomllib
 from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import pandas as pd
@@ -13,14 +11,11 @@ from studies.bench.index import run_study, write_index
 from studies.bench.render import render
 from studies.bench.store import Output
 from studies.claims import beam_judges, experiments, judges
-from studies.claims.rows import STUDIES, Rows, processors, read
-from studies.claims.verdicts import Claim, Judgement, Verdict, load
+from studies.claims.rows import STUDIES, Rows, read
+from studies.claims.verdicts import UNTESTABLE, Claim, Judgement, Verdict, load
+from studies.reproduction.study import PARTS
 
-ERRATA = tomllib.loads(Path(__file__).with_name("errata.toml").read_text())
-COLUMNS = (  # of a claim, for claims.csv
-    *("section", "statement", "criterion", "fixed", "judge"),
-    *("stand_in", "inputs", "choice", "assumed"),
-)
+COLUMNS = ("section", "statement", "criterion", "fixed", "judge", "stand_in", "inputs", "circular", "assumed")  # of CSV
 Judged = Mapping[str, tuple[Claim, Judgement]]
 JUDGES: dict[str, Callable[..., Judgement]] = vars(judges) | vars(beam_judges)  # by the names that claims.toml has
 
@@ -31,47 +26,48 @@ def judged(rows: Rows) -> Judged:
 
 
 def findings_of(pairs: Judged) -> dict[str, Any]:
-    """Verdicts and numbers by claim, how many of each verdict, and the places of those that hold by construction.
-
-    What the paper chose, and does not claim, is not counted among its claims.
-    """
-    circular: dict[str, list[str]] = {}
-    for k, (claim, found) in enumerate(pairs.values(), 1):
-        if found.verdict is Verdict.CIRCULAR:
-            circular.setdefault(claim.circular, []).append(str(k))
+    """How many claims have each verdict, the answer, and verdict and numbers of each."""
     verdicts = [found.verdict for _, found in pairs.values()]
-    counted = [(claim, found.verdict) for claim, found in pairs.values() if not claim.choice]
-    told: dict[str, Any] = {"n": len(counted), "after": sum(claim.fixed == "after" for claim, _ in counted)}
-    told |= {"by_stand_in": sum(bool(claim.stand_in) and verdict is not Verdict.NOT_RUN for claim, verdict in counted)}
-    told |= {"judged": sum(verdict is not Verdict.NOT_RUN for _, verdict in counted)}
-    told |= {"places": {key: k for k, key in enumerate(pairs, 1)}}
-    told |= {"counts": {verdict.value: verdicts.count(verdict) for verdict in Verdict}}
-    told |= {"claims": {key: {"verdict": each.verdict.value, **each.values} for key, (_, each) in pairs.items()}}
-    return told | {"circular": circular}
+    counts = {verdict: verdicts.count(verdict) for verdict in Verdict}
+    untestable, n = sum(counts[verdict] for verdict in UNTESTABLE), len(pairs)
+    answer = f"Of {n} claims, {counts[Verdict.HOLDS]} hold, {counts[Verdict.PART]} hold in part, "
+    answer += f"{counts[Verdict.FAILS]} do not hold, and {untestable} cannot be tested with what the paper's text gives"
+    answer += f"; {counts[Verdict.NOT_RUN]} were not judged" * bool(counts[Verdict.NOT_RUN])
+    found: dict[str, Any] = {
+        "answer": f"{answer}.",
+        "n": n,
+        "counts": {verdict.value: counts[verdict] for verdict in counts},
+    }
+    found |= {"untestable": untestable, "after": sum(claim.fixed == "after" for claim, _ in pairs.values())}
+    told = {key: {"verdict": each.verdict.value, **each.values} for key, (_, each) in pairs.items()}
+    return found | {"claims": told}
 
 
 def report(output: Output, rows: Rows, line: str) -> dict[str, Any]:
-    """Write findings, rows and reports; the findings."""
-    pairs, lines = judged(rows), []
-    for key, (claim, found) in pairs.items():
-        told = {"claim": key, "verdict": found.verdict.value, "number": claim.text(found), "why_not_run": found.why}
-        lines.append(told | {name: getattr(claim, name) for name in COLUMNS})
-    findings, table = findings_of(pairs) | {"experiments": dict(rows.experiments)}, pd.DataFrame(lines)
-    findings["processors"] = processors(output.path)
+    """Write findings, rows and report; return the findings."""
+    pairs = judged(rows)
+    lines = [
+        {"claim": key, "verdict": found.verdict.value, "number": claim.text(found)}
+        | {name: getattr(claim, name) for name in COLUMNS}
+        for key, (claim, found) in pairs.items()
+    ]
+    findings = findings_of(pairs) | {"experiments": dict(rows.experiments)}
     output.save_findings(findings)
-    output.save_rows(table, line)
-    more = {"stamp": line, "quick": output.call.quick}
-    for name in ("claims", "claims_that_hold"):
-        output.write(f"{name}.md", render(name, findings, {}, lines=table.to_dict("records"), **more))
-    output.write("errata.md", render("errata", ERRATA, {}, **more))
+    output.save_rows(pd.DataFrame(lines), line)
+    output.write("claims.md", render("claims", findings, {}, lines=lines, stamp=line, quick=output.call.quick))
     return findings
 
 
 def _work(words: Sequence[str] | None) -> None:
     call = cli.parse("claims", __doc__, words)
-    for name in () if call.redraw else STUDIES:
-        if not (call.out / f"{name}.csv").exists():
-            run_study(name, ["--quick"] * call.quick + ["--out", str(call.out)])
+    options = ["--quick"] * call.quick + ["--out", str(call.out)]
+    missing = [name for name in STUDIES if not (call.redraw or (call.out / f"{name}.csv").exists())]
+    if "table3_full" in missing:
+        run_study("table3", ["--full", *options])
+    if "energy" in missing:
+        run_study("energy", options)
+    if parts := [name for name in missing if name in PARTS]:
+        run_study("reproduction", [*parts, *options])
     with Output(call) as output:
         if call.redraw:
             _, line = output.load_rows()
@@ -82,8 +78,7 @@ def _work(words: Sequence[str] | None) -> None:
             made, line = experiments.make(call.quick), cli.stamp(call.command)
         findings = report(output, Rows(read(output.path), made), line)
         write_index(output)
-    print(", ".join(f"{n} {verdict}" for verdict, n in findings["counts"].items() if n))
-    print(f"wrote claims.md, claims_that_hold.md, claims.csv, .json and errata.md to {output.path}")
+    print(f"{findings['answer']} Wrote claims.md, .csv and .json to {output.path}")
 
 
 def main(words: Sequence[str] | None = None) -> None:

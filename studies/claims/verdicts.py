@@ -21,11 +21,13 @@ class Verdict(StrEnum):
     HOLDS = "holds"
     PART = "holds in part"
     FAILS = "does not hold"
-    ASSUMED = "not reproduced (inputs assumed)"
     CONSISTENT = "consistent"
+    ASSUMED = "not reproduced (inputs assumed)"
     CIRCULAR = "holds by construction"
-    CHOICE = "choice of the paper"
     NOT_RUN = "not run"
+
+
+UNTESTABLE = (Verdict.CONSISTENT, Verdict.ASSUMED, Verdict.CIRCULAR)  # our runs cannot decide, whatever they give
 
 
 @dataclass(frozen=True)
@@ -39,7 +41,7 @@ class Judgement:
 
 def decide(met: Iterable[Any], in_part: Any = None, **values: Any) -> Judgement:
     """The verdict of conditions: all met, or some of the cases of which the claim speaks, or none."""
-    conditions = [bool(each) for each in met]
+    conditions = [bool(condition) for condition in met]
     if all(conditions):
         return Judgement(Verdict.HOLDS, values)
     part = any(conditions) if in_part is None else in_part
@@ -47,7 +49,7 @@ def decide(met: Iterable[Any], in_part: Any = None, **values: Any) -> Judgement:
 
 
 def span(values: Iterable[Any]) -> list[float]:
-    """Least and largest."""
+    """Least and largest; NaN where a value is."""
     array = np.asarray(list(values), dtype=float)
     return [float(array.min()), float(array.max())]
 
@@ -75,11 +77,10 @@ class Claim:
     circular: str = ""
     stand_in: str = ""
     inputs: str = ""
-    choice: bool = False
     assumed: bool = False
 
     def judgement(self, judge: Callable[..., Judgement], rows: Rows) -> Judgement:
-        """What the judge makes of the rows; not run where there is nothing to judge by."""
+        """Judge the claim from the rows; "not run" where there is nothing to judge by."""
         try:
             found = judge(rows, **self.options)
         except NotRun as reason:
@@ -90,14 +91,16 @@ class Claim:
             return Judgement(Verdict.NOT_RUN, why="the rows lack a value that decides")
         holds = Verdict.CONSISTENT if self.stand_in or self.inputs else Verdict.HOLDS
         marked = {Verdict.HOLDS: Verdict.CIRCULAR if self.circular else holds}
-        marked |= {Verdict.FAILS: Verdict.ASSUMED if self.inputs else Verdict.FAILS}
-        return replace(found, verdict=Verdict.CHOICE if self.choice else marked.get(found.verdict, found.verdict))
+        marked[Verdict.FAILS] = Verdict.ASSUMED if self.inputs else Verdict.FAILS
+        return replace(found, verdict=marked.get(found.verdict, found.verdict))
 
     def text(self, found: Judgement) -> str:
         """The numbers of a judgement in the words of `claims.toml`."""
-        each = {name: value if isinstance(value, list) else [value] for name, value in found.values.items()}
-        texts = {name: "–".join(dict.fromkeys(map(number, values))) for name, values in each.items()}
-        return self.number.format(**texts) if texts else "–"
+        if found.verdict is Verdict.NOT_RUN:
+            return found.why
+        values = {name: value if isinstance(value, list) else [value] for name, value in found.values.items()}
+        texts = {name: " to ".join(dict.fromkeys(map(number, value))) for name, value in values.items()}
+        return self.number.format(**texts)
 
 
 def load() -> list[Claim]:

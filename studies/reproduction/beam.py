@@ -9,28 +9,13 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from studies.bench import adaptive, figures, tables
+from studies.bench import adaptive, figures, solvers, tables
 from studies.bench.cases import beam
 from studies.bench.cases.beam import SOFT, STIFF
 from studies.bench.cli import StudyError
 from studies.bench.collector import REPEATS, Case, Run, Solver, Warm, row_of
 from studies.bench.metrics import ASTRAY, deviation
 from studies.bench.render import number
-from studies.bench.solvers import (
-    CATALOGUE,
-    CYRK,
-    DEFAULT,
-    IDA_C_BANDED,
-    IDA_C_ORDER_2,
-    IRK,
-    IRK_LINE,
-    NEWMARK,
-    OTHER_SOLVERS,
-    OWN_EXPLICIT,
-    PAPER_TOL,
-    QUARTER,
-    RADAU,
-)
 from studies.bench.store import Output, Row
 from studies.reproduction.beam_limits import MESH, limit_rows, sensitivity_rows
 from twoloop import Result
@@ -38,25 +23,27 @@ from twoloop.mechanisms.ancf_beam import tip_height
 
 PAPER_SECONDS = {SOFT: 56.27, STIFF: 6278.54}  # the computation times that the paper gives
 PAPER_STEPS = {SOFT: 1e-3, STIFF: 1e-5}  # s, its step sizes by order of magnitude
-OURS = ("auto", "auto, compiled", "TRBDF2", "ESDIRK4", "SunRadau5", "Gauss6", "BDF", "Adams", OWN_EXPLICIT)
-OTHERS = (*(name for name in OTHER_SOLVERS if not name.startswith("Exudyn")), IDA_C_BANDED)  # Exudyn's beam is another
+OURS = ("auto", "auto, compiled", "TRBDF2", "ESDIRK4", "SunRadau5", "Gauss6", "BDF", "Adams", solvers.OWN_EXPLICIT)
+# without Exudyn, whose beam is another model
+OTHERS = (*(name for name in solvers.OTHER_SOLVERS if not name.startswith("Exudyn")), solvers.IDA_C_BANDED)
 HALF_A_DECADE = 0.5  # of the printed step sizes, within which ours count as the same
 TARGETS, TOLD = (1e-2, 1e-3, 1e-4), 1e-3  # m, errors of the tip's height; the report tells of the latter
 LOOSE = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5)  # tolerances, between and beyond which `adaptive` asks
 OWN_VALUES = {  # of those that do not take these
-    IRK: (1e-1, PAPER_TOL),  # its error is that of rounding from the loosest on
-    **dict.fromkeys((NEWMARK, QUARTER), (1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9)),
+    solvers.IRK: (1e-1, solvers.PAPER_TOL),  # its error is that of rounding from the loosest on
+    **dict.fromkeys((solvers.NEWMARK, solvers.QUARTER), (1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9)),
 }
 LIMIT = 3.0  # s of CPU of a run of others, as in `work_precision`
-QUICK = (IRK, *RADAU[:2], "BDF", OWN_EXPLICIT)  # IDA takes seconds to compile, Gauss6 tens of thousands of steps
+# IDA takes seconds to compile, Gauss6 tens of thousands of steps
+QUICK = (solvers.IRK, *solvers.RADAU[:2], "BDF", solvers.OWN_EXPLICIT)
 QUICK_TOLERANCES = (1e-1, 1e-3)
-DRAWN = (DEFAULT, NEWMARK, "TRBDF2", IDA_C_ORDER_2, CYRK)  # beside the paper's procedure
+DRAWN = (solvers.DEFAULT, solvers.NEWMARK, "TRBDF2", solvers.IDA_C_ORDER_2, solvers.CYRK)  # beside PaperIRK
 
 
-def solvers() -> dict[str, Solver]:
+def line_up() -> dict[str, Solver]:
     """The line-up by name."""
-    listed = [replace(CATALOGUE[IRK_LINE], name=IRK)]
-    listed += [CATALOGUE[name] for name in (NEWMARK, QUARTER, *RADAU, *OURS, *OTHERS)]
+    listed = [replace(solvers.CATALOGUE[solvers.IRK_LINE], name=solvers.IRK)]
+    listed += [solvers.CATALOGUE[name] for name in (solvers.NEWMARK, solvers.QUARTER, *solvers.RADAU, *OURS, *OTHERS)]
     return {solver.name: solver for solver in listed}
 
 
@@ -68,12 +55,12 @@ def cases(quick: bool) -> dict[str, Case]:
 def runs(known: dict[str, Case], quick: bool) -> Iterator[Run]:
     """List the solvers at their settings on both beams."""
     for case in known.values():
-        for name, solver in solvers().items():
+        for name, solver in line_up().items():
             if quick and name not in QUICK:
                 continue
             values = OWN_VALUES.get(name, case.steps() if solver.setting == "h" else LOOSE)
             if quick:
-                values = (PAPER_TOL,) if name == IRK else QUICK_TOLERANCES
+                values = (solvers.PAPER_TOL,) if name == solvers.IRK else QUICK_TOLERANCES
             at = case if solver.family == "two-loop" else replace(case, time_limit=LIMIT)
             yield from (Run(at, solver, value, "run", 1 if quick else REPEATS) for value in values)
 
@@ -110,10 +97,10 @@ def measure(run: Run, result: Result) -> dict[str, Any]:
 def _case(rows: pd.DataFrame, name: str) -> dict[str, Any]:
     own = tables.where(rows, case=name, group="run")
     changes = tables.where(rows, case=name, group="sensitivity").set_index("solver")["largest"].astype(float)
-    paper = tables.where(own, solver=IRK, tol=PAPER_TOL)
+    paper = tables.where(own, solver=solvers.IRK, tol=solvers.PAPER_TOL)
     if paper.empty or changes.empty:
         raise StudyError("the rows lack PaperIRK or changed beams; run python -m studies.reproduction beam")
-    run, irk = paper.iloc[0], tables.where(own, solver=IRK)
+    run, irk = paper.iloc[0], tables.where(own, solver=solvers.IRK)
     found: dict[str, Any] = {
         key: float(run[key]) for key in ("n_steps", "n_evaluations", "call_s", "h_median", "floor")
     }
@@ -143,9 +130,9 @@ def figure_of(rows: pd.DataFrame, found: dict[str, Any]) -> Figure:
             along = figures.line_of(tables.where(own, solver=solver))
             if len(along):
                 panel.plot(along["error_q"], along["call_s"], **figures.look(along.iloc[0], coded=False))
-        paper = tables.where(own, solver=IRK)  # its errors are below that of the reference
-        label = f"{IRK} (smaller errors)"
-        panel.axhline(paper["call_s"].min(), color=figures.style(IRK)["color"], label=label)
+        paper = tables.where(own, solver=solvers.IRK)  # its errors are below that of the reference
+        label = f"{solvers.IRK} (smaller errors)"
+        panel.axhline(paper["call_s"].min(), color=figures.style(solvers.IRK)["color"], label=label)
         panel.set(xscale="log", yscale="log", xlabel="largest error of the tip's height (m)")
         panel.set_title(f"{name} beam", fontsize=9)
     panels[0].set_ylabel("CPU time (s)")

@@ -10,7 +10,7 @@ from scipy.optimize import brentq
 from studies.bench.cases.beam import SOFT, STIFF
 from studies.bench.collector import Array, Case
 from twoloop import solve_dae
-from twoloop.mechanisms import Problem, ancf_beam
+from twoloop.mechanisms import Problem, ancf_beam, very_flexible_beam
 from twoloop.mechanisms.ancf_beam import elastic_tangent, tip_height
 from twoloop.methods.tableaux import Tableau, sun_radau_iib
 
@@ -49,7 +49,7 @@ def gauss_seidel_limit(tableau: Tableau) -> float:
 
 def limit_rows() -> Iterator[Row]:
     """The limit in theory, and the largest frequency w_max of the very flexible beam."""
-    w_max = float(frequencies(ancf_beam(youngs_modulus=2e6))[-1])
+    w_max = float(frequencies(very_flexible_beam())[-1])
     yield {"group": "limit", "solver": GAUSS_SEIDEL, "w_max": w_max, "theory": gauss_seidel_limit(sun_radau_iib(3))}
 
 

@@ -8,19 +8,17 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from references.sundials.ida import solve_ida
 from studies.bench import figures
 from studies.bench.cases import four_bar
 from studies.bench.cli import StudyError
-from studies.bench.collector import Run, Solver
+from studies.bench.collector import Run
 from studies.bench.render import number
 from studies.bench.solvers import CATALOGUE, GIVEN, IRK, NEWMARK, PRESETS, QUARTER
 from studies.bench.store import Array
 from twoloop import Result
 
 LONG = 0.02  # s; the paper: Runge-Kutta steps are longer than this most of the time
-ERR_OUT, TOL = 1e-9, 1e-5  # of the paper's procedures; Atol = Rtol of all others, as of the paper
-OTHERS = ("LSODA, index 1", "DOP853, projected")
+ERR_OUT, TOL = 1e-9, 1e-5  # of the paper's procedures; Atol = Rtol of the others, as of the paper
 PAPER = (IRK, QUARTER, NEWMARK)
 PERIODS = 2.0  # of the motion, at the start, that the figure shows
 CURVE = 1200  # most points of a curve: of more steps, the shortest and the longest in each of half as many bins
@@ -28,15 +26,10 @@ COLUMNS = ("h_median", "share_time", "retried", "n_evaluations")
 
 
 def runs(quick: bool) -> list[Run]:
-    """List the paper's procedures at its settings, and the other adaptive solvers at its Atol = Rtol."""
+    """List the paper's procedures at its settings, and twoloop's other adaptive methods at its Atol = Rtol."""
     case = replace(four_bar.cases(quick)[0], timed=0.0)  # times are not compared here
     listed = [Run(case, CATALOGUE[name], ERR_OUT, "paper", 1) for name in (IRK, NEWMARK, QUARTER)]
-    listed += [Run(case, CATALOGUE[name], TOL, "two-loop", 1) for name in (GIVEN, *PRESETS)]
-    # the catalogue's IDA stores its states at common instants only, and not its steps
-    run = lambda case, tol, _: solve_ida(*case.start, "stabilised", tol, tol)  # noqa: E731
-    ida = Solver("IDA, stabilised", "SUNDIALS", "Python", True, "tol", run, own_accelerations=True)
-    others = [*([] if quick else [ida]), *(CATALOGUE[name] for name in OTHERS)]
-    return listed + [Run(case, solver, TOL, "others", 1) for solver in others]
+    return listed + [Run(case, CATALOGUE[name], TOL, "two-loop", 1) for name in (GIVEN, *PRESETS)]
 
 
 def measure(run: Run, result: Result) -> dict[str, Any]:

@@ -8,23 +8,11 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from references.scipy.index1 import ALPHAS, baumgarte
-from studies.bench import figures, tables
+from studies.bench import figures, solvers, tables
 from studies.bench.cases import four_bar
 from studies.bench.cli import StudyError
 from studies.bench.collector import REPEATS, Run
 from studies.bench.metrics import violations
-from studies.bench.solvers import (
-    CATALOGUE,
-    CVODE_C,
-    CVODE_C_PROJECTED,
-    GIVEN,
-    HEYOKA,
-    IDA_C,
-    IRK,
-    LINE_UP,
-    OWN_EXPLICIT,
-    paper_irk_at,
-)
 from studies.bench.store import Array
 from twoloop import Result
 
@@ -39,31 +27,31 @@ ZERO = 1e-17  # what counts as a violation of zero where a logarithm is taken
 
 PAIRS = (  # kept, not kept
     ("DOP853, projected", "DOP853, index 1"),
-    (CVODE_C_PROJECTED, "CVODE from C, BDF"),
+    (solvers.CVODE_C_PROJECTED, "CVODE from C, BDF"),
     ("IDA, stabilised", "IDA, index1"),
 )
-OWN = (GIVEN, "SunRadau5", "Gauss12", OWN_EXPLICIT)
-ALONG = (*(name for pair in PAIRS for name in pair), "LSODA, index 1", IDA_C, HEYOKA, CVODE_C, *OWN)
-MORE = {CVODE_C_PROJECTED: 1e-8}  # tolerance, in the line-up of this part
+OWN = (solvers.GIVEN, "SunRadau5", "Gauss12", solvers.OWN_EXPLICIT)
+ALONG = (*sum(PAIRS, ()), "LSODA, index 1", solvers.IDA_C, solvers.HEYOKA, solvers.CVODE_C, *OWN)
+MORE = {solvers.CVODE_C_PROJECTED: 1e-8}  # tolerance, in the line-up of this part
 BAUMGARTE = baumgarte("DOP853", 10.0)
 STABILISED = tuple(baumgarte(name, alpha) for name in ("DOP853", "LSODA") for alpha in ALPHAS)
 QUICK_ALONG = (*PAIRS[0], BAUMGARTE, *OWN)
-SHOWN = ("Exudyn, GeneralizedAlpha", "IDA, stabilised", BAUMGARTE, CVODE_C, "DOP853, index 1")
+SHOWN = ("Exudyn, GeneralizedAlpha", "IDA, stabilised", BAUMGARTE, solvers.CVODE_C, "DOP853, index 1")
 TARGETS = (1e-2, 1e-4, 1e-6)
 
 
 def runs(quick: bool) -> list[Run]:
     """List every solver at one setting, PaperIRK with loose loops, and solvers along their tolerances."""
     case = four_bar.cases(quick)[0]
-    settings = LINE_UP | MORE
-    line_up = [CATALOGUE[name] for name in settings]
+    settings = solvers.LINE_UP | MORE
+    line_up = [solvers.CATALOGUE[name] for name in settings]
     if quick:
         line_up = [s for s in line_up if s.family == "two-loop" or s.name.startswith(("Exudyn", "GSTIFF", "DOP853"))]
     listed = [Run(case, solver, settings[solver.name], "line-up", 1) for solver in line_up]
-    listed += [Run(case, paper_irk_at(LOOSE), err_out, "loops", 1) for err_out in (LOOSE, TIGHT)]
+    listed += [Run(case, solvers.paper_irk_at(LOOSE), err_out, "loops", 1) for err_out in (LOOSE, TIGHT)]
     for name in QUICK_ALONG if quick else (*ALONG, *STABILISED):
-        values = (1e-5, 1e-7) if quick else CATALOGUE[name].grid(case)
-        listed += [Run(case, CATALOGUE[name], value, "tolerances", 1 if quick else REPEATS) for value in values]
+        values = (1e-5, 1e-7) if quick else solvers.CATALOGUE[name].grid(case)
+        listed += [Run(case, solvers.CATALOGUE[name], value, "tolerances", 1 if quick else REPEATS) for value in values]
     return listed
 
 
@@ -115,9 +103,9 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     line_up, loops, along = (rows[rows["group"] == group] for group in ("line-up", "loops", "tolerances"))
     line_up = line_up[line_up["growth_q"].notna()].set_index("solver")
     loose = loops.set_index("err_out")["violation_q"]
-    if IRK not in line_up.index or not {LOOSE, TIGHT} <= set(loose.index):
+    if solvers.IRK not in line_up.index or not {LOOSE, TIGHT} <= set(loose.index):
         raise StudyError("the rows lack runs of PaperIRK; run python -m studies.reproduction violation")
-    irk, ours = line_up.loc[IRK], line_up[line_up["family"] == "two-loop"]
+    irk, ours = line_up.loc[solvers.IRK], line_up[line_up["family"] == "two-loop"]
     every = pd.concat([ours, along[(along["family"] == "two-loop") & along["error_q"].notna()]])
     of_alpha = along[along["solver"].str.contains("Baumgarte") & along["error_q"].notna()]["violation_q"]
     found: dict[str, Any] = {"t_end": float(rows["t_end"].iloc[0]), "kept": KEPT}
