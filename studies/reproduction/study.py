@@ -60,11 +60,11 @@ def answer(found: dict[str, Any]) -> str:
         "steps": stepped["holds"] and stepped["longer"],
         "constraints": not kept["irk_grows"] and max(kept["irk"]) <= kept["kept"],
     }
-    words = [f"Of the linkage, {listed(name for name in right if right[name])} come out as described"]
+    words = [f"The linkage's {listed(name for name in right if right[name])} come out as described"]
     words[0] += f", but not {listed(name for name in right if not right[name])}" * (not all(right.values()))
     words[0] += f", and the steps of {sum(case['steps_as_printed'] for case in beams)} of {len(beams)} beams"
     if projected:
-        words.append(f"projecting once a step takes {number(projected[1])} times the time")
+        words.append(f"projecting once a step takes {number(projected[1])} times the time of its method")
     return "; ".join(words) + "."
 
 
@@ -75,7 +75,7 @@ def report(output: Output) -> None:
     stamps = {name: stamp.split("; ") for name, (_, stamp) in read.items()}
     dates = {name: stamp[1] for name, stamp in stamps.items()}
     found = findings_of(rows)
-    found |= {"date": max(dates.values()), "processor": "; ".join(dict.fromkeys(stamp[3] for stamp in stamps.values()))}
+    found |= {"processor": "; ".join(dict.fromkeys(stamp[3] for stamp in stamps.values()))}
     output.save_findings(found)
     for name, part in PARTS.items():
         figures.save(part.figure_of(rows[name], found[name]), output, name)
