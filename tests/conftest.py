@@ -1,4 +1,4 @@
-"""Hypothesis without deadlines (the first call may compile) and always with the same examples; shared problems."""
+"""Configure hypothesis (no deadlines, as the first call may compile; always the same examples) and share fixtures."""
 
 import gc
 import signal
@@ -13,9 +13,8 @@ from twoloop import solve
 
 # not collected where the packages of the studies, or of the documentation, are not installed: `make test-oldest`
 NEED_STUDIES = (
-    *("general/test_cost.py", "kernels/test_augmented.py", "kernels/test_factors.py", "kernels/test_saddle_point.py"),
-    *("symbolic/test_from_lagrangian.py", "symbolic/test_matrices.py", "test_differential.py"),
-    *("test_docs.py", "test_rooms.py"),
+    *("symbolic/test_from_lagrangian.py", "symbolic/test_matrices.py"),
+    *("test_differential.py", "test_docs.py", "test_rooms.py"),
 )
 LONG_AND_LATE = {"test_docs.py", "test_check.py", "test_examples.py"}
 collect_ignore = [] if find_spec("pandas") and find_spec("matplotlib") else list(NEED_STUDIES)
@@ -25,7 +24,7 @@ settings.load_profile("twoloop")
 
 @pytest.fixture(autouse=True)
 def no_figures_stay():
-    """Matplotlib warns of many that are open, of whichever tests a worker has run."""
+    """Close all figures: Matplotlib warns when many are open."""
     yield
     if "matplotlib.pyplot" in sys.modules:
         sys.modules["matplotlib.pyplot"].close("all")
@@ -33,7 +32,7 @@ def no_figures_stay():
 
 @pytest.hookimpl(wrapper=True)
 def pytest_collection():
-    """Nothing of what is imported is garbage."""
+    """Switch garbage collection off while modules are imported: nothing of it is garbage."""
     gc.disable()
     try:
         return (yield)
@@ -42,12 +41,12 @@ def pytest_collection():
 
 
 def pytest_collection_modifyitems(items):
-    """The longest of the files that would come last come first, so that neither of two workers waits for one."""
+    """Run the longest of the last files first, so that neither of two workers waits for the other."""
     items.sort(key=lambda item: item.path.name not in LONG_AND_LATE)
 
 
 def pytest_collection_finish():
-    """What the tests have imported stays: Python need not look through it for cycles again and again."""
+    """Freeze what was imported: Python need not search it for cycles again and again."""
     gc.collect()
     gc.freeze()
     gc.set_threshold(20_000, 20, 20)
@@ -65,13 +64,13 @@ def collinear_four_bar():
 
 @pytest.fixture
 def collected_alone():
-    """A collection of cycles looks at what the test makes: of all else a worker has, it takes seconds."""
+    """Let a collection of cycles search only what the test makes: all else takes seconds."""
     gc.freeze()
 
 
 @pytest.fixture
 def interruptible():
-    """Python's own handler of Ctrl-C, without which shells start jobs in the background."""
+    """Set Python's own handler of Ctrl-C, which shells take away from jobs in the background."""
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, before)
@@ -79,7 +78,7 @@ def interruptible():
 
 @pytest.fixture
 def taken(monkeypatch):
-    """How calls were made: True by the arrays of a run before."""
+    """Record for each call whether it used the arrays of an earlier run."""
     made, ways = solve.record_again, []
 
     def watched(*asked):

@@ -15,9 +15,6 @@ from twoloop.kernels.compile.caches import compile_kept, kept_when_called
 from twoloop.kernels.compile.linking import KernelCompiler
 from twoloop.kernels.data.common import OPTIONS, stamp
 from twoloop.kernels.data.flags import FORCE_BY_Q_GIVEN
-from twoloop.kernels.data.kit import Kit
-from twoloop.kernels.evaluation.calls import inner_loop
-from twoloop.kernels.steps.explicit_step import EXPLICIT
 from twoloop.mechanisms import Problem, four_bar
 
 G = 9.81
@@ -29,13 +26,13 @@ def worst(a, b):
 
 
 def some_of(one, other, each=3):
-    """Pairs in which each of `one` is with a few of `other`, evenly spread, and each of these with a few of those."""
+    """Pair each of `one` with a few of `other`, evenly spread."""
     n = len(other)
     return [(a, other[(i + k * n // each) % n]) for i, a in enumerate(one) for k in range(each)]
 
 
 def quick(cases, n=1):
-    """The first n cases are in every run of the tests, the others are slow ones."""
+    """Mark all cases but the first n as slow: `make test` leaves them out."""
     rest = [each if isinstance(each, tuple) else (each,) for each in list(cases)[n:]]
     return [*list(cases)[:n], *(pytest.param(*each, marks=pytest.mark.slow) for each in rest)]
 
@@ -112,11 +109,6 @@ def driven_cart(place, speed, **more):
         "force": lambda t, q, v: np.array([0.0, 0.0, -G]),
     }
     return ConstrainedSystem.from_python(**{"n_q": 3, "n_c": 2, "mass": np.eye(3), **functions, **more})
-
-
-def kit_of(system):
-    """What the steps of the integrator get of a system."""
-    return Kit(system.functions, inner_loop, EXPLICIT)
 
 
 @cache

@@ -97,16 +97,6 @@ def test_a_failure_is_a_row_and_a_wrong_simulator_an_error(pendulum):
         audit_simulator(failing, None, step=1e-2)
 
 
-def test_what_stands_still_or_is_not_known_is_refused(pendulum):
-    with pytest.raises(RuntimeError, match="not known to 1e-17: two references differ by"):
-        audit_simulator(falling(), pendulum, step=1e-2, error=1e-17)
-    model = PlanarModel(name="hanging")
-    model.rod("bar", (0.0, 0.0), (0.0, -1.0), mass=1.0)
-    model.revolute("ground", "bar", at=(0.0, 0.0))
-    with pytest.raises(ValueError, match="nothing moves"):
-        audit_simulator(falling(), model.problem((0.0, 0.5)), step=1e-2)
-
-
 @pytest.mark.skipif(find_spec("mujoco") is None, reason="MuJoCo is not installed")
 class TestInMuJoCo:
     def test_the_default_has_a_floor_and_the_advice_holds(self, tmp_path, capsys):

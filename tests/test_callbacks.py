@@ -296,17 +296,6 @@ def sampled_controller():
     return force
 
 
-def integral():
-    held = {"t": 0.0, "sum": 0.0}
-
-    def force(t, q, v):
-        held["sum"] += q[0] * (t - held["t"])
-        held["t"] = t
-        return -2.0 * held["sum"]
-
-    return force
-
-
 def delayed():
     before = []
 
@@ -320,7 +309,7 @@ def delayed():
 
 
 @pytest.mark.parametrize("method", quick(["auto", "RadauIIA9"]))
-@pytest.mark.parametrize("make", [noise, sampled_controller, integral])
+@pytest.mark.parametrize("make", [noise, sampled_controller])
 def test_memory_is_named_at_the_start(make, method):
     with pytest.raises(ValueError, match="force of 'pendulum' gives something else when it is called again"):
         solve_dae(pushed_by(make()), (0.0, 1.0), *BESIDE, method)

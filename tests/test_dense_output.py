@@ -161,7 +161,7 @@ def test_they_are_those_of_the_dense_solution(default_four_bar, method):
     given = run(default_four_bar, 1.0, method=method, t_eval=TIMES, dense_output=True)
     alone = run(default_four_bar, 1.0, method=method, t_eval=TIMES)
     state = given.sol(TIMES)
-    for result in (given, alone):  # steps looked at chunk by chunk, and none kept
+    for result in (given, alone):  # interpolated chunk by chunk, and no step kept
         assert worst(result.q, state.q) < 1e-14 and worst(result.v, state.v) < 1e-13
         assert worst(result.a, state.a) < 1e-11 and worst(result.lam, state.lam) < 1e-11
     assert alone.sol is None

@@ -1,4 +1,4 @@
-"""Random mechanisms under random sharp forces: a run is right, or it says that it is not.
+"""Random mechanisms under random short and discontinuous forces: a run is right, or it says that it is not.
 
 Right is what SciPy makes of the same motion in as few coordinates as it has freedoms, by the rule of
 `studies/bench/sharp_motion.py`, kept in differential_motions.json. `studies.robustness` does the same at length.
@@ -17,7 +17,7 @@ OTHERS = (
     *("Adams", "DOP853", "Gauss4", "Gauss8", "Gauss12", "Gauss16", "SunRadau5", "RadauIIA5", "RadauIIA9", "RadauIIA13"),
     *("TRBDF2", "ESDIRK4", "BDF"),
 )
-NARROW = ("gust of 3 ms",)  # lasts less than a hundredth of the run, which no method promises to see
+SHORT_CHANGES = ("gust of 3 ms",)  # lasts less than a hundredth of the run, which no method promises to see
 MAY_END = ("drive with a kink",)  # whose velocities jump
 MOTIONS = read()
 
@@ -29,7 +29,7 @@ def calls(place):
     return made + [(name, tolerance, {"compiled": True}) for name, tolerance, _ in made[:2]]
 
 
-@pytest.mark.parametrize("family", [family for family in FAMILIES if family not in NARROW])
+@pytest.mark.parametrize("family", [family for family in FAMILIES if family not in SHORT_CHANGES])
 def test_a_run_is_right_or_says_that_it_is_not(family):
     n_drawn, known = MOTIONS[family]
     mechanism = mechanism_of(family, n_drawn)

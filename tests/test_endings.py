@@ -240,7 +240,7 @@ def test_ctrl_c_in_any_function_at_any_call_returns_what_there_is(method, option
             warnings.simplefilter("ignore")
             return solve_dae(system, (0.0, END), *START, method, 1e-5, 1e-5, **OPTIONS[options])
 
-    solve()  # derivatives are looked at once
+    solve()  # derivatives are checked once
     for each in COUNTED.values():
         each.set()
     full = solve()

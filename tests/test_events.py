@@ -9,7 +9,6 @@ from scipy.integrate import solve_ivp
 
 from tests.problems import at_one, event, pendulum, quick, run, swing, unconstrained, violations, worst
 from twoloop import Status, solve_dae
-from twoloop.problem.events import EventSearch, check_events
 
 
 def clock(*times, terminal=None):
@@ -166,29 +165,3 @@ def test_an_exception_of_an_event_comes_through_with_a_note():
 def test_a_value_that_is_wrong_later_is_named_with_its_time():
     with pytest.raises(ValueError, match=r"events\[0\] must return a finite number; at t = 0\.\d+ it returned nan"):
         swing(1.0, events=lambda t, q, v: np.nan if t > 0.3 else 1.0)
-
-
-class OneStep:
-    """A step from its beginning on, as a search for events asks for its states."""
-
-    def __init__(self):
-        self.asked = []
-
-    def at(self, times):
-        return np.stack([times, np.ones_like(times)], axis=1)
-
-    def within(self, t):
-        self.asked.append(t)
-        return lambda t: np.array([t, 1.0])
-
-
-def test_a_zero_in_a_step_of_one_spacing_is_looked_for_in_that_step():
-    """As across a jump of velocities: the middle of such a step may be its end, where the next one begins."""
-    begin = 1.0
-    for _ in range(4):
-        end, states = float(np.nextafter(begin, 2.0)), OneStep()
-        jump = event(lambda t, q, v, end=end: -1.0 if t < end else 1.0)
-        search = EventSearch(check_events(jump), begin, np.array([begin, 1.0]), 1.0)
-        search.search(states, np.array([begin, end]))
-        assert len(search.found[0]) == 1 and states.asked == [begin]
-        begin = end

@@ -71,13 +71,6 @@ def from_python(**changed):
     return solve(system=system) if set(changed) & {"n_q", "n_c", "n_a", *KINDS} else system
 
 
-def compiled(**changed):
-    """The system of compiled callbacks."""
-    whole = mechanisms.pendulum().system
-    given_ones = {kind: whole.functions_given[kind] for kind in ("mass", "force", "constraint", "jacobian", "gamma")}
-    return ConstrainedSystem(**({"n_q": 2, "n_c": 1, "parameters": whole.parameters} | given_ones | changed))
-
-
 def start(**changed):
     return consistent_state(**({"system": pendulum(), "t": 0.0, "q": [-0.6, -0.81], "v": [0.0, 0.0]} | changed))
 
@@ -164,17 +157,3 @@ def test_a_result_or_an_error_that_names_the_argument(call, name, tmp_path, monk
             try_one(call, name, value)
 
     each()
-
-
-def test_there_are_many_kinds():
-    assert len(ARGUMENTS) * len(SORTS) > 1500
-
-
-def test_an_error_that_does_not_name_the_argument_is_seen():
-    def vague(rtol):
-        raise ValueError("something is wrong")
-
-    with pytest.raises(AssertionError, match="does not name the argument"):
-        try_one(vague, "rtol", 1.0)
-    with pytest.raises(ZeroDivisionError):
-        try_one(lambda rtol: 1.0 / 0.0, "rtol", 1.0)

@@ -14,7 +14,6 @@ from tests.test_bounds import FAR
 from twoloop import ConstrainedSystem, Integrator, callback, consistent_state, mechanisms, solve, solve_dae
 from twoloop.checks.scales import scales_of
 from twoloop.checks.violation import Violation, surely_consistent
-from twoloop.kernels.compile.caches import Newest
 
 METHODS = ["auto", "Taylor", "DOP853", "Adams", "RadauIIA5", "BDF"]
 NAMES = ["four_bar", "redundant_slider_crank", "heavy_top", "knife_edge", "driven_crank", "n_four_bar"]
@@ -352,20 +351,3 @@ def test_callbacks_that_are_no_formulas_of_their_parameters_run_all_the_same(for
         system = bead([1.3, value, 0.4, 1.9], force)
         made, expected = run_bead(system), run_bead(system, compiled=False, method="DOP853")
         assert made.success and np.abs(made.q[:, -1] - expected.q[:, -1]).max() < 1e-7
-
-
-def test_threads_trace_one_family_one_after_another(monkeypatch):
-    monkeypatch.setattr("twoloop.generate.families._FAMILIES", Newest())
-    lengths = np.linspace(1.1, 1.9, 8) + 0.013
-
-    def end(length, compiled="auto"):
-        problem = mechanisms.four_bar(lengths=(1.0, 2.0, float(length)))
-        result = solve_dae(
-            problem.system, (0.0, 0.5), problem.q0, problem.v0, rtol=1e-10, atol=1e-10, compiled=compiled
-        )
-        return result.q[:, -1]
-
-    with ThreadPoolExecutor(4) as pool:
-        made = list(pool.map(end, lengths))
-    expected = [end(length, compiled=False) for length in lengths]
-    assert np.abs(np.array(made) - np.array(expected)).max() < 1e-7

@@ -138,7 +138,7 @@ def test_results_do_not_share_arrays(taken):
 
 @pytest.mark.parametrize("options", [*({"method": name} for name in ("DOP853", "Adams")), {}], ids=str)
 def test_a_run_of_several_chunks_is_that_of_the_long_way(options, taken, monkeypatch):
-    """It is looked at after as many attempts, so that the message is the same, too."""
+    """The clock is read after as many attempts, so that the message is the same, too."""
     problem, other = mechanisms.four_bar(), mechanisms.four_bar()
     options = {"max_step": 0.01, "t_eval": [0.5, 7.3, 25.0]} | options
     states = starts(problem, 1.0, 8)

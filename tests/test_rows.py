@@ -3,6 +3,7 @@
 import gzip
 import inspect
 import json
+from pathlib import Path
 
 import pytest
 
@@ -10,7 +11,7 @@ from twoloop import mechanisms
 from twoloop.__main__ import main
 from twoloop.rows import leaderboard, row_format
 from twoloop.rows.leaderboard import ARCHIVE, boards, chosen, seconds
-from twoloop.rows.row_format import mistakes, read_rows, text_of
+from twoloop.rows.row_format import FIELDS, mistakes, read_rows, text_of
 
 ROW = {"schema": 1, "mechanism": "four_bar", "t_end": 10, "solver": "mine", "family": "me", "version": "3"}
 ROW |= {"processor": "abacus", "setting": "tol", "value": 1e-6, "status": "REACHED_END", "times_s": [0.1, 0.11, 0.09]}
@@ -170,3 +171,9 @@ def test_the_leaderboard(tmp_path, capsys):
     ):
         with pytest.raises(SystemExit, match=f"error: {says}"):
             main(["leaderboard", *words])
+
+
+def test_the_page_says_what_the_fields_are():
+    page = (Path(__file__).parents[1] / "docs" / "reference" / "rows.md").read_text(encoding="utf-8")
+    for name, field in FIELDS.items():
+        assert f"| `{name}` | {field.expected} | {field.about}{'' if field.needed else '; may be left out'} |" in page

@@ -19,7 +19,7 @@ from tests.problems import (
     unconstrained,
     worst,
 )
-from twoloop import ConstrainedSystem, consistent_state, solve_dae
+from twoloop import consistent_state, solve_dae
 from twoloop.bodies import SpatialModel
 from twoloop.checks.consistency import check_start
 from twoloop.mechanisms import (
@@ -328,18 +328,3 @@ def test_plain_functions_take_parameters_last(compile):
         expected = pendulum_state(np.sqrt(1.0 / radius), angle=0.5 * np.pi)[0]
         assert result.success and np.allclose(result.q[:, -1], radius * expected, atol=1e-7) and result.system is each
     assert other.functions[:3] == system.functions[:3]  # nothing is compiled again
-
-
-def test_parameters_are_taken_where_they_are_asked_for():
-    length = 3.0
-    system = bead(
-        force=lambda t, q, v, length=length: np.array([0.0, -length])
-    )  # an argument with a default is its own
-    assert system.force(0.0, [1.0, 0.0], [0.0, 0.0]).tolist() == [0.0, -3.0]
-    assert bead(force=lambda *arguments: arguments[-1]).force(0.0, [1.0, 0.0], [0.0, 0.0]).tolist() == [2.0, 1.0]
-    with pytest.raises(
-        TypeError, match=r"force is called as force\(t, q, v, p\); the function given takes \(p, t, q, v\)"
-    ):
-        bead(force=lambda p, t, q, v: p)
-    with pytest.raises(ValueError, match="parameters are given, but none of the functions"):
-        ConstrainedSystem.from_python(n_q=1, n_c=0, mass=np.eye(1), force=lambda t, q, v: -q, parameters=[1.0])
