@@ -1,6 +1,7 @@
 """Machine code on disk: read again when nothing changed, rebuilt when anything did, never a reason to fail."""
 
 import hashlib
+import math
 import os
 import pickle
 import shutil
@@ -392,3 +393,15 @@ def test_whose_folders_are_in_doubt(tmp_path, monkeypatch, changes, why, above):
     at = folder.parent if above else folder
     seen_as(monkeypatch, at, **changes)
     assert doubt_of(folder) == (f"{at} {why}" if why else "") and (own_folder(folder) == folder) == (not why)
+
+
+@njit
+def takes_an_attribute(x):
+    return math.log(x)
+
+
+def test_an_attribute_is_not_the_global_of_the_same_name(monkeypatch):
+    """A callback that calls `math.log` was not kept where its file had something else that is called `log`."""
+    stamp = watch(takes_an_attribute.py_func)
+    monkeypatch.setitem(globals(), "log", object())
+    assert watch(takes_an_attribute.py_func) == stamp is not None

@@ -89,14 +89,6 @@ def test_a_step_that_is_too_small_for_the_run_ends():
     assert result.status is Status.STAGNATED and "larger step_size" in result.message
 
 
-def test_what_ends_before_the_end_may_be_far_from_it():
-    far, start = (0.0, 1e11), ([-1.0, 0.0], [0.0, 0.0])
-    ended = solve_dae(pendulum(compile=True), far, *start, "DOP853", time_limit=0.5, compiled=False)
-    assert ended.status is Status.TIME_LIMIT
-    late = event(lambda t, q, v: t - 1e3, terminal=True)
-    assert solve_dae(pendulum(compile=True), far, *start, "DOP853", max_step=0.02, events=late).status is Status.EVENT
-
-
 # --- values that are not finite
 KINDS = ("mass", "force", "constraint", "jacobian", "gamma")
 METHODS = ("Gauss12", "SunRadau5", "PaperIRK", "Newmark", "BDF", "DOP853", "Adams", "RadauIIA5")

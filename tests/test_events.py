@@ -1,5 +1,6 @@
 """Events: where functions of the motion are zero, by the rules of SciPy."""
 
+import numba
 import numpy as np
 import pytest
 import scipy
@@ -165,3 +166,12 @@ def test_an_exception_of_an_event_comes_through_with_a_note():
 def test_a_value_that_is_wrong_later_is_named_with_its_time():
     with pytest.raises(ValueError, match=r"events\[0\] must return a finite number; at t = 0\.\d+ it returned nan"):
         swing(1.0, events=lambda t, q, v: np.nan if t > 0.3 else 1.0)
+
+
+def test_compiled_events():
+    @numba.njit
+    def lowest(t, q, v):
+        return q[0]
+
+    result = swing(2.0, events=lowest)
+    assert result.t_events[0].size > 0 and worst(result.q_events[0][:, 0], 0.0) < 1e-15

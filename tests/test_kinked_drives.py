@@ -7,7 +7,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from tests.problems import driven_cart, pendulum, quick, unconstrained
-from twoloop import ConstrainedSystem, solve_dae
+from twoloop import ConstrainedSystem, Status, solve_dae
 from twoloop.methods.presets import PRESETS
 
 # a cart on a driven path, two bars below it, the five coordinates coupled by the mass matrix
@@ -224,3 +224,17 @@ def test_a_run_may_start_and_end_at_a_kink(method, at):
     along = np.array([np.cos(angle), np.sin(angle)])
     assert abs(result.v[:, -1] - [speed, 0.0] - rate * along).max() < 1e-5
     assert abs(along @ result.a[:, -1] + 9.81 * np.sin(angle)) < 1e-4
+
+
+def test_drives_that_contradict_one_another_end_the_run():
+    """Two rows for one coordinate, one of which jumps and not the other."""
+    system = pendulum(
+        n_c=2,
+        constraint=lambda t, q: np.array([q[0] - max(0.0, t - 0.5), q[0]]),
+        jacobian=lambda t, q: np.array([[1.0, 0.0], [1.0, 0.0]]),
+        constraint_rate=lambda t, q: np.array([-1.0 if t > 0.5 else 0.0, 0.0]),
+        gamma=lambda t, q, v: np.zeros(2),
+    )
+    with pytest.warns(UserWarning, match="rank 1 of 2"):
+        result = solve_dae(system, (0.0, 1.0), np.zeros(2), np.zeros(2), "Gauss6", check_derivatives=False)
+    assert result.status in (Status.RATE_JUMPS, Status.ROWS_CONTRADICT) and result.t[-1] < 0.51

@@ -200,3 +200,17 @@ def test_the_papers_criterion_over_all_coordinates_needs_fewer_steps_at_a_loose_
         assert result.success, result.message
         steps[outer_test] = len(result.h)
     assert steps["all"] < 0.8 * steps["independent"]
+
+
+def test_progress_draws_a_bar(capsys):
+    pytest.importorskip("rich")
+    quiet = swing()
+    assert capsys.readouterr().out == ""
+    shown = swing(progress=True)
+    assert "100%" in capsys.readouterr().out and (shown.q == quiet.q).all()
+
+
+def test_input_is_not_changed(default_four_bar):
+    q0, v0, times = default_four_bar.q0.copy(), default_four_bar.v0.copy(), np.array([0.5, 1.0])
+    solve_dae(default_four_bar.system, (0.0, 1.0), q0, v0, t_eval=times)
+    assert (q0 == default_four_bar.q0).all() and (v0 == 0.0).all() and (times == [0.5, 1.0]).all()

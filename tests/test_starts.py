@@ -328,3 +328,24 @@ def test_plain_functions_take_parameters_last(compile):
         expected = pendulum_state(np.sqrt(1.0 / radius), angle=0.5 * np.pi)[0]
         assert result.success and np.allclose(result.q[:, -1], radius * expected, atol=1e-7) and result.system is each
     assert other.functions[:3] == system.functions[:3]  # nothing is compiled again
+
+
+def test_it_says_how_far_it_moved():
+    state = consistent_state(pendulum(), 0.0, [0.6, -0.7], [1.0, 0.0], keep=[0])
+    q, v = state
+    assert len(state) == 2 and worst(q, [0.6, -0.8]) < 1e-15 and worst(v, [1.0, 0.75]) < 1e-15
+    assert state.moved_q.coordinate == state.moved_v.coordinate == 1 and abs(state.moved_q.change + 0.1) < 1e-15
+    assert abs(state.moved_v.change - 0.75) < 1e-15
+    still = consistent_state(pendulum(), 0.0, q, v)
+    assert max(abs(still.moved_q.change), abs(still.moved_v.change)) < 1e-15
+
+
+@pytest.mark.parametrize("theta3", [0.0, 0.4, 1.0])
+def test_the_sign_tells_the_two_assemblies_apart(theta3):
+    states = []
+    for branch in (-1, 1):
+        problem = four_bar(theta3=theta3, branch=branch)
+        states.append(consistent_state(problem.system, 0.0, problem.q0, problem.v0, keep=[CRANK]))
+    assert states[0].dependent == states[1].dependent == tuple(range(8))
+    assert states[0].determinant_sign == -states[1].determinant_sign != 0
+    assert min(state.margin for state in states) > 0.01

@@ -11,12 +11,6 @@ from tests.problems import quick, unconstrained, worst
 from twoloop import Taylor, mechanisms, solve_dae
 from twoloop.bodies import PlanarModel
 from twoloop.generate import compiled_series, families
-from twoloop.generate.coefficients import Coefficients
-from twoloop.generate.llvm_code import Emitter
-from twoloop.generate.llvm_text import Module
-from twoloop.generate.series import series_program
-from twoloop.generate.series_code import SeriesCode
-from twoloop.generate.series_loops import SeriesLoops
 from twoloop.generate.straight_code import own_code
 
 FORCES = {
@@ -214,24 +208,3 @@ def test_functions_of_any_number_of_quantities(name, n, monkeypatch):
     assert worst(loops.q[:, -1], straight.q[:, -1]) < 1e-12
     q, v = loops.q[:, 0], loops.v[:, 0]
     assert np.allclose(loops.a[:, 0], FUNCTIONS[name](0.0, q, v), rtol=1e-14, atol=0.0)
-
-
-def n_lines(kind, system):
-    """Of the code of a kind."""
-    module, code = Module(), kind(series_program(system), Coefficients())
-    code.write_parts(module)
-    for name, emit, n_vectors in (("begin", code.begin, 5), ("find", code.find_order, 4), ("take", code.take_order, 4)):
-        more = {"begin": 2, "find": 2, "take": 1}[name]
-        arguments = ["double*"] * n_vectors + ["double"] * more
-        arguments += ["double*"] * (2 if name == "begin" else 0) + ["i64"] * (name != "begin")
-        arguments += ["double*"] * (name != "begin")
-        builder = module.function(name, "void", arguments)
-        emit(Emitter(builder), *builder.arguments)
-        builder.ret(None)
-    return str(module).count("\n")
-
-
-def test_the_code_does_not_grow_with_a_mechanism():
-    short, long = (n_lines(SeriesLoops, spatial_chain(n, hinges=True)[0]) for n in (4, 12))
-    assert long < 1.2 * short
-    assert n_lines(SeriesCode, spatial_chain(12, hinges=True)[0]) > 8 * long
