@@ -7,7 +7,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from tests.marks import slow
-from twoloop import ensemble, solve_dae
+from twoloop import solve_dae
 from twoloop.bodies import PlanarModel, SpatialModel
 
 G = 9.81
@@ -76,23 +76,6 @@ def test_a_cart_with_a_pendulum(spatial):
     rod = result.q[7:9] if spatial else result.q[3:5]
     np.testing.assert_allclose(rod, [x + 0.5 * np.sin(a), -0.5 * np.cos(a)], atol=1e-9)
     assert (np.diff(problem.energy(result.t, result.q, result.v)) < 0.0).all()
-
-
-@pytest.mark.slow
-def test_a_stiff_method_and_many_runs_with_other_coefficients():
-    model, *_ = cart(False)
-    problem = model.problem((0.0, 0.03))
-    known = solve_dae(problem.system, problem.t_span, problem.q0, problem.v0, "DOP853", rtol=1e-8)
-    other = solve_dae(problem.system, problem.t_span, problem.q0, problem.v0, "RadauIIA9", rtol=1e-8)
-    np.testing.assert_allclose(other.q[:, -1], known.q[:, -1], atol=1e-7)
-    name = "coefficient of friction of prismatic cart-ground"
-    P = np.tile(problem.system.parameters, (2, 1))
-    P[1, problem.place(name)] = 0.05
-    runs = ensemble(problem.system, (0.0, 0.03), problem.q0, problem.v0, parameters=P)
-    single = solve_dae(problem.with_parameters({name: 0.05}).system, (0.0, 0.03), problem.q0, problem.v0)
-    np.testing.assert_allclose(runs.q[0, :, -1], known.q[:, -1], atol=1e-6)
-    np.testing.assert_allclose(runs.q[1, :, -1], single.q[:, -1], atol=1e-6)
-    assert abs(runs.q[1, 0, -1] - runs.q[0, 0, -1]) > 1e-4
 
 
 def test_where_the_load_or_the_friction_is_not_determined():

@@ -4,12 +4,12 @@ import warnings
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from tests.bodies.random_models import Both
 from tests.bodies.runs import moved
 from tests.marks import slow
 from twoloop.bodies import IgnoredWarning, SpatialModel, from_mjcf
-from twoloop.bodies.rotation import rotation_matrix
 
 pytestmark = pytest.mark.filterwarnings("ignore::twoloop.ConstraintWarning")
 LEG = """
@@ -53,8 +53,7 @@ def end(model, end=0.5):
 
 
 def about_y(degrees):
-    half = np.radians(degrees) / 2.0
-    return rotation_matrix([np.cos(half), 0.0, np.sin(half), 0.0])
+    return Rotation.from_euler("y", degrees, degrees=True).as_matrix()
 
 
 def test_a_leg_by_hand_and_from_a_file(tmp_path):

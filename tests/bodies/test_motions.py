@@ -200,34 +200,3 @@ def test_a_strandbeest_leg():
         known = strandbeest(0.4 + turned)
         centre = np.mean([known[each] for each in LEG["ghi"]], axis=0)
         np.testing.assert_allclose(walk.q[3 * foot : 3 * foot + 2, k], centre, atol=1e-11)
-
-
-def test_bennetts_linkage():
-    """G. T. Bennett (1903): four hinges in space whose links have a / sin(alpha) alike: it moves."""
-    a, alpha = 0.5, 0.6
-    b = 0.8
-    beta = np.arcsin(b / a * np.sin(alpha))
-    lengths, twists = (a, b, a, b), (alpha, beta, alpha, beta)
-    first = 1.1
-    second = 2.0 * np.arctan(np.sin(0.5 * (beta + alpha)) / (np.sin(0.5 * (beta - alpha)) * np.tan(0.5 * first)))
-    frames = [(np.eye(3), np.zeros(3))]
-    for length, twist, angle in zip(lengths, twists, (first, second, -first, -second), strict=True):
-        R, x = frames[-1]
-        s, c = np.sin(angle), np.cos(angle)
-        R = R @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-        x = x + R @ (length, 0.0, 0.0)
-        s, c = np.sin(twist), np.cos(twist)
-        frames.append((R @ np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]]), x))
-    np.testing.assert_allclose(frames[-1][1], 0.0, atol=1e-12)  # it closes
-    np.testing.assert_allclose(frames[-1][0], np.eye(3), atol=1e-12)
-    model = SpatialModel(name="Bennett")
-    names = ("base", "one", "two", "three")
-    for name, (_, x), (_, y) in zip(names[1:], frames[1:], frames[2:], strict=False):
-        model.rod(name, x, y, radius=0.03, mass=0.5)
-    for k, (R, x) in enumerate(frames[:4]):
-        ends = [names[(k + 3) % 4], names[k]]
-        a_name, b_name = ("ground" if each == "base" else each for each in ends)
-        model.revolute(a_name, b_name, at=x, axis=R[:, 2])
-    problem = model.problem()
-    assert problem.freedom.degrees == 1 and problem.freedom.redundant
-    agreed(problem, 1.0)

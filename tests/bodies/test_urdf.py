@@ -4,6 +4,7 @@ import warnings
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from tests.bodies.runs import moved
 from twoloop.bodies import IgnoredWarning, Loop, PlanarModel, SpatialModel, from_urdf
@@ -53,18 +54,13 @@ def read(path, **options):
         return from_urdf(path, **options)
 
 
-def turned(x, y, z):
+def turned(*angles):
     """About fixed axes: x, then y, then z."""
-    (a, b), (c, d), (e, f) = ((np.cos(angle), np.sin(angle)) for angle in (x, y, z))
-    one, two, three = np.eye(3), np.eye(3), np.eye(3)
-    one[1:, 1:], three[:2, :2] = ((a, -b), (b, a)), ((e, -f), (f, e))
-    two[np.ix_([0, 2], [0, 2])] = ((c, d), (-d, c))
-    return three @ two @ one
+    return Rotation.from_euler("xyz", angles).as_matrix()
 
 
 def about(axis, angle):
-    axis = np.array(axis) / np.linalg.norm(axis)
-    return rotation_matrix(np.append(np.cos(0.5 * angle), np.sin(0.5 * angle) * axis))
+    return Rotation.from_rotvec(angle * np.array(axis) / np.linalg.norm(axis)).as_matrix()
 
 
 def by_hand():
@@ -173,12 +169,3 @@ def test_what_is_wrong_is_named(arm, old, new, message):
     arm.write_text(arm.read_text().replace(old, new, 1))
     with pytest.raises(ValueError, match=message):
         read(arm)
-
-
-def test_the_damping_of_a_floating_joint_is_told(tmp_path):
-    path = tmp_path / "floats.urdf"
-    path.write_text("""<robot name="floats"><link name="base"/><link name="hull"><inertial><mass value="1"/>
-      <inertia ixx="1" iyy="1" izz="1"/></inertial></link><joint name="free" type="floating"><parent link="base"/>
-      <child link="hull"/><dynamics damping="3"/></joint></robot>""")
-    with pytest.warns(IgnoredWarning, match="damping of joint 'free'"):
-        assert not from_urdf(path).joints

@@ -126,11 +126,3 @@ class AdaptiveMethod:
         found = *problems.oblique_to_point(result), result.lam
         for values, known, far in zip(found, problems.oblique_point(result.t), self.oblique_far, strict=True):
             assert problems.worst(values, known) < far
-
-    def test_plain_python_gives_the_run_of_compiled_functions(self):
-        plain, compiled = (
-            # plain functions may have narrow forces, for all that is known, so that steps are limited
-            problems.swing(method=self.method, system=problems.pendulum(compile=how), compiled=False, max_step=0.02)
-            for how in (False, True)
-        )
-        assert plain.stats.n_evaluations == compiled.stats.n_evaluations and problems.worst(plain.q, compiled.q) < 1e-12

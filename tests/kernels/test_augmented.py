@@ -6,7 +6,7 @@ import pytest
 import twoloop.run.workspace as workspace_module
 from tests.chains import chain
 from tests.general.mechanisms import error, mechanism
-from tests.problems import force_residual, pendulum, some_of, violations, worst
+from tests.problems import pendulum, some_of, violations, worst
 from twoloop import solve_dae
 from twoloop.kernels.algebra.sparse import MANY, sparse_pays
 from twoloop.kernels.data import flags
@@ -67,15 +67,6 @@ def test_known_motions(both, name, method):
     assert worst(dense.lam[:, 0], sparse.lam[:, 0]) < 1e-9 * max(1.0, np.abs(dense.lam[:, 0]).max())
     assert error(m, sparse) < max(3.0 * error(m, dense), 1e-8)
     assert sparse.stats.n_evaluations < 1.5 * dense.stats.n_evaluations  # at 1e-10 rounding decides on some iterations
-
-
-@pytest.mark.parametrize(("method", "closed"), [("DOP853", False), ("Gauss6", True)])
-def test_a_chain_of_fourteen(both, closed, method):
-    problem = chain(14, closed)
-    options = {"method": method, "rtol": 1e-10, "atol": 1e-10, "t_eval": np.linspace(0.0, 0.05, 6)}
-    dense, sparse = both(problem.system, (0.0, 0.05), problem.q0, problem.v0, **options)
-    assert worst(dense.q, sparse.q) < 1e-8 and worst(dense.v, sparse.v) < 1e-6
-    assert force_residual(problem.system, sparse) < 1e-8 and max(violations(problem.system, sparse)) < 1e-9
 
 
 def test_chosen_where_rows_and_degrees_of_freedom_are_many():

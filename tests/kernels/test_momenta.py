@@ -77,15 +77,3 @@ def test_symplectic_where_the_mass_matrix_depends_on_the_position(gamma):
         for method in [RungeKutta(sun_radau_iib(3), variables=variables)]
     }
     assert defects["momenta"] < 1e-8 and defects["velocities"] > 1e-7
-
-
-@pytest.mark.parametrize(("variables", "gamma"), [("velocities", True), ("momenta", False)])
-def test_forces_without_a_potential_and_a_mass_that_depends_on_time_are_right_too(gamma, variables):
-    system, times = problems.oblique_pendulum(gamma), np.linspace(0.0, 2.0, 6)
-    method = RungeKutta(gauss(3), variables=variables)
-    result = solve_dae(system, (0.0, 2.0), *problems.oblique_start(), method, 1e-10, 1e-10, t_eval=times)
-    x, u = problems.oblique_to_point(result)
-    truth = problems.oblique_point(times)
-    assert max(problems.worst(x, truth[0]), problems.worst(u, truth[1])) < 1e-8
-    assert problems.worst(result.lam[0], truth[2]) < 1e-6
-    assert max(problems.violations(system, result)) < 1e-12 and problems.force_residual(system, result) < 1e-10

@@ -11,7 +11,7 @@ from studies.bench.random_assemblies import PlanarAssembly, SpatialAssembly, den
 from tests.large_systems import spatial_chain, started_run
 from tests.marks import slow
 from tests.problems import worst
-from twoloop import ConstrainedSystem, ConstraintWarning, solve_dae
+from twoloop import ConstrainedSystem, solve_dae
 from twoloop.checks.values import MOST
 from twoloop.kernels import advance
 from twoloop.kernels.algebra import static_program
@@ -91,21 +91,6 @@ def test_runs_are_those_of_the_other_forms(both, method):
     assert worst(one.reactions(name).force[:, -1], other.reactions(name).force[:, -1]) < 1e-7
 
 
-def test_redundant_rows_are_named_and_held(both):
-    assembly = PlanarAssembly(5, 24, 2, 2)
-    system, q = assembly.system("redundant"), assembly.q
-
-    def run():
-        with pytest.warns(ConstraintWarning, match="depend on the others"):
-            return solve_dae(assembly.system("redundant"), (0.0, 0.02), q, 0.0 * q, "DOP853", 1e-9, 1e-9)
-
-    other, result = both(run)
-    assert result.success and result.rank == other.rank == system.n_c - len(result.redundant)
-    assert worst(result.q[:, -1], other.q[:, -1]) < 1e-9
-    assert worst(result.lam[:, -1], other.lam[:, -1]) < 1e-6 * np.abs(other.lam[:, -1]).max()
-    assert worst(system.constraint(0.02, result.q[:, -1]), 0.0) < 1e-12
-
-
 @pytest.mark.parametrize(("end", "partitions", "drift"), [(0.09, 10, 1e-6), slow(0.15, 20, 1e-5)])
 def test_a_ladder_whose_parallelograms_pass_their_flat_position(end, partitions, drift):
     """Which is a singular one: steps cross it. Rungs stay parallel, and the rails each other's images.
@@ -164,56 +149,6 @@ def test_bodies_whose_mass_matrix_is_singular(any_size, both):
     assert (static_form(system, 0.0, q) is not None) and started_run(system, q).static is not None
     assert worst(one.q[:, -1], other.q[:, -1]) < 1e-11
     assert worst(one.lam[:, -1], other.lam[:, -1]) < 1e-9 * np.abs(one.lam[:, -1]).max()
-
-
-def masses_on_rods(n, dense):
-    """A chain of point masses in plain functions, its matrices dense or by values; masses vary by a millionth."""
-    rows = np.repeat(np.arange(n), [2] + [4] * (n - 1))
-    columns = np.concatenate([[0, 1]] + [[2 * k - 2, 2 * k - 1, 2 * k, 2 * k + 1] for k in range(1, n)])
-
-    def differences(q):
-        return np.diff(np.vstack([np.zeros((1, 2)), q.reshape(n, 2)]), axis=0)
-
-    def values(t, q):
-        d = differences(q)
-        return np.concatenate([d[0], np.hstack([-d[1:], d[1:]]).ravel()])
-
-    def matrix(t, q):
-        made = np.zeros((n, 2 * n))
-        made[rows, columns] = values(t, q)
-        return made
-
-    def masses(t, q):
-        return 1.0 + 1e-6 * np.sin(q)
-
-    both = np.arange(2 * n)
-    if dense:
-        options = {"jacobian": matrix, "mass": lambda t, q: np.diag(masses(t, q))}
-    else:
-        options = {"jacobian_values": values, "jacobian_entries": (rows, columns)}
-        options |= {"mass_values": masses, "mass_entries": (both, both)}
-    system = ConstrainedSystem.from_python(
-        n_q=2 * n,
-        n_c=n,
-        force=lambda t, q, v: np.tile([0.0, -9.81], n),
-        constraint=lambda t, q: 0.5 * ((differences(q) ** 2).sum(axis=1) - 1.0 / n**2),
-        gamma=lambda t, q, v: -(differences(v) ** 2).sum(axis=1),
-        name="masses on rods",
-        **options,
-    )
-    angles = np.linspace(0.1, 1.3, n)
-    return system, np.cumsum(np.column_stack([np.cos(angles), np.sin(angles)]) / n, axis=0).ravel()
-
-
-def test_plain_functions_dense_or_by_values(large):
-    found = []
-    for dense, least in ((True, 10**9), (True, 0), (False, 0)):
-        large(least)
-        system, q = masses_on_rods(30, dense)
-        assert (started_run(system, q).static is not None) == (least == 0)
-        found.append(solve_dae(system, (0.0, 0.02), q, 0.0 * q, "DOP853", 1e-8, 1e-8))
-    assert all(result.success for result in found) and worst(found[0].q[:, -1], found[1].q[:, -1]) < 1e-12
-    assert worst(found[0].q[:, -1], found[2].q[:, -1]) < 1e-12
 
 
 def test_an_entry_that_comes_up_on_the_way_ends_the_static_form(both):

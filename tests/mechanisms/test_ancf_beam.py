@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.interpolate import CubicSpline
 from scipy.linalg import eigh
@@ -97,6 +97,7 @@ def turned(q, angle, x=0.0, y=0.0):
     return vectors.ravel()
 
 
+@settings(max_examples=8)
 @given(displacements)
 def test_force_is_minus_the_gradient_of_the_strain_energy(beam, u):
     q = beam.q0 + u

@@ -6,9 +6,7 @@ import pytest
 from references.casadi.integrators import solve_collocation
 from references.exudyn.beam import solve_exudyn_beam
 from references.exudyn.mechanisms import solve_exudyn
-from references.paper.four_bar_minimal import trajectory
 from references.paper.gear import solve_gear
-from references.scipy.beam_reduced import reduced_motion
 from references.scipy.fully_implicit import solve_fully_implicit
 from references.scipy.index1 import solve_index1
 from references.sundials.cvode_c import solve_cvode_c
@@ -28,12 +26,6 @@ def test_every_adapter_watches_the_bounds_of_every_callback(entry, kind):
     tangents = NO_TANGENT if kind == "reaction_by_q" else {}
     with pytest.raises(ValueError, match=rf"{kind} of 'far' goes out of bounds: index {FAR}"):
         BOUNDED[entry](system(**tangents, **{kind: beyond(kind)}))
-
-
-@pytest.mark.parametrize("entry", BOUNDED)
-def test_too_few_parameters_are_reported_as_such(entry):
-    with pytest.raises(ValueError, match=r"(?s)of 'far' goes out of bounds.*p has 0.*Give more `parameters`"):
-        BOUNDED[entry](system(parameters=[]))
 
 
 CHECKED = (
@@ -63,13 +55,6 @@ def test_wrong_arguments_are_named(name, changed, error, words):
     at = [given.pop(key) for key in ("system", "t_span", "q0", "v0")]
     with pytest.raises(error, match=words):
         ADAPTERS[name](*at, **given)
-
-
-@pytest.mark.parametrize("tol", [0.0, -1.0, np.nan, np.inf, "small"])
-@pytest.mark.parametrize("name", CHECKED)
-def test_wrong_tolerances_are_named(name, tol):
-    with pytest.raises(TypeError if tol == "small" else ValueError, match=r"tol must be (positive|a number)"):
-        ADAPTERS[name](*start(PROBLEM, 1.0), tol=tol)
 
 
 @pytest.mark.parametrize(
@@ -117,13 +102,6 @@ def test_adapters_of_one_mechanism_name_wrong_arguments(solve):
     ):
         with pytest.raises(error, match=words):
             solve(**{"problem": problem, "t_end": 1.0, "n_steps": 10, **changed})
-
-
-def test_references_name_wrong_arguments():
-    with pytest.raises(TypeError, match=r"problem must be a beam of ancf_beam.*given ConstrainedSystem"):
-        reduced_motion(PROBLEM.system, [1.0], 1e-8)
-    with pytest.raises(ValueError, match="times must be a list of finite times"):
-        trajectory(PROBLEM.parameters, [0.0, np.nan])
 
 
 def test_a_missing_package_is_told(monkeypatch):

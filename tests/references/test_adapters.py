@@ -6,16 +6,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from references.driver import TimeLimit
-from references.equations.rows import with_all_rows
 from references.exudyn.beam import solve_exudyn_beam
 from references.exudyn.mechanisms import solve_exudyn
 from references.exudyn.run import SOLVERS
-from references.paper.gear import solve_gear
-from references.scipy.index1 import solve_index1
+from tests.marks import slow
 from tests.problems import pendulum
 from tests.references.adapters import ADAPTERS, ALIKE, ANY_CALLBACK, COMPILES, each, start
-from twoloop import ConstrainedSystem
 from twoloop.mechanisms import double_pendulum, four_bar, knife_edge, rolling_disc, very_flexible_beam
 from twoloop.run.record import Status
 from twoloop.testing.known_problems import MAKERS
@@ -28,62 +24,37 @@ TIMES = np.linspace(0.0, 2.0, 201)
 
 
 # --- right, and measured
-# largest error of q of the four-bar at 10 s with tolerances of 1e-9: two to four times what it was when this was
-# written; gear takes steps of 1e-3 s, collocation 300, heyoka is asked for 1e-6
+# largest error of q with tolerances of 1e-9: of the four-bar at 10 s, two to four times what it was when written,
+# and of the double pendulum at 3 s, three to six times; gear takes steps of 1e-3 s, collocation 300, heyoka 1e-6
 RIGHT = {
-    **{
-        "heyoka": 5e-6,
-        "CVODE from C, Adams": 5e-6,
-        "CVODE from C, BDF": 1e-5,
-        "CVODE, Adams": 2e-6,
-        "Pr9, index 1": 1e-9,
-        "CyRK, DOP853": 5e-8,
-        "CyRK, Vern8": 1e-6,
-        "CyRK, Radau": 1e-6,
-    },
-    **{
-        "IDAS, CasADi": 5e-6,
-        "collocation, CasADi": 2e-7,
-        "Dopri8, diffrax": 2e-8,
-        "CVODES, CasADi": 1e-5,
-        "GSTIFF": 0.05,
-        "Radau9, solve_dae": 1e-7,
-    },
-    **{"IDA, index1": 1.1e-5, "IDA, stabilised": 3e-6, "IDA from C, stabilised": 2.4e-5},
-}
-# and of the double pendulum at 3 s: three to six times
-RIGHT_ON_SMALL = {
-    **{
-        "heyoka": 2e-6,
-        "CVODE from C, Adams": 5e-7,
-        "CVODE from C, BDF": 4e-6,
-        "CVODE, Adams": 2e-6,
-        "Pr9, index 1": 2e-11,
-        "CyRK, DOP853": 4e-9,
-        "CyRK, Vern8": 2e-7,
-        "CyRK, Radau": 1e-8,
-    },
-    **{
-        "IDAS, CasADi": 1.5e-6,
-        "collocation, CasADi": 1e-9,
-        "Dopri8, diffrax": 2e-8,
-        "CVODES, CasADi": 4e-6,
-        "GSTIFF": 4e-4,
-        "Radau9, solve_dae": 3e-12,
-    },
-    **{"IDA, index1": 1e-6, "IDA, stabilised": 2e-7, "IDA from C, stabilised": 2e-7},
+    "heyoka": (5e-06, 2e-06),
+    "CVODE from C, Adams": (5e-06, 5e-07),
+    "CVODE from C, BDF": (1e-05, 4e-06),
+    "CVODE, Adams": (2e-06, 2e-06),
+    "Pr9, index 1": (1e-09, 2e-11),
+    "CyRK, DOP853": (5e-08, 4e-09),
+    "CyRK, Vern8": (1e-06, 2e-07),
+    "CyRK, Radau": (1e-06, 1e-08),
+    "IDAS, CasADi": (5e-06, 1.5e-06),
+    "collocation, CasADi": (2e-07, 1e-09),
+    "Dopri8, diffrax": (2e-08, 2e-08),
+    "CVODES, CasADi": (1e-05, 4e-06),
+    "GSTIFF": (0.05, 0.0004),
+    "Radau9, solve_dae": (1e-07, 3e-12),
+    "IDA, index1": (1.1e-05, 1e-06),
+    "IDA, stabilised": (3e-06, 2e-07),
+    "IDA from C, stabilised": (2.4e-05, 2e-07),
 }
 
 
-@pytest.mark.parametrize("problem", [SMALL, pytest.param(PROBLEM, marks=pytest.mark.slow)], ids=lambda each: each.name)
+@pytest.mark.parametrize("problem", [SMALL, slow(PROBLEM)], ids=lambda each: each.name)
 @pytest.mark.parametrize("name", each(of=RIGHT, slow=(ALIKE - {"Radau9, solve_dae"}) | COMPILES))
 def test_another_solver_is_right_and_measured(name, problem):
     result = ADAPTERS[name](*start(problem), tol=1e-6 if name == "heyoka" else 1e-9)
     system, n, end = problem.system, problem.system.n_q, result.q[:, -1].copy()
     assert result.success, result.message
     assert result.t[0] == 0.0 and result.t[-1] == pytest.approx(problem.reference.t, abs=1e-12)
-    bounds = RIGHT if problem is PROBLEM else RIGHT_ON_SMALL
-    assert 1e-14 < np.abs(end - problem.reference.q).max() < bounds[name]
+    assert 1e-14 < np.abs(end - problem.reference.q).max() < RIGHT[name][problem is SMALL]
     assert result.q.shape == result.v.shape == result.a.shape == (n, result.t.size)
     assert result.lam.shape == (system.n_c, result.t.size)
     residual = system.mass(0.0, end) @ result.a[:, -1] + system.jacobian(0.0, end).T @ result.lam[:, -1]
@@ -171,29 +142,6 @@ def test_a_run_past_its_limit_is_not_run_again_to_its_end(name):
     more = {} if short else {"t_eval": [LONG]}
     result = ADAPTERS[name](*start(SMALL, 1.0 if short else LONG), time_limit=1e-9 if short else 0.01, **more)
     assert result.status is Status.SOLVER_FAILED and "time_limit" in result.message and result.t.size == 0
-
-
-@pytest.mark.parametrize("name", each(of=[*ANY_CALLBACK, "IDA from C, stabilised"], slow=ALIKE))
-def test_a_limit_that_is_not_reached_changes_nothing(name):
-    # more steps than between two looks at the clock, where those are counted
-    times = [0.0, 0.25, 1.0]
-    free, limited = (ADAPTERS[name](*start(SMALL, 1.0), t_eval=times, time_limit=limit) for limit in (None, 600.0))
-    assert free.success and limited.success
-    for field in ("t", "q", "v", "a", "lam", "h"):
-        assert np.array_equal(getattr(free, field), getattr(limited, field)), field
-    assert free.stats.n_evaluations == limited.stats.n_evaluations
-
-
-def test_the_accurate_start_of_gear_is_within_the_limit():
-    result = solve_gear(*start(SMALL, 1.0), 0.01, 3, start="accurate", time_limit=1e-9)
-    assert result.status is Status.SOLVER_FAILED
-    assert "The accurate start failed. DOP853 was stopped at t = 0 by time_limit = 1e-09 s" in result.message
-
-
-def test_the_clock_starts_when_a_limit_is_made():
-    assert not TimeLimit(None).passed() and not TimeLimit(100.0).passed()
-    over = TimeLimit(1e-9)
-    assert over.passed() and over.exceeded
 
 
 # --- the longest step
@@ -292,28 +240,3 @@ def test_the_motion_is_right_and_the_rows_hold(name):
     assert result.lam.shape == (system.n_c + system.n_a, result.t.size)
     rows, rates = system.rows(result.t[-1], result.q[:, -1]), system.rates(result.t[-1], result.q[:, -1])
     assert np.abs(rows @ result.v[:, -1] + rates).max() < 1e-6
-
-
-def test_the_rows_stand_below_those_of_c():
-    problem = rolling_disc()
-    system, made = problem.system, with_all_rows(problem.system)
-    assert made is with_all_rows(system) and (made.n_c, made.n_a) == (3, 0)
-    at = 0.3, problem.q0 + 0.1, problem.v0 - 0.2
-    np.testing.assert_array_equal(made.jacobian(*at[:2]), system.rows(*at[:2]))
-    np.testing.assert_array_equal(made.gamma(*at), np.append(system.gamma(*at), system.nonholonomic_gamma(*at)))
-    np.testing.assert_array_equal(made.constraint(*at[:2]), np.append(system.constraint(*at[:2]), [0.0, 0.0]))
-    plain = four_bar().system
-    assert with_all_rows(plain) is plain
-
-
-def test_without_the_right_hand_side_of_these_rows_there_is_no_way():
-    problem = knife_edge()
-    given = {kind: function for kind, function in problem.system.given.items() if kind != "nonholonomic_gamma"}
-    edge = ConstrainedSystem(n_q=3, n_c=0, n_a=1, name="edge", parameters=problem.system.parameters, **given)
-    with pytest.raises(ValueError, match="must give nonholonomic_gamma for the adapters of other solvers"):
-        solve_index1(edge, (0.0, 1.0), problem.q0, problem.v0, "DOP853", 1e-6, 1e-6)
-
-
-def test_other_adapters_have_no_such_rows_and_say_so():
-    with pytest.raises(ValueError, match=r"this adapter has no rows A v \+ b = 0; given 'rolling disc' with n_a = 2"):
-        solve_gear(*start(rolling_disc()), 0.01, 2)

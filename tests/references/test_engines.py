@@ -7,8 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from references.engines import engine as catalogue
-from references.engines import exudyn_bodies, mujoco, pinocchio
-from references.engines.rigid import coordinates, rigid_of
+from references.engines.rigid import rigid_of
 from studies.bench import closed_loops
 from studies.bench.changed_loops import IN_A_FRAME, LIGHTENED, MOTORISED
 from studies.bench.engine_runs import Loop, errors, gate
@@ -97,14 +96,6 @@ def test_motors_do_what_they_should(engine, make):
     assert errors(loop, prepared(engine, rigid_of(loop.problem)).run(1.0, 2000, 50))["error_q"] > 0.1
 
 
-@engines
-@pytest.mark.parametrize("make", [each for each in MOTORISED if each.__name__ in ("rssr_PD_motor", "stewart_PD_motor")])
-def test_springs_and_dampers_of_joints_and_legs_in_space(engine, make):
-    """The hinge of a crank with a spring and a damper; legs with both, of which Pinocchio has none of its own."""
-    loop = Loop(replace(make(), t_span=(0.0, 0.1)))
-    assert errors(loop, prepared(engine, loop.rigid).run(0.1, 250, 50))["error_q"] < 2e-3
-
-
 def leaning():
     """Two bars that lean on one another, at rest, and a pendulum that moves: forces by hand, without any solver."""
     model = PlanarModel(name="leaning")
@@ -153,24 +144,6 @@ def test_an_engine_is_audited_by_a_small_adapter(engine):
     assert made.order > 1.7 and made.reaching.error <= 1e-4
 
 
-def test_mujoco_has_the_masses_and_moments_that_it_is_given():
-    package = pytest.importorskip("mujoco")
-    rigid = rigid_of(closed_loops.stewart())
-    model = package.MjModel.from_xml_string(mujoco.file_of(rigid, mujoco.Settings()))
-    for body in rigid.model.bodies:
-        own = model.body(body.name)
-        np.testing.assert_allclose(own.mass, body.inertia[0])
-        np.testing.assert_allclose(sorted(own.inertia), sorted(body.inertia[1:4]), rtol=1e-9)
-
-
-def test_pinocchio_adds_joints_branch_by_branch():
-    model, frames = pinocchio._tree(pytest.importorskip("pinocchio"), rigid_of(closed_loops.stewart()))
-    for number in range(1, model.njoints):  # the joints of a branch follow one another
-        branch = list(model.subtrees[number])
-        assert branch == list(range(number, number + len(branch)))
-    assert len(frames) == 14
-
-
 @pytest.mark.parametrize("make", (*closed_loops.MECHANISMS, *IN_A_FRAME, *LIGHTENED[2:4]))
 def test_loops_are_cut_between_bodies_that_move_and_close(make):
     problem = closed_loops.closed_chain(6) if make is closed_loops.closed_chain else make()
@@ -179,25 +152,6 @@ def test_loops_are_cut_between_bodies_that_move_and_close(make):
         assert rigid.model.ground not in (a, b)
         np.testing.assert_allclose(a.in_space(on_a), b.in_space(on_b), atol=1e-12)
     assert gaps(rigid.model, rigid.x[None], rigid.R[None])[0] < 1e-12 and problem.freedom.degrees >= 1
-
-
-def test_coordinates_come_back_from_motions(loops):
-    for loop in (*loops, Loop(closed_loops.parallelogram()), Loop(closed_loops.bricard())):
-        rigid = loop.rigid
-        one = loop.motion(loop.problem.q0[:, None], loop.problem.v0[:, None])
-        q, v = coordinates(one, rigid.planar)
-        again = loop.motion(q, v)
-        for name in ("x", "R", "v", "w"):
-            np.testing.assert_allclose(getattr(one, name), getattr(again, name), atol=1e-9)
-
-
-def test_a_joint_without_a_counterpart_is_named():
-    pytest.importorskip("exudyn")
-    model = SpatialModel(name="sleeve")
-    model.rod("bar", (0.0, 0.0, 0.0), (1.0, 0.0, 0.0), radius=0.02, mass=1.0)
-    model.cylindrical("ground", "bar", at=(0.0, 0.0, 0.0), axis=(1.0, 0.0, 0.0))
-    with pytest.raises(ValueError, match="is cylindrical"):
-        exudyn_bodies.prepare(rigid_of(model.problem()))
 
 
 def test_what_no_engine_is_given_is_refused():

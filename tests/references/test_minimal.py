@@ -1,7 +1,9 @@
-"""Minimal coordinates: starts, motions and energies are those of the problems, whose kernels they do not share."""
+"""Test motions in minimal coordinates: of the four-bar, of other mechanisms and of the beam."""
 
 import math
+from copy import copy
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -10,8 +12,56 @@ from scipy.integrate import solve_ivp
 from references.minimal import solvers as minimal_solvers
 from references.minimal.equations import NoMinimalCoordinates, minimal
 from references.paper.four_bar_minimal import MinimalFourBar
+from references.scipy.beam_reduced import reduced_motion
 from studies.bench.cases.four_bar import SECOND
-from twoloop import mechanisms
+from twoloop import mechanisms, solve_dae
+from twoloop.mechanisms import four_bar, very_flexible_beam
+
+PROBLEMS = [four_bar(), four_bar(lengths=(0.8, 1.2, 1.0), ground=2.0), four_bar((1.0, 1.2, 0.5), 1.0, math.pi, 1)]
+IDS = [problem.name for problem in PROBLEMS]
+
+
+@cache
+def minimal_form(k):
+    return MinimalFourBar.from_parameters(PROBLEMS[k].parameters)
+
+
+@pytest.fixture(params=range(len(PROBLEMS)), ids=IDS)
+def case(request):
+    return PROBLEMS[request.param], minimal_form(request.param)
+
+
+def test_published_state_and_period():
+    problem, minimal = PROBLEMS[0], minimal_form(0)
+    reference = problem.reference
+    q, v = minimal.states([reference.t])
+    assert np.abs(q[:, 0] - reference.q).max() < 1e-13 and np.abs(v[:, 0] - reference.v).max() < 1e-12
+    assert abs(minimal.period - reference.period) < 1e-13
+
+
+def test_starts_where_the_problem_does(case):
+    problem, minimal = case
+    q, v = minimal.states([0.0, minimal.period])
+    assert np.abs(q - problem.q0[:, None]).max() < 1e-13 and np.abs(v).max() < 1e-12
+
+
+def test_keeps_energy_and_constraints_for_100_s(case):
+    problem, minimal = case
+    times = np.linspace(0.0, 100.0, 1001)
+    q, v = minimal.states(times)
+    assert np.abs(problem.energy(times, q, v) - problem.energy(0.0, problem.q0, problem.v0)).max() < 1e-12
+    for k in range(0, times.size, 10):
+        assert np.abs(problem.system.constraint(times[k], q[:, k])).max() < 1e-13
+        assert np.abs(problem.system.velocity_constraint(times[k], q[:, k], v[:, k])).max() < 1e-13
+
+
+def test_velocities_are_the_rates_of_the_positions(case):
+    _, minimal = case
+    times = np.linspace(0.0, minimal.period, 41)
+    e = 1e-3
+    far, near = (minimal.states(times + k * e)[0] - minimal.states(times - k * e)[0] for k in (2, 1))
+    assert np.abs((8.0 * near - far) / (12.0 * e) - minimal.states(times)[1]).max() < 1e-7
+
 
 MAKE = {
     "four-bar": mechanisms.four_bar,
@@ -104,33 +154,29 @@ def test_both_solvers_end_at_the_reference(which, name):
     assert np.abs(solve(problem, problem.reference.t, t_eval=times).q - result.q).max() < far
 
 
-@pytest.mark.parametrize("which", SOLVERS)
-def test_no_time_left_is_said(which):
-    package, solve, _ = SOLVERS[which]
-    pytest.importorskip(package)
-    result = solve(mechanisms.sundials_slider_crank(), 1e5, t_eval=[0.0, 0.1], time_limit=1e-9)
-    assert not result.success and "time_limit" in result.message
-
-
-def test_other_mechanisms_are_refused():
-    with pytest.raises(NoMinimalCoordinates, match="Andrews"):
-        minimal(mechanisms.andrews())
-    with pytest.raises(TypeError, match="Problem"):
-        minimal_solvers.solve_cvode_minimal(mechanisms.four_bar().system, 1.0)
-
-
 def test_a_four_bar_all_of_whose_angles_come_to_dead_centres_is_refused():
     with pytest.raises(NoMinimalCoordinates, match="dead centre"):
         minimal(mechanisms.four_bar((0.894, 1.13, 0.659), 2.08, -0.717))
 
 
-@pytest.mark.parametrize(("beside", "right"), [(0.0, False), (0.01, True)])
-def test_heyoka_at_order_8_has_no_last_terms_of_a_pendulum_released_horizontally(beside, right):
-    """There the angle has powers 2, 6, 10, ... of t alone, and its rate 1, 5, 9, ...: reports/work_precision.md."""
-    heyoka = pytest.importorskip("heyoka")
-    angle, rate = heyoka.make_vars("angle", "rate")
-    start = [0.5 * math.pi + beside, 0.0]
-    integrator = heyoka.taylor_adaptive([(angle, rate), (rate, -9.81 * heyoka.sin(angle))], start, tol=1e-6)
-    integrator.propagate_until(10.0)
-    known = solve_ivp(lambda t, y: (y[1], -9.81 * math.sin(y[0])), (0.0, 10.0), start, "DOP853", rtol=1e-12, atol=1e-12)
-    assert integrator.order == 8 and (float(np.abs(integrator.state - known.y[:, -1]).max()) < 1e-4) is right
+TIMES = [0.0, 0.03, 0.05]
+
+
+@pytest.fixture(scope="module")
+def problem():
+    return very_flexible_beam()
+
+
+def test_the_constrained_beam_moves_alike(problem):
+    q, v = reduced_motion(problem, TIMES, 1e-11)
+    result = solve_dae(problem.system, (0.0, TIMES[-1]), problem.q0, problem.v0, "Gauss12", 1e-11, 1e-11, t_eval=TIMES)
+    assert np.abs(result.q - q).max() < 1e-10 and np.abs(result.v - v).max() < 1e-6
+    for k, t in enumerate(TIMES):
+        assert np.abs(problem.system.constraint(t, q[:, k])).max() < 1e-16
+
+
+def test_a_start_that_is_not_finite_is_an_error(problem):
+    moving = copy(problem)
+    object.__setattr__(moving, "v0", np.full(problem.v0.size, np.nan))  # which Problem itself refuses
+    with pytest.raises(RuntimeError, match=r"DOP853 .* cannot start: the accelerations are not finite"):
+        reduced_motion(moving, TIMES, 1e-8)

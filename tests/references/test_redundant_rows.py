@@ -5,6 +5,7 @@ import pytest
 
 from references.equations.rows import independent_rows
 from references.scipy.index1 import solve_index1
+from tests.marks import slow
 from tests.problems import held_twice, pendulum
 from tests.references.adapters import ADAPTERS
 from twoloop.mechanisms import bricard, redundant_slider_crank
@@ -14,7 +15,7 @@ SLOW = ("IDA from C, stabilised", "CVODE, Adams", "IDA, stabilised", "Radau, sol
 
 @pytest.mark.parametrize(
     "name",
-    ["DOP853, projected", *(pytest.param(each, marks=pytest.mark.slow) for each in SLOW)],
+    ["DOP853, projected", *(slow(each) for each in SLOW)],
 )
 def test_motion_and_multipliers_of_all_rows_are_those_of_the_reference(name):
     problem = redundant_slider_crank()
@@ -38,7 +39,7 @@ def test_the_rows_that_are_kept_span_all():
     assert independent_rows(rows) == (0, 2, 5)
 
 
-@pytest.mark.parametrize("name", [pytest.param("DOP853, projected", marks=pytest.mark.slow), "IDA, stabilised"])
+@pytest.mark.parametrize("name", [slow("DOP853, projected"), "IDA, stabilised"])
 def test_rows_that_contradict_one_another_now_or_later_are_no_success(name):
     start = (0.0, 1.0), [1.0, 0.0], [0.0, 0.0]
     now = held_twice(constraint=lambda t, q: 0.5 * (q @ q - np.array([1.0, 1.1])), name="held twice")

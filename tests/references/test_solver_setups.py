@@ -1,22 +1,29 @@
-"""Rivals as their authors would set them up: what the error test sees, exact Jacobians, CVODE's own projection."""
+"""Test that other solvers are set up, timed and stopped as their users would do it, and found by their files."""
 
 import math
-from contextlib import ExitStack
+import sys
 
 import numpy as np
 import pytest
 
-from references.equations import straight_line as code
-from references.equations.expressions import expressions_at
+import references
+from references import lines as lines_module
+from references.driver import TimeLimit, user_call
 from references.equations.straight_line import exact_jacobian, straight_line
+from references.lines import Line, lines
+from references.scipy import fully_implicit, index1
+from references.scipy.index1 import solve_index1
 from references.sundials import cvode_c
-from references.sundials import library as sundials
+from references.sundials.cvode import solve_cvode
 from references.sundials.cvode_c import solve_cvode_c
-from references.sundials.cvode_projection import projection_for_cvode
 from references.sundials.ida_c import solve_ida_c
-from studies.bench.figures import STYLES
-from studies.bench.solvers import CATALOGUE, CVODE_C_PROJECTED, IDA_C_STATES, OTHER_SOLVERS
-from twoloop import ConstrainedSystem, callback
+from studies.bench.collector import Case, Run, attempt
+from studies.bench.solvers import CATALOGUE, OTHER_SOLVERS
+from studies.validation.study import MAKE
+from tests.marks import slow
+from tests.problems import pendulum
+from tests.processes import run_python
+from twoloop import ConstrainedSystem, callback, mechanisms
 from twoloop.mechanisms import double_pendulum, four_bar, projection_pendulum, spatial_slider_crank
 from twoloop.problem.given import callbacks_in
 
@@ -116,18 +123,6 @@ def test_cvode_takes_the_analytic_jacobian(monkeypatch):
     assert more[0] < exact.stats.n_jacobians and more[1] >= 4 * differenced.stats.n_jacobians  # one for each unknown
 
 
-@pytest.mark.parametrize(
-    "name", ["singular mass", *(pytest.param(each, marks=pytest.mark.slow) for each in ("double pendulum", "pendulum"))]
-)
-def test_a_jacobian_in_loops_is_that_of_straight_line_code(name):
-    system, q, v = STATES[name]
-    equations = expressions_at(system, 0.0, q.tobytes(), v.tobytes())
-    columns = np.zeros((2, 2 * system.n_q, 2 * system.n_q))
-    for make, into in zip((code._straight_line_jacobian, code._jacobian_in_loops), columns, strict=True):
-        make(equations)(0.3, np.concatenate([q, v]), into)
-    assert np.abs(columns[0]).max() > 0.5 and np.abs(columns[0] - columns[1]).max() < 1e-12 * np.abs(columns[0]).max()
-
-
 def kept(system, t, q, v):
     """The largest residual of the constraints on positions, and on velocities."""
     rates = system.jacobian(t, q) @ v + system.constraint_rate(t, q)
@@ -143,36 +138,143 @@ def test_cvode_keeps_the_constraints_that_it_projects_onto():
     assert max(kept(problem.system, end, free.q[:, -1].copy(), free.v[:, -1].copy())) > 1e-11
 
 
-def test_the_projection_is_the_shortest_one_and_projects_the_error():
-    rng, t, f = np.random.default_rng(2), 0.3, DRIVEN.functions
-    projection, size = projection_for_cvode(*f[2:5], 3, 2, 1)
-    data = np.zeros(size)
-    data[:3] = 0.7, 1e-12, 1e-12
-    y, corr, err = 0.5 + 0.1 * rng.standard_normal(6), np.empty(6), rng.standard_normal(6)
-    given, estimate = y.copy(), err.copy()
-    with ExitStack() as stack:
-        own = sundials.context(stack)
-        vectors = [
-            sundials.made(stack, "N_VMake_Serial", sundials.library().N_VDestroy, 6, each.ctypes.data, own).value
-            for each in (y, corr, err)
-        ]
-        call = projection.ctypes
-        assert call(t, *vectors[:2], 0.1, 0, data.ctypes.data) == 0
-        alone = corr.copy()
-        assert call(t, *vectors[:2], 0.1, vectors[2], data.ctypes.data) == 0
-        assert np.array_equal(alone, corr) and np.array_equal(y, given)
-        y[0] = np.nan
-        assert call(t, *vectors[:2], 0.1, 0, data.ctypes.data) > 0
-    q, v = np.split(given + alone, 2)
-    Cq = DRIVEN.jacobian(t, q)
-    assert max(kept(DRIVEN, t, q, v)) < 1e-14 and np.abs(alone).max() > 0.05
-    free = np.eye(3) - np.linalg.pinv(Cq) @ Cq
-    assert np.abs(free @ alone[3:]).max() < 1e-14
-    assert np.allclose(err, np.concatenate([free @ estimate[:3], free @ estimate[3:]]), rtol=0.0, atol=1e-13)
+def start(problem, t_end):
+    return problem.system, (0.0, t_end), problem.q0, problem.v0
 
 
-def test_each_set_up_is_run_beside_the_others_and_drawn_as_itself():
-    added = {IDA_C_STATES: True, CVODE_C_PROJECTED: True, "CVODES, CasADi": False}
-    assert {name: CATALOGUE[name].keeps_constraints for name in added} == added
-    assert set(added) <= set(OTHER_SOLVERS) and len(set(OTHER_SOLVERS)) == len(OTHER_SOLVERS)
-    assert [list(STYLES.values()).count(STYLES[name]) for name in added] == [1, 1, 1]
+# --- solve_dae
+@pytest.mark.parametrize("tolerance", [3e-8, 1e-8, 1e-9])
+def test_solve_dae_starts_from_rest_with_a_step_that_rounding_does_not_spoil(tolerance):
+    """With its own first step, of 1e-6 of the span, it fails there at these tolerances."""
+    result = fully_implicit.solve_fully_implicit(*start(mechanisms.pendulum(), 0.5), "Radau", tolerance, tolerance)
+    assert result.success, result.message
+
+
+# --- CasADi
+
+
+# --- diffrax
+
+
+# --- mass matrices that are singular without the constraints, as with Euler parameters
+QUICK = ("DOP853, projected",)
+OTHERS = (
+    "DOP853, index 1",
+    "Pr9, index 1",
+    "LSODA, index 1",
+    "Radau, index 1",
+    "CVODE, Adams",
+    "IDA from C, stabilised",
+)
+EULER = ("heavy top", "spatial slider-crank", "spatial four-bar", "A05 governor")
+SLOW = [slow(name, (*QUICK, *OTHERS)) for name in EULER]
+
+
+@pytest.mark.parametrize(("name", "solvers"), [("heavy top", QUICK), *SLOW])
+def test_every_solver_is_put_to_mechanisms_with_euler_parameters(name, solvers):
+    problem = next(problem for problem in (make() for make in MAKE) if problem.name == name)
+    known = problem.reference
+    for solver in solvers:
+        errors = []
+        for tol in (1e-5, 1e-9):
+            case = Case(name, problem, known.t, n_instants=1, time_limit=60.0)
+            result, status, message, _ = attempt(Run(case, CATALOGUE[solver], tol), 0)
+            if status == "NOT_AVAILABLE":
+                break
+            assert status == "REACHED_END", (solver, message)
+            errors.append(np.nanmax(np.abs(result.q[:, -1] - known.q)))
+        assert not errors or errors[1] < min(1e-5, 0.1 * errors[0]), (solver, errors)
+
+
+def test_a_step_of_scipy_that_is_timed_makes_no_interpolant(monkeypatch):
+    made = []
+    before = index1.METHODS["DOP853"]
+
+    class Watched(before):
+        def dense_output(self):
+            made.append(user_call.so_far())
+            return super().dense_output()
+
+    monkeypatch.setitem(index1.METHODS, "DOP853", Watched)
+    assert solve_index1(*start(PENDULUM, 2.0), t_eval=np.linspace(0.0, 2.0, 201)).success
+    assert made and not any(made)  # outside of the user's call
+
+
+# --- Jacobians
+def test_implicit_solvers_get_the_analytic_jacobian(monkeypatch):
+    """Without it as many evaluations more as there are unknowns, for every Jacobian; the motion is the same."""
+    at = start(PENDULUM, 2.0)
+    solvers = {
+        "Radau": lambda: solve_index1(*at, "Radau", 1e-7, 1e-7),
+        "CVODE": lambda: solve_cvode(*at, 1e-7, 1e-7),
+    }
+    exact = {name: solve() for name, solve in solvers.items()}
+    monkeypatch.setattr(index1.RightHandSide, "jacobian", lambda *_: None)
+    differenced = {name: solve() for name, solve in solvers.items()}
+    for name in solvers:
+        assert exact[name].success and exact[name].stats.n_evaluations < differenced[name].stats.n_evaluations, name
+        assert np.abs(exact[name].q[:, -1] - differenced[name].q[:, -1]).max() < 1e-4
+
+
+def test_a_jacobian_is_given_only_where_it_is_that_of_the_equations():
+    system, q, v = PENDULUM.system, PENDULUM.q0, PENDULUM.v0
+    y = np.concatenate([q, v])
+    plain = index1.RightHandSide(system, 0.0, q, 0.0)
+    jacobian, function = plain.jacobian(0.0, y), plain.function(TimeLimit(None))
+    differences = [(function(0.0, y + e) - function(0.0, y - e)) / 2e-6 for e in 1e-6 * np.eye(y.size)]
+    assert np.abs(jacobian(0.0, y) - np.transpose(differences)).max() < 1e-6 * np.abs(differences).max()
+    assert index1.RightHandSide(system, 0.0, q, 10.0).jacobian(0.0, y) is None  # of other equations
+    assert index1.RightHandSide(pendulum(), 0.0, np.array([1.0, 0.0]), 0.0).jacobian(0.0, np.eye(4)[0]) is None
+
+
+FILE = """
+from references.driver import adapter
+from references.lines import Line
+
+
+@adapter(derivatives=False)
+def solve(task, rtol=1e-8, atol=1e-8):
+    raise NotImplementedError
+
+
+LINES = (Line("newcomer", "numpy", "numpy", solve),)
+"""
+
+
+def test_names_are_those_of_the_catalogue():
+    found = lines()
+    names = [line.name for line in found]
+    assert len(set(names)) == len(names) > 25 and set(names) <= set(CATALOGUE)
+    assert [line.name for line in found if line.compared] == list(OTHER_SOLVERS)
+    for line in found:
+        assert CATALOGUE[line.name].keeps_constraints == line.keeps and CATALOGUE[line.name].family == line.family
+
+
+def test_a_file_in_the_folder_is_enough(tmp_path, monkeypatch):
+    (tmp_path / "newcomer.py").write_text(FILE)
+    monkeypatch.setattr(lines_module, "__file__", str(tmp_path / "lines.py"))
+    monkeypatch.setattr(references, "__path__", [*references.__path__, str(tmp_path)])
+    found = lines.__wrapped__()
+    monkeypatch.delitem(sys.modules, "references.newcomer")
+    assert [line.name for line in found] == ["newcomer"] and isinstance(found[0], Line)
+
+
+def test_a_package_that_is_not_installed_leaves_the_others():
+    told = run_python(
+        """
+        import sys
+        for name in ("exudyn", "sksundae", "heyoka", "casadi", "diffrax", "solve_dae", "extensisq", "CyRK"):
+            sys.modules[name] = None
+        from references.lines import lines
+        from references.sundials.ida import solve_ida
+        from twoloop.mechanisms import projection_pendulum
+        problem = projection_pendulum()
+        print(len(lines()))
+        try:
+            solve_ida(problem.system, (0.0, 1.0), problem.q0, problem.v0)
+        except RuntimeError as error:
+            print(error)
+        """
+    )
+    said = "scikit-sundae is not installed: pip install 'twoloop[references]'"
+    assert told.stdout.splitlines() == [str(len(lines())), said]

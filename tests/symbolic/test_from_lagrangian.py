@@ -71,15 +71,6 @@ def test_tangents_are_the_derivatives(name):
         assert pytest.approx(reaction, rel=1e-6, abs=1e-6) == R
 
 
-def test_the_energy_is_that_of_the_hand_written_mechanism(pair):
-    problem, mechanism = pair
-    _, q, v = (np.array(each) for each in zip(*states(problem), strict=True))
-    given, known = mechanism.energy(0.0, q.T, v.T), problem.energy(0.0, q.T, v.T)
-    assert given == pytest.approx(known, rel=1e-12)
-    assert mechanism.energy(0.0, q[0], v[0]) == pytest.approx(known[0], rel=1e-12)
-    assert mechanism.conserved == problem.conserved
-
-
 def test_counts_are_those_of_the_hand_written_mechanism():
     for make in (symbolic_four_bar, symbolic_knife_edge):
         problem, mechanism = make()

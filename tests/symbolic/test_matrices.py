@@ -89,23 +89,6 @@ def test_kanes_method_with_linear_kinematics(of_rate):
     assert not from_method(kane, parameters=VALUES).conserved  # without the potential
 
 
-def test_a_system_brings_its_constraints():
-    T, V, constraints, coordinates = two_rods()
-    frame, q, u, kinematic, bodies, loads = particles()
-    system = me.System(frame)
-    system.add_coordinates(*q)
-    system.add_speeds(*u)
-    system.add_kdes(*kinematic)
-    system.add_bodies(*bodies)
-    system.add_loads(*loads)
-    system.add_holonomic_constraints(*constraints)
-    system.add_nonholonomic_constraints(u[0] - sp.sin(q[1]) * u[1])
-    a, b = coordinates
-    rolling = [a.diff(t) - sp.sin(b) * b.diff(t)]
-    known = from_lagrangian(T, V, constraints, coordinates, nonholonomic=rolling, parameters=VALUES)
-    same(from_method(system, parameters=VALUES), known)
-
-
 def test_euler_parameters_with_angular_velocities_as_speeds():
     """A tangent that constraints allow sees the same M and Q, though they differ across e.e = 1."""
     _, known = symbolic_heavy_top()

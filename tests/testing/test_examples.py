@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 from hatchling.build import build_wheel
 
+from tests.marks import slow
 from tests.testing.planted import EXAMPLES
 
 ROOT = Path(__file__).parents[2]
@@ -44,7 +45,7 @@ def outside(python, folder, *words):
 
 
 # the dearest suite has one of its problems here, that on which no other runs; the whole is slow
-@pytest.mark.parametrize("smoke", ["redundant_slider_crank", pytest.param("smoke", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("smoke", ["redundant_slider_crank", slow("smoke")])
 def test_the_template_runs_on_the_installed_wheel(python, tmp_path, smoke):
     pytest.importorskip("xdist")
     for path in EXAMPLES.glob("*.py"):

@@ -90,15 +90,6 @@ def simulate(problem, times, tolerance):
     return result.q.T[:, place], result.v.T[:, place]
 
 
-def test_which_have_parts():
-    """Those that are nothing but bodies, joints and weight; their rows are those of the joints, in their order."""
-    assert len(WITH_PARTS) == 13
-    for problem in WITH_PARTS.values():
-        norms = len(problem.bodies) if "e0" in problem.coordinates else 0
-        rows = [row for joint in problem.joints for row in range(joint.rows.start, joint.rows.stop)]
-        assert rows == list(range(norms, problem.n_c)), problem.name
-
-
 @pytest.mark.filterwarnings("ignore::twoloop.ConstraintWarning")
 @pytest.mark.parametrize("name", WITH_PARTS)
 def test_a_simulator_of_bodies_and_joints_passes(name):
@@ -121,12 +112,3 @@ def test_reactions_are_those_of_a_model(name):
         np.testing.assert_allclose(force, there.force[:, 0], atol=1e-8 * largest)
         if torque.size:
             np.testing.assert_allclose(torque, np.atleast_2d(there.torque)[..., 0].ravel(), atol=1e-8 * largest)
-
-
-@pytest.mark.parametrize("name", [name for name, problem in WITH_PARTS.items() if problem.period])
-def test_the_motion_repeats_itself(name):
-    problem = WITH_PARTS[name]
-    made, place = model_of(problem)
-    result = solve_dae(made.system, (0.0, problem.period), made.q0, made.v0, rtol=1e-12, atol=1e-12)
-    np.testing.assert_allclose(result.q[place, -1], problem.q0, atol=1e-9)
-    assert problem.reference.t[-1] > problem.period

@@ -9,8 +9,6 @@ from tests.processes import run_python
 from tests.testing.systems import system_of
 from twoloop import mechanisms
 from twoloop.testing import problems
-from twoloop.testing.changes import in_a_frame, in_millimetres_and_grams
-from twoloop.testing.known_problem import DIMENSIONS
 from twoloop.testing.known_problems import MAKERS, TAGS
 
 SAME_NAME = ("pendulum", "double_pendulum", "closed_chain", "four_bar", "redundant_slider_crank", "driven_slider_crank")
@@ -100,24 +98,6 @@ def test_the_motion_obeys_the_equations(name):
         values = [quantity(*state) for state in zip(motion.t, motion.q, motion.v, strict=True)]
         assert np.ptp(values) < 1e-9 * max(1.0, np.abs(values).max())
     assert min(motion.digits["q"].min(), motion.digits["v"].min()) > 9.0 and (motion.growth >= 1.0).all()
-
-
-@pytest.mark.parametrize("change", [in_a_frame, in_millimetres_and_grams])
-def test_parameters_are_those_of_the_equations(change):
-    for name, problem in ALL.items():
-        seen = change(problem)
-        there, t, q0 = seen.problem, problem.t_span[0], seen.problem.q0
-        given = there.parameters
-        assert set(given) <= set(DIMENSIONS) and (given["masses"] >= 0.0).all(), name
-        if there.bodies:
-            near(given["masses"], [body.mass for body in there.bodies])
-            near(given["gravity"], there.gravity)
-            near(there.force(t, q0, 0.0 * q0)[: given["gravity"].size], given["masses"][0] * given["gravity"], 9.0)
-        if name in ("pendulum", "spherical_pendulum"):  # with the point in the pin
-            near(there.constraint(t, seen.d), -0.5 * given["lengths"] ** 2)
-    shaken = change(ALL["shaken_spring"]).problem
-    forces, given = [shaken.force(t, shaken.q0, shaken.v0) for t in (0.0, 1.1)], shaken.parameters
-    near(np.linalg.norm(forces[1] - forces[0]), abs(given["force_amplitude"] * np.sin(1.1 * given["force_frequency"])))
 
 
 def test_tags():

@@ -4,12 +4,10 @@ import os
 import subprocess
 import sys
 from pathlib import Path
-from types import SimpleNamespace
 from xml.etree import ElementTree
 
 import pytest
 
-from tests.processes import run_python
 from tests.testing.planted import EXAMPLES
 from twoloop.testing import plugin
 
@@ -34,11 +32,6 @@ def run_pytest(folder, *arguments):
     return subprocess.run(
         [*command, *arguments], env=environment, cwd=folder, capture_output=True, text=True, timeout=300
     )
-
-
-def test_without_the_option_nothing_is_imported():
-    told = run_python("import sys, twoloop.testing.plugin; print(*{'numpy', 'numba', 'scipy'} & set(sys.modules))")
-    assert told.stdout.strip() == ""
 
 
 def test_a_sound_integrator_a_fixture_and_a_report(tmp_path):
@@ -92,21 +85,3 @@ def test_what_is_no_simulator(tmp_path, where, words):
     (tmp_path / "still.py").write_text(FAULTY, encoding="utf-8")
     with pytest.raises(pytest.UsageError, match=words):
         plugin._loaded(where, tmp_path)
-
-
-@pytest.mark.parametrize(
-    ("option", "value", "words"),
-    [
-        ("simulator_problems", "five_bar", "problems must be 'smoke'.*given 'five_bar'"),
-        ("simulator_steps", "30", "steps must be two or more"),
-        ("simulator_steps", "many", "invalid literal"),
-        ("simulator_order", 2.0, "order is for simulators of fixed steps"),
-        ("simulator_time_limit", -1.0, "time_limit must be a positive number of seconds"),
-    ],
-)
-def test_wrong_options(tmp_path, option, value, words):
-    (tmp_path / "still.py").write_text(FAULTY, encoding="utf-8")
-    options = {"simulator": "still.py:simulate", "simulator_problems": "smoke", "simulator_time_limit": 60.0}
-    config = SimpleNamespace(getoption=(options | {option: value}).get, invocation_params=SimpleNamespace(dir=tmp_path))
-    with pytest.raises(pytest.UsageError, match=f"--simulator: {words}"):
-        plugin.pytest_collection_modifyitems(None, config, [])
