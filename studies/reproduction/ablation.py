@@ -69,6 +69,11 @@ def runs(quick: bool) -> list[Run]:
     return listed
 
 
+def measure(run: Run, result: Result) -> dict[str, Any]:
+    """No columns beside the common ones."""
+    return {}
+
+
 def costs_at(along: pd.DataFrame, targets: Sequence[float], what: str) -> Array:
     """Costs of these errors, NaN where there are none."""
     return np.array([tables.time_for(along, target, what) for target in targets])
