@@ -17,6 +17,7 @@ INSTANTS = 101  # of solvers that store none of their steps; not a multiple of a
 DECADES = 2  # a run is right within so many decades of its tolerance, where the problem has no condition of its own
 EXACT = 1e-3  # what misses its tolerance by more, but is right to this, is inexact and not wrong
 LEVELS = ("q", "v", "lam")
+SAID = "reported failure"  # outcome of a run that ends with a message
 
 
 def unknown() -> ReferenceMotion:
@@ -127,16 +128,16 @@ def row_of(run: Run) -> Row:
 
 
 def outcome(row: Row, problem: Problem, tolerance: float) -> str:
-    """ "right", "inexact", "wrong" (it reached the end), "said so" (it did not), or "not run".
+    """Judge a run: "right", "inexact" or "wrong" where it reached the end, SAID where it did not, or "not run".
 
-    An answer that misses its tolerance but has three digits is a matter of calibration. Not run are also those that our
-    adapter of a foreign solver refuses, which says nothing of the solver.
+    An answer that misses its tolerance but has three digits may just mean that the tolerance was too loose. A run that
+    the adapter of another solver refuses is not run: that says nothing of the solver.
     """
     refused = row["status"] == "RAISED" and row["family"] != "two-loop"
     if refused or row["status"] in NOTHING_RUN:
         return "not run"
     if row["error_q"] is None:
-        return "said so"
+        return SAID
     if row["condition"] is not None and problem.condition is not None:
         return "right" if row["condition"] <= problem.condition.high else "wrong"
     if row["error_q"] <= 10.0**DECADES * max(tolerance, row["floor"]):

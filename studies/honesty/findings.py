@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from studies.bench import figures
 from studies.bench.end_states import EXACT, JUDGED
-from studies.bench.render import number
+from studies.bench.render import number, power
 from studies.bench.sharp_forces import T_END
 from studies.bench.solvers import GIVEN
 from studies.honesty.solvers import DEFAULT, KINDS, LIMITED, LOOK, OWN_SUFFIX, kind_of
@@ -179,10 +179,10 @@ def figures_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Figure]:
         axes.text(end, place, f"  {line['wrong']} of {line['n']}", va="center", fontsize=9)
     axes.set_yticks(places, [line["kind"] for line in lines])
     axes.invert_yaxis()
-    axes.set_xlabel(f"silently wrong runs (%); red: off by over {EXACT:g} m or rad")
+    axes.set_xlabel(f"silently wrong runs (%); red: off by over {power(EXACT)} m or rad")
     axes.set_xlim(0.0, max(5.0, 1.2 * left.max()))
     axes.grid(False)
     wrong = {line["kind"] for line in lines if line["wrong"]}
     only = "Only other solvers are silently" if wrong and not wrong & {KINDS["default"], KINDS["own"]} else "Silently"
-    axes.set_title(f"{only} wrong under sharp forces")
+    figures.message(figure, f"{only} wrong under sharp forces")
     return {"honesty": figure}
