@@ -7,7 +7,6 @@ import matplotlib as mpl
 import pandas as pd
 import pytest
 
-from studies import ablation, motion, step_size, violation
 from studies.bench import collector, figures, store
 from studies.energy import study as energy
 
@@ -41,5 +40,5 @@ def unsaved(monkeypatch):
     """Make and save no figures, which takes longer than all else of a report."""
     monkeypatch.setattr(figures, "save", lambda *arguments: None)
     monkeypatch.setattr(figures, "work_precision", lambda *arguments, **more: SimpleNamespace(axes=[]))
-    for study in (ablation, energy, motion, step_size, violation):
+    for study in (energy,):
         monkeypatch.setattr(study, "STUDY", replace(study.STUDY, figures=lambda rows, found: {}))

@@ -5,11 +5,11 @@ import pytest
 
 from references.paper.four_bar_minimal import trajectory
 from references.scipy.index1 import baumgarte
-from studies import motion, step_size, violation
 from studies.bench.collector import Case
 from studies.bench.headline import OWN_CODE
 from studies.bench.metrics import violations
 from studies.bench.solvers import CATALOGUE, DEFAULT, EXUDYN, GIVEN, IRK, LINE_UP, TOLERANCES, gear
+from studies.reproduction import motion, step_size, violation
 from studies.validation import study as validation
 from twoloop import solve_dae
 from twoloop.mechanisms import four_bar

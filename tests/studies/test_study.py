@@ -3,9 +3,9 @@
 import pandas as pd
 import pytest
 
-from studies import motion, step_size, violation
 from studies.bench.store import key
 from studies.energy import runs as energy
+from studies.reproduction import motion, step_size, violation
 
 
 def rows_of(study, quick):

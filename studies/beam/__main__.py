@@ -1,3 +1,0 @@
-from studies.beam.study import STUDY
-
-STUDY.main()
