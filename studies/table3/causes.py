@@ -1,6 +1,5 @@
 """Why the paper's time over ours is not one factor in Table 3: causes and readings of the text, tested on the rows."""
 
-import math
 from functools import partial
 from itertools import product
 from typing import Any, Literal
@@ -20,12 +19,6 @@ UNEQUAL = 1.2  # times of the same run, largest over least, beyond which they ar
 FLAT = 1.5  # a cause explains the pattern if the largest ratio over the smallest is at most this
 Reading = Literal["all", "independent"]
 READINGS: dict[Reading, str] = {"all": "all of z", "independent": "y_i only"}  # what criterion (32) is taken over
-
-
-def by_repetition(slow: pd.Series, fast: pd.Series) -> list[float]:
-    """Least and largest time of one run over that of another, of repetitions made in turn."""
-    ratios = [a / b for a, b in zip(slow["times"], fast["times"], strict=False)]
-    return [float(min(ratios)), float(max(ratios))] if ratios else [math.nan, math.nan]
 
 
 def cells(rows: pd.DataFrame, exchanged: bool = False) -> pd.DataFrame:

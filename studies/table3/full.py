@@ -1,7 +1,7 @@
 """Table 3 at length: both two-loop procedures and other solvers at equal error, and why the times differ."""
 
 from functools import partial
-from itertools import chain, pairwise
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -13,7 +13,6 @@ from studies.bench.cases import four_bar
 from studies.bench.cli import StudyError
 from studies.bench.collector import REPEATS, Case, Run, Solver, Warm, collect, row_of
 from studies.bench.headline import OWN_CODE
-from studies.bench.metrics import ASTRAY, LOST
 from studies.bench.render import number, power, table
 from studies.bench.solvers import (
     ADAMS,
@@ -36,9 +35,8 @@ from studies.bench.solvers import (
 )
 from studies.bench.store import Output, Row
 from studies.bench.study import Study
-from studies.bench.tables import used
-from studies.table3.causes import UNEQUAL, by_repetition, causes, reading_runs
-from studies.table3.cells import FAMILIES, PAPER_IRK, PAPER_NEWMARK, TOLERANCES, machine
+from studies.table3.causes import UNEQUAL, causes, reading_runs
+from studies.table3.cells import FAMILIES, TOLERANCES
 from twoloop import Result, RungeKutta, solve_dae
 from twoloop.methods.tableaux import gauss
 
@@ -114,37 +112,24 @@ def make(output: Output) -> pd.DataFrame:
 
 
 def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
+    """Compute what the report says, of the first geometry."""
     first = rows[rows["problem"] == rows["problem"].iloc[0]]
-    irk, newmark = (machine(first, group, ERR_IN, ERR_IN) for group in FAMILIES)
-    if irk is None or newmark is None:
-        raise StudyError("the rows lack cells of Table 3; make them again by python -m studies.table3")
     found: dict[str, Any] = {"t_end": float(first["t_end"].iloc[0])}
-    found |= {"lost_limit": LOST, "astray_limit": ASTRAY}
-    found["paper_ratio"] = float(PAPER_NEWMARK[3][3] or 0.0) / PAPER_IRK[3][3]
-    for name, cell in (("irk", irk), ("newmark", newmark)):
-        found[f"{name}_s"] = cell["call_s"]
-        cells = first[first["group"] == cell["group"]]
-        for what in ("lost", "astray"):
-            bad = cells[cells[what].astype(bool)]["err_out"].unique()
-            found[f"{name}_{what}"] = [power(e) for e in sorted(bad, reverse=True)]
-    found["newmark_only_astray"] = [e for e in found["newmark_astray"] if e not in found["newmark_lost"]]
-    found["ratio_s"] = by_repetition(newmark, irk)
     same = first[(first["solver"] == NEWMARK) & (first["err_in"] == ERR_IN) & (first["err_out"] == ERR_IN)]
     times = [time for own in same["times"] for time in own]  # of all its repetitions, in whatever group
+    if not times:
+        raise StudyError("the rows lack cells of Table 3; make them again by python -m studies.table3 --full")
     found["newmark_times"] = [float(min(times)), float(max(times))]
     found["times_unequal"] = found["newmark_times"][1] > UNEQUAL * found["newmark_times"][0]
-    found["ratio_evaluations"] = newmark["n_evaluations"] / irk["n_evaluations"]
     ratios = _newmark_over_irk(first)
     over = list(chain(*ratios.values()))
     found["newmark_over_irk"] = [min(over), max(over)] if over else []
     found["newmark_errors"] = list(ratios)
-    found["newmark_dearer_everywhere"] = bool(over and min(over) > 1.0)
     found["cheapest"] = [line for error in TARGETS if (line := _cheapest(_compared(first), error)) is not None]
     found["explicit"] = _explicit(first)
-    found |= _of_default(first)
     failed = rows[rows["status"] != "REACHED_END"]
     found |= {"failed": len(failed), "failed_two_loop": int((failed["family"] == "two-loop").sum())}
-    return found | {"newmark_growth": growth(first)} | causes(first) | {"answer": _answer(found["cheapest"])}
+    return found | causes(first) | {"answer": _answer(found["cheapest"])}
 
 
 def _answer(cheapest: list[dict[str, Any]]) -> str:
@@ -153,40 +138,6 @@ def _answer(cheapest: list[dict[str, Any]]) -> str:
         return "No error is reached by both the paper's Runge–Kutta procedure and another solver."
     over = f"{dearer[0]} to {dearer[-1]}" if len(dearer) > 1 else dearer[0]
     return f"At equal error, the paper's Runge–Kutta procedure takes {over} times as long as the cheapest solver."
-
-
-def growth(first: pd.DataFrame) -> list[dict[str, Any]]:
-    """Growth of Newmark's cost between neighbouring err_out, least and most over err_in: printed, our time and counts.
-
-    A star of the paper, or a run of ours that lost its energy, has no cost that could grow.
-    """
-    found = []
-    group = "Table 3: Newmark"
-    for j, (loose, tight) in enumerate(pairwise(TOLERANCES)):
-        factors: dict[str, list[float]] = {"printed": [], "time": [], "evaluations": []}
-        for e_in, (before, after) in zip(TOLERANCES, (row[j : j + 2] for row in PAPER_NEWMARK), strict=True):
-            ours, finer = (machine(first, group, e_in, e_out) for e_out in (loose, tight))
-            if before and after and ours is not None and finer is not None and not (ours["lost"] or finer["lost"]):
-                factors["printed"].append(after / before)
-                factors["time"].append(finer["call_s"] / ours["call_s"])
-                factors["evaluations"].append(finer["n_evaluations"] / ours["n_evaluations"])
-        if factors["printed"]:
-            spans = {what: [float(min(each)), float(max(each))] for what, each in factors.items()}
-            found.append({"from": power(loose), "to": power(tight)} | spans)
-    return found
-
-
-def _of_default(first: pd.DataFrame) -> dict[str, Any]:
-    """From which tolerance down the default takes the steps of the Taylor series, and whether it is explicit beside."""
-    default, series = (
-        first[(first["solver"] == name) & first["error_q"].notna()].sort_values("tol") for name in (DEFAULT, TAYLOR)
-    )
-    both = default.merge(series, on="tol", suffixes=("", "_series"))
-    alike = (both["n_steps"] == both["n_steps_series"]) & (both["error_q"] == both["error_q_series"])
-    same = both["tol"][alike.cummin().astype(bool)]
-    looser = default[default["tol"] > same.max()] if len(same) else default
-    explicit = len(looser) > 0 and all(used(run) == "explicit" for _, run in looser.iterrows())
-    return {"series_from": float(same.max()) if len(same) else None, "default_explicit": explicit}
 
 
 def _cheapest(first: pd.DataFrame, error: float) -> dict[str, Any] | None:
