@@ -133,10 +133,10 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
 
 
 def _answer(cheapest: list[dict[str, Any]]) -> str:
-    dearer = [number(irk) for each in cheapest if (irk := each["paper_times"])]
+    dearer = [irk for each in cheapest if (irk := each["paper_times"])]
     if not dearer:
         return "No error is reached by both the paper's Runge–Kutta procedure and another solver."
-    over = f"{dearer[0]} to {dearer[-1]}" if len(dearer) > 1 else dearer[0]
+    over = f"{number(min(dearer))} to {number(max(dearer))}"
     return f"At equal error, the paper's Runge–Kutta procedure takes {over} times as long as the cheapest solver."
 
 
@@ -201,7 +201,12 @@ def tables_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, str]:
     """Make the table of the report."""
     first = rows[rows["problem"] == rows["problem"].iloc[0]]
     made = tables.work_precision(_compared(first), TARGETS, DRAWN, coded=True)
-    return {"work": table(["solver", *map(power, TARGETS)], [[solver, *costs] for solver, _, *costs in made])}
+    return {
+        "work": table(
+            ["solver", *map(power, TARGETS)],
+            [[solver, *(cost.split(" (")[0] for cost in costs)] for solver, _, *costs in made],
+        )
+    }
 
 
 STUDY = Study("table3_full", __doc__, make, findings_of, figures_of, tables_of, medians=True)
