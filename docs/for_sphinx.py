@@ -38,7 +38,7 @@ MEMBERS = {
     "twoloop.audit.MjcfAudit": ":members: write",
     "twoloop.audit.Audit": ":members: reaching",
     "twoloop.audit.AuditedRun": ":no-members:",
-    "twoloop.mechanisms": f"{ALL}\n:imported-members:",
+    "twoloop.mechanisms": f"{ALL}\n:imported-members:\n:exclude-members: Problem",  # which has an entry of its own
     "twoloop.mechanisms.planar.PlanarBodies": ALL,
     "twoloop.mechanisms.quadratic.QuadraticSystem": ALL,
 }

@@ -19,7 +19,7 @@ SOLID = 40, 3  # ... or, of bodies in space of so many lines, so few
 
 BEGINNING = """# Gallery of mechanisms
 
-Each of these functions of `twoloop.mechanisms` returns a [`Problem`](../reference.md#ready-mechanisms): a system with
+Each of these functions of `twoloop.mechanisms` returns a [`Problem`](../reference.md#systems): a system with
 compiled callbacks, a consistent start, a time span, the energy and, where one is known, a reference for the end.
 
 ```python
