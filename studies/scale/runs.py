@@ -1,4 +1,4 @@
-"""Rows of evaluations, of memory, and of chains at equal error."""
+"""Make rows of evaluations, of memory, and of chains at equal error."""
 
 import time
 import tracemalloc
@@ -23,7 +23,6 @@ EVALUATION, MEMORY, CHAIN = "evaluation", "memory", "chain"  # groups of rows
 Keyed = Iterator[tuple[str, Callable[[], Row]]]  # what a row is kept by, and what makes it
 SIZES, QUICK_SIZES = (3, 10, 30, 100, 300, 1000, 3000), (3, 10)
 METHOD, TOLERANCE = "DOP853", 1e-6
-FROM, TO = 30, 1000  # bodies, between which the slope is fitted
 SKIPPED, STEPS = 3, 6  # steps that set a run up, and steps timed: few, as motions differ later by size
 MANY, AGAIN = 300, 5  # bodies, below which the steps are timed so many times
 KEPT = 24  # steps of the run whose memory is asked for
@@ -36,20 +35,19 @@ N_STEPS = (100, 300, 1000, 3000, 10_000, 30_000)  # of Exudyn; the last two once
 ONCE = 2
 SPARSE_IDA, IDA_TOLERANCES = "IDA, sparse", (1e-4, 1e-5, 1e-6, 1e-7, 1e-8)  # where entries are given by values: once
 OTHERS = {20: (CVODE_C, CYRK, HEYOKA), 100: (CVODE_C, CYRK)}  # by size: their expressions grow faster than the chain
-STAGES = 12  # evaluations of a step of DOP853
 LIMIT, TIGHT = 60.0, 1e-10  # s of CPU of a run; tolerance of the reference
 AGREE = 1e-7  # how far two unlike methods may end apart with it
 
 
 def problem_of(made: Assembly, t_end: float) -> Problem:
-    """An assembly released from rest."""
+    """Return an assembly released from rest."""
     q0 = made.q
     energy = made.bodies.energy
     return Problem(made.system.name, made.system, q0, np.zeros_like(q0), (0.0, t_end), energy, conserved=True)
 
 
 def evaluations(quick: bool) -> Keyed:
-    """Rows of our evaluations, then of the memory."""
+    """Make rows of evaluations of twoloop, then of its memory."""
     for repeat in range(1 if quick else ROUNDS):
         for n in QUICK_SIZES if quick else SIZES:
             for build in (*PLANAR, *SPATIAL):
@@ -59,9 +57,9 @@ def evaluations(quick: bool) -> Keyed:
 
 
 def evaluation(build: Callable[[int], Assembly], n: int, repeat: int) -> Row:
-    """Time of an evaluation, with its share of projections and all else of a step, and of a first call.
+    """Time an evaluation, with its share of projections and all else of a step, and a first call.
 
-    passes: of the projection, in a step: many where stages are put on the constraints too, near a singular position.
+    `passes` of the projection in a step: many near a singular position, where stages are projected too.
     """
     case = build.__name__.replace("_", " ")
     row: Row = {"group": EVALUATION, "case": case, "solver": f"{METHOD} (twoloop)", "n": n, "repeat": repeat}
@@ -85,7 +83,7 @@ def evaluation(build: Callable[[int], Assembly], n: int, repeat: int) -> Row:
 
 
 def memory(n: int) -> Row:
-    """What Python and NumPy allocate at most for a run of a few steps, all of them kept; kernels allocate nothing."""
+    """Measure what Python and NumPy allocate at most for a run of a few steps; kernels allocate nothing."""
     _steps(problem_of(open_chain(min(SIZES[3:])), 1.0), 1)  # what is loaded once
     tracemalloc.start()
     _steps(problem_of(open_chain(n), 1.0), KEPT)
@@ -104,7 +102,7 @@ def _steps(problem: Problem, steps: int) -> Result:
 
 
 def chains(quick: bool) -> Keyed:
-    """Rows of runs of chains."""
+    """Make rows of runs of chains."""
     sizes = list(CHAINS)[:1] if quick else list(CHAINS)
     for repeat in range(1 if quick else REPEATS):
         for n in sizes:
@@ -117,7 +115,7 @@ def chains(quick: bool) -> Keyed:
 
 
 def solvers(n: int) -> dict[str, tuple[float, ...]]:
-    """What runs a chain of n bodies, and tolerances, or steps in s."""
+    """Return the solvers of a chain of n bodies, with tolerances, or steps in s."""
     steps = tuple(CHAINS[n] / n_steps for n_steps in N_STEPS)
     ours = dict.fromkeys((DEFAULT, "DOP853 (twoloop)"), TOLERANCES)
     others: dict[str, tuple[float, ...]] = dict.fromkeys(OTHERS.get(n, ()), TOLERANCES)
@@ -128,7 +126,7 @@ def solvers(n: int) -> dict[str, tuple[float, ...]]:
 
 @cache
 def case_of(n: int, t_end: float) -> tuple[Case, Assembly]:
-    """A chain of n bars."""
+    """Return a chain of n bars."""
     made = open_chain(n)
     problem = problem_of(made, t_end)
     return Case(f"open chain of {n}", problem, t_end, n_instants=1, time_limit=LIMIT), made
@@ -136,7 +134,7 @@ def case_of(n: int, t_end: float) -> tuple[Case, Assembly]:
 
 @cache
 def ends(n: int, t_end: float) -> tuple[np.ndarray, str]:
-    """Where a chain ends, by two unlike routes, and the second of these: without Pinocchio it is a method of ours.
+    """Return where a chain ends, by two unlike routes, and the name of the second: without Pinocchio it is Adams.
 
     Raises RuntimeError if they end apart.
     """
@@ -154,7 +152,7 @@ def ends(n: int, t_end: float) -> tuple[np.ndarray, str]:
 
 @cache
 def solver_of(name: str) -> Solver:
-    """A solver of the catalogue, IDA with sparse factors, or Exudyn with bodies and joints of its own."""
+    """Return a solver of the catalogue, IDA with sparse factors, or Exudyn with bodies and joints of its own."""
     if name == SPARSE_IDA:
         ida = lambda case, tol, _: at_instants(solve_ida_sparse, case, rtol=tol, atol=tol)  # noqa: E731
         return Solver(name, "SUNDIALS", "Python", True, "tol", ida)
@@ -169,13 +167,13 @@ def solver_of(name: str) -> Solver:
 
 
 def error_of(n: int, t_end: float, result: Result) -> float:
-    """How far a chain ends from where it should, over max(1, max |q|)."""
+    """Return how far a chain ends from where it should, over max(1, max |q|)."""
     expected = ends(n, t_end)[0]
     return float(np.abs(result.q[:, -1] - expected).max() / max(1.0, np.abs(expected).max()))
 
 
 def chain_row(n: int, solver: str, value: float, repeat: int) -> Row:
-    """A run of a solver on a chain."""
+    """Run a solver on a chain."""
     case, chosen = case_of(n, CHAINS[n])[0], solver_of(solver)
     run = Run(case, chosen, value)
     row: Row = {"group": CHAIN, "case": case.name, "solver": solver, "family": chosen.family, "n": n, "repeat": repeat}

@@ -1,4 +1,4 @@
-"""Rows of trees in engines, and of chains up to the size at which what takes expressions is no longer built."""
+"""Make rows of trees in physics engines, and of chains up to the size at which solvers stop that take expressions."""
 
 import time
 from collections.abc import Callable
@@ -18,7 +18,7 @@ from twoloop import solve_dae
 
 TREE, UNTIL = "tree", "until"  # groups of rows
 TREES, TREE_SIZES = (open_chain, tree), (10, 30, 100, 300)  # of 600, Pinocchio holds over 7 GB
-SOON, APART = 0.01, 1e-6  # s, after which a tree moves; accelerations that are off by a larger share are wrong
+SOON, APART = 0.01, 1e-6  # s, after which a tree moves; largest relative difference of accelerations
 TIMED = 0.05  # s of CPU time, of evaluations one after another
 UNTIL_SIZES, UNTIL_END = (5, 10, 20, 40, 80, 160, 320), 0.1
 UNTIL_SOLVERS = (DEFAULT, HEYOKA, CVODE_C, IDAS)
@@ -26,7 +26,7 @@ BUDGET = 20.0  # s of CPU time, of building and of a call
 
 
 def trees(quick: bool) -> Keyed:
-    """Rows of accelerations of trees in engines."""
+    """Make rows of accelerations of trees in engines."""
     rounds, sizes = range(1 if quick else ROUNDS), QUICK_SIZES[1:] if quick else TREE_SIZES
     for repeat, n, build, engine in product(rounds, sizes, TREES, ENGINES):
         key = f"{TREE} | {build.__name__} | {n} | {engine} | {repeat}"
@@ -35,7 +35,7 @@ def trees(quick: bool) -> Keyed:
 
 @cache
 def _moving(build: Callable[[int], Assembly], n: int) -> tuple[Assembly, np.ndarray, np.ndarray, np.ndarray]:
-    """A tree soon after its release: angles, angular velocities and accelerations."""
+    """Return a tree soon after its release: angles, angular velocities and accelerations."""
     made = build(n)
     result = solve_dae(made.system, (0.0, SOON), made.q, np.zeros_like(made.q))
     q, v, a = (each[2::3, -1] for each in (result.q, result.v, result.a))
@@ -44,7 +44,7 @@ def _moving(build: Callable[[int], Assembly], n: int) -> tuple[Assembly, np.ndar
 
 @cache
 def _dynamics(build: Callable[[int], Assembly], n: int, engine: str) -> tuple[TreeDynamics, float]:
-    """The tree in an engine, and the time that its making takes, s."""
+    """Return the tree in an engine, and the time that it takes to build, s."""
     made, angles, rates, _ = _moving(build, n)
     began = time.process_time()
     dynamics = ENGINES[engine](made.bodies, angles, rates)
@@ -52,7 +52,7 @@ def _dynamics(build: Callable[[int], Assembly], n: int, engine: str) -> tuple[Tr
 
 
 def tree_row(build: Callable[[int], Assembly], n: int, engine: str, repeat: int) -> Row:
-    """Time of an evaluation of an engine, where its accelerations are ours."""
+    """Time an evaluation of an engine whose accelerations agree with those of twoloop."""
     case, expected = build.__name__.replace("_", " "), _moving(build, n)[3]
     row: Row = {"group": TREE, "case": case, "solver": engine, "n": n, "repeat": repeat, "evaluation_us": None}
     try:
@@ -65,7 +65,10 @@ def tree_row(build: Callable[[int], Assembly], n: int, engine: str, repeat: int)
     apart = float(np.abs(dynamics.angular() - expected).max() / np.abs(expected).max())
     row |= {"start_s": took, "error_q": apart}
     if not apart < APART:
-        return row | {"status": "FAILED", "message": f"accelerations are {apart:.1g} of the largest apart from ours"}
+        return row | {
+            "status": "FAILED",
+            "message": f"accelerations are {apart:.1g} of the largest apart from those of twoloop",
+        }
     began = time.process_time()
     for _ in range(times):
         dynamics.evaluate()
@@ -73,7 +76,7 @@ def tree_row(build: Callable[[int], Assembly], n: int, engine: str, repeat: int)
 
 
 def until(quick: bool) -> Keyed:
-    """Rows of chains of growing size, by solvers that take expressions, and by the default."""
+    """Make rows of chains of growing size, by solvers that take expressions, and by twoloop."""
     for solver in UNTIL_SOLVERS:
         before: list[float] = []  # bodies, and s of the largest chain that was built
         for n in UNTIL_SIZES[:1] if quick else UNTIL_SIZES:
@@ -81,7 +84,7 @@ def until(quick: bool) -> Keyed:
 
 
 def until_row(n: int, solver: str, before: list[float]) -> Row:
-    """Building, a call and its error; of a solver that is not built within the budget, why it was not run."""
+    """Time building and a call; a solver that would exceed the budget is not run."""
     case, chosen = case_of(n, UNTIL_END)[0], CATALOGUE[solver]
     row: Row = {"group": UNTIL, "case": case.name, "solver": solver, "n": n, "repeat": 0, "tol": TOLERANCE}
     row |= {"family": chosen.family, "build_s": None, "call_s": None, "error_q": None}
