@@ -1,0 +1,103 @@
+"""The committed reports, and the numbers of README.md, are those of the committed rows."""
+
+import json
+import re
+import shutil
+from functools import cache
+
+import pytest
+
+from studies.bench.cli import REPORTS, ROOT
+from studies.bench.index import REPORTS as INDEX
+from studies.bench.index import run_study
+from studies.bench.render import listed, number
+
+README = (ROOT / "README.md").read_text()
+ENGINES = ("MuJoCo", "Pinocchio", "Exudyn")  # in the order of README
+WORDS = {"README.md": 900, "CHANGELOG.md": 1200, "CONTRIBUTING.md": 1200}
+
+
+@cache
+def findings(name):
+    """Return the committed findings of a report."""
+    return json.loads((REPORTS / f"{name}.json").read_text())
+
+
+def words(*texts):
+    """Count as `wc -w`."""
+    return sum(len(text.split()) for text in texts)
+
+
+@pytest.fixture(scope="module")
+def copy(tmp_path_factory):
+    """Return a folder with the committed rows, in which reports can be written."""
+    folder = tmp_path_factory.mktemp("reports")
+    for path in REPORTS.iterdir():
+        if path.suffix in (".csv", ".npz", ".json"):
+            shutil.copy(path, folder)
+    return folder
+
+
+@pytest.mark.slow  # draws all figures
+@pytest.mark.parametrize("name", [name for name in INDEX if name != "table3"])  # `make table3` writes its rows anew
+def test_a_report_is_what_its_rows_say(copy, name):
+    run_study(name, ["--redraw", "--out", str(copy)])
+    assert (copy / f"{name}.md").read_text() == (REPORTS / f"{name}.md").read_text()
+    assert json.loads((copy / f"{name}.json").read_text()) == findings(name)
+
+
+def milliseconds(solver, error):
+    """Return the median time of a call, as README prints it."""
+    return number(1e3 * findings("engines")["times"][solver][error]["call_s"])
+
+
+def test_readme_has_the_times_of_engines():
+    own, *others = ((milliseconds(name, "1e-2"), milliseconds(name, "1e-6")) for name in ("twoloop", *ENGINES))
+    told = [f"{loose} ms with {name}" for name, (loose, _) in zip(ENGINES, others, strict=True)]
+    n_cases = len(findings("engines")["cases"])
+    assert f"takes {own[0]} ms (median of {n_cases} mechanisms), against {listed(told)}" in README
+    assert f"for 1e-6, {own[1]} ms against {others[0][1]}, {others[1][1]} and {others[2][1]} ms" in README
+    reached = [findings("engines")["times"][name]["1e-6"]["reached"] for name in ENGINES]
+    assert f"at 1e-6: {reached[0]}, {reached[1]}\nand {reached[2]} of 11" in README
+    assert all(at["reached"] == 11 for at in findings("engines")["times"]["twoloop"].values())
+    slower = findings("engines")["against"]
+    assert len(slower["1e-2"]["slower"]) == 3 and not slower["1e-6"]["slower"]
+    assert {each["engine"] for each in slower["1e-2"]["slower"].values()} == {"MuJoCo"}
+
+
+def test_readme_has_the_numbers_of_its_other_reports():
+    violation, million = findings("reproduction")["violation"], findings("ensembles")["million"]
+    assert violation["ours_q"] <= 1e-15
+    assert f"At most 1e-15 m of violation over {violation['t_end']:.0f} s" in README
+    assert f"all {violation['n_ours']} methods and settings" in README
+    assert (million["n_runs"], million["n_threads"], million["n_failed"]) == (1e6, 2, 0)
+    assert f"four-bar linkages, {million['t_end']:.0f} s each, in {number(million['wall'])} s on two cores" in README
+    table = findings("honesty")["table"]
+    assert table["sharp"]["default"]["wrong"] == 0
+    assert f"None of {table['sharp']['default']['n']} runs with sharp forces" in README
+    short = [table[name]["default"] for name in ("gust_short", "pulse_short")]
+    assert f"{sum(own['wrong'] for own in short)} of {sum(own['n'] for own in short)} runs" in README
+    typical = {at["error"]: number(at["median"]) for at in findings("work_precision")["typical"]}
+    assert f"takes {typical[1e-4]} (at 1e-4) to {typical[1e-8]} times (at 1e-8) our time" in README
+    counts, untestable = findings("claims")["counts"], findings("claims")["untestable"]
+    told = (
+        f"{counts['holds']} hold, {counts['holds in part']} hold in part, {counts['does not hold']} do not hold, and "
+    )
+    assert told + f"{untestable} cannot be tested" in README
+    assert f"Of {counts['holds'] + counts['holds in part'] + counts['does not hold'] + untestable} claims" in README
+
+
+def test_what_people_read_is_short():
+    for name, most in WORDS.items():
+        assert words((ROOT / name).read_text()) <= most, name
+    assert README.count("\n") <= 120
+    assert words(*(path.read_text() for path in REPORTS.glob("*.md"))) <= 7500
+    pages = (path for path in (ROOT / "docs").glob("*.md") if path.name != "errors.md")
+    assert words(*(path.read_text() for path in pages)) <= 22_000
+
+
+def test_the_words_of_a_private_dialect_are_gone():
+    folders = [(ROOT / "docs").glob("*"), (ROOT / "docs" / "reference").glob("*"), REPORTS.rglob("*")]
+    files = [ROOT / "README.md", *(path for folder in folders for path in folder if path.is_file())]
+    texts = [path for path in files if path.suffix in (".md", ".py", ".csv", ".json", ".svg", ".html")]
+    assert not [path.name for path in texts if re.search(r"rival|rows not kept", path.read_text(), re.IGNORECASE)]
