@@ -11,7 +11,7 @@ from tests.bad_input.rows import edge, slide
 from tests.general.mechanism import G
 from tests.general.mechanisms import mechanism
 from tests.general.systems import KNIFE_EDGE, parted_drives, without_inertia
-from tests.marks import slow
+from tests.marks import slow, slow_but
 from tests.problems import START, held_twice, pendulum_state
 from twoloop import ConstraintWarning, consistent_state, solve_dae
 from twoloop.methods.presets import PRESETS
@@ -63,7 +63,7 @@ def test_a_guess_is_projected_on_all_rows(name, off_q, off_v):
         assert found_q == pytest.approx(q, abs=1e-12) and found_v != pytest.approx(v, abs=1e-4)
 
 
-@pytest.mark.parametrize("method", ["auto", "Newmark", "BDF", *(slow(name) for name in PRESETS)])
+@pytest.mark.parametrize("method", slow_but(["auto", "Newmark", "BDF"], PRESETS))
 def test_every_preset_takes_non_holonomic_rows(method):
     """Only the canonical variables refuse them."""
     result = slide(method=method, rtol=1e-5, atol=1e-5)

@@ -9,7 +9,7 @@ from scipy.integrate import solve_ivp
 from scipy.linalg import block_diag
 
 from tests.compiled import SPRUNG_START, sprung_pair
-from tests.marks import slow
+from tests.marks import slow, slow_but
 from tests.problems import (
     G,
     moving_pivot,
@@ -50,9 +50,7 @@ def stiff_spring_truth(stiffness):
     return np.array([np.cos(y[0]), np.sin(y[0]), y[1], y[2]])
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[pytest.mark.slow] * (name not in QUICK)) for name in TABLEAUX]
-)
+@pytest.mark.parametrize("name", slow_but(QUICK, TABLEAUX))
 @pytest.mark.parametrize("system", ["constant mass", "mass and damping that vary"])
 def test_newton_and_sweeps_make_the_same_steps(name, system):
     if system == "constant mass":

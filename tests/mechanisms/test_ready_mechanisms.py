@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from references.paper.four_bar_minimal import MinimalFourBar
 from tests.general.mechanisms import ELSEWHERE
-from tests.marks import slow
+from tests.marks import slow, slow_but
 from tests.mechanisms.make_references import converged, digits
 from tests.mechanisms.motions import closed_forms, known_motions
 from tests.mechanisms.motions.integrate import by_scipy
@@ -79,7 +79,7 @@ def test_it_says_what_it_is(name):
 
 
 # --- references by a second route
-@pytest.mark.parametrize("name", [slow(each) if each in LONG else each for each in COMPUTED])
+@pytest.mark.parametrize("name", slow_but(COMPUTED.keys() - LONG, COMPUTED))
 def test_references_by_equations_in_few_coordinates(name):
     """In double precision by SciPy; the numbers themselves are from extended precision, by extrapolation."""
     problem, (rate, start, known), end = COMPUTED[name]

@@ -9,6 +9,7 @@ import pytest
 from references.casadi.integrators import solve_collocation
 from references.lines import Line, lines
 from references.paper.gear import solve_gear
+from tests.marks import slow_but
 
 
 class Adapter:
@@ -40,20 +41,15 @@ ADAPTERS: dict[str, Any] = {
     "collocation, CasADi": _by_collocation,
     "GSTIFF": lambda *start, tol=None, **options: solve_gear(*start, 1e-3, 2, **options),
 }
-COMPILES = {"Dopri8, diffrax"}  # for ten seconds
-# solvers that others of the same adapter stand for: another formula, told by an option
-ALIKE = {
-    *("RK45, index 1", "RK45, projected", "LSODA, index 1", "BDF, index 1", "BDF, solve_dae", "Radau9, solve_dae"),
-    *("CyRK, Vern8", "CyRK, BDF", "CyRK, LSODA", "CVODES, CasADi, Adams", "IDA from C, q and v tested"),
-    *("IDA from C, order 2, positions tested", "CVODE from C, BDF", "IDA, index1"),
-}
+# one of each way to call a solver, of those that need no long compilation: the other tests are slow
+QUICK = ("DOP853, index 1", "IDA, stabilised", "IDA from C, stabilised", "GSTIFF")
 # callbacks in Python, too
 ANY_CALLBACK = (*(name for name, line in FOUND.items() if not (line.traces or line.compiled_callbacks)), "GSTIFF")
 
 
-def each(*left_out: str, of: Any = tuple(ADAPTERS), slow: Collection[str] = COMPILES) -> list[Any]:
-    """Names of adapters, of which some are slow: those that compile for long, or those given."""
-    return [pytest.param(name, marks=[pytest.mark.slow] * (name in slow)) for name in of if name not in left_out]
+def each(*left_out: str, of: Any = tuple(ADAPTERS), quick: Collection[str] = QUICK) -> list[Any]:
+    """Names of adapters; those that are not quick are slow tests."""
+    return slow_but(quick, [name for name in of if name not in left_out])
 
 
 def start(problem, t_end=None):

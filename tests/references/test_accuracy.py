@@ -6,7 +6,8 @@ from references.paper.four_bar_minimal import trajectory
 from references.scipy.index1 import STABILISATIONS, solve_index1
 from references.sundials.residual import FORMS
 from tests import problems
-from tests.references.adapters import ADAPTERS, ALIKE, ANY_CALLBACK, each
+from tests.marks import slow
+from tests.references.adapters import ADAPTERS, ANY_CALLBACK, each
 
 # error of q at 10 s for each tolerance: three times the largest of 15 runs that differ in rounding, which alone moves
 # IDA's error by a factor of 2 to 24
@@ -27,7 +28,7 @@ BOUNDS = {
 
 
 # test_adapters.py has every adapter on a double pendulum, of which machine code is made in less time
-FAST = (("default", "DOP853, projection"), ("default", "IDA, stabilised"), ("collinear", "IDA, stabilised"))
+FAST = (("default", "DOP853, projection"),)
 
 
 def run(name, *start, tol, **options):
@@ -37,9 +38,7 @@ def run(name, *start, tol, **options):
     return ADAPTERS[name](*start, tol=tol, **options)
 
 
-@pytest.mark.parametrize(
-    ("problem", "name"), [pytest.param(*key, marks=[] if key in FAST else pytest.mark.slow) for key in BOUNDS]
-)
+@pytest.mark.parametrize(("problem", "name"), [key if key in FAST else slow(*key) for key in BOUNDS])
 def test_agrees_with_the_truth_and_follows_the_tolerance(problem, name):
     made, times, errors = problems.LINKAGES[problem], [10.0], []
     q, v = trajectory(made.parameters, times)
@@ -56,11 +55,9 @@ def test_agrees_with_the_truth_and_follows_the_tolerance(problem, name):
 # times and tolerances; gear takes steps of 1e-3 s
 ON_ANY = [*ANY_CALLBACK, "DOP853, baumgarte"]
 LOOSE = {"GSTIFF": 1e-4, "RK45, index 1": 1e-5, "BDF, solve_dae": 1e-4}
-# whose equations are those of the motion before; their Jacobians, if wrong, cost steps and no digits
-BY_NEWTON = {"Radau, index 1", "Radau, solve_dae", "CVODE, Adams"}
 
 
-@pytest.mark.parametrize("name", each(of=ON_ANY, slow=ALIKE))
+@pytest.mark.parametrize("name", each(of=ON_ANY))
 def test_time_dependent_constraints_without_a_gamma(name):
     system, times = problems.moving_pivot(gamma=False), [0.5, 2.0]
     result = run(name, system, (0.0, 2.0), *problems.moving_pivot_state(0.0), tol=1e-8, t_eval=times)
@@ -71,7 +68,7 @@ def test_time_dependent_constraints_without_a_gamma(name):
     assert problems.violations(system, result)[0] < held.get(name, 1e-5)
 
 
-@pytest.mark.parametrize("name", each(of=ON_ANY, slow=ALIKE | BY_NEWTON))
+@pytest.mark.parametrize("name", each(of=ON_ANY))
 def test_full_mass_matrix_that_varies_and_forces_that_depend_on_velocities(name):
     result = run(name, problems.oblique_pendulum(), (0.0, 2.0), *problems.oblique_start(), tol=1e-8, t_eval=[0.5, 2.0])
     x, u, lam = problems.oblique_point(result.t)
@@ -80,6 +77,7 @@ def test_full_mass_matrix_that_varies_and_forces_that_depend_on_velocities(name)
     assert problems.worst(result.lam[0], lam) < (1e3 if "IDA" in name or "solve_dae" in name else 1e2) * far
 
 
+@pytest.mark.slow
 def test_the_stabilised_form_of_ida_keeps_both_constraints_and_index_1_drifts():
     made = problems.LINKAGES["default"]
     start = made.system, (0.0, 10.0), made.q0, made.v0

@@ -11,7 +11,7 @@ from references.exudyn.mechanisms import solve_exudyn
 from references.exudyn.run import SOLVERS
 from tests.marks import slow
 from tests.problems import pendulum
-from tests.references.adapters import ADAPTERS, ALIKE, ANY_CALLBACK, COMPILES, each, start
+from tests.references.adapters import ADAPTERS, ANY_CALLBACK, QUICK, each, start
 from twoloop.mechanisms import double_pendulum, four_bar, knife_edge, rolling_disc, very_flexible_beam
 from twoloop.run.record import Status
 from twoloop.testing.known_problems import MAKERS
@@ -48,7 +48,7 @@ RIGHT = {
 
 
 @pytest.mark.parametrize("problem", [SMALL, slow(PROBLEM)], ids=lambda each: each.name)
-@pytest.mark.parametrize("name", each(of=RIGHT, slow=(ALIKE - {"Radau9, solve_dae"}) | COMPILES))
+@pytest.mark.parametrize("name", each(of=RIGHT))
 def test_another_solver_is_right_and_measured(name, problem):
     result = ADAPTERS[name](*start(problem), tol=1e-6 if name == "heyoka" else 1e-9)
     system, n, end = problem.system, problem.system.n_q, result.q[:, -1].copy()
@@ -67,8 +67,7 @@ def test_another_solver_is_right_and_measured(name, problem):
 AT = [[1.0], [0.0, 0.26, 1.0], [0.5], [0.0, 1.0]]
 
 
-# CVODE's output is that of its other lines, also where it projects, for which it compiles more
-@pytest.mark.parametrize("name", each("collocation, CasADi", slow=ALIKE | COMPILES | {"CVODE from C, BDF, projected"}))
+@pytest.mark.parametrize("name", each("collocation, CasADi"))
 def test_output_is_at_the_times_asked_for(name):
     at, far = start(SMALL, 1.0), 2e-2 if name == "RK45, index 1" else 1e-3
     for times in AT:
@@ -86,7 +85,7 @@ OWN_OUTPUT = ("collocation, CasADi", "Dopri8, diffrax", "GSTIFF", "heyoka")
 OWN_OUTPUT += ("IDAS, CasADi", "CVODES, CasADi", "CVODES, CasADi, Adams")
 
 
-@pytest.mark.parametrize("name", each(*OWN_OUTPUT, slow=ALIKE | COMPILES))
+@pytest.mark.parametrize("name", each(*OWN_OUTPUT))
 def test_output_takes_no_step_and_no_evaluation_of_the_run_that_is_timed(name):
     solve, at = ADAPTERS[name], start(SMALL, 2.0)
     end, many = (solve(*at, tol=1e-7, t_eval=times) for times in ([2.0], TIMES))
@@ -116,7 +115,7 @@ STOPPED = {
 }
 
 
-@pytest.mark.parametrize("name", each(of=STOPPED, slow=ALIKE))
+@pytest.mark.parametrize("name", each(of=STOPPED))
 def test_a_run_past_its_time_limit_is_a_row(name):
     STOPPED[name](time_limit=0.02)  # compiles, and imports what SciPy imports late
     for limit in (1e-9, 0.1):
@@ -186,10 +185,11 @@ NANS += [(name, "constraint") for name in ("DOP853, projected", "IDA, stabilised
 NANS += [(name, "gamma") for name in ("DOP853, index 1", "IDA, index1")]
 
 
+QUICK_NANS = [(name, "force") for name in QUICK] + [("IDA, stabilised", "constraint")]
+
+
 @pytest.mark.parametrize("every_step", [True, False])
-@pytest.mark.parametrize(
-    ("name", "kind"), [pytest.param(*pair, marks=[pytest.mark.slow] * (pair[0] in ALIKE)) for pair in NANS]
-)
+@pytest.mark.parametrize(("name", "kind"), [pair if pair in QUICK_NANS else slow(*pair) for pair in NANS])
 def test_a_function_that_becomes_nan_is_a_row(name, kind, every_step, capfd):
     began, more = time.monotonic(), {} if every_step else {"t_eval": np.linspace(0.0, 2.0, 101)}
     result = ADAPTERS[name](late(kind, lambda: np.nan), (0.0, 2.0), [1.0, 0.0], [0.0, 0.0], **more)
@@ -202,7 +202,7 @@ def test_a_function_that_becomes_nan_is_a_row(name, kind, every_step, capfd):
     assert capfd.readouterr().out == ""
 
 
-@pytest.mark.parametrize("name", each(of=ANY_CALLBACK, slow=ALIKE))
+@pytest.mark.parametrize("name", each(of=ANY_CALLBACK))
 def test_an_exception_of_a_callback_comes_through(name):
     with pytest.raises(ValueError, match="no force today"):
         ADAPTERS[name](late("force", raising), (0.0, 2.0), [1.0, 0.0], [0.0, 0.0])
@@ -218,7 +218,7 @@ def test_exudyn_ends_where_its_model_is_not_finite(solver):
 
 
 # --- rows A v + b = 0
-# `Task` adds them for every adapter; of the adapters that read callbacks in one way, one is not slow
+# `Task` adds them for every adapter
 ROLLING = (
     "DOP853, index 1",
     "heyoka",
@@ -228,10 +228,9 @@ ROLLING = (
     "IDA, stabilised",
 )
 ON_AN_EDGE = ("IDAS, CasADi", "CVODE from C, BDF, projected", "IDA, index1", "Dopri8, diffrax")
-SLOW = (*ROLLING[2:], *ON_AN_EDGE[1:])
 
 
-@pytest.mark.parametrize("name", each(of=(*ROLLING, *ON_AN_EDGE), slow=SLOW))
+@pytest.mark.parametrize("name", each(of=(*ROLLING, *ON_AN_EDGE), quick=["IDA, index1"]))
 def test_the_motion_is_right_and_the_rows_hold(name):
     problem = rolling_disc() if name in ROLLING else knife_edge()
     result = ADAPTERS[name](*start(problem), tol=1e-10 if name == "heyoka" else 1e-9)

@@ -16,7 +16,7 @@ from references.sundials.cvode_c import solve_cvode_c
 from studies.validation.study import MAKE as PUBLISHED
 from tests.compiled import PENDULUM
 from tests.general.systems import SPRING, massless_coordinate
-from tests.marks import slow
+from tests.marks import slow, slow_but
 from tests.mechanisms.make_references import solution
 from tests.problems import moving_pivot, moving_pivot_state, oblique_pendulum, oblique_start, pendulum, worst
 from tests.problems import pendulum as plain_pendulum
@@ -80,9 +80,8 @@ def test_singular_matrices():
         accelerations(pendulum(mass=lambda t, q: np.diag([1.0, 0.0])), [0.0], [[1.0], [0.0]], np.zeros((2, 1)))
 
 
-# the larger ones are as the heavy top
 @pytest.mark.parametrize(
-    "make", [four_bar, heavy_top, *(slow(each) for each in (spatial_slider_crank, spatial_four_bar, governor))]
+    "make", [four_bar, *(slow(each) for each in (heavy_top, spatial_slider_crank, spatial_four_bar, governor))]
 )
 def test_a_mass_that_is_constant_or_singular_alone(make):
     problem = make()
@@ -150,7 +149,7 @@ def known(problem):
     return least_norm(problem.system, np.zeros(1), states)[0][:, 0]
 
 
-@pytest.mark.parametrize("make", HOLONOMIC, ids=lambda make: make().name)
+@pytest.mark.parametrize("make", slow_but(HOLONOMIC[::3], HOLONOMIC), ids=lambda make: make().name)
 def test_accelerations_of_every_mechanism(make):
     problem = make()
     made = Expressions(problem.system, 0.0, problem.q0, problem.v0)
@@ -167,7 +166,7 @@ def test_redundant_rows_are_left_out_and_a_singular_mass_is_made_definite():
     assert Expressions(pendulum.system, 0.0, pendulum.q0, pendulum.v0).added == []
 
 
-@pytest.mark.parametrize("make", [four_bar, heavy_top, partial(n_four_bar, 2)])
+@pytest.mark.parametrize("make", [heavy_top, slow(four_bar), slow(partial(n_four_bar, 2))])
 def test_straight_line_code_is_the_right_hand_side(make):
     problem = make()
     n = problem.q0.size

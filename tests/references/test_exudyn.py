@@ -17,6 +17,7 @@ from references.paper.four_bar_minimal import trajectory
 from studies.bench.collector import Case
 from studies.bench.solvers import CATALOGUE
 from studies.validation import study as validation
+from tests.marks import slow, slow_but
 from tests.problems import LINKAGES
 from twoloop import solve_dae
 from twoloop.mechanisms import ancf_beam, moderately_stiff_beam
@@ -39,14 +40,16 @@ def final_error(result, name):
     return np.abs(result.q[:, -1] - q[:, 0]).max(), np.abs(result.v[:, -1] - v[:, 0]).max()
 
 
-@pytest.mark.parametrize(("name", "solver"), BOUNDS)
+@pytest.mark.parametrize(
+    ("name", "solver"), [key if key == ("default", "GeneralizedAlpha") else slow(*key) for key in BOUNDS]
+)
 def test_agrees_and_is_of_second_order(name, solver):
     problem = LINKAGES[name]
     coarse, fine = (final_error(solve_exudyn(problem, 10.0, n, solver, store_every=1000), name) for n in (5000, 10000))
     assert fine[0] < BOUNDS[name, solver] and 3.5 < coarse[0] / fine[0] < 4.5 and 3.5 < coarse[1] / fine[1] < 4.5
 
 
-@pytest.mark.parametrize("solver", SOLVERS)
+@pytest.mark.parametrize("solver", slow_but(["GeneralizedAlpha"], SOLVERS))
 def test_stores_every_step_in_our_order(solver):
     problem = LINKAGES["default"]
     result = solve_exudyn(problem, 1.0, 1000, solver)
@@ -80,7 +83,7 @@ def end_error(problem, n_steps, **options):
     return np.abs(result.q[:, -1] - known.q).max(), np.abs(result.v[:, -1] - known.v).max()
 
 
-@pytest.mark.parametrize("name", [name for name in validation.MODELS if "bodies" not in name])
+@pytest.mark.parametrize("name", slow_but(["heavy top"], [name for name in validation.MODELS if "bodies" not in name]))
 def test_second_order_towards_the_known_state(name):
     n = FEWEST.get(name, 500)
     coarse, fine = (end_error(PROBLEMS[name], steps) for steps in (n, 2 * n))
@@ -95,7 +98,7 @@ def test_the_list_of_the_study_is_that_of_the_models():
 
 
 # --- the spectral radius, and why there are no steps by error control
-@pytest.mark.parametrize("name", MODELS)
+@pytest.mark.parametrize("name", slow_but(["heavy top"], MODELS))
 def test_every_model_runs_with_another_radius(name):
     """It was refused where there is a model and an option."""
     result = CATALOGUE["Exudyn, GeneralizedAlpha 0.6"].run(Case(name, PROBLEMS[name], 0.02), 1e-3, 0)
@@ -154,12 +157,14 @@ def test_cable_converges_in_mesh_and_in_time():
     assert fine.min() < -0.8  # it moves
 
 
+@pytest.mark.slow
 def test_elements_approach_the_cable_as_the_mesh_gets_finer():
     apart = {n: distance(ours(n), theirs("cable", 16)) for n in BY_ELEMENTS}
     assert all(apart[n] < BY_ELEMENTS[n] for n in apart), apart
     assert apart[4] > 3.0 * apart[8] > 9.0 * apart[16], apart
 
 
+@pytest.mark.slow
 def test_elements_lock_by_the_factor_that_is_said():
     # Poisson's ratio 0.3: the elements meet a cable that is (lambda + 2 mu)/E = 0.7/(1.3 x 0.4) times as stiff
     elements = tip_of(moderately_stiff_beam(16, "beam"))
@@ -178,7 +183,7 @@ def test_beams_meet_as_the_section_gets_slender():
 
 
 @pytest.mark.parametrize("model", BEAMS)
-@pytest.mark.parametrize("solver", SOLVERS)
+@pytest.mark.parametrize("solver", slow_but(["GeneralizedAlpha"], SOLVERS))
 def test_result_is_in_our_order_and_on_the_base(model, solver):
     problem = moderately_stiff_beam(4)
     result = solve_exudyn_beam(problem, 0.2, 400, model, solver=solver)

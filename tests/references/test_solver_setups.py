@@ -20,7 +20,7 @@ from references.sundials.ida_c import solve_ida_c
 from studies.bench.collector import Case, Run, attempt
 from studies.bench.solvers import CATALOGUE, OTHER_SOLVERS
 from studies.validation.study import MAKE
-from tests.marks import slow
+from tests.marks import slow, slow_but
 from tests.problems import pendulum
 from tests.processes import run_python
 from twoloop import ConstrainedSystem, callback, mechanisms
@@ -97,7 +97,7 @@ STATES = {
 }
 
 
-@pytest.mark.parametrize("name", STATES)
+@pytest.mark.parametrize("name", slow_but(["singular mass"], STATES))
 def test_the_jacobian_of_the_accelerations_is_their_derivative(name):
     system, q, v = STATES[name]
     rate, derivatives = (make(system, 0.0, q.tobytes(), v.tobytes()) for make in (straight_line, exact_jacobian))
@@ -143,7 +143,7 @@ def start(problem, t_end):
 
 
 # --- solve_dae
-@pytest.mark.parametrize("tolerance", [3e-8, 1e-8, 1e-9])
+@pytest.mark.parametrize("tolerance", [1e-8, slow(3e-8), slow(1e-9)])
 def test_solve_dae_starts_from_rest_with_a_step_that_rounding_does_not_spoil(tolerance):
     """With its own first step, of 1e-6 of the span, it fails there at these tolerances."""
     result = fully_implicit.solve_fully_implicit(*start(mechanisms.pendulum(), 0.5), "Radau", tolerance, tolerance)
@@ -157,8 +157,8 @@ def test_solve_dae_starts_from_rest_with_a_step_that_rounding_does_not_spoil(tol
 
 
 # --- mass matrices that are singular without the constraints, as with Euler parameters
-QUICK = ("DOP853, projected",)
-OTHERS = (
+SOLVERS = (
+    "DOP853, projected",
     "DOP853, index 1",
     "Pr9, index 1",
     "LSODA, index 1",
@@ -167,14 +167,14 @@ OTHERS = (
     "IDA from C, stabilised",
 )
 EULER = ("heavy top", "spatial slider-crank", "spatial four-bar", "A05 governor")
-SLOW = [slow(name, (*QUICK, *OTHERS)) for name in EULER]
 
 
-@pytest.mark.parametrize(("name", "solvers"), [("heavy top", QUICK), *SLOW])
-def test_every_solver_is_put_to_mechanisms_with_euler_parameters(name, solvers):
+@pytest.mark.slow
+@pytest.mark.parametrize("name", EULER)
+def test_every_solver_is_put_to_mechanisms_with_euler_parameters(name):
     problem = next(problem for problem in (make() for make in MAKE) if problem.name == name)
     known = problem.reference
-    for solver in solvers:
+    for solver in SOLVERS:
         errors = []
         for tol in (1e-5, 1e-9):
             case = Case(name, problem, known.t, n_instants=1, time_limit=60.0)
@@ -201,6 +201,7 @@ def test_a_step_of_scipy_that_is_timed_makes_no_interpolant(monkeypatch):
 
 
 # --- Jacobians
+@pytest.mark.slow
 def test_implicit_solvers_get_the_analytic_jacobian(monkeypatch):
     """Without it as many evaluations more as there are unknowns, for every Jacobian; the motion is the same."""
     at = start(PENDULUM, 2.0)
@@ -259,6 +260,7 @@ def test_a_file_in_the_folder_is_enough(tmp_path, monkeypatch):
     assert [line.name for line in found] == ["newcomer"] and isinstance(found[0], Line)
 
 
+@pytest.mark.slow
 def test_a_package_that_is_not_installed_leaves_the_others():
     told = run_python(
         """

@@ -28,6 +28,7 @@ def test_the_end_of_a_motion_by_pinocchio():
     assert np.abs(end_by_pinocchio(made.bodies, made.q[2::3], 0.2, 1e-11) - ours).max() < 1e-8
 
 
+@pytest.mark.slow
 def test_ida_with_its_sparse_solver():
     made = open_chain(40)
     start = made.system, (0.0, 0.05), made.q, 0.0 * made.q

@@ -10,7 +10,6 @@ from pathlib import Path
 import pytest
 from hatchling.build import build_wheel
 
-from tests.marks import slow
 from tests.testing.planted import EXAMPLES
 
 ROOT = Path(__file__).parents[2]
@@ -44,8 +43,8 @@ def outside(python, folder, *words):
     return subprocess.run(command, env=environment, cwd=folder, capture_output=True, text=True, timeout=600)
 
 
-# the dearest suite has one of its problems here, that on which no other runs; the whole is slow
-@pytest.mark.parametrize("smoke", ["redundant_slider_crank", slow("smoke")])
+@pytest.mark.slow
+@pytest.mark.parametrize("smoke", ["redundant_slider_crank", "smoke"])
 def test_the_template_runs_on_the_installed_wheel(python, tmp_path, smoke):
     pytest.importorskip("xdist")
     for path in EXAMPLES.glob("*.py"):

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from tests.marks import slow, slow_but
 from twoloop import solve_dae
 from twoloop.bodies import PlanarModel, SpatialModel
 from twoloop.testing import check_simulator, problems
@@ -91,13 +92,13 @@ def simulate(problem, times, tolerance):
 
 
 @pytest.mark.filterwarnings("ignore::twoloop.ConstraintWarning")
-@pytest.mark.parametrize("name", WITH_PARTS)
+@pytest.mark.parametrize("name", slow_but(["spatial_four_bar", "driven_crank"], WITH_PARTS))
 def test_a_simulator_of_bodies_and_joints_passes(name):
     report = check_simulator(simulate, name, tolerances=(1e-6, 1e-8))
     assert report.passed, str(report)
 
 
-@pytest.mark.parametrize("name", ["four_bar", "slider_crank", "heavy_top", "spatial_four_bar", "spherical_pendulum"])
+@pytest.mark.parametrize("name", ["spatial_four_bar", slow("slider_crank"), slow("heavy_top")])
 def test_reactions_are_those_of_a_model(name):
     problem = WITH_PARTS[name]
     made, place = model_of(problem)

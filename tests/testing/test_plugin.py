@@ -47,6 +47,7 @@ def test_a_sound_integrator_a_fixture_and_a_report(tmp_path):
     assert "measured" in told["order of q"]
 
 
+@pytest.mark.slow
 def test_a_faulty_one_and_known_failures(tmp_path):
     (tmp_path / "still.py").write_text(FAULTY, encoding="utf-8")
     known = "[pytest]\nsimulator_known_failures = out_of_reach: says that it ends\n"
@@ -61,6 +62,7 @@ def test_a_faulty_one_and_known_failures(tmp_path):
     assert done.returncode == 1 and "XPASS(strict)" in done.stdout  # what was known to fail does not
 
 
+@pytest.mark.slow
 def test_one_that_hangs_fails(tmp_path):
     text = "def simulate(problem, times, step):\n    while True:\n        pass\n"
     (tmp_path / "hangs.py").write_text(text, encoding="utf-8")
