@@ -76,7 +76,7 @@ def test_readme_has_the_numbers_of_its_other_reports():
     assert table["sharp"]["default"]["wrong"] == 0
     assert f"None of {table['sharp']['default']['n']} runs with sharp forces" in README
     short = [table[name]["default"] for name in ("gust_short", "pulse_short")]
-    assert f"{sum(own['wrong'] for own in short)} of {sum(own['n'] for own in short)} runs" in README
+    assert f"({sum(own['wrong'] for own in short)} of {sum(own['n'] for own in short)})" in README
     typical = {at["error"]: number(at["median"]) for at in findings("work_precision")["typical"]}
     assert f"takes {typical[1e-4]} (at 1e-4) to {typical[1e-8]} times (at 1e-8) our time" in README
     counts, untestable = findings("claims")["counts"], findings("claims")["untestable"]
