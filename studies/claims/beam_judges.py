@@ -33,7 +33,7 @@ BY_NEWTON = ("Radau", "Gauss", "BDF", "TRBDF2", "ESDIRK", "IDA", "CVODES", "coll
 
 
 def kind_of(solver: str) -> str:
-    """What a solver's steps are. Raises StudyError for one that is in no list: it would count as something else."""
+    """Tell how a solver steps. Raises StudyError for one that is in no list: it would count as something else."""
     if solver in EXPLICIT:
         return "explicit"
     if solver in (*CHOOSING, *FIXED_POINT):
@@ -44,7 +44,7 @@ def kind_of(solver: str) -> str:
 
 
 def jacobian_difficult(rows: Rows) -> Judgement:
-    """Costs of Newton's outer loop alone, and against the paper's procedure; whether Jacobians are hard to get, not."""
+    """Compare costs only; whether Jacobians are hard to get was not tested."""
     counts = [rows.number(f"Newton over fixed point, {case}") for case in ("linkage", *BEAMS)]
     seconds = [[as_good(rows.beam(case, name), TIP) for name in ("SunRadau5", solvers.IRK)] for case in BEAMS]
     times = [newton / paper for newton, paper in seconds]

@@ -48,7 +48,7 @@ def make(quick: bool) -> dict[str, float]:
 
 
 def predictor(problem: Problem, states: list[tuple[float, Array, Array]]) -> dict[str, float]:
-    """Iterations of a step from the Euler prediction, and from the stages of the step before."""
+    """Count the iterations of a step from the Euler prediction, and from the stages of the step before."""
     counts = []
     for t, q, v in states:
         before = Step(problem.system, SUN, t, STEP, q, v)
@@ -61,7 +61,7 @@ def predictor(problem: Problem, states: list[tuple[float, Array, Array]]) -> dic
 
 
 def values_alone(problem: Problem) -> dict[str, float]:
-    """A second of the linkage given by functions that return values: calls of C_q an evaluation, and the difference."""
+    """Run a second of the linkage, given by functions that return values; count calls of C_q an evaluation."""
     given, calls = problem.system, 0
 
     def jacobian(t: float, q: Array) -> Array:
@@ -87,7 +87,7 @@ def values_alone(problem: Problem) -> dict[str, float]:
 
 
 def ended(problem: Problem) -> tuple[Result, float]:
-    """The paper's procedure to the end of a problem's reference, and the error in q of its last state."""
+    """Run the paper's procedure to the end of a problem's reference; return result and error in q at the end."""
     known = problem.reference
     assert known is not None
     options: dict[str, Any] = {"method": paper_irk(), "rtol": TOL, "atol": TOL, "time_limit": TIME_LIMIT}
@@ -100,7 +100,7 @@ def ended(problem: Problem) -> tuple[Result, float]:
 
 
 def generality(make: Sequence[Callable[[], Problem]]) -> dict[str, float]:
-    """How many of these mechanisms the paper's procedure brings to the state known; where it keeps its coordinates."""
+    """Count the mechanisms that the paper's procedure gets right, and those where it keeps its coordinates."""
     right, same = [], [repeated_choices(linkage := four_bar(), ended(linkage)[0])]
     for problem in (one() for one in make):
         result, error = ended(problem)
@@ -112,7 +112,7 @@ def generality(make: Sequence[Callable[[], Problem]]) -> dict[str, float]:
 
 
 def repeated_choices(problem: Problem, result: Result) -> float:
-    """Share of steps at which the decomposition of C_q picks out the independent coordinates of the step before."""
+    """Return the share of steps at which full pivoting picks the same independent coordinates as a step before."""
     places = np.unique(np.linspace(0, result.t.size - 2, PAIRS).astype(int))
     chosen = [
         [independents(problem.system.jacobian(float(result.t[n]), result.q[:, n])) for n in (k, k + 1)] for k in places
@@ -121,7 +121,7 @@ def repeated_choices(problem: Problem, result: Result) -> float:
 
 
 def without_tangent(problem: Problem) -> ConstrainedSystem:
-    """The same system without the tangent of its force and the bandwidth of its matrices."""
+    """Return the same system without the tangent of its force and the bandwidth of its matrices."""
     system = problem.system
     tangents = {"force_by_q", "force_by_v", "reaction_by_q"}
     functions: dict[str, Any] = {kind: f for kind, f in system.given.items() if kind not in tangents}
@@ -130,7 +130,7 @@ def without_tangent(problem: Problem) -> ConstrainedSystem:
 
 
 def outer_loops() -> dict[str, float]:
-    """Evaluations of Newton's method, Jacobian by differences, over those of the fixed point: nothing else differs.
+    """Compare the evaluations of Newton's method, Jacobian by differences, with those of the fixed point.
 
     Both with Sun's tableau, at the least number of equal steps for an error of `CLOSE` in q at the end.
     """
@@ -152,7 +152,7 @@ def outer_loops() -> dict[str, float]:
 
 
 def orders() -> dict[str, float]:
-    """How many implicit methods reach nine tenths of their order, in fixed steps on a linkage of lasting partition."""
+    """Count the implicit methods that reach nine tenths of their order, in fixed steps with a lasting partition."""
     problem = four_bar((1.0, 1.2, 0.5), 1.0, math.pi, 1)
     truth, reached = MinimalFourBar.from_parameters(problem.parameters), 0
     for method, order in ORDERS.items():
@@ -187,7 +187,7 @@ def passing(geometries: Sequence[tuple[float, float, float, float]]) -> dict[str
 
 
 def nonholonomic() -> dict[str, float]:
-    """Largest error and largest residual of the velocity constraints on two non-holonomic systems."""
+    """Find the largest error and the largest violation of velocities on two non-holonomic systems."""
     errors, residuals = [], []
     for problem in (knife_edge(), rolling_disc()):
         result, error = ended(problem)

@@ -21,11 +21,11 @@ BEAMS = (SOFT, STIFF)
 
 
 class NotRun(Exception):
-    """There is no row to judge by; the text says which."""
+    """Raised where there is no row to judge by; the text says which."""
 
 
 def read(folder: Path) -> dict[str, pd.DataFrame]:
-    """One row a run of every study whose rows are in the folder. Raises StudyError if a file of rows is damaged."""
+    """Read one row a run of every study that has rows in the folder. Raises StudyError if a file is damaged."""
     paths = [path for name in STUDIES if (path := folder / f"{name}.csv").is_file()]
     return {path.stem: _one_a_run(path.stem, read_rows(path)[0]) for path in paths}
 
@@ -43,19 +43,19 @@ def _one_a_run(name: str, table: pd.DataFrame) -> pd.DataFrame:
 
 @dataclass(frozen=True)
 class Rows:
-    """What judges read: one row a run of each study, and the numbers of `experiments.py`."""
+    """Hold what judges read: one row a run of each study, and the numbers of `experiments.py`."""
 
     tables: Mapping[str, pd.DataFrame]
     experiments: Mapping[str, float]
 
     def number(self, key: str) -> float:
-        """A number of `experiments.py`."""
+        """Return a number of `experiments.py`."""
         if self.experiments.get(key) is None:
             raise NotRun(f"the experiment {key} was not made")
         return float(self.experiments[key])
 
     def pick(self, study: str, least: float = 0.0, named: str = "", **equal: Any) -> pd.DataFrame:
-        """Rows in which each column named has that value, or one of a tuple of values.
+        """Select the rows in which each column named has that value, or one of a tuple of values.
 
         Of solvers whose name contains `named`; not run if none covers `least` seconds.
         """
@@ -71,15 +71,15 @@ class Rows:
         return found
 
     def long(self, study: str, named: str = "", **equal: Any) -> pd.DataFrame:
-        """The rows, if they are of runs as long as the paper's."""
+        """Select rows of runs as long as the paper's."""
         return self.pick(study, LONG, named, **equal)
 
     def cell(self, group: str, err_in: float, err_out: float, problem: str = DEFAULT) -> pd.Series:
-        """A cell of Table 3."""
+        """Return a cell of Table 3."""
         return self.long("table3_full", group=group, problem=problem, err_in=err_in, err_out=err_out).iloc[0]
 
     def beam(self, case: str, named: str, **equal: Any) -> pd.DataFrame:
-        """Full runs of a beam."""
+        """Select full runs of a beam."""
         return self.pick("beam", BEAM_END, named, case=case, group="run", **equal)
 
 
@@ -89,7 +89,7 @@ def common_costs(
     targets: tuple[float, ...],
     cost: Callable[[pd.DataFrame, float], float] = tables.time_for,
 ) -> list[float]:
-    """Times of the first solver over those of the second at the errors that both reach; `cost`: cost(runs, error)."""
+    """Divide times of the first solver by those of the second at errors that both reach; `cost`: cost(runs, error)."""
     ratios = [cost(first, error) / cost(second, error) for error in targets]
     ratios = [ratio for ratio in ratios if np.isfinite(ratio)]
     if not ratios:
@@ -98,6 +98,6 @@ def common_costs(
 
 
 def cheapest(runs: pd.DataFrame, target: float, what: str) -> float:
-    """Least cost of any solver at an error; NaN where none has it."""
+    """Find the least cost of any solver at an error; NaN where none has it."""
     costs = [tables.time_for(own, target, what) for _, own in runs.groupby("solver")]
     return min((cost for cost in costs if np.isfinite(cost)), default=float("nan"))

@@ -21,12 +21,12 @@ JUDGES: dict[str, Callable[..., Judgement]] = vars(judges) | vars(beam_judges)  
 
 
 def judged(rows: Rows) -> Judged:
-    """Every claim with its judgement."""
+    """Judge every claim."""
     return {claim.key: (claim, claim.judgement(JUDGES[claim.judge], rows)) for claim in load()}
 
 
 def findings_of(pairs: Judged) -> dict[str, Any]:
-    """How many claims have each verdict, the answer, and verdict and numbers of each."""
+    """Count the verdicts, and tell the answer, verdict and numbers of each claim."""
     verdicts = [found.verdict for _, found in pairs.values()]
     counts = {verdict: verdicts.count(verdict) for verdict in Verdict}
     untestable, n = sum(counts[verdict] for verdict in UNTESTABLE), len(pairs)

@@ -32,7 +32,7 @@ UNTESTABLE = (Verdict.CONSISTENT, Verdict.ASSUMED, Verdict.CIRCULAR)  # our runs
 
 @dataclass(frozen=True)
 class Judgement:
-    """A verdict, the numbers that decide (a list holds a least and a largest), and why a claim was not judged."""
+    """Hold a verdict, the numbers that decide (a list: least and largest), and why a claim was not judged."""
 
     verdict: Verdict
     values: Mapping[str, Any] = field(default_factory=dict)
@@ -40,7 +40,7 @@ class Judgement:
 
 
 def decide(met: Iterable[Any], in_part: Any = None, **values: Any) -> Judgement:
-    """The verdict of conditions: all met, or some of the cases of which the claim speaks, or none."""
+    """Decide by conditions: all met, or some of the cases of which the claim speaks, or none."""
     conditions = [bool(condition) for condition in met]
     if all(conditions):
         return Judgement(Verdict.HOLDS, values)
@@ -49,13 +49,13 @@ def decide(met: Iterable[Any], in_part: Any = None, **values: Any) -> Judgement:
 
 
 def span(values: Iterable[Any]) -> list[float]:
-    """Least and largest; NaN where a value is."""
+    """Return the least and the largest; NaN where a value is."""
     array = np.asarray(list(values), dtype=float)
     return [float(array.min()), float(array.max())]
 
 
 def span_known(ratios: Iterable[float]) -> list[float]:
-    """Least and largest of those that are known."""
+    """Return the least and the largest of the known values."""
     known = [ratio for ratio in ratios if np.isfinite(ratio)]
     if not known:
         raise NotRun("no error that both sides reach")
@@ -95,7 +95,7 @@ class Claim:
         return replace(found, verdict=marked.get(found.verdict, found.verdict))
 
     def text(self, found: Judgement) -> str:
-        """The numbers of a judgement in the words of `claims.toml`."""
+        """Tell the numbers of a judgement in the words of `claims.toml`."""
         if found.verdict is Verdict.NOT_RUN:
             return found.why
         values = {name: value if isinstance(value, list) else [value] for name, value in found.values.items()}
@@ -104,5 +104,5 @@ class Claim:
 
 
 def load() -> list[Claim]:
-    """The claims in the order of the paper."""
+    """Load the claims in the order of the paper."""
     return [Claim(key, **entry) for key, entry in tomllib.loads(FILE.read_text()).items()]

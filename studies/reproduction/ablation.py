@@ -45,7 +45,7 @@ def _solve(variant: str, tableau: Tableau, setting: str, case: Case, value: floa
 
 
 def solver(variant: str, tableau: Tableau, setting: str) -> Solver:
-    """A variant with fixed steps ("h") or under control ("tol")."""
+    """Make a solver of a variant, with fixed steps ("h") or under control ("tol")."""
     keeps, run = variant != UNPROJECTED, partial(_solve, variant, tableau, setting)
     return Solver(variant, "ablation", "compiled", keeps, setting, run, fixed={"tableau": tableau.name})
 
@@ -70,17 +70,17 @@ def runs(quick: bool) -> list[Run]:
 
 
 def measure(run: Run, result: Result) -> dict[str, Any]:
-    """No columns beside the common ones."""
+    """Add no columns to the common ones."""
     return {}
 
 
 def costs_at(along: pd.DataFrame, targets: Sequence[float], what: str) -> Array:
-    """Costs of these errors, NaN where there are none."""
+    """Return the costs of these errors; NaN where there are none."""
     return np.array([tables.time_for(along, target, what) for target in targets])
 
 
 def ratios(rows: pd.DataFrame, variant: str, what: str) -> list[float]:
-    """Costs of a variant over those of the paper's way, for all cases, tableaux and errors that both have."""
+    """Divide a variant's costs by those of the paper's way, for all cases, tableaux and errors that both have."""
     found: list[float] = []
     for (case, _), both in where(rows, group="controlled").groupby(["case", "tableau"], sort=False):
         costs = [costs_at(where(both, solver=name), TARGETS[case], what) for name in (variant, PAPER)]
@@ -89,7 +89,7 @@ def ratios(rows: pd.DataFrame, variant: str, what: str) -> list[float]:
 
 
 def frozen_ratios(rows: pd.DataFrame) -> list[float]:
-    """Evaluations of the best runs with dependents frozen over the least of the paper's runs as good or better."""
+    """Divide evaluations of the best runs with frozen dependents by the least of the paper's runs that are as good."""
     found = []
     controlled = where(rows, group="controlled").dropna(subset="error_q")
     for _, both in controlled.groupby(["case", "tableau"], sort=False):
@@ -102,14 +102,14 @@ def frozen_ratios(rows: pd.DataFrame) -> list[float]:
 
 
 def order(rows: pd.DataFrame, variant: str, tableau: str) -> float:
-    """Slope of the position error over the steps of `ORDER_STEPS`."""
+    """Return the slope of the position error over the steps of `ORDER_STEPS`."""
     along = where(rows, group="order", solver=variant, tableau=tableau)
     long, short = (where(along, h=h)["error_q"].astype(float).mean() for h in ORDER_STEPS)
     return float(np.log(long / short) / np.log(ORDER_STEPS[0] / ORDER_STEPS[1]))
 
 
 def span(values: Sequence[float]) -> list[float] | None:
-    """Least, median and largest."""
+    """Return the least, the median and the largest."""
     return [float(value) for value in np.quantile(values, (0.0, 0.5, 1.0))] if values else None
 
 
@@ -131,7 +131,7 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
 
 
 def figure_of(rows: pd.DataFrame, found: dict[str, Any]) -> Figure:
-    """CPU time over error on both mechanisms."""
+    """Draw CPU time over error on both mechanisms."""
     figure, panels = plt.subplots(1, 2, figsize=(9.2, 3.6), sharey=True, layout="constrained")
     for panel, case in zip(panels, (LINKAGE, FLEXIBLE), strict=True):
         for variant in VARIANTS:

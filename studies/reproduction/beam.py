@@ -41,14 +41,14 @@ DRAWN = (solvers.DEFAULT, solvers.NEWMARK, "TRBDF2", solvers.IDA_C_ORDER_2, solv
 
 
 def line_up() -> dict[str, Solver]:
-    """The line-up by name."""
+    """Return the solvers by name."""
     listed = [replace(solvers.CATALOGUE[solvers.IRK_LINE], name=solvers.IRK)]
     listed += [solvers.CATALOGUE[name] for name in (solvers.NEWMARK, solvers.QUARTER, *solvers.RADAU, *OURS, *OTHERS)]
     return {solver.name: solver for solver in listed}
 
 
 def cases(quick: bool) -> dict[str, Case]:
-    """Both beams by name."""
+    """Return both beams by name."""
     return {name: beam.case(name, name, quick) for name in (SOFT, STIFF)}
 
 
@@ -66,7 +66,7 @@ def runs(known: dict[str, Case], quick: bool) -> Iterator[Run]:
 
 
 def make(output: Output) -> pd.DataFrame:
-    """Rows of these runs, and of those between them; twoloop's methods are run however slow."""
+    """Make the rows of these runs, and of those between them; twoloop's methods are run however slow."""
     quick = output.call.quick
     known = cases(quick)
 
@@ -83,7 +83,7 @@ def make(output: Output) -> pd.DataFrame:
 
 
 def measure(run: Run, result: Result) -> dict[str, Any]:
-    """Columns of this part: the error of the tip's height, by which solvers are compared, and the steps."""
+    """Measure the error of the tip's height, by which solvers are compared, and the steps."""
     case, h = run.case, result.h
     row: dict[str, Any] = {"n_rejected_convergence": result.stats.n_rejected_convergence, "error_tip": None}
     row["h_median"] = float(np.median(h)) if h.size else None
@@ -101,9 +101,7 @@ def _case(rows: pd.DataFrame, name: str) -> dict[str, Any]:
     if paper.empty or changes.empty:
         raise StudyError("the rows lack PaperIRK or changed beams; run python -m studies.reproduction beam")
     run, irk = paper.iloc[0], tables.where(own, solver=solvers.IRK)
-    found: dict[str, Any] = {
-        key: float(run[key]) for key in ("n_steps", "n_evaluations", "call_s", "h_median", "floor")
-    }
+    found: dict[str, Any] = {key: float(run[key]) for key in ("call_s", "h_median", "floor")}
     found |= {"name": name, "printed_s": PAPER_SECONDS[name], "printed_h": PAPER_STEPS[name]}
     found["steps_as_printed"] = bool(abs(np.log10(found["h_median"] / found["printed_h"])) < HALF_A_DECADE)
     found |= {"error": run["error_tip"], "t_end": float(run["t_end"]), "mesh": changes[MESH]}
@@ -117,12 +115,11 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     cases = [_case(rows, name) for name in (SOFT, STIFF)]
     soft, stiff = cases
     found: dict[str, Any] = {"cases": cases, "t_end": soft["t_end"]}
-    found |= {f"growth_{key}": stiff[key] / soft[key] for key in ("n_evaluations", "call_s", "printed_s")}
-    return found
+    return found | {f"growth_{key}": stiff[key] / soft[key] for key in ("call_s", "printed_s")}
 
 
 def figure_of(rows: pd.DataFrame, found: dict[str, Any]) -> Figure:
-    """CPU time over the error of the tip's height, a panel a beam."""
+    """Draw CPU time over the error of the tip's height, a panel a beam."""
     figure, panels = plt.subplots(1, 2, figsize=(9.2, 3.8), sharey=True, layout="constrained")
     for panel, name in zip(panels, (SOFT, STIFF), strict=True):
         own = tables.where(rows, case=name, group="run")

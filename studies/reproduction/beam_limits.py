@@ -24,7 +24,7 @@ PARAMETERS, MESH, START = ("E + 0.1 %", "g + 0.1 %"), "8 elements", "start of th
 
 
 def frequencies(problem: Problem) -> Array:
-    """Angular frequencies, rad/s, in increasing order, of the straight beam with its base at rest."""
+    """Return the angular frequencies, rad/s, in increasing order, of the straight beam with its base at rest."""
     q, n = problem.q0, problem.q0.size
     K = np.zeros((n, n))
     elastic_tangent(0.0, q, np.zeros(n), problem.system.functions.p, K)
@@ -32,7 +32,7 @@ def frequencies(problem: Problem) -> Array:
 
 
 def gauss_seidel_limit(tableau: Tableau) -> float:
-    """Largest h w_max at which the paper's iteration on [v, q] converges, which uses the latest stages.
+    """Find the largest h w_max at which the paper's iteration on [v, q] converges, which uses the latest stages.
 
     With K_j = B (K_j's sum over A), B = x [[0, -1], [1, 0]] and L the part of A below its diagonal, one iteration is
     K_new = B (L K_new + (A - L) K_old).
@@ -48,13 +48,13 @@ def gauss_seidel_limit(tableau: Tableau) -> float:
 
 
 def limit_rows() -> Iterator[Row]:
-    """The limit in theory, and the largest frequency w_max of the very flexible beam."""
+    """Make the row of the limit in theory, and of the largest frequency w_max of the very flexible beam."""
     w_max = float(frequencies(very_flexible_beam())[-1])
     yield {"group": "limit", "solver": GAUSS_SEIDEL, "w_max": w_max, "theory": gauss_seidel_limit(sun_radau_iib(3))}
 
 
 def sensitivity_rows(known: Mapping[str, Case]) -> Iterator[Row]:
-    """Largest change of the tip's height, until the paper's 1.2 s and over the run, of beams that differ a little."""
+    """Find the largest change of the tip's height, until 1.2 s and over the run, of beams that differ a little."""
     for name, case in known.items():
         times, given = np.append(0.0, case.instants), dict(case.problem.parameters)
         changes: dict[str, dict[str, Any]] = {MESH: {"n_elements": 8}, START: {"start": "beam"}}

@@ -42,7 +42,7 @@ def runs(quick: bool) -> list[Run]:
 
 
 def measure(run: Run, result: Result) -> dict[str, Any]:
-    """Columns of this part, and the curves of the figure in the entry "series"."""
+    """Measure the errors and the heights of y3, and sample the curves of the figure ("series")."""
     row: dict[str, Any] = dict.fromkeys(("error_y3", "error_y3_short", "top", "top_late"))
     row |= {"kinetic": run.case.scale.kinetic, "range_y3": run.case.scale.ranges[Y3], "series": {}}
     if result.t.size < 2 or result.t[-1] < FINE:
@@ -65,14 +65,14 @@ def measure(run: Run, result: Result) -> dict[str, Any]:
 
 
 def find(rows: pd.DataFrame, solver: str, step: float | None = None) -> pd.Series | None:
-    """The row of a solver of the line-up, or of the stand-in with a fixed step."""
+    """Find the row of a solver of the line-up, or of the stand-in with a fixed step."""
     fixed = {"group": "line-up"} if step is None else {"group": "GSTIFF stand-in", "h": step}
     matching = where(rows, solver=solver, **fixed)
     return None if matching.empty else matching.iloc[0]
 
 
 def _stand_in(rows: pd.DataFrame) -> dict[str, Any]:
-    """Orders of the stand-in that are visibly wrong: over 2 s with both steps, and over the run with the smaller."""
+    """List the orders of the stand-in that are visibly wrong: over 2 s with both steps, then over the run."""
     both = {n: [find(rows, gear(n), step) for step in (COARSE, MIDDLE)] for n in GEAR_ORDERS}
     known = {n: (coarse, fine) for n, (coarse, fine) in both.items() if coarse is not None and fine is not None}
 
@@ -99,7 +99,7 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
 
 
 def figure_of(rows: pd.DataFrame, found: dict[str, Any]) -> Figure:
-    """Height of bar 3's centre over the first 2 s and over the last 5 s, with the true motion."""
+    """Draw the height of bar 3's centre over the first 2 s and over the last 5 s, with the true motion."""
     figure, panels = plt.subplots(1, 2, figsize=(9.2, 3.4), sharey=True, layout="constrained")
     truth = four_bar.cases(False)[0].reference
     for panel, curve, step, start in ((panels[0], "short", COARSE, 0.0), (panels[1], "last", MIDDLE, found["t_end"])):

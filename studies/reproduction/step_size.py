@@ -33,7 +33,7 @@ def runs(quick: bool) -> list[Run]:
 
 
 def measure(run: Run, result: Result) -> dict[str, Any]:
-    """Columns of this part, and the curves of the figure in the entry "series"."""
+    """Measure the steps, and sample the curve of the figure ("series")."""
     h = result.h
     row: dict[str, Any] = {"series": {}, "retried": None}
     if h.size == 0:
@@ -47,7 +47,7 @@ def measure(run: Run, result: Result) -> dict[str, Any]:
 
 
 def thinned(t: Array, h: Array) -> Array:
-    """Steps to draw, (2, n): all, or of many the shortest and the longest in each of evenly spaced bins of time."""
+    """Return the steps to draw, (2, n): all, or of many the shortest and the longest in even bins of time."""
     if t.size <= CURVE:
         return np.array([t, h])
     edges = np.searchsorted(t, np.linspace(t[0], t[-1], CURVE // 2 + 1)[1:-1])
@@ -71,7 +71,7 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
 
 
 def figure_of(rows: pd.DataFrame, found: dict[str, Any]) -> Figure:
-    """Steps of the paper's procedures over two periods of the motion."""
+    """Draw the steps of the paper's procedures over two periods of the motion."""
     figure, panel = plt.subplots(figsize=(7.6, 3.8), layout="constrained")
     paper = rows[rows["group"] == "paper"].set_index("solver", drop=False).loc[list(PAPER)]
     for _, row in paper.iterrows():

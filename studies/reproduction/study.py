@@ -37,7 +37,7 @@ def make_rows(call: Call, name: str) -> None:
 
 
 def read_rows(call: Call, name: str) -> tuple[pd.DataFrame, str]:
-    """The rows of a part, a row a run, and their stamp."""
+    """Read the rows of a part, a row a run, and their stamp."""
     output = Output(replace(call, study=name))
     if not (output.path / f"{name}.csv").is_file():
         raise StudyError(f"there is no {output.path / name}.csv; run python -m studies.{NAME} {name}")
@@ -46,13 +46,13 @@ def read_rows(call: Call, name: str) -> tuple[pd.DataFrame, str]:
 
 
 def findings_of(rows: dict[str, pd.DataFrame]) -> dict[str, Any]:
-    """The findings of each part, by its name, and the answer."""
+    """Collect the findings of each part, by its name, and the answer."""
     found = {name: PARTS[name].findings_of(own) for name, own in rows.items()}
     return found | {"answer": answer(found)}
 
 
 def answer(found: dict[str, Any]) -> str:
-    """One sentence: which figures come out as the text describes them, and whether the paper's idea pays."""
+    """Tell in one sentence what comes out as the text describes it, and whether the paper's idea pays."""
     moved, stepped, kept = found["motion"], found["step_size"], found["violation"]
     beams, projected = found["beam"]["cases"], found["ablation"]["against"][ablation.PROJECTED]["time"]
     right = {

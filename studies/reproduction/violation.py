@@ -56,13 +56,13 @@ def runs(quick: bool) -> list[Run]:
 
 
 def windows(t: Array, size: Array, n: int) -> Array:
-    """Largest value in each of n equal parts of the run; NaN where nothing is stored."""
+    """Return the largest value in each of n equal parts of the run; NaN where nothing is stored."""
     places = np.minimum((t / t[-1] * n).astype(int), n - 1)
     return np.array([size[places == k].max(initial=ZERO) if (places == k).any() else np.nan for k in range(n)])
 
 
 def growth(t: Array, size: Array) -> float:
-    """Exponent p of size ~ t^p: least squares through the largest values of equal parts of the run."""
+    """Fit the exponent p of size ~ t^p through the largest values of equal parts of the run."""
     values = windows(t, size, WINDOWS)
     ends = np.arange(1, WINDOWS + 1)  # where what grows is largest
     known = ~np.isnan(values)
@@ -70,7 +70,7 @@ def growth(t: Array, size: Array) -> float:
 
 
 def measure(run: Run, result: Result) -> dict[str, Any]:
-    """Columns of this part, and the curves of the figure in the entry "series"."""
+    """Measure how the violations grow, and sample the curves of the figure ("series")."""
     if result.t.size < WINDOWS or run.group == "tolerances":  # of those the common columns are enough
         return {}
     row: dict[str, Any] = {}
@@ -86,12 +86,12 @@ def measure(run: Run, result: Result) -> dict[str, Any]:
 
 
 def grows(row: pd.Series, level: str) -> bool:
-    """Whether the violation of a level grows, by the criterion of the report."""
+    """Tell whether the violation of a level grows."""
     return bool(row[f"growth_{level}"] >= SLOPE and row[f"late_{level}"] > TIMES * row[f"early_{level}"])
 
 
 def time_ratios(rows: pd.DataFrame, kept: str, drifting: str) -> list[float]:
-    """CPU times of the first solver over those of the second at the errors that both reach."""
+    """Divide CPU times of the first solver by those of the second at the errors that both reach."""
     first, second = (rows[rows["solver"] == name] for name in (kept, drifting))
     # where all runs of a solver are better than a target, its cost at the target is not known
     targets = [target for target in TARGETS if target <= min(first["error_q"].max(), second["error_q"].max())]
@@ -122,7 +122,7 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
 
 
 def figure_of(rows: pd.DataFrame, found: dict[str, Any]) -> Figure:
-    """Largest violation of the positions in each fiftieth of the run."""
+    """Draw the largest violation of the positions in each fiftieth of the run."""
     line_up = rows[(rows["group"] == "line-up") & rows["series"].map(lambda curves: "q" in curves)]
     t = (np.arange(CURVE) + 0.5) * found["t_end"] / CURVE
     figure, panel = plt.subplots(figsize=(7.6, 3.8), layout="constrained")
