@@ -22,7 +22,9 @@ instants = np.linspace(0.0, 2.0, 81)  # s, of the measurement
 
 def slider(masses, tol=1e-10):
     """Positions of the slider at the instants, with other masses of rod and slider."""
-    changed = problem.with_parameters({"mass of rod": masses[0], "mass of slider": masses[1]})
+    inertia = masses[0] * np.hypot(B[0] - A[0], B[1] - A[1]) ** 2 / 12.0  # a parameter of its own
+    numbers = {"mass of rod": masses[0], "moment of inertia of rod": inertia, "mass of slider": masses[1]}
+    changed = problem.with_parameters(numbers)
     run = solve_dae(changed.system, changed.t_span, problem.q0, problem.v0, rtol=tol, atol=tol, t_eval=instants)
     if not run.success:
         raise RuntimeError(run.message)

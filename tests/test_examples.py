@@ -310,6 +310,16 @@ def test_the_rest_of_the_code_of_a_page_runs(run, page):
     run(page)
 
 
+def test_the_four_bar_of_the_urdf_file_is_closed(run):
+    names = run("docs/from_a_file.md")
+    problem, bodies = names["four_bar"], {body.name: body for body in names["robot"].bodies}
+    assert problem.freedom.degrees == 1
+    crank, rod_, rocker = (problem.q0[[*bodies[name].coordinates][:3:2]] for name in ("crank", "rod", "rocker"))
+    elbow, knee = 2.0 * crank, 2.0 * rocker - [3.0, 0.0]
+    assert np.hypot(*(rod_ - elbow)) == pytest.approx(1.0, abs=1e-12) and rod_ == pytest.approx((elbow + knee) / 2.0)
+    assert [np.hypot(*crank), np.hypot(*(rocker - [3.0, 0.0]))] == pytest.approx([0.5, 0.75], abs=1e-12)
+
+
 def test_start_here_draws_the_bars_of_its_sketch(run):
     names, points = run("run_linkage"), run("linkage")
     drawing, corners = names["problem"].drawing, [np.array(points[name]) for name in "OABD"]
