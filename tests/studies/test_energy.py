@@ -1,17 +1,16 @@
-"""The energy study: what its rows say of drift, how they come to say it, and that its sentences turn with them."""
+"""The energy study: what its rows say of drift, how they come to say it, and other solvers whose energy is followed."""
 
-import json
 import math
-from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 
+from references.casadi.integrators import solve_cvodes
 from studies.bench.cli import Call
 from studies.bench.collector import REPEATS, attempt
-from studies.bench.render import render
+from studies.bench.figures import STYLES
 from studies.bench.solvers import CVODE_C, CVODES, CYRK, DEFAULT, DIFFRAX, HEYOKA, IDA_C, IRK, OWN_EXPLICIT
 from studies.bench.store import Output
 from studies.energy import study as energy
@@ -25,7 +24,9 @@ from studies.energy.runs import (
     MOMENTA,
     MOMENTA_EVEN,
     NEWMARK,
+    NOT_QUICK,
     ONE,
+    OTHERS,
     QUICK,
     RADAU,
     REPEATED,
@@ -43,7 +44,6 @@ from tests.studies import of_study
 
 STUDIED = energy
 REPORTS = Path(__file__).parents[2] / "reports"
-RIVALS = (HEYOKA, CVODE_C, CVODES, DIFFRAX)
 PERIOD = 2.2489859198
 
 
@@ -63,11 +63,6 @@ def quick(out):
     return energy.judged(Output(Call("energy", True, out, False, "")).load_rows(curves=True)[0])
 
 
-@pytest.fixture
-def found_of(tmp_path, unsaved):
-    return partial(of_study.found_of, energy, tmp_path, quick=True)
-
-
 def changed(rows, where, **values):
     place = rows.index[rows.eval(where, engine="python")]
     assert len(place), where
@@ -76,36 +71,9 @@ def changed(rows, where, **values):
     return rows
 
 
-@pytest.mark.slow  # the quick study
-def test_only_the_report_is_left(out):
-    names = {"README.md", "energy.md", "energy.csv", "energy.json", "energy_series.npz", ".lock"}
-    names |= {f"energy_{what}.{suffix}" for what in ("long", "cost") for suffix in ("png", "svg")}
-    assert {path.name for path in out.iterdir()} == names
-
-
 @pytest.mark.slow  # as that of step_size
 class TestQuickRun(of_study.QuickRun):
     pictures = ("energy_long", "energy_cost")
-
-
-def test_findings_answer_the_first_screen():
-    found = json.loads((REPORTS / "energy.json").read_text())["long"]
-    ours = found["no_drift"]["ours"]
-    assert ours["calm"] and ours["keeps"] and ours["call_s"] > 0.0
-    assert [at["share"] for at in found["at"]] == [1e-3, 1e-5, 1e-7]
-    assert {IDA_C, "LSODA, index 1", "Exudyn, GeneralizedAlpha"} <= {run["solver"] for run in found["alternatives"]}
-
-
-def test_the_full_report_is_short_with_all_rivals(rows):
-    """The words of the longest verdict in each line of a rival; the quick rows lack those that are slow to compile."""
-    wordy = {"slope": -1e-13, "slope_error": 1e-15, "swing": 1e-6, "n_steps": 10**6, "energy": 1.1e-9, "t_end": 1e4}
-    more = rows[rows["solver"] == IDA_C].assign(**wordy)
-    rows = pd.concat([rows, *(more.assign(solver=name, name=name) for name in RIVALS)], ignore_index=True)
-    found = energy.findings_of(rows)
-    text = render("energy", found, {"failed": ""}, stamp="stamp; of a commit; of a processor, 2 cores", quick=False)
-    assert all(f"`{name}, tol" in text for name in RIVALS) and "(rounding)" in text
-    prose = [line for line in text.splitlines() if not line.startswith(("|", "!["))]
-    assert len(" ".join(prose).split()) < 700
 
 
 @pytest.mark.slow  # the quick study
@@ -151,10 +119,10 @@ def test_variable_steps_drift(rows):
 
 FIXED = "group == 'fixed' and case == "
 ON_ONE = f"{FIXED}'{ONE}' and partition == 'lasting' and solver == "
-TURNING = {  # finding: rows, what is changed in them; the finding is there before and not after
+TURNING = {  # finding: rows, and their slope; the finding is there before that and not after
     "sun drifts": (lambda f: f["sun"]["drifts"], f"{ON_ONE}'{SUN}' and variables == 'velocities'", 0.0),
     "momenta do not": (lambda f: f["canonical"]["calm"], f"{ON_ONE}'{SUN}' and variables == 'momenta'", 1.0),
-    "nor symmetry": (lambda f: f["gauss"]["calm"], f"{ON_ONE}'{GAUSS}' and variables == 'velocities'", 1.0),
+    "symmetry": (lambda f: f["gauss"]["calm"], f"{ON_ONE}'{GAUSS}' and variables == 'velocities'", 1.0),
     "none is calm": (lambda f: f["n_calm"]["lasting"] == 0, f"{FIXED}'{SWITCHING}' and solver == '{GAUSS}'", 0.0),
     "but the symmetric": (
         lambda f: f["n_calm"]["even"] == f["n"]["even"],
@@ -162,26 +130,19 @@ TURNING = {  # finding: rows, what is changed in them; the finding is there befo
         1.0,
     ),
     "sun is not": (
-        lambda f: f["n_calm"]["uneven"] == 0,
+        lambda f: f["n_calm"]["uneven"] == 0 and f["fates"][0]["fates"][3] == "drifts",
         f"{FIXED}'{SWITCHING}' and solver == '{SUN}' and partition == 'symmetric'",
         0.0,
     ),
     "the paper's drifts": (lambda f: f["paper"]["one"]["drifts"], f"solver == '{IRK}'", 0.0),
+    "variable steps": (lambda f: f["controlled"]["drift"] > 0, "group == 'controlled'", 0.0),
 }
 
 
 @pytest.mark.parametrize(("finding", "where", "slope"), TURNING.values(), ids=TURNING)
-def test_findings_turn_with_the_rows(finding, where, slope, rows, found_of):
+def test_findings_turn_with_the_rows(finding, where, slope, rows):
     assert finding(energy.findings_of(rows))
-    assert not finding(found_of(changed(rows, where, slope_error=0.0, slope=slope)))
-
-
-def test_all_controlled_runs_drift_or_not(rows, found_of):
-    found = found_of(changed(rows.copy(), "group == 'controlled'", slope=1.0, slope_error=0.0))
-    assert found["controlled_steady"] == [] and found["n_controlled"] > 0
-    found = found_of(changed(rows, "group == 'controlled'", slope=0.0, slope_error=0.0))
-    assert len(found["controlled_steady"]) == found["n_controlled"]
-    assert found["paper"]["one"]["calm"] and found["paper"]["switching"]["calm"]
+    assert not finding(energy.findings_of(changed(rows, where, slope_error=0.0, slope=slope)))
 
 
 def repeated(rows, seconds=None):
@@ -201,25 +162,27 @@ def test_freedom_from_drift_pays_where_it_is_cheaper(rows):
     even = f"{FIXED}'{SWITCHING}' and solver == '{GAUSS}' and partition == 'symmetric'"
     pays = changed(rows.copy(), even, slope=0.0, call_s=0.1)
     found = long_found(repeated(pays))
-    assert found["n_pays"] == len(found["at"]) == 3 and found["no_drift"]["others"] is None
-    for cpu, undecided in ((0.98, 3), (1.02, 3), (10.0, 0)):
+    assert found["n_pays"] == len(found["at"]) == 3 and found["ratios"] == [0.1, 0.1] and not found["others_calm"]
+    assert energy.answer_of(found).startswith("Over 1e4 s a run without drift is at 3 of 3 energy errors the cheapest")
+    for cpu in (0.98, 1.02, 10.0):
         found = long_found(repeated(changed(pays, even, call_s=cpu)))
-        assert (found["n_pays"], found["n_undecided"]) == (0, undecided)
-    assert long_found(repeated(changed(pays, where, slope=1.0)))["no_drift"]["ours"] is None
+        assert found["n_pays"] == 0 and found["ratios"] == [cpu, cpu]
+    found = long_found(repeated(changed(pays, where, slope=1.0)))
+    assert found["ratios"] is None and all(at["no_drift"]["own"] is None for at in found["at"])
 
 
 def test_times_of_energy_are_ranked_by_the_rule_of_the_other_comparisons(rows):
     """Five repetitions, beyond 5 %, also against runs whose error is a little too large; a single run ranks nothing."""
     here = rows["case"] == SWITCHING
     rows = changed(rows, f"case == '{SWITCHING}'", energy=1e-9, slope=1.0, slope_error=0.0)
-    ours = rows["family"] == "two-loop"
+    own = rows["family"] == "two-loop"
     for seconds, ranked in ((1.0, "ahead"), (3.0, "behind"), (2.0, "undecided")):
-        made = rows.assign(call_s=np.where(ours, seconds, 2.0))
+        made = rows.assign(call_s=np.where(own, seconds, 2.0))
         assert {at["verdict"] for at in long_found(repeated(made))["at"]} == {ranked}
         assert {at["verdict"] for at in long_found(made.assign(repeats=1))["at"]} == {"undecided"}
     level = 1e-5 * float(rows.loc[here, "kinetic"].iloc[0])
-    near = rows.index[here & ~ours & (rows["solver"] == IDA_C)][:1]
-    made = repeated(made.assign(call_s=np.where(ours, 1.0, 2.0)))
+    near = rows.index[here & ~own & (rows["solver"] == IDA_C)][:1]
+    made = repeated(made.assign(call_s=np.where(own, 1.0, 2.0)))
     made.loc[near, "energy"], made.loc[near, "call_s"] = 1.1 * level, 1.0
     made.at[near[0], "times"] = (1.0,) * 5
     verdicts = [at["verdict"] for at in long_found(made)["at"]]
@@ -231,23 +194,6 @@ def test_what_sets_the_price_is_repeated():
     assert {run.repeats for run in listed if run.case.name == ONE} == {1}
     assert {run.solver.name for run in listed if run.repeats == REPEATS} == set(REPEATED)
     assert all(run.repeats == 1 for run in runs(True))
-
-
-def test_failed_and_lost_runs_are_found(rows, found_of):
-    rows = rows[~rows["solver"].isin((HEYOKA, CYRK))]  # which are not installed everywhere
-    before = found_of(rows)["failed"]
-    gone = {"status": "NOT_CONVERGED", "t_reached": 0.1, "slope": math.nan, "slope_error": math.nan}
-    rows = changed(rows, f"{ON_ONE}'{RADAU}'", energy=math.nan, swing=math.nan, **gone)
-    found = found_of(changed(rows, "solver == 'LSODA, index 1'", lost=True))
-    assert found["failed"] == before + 1 and found["radau"]["status"] == "NOT_CONVERGED"
-    lost = next(run for run in found["long"]["alternatives"] if run["solver"] == "LSODA, index 1")
-    assert lost["verdict"] == IS_LOST and not lost["calm"]
-
-
-def test_the_run_of_least_error_stands_for_a_solver(rows):
-    more = rows[rows["solver"] == OWN_EXPLICIT].assign(tol=1e-7, energy=1e-12)
-    found = energy.findings_of(pd.concat([rows, more], ignore_index=True))["long"]["alternatives"]
-    assert [run["label"] for run in found if run["solver"] == OWN_EXPLICIT] == ["DOP853, compiled=False, tol 1e-7"]
 
 
 def test_a_run_that_does_not_converge_is_a_row():
@@ -312,20 +258,6 @@ def test_what_wanders_and_comes_back_is_not_free_of_drift():
         assert abs(slope) < 3.0 * error and verdict(row) == expected
 
 
-def test_cheaper_runs_that_drift_are_told_beside_those_that_do_not(rows, found_of, tmp_path):
-    own = f"case == '{SWITCHING}' and family == 'two-loop'"
-    rows = changed(rows, own, slope=1.0, slope_error=0.0, call_s=9.0, energy=1e-9)
-    even = f"{FIXED}'{SWITCHING}' and solver == '{GAUSS}' and partition == 'symmetric' and variables == 'velocities'"
-    rows = changed(rows, even, slope=0.0, call_s=6.0)
-    rows = changed(rows, f"case == '{SWITCHING}' and solver == '{OWN_EXPLICIT}'", call_s=2.0)
-    found = found_of(rows)["long"]["calm_ours"]
-    assert found["fixed"] and found["drifting_explicit"] and found["over_drifting"] == [3.0, 3.0]
-    said = "have fixed steps, and take 3.0 times as long as explicit methods of ours whose energy drifts"
-    assert said in (tmp_path / "energy.md").read_text()
-    assert found_of(changed(rows, own, slope=1.0))["long"]["calm_ours"]["labels"] == []
-    assert "None of ours is without drift." in (tmp_path / "energy.md").read_text()
-
-
 def test_windows_are_whole_periods():
     t = np.linspace(0.0, 100.0, 200_001)
     seen = windows(t, 1e-3 * t + np.sin(2.0 * np.pi * t / PERIOD), PERIOD, 100.0)
@@ -368,3 +300,48 @@ def test_a_run_counts_as_good_as_the_worst_of_the_tighter_ones():
         }
     )
     assert energy.settled(made).tolist() == [1e-2, 1e-2, 1e-5, 1e-9, np.inf, np.inf]
+
+
+PACKAGES = {HEYOKA: "heyoka", CYRK: "CyRK", CVODE_C: "sksundae", CVODES: "casadi", DIFFRAX: "diffrax"}
+
+
+def test_the_other_solvers_are_among_the_runs():
+    full, quick = ({run.solver.name for run in runs(short)} for short in (False, True))
+    assert set(PACKAGES) <= full and quick == full - set(NOT_QUICK) and set(PACKAGES) <= set(STYLES)
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.slow if name == DIFFRAX else ()) for name in PACKAGES]
+)
+def test_the_energy_of_another_solver_is_followed(name):
+    """Where tolerances are tight the energy changes less, and the motion is the true one."""
+    pytest.importorskip(PACKAGES[name])
+    run = next(run for run in runs(False) if run.solver.name == name)
+    case, found = case_of(SWITCHING, QUICK), {}
+    for tol in (1e-6, 1e-10):
+        short = type(run)(case, run.solver, tol, "other", 1)
+        result, status, message, _ = attempt(short, 0)
+        assert status == "REACHED_END", message
+        found[tol] = max(
+            abs(case.problem.energy(result.t, result.q, result.v) - case.problem.energy(0.0, *start(case)))
+        )
+        assert measure(short, result)["slope_error"] > 0.0 and result.t.size > 300
+    assert found[1e-10] < 1e-3 * case.scale.kinetic and found[1e-10] < 0.01 * found[1e-6]
+
+
+def start(case):
+    return case.problem.q0, case.problem.v0
+
+
+def test_a_long_run_may_take_as_many_steps_as_it_needs():
+    """The limit of the other studies, which have no clock in it, would end a long run."""
+    pytest.importorskip("casadi")
+    case = case_of(SWITCHING, QUICK)
+    assert OTHERS[CVODES][1](case, 1e-8, 0).stats.n_accepted > 1000
+    span = (0.0, case.t_end)
+    few = solve_cvodes(case.problem.system, span, *start(case), 1e-4, 1e-4, most_steps=100)
+    assert not few.success and few.t.size == 0
+    run = next(run for run in runs(False) if run.solver.name == CVODES)
+    assert measure(type(run)(case, run.solver, 1e-4, "other", 1), few)["t_reached"] == 0.0  # a row, all the same
+    with pytest.raises(ValueError, match="most_steps"):
+        solve_cvodes(case.problem.system, span, *start(case), most_steps=0)
