@@ -172,7 +172,7 @@ def test_every_failure_leads_to_a_section_with_cause_and_remedy(status):
 
 def test_only_a_failed_run_names_its_section(names):
     result = names("when_it_fails")["result"]
-    assert result.status is Status.NOT_FINITE and result.message.endswith(explained(Status.NOT_FINITE))
+    assert result.status is Status.MAX_STEPS and result.message.endswith(explained(Status.MAX_STEPS))
     assert explained(Status.REACHED_END) == explained(Status.EVENT) == ""
 
 
