@@ -94,10 +94,18 @@ def with_one_name(rows: pd.DataFrame) -> pd.DataFrame:
     return rows.assign(processor=bare.where(bare.isin(rows["processor"]), rows["processor"]))
 
 
+def on_the_same_processor(rows: pd.DataFrame, others: pd.DataFrame) -> pd.DataFrame:
+    """The rows of mechanisms that were measured on the processor on which the others were."""
+    if "processor" not in rows or "processor" not in others:
+        return rows
+    return rows[rows["processor"] == rows["case"].map(others.groupby("case")["processor"].first())]
+
+
 def report(output: Output, rows: pd.DataFrame, line: str) -> dict[str, Any]:
     """Write findings, figures and report."""
     rows = with_one_name(rows) if "processor" in rows else rows
-    everywhere, in_angles = tables.medians(part(rows, mechanisms.GROUP)), part(rows, minimal.GROUP)
+    everywhere = tables.medians(part(rows, mechanisms.GROUP))
+    in_angles = on_the_same_processor(part(rows, minimal.GROUP), part(rows, mechanisms.GROUP))
     standings, firsts = mechanisms.standings_of(everywhere), part(rows, first_calls.GROUP)
     found = mechanisms.findings_of(standings, everywhere)
     found["minimal"] = minimal.findings_of(tables.medians(in_angles) if len(in_angles) else in_angles, everywhere)
@@ -114,9 +122,18 @@ def report(output: Output, rows: pd.DataFrame, line: str) -> dict[str, Any]:
 
 
 def measured_on(rows: pd.DataFrame) -> dict[str, Any]:
-    """At how many commits, and on which processors, the rows were measured."""
+    """At how many commits, on which processors, and in how many sessions at most a mechanism was measured.
+
+    `speeds`: the largest time of the calibration over the least between the sessions of a mechanism, at most.
+    """
     made = rows.reindex(columns=["processor", "commit"]).dropna().astype(str)
-    return {"commits": made["commit"].nunique(), "processors": sorted(map(short, made["processor"].unique()))}
+    told: dict[str, Any] = {"commits": made["commit"].nunique(), "sessions": 1, "speeds": None}
+    told["processors"] = sorted(map(short, made["processor"].unique()))
+    known = rows[rows["group"] == mechanisms.GROUP].reindex(columns=["case", "commit", "calibration_s"])
+    times = known.dropna().groupby(["case", "commit"])["calibration_s"].median().groupby("case")
+    if len(times):
+        told |= {"sessions": int(times.size().max()), "speeds": float((times.max() / times.min()).max())}
+    return told
 
 
 def answer(found: dict[str, Any]) -> str:

@@ -4,7 +4,7 @@ import pytest
 
 from studies.bench import adaptive
 from studies.bench.collector import Case, Run, Solver
-from tests.studies.test_rivals import Kept
+from tests.studies.test_work_precision import Kept
 
 VALUES = (1e-2, 1e-4, 1e-6, 1e-8, 1e-10)
 

@@ -1,12 +1,10 @@
-"""Medians, cost at equal error, rankings and figures, from rows made by hand."""
+"""Medians, cost at equal error, rankings, from rows made by hand."""
 
 import numpy as np
 import pandas as pd
 import pytest
 
-from studies.bench import figures, tables
-from studies.bench.cli import Call
-from studies.bench.store import Output
+from studies.bench import tables
 from tests.studies.of_study import median
 
 
@@ -151,31 +149,6 @@ def test_who_alone_gets_there_and_who_misses_is_told():
     assert verdicts == ["alone", "missed", "none"]
 
 
-def test_styles_tell_the_solvers_of_a_figure_apart():
-    looks = {(look[0], look[1]) for look in figures.STYLES.values()}
-    assert len(looks) >= len(figures.STYLES) - 1  # PaperIRK along its two settings is one
-    assert figures.style("LSODA, index 1", "SciPy", False)["markerfacecolor"] == "white"
-    assert "markerfacecolor" not in figures.style("Gauss12")
-
-
-def test_a_figure_has_at_most_nine_lines_and_both_formats(tmp_path):
-    made = rows(*[(name, error, 1.0 / error) for name in "abcdefghijk" for error in (1e-2, 1e-4)])
-    with pytest.raises(ValueError, match="at most 9 lines"):
-        figures.work_precision(made, list("abcdefghij"), "title")
-    lines = figures.lines_of(made, (1e-2, 1e-4))
-    assert len(lines) == 9
-    with Output(Call("x", True, tmp_path, False, "")) as output:
-        figures.save(figures.work_precision(made, lines, "title"), output, "x")
-        first = (tmp_path / "x.svg").read_bytes()
-        figures.save(figures.work_precision(made, lines, "title"), output, "x")
-    assert (tmp_path / "x.svg").read_bytes() == first and b"quick run" in first
-    assert (tmp_path / "x.png").stat().st_size > 1000
-
-
-def test_the_cheapest_lines_are_the_cheapest():
-    assert figures.cheapest_lines(rows(*[(f"s{k}", 1e-4, 1.0 + k) for k in range(9)]), (1e-3,), 2) == ["s0", "s1"]
-
-
 def test_repetitions_that_timed_something_else_do_not_count():
     times, errors = np.array([1.0, 1.1, 9.0, 1.2, 0.9]), np.full(5, 1e-6)
     assert tables.alike(times, errors).tolist() == [True, True, False, True, True]
@@ -200,3 +173,43 @@ def test_the_price_is_the_cheapest_run_that_is_good_enough_however_good():
     for error in (1e-4, 1e-6, 1e-12):
         assert tables.time_for(made, error) == 7.7 and tables.costs_at(made, error)["a"][0] == 7.7
     assert tables.run_for(made, 1e-4)["error_q"] == 1e-13
+
+
+def runs(*lines):
+    """Rows of (tolerance, error or None, status) of a solver."""
+    made = rows(*(("a", error, 0.1) for _, error, _ in lines))
+    return made.assign(
+        tol=[tol for tol, *_ in lines],
+        status=[status for *_, status in lines],
+        family="theirs",
+        times=[(0.1,) * 5] * len(lines),
+    )
+
+
+END, LIMIT, FAILED = "REACHED_END", "TIME_LIMIT", "SOLVER_FAILED"
+
+
+@pytest.mark.parametrize(
+    ("lines", "missed"),
+    [
+        ([(1e-3, 1e-3, END), (1e-5, None, LIMIT)], False),  # stopped by us
+        ([(1e-3, 1e-3, END), (1e-5, None, LIMIT), (1e-7, None, FAILED)], False),
+        ([(1e-3, None, LIMIT)], False),
+        ([(1e-3, None, FAILED), (1e-5, None, FAILED)], False),  # tighter ones may do better
+        ([(1e-3, None, FAILED), (tables.TIGHTEST, None, FAILED)], True),
+        ([(1e-3, None, LIMIT), (1e-5, 1e-3, END), (tables.TIGHTEST, 1e-4, END)], True),  # only a loose run was stopped
+        ([(1e-3, 1e-3, END), (1e-5, None, FAILED)], True),
+        ([(1e-3, 1e-3, END), (1e-5, 1e-4, END)], False),  # not asked for more
+        ([(1e-3, 1e-3, END), (1e-5, 1e-7, END), (1e-7, None, FAILED)], False),  # it gets there
+    ],
+)
+def test_a_solver_misses_what_it_was_asked_for_to_its_end(lines, missed):
+    assert tables.missed(runs(*lines), 1e-6) is missed
+
+
+@pytest.mark.parametrize("message", ["100000 steps were not enough. Raise most_steps", "CV_TOO_MUCH_WORK at t = 1"])
+def test_the_most_steps_that_an_adapter_allows_are_a_limit_of_ours(message):
+    made = runs((1e-3, 1e-3, END), (1e-5, None, FAILED))
+    assert tables.missed(made, 1e-6)
+    made.loc[1, "message"] = message
+    assert not tables.missed(made, 1e-6)
