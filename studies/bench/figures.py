@@ -22,7 +22,6 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.collections import PolyCollection
 from matplotlib.colors import to_hex
-from matplotlib.container import ErrorbarContainer
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
@@ -50,7 +49,6 @@ OLIVE, CRIMSON, LIME, TAN, ROSE, LAVENDER = "#556B2F", "#8B0000", "#7AB52E", "#A
 TEAL, NAVY = "#00A6A6", "#283593"
 STEELS = ("#9AD0D2", "#6FB7B9", "#4A9A9D", "#327D81", "#1E6064", "#0B4447")  # of the stand-in, by its order
 MARKERS = "o^sDvP>d<pX*Hh8"
-DEFAULT_COLOR = VIOLET
 
 LOOKS = tomllib.loads(Path(__file__).with_name("looks.toml").read_text(encoding="utf-8"))
 OURS, THEIRS = ({globals()[color]: own for color, own in LOOKS[whose].items()} for whose in ("ours", "theirs"))
@@ -59,19 +57,15 @@ STYLES |= {gear(order): look for order, look in zip(GEAR_ORDERS, zip(STEELS, "12
 SAME: dict[str, str] = LOOKS["same"]
 
 
-def style(solver: str, family: str = "two-loop", keeps_constraints: bool = True) -> dict[str, Any]:
-    """Return colour, marker and line of a solver, the same in all figures; the default's line is thick.
-
-    `keeps_constraints` changes nothing.
-    """
+def style(solver: str) -> dict[str, Any]:
+    """Return colour, marker and line of a solver, the same in all figures; the default's line is thick."""
     name = SAME.get(solver, solver)
-    if name not in STYLES:  # the same one every time, and no listed solver's
+    if name not in STYLES:  # the same pair every time, and that of no listed solver
         free = [pair for pair in product(THEIRS, MARKERS) if pair not in STYLES.values()]
         color, marker = free[zlib.crc32(name.encode()) % len(free)]
     else:
         color, marker = STYLES[name]
-    thick = {"linewidth": THICK, "zorder": 3} if name == DEFAULT else {}
-    return {"color": color, "marker": marker, "linestyle": "-"} | thick
+    return {"color": color, "marker": marker} | ({"linewidth": THICK, "zorder": 3} if name == DEFAULT else {})
 
 
 def look(row: pd.Series, coded: bool | None = None) -> dict[str, Any]:
@@ -100,8 +94,7 @@ def label_lines(panels: Axes | Iterable[Axes]) -> None:
     """
     last: dict[str, tuple[Axes, Any]] = {}
     for axes in [panels] if isinstance(panels, Axes) else panels:
-        for handle, text in zip(*axes.get_legend_handles_labels(), strict=True):
-            line = handle[0] if isinstance(handle, ErrorbarContainer) else handle
+        for line, text in zip(*axes.get_legend_handles_labels(), strict=True):
             if np.isfinite(_points(line)).all(axis=1).any():
                 last[text] = axes, line
     for axes in dict.fromkeys(axes for axes, _ in last.values()):
@@ -154,19 +147,6 @@ def _label_ends(axes: Axes, lines: dict[str, Any]) -> None:
         )
 
 
-def legend(figure: Figure, axes: Iterable[Axes], title: str | None = None, below: int = 0) -> None:
-    """Explain what has no line to be labelled, such as bars: each label once, right of the panels or below them.
-
-    `below`: the number of columns below. Lines have their labels by `label_lines`.
-    """
-    entries: dict[str, Any] = {}
-    for panel in axes:
-        for handle, words in zip(*panel.get_legend_handles_labels(), strict=True):
-            entries.setdefault(words, handle)
-    place: dict[str, Any] = {"loc": "outside lower center", "ncols": below, "fontsize": 8} if below else {}
-    figure.legend(entries.values(), entries.keys(), **{"loc": "outside right upper", "title": title} | place)
-
-
 def label_decades(figure: Figure) -> None:
     """Label logarithmic axes at decades alone, of which at least two are brought into view."""
     for axes in figure.axes:
@@ -195,16 +175,14 @@ def save(figure: Figure, output: Output, name: str) -> None:
 
 def cheapest_lines(rows: pd.DataFrame, targets: Sequence[float], most: int = MOST_LINES) -> list[str]:
     """Return at most so many solvers of a case, those with the best places at the targets, in the order of the rows."""
-    solvers = rows["solver"].unique()
-    score = dict.fromkeys(solvers, 0)
+    score = {str(solver): 0 for solver in rows["solver"].unique()}
     for target in targets:
-        times = {solver: time_for(runs, target) for solver, runs in rows.groupby("solver", sort=False)}
-        ranked = sorted((solver for solver in solvers if times[solver] == times[solver]), key=times.__getitem__)
-        for solver in solvers:
-            score[solver] += ranked.index(solver) if solver in ranked else len(solvers)
-    reached = [solver for solver in solvers if score[solver] < len(targets) * len(solvers)]
-    best = sorted(reached, key=score.__getitem__)[:most]
-    return [str(solver) for solver in solvers if solver in best]
+        times = {name: time_for(rows[rows["solver"] == name], target) for name in score}
+        ranked = sorted((name for name in score if times[name] == times[name]), key=times.__getitem__)
+        for name in score:
+            score[name] += ranked.index(name) if name in ranked else len(score)
+    best = sorted((name for name in score if score[name] < len(targets) * len(score)), key=score.__getitem__)[:most]
+    return [name for name in score if name in best]
 
 
 def lines_of(rows: pd.DataFrame, targets: Sequence[float], coded: bool | None = None) -> list[str]:
@@ -235,11 +213,6 @@ def lines_of(rows: pd.DataFrame, targets: Sequence[float], coded: bool | None = 
     return list(dict.fromkeys([*chosen, *cheapest_lines(further, targets)]))[:MOST_LINES]
 
 
-def default_first(solvers: Iterable[str], coded: bool | None) -> list[str]:
-    """Return the solvers with the default first, each once; `coded`: as `names.label` has it."""
-    return sorted(dict.fromkeys(solvers), key=lambda name: label(name, coded) != GIVEN)
-
-
 def _told(rows: pd.DataFrame) -> pd.Series:
     """Return whether the reference resolves the error of a run, and the run has not lost the motion."""
     return (rows["error_q"].astype(float) > rows["floor"].astype(float)) & ~astray(rows)
@@ -254,9 +227,6 @@ def line_of(runs: pd.DataFrame) -> pd.DataFrame:
     return runs.iloc[np.lexsort((-runs["error_q"].astype(float), -setting_of(runs)))].reset_index(drop=True)
 
 
-with_gaps, LEGEND = line_of, None  # lines have no gaps and no legend any more
-
-
 def work_precision(
     rows: pd.DataFrame, solvers: Sequence[str], title: str, error: str = ERROR, coded: bool | None = None
 ) -> Figure:
@@ -268,7 +238,7 @@ def work_precision(
     if len(solvers) > MOST_LINES:
         raise ValueError(f"a work-precision figure has at most {MOST_LINES} lines; given {len(solvers)}")
     figure, axes = plt.subplots(figsize=(7.6, 4.0), layout="constrained")
-    for solver in default_first(solvers, coded):
+    for solver in sorted(dict.fromkeys(solvers), key=lambda name: label(name, coded) != GIVEN):  # the default first
         runs = line_of(rows[rows["solver"] == solver])
         if len(runs):
             axes.plot(runs["error_q"].astype(float), runs["call_s"].astype(float), **look(runs.iloc[0], coded))
