@@ -42,6 +42,7 @@ def test_a_run_is_right_or_says_that_it_is_not(family):
             assert made["outcome"] == RIGHT, told
 
 
+@pytest.mark.slow  # numbers that do not change
 def test_the_motions_are_those_of_the_mechanisms():
     for family in ("gust of 100 ms", "drive with a kink", "softplus stop"):
         n_drawn, known = MOTIONS[family]

@@ -2,7 +2,6 @@
 
 import pytest
 
-from tests.problems import quick
 from tests.processes import run_python
 
 RUN = """
@@ -32,9 +31,10 @@ loaded(NamedStep("diagonal_step", "DIAGONAL")), loaded(NamedStep("newton_step", 
 KINDS = ("ends", "t_eval", "dense", "Integrator")
 
 
+@pytest.mark.slow  # each runs two processes
 @pytest.mark.parametrize(
     ("tol", "compiled", "name"),
-    quick([(1e-3, False, "diagonal_step"), (1e-5, False, "newton_step"), (1e-5, True, "newton_step")]),
+    [(1e-3, False, "diagonal_step"), (1e-5, False, "newton_step"), (1e-5, True, "newton_step")],
 )
 def test_a_run_that_loads_its_implicit_method_is_the_one_that_had_it(tol, compiled, name):
     source = RUN.format(tol=tol, compiled=compiled, kinds=KINDS)

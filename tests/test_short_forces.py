@@ -96,7 +96,7 @@ def off(name, **options):
     return result, np.abs(result.q[:, -1] - reference(force, state)).max()
 
 
-@pytest.mark.parametrize("compiled", [False, True], ids=["general", "compiled"])
+@pytest.mark.parametrize("compiled", quick([False, True]))
 @pytest.mark.parametrize("name", FORCES)
 def test_a_series_sees_what_it_cannot_foresee(name, compiled):
     for tolerance in (1e-5, 1e-8, 1e-11):
@@ -127,15 +127,18 @@ def falling_off(t, q, v):
 
 @pytest.mark.parametrize(
     ("force", "short"),
-    [
-        (lambda t, q, v: -0.1 * q, False),
-        (lambda t, q, v: -0.1 * np.sin(q) * np.cos(t), True),
-        (lambda t, q, v: -0.1 * np.sin((q + v) * (q - 8.0 * v)), True),
-        (lambda t, q, v: -0.1 * np.sin(q * v), False),
-        (falling_off, True),
-        (lambda t, q, v: -0.1 * np.tanh(q), True),
-        (lambda t, q, v: -0.1 * q if t < 1e9 else q, True),
-    ],
+    quick(
+        [
+            (lambda t, q, v: -0.1 * np.sin(q * v), False),
+            (falling_off, True),
+            (lambda t, q, v: -0.1 * q if t < 1e9 else q, True),
+            (lambda t, q, v: -0.1 * q, False),
+            (lambda t, q, v: -0.1 * np.sin(q) * np.cos(t), True),
+            (lambda t, q, v: -0.1 * np.sin((q + v) * (q - 8.0 * v)), True),
+            (lambda t, q, v: -0.1 * np.tanh(q), True),
+        ],
+        3,
+    ),
 )
 def test_steps_are_longer_than_a_hundredth_where_forces_change_slowly(force, short):
     """4/15 of a step is the longest part without a stage: the equations are still evaluated in each hundredth."""
@@ -177,7 +180,7 @@ SQUARE = {
 }
 
 
-@pytest.mark.parametrize("compiled", [False, True], ids=["general", "compiled"])
+@pytest.mark.parametrize("compiled", quick([False, True]))
 @pytest.mark.parametrize("name", SQUARE)
 def test_auto_goes_on_where_a_series_is_not_finite(name, compiled):
     force, state = SQUARE[name], (0.7, 0.0)
@@ -321,7 +324,7 @@ def test_nor_is_what_acts_at_a_place_that_is_passed_in_that_time(compile, p=(0.3
 def test_nor_is_a_smooth_force_at_such_a_place(options):
     """It is passed at 3/s, a width in a two-thousandth of the run or more."""
     for p in ((0.1, 5e-3), (-0.2, 1e-2)):
-        expected = reference(smooth_magnet, FAST, p, 5e-4)
+        expected = reference(smooth_magnet, FAST, p, 1e-3)
         assert np.abs(end_of(smooth_magnet, p, FAST, **TIGHT, **options) - expected).max() < 1e-5
 
 
@@ -366,10 +369,10 @@ def test_nor_are_gusts_in_lanes():
 
 def test_nor_are_pulses_of_a_high_power_of_a_cosine():
     """Between these the force and its series are zero to rounding; each acts for a hundredth of the run."""
-    widths = np.linspace(0.04, 0.09, 24)[::3].tolist()
+    widths = np.linspace(0.04, 0.09, 5).tolist()
     given = {"parameters": [[0.1, width] for width in widths], **LOOSE}
     runs = ensemble(pendulum_with(cogs), (0.0, T_END), *start_of(FAST), method="Taylor", t_eval=[T_END], **given)
-    assert runs.success.all() and (~runs.singly).sum() > 4
+    assert runs.success.all() and (~runs.singly).sum() > 2
     for q, width in zip(runs.q[:, :, -1], widths, strict=True):
         assert np.abs(q - reference(cogs, FAST, (0.1, width), 0.035 * width)).max() < 1e-3
 
