@@ -76,23 +76,3 @@ def test_a_cart_with_a_pendulum(spatial):
     rod = result.q[7:9] if spatial else result.q[3:5]
     np.testing.assert_allclose(rod, [x + 0.5 * np.sin(a), -0.5 * np.cos(a)], atol=1e-9)
     assert (np.diff(problem.energy(result.t, result.q, result.v)) < 0.0).all()
-
-
-def test_where_the_load_or_the_friction_is_not_determined():
-    model, rail, hinge = cart(False)
-    with pytest.raises(ValueError, match="radius is that of the pin of a revolute joint"):
-        model.friction(rail, speed=0.1, coefficient=0.1, radius=0.1)
-    with pytest.raises(ValueError, match="radius is that of the pin of a revolute joint"):
-        model.friction(hinge, speed=0.1, coefficient=0.1)
-    with pytest.raises(ValueError, match="coefficient must not be negative"):
-        model.friction(rail, speed=0.1, coefficient=-0.1)
-    double = PlanarModel()
-    double.body("block", mass=1.0, inertia=1.0, position=(0.0, 0.0))
-    first = double.prismatic("ground", "block", at=(0.0, 0.0), axis=(1.0, 0.0))
-    double.prismatic("ground", "block", at=(1.0, 0.0), axis=(1.0, 0.0))
-    double.friction(first, speed=0.1, coefficient=0.1)
-    with pytest.raises(ValueError, match="not determined: the rows of"):
-        double.problem()
-    jams, *_ = cart(False, guide=60.0)
-    with pytest.raises(ValueError, match="cannot be computed at the start: the coefficients are so large"):
-        jams.problem()

@@ -325,22 +325,7 @@ def welded_branches():
     return text, hand, 1
 
 
-def tendons():
-    """A free body that hangs on two tendons from a hinged arm, with a damper."""
-    text = f"""<site name="world" pos="2 0 2"/><body name="a" pos="0 0 2"><joint axis="0 1 0" stiffness="40"/>
-      {ball("1 0 0")}<site name="tip" pos="1 0 0"/></body>
-      <body name="b" pos="1.2 0.1 0.8"><freejoint/>{ball()}<site name="hook" pos="0.1 0 0"/></body>
-      </worldbody><tendon><spatial stiffness="30" damping="0.5" springlength="0.9"><site site="tip"/><site site="hook"/>
-      </spatial><spatial stiffness="10" springlength="1.1"><site site="world"/><site site="hook"/></spatial>
-      </tendon></mujoco>"""
-    hand = bodies(SpatialModel(), (1.0, 0, 2), (1.2, 0.1, 0.8))
-    hand.torsion_spring(hand.revolute("ground", "a", at=(0, 0, 2), axis=Y), stiffness=40.0)
-    hand.spring("a", (1.0, 0, 2), "b", (1.3, 0.1, 0.8), stiffness=30.0, damping=0.5, length=0.9)
-    hand.spring("ground", (2.0, 0, 2), "b", (1.3, 0.1, 0.8), stiffness=10.0, length=1.1)
-    return text, hand, 7
-
-
-@pytest.mark.parametrize("make", [slider_crank, welded_branches, tendons])
+@pytest.mark.parametrize("make", [slider_crank, welded_branches])
 def test_a_file_and_the_same_by_hand(make, tmp_path):
     text, hand, degrees = make()
     gravity = "{} {} {}".format(*hand.gravity)

@@ -92,10 +92,3 @@ def test_a_cubic_torque_in_a_hinge_in_space(options):
     result = moved(problem, **options)
     angle = 2.0 * np.arctan2(AXIS @ result.q[4:7, -1], result.q[3, -1])
     assert angle == pytest.approx(known.y[0, -1], abs=1e-8)
-
-
-def test_wrong_results():
-    with pytest.raises(ValueError, match="must return a number"):
-        spring_pendulum(lambda x, rate: (x, rate))
-    with pytest.raises(ValueError, match="must be finite at the start"):
-        spring_pendulum(lambda x, rate: x / rate)

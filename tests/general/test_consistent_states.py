@@ -45,35 +45,13 @@ def test_parameters_of_their_own_and_coordinates_that_are_kept():
         assert np.abs(own.constraint(0.0, q[run])).max() < 1e-14
 
 
-MODULE = "twoloop.ensembles.consistent_states"
-
-
-@pytest.fixture
-def singly(monkeypatch):
-    """Calls for one guess."""
-    calls = []
-
-    def one(*arguments, **options):
-        calls.append(arguments)
-        return consistent_state(*arguments, **options)
-
-    monkeypatch.setattr(f"{MODULE}.consistent_state", one)
-    return calls
-
-
-@pytest.mark.parametrize(
-    ("name", "n_singly"), [("spatial_four_bar", 0), *(slow(name, 1) for name in ("redundant_slider_crank", "bricard"))]
-)
-def test_lanes_take_those_that_are_near_and_none_depends_on_others(monkeypatch, singly, name, n_singly):
-    """Of redundant rows the first guess says how many they are."""
+@pytest.mark.parametrize("name", ["spatial_four_bar", slow("redundant_slider_crank"), slow("bricard")])
+def test_none_depends_on_the_others_or_on_threads(monkeypatch, name):
     problem = getattr(mechanisms, name)()
     q, v = problem.q0 + 0.5 * (guesses(problem, 300)[0] - problem.q0), guesses(problem, 300)[1]
-    monkeypatch.setattr(f"{MODULE}.threads_of", lambda wanted: 2)
+    monkeypatch.setattr("twoloop.ensembles.consistent_states.threads_of", lambda wanted: 2)
     all_q, all_v = consistent_states(problem.system, 0.1, q, v)
-    assert len(singly) == n_singly
-    consistent_states(problem.system, 0.1, all_q, all_v)  # which are on the constraints
-    assert len(singly) == 2 * n_singly
-    monkeypatch.setattr(f"{MODULE}.threads_of", lambda wanted: 1)
+    monkeypatch.setattr("twoloop.ensembles.consistent_states.threads_of", lambda wanted: 1)
     for some in (slice(0, 13), slice(5, 300)):
         made_q, made_v = consistent_states(problem.system, 0.1, q[some], v[some])
         assert (made_q == all_q[some]).all() and (made_v == all_v[some]).all()

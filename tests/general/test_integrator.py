@@ -31,14 +31,6 @@ def test_its_runs_are_those_of_solve_dae(problem, options):
         assert (own.q == known.q).all() and own.t.tolist() == [0.1, 0.2]
 
 
-def test_wrong_tolerances_and_systems_are_named_when_it_is_made(problem):
-    with pytest.raises(ValueError, match="rtol must be positive"):
-        Integrator(problem.system, rtol=0.0)
-    with pytest.raises(TypeError, match="system must be a ConstrainedSystem"):
-        Integrator(problem)
-    assert "four-bar" in repr(Integrator(problem.system)) and "auto" in repr(Integrator(problem.system))
-
-
 # --- sample by sample
 M, L, GRAVITY = 1.3, 0.8, 9.81
 ABOUT_PIN = M * L * L / 3.0

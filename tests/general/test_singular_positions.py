@@ -8,7 +8,7 @@ import pytest
 from tests.general.mechanisms import SINGULAR, WINDOWS, error, first_singular_time, mechanism, run
 from tests.general.systems import CUSP_TIME, cusp
 from tests.marks import slow
-from tests.problems import event, worst
+from tests.problems import worst
 from twoloop import DOP853, ConstraintWarning, Integrator, Status, solve_dae
 from twoloop.bodies import PlanarModel
 
@@ -73,22 +73,6 @@ def test_a_cusp_ends_the_run_and_is_named(method):
     before = result.t < 0.95 * CUSP_TIME
     q, _ = m.states(result.t[before])
     assert np.abs(result.q[:, before] - q).max() < 1e-6
-
-
-@pytest.mark.parametrize("method", ["DOP853", slow("auto")])
-def test_states_stay_as_they_were_stored_when_a_step_goes_across(method):
-    """With a terminal event chunks are short, and one may end, half full, at a singular position."""
-    m, never = mechanism("A02, N = 1"), event(lambda t, q, v: 1.0, terminal=True)
-    crossed = 0
-    for tol in (1e-3, 1e-4, 3e-5, 1e-6, 1e-8):
-        runs = [
-            solve_dae(m.system(), (0.0, 10.0), *m.start, method, tol, tol, events=events, check_derivatives=False)
-            for events in (None, never)
-        ]
-        assert runs[0].status is runs[1].status
-        crossed += "across" in runs[1].message
-        assert (runs[0].t == runs[1].t).all() and (runs[0].q == runs[1].q).all() and (np.diff(runs[1].t) > 0.0).all()
-    assert crossed > 0
 
 
 def parallelogram(angle, speed, gravity=-9.81):

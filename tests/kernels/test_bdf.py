@@ -62,12 +62,6 @@ def test_steps_far_shorter_than_the_tolerance_asks_for_are_no_worse(tol):
     assert many_error < error and many.stats.n_evaluations >= 2 * many.stats.n_accepted
 
 
-def test_the_last_fixed_step_may_be_short():
-    for end in (1.01, 1.0001):  # half a step, and one too short for the history
-        result = swing(end, method="BDF", step_size=0.02)
-        assert result.success and worst(result.q[:, -1], pendulum_state(end)[0]) < 1e-4
-
-
 # --- Newton's method as the outer loop
 def test_newtons_method_takes_the_steps_of_the_fixed_point_where_nothing_is_stiff():
     (one, error), (other, same) = (four_bar_run(BDF(outer=outer), 1e-8, 3.0) for outer in ("fixed-point", "newton"))

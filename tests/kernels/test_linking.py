@@ -7,7 +7,6 @@ import numba
 import numpy as np
 import pytest
 from numba import types
-from numba.core.registry import cpu_target
 
 from twoloop.kernels.compile import own_rules
 from twoloop.kernels.compile.linking import KernelCompiler
@@ -86,13 +85,3 @@ def test_numba_has_its_own_functions_after_a_kernel_and_after_a_failure():
     with pytest.raises(numba.TypingError):
         numba.njit("f8(f8)", pipeline_class=KernelCompiler, **OPTIONS)(lambda x: x + "one")
     assert [vars(owner).get(name) for owner, name, _ in own_rules._RULES] == before and own_rules._open == [0]
-
-
-def test_what_numba_learns_while_a_kernel_is_compiled_is_found():
-    """An intrinsic goes into a registry when it is first met, which may be after all of them were loaded."""
-    context = cpu_target.target_context
-    with own_rules.own_rules():
-        context.refresh()
-        next(iter(context._registries)).lower(_long, types.float64)(lambda *given: None)
-        context.refresh()
-        assert context._defns[_long].find((types.float64,)) is not None

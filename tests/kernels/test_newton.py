@@ -22,7 +22,6 @@ from tests.problems import (
     worst,
 )
 from twoloop import ConstrainedSystem, RungeKutta, solve_dae
-from twoloop.bodies import PlanarModel
 from twoloop.mechanisms import four_bar, moderately_stiff_beam, very_flexible_beam
 from twoloop.methods.tableaux import gauss, lobatto_iiie, radau_iia, sun_radau_iib
 from twoloop.run import workspace as workspace_module
@@ -110,18 +109,6 @@ def test_auto_takes_newton_where_a_fixed_step_does_not_converge_by_sweeps():
     run = {o: solve_dae(sprung_pair(1e8), (0.0, 0.1), *SPRUNG_START, m, step_size=1e-3) for o, m in method.items()}
     assert not run["fixed-point"].success
     assert run["auto"].success, run["auto"].message
-
-
-def test_newton_goes_on_from_where_friction_is_stiff(speed=1e-5):
-    """In the middle of the first step, by the accelerations at its beginning, the block would slide."""
-    model = PlanarModel(gravity=(0.0, 0.0))
-    block = model.box("block", (0.1, 0.1), mass=1.0, position=(0.0, 0.0))
-    model.friction(model.prismatic("ground", block, at=(0.0, 0.0), axis=(1.0, 0.0)), 10.0, speed=speed)
-    model.force(block, (0.0, 0.0), np.array([3.0, 0.0]))
-    problem = model.problem((0.0, 0.5))
-    start = problem.q0, [0.3 * speed, 0.0, 0.0]
-    result = solve_dae(problem.system, problem.t_span, *start, "RadauIIA5", 1e-5, 1e-5, first_step=1e-3)
-    assert result.success and result.stats.n_rejected_convergence < 2  # 3 to 5 with derivatives in the middle alone
 
 
 def dragged_and_bouncing(t, q, v, p):

@@ -27,18 +27,8 @@ anything = st.lists(st.floats(-2.0, 2.0), min_size=N_Q, max_size=N_Q).map(np.arr
 @pytest.fixture(scope="module")
 def beam():
     """Thick enough for all terms to count; without gravity the force is the elastic force."""
-    return ancf_beam(
-        N,
-        youngs_modulus=YOUNG,
-        poisson_ratio=POISSON,
-        density=DENSITY,
-        length=LENGTH,
-        height=HEIGHT,
-        width=WIDTH,
-        amplitude=0.0,
-        angular_frequency=1.0,
-        gravity=0.0,
-    )
+    section = {"length": LENGTH, "height": HEIGHT, "width": WIDTH, "density": DENSITY, "poisson_ratio": POISSON}
+    return ancf_beam(N, youngs_modulus=YOUNG, amplitude=0.0, angular_frequency=1.0, gravity=0.0, **section)
 
 
 def gauss(n, a, b):

@@ -20,7 +20,7 @@ from tests.mechanisms.motions.integrate import by_scipy
 from tests.problems import row_errors, run, slope, worst
 from tests.processes import run_python
 from twoloop import ConstraintWarning, mechanisms
-from twoloop.bodies.rotation import G, euler_parameters, euler_rates, pulled, rotated, rotated_rate, rotation_matrix
+from twoloop.bodies.rotation import euler_parameters, euler_rates
 from twoloop.kernels.compile.callbacks import KINDS
 from twoloop.mechanisms import four_bar
 from twoloop.mechanisms.momentum import Momentum
@@ -277,30 +277,7 @@ def test_linkages_agree_with_the_minimal_form_to_nine_digits(linkage, method, to
         assert worst(result.v[:, -1], problem.reference.v) < 1e-9
 
 
-RNG = np.random.default_rng(3)
 TURNS = Rotation.random(5, random_state=5)
-
-
-@pytest.mark.parametrize("turn", [*TURNS, Rotation.from_rotvec([np.pi, 0.0, 0.0]), Rotation.from_rotvec([0, np.pi, 0])])
-def test_matrix_and_parameters(turn):
-    e = euler_parameters(turn.as_matrix())
-    assert rotation_matrix(e) == pytest.approx(turn.as_matrix(), abs=1e-14) and e @ e == pytest.approx(1.0)
-    spin = RNG.normal(size=3)
-    u = euler_rates(e, spin)
-    assert 2.0 * rotation_matrix(e) @ G(e) @ u == pytest.approx(spin, abs=1e-14)
-    assert e @ u == pytest.approx(0.0, abs=1e-15)
-
-
-def test_vectors_and_their_derivatives():
-    """Off the unit sphere too, where steps and differences evaluate."""
-    e, u, a, f = RNG.normal(size=4), RNG.normal(size=4), RNG.normal(size=3), RNG.normal(size=3)
-    assert rotated(*e, *a) == pytest.approx(rotation_matrix(e) @ a)
-    h = 1e-6
-    ahead, behind = (np.array(rotated(*(e + s * u), *a)) for s in (h, -h))
-    assert rotated_rate(*e, *u, *a) == pytest.approx((ahead - behind) / (2.0 * h), abs=1e-8)
-    assert np.dot(pulled(*e, *a, *f), u) == pytest.approx(f @ np.array(rotated_rate(*e, *u, *a)))
-    bend = (ahead + behind - 2.0 * rotation_matrix(e) @ a) / h**2
-    assert 2.0 * np.array(rotated(*u, *a)) == pytest.approx(bend, abs=1e-2)
 
 
 def test_momentum_of_a_free_body():
@@ -312,31 +289,6 @@ def test_momentum_of_a_free_body():
     momentum = Momentum(np.array([[2.0, *moments]]), point, axis)
     assert momentum(0.0, q, v) == pytest.approx(axis @ moment)
     assert momentum(0.0, np.array([q, q]).T, np.array([v, v]).T) == pytest.approx([axis @ moment] * 2)
-
-
-def imported(*statements):
-    """Modules of twoloop after each of the statements in a new process."""
-    told = "print(*(m for m in sys.modules if m.startswith('twoloop.')))"
-    source = "\n".join(["import sys", *(f"{statement}; {told}" for statement in statements)])
-    return [set(line.split()) for line in run_python(source).stdout.splitlines()]
-
-
-def mechanisms_among(modules):
-    """Names of those of mechanisms."""
-    return {name.removeprefix("twoloop.mechanisms.") for name in modules if name.startswith("twoloop.mechanisms.")}
-
-
-def test_a_mechanism_imports_no_other_and_its_name_is_a_function_also_after_an_import_of_the_module():
-    first, *after = imported(
-        "import twoloop; twoloop.solve_dae",
-        "import twoloop.mechanisms",
-        "from twoloop.mechanisms import four_bar",
-        "import twoloop.mechanisms.heavy_top; from twoloop.mechanisms import heavy_top; assert callable(heavy_top)",
-    )
-    assert not first & {f"twoloop.kernels.{name}" for name in ("lanes.lane_room", "evaluation.calls", "advance")}
-    none, one, other = map(mechanisms_among, after)
-    assert none == set() and one == {"four_bar"}
-    assert {"four_bar", "heavy_top"} <= other and "andrews" not in other
 
 
 def test_a_first_run_imports_no_models_and_no_step_that_it_does_not_come_to():

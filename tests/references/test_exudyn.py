@@ -14,8 +14,6 @@ from references.exudyn.beam import solve_exudyn_beam
 from references.exudyn.mechanisms import MODELS, has_model, solve_exudyn
 from references.exudyn.run import SOLVERS
 from references.paper.four_bar_minimal import trajectory
-from studies.bench.collector import Case
-from studies.bench.solvers import CATALOGUE
 from studies.validation import study as validation
 from tests.marks import slow, slow_but
 from tests.problems import LINKAGES
@@ -98,12 +96,6 @@ def test_the_list_of_the_study_is_that_of_the_models():
 
 
 # --- the spectral radius, and why there are no steps by error control
-@pytest.mark.parametrize("name", slow_but(["heavy top"], MODELS))
-def test_every_model_runs_with_another_radius(name):
-    """It was refused where there is a model and an option."""
-    result = CATALOGUE["Exudyn, GeneralizedAlpha 0.6"].run(Case(name, PROBLEMS[name], 0.02), 1e-3, 0)
-    assert result.success and result.t[-1] == pytest.approx(0.02)
-    assert np.abs(result.q[:, 0] - PROBLEMS[name].q0).max() < 1e-12
 
 
 TIMES = np.arange(11) / 10.0

@@ -10,8 +10,6 @@ import pytest
 from numba import njit
 
 from references.driver import Task
-from references.scipy.index1 import solve_index1
-from references.sundials import library as sundials
 from references.sundials.ida import solve_ida
 from references.sundials.ida_c import solve_ida_c
 from references.sundials.residual import FORMS, Implicit, iteration_matrix_at, residual_at
@@ -164,27 +162,6 @@ def test_python_functions_are_refused():
 
 
 # --- the wheel
-@pytest.fixture
-def fresh():
-    """The library is looked for again in the test, and after it."""
-    sundials.library.cache_clear()
-    yield
-    sundials.library.cache_clear()
-
-
-@pytest.mark.parametrize(
-    ("name", "value", "found"),
-    [
-        ("files", lambda package: None, "there are 0 files"),
-        ("_version", lambda sundials: (8, 1, 0), "SUNDIALS has the version 8.1.0"),
-        ("FUNCTIONS", {"core": "SUNContext_Make:-"}, "undefined symbol: SUNContext_Make"),
-    ],
-)
-@pytest.mark.usefixtures("fresh")
-def test_another_wheel_is_named(monkeypatch, name, value, found):
-    monkeypatch.setattr(sundials, name, value)
-    with pytest.raises(RuntimeError, match=f"{found}.*written for scikit-sundae 1.2.0"):
-        run(1.0, 1e-6)
 
 
 class _Mallinfo(ctypes.Structure):
@@ -225,7 +202,6 @@ CASES = {
     "stiff": moderately_stiff_beam(),
     "stiff, no tangent": without_tangent(moderately_stiff_beam()),
 }
-FOUR_BAR = four_bar()
 ORDER_2 = {"max_order": 2, "error_test": "positions"}
 # m, the tip's height at 0.1, 0.2 ... 2 s, by DOP853 on the index-1 equations (index1.py) with rtol = atol =
 # 3e-14. From 1e-12 to 3e-14 they change by less than 1e-13 m up to 1 s and 5e-11 m up to 2 s ("flexible"), and by less
@@ -258,20 +234,6 @@ def errors(name, result):
     assert result.success
     error = np.abs(tip_height(result.q) - TIPS[name][: result.t.size])
     return error[:10].max(), error.max()
-
-
-@pytest.mark.slow
-def test_heights_are_those_of_dop853():
-    problem = CASES["flexible"]
-    result = solve_index1(problem.system, (0.0, 1.0), problem.q0, problem.v0, "DOP853", 1e-9, 1e-9, t_eval=TIMES[:10])
-    assert np.abs(tip_height(result.q) - TIPS["flexible"][:10]).max() < 1e-9
-
-
-@pytest.mark.slow
-def test_the_flexible_beam_forgets_its_start():
-    to_1_s, to_2_s = errors("flexible", run_beam("flexible", 1e-8))
-    assert to_1_s < 2e-9
-    assert to_2_s < 1e-6  # it forgets its start: 500 times the error
 
 
 @pytest.mark.slow

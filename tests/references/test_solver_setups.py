@@ -8,7 +8,7 @@ import pytest
 
 import references
 from references import lines as lines_module
-from references.driver import TimeLimit, user_call
+from references.driver import TimeLimit
 from references.equations.straight_line import exact_jacobian, straight_line
 from references.lines import Line, lines
 from references.scipy import fully_implicit, index1
@@ -18,7 +18,7 @@ from references.sundials.cvode import solve_cvode
 from references.sundials.cvode_c import solve_cvode_c
 from references.sundials.ida_c import solve_ida_c
 from studies.bench.collector import Case, Run, attempt
-from studies.bench.solvers import CATALOGUE, OTHER_SOLVERS
+from studies.bench.solvers import CATALOGUE
 from studies.validation.study import MAKE
 from tests.marks import slow, slow_but
 from tests.problems import pendulum
@@ -186,20 +186,6 @@ def test_every_solver_is_put_to_mechanisms_with_euler_parameters(name):
         assert not errors or errors[1] < min(1e-5, 0.1 * errors[0]), (solver, errors)
 
 
-def test_a_step_of_scipy_that_is_timed_makes_no_interpolant(monkeypatch):
-    made = []
-    before = index1.METHODS["DOP853"]
-
-    class Watched(before):
-        def dense_output(self):
-            made.append(user_call.so_far())
-            return super().dense_output()
-
-    monkeypatch.setitem(index1.METHODS, "DOP853", Watched)
-    assert solve_index1(*start(PENDULUM, 2.0), t_eval=np.linspace(0.0, 2.0, 201)).success
-    assert made and not any(made)  # outside of the user's call
-
-
 # --- Jacobians
 @pytest.mark.slow
 def test_implicit_solvers_get_the_analytic_jacobian(monkeypatch):
@@ -240,15 +226,6 @@ def solve(task, rtol=1e-8, atol=1e-8):
 
 LINES = (Line("newcomer", "numpy", "numpy", solve),)
 """
-
-
-def test_names_are_those_of_the_catalogue():
-    found = lines()
-    names = [line.name for line in found]
-    assert len(set(names)) == len(names) > 25 and set(names) <= set(CATALOGUE)
-    assert [line.name for line in found if line.compared] == list(OTHER_SOLVERS)
-    for line in found:
-        assert CATALOGUE[line.name].keeps_constraints == line.keeps and CATALOGUE[line.name].family == line.family
 
 
 def test_a_file_in_the_folder_is_enough(tmp_path, monkeypatch):

@@ -10,7 +10,6 @@ from sympy.physics.mechanics import dynamicsymbols
 from tests.processes import run_python
 from twoloop import solve_dae
 from twoloop.problem import generated
-from twoloop.problem.generated import GeneratedCode
 from twoloop.symbolic import from_lagrangian
 from twoloop.symbolic.equations import Equations
 
@@ -48,18 +47,6 @@ def test_equations_that_were_derived_before_are_not_derived_again(folder, monkey
         with pytest.raises(AssertionError, match="derived again"):
             pendulum(dissipation=m * dynamicsymbols("x").diff() ** 2)
     assert pendulum(dissipation=m * dynamicsymbols("x").diff() ** 2).code.key != code.key
-
-
-def test_a_damaged_file_is_written_again(folder):
-    code = pendulum().code
-    code.value("mass")
-    (path,) = (folder / "equations").iterdir()
-    whole = path.read_text()
-    path.write_text(whole.replace("p0", "p1"))
-    assert GeneratedCode.stored(code.key) is None
-    generated._functions.cache_clear()
-    pendulum().code.value("mass")
-    assert path.read_text() == whole
 
 
 def test_parameters_change_without_compiling_again(folder):

@@ -8,8 +8,7 @@ from tests.problems import row_errors
 from tests.processes import run_python
 from tests.testing.systems import system_of
 from twoloop import mechanisms
-from twoloop.testing import problems
-from twoloop.testing.known_problems import MAKERS, TAGS
+from twoloop.testing.known_problems import MAKERS
 
 SAME_NAME = ("pendulum", "double_pendulum", "closed_chain", "four_bar", "redundant_slider_crank", "driven_slider_crank")
 SAME_NAME += ("driven_crank", "andrews", "heavy_top", "spatial_four_bar")
@@ -98,10 +97,3 @@ def test_the_motion_obeys_the_equations(name):
         values = [quantity(*state) for state in zip(motion.t, motion.q, motion.v, strict=True)]
         assert np.ptp(values) < 1e-9 * max(1.0, np.abs(values).max())
     assert min(motion.digits["q"].min(), motion.digits["v"].min()) > 9.0 and (motion.growth >= 1.0).all()
-
-
-def test_tags():
-    assert {problem.name for problem in problems("driven")} >= {"driven_crank", "driven_slider_crank"}
-    assert [problem.name for problem in problems(["closed chain", "spatial"])] == ["spatial_four_bar"]
-    assert {tag for problem in problems() for tag in problem.tags} == set(TAGS)
-    assert set(MAKERS) == {problem.name for problem in problems()}

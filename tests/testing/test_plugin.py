@@ -9,7 +9,6 @@ from xml.etree import ElementTree
 import pytest
 
 from tests.testing.planted import EXAMPLES
-from twoloop.testing import plugin
 
 ROOT = Path(__file__).parents[2]
 QUICK = ["--simulator-steps", "200,400", "--simulator-order", "4"]
@@ -71,19 +70,3 @@ def test_one_that_hangs_fails(tmp_path):
     assert done.returncode == 1 and "2 failed" in done.stdout
     assert "pendulum: runs: did not end within 0.2 s" in done.stdout
     assert "out_of_reach: says that it ends: did not end within 0.2 s" in done.stdout
-
-
-@pytest.mark.parametrize(
-    ("where", "words"),
-    [
-        ("nowhere_at_all:simulate", "--simulator nowhere_at_all:simulate: ModuleNotFoundError"),
-        ("missing.py:simulate", "FileNotFoundError"),
-        ("still.py:run", "has no attribute 'run'"),
-        ("still.py:np", "not a function but module"),
-        ("simulate", "expected MODULE:FUNCTION or FILE.py:FUNCTION"),
-    ],
-)
-def test_what_is_no_simulator(tmp_path, where, words):
-    (tmp_path / "still.py").write_text(FAULTY, encoding="utf-8")
-    with pytest.raises(pytest.UsageError, match=words):
-        plugin._loaded(where, tmp_path)

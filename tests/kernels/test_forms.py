@@ -1,19 +1,76 @@
-"""Test banded linear algebra: the runs of dense algebra, when it is chosen, and a bandwidth that is too small."""
+"""Test the linear algebra of systems with many rows or a bandwidth: runs are those of the dense forms; refusals."""
 
 import numpy as np
 import pytest
 
-from tests.problems import without_tangent, worst
+import twoloop.run.workspace as workspace_module
+from tests.general.mechanisms import error, mechanism
+from tests.problems import pendulum, some_of, violations, without_tangent, worst
 from twoloop import ConstrainedSystem, consistent_state, solve_dae
 from twoloop.kernels.algebra import lapack
-from twoloop.kernels.data import flags
 from twoloop.mechanisms.ancf_beam import very_flexible_beam
 from twoloop.methods.newmark import Newmark
 from twoloop.methods.runge_kutta import RungeKutta
 from twoloop.methods.tableaux import radau_iia
-from twoloop.run import workspace as workspace_module
-from twoloop.run.run import Run
 
+# every kind of row and of mass: redundant rows, driven ones, rows of velocities, a mass that varies and one without
+# inverse, Gamma by differences
+KINDS = (
+    "redundant slider-crank",
+    "top with its centre",
+    "pushed knife edge",
+    "wobbling disc, redundant",
+    "driven slider-crank, redundant",
+    "massless coordinate",
+    "driven crank",
+)
+
+
+@pytest.fixture
+def both(monkeypatch):
+    """The same run without and with a form of the linear algebra, which the function `choice` chooses by the size."""
+
+    def solved(choice, *start, **options):
+        runs = []
+        for answer in (False, True):
+            monkeypatch.setattr(workspace_module, choice, lambda *sizes, answer=answer: answer)
+            runs.append(solve_dae(*start, **options))
+            assert runs[-1].success, runs[-1].message
+        return runs
+
+    return solved
+
+
+# --- the sparse augmented matrix
+@pytest.mark.filterwarnings("ignore::twoloop.ConstraintWarning")
+@pytest.mark.parametrize(("name", "method"), some_of(KINDS, ["Gauss12", "DOP853", "Adams"], 1))
+def test_known_motions(both, name, method):
+    m = mechanism(name)
+    dense, sparse = both("sparse_pays", m.system(), (0.0, 0.5 * m.end), *m.start, method, 1e-10, 1e-10)
+    assert worst(dense.a[:, 0], sparse.a[:, 0]) < 1e-9 * max(1.0, np.abs(dense.a[:, 0]).max())
+    assert worst(dense.lam[:, 0], sparse.lam[:, 0]) < 1e-9 * max(1.0, np.abs(dense.lam[:, 0]).max())
+    assert error(m, sparse) < max(3.0 * error(m, dense), 1e-8)
+    assert sparse.stats.n_evaluations < 1.5 * dense.stats.n_evaluations  # at 1e-10 rounding decides on some iterations
+
+
+def test_an_entry_that_comes_later_is_found(both):
+    """The last mass is first tied by the ground, then from x = 0.05 on, by a row that begins to depend on y."""
+
+    def bent(q):
+        return max(q[0] - 0.05, 0.0)
+
+    system = pendulum(
+        constant_mass=True,
+        force=lambda t, q, v: np.array([1.0, 0.0]),
+        constraint=lambda t, q: np.array([q[1] - bent(q) ** 4]),
+        jacobian=lambda t, q: np.array([[-4.0 * bent(q) ** 3, 1.0]]),
+        gamma=lambda t, q, v: np.array([12.0 * bent(q) ** 2 * v[0] ** 2]),
+    )
+    one, other = both("sparse_pays", system, (0.0, 2.0), [0.0, 0.0], [0.0, 0.0], "Adams", 1e-9, 1e-9)
+    assert worst(one.q[:, -1], other.q[:, -1]) < 1e-7 and max(violations(system, other)) < 1e-9
+
+
+# --- bands
 NEWTON = RungeKutta(radau_iia(3), outer="newton")
 
 
@@ -54,17 +111,6 @@ def chain(n=12, stiffness=1e4, damping=0.0, lumped=False, bandwidth=3):
     return system, *consistent_state(system, 0.0, guess, np.zeros(2 * n))
 
 
-def both(system, *args, monkeypatch, **options):
-    """The run with banded linear algebra and the same with dense."""
-    results = []
-    for dense in (False, True):
-        with monkeypatch.context() as patch:
-            patch.setattr(workspace_module, "banded_pays", lambda *sizes, answer=not dense: answer)
-            results.append(solve_dae(system, *args, **options))
-    assert all(result.success for result in results), [result.message for result in results]
-    return results
-
-
 def test_other_integers_than_32_bit_are_refused(monkeypatch):
     monkeypatch.setitem(lapack.scipy.linalg.cython_lapack.__pyx_capi__, "dgbtrf", "void (npy_int64 *, npy_int64 *)")
     with pytest.raises(ImportError, match=r"cython_lapack\.dgbtrf must take 32-bit integers; it is 'void \(npy_int64"):
@@ -72,30 +118,18 @@ def test_other_integers_than_32_bit_are_refused(monkeypatch):
 
 
 @pytest.mark.parametrize(("lumped", "damping"), [(False, 20.0), (True, 0.0)])
-def test_newton_gives_the_same_run_as_dense(monkeypatch, lumped, damping):
+def test_newton_gives_the_same_run_as_dense(both, lumped, damping):
     system, q0, v0 = chain(lumped=lumped, damping=damping)
-    banded, dense = both(system, (0.0, 0.2), q0, v0, NEWTON, step_size=2e-3, monkeypatch=monkeypatch)
+    dense, banded = both("banded_pays", system, (0.0, 0.2), q0, v0, NEWTON, step_size=2e-3)
     assert worst(banded.q, dense.q) < 1e-11 and worst(banded.v, dense.v) < 1e-8
     assert banded.stats.n_outer <= 1.2 * dense.stats.n_outer and banded.stats.n_evaluations <= dense.stats.n_evaluations
 
 
-def test_mass_gives_the_same_run_as_dense(monkeypatch):
+def test_mass_gives_the_same_run_as_dense(both):
     system, q0, v0 = chain(stiffness=100.0)
-    banded, dense = both(system, (0.0, 1.0), q0, v0, Newmark(), step_size=5e-3, monkeypatch=monkeypatch)
+    dense, banded = both("banded_pays", system, (0.0, 1.0), q0, v0, Newmark(), step_size=5e-3)
     assert worst(banded.q, dense.q) < 1e-11 and worst(banded.lam, dense.lam) < 1e-8
     assert banded.stats.n_evaluations == pytest.approx(dense.stats.n_evaluations, rel=0.02)
-
-
-def test_chosen_by_size():
-    def chosen(system, q0, v0):
-        run = Run(system, NEWTON.plan(system.n_q, 1e-6, 1e-6, True), 0.0, q0, v0, 1e-6, np.full(system.n_q, 1e-6), 1e-3)
-        return int(run.functions.flags[flags.BANDWIDTH])
-
-    for n_elements, bandwidth in ((4, -1), (8, -1), (16, 11)):
-        problem = very_flexible_beam(n_elements)
-        assert chosen(problem.system, problem.q0, problem.v0) == bandwidth
-    assert chosen(*chain(20)) == -1 and chosen(*chain(28)) == 3 and chosen(*chain(28, lumped=True)) == 3
-    assert chosen(*chain(28, bandwidth=None)) == -1
 
 
 def test_cost_grows_like_the_number_of_coordinates():
