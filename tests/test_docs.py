@@ -297,6 +297,21 @@ def test_pages_are_plain_markdown_and_use_the_words_of_the_glossary():
         assert not re.search(r"rival|rows not kept", text, re.IGNORECASE), page
 
 
+@pytest.mark.parametrize(
+    ("pattern", "words"),
+    [
+        ("README.md", 900),
+        ("CHANGELOG.md", 1200),
+        ("CONTRIBUTING.md", 1200),
+        ("docs/*.md", 22_000),
+        ("reports/*.md", 7500),
+    ],
+)
+def test_pages_stay_short(pattern, words):
+    pages = [path for path in ROOT.glob(pattern) if path.name != "errors.md"]  # a list for searching
+    assert 0 < sum(len(path.read_text(encoding="utf-8").split()) for path in pages) <= words
+
+
 def test_the_menu_has_every_page_once():
     for_sphinx = documentation("for_sphinx")
     pages = Counter(page for _, section in for_sphinx.menu(text_of("docs/index.md")) for page in section)
