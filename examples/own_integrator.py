@@ -1,4 +1,4 @@
-"""Check an integrator of your own: the classical Runge-Kutta method, put back onto the constraints after each step."""
+"""Check an integrator of your own: the midpoint rule, put back onto the constraints after each step."""
 
 from functools import partial
 from itertools import pairwise
@@ -32,20 +32,15 @@ def simulate(problem, times, step, project=projected):
         n = round((end - t) / step)
         h = (end - t) / n
         for t_n in t + h * np.arange(n):
-            a1 = acceleration(problem, t_n, q, v)
-            v2 = v + h / 2 * a1
-            a2 = acceleration(problem, t_n + h / 2, q + h / 2 * v, v2)
-            v3 = v + h / 2 * a2
-            a3 = acceleration(problem, t_n + h / 2, q + h / 2 * v2, v3)
-            v4 = v + h * a3
-            a4 = acceleration(problem, t_n + h, q + h * v3, v4)
-            q, v = q + h / 6 * (v + 2 * v2 + 2 * v3 + v4), v + h / 6 * (a1 + 2 * a2 + 2 * a3 + a4)
+            middle = v + h / 2 * acceleration(problem, t_n, q, v)
+            a = acceleration(problem, t_n + h / 2, q + h / 2 * v, middle)
+            q, v = q + h * middle, v + h * a
             q, v = project(problem, t_n + h, q, v)
         rows.append((q, v))
     return tuple(np.array(column) for column in zip(*rows, strict=True))
 
 
-report = check_simulator(simulate, ["pendulum", "driven_crank"], steps=(100, 200), order=4)
+report = check_simulator(simulate, ["pendulum", "driven_crank"], steps=(100, 200), order=2)
 print(report)
 
 
@@ -57,5 +52,5 @@ def repaired(problem, t, q, v):
     return q, v - np.linalg.pinv(J) @ (J @ v + problem.constraint_rate(t, q))
 
 
-repeated = check_simulator(partial(simulate, project=repaired), "driven_crank", steps=(100, 200), order=4)
+repeated = check_simulator(partial(simulate, project=repaired), "driven_crank", steps=(100, 200), order=2)
 assert repeated.passed, str(repeated)

@@ -1,7 +1,5 @@
 """A digital controller: it reads an arm at 1 kHz, and holds its torque between the samples."""
 
-import matplotlib.pyplot as plt
-
 from twoloop import Integrator
 from twoloop.bodies import PlanarModel
 
@@ -27,10 +25,5 @@ for _ in range(2000):
 print(f"t = {sample.t:g} s, angle {sample.q[angle]:.4f} rad")
 
 result = integrator.result()  # the samples so far
-figure, (above, below) = plt.subplots(2, sharex=True, layout="constrained")
-above.plot(result.t, result.q[angle])
-above.axhline(TARGET, color="0.6", linewidth=0.8)
-above.set(ylabel="angle (rad)")
-below.step(result.t[:-1], torques, where="post")
-below.set(xlabel="t (s)", ylabel="torque (N m)")
-figure.savefig("sampled_controller.png", dpi=110)
+result.plot("sampled_controller.png")
+result.animate("sampled_controller.html")

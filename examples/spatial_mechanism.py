@@ -1,6 +1,5 @@
 """A spatial linkage with ball joints (RSSR): the torque that turns its crank at a constant rate."""
 
-import matplotlib.pyplot as plt
 import numpy as np
 
 from twoloop import solve_dae
@@ -31,10 +30,4 @@ angle = np.degrees(np.arctan2(centre[0] - D[0], centre[2] - D[2]))
 torque = result.reactions("drive").torque[2]  # about the axis of the crank, N m
 print(f"the rocker swings from {angle.min():.1f} to {angle.max():.1f} degrees")
 print(f"the crank needs between {torque.min():.2f} and {torque.max():.2f} N m")
-
-figure, (above, below) = plt.subplots(2, sharex=True, layout="constrained")
-above.plot(np.degrees(RATE * times), angle)
-above.set(ylabel="rocker (degrees)")
-below.plot(np.degrees(RATE * times), torque)
-below.set(xlabel="crank (degrees)", ylabel="torque (N m)")
-figure.savefig("spatial_mechanism.png", dpi=110)
+result.animate("spatial_mechanism.html")

@@ -141,7 +141,7 @@ def test_the_linkage_moves_as_newton_and_euler_say(run):
     assert np.hypot(*names["pin"].force)[begun] == pytest.approx(np.hypot(*forces[:, 1].T), abs=1e-4)
     assert names["error"] < 1e-7 and names["violation"] < 1e-13 and np.ptp(names["energies"]) < 1e-6
     assert "linkage" in (names["_folder"] / "linkage.html").read_text(encoding="utf-8")
-    assert (names["_folder"] / "heights.png").stat().st_size > 5000
+    assert (names["_folder"] / "linkage.png").stat().st_size > 5000
 
 
 def test_the_spatial_mechanism_has_the_geometry_and_the_power_of_its_drive(run):
@@ -328,11 +328,14 @@ def test_start_here_draws_the_bars_of_its_sketch(run):
     assert bars == pytest.approx(sorted(np.linalg.norm(b - a) for a, b in pairwise(corners)))
 
 
-def test_many_runs_has_the_workspace_and_the_sweep(run):
+def test_the_sweep_of_many_runs_has_a_row_for_each(run):
     names = run("docs/many_runs.md")
-    assert names["again"].success and {"workspace.png"} <= {path.name for path in names["_folder"].iterdir()}
-    assert np.hypot(*(names["workspace"].q[:, 3:5].transpose(1, 0, 2).reshape(2, -1))).max() < 4.0
     assert len(names["rows"]) == 20 and set(names["rows"]["status"]) == {"REACHED_END"}
+    alone = (
+        names["again"].q[8, -1],
+        names["runs"].q[0, 8, -1],
+    )  # by the Integrator at looser tolerances, and in the ensemble
+    assert names["again"].success and alone[0] == pytest.approx(alone[1], abs=1e-4)
 
 
 def pendulum(t):
