@@ -30,7 +30,8 @@ from studies.honesty.traps import (
 
 RIGHT, SAID, SILENT, HANG, NOT_RUN = "right", "reported failure", "silently wrong", "hangs", "not run"
 BAD = (SILENT, HANG)
-LOOSENESS = 1e3  # an answer is right within so many times the tolerance
+LOOSENESS = 1e3  # an answer is right within so many times the tolerance ...
+LEAST = 1e-10  # ... of which no less counts: rounding decides there
 USUAL = 1e-8  # tolerance of all traps that are not about tolerances
 PUBLISHED, AUTHORS = "published", "authors"  # groups of the rows of validation
 BRIEF = LOOK * T_END  # s: forces that change with time are evaluated at least so often
@@ -68,7 +69,7 @@ def of_validation(rows: pd.DataFrame) -> pd.DataFrame:
     own = rows["family"] == "two-loop"
     names = rows["solver"].astype(str).str.removesuffix(OWN_SUFFIX) + np.where(own, OWN_SUFFIX, "")
     by_authors = rows["group"] == JUDGED
-    allowed = LOOSENESS * rows[["tol", "floor"]].max(axis=1)
+    allowed = LOOSENESS * rows[["tol", "floor"]].max(axis=1).clip(lower=LEAST)
     wrong = (rows["outcome"] == "wrong").where(by_authors, rows["error_q"].astype(float) > allowed)
     ended = rows["outcome"].isin(("right", "inexact", "wrong"))
     outcome = pd.Series(np.where(wrong, np.where(rows["warnings"] > 0, SAID, SILENT), RIGHT), rows.index)
@@ -146,6 +147,7 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     found["singular"] = {"tolerances": [max(TOLERANCES), min(TOLERANCES)]}
     found["singular"]["plain"] = graded(singular[singular["solver"] == PLAIN])["failed"]
     found |= {"look": LOOK, "brief": BRIEF, "t_end": T_END, "exact": EXACT, "usual": USUAL, "looseness": LOOSENESS}
+    found["least"] = LOOSENESS * LEAST
     # which methods the traps in models and settings deceive
     found["counts"] = {str(name): graded(own) for name, own in mistakes.groupby("solver", sort=False)}
     return found | {"n_traps": int(mistakes["trap"].nunique()), "seed": SEED, "answer": answer_of(found["table"])}

@@ -18,6 +18,7 @@ from studies.bench.store import Array, Output, Row, read_rows
 from studies.bench.study import Study
 from studies.honesty.findings import (
     HANG,
+    LEAST,
     LOOSENESS,
     NOT_RUN,
     RIGHT,
@@ -45,7 +46,6 @@ from twoloop import ConstrainedSystem, solve_dae
 from twoloop.__main__ import compile_all
 from twoloop.kernels.compile import callbacks
 
-LEAST = 1e-10  # no tolerance below it is asked for: rounding decides there
 GRACE = 6.0  # s beyond the time limit of a run after which it hangs
 TRUTHS = (1e-12, 1e-10, 1e-9)  # tolerances of the two runs that give the right answer: the first that succeed
 TRUTH_LIMIT = 10.0  # s that one of them may take
