@@ -162,15 +162,6 @@ class TestInMuJoCo:
         made = audit_mjcf(file_with(tmp_path, *self.CHANGES[name]), error=1e-2, t_end=0.1)
         assert made.audits[-1].runs[-1].error < 1e-4
 
-    def test_a_keyframe_is_where_it_starts_with_loops_closed(self, tmp_path):
-        key = '<keyframe><key name="swung" qpos="0.3 0 0" qvel="3 0 0"/><key qpos="0 0 0"/></keyframe>'
-        path = file_with(tmp_path, end(key))
-        made = audit_mjcf(path, error=1e-2, t_end=0.2, key="swung")
-        assert any("were open by 0.25 m" in note for note in made.notes) and "'swung'" in made.start
-        assert made.audits[-1].runs[-1].error < 1e-3
-        with pytest.raises(ValueError, match="no keyframe 'no'; it has swung, 1"):
-            audit_mjcf(path, key="no")
-
     @pytest.mark.parametrize(
         ("changes", "words"),
         [

@@ -40,7 +40,6 @@ from twoloop import callback
 import constants, helpers
 from constants import *
 from helpers import *
-from own_caches import *
 
 class Callbacks:
     pass
@@ -83,7 +82,6 @@ class Folder:
         self.cache = with_kernels(path / "cache")
         self.write("constants", "")
         self.write("helpers", "")
-        self.write("own_caches", "")
 
     def write(self, name, text):
         (self.path / f"{name}.py").write_text(text)
@@ -125,8 +123,6 @@ VALUES = {
     "the_default_of_a_helper": "with_default()",
     "the_helper_of_a_helper": "outer(q[0])",
     "the_global_of_a_helper": "named(q[0])",
-    "what_a_helper_with_a_cache_of_its_own_calls": "own_cache(q[0])",
-    "the_same_compiled_at_once": "own_cache_at_once(q[0])",
     "an_enclosed_value": "enclosed;FLOAT",
     "an_enclosed_helper": "enclosed(q[0]);helper",
     "what_cannot_be_watched": "overloaded(q[0])",
@@ -155,16 +151,6 @@ def overloaded(x):
 @overload(overloaded)
 def _overloaded(x):
     return lambda x: {0}.0 * x
-"""
-OWN_CACHES = """
-import numba
-from inner import inner
-@numba.njit(cache=True)
-def own_cache(x):
-    return inner(x)
-@numba.njit("f8(f8)", cache=True)
-def own_cache_at_once(x):
-    return inner(x)
 """
 KERNELS = """
 from twoloop.kernels.data.common import kernel, f8
@@ -204,7 +190,7 @@ DAMAGES = {  # what stands in the file of a callback instead of its machine code
 @pytest.mark.slow
 def test_what_changes_in_other_files_and_damage_make_machine_code_stale(folder):
     folder.mechanism(**VALUES)
-    folder.write("own_caches", OWN_CACHES + KERNELS)  # does not change
+    folder.write("kernels", KERNELS)  # does not change
     folder.write("systems", SYSTEMS)
     for factor in (1, 2):
         for name, text in {"constants": CONSTANTS, "helpers": HELPERS, "inner": INNER}.items():
@@ -212,7 +198,7 @@ def test_what_changes_in_other_files_and_damage_make_machine_code_stale(folder):
         kept = factor - 1  # what names none of it is read from the disk the second time
         same = {"nothing": (1.0, kept), "mass_1": (1.0, kept), "mass_10": (10.0, kept)}
         changed = {name: (factor, 0) for name in VALUES} | {"force_1": (factor, 0), "force_10": (10.0 * factor, 0)}
-        assert folder.values(f"{RUN}\nimport systems") == changed | same
+        assert folder.values(f"import kernels\n{RUN}\nimport systems") == changed | same
         assert folder.said.count(ANNOUNCED) == 1 - kept  # of the kernels
 
     def file(name):

@@ -11,11 +11,9 @@ from tests import problems
 from tests.compiled import unit_mass
 from tests.problems import kept, pendulum, quick, unconstrained, worst
 from twoloop import ConstrainedSystem, Status, callback, consistent_state, mechanisms, solve_dae
-from twoloop.generate.calls_on_symbols import as_forms
 from twoloop.generate.derived import standing_for
 from twoloop.generate.series import series_program
-from twoloop.generate.traced_values import Traced, unchecked
-from twoloop.generate.tracing import Graph
+from twoloop.generate.traced_values import unchecked
 from twoloop.kernels.data.codes import DONE
 from twoloop.kernels.data.common import KIT, VECTOR, WORK, f8, i8
 from twoloop.kernels.evaluation.accelerations import acceleration_constraint
@@ -225,32 +223,6 @@ def test_random_numbers_are_seen():
     rng = np.random.default_rng(0)
     with pytest.raises(ValueError, match="does not give what its operations give"):
         run(pendulum(force=lambda t, q, v: WEIGHT - rng.uniform(1.0, 1.001) * v))
-
-
-def traced(system, **changed):
-    """What the callbacks of a system were traced to, with other operations in the place of some."""
-    graph = Graph()
-    t, *x = graph.inputs(1, False) + graph.inputs(system.n_q, False) + graph.inputs(system.n_q, True)
-    for kind, function in changed.items():
-        made = function(t, np.array(x[: system.n_q]), np.array(x[system.n_q :]))
-        graph.traced[kind] = as_forms(graph, np.array(made, dtype=object))
-    return Traced(system, graph)
-
-
-STATES = np.column_stack([np.linspace(0.0, 1.0, 9), np.random.default_rng(2).uniform(0.5, 1.5, (9, 4))])
-
-
-@pytest.mark.parametrize(
-    "function",
-    [
-        lambda t, q, v: [0.0, -9.81],
-        lambda t, q, v: [1e6 * (q[0] + 1e8) - 1e6 * q[0] - 1e14, -9.81],
-        lambda t, q, v: [q[0].sine() ** 2 + q[0].cosine() ** 2 - 1.0, -9.81],
-        lambda t, q, v: [0.0, -9.81 - (q[0] * 1e8) ** 2 + (q[0] * 1e4) ** 2 * 1e8],
-    ],
-)
-def test_rounding_is_no_difference(function):
-    assert traced(pendulum(), force=function).wrong(pendulum(), STATES) is None
 
 
 # symmetry of M ------------------------------------------------------------------------------------------------------
