@@ -1,13 +1,13 @@
 """How figures, tables and sentences call a solver: the one mapping from the names of rows, which CSV files keep.
 
 Of `method="auto"` there are three ways, "the default", "compiled=True" and "compiled=False"; other methods of ours have
-the value of `method`, with `compiled` where it is not what `solve_dae` does by itself. Rivals have their names.
+the value of `method`, with `compiled` where it is not what `solve_dae` does by itself. Other solvers have their names.
 """
 
 from studies.bench.solvers import COMPILED, DEFAULT, GIVEN, OWN_EXPLICIT
 from twoloop.methods.presets import PRESETS
 
-SUFFIX = " (twoloop)"  # of ours, where a rival has such a name, too
+SUFFIX = " (twoloop)"  # of methods of twoloop, where another solver has such a name, too
 WITH, WITHOUT = "compiled", "not compiled"  # after a comma, of rows; without either: as a study runs its methods
 ON_SCIPY = "solve_dae"  # another project, whose methods have names of SciPy's
 SCIPY = ("LSODA, ", "DOP853, ", "Radau, ", "BDF, ", "RK45, ")  # how rows of SciPy's begin, which ours may, too
@@ -55,22 +55,8 @@ def call(solver: str, coded: bool | None = None) -> str:
     return f'`method="{method}"{", " * bool(option)}{option}`'
 
 
-def whose(n_ours: int) -> dict[str, str]:
-    """Kinds of solvers in sentences on silent errors, in their order; `n_ours`: of ours beside the default."""
-    return {
-        "default": "the default",
-        "ours": f"our {n_ours} other methods",
-        "set": "some of these with `compiled` set",
-        "heyoka": "heyoka",
-        "cyrk": "CyRK",
-        "sundials": "IDA and CVODE",
-        "scipy": "SciPy",
-        "limited": "other projects' solvers with `max_step`",
-    }
-
-
 def project(solver: str) -> str:
-    """Whose solver a row is, for rivals: what stands before its method."""
+    """The project of another solver: what stands before its method."""
     return solver.partition(", ")[0]
 
 

@@ -43,11 +43,6 @@ def power(value: float) -> str:
     return f"{mantissa}e{int(exponent)}"
 
 
-def one_digit(value: float) -> str:
-    """A count to one digit: 30000 for 29817."""
-    return f"{float(f'{value:.0e}'):.0f}"
-
-
 def brief(stamp: str) -> str:
     """Command, date, commit and machine of a stamp; the first line of the CSV has the versions, too."""
     return "; ".join(stamp.split("; ")[:4])
@@ -90,7 +85,7 @@ def environment() -> jinja2.Environment:
         "listed": listed,
     }
     made.filters |= {"brief": brief}
-    made.globals |= {"table": table, "whose": names.whose}
+    made.globals |= {"table": table}
     return made
 
 

@@ -29,12 +29,20 @@ from twoloop.problem.problem import Array
 Row = dict[str, Any]
 FOLDERS = ("twoloop", "references", "studies")  # a change in any of these makes kept rows worthless
 NUMERICS = ("numpy", "scipy", "numba")
-# studies whose times are compared, so that no two run at once
+# studies, and parts of the study of reproduction, whose times are compared, so that no two run at once
 TIMED = (
-    *("work_precision", "compare", "table3", "beam", "energy", "violation", "symbolic_size", "sweep_linkages"),
-    *("ensembles", "ablation", "engines", "scale"),
+    "work_precision",
+    "compare",
+    "table3",
+    "energy",
+    "ensembles",
+    "engines",
+    "scale",
+    "beam",
+    "violation",
+    "ablation",
 )
-WHOLE_CALL = "whole call"  # what their times are of, in their findings
+MADE_BY = dict.fromkeys(("motion", "step_size", "violation", "beam", "ablation"), "reproduction")
 LOCK = "twoloop-timed.lock"  # in the machine's folder of temporary files
 NO_LINK = getattr(os, "O_NOFOLLOW", 0)
 
@@ -125,7 +133,7 @@ class Output:
         asked for.
         """
         path = self.file(f"{self.call.study}.csv")
-        rerun = f"make it again by python -m studies.{self.call.study}"
+        rerun = f"make it again by {command_of(self.call.study)}"
         if not path.is_file():
             raise StudyError(f"there is no {path} to redraw from; {rerun}")
         rows, first = read_rows(path)
@@ -149,8 +157,7 @@ class Output:
 
     def save_findings(self, findings: Mapping[str, Any]) -> None:
         """Write NAME.json; what is not finite becomes null."""
-        told = {"timed": WHOLE_CALL} if self.call.study in TIMED else {}
-        text = json.dumps(plain({**findings, **told}), indent=1, allow_nan=False, ensure_ascii=False)
+        text = json.dumps(plain(findings), indent=1, allow_nan=False, ensure_ascii=False)
         self.write(f"{self.call.study}.json", text + "\n")
 
     def load_findings(self) -> dict[str, Any]:
@@ -181,8 +188,12 @@ def read_rows(path: Path, *columns: str) -> tuple[pd.DataFrame, str]:
         _ = rows[list(columns)]
         return rows, first
     except (ValueError, KeyError) as error:
-        again = f"make it again by python -m studies.{path.stem}"
-        raise StudyError(f"{path} is damaged ({error}); {again}") from None
+        raise StudyError(f"{path} is damaged ({error}); make it again by {command_of(path.stem)}") from None
+
+
+def command_of(name: str) -> str:
+    """Tell the command that makes NAME.csv."""
+    return f"python -m studies.{MADE_BY[name]} {name}" if name in MADE_BY else f"python -m studies.{name}"
 
 
 def key(row: pd.Series) -> str:

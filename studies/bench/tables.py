@@ -132,14 +132,6 @@ def time_for(rows: pd.DataFrame, target: float, what: str = "call_s") -> float:
     return float("nan") if place is None else float(cost_at(runs.of(what), place))
 
 
-def run_for(rows: pd.DataFrame, target: float) -> pd.Series:
-    """The run of one solver that `time_for` prices, where there is one."""
-    runs = runs_with(rows, "call_s")
-    place = place_of(runs, target, unasked=True)
-    assert place is not None
-    return rows.iloc[cheapest(runs, place)]
-
-
 Costs = dict[str, tuple[float, Array]]  # by solver the time at an error, and draws of it (RESAMPLES,)
 
 
@@ -251,11 +243,6 @@ def of_both(ranked: pd.DataFrame) -> dict[str, dict[str, Any] | None]:
     """The cheapest of ours and of others in a ranking."""
     own = ranked["family"] == "two-loop"
     return {"ours": best(ranked[own]), "others": best(ranked[~own])}
-
-
-def put(rows: pd.DataFrame) -> pd.DataFrame:
-    """Those rows for which a solver was started: a refusal is our adapter's, and says nothing of the solver."""
-    return rows[~rows["status"].isin((*NOTHING_RUN, "RAISED"))]
 
 
 def missed(rows: pd.DataFrame, target: float) -> bool:
