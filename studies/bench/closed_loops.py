@@ -1,4 +1,4 @@
-"""Mechanisms with closed loops made of bodies and joints, for programs that take such: a model each, and its time."""
+"""Build the mechanisms with closed loops that physics engines run, of bodies and joints."""
 
 import math
 import sys
@@ -21,7 +21,7 @@ numbers = sys.modules[ready_andrews.__module__]  # those of the squeezer
 
 
 def _closing(one: Array, r: float, other: Array, s: float) -> Array:
-    """The point at distances r and s from two points, to the left of the way from one to the other."""
+    """Return the point at distances r and s from two points, to the left of the way from one to the other."""
     along = other - one
     d = float(np.linalg.norm(along))
     x = (r * r - s * s + d * d) / (2.0 * d)
@@ -32,7 +32,7 @@ def _closing(one: Array, r: float, other: Array, s: float) -> Array:
 def _linkage(
     name: str, crank: float, coupler: float, rocker: float, base: float, angle: float, rate: float
 ) -> PlanarModel:
-    """A four-bar linkage of uniform rods of 1 kg/m, its crank turning."""
+    """Build a four-bar linkage of uniform rods of 1 kg/m, its crank turning."""
     O, C = np.zeros(2), np.array([base, 0.0])
     A = crank * np.array([math.cos(angle), math.sin(angle)])
     B = _closing(A, coupler, C, rocker)
@@ -45,14 +45,14 @@ def _linkage(
 
 
 def _pinned(model: PlanarModel, pins: Iterable[tuple[str, str, Any]]) -> PlanarModel:
-    """The model with hinges between two of its bodies at places."""
+    """Add hinges between two bodies at places, and return the model."""
     for a, b, at in pins:
         model.revolute(a, b, at=at)
     return model
 
 
 def four_bar() -> ModelProblem:
-    """The four-bar of the paper, 1, 2 and 1.5 m on 3 m, as the library starts it."""
+    """Build the four-bar of the paper, 1, 2 and 1.5 m on 3 m, as the library starts it."""
     known = ready_four_bar()
     q, v = known.q0.reshape(3, 3), known.v0.reshape(3, 3)
     model = PlanarModel(name="four-bar")
@@ -70,17 +70,17 @@ def four_bar() -> ModelProblem:
 
 
 def crank_rocker() -> ModelProblem:
-    """A four-bar whose crank turns round: 0.5, 2 and 1.5 m on 1.8 m."""
+    """Build a four-bar whose crank turns round: 0.5, 2 and 1.5 m on 1.8 m."""
     return _linkage("crank-rocker", 0.5, 2.0, 1.5, 1.8, 0.5, 8.0).problem((0.0, 10.0))
 
 
 def parallelogram() -> ModelProblem:
-    """1, 2 and 1 m on 2 m: the bars line up twice a turn, where it could fold."""
+    """Build a parallelogram, 1, 2 and 1 m on 2 m: the bars line up twice a turn, where it could fold."""
     return _linkage("parallelogram", 1.0, 2.0, 1.0, 2.0, 0.5 * math.pi, 8.0).problem((0.0, 2.0))
 
 
 def parallelogram_motion(times: Array, torque: float = 0.0) -> tuple[Array, Array, float]:
-    """Coordinates and velocities (9, n_t) of the parallelogram that does not fold, and how far two routes differ.
+    """Return q and v (9, n_t) of the parallelogram that does not fold, and the difference of two solutions.
 
     `torque`: on its crank, N m.
     Its bars turn alike, with a moment of inertia of 2/3 + 2 kg m^2 and the weight of 3 kg at the end of a bar of 1 m.
@@ -99,7 +99,7 @@ def parallelogram_motion(times: Array, torque: float = 0.0) -> tuple[Array, Arra
 
 
 def six_bar() -> ModelProblem:
-    """Watt's linkage: a four-bar whose coupler, a triangle, moves a second loop."""
+    """Build Watt's linkage: a four-bar whose coupler, a triangle, moves a second loop."""
     O, A, B, C, D_, E, F = (0.0, 0.0), (0.0, 0.5), (1.6, 1.1), (2.0, 0.0), (0.7, 1.6), (2.6, 1.9), (3.2, 0.0)
     model = PlanarModel(name="Watt's six-bar")
     model.rod("crank", O, A, mass=0.5, angular_velocity=-6.0)
@@ -112,7 +112,7 @@ def six_bar() -> ModelProblem:
 
 
 def slider_crank() -> ModelProblem:
-    """A slider-crank with two coupler rods between the same pins: the second adds a row that follows from others."""
+    """Build a slider-crank with two coupler rods between the same pins: the second adds a redundant row."""
     crank, rod, angle = 0.5, 1.2, 0.5
     pin = crank * np.array([math.cos(angle), math.sin(angle)])
     end = np.array([pin[0] + math.sqrt(rod**2 - pin[1] ** 2), 0.0])
@@ -130,7 +130,7 @@ def slider_crank() -> ModelProblem:
 
 
 def closed_chain(n: int = 50) -> ModelProblem:
-    """Uniform bars, 1 kg and 2 m / n long, hung between two points 1.6 m apart, released from an arc above these."""
+    """Build a chain of 1 kg and 2 m, hung between two points 1.6 m apart and released from an arc above these."""
     # half the angle of the arc, whose chord and length have the ratio 0.8 of n equal chords
     half = brentq(lambda each: math.sin(each) - 0.8 * n * math.sin(each / n), 0.1, 3.0)
     radius = 0.8 / math.sin(half)
@@ -144,7 +144,7 @@ def closed_chain(n: int = 50) -> ModelProblem:
 
 
 def squeezer() -> ModelProblem:
-    """Andrews' squeezing mechanism, of seven bodies, three loops, a spring and a constant torque."""
+    """Build Andrews' squeezing mechanism, of seven bodies, three loops, a spring and a constant torque."""
     known = ready_andrews()
     beta, theta, gamma, phi, delta, omega, epsilon = known.q0
     A, B, C = np.array([numbers.XA, numbers.YA]), np.array([numbers.XB, numbers.YB]), np.array([numbers.XC, numbers.YC])
@@ -183,7 +183,7 @@ ASKEW = rotation_matrix(np.array([0.5, 0.7, -0.1, 0.5]))  # about no axis of the
 
 
 def rssr(Q: Array = UPRIGHT) -> ModelProblem:
-    """A spatial four-bar with two hinges and two ball joints."""
+    """Build a spatial four-bar with two hinges and two ball joints."""
     model = SpatialModel(gravity=Q @ [0.0, 0.0, -9.81], name="RSSR")
     O, P, S, T = np.array([(0.0, 0.0, 0.0), (0.3, 0.0, 0.0), (0.9, 0.0, 1.0), (0.9, 0.0, 0.3)]) @ Q.T
     model.rod("crank", O, P, radius=0.02, mass=0.8, angular_velocity=6.0 * Q[:, 2])
@@ -197,7 +197,7 @@ def rssr(Q: Array = UPRIGHT) -> ModelProblem:
 
 
 def bricard(Q: Array = UPRIGHT) -> ModelProblem:
-    """Bricard's six hinges, five bars of 1 kg and 1 m and the ground: it moves though its rows seem one too many."""
+    """Build Bricard's loop of six hinges, with five bars of 1 kg and 1 m: one of its rows is redundant."""
     C = np.array([[0, 0, 0], [1, 0, 0], [1, -1, 0], [1, -1, 1], [0, -1, 1], [0, 0, 1]], dtype=float) @ Q.T
     axes = np.eye(3)[[1, 2, 0, 1, 2, 0]] @ Q.T
     model = SpatialModel(gravity=Q @ [0.0, -9.81, 0.0], name="Bricard")
@@ -212,7 +212,7 @@ def bricard(Q: Array = UPRIGHT) -> ModelProblem:
 
 
 def governor(Q: Array = UPRIGHT) -> ModelProblem:
-    """Watt's flyball governor: arms hinged to a turning shaft, links from these to a sleeve that slides on it."""
+    """Build Watt's flyball governor: arms hinged to a turning shaft, links from these to a sleeve that slides on it."""
     model = SpatialModel(gravity=Q @ [0.0, 0.0, -9.81], name="flyball governor")
     x, y, z = Q.T
     model.rod("shaft", np.zeros(3), z, radius=0.02, mass=1.0, angular_velocity=9.0 * z)
@@ -233,7 +233,7 @@ def governor(Q: Array = UPRIGHT) -> ModelProblem:
 
 
 def stewart(Q: Array = UPRIGHT, stiffness: float = 600.0, damping: float = 0.0) -> ModelProblem:
-    """A platform on six legs, each two bodies that slide on one another, with a spring from base to platform."""
+    """Build a platform on six legs, each two bodies that slide on one another, with a spring from base to platform."""
     model = SpatialModel(gravity=Q @ [0.0, 0.0, -9.81], name="Stewart platform")
     moving = {"velocity": Q @ [0.3, 0.1, 0.0], "rotation": Q}
     model.body("platform", mass=4.0, inertia=(0.4, 0.4, 0.8), position=Q[:, 2], **moving)

@@ -1,4 +1,4 @@
-"""Runs of physics engines on closed loops: reference motions, gates before anything is timed, and rows."""
+"""Run physics engines on closed loops: reference motions, checks of the models, errors and times."""
 
 import time
 import warnings
@@ -30,7 +30,7 @@ TIMED, ENOUGH = 3, 0.3  # calls of which the shortest counts, and s of CPU after
 
 @dataclass(frozen=True)
 class Loop:
-    """A mechanism with its reference; `floor`: how far its two routes differ, over all instants."""
+    """A mechanism with its reference motion."""
 
     problem: ModelProblem
 
@@ -46,7 +46,7 @@ class Loop:
     def times(self) -> Array:
         return np.linspace(0.0, self.t_end, INSTANTS + 1)
 
-    def ours(self, tolerance: float, times: Array | None = None, t0: float = 0.0, **more: Any) -> Any:
+    def solve(self, tolerance: float, times: Array | None = None, t0: float = 0.0, **more: Any) -> Any:
         options: dict[str, Any] = {"rtol": tolerance, "atol": tolerance, "t_eval": times, **more}
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", ConstraintWarning)
@@ -55,14 +55,14 @@ class Loop:
 
     @cached_property
     def reference(self) -> tuple[Motion, float]:
-        """The motion by a route, and how far another, unlike, ends up from it at any instant.
+        """Return the motion, and the largest difference of a second, unlike solution at any instant.
 
         Raises RuntimeError if one of them fails.
         """
-        if self.problem.name in (PARALLEL, PARALLEL + DRIVEN):  # ours do not cross its singular positions so tightly
+        if self.problem.name in (PARALLEL, PARALLEL + DRIVEN):  # no method crosses its singular positions so tightly
             q, v, apart = parallelogram_motion(self.times, self.rigid.torques[0, 2])
             return self.motion(q, v), apart
-        plain = partial(self.ours, TIGHT, self.times, compiled=False)  # references are no reason to compile
+        plain = partial(self.solve, TIGHT, self.times, compiled=False)  # references are no reason to compile
         runs = [plain(method=method) for method in ("DOP853", "RadauIIA9")]
         if not all(run.success for run in runs):
             raise RuntimeError(next(run.message for run in runs if not run.success))
@@ -71,7 +71,7 @@ class Loop:
 
     @cached_property
     def kinetic(self) -> float:
-        """The largest kinetic energy of the reference, J."""
+        """Return the largest kinetic energy of the reference, J."""
         known, bodies = self.reference[0], self.rigid.model.bodies
         J = np.array([tensor(body.inertia) for body in bodies])
         local = np.einsum("tkji,tkj->tki", known.R, known.w)
@@ -80,32 +80,32 @@ class Loop:
         return float(0.5 * each.sum(axis=1).max())
 
     def force(self, run: Any) -> Array:
-        """Of the first joint that closes a loop in a run of ours, as in `Motion`; NaN if it is not unique."""
+        """Return the force of the first joint that closes a loop, as in `Motion`; NaN if it is not unique."""
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", ConstraintWarning)
-            made = run.reactions(self.rigid.cut)
-        if not made.unique:
+            reaction = run.reactions(self.rigid.cut)
+        if not reaction.unique:
             return np.full((run.t.size, 3), np.nan)
-        return np.pad(made.force.T, ((0, 0), (0, 3 - len(made.force))))
+        return np.pad(reaction.force.T, ((0, 0), (0, 3 - len(reaction.force))))
 
     def motion(
         self, q: Array, v: Array, f: Array | None = None, call_s: float = 0.0, stepping_s: float = 0.0
     ) -> Motion:
-        """Of coordinates of the model, at the instants."""
+        """Return the motion of coordinates of the model, at the instants."""
         f = np.full((q.shape[1], 3), np.nan) if f is None else f
         return Motion(self.times[: q.shape[1]], *states(self.rigid.planar, q, v), f, call_s, stepping_s)
 
     @cached_property
     def start_rates(self) -> dict[float, tuple[Array, Array]]:
-        """Changes of v and w within the times of the gates, by these."""
+        """Return the changes of v and w within the times of the checks, by these times."""
         spans = [0.0, *sorted({share * self.t_end for share, _ in GATES})]
-        run = self.ours(TIGHT, np.array(spans), method="DOP853", compiled=False)
+        run = self.solve(TIGHT, np.array(spans), method="DOP853", compiled=False)
         _, _, v, w = states(self.rigid.planar, run.q, run.v)
         return {span: (v[k] - v[0], w[k] - w[0]) for k, span in enumerate(spans)}
 
 
 def gate(loop: Loop, prepared: Prepared) -> str:
-    """What is wrong with a model before anything is timed; nothing if it is the mechanism that was asked for."""
+    """Say what is wrong with a model before anything is timed; an empty text if it is the mechanism."""
     rigid = loop.rigid
     bodies = rigid.model.bodies
     for what, own, given in (
@@ -135,7 +135,7 @@ def gate(loop: Loop, prepared: Prepared) -> str:
 
 
 def _accelerated(loop: Loop, motion: Motion, span: float) -> str:
-    """Whether velocities change as they should, those of turning at the bodies' radii of gyration."""
+    """Say by how much accelerations at the start are off; angular ones at the bodies' radii of gyration."""
     dv, dw = loop.start_rates[span]
     bodies = loop.rigid.model.bodies
     size = np.array([np.sqrt(np.trace(tensor(each.inertia)) / 2.0 / each.inertia[0]) for each in bodies])[:, None]
@@ -149,21 +149,25 @@ def _accelerated(loop: Loop, motion: Motion, span: float) -> str:
 
 
 def errors(loop: Loop, motion: Motion) -> Row:
-    """What a motion that reached its end is off by, at the instants."""
+    """Return the largest errors of a motion that reached its end, over the instants."""
     (known, _), rigid = loop.reference, loop.rigid
     off = max(np.abs(motion.x - known.x).max(), np.abs(motion.R - known.R).max())
     fastest = max(np.linalg.norm(known.v, axis=2).max(), 1e-12)
     energies = [loop.problem.energy(each.t, *coordinates(each, rigid.planar)) for each in (motion, known)]
     d = 2 if rigid.planar else 3  # what holds a mechanism in its plane is not unique
     f = np.abs(motion.f - known.f)[1:, :d].max() / np.abs(known.f[:, :d]).max()  # Drake's first step holds no loop
-    found: dict[str, Any] = {"error_f": float(f), "error_q": float(off)}
-    found |= {"error_v": float(np.abs(motion.v - known.v).max() / fastest)}
-    found |= {"gap": float(gaps(rigid.model, motion.x, motion.R).max())}
-    return found | {"energy": float(np.abs(energies[0] - energies[1]).max() / loop.kinetic)}
+    values = {
+        "error_f": f,
+        "error_q": off,
+        "error_v": np.abs(motion.v - known.v).max() / fastest,
+        "gap": gaps(rigid.model, motion.x, motion.R).max(),
+        "energy": np.abs(energies[0] - energies[1]).max() / loop.kinetic,
+    }
+    return {name: float(value) for name, value in values.items()}
 
 
 def timed(run: Callable[[int], Motion]) -> tuple[float, float]:
-    """CPU time of the shortest of some calls, whole and stepping; run(k) makes the k-th."""
+    """Return the CPU time of the shortest of some calls, whole and stepping; run(k) makes the k-th."""
     calls: list[tuple[float, float]] = []
     began = time.process_time()
     while len(calls) < TIMED and (not calls or time.process_time() - began < ENOUGH):

@@ -1,4 +1,4 @@
-"""Assemblies of any n bodies: chains, ladders, trees, stars and grids with pins; chains and trees of hinges."""
+"""Build assemblies of any n bodies: chains, ladders, trees, stars and grids with pins; chains and trees of hinges."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -38,7 +38,7 @@ class Bars:
         self.centres = np.zeros((n, 2))
 
     def end(self, k: int, side: float) -> Array:
-        """Where an end of bar k is; side is -1 or 1."""
+        """Return the place of an end of bar k; side is -1 or 1."""
         return self.centres[k] + side * self.half * np.array([np.cos(self.angles[k]), np.sin(self.angles[k])])
 
     def hang(self, k: int, at: Array, on: int, side: float) -> None:
@@ -47,7 +47,7 @@ class Bars:
         self.bodies.pin(k, (-self.half, 0.0), on, tuple(at) if on == GROUND else (side * self.half, 0.0))
 
     def assembly(self, name: str) -> Assembly:
-        """The system, and its position."""
+        """Return the system and its position."""
         q = np.column_stack([self.centres, self.angles]).ravel()
         return Assembly(self.bodies.system(name), q, self.bodies)
 
@@ -57,7 +57,7 @@ def _leaning(n: int) -> Array:
 
 
 def _hung(n: int, on: Callable[[int], int]) -> Bars:
-    """Bars of which the first hangs on a pin, and bar k on the end of bar on(k)."""
+    """Build bars of which the first hangs on a pin, and bar k on the end of bar on(k)."""
     bars = Bars(_leaning(n))
     for k in range(n):
         bars.hang(k, bars.end(on(k), 1.0) if k else np.zeros(2), on(k) if k else GROUND, 1.0)
@@ -65,19 +65,19 @@ def _hung(n: int, on: Callable[[int], int]) -> Bars:
 
 
 def open_chain(n: int) -> Assembly:
-    """A chain that hangs on a pin."""
+    """Build a chain that hangs on a pin."""
     return _hung(n, lambda k: k - 1).assembly(f"open chain of {n}")
 
 
 def closed_chain(n: int) -> Assembly:
-    """The same with a pin at its other end."""
+    """Build the open chain with a pin at its other end."""
     bars = _hung(n, lambda k: k - 1)
     bars.bodies.pin(n - 1, (bars.half, 0.0), GROUND, tuple(bars.end(n - 1, 1.0)))
     return bars.assembly(f"closed chain of {n}")
 
 
 def ladder(n: int) -> Assembly:
-    """Two chains of n // 3 bars, with a bar from joint to joint after each: as many loops, of parallelograms."""
+    """Build two chains of n // 3 bars, with a bar from joint to joint after each: as many loops, of parallelograms."""
     m = n // 3
     bars = Bars(np.concatenate([np.repeat(_leaning(m), 2), np.full(m, LEVEL)]))
     across = 2.0 * bars.half * np.array([np.cos(LEVEL), np.sin(LEVEL)])
@@ -92,17 +92,17 @@ def ladder(n: int) -> Assembly:
 
 
 def tree(n: int) -> Assembly:
-    """A binary tree."""
+    """Build a binary tree."""
     return _hung(n, lambda k: (k - 1) // 2).assembly(f"tree of {n}")
 
 
 def star(n: int) -> Assembly:
-    """All bars on the end of one."""
+    """Build bars that all hang on the end of one."""
     return _hung(n, lambda k: 0).assembly(f"star of {n}")
 
 
 def grid(n: int) -> Assembly:
-    """A net that hangs on a corner: beads with bars to the right and below, and at its end what is left as a chain."""
+    """Build a net that hangs on a corner: beads with bars to the right and below; bars that are left are a chain."""
     side = max(k for k in range(1, n + 1) if 3 * k * k - 2 * k <= n)
     beads = side**2
     pairs = [(i, i + 1) for i in range(beads) if (i + 1) % side]
@@ -129,7 +129,7 @@ def grid(n: int) -> Assembly:
 
 
 def in_space(made: Assembly, tilt: float) -> Assembly:
-    """A planar assembly as bodies in space, with hinges that lean from across the plane by `tilt` to all sides."""
+    """Turn a planar assembly into bodies in space, with hinges that lean to all sides by `tilt`."""
     planar = made.bodies
     model, places = SpatialModel((0.0, -planar.gravity, 0.0)), made.q.reshape(-1, 3)
     for k, (x, y, angle) in enumerate(places):
@@ -152,17 +152,17 @@ def in_space(made: Assembly, tilt: float) -> Assembly:
 
 
 def open_chain_of_hinges(n: int) -> Assembly:
-    """The open chain with hinges whose axes differ."""
+    """Build the open chain with hinges whose axes differ."""
     return in_space(open_chain(n), TILT)
 
 
 def closed_chain_of_hinges(n: int) -> Assembly:
-    """The closed chain with parallel hinges, three rows of which are redundant."""
+    """Build the closed chain with parallel hinges, three rows of which are redundant."""
     return in_space(closed_chain(n), 0.0)
 
 
 def tree_of_hinges(n: int) -> Assembly:
-    """The tree with hinges whose axes differ."""
+    """Build the tree with hinges whose axes differ."""
     return in_space(tree(n), TILT)
 
 

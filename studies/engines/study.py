@@ -1,9 +1,10 @@
-"""Engines and closed loops: what MuJoCo, Drake, Pinocchio and Exudyn are off by, and what an accuracy costs there."""
+"""Run MuJoCo, Drake, Pinocchio and Exudyn on closed loops beside twoloop: errors, and time at equal error."""
 
 import time
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache, partial
+from itertools import product
 from typing import Any
 
 import matplotlib.pyplot as plt
@@ -41,28 +42,29 @@ from twoloop.audit.step_audit import LOST
 
 N_STEPS = (100, 200, 500, 1500, 5000, 15_000, 50_000, 150_000)  # multiples of INSTANTS
 TOLERANCES = (1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10, 1e-11)
-# steps, or tolerances
-FEWER: dict[str, Any] = {RUN: (N_STEPS, TOLERANCES), **dict.fromkeys((MASS, MOTOR, TURN), ((PROBED,), (TIGHT,)))}
+# by group: steps of engines, tolerances of twoloop
+VALUES: dict[str, Any] = {RUN: (N_STEPS, TOLERANCES), **dict.fromkeys((MASS, MOTOR, TURN), ((PROBED,), (TIGHT,)))}
 CHANGED = {MASS: LIGHTENED, TURN: IN_A_FRAME, MOTOR: MOTORISED}
 SHORT = 0.1  # s: motions that last no longer are too fast for the steps of the long ones
 LONG, LONG_STEPS, LONG_INSTANTS, LONG_LIMIT = 100.0, 50_000, 200, 20.0  # s; how it is run; s of CPU
 SHOWN, AS_IT_COMES = ("four-bar", "RSSR", "Stewart platform"), "MuJoCo, default"  # in the figure
-ASKED_MORE = [each for each in CONFIGURATIONS if each.everywhere]
+EVERYWHERE = [each for each in CONFIGURATIONS if each.everywhere]
+MEASURES = ("h", "tol", "n_steps", "call_s", "stepping_s", "error_q", "error_v", "error_f", "gap", "energy", "floor")
 STOPPED = ("NOT_AVAILABLE", "NOT_APPLICABLE", "GATE_FAILED")
 
 
 @cache
-def loop_of(make: Callable[[], Any]) -> Loop:
-    """A mechanism, made once."""
-    return Loop(make())
+def loop_of(build: Callable[[], Any]) -> Loop:
+    """Return a mechanism with its reference."""
+    return Loop(build())
 
 
 @cache
-def gated(make: Callable[[], Any], engine: str) -> tuple[str, str]:
-    """Status and message of the gates of an engine's model of a mechanism."""
-    asked = engines()[engine]
+def gated(build: Callable[[], Any], engine: str) -> tuple[str, str]:
+    """Return status and message of the checks of an engine's model of a mechanism."""
+    chosen, loop = engines()[engine], loop_of(build)
     try:
-        wrong = gate(loop_of(make), asked.prepare(loop_of(make).rigid, asked.most_rigid))
+        wrong = gate(loop, chosen.prepare(loop.rigid, chosen.most_rigid))
     except RuntimeError as error:
         return ("NOT_AVAILABLE" if "not installed" in str(error) else "FAILED"), str(error).strip().splitlines()[0]
     except ValueError as error:
@@ -71,19 +73,19 @@ def gated(make: Callable[[], Any], engine: str) -> tuple[str, str]:
 
 
 def make(output: Output) -> pd.DataFrame:
-    """Rows of the gates, of runs, of masses and turned frames, of motors, and of the energy over a long time."""
+    """Make the rows of the checks, of runs, also with other masses, frames and motors, and of the energy over 100 s."""
     quick = output.call.quick
     groups: dict[str, Any] = {RUN: (four_bar, rssr)} if quick else {RUN: MECHANISMS} | CHANGED
     with output.kept() as kept:
         rows: list[Row] = []
         for group, build in ((group, build) for group, builds in groups.items() for build in builds):
-            for engine in engines():
+            for engine, name in list(NAMES.items())[:-1]:  # twoloop is last
                 status, message = gated(build, engine)
-                told = {"solver": NAMES[engine], "family": NAMES[engine], "status": status, "message": message}
-                rows.append(kept.made(f"{GATE} {build.__name__} {engine}", partial(_row, GATE, build, **told)))
-            for each in CONFIGURATIONS if group == RUN else ASKED_MORE:
+                row = _row(GATE, build, solver=name, family=name, status=status, message=message)
+                rows.append(kept.made(f"{GATE} {build.__name__} {engine}", partial(dict, row)))
+            for each in CONFIGURATIONS if group == RUN else EVERYWHERE:
+                values: Any = VALUES[group][each.engine == OURS]
                 cost: list[float] = []  # of the run before, and its steps
-                values: Any = FEWER[group][each.engine == OURS]
                 for value in values[1:4:2] if quick else values:
                     key = f"{group} {build.__name__} {each.name} {value!r}"
                     row = kept.made(key, partial(run_row, build, each, value, cost, group))
@@ -91,26 +93,27 @@ def make(output: Output) -> pd.DataFrame:
                     rows.append(row)
                     if row["status"] in STOPPED:
                         break
-        for build in () if quick else MECHANISMS:
+        for build, each in () if quick else product(MECHANISMS, EVERYWHERE):
             if loop_of(build).t_end > SHORT:
-                rows += [
-                    kept.made(f"{ENERGY} {build.__name__} {each.name}", partial(energy_row, build, each))
-                    for each in ASKED_MORE
-                ]
+                rows.append(kept.made(f"{ENERGY} {build.__name__} {each.name}", partial(energy_row, build, each)))
     versions = {engine.name: version_of(engine.package) for engine in engines().values()}
-    made = pd.DataFrame(rows)
-    return made.assign(version=made["family"].map(versions))
+    return (table := pd.DataFrame(rows)).assign(version=table["family"].map(versions))
 
 
 def _row(group: str, build: Callable[[], Any], **more: Any) -> Row:
-    names = ("h", "tol", "n_steps", "call_s", "stepping_s", "error_q", "error_v", "error_f", "gap", "energy", "floor")
     loop = loop_of(build)
-    known = {"group": group, "case": loop.problem.name, "span": loop.t_end}
-    return {**known, **dict.fromkeys(names), "message": "", **more}
+    return {
+        "group": group,
+        "case": loop.problem.name,
+        "span": loop.t_end,
+        **dict.fromkeys(MEASURES),
+        "message": "",
+        **more,
+    }
 
 
 def _prepared(build: Callable[[], Any], each: Configuration) -> tuple[Prepared | None, Row]:
-    """The model in an engine, or why there is none."""
+    """Return the model in an engine, or why there is none."""
     status, message = gated(build, each.engine)
     if status != "PASSED":
         return None, {"status": status, "message": message}
@@ -121,7 +124,7 @@ def _prepared(build: Callable[[], Any], each: Configuration) -> tuple[Prepared |
 
 
 def run_row(build: Callable[[], Any], each: Configuration, value: float, before: list[float], group: str = RUN) -> Row:
-    """A run, its error and its time; the shortest of several calls in the group of runs."""
+    """Make a run and measure its error and time; in the group of runs the shortest of several calls."""
     loop = loop_of(build)
     row = _row(group, build, solver=each.name, family=NAMES[each.engine], status="REACHED_END")
     if each.engine == OURS:
@@ -138,40 +141,37 @@ def run_row(build: Callable[[], Any], each: Configuration, value: float, before:
         again = lambda k: alone()  # noqa: E731
     try:
         motion = run()
-    except ValueError as error:  # a mechanism for which no code can be made
+    except ValueError as error:  # a mechanism for which no code can be generated
         return row | {"status": "NOT_APPLICABLE", "message": str(error)}
     if motion.message:
         return row | {"status": "FAILED", "message": motion.message, "call_s": motion.call_s}
     call, stepping = timed(again) if group == RUN else (motion.call_s, motion.stepping_s)
-    row |= {"call_s": call, "stepping_s": stepping, "floor": loop.reference[1]}
-    return row | errors(loop, motion)
+    return row | {"call_s": call, "stepping_s": stepping, "floor": loop.reference[1]} | errors(loop, motion)
 
 
 def _ours(loop: Loop, tolerance: float, compiled: Any) -> tuple[Callable[[], Motion], Callable[[int], Motion]]:
-    def run() -> Motion:
-        began = time.process_time()
-        made = loop.ours(tolerance, loop.times, compiled=compiled)
-        motion = loop.motion(made.q, made.v, loop.force(made), time.process_time() - began, made.stats.cpu_time)
-        return motion if made.success else replace(motion, message=made.message)
+    """Return a run of twoloop with states at the instants, and one that is timed: the k-th has a start of its own."""
 
-    def again(k: int) -> Motion:
+    def run(times: Any = None, t0: float = 0.0) -> Motion:
         began = time.process_time()
-        made = loop.ours(tolerance, t0=1e-9 * (k + 1) * loop.t_end, compiled=compiled)  # a start that no call has had
-        call = time.process_time() - began
-        return loop.motion(made.q[:, :1], made.v[:, :1], None, call, made.stats.cpu_time)
+        result = loop.solve(tolerance, times, t0=t0, compiled=compiled)
+        spent, last = time.process_time() - began, None if times is not None else 1
+        force = loop.force(result) if last is None else None
+        motion = loop.motion(result.q[:, :last], result.v[:, :last], force, spent, result.stats.cpu_time)
+        return motion if result.success else replace(motion, message=result.message)
 
-    return run, again
+    return lambda: run(loop.times), lambda k: run(t0=1e-9 * (k + 1) * loop.t_end)
 
 
 def energy_row(build: Callable[[], Any], each: Configuration) -> Row:
-    """The largest change of the energy over a long time, over the largest kinetic energy of the reference."""
+    """Measure the largest change of the energy over a long time, over the largest kinetic energy of the reference."""
     loop = loop_of(build)
     row = _row(ENERGY, build, solver=each.name, family=NAMES[each.engine], status="REACHED_END")
     if each.engine == OURS:
         longer = Loop(replace(loop.problem, t_span=(0.0, LONG)))
-        made = longer.ours(TIGHT, times=np.linspace(0.0, LONG, LONG_INSTANTS + 1))
-        row |= {"tol": TIGHT, "call_s": made.stats.cpu_time}
-        t, q, v, message = made.t, made.q, made.v, "" if made.success else made.message
+        result = longer.solve(TIGHT, times=np.linspace(0.0, LONG, LONG_INSTANTS + 1))
+        row |= {"tol": TIGHT, "call_s": result.stats.cpu_time}
+        t, q, v, message = result.t, result.q, result.v, "" if result.success else result.message
     else:
         row |= {"h": LONG / LONG_STEPS, "n_steps": LONG_STEPS}
         prepared, why = _prepared(build, each)

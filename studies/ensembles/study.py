@@ -22,12 +22,11 @@ from studies.bench.store import Array, Output
 from studies.bench.study import Study
 from studies.ensembles import linkages
 from twoloop import consistent_states, ensemble, mechanisms, solve_dae
-from twoloop.ensembles.in_lanes import threads_of
 from twoloop.mechanisms import Problem
 
 Solve = Callable[[float], Array]  # tolerance -> q at the end (n_runs, n_q), NaN of what failed
 
-GROUP, THREADS = "many", "threads"  # groups of rows; the others are of `linkages`
+GROUP = "many"  # of rows; the other groups are of `linkages`
 TOLERANCES, QUICK_TOLERANCES = tuple(float(f"1e-{k}") for k in range(4, 12)), (1e-6, 1e-9)
 BETWEEN = (1e-3, *(float(f"3e-{k}") for k in range(4, 12)))  # of ways whose error leaps from one of these to the next
 ERRORS = (1e-4, 1e-6, 1e-8)  # of the worst of the runs, at which ways are compared
@@ -52,7 +51,7 @@ OWN, LEAPING = (ENSEMBLE, SINGLE), (ENSEMBLE, HEYOKA)
 LINKAGES = "random four-bar linkages"
 # mechanisms whose runs differ by their velocities at the start, and how long they run
 STARTS = {"andrews": 0.03, "spatial_slider_crank": 2.0, "redundant_slider_crank": 2.0}
-N_RUNS, N_QUICK, N_SINGLE, N_ON_THREADS = 1000, 16, 32, 10_000  # N_SINGLE: of those that are made one by one
+N_RUNS, N_QUICK, N_SINGLE = 1000, 16, 32  # N_SINGLE: of those that are made one by one
 
 
 @dataclass(frozen=True)
@@ -170,17 +169,6 @@ def _timed(solve: Solve, tol: float) -> tuple[float, Array]:
     return spent if user_call.seconds is None else user_call.seconds, ends
 
 
-def on_threads(n: int, quick: bool) -> Iterator[dict[str, Any]]:
-    """Make rows of the wall-clock time of n linkages on one thread and on more, in turn, after a first call of each."""
-    system, (p, q, v) = mechanisms.four_bar().system, linkages.varied(n, np.random.default_rng(11))
-    for repeat, threads in product(range(-1, 1 if quick else REPEATS), range(1, threads_of(None) + 1)):
-        began = time.perf_counter()
-        ensemble(system, (0.0, linkages.SPAN), q, v, parameters=p, threads=threads)
-        wall = time.perf_counter() - began
-        if repeat >= 0:
-            yield {"group": THREADS, "n_runs": n, "n_threads": threads, "repeat": repeat, "wall": wall}
-
-
 def make(output: Output) -> pd.DataFrame:
     """Make the rows of all groups."""
     quick, rows = output.call.quick, []
@@ -191,7 +179,6 @@ def make(output: Output) -> pd.DataFrame:
         # diffrax takes ten seconds to compile, and minutes for larger mechanisms
         names = [way for way in WAYS if way != DIFFRAX or (of.name == LINKAGES and not quick)]
         rows += list(rows_of(of, names, quick))
-    rows += list(on_threads(200 if quick else N_ON_THREADS, quick))
     return pd.DataFrame([*rows, *linkages.rows(quick)]).assign(processor=processor())
 
 
@@ -227,7 +214,7 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     found["linkages"] = (
         about.reindex(columns=LINKAGE_COLUMNS).astype(object).where(about.notna(), None).to_dict("records")
     )
-    return found | {"threads": _scaling(rows), "answer": _answer(found)}
+    return found | {"answer": _answer(found)}
 
 
 LINKAGE_COLUMNS = ["group", "way", *("n_runs", "n_assembled", "wall", "n_failed", "n_singly", "energy_median")]
@@ -240,16 +227,12 @@ def _answer(found: dict[str, Any]) -> str:
     text = f"{n} four-bar linkages over {many['t_end']:.0f} s take {number(many['wall'])} s on {many['n_threads']:.0f} "
     text += f"core{'s' if many['n_threads'] > 1 else ''}"
     if ratios:
-        low, high = map(number, ratios)
-        text += f"; at equal error the fastest other solver takes {low} to {high} times as long"
+        text += f"; at equal error the fastest other solver takes {_span(ratios)} times as long"
     return f"{text[0].upper()}{text[1:]}."
 
 
-def _scaling(rows: pd.DataFrame) -> list[dict[str, float]]:
-    """Return the wall-clock time of a run on so many threads, s, and how many times as fast that is as one."""
-    own = rows[rows["group"] == THREADS]
-    times = (own["wall"] / own["n_runs"]).groupby(own["n_threads"]).median()
-    return [{"n": int(n), "run_s": each, "gain": times.iloc[0] / each} for n, each in times.items()]
+def _span(values: Sequence[float]) -> str:
+    return " to ".join(dict.fromkeys(map(number, values)))
 
 
 def _runs(rows: pd.DataFrame) -> pd.DataFrame:
@@ -277,11 +260,9 @@ def figures_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Figure]:
         axes.set_xlabel("largest error at the end (m, rad)")
     for axes in grid[:, 0]:
         axes.set_ylabel("CPU time of a run (µs)")
-    if found["ratios"]:
-        low, high = map(number, found["ratios"])
-        figures.message(
-            figure, f"At equal error the fastest other solver takes {low} to {high} times as long as ensemble"
-        )
+    if ratios := found["ratios"]:
+        text = f"At equal error the fastest other solver takes {_span(ratios)} times as long as ensemble"
+        figures.message(figure, text)
     figures.label_lines(panels)
     return {"ensembles": figure}
 

@@ -1,7 +1,6 @@
-"""Make rows of evaluations, of memory, and of chains at equal error."""
+"""Make rows of evaluations, and of chains at equal error."""
 
 import time
-import tracemalloc
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import cache, partial
@@ -19,13 +18,12 @@ from studies.bench.store import Row
 from twoloop import Result, solve_dae
 from twoloop.mechanisms import Problem
 
-EVALUATION, MEMORY, CHAIN = "evaluation", "memory", "chain"  # groups of rows
+EVALUATION, CHAIN = "evaluation", "chain"  # groups of rows
 Keyed = Iterator[tuple[str, Callable[[], Row]]]  # what a row is kept by, and what makes it
 SIZES, QUICK_SIZES = (3, 10, 30, 100, 300, 1000, 3000), (3, 10)
 METHOD, TOLERANCE = "DOP853", 1e-6
 SKIPPED, STEPS = 3, 6  # steps that set a run up, and steps timed: few, as motions differ later by size
 MANY, AGAIN = 300, 5  # bodies, below which the steps are timed so many times
-KEPT = 24  # steps of the run whose memory is asked for
 ROUNDS, REPEATS = 3, 3
 CHAINS = {20: 1.0, 100: 0.3, 400: 0.15}  # bodies, and how long they move, s: later they are chaotic
 ERRORS = (1e-3, 1e-4, 1e-5)  # at the end, over max(1, max |q|)
@@ -47,13 +45,11 @@ def problem_of(made: Assembly, t_end: float) -> Problem:
 
 
 def evaluations(quick: bool) -> Keyed:
-    """Make rows of evaluations of twoloop, then of its memory."""
+    """Make rows of evaluations of twoloop."""
     for repeat in range(1 if quick else ROUNDS):
         for n in QUICK_SIZES if quick else SIZES:
             for build in (*PLANAR, *SPATIAL):
                 yield f"{EVALUATION} | {build.__name__} | {n} | {repeat}", partial(evaluation, build, n, repeat)
-    for n in QUICK_SIZES if quick else SIZES[3:]:
-        yield f"{MEMORY} | {n}", partial(memory, n)
 
 
 def evaluation(build: Callable[[int], Assembly], n: int, repeat: int) -> Row:
@@ -80,17 +76,6 @@ def evaluation(build: Callable[[int], Assembly], n: int, repeat: int) -> Row:
     passes = ((many.stats.n_inner or 0) - (few.stats.n_inner or 0)) / STEPS
     row |= {"step_us": spent / STEPS, "evaluation_us": spent / evaluations, "passes": passes}
     return row | {"status": "REACHED_END"}
-
-
-def memory(n: int) -> Row:
-    """Measure what Python and NumPy allocate at most for a run of a few steps; kernels allocate nothing."""
-    _steps(problem_of(open_chain(min(SIZES[3:])), 1.0), 1)  # what is loaded once
-    tracemalloc.start()
-    _steps(problem_of(open_chain(n), 1.0), KEPT)
-    most = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    row: Row = {"group": MEMORY, "case": "open chain", "n": n, "repeat": 0, "status": "REACHED_END"}
-    return row | {"memory_mb": 1e-6 * most}
 
 
 def _steps(problem: Problem, steps: int) -> Result:

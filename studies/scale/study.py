@@ -13,7 +13,7 @@ from studies.bench.names import label
 from studies.bench.render import listed, number, power
 from studies.bench.solvers import DEFAULT
 from studies.bench.study import Study, kept_rows
-from studies.scale.runs import CHAIN, CHAINS, ERRORS, EVALUATION, EXUDYN, LIMIT, MEMORY, chains, evaluations
+from studies.scale.runs import CHAIN, CHAINS, ERRORS, EVALUATION, EXUDYN, LIMIT, chains, evaluations
 from studies.scale.solvers import BUDGET, TREE, UNTIL, UNTIL_END, trees, until
 
 FROM, TO = 30, 1000  # bodies, between which the power is fitted
@@ -40,8 +40,6 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     ]
     found["chains"] = [_chain(n, medians) for n, medians in _chains(rows).items()]
     found["solvers"] = list(dict.fromkeys(name for chain in found["chains"] for name in chain["call_s"]))
-    held = rows[rows["group"].eq(MEMORY)].reindex(columns=["n", "memory_mb"]).dropna()
-    found["memory"] = {int(n): float(mb) for n, mb in held.itertuples(index=False)}
     right = rows[rows["group"].eq(TREE) & rows["status"].eq("REACHED_END")]
     found["trees"] = {
         f"{case}, {engine}": own.groupby("n")["evaluation_us"].median().to_dict()

@@ -85,7 +85,7 @@ def test_a_mechanism_without_code_is_a_row(monkeypatch):
     def refused(*_, **__):
         raise ValueError("compiled=True needs equations that can be written down")
 
-    monkeypatch.setattr(engines.Loop, "ours", refused)
+    monkeypatch.setattr(engines.Loop, "solve", refused)
     row = engines.run_row(four_bar, engines.CONFIGURATIONS[-1], 1e-3, [])
     assert row["status"] == "NOT_APPLICABLE" and "written down" in row["message"] and row["call_s"] is None
 

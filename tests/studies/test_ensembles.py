@@ -123,22 +123,9 @@ def test_a_package_that_is_not_there_is_a_row(monkeypatch, few):
 def test_rows_have_their_processor(monkeypatch):
     made = rows(**{ENSEMBLE: 0.01, HEYOKA: 0.05}).to_dict("records")
     monkeypatch.setattr(ensembles, "rows_of", lambda of, names, quick: made[:-2])
-    monkeypatch.setattr(ensembles, "on_threads", lambda n, quick: [])
     monkeypatch.setattr(linkages, "rows", lambda quick: made[-2:])
     table = ensembles.make(SimpleNamespace(call=SimpleNamespace(quick=True)))
     assert (table["processor"] == processor()).all()
-
-
-def test_threads_are_measured_and_compared():
-    made = list(ensembles.on_threads(300, True))
-    assert [row["n_threads"] for row in made] == list(range(1, len(made) + 1)) and all(row["wall"] > 0 for row in made)
-    threads = [
-        {"group": ensembles.THREADS, "n_runs": 10, "n_threads": n, "repeat": k, "wall": wall * (1.0 + 0.1 * k)}
-        for n, wall in ((1, 0.9), (2, 0.5))
-        for k in range(3)
-    ]
-    found, text = said(ensembles, pd.concat([rows(**{ENSEMBLE: 0.01}), pd.DataFrame(threads)], ignore_index=True))
-    assert [round(each["gain"], 6) for each in found["threads"]] == [1.0, 1.8] and "1.8 times as fast as one" in text
 
 
 def test_linkages_are_put_together_and_run():
