@@ -38,8 +38,8 @@ REPORTS = {  # in the order of the index
 }
 # claims and the page in the browser read the rows of the others
 STUDIES = (
-    *("linkage", "work_precision", "table3", "energy", "validation", "honesty", "planted_errors", "ensembles"),
-    *("scale", "engines", "reproduction", "claims", "compare_page"),
+    *("work_precision", "table3", "energy", "validation", "honesty", "planted_errors", "ensembles", "scale", "engines"),
+    *("reproduction", "claims", "compare_page"),
 )
 
 

@@ -31,6 +31,9 @@ FOLDERS = ("twoloop", "references", "studies")  # a change in any of these makes
 NUMERICS = ("numpy", "scipy", "numba")
 # studies, and parts of the study of reproduction, whose times are compared, so that no two run at once
 TIMED = (
+    *("work_precision", "compare", "table3", "energy", "ensembles", "engines", "scale", "beam", "violation"),
+    "ablation",
+)
     "work_precision",
     "compare",
     "table3",
