@@ -318,7 +318,7 @@ def test_the_menu_has_every_page_once():
     reference = {f"reference/{path.stem}" for path in (DOCS / "reference").glob("*.md")}
     reports = {f"../reports/{path.stem}" for path in (ROOT / "reports").glob("*.md")}
     assert {*PAGES, *reference, *reports} - {"index", "errors"} <= set(pages) and set(pages.values()) == {1}
-    assert for_sphinx.with_menu(text_of("docs/index.md")).count("```{toctree}") == 8
+    assert for_sphinx.with_menu(text_of("docs/index.md")).count("```{toctree}") == 7
 
 
 # --- pages that follow from the code
