@@ -123,16 +123,18 @@ def _label_ends(axes: Axes, lines: dict[str, Any]) -> None:
     ends.sort(key=lambda each: each[0][1])
     size = float(mpl.rcParams["legend.fontsize"])
     gap = LABEL_HEIGHT * size / 72.0 * figure.dpi / axes.get_window_extent().height
-    heights = np.array([end[1] for end, *_ in ends])
-    for k in range(1, len(heights)):  # push up what would overlap, then down again what is above the panel
-        heights[k] = max(heights[k], heights[k - 1] + gap)
-    for k in reversed(range(len(heights))):
-        heights[k] = min(heights[k], max(1.0, gap * (len(heights) - 1)) - gap * (len(heights) - 1 - k))
+    room = gap * np.arange(len(ends))
+    free = np.array([end[1] for end, *_ in ends]) - room
+    # labels that would overlap are pushed up and down alike: the mean of pushing up alone and down alone
+    heights = 0.5 * (np.maximum.accumulate(free) + np.minimum.accumulate(free[::-1])[::-1]) + room
+    heights -= max(0.0, heights[-1] - 1.0)
+    heights += max(0.0, -heights[0])
     for height, (end, text, line) in zip(heights, ends, strict=True):
         band = isinstance(line, PolyCollection)
         color = to_hex(line.get_facecolor()[0] if band else line.get_color())
         thick = not band and line.get_linewidth() >= THICK
         arrow = {"arrowstyle": "-", "color": color, "linewidth": 0.6, "alpha": 0.6, "shrinkA": 1, "shrinkB": 3}
+        arrow["relpos"] = (0.0, 0.5)  # from the left end of the text
         axes.annotate(
             text,
             xy=end,
