@@ -15,6 +15,7 @@ NAMES = [name for name in re.findall(r"^- `(twoloop[\w.]+)`", PAGE, re.MULTILINE
 NAMES += [f"twoloop.mechanisms.{name}" for name in mechanisms.__all__]
 NAMES += [f"twoloop.methods.tableaux.{name}" for name in ("Tableau", "gauss", "radau_iia", "lobatto_iiie")]
 OPTIONAL = {"twoloop.symbolic": "sympy", "twoloop.sweep": "pandas", "twoloop.Result": "pandas"}
+OPTIONAL["twoloop.audit.audit_mjcf"] = "mujoco"
 
 
 def public(name):

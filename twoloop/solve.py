@@ -170,6 +170,17 @@ def solve_dae(
         If an argument is wrong: before any work, naming the argument. An exception from a Python callback or an event
         is passed on unchanged, with a note that says which one was called and at what time. If an event returns
         something other than a real number, the error has this note, too.
+
+    Examples
+    --------
+    >>> from twoloop import solve_dae
+    >>> from twoloop.mechanisms import four_bar
+    >>> problem = four_bar()
+    >>> result = solve_dae(problem.system, (0.0, 1.0), problem.q0, problem.v0)
+    >>> result.message
+    'Reached the end, t = 1.'
+    >>> bool(result.success), result.q.shape == (9, result.t.size)
+    (True, True)
     """
     check_system(system)
     given = (

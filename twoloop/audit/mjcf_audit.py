@@ -39,6 +39,13 @@ class MjcfAudit:
         With the settings of the file; with loops as stiff as the step allows; the same with RK4.
     advice : str
         Settings for the requested error and their cost; empty if none of the audits reaches it.
+
+    Examples
+    --------
+    >>> from twoloop.audit import MjcfAudit
+    >>> audit = MjcfAudit("linkage.xml", "its pose", ("contacts",), (), "error 0.02", (), "")
+    >>> audit.left_out
+    ('contacts',)
     """
 
     file: str
@@ -144,6 +151,45 @@ def audit_mjcf(
     Notes
     -----
     Parts of the file ignored by `twoloop.bodies.from_mjcf` are disabled in MuJoCo as well, and listed.
+
+    Examples
+    --------
+    It needs MuJoCo.
+
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> from twoloop.audit import audit_mjcf
+    >>> TEXT = '''
+    ... <mujoco>
+    ...   <default>
+    ...     <geom type="capsule" size="0.02" mass="1" contype="0" conaffinity="0"/>
+    ...     <joint axis="0 1 0"/>
+    ...   </default>
+    ...   <worldbody>
+    ...     <body name="crank">
+    ...       <joint/>
+    ...       <geom fromto="0 0 0 0.1 0 0.3"/>
+    ...       <body name="rod" pos="0.1 0 0.3">
+    ...         <joint/>
+    ...         <geom fromto="0 0 0 0.7 0 0.1"/>
+    ...         <body name="rocker" pos="0.7 0 0.1">
+    ...           <joint/>
+    ...           <geom fromto="0 0 0 -0.1 0 -0.4"/>
+    ...         </body>
+    ...       </body>
+    ...     </body>
+    ...   </worldbody>
+    ...   <equality>
+    ...     <connect body1="rocker" anchor="-0.1 0 -0.4"/>
+    ...   </equality>
+    ... </mujoco>
+    ... '''
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = Path(folder) / "linkage.xml"
+    ...     _ = path.write_text(TEXT)
+    ...     audit = audit_mjcf(path, error=1e-2, t_end=0.2)
+    >>> len(audit.audits), bool(audit.advice)
+    (3, True)
     """
     check_positive("error", error)
     check_positive("t_end", t_end)

@@ -44,6 +44,14 @@ def coordinates(x: ArrayLike, R: ArrayLike) -> Array:
     ------
     ValueError
         If the shapes are inconsistent, or an R is not a rotation matrix.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from twoloop.audit import coordinates
+    >>> x, R = np.array([[[0.0, 0.0, 1.0]]]), np.eye(3)[None, None]  # one time, one body
+    >>> coordinates(x, R)
+    array([[0., 0., 1., 1., 0., 0., 0.]])
     """
     x, R = np.asarray(x, dtype=float), np.asarray(R, dtype=float)
     if x.ndim != 3 or x.shape[2] != 3 or R.shape != (*x.shape, 3):

@@ -43,6 +43,22 @@ class AuditedRun(NamedTuple):
         Largest distance between points that joints keep coincident, m.
     cpu_s : float
         CPU time of the call, s.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from twoloop.audit import audit_simulator
+    >>> from twoloop.bodies import SpatialModel
+    >>> model = SpatialModel(name="pendulum")
+    >>> rod = model.rod("rod", (0.0, 0.0, 0.0), (1.0, 0.0, 0.0), radius=0.02, mass=1.0)
+    >>> pin = model.revolute("ground", rod, at=(0.0, 0.0, 0.0), axis=(0.0, 1.0, 0.0))
+    >>> problem = model.problem((0.0, 0.2))
+    >>> def simulate(problem, times, step):
+    ...     return np.tile(problem.q0, (len(times), 1))  # a simulator that does not move
+    >>> audit = audit_simulator(simulate, problem, step=0.01, error=1e-3)
+    >>> run = audit.runs[0]
+    >>> float(run.step), run.n_steps
+    (0.004, 50)
     """
 
     step: float
@@ -69,6 +85,21 @@ class Audit:
     runs : tuple of AuditedRun
     order, floor : float or None
         Observed order, the median over steps where the error decreases; the error that shorter steps do not reduce.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from twoloop.audit import audit_simulator
+    >>> from twoloop.bodies import SpatialModel
+    >>> model = SpatialModel(name="pendulum")
+    >>> rod = model.rod("rod", (0.0, 0.0, 0.0), (1.0, 0.0, 0.0), radius=0.02, mass=1.0)
+    >>> pin = model.revolute("ground", rod, at=(0.0, 0.0, 0.0), axis=(0.0, 1.0, 0.0))
+    >>> problem = model.problem((0.0, 0.2))
+    >>> def simulate(problem, times, step):
+    ...     return np.tile(problem.q0, (len(times), 1))  # a simulator that does not move
+    >>> audit = audit_simulator(simulate, problem, step=0.01, error=1e-3)
+    >>> audit.label, audit.error
+    ('simulator', 0.001)
     """
 
     label: str
@@ -135,6 +166,21 @@ def audit_simulator(
         If an argument is invalid, nothing moves, or `simulate` has another start or returns an array of wrong shape.
     RuntimeError
         If a reference fails or takes more than a minute, or the two differ by more than a tenth of `error`.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from twoloop.audit import audit_simulator
+    >>> from twoloop.bodies import SpatialModel
+    >>> model = SpatialModel(name="pendulum")
+    >>> rod = model.rod("rod", (0.0, 0.0, 0.0), (1.0, 0.0, 0.0), radius=0.02, mass=1.0)
+    >>> pin = model.revolute("ground", rod, at=(0.0, 0.0, 0.0), axis=(0.0, 1.0, 0.0))
+    >>> problem = model.problem((0.0, 0.2))
+    >>> def simulate(problem, times, step):
+    ...     return np.tile(problem.q0, (len(times), 1))  # a simulator that does not move
+    >>> audit = audit_simulator(simulate, problem, step=0.01, error=1e-3)
+    >>> audit.order is None, audit.runs[-1].error > 0.1
+    (True, True)
     """
     if not isinstance(problem, ModelProblem) or problem.model is None:
         raise TypeError(f"problem must be made by model.problem(...) of twoloop.bodies; given {shown(problem)}")

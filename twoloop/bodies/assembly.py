@@ -42,6 +42,16 @@ class Freedom:
         Number of additional degrees of freedom at the start itself, where C_q loses rank.
     redundant : tuple of tuple of str
         Groups of joints with linearly dependent rows.
+
+    Examples
+    --------
+    >>> from twoloop.bodies import PlanarModel
+    >>> model = PlanarModel(name="pendulum")
+    >>> bob = model.body("bob", mass=2.0, inertia=0.1, position=(1.0, 0.0))
+    >>> pin = model.revolute("ground", bob, at=(0.0, 0.0), name="pin")
+    >>> freedom = model.problem((0.0, 1.0)).freedom
+    >>> freedom.degrees, freedom.redundant
+    (1, ())
     """
 
     degrees: int

@@ -22,7 +22,15 @@ DENSITY = 1000.0  # kg/m^3, default of MuJoCo for geoms with neither mass nor de
 
 
 class IgnoredWarning(UserWarning):
-    """Warns that parts of a file have no counterpart in a model, or parts of a model none in a file."""
+    """Warns that parts of a file have no counterpart in a model, or parts of a model none in a file.
+
+    Examples
+    --------
+    >>> import warnings
+    >>> from twoloop.bodies import IgnoredWarning
+    >>> warnings.simplefilter("error", IgnoredWarning)  # parts of a file that are left out raise
+    >>> warnings.resetwarnings()
+    """
 
 
 @dataclass(frozen=True)

@@ -52,6 +52,28 @@ def from_mjcf(path: str | os.PathLike[str]) -> SpatialModel:
     Notes
     -----
     The format is described in MuJoCo's XML reference.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> TEXT = '''
+    ... <mujoco>
+    ...   <worldbody>
+    ...     <body name="rod">
+    ...       <joint type="hinge" axis="0 1 0"/>
+    ...       <geom type="capsule" fromto="0 0 0 1 0 0" size="0.02" mass="1"/>
+    ...     </body>
+    ...   </worldbody>
+    ... </mujoco>
+    ... '''
+    >>> from twoloop.bodies import from_mjcf
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = Path(folder) / "pendulum.xml"
+    ...     _ = path.write_text(TEXT)
+    ...     model = from_mjcf(path)
+    >>> model.problem((0.0, 1.0)).freedom.degrees
+    1
     """
     root = root_of(path, "mujoco")
     reader = _Reader(root)

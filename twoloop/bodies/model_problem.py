@@ -29,6 +29,17 @@ class ModelProblem(Problem):
         Degrees of freedom, and the joints with redundant rows.
     stops : tuple of Stop
         For `solve_with_stops`.
+
+    Examples
+    --------
+    >>> from twoloop.bodies import PlanarModel
+    >>> model = PlanarModel(name="pendulum")
+    >>> bob = model.body("bob", mass=2.0, inertia=0.1, position=(1.0, 0.0))
+    >>> pin = model.revolute("ground", bob, at=(0.0, 0.0), name="pin")
+    >>> problem = model.problem((0.0, 1.0))
+    >>> heavier = problem.with_parameters({"mass of bob": 3.0})
+    >>> float(heavier.system.mass(0.0, heavier.q0)[0, 0])
+    3.0
     """
 
     model: Model | None = field(default=None, repr=False)

@@ -43,6 +43,15 @@ class Body:
         Index in the order of addition, from 0; -1 for the ground.
     coordinates : tuple of int
         Indices of the body in `q` and `v`: x, y and the angle, or x, y, z and four Euler parameters.
+
+    Examples
+    --------
+    >>> from twoloop.bodies import PlanarModel
+    >>> model = PlanarModel(name="pendulum")
+    >>> bob = model.body("bob", mass=2.0, inertia=0.1, position=(1.0, 0.0))
+    >>> pin = model.revolute("ground", bob, at=(0.0, 0.0), name="pin")
+    >>> bob.name, bob.coordinates
+    ('bob', (0, 1, 2))
     """
 
     name: str
@@ -124,6 +133,15 @@ class ModelJoint:
         Name in `Result.reactions`.
     kind : str
     a, b : Body
+
+    Examples
+    --------
+    >>> from twoloop.bodies import PlanarModel
+    >>> model = PlanarModel(name="pendulum")
+    >>> bob = model.body("bob", mass=2.0, inertia=0.1, position=(1.0, 0.0))
+    >>> pin = model.revolute("ground", bob, at=(0.0, 0.0), name="pin")
+    >>> pin.kind, pin.b.name
+    ('revolute', 'bob')
     """
 
     name: str
@@ -148,6 +166,16 @@ class Force:
     Attributes
     ----------
     name : str
+
+    Examples
+    --------
+    >>> from twoloop.bodies import PlanarModel
+    >>> model = PlanarModel(name="pendulum")
+    >>> bob = model.body("bob", mass=2.0, inertia=0.1, position=(1.0, 0.0))
+    >>> pin = model.revolute("ground", bob, at=(0.0, 0.0), name="pin")
+    >>> spring = model.spring("ground", (1.0, 1.0), bob, (0.0, 0.0), stiffness=100.0, length=1.0, name="spring")
+    >>> spring.name
+    'spring'
     """
 
     name: str
@@ -172,6 +200,16 @@ class DryFriction:
     joint : ModelJoint
     kinetic, static : float
         Kinetic friction and largest static friction, N m or N.
+
+    Examples
+    --------
+    >>> from twoloop.bodies import PlanarModel
+    >>> model = PlanarModel(name="pendulum")
+    >>> bob = model.body("bob", mass=2.0, inertia=0.1, position=(1.0, 0.0))
+    >>> pin = model.revolute("ground", bob, at=(0.0, 0.0), name="pin")
+    >>> friction = model.dry_friction(pin, 0.2, static=0.3)
+    >>> friction.kinetic, friction.static
+    (0.2, 0.3)
     """
 
     name: str

@@ -40,6 +40,16 @@ class PlanarModel(Couplings):
     ------
     TypeError, ValueError
         If an argument is invalid.
+
+    Examples
+    --------
+    >>> from twoloop.bodies import PlanarModel
+    >>> model = PlanarModel(name="pendulum")
+    >>> bob = model.body("bob", mass=2.0, inertia=0.1, position=(1.0, 0.0))
+    >>> pin = model.revolute("ground", bob, at=(0.0, 0.0), name="pin")
+    >>> problem = model.problem((0.0, 1.0))
+    >>> problem.system.n_q, problem.system.n_c, problem.freedom.degrees
+    (3, 2, 1)
     """
 
     dimension = 2

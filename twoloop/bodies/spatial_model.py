@@ -47,6 +47,15 @@ class SpatialModel(Wheels):
     ------
     TypeError, ValueError
         If an argument is invalid.
+
+    Examples
+    --------
+    >>> from twoloop.bodies import SpatialModel
+    >>> model = SpatialModel(name="pendulum")
+    >>> rod = model.rod("rod", (0.0, 0.0, 0.0), (1.0, 0.0, 0.0), radius=0.02, mass=1.0)
+    >>> pin = model.revolute("ground", rod, at=(0.0, 0.0, 0.0), axis=(0.0, 1.0, 0.0))
+    >>> model.problem((0.0, 1.0)).freedom.degrees
+    1
     """
 
     ignored: tuple[str, ...] = ()  # parts of a file without a counterpart

@@ -39,6 +39,13 @@ class Loop:
     axis, axis_b : array_like (3,), optional
         Directions in the frames of a and b. None for b: that of a in the position read.
     name : str, optional
+
+    Examples
+    --------
+    >>> from twoloop.bodies import Loop
+    >>> loop = Loop("revolute", "coupler", "rocker", at=(0.4, 0.0, 0.0), axis=(0.0, 1.0, 0.0))
+    >>> loop.kind, loop.a, loop.b
+    ('revolute', 'coupler', 'rocker')
     """
 
     kind: str
@@ -95,6 +102,35 @@ def from_urdf(
     Notes
     -----
     The format is described at wiki.ros.org/urdf/XML.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> TEXT = '''
+    ... <robot name="arm">
+    ...   <link name="base"/>
+    ...   <link name="rod">
+    ...     <inertial>
+    ...       <origin xyz="0.5 0 0"/>
+    ...       <mass value="1"/>
+    ...       <inertia ixx="0.01" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"/>
+    ...     </inertial>
+    ...   </link>
+    ...   <joint name="hinge" type="continuous">
+    ...     <parent link="base"/>
+    ...     <child link="rod"/>
+    ...     <axis xyz="0 1 0"/>
+    ...   </joint>
+    ... </robot>
+    ... '''
+    >>> from twoloop.bodies import from_urdf
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = Path(folder) / "arm.urdf"
+    ...     _ = path.write_text(TEXT)
+    ...     model = from_urdf(path, positions={"hinge": 0.3})
+    >>> model.problem((0.0, 1.0)).freedom.degrees
+    1
     """
     root = root_of(path, "robot")
     check_flag("free_base", free_base)

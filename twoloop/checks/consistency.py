@@ -29,6 +29,18 @@ class ConstraintWarning(UserWarning):
     """Constraints depend on one another, or something changes for so short a time that a run may have missed it.
 
     Rows that are left out are checked, and their multipliers are not unique.
+
+    Examples
+    --------
+    >>> import warnings
+    >>> from twoloop import ConstraintWarning, solve_dae
+    >>> from twoloop.mechanisms import redundant_slider_crank
+    >>> problem = redundant_slider_crank()
+    >>> with warnings.catch_warnings(record=True) as caught:
+    ...     warnings.simplefilter("always", ConstraintWarning)
+    ...     result = solve_dae(problem.system, (0.0, 0.1), problem.q0, problem.v0)
+    >>> caught[0].category.__name__
+    'ConstraintWarning'
     """
 
 

@@ -61,6 +61,16 @@ def consistent_states(
     ------
     TypeError, ValueError
         If an argument is wrong, or a guess cannot be projected: as `consistent_state`, and which.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from twoloop import consistent_states
+    >>> from twoloop.mechanisms import pendulum
+    >>> problem = pendulum()
+    >>> q, v = consistent_states(problem.system, 0.0, [[0.6, -0.9], [0.9, -0.6]], np.zeros((2, 2)))
+    >>> q.shape, bool(abs(np.hypot(*q.T) - 1.0).max() < 1e-12)
+    ((2, 2), True)
     """
     check_system(system)
     t = check_finite("t", t)

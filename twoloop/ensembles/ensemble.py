@@ -95,6 +95,18 @@ def ensemble(
     the accelerations of all coordinates. The end of each step is put on the constraints. States at `t_eval` within a
     step are the ends of shorter steps from its beginning. A run that would take more than 100,000 steps is made by
     `solve_dae`. So is one that by series meets a place at which the equations have no values.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from twoloop import ensemble
+    >>> from twoloop.mechanisms import pendulum
+    >>> problem = pendulum()
+    >>> speeds = np.array([0.0, 0.5, 1.0])
+    >>> v0 = np.outer(speeds, [0.0, 1.0])  # along the circle
+    >>> runs = ensemble(problem.system, (0.0, 1.0), problem.q0, v0, t_eval=[0.0, 0.5, 1.0])
+    >>> runs.q.shape, bool(runs.success.all())  # runs, coordinates, times
+    ((3, 2, 3), True)
     """
     check_system(system)
     t0, t1 = check_span(t_span)

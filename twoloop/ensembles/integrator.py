@@ -45,6 +45,19 @@ class Integrator:
     ------
     TypeError, ValueError
         If an argument is wrong, naming it.
+
+    Examples
+    --------
+    >>> from twoloop import Integrator
+    >>> from twoloop.mechanisms import four_bar
+    >>> problem = four_bar()
+    >>> integrator = Integrator(problem.system, rtol=1e-6, atol=1e-6)
+    >>> result = integrator.run((0.0, 1.0), problem.q0, problem.v0)
+    >>> result.success
+    True
+    >>> _ = integrator.start(0.0, problem.q0, problem.v0)
+    >>> integrator.step(0.01).t  # from sample to sample
+    0.01
     """
 
     def __init__(

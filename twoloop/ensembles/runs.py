@@ -35,6 +35,18 @@ class Runs:
         What `solve_dae` said of those runs that failed.
     reasons : dict of int to str
         Why each of the runs that were made singly was.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from twoloop import ensemble
+    >>> from twoloop.mechanisms import pendulum
+    >>> problem = pendulum()
+    >>> speeds = np.array([0.0, 0.5, 1.0])
+    >>> v0 = np.outer(speeds, [0.0, 1.0])  # along the circle
+    >>> runs = ensemble(problem.system, (0.0, 1.0), problem.q0, v0, t_eval=[0.0, 0.5, 1.0])
+    >>> runs.v.shape, runs.status.shape
+    ((3, 2, 3), (3,))
     """
 
     t: Array

@@ -21,6 +21,19 @@ class Impact(NamedTuple):
     """An impact: time, s; stops; velocities before and after (n_q,); impulses of the stops and of their friction.
 
     Impulses are in N s (N m s for an angle); those of friction act along `slide`, and are zero without friction.
+
+    Examples
+    --------
+    >>> from twoloop import Stop, solve_with_stops
+    >>> from twoloop.mechanisms import four_bar
+    >>> problem = four_bar()
+    >>> stop = Stop(lambda t, q: 1.0 - q[8], restitution=0.5, name="stop")  # the third bar turns to 1 rad at most
+    >>> result = solve_with_stops(problem.system, (0.0, 0.6), problem.q0, problem.v0, stop)
+    >>> impact = result.impacts[0]
+    >>> impact.stops, bool(impact.impulses[0] > 0.0)
+    (('stop',), True)
+    >>> round(float(-impact.v_after[8] / impact.v_before[8]), 6)  # the coefficient of restitution
+    0.5
     """
 
     t: float
@@ -49,6 +62,17 @@ class ArcSolution:
     arcs : tuple of Result
     t_min, t_max : float
         Time interval covered, s.
+
+    Examples
+    --------
+    >>> from twoloop import Stop, solve_with_stops
+    >>> from twoloop.mechanisms import four_bar
+    >>> problem = four_bar()
+    >>> stop = Stop(lambda t, q: 1.0 - q[8], restitution=0.5, name="stop")  # the third bar turns to 1 rad at most
+    >>> result = solve_with_stops(problem.system, (0.0, 0.6), problem.q0, problem.v0, stop)
+    >>> state = result.sol(0.5)
+    >>> state.q.shape, len(result.sol.arcs) == len(result.impacts) + 1
+    ((9,), True)
     """
 
     def __init__(self, arcs: Sequence[Result], n_c: int, n_a: int):

@@ -76,6 +76,16 @@ def solve_with_stops(
     four times per step, and at least at every two-thousandth of the motion. A gap that closes and opens again between
     two evaluations is found, unless its rate changes sign more than once there; then reduce `max_step`. The time of an
     impact is as accurate as the motion before it.
+
+    Examples
+    --------
+    >>> from twoloop import Stop, solve_with_stops
+    >>> from twoloop.mechanisms import four_bar
+    >>> problem = four_bar()
+    >>> stop = Stop(lambda t, q: 1.0 - q[8], restitution=0.5, name="stop")  # the third bar turns to 1 rad at most
+    >>> result = solve_with_stops(problem.system, (0.0, 0.6), problem.q0, problem.v0, stop)
+    >>> bool(result.q[8].max() <= 1.0 + 1e-8), len(result.impacts)
+    (True, 1)
     """
     check_system(system)
     t0, t1 = check_span(t_span)

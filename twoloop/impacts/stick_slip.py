@@ -63,6 +63,18 @@ def solve_with_friction(
     -----
     Mode changes are located like events, by checks four times per step and at least every two-thousandth of the motion:
     a joint that reverses twice between two of these is missed; reduce `max_step` if needed.
+
+    Examples
+    --------
+    >>> from twoloop import solve_with_friction
+    >>> from twoloop.bodies import PlanarModel
+    >>> model = PlanarModel(name="block")
+    >>> block = model.box("block", (0.2, 0.1), mass=1.0, position=(0.0, 0.0), velocity=(1.0, 0.0))
+    >>> rail = model.prismatic("ground", block, at=(0.0, 0.0), axis=(1.0, 0.0))
+    >>> friction = model.dry_friction(rail, 2.0)
+    >>> result = solve_with_friction(model.problem((0.0, 1.0)))
+    >>> round(float(result.q[0, -1]), 6)  # v**2 / (2 a), m
+    0.25
     """
     from twoloop.bodies.model_problem import ModelProblem  # slow to import
 

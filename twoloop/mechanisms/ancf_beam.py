@@ -126,6 +126,13 @@ def ancf_beam(
     ------
     TypeError, ValueError
         If an argument is out of range.
+
+    Examples
+    --------
+    >>> from twoloop.mechanisms import ancf_beam
+    >>> problem = ancf_beam(youngs_modulus=2e6, amplitude=0.1, angular_frequency=20.0)
+    >>> problem.system.n_q, problem.system.n_c
+    (30, 2)
     """
     n_elements = check_size("n_elements", n_elements, 1)
     if not isinstance(start, str) or start not in STARTS:
@@ -238,6 +245,13 @@ def very_flexible_beam(n_elements: int = 4, start: str = "node") -> Problem:
     increases the bending stiffness by (lambda + 2 mu)/E = 1.346, the coarse mesh by 1.059, and 1.194^2 = 1.346 x 1.059.
     The large motion is not converged either: with 4, 8 and 16 elements the tip's height at 1 s is 0.301, 0.001 and
     -0.091 m.
+
+    Examples
+    --------
+    >>> from twoloop.mechanisms import very_flexible_beam
+    >>> problem = very_flexible_beam()
+    >>> problem.system.n_q, problem.system.n_c, problem.t_span[1]
+    (30, 2, 2.0)
     """
     return ancf_beam(n_elements, start, youngs_modulus=2e6, amplitude=-0.02, angular_frequency=10.0 * math.pi)
 
@@ -246,6 +260,13 @@ def moderately_stiff_beam(n_elements: int = 4, start: str = "node") -> Problem:
     """The paper's beam of 2e8 N/m^2 on a base that moves by -0.01 m sin(2 pi t); see `ancf_beam`.
 
     Its frequencies are ten times those of `very_flexible_beam`, up to 33585 rad/s.
+
+    Examples
+    --------
+    >>> from twoloop.mechanisms import moderately_stiff_beam
+    >>> problem = moderately_stiff_beam()
+    >>> problem.system.n_q, problem.system.n_c, problem.t_span[1]
+    (30, 2, 2.0)
     """
     return ancf_beam(n_elements, start, youngs_modulus=2e8, amplitude=-0.01, angular_frequency=2.0 * math.pi)
 

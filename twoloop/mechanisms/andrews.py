@@ -156,7 +156,15 @@ def joints(q: Array) -> Array:
 
 
 def andrews() -> Problem:
-    """The mechanism released from rest, as published, over 0.03 s."""
+    """The mechanism released from rest, as published, over 0.03 s.
+
+    Examples
+    --------
+    >>> from twoloop.mechanisms import andrews
+    >>> problem = andrews()
+    >>> problem.system.n_q, problem.system.n_c, problem.t_span[1]
+    (7, 6, 0.03)
+    """
     q0 = np.array(
         [
             *(-0.0617138900142764496358948458001, 0.0, 0.455279819163070380255912382449),

@@ -85,7 +85,15 @@ def _rows() -> QuadraticSystem:
 
 
 def bricard() -> Problem:
-    """The mechanism released from rest on the edges of a cube: 60 rows of rank 59, one degree of freedom."""
+    """The mechanism released from rest on the edges of a cube: 60 rows of rank 59, one degree of freedom.
+
+    Examples
+    --------
+    >>> from twoloop.mechanisms import bricard
+    >>> problem = bricard()
+    >>> problem.system.n_q, problem.system.n_c, problem.t_span[1]
+    (60, 60, 2.0)
+    """
     rows = _rows()
     centres = 0.5 * (CORNERS[:5] + CORNERS[1:])
     q0 = np.concatenate([[*centre, *frame.T.ravel()] for centre, frame in zip(centres, FRAMES, strict=True)])

@@ -30,6 +30,13 @@ def double_pendulum() -> Problem:
     """Two masses of 1/2 kg on two links of 1 m, released from rest with both links level.
 
     The motion is chaotic, which costs about one digit over the usual run of 3 s.
+
+    Examples
+    --------
+    >>> from twoloop.mechanisms import double_pendulum
+    >>> problem = double_pendulum()
+    >>> problem.system.n_q, problem.system.n_c, problem.t_span[1]
+    (4, 2, 3.0)
     """
     rows = _masses(2)
     rows.link("link 1", 0, fixed(0.0, 0.0), 1.0)
@@ -66,6 +73,13 @@ def closed_chain(n: int = 4) -> Problem:
     ------
     TypeError, ValueError
         If n is not an integer from 2 to 20.
+
+    Examples
+    --------
+    >>> from twoloop.mechanisms import closed_chain
+    >>> problem = closed_chain()
+    >>> problem.system.n_q, problem.system.n_c, problem.t_span[1]
+    (8, 5, 1.0)
     """
     n = check_size("n", n, 2)
     if n > N_MOST:

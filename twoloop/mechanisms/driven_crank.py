@@ -21,7 +21,15 @@ ANGLE, RATE = 0.4 - 0.5 * np.pi, -1.0  # initial angle of the pendulum from the 
 
 
 def driven_crank() -> Problem:
-    """The crank at the angle 2.5 t + 0.2 sin(t); the pendulum starts 0.4 rad off the vertical at -1 rad/s."""
+    """The crank at the angle 2.5 t + 0.2 sin(t); the pendulum starts 0.4 rad off the vertical at -1 rad/s.
+
+    Examples
+    --------
+    >>> from twoloop.mechanisms import driven_crank
+    >>> problem = driven_crank()
+    >>> problem.system.n_q, problem.system.n_c, problem.t_span[1]
+    (6, 5, 3.0)
+    """
     rows = PlanarBodies(("crank", "rod"), MASSES, INERTIAS, GRAVITY)
     rows.pin(0, (-0.5 * CRANK, 0.0), GROUND, (0.0, 0.0))
     rows.pin(1, (-0.5 * ROD, 0.0), 0, (0.5 * CRANK, 0.0))

@@ -151,6 +151,13 @@ def four_bar(
     ------
     TypeError, ValueError
         If an argument is out of range, or bars 1 and 2 cannot reach joint 2-3.
+
+    Examples
+    --------
+    >>> from twoloop.mechanisms import four_bar
+    >>> problem = four_bar()
+    >>> problem.system.n_q, problem.system.n_c, problem.t_span[1]
+    (9, 8, 100.0)
     """
     lengths_array = check_vector("lengths", lengths, 3)
     if not (lengths_array > 0.0).all():

@@ -29,6 +29,13 @@ def governor() -> Problem:
     """The stiff version: springs of 8e5 N/m, dampers of 4e4 N s/m, initial angular velocity 2 pi rad/s.
 
     Two models of Exudyn are a different problem, with springs of 4000 N/m and 0.16 of that angular velocity.
+
+    Examples
+    --------
+    >>> from twoloop.mechanisms import governor
+    >>> problem = governor()
+    >>> problem.system.n_q, problem.system.n_c, problem.t_span[1]
+    (28, 24, 10.0)
     """
     z, y = np.array([0.0, 0.0, 1.0]), np.array([0.0, 1.0, 0.0])
     spin = RATE * z

@@ -14,7 +14,15 @@ SPIN = np.array([0.0, 150.0, -4.61538])  # rad/s at the start
 
 
 def heavy_top() -> Problem:
-    """The top of the benchmark for Lie-group integrators: its axis initially level, spinning at 150 rad/s."""
+    """The top of the benchmark for Lie-group integrators: its axis initially level, spinning at 150 rad/s.
+
+    Examples
+    --------
+    >>> from twoloop.mechanisms import heavy_top
+    >>> problem = heavy_top()
+    >>> problem.system.n_q, problem.system.n_c, problem.t_span[1]
+    (7, 4, 0.2)
+    """
     model, position = SpatialModel((0.0, 0.0, -GRAVITY), name="heavy top"), np.array([0.0, LENGTH, 0.0])
     motion = {"velocity": np.cross(SPIN, position), "angular_velocity": SPIN}
     model.body("top", mass=MASS, inertia=INERTIA, position=position, **motion)

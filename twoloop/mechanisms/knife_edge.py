@@ -58,7 +58,15 @@ def motion(t: float) -> tuple[Array, Array]:
 
 
 def knife_edge() -> Problem:
-    """The blade initially pointing down the slope, at rest except for its constant spin of 1.7 rad/s."""
+    """The blade initially pointing down the slope, at rest except for its constant spin of 1.7 rad/s.
+
+    Examples
+    --------
+    >>> from twoloop.mechanisms import knife_edge
+    >>> problem = knife_edge()
+    >>> problem.system.n_q, problem.system.n_c, problem.t_span[1]
+    (3, 0, 10.0)
+    """
     system = ConstrainedSystem(
         n_q=3,
         n_c=0,

@@ -68,6 +68,13 @@ def n_four_bar(n: int = 2, coordinates: str = "tips") -> Problem:
     ------
     TypeError, ValueError
         If n is not a positive integer, or `coordinates` is unknown.
+
+    Examples
+    --------
+    >>> from twoloop.mechanisms import n_four_bar
+    >>> problem = n_four_bar()
+    >>> problem.system.n_q, problem.system.n_c, problem.t_span[1]
+    (6, 5, 10.0)
     """
     n = check_size("n", n, 1)
     if not isinstance(coordinates, str) or coordinates not in SETS:

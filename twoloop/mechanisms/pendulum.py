@@ -82,6 +82,13 @@ def pendulum(start: float = -1.0) -> Problem:
     ------
     TypeError, ValueError
         If `start` is neither -1 nor 1.
+
+    Examples
+    --------
+    >>> from twoloop.mechanisms import pendulum
+    >>> problem = pendulum()
+    >>> problem.system.n_q, problem.system.n_c, problem.t_span[1]
+    (2, 1, 10.0)
     """
     if check_finite("start", start) not in (-1.0, 1.0):
         raise ValueError(f"start must be -1 or 1 (m, x of the bob at the start); given {start!r}")
@@ -110,7 +117,15 @@ def pendulum(start: float = -1.0) -> Problem:
 
 
 def projection_pendulum() -> Problem:
-    """The pendulum of SUNDIALS' projection example: its period is exactly 2 s, so that it returns after 30 s."""
+    """The pendulum of SUNDIALS' projection example: its period is exactly 2 s, so that it returns after 30 s.
+
+    Examples
+    --------
+    >>> from twoloop.mechanisms import projection_pendulum
+    >>> problem = projection_pendulum()
+    >>> problem.system.n_q, problem.system.n_c, problem.t_span[1]
+    (2, 1, 30.0)
+    """
     return _pendulum(
         "projection pendulum",
         CVODE_GRAVITY,

@@ -207,6 +207,13 @@ class PlanarBodies:
         kg, and kg m^2 about the centre of mass.
     gravity : float
         m/s^2, along -y.
+
+    Examples
+    --------
+    >>> from twoloop.mechanisms.planar import PlanarBodies
+    >>> bodies = PlanarBodies(["crank", "rod"], masses=[1.0, 2.0], inertias=[0.1, 0.2])
+    >>> len(bodies.names)
+    2
     """
 
     def __init__(self, names: Sequence[str], masses: Any, inertias: Any, gravity: float = 9.81):

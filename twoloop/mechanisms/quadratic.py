@@ -99,6 +99,16 @@ class QuadraticSystem:
         Constant and symmetric.
     force : ndarray (n_q,)
         Constant.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from twoloop.mechanisms.quadratic import QuadraticSystem, fixed, point
+    >>> rows = QuadraticSystem(np.eye(2), np.array([0.0, -9.81]))
+    >>> rows.distance(point(0), fixed(0.0, 0.0), 1.0)  # a pendulum of 1 m
+    0
+    >>> rows.system("pendulum").n_c
+    1
     """
 
     def __init__(self, mass: Array, force: Array):

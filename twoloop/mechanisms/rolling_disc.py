@@ -96,7 +96,15 @@ def rim(q: Array) -> Array:
 
 
 def rolling_disc() -> Problem:
-    """A disc of 2 kg and 0.4 m radius that initially leans by 0.3 rad, and wobbles as it rolls."""
+    """A disc of 2 kg and 0.4 m radius that initially leans by 0.3 rad, and wobbles as it rolls.
+
+    Examples
+    --------
+    >>> from twoloop.mechanisms import rolling_disc
+    >>> problem = rolling_disc()
+    >>> problem.system.n_q, problem.system.n_c, problem.t_span[1]
+    (6, 1, 2.0)
+    """
     yaw, lean, _ = ANGLES
     turn = UPRIGHT / math.cos(lean)
     sy, cy = math.sin(yaw), math.cos(yaw)

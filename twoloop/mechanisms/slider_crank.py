@@ -56,7 +56,15 @@ def positions(angle: float, rate: float, acceleration: float = 0.0) -> tuple[Arr
 
 
 def redundant_slider_crank() -> Problem:
-    """The slider-crank with nine rows of rank eight, moving freely under gravity; the crank starts at 8 rad/s."""
+    """The slider-crank with nine rows of rank eight, moving freely under gravity; the crank starts at 8 rad/s.
+
+    Examples
+    --------
+    >>> from twoloop.mechanisms import redundant_slider_crank
+    >>> problem = redundant_slider_crank()
+    >>> problem.system.n_q, problem.system.n_c, problem.t_span[1]
+    (9, 9, 2.0)
+    """
     rows = _rows(True)
     q0, v0, _ = positions(ANGLE, RATE)
     return ready(
@@ -92,7 +100,15 @@ class Driven:
 
 
 def driven_slider_crank() -> Problem:
-    """The slider-crank with the crank angle 0.5 + 4 t + 0.3 sin(3 t): nine rows for nine coordinates."""
+    """The slider-crank with the crank angle 0.5 + 4 t + 0.3 sin(3 t): nine rows for nine coordinates.
+
+    Examples
+    --------
+    >>> from twoloop.mechanisms import driven_slider_crank
+    >>> problem = driven_slider_crank()
+    >>> problem.system.n_q, problem.system.n_c, problem.t_span[1]
+    (9, 9, 2.0)
+    """
     rows = _rows(False)
     rows.drive(2, **DRIVE)
     motion = Driven()

@@ -36,7 +36,15 @@ def frame(along: Array, up: Array) -> Array:
 
 
 def spatial_four_bar() -> Problem:
-    """The RSSR linkage under gravity, its crank initially level and rotating at 5 rad/s."""
+    """The RSSR linkage under gravity, its crank initially level and rotating at 5 rad/s.
+
+    Examples
+    --------
+    >>> from twoloop.mechanisms import spatial_four_bar
+    >>> problem = spatial_four_bar()
+    >>> problem.system.n_q, problem.system.n_c, problem.t_span[1]
+    (21, 19, 2.0)
+    """
     theta, phi = START
     P = CRANK * np.array([math.cos(theta), math.sin(theta), 0.0])
     P_v = CRANK * RATE * np.array([-math.sin(theta), math.cos(theta), 0.0])

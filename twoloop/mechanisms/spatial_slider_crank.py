@@ -17,7 +17,15 @@ INERTIAS = {"crank": (1e-4, 1e-4, 1e-5), "rod": (4e-4, 4e-3, 4e-3), "slider": (1
 
 
 def spatial_slider_crank() -> Problem:
-    """The mechanism under gravity, its crank initially upright and rotating at 6 rad/s."""
+    """The mechanism under gravity, its crank initially upright and rotating at 6 rad/s.
+
+    Examples
+    --------
+    >>> from twoloop.mechanisms import spatial_slider_crank
+    >>> problem = spatial_slider_crank()
+    >>> problem.system.n_q, problem.system.n_c, problem.t_span[1]
+    (21, 20, 5.0)
+    """
     x = np.array([1.0, 0.0, 0.0])
     up = np.array([0.0, 0.0, CRANK])
     B, B_v = A + up, np.cross(RATE * x, up)

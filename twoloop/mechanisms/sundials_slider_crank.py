@@ -79,7 +79,15 @@ def joints(q: Array) -> Array:
 
 
 def sundials_slider_crank() -> Problem:
-    """The mechanism released from rest with its crank upright, over 10 s."""
+    """The mechanism released from rest with its crank upright, over 10 s.
+
+    Examples
+    --------
+    >>> from twoloop.mechanisms import sundials_slider_crank
+    >>> problem = sundials_slider_crank()
+    >>> problem.system.n_q, problem.system.n_c, problem.t_span[1]
+    (3, 2, 10.0)
+    """
     p = np.array(list(PARAMETERS.values()))
     tilt = math.asin(-PARAMETERS["a"])
     system = ConstrainedSystem(

@@ -39,6 +39,15 @@ class Adams:
     halved or doubled as there: it is multiplied by 0.8 e^(-1/(k+1)), e the estimated error over the tolerance, but at
     most by 1.2 (2 while the order still rises with every step) and, when it is refused, at least by 0.5. The integrals
     of the polynomials are found by Gauss quadrature with eight nodes, which is exact for them.
+
+    Examples
+    --------
+    >>> from twoloop import solve_dae
+    >>> from twoloop.mechanisms import four_bar
+    >>> problem = four_bar()
+    >>> result = solve_dae(problem.system, (0.0, 1.0), problem.q0, problem.v0, method="Adams")
+    >>> result.success
+    True
     """
 
     @property

@@ -117,6 +117,15 @@ class Auto:
         Implicit methods, for loose, tight and the tightest tolerances.
     fixed : method object
         For constant steps.
+
+    Examples
+    --------
+    >>> from twoloop import solve_dae
+    >>> from twoloop.mechanisms import four_bar
+    >>> problem = four_bar()
+    >>> result = solve_dae(problem.system, (0.0, 1.0), problem.q0, problem.v0, method="auto")
+    >>> result.success
+    True
     """
 
     few: Method

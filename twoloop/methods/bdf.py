@@ -58,6 +58,16 @@ class BDF:
     equidistant history of Shampine and Reichelt (1997) they need no interpolation when the step size changes. The order
     is that of the largest next step, as in VODE. Stability and error constants: Hairer, Norsett and Wanner, Solving
     ODEs I (1993), chapter III.
+
+    Examples
+    --------
+    >>> from twoloop import BDF, solve_dae
+    >>> from twoloop.mechanisms import four_bar
+    >>> problem = four_bar()
+    >>> run = problem.system, (0.0, 1.0), problem.q0, problem.v0
+    >>> result = solve_dae(*run, method=BDF(max_order=4), rtol=1e-5, atol=1e-5)
+    >>> result.success
+    True
     """
 
     max_order: int = 5

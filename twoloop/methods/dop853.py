@@ -61,6 +61,15 @@ class DOP853:
     of this quotient, as terms of high order are not small there. The numbers are those of SciPy's `DOP853`. The
     stability limits are those of the method's polynomial R(z): |R| <= 1 on the imaginary axis up to 5.96 i, on the
     real one down to -6.39.
+
+    Examples
+    --------
+    >>> from twoloop import DOP853, solve_dae
+    >>> from twoloop.mechanisms import four_bar
+    >>> problem = four_bar()
+    >>> result = solve_dae(problem.system, (0.0, 1.0), problem.q0, problem.v0, method=DOP853("restored"))
+    >>> result.success
+    True
     """
 
     stages: Literal["free", "restored"] = "free"

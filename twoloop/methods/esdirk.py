@@ -104,6 +104,16 @@ class ESDIRK:
     TR-BDF2 and the filter of its estimate: M. E. Hosea and L. F. Shampine, Applied Numerical Mathematics 20 (1996),
     21-37. ESDIRK4(3)6L[2]SA: C. A. Kennedy and M. H. Carpenter, NASA/TM-2016-219173. SDIRK methods for the state-space
     form of mechanisms: D. Negrut, E. J. Haug and H. C. German, Multibody System Dynamics 9 (2003), 121-142.
+
+    Examples
+    --------
+    >>> from twoloop import ESDIRK, solve_dae
+    >>> from twoloop.mechanisms import four_bar
+    >>> problem = four_bar()
+    >>> run = problem.system, (0.0, 1.0), problem.q0, problem.v0
+    >>> result = solve_dae(*run, method=ESDIRK("TRBDF2"), rtol=1e-4, atol=1e-4)
+    >>> result.success
+    True
     """
 
     formula: Literal["TRBDF2", "ESDIRK4"] = "TRBDF2"

@@ -37,6 +37,16 @@ class Newmark:
     ------
     TypeError, ValueError
         If a parameter is out of range.
+
+    Examples
+    --------
+    >>> from twoloop import Newmark, solve_dae
+    >>> from twoloop.mechanisms import four_bar
+    >>> problem = four_bar()
+    >>> run = problem.system, (0.0, 1.0), problem.q0, problem.v0
+    >>> result = solve_dae(*run, method=Newmark(beta=0.25), rtol=1e-4, atol=1e-4)
+    >>> result.success
+    True
     """
 
     beta: float = 0.25

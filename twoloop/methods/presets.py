@@ -51,6 +51,16 @@ def paper_irk(inner_tol: float = 1e-9, outer_tol: float = 1e-9) -> RungeKutta:
     ----------
     inner_tol, outer_tol : float
         err_in (largest Newton correction of a position) and err_out (epsilon_tol of (32)).
+
+    Examples
+    --------
+    >>> from twoloop import paper_irk, solve_dae
+    >>> from twoloop.mechanisms import four_bar
+    >>> problem = four_bar()
+    >>> run = problem.system, (0.0, 1.0), problem.q0, problem.v0
+    >>> result = solve_dae(*run, method=paper_irk(1e-9, 1e-7), rtol=1e-5, atol=1e-5)
+    >>> result.success
+    True
     """
     return RungeKutta(sun_radau_iib(3), "paper", "richardson-paper", inner_tol, outer_tol)
 
@@ -79,6 +89,16 @@ def paper_newmark(inner_tol: float = 1e-9, outer_tol: float = 1e-9, beta: float 
         err_in (largest Newton correction of a position) and err_out (tolerance of the step error, unit of q).
     beta : float
         Parameter of (12).
+
+    Examples
+    --------
+    >>> from twoloop import paper_newmark, solve_dae
+    >>> from twoloop.mechanisms import four_bar
+    >>> problem = four_bar()
+    >>> run = problem.system, (0.0, 1.0), problem.q0, problem.v0
+    >>> result = solve_dae(*run, method=paper_newmark(1e-9, 1e-5), rtol=1e-5, atol=1e-5)
+    >>> result.success
+    True
     """
     check_positive("outer_tol", outer_tol)
     return Newmark(beta=beta, gamma=0.5, error_tol=outer_tol, inner_tol=inner_tol)

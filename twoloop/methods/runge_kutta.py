@@ -77,6 +77,17 @@ class RungeKutta:
     ------
     TypeError, ValueError
         If an option is not one of those named, or a tolerance is not positive.
+
+    Examples
+    --------
+    >>> from twoloop import RungeKutta, solve_dae
+    >>> from twoloop.mechanisms import four_bar
+    >>> from twoloop.methods.tableaux import gauss
+    >>> problem = four_bar()
+    >>> method = RungeKutta(gauss(3))
+    >>> result = solve_dae(problem.system, (0.0, 1.0), problem.q0, problem.v0, method=method, step_size=0.01)
+    >>> result.stats.n_accepted
+    100
     """
 
     tableau: Tableau

@@ -37,6 +37,13 @@ class Tableau:
     ------
     TypeError, ValueError
         If shapes do not fit, a coefficient is not finite, b does not sum to 1, or c is not A 1.
+
+    Examples
+    --------
+    >>> from twoloop.methods.tableaux import gauss
+    >>> tableau = gauss(3)
+    >>> tableau.A.shape, round(float(tableau.b.sum()), 12)
+    ((3, 3), 1.0)
     """
 
     name: str
@@ -129,6 +136,13 @@ def gauss(s: int) -> Tableau:
     ------
     TypeError, ValueError
         If s is not an integer of at least 1.
+
+    Examples
+    --------
+    >>> from twoloop.methods.tableaux import gauss
+    >>> tableau = gauss(2)
+    >>> tableau.order, tableau.b.round(12).tolist()
+    (4, [0.5, 0.5])
     """
     _check_stages(s, 1, "gauss")
     c = _nodes(Legendre.basis(s))
@@ -143,6 +157,13 @@ def radau_iia(s: int) -> Tableau:
     ------
     TypeError, ValueError
         If s is not an integer of at least 1.
+
+    Examples
+    --------
+    >>> from twoloop.methods.tableaux import radau_iia
+    >>> tableau = radau_iia(3)
+    >>> tableau.order, tableau.stages
+    (5, 3)
     """
     _check_stages(s, 1, "radau_iia")
     c = _nodes(Legendre.basis(s) - Legendre.basis(s - 1))
@@ -160,6 +181,13 @@ def sun_radau_iib(s: int) -> Tableau:
     ------
     TypeError, ValueError
         If s is not an integer of at least 1.
+
+    Examples
+    --------
+    >>> from twoloop.methods.tableaux import sun_radau_iib
+    >>> tableau = sun_radau_iib(3)
+    >>> tableau.order, tableau.stages
+    (5, 3)
     """
     _check_stages(s, 1, "sun_radau_iib")
     base = radau_iia(s)
@@ -174,6 +202,13 @@ def lobatto_iiie(s: int) -> Tableau:
     ------
     TypeError, ValueError
         If s is not an integer of at least 2.
+
+    Examples
+    --------
+    >>> from twoloop.methods.tableaux import lobatto_iiie
+    >>> tableau = lobatto_iiie(3)
+    >>> tableau.order, tableau.stages
+    (4, 3)
     """
     _check_stages(s, 2, "lobatto_iiie")
     c = _nodes(Legendre.basis(s) - Legendre.basis(s - 2))

@@ -73,6 +73,15 @@ class Taylor:
     DAEs, BIT 41 (2001), 364-394. The step: the length at which each of the last two terms is within the tolerance, A.
     Jorba and M. Zou, A software package for the numerical integration of ODEs by means of high-order Taylor methods,
     Experimental Mathematics 14 (2005), 99-117. In the statistics every coefficient counts as an evaluation.
+
+    Examples
+    --------
+    >>> from twoloop import Taylor, solve_dae
+    >>> from twoloop.mechanisms import four_bar
+    >>> problem = four_bar()
+    >>> result = solve_dae(problem.system, (0.0, 1.0), problem.q0, problem.v0, method=Taylor(order=12))
+    >>> result.success
+    True
     """
 
     order: int | None = None

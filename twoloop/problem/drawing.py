@@ -30,6 +30,14 @@ class Drawing:
     TypeError, ValueError
         If `points` is not callable, or `bars` and `traces` are not made of indices. Whether the points exist is
         checked with a `Problem`, at its start.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from twoloop import Drawing
+    >>> rod = Drawing(lambda q: [(0.0, 0.0), (q[0], q[1])], bars=((0, 1),), traces=(1,))
+    >>> rod.at(np.array([0.6, -0.8])).shape
+    (2, 2)
     """
 
     points: Callable[[Array], Any]

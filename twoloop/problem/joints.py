@@ -43,6 +43,13 @@ class Joint:
     ------
     TypeError, ValueError
         If an argument is wrong. The system checks that its sizes fit.
+
+    Examples
+    --------
+    >>> from twoloop.mechanisms import four_bar
+    >>> joint = four_bar().joints[1]
+    >>> joint.name, joint.rows
+    ('1-2', (2, 3))
     """
 
     name: str

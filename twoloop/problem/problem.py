@@ -39,6 +39,13 @@ class Reference:
         "q", "v", "lam": how many decimals of the values over max(1, largest of them) hold.
     verified : str
         The second route by which they were checked, and how far it agrees.
+
+    Examples
+    --------
+    >>> from twoloop.mechanisms import four_bar
+    >>> reference = four_bar().reference
+    >>> reference.t, reference.q.shape
+    (10.0, (9,))
     """
 
     t: float
@@ -70,6 +77,12 @@ class Condition:
     low, high : float
         Largest error allowed at low and at high precision.
     source : str
+
+    Examples
+    --------
+    >>> from twoloop.mechanisms import andrews
+    >>> andrews().condition is not None
+    False
     """
 
     t_end: float
@@ -137,6 +150,25 @@ class Problem:
     TypeError, ValueError
         If an attribute is wrong, a tag is unknown, `coordinates` are not n_q different names, or the drawing does not
         fit the start.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from twoloop import ConstrainedSystem, Problem, solve_dae
+    >>> system = ConstrainedSystem.from_python(
+    ...     n_q=1, n_c=0, mass=np.eye(1), force=lambda t, q, v: -4.0 * q, name="spring"
+    ... )
+    >>> problem = Problem(
+    ...     name="spring",
+    ...     system=system,
+    ...     q0=np.array([1.0]),
+    ...     v0=np.array([0.0]),
+    ...     t_span=(0.0, np.pi),
+    ...     energy=lambda t, q, v: 0.5 * v[0] ** 2 + 2.0 * q[0] ** 2,
+    ... )
+    >>> result = solve_dae(problem.system, problem.t_span, problem.q0, problem.v0)
+    >>> round(float(result.q[0, -1]), 5)  # after one period
+    1.0
     """
 
     name: str

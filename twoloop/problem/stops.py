@@ -30,6 +30,13 @@ class Stop:
     ------
     TypeError, ValueError
         If an attribute is wrong.
+
+    Examples
+    --------
+    >>> from twoloop import Stop
+    >>> floor = Stop(lambda t, q: q[1], restitution=0.5, name="floor")  # the second coordinate stays above zero
+    >>> floor.name, floor.restitution
+    ('floor', 0.5)
     """
 
     gap: Callable[[Any, Any], Any]

@@ -69,6 +69,21 @@ class ConstrainedSystem(EvaluatedEquations):
     -----
     A system can be copied, and pickled for another process: callbacks and functions at the top level of a module
     travel by name. Plain functions without a name of their own, such as lambdas, cannot be pickled: a `TypeError`.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from twoloop import ConstrainedSystem
+    >>> pendulum = ConstrainedSystem.from_python(
+    ...     n_q=2,
+    ...     n_c=1,
+    ...     mass=np.eye(2),
+    ...     force=lambda t, q, v: np.array([0.0, -9.81]),
+    ...     constraint=lambda t, q: np.array([0.5 * (q @ q - 1.0)]),
+    ...     name="pendulum",
+    ... )
+    >>> pendulum.jacobian(0.0, np.array([0.6, -0.8]))  # derived
+    array([[ 0.6, -0.8]])
     """
 
     if TYPE_CHECKING:  # the methods of the callbacks, which follow from KINDS

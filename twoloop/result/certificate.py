@@ -30,7 +30,15 @@ LOOSER = (10.0, 100.0)  # factors of the tolerances with which a failed reintegr
 
 
 class CertificateWarning(UserWarning):
-    """A run does not pass its certificate: its defect is larger than the tolerances allow."""
+    """A run does not pass its certificate: its defect is larger than the tolerances allow.
+
+    Examples
+    --------
+    >>> import warnings
+    >>> from twoloop import CertificateWarning
+    >>> warnings.simplefilter("error", CertificateWarning)  # a certificate that does not pass raises
+    >>> warnings.resetwarnings()
+    """
 
 
 @dataclass(frozen=True)
@@ -57,6 +65,16 @@ class Certificate:
         True if `defect` is at most `limit` and `unseen` is empty.
     message : str
         The outcome in words.
+
+    Examples
+    --------
+    >>> from twoloop import solve_dae
+    >>> from twoloop.mechanisms import four_bar
+    >>> problem = four_bar()
+    >>> result = solve_dae(problem.system, (0.0, 1.0), problem.q0, problem.v0)
+    >>> certificate = result.certify()
+    >>> certificate.passed
+    True
     """
 
     defect: float

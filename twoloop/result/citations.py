@@ -51,6 +51,16 @@ def citation(result: Result) -> str:
     ------
     TypeError, ValueError
         If the argument is not a result, or comes from another solver.
+
+    Examples
+    --------
+    >>> from twoloop import solve_dae
+    >>> from twoloop.mechanisms import four_bar
+    >>> problem = four_bar()
+    >>> result = solve_dae(problem.system, (0.0, 1.0), problem.q0, problem.v0)
+    >>> from twoloop import citation
+    >>> "@" in citation(result)  # BibTeX
+    True
     """
     from twoloop import __version__
 

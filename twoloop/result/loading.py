@@ -42,6 +42,20 @@ def load(path: str | os.PathLike[str], system: ConstrainedSystem | None = None) 
     TypeError, ValueError
         If the file was not written by `Result.save`, or the folder not by `solve_dae`; if it is damaged (the message
         names the field); or if the system has other sizes.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> from twoloop import load, solve_dae
+    >>> from twoloop.mechanisms import four_bar
+    >>> problem = four_bar()
+    >>> result = solve_dae(problem.system, (0.0, 1.0), problem.q0, problem.v0)
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     result.save(Path(folder) / "run.npz")
+    ...     loaded = load(Path(folder) / "run.npz")
+    >>> bool((loaded.q == result.q).all())
+    True
     """
     if system is not None:
         check_system(system)

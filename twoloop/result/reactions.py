@@ -32,6 +32,16 @@ class Reaction:
         may share the load in any proportion: `force` and `torque` are then those of the multipliers of minimum norm.
         The sum C_q^T lam, hence the sum of all reactions on a body, is unique in any case. Determined at the first
         time of the result; later losses of rank are not detected.
+
+    Examples
+    --------
+    >>> from twoloop import solve_dae
+    >>> from twoloop.mechanisms import four_bar
+    >>> problem = four_bar()
+    >>> result = solve_dae(problem.system, (0.0, 1.0), problem.q0, problem.v0)
+    >>> pin = result.reactions("1-2")
+    >>> pin.force.shape == (2, result.t.size), pin.unique
+    (True, True)
     """
 
     force: Array

@@ -87,6 +87,18 @@ class Result(Record):
         other processes.
     impacts : tuple of Impact
         For `solve_with_stops`: times, stops, velocities before and after, and impulses. They are not saved to files.
+
+    Examples
+    --------
+    >>> from twoloop import solve_dae
+    >>> from twoloop.mechanisms import four_bar
+    >>> problem = four_bar()
+    >>> result = solve_dae(problem.system, (0.0, 1.0), problem.q0, problem.v0)
+    >>> result.status.name, result.q.shape == result.v.shape
+    ('REACHED_END', True)
+    >>> names = list(result.to_dataframe().columns)
+    >>> names[:2]
+    ['x (m) of bar 1', 'y (m) of bar 1']
     """
 
     def to_dataframe(self) -> Any:

@@ -80,6 +80,18 @@ class DenseSolution:
     ----------
     t_min, t_max : float
         The times that it covers, s.
+
+    Examples
+    --------
+    >>> from twoloop import solve_dae
+    >>> from twoloop.mechanisms import four_bar
+    >>> problem = four_bar()
+    >>> result = solve_dae(problem.system, (0.0, 1.0), problem.q0, problem.v0, dense_output=True)
+    >>> state = result.sol([0.25, 0.5])
+    >>> state.q.shape, state.lam.shape
+    ((9, 2), (8, 2))
+    >>> bool(abs(problem.system.constraint(0.25, state.q[:, 0])).max() < 1e-12)  # closed between steps
+    True
     """
 
     def __init__(self, interpolator: Interpolator, table: Table, t_max: float):

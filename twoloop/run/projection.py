@@ -50,6 +50,14 @@ class ConsistentState(tuple[Array, Array]):
         values of the other coordinates and opposite signs are on different assemblies, with a dead centre between.
     margin : float
         Smallest over largest singular value of these columns, rows and columns scaled to like size: 0 at a dead centre.
+
+    Examples
+    --------
+    >>> from twoloop import consistent_state
+    >>> from twoloop.mechanisms import pendulum
+    >>> q, v = consistent_state(pendulum().system, 0.0, [0.6, -0.9], [1.0, 1.0])
+    >>> q.shape, v.shape
+    ((2,), (2,))
     """
 
     moved_q: Move
@@ -94,6 +102,15 @@ def consistent_state(
     TypeError, ValueError
         If a shape is wrong, a value is not finite, `keep` leaves too little freedom, no consistent position is found
         near the guess, or other guesses as far off would lead to another one: near a dead centre, as a rule.
+
+    Examples
+    --------
+    >>> from twoloop import consistent_state
+    >>> from twoloop.mechanisms import pendulum
+    >>> problem = pendulum()
+    >>> q, v = consistent_state(problem.system, 0.0, [0.6, -0.9], [1.0, 1.0])
+    >>> bool(abs(problem.system.constraint(0.0, q)[0]) < 1e-12), bool(abs(q @ v) < 1e-12)  # v along the circle
+    (True, True)
     """
     check_system(system)
     check_flag("check_assembly", check_assembly)

@@ -18,7 +18,18 @@ Array = NDArray[np.float64]
 
 
 class Status(IntEnum):
-    """How a run ended: 0 reached the end, 1 an event, negative a failure. See docs/when_it_fails.md for each."""
+    """How a run ended: 0 reached the end, 1 an event, negative a failure. See docs/when_it_fails.md for each.
+
+    Examples
+    --------
+    >>> from twoloop import solve_dae
+    >>> from twoloop.mechanisms import four_bar
+    >>> problem = four_bar()
+    >>> result = solve_dae(problem.system, (0.0, 1.0), problem.q0, problem.v0)
+    >>> from twoloop import Status
+    >>> result.status is Status.REACHED_END
+    True
+    """
 
     REACHED_END = 0
     EVENT = 1
@@ -88,6 +99,15 @@ class Statistics:
         times between them. Compilation, checks of the input, the workspace, the first accelerations, and a and lam at
         output times between steps are not included. A run that was made again counts as a whole; counts are those of
         the last time.
+
+    Examples
+    --------
+    >>> from twoloop import solve_dae
+    >>> from twoloop.mechanisms import four_bar
+    >>> problem = four_bar()
+    >>> result = solve_dae(problem.system, (0.0, 1.0), problem.q0, problem.v0)
+    >>> result.stats.n_accepted == result.t.size - 1, result.stats.n_evaluations > 0
+    (True, True)
     """
 
     n_accepted: int | None = None

@@ -43,7 +43,19 @@ CHANGED = "the parameters changed at samples"
 
 
 class SampledState(NamedTuple):
-    """The state at the end of a sample: t, s, and q, v, a (n_q,), lam (n_c + n_a,); read-only."""
+    """The state at the end of a sample: t, s, and q, v, a (n_q,), lam (n_c + n_a,); read-only.
+
+    Examples
+    --------
+    >>> from twoloop import Integrator
+    >>> from twoloop.mechanisms import four_bar
+    >>> problem = four_bar()
+    >>> integrator = Integrator(problem.system)
+    >>> _ = integrator.start(0.0, problem.q0, problem.v0)
+    >>> state = integrator.step(0.01)
+    >>> state.t, state.q.shape, state.lam.shape
+    (0.01, (9,), (8,))
+    """
 
     t: float
     q: Array

@@ -24,6 +24,17 @@ def ends(problem: Problem, result: Result) -> dict[str, Any]:
     """Return the default measures of a sweep: last time, steps, evaluations and the largest energy error.
 
     The energy error is NaN unless the problem declares its energy an invariant.
+
+    Examples
+    --------
+    >>> from twoloop import solve_dae
+    >>> from twoloop.mechanisms import four_bar
+    >>> problem = four_bar()
+    >>> result = solve_dae(problem.system, (0.0, 1.0), problem.q0, problem.v0)
+    >>> from twoloop.sweeps.one_run import ends
+    >>> measures = ends(problem, result)
+    >>> "energy_error" in measures
+    True
     """
     energy = result.energy if problem.conserved and result.t.size else np.array([np.nan])
     return {

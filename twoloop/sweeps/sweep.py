@@ -106,6 +106,15 @@ def sweep(
 
     All other runs are separate calls of `solve_dae`, whose rows do not depend on how they are distributed. A process
     that dies affects a single run: the others of its task are repeated one by one.
+
+    Examples
+    --------
+    >>> from twoloop import sweep
+    >>> from twoloop.mechanisms import four_bar
+    >>> grid = [{"theta3": 0.0}, {"theta3": 0.1}]
+    >>> rows = sweep(four_bar, grid, t_span=(0.0, 1.0), parallel="threads")
+    >>> rows["status"].tolist()
+    ['REACHED_END', 'REACHED_END']
     """
     check_choice("parallel", parallel, PARALLEL)
     check_flag("progress", progress)

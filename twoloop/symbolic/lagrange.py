@@ -66,6 +66,19 @@ def from_lagrangian(
         If an expression has an unknown symbol or is not smooth; if a constraint depends on velocities or on no
         coordinate; if T is not quadratic or `nonholonomic` not linear in the velocities; or if `forces` have a wrong
         size or unknown coordinates.
+
+    Examples
+    --------
+    >>> import sympy as sp
+    >>> from twoloop.symbolic import from_lagrangian
+    >>> t, m, g = sp.symbols("t m g")
+    >>> x, y = (sp.Function(name)(t) for name in "xy")
+    >>> T = m * (x.diff(t) ** 2 + y.diff(t) ** 2) / 2
+    >>> rows, numbers = [x**2 + y**2 - 1], {m: 1.0, g: 9.81}
+    >>> pendulum = from_lagrangian(T, m * g * y, rows, [x, y], parameters=numbers, name="pendulum")
+    >>> problem = pendulum.problem([1.0, 0.0], [0.0, 0.0], (0.0, 1.0))
+    >>> problem.system.n_q, problem.system.n_c
+    (2, 1)
     """
     x = Reader(coordinates, parameters)
     kinetic, potential = x.read("T", T, VELOCITIES), x.read("V", V, POSITIONS)

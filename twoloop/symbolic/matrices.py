@@ -59,6 +59,16 @@ def from_matrices(
     TypeError, ValueError
         As for `from_lagrangian`; also if M is not square, not symmetric or depends on velocities, if Q has a wrong
         size, or if a speed is not linear in the velocities.
+
+    Examples
+    --------
+    >>> import sympy as sp
+    >>> from twoloop.symbolic import from_matrices
+    >>> t = sp.Symbol("t")
+    >>> x, y = (sp.Function(name)(t) for name in "xy")
+    >>> M, Q = sp.eye(2), sp.Matrix([0, sp.Float("-9.81")])
+    >>> from_matrices(M, Q, [x**2 + y**2 - 1], [x, y], name="pendulum").coordinates
+    ('x', 'y')
     """
     if speeds is not None and not isinstance(speeds, Mapping):
         raise TypeError(f"speeds must map generalised speeds to expressions in the velocities; given {speeds!r}")

@@ -42,6 +42,18 @@ def from_method(
     TypeError, ValueError
         As for `from_matrices`; also if the method has dependent or auxiliary speeds, or kinematic equations that do not
         determine its speeds.
+
+    Examples
+    --------
+    >>> import sympy as sp
+    >>> from sympy.physics.mechanics import LagrangesMethod, dynamicsymbols
+    >>> from twoloop.symbolic import from_method
+    >>> x, y = dynamicsymbols("x y")
+    >>> lagrangian = (x.diff() ** 2 + y.diff() ** 2) / 2 - 9.81 * y
+    >>> method = LagrangesMethod(lagrangian, [x, y], hol_coneqs=[x**2 + y**2 - 1])
+    >>> _ = method.form_lagranges_equations()
+    >>> from_method(method, name="pendulum").n_c
+    1
     """
     if isinstance(method, System):
         own = method.holonomic_constraints, method.nonholonomic_constraints

@@ -38,6 +38,18 @@ class SymbolicMechanism:
         Values by name, in the order of `p`.
     code : GeneratedCode
         The callbacks and the energy; `code.source` is the generated source.
+
+    Examples
+    --------
+    >>> import sympy as sp
+    >>> from twoloop.symbolic import from_lagrangian
+    >>> t, m, g = sp.symbols("t m g")
+    >>> x, y = (sp.Function(name)(t) for name in "xy")
+    >>> T = m * (x.diff(t) ** 2 + y.diff(t) ** 2) / 2
+    >>> rows, numbers = [x**2 + y**2 - 1], {m: 1.0, g: 9.81}
+    >>> pendulum = from_lagrangian(T, m * g * y, rows, [x, y], parameters=numbers, name="pendulum")
+    >>> pendulum.coordinates, pendulum.n_c
+    (('x', 'y'), 1)
     """
 
     name: str

@@ -18,6 +18,18 @@ class Finding:
     passed : bool
     hint : str
         Likely cause; empty if passed.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from twoloop.testing import check_simulator
+    >>> def simulate(problem, times, tolerance):
+    ...     rows = np.tile(problem.q0, (len(times), 1))  # a simulator that does not move
+    ...     return rows
+    >>> report = check_simulator(simulate, "pendulum", tolerances=(1e-4, 1e-6))
+    >>> finding = report.findings[0]
+    >>> finding.problem, isinstance(finding.passed, bool)
+    ('pendulum', True)
     """
 
     problem: str
@@ -30,7 +42,19 @@ class Finding:
 
 @dataclass(frozen=True)
 class Failure:
-    """A failed property: problem, property, measured and allowed value, and a hint."""
+    """A failed property: problem, property, measured and allowed value, and a hint.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from twoloop.testing import check_simulator
+    >>> def simulate(problem, times, tolerance):
+    ...     rows = np.tile(problem.q0, (len(times), 1))  # a simulator that does not move
+    ...     return rows
+    >>> report = check_simulator(simulate, "pendulum", tolerances=(1e-4, 1e-6))
+    >>> report.failures[0].problem
+    'pendulum'
+    """
 
     problem: str
     property: str
@@ -53,6 +77,17 @@ class Report:
         All properties of all problems, passed or failed.
     skipped : tuple of (str, str, str)
         Problem, property and the reason why it was not measured.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from twoloop.testing import check_simulator
+    >>> def simulate(problem, times, tolerance):
+    ...     rows = np.tile(problem.q0, (len(times), 1))  # a simulator that does not move
+    ...     return rows
+    >>> report = check_simulator(simulate, "pendulum", tolerances=(1e-4, 1e-6))
+    >>> report.passed, len(report.failures) > 0
+    (False, True)
     """
 
     findings: tuple[Finding, ...]

@@ -23,6 +23,13 @@ class KnownBody:
         kg m^2: empty for a point, the moment in the plane, or the principal moments in body axes.
     columns : slice
         Its coordinates in q: centre of mass, then an angle or four Euler parameters.
+
+    Examples
+    --------
+    >>> from twoloop.testing import problems
+    >>> problem = next(each for each in problems() if each.bodies)
+    >>> problem.bodies[0].mass > 0.0
+    True
     """
 
     mass: float
@@ -52,6 +59,13 @@ class KnownJoint:
         Length of a distance, m.
     motion : tuple of callable or None
         The angle of a drive as a function of time, rad, and its first two derivatives.
+
+    Examples
+    --------
+    >>> from twoloop.testing import problems
+    >>> problem = next(each for each in problems() if each.joints)
+    >>> len(problem.joints[0].bodies)
+    2
     """
 
     kind: str

@@ -33,6 +33,14 @@ class Motion:
     growth : ndarray (n_t,)
         Largest growth factor of a perturbation of an earlier state, with q and v relative to their largest values.
         At least 1.
+
+    Examples
+    --------
+    >>> from twoloop.testing import problems
+    >>> problem = next(each for each in problems() if each.name == "pendulum")
+    >>> motion = problem.reference
+    >>> motion.q.shape == motion.v.shape, bool(motion.t[0] == problem.t_span[0])
+    (True, True)
     """
 
     t: Array
@@ -98,6 +106,13 @@ class KnownProblem:
         links and so on. Points of bodies are with `joints`.
     note : str
         Purpose of the problem.
+
+    Examples
+    --------
+    >>> from twoloop.testing import problems
+    >>> problem = next(each for each in problems() if each.name == "pendulum")
+    >>> problem.mass(0.0, problem.q0).shape, problem.q0.shape
+    ((2, 2), (2,))
     """
 
     name: str

@@ -242,6 +242,19 @@ def callback(kind: str, allocates: bool = True) -> Callable[[Callable[..., None]
         If `kind` is unknown.
     TypeError
         If the function has other arguments, writes to one that it is given, or numba cannot compile it.
+
+    Examples
+    --------
+    >>> from twoloop import ConstrainedSystem, callback
+    >>> @callback("mass")
+    ... def mass(t, q, p, M):
+    ...     M[0, 0] = p[0]
+    >>> @callback("force")
+    ... def force(t, q, v, p, Q):
+    ...     Q[0] = -p[1] * q[0]
+    >>> spring = ConstrainedSystem(n_q=1, n_c=0, mass=mass, force=force, parameters=[2.0, 8.0])
+    >>> spring.force(0.0, [0.5], [0.0])
+    array([-4.])
     """
     if callable(kind):
         raise TypeError('the decorator needs the kind of callback: write @callback("force"), not @callback')
