@@ -34,17 +34,6 @@ TIMED = (
     *("work_precision", "compare", "table3", "energy", "ensembles", "engines", "scale", "beam", "violation"),
     "ablation",
 )
-    "work_precision",
-    "compare",
-    "table3",
-    "energy",
-    "ensembles",
-    "engines",
-    "scale",
-    "beam",
-    "violation",
-    "ablation",
-)
 MADE_BY = dict.fromkeys(("motion", "step_size", "violation", "beam", "ablation"), "reproduction")
 LOCK = "twoloop-timed.lock"  # in the machine's folder of temporary files
 NO_LINK = getattr(os, "O_NOFOLLOW", 0)
