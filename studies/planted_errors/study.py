@@ -1,4 +1,4 @@
-"""Faults planted one at a time: which of our checks catches each, and which none does."""
+"""Planted errors: which check catches each of some faults in models, solvers and reports, planted one at a time."""
 
 import contextlib
 import io
@@ -15,11 +15,11 @@ import pytest
 
 from studies.bench import study
 from studies.bench.apart import apart
-from studies.bench.cli import ROOT, StudyError
+from studies.bench.cli import REPORTS, ROOT, StudyError
 from studies.bench.collector import Run, warm_up
 from studies.bench.end_states import case_of
 from studies.bench.end_states import row_of as row_of_run
-from studies.bench.render import render, table
+from studies.bench.render import render
 from studies.bench.solvers import CATALOGUE
 from studies.bench.store import Output, Row
 from studies.planted_errors.faults import SCIPY, TRACING, Fault, all_faults
@@ -53,7 +53,7 @@ BEGINS = {
 
 
 def run_check(problem: Problem, solver: str) -> str:
-    """Run the problem and judge it: what speaks against it, "" if nothing does."""
+    """Run the problem and say what speaks against the run, "" if nothing does."""
     row = row_of_run(Run(case_of(problem), CATALOGUE[solver], TOLERANCE, repeats=1))
     if row["error_q"] is None:
         if row["status"] == "NOT_APPLICABLE":
@@ -90,7 +90,7 @@ class FirstFailure:
 
 
 def test_check(tests: Sequence[str]) -> str:
-    """The first test that fails, "" if none does."""
+    """Run tests and name the first that fails, "" if none does."""
     seen = FirstFailure()
     options = ["-q", "-x", "-p", "no:cacheprovider", "-p", "no:xdist", *(str(ROOT / test) for test in tests)]
     with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
@@ -103,8 +103,8 @@ def test_check(tests: Sequence[str]) -> str:
 test_check.__test__ = False  # type: ignore[attr-defined]
 
 
-def look(fault: Fault, planted: bool) -> str:
-    """Plant a fault in this process: what catches it."""
+def check(fault: Fault, planted: bool) -> str:
+    """Plant a fault in this process, or not, and say what catches it."""
     os.chdir(ROOT)
     warnings.simplefilter("ignore")
     with fault.plant() if planted else contextlib.nullcontext():
@@ -112,9 +112,9 @@ def look(fault: Fault, planted: bool) -> str:
 
 
 def caught(fault: Fault, planted: bool) -> str:
-    """What catches a fault, found in a process of its own; a check that does not come back has caught it, too."""
+    """Check a fault in a process of its own; a check that does not come back has caught it, too."""
     try:
-        return str(apart(partial(look, fault, planted), TIME_LIMIT))
+        return str(apart(partial(check, fault, planted), TIME_LIMIT))
     except TimeoutError:
         return "time limit of the check"
     except EOFError:
@@ -122,7 +122,7 @@ def caught(fault: Fault, planted: bool) -> str:
 
 
 def row_of(fault: Fault) -> Row:
-    """A fault and what catches it."""
+    """Make the row of a fault, with what catches it."""
     began = time.monotonic()
     found = caught(fault, True)
     row: Row = {"fault": fault.name, "place": fault.place, "caught_by": found or NONE}
@@ -131,7 +131,7 @@ def row_of(fault: Fault) -> Row:
 
 
 def check_sound(faults: Sequence[Fault]) -> int:
-    """Run every check without a fault; how many there are.
+    """Run every check without a fault, and count them.
 
     Raises StudyError if one of them fails: it would catch anything.
     """
@@ -163,27 +163,37 @@ def make(output: Output) -> pd.DataFrame:
         return pd.DataFrame([kept.made(fault.name, partial(row_of, fault)) for fault in faults])
 
 
+def catcher(caught_by: str) -> str:
+    """Say who catches a fault."""
+    if caught_by == NONE:
+        return NONE
+    return next((who for who, begins in BEGINS.items() if caught_by.startswith(begins)), TESTS)
+
+
 def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
-    missed, by = rows["caught_by"] == NONE, {ITSELF: 0, KNOWN: 0, BOUNDS: 0, TESTS: 0}
-    models, stopped = rows["place"] == "mechanism", 0
-    for caught_by, of_model in zip(rows["caught_by"][~missed], models[~missed], strict=True):
-        who = next((who for who, begins in BEGINS.items() if caught_by.startswith(begins)), TESTS)
-        by[who] += 1
-        stopped += of_model and who == ITSELF
-    found = {"n": len(rows), "missed": rows["fault"][missed].tolist(), "by": by}
-    return found | {"models": {"n": int(models.sum()), "stopped": int(stopped)}, "tolerance": TOLERANCE}
+    """Count the faults by who catches them, in all and by their place."""
+    who = rows["caught_by"].map(catcher)
+
+    def counts(own: pd.DataFrame) -> dict[str, int]:
+        return {each: int((who[own.index] == each).sum()) for each in (*BEGINS, TESTS, NONE)}
+
+    places = [{"place": str(place), "n": len(own), **counts(own)} for place, own in rows.groupby("place", sort=False)]
+    found = {"n": len(rows), "missed": rows["fault"][who == NONE].tolist(), "by": counts(rows), "places": places}
+    answer = f"The checks catch {len(rows) - len(found['missed'])} of {len(rows)} planted faults; solve_dae itself "  # type: ignore[arg-type]
+    return found | {"tolerance": TOLERANCE, "answer": f"{answer}refuses or stops {found['by'][ITSELF]} of them."}  # type: ignore[index]
 
 
 def report(output: Output, rows: pd.DataFrame, line: str) -> None:
+    """Write the findings, and the page of the documentation; a quick run writes the page beside its rows."""
     found = findings_of(rows)
     mutants = output.path / "mutants.json"
     found["mutants"] = json.loads(mutants.read_text()) if mutants.is_file() else None
     output.save_findings(found)
-    by_file = rows["caught_by"].str.removeprefix("tests/").str.split("::").str[0]  # the rows have the test, too
-    caught = rows.groupby(["place", by_file], sort=False)["fault"]
-    cells = [[str(place), str(by), len(names), names.iloc[0]] for (place, by), names in caught]
-    ready = {"faults": table(["fault in", "caught by", "faults", "for example"], cells)}
-    output.write("planted_errors.md", render("planted_errors", found, ready, stamp=line, quick=output.call.quick))
+    text = render("planted_errors", found, {}, stamp=line, quick=output.call.quick)
+    if output.path == REPORTS.resolve() and not output.call.quick:
+        (ROOT / "docs" / "planted_errors.md").write_text(text)
+    else:
+        output.write("planted_errors.md", text)
 
 
 def main(words: Sequence[str] | None = None) -> None:

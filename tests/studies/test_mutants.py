@@ -1,4 +1,4 @@
-"""Mutants of kernels: what is changed, that a test which sees one is named, and what the report says."""
+"""Mutants of kernels: what is changed, that a test which sees one is named, and what is counted."""
 
 import ast
 from pathlib import Path
@@ -7,7 +7,6 @@ import pandas as pd
 import pytest
 
 from studies.bench.cli import ROOT
-from studies.bench.render import render
 from studies.planted_errors import mutants
 from studies.planted_errors.mutants import Mutant, mutants_of
 
@@ -82,18 +81,10 @@ def test_a_mutant_that_is_seen_and_one_that_is_not(folder: Path, monkeypatch):
     assert mutants.file_of(folder, "x").read_text() == "def f():\n    return 1\n"
 
 
-def text_of(seen_by, why=""):
-    line = {"kernel": "bdf", "line": 3, "text": "a | b", "old": "1", "new": "2", "seen_by": seen_by}
-    found = mutants.findings_of(pd.DataFrame([line]))
-    for survivor in found["survivors"]:
-        survivor["why"] = why
-    whole = {"n": 1, "missed": [], "tolerance": 1e-10, "mutants": found | {"made": "stamp"}}
-    whole["by"] = {"solve_dae": 1, "known motion": 0, "bounds": 0, "tests": 0}
-    whole["models"] = {"n": 1, "stopped": 1}
-    return render("planted_errors", whole, {"faults": ""}, stamp="stamp", quick=False)
-
-
-def test_sentences_turn_with_the_rows():
-    assert "Not seen" not in text_of("test_x.py::test_it")
-    assert "| bdf.py:3 | 1 → 2 | **no test detects it** |" in text_of(mutants.NONE)
-    assert "because" in text_of(mutants.NONE, "because")
+def test_mutants_that_no_test_sees_are_listed_with_the_reason(monkeypatch):
+    line = {"kernel": "bdf", "line": 3, "text": "a | b", "old": "1", "new": "2"}
+    rows = pd.DataFrame([line | {"seen_by": mutants.NONE}, line | {"seen_by": "test_x.py::test_it"}])
+    monkeypatch.setitem(mutants.ARGUED, "bdf | a | b | 1 | 2", "because")
+    found = mutants.findings_of(rows)
+    assert (found["n"], found["seen"], found["kernels"]) == (2, 1, {"bdf": {"n": 2, "seen": 1}})
+    assert [(each["line"], each["why"]) for each in found["survivors"]] == [("3", "because")]
