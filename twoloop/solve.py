@@ -71,10 +71,7 @@ def solve_dae(
     compiled: Compiled = "auto",
     store: str | os.PathLike[str] | None = None,
 ) -> Result:
-    """Integrate a constrained mechanical system; its constraints hold at every step.
-
-    Constraints that depend on others at the start are left out and checked at every step; a `ConstraintWarning` names
-    them. Near a position where the constraints lose rank, any method may take explicit steps across it.
+    """Integrate a constrained mechanical system and keep its constraints closed at every step.
 
     Parameters
     ----------
@@ -83,80 +80,43 @@ def solve_dae(
     t_span : (float, float)
         Start and end, s; the end after the start.
     q0, v0 : array_like (n_q,)
-        Consistent initial coordinates and velocities (see `consistent_state`).
+        Consistent initial coordinates and velocities; `consistent_state` makes them from rough ones.
     method : str or method object
-        "auto" (default: explicit, with Newton's method while the problem is found to be stiff, see `Auto`),
-        "Taylor", "DOP853", "Adams", "Gauss4" ... "Gauss16", "SunRadau5", "RadauIIA5", "RadauIIA9", "RadauIIA13",
-        "TRBDF2", "ESDIRK4", "BDF", "Newmark", "PaperIRK", "PaperNewmark", or an object: `RungeKutta(...)`,
-        `ESDIRK(...)`, `Newmark(...)`, ...
+        "auto" (default), "Taylor", "DOP853", "Adams", "Gauss4" ... "Gauss16", "SunRadau5", "RadauIIA5", "RadauIIA9",
+        "RadauIIA13", "TRBDF2", "ESDIRK4", "BDF", "Newmark", "PaperIRK" or "PaperNewmark". Or an object, such as
+        `RungeKutta(...)`, `ESDIRK(...)` or `Newmark(...)`.
     rtol : float
         Relative tolerance of the error of a step.
     atol : float or array_like (n_q,)
-        Absolute tolerance. An array has one number for each coordinate, which also holds for its velocity.
-
-        A step is accepted if the largest component of its estimated error, divided by atol + rtol |value|, is at most
-        1. Positions and velocities count. For `Newmark`, the error of the positions per unit step counts, with the
-        tolerances of the velocities; with `error_tol`, Newmark has a test of its own. With error="richardson-paper" of
-        `RungeKutta`, the root mean square counts instead of the largest component.
-
-        The dependent positions are tested, too, except in the paper's two procedures. The distance between those that
-        the formula predicts and those that the constraints give counts as an error, and must not exceed about a tenth
-        of the motion in the step. A step therefore cannot end on another assembly of the mechanism.
+        Absolute tolerance of the error of a step. An array has one number for each coordinate and its velocity.
     t_eval : array_like, optional
-        Increasing times in t_span at which to store the solution. It is interpolated between the steps as by `sol`, and
-        the steps do not change. None: every accepted step is stored. With `step_size`, and with the two methods of the
-        paper, nothing is interpolated, and steps are shortened to end at these times.
+        Increasing times in t_span at which to store the solution. None: at every accepted step.
     first_step : float, optional
-        First step to try, s. None: chosen from the velocities and accelerations at the start, or from the Taylor series
-        there.
+        First step to try, s. None: chosen from the state at the start.
     max_step : float
-        Largest step, s. "Taylor" evaluates the equations within its steps. All other methods evaluate them only at the
-        ends and stages of steps, and take no step longer than a hundredth of the run. Steps of "DOP853", whose stages
-        are no more than 4/15 of a step apart, may last 3.75 hundredths where no callback has quotients, roots or fast
-        vibrations and no position was nearly singular. Forces and drives that may change suddenly with time are also
-        evaluated every two-thousandth of the run, and at least eight times per step; steps end where they change. A run
-        that meets a change too short for this is made again, up to twice, with more such evaluations. If these are
-        still too few, a `ConstraintWarning` and the message say how long it lasts. What acts for a shorter time, or
-        over a shorter distance, may be missed, if the run meets none of it; then give its duration.
+        Largest step, s. Forces shorter than 1/2000 of the run can be missed; then set this to their duration.
     max_steps : int, optional
-        Largest number of accepted steps. None: no limit, but a run ends with the status STAGNATED if the rest would
-        take more than 1e7 steps as short as the last and these are a thousand times shorter than before, or more than
-        1e11 and there is neither a time_limit nor a terminal event.
+        Largest number of accepted steps. None: no limit, but a run that would not end is stopped.
     step_size : float, optional
-        Constant step, s, without error control. Only the last step is shortened, to end at t_span[1]. Times in `t_eval`
-        must then be multiples of it. A step that does not converge ends the run.
+        Constant step, s, without error control. Times in `t_eval` must then be multiples of it.
     dense_output : bool
-        Whether to keep what `result.sol(t)` needs, the state at any time t of the run (see `DenseSolution`).
+        Whether to keep what `result.sol(t)` needs, the state at any time t of the run. See `DenseSolution`.
     events : callable or list of callables, optional
-        Functions event(t, q, v) -> float, plain or compiled by numba, whose zeros are found by the rules of SciPy's
-        `solve_ivp`. An attribute `terminal`, True or a number of occurrences, ends the run there. With an attribute
-        `direction`, 1 or -1, only zeros count at which the value rises or falls. A zero at the start counts. The sign
-        is checked four times per step, and at least every 400th of t_span. Two zeros between two checks can be missed,
-        and so can one without a change of sign; a smaller `max_step` helps. The time of an event is that of the dense
-        solution, to rounding. Events that are not terminal do not change the steps.
+        Functions event(t, q, v) -> float, plain or compiled by numba, whose zeros are found. As in SciPy's
+        `solve_ivp`, they may have the attributes `terminal` and `direction`.
     progress : bool, optional
         True: show a bar (needs the package rich).
     time_limit : float, optional
-        Wall-clock time, s, after which the run ends with the status TIME_LIMIT. It is checked about every 0.1 s, but
-        not within a step, and for a small compiled system not before a thousand steps.
+        Wall-clock time, s, after which the run ends with the status TIME_LIMIT. It is checked about every 0.1 s.
     check_derivatives : bool
-        Whether to check C_q, C_t, gamma and the tangents at the first start of a system, and all but the tangents again
-        at a few states of the run. They are compared with exact derivatives if the callbacks run on symbols, otherwise
-        with differences. For compiled callbacks, only states outside the region of earlier runs are compared, and the
-        2nd, 4th, 8th, ... run as a whole. A system with other parameters (`with_parameters`) is checked at the start
-        like a new one. Along runs, parameters count as if they were coordinates, unless callbacks branch on them.
+        Whether to compare C_q, C_t, gamma and the tangents with exact derivatives or differences. This is done at the
+        first start of a system and at a few states of its runs.
     compiled : bool or "auto"
-        Whether to make machine code of the equations of the mechanism, for the methods "auto", "Taylor", "DOP853" and
-        "Adams". It usually makes the integrator two to four times as fast, but gains less in a short call and not
-        always on stiff motion. Making it takes 0.1 to 7 s, growing with the mechanism. This happens once for equations
-        of the same structure, because the code is kept on disk and reads its numbers. The callbacks must not branch on
-        t, q or v. Near a singular position, steps that cannot be trusted to this code are computed without it.
-        "auto" (default): for small mechanisms with compiled callbacks, whose code takes some tenths of a second. The
-        choice depends only on the arguments of the call, so the same call gives the same numbers whatever ran before.
+        Whether to generate machine code for the equations of the mechanism, for "auto", "Taylor", "DOP853" and
+        "Adams". "auto" (default): for small mechanisms with compiled callbacks.
     store : str or path, optional
-        A new folder, for runs that do not fit into memory. What the run keeps is written there as it is computed.
-        Arrays of the result, and of the dense solution, are read from there when they are used. Events stay in memory.
-        `twoloop.load` reads the folder again, even if the run failed or its process died.
+        A new folder in which a run that does not fit into memory is written as it is computed. `twoloop.load` reads
+        it again.
 
     Returns
     -------
@@ -168,8 +128,49 @@ def solve_dae(
     ------
     TypeError, ValueError
         If an argument is wrong: before any work, naming the argument. An exception from a Python callback or an event
-        is passed on unchanged, with a note that says which one was called and at what time. If an event returns
-        something other than a real number, the error has this note, too.
+        is passed on unchanged, with a note that says which one was called and at what time.
+
+    Notes
+    -----
+    *Method.* "auto" is explicit, with Newton's method while the problem is found to be stiff, see `Auto`. Near a
+    position where the constraints lose rank, any method may take explicit steps across it.
+
+    *Constraints.* Rows that depend on others at the start are left out and checked at every step; a
+    `ConstraintWarning` names them.
+
+    *Tolerances.* A step is accepted if the largest component of its estimated error, divided by atol + rtol |value|,
+    is at most 1. Positions and velocities count. For `Newmark`, the error of the positions per unit step counts, with
+    the tolerances of the velocities, unless it has an `error_tol`. With error="richardson-paper" of `RungeKutta`, the
+    root mean square counts. The dependent positions are tested, too, except in the paper's two procedures: the distance
+    between those that the formula predicts and those that the constraints give counts as an error, and must not exceed
+    about a tenth of the motion in the step. So no step ends on another assembly of the mechanism.
+
+    *Output times.* The solution is interpolated between the steps as by `sol`, and the steps do not change. With
+    `step_size`, and with the two methods of the paper, steps are shortened to end at the times of `t_eval`.
+
+    *Short forces.* "Taylor" evaluates the equations within its steps. Other methods evaluate them at the ends and
+    stages of steps, and take no step longer than a hundredth of the run ("DOP853": 3.75 hundredths where no callback
+    has quotients, roots or fast vibrations and no position was nearly singular). Forces and drives that may change
+    suddenly with time are also evaluated every two-thousandth of the run, and at least eight times per step; steps end
+    where they change. A run that meets a change too short for this is repeated, up to twice, with more evaluations.
+    If these are too few, a `ConstraintWarning` says how long the change lasts.
+
+    *Runs that do not end.* Without `max_steps`, a run ends as STAGNATED if the rest would take more than 1e7 steps as
+    short as the last and these are a thousand times shorter than before, or more than 1e11 steps and there is neither
+    a time limit nor a terminal event.
+
+    *Events.* A zero at the start counts. The sign is checked four times per step, and at least every 400th of t_span:
+    two zeros between two checks can be missed, and so can one without a change of sign. The time of an event is that
+    of the dense solution, to rounding. Events that are not terminal do not change the steps.
+
+    *Derivatives.* They are compared with exact ones if the callbacks run on symbols. For compiled callbacks, only
+    states outside the region of earlier runs are compared, and the 2nd, 4th, 8th, ... run as a whole. A system with
+    other parameters (`with_parameters`) is checked at the start like a new one.
+
+    *Generated code* usually makes the integrator two to four times as fast. Making it takes 0.1 to 7 s, once for
+    equations of the same structure, as it is kept on disk. The callbacks must not branch on t, q or v. Near a singular
+    position, steps that cannot be trusted to this code are computed without it. The choice by "auto" depends only on
+    the arguments, so the same call gives the same numbers whatever ran before.
 
     Examples
     --------
