@@ -1,15 +1,15 @@
 """Random mechanisms under random short and discontinuous forces: a run is right, or it says that it is not.
 
 Right is what SciPy makes of the same motion in as few coordinates as it has freedoms, by the rule of
-`studies/bench/sharp_motion.py`, kept in differential_motions.json. `studies.robustness` does the same at length.
+`differential_motions.py`, kept in differential_motions.json.
 """
 
 import numpy as np
 import pytest
 
 from studies.bench.sharp_forces import KIND, SIZE, A
-from studies.bench.sharp_motion import RIGHT, SILENT, TIMES, judged, march, off, positions
-from tests.differential_motions import FAMILIES, mechanism_of, read
+from studies.bench.sharp_motion import TIMES, march, off, positions
+from tests.differential_motions import FAMILIES, RIGHT, SILENT, judged, mechanism_of, read
 
 TIME_LIMIT = 20.0  # s
 TOLERANCES = (1e-4, 1e-6, 1e-8, 1e-10, 1e-12)

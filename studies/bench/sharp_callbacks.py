@@ -67,43 +67,6 @@ def chain_gamma(t, q, v, p, Qd):  # type: ignore[no-untyped-def]
         Qd[i] = scale * ((q[0] - f) * second * (k == 0) - (x * x + y * y))
 
 
-# --- of a slider-crank of points, p = [crank, rod, two masses, ...]: x, y of the crank's end and x of the slider
-
-
-@callback("mass")
-def crank_mass(t, q, p, M):  # type: ignore[no-untyped-def]
-    M[0, 0] = p[2]
-    M[1, 1] = p[2]
-    M[2, 2] = p[3]
-
-
-@callback("force")
-def crank_force(t, q, v, p, Q):  # type: ignore[no-untyped-def]
-    Q[1] = -GRAVITY * p[2]
-    Q[2] = force_along(t, q[2], v[2], p)
-
-
-@callback("constraint")
-def crank_constraint(t, q, p, C):  # type: ignore[no-untyped-def]
-    C[0] = 0.5 * (q[0] * q[0] + q[1] * q[1] - p[0] * p[0])
-    C[1] = 0.5 * ((q[2] - q[0]) ** 2 + q[1] * q[1] - p[1] * p[1])
-
-
-@callback("jacobian")
-def crank_jacobian(t, q, p, Cq):  # type: ignore[no-untyped-def]
-    Cq[0, 0] = q[0]
-    Cq[0, 1] = q[1]
-    Cq[1, 0] = q[0] - q[2]
-    Cq[1, 1] = q[1]
-    Cq[1, 2] = q[2] - q[0]
-
-
-@callback("gamma")
-def crank_gamma(t, q, v, p, Qd):  # type: ignore[no-untyped-def]
-    Qd[0] = -(v[0] * v[0] + v[1] * v[1])
-    Qd[1] = -((v[2] - v[0]) ** 2 + v[1] * v[1])
-
-
 # --- of two masses on springs with x1 + x2 = the drive, p = [two stiffnesses, two masses, ...]
 
 
@@ -158,7 +121,5 @@ def slider_force(t, q, v, p, Q):  # type: ignore[no-untyped-def]
 
 CHAIN: dict[str, Any] = {"mass": chain_mass, "force": chain_force, "constraint": chain_constraint}
 CHAIN |= {"jacobian": chain_jacobian, "constraint_rate": chain_rate, "gamma": chain_gamma}
-CRANK: dict[str, Any] = {"mass": crank_mass, "force": crank_force, "constraint": crank_constraint}
-CRANK |= {"jacobian": crank_jacobian, "gamma": crank_gamma}
 ROW: dict[str, Any] = {"mass": row_mass, "force": row_force, "constraint": row_constraint}
 ROW |= {"jacobian": row_jacobian, "constraint_rate": row_rate, "gamma": row_gamma}

@@ -152,28 +152,6 @@ def turning(
     return Mechanism(name, system, *start, force, np.array(y0), rate, positions)
 
 
-def slider_crank(sharp: Sharp, crank: float, rod: float, masses: Array, angle: float, speed: float) -> Mechanism:
-    """A slider-crank of points; the force acts on the slider, with x = 0 where it is 1 m before its far end."""
-    p = np.concatenate([[crank, rod], masses, sharp.on(float(masses[1]), crank + rod - 1.0, 1.0, 1.0)])
-
-    def energies(s: Any) -> tuple[Any, Any, Any]:
-        root = np.sqrt(rod * rod - (crank * np.sin(s)) ** 2)
-        slope = -crank * np.sin(s) - crank * crank * np.sin(s) * np.cos(s) / root
-        inertia = masses[0] * crank**2 + masses[1] * slope * slope
-        return inertia, GRAVITY * masses[0] * crank * np.sin(s), crank * np.cos(s) + root
-
-    def positions(t: float, y: Array) -> Array:
-        return np.array([crank * np.cos(y[0]), crank * np.sin(y[0]), energies(y[0])[2]])
-
-    about: dict[str, Any] = {"parameters": p, "constant_mass": True, "name": "slider-crank"}
-    system = ConstrainedSystem(n_q=3, n_c=2, **callbacks.CRANK, **about)
-    slope = energies(complex(angle, TINY))[2].imag / TINY
-    v0 = speed * np.array([-crank * np.sin(angle), crank * np.cos(angle), slope])
-    return turning(
-        system.name, system, (positions(0.0, np.array([angle])), v0), (angle, speed), (sharp, p), energies, positions
-    )
-
-
 def under_force(system: ConstrainedSystem, force: Any, parameters: Array, **more: Any) -> ConstrainedSystem:
     """A ready system with another force, and its parameters with those of this."""
     about: dict[str, Any] = {"n_q": system.n_q, "n_c": system.n_c, "name": system.name}
@@ -247,23 +225,3 @@ def slider_in_space(sharp: Sharp) -> Mechanism:
 
     rate0 = 6.0  # rad/s, of the benchmark
     return turning("spatial slider-crank", system, (q0, problem.v0), (0.0, rate0), (sharp, own), energies, positions)
-
-
-KINDS = ("1", "2", "3", "row", "slider")
-
-
-def drawn(sharp: Sharp, g: np.random.Generator) -> Mechanism:
-    """A random mechanism: a chain of one to three points, a driven row or, under a force, a slider-crank."""
-    kind = str(g.choice(KINDS[:-1] if sharp.driven else KINDS))
-    masses = g.uniform(0.5, 2.0, 3)
-    if kind == "row":
-        return row(sharp, g.uniform(1.0, 20.0, 2), masses[:2], float(g.uniform(-0.5, 0.5)), float(g.uniform(-1, 1)))
-    if kind == "slider":
-        crank = float(g.uniform(0.3, 0.6))
-        rod = crank * float(g.uniform(1.6, 3.0))
-        return slider_crank(sharp, crank, rod, masses[:2], float(g.uniform(0.4, 2.6)), float(g.uniform(-6.0, 6.0)))
-    n = int(kind)
-    angles, rates = g.uniform(-1.3, 1.3, n), g.uniform(-2.0, 2.0, n)
-    if (sharp.windows or sharp.breaks) and g.uniform() < 0.3:  # it hangs, and nothing happens before the force does
-        angles, rates = np.zeros(n), np.zeros(n)
-    return chain(sharp, g.uniform(0.5, 1.5, n), masses[:n], angles, rates)

@@ -1,22 +1,18 @@
-"""The motion of a mechanism of `sharp_mechanisms` by SciPy, and runs judged by it.
+"""Integrate a mechanism of `sharp_mechanisms` by SciPy in independent coordinates.
 
-It is integrated from one instant at which the force is known to break to the next, in steps that cannot pass over it; a
-second, unlike method says how good it is, disturbed starts how much errors grow.
+It goes from one instant at which the force is known to break to the next, in steps that cannot pass over it. A second,
+unlike method says how good the motion is; disturbed starts say how much errors grow.
 """
 
 import warnings
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from studies.bench.apart import heard
-from studies.bench.sharp_forces import DRIVE_A, T_END, families
-from studies.bench.sharp_mechanisms import Mechanism, drawn
-from studies.bench.store import Array, Row
-from twoloop import Result, solve_dae
+from studies.bench.sharp_forces import DRIVE_A, T_END
+from studies.bench.sharp_mechanisms import Mechanism
+from studies.bench.store import Array
 
 TIMES = np.linspace(0.0, T_END, 13)  # s, at which positions are compared
 RTOL, CHECK, DISTURBED = 1e-13, 1e-12, 1e-9  # of the motion, of the one to compare it with, and of disturbed ones
@@ -24,11 +20,6 @@ LONGEST, LONGEST_IN_X = 0.02, 2e-3  # s, steps; where the force is sharp in x
 PARTS = 40  # steps of a window, at least
 NUDGE = 1e-6  # of a state, to see how errors grow
 FROM = (0, 4, 8)  # places in TIMES at which it is disturbed
-LOOSENESS = 1e3  # an answer is right within so many tolerances, times the growth of errors ...
-JUMPS = 10  # ... and once more for as many jumps ...
-LEAST = 3e-12  # ... a tolerance below which no more is asked
-CHAOTIC = 1e3  # growth beyond which a motion is not used
-RIGHT, SAID, SILENT = "right", "reported failure", "silently wrong"
 
 
 @dataclass(frozen=True)
@@ -94,43 +85,3 @@ def motion(mechanism: Mechanism) -> Motion:
             moved = positions(mechanism, march(mechanism, "DOP853", DISTURBED, base + step, TIMES[k]))
             growth = max(growth, off(moved, q[k:]) / NUDGE)
     return Motion(q, apart, growth)
-
-
-def drawn_from(family: str, g: np.random.Generator, n_drawn: int = 1) -> Mechanism:
-    """A random mechanism under a random force of a family, the last of so many draws."""
-    for _ in range(n_drawn):
-        mechanism = drawn(families()[family](g), g)
-    return mechanism
-
-
-def case(family: str, seed: list[int]) -> tuple[Mechanism, Motion, int]:
-    """The same with its motion, and how often it was drawn until that was known well enough."""
-    g, n_drawn = np.random.default_rng(seed), 0
-    while True:
-        mechanism, n_drawn = drawn_from(family, g), n_drawn + 1
-        known = motion(mechanism)
-        if known.growth <= CHAOTIC and known.apart <= 0.1 * allowed(known, 0.0):
-            return mechanism, known, n_drawn
-
-
-def allowed(known: Motion, tolerance: float, n_jumps: int = 0) -> float:
-    """Error up to which an answer is right."""
-    return LOOSENESS * (1.0 + n_jumps / JUMPS) * max(tolerance, LEAST) * known.growth
-
-
-def judged(mechanism: Mechanism, known: Motion, method: str, tolerance: float, time_limit: float, **more: Any) -> Row:
-    """A run and its outcome."""
-    limit = allowed(known, tolerance, len(mechanism.sharp.breaks))
-    options: dict[str, Any] = {"rtol": tolerance, "atol": tolerance, "time_limit": time_limit, "t_eval": TIMES, **more}
-    start = mechanism.system, (0.0, T_END), mechanism.q0, mechanism.v0
-    return graded(lambda: solve_dae(*start, method, **options), lambda result: off(result.q.T, known.q), limit)
-
-
-def graded(call: Callable[[], Result], error: Callable[[Result], float], allowed: float) -> Row:
-    """A call and its outcome, by the error of its result and that which is allowed."""
-    result, row = heard(call)
-    row |= {"error": None, "allowed": allowed, "n_evaluations": None}
-    if result is None or not result.success:
-        return row | {"outcome": SAID}
-    row |= {"error": error(result), "n_evaluations": result.stats.n_evaluations}
-    return row | {"outcome": RIGHT if row["error"] <= allowed else SAID if row["warned"] else SILENT}
