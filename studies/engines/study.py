@@ -23,28 +23,18 @@ from studies.bench.render import number
 from studies.bench.solvers import GIVEN
 from studies.bench.store import Output, Row
 from studies.bench.study import Study
-from studies.engines.findings import (
-    CONFIGURATIONS,
-    ENERGY,
-    GATE,
-    MASS,
-    MOTOR,
-    NAMES,
-    OURS,
-    PROBED,
-    RUN,
-    TIGHT,
-    TURN,
-    Configuration,
-    findings_of,
-)
+from studies.engines import findings
+from studies.engines.findings import CONFIGURATIONS, NAMES, OURS, RUN, TIGHT, Configuration, findings_of
 from twoloop.audit.step_audit import LOST
 
 N_STEPS = (100, 200, 500, 1500, 5000, 15_000, 50_000, 150_000)  # multiples of INSTANTS
 TOLERANCES = (1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10, 1e-11)
 # by group: steps of engines, tolerances of twoloop
-VALUES: dict[str, Any] = {RUN: (N_STEPS, TOLERANCES), **dict.fromkeys((MASS, MOTOR, TURN), ((PROBED,), (TIGHT,)))}
-CHANGED = {MASS: LIGHTENED, TURN: IN_A_FRAME, MOTOR: MOTORISED}
+VALUES: dict[str, Any] = {
+    RUN: (N_STEPS, TOLERANCES),
+    **dict.fromkeys((findings.MASS, findings.MOTOR, findings.TURN), ((findings.PROBED,), (TIGHT,))),
+}
+CHANGED = {findings.MASS: LIGHTENED, findings.TURN: IN_A_FRAME, findings.MOTOR: MOTORISED}
 SHORT = 0.1  # s: motions that last no longer are too fast for the steps of the long ones
 LONG, LONG_STEPS, LONG_INSTANTS, LONG_LIMIT = 100.0, 50_000, 200, 20.0  # s; how it is run; s of CPU
 SHOWN, AS_IT_COMES = ("four-bar", "RSSR", "Stewart platform"), "MuJoCo, default"  # in the figure
@@ -81,8 +71,8 @@ def make(output: Output) -> pd.DataFrame:
         for group, build in ((group, build) for group, builds in groups.items() for build in builds):
             for engine, name in list(NAMES.items())[:-1]:  # twoloop is last
                 status, message = gated(build, engine)
-                row = _row(GATE, build, solver=name, family=name, status=status, message=message)
-                rows.append(kept.made(f"{GATE} {build.__name__} {engine}", partial(dict, row)))
+                row = _row(findings.GATE, build, solver=name, family=name, status=status, message=message)
+                rows.append(kept.made(f"{findings.GATE} {build.__name__} {engine}", partial(dict, row)))
             for each in CONFIGURATIONS if group == RUN else EVERYWHERE:
                 values: Any = VALUES[group][each.engine == OURS]
                 cost: list[float] = []  # of the run before, and its steps
@@ -95,7 +85,9 @@ def make(output: Output) -> pd.DataFrame:
                         break
         for build, each in () if quick else product(MECHANISMS, EVERYWHERE):
             if loop_of(build).t_end > SHORT:
-                rows.append(kept.made(f"{ENERGY} {build.__name__} {each.name}", partial(energy_row, build, each)))
+                rows.append(
+                    kept.made(f"{findings.ENERGY} {build.__name__} {each.name}", partial(energy_row, build, each))
+                )
     versions = {engine.name: version_of(engine.package) for engine in engines().values()}
     return (table := pd.DataFrame(rows)).assign(version=table["family"].map(versions))
 
@@ -166,7 +158,7 @@ def _ours(loop: Loop, tolerance: float, compiled: Any) -> tuple[Callable[[], Mot
 def energy_row(build: Callable[[], Any], each: Configuration) -> Row:
     """Measure the largest change of the energy over a long time, over the largest kinetic energy of the reference."""
     loop = loop_of(build)
-    row = _row(ENERGY, build, solver=each.name, family=NAMES[each.engine], status="REACHED_END")
+    row = _row(findings.ENERGY, build, solver=each.name, family=NAMES[each.engine], status="REACHED_END")
     if each.engine == OURS:
         longer = Loop(replace(loop.problem, t_span=(0.0, LONG)))
         result = longer.solve(TIGHT, times=np.linspace(0.0, LONG, LONG_INSTANTS + 1))

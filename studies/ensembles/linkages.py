@@ -60,7 +60,7 @@ def varied(n: int, random: np.random.Generator) -> tuple[Array, Array, Array]:
 
 
 def varied_row(n: int, block: int = 2 * BLOCK) -> dict[str, Any]:
-    """Assemble and run n linkages on all cores; the total time."""
+    """Assemble and run n linkages on all cores, and time it."""
     system, random = mechanisms.four_bar().system, np.random.default_rng(11)
     began, failed, singly, spent = time.perf_counter(), 0, 0, time.process_time()
     for first in range(0, n, block):
@@ -121,7 +121,7 @@ def end_error(given: Array, q: Array, t_end: float) -> float:
 
 
 def drawn_row(n: int, t_end: float = SPAN) -> dict[str, Any]:
-    """Draw, assemble and run n linkages, with the time of this, and measure errors of energy and of some ends.
+    """Draw, assemble and run n linkages, time it, and measure errors of energy and of some ends.
 
     `end_error_hard`: of the runs of largest energy errors and most steps, and of those not made in lanes;
     `end_error_any`: of the first ones.
