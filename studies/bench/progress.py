@@ -13,12 +13,12 @@ class Progress:
     """Print a line after each of `total` pieces of work: its number, its label, its time, what is left.
 
     The lines go to stderr, so that a table on stdout can be redirected. The remaining time assumes that the pieces left
-    take as long in the mean as those that are done; the first ones hold the compilation, so it is rather too long.
+    take as long in the mean as those that are done, without the first, which holds the compilation.
     """
 
     def __init__(self, total: int):
         self.total, self.done = total, 0
-        self._began = self._last = time.monotonic()
+        self._last = self._first = time.monotonic()
         self._printed = -PAUSE
 
     def add(self, more: int) -> None:
@@ -30,10 +30,12 @@ class Progress:
         self.done += 1
         now = time.monotonic()
         seconds, self._last = now - self._last, now
+        if self.done == 1:
+            self._first = now
         if not (always or self.done == self.total or now - self._printed >= PAUSE):
             return
         self._printed = now
-        left = (self.total - self.done) * (now - self._began) / self.done
+        left = (self.total - self.done) * ((now - self._first) / (self.done - 1) if self.done > 1 else seconds)
         print(f"{self.done}/{self.total}  {label}  {seconds:.1f} s  {remaining(left)}", file=sys.stderr, flush=True)
 
 
