@@ -99,7 +99,9 @@ compile: install ## compile the kernels, and the callbacks of bodies, mechanisms
 SHARED := -n 2 --dist loadfile --no-loadscope-reorder
 
 test: compile ## the tests that a change needs, on two cores
-	@$(RUN) -c "import tests.compiled, tests.problems, tests.test_bounds, tests.test_other_parameters"
+	@$(RUN) -c "import tests.compiled, tests.problems, tests.test_bounds, tests.test_callbacks, tests.test_repeated_calls" & \
+	$(RUN) -c "import tests.test_other_parameters, tests.test_certificate, tests.test_traced_values, tests.test_sweep_together" \
+	&& wait $$!
 	$(RUN) -m pytest $(SHARED) $(ARGS)
 
 test-all: ## all tests, the slow ones too: about twenty minutes

@@ -78,6 +78,9 @@ def test_readme_has_the_numbers_of_its_other_reports():
     assert f"None of {table['sharp']['default']['n']} runs with sharp forces" in README
     short = [table[name]["default"] for name in ("gust_short", "pulse_short")]
     assert f"in {sum(own['wrong'] for own in short)} of {sum(own['n'] for own in short)} runs" in README
+    singular = table["singular"]["default"]
+    told = f"{singular['failed']} of {singular['n']} runs stopped, saying so, and {singular['wrong']} ended wrong"
+    assert told in README
     typical = {at["error"]: number(1.0 / at["median"]) for at in findings("work_precision")["typical"]}
     assert f"is {typical[1e-4]} times as fast at an error of 1e-4 and {typical[1e-8]} times at 1e-8" in README
     counts, untestable = findings("claims")["counts"], findings("claims")["untestable"]
