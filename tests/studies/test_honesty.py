@@ -182,13 +182,6 @@ def test_other_solvers_are_run_with_a_largest_step_too(monkeypatch):
     assert why_not("LSODA, index 1" + LIMITED, half)
 
 
-def test_a_solver_is_warmed_up_once_for_the_same_callbacks():
-    called, compiled = [], set()
-    for trap in islice(of_linkages(), 2):
-        honesty.warm_up("auto (twoloop)", called.append, trap, compiled)
-    assert len(called) == len(compiled) == 1 and called[0].t_end == 1e-6
-
-
 def test_short_forces_come_at_random_times():
     made = list(short_forces(quick=True))
     assert {trap.name for trap in made} == {"gust of 1 ms", "pulse of 1 ms"} and len(made) == 4
