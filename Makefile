@@ -80,9 +80,11 @@ bench: compile ## two commits side by side: make bench BASE=main [HEAD=branch] [
 # large systems have in common, and BDF, are in one of them. What imports callbacks of bodies is last, and the traps, which
 # import all, last of these
 compile: install ## compile the kernels, and the callbacks of bodies, mechanisms and studies, on two cores
+	@echo "Compiling the kernels (once, on both cores): the inner loop and the callbacks of bodies"
 	@$(RUN) -c "from twoloop.bodies import planar_callbacks, planar_programs, spatial_callbacks, spatial_programs" & \
 	$(RUN) -c "from twoloop.kernels.evaluation import calls, own_inner; from twoloop.kernels.control import controller" \
 	&& wait $$!
+	@echo "Compiling the steps of all methods, interpolation, and the runs in SIMD lanes"
 	@$(RUN) -c "from twoloop.kernels.steps import bdf_newton_step, bdf_step, diagonal_step, newton_step; \
 	from twoloop.kernels.evaluation import static_inner; from twoloop.kernels.lanes import lane_implicit" & \
 	$(RUN) -c "from twoloop.kernels import advance, agreement, interpolation, short_loops; \
@@ -91,6 +93,7 @@ compile: install ## compile the kernels, and the callbacks of bodies, mechanisms
 	from twoloop.kernels.lanes import lane_dop853, lane_runs, lane_starts, lane_taylor; \
 	from twoloop.kernels.steps import adams_step, asking_step, bridge, canonical_step, explicit_step, \
 	fixed_point_step, newmark_step, paper_step, taylor_step" && wait $$!
+	@echo "Compiling the callbacks of the ready mechanisms and of studies"
 	@$(RUN) -c "from studies.bench import sharp_callbacks" & \
 	$(RUN) -c "from twoloop.mechanisms import *; from studies.honesty import traps" && wait $$!
 
@@ -99,6 +102,7 @@ compile: install ## compile the kernels, and the callbacks of bodies, mechanisms
 SHARED := -n 2 --dist loadfile --no-loadscope-reorder
 
 test: compile ## the tests that a change needs, on two cores
+	@echo "Compiling the callbacks of tests"
 	@$(RUN) -c "import tests.compiled, tests.problems, tests.test_bounds, tests.test_callbacks, tests.test_repeated_calls" & \
 	$(RUN) -c "import tests.test_other_parameters, tests.test_certificate, tests.test_traced_values, tests.test_sweep_together" \
 	&& wait $$!
