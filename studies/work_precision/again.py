@@ -1,21 +1,19 @@
 """Measure single mechanisms, or other parts, again: `python -m studies.work_precision.again NAME ...`.
 
-The whole study takes hours. A part is a mechanism, or another project's solvers on all mechanisms; "MECHANISM | SOLVER
-| ..." are single solvers on a mechanism, by their names in work_precision.csv. The rows of a part take the place of
-those in work_precision.csv at once, with the commit and the processor that they were made on;
+The whole study takes hours. A part is a mechanism, or another project's solvers on all mechanisms. Its rows take the
+place of those in work_precision.csv at once, with the commit and the processor that they were made on;
 `python -m studies.work_precision --redraw` then writes the report anew. Without names: what there is.
 """
 
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 
 import pandas as pd
 
 from studies.bench import cli
 from studies.bench.cli import StudyError
-from studies.bench.solvers import CATALOGUE
 from studies.bench.store import KeptRows, Output
 from studies.compare import GROUP as LENGTH
 from studies.work_precision import first_calls, mechanisms, minimal, study
@@ -26,13 +24,12 @@ IN_ANGLES = ", in angles"  # after that of a mechanism: the runs of its equation
 
 @dataclass(frozen=True)
 class Part:
-    """Rows that are measured together: all of a group, or those of one case of it, or of one project, or of solvers."""
+    """Rows that are measured together: all of a group, or those of one case of it, or of one project."""
 
     group: str
     case: str | None
     make: Callable[[KeptRows], pd.DataFrame]
     family: str | None = None
-    solvers: Sequence[str] = ()
 
 
 def parts() -> dict[str, Part]:
@@ -58,18 +55,9 @@ def part_of(name: str, known: Mapping[str, Part]) -> Part:
 
     Raises StudyError if there is none.
     """
-    case, *solvers = name.split(" | ")
-    whole = known.get(case)
-    only_whole = whole is None or whole.case is None or whole.group == minimal.GROUP
-    if whole is None or (solvers and (only_whole or set(solvers) - CATALOGUE.keys())):
-        raise StudyError(f"there is no {name!r}; parts are {'; '.join(known)}; and solvers of a mechanism after ' | '")
-    if not solvers:
-        return whole
-    if whole.group == LENGTH:
-        cases = [case for case in study.known_cases(False) if case.name == whole.case]
-        return replace(whole, make=partial(study.at_length, cases, False, solvers=solvers), solvers=solvers)
-    runs = [run for run in mechanisms.runs(False) if run.case.name == case and run.solver.name in solvers]
-    return replace(whole, make=partial(mechanisms.collect, runs), solvers=solvers)
+    if name not in known:
+        raise StudyError(f"there is no {name!r}; parts are {'; '.join(known)}")
+    return known[name]
 
 
 def replaced(rows: pd.DataFrame, part: Part, new: pd.DataFrame) -> pd.DataFrame:
@@ -79,8 +67,6 @@ def replaced(rows: pd.DataFrame, part: Part, new: pd.DataFrame) -> pd.DataFrame:
         old &= rows["case"] == part.case
     if part.family is not None:
         old &= rows["family"] == part.family
-    if part.solvers:
-        old &= rows["solver"].isin(part.solvers)
     columns = list(dict.fromkeys([*rows.columns, *new.columns]))
     return pd.concat([rows[~old], new], ignore_index=True).reindex(columns=columns)
 

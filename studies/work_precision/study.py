@@ -76,9 +76,9 @@ def calibrated(rows: pd.DataFrame) -> pd.DataFrame:
     return rows.assign(calibration=CALIBRATION, calibration_s=calibration_s())
 
 
-def at_length(known: Sequence[Case], quick: bool, kept: KeptRows, solvers: Sequence[str] = ()) -> pd.DataFrame:
-    """The rows of cases over their whole motion; `solvers`: of these alone."""
-    made = [run for case in known for run in runs(case, quick) if not solvers or run.solver.name in solvers]
+def at_length(known: Sequence[Case], quick: bool, kept: KeptRows) -> pd.DataFrame:
+    """The rows of cases over their whole motion."""
+    made = [run for case in known for run in runs(case, quick)]
     row = lambda run, repeat, built: row_of(run, repeat, None, built)  # noqa: E731
     return adaptive.collect(made, kept, row, lambda run: True, () if quick else ERRORS)
 
