@@ -58,35 +58,16 @@ def linkages(seed, n):
     return found
 
 
-KNOWN = [  # each jumped with success before dependents entered the error test
-    ((1.0912, 1.3596, 0.6330), 0.3511, 0.0332, -1),
-    ((1.7365, 1.8959, 0.3385), 0.5008, None, None),
-    ((0.8906, 0.6238, 1.9312), 1.6662, None, None),
-]
+JUMPED = ((1.0912, 1.3596, 0.6330), 0.3511, 0.0332, -1)  # with success before dependents entered the error test
 
 
 @pytest.mark.parametrize("method", quick(METHODS, 3))
 @pytest.mark.parametrize("tolerance", quick([0.3, 0.03, 0.1], 2))
 def test_loose_tolerances_on_a_linkage_that_jumped(method, tolerance):
-    lengths, ground, theta3, branch = KNOWN[0]
+    lengths, ground, theta3, branch = JUMPED
     result = run(four_bar(lengths, ground, theta3, branch), 10.0, method=method, rtol=tolerance, atol=tolerance)
     assert result.success, result.message
     assert same_assembly(lengths, ground, result)
-
-
-@pytest.mark.parametrize("start", quick(np.linspace(-3.0, 3.0, 13), 4))
-@pytest.mark.parametrize("known", KNOWN[1:], ids=["near a change point", "nearer"])
-def test_loose_tolerances_near_change_points(known, start):
-    lengths, ground = known[:2]
-    for branch in (-1, 1):
-        try:
-            problem = four_bar(lengths, ground, float(start), branch)
-        except ValueError:
-            continue
-        for method in ("Newmark", "RadauIIA5", "BDF"):
-            for tolerance in (0.03, 0.3):
-                result = run(problem, 5.0, method=method, rtol=tolerance, atol=tolerance)
-                assert not result.success or same_assembly(lengths, ground, result)
 
 
 @pytest.mark.parametrize("method", quick(METHODS, 3))

@@ -126,11 +126,6 @@ def test_a_run_of_few_steps_covers_what_was_computed(default_four_bar, method, m
         result.sol(1.0)
 
 
-def test_a_run_without_a_step():
-    result = swing(dense_output=True, step_size=2.0, method="Gauss12")
-    assert result.status == Status.NOT_CONVERGED and result.t.size == 1 and (result.sol(0.0).q == result.q[:, 0]).all()
-
-
 @pytest.mark.parametrize("method", quick(["SunRadau5", "Gauss8"]))
 @pytest.mark.parametrize("copied", [copy.copy, copy.deepcopy, lambda result: pickle.loads(pickle.dumps(result))])
 def test_copies(default_four_bar, method, copied):

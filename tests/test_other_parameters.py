@@ -2,7 +2,6 @@
 
 import math
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import nullcontext
 
 import numpy as np
 import pytest
@@ -222,34 +221,6 @@ def test_bounds_are_looked_at_where_parameters_are_places(wrong):
         assert solve_dae(system.with_parameters([1.4, 0.2 / FAR]), (0.0, 0.1), q0, v0).success
     with pytest.raises(ValueError, match="goes out of bounds: index"):
         solve_dae(system.with_parameters([1.4, wrong]), (0.0, 0.1), q0, v0)
-
-
-@callback("constraint")
-def ellipse(t, q, p, C):
-    C[0] = 0.5 * (p[0] * q[0] ** 2 + q[1] ** 2 - 1.0)
-
-
-@callback("jacobian")
-def of_one_ellipse(t, q, p, Cq):
-    Cq[0, 0], Cq[0, 1] = 1.3 * q[0], q[1]
-
-
-@callback("gamma")
-def of_any_ellipse(t, q, v, p, Qd):
-    Qd[0] = -(p[0] * v[0] ** 2 + v[1] ** 2)
-
-
-def test_a_derivative_that_is_right_for_some_parameters_is_refused_for_others():
-    given = bare_pendulum(compile=True).given | {
-        "jacobian": of_one_ellipse,
-        "gamma": of_any_ellipse,
-        "constraint": ellipse,
-    }
-    system = ConstrainedSystem(n_q=2, n_c=1, parameters=[1.3], **given)
-    for p in (1.3, 1.3001, 1.3, 1.7):
-        with pytest.raises(ValueError, match="jacobian of") if p != 1.3 else nullcontext():
-            q0 = [0.6 / np.sqrt(p), -0.8]
-            assert solve_dae(system.with_parameters([p]), (0.0, 0.1), q0, [0.0, 0.0]).success
 
 
 # --- code that is traced once for systems that share callbacks: with any parameters it is what they would get alone

@@ -71,12 +71,6 @@ def crossing_lines():
 CROSSING = ((0.0, 2.0), [-1.0, -1.0, 0.0], [1.0, 1.0, 0.0])
 
 
-def test_a_step_that_ends_on_a_singular_position_is_a_status():
-    result = solve_dae(crossing_lines(), *CROSSING, step_size=0.5, t_eval=[0.5, 1.0, 2.0])
-    assert not result.success and result.status in (Status.RANK_LOST, Status.STEP_TOO_SMALL)
-    assert (result.t == [0.5]).all() and "t = 0.5:" in result.message and "singular" in result.message
-
-
 def test_an_output_time_on_a_singular_position_is_warned_of():
     with pytest.warns(ConstraintWarning) as caught:
         result = solve_dae(crossing_lines(), *CROSSING, t_eval=[0.5, 1.0, 2.0])

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import tracemalloc
+import warnings
 from contextlib import nullcontext
 from dataclasses import fields
 
@@ -15,7 +16,7 @@ import pytest
 
 import twoloop
 from tests.problems import at_one, pendulum, quick, run, swing, worst
-from tests.processes import ROOT, run_python
+from tests.processes import ROOT
 from twoloop import Result, Statistics, Status
 from twoloop.mechanisms import closed_chain, four_bar
 from twoloop.run import course
@@ -276,63 +277,38 @@ def test_a_field_whose_bytes_changed_is_named(saved, tmp_path):
         twoloop.load(path)
 
 
-FUZZ = """
-import json, sys
-import numpy as np
-import twoloop
-from twoloop.mechanisms import four_bar
-
-saved, folder, n = sys.argv[1], sys.argv[2], int(sys.argv[3])
-system, rng, content = four_bar().system, np.random.default_rng(4), open(saved, "rb").read()
-with np.load(saved) as file:
-    arrays = {name: file[name] for name in file.files}
-words = json.loads(str(arrays.pop("words")))
-del words["check_sums"]
-odd = [-1, 0, 3, 10**9, -(10**12), 1e308, float("nan"), None, "x", [], {}, True, [8, 8], [3, 8], [0, 0], [9, 9]]
+ODD = [-1, 0, 3, 10**9, 1e308, float("nan"), None, "x", [], {}, True, [3, 8], [9, 9]]
 
 
-def flipped():
-    other = bytearray(content)
-    for _ in range(rng.integers(1, 4)):
-        other[rng.integers(len(other))] ^= 1 << rng.integers(8)
-    return bytes(other[: rng.integers(len(other))] if rng.random() < 0.3 else other)
-
-
-def altered():
-    own, said = {name: array.copy() for name, array in arrays.items()}, dict(words)
-    name, way = list(own)[rng.integers(len(own))], rng.integers(4)
-    array = own[name] = np.ascontiguousarray(own[name])
-    if way == 0:
-        said[list(said)[rng.integers(len(said))]] = odd[rng.integers(len(odd))]
-    elif way == 1:
-        own[name] = array.astype([np.float32, np.int64, np.complex128, bool][rng.integers(4)])
-    elif way == 2:
-        own[name] = array[..., : rng.integers(array.shape[-1] + 1)]
-    elif array.size:
-        array.view(np.uint8).reshape(-1)[rng.integers(array.nbytes)] ^= 1 << rng.integers(8)
-    np.savez(folder + "/fuzzed.npz", words=np.array(json.dumps(said)), **own)
-
-
-refused = read = 0
-for k in range(n):
-    if k % 2:
-        altered()
-    else:
-        open(folder + "/fuzzed.npz", "wb").write(flipped())
-    try:
-        result = twoloop.load(folder + "/fuzzed.npz", system)
-    except ValueError:
-        refused += 1
-        continue
-    read += 1
-    if result.sol is not None:
-        state = result.sol(np.linspace(result.sol.t_min, result.sol.t_max, 20))
-        assert state.a.shape == (9, 20) and state.lam.shape == (8, 20)
-print(refused, read)
-"""
-
-
-@pytest.mark.slow
 def test_nothing_in_a_file_ends_the_process(saved, tmp_path):
-    refused, read = map(int, run_python(FUZZ, saved, tmp_path, 240, PYTHONWARNINGS="ignore").stdout.split())
-    assert refused > 120 and read > 10  # both ways were tried
+    """Bits of the file or of an array that are flipped, lost ends, other types and words: refused, or of use."""
+    rng, content, path = np.random.default_rng(4), saved.read_bytes(), tmp_path / "fuzzed.npz"
+
+    def alter(arrays, words):
+        name, way = list(arrays)[rng.integers(len(arrays))], rng.integers(4)
+        array = arrays[name] = np.ascontiguousarray(arrays[name])
+        if way == 0:
+            words[list(words)[rng.integers(len(words))]] = ODD[rng.integers(len(ODD))]
+        elif way == 1:
+            arrays[name] = array.astype([np.float32, np.int64, bool][rng.integers(3)])
+        elif way == 2:
+            arrays[name] = array[..., : rng.integers(array.shape[-1] + 1)]
+        elif array.size:
+            array.view(np.uint8).reshape(-1)[rng.integers(array.nbytes)] ^= 1 << rng.integers(8)
+
+    refused = []
+    for k in range(120):
+        if k % 2:
+            changed(saved, tmp_path, alter).rename(path)
+        else:
+            other = bytearray(content)
+            other[rng.integers(len(other))] ^= 1 << rng.integers(8)
+            path.write_bytes(other[: rng.integers(len(other))] if k % 6 == 0 else other)
+        try:
+            with warnings.catch_warnings(action="ignore"):
+                result = twoloop.load(path, four_bar().system)
+                refused.append(False)
+                assert result.sol is None or result.sol([result.sol.t_min, result.sol.t_max]).a.shape == (9, 2)
+        except ValueError:
+            refused.append(True)
+    assert sum(refused) > 60 and not all(refused)  # both ways were tried

@@ -156,22 +156,6 @@ def test_problems_that_depend_on_the_runs_before_them_are_those_of_single_runs()
         assert rows.loc[number, "x"] == pytest.approx(known["x"], rel=1e-5)
 
 
-def test_problems_that_are_one_object_are_told_apart():
-    start = np.array([-1.0, 0.0])
-
-    def released(height):
-        start[:] = -np.sqrt(1.0 - height**2), height
-        return Problem("swing", SWING, start, np.zeros(2), (0.0, 1.0), energy)
-
-    def from_there(problem, result):
-        return {"y": result.q[1, 0], "y0": problem.q0[1], "x": result.q[0, -1]}
-
-    heights = [{"height": 0.05 * k} for k in range(12)]
-    rows = sweep(released, heights, measure=from_there, t_eval=TIMES, **TOGETHER)
-    assert rows["y"].tolist() == pytest.approx([each["height"] for each in heights])
-    compare(rows, released, from_there, (0.0, 1.0), t_eval=TIMES)
-
-
 def last_place(problem, result):
     return {"x": result.q[0, -1]}
 

@@ -384,16 +384,6 @@ def test_where_a_derivative_overflows_differences_take_its_place():
     assert result.success and result.q[0, -1] == pytest.approx(1.0, abs=1e-6)
 
 
-def test_where_there_is_no_second_derivative_a_motion_goes_on():
-    """The curve y = |x|**1.5 has an infinite curvature at the start."""
-    system = constant_pendulum(
-        constraint=lambda t, q: np.array([q[1] - (q[0] * q[0]) ** 0.75]), jacobian=None, gamma=None
-    )
-    assert solve_dae(system, (0.0, 0.1), [0.3, 0.3**1.5], [0.0, 0.0]).success
-    _, gamma, _ = in_kernels(system, 0.0, np.zeros(2), np.zeros(2))
-    assert np.isfinite(gamma).all()
-
-
 def test_products_may_be_a_thousand_deep():
     def constraint(t, q):
         x = q[0]

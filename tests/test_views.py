@@ -2,8 +2,6 @@
 
 import pickle
 import re
-import stat
-import sys
 from dataclasses import replace
 
 import numpy as np
@@ -157,23 +155,3 @@ def test_a_spatial_page_can_be_turned(crank, tmp_path):
     assert lines and all(0 < x < 1440 and 0 < y < 960 for _, x, y in lines)
     first = [call for call in said["drawn"] if call[0] == "lineTo"]
     assert first[0] != lines[0]
-
-
-def test_a_film_is_what_ffmpeg_gets(crank, tmp_path, monkeypatch):
-    """A program in the place of ffmpeg, which this machine may not have, writes down what it was given."""
-    program = tmp_path / "ffmpeg"
-    program.write_text(
-        f"#!{sys.executable}\nimport sys\n"
-        "open(sys.argv[-1], 'w').write(f'{len(sys.stdin.buffer.read())} ' + ' '.join(sys.argv[1:]))\n"
-    )
-    program.chmod(program.stat().st_mode | stat.S_IXUSR)
-    monkeypatch.setenv("PATH", str(tmp_path))
-    n_bytes, *words = crank.animate(tmp_path / "crank.mp4", seconds=0.2).read_text().split()
-    width, height = map(int, words[words.index("-s") + 1].split("x"))
-    assert int(n_bytes) == 6 * width * height * 3
-    program.write_text(f"#!{sys.executable}\nimport sys\nsys.exit('no codec')\n")
-    with pytest.raises(RuntimeError, match=r"ffmpeg could not write.*no codec"):
-        crank.animate(tmp_path / "crank.mp4", seconds=0.2)
-    program.unlink()
-    with pytest.raises(RuntimeError, match=r"needs the program ffmpeg.*or write \.gif, \.html"):
-        crank.animate(tmp_path / "crank.mp4", seconds=0.2)
