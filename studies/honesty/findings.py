@@ -148,7 +148,7 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     found["singular"]["plain"] = graded(singular[singular["solver"] == PLAIN])["failed"]
     found |= {"look": LOOK, "brief": BRIEF, "t_end": T_END, "exact": EXACT, "usual": USUAL, "looseness": LOOSENESS}
     found["least"] = LOOSENESS * LEAST
-    # which methods the traps in models and settings deceive
+    # outcomes of each solver on mistakes and hard motions
     found["counts"] = {str(name): graded(own) for name, own in mistakes.groupby("solver", sort=False)}
     return found | {"n_traps": int(mistakes["trap"].nunique()), "seed": SEED, "answer": answer_of(found["table"])}
 

@@ -24,7 +24,7 @@ EXPLICIT = "tests/test_tableaux.py::test_dop853_is_that_of_scipy"
 TABLES, METRICS, RENDER = (f"tests/studies/test_{name}.py" for name in ("tables", "metrics", "render"))
 
 
-SCIPY = "DOP853, index 1"  # for all adapters of foreign solvers
+SCIPY = "DOP853, index 1"  # stands for the adapters of all other solvers
 TRACING = "Taylor"  # a solver that integrates what callbacks were traced to
 GRAVITY, OTHER = 9.81, 9.80  # m/s^2, of a pendulum and what it is in a wrong trace
 weight = GRAVITY  # a global on purpose: numba takes it as it is when it compiles `frozen`
@@ -259,7 +259,7 @@ def in_adapter() -> Iterator[Fault]:
         return partial(patch.dict, solvers.CATALOGUE, {SCIPY: changed})
 
     own = partial(_changed, solvers, "solve_dae")
-    for solver, whose, plant in (("Gauss12", "ours", own), (SCIPY, "SciPy's", foreign)):
+    for solver, whose, plant in (("Gauss12", "twoloop", own), (SCIPY, "SciPy's", foreign)):
         for what, change in (
             ("multipliers with the other sign", lambda result: replace(result, lam=-result.lam)),
             ("velocities of the step before", lambda result: replace(result, v=np.roll(result.v, 1, axis=1))),

@@ -30,8 +30,8 @@ def test_there_are_many_and_each_has_its_own_name():
         ("one mass 0.1 % too large", "reference: q"),
         ("lam with the other sign", "reference: lam"),
         ("steps that never grow", "count of evaluations"),
-        ("single precision (ours)", "reference: q"),
-        ("accelerations of the other sign (ours)", "violation: a"),
+        ("single precision (twoloop)", "reference: q"),
+        ("accelerations of the other sign (twoloop)", "violation: a"),
     ],
 )
 def test_a_fault_is_caught(name, caught_by):
