@@ -1,4 +1,4 @@
-"""Work-precision report of a mechanism or a solver of your own: our methods beside those of other projects."""
+"""Compare solvers on a mechanism of your own, or a solver of your own: methods of twoloop beside other projects."""
 
 import time
 from collections.abc import Iterable, Mapping, Sequence
@@ -131,10 +131,10 @@ def report(
         published = check_published(case.problem, case.reference, case.t_end)
         findings |= {"source": case.reference.source, "published": published}
     output.save_findings(findings)
-    lines, coded = figures.lines_of(rows, errors), findings["coded"]
+    coded = findings["coded"]
+    lines = figures.lines_of(rows, errors, coded)
     if lines:
-        plot = figures.work_precision(rows, lines, f"{case.name}, {number(case.t_end)} s", coded=coded)
-        figures.save(plot, output, "compare")
+        figures.save(figures.work_precision(rows, lines, message(findings), coded=coded), output, "compare")
     middle = errors[len(errors) // 2]
     header = ["solver", "called from", *(power(error) for error in errors)]
     kept = {"solver": "solver", "call_s": "CPU (s)", "n_evaluations": "evaluations", "violation_q": "max abs C"}
@@ -154,6 +154,18 @@ def report(
     files = dict.fromkeys(rows[rows["family"] == FILE]["solver"])
     more |= {"files": [f"`{name}`" for name in files], "n_times": N_TIMES}
     output.write("compare.md", render("compare", findings, ready, **more))
+
+
+def message(found: dict[str, Any]) -> str:
+    """What the figure shows: the ratio of both sides at the smallest error that both reach."""
+    both = [at for at in found["cheapest"] if at["ours_first"] is not None]
+    about = f"{found['name']}, {number(found['t_end'])} s"
+    if not both:
+        return about
+    at = both[-1]
+    ratio = at["others"]["call_s"] / at["ours"]["call_s"]
+    told = f"{number(ratio)} times the time of twoloop for an error of {power(at['error'])}"
+    return f"{about}: {label(at['others']['solver'])} takes {told}"
 
 
 def _failed(rows: pd.DataFrame, coded: bool) -> str:

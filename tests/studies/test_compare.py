@@ -123,9 +123,13 @@ def text_of(found):
 def test_the_sentences_turn_with_the_rows():
     ours, theirs = ("two-loop", 1e-5, 1.0), ("SciPy", 1e-5, 2.0)
     assert "`ours` is cheapest" in text_of(findings(ours=ours, theirs=theirs))
+    assert "theirs takes 2.0 times the time of twoloop for an error of 1e-4" in compare.message(
+        findings(ours=ours, theirs=theirs)
+    )
+    assert compare.message(findings(ours=ours)) == "swing, 1.0 s"
     assert "`theirs` (compiled) is cheapest" in text_of(findings(ours=("two-loop", 1e-5, 3.0), theirs=theirs))
     assert "None of the other solvers reaches it" in text_of(findings(ours=ours, theirs=("SciPy", 1e-2, 2.0)))
-    assert "None of our methods" in text_of(findings(ours=("two-loop", 1e-2, 1.0), theirs=theirs))
+    assert "No method of twoloop" in text_of(findings(ours=("two-loop", 1e-2, 1.0), theirs=theirs))
     assert "no solver reaches it" in text_of(findings(ours=("two-loop", 1e-2, 1.0)))
     assert "check the problem" in text_of(findings(ours=ours) | {"published": 1e-3})
     assert "check the problem" not in text_of(findings(ours=ours) | {"published": 1e-10})
