@@ -45,7 +45,7 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
         f"{case}, {engine}": own.groupby("n")["evaluation_us"].median().to_dict()
         for (case, engine), own in right.groupby(["case", "solver"], sort=False)
     }
-    grown = rows[rows["group"] == UNTIL]
+    grown = rows[rows["group"].eq(UNTIL) & rows["status"].eq("REACHED_END")]
     found["until"] = [_until(str(solver), own) for solver, own in grown.groupby("solver", sort=False)]
     found |= {"budget": BUDGET, "until_end": UNTIL_END, "bend": BEND}
     found["references"] = sorted(set(rows["reference"].dropna())) if "reference" in rows else []
@@ -90,10 +90,10 @@ def _chains(rows: pd.DataFrame) -> dict[int, pd.DataFrame]:
 
 def _until(solver: str, rows: pd.DataFrame) -> dict[str, Any]:
     """Return the largest chain that a solver ran, with times of building and of a call."""
-    run = rows[rows["status"] == "REACHED_END"].sort_values("n").iloc[-1]
-    found = {"solver": solver, "n": int(run["n"])}
-    found |= {name: float(run[name]) for name in ("build_s", "call_s", "error_q")}
-    return found | {"stopped": bool((rows["status"] != "REACHED_END").any())}
+    run = rows.sort_values("n").iloc[-1]
+    return {"solver": solver, "n": int(run["n"])} | {
+        name: float(run[name]) for name in ("build_s", "call_s", "error_q")
+    }
 
 
 def _growth(found: dict[str, Any]) -> str:

@@ -171,3 +171,10 @@ def test_a_table_has_the_same_runs_in_both_ways(monkeypatch):
     lanes, singly = linkages.table_rows(12, 1.0, "threads", 1)
     assert lanes["n_assembled"] == singly["n_assembled"] > 6 and singly["n_singly"] > lanes["n_singly"]
     assert 0.0 < lanes["energy_error"] < 1e-6 and 0.0 < singly["energy_error"] < 1e-6
+
+
+@pytest.mark.slow
+def test_the_quick_run(tmp_path):
+    ensembles.STUDY.main(["--quick", "--out", str(tmp_path)])
+    text = (tmp_path / "ensembles.md").read_text()
+    assert "Quick run" in text and "|twoloop, ensemble|" in text and (tmp_path / "ensembles.png").is_file()

@@ -130,3 +130,10 @@ def test_engines_and_where_others_stop_follow_the_rows():
     assert "|open chain, MuJoCo|15|300|" in text and "|heyoka|10|1.0|2.0|" in text
     before = [40, solvers.BUDGET]
     assert solvers.until_row(80, "heyoka", before)["status"] == "TIME_LIMIT" and before[0] == 40
+
+
+@pytest.mark.slow
+def test_the_quick_run(tmp_path):
+    scale.STUDY.main(["--quick", "--out", str(tmp_path)])
+    text = (tmp_path / "scale.md").read_text()
+    assert "Quick run" in text and "|open chain|" in text and (tmp_path / "scale_chains.png").is_file()
