@@ -13,8 +13,8 @@ from studies.bench.names import label
 from studies.bench.render import listed, number, power
 from studies.bench.solvers import DEFAULT
 from studies.bench.study import Study, kept_rows
+from studies.scale.engines import TREE, trees
 from studies.scale.runs import CHAIN, CHAINS, ERRORS, EVALUATION, EXUDYN, LIMIT, chains, evaluations
-from studies.scale.solvers import BUDGET, TREE, UNTIL, UNTIL_END, trees, until
 
 FROM, TO = 30, 1000  # bodies, between which the power is fitted
 CAREFUL = 5.0  # passes of the projection in a step, beyond which stages are projected too
@@ -45,9 +45,7 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
         f"{case}, {engine}": own.groupby("n")["evaluation_us"].median().to_dict()
         for (case, engine), own in right.groupby(["case", "solver"], sort=False)
     }
-    grown = rows[rows["group"].eq(UNTIL) & rows["status"].eq("REACHED_END")]
-    found["until"] = [_until(str(solver), own) for solver, own in grown.groupby("solver", sort=False)]
-    found |= {"budget": BUDGET, "until_end": UNTIL_END, "bend": BEND}
+    found["bend"] = BEND
     found["references"] = sorted(set(rows["reference"].dropna())) if "reference" in rows else []
     return found | {"answer": _answer(found)}
 
@@ -86,14 +84,6 @@ def _chains(rows: pd.DataFrame) -> dict[int, pd.DataFrame]:
     order = {"n": True, "solver": True, "h": False, "tol": False, "repeat": True}
     chained = rows[rows["group"] == CHAIN].sort_values([*order], ascending=[*order.values()])
     return {int(n): tables.medians(own.reset_index(drop=True)) for n, own in chained.groupby("n")}
-
-
-def _until(solver: str, rows: pd.DataFrame) -> dict[str, Any]:
-    """Return the largest chain that a solver ran, with times of building and of a call."""
-    run = rows.sort_values("n").iloc[-1]
-    return {"solver": solver, "n": int(run["n"])} | {
-        name: float(run[name]) for name in ("build_s", "call_s", "error_q")
-    }
 
 
 def _growth(found: dict[str, Any]) -> str:
@@ -152,4 +142,4 @@ def _short(solver: str) -> str:
     return OURS if solver == DEFAULT else label(solver).split()[0].rstrip(",")
 
 
-STUDY = Study("scale", __doc__, kept_rows(evaluations, trees, chains, until), findings_of, figures_of)
+STUDY = Study("scale", __doc__, kept_rows(evaluations, trees, chains), findings_of, figures_of)
