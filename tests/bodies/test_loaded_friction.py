@@ -1,4 +1,4 @@
-"""Friction that grows with the load of a joint, against Newton's and Euler's laws solved apart."""
+"""Test friction that grows with the load of a joint, against Newton's and Euler's laws solved apart."""
 
 from functools import cache
 

@@ -1,4 +1,4 @@
-"""Models from URDF files: what is read, what is not, the same by hand, and by Pinocchio where it is installed."""
+"""Test models from URDF files: what is read, what is not, and the same models by hand."""
 
 import warnings
 

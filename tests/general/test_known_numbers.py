@@ -1,4 +1,4 @@
-"""Numbers that remember how they were made of parameters: for other values they are what plain numbers would be."""
+"""Test numbers that remember how they depend on parameters: for other values they are what plain numbers would be."""
 
 import math
 

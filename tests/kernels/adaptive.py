@@ -1,4 +1,4 @@
-"""What holds for each method of variable steps, as tests of a class: a subclass names its method and the bounds."""
+"""Test what holds for each method of variable steps: a class whose subclasses name their method and the bounds."""
 
 from functools import cache
 

@@ -1,4 +1,4 @@
-"""Adams: its nodes, what a step costs, and what holds for each method of variable steps."""
+"""Test Adams: its nodes, the evaluations of a step, and what holds for each method of variable steps."""
 
 import numpy as np
 import pytest

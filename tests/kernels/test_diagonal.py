@@ -1,4 +1,4 @@
-"""Diagonally implicit stages: the tableaux, stiff problems with and without tangents, the estimate."""
+"""Test diagonally implicit stages: stability, stiff problems with and without tangents, contacts."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""How helpers get into kernels, and which kernels are compiled together."""
+"""Test how helpers get into kernels, and which kernels are compiled together."""
 
 import re
 from pathlib import Path

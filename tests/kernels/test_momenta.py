@@ -1,4 +1,4 @@
-"""Canonical variables: a symplectic tableau is a symplectic map in (q_i, p_i) and is not in (q_i, v_i)."""
+"""Test canonical variables: a symplectic tableau is symplectic in (q_i, p_i) and is not in (q_i, v_i)."""
 
 from functools import cache
 

@@ -1,4 +1,4 @@
-"""Newmark: prices of its adaptive steps, by which a wrong prediction or estimate shows; what its tolerance means."""
+"""Test Newmark: cost of its adaptive steps, by which a wrong prediction or estimate shows; what its tolerance means."""
 
 import numpy as np
 import pytest

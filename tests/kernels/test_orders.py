@@ -1,4 +1,4 @@
-"""Convergence order of every method on a pendulum whose pivot moves: slopes of position and velocity errors."""
+"""Test the convergence order of every method on a pendulum whose pivot moves, by errors of positions and velocities."""
 
 from functools import cache
 

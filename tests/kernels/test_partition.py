@@ -1,4 +1,4 @@
-"""Coordinate partitioning: what full pivoting chooses, the rank it sees, and runs that one partition cannot make."""
+"""Test coordinate partitioning: the rank that full pivoting sees, and runs that one partition cannot make."""
 
 import numpy as np
 import pytest

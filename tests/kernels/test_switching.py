@@ -1,4 +1,4 @@
-"""`auto`: which method runs when, that stiffness is found and left, and what the choice costs."""
+"""Test `auto`: stiffness is found and left, and the choice costs little."""
 
 import numpy as np
 import pytest

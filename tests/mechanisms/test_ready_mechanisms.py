@@ -1,4 +1,4 @@
-"""Test all ready mechanisms: drawings, derivatives, references by a second route, nine digits, imports, rotations."""
+"""Test all ready mechanisms: drawings, derivatives, references by a second route, nine digits, imports."""
 
 import math
 import pickle

@@ -34,7 +34,7 @@ def _by_collocation(*start: Any, tol: float | None = None, **options: Any) -> An
 
 # one setting of each solver: `fixed` tells those that differ in a number
 FOUND = {line.name: line for line in lines() if line.setting == "tol" and not line.of_problem and not line.fixed}
-del FOUND["IDA from C, order 2, banded"]  # only of systems that declare a bandwidth: test_ida_beam.py
+del FOUND["IDA from C, order 2, banded"]  # only of systems that declare a bandwidth: test_ida.py
 ADAPTERS: dict[str, Any] = {
     **{name: Adapter(line) for name, line in FOUND.items()},
     # which take steps, here of a fixed length or number

@@ -1,4 +1,4 @@
-"""Every adapter against motions that are known by other means, at tolerances that it follows."""
+"""Test every adapter against motions that are known by other means, at tolerances that it follows."""
 
 import pytest
 

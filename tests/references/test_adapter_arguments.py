@@ -1,4 +1,4 @@
-"""Wrong arguments, options and callbacks out of bounds: every adapter names them."""
+"""Test that adapters name wrong arguments, wrong options and callbacks out of bounds."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""What holds for every adapter: it is right, output and time limits, what fails is a row."""
+"""Test what holds for every adapter: it is right; output; time limits; a failure is a row."""
 
 import time
 from dataclasses import replace
@@ -174,7 +174,7 @@ def raising():
 
 
 # what reads which function; the index-1 forms do not read the constraint, the others not gamma; those from C, which
-# take compiled functions alone, have theirs in test_ida_c.py
+# take compiled functions alone, have theirs in test_ida.py
 NANS = [(name, "force") for name in ANY_CALLBACK]
 NANS += [
     (name, kind)

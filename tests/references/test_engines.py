@@ -1,4 +1,4 @@
-"""Models of closed loops in physics engines: inertia, kinematics, accelerations; and what the gates catch."""
+"""Test models of closed loops in physics engines: inertia, accelerations, motions; what the gates catch."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Fixed-step BDF on the index-3 form: order, damping, constraints, the start, failures."""
+"""Test fixed-step BDF on the index-3 form: order, constraints, the start, failures."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Test IDA on the beam and without Python: accuracy, the options that matter, failures, memory, other wheels."""
+"""Test IDA without Python and on the beam: accuracy, the options that matter, failures, memory."""
 
 import ctypes
 import gc

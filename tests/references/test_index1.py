@@ -1,4 +1,4 @@
-"""SciPy's solvers on the index-1 ODE: accuracy against the truth, drift and its two cures, output, failures."""
+"""Test SciPy's solvers on the index-1 ODE: accuracy, drift and its two cures, failures."""
 
 import numpy as np
 import pytest

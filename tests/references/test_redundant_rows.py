@@ -1,4 +1,4 @@
-"""Mechanisms whose rows of C_q depend on one another, through adapters of solvers that need them independent."""
+"""Test mechanisms whose rows depend on one another with solvers that need independent rows."""
 
 import numpy as np
 import pytest

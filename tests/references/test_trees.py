@@ -1,4 +1,4 @@
-"""Trees in engines, and IDA's sparse solver: the same accelerations and motions as ours."""
+"""Test trees in engines, and IDA's sparse solver: accelerations and motions are those of twoloop."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Mechanisms from energies against the same ones written by hand."""
+"""Test mechanisms from energies against the same ones written by hand."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Generated code: derived once, kept on disk, pickled without SymPy, its parameters free to change."""
+"""Test generated code: derived once, pickled without SymPy, its parameters free to change."""
 
 import pickle
 

@@ -1,4 +1,4 @@
-"""`check_simulator`: what it measures, what it finds, what it says of it, and what it refuses."""
+"""Test `check_simulator`: it finds and names planted faults, passes sound integrators, and ends where a run hangs."""
 
 from contextlib import suppress
 from time import sleep

@@ -1,4 +1,4 @@
-"""The template of docs/examples runs outside the clone, on the wheel as it is installed, with numpy and pytest only."""
+"""Test the template of docs/examples outside the clone, on the wheel as it is installed, with numpy and pytest only."""
 
 import os
 import subprocess

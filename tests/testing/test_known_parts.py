@@ -1,4 +1,4 @@
-"""Bodies and joints of the problems of `twoloop.testing`: a simulator that is given nothing else passes the check."""
+"""Test bodies and joints of the problems of `twoloop.testing`: a simulator that gets nothing else passes the check."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""The problems of `twoloop.testing`: their equations, what is known of their motions, and what an import costs."""
+"""Test the problems of `twoloop.testing`: their equations, what is known of their motions, what an import loads."""
 
 import numpy as np
 import pytest

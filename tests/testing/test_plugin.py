@@ -1,4 +1,4 @@
-"""The plugin of pytest: a test a problem and property, known failures, reports, and nothing without its option."""
+"""Test the plugin of pytest: a test for each problem and property, known failures, reports."""
 
 import os
 import subprocess
