@@ -1,4 +1,4 @@
-"""Mechanisms from M and Q, in velocities and in generalised speeds, and from the objects of sympy.physics.mechanics."""
+"""Test mechanisms from M and Q, in velocities and in generalised speeds, and from sympy.physics.mechanics."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Printed code and derivatives against what SymPy itself evaluates."""
+"""Test printed code and derivatives against what SymPy itself evaluates."""
 
 import math
 
