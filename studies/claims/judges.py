@@ -96,7 +96,7 @@ def extra_multipliers(rows: Rows) -> Judgement:
 def constraints_kept(rows: Rows) -> Judgement:
     run = rows.long("violation", solver=IRK, group="line-up").iloc[0]
     worst = max(float(run[f"violation_{level}"]) for level in "qva")
-    return decide([worst < SATISFIED and not grows(run, "q")], levels=worst)
+    return decide([worst < SATISFIED and not grows(run)], levels=worst)
 
 
 def _steady(runs: pd.DataFrame) -> pd.Series:

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import product
 from typing import Any
 
 import matplotlib.pyplot as plt
@@ -28,7 +29,7 @@ OURS = ("auto", "auto, compiled", "TRBDF2", "ESDIRK4", "SunRadau5", "Gauss6", "B
 OTHERS = (*(name for name in solvers.OTHER_SOLVERS if not name.startswith("Exudyn")), solvers.IDA_C_BANDED)
 HALF_A_DECADE = 0.5  # of the printed step sizes, within which ours count as the same
 TARGETS, TOLD = (1e-2, 1e-3, 1e-4), 1e-3  # m, errors of the tip's height; the report tells of the latter
-LOOSE = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5)  # tolerances, between and beyond which `adaptive` asks
+LOOSE: tuple[float, ...] = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5)  # tolerances, between and beyond which `adaptive` asks
 OWN_VALUES = {  # of those that do not take these
     solvers.IRK: (1e-1, solvers.PAPER_TOL),  # its error is that of rounding from the loosest on
     **dict.fromkeys((solvers.NEWMARK, solvers.QUARTER), (1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9)),
@@ -42,9 +43,9 @@ DRAWN = (solvers.DEFAULT, solvers.NEWMARK, "TRBDF2", solvers.IDA_C_ORDER_2, solv
 
 def line_up() -> dict[str, Solver]:
     """Return the solvers by name."""
-    listed = [replace(solvers.CATALOGUE[solvers.IRK_LINE], name=solvers.IRK)]
-    listed += [solvers.CATALOGUE[name] for name in (solvers.NEWMARK, solvers.QUARTER, *solvers.RADAU, *OURS, *OTHERS)]
-    return {solver.name: solver for solver in listed}
+    names = (solvers.NEWMARK, solvers.QUARTER, *solvers.RADAU, *OURS, *OTHERS)
+    irk = replace(solvers.CATALOGUE[solvers.IRK_LINE], name=solvers.IRK)
+    return {irk.name: irk} | {name: solvers.CATALOGUE[name] for name in names}
 
 
 def cases(quick: bool) -> dict[str, Case]:
@@ -54,15 +55,12 @@ def cases(quick: bool) -> dict[str, Case]:
 
 def runs(known: dict[str, Case], quick: bool) -> Iterator[Run]:
     """List the solvers at their settings on both beams."""
-    for case in known.values():
-        for name, solver in line_up().items():
-            if quick and name not in QUICK:
-                continue
-            values = OWN_VALUES.get(name, case.steps() if solver.setting == "h" else LOOSE)
-            if quick:
-                values = (solvers.PAPER_TOL,) if name == solvers.IRK else QUICK_TOLERANCES
-            at = case if solver.family == "two-loop" else replace(case, time_limit=LIMIT)
-            yield from (Run(at, solver, value, "run", 1 if quick else REPEATS) for value in values)
+    for case, (name, solver) in product(known.values(), line_up().items()):
+        values = OWN_VALUES.get(name, case.steps() if solver.setting == "h" else LOOSE)
+        if quick:
+            values = () if name not in QUICK else (solvers.PAPER_TOL,) if name == solvers.IRK else QUICK_TOLERANCES
+        at = case if solver.family == "two-loop" else replace(case, time_limit=LIMIT)
+        yield from (Run(at, solver, value, "run", 1 if quick else REPEATS) for value in values)
 
 
 def make(output: Output) -> pd.DataFrame:
@@ -72,50 +70,43 @@ def make(output: Output) -> pd.DataFrame:
 
     def row(run: Run, repeat: int, built: Warm) -> Row:
         measured = row_of(run, repeat, measure, built)
-        return measured | {"error_all": measured.get("error_q"), "error_q": measured.get("error_tip")}
+        return measured | {"error_q": measured.get("error_tip")}
 
     with output.kept() as kept:
-        errors = () if quick else TARGETS
-        listed = list(runs(known, quick))
+        listed, errors = list(runs(known, quick)), () if quick else TARGETS
         rows = adaptive.collect(listed, kept, row, adaptive.is_ours, errors, adaptive.is_ours)
-        more = [*limit_rows(), *sensitivity_rows(known)]
-    return pd.concat([rows, pd.DataFrame(more)], ignore_index=True)
+    return pd.concat([rows, pd.DataFrame([*limit_rows(), *sensitivity_rows(known)])], ignore_index=True)
 
 
 def measure(run: Run, result: Result) -> dict[str, Any]:
     """Measure the error of the tip's height, by which solvers are compared, and the steps."""
-    case, h = run.case, result.h
-    row: dict[str, Any] = {"n_rejected_convergence": result.stats.n_rejected_convergence, "error_tip": None}
-    row["h_median"] = float(np.median(h)) if h.size else None
+    case, error = run.case, None
     if result.success:
-        row["error_tip"] = float(np.abs(tip_height(deviation(result, case.reference, case.instants)[0])).max())
+        error = float(np.abs(tip_height(deviation(result, case.reference, case.instants)[0])).max())
     span = float(np.ptp(tip_height(case.reference.states(case.instants)[0])))
-    row["astray"] = row["error_tip"] is None or row["error_tip"] > ASTRAY * span
-    return row
+    row = {"error_tip": error, "astray": error is None or error > ASTRAY * span}
+    return row | {"h_median": float(np.median(result.h)) if result.h.size else None}
 
 
 def _case(rows: pd.DataFrame, name: str) -> dict[str, Any]:
     own = tables.where(rows, case=name, group="run")
-    changes = tables.where(rows, case=name, group="sensitivity").set_index("solver")["largest"].astype(float)
-    paper = tables.where(own, solver=solvers.IRK, tol=solvers.PAPER_TOL)
-    if paper.empty or changes.empty:
+    irk = tables.where(own, solver=solvers.IRK)
+    paper, changed = tables.where(irk, tol=solvers.PAPER_TOL), tables.where(rows, case=name, solver=MESH)
+    if paper.empty or changed.empty:
         raise StudyError("the rows lack PaperIRK or changed beams; run python -m studies.reproduction beam")
-    run, irk = paper.iloc[0], tables.where(own, solver=solvers.IRK)
-    found: dict[str, Any] = {key: float(run[key]) for key in ("call_s", "h_median", "floor")}
+    found: dict[str, Any] = {key: float(paper[key].iloc[0]) for key in ("call_s", "h_median", "floor")}
     found |= {"name": name, "printed_s": PAPER_SECONDS[name], "printed_h": PAPER_STEPS[name]}
     found["steps_as_printed"] = bool(abs(np.log10(found["h_median"] / found["printed_h"])) < HALF_A_DECADE)
-    found |= {"error": run["error_tip"], "t_end": float(run["t_end"]), "mesh": changes[MESH]}
     sides = tables.of_both(tables.ranking(own, TOLD))
     found["at"] = {"error": TOLD, **sides, "paper_s": tables.as_good(irk, TOLD)}
     fastest = min((side["call_s"] for side in sides.values() if side), default=np.nan)
-    return found | {"paper_over_fastest": found["at"]["paper_s"] / fastest}
+    found |= {"mesh": float(changed["largest"].iloc[0]), "paper_over_fastest": found["at"]["paper_s"] / fastest}
+    return found
 
 
 def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
-    cases = [_case(rows, name) for name in (SOFT, STIFF)]
-    soft, stiff = cases
-    found: dict[str, Any] = {"cases": cases, "t_end": soft["t_end"]}
-    return found | {f"growth_{key}": stiff[key] / soft[key] for key in ("call_s", "printed_s")}
+    cases = soft, stiff = [_case(rows, name) for name in (SOFT, STIFF)]
+    return {"cases": cases} | {f"growth_{key}": stiff[key] / soft[key] for key in ("call_s", "printed_s")}
 
 
 def figure_of(rows: pd.DataFrame, found: dict[str, Any]) -> Figure:
@@ -134,8 +125,7 @@ def figure_of(rows: pd.DataFrame, found: dict[str, Any]) -> Figure:
         panel.set_title(f"{name} beam", fontsize=9)
     panels[0].set_ylabel("CPU time (s)")
     least, most = sorted(case["paper_over_fastest"] for case in found["cases"])
-    figures.message(
-        figure, f"PaperIRK takes {number(least)} and {number(most)} times as long as the fastest solver within 1 mm"
-    )
+    over = f"{number(least)} and {number(most)}"
+    figures.message(figure, f"PaperIRK takes {over} times as long as the fastest solver within 1 mm")
     figures.label_lines(panels)
     return figure

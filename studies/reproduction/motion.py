@@ -14,7 +14,7 @@ from studies.bench.cases.four_bar import Y3
 from studies.bench.cli import StudyError
 from studies.bench.collector import Run
 from studies.bench.metrics import deviation
-from studies.bench.solvers import CATALOGUE, GEAR_ORDERS, IRK, LINE_UP, NEWMARK, gear
+from studies.bench.solvers import CATALOGUE, GEAR_ORDERS, IRK, NEWMARK, gear
 from studies.bench.tables import where
 from twoloop import Result
 
@@ -29,22 +29,17 @@ DRAWN_ORDER = 2  # of the stand-in: its statements are true of it
 
 
 def runs(quick: bool) -> list[Run]:
-    """List every solver at one sensible setting, then the stand-in for Gstiff at several steps."""
+    """List the paper's procedures, then the stand-in for Gstiff at several steps."""
     case = replace(four_bar.cases(quick)[0], timed=0.0)  # times are not compared here
-    line_up = [CATALOGUE[name] for name in LINE_UP]
-    if quick:
-        line_up = [solver for solver in line_up if solver.family in ("two-loop", "Exudyn")]
-    listed = [Run(case, solver, LINE_UP[solver.name], "line-up", 1) for solver in line_up]
-    for order in (2, 5) if quick else GEAR_ORDERS:
-        for step in STEPS[:3] if quick else STEPS:
-            listed.append(Run(case, CATALOGUE[gear(order)], step, "GSTIFF stand-in", 1))
-    return listed
+    listed = [Run(case, CATALOGUE[name], 1e-9, "line-up", 1) for name in (IRK, NEWMARK)]
+    orders, steps = ((2, 5), STEPS[:3]) if quick else (GEAR_ORDERS, STEPS)
+    return listed + [Run(case, CATALOGUE[gear(n)], h, "GSTIFF stand-in", 1) for n in orders for h in steps]
 
 
 def measure(run: Run, result: Result) -> dict[str, Any]:
     """Measure the errors and the heights of y3, and sample the curves of the figure ("series")."""
     row: dict[str, Any] = dict.fromkeys(("error_y3", "error_y3_short", "top", "top_late"))
-    row |= {"kinetic": run.case.scale.kinetic, "range_y3": run.case.scale.ranges[Y3], "series": {}}
+    row |= {"range_y3": run.case.scale.ranges[Y3], "series": {}}
     if result.t.size < 2 or result.t[-1] < FINE:
         return row
     problem, motion, t_end = run.case.problem, run.case.reference, run.case.t_end
@@ -56,8 +51,7 @@ def measure(run: Run, result: Result) -> dict[str, Any]:
     worst = np.maximum.accumulate(np.abs(off))
     row["error_y3_short"] = worst[t <= SHORT * (1.0 + 1e-9)][-1]
     if result.success:
-        row["error_y3"] = worst[-1]
-        row["top"] = max(y3.max(), problem.q0[Y3])
+        row["error_y3"], row["top"] = worst[-1], max(y3.max(), problem.q0[Y3])
         row["top_late"] = y3[t >= t[-1] - 1.5 * four_bar.period()].max()
     for name, at in {"short": GRIDS["short"], "last": t_end + GRIDS["last"]}.items():
         row["series"][name] = np.where(at <= t[-1] * (1.0 + 1e-9), np.interp(at, t, y3), np.nan)
@@ -73,8 +67,8 @@ def find(rows: pd.DataFrame, solver: str, step: float | None = None) -> pd.Serie
 
 def _stand_in(rows: pd.DataFrame) -> dict[str, Any]:
     """List the orders of the stand-in that are visibly wrong: over 2 s with both steps, then over the run."""
-    both = {n: [find(rows, gear(n), step) for step in (COARSE, MIDDLE)] for n in GEAR_ORDERS}
-    known = {n: (coarse, fine) for n, (coarse, fine) in both.items() if coarse is not None and fine is not None}
+    pairs = {n: [run for h in (COARSE, MIDDLE) if (run := find(rows, gear(n), h)) is not None] for n in GEAR_ORDERS}
+    known = {n: pair for n, pair in pairs.items() if len(pair) == 2}
 
     def wrong(step: int, column: str) -> list[int]:
         return [n for n, pair in known.items() if not pair[step][column] <= VISIBLE]  # a failed run is wrong, too
@@ -90,12 +84,11 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
         if run is None or pd.isna(run["error_y3"]):
             raise StudyError("the rows lack the paper's procedures; run python -m studies.reproduction motion")
         procedures.append({name: run[name] for name in ("solver", "error_y3_short", "error_y3", "top", "top_late")})
-    found: dict[str, Any] = {"t_end": float(rows["t_end"].iloc[0]), "problem": rows["problem"].iloc[0]}
-    found |= {"visible": VISIBLE, "passes": PASSES, "procedures": procedures, "gear": _stand_in(rows)}
-    found["agree"] = all(run["error_y3_short"] <= VISIBLE for run in procedures)
-    found["agree_long"] = all(run["error_y3"] <= VISIBLE for run in procedures)
-    found["reach"] = all(run["top"] < PASSES and run["top_late"] > -PASSES for run in procedures)
-    return found
+    found: dict[str, Any] = {"t_end": float(rows["t_end"].iloc[0]), "visible": VISIBLE, "procedures": procedures}
+    for name, column in (("agree", "error_y3_short"), ("agree_long", "error_y3")):
+        found[name] = all(run[column] <= VISIBLE for run in procedures)
+    reach = all(run["top"] < PASSES and run["top_late"] > -PASSES for run in procedures)
+    return found | {"reach": reach, "gear": _stand_in(rows)}
 
 
 def figure_of(rows: pd.DataFrame, found: dict[str, Any]) -> Figure:
@@ -105,8 +98,7 @@ def figure_of(rows: pd.DataFrame, found: dict[str, Any]) -> Figure:
     for panel, curve, step, start in ((panels[0], "short", COARSE, 0.0), (panels[1], "last", MIDDLE, found["t_end"])):
         t = GRIDS[curve] + start
         panel.plot(t, truth.states(t)[0][Y3], color="black", lw=2.9, alpha=0.3, label="true motion")
-        names = ((IRK, None, "-"), (NEWMARK, None, ":"), (gear(DRAWN_ORDER), step, "--"))
-        for name, fixed, line in names:
+        for name, fixed, line in ((IRK, None, "-"), (NEWMARK, None, ":"), (gear(DRAWN_ORDER), step, "--")):
             row = find(rows, name, fixed)
             if row is not None and curve in row["series"]:
                 look = figures.look(row, coded=True) | {"marker": "", "linestyle": line}

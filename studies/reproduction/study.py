@@ -17,22 +17,16 @@ from studies.bench.study import rows_of
 from studies.reproduction import ablation, beam, motion, step_size, violation
 
 NAME = "reproduction"
-PARTS: dict[str, Any] = {
-    "motion": motion,
-    "step_size": step_size,
-    "violation": violation,
-    "beam": beam,
-    "ablation": ablation,
-}
+PARTS: dict[str, Any] = dict(motion=motion, step_size=step_size, violation=violation, beam=beam, ablation=ablation)
 CURVES = ("motion", "step_size", "violation")  # parts whose figures are drawn of the curves of runs
-ERRATA = tomllib.loads(Path(__file__).with_name("errata.toml").read_text())
+ERRATA = tomllib.loads(Path(__file__).with_name("errata.toml").read_text())["errata"]
 
 
 def make_rows(call: Call, name: str) -> None:
     """Make the rows of a part, PART.csv."""
     part = PARTS[name]
+    make = part.make if hasattr(part, "make") else rows_of(part.runs, getattr(part, "measure", lambda *of_run: {}))
     with Output(replace(call, study=name)) as output:
-        make = part.make if hasattr(part, "make") else rows_of(part.runs, part.measure)
         output.save_rows(make(output), cli.stamp(call.command))
 
 
@@ -48,24 +42,23 @@ def read_rows(call: Call, name: str) -> tuple[pd.DataFrame, str]:
 def findings_of(rows: dict[str, pd.DataFrame]) -> dict[str, Any]:
     """Collect the findings of each part, by its name, and the answer."""
     found = {name: PARTS[name].findings_of(own) for name, own in rows.items()}
-    return found | {"answer": answer(found)}
+    return found | {"answer": answer(*(found[name] for name in PARTS))}
 
 
-def answer(found: dict[str, Any]) -> str:
+def answer(moved: Any, stepped: Any, kept: Any, beams: Any, compared: Any) -> str:
     """Tell in one sentence what comes out as the text describes it, and whether the paper's idea pays."""
-    moved, stepped, kept = found["motion"], found["step_size"], found["violation"]
-    beams, projected = found["beam"]["cases"], found["ablation"]["against"][ablation.PROJECTED]["time"]
     right = {
         "motion": moved["agree"] and moved["reach"],
         "steps": stepped["holds"] and stepped["longer"],
         "constraints": not kept["irk_grows"] and max(kept["irk"]) <= kept["kept"],
     }
-    words = [f"The linkage's {listed(name for name in right if right[name])} come out as described"]
-    words[0] += f", but not {listed(name for name in right if not right[name])}" * (not all(right.values()))
-    words[0] += f", and the steps of {sum(case['steps_as_printed'] for case in beams)} of {len(beams)} beams"
-    if projected:
-        words.append(f"projecting once a step takes {number(projected[1])} times the time of its method")
-    return "; ".join(words) + "."
+    text = f"The linkage's {listed(name for name in right if right[name])} come out as described"
+    text += f", but not {listed(name for name in right if not right[name])}" * (not all(right.values()))
+    near = [case["steps_as_printed"] for case in beams["cases"]]
+    text += f", and the steps of {sum(near)} of {len(near)} beams"
+    if projected := compared["against"][ablation.PROJECTED]["time"]:
+        text += f"; projecting once a step takes {number(projected[1])} times the time of its method"
+    return f"{text}."
 
 
 def report(output: Output) -> None:
@@ -73,14 +66,12 @@ def report(output: Output) -> None:
     read = {name: read_rows(output.call, name) for name in PARTS}
     rows = {name: own for name, (own, _) in read.items()}
     stamps = {name: stamp.split("; ") for name, (_, stamp) in read.items()}
-    dates = {name: stamp[1] for name, stamp in stamps.items()}
-    found = findings_of(rows)
-    found |= {"processor": "; ".join(dict.fromkeys(stamp[3] for stamp in stamps.values()))}
+    found = findings_of(rows) | {"processor": "; ".join(dict.fromkeys(stamp[3] for stamp in stamps.values()))}
     output.save_findings(found)
     for name, part in PARTS.items():
         figures.save(part.figure_of(rows[name], found[name]), output, name)
-    text = render(NAME, found, {}, dates=dates, errata=ERRATA["errata"], quick=output.call.quick)
-    output.write(f"{NAME}.md", text)
+    dates = {name: stamp[1] for name, stamp in stamps.items()}
+    output.write(f"{NAME}.md", render(NAME, found, {}, dates=dates, errata=ERRATA, quick=output.call.quick))
 
 
 def _work(words: Sequence[str] | None) -> None:

@@ -9,7 +9,7 @@ from studies.bench.collector import Case
 from studies.bench.headline import OWN_CODE
 from studies.bench.metrics import violations
 from studies.bench.solvers import CATALOGUE, DEFAULT, EXUDYN, GIVEN, IRK, LINE_UP, TOLERANCES, gear
-from studies.reproduction import motion, step_size, violation
+from studies.reproduction import step_size, violation
 from studies.validation import study as validation
 from twoloop import solve_dae
 from twoloop.mechanisms import four_bar
@@ -69,7 +69,7 @@ def test_the_default_is_what_a_call_without_options_takes():
     assert np.array_equal(result.q, plain.q) and not np.array_equal(result.q, without_code.q)
 
 
-@pytest.mark.parametrize("study", [motion, step_size, violation, validation])
+@pytest.mark.parametrize("study", [step_size, violation, validation])
 @pytest.mark.parametrize("quick", [False, True])
 def test_the_studies_of_one_line_a_method_run_the_default(study, quick):
     names = {run.solver.name for run in study.runs(quick)}

@@ -22,7 +22,7 @@ TOLERANCES = tuple(float(f"1e-{k}") for k in range(1, 9))  # from looser ones on
 TIME_LIMIT = 30.0  # s, of a call; the paper's procedure takes a third of it on the processors seen so far
 NOTE = (
     "The start is assumed, the paper's text does not tell it: straight along x, gravity across it, only the base node "
-    "moving. Its figures are lost."
+    "moving. Its figures are missing from the text that we worked from."
 )
 
 
