@@ -29,10 +29,10 @@ from twoloop.problem.problem import Array
 Row = dict[str, Any]
 FOLDERS = ("twoloop", "references", "studies")  # a change in any of these makes kept rows worthless
 NUMERICS = ("numpy", "scipy", "numba")
-# studies, and parts of the study of reproduction, whose times are compared, so that no two run at once
+# studies whose times are compared, so that no two run at once
 TIMED = (
-    *("work_precision", "compare", "table3", "energy", "ensembles", "engines", "scale", "beam", "violation"),
-    "ablation",
+    *("work_precision", "compare", "table3", "table3_full", "energy", "ensembles", "engines", "scale"),
+    *("beam", "violation", "ablation"),  # parts of the study of reproduction
 )
 MADE_BY = dict.fromkeys(("motion", "step_size", "violation", "beam", "ablation"), "reproduction")
 LOCK = "twoloop-timed.lock"  # in the machine's folder of temporary files

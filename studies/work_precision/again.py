@@ -14,6 +14,7 @@ import pandas as pd
 
 from studies.bench import cli
 from studies.bench.cli import StudyError
+from studies.bench.row_files import versions
 from studies.bench.store import KeptRows, Output
 from studies.compare import GROUP as LENGTH
 from studies.work_precision import first_calls, mechanisms, minimal, study
@@ -83,6 +84,9 @@ def main(words: Sequence[str] | None = None) -> None:
             rows, line = output.load_rows()
             new = study.calibrated(new).assign(processor=cli.processor(), commit=cli.commit())
             output.save_rows(replaced(rows, part, new), line)
+            if output.file("work_precision.json").is_file():
+                found = output.load_findings()
+                output.save_findings(found | {"versions": found["versions"] | versions()})
             print(f"{name}: {len(new)} rows", flush=True)
 
 

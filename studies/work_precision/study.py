@@ -112,13 +112,19 @@ def report(output: Output, rows: pd.DataFrame, line: str) -> dict[str, Any]:
     found |= {"calls": headline.calls(everywhere, firsts, HEADLINE), "first_calls": first_calls.findings_of(firsts)}
     found["favourable"] = favourable(found)
     found["processors"] = [] if output.call.quick else processors.kept(output, rows, line, standings)
-    found |= {"measured": measured_on(rows), "versions": versions(), "least": tables.LEAST}
+    found |= {"measured": measured_on(rows), "versions": versions_of(output), "least": tables.LEAST}
     found |= {"repeats": REPEATS, "answer": answer(found)}
     output.save_findings(found)
     figures.save(heat_map(found), output, "work_precision_ratios")
     figures.save(picture(everywhere, found), output, "work_precision")
     output.write("work_precision.md", render("work_precision", found, {}, stamp=line, quick=output.call.quick))
     return found
+
+
+def versions_of(output: Output) -> dict[str, str]:
+    """The versions of the packages with which the rows were measured: of rows that are read again, those told then."""
+    known = output.file("work_precision.json")
+    return dict(output.load_findings()["versions"]) if output.call.redraw and known.is_file() else versions()
 
 
 def measured_on(rows: pd.DataFrame) -> dict[str, Any]:
