@@ -17,9 +17,7 @@ STIFFER = 10.0  # times w_max of the very flexible beam, whose modulus is a hund
 FOLLOWS = 1e-3  # m, of the tip over the run
 A_LOT = 5.0  # times; the frequencies grow by 10
 TIPS = (1e-2, 1e-3, 1e-4)  # m or rad, errors over the run at which costs are compared: tip, or the linkage
-TIP = TIPS[-1]  # m
 WIDTH = 0.02  # m, about the width of a line in a figure of the tip
-KEYS = ("soft", "stiff")
 PARTED = 10.0  # times the change until 1.2 s
 
 EXPLICIT = (
@@ -46,7 +44,7 @@ def kind_of(solver: str) -> str:
 def jacobian_difficult(rows: Rows) -> Judgement:
     """Compare costs only; whether Jacobians are hard to get was not tested."""
     counts = [rows.number(f"Newton over fixed point, {case}") for case in ("linkage", *BEAMS)]
-    seconds = [[as_good(rows.beam(case, name), TIP) for name in ("SunRadau5", solvers.IRK)] for case in BEAMS]
+    seconds = [[as_good(rows.beam(case, name), TIPS[-1]) for name in ("SunRadau5", solvers.IRK)] for case in BEAMS]
     times = [newton / paper for newton, paper in seconds]
     return decide((ratio > 1.0 for ratio in (*counts, *times)), evaluations=span(counts), times=span(times))
 
@@ -54,22 +52,21 @@ def jacobian_difficult(rows: Rows) -> Judgement:
 def stiff_applicable(rows: Rows) -> Judgement:
     limit = rows.pick("beam", named="latest stages", group="limit").iloc[0]
     runs = [_paper_on(rows, case) for case in BEAMS]
-    steps, reached = [float(run["h_median"]) for run in runs], sum(map(_follows, runs))
-    h_omega = [steps[0] * limit["w_max"], steps[1] * limit["w_max"] * STIFFER]
+    reached = sum(map(_follows, runs))
+    h_omega = [run["h_median"] * limit["w_max"] * factor for run, factor in zip(runs, (1.0, STIFFER), strict=True)]
     limited = max(h_omega) < limit["theory"] and max(h_omega) < FACTOR * min(h_omega)  # h goes as 1 / w_max
-    all_reached = reached == len(BEAMS)
-    return decide([all_reached and not limited], all_reached, h_omega=span(h_omega), reached=reached)
+    return decide([reached == len(runs) and not limited], reached == len(runs), h_omega=span(h_omega), reached=reached)
 
 
 def implicit_needed(rows: Rows) -> Judgement:
     ratios = {}
-    for key, case in zip(KEYS, BEAMS, strict=True):
+    for key, case in zip(("soft", "stiff"), BEAMS, strict=True):
         runs = rows.beam(case, "")
         kinds = runs["solver"].map(kind_of)
-        sides = [runs[kinds == kind] for kind in ("explicit", "Newton")]
         for name, what in ((key, "call_s"), (f"{key}_evaluations", "n_evaluations")):
-            explicit, newton = ([cheapest(side, tip, what) for tip in TIPS] for side in sides)
-            ratios[name] = span_known(np.array(explicit) / newton)
+            sides = (runs[kinds == kind] for kind in ("explicit", "Newton"))
+            explicit, newton = (np.array([cheapest(side, tip, what) for tip in TIPS]) for side in sides)
+            ratios[name] = span_known(explicit / newton)
     return decide((ratio > 1.0 for bounds in ratios.values() for ratio in bounds), **ratios)
 
 

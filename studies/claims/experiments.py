@@ -3,7 +3,7 @@
 import math
 import warnings
 from collections.abc import Callable, Sequence
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -26,12 +26,10 @@ TIME_LIMIT = 60.0  # s of a published mechanism
 STEP = 0.06  # s, about the median step of the paper's procedure
 CLOSE = 1e-4  # m or rad, error at which the outer loops are compared
 BEAM_END, PARTS = 0.2, range(3, 14)  # s of a beam; 2^k fixed steps
-OUTER: tuple[Literal["fixed-point"], Literal["newton"]] = ("fixed-point", "newton")
 ORDERS = dict(zip(IMPLICIT, (5, 6, 12, 5, 9, 13, 2, 4, 2, 5), strict=True))
 STEPS = (4, 5, 6, 8, 10, 12, 16, 20, 24, 32, 48, 64, 96, 128)  # a second
 FALLING = (1e-9, 1e-2)  # errors between which an order is seen
 ENOUGH = 0.9  # of the order
-HALF = 0.5  # of the steps: "most"
 PAIRS = 200  # of successive steps at which the choice of coordinates is compared
 GEOMETRIES = (  # lengths of the bars and of the ground, m: the assumed one, that of Table 3 beside it, and others
     *((1.0, 2.0, 1.5, 3.0), (0.8, 1.2, 1.0, 2.0), (1.0, 1.2, 0.5, 1.0)),
@@ -41,8 +39,7 @@ GEOMETRIES = (  # lengths of the bars and of the ground, m: the assumed one, tha
 
 def make(quick: bool) -> dict[str, float]:
     linkage = four_bar()
-    states = true_states(linkage, 8 if quick else 40)
-    found = predictor(linkage, states) | values_alone(linkage)
+    found = predictor(linkage, true_states(linkage, 8 if quick else 40)) | values_alone(linkage)
     found |= generality(validation.MAKE[:: 7 if quick else 1]) | nonholonomic()
     return found | outer_loops() | orders() | passing(GEOMETRIES[: 1 if quick else None])
 
@@ -62,20 +59,18 @@ def predictor(problem: Problem, states: list[tuple[float, Array, Array]]) -> dic
 
 def values_alone(problem: Problem) -> dict[str, float]:
     """Run a second of the linkage, given by functions that return values; count calls of C_q an evaluation."""
-    given, calls = problem.system, 0
+    given, calls = problem.system, []
 
     def jacobian(t: float, q: Array) -> Array:
-        nonlocal calls
-        calls += 1
+        calls.append(t)
         return given.jacobian(t, q)
 
     def run(system: ConstrainedSystem) -> tuple[Array, float]:
-        nonlocal calls
-        calls = 0
+        calls.clear()
         result = solve_dae(system, (0.0, 1.0), problem.q0, problem.v0, method=paper_irk(), rtol=TOL, atol=TOL)
         if not result.success or not result.stats.n_evaluations:
             raise RuntimeError(f"the linkage given by values: {result.message}")
-        return result.q[:, -1], calls / result.stats.n_evaluations
+        return result.q[:, -1], len(calls) / result.stats.n_evaluations
 
     functions: dict[str, Any] = {"mass": given.mass, "force": given.force, "constraint": given.constraint}
     functions |= {"n_q": given.n_q, "n_c": given.n_c, "jacobian": jacobian}
@@ -107,17 +102,19 @@ def generality(make: Sequence[Callable[[], Problem]]) -> dict[str, float]:
         right.append(result.success and error < NEAR)
         if problem.system.n_c and not problem.system.n_a and "redundant" not in problem.tags:
             same.append(repeated_choices(problem, result))
-    found = {"mechanisms": float(len(right)), "mechanisms right": float(sum(right))}
-    return found | {"partitions seen": float(len(same)), "partitions mostly kept": float(sum(x > HALF for x in same))}
+    mostly = sum(share > 0.5 for share in same)
+    partitions: dict[str, float] = {"partitions seen": len(same), "partitions mostly kept": mostly}
+    return partitions | {"mechanisms": len(right), "mechanisms right": sum(right)}
 
 
 def repeated_choices(problem: Problem, result: Result) -> float:
     """Return the share of steps at which full pivoting picks the same independent coordinates as a step before."""
-    places = np.unique(np.linspace(0, result.t.size - 2, PAIRS).astype(int))
-    chosen = [
-        [independents(problem.system.jacobian(float(result.t[n]), result.q[:, n])) for n in (k, k + 1)] for k in places
-    ]
-    return float(np.mean([before == after for before, after in chosen]))
+    kept = []
+    for k in np.unique(np.linspace(0, result.t.size - 2, PAIRS).astype(int)):
+        matrices = (problem.system.jacobian(float(result.t[n]), result.q[:, n]) for n in (k, k + 1))
+        before, after = map(independents, matrices)
+        kept.append(before == after)
+    return float(np.mean(kept))
 
 
 def without_tangent(problem: Problem) -> ConstrainedSystem:
@@ -139,12 +136,11 @@ def outer_loops() -> dict[str, float]:
     for name, problem, t_end in (*known, ("moderately stiff", moderately_stiff_beam(), BEAM_END)):
         start, least = (problem.q0, problem.v0), []
         truth = solve_dae(problem.system, (0.0, t_end), *start, method="DOP853", rtol=LOOPS, atol=LOOPS).q[:, -1]
-        for outer in OUTER:
+        for outer in ("fixed-point", "newton"):
             method, system = RungeKutta(SUN, outer, inner_tol=LOOPS, outer_tol=LOOPS), without_tangent(problem)
             made = (solve_dae(system, (0.0, t_end), *start, method=method, step_size=t_end / 2**k) for k in PARTS)
             good = (run for run in made if run.success and np.abs(run.q[:, -1] - truth).max() < CLOSE)
-            best = next(good, None)
-            if best is None:
+            if (best := next(good, None)) is None:
                 raise RuntimeError(f"{outer} comes nowhere within {CLOSE:g} on the {name}")
             least.append(best.stats.n_evaluations or 0)
         found[f"Newton over fixed point, {name}"] = least[1] / least[0]
@@ -165,7 +161,7 @@ def orders() -> dict[str, float]:
                 seen.append((math.log(n), math.log(error)))
         points = np.array(seen).T
         reached += len(seen) > 1 and -float(np.polyfit(points[0], points[1], 1)[0]) > ENOUGH * order
-    return {"methods": float(len(ORDERS)), "methods of their order": float(reached)}
+    return {"methods": len(ORDERS), "methods of their order": reached}
 
 
 def passing(geometries: Sequence[tuple[float, float, float, float]]) -> dict[str, float]:
@@ -182,8 +178,8 @@ def passing(geometries: Sequence[tuple[float, float, float, float]]) -> dict[str
                 continue
             truth = MinimalFourBar.from_parameters(problem.parameters)
             tops.append(float(truth.states(np.linspace(0.0, truth.period, 1000))[0][7].max()))
-    found = {"linkages": float(len(tops)), "linkages passing": float(sum(top > PASSES for top in tops))}
-    return found | {"highest y3, assumed": tops[0]}
+    passing = sum(top > PASSES for top in tops)
+    return {"linkages": len(tops), "linkages passing": passing, "highest y3, assumed": tops[0]}
 
 
 def nonholonomic() -> dict[str, float]:

@@ -8,6 +8,7 @@ import pandas as pd
 from studies.bench import tables
 from studies.bench.metrics import ASTRAY, LOST
 from studies.bench.solvers import GEAR_ORDERS, IDA_C, IRK, IRK_LINE, NEWMARK, OWN_BDF, QUARTER, gear
+from studies.bench.store import Array
 from studies.claims.beam_judges import FOLLOWS, TIPS
 from studies.claims.rows import BEAMS, DEFAULT, LONG, NotRun, Rows, cheapest, common_costs
 from studies.claims.verdicts import Judgement, decide, span, span_known
@@ -16,9 +17,10 @@ from studies.reproduction import ablation
 from studies.reproduction.motion import PASSES, VISIBLE
 from studies.reproduction.violation import grows
 from studies.table3.causes import FLAT, cells
-from studies.table3.cells import PAPER_IRK, PAPER_NEWMARK, TOLERANCES
+from studies.table3.cells import FAMILIES, PRINTED_RATIO, TOLERANCES
 
-IRK_GROUP, NEWMARK_GROUP, GSTIFF_GROUP = "Table 3: IRK", "Table 3: Newmark", "GSTIFF stand-in"
+IRK_GROUP, NEWMARK_GROUP = FAMILIES
+GSTIFF_GROUP = "GSTIFF stand-in"
 COARSEST, FINEST = TOLERANCES[0], TOLERANCES[-1]
 
 GROWTH = 10.0  # of the violation from the first tenth of a run to its last: it drifts
@@ -29,7 +31,6 @@ AGREE = 1e-10  # m or rad
 STEP = 0.02  # s
 MAIN = 2.0  # times a logarithm must exceed another for its tolerance to be the one that governs
 CHANGE = 1.1  # times the steps: a tolerance affects them
-PRINTED_RATIO = float(PAPER_NEWMARK[3][3] or 0.0) / PAPER_IRK[3][3]  # 50.93 s over 3.60 s
 TARGETS = (1e-1, *TIPS)
 FINER = (*TIPS, 1e-5, 1e-6)  # m, on the stiffer beam no run of Newmark's method is much worse
 BOTH_BETAS = (NEWMARK, QUARTER)
@@ -70,17 +71,13 @@ def projection_exact(rows: Rows) -> Judgement:
     return decide((violation.max() < SATISFIED for violation in worst), **values)
 
 
-def _cheapest(rows: Rows, solvers: tuple[str, ...], what: str) -> list[float]:
-    """Find the least cost of any of these solvers at each of `TARGETS`; NaN where none has the error."""
-    runs = rows.long("table3_full", solver=solvers, group="comparison", problem=DEFAULT)
-    return [cheapest(runs, target, what) for target in TARGETS]
-
-
 def projection_inefficient(rows: Rows) -> Judgement:
-    spans = {}
-    for key, solvers in (("paper", (IRK_LINE,)), ("best", STATE_SPACE)):
-        found = np.array(_cheapest(rows, PROJECTING, "call_s")) / _cheapest(rows, solvers, "call_s")
-        spans[key] = span_known(found)
+    def seconds(solvers: tuple[str, ...]) -> Array:  # of the cheapest, at each error that counts
+        runs = rows.long("table3_full", solver=solvers, group="comparison", problem=DEFAULT)
+        return np.array([cheapest(runs, target, "call_s") for target in TARGETS])
+
+    against = {"paper": (IRK_LINE,), "best": STATE_SPACE}
+    spans = {name: span_known(seconds(PROJECTING) / seconds(solvers)) for name, solvers in against.items()}
     return decide((least > DEARER for least, _ in spans.values()), **spans)
 
 
@@ -107,13 +104,11 @@ def _steady(runs: pd.DataFrame) -> pd.Series:
 def symplectic_stable(rows: Rows) -> Judgement:
     """Judge in part if no run loses its energy, yet one drifts: stability then has another reason."""
     runs = rows.pick("energy", 10.0 * LONG, solver=("Sun Radau IIB(3)", IRK), partition="lasting")
-    runs = runs[runs["t_end"] == runs["t_end"].max()]
-    runs = runs[runs["variables"] == "velocities"]
+    runs = runs[(runs["t_end"] == runs["t_end"].max()) & (runs["variables"] == "velocities")]
     drifts, change = ~_steady(runs), runs["slope"].abs() * runs["t_end"]
-    stable = (change / runs["kinetic"]).max() < LOST and not runs["lost"].any()
-    stable = bool(stable and (runs["status"] == "REACHED_END").all())
+    stable = (runs["status"] == "REACHED_END") & ~runs["lost"] & (change / runs["kinetic"] < LOST)
     values = {"drifting": int(drifts.sum()), "runs": len(runs), "most": float(change.max())}
-    return decide([stable, not drifts.any()], stable, **values)
+    return decide([stable.all(), not drifts.any()], bool(stable.all()), **values)
 
 
 def newmark_symplectic(rows: Rows) -> Judgement:
@@ -182,7 +177,7 @@ def large_steps(rows: Rows) -> Judgement:
 
 def tolerances_and_steps(rows: Rows) -> Judgement:
     changes = []
-    for group, loose in itertools.product((IRK_GROUP, NEWMARK_GROUP), ((COARSEST, FINEST), (FINEST, COARSEST))):
+    for group, loose in itertools.product(FAMILIES, ((COARSEST, FINEST), (FINEST, COARSEST))):
         changes.append(float(rows.cell(group, FINEST, FINEST)["n_steps"] / rows.cell(group, *loose)["n_steps"]))
     affected = [max(change, 1.0 / change) > CHANGE for change in changes]
     return decide(affected, affected=sum(affected), changes=changes)
@@ -228,7 +223,7 @@ def fourteen_times(rows: Rows) -> Judgement:
 
 
 def table_3_seconds(rows: Rows) -> Judgement:
-    parts = (cells(rows.long("table3_full", problem=DEFAULT, group=group)) for group in (IRK_GROUP, NEWMARK_GROUP))
+    parts = (cells(rows.long("table3_full", problem=DEFAULT, group=group)) for group in FAMILIES)
     irk, newmark = (span(part["paper"] / part["call_s"]) for part in parts)
     return decide([max(irk + newmark) <= FLAT * min(irk + newmark)], irk=irk, newmark=newmark)
 
@@ -266,17 +261,17 @@ def more_efficient(rows: Rows) -> Judgement:
 
 
 def because_of_order(rows: Rows) -> Judgement:
-    found = {}
-    for name, solver in (("irk", IRK_LINE), ("newmark", NEWMARK)):
+    slopes = []
+    for solver in (IRK_LINE, NEWMARK):
         runs = _along(rows, solver, DEFAULT)
         runs = runs[~runs["astray"]]
         if runs["error_q"].nunique() < 2:
             raise NotRun(f"fewer than two runs of {solver} follow the motion")
-        x, y = np.log(1.0 / runs["error_q"].astype(float)), np.log(runs["n_evaluations"].astype(float))
-        found[name] = float(np.polyfit(x, y, 1)[0])
-    near = (abs(found[name] * order - 1.0) < 0.25 for name, order in (("irk", 5), ("newmark", 2)))
+        x, y = (np.log(runs[column].astype(float)) for column in ("error_q", "n_evaluations"))
+        slopes.append(-float(np.polyfit(x, y, 1)[0]))
+    near = (abs(slope * order - 1.0) < 0.25 for slope, order in zip(slopes, (5, 2), strict=True))
     won = [min(ratios) > 1.0 for ratios in _newmark_over_irk(rows).values()]
-    least = found["irk"] < found["newmark"]
+    least = slopes[0] < slopes[1]
     return decide([*near, least, *won], least and any(won), won=sum(won), cases=len(won))
 
 

@@ -33,14 +33,9 @@ def findings_of(pairs: Judged) -> dict[str, Any]:
     answer = f"Of {n} claims, {counts[Verdict.HOLDS]} hold, {counts[Verdict.PART]} hold in part, "
     answer += f"{counts[Verdict.FAILS]} do not hold, and {untestable} cannot be tested with what the paper's text gives"
     answer += f"; {counts[Verdict.NOT_RUN]} were not judged" * bool(counts[Verdict.NOT_RUN])
-    found: dict[str, Any] = {
-        "answer": f"{answer}.",
-        "n": n,
-        "counts": {verdict.value: counts[verdict] for verdict in counts},
-    }
-    found |= {"untestable": untestable, "after": sum(claim.fixed == "after" for claim, _ in pairs.values())}
-    told = {key: {"verdict": each.verdict.value, **each.values} for key, (_, each) in pairs.items()}
-    return found | {"claims": told}
+    found: dict[str, Any] = {"answer": f"{answer}.", "n": n, "counts": counts, "untestable": untestable}
+    found["after"] = sum(claim.fixed == "after" for claim, _ in pairs.values())
+    return found | {"claims": {key: {"verdict": each.verdict, **each.values} for key, (_, each) in pairs.items()}}
 
 
 def report(output: Output, rows: Rows, line: str) -> dict[str, Any]:

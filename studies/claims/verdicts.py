@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from studies.bench.render import number
+from studies.bench.store import Array
 from studies.claims.rows import NotRun, Rows
 
 FILE = Path(__file__).with_name("claims.toml")
@@ -54,10 +55,9 @@ def span(values: Iterable[Any]) -> list[float]:
     return [float(array.min()), float(array.max())]
 
 
-def span_known(ratios: Iterable[float]) -> list[float]:
+def span_known(ratios: Array) -> list[float]:
     """Return the least and the largest of the known values."""
-    known = [ratio for ratio in ratios if np.isfinite(ratio)]
-    if not known:
+    if not (known := ratios[np.isfinite(ratios)]).size:
         raise NotRun("no error that both sides reach")
     return span(known)
 

@@ -8,58 +8,34 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from studies.bench import adaptive, figures, tables
+from studies.bench import adaptive, figures, solvers, tables
 from studies.bench.cases import four_bar
 from studies.bench.cli import StudyError
 from studies.bench.collector import REPEATS, Case, Run, Solver, Warm, collect, row_of
 from studies.bench.headline import OWN_CODE
 from studies.bench.render import number, power, table
-from studies.bench.solvers import (
-    ADAMS,
-    CATALOGUE,
-    CVODE_C,
-    CYRK,
-    DEFAULT,
-    ERR_IN,
-    HEYOKA,
-    IDA_C,
-    IDA_INDEX_1,
-    IRK,
-    IRK_LINE,
-    NEWMARK,
-    OWN_EXPLICIT,
-    QUARTER,
-    TAYLOR,
-    paper_irk_at,
-    paper_newmark_at,
-)
+from studies.bench.solvers import CATALOGUE, ERR_IN, IRK_LINE, NEWMARK, OWN_EXPLICIT, QUARTER
 from studies.bench.store import Output, Row
 from studies.bench.study import Study
 from studies.table3.causes import UNEQUAL, causes, reading_runs
-from studies.table3.cells import FAMILIES, TOLERANCES
+from studies.table3.cells import FAMILIES, cell_runs
 from twoloop import Result, RungeKutta, solve_dae
 from twoloop.methods.tableaux import gauss
 
 TARGETS = (1e-2, 1e-4, 1e-6)
 PAPER = (NEWMARK, QUARTER, IRK_LINE)
-EXPLICIT = (OWN_EXPLICIT, TAYLOR, ADAMS)  # all coordinates, projected: not the paper's procedure
-OTHERS = (
-    *(DEFAULT, OWN_CODE, "SunRadau5", "Gauss6", "Gauss12", "BDF", OWN_EXPLICIT, ADAMS, TAYLOR),
-    *(HEYOKA, CYRK, CVODE_C, IDA_C, "IDA, stabilised", "LSODA, index 1", "DOP853, index 1", "DOP853, projected"),
-    *("Exudyn, GeneralizedAlpha", "Exudyn, TrapezoidalIndex2"),
-)
+LOOPS = (1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10)  # err_out of Newmark
+EXPLICIT = (OWN_EXPLICIT, solvers.TAYLOR, solvers.ADAMS)  # all coordinates, projected: not the paper's procedure
 # for seconds: no quick runs
 COMPILED = (
-    OWN_CODE,
-    HEYOKA,
-    CYRK,
-    CVODE_C,
-    "IDA, stabilised",
-    "LSODA, index 1",
-    "DOP853, index 1",
-    "DOP853, projected",
+    *(OWN_CODE, solvers.HEYOKA, solvers.CYRK, solvers.CVODE_C, solvers.IDA_INDEX_1, "IDA, stabilised"),
+    *("LSODA, index 1", "DOP853, index 1", "DOP853, projected"),
 )
-DRAWN = (OWN_CODE, NEWMARK, IRK_LINE, HEYOKA, CYRK, IDA_C)
+OTHERS = (
+    *(solvers.DEFAULT, "SunRadau5", "Gauss6", "Gauss12", "BDF", *EXPLICIT, solvers.IDA_C, *COMPILED),
+    *("Exudyn, GeneralizedAlpha", "Exudyn, TrapezoidalIndex2"),
+)
+DRAWN = (OWN_CODE, NEWMARK, IRK_LINE, solvers.HEYOKA, solvers.CYRK, solvers.IDA_C)
 STEP = 0.01  # s, of the runs that tell what a partition costs
 
 
@@ -68,27 +44,19 @@ def _fixed(partition: str, case: Case, step: float, repeat: int) -> Result:
 
 
 def runs(first: Case, second: Case, quick: bool) -> list[Run]:
-    """The cells of the table, what a partition costs, both readings of (32), and the other solvers.
+    """List the cells of the table, what a partition costs, both readings of (32), and the other solvers.
 
     On the second geometry only the paper's procedures: `studies.work_precision` has the others there.
     """
-    made = reading_runs(first)
-    for case, once in ((first, quick), (second, True)):
-        for group, at in zip(FAMILIES, (paper_irk_at, paper_newmark_at), strict=True):
-            cells = [(e_in, e_out) for e_in in TOLERANCES for e_out in TOLERANCES if case is first or e_in == e_out]
-            made += [Run(case, at(e_in), e_out, group, 1 if once else REPEATS) for e_in, e_out in cells]
+    made, repeats = reading_runs(first), 1 if quick else REPEATS
+    made += cell_runs(first, repeats) + [run for run in cell_runs(second, 1) if run.solver.fixed["err_in"] == run.value]
     for partition in ("lasting", "symmetric"):
         solver = Solver(f"fixed step, {partition}", "two-loop", "compiled", True, "h", partial(_fixed, partition))
         made.append(Run(first, solver, STEP, "partition", 3 if quick else 9))  # they differ by little
-    more = [] if quick else [IDA_INDEX_1]
-    names = [name for name in (*PAPER, *OTHERS, *more) if not (quick and name in COMPILED)]
-    for case, names_ in ((first, names),) if quick else ((first, names), (second, PAPER)):
-        for name in names_:
-            solver = CATALOGUE[name]
-            values = solver.grid(case) if name not in (NEWMARK, QUARTER) else (1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10)
-            made += [
-                Run(case, solver, x, "comparison", 1 if quick else REPEATS) for x in (values[1:3] if quick else values)
-            ]
+    for case, names in ((first, (*PAPER, *OTHERS)), (second, () if quick else PAPER)):
+        for solver in (CATALOGUE[name] for name in names if not (quick and name in COMPILED)):
+            values = LOOPS if solver.name in (NEWMARK, QUARTER) else solver.grid(case)
+            made += [Run(case, solver, x, "comparison", repeats) for x in (values[1:3] if quick else values)]
     return made
 
 
@@ -111,49 +79,42 @@ def make(output: Output) -> pd.DataFrame:
     return pd.concat([rows, more], ignore_index=True)
 
 
+def first_of(rows: pd.DataFrame) -> pd.DataFrame:
+    """Select the rows of the first geometry."""
+    return rows[rows["problem"] == rows["problem"].iloc[0]]
+
+
 def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     """Compute what the report says, of the first geometry."""
-    first = rows[rows["problem"] == rows["problem"].iloc[0]]
-    found: dict[str, Any] = {"t_end": float(first["t_end"].iloc[0])}
-    same = first[(first["solver"] == NEWMARK) & (first["err_in"] == ERR_IN) & (first["err_out"] == ERR_IN)]
+    first = first_of(rows)
+    same = tables.where(first, solver=NEWMARK, err_in=ERR_IN, err_out=ERR_IN)
     times = [time for own in same["times"] for time in own]  # of all its repetitions, in whatever group
     if not times:
         raise StudyError("the rows lack cells of Table 3; make them again by python -m studies.table3 --full")
-    found["newmark_times"] = [float(min(times)), float(max(times))]
-    found["times_unequal"] = found["newmark_times"][1] > UNEQUAL * found["newmark_times"][0]
+    found: dict[str, Any] = {"t_end": float(first["t_end"].iloc[0]), "newmark_times": [min(times), max(times)]}
+    found["times_unequal"] = max(times) > UNEQUAL * min(times)
     ratios = _newmark_over_irk(first)
     over = list(chain(*ratios.values()))
-    found["newmark_over_irk"] = [min(over), max(over)] if over else []
-    found["newmark_errors"] = list(ratios)
+    found |= {"newmark_over_irk": [min(over), max(over)] if over else [], "newmark_errors": list(ratios)}
     found["cheapest"] = [line for error in TARGETS if (line := _cheapest(_compared(first), error)) is not None]
-    found["explicit"] = _explicit(first)
+    dearer = [irk for each in found["cheapest"] if (irk := each["paper_times"])]
+    found |= {"paper_times": [min(dearer), max(dearer)] if dearer else [], "explicit": _explicit(first)}
     failed = rows[rows["status"] != "REACHED_END"]
     found |= {"failed": len(failed), "failed_two_loop": int((failed["family"] == "two-loop").sum())}
-    return found | causes(first) | {"answer": _answer(found["cheapest"])}
-
-
-def _answer(cheapest: list[dict[str, Any]]) -> str:
-    dearer = [irk for each in cheapest if (irk := each["paper_times"])]
-    if not dearer:
-        return "No error is reached by both the paper's Runge–Kutta procedure and another solver."
-    over = f"{number(min(dearer))} to {number(max(dearer))}"
-    return f"At equal error, the paper's Runge–Kutta procedure takes {over} times as long as the cheapest solver."
+    answer = "No error is reached by both the paper's Runge–Kutta procedure and another solver."
+    if dearer:
+        answer = "At equal error, the paper's Runge–Kutta procedure takes "
+        answer += " to ".join(map(number, found["paper_times"])) + " times as long as the cheapest solver."
+    return found | causes(first) | {"answer": answer}
 
 
 def _cheapest(first: pd.DataFrame, error: float) -> dict[str, Any] | None:
-    """The cheapest solver at an error, and how many times as long the paper's procedure and IDA from C take."""
+    """Find the cheapest solver at an error, and how many times as long the paper's procedure takes."""
     ranked = tables.ranking(first, error)
     if ranked.empty:
         return None
     times = dict(zip(ranked["solver"], ranked["call_s"] / ranked["call_s"].iloc[0], strict=True))
-    found = {"error": error, "paper_times": times.get(IRK_LINE), "ida_times": times.get(IDA_C)}
-    found["beside"] = None
-    if len(ranked) > 1:
-        best, second = ranked["solver"].iloc[:2]
-        costs = tables.costs_at(first, error)
-        verdict = tables.compared({best: costs[best]}, {second: costs[second]})["verdict"]
-        found["beside"] = None if verdict == "ahead" else str(second)
-    return found | (tables.best(ranked) or {})
+    return {"error": error, "paper_times": times.get(IRK_LINE)} | (tables.best(ranked) or {})
 
 
 def _newmark_over_irk(first: pd.DataFrame) -> dict[str, list[float]]:
@@ -170,16 +131,13 @@ def _newmark_over_irk(first: pd.DataFrame) -> dict[str, list[float]]:
     return found
 
 
-def _explicit(first: pd.DataFrame) -> dict[str, Any]:
-    """Time of the paper's Runge-Kutta procedure over that of the cheapest explicit method on all coordinates."""
-    fine = _compared(first)
-    over = {}
+def _explicit(first: pd.DataFrame) -> list[float]:
+    """Divide the time of the paper's Runge-Kutta procedure by that of the cheapest explicit method of `EXPLICIT`."""
+    fine, over = _compared(first), []
     for error in TARGETS:
         paper, *explicit = (tables.time_for(fine[fine["solver"] == name], error) for name in (IRK_LINE, *EXPLICIT))
-        least = np.fmin.reduce(explicit)  # of those that get there
-        if not np.isnan(paper) and not np.isnan(least):
-            over[power(error)] = float(paper / least)
-    return {"solvers": list(EXPLICIT), "paper": IRK, "errors": list(over), "over": list(over.values())}
+        over.append(float(paper / np.fmin.reduce(explicit)))  # of those that get there
+    return [ratio for ratio in over if not np.isnan(ratio)]
 
 
 def _compared(first: pd.DataFrame) -> pd.DataFrame:
@@ -189,24 +147,17 @@ def _compared(first: pd.DataFrame) -> pd.DataFrame:
 
 
 def figures_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, Figure]:
-    """Cost over error."""
-    first = rows[rows["problem"] == rows["problem"].iloc[0]]
-    dearer = [irk for each in found["cheapest"] if (irk := each["paper_times"])]
-    most = f"{number(min(dearer))} to {number(max(dearer))} times" if dearer else "more"
+    """Draw CPU time over error."""
+    most = f"{' to '.join(map(number, found['paper_times']))} times" if found["paper_times"] else "more"
     title = f"The paper's Runge–Kutta procedure takes {most} the least time"
-    return {"table3_full": figures.work_precision(_compared(first), DRAWN, title, coded=True)}
+    return {"table3_full": figures.work_precision(_compared(first_of(rows)), DRAWN, title, coded=True)}
 
 
 def tables_of(rows: pd.DataFrame, found: dict[str, Any]) -> dict[str, str]:
     """Make the table of the report."""
-    first = rows[rows["problem"] == rows["problem"].iloc[0]]
-    made = tables.work_precision(_compared(first), TARGETS, DRAWN, coded=True)
-    return {
-        "work": table(
-            ["solver", *map(power, TARGETS)],
-            [[solver, *(cost.split(" (")[0] for cost in costs)] for solver, _, *costs in made],
-        )
-    }
+    made = tables.work_precision(_compared(first_of(rows)), TARGETS, DRAWN, coded=True)
+    lines = [[solver, *(cost.split(" (")[0] for cost in costs)] for solver, _, *costs in made]
+    return {"work": table(["solver", *map(power, TARGETS)], lines)}
 
 
 STUDY = Study("table3_full", __doc__, make, findings_of, figures_of, tables_of, medians=True)

@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from studies.bench.cli import StudyError
+from studies.bench.cases import four_bar
 from studies.bench.solvers import IDA_C, IRK, IRK_LINE, NEWMARK, QUARTER
 from studies.table3 import cells as short
 from studies.table3 import full
@@ -39,13 +39,7 @@ def rows(machine=10.0, step=0.0, t_end=100.0):
                 lines.append({**common, **line, "lost": solver == NEWMARK and j == 0})
         for name, each in (("lasting", 0.0), ("symmetric", 2.0)):
             line = {"problem": problem, "group": "partition", "solver": f"fixed step, {name}", "n_steps": 1e4}
-            evaluations = 1e5
-            line |= {
-                "n_evaluations": evaluations,
-                "call_s": 1e-6 * (evaluations + each * 1e4),
-                "error_q": 1e-3,
-                "h": 0.01,
-            }
+            line |= {"n_evaluations": 1e5, "call_s": 1e-6 * (1e5 + each * 1e4), "error_q": 1e-3, "h": 0.01}
             lines.append({**common, **line})
         for solver, cpu in ((NEWMARK, 4.0), (QUARTER, 3.0), (IRK_LINE, 1.0), (IDA_C, 0.5), ("Gauss12", 0.2)):
             for k, error in enumerate((0.5, 1e-3, 1e-6)):
@@ -77,15 +71,9 @@ def test_the_cells_stand_beside_the_printed_times(tmp_path, capsys):
     text = (tmp_path / "table3.md").read_text()
     assert "| 1e-9 | 0.34 | 0.35 | 0.35 | 0.36 |" in text and "| 1e-9 | 3.370 | 3.460 | 3.550 | 3.600 |" in text
     assert "| 1e-9 | 0.34 | 0.35 | 0.35 | 0.36 |" in capsys.readouterr().out
-    assert found["irk_over"] == pytest.approx([10.0, 10.0]) and found["paper_ratio"] == pytest.approx(14.147, abs=1e-3)
+    assert found["irk_over"] == pytest.approx([10.0, 10.0])
     assert (found["newmark_lost"], found["irk_lost"], found["failed"]) == (["1e-3"], [], 0)
-    assert found["answer"] in text and "Exudyn beside it" in text
-
-
-@pytest.mark.usefixtures("unsaved")
-def test_other_solvers_stand_below_in_the_order_of_their_errors(tmp_path):
-    found_of(SHORT, tmp_path, first(rows()))
-    text = (tmp_path / "table3.md").read_text()
+    assert found["answer"] in text
     assert text.index(f"| {IDA_C} | tol 1.0 | 0.50 | 0.50 |") < text.index(f"| {IDA_C} | tol 0.10 | 1.0 | 1e-3 |")
 
 
@@ -98,12 +86,8 @@ def test_runs_that_are_lost_or_fail_are_told(tmp_path):
     found = found_of(SHORT, tmp_path, made)
     assert found["newmark_lost"] == [] and found["irk_lost"][0] == "1e-3" and found["failed"] == 1
     assert found["newmark_only_astray"] == ["1e-3", "1e-5", "1e-7", "1e-9"] and not found["irk_over"]
-
-
-@pytest.mark.usefixtures("unsaved")
-def test_a_quick_report_compares_nothing_with_the_paper(tmp_path):
     found_of(SHORT, tmp_path, first(rows(t_end=10.0)), quick=True)
-    assert "3.600" not in (tmp_path / "table3.md").read_text()
+    assert "3.600" not in (tmp_path / "table3.md").read_text()  # a shorter run is not compared with the paper's
 
 
 def test_another_geometry_needs_all_four_lengths_and_must_assemble(tmp_path, capsys):
@@ -115,13 +99,9 @@ def test_another_geometry_needs_all_four_lengths_and_must_assemble(tmp_path, cap
     ):
         with pytest.raises(SystemExit, match="error: "):
             main([*words, "--out", str(tmp_path)])
-    with pytest.raises(StudyError, match="go together"):
-        short.geometry_of(None, 3.0)
 
 
 def test_the_study_lists_all_cells_once():
-    from studies.bench.cases import four_bar
-
     runs = short.runs(four_bar.cases(False)[0], False)
     assert sum(run.group in FAMILIES for run in runs) == 32 and len({run.key(0) for run in runs}) == len(runs)
     assert {run.solver.family for run in runs} >= {"SUNDIALS", "Exudyn"}
@@ -154,12 +134,8 @@ def test_one_machine_constant_is_told_from_more(tmp_path):
     assert found["span_time"] > 1.5 and not found["one_constant"] and found["partition_us"] == pytest.approx(2.0)
     assert found["span_partition"] == pytest.approx(1.0, abs=0.01) and found["partition_explains"]
     assert fit(cells(rows(step=2.0).query("problem == @PROBLEMS[0]")))["attempt"] == pytest.approx(2.0, rel=0.1)
-
-
-@pytest.mark.usefixtures("unsaved")
-def test_a_partition_too_cheap_to_be_measured_explains_nothing(tmp_path):
     made = rows(step=2.0)
-    made.loc[made["solver"] == "fixed step, symmetric", "call_s"] = 0.09
+    made.loc[made["solver"] == "fixed step, symmetric", "call_s"] = 0.09  # too cheap to be measured
     found = found_of(full, tmp_path, made)
     assert found["partition_us"] <= 0.0 and not found["partition_explains"]
 
