@@ -37,7 +37,7 @@ REFERENCE_LIMIT = 300.0  # s of wall-clock time for each run of the reference
 
 
 def load_problem(where: str) -> Problem:
-    """The problem that FILE.py:FUNCTION makes, or a ready mechanism by its name.
+    """Make the problem of FILE.py:FUNCTION, or a ready mechanism by its name.
 
     Raises StudyError if there is no such file or function, or it does not return a `Problem`.
     """
@@ -48,7 +48,7 @@ def load_problem(where: str) -> Problem:
 
 
 def known_of(problem: Problem, t_end: float, limit: float) -> ReferenceMotion:
-    """The reference, with a word before and after, as it is the longest part of many comparisons."""
+    """Make the reference, and print how long it takes, as it is the longest part of many comparisons."""
     print(f"making the reference of {problem.name!r} to {t_end:g} s, at most {limit:g} s a run ...", flush=True)
     began = time.perf_counter()
     try:
@@ -63,7 +63,7 @@ def known_of(problem: Problem, t_end: float, limit: float) -> ReferenceMotion:
 
 
 def runs_of(case: Case, solvers: Iterable[str | Solver], quick: bool) -> list[Run]:
-    """All runs of the comparison of a case; a `Solver` that is no name is from a file."""
+    """List all runs of the comparison of a case; a `Solver` that is no name is from a file."""
     runs, at_times = [], replace(case, n_instants=N_TIMES - 1, known=lambda: case.reference)
     for each in solvers:
         solver, of = (CATALOGUE[each], case) if isinstance(each, str) else (each, at_times)
@@ -76,7 +76,7 @@ def runs_of(case: Case, solvers: Iterable[str | Solver], quick: bool) -> list[Ru
 
 
 def beside(outsiders: Mapping[str, Outsider], run: Run, result: Result) -> dict[str, Any]:
-    """The calibration, in the process in which the solver ran, and the error at the end over the largest coordinate."""
+    """Measure the calibration where the solver ran, and the error at the end over the largest coordinate."""
     outsider = outsiders.get(run.solver.name)
     q, _ = run.case.reference.states(run.case.instants[-1:])
     size = max(1.0, float(np.abs(q).max()))
@@ -87,7 +87,7 @@ def beside(outsiders: Mapping[str, Outsider], run: Run, result: Result) -> dict[
 
 
 def rows_from(files: Iterable[str], mechanism: str, t_end: float) -> list[Row]:
-    """The rows of files that are of this comparison's mechanism; the word "archive" is the file that is shipped.
+    """Read the rows of files that are of this comparison's mechanism; the word "archive" is the file that is shipped.
 
     Raises StudyError if a file has none, or cannot be read.
     """
@@ -157,7 +157,7 @@ def report(
 
 
 def message(found: dict[str, Any]) -> str:
-    """What the figure shows: the ratio of both sides at the smallest error that both reach."""
+    """Say what the figure shows: the ratio of both sides at the smallest error that both reach."""
     both = [at for at in found["cheapest"] if at["ours_first"] is not None]
     about = f"{found['name']}, {number(found['t_end'])} s"
     if not both:

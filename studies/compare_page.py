@@ -38,7 +38,7 @@ LIBRARIES = ("chart-4.6.1", "chartjs-plugin-zoom-2.2.0")  # the second extends t
 
 
 def read(folder: Path, files: Sequence[str] = ()) -> tuple[pd.DataFrame, dict[str, str]]:
-    """One row a run of all studies in a folder and of files of rows, and where these are from.
+    """Read one row a run, of all studies in a folder and of files of rows, and where these are from.
 
     Raises StudyError if there are no rows at all, or a file is damaged.
     """
@@ -66,7 +66,7 @@ def read(folder: Path, files: Sequence[str] = ()) -> tuple[pd.DataFrame, dict[st
 
 
 def named(rows: pd.DataFrame, folder: Path) -> pd.DataFrame:
-    """The rows with the names of solvers that figures have, and in "look" the rows whose looks these have."""
+    """Give solvers the names that they have in figures, and in the column "look" the row whose look each has."""
     path = folder / "work_precision.json"
     told = json.loads(path.read_text()) if path.is_file() else {}
     cases = rows.loc[rows["study"] == "work_precision", "case"].unique() if told else ()
@@ -76,7 +76,7 @@ def named(rows: pd.DataFrame, folder: Path) -> pd.DataFrame:
 
 
 def page_data(rows: pd.DataFrame, stamps: dict[str, str]) -> dict[str, Any]:
-    """What the page is given: mechanisms, solvers with their looks, and the runs as lists."""
+    """Make the data of the page: mechanisms, solvers with their looks, and the runs as lists."""
     families = rows.groupby("solver", sort=False)["family"].first()
     seen = looks(dict(zip(rows["solver"], rows["look"], strict=True)))
     solvers = [{"name": name, "ours": family == "two-loop", **seen[name]} for name, family in families.items()]
@@ -102,7 +102,7 @@ def page_data(rows: pd.DataFrame, stamps: dict[str, str]) -> dict[str, Any]:
 
 
 def looks(solvers: Mapping[str, str]) -> dict[str, dict[str, Any]]:
-    """Colour and point of each solver: those that figures give to a row, another pair where one is taken or not there.
+    """Choose colour and point of each solver: those of the figures, or another pair where these are taken or missing.
 
     `solvers`: the name of the row of each.
     """
@@ -121,7 +121,7 @@ def looks(solvers: Mapping[str, str]) -> dict[str, dict[str, Any]]:
 
 
 def page(data: dict[str, Any]) -> str:
-    """The page, without further files."""
+    """Render the page, which needs no further files."""
     text = json.dumps(plain(data), separators=(",", ":"), ensure_ascii=False).replace("</", "<\\/")
     stamps = "".join(f"<li>{html.escape(name)}: {html.escape(stamp)}</li>" for name, stamp in data["stamps"].items())
     template = (TEMPLATES / FILE).read_text(encoding="utf-8")

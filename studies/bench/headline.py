@@ -49,7 +49,7 @@ def of_errors(rows: pd.DataFrame, errors: Iterable[float], given: str = DEFAULT)
 
 
 def compared(own: tables.Costs, others: tables.Costs, *near: tables.Costs) -> dict[str, Any]:
-    """`tables.compared`, undecided where near misses of the slower side, of ours or of others, would not be slower."""
+    """Compare as `tables.compared` does; undecided where near misses of the slower side would not be slower."""
     found, (near_own, near_others) = tables.compared(own, others), near
     sides = {"ahead": (own, others | near_others), "behind": (own | near_own, others)}.get(found["verdict"])
     if sides and tables.compared(*sides)["verdict"] != found["verdict"]:
@@ -75,7 +75,7 @@ def counted(pairs: Iterable[Mapping[str, Mapping[str, Any]]], name: str) -> dict
 
 
 def calls(rows: pd.DataFrame, firsts: pd.DataFrame, case: str) -> dict[str, Any] | None:
-    """What a call takes on one mechanism at PRICED, and the first call; None: the mechanism was not run.
+    """Find what a call takes on one mechanism at PRICED, and the first call; None: the mechanism was not run.
 
     `rows`: medians, of all mechanisms and solvers. `firsts`: rows of `studies.work_precision.first_calls`.
 
@@ -100,7 +100,7 @@ def calls(rows: pd.DataFrame, firsts: pd.DataFrame, case: str) -> dict[str, Any]
 
 
 def _call(runs: pd.DataFrame, error: float, doubt: bool) -> dict[str, Any]:
-    """The cheapest of some solvers; others' by the rule of the verdicts, where they were not run at about the error."""
+    """Find the cheapest of some runs; `doubt`: by the rule of the verdicts, for solvers not run at about the error."""
     best = _cheapest(tables.costs_at(runs, error, doubt=doubt))
     if best["solver"] is None:
         return best | {"keeps": None, "near": None}

@@ -25,7 +25,7 @@ IN_ANGLES = ", in angles"  # after that of a mechanism: the runs of its equation
 
 @dataclass(frozen=True)
 class Part:
-    """Rows that are measured together: all of a group, or those of one case of it, or of one project."""
+    """Rows that are measured together: all of a group, or those of one case or of one project."""
 
     group: str
     case: str | None
@@ -34,7 +34,7 @@ class Part:
 
 
 def parts() -> dict[str, Part]:
-    """What can be measured again, by name."""
+    """List what can be measured again, by name."""
     runs = mechanisms.runs(False)
     found = {
         name: Part(mechanisms.GROUP, name, partial(mechanisms.collect, [run for run in runs if run.case.name == name]))
@@ -52,7 +52,7 @@ def parts() -> dict[str, Part]:
 
 
 def part_of(name: str, known: Mapping[str, Part]) -> Part:
-    """The part of a name.
+    """Look up a part.
 
     Raises StudyError if there is none.
     """
@@ -62,7 +62,7 @@ def part_of(name: str, known: Mapping[str, Part]) -> Part:
 
 
 def replaced(rows: pd.DataFrame, part: Part, new: pd.DataFrame) -> pd.DataFrame:
-    """All rows with those of one part in the place of what stood there."""
+    """Put the new rows of one part in the place of the old ones."""
     old = rows["group"] == part.group
     if part.case is not None:
         old &= rows["case"] == part.case

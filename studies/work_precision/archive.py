@@ -27,7 +27,7 @@ MEASURED = {  # what the errors of a group are
 
 
 def archived(rows: pd.DataFrame, versions: dict[str, str]) -> list[Row]:
-    """Rows of the format, of the repetitions of all runs compared; `versions`: of the other projects' packages."""
+    """Convert rows of all runs compared to the format; `versions`: of the other projects' packages."""
     found = []
     for group, columns in MEASURED.items():
         medians = tables.medians(rows[rows["group"] == group])
@@ -36,7 +36,7 @@ def archived(rows: pd.DataFrame, versions: dict[str, str]) -> list[Row]:
 
 
 def made_of(folder: Path) -> str:
-    """The archive of the rows in a folder of reports."""
+    """Write the archive of the rows in a folder of reports, as text."""
     rows, _ = read_rows(folder / "work_precision.csv", "group", "case", "solver", "t_end")
     return text_of(archived(with_one_name(rows), json.loads((folder / "work_precision.json").read_text())["versions"]))
 

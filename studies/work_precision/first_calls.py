@@ -49,7 +49,7 @@ EQUATIONS = "equations"  # folder of twoloop's code for single mechanisms in a f
 
 
 def collect(kept: KeptRows, quick: bool) -> pd.DataFrame:
-    """One row a mechanism and solver."""
+    """Make the rows, one a mechanism and solver."""
 
     def made(name: str, solver: str) -> Row:
         row: Row = {"group": GROUP, "case": name, "solver": solver, "tol": TOLERANCE, "repeat": 0}
@@ -62,7 +62,7 @@ def collect(kept: KeptRows, quick: bool) -> pd.DataFrame:
 
 
 def in_process(module: str, *words: str) -> Row:
-    """What a module prints of a mechanism, in a new process in which no code of mechanisms is kept."""
+    """Run a module for a mechanism in a new process, in which no code of mechanisms is cached, and read its answer."""
     with tempfile.TemporaryDirectory(prefix="twoloop-first-") as folder:
         environment = {**os.environ, "HOME": folder, "XDG_CACHE_HOME": folder, "PYTHONUSERBASE": site.getuserbase()}
         if shared := os.environ.get("NUMBA_CACHE_DIR"):  # with the kernels, and the code of mechanisms
@@ -76,7 +76,7 @@ def in_process(module: str, *words: str) -> Row:
 
 
 def times_of(name: str, solver: str) -> Row:
-    """The same in this process."""
+    """Time the first call and later ones in this process."""
     attempt(run_of(mechanisms.double_pendulum(), solver), 0)
     make = getattr(mechanisms, MECHANISMS[name])
     callbacks = [function.py_func.__module__ for function in make().system.given.values()]
@@ -100,12 +100,12 @@ def times_of(name: str, solver: str) -> Row:
 
 
 def run_of(problem: mechanisms.Problem, solver: str) -> Run:
-    """The run of a solver on a mechanism that is timed."""
+    """Set up the run of a solver on a mechanism."""
     return Run(replace(case_of(problem), time_limit=LIMIT, timed=TIMED), CATALOGUE[solver], TOLERANCE)
 
 
 def _compiled_anew(modules: list[ModuleType]) -> ModuleType:
-    """The last of these with all callbacks compiled again, as a user's are when they are new."""
+    """Load modules again with all callbacks compiled anew, as a user's are, and return the last."""
     kept = numba.config.CACHE_DIR  # type: ignore[attr-defined]
     with tempfile.TemporaryDirectory(prefix="twoloop-callbacks-") as numba.config.CACHE_DIR:  # type: ignore[attr-defined]
         modules = [importlib.reload(module) for module in modules]
@@ -114,7 +114,7 @@ def _compiled_anew(modules: list[ModuleType]) -> ModuleType:
 
 
 def findings_of(rows: pd.DataFrame) -> list[dict[str, Any]]:
-    """By solver the first call, s: on how many mechanisms, the median, the least and the most."""
+    """Find the first call of each solver, s: median and range over mechanisms."""
     if "first_call_s" not in rows:
         return []
     told = rows[rows["first_call_s"].notna()].groupby("solver", sort=False)["first_call_s"]

@@ -52,7 +52,7 @@ FAR = 1e-11  # ... to so much
 
 @cache
 def problems(quick: bool) -> dict[str, Problem]:
-    """The mechanisms by name, each with a reference."""
+    """Make the mechanisms by name, each with a reference."""
     made = {name: replace(make(), name=name) for name, make in GEOMETRIES.items()}
     made["four-bar, second"] = replace(made["four-bar, second"], reference=_end_of_second(made["four-bar, second"]))
     for problem in (make() for make in MAKE):
@@ -62,12 +62,12 @@ def problems(quick: bool) -> dict[str, Problem]:
 
 @cache
 def singular() -> frozenset[str]:
-    """The mechanisms that pass through singular positions."""
+    """Name the mechanisms that pass through singular positions."""
     return frozenset(problem.name for problem in (make() for make in MAKE) if SINGULAR in problem.tags)
 
 
 def _end_of_second(problem: Problem) -> Reference:
-    """Its state after 10 s by Gauss14, from which DOP853 differs in the last of its digits.
+    """Compute its state after 10 s by Gauss14, from which DOP853 differs in the last of its digits.
 
     Raises StudyError if a run fails, or the equation in one coordinate, which shares nothing with them, does not agree
     to FAR.
@@ -89,7 +89,7 @@ def _end_of_second(problem: Problem) -> Reference:
 
 
 def runs(quick: bool) -> list[Run]:
-    """Every mechanism, solver and setting."""
+    """List the runs of every mechanism, solver and setting."""
     found = []
     for name, problem in problems(quick).items():
         case = replace(case_of(problem), name=name, time_limit=TIME_LIMIT, timed=TIMED)
@@ -103,14 +103,14 @@ def runs(quick: bool) -> list[Run]:
 
 
 def collect(todo: Sequence[Run], kept: KeptRows) -> pd.DataFrame:
-    """Rows of all runs that are of use; on the four-bars however far behind a solver is, and repeated where priced."""
+    """Make the rows of all runs that are of use; on the four-bars however far behind a solver is."""
     quick = all(run.repeats == 1 for run in todo)
     errors, priced = () if quick else DECADES, lambda run: run.case.name == HEADLINE
     return adaptive.collect(todo, kept, row_at_end, lambda run: run.case.name in GEOMETRIES, errors, priced, priced)
 
 
 def row_at_end(run: Run, repeat: int, built: Warm) -> Row:
-    """A repetition of a run, measured by the end of the reference."""
+    """Make a repetition of a run and measure it by the end of the reference."""
     warm_up(run, repeat, built, COMPILING)
     row = row_of(run) | {"repeat": repeat, "keeps_constraints": run.solver.keeps_constraints}
     return row | {"n_steps": row.pop("n_accepted")}
@@ -118,13 +118,13 @@ def row_at_end(run: Run, repeat: int, built: Warm) -> Row:
 
 @cache
 def given_on(case: str) -> str:
-    """The solver that the default is on a mechanism: `auto`, with code for the mechanism if it is small."""
+    """Tell which solver the default is on a mechanism: `auto`, with code for the mechanism if it is small."""
     problem = problems(False).get(case)
     return headline.OWN_CODE if problem is not None and is_small(problem.system) else headline.DEFAULT
 
 
 def standings(rows: pd.DataFrame, errors: Sequence[float]) -> list[dict[str, dict[str, Any]]]:
-    """How the default and ours stand on one mechanism at each error; `rows`: its medians."""
+    """Compare the default and other methods of twoloop on one mechanism at each error; `rows`: its medians."""
     return headline.of_errors(rows, errors, given_on(str(rows["case"].iloc[0])))
 
 
@@ -132,14 +132,14 @@ Standings = dict[str, list[dict[str, dict[str, Any]]]]  # by mechanism how each 
 
 
 def standings_of(rows: pd.DataFrame) -> Standings:
-    """How the default and ours stand on each mechanism at each decade, in the order of `problems`."""
+    """Compare them on each mechanism at each decade, in the order of `problems`; `rows`: medians."""
     places = {name: k for k, name in enumerate(problems(False))}
     cases = sorted(rows.groupby("case"), key=lambda each: places.get(str(each[0]), len(places)))
     return {str(name): standings(own, DECADES) for name, own in cases}
 
 
 def findings_of(made: Standings, rows: pd.DataFrame) -> dict[str, Any]:
-    """What the report says of the mechanisms; `rows`: the medians of which `made` is."""
+    """Find what the report says of the mechanisms; `rows`: the medians of which `made` is."""
     smooth = {case: own for case, own in made.items() if case not in singular()}
     crossing = {case: own for case, own in made.items() if case in singular()}
     found: dict[str, Any] = {"mechanisms": len(smooth), "typical": [typical(smooth, error) for error in TYPICAL]}
@@ -165,7 +165,7 @@ def findings_of(made: Standings, rows: pd.DataFrame) -> dict[str, Any]:
 
 
 def typical(made: Standings, error: float) -> dict[str, Any]:
-    """Time of the fastest other solver over the default's at an error: median and range over mechanisms, and counts."""
+    """Summarise at an error the time of the fastest other solver over the default's: median, range, counts."""
     at = [own[DECADES.index(error)][headline.GIVEN] for own in made.values()]
     ratios = [each["ratio"] for each in at if each["ratio"] is not None]
     verdicts = [each["verdict"] for each in at]
@@ -177,13 +177,13 @@ def typical(made: Standings, error: float) -> dict[str, Any]:
 
 
 def fastest(pairs: Iterable[Mapping[str, Mapping[str, Any]]]) -> dict[str, int]:
-    """Which other solvers are the fastest where the default is slower, and in how many pairs of mechanism and error."""
+    """Count the pairs of mechanism and error in which the default is slower, by the fastest other solver."""
     at = [each[headline.GIVEN] for each in pairs]
     return dict(Counter(each["other"]["solver"] for each in at if each["verdict"] == "behind").most_common())
 
 
 def reached(rows: pd.DataFrame) -> dict[str, Any]:
-    """At how many of the errors that any solver reaches at singular positions each does."""
+    """Count the errors that a solver reaches at singular positions, of those that any reaches."""
     crossed = rows[rows["case"].isin(singular()) & rows["error_q"].notna()]
     least = crossed.groupby(["case", "solver"])["error_q"].min()
     errors = [(case, error) for case, own in least.groupby("case") for error in DECADES if own.min() <= error]
@@ -200,7 +200,7 @@ def reached(rows: pd.DataFrame) -> dict[str, Any]:
 
 
 def drift(made: Standings, rows: pd.DataFrame) -> dict[str, float] | None:
-    """How far the fastest other solvers leave the constraints where they are faster than the default.
+    """Measure how far the fastest other solvers leave the constraints where they are faster than the default.
 
     |C| of the cheapest run that is accurate enough over the error compared; None: all of them keep the constraints.
     """
@@ -217,7 +217,7 @@ def drift(made: Standings, rows: pd.DataFrame) -> dict[str, float] | None:
 
 
 def cells(made: Standings) -> list[dict[str, Any]]:
-    """By mechanism the ratio of times and the verdict on the default at each of RESOLVED; singular positions last."""
+    """List ratios of times and verdicts on the default at RESOLVED, a line a mechanism; singular positions last."""
     found = []
     for case, own in sorted(made.items(), key=lambda each: each[0] in singular()):
         at = [each[headline.GIVEN] for each in own[: len(RESOLVED)]]

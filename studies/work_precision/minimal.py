@@ -29,12 +29,12 @@ PENDULUMS = {"A01 pendulum", "projection pendulum", "double pendulum"}  # no loo
 
 
 def problems(quick: bool) -> dict[str, Problem]:
-    """Every mechanism that has minimal coordinates."""
+    """Make the mechanisms that have minimal coordinates."""
     return {name: problem for name, problem in mechanisms.problems(quick).items() if has_minimal(problem)}
 
 
 def runs(quick: bool, names: Sequence[str] = ()) -> list[Run]:
-    """All solvers on the mechanisms of these names, or on all."""
+    """List the runs of all solvers on the mechanisms of these names, or on all."""
     found, known = [], problems(quick)
     for name in names or known:
         case = replace(case_of(known[name]), name=name, time_limit=TIME_LIMIT, timed=mechanisms.TIMED)
@@ -47,14 +47,14 @@ def runs(quick: bool, names: Sequence[str] = ()) -> list[Run]:
 
 
 def collect(kept: KeptRows, quick: bool, names: Sequence[str] = ()) -> pd.DataFrame:
-    """Rows of all runs, the repetitions interleaved."""
+    """Make the rows of all runs, the repetitions interleaved."""
     return adaptive.collect(
         runs(quick, names), kept, mechanisms.row_at_end, lambda run: True, () if quick else mechanisms.RESOLVED
     )
 
 
 def findings_of(rows: pd.DataFrame, everywhere: pd.DataFrame) -> list[dict[str, Any]]:
-    """By kind of mechanism, the ODE in minimal coordinates beside the best of ours with constraints.
+    """Compare the ODE in minimal coordinates with the best of twoloop with constraints, by kind of mechanism.
 
     `rows` and `everywhere` (of `mechanisms`): medians.
     """

@@ -24,7 +24,7 @@ COLUMNS = ["processor", "commit", *PLACE, "ratio", "verdict"]
 
 
 def verdicts(rows: pd.DataFrame, stamp: str, known: Standings | None = None) -> pd.DataFrame:
-    """Who is ahead, in the columns of the file; `rows`: of all runs; `known`: how solvers stand by them, if it is."""
+    """Make the lines of the file from the rows of all runs; `known`: how solvers stand by them, if it is known."""
     commit = re.search(r"commit (\w+)", stamp)
     rows = rows[rows["group"] == GROUP]
     own = rows[rows["family"] == "two-loop"]  # which stand in every verdict; of others, some may be older
@@ -43,7 +43,7 @@ def verdicts(rows: pd.DataFrame, stamp: str, known: Standings | None = None) -> 
 
 
 def added(path: Path, made: pd.DataFrame) -> pd.DataFrame:
-    """What stands in the file for mechanisms on other processors, and what was made on this one."""
+    """Put new lines in the place of those of the same processors and mechanisms in the file."""
     before = pd.read_csv(path) if path.is_file() else made[:0]
     place = ["processor", "case"]
     again = before.set_index(place).index.isin(made.set_index(place).index)
@@ -51,14 +51,14 @@ def added(path: Path, made: pd.DataFrame) -> pd.DataFrame:
 
 
 def kept(output: Output, rows: pd.DataFrame, stamp: str, known: Standings) -> list[dict[str, Any]]:
-    """Keep the verdicts of these rows beside those of other processors; the findings of all."""
+    """Keep the verdicts of these rows beside those of other processors, and compare all."""
     table = added(output.file(FILE), verdicts(rows, stamp, known))
     output.write(FILE, table.to_csv(index=False))
     return findings_of(table)
 
 
 def findings_of(table: pd.DataFrame, who: str = headline.OWN_CODE) -> list[dict[str, Any]]:
-    """For each two processors: in how many pairs of mechanism and error that both have twoloop is faster, and slower.
+    """Count for each two processors the pairs of mechanism and error in which twoloop is faster, and slower.
 
     `who`: the default where it makes code. `turned`: pairs in which one processor has it faster, the other slower.
     """
@@ -78,7 +78,7 @@ def findings_of(table: pd.DataFrame, who: str = headline.OWN_CODE) -> list[dict[
 
 
 def rows_of(folder: Path) -> tuple[pd.DataFrame, str]:
-    """The rows of `work_precision` in a folder of reports, and their stamp. Raises StudyError if there are none."""
+    """Read the rows of `work_precision` in a folder of reports, and their stamp. Raises StudyError if there are none."""
     path = folder / "work_precision.csv"
     if not path.is_file():
         raise StudyError(f"there is no {path}; run python -m studies.work_precision on the other machine")

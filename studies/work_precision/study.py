@@ -47,7 +47,7 @@ MARKS = {"alone": "ours", "missed": "others", "none": "–"}  # cells of the pic
 
 
 def runs(case: Case, quick: bool) -> list[Run]:
-    """The runs of a case, at every other value of the grid: between them `adaptive` asks where that is of use."""
+    """List the runs of a case, at every other value of the grid: `adaptive` adds values between them where needed."""
     stiff = "stiff" in case.tags
     if quick:
         return runs_of(case, QUICK, quick)
@@ -72,30 +72,30 @@ def make(output: Output) -> pd.DataFrame:
 
 
 def calibrated(rows: pd.DataFrame) -> pd.DataFrame:
-    """Rows with the time of the calibration, which lays those of several processors side by side, as it is now."""
+    """Add the time that a fixed calculation takes now, by which times of several processors can be compared."""
     return rows.assign(calibration=CALIBRATION, calibration_s=calibration_s())
 
 
 def at_length(known: Sequence[Case], quick: bool, kept: KeptRows) -> pd.DataFrame:
-    """The rows of cases over their whole motion."""
+    """Make the rows of cases over their whole motion."""
     made = [run for case in known for run in runs(case, quick)]
     row = lambda run, repeat, built: row_of(run, repeat, None, built)  # noqa: E731
     return adaptive.collect(made, kept, row, lambda run: True, () if quick else ERRORS)
 
 
 def part(rows: pd.DataFrame, group: str) -> pd.DataFrame:
-    """The rows of one group, without columns that it has not."""
+    """Select the rows of one group, without columns that it has not."""
     return rows[rows["group"] == group].dropna(axis="columns", how="all").reset_index(drop=True)
 
 
 def with_one_name(rows: pd.DataFrame) -> pd.DataFrame:
-    """Rows whose processors are named without their family, where rows from before that was kept lack it."""
+    """Name processors without their family where older rows lack it."""
     bare = rows["processor"].str.partition(" (family ")[0]
     return rows.assign(processor=bare.where(bare.isin(rows["processor"]), rows["processor"]))
 
 
 def on_the_same_processor(rows: pd.DataFrame, others: pd.DataFrame) -> pd.DataFrame:
-    """The rows of mechanisms that were measured on the processor on which the others were."""
+    """Select the rows of mechanisms that were measured on the processor on which the others were."""
     if "processor" not in rows or "processor" not in others:
         return rows
     return rows[rows["processor"] == rows["case"].map(others.groupby("case")["processor"].first())]
@@ -122,13 +122,13 @@ def report(output: Output, rows: pd.DataFrame, line: str) -> dict[str, Any]:
 
 
 def versions_of(output: Output) -> dict[str, str]:
-    """The versions of the packages with which the rows were measured: of rows that are read again, those told then."""
+    """Tell the versions of the packages with which the rows were measured; if these are read again, as told then."""
     known = output.file("work_precision.json")
     return dict(output.load_findings()["versions"]) if output.call.redraw and known.is_file() else versions()
 
 
 def measured_on(rows: pd.DataFrame) -> dict[str, Any]:
-    """At how many commits, on which processors, and in how many sessions at most a mechanism was measured.
+    """Count the commits and processors of the rows, and the sessions in which a mechanism was measured, at most.
 
     `speeds`: the largest time of the calibration over the least between the sessions of a mechanism, at most.
     """
@@ -143,7 +143,7 @@ def measured_on(rows: pd.DataFrame) -> dict[str, Any]:
 
 
 def answer(found: dict[str, Any]) -> str:
-    """One sentence: which part of the default's time the fastest other solver takes."""
+    """Say in one sentence which part of the default's time the fastest other solver takes."""
     at = found["typical"]
     if not at:
         return "No error was reached by both sides."
@@ -154,14 +154,14 @@ def answer(found: dict[str, Any]) -> str:
 
 
 def favourable(found: dict[str, Any]) -> bool:
-    """Whether on the mechanism of the single calls the default does at least as well at each error as in the median."""
+    """Return whether the default does at least as well on the mechanism of the single calls as in the median."""
     cells = [each["ratio"] for each in found["cells"] if each["case"] == HEADLINE]
     at = [(cells[0][RESOLVED.index(line["error"])], line["median"]) for line in found["typical"]] if cells else []
     return bool(at) and all(ratio is not None and ratio >= median for ratio, median in at)
 
 
 def picture(rows: pd.DataFrame, found: dict[str, Any]) -> Figure:
-    """What a call takes over its error on the four-bar: the default, the fastest other solvers, and SUNDIALS'."""
+    """Draw what a call takes over its error on the four-bar: the default, and the fastest other solvers."""
     own, coded = rows[rows["case"] == HEADLINE], mechanisms.given_on(HEADLINE) == headline.OWN_CODE
     lines = figures.lines_of(own, RESOLVED[1::3], coded)
     at = {line["name"]: line["at"][-1]["call_s"] for line in found["calls"]["lines"]} if found["calls"] else {}
@@ -174,7 +174,7 @@ def picture(rows: pd.DataFrame, found: dict[str, Any]) -> Figure:
 
 
 def heat_map(found: dict[str, Any]) -> Figure:
-    """Mechanism by error: the time of the fastest other solver over that of the default."""
+    """Draw the time of the fastest other solver over that of the default, by mechanism and error."""
     cells, count = found["cells"], found["default"]
     names = [f"{each['case']}{' *' if each['singular'] else ''}" for each in cells]
     figure, axes = plt.subplots(figsize=(7.6, 0.3 * len(names) + 1.5), layout="constrained")
