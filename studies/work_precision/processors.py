@@ -78,7 +78,7 @@ def findings_of(table: pd.DataFrame, who: str = headline.OWN_CODE) -> list[dict[
 
 
 def rows_of(folder: Path) -> tuple[pd.DataFrame, str]:
-    """Read the rows of `work_precision` in a folder of reports, and their stamp. Raises StudyError if there are none."""
+    """Read the rows of `work_precision` in a folder, and their stamp. Raises StudyError if there are none."""
     path = folder / "work_precision.csv"
     if not path.is_file():
         raise StudyError(f"there is no {path}; run python -m studies.work_precision on the other machine")
