@@ -125,84 +125,42 @@ BODIES: list[Case] = [
     of_planar("a body of another model", lambda: planar().revolute("bar", planar().bodies[1], at=(0, 0))).says("'block' belongs to another", NAMES),
     of_planar("a number for a body", lambda: planar().revolute(0, "bar", at=(0, 0)), "a must be a body", NAMES, TypeError),
     of_planar("a joint of a body with itself", lambda: planar().revolute("bar", "bar", at=(0, 0))).says("a and b of a revolute joint must be two bodies; given 'bar' twice", "give two bodies"),
-    of_planar("a joint without a point", lambda: planar().revolute("bar", "block", at=None)).says(
-        "at must be an array of real numbers; given None", "give a point in space, or one of each body", TypeError
-    ),
+    of_planar("a joint without a point", lambda: planar().revolute("bar", "block", at=None)).says("at must be an array of real numbers; given None", "give a point in space, or one of each body", TypeError),
     of_planar("an axis of length zero", lambda: planar().prismatic("bar", "block", at=(0, 0), axis=(0, 0))).says("axis must have a direction", "give a vector other than zero"),
     of_planar("a point on another body", point_of_another).says("must be a point on 'bar'; given one on 'block'", "the first point is one of a, the second one of b"),
-    of_planar("a single point of a body")
-    .when(lambda: (model := planar()).revolute("bar", "block", at=model.bodies[0].point(0.0, 0.0)))
-    .says("at must be a point in space, or a pair of points", "give a point of each body", TypeError),
-    of_planar("the radius of a pin for friction on a guide", lambda: loaded(radius=0.1)).says(
-        "radius is that of the pin of a revolute joint whose friction has a coefficient; given radius=0.1", "leave it out; a pin needs one where its friction has a coefficient"
-    ),
-    of_planar("friction in proportion to a load that two joints share", lambda: loaded(twice=True)).says(
-        "depends on the load of its joint, which is not determined: the rows of", "make one of them a slot (a distance, or a point on a curve), or give the friction as a number"
-    ),
-    of_planar("friction so large that a joint may jam", lambda: loaded(coefficient=50.0)).says(
-        "cannot be computed at the start: the coefficients are so large that a joint may jam", "give a smaller coefficient: self-locking has no smooth law"
-    ),
+    of_planar("a single point of a body").when(lambda: (model := planar()).revolute("bar", "block", at=model.bodies[0].point(0.0, 0.0))).says("at must be a point in space, or a pair of points", "give a point of each body", TypeError),
+    of_planar("the radius of a pin for friction on a guide", lambda: loaded(radius=0.1)).says("radius is that of the pin of a revolute joint whose friction has a coefficient; given radius=0.1", "leave it out; a pin needs one where its friction has a coefficient"),
+    of_planar("friction in proportion to a load that two joints share", lambda: loaded(twice=True)).says("depends on the load of its joint, which is not determined: the rows of", "make one of them a slot (a distance, or a point on a curve), or give the friction as a number"),
+    of_planar("friction so large that a joint may jam", lambda: loaded(coefficient=50.0)).says("cannot be computed at the start: the coefficients are so large that a joint may jam", "give a smaller coefficient: self-locking has no smooth law"),
     of_planar("a distance of points that coincide", lambda: planar().distance("bar", (1, 0), "block", (1, 0))).says("coincide in the position given", "give a length, or take a revolute joint"),
-    of_planar("a negative stiffness", lambda: planar().spring("bar", (0, 0), "block", (1, 0), stiffness=-1.0)).says(
-        "stiffness must not be negative; given -1.0", "give N/m; for a force that pushes away, force(...)"
-    ),
-    of_planar("a spring with neither a stiffness nor a function", lambda: planar().spring("bar", (0, 0), "block", (1, 0))).says(
-        "give either stiffness, with damping and what is unstressed, or a function", "give N/m, or force=f with f(length, rate)", TypeError
-    ),
-    of_planar("a spring as a function of t, q and v")
-    .when(lambda: planar().spring("bar", (0, 0), "block", (1, 0), force=lambda t, q, v: 1.0))
-    .says(r"is called as \(length, rate\)", "take length and rate, or use force(...)", TypeError),
-    of_planar("a damper without a length")
-    .when(lambda: planar().spring("bar", (0, 0), "block", (1, 0), stiffness=1.0, damping=1.0, length=0.0))
-    .says("has no direction where its points meet", "give a length, or the damper as a force"),
+    of_planar("a negative stiffness", lambda: planar().spring("bar", (0, 0), "block", (1, 0), stiffness=-1.0)).says("stiffness must not be negative; given -1.0", "give N/m; for a force that pushes away, force(...)"),
+    of_planar("a spring with neither a stiffness nor a function", lambda: planar().spring("bar", (0, 0), "block", (1, 0))).says("give either stiffness, with damping and what is unstressed, or a function", "give N/m, or force=f with f(length, rate)", TypeError),
+    of_planar("a spring as a function of t, q and v").when(lambda: planar().spring("bar", (0, 0), "block", (1, 0), force=lambda t, q, v: 1.0)).says(r"is called as \(length, rate\)", "take length and rate, or use force(...)", TypeError),
+    of_planar("a damper without a length").when(lambda: planar().spring("bar", (0, 0), "block", (1, 0), stiffness=1.0, damping=1.0, length=0.0)).says("has no direction where its points meet", "give a length, or the damper as a force"),
     of_planar("a force on the ground", lambda: planar().force("ground", (0, 0), (1.0, 0.0))).says("body must be a body that moves; given the ground", "leave it out, or let it act on a body"),
     of_planar("a force of three components", lambda: planar().force("bar", (0, 0), (1, 0, 0))).says("f of 'force on bar' must be 2 finite numbers", "give x and y"),
-    of_planar("a force of t and q", lambda: planar().force("bar", (0, 0), lambda t, q: (1.0, 0.0))).says(
-        r"is called as \(t\) or \(t, q, v\); the function given takes 2 arguments", "take t, q and v", TypeError
-    ),
-    of_planar("a function that returns another shape")
-    .when(lambda: (m := planar(), m.force("bar", (0, 0), lambda t: 1.0), m.problem()))
-    .says("must return shape", "return one number for each component"),
+    of_planar("a force of t and q", lambda: planar().force("bar", (0, 0), lambda t, q: (1.0, 0.0))).says(r"is called as \(t\) or \(t, q, v\); the function given takes 2 arguments", "take t, q and v", TypeError),
+    of_planar("a function that returns another shape").when(lambda: (m := planar(), m.force("bar", (0, 0), lambda t: 1.0), m.problem())).says("must return shape", "return one number for each component"),
     of_planar("an unknown joint", lambda: planar().motor("pins", 1.0)).says("joint must be one of this model, 'pin'", "give its name"),
     of_planar("a joint of another model", lambda: planar().motor(planar().joints[0], 1.0)).says("'pin' belongs to another", "give a joint of the same model"),
-    of_planar("a motor in a distance")
-    .when(lambda: (m := planar()).motor(m.distance("bar", (0, 0), "block", (1, 0)), 1.0))
-    .says("motor needs a revolute or prismatic joint; given 'distance bar-block', which is distance", "let a force or a spring act between the points"),
+    of_planar("a motor in a distance").when(lambda: (m := planar()).motor(m.distance("bar", (0, 0), "block", (1, 0)), 1.0)).says("motor needs a revolute or prismatic joint; given 'distance bar-block', which is distance", "let a force or a spring act between the points"),
     of_planar("limits the wrong way round", lambda: planar().limit("pin", lower=1.0, upper=0.5)).says("lower of the limit of 'pin' must be below upper; given 1.0, 0.5", "exchange them"),
-    of_planar("a force that is NaN")
-    .when(lambda: (m := planar(), m.force("bar", (0, 0), lambda t: (np.nan, 0.0)), m.problem()))
-    .says(r"f of 'force on bar' must be finite at the start; at t = 0 it gives array\(\[nan", "find out where the NaN comes from"),
-    of_planar("a force that has no value at rest")
-    .when(lambda: (m := planar(), m.torque("bar", lambda t, q, v: -v[2] / abs(v[2])), m.problem()))
-    .says("f of 'torque on bar' must be finite at the start; .* divisions by zero", "friction(...) is a smooth law; or give velocities"),
-    of_planar("a force of coordinates that the model does not have")
-    .when(lambda: (m := planar(), m.force("bar", (0, 0), lambda t, q, v: (q[17], 0.0)), m.problem()))
-    .says("index 17 is out of bounds", "`body.coordinates` are those of a body", IndexError),
-    of_planar("a spring whose points coincide")
-    .when(lambda: (m := planar(), m.spring("bar", (0, 0), "ground", (0, 0), stiffness=1.0, length=0.1), m.problem()))
-    .says("the points of the spring 'spring bar-ground' coincide at the start", "move a point, or give `length=0`"),
+    of_planar("a force that is NaN").when(lambda: (m := planar(), m.force("bar", (0, 0), lambda t: (np.nan, 0.0)), m.problem())).says(r"f of 'force on bar' must be finite at the start; at t = 0 it gives array\(\[nan", "find out where the NaN comes from"),
+    of_planar("a force that has no value at rest").when(lambda: (m := planar(), m.torque("bar", lambda t, q, v: -v[2] / abs(v[2])), m.problem())).says("f of 'torque on bar' must be finite at the start; .* divisions by zero", "friction(...) is a smooth law; or give velocities"),
+    of_planar("a force of coordinates that the model does not have").when(lambda: (m := planar(), m.force("bar", (0, 0), lambda t, q, v: (q[17], 0.0)), m.problem())).says("index 17 is out of bounds", "`body.coordinates` are those of a body", IndexError),
+    of_planar("a spring whose points coincide").when(lambda: (m := planar(), m.spring("bar", (0, 0), "ground", (0, 0), stiffness=1.0, length=0.1), m.problem())).says("the points of the spring 'spring bar-ground' coincide at the start", "move a point, or give `length=0`"),
     of_planar("a negative damping", lambda: planar().torsion_spring("pin", stiffness=1.0, damping=-0.1)).says("damping must not be negative; given -0.1", "for a driving torque use motor(...)"),
-    of_planar("a drive of a drive", lambda: (m := planar()).drive(m.drive("pin", lambda t: t), lambda t: t)).says(
-        "drive needs a revolute or prismatic joint; given 'drive of pin', which is drive", "drive the joint once"
-    ),
-    of_planar("a drive that is not finite")
-    .when(lambda: (m := planar(), m.drive("pin", lambda t: np.sqrt(t)), m.problem()))
-    .says("motion of 'drive of pin' must be finite at the start", "its rate is infinite there: give a motion that begins smoothly"),
+    of_planar("a drive of a drive", lambda: (m := planar()).drive(m.drive("pin", lambda t: t), lambda t: t)).says("drive needs a revolute or prismatic joint; given 'drive of pin', which is drive", "drive the joint once"),
+    of_planar("a drive that is not finite").when(lambda: (m := planar(), m.drive("pin", lambda t: np.sqrt(t)), m.problem())).says("motion of 'drive of pin' must be finite at the start", "its rate is infinite there: give a motion that begins smoothly"),
     of_planar("a number for a motion", drive(1.0), "must be a function of t", "give lambda t: ...", TypeError),
-    of_planar("a motion that branches", drive(lambda t: 0.0 if t < 1.0 else t)).says(
-        "cannot be differentiated exactly.*give rate= and acceleration=", "give its derivatives, or write it without branches"
-    ),
+    of_planar("a motion that branches", drive(lambda t: 0.0 if t < 1.0 else t)).says("cannot be differentiated exactly.*give rate= and acceleration=", "give its derivatives, or write it without branches"),
     of_planar("`rate` without `acceleration`", drive(lambda t: t, rate=lambda t: 1.0)).says("rate and acceleration .* go together", "give both, or none", TypeError),
     of_spatial("an inertia that is not positive", solid(inertia=(1.0, 1.0, 0.0))).says("inertia of 'arm' must be symmetric and positive definite", "give a thin rod a small moment about its axis"),
     of_spatial("an inertia of two numbers", solid(inertia=(1.0, 1.0)), "must be three finite moments", "give J or its diagonal"),
     of_spatial("a rotation that is none", solid(rotation=np.ones((3, 3)))).says(r"rotation of 'arm' must be a rotation matrix \(3, 3\)", "columns are the axes of the body, right-handed"),
     of_spatial("a rotation of NaN", solid(rotation=np.full((3, 3), np.nan))).says(r"rotation of 'arm' must be a rotation matrix \(3, 3\)", "find out where the NaN comes from"),
-    of_spatial("a wheel that lies flat", lambda: spatial().rolling("bar", radius=0.5, axis=(0, 0, 1))).says(
-        "axis of 'rolling bar' must not be across the plane", "the axis is that about which the wheel is round"
-    ),
-    of_spatial("axes of a universal joint that are not perpendicular")
-    .when(lambda: spatial().universal("ground", "bar", at=(0, 0, 0), axes=((1, 0, 0), (1, 1, 0))))
-    .says("axes of 'universal bar-ground' must be perpendicular", "give the two axes of the cross"),
+    of_spatial("a wheel that lies flat", lambda: spatial().rolling("bar", radius=0.5, axis=(0, 0, 1))).says("axis of 'rolling bar' must not be across the plane", "the axis is that about which the wheel is round"),
+    of_spatial("axes of a universal joint that are not perpendicular").when(lambda: spatial().universal("ground", "bar", at=(0, 0, 0), axes=((1, 0, 0), (1, 1, 0)))).says("axes of 'universal bar-ground' must be perpendicular", "give the two axes of the cross"),
     of_spatial("`to_mjcf(3)`", lambda: spatial().to_mjcf(3)).says("path must be a file name or a path; given 3", "give the name of a file", TypeError),
     of_files("`from_mjcf(3)`", lambda: from_mjcf(3)).says("path must be a file name or a path; given 3", "give the name of a file", TypeError),
     of_files("`from_urdf(None)`", lambda: from_urdf(None)).says("path must be a file name or a path; given None", "give the name of a file", TypeError),
@@ -212,19 +170,11 @@ BODIES: list[Case] = [
     of_problem("a velocity across a skate", sideways).says("do not allow the velocities given: the rate of y of sledge is given as 1", "give one along the blade"),
     of_problem("two drives that contradict", two_drives, "the motion is over-constrained", "leave one of them out"),
     of_problem("a drive that begins far away", half_a_turn).says("assembled half a turn from it", "give the bodies near to where the motion begins"),
-    of_problem("`energy` of rows", lambda: rough(1.9).energy(0.0, np.zeros((9, 6)), np.zeros((9, 6)))).says(
-        r"q must have shape \(6,\) or \(6, n_t\); given shape \(9, 6\)", "give states as columns: q.T"
-    ),
+    of_problem("`energy` of rows", lambda: rough(1.9).energy(0.0, np.zeros((9, 6)), np.zeros((9, 6)))).says(r"q must have shape \(6,\) or \(6, n_t\); given shape \(9, 6\)", "give states as columns: q.T"),
     of_problem("an unknown parameter", lambda: rough(1.9).with_parameters({"mass of three": 1.0})).says("'arms' has no parameter 'mass of three'", "take a name from problem.parameters"),
     of_problem("a mass that becomes negative", lambda: rough(1.9).with_parameters({"mass of two": -1.0})).says("mass of two must be positive", "give a positive mass"),
-    of_problem("a damping that becomes negative", lambda: (m := planar(), m.torsion_spring("pin", stiffness=1.0, name="s"))[0].problem().with_parameters({"damping of s": -1.0})).says(
-        r"damping of s \(N m s/rad\) must not be negative; given -1.0", "give zero or more"
-    ),
-    of_problem("a distance that becomes zero", lambda: (m := planar(), m.distance("bar", (1, 0), "block", (2, 0), name="d"))[0].problem().with_parameters({"length of d": 0.0})).says(
-        r"length of d \(m\) must be positive", "take a revolute joint for points that coincide"
-    ),
+    of_problem("a damping that becomes negative", lambda: (m := planar(), m.torsion_spring("pin", stiffness=1.0, name="s"))[0].problem().with_parameters({"damping of s": -1.0})).says(r"damping of s \(N m s/rad\) must not be negative; given -1.0", "give zero or more"),
+    of_problem("a distance that becomes zero", lambda: (m := planar(), m.distance("bar", (1, 0), "block", (2, 0), name="d"))[0].problem().with_parameters({"length of d": 0.0})).says(r"length of d \(m\) must be positive", "take a revolute joint for points that coincide"),
     of_problem("a length that no longer fits", lambda: rough(1.9).with_parameters({"x of end on ground": 2.5})).says("cannot be assembled", "change other lengths with it"),
-    of_problem("another axis of a slide with a limit or a rack", lambda: limited().with_parameters({"angle of slide on ground": 0.1})).says(
-        r"angle of slide on ground \(rad\) cannot change", "make the model anew"
-    ),
+    of_problem("another axis of a slide with a limit or a rack", lambda: limited().with_parameters({"angle of slide on ground": 0.1})).says(r"angle of slide on ground \(rad\) cannot change", "make the model anew"),
 ]

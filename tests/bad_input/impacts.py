@@ -81,9 +81,7 @@ IMPACTS = [
     of_stops("no stops", against(), "stops must be a Stop or a list of them", "give at least one, or use `solve_dae`", TypeError),
     of_stops("a function in place of a stop", against(lambda t, q: q[0]), "stops must be a Stop", "write Stop(gap)", TypeError),
     of_stops("a start beyond a stop", against(Stop(lambda t, q: q[8] - 9.0, name="wall"))).says("gaps must not be negative at q0; that of 'wall' is", "change the sign of the gap, or start elsewhere"),
-    of_stops("a gap that branches", against(Stop(lambda t, q: q[8] if q[0] > 0.0 else 1.0))).says(
-        "gap of 'stop' must be a number computed from t and q by numpy functions", "give one stop for each branch"
-    ),
+    of_stops("a gap that branches", against(Stop(lambda t, q: q[8] if q[0] > 0.0 else 1.0))).says("gap of 'stop' must be a number computed from t and q by numpy functions", "give one stop for each branch"),
     of_stops("`restitution=1.1`", lambda: Stop(lambda t, q: q[0], 1.1), "restitution of 'stop' must be from 0 to 1", "give a number from 0 to 1"),
     of_stops("`events=`", against(Stop(lambda t, q: 9.0 - q[8]), events=[]), "no option 'events'", "leave it out", TypeError),
     of_step("a step before a start", lambda: Integrator(LINKAGE.system).step(1e-3)).says("step goes on from a start", "call `start(t0, q0, v0)` first"),
@@ -95,28 +93,18 @@ IMPACTS = [
     of_step("`method='Taylor'`", lambda: Integrator(LINKAGE.system, "Taylor").start(0.0, LINKAGE.q0, LINKAGE.v0)).says("must not be 'Taylor'", "take the default"),
     of_step("`compiled=True`").when(lambda: Integrator(LINKAGE.system, compiled=True).start(0.0, LINKAGE.q0, LINKAGE.v0)).says("start takes no compiled", "leave it out"),
     of_spatial("friction of a stop in space", rubs_in_space).says("must be zero, as stops rub in the plane only", "leave it out, or make the model in a plane"),
-    of_stops("friction without a slide", lambda: Stop(lambda t, q: q[0], friction=0.3)).says(
-        "slide of 'stop' must be a function of t and q, as it rubs", "give slide(t, q), the position of the point along the surface", TypeError
-    ),
+    of_stops("friction without a slide", lambda: Stop(lambda t, q: q[0], friction=0.3)).says("slide of 'stop' must be a function of t and q, as it rubs", "give slide(t, q), the position of the point along the surface", TypeError),
     of_model("a gear of one hinge", wheels(lambda model: model.gear("pin 0", "pin 0", ratio=1.0))).says("a gear needs two joints", "name both joints"),
     of_model("`ratio=0`", wheels(lambda model: model.gear("pin 0", "pin 1", ratio=0.0))).says("ratio must not be zero", "hold the hinge by fixed(...) or a drive"),
     of_spatial("a gear in space whose ratio is none of teeth", geared(np.pi)).says("must be a ratio of whole numbers up to 1000, such as -17 / 43", "give the numbers of teeth"),
     of_model("a rack of two hinges", wheels(lambda model: model.rack("pin 0", "pin 1", radius=0.1))).says("needs a prismatic joint", "give a hinge and a slide"),
     of_model("a wheel of negative radius").when(wheels(lambda model: model.rolling("ground", "wheel 0", radius=-1.0, axis=(1, 0)))).says("radius must be positive", "turn the axis instead"),
-    of_model("a curve that branches")
-    .when(wheels(lambda model: model.point_on_curve("ground", "wheel 0", at=(0, 0), curve=branching)))
-    .says("must be made of numpy's functions, without branches", "write one formula without branches"),
+    of_model("a curve that branches").when(wheels(lambda model: model.point_on_curve("ground", "wheel 0", at=(0, 0), curve=branching))).says("must be made of numpy's functions, without branches", "write one formula without branches"),
     of_model("a limit without a number", wheels(lambda model: model.limit("pin 0"))).says("needs lower, upper, or both", "give lower, upper, or both"),
     of_friction("a model without dry friction", lambda: solve_with_friction(rubbed())).says("'linkage' has no dry friction: add some with model.dry_friction", "add dry friction, or use `solve_dae`"),
-    of_friction("a system in place of a problem", lambda: solve_with_friction(rubbed("A").system)).says(
-        "problem must be a model's problem, as returned", "give what `model.problem()` returned", TypeError
-    ),
+    of_friction("a system in place of a problem", lambda: solve_with_friction(rubbed("A").system)).says("problem must be a model's problem, as returned", "give what `model.problem()` returned", TypeError),
     of_friction("`events=`", lambda: solve_with_friction(rubbed("A"), events=[])).says("solve_with_friction has no option 'events'", "leave it out", TypeError),
     of_friction("`static` below `f`", lambda: rubbed("A", static=0.5)).says("static must be at least f = 1; given 0.5", "leave it out, or give more"),
-    of_friction("friction in two joints of a linkage with one degree of freedom")
-    .when(lambda: solve_with_friction(rubbed("A", "B")))
-    .says("'dry friction of B' cannot slide by itself.* or its motion depends on 'dry friction of A'", "give one joint all of it"),
-    of_friction("friction in a joint that is driven")
-    .when(lambda: solve_with_friction(rubbed("A", drive=lambda t: 0.3 * t)))
-    .says("'dry friction of A' cannot slide by itself: drives or other joints hold it", "add it to the torque of the drive"),
+    of_friction("friction in two joints of a linkage with one degree of freedom").when(lambda: solve_with_friction(rubbed("A", "B"))).says("'dry friction of B' cannot slide by itself.* or its motion depends on 'dry friction of A'", "give one joint all of it"),
+    of_friction("friction in a joint that is driven").when(lambda: solve_with_friction(rubbed("A", drive=lambda t: 0.3 * t))).says("'dry friction of A' cannot slide by itself: drives or other joints hold it", "add it to the torque of the drive"),
 ]

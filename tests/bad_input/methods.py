@@ -47,14 +47,10 @@ METHODS = [
     *of_option("inner_tol", *FEW_POSITIVES),
     *of_option("outer_tol", *FEW_POSITIVES, INFINITE, (np.nan, ValueError, "must be positive", POSITIVE)),
     *(
-        of_runge_kutta(f"`outer='{outer}', variables='momenta'`")
-        .when(lambda outer=outer: runge_kutta(outer=outer, variables="momenta"))
-        .says(f"outer='{outer}' {words}", "take outer='fixed-point' for momenta")
+        of_runge_kutta(f"`outer='{outer}', variables='momenta'`").when(lambda outer=outer: runge_kutta(outer=outer, variables="momenta")).says(f"outer='{outer}' {words}", "take outer='fixed-point' for momenta")
         for outer, words in (("newton", "goes with variables='velocities' only"), ("auto", "goes with variables='velocities' only"), ("paper", ".*'momenta'"))
     ),
-    of_runge_kutta("`outer='paper', partition='symmetric'`")
-    .when(lambda: runge_kutta(outer="paper", partition="symmetric"))
-    .says("outer='paper' is the paper's procedure", "take outer='fixed-point' for symmetric partitions"),
+    of_runge_kutta("`outer='paper', partition='symmetric'`").when(lambda: runge_kutta(outer="paper", partition="symmetric")).says("outer='paper' is the paper's procedure", "take outer='fixed-point' for symmetric partitions"),
     *of_newmark(
         "beta",
         (2.0, ValueError, "must be between 0 and 1; given 2.0", UNIT),
@@ -79,23 +75,11 @@ METHODS = [
     *argument("BDF", BDF, "outer_tol", *FEW_POSITIVES[:2]),
     *argument("BDF", BDF, "inner_tol", *FEW_POSITIVES[:1]),
     *argument("BDF", BDF, "outer", ("paper", ValueError, "must be 'fixed-point' or 'newton'", "take one of the values named")),
-    *argument(
-        "Taylor",
-        Taylor,
-        "order",
-        (3, ValueError, "must be", "give an int from 4 to 40"),
-        (41, ValueError, "must be", "give an int from 4 to 40"),
-        (8.5, TypeError, "must be", "give an int from 4 to 40"),
-        ("high", TypeError, "must be", "give an int from 4 to 40"),
-    ),
+    *argument("Taylor", Taylor, "order", (3, ValueError, "must be", "give an int from 4 to 40"), (41, ValueError, "must be", "give an int from 4 to 40"), (8.5, TypeError, "must be", "give an int from 4 to 40"), ("high", TypeError, "must be", "give an int from 4 to 40")),
     *argument("DOP853", DOP853, "inner_tol", *FEW_POSITIVES),
     *argument("paper_irk", paper_irk, "inner_tol", *FEW_POSITIVES[:2]),
     *argument("paper_newmark", paper_newmark, "beta", (2.0, ValueError, "must be between 0 and 1", UNIT)),
-    *(
-        case
-        for family in (gauss, radau_iia, sun_radau_iib, lobatto_iiie)
-        for case in argument(family.__name__, family, "s", (0, ValueError, "must be at least [12]", STAGES), (2.0, TypeError, "must be an int", STAGES))
-    ),
+    *(case for family in (gauss, radau_iia, sun_radau_iib, lobatto_iiie) for case in argument(family.__name__, family, "s", (0, ValueError, "must be at least [12]", STAGES), (2.0, TypeError, "must be an int", STAGES))),
     *argument("lobatto_iiie", lobatto_iiie, "s", (1, ValueError, "must be at least 2", STAGES)),
     *argument("gauss", gauss, "s", (True, TypeError, "must be an int", STAGES), ("3", TypeError, "must be", STAGES)),
     *argument("gauss", gauss, "s", (HUGE, ValueError, "must be at most 100", "give a moderate number")),
@@ -108,14 +92,7 @@ METHODS = [
         ([["1/2"]], TypeError, "must be an array of real numbers", "give numbers"),
         ([[True]], TypeError, "must be an array of real numbers", "give numbers"),
     ),
-    *of_tableau(
-        "b",
-        ([], ValueError, "must be a vector with one weight for each stage", "give s weights"),
-        ([0.9], ValueError, "must sum to 1; the sum of .* is 0.9", "give weights that sum to 1"),
-        ([np.inf], ValueError, "must be finite", "give finite coefficients"),
-    ),
-    *of_tableau(
-        "c", ([0.5, 1.0], ValueError, r"must have shape \(1,\)", "give s nodes"), ([0.25], ValueError, r"must be the row sums of A.*row 0 of A sums to 0.5, and c\[0\] is 0.25", "give A @ ones")
-    ),
+    *of_tableau("b", ([], ValueError, "must be a vector with one weight for each stage", "give s weights"), ([0.9], ValueError, "must sum to 1; the sum of .* is 0.9", "give weights that sum to 1"), ([np.inf], ValueError, "must be finite", "give finite coefficients")),
+    *of_tableau("c", ([0.5, 1.0], ValueError, r"must have shape \(1,\)", "give s nodes"), ([0.25], ValueError, r"must be the row sums of A.*row 0 of A sums to 0.5, and c\[0\] is 0.25", "give A @ ones")),
     *of_tableau("order", (0, ValueError, "must be at least 1; given 0", "give the classical order"), (2.5, TypeError, "must be an int; given 2.5", "give the classical order")),
 ]

@@ -38,9 +38,7 @@ RESULTS = [
     of_result("`plot('swing.avi')`", lambda: solve().plot("swing.avi"), r"path must end in .*\.png", "take one of the endings named"),
     of_result("`animate(None)`", lambda: solve().animate(None), "path must be a file name", "give a file name", TypeError),
     of_certify("a result of another solver, or of an older file").when(lambda: replace(solve(), rtol=None, atol=None).certify()).says("certify needs tolerances", "give `rtol` and `atol`"),
-    of_certify("a result without its system", lambda: replace(solve(), system=None).certify()).says(
-        "certify needs the system", "`load(path, system)`, or `dataclasses.replace(result, system=system)`"
-    ),
+    of_certify("a result without its system", lambda: replace(solve(), system=None).certify()).says("certify needs the system", "`load(path, system)`, or `dataclasses.replace(result, system=system)`"),
     of_certify("`t_eval` of one time", lambda: solve(t_eval=[0.05]).certify()).says("certify needs a result with two times or more", "store more: `dense_output=True`, or a longer `t_eval`"),
     Case("citation", "another object", lambda: citation(linkage()), "citation needs a result", "give it a result", TypeError),
     of_problem("`name=3`", lambda: remade(name=3), "name must be a string; given 3", "give text", TypeError),
@@ -55,9 +53,7 @@ RESULTS = [
     of_problem("bars as `drawing`", lambda: remade(drawing=[(0, 1)])).says("drawing must be a twoloop.Drawing", "write twoloop.Drawing(points, bars)", TypeError),
     of_problem("two coordinates of one name", lambda: problem(coordinates=("x (m)", "x (m)"))).says("coordinates must be n_q = 2 different names", "name each coordinate"),
     of_problem("a bar to a point that is not there", lambda: problem(drawing=Drawing(bob, [(0, 1)]))).says("must name points from 0 to 0; they name 1", "count the points from 0"),
-    of_problem("points of the wrong shape", lambda: problem(drawing=Drawing(np.sum, [(0, 1)]))).says(
-        r"points of a drawing must give an array of shape \(n_points, 2 or 3\)", "give a row for each point"
-    ),
+    of_problem("points of the wrong shape", lambda: problem(drawing=Drawing(np.sum, [(0, 1)]))).says(r"points of a drawing must give an array of shape \(n_points, 2 or 3\)", "give a row for each point"),
     of_problem("`bars=[0, 1]`", lambda: Drawing(bob, [0, 1]), "bars must be pairs", "write `bars=[(0, 1)]`", TypeError),
     of_sweep("a mapping of lists", lambda: swept(parameters={"theta3": [0.1, 0.2]})).says("parameters must be a list of mappings, one for each run", "make a mapping for each run", TypeError),
     of_sweep("a tuple as a parameter", lambda: swept(parameters=[{"lengths": (1.0, 2.0, 1.5)}])).says("must be a number, a string, True or False", ONE_BY_ONE, TypeError),

@@ -26,9 +26,7 @@ MULTIPLES = "give numbers of steps such as (100, 200, 400)"
 NAMES = "give 'smoke', 'all', or names of `problems()`"
 SIMULATORS = [
     of_check("the path of a file", lambda: check("solver.py")).says("simulate must be a function of .*given 'solver.py' of type str", "import the function", TypeError),
-    of_check("a simulator of the problem alone", lambda: check(lambda problem: None)).says(
-        r"simulate is called as simulate\(problem, times, tolerance\); the function given takes \(problem\)", "take the three arguments", TypeError
-    ),
+    of_check("a simulator of the problem alone", lambda: check(lambda problem: None)).says(r"simulate is called as simulate\(problem, times, tolerance\); the function given takes \(problem\)", "take the three arguments", TypeError),
     of_check("a problem that is not there", lambda: check(problems="five_bar"), "problems must be.*'five_bar'", NAMES),
     of_check("a number among the problems", lambda: check(problems=["pendulum", 3]), "problems must be.*given 3", NAMES),
     of_check("a number of problems", lambda: check(problems=3), "problems must be a list; given 3", NAMES, TypeError),

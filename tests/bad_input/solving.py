@@ -60,9 +60,7 @@ SOLVE = [
         ([0.5, case.HUGE], ValueError, "must hold numbers that fit into a float", "keep within t_span"),
         ([0.5, 1.0 - 1e-16], ValueError, "must not come within rounding.*given 0.99999", "give the end itself"),
     ),
-    of_solve("`t_eval=[0.2, 0.25]` with `step_size=0.1`", lambda: case.solve(t_eval=[0.2, 0.25], step_size=0.1)).says(
-        r"t_eval must hold multiples of step_size = 0.1.*0.25", "give times on the fixed grid, or leave step_size out"
-    ),
+    of_solve("`t_eval=[0.2, 0.25]` with `step_size=0.1`", lambda: case.solve(t_eval=[0.2, 0.25], step_size=0.1)).says(r"t_eval must hold multiples of step_size = 0.1.*0.25", "give times on the fixed grid, or leave step_size out"),
     *of_argument("rtol", *case.POSITIVES, case.INFINITE, case.LIST, case.NONE),
     *of_argument("atol", *case.POSITIVES, case.INFINITE, case.SHORT_ATOL),
     *of_argument(
@@ -88,28 +86,15 @@ SOLVE = [
         ("many", TypeError, "must be an int; given 'many'", "give an int"),
         (case.HUGE, ValueError, "must fit into 64 bits", "leave it out for no limit"),
     ),
-    *of_argument(
-        "method",
-        ("RK45", ValueError, "must be one of auto.*given 'RK45'", "take one of the names listed"),
-        (None, TypeError, "must be a name .*given None", "leave it out for the default"),
-        (5, TypeError, "must be a name .*given 5", "take a name or a method object"),
-    ),
+    *of_argument("method", ("RK45", ValueError, "must be one of auto.*given 'RK45'", "take one of the names listed"), (None, TypeError, "must be a name .*given None", "leave it out for the default"), (5, TypeError, "must be a name .*given 5", "take a name or a method object")),
     of_solve("`method=Newmark`, the class", lambda: case.solve(method=Newmark)).says("method must be a name .*or an object", "write Newmark()", TypeError),
     of_solve("`method=gauss(2)`, a tableau", lambda: case.solve(method=gauss(2))).says("method must be a name .*or an object", "write RungeKutta(gauss(2))", TypeError),
-    *of_argument(
-        "compiled",
-        ("yes", ValueError, "must be True, False or 'auto'; given 'yes'", "take one of the values named"),
-        (1, TypeError, "must be True, False or 'auto'; given 1", "take one of the values named"),
-    ),
+    *of_argument("compiled", ("yes", ValueError, "must be True, False or 'auto'; given 'yes'", "take one of the values named"), (1, TypeError, "must be True, False or 'auto'; given 1", "take one of the values named")),
     *(
-        of_solve(f"`compiled=True` with `method='{method}'`")
-        .when(lambda method=method: case.solve(method=method, compiled=True))
-        .says(f"compiled=True goes with 'auto', .*given method {name}", "leave it out, or take a method that is named")
+        of_solve(f"`compiled=True` with `method='{method}'`").when(lambda method=method: case.solve(method=method, compiled=True)).says(f"compiled=True goes with 'auto', .*given method {name}", "leave it out, or take a method that is named")
         for method, name in (("RadauIIA5", "Radau IIA"), ("Gauss4", "Gauss"), ("PaperIRK", "Sun"), ("BDF", "BDF"))
     ),
-    of_solve("`compiled=True` with `step_size` and the default method")
-    .when(lambda: case.solve(step_size=0.1, compiled=True))
-    .says("compiled=True goes with .*given method auto with step_size", "name a method, or leave one of the two out"),
+    of_solve("`compiled=True` with `step_size` and the default method").when(lambda: case.solve(step_size=0.1, compiled=True)).says("compiled=True goes with .*given method auto with step_size", "name a method, or leave one of the two out"),
     of_solve(
         "`compiled=True` where a callback branches on q",
         lambda: case.solve(pendulum(force=lambda t, q, v: np.array([0.0, -9.81 if q[0] > 0.0 else -1.0])), compiled=True),
@@ -118,10 +103,7 @@ SOLVE = [
     ),
     of_solve("a force in Python that draws random numbers, or keeps what it did before")
     .when(lambda: case.solve(pendulum(force=latch())))
-    .says(
-        "force of 'pendulum' gives something else when it is called again with the same t, q and v",
-        "let it depend on its arguments alone; a controller that samples sets inputs of `Integrator.step`; steps of a constant size (`step_size`) are not checked",
-    ),
+    .says("force of 'pendulum' gives something else when it is called again with the same t, q and v", "let it depend on its arguments alone; a controller that samples sets inputs of `Integrator.step`; steps of a constant size (`step_size`) are not checked"),
     of_solve("a `Problem` as `system`", lambda: case.solve(case.linkage())).says(r"system must be a ConstrainedSystem.*problem\.system", "give problem.system", TypeError),
     *case.argument(
         "solve_dae",
@@ -139,8 +121,6 @@ SOLVE = [
         (".", ValueError, "must be a folder that does not exist yet; given '.', which exists", "take another name"),
         ("no/run", ValueError, "must be inside an existing folder; given 'no.run'", "make the folder above it"),
     ),
-    of_solve("`Newmark(beta=1/6)` without `step_size`", lambda: case.solve(method=Newmark(beta=1.0 / 6.0))).says(
-        "Newmark with beta = 0.166667.*has no error estimate", "give step_size, or take beta=1/4"
-    ),
+    of_solve("`Newmark(beta=1/6)` without `step_size`", lambda: case.solve(method=Newmark(beta=1.0 / 6.0))).says("Newmark with beta = 0.166667.*has no error estimate", "give step_size, or take beta=1/4"),
     of_solve("`Newmark(gamma=0.6)` without `step_size`", lambda: case.solve(method=Newmark(gamma=0.6))).says("gamma = 0.6 has no error estimate", "give step_size, or take gamma=1/2"),
 ]

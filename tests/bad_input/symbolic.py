@@ -42,12 +42,7 @@ of_mechanism = cases_of("symbolic.SymbolicMechanism")
 SYMBOLIC = [
     case("V=m * g * h * y", "V depends on h, which is neither a coordinate nor one of the parameters", "give its value in parameters", V=m * g * sp.Symbol("h") * y),
     case("V=Symbol('m', positive=True) * g * y", "V depends on m.*other assumptions", "make each symbol once", V=sp.Symbol("m", positive=True) * g * y),
-    case(
-        "T=..., a function z(t) that is no coordinate",
-        r"T depends on z\(t\), which is not among the coordinates x, y",
-        "name it in coordinates, or give the formula of its motion",
-        T=T + dynamicsymbols("z").diff(t) ** 2,
-    ),
+    case("T=..., a function z(t) that is no coordinate", r"T depends on z\(t\), which is not among the coordinates x, y", "name it in coordinates, or give the formula of its motion", T=T + dynamicsymbols("z").diff(t) ** 2),
     case("T=m * x'**4", r"dT/dv\[0\] must be linear in the velocities", "give a T that is at most quadratic in the velocities", T=m * xd**4),
     case("V=m * x' * y", r"V may depend on coordinates and time only", "give it as forces=", V=m * xd * y),
     case("T=m * x''", "T may not depend on accelerations", "leave accelerations out: they are the unknowns", T=m * xd.diff(t)),
@@ -86,12 +81,8 @@ SYMBOLIC += [
     of_matrices("Q=[0]", "Q must have 2 entries, one for each row of M; given 1", "give one for each row", Q=[0]),
     of_matrices("speeds=[u1, u2]", "speeds must map generalised speeds", "give {u1: its formula in the velocities, ...}", TypeError, speeds=[u1, u2]),
     of_matrices("speeds={u1: x'**2, u2: y'}", r"speeds\[0\] must be linear in the velocities", "choose other speeds", speeds={u1: xd**2, u2: yd}),
-    cases_of("symbolic.from_method")("`method=KanesMethod(..., u_dependent=...)`", dependent_speeds).says(
-        "method must have independent coordinates and speeds only", "give its constraints to from_method"
-    ),
-    cases_of("symbolic.from_method")("`method='Kane'`", lambda: from_method("Kane")).says(
-        "method must be a LagrangesMethod, a KanesMethod or a System; given 'Kane'", "give the object itself; energies go to from_lagrangian", TypeError
-    ),
+    cases_of("symbolic.from_method")("`method=KanesMethod(..., u_dependent=...)`", dependent_speeds).says("method must have independent coordinates and speeds only", "give its constraints to from_method"),
+    cases_of("symbolic.from_method")("`method='Kane'`", lambda: from_method("Kane")).says("method must be a LagrangesMethod, a KanesMethod or a System; given 'Kane'", "give the object itself; energies go to from_lagrangian", TypeError),
     of_mechanism("`with_parameters({'mass': 2.0})`", lambda: lagrangian().with_parameters({"mass": 2.0})).says("parameters must be of m, g, L; given mass", "use the symbols, or their names"),
     of_mechanism("`with_parameters([2.0])`", lambda: lagrangian().with_parameters([2.0])).says(r"parameters must map symbols to numbers; given \[2.0\]", "write {m: 2.0}", TypeError),
     of_mechanism("`problem(..., t_span=2.0)`", lambda: lagrangian().problem([1.0, 0.0], [0.0, 0.0], 2.0)).says(r"t_span must have shape \(2,\)", "give (start, end)"),
