@@ -26,7 +26,10 @@ from studies.bench.store import Output, Row
 TESTS = {  # of a kernel whose change compiles nothing but itself, and what is run until a test fails
     "adams": ("tests/kernels/test_adams.py",),
     "bdf": ("tests/kernels/test_orders.py", "tests/kernels/test_bdf.py"),
-    "explicit": ("tests/kernels/test_orders.py", "tests/kernels/test_explicit.py", "tests/test_straight_line.py"),
+    "explicit": (
+        *("tests/kernels/test_error_estimate.py", "tests/kernels/test_orders.py", "tests/kernels/test_explicit.py"),
+        *("tests/test_straight_line.py", "tests/studies/test_sharp.py"),
+    ),
     "newmark": ("tests/kernels/test_newmark.py", "tests/kernels/test_orders.py", "tests/test_fixed_step.py"),
 }
 FOLDERS = ("twoloop", "references", "studies", "tests", "pyproject.toml", "docs", "reports")
