@@ -126,3 +126,11 @@ class AdaptiveMethod:
         found = *problems.oblique_to_point(result), result.lam
         for values, known, far in zip(found, problems.oblique_point(result.t), self.oblique_far, strict=True):
             assert problems.worst(values, known) < far
+
+    def test_errors_of_positions_count_where_velocities_are_small(self):
+        """A slow oscillator: velocities err by a thousandth of what positions do."""
+        w = 1e-3
+        system = problems.unconstrained(lambda t, q, v: -w * w * q)
+        options = {"method": self.method, "rtol": 1e-6, "atol": 1e-6, "compiled": False}
+        result = solve_dae(system, (0.0, 300.0 / w), [1.0], [0.0], **options)
+        assert abs(result.q[0, -1] - np.cos(300.0)) < 0.3 * self.far * 1e-6

@@ -6,7 +6,7 @@ import pytest
 import twoloop.run.newton_form as newton_form
 import twoloop.run.static_form as static_module
 from studies.bench.large import PLANAR, closed_chain, grid, ladder, open_chain, tree
-from studies.bench.random_assemblies import PlanarAssembly
+from tests.kernels.random_assemblies import PlanarAssembly
 from tests.large_systems import spatial_chain
 from tests.marks import slow
 from tests.problems import worst

@@ -25,6 +25,7 @@ METHODS = {
     "newmark(1/2)": (Newmark(beta=0.5), 2),
     "newmark(1/4, gamma=0.6)": (Newmark(beta=0.25, gamma=0.6), 1),
     "dop853": (DOP853(), 8),
+    "dop853, restored": (DOP853("restored"), 8),
     "tr-bdf2": (ESDIRK("TRBDF2"), 2),
     "esdirk4": (ESDIRK("ESDIRK4"), 4),
     **{f"bdf({k})": (BDF(max_order=k), k) for k in range(1, 6)},

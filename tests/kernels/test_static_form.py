@@ -7,7 +7,7 @@ import pytest
 
 import twoloop.run.static_form as static_module
 from studies.bench.large import LEVEL, PLANAR, closed_chain, grid, ladder
-from studies.bench.random_assemblies import PlanarAssembly, SpatialAssembly, dense_solution, drawn
+from tests.kernels.random_assemblies import PlanarAssembly, SpatialAssembly, dense_solution, drawn
 from tests.large_systems import spatial_chain, started_run
 from tests.marks import slow
 from tests.problems import worst
