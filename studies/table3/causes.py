@@ -11,7 +11,7 @@ from scipy.optimize import least_squares
 from studies.bench.collector import Case, Run, Solver
 from studies.bench.solvers import ERR_IN, IRK, PAPER_TOL
 from studies.bench.tables import where
-from studies.table3.cells import FAMILIES, PAPER_IRK, TOLERANCES, least, machine, printed
+from studies.table3.cells import FAMILIES, PAPER_IRK, PRINTED, TOLERANCES, least, machine
 from twoloop import Result, RungeKutta, solve_dae
 from twoloop.methods.tableaux import sun_radau_iib
 
@@ -26,7 +26,7 @@ def cells(rows: pd.DataFrame, exchanged: bool = False) -> pd.DataFrame:
     lines = []
     for group, (i, e_in), (j, e_out) in product(FAMILIES, enumerate(TOLERANCES), enumerate(TOLERANCES)):
         swapped = exchanged and group == "Table 3: IRK"
-        paper = printed(group)[j][i] if swapped else printed(group)[i][j]
+        paper = PRINTED[group][j][i] if swapped else PRINTED[group][i][j]
         ours = machine(rows, group, e_in, e_out)
         if paper is not None and ours is not None:
             attempts = float(ours["n_steps"]) + float(ours["n_rejected"])

@@ -11,7 +11,7 @@ from studies.bench.solvers import IRK, NEWMARK, QUARTER
 from studies.claims import beam_judges, experiments, judges
 from studies.claims import study as claims
 from studies.claims.beam_judges import kind_of
-from studies.claims.rows import BEAMS, STUDIES, Rows, read
+from studies.claims.rows import BEAMS, Rows, read
 from studies.claims.study import JUDGES, judged
 from studies.claims.verdicts import Claim, Judgement, Verdict, load
 from studies.reproduction import beam
@@ -120,7 +120,7 @@ FLIPS = [  # claim, study, rows, changes, verdict then
 ]  # fmt: skip
 OTHER_NUMBERS = [
     ("euler_predictor", "iterations from the step before", 8.0, HOLDS),
-    ("jacobian_difficult", "Newton over fixed point, linkage", 2.0, PART),
+    *(("jacobian_difficult", f"Newton over fixed point, {case}", 2.0, PART) for case in ("linkage", *BEAMS)),
     ("partition_kept", "partitions mostly kept", 18.0, HOLDS),
     ("partition_kept", "partitions mostly kept", 3.0, FAILS),
     ("energy_bounds_y3", "linkages passing", 0.0, HOLDS),
@@ -189,18 +189,6 @@ def test_a_missing_solver_is_not_run_and_never_an_exception(tables, every):
     solvers = sorted({str(solver) for table in tables.values() for solver in table["solver"].unique()})
     for solver in {*solvers[::every], IRK, NEWMARK, QUARTER, "DOP853, projected"}:
         judged(Rows({name: table[table["solver"] != solver] for name, table in tables.items()}, EXPERIMENTS))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", STUDIES)
-def test_a_missing_column_or_row_is_not_run_and_never_an_exception(name, tables):
-    table = tables[name]
-    before = {key: judgement.verdict for key, (_, judgement) in judged(Rows(tables, EXPERIMENTS)).items()}
-    for column in table.columns:
-        found = judged(Rows({**tables, name: table.drop(columns=column)}, EXPERIMENTS))
-        assert all(each.verdict in (before[key], NOT_RUN) for key, (_, each) in found.items()), column
-    for k in range(0, len(table), 7):
-        judged(Rows({**tables, name: table.drop(index=k)}, EXPERIMENTS))
 
 
 def test_quick_rows_do_not_answer_what_is_about_long_runs(tables):
@@ -277,17 +265,3 @@ def test_choices_repeat_where_nothing_moves_and_change_with_the_motion():
 
 def test_outer_loops_differ_in_nothing_else():
     assert experiments.outer_loops()["Newton over fixed point, moderately stiff"] < 0.1
-
-
-def test_no_jacobian_is_an_advantage_only_where_it_is_everywhere():
-    """All five comparisons decide: two beams by time, and evaluations on these and the linkage."""
-    numbers = {f"Newton over fixed point, {name}": 2.0 for name in ("linkage", *BEAMS)}
-    rows = [
-        {"group": "run", "case": case, "solver": solver, "tol": 1e-5, "t_end": 2.0, "error_q": 1e-5, "call_s": seconds}
-        for case in BEAMS
-        for solver, seconds in (("SunRadau5", 2.0), ("PaperIRK", 1.0))
-    ]
-    tables = {"beam": pd.DataFrame(rows).assign(floor=0.0)}
-    assert verdict("jacobian_difficult", tables, numbers) is HOLDS
-    for key in numbers:
-        assert verdict("jacobian_difficult", tables, numbers | {key: 0.5}) is PART

@@ -48,11 +48,6 @@ def test_dependents():
     assert abs(g1(0.1, 0.9, 1.0) - g1(0.1, 0.4, 1.0)) > 0.1 and abs(g1(0.8, 0.4, 1.0) - g1(0.1, 0.4, 1.0)) > 0.1
 
 
-def test_components():
-    problem = four_bar()
-    assert len(np.concatenate([problem.q0, problem.v0])) == 2 * problem.system.n_q != problem.system.n_q
-
-
 def test_stopping_test():
     """The least change that a number of 1e8 can have is above 1e-9 as printed, and below as corrected."""
     size = 1e8

@@ -12,7 +12,7 @@ from studies.bench.solvers import IDA_C, IRK, IRK_LINE, NEWMARK, QUARTER
 from studies.table3 import cells as short
 from studies.table3 import full
 from studies.table3.causes import READINGS, causes, cells, fit
-from studies.table3.cells import FAMILIES, PAPER_IRK, PAPER_NEWMARK, TOLERANCES, printed
+from studies.table3.cells import FAMILIES, PAPER_IRK, PAPER_NEWMARK, PRINTED, TOLERANCES
 from studies.table3.study import main
 from tests.studies.of_study import GOOD, found_of
 
@@ -31,7 +31,7 @@ def rows(machine=10.0, step=0.0, t_end=100.0):
     for problem in PROBLEMS:
         for group, solver in FAMILIES.items():
             for (i, e_in), (j, e_out) in itertools.product(enumerate(TOLERANCES), repeat=2):
-                paper = printed(group)[i][j] or 1.0
+                paper = PRINTED[group][i][j] or 1.0
                 steps = 1600.0 if solver == IRK else 1e3 * 10.0**j
                 cpu = paper / machine - 1e-6 * step * steps
                 line = {"problem": problem, "group": group, "solver": solver, "err_in": e_in, "err_out": e_out}
