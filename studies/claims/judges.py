@@ -133,7 +133,7 @@ def dependents_in_the_loop(rows: Rows) -> Judgement:
     ratio = ablation.frozen_ratios(table)
     if not ratio:
         raise NotRun("ablation.csv has no run as good as the best with dependents frozen")
-    orders = [ablation.order(table, ablation.FROZEN, name) for name in table["tableau"].unique()]
+    orders = [ablation.order(table, name) for name in table["tableau"].unique()]
     return decide([min(ratio) > DEARER, max(orders) < ablation.ONE], ratio=span(ratio))
 
 
