@@ -265,9 +265,8 @@ def _point_jacobian(q):
 def _point_bias(q, v):
     """What remains of the acceleration of the point when q'' = 0."""
     phi, rate = q[1] + 0.3 * q[0], v[1] + 0.3 * v[0]
-    return -q[0] * rate**2 * np.array([np.cos(phi), np.sin(phi)]) + 2.0 * v[0] * rate * np.array(
-        [-np.sin(phi), np.cos(phi)]
-    )
+    along, across = np.array([np.cos(phi), np.sin(phi)]), np.array([-np.sin(phi), np.cos(phi)])
+    return 2.0 * v[0] * rate * across - q[0] * rate**2 * along
 
 
 def mass_factor(t):
@@ -339,15 +338,11 @@ def oblique_to_point(result):
 LINKAGES = {"default": four_bar(), "collinear": four_bar(lengths=(0.8, 1.2, 1.0), ground=2.0)}
 
 
-# --- what every test of a run wants to know
 def violations(system, result):
     """Largest violation of the position and of the velocity constraints over all stored states."""
-    columns = range(result.t.size)
-    position = max(np.abs(system.constraint(result.t[k], result.q[:, k])).max() for k in columns)
-    velocity = max(
-        np.abs(system.velocity_constraint(result.t[k], result.q[:, k], result.v[:, k])).max() for k in columns
-    )
-    return float(position), float(velocity)
+    states = list(zip(result.t, result.q.T, result.v.T, strict=True))
+    position = max(np.abs(system.constraint(t, q)).max() for t, q, _ in states)
+    return float(position), float(max(np.abs(system.velocity_constraint(*state)).max() for state in states))
 
 
 def force_residual(system, result):

@@ -44,10 +44,8 @@ ENTRIES = {
 @pytest.mark.parametrize("kind", [kind for kind in KINDS if not kind.startswith(("nonholonomic", "kinematics"))])
 def test_every_callback_is_watched_when_it_is_called_alone(kind):
     tangents = NO_TANGENT if kind in ("force_by_v", "reaction_by_q") else {}
-    places = {
-        "mass_values": {"mass_entries": ([0, 1], [0, 1])},
-        "jacobian_values": {"jacobian_entries": ([0, 0], [0, 1])},
-    }
+    places = {"mass_values": {"mass_entries": ([0, 1], [0, 1])}}
+    places["jacobian_values"] = {"jacobian_entries": ([0, 0], [0, 1])}
     state = [V if name == "v" else [1.0] if name == "lam" else Q for name in KINDS[kind].state]
     with pytest.raises(ValueError, match=rf"{kind} of 'far' goes out of bounds: index {FAR} .*n_q = 2, n_c = 1"):
         getattr(system(**tangents, **places.get(kind, {}), **{kind: beyond(kind)}), kind)(0.0, *state)
@@ -85,26 +83,16 @@ def countdown(out, place):
         fill(out, place)
 
 
-def enclosing(helper):
+@pytest.mark.parametrize("helper", [fill, pass_on, countdown])
+def test_helpers_are_watched(helper):
     def force(t, q, v, p, Q):
         helper(Q, FAR + 3)
 
-    return force
-
-
-@pytest.mark.parametrize(
-    "force",
-    [enclosing(fill), enclosing(pass_on), enclosing(countdown)],
-    ids=["helper", "helper of a helper", "recursive"],
-)
-def test_helpers_are_watched(force):
-    with pytest.raises(
-        ValueError, match=r"force of 'far' goes out of bounds: index 1000000\d is .*`out\[place\] = 1.0`"
-    ):
+    words = r"force of 'far' goes out of bounds: index 1000000\d is .*`out\[place\] = 1.0`"
+    with pytest.raises(ValueError, match=words):
         system(force=callback("force")(force)).force(0.0, Q, V)
 
 
-# --- what the caller passes
 @pytest.mark.parametrize("make", [system, pendulum], ids=["compiled", "plain"])
 @pytest.mark.parametrize(
     ("kind", "arguments", "error", "words"),
@@ -211,9 +199,3 @@ print(solve_dae(system, (0.0, 1e-3), start, np.zeros(2), rtol=1e-5, atol=1e-5).s
 @pytest.mark.slow
 def test_checks_of_a_start_that_look_beyond_a_table_do_not_end_the_process():
     assert run_python(CAM).stdout.split() == ["True"]
-
-
-def plain(q, p, out):
-    for i in range(3):
-        for j, k in ((0, 1), (1, 0)):
-            out[3 * i + j] = q[i] * p[len(p) - 1] + out[-k]

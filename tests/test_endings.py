@@ -18,7 +18,6 @@ from twoloop.mechanisms import four_bar
 HORIZONTAL = ([-1.0, 0.0], [0.0, 0.0])
 
 
-# --- beside other threads; Ctrl-C: tests/test_results_stay.py
 def test_other_threads_run_beside_the_compiled_integrator():
     problem = four_bar()
     solve_dae(problem.system, (0.0, 0.1), problem.q0, problem.v0)
@@ -40,7 +39,6 @@ def test_other_threads_run_beside_the_compiled_integrator():
     assert runs[0].success and counted > 1000
 
 
-# --- time limit
 def test_a_time_limit_keeps_what_there_is():
     result = solve_dae(pendulum(), (0.0, 1e9), *HORIZONTAL, time_limit=0.2)
     assert result.status is Status.TIME_LIMIT and "time_limit" in result.message
@@ -48,7 +46,6 @@ def test_a_time_limit_keeps_what_there_is():
     assert solve_dae(pendulum(), (0.0, 0.1), *HORIZONTAL, time_limit=60.0).success
 
 
-# --- standstill
 def stiffening_pendulum(stiffness):
     """A pendulum whose rod is met by a stiff spring after 0.5 s: an explicit method then needs tiny steps."""
 
@@ -89,7 +86,6 @@ def test_a_step_that_is_too_small_for_the_run_ends():
     assert result.status is Status.STAGNATED and "larger step_size" in result.message
 
 
-# --- values that are not finite
 KINDS = ("mass", "force", "constraint", "jacobian", "gamma")
 METHODS = ("Gauss12", "SunRadau5", "PaperIRK", "Newmark", "BDF", "DOP853", "Adams", "RadauIIA5")
 
@@ -129,7 +125,6 @@ START = ([0.0, -1.0], [3.0, 0.0])
 OTHER = [1.0, 2.0, 1.5, 2.9]  # lengths of the default four-bar, its ground a little shorter
 
 
-# --- parameters
 def test_parameters_cannot_be_written_to(default_four_bar):
     result = run(default_four_bar, 0.5, dense_output=True)
     before, system = result.sol(0.31), default_four_bar.system
@@ -145,10 +140,7 @@ def test_parameters_cannot_be_written_to(default_four_bar):
     assert (after.q == known[0]).all() and (after.lam == known[1]).all()
 
 
-# --- an event before the first output
-@pytest.mark.parametrize(
-    "options", quick([{}, {"dense_output": True}, {"method": "SunRadau5"}, {"step_size": 0.125}], 2)
-)
+@pytest.mark.parametrize("options", quick([{}, {"dense_output": True}, {"method": "BDF"}, {"step_size": 0.125}], 2))
 def test_an_event_before_the_first_output_ends_the_run(options):
     early = event(lambda t, q, v: t - 0.2, terminal=True)
     result = solve_dae(pendulum(), (0.0, 2.0), *START, t_eval=[0.5, 1.0], events=early, **options)
@@ -158,7 +150,6 @@ def test_an_event_before_the_first_output_ends_the_run(options):
         assert abs(result.sol.t_max - 0.2) < 1e-12
 
 
-# --- Ctrl-C
 class Counted:
     """A function that calls something at one of its calls, or at all from it on."""
 
@@ -228,8 +219,7 @@ def test_ctrl_c_in_any_function_at_any_call_returns_what_there_is(method, option
     system = pendulum(**plain)
 
     def solve():
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
+        with warnings.catch_warnings(action="ignore"):
             return solve_dae(system, (0.0, END), *START, method, 1e-5, 1e-5, **OPTIONS[options])
 
     solve()  # derivatives are checked once
@@ -297,16 +287,12 @@ def run_of(problem, end, method, tol, **options):
     return solve_dae(problem.system, (0.0, end), problem.q0, problem.v0, method, tol, tol, **options)
 
 
-@pytest.mark.parametrize(
-    ("make", "end", "tol", "method", "what"),
-    [
-        (mechanisms.moderately_stiff_beam, 0.1, 1e-2, "Adams", "vibrations of 3.*e.04 rad/s"),
-        (mechanisms.moderately_stiff_beam, 0.3, 1e-2, "DOP853", "vibrations of 3.*e.04 rad/s"),
-        (mechanisms.moderately_stiff_beam, 0.3, 1e-2, DOP853("restored"), "vibrations of 3.*e.04 rad/s"),
-        (mechanisms.governor, 2.0, 1e-4, "Adams", "a decay of .*e.03 1/s"),
-        (mechanisms.governor, 2.0, 1e-4, "DOP853", "a decay of .*e.03 1/s"),
-    ],
-)
+BEAM, GOVERNOR = (mechanisms.moderately_stiff_beam, 1e-2, "vibrations of 3.*e.04 rad/s"), (mechanisms.governor, 1e-4)
+STIFF_RUNS = [(*BEAM, 0.1, "Adams"), (*BEAM, 0.3, "DOP853"), (*BEAM, 0.3, DOP853("restored"))]
+STIFF_RUNS += [(*GOVERNOR, "a decay of .*e.03 1/s", 2.0, method) for method in ("Adams", "DOP853")]
+
+
+@pytest.mark.parametrize(("make", "tol", "what", "end", "method"), STIFF_RUNS)
 def test_steps_at_the_limit_of_stability_are_said_to_be(make, end, tol, method, what):
     result = run_of(make(), end, method, tol)
     assert result.success and result.message.count(STIFF) == 1

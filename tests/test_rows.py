@@ -106,12 +106,8 @@ def run(solver, error, time, n=5, **more):
 
 
 def test_solvers_are_compared_at_equal_error_on_one_processor():
-    rows = [
-        run("fast", 10.0**-5.5, 0.1),
-        run("fast", 10.0**-6.5, 0.4),
-        run("slow", 1e-6, 0.8),
-        run("near", 1e-6, 0.205),
-    ]
+    rows = [run("fast", 10.0**-5.5, 0.1), run("fast", 10.0**-6.5, 0.4), run("slow", 1e-6, 0.8)]
+    rows += [run("near", 1e-6, 0.205)]
     rows += [run("once", 1e-6, 0.3, 1), run("precise", 1e-12, 0.01), run("coarse", 1e-3, 0.01)]
     rows += [run("fast", 1e-6, 0.001, processor="another"), run("dead", ..., 1.0, 0, value=1e-6, status="RAISED")]
     rows[-1]["message"] = "it fell"

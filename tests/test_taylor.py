@@ -158,15 +158,8 @@ FUNCTIONS = {
     "arctangent": lambda t, q, v: -np.arctan(2.0 * q + 0.1 * v),
     "sines of some angles": lambda t, q, v: -np.sin(q) + 0.1 * np.cos(3.0 * t),
 }
-KINDS_OF_MECHANISM = [
-    mechanisms.four_bar,
-    mechanisms.driven_slider_crank,
-    mechanisms.andrews,
-    mechanisms.heavy_top,
-    mechanisms.spatial_slider_crank,
-    mechanisms.rolling_disc,
-    mechanisms.moderately_stiff_beam,
-]
+KINDS_OF_MECHANISM = [mechanisms.four_bar, mechanisms.driven_slider_crank, mechanisms.andrews, mechanisms.heavy_top]
+KINDS_OF_MECHANISM += [mechanisms.spatial_slider_crank, mechanisms.rolling_disc, mechanisms.moderately_stiff_beam]
 
 
 def both(monkeypatch, make, t_end):

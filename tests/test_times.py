@@ -2,10 +2,13 @@
 
 import numpy as np
 import pytest
+from scipy.linalg import null_space
 
 from tests.compiled import pendulum_under
-from tests.problems import START, SWING, G, pendulum_state, quick, swing, worst
-from twoloop import ConstrainedSystem, Status, solve_dae
+from tests.problems import START, SWING, G, pendulum_state, quick, swing, unconstrained, worst
+from twoloop import BDF, DOP853, Newmark, RungeKutta, Status, solve_dae
+from twoloop.mechanisms import four_bar
+from twoloop.methods.tableaux import gauss
 
 METHODS = ["Adams", "Gauss12", "RadauIIA5", "SunRadau5", "Newmark", "BDF", "DOP853"]
 
@@ -49,15 +52,12 @@ def test_the_first_step_follows_the_time_scale_of_the_motion(method, scale):
 def test_a_drive_starts_at_zero_far_from_the_time_zero(method, t0):
     """Coordinates that are zero have no scale for a first step, which was shorter than the spacing of times."""
     tolerance = {1e5: 1e-8, -1e7: 1e-6, 1e9: 1e-4}[t0] if method not in ("Newmark", "BDF") else 1e-4
-    system = ConstrainedSystem.from_python(
-        n_q=2,
-        n_c=1,
-        mass=np.eye(2),
-        force=lambda t, q, v: np.array([0.0, -4.0 * (q[1] - q[0])]),
+    system = unconstrained(
+        lambda t, q, v: np.array([0.0, -4.0 * (q[1] - q[0])]),
+        **{"n_q": 2, "n_c": 1, "compile": True},
         constraint=lambda t, q: np.array([q[0] - np.sin(3.0 * (t - t0))]),
         jacobian=lambda t, q: np.array([[1.0, 0.0]]),
         constraint_rate=lambda t, q: np.array([-3.0 * np.cos(3.0 * (t - t0))]),
-        compile=True,
     )
     options = {"method": method, "rtol": tolerance, "atol": tolerance}
     result = solve_dae(system, (t0, t0 + 5.0), [0.0, 0.0], [3.0, 0.0], **options)
@@ -83,3 +83,18 @@ def test_an_absolute_tolerance_for_each_coordinate(method):
     end = 1.0 if method in ("Newmark", "BDF") else 20.0  # a hundredth of it is no limit of steps
     mixed, loose = (swing(end, method=method, rtol=1e-9, atol=atol) for atol in (np.array([1e-3, small]), 1e-3))
     assert (tight.q == same.q).all() and mixed.stats.n_evaluations > loose.stats.n_evaluations
+
+
+OBJECTS = [RungeKutta(gauss(3)), RungeKutta(gauss(3), variables="momenta"), Newmark(), BDF(), DOP853()]
+
+
+@pytest.mark.parametrize("turns", quick([10_000, 0]))
+@pytest.mark.parametrize("method", OBJECTS, ids=lambda method: method.name)
+def test_fixed_steps_of_a_crank_converge_after_many_turns(method, turns):
+    """The rounding of a large angle keeps the sweeps from converging as far as they do near zero."""
+    problem = four_bar(lengths=(1.0, 1.2, 0.5), ground=1.0, theta3=np.pi, branch=1)
+    direction = null_space(problem.system.jacobian(0.0, problem.q0))[:, 0]
+    q0 = problem.q0.copy()
+    q0[8] += 2.0 * np.pi * turns
+    run = solve_dae(problem.system, (0.0, 1.0), q0, direction / direction[8] * 12.0, method, step_size=2e-3)
+    assert run.success, run.message

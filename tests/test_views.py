@@ -51,7 +51,6 @@ def test_a_result_from_a_file_knows_what_its_system_knows(result, default_four_b
     np.testing.assert_allclose(other, table, rtol=1e-13)  # of another layout in memory, the energy is rounded otherwise
 
 
-# --- figures
 def test_panels_for_units_energy_and_violation(result, tmp_path):
     figure = result.plot(tmp_path / "run.png")
     assert (tmp_path / "run.png").read_bytes().startswith(b"\x89PNG")
@@ -70,7 +69,6 @@ def test_violation_is_that_of_the_rows(result, default_four_bar):
     assert np.delete(positions, 3).max() < 1e-12 and np.delete(velocities, [3, 5]).max() < 1e-12
 
 
-# --- packages that may be missing, and other processes (see also tests/test_identity.py)
 def test_results_of_lambdas_travel_without_their_system():
     done = solve_dae(pendulum(force=lambda t, q, v: np.array([0.0, -1.0])), (0.0, 0.1), [-1.0, 0.0], [0.0, 0.0])
     other = pickle.loads(pickle.dumps(done))
@@ -136,12 +134,8 @@ def played(path):
 
 def test_the_script_of_a_planar_page(swung, tmp_path):
     said = played(swung.animate(tmp_path / "swing.html"))
-    assert [said[when] for when in ("first", "second", "paused", "chosen")] == [
-        "t = 0.00 s",
-        "t = 0.333 s",  # after a second of three
-        "t = 0.333 s",
-        "t = 0.0400 s",
-    ]
+    times = [said[when] for when in ("first", "second", "paused", "chosen")]  # the second after a second of three
+    assert times == ["t = 0.00 s", "t = 0.333 s", "t = 0.333 s", "t = 0.0400 s"]
     calls = [name for name, *_ in said["drawn"]]
     assert calls.count("fillRect") == 1 and calls.count("arc") == 1 and "lineTo" in calls
     assert all(x is not None for _, *numbers in said["drawn"] for x in numbers)  # NaN is null in JSON

@@ -105,9 +105,7 @@ class Both:
             if self.planar and abs(across[2]) > 0.5:
                 continue
             c = self.along(i, across)
-            self.laws.rows.append(
-                lambda t, bodies, c=c: bodies.direction(i, c) @ (bodies.point(j, b) - bodies.point(i, a))
-            )
+            self.laws.rows.append(lambda t, at, c=c: at.direction(i, c) @ (at.point(j, b) - at.point(i, a)))
             if not self.planar:
                 self._dot(i, across, j, axis, 0.0)
         make = self.model.prismatic if slide else self.model.cylindrical
@@ -175,15 +173,8 @@ class Both:
         one, other, random = self.point(), self.point(), self.random
         stiffness, damping, length = random.uniform(5.0, 50.0), random.uniform(0.0, 3.0), random.uniform(0.2, 2.0)
         stiffness, damping = stiffness * stiff, damping * damped
-        self.model.spring(
-            self.handle(i),
-            self.cut(one),
-            self.handle(j),
-            self.cut(other),
-            stiffness=stiffness,
-            damping=damping,
-            length=length,
-        )
+        given = {"stiffness": stiffness, "damping": damping, "length": length}
+        self.model.spring(self.handle(i), self.cut(one), self.handle(j), self.cut(other), **given)
         a, b = self.here(i, one), self.here(j, other)
 
         def load(t, bodies, v, w):

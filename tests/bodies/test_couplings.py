@@ -19,7 +19,6 @@ def run_of(model, method="DOP853"):
 
 @pytest.mark.parametrize("method", ["RadauIIA9", slow("auto")])
 def test_a_train_of_gears(method):
-    """Two wheels on the ground, the second with a weight beside its centre."""
     model = PlanarModel()
     model.disc("small", 0.1, mass=2.0, position=(0.0, 0.0), angle=0.3, angular_velocity=4.0)
     model.body("large", mass=3.0, inertia=0.05, position=(0.35, 0.05))
@@ -98,7 +97,6 @@ def test_a_gear_in_space_stays_at_its_tooth_when_bodies_are_assembled():
 
 
 def test_a_wheel_that_rolls_down_a_slope_that_slides():
-    """A disc on a wedge on a level floor: the classical pair of equations."""
     m, M, r, tilt = 1.0, 2.0, 0.1, 0.5
     along, up = np.array([np.cos(tilt), np.sin(tilt)]), np.array([-np.sin(tilt), np.cos(tilt)])
     model = PlanarModel()
@@ -138,7 +136,6 @@ def test_a_bead_on_a_cycloid_is_isochronous():
 
 
 def test_a_rolling_disc_in_space():
-    """That of the library, in angles: the same path of the centre."""
     known = mechanisms.rolling_disc()
     p = known.parameters
     yaw, lean, _ = p["angles"]
@@ -149,15 +146,8 @@ def test_a_rolling_disc_in_space():
     w = turn * np.array([0.0, 0.0, 1.0]) + fall * ahead + spin * axle
     model = SpatialModel(gravity=(0.0, 0.0, -p["gravity"]))
     R = np.column_stack([ahead, axle, np.cross(ahead, axle)])
-    wheel = model.body(
-        "wheel",
-        mass=m,
-        inertia=m * r * r * np.array([0.25, 0.5, 0.25]),
-        position=known.q0[:3],
-        rotation=R,
-        velocity=known.v0[:3],
-        angular_velocity=w,
-    )
+    pose = {"position": known.q0[:3], "rotation": R, "velocity": known.v0[:3], "angular_velocity": w}
+    wheel = model.body("wheel", mass=m, inertia=m * r * r * np.array([0.25, 0.5, 0.25]), **pose)
     joint = model.rolling(wheel, radius=r, axis=axle)
     problem = model.problem((0.0, 2.0))
     found, theirs = (moved(each, "auto", 1e-10) for each in (problem, known))

@@ -4,8 +4,8 @@ from functools import cache
 
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
 
+from tests.bodies.runs import by_hand
 from tests.marks import slow
 from twoloop import solve_dae
 from twoloop.bodies import PlanarModel, SpatialModel
@@ -35,7 +35,7 @@ def cart(spatial, guide=0.2, pin=0.3, push=0.0):
 
 
 @cache
-def by_hand(guide=0.2, pin=0.3, push=0.0):
+def known(guide=0.2, pin=0.3, push=0.0):
     """x of the cart, the angle from below, and their rates; forces in the joints by iteration."""
     M, m, J, l = 2.0, 1.0, 0.08, 0.5
 
@@ -51,11 +51,8 @@ def by_hand(guide=0.2, pin=0.3, push=0.0):
             turn = -pin * RADIUS * np.hypot(X, Y) * np.tanh(w / 0.5)
         return found[:2]
 
-    def slope(t, y):
-        return [*y[2:], *accelerations(*y)]
-
     start = [0.0, np.arctan2(0.3, 0.4), 1.0, 2.0]
-    return solve_ivp(slope, (0.0, TIMES[-1]), start, "DOP853", TIMES, rtol=1e-11, atol=1e-12).y
+    return by_hand(lambda t, place, rate: accelerations(*place, *rate), start, TIMES)
 
 
 @pytest.mark.parametrize("spatial", [False, slow(True)])
@@ -71,7 +68,7 @@ def test_a_cart_with_a_pendulum(spatial):
     # machine code of the plane's law is made as that of space would be, which is four times as long
     result = solve_dae(*run, rtol=1e-10, atol=1e-10, t_eval=TIMES, compiled=False if spatial else "auto")
     assert result.success, result.message
-    x, a, *_ = by_hand(push=0.4)
+    x, a, *_ = known(push=0.4)
     np.testing.assert_allclose(result.q[0], x, atol=1e-9)
     rod = result.q[7:9] if spatial else result.q[3:5]
     np.testing.assert_allclose(rod, [x + 0.5 * np.sin(a), -0.5 * np.cos(a)], atol=1e-9)

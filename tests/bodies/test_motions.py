@@ -1,7 +1,5 @@
 """Test motions of models against equations by hand in least coordinates, and of published mechanisms with loops."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -129,74 +127,3 @@ def test_a_function_that_is_called_in_python_is_not_called_on_symbols(model):
     with pytest.raises(ValueError, match="f of 'motor of"):
         solve_dae(problem.system, problem.t_span, problem.q0, problem.v0, compiled=True)
     assert solve_dae(problem.system, problem.t_span, problem.q0, problem.v0).success and seen == {float}
-
-
-UNLIKE = ("DOP853", "RadauIIA13")
-
-
-def agreed(problem, end):
-    """The motion at 1e-10 by an explicit method that projects, if an implicit one finds it, too."""
-    run = replace(problem, t_span=(0.0, end))
-    one, other = (moved(run, method, 1e-10, t_eval=np.linspace(0.0, end, 9)) for method in UNLIKE)
-    assert np.abs(one.q - one.q[:, :1]).max() > 1e-2  # it moves
-    np.testing.assert_allclose(one.q, other.q, atol=1e-9 * max(1.0, np.abs(one.q).max()))
-    if problem.conserved:
-        assert np.ptp(one.energy) < 1e-8 * max(1.0, np.abs(one.energy).max())
-    return one
-
-
-def planar(places, bodies, ground, name, **options):
-    """Bars and plates by the points that they have; a pin where points of several are one."""
-    model = PlanarModel(name=name, **options)
-    at: dict[str, list[str]] = {each: ["ground"] for each in ground}
-    for body, points in bodies.items():
-        own = np.array([places[each] for each in points])
-        size = float(np.abs(own - own.mean(axis=0)).max())
-        model.body(body, mass=size, inertia=size**3 / 3.0, position=own.mean(axis=0))
-        for each in points:
-            at.setdefault(each, []).append(body)
-    for each, there in at.items():
-        for other in there[1:]:
-            model.revolute(there[0], other, at=places[each], name=f"{each} {there[0]} {other}")
-    return model
-
-
-def meet(one, radius, other, far, side):
-    """The point at these distances from two others, to the left (1) or the right (-1) of the way between them."""
-    one, other = np.array(one, dtype=float), np.array(other, dtype=float)
-    d = np.linalg.norm(other - one)
-    along, x = (other - one) / d, (radius**2 - far**2 + d * d) / (2.0 * d)
-    return one + x * along + side * np.sqrt(radius**2 - x * x) * np.array([-along[1], along[0]])
-
-
-# T. Jansen, The Great Pretender (2007): the "holy numbers", over 100; compared with those of public programs,
-# OpenSCAD User Manual/Example/Strandbeest (Wikibooks) among them
-LENGTHS = (38.0, 41.5, 39.3, 40.1, 55.8, 39.4, 36.7, 65.7, 49.0, 50.0, 61.9, 7.8, 15.0)
-JANSEN = {name: 0.01 * length for name, length in zip("abcdefghijklm", LENGTHS, strict=True)}
-LEG = {"crank": "ZX", "j": "XV", "k": "XW", "bde": "YVU", "c": "YW", "f": "UT", "ghi": "TWS"}
-
-
-def strandbeest(angle):
-    n = JANSEN
-    Z, Y = np.zeros(2), np.array([-n["a"], -n["l"]])
-    X = n["m"] * np.array([np.cos(angle), np.sin(angle)])
-    V, W = meet(Y, n["b"], X, n["j"], 1), meet(Y, n["c"], X, n["k"], -1)
-    U = meet(Y, n["d"], V, n["e"], 1)
-    T = meet(U, n["f"], W, n["g"], -1)  # on the other side of U W than Y
-    S = min((meet(T, n["h"], W, n["i"], side) for side in (1, -1)), key=lambda foot: foot[1])
-    return {"Z": Z, "Y": Y, "X": X, "V": V, "W": W, "U": U, "T": T, "S": S}
-
-
-def test_a_strandbeest_leg():
-    places = strandbeest(0.4)
-    swings = planar(places, LEG, "ZY", "leg").problem()
-    assert swings.freedom.degrees == 1 and not swings.freedom.redundant
-    agreed(swings, 0.7)
-    driven = planar(places, LEG, "ZY", "leg")
-    driven.drive("Z ground crank", lambda t: 5.0 * t)
-    walk = agreed(driven.problem(), 2.0 * np.pi / 5.0)  # once round
-    foot, angle = len(LEG) - 1, walk.q[2]
-    for k, turned in enumerate(angle):
-        known = strandbeest(0.4 + turned)
-        centre = np.mean([known[each] for each in LEG["ghi"]], axis=0)
-        np.testing.assert_allclose(walk.q[3 * foot : 3 * foot + 2, k], centre, atol=1e-11)

@@ -49,8 +49,7 @@ def arm(tmp_path):
 
 
 def read(path, **options):
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", IgnoredWarning)
+    with warnings.catch_warnings(action="ignore", category=IgnoredWarning):
         return from_urdf(path, **options)
 
 
@@ -124,9 +123,7 @@ def test_a_loop_that_is_given_beside_the_file(tmp_path):
     links = "".join(LINK.format(name, 0.5 * L, L, L**3 / 12.0) for name, L in BARS.items())
     path = tmp_path / "four_bar.urdf"
     path.write_text(LINKAGE.format(links='<link name="base"/>' + links))
-    loop = Loop(
-        "revolute", "rod", "rocker", at=(2.0, 0.0, 0.0), at_b=(1.5, 0.0, 0.0), axis=(0.0, 1.0, 0.0), name="knee"
-    )
+    loop = Loop("revolute", "rod", "rocker", at=(2, 0, 0), at_b=(1.5, 0, 0), axis=(0, 1, 0), name="knee")
     model = read(path, loops=[loop], positions={"pivot": 1.4, "elbow": -1.2, "foot": 1.9})
     plane = PlanarModel()
     with pytest.warns(match="have rank"):

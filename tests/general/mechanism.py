@@ -45,15 +45,9 @@ def of_functions(**functions):
 def of_problem(problem, state, end, rank=None):
     """A ready problem beside a motion that shares nothing with it; rank=None: all rows count."""
     system = problem.system
-    return Mechanism(
-        name=problem.name,
-        system=lambda: system,
-        end=end,
-        state=state,
-        rank=system.n_c + system.n_a if rank is None else rank,
-        energy=(lambda q, v: problem.energy(0.0, q, v)) if problem.conserved else None,
-        given=(problem.q0, problem.v0),
-    )
+    energy = (lambda q, v: problem.energy(0.0, q, v)) if problem.conserved else None
+    rank = system.n_c + system.n_a if rank is None else rank
+    return Mechanism(problem.name, lambda: system, end, state, rank, energy, given=(problem.q0, problem.v0))
 
 
 def known(motion, end):

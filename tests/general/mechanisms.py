@@ -25,14 +25,8 @@ def planet(eccentricity=0.2):
         return np.array([np.cos(E) - eccentricity, b * np.sin(E)]), rate * np.array([-np.sin(E), b * np.cos(E)])
 
     system = unconstrained(lambda t, q, v: -q / (q[0] * q[0] + q[1] * q[1]) ** 1.5, 2, name="planet")
-    return Mechanism(
-        name="planet",
-        system=lambda: system,
-        end=3.0,
-        state=state,
-        rank=0,
-        energy=lambda q, v: 0.5 * v @ v - 1.0 / np.hypot(q[0], q[1]),
-    )
+    energy = lambda q, v: 0.5 * v @ v - 1.0 / np.hypot(q[0], q[1])  # noqa: E731
+    return Mechanism("planet", lambda: system, 3.0, state, rank=0, energy=energy)
 
 
 # --- the slider-crank with a redundant row, which says once more, and not linearly, how far pin and slider are apart
@@ -55,16 +49,8 @@ def driven_slider_crank(redundant):
         return lambda *state: np.concatenate([of_free(*state), of_driven(*state)[-1:]])
 
     rows = {kind: joined(kind) for kind in ("constraint", "jacobian", "constraint_rate", "gamma")}
-    return Mechanism(
-        name="driven slider-crank, redundant",
-        system=of_functions(n_q=9, n_c=10, **functions_of(free) | rows),
-        end=2.0,
-        state=DRIVEN.motion,
-        rank=9,
-    )
-
-
-# --- IFToMM A02 beside the equation for the angle of its cranks
+    system = of_functions(n_q=9, n_c=10, **functions_of(free) | rows)
+    return Mechanism("driven slider-crank, redundant", system, 2.0, DRIVEN.motion, rank=9)
 
 
 def windows(n, coordinates="tips"):
@@ -76,7 +62,6 @@ def first_singular_time(n):
     return float(brentq(lambda t: n_four_bar(n).motion.crank(t)[0], 0.5, 1.0, xtol=1e-15))
 
 
-# --- all of them
 WINDOWS = (1, 2, 40)
 # name -> how it is made; motion that never comes near a point where C_q loses rank
 REGULAR = {
@@ -117,7 +102,6 @@ def mechanism(name):
     return ALL[name]()
 
 
-# --- runs
 TOLERANCE = 5e-11
 
 
@@ -125,18 +109,10 @@ TOLERANCE = 5e-11
 def run(name, method, tolerance=TOLERANCE, times=41):
     """A run, and the warnings about its rows."""
     m = mechanism(name)
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        result = solve_dae(
-            m.system(),
-            (0.0, m.end),
-            *m.start,
-            method=method,
-            rtol=tolerance,
-            atol=tolerance,
-            t_eval=np.linspace(0.0, m.end, times),
-            max_steps=100_000,
-        )
+    with warnings.catch_warnings(record=True, action="always") as caught:
+        times = np.linspace(0.0, m.end, times)
+        options = {"rtol": tolerance, "atol": tolerance, "t_eval": times, "max_steps": 100_000}
+        result = solve_dae(m.system(), (0.0, m.end), *m.start, method, **options)
     return result, [str(each.message) for each in caught if issubclass(each.category, ConstraintWarning)]
 
 

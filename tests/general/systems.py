@@ -14,7 +14,6 @@ from twoloop.mechanisms.rolling_disc import energy as energy_of_disc
 END = 2.0
 
 
-# --- rank is lost on the way
 def crossing_lines():
     """A bead on x^2 = y^2, thrown up along x = y through the crossing, where C_q = 0. Closed form."""
     rows = QuadraticSystem(np.eye(2), np.array([0.0, -G]))
@@ -69,17 +68,11 @@ def wobbling_disc(redundant=False):
         return np.append(DISC.nonholonomic_gamma(t, q, v), -RADIUS * np.cos(q[4]) * v[4] ** 2)
 
     more = {"n_q": 6, "n_c": 1, "n_a": 3, "nonholonomic": nonholonomic, "nonholonomic_gamma": nonholonomic_gamma}
-    return Mechanism(
-        name=f"wobbling disc{', redundant' if redundant else ''}",
-        system=of_functions(**functions_of(DISC) | more) if redundant else lambda: DISC,
-        end=END,
-        state=known(spatial.rolling_disc(), END),
-        rank=3,
-        energy=lambda q, v: energy_of_disc(0.0, q, v),
-    )
+    system = of_functions(**functions_of(DISC) | more) if redundant else lambda: DISC
+    state, energy = known(spatial.rolling_disc(), END), lambda q, v: energy_of_disc(0.0, q, v)
+    return Mechanism(f"wobbling disc{', redundant' if redundant else ''}", system, END, state, rank=3, energy=energy)
 
 
-# --- the knife edge
 KNIFE_EDGE = mechanisms.knife_edge()
 EDGE = KNIFE_EDGE.system
 EDGE_FUNCTIONS = {"n_q": 3, "n_c": 0, "n_a": 1, "name": "knife edge", **functions_of(EDGE)}
@@ -105,7 +98,6 @@ def pushed_knife_edge():
     return Mechanism("pushed knife edge", system, END, pushed, rank=1)
 
 
-# --- coordinates without mass
 SPRING = 20.0
 
 
@@ -116,24 +108,16 @@ def massless_coordinate():
         s, c = np.sin(y[0]), np.cos(y[0])
         return np.array([s, -c, s]), y[1] * np.array([c, s, c])
 
-    motion = lambda t, y: [y[1], -(G + SPRING * np.cos(y[0])) * np.sin(y[0])], (1.2, 0.5), state
-    return Mechanism(
-        name="massless coordinate",
-        system=of_functions(
-            name="massless coordinate",
-            n_q=3,
-            n_c=2,
-            mass=np.diag([1.0, 1.0, 0.0]),
-            force=lambda t, q, v: np.array([0.0, -G, -SPRING * q[2]]),
-            constraint=lambda t, q: np.array([0.5 * (q[0] * q[0] + q[1] * q[1] - 1.0), q[2] - q[0]]),
-            jacobian=lambda t, q: np.array([[q[0], q[1], 0.0], [-1.0, 0.0, 1.0]]),
-            gamma=lambda t, q, v: np.array([-v[0] * v[0] - v[1] * v[1], 0.0]),
-        ),
-        end=END,
-        state=known(motion, END),
-        rank=2,
-        energy=lambda q, v: 0.5 * (v[0] ** 2 + v[1] ** 2) + G * q[1] + 0.5 * SPRING * q[2] ** 2,
-    )
+    functions = {
+        "force": lambda t, q, v: np.array([0.0, -G, -SPRING * q[2]]),
+        "constraint": lambda t, q: np.array([0.5 * (q[0] * q[0] + q[1] * q[1] - 1.0), q[2] - q[0]]),
+        "jacobian": lambda t, q: np.array([[q[0], q[1], 0.0], [-1.0, 0.0, 1.0]]),
+        "gamma": lambda t, q, v: np.array([-v[0] * v[0] - v[1] * v[1], 0.0]),
+    }
+    system = of_functions(name="massless coordinate", n_q=3, n_c=2, mass=np.diag([1.0, 1.0, 0.0]), **functions)
+    state = known((lambda t, y: [y[1], -(G + SPRING * np.cos(y[0])) * np.sin(y[0])], (1.2, 0.5), state), END)
+    energy = lambda q, v: 0.5 * (v[0] ** 2 + v[1] ** 2) + G * q[1] + 0.5 * SPRING * q[2] ** 2  # noqa: E731
+    return Mechanism("massless coordinate", system, END, state, rank=2, energy=energy)
 
 
 def without_inertia(mass=(1.0, 1.0, 0.0)):
@@ -142,7 +126,6 @@ def without_inertia(mass=(1.0, 1.0, 0.0)):
     return pendulum(n_q=3, force=lambda t, q, v: np.array([0.0, -G, 0.0]), **more)
 
 
-# --- rows that contradict one another
 def parted_drives(power):
     """Two coordinates; row 1 drives q0 by sin(t), and row 2 by sin(t) + t^power: they part after the start.
 
