@@ -47,14 +47,12 @@ def slider_crank(unit, offset=0.0, crank=0.7, offset_of_guide=0.2):
     a, b = crank, -math.asin((r * math.sin(crank) - e) / l)
 
     def constraint(t, q):
-        return np.array(
-            [r * math.cos(q[0]) + l * math.cos(q[1]) - (q[2] - offset), r * math.sin(q[0]) + l * math.sin(q[1]) - e]
-        )
+        x, y = r * math.cos(q[0]) + l * math.cos(q[1]), r * math.sin(q[0]) + l * math.sin(q[1])
+        return np.array([x - (q[2] - offset), y - e])
 
     def jacobian(t, q):
-        return np.array(
-            [[-r * math.sin(q[0]), -l * math.sin(q[1]), -1.0], [r * math.cos(q[0]), l * math.cos(q[1]), 0.0]]
-        )
+        by_x = [-r * math.sin(q[0]), -l * math.sin(q[1]), -1.0]
+        return np.array([by_x, [r * math.cos(q[0]), l * math.cos(q[1]), 0.0]])
 
     def gamma(t, q, v):
         c, s = r * v[0] ** 2, l * v[1] ** 2
@@ -111,22 +109,12 @@ def lever(small, large):
     total = math.sin(0.3) + math.cos(0.3) + 0.5 * 0.7**2
 
     def constraint(t, q):
-        return np.array(
-            [
-                q[0] - small * math.sin(q[2]),
-                q[1] - large * math.cos(q[2]),
-                q[0] / small + q[1] / large + 0.5 * q[3] ** 2 - total,
-            ]
-        )
+        sine, cosine = small * math.sin(q[2]), large * math.cos(q[2])
+        return np.array([q[0] - sine, q[1] - cosine, q[0] / small + q[1] / large + 0.5 * q[3] ** 2 - total])
 
     def jacobian(t, q):
-        return np.array(
-            [
-                [1.0, 0.0, -small * math.cos(q[2]), 0.0],
-                [0.0, 1.0, large * math.sin(q[2]), 0.0],
-                [1.0 / small, 1.0 / large, 0.0, q[3]],
-            ]
-        )
+        first = [[1.0, 0.0, -small * math.cos(q[2]), 0.0], [0.0, 1.0, large * math.sin(q[2]), 0.0]]
+        return np.array([*first, [1.0 / small, 1.0 / large, 0.0, q[3]]])
 
     def gamma(t, q, v):
         w = v[2] ** 2

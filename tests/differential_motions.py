@@ -34,8 +34,7 @@ FILE = Path(__file__).with_suffix(".json")
 
 @callback("mass")
 def crank_mass(t, q, p, M):  # type: ignore[no-untyped-def]
-    M[0, 0] = p[2]
-    M[1, 1] = p[2]
+    M[0, 0] = M[1, 1] = p[2]
     M[2, 2] = p[3]
 
 
@@ -53,11 +52,8 @@ def crank_constraint(t, q, p, C):  # type: ignore[no-untyped-def]
 
 @callback("jacobian")
 def crank_jacobian(t, q, p, Cq):  # type: ignore[no-untyped-def]
-    Cq[0, 0] = q[0]
-    Cq[0, 1] = q[1]
-    Cq[1, 0] = q[0] - q[2]
-    Cq[1, 1] = q[1]
-    Cq[1, 2] = q[2] - q[0]
+    Cq[0, 0], Cq[0, 1] = q[0], q[1]
+    Cq[1, 0], Cq[1, 1], Cq[1, 2] = q[0] - q[2], q[1], q[2] - q[0]
 
 
 @callback("gamma")

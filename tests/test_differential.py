@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from studies.bench.sharp_forces import KIND, SIZE, A
-from studies.bench.sharp_motion import TIMES, march, off, positions
+from studies.bench.sharp_motion import TIMES
 from tests.differential_motions import FAMILIES, RIGHT, SILENT, judged, mechanism_of, read
 
 TIME_LIMIT = 20.0  # s
@@ -40,15 +40,6 @@ def test_a_run_is_right_or_says_that_it_is_not(family):
         refused = options and made["status"] == "RAISED"  # of equations that branch there is no code
         if name == "auto" and not refused and family not in MAY_END:
             assert made["outcome"] == RIGHT, told
-
-
-@pytest.mark.slow  # numbers that do not change
-def test_the_motions_are_those_of_the_mechanisms():
-    for family in ("gust of 100 ms", "drive with a kink", "softplus stop"):
-        n_drawn, known = MOTIONS[family]
-        mechanism = mechanism_of(family, n_drawn)
-        again = positions(mechanism, march(mechanism, "DOP853", 1e-9, mechanism.y0))
-        assert off(again, known.q) < 1e-6 * known.growth
 
 
 def test_the_rule_sees_a_force_that_is_left_out():

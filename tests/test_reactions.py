@@ -15,11 +15,9 @@ DOWN = np.array([0.0, -9.81])
 
 def run(problem, t_end):
     """A few states of a run."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", ConstraintWarning)
-        result = solve_dae(
-            problem.system, (0.0, t_end), problem.q0, problem.v0, "DOP853", t_eval=np.linspace(0.0, t_end, 6)
-        )
+    with warnings.catch_warnings(action="ignore", category=ConstraintWarning):
+        times = np.linspace(0.0, t_end, 6)
+        result = solve_dae(problem.system, (0.0, t_end), problem.q0, problem.v0, "DOP853", t_eval=times)
     assert result.success
     return result
 
@@ -192,7 +190,6 @@ def test_bars_by_rotation_matrices_with_a_redundant_row():
     assert not any(result.reactions(joint.name).unique for joint in problem.joints)
 
 
-# --- what is unique
 def test_a_redundant_row_is_said_to_leave_single_joints_open():
     """Another choice of the multipliers of the same motion changes single joints, and no sum on a body."""
     problem = mechanisms.redundant_slider_crank()
@@ -208,14 +205,12 @@ def test_a_redundant_row_is_said_to_leave_single_joints_open():
     assert changed["pin rod-crank"] and changed["distance slider-crank"] and not changed["pin crank-ground"]
 
 
-# --- signs, points, names
 BOB = [0.0, -1.0], [0.0, 0.0]
 
 
 @pytest.mark.parametrize("equations", [None, np.array([[1.0, 0.0], [1.0, 2.0]])], ids=["rows", "sums of rows"])
 @pytest.mark.parametrize(("rows", "unique"), [((1,), False), ((0, 1), True)])
 def test_rows_that_depend_on_one_another_leave_what_has_all_of_them_unique(rows, unique, equations):
-    """The length of the link is said twice."""
     system = held_twice(joints=[Joint("link", rows, (0, 1), equations=equations)])
     with pytest.warns(ConstraintWarning):
         result = solve_dae(system, (0.0, 0.1), *BOB)
@@ -228,9 +223,7 @@ def test_rows_that_depend_on_one_another_leave_what_has_all_of_them_unique(rows,
 def test_a_drive_does_work_by_its_torque():
     problem = mechanisms.driven_crank()
     times = np.linspace(0.4, 0.5, 41)
-    result = solve_dae(
-        problem.system, (0.0, 1.0), problem.q0, problem.v0, "Gauss12", rtol=1e-11, atol=1e-11, t_eval=times
-    )
+    result = solve_dae(problem.system, (0.0, 1.0), problem.q0, problem.v0, "Gauss12", 1e-11, 1e-11, t_eval=times)
     torque = result.reactions("drive of angle of crank").torque
     energy = problem.energy(result.t, result.q, result.v)
     power = torque * result.v[2]

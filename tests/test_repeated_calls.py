@@ -11,21 +11,10 @@ from itertools import chain
 import numpy as np
 import pytest
 
+import twoloop
 from tests.compiled import PENDULUM
 from tests.problems import assert_same, pendulum, quick, some_of
-from twoloop import (
-    BDF,
-    DOP853,
-    ConstrainedSystem,
-    ConstraintWarning,
-    Integrator,
-    RungeKutta,
-    Taylor,
-    callback,
-    mechanisms,
-    solve,
-    solve_dae,
-)
+from twoloop import ConstrainedSystem, ConstraintWarning, Integrator, callback, mechanisms, solve, solve_dae
 from twoloop.checks.consistency import Look, check_start
 from twoloop.generate.exact_derivatives import exact_derivatives, generic_states
 from twoloop.kernels.layout import _free
@@ -204,13 +193,8 @@ def test_a_result_has_the_system_of_the_call(taken):
 # third, which may compare callbacks at turning points, in a fifth, which uses these arrays, and in a sixth
 MANY, THIRD, FEWER, FEWEST = 780, 690, 115, 77
 # in a run from another start, and in one with other parameters; a twentieth more with the oldest versions
-ANOTHER = {
-    "four_bar": (88, 1000),
-    "redundant_slider_crank": (92, 1430),
-    "heavy_top": (108, 770),
-    "spatial_four_bar": (106, 1200),
-    "bricard": (92, 640),
-}
+ANOTHER = {"four_bar": (88, 1000), "redundant_slider_crank": (92, 1430), "heavy_top": (108, 770)}
+ANOTHER |= {"spatial_four_bar": (106, 1200), "bricard": (92, 640)}
 
 
 def run(problem, rtol=1e-6, **options):
@@ -221,7 +205,7 @@ OF_OBJECTS = 110  # calls more where the method is an object, which is compared 
 WAYS = {
     "name": (lambda problem: run(problem, method="RadauIIA5"), 0),
     "default": (run, 0),
-    "object": (lambda problem: run(problem, method=BDF(max_order=3)), OF_OBJECTS),
+    "object": (lambda problem: run(problem, method=twoloop.BDF(max_order=3)), OF_OBJECTS),
     "integrator": (lambda problem: integrator(problem.system).run((0.0, 1.0), problem.q0, problem.v0), 0),
 }
 
@@ -246,7 +230,7 @@ def test_a_repeated_call_takes_few_calls_of_functions(way):
 def test_a_method_of_other_options_makes_a_run_of_its_own():
     problem = mechanisms.four_bar()
     orders = [8, 12, 8, 12, 8, 12, 8, 12]
-    ends = [run(problem, method=Taylor(order=order)).q[:, -1].tolist() for order in orders]
+    ends = [run(problem, method=twoloop.Taylor(order=order)).q[:, -1].tolist() for order in orders]
     assert ends[0] != ends[1] and all(end == ends[k % 2] for k, end in enumerate(ends))
 
 
@@ -256,7 +240,7 @@ class Changing:
     name = "changing"
 
     def __init__(self):
-        self.now = DOP853()
+        self.now = twoloop.DOP853()
 
     def plan(self, *given):
         return self.now.plan(*given)
@@ -265,18 +249,18 @@ class Changing:
 def test_nothing_is_kept_for_a_method_that_may_change():
     problem, method = mechanisms.four_bar(), Changing()
     before = [run(problem, method=method).h.size for _ in range(4)]
-    method.now = RungeKutta(gauss(3))
+    method.now = twoloop.RungeKutta(gauss(3))
     after = [run(problem, method=method).h.size for _ in range(4)]
     assert len({*before}) == len({*after}) == 1 and before[0] != after[0]
 
 
 def test_a_tableau_that_was_written_to_makes_a_run_of_its_own():
     problem, tableau, other = mechanisms.four_bar(), gauss(3), radau_iia(3)
-    before = [run(problem, method=RungeKutta(tableau)).q[:, -1].tolist() for _ in range(4)]
+    before = [run(problem, method=twoloop.RungeKutta(tableau)).q[:, -1].tolist() for _ in range(4)]
     for name in ("A", "b", "c"):
         getattr(tableau, name)[...] = getattr(other, name)
-    after = [run(problem, method=RungeKutta(tableau)).q[:, -1].tolist() for _ in range(4)]
-    again = [run(problem, method=RungeKutta(gauss(3))).q[:, -1].tolist() for _ in range(2)]
+    after = [run(problem, method=twoloop.RungeKutta(tableau)).q[:, -1].tolist() for _ in range(4)]
+    again = [run(problem, method=twoloop.RungeKutta(gauss(3))).q[:, -1].tolist() for _ in range(2)]
     assert before[0] == before[-1] == again[0] == again[1] and after[0] == after[-1] != before[0]
 
 

@@ -9,27 +9,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.derivative_cases import UNITS, lever, linkage, slider_crank
-from tests.problems import (
-    moving_pivot,
-    oblique_pendulum,
-    pendulum,
-    pendulum_state,
-    quick,
-    row_errors,
-    unconstrained,
-    worst,
-)
+from tests.problems import pendulum, pendulum_state, quick, unconstrained, worst
 from twoloop import consistent_state, solve_dae
 from twoloop.bodies import SpatialModel
 from twoloop.checks.consistency import check_start
-from twoloop.mechanisms import (
-    andrews,
-    bricard,
-    four_bar,
-    heavy_top,
-    n_four_bar,
-    spatial_four_bar,
-)
+from twoloop.mechanisms import andrews, bricard, four_bar, heavy_top, n_four_bar, spatial_four_bar
 
 REST = np.zeros(2)
 STRETCHED = math.acos(0.25)  # theta_3 at which bars 1 and 2 of this linkage are in line
@@ -101,7 +85,6 @@ def test_every_coordinate_counts_in_its_own_unit(case):
             assert accepted(system, moved, rest) == fine, (j, part)
 
 
-# --- consistent_state
 def test_a_kept_crank_keeps_its_angle_and_its_speed():
     problem = four_bar(theta3=0.4)
     guess = problem.q0 + 0.02 * np.sin(np.arange(9.0))
@@ -146,7 +129,6 @@ def test_velocities_off_by_rounding_of_the_fastest_are_no_violation_and_larger_o
             check_start(problem.system, t, state.q, state.v + 1e-7 * problem.system.jacobian(t, state.q)[0])
 
 
-# --- guesses that are a little off
 def off(found, q):
     return float(np.abs(found[0] - q).max())
 
@@ -270,19 +252,6 @@ def test_an_inertia_that_is_rounding_of_zero_makes_no_velocity_consistent(turned
             assert not accepted(problem.system, problem.q0, problem.v0 + 1e-3 * row)
 
 
-# --- constrainedSystem and consistent_state
-numbers = st.floats(-2.0, 2.0)
-vectors = st.tuples(numbers, numbers).map(np.array)
-SYSTEMS = {"moving pivot": moving_pivot(), "oblique": oblique_pendulum(), "pendulum": pendulum()}
-
-
-@pytest.mark.parametrize("name", SYSTEMS)
-@given(t=numbers, q=vectors, v=vectors)
-def test_derivatives_of_the_shared_problems(name, t, q, v):
-    by_q, by_t, gamma = row_errors(SYSTEMS[name], t, q, v)
-    assert by_q < 1e-8 and by_t < 1e-8 and gamma < 1e-7
-
-
 def test_a_mass_array_is_constant_and_copied():
     matrix = np.eye(2)
     system = pendulum(mass=matrix)
@@ -290,7 +259,6 @@ def test_a_mass_array_is_constant_and_copied():
     assert system.constant_mass and (system.mass(0.0, np.zeros(2)) == np.eye(2)).all()
 
 
-# --- consistent_state
 @given(st.lists(st.floats(-0.1, 0.1), min_size=9, max_size=9), st.lists(st.floats(-3, 3), min_size=9, max_size=9))
 def test_a_guess_is_projected_and_can_be_started_from(shift, speeds):
     problem = four_bar()

@@ -88,7 +88,6 @@ def test_a_dask_cluster_gives_the_same_numbers(rows):
     pd.testing.assert_frame_equal(other.drop(columns="seconds"), rows.drop(columns="seconds"))
 
 
-# --- going on
 def test_an_interrupted_sweep_goes_on(tmp_path, monkeypatch):
     out = tmp_path / "rows.parquet"
     options = {"parallel": "threads", "workers": 1, "t_span": (0.0, 0.1), "out": out}
@@ -129,7 +128,9 @@ def test_rows_of_another_sweep_are_refused(tmp_path):
         sweep(linkage, ANGLES[:2], t_span=(0.0, 0.1), out=tmp_path / "nowhere" / "rows.parquet")
 
 
-# --- mistakes
+OF_LINKAGES = linkage, ANGLES
+
+
 @pytest.mark.parametrize(
     ("arguments", "options", "error", "words"),
     [
@@ -138,24 +139,14 @@ def test_rows_of_another_sweep_are_refused(tmp_path):
         ((linkage, [0.1]), {}, TypeError, r"parameters\[0\] must be a mapping of names to values; given 0.1"),
         ((linkage, [{"theta3": 0.1}, {"x": 1}]), {}, ValueError, r"all have the same names; .*\[1\] \['x'\]"),
         ((lambda status: None, [{"status": 1}]), {}, ValueError, "the name of a standard column; given 'status'"),
-        ((linkage, ANGLES), {"parallel": "fork"}, ValueError, "must be 'processes' or 'threads'; given 'fork'"),
-        ((linkage, ANGLES), {"method": "Guass8"}, ValueError, r"method must be one of .*given 'Guass8'"),
-        ((linkage, ANGLES), {"rtol": 0.0}, ValueError, "rtol must be positive"),
-        ((linkage, ANGLES), {"measure": lambda p, r: {}}, TypeError, "measure cannot be sent to another process"),
-        ((linkage, ANGLES), {"measure": len, "parallel": "threads"}, TypeError, r"len\(\) takes exactly one argument"),
-        ((linkage, ANGLES), THREADS | {"measure": lambda p, r: 1.0}, TypeError, "must return a mapping of columns"),
-        (
-            (linkage, ANGLES),
-            THREADS | {"measure": lambda p, r: {"theta3": 1}},
-            TypeError,
-            "that the row has not already",
-        ),
-        (
-            (linkage, ANGLES),
-            THREADS | {"measure": lambda p, r: {"x": [1.0]}},
-            TypeError,
-            r"'x' is \[1.0\] of type list",
-        ),
+        (OF_LINKAGES, {"parallel": "fork"}, ValueError, "must be 'processes' or 'threads'; given 'fork'"),
+        (OF_LINKAGES, {"method": "Guass8"}, ValueError, r"method must be one of .*given 'Guass8'"),
+        (OF_LINKAGES, {"rtol": 0.0}, ValueError, "rtol must be positive"),
+        (OF_LINKAGES, {"measure": lambda p, r: {}}, TypeError, "measure cannot be sent to another process"),
+        (OF_LINKAGES, {"measure": len, "parallel": "threads"}, TypeError, r"len\(\) takes exactly one argument"),
+        (OF_LINKAGES, THREADS | {"measure": lambda p, r: 1.0}, TypeError, "must return a mapping of columns"),
+        (OF_LINKAGES, THREADS | {"measure": lambda p, r: {"theta3": 1}}, TypeError, "that the row has not already"),
+        (OF_LINKAGES, THREADS | {"measure": lambda p, r: {"x": [1.0]}}, TypeError, r"'x' is \[1.0\] of type list"),
         ((swinging, [{"k": 1.0}, {"k": "one"}]), THREADS, TypeError, "'k' has numbers, and 'one'"),
         ((swinging, [{"k": 2**63}]), THREADS, TypeError, "must be a number"),
     ],
@@ -185,7 +176,6 @@ def dying(k):
     return swinging(k)
 
 
-# --- other functions under the same names
 @pytest.fixture
 def resumes(tmp_path):
     """Whether a sweep of a second function goes on from the file of a first."""
@@ -254,7 +244,6 @@ def test_a_global_that_is_reached_counts_and_others_do_not(tmp_path, monkeypatch
         sweep(swinging, RUNS[:2], **options)
 
 
-# --- workers that die
 @pytest.mark.slow
 def test_a_worker_that_dies_costs_its_own_run_alone(tmp_path, monkeypatch):
     monkeypatch.setattr(workers, "RENEWED_AFTER", 0)  # processes grow with what they compile: each ends after a run

@@ -117,9 +117,6 @@ def test_times_at_which_states_are_wanted_change_no_step(made):
     assert np.abs(ends.q[1:, :, 1] - runs.q[1:20, :, -1]).max() < 1e-13
 
 
-# stiff ensembles
-
-
 def springs(n_runs):
     """A mass on a circle, and one hung on it by a stiff spring with a damper: stiffness, damping and length vary."""
     random = np.random.default_rng(1)
@@ -151,15 +148,11 @@ def dampers(n_runs):
     return system, np.column_stack([np.sin(angle), -np.cos(angle)]), p
 
 
-@pytest.mark.parametrize(
-    ("make", "method", "tolerance"),
-    [
-        (springs, "auto", 1e-4),
-        slow(dampers, "auto", 1e-4),
-        slow(dampers, "RadauIIA9", 1e-7),
-        slow(springs, "RadauIIA5", 1e-5),
-    ],
-)
+STIFF = [(springs, "auto", 1e-4), slow(dampers, "auto", 1e-4)]
+STIFF += [slow(dampers, "RadauIIA9", 1e-7), slow(springs, "RadauIIA5", 1e-5)]
+
+
+@pytest.mark.parametrize(("make", "method", "tolerance"), STIFF)
 def test_stiff_runs_are_those_made_singly(make, method, tolerance):
     system, q, p = make(11)
     span, times = (0.0, 0.3), np.linspace(0.0, 0.3, 5)
@@ -180,9 +173,6 @@ def test_stiff_motion_takes_the_implicit_method_that_auto_takes_singly():
     assert list(names.values()) == ["RadauIIA5", "RadauIIA5", "RadauIIA9"]
 
 
-# what one method cannot do
-
-
 def test_auto_goes_on_with_dop853_where_series_are_not_finite():
     """Drag from rest: its series has no coefficients there."""
 
@@ -201,9 +191,8 @@ def test_auto_goes_on_with_dop853_where_series_are_not_finite():
 def test_a_force_that_ends_is_left_to_single_runs_and_others_are_not(method):
     _, q, v, parameters = pendulums(9)
     parameters[:, 2] = [9.0, 9.0, 9.0, 0.7, 9.0, 9.0, 9.0, 1.3, 9.0]
-    system = system_of(
-        parameters, mass=np.eye(2), force=lambda t, q, v, p: np.array([np.sqrt(p[2] - t), -9.81]) + 0.0 * v
-    )
+    force = lambda t, q, v, p: np.array([np.sqrt(p[2] - t), -9.81]) + 0.0 * v  # noqa: E731
+    system = system_of(parameters, mass=np.eye(2), force=force)
     runs = ensemble(system, SPAN, q, v, parameters=parameters, method=method, t_eval=TIMES)
     assert np.flatnonzero(runs.singly).tolist() == [0, 3, 7] == [0, *sorted(runs.messages)]
     assert np.isnan(runs.q[[3, 7], :, -1]).all() and runs.success.sum() == 7
@@ -241,15 +230,12 @@ def test_drives_whose_speed_jumps_are_left_to_single_runs(method):
     def away(t, p):
         return np.sqrt((t - p[0]) * (t - p[0]))
 
-    system = ConstrainedSystem.from_python(
-        n_q=3,
-        n_c=2,
-        mass=np.eye(3),
-        force=lambda t, q, v, p: np.array([0.0, 0.0, -9.81]),
+    system = unconstrained(
+        lambda t, q, v, p: np.array([0.0, 0.0, -9.81]),
+        **{"n_q": 3, "n_c": 2, "parameters": parameters[0]},
         constraint=lambda t, q, p: np.array([q[0] - 0.5 * away(t, p), 0.5 * ((q[1] - q[0]) ** 2 + q[2] ** 2 - 1.0)]),
         constraint_rate=lambda t, q, p: np.array([-0.5 * (t - p[0]) / away(t, p), 0.0 * t]),
         gamma=lambda t, q, v, p: np.array([0.0 * t, -((v[1] - v[0]) ** 2) - v[2] ** 2]),
-        parameters=parameters[0],
     )
     q = np.column_stack([0.5 * parameters, 0.5 * parameters + 0.6, np.full((3, 1), -0.8)])
     runs = ensemble(system, (0.0, 0.4), q, np.full((3, 3), [-0.5, -0.5, 0.0]), parameters=parameters, method=method)
@@ -258,17 +244,11 @@ def test_drives_whose_speed_jumps_are_left_to_single_runs(method):
     assert runs.singly.all()
 
 
-@pytest.mark.parametrize(
-    ("name", "method"),
-    [
-        ("redundant_slider_crank", "DOP853"),
-        slow("driven_slider_crank", "auto"),
-        slow("redundant_slider_crank", "auto"),
-        slow("andrews", "RadauIIA9"),
-        slow("heavy_top", "RadauIIA5"),
-        slow("n_four_bar", "DOP853"),
-    ],
-)
+NAMED = [slow("driven_slider_crank", "auto"), slow("redundant_slider_crank", "auto"), slow("andrews", "RadauIIA9")]
+NAMED += [("redundant_slider_crank", "DOP853"), slow("heavy_top", "RadauIIA5"), slow("n_four_bar", "DOP853")]
+
+
+@pytest.mark.parametrize(("name", "method"), NAMED)
 def test_mechanisms(name, method):
     problem = getattr(mechanisms, name)()
     span = (0.0, 0.01 if name == "andrews" else 0.3)
@@ -291,9 +271,6 @@ def test_runs_through_a_singular_position_are_made_singly(method):
     assert "lose rank" in runs.reasons[1] or "singular position" in runs.reasons[1]
 
 
-# long steps
-
-
 def test_long_steps_stay_on_their_assembly():
     """Four-bars near a change of assembly, at a loose tolerance, end where series at a tight one have them end."""
     made, random = [], np.random.default_rng(17)
@@ -304,9 +281,7 @@ def test_long_steps_stay_on_their_assembly():
             made.append(mechanisms.four_bar(lengths, ground, random.uniform(-1.0, 1.0), int(random.choice((-1, 1)))))
         except ValueError:
             continue
-    q, v, p = (
-        np.array([get(m) for m in made]) for get in (lambda m: m.q0, lambda m: m.v0, lambda m: m.system.parameters)
-    )
+    q, v, p = (np.array(each) for each in zip(*((m.q0, m.v0, m.system.parameters) for m in made), strict=True))
     ends = {}
     for method, tolerance in (("Taylor", 1e-11), ("DOP853", 1e-4)):
         runs = ensemble(made[0].system, (0.0, 4.0), q, v, parameters=p, rtol=tolerance, atol=tolerance, method=method)
@@ -334,14 +309,11 @@ BRANCHING = {
 }
 
 
-@pytest.mark.parametrize(
-    ("case", "compiled"),
-    [
-        ("a branch", True),
-        ("a number made of a parameter", False),
-        *(slow(case, False) for case in ("a branch on a parameter", "a parameter rounded")),
-    ],
-)
+UNSEEN = [("a branch", True), ("a number made of a parameter", False)]
+UNSEEN += [slow(case, False) for case in ("a branch on a parameter", "a parameter rounded")]
+
+
+@pytest.mark.parametrize(("case", "compiled"), UNSEEN)
 def test_what_lanes_cannot_see_is_found_and_made_singly(case, compiled):
     q, v, parameters = drawn(8)
     system = system_of(parameters, mass=np.eye(2), force=BRANCHING[case], compile=compiled)

@@ -16,14 +16,11 @@ from tests.problems import START, held_twice, pendulum_state
 from twoloop import ConstraintWarning, consistent_state, solve_dae
 from twoloop.methods.presets import PRESETS
 
+FACTORS = [("DOP853", -0.5), ("RadauIIA5", 3.0), ("Newmark", 1.0)]
+FACTORS += [slow(method, 3.0) for method in ("SunRadau5", "Gauss12", "BDF", "PaperIRK")]
 
-@pytest.mark.parametrize(
-    ("method", "factor"),
-    [
-        *(("DOP853", -0.5), ("RadauIIA5", 3.0), ("Newmark", 1.0)),
-        *(slow(method, 3.0) for method in ("SunRadau5", "Gauss12", "BDF", "PaperIRK")),
-    ],
-)
+
+@pytest.mark.parametrize(("method", "factor"), FACTORS)
 def test_a_row_given_twice_shares_the_force(method, factor):
     """Minimum norm: lam (1, factor) / (1 + factor^2) of the one multiplier, which is known in closed form."""
     with pytest.warns(ConstraintWarning, match=r"row\(?s?\)? .*[01]") as caught:
@@ -47,15 +44,11 @@ def test_rows_that_part_later_end_the_run(method):
     assert "2" in result.message
 
 
-@pytest.mark.parametrize(
-    ("name", "off_q", "off_v"), [("redundant slider-crank", 1e-3, 0.0), ("wobbling disc", 0.0, 0.01)]
-)
+@pytest.mark.parametrize(("name", "off_q", "off_v"), [("redundant slider-crank", 1e-3, 0), ("wobbling disc", 0, 0.01)])
 def test_a_guess_is_projected_on_all_rows(name, off_q, off_v):
-    """Velocities on the non-holonomic ones of the disc, too, whose positions stay."""
     m = mechanism(name)
     system, (q, v), shape = m.system(), m.start, np.cos(np.arange(m.start[0].size))
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", ConstraintWarning)
+    with warnings.catch_warnings(action="ignore", category=ConstraintWarning):
         found_q, found_v = consistent_state(system, 0.0, q + off_q * shape, v + off_v * shape)
     assert np.abs(system.constraint(0.0, found_q)).max() < 1e-12
     assert np.abs(system.velocity_constraint(0.0, found_q, found_v)).max() < 1e-11
@@ -65,7 +58,6 @@ def test_a_guess_is_projected_on_all_rows(name, off_q, off_v):
 
 @pytest.mark.parametrize("method", slow_but(["auto", "Newmark", "BDF"], PRESETS))
 def test_every_preset_takes_non_holonomic_rows(method):
-    """Only the canonical variables refuse them."""
     result = slide(method=method, rtol=1e-5, atol=1e-5)
     assert result.success, result.message
     q, _ = KNIFE_EDGE.motion(result.t[-1])

@@ -78,14 +78,8 @@ def computed(problem, motion, end):
     q, v = (np.array(each, dtype=float) for each in (q, v))
     other_q, other_v = index_1(problem, end)
     lam, held_lam = multipliers(problem.system, end, q, v, held_v)
-    return {
-        "t": end,
-        "q": q.tolist(),
-        "v": v.tolist(),
-        "lam": lam.tolist(),
-        "digits": {"q": held_q, "v": held_v, "lam": held_lam},
-        "agrees": {"q": digits(other_q, q), "v": digits(other_v, v)},
-    }
+    held, agrees = {"q": held_q, "v": held_v, "lam": held_lam}, {"q": digits(other_q, q), "v": digits(other_v, v)}
+    return {"t": end, "q": q.tolist(), "v": v.tolist(), "lam": lam.tolist(), "digits": held, "agrees": agrees}
 
 
 def main(names):

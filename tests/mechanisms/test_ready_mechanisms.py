@@ -17,7 +17,7 @@ from tests.marks import slow, slow_but
 from tests.mechanisms.make_references import converged, digits
 from tests.mechanisms.motions import closed_forms, known_motions
 from tests.mechanisms.motions.integrate import by_scipy
-from tests.problems import row_errors, run, slope, worst
+from tests.problems import LINKAGES, row_errors, run, slope, worst
 from tests.processes import run_python
 from twoloop import ConstraintWarning, mechanisms
 from twoloop.bodies.rotation import euler_parameters, euler_rates
@@ -40,16 +40,11 @@ REGULAR = [name for name in PROBLEMS if name not in SINGULAR]
 RUN_HERE = [name for name in REGULAR if name not in COMPUTED or (name in ELSEWHERE and "chain" in name)]
 
 
-def of(name):
-    return PROBLEMS[name]
-
-
 @cache
 def end_of(name, method):
     """The run to the reference at 1e-10."""
-    problem = of(name)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", ConstraintWarning)
+    problem = PROBLEMS[name]
+    with warnings.catch_warnings(action="ignore", category=ConstraintWarning):
         result = run(problem, problem.reference.t, method=method, rtol=1e-10, atol=1e-10)
     assert result.success, result.message
     return result
@@ -57,7 +52,7 @@ def end_of(name, method):
 
 @pytest.mark.parametrize("name", PROBLEMS)
 def test_the_start_is_consistent(name):
-    problem = of(name)
+    problem = PROBLEMS[name]
     assert problem.q0.shape == problem.v0.shape == (problem.system.n_q,)
     assert np.abs(problem.system.constraint(0.0, problem.q0)).max(initial=0.0) < 1e-14
     rates = problem.system.velocity_constraint(0.0, problem.q0, problem.v0)
@@ -66,7 +61,7 @@ def test_the_start_is_consistent(name):
 
 @pytest.mark.parametrize("name", PROBLEMS)
 def test_it_says_what_it_is(name):
-    problem = of(name)
+    problem = PROBLEMS[name]
     assert problem.source and problem.purpose and problem.parameters
     assert {"open chain", "closed chain"} & set(problem.tags) and {"planar", "spatial"} & set(problem.tags)
     assert len(problem.coordinates) == len(set(problem.coordinates)) == problem.system.n_q
@@ -78,7 +73,6 @@ def test_it_says_what_it_is(name):
         assert problem.published.digits["q"] < reference.digits["q"]
 
 
-# --- references by a second route
 @pytest.mark.parametrize("name", slow_but(COMPUTED.keys() - LONG, COMPUTED))
 def test_references_by_equations_in_few_coordinates(name):
     """In double precision by SciPy; the numbers themselves are from extended precision, by extrapolation."""
@@ -94,14 +88,14 @@ def test_references_by_equations_in_few_coordinates(name):
 def test_references_again_in_extended_precision(name):
     _, motion, end = COMPUTED[name]
     (q, v), _ = converged(motion, end)
-    assert digits(np.array(q, dtype=float), of(name).reference.q) > 13.0
-    assert digits(np.array(v, dtype=float), of(name).reference.v) > 12.5
+    assert digits(np.array(q, dtype=float), PROBLEMS[name].reference.q) > 13.0
+    assert digits(np.array(v, dtype=float), PROBLEMS[name].reference.v) > 12.5
 
 
 @pytest.mark.parametrize("name", COMPUTED)
 def test_references_obey_the_mechanisms_own_equations(name):
     """On all rows, with the multipliers stored; the acceleration is then unique where the mass is regular."""
-    problem = of(name)
+    problem = PROBLEMS[name]
     system, known = problem.system, problem.reference
     assert np.abs(system.constraint(known.t, known.q)).max(initial=0.0) < 1e-14
     assert np.abs(system.velocity_constraint(known.t, known.q, known.v)).max() < 1e-13 * max(1.0, np.abs(known.v).max())
@@ -131,7 +125,6 @@ def test_driven_slider_crank_by_other_means():
     assert -lam[-1] * v[2] == pytest.approx(power, rel=1e-9)
 
 
-# --- published values
 def test_andrews_as_published_is_the_state_a_picosecond_later():
     problem = mechanisms.andrews()
     known, printed = problem.reference, problem.published
@@ -147,27 +140,24 @@ def test_sundials_slider_crank_as_printed():
     assert np.abs(problem.published.q - problem.reference.q).max() < 4.4e-5
 
 
-@pytest.mark.parametrize(
-    "problem", [mechanisms.heavy_top(), mechanisms.n_four_bar(2)], ids=lambda problem: problem.name
-)
+@pytest.mark.parametrize("problem", [mechanisms.heavy_top(), mechanisms.n_four_bar(2)], ids=["top", "windows"])
 def test_printed_values_hold_the_digits_said(problem):
     printed = ~np.isnan(problem.published.q)
     assert printed.any()
     assert digits(problem.published.q[printed], problem.reference.q[printed]) >= problem.published.digits["q"]
 
 
-# --- runs
 @pytest.mark.parametrize("method", ["Gauss12", slow("DOP853")])
 @pytest.mark.parametrize("name", RUN_HERE)
 def test_nine_digits(name, method):
-    result, known = end_of(name, method), of(name).reference
+    result, known = end_of(name, method), PROBLEMS[name].reference
     assert digits(result.q[:, -1], known.q) > 9.0 and digits(result.v[:, -1], known.v) > 7.5
     assert digits(result.lam[:, -1], known.lam) > 7.0
 
 
-@pytest.mark.parametrize("name", [name for name in REGULAR if name in RUN_HERE or of(name).invariants])
+@pytest.mark.parametrize("name", [name for name in REGULAR if name in RUN_HERE or PROBLEMS[name].invariants])
 def test_invariants(name):
-    problem, result = of(name), end_of(name, "Gauss12")
+    problem, result = PROBLEMS[name], end_of(name, "Gauss12")
     kept = dict(problem.invariants) | ({"energy": problem.energy} if problem.conserved else {})
     for quantity in kept.values():
         values = quantity(result.t, result.q, result.v)
@@ -239,35 +229,25 @@ angles = st.floats(-math.pi, math.pi)
 branches = st.sampled_from([-1, 1])
 
 
-def assembled(L1, L2, L3, ground, theta3, branch):
-    """The problem, or a discarded example where the bars do not reach."""
-    reach = abs(ground - L3 * np.exp(1j * theta3))
-    assume(abs(L1 - L2) * 1.02 + 0.02 < reach < 0.98 * (L1 + L2))
-    return four_bar(lengths=(L1, L2, L3), ground=ground, theta3=theta3, branch=branch)
-
-
 @given(lengths, lengths, lengths, lengths, angles, branches)
 def test_assembled_linkages_satisfy_their_constraints_on_the_branch_asked_for(L1, L2, L3, ground, theta3, branch):
-    problem = assembled(L1, L2, L3, ground, theta3, branch)
+    joint23 = ground - L3 * np.exp(1j * theta3)
+    assume(abs(L1 - L2) * 1.02 + 0.02 < abs(joint23) < 0.98 * (L1 + L2))
+    problem = four_bar(lengths=(L1, L2, L3), ground=ground, theta3=theta3, branch=branch)
     q = problem.q0
     assert np.abs(problem.system.constraint(0.0, q)).max() < 1e-12 and q[8] == theta3 and (problem.v0 == 0.0).all()
     joint12 = 2.0 * complex(q[0], q[1])
-    joint23 = ground - L3 * np.exp(1j * theta3)
     side = (joint23.conjugate() * joint12).imag  # positive: to the left of the line from O to joint 2-3
     assert math.copysign(1.0, side) == branch
 
 
 # the embedded estimate of RadauIIA5 is of order 3, and its steps continue unextrapolated
-MINIMAL = [
-    ("default_four_bar", "SunRadau5", 1e-10),
-    ("collinear_four_bar", "Gauss12", 1e-10),
-    slow("collinear_four_bar", "RadauIIA5", 1e-11),
-]
+MINIMAL = [("default", "SunRadau5", 1e-10), ("collinear", "Gauss12", 1e-10), slow("collinear", "RadauIIA5", 1e-11)]
 
 
 @pytest.mark.parametrize(("linkage", "method", "tol"), MINIMAL)
-def test_linkages_agree_with_the_minimal_form_to_nine_digits(linkage, method, tol, request):
-    problem, times = request.getfixturevalue(linkage), np.linspace(0.0, 10.0, 41)
+def test_linkages_agree_with_the_minimal_form_to_nine_digits(linkage, method, tol):
+    problem, times = LINKAGES[linkage], np.linspace(0.0, 10.0, 41)
     result = run(problem, method=method, rtol=tol, atol=tol, t_eval=times)
     assert result.success
     q, v = MinimalFourBar.from_parameters(problem.parameters).states(times)
@@ -277,11 +257,8 @@ def test_linkages_agree_with_the_minimal_form_to_nine_digits(linkage, method, to
         assert worst(result.v[:, -1], problem.reference.v) < 1e-9
 
 
-TURNS = Rotation.random(5, random_state=5)
-
-
 def test_momentum_of_a_free_body():
-    spin, R = np.array([0.4, -0.3, 0.7]), TURNS[0].as_matrix()
+    spin, R = np.array([0.4, -0.3, 0.7]), Rotation.random(random_state=5).as_matrix()
     e, moments = euler_parameters(R), np.array([1.0, 2.0, 2.5])
     q, v = np.append([0.1, 0.2, 0.3], e), np.append([1.0, -2.0, 0.5], euler_rates(e, spin))
     point, axis = np.array([0.5, 0.0, -1.0]), np.array([0.0, 0.6, 0.8])

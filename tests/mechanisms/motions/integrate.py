@@ -9,17 +9,12 @@ DIVISIONS = 2 * np.arange(1, COLUMNS + 1)
 
 def by_scipy(rate, y, end, times=None):
     """y at the end (or at times) by DOP853 at 1e-13."""
-    solution = solve_ivp(
-        lambda t, y: np.array(rate(t, y), dtype=float),
-        (0.0, end),
-        np.array(y, dtype=float),
-        "DOP853",
-        t_eval=[end] if times is None else times,
-        rtol=1e-13,
-        atol=1e-14,
-    )
+    times, one = ([end], True) if times is None else (times, False)
+    options = {"t_eval": times, "rtol": 1e-13, "atol": 1e-14}
+    start = np.array(y, dtype=float)
+    solution = solve_ivp(lambda t, y: np.array(rate(t, y), dtype=float), (0.0, end), start, "DOP853", **options)
     assert solution.success, solution.message
-    return solution.y[:, -1] if times is None else solution.y
+    return solution.y[:, -1] if one else solution.y
 
 
 def by_extrapolation(rate, y, end, n):

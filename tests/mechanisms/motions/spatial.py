@@ -11,7 +11,6 @@ from tests.mechanisms.motions.planar import PI, G
 f = np.longdouble
 
 
-# --- Euler parameters
 def turned(e, w):
     """e' at the angular velocity w along the axes of space: half the product of quaternions w e."""
     return [
@@ -80,17 +79,10 @@ def rolling_disc():
         frame = -upright * np.tan(lean)  # turn of the frame about the axis of the disc
         yaw_rate = upright / np.cos(lean)
         fall = m * G * r * np.sin(lean) - (axial + m * r**2) * upright * turn + across * frame * upright
-        return np.array(
-            [
-                yaw_rate,
-                ahead,
-                turn + yaw_rate * np.sin(lean),
-                fall / (across + m * r**2),
-                (axial * ahead * turn - across * frame * ahead) / across,
-                m * r**2 * ahead * upright / (axial + m * r**2),
-                *centre(yaw, lean, ahead, turn),
-            ]
-        )
+        angles = [yaw_rate, ahead, turn + yaw_rate * np.sin(lean), fall / (across + m * r**2)]
+        speeds = [(axial * ahead * turn - across * frame * ahead) / across]
+        speeds += [m * r**2 * ahead * upright / (axial + m * r**2)]
+        return np.array([*angles, *speeds, *centre(yaw, lean, ahead, turn)])
 
     def known(t, y):
         yaw, lean, spin, ahead, upright, turn, x, z = y
