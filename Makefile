@@ -120,7 +120,7 @@ test-portable: install ## the tests of twoloop and references as on another proc
 # the numba cache is its own: the versions would take turns in compiling everything anew
 test-oldest: .venv-oldest/installed ## the tests of twoloop with the oldest versions it supports; about ten minutes
 	NUMBA_CACHE_DIR=$(CURDIR)/.venv-oldest/numba .venv-oldest/bin/python -m pytest tests \
-		--ignore tests/references --ignore tests/studies --ignore tests/test_turning_crank.py $(ARGS)
+		--ignore tests/references --ignore tests/studies $(ARGS)
 
 .venv-oldest/installed: FITS := import sys, venv, ensurepip; sys.exit(sys.version_info[:2] != (3, 11))
 .venv-oldest/installed: NEEDS := 3.11
