@@ -18,7 +18,7 @@ from references.driver import user_call
 from references.lines import CannotRun
 from studies.bench import metrics
 from studies.bench.apart import Alarm
-from studies.bench.progress import track
+from studies.bench.progress import say, track
 from studies.bench.reference_motion import ReferenceMotion, make_reference
 from studies.bench.store import Array, KeptRows, Row
 from twoloop import ConstrainedSystem, Result, Statistics, solve_dae
@@ -196,6 +196,7 @@ def collect(runs: Iterable[Run], kept: KeptRows, measure: Measure | None = None)
     rounds = range(max((run.repeats for run in runs), default=0))
     left = [(run, k) for k in rounds for run in runs if k < run.repeats and run.key(k) not in kept]
     for case in {id(run.case): run.case for run, _ in left}.values():
+        say(f"reference motion of {case.name} to {case.t_end:g} s ...")
         _ = case.scale  # makes the reference, which is not to be timed with anything
     warm: Warm = set()
     # a line for each run, and for its repetitions as far as they take their time

@@ -36,7 +36,12 @@ class Progress:
             return
         self._printed = now
         left = (self.total - self.done) * ((now - self._first) / (self.done - 1) if self.done > 1 else seconds)
-        print(f"{self.done}/{self.total}  {label}  {seconds:.1f} s  {remaining(left)}", file=sys.stderr, flush=True)
+        say(f"{self.done}/{self.total}  {label}  {seconds:.1f} s  {remaining(left)}")
+
+
+def say(line: str) -> None:
+    """Print a line of progress at once."""
+    print(line, file=sys.stderr, flush=True)
 
 
 def track(items: Sequence[Item], label: Callable[[Item], str], always: Callable[[Item], bool] = bool) -> Iterator[Item]:
