@@ -59,7 +59,6 @@ def cell(text: str) -> str:
 
 
 def statuses() -> list[str]:
-    """Return the rows of the statuses, with their meanings."""
     rows = ["| `result.status` | What it means |", "|---|---|"]
     for status in Status:
         name = f"`{status.name}` = {int(status)}"
@@ -78,7 +77,6 @@ def groups() -> dict[str, list[Case]]:
 
 
 def page() -> str:
-    """Return the page."""
     parts = [BEGINNING, "## How a run ends\n", *statuses(), ""]
     for group, cases in groups().items():
         parts += [f"## {group}\n", *([MEANT[group]] if group in MEANT else [])]

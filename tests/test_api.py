@@ -11,7 +11,6 @@ from twoloop import ConstrainedSystem, Statistics, Status, exported, mechanisms,
 
 
 def test_arguments_that_are_left_out_are_as_documented():
-    """With all of them given, a run is that of the few that are needed."""
     few = ConstrainedSystem.from_python(**PLAIN)
     more = {"constraint_rate": None, "gamma": None, "compile": False, "name": "system"}
     system = ConstrainedSystem.from_python(**PLAIN, **more)

@@ -17,7 +17,6 @@ METHODS = ["Adams", "RadauIIA5", "BDF", "SunRadau5", "Gauss12", "Newmark", "DOP8
 @pytest.mark.parametrize("tolerance", quick([1e-1, 1e-4, 1e-8]))
 @pytest.mark.parametrize("method", quick(METHODS, 3))
 def test_a_mechanism_without_independent_coordinates(method, tolerance):
-    """Every coordinate is prescribed."""
     if method == "Newmark":
         tolerance = max(tolerance, 1e-6)
     problem = driven_slider_crank()

@@ -15,23 +15,12 @@ from twoloop.bodies import PlanarModel
 FILE = """
 <mujoco model="linkage">
   <option timestep="0.002"/>
-  <default>
-    <geom type="capsule" size="0.02" contype="0" conaffinity="0"/>
-    <joint axis="0 1 0"/>
-  </default>
+  <default><geom type="capsule" size="0.02" contype="0" conaffinity="0"/><joint axis="0 1 0"/></default>
   <worldbody>
-    <body name="crank">
-      <joint name="pivot"/>
-      <geom fromto="0 0 0 0.1 0 0.3"/>
-      <body name="rod" pos="0.1 0 0.3">
-        <joint name="elbow"/>
-        <geom fromto="0 0 0 0.7 0 0.1"/>
-      </body>
+    <body name="crank"><joint name="pivot"/><geom fromto="0 0 0 0.1 0 0.3"/>
+      <body name="rod" pos="0.1 0 0.3"><joint name="elbow"/><geom fromto="0 0 0 0.7 0 0.1"/></body>
     </body>
-    <body name="rocker" pos="0.7 0 0">
-      <joint name="base"/>
-      <geom fromto="0 0 0 0.1 0 0.4"/>
-    </body>
+    <body name="rocker" pos="0.7 0 0"><joint name="base"/><geom fromto="0 0 0 0.1 0 0.4"/></body>
   </worldbody>
   <equality><connect body1="rod" body2="rocker" anchor="0.7 0 0.1"/></equality>
 </mujoco>

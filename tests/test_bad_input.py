@@ -41,7 +41,6 @@ def test_the_page_of_errors_is_what_the_cases_give():
     assert page.read_text(encoding="utf-8") == errors_page.page(), "renew it: python -m tests.errors_page"
 
 
-# --- what is right is accepted
 @pytest.mark.parametrize(
     "value",
     [[-1, 0], (-1.0, 0.0), np.array([-1, 0], dtype=np.int8), np.array([-1.0, 0.0], dtype=np.float32), [2**70, 0]],
@@ -85,20 +84,13 @@ def test_a_callback_whose_shape_changes_later_names_the_time():
     refuses(ValueError, r"force of system 'pendulum'.*t = 0\.[5-9].*shape \(3,\)", system)
 
 
-# --- what goes wrong later
 class OwnError(Exception):
     pass
 
 
-@pytest.mark.parametrize(
-    ("kind", "error"),
-    [
-        *(("mass", OwnError), ("force", ZeroDivisionError), ("constraint", OwnError)),
-        *(("jacobian", ZeroDivisionError), ("gamma", OwnError), ("constraint_rate", OwnError)),
-    ],
-)
-def test_an_exception_of_a_callback_comes_through_with_its_time(kind, error):
-    good = getattr(pendulum(), kind)
+@pytest.mark.parametrize("kind", ["mass", "force", "constraint", "jacobian", "gamma", "constraint_rate"])
+def test_an_exception_of_a_callback_comes_through_with_its_time(kind):
+    good, error = getattr(pendulum(), kind), ZeroDivisionError if kind == "force" else OwnError
 
     def fails(t, *arguments):
         if t > 0.5:
@@ -148,7 +140,6 @@ def test_step_size_underflow_says_where_and_what_to_try():
     assert result.t.size == result.stats.n_accepted + 1 and result.stats.n_rejected_convergence > 10
 
 
-# --- compile=True
 @pytest.mark.parametrize(
     ("kind", "function"),
     [pytest.param("jacobian", lambda t, q: q, marks=pytest.mark.slow), ("force", lambda t, q, v: np.zeros(3))],

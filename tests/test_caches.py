@@ -115,19 +115,11 @@ def folder(tmp_path):
     return Folder(tmp_path)
 
 
-VALUES = {
-    "a_float": "FLOAT",
-    "an_attribute_of_a_module": "constants.FLOAT",
-    "a_helper": "helper(q[0])",
-    "a_helper_of_a_module": "helpers.helper(q[0])",
-    "the_default_of_a_helper": "with_default()",
-    "the_helper_of_a_helper": "outer(q[0])",
-    "the_global_of_a_helper": "named(q[0])",
-    "an_enclosed_value": "enclosed;FLOAT",
-    "an_enclosed_helper": "enclosed(q[0]);helper",
-    "what_cannot_be_watched": "overloaded(q[0])",
-    "nothing": "q[0]",
-}
+VALUES = {"a_float": "FLOAT", "an_attribute_of_a_module": "constants.FLOAT", "a_helper": "helper(q[0])"}
+VALUES |= {"a_helper_of_a_module": "helpers.helper(q[0])", "the_default_of_a_helper": "with_default()"}
+VALUES |= {"the_helper_of_a_helper": "outer(q[0])", "the_global_of_a_helper": "named(q[0])"}
+VALUES |= {"an_enclosed_value": "enclosed;FLOAT", "an_enclosed_helper": "enclosed(q[0]);helper"}
+VALUES |= {"what_cannot_be_watched": "overloaded(q[0])", "nothing": "q[0]"}
 CONSTANTS = "FLOAT = {0}.0"
 HELPERS = """
 import numba
@@ -167,11 +159,9 @@ SYSTEMS = """
 import numpy as np
 import constants
 from twoloop import ConstrainedSystem
-
 def made(scale):
     return ConstrainedSystem.from_python(
         n_q=1, n_c=0, compile=True, mass=scale * np.eye(1), force=lambda t, q, v: scale * constants.FLOAT * q)
-
 for scale in (1, 10):
     system = made(1.0 * scale)
     for kind, value in (("force", system.force(0.0, [1.0], [0.0])[0]), ("mass", system.mass(0.0, [1.0])[0, 0])):
@@ -242,7 +232,6 @@ def test_without_a_writable_folder_callbacks_and_kernels_run_and_say_so_once(fol
     assert values.split() == ["2.0", "3.0", "one", "1.0", "0", "two", "1.0", "0"] and folder.said.count(UNWRITABLE) == 1
 
 
-# --- the digests themselves
 NAMED = {"values": 1.0}
 
 
@@ -361,17 +350,12 @@ def seen_as(monkeypatch, path, **changes):
     monkeypatch.setattr(os, "stat", stat)
 
 
-@pytest.mark.parametrize(
-    ("changes", "why"),
-    [
-        ({}, ""),
-        ({"uid": 0}, ""),
-        ({"uid": OTHER}, f"belongs to user {OTHER}"),
-        ({"mode": 0o040777}, "can be written by everybody (mode 777)"),
-        ({"mode": 0o040775, "gid": OTHER}, f"can be written by group {OTHER} (mode 775)"),
-        ({"mode": 0o040755, "gid": OTHER}, ""),
-    ],
-)
+DOUBTS = [({}, ""), ({"uid": 0}, ""), ({"uid": OTHER}, f"belongs to user {OTHER}")]
+DOUBTS += [({"mode": 0o040777}, "can be written by everybody (mode 777)"), ({"mode": 0o040755, "gid": OTHER}, "")]
+DOUBTS += [({"mode": 0o040775, "gid": OTHER}, f"can be written by group {OTHER} (mode 775)")]
+
+
+@pytest.mark.parametrize(("changes", "why"), DOUBTS)
 @pytest.mark.parametrize("above", [False, True])
 def test_whose_folders_are_in_doubt(tmp_path, monkeypatch, changes, why, above):
     folder = tmp_path / "above" / "folder"

@@ -29,14 +29,12 @@ def test_every_preset_has_a_source_of_its_own(name):
     assert len(cited) == len(set(cited)) and twoloop.__version__ in text
 
 
-@pytest.mark.parametrize(
-    ("method", "cited"),
-    [
-        (RungeKutta(gauss(3), variables="momenta"), ["butcher1964", "hairer2006"]),
-        (RungeKutta(gauss(3), outer="newton"), ["butcher1964", "hairer1996"]),
-        (RungeKutta(lobatto_iiie(3), variables="momenta"), ["hairer2006"]),
-    ],
-)
+OPTIONS = [(RungeKutta(gauss(3), variables="momenta"), ["butcher1964", "hairer2006"])]
+OPTIONS += [(RungeKutta(gauss(3), outer="newton"), ["butcher1964", "hairer1996"])]
+OPTIONS += [(RungeKutta(lobatto_iiie(3), variables="momenta"), ["hairer2006"])]
+
+
+@pytest.mark.parametrize(("method", "cited"), OPTIONS)
 def test_options_that_have_sources(method, cited):
     assert keys(citation(swing(0.1, method=method, step_size=0.01)))[1:-1] == cited
 
@@ -59,8 +57,6 @@ def test_entries_are_all_used_and_agree_with_the_citation_file():
 
 
 def test_what_cannot_be_cited():
-    with pytest.raises(TypeError, match="citation needs a result of solve_dae; given str"):
-        citation("Gauss8")
     row = np.zeros((1, 2))
     foreign = Result(row[0], row, row, row, row, row[0], Status.REACHED_END, "", Statistics())
     with pytest.raises(ValueError, match="this result was made by another solver"):

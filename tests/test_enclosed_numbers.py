@@ -129,11 +129,7 @@ def pulls():
     return {
         "cell": (lambda t: g + 0.0 * t, rebind, "g"),
         "tuple": (lambda t: tables[0][0] + 0.0 * t, fill(tables[0]), r"tables\[0\]"),
-        "table in a module in a module": (
-            lambda t: mall.shop.table[0] + 0.0 * t,
-            fill(shop.table),
-            r"mall\.shop\.table",
-        ),
+        "table in two modules": (lambda t: mall.shop.table[0] + 0.0 * t, fill(shop.table), r"mall\.shop\.table"),
         "module in a cell": (lambda t: store.pull + 0.0 * t, set_pull, r"store\.pull"),
         "other helper in a cell": (lambda t: law(t), rebind, "law"),
         "array": (lambda t: table[0] + 0.0 * t, fill(table), "table"),
@@ -231,25 +227,19 @@ import sys, types
 import numpy as np
 from numba import njit
 from twoloop import callback
-
 g = float(sys.argv[1])
-
 @njit
 def heavy(t):
     return 9.81 + 0.0 * t
-
 @njit
 def light(t):
     return 4.0 + 0.0 * t
-
 @njit
 def of_g(t):
     return g + 0.0 * t
-
 @njit
 def pull_of(place, t):
     return place.pull + 0.0 * t
-
 def made(how):
     shop = types.ModuleType("shop")
     shop.pull, tables = g, ((np.array([g]),), 1.0)
@@ -263,12 +253,10 @@ def made(how):
     def module_as_argument(t, q, v, p, Q):
         Q[0] = -pull_of(shop, t)
     return callback("force")(locals()[how])
-
 def values(how):
     Q, function = np.zeros(1), made(how)
     function(0.0, np.zeros(1), np.zeros(1), np.zeros(0), Q)
     return -Q[0]
-
 hows = "in_tuple", "again", "of_helper", "module_as_argument"
 print(*map(values, hows))
 if g == 9.81:

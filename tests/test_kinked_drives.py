@@ -132,9 +132,7 @@ def test_a_ramp_between_the_ends_of_a_step(method, tolerance, width):
 @pytest.mark.parametrize("method", quick(["auto", "RadauIIA9", "BDF", "Adams", "PaperIRK"]))
 def test_a_jump_of_the_acceleration_of_a_drive_is_none(method):
     at = 0.437
-    system = driven(
-        lambda t: 3.0 * max(0.0, t - at) ** 2, lambda t: 6.0 * max(0.0, t - at), lambda t: 6.0 if t > at else 0.0
-    )
+    system = driven(lambda t: 3 * max(0, t - at) ** 2, lambda t: 6 * max(0, t - at), lambda t: 6.0 if t > at else 0.0)
     result = solve_dae(system, (0.0, END), START, np.zeros(5), method, 1e-6, 1e-6)
     assert off(result, at_rest_until(at, 0.0, 6.0)) < 1e-3 and "jumps" not in result.message
 

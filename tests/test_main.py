@@ -18,19 +18,14 @@ FILE = """
 from twoloop.mechanisms import four_bar, heavy_top
 import dataclasses
 import twoloop
-
 def linkage():
     return four_bar()
-
 def bare():
     return dataclasses.replace(four_bar(), drawing=None)
-
 def steep():
     return four_bar(theta3=2.0)
-
 def number():
     return 3
-
 def mass(t, q):
     return [[1.0]]
 """

@@ -224,8 +224,6 @@ def test_bounds_are_looked_at_where_parameters_are_places(wrong):
 
 
 # --- code that is traced once for systems that share callbacks: with any parameters it is what they would get alone
-MECHANISMS = [mechanisms.four_bar, mechanisms.andrews, mechanisms.driven_crank, mechanisms.redundant_slider_crank]
-MECHANISMS += [mechanisms.spatial_four_bar, mechanisms.bricard, mechanisms.governor]
 SPAN = (0.0, 1.0)
 
 

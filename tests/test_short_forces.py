@@ -125,21 +125,13 @@ def falling_off(t, q, v):
     return -0.1 * q / (1.0 + q**2)
 
 
-@pytest.mark.parametrize(
-    ("force", "short"),
-    quick(
-        [
-            (lambda t, q, v: -0.1 * np.sin(q * v), False),
-            (falling_off, True),
-            (lambda t, q, v: -0.1 * q if t < 1e9 else q, True),
-            (lambda t, q, v: -0.1 * q, False),
-            (lambda t, q, v: -0.1 * np.sin(q) * np.cos(t), True),
-            (lambda t, q, v: -0.1 * np.sin((q + v) * (q - 8.0 * v)), True),
-            (lambda t, q, v: -0.1 * np.tanh(q), True),
-        ],
-        3,
-    ),
-)
+SLOWLY = [(lambda t, q, v: -0.1 * np.sin(q * v), False), (falling_off, True)]
+SLOWLY += [(lambda t, q, v: -0.1 * q if t < 1e9 else q, True), (lambda t, q, v: -0.1 * q, False)]
+SLOWLY += [(lambda t, q, v: -0.1 * np.sin(q) * np.cos(t), True), (lambda t, q, v: -0.1 * np.tanh(q), True)]
+SLOWLY += [(lambda t, q, v: -0.1 * np.sin((q + v) * (q - 8.0 * v)), True)]
+
+
+@pytest.mark.parametrize(("force", "short"), quick(SLOWLY, 3))
 def test_steps_are_longer_than_a_hundredth_where_forces_change_slowly(force, short):
     """4/15 of a step is the longest part without a stage: the equations are still evaluated in each hundredth."""
     system = unconstrained(force, compile=True)
@@ -148,17 +140,12 @@ def test_steps_are_longer_than_a_hundredth_where_forces_change_slowly(force, sho
     assert result.widest_gap == pytest.approx(0.01, rel=1e-9)
 
 
+HEIGHT = {"constraint": lambda t, q: np.array([q[1] - 0.1 / (1.0 + q[0] ** 2)])}
 HILL = {"n_q": 2, "n_c": 1, "mass": np.eye(2), "force": lambda t, q, v: np.array([0.1, -1.0])}
 SHORT_CHANGES = {
-    "mass": {
-        "mass": lambda t, q: np.diag(np.array([1.0 - 0.999 * np.exp(-(((t - 0.5) / 0.002) ** 2)), 1.0])),
-        "n_c": 0,
-    },
-    "constraint": {"constraint": lambda t, q: np.array([q[1] - 0.1 / (1.0 + q[0] ** 2)])},
-    "jacobian": {
-        "constraint": lambda t, q: np.array([q[1] - 0.1 / (1.0 + q[0] ** 2)]),
-        "jacobian": lambda t, q: np.array([[0.2 * q[0] / (1.0 + q[0] ** 2) ** 2, 1.0]]),
-    },
+    "mass": {"mass": lambda t, q: np.diag(np.array([1.0 - 0.999 * np.exp(-(((t - 0.5) / 2e-3) ** 2)), 1.0])), "n_c": 0},
+    "constraint": HEIGHT,
+    "jacobian": HEIGHT | {"jacobian": lambda t, q: np.array([[0.2 * q[0] / (1.0 + q[0] ** 2) ** 2, 1.0]])},
     "nonholonomic": {"n_c": 0, "n_a": 1, "nonholonomic": lambda t, q: np.array([[1.0 / (1.0 + q[0] ** 2), -1.0]])},
 }
 
@@ -552,8 +539,7 @@ def test_steps_across_singular_positions(windows, tolerances, end, compiled):
     result = across(problem, end, tolerances, dense_output=True, compiled=compiled)
     assert result.success
     assert result.h.max() / result.h.min() > 100.0  # else there is nothing to see
-    with warnings.catch_warnings(record=True) as said:
-        warnings.simplefilter("always")
+    with warnings.catch_warnings(record=True, action="always") as said:
         state = result.sol(inside(result.t))
     # they were off by metres
     assert (largest_errors(state, problem.motion) < 20.0 * largest_errors(result, problem.motion)).all()
@@ -586,7 +572,6 @@ CASES += [(RUBBING, "DOP853", 1e-7), (BRAKING, "Gauss8", 1e-10), (BRAKING, "Rada
 
 @pytest.mark.parametrize(("case", "method", "tol"), quick(CASES, 3))
 def test_between_steps_that_forces_make_short(case, method, tol):
-    """Beside steps that the force made short, and within these."""
     system, q0 = case
     span = (system, (0.0, 2.0), q0, [0.0, 0.0])
     result = solve_dae(*span, method, tol, tol, dense_output=True)

@@ -105,7 +105,6 @@ def test_a_start_off_the_constraints_is_a_row():
     assert sum(in_lanes(rows)) == 6
 
 
-# --- functions of one's own
 def pull(t, q, v, p):
     return np.array([0.0, -p[0]])
 
@@ -160,7 +159,6 @@ def last_place(problem, result):
     return {"x": result.q[0, -1]}
 
 
-# --- tasks
 def test_rows_are_the_same_however_they_are_shared_out(monkeypatch):
     options = {"measure": ends_of, "t_span": (0.0, 1.0), "t_eval": TIMES, "parallel": "threads"}
     monkeypatch.setattr(shared_out, "LARGEST_SHARED", 7)

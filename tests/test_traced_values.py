@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from tests import problems
-from tests.compiled import unit_mass
 from tests.problems import kept, pendulum, quick, unconstrained, worst
-from twoloop import ConstrainedSystem, Status, callback, consistent_state, mechanisms, solve_dae
+from twoloop import ConstrainedSystem, Status, consistent_state, mechanisms, solve_dae
 from twoloop.generate.derived import standing_for
 from twoloop.generate.series import series_program
 from twoloop.generate.traced_values import unchecked
@@ -26,9 +25,6 @@ START = {"t_span": (0.0, 0.3), "q0": [1.0, 0.0], "v0": [0.0, 0.0]}
 
 def run(system, method="Taylor", tolerance=1e-8, **options):
     return solve_dae(system, **START, method=method, rtol=tolerance, atol=tolerance, **options)
-
-
-# callbacks that do something else with symbols than with numbers, unless that is refused ----------------------------
 
 
 def swallowed_branch(t, q, v):
@@ -114,9 +110,6 @@ def test_what_tells_symbols_from_numbers_is_refused(case):
         run(pendulum(force=force), "DOP853", compiled=True)
 
 
-# callbacks that are traced ------------------------------------------------------------------------------------------
-
-
 class Damper:
     k = 2.0
 
@@ -178,34 +171,6 @@ def test_what_does_the_same_with_symbols_is_traced(case):
     assert one.success and worst(one.q[:, -1], other.q[:, -1]) < 1e-6
 
 
-# values that are not what they were ---------------------------------------------------------------------------------
-
-K = 5.0
-
-
-@callback("force")
-def damped(t, q, v, p, Q):
-    Q[0] = -K * v[0]
-    Q[1] = -9.81 - K * v[1]
-
-
-def free(force):
-    return ConstrainedSystem(n_q=2, n_c=0, mass=unit_mass, force=force, name="free")
-
-
-@pytest.fixture
-def another_constant(monkeypatch):
-    """The global is another than when numba compiled the callback."""
-    monkeypatch.setattr("tests.test_traced_values.K", 0.5)
-
-
-@pytest.mark.usefixtures("another_constant")
-def test_a_global_that_numba_froze_is_not_read_anew():
-    for method, compiled in (("Taylor", False), ("DOP853", True), ("Adams", True), ("auto", True), ("auto", "auto")):
-        with pytest.raises(ValueError, match=r"force of 'free' was compiled with K = 5.0, which is 0.5 now"):
-            run(free(damped), method, compiled=compiled)
-
-
 @pytest.mark.parametrize("options", [{"method": "Taylor"}, {"method": "Adams", "compiled": True}], ids=str)
 def test_an_event_that_changes_a_callback_ends_the_run(options):
     state = {"k": 1.0}
@@ -223,9 +188,6 @@ def test_random_numbers_are_seen():
     rng = np.random.default_rng(0)
     with pytest.raises(ValueError, match="does not give what its operations give"):
         run(pendulum(force=lambda t, q, v: WEIGHT - rng.uniform(1.0, 1.001) * v))
-
-
-# symmetry of M ------------------------------------------------------------------------------------------------------
 
 
 def two_masses(mass):
@@ -248,25 +210,20 @@ def test_a_mass_that_is_not_symmetric_later_ends_the_run(method):
 
 # --- c_q and gamma that are not given come exactly from what the other callbacks were traced to
 SPEED = 4000.0  # rad/s
+WEIGHT3 = np.array([0.0, -9.81, 0.0])
 
 
-def bar(speed=SPEED, length=1.0, **more):
+def bar(speed=SPEED, **more):
     """A bar about a pin, [x, y, angle] of its centre, that a drive turns at a speed."""
     functions = {
-        "constraint": lambda t, q: np.array(
-            [q[0] - length * np.cos(q[2]), q[1] - length * np.sin(q[2]), q[2] - speed * t]
-        ),
-        "jacobian": lambda t, q: np.array(
-            [[1.0, 0.0, length * np.sin(q[2])], [0.0, 1.0, -length * np.cos(q[2])], [0.0, 0.0, 1.0]]
-        ),
+        "constraint": lambda t, q: np.array([q[0] - np.cos(q[2]), q[1] - np.sin(q[2]), q[2] - speed * t]),
+        "jacobian": lambda t, q: np.array([[1.0, 0.0, np.sin(q[2])], [0.0, 1.0, -np.cos(q[2])], [0.0, 0.0, 1.0]]),
         "constraint_rate": lambda t, q: np.array([0.0, 0.0, -speed]),
-        "gamma": lambda t, q, v: -length * v[2] ** 2 * np.array([np.cos(q[2]), np.sin(q[2]), 0.0]),
+        "gamma": lambda t, q, v: -(v[2] ** 2) * np.array([np.cos(q[2]), np.sin(q[2]), 0.0]),
     }
     functions |= more
     given = {kind: function for kind, function in functions.items() if function is not None}
-    return ConstrainedSystem.from_python(
-        n_q=3, n_c=3, mass=np.diag([1.0, 1.0, 1.0 / 3.0]), force=lambda t, q, v: np.array([0.0, -9.81, 0.0]), **given
-    )
+    return unconstrained(lambda t, q, v: WEIGHT3, 3, n_c=3, mass=np.diag([1.0, 1.0, 1.0 / 3.0]), **given)
 
 
 def constant_pendulum(**more):
@@ -394,7 +351,3 @@ def test_products_may_be_a_thousand_deep():
     system = constant_pendulum(constraint=constraint, jacobian=None, gamma=None)
     rows, gamma, traced = in_kernels(system, 0.0, np.array([1.0, 0.0]), np.array([0.0, 1.0]))
     assert traced and np.allclose(rows, [[1.0, 1.0]], rtol=1e-12) and gamma[0] == pytest.approx(1000.0 * 1e-6, rel=1e-9)
-
-
-def branches(t, q, v, p):
-    return np.array([0.0, -p[0] if p[0] < 10.0 else 0.0])

@@ -39,9 +39,9 @@ def heavy(*moments):
 
 
 ODD = {
-    "moments of inertia that no masses have": (
+    "moments of no masses": (
         heavy(0.1, 0.2, 0.5),
-        "No body has the principal moments of inertia of 'top', 0.1, 0.2 and 0.5",
+        "No body has the principal moments of inertia of 'top', 0.1, 0.2 and",
     ),
     "a bar on two pins of the ground": (
         added(lambda m: m.revolute("ground", "bar", at=(1, 0))),

@@ -49,10 +49,8 @@ def test_one_window_by_steps_of_constant_size(method, step_size):
     [(1, "DOP853", 1e-6), (2, "auto", 1e-10), slow(1, "RadauIIA5", 1e-6), slow(2, "DOP853", 1e-10)],
 )
 def test_the_end_on_a_singular_position_is_right_or_the_run_says_so(n, method, tol):
-    """Velocities are not determined there."""
     m, end = mechanism(f"A02, N = {n}"), first_singular_time(n)
-    with warnings.catch_warnings(record=True) as said:
-        warnings.simplefilter("always", ConstraintWarning)
+    with warnings.catch_warnings(record=True, action="always", category=ConstraintWarning) as said:
         result = solve_dae(m.system(), (0.0, end), *m.start, method, tol, tol)
     q, v = m.state(end)
     if result.success:
@@ -65,7 +63,6 @@ def test_the_end_on_a_singular_position_is_right_or_the_run_says_so(n, method, t
 
 @pytest.mark.parametrize("method", ["DOP853", slow("SunRadau5"), slow("Gauss12")])
 def test_a_cusp_ends_the_run_and_is_named(method):
-    """Where the motion cannot go on, the run says so: the time, the row, and nothing beyond."""
     m = cusp()
     result = solve_dae(m.system(), (0.0, m.end), *m.start, method=method, max_steps=20_000)
     assert result.status in (Status.RANK_LOST, Status.STEP_TOO_SMALL), result.message
@@ -98,15 +95,11 @@ def test_steps_that_test_positions_alone_do_not_creep_onto_another_branch(method
         assert np.abs(result.q[5]).max() < 1e-6, result
 
 
+MORE = [("ESDIRK4", 1e-3), ("BDF", 1e-3), ("RadauIIA5", 1e-3), ("Adams", 1e-6), ("Taylor", 1e-6)]
+
+
 @pytest.mark.filterwarnings("ignore:the run (begins|ends) where:twoloop.ConstraintWarning")
-@pytest.mark.parametrize(
-    ("method", "tolerance"),
-    [
-        *(("auto", 1e-3), ("TRBDF2", 1e-6)),
-        *(slow(method, 1e-3) for method in ("ESDIRK4", "BDF", "RadauIIA5")),
-        *(slow(method, 1e-6) for method in ("Adams", "Taylor")),
-    ],
-)
+@pytest.mark.parametrize(("method", "tolerance"), [("auto", 1e-3), ("TRBDF2", 1e-6), *(slow(*each) for each in MORE)])
 def test_no_run_that_begins_beside_a_singular_position_succeeds_on_another_branch_without_a_word(method, tolerance):
     """Both branches are within the tolerance there, and the pivots of the start are small themselves.
 
@@ -125,19 +118,16 @@ NEAR_START = "the run begins where the constraints nearly lose rank"
 
 @pytest.mark.parametrize(("angle", "tolerance", "near"), [(1e-4, 1e-3, True), (1e-4, 1e-6, False), (0.1, 1e-3, False)])
 def test_a_start_that_the_tolerances_do_not_tell_from_a_singular_position_is_told(angle, tolerance, near):
-    """At every call, and by whatever makes the run."""
     problem, far = parallelogram(angle, 1.0), parallelogram(0.5, 1.0)
     starts = (problem.q0, problem.v0), (far.q0, far.v0), (problem.q0, problem.v0), (problem.q0, problem.v0)
     for start, beside in zip(starts, (near, False, near, near), strict=True):
-        with warnings.catch_warnings(record=True) as said:
-            warnings.simplefilter("always", ConstraintWarning)
+        with warnings.catch_warnings(record=True, action="always", category=ConstraintWarning) as said:
             result = solve_dae(problem.system, (0.0, 0.1), *start, rtol=tolerance, atol=tolerance)
         assert result.success, result.message
         assert [NEAR_START in str(each.message) for each in said] == [True] * beside
         assert (NEAR_START[1:] in result.message) is beside
     integrator = Integrator(problem.system, method="RadauIIA5", rtol=tolerance, atol=tolerance)
-    with warnings.catch_warnings(record=True) as said:
-        warnings.simplefilter("always", ConstraintWarning)
+    with warnings.catch_warnings(record=True, action="always", category=ConstraintWarning) as said:
         integrator.start(0.0, problem.q0, problem.v0)
     assert [NEAR_START in str(each.message) for each in said] == [True] * near
 
@@ -148,8 +138,7 @@ ANGLE, SPEED = 2.3, 1.7  # of a parallelogram that turns uniformly, at first
 def turning(method, tolerance, end, **options):
     """The run until `end`, the largest errors of its velocities over the tolerances, and what was said."""
     problem = parallelogram(ANGLE, SPEED, gravity=0.0)
-    with warnings.catch_warnings(record=True) as said:
-        warnings.simplefilter("always", ConstraintWarning)
+    with warnings.catch_warnings(record=True, action="always", category=ConstraintWarning) as said:
         result = solve_dae(problem.system, (0.0, end), problem.q0, problem.v0, method, tolerance, tolerance, **options)
     return result, errors_of_velocities(result.t, result.v, tolerance), [str(each.message) for each in said]
 
@@ -198,8 +187,7 @@ def test_beside_a_singular_position_no_state_between_steps_is_made_by_rounding(m
     counted = [words for words in said if ROUNDED in words]
     assert off <= (int(counted[0].split("at ")[1].split(" of")[0]) if counted else 0) < len(CLOSE_TIMES)
     dense, _, _ = turning(method, 1e-6, beside_singular(0.1), dense_output=True)
-    with warnings.catch_warnings(record=True) as said:
-        warnings.simplefilter("always", ConstraintWarning)
+    with warnings.catch_warnings(record=True, action="always", category=ConstraintWarning) as said:
         assert (dense.sol(CLOSE_TIMES).v == result.v).all()
     assert [str(each.message) for each in said] == counted
 
@@ -210,8 +198,7 @@ def test_a_sample_beside_a_singular_position_is_right_or_the_step_says_so(method
     for angle in (2e-8, -5e-8, -1e-7, 2e-7, -3e-7, 5e-7, 1e-6):
         integrator = Integrator(problem.system, method, 1e-8, 1e-8)
         integrator.start(0.0, problem.q0, problem.v0)
-        with warnings.catch_warnings(record=True) as said:
-            warnings.simplefilter("always", ConstraintWarning)
+        with warnings.catch_warnings(record=True, action="always", category=ConstraintWarning) as said:
             try:
                 state = integrator.step(beside_singular(angle))
             except RuntimeError:

@@ -187,7 +187,6 @@ def test_a_block_slides_down_bounces_and_rests_on_the_limit():
 
 
 def test_an_impact_releases_a_joint_that_sticks():
-    """A cart that sticks is hit by a mass on it, whose guide has a limit: both slide, and stop one after the other."""
     M, m, v, f, g = 2.0, 1.0, 3.0, 1.0, 0.4
     model = PlanarModel(name="cart")
     model.body("cart", mass=M, inertia=1.0, position=(0.0, 0.0))

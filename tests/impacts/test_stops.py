@@ -81,9 +81,8 @@ def test_a_plane_and_space_agree():
         inertia = (0.1, 0.1, 0.1) if spatial else 0.1
         sledge = made.body("sledge", mass=1.0, inertia=inertia, position=at(0.0, 0.0), velocity=at(1.0, 0.0))
         bob = made.body("bob", mass=0.5, inertia=inertia, position=at(0.3, -0.6))
-        made.limit(
-            made.prismatic("ground", sledge, at=at(0.0, 0.0), axis=at(2.0, 0.0)), lower=-0.2, upper=0.5, restitution=0.8
-        )
+        guide = made.prismatic("ground", sledge, at=at(0.0, 0.0), axis=at(2.0, 0.0))
+        made.limit(guide, lower=-0.2, upper=0.5, restitution=0.8)
         made.revolute(sledge, bob, at=at(0.0, 0.0), **across)
         made.stop(bob, at(0.3, -0.6), sledge, at(-0.1, 0.0), normal=at(1.0, 0.0), restitution=0.4)
         return made
@@ -142,10 +141,7 @@ def test_a_ball_that_does_not_reach_a_ceiling_does_not_hit_it():
 
 def test_two_stops_on_one_side_of_which_one_moves():
     """The stop whose rebound is the faster one hits, also where the other closes at another rate."""
-    stops = [
-        Stop(lambda t, q: -q[0] + 0.5 * t, restitution=1.0, name="moving"),
-        Stop(lambda t, q: -q[0], restitution=0.5, name="fixed"),
-    ]
+    stops = [Stop(lambda t, q: -q[0] + 0.5 * t, 1.0, "moving"), Stop(lambda t, q: -q[0], 0.5, "fixed")]
     free = unconstrained(lambda t, q, v: np.zeros(1))
     result = solve_with_stops(free, (0.0, 1.0), [0.0], [1.0], stops)
     assert result.success and [impact.stops for impact in result.impacts] == [("fixed",)]
@@ -175,10 +171,7 @@ def test_parallel_stops_let_go_at_once():
 def test_rebounds_from_a_wall_towards_which_another_turns_the_load_die_out():
     """Without the wall on the left, the load would lift the body off the slope."""
     pressed = unconstrained(lambda t, q, v: np.array([-6.0, -1.0]), 2)
-    groove = [
-        Stop(lambda t, q: q[0], name="wall"),
-        Stop(lambda t, q: 0.8 * q[1] - 0.6 * q[0], restitution=0.5, name="slope"),
-    ]
+    groove = [Stop(lambda t, q: q[0], name="wall"), Stop(lambda t, q: 0.8 * q[1] - 0.6 * q[0], 0.5, "slope")]
     result = solve_with_stops(pressed, (0.0, 3.0), [0.0, 0.1], [0.0, 0.0], groove, time_limit=20.0)
     assert result.success and np.abs(result.q[:, -1]).max() < 1e-9, result.message
     times = [impact.t for impact in result.impacts]
@@ -188,10 +181,8 @@ def test_rebounds_from_a_wall_towards_which_another_turns_the_load_die_out():
 def test_a_stop_that_opens_is_hit_when_the_impact_at_another_turns_the_body_back():
     """The impact at the wall sends the body towards the floor, which it was leaving."""
     free = unconstrained(lambda t, q, v: np.array([0.0, -1e-3]), 2)
-    corner = [
-        Stop(lambda t, q: q[1], restitution=0.8, name="floor"),
-        Stop(lambda t, q: np.sqrt(0.75) * q[0] - 0.5 * q[1], restitution=0.8, name="wall"),
-    ]
+    corner = [Stop(lambda t, q: q[1], 0.8, "floor")]
+    corner.append(Stop(lambda t, q: np.sqrt(0.75) * q[0] - 0.5 * q[1], 0.8, "wall"))
     result = solve_with_stops(free, (0.0, 0.1), [0.0, 0.0], [-0.5, 0.5], corner)
     assert result.success and [impact.stops for impact in result.impacts] == [("wall",), ("floor",)]
     jumps = sum(impact.v_after - impact.v_before for impact in result.impacts)
@@ -336,9 +327,8 @@ def test_stops_that_depend_on_one_another_keep_their_conditions(joints):
             continue
         found += 1
         opens, close = D @ x + c, 1e-7 * (1.0 + np.abs(x).max())
-        assert (
-            (x[:n] >= 0.0).all() and (opens[:n] >= -close).all() and (x[:n] * opens[:n] <= close * (1.0 + x[:n])).all()
-        )
+        assert (x[:n] >= 0.0).all() and (opens[:n] >= -close).all()
+        assert (x[:n] * opens[:n] <= close * (1.0 + x[:n])).all()
         assert (np.abs(x[n:]) <= most * (1.0 + 1e-9)).all()
         slides = np.abs(opens[n:]) > close
         np.testing.assert_allclose(x[n:][slides], (-np.sign(opens[n:]) * most)[slides], rtol=1e-6)
