@@ -21,7 +21,6 @@ N_TABLE = 64
 # the drive and three numbers; values between which noise is interpolated
 KIND, A, B, C, D, UNIT, ORIGIN, LENGTH, SPEED, DRIVE, DRIVE_A, DRIVE_B, DRIVE_C, TABLE = range(14)
 SIZE = TABLE + N_TABLE
-FRICTION = ("drag", "tanh friction", "brake", "Stribeck friction")
 
 
 @numba.njit(cache=True)

@@ -1,6 +1,6 @@
 """The catalogue: every solver that the studies compare, one entry each, usable on any case.
 
-Rivals are the `LINES` of `references/`, found by their place. One that needs a model of its own (Exudyn) or compiled
+The other solvers are the `LINES` of `references/`, found by their place. One that needs a model of its own (Exudyn) or compiled
 functions (IDA from C) refuses a case that it cannot run, which becomes a row. Foreign packages are imported when they
 are used, so that one that is not installed is a row too.
 """
@@ -51,7 +51,7 @@ OWN = (*(*COMPILED, DEFAULT, TAYLOR, ADAMS, OWN_EXPLICIT), *("Gauss12", "Gauss16
 IDA_INDEX_1 = "IDA, index1"
 EXUDYN = tuple(EXUDYN_SOLVERS)
 HEYOKA, CYRK, CVODE_C, DIFFRAX = "heyoka", "CyRK, DOP853", "CVODE from C, Adams", "Dopri8, diffrax"
-IDAS, CVODES, COLLOCATION = "IDAS, CasADi", "CVODES, CasADi", "collocation, CasADi"
+CVODES = "CVODES, CasADi"
 CVODE_C_PROJECTED = "CVODE from C, BDF, projected"
 SAME_IN_LINES = ("own_accelerations", "traces", "builds_each", "builds_span", "fixed")
 GEAR_ORDERS = tuple(range(1, HIGHEST + 1))
