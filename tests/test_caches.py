@@ -224,6 +224,7 @@ def block_caches(folder):
     return {"NUMBA_CACHE_DIR": home, "HOME": home, "XDG_CACHE_HOME": home}
 
 
+@pytest.mark.slow
 def test_without_a_writable_folder_callbacks_and_kernels_run_and_say_so_once(folder):
     folder.mechanism(one="q[0]", two="q[0]")
     blocked = block_caches(folder)

@@ -54,6 +54,7 @@ def rows():
     return sweep(linkage, ANGLES, measure=heights, workers=1, t_span=(0.0, 0.3), rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_rows_are_those_of_single_runs(rows):
     assert list(rows.columns) == ["theta3", "status", "message", "seconds", "lowest", "system"]
     assert rows.index.tolist() == list(range(6)) and rows.index.name == "run"

@@ -56,6 +56,7 @@ def known(guide=0.2, pin=0.3, push=0.0):
 
 
 @pytest.mark.parametrize("spatial", [False, slow(True)])
+@pytest.mark.slow
 def test_a_cart_with_a_pendulum(spatial):
     model, *_ = cart(spatial, push=0.4)
     problem = model.problem((0.0, TIMES[-1]))

@@ -116,6 +116,7 @@ def test_a_torsion_spring_in_space_does_not_jump_after_a_turn(method):
 
 
 @pytest.mark.parametrize("model", [PlanarModel, SpatialModel])
+@pytest.mark.slow
 def test_a_function_that_is_called_in_python_is_not_called_on_symbols(model):
     seen, model = set(), model()
     axis = {} if model.dimension == 2 else {"axis": (0.0, 1.0, 0.0)}

@@ -268,6 +268,7 @@ def test_momentum_of_a_free_body():
     assert momentum(0.0, np.array([q, q]).T, np.array([v, v]).T) == pytest.approx([axis @ moment] * 2)
 
 
+@pytest.mark.slow
 def test_a_first_run_imports_no_models_and_no_step_that_it_does_not_come_to():
     """Of an implicit method, whose machine code takes a third of a cold first run, and of SciPy's optimisation."""
     source = """

@@ -42,9 +42,9 @@ ADAPTERS: dict[str, Any] = {
     "GSTIFF": lambda *start, tol=None, **options: solve_gear(*start, 1e-3, 2, **options),
 }
 # one of each way to call a solver, of those that need no long compilation: the other tests are slow
-QUICK = ("DOP853, index 1", "IDA, stabilised", "IDA from C, stabilised", "GSTIFF")
+QUICK = ("DOP853, index 1", "IDA, stabilised", "IDA from C, stabilised")
 # callbacks in Python, too
-ANY_CALLBACK = (*(name for name, line in FOUND.items() if not (line.traces or line.compiled_callbacks)), "GSTIFF")
+ANY_CALLBACK = (*(name for name, line in FOUND.items() if not (line.traces or line.compiled_callbacks)))
 
 
 def each(*left_out: str, of: Any = tuple(ADAPTERS), quick: Collection[str] = QUICK) -> list[Any]:

@@ -39,6 +39,7 @@ def run(name, *start, tol, **options):
 
 
 @pytest.mark.parametrize(("problem", "name"), [key if key in FAST else slow(*key) for key in BOUNDS])
+@pytest.mark.slow
 def test_agrees_with_the_truth_and_follows_the_tolerance(problem, name):
     made, times, errors = problems.LINKAGES[problem], [10.0], []
     q, v = trajectory(made.parameters, times)
@@ -58,6 +59,7 @@ LOOSE = {"GSTIFF": 1e-4, "RK45, index 1": 1e-5, "BDF, solve_dae": 1e-4}
 
 
 @pytest.mark.parametrize("name", each(of=ON_ANY))
+@pytest.mark.slow
 def test_time_dependent_constraints_without_a_gamma(name):
     system, times = problems.moving_pivot(gamma=False), [0.5, 2.0]
     result = run(name, system, (0.0, 2.0), *problems.moving_pivot_state(0.0), tol=1e-8, t_eval=times)

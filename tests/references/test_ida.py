@@ -96,6 +96,7 @@ def test_is_what_ida_does_through_python(tolerance):
     assert result.stats.n_factorizations == pytest.approx(python.stats.n_factorizations, rel=0.3)
 
 
+@pytest.mark.slow
 def test_moving_pivot_without_gamma_and_with_a_mass_that_varies():
     system, q0, v0 = pendulum()
     ours = solve_dae(system, (0.0, 3.0), q0, v0, rtol=1e-10, atol=1e-10)
@@ -248,6 +249,7 @@ def test_the_same_through_python(form):
     assert errors("flexible", result)[0] < 3e-7
 
 
+@pytest.mark.slow
 def test_order_2_and_positions_step_over_them():
     assert errors("stiff", result := run_beam("stiff", 1e-6, **ORDER_2))[1] < 4e-3 and result.stats.n_accepted < 8000
     assert errors("stiff", run_beam("stiff", 1e-8, **ORDER_2))[1] < 2e-4

@@ -68,6 +68,7 @@ def test_failure_of_a_projection_comes_back_as_a_row():
     assert 0.0 < result.t[-1] <= 0.5
 
 
+@pytest.mark.slow
 def test_lsoda_does_not_step_towards_a_singularity_without_end():
     system = pendulum(force=lambda t, q, v: np.array([0.0, -9.81 / max(0.0, 0.7 - t) ** 2]))
     result = solve_index1(system, (0.0, 2.0), [1.0, 0.0], [0.0, 0.0], "LSODA", 1e-4, 1e-4)

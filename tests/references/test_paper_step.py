@@ -37,6 +37,7 @@ def error(result):
 
 @pytest.mark.parametrize("tableau", TABLEAUX.values(), ids=TABLEAUX)
 @pytest.mark.parametrize("variant", VARIANTS)
+@pytest.mark.slow  # compiles the variants, for half a minute
 def test_converges_to_the_true_motion_with_the_order_of_the_tableau(variant, tableau):
     errors = []
     for step in (0.02, 0.01):
@@ -49,6 +50,7 @@ def test_converges_to_the_true_motion_with_the_order_of_the_tableau(variant, tab
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
+@pytest.mark.slow
 def test_follows_the_tolerance(variant):
     tolerances = (1e-4, 1e-5) if variant == FROZEN else (1e-4, 1e-6, 1e-8)
     results = [run(variant, tol=tol)[0] for tol in tolerances]
@@ -59,6 +61,7 @@ def test_follows_the_tolerance(variant):
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
+@pytest.mark.slow
 def test_only_without_projection_the_constraints_drift(variant):
     result, _ = run(variant, t_end=5.0, step=0.04)
     assert result.success
@@ -69,6 +72,7 @@ def test_only_without_projection_the_constraints_drift(variant):
         assert max(early, late) < 1e-14
 
 
+@pytest.mark.slow
 def test_the_multiplier_of_the_stabilised_form_vanishes_with_the_step():
     largest = [run(STABILISED, radau_iia(3), step=step)[1] for step in (0.02, 0.01, 0.005)]
     assert largest[0] > 6.0 * largest[1] > 36.0 * largest[2] > 0.0  # as the stage order, 3
@@ -76,6 +80,7 @@ def test_the_multiplier_of_the_stabilised_form_vanishes_with_the_step():
     assert all(run(variant, step=0.02)[1] == 0.0 for variant in VARIANTS if variant != STABILISED)
 
 
+@pytest.mark.slow
 def test_a_step_with_positions_in_every_stage_is_that_of_the_paper():
     for _, q, v in true_states(LINKAGE, 5):
         plain, _ = advance(LINKAGE.system, SUN, 0.0, 0.02, q, v, 1, 1e-13)
@@ -84,6 +89,7 @@ def test_a_step_with_positions_in_every_stage_is_that_of_the_paper():
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
+@pytest.mark.slow
 def test_a_moving_pivot_and_a_mass_that_varies(variant):
     """C_t and C_tt that are not zero; an oblique pendulum whose mass matrix depends on t and q."""
     step, near = (2e-3, 0.1) if variant == FROZEN else (0.02, 1e-6)
@@ -94,6 +100,7 @@ def test_a_moving_pivot_and_a_mass_that_varies(variant):
     assert result.success and np.abs(oblique_to_point(result)[0][:, -1] - oblique_point(1.0)[0]).max() < near
 
 
+@pytest.mark.slow
 def test_what_does_not_converge_or_takes_too_long_is_a_failed_result():
     result, _ = run(PAPER, step=1.0)
     assert result.status is Status.SOLVER_FAILED and "the stage iteration does not converge" in result.message

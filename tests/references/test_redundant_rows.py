@@ -52,6 +52,7 @@ def test_rows_that_contradict_one_another_now_or_later_are_no_success(name):
     assert result.t[-1] == 1.0 and result.lam.shape == (2, result.t.size)  # what it has is kept
 
 
+@pytest.mark.slow
 def test_rows_that_part_at_a_position_where_rank_is_lost_only_for_a_moment_are_no_success():
     # the second row holds y at 0, where its gradient is that of the first
     system = pendulum(

@@ -129,6 +129,7 @@ def kept(system, t, q, v):
     return np.abs(system.constraint(t, q)).max(), np.abs(rates).max()
 
 
+@pytest.mark.slow
 def test_cvode_keeps_the_constraints_that_it_projects_onto():
     problem = PENDULUM
     free, made = (run(solve_cvode_c, problem, "BDF", 1e-8, 1e-8, projected=each) for each in (False, True))

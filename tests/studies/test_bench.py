@@ -77,6 +77,7 @@ def test_a_short_run_is_called_several_times_more(kept, timed, calls):
     assert row(kept, ours, case(timed=timed))["calls"] == calls
 
 
+@pytest.mark.slow
 def test_runs_of_ours_are_timed_at_starts_that_no_call_has_had(kept):
     begun = []
 
@@ -94,6 +95,7 @@ def test_runs_of_ours_are_timed_at_starts_that_no_call_has_had(kept):
         assert 0.0 < t0 < 1e-6 and worst(state, [*q, *v]) < 1e-12
 
 
+@pytest.mark.slow
 def test_the_first_call_of_a_setting_is_made_again_where_it_may_hold_a_build(kept):
     counted = []
 
@@ -142,6 +144,7 @@ def spend(seconds):
 
 
 @pytest.mark.parametrize(("marked", "said"), [(True, "0.05 s of CPU time, the limit of a run"), (False, "0.5 s")])
+@pytest.mark.slow
 def test_a_run_past_its_limit_is_a_row(kept, marked, said):
     def run(case, value, repeat):
         with user_call if marked else nullcontext():
@@ -154,6 +157,7 @@ def test_a_run_past_its_limit_is_a_row(kept, marked, said):
     assert rows["status"].tolist() == ["TIME_LIMIT"] and said in rows["message"][0]
 
 
+@pytest.mark.slow
 def test_the_limit_is_that_of_the_users_call_and_not_of_what_an_adapter_does_beside_it(kept):
     def run(case, value, repeat):
         if case.t_end == T_END:

@@ -56,6 +56,7 @@ def compared(path, name, *words):
     return (out / "compare.md").read_text(), pd.read_csv(out / "compare.csv", comment="#")
 
 
+@pytest.mark.slow
 def test_euler_parameters(mechanisms, capsys):
     solvers = ["DOP853 (twoloop)", "DOP853, projected", "LSODA, index 1"]
     text, rows = compared(mechanisms, "top", "--t-end", "0.02", "--solvers", *solvers)

@@ -75,6 +75,7 @@ def row(folder, new, monkeypatch):
     return mutants.row_of(Mutant("x", 2, 11, 12, "1", new, "return 1"), folder)
 
 
+@pytest.mark.slow
 def test_a_mutant_that_is_seen_and_one_that_is_not(folder: Path, monkeypatch):
     assert row(folder, "2", monkeypatch)["seen_by"] == "test_x.py::test_it"
     assert row(folder, "1 ", monkeypatch)["seen_by"] == mutants.NONE

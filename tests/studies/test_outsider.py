@@ -80,6 +80,7 @@ def ran(tmp_path_factory, case):
     outsider.end()
 
 
+@pytest.mark.slow
 def test_what_a_solver_returns_is_measured_and_what_it_breaks_stays_with_it(ran, case):
     result, status, _, seconds = ran(12)
     times = np.linspace(0.0, 1.0, 101)
@@ -105,6 +106,7 @@ def test_what_a_solver_returns_is_measured_and_what_it_breaks_stays_with_it(ran,
     assert "time_limit = 0.5 s at the tolerance 1e-09" in ran(12)[2]
 
 
+@pytest.mark.slow
 def test_files_that_are_no_solver(tmp_path):
     path = tmp_path / "mine.py"
     # texts of unlike lengths: Python takes one of the same length, written in the same second, for the one before it
@@ -118,6 +120,7 @@ def test_files_that_are_no_solver(tmp_path):
         outsider.start()
 
 
+@pytest.mark.slow
 def test_a_process_that_dies_while_it_loads_says_why(tmp_path):
     path = tmp_path / "dying.py"
     path.write_text("import os, sys\nprint('no licence', file=sys.stderr, flush=True)\nos._exit(3)\n")
@@ -176,6 +179,7 @@ def test_a_header_gets_an_environment_on_top_of_this_one(tmp_path, monkeypatch, 
         environment(["no-such-package-of-anyone"])
 
 
+@pytest.mark.slow
 def test_a_solver_of_references_is_named_without_its_path(case):
     outsider = Outsider("extensisq_pr9", "pendulum")
     try:

@@ -231,6 +231,7 @@ def quick(tmp_path_factory):
     return folder, {name: pd.read_csv(folder / f"{name}.csv", comment="#") for name in study.PARTS}
 
 
+@pytest.mark.slow
 def test_the_report_is_written_and_drawn_again_as_it_was(quick):
     folder, _ = quick
     text = (folder / "reproduction.md").read_text()

@@ -151,6 +151,7 @@ def test_rows_of_changed_sources_are_not_used(tmp_path, monkeypatch):
         assert "a" not in kept
 
 
+@pytest.mark.slow
 def test_rows_survive_a_kill(tmp_path):
     path = tmp_path / "x.partial.jsonl"
     code = f"""

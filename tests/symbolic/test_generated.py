@@ -82,6 +82,7 @@ except ImportError as error:
 """
 
 
+@pytest.mark.slow
 def test_a_problem_goes_to_another_process_by_its_equations(folder):
     (folder / "problem.pickle").write_bytes(pickle.dumps(pendulum().problem([0.3, -0.4], [0.0, 0.0], (0.0, 1.0))))
     numbers, energy, compiled, refusal = run_python(UNPICKLED, folder=folder).stdout.splitlines()
