@@ -44,7 +44,7 @@ ADAPTERS: dict[str, Any] = {
 # one of each way to call a solver, of those that need no long compilation: the other tests are slow
 QUICK = ("DOP853, index 1", "IDA, stabilised", "IDA from C, stabilised")
 # callbacks in Python, too
-ANY_CALLBACK = (*(name for name, line in FOUND.items() if not (line.traces or line.compiled_callbacks)))
+ANY_CALLBACK = (*(name for name, line in FOUND.items() if not (line.traces or line.compiled_callbacks)), "GSTIFF")
 
 
 def each(*left_out: str, of: Any = tuple(ADAPTERS), quick: Collection[str] = QUICK) -> list[Any]:
