@@ -1,9 +1,8 @@
-"""Runs in the format of `twoloop.rows`, of the medians that tables are made of, and back."""
+"""Write runs in the format of `twoloop.rows`, from the medians that tables are made of."""
 
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from statistics import median
 from typing import Any
 
 import pandas as pd
@@ -94,28 +93,6 @@ def rows_of_file(file: str) -> list[Row]:
         return read_rows(ARCHIVE if file == "archive" else Path(file))
     except ValueError as error:
         raise StudyError(str(error)) from None
-
-
-def as_runs(rows: list[Row]) -> pd.DataFrame:
-    """Rows of the format as a table of runs, medians of their times; a mechanism on each processor has a name."""
-    ends = {(row["mechanism"], row["t_end"]) for row in rows if "error_end" in row}
-    found = []
-    for row in rows:
-        done, where = row["status"] == REACHED_END, (row["mechanism"], row["t_end"])
-        for error, floor, words in (("error", "floor", ""), ("error_end", "floor_end", " at the end")):
-            if error not in row and (done or (error == "error_end") != (where in ends)):
-                continue  # a run that failed stands beside those that did not
-            run = {
-                name: row.get(name) for name in ("t_end", "solver", "family", "status", "astray", *QUALITY, "error_v")
-            }
-            run |= {"case": row["mechanism"], "message": row.get("message", ""), row["setting"]: row["value"]}
-            run |= {
-                "call_s": median(row["times_s"]) if row["times_s"] else None,
-                "n_evaluations": row.get("evaluations"),
-            }
-            run |= {"called_from": row.get("called_from", "?"), "error_q": row.get(error), "floor": row.get(floor, 0.0)}
-            found.append(run | {"mechanism": f"{where[0]}, {where[1]:g} s{words}, {row['processor']}"})
-    return pd.DataFrame(found)
 
 
 def rounded(value: Any) -> Any:
