@@ -39,7 +39,6 @@ COMPARED_PACKAGES = (
 )
 PACKAGES = {"SUNDIALS": "scikit-sundae", "solve_dae": "solve-dae"}  # of families that are called otherwise
 QUALITY = ("violation_q", "violation_v", "error_lam", "energy")
-SAME = ("t_end", "solver", "family", "status", "astray", "error_v", *QUALITY)  # by these names in tables of runs, too
 DIGITS = 4  # significant, of numbers that are measured, not of ...
 EXACT = ("t_end", "value", "evaluations")  # ... these
 LONGEST = 120  # letters of a message

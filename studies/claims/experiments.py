@@ -178,8 +178,8 @@ def passing(geometries: Sequence[tuple[float, float, float, float]]) -> dict[str
                 continue
             truth = MinimalFourBar.from_parameters(problem.parameters)
             tops.append(float(truth.states(np.linspace(0.0, truth.period, 1000))[0][7].max()))
-    passing = sum(top > PASSES for top in tops)
-    return {"linkages": len(tops), "linkages passing": passing, "highest y3, assumed": tops[0]}
+    n_passing = sum(top > PASSES for top in tops)
+    return {"linkages": len(tops), "linkages passing": n_passing, "highest y3, assumed": tops[0]}
 
 
 def nonholonomic() -> dict[str, float]:
