@@ -1,7 +1,6 @@
 """Work that may hang, die or raise: in a process of its own, with what it warns of, with a limit on its CPU time."""
 
 import multiprocessing
-import resource
 import signal
 import threading
 import time
@@ -25,8 +24,8 @@ def heard(call: Callable[[], Result]) -> tuple[Result | None, Row]:
     return result, told | {"warned": " / ".join(str(each.message) for each in said)}
 
 
-def apart(work: Callable[[], Any], limit: float | None = None, cpu: int | None = None) -> Any:
-    """What work() returns in a fork of this process, which is ended after `limit` s, or `cpu` s of CPU time, if given.
+def apart(work: Callable[[], Any], limit: float | None = None) -> Any:
+    """Return what work() returns in a fork of this process, which is ended after `limit` s.
 
     Raises TimeoutError if it does not come back. Raises EOFError if the process ends without an answer; its argument is
     the code, as of `multiprocessing.Process.exitcode`.
@@ -34,12 +33,7 @@ def apart(work: Callable[[], Any], limit: float | None = None, cpu: int | None =
     context = multiprocessing.get_context("fork")
     here, there = context.Pipe(duplex=False)
 
-    def answer() -> None:
-        if cpu is not None:
-            resource.setrlimit(resource.RLIMIT_CPU, (cpu, cpu + 1))
-        there.send(work())
-
-    process = context.Process(target=answer, daemon=True)
+    process = context.Process(target=lambda: there.send(work()), daemon=True)
     process.start()
     there.close()
     try:

@@ -201,33 +201,21 @@ def compared(own: Costs, others: Costs) -> dict[str, Any]:
     return {"ratio": least[1] / least[0], "interval": None if np.isnan(low) else [low, high], "verdict": verdict}
 
 
-def ranking(rows: pd.DataFrame, target: float, unasked: bool = False) -> pd.DataFrame:
-    """The solvers of one case that reach an error, cheapest first; others' only where asked for about so much.
-
-    `unasked`: others', too, wherever they reach it.
+def ranking(rows: pd.DataFrame, target: float) -> pd.DataFrame:
+    """Rank the solvers of one case that reach an error, cheapest first; others' only where asked for about so much.
 
     Returns solver, family, called_from, keeps_constraints, call_s, call_q1, call_q3, n_evaluations for this error (on
     the log-log line between two runs), and violation_q, violation_v, energy, setting of the cheapest run near it.
     """
-    return rankings(rows, (target,), unasked)[0]
-
-
-def rankings(rows: pd.DataFrame, targets: Sequence[float], unasked: bool = False) -> list[pd.DataFrame]:
-    """The `ranking` at each of some errors."""
-    grouped, ranked = by_solver(rows, *COSTS), []
     told = {name: rows[name].to_numpy() for name in (*RANKED, *SETTINGS) if name in rows and name not in COSTS}
-    for target in targets:
-        lines = []
-        for solver, runs in grouped.items():
-            ours = len(runs.rows) > 0 and told["family"][runs.rows[0]] == "two-loop"
-            if (place := place_of(runs, target, unasked=ours or unasked)) is None:
-                continue
+    lines = []
+    for solver, runs in by_solver(rows, *COSTS).items():
+        ours = len(runs.rows) > 0 and told["family"][runs.rows[0]] == "two-loop"
+        if (place := place_of(runs, target, unasked=ours)) is not None:
             run = {name: column[cheapest(runs, place)] for name, column in told.items()}
             line = run | {what: float(cost_at(runs.of(what), place)) for what in COSTS}
             lines.append(line | {"solver": solver, "setting": setting(run)})
-        made = pd.DataFrame(lines, columns=["solver", *RANKED, "setting"])
-        ranked.append(made.sort_values("call_s", ignore_index=True))
-    return ranked
+    return pd.DataFrame(lines, columns=["solver", *RANKED, "setting"]).sort_values("call_s", ignore_index=True)
 
 
 def best(ranked: pd.DataFrame) -> dict[str, Any] | None:
@@ -301,9 +289,9 @@ def work_precision(
     return lines
 
 
-def as_good(runs: pd.DataFrame, target: float, what: str = "call_s") -> float:
-    """Cost of the cheapest run of a solver that is at least as good as an error, however much better; NaN: none is."""
-    return float(runs[runs["error_q"].astype(float) <= target][what].astype(float).min())
+def as_good(runs: pd.DataFrame, target: float) -> float:
+    """Time of the cheapest run of a solver that is at least as good as an error, however much better; NaN: none is."""
+    return float(runs[runs["error_q"].astype(float) <= target]["call_s"].astype(float).min())
 
 
 def with_quartiles(middle: float, low: float, high: float) -> str:

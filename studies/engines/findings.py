@@ -94,9 +94,9 @@ def _answer(found: dict[str, Any]) -> str:
     )
 
 
-def _cost(runs: pd.DataFrame, error: float, what: str = "call_s") -> float | None:
+def _cost(runs: pd.DataFrame, error: float) -> float | None:
     """Return the cost of the cheapest run on a mechanism whose error is at most this; None if there is none."""
-    cost = tables.as_good(runs, error, what) if len(runs) else np.nan
+    cost = tables.as_good(runs, error) if len(runs) else np.nan
     return cost if cost == cost else None
 
 
