@@ -3,7 +3,7 @@
 Only the data of the beam and its base are shared with twoloop. Both are models of slender beams with E A, E I and, in
 the second, G A, without thickness deformation or other effects of Poisson's ratio. For Poisson's ratio 0, the elements
 of `twoloop.mechanisms.ancf_beam` converge to them as the mesh is refined and the section becomes slender. Otherwise
-the elements lock and converge to a cable of (lambda + 2 mu)/E times the stiffness; tests/references/test_exudyn_beam.py
+the elements lock and converge to a cable of (lambda + 2 mu)/E times the stiffness; tests/references/test_exudyn.py
 measures how closely.
 """
 

@@ -116,9 +116,9 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
             found[f"{name}_{what}"] = list(map(power, which))
     found["newmark_only_astray"] = [e for e in found["newmark_astray"] if e not in found["newmark_lost"]]
     found |= {"lost_limit": LOST, "astray_limit": ASTRAY, "failed": int((rows["status"] != "REACHED_END").sum())}
-    answer = f"Newmark takes {number(found['time_ratio'])} times the time of Runge–Kutta at the tightest tolerances"
+    answer = f"Newmark takes {number(found['time_ratio'])} times as long as Runge–Kutta at the tightest tolerances"
     if found["t_end"] == PAPER_END:
-        answer = f"The order comes out, the times do not: {answer}, in the paper {number(PRINTED_RATIO)} times."
+        answer = f"The pattern comes out in part, not the times: {answer}, in the paper {number(PRINTED_RATIO)} times."
     else:
         answer += f"; the paper's {number(PRINTED_RATIO)} is for {number(PAPER_END)} s."
     return found | {"answer": answer}
