@@ -48,7 +48,8 @@ $(STAMP): requirements.lock pyproject.toml
 	@echo "[2/3] Installing packages; beside that, on the second core, compiling the inner loop of the integrator (once)"
 	@{ $(RUN) $(PIP) install --no-compile -r requirements.lock \
 		&& $(RUN) $(PIP) install --no-compile --no-deps --no-build-isolation --editable .; } & \
-	$(RUN) -W ignore -c "import twoloop.kernels.advance" 2>/dev/null; wait $$!
+	$(RUN) -W ignore -c "from twoloop.kernels import advance; from twoloop.kernels.evaluation import own_inner" 2>/dev/null; \
+	wait $$!
 	@touch $@
 
 peers: .venv/peers ## more solvers for work_precision, which does without them: heyoka, CyRK, diffrax, CasADi, extensisq
@@ -75,18 +76,15 @@ reports: install ## all studies into reports/
 bench: compile ## two commits side by side: make bench BASE=main [HEAD=branch] [ARGS=--short]
 	@$(RUN) -m studies.bench_commits $(BASE) $(if $(HEAD),--head $(HEAD)) $(ARGS)
 
-# the inner loop first, which all kernels need, and beside it the callbacks of bodies, which need no kernel; then two
-# processes of about equal work, neither of which imports, and so compiles, what the other does: what Newton's matrices and
-# large systems have in common, and BDF, are in one of them. What imports callbacks of bodies is last, and the traps, which
-# import all, last of these
+# the inner loop is there; two processes of about equal work, neither of which imports, and so compiles, what the other
+# does: what Newton's matrices and large systems have in common, and BDF, are in one of them. What imports callbacks of
+# bodies is last, and the traps, which import all, last of these
 compile: install ## compile the kernels, and the callbacks of bodies, mechanisms and studies, on two cores
-	@echo "Compiling the kernels (once, on both cores): the inner loop and the callbacks of bodies"
-	@$(RUN) -c "from twoloop.bodies import planar_callbacks, planar_programs, spatial_callbacks, spatial_programs" & \
-	$(RUN) -c "from twoloop.kernels.evaluation import calls, own_inner; from twoloop.kernels.control import controller" \
-	&& wait $$!
-	@echo "Compiling the steps of all methods, interpolation, and the runs in SIMD lanes"
+	@echo "Compiling (once, on both cores) the steps of all methods, interpolation, and the runs in SIMD lanes"
+	@$(RUN) -c "from twoloop.kernels.evaluation import own_inner; from twoloop.kernels.control import controller"
 	@$(RUN) -c "from twoloop.kernels.steps import bdf_newton_step, bdf_step, diagonal_step, newton_step; \
-	from twoloop.kernels.evaluation import static_inner; from twoloop.kernels.lanes import lane_implicit" & \
+	from twoloop.kernels.evaluation import static_inner; from twoloop.kernels.lanes import lane_implicit; \
+	from twoloop.bodies import planar_callbacks, planar_programs, spatial_callbacks, spatial_programs" & \
 	$(RUN) -c "from twoloop.kernels import advance, agreement, interpolation, short_loops; \
 	from twoloop.kernels.algebra import independent, pivots, scaling; from twoloop.kernels.control import switching; \
 	from twoloop.kernels.evaluation import first_look, traced; \

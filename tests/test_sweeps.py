@@ -66,6 +66,7 @@ def test_rows_are_those_of_single_runs(rows):
         assert rows.loc[number, "system"] == "four-bar"
 
 
+@pytest.mark.slow
 def test_a_failure_is_a_row(rows):
     assert rows.loc[2, "status"] == "ERROR"
     assert rows.loc[2, "message"].startswith("ValueError: the linkage cannot be assembled with theta3 = 2")

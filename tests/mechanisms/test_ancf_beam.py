@@ -187,7 +187,7 @@ def test_static_tip_deflection_is_that_of_the_locked_beam(modulus, n):
     assert worst(problem.system.force(0.0, q, q)[6:], -load) < 1e-3 * load[-5]
 
 
-@pytest.mark.parametrize(("case", "end"), [("stiff", 0.2), slow("stiff", 2.0), slow("flexible", 2.0)])
+@pytest.mark.parametrize(("case", "end"), [slow("stiff", 0.2), slow("stiff", 2.0), slow("flexible", 2.0)])
 def test_tip_heights(case, end):
     n = np.count_nonzero(end + 1e-9 > TIMES)
     q, _ = reduced_motion(BEAMS[case], TIMES[:n], 1e-8)

@@ -71,6 +71,7 @@ def test_time_dependent_constraints_without_a_gamma(name):
 
 
 @pytest.mark.parametrize("name", each(of=ON_ANY))
+@pytest.mark.slow
 def test_full_mass_matrix_that_varies_and_forces_that_depend_on_velocities(name):
     result = run(name, problems.oblique_pendulum(), (0.0, 2.0), *problems.oblique_start(), tol=1e-8, t_eval=[0.5, 2.0])
     x, u, lam = problems.oblique_point(result.t)

@@ -40,17 +40,20 @@ def test_formulas_are_exact_for_polynomials_of_their_order(order):
 
 
 @pytest.mark.parametrize("order", [1, 2, 3, 4, 5])
+@pytest.mark.slow
 def test_order_with_an_accurate_start(order):
     assert np.abs(slopes(order, (4e-3, 2e-3), start="accurate") - order).max() < 0.3
 
 
 @pytest.mark.parametrize("order", [2, 4, 6])
+@pytest.mark.slow
 def test_the_ramp_limits_the_order_to_two(order):
     assert np.abs(slopes(order, (4e-3, 2e-3)) - 2.0).max() < 0.1
 
 
 @pytest.mark.parametrize("start", STARTS)
 @pytest.mark.parametrize("order", range(1, HIGHEST + 1))
+@pytest.mark.slow
 def test_positions_keep_the_constraints_and_velocities_nearly(order, start):
     coarse, fine = (run(2.0, step, order, start=start) for step in (0.01, 0.005))
     assert violations(PROBLEM.system, coarse)[0] < 1e-12 and violations(PROBLEM.system, fine)[0] < 1e-12
@@ -59,6 +62,7 @@ def test_positions_keep_the_constraints_and_velocities_nearly(order, start):
     assert force_residual(PROBLEM.system, fine) < 1e-8
 
 
+@pytest.mark.slow
 def test_ramp_begins_with_half_of_the_centripetal_acceleration():
     """On a unit circle without gravity lam = v^2 = 4, at any step."""
     system = pendulum(force=lambda t, q, v: np.zeros(2))
@@ -72,6 +76,7 @@ def test_ramp_begins_with_half_of_the_centripetal_acceleration():
 
 
 @pytest.mark.parametrize("order", [2, 3])
+@pytest.mark.slow
 def test_time_dependent_constraints(order):
     system = moving_pivot(gamma=False)
     q, v = moving_pivot_state(0.0)
@@ -83,6 +88,7 @@ def test_time_dependent_constraints(order):
 
 
 @pytest.mark.parametrize("start", STARTS)
+@pytest.mark.slow
 def test_stores_every_step_or_those_asked_for(start):
     full = run(0.5, 0.01, 3, start=start)
     assert full.t.size == 51 and full.h.size == full.stats.n_accepted == 50 and full.t[-1] == pytest.approx(0.5)
@@ -93,6 +99,7 @@ def test_stores_every_step_or_those_asked_for(start):
     assert np.allclose(some.t, [0.01, 0.2, 0.5], rtol=0.0, atol=1e-12) and some.h.size == 50
 
 
+@pytest.mark.slow
 def test_machine_code_on_disk_follows_the_factorisations_that_it_holds(monkeypatch):
     before = watch(gear._integrate.__wrapped__)
     assert before is not None and watch(gear._integrate.__wrapped__) == before
@@ -100,6 +107,7 @@ def test_machine_code_on_disk_follows_the_factorisations_that_it_holds(monkeypat
     assert watch(gear._integrate.__wrapped__) != before
 
 
+@pytest.mark.slow
 def test_too_large_a_step_comes_back_as_a_row():
     result = run(10.0, 0.1, 3)
     assert result.status is Status.SOLVER_FAILED and not result.success
@@ -107,6 +115,7 @@ def test_too_large_a_step_comes_back_as_a_row():
     assert result.t[-1] == pytest.approx(0.9) and result.stats.n_accepted == result.h.size == result.t.size - 1 == 9
 
 
+@pytest.mark.slow
 def test_failure_of_the_accurate_start_comes_back_as_a_row():
     system = pendulum(force=lambda t, q, v: np.array([0.0, -9.81 if t < 0.015 else np.nan]))
     result = solve_gear(system, (0.0, 2.0), [1.0, 0.0], [0.0, 0.0], 0.01, 4, start="accurate")

@@ -27,6 +27,7 @@ def file(tmp_path):
 
 
 @pytest.mark.parametrize("code", [PLAIN, pytest.param(CODE, marks=pytest.mark.slow)], ids=["plain", "compiled"])
+@pytest.mark.slow
 def test_the_page_of_the_docs_runs_outside_the_repository(file, code, monkeypatch):
     file.write_text(code)
     words = ["swing.py:swing", "--quick", "--t-end", "0.512345", "--out", "report", "--errors", "1e-3", "1e-5"]

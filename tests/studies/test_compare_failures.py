@@ -8,6 +8,7 @@ from studies import compare
 from studies.bench import metrics, reference_motion
 from studies.bench.collector import Case, Run, called_from
 from studies.bench.solvers import CATALOGUE
+from tests.marks import slow
 
 MECHANISMS = """
 import dataclasses
@@ -95,6 +96,7 @@ def test_functions_that_raise_are_named(mechanisms):
         compared(mechanisms, "raising")
 
 
+@pytest.mark.slow
 def test_where_no_solver_reaches_the_end_the_report_lists_them(mechanisms):
     with pytest.raises(SystemExit, match=r"^error: no solver reached the end; the first said: Exudyn needs a model"):
         compared(mechanisms, "plain", "--t-end", "0.1", "--solvers", "Exudyn, GeneralizedAlpha")
@@ -118,7 +120,13 @@ def test_a_run_that_cannot_be_measured_is_a_row(mechanisms, monkeypatch):
 
 @pytest.mark.parametrize(
     ("call", "kept"),
-    [("swinging(0.0)", True), ("swinging(0.1)", False), ("swinging(1e-6)", False), ("still()", False), ("top()", True)],
+    [
+        ("swinging(0.0)", True),
+        ("swinging(0.1)", False),
+        ("swinging(1e-6)", False),
+        ("still()", False),
+        slow("top()", True),
+    ],
 )
 def test_whether_the_energy_is_an_invariant_is_found(mechanisms, call, kept):
     names = {}

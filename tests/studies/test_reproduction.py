@@ -251,6 +251,7 @@ def test_a_missing_part_is_named(tmp_path, capsys):
     assert "errata: not a part; the parts are motion, step_size" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_the_procedures_reach_0_and_errors_between_the_steps_are_those_at_the_steps(quick):
     made = quick[1]["motion"]
     ours = made[made["group"] == "line-up"]
@@ -258,6 +259,7 @@ def test_the_procedures_reach_0_and_errors_between_the_steps_are_those_at_the_st
     assert (ours["top_late"] > -1e-4).all() and (ours["error_y3"] <= 1.5 * ours["error_q"]).all()
 
 
+@pytest.mark.slow
 def test_steps_are_as_long_as_their_error_constants_say(quick):
     made = quick[1]["step_size"].set_index("solver")
     assert made.loc[IRK, "share_time"] > 0.99 and made.loc[NEWMARK, "share_time"] == 0.0
@@ -265,6 +267,7 @@ def test_steps_are_as_long_as_their_error_constants_say(quick):
     assert made["retried"].between(0.0, 1.0).all()
 
 
+@pytest.mark.slow
 def test_twoloop_keeps_the_constraints_and_forms_of_lower_index_their_own_level(quick):
     made = quick[1]["violation"]
     line_up = tables.where(made, group="line-up").set_index("solver")
