@@ -81,7 +81,7 @@ bench: compile ## two commits side by side: make bench BASE=main [HEAD=branch] [
 # bodies is last, and the traps, which import all, last of these
 compile: install ## compile the kernels, and the callbacks of bodies, mechanisms and studies, on two cores
 	@echo "Compiling (once, on both cores) the steps of all methods, interpolation, and the runs in SIMD lanes"
-	@$(RUN) -c "from twoloop.kernels.evaluation import own_inner; from twoloop.kernels.control import controller"
+	@$(RUN) -c "from twoloop.kernels.evaluation import calls, own_inner; from twoloop.kernels.control import controller"
 	@$(RUN) -c "from twoloop.kernels.steps import bdf_newton_step, bdf_step, diagonal_step, newton_step; \
 	from twoloop.kernels.evaluation import static_inner; from twoloop.kernels.lanes import lane_implicit; \
 	from twoloop.bodies import planar_callbacks, planar_programs, spatial_callbacks, spatial_programs" & \
