@@ -83,14 +83,14 @@ compile: install ## compile the kernels, and the callbacks of bodies, mechanisms
 	@echo "Compiling (once, on both cores) the steps of all methods, interpolation, and the runs in SIMD lanes"
 	@$(RUN) -c "from twoloop.kernels.evaluation import calls, own_inner; from twoloop.kernels.control import controller"
 	@$(RUN) -c "from twoloop.kernels.steps import bdf_newton_step, bdf_step, diagonal_step, newton_step; \
-	from twoloop.kernels.evaluation import static_inner; from twoloop.kernels.lanes import lane_implicit; \
-	from twoloop.bodies import planar_callbacks, planar_programs, spatial_callbacks, spatial_programs" & \
+	from twoloop.kernels.evaluation import static_inner; from twoloop.kernels.lanes import lane_implicit" & \
 	$(RUN) -c "from twoloop.kernels import advance, agreement, interpolation, short_loops; \
 	from twoloop.kernels.algebra import independent, pivots, scaling; from twoloop.kernels.control import switching; \
 	from twoloop.kernels.evaluation import first_look, traced; \
 	from twoloop.kernels.lanes import lane_dop853, lane_runs, lane_starts, lane_taylor; \
 	from twoloop.kernels.steps import adams_step, asking_step, bridge, canonical_step, explicit_step, \
-	fixed_point_step, newmark_step, paper_step, taylor_step" && wait $$!
+	fixed_point_step, newmark_step, paper_step, taylor_step; \
+	from twoloop.bodies import planar_callbacks, planar_programs, spatial_callbacks, spatial_programs" && wait $$!
 	@echo "Compiling the callbacks of the ready mechanisms and of studies"
 	@$(RUN) -c "from studies.bench import sharp_callbacks" & \
 	$(RUN) -c "from twoloop.mechanisms import *; from studies.honesty import traps" && wait $$!
