@@ -123,8 +123,7 @@ PLANAR = (
     Kind(
         "Point on a curve",
         "A point of b stays on a curve of a, as a pin in a slot.",
-        'model.point_on_curve("ground", "b", at=(0.0, 0.25),\n'
-        "                     curve=lambda x, y: y - 0.25 * np.cos(3.0 * x))",
+        'model.point_on_curve("ground", "b", at=(0.0, 0.25), curve=lambda x, y: y - 0.25 * np.cos(3.0 * x))',
         {"b": [bar((0.0, 0.25), (0.0, 0.85), 0.06)]},
         ({"b": (0.9, 0.0, 0.0)}, {"b": (0.0, 0.0, 0.5, 0.0, 0.25)}),
         lines=(np.column_stack([x := np.linspace(-1.2, 1.2, 100), 0.25 * np.cos(3.0 * x)]),),
@@ -172,7 +171,7 @@ SPATIAL = (
     Kind(
         "Universal",
         "A cross: one of its axes is fixed in a, the other, perpendicular, in b.",
-        'model.universal("ground", "b", at=(0.0, 0.0, 0.0),\n                axes=((0.0, 1.0, 0.0), (0.0, 0.0, 1.0)))',
+        'model.universal("ground", "b", at=(0.0, 0.0, 0.0), axes=((0.0, 1.0, 0.0), (0.0, 0.0, 1.0)))',
         {
             "ground": [
                 *box((-0.85, 0, 0), (0.7, 0.14, 0.14)),
