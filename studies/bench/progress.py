@@ -35,8 +35,10 @@ class Progress:
         if not (always or self.done == self.total or now - self._printed >= PAUSE):
             return
         self._printed = now
-        left = (self.total - self.done) * ((now - self._first) / (self.done - 1) if self.done > 1 else seconds)
-        say(f"{self.done}/{self.total}  {label}  {seconds:.1f} s  {remaining(left)}")
+        left = ""  # unknown after the first
+        if self.done > 1:
+            left = f"  {remaining((self.total - self.done) * (now - self._first) / (self.done - 1))}"
+        say(f"{self.done}/{self.total}  {label}  {seconds:.1f} s{left}")
 
 
 def say(line: str) -> None:
