@@ -80,7 +80,9 @@ def runs(case: Case, quick: bool) -> list[Run]:
 def make(output: Output, geometry: Geometry | None = None) -> pd.DataFrame:
     """Make all rows, of the assumed geometry or of another."""
     try:
-        case = four_bar.cases(output.call.quick)[0] if geometry is None else four_bar.case_of(*geometry)
+        case = (
+            four_bar.cases(output.call.quick)[0] if geometry is None else four_bar.case_of(*geometry, output.call.quick)
+        )
         _ = case.reference
     except ValueError as error:
         raise StudyError(f"no run with these lengths: {error}") from None
