@@ -83,6 +83,8 @@ def test_readme_has_the_numbers_of_its_other_reports():
     assert told in README
     typical = {at["error"]: number(1.0 / at["median"]) for at in findings("work_precision")["typical"]}
     assert f"is {typical[1e-4]} times as fast at an error of 1e-4 and {typical[1e-8]} times at 1e-8" in README
+    first = next(each for each in findings("work_precision")["first_calls"] if each["solver"] == "auto, compiled")
+    assert f"takes up to {number(first['most'])} s ({first['n']} timed)" in README
     counts, untestable = findings("claims")["counts"], findings("claims")["untestable"]
     told = (
         f"{counts['holds']} hold, {counts['holds in part']} hold in part, {counts['does not hold']} do not hold, and "
