@@ -1,38 +1,15 @@
 """Compiled linear algebra of the references, independent of twoloop's."""
 
-from collections.abc import Callable
-from functools import cache, wraps
 from typing import Any
 
 import numpy as np
 from numba import njit
-from numba.core.dispatcher import Dispatcher
 
-from twoloop.kernels.compile.caches import compile_kept, kept_when_called, watch
+from twoloop.kernels.compile.caches import kept_when_called
 
 SINGULAR = 1e-13  # relative to the original entry, or to its row: smaller pivots count as zero
 
 OPTIONS: dict[str, Any] = {"error_model": "numpy", "fastmath": {"contract", "reassoc", "nsz", "arcp"}}
-
-
-def compiled_when_called(signature: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Compile for any mechanism at the first call, and cache the machine code until it or what it calls changes.
-
-    Not when the module is imported: that takes 30 s of CPU time, and whoever lists the solvers imports all modules.
-    """
-
-    def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
-        @cache
-        def compiled() -> Dispatcher:
-            return compile_kept(function, signature, watch(function), error_model="numpy")
-
-        @wraps(function)
-        def call(*arguments: Any) -> Any:
-            return compiled()(*arguments)
-
-        return call
-
-    return decorate
 
 
 # a closure over callbacks: compiled when it is called, for its argument types, and read from the disk in later

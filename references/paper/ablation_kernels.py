@@ -3,10 +3,10 @@
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit, types
+from numba import njit
 
-from references.equations.linear import cholesky, cholesky_solve, compiled_when_called, lu_factor, lu_solve
-from twoloop.kernels.data.common import INTEGERS, KIT, MATRIX, VECTOR
+from references.equations.linear import cholesky, cholesky_solve, lu_factor, lu_solve
+from twoloop.kernels.compile.caches import kept_when_called
 from twoloop.kernels.data.flags import CONSTANT_MASS
 from twoloop.kernels.evaluation.partition import full_pivoting
 
@@ -317,11 +317,7 @@ def _error(n, tol, states):  # type: ignore[no-untyped-def]
     return np.sqrt(total / (2 * n))
 
 
-_I8, _F8 = types.int64, types.float64
-_SIZES, _TABLEAU = (_I8,) * 5, (MATRIX, VECTOR, VECTOR, MATRIX)
-
-
-@compiled_when_called(_I8(KIT, *_SIZES, *_TABLEAU, _F8, _F8, _I8, _F8, _F8, VECTOR, VECTOR, MATRIX, INTEGERS))
+@kept_when_called(error_model="numpy")
 def run(  # type: ignore[no-untyped-def]
     f, n, m, s, variant, order, A, b, c, inverse, t0, t1, n_steps, tol, loop_tol, state, where, rows, counters
 ):

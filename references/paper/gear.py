@@ -12,15 +12,15 @@ from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit, types
+from numba import njit
 
 from references.driver import STORED as STEPS_STORED
 from references.driver import Task, TimeLimit, adapter, user_call
-from references.equations.linear import compiled_when_called, lu_factor, lu_solve
+from references.equations.linear import lu_factor, lu_solve
 from references.lines import Line
 from references.scipy.index1 import solve_index1
 from twoloop.checks.arguments import check_choice, check_size, check_times
-from twoloop.kernels.data.common import INTEGERS, KIT, MATRIX
+from twoloop.kernels.compile.caches import kept_when_called
 from twoloop.kernels.data.kit import Kit
 from twoloop.problem.problem import Array
 from twoloop.problem.system import ConstrainedSystem
@@ -48,8 +48,6 @@ _REASONS = {
     NOT_FINITE: "Newton's method meets values that are not finite",
 }
 NEWTON, MATRICES, STEPS, STORED, N_COUNTERS = range(5)  # indices of the counters
-_I8, _F8 = types.int64, types.float64
-_INTEGRATE = _I8(*(KIT, _I8, MATRIX, MATRIX, _I8, _I8, _F8, _F8, _I8, MATRIX, INTEGERS, MATRIX, INTEGERS))
 
 
 @adapter(velocity_rows=False)
@@ -242,7 +240,7 @@ def _newton(f, w, t, q, forces, q_past, v_past, hb, r, there, J, pivots, counter
     return NOT_CONVERGED
 
 
-@compiled_when_called(_INTEGRATE)
+@kept_when_called(error_model="numpy")
 def _integrate(  # type: ignore[no-untyped-def]
     f, n, given, past, first, last, t0, h, order, formulas, keep, rows, counters
 ):

@@ -177,9 +177,9 @@ def picture(rows: pd.DataFrame, found: dict[str, Any]) -> Figure:
     panels[0].set_ylabel("err_in")
     ticks = LogLocator(subs=(1.0, 2.0, 3.0, 4.0, 6.0, 8.0))
     scale = figure.colorbar(image, ax=panels, shrink=0.8, ticks=ticks, format=lambda value, _: number(value))
-    scale.set_label("paper's time / ours")
+    scale.set_label("paper's time / that of twoloop")
     least_, most = number(np.nanmin(every)), number(np.nanmax(every))
-    figures.message(figure, f"The paper's times are {least_} to {most} times ours: not one factor")
+    figures.message(figure, f"The paper's times are {least_} to {most} times those of twoloop: not one factor")
     return figure
 
 
