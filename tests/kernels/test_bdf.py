@@ -62,13 +62,15 @@ def test_steps_far_shorter_than_the_tolerance_asks_for_are_no_worse(tol):
     assert many_error < error and many.stats.n_evaluations >= 2 * many.stats.n_accepted
 
 
-# --- Newton's method as the outer loop
+# --- Newton's method as the outer loop, whose kernel slow tests alone compile
+@pytest.mark.slow
 def test_newtons_method_takes_the_steps_of_the_fixed_point_where_nothing_is_stiff():
     (one, error), (other, same) = (four_bar_run(BDF(outer=outer), 1e-8, 3.0) for outer in ("fixed-point", "newton"))
     assert same < 1.2 * error and abs(other.stats.n_accepted - one.stats.n_accepted) < 0.02 * one.stats.n_accepted
     assert other.stats.n_outer <= 1.1 * one.stats.n_outer and 0 < other.stats.n_jacobians < 30
 
 
+@pytest.mark.slow
 def test_newtons_method_takes_long_steps_in_a_viscous_fluid():
     """An overdamped pendulum: transients decay within a thousandth of the motion, at rates of 1e4 per second."""
 
