@@ -77,31 +77,30 @@ bench: compile-all ## two commits side by side: make bench BASE=main [HEAD=branc
 	@$(RUN) -m studies.bench_commits $(BASE) $(if $(HEAD),--head $(HEAD)) $(ARGS)
 
 # the inner loop is there; two processes of about equal work, neither of which imports, and so compiles, what the other
-# does: what Newton's matrices and large systems have in common, BDF and bodies in space are in one of them. Forces of
-# studies are compiled in a third of the time by the process that has just compiled those of bodies
+# does: what Newton's matrices and large systems have in common, and bodies in space, are in one of them
 compile: install ## compile the kernels, and the callbacks of bodies, mechanisms and studies, on two cores
 	@echo "Compiling (once, on both cores) the steps of most methods, interpolation, and the runs in SIMD lanes"
 	@$(RUN) -c "from twoloop.kernels.evaluation import calls, own_inner; from twoloop.kernels.control import controller"
-	@$(RUN) -c "from twoloop.kernels.steps import bdf_step, diagonal_step, newton_step; \
+	@$(RUN) -c "from twoloop.kernels.steps import diagonal_step, newton_step; \
 	from twoloop.kernels.evaluation import static_inner; from twoloop.bodies import spatial_callbacks, spatial_programs; \
 	from studies.bench import sharp_callbacks" & \
 	$(RUN) -c "from twoloop.kernels import advance, agreement, interpolation, short_loops; \
 	from twoloop.kernels.algebra import independent, pivots, scaling; from twoloop.kernels.control import switching; \
 	from twoloop.kernels.evaluation import first_look, traced; \
 	from twoloop.kernels.lanes import lane_dop853, lane_runs, lane_starts, lane_taylor; \
-	from twoloop.kernels.steps import adams_step, asking_step, bridge, explicit_step, fixed_point_step, newmark_step, \
-	paper_step, taylor_step; from twoloop.bodies import planar_callbacks, planar_programs" && wait $$!
+	from twoloop.kernels.steps import adams_step, asking_step, bdf_step, bridge, canonical_step, explicit_step, \
+	fixed_point_step, newmark_step, paper_step, taylor_step; from twoloop.bodies import planar_callbacks, planar_programs" && wait $$!
 	@echo "Compiling the callbacks of the ready mechanisms and of studies"
 	@$(RUN) -c "from twoloop.mechanisms import *" & $(RUN) -c "from studies.honesty import traps" && wait $$!
 
-# a third of the time for kernels that slow tests alone need
+# kernels that slow tests alone need
 compile-all: compile
-	@echo "Compiling the steps of the other methods: BDF by Newton's method, canonical variables, implicit methods in lanes"
+	@echo "Compiling the steps of BDF by Newton's method, and of implicit methods in lanes"
 	@$(RUN) -c "from twoloop.kernels.steps import bdf_newton_step" & \
-	$(RUN) -c "from twoloop.kernels.steps import canonical_step; from twoloop.kernels.lanes import lane_implicit" && wait $$!
+	$(RUN) -c "from twoloop.kernels.lanes import lane_implicit" && wait $$!
 
-# the callbacks of tests are compiled before: both workers would do that. Files
-# in the order of their names: sorted by how many tests they have, long ones with few tests would come last
+# the callbacks of tests are compiled before: both workers would do that. Files in the order of tests/conftest.py: sorted
+# by how many tests they have, long ones with few tests would come last
 SHARED := -n 2 --dist loadfile --no-loadscope-reorder
 
 test: compile ## the tests that a change needs, on two cores
