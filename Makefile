@@ -88,7 +88,7 @@ compile: install ## compile the kernels, and the callbacks of bodies, mechanisms
 	from twoloop.kernels.algebra import independent, pivots, scaling; from twoloop.kernels.control import switching; \
 	from twoloop.kernels.evaluation import first_look, traced; \
 	from twoloop.kernels.lanes import lane_dop853, lane_runs, lane_starts, lane_taylor; \
-	from twoloop.kernels.steps import adams_step, asking_step, bdf_step, bridge, canonical_step, explicit_step, \
+	from twoloop.kernels.steps import adams_step, asking_step, bdf_step, bridge, explicit_step, \
 	fixed_point_step, newmark_step, paper_step, taylor_step; from twoloop.bodies import planar_callbacks, planar_programs" && wait $$!
 	@echo "Compiling the callbacks of the ready mechanisms and of studies"
 	@$(RUN) -c "from twoloop.mechanisms import *" & $(RUN) -c "from studies.honesty import traps" && wait $$!
