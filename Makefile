@@ -95,9 +95,8 @@ compile: install ## compile the kernels, and the callbacks of bodies, mechanisms
 
 # kernels that slow tests alone need
 compile-all: compile
-	@echo "Compiling the steps of BDF by Newton's method, and of implicit methods in lanes"
-	@$(RUN) -c "from twoloop.kernels.steps import bdf_newton_step" & \
-	$(RUN) -c "from twoloop.kernels.lanes import lane_implicit" && wait $$!
+	@echo "Compiling the steps of implicit methods in lanes"
+	@$(RUN) -c "from twoloop.kernels.lanes import lane_implicit"
 
 # the callbacks of tests are compiled before: both workers would do that. Files in the order of tests/conftest.py: sorted
 # by how many tests they have, long ones with few tests would come last

@@ -69,7 +69,6 @@ METHODS = [
     ),
     *argument("BDF", BDF, "outer_tol", *FEW_POSITIVES[:2]),
     *argument("BDF", BDF, "inner_tol", *FEW_POSITIVES[:1]),
-    *argument("BDF", BDF, "outer", ("paper", ValueError, "must be 'fixed-point' or 'newton'", "take one of the values named")),
     *argument("Taylor", Taylor, "order", (3, ValueError, "must be", "give an int from 4 to 40"), (41, ValueError, "must be", "give an int from 4 to 40"), (8.5, TypeError, "must be", "give an int from 4 to 40"), ("high", TypeError, "must be", "give an int from 4 to 40")),
     *argument("DOP853", DOP853, "inner_tol", *FEW_POSITIVES),
     *argument("paper_irk", paper_irk, "inner_tol", *FEW_POSITIVES[:2]),

@@ -27,7 +27,6 @@ METHODS = {
     "tr-bdf2": (ESDIRK("TRBDF2"), 2),
     "esdirk4": (ESDIRK("ESDIRK4"), 4),
     **{f"bdf({k})": (BDF(max_order=k), k) for k in range(1, 6)},
-    "bdf(2), Newton's method": (BDF(2, outer="newton"), 2),
 }
 
 
