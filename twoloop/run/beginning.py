@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.checks.consistency import Look
-from twoloop.generate.choices import BOUNDS, LEAST, RANK, SINGULAR_MASS, Choice
+from twoloop.generate.choices import BOUNDS, LEAST, RANK, SINGULAR_MASS, Choice, Dependents
 from twoloop.generate.straight_code import OwnCode
 from twoloop.kernels.algebra.lapack import addresses
 from twoloop.kernels.compile.linking import direct
@@ -68,7 +68,11 @@ class Beginning:
         i, j = run.clock.size, run.clock.size + run.control.size
         run.clock, run.control, run.tolerances = numbers[:i], numbers[i:j], numbers[j:]
         memory, (of_work, integers) = run.plan.memory, lasting(run.work)
-        expected, scale = _expected(None if code is None else code.shared.equations.choice)
+        choice = None if code is None else code.shared.equations.choice
+        expected, scale = _expected(choice)
+        self._dependents = None if choice is None else Dependents(system, choice.rows)
+        blocks = [] if choice is None else [(i[0], i[-1], j[0], j[-1]) for i, j in choice.blocks]
+        self._blocks = np.array(blocks, dtype=np.int64).ravel().data
         places = np.flatnonzero(memory.view(np.int64))  # -0 is not what is cleared
         of_start: tuple[float, ...]
         of_start = max(run.rtol, GAMMA_ACCURACY), run.reuse, 0.0 if run.plan.watchful else 1.0, RANK, scale, CONTRADICTS
@@ -107,11 +111,16 @@ class Beginning:
             except Exception:  # of a callback, which is called by itself then
                 return False
             if code != self.names.IN_DOUBT:
-                return bool(code == self.names.READY)
+                break
             interrupts.listen()
             sure = look.is_surely(0, t, q, v)
             if not sure:
                 return False
+        dependents = self._dependents
+        if code != self.names.READY or dependents is None or dependents.find is None:
+            return bool(code == self.names.READY)
+        n = dependents.find(look.rows, *dependents.arguments)  # whether the code is for the coordinates that rows give
+        return bool(dependents.found[: 4 * n] == self._blocks)
 
     def go(self, t1: float, box: Array) -> int:
         """The first chunk of the steps from that start: how `advance` ended."""
