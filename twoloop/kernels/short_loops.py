@@ -126,8 +126,8 @@ AGAIN = Reference(
     {
         **dict.fromkeys(("looked", "lam", "room", "least", "bounds", "scratch", "constants", "saved"), VECTOR),
         **dict.fromkeys(("begin_numbers", "numbers", "begin_memory", "memory", "lasting", "options"), VECTOR),
-        **dict.fromkeys(("tolerances", "control", "clock", "state", "new_state", "end", "out_t", "told"), VECTOR),
-        **dict.fromkeys(("mass", "rows", "ways", "pattern", "out_rows", "out_steps"), MATRIX),
+        **dict.fromkeys(("tolerances", "control", "clock", "state", "new_state", "end", "t", "told"), VECTOR),
+        **dict.fromkeys(("mass", "rows", "ways", "pattern", "states", "steps"), MATRIX),
         **dict.fromkeys(("chosen", "expected", "lapack", "lasting_integers", "saved_integers"), INTEGERS),
         **dict.fromkeys(("places", "filled"), INTEGERS),
     },
@@ -262,9 +262,9 @@ def _turned(b, k, n):
     """Whether the velocities of the last two states differ by more than one of their accelerations gives."""
     change, first, last = 0.0, 0.0, 0.0
     for j in range(n):
-        change = max(change, abs(b.out_rows[k, n + j] - b.out_rows[k - 1, n + j]))
-        first, last = max(first, abs(b.out_rows[k - 1, 2 * n + j])), max(last, abs(b.out_rows[k, 2 * n + j]))
-    return change > b.constants[MOST_TURNED] * (b.out_t[k] - b.out_t[k - 1]) * min(first, last)
+        change = max(change, abs(b.states[k, n + j] - b.states[k - 1, n + j]))
+        first, last = max(first, abs(b.states[k - 1, 2 * n + j])), max(last, abs(b.states[k, 2 * n + j]))
+    return change > b.constants[MOST_TURNED] * (b.t[k] - b.t[k - 1]) * min(first, last)
 
 
 @kernel(i8(KIT, WORK, AGAIN, f8, MATRIX, i8, i8), vectorized=True)
@@ -276,13 +276,13 @@ def go(f, w, b, t1, box, n_rows, n_steps):
     code = at.GO_ON
     if n_steps < 0:
         _begin_again(f, b)
-        b.end[0], b.out_t[0] = t1, b.clock[at.T]
-        _copy(b.state, b.out_rows[0])
+        b.end[0], b.t[0] = t1, b.clock[at.T]
+        _copy(b.state, b.states[0])
         arrays = b.tolerances, b.control, b.clock, b.state, b.new_state
-        code = b.advance(f, w, b.options, b.memory, *arrays, b.end, b.out_t[1:], b.out_rows[1:], b.out_steps, b.filled)
+        code = b.advance(f, w, b.options, b.memory, *arrays, b.end, b.t[1:], b.states[1:], b.steps, b.filled)
         n_rows, n_steps = b.filled[0], b.filled[1]
     turned = n_rows > 0 and _turned(b, n_rows, w.Q.size)
-    inside = box.shape[1] > 0 and _lie_within(b.out_t[: 1 + n_rows], b.out_rows, box)
+    inside = box.shape[1] > 0 and _lie_within(b.t[: 1 + n_rows], b.states, box)
     near = b.clock[at.PIVOT_AT_OUTPUT] < b.constants[NEAR]
     missed = b.clock[at.BRIEFEST] < b.constants[LOOKS] * b.clock[at.WIDEST_LOOK]
     b.told[N_STATES], b.told[N_STEPS], b.told[PLAIN] = 1 + n_rows, n_steps, not (turned or near or missed)

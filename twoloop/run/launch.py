@@ -63,7 +63,7 @@ def record_again(
         known = others.get((asked.key, _family_of(system)))
         alike = (known,) if isinstance(known, Kept) else ()
     for kept in alike:
-        if kept.waiting is None or not (output is STEPS or _suits(kept, output)):
+        if kept.waiting is None or not (output is STEPS or Again.gives(kept.run, output, kept.kin)):
             continue
         if kept.kin is not None or output is not STEPS or not kept.waiting:
             interrupts.listen()
@@ -78,13 +78,6 @@ def record_again(
         if fields is not None:
             return fields, said_of_rows
     return None
-
-
-def _suits(kept: Kept, output: Output) -> bool:
-    """Whether what is wanted of a run may be had by the arrays of one that is kept."""
-    if output.dense and (output.between is not None or kept.kin is not None):
-        return False  # both have the same states within steps; what belongs to kin takes other parameters
-    return output.between is None or Again.interpolates(kept.run)
 
 
 def run_from(system: ConstrainedSystem, t0: float, t1: float, q0: Array, v0: Array, asked: Asked) -> Run:
