@@ -124,16 +124,19 @@ REFUSED, IN_DOUBT, READY = range(3)  # another way has to be gone; a closer look
 AGAIN = Reference(
     "Again",
     {
-        **dict.fromkeys(("looked", "lam", "room", "least", "bounds", "scratch", "constants", "saved"), VECTOR),
+        **dict.fromkeys(
+            ("looked", "lam", "room", "least", "bounds", "scratch", "constants", "saved", "search"), VECTOR
+        ),
         **dict.fromkeys(("begin_numbers", "numbers", "begin_memory", "memory", "lasting", "options"), VECTOR),
         **dict.fromkeys(("tolerances", "control", "clock", "state", "new_state", "end", "t", "told"), VECTOR),
         **dict.fromkeys(("mass", "rows", "ways", "pattern", "states", "steps"), MATRIX),
         **dict.fromkeys(("chosen", "expected", "lapack", "lasting_integers", "saved_integers"), INTEGERS),
-        **dict.fromkeys(("places", "filled"), INTEGERS),
+        **dict.fromkeys(("places", "filled", "kinds", "counted", "search_places", "blocks", "found"), INTEGERS),
     },
 )
 AGAIN.add_function("look", i8(KIT, f8, *(VECTOR,) * 5, *(MATRIX,) * 4, VECTOR))
 AGAIN.add_function("choose", i8(MATRIX, MATRIX, f8, f8, VECTOR, VECTOR, INTEGERS))
+AGAIN.add_function("dependents", i8(MATRIX, INTEGERS, INTEGERS, i8, VECTOR, INTEGERS, INTEGERS))
 AGAIN.add_function("start", i8(KIT, WORK, f8, VECTOR))
 AGAIN.add_function("advance", i8(KIT, WORK, *(VECTOR,) * 9, MATRIX, MATRIX, INTEGERS))
 # in `constants`: of starts, the flag of an M that varies, else 0, the smallest pivot with which one is taken and the
@@ -147,7 +150,7 @@ PLACE, N_KEPT, N_ADDED, KEPT = range(4)  # in `expected`, which is empty without
 
 @merged
 def _is_expected(b, weak):
-    """Whether the rows that count, and those that help M, are those of the code."""
+    """Whether the rows that count, those that help M, and the coordinates that follow are those of the code."""
     b.scratch[0] = 0.0
     place = b.choose(b.mass, b.rows, b.constants[RANK], weak, b.bounds, b.scratch, b.chosen)
     n_kept, n_added = b.expected[N_KEPT], b.expected[N_ADDED]
@@ -162,6 +165,11 @@ def _is_expected(b, weak):
         same = same and b.chosen[2 + k] == b.expected[KEPT + k]
     for k in range(n_added):
         same = same and b.chosen[2 + len(b.rows) + k] == b.expected[KEPT + n_kept + k]
+    if same and b.kinds.size > 0:
+        n = 4 * b.dependents(b.rows, b.kinds, b.counted, b.counted.size, b.search, b.search_places, b.found)
+        same = n == b.blocks.size
+        for k in range(b.blocks.size):
+            same = same and b.found[k] == b.blocks[k]
     return same
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.checks.consistency import Look
-from twoloop.generate.choices import SINGULAR_MASS, Dependents
+from twoloop.generate.choices import SINGULAR_MASS
 from twoloop.generate.exact_derivatives import farthest
 from twoloop.generate.straight_code import OwnCode
 from twoloop.generate.traced_values import Sample
@@ -103,10 +103,6 @@ class Again:
         looked, room = system if self.movable is None else self.movable.system, LARGEST // len(run.state)
         self.look, self.loops, self.rest = Look(looked), short_loops(), 0
         self.known, self.given = arrays_of(run, self.look, code, definite, asked, room), looked.kit
-        choice = None if code is None else code.shared.equations.choice
-        self.dependents = None if choice is None else Dependents(looked, choice.rows)
-        blocks = [] if choice is None else [(i[0], i[-1], j[0], j[-1]) for i, j in choice.blocks]
-        self.blocks = np.array(blocks, dtype=np.int64).ravel().data
         self._begin, self._go, self._advance = map(direct, (self.loops.begin, self.loops.go, run.kernels.advance))
         self.plan, self.kit, self.form, self.memory = run.plan, run.kit, run.kit.flags[flags.FORM], run.memory
         self.looks: Looks | None = None  # of a run of several chunks
@@ -294,13 +290,8 @@ class Again:
             interrupts.listen()
             if not look.is_surely(0, t0, *state):
                 return False
-        dependents = self.dependents
         if code != self.loops.READY:
             return False
-        if dependents is not None and dependents.find is not None:
-            n = dependents.find(look.rows, *dependents.arguments)
-            if dependents.found[: 4 * n] != self.blocks:  # the code is for other coordinates than the rows give here
-                return False
         run.t0, run.compared_to[0] = t0, -np.inf
         if run.said_of_rows:  # rounding may decide which row is left out
             interrupts.listen()

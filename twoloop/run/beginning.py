@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twoloop.checks.consistency import Look
-from twoloop.generate.choices import BOUNDS, LEAST, RANK, Choice
+from twoloop.generate.choices import BOUNDS, LEAST, RANK, Choice, Dependents
 from twoloop.generate.straight_code import OwnCode
 from twoloop.kernels.algebra.lapack import addresses
 from twoloop.kernels.data import noted
@@ -30,6 +30,7 @@ def arrays_of(run: Run, look: Look, code: OwnCode | None, definite: bool, asked:
     the one that it stands for; `code` is the machine code that its plan calls; `definite`: whether M has an inverse.
     """
     from twoloop.kernels.algebra import pivots
+    from twoloop.kernels.algebra.dependents import dependents as find
     from twoloop.kernels.evaluation import first_look
 
     loops, system = short_loops(), look.system
@@ -38,7 +39,11 @@ def arrays_of(run: Run, look: Look, code: OwnCode | None, definite: bool, asked:
     i, j = run.clock.size, run.clock.size + run.control.size
     run.clock, run.control, run.tolerances = numbers[:i], numbers[i:j], numbers[j:]
     memory, (of_work, integers) = run.plan.memory, lasting(run.work)
-    expected, scale = _expected(None if code is None else code.shared.equations.choice)
+    choice, nothing = None if code is None else code.shared.equations.choice, np.zeros(0, dtype=np.int64)
+    expected, scale = _expected(choice)
+    blocks = [] if choice is None else [(i[0], i[-1], j[0], j[-1]) for i, j in choice.blocks]
+    dependents = Dependents(system, () if choice is None else choice.rows)
+    search = dependents.arguments if dependents.find else (nothing, nothing, 0, np.zeros(0), nothing, nothing)
     places = np.flatnonzero(memory.view(np.int64))  # -0 is not what is cleared
     of_start: tuple[float, ...]
     of_start = max(run.rtol, GAMMA_ACCURACY), run.reuse, 0.0 if run.plan.watchful else 1.0, RANK, scale, CONTRADICTS
@@ -54,10 +59,11 @@ def arrays_of(run: Run, look: Look, code: OwnCode | None, definite: bool, asked:
         **{"constants": np.array([*of_start, *of_steps, run.near, TURNED, WITHIN])},
         lapack=np.array(addresses() if run.kit.flags[BANDWIDTH] >= 0 else [], dtype=np.int64),
         **{"bounds": BOUNDS, "scratch": np.zeros(pivots.room_size(n_rows, system.n_q)), "expected": expected},
-        chosen=np.zeros(2 + 3 * n_rows, dtype=np.int64),
+        **{"chosen": np.zeros(2 + 3 * n_rows, dtype=np.int64), "blocks": np.array(blocks, dtype=np.int64).ravel()},
+        **dict(zip(("kinds", "counted", "_", "search", "search_places", "found"), search, strict=True)),
         **{"end": np.zeros(1), "t": np.empty(room + 1), "states": np.empty((room + 1, len(run.state)))},
         **{"steps": np.empty((room, run.a.N_STEP_COLUMNS)), "filled": np.zeros(2, dtype=np.int64)},
-        **{"told": np.zeros(loops.N_TOLD), "look": first_look.look, "choose": pivots.choose},
+        **{"told": np.zeros(loops.N_TOLD), "look": first_look.look, "choose": pivots.choose, "dependents": find},
         **{"start": run.kernels.start, "advance": run.kernels.advance},
     )
     known.table = loops.AGAIN.table(known)
