@@ -194,12 +194,6 @@ def _agree(w, b, n):
     return True
 
 
-@merged
-def _put_form(f, b):
-    if f.flags[FORM] != int(b.constants[IN_FORM]):  # which a run may change
-        f.flags[FORM] = int(b.constants[IN_FORM])
-
-
 @kernel(i8(KIT, KIT, WORK, AGAIN, f8, f8, VECTOR, VECTOR, VECTOR, f8, types.boolean), vectorized=True)
 def begin(f, given, w, b, t, t1, q, v, sizes, weak, sure):
     """Whether a run to t1 begins at a state, with the same choices as the run before it; its start is then saved.
@@ -210,7 +204,7 @@ def begin(f, given, w, b, t, t1, q, v, sizes, weak, sure):
     n = q.size
     if not (finite_vector(q) and finite_vector(v)):
         return REFUSED
-    _put_form(f, b)
+    f.flags[FORM] = int(b.constants[IN_FORM])  # which a run may have changed
     for k in range(b.looked.size):
         b.looked[k] = 0.0
     found = b.look(given, t, q, v, sizes, b.lam, b.room, b.mass, b.rows, b.ways, b.pattern, b.least)
@@ -248,7 +242,7 @@ def begin(f, given, w, b, t, t1, q, v, sizes, weak, sure):
 @merged
 def _begin_again(f, b):
     """Put all that counts back to where the last start left it."""
-    _put_form(f, b)
+    f.flags[FORM] = int(b.constants[IN_FORM])  # which a run may have changed
     i, j = b.numbers.size, b.numbers.size + b.lasting.size
     _copy(b.saved[:i], b.numbers)
     _copy(b.saved[i:j], b.lasting)
