@@ -5,6 +5,8 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from scipy.linalg import null_space
 
 from tests.bodies.random_models import Both
@@ -18,6 +20,7 @@ from twoloop.generate.llvm_text import BIT, Module
 from twoloop.generate.null_space import LEAST
 from twoloop.generate.straight_code import own_code, write_function
 from twoloop.generate.straight_line import StraightLine
+from twoloop.kernels.algebra.dependents import NONE, NUMBER, VARIES, dependents, room_size
 from twoloop.kernels.compile.own_functions import OwnFunctions, object_code
 from twoloop.kernels.lanes.lane_room import LANES
 
@@ -164,6 +167,28 @@ def test_they_take_fewer_operations(name, most, mass_first):
 def test_where_few_coordinates_depend_mass_first_stays(name):
     problem = getattr(mechanisms, name)()
     assert own_code(problem.system, 0.0, problem.q0).shared.equations.quick is None
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.integers(1, 8), st.integers(0, 3), st.integers(0, 10**6))
+def test_pivots_are_one_for_each_row_and_not_small(m, freedom, seed):
+    """Of random rows, a third of whose entries are not zero, half of these numbers."""
+    rng, n = np.random.default_rng(seed), m + freedom
+    G = rng.standard_normal((m, n)) * (rng.random((m, n)) < 0.4)
+    kinds = np.where(G == 0.0, NONE, np.where(rng.random((m, n)) < 0.5, NUMBER, VARIES))
+    numbers, integers = room_size(m, n)
+    out, work = np.zeros(4 * m, np.int64), np.zeros(integers, np.int64)
+    count = dependents(G, kinds.ravel(), np.arange(m), m, np.zeros(numbers), work, out)
+    if count == 0:
+        assert np.linalg.svd(G)[1][-1] < 0.3
+        return
+    blocks = out[: 4 * count].reshape(count, 4).tolist()
+    rows = [i for block in blocks for i in dict.fromkeys(block[:2])]
+    columns = [j for block in blocks for j in dict.fromkeys(block[2:])]
+    assert sorted(rows) == list(range(m)) and len(set(columns)) == m
+    assert np.linalg.svd(G[:, columns])[1][-1] > 1e-6
+    numbers_first = [kinds[i, j] == NUMBER for i, j in zip(rows, columns, strict=True)]
+    assert not (kinds == NUMBER).all(axis=None) or all(numbers_first)
 
 
 def blocks_along(system, known):

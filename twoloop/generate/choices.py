@@ -82,7 +82,7 @@ class Dependents:
     Attributes
     ----------
     find : callable or None
-        Of G and `arguments`: how many blocks there are, of which it puts four numbers each into `found`. None: there
+        Of G and `arguments`: how many blocks there are, see `dependents` of kernels/algebra/dependents.py. None: there
         are none at any position.
     """
 
@@ -95,7 +95,7 @@ class Dependents:
 
             numbers, integers = room_size(len(rows), system.n_q)
             blocks, room, work = np.zeros(4 * len(rows), np.int64), np.zeros(numbers), np.zeros(integers, np.int64)
-            self.find, self.found = direct(dependents), blocks.data
+            self.find, self._blocks = direct(dependents), blocks
             self.arguments = kinds, np.array(rows, np.int64), len(rows), room, work, blocks
 
     def blocks(self, G: Array) -> Blocks:
@@ -103,12 +103,12 @@ class Dependents:
         if self.find is None:
             return ()
         n = self.find(G, *self.arguments)
-        each = (self.found[4 * k : 4 * k + 4].tolist() for k in range(n))
-        return tuple(((i,), (j,)) if i == k else ((i, k), (j, l)) for i, k, j, l in each)
+        found = self._blocks[: 4 * n].reshape(n, 4).tolist()
+        return tuple(((i,), (j,)) if i == k else ((i, k), (j, l)) for i, k, j, l in found)
 
 
 def _kinds(system: ConstrainedSystem) -> Any:
-    """Which entries of G are zero, 0, or a number, 1, or vary, 2; None: that is known only when code is made."""
+    """Which entries of G are zero, 0, or a number, 1, or vary, 2; None: it is not known."""
     if system.called_in_python:  # may keep what it gets, and so is traced no earlier than it must be
         return None
 

@@ -16,8 +16,8 @@ from twoloop.generate.tracing import Form
 Blocks = Sequence[tuple[tuple[int, ...], tuple[int, ...]]]  # rows and columns of pivots, one or two each
 Terms = dict[int, Form]  # entries of a row that are not zero, by their columns
 
-# The square of what a pivot must be at least, of what it is divided into, or of the sine between two columns. The
-# accelerations lose up to three times as many digits. Blocks are chosen by limits 7 and 2 times as strict.
+# Squares of the least pivot over what it is divided into, or its column, and of the sine between two columns. The
+# accelerations lose up to three times as many digits. At a start more is asked for, see kernels/algebra/dependents.py.
 LEAST = 0.03**2
 
 
@@ -63,6 +63,7 @@ class DependentCoordinates:
             {j: entry for j, entry in enumerate([*row, right]) if not _is_zero(entry)}
             for row, right in zip(rows, gamma, strict=True)
         ]
+        self._columns = list(zip(*rows, strict=True))
         self._left, self._free = set(range(len(rows))), set(range(self._n))
         self.conditions: list[tuple[Form, Form]] = []
         for block in blocks:
@@ -97,7 +98,7 @@ class DependentCoordinates:
         for i, row in zip(places, solved, strict=True):
             self._rows[i] = row
         if pivot.terms:
-            self._add_conditions(block, pivot, solved)
+            self._add_conditions(block, columns, pivot, solved)
 
     def _bound(self) -> None:
         if len(self._graph.operations) > self._most:
@@ -120,13 +121,24 @@ class DependentCoordinates:
             [(-(c * share)).value(), (a * share).value()],
         ]
 
-    def _add_conditions(self, block: list[list[Form]], pivot: Form, solved: list[Terms]) -> None:
-        """What is solved is not divided by too small a pivot, and columns of a block are not nearly parallel."""
+    def _add_conditions(
+        self, block: list[list[Form]], columns: tuple[int, ...], pivot: Form, solved: list[Terms]
+    ) -> None:
+        """What is solved is not divided by too small a pivot, nor are rows nearly dependent.
+
+        Then columns of a block are nearly parallel, or one pivot is small in its column, where its row may be, too.
+
+        The sign of a pivot has no part in it: on either side of zero the accelerations are the same function.
+        """
         entries = [entry for row in solved for j, entry in row.items() if j < self._n]
         total = _dot(self._zero, [(entry, entry) for entry in entries])
         if total.terms:
             self.conditions.append((Form(total.graph, 1.0 / LEAST, {}), total))
-        if len(block) == 2:
+        if len(block) == 1:
+            (column,) = (self._columns[j] for j in columns)
+            squares = _dot(self._zero, [(entry, entry) for entry in column])
+            self.conditions.append((pivot * pivot, squares.times(LEAST)))
+        else:
             a, b = (_dot(self._zero, [(x, x) for x in column]).value() for column in zip(*block, strict=True))
             self.conditions.append((pivot * pivot, (a * b).times(LEAST)))
 

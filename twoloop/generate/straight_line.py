@@ -27,14 +27,13 @@ from twoloop.generate.traced_equations import Equations, only
 from twoloop.generate.traced_values import Traced
 from twoloop.generate.tracing import Form, Graph, Untraceable
 from twoloop.kernels.evaluation.inner import CONTRADICTS
-from twoloop.kernels.evaluation.operations import PRODUCT, RECIPROCAL, SUM
+from twoloop.kernels.evaluation.operations import PRODUCT, RECIPROCAL
 from twoloop.problem.system import ConstrainedSystem
 
 MOST_ELIMINATED = 60_000  # operations with their elimination: those of more than 40 bodies on hinges in space
 # operations of `quick` over those of `there`, from which on it does not pay: now and then both are needed
 WORTH = 0.9
-# of operations, in multiplications: those of division and functions where their results are not waited for
-COSTS, FUNCTION = {PRODUCT: 1, SUM: 0, RECIPROCAL: 4}, 20
+COSTS = {PRODUCT: 1, RECIPROCAL: 4}  # in multiplications; sums are counted by their terms, and functions are the same
 
 
 @dataclass(frozen=True)
@@ -57,11 +56,11 @@ class Outputs:
         return graph.needed_by(self.forms, known)
 
     def cost(self, graph: Graph) -> int:
-        """About how long all of this takes to compute, in multiplications and additions."""
+        """About how long all of this takes to compute, functions apart, in multiplications and additions."""
         forms, total = self.forms, 0
         for i in self.quantities(graph):
             kind, *arguments = graph.operations[i]  # type: ignore[misc]
-            total += COSTS.get(kind, FUNCTION)
+            total += COSTS.get(kind, 0)
             forms += [form for form in arguments if isinstance(form, Form)]
         return total + sum(max(len(form.terms) - 1, 0) for form in forms)
 
