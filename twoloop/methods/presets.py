@@ -10,6 +10,7 @@ from twoloop.methods.auto import Auto
 from twoloop.methods.bdf import BDF
 from twoloop.methods.dop853 import DOP853
 from twoloop.methods.esdirk import ESDIRK
+from twoloop.methods.lobatto import Lobatto16
 from twoloop.methods.newmark import Newmark
 from twoloop.methods.plan import Method
 from twoloop.methods.runge_kutta import RungeKutta
@@ -121,6 +122,7 @@ PRESETS: dict[str, Method] = {
     "ESDIRK4": ESDIRK("ESDIRK4"),
     "Newmark": Newmark(),
     "BDF": BDF(),
+    "Lobatto16": Lobatto16(),
     "DOP853": DOP853(),
     "Adams": Adams(),
     "Taylor": Taylor(),
@@ -129,7 +131,7 @@ PRESETS: dict[str, Method] = {
 }
 
 
-OWN = (Adams, BDF, DOP853, ESDIRK, Newmark, RungeKutta, Taylor)  # whose objects are the values of their options
+OWN = (Adams, BDF, DOP853, ESDIRK, Lobatto16, Newmark, RungeKutta, Taylor)  # whose objects are the values of their options
 PLAIN = (str, int, float, np.generic, type(None))  # such values, beside tableaux
 _OF_PRESETS = frozenset(map(id, PRESETS.values()))
 

@@ -166,6 +166,7 @@ class Run:
         control[a.LIMIT_MEMORY], control[a.SYMMETRIC] = plan.limit_memory, plan.symmetric
         control[a.ROUGH] = plan.rough
         control[a.GIVES_WAY] = plan.substitute is not None
+        control[a.IN_A_ROW] = getattr(plan.step, "many", None) is not None
         control[a.PROVISIONAL] = PROVISIONAL if plan.provisional else -1.0
         self.clock[a.H_LIMIT] = plan.limit_start
 

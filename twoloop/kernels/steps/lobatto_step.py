@@ -1,0 +1,315 @@
+"""Steps by collocation at nine Lobatto nodes, of order 16: the outer loop of the paper's procedure in the lanes of vectors.
+
+The stages of an implicit Runge-Kutta step are iterated without any Jacobian, as the paper does, all of them at once: see
+generate/collocation_code.py, whose functions do the arithmetic. (For ordinary differential equations at high precision:
+M. Antonana, E. Alberdi, J. Makazaga, A. Murua, arXiv 2511.03655.) What is chosen here is the length of a step. A sweep
+over the stages shrinks their error by rho, which grows with the step and with the derivatives of the accelerations; the
+length is such that a given number of sweeps suffices, or such that the top coefficients of the accelerations in
+Legendre polynomials are as small as the tolerance asks for. Steps are counted as the integrator does, one at a time; or
+many are made in a row while nothing else has to be looked at, and eight of them are put on the constraints side by side.
+"""
+
+import math
+
+import numpy as np
+
+from twoloop.kernels.algebra.linalg import copy
+from twoloop.kernels.control import clock as at
+from twoloop.kernels.control.predictor import departure, keep_predicted
+from twoloop.kernels.control.progress import count_step
+from twoloop.kernels.data import collocation as room_at
+from twoloop.kernels.data.codes import DONE, OUTER_DIVERGED, UNSUITED
+from twoloop.kernels.data.collocation import LANES, places
+from twoloop.kernels.data.common import ATTEMPT, MANY, SETTLE, Attempt, Step, compiled, inlined, kernel, merged
+from twoloop.kernels.data.counters import N_ACCEPTED, N_EVALUATIONS, N_FACTORIZATIONS, N_INNER, N_OUTER, N_REJECTED_ERROR
+from twoloop.kernels.data.noted import BY_GENERAL, DEFECT, NEARLY_SINGULAR, ORIENTATION_NEW, ROUNDED
+from twoloop.kernels.data.tolerances import ESTIMATE, LEAST, allowed
+from twoloop.kernels.evaluation.calls import check_redundant, project
+from twoloop.kernels.evaluation.gamma import representable
+from twoloop.kernels.evaluation.onto_constraints import ABOVE_ROUNDING
+
+KAPPA, TARGET, THETA, N_ITERATED, N_ROWS, N_OPTIONS = range(6)
+
+MORE = 7  # sweeps beyond the target, after which a step is refused
+SLOW = 0.8  # contraction that is too slow
+LEAST_RHO, MOST_RHO = 1e-3, 0.9
+SLOW_START, FAST_START, WANTED_START = 0.3, 0.04, 0.12  # contraction of the first step: between the first two is well
+MOST_STARTS = 4
+STAGNANT, NOISE = 0.5, 1e-13  # changes that fall no further, and are this small relative to the values, are rounding
+AT_ONCE = 16  # steps in a row at most: then a look is taken at what else there is
+ORDER = 16.0
+SHARP, ROUGH_SHARE = 0.3, 0.05  # coefficients that fall less are not those of a smooth motion; what error they stand for
+SHORTER, SAFETY = 0.6, 0.85
+UNFORESEEN = 10.0  # an error that is so large is looked at elsewhere
+LIMITED, LIMITED_ERROR = 24, 1e-11  # steps that accuracy would let be five times as long: stiffness limits them
+REFUSALS = 6
+EARLY, GROWTH_EARLY, GROWTH = 6, 4.0, 1.4
+MADE, REFUSED, GUESSED, LEFT = range(4)
+_places = merged(places)
+
+
+def memory_size(n, n_iterated, n_rows):
+    """Length of `memory`, with room to begin at an aligned place."""
+    return places(n, n_iterated, n_rows)[-1] + LANES
+
+
+@inlined
+def _room(memory):
+    """The memory from an aligned place on."""
+    return memory[(-(memory.ctypes.data >> 3)) & (LANES - 1) :]
+
+
+@merged
+def _sweeps(f, w, options, room, tolerances, state, first):
+    """Iterate the stages: how that ended, after how many sweeps, and the last change."""
+    fixed = tolerances[ESTIMATE] == 0.0
+    target = options[TARGET]
+    if room[room_at.DEGREE] >= 7.0:
+        target += 2.0
+    elif room[room_at.DEGREE] >= 6.0:
+        target += 1.0
+    noise = min(options[KAPPA], NOISE / tolerances[LEAST])
+    rho, before, m = room[room_at.RHO], math.inf, 0.0
+    while True:
+        change = f.sweep_nodes(room, state, f.numbers)
+        m += 1.0
+        if not change >= 0.0:
+            return LEFT, m, change, target
+        if m > 1.0:
+            rho = min(max(change / before, LEAST_RHO), MOST_RHO) if before > 0.0 else LEAST_RHO
+            room[room_at.RHO] = rho
+        if first and m == 2.0 and not fixed and room[room_at.STARTS] < MOST_STARTS and change > 0.0:
+            if rho < FAST_START or rho > SLOW_START:
+                return GUESSED, m, change, target
+        if not fixed and rho * change <= options[KAPPA]:
+            return MADE, m, change, target
+        if m > 2.0 and change >= STAGNANT * before and change <= noise:
+            return MADE, m, change, target
+        if change == 0.0:
+            return MADE, m, change, target
+        if not change < 1e300 or (m > 3.0 and rho >= SLOW) or (m >= target + MORE and not fixed) or m > 50.0:
+            return REFUSED, m, change, target
+        before = change
+
+
+@merged
+def _error(room):
+    """The error of a step over the tolerances, from the coefficients of its accelerations."""
+    top, largest = room[room_at.SPECTRUM + 7], max(room[room_at.LARGEST], 1e-300)
+    error = max(0.005 * top * (top / largest), 1e-5 * top)
+    tail = max(top, room[room_at.SPECTRUM + 6])
+    if tail > SHARP * max(room[room_at.SPECTRUM + 5], room[room_at.SPECTRUM + 4]):
+        error = max(error, ROUGH_SHARE * tail)
+    return error
+
+
+@compiled
+def _collocate(f, w, options, room, tolerances, t, h, state):
+    """The stages of a step: how it ended, its error, and the factor for the next one."""
+    first = room[room_at.PREDICTS] == 0.0
+    room[room_at.T], room[room_at.H] = t, h
+    if first:
+        room[room_at.H_BEFORE], room[room_at.DEGREE], room[room_at.RHO] = h, 0.0, WANTED_START
+    f.begin_nodes(room, state, tolerances)
+    ended, m, change, target = _sweeps(f, w, options, room, tolerances, state, first)
+    rho = room[room_at.RHO]
+    w.counters[N_OUTER] += int(m)
+    w.counters[N_EVALUATIONS] += LANES * int(m)
+    w.counters[N_FACTORIZATIONS] += LANES * int(m)
+    if ended == GUESSED:
+        room[room_at.STARTS] += 1.0
+        return ended, 2.0, min(max(WANTED_START / rho, 0.05), 30.0)
+    if ended != MADE:
+        room[room_at.REFUSED] += 1.0
+        return ended, 2.0, SHORTER
+    if tolerances[ESTIMATE] == 0.0:
+        return MADE, 0.0, 1.0
+    f.judge_nodes(room, state)
+    error = _error(room)
+    if not error <= 1.0:
+        return REFUSED, error, min(max(0.9 * error ** (-1.0 / ORDER), 0.3), 0.9)
+    left = math.log2(rho * change / options[KAPPA] + 1e-30) + (target - m) * math.log2(rho)
+    factor = 2.0 ** (-(left + 1.0) / (target + 2.0))
+    stiff = error < LIMITED_ERROR and factor < 1.2 and room[room_at.N_STEPS] >= EARLY
+    room[room_at.LIMITED] = room[room_at.LIMITED] + 1.0 if stiff else 0.0
+    if error > 1e-6:
+        factor = min(factor, SAFETY * error ** (-1.0 / ORDER))
+    most = GROWTH_EARLY if room[room_at.N_STEPS] < EARLY else GROWTH
+    if m > target + 1.0:
+        most = 0.9
+    return MADE, error, min(max(factor, 0.4), most)
+
+
+@merged
+def _next_degree(room):
+    """The degree of the polynomial that would have predicted the end of this step best, near the one that it had."""
+    if room[room_at.PREDICTS] == 0.0:
+        return 3.0
+    least = math.inf
+    for k in range(LANES):
+        least = min(least, room[room_at.WORST + k])
+    best = LANES
+    for k in range(LANES - 1, -1, -1):
+        if room[room_at.WORST + k] <= 1.2 * least:
+            best = k + 1
+    degree = min(max(float(best), room[room_at.DEGREE] - 2.0), room[room_at.DEGREE] + 2.0)
+    return min(max(degree, 2.0), 8.0)
+
+
+@merged
+def _accept(room):
+    """The polynomial of this step predicts the next."""
+    room[room_at.WHICH] = 1.0 - room[room_at.WHICH]
+    room[room_at.DEGREE], room[room_at.H_BEFORE] = room[room_at.NEXT_DEGREE], room[room_at.H]
+    room[room_at.PREDICTS], room[room_at.REFUSED] = 1.0, 0.0
+    room[room_at.N_STEPS] += 1.0
+
+
+@merged
+def _is_unsuited(w, room):
+    """Whether another method should go on: near a singular position, and where stiffness limits the steps."""
+    stiff = room[room_at.LIMITED] >= LIMITED or room[room_at.REFUSED] >= REFUSALS
+    return stiff or w.notes[NEARLY_SINGULAR] == 1.0
+
+
+@kernel(SETTLE)
+def settle_lobatto(f, w, options, memory, tolerances, accepted):
+    """The polynomial of an accepted step predicts the next."""
+    room = _room(memory)
+    if accepted and room[room_at.TRIED] == 1.0:
+        _accept(room)
+    room[room_at.TRIED] = 0.0
+
+
+@kernel(ATTEMPT)
+def lobatto_step(f, w, options, memory, t, h, tolerances, state, new_state):
+    """One attempt."""
+    room, n = _room(memory), w.Q.size
+    room[room_at.TRIED] = 0.0
+    if tolerances[ESTIMATE] == 1.0 and _is_unsuited(w, room):
+        return Attempt(UNSUITED, math.inf, 0.0)
+    ended, error, factor = _collocate(f, w, options, room, tolerances, t, h, state)
+    if ended == LEFT:
+        return Attempt(OUTER_DIVERGED, math.inf, 0.0)
+    if ended != MADE:
+        return Attempt(DONE, error, factor)
+    f.end_nodes(room, state, new_state)
+    room[room_at.NEXT_DEGREE], room[room_at.TRIED] = _next_degree(room), 1.0
+    q1, v1, a1, lam1 = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n], new_state[3 * n :]
+    keep_predicted(w, q1)
+    code = project(f, w, t + h, q1, v1, options[THETA], a1, lam1)
+    if code == DONE:
+        error = max(error, departure(w, tolerances, h, state[:n], state[n : 2 * n], q1))
+    return Attempt(code, error, factor if error <= 1.0 else 0.0)
+
+
+@merged
+def _project_all(f, w, options, room, n, n_ends, out_t, out_state):
+    """Put the states of so many rows on the constraints, with accelerations and multipliers, into the lanes of `room`."""
+    ends = _places(n, int(options[N_ITERATED]), int(options[N_ROWS]))[4]
+    for k in range(LANES):
+        row = min(k, n_ends - 1)
+        room[ends + k] = out_t[row]
+        for i in range(2 * n):
+            room[ends + LANES * (1 + i) + k] = out_state[row, i]
+        room[room_at.FINE + k] = 1.0
+    least = max(options[THETA], ABOVE_ROUNDING * w.notes[ROUNDED])
+    f.closer_ends(room, f.numbers)
+    for _ in range(4):
+        f.nearer_ends(room, f.numbers)
+        w.counters[N_INNER] += n_ends
+        w.counters[N_FACTORIZATIONS] += n_ends
+        moved = 0.0
+        for k in range(n_ends):
+            moved = max(moved, room[room_at.MOVED + k])
+        if moved <= least:
+            break
+    for k in range(n_ends):
+        if not room[room_at.MOVED + k] <= least:
+            room[room_at.FINE + k] = 0.0
+
+
+@merged
+def _take(f, w, options, room, tolerances, n, k, t, row, state):
+    """Make `row`, a state beside the constraints, that of lane k, on them; whether it was near enough."""
+    _, _, _, _, ends, end_a, lam, _ = _places(n, int(options[N_ITERATED]), int(options[N_ROWS]))
+    if room[room_at.FINE + k] == 0.0:
+        return False
+    for i in range(n):
+        q = room[ends + LANES * (1 + i) + k]
+        if not abs(q - row[i]) <= allowed(tolerances, i, q, q):
+            return False
+    for i in range(n):
+        row[i], row[n + i] = room[ends + LANES * (1 + i) + k], room[ends + LANES * (1 + n + i) + k]
+        row[2 * n + i] = room[end_a + LANES * i + k]
+    for i in range(state.size - 3 * n):
+        row[3 * n + i] = room[lam + LANES * i + k]
+    if w.rows_v.size < w.Rate.size:
+        w.notes[BY_GENERAL] = 0.0
+        if check_redundant(f, w, t, row[:n], row[n : 2 * n]) != DONE:
+            return False
+    copy(row, state)
+    return True
+
+
+@merged
+def _make(f, w, options, room, tolerances, control, clock, goal, state, n_most, out_t, out_state, out_steps):
+    """Steps in a row, at most so many, beside the constraints: how many, and whether others may follow."""
+    n, t, n_ends = w.Q.size, clock[at.T], 0
+    while n_ends < n_most:
+        h = min(clock[at.H_NEXT], control[at.MAX_STEP])
+        if h > 0.5 * (goal - t) or h < 0.5 * clock[at.H_LONG]:
+            return n_ends, False
+        h = representable(t, h)
+        ended, error, factor = _collocate(f, w, options, room, tolerances, t, h, state)
+        if ended == GUESSED or (ended == REFUSED and error <= UNFORESEEN):
+            clock[at.H_NEXT] = h * factor
+            w.counters[N_REJECTED_ERROR] += 1 if ended == REFUSED else 0
+            continue
+        if ended != MADE or _is_unsuited(w, room):
+            return n_ends, False
+        f.end_nodes(room, state, state)
+        room[room_at.NEXT_DEGREE] = _next_degree(room)
+        _accept(room)
+        t += h
+        out_t[n_ends], out_steps[n_ends, at.H] = t, h
+        copy(state[: 2 * n], out_state[n_ends, : 2 * n])
+        clock[at.H_NEXT] = h * factor
+        n_ends += 1
+    return n_ends, True
+
+
+@kernel(MANY)
+def lobatto_steps(
+    f, w, options, memory, tolerances, control, clock, goal, state, new_state, out_t, out_state, out_steps
+):
+    """Steps in a row, as many as there are rows, while nothing else has to be looked at; how many were accepted."""
+    room, n = _room(memory), w.Q.size
+    most = min(out_t.size, AT_ONCE - w.counters[N_ACCEPTED] % AT_ONCE)
+    made, goes = 0, not _is_unsuited(w, room)
+    while goes and made < most:
+        n_most = min(LANES, most - made)
+        t, rows, steps = out_t[made:], out_state[made:], out_steps[made:]
+        copy(state, new_state)
+        n_ends, goes = _make(
+            f, w, options, room, tolerances, control, clock, goal, state, n_most, t, rows, steps
+        )
+        if n_ends == 0:
+            break
+        _project_all(f, w, options, room, n, n_ends, t, rows)
+        for k in range(n_ends):
+            h = steps[k, at.H]
+            if not _take(f, w, options, room, tolerances, n, k, t[k], rows[k], state):
+                if k == 0:
+                    copy(new_state, state)
+                clock[at.H_NEXT], room[room_at.PREDICTS], goes = SHORTER * h, 0.0, False
+                break
+            clock[at.T] = t[k]
+            w.notes[DEFECT], w.notes[ORIENTATION_NEW] = -1.0, 0.0
+            count_step(w, tolerances, control, clock, h, steps[k])
+            made += 1
+    return made
+
+
+LOBATTO = Step(lobatto_step, settle_lobatto, lobatto_steps)
+LOBATTO_SINGLY = Step(lobatto_step, settle_lobatto)  # without code for projections
