@@ -8,6 +8,7 @@ the ends of eight steps are moved to the constraints side by side, too.
 The functions work in a memory that kernels/data/collocation.py describes; kernels/steps/lobatto_step.py calls them.
 """
 
+import hashlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import cache, partial
@@ -18,6 +19,7 @@ from numpy.typing import NDArray
 
 from twoloop.generate import lane_emitter, llvm_code, lobatto_tables
 from twoloop.generate.accelerations import write_accelerations
+from twoloop.generate.coefficients import Coefficients
 from twoloop.generate.lane_emitter import LaneEmitter
 from twoloop.generate.llvm_code import Emitter
 from twoloop.generate.llvm_text import BIT, DOUBLE, INTEGER, Module, Value, constant, constants, integer
@@ -32,7 +34,15 @@ from twoloop.kernels.data.collocation import LANES
 from twoloop.kernels.data.tolerances import ATOL, RTOL
 
 Array = NDArray[np.float64]
+LONGEST = 8000  # operations of a projection
 FAILED = -1.0  # what a sweep gives in place of a change where accelerations cannot be had
+
+
+def suits(own: SharedCode) -> bool:
+    """Whether the code of a mechanism takes no longer than some seconds to compile."""
+    equations = own.equations
+    outputs = equations.nearer if own.projects else equations.there
+    return len(outputs.quantities(equations.graph)) <= LONGEST
 
 
 class CollocationCode:
@@ -46,10 +56,14 @@ class CollocationCode:
     ----------
     iterated : list of int
         Coordinates on which accelerations depend.
+    numbers : Coefficients
+        What the functions read.
+    structure : str
+        What the functions depend on, the values of these apart.
     """
 
     def __init__(self, own: SharedCode):
-        self.own, self.equations = own, own.equations
+        self.equations, self.numbers = own.equations, Coefficients()
         self.n, self.n_rows = self.equations.system.n_q, len(self.equations.all_rows)
         self.iterated = self._iterated()
         self.others = [i for i in range(self.n) if i not in self.iterated]
@@ -57,9 +71,15 @@ class CollocationCode:
             self.n, len(self.iterated), self.n_rows
         )
 
+        outputs = [self.equations.there]
+        if own.projects:
+            outputs += [self.equations.closer, self.equations.nearer]
+        graph, numbers = self.equations.graph, self.numbers
+        told = [[each.sizes, *numbers.structure(graph, each.forms)] for each in outputs]
+        self.structure = hashlib.sha256(repr([own.digest, told]).encode()).hexdigest()
+
     def _iterated(self) -> list[int]:
-        graph, found = self.equations.graph, set()
-        outputs = self.equations.there
+        graph, outputs = self.equations.graph, self.equations.there
         quantities = outputs.quantities(graph)
         forms = outputs.forms + [form for i in quantities for form in graph.arguments(i)]
         found = {i for form in forms for i in form.terms if graph.operations[i] is None}
@@ -108,7 +128,7 @@ class CollocationCode:
         q, v = [zero] * n, [zero] * n
         for k, i in enumerate(self.iterated):
             q[i], v[i] = _get(emit, room, self.q + LANES * k), _get(emit, room, self.v + LANES * k)
-        a, holds = write_accelerations(emit, self.equations, [t, *q, *v], self.own.numbers)
+        a, holds = write_accelerations(emit, self.equations, [t, *q, *v], self.numbers)
         for i, value in enumerate(a):
             _put(emit, value, room, self.a + LANES * i)
         change = self._integrate(emit, room, state)
@@ -184,7 +204,7 @@ class CollocationCode:
         builder, n = emit.builder, self.n
         emit.constants = numbers
         inputs = [_get(emit, room, self.ends + LANES * k) for k in range(1 + 2 * n)]
-        written, arrays = results_of(emit, self.equations.graph, outputs, inputs, self.own.numbers)
+        written, arrays = results_of(emit, self.equations.graph, outputs, inputs, self.numbers)
         values = dict(zip(outputs.arrays, arrays, strict=True))
         holds = conditions_hold(emit, written, outputs, [value for array in arrays for value in array])
         places = {"q": self.ends + LANES, "v": self.ends + LANES * (1 + n), "a": self.end_a, "lam": self.lam}
@@ -276,13 +296,14 @@ class Collocation(NamedTuple):
 
     functions: LaterFunctions
     code: CollocationCode
+    numbers: Any  # what they read, or formulas for it
 
 
 def compiled_collocation(of_one: OwnCode) -> Collocation:
     """The code for a mechanism; its machine code is kept on disk, and compiled when steps are to call it."""
     own = of_one.shared
     made: Collocation = own.family.remembered(("collocation", own.equations.choice), lambda: _compiled(own))
-    return made
+    return made._replace(numbers=of_one.evaluate(made.numbers))
 
 
 def _compiled(own: SharedCode) -> Collocation:
@@ -293,14 +314,16 @@ def _compiled(own: SharedCode) -> Collocation:
     if own.projects:
         parts |= {"closer_ends": code.closer, "nearer_ends": code.nearer}
 
+    long = own.parts is not None
+
     def write() -> tuple[list[str], str]:
-        module = Module()
+        module = Module(divided=long)
         for name, emit in parts.items():
             llvm_code.write(module, name, KIT.own_type(name), emit, partial(LaneEmitter, lanes=LANES))
         return list(parts), str(module)
 
-    functions = LaterFunctions(lambda: own_functions("collocation", _stamp(), own.digest, write))
-    return Collocation(functions, code)
+    functions = LaterFunctions(lambda: own_functions("collocation", _stamp(), code.structure, write, passes=not long))
+    return Collocation(functions, code, code.numbers.formulas)
 
 
 @cache

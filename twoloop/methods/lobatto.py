@@ -13,9 +13,9 @@ from twoloop.methods.dop853 import DOP853
 from twoloop.methods.plan import LARGEST_MOVE, Plan
 from twoloop.problem.system import ConstrainedSystem
 
-KAPPA = 0.06  # of the tolerance: what the iteration may leave; errors are then those of other methods of ours
+KAPPA = 0.01  # of the tolerance: what the iteration may leave; errors are then those of other methods of ours
 FEW, MOST, LOOSE = 4.0, 5.0, 3e-4  # sweeps that a step is to take, at tolerances from LOOSE on and below
-PARTS = 6  # of a step, for the solution between its ends
+PARTS = 8  # of a step, for the solution between its ends
 UNSEEN = float(np.diff([0.0, *tables().nodes]).max())  # of a step, between two nodes
 
 
@@ -98,6 +98,7 @@ class Lobatto16:
             unseen=UNSEEN,
             parts=PARTS,
             own=(made.functions,),
+            own_numbers=made.numbers,
         )
         plan = plan.changed(interior=plan.changed(memory=plan.memory.copy()))
         if fixed:

@@ -66,6 +66,11 @@ class Plan:
         """Of step-size control, see kernels/control/controller.py."""
         return [self.safety, self.exponent, self.factor_min, self.factor_max, self.least_error]
 
+    @property
+    def substitutes(self) -> list["Plan"]:
+        """What takes over, and what from that."""
+        return [] if self.substitute is None else [self.substitute, *self.substitute.substitutes]
+
     def fresh(self) -> "Plan":
         """The same for another run, with memory of its own; not so the plans that it holds."""
         return self.changed(memory=self.memory.copy())

@@ -114,6 +114,7 @@ PRESETS: dict[str, Method] = {
         tight=RungeKutta(radau_iia(3), outer="newton", tested="positions"),
         tightest=RungeKutta(radau_iia(5), outer="newton", tested="positions"),
         fixed=RungeKutta(sun_radau_iib(3), outer="auto"),
+        lanes=Lobatto16(),
     ),
     "SunRadau5": RungeKutta(sun_radau_iib(3), outer="auto"),
     **{f"Gauss{2 * s}": RungeKutta(gauss(s)) for s in range(2, 9)},

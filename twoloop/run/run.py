@@ -68,9 +68,9 @@ class Run:
         self.memory = plan.memory.copy()
         self.rtol, self.reuse, self.interiors, self.traced = rtol, plan.reuse, interiors, plan.traced
         self.least_atol = float(atol.min())
-        others = () if plan.substitute is None else (plan.substitute,)
-        self.static = static_form(system, t0, q0, plan, *others)
-        self.matrices = max(each.matrices for each in (plan, *others))
+        plans = plan, *plan.substitutes
+        self.static = static_form(system, t0, q0, *plans)
+        self.matrices = max(each.matrices for each in plans)
         self.kit = kit_of(system, t0, q0, plan, self.static)
         self.functions = self.kit.functions
         n_rows = system.n_c + system.n_a

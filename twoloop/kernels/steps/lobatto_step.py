@@ -38,6 +38,7 @@ MOST_STARTS = 4
 STAGNANT, NOISE = 0.5, 1e-13  # changes that fall no further, and are this small relative to the values, are rounding
 AT_ONCE = 16  # steps in a row at most: then a look is taken at what else there is
 ORDER = 16.0
+SQUARED, LINEAR = 0.05, 1e-5  # of the top coefficient, over the tolerances, squared and as it is: an error
 SHARP, ROUGH_SHARE = 0.3, 0.05  # coefficients that fall less are not those of a smooth motion; what error they stand for
 SHORTER, SAFETY = 0.6, 0.85
 UNFORESEEN = 10.0  # an error that is so large is looked at elsewhere
@@ -71,7 +72,7 @@ def _sweeps(f, w, options, room, tolerances, state, first):
     noise = min(options[KAPPA], NOISE / tolerances[LEAST])
     rho, before, m = room[room_at.RHO], math.inf, 0.0
     while True:
-        change = f.sweep_nodes(room, state, f.numbers)
+        change = f.sweep_nodes(room, state, f.own_numbers)
         m += 1.0
         if not change >= 0.0:
             return LEFT, m, change, target
@@ -96,7 +97,7 @@ def _sweeps(f, w, options, room, tolerances, state, first):
 def _error(room):
     """The error of a step over the tolerances, from the coefficients of its accelerations."""
     top, largest = room[room_at.SPECTRUM + 7], max(room[room_at.LARGEST], 1e-300)
-    error = max(0.005 * top * (top / largest), 1e-5 * top)
+    error = max(SQUARED * top * (top / largest), LINEAR * top)
     tail = max(top, room[room_at.SPECTRUM + 6])
     if tail > SHARP * max(room[room_at.SPECTRUM + 5], room[room_at.SPECTRUM + 4]):
         error = max(error, ROUGH_SHARE * tail)
@@ -214,9 +215,9 @@ def _project_all(f, w, options, room, n, n_ends, out_t, out_state):
             room[ends + LANES * (1 + i) + k] = out_state[row, i]
         room[room_at.FINE + k] = 1.0
     least = max(options[THETA], ABOVE_ROUNDING * w.notes[ROUNDED])
-    f.closer_ends(room, f.numbers)
+    f.closer_ends(room, f.own_numbers)
     for _ in range(4):
-        f.nearer_ends(room, f.numbers)
+        f.nearer_ends(room, f.own_numbers)
         w.counters[N_INNER] += n_ends
         w.counters[N_FACTORIZATIONS] += n_ends
         moved = 0.0
