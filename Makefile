@@ -2,7 +2,7 @@
 # PYTHON=/path/to/python chooses the interpreter, ARGS="--quick" passes options on.
 
 .DEFAULT_GOAL := help
-.PHONY: help install peers engines compile table3 reports bench test test-all test-portable test-oldest lint docs lock clean
+.PHONY: help install peers engines compile compile-all table3 reports bench test test-all test-portable test-oldest lint docs lock clean
 
 # one thread: CPU times can be compared, and no BLAS changes a count
 export OPENBLAS_NUM_THREADS := 1
@@ -73,40 +73,44 @@ table3: install ## the paper's Table 3 into reports/, about three minutes; ARGS=
 reports: install ## all studies into reports/
 	$(RUN) -m studies all $(ARGS)
 
-bench: compile ## two commits side by side: make bench BASE=main [HEAD=branch] [ARGS=--short]
+bench: compile-all ## two commits side by side: make bench BASE=main [HEAD=branch] [ARGS=--short]
 	@$(RUN) -m studies.bench_commits $(BASE) $(if $(HEAD),--head $(HEAD)) $(ARGS)
 
 # the inner loop is there; two processes of about equal work, neither of which imports, and so compiles, what the other
-# does: what Newton's matrices and large systems have in common, and BDF, are in one of them. What imports callbacks of
-# bodies is last, and the traps, which import all, last of these
+# does: what Newton's matrices and large systems have in common, and bodies in space, are in one of them
 compile: install ## compile the kernels, and the callbacks of bodies, mechanisms and studies, on two cores
-	@echo "Compiling (once, on both cores) the steps of all methods, interpolation, and the runs in SIMD lanes"
+	@echo "Compiling (once, on both cores) the steps of most methods, interpolation, and the runs in SIMD lanes"
 	@$(RUN) -c "from twoloop.kernels.evaluation import calls, own_inner; from twoloop.kernels.control import controller"
-	@$(RUN) -c "from twoloop.kernels.steps import bdf_newton_step, bdf_step, diagonal_step, newton_step; \
-	from twoloop.kernels.evaluation import static_inner; from twoloop.kernels.lanes import lane_implicit" & \
+	@$(RUN) -c "from twoloop.kernels.steps import diagonal_step, newton_step; \
+	from twoloop.kernels.evaluation import static_inner; from twoloop.bodies import spatial_callbacks, spatial_programs; \
+	from studies.bench import sharp_callbacks" & \
 	$(RUN) -c "from twoloop.kernels import advance, agreement, interpolation, short_loops; \
 	from twoloop.kernels.algebra import independent, pivots, scaling; from twoloop.kernels.control import switching; \
 	from twoloop.kernels.evaluation import first_look, traced; \
 	from twoloop.kernels.lanes import lane_dop853, lane_runs, lane_starts, lane_taylor; \
-	from twoloop.kernels.steps import adams_step, asking_step, bridge, canonical_step, explicit_step, \
-	fixed_point_step, newmark_step, paper_step, taylor_step; \
-	from twoloop.bodies import planar_callbacks, planar_programs, spatial_callbacks, spatial_programs" && wait $$!
+	from twoloop.kernels.steps import adams_step, asking_step, bdf_step, bridge, explicit_step, \
+	fixed_point_step, newmark_step, paper_step, taylor_step; from twoloop.bodies import planar_callbacks, planar_programs" && wait $$!
 	@echo "Compiling the callbacks of the ready mechanisms and of studies"
-	@$(RUN) -c "from studies.bench import sharp_callbacks" & \
-	$(RUN) -c "from twoloop.mechanisms import *; from studies.honesty import traps" && wait $$!
+	@$(RUN) -c "from twoloop.mechanisms import *" & $(RUN) -c "from studies.honesty import traps" && wait $$!
 
-# the callbacks of tests are compiled before: both workers would do that. Files
-# in the order of their names: sorted by how many tests they have, long ones with few tests would come last
+# kernels that slow tests alone need
+compile-all: compile
+	@echo "Compiling the steps of implicit methods in lanes"
+	@$(RUN) -c "from twoloop.kernels.lanes import lane_implicit"
+
+# the callbacks of tests are compiled before: both workers would do that. Files in the order of tests/conftest.py: sorted
+# by how many tests they have, long ones with few tests would come last
 SHARED := -n 2 --dist loadfile --no-loadscope-reorder
 
 test: compile ## the tests that a change needs, on two cores
 	@echo "Compiling the callbacks of tests"
-	@$(RUN) -c "import tests.compiled, tests.problems, tests.test_bounds, tests.test_callbacks, tests.test_repeated_calls" & \
-	$(RUN) -c "import tests.test_other_parameters, tests.test_certificate, tests.test_traced_values, tests.test_sweep_together" \
-	&& wait $$!
+	@$(RUN) -c "import tests.compiled, tests.problems, tests.test_bounds, tests.test_callbacks, tests.test_repeated_calls, \
+	tests.test_other_parameters, tests.test_certificate, tests.test_traced_values, tests.test_sweep_together" & \
+	$(RUN) -c "import tests.studies.test_honesty, tests.test_differential, tests.test_derivative_campaign, \
+	tests.references.test_equations, tests.references.test_ida" && wait $$!
 	$(RUN) -m pytest $(SHARED) $(ARGS)
 
-test-all: ## all tests, the slow ones too: about twenty minutes
+test-all: compile-all ## all tests, the slow ones too: about twenty minutes
 	@$(MAKE) --no-print-directory test ARGS="-m ''"
 
 # other rounding: no fused operations, and kernels of OpenBLAS for an old processor; a numba cache of its own, as below

@@ -16,7 +16,10 @@ NEED_STUDIES = (
     *("symbolic/test_from_lagrangian.py", "symbolic/test_matrices.py"),
     *("test_differential.py", "test_docs.py", "test_rooms.py"),
 )
-LONG_AND_LATE = {"test_docs.py", "test_check.py", "test_examples.py"}
+LONGEST = (  # seconds each; those that compile most in a fresh clone are first
+    *("test_adapters.py", "test_short_forces.py", "test_docs.py", "test_equations.py", "test_check.py"),
+    *("test_derivative_campaign.py", "test_examples.py", "test_algebra.py", "test_table3.py"),
+)
 collect_ignore = [] if find_spec("pandas") and find_spec("matplotlib") else list(NEED_STUDIES)
 settings.register_profile("twoloop", deadline=None, derandomize=True, max_examples=25)
 settings.load_profile("twoloop")
@@ -41,8 +44,9 @@ def pytest_collection():
 
 
 def pytest_collection_modifyitems(items):
-    """Run the longest of the last files first, so that neither of two workers waits for the other."""
-    items.sort(key=lambda item: item.path.name not in LONG_AND_LATE)
+    """Run the longest files first, so that neither of two workers waits for the other at the end."""
+    place = {name: k for k, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: place.get(item.path.name, len(LONGEST)))
 
 
 def pytest_collection_finish():

@@ -204,7 +204,7 @@ def moving_pivot_state(t, start=MOVING_PIVOT_START, end=10.0):
 
 
 # --- double pendulum: two unit masses on two unit rods, Cartesian coordinates; two degrees of freedom
-def double_pendulum(gamma=True):
+def double_pendulum():
     def right_side(t, q, v):
         d = v[2:] - v[:2]
         return np.array([-(v[0] * v[0] + v[1] * v[1]), -(d[0] * d[0] + d[1] * d[1])])
@@ -217,30 +217,16 @@ def double_pendulum(gamma=True):
         d0, d1 = q[2] - q[0], q[3] - q[1]
         return 0.5 * np.array([q[0] * q[0] + q[1] * q[1] - 1.0, d0 * d0 + d1 * d1 - 1.0])
 
-    functions = {"constraint": constraint, "jacobian": jacobian, "gamma": right_side if gamma else None}
+    functions = {"constraint": constraint, "jacobian": jacobian, "gamma": right_side}
     weights = lambda t, q, v: np.array([0.0, -9.81, 0.0, -9.81])  # noqa: E731
     return unconstrained(weights, 4, n_c=2, **functions, compile=True, name="double pendulum")
 
 
-def double_pendulum_state(angles, momenta):
-    """q, v from the angles to the downward vertical and their canonical momenta (2,)."""
-    velocity = np.linalg.solve(_double_pendulum_mass(angles), momenta)
+def double_pendulum_state(angles, rates):
+    """q, v from the angles to the downward vertical and their rates (2,)."""
     x = np.array([np.sin(angles), -np.cos(angles)])
-    u = np.array([np.cos(angles), np.sin(angles)]) * velocity
+    u = np.array([np.cos(angles), np.sin(angles)]) * rates
     return np.concatenate([x[:, 0], x.sum(axis=1)]), np.concatenate([u[:, 0], u.sum(axis=1)])
-
-
-def double_pendulum_canonical(q, v):
-    """Angles and their canonical momenta of a state: the inverse of `double_pendulum_state`."""
-    x, u = np.array([q[:2], q[2:] - q[:2]]).T, np.array([v[:2], v[2:] - v[:2]]).T
-    angles = np.arctan2(x[0], -x[1])
-    velocity = u[0] * np.cos(angles) + u[1] * np.sin(angles)
-    return angles, _double_pendulum_mass(angles) @ velocity
-
-
-def _double_pendulum_mass(angles):
-    coupling = np.cos(angles[0] - angles[1])
-    return np.array([[2.0, coupling], [coupling, 1.0]])
 
 
 # --- oblique polar coordinates: x = r(cos phi, sin phi), r = q0, phi = q1 + 0.3 q0; a damped pendulum whose pivot is
@@ -273,24 +259,21 @@ def mass_factor(t):
     return 2.0 + np.sin(t)
 
 
-def oblique_pendulum(gamma=True, conservative=False):
-    """With conservative=True there is no damping, and the mass is 1."""
-    damping, factor = (0.0, lambda t: 1.0) if conservative else (DAMPING, mass_factor)
-
+def oblique_pendulum():
     def force(t, q, v):
         J = _point_jacobian(q)
-        return factor(t) * J.T @ (np.array([0.0, -G]) - damping * (J @ v) - _point_bias(q, v))
+        return mass_factor(t) * J.T @ (np.array([0.0, -G]) - DAMPING * (J @ v) - _point_bias(q, v))
 
     def right_side(t, q, v):
         u = _point_jacobian(q) @ v
         return np.array([-(u @ u) - (_point(q) - PIVOT) @ _point_bias(q, v)])
 
     return pendulum(
-        mass=lambda t, q: factor(t) * _point_jacobian(q).T @ _point_jacobian(q),
+        mass=lambda t, q: mass_factor(t) * _point_jacobian(q).T @ _point_jacobian(q),
         force=force,
         constraint=lambda t, q: np.array([0.5 * ((_point(q) - PIVOT) @ (_point(q) - PIVOT) - 1.0)]),
         jacobian=lambda t, q: ((_point(q) - PIVOT) @ _point_jacobian(q))[None, :],
-        gamma=right_side if gamma else False,
+        gamma=right_side,
         name="oblique pendulum",
     )
 
@@ -314,11 +297,6 @@ def oblique_point(t, end=5.0):
 
 def oblique_start():
     x, u, _ = oblique_point(0.0)
-    return oblique_state(x, u)
-
-
-def oblique_state(x, u):
-    """Oblique coordinates and velocities of a point at x with velocity u."""
     r = np.hypot(*x)
     q = np.array([r, np.arctan2(x[1], x[0]) - 0.3 * r])
     return q, np.linalg.solve(_point_jacobian(q), u)

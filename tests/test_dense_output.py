@@ -59,7 +59,7 @@ ORDERS = [("DOP853", 8, 0.04), ("Gauss8", 8, 0.04), ("RadauIIA5", 5, 0.01), ("BD
 ORDERS += [("SunRadau5", 5, 0.02), ("Gauss4", 4, 0.02), ("Gauss6", 6, 0.02), ("Gauss12", 12, 0.04)]
 ORDERS += [("RadauIIA9", 9, 0.04), ("PaperIRK", 5, 0.02), ("PaperNewmark", 2, 0.01)]
 ORDERS += [(RungeKutta(lobatto_iiie(3)), 4, 0.02)]
-ORDERS += [(RungeKutta(gauss(3), variables="momenta", partition="symmetric"), 6, 0.02)]
+ORDERS += [(RungeKutta(gauss(3), partition="symmetric"), 6, 0.02)]
 
 
 @pytest.mark.parametrize(("method", "order", "h"), quick(ORDERS, 5))

@@ -53,13 +53,16 @@ def test_info(capsys):
     assert str(folder_of(kernels)) in text and "compiled functions" in text and "cores" in text
 
 
-def test_compile_names_every_file(capsys):
+def test_compile_imports_and_names_every_file(monkeypatch, capsys):
+    imported = []  # and not compiled: slow tests alone need some kernels
+    monkeypatch.setattr("twoloop.__main__.import_module", imported.append)
     main(["compile"])
     lines = capsys.readouterr().out.splitlines()
     folder = Path(kernels.__file__).parent
     files = {path.relative_to(folder).with_suffix("") for path in folder.rglob("*.py") if path.stem != "__init__"}
     names = {".".join(path.parts) for path in files}
     assert {line.split()[3] for line in lines[:-1]} == names and lines[-1].startswith("ready after")
+    assert {name.removeprefix(f"{kernels.__name__}.") for name in imported} == names
 
 
 def test_solve_writes_what_the_endings_say(where, tmp_path, capsys):

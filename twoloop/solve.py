@@ -287,11 +287,6 @@ def check_options(
         check_size("max_steps", max_steps, 1)
     if time_limit is not None:
         check_positive("time_limit", time_limit)
-    if system.n_a > 0 and getattr(chosen, "variables", "velocities") == "momenta":
-        raise ValueError(
-            f"method with variables='momenta' needs constraints on positions only: there are no canonical variables "
-            f"for the n_a = {system.n_a} nonholonomic rows of {system.name!r}. Take variables='velocities'"
-        )
     sizes = first_step, float(max_step), max_steps, step_size
     return Asked(chosen, float(rtol), atol, *sizes, compiled, bool(check_derivatives))
 

@@ -140,7 +140,8 @@ def _rows(
         if n_a > 0:
             nonholonomic(t, q, p, of_all[m:])
         for i in range(Cq.shape[0]):
-            Cq[i] = of_all[kept[i]]
+            for j in range(q.size):  # numba compiles `Cq[i] = ...` two seconds longer
+                Cq[i, j] = of_all[kept[i], j]
 
     @callback("constraint_rate")
     def some_rates(t, q, p, Ct):  # type: ignore[no-untyped-def]

@@ -254,7 +254,8 @@ def _integrate(  # type: ignore[no-untyped-def]
     combined, new = np.zeros(2 * n), past[(first - 1) % HIGHEST].copy()
     for step in range(first, last + 1):
         if step < given.shape[0]:
-            new[:] = given[step]
+            for j in range(new.size):
+                new[j] = given[step, j]
         else:
             k = min(order, step)
             hb = h * formulas[k - 1, 0]

@@ -69,11 +69,14 @@ def _rate_of(force: Dispatcher) -> Callable[..., Array]:
         inverse, coupling, amplitude, frequency = fixed
         n = coupling.size + 2
         q, v, Q = np.zeros(n), np.zeros(n), np.zeros(n)
-        q[0], q[2:] = amplitude * math.sin(frequency * t), y[: n - 2]
+        q[0] = amplitude * math.sin(frequency * t)
+        for k in range(2, n):
+            q[k] = y[k - 2]
         force(t, q, v, p, Q)
+        a = inverse @ (Q[2:] + coupling * amplitude * frequency**2 * math.sin(frequency * t))
         out = np.empty_like(y)
-        out[: n - 2] = y[n - 2 :]
-        out[n - 2 :] = inverse @ (Q[2:] + coupling * amplitude * frequency**2 * math.sin(frequency * t))
+        for k in range(n - 2):  # numba compiles `out[: n - 2] = ...` two seconds longer
+            out[k], out[n - 2 + k] = y[n - 2 + k], a[k]
         return out
 
     return rate  # type: ignore[no-any-return]

@@ -165,7 +165,8 @@ def iteration_matrix_at(parts: Parts) -> Callable[..., None]:
     @kept
     def iteration_matrix(t, cj, y, yp, p, M, Cq, K, moved, here, there, J):  # type: ignore[no-untyped-def]
         m, n = Cq.shape
-        moved[:] = y
+        for k in range(y.size):  # numba compiles `moved[:] = y` for two seconds
+            moved[k] = y[k]
         q, v = moved[:n], moved[n : 2 * n]
         if not constant_mass:
             M[:, :] = 0.0

@@ -22,7 +22,7 @@ from twoloop import Result, RungeKutta, paper_irk, paper_newmark, solve_dae
 from twoloop.methods.auto import LOOSE, TIGHTEST
 from twoloop.methods.code_for import Compiled
 from twoloop.methods.plan import Method
-from twoloop.methods.tableaux import gauss, sun_radau_iib
+from twoloop.methods.tableaux import sun_radau_iib
 
 TOLERANCES = tuple(float(f"1e-{k}") for k in range(3, 14))  # of all solvers that have one: no gap of over a decade
 ERR_OUT = (1e-3, 1e-5, 1e-7, 1e-9)  # of the paper's procedures
@@ -36,7 +36,6 @@ IRK_LINE = "PaperIRK, Atol = Rtol varied"
 IDA_C, IDA_C_ORDER_2 = "IDA from C, stabilised", "IDA from C, order 2, positions tested"
 IDA_C_BANDED = "IDA from C, order 2, banded"  # of systems with a bandwidth, with positions tested
 IDA_C_STATES = "IDA from C, q and v tested"
-CANONICAL = "Gauss6, momenta, symmetric"
 ADAMS, TAYLOR = "Adams", "Taylor"
 OWN_EXPLICIT, OWN_BDF = "DOP853 (twoloop)", "BDF"  # presets; the other lines of the first name are SciPy's
 DEFAULT = "auto"  # of solve_dae, without code made for the mechanism
@@ -99,11 +98,6 @@ def _paper(make: Callable[[float], Method], case: Case, err_out: float, repeat: 
     return _preset(make(err_out), case, PAPER_TOL, repeat)
 
 
-def _canonical(case: Case, step: float, repeat: int) -> Result:
-    method = RungeKutta(gauss(3), variables="momenta", partition="symmetric")
-    return solve_dae(*case.start, method=method, step_size=step, time_limit=case.time_limit)
-
-
 def at_instants(solve: Callable[..., Result], case: Case, **options: Any) -> Result:
     """A run of a solver that tells its states at the common instants."""
     return solve(*case.start, t_eval=np.append(0.0, case.instants), time_limit=case.time_limit, **options)
@@ -154,7 +148,6 @@ def _all() -> Iterator[Solver]:
         more: dict[str, Any] = {"builds_each": True, "traces": True} if preset in COMPILED else {}
         used = _chosen if COMPILED.get(preset, preset) == DEFAULT else None
         yield _solver(preset, "two-loop", "compiled", "tol", run, used=used, **more)
-    yield _solver(CANONICAL, "two-loop", "compiled", "h", _canonical)
     for line in lines():
         told = {each: getattr(line, each) for each in SAME_IN_LINES}
         run = partial(_by_line, line)
@@ -165,7 +158,7 @@ CATALOGUE: dict[str, Solver] = {solver.name: solver for solver in _all()}
 
 # one sensible setting of each, for studies that show a run of every solver: two-loop procedures first
 LINE_UP: dict[str, float] = dict.fromkeys((IRK, NEWMARK, QUARTER), 1e-9) | dict.fromkeys((GIVEN, *PRESETS), 1e-8)
-LINE_UP |= {"Newmark": 1e-6, CANONICAL: 0.01}  # of order 2: ten times the steps at 1e-8
+LINE_UP |= {"Newmark": 1e-6}  # of order 2: ten times the steps at 1e-8
 LINE_UP |= dict.fromkeys((IDA_INDEX_1, "IDA, stabilised", IDA_C, HEYOKA, CVODE_C, "LSODA, index 1"), 1e-8)
 LINE_UP |= dict.fromkeys(("DOP853, index 1", "DOP853, projected", baumgarte("DOP853", 10.0)), 1e-8)
 LINE_UP |= dict.fromkeys((*(f"Exudyn, {solver}" for solver in EXUDYN), "Exudyn, GeneralizedAlpha 0.6"), 1e-3)

@@ -190,7 +190,7 @@ def command_of(name: str) -> str:
 
 def key(row: pd.Series) -> str:
     """What tells the curves of this row from those of all others of the study."""
-    words = [row.get(name) for name in ("group", "case", "solver", "variables", "partition")]
+    words = [row.get(name) for name in ("group", "case", "solver", "partition")]
     values = [f"{name}={row[name]:g}" for name in ("err_in", "err_out", "tol", "h") if pd.notna(row.get(name))]
     return " ".join([*(word for word in words if isinstance(word, str)), *values])
 

@@ -37,8 +37,6 @@ from twoloop.mechanisms import Problem, four_bar
 from twoloop.methods.plan import Method
 from twoloop.methods.tableaux import gauss, radau_iia, sun_radau_iib
 
-Variant = tuple[str, str]  # variables and partition
-
 ONE, SWITCHING = "one partition", "switching"
 GEOMETRIES: dict[str, dict[str, Any]] = {
     ONE: {"lengths": (1.0, 1.2, 0.5), "ground": 1.0, "theta3": math.pi, "branch": 1},
@@ -56,18 +54,16 @@ NEWMARK = "Newmark, β = 1/2"
 TABLEAUX = {SUN: sun_radau_iib(3), GAUSS: gauss(3), RADAU: radau_iia(3), MIDPOINT: gauss(1)}
 METHODS: dict[str, Method] = {name: RungeKutta(tableau) for name, tableau in TABLEAUX.items()}
 METHODS |= {NEWMARK: Newmark(0.5), IRK: paper_irk(), OWN_BDF: BDF()}
-BASIC, EVEN = ("velocities", "lasting"), ("velocities", "symmetric")
-MOMENTA, MOMENTA_EVEN = ("momenta", "lasting"), ("momenta", "symmetric")
-VARIANTS = (BASIC, EVEN, MOMENTA, MOMENTA_EVEN)
+LASTING, EVEN = "lasting", "symmetric"  # choices of the partition
 H, H_SMALL = 0.02, 0.01  # s; H_SMALL for methods of order 2
-FIXED: dict[str, dict[str, tuple[Variant, ...]]] = {
-    ONE: {SUN: (BASIC, MOMENTA), GAUSS: (BASIC,), RADAU: (BASIC,), MIDPOINT: (BASIC,), NEWMARK: (BASIC,)},
-    SWITCHING: {SUN: VARIANTS, GAUSS: (BASIC, EVEN, MOMENTA_EVEN), MIDPOINT: (BASIC, EVEN), NEWMARK: (BASIC,)},
+FIXED: dict[str, dict[str, tuple[str, ...]]] = {
+    ONE: dict.fromkeys((SUN, GAUSS, RADAU, MIDPOINT, NEWMARK), (LASTING,)),
+    SWITCHING: dict.fromkeys((SUN, GAUSS, MIDPOINT), (LASTING, EVEN)) | {NEWMARK: (LASTING,)},
 }
 COARSER = {GAUSS: (0.04, 0.03), MIDPOINT: (0.02,)}  # s, further steps of what is free of drift on SWITCHING, EVEN
-CONTROLLED: dict[str, dict[str, Variant]] = {
-    ONE: {IRK: BASIC, SUN: MOMENTA, GAUSS: BASIC},
-    SWITCHING: {IRK: BASIC, SUN: BASIC, GAUSS: EVEN, OWN_BDF: BASIC},
+CONTROLLED = {
+    ONE: {IRK: LASTING, GAUSS: LASTING},
+    SWITCHING: {IRK: LASTING, SUN: LASTING, GAUSS: EVEN, OWN_BDF: LASTING},
 }
 TOL = 1e-5  # Rtol = Atol
 # of those on SWITCHING which may set a price: all others take three times as long for no smaller an energy error
@@ -160,13 +156,12 @@ OTHERS: dict[str, tuple[tuple[float, ...], Callable[[Case, float, int], Result]]
 }
 
 
-def _two_loop(name: str, setting: str, variant: Variant) -> Solver:
+def _two_loop(name: str, setting: str, partition: str) -> Solver:
     method = METHODS[name]
-    fixed = dict(zip(("variables", "partition"), variant, strict=True))
-    if isinstance(method, RungeKutta) and variant != BASIC:
-        method = replace(method, **fixed)  # type: ignore[arg-type]
+    if isinstance(method, RungeKutta) and partition == EVEN:
+        method = replace(method, partition="symmetric")
     run = partial(_fixed if setting == "h" else _controlled, method)
-    return Solver(name, "two-loop", "compiled", True, setting, run, fixed=fixed)
+    return Solver(name, "two-loop", "compiled", True, setting, run, fixed={"partition": partition})
 
 
 def runs(quick: bool) -> Iterator[Run]:
@@ -182,13 +177,13 @@ def _once(quick: bool) -> Iterator[Run]:
         for value in () if quick and name in NOT_QUICK else reversed(values[:1] if quick else values):
             yield Run(cases[SWITCHING], replace(CATALOGUE[name], run=run), value, "other", 1)
     for geometry, controlled in CONTROLLED.items():
-        for name, variant in controlled.items():
-            yield Run(cases[geometry], _two_loop(name, "tol", variant), TOL, "controlled", 1)
+        for name, partition in controlled.items():
+            yield Run(cases[geometry], _two_loop(name, "tol", partition), TOL, "controlled", 1)
     for geometry, methods in FIXED.items():
-        for name, variants in methods.items():
+        for name, partitions in methods.items():
             h = H_SMALL if name in (MIDPOINT, NEWMARK) else H
-            for variant in variants:
-                yield Run(cases[geometry], _two_loop(name, "h", variant), h, "fixed", 1)
+            for partition in partitions:
+                yield Run(cases[geometry], _two_loop(name, "h", partition), h, "fixed", 1)
     for name, steps in COARSER.items():
         for h in () if quick else steps:
             yield Run(cases[SWITCHING], _two_loop(name, "h", EVEN), h, "coarser", 1)

@@ -18,17 +18,15 @@ from studies.bench.study import Study, rows_of
 from studies.bench.tables import setting, setting_of, where
 from studies.energy.drift import DRIFTING, IRREGULAR, IS_LOST, NO_DRIFT, bound, verdict
 from studies.energy.runs import (
-    BASIC,
     EVEN,
     GAUSS,
-    MOMENTA,
+    LASTING,
     NEWMARK,
     ONE,
     RADAU,
     SUN,
     SWITCHING,
     TRAPEZOIDAL,
-    Variant,
     measure,
     runs,
 )
@@ -37,7 +35,7 @@ SHARES = (1e-3, 1e-5, 1e-7)  # of the largest kinetic energy: energy errors at w
 KEEPING = f"{GAUSS}, symmetric partition"
 FATES = dict.fromkeys(DRIFTING, "drifts") | {NO_DRIFT: "no drift", IS_LOST: "loses the motion", IRREGULAR: "irregular"}
 DRAWN = (OWN_CODE, KEEPING, CYRK, HEYOKA, IDA_C, TRAPEZOIDAL)  # over cost
-PLACES = ((ONE, BASIC), (ONE, MOMENTA), (SWITCHING, BASIC), (SWITCHING, EVEN))  # of the table of fixed steps
+PLACES = ((ONE, LASTING), (SWITCHING, LASTING), (SWITCHING, EVEN))  # of the table of fixed steps
 
 
 def judged(rows: pd.DataFrame) -> pd.DataFrame:
@@ -47,18 +45,17 @@ def judged(rows: pd.DataFrame) -> pd.DataFrame:
 
 def name_of(row: pd.Series) -> str:
     """Name a method, with what is not the default."""
-    extra = ["momenta"] * (row["variables"] == "momenta") + ["symmetric partition"] * (row["partition"] == "symmetric")
-    return ", ".join([row["solver"], *extra])
+    return ", ".join([row["solver"], *["symmetric partition"] * (row["partition"] == EVEN)])
 
 
-def of(rows: pd.DataFrame, solver: str, variant: Variant = BASIC) -> pd.DataFrame:
-    """Choose the runs of a method on certain variables, with a certain choice of the partition."""
-    return where(rows, solver=solver, variables=variant[0], partition=variant[1])
+def of(rows: pd.DataFrame, solver: str, partition: str = LASTING) -> pd.DataFrame:
+    """Choose the runs of a method with a certain choice of the partition."""
+    return where(rows, solver=solver, partition=partition)
 
 
-def pick(rows: pd.DataFrame, motion: str, solver: str, variant: Variant = BASIC, group: str = "fixed") -> pd.Series:
+def pick(rows: pd.DataFrame, motion: str, solver: str, partition: str = LASTING, group: str = "fixed") -> pd.Series:
     """Choose the long run of a method with fixed steps (group "fixed") or step-size control ("controlled")."""
-    chosen = of(where(rows, case=motion, group=group), solver, variant)
+    chosen = of(where(rows, case=motion, group=group), solver, partition)
     if chosen.empty:
         raise StudyError(f"the rows have no run of {solver} on {motion}; make them again by python -m studies.energy")
     return chosen.iloc[0]
@@ -127,7 +124,7 @@ def fates_of(fixed: pd.DataFrame) -> list[dict[str, Any]]:
     """Say in a word what the energy does with fixed steps, for each method in each of PLACES."""
     found = []
     for solver in dict.fromkeys(fixed["solver"]):
-        runs = [of(fixed[fixed["case"] == geometry], solver, variant) for geometry, variant in PLACES]
+        runs = [of(fixed[fixed["case"] == geometry], solver, partition) for geometry, partition in PLACES]
         fates = ["–" if run.empty else FATES.get(run.iloc[0]["verdict"], "fails") for run in runs]
         found.append({"solver": solver, "fates": fates})
     return found
@@ -137,11 +134,11 @@ def findings_of(rows: pd.DataFrame) -> dict[str, Any]:
     """Describe what drifts, what a run without drift costs, and why."""
     rows = judged(rows)
     fixed, controlled = where(rows, group="fixed", case=SWITCHING), rows[rows["group"] == "controlled"]
-    even = fixed["partition"] == "symmetric"
+    even = fixed["partition"] == EVEN
     kinds = {"lasting": ~even, "even": even & (fixed["solver"] != SUN), "uneven": even & (fixed["solver"] == SUN)}
     found: dict[str, Any] = {"long": long_of(rows[rows["case"] == SWITCHING])}
-    for name, which in (("sun", (SUN,)), ("gauss", (GAUSS,)), ("canonical", (SUN, MOMENTA)), ("radau", (RADAU,))):
-        found[name] = told(pick(rows, ONE, *which))
+    for name, solver in (("sun", SUN), ("gauss", GAUSS), ("radau", RADAU)):
+        found[name] = told(pick(rows, ONE, solver))
     found["fates"] = fates_of(rows[rows["group"] == "fixed"])
     found["n"] = {name: int(which.sum()) for name, which in kinds.items()}
     found["n_calm"] = {name: int((fixed[which]["verdict"] == NO_DRIFT).sum()) for name, which in kinds.items()}
@@ -187,16 +184,16 @@ def cost_figure(rows: pd.DataFrame, found: dict[str, Any]) -> Figure:
 
 def time_figure(rows: pd.DataFrame, found: dict[str, Any]) -> Figure:
     """Draw the mean energy error over time with fixed steps, on both geometries."""
-    dashes = {BASIC: "-", MOMENTA: ":", EVEN: "--"}
-    chosen = [(SUN, BASIC), (SUN, MOMENTA), (GAUSS, BASIC), (GAUSS, EVEN), (RADAU, BASIC), (NEWMARK, BASIC)]
+    dashes = {LASTING: "-", EVEN: "--"}
+    chosen = [(SUN, LASTING), (GAUSS, LASTING), (GAUSS, EVEN), (RADAU, LASTING), (NEWMARK, LASTING)]
     figure, panels = plt.subplots(1, 2, figsize=(10.5, 3.8), sharey=True, layout="constrained")
     titles = {ONE: "the partition never changes", SWITCHING: "the partition changes"}
     for axes, motion in zip(panels, titles, strict=True):
-        for solver, variant in chosen:
-            for _, row in of(where(rows, group="fixed", case=motion), solver, variant).iterrows():
+        for solver, partition in chosen:
+            for _, row in of(where(rows, group="fixed", case=motion), solver, partition).iterrows():
                 if curves := row["series"]:
                     look = figures.look(row, coded=True) | {"label": row["name"]}
-                    look |= {"linestyle": dashes[variant], "marker": ""}
+                    look |= {"linestyle": dashes[partition], "marker": ""}
                     axes.plot(curves["t"], np.abs(curves["mean"]), **look)
         axes.set(xscale="log", yscale="log", xlabel="time (s)")
         axes.set_title(f"{rows[rows['case'] == motion]['problem'].iloc[0]}: {titles[motion]}", fontsize=9)

@@ -40,16 +40,11 @@ METHODS = [
     of_runge_kutta("an explicit tableau with `outer='newton'`", lambda: RungeKutta(EXPLICIT, outer="newton")).says("tableau must have an invertible A.*Heun.*fixed-point", "take outer='fixed-point'"),
     *of_option("outer", ("n", ValueError, "must be 'auto', 'fixed-point', 'newton' or 'paper'; given 'n'", "take one of the values named"), (None, TypeError, "must be .*given None", "leave it out")),
     *of_option("error", ("none", ValueError, "must be 'richardson'", "take one of the values named")),
-    *of_option("variables", ("q", ValueError, "must be 'velocities'", "take one of the values named")),
     *of_option("partition", (1, TypeError, "must be 'lasting'", "take one of the values named")),
     *of_option("partition", ("no", ValueError, "must be 'lasting'.*'symmetric'; given 'no'", "take one of the values named")),
     *of_option("outer_test", (1, TypeError, "must be 'all'", "take one of the values named")),
     *of_option("inner_tol", *FEW_POSITIVES),
     *of_option("outer_tol", *FEW_POSITIVES, INFINITE, (np.nan, ValueError, "must be positive", POSITIVE)),
-    *(
-        of_runge_kutta(f"`outer='{outer}', variables='momenta'`").when(lambda outer=outer: runge_kutta(outer=outer, variables="momenta")).says(f"outer='{outer}' {words}", "take outer='fixed-point' for momenta")
-        for outer, words in (("newton", "goes with variables='velocities' only"), ("auto", "goes with variables='velocities' only"), ("paper", ".*'momenta'"))
-    ),
     of_runge_kutta("`outer='paper', partition='symmetric'`").when(lambda: runge_kutta(outer="paper", partition="symmetric")).says("outer='paper' is the paper's procedure", "take outer='fixed-point' for symmetric partitions"),
     *of_newmark(
         "beta",
@@ -74,7 +69,6 @@ METHODS = [
     ),
     *argument("BDF", BDF, "outer_tol", *FEW_POSITIVES[:2]),
     *argument("BDF", BDF, "inner_tol", *FEW_POSITIVES[:1]),
-    *argument("BDF", BDF, "outer", ("paper", ValueError, "must be 'fixed-point' or 'newton'", "take one of the values named")),
     *argument("Taylor", Taylor, "order", (3, ValueError, "must be", "give an int from 4 to 40"), (41, ValueError, "must be", "give an int from 4 to 40"), (8.5, TypeError, "must be", "give an int from 4 to 40"), ("high", TypeError, "must be", "give an int from 4 to 40")),
     *argument("DOP853", DOP853, "inner_tol", *FEW_POSITIVES),
     *argument("paper_irk", paper_irk, "inner_tol", *FEW_POSITIVES[:2]),

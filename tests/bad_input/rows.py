@@ -4,9 +4,8 @@ import numpy as np
 
 from tests.bad_input.case import HUGE, WRONG, argument, cases_of
 from tests.general.systems import EDGE, EDGE_FUNCTIONS, KNIFE_EDGE, parted_drives, parted_velocities, without_inertia
-from twoloop import ConstrainedSystem, RungeKutta, consistent_state, solve_dae
+from twoloop import ConstrainedSystem, consistent_state, solve_dae
 from twoloop.mechanisms.knife_edge import SPIN
-from twoloop.methods.tableaux import gauss
 
 
 def edge(**changed):
@@ -43,7 +42,6 @@ def shape_cases():
         yield case(f"`{kind}` returns None", lambda kind=kind: slide(edge(**{kind: lambda *arguments: None}))).says(f"{kind} of system 'knife edge' must return a real array.*returned None", "return an array of real numbers", TypeError)
 
 
-CANONICAL = RungeKutta(gauss(3), variables="momenta")
 COUNT = "give the number of non-holonomic rows, an int"
 ROWS = [
     # --- numbers of rows, and the functions that go with them
@@ -81,6 +79,4 @@ ROWS = [
     case("a coordinate without mass that no row holds", lambda: drift((1.0, 1.0, 0.0))).says(r"mass of 'drifter'.*coordinate\(?s?\)? .*2.*inertia|mass of 'drifter'.*inertia.*coordinate\(?s?\)? .*2", "give the coordinate a mass, or a row that holds it"),
     case("no mass in the only direction that the rows allow", lambda: drift((1.0, 0.0, 1.0))).says(r"mass of 'drifter'.*coordinate\(?s?\)? .*1.*inertia|mass of 'drifter'.*inertia.*coordinate\(?s?\)? .*1", "give the coordinate a mass, or a row that holds it"),
     case("a negative mass where the rows allow motion", lambda: drift((1.0, 1.0, -1.0))).says("mass of 'drifter' must be positive definite", "correct the mass matrix"),
-    # --- methods
-    case("non-holonomic rows with `variables='momenta'`", lambda: slide(method=CANONICAL)).says("(momenta.*non-?holonomic|non-?holonomic.*momenta)", "take variables='velocities'", WRONG),
 ]

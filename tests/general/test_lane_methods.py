@@ -165,6 +165,7 @@ def test_stiff_runs_are_those_made_singly(make, method, tolerance):
         assert np.abs(runs.q[run] - known.q).max() < 30.0 * tolerance
 
 
+@pytest.mark.slow  # the kernel of implicit methods in lanes is compiled for slow tests alone
 def test_stiff_motion_takes_the_implicit_method_that_auto_takes_singly():
     system, q, p = dampers(4)
     runs = ensemble(system, (0.0, 0.3), q, 0 * q, parameters=p, rtol=1e-7, atol=1e-7)

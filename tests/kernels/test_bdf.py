@@ -1,11 +1,11 @@
-"""Test BDF with variable step and order: cost, jumps of the force, Newton's method, and the tests of every method."""
+"""Test BDF with variable step and order: cost, jumps of the force, and the tests of every method."""
 
 import numpy as np
 import pytest
 
 from tests.kernels.adaptive import AdaptiveMethod, after_the_jump, four_bar_run, jumping, shared_run
 from tests.marks import slow
-from tests.problems import pendulum, pendulum_state, swing, worst
+from tests.problems import pendulum_state, swing, worst
 from twoloop import BDF
 
 TOLERANCES = (1e-6, 1e-8, 1e-10)
@@ -60,25 +60,3 @@ def test_steps_far_shorter_than_the_tolerance_asks_for_are_no_worse(tol):
     _, error = four_bar_run("BDF", tol, 1.0)
     many, many_error = four_bar_run("BDF", tol, 1.0, max_step=1e-4)
     assert many_error < error and many.stats.n_evaluations >= 2 * many.stats.n_accepted
-
-
-# --- Newton's method as the outer loop
-def test_newtons_method_takes_the_steps_of_the_fixed_point_where_nothing_is_stiff():
-    (one, error), (other, same) = (four_bar_run(BDF(outer=outer), 1e-8, 3.0) for outer in ("fixed-point", "newton"))
-    assert same < 1.2 * error and abs(other.stats.n_accepted - one.stats.n_accepted) < 0.02 * one.stats.n_accepted
-    assert other.stats.n_outer <= 1.1 * one.stats.n_outer and 0 < other.stats.n_jacobians < 30
-
-
-def test_newtons_method_takes_long_steps_in_a_viscous_fluid():
-    """An overdamped pendulum: transients decay within a thousandth of the motion, at rates of 1e4 per second."""
-
-    def viscous(t, q, v):
-        return np.array([0.0, -9.81]) - 1e4 * v
-
-    found = {}
-    for outer in ("fixed-point", "newton"):
-        options = {"method": BDF(outer=outer), "rtol": 1e-5, "atol": 1e-5}
-        found[outer] = swing(1.0, pendulum(force=viscous), **options)
-        assert found[outer].success
-    one, other = found["fixed-point"], found["newton"]
-    assert worst(one.q[:, -1], other.q[:, -1]) < 1e-4 and other.stats.n_accepted < 0.02 * one.stats.n_accepted

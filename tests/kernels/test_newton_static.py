@@ -10,7 +10,7 @@ from tests.kernels.random_assemblies import PlanarAssembly
 from tests.large_systems import spatial_chain
 from tests.marks import slow
 from tests.problems import worst
-from twoloop import BDF, ConstrainedSystem, solve_dae
+from twoloop import ConstrainedSystem, solve_dae
 from twoloop.kernels.algebra.static_program import N_UPDATES
 from twoloop.mechanisms import planar
 from twoloop.run.run import Run
@@ -100,10 +100,10 @@ def alike(one, other, allowed):
     ("case", "method", "tolerance", "allowed"),
     [
         ("closed chain", "TRBDF2", 1e-5, 1e-5),
-        ("ladder", BDF(outer="newton"), 1e-7, 1e-6),
         *(
             slow(*case)
             for case in (
+                ("ladder", "TRBDF2", 1e-5, 1e-5),
                 ("redundant rows", "RadauIIA9", 1e-10, 1e-9),
                 ("open chain", "RadauIIA9", 1e-10, 1e-9),
                 ("closed chain", "RadauIIA13", 1e-10, 1e-9),

@@ -94,15 +94,9 @@ def beam():
 
 
 def energy():
-    """Sun's method drifts on velocities, and on momenta not."""
-    rows = []
-    for solver, variables, slope in (
-        (IRK, "velocities", -4e-6),
-        ("Sun Radau IIB(3)", "velocities", -1e-7),
-        ("Sun Radau IIB(3)", "momenta", 1e-13),
-        ("Newmark, β = 1/2", "velocities", 1e-13),
-    ):
-        rows.append(GOOD | {"solver": solver, "variables": variables, "slope": slope, "slope_error": 1e-11})
+    """The paper's procedure and Sun's method drift, Newmark's method does not."""
+    slopes = ((IRK, -4e-6), ("Sun Radau IIB(3)", -1e-7), ("Newmark, β = 1/2", 1e-13))
+    rows = [GOOD | {"solver": solver, "slope": slope, "slope_error": 1e-11} for solver, slope in slopes]
     made = pd.DataFrame(rows).assign(case="one partition", partition="lasting", h=0.02, t_end=1e4, n_steps=500_000)
     return made.assign(kinetic=5.6, swing=1e-3, t_reached=1e4)
 

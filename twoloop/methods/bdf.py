@@ -1,12 +1,11 @@
 """BDF(...): backward differentiation formulas in the two-loop procedure."""
 
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 
 from twoloop.checks.arguments import check_size
-from twoloop.methods.plan import INNER_TOL, Plan, check_choices, check_tolerances, outer_tolerance
+from twoloop.methods.plan import INNER_TOL, Plan, check_tolerances, outer_tolerance
 from twoloop.methods.tableaux import gauss
 
 BDF_HIGHEST = 5  # order; the formula of order 6 is next to unstable, those beyond are
@@ -29,9 +28,8 @@ class BDF:
     at the rate of the truncation error; large ones may do either from order 3 on. The fixed point limits h to about
     the reciprocal of the largest frequency or rate of decay: stiff problems need small steps.
 
-    With outer="newton" the outer loop is Newton's method, and stiff problems take long steps; with fixed steps the
-    order rises from 1, a step at a time. The matrices are sparse where systems are large, with either outer loop: then
-    all coordinates are integrated, and the end of each step is put on the constraints.
+    The matrices are sparse where systems are large: then all coordinates are integrated, and the end of each step is
+    put on the constraints.
 
     Parameters
     ----------
@@ -42,13 +40,11 @@ class BDF:
     outer_tol : float, optional
         The outer loop stops when no independent velocity or position would change by more than this, relative to
         max(|value|, 1), but not before one correction. None: 0.01 min(rtol, atol); with fixed steps 1e-14.
-    outer : {"fixed-point", "newton"}
-        The outer loop: a fixed-point iteration, or Newton's method, for stiff problems.
 
     Raises
     ------
     TypeError, ValueError
-        If max_order is not an int from 1 to 5, a tolerance is not positive, or outer is another word.
+        If max_order is not an int from 1 to 5, or a tolerance is not positive.
 
     Notes
     -----
@@ -73,10 +69,8 @@ class BDF:
     max_order: int = 5
     inner_tol: float | None = None
     outer_tol: float | None = None
-    outer: Literal["fixed-point", "newton"] = "fixed-point"
 
     def __post_init__(self) -> None:
-        check_choices(self)
         check_size("max_order", self.max_order, 1)
         if self.max_order > BDF_HIGHEST:
             raise ValueError(f"max_order must be at most {BDF_HIGHEST}; given {self.max_order!r}")
@@ -85,7 +79,7 @@ class BDF:
     @property
     def name(self) -> str:
         """Shown in messages and tables."""
-        return f"BDF(max_order={self.max_order}{', newton' if self.outer == 'newton' else ''})"
+        return f"BDF(max_order={self.max_order})"
 
     def plan(self, n_q: int, rtol: float, atol: float, fixed: bool) -> Plan:
         """Make the method ready for a run of n_q coordinates."""
@@ -93,23 +87,11 @@ class BDF:
 
         inner_tol = INNER_TOL if self.inner_tol is None else self.inner_tol
         outer_tol = outer_tolerance(rtol, atol, fixed) if self.outer_tol is None else self.outer_tol
-        plan = Plan(
+        return Plan(
             kernels.BDF,
             kernels.options_array(self.max_order, inner_tol, outer_tol, gauss(kernels.STARTER_STAGES)),
             np.zeros(kernels.memory_size(n_q)),
             exponent=1.0,  # not used: the order varies, and with it the factor, which the step returns
             projects=True,
             apart=True,
-        )
-        return plan if self.outer == "fixed-point" else self._with_newton(plan, n_q, inner_tol, outer_tol)
-
-    def _with_newton(self, plan: Plan, n_q: int, inner_tol: float, outer_tol: float) -> Plan:
-        from twoloop.kernels.steps import bdf_newton_step as kernels
-        from twoloop.kernels.steps.newton_memory import n_matrices
-
-        return plan.changed(
-            step=kernels.BDF_NEWTON,
-            options=kernels.newton_options(self.max_order, inner_tol, outer_tol),
-            memory=kernels.newton_memory(n_q),
-            matrices=n_matrices(1),
         )

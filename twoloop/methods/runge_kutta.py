@@ -52,19 +52,12 @@ class RungeKutta:
     outer_tol : float, optional
         The outer loop stops when no independent velocity or position changes by more than this, relative to
         max(|value|, 1). None: 0.01 min(rtol, atol); with fixed steps 1e-14.
-    variables : {"velocities", "momenta"}
-        What is integrated. "velocities": (q_i, v_i), as in the paper; these are not canonical, so that a symplectic
-        tableau does not make a symplectic map. "momenta": (q_i, p_i = T^T M v), where v = T v_i + u are the velocities
-        that the constraints allow; where the force comes from a potential, a symplectic tableau (Gauss, Sun, Lobatto
-        IIIE) with a fixed step then is symplectic as long as the partition stays. A mass matrix M(t, q) is
-        differenced along the motion. Costs about a tenth more.
     partition : {"lasting", "symmetric"}
         "lasting": a partition stays until its pivots have become too small. "symmetric": each step has the partition
         that full pivoting finds in the middle of the step, the same forwards and backwards, so that fixed steps with a
         symmetric tableau (Gauss, Lobatto IIIE) stay time-reversible where the partition changes. On conservative
-        mechanisms that swing back the way they came, `RungeKutta(gauss(3), variables="momenta", partition="symmetric")`
-        with fixed steps then shows no drift of the energy; where motion does not reverse, as of a turning crank, only
-        momenta under one lasting partition do. Step-size control spoils both properties.
+        mechanisms that swing back the way they came, `RungeKutta(gauss(3), partition="symmetric")` with fixed steps
+        then shows no drift of the energy. Step-size control spoils this.
     tested : {"all", "positions"}
         What the error estimate of outer="newton" is taken over: positions and velocities, or positions and what
         velocities make of them before they turn back or decay. Stiff vibrations that do not matter show in the
@@ -95,7 +88,6 @@ class RungeKutta:
     error: Literal["richardson", "richardson-paper"] = "richardson"
     inner_tol: float | None = None
     outer_tol: float | None = None
-    variables: Literal["velocities", "momenta"] = "velocities"
     partition: Literal["lasting", "symmetric"] = "lasting"
     tested: Literal["all", "positions"] = "all"
     outer_test: Literal["all", "independent"] = "all"
@@ -110,8 +102,6 @@ class RungeKutta:
         check_choices(self)
         if self.tested == "positions" and self.outer not in ("auto", "newton"):
             raise ValueError(f"tested='positions' goes with outer='newton' or 'auto' only; given {self.outer!r}")
-        if self.outer != "fixed-point" and self.variables != "velocities":
-            raise ValueError(f"outer={self.outer!r} goes with variables='velocities' only; given {self.variables!r}")
         if self.outer == "paper" and self.partition != "lasting":
             raise ValueError(
                 f"outer='paper' is the paper's procedure, which has partition='lasting'; given {self.partition!r}"
@@ -128,7 +118,7 @@ class RungeKutta:
     @property
     def name(self) -> str:
         """Shown in messages and tables."""
-        usual = {"variables": "velocities", "partition": "lasting", "tested": "all", "outer_test": "all"}
+        usual = {"partition": "lasting", "tested": "all", "outer_test": "all"}
         changed = [getattr(self, option) for option, value in usual.items() if getattr(self, option) != value]
         return ", ".join([self.tableau.name, self.outer, self.error, *changed])
 
@@ -167,10 +157,6 @@ class RungeKutta:
                 rough=1.0,
             )
         plan = plan.changed(least_error=LEAST_ERROR, symmetric=self.partition == "symmetric", parts=self._parts())
-        if self.variables == "momenta":
-            from twoloop.kernels.steps import canonical_step as momenta
-
-            return plan.changed(step=momenta.MOMENTA, memory=np.zeros(momenta.memory_size(tableau.stages, n_q)))
         if self.outer == "fixed-point":
             return plan
         newton = self._newton_plan(plan, n_q)

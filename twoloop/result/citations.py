@@ -69,8 +69,6 @@ def citation(result: Result) -> str:
     if not result.method:
         raise ValueError("this result was made by another solver, or by a version that did not record the method")
     keys = ["paper", *(key for name, known in METHODS.items() if result.method.startswith(name) for key in known)]
-    if ", momenta" in result.method and "geometric" not in keys:
-        keys.append("geometric")
     if any(outer in result.method for outer in (", auto", ", newton")) and "stiff" not in keys:
         keys.append("stiff")  # simplified Newton iteration in the outer loop
     preset = next((f' (method="{name}")' for name, known in PRESETS.items() if known.name == result.method), "")

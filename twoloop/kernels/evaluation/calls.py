@@ -6,9 +6,9 @@ A step gets a `Kit`, the callbacks and this function; the helpers here name its 
 from twoloop.kernels.algebra.patterns import has_new_entries
 from twoloop.kernels.data.codes import DONE, INNER_DIVERGED, SINGULAR
 from twoloop.kernels.data.common import INNER, compiled, kernel, merged
-from twoloop.kernels.data.noted import KNOWN, REUSE, ROUNDED
+from twoloop.kernels.data.noted import REUSE, ROUNDED
 from twoloop.kernels.evaluation import tasks
-from twoloop.kernels.evaluation.accelerations import accelerate, acceleration_constraint, equilibrate, mass_there
+from twoloop.kernels.evaluation.accelerations import accelerate, equilibrate, mass_there
 from twoloop.kernels.evaluation.inner import (
     ROUNDING,
     factor_dependent,
@@ -38,9 +38,6 @@ def _other_task(f, w, task, t, q, v):
         if code == DONE:
             tangents(f, w, t, q)
         return code
-    if task == tasks.GAMMA_TASK:
-        w.notes[KNOWN] = 0.0
-        return acceleration_constraint(f, w, t, q, v)
     if task == tasks.MASS_TASK:
         return mass_there(f, w, t, q)
     if task == tasks.RENEW:
@@ -68,12 +65,12 @@ def inner_loop(f, w, task, t, q, v, tolerance, a, lam):
     if task >= tasks.EVALUATE_THERE:
         return _all_coordinates(f, w, task, t, q, v, tolerance, a, lam)
     code = DONE
-    if task <= tasks.POSITIONS:
+    if task <= tasks.RESTORE:
         reuse = w.notes[REUSE] if task == tasks.EVALUATE else w.notes[ROUNDED]
         code = positions(f, w, t, q, v, tolerance, reuse)
         if code == DONE and task != tasks.EVALUATE:
             code = _verify_pattern(w)
-        if code != DONE or task == tasks.POSITIONS:
+        if code != DONE:
             return code
         velocities(f, w, t, q, v, reuse)
     if task == tasks.RESTORE:
@@ -127,12 +124,6 @@ def restore(f, w, t, q, v, tolerance):
 
 
 @merged
-def dependent_positions(f, w, t, q, v, tolerance):
-    """Dependents of q from its independents; rows and factors in w are those at q."""
-    return f.inner(f, w, tasks.POSITIONS, t, q, v, tolerance, w.x, w.lam)
-
-
-@merged
 def accelerations(f, w, t, q, v, a, lam):
     """Eqs. (6)-(8) at a state that was restored just before: accelerations and multipliers."""
     return f.inner(f, w, tasks.ACCELERATIONS, t, q, v, 0.0, a, lam)
@@ -148,12 +139,6 @@ def multipliers(f, w, t, q, v, a, lam):
 def find_tangents(f, w, t, q):
     """Rows and factors at a position on the constraints, and the velocities that they allow, in w.D."""
     return f.inner(f, w, tasks.TANGENTS, t, q, q, 0.0, w.x, w.lam)
-
-
-@merged
-def find_gamma(f, w, t, q, v):
-    """The right-hand side of the acceleration constraints, in w.Gamma."""
-    return f.inner(f, w, tasks.GAMMA_TASK, t, q, v, 0.0, w.x, w.lam)
 
 
 @merged

@@ -184,8 +184,6 @@ def _other_task(f, w, task, t, q, v, a, lam):
     if task == tasks.MASS_TASK:
         mass_values_there(f, w, t, q)
         return DONE if finite_vector(w.mass_values) else not_finite(w.notes, MASS, t, q)
-    if task == tasks.GAMMA_TASK:
-        return _gamma(f, w, t, q, v)
     if task == tasks.REDUNDANT:
         return _redundant_rows_hold(f, w, t, q, v)
     if task == tasks.SOLVE:
@@ -210,7 +208,7 @@ def static_inner_loop(f, w, task, t, q, v, tolerance, a, lam):
     code = DONE
     if task != tasks.ACCELERATIONS:
         code = _to_constraints(f, w, t, q, v, tolerance if task == tasks.PROJECT else 0.0)
-        if code != DONE or task in (tasks.RESTORE, tasks.POSITIONS):
+        if code != DONE or task == tasks.RESTORE:
             return code
     code = _accelerate(f, w, t, q, v, a)
     if code != DONE:

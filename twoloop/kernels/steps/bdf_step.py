@@ -34,7 +34,7 @@ GROWTH = 2.0  # the most by which a step grows
 
 # places in `options`: scalars, then the parameter block of the Gauss steps
 HIGHEST, INNER_TOL, OUTER_TOL, N_SCALARS = range(4)
-# places in `memory`: scalars, rows of coefficients, then vectors; see _coefficients and blocks_of
+# places in `memory`: scalars, rows of coefficients, then vectors; see _coefficients and _blocks
 (
     HAS_TRIAL,  # whether the last attempt left differences at its end
     ORDER,
@@ -67,7 +67,7 @@ def _coefficients(memory, row):
 
 
 @inlined
-def blocks_of(memory, n):
+def _blocks(memory, n):
     """Differences and trial differences (N_DIFFERENCES, 2 n), prediction and its rate (2 n), scratch."""
     o = N_MEMORY_SCALARS + N_ROWS * N_DIFFERENCES
     size = N_DIFFERENCES * 2 * n
@@ -77,10 +77,10 @@ def blocks_of(memory, n):
     return differences, trial, memory[o : o + 2 * n], memory[o + 2 * n : o + 4 * n], memory[o + 4 * n :]
 
 
-@compiled
-def settle(memory, n, accepted):
+@kernel(SETTLE)
+def settle_bdf(f, w, options, memory, tolerances, accepted):
     """Make the trial differences the history, if the attempt was accepted."""
-    differences, trial, _, _, _ = blocks_of(memory, n)
+    differences, trial, _, _, _ = _blocks(memory, w.Q.size)
     left = memory[HAS_TRIAL]
     memory[HAS_TRIAL] = 0.0
     if left == 0.0:
@@ -95,12 +95,6 @@ def settle(memory, n, accepted):
     memory[AGE] = memory[AGE] + 1.0 if memory[ORDER] == memory[NEXT_ORDER] else 0.0
     memory[ORDER] = memory[NEXT_ORDER]
     memory[DEPTH] = memory[NEXT_DEPTH]
-
-
-@kernel(SETTLE)
-def settle_bdf(f, w, options, memory, tolerances, accepted):
-    """As `settle` says."""
-    settle(memory, w.Q.size, accepted)
 
 
 @compiled
@@ -144,7 +138,7 @@ def _predict(memory, differences, trial, h, prediction, rate):
 
 
 @merged
-def spread(h, k):
+def _spread(h, k):
     """c = h / (1 + 1/2 + ... + 1/k)."""
     leading = 0.0
     for j in range(k):
@@ -284,26 +278,30 @@ def _gauss_step(f, w, options, tolerances, t, h, state, new_state, scratch):
     return code
 
 
-@compiled
-def begin_step(memory, blocks, state, h, lowest):
-    """Predict the end of a step; a history that begins has this order at first. The order of the step."""
-    differences, trial, prediction, rate, _ = blocks
-    if memory[DEPTH] == 0.0:
-        _begin(memory, differences, state, h, lowest)
-    _predict(memory, differences, trial, h, prediction, rate)
-    return int(memory[ORDER])
+@kernel(ATTEMPT)
+def bdf_step(f, w, options, memory, t, h, tolerances, state, new_state):
+    """One attempt: predict from the history, correct, and choose the order and the size of the next step.
 
-
-@compiled
-def end_step(w, options, memory, blocks, h, tolerances, state, new_state):
-    """Judge the corrected end of a step, and choose the order and the size of the next one."""
+    Fixed steps are of the highest order; the history that it needs comes from as many Gauss steps.
+    """
     n = w.Q.size
-    y, y1 = state[: 2 * n], new_state[: 2 * n]
-    _, trial, d, _, _ = blocks
+    differences, trial, prediction, rate, scratch = _blocks(memory, n)
+    fixed = tolerances[ESTIMATE] == 0.0
+    if memory[DEPTH] == 0.0:
+        _begin(memory, differences, state, h, 0.0 if fixed else 1.0)
+    _predict(memory, differences, trial, h, prediction, rate)
+    k = int(memory[ORDER])
+    if fixed and k < options[HIGHEST]:
+        code = _gauss_step(f, w, options, tolerances, t, h, state, new_state, scratch)
+    else:
+        code = _correct(f, w, options, t + h, _spread(h, k), prediction, rate, new_state, scratch[:n])
+    if code != DONE:
+        return Attempt(code, np.inf, 0.0)
+    y, y1, d = state[: 2 * n], new_state[: 2 * n], prediction
     for m in range(2 * n):
         d[m] = y1[m] - d[m]
     error, factor = 0.0, 0.0
-    if tolerances[ESTIMATE] == 0.0:
+    if fixed:
         memory[NEXT_ORDER] = min(memory[ORDER] + 1.0, options[HIGHEST])
     else:
         error, factor = _judge(options, memory, tolerances, trial, y, y1, d)
@@ -314,26 +312,6 @@ def end_step(w, options, memory, blocks, h, tolerances, state, new_state):
     memory[HAS_TRIAL] = 1.0
     _extend(memory, trial, y1, d)
     return Attempt(DONE, error, factor)
-
-
-@kernel(ATTEMPT)
-def bdf_step(f, w, options, memory, t, h, tolerances, state, new_state):
-    """One attempt: predict from the history, correct, and choose the order and the size of the next step.
-
-    Fixed steps are of the highest order; the history that it needs comes from as many Gauss steps.
-    """
-    n = w.Q.size
-    blocks = blocks_of(memory, n)
-    _, _, prediction, rate, scratch = blocks
-    fixed = tolerances[ESTIMATE] == 0.0
-    k = begin_step(memory, blocks, state, h, 0.0 if fixed else 1.0)
-    if fixed and k < options[HIGHEST]:
-        code = _gauss_step(f, w, options, tolerances, t, h, state, new_state, scratch)
-    else:
-        code = _correct(f, w, options, t + h, spread(h, k), prediction, rate, new_state, scratch[:n])
-    if code != DONE:
-        return Attempt(code, np.inf, 0.0)
-    return end_step(w, options, memory, blocks, h, tolerances, state, new_state)
 
 
 BDF = Step(bdf_step, settle_bdf)

@@ -1,4 +1,4 @@
-"""One stage of a diagonally implicit method: Newton's method for its accelerations, of ESDIRK methods and of BDF.
+"""One stage of a diagonally implicit method: Newton's method for its accelerations.
 
 Newton's method finds the accelerations a of the independent coordinates, z = gamma h:
 
