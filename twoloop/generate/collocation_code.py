@@ -153,6 +153,31 @@ class CollocationCode:
         _put(emit, emit.multiply(new[0], emit.splat(h)), room, at.SPECTRUM)
         one.store(one.multiply(new[1], h), room, at.LARGEST)
 
+    def audit(self, emit: LaneEmitter, room: Value, state: Value, numbers: Value) -> Value:
+        """The largest defect between nodes: what a step as long as this one would make of it, over the tolerances."""
+        builder, one, n = emit.builder, Emitter(emit.builder), self.n
+        emit.constants = numbers
+        t, h = emit.splat(one.load(room, at.T)), emit.splat(one.load(room, at.H))
+        length = emit.multiply(h, constants(tables().between))
+        zero = emit.constant(0.0)
+        q, v = [zero] * n, [zero] * n
+        for i in self.iterated:
+            q0, v0, a0 = (one.load(state, m * n + i) for m in range(3))
+            of_v = self._combined(emit, tables().velocities_between, a0, room, integer(i))
+            of_q = self._combined(emit, tables().positions_between, a0, room, integer(i))
+            v[i] = emit.fused(h, of_v, emit.splat(v0))
+            q[i] = emit.fused(emit.multiply(h, h), of_q, emit.fused(length, emit.splat(v0), emit.splat(q0)))
+        a, holds = write_accelerations(emit, self.equations, [emit.add(t, length), *q, *v], self.numbers)
+        worst = zero
+        for i, value in enumerate(a):
+            a0 = one.load(state, 2 * n + i)
+            off = emit.subtract(value, self._combined(emit, tables().values_between, a0, room, integer(i)))
+            weight = emit.splat(one.load(room, at.WEIGHTS + i))
+            worst = emit.larger(emit.multiply(emit.function("fabs", off), weight), worst)
+        largest = builder.call(f"llvm.vector.reduce.fmax.{emit.suffix}", DOUBLE, [emit.multiply(worst, h)])
+        all_hold = builder.call(f"llvm.vector.reduce.and.v{LANES}i1", BIT, [holds])
+        return builder.select(all_hold, largest, constant(DOUBLE, FAILED))
+
     def end(self, emit: LaneEmitter, room: Value, state: Value, new_state: Value) -> None:
         """[q, v, a] at the end of the step, and the polynomial that predicts the next, with the best DEGREE of this."""
         builder, one, n = emit.builder, Emitter(emit.builder), self.n
@@ -311,6 +336,7 @@ def _compiled(own: SharedCode) -> Collocation:
 
     code = CollocationCode(own)
     parts = {"begin_nodes": code.begin, "sweep_nodes": code.sweep, "judge_nodes": code.judge, "end_nodes": code.end}
+    parts["audit_nodes"] = code.audit
     if own.projects:
         parts |= {"closer_ends": code.closer, "nearer_ends": code.nearer}
 

@@ -13,6 +13,7 @@ from numpy.polynomial import legendre
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+Extended = NDArray[np.longdouble]
 N = 9
 
 
@@ -21,10 +22,12 @@ class Tables(NamedTuple):
 
     Attributes
     ----------
-    nodes : (8,)
-        Of those that are not known.
+    nodes, between : (8,)
+        Nodes that are not known, and places half-way from one node to the next.
     velocities, positions : (9, 8)
         Single and double integrals from 0 to each node.
+    values_between, velocities_between, positions_between : (9, 8)
+        The polynomial and these integrals at the places between nodes.
     spectrum : (9, 8)
         Coefficients of the Legendre polynomials 1 to 8 on [0, 1], which are 1 at its end.
     end : (9, 8)
@@ -32,8 +35,12 @@ class Tables(NamedTuple):
     """
 
     nodes: Array
+    between: Array
     velocities: Array
     positions: Array
+    values_between: Array
+    velocities_between: Array
+    positions_between: Array
     spectrum: Array
     end: Array
 
@@ -42,22 +49,24 @@ class Tables(NamedTuple):
 def tables() -> Tables:
     """The coefficients, right to rounding."""
     x = _nodes()
-    values = np.array([[_legendre(k, z) for z in x] for k in range(N + 2)], dtype=np.longdouble)
+    between = (x[1:] + x[:-1]) / 2
+    values = _legendre(x)
     weights = 2 / (N * (N - 1) * values[N - 1] ** 2)
     norms = np.array([np.longdouble(2) / (2 * k + 1) for k in range(N)])
     norms[N - 1] = np.longdouble(2) / (N - 1)  # what the quadrature gives of the square of the last one
     coefficients = values[:N] * weights / norms[:, None]  # (k, node): Legendre coefficients of the Lagrange polynomials
-    once = _integrals(values)  # (k, node): from -1
-    integral = np.array([_integrals_of(k, values) for k in range(N)])
-    single = coefficients.T @ once[:N] / 2
-    double = coefficients.T @ integral / 4
     powers = [[comb(n, k) * comb(n + k, k) for n in range(N)] for k in range(1, N)]
-    end = coefficients.T @ np.array(powers, dtype=np.longdouble).T
-    made = ((x[1:] + 1) / 2, single[:, 1:], double[:, 1:], coefficients[1:].T, end)
+    made = (
+        *((each + 1) / 2 for each in (x[1:], between)),
+        *_integrals(coefficients, x[1:])[1:],
+        *_integrals(coefficients, between),
+        coefficients[1:].T,
+        coefficients.T @ np.array(powers, dtype=np.longdouble).T,
+    )
     return Tables(*(each.astype(np.float64) for each in made))
 
 
-def _nodes() -> NDArray[np.longdouble]:
+def _nodes() -> Extended:
     """-1, the zeros of P_8', 1."""
     inner = legendre.legroots(legendre.legder([0] * (N - 1) + [1])).astype(np.longdouble)
     derivative = legendre.legder(np.array([0] * (N - 1) + [1], dtype=np.longdouble))
@@ -66,20 +75,15 @@ def _nodes() -> NDArray[np.longdouble]:
     return np.concatenate([[np.longdouble(-1)], np.sort(inner), [np.longdouble(1)]])
 
 
-def _legendre(k: int, z: np.longdouble) -> np.longdouble:
-    return legendre.legval(z, np.array([0] * k + [1], dtype=np.longdouble))
+def _legendre(z: Extended) -> Extended:
+    """P_0 to P_10, a row each."""
+    return np.array([legendre.legval(z, np.array([0] * k + [1], dtype=np.longdouble)) for k in range(N + 2)])
 
 
-def _integrals(values: NDArray[np.longdouble]) -> NDArray[np.longdouble]:
-    """Integrals from -1 of P_0, ..., P_9: (P_k+1 - P_k-1) / (2 k + 1)."""
-    first = values[1] + 1
-    rest = [(values[k + 1] - values[k - 1]) / (2 * k + 1) for k in range(1, N + 1)]
-    return np.array([first, *rest])
-
-
-def _integrals_of(k: int, values: NDArray[np.longdouble]) -> NDArray[np.longdouble]:
-    """Double integrals from -1 of P_k."""
-    once = _integrals(values)
-    if k == 0:
-        return once[1] + once[0]
-    return (once[k + 1] - once[k - 1]) / (2 * k + 1)
+def _integrals(coefficients: Extended, z: Extended) -> tuple[Extended, Extended, Extended]:
+    """Lagrange polynomials on [0, 1], and their single and double integrals from its beginning, a row a node."""
+    values = _legendre(z)
+    # the integral of P_k from -1 is (P_k+1 - P_k-1) / (2 k + 1)
+    once = np.array([values[1] + 1, *((values[k + 1] - values[k - 1]) / (2 * k + 1) for k in range(1, N + 1))])
+    twice = np.array([once[1] + once[0], *((once[k + 1] - once[k - 1]) / (2 * k + 1) for k in range(1, N))])
+    return coefficients.T @ values[:N], coefficients.T @ once[:N] / 2, coefficients.T @ twice / 4

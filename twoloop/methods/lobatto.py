@@ -8,6 +8,7 @@ import numpy as np
 from twoloop.generate.collocation_code import compiled_collocation
 from twoloop.generate.lobatto_tables import tables
 from twoloop.generate.straight_code import OwnCode
+from twoloop.generate.time_dependence import may_be_narrow
 from twoloop.generate.traced_values import Check, unchecked
 from twoloop.methods.dop853 import DOP853
 from twoloop.methods.plan import LARGEST_MOVE, Plan
@@ -56,6 +57,7 @@ class Lobatto16:
     needs_code: ClassVar[bool] = True
     name: ClassVar[str] = "Lobatto16"
     code: OwnCode | None = None  # made for one system; solve_dae puts it in
+    narrow: bool = True  # whether forces may change much over a short way
 
     def for_system(self, system: ConstrainedSystem, code: OwnCode | None = None, check: Check = unchecked) -> "Lobatto16":
         """The method with what is compiled for this system.
@@ -70,7 +72,7 @@ class Lobatto16:
                 f"method='Lobatto16' needs code made for {system.name!r}: callbacks that are compiled and do not branch "
                 "on t, q or v, and compiled=True where they are long. Take 'auto', which does without"
             )
-        return replace(self, code=code)
+        return replace(self, code=code, narrow=may_be_narrow(system, ran_on_symbols=True))
 
     def takes_code(self, fixed: bool) -> bool:
         """Whether its steps may be run with code made for the mechanism."""
@@ -87,6 +89,7 @@ class Lobatto16:
         options[kernels.KAPPA], options[kernels.THETA] = KAPPA, LARGEST_MOVE
         options[kernels.TARGET] = FEW if min(rtol, atol) >= LOOSE else MOST
         options[kernels.N_ITERATED], options[kernels.N_ROWS] = len(made.code.iterated), made.code.n_rows
+        options[kernels.FREE] = 1.0 if self.narrow else 1.0 / UNSEEN
         sizes = n_q, len(made.code.iterated), made.code.n_rows
         plan = Plan(
             kernels.LOBATTO if self.code.shared.projects else kernels.LOBATTO_SINGLY,
@@ -95,6 +98,7 @@ class Lobatto16:
             exponent=1.0 / kernels.ORDER,
             watchful=True,
             projects=True,
+            looks_within=True,
             unseen=UNSEEN,
             parts=PARTS,
             own=(made.functions,),

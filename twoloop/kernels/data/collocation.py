@@ -21,13 +21,15 @@ LANES = 8
     LIMITED,  # steps in a row, and refusals in a row, which convergence kept much shorter than accuracy needs
     REFUSED,
     LARGEST,  # acceleration at the beginning, over the tolerances
-) = range(14)
+    DEFECT,  # between nodes, over what is allowed; -1: it was not looked for
+) = range(15)
 SPECTRUM = 16  # lanes: coefficients of the Legendre polynomials 1 to 8 of the accelerations, over the tolerances
 POWERS = 24  # lanes: of the length of the step over that before
 WORST = 32  # lanes: the error of predictions of degree 1 to 8 at the end of the step
 MOVED = 40  # lanes: how far positions were moved last, the largest coordinate
 FINE = 48  # lanes: 1 where the projection could be made
-WEIGHTS = 56  # (n): 1 / what an error of a velocity may be
+DEFECTS = 56  # lanes: of steps in a row
+WEIGHTS = 64  # (n): 1 / what an error of a velocity may be
 
 
 def places(n, n_iterated, n_rows):

@@ -203,9 +203,11 @@ OWN_FUNCTIONS = {
     "find_stage": types.boolean(VECTOR, i8, VECTOR, f8, f8, VECTOR, VECTOR),
     "put_stage": types.none(VECTOR, i8, VECTOR),
     # of collocation, on a memory that data/collocation.py describes: (room, state, tolerances), (room, state, numbers),
-    # whose result is the change of velocities, (room, state), (room, state, new_state); (room, numbers)
+    # with the change of velocities, and the defect between nodes, as their results, (room, state), (room, state,
+    # new_state); (room, numbers)
     "begin_nodes": types.none(*[VECTOR] * 3),
     "sweep_nodes": f8(*[VECTOR] * 3),
+    "audit_nodes": f8(*[VECTOR] * 3),
     "judge_nodes": types.none(*[VECTOR] * 2),
     "end_nodes": types.none(*[VECTOR] * 3),
     "closer_ends": types.none(*[VECTOR] * 2),

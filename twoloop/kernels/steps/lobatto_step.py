@@ -23,12 +23,13 @@ from twoloop.kernels.data.collocation import LANES, places
 from twoloop.kernels.data.common import ATTEMPT, MANY, SETTLE, Attempt, Step, compiled, inlined, kernel, merged
 from twoloop.kernels.data.counters import N_ACCEPTED, N_EVALUATIONS, N_FACTORIZATIONS, N_INNER, N_OUTER, N_REJECTED_ERROR
 from twoloop.kernels.data.noted import BY_GENERAL, DEFECT, NEARLY_SINGULAR, ORIENTATION_NEW, ROUNDED
-from twoloop.kernels.data.tolerances import ESTIMATE, LEAST, allowed
+from twoloop.kernels.data.tolerances import ESTIMATE, LEAST, LOOK, ROUNDING, allowed
 from twoloop.kernels.evaluation.calls import check_redundant, project
 from twoloop.kernels.evaluation.gamma import representable
 from twoloop.kernels.evaluation.onto_constraints import ABOVE_ROUNDING
 
-KAPPA, TARGET, THETA, N_ITERATED, N_ROWS, N_OPTIONS = range(6)
+# FREE: how many times LOOK a step may be long that nothing is looked at within, beside the nodes
+KAPPA, TARGET, THETA, N_ITERATED, N_ROWS, FREE, N_OPTIONS = range(7)
 
 MORE = 7  # sweeps beyond the target, after which a step is refused
 SLOW = 0.8  # contraction that is too slow
@@ -44,6 +45,8 @@ SHORTER, SAFETY = 0.6, 0.85
 UNFORESEEN = 10.0  # an error that is so large is looked at elsewhere
 LIMITED, LIMITED_ERROR = 24, 1e-11  # steps that accuracy would let be five times as long: stiffness limits them
 REFUSALS = 6
+BETWEEN = 0.0908  # of a step, the longest part that an audit leaves unseen: half that between two nodes
+ALLOWED = 16.0  # the defect between nodes, over the tolerances: most of it does not last to the end
 EARLY, GROWTH_EARLY, GROWTH = 6, 4.0, 1.4
 MADE, REFUSED, GUESSED, LEFT = range(4)
 _places = merged(places)
@@ -107,8 +110,11 @@ def _error(room):
 @compiled
 def _collocate(f, w, options, room, tolerances, t, h, state):
     """The stages of a step: how it ended, its error, and the factor for the next one."""
-    first = room[room_at.PREDICTS] == 0.0
-    room[room_at.T], room[room_at.H] = t, h
+    first, estimated = room[room_at.PREDICTS] == 0.0, tolerances[ESTIMATE] == 1.0
+    longest = tolerances[LOOK] / BETWEEN
+    if estimated and h > longest * (1.0 + ROUNDING):
+        return REFUSED, h / longest, longest / h
+    room[room_at.T], room[room_at.H], room[room_at.DEFECT] = t, h, -1.0
     if first:
         room[room_at.H_BEFORE], room[room_at.DEGREE], room[room_at.RHO] = h, 0.0, WANTED_START
     f.begin_nodes(room, state, tolerances)
@@ -123,21 +129,32 @@ def _collocate(f, w, options, room, tolerances, t, h, state):
     if ended != MADE:
         room[room_at.REFUSED] += 1.0
         return ended, 2.0, SHORTER
-    if tolerances[ESTIMATE] == 0.0:
+    if not estimated:
         return MADE, 0.0, 1.0
     f.judge_nodes(room, state)
     error = _error(room)
     if not error <= 1.0:
         return REFUSED, error, min(max(0.9 * error ** (-1.0 / ORDER), 0.3), 0.9)
+    most = GROWTH_EARLY if room[room_at.N_STEPS] < EARLY else GROWTH
+    if h > options[FREE] * tolerances[LOOK] * (1.0 + ROUNDING):
+        w.counters[N_EVALUATIONS] += LANES
+        defect = f.audit_nodes(room, state, f.own_numbers)
+        if defect < 0.0:
+            return LEFT, 2.0, SHORTER
+        defect = max(0.0, defect - NOISE * room[room_at.LARGEST]) / ALLOWED
+        if defect > 1.0:
+            return REFUSED, min(defect, UNFORESEEN), max(0.3, 0.9 * defect ** (-1.0 / 9.0))
+        room[room_at.DEFECT] = defect
+        most = min(most, 0.9 * max(defect, 1e-9) ** (-1.0 / 9.0))
+    most = min(most, longest / h)
     left = math.log2(rho * change / options[KAPPA] + 1e-30) + (target - m) * math.log2(rho)
     factor = 2.0 ** (-(left + 1.0) / (target + 2.0))
     stiff = error < LIMITED_ERROR and factor < 1.2 and room[room_at.N_STEPS] >= EARLY
     room[room_at.LIMITED] = room[room_at.LIMITED] + 1.0 if stiff else 0.0
     if error > 1e-6:
         factor = min(factor, SAFETY * error ** (-1.0 / ORDER))
-    most = GROWTH_EARLY if room[room_at.N_STEPS] < EARLY else GROWTH
     if m > target + 1.0:
-        most = 0.9
+        most = min(most, 0.9)
     return MADE, error, min(max(factor, 0.4), most)
 
 
@@ -194,6 +211,7 @@ def lobatto_step(f, w, options, memory, t, h, tolerances, state, new_state):
         return Attempt(OUTER_DIVERGED, math.inf, 0.0)
     if ended != MADE:
         return Attempt(DONE, error, factor)
+    w.notes[DEFECT] = room[room_at.DEFECT]
     f.end_nodes(room, state, new_state)
     room[room_at.NEXT_DEGREE], room[room_at.TRIED] = _next_degree(room), 1.0
     q1, v1, a1, lam1 = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n], new_state[3 * n :]
@@ -274,6 +292,7 @@ def _make(f, w, options, room, tolerances, control, clock, goal, state, n_most, 
         _accept(room)
         t += h
         out_t[n_ends], out_steps[n_ends, at.H] = t, h
+        room[room_at.DEFECTS + n_ends] = room[room_at.DEFECT]
         copy(state[: 2 * n], out_state[n_ends, : 2 * n])
         clock[at.H_NEXT] = h * factor
         n_ends += 1
@@ -306,7 +325,7 @@ def lobatto_steps(
                 clock[at.H_NEXT], room[room_at.PREDICTS], goes = SHORTER * h, 0.0, False
                 break
             clock[at.T] = t[k]
-            w.notes[DEFECT], w.notes[ORIENTATION_NEW] = -1.0, 0.0
+            w.notes[DEFECT], w.notes[ORIENTATION_NEW] = room[room_at.DEFECTS + k], 0.0
             count_step(w, tolerances, control, clock, h, steps[k])
             made += 1
     return made
