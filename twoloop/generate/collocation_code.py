@@ -31,10 +31,11 @@ from twoloop.kernels.compile.dependencies import digest_of
 from twoloop.kernels.compile.own_functions import LaterFunctions, own_functions
 from twoloop.kernels.data import collocation as at
 from twoloop.kernels.data.collocation import LANES
-from twoloop.kernels.data.tolerances import ATOL, RTOL
+from twoloop.kernels.data.tolerances import ATOL, ESTIMATE, RTOL
 
 Array = NDArray[np.float64]
 LONGEST = 8000  # operations of a projection
+SMALLEST = 1e-300  # in place of a coefficient of zero
 FAILED = -1.0  # what a sweep gives in place of a change where accelerations cannot be had
 
 
@@ -88,16 +89,23 @@ class CollocationCode:
     # the functions
 
     def begin(self, emit: LaneEmitter, room: Value, state: Value, tolerances: Value) -> None:
-        """Weights of errors, accelerations as predicted, positions and velocities at the nodes by these."""
+        """Weights of errors, accelerations as predicted, positions and velocities at the nodes by these.
+
+        Where no error is estimated, errors are relative, of values below 1 absolute.
+        """
         builder, one, n = emit.builder, Emitter(emit.builder), self.n
-        h, rtol = one.load(room, at.H), one.load(tolerances, RTOL)
-        with one.loop(integer(0), integer(n), []) as (i, _, _):
+        fixed = builder.compare("fcmp oeq", one.load(tolerances, ESTIMATE), llvm_code.ZERO)
+        h, rtol = one.load(room, at.H), builder.select(fixed, llvm_code.ONE, one.load(tolerances, RTOL))
+        with one.loop(integer(0), integer(n), [llvm_code.ZERO]) as (i, (most,), new):
             q, v = (one.function("fabs", one.load(one.pointer(state, i), place)) for place in (0, n))
-            atol = one.load(one.pointer(tolerances, i), ATOL)
+            atol = builder.select(fixed, llvm_code.ONE, one.load(one.pointer(tolerances, i), ATOL))
             of_v, of_q = (one.add(atol, one.multiply(rtol, each)) for each in (v, q))
             of_q = one.divide(of_q, h)
             least = builder.select(builder.compare("fcmp olt", of_v, of_q), of_v, of_q)
-            one.store(one.divide(llvm_code.ONE, least), one.pointer(room, i), at.WEIGHTS)
+            weight = one.divide(llvm_code.ONE, least)
+            one.store(weight, one.pointer(room, i), at.WEIGHTS)
+            new.append(builder.select(builder.compare("fcmp ogt", weight, most), weight, most))
+        (of_all,) = new
         x = one.divide(h, one.load(room, at.H_BEFORE))
         powers = [x]
         while len(powers) < LANES:
@@ -109,13 +117,17 @@ class CollocationCode:
         kept = builder.select(builder.compare("fcmp olt", known, degree), powers_vector, emit.constant(0.0))
         old = self._polynomial(emit, room, other=False)
         nodes = np.array(tables().nodes)
-        with _over(emit, self.iterated) as (k, i, _, _):
+        with _over(emit, self.iterated, [llvm_code.ZERO]) as (k, i, (most,), new):
+            weight = one.load(one.pointer(room, i), at.WEIGHTS)
+            new.append(builder.select(builder.compare("fcmp ogt", weight, most), weight, most))
             a0 = emit.splat(one.load(one.pointer(state, i), 2 * n))
             scaled = emit.multiply(_get(emit, one.pointer(old, _lanes(emit, k))), kept)
             total = a0
             for degree_, each in enumerate(_splats(emit, scaled)):
                 total = emit.fused(each, constants(nodes ** (degree_ + 1)), total)
             _put(emit, total, one.pointer(room, _lanes(emit, i)), self.a)
+        if self.iterated:
+            one.store(one.divide(of_all, new[0]), room, at.STRICTER)
         self._integrate(emit, room, state)
 
     def sweep(self, emit: LaneEmitter, room: Value, state: Value, numbers: Value) -> Value:
@@ -136,22 +148,31 @@ class CollocationCode:
         return builder.select(all_hold, change, constant(DOUBLE, FAILED))
 
     def judge(self, emit: LaneEmitter, room: Value, state: Value) -> None:
-        """SPECTRUM and LARGEST, over the tolerances."""
+        """ERROR and LARGEST, over the tolerances.
+
+        The coefficients c_k of a in Legendre polynomials tell how fast they fall at last: t (t / s)^2 with t and s the
+        larger ones of c_7, c_8 and of c_5, c_6. Those of smooth motion fall at one rate, and its error, which is of
+        order 16, is smaller by two decades; where forces have a sharp corner they fall no further, and it is t.
+        """
         builder, one, n = emit.builder, Emitter(emit.builder), self.n
-        zero = emit.constant(0.0)
-        with one.loop(integer(0), integer(n), [zero, llvm_code.ZERO]) as (i, (worst, largest), new):
-            weight = one.load(one.pointer(room, i), at.WEIGHTS)
+
+        def larger(a: Value, b: Value) -> Value:
+            return builder.select(builder.compare("fcmp ogt", a, b), a, b)
+
+        with one.loop(integer(0), integer(n), [llvm_code.ZERO] * 2) as (i, (error, largest), new):
             a0 = one.load(one.pointer(state, i), 2 * n)
-            values = self._combined(emit, tables().spectrum, a0, room, i)
-            new.append(emit.larger(emit.multiply(emit.function("fabs", values), emit.splat(weight)), worst))
+            values = emit.function("fabs", self._combined(emit, tables().spectrum, a0, room, i))
+            before, top = (larger(*(builder.extract(values, k + m) for m in range(2))) for k in (4, 6))
+            falls = one.divide(top, larger(larger(before, top), constant(DOUBLE, SMALLEST)))
+            weight = one.load(one.pointer(room, i), at.WEIGHTS)
+            new.append(larger(one.multiply(one.multiply(top, weight), one.multiply(falls, falls)), error))
             middle = one.load(one.pointer(room, _lanes(emit, i)), self.a + LANES // 2 - 1)
             for each in (a0, middle):
-                size = one.multiply(one.function("fabs", each), weight)
-                largest = builder.select(builder.compare("fcmp ogt", size, largest), size, largest)
+                largest = larger(one.multiply(one.function("fabs", each), weight), largest)
             new.append(largest)
         h = one.load(room, at.H)
-        _put(emit, emit.multiply(new[0], emit.splat(h)), room, at.SPECTRUM)
-        one.store(one.multiply(new[1], h), room, at.LARGEST)
+        for value, place in zip(new, (at.ERROR, at.LARGEST), strict=True):
+            one.store(one.multiply(value, h), room, place)
 
     def audit(self, emit: LaneEmitter, room: Value, state: Value, numbers: Value) -> Value:
         """The largest defect between nodes: what a step as long as this one would make of it, over the tolerances."""
@@ -214,6 +235,21 @@ class CollocationCode:
                 one.store(one.add(q, further), here, 0)
                 one.store(one.add(v, one.multiply(h, sums[0])), here, n)
                 one.store(builder.extract(a, last), here, 2 * n)
+
+    def divide(self, emit: LaneEmitter, room: Value, state: Value) -> None:
+        """Positions and velocities at the ends of four equal parts of the step, where those of steps are else."""
+        one, n = Emitter(emit.builder), self.n
+        h = emit.splat(one.load(room, at.H))
+        length = emit.multiply(h, constants(np.minimum(np.arange(1, LANES + 1) / 4.0, 1.0)))
+        with _over(emit, range(n)) as (_, i, _, _):
+            begin, place = one.pointer(state, i), one.pointer(room, _lanes(emit, i))
+            q0, v0, a0 = (one.load(begin, m * n) for m in range(3))
+            of_v = self._combined(emit, tables().velocities_parts, a0, room, i)
+            of_q = self._combined(emit, tables().positions_parts, a0, room, i)
+            v = emit.fused(h, of_v, emit.splat(v0))
+            q = emit.fused(emit.multiply(h, h), of_q, emit.fused(length, emit.splat(v0), emit.splat(q0)))
+            _put(emit, q, place, self.ends + LANES)
+            _put(emit, v, place, self.ends + LANES * (1 + n))
 
     def closer(self, emit: LaneEmitter, room: Value, numbers: Value) -> None:
         """Positions at the ends of eight steps, moved towards the constraints; FINE and MOVED."""
@@ -336,7 +372,7 @@ def _compiled(own: SharedCode) -> Collocation:
 
     code = CollocationCode(own)
     parts = {"begin_nodes": code.begin, "sweep_nodes": code.sweep, "judge_nodes": code.judge, "end_nodes": code.end}
-    parts["audit_nodes"] = code.audit
+    parts |= {"audit_nodes": code.audit, "divide_nodes": code.divide}
     if own.projects:
         parts |= {"closer_ends": code.closer, "nearer_ends": code.nearer}
 

@@ -28,6 +28,8 @@ class Tables(NamedTuple):
         Single and double integrals from 0 to each node.
     values_between, velocities_between, positions_between : (9, 8)
         The polynomial and these integrals at the places between nodes.
+    velocities_parts, positions_parts : (9, 8)
+        Integrals to the ends of four equal parts, and to the end.
     spectrum : (9, 8)
         Coefficients of the Legendre polynomials 1 to 8 on [0, 1], which are 1 at its end.
     end : (9, 8)
@@ -41,6 +43,8 @@ class Tables(NamedTuple):
     values_between: Array
     velocities_between: Array
     positions_between: Array
+    velocities_parts: Array
+    positions_parts: Array
     spectrum: Array
     end: Array
 
@@ -60,6 +64,7 @@ def tables() -> Tables:
         *((each + 1) / 2 for each in (x[1:], between)),
         *_integrals(coefficients, x[1:])[1:],
         *_integrals(coefficients, between),
+        *_integrals(coefficients, np.minimum(np.arange(-1, 7) / np.longdouble(2), 1))[1:],
         coefficients[1:].T,
         coefficients.T @ np.array(powers, dtype=np.longdouble).T,
     )

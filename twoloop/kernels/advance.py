@@ -57,6 +57,7 @@ from twoloop.kernels.evaluation.partition import CHANGED
 
 UNFORESEEN = 10.0  # an error that is so large was not foreseen: the force jumps, or bends, within the step
 REFUSED = 0.95  # of a refused step is what the next one is at most
+IN_A_ROW = 8  # steps at most: there has to be room for them
 FIRST_JUDGED = 2  # accepted step after which a provisional method may give way: the first one may be a guess
 
 
@@ -179,9 +180,9 @@ def _refused(f, w, control, clock, t, size, proposal):
 @merged
 def _may_go_on(control, clock):
     """Whether the method makes steps in a row, and nothing else has to be looked at before each of them."""
-    if control[at.IN_A_ROW] == 0.0 or control[at.STORE_ALL] == 0.0 or control[at.FIXED_STEP] > 0.0:
+    if control[at.IN_A_ROW] == 0.0 or control[at.FIXED_STEP] > 0.0 or clock[at.LEAPS] == 1.0:
         return False
-    if control[at.SPACING] > 0.0 or control[at.DRIVEN] == 1.0 or clock[at.LEAPS] == 1.0:
+    if control[at.SPACING] > 0.0 or control[at.DRIVEN] == 1.0:
         return False
     return clock[at.FAILURE_CODE] == DONE and clock[at.T] >= clock[at.ROUGH_TO]
 
@@ -212,13 +213,14 @@ def advance(
         if w.counters[N_ACCEPTED] >= control[at.MAX_STEPS]:
             return at.MAX_STEPS_REACHED
         if _may_go_on(control, clock):
-            most = min(control[at.MAX_ATTEMPTS] - attempts, control[at.MAX_STEPS] - w.counters[N_ACCEPTED])
-            most = int(min(most, out_t.size - filled[0], out_steps.shape[0] - filled[1]))
             first, goal = filled[0], outputs[int(clock[at.NEXT_OUTPUT])]
-            rows = out_t[first : first + most], out_state[first : first + most], out_steps[filled[1] :]
+            if min(out_t.size - first, out_steps.shape[0] - filled[1]) < IN_A_ROW and first + filled[1] > 0:
+                return at.PAUSED
+            rows = out_t[first:], out_state[first:], out_steps[filled[1] :]
             made = f.attempt_many(f, w, options, memory, tolerances, control, clock, goal, state, new_state, *rows)
             if made > 0:
-                filled[0] += made
+                if control[at.STORE_ALL] == 1.0:
+                    filled[0] += made
                 filled[1] += made
                 attempts += made
                 end = look_at_partition(f, w, control, clock, out_steps[filled[1] - 1, at.H], False, state)

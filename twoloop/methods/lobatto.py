@@ -5,18 +5,18 @@ from typing import ClassVar
 
 import numpy as np
 
-from twoloop.generate.collocation_code import compiled_collocation
+from twoloop.generate.collocation_code import compiled_collocation, suits
 from twoloop.generate.lobatto_tables import tables
 from twoloop.generate.straight_code import OwnCode
 from twoloop.generate.time_dependence import may_be_narrow
 from twoloop.generate.traced_values import Check, unchecked
+from twoloop.kernels.data.collocation import LANES
 from twoloop.methods.dop853 import DOP853
 from twoloop.methods.plan import LARGEST_MOVE, Plan
 from twoloop.problem.system import ConstrainedSystem
 
-KAPPA = 0.01  # of the tolerance: what the iteration may leave; errors are then those of other methods of ours
+KAPPA = 0.02  # of the tolerance: what the iteration may leave; errors are then at most those of other methods of ours
 FEW, MOST, LOOSE = 4.0, 5.0, 3e-4  # sweeps that a step is to take, at tolerances from LOOSE on and below
-PARTS = 8  # of a step, for the solution between its ends
 UNSEEN = float(np.diff([0.0, *tables().nodes]).max())  # of a step, between two nodes
 
 
@@ -35,8 +35,7 @@ class Lobatto16:
     Raises
     ------
     ValueError
-        From `solve_dae`, if there is no code for the system: its callbacks are Python functions, branch on t, q or v,
-        or are too long.
+        From `solve_dae`, if there can be no code for the system: its callbacks branch on t, q or v, or are too long.
 
     Notes
     -----
@@ -67,10 +66,9 @@ class Lobatto16:
         ValueError
             If there is no code for it.
         """
-        if code is None:
+        if code is None or not suits(code.shared):
             raise ValueError(
-                f"method='Lobatto16' needs code made for {system.name!r}: callbacks that are compiled and do not branch "
-                "on t, q or v, and compiled=True where they are long. Take 'auto', which does without"
+                f"method='Lobatto16' needs code made for {system.name!r}, whose equations are too long. Take method='auto'"
             )
         return replace(self, code=code, narrow=may_be_narrow(system, ran_on_symbols=True))
 
@@ -100,11 +98,13 @@ class Lobatto16:
             projects=True,
             looks_within=True,
             unseen=UNSEEN,
-            parts=PARTS,
+            parts=LANES,
             own=(made.functions,),
             own_numbers=made.numbers,
         )
-        plan = plan.changed(interior=plan.changed(memory=plan.memory.copy()))
+        divided = options.copy()
+        divided[kernels.DIVIDED] = 1.0
+        plan = plan.changed(interior=plan.changed(options=divided, memory=plan.memory.copy()))
         if fixed:
             return plan
         return plan.changed(substitute=DOP853().plan(n_q, rtol, atol, False))

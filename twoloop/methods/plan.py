@@ -88,6 +88,11 @@ def takes_code(method: Any, fixed: bool) -> bool:
     return said is not None and bool(said(fixed))
 
 
+def needs_code(method: Any) -> bool:
+    """Whether steps of a method cannot do without code for the mechanism."""
+    return bool(getattr(method, "needs_code", False))
+
+
 def least_tolerance(rtol: float, atol: float) -> float:
     """The smaller of the two, but not below rounding."""
     return max(min(rtol, atol), LEAST_TOLERANCE)

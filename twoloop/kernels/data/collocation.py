@@ -22,8 +22,10 @@ LANES = 8
     REFUSED,
     LARGEST,  # acceleration at the beginning, over the tolerances
     DEFECT,  # between nodes, over what is allowed; -1: it was not looked for
-) = range(15)
-SPECTRUM = 16  # lanes: coefficients of the Legendre polynomials 1 to 8 of the accelerations, over the tolerances
+    PARTS,  # of a divided step that have been asked for
+    ERROR,  # of the step, over the tolerances
+    STRICTER,  # how many times less of the coordinates that are iterated the tolerances of others allow
+) = range(18)
 POWERS = 24  # lanes: of the length of the step over that before
 WORST = 32  # lanes: the error of predictions of degree 1 to 8 at the end of the step
 MOVED = 40  # lanes: how far positions were moved last, the largest coordinate

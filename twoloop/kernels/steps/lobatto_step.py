@@ -28,8 +28,9 @@ from twoloop.kernels.evaluation.calls import check_redundant, project
 from twoloop.kernels.evaluation.gamma import representable
 from twoloop.kernels.evaluation.onto_constraints import ABOVE_ROUNDING
 
+# DIVIDED: 1 where attempts are the parts of one step, for the solution between its ends;
 # FREE: how many times LOOK a step may be long that nothing is looked at within, beside the nodes
-KAPPA, TARGET, THETA, N_ITERATED, N_ROWS, FREE, N_OPTIONS = range(7)
+KAPPA, TARGET, THETA, N_ITERATED, N_ROWS, FREE, DIVIDED, N_OPTIONS = range(8)
 
 MORE = 7  # sweeps beyond the target, after which a step is refused
 SLOW = 0.8  # contraction that is too slow
@@ -37,17 +38,16 @@ LEAST_RHO, MOST_RHO = 1e-3, 0.9
 SLOW_START, FAST_START, WANTED_START = 0.3, 0.04, 0.12  # contraction of the first step: between the first two is well
 MOST_STARTS = 4
 STAGNANT, NOISE = 0.5, 1e-13  # changes that fall no further, and are this small relative to the values, are rounding
-AT_ONCE = 16  # steps in a row at most: then a look is taken at what else there is
-ORDER = 16.0
-SQUARED, LINEAR = 0.05, 1e-5  # of the top coefficient, over the tolerances, squared and as it is: an error
-SHARP, ROUGH_SHARE = 0.3, 0.05  # coefficients that fall less are not those of a smooth motion; what error they stand for
-SHORTER, SAFETY = 0.6, 0.85
+ROUNDING_OF_FIXED, NOISE_OF_FIXED, MOST_OF_FIXED = 1e-16, 1e-9, 60.0  # of steps without an estimate of their error
+ORDER, SHARE = 12.0, 0.1  # of the estimate of the error: it is mostly ten times smaller
+SHORTER, SAFETY = 0.6, 0.65
 UNFORESEEN = 10.0  # an error that is so large is looked at elsewhere
 LIMITED, LIMITED_ERROR = 24, 1e-11  # steps that accuracy would let be five times as long: stiffness limits them
 REFUSALS = 6
 BETWEEN = 0.0908  # of a step, the longest part that an audit leaves unseen: half that between two nodes
 ALLOWED = 16.0  # the defect between nodes, over the tolerances: most of it does not last to the end
-EARLY, GROWTH_EARLY, GROWTH = 6, 4.0, 1.4
+HALF = 4  # parts of half a step
+EARLY, GROWTH_EARLY, GROWTH = 6, 4.0, 1.3
 MADE, REFUSED, GUESSED, LEFT = range(4)
 _places = merged(places)
 
@@ -65,46 +65,34 @@ def _room(memory):
 
 @merged
 def _sweeps(f, w, options, room, tolerances, state, first):
-    """Iterate the stages: how that ended, after how many sweeps, and the last change."""
-    fixed = tolerances[ESTIMATE] == 0.0
-    target = options[TARGET]
+    """Iterate the stages: how that ended, after how many sweeps, the last change, and how many there should be."""
+    estimated = tolerances[ESTIMATE] == 1.0
+    target, kappa, noise, most = options[TARGET], options[KAPPA], NOISE_OF_FIXED, MOST_OF_FIXED
     if room[room_at.DEGREE] >= 7.0:
         target += 2.0
     elif room[room_at.DEGREE] >= 6.0:
         target += 1.0
-    noise = min(options[KAPPA], NOISE / tolerances[LEAST])
+    if estimated:
+        noise, most = min(kappa, NOISE / tolerances[LEAST]), target + MORE
+    else:
+        kappa = ROUNDING_OF_FIXED
     rho, before, m = room[room_at.RHO], math.inf, 0.0
     while True:
-        change = f.sweep_nodes(room, state, f.own_numbers)
+        change = room[room_at.STRICTER] * f.sweep_nodes(room, state, f.own_numbers)
         m += 1.0
         if not change >= 0.0:
             return LEFT, m, change, target
         if m > 1.0:
             rho = min(max(change / before, LEAST_RHO), MOST_RHO) if before > 0.0 else LEAST_RHO
             room[room_at.RHO] = rho
-        if first and m == 2.0 and not fixed and room[room_at.STARTS] < MOST_STARTS and change > 0.0:
+        if first and m == 2.0 and estimated and room[room_at.STARTS] < MOST_STARTS and change > 0.0:
             if rho < FAST_START or rho > SLOW_START:
                 return GUESSED, m, change, target
-        if not fixed and rho * change <= options[KAPPA]:
+        if rho * change <= kappa or (m > 2.0 and change >= STAGNANT * before and change <= noise):
             return MADE, m, change, target
-        if m > 2.0 and change >= STAGNANT * before and change <= noise:
-            return MADE, m, change, target
-        if change == 0.0:
-            return MADE, m, change, target
-        if not change < 1e300 or (m > 3.0 and rho >= SLOW) or (m >= target + MORE and not fixed) or m > 50.0:
+        if not change < math.inf or (m > 3.0 and rho >= SLOW and estimated) or m >= most:
             return REFUSED, m, change, target
         before = change
-
-
-@merged
-def _error(room):
-    """The error of a step over the tolerances, from the coefficients of its accelerations."""
-    top, largest = room[room_at.SPECTRUM + 7], max(room[room_at.LARGEST], 1e-300)
-    error = max(SQUARED * top * (top / largest), LINEAR * top)
-    tail = max(top, room[room_at.SPECTRUM + 6])
-    if tail > SHARP * max(room[room_at.SPECTRUM + 5], room[room_at.SPECTRUM + 4]):
-        error = max(error, ROUGH_SHARE * tail)
-    return error
 
 
 @compiled
@@ -132,7 +120,7 @@ def _collocate(f, w, options, room, tolerances, t, h, state):
     if not estimated:
         return MADE, 0.0, 1.0
     f.judge_nodes(room, state)
-    error = _error(room)
+    error = SHARE * room[room_at.ERROR]
     if not error <= 1.0:
         return REFUSED, error, min(max(0.9 * error ** (-1.0 / ORDER), 0.3), 0.9)
     most = GROWTH_EARLY if room[room_at.N_STEPS] < EARLY else GROWTH
@@ -199,15 +187,37 @@ def settle_lobatto(f, w, options, memory, tolerances, accepted):
     room[room_at.TRIED] = 0.0
 
 
+@merged
+def _next_part(f, w, options, room, tolerances, t, h, state, new_state):
+    """The end of the next of eight equal parts of a step, which is made again in halves.
+
+    Between its ends the polynomial of a step is less accurate than there.
+    """
+    n, k = w.Q.size, int(room[room_at.PARTS])
+    if k == 0:
+        ended, _, _ = _collocate(f, w, options, room, tolerances, t, HALF * h, state)
+        if ended != MADE:
+            return Attempt(OUTER_DIVERGED, math.inf, 0.0)
+        f.divide_nodes(room, state)
+    room[room_at.PARTS] = (k + 1.0) % HALF
+    ends = _places(n, int(options[N_ITERATED]), int(options[N_ROWS]))[4] + LANES + k
+    for i in range(2 * n):
+        new_state[i] = room[ends + LANES * i]
+    q1, v1, a1, lam1 = new_state[:n], new_state[n : 2 * n], new_state[2 * n : 3 * n], new_state[3 * n :]
+    return Attempt(project(f, w, t + h, q1, v1, options[THETA], a1, lam1), 0.0, 0.0)
+
+
 @kernel(ATTEMPT)
 def lobatto_step(f, w, options, memory, t, h, tolerances, state, new_state):
     """One attempt."""
     room, n = _room(memory), w.Q.size
     room[room_at.TRIED] = 0.0
+    if options[DIVIDED] == 1.0:
+        return _next_part(f, w, options, room, tolerances, t, h, state, new_state)
     if tolerances[ESTIMATE] == 1.0 and _is_unsuited(w, room):
         return Attempt(UNSUITED, math.inf, 0.0)
     ended, error, factor = _collocate(f, w, options, room, tolerances, t, h, state)
-    if ended == LEFT:
+    if ended == LEFT or (ended == REFUSED and tolerances[ESTIMATE] == 0.0):
         return Attempt(OUTER_DIVERGED, math.inf, 0.0)
     if ended != MADE:
         return Attempt(DONE, error, factor)
@@ -273,12 +283,12 @@ def _take(f, w, options, room, tolerances, n, k, t, row, state):
 
 @merged
 def _make(f, w, options, room, tolerances, control, clock, goal, state, n_most, out_t, out_state, out_steps):
-    """Steps in a row, at most so many, beside the constraints: how many, and whether others may follow."""
+    """Steps in a row, at most so many, beside the constraints; how many."""
     n, t, n_ends = w.Q.size, clock[at.T], 0
     while n_ends < n_most:
         h = min(clock[at.H_NEXT], control[at.MAX_STEP])
         if h > 0.5 * (goal - t) or h < 0.5 * clock[at.H_LONG]:
-            return n_ends, False
+            return n_ends
         h = representable(t, h)
         ended, error, factor = _collocate(f, w, options, room, tolerances, t, h, state)
         if ended == GUESSED or (ended == REFUSED and error <= UNFORESEEN):
@@ -286,7 +296,7 @@ def _make(f, w, options, room, tolerances, control, clock, goal, state, n_most, 
             w.counters[N_REJECTED_ERROR] += 1 if ended == REFUSED else 0
             continue
         if ended != MADE or _is_unsuited(w, room):
-            return n_ends, False
+            return n_ends
         f.end_nodes(room, state, state)
         room[room_at.NEXT_DEGREE] = _next_degree(room)
         _accept(room)
@@ -296,39 +306,42 @@ def _make(f, w, options, room, tolerances, control, clock, goal, state, n_most, 
         copy(state[: 2 * n], out_state[n_ends, : 2 * n])
         clock[at.H_NEXT] = h * factor
         n_ends += 1
-    return n_ends, True
+    return n_ends
 
 
 @kernel(MANY)
 def lobatto_steps(
     f, w, options, memory, tolerances, control, clock, goal, state, new_state, out_t, out_state, out_steps
 ):
-    """Steps in a row, as many as there are rows, while nothing else has to be looked at; how many were accepted."""
+    """Steps in a row while nothing else has to be looked at, at most as many as there are lanes; how many.
+
+    Such a group ends where the number of steps is a multiple of that, whatever else makes the integrator pause: what is
+    put on the constraints together depends on nothing but the run.
+    """
     room, n = _room(memory), w.Q.size
-    most = min(out_t.size, AT_ONCE - w.counters[N_ACCEPTED] % AT_ONCE)
-    made, goes = 0, not _is_unsuited(w, room)
-    while goes and made < most:
-        n_most = min(LANES, most - made)
-        t, rows, steps = out_t[made:], out_state[made:], out_steps[made:]
-        copy(state, new_state)
-        n_ends, goes = _make(
-            f, w, options, room, tolerances, control, clock, goal, state, n_most, t, rows, steps
-        )
-        if n_ends == 0:
-            break
-        _project_all(f, w, options, room, n, n_ends, t, rows)
-        for k in range(n_ends):
-            h = steps[k, at.H]
-            if not _take(f, w, options, room, tolerances, n, k, t[k], rows[k], state):
-                if k == 0:
-                    copy(new_state, state)
-                clock[at.H_NEXT], room[room_at.PREDICTS], goes = SHORTER * h, 0.0, False
-                break
-            clock[at.T] = t[k]
-            w.notes[DEFECT], w.notes[ORIENTATION_NEW] = room[room_at.DEFECTS + k], 0.0
-            count_step(w, tolerances, control, clock, h, steps[k])
-            made += 1
-    return made
+    if _is_unsuited(w, room) or out_t.size < LANES:
+        return 0
+    if control[at.FIRST_GIVEN] == 1.0:
+        room[room_at.STARTS] = MOST_STARTS
+    n_most = LANES - w.counters[N_ACCEPTED] % LANES
+    if n_most > control[at.MAX_STEPS] - w.counters[N_ACCEPTED]:
+        n_most = int(control[at.MAX_STEPS]) - w.counters[N_ACCEPTED]
+    copy(state, new_state)
+    n_ends = _make(f, w, options, room, tolerances, control, clock, goal, state, n_most, out_t, out_state, out_steps)
+    if n_ends == 0:
+        return 0
+    _project_all(f, w, options, room, n, n_ends, out_t, out_state)
+    for k in range(n_ends):
+        h = out_steps[k, at.H]
+        if not _take(f, w, options, room, tolerances, n, k, out_t[k], out_state[k], state):
+            if k == 0:
+                copy(new_state, state)
+            clock[at.H_NEXT], room[room_at.PREDICTS] = SHORTER * h, 0.0
+            return k
+        clock[at.T] = out_t[k]
+        w.notes[DEFECT], w.notes[ORIENTATION_NEW] = room[room_at.DEFECTS + k], 0.0
+        count_step(w, tolerances, control, clock, h, out_steps[k])
+    return n_ends
 
 
 LOBATTO = Step(lobatto_step, settle_lobatto, lobatto_steps)
